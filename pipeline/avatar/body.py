@@ -1,0 +1,157 @@
+"""The parametric body, one person's body, and its motion.
+
+`ParametricBody` turns shape parameters into an A-pose body. A fit freezes one shape into a `Body`, whose A-pose is the
+bind pose from there on, and a `Motion`, one pose a frame. Joints carry the names that Mixamo, Ready Player Me and
+Unity's humanoid mapping use, and identity rest orientations, so a pose here is a glTF pose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.rotation import quaternion_to_matrix
+from pipeline.geometry.skinning import forward_kinematics, skinning_transforms
+
+
+@dataclass(frozen=True)
+class Body:
+    """One person: A-pose surface and skeleton, canonical frame (+Y up, facing +Z, metres, lowest point at y = 0)."""
+
+    joint_names: tuple[str, ...]
+    parents: Int[np.ndarray, "j"]
+    joints_m: Float[np.ndarray, "j 3"]
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+    skin_weights: Float[np.ndarray, "v j"]
+    shape: dict[str, float]
+
+    def mesh(self) -> Mesh:
+        return Mesh(self.vertices, self.faces)
+
+    def joint(self, name: str) -> int:
+        """Index of a joint by name; ValueError when there is none."""
+        return self.joint_names.index(name)
+
+    def height_m(self) -> float:
+        return float(np.ptp(self.vertices[:, 1]))
+
+
+@dataclass(frozen=True)
+class Motion:
+    """One pose a frame: local rotations (identity = A-pose) and the world position of the root joint."""
+
+    frame_index: Int[np.ndarray, "n"]
+    time_s: Float[np.ndarray, "n"]
+    rotations_wxyz: Float[np.ndarray, "n j 4"]
+    root_translation_m: Float[np.ndarray, "n 3"]
+
+    def select(self, rows: np.ndarray) -> Motion:
+        """The motion at some rows only (index or mask)."""
+        return Motion(
+            self.frame_index[rows], self.time_s[rows], self.rotations_wxyz[rows], self.root_translation_m[rows]
+        )
+
+    def with_pose(self, rotations_wxyz: np.ndarray, root_translation_m: np.ndarray) -> Motion:
+        """The same frames in other poses."""
+        return replace(
+            self,
+            rotations_wxyz=np.asarray(rotations_wxyz, dtype=np.float32),
+            root_translation_m=np.asarray(root_translation_m, dtype=np.float32),
+        )
+
+
+def canonical_to_world(body: Body, motion: Motion) -> Float[Tensor, "n j 4 4"]:
+    """Skinning matrices of every frame."""
+    joints_m = torch.as_tensor(body.joints_m)
+    joint_to_world = forward_kinematics(
+        quaternion_to_matrix(torch.as_tensor(motion.rotations_wxyz)),
+        torch.as_tensor(motion.root_translation_m),
+        joints_m,
+        body.parents,
+    )
+    return skinning_transforms(joint_to_world, joints_m)
+
+
+SHAPE_DEFAULTS = {
+    "gender": 0.5,
+    "age": 2.0 / 3.0,
+    "muscle": 0.5,
+    "weight": 0.5,
+    "height": 0.5,
+    "proportions": 0.5,
+    "cupsize": 0.5,
+    "firmness": 0.5,
+    "african": 1.0 / 3.0,
+    "asian": 1.0 / 3.0,
+    "caucasian": 1.0 / 3.0,
+}
+"""Anny's phenotypes, each in [0, 1]; gender 0 is male, age 2/3 is a young adult (anchors at 0 baby, 1/3 child, 1 old)."""
+
+
+class AnnyBody:
+    """Anny (Apache-2.0 code, CC0 data) behind the interface that the fit needs, with the 52-joint Mixamo rig.
+
+    Anny's frame is +Z up, facing -Y; here everything is turned to +Y up, facing +Z. Its rest pose is an A-pose.
+    The first construction on a machine builds a cache of up to a minute.
+    """
+
+    def __init__(self) -> None:
+        import anny  # here, because loading it costs seconds that `--status` should not pay
+
+        model = anny.Anny(rig="mixamo", phenotypes="all", skinning_method="lbs").to(torch.float32)
+        self._model = model
+        self.shape_names: tuple[str, ...] = tuple(SHAPE_DEFAULTS)
+        self.shape_defaults: Float[Tensor, "p"] = torch.tensor(list(SHAPE_DEFAULTS.values()))
+        self.joint_names: tuple[str, ...] = tuple(name.split(":")[-1] for name in model.bone_labels)
+        self.parents: Int[np.ndarray, "j"] = np.array(model.bone_parents, dtype=np.int32)
+        self.faces: Int[np.ndarray, "f 3"] = model.get_triangular_faces().numpy().astype(np.int32)
+        self.skin_weights: Float[np.ndarray, "v j"] = self._dense_weights()
+        self.uv: Float[np.ndarray, "t 2"] = model.texture_coordinates.numpy().astype(np.float32)
+        self.faces_uv: Int[np.ndarray, "f 3"] = model.face_texture_coordinate_indices.numpy().astype(np.int32)
+
+    def _dense_weights(self) -> Float[np.ndarray, "v j"]:
+        indices = self._model.vertex_bone_indices.numpy()
+        dense = np.zeros((len(indices), len(self.joint_names)), dtype=np.float32)
+        np.add.at(dense, (np.arange(len(indices))[:, None], indices), self._model.vertex_bone_weights.numpy())
+        return dense / dense.sum(axis=1, keepdims=True)
+
+    def rest(self, shape: Float[Tensor, "p"]) -> tuple[Float[Tensor, "v 3"], Float[Tensor, "j 3"]]:
+        """A-pose vertices and joints of a shape (ordered as `shape_names`), canonical frame, differentiable."""
+        coefficients = self._model.get_phenotype_blendshape_coefficients(
+            **{name: shape[i : i + 1] for i, name in enumerate(self.shape_names)}
+        )
+        vertices = self._model.get_rest_vertices(coefficients)[0]
+        heads = self._model.template_bone_heads + torch.einsum(
+            "k,kjc->jc", coefficients[0], self._model.bone_heads_blendshapes
+        )
+        turn = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+        vertices, joints_m = vertices @ turn.T, heads @ turn.T
+        origin = torch.stack([joints_m[0, 0], vertices[:, 1].min(), joints_m[0, 2]])
+        return vertices - origin, joints_m - origin
+
+    def body(self, shape: Float[Tensor, "p"]) -> Body:
+        """Freeze a shape into one person's body."""
+        with torch.no_grad():
+            vertices, joints_m = self.rest(shape)
+        return Body(
+            joint_names=self.joint_names,
+            parents=self.parents,
+            joints_m=joints_m.numpy(),
+            vertices=vertices.numpy(),
+            faces=self.faces,
+            skin_weights=self.skin_weights,
+            shape={name: float(value) for name, value in zip(self.shape_names, shape, strict=True)},
+        )
+
+
+@lru_cache(maxsize=1)
+def load_anny() -> AnnyBody:
+    """The default parametric body, loaded once a process."""
+    return AnnyBody()

@@ -1,0 +1,113 @@
+"""The one pinhole camera of the house.
+
+OpenCV axes: x right, y down, z forward; pixel centres lie at +0.5, so the image spans [0, width] x [0, height].
+`world_to_camera` is a rigid 4x4 matrix that acts on column vectors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+UPRIGHT_WORLD_TO_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32)
+"""Camera at the world's origin that looks along -Z with +Y up: what is assumed when nothing else is known."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Pinhole intrinsics in pixels and a rigid pose.
+
+    `distortion` holds OpenCV's (k1, k2, p1, p2[, k3]). It is honoured once, when frames are undistorted on reading;
+    `project` and `pixel_rays` speak of the undistorted image.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    world_to_camera: Float[np.ndarray, "4 4"] = field(default_factory=UPRIGHT_WORLD_TO_CAMERA.copy)
+    distortion: tuple[float, ...] = ()
+
+    def matrix(self) -> Float[np.ndarray, "3 3"]:
+        """Intrinsic matrix K in pixels."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]], dtype=np.float32)
+
+    def scaled(self, factor: float) -> Camera:
+        """The same camera for an image resized by `factor`; sides are rounded to whole pixels."""
+        width, height = max(1, round(self.width * factor)), max(1, round(self.height * factor))
+        scale_x, scale_y = width / self.width, height / self.height
+        return replace(
+            self,
+            fx=self.fx * scale_x,
+            fy=self.fy * scale_y,
+            cx=self.cx * scale_x,
+            cy=self.cy * scale_y,
+            width=width,
+            height=height,
+        )
+
+    def cropped(self, left_px: int, top_px: int, width_px: int, height_px: int) -> Camera:
+        """The same camera for the window of the image that starts at (left, top)."""
+        return replace(self, cx=self.cx - left_px, cy=self.cy - top_px, width=width_px, height=height_px)
+
+    def centre_m(self) -> Float[np.ndarray, "3"]:
+        """Position of the pinhole in the world."""
+        rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
+        return -rotation.T @ translation
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Flat arrays for an npz; `from_arrays` is the inverse."""
+        return {
+            "camera_intrinsics_px": np.array([self.fx, self.fy, self.cx, self.cy], dtype=np.float64),
+            "camera_size_px": np.array([self.width, self.height], dtype=np.int32),
+            "camera_world_to_camera": np.asarray(self.world_to_camera, dtype=np.float32),
+            "camera_distortion": np.array(self.distortion, dtype=np.float64),
+        }
+
+    @staticmethod
+    def from_arrays(arrays: Mapping[str, np.ndarray]) -> Camera:
+        fx, fy, cx, cy = (float(value) for value in arrays["camera_intrinsics_px"])
+        width, height = (int(value) for value in arrays["camera_size_px"])
+        distortion = tuple(float(value) for value in arrays["camera_distortion"])
+        return Camera(fx, fy, cx, cy, width, height, np.asarray(arrays["camera_world_to_camera"]), distortion)
+
+
+def world_to_camera_points(points_world: Float[Tensor, "*n 3"], camera: Camera) -> Float[Tensor, "*n 3"]:
+    """Points in camera axes, metres."""
+    pose = torch.as_tensor(camera.world_to_camera, dtype=points_world.dtype, device=points_world.device)
+    return points_world @ pose[:3, :3].T + pose[:3, 3]
+
+
+def project(points_world: Float[Tensor, "*n 3"], camera: Camera) -> tuple[Float[Tensor, "*n 2"], Float[Tensor, "*n"]]:
+    """Pixel positions and depths (m) of world points; differentiable.
+
+    Points behind the camera (depth <= 0) get meaningless pixels: mask them by depth.
+    """
+    points = world_to_camera_points(points_world, camera)
+    depth_m = points[..., 2]
+    x_px = camera.fx * points[..., 0] / depth_m + camera.cx
+    y_px = camera.fy * points[..., 1] / depth_m + camera.cy
+    return torch.stack([x_px, y_px], dim=-1), depth_m
+
+
+def pixel_rays(camera: Camera, pixels_px: Float[Tensor, "n 2"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Origins (m) and unit directions, in the world, of the rays through pixel positions (centres at +0.5)."""
+    pose = torch.as_tensor(camera.world_to_camera, dtype=pixels_px.dtype, device=pixels_px.device)
+    in_camera = torch.stack(
+        [
+            (pixels_px[:, 0] - camera.cx) / camera.fx,
+            (pixels_px[:, 1] - camera.cy) / camera.fy,
+            torch.ones_like(pixels_px[:, 0]),
+        ],
+        dim=-1,
+    )
+    directions = torch.nn.functional.normalize(in_camera @ pose[:3, :3], dim=-1)
+    centre = -pose[:3, :3].T @ pose[:3, 3]
+    return centre.expand_as(directions), directions

@@ -1,0 +1,84 @@
+"""Forward kinematics and linear blend skinning, in plain torch.
+
+Letters: n frames, j joints, v vertices, k influences. Joints have identity rest orientation, as glTF nodes may have:
+G_j = G_parent · T(joint_j - joint_parent) · R_j, and the skinning matrix is B_j = G_j · T(-joint_j).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+def rigid(rotation: Float[Tensor, "*n 3 3"], translation: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 4 4"]:
+    """Homogeneous matrices from rotations and translations (m)."""
+    top = torch.cat([rotation, translation[..., None]], dim=-1)
+    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
+    return torch.cat([top, bottom], dim=-2)
+
+
+def forward_kinematics(
+    rotations: Float[Tensor, "n j 3 3"],
+    root_translation_m: Float[Tensor, "n 3"],
+    joints_m: Float[Tensor, "j 3"],
+    parents: Sequence[int] | Int[np.ndarray, "j"],
+) -> Float[Tensor, "n j 4 4"]:
+    """World pose of every joint.
+
+    Args:
+        rotations: local to the parent; identity is the bind pose.
+        root_translation_m: world position of joint 0.
+        joints_m: bind-pose joint positions, canonical frame.
+        parents: index of each joint's parent, which comes before it; -1 for the root, which is joint 0.
+
+    Raises:
+        ValueError: a parent does not come before its child.
+    """
+    joint_rotations, joint_positions = [rotations[:, 0]], [root_translation_m]
+    for joint in range(1, len(parents)):
+        parent = int(parents[joint])
+        if not 0 <= parent < joint:
+            raise ValueError(f"joint {joint} has parent {parent}; parents must come before their children")
+        offset = joints_m[joint] - joints_m[parent]
+        joint_positions.append(joint_positions[parent] + joint_rotations[parent] @ offset)
+        joint_rotations.append(joint_rotations[parent] @ rotations[:, joint])
+    return rigid(torch.stack(joint_rotations, dim=1), torch.stack(joint_positions, dim=1))
+
+
+def skinning_transforms(
+    joint_to_world: Float[Tensor, "n j 4 4"], joints_m: Float[Tensor, "j 3"]
+) -> Float[Tensor, "n j 4 4"]:
+    """B_j, which carries canonical points that move rigidly with joint j into the world."""
+    rotation = joint_to_world[..., :3, :3]
+    moved = (rotation @ joints_m[:, :, None]).squeeze(-1)
+    return rigid(rotation, joint_to_world[..., :3, 3] - moved)
+
+
+def linear_blend_skinning(
+    vertices: Float[Tensor, "v 3"], weights: Float[Tensor, "v j"], canonical_to_world: Float[Tensor, "n j 4 4"]
+) -> Float[Tensor, "n v 3"]:
+    """Posed vertices: x' = (sum_j w_j B_j) x."""
+    n_frames, n_joints = canonical_to_world.shape[:2]
+    flat = canonical_to_world[:, :, :3].reshape(n_frames, n_joints, 12)
+    blended = torch.einsum("vj,njm->nvm", weights, flat).reshape(n_frames, len(vertices), 3, 4)
+    return (blended[..., :3] @ vertices[:, :, None]).squeeze(-1) + blended[..., 3]
+
+
+def dense_weights(indices: Int[Tensor, "v k"], weights: Float[Tensor, "v k"], joint_count: int) -> Float[Tensor, "v j"]:
+    """Scatter sparse influences into one row per vertex."""
+    dense = weights.new_zeros(len(weights), joint_count)
+    return dense.scatter_add(1, indices.long(), weights)
+
+
+def top_k_weights(
+    weights: Float[np.ndarray, "v j"], k: int = 4
+) -> tuple[Int[np.ndarray, "v k"], Float[np.ndarray, "v k"]]:
+    """The k largest influences of each vertex, renormalised to sum 1, largest first; joint 0 where the weight is 0."""
+    indices = np.argsort(-weights, axis=1, kind="stable")[:, :k]
+    kept = np.take_along_axis(weights, indices, axis=1)
+    kept = kept / kept.sum(axis=1, keepdims=True)
+    return np.where(kept > 0, indices, 0).astype(np.int32), kept.astype(np.float32)

@@ -1,0 +1,91 @@
+"""Arrays on disk: npz without pickles and with the same bytes for the same arrays."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.avatar.body import Body, Motion
+from pipeline.core.errors import UserError
+from pipeline.geometry.camera import Camera
+
+_ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
+
+
+def save_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write arrays under their names; `numpy.savez` would stamp the time of day into the archive."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name in sorted(arrays):
+            with archive.open(zipfile.ZipInfo(f"{name}.npy", _ZIP_EPOCH), "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.ascontiguousarray(arrays[name]), allow_pickle=False)
+
+
+def load_npz(path: Path) -> dict[str, np.ndarray]:
+    """Read all arrays into memory.
+
+    Raises:
+        UserError: the file is missing, is no npz, or holds pickled objects.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        raise UserError(f"{path} cannot be read as npz arrays ({error}); run the stage that writes it again") from error
+
+
+def save_body(path: Path, body: Body) -> None:
+    save_npz(
+        path,
+        {
+            "joint_names": np.array(body.joint_names),
+            "parents": body.parents,
+            "joints_m": body.joints_m,
+            "vertices": body.vertices,
+            "faces": body.faces,
+            "skin_weights": body.skin_weights,
+            "shape_names": np.array(list(body.shape), dtype=str),
+            "shape_values": np.array(list(body.shape.values()), dtype=np.float64),
+        },
+    )
+
+
+def load_body(path: Path) -> Body:
+    arrays = load_npz(path)
+    names = [str(name) for name in arrays["shape_names"]]
+    return Body(
+        joint_names=tuple(str(name) for name in arrays["joint_names"]),
+        parents=arrays["parents"],
+        joints_m=arrays["joints_m"],
+        vertices=arrays["vertices"],
+        faces=arrays["faces"],
+        skin_weights=arrays["skin_weights"],
+        shape=dict(zip(names, arrays["shape_values"].tolist(), strict=True)),
+    )
+
+
+def save_motion(path: Path, motion: Motion) -> None:
+    save_npz(
+        path,
+        {
+            "frame_index": motion.frame_index,
+            "time_s": motion.time_s,
+            "rotations_wxyz": motion.rotations_wxyz,
+            "root_translation_m": motion.root_translation_m,
+        },
+    )
+
+
+def load_motion(path: Path) -> Motion:
+    arrays = load_npz(path)
+    return Motion(arrays["frame_index"], arrays["time_s"], arrays["rotations_wxyz"], arrays["root_translation_m"])
+
+
+def save_camera(path: Path, camera: Camera) -> None:
+    save_npz(path, camera.arrays())
+
+
+def load_camera(path: Path) -> Camera:
+    return Camera.from_arrays(load_npz(path))

@@ -1,0 +1,35 @@
+"""Mesh facts against trimesh and closed forms."""
+
+import numpy as np
+import trimesh
+
+from pipeline.geometry.mesh import Mesh
+
+
+def sphere() -> tuple[Mesh, trimesh.Trimesh]:
+    truth = trimesh.creation.icosphere(subdivisions=3)
+    return Mesh(truth.vertices.astype(np.float32), truth.faces.astype(np.int32)), truth
+
+
+def test_normals_and_areas_agree_with_trimesh() -> None:
+    mesh, truth = sphere()
+    np.testing.assert_allclose(mesh.face_normals(), truth.face_normals, atol=1e-5)
+    np.testing.assert_allclose(mesh.face_areas_m2(), truth.area_faces, rtol=1e-5)
+    np.testing.assert_allclose(mesh.vertex_normals(), mesh.vertices, atol=0.02)  # a unit sphere
+
+
+def test_edges_agree_with_eulers_formula() -> None:
+    mesh, truth = sphere()
+    assert len(mesh.vertices) - len(mesh.edges()) + len(mesh.faces) == 2
+    assert (mesh.edge_face_counts() == 2).all()
+    assert len(mesh.edges()) == len(truth.edges_unique)
+
+
+def test_watertight_needs_closed_and_consistently_wound_faces() -> None:
+    mesh, _ = sphere()
+    assert mesh.is_watertight()
+    assert not Mesh(mesh.vertices, mesh.faces[1:]).is_watertight()
+    flipped = mesh.faces.copy()
+    flipped[0] = flipped[0, ::-1]
+    assert not Mesh(mesh.vertices, flipped).is_watertight()
+    assert not Mesh(mesh.vertices, np.concatenate([mesh.faces, mesh.faces[:1]])).is_watertight()
