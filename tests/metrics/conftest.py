@@ -1,0 +1,9 @@
+"""One seeded source of random numbers for the metric tests."""
+
+import numpy as np
+import pytest
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(7)

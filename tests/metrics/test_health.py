@@ -1,0 +1,77 @@
+"""Mesh health on meshes whose faults are known."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from pipeline.geometry.mesh import Mesh
+from pipeline.metrics.health import (
+    component_count,
+    is_manifold,
+    mesh_health,
+    self_intersecting_faces,
+    smallest_angles_deg,
+)
+
+
+def box(centre: tuple[float, float, float] = (0.0, 0.0, 0.0), side_m: float = 1.0) -> Mesh:
+    made = trimesh.creation.box(extents=[side_m] * 3)
+    return Mesh(np.asarray(made.vertices) + centre, np.asarray(made.faces, dtype=np.int32))
+
+
+def together(a: Mesh, b: Mesh) -> Mesh:
+    return Mesh(np.concatenate([a.vertices, b.vertices]), np.concatenate([a.faces, b.faces + len(a.vertices)]))
+
+
+def test_a_box_is_sound():
+    health = mesh_health(box())
+    assert health == {
+        "vertices": 8,
+        "faces": 12,
+        "watertight": True,
+        "manifold": True,
+        "components": 1,
+        "sliver_share": 0.0,
+        "smallest_angle_deg": pytest.approx(45.0),
+        "self_intersecting_faces": 0,
+    }
+
+
+def test_a_hole_opens_the_box_but_leaves_it_manifold():
+    open_box = Mesh(box().vertices, box().faces[1:])
+    assert not mesh_health(open_box)["watertight"]
+    assert is_manifold(open_box)
+
+
+def test_three_faces_on_an_edge_are_not_manifold():
+    vertices = np.array([[0, 0, 0], [1.0, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]])
+    assert not is_manifold(Mesh(vertices, np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4]], dtype=np.int32)))
+
+
+def test_two_cones_that_share_a_tip_are_not_manifold_though_every_edge_is():
+    two = together(box(), box((1.0, 1.0, 1.0)))
+    corner = np.argmax(np.all(two.vertices[:8] == 0.5, axis=1))
+    twin = 8 + np.argmax(np.all(two.vertices[8:] == 0.5, axis=1))
+    pinched = Mesh(two.vertices, np.where(two.faces == twin, corner, two.faces))
+    assert is_manifold(two)
+    assert not is_manifold(pinched)
+    assert component_count(two) == 2
+    assert component_count(pinched) == 1
+
+
+def test_unused_vertices_are_no_component():
+    assert component_count(Mesh(np.zeros((9, 3)), np.array([[1, 3, 5]], dtype=np.int32))) == 1
+
+
+def test_boxes_that_cut_each_other_are_seen():
+    assert self_intersecting_faces(together(box(), box((3.0, 0.0, 0.0)))) == 0
+    assert self_intersecting_faces(together(box(), box((0.4, 0.3, 0.2)))) > 4
+
+
+def test_smallest_angle_is_the_law_of_cosines(rng):
+    mesh = Mesh(rng.normal(size=(3, 3)), np.array([[0, 1, 2]], dtype=np.int32))
+    a, b, c = (np.linalg.norm(mesh.vertices[i] - mesh.vertices[(i + 1) % 3]) for i in range(3))
+    cosines = [(a * a + b * b - c * c) / (2 * a * b), (b * b + c * c - a * a) / (2 * b * c), (a * a + c * c - b * b) / (2 * a * c)]
+    assert smallest_angles_deg(mesh)[0] == pytest.approx(np.degrees(np.arccos(cosines)).min())
+    flat = Mesh(np.array([[0, 0, 0], [1.0, 0, 0], [2, 0, 0]]), mesh.faces)
+    assert smallest_angles_deg(flat)[0] == pytest.approx(0.0)

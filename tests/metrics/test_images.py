@@ -1,0 +1,125 @@
+"""Image metrics against a slow reference, scikit-image and closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+from skimage.metrics import structural_similarity
+
+from pipeline.metrics.images import (
+    body_box,
+    body_pixels,
+    frame_scores,
+    mask_iou,
+    mean_scores,
+    on_white,
+    premultiplied_on_white,
+    psnr_db,
+    ssim,
+)
+
+
+@pytest.fixture
+def pair(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    image = rng.integers(0, 256, (40, 31, 3)).astype(np.uint8)
+    noisy = np.clip(image + rng.normal(0, 20, image.shape), 0, 255).astype(np.uint8)
+    return noisy, image
+
+
+def slow_ssim(x: np.ndarray, y: np.ndarray) -> float:
+    """The definition window by window, as torchmetrics documents it (reflect padding there is cropped again)."""
+    offsets = np.arange(-5, 6)
+    window = np.exp(-(offsets[:, None] ** 2 + offsets[None] ** 2) / (2 * 1.5**2))
+    window /= window.sum()
+    values = []
+    for channel in range(3):
+        for row in range(5, x.shape[0] - 5):
+            for column in range(5, x.shape[1] - 5):
+                a = x[row - 5 : row + 6, column - 5 : column + 6, channel] / 255.0
+                b = y[row - 5 : row + 6, column - 5 : column + 6, channel] / 255.0
+                mean_a, mean_b = (window * a).sum(), (window * b).sum()
+                variance_a, variance_b = (window * (a - mean_a) ** 2).sum(), (window * (b - mean_b) ** 2).sum()
+                covariance = (window * (a - mean_a) * (b - mean_b)).sum()
+                top = (2 * mean_a * mean_b + 1e-4) * (2 * covariance + 9e-4)
+                values.append(top / ((mean_a**2 + mean_b**2 + 1e-4) * (variance_a + variance_b + 9e-4)))
+    return float(np.mean(values))
+
+
+def test_ssim_is_the_definition(pair):
+    assert ssim(*pair) == pytest.approx(slow_ssim(*pair), abs=1e-9)
+
+
+def test_ssim_is_what_scikit_image_computes(pair):
+    expected = structural_similarity(
+        *pair, channel_axis=2, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=255
+    )
+    assert ssim(*pair) == pytest.approx(expected, abs=1e-9)
+
+
+def test_ssim_of_equal_images_is_one_and_small_images_are_refused(pair):
+    assert ssim(pair[0], pair[0]) == pytest.approx(1.0)
+    with pytest.raises(ValueError, match="11 px window"):
+        ssim(pair[0][:10], pair[1][:10])
+
+
+@pytest.mark.parametrize("step", [1, 10, 255])
+def test_psnr_of_a_constant_offset_is_closed_form(step):
+    dark = np.zeros((5, 7, 3), dtype=np.uint8)
+    assert psnr_db(dark + np.uint8(step), dark) == pytest.approx(20 * math.log10(255 / step))
+
+
+def test_psnr_counts_only_the_chosen_pixels(pair):
+    noisy, image = pair
+    where = np.zeros(image.shape[:2], dtype=bool)
+    where[3:9, 4:20] = True
+    assert psnr_db(noisy, image, where) == pytest.approx(psnr_db(noisy[3:9, 4:20], image[3:9, 4:20]))
+    assert psnr_db(image, image) == math.inf
+    with pytest.raises(ValueError, match="no pixel"):
+        psnr_db(noisy, image, np.zeros_like(where))
+
+
+def test_compositing_on_white_is_the_same_for_frames_and_for_premultiplied_renders(rng):
+    rgb = rng.integers(0, 256, (6, 5, 3)).astype(np.uint8)
+    alpha = rng.integers(0, 256, (6, 5)).astype(np.uint8)
+    opacity = alpha[..., None] / np.float32(255)
+    rgba = np.concatenate([rgb / np.float32(255) * opacity, opacity], axis=2).astype(np.float32)
+    difference = premultiplied_on_white(rgba).astype(int) - on_white(rgb, alpha)
+    assert np.abs(difference).max() <= 1  # two roundings of the same number
+    assert (on_white(rgb, np.zeros_like(alpha)) == 255).all()
+    assert (on_white(rgb, np.full_like(alpha, 255)) == rgb).all()
+
+
+def test_body_box_is_tight():
+    body = np.zeros((20, 30), dtype=bool)
+    body[4, 9] = body[11, 17] = True
+    assert body_box(body) == (slice(4, 12), slice(9, 18))
+    with pytest.raises(ValueError, match="no body pixel"):
+        body_box(np.zeros((4, 4), dtype=bool))
+
+
+def test_iou_of_two_overlapping_boxes():
+    a, b = np.zeros((10, 10), dtype=bool), np.zeros((10, 10), dtype=bool)
+    a[:, :6], b[:, 4:] = True, True
+    assert mask_iou(a, b) == pytest.approx(2 / 10)
+    assert mask_iou(a & False, b & False) == 1.0
+
+
+def test_frame_scores_of_a_perfect_render_and_of_a_missing_person(rng):
+    image = rng.integers(0, 200, (48, 40, 3)).astype(np.uint8)
+    mask = np.zeros((48, 40), dtype=np.uint8)
+    mask[8:40, 10:30] = 255
+    solid = (mask[..., None] / 255.0).astype(np.float32)
+    perfect = np.concatenate([image / np.float32(255) * solid, solid], axis=2).astype(np.float32)
+    scores = frame_scores(perfect, image, mask)
+    assert scores["psnr_full"] == scores["psnr_body"] == math.inf and scores["mask_iou"] == 1.0
+    nobody = frame_scores(np.zeros_like(perfect), image, mask)
+    assert nobody["mask_iou"] == 0.0
+    share = body_pixels(mask).mean()  # all error lies on the body, so the full image only dilutes it
+    assert nobody["psnr_full"] - nobody["psnr_body"] == pytest.approx(-10 * math.log10(share))
+    assert nobody["psnr_box"] == pytest.approx(nobody["psnr_body"])
+
+
+def test_mean_scores():
+    assert mean_scores([{"a": 1.0, "b": 2.0}, {"a": 3.0, "b": 4.0}]) == {"a": 2.0, "b": 3.0}
+    with pytest.raises(ValueError, match="no frame"):
+        mean_scores([])
