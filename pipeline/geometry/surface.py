@@ -1,0 +1,241 @@
+"""Operations on closed surfaces: isosurface, repair, remeshing, conforming subdivision, Laplacian, transfer between meshes."""
+
+from __future__ import annotations
+
+import igl
+import numpy as np
+import pymeshlab
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+from scipy.sparse import coo_array, csr_array, diags_array
+from scipy.sparse.csgraph import connected_components
+from skimage.measure import marching_cubes
+
+from pipeline.geometry.mesh import Mesh
+
+REPAIR_ROUNDS = 4
+
+
+def solid_body(inside: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
+    """The largest 6-connected part of a grid, with the cavities that the outside cannot reach filled."""
+    labels, count = ndimage.label(inside)
+    if count == 0:
+        return inside
+    sizes = np.bincount(labels.ravel())[1:]
+    return ndimage.binary_fill_holes(labels == 1 + int(np.argmax(sizes)))
+
+
+def isosurface(
+    values: Float[np.ndarray, "x y z"], level: float, origin_m: Float[np.ndarray, "3"], spacing_m: float
+) -> Mesh:
+    """Marching cubes (Lewiner et al. 2003) of ``values >= level``, closed at the grid's border, outward counter-clockwise.
+
+    origin_m: position of the sample [0, 0, 0]. Raises ValueError when nothing reaches the level.
+    """
+    floor = min(float(values.min()), level) - 1.0
+    padded = np.pad(values, 1, constant_values=floor)
+    if not (padded >= level).any():
+        raise ValueError(f"no value of the grid reaches the level {level:g}; the largest is {float(values.max()):g}")
+    # a sample exactly on the level makes faces without area, which pinch the surface
+    padded = np.where(np.abs(padded - level) < 1e-6, level + 1e-6, padded)
+    vertices, faces, _, _ = marching_cubes(padded, level, gradient_direction="ascent", allow_degenerate=False)
+    vertices_m = (vertices - 1.0) * spacing_m + np.asarray(origin_m)
+    return Mesh(vertices_m.astype(np.float32), faces.astype(np.int32))
+
+
+def compact(mesh: Mesh) -> Mesh:
+    """The mesh without vertices that no face uses; order kept."""
+    used, flat = np.unique(mesh.faces, return_inverse=True)
+    return Mesh(mesh.vertices[used], flat.reshape(-1, 3).astype(mesh.faces.dtype))
+
+
+def largest_component(mesh: Mesh) -> Mesh:
+    """The edge-connected piece with the largest area."""
+    vertex_count = len(mesh.vertices)
+    ends = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]]])
+    graph = coo_array((np.ones(len(ends), dtype=bool), ends.T), shape=(vertex_count, vertex_count))
+    label = connected_components(graph, directed=False)[1][mesh.faces[:, 0]]
+    areas_m2 = np.bincount(label, mesh.face_areas_m2())
+    return compact(Mesh(mesh.vertices, mesh.faces[label == int(np.argmax(areas_m2))]))
+
+
+def split_fans(mesh: Mesh) -> Mesh:
+    """Gives every fan of faces around a vertex its own copy of the vertex: no vertex is left where two sheets only touch.
+
+    Edges must have at most two faces. A mesh whose vertices are manifold comes back unchanged.
+    """
+    count = len(mesh.faces)
+    corner = np.arange(3 * count).reshape(count, 3)
+    starts, ends = mesh.faces.ravel(), mesh.faces[:, [1, 2, 0]].ravel()
+    start_corner, end_corner = corner.ravel(), corner[:, [1, 2, 0]].ravel()
+    flipped = starts > ends
+    low_corner, high_corner = np.where(flipped, end_corner, start_corner), np.where(flipped, start_corner, end_corner)
+    key = np.minimum(starts, ends).astype(np.int64) * len(mesh.vertices) + np.maximum(starts, ends)
+    order = np.argsort(key, kind="stable")
+    twin = np.flatnonzero(key[order][1:] == key[order][:-1])
+    left, right = order[twin], order[twin + 1]
+    pairs = np.concatenate(
+        [np.stack([low_corner[left], low_corner[right]]), np.stack([high_corner[left], high_corner[right]])], axis=1
+    )
+    graph = coo_array((np.ones(pairs.shape[1], dtype=bool), pairs), shape=(3 * count, 3 * count))
+    fan = connected_components(graph, directed=False)[1]
+    _, first_corner, vertex_of_corner = np.unique(fan, return_index=True, return_inverse=True)
+    if len(first_corner) == len(np.unique(mesh.faces)):
+        return mesh
+    return Mesh(mesh.vertices[starts[first_corner]], vertex_of_corner.reshape(-1, 3).astype(mesh.faces.dtype))
+
+
+def is_closed_manifold(mesh: Mesh) -> bool:
+    """Watertight with one fan of faces around every vertex in use."""
+    return mesh.is_watertight() and split_fans(mesh) is mesh
+
+
+def repair(mesh: Mesh) -> Mesh:
+    """The largest piece of a mesh made watertight and manifold by removing bad faces and closing the holes.
+
+    Raises ValueError when that does not succeed within a few rounds; rebuild it with `isosurface` of its solid then.
+    """
+    for _ in range(REPAIR_ROUNDS):
+        mesh = largest_component(split_fans(_without_bad_faces(mesh)))
+        if is_closed_manifold(mesh):
+            return mesh
+        meshes = _meshset(mesh)
+        meshes.meshing_re_orient_faces_coherently()
+        meshes.meshing_close_holes(maxholesize=len(mesh.faces), selfintersection=False)
+        mesh = _from_meshset(meshes)
+    raise ValueError("the surface could not be closed: its holes border on each other")
+
+
+def _without_bad_faces(mesh: Mesh) -> Mesh:
+    """Without faces that repeat a vertex or another face, and without the faces at edges shared by more than two."""
+    faces = mesh.faces
+    ordered = np.sort(faces, axis=1)
+    distinct = (ordered[:, 0] != ordered[:, 1]) & (ordered[:, 1] != ordered[:, 2])
+    _, first = np.unique(ordered, axis=0, return_index=True)
+    single = np.zeros(len(faces), dtype=bool)
+    single[first] = True
+    faces = faces[distinct & single]
+    half_edges = np.sort(np.stack([faces, faces[:, [1, 2, 0]]], axis=2).reshape(-1, 2), axis=1)
+    _, edge, uses = np.unique(half_edges, axis=0, return_inverse=True, return_counts=True)
+    return Mesh(mesh.vertices, faces[(uses[edge.ravel()].reshape(-1, 3) <= 2).all(axis=1)])
+
+
+def remesh(
+    mesh: Mesh,
+    edge_m: float,
+    iterations: int = 5,
+    selected: Bool[np.ndarray, "f"] | None = None,
+    tolerance_m: float | None = None,
+) -> Mesh:
+    """Isotropic explicit remeshing (Hoppe et al. 1993 as in VCGlib): split, collapse, flip, smooth, project back, in turn.
+
+    edge_m: edge length to reach. selected: only these faces change; their border stays.
+    tolerance_m: no change may move the surface farther than this (a tenth of the edge when None), so thin parts keep short edges.
+    """
+    meshes = _meshset(mesh, selected)
+    meshes.meshing_isotropic_explicit_remeshing(
+        iterations=iterations,
+        selectedonly=selected is not None,
+        targetlen=pymeshlab.PureValue(edge_m),
+        checksurfdist=True,
+        maxsurfdist=pymeshlab.PureValue(0.1 * edge_m if tolerance_m is None else tolerance_m),
+    )
+    return repair(_from_meshset(meshes))
+
+
+def _meshset(mesh: Mesh, selected: Bool[np.ndarray, "f"] | None = None) -> pymeshlab.MeshSet:
+    meshes = pymeshlab.MeshSet()
+    quality = None if selected is None else selected.astype(np.float64)
+    extra = {} if quality is None else {"f_scalar_array": quality}
+    meshes.add_mesh(pymeshlab.Mesh(mesh.vertices.astype(np.float64), mesh.faces.astype(np.int32), **extra))
+    if quality is not None:
+        meshes.compute_selection_by_condition_per_face(condselect="fq > 0.5")
+    return meshes
+
+
+def _from_meshset(meshes: pymeshlab.MeshSet) -> Mesh:
+    current = meshes.current_mesh()
+    return Mesh(current.vertex_matrix().astype(np.float32), current.face_matrix().astype(np.int32))
+
+
+def subdivide(mesh: Mesh, marked: Bool[np.ndarray, "f"]) -> tuple[Mesh, Int[np.ndarray, "n 2"]]:
+    """Midpoint subdivision of the marked faces; their neighbours are cut so that no vertex hangs on an edge.
+
+    A face with all edges split becomes 4 faces, with two 3, with one 2. Watertight and manifold meshes stay so.
+
+    Returns the finer mesh, whose vertices are the old ones followed by one a split edge, and the two ends of each split edge:
+    any vertex attribute is carried over as ``np.concatenate([a, (a[ends[:, 0]] + a[ends[:, 1]]) / 2])``.
+    """
+    faces = mesh.faces.astype(np.int64)
+    half_edges = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2), axis=2)
+    ends, edge = np.unique(half_edges.reshape(-1, 2), axis=0, return_inverse=True)
+    edge = edge.reshape(-1, 3)
+    split = np.zeros(len(ends), dtype=bool)
+    split[edge[marked]] = True
+    midpoint = np.where(split, len(mesh.vertices) + np.cumsum(split) - 1, -1)
+    new_faces = _split_faces(faces, midpoint[edge])
+    vertices = np.concatenate([mesh.vertices, mesh.vertices[ends[split]].mean(axis=1)]).astype(mesh.vertices.dtype)
+    return Mesh(vertices, new_faces.astype(mesh.faces.dtype)), ends[split]
+
+
+def _split_faces(faces: Int[np.ndarray, "f 3"], middle: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "g 3"]:
+    """Faces cut at the midpoints of their edges k = (corner k, corner k + 1); -1 marks an edge that is not split."""
+    count = (middle >= 0).sum(axis=1)
+    # turn each face so that its split edges come first: the one, or the two around the edge that stays last
+    turn = np.where(count == 1, np.argmax(middle >= 0, axis=1), np.where(count == 2, np.argmin(middle, axis=1) + 1, 0))
+    columns = (np.arange(3) + turn[:, None]) % 3
+    corner, middle = np.take_along_axis(faces, columns, axis=1), np.take_along_axis(middle, columns, axis=1)
+    (a, b, c), (ab, bc, ca) = corner.T, middle.T
+    one, two, three = count == 1, count == 2, count == 3
+    parts = [faces[count == 0]]
+    parts += [np.stack(t, axis=1)[one] for t in ((a, ab, c), (ab, b, c))]
+    parts += [np.stack(t, axis=1)[two] for t in ((ab, b, bc), (a, ab, bc), (a, bc, c))]
+    parts += [np.stack(t, axis=1)[three] for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+    return np.concatenate(parts)
+
+
+def laplacian(mesh: Mesh) -> csr_array:
+    """Uniform Laplacian I - D^-1 A, (v, v) float64: applied to positions, each vertex minus the mean of its neighbours."""
+    ends = mesh.edges()
+    count = len(mesh.vertices)
+    both = np.concatenate([ends, ends[:, ::-1]])
+    adjacency = coo_array((np.ones(len(both)), both.T), shape=(count, count)).tocsr()
+    degree = np.maximum(adjacency.sum(axis=1), 1.0)
+    return csr_array(diags_array(np.ones(count)) - diags_array(1.0 / degree) @ adjacency)
+
+
+def closest_on_mesh(
+    points: Float[np.ndarray, "n 3"], mesh: Mesh
+) -> tuple[Float[np.ndarray, "n"], Int[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
+    """Distance (m) of each point to the mesh, the face that is nearest, and the barycentrics of the nearest place on it."""
+    vertices, faces = mesh.vertices.astype(np.float64), mesh.faces.astype(np.int64)
+    squared, face, nearest = igl.point_mesh_squared_distance(np.ascontiguousarray(points, dtype=np.float64), vertices, faces)
+    a, b, c = (vertices[faces[face, k]] for k in range(3))
+    barycentric = np.clip(_barycentric(nearest, a, b, c), 0.0, 1.0)
+    return np.sqrt(np.maximum(squared, 0.0)), face, barycentric / barycentric.sum(axis=1, keepdims=True)
+
+
+def _barycentric(p: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> Float[np.ndarray, "n 3"]:
+    """Barycentrics of points in the planes of triangles; all weight on a corner where the triangle has no area."""
+    normal = np.cross(b - a, c - a)
+    squared = np.maximum(np.sum(normal**2, axis=1), 1e-30)
+    second = np.sum(np.cross(p - a, c - a) * normal, axis=1) / squared
+    third = np.sum(np.cross(b - a, p - a) * normal, axis=1) / squared
+    return np.stack([1.0 - second - third, second, third], axis=1)
+
+
+def transfer(
+    points: Float[np.ndarray, "n 3"], mesh: Mesh, attributes: Float[np.ndarray, "v c"]
+) -> Float[np.ndarray, "n c"]:
+    """Vertex attributes of a mesh at the place on it nearest to each point."""
+    _, face, barycentric = closest_on_mesh(points, mesh)
+    return np.einsum("nk,nkc->nc", barycentric, attributes[mesh.faces[face]]).astype(attributes.dtype)
+
+
+def signed_distance_m(points: Float[np.ndarray, "n 3"], mesh: Mesh) -> Float[np.ndarray, "n"]:
+    """Distance (m) to a closed mesh, negative inside (generalised winding number above one half; Barill et al. 2018)."""
+    query = np.ascontiguousarray(points, dtype=np.float64)
+    vertices, faces = mesh.vertices.astype(np.float64), mesh.faces.astype(np.int64)
+    squared, _, _ = igl.point_mesh_squared_distance(query, vertices, faces)
+    inside = igl.fast_winding_number(vertices, faces, query) > 0.5
+    return np.where(inside, -1.0, 1.0) * np.sqrt(np.maximum(squared, 0.0))
