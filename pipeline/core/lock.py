@@ -1,0 +1,78 @@
+"""One writer per run folder: an exclusive `flock`, which the kernel drops when its holder dies, however it dies."""
+
+import ctypes
+import fcntl
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from pipeline.core.errors import UserError
+
+LOCK_FD_VARIABLE = "AVATAR_RUN_LOCK_FD"
+PARENT_VARIABLE = "AVATAR_RUN_PARENT"
+# A stage process whose runner was killed needs this long at most to notice and let go.
+PATIENCE_S = 10.0
+
+
+@contextmanager
+def run_lock(run_dir: Path, patience_s: float = PATIENCE_S) -> Iterator[int]:
+    """Hold the run's lock; yield its file descriptor, which a child process may inherit.
+
+    Inside a child of the runner the inherited lock is used. UserError when another process holds it.
+    """
+    path = run_dir / ".lock"
+    inherited = os.environ.get(LOCK_FD_VARIABLE)
+    if inherited and _is_same_file(int(inherited), path):
+        yield int(inherited)
+        return
+    with path.open("a+") as file:
+        _acquire(file.fileno(), path, patience_s)
+        file.truncate(0)
+        file.write(f"{os.getpid()}\n")
+        file.flush()
+        yield file.fileno()
+
+
+def child_environment(lock_fd: int) -> dict[str, str]:
+    """Environment for a stage process that works under this process's lock."""
+    return {**os.environ, LOCK_FD_VARIABLE: str(lock_fd), PARENT_VARIABLE: str(os.getpid())}
+
+
+def is_runner_child() -> bool:
+    """True in a stage process that the runner started."""
+    return PARENT_VARIABLE in os.environ
+
+
+def die_with_parent() -> None:
+    """In a stage process of the runner: end when the runner ends, even when it is killed (Linux; elsewhere no-op)."""
+    parent = os.environ.get(PARENT_VARIABLE)
+    if not parent or sys.platform != "linux":
+        return
+    pr_set_pdeathsig = 1
+    ctypes.CDLL(None).prctl(pr_set_pdeathsig, signal.SIGKILL)
+    if os.getppid() != int(parent):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _acquire(descriptor: int, path: Path, patience_s: float) -> None:
+    deadline = time.monotonic() + patience_s
+    while True:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return
+        except BlockingIOError:
+            if time.monotonic() > deadline:
+                holder = path.read_text().strip() or "unknown"
+                raise UserError(f"{path.parent} is in use by process {holder}: wait for it, or stop it") from None
+            time.sleep(0.1)
+
+
+def _is_same_file(descriptor: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(descriptor), path.stat())
+    except OSError:
+        return False

@@ -1,0 +1,221 @@
+"""A stage: a named function from input folders to an output folder, and the machinery that runs one whole or not at all.
+
+Work happens in `<stage>.part/`. What a killed run leaves there survives only as `checkpoint*` files, and only for a run
+with the same fingerprint; everything else is written anew. A finished folder gets its manifest, is flushed to disk,
+and appears under its name with one rename.
+"""
+
+import math
+import os
+import shutil
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.core.atomic import atomic_path, flush
+from pipeline.core.config import Config
+from pipeline.core.errors import UserError
+from pipeline.core.manifest import (
+    MANIFEST,
+    Manifest,
+    digest_files,
+    digest_source,
+    fingerprint,
+    read_manifest,
+    write_manifest,
+)
+from pipeline.core.measure import environment, peak_rss_mib
+from pipeline.core.progress import take_warnings
+
+VIDEO = "video"
+FINGERPRINT = ".fingerprint"
+CHECKPOINT_PREFIX = "checkpoint"
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One arrow of the pipeline.
+
+    name: the module, the config section, the folder and the command.
+    version: raised when the meaning of the outputs changes.
+    needs: names of the stages it reads, or "video" for the user's file or folder.
+    makes: files and folders that must exist, not empty, when it has run; it makes nothing else.
+    run: `run(inputs, out, config) -> metrics`; `inputs` maps each need to its path, `out` is the folder to fill.
+    """
+
+    name: str
+    version: int
+    needs: tuple[str, ...]
+    makes: tuple[str, ...]
+    config: type[Config]
+    run: Callable[[Mapping[str, Path], Path, Any], Mapping[str, float]]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What one stage would do in one run folder: its inputs, its fingerprint, and whether the result is there."""
+
+    stage: Stage
+    config: Config
+    run_dir: Path
+    inputs: Mapping[str, Path]
+    input_digests: Mapping[str, str]
+    fingerprint: str
+
+    @property
+    def folder(self) -> Path:
+        """Where the finished artifacts lie."""
+        return self.run_dir / self.stage.name
+
+    @property
+    def part(self) -> Path:
+        """Where the work happens."""
+        return self.run_dir / f"{self.stage.name}.part"
+
+    def is_fresh(self) -> bool:
+        """True when the folder holds the result of just this fingerprint, with every file in its place."""
+        manifest = read_manifest(self.folder)
+        return (
+            manifest is not None
+            and manifest.fingerprint == self.fingerprint
+            and all((self.folder / name).is_file() for name in manifest.outputs)
+        )
+
+
+def plan_stage(stage: Stage, config: Config, run_dir: Path, video: Path | None) -> Plan:
+    """Find a stage's inputs and fingerprint; raise UserError naming the command when an input is missing."""
+    inputs, digests = {}, {}
+    for need in stage.needs:
+        if need == VIDEO:
+            if video is None:
+                raise UserError(f"{run_dir} has no video yet: python -m stages --run {run_dir} --video FILE_OR_FOLDER")
+            inputs[need], digests[need] = video, digest_source(video)
+            continue
+        manifest = read_manifest(run_dir / need)
+        if manifest is None:
+            raise UserError(f"{stage.name} needs {run_dir / need}, which is missing: python -m stages.{need} {run_dir}")
+        inputs[need], digests[need] = run_dir / need, manifest.outputs_digest
+    key = fingerprint(stage.name, stage.version, config.model_dump(mode="json"), digests)
+    return Plan(stage, config, run_dir, inputs, digests, key)
+
+
+def run_stage(plan: Plan, force: bool = False) -> bool:
+    """Bring one stage up to date; return True when it ran and False when the result was there already.
+
+    Bad input, a full disk or too little memory removes the unfinished folder; a kill or Ctrl-C leaves its checkpoints,
+    and the next call goes on from them.
+    """
+    previous = plan.run_dir / f"{plan.stage.name}.old"
+    _remove(previous)
+    if plan.is_fresh() and not force:
+        discard_part(plan)
+        return False
+    try:
+        _work(plan, force)
+        _publish(plan, previous)
+    except (UserError, OSError, MemoryError):
+        discard_part(plan)
+        raise
+    return True
+
+
+def discard_part(plan: Plan) -> None:
+    """Remove unfinished work, if there is any."""
+    _remove(plan.part)
+
+
+def _work(plan: Plan, force: bool) -> None:
+    """Fill the .part folder and write its manifest, unless a run killed just before the rename did so."""
+    if not force and _manifest_fingerprint(plan.part) == plan.fingerprint:
+        return
+    resumed = _prepare_part(plan, force)
+    take_warnings()
+    start = time.monotonic()
+    metrics = plan.stage.run(plan.inputs, plan.part, plan.config)
+    seconds = time.monotonic() - start
+    _check_makes(plan)
+    manifest = Manifest(
+        stage=plan.stage.name,
+        version=plan.stage.version,
+        fingerprint=plan.fingerprint,
+        config=plan.config.model_dump(mode="json"),
+        inputs=dict(plan.input_digests),
+        outputs={name: digest for name, digest in digest_files(plan.part).items() if not _is_working_file(name)},
+        metrics={name: float(value) if math.isfinite(value) else None for name, value in metrics.items()},
+        seconds=round(seconds, 3),
+        peak_rss_mib=round(peak_rss_mib(), 1),
+        resumed=resumed,
+        warnings=take_warnings(),
+        environment=environment(),
+    )
+    _flush_tree(plan.part)
+    with atomic_path(plan.part / MANIFEST) as path:
+        write_manifest(manifest, path)
+
+
+def _prepare_part(plan: Plan, force: bool) -> bool:
+    """Make the .part folder ready; return True when checkpoints of a run with this fingerprint are kept in it."""
+    mark = plan.part / FINGERPRINT
+    same = not force and mark.is_file() and mark.read_text() == plan.fingerprint
+    if not same:
+        _remove(plan.part)
+        plan.part.mkdir(parents=True)
+        mark.write_text(plan.fingerprint)
+    kept = False
+    for path in plan.part.iterdir():
+        if path.name.startswith(CHECKPOINT_PREFIX):
+            kept = True
+        elif path != mark:
+            _remove(path)
+    return kept
+
+
+def _check_makes(plan: Plan) -> None:
+    """A stage makes just what it declares; anything else is a fault of its code."""
+    name, made = plan.stage.name, set()
+    for declared in plan.stage.makes:
+        path = plan.part / declared
+        if not (any(path.iterdir()) if path.is_dir() else path.is_file() and path.stat().st_size > 0):
+            raise RuntimeError(f"stage {name} did not make {declared}")
+        made.add(Path(declared).parts[0])
+    strays = [path.name for path in plan.part.iterdir() if path.name not in made and not _is_working_file(path.name)]
+    if strays:
+        raise RuntimeError(f"stage {name} made {', '.join(sorted(strays))}, which its `makes` does not declare")
+
+
+def _publish(plan: Plan, previous: Path) -> None:
+    """Drop the working files and give the finished folder its name; the result it replaces goes last."""
+    for path in list(plan.part.iterdir()):
+        if _is_working_file(path.name):
+            _remove(path)
+    if plan.folder.exists():
+        plan.folder.rename(previous)
+    plan.part.rename(plan.folder)
+    flush(plan.run_dir)
+    _remove(previous)
+
+
+def _is_working_file(name: str) -> bool:
+    return name == FINGERPRINT or name.startswith(CHECKPOINT_PREFIX)
+
+
+def _manifest_fingerprint(folder: Path) -> str | None:
+    manifest = read_manifest(folder)
+    return manifest.fingerprint if manifest else None
+
+
+def _remove(path: Path) -> None:
+    """Delete a file or a whole folder, if it is there."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _flush_tree(folder: Path) -> None:
+    for directory, _, names in os.walk(folder):
+        for name in names:
+            flush(Path(directory, name))
+        flush(Path(directory))
