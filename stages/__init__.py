@@ -1,4 +1,4 @@
-"""The pipeline, in order: each stage is the module `stages.<name>`, the folder `runs/<run>/<name>/`, the config section."""
+"""The pipeline, in order: a name is the module `stages.<name>`, the folder `runs/<run>/<name>/`, the config section."""
 
 from importlib import import_module
 

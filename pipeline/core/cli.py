@@ -17,6 +17,8 @@ from pipeline.core.stage import Stage, plan_stage, run_stage
 
 USER_ERROR = 2
 
+LoadStage = Callable[[str], Stage]
+
 
 def main(stage: Stage, argv: Sequence[str] | None = None, config_dir: Path = CONFIG_DIR) -> int:
     """Run one stage on one run folder; return the exit status."""
@@ -25,16 +27,14 @@ def main(stage: Stage, argv: Sequence[str] | None = None, config_dir: Path = CON
 
 
 def main_all(
-    names: Sequence[str], load: Callable[[str], Stage], argv: Sequence[str] | None = None, config_dir: Path = CONFIG_DIR
+    names: Sequence[str], load: LoadStage, argv: Sequence[str] | None = None, config_dir: Path = CONFIG_DIR
 ) -> int:
     """Run, or report on, all stages of one run folder; return the exit status."""
     return _guarded(lambda: _run_every(names, load, argv, config_dir))
 
 
 def _run_one(stage: Stage, argv: Sequence[str] | None, config_dir: Path) -> None:
-    parser = _Parser(
-        prog=f"python -m stages.{stage.name}", description=f"Run the stage {stage.name} of one run folder."
-    )
+    parser = _Parser(prog=f"python -m stages.{stage.name}", description=f"Run the stage {stage.name} alone.")
     parser.add_argument("run", type=Path, help="the run folder, runs/NAME")
     _add_record_options(parser)
     parser.add_argument("--force", action="store_true", help="run even when the result is there already")
@@ -51,9 +51,7 @@ def _run_one(stage: Stage, argv: Sequence[str] | None, config_dir: Path) -> None
         print(f"{plan.folder}: {'done' if ran else 'cached'}")
 
 
-def _run_every(
-    names: Sequence[str], load: Callable[[str], Stage], argv: Sequence[str] | None, config_dir: Path
-) -> None:
+def _run_every(names: Sequence[str], load: LoadStage, argv: Sequence[str] | None, config_dir: Path) -> None:
     options = _parse_all(names, argv)
     stages = [load(name) for name in names]
     if options.defaults:
@@ -78,9 +76,7 @@ def _parse_all(names: Sequence[str], argv: Sequence[str] | None) -> argparse.Nam
     parser = _Parser(prog="python -m stages", description=f"Run the whole pipeline: {', '.join(names)}.")
     parser.add_argument("--run", type=Path, help="the run folder (default: runs/NAME after the video)")
     _add_record_options(parser)
-    parser.add_argument(
-        "--from", dest="from_stage", choices=names, metavar="STAGE", help="run STAGE and all after it anew"
-    )
+    parser.add_argument("--from", dest="from_stage", choices=names, metavar="STAGE", help="run STAGE and what follows")
     parser.add_argument("--force", action="store_true", help="run every stage anew")
     parser.add_argument("--verify", action="store_true", help="digest every artifact again and name what is damaged")
     parser.add_argument("--status", action="store_true", help="show what is fresh, stale, unfinished or missing")
@@ -91,9 +87,7 @@ def _parse_all(names: Sequence[str], argv: Sequence[str] | None) -> argparse.Nam
 def _add_record_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--video", type=Path, help="video file or image folder; remembered in the run folder")
     parser.add_argument("--preset", help="a name in configs/ or a .yaml file; remembered, drops earlier --set")
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="one option; remembered"
-    )
+    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="an option; remembered")
 
 
 def default_run_dir(video: Path | None) -> Path:
@@ -136,7 +130,7 @@ def _open_run(run_dir: Path, options: argparse.Namespace, replace_video: bool) -
 
 
 def _guarded(work: Callable[[], None]) -> int:
-    """Run `work`; turn what the user can mend into one sentence and an exit status. A fault of the program stays loud."""
+    """Run `work`; turn what the user can mend into one sentence and an exit status. Faults of the program stay loud."""
     try:
         work()
     except UserError as error:

@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sized
 from typing import TypeVar
 
 from tqdm import tqdm
@@ -23,7 +23,7 @@ def track(iterable: Iterable[Item], label: str, total: int | None = None, initia
 
     A terminal sees a bar; a log file sees a line every ten seconds.
     """
-    if total is None and hasattr(iterable, "__len__"):
+    if total is None and isinstance(iterable, Sized):
         total = initial + len(iterable)
     if sys.stderr.isatty():
         yield from tqdm(iterable, desc=label, total=total, initial=initial, leave=False, dynamic_ncols=True)

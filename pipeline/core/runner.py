@@ -1,8 +1,7 @@
-"""Run all stages in order, each in a process of its own: memory is measured per stage, and a crash stays in one stage."""
+"""Run all stages in order, each in a process of its own: memory is measured per stage, a crash stays in one."""
 
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

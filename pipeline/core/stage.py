@@ -1,4 +1,4 @@
-"""A stage: a named function from input folders to an output folder, and the machinery that runs one whole or not at all.
+"""A stage: a named function from input folders to an output folder, run whole or not at all.
 
 Work happens in `<stage>.part/`. What a killed run leaves there survives only as `checkpoint*` files, and only for a run
 with the same fingerprint; everything else is written anew. A finished folder gets its manifest, is flushed to disk,
