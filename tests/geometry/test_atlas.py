@@ -1,0 +1,122 @@
+"""Atlases: unfolded faces cover the texture once with a gutter between charts, and gaps are filled without inventing colours."""
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
+
+from pipeline.geometry.atlas import Atlas, fill_gaps, rasterize_texels, texture_size_px, unwrap
+from pipeline.geometry.mesh import Mesh
+
+SIZE_PX, PADDING_PX = 256, 4
+
+
+@pytest.fixture(scope="module")
+def ball() -> Mesh:
+    sphere = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
+    return Mesh(sphere.vertices.astype(np.float32), sphere.faces.astype(np.int32))
+
+
+@pytest.fixture(scope="module")
+def halves(ball: Mesh) -> np.ndarray:
+    return (ball.vertices[ball.faces].mean(axis=1)[:, 0] > 0).astype(np.int32)
+
+
+@pytest.fixture(scope="module")
+def atlas(ball: Mesh, halves: np.ndarray) -> Atlas:
+    return unwrap(ball, halves, SIZE_PX, PADDING_PX)
+
+
+def connected_charts(faces_uv: np.ndarray) -> np.ndarray:
+    """Chart label of every face, by repeated merging of the faces that share a uv corner."""
+    label = np.arange(faces_uv.max() + 1)
+    while True:
+        lowest = label[faces_uv].min(axis=1)
+        merged = label.copy()
+        np.minimum.at(merged, faces_uv.ravel(), np.repeat(lowest, 3))
+        if np.array_equal(merged, label):
+            return label[faces_uv[:, 0]]
+        label = merged
+
+
+def test_unwrap_keeps_every_corner_on_its_vertex(ball: Mesh, atlas: Atlas) -> None:
+    np.testing.assert_array_equal(atlas.vertex_of_uv[atlas.faces_uv], ball.faces)
+    assert atlas.uv.min() >= 0.0 and atlas.uv.max() <= 1.0
+
+
+def test_unwrap_gives_the_same_bytes_again(ball: Mesh, halves: np.ndarray, atlas: Atlas) -> None:
+    again = unwrap(ball, halves, SIZE_PX, PADDING_PX)
+    assert again.uv.tobytes() == atlas.uv.tobytes() and again.faces_uv.tobytes() == atlas.faces_uv.tobytes()
+
+
+def test_no_chart_holds_faces_of_two_parts(halves: np.ndarray, atlas: Atlas) -> None:
+    charts = connected_charts(atlas.faces_uv)
+    assert all(len(np.unique(halves[charts == chart])) == 1 for chart in np.unique(charts))
+
+
+def test_charts_keep_their_gutter(atlas: Atlas) -> None:
+    charts, texels = connected_charts(atlas.faces_uv), rasterize_texels(atlas, SIZE_PX)
+    places = np.stack([texels.rows, texels.columns], axis=1)
+    chart_of_texel = charts[texels.face]
+    for chart in np.unique(charts):
+        inside, outside = places[chart_of_texel == chart], places[chart_of_texel != chart]
+        apart, _ = cKDTree(outside).query(inside, p=np.inf)
+        assert apart.min() > PADDING_PX - 1
+
+
+def test_texels_show_the_point_that_their_uv_names(ball: Mesh, atlas: Atlas) -> None:
+    texels = rasterize_texels(atlas, SIZE_PX)
+    np.testing.assert_allclose(texels.barycentric.sum(axis=1), 1.0, atol=1e-5)
+    uv = texels.interpolate(atlas.faces_uv, atlas.uv)
+    np.testing.assert_allclose(uv[:, 0] * SIZE_PX, texels.columns + 0.5, atol=2e-2)
+    np.testing.assert_allclose((1.0 - uv[:, 1]) * SIZE_PX, texels.rows + 0.5, atol=2e-2)
+    radius = np.linalg.norm(texels.interpolate(ball.faces, ball.vertices), axis=1)
+    assert np.all((radius > 0.48) & (radius < 0.501))
+
+
+def test_texels_cover_the_surface_evenly(ball: Mesh, atlas: Atlas) -> None:
+    texels = rasterize_texels(atlas, SIZE_PX)
+    per_area = np.bincount(texels.face, minlength=len(ball.faces)).sum() / ball.face_areas_m2().sum()
+    assert len(np.unique(texels.face)) == len(ball.faces)
+    upper = ball.vertices[ball.faces].mean(axis=1)[:, 1] > 0
+    upper_per_area = np.isin(texels.face, np.flatnonzero(upper)).sum() / ball.face_areas_m2()[upper].sum()
+    assert upper_per_area == pytest.approx(per_area, rel=0.1)
+
+
+def test_image_puts_values_where_covered_says(atlas: Atlas) -> None:
+    texels = rasterize_texels(atlas, SIZE_PX)
+    image = texels.image(np.ones((len(texels.face), 1), dtype=np.float32))
+    np.testing.assert_array_equal(image[..., 0] > 0, texels.covered())
+
+
+@pytest.mark.parametrize(("footprint_m", "expected"), [(0.0035, 512), (0.0021, 1024), (1e-5, 2048), (1.0, 256)])
+def test_texture_size_follows_the_capture(footprint_m: float, expected: int) -> None:
+    size = texture_size_px(1.8, footprint_m, smallest=256, largest=2048)
+    assert size == expected
+    if 256 < size < 2048:
+        texel_m = np.sqrt(1.8 / 0.65) / size
+        assert 0.5 * footprint_m < texel_m <= footprint_m
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**31), st.integers(3, 40), st.integers(3, 40))
+def test_filling_keeps_the_known_and_stays_between_its_extremes(seed: int, height: int, width: int) -> None:
+    random = np.random.default_rng(seed)
+    image = random.uniform(0.2, 0.8, (height, width, 3)).astype(np.float32)
+    known = random.uniform(size=(height, width)) < 0.2
+    known[random.integers(height), random.integers(width)] = True
+    filled = fill_gaps(np.where(known[..., None], image, 7.0).astype(np.float32), known)
+    np.testing.assert_array_equal(filled[known], image[known])
+    assert np.all(filled >= image[known].min(axis=0) - 1e-4) and np.all(filled <= image[known].max(axis=0) + 1e-4)
+
+
+def test_filling_next_to_a_chart_takes_that_chart_s_colour() -> None:
+    image, known = np.zeros((64, 64, 3), dtype=np.float32), np.zeros((64, 64), dtype=bool)
+    image[:, :20], image[:, 40:] = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
+    known[:, :20] = known[:, 40:] = True
+    filled = fill_gaps(image, known, copied_px=2)
+    np.testing.assert_allclose(filled[:, 20:22], np.broadcast_to([1.0, 0.0, 0.0], (64, 2, 3)), atol=1e-6)
+    np.testing.assert_allclose(filled[:, 38:40], np.broadcast_to([0.0, 0.0, 1.0], (64, 2, 3)), atol=1e-6)
+    assert 0.2 < filled[32, 30, 0] < 0.8
