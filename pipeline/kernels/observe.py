@@ -24,8 +24,9 @@ def observe_texels(
 ) -> tuple[Float[Tensor, "t c"], Float[Tensor, "t 2"]]:
     """Bilinear look-ups of a picture at the places where it shows the texels' surface points.
 
-    A texel is visible when nothing in the 2 x 2 pixels that it is read from lies in front of it by more than the tolerance (Shetty et al.,
-    "Holoported Characters", 2024, supplement B, equation 4, one-sided, and over the whole footprint so that no occluder bleeds in).
+    A texel is visible when nothing in the 2 x 2 pixels that it is read from lies in front of it by more than the
+    tolerance (Shetty et al., "Holoported Characters", 2024, supplement B, equation 4, one-sided, and over the whole
+    footprint so that no occluder bleeds in).
 
     Args:
         vertices_px, depth_m: of the posed vertices, as `rasterize` takes them.

@@ -1,6 +1,7 @@
 """What one picture says about every texel, on the CPU: a texel is one thread's, so nothing depends on thread timing.
 
-Letters: b are barycentrics, z depth; a point of a face lies at pixel sum(b_k z_k p_k) / sum(b_k z_k) of its corners' pixels p_k.
+Letters: b are barycentrics, z depth; a point of a face lies at pixel sum(b_k z_k p_k) / sum(b_k z_k), where p_k are
+its corners' pixels.
 """
 
 import numpy as np

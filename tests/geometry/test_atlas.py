@@ -1,4 +1,4 @@
-"""Atlases: unfolded faces cover the texture once with a gutter between charts, and gaps are filled without inventing colours."""
+"""Atlases: unfolded faces cover the texture once, with a gutter; gaps are filled without inventing colours."""
 
 import numpy as np
 import pytest
@@ -43,12 +43,14 @@ def connected_charts(faces_uv: np.ndarray) -> np.ndarray:
 
 def test_unwrap_keeps_every_corner_on_its_vertex(ball: Mesh, atlas: Atlas) -> None:
     np.testing.assert_array_equal(atlas.vertex_of_uv[atlas.faces_uv], ball.faces)
-    assert atlas.uv.min() >= 0.0 and atlas.uv.max() <= 1.0
+    assert atlas.uv.min() >= 0.0
+    assert atlas.uv.max() <= 1.0
 
 
 def test_unwrap_gives_the_same_bytes_again(ball: Mesh, halves: np.ndarray, atlas: Atlas) -> None:
     again = unwrap(ball, halves, SIZE_PX, PADDING_PX)
-    assert again.uv.tobytes() == atlas.uv.tobytes() and again.faces_uv.tobytes() == atlas.faces_uv.tobytes()
+    assert again.uv.tobytes() == atlas.uv.tobytes()
+    assert again.faces_uv.tobytes() == atlas.faces_uv.tobytes()
 
 
 def test_no_chart_holds_faces_of_two_parts(halves: np.ndarray, atlas: Atlas) -> None:
@@ -109,7 +111,8 @@ def test_filling_keeps_the_known_and_stays_between_its_extremes(seed: int, heigh
     known[random.integers(height), random.integers(width)] = True
     filled = fill_gaps(np.where(known[..., None], image, 7.0).astype(np.float32), known)
     np.testing.assert_array_equal(filled[known], image[known])
-    assert np.all(filled >= image[known].min(axis=0) - 1e-4) and np.all(filled <= image[known].max(axis=0) + 1e-4)
+    assert np.all(filled >= image[known].min(axis=0) - 1e-4)
+    assert np.all(filled <= image[known].max(axis=0) + 1e-4)
 
 
 def test_filling_next_to_a_chart_takes_that_chart_s_colour() -> None:
