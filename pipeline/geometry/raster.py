@@ -1,5 +1,7 @@
 """A differentiable picture of a mesh: attributes interpolated with perspective-correct barycentrics, silhouettes antialiased."""
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -25,23 +27,47 @@ def face_adjacency(faces: Int[Tensor, "f 3"]) -> Int[Tensor, "f 3"]:
     return neighbour.view(-1, 3)
 
 
-def interpolate(
+def interpolate_covered(
     face_id: Int[Tensor, "h w"],
     vertices_px: Float[Tensor, "v 2"],
     depth_m: Float[Tensor, "v"],
     faces: Int[Tensor, "f 3"],
     attributes: Float[Tensor, "v c"],
-) -> Float[Tensor, "h w c"]:
-    """Attributes at every pixel centre, 0 where no face is seen. Differentiable in positions, depth and attributes."""
-    height, width = face_id.shape
+) -> tuple[Int[Tensor, "n"], Float[Tensor, "n c"]]:
+    """Row-major numbers of the pixels where a face is seen, and the attributes there. Differentiable in positions, depth, attributes."""
+    width = face_id.shape[1]
     covered = torch.nonzero(face_id.reshape(-1) >= 0).squeeze(1)
     corner = faces.long()[face_id.reshape(-1)[covered].long()]
-    q = weighted_inverse_depth(
-        vertices_px[corner], depth_m[corner], pixel_centres_px(covered, width, vertices_px.dtype)
-    )
-    values = ((q / q.sum(1, keepdim=True))[..., None] * attributes[corner]).sum(1)
-    image = torch.zeros(height * width, attributes.shape[1], dtype=values.dtype, device=values.device)
-    return image.index_copy(0, covered, values).view(height, width, -1)
+    q = weighted_inverse_depth(vertices_px[corner], depth_m[corner], pixel_centres_px(covered, width, vertices_px.dtype))
+    return covered, ((q / q.sum(1, keepdim=True))[..., None] * attributes[corner]).sum(1)
+
+
+def render_shaded(
+    vertices_world: Float[Tensor, "v 3"],
+    faces: Int[Tensor, "f 3"],
+    camera: Camera,
+    attributes: Float[Tensor, "v c"],
+    shade: Callable[[Float[Tensor, "n c"]], Float[Tensor, "n d"]],
+    adjacency: Int[Tensor, "f 3"] | None = None,
+) -> tuple[Float[Tensor, "h w d"], Float[Tensor, "h w"], Int[Tensor, "h w"]]:
+    """(image premultiplied by alpha, alpha in [0, 1], face ids) of a mesh in metres; on white: ``image + 1 - alpha``.
+
+    shade: called once with the interpolated attributes of all covered pixels, returns what is seen there (deferred shading).
+    adjacency: ``face_adjacency(faces)``, to be passed in when the same mesh is rendered many times.
+
+    Differentiable in ``vertices_world`` (inside faces through interpolation, at silhouettes through antialiasing), in ``attributes``
+    and in whatever ``shade`` depends on.
+    """
+    vertices_px, depth_m = project(vertices_world, camera)
+    face_id, _, depth = rasterize(vertices_px, depth_m, faces, camera.height, camera.width)
+    adjacency = face_adjacency(faces) if adjacency is None else adjacency
+    covered, values = interpolate_covered(face_id, vertices_px, depth_m, faces, attributes)
+    shaded = shade(values)
+    with_alpha = torch.cat([shaded, torch.ones_like(shaded[:, :1])], dim=1)
+    flat = torch.zeros(face_id.numel(), with_alpha.shape[1], dtype=with_alpha.dtype, device=with_alpha.device)
+    image = flat.index_copy(0, covered, with_alpha).view(*face_id.shape, -1)
+    image = antialias(image, face_id, depth, vertices_px, depth_m, faces, adjacency)
+    return image[..., :-1], image[..., -1], face_id
 
 
 def render_mesh(
@@ -51,15 +77,6 @@ def render_mesh(
     attributes: Float[Tensor, "v c"],
     adjacency: Int[Tensor, "f 3"] | None = None,
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
-    """(attribute image premultiplied by alpha, alpha in [0, 1]) of a mesh in metres; composite on white with ``image + 1 - alpha``.
-
-    Differentiable in ``vertices_world`` (inside faces through interpolation, at silhouettes through antialiasing) and in ``attributes``.
-    adjacency: ``face_adjacency(faces)``, to be passed in when the same mesh is rendered many times.
-    """
-    vertices_px, depth_m = project(vertices_world, camera)
-    face_id, _, depth = rasterize(vertices_px, depth_m, faces, camera.height, camera.width)
-    adjacency = face_adjacency(faces) if adjacency is None else adjacency
-    with_alpha = torch.cat([attributes, torch.ones_like(attributes[:, :1])], dim=1)
-    image = interpolate(face_id, vertices_px, depth_m, faces, with_alpha)
-    image = antialias(image, face_id, depth, vertices_px, depth_m, faces, adjacency)
-    return image[..., :-1], image[..., -1]
+    """``render_shaded`` that shows the interpolated attributes themselves: (attribute image premultiplied by alpha, alpha)."""
+    image, alpha, _ = render_shaded(vertices_world, faces, camera, attributes, lambda values: values, adjacency)
+    return image, alpha
