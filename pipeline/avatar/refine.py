@@ -1,0 +1,294 @@
+"""Vertex positions and triangle density of the canonical mesh, refined against the video through the differentiable rasteriser.
+
+Letters: x0 the round's start positions, D per-vertex offsets, G one global offset (the paper's delta v_i and delta V); x = x0 + D + G.
+D is not optimised itself but u = (I + lambda L) D with the graph Laplacian L, so every step moves a neighbourhood and no vertex alone
+(Nicolet et al., "Large steps in inverse rendering of geometry", 2021). Rounds after the first begin with new triangles: faces whose
+accumulated image error is above an upper percentile are split at midpoints, those below a lower one decimated and remeshed (IHM 2.3).
+A round that makes the validation frames worse is undone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from pydantic import Field
+from scipy.sparse import csc_array, diags_array, eye_array
+from scipy.sparse.linalg import SuperLU, splu
+from torch import Tensor
+
+from pipeline.avatar.body import Body
+from pipeline.avatar.extract import transfer_skin_weights
+from pipeline.core.config import Config
+from pipeline.core.progress import track
+from pipeline.geometry.camera import Camera
+from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.raster import face_adjacency, render_shaded
+from pipeline.geometry.skinning import linear_blend_skinning, top_k_weights
+from pipeline.geometry.surface import is_closed_manifold, laplacian, remesh, repair, subdivide
+
+Shade = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n 3"]]
+
+
+class RefineConfig(Config):
+    """Options of the refinement."""
+
+    rounds: int = Field(3, ge=0, le=10, description="rounds of optimisation; each after the first starts with new triangles")
+    steps: int = Field(120, ge=1, le=5000, description="optimiser steps a round")
+    frames_per_step: int = Field(3, ge=1, le=16, description="training frames a step looks at")
+    person_height_px: int = Field(480, ge=64, le=4096, description="images are reduced until the person is at most this high, px")
+    learning_rate: float = Field(0.0012, gt=0.0, le=0.1, description="step of the smoothed offsets, m")
+    global_learning_rate: float = Field(0.0003, ge=0.0, le=0.1, description="step of the one offset of all vertices, m")
+    stiffness: float = Field(12.0, ge=0.0, le=1000.0, description="lambda of the implicit smoothing of every step; 0 moves vertices alone")
+    colour_weight: float = Field(1.0, ge=0.0, description="weight of the Huber colour loss")
+    alpha_weight: float = Field(1.0, ge=0.0, description="weight of the silhouette loss, alpha against mask")
+    smooth_weight: float = Field(0.02, ge=0.0, description="weight of the uniform Laplacian of the positions, in units of the edge length")
+    offset_weight: float = Field(0.002, ge=0.0, description="weight of the squared vertex offsets, in units of the edge length")
+    global_offset_weight: float = Field(0.02, ge=0.0, description="weight of the squared global offset, in units of the edge length")
+    subdivide_percentile: float = Field(95.0, ge=50.0, le=100.0, description="faces with more image error than this share are split, %")
+    decimate_percentile: float = Field(50.0, ge=0.0, le=95.0, description="faces with less image error than this share are decimated, %")
+    decimate_edge: float = Field(1.4, ge=1.0, le=4.0, description="edge length of decimated regions, in target edge lengths")
+    max_faces: int = Field(60000, ge=100, description="no face is split beyond this number of faces")
+
+
+@dataclass(frozen=True)
+class View:
+    """A crop of a frame around the person: colours and mask 0..255, and the pose that was held then."""
+
+    image: UInt8[Tensor, "h w 3"]
+    mask: UInt8[Tensor, "h w"]
+    camera: Camera
+    canonical_to_world: Float[Tensor, "j 4 4"]
+
+
+@dataclass(frozen=True)
+class Skin:
+    """A mesh that can be posed and rendered: torch copies of what stays fixed while vertices move."""
+
+    faces: Int[Tensor, "f 3"]
+    adjacency: Int[Tensor, "f 3"]
+    weights: Float[Tensor, "v j"]
+
+
+@dataclass(frozen=True)
+class Refined:
+    """Where the refinement stands after a round: also what a checkpoint holds."""
+
+    mesh: Mesh
+    rounds_done: int
+    validation_psnr_db: tuple[float, ...]
+    finished: bool
+
+
+class SmoothOffset(torch.autograd.Function):
+    """D = (I + lambda L)^-1 u, with the same solve for the gradient (the matrix is symmetric)."""
+
+    @staticmethod
+    def forward(context: torch.autograd.function.FunctionCtx, smooth_coordinates: Tensor, factor: SuperLU) -> Tensor:
+        context.factor = factor
+        return torch.from_numpy(factor.solve(smooth_coordinates.detach().double().numpy())).to(smooth_coordinates)
+
+    @staticmethod
+    def backward(context: torch.autograd.function.FunctionCtx, gradient: Tensor) -> tuple[Tensor, None]:
+        return torch.from_numpy(context.factor.solve(gradient.double().contiguous().numpy())).to(gradient), None
+
+
+def smoothing_factor(mesh: Mesh, stiffness: float) -> SuperLU:
+    """Factor of I + stiffness * L with the combinatorial Laplacian L = degree - adjacency."""
+    operator = laplacian(mesh)
+    degree = np.bincount(mesh.edges().ravel(), minlength=len(mesh.vertices))
+    return splu(csc_array(eye_array(len(mesh.vertices)) + stiffness * (diags_array(degree.astype(float)) @ operator)))
+
+
+def skin_of(mesh: Mesh, body: Body) -> Skin:
+    """Four influences a vertex (as exported), in dense rows; adjacency for the silhouettes."""
+    indices, kept = top_k_weights(transfer_skin_weights(mesh, body))
+    dense = np.zeros((len(mesh.vertices), len(body.joint_names)), dtype=np.float32)
+    np.add.at(dense, (np.arange(len(dense))[:, None], indices), kept)
+    faces = torch.from_numpy(mesh.faces.astype(np.int64))
+    return Skin(faces, face_adjacency(faces), torch.from_numpy(dense))
+
+
+def render_view(
+    vertices: Float[Tensor, "v 3"], skin: Skin, view: View, shade: Shade
+) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"], Int[Tensor, "h w"]]:
+    """Premultiplied colour, alpha and face ids of the canonical mesh in a view's pose; colours are asked for at canonical points."""
+    posed = linear_blend_skinning(vertices, skin.weights, view.canonical_to_world[None])[0]
+    return render_shaded(posed, skin.faces, view.camera, vertices, shade, skin.adjacency)
+
+
+def _target(view: View, background: Float[Tensor, "3"]) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
+    mask = view.mask.float() / 255.0
+    return view.image.float() / 255.0 * mask[..., None] + (1.0 - mask[..., None]) * background, mask
+
+
+def refine(
+    start: Mesh | Refined,
+    body: Body,
+    views: tuple[Sequence[View], Sequence[View]],
+    shade: Shade,
+    edge_m: float,
+    config: RefineConfig,
+    seed: int = 0,
+    on_round: Callable[[Refined], None] = lambda state: None,
+) -> Refined:
+    """Runs the rounds that are left. views: (training, validation). edge_m: target edge length, m. on_round: called after each round.
+
+    Deterministic in (start, seed): going on from a `Refined` that `on_round` was given ends with the same mesh.
+    """
+    train, validation = views
+    if isinstance(start, Mesh):
+        psnr_db = validation_psnr_db(start, skin_of(start, body), validation, shade)
+        start = Refined(start, 0, (psnr_db,), config.rounds == 0)
+    state = start
+    while not state.finished:
+        state = _round(state, body, train, validation, shade, edge_m, config, seed)
+        on_round(state)
+    return state
+
+
+def _round(
+    state: Refined,
+    body: Body,
+    train: Sequence[View],
+    validation: Sequence[View],
+    shade: Shade,
+    edge_m: float,
+    config: RefineConfig,
+    seed: int,
+) -> Refined:
+    """One round: new triangles (not in the first), optimisation, and back to the start if validation frames got worse."""
+    mesh = state.mesh
+    if state.rounds_done > 0:
+        errors = face_errors(mesh, skin_of(mesh, body), train, shade)
+        mesh = adapt_triangles(mesh, errors, edge_m, config)
+    skin = skin_of(mesh, body)
+    mesh = optimise(mesh, skin, train, shade, edge_m, config, seed + 1000 * state.rounds_done, f"mesh round {state.rounds_done + 1}")
+    psnr_db = validation_psnr_db(mesh, skin, validation, shade)
+    rounds_done = state.rounds_done + 1
+    if validation and psnr_db < state.validation_psnr_db[-1]:
+        return replace(state, rounds_done=rounds_done, finished=True)
+    return Refined(mesh, rounds_done, (*state.validation_psnr_db, psnr_db), rounds_done == config.rounds)
+
+
+def optimise(
+    mesh: Mesh, skin: Skin, views: Sequence[View], shade: Shade, edge_m: float, config: RefineConfig, seed: int, label: str = "refine"
+) -> Mesh:
+    """The mesh with its vertices moved so that it looks like the views; triangles stay."""
+    generator = torch.Generator().manual_seed(seed)
+    start = torch.from_numpy(mesh.vertices.astype(np.float32))
+    factor = smoothing_factor(mesh, config.stiffness)
+    coordinates, shift = torch.zeros_like(start, requires_grad=True), torch.zeros(3, requires_grad=True)
+    operator = _to_torch(laplacian(mesh))
+    optimiser = _UniformAdam([(coordinates, config.learning_rate * (1.0 + config.stiffness)), (shift, config.global_learning_rate)])
+    for step in track(range(config.steps), label):
+        offset = SmoothOffset.apply(coordinates, factor)
+        vertices = start + offset + shift
+        loss = _regularisers(vertices, offset, shift, operator, edge_m, config)
+        for k in torch.randint(len(views), (config.frames_per_step,), generator=generator).tolist():
+            background = torch.rand(3, generator=generator)
+            loss = loss + _view_loss(vertices, skin, views[k], shade, background, config) / config.frames_per_step
+        optimiser.step(loss, 0.5 * (1.0 + np.cos(np.pi * step / config.steps)))
+    moved = (start + SmoothOffset.apply(coordinates, factor) + shift).detach().numpy()
+    return Mesh(moved, mesh.faces)
+
+
+def _view_loss(
+    vertices: Float[Tensor, "v 3"], skin: Skin, view: View, shade: Shade, background: Float[Tensor, "3"], config: RefineConfig
+) -> Float[Tensor, ""]:
+    image, alpha, _ = render_view(vertices, skin, view, shade)
+    target, mask = _target(view, background)
+    colour = torch.nn.functional.huber_loss(image + (1.0 - alpha[..., None]) * background, target, delta=0.1)
+    # Huber with delta 0.1 is 0.1 |e| for large errors: the factor 10 makes weight 1 mean the mean absolute error
+    return config.colour_weight * 10.0 * colour + config.alpha_weight * (alpha - mask).abs().mean()
+
+
+def _regularisers(
+    vertices: Float[Tensor, "v 3"],
+    offset: Float[Tensor, "v 3"],
+    shift: Float[Tensor, "3"],
+    operator: Tensor,
+    edge_m: float,
+    config: RefineConfig,
+) -> Float[Tensor, ""]:
+    """Uniform Laplacian, vertex offsets and global offset, squared in units of the edge length."""
+    smooth = (torch.sparse.mm(operator, vertices) / edge_m).square().sum(1).mean()
+    drift, common = (offset / edge_m).square().sum(1).mean(), (shift / edge_m).square().sum()
+    return config.smooth_weight * smooth + config.offset_weight * drift + config.global_offset_weight * common
+
+
+class _UniformAdam:
+    """Adam whose second moment is one number per tensor, the largest: step sizes keep the gradient's shape (Nicolet et al., 4.3)."""
+
+    def __init__(self, parameters: Sequence[tuple[Tensor, float]], betas: tuple[float, float] = (0.9, 0.99)) -> None:
+        self._parameters = parameters
+        self._betas = betas
+        self._moments = [(torch.zeros_like(p), torch.zeros(())) for p, _ in parameters]
+        self._count = 0
+
+    def step(self, loss: Float[Tensor, ""], rate_factor: float) -> None:
+        """One step down the loss with the learning rates times ``rate_factor``."""
+        gradients = torch.autograd.grad(loss, [parameter for parameter, _ in self._parameters])
+        self._count += 1
+        first_beta, second_beta = self._betas
+        first_bias, second_bias = 1.0 - first_beta**self._count, 1.0 - second_beta**self._count
+        for i, ((parameter, rate), gradient) in enumerate(zip(self._parameters, gradients, strict=True)):
+            mean, largest = self._moments[i]
+            mean = torch.lerp(gradient, mean, first_beta)
+            largest = torch.lerp(gradient.square().max(), largest, second_beta)
+            self._moments[i] = (mean, largest)
+            update = mean / first_bias / ((largest / second_bias).sqrt() + 1e-12)
+            with torch.no_grad():
+                parameter -= rate * rate_factor * update
+
+
+def _to_torch(matrix: csc_array) -> Tensor:
+    rows = matrix.tocsr()
+    arrays = [torch.from_numpy(part.astype(np.int64)) for part in (rows.indptr, rows.indices)]
+    return torch.sparse_csr_tensor(*arrays, torch.from_numpy(rows.data.astype(np.float32)), size=rows.shape)
+
+
+@torch.no_grad()
+def face_errors(mesh: Mesh, skin: Skin, views: Sequence[View], shade: Shade) -> Float[np.ndarray, "f"]:
+    """Colour error (sum over channels, pixels and views of the absolute difference, white behind) that lands on each face."""
+    total = np.zeros(len(mesh.faces))
+    vertices, white = torch.from_numpy(mesh.vertices), torch.ones(3)
+    for view in views:
+        image, alpha, face_id = render_view(vertices, skin, view, shade)
+        error = (image + (1.0 - alpha[..., None]) - _target(view, white)[0]).abs().sum(2)
+        seen = face_id >= 0
+        total += np.bincount(face_id[seen].numpy(), error[seen].numpy(), minlength=len(total))
+    return total
+
+
+@torch.no_grad()
+def validation_psnr_db(mesh: Mesh, skin: Skin, views: Sequence[View], shade: Shade) -> float:
+    """PSNR of all crops together, white behind; 0 when there is no view."""
+    vertices, white = torch.from_numpy(mesh.vertices), torch.ones(3)
+    squared, count = 0.0, 0
+    for view in views:
+        image, alpha, _ = render_view(vertices, skin, view, shade)
+        error = image + (1.0 - alpha[..., None]) - _target(view, white)[0]
+        squared, count = squared + float(error.square().sum()), count + error.numel()
+    return -10.0 * float(np.log10(max(squared / count, 1e-12))) if count else 0.0
+
+
+def adapt_triangles(mesh: Mesh, errors: Float[np.ndarray, "f"], edge_m: float, config: RefineConfig) -> Mesh:
+    """Splits faces above the upper percentile of the error at midpoints, decimates and remeshes those below the lower one."""
+    low = errors <= np.percentile(errors, config.decimate_percentile)
+    high = errors > np.percentile(errors, config.subdivide_percentile)
+    room = max(0, config.max_faces - len(mesh.faces)) // 4
+    if high.sum() > room:
+        high &= errors >= np.partition(errors, len(errors) - room)[len(errors) - room] if room else False
+    centres = mesh.vertices[mesh.faces].mean(axis=1)
+    fine, _ = subdivide(mesh, high)
+    # the faces to decimate are found again by their corners, which splitting elsewhere leaves alone
+    keys = {tuple(face) for face in np.sort(mesh.faces[low], axis=1).tolist()}
+    selected = np.array([tuple(face) in keys for face in np.sort(fine.faces, axis=1).tolist()])
+    if len(centres) == 0 or not selected.any():
+        return fine
+    coarse = remesh(fine, config.decimate_edge * edge_m, iterations=3, selected=selected)
+    return coarse if is_closed_manifold(coarse) else repair(fine)
