@@ -1,11 +1,10 @@
-"""From the canonical density to a first closed mesh: what the field saw, the body's core where it saw nothing, the body's hands.
+"""From the canonical density to a first closed mesh: what the field saw, the body's core where it saw nothing, the
+body's hands.
 
-Inside a person no ray ever ends, so a trained density may be hollow, and it is anything at all where no frame looked. The solid whose
-surface is taken is therefore: density above a level, or deeper inside the fitted body than a safe inset; never farther from the body
-than clothes and hair reach; cavities filled.
+Inside a person no ray ever ends, so a trained density may be hollow, and it is anything at all where no frame looked.
+The solid whose surface is taken is therefore: density above a level, or deeper inside the fitted body than a safe
+inset; never farther from the body than clothes and hair reach; cavities filled.
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -46,14 +45,19 @@ class ExtractConfig(Config):
 
     voxel_m: float = Field(0.005, gt=0.001, le=0.03, description="spacing of the density samples, m")
     reach_m: float = Field(0.12, gt=0.0, le=0.5, description="farthest a surface may lie outside the fitted body, m")
-    inset_m: float = Field(0.025, ge=0.0, le=0.2, description="what lies deeper inside the fitted body than this is solid, m")
-    blur_voxels: float = Field(1.0, ge=0.0, le=4.0, description="Gaussian blur of the solid before its surface is taken, voxels")
+    inset_m: float = Field(
+        0.025, ge=0.0, le=0.2, description="what lies deeper inside the fitted body than this is solid, m"
+    )
+    blur_voxels: float = Field(
+        1.0, ge=0.0, le=4.0, description="Gaussian blur of the solid before its surface is taken, voxels"
+    )
     body_hands: bool = Field(True, description="take hands and fingers from the fitted body, not from the field")
 
 
 @dataclass(frozen=True)
 class CanonicalSamples:
-    """Density (1/m) and signed distance to the body (m) on a regular canonical grid, and how much each sample belongs to a hand."""
+    """Density (1/m) and signed distance to the body (m) on a regular canonical grid, and how much each sample belongs
+    to a hand."""
 
     origin_m: Float[np.ndarray, "3"]
     spacing_m: float
@@ -63,7 +67,8 @@ class CanonicalSamples:
 
 
 def sample_canonical(density_of: Callable[[Tensor], Tensor], body: Body, config: ExtractConfig) -> CanonicalSamples:
-    """Samples the density within reach of the body. density_of: canonical points (n, 3) m -> (n,) 1/m, 0 in empty space."""
+    """Samples the density within reach of the body. density_of: canonical points (n, 3) m -> (n,) 1/m, 0 in empty
+    space."""
     origin_m = body.vertices.min(axis=0) - config.reach_m
     counts = np.ceil((body.vertices.max(axis=0) + config.reach_m - origin_m) / config.voxel_m).astype(int)
     counts = COARSE_STEP * np.ceil(counts / COARSE_STEP).astype(int) + 1
@@ -101,11 +106,16 @@ def _distance_grid(
     mesh: Mesh, origin_m: Float[np.ndarray, "3"], counts: np.ndarray, spacing_m: float
 ) -> Float[np.ndarray, "x y z"]:
     """Signed distance to a mesh: exact near it, interpolated between every fourth sample farther away."""
-    coarse_axes = [origin + spacing_m * np.arange(0, count, COARSE_STEP) for origin, count in zip(origin_m, counts, strict=True)]
+    coarse_axes = [
+        origin + spacing_m * np.arange(0, count, COARSE_STEP) for origin, count in zip(origin_m, counts, strict=True)
+    ]
     coarse_points = np.stack(np.meshgrid(*coarse_axes, indexing="ij"), axis=-1)
     coarse = signed_distance_m(coarse_points.reshape(-1, 3), mesh).reshape(coarse_points.shape[:3])
     upsampled = torch.nn.functional.interpolate(
-        torch.from_numpy(coarse).float()[None, None], size=tuple(int(c) for c in counts), mode="trilinear", align_corners=True
+        torch.from_numpy(coarse).float()[None, None],
+        size=tuple(int(c) for c in counts),
+        mode="trilinear",
+        align_corners=True,
     )
     distance_m = upsampled[0, 0].numpy()
     near = np.argwhere(np.abs(distance_m) < EXACT_BAND_VOXELS * spacing_m)
@@ -157,12 +167,15 @@ def simplify(mesh: Mesh, edge_m: float) -> Mesh:
     return remesh(mesh, edge_m, iterations=6, tolerance_m=0.15 * edge_m)
 
 
-def transfer_skin_weights(mesh: Mesh, body: Body, reach_m: float = 0.08, smoothing: int = 4) -> Float[np.ndarray, "v j"]:
+def transfer_skin_weights(
+    mesh: Mesh, body: Body, reach_m: float = 0.08, smoothing: int = 4
+) -> Float[np.ndarray, "v j"]:
     """Skin weights (v, j), rows summing to 1, for a mesh around the body in the canonical pose.
 
-    A vertex takes the weights of the nearest place on the body if that is within reach and faces the same way (within 60 degrees);
-    all others (an arm's inner side that is nearer to the trunk, loose cloth) are filled in harmonically from those over the mesh
-    (after Abdrashitov et al., "Robust Skin Weights Transfer via Weight Inpainting", 2023). A few smoothing steps end it.
+    A vertex takes the weights of the nearest place on the body if that is within reach and faces the same way (within
+    60 degrees); all others (an arm's inner side that is nearer to the trunk, loose cloth) are filled in harmonically
+    from those over the mesh (after Abdrashitov et al., "Robust Skin Weights Transfer via Weight Inpainting", 2023). A
+    few smoothing steps end it.
     """
     body_mesh = body.mesh()
     distance_m, face, barycentric = closest_on_mesh(mesh.vertices, body_mesh)

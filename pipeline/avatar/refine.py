@@ -1,16 +1,17 @@
-"""Vertex positions and triangle density of the canonical mesh, refined against the video through the differentiable rasteriser.
+"""Vertex positions and triangle density of the canonical mesh, refined against the video through the differentiable
+rasteriser.
 
-Letters: x0 the round's start positions, D per-vertex offsets, G one global offset (the paper's delta v_i and delta V); x = x0 + D + G.
-D is not optimised itself but u = (I + lambda L) D with the graph Laplacian L, so every step moves a neighbourhood and no vertex alone
-(Nicolet et al., "Large steps in inverse rendering of geometry", 2021). Rounds after the first begin with new triangles: faces whose
-accumulated image error is above an upper percentile are split at midpoints, those below a lower one decimated and remeshed (IHM 2.3).
-A round that makes the validation frames worse is undone.
+Letters: x0 the round's start positions, D per-vertex offsets, G one global offset (the paper's delta v_i and delta V);
+x = x0 + D + G. D is not optimised itself but u = (I + lambda L) D with the graph Laplacian L, so every step moves a
+neighbourhood and no vertex alone (Nicolet et al., "Large steps in inverse rendering of geometry", 2021). Rounds after
+the first begin with new triangles: faces whose accumulated image error is above an upper percentile are split at
+midpoints, those below a lower one decimated and remeshed (IHM 2.3). A round that makes the validation frames worse is
+undone.
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -36,21 +37,39 @@ Shade = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n 3"]]
 class RefineConfig(Config):
     """Options of the refinement."""
 
-    rounds: int = Field(3, ge=0, le=10, description="rounds of optimisation; each after the first starts with new triangles")
+    rounds: int = Field(
+        3, ge=0, le=10, description="rounds of optimisation; each after the first starts with new triangles"
+    )
     steps: int = Field(120, ge=1, le=5000, description="optimiser steps a round")
     frames_per_step: int = Field(3, ge=1, le=16, description="training frames a step looks at")
-    person_height_px: int = Field(480, ge=64, le=4096, description="images are reduced until the person is at most this high, px")
+    person_height_px: int = Field(
+        480, ge=64, le=4096, description="images are reduced until the person is at most this high, px"
+    )
     learning_rate: float = Field(0.0012, gt=0.0, le=0.1, description="step of the smoothed offsets, m")
     global_learning_rate: float = Field(0.0003, ge=0.0, le=0.1, description="step of the one offset of all vertices, m")
-    stiffness: float = Field(12.0, ge=0.0, le=1000.0, description="lambda of the implicit smoothing of every step; 0 moves vertices alone")
+    stiffness: float = Field(
+        12.0, ge=0.0, le=1000.0, description="lambda of the implicit smoothing of every step; 0 moves vertices alone"
+    )
     colour_weight: float = Field(1.0, ge=0.0, description="weight of the Huber colour loss")
     alpha_weight: float = Field(1.0, ge=0.0, description="weight of the silhouette loss, alpha against mask")
-    smooth_weight: float = Field(0.02, ge=0.0, description="weight of the uniform Laplacian of the positions, in units of the edge length")
-    offset_weight: float = Field(0.002, ge=0.0, description="weight of the squared vertex offsets, in units of the edge length")
-    global_offset_weight: float = Field(0.02, ge=0.0, description="weight of the squared global offset, in units of the edge length")
-    subdivide_percentile: float = Field(95.0, ge=50.0, le=100.0, description="faces with more image error than this share are split, %")
-    decimate_percentile: float = Field(50.0, ge=0.0, le=95.0, description="faces with less image error than this share are decimated, %")
-    decimate_edge: float = Field(1.4, ge=1.0, le=4.0, description="edge length of decimated regions, in target edge lengths")
+    smooth_weight: float = Field(
+        0.02, ge=0.0, description="weight of the uniform Laplacian of the positions, in units of the edge length"
+    )
+    offset_weight: float = Field(
+        0.002, ge=0.0, description="weight of the squared vertex offsets, in units of the edge length"
+    )
+    global_offset_weight: float = Field(
+        0.02, ge=0.0, description="weight of the squared global offset, in units of the edge length"
+    )
+    subdivide_percentile: float = Field(
+        95.0, ge=50.0, le=100.0, description="faces with more image error than this share are split, %"
+    )
+    decimate_percentile: float = Field(
+        50.0, ge=0.0, le=95.0, description="faces with less image error than this share are decimated, %"
+    )
+    decimate_edge: float = Field(
+        1.4, ge=1.0, le=4.0, description="edge length of decimated regions, in target edge lengths"
+    )
     max_faces: int = Field(60000, ge=100, description="no face is split beyond this number of faces")
 
 
@@ -87,12 +106,14 @@ class SmoothOffset(torch.autograd.Function):
     """D = (I + lambda L)^-1 u, with the same solve for the gradient (the matrix is symmetric)."""
 
     @staticmethod
-    def forward(context: torch.autograd.function.FunctionCtx, smooth_coordinates: Tensor, factor: SuperLU) -> Tensor:
+    def forward(context: Any, smooth_coordinates: Tensor, factor: SuperLU) -> Tensor:
+        """(v, 3) u -> (v, 3) D."""
         context.factor = factor
         return torch.from_numpy(factor.solve(smooth_coordinates.detach().double().numpy())).to(smooth_coordinates)
 
     @staticmethod
-    def backward(context: torch.autograd.function.FunctionCtx, gradient: Tensor) -> tuple[Tensor, None]:
+    def backward(context: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        """dL/dD -> dL/du."""
         return torch.from_numpy(context.factor.solve(gradient.double().contiguous().numpy())).to(gradient), None
 
 
@@ -115,7 +136,8 @@ def skin_of(mesh: Mesh, body: Body) -> Skin:
 def render_view(
     vertices: Float[Tensor, "v 3"], skin: Skin, view: View, shade: Shade
 ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"], Int[Tensor, "h w"]]:
-    """Premultiplied colour, alpha and face ids of the canonical mesh in a view's pose; colours are asked for at canonical points."""
+    """Premultiplied colour, alpha and face ids of the canonical mesh in a view's pose; colours are asked for at
+    canonical points."""
     posed = linear_blend_skinning(vertices, skin.weights, view.canonical_to_world[None])[0]
     return render_shaded(posed, skin.faces, view.camera, vertices, shade, skin.adjacency)
 
@@ -135,7 +157,8 @@ def refine(
     seed: int = 0,
     on_round: Callable[[Refined], None] = lambda state: None,
 ) -> Refined:
-    """Runs the rounds that are left. views: (training, validation). edge_m: target edge length, m. on_round: called after each round.
+    """Runs the rounds that are left. views: (training, validation). edge_m: target edge length, m. on_round: called
+    after each round.
 
     Deterministic in (start, seed): going on from a `Refined` that `on_round` was given ends with the same mesh.
     """
@@ -160,13 +183,16 @@ def _round(
     config: RefineConfig,
     seed: int,
 ) -> Refined:
-    """One round: new triangles (not in the first), optimisation, and back to the start if validation frames got worse."""
+    """One round: new triangles (not in the first), optimisation, and back to the start if validation frames got
+    worse."""
     mesh = state.mesh
     if state.rounds_done > 0:
         errors = face_errors(mesh, skin_of(mesh, body), train, shade)
         mesh = adapt_triangles(mesh, errors, edge_m, config)
     skin = skin_of(mesh, body)
-    mesh = optimise(mesh, skin, train, shade, edge_m, config, seed + 1000 * state.rounds_done, f"mesh round {state.rounds_done + 1}")
+    mesh = optimise(
+        mesh, skin, train, shade, edge_m, config, seed + 1000 * state.rounds_done, f"mesh round {state.rounds_done + 1}"
+    )
     psnr_db = validation_psnr_db(mesh, skin, validation, shade)
     rounds_done = state.rounds_done + 1
     if validation and psnr_db < state.validation_psnr_db[-1]:
@@ -175,7 +201,14 @@ def _round(
 
 
 def optimise(
-    mesh: Mesh, skin: Skin, views: Sequence[View], shade: Shade, edge_m: float, config: RefineConfig, seed: int, label: str = "refine"
+    mesh: Mesh,
+    skin: Skin,
+    views: Sequence[View],
+    shade: Shade,
+    edge_m: float,
+    config: RefineConfig,
+    seed: int,
+    label: str = "refine",
 ) -> Mesh:
     """The mesh with its vertices moved so that it looks like the views; triangles stay."""
     generator = torch.Generator().manual_seed(seed)
@@ -183,7 +216,9 @@ def optimise(
     factor = smoothing_factor(mesh, config.stiffness)
     coordinates, shift = torch.zeros_like(start, requires_grad=True), torch.zeros(3, requires_grad=True)
     operator = _to_torch(laplacian(mesh))
-    optimiser = _UniformAdam([(coordinates, config.learning_rate * (1.0 + config.stiffness)), (shift, config.global_learning_rate)])
+    optimiser = _UniformAdam(
+        [(coordinates, config.learning_rate * (1.0 + config.stiffness)), (shift, config.global_learning_rate)]
+    )
     for step in track(range(config.steps), label):
         offset = SmoothOffset.apply(coordinates, factor)
         vertices = start + offset + shift
@@ -197,7 +232,12 @@ def optimise(
 
 
 def _view_loss(
-    vertices: Float[Tensor, "v 3"], skin: Skin, view: View, shade: Shade, background: Float[Tensor, "3"], config: RefineConfig
+    vertices: Float[Tensor, "v 3"],
+    skin: Skin,
+    view: View,
+    shade: Shade,
+    background: Float[Tensor, "3"],
+    config: RefineConfig,
 ) -> Float[Tensor, ""]:
     image, alpha, _ = render_view(vertices, skin, view, shade)
     target, mask = _target(view, background)
@@ -221,7 +261,8 @@ def _regularisers(
 
 
 class _UniformAdam:
-    """Adam whose second moment is one number per tensor, the largest: step sizes keep the gradient's shape (Nicolet et al., 4.3)."""
+    """Adam whose second moment is one number per tensor, the largest: step sizes keep the gradient's shape (Nicolet et
+    al., 4.3)."""
 
     def __init__(self, parameters: Sequence[tuple[Tensor, float]], betas: tuple[float, float] = (0.9, 0.99)) -> None:
         self._parameters = parameters
@@ -246,14 +287,16 @@ class _UniformAdam:
 
 
 def _to_torch(matrix: csc_array) -> Tensor:
-    rows = matrix.tocsr()
-    arrays = [torch.from_numpy(part.astype(np.int64)) for part in (rows.indptr, rows.indices)]
-    return torch.sparse_csr_tensor(*arrays, torch.from_numpy(rows.data.astype(np.float32)), size=rows.shape)
+    entries = matrix.tocoo()
+    positions = torch.from_numpy(np.stack(entries.coords).astype(np.int64))
+    values = torch.from_numpy(entries.data.astype(np.float32))
+    return torch.sparse_coo_tensor(positions, values, matrix.shape, check_invariants=True).coalesce()
 
 
 @torch.no_grad()
 def face_errors(mesh: Mesh, skin: Skin, views: Sequence[View], shade: Shade) -> Float[np.ndarray, "f"]:
-    """Colour error (sum over channels, pixels and views of the absolute difference, white behind) that lands on each face."""
+    """Colour error (sum over channels, pixels and views of the absolute difference, white behind) that lands on each
+    face."""
     total = np.zeros(len(mesh.faces))
     vertices, white = torch.from_numpy(mesh.vertices), torch.ones(3)
     for view in views:
@@ -277,7 +320,8 @@ def validation_psnr_db(mesh: Mesh, skin: Skin, views: Sequence[View], shade: Sha
 
 
 def adapt_triangles(mesh: Mesh, errors: Float[np.ndarray, "f"], edge_m: float, config: RefineConfig) -> Mesh:
-    """Splits faces above the upper percentile of the error at midpoints, decimates and remeshes those below the lower one."""
+    """Splits faces above the upper percentile of the error at midpoints, decimates and remeshes those below the lower
+    one."""
     low = errors <= np.percentile(errors, config.decimate_percentile)
     high = errors > np.percentile(errors, config.subdivide_percentile)
     room = max(0, config.max_faces - len(mesh.faces)) // 4

@@ -1,4 +1,5 @@
-"""A differentiable picture of a mesh: attributes interpolated with perspective-correct barycentrics, silhouettes antialiased."""
+"""A differentiable picture of a mesh: attributes interpolated with perspective-correct barycentrics, silhouettes
+antialiased."""
 
 from collections.abc import Callable
 
@@ -12,7 +13,8 @@ from pipeline.kernels.reference.raster import pixel_centres_px, weighted_inverse
 
 
 def face_adjacency(faces: Int[Tensor, "f 3"]) -> Int[Tensor, "f 3"]:
-    """Face across edge k = (corner k, corner k + 1) of every face; -1 at a border and at edges shared by more than two faces."""
+    """Face across edge k = (corner k, corner k + 1) of every face; -1 at a border and at edges shared by more than two
+    faces."""
     faces = faces.long()
     edges = torch.stack([faces, faces.roll(-1, dims=1)], dim=2).view(-1, 2)
     low, high = edges.amin(1), edges.amax(1)
@@ -34,11 +36,14 @@ def interpolate_covered(
     faces: Int[Tensor, "f 3"],
     attributes: Float[Tensor, "v c"],
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n c"]]:
-    """Row-major numbers of the pixels where a face is seen, and the attributes there. Differentiable in positions, depth, attributes."""
+    """Row-major numbers of the pixels where a face is seen, and the attributes there. Differentiable in positions,
+    depth, attributes."""
     width = face_id.shape[1]
     covered = torch.nonzero(face_id.reshape(-1) >= 0).squeeze(1)
     corner = faces.long()[face_id.reshape(-1)[covered].long()]
-    q = weighted_inverse_depth(vertices_px[corner], depth_m[corner], pixel_centres_px(covered, width, vertices_px.dtype))
+    q = weighted_inverse_depth(
+        vertices_px[corner], depth_m[corner], pixel_centres_px(covered, width, vertices_px.dtype)
+    )
     return covered, ((q / q.sum(1, keepdim=True))[..., None] * attributes[corner]).sum(1)
 
 
@@ -52,11 +57,11 @@ def render_shaded(
 ) -> tuple[Float[Tensor, "h w d"], Float[Tensor, "h w"], Int[Tensor, "h w"]]:
     """(image premultiplied by alpha, alpha in [0, 1], face ids) of a mesh in metres; on white: ``image + 1 - alpha``.
 
-    shade: called once with the interpolated attributes of all covered pixels, returns what is seen there (deferred shading).
-    adjacency: ``face_adjacency(faces)``, to be passed in when the same mesh is rendered many times.
+    shade: called once with the interpolated attributes of all covered pixels, returns what is seen there (deferred
+    shading). adjacency: ``face_adjacency(faces)``, to be passed in when the same mesh is rendered many times.
 
-    Differentiable in ``vertices_world`` (inside faces through interpolation, at silhouettes through antialiasing), in ``attributes``
-    and in whatever ``shade`` depends on.
+    Differentiable in ``vertices_world`` (inside faces through interpolation, at silhouettes through antialiasing), in
+    ``attributes`` and in whatever ``shade`` depends on.
     """
     vertices_px, depth_m = project(vertices_world, camera)
     face_id, _, depth = rasterize(vertices_px, depth_m, faces, camera.height, camera.width)
@@ -77,6 +82,7 @@ def render_mesh(
     attributes: Float[Tensor, "v c"],
     adjacency: Int[Tensor, "f 3"] | None = None,
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
-    """``render_shaded`` that shows the interpolated attributes themselves: (attribute image premultiplied by alpha, alpha)."""
+    """``render_shaded`` that shows the interpolated attributes themselves: (attribute image premultiplied by alpha,
+    alpha)."""
     image, alpha, _ = render_shaded(vertices_world, faces, camera, attributes, lambda values: values, adjacency)
     return image, alpha

@@ -1,6 +1,5 @@
-"""Operations on closed surfaces: isosurface, repair, remeshing, conforming subdivision, Laplacian, transfer between meshes."""
-
-from __future__ import annotations
+"""Operations on closed surfaces: isosurface, repair, remeshing, conforming subdivision, Laplacian, transfer between
+meshes."""
 
 import igl
 import numpy as np
@@ -28,7 +27,8 @@ def solid_body(inside: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
 def isosurface(
     values: Float[np.ndarray, "x y z"], level: float, origin_m: Float[np.ndarray, "3"], spacing_m: float
 ) -> Mesh:
-    """Marching cubes (Lewiner et al. 2003) of ``values >= level``, closed at the grid's border, outward counter-clockwise.
+    """Marching cubes (Lewiner et al. 2003) of ``values >= level``, closed at the grid's border, outward
+    counter-clockwise.
 
     origin_m: position of the sample [0, 0, 0]. Raises ValueError when nothing reaches the level.
     """
@@ -60,7 +60,8 @@ def largest_component(mesh: Mesh) -> Mesh:
 
 
 def split_fans(mesh: Mesh) -> Mesh:
-    """Gives every fan of faces around a vertex its own copy of the vertex: no vertex is left where two sheets only touch.
+    """Gives every fan of faces around a vertex its own copy of the vertex: no vertex is left where two sheets only
+    touch.
 
     Edges must have at most two faces. A mesh whose vertices are manifold comes back unchanged.
     """
@@ -127,10 +128,11 @@ def remesh(
     selected: Bool[np.ndarray, "f"] | None = None,
     tolerance_m: float | None = None,
 ) -> Mesh:
-    """Isotropic explicit remeshing (Hoppe et al. 1993 as in VCGlib): split, collapse, flip, smooth, project back, in turn.
+    """Isotropic explicit remeshing (Hoppe et al. 1993 as in VCGlib): split, collapse, flip, smooth, project back, in
+    turn.
 
-    edge_m: edge length to reach. selected: only these faces change; their border stays.
-    tolerance_m: no change may move the surface farther than this (a tenth of the edge when None), so thin parts keep short edges.
+    edge_m: edge length to reach. selected: only these faces change; their border stays. tolerance_m: no change may move
+    the surface farther than this (a tenth of the edge when None), so thin parts keep short edges.
     """
     meshes = _meshset(mesh, selected)
     meshes.meshing_isotropic_explicit_remeshing(
@@ -163,8 +165,8 @@ def subdivide(mesh: Mesh, marked: Bool[np.ndarray, "f"]) -> tuple[Mesh, Int[np.n
 
     A face with all edges split becomes 4 faces, with two 3, with one 2. Watertight and manifold meshes stay so.
 
-    Returns the finer mesh, whose vertices are the old ones followed by one a split edge, and the two ends of each split edge:
-    any vertex attribute is carried over as ``np.concatenate([a, (a[ends[:, 0]] + a[ends[:, 1]]) / 2])``.
+    Returns the finer mesh, whose vertices are the old ones followed by one a split edge, and the two ends of each split
+    edge: any vertex attribute is carried over as ``np.concatenate([a, (a[ends[:, 0]] + a[ends[:, 1]]) / 2])``.
     """
     faces = mesh.faces.astype(np.int64)
     half_edges = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2), axis=2)
@@ -195,7 +197,8 @@ def _split_faces(faces: Int[np.ndarray, "f 3"], middle: Int[np.ndarray, "f 3"]) 
 
 
 def laplacian(mesh: Mesh) -> csr_array:
-    """Uniform Laplacian I - D^-1 A, (v, v) float64: applied to positions, each vertex minus the mean of its neighbours."""
+    """Uniform Laplacian I - D^-1 A, (v, v) float64: applied to positions, each vertex minus the mean of its
+    neighbours."""
     ends = mesh.edges()
     count = len(mesh.vertices)
     both = np.concatenate([ends, ends[:, ::-1]])
@@ -207,9 +210,12 @@ def laplacian(mesh: Mesh) -> csr_array:
 def closest_on_mesh(
     points: Float[np.ndarray, "n 3"], mesh: Mesh
 ) -> tuple[Float[np.ndarray, "n"], Int[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
-    """Distance (m) of each point to the mesh, the face that is nearest, and the barycentrics of the nearest place on it."""
+    """Distance (m) of each point to the mesh, the face that is nearest, and the barycentrics of the nearest place on
+    it."""
     vertices, faces = mesh.vertices.astype(np.float64), mesh.faces.astype(np.int64)
-    squared, face, nearest = igl.point_mesh_squared_distance(np.ascontiguousarray(points, dtype=np.float64), vertices, faces)
+    squared, face, nearest = igl.point_mesh_squared_distance(
+        np.ascontiguousarray(points, dtype=np.float64), vertices, faces
+    )
     a, b, c = (vertices[faces[face, k]] for k in range(3))
     barycentric = np.clip(_barycentric(nearest, a, b, c), 0.0, 1.0)
     return np.sqrt(np.maximum(squared, 0.0)), face, barycentric / barycentric.sum(axis=1, keepdims=True)
@@ -233,7 +239,8 @@ def transfer(
 
 
 def signed_distance_m(points: Float[np.ndarray, "n 3"], mesh: Mesh) -> Float[np.ndarray, "n"]:
-    """Distance (m) to a closed mesh, negative inside (generalised winding number above one half; Barill et al. 2018)."""
+    """Distance (m) to a closed mesh, negative inside (generalised winding number above one half; Barill et al.
+    2018)."""
     query = np.ascontiguousarray(points, dtype=np.float64)
     vertices, faces = mesh.vertices.astype(np.float64), mesh.faces.astype(np.int64)
     squared, _, _ = igl.point_mesh_squared_distance(query, vertices, faces)

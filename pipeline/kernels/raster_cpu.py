@@ -1,9 +1,10 @@
-"""Z-buffer rasterisation on the CPU: every thread owns whole bands of rows, so the picture never depends on thread timing.
+"""Z-buffer rasterisation on the CPU: every thread owns whole bands of rows, so the picture never depends on thread
+timing.
 
-Letters: a, b, c are the corners of a face in pixels; e is twice the signed area of (corner, corner, pixel centre); w = e / area are the
-screen-space barycentrics; 1/z is linear in them (Blinn, "Hyperbolic interpolation", 1992), hence q_k = w_k / z_k and depth = 1 / sum(q).
-Edge functions are float64: in float32 a pixel centre on an edge shared by two faces can fall outside both.
-NaN must compare false (a face with a NaN corner is dropped), hence no full fastmath.
+Letters: a, b, c are the corners of a face in pixels; e is twice the signed area of (corner, corner, pixel centre); w =
+e / area are the screen-space barycentrics; 1/z is linear in them (Blinn, "Hyperbolic interpolation", 1992), hence q_k =
+w_k / z_k and depth = 1 / sum(q). Edge functions are float64: in float32 a pixel centre on an edge shared by two faces
+can fall outside both. NaN must compare false (a face with a NaN corner is dropped), hence no full fastmath.
 """
 
 import numpy as np
@@ -29,7 +30,8 @@ def _last_centre(high: float, size: int) -> int:
 def face_boxes(
     vertices_px: np.ndarray, depth_m: np.ndarray, faces: np.ndarray, size_wh: tuple, near_m: float, cull: bool
 ) -> np.ndarray:
-    """(f, 4) int32 first and last pixel column and row a face can cover; first row > last row means that it covers none."""
+    """(f, 4) int32 first and last pixel column and row a face can cover; first row > last row means that it covers
+    none."""
     width, height = size_wh
     boxes = np.empty((faces.shape[0], 4), np.int32)
     for f in prange(faces.shape[0]):
@@ -79,7 +81,13 @@ def _edge_plane(ax: float, ay: float, bx: float, by: float, scale: float) -> tup
 
 @njit(**_FLAGS)
 def _draw_face(
-    f: int, box: tuple, vertices_px: np.ndarray, depth_m: np.ndarray, faces: np.ndarray, face_id: np.ndarray, inverse: np.ndarray
+    f: int,
+    box: tuple,
+    vertices_px: np.ndarray,
+    depth_m: np.ndarray,
+    faces: np.ndarray,
+    face_id: np.ndarray,
+    inverse: np.ndarray,
 ) -> None:
     """Draws face ``f`` into the rows and columns of ``box``; a nearer fragment wins, the lower face index on a tie."""
     a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
@@ -125,7 +133,12 @@ def draw_bands(
 
 @njit(parallel=True, **_FLAGS)
 def resolve(
-    vertices_px: np.ndarray, depth_m: np.ndarray, faces: np.ndarray, face_id: np.ndarray, barycentric: np.ndarray, depth: np.ndarray
+    vertices_px: np.ndarray,
+    depth_m: np.ndarray,
+    faces: np.ndarray,
+    face_id: np.ndarray,
+    barycentric: np.ndarray,
+    depth: np.ndarray,
 ) -> None:
     """Perspective-correct barycentrics and depth of the visible face, once per pixel after all faces are drawn."""
     for y in prange(face_id.shape[0]):

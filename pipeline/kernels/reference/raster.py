@@ -1,6 +1,7 @@
 """Plain torch rasterisation and silhouette antialiasing: the definition that the fast kernels are tested against.
 
-Letters as in ``pipeline.kernels.raster_cpu``. Order-independent reductions (max of 1/z, then min of the face index) keep it deterministic.
+Letters as in ``pipeline.kernels.raster_cpu``. Order-independent reductions (max of 1/z, then min of the face index)
+keep it deterministic.
 """
 
 import torch
@@ -11,7 +12,8 @@ FRAGMENTS_PER_CHUNK = 1 << 22
 
 
 def signed_areas_px(vertices_px: Float[Tensor, "v 2"], faces: Int[Tensor, "f 3"]) -> Float[Tensor, "f"]:
-    """Twice the signed screen area of every face in px^2; negative for a counter-clockwise outward face seen from outside (y down)."""
+    """Twice the signed screen area of every face in px^2; negative for a counter-clockwise outward face seen from
+    outside (y down)."""
     a, b, c = vertices_px[faces].unbind(1)
     return _cross(b - a, c - a)
 
@@ -23,9 +25,12 @@ def _cross(first: Float[Tensor, "*n 2"], second: Float[Tensor, "*n 2"]) -> Float
 def weighted_inverse_depth(
     corners_px: Float[Tensor, "n 3 2"], corners_depth_m: Float[Tensor, "n 3"], points_px: Float[Tensor, "n 2"]
 ) -> Float[Tensor, "n 3"]:
-    """q_k = w_k / z_k of each point in its face: q / sum(q) are perspective-correct barycentrics and 1 / sum(q) the depth. Differentiable."""
+    """q_k = w_k / z_k of each point in its face: q / sum(q) are perspective-correct barycentrics and 1 / sum(q) the
+    depth. Differentiable."""
     a, b, c = corners_px.unbind(1)
-    edges = torch.stack([_cross(c - b, points_px - b), _cross(a - c, points_px - c), _cross(b - a, points_px - a)], dim=1)
+    edges = torch.stack(
+        [_cross(c - b, points_px - b), _cross(a - c, points_px - c), _cross(b - a, points_px - a)], dim=1
+    )
     return edges / _cross(b - a, c - a)[:, None] / corners_depth_m
 
 
@@ -42,7 +47,12 @@ def _face_boxes(
 
 
 def _fragments(
-    vertices_px: Float[Tensor, "v 2"], depth_m: Float[Tensor, "v"], faces: Int[Tensor, "f 3"], first: Tensor, extent: Tensor, width: int
+    vertices_px: Float[Tensor, "v 2"],
+    depth_m: Float[Tensor, "v"],
+    faces: Int[Tensor, "f 3"],
+    first: Tensor,
+    extent: Tensor,
+    width: int,
 ) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"], Float[Tensor, "n"]]:
     """Covered (face, pixel, 1/z as float32) triples of a chunk of faces."""
     counts = extent.prod(1)
@@ -64,7 +74,13 @@ def _chunks(fragments: Int[Tensor, "f"]) -> tuple[Int[Tensor, "_"], ...]:
 
 
 def rasterize_reference(
-    vertices_px: Float[Tensor, "v 2"], depth_m: Float[Tensor, "v"], faces: Int[Tensor, "f 3"], height: int, width: int, near_m: float, cull: bool
+    vertices_px: Float[Tensor, "v 2"],
+    depth_m: Float[Tensor, "v"],
+    faces: Int[Tensor, "f 3"],
+    height: int,
+    width: int,
+    near_m: float,
+    cull: bool,
 ) -> tuple[Int[Tensor, "h w"], Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
     """``pipeline.kernels.raster.rasterize`` in plain torch on any device, any float type."""
     dtype, device = vertices_px.dtype, vertices_px.device
@@ -84,7 +100,9 @@ def rasterize_reference(
         winner.scatter_reduce_(0, pixel[wins], chunk[face[wins]], "amin")
     covered = torch.nonzero(winner < len(index)).squeeze(1)
     corner = index[winner[covered]]
-    q = weighted_inverse_depth(corners_px[corner], corners_depth[corner], pixel_centres_px(covered, width, torch.float64))
+    q = weighted_inverse_depth(
+        corners_px[corner], corners_depth[corner], pixel_centres_px(covered, width, torch.float64)
+    )
     face_id = torch.where(winner < len(index), winner, -1).to(torch.int32)
     barycentric = torch.zeros(height * width, 3, dtype=dtype, device=device)
     depth = torch.full((height * width,), torch.inf, dtype=dtype, device=device)
@@ -101,7 +119,8 @@ def pixel_centres_px(pixel: Int[Tensor, "n"], width: int, dtype: torch.dtype) ->
 def silhouette_edges(
     vertices_px: Float[Tensor, "v 2"], faces: Int[Tensor, "f 3"], adjacency: Int[Tensor, "f 3"]
 ) -> Int[Tensor, "s 3"]:
-    """(start, end, apex) vertices of every edge with the surface on one side only: no neighbour, or one that faces the other way."""
+    """(start, end, apex) vertices of every edge with the surface on one side only: no neighbour, or one that faces the
+    other way."""
     facing = signed_areas_px(vertices_px, faces) < 0
     folded = facing[:, None] & (adjacency >= 0) & ~facing[adjacency.clamp_min(0)]
     face, edge = torch.nonzero(folded | (adjacency < 0), as_tuple=True)
@@ -111,7 +130,8 @@ def silhouette_edges(
 def _crossings(
     ends_px: Float[Tensor, "s 3 2"], axis: int, lines: int
 ) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"], Float[Tensor, "n"]]:
-    """Where edges (start, end, apex) cross the lines of pixel centres along ``axis``: (edge, line, fraction of the way to its end)."""
+    """Where edges (start, end, apex) cross the lines of pixel centres along ``axis``: (edge, line, fraction of the way
+    to its end)."""
     across = ends_px[:, :2, 1 - axis]
     first = (across.amin(1) - 0.5).clamp(0, lines).ceil().long()
     last = (across.amax(1) - 0.5).clamp(0, lines).ceil().long()
@@ -147,7 +167,9 @@ def _axis_change(
     edge, line, fraction = _crossings(ends_px, axis, lines)
     start, end, apex = ends_px[edge].unbind(1)
     position = start[:, axis] + fraction * (end[:, axis] - start[:, axis])
-    inverse = ends_inverse_depth[edge, 0] + fraction.detach() * (ends_inverse_depth[edge, 1] - ends_inverse_depth[edge, 0])
+    inverse = ends_inverse_depth[edge, 0] + fraction.detach() * (
+        ends_inverse_depth[edge, 1] - ends_inverse_depth[edge, 0]
+    )
     slope = (end - start)[:, 1 - axis] * (-1.0 if axis == 0 else 1.0)
     # a border is met by row pairs and by column pairs: shares by the square of its normal add up to one border
     weight = (slope**2 / (end - start).square().sum(1)).detach()
@@ -158,7 +180,11 @@ def _axis_change(
     near = low_pixel + (outward < 0) * step
     far = low_pixel + (outward > 0) * step
     behind = depth.reshape(-1)
-    ok &= (behind[near] < behind[far]) & (behind[far] * inverse > 1.0) & (face_id.reshape(-1)[near] != face_id.reshape(-1)[far])
+    ok &= (
+        (behind[near] < behind[far])
+        & (behind[far] * inverse > 1.0)
+        & (face_id.reshape(-1)[near] != face_id.reshape(-1)[far])
+    )
     near_position = torch.where(outward < 0, low + 1, low).to(position.dtype) + 0.5
     distance = ((position - near_position) * outward)[ok]
     near, far, low_pixel = near[ok], far[ok], low_pixel[ok]
