@@ -79,7 +79,7 @@ def canonical_to_world(body: Body, motion: Motion) -> Float[Tensor, "n j 4 4"]:
     return skinning_transforms(joint_to_world, joints_m)
 
 
-SHAPE_DEFAULTS = {
+PHENOTYPE_DEFAULTS = {
     "gender": 0.5,
     "age": 2.0 / 3.0,
     "muscle": 0.5,
@@ -94,6 +94,39 @@ SHAPE_DEFAULTS = {
 }
 """Anny's phenotypes, each in [0, 1]; gender 0 is male, age 2/3 is a young adult (anchors at 0 baby, 1/3 child, 1 old)."""
 
+LOCAL_CHANGES = {
+    "upperarm-length": ("measure-upperarm-length-incr",),
+    "lowerarm-length": ("measure-lowerarm-length-incr",),
+    "upperleg-length": ("measure-upperleg-height-incr",),
+    "lowerleg-length": ("measure-lowerleg-height-incr",),
+    "neck-length": ("measure-neck-height-incr",),
+    "nape-to-waist": ("measure-napetowaist-dist-incr",),
+    "waist-to-hip": ("measure-waisttohip-dist-incr",),
+    "shoulder-width": ("measure-shoulder-dist-incr",),
+    "torso-width": ("torso-scale-horiz-incr",),
+    "torso-depth": ("torso-scale-depth-incr",),
+    "hip-depth": ("hip-scale-depth-incr",),
+    "bust-girth": ("measure-bust-circ-incr",),
+    "waist-girth": ("measure-waist-circ-incr",),
+    "hips-girth": ("measure-hips-circ-incr",),
+    "stomach-tone": ("stomach-tone-incr",),
+    "neck-girth": ("measure-neck-circ-incr",),
+    "upperarm-girth": ("measure-upperarm-circ-incr",),
+    "thigh-girth": ("measure-thigh-circ-incr",),
+    "knee-girth": ("measure-knee-circ-incr",),
+    "calf-girth": ("measure-calf-circ-incr",),
+    "ankle-girth": ("measure-ankle-circ-incr",),
+    "head-height": ("head-scale-vert-incr",),
+    "head-width": ("head-scale-horiz-incr",),
+    "head-depth": ("head-scale-depth-incr",),
+    "foot-size": ("l-foot-scale-incr", "r-foot-scale-incr"),
+    "hand-size": ("l-hand-scale-incr", "r-hand-scale-incr"),
+}
+"""Symmetric deviations from the phenotypes, each in [-1, 1] with default 0, and the names that anny has for them."""
+
+SHAPE_DEFAULTS = {**PHENOTYPE_DEFAULTS, **dict.fromkeys(LOCAL_CHANGES, 0.0)}
+"""Every number of a shape with its default."""
+
 
 class AnnyBody:
     """Anny (Apache-2.0 code, CC0 data) behind the interface that the fit needs, with the 52-joint Mixamo rig.
@@ -105,7 +138,9 @@ class AnnyBody:
     def __init__(self) -> None:
         import anny  # here, because loading it costs seconds that `--status` should not pay
 
-        model = anny.Anny(rig="mixamo", phenotypes="all", skinning_method="lbs").to(torch.float32)
+        changes = [name for names in LOCAL_CHANGES.values() for name in names]
+        model = anny.Anny(rig="mixamo", phenotypes="all", skinning_method="lbs", local_changes=changes)
+        model = model.to(torch.float32)
         self._model = model
         self.shape_names: tuple[str, ...] = tuple(SHAPE_DEFAULTS)
         self.shape_defaults: Float[Tensor, "p"] = torch.tensor(list(SHAPE_DEFAULTS.values()))
@@ -124,8 +159,10 @@ class AnnyBody:
 
     def rest(self, shape: Float[Tensor, "p"]) -> tuple[Float[Tensor, "v 3"], Float[Tensor, "j 3"]]:
         """A-pose vertices and joints of a shape (ordered as `shape_names`), canonical frame, differentiable."""
+        values = {name: shape[i : i + 1] for i, name in enumerate(self.shape_names)}
         coefficients = self._model.get_phenotype_blendshape_coefficients(
-            **{name: shape[i : i + 1] for i, name in enumerate(self.shape_names)}
+            **{name: values[name] for name in PHENOTYPE_DEFAULTS},
+            local_changes={label: values[name] for name, labels in LOCAL_CHANGES.items() for label in labels},
         )
         vertices = self._model.get_rest_vertices(coefficients)[0]
         heads = self._model.template_bone_heads + torch.einsum(
