@@ -1,0 +1,101 @@
+"""Pictures and models inside one HTML file: data URIs, and a GLB made light enough to be carried along."""
+
+from __future__ import annotations
+
+import base64
+import json
+import struct
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+WEBP_QUALITY = 84
+JPEG_QUALITY = 88
+_GLB_MAGIC, _JSON_CHUNK, _BIN_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
+
+
+def webp_uri(pixels: UInt8[np.ndarray, "h w c"]) -> str:
+    """A `data:` URI of an RGB image, or of an RGBA image with straight alpha, as WebP."""
+    order = cv2.COLOR_RGBA2BGRA if pixels.shape[2] == 4 else cv2.COLOR_RGB2BGR
+    encoded, data = cv2.imencode(".webp", cv2.cvtColor(pixels, order), (cv2.IMWRITE_WEBP_QUALITY, WEBP_QUALITY))
+    if not encoded:
+        raise ValueError(f"an image of shape {pixels.shape} cannot be encoded as WebP")
+    return f"data:image/webp;base64,{base64.b64encode(data.tobytes()).decode()}"
+
+
+def split_glb(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """The JSON document and the binary chunk of a GLB (glTF 2.0, section 4.4); ValueError when it is none."""
+    if len(data) < 20 or struct.unpack_from("<II", data) != (_GLB_MAGIC, 2):
+        raise ValueError("no binary glTF 2.0")
+    length, kind = struct.unpack_from("<II", data, 12)
+    if kind != _JSON_CHUNK:
+        raise ValueError("the first chunk of the GLB is not JSON")
+    document = json.loads(data[20 : 20 + length])
+    rest = 20 + length
+    if rest >= len(data):
+        return document, b""
+    binary_length, kind = struct.unpack_from("<II", data, rest)
+    if kind != _BIN_CHUNK:
+        raise ValueError("the second chunk of the GLB is not binary")
+    return document, data[rest + 8 : rest + 8 + binary_length]
+
+
+def join_glb(document: dict[str, Any], binary: bytes) -> bytes:
+    """The inverse of `split_glb`; chunks are padded to four bytes."""
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    binary += b"\0" * (-len(binary) % 4)
+    length = 12 + 8 + len(text) + 8 + len(binary)
+    return b"".join(
+        (
+            struct.pack("<III", _GLB_MAGIC, 2, length),
+            struct.pack("<II", len(text), _JSON_CHUNK),
+            text,
+            struct.pack("<II", len(binary), _BIN_CHUNK),
+            binary,
+        )
+    )
+
+
+def light_glb(data: bytes, max_texture_px: int = 2048) -> bytes:
+    """The same model with its opaque textures as JPEG of at most `max_texture_px` a side.
+
+    For showing only: geometry, skin and animation stay bit for bit; textures with alpha stay PNG. A texture is left
+    alone where JPEG would not be smaller.
+    """
+    document, binary = split_glb(data)
+    replaced = {}
+    for image in document.get("images", []):
+        view = document["bufferViews"][image["bufferView"]]
+        original = _view_bytes(view, binary)
+        smaller = _as_jpeg(original, max_texture_px)
+        if smaller is not None and len(smaller) < len(original):
+            replaced[image["bufferView"]] = smaller
+            image["mimeType"] = "image/jpeg"
+    packed = bytearray()
+    for number, view in enumerate(document.get("bufferViews", [])):
+        content = replaced.get(number, _view_bytes(view, binary))
+        packed.extend(b"\0" * (-len(packed) % 4))
+        view.update(byteOffset=len(packed), byteLength=len(content))
+        packed.extend(content)
+    if document.get("buffers"):
+        document["buffers"][0]["byteLength"] = len(packed)
+    return join_glb(document, bytes(packed))
+
+
+def _view_bytes(view: dict[str, Any], binary: bytes) -> bytes:
+    start = view.get("byteOffset", 0)
+    return binary[start : start + view["byteLength"]]
+
+
+def _as_jpeg(encoded: bytes, max_texture_px: int) -> bytes | None:
+    """The image as JPEG; None when it has an alpha channel, which JPEG cannot hold."""
+    pixels = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None or (pixels.ndim == 3 and pixels.shape[2] == 4):
+        return None
+    shrink = max_texture_px / max(pixels.shape[:2])
+    if shrink < 1.0:
+        pixels = cv2.resize(pixels, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    return cv2.imencode(".jpg", pixels, (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))[1].tobytes()
