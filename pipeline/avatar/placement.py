@@ -1,0 +1,42 @@
+"""Where an avatar's scene has its origin: on the floor, where the person stood."""
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.avatar.body import Motion
+
+FLOOR_PERCENTILE = 10.0
+
+
+def scene_from_world_m(motion: Motion, lowest_m: Float[np.ndarray, "n"]) -> Float[np.ndarray, "3"]:
+    """Translation (m) that carries world points into the scene of the exported file.
+
+    The floor (y = 0) is where the feet are: the lowest tenth of the frames' lowest points, since a jump lifts some frames
+    and a wrong pose sinks few. x = z = 0 is the middle (median) of the root's places, so that viewers, which look at the
+    rest pose, find the moving person. Nothing is scaled or turned: displacements and the camera's relative place stay.
+
+    lowest_m: y of the lowest point of the posed surface, a frame, world.
+    """
+    middle = np.median(motion.root_translation_m, axis=0)
+    floor_m = np.percentile(lowest_m, FLOOR_PERCENTILE)
+    return -np.array([middle[0], floor_m, middle[2]], dtype=np.float32)
+
+
+def hold_ends(motion: Motion, frame_rate: float, video_frame_count: int) -> Motion:
+    """The motion over the whole video: the first and last pose held to the first and last frame of the video.
+
+    frame_rate: frames a second, so that time = frame index / frame_rate.
+    """
+    rows = np.arange(len(motion.frame_index))
+    frames = motion.frame_index
+    if frames[0] > 0:
+        rows, frames = np.concatenate([rows[:1], rows]), np.concatenate([[0], frames])
+    if frames[-1] < video_frame_count - 1:
+        rows, frames = np.concatenate([rows, rows[-1:]]), np.concatenate([frames, [video_frame_count - 1]])
+    frames = frames.astype(np.int32)
+    return Motion(
+        frames,
+        (frames / frame_rate).astype(motion.time_s.dtype),
+        motion.rotations_wxyz[rows],
+        motion.root_translation_m[rows],
+    )

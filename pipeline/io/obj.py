@@ -1,0 +1,54 @@
+"""A textured mesh as Wavefront .obj with its .mtl: what every modelling tool opens, without skeleton or motion."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipeline.geometry.mesh import Mesh
+
+MATERIAL = "avatar"
+
+
+def write_obj(
+    path: Path,
+    mesh: Mesh,
+    uv: Float[np.ndarray, "t 2"],
+    faces_uv: Int[np.ndarray, "f 3"],
+    normals: Float[np.ndarray, "v 3"],
+    diffuse_name: str,
+    specular_name: str | None,
+) -> None:
+    """Write `path` (.obj) and the .mtl beside it, which names the maps that lie in the same folder.
+
+    mesh: metres, +Y up. uv: origin bottom-left, which is OBJ's own. normals: unit, one a vertex.
+    """
+    corners = np.stack([mesh.faces, faces_uv, mesh.faces], axis=2).reshape(len(mesh.faces), 9) + 1
+    lines = [f"mtllib {path.with_suffix('.mtl').name}", f"o {MATERIAL}"]
+    lines += _rows("v %.6f %.6f %.6f", mesh.vertices)
+    lines += _rows("vt %.6f %.6f", uv)
+    lines += _rows("vn %.4f %.4f %.4f", normals)
+    lines += [f"usemtl {MATERIAL}", "s 1"]
+    lines += _rows("f %d/%d/%d %d/%d/%d %d/%d/%d", corners)
+    path.write_text("\n".join(lines) + "\n", encoding="ascii")
+    path.with_suffix(".mtl").write_text(_material(diffuse_name, specular_name), encoding="ascii")
+
+
+def _rows(form: str, values: np.ndarray) -> list[str]:
+    return [form % tuple(row) for row in values.tolist()]
+
+
+def _material(diffuse_name: str, specular_name: str | None) -> str:
+    shine = "1" if specular_name else "0"
+    lines = [
+        f"newmtl {MATERIAL}",
+        "Ka 0 0 0",
+        "Kd 1 1 1",
+        f"Ks {shine} {shine} {shine}",
+        "Ns 20",
+        "d 1",
+        "illum 2",
+        f"map_Kd {diffuse_name}",
+    ]
+    lines += [f"map_Ks {specular_name}"] if specular_name else []
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,38 @@
+"""The exported scene: floor under the feet, origin where the person stood, and the clip as long as the video."""
+
+import numpy as np
+import pytest
+
+from pipeline.avatar.body import Motion
+from pipeline.avatar.placement import hold_ends, scene_from_world_m
+
+
+def motion_at(frames: list[int], places: np.ndarray) -> Motion:
+    index = np.array(frames, dtype=np.int32)
+    rotations = np.tile(np.array([1.0, 0, 0, 0], dtype=np.float32), (len(frames), 2, 1))
+    rotations[:, 1, 0] = np.arange(len(frames))  # marks which frame a row came from
+    return Motion(index, (index / 30.0).astype(np.float32), rotations, places.astype(np.float32))
+
+
+def test_the_floor_survives_jumps_and_one_wrong_pose() -> None:
+    frames = list(range(100))
+    places = np.tile([0.3, 0.0, -5.0], (100, 1))
+    lowest = np.full(100, -1.2)
+    lowest[20:80] = -0.9  # sixty frames in the air
+    lowest[5] = -2.0
+    offset = scene_from_world_m(motion_at(frames, places), lowest)
+    np.testing.assert_allclose(offset, [-0.3, 1.2, 5.0], atol=1e-6)
+
+
+def test_the_clip_lasts_as_long_as_the_video() -> None:
+    held = hold_ends(motion_at([4, 6, 9], np.eye(3)), frame_rate=25.0, video_frame_count=21)
+    np.testing.assert_array_equal(held.frame_index, [0, 4, 6, 9, 20])
+    np.testing.assert_allclose(held.time_s, held.frame_index / 25.0, rtol=1e-6)
+    np.testing.assert_array_equal(held.rotations_wxyz[:, 1, 0], [0, 0, 1, 2, 2])
+    np.testing.assert_array_equal(held.root_translation_m[[0, -1]], np.eye(3)[[0, 2]])
+
+
+@pytest.mark.parametrize("frames", [[0, 1, 2], [0, 7, 20]])
+def test_a_clip_that_is_whole_gains_no_key_it_has(frames: list[int]) -> None:
+    held = hold_ends(motion_at(frames, np.eye(3)), frame_rate=30.0, video_frame_count=frames[-1] + 1)
+    np.testing.assert_array_equal(held.frame_index, frames)
