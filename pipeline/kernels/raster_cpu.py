@@ -7,11 +7,13 @@ w_k / z_k and depth = 1 / sum(q). Edge functions are float64: in float32 a pixel
 can fall outside both. NaN must compare false (a face with a NaN corner is dropped), hence no full fastmath.
 """
 
+from typing import Any
+
 import numpy as np
 from numba import njit, prange
 
 BAND_ROWS = 16
-_FLAGS = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "arcp", "nsz"}}
+_FLAGS: dict[str, Any] = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "arcp", "nsz"}}
 
 
 @njit(**_FLAGS)
