@@ -1,0 +1,92 @@
+"""Options that all synthetic captures share, from the command line to a `Capture`."""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from data_tools.backdrop import Room, make_room
+from data_tools.capture import Capture, Heldout, novel_cameras, portrait_camera
+from data_tools.motion import novel_motion
+from data_tools.noise import Noise
+from data_tools.renderer import LIGHTS
+from data_tools.subject import Subject
+from pipeline.avatar.body import Body, Motion
+from pipeline.core.errors import UserError
+from pipeline.geometry.camera import Camera
+from pipeline.io.image import to_float, to_uint8
+
+LEAST_FRAMES, LEAST_SIZE_PX = 2, 32
+
+
+def capture_parser(command: str, description: str) -> argparse.ArgumentParser:
+    """A parser with the options that all captures share."""
+    parser = argparse.ArgumentParser(
+        prog=f"python -m data_tools.{command}",
+        description=description,
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    parser.add_argument("--frames", type=int, default=96, help="number of frames")
+    parser.add_argument("--fps", type=float, default=24.0, help="frames a second")
+    parser.add_argument("--size", type=int, default=540, help="side of the square image in pixels, even")
+    parser.add_argument("--distance", type=float, default=3.6, help="from camera to person, metres")
+    parser.add_argument("--fill", type=float, default=0.82, help="share of the image's height that the person takes")
+    parser.add_argument("--light", choices=sorted(LIGHTS), default="studio", help="flat shows the bare texture")
+    parser.add_argument("--background", choices=("busy", "plain"), default="busy", help="the room")
+    parser.add_argument("--samples", type=int, default=2, help="antialiasing: samples a pixel along each axis")
+    parser.add_argument("--novel-views", type=int, default=4, help="held-out cameras to render into truth/")
+    parser.add_argument("--novel-poses", type=int, default=4, help="held-out poses to render into truth/")
+    parser.add_argument("--seed", type=int, default=0, help="person, clothes and sway; same seed, same bytes")
+    return parser
+
+
+def check_options(options: argparse.Namespace) -> None:
+    """Refuse numbers that cannot make a capture, before any work.
+
+    Raises:
+        UserError: naming the option and its range.
+    """
+    bounds = (
+        ("frames", LEAST_FRAMES, 100_000),
+        ("fps", 1.0, 1000.0),
+        ("size", LEAST_SIZE_PX, 4096),
+        ("distance", 1.0, 50.0),
+        ("fill", 0.05, 0.95),
+        ("samples", 1, 8),
+        ("novel_views", 0, 1000),
+        ("novel_poses", 0, 1000),
+        ("seed", 0, 2**31 - 1),
+    )
+    for name, low, high in bounds:
+        value = getattr(options, name)
+        if not low <= value <= high:
+            raise UserError(f"--{name.replace('_', '-')} {value} is outside {low} to {high}; choose a value within")
+    if options.size % 2:
+        raise UserError(f"--size {options.size} is odd, which H.264 cannot store; choose {options.size + 1}")
+
+
+def stage_scene(options: argparse.Namespace, body: Body) -> tuple[Camera, np.ndarray, Room]:
+    """Camera, ground and room for a person of this height."""
+    camera, ground_m = portrait_camera(options.size, body.height_m(), options.distance, options.fill)
+    room = make_room(camera, ground_m, options.background == "busy", Noise(options.seed))
+    return camera, ground_m, Room(to_float(to_uint8(room.image)), room.floor_m)
+
+
+def assemble(
+    options: argparse.Namespace, subject: Subject, motion: Motion, scene: tuple[Camera, np.ndarray, Room]
+) -> tuple[Capture, Heldout]:
+    """The capture, and its held-out questions."""
+    camera, ground_m, room = scene
+    capture = Capture(subject, motion, camera, LIGHTS[options.light], room, ground_m, options.fps, options.samples)
+    cameras = novel_cameras(camera, ground_m, subject.body.height_m(), options.novel_views)
+    poses = novel_motion(subject.body, ground_m, options.novel_poses) if options.novel_poses else None
+    return capture, Heldout(cameras, poses)
+
+
+def recipe_of(options: argparse.Namespace) -> dict[str, object]:
+    """The options by name, as they go into the truth's recipe."""
+    return {
+        name: value if isinstance(value, int | float | str) else str(value)
+        for name, value in sorted(vars(options).items())
+        if value is not None and not isinstance(value, Path)
+    }

@@ -1,0 +1,132 @@
+"""Lit, antialiased pictures of a textured skinned surface: what the synthetic camera sees."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from data_tools.subject import Subject
+from pipeline.geometry.camera import Camera, project
+from pipeline.geometry.skinning import linear_blend_skinning
+from pipeline.geometry.textured import sample_texture
+from pipeline.kernels.raster import rasterize
+
+
+@dataclass(frozen=True)
+class Light:
+    """One key light from a fixed direction of the world, and ambient light that is stronger from above.
+
+    A key of 0 and an ambient of 1 with no sky shows the bare texture (shadow-free).
+    """
+
+    key: float = 0.55
+    key_from: tuple[float, float, float] = (0.45, 0.65, 0.75)
+    ambient: float = 0.62
+    sky: float = 0.10
+    shine: float = 0.0
+
+
+STUDIO = Light()
+FLAT = Light(key=0.0, ambient=1.0, sky=0.0)
+SHINY = Light(shine=0.35)
+LIGHTS = {"studio": STUDIO, "flat": FLAT, "shiny": SHINY}
+
+SHININESS = 24.0
+
+
+def pose_vertices(subject: Subject, canonical_to_world: Float[Tensor, "j 4 4"]) -> Float[Tensor, "v 3"]:
+    """The clothed surface in one pose, world, metres."""
+    body = subject.body
+    weights = torch.from_numpy(body.skin_weights)
+    return linear_blend_skinning(torch.from_numpy(body.vertices), weights, canonical_to_world[None])[0]
+
+
+def render_subject(
+    subject: Subject, vertices_world: Float[Tensor, "v 3"], camera: Camera, light: Light, samples: int
+) -> Float[np.ndarray, "h w 4"]:
+    """sRGB colours premultiplied by coverage, and the coverage, in [0, 1].
+
+    Each pixel is the mean of `samples` x `samples` shaded look-ups at regular places. Composite with
+    ``rgb + (1 - coverage) * background``.
+    """
+    image = np.zeros((camera.height, camera.width, 4), dtype=np.float32)
+    window = _window(vertices_world, camera)
+    if window is None:
+        return image
+    left, top, width, height = window
+    fine = camera.cropped(left, top, width, height).scaled(samples)
+    shaded = _shade_window(subject, vertices_world, fine, light)
+    mean = shaded.reshape(height, samples, width, samples, 4).mean(axis=(1, 3))
+    image[top : top + height, left : left + width] = mean
+    return image
+
+
+def _window(vertices_world: Float[Tensor, "v 3"], camera: Camera) -> tuple[int, int, int, int] | None:
+    """Left, top, width and height (px) of the part of the image that the surface can touch; None when it is outside."""
+    position_px, _ = project(vertices_world, camera)
+    size = torch.tensor([camera.width, camera.height])
+    low = position_px.amin(0).floor().clamp_min(0).int()
+    high = torch.minimum(position_px.amax(0).ceil(), size).int()
+    if bool((high <= low).any()):
+        return None
+    return int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
+
+
+def _shade_window(
+    subject: Subject, vertices_world: Float[Tensor, "v 3"], camera: Camera, light: Light
+) -> Float[np.ndarray, "h w 4"]:
+    """One shaded look-up a pixel."""
+    faces, faces_uv = torch.from_numpy(subject.body.faces), torch.from_numpy(subject.faces_uv)
+    position_px, depth_m = project(vertices_world, camera)
+    face_id, barycentric, _ = rasterize(position_px, depth_m, faces, camera.height, camera.width)
+    seen = face_id >= 0
+    face, blend = face_id[seen].long(), barycentric[seen][:, :, None]
+    uv = (torch.from_numpy(subject.uv)[faces_uv[face].long()] * blend).sum(1)
+    albedo = sample_texture(subject.texture_tensor(), uv)
+    normals = _normals(vertices_world, faces)
+    corners = faces[face].long()
+    normal = torch.nn.functional.normalize((normals[corners] * blend).sum(1), dim=1)
+    point = (vertices_world[corners] * blend).sum(1)
+    to_camera = torch.nn.functional.normalize(torch.from_numpy(camera.centre_m()) - point, dim=1)
+    image = np.zeros((camera.height, camera.width, 4), dtype=np.float32)
+    image[seen.numpy(), :3] = shade(albedo, normal, to_camera, light).numpy()
+    image[seen.numpy(), 3] = 1.0
+    return image
+
+
+def _normals(vertices: Float[Tensor, "v 3"], faces: Tensor) -> Float[Tensor, "v 3"]:
+    """Area-weighted vertex normals."""
+    corners = vertices[faces.long()]
+    cross = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = torch.zeros_like(vertices)
+    for corner in range(3):
+        normals.index_add_(0, faces[:, corner].long(), cross)
+    return torch.nn.functional.normalize(normals, dim=1)
+
+
+def shade(
+    albedo: Float[Tensor, "n 3"], normal: Float[Tensor, "n 3"], to_camera: Float[Tensor, "n 3"], light: Light
+) -> Float[Tensor, "n 3"]:
+    """sRGB colours under the light: Lambert with a wrapped key light, hemispheric ambient, Blinn-Phong shine.
+
+    All directions are unit vectors in the world; albedo is sRGB, the sum is taken in linear light.
+    """
+    key_from = torch.nn.functional.normalize(torch.tensor(light.key_from), dim=0)
+    wrapped = ((normal @ key_from + 0.25) / 1.25).clamp_min(0.0)
+    irradiance = light.ambient + light.sky * normal[:, 1] + light.key * wrapped
+    half = torch.nn.functional.normalize(key_from + to_camera, dim=1)
+    gloss = light.shine * (normal * half).sum(1).clamp_min(0.0) ** SHININESS
+    return _to_srgb(_to_linear(albedo) * irradiance[:, None] + gloss[:, None])
+
+
+def _to_linear(srgb: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """IEC 61966-2-1."""
+    return torch.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def _to_srgb(linear: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """IEC 61966-2-1, clipped to [0, 1]; inverse of `_to_linear`."""
+    clipped = linear.clamp(0.0, 1.0)
+    return torch.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)

@@ -1,0 +1,33 @@
+"""The built-in sample: a clothed person, generated from the embedded body, turns once before a camera.
+
+python -m data_tools.sample OUT [--frames 96 --size 540 --seed 0 ...]
+"""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from data_tools.capture import refuse_existing, write_capture
+from data_tools.command import run_command
+from data_tools.motion import turn_in_a_pose
+from data_tools.options import assemble, capture_parser, check_options, recipe_of, stage_scene
+from data_tools.person import make_person
+
+
+def main(argv: Sequence[str]) -> None:
+    """Make one capture."""
+    parser = capture_parser("sample", __doc__.splitlines()[0])
+    parser.add_argument("out", type=Path, help="folder to make: OUT/video for the pipeline, OUT/truth beside it")
+    options = parser.parse_args(argv)
+    check_options(options)
+    refuse_existing(options.out)
+    subject, bare = make_person(options.seed)
+    scene = stage_scene(options, subject.body)
+    motion = turn_in_a_pose(subject.body, options.frames, options.fps, scene[1], options.seed)
+    capture, heldout = assemble(options, subject, motion, scene)
+    write_capture(options.out, capture, bare, heldout, {"source": "sample", **recipe_of(options)})
+    print(f"{options.out}/video/video.mp4 and its truth in {options.out}/truth")
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_command(main, sys.argv[1:]))

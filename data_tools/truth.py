@@ -1,0 +1,108 @@
+"""The truth beside a synthetic capture: load it, and check that it explains the video.
+
+python -m data_tools.truth OUT
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from data_tools.backdrop import Room, floor_points
+from data_tools.capture import Capture
+from data_tools.command import run_command
+from data_tools.renderer import Light
+from data_tools.subject import load_subject
+from pipeline.core.errors import UserError
+from pipeline.io.image import read_gray, read_rgb, to_float
+from pipeline.io.npz import load_camera, load_motion
+from pipeline.io.video import open_source, read_frames
+from pipeline.metrics.images import body_pixels, mask_iou, psnr_db
+
+LEAST_PSNR_DB, LEAST_IOU = 45.0, 0.995
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How well the truth explains the video: the worst frame of each figure."""
+
+    frames: int
+    psnr_full_db: float
+    psnr_body_db: float
+    mask_iou: float
+
+    def holds(self) -> bool:
+        """Whether the truth may be trusted."""
+        return min(self.psnr_full_db, self.psnr_body_db) > LEAST_PSNR_DB and self.mask_iou > LEAST_IOU
+
+
+def load_truth(out: Path) -> Capture:
+    """The capture that was written to `out`, ready to be rendered again.
+
+    Raises:
+        UserError: there is no truth, or a file of it is missing or damaged.
+    """
+    truth = out / "truth"
+    if not (truth / "recipe.json").is_file():
+        raise UserError(f"{truth} holds no truth; make a capture with python -m data_tools.sample {out}")
+    recipe = json.loads((truth / "recipe.json").read_text())
+    camera = load_camera(truth / "camera.npz")
+    ground_m = np.array(recipe["ground_m"])
+    light = Light(**{**recipe["light"], "key_from": tuple(recipe["light"]["key_from"])})
+    return Capture(
+        subject=load_subject(truth),
+        motion=load_motion(truth / "motion.npz"),
+        camera=camera,
+        light=light,
+        room=Room(to_float(read_rgb(truth / "room.png")), floor_points(camera, ground_m)),
+        ground_m=ground_m,
+        fps=recipe["fps"],
+        samples=recipe["samples"],
+    )
+
+
+def true_mask(out: Path, frame: int) -> UInt8[np.ndarray, "h w"]:
+    """Coverage by the person, 0 to 255, of one frame (by its index in the video)."""
+    return read_gray(out / "truth" / "masks" / f"{frame:06d}.png")
+
+
+def check(out: Path, every: int = 1) -> Agreement:
+    """Render the stored truth again and compare it with the decoded video and the stored masks.
+
+    every: look at each `every`-th frame.
+    """
+    capture = load_truth(out)
+    source = open_source(out / "video")
+    scores = []
+    longer_side_px = max(capture.camera.width, capture.camera.height)
+    for frame in read_frames(source, lambda index: index % every == 0, longer_side_px):
+        picture, coverage = capture.frame(frame.index)
+        stored = body_pixels(true_mask(out, frame.index))
+        full, body = psnr_db(picture, frame.rgb), psnr_db(picture, frame.rgb, stored)
+        scores.append((full, body, mask_iou(body_pixels(coverage), stored)))
+    return Agreement(len(scores), *(float(worst) for worst in np.min(scores, axis=0)))
+
+
+def _main(argv: Sequence[str]) -> None:
+    parser = argparse.ArgumentParser(prog="python -m data_tools.truth", description=__doc__.splitlines()[0])
+    parser.add_argument("out", type=Path, help="folder of a synthetic capture")
+    parser.add_argument("--every", type=int, default=8, help="look at each n-th frame (default 8)")
+    options = parser.parse_args(argv)
+    agreement = check(options.out, options.every)
+    print(
+        f"{agreement.frames} frames, worst: {agreement.psnr_full_db:.1f} dB in all, "
+        f"{agreement.psnr_body_db:.1f} dB on the body, mask IoU {agreement.mask_iou:.4f}"
+    )
+    if not agreement.holds():
+        raise UserError(
+            f"{options.out} contradicts its truth (wanted {LEAST_PSNR_DB} dB and IoU {LEAST_IOU}); make it again"
+        )
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_command(_main, sys.argv[1:]))
