@@ -1,0 +1,201 @@
+"""Person masks: from a detector's blurred guess to soft edges at the image's own resolution. Pure functions.
+
+The letters used here: I colour of a pixel, F and B the colours of person and background around it, alpha the part of
+the pixel that the person covers, so that I = alpha F + (1 - alpha) B. Alphas are float32 in [0, 1].
+"""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+# The detector's mask is a 256-cell grid over a square 1.25 times as high as the person.
+_CELLS_PER_PERSON = 256 / 1.25
+# In cells: how far the detector's outline may be wrong, and how far away colours are gathered. Widths of 3 / 6 / 9 / 12
+# cells for the latter give IoU 0.983 / 0.985 / 0.985 / 0.984 on the green-screen capture.
+_BAND_CELLS, _COLOUR_CELLS = 3.0, 6.0
+# Standard deviation (of 1) that no colour cloud goes below: video noise. 3 / 5 / 10 of 255: IoU 0.986 / 0.985 / 0.982.
+_COLOUR_NOISE = 4.0 / 255.0
+# How much the detector's word weighs, in the unit of a squared Mahalanobis distance: at its outline, and far from it.
+_PRIOR_AT_EDGE, _PRIOR_CERTAIN = 0.3, 10.0
+_PRIOR_RAMP = 0.2
+_RIM_PX = 2
+# Parts smaller than this share of the person are specks, holes smaller than this share are noise.
+_SPECK_SHARE, _HOLE_SHARE = 0.05, 2e-4
+
+
+class _Cloud(NamedTuple):
+    """Colours around each pixel: total weight, mean and covariance (xx, xy, xz, yy, yz, zz)."""
+
+    weight: Float[np.ndarray, "h w"]
+    mean: Float[np.ndarray, "h w 3"]
+    covariance: Float[np.ndarray, "h w 6"]
+
+
+def sharpen_mask(rgb: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Alpha with the image's own edges from a soft mask (0..255) that is smooth where the image is sharp.
+
+    The colours on both sides of the outline are gathered around each pixel (weighted Gaussian clouds); alpha is the
+    position of the pixel's colour between them along Fisher's linear discriminant, where clouds that spread in some
+    direction count less in it. It is then averaged with the mask, each weighted by how sure it is: the colours by the
+    squared distance of the clouds, the mask by its distance from 0.5. Done twice, so that the colours are gathered
+    with the better outline. Only the surroundings of the outline can gain area.
+    """
+    if not (mask > 127).any():
+        return np.zeros(mask.shape, dtype=np.float32)
+    window = _window(mask > 25, margin_px=round((_BAND_CELLS + 2 * _COLOUR_CELLS) * _cell_px(mask > 127)) + 2)
+    image = rgb[window].astype(np.float32) / 255.0
+    guess = mask[window].astype(np.float32) / 255.0
+    cell_px = _cell_px(guess > 0.5)
+    reach = cv2.dilate((guess > 0.5).astype(np.uint8), _disc(round(_BAND_CELLS * cell_px))) > 0
+    alpha = guess
+    for _ in range(2):
+        alpha = np.where(reach, _recolour(image, alpha, guess, cell_px), 0.0).astype(np.float32)
+    whole = np.zeros(mask.shape, dtype=np.float32)
+    whole[window] = clean_alpha(alpha)
+    return whole
+
+
+def clean_alpha(alpha: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Drop specks and pinholes; 1 inside and 0 outside except in a rim along the outline, where alpha stays soft.
+
+    Gaps that are larger than noise (between arm and body) stay; parts cut off from the person stay when they are large.
+    """
+    body = _largest_parts(alpha > 0.5)
+    body = ~_without_specks(~body, _HOLE_SHARE * body.sum())
+    kernel = _disc(_RIM_PX)
+    outer = cv2.dilate(body.astype(np.uint8), kernel) > 0
+    inner = cv2.erode(body.astype(np.uint8), kernel) > 0
+    soft = np.where(body, np.maximum(alpha, 0.5), np.minimum(alpha, 0.5))
+    return np.where(inner, 1.0, np.where(outer, soft, 0.0)).astype(np.float32)
+
+
+def steady_mask(
+    images: UInt8[np.ndarray, "t h w 3"], masks: UInt8[np.ndarray, "t h w"], centre: int, noise: float
+) -> UInt8[np.ndarray, "h w"]:
+    """The mask at time `centre`, averaged with those of other times where the image is the same there.
+
+    A mask that changes where the image does not is flicker. The weight of another time falls with the squared change of
+    the (slightly blurred) colour in units of `noise` (levels of 255), so that moving limbs are left alone.
+    """
+    blurred = [cv2.blur(image, (5, 5)).astype(np.float32) for image in images]
+    total = masks[centre].astype(np.float32)
+    weights = np.ones_like(total)
+    for time in range(len(images)):
+        if time == centre:
+            continue
+        change = np.abs(blurred[time] - blurred[centre]).max(axis=-1) / (3.0 * noise)
+        weight = np.exp(-(change**2)).astype(np.float32)
+        total += weight * masks[time]
+        weights += weight
+    return np.rint(total / weights).astype(np.uint8)
+
+
+def outline(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """The mask's pixels that touch its outside."""
+    return mask & (cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
+
+
+def _cell_px(person: Bool[np.ndarray, "h w"]) -> float:
+    """Size of the detector's grid cell in pixels of this image, at least one."""
+    rows = np.flatnonzero(person.any(axis=1))
+    return max(1.0, float(rows[-1] - rows[0] + 1) / _CELLS_PER_PERSON)
+
+
+def _window(mask: Bool[np.ndarray, "h w"], margin_px: int) -> tuple[slice, slice]:
+    """Rows and columns of the mask's box with a margin, inside the image."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return (
+        slice(max(0, rows[0] - margin_px), rows[-1] + margin_px + 1),
+        slice(max(0, columns[0] - margin_px), columns[-1] + margin_px + 1),
+    )
+
+
+def _recolour(
+    image: Float[np.ndarray, "h w 3"],
+    alpha: Float[np.ndarray, "h w"],
+    guess: Float[np.ndarray, "h w"],
+    cell_px: float,
+) -> Float[np.ndarray, "h w"]:
+    """One round of `sharpen_mask`: new alpha from the clouds that the old alpha separates, and the detector's guess."""
+    radius_px = max(2, round(_COLOUR_CELLS * cell_px))
+    person = _gather(image, np.clip(2.0 * alpha - 1.0, 0.0, 1.0) ** 2, radius_px)
+    background = _gather(image, np.clip(1.0 - 2.0 * alpha, 0.0, 1.0) ** 2, 2 * radius_px)
+    position, distance = _discriminate(image, person, background)
+    distance = np.where((person.weight > 1.0) & (background.weight > 1.0), distance, 0.0)
+    prior = np.clip((guess - 0.5) / (2.0 * _PRIOR_RAMP) + 0.5, 0.0, 1.0)
+    prior_weight = _PRIOR_AT_EDGE + _PRIOR_CERTAIN * (2.0 * guess - 1.0) ** 2
+    return np.clip((distance * position + prior_weight * prior) / (distance + prior_weight), 0.0, 1.0)
+
+
+def _gather(image: Float[np.ndarray, "h w 3"], weight: Float[np.ndarray, "h w"], radius_px: int) -> _Cloud:
+    """Weighted mean and covariance of the colours in the square window around each pixel."""
+    size = (2 * radius_px + 1, 2 * radius_px + 1)
+
+    def windowed(values: np.ndarray) -> np.ndarray:
+        return cv2.boxFilter(values, cv2.CV_32F, size, normalize=False)
+
+    x, y, z = cv2.split(image)
+    total = windowed(weight)
+    scale = 1.0 / (total + 1e-6)
+    mean = [windowed(channel * weight) * scale for channel in (x, y, z)]
+    pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+    channels = (x, y, z)
+    covariance = [windowed(channels[a] * channels[b] * weight) * scale - mean[a] * mean[b] for a, b in pairs]
+    return _Cloud(total, np.stack(mean, axis=-1), np.stack(covariance, axis=-1))
+
+
+def _discriminate(
+    image: Float[np.ndarray, "h w 3"], person: _Cloud, background: _Cloud
+) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
+    """Position of each colour on Fisher's discriminant (0 at B, 1 at F, cut off at -0.2 and 1.2), and its certainty.
+
+    With S the sum of both covariances and d = F - B: w = S^-1 d, position = w.(I - B) / w.d, certainty = w.d, the
+    squared Mahalanobis distance of the clouds. S^-1 is written out as adjugate over determinant, for every pixel.
+    """
+    xx, xy, xz, yy, yz, zz = cv2.split((person.covariance + background.covariance).reshape(-1, 1, 6))
+    floor = np.float32(_COLOUR_NOISE**2)
+    xx, yy, zz = xx + floor, yy + floor, zz + floor
+    d = (person.mean - background.mean).reshape(-1, 3)
+    dx, dy, dz = (d[:, i : i + 1] for i in range(3))
+    adjugate = (
+        yy * zz - yz * yz,
+        xz * yz - xy * zz,
+        xy * yz - xz * yy,
+        xx * zz - xz * xz,
+        xy * xz - xx * yz,
+        xx * yy - xy * xy,
+    )
+    axx, axy, axz, ayy, ayz, azz = adjugate
+    determinant = np.maximum(xx * axx + xy * axy + xz * axz, floor**3)
+    w = np.concatenate(
+        [axx * dx + axy * dy + axz * dz, axy * dx + ayy * dy + ayz * dz, axz * dx + ayz * dy + azz * dz], axis=1
+    )
+    w /= determinant
+    distance = (w * d).sum(axis=1)
+    position = (w * (image - background.mean).reshape(-1, 3)).sum(axis=1) / np.maximum(distance, 1e-6)
+    shape = image.shape[:2]
+    return np.clip(position, -0.2, 1.2).reshape(shape), distance.reshape(shape)
+
+
+def _largest_parts(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """The largest connected part and every other that is not small beside it."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    if count == 1:
+        return mask
+    areas = stats[1:, cv2.CC_STAT_AREA]
+    return np.concatenate([[False], areas >= _SPECK_SHARE * areas.max()])[labels]
+
+
+def _without_specks(mask: Bool[np.ndarray, "h w"], smallest_area_px: float) -> Bool[np.ndarray, "h w"]:
+    """The connected parts that have at least this area."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+    keep = stats[:, cv2.CC_STAT_AREA] >= smallest_area_px
+    keep[0] = False
+    return keep[labels]
+
+
+def _disc(radius_px: int) -> UInt8[np.ndarray, "k k"]:
+    size = 2 * max(0, radius_px) + 1
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))

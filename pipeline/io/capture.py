@@ -1,0 +1,124 @@
+"""The artifact of the `frames` stage, and the one reader of it that all later stages use."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from pipeline.geometry.camera import UPRIGHT_WORLD_TO_CAMERA, Camera
+from pipeline.io.image import read_gray, read_rgb, to_float
+from pipeline.io.npz import load_npz, save_npz
+
+FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, CONTACT_SHEET = "frames.npz", "images", "masks", "contact.jpg"
+
+
+@dataclass(frozen=True)
+class Capture:
+    """The chosen frames of a recording: n frames, all of one size.
+
+    frame_index: index in the whole recording; time_s: since its first frame.
+    split: 0 train, 1 validation, 2 held out (see `pipeline.avatar.selection.split_of`).
+    landmarks_px: MediaPipe's 33 points, pixel centres at +0.5; nan where unknown. Visibility in [0, 1].
+    landmarks_world_m: metres about the hips' centre in camera axes; nan where unknown.
+    camera: what was supplied with the video, for these images; None when unknown.
+    scale: size of these images relative to the recording's. Images are undistorted.
+    """
+
+    folder: Path
+    frame_index: Int[np.ndarray, "n"]
+    time_s: Float[np.ndarray, "n"]
+    split: UInt8[np.ndarray, "n"]
+    fps: float
+    width: int
+    height: int
+    landmarks_px: Float[np.ndarray, "n 33 2"]
+    landmarks_visibility: Float[np.ndarray, "n 33"]
+    landmarks_world_m: Float[np.ndarray, "n 33 3"]
+    camera: Camera | None
+    mask_source: str
+    n_video_frames: int
+    scale: float
+
+    def __len__(self) -> int:
+        return len(self.frame_index)
+
+    def positions(self, split: int) -> Int[np.ndarray, "k"]:
+        """Positions (0..n-1) of the frames of one split."""
+        return np.flatnonzero(self.split == split)
+
+    def image(self, position: int) -> Float[np.ndarray, "h w 3"]:
+        """Colours of the frame at this position (not its index in the recording), sRGB in [0, 1]."""
+        return to_float(read_rgb(image_path(self.folder, int(self.frame_index[position]))))
+
+    def mask(self, position: int) -> Float[np.ndarray, "h w"]:
+        """Alpha of the person in [0, 1], soft along the outline."""
+        return to_float(read_gray(mask_path(self.folder, int(self.frame_index[position]))))
+
+
+def image_path(folder: Path, frame_index: int) -> Path:
+    """Where the picture with this index in the recording lies."""
+    return folder / IMAGES_FOLDER / f"{frame_index:06d}.png"
+
+
+def mask_path(folder: Path, frame_index: int) -> Path:
+    """Where its mask lies."""
+    return folder / MASKS_FOLDER / f"{frame_index:06d}.png"
+
+
+def save_capture(capture: Capture) -> None:
+    """Write `frames.npz` into the capture's folder; images and masks are written beside it as they are made."""
+    camera = capture.camera
+    intrinsics = {
+        f"camera_{name}": np.float64(getattr(camera, name) if camera else np.nan) for name in ("fx", "fy", "cx", "cy")
+    }
+    pose = camera.world_to_camera if camera else UPRIGHT_WORLD_TO_CAMERA
+    arrays: dict[str, np.ndarray] = {
+        "frame_index": capture.frame_index.astype(np.int32),
+        "time_s": capture.time_s.astype(np.float64),
+        "split": capture.split,
+        "fps": np.float64(capture.fps),
+        "width": np.int32(capture.width),
+        "height": np.int32(capture.height),
+        "landmarks_px": capture.landmarks_px.astype(np.float32),
+        "landmarks_visibility": capture.landmarks_visibility.astype(np.float32),
+        "landmarks_world_m": capture.landmarks_world_m.astype(np.float32),
+        "camera_world_to_camera": np.asarray(pose, dtype=np.float32),
+        "camera_distortion": np.zeros(0),
+        "mask_source": np.array(capture.mask_source),
+        "n_video_frames": np.int32(capture.n_video_frames),
+        "scale": np.float64(capture.scale),
+    }
+    save_npz(capture.folder / FRAMES_NPZ, arrays | intrinsics)
+
+
+def load_capture(frames_dir: Path) -> Capture:
+    """Read what the `frames` stage made; images and masks are read when they are asked for.
+
+    Raises UserError when the folder holds no readable `frames.npz`.
+    """
+    arrays = load_npz(frames_dir / FRAMES_NPZ)
+    return Capture(
+        folder=frames_dir,
+        frame_index=arrays["frame_index"],
+        time_s=arrays["time_s"],
+        split=arrays["split"],
+        fps=float(arrays["fps"]),
+        width=int(arrays["width"]),
+        height=int(arrays["height"]),
+        landmarks_px=arrays["landmarks_px"],
+        landmarks_visibility=arrays["landmarks_visibility"],
+        landmarks_world_m=arrays["landmarks_world_m"],
+        camera=_camera(arrays),
+        mask_source=str(arrays["mask_source"]),
+        n_video_frames=int(arrays["n_video_frames"]),
+        scale=float(arrays["scale"]),
+    )
+
+
+def _camera(arrays: Mapping[str, np.ndarray]) -> Camera | None:
+    fx, fy, cx, cy = (float(arrays[f"camera_{name}"]) for name in ("fx", "fy", "cx", "cy"))
+    if not np.isfinite([fx, fy, cx, cy]).all():
+        return None
+    return Camera(fx, fy, cx, cy, int(arrays["width"]), int(arrays["height"]), arrays["camera_world_to_camera"])

@@ -1,0 +1,246 @@
+"""The two walks through a recording: look for the person in every frame, then write the chosen frames with masks."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from pipeline.avatar.person import PersonDetector
+from pipeline.core.errors import UserError
+from pipeline.core.progress import track
+from pipeline.geometry.matte import sharpen_mask, steady_mask
+from pipeline.io.capture import IMAGES_FOLDER, MASKS_FOLDER, image_path, mask_path
+from pipeline.io.image import to_uint8, write_gray, write_rgb
+from pipeline.io.supplied import N_LANDMARKS, Supplied
+from pipeline.io.video import Frame, Source, read_frames
+from pipeline.io.workers import Workers
+
+# Longer side of the small grey pictures on which frames are compared.
+_SMALL_SIDE_PX = 320
+# Mask level of 255 from which a pixel counts as the person there.
+_PERSON_LEVEL = 100
+
+
+class _Look(NamedTuple):
+    """What one frame shows; `mask_png` is empty where masks are supplied."""
+
+    gray: UInt8[np.ndarray, "h w"]
+    person: Bool[np.ndarray, "h w"]
+    landmarks: Float[np.ndarray, "33 6"] | None
+    mask_png: bytes
+    n_people: int
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """All frames that were looked at, n of them, in order.
+
+    grays, persons: small pictures and person masks; masks_png: the detector's soft masks, PNG-encoded to save memory.
+    landmarks as in `Capture`, nan where no person was found. n_people: -1 where people were not counted.
+    """
+
+    frame_index: Int[np.ndarray, "n"]
+    time_s: Float[np.ndarray, "n"]
+    found: Bool[np.ndarray, "n"]
+    n_people: Int[np.ndarray, "n"]
+    grays: UInt8[np.ndarray, "n h w"]
+    persons: Bool[np.ndarray, "n h w"]
+    landmarks_px: Float[np.ndarray, "n 33 2"]
+    landmarks_visibility: Float[np.ndarray, "n 33"]
+    landmarks_world_m: Float[np.ndarray, "n 33 3"]
+    masks_png: tuple[bytes, ...]
+    width: int
+    height: int
+    scale: float
+
+
+def look_at_all(
+    source: Source, supplied: Supplied, stride: int, n_counted: int, max_side_px: int, workers: Workers
+) -> Sightings:
+    """Find the person in every `stride`-th frame; in `n_counted` of them, evenly spread, count the people.
+
+    Raises UserError when the recording yields no frame.
+    """
+    looked_at = range(0, source.n_frames, stride)
+    counted = {looked_at[int(k)] for k in np.linspace(0, len(looked_at) - 1, n_counted)} if looked_at else set()
+    seen: list[tuple[int, float]] = []
+    shape: list[tuple[int, int, float]] = []
+
+    def tasks() -> Iterator[tuple[object, ...]]:
+        for frame in read_undistorted(source, supplied, lambda index: index % stride == 0, max_side_px):
+            seen.append((frame.index, frame.time_s))
+            shape.append((*frame.rgb.shape[:2], frame.scale))
+            mask = supplied_mask(supplied, frame)
+            yield frame.rgb, mask, supplied.landmarks is None, frame.index in counted
+
+    looks = list(track(workers.map(_look, tasks()), "looking for the person", total=len(looked_at)))
+    if not looks:
+        raise UserError(f"{source.path} has no frame that can be read; give another video")
+    height, width, scale = shape[0]
+    landmarks = _landmarks(looks, np.array([index for index, _ in seen]), supplied, scale)
+    return Sightings(
+        frame_index=np.array([index for index, _ in seen], dtype=np.int32),
+        time_s=np.array([time_s for _, time_s in seen]),
+        found=np.isfinite(landmarks[..., :2]).all(axis=(1, 2)) & np.array([bool(look.person.any()) for look in looks]),
+        n_people=np.array([look.n_people for look in looks], dtype=np.int32),
+        grays=np.stack([look.gray for look in looks]),
+        persons=np.stack([look.person for look in looks]),
+        landmarks_px=landmarks[..., :2],
+        landmarks_visibility=np.nan_to_num(landmarks[..., 2]),
+        landmarks_world_m=landmarks[..., 3:],
+        masks_png=tuple(look.mask_png for look in looks),
+        width=width,
+        height=height,
+        scale=scale,
+    )
+
+
+def write_frames(
+    source: Source,
+    supplied: Supplied,
+    sightings: Sightings,
+    positions: Sequence[int],
+    out: Path,
+    max_side_px: int,
+    noise: float,
+    workers: Workers,
+) -> None:
+    """Write the picture and the mask of the sightings at `positions` into `out`.
+
+    A supplied mask is written as it is; the detector's is steadied with its neighbours in time and sharpened.
+    """
+    for folder in (IMAGES_FOLDER, MASKS_FOLDER):
+        (out / folder).mkdir(exist_ok=True)
+    wanted = set(positions)
+    needed = {int(sightings.frame_index[p]) for k in wanted for p in _neighbours(k, sightings)}
+    frames = read_undistorted(source, supplied, needed.__contains__, max_side_px)
+
+    def tasks() -> Iterator[tuple[object, ...]]:
+        for position, near in _windows(frames, sightings, wanted):
+            images = np.stack([frame.rgb for frame in near])
+            centre = [frame.index for frame in near].index(int(sightings.frame_index[position]))
+            if supplied.read_mask is not None:
+                yield images[centre], supplied_mask(supplied, near[centre]), out, near[centre].index
+            else:
+                masks = [sightings.masks_png[p] for p in _neighbours(position, sightings)]
+                yield images, masks, out, near[centre].index, centre, noise
+
+    function = _write_supplied if supplied.read_mask is not None else _write_sharpened
+    for _ in track(workers.map(function, tasks()), "sharpening masks", total=len(wanted)):
+        pass
+
+
+def read_undistorted(
+    source: Source, supplied: Supplied, is_wanted: Callable[[int], bool], max_side_px: int
+) -> Iterator[Frame]:
+    """The recording's frames with the supplied camera's lens distortion taken out."""
+    for frame in read_frames(source, is_wanted, max_side_px):
+        if supplied.camera is None:
+            yield frame
+        else:
+            yield Frame(frame.index, frame.time_s, supplied.camera.undistort(frame.rgb, frame.scale), frame.scale)
+
+
+def supplied_mask(supplied: Supplied, frame: Frame) -> UInt8[np.ndarray, "h w"] | None:
+    """The user's mask for a frame at the frame's size, lens distortion taken out; None when none was given."""
+    if supplied.read_mask is None:
+        return None
+    mask = supplied.read_mask(frame.index)
+    height, width = frame.rgb.shape[:2]
+    if abs(mask.shape[0] / mask.shape[1] - height / width) > 0.01 * height / width:
+        raise UserError(
+            f"the mask of frame {frame.index} in {supplied.mask_source} is {mask.shape[1]}x{mask.shape[0]}, "
+            f"the frame is {width}x{height}; give masks of the frames' shape"
+        )
+    mask = cv2.resize(mask, (width, height), interpolation=cv2.INTER_AREA)
+    return mask if supplied.camera is None else supplied.camera.undistort(mask[..., None], frame.scale)[..., 0]
+
+
+@cache
+def _detector() -> PersonDetector:
+    """One detector a process; loading it takes seconds."""
+    return PersonDetector()
+
+
+def _look(
+    rgb: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"] | None, needs_landmarks: bool, is_counted: bool
+) -> _Look:
+    """Runs in a worker: find the person in one frame."""
+    detection = _detector().detect(rgb) if needs_landmarks or mask is None else None
+    n_people = _detector().count_people(rgb) if is_counted and mask is None else -1
+    factor = min(1.0, _SMALL_SIDE_PX / max(rgb.shape[:2]))
+    size = (max(1, round(rgb.shape[1] * factor)), max(1, round(rgb.shape[0] * factor)))
+    gray = cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
+    landmarks, mask_png = None, b""
+    if detection is not None:
+        landmarks = np.concatenate(
+            [detection.landmarks_px, detection.visibility[:, None], detection.landmarks_world_m], axis=1
+        )
+    if mask is None and detection is not None:
+        mask = detection.mask
+        mask_png = cv2.imencode(".png", mask, (cv2.IMWRITE_PNG_COMPRESSION, 1))[1].tobytes()
+    if mask is None:
+        return _Look(gray, np.zeros(gray.shape, dtype=bool), None, b"", n_people)
+    person = cv2.resize(mask, size, interpolation=cv2.INTER_AREA) > _PERSON_LEVEL
+    return _Look(gray, person, landmarks, mask_png, n_people)
+
+
+def _landmarks(
+    looks: Sequence[_Look], frame_index: Int[np.ndarray, "n"], supplied: Supplied, scale: float
+) -> Float[np.ndarray, "n 33 6"]:
+    """Pixel position, visibility and world position of all landmarks; nan where no person was found."""
+    if supplied.landmarks is None:
+        missing = np.full((N_LANDMARKS, 6), np.nan, dtype=np.float32)
+        return np.stack([missing if look.landmarks is None else look.landmarks for look in looks])
+    given = supplied.landmarks
+    points_px = given.landmarks_px[frame_index]
+    if supplied.camera is not None:
+        points_px = supplied.camera.undistort_points(points_px)
+    parts = [points_px * scale, given.visibility[frame_index][..., None], given.landmarks_world_m[frame_index]]
+    return np.concatenate(parts, axis=-1).astype(np.float32)
+
+
+def _neighbours(position: int, sightings: Sightings) -> list[int]:
+    """The position and those beside it, where a person was found."""
+    beside = range(max(0, position - 1), min(len(sightings.found), position + 2))
+    return [p for p in beside if p == position or sightings.found[p]]
+
+
+def _windows(frames: Iterable[Frame], sightings: Sightings, wanted: set[int]) -> Iterator[tuple[int, list[Frame]]]:
+    """For each wanted position, in order: its frame and those of its neighbours, as soon as they have been read."""
+    held: dict[int, Frame] = {}
+    waiting = sorted(wanted)
+    for frame in frames:
+        held[frame.index] = frame
+        while waiting:
+            near = [int(sightings.frame_index[p]) for p in _neighbours(waiting[0], sightings)]
+            if frame.index < near[-1]:
+                break
+            yield waiting.pop(0), [held[index] for index in near]
+            held = {index: kept for index, kept in held.items() if index >= near[0]}
+
+
+def _write_supplied(
+    rgb: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"], out: Path, frame_index: int
+) -> None:
+    write_rgb(image_path(out, frame_index), rgb)
+    write_gray(mask_path(out, frame_index), mask)
+
+
+def _write_sharpened(
+    images: UInt8[np.ndarray, "t h w 3"],
+    masks_png: Sequence[bytes],
+    out: Path,
+    frame_index: int,
+    centre: int,
+    noise: float,
+) -> None:
+    """Runs in a worker: the finished mask of one frame."""
+    masks = np.stack([cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) for data in masks_png])
+    alpha = sharpen_mask(images[centre], steady_mask(images, masks, centre, noise))
+    _write_supplied(images[centre], to_uint8(alpha), out, frame_index)

@@ -1,0 +1,129 @@
+"""frames: from a recording to the pictures that matter, each with the person's mask and 33 landmarks."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from pydantic import Field
+
+from pipeline.avatar import selection
+from pipeline.core.cli import main
+from pipeline.core.config import Config as BaseConfig
+from pipeline.core.errors import UserError
+from pipeline.core.stage import Stage
+from pipeline.io.capture import CONTACT_SHEET, FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, Capture, save_capture
+from pipeline.io.contact import contact_sheet
+from pipeline.io.image import write_rgb
+from pipeline.io.screening import refuse_bad_input, warn_of_gaps
+from pipeline.io.sightings import Sightings, look_at_all, write_frames
+from pipeline.io.supplied import Supplied, find_supplied
+from pipeline.io.video import Source, open_source
+from pipeline.io.workers import start_workers
+
+_COUNTED_FRAMES = 6
+
+
+class Config(BaseConfig):
+    """Options of the frames stage."""
+
+    max_frames: int = Field(200, ge=16, le=2000, description="Most frames that are kept (held-out ones included).")
+    min_frames: int = Field(16, ge=5, le=1000, description="Fewest frames with a person that a run goes on with.")
+    max_looked_at: int = Field(900, ge=16, description="Most frames in which the person is looked for.")
+    max_side_px: int = Field(1280, ge=64, le=8192, description="Longer side of the stored images at most this, pixels.")
+    duplicate_noise: float = Field(
+        3.0, ge=0.0, le=100.0, description="Frames nearer than this to the last kept one are dropped, times the noise."
+    )
+    workers: int = Field(2, ge=1, le=64, description="Processes that look for the person and sharpen masks.")
+
+
+def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, float]:
+    """Find the person in all frames, choose frames, write images, masks, landmarks and a contact sheet."""
+    source = open_source(inputs["video"])
+    supplied = find_supplied(inputs["video"], source)
+    if source.n_frames < config.min_frames:
+        raise UserError(f"{source.path} has {source.n_frames} frames, too few: give at least {config.min_frames}")
+    with start_workers(config.workers) as workers:
+        stride = looking_stride(source.n_frames, config.max_looked_at)
+        sightings = look_at_all(source, supplied, stride, _COUNTED_FRAMES, config.max_side_px, workers)
+        refuse_bad_input(sightings, source.path, config.min_frames)
+        noise = selection.noise_level(sightings.grays)
+        chosen, n_duplicates = choose(sightings, source.path, config, noise)
+        # Colour noise of a small blurred patch is never below one level, whatever the small grey pictures say.
+        write_frames(source, supplied, sightings, chosen, out, config.max_side_px, max(1.0, noise), workers)
+    capture = make_capture(sightings, chosen, out, source, supplied)
+    save_capture(capture)
+    write_rgb(out / CONTACT_SHEET, contact_sheet(capture))
+    unseen_rad = selection.largest_gap_rad(selection.body_yaw_rad(capture.landmarks_world_m))
+    warn_of_gaps(sightings, unseen_rad, source.path)
+    return {
+        "frames": len(chosen),
+        "masks_count": len(chosen),
+        "frames_train": len(capture.positions(selection.TRAIN)),
+        "frames_validation": len(capture.positions(selection.VALIDATION)),
+        "frames_heldout": len(capture.positions(selection.HELDOUT)),
+        "video_frames": source.n_frames,
+        "dropped_no_person": int((~sightings.found).sum()),
+        "dropped_duplicates": n_duplicates,
+        "noise_levels": noise,
+        "landmark_visibility": float(capture.landmarks_visibility.mean()),
+        "unseen_arc_deg": float(np.degrees(unseen_rad)),
+        "scale": sightings.scale,
+    }
+
+
+def looking_stride(n_frames: int, max_looked_at: int) -> int:
+    """The smallest odd step that looks at few enough frames; odd, so that every index modulo 8 occurs as often."""
+    stride = -(-n_frames // max_looked_at)
+    return stride + 1 - stride % 2
+
+
+def choose(sightings: Sightings, path: Path, config: Config, noise: float) -> tuple[list[int], int]:
+    """Positions of the frames to keep, and how many were dropped as near-duplicates."""
+    found = np.flatnonzero(sightings.found)
+    threshold = config.duplicate_noise * noise
+    distinct, way = selection.distinct_frames(sightings.grays[found], sightings.persons[found], threshold)
+    kept = found[distinct]
+    chosen = kept[selection.choose_frames(sightings.frame_index[kept], way[distinct], config.max_frames)]
+    n_splits = len(np.unique(selection.split_of(sightings.frame_index[chosen])))
+    if len(chosen) < config.min_frames or n_splits < 3:
+        raise UserError(
+            f"{path} has only {len(chosen)} frames in which the person has moved, {config.min_frames} are needed; "
+            "film a slow full turn, or lower frames.duplicate_noise"
+        )
+    return [int(position) for position in chosen], int((~distinct).sum())
+
+
+def make_capture(sightings: Sightings, chosen: list[int], out: Path, source: Source, supplied: Supplied) -> Capture:
+    """Gather what is known about the chosen frames."""
+    frame_index = sightings.frame_index[chosen]
+    return Capture(
+        folder=out,
+        frame_index=frame_index,
+        time_s=sightings.time_s[chosen],
+        split=selection.split_of(frame_index),
+        fps=source.fps,
+        width=sightings.width,
+        height=sightings.height,
+        landmarks_px=sightings.landmarks_px[chosen],
+        landmarks_visibility=sightings.landmarks_visibility[chosen],
+        landmarks_world_m=sightings.landmarks_world_m[chosen],
+        camera=None
+        if supplied.camera is None
+        else supplied.camera.at(sightings.scale, sightings.width, sightings.height),
+        mask_source=supplied.mask_source or "detector",
+        n_video_frames=source.n_frames,
+        scale=sightings.scale,
+    )
+
+
+STAGE = Stage(
+    "frames",
+    version=1,
+    needs=("video",),
+    makes=(FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, CONTACT_SHEET),
+    config=Config,
+    run=run,
+)
+
+if __name__ == "__main__":
+    raise SystemExit(main(STAGE))
