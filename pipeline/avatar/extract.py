@@ -6,7 +6,7 @@ The solid whose surface is taken is therefore: density above a level, or deeper 
 inset; never farther from the body than clothes and hair reach; cavities filled.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import fast_simplification
@@ -64,6 +64,11 @@ class CanonicalSamples:
     density: Float[np.ndarray, "x y z"]
     body_distance_m: Float[np.ndarray, "x y z"]
     hand_share: Float[np.ndarray, "x y z"]
+
+    def coarser(self) -> "CanonicalSamples":
+        """Every second sample."""
+        grids = (grid[::2, ::2, ::2] for grid in (self.density, self.body_distance_m, self.hand_share))
+        return CanonicalSamples(self.origin_m, 2.0 * self.spacing_m, *grids)
 
 
 def sample_canonical(density_of: Callable[[Tensor], Tensor], body: Body, config: ExtractConfig) -> CanonicalSamples:
@@ -156,6 +161,19 @@ def extract_mesh(samples: CanonicalSamples, level_per_m: float, config: ExtractC
     Raises ValueError when the level leaves nothing.
     """
     return repair(isosurface(solid(samples, level_per_m, config), HALF, samples.origin_m, samples.spacing_m))
+
+
+def choose_level(
+    samples: CanonicalSamples, config: ExtractConfig, levels_per_m: Sequence[float], score: Callable[[Mesh], float]
+) -> tuple[float, float]:
+    """The density level (1/m) whose surface scores best, and its score; tried on every second sample."""
+    coarse = samples.coarser()
+    scores = []
+    for level in levels_per_m:
+        mesh = isosurface(solid(coarse, level, config), HALF, coarse.origin_m, coarse.spacing_m)
+        scores.append(score(mesh))
+    best = int(np.argmax(scores))
+    return float(levels_per_m[best]), scores[best]
 
 
 def simplify(mesh: Mesh, edge_m: float) -> Mesh:

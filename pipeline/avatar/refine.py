@@ -15,23 +15,27 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float
 from pydantic import Field
 from scipy.sparse import csc_array, diags_array, eye_array
 from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
 from pipeline.avatar.body import Body
-from pipeline.avatar.extract import transfer_skin_weights
+from pipeline.avatar.mesh_views import (
+    Shade,
+    Skin,
+    View,
+    face_errors,
+    render_view,
+    skin_of,
+    target_over,
+    validation_psnr_db,
+)
 from pipeline.core.config import Config
 from pipeline.core.progress import track
-from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
-from pipeline.geometry.raster import face_adjacency, render_shaded
-from pipeline.geometry.skinning import linear_blend_skinning, top_k_weights
 from pipeline.geometry.surface import is_closed_manifold, laplacian, remesh, repair, subdivide
-
-Shade = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n 3"]]
 
 
 class RefineConfig(Config):
@@ -74,25 +78,6 @@ class RefineConfig(Config):
 
 
 @dataclass(frozen=True)
-class View:
-    """A crop of a frame around the person: colours and mask 0..255, and the pose that was held then."""
-
-    image: UInt8[Tensor, "h w 3"]
-    mask: UInt8[Tensor, "h w"]
-    camera: Camera
-    canonical_to_world: Float[Tensor, "j 4 4"]
-
-
-@dataclass(frozen=True)
-class Skin:
-    """A mesh that can be posed and rendered: torch copies of what stays fixed while vertices move."""
-
-    faces: Int[Tensor, "f 3"]
-    adjacency: Int[Tensor, "f 3"]
-    weights: Float[Tensor, "v j"]
-
-
-@dataclass(frozen=True)
 class Refined:
     """Where the refinement stands after a round: also what a checkpoint holds."""
 
@@ -122,29 +107,6 @@ def smoothing_factor(mesh: Mesh, stiffness: float) -> SuperLU:
     operator = laplacian(mesh)
     degree = np.bincount(mesh.edges().ravel(), minlength=len(mesh.vertices))
     return splu(csc_array(eye_array(len(mesh.vertices)) + stiffness * (diags_array(degree.astype(float)) @ operator)))
-
-
-def skin_of(mesh: Mesh, body: Body) -> Skin:
-    """Four influences a vertex (as exported), in dense rows; adjacency for the silhouettes."""
-    indices, kept = top_k_weights(transfer_skin_weights(mesh, body))
-    dense = np.zeros((len(mesh.vertices), len(body.joint_names)), dtype=np.float32)
-    np.add.at(dense, (np.arange(len(dense))[:, None], indices), kept)
-    faces = torch.from_numpy(mesh.faces.astype(np.int64))
-    return Skin(faces, face_adjacency(faces), torch.from_numpy(dense))
-
-
-def render_view(
-    vertices: Float[Tensor, "v 3"], skin: Skin, view: View, shade: Shade
-) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"], Int[Tensor, "h w"]]:
-    """Premultiplied colour, alpha and face ids of the canonical mesh in a view's pose; colours are asked for at
-    canonical points."""
-    posed = linear_blend_skinning(vertices, skin.weights, view.canonical_to_world[None])[0]
-    return render_shaded(posed, skin.faces, view.camera, vertices, shade, skin.adjacency)
-
-
-def _target(view: View, background: Float[Tensor, "3"]) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
-    mask = view.mask.float() / 255.0
-    return view.image.float() / 255.0 * mask[..., None] + (1.0 - mask[..., None]) * background, mask
 
 
 def refine(
@@ -240,7 +202,7 @@ def _view_loss(
     config: RefineConfig,
 ) -> Float[Tensor, ""]:
     image, alpha, _ = render_view(vertices, skin, view, shade)
-    target, mask = _target(view, background)
+    target, mask = target_over(view, background)
     colour = torch.nn.functional.huber_loss(image + (1.0 - alpha[..., None]) * background, target, delta=0.1)
     # Huber with delta 0.1 is 0.1 |e| for large errors: the factor 10 makes weight 1 mean the mean absolute error
     return config.colour_weight * 10.0 * colour + config.alpha_weight * (alpha - mask).abs().mean()
@@ -291,32 +253,6 @@ def _to_torch(matrix: csc_array) -> Tensor:
     positions = torch.from_numpy(np.stack(entries.coords).astype(np.int64))
     values = torch.from_numpy(entries.data.astype(np.float32))
     return torch.sparse_coo_tensor(positions, values, matrix.shape, check_invariants=True).coalesce()
-
-
-@torch.no_grad()
-def face_errors(mesh: Mesh, skin: Skin, views: Sequence[View], shade: Shade) -> Float[np.ndarray, "f"]:
-    """Colour error (sum over channels, pixels and views of the absolute difference, white behind) that lands on each
-    face."""
-    total = np.zeros(len(mesh.faces))
-    vertices, white = torch.from_numpy(mesh.vertices), torch.ones(3)
-    for view in views:
-        image, alpha, face_id = render_view(vertices, skin, view, shade)
-        error = (image + (1.0 - alpha[..., None]) - _target(view, white)[0]).abs().sum(2)
-        seen = face_id >= 0
-        total += np.bincount(face_id[seen].numpy(), error[seen].numpy(), minlength=len(total))
-    return total
-
-
-@torch.no_grad()
-def validation_psnr_db(mesh: Mesh, skin: Skin, views: Sequence[View], shade: Shade) -> float:
-    """PSNR of all crops together, white behind; 0 when there is no view."""
-    vertices, white = torch.from_numpy(mesh.vertices), torch.ones(3)
-    squared, count = 0.0, 0
-    for view in views:
-        image, alpha, _ = render_view(vertices, skin, view, shade)
-        error = image + (1.0 - alpha[..., None]) - _target(view, white)[0]
-        squared, count = squared + float(error.square().sum()), count + error.numel()
-    return -10.0 * float(np.log10(max(squared / count, 1e-12))) if count else 0.0
 
 
 def adapt_triangles(mesh: Mesh, errors: Float[np.ndarray, "f"], edge_m: float, config: RefineConfig) -> Mesh:
