@@ -1,0 +1,112 @@
+"""The canonical radiance field: hash grid, one hidden layer, colour and density.
+
+Colour depends on the place alone: an avatar's texture must not hold the light of one view.
+"""
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pipeline.kernels.hashgrid import GridLayout, encode
+
+START_DENSITY_PER_M = 10.0
+"""Before training a torso of 0.2 m is seen as 86 % opaque: enough for a signal, not so much that the inside gets none."""
+
+QUERY_POINTS = 1 << 18
+
+
+class _Decode(torch.autograd.Function):
+    """relu(features W1) W2 + b, sigmoid for three colours, exp for the density; four matrix products back.
+
+    The exponent is clamped, but its gradient is not cut there (as the truncated exponential of Instant-NGP), so that a density
+    that ran away comes back.
+    """
+
+    @staticmethod
+    def forward(ctx, features, hidden, output, bias):
+        activation = (features @ hidden).clamp_(min=0)
+        raw = torch.addmm(bias, activation, output)
+        colour = torch.sigmoid(raw[:, :3])
+        density = START_DENSITY_PER_M * torch.exp(raw[:, 3].clamp(-12.0, 7.0))
+        ctx.save_for_backward(features, hidden, output, activation, colour, density)
+        return colour, density
+
+    @staticmethod
+    def backward(ctx, colour_gradient, density_gradient):
+        features, hidden, output, activation, colour, density = ctx.saved_tensors
+        raw_gradient = torch.empty_like(features[:, :4])
+        torch.mul(colour_gradient, colour * (1 - colour), out=raw_gradient[:, :3])
+        torch.mul(density_gradient, density, out=raw_gradient[:, 3])
+        activation_gradient = (raw_gradient @ output.T).mul_(activation > 0)
+        return (
+            activation_gradient @ hidden.T,
+            features.T @ activation_gradient,
+            activation.T @ raw_gradient,
+            raw_gradient.sum(0),
+        )
+
+
+class Field(torch.nn.Module):
+    """Colour and density of canonical points.
+
+    bounds_m: (2, 3) box outside which there is nothing. layout: the hash grid's levels, over that box.
+    """
+
+    def __init__(
+        self, bounds_m: Float[np.ndarray, "2 3"], layout: GridLayout, hidden_width: int = 64, seed: int = 0
+    ) -> None:
+        super().__init__()
+        self.layout = layout
+        self.register_buffer("bounds_m", torch.tensor(bounds_m, dtype=torch.float32))
+        random = torch.Generator().manual_seed(seed)
+        self.table = _uniform((layout.rows, layout.features), 1e-4, random)
+        self.hidden = _uniform((layout.width, hidden_width), math.sqrt(6 / layout.width), random)
+        self.output = _uniform((hidden_width, 4), math.sqrt(1 / hidden_width), random)
+        self.bias = torch.nn.Parameter(torch.zeros(4))
+
+    def radiance(
+        self, x_canonical_m: Float[Tensor, "n 3"], table_gradient: Tensor | None = None
+    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+        """Colour and density without the cut at the bounds; for training. `table_gradient`: see `encode`."""
+        unit = (x_canonical_m - self.bounds_m[0]) / (self.bounds_m[1] - self.bounds_m[0])
+        features = encode(unit, self.table, self.layout, table_gradient)
+        return _Decode.apply(features, self.hidden, self.output, self.bias)
+
+    def forward(self, x_canonical: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+        """Colour (n, 3) in [0, 1] and density (n) in 1/m >= 0 of canonical points (m); density is 0 outside the bounds."""
+        inside = ((x_canonical >= self.bounds_m[0]) & (x_canonical <= self.bounds_m[1])).all(-1)
+        colour, density = self.radiance(x_canonical)
+        return colour, density * inside
+
+    def density(self, x_canonical: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        """Density (1/m) alone, without gradient, in parts that fit into the cache."""
+        with torch.no_grad():
+            return torch.cat([self(part)[1] for part in x_canonical.split(QUERY_POINTS)])
+
+    def colour(self, x_canonical: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Colour alone, without gradient, in parts that fit into the cache."""
+        with torch.no_grad():
+            return torch.cat([self(part)[0] for part in x_canonical.split(QUERY_POINTS)])
+
+
+def _uniform(shape: tuple[int, int], limit: float, random: torch.Generator) -> torch.nn.Parameter:
+    return torch.nn.Parameter((2 * torch.rand(shape, generator=random) - 1) * limit)
+
+
+def choose_layout(
+    bounds_m: Float[np.ndarray, "2 3"], finest_cell_m: float, levels: int, features: int, log2_rows: int
+) -> GridLayout:
+    """Levels from an eighth of the box's longest side down to the finest cell, in equal ratios.
+
+    finest_cell_m: what a pixel covers on the body: finer cells cannot be observed (Nyquist), coarser ones blur.
+    """
+    extent = np.asarray(bounds_m[1] - bounds_m[0], dtype=np.float64)
+    coarsest = max(float(extent.max()) / 16, finest_cell_m)
+    ratio = (finest_cell_m / coarsest) ** (1 / max(levels - 1, 1))
+    cells = tuple(
+        tuple(max(1, math.ceil(side / (coarsest * ratio**level))) for side in extent) for level in range(levels)
+    )
+    return GridLayout(cells, features, log2_rows)

@@ -1,0 +1,67 @@
+"""Options of stage one, with the meaning and unit of each."""
+
+from typing import Literal
+
+from pydantic import Field as Option
+
+from pipeline.core.config import Config
+
+
+class FieldConfig(Config):
+    """What steers the learning of the canonical field."""
+
+    seed: int = Option(0, ge=0, description="seed of all random draws")
+    steps: int = Option(1600, ge=1, le=200_000, description="training steps")
+    rays: int = Option(4096, ge=64, le=1 << 18, description="rays a step")
+    frames_per_step: int = Option(8, ge=1, le=64, description="frames that a step's rays come from")
+    max_frames: int = Option(120, ge=2, description="training frames kept, evenly spread; each holds about 3 MB")
+    max_person_px: int = Option(
+        640, ge=32, description="images are scaled down until the person is at most this tall, px"
+    )
+
+    levels: int = Option(6, ge=1, le=16, description="levels of the hash grid")
+    features: Literal[1, 2, 4, 8] = Option(4, description="features a level")
+    log2_rows: int = Option(17, ge=8, le=24, description="log2 of the most rows a level may have")
+    finest_cell_px: float = Option(1.0, gt=0, description="finest cell of the hash grid, in pixels at the body's depth")
+    hidden_width: int = Option(64, ge=8, le=512, description="width of the hidden layer")
+
+    margin_m: float = Option(
+        0.10, gt=0, le=0.6, description="how far clothing and hair may stand off the fitted body, m"
+    )
+    step_fraction: float = Option(0.005, gt=0, le=0.1, description="ray step, as a part of the body's height")
+    pixel_jitter: bool = Option(True, description="rays start anywhere in their pixel instead of its centre")
+    share_border: float = Option(0.25, ge=0, le=1, description="part of the rays along the mask's border")
+    share_outside: float = Option(0.1, ge=0, le=1, description="part of the rays outside the mask")
+    border_px: int = Option(4, ge=1, description="half width of the border, px")
+
+    occupancy: Literal["attention", "plain"] = Option("attention", description="how the occupancy grid is updated")
+    occupancy_every: int = Option(16, ge=1, description="steps between updates of the occupancy grid")
+    occupancy_start: int = Option(128, ge=0, description="step of the first update that may empty a cell")
+    occupancy_threshold: float = Option(
+        0.01, ge=0, le=1, description="mean opacity of a step above which a cell is occupied"
+    )
+    occupancy_decay: float = Option(
+        0.95, gt=0, lt=1, description="moving average of the occupancy, part kept an update"
+    )
+    attention_rate: float = Option(3e-3, gt=0, description="learning rate of the voxel attention")
+    mask_support: float = Option(
+        0.6, ge=0, le=1, description="part of the frames whose mask must hold a cell, at the start"
+    )
+
+    table_rate: float = Option(1e-2, gt=0, description="learning rate of the hash table")
+    network_rate: float = Option(3e-3, gt=0, description="learning rate of the network")
+    final_rate: float = Option(
+        0.03, gt=0, le=1, description="learning rates at the end, as a part of those at the start"
+    )
+    huber_delta: float = Option(0.1, gt=0, description="colour error where the Huber loss turns from square to linear")
+    weight_alpha: float = Option(0.3, ge=0, description="weight of the alpha loss")
+    weight_hard: float = Option(0.02, ge=0, description="weight of the hard-surface loss")
+    weight_density: float = Option(0.05, ge=0, description="weight of the density loss in empty cells")
+    empty_points: int = Option(2048, ge=0, description="points a step at which emptiness is asked for")
+
+    pose_refinement: bool = Option(True, description="learn small corrections of the poses")
+    pose_start: float = Option(0.25, ge=0, le=1, description="part of the steps after which poses are refined")
+    pose_rate: float = Option(5e-4, gt=0, description="learning rate of the poses, rad (shifts: a third of it, m)")
+    pose_smoothness: float = Option(0.3, ge=0, description="weight of the change of corrections from frame to frame")
+    pose_size: float = Option(0.03, ge=0, description="weight of the size of corrections")
+    validation_frames: int = Option(4, ge=0, description="validation frames that are rendered to judge the result")

@@ -1,0 +1,48 @@
+"""Losses of stage one (IHM, Wang et al. 2025, section 2.4)."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pipeline.avatar.field_config import FieldConfig
+
+HARD_OFFSET = math.log(1 + math.exp(-1))
+"""Makes the hard-surface loss zero where alpha is 0 or 1."""
+
+
+def huber(error: Float[Tensor, "..."], delta: float) -> Float[Tensor, "..."]:
+    """error² / (2 delta) below delta, |error| - delta / 2 above: slope one for large errors whatever delta is."""
+    return torch.nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none", delta=delta) / delta
+
+
+def hard_surface(alpha: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+    """-log(exp(-|a|) + exp(-|a - 1|)) + const: 0 for alpha in {0, 1}, largest at one half (LOLNeRF, Rebain et al. 2022)."""
+    return HARD_OFFSET - torch.log(torch.exp(-alpha.abs()) + torch.exp(-(alpha - 1).abs()))
+
+
+def field_losses(
+    image: Float[Tensor, "n 3"],
+    alpha: Float[Tensor, "n"],
+    empty_density_per_m: Float[Tensor, "e"],
+    rgba: Float[Tensor, "n 4"],
+    background: Float[Tensor, "n 3"],
+    config: FieldConfig,
+) -> dict[str, Tensor]:
+    """Weighted losses of one batch of rays.
+
+    image: premultiplied. rgba: straight colour and mask of the pixels. background: laid behind both, random for each ray,
+    so that no colour can pass for transparency.
+    """
+    mask = rgba[:, 3]
+    target = rgba[:, :3] * mask[:, None] + background * (1 - mask[:, None])
+    shown = image + background * (1 - alpha[:, None])
+    losses = {
+        "colour": huber(shown - target, config.huber_delta).mean(),
+        "alpha": config.weight_alpha * huber(alpha - mask, config.huber_delta).mean(),
+        "hard": config.weight_hard * hard_surface(alpha).mean(),
+    }
+    if len(empty_density_per_m):
+        losses["density"] = config.weight_density * 0.01 * empty_density_per_m.mean()
+    return losses

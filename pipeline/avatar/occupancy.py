@@ -1,0 +1,162 @@
+"""Which cells of canonical space may hold something: 64³ voxels, one grid for the whole sequence.
+
+IHM (Wang et al. 2025), section 2.2: starts from the A-posed body, and is updated by a moving average of the field's density,
+weighted by voxel attention, a two-layer network on density, distance to the body surface and frequency over time. The paper
+does not say how that network learns. Here it learns from what the training rays saw: a voxel that light reached is an example,
+positive if it gave weight to a pixel, negative if the light went through. Voxels that no light reached (the inside of the body)
+give no example and are judged by what the network learnt from the others.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from pipeline.kernels.visits import record_visits
+
+RESOLUTION = 64
+HIDDEN = 16
+
+
+@dataclass(frozen=True)
+class Occupancy:
+    """Occupied cells (not zero) of a grid that fills the box `bounds_m`."""
+
+    occupied: UInt8[Tensor, "gx gy gz"]
+    bounds_m: Float[Tensor, "2 3"]
+
+    def contains(self, points_m: Float[Tensor, "n 3"]) -> Tensor:
+        """True for each canonical point in an occupied cell."""
+        size = torch.tensor(self.occupied.shape, device=points_m.device)
+        index = ((points_m - self.bounds_m[0]) / (self.bounds_m[1] - self.bounds_m[0]) * size).floor().long()
+        inside = ((index >= 0) & (index < size)).all(-1)
+        index = torch.where(inside[:, None], index, 0)
+        return inside & (self.occupied[tuple(index.unbind(-1))] != 0)
+
+
+def cell_centres(bounds_m: Float[np.ndarray, "2 3"], resolution: int = RESOLUTION) -> Float[np.ndarray, "cells 3"]:
+    """Centres (m) of the cells, x slowest."""
+    steps = (np.arange(resolution) + 0.5) / resolution
+    unit = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
+    return (bounds_m[0] + unit * (bounds_m[1] - bounds_m[0])).astype(np.float32)
+
+
+class VoxelAttention(torch.nn.Module):
+    """(density, distance, frequency) -> weight in [0, 1]; near one before it has learnt anything."""
+
+    def __init__(self, margin_m: float, seed: int) -> None:
+        super().__init__()
+        self.margin_m = margin_m
+        random = torch.Generator().manual_seed(seed)
+        self.first = torch.nn.Linear(3, HIDDEN)
+        self.second = torch.nn.Linear(HIDDEN, 1)
+        for weight in (self.first.weight, self.second.weight):
+            weight.data.uniform_(-0.6, 0.6, generator=random)
+        self.first.bias.data.zero_()
+        self.second.bias.data.fill_(2.0)
+
+    def forward(
+        self, density_per_m: Float[Tensor, "n"], distance_m: Float[Tensor, "n"], frequency: Float[Tensor, "n"]
+    ) -> Float[Tensor, "n"]:
+        """Logit of the weight. density >= 0; distance negative inside the body; frequency in [0, 1]."""
+        inputs = torch.stack(
+            [0.5 * torch.log1p(density_per_m) - 1, distance_m / self.margin_m, 2 * frequency - 1], dim=-1
+        )
+        return self.second(torch.relu(self.first(inputs))).squeeze(-1)
+
+
+class OccupancyUpdate:
+    """The state that changes while the field learns: moving average, what rays saw, and the attention network."""
+
+    def __init__(
+        self,
+        shell: Float[np.ndarray, "gx gy gz"],
+        distance_m: Float[np.ndarray, "gx gy gz"],
+        frequency: Float[np.ndarray, "gx gy gz"],
+        bounds_m: Float[np.ndarray, "2 3"],
+        margin_m: float,
+        attention: bool,
+        learning_rate: float,
+        decay: float,
+        seed: int,
+    ) -> None:
+        self.bounds_m = torch.tensor(bounds_m, dtype=torch.float32)
+        self.shape = shell.shape
+        self.cells = torch.from_numpy(np.flatnonzero(shell))
+        self.centres_m = torch.from_numpy(cell_centres(bounds_m, shell.shape[0]))[self.cells]
+        self.distance_m = torch.from_numpy(distance_m.reshape(-1).astype(np.float32))[self.cells]
+        self.frequency = torch.from_numpy(frequency.reshape(-1).astype(np.float32))[self.cells]
+        self.average = torch.ones(len(self.cells))
+        self.reached, self.gave = torch.zeros(shell.size), torch.zeros(shell.size)
+        self.decay = decay
+        self.attention = VoxelAttention(margin_m, seed) if attention else None
+        if self.attention is not None:
+            self.optimiser = torch.optim.Adam(self.attention.parameters(), lr=learning_rate)
+        self.occupied = torch.zeros(shell.shape, dtype=torch.uint8)
+        self.occupied.view(-1)[self.cells] = 1
+
+    def grid(self) -> Occupancy:
+        return Occupancy(self.occupied, self.bounds_m)
+
+    def record(self, points_m: Float[Tensor, "s 3"], light: Float[Tensor, "s"], weights: Float[Tensor, "s"]) -> None:
+        """Note for each sample's cell how much light reached it and how much of a pixel it gave."""
+        record_visits(points_m, light, weights, self.bounds_m, self.shape, self.reached, self.gave)
+
+    @torch.no_grad()
+    def update(self, density_of, step_m: float, threshold: float, random: np.random.Generator) -> None:
+        """One update of all cells of the shell.
+
+        density_of: canonical points (n, 3) -> density (n); asked at a random point of each cell.
+        step_m: length over which a density becomes an opacity. threshold: average opacity at which a cell is occupied.
+        """
+        cell_m = (self.bounds_m[1] - self.bounds_m[0]) / torch.tensor(self.shape)
+        offset = torch.from_numpy(random.random((len(self.cells), 3), dtype=np.float32)) - 0.5
+        density = density_of(self.centres_m + offset * cell_m)
+        opacity = -torch.expm1(-density * step_m)
+        if self.attention is None:
+            self.average = torch.maximum(self.average * self.decay, opacity)
+        else:
+            weight = torch.sigmoid(self._learn(density))
+            self.average = self.decay * self.average + (1 - self.decay) * weight * opacity
+        kept = self.average > min(threshold, float(self.average.mean()))
+        self.occupied.view(-1)[self.cells] = kept.to(torch.uint8)
+        self.reached *= 0.8
+        self.gave *= 0.8
+
+    def _learn(self, density: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+        """One step of the attention network on the cells that light reached lately; returns the logits of all cells."""
+        reached, gave = self.reached[self.cells], self.gave[self.cells]
+        seen = (reached > 0.25).float()
+        target = (gave / 0.05).clamp(max=1)
+        with torch.enable_grad():
+            logit = self.attention(density, self.distance_m, self.frequency)
+            loss = torch.nn.functional.binary_cross_entropy_with_logits(logit, target, seen, reduction="sum")
+            self.optimiser.zero_grad()
+            (loss / seen.sum().clamp(min=1)).backward()
+            self.optimiser.step()
+        return logit.detach()
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything that a resumed run needs."""
+        tensors = {"average": self.average, "reached": self.reached, "gave": self.gave, "occupied": self.occupied}
+        if self.attention is None:
+            return tensors
+        for name, parameter in self.attention.named_parameters():
+            moments = self.optimiser.state.get(parameter, {})
+            tensors[f"attention.{name}"] = parameter.detach()
+            tensors |= {f"attention.{name}.{key}": value for key, value in moments.items()}
+        return tensors
+
+    def load_state(self, tensors: dict[str, Tensor]) -> None:
+        """Go on from `state()`."""
+        self.average, self.reached, self.gave = (tensors[name].clone() for name in ("average", "reached", "gave"))
+        self.occupied.copy_(tensors["occupied"])
+        if self.attention is None:
+            return
+        for name, parameter in self.attention.named_parameters():
+            parameter.data.copy_(tensors[f"attention.{name}"])
+            keys = [key for key in ("step", "exp_avg", "exp_avg_sq") if f"attention.{name}.{key}" in tensors]
+            if keys:
+                self.optimiser.state[parameter] = {key: tensors[f"attention.{name}.{key}"].clone() for key in keys}

@@ -1,0 +1,81 @@
+"""Small corrections of the fitted poses, learnt with the field and smooth in time."""
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pipeline.avatar.body import Body, Motion
+from pipeline.geometry.rotation import axis_angle_to_quaternion, quaternion_multiply, quaternion_to_matrix
+from pipeline.geometry.skinning import forward_kinematics, skinning_transforms
+
+MAIN_JOINTS = (
+    "Hips", "Spine", "Spine1", "Spine2", "Neck", "Head",
+    "LeftShoulder", "LeftArm", "LeftForeArm", "LeftHand", "RightShoulder", "RightArm", "RightForeArm", "RightHand",
+    "LeftUpLeg", "LeftLeg", "LeftFoot", "RightUpLeg", "RightLeg", "RightFoot",
+)  # fmt: skip
+
+
+class PoseCorrection:
+    """An axis-angle vector for each main joint and a shift of the root, for each training frame, in time order.
+
+    A joint turns by its correction before its fitted local rotation is applied to what hangs on it: R = R_fit · exp(correction).
+    """
+
+    def __init__(self, body: Body, motion: Motion) -> None:
+        self.body, self.motion = body, motion
+        self.joints = [body.joint(name) for name in MAIN_JOINTS if name in body.joint_names]
+        frames = len(motion.frame_index)
+        self.rotation_rad = torch.zeros(frames, len(self.joints), 3, requires_grad=True)
+        self.shift_m = torch.zeros(frames, 3, requires_grad=True)
+        self._joints_m = torch.as_tensor(body.joints_m)
+        self._quaternions = torch.as_tensor(motion.rotations_wxyz)
+        self._root_m = torch.as_tensor(motion.root_translation_m)
+        gaps_s = np.diff(motion.time_s.astype(np.float64)) if frames > 1 else np.zeros(0)
+        self._gap = torch.tensor(
+            np.maximum(gaps_s / max(np.median(gaps_s), 1e-9), 1e-3) if len(gaps_s) else gaps_s
+        ).float()
+
+    def canonical_to_world(self, rows: Tensor) -> Float[Tensor, "k j 4 4"]:
+        """Skinning matrices of some frames, differentiable in the corrections."""
+        quaternions = self._corrected(rows)
+        posed = forward_kinematics(
+            quaternion_to_matrix(quaternions),
+            self._root_m[rows] + self.shift_m[rows],
+            self._joints_m,
+            self.body.parents,
+        )
+        return skinning_transforms(posed, self._joints_m)
+
+    def roughness(self) -> Tensor:
+        """Mean squared change of the corrections from frame to frame (rad² and, in decimetres, m²)."""
+        if len(self.shift_m) < 2:
+            return torch.zeros(())
+        turn = self.rotation_rad.diff(dim=0).square().sum((1, 2)) / self._gap
+        shift = (10 * self.shift_m.diff(dim=0)).square().sum(1) / self._gap
+        return (turn + shift).mean()
+
+    def size(self) -> Tensor:
+        """Mean squared correction."""
+        return self.rotation_rad.square().sum((1, 2)).mean() + (10 * self.shift_m).square().sum(1).mean()
+
+    def corrected(self, motion: Motion) -> Motion:
+        """Another motion (any frames) with the corrections interpolated to its times, held at the ends."""
+        known, wanted = self.motion.time_s.astype(np.float64), motion.time_s.astype(np.float64)
+        rotation = _interpolate(wanted, known, self.rotation_rad.detach().numpy().reshape(len(known), -1))
+        shift = _interpolate(wanted, known, self.shift_m.detach().numpy())
+        quaternions = torch.as_tensor(motion.rotations_wxyz).clone()
+        turn = axis_angle_to_quaternion(torch.from_numpy(rotation.reshape(len(wanted), -1, 3)))
+        quaternions[:, self.joints] = quaternion_multiply(quaternions[:, self.joints], turn)
+        return motion.with_pose(quaternions.numpy(), motion.root_translation_m + shift)
+
+    def _corrected(self, rows: Tensor) -> Float[Tensor, "k j 4"]:
+        base = self._quaternions[rows]
+        turn = axis_angle_to_quaternion(self.rotation_rad[rows])
+        turned = quaternion_multiply(base[:, self.joints], turn)
+        return base.index_copy(1, torch.tensor(self.joints), turned)
+
+
+def _interpolate(wanted: np.ndarray, known: np.ndarray, values: np.ndarray) -> np.ndarray:
+    columns = [np.interp(wanted, known, values[:, column]) for column in range(values.shape[1])]
+    return np.stack(columns, axis=-1).astype(np.float32)

@@ -1,0 +1,85 @@
+"""From a fitted body and the pictures to a field that is ready to learn."""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import UInt8
+
+from pipeline.avatar.body import Body, Motion, canonical_to_world
+from pipeline.avatar.field import Field, choose_layout
+from pipeline.avatar.field_config import FieldConfig
+from pipeline.avatar.occupancy import OccupancyUpdate, cell_centres
+from pipeline.avatar.rays import build_pool
+from pipeline.avatar.support import cell_distances_m, field_bounds_m, mask_frequency, starting_shell
+from pipeline.avatar.train import Learning, Scene
+from pipeline.avatar.warp import build_skin_grid, skin_margin_m
+from pipeline.geometry.camera import Camera, world_to_camera_points
+
+SUPPORT_FRAMES = 32
+"""Frames that are asked which cells their masks hold."""
+
+Picture = tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]
+
+
+def body_depth_m(motion: Motion, camera: Camera) -> float:
+    """Median depth of the body's root before the camera."""
+    roots = world_to_camera_points(torch.as_tensor(motion.root_translation_m), camera)
+    return float(roots[:, 2].median())
+
+
+def training_scale(body: Body, motion: Motion, camera: Camera, max_person_px: int) -> float:
+    """Factor by which images shrink so that the standing person is at most `max_person_px` tall; at most 1."""
+    person_px = body.height_m() * camera.fy / body_depth_m(motion, camera)
+    return min(1.0, max_person_px / person_px)
+
+
+def spread(count: int, limit: int) -> np.ndarray:
+    """At most `limit` of the positions 0..count-1, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(np.int64))
+
+
+def start_learning(
+    body: Body, motion: Motion, camera: Camera, pictures: Sequence[Picture], config: FieldConfig
+) -> Learning:
+    """Choose box, grid levels and starting cells from the data, and set everything up.
+
+    pictures: image and mask of each frame of `motion`, for `camera`.
+    """
+    bounds_m = field_bounds_m(body, config.margin_m)
+    skin = build_skin_grid(body, skin_margin_m(body, bounds_m))
+    pixel_m = body_depth_m(motion, camera) / camera.fy
+    distance_m = cell_distances_m(body, bounds_m)
+    near = distance_m < config.margin_m
+    frequency = np.zeros(distance_m.shape, dtype=np.float32)
+    rows = spread(len(pictures), SUPPORT_FRAMES)
+    cell_px = 0.5 * float((bounds_m[1] - bounds_m[0]).max()) / distance_m.shape[0] / pixel_m
+    frequency[near] = mask_frequency(
+        cell_centres(bounds_m)[near.reshape(-1)],
+        skin,
+        canonical_to_world(body, motion.select(rows)),
+        camera,
+        [dilate(pictures[row][1] >= 128, cell_px) for row in rows],
+    )
+    layout = choose_layout(bounds_m, pixel_m * config.finest_cell_px, config.levels, config.features, config.log2_rows)
+    occupancy = OccupancyUpdate(
+        starting_shell(distance_m, frequency, config.margin_m, config.mask_support),
+        distance_m,
+        frequency,
+        bounds_m,
+        margin_m=config.margin_m,
+        attention=config.occupancy == "attention",
+        learning_rate=config.attention_rate,
+        decay=config.occupancy_decay,
+        seed=config.seed,
+    )
+    pool = build_pool(pictures, config.border_px, config.seed)
+    field = Field(bounds_m, layout, config.hidden_width, config.seed)
+    return Learning(Scene(body, motion, camera, pool, skin), field, occupancy, config)
+
+
+def dilate(mask: np.ndarray, radius_px: float) -> UInt8[np.ndarray, "h w"]:
+    """The mask widened by a disc."""
+    size = 2 * int(np.ceil(radius_px)) + 1
+    return cv2.dilate(mask.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))

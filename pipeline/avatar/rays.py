@@ -1,0 +1,91 @@
+"""The pixels that training draws from: on the body, along its border, and a few outside."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+KINDS = ("body", "border", "outside")
+OUTSIDE_PER_FRAME = 20_000
+
+
+@dataclass(frozen=True)
+class PixelPool:
+    """Pixels of all training frames, frame by frame and kind by kind.
+
+    xy_px: column and row. rgba: colour and mask, uint8. start: (frames, 4) offsets; the pixels of kind q of frame f are
+    start[f, q] : start[f, q + 1].
+    """
+
+    xy_px: Int[np.ndarray, "p 2"]
+    rgba: UInt8[np.ndarray, "p 4"]
+    start: Int[np.ndarray, "frames 4"]
+
+    @property
+    def frames(self) -> int:
+        return len(self.start)
+
+    def draw(
+        self, frames: Int[np.ndarray, "k"], rays: int, shares: tuple[float, float, float], random: np.random.Generator
+    ) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
+        """Rows of random pixels, about `rays` in all, and the slot (position in `frames`) of each; sorted by slot, then place.
+
+        shares: parts of the rays on the body, its border and outside; a frame without pixels of a kind draws none of it.
+        """
+        rows, slots = [], []
+        for slot, frame in enumerate(frames):
+            mine = []
+            for kind, share in enumerate(shares):
+                first, last = self.start[frame, kind], self.start[frame, kind + 1]
+                count = round(rays * share / len(frames)) if last > first else 0
+                mine.append(random.integers(first, max(last, first + 1), count))
+            drawn = np.sort(np.concatenate(mine))
+            rows.append(drawn)
+            slots.append(np.full(len(drawn), slot))
+        return np.concatenate(rows), np.concatenate(slots)
+
+
+def build_pool(
+    images: Iterable[tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]], border_px: int, seed: int
+) -> PixelPool:
+    """Sort the pixels of each (image, mask) into the three kinds.
+
+    border_px: half width of the band around the mask's edge. Outside pixels come from the body's box, widened by a tenth,
+    and are thinned to a fixed number a frame.
+    """
+    xy, rgba, starts, total = [], [], [], 0
+    for index, (image, mask) in enumerate(images):
+        start = [total]
+        for place in _kinds(mask, border_px, np.random.default_rng((seed, index))):
+            rows, columns = place
+            xy.append(np.stack([columns, rows], axis=-1).astype(np.int16))
+            rgba.append(np.concatenate([image[rows, columns], mask[rows, columns, None]], axis=-1))
+            total += len(rows)
+            start.append(total)
+        starts.append(start)
+    return PixelPool(np.concatenate(xy), np.concatenate(rgba), np.array(starts, dtype=np.int64))
+
+
+def _kinds(mask: UInt8[np.ndarray, "h w"], border_px: int, random: np.random.Generator) -> list[tuple]:
+    """Rows and columns of the body, border and outside pixels of one mask."""
+    solid = (mask >= 128).astype(np.uint8)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * border_px + 1, 2 * border_px + 1))
+    outer, inner = cv2.dilate(solid, kernel), cv2.erode(solid, kernel, borderValue=0)
+    border = (outer > inner) | ((mask > 0) & (mask < 255) & (outer > 0))
+    rows, columns = np.nonzero(outer)
+    outside = np.zeros(mask.shape, dtype=bool)
+    if len(rows):
+        pad = 8 + int(0.1 * (np.ptp(rows) + 1))
+        outside[max(rows.min() - pad, 0) : rows.max() + pad, max(columns.min() - pad, 0) : columns.max() + pad] = True
+    outside &= (outer == 0) & (mask == 0)
+    far = np.flatnonzero(outside)
+    if len(far) > OUTSIDE_PER_FRAME:
+        far = np.sort(random.choice(far, OUTSIDE_PER_FRAME, replace=False))
+    return [np.nonzero(solid & ~border), np.nonzero(border), np.unravel_index(far, mask.shape)]
+
+
+def pixel_footprint_m(depths_m: Float[np.ndarray, "n"], focal_px: float) -> float:
+    """What one pixel covers at the typical depth of the body."""
+    return float(np.median(depths_m)) / focal_px

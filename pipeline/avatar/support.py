@@ -1,0 +1,59 @@
+"""Where the masks allow a person to be: the box of the field and the cells that training starts with."""
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from pipeline.avatar.body import Body
+from pipeline.avatar.occupancy import RESOLUTION, cell_centres
+from pipeline.geometry.camera import Camera, project
+from pipeline.geometry.surface import signed_distance_m
+from pipeline.kernels.reference.warp import skin_points
+from pipeline.kernels.warp import SkinGrid
+
+
+def field_bounds_m(body: Body, margin_m: float) -> Float[np.ndarray, "2 3"]:
+    """The body's canonical box, widened on all sides."""
+    return np.stack([body.vertices.min(0) - margin_m, body.vertices.max(0) + margin_m]).astype(np.float32)
+
+
+def cell_distances_m(body: Body, bounds_m: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "gx gy gz"]:
+    """Signed distance of each cell's centre to the canonical body, negative inside."""
+    distance = signed_distance_m(cell_centres(bounds_m), body.mesh())
+    return distance.astype(np.float32).reshape(RESOLUTION, RESOLUTION, RESOLUTION)
+
+
+def mask_frequency(
+    centres_m: Float[np.ndarray, "n 3"],
+    skin: SkinGrid,
+    canonical_to_world: Float[Tensor, "k j 4 4"],
+    camera: Camera,
+    masks: list[UInt8[np.ndarray, "h w"]],
+) -> Float[np.ndarray, "n"]:
+    """Part of the frames in which each canonical point, carried by its skin weights, projects into the mask.
+
+    Frames in which a point lies outside the image do not count; a point that is never in an image gets 1.
+    masks: one a frame, dilated by as much as a point stands for.
+    """
+    points = torch.from_numpy(centres_m)
+    hits, seen = np.zeros(len(centres_m)), np.zeros(len(centres_m))
+    grid = (skin.origin_m, skin.cell_m, skin.row_of_node)
+    for row, mask in enumerate(masks):
+        posed = skin_points(points, skin.blend(canonical_to_world[row : row + 1])[0], *grid)
+        pixels, depth_m = project(posed, camera)
+        column, line = (pixels[:, axis].floor().long().numpy() for axis in range(2))
+        inside = (depth_m.numpy() > 0) & (column >= 0) & (line >= 0) & (column < mask.shape[1]) & (line < mask.shape[0])
+        seen += inside
+        hits[inside] += mask[line[inside], column[inside]] > 0
+    return np.where(seen > 0, hits / np.maximum(seen, 1), 1.0).astype(np.float32)
+
+
+def starting_shell(
+    distance_m: Float[np.ndarray, "gx gy gz"],
+    frequency: Float[np.ndarray, "gx gy gz"],
+    margin_m: float,
+    mask_support: float,
+) -> Bool[np.ndarray, "gx gy gz"]:
+    """Cells within the clothing margin that enough masks hold, and all cells inside the body."""
+    return (distance_m < 0) | ((distance_m < margin_m) & (frequency >= mask_support))

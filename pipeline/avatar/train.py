@@ -1,0 +1,222 @@
+"""Learning the canonical field from a video: one step, and all that it changes."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pipeline.avatar.body import Body, Motion
+from pipeline.avatar.field import Field
+from pipeline.avatar.field_config import FieldConfig
+from pipeline.avatar.losses import field_losses
+from pipeline.avatar.occupancy import OccupancyUpdate
+from pipeline.avatar.pose import PoseCorrection
+from pipeline.avatar.rays import PixelPool
+from pipeline.avatar.warp import bake_motion, posed_from_world
+from pipeline.geometry.camera import Camera, pixel_rays
+from pipeline.kernels.adam import adam_step_
+from pipeline.kernels.composite import composite
+from pipeline.kernels.march import Samples, march
+from pipeline.kernels.visits import light_before
+from pipeline.kernels.warp import SkinGrid, newton
+
+WARM_UP = 20
+MAX_BAD_STEPS = 20
+REBAKES = (0.5, 0.75)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is learnt from: one body in motion before one camera, and the pixels that saw it."""
+
+    body: Body
+    motion: Motion
+    camera: Camera
+    pool: PixelPool
+    skin: SkinGrid
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Rays of one step, in the posed space of their frames, sorted by frame."""
+
+    frames: Int[Tensor, "k"]
+    slot: Int[Tensor, "n"]
+    origins_m: Float[Tensor, "n 3"]
+    directions: Float[Tensor, "n 3"]
+    rgba: Float[Tensor, "n 4"]
+    background: Float[Tensor, "n 3"]
+    jitter: Float[Tensor, "n"]
+
+
+class DivergedError(ArithmeticError):
+    """Many steps in a row gave no finite gradient."""
+
+
+class Learning:
+    """The state of stage one: everything that a step changes is here and in `state()`.
+
+    Random numbers come from a generator keyed by (seed, step), so a resumed run draws what an unbroken one would have drawn.
+    """
+
+    def __init__(self, scene: Scene, field: Field, occupancy: OccupancyUpdate, config: FieldConfig) -> None:
+        self.scene, self.field, self.occupancy, self.config = scene, field, occupancy, config
+        self.poses = PoseCorrection(scene.body, scene.motion)
+        self.step_m = scene.body.height_m() * config.step_fraction
+        self.done = 0
+        self.bad_steps = 0
+        self.table_gradient = torch.zeros_like(field.table)
+        parameters = dict(field.named_parameters())
+        parameters |= {"rotation_rad": self.poses.rotation_rad, "shift_m": self.poses.shift_m}
+        self.parameters: dict[str, Tensor] = parameters
+        self.moments = {name: (torch.zeros_like(p), torch.zeros_like(p)) for name, p in parameters.items()}
+        self.baked_rotation_rad, self.baked_shift_m = torch.zeros(()), torch.zeros(())
+        self._bake()
+
+    def _bake(self) -> None:
+        """Invert the skinning of all training frames as they are posed now."""
+        self.baked_rotation_rad = self.poses.rotation_rad.detach().clone()
+        self.baked_shift_m = self.poses.shift_m.detach().clone()
+        with torch.no_grad():
+            everything = torch.arange(self.scene.pool.frames)
+            canonical_to_world = self.poses.canonical_to_world(everything)
+            self.posed_from_world = posed_from_world(canonical_to_world)
+            self.warps = bake_motion(self.scene.skin, self.posed_from_world[:, None] @ canonical_to_world)
+
+    @property
+    def refines_poses(self) -> bool:
+        return self.config.pose_refinement and self.done >= self.config.pose_start * self.config.steps
+
+    def _random(self) -> np.random.Generator:
+        return np.random.Generator(np.random.Philox(key=[self.config.seed, self.done]))
+
+    def _draw(self, random: np.random.Generator) -> Batch:
+        config, pool = self.config, self.scene.pool
+        frames = np.sort(random.choice(pool.frames, min(config.frames_per_step, pool.frames), replace=False))
+        shares = (1 - config.share_border - config.share_outside, config.share_border, config.share_outside)
+        rows, slots = pool.draw(frames, config.rays, shares, random)
+        inside = random.random((len(rows), 2), dtype=np.float32) if config.pixel_jitter else np.float32(0.5)
+        origins, directions = pixel_rays(self.scene.camera, torch.from_numpy(pool.xy_px[rows] + inside))
+        slot, frames = torch.from_numpy(slots), torch.from_numpy(frames)
+        matrix = self.posed_from_world[frames][slot]
+        return Batch(
+            frames=frames,
+            slot=slot,
+            origins_m=(matrix[:, :3, :3] @ origins[:, :, None])[:, :, 0] + matrix[:, :3, 3],
+            directions=(matrix[:, :3, :3] @ directions[:, :, None])[:, :, 0],
+            rgba=torch.from_numpy(pool.rgba[rows]).float() / 255,
+            background=torch.from_numpy(random.random((len(rows), 3), dtype=np.float32)),
+            jitter=torch.from_numpy(random.random(len(rows), dtype=np.float32)),
+        )
+
+    def _place(self, batch: Batch, samples: Samples) -> Float[Tensor, "s 3"]:
+        """Canonical positions of the samples: as looked up, or exact and differentiable once poses are refined."""
+        if not self.refines_poses:
+            return samples.canonical_m
+        to_world = self.poses.canonical_to_world(batch.frames)
+        blended = self.scene.skin.blend(self.posed_from_world[batch.frames][:, None] @ to_world)
+        counts = samples.ray_start.diff()
+        ray = torch.repeat_interleave(torch.arange(len(counts)), counts)
+        posed = batch.origins_m[ray] + samples.distance_m[:, None] * batch.directions[ray]
+        slots = torch.arange(len(batch.frames) + 1)
+        slot_start = samples.ray_start[torch.searchsorted(batch.slot, slots)]
+        return newton(blended, samples.canonical_m, posed, slot_start, self.scene.skin)
+
+    def _empty_points(self, random: np.random.Generator) -> Float[Tensor, "e 3"]:
+        """Random points of the box that lie in empty cells."""
+        low, high = self.occupancy.bounds_m
+        points = torch.from_numpy(random.random((self.config.empty_points, 3), dtype=np.float32)) * (high - low) + low
+        return points[~self.occupancy.grid().contains(points)]
+
+    def step(self) -> dict[str, float]:
+        """One step; returns the losses. Raises DivergedError after many steps without a finite gradient."""
+        config, random = self.config, self._random()
+        if self.refines_poses and self.done in {round(part * config.steps) for part in REBAKES}:
+            self._bake()
+        batch = self._draw(random)
+        grid = self.occupancy.grid()
+        samples = march(
+            batch.origins_m,
+            batch.directions,
+            batch.frames[batch.slot],
+            batch.jitter,
+            self.step_m,
+            self.warps,
+            grid.occupied,
+            grid.bounds_m,
+        )
+        count = len(samples.distance_m)
+        points = torch.cat([self._place(batch, samples), self._empty_points(random)])
+        colour, density = self.field.radiance(points, self.table_gradient)
+        step_m = torch.full((count,), self.step_m)
+        image, alpha, weights = composite(density[:count], colour[:count], step_m, samples.ray_start)
+        losses = field_losses(image, alpha, density[count:], batch.rgba, batch.background, config)
+        total = sum(losses.values())
+        if self.refines_poses:
+            total = total + config.pose_smoothness * self.poses.roughness() + config.pose_size * self.poses.size()
+        total.backward()
+        self._update_parameters(bool(torch.isfinite(total)))
+        self.occupancy.record(samples.canonical_m, light_before(weights, samples.ray_start), weights)
+        self.done += 1
+        if self.done % config.occupancy_every == 0 and self.done >= config.occupancy_start:
+            self.occupancy.update(self.field.density, self.step_m, config.occupancy_threshold, random)
+        return {name: float(loss.detach()) for name, loss in losses.items()} | {"samples": float(count)}
+
+    def _rate(self) -> float:
+        """Part of the full learning rate: a short warm-up, then an exponential decay that ends at `final_rate`."""
+        return min(1.0, (self.done + 1) / WARM_UP) * self.config.final_rate ** (self.done / self.config.steps)
+
+    def _update_parameters(self, finite: bool) -> None:
+        self.bad_steps = 0 if finite else self.bad_steps + 1
+        if self.bad_steps >= MAX_BAD_STEPS:
+            raise DivergedError(f"no finite loss in {MAX_BAD_STEPS} steps up to step {self.done}")
+        config = self.config
+        rates = {"table": config.table_rate, "rotation_rad": config.pose_rate, "shift_m": config.pose_rate / 3}
+        for name, parameter in self.parameters.items():
+            gradient = self.table_gradient if name == "table" else parameter.grad
+            if gradient is None:
+                continue
+            if not finite:
+                gradient.zero_()
+                continue
+            is_pose = name in ("rotation_rad", "shift_m")
+            begun = round(config.pose_start * config.steps) if is_pose else 0
+            rate = rates.get(name, config.network_rate) * self._rate()
+            adam_step_(parameter, gradient, *self.moments[name], self.done - begun + 1, rate, epsilon=1e-15)
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything that a resumed run needs."""
+        tensors = {"done": torch.tensor(self.done), "bad_steps": torch.tensor(self.bad_steps)}
+        tensors |= {"baked.rotation_rad": self.baked_rotation_rad, "baked.shift_m": self.baked_shift_m}
+        for name, parameter in self.parameters.items():
+            tensors[f"parameter.{name}"] = parameter.detach()
+            tensors[f"first.{name}"], tensors[f"second.{name}"] = self.moments[name]
+        return tensors | {f"occupancy.{name}": value for name, value in self.occupancy.state().items()}
+
+    def load_state(self, tensors: dict[str, Tensor]) -> None:
+        """Go on from `state()`; the next step is the one that the other run would have made."""
+        self.done, self.bad_steps = int(tensors["done"]), int(tensors["bad_steps"])
+        with torch.no_grad():
+            self.poses.rotation_rad.copy_(tensors["baked.rotation_rad"])
+            self.poses.shift_m.copy_(tensors["baked.shift_m"])
+            self._bake()
+            for name, parameter in self.parameters.items():
+                parameter.copy_(tensors[f"parameter.{name}"])
+                for moment, kept in zip(self.moments[name], ("first", "second"), strict=True):
+                    moment.copy_(tensors[f"{kept}.{name}"])
+        prefix = "occupancy."
+        kept = {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+        self.occupancy.load_state(kept)
+
+
+def training_step_m(height_m: float, config: FieldConfig) -> float:
+    """Length of a ray step in metres."""
+    return height_m * config.step_fraction
+
+
+def psnr(mean_square: float) -> float:
+    """Decibels of a mean squared error of values in [0, 1]."""
+    return -10 * math.log10(max(mean_square, 1e-12))

@@ -1,0 +1,78 @@
+"""Tensors on disk as safetensors: whole or absent, no pickles, the same bytes for the same tensors."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from pipeline.avatar.field import Field
+from pipeline.avatar.occupancy import Occupancy
+from pipeline.core.atomic import atomic_path
+from pipeline.core.errors import UserError
+from pipeline.io.npz import load_npz, save_npz
+from pipeline.kernels.hashgrid import GridLayout
+
+# One entry only: the library writes several in an order that changes from run to run.
+DESCRIPTION = "description"
+
+
+def save_tensors(path: Path, tensors: dict[str, Tensor], description: dict | None = None) -> None:
+    """Write tensors and a JSON-like description."""
+    whole = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
+    text = json.dumps(description or {}, sort_keys=True)
+    with atomic_path(path) as unfinished:
+        unfinished.write_bytes(save(whole, {DESCRIPTION: text}))
+
+
+def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict]:
+    """Read tensors and description.
+
+    Raises:
+        UserError: the file is missing, damaged, or no safetensors file.
+    """
+    try:
+        with safe_open(path, framework="pt") as archive:
+            description = json.loads((archive.metadata() or {}).get(DESCRIPTION, "{}"))
+            return {name: archive.get_tensor(name) for name in archive.keys()}, description  # noqa: SIM118
+    except (OSError, SafetensorError, ValueError) as error:
+        raise UserError(f"{path} cannot be read ({error}); run the stage that writes it again") from None
+
+
+def save_field(path: Path, field: Field) -> None:
+    """Write a field's weights and the shape of its hash grid."""
+    layout = field.layout
+    description = {
+        "cells_per_axis": [list(cells) for cells in layout.cells_per_axis],
+        "features": layout.features,
+        "log2_rows": layout.log2_rows,
+        "hidden_width": field.hidden.shape[1],
+    }
+    save_tensors(path, dict(field.state_dict()), description)
+
+
+def load_field(path: Path) -> Field:
+    """Read a field; UserError when the file is no field."""
+    tensors, description = load_tensors(path)
+    try:
+        cells = tuple((int(x), int(y), int(z)) for x, y, z in description["cells_per_axis"])
+        layout = GridLayout(cells, description["features"], description["log2_rows"])
+        field = Field(tensors["bounds_m"].numpy(), layout, description["hidden_width"])
+        field.load_state_dict(tensors)
+    except (KeyError, RuntimeError, TypeError) as error:
+        raise UserError(f"{path} holds no field ({error}); run stages.field again") from None
+    return field.requires_grad_(False)
+
+
+def save_occupancy(path: Path, occupancy: Occupancy) -> None:
+    """Write the occupied cells and their box."""
+    save_npz(path, {"occupied": occupancy.occupied.numpy(), "bounds_m": occupancy.bounds_m.numpy()})
+
+
+def load_occupancy(path: Path) -> Occupancy:
+    """Read the occupied cells and their box."""
+    arrays = load_npz(path)
+    return Occupancy(torch.from_numpy(arrays["occupied"].astype(np.uint8)), torch.from_numpy(arrays["bounds_m"]))

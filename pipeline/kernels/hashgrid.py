@@ -1,0 +1,112 @@
+"""Multi-resolution hash grid: features of points by trilinear interpolation in several grids at once.
+
+Müller et al. 2022, "Instant Neural Graphics Primitives", section 3. Letters: n points, l levels, f features a level.
+
+Two things differ from the paper, both measured (docs/decisions.md):
+a level's cells are cubes in metres, so the number of cells is given per axis and a standing body wastes no table rows on
+the empty half of a cube; levels whose nodes fit in the table are dense and have no collisions.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pipeline.kernels import hashgrid_cpu
+from pipeline.kernels.dispatch import runs_on_numba
+from pipeline.kernels.reference import hashgrid as reference
+
+BLOCK_FEATURES = (1, 2, 4, 8)
+
+
+@dataclass(frozen=True)
+class GridLayout:
+    """Where each level's rows lie in the one table.
+
+    `cells_per_axis` has a triple (x, y, z) of cell counts a level, coarse to fine; a level has at most 2**`log2_rows` rows of
+    `features` floats each.
+    """
+
+    cells_per_axis: tuple[tuple[int, int, int], ...]
+    features: int
+    log2_rows: int
+
+    def __post_init__(self) -> None:
+        if self.features not in BLOCK_FEATURES:
+            raise ValueError(f"features per level must be one of {BLOCK_FEATURES}, not {self.features}")
+
+    @property
+    def levels(self) -> int:
+        return len(self.cells_per_axis)
+
+    @property
+    def width(self) -> int:
+        """Length of an encoded point."""
+        return self.levels * self.features
+
+    @cached_property
+    def rows_per_level(self) -> tuple[int, ...]:
+        limit = 1 << self.log2_rows
+        return tuple(min(limit, (x + 1) * (y + 1) * (z + 1)) for x, y, z in self.cells_per_axis)
+
+    @cached_property
+    def rows(self) -> int:
+        """Rows of the whole table."""
+        return sum(self.rows_per_level)
+
+    @cached_property
+    def plan(self) -> np.ndarray:
+        """(l, 6) int64 for the kernels: cells x, y, z; first row; rows; 1 if the level is dense."""
+        plan, first = [], 0
+        for (x, y, z), rows in zip(self.cells_per_axis, self.rows_per_level, strict=True):
+            plan.append((x, y, z, first, rows, int((x + 1) * (y + 1) * (z + 1) <= rows)))
+            first += rows
+        return np.array(plan, dtype=np.int64)
+
+
+class _Encode(torch.autograd.Function):
+    """float32 on the CPU. `table_gradient`, if given, takes the table's gradient in autograd's place."""
+
+    @staticmethod
+    def forward(ctx, points, table, layout, table_gradient):
+        features = torch.empty(len(points), layout.width)
+        hashgrid_cpu.forward(layout.features)(points.numpy(), table.detach().numpy(), layout.plan, features.numpy())
+        ctx.save_for_backward(points, table)
+        ctx.layout, ctx.table_gradient = layout, table_gradient
+        return features
+
+    @staticmethod
+    def backward(ctx, gradient):
+        points, table = (saved.detach() for saved in ctx.saved_tensors)
+        layout, sums = ctx.layout, ctx.table_gradient
+        gradient = gradient.contiguous().numpy()
+        points_gradient = None
+        if ctx.needs_input_grad[0]:
+            points_gradient = torch.zeros_like(points)
+            hashgrid_cpu.backward_points(layout.features)(
+                points.numpy(), table.numpy(), layout.plan, gradient, points_gradient.numpy()
+            )
+        if not ctx.needs_input_grad[1]:
+            return points_gradient, None, None, None
+        target = torch.zeros_like(table) if sums is None else sums
+        hashgrid_cpu.backward_table(layout.features)(points.numpy(), layout.plan, gradient, target.numpy())
+        return points_gradient, target if sums is None else None, None, None
+
+
+def encode(
+    points_unit: Float[Tensor, "n 3"],
+    table: Float[Tensor, "rows f"],
+    layout: GridLayout,
+    table_gradient: Float[Tensor, "rows f"] | None = None,
+) -> Float[Tensor, "n width"]:
+    """Features of points in the unit box, level after level; differentiable in the points and the table.
+
+    Points outside [0, 1] are read at the nearest point of the box. With `table_gradient` (numba only), backward adds the
+    table's gradient to that buffer and autograd gets none: a training step then neither allocates nor clears a table.
+    """
+    if not runs_on_numba(points_unit, table):
+        return reference.encode(points_unit, table, layout.plan)
+    return _Encode.apply(points_unit.contiguous(), table, layout, table_gradient)

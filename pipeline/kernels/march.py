@@ -1,0 +1,99 @@
+"""Ray marching: where along each ray the canonical field has to be asked.
+
+Each ray walks through the posed box of its own frame in steps of constant length in metres; each stop is looked up in the
+frame's warp grid, and kept if its canonical point lies in an occupied cell. What is kept is packed, ray after ray.
+
+Letters: n rays, s samples, k frames.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from pipeline.kernels import march_cpu
+from pipeline.kernels.dispatch import runs_on_numba
+from pipeline.kernels.reference import march as reference
+from pipeline.kernels.warp import WarpGrid
+
+
+@dataclass(frozen=True)
+class WarpSet:
+    """The warp grids of several frames, one behind the other, all with the same cell.
+
+    table has a row a frame: origin and size are in `origin_m` (k, 3) and `dims` (k, 3); `first` (k, 3) says where the frame's
+    nodes, cells and maps begin.
+    """
+
+    cell_m: float
+    origin_m: Float[np.ndarray, "k 3"]
+    dims: Int[np.ndarray, "k 3"]
+    first: Int[np.ndarray, "k 3"]
+    canonical_m: Float[np.ndarray, "nodes 3"]
+    codes: Int[np.ndarray, "cells"]
+    maps: Float[np.ndarray, "maps 12"]
+
+    @staticmethod
+    def of(grids: Sequence[WarpGrid], cell_m: float) -> "WarpSet":
+        sizes = np.array([(len(g.canonical_m), len(g.codes), len(g.maps)) for g in grids], dtype=np.int64)
+        return WarpSet(
+            cell_m=cell_m,
+            origin_m=np.stack([grid.origin_m for grid in grids]),
+            dims=np.stack([grid.dims for grid in grids]),
+            first=np.cumsum(sizes, axis=0) - sizes,
+            canonical_m=np.concatenate([grid.canonical_m for grid in grids]),
+            codes=np.concatenate([grid.codes for grid in grids]),
+            maps=np.concatenate([grid.maps for grid in grids]),
+        )
+
+    def arrays(self) -> tuple[np.ndarray, ...]:
+        """In the order that the compiled loops take."""
+        cell = np.float32(self.cell_m)
+        return cell, self.origin_m, self.dims, self.first, self.canonical_m, self.codes, self.maps
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Packed samples: canonical position, distance along the ray (m), and where each ray's samples begin (n + 1)."""
+
+    canonical_m: Float[Tensor, "s 3"]
+    distance_m: Float[Tensor, "s"]
+    ray_start: Int[Tensor, "m"]
+
+
+def march(
+    origins_m: Float[Tensor, "n 3"],
+    directions: Float[Tensor, "n 3"],
+    frame: Int[Tensor, "n"],
+    jitter: Float[Tensor, "n"],
+    step_m: float,
+    warps: WarpSet,
+    occupied: UInt8[Tensor, "gx gy gz"],
+    bounds_m: Float[Tensor, "2 3"],
+    max_samples: int = 160,
+) -> Samples:
+    """Samples of rays, given in the posed space of their frame, inside occupied cells.
+
+    Args:
+        directions: unit length.
+        frame: row of `warps` that each ray belongs to, int64.
+        jitter: in [0, 1), the part of a step by which a ray's stops are shifted.
+        occupied: not zero where the canonical field may hold something; the grid fills the box `bounds_m`.
+        max_samples: a ray's samples beyond that number are dropped.
+
+    A stop in a posed cell with several inverses gives a sample for each of them that is occupied, at the same distance.
+    """
+    if not runs_on_numba(origins_m, directions, jitter):
+        return Samples(
+            *reference.march(
+                origins_m, directions, frame, jitter, step_m, warps.arrays(), occupied, bounds_m, max_samples
+            )
+        )
+    arrays = (tensor.contiguous().numpy() for tensor in (origins_m, directions, frame, jitter))
+    points, distance, ray_start = march_cpu.march(
+        *arrays, np.float32(step_m), *warps.arrays(), occupied.numpy(), bounds_m.numpy(), max_samples
+    )
+    return Samples(torch.from_numpy(points), torch.from_numpy(distance), torch.from_numpy(ray_start))

@@ -1,0 +1,34 @@
+"""What the training rays saw in each voxel."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pipeline.kernels import visits_cpu
+from pipeline.kernels.dispatch import runs_on_numba
+from pipeline.kernels.reference import visits as reference
+
+
+def record_visits(
+    points_m: Float[Tensor, "s 3"],
+    light: Float[Tensor, "s"],
+    weight: Float[Tensor, "s"],
+    bounds_m: Float[Tensor, "2 3"],
+    shape: tuple[int, int, int],
+    reached: Float[Tensor, "cells"],
+    gave: Float[Tensor, "cells"],
+) -> None:
+    """Raise `reached` and `gave` (x slowest) to the largest light and weight of the samples in each cell, in place."""
+    tensors = (points_m, light, weight, bounds_m)
+    if runs_on_numba(*tensors, reached, gave):
+        arrays = (tensor.detach().numpy() for tensor in tensors)
+        visits_cpu.record(*arrays, shape, reached.numpy(), gave.numpy())
+    else:
+        reference.record(*tensors, shape, reached, gave)
+
+
+def light_before(weight: Float[Tensor, "s"], ray_start: Int[Tensor, "m"]) -> Float[Tensor, "s"]:
+    """Light in [0, 1] that reached each sample: what the samples before it on its ray have left."""
+    before = weight.detach().double().cumsum(0) - weight
+    first = torch.repeat_interleave(ray_start[:-1], ray_start.diff())
+    return (1 - (before - before[first])).clamp(0, 1).to(weight.dtype)

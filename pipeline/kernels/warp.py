@@ -1,0 +1,112 @@
+"""Inverse skinning: from posed points back to the canonical A-pose.
+
+A `SkinGrid` holds skin weights on the nodes near the canonical body. For one frame, `bake` turns its skinning matrices into a
+`WarpGrid` that says for each node of a posed grid where it lies in canonical space; a lookup there, and at most one Newton step
+(`newton`), replaces the 13-start Broyden search of SNARF and InstantAvatar (Chen et al. 2021, Jiang et al. 2023).
+Where limbs come near each other a posed cell has several inverses: it then holds one affine map for each.
+
+Letters: m skin-grid nodes, j joints, k frames of a batch, s samples.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pipeline.kernels import warp_cpu
+from pipeline.kernels.dispatch import runs_on_numba
+from pipeline.kernels.reference import warp as reference
+
+
+@dataclass(frozen=True)
+class SkinGrid:
+    """Skin weights near the canonical body, continuous in space: trilinear between nodes `cell_m` apart."""
+
+    origin_m: Float[np.ndarray, "3"]
+    cell_m: float
+    row_of_node: Int[np.ndarray, "gx gy gz"]
+    nodes_m: Float[np.ndarray, "m 3"]
+    distance_m: Float[np.ndarray, "m"]
+    weights: Float[Tensor, "m j"]
+
+    def blend(self, canonical_to_posed: Float[Tensor, "k j 4 4"]) -> Float[Tensor, "k m 12"]:
+        """The blended skinning matrix (rows of its upper 3x4 part) at every node."""
+        count, joints = canonical_to_posed.shape[:2]
+        flat = canonical_to_posed[:, :, :3].reshape(count, joints, 12)
+        return torch.matmul(self.weights.to(flat), flat)
+
+    def weights_at(self, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "n j"]:
+        """Skin weights of canonical points; outside the grid, those of the nearest node that exists."""
+        return reference.interpolate(points_m, self.origin_m, self.cell_m, self.row_of_node, self.weights.to(points_m))
+
+
+@dataclass(frozen=True)
+class WarpGrid:
+    """Inverse skinning of one frame on a posed grid whose cells are as large as the skin grid's.
+
+    canonical_m: position of each node in canonical space, NaN where unknown (x slowest, z fastest).
+    codes: a code a cell: -1 no inverse, 0 one smooth inverse (interpolate), 1 + 4 * first + (count - 1) several
+    inverses: rows first..first + count - 1 of `maps`, which are affine maps (3x4 by rows) from posed to canonical.
+    """
+
+    origin_m: Float[np.ndarray, "3"]
+    dims: Int[np.ndarray, "3"]
+    canonical_m: Float[np.ndarray, "nodes 3"]
+    codes: Int[np.ndarray, "cells"]
+    maps: Float[np.ndarray, "maps 12"]
+
+
+def bake(skin: SkinGrid, canonical_to_posed: Float[Tensor, "j 4 4"]) -> WarpGrid:
+    """Invert the skinning of one frame. Runs on the CPU and without the GIL: threads may bake different frames."""
+    blended = skin.blend(canonical_to_posed.detach().float().cpu()[None])[0].numpy()
+    posed, box = warp_cpu.carry_nodes(skin.nodes_m, blended)
+    cell = np.float32(skin.cell_m)
+    origin = (np.floor(box[0] / cell) * cell).astype(np.float32)
+    dims = (np.ceil((box[1] - origin) / cell) + 1).astype(np.int64)
+    canonical, codes, maps = warp_cpu.bake(
+        skin.nodes_m, posed, skin.distance_m, origin, dims, skin.origin_m, cell, skin.row_of_node, blended
+    )
+    return WarpGrid(origin, dims, canonical, codes, maps)
+
+
+class _Newton(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, blended, start, posed, slot_start, skin):
+        slot = torch.repeat_interleave(torch.arange(len(blended)), slot_start.diff())
+        refined = torch.empty_like(start)
+        grid = (skin.origin_m, np.float32(skin.cell_m), skin.row_of_node)
+        warp_cpu.refine(posed.numpy(), start.numpy(), slot.numpy(), *grid, blended.detach().numpy(), refined.numpy())
+        ctx.save_for_backward(blended, refined, slot_start)
+        ctx.skin = skin
+        return refined
+
+    @staticmethod
+    def backward(ctx, gradient):
+        blended, refined, slot_start = (tensor.detach() for tensor in ctx.saved_tensors)
+        skin = ctx.skin
+        total = torch.zeros_like(blended)
+        grid = (skin.origin_m, np.float32(skin.cell_m), skin.row_of_node)
+        arrays = (refined.numpy(), gradient.contiguous().numpy(), slot_start.numpy())
+        warp_cpu.pose_gradient(*arrays, *grid, blended.numpy(), total.numpy())
+        return total, None, None, None, None
+
+
+def newton(
+    blended: Float[Tensor, "k m 12"],
+    start_m: Float[Tensor, "s 3"],
+    posed_m: Float[Tensor, "s 3"],
+    slot_start: Int[Tensor, "k1"],
+    skin: SkinGrid,
+) -> Float[Tensor, "s 3"]:
+    """One Newton step towards the canonical points that skinning carries to `posed_m`.
+
+    Args:
+        blended: `SkinGrid.blend` of the batch's frames. Differentiable, by the implicit function theorem: dx = -J^-1 dA x.
+        start_m: canonical points to start from (a warp grid's answer). Where no step is possible they are the result.
+        slot_start: k + 1 offsets; the samples of frame f are slot_start[f] : slot_start[f + 1].
+    """
+    if not runs_on_numba(blended, start_m, posed_m):
+        return reference.newton(blended, start_m, posed_m, slot_start, skin.origin_m, skin.cell_m, skin.row_of_node)
+    return _Newton.apply(blended.contiguous(), start_m.contiguous(), posed_m.contiguous(), slot_start, skin)

@@ -1,0 +1,356 @@
+"""Compiled loops of inverse skinning.
+
+Forward, a canonical point x is carried by A(x) = sum_j w_j(x) B_j, whose 12 numbers are interpolated trilinearly between
+the nodes of the skin grid. Inverse, x(p) solves A(x) x = p: Newton's method with the exact Jacobian
+J = A_3x3 + sum_corners (A_corner x) grad(weight_corner)^T.
+
+Grid arguments, everywhere: origin (3), cell (m), row_of_node (gx, gy, gz) int32 with -1 where the grid has no node,
+blended (m, 12), the rows of A (3, 4) at the nodes that exist.
+"""
+
+import numpy as np
+from numba import njit, prange
+
+_OPTIONS = {"cache": True, "fastmath": {"contract", "reassoc", "arcp", "nsz"}, "error_model": "numpy"}
+_ZERO, _ONE = np.float32(0), np.float32(1)
+BLOCK = 256
+
+
+@njit(**_OPTIONS)
+def skin(x, y, z, origin, cell, row_of_node, blended):
+    """Posed position of a canonical point and the Jacobian, as 13 numbers: inside, position, J by rows."""
+    inverse = _ONE / cell
+    gx, gy, gz = (x - origin[0]) * inverse, (y - origin[1]) * inverse, (z - origin[2]) * inverse
+    i, j, k = int(np.floor(gx)), int(np.floor(gy)), int(np.floor(gz))
+    px = py = pz = _ZERO
+    j00 = j01 = j02 = j10 = j11 = j12 = j20 = j21 = j22 = _ZERO
+    inside = (
+        0 <= i < row_of_node.shape[0] - 1 and 0 <= j < row_of_node.shape[1] - 1 and 0 <= k < row_of_node.shape[2] - 1
+    )
+    if inside:
+        u, v, w = gx - np.float32(i), gy - np.float32(j), gz - np.float32(k)
+        for corner in range(8):
+            a, b, c = corner & 1, (corner >> 1) & 1, corner >> 2
+            row = row_of_node[i + a, j + b, k + c]
+            if row < 0:
+                inside = False
+                break
+            wx, dx = (u, inverse) if a == 1 else (_ONE - u, -inverse)
+            wy, dy = (v, inverse) if b == 1 else (_ONE - v, -inverse)
+            wz, dz = (w, inverse) if c == 1 else (_ONE - w, -inverse)
+            m = blended[row]
+            qx = m[0] * x + m[1] * y + m[2] * z + m[3]
+            qy = m[4] * x + m[5] * y + m[6] * z + m[7]
+            qz = m[8] * x + m[9] * y + m[10] * z + m[11]
+            weight, along_x, along_y, along_z = wx * wy * wz, dx * wy * wz, wx * dy * wz, wx * wy * dz
+            px, py, pz = px + weight * qx, py + weight * qy, pz + weight * qz
+            j00, j01, j02 = (
+                j00 + weight * m[0] + along_x * qx,
+                j01 + weight * m[1] + along_y * qx,
+                j02 + weight * m[2] + along_z * qx,
+            )
+            j10, j11, j12 = (
+                j10 + weight * m[4] + along_x * qy,
+                j11 + weight * m[5] + along_y * qy,
+                j12 + weight * m[6] + along_z * qy,
+            )
+            j20, j21, j22 = (
+                j20 + weight * m[8] + along_x * qz,
+                j21 + weight * m[9] + along_y * qz,
+                j22 + weight * m[10] + along_z * qz,
+            )
+    return inside, px, py, pz, j00, j01, j02, j10, j11, j12, j20, j21, j22
+
+
+@njit(**_OPTIONS)
+def invert(j00, j01, j02, j10, j11, j12, j20, j21, j22):
+    """Inverse of a 3x3 matrix by rows, and whether it is far from singular."""
+    c00, c01, c02 = j11 * j22 - j12 * j21, j12 * j20 - j10 * j22, j10 * j21 - j11 * j20
+    determinant = j00 * c00 + j01 * c01 + j02 * c02
+    sound = abs(determinant) > np.float32(1e-3)
+    s = _ONE / determinant if sound else _ZERO
+    return (
+        sound,
+        s * c00,
+        s * (j02 * j21 - j01 * j22),
+        s * (j01 * j12 - j02 * j11),
+        s * c01,
+        s * (j00 * j22 - j02 * j20),
+        s * (j02 * j10 - j00 * j12),
+        s * c02,
+        s * (j01 * j20 - j00 * j21),
+        s * (j00 * j11 - j01 * j10),
+    )
+
+
+@njit(**_OPTIONS)
+def _newton(px, py, pz, x, y, z, iterations, tolerance, origin, cell, row_of_node, blended, inverse_jacobian):
+    """Solve A(x) x = p from a start; fills the inverse Jacobian (9). Returns converged, x, y, z, squared residual."""
+    squared = np.float32(1e9)
+    for iteration in range(iterations + 1):
+        inside, qx, qy, qz, a, b, c, d, e, f, g, h, k = skin(x, y, z, origin, cell, row_of_node, blended)
+        if not inside:
+            return False, x, y, z, squared
+        sound, a, b, c, d, e, f, g, h, k = invert(a, b, c, d, e, f, g, h, k)
+        if not sound:
+            return False, x, y, z, squared
+        inverse_jacobian[0], inverse_jacobian[1], inverse_jacobian[2] = a, b, c
+        inverse_jacobian[3], inverse_jacobian[4], inverse_jacobian[5] = d, e, f
+        inverse_jacobian[6], inverse_jacobian[7], inverse_jacobian[8] = g, h, k
+        rx, ry, rz = px - qx, py - qy, pz - qz
+        squared = rx * rx + ry * ry + rz * rz
+        if squared < tolerance * tolerance or iteration == iterations:
+            break
+        sx, sy, sz = a * rx + b * ry + c * rz, d * rx + e * ry + f * rz, g * rx + h * ry + k * rz
+        length = np.sqrt(sx * sx + sy * sy + sz * sz)
+        scale = min(_ONE, np.float32(2) * cell / max(length, np.float32(1e-9)))
+        x, y, z = x + scale * sx, y + scale * sy, z + scale * sz
+    return squared < tolerance * tolerance, x, y, z, squared
+
+
+@njit(nogil=True, **_OPTIONS)
+def carry_nodes(nodes, blended):
+    """Posed positions (m, 3) of the skin grid's nodes, and their box (2, 3)."""
+    posed = np.empty((nodes.shape[0], 3), np.float32)
+    box = np.empty((2, 3), np.float32)
+    box[0], box[1] = np.float32(1e9), np.float32(-1e9)
+    for row in range(nodes.shape[0]):
+        x, y, z = nodes[row, 0], nodes[row, 1], nodes[row, 2]
+        m = blended[row]
+        for axis in range(3):
+            value = m[4 * axis] * x + m[4 * axis + 1] * y + m[4 * axis + 2] * z + m[4 * axis + 3]
+            posed[row, axis] = value
+            box[0, axis], box[1, axis] = min(box[0, axis], value), max(box[1, axis], value)
+    return posed, box
+
+
+@njit(**_OPTIONS)
+def _claim(posed, distance, posed_origin, cell, dims):
+    """For each posed node the skin-grid row to start from: near in space, and of the body part that is nearest."""
+    best = np.full(dims[0] * dims[1] * dims[2], np.float32(1e9))
+    row_of = np.full(dims[0] * dims[1] * dims[2], -1, np.int32)
+    for row in range(posed.shape[0]):
+        ci = int(np.floor((posed[row, 0] - posed_origin[0]) / cell + np.float32(0.5)))
+        cj = int(np.floor((posed[row, 1] - posed_origin[1]) / cell + np.float32(0.5)))
+        ck = int(np.floor((posed[row, 2] - posed_origin[2]) / cell + np.float32(0.5)))
+        for i in range(max(ci - 1, 0), min(ci + 2, dims[0])):
+            dx = posed_origin[0] + np.float32(i) * cell - posed[row, 0]
+            for j in range(max(cj - 1, 0), min(cj + 2, dims[1])):
+                dy = posed_origin[1] + np.float32(j) * cell - posed[row, 1]
+                for k in range(max(ck - 1, 0), min(ck + 2, dims[2])):
+                    dz = posed_origin[2] + np.float32(k) * cell - posed[row, 2]
+                    key = distance[row] + np.sqrt(dx * dx + dy * dy + dz * dz)
+                    node = (i * dims[1] + j) * dims[2] + k
+                    if key < best[node]:
+                        best[node], row_of[node] = key, row
+    return row_of
+
+
+@njit(**_OPTIONS)
+def _solve_nodes(row_of, nodes, posed, posed_origin, dims, origin, cell, row_of_node, blended):
+    """Canonical positions (count, 3) of the posed nodes; NaN where none was found."""
+    canonical = np.full((row_of.shape[0], 3), np.float32(np.nan))
+    inverse_jacobian = np.empty(9, np.float32)
+    for node in range(row_of.shape[0]):
+        row = row_of[node]
+        if row < 0:
+            continue
+        px = posed_origin[0] + np.float32(node // (dims[1] * dims[2])) * cell
+        py = posed_origin[1] + np.float32(node // dims[2] % dims[1]) * cell
+        pz = posed_origin[2] + np.float32(node % dims[2]) * cell
+        m = blended[row]
+        sound, a, b, c, d, e, f, g, h, k = invert(m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10])
+        rx, ry, rz = px - posed[row, 0], py - posed[row, 1], pz - posed[row, 2]
+        x = nodes[row, 0] + a * rx + b * ry + c * rz
+        y = nodes[row, 1] + d * rx + e * ry + f * rz
+        z = nodes[row, 2] + g * rx + h * ry + k * rz
+        found, x, y, z, _ = _newton(
+            px, py, pz, x, y, z, 6, np.float32(2e-5), origin, cell, row_of_node, blended, inverse_jacobian
+        )
+        if found:
+            canonical[node, 0], canonical[node, 1], canonical[node, 2] = x, y, z
+    return canonical
+
+
+@njit(**_OPTIONS)
+def _is_smooth(canonical, corners, limit):
+    """True if all eight corners have an inverse and no edge of the cell is stretched beyond `limit` metres."""
+    for a in range(8):
+        if np.isnan(canonical[corners[a], 0]):
+            return False
+    for a in range(8):
+        for bit in range(3):
+            b = a ^ (1 << bit)
+            squared = _ZERO
+            for axis in range(3):
+                part = canonical[corners[a], axis] - canonical[corners[b], axis]
+                squared += part * part
+            if squared > limit * limit:
+                return False
+    return True
+
+
+@njit(**_OPTIONS)
+def _roots_in_cell(canonical, corners, centre, origin, cell, row_of_node, blended, maps):
+    """Distinct inverses at a cell's centre, started from its corners, as affine maps (4, 12); returns their number."""
+    found = 0
+    inverse_jacobian = np.empty(9, np.float32)
+    for corner in range(8):
+        node = corners[corner]
+        x, y, z = canonical[node, 0], canonical[node, 1], canonical[node, 2]
+        if found == maps.shape[0] or np.isnan(x):
+            continue
+        converged, x, y, z, _ = _newton(
+            centre[0],
+            centre[1],
+            centre[2],
+            x,
+            y,
+            z,
+            5,
+            np.float32(2e-4),
+            origin,
+            cell,
+            row_of_node,
+            blended,
+            inverse_jacobian,
+        )
+        for other in range(found):
+            ox = (
+                maps[other, 0] * centre[0]
+                + maps[other, 1] * centre[1]
+                + maps[other, 2] * centre[2]
+                + maps[other, 3]
+                - x
+            )
+            oy = (
+                maps[other, 4] * centre[0]
+                + maps[other, 5] * centre[1]
+                + maps[other, 6] * centre[2]
+                + maps[other, 7]
+                - y
+            )
+            oz = (
+                maps[other, 8] * centre[0]
+                + maps[other, 9] * centre[1]
+                + maps[other, 10] * centre[2]
+                + maps[other, 11]
+                - z
+            )
+            converged &= ox * ox + oy * oy + oz * oz > np.float32(0.01) * cell * cell
+        if not converged:
+            continue
+        for axis in range(3):
+            value = x if axis == 0 else (y if axis == 1 else z)
+            for column in range(3):
+                maps[found, 4 * axis + column] = inverse_jacobian[3 * axis + column]
+                value -= inverse_jacobian[3 * axis + column] * centre[column]
+            maps[found, 4 * axis + 3] = value
+        found += 1
+    return found
+
+
+@njit(**_OPTIONS)
+def _code_cells(canonical, posed_origin, dims, origin, cell, row_of_node, blended):
+    """A code per posed cell and the affine maps of the cells without one smooth inverse: see `bake`."""
+    codes = np.full((dims[0] - 1) * (dims[1] - 1) * (dims[2] - 1), -1, np.int32)
+    capacity, used = 256, 0
+    table = np.empty((capacity, 12), np.float32)
+    maps = np.empty((4, 12), np.float32)
+    corners, centre = np.empty(8, np.int64), np.empty(3, np.float32)
+    for i in range(dims[0] - 1):
+        for j in range(dims[1] - 1):
+            for k in range(dims[2] - 1):
+                known = False
+                for corner in range(8):
+                    node = ((i + (corner & 1)) * dims[1] + j + ((corner >> 1) & 1)) * dims[2] + k + (corner >> 2)
+                    corners[corner] = node
+                    known |= not np.isnan(canonical[node, 0])
+                if not known:
+                    continue
+                code = (i * (dims[1] - 1) + j) * (dims[2] - 1) + k
+                if _is_smooth(canonical, corners, np.float32(2) * cell):
+                    codes[code] = 0
+                    continue
+                centre[0] = posed_origin[0] + (np.float32(i) + np.float32(0.5)) * cell
+                centre[1] = posed_origin[1] + (np.float32(j) + np.float32(0.5)) * cell
+                centre[2] = posed_origin[2] + (np.float32(k) + np.float32(0.5)) * cell
+                count = _roots_in_cell(canonical, corners, centre, origin, cell, row_of_node, blended, maps)
+                if count == 0:
+                    continue
+                if used + count > capacity:
+                    capacity *= 2
+                    larger = np.empty((capacity, 12), np.float32)
+                    larger[:used] = table[:used]
+                    table = larger
+                table[used : used + count] = maps[:count]
+                codes[code] = 1 + 4 * used + (count - 1)
+                used += count
+    return codes, table[:used].copy()
+
+
+@njit(nogil=True, **_OPTIONS)
+def bake(nodes, posed, distance, posed_origin, dims, origin, cell, row_of_node, blended):
+    """The warp grid of one frame: see `pipeline.kernels.warp.bake`."""
+    row_of = _claim(posed, distance, posed_origin, cell, dims)
+    canonical = _solve_nodes(row_of, nodes, posed, posed_origin, dims, origin, cell, row_of_node, blended)
+    codes, maps = _code_cells(canonical, posed_origin, dims, origin, cell, row_of_node, blended)
+    return canonical, codes, maps
+
+
+@njit(parallel=True, **_OPTIONS)
+def refine(points_posed, start, slot, origin, cell, row_of_node, blended, refined):
+    """One Newton step for each point (s, 3) from its start; the start itself where a step is not possible.
+
+    blended has a leading axis of frames, and slot (s) says which one a point belongs to.
+    """
+    count = points_posed.shape[0]
+    for block in prange((count + BLOCK - 1) // BLOCK):
+        for s in range(block * BLOCK, min(block * BLOCK + BLOCK, count)):
+            x, y, z = start[s, 0], start[s, 1], start[s, 2]
+            inside, qx, qy, qz, a, b, c, d, e, f, g, h, k = skin(x, y, z, origin, cell, row_of_node, blended[slot[s]])
+            sound, a, b, c, d, e, f, g, h, k = invert(a, b, c, d, e, f, g, h, k)
+            if inside and sound:
+                rx, ry, rz = points_posed[s, 0] - qx, points_posed[s, 1] - qy, points_posed[s, 2] - qz
+                x, y, z = x + a * rx + b * ry + c * rz, y + d * rx + e * ry + f * rz, z + g * rx + h * ry + k * rz
+            refined[s, 0], refined[s, 1], refined[s, 2] = x, y, z
+
+
+@njit(parallel=True, **_OPTIONS)
+def pose_gradient(points, gradient, slot_start, origin, cell, row_of_node, blended, blended_gradient):
+    """Add dL/dA (frames, m, 12) for dL/dx = gradient at the solutions x of A(x) x = p: dL/d(A x) = -J^-T dL/dx.
+
+    The samples of frame f are slot_start[f] : slot_start[f + 1]; a thread owns whole frames.
+    """
+    inverse = _ONE / cell
+    for frame in prange(slot_start.shape[0] - 1):
+        for s in range(slot_start[frame], slot_start[frame + 1]):
+            x, y, z = points[s, 0], points[s, 1], points[s, 2]
+            gx, gy, gz = gradient[s, 0], gradient[s, 1], gradient[s, 2]
+            if gx == _ZERO and gy == _ZERO and gz == _ZERO:
+                continue
+            inside, _, _, _, a, b, c, d, e, f, g, h, k = skin(x, y, z, origin, cell, row_of_node, blended[frame])
+            sound, a, b, c, d, e, f, g, h, k = invert(a, b, c, d, e, f, g, h, k)
+            if not inside or not sound:
+                continue
+            lx, ly, lz = -(a * gx + d * gy + g * gz), -(b * gx + e * gy + h * gz), -(c * gx + f * gy + k * gz)
+            ui, uj, uk = (x - origin[0]) * inverse, (y - origin[1]) * inverse, (z - origin[2]) * inverse
+            i, j, m = int(np.floor(ui)), int(np.floor(uj)), int(np.floor(uk))
+            ui, uj, uk = ui - np.float32(i), uj - np.float32(j), uk - np.float32(m)
+            for corner in range(8):
+                p, q, r = corner & 1, (corner >> 1) & 1, corner >> 2
+                weight = (ui if p == 1 else _ONE - ui) * (uj if q == 1 else _ONE - uj) * (uk if r == 1 else _ONE - uk)
+                target = blended_gradient[frame, row_of_node[i + p, j + q, m + r]]
+                wx, wy, wz = weight * lx, weight * ly, weight * lz
+                target[0] += wx * x
+                target[1] += wx * y
+                target[2] += wx * z
+                target[3] += wx
+                target[4] += wy * x
+                target[5] += wy * y
+                target[6] += wy * z
+                target[7] += wy
+                target[8] += wz * x
+                target[9] += wz * y
+                target[10] += wz * z
+                target[11] += wz
