@@ -30,7 +30,9 @@ PREVIEW_FRAMES = 4
 
 
 def run(inputs: Mapping[str, Path], out: Path, config: FieldConfig) -> Mapping[str, float]:
-    """Learn the field on training frames, judge the refined poses on validation frames, write field, occupancy, motion."""
+    """Learn the field on training frames, judge the refined poses on validation frames, write field, occupancy,
+    motion.
+    """
     torch.set_flush_denormal(True)
     capture, camera = load_capture(inputs["frames"]), load_camera(inputs["body"] / "camera.npz")
     body, motion = load_body(inputs["body"] / "body.npz"), load_motion(inputs["body"] / "motion.npz")
@@ -88,7 +90,9 @@ def learn(learning: Learning, checkpoint: Path) -> float:
 def judge_poses(
     learning: Learning, body: Body, motion: Motion, camera: Camera, positions: np.ndarray, truths: list[Picture]
 ) -> tuple[Motion, dict[str, float], list[np.ndarray]]:
-    """Keep the pose corrections only if they make validation frames better, to which they come by interpolation in time."""
+    """Keep the pose corrections only if they make validation frames better, to which they come by interpolation in
+    time.
+    """
     motions = {"fitted": motion}
     if learning.config.pose_refinement:
         motions["refined"] = learning.poses.corrected(motion)

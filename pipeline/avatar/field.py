@@ -13,7 +13,9 @@ from torch import Tensor
 from pipeline.kernels.hashgrid import GridLayout, encode
 
 START_DENSITY_PER_M = 10.0
-"""Before training a torso of 0.2 m is seen as 86 % opaque: enough for a signal, not so much that the inside gets none."""
+"""Before training a torso of 0.2 m is seen as 86 % opaque: enough for a signal, not so much that the inside gets
+none.
+"""
 
 QUERY_POINTS = 1 << 18
 
@@ -21,8 +23,8 @@ QUERY_POINTS = 1 << 18
 class _Decode(torch.autograd.Function):
     """relu(features W1) W2 + b, sigmoid for three colours, exp for the density; four matrix products back.
 
-    The exponent is clamped, but its gradient is not cut there (as the truncated exponential of Instant-NGP), so that a density
-    that ran away comes back.
+    The exponent is clamped, but its gradient is not cut there (as the truncated exponential of Instant-NGP), so that
+    a density that ran away comes back.
     """
 
     @staticmethod
@@ -76,7 +78,9 @@ class Field(torch.nn.Module):
         return _Decode.apply(features, self.hidden, self.output, self.bias)
 
     def forward(self, x_canonical: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
-        """Colour (n, 3) in [0, 1] and density (n) in 1/m >= 0 of canonical points (m); density is 0 outside the bounds."""
+        """Colour (n, 3) in [0, 1] and density (n) in 1/m >= 0 of canonical points (m); density is 0 outside the
+        bounds.
+        """
         inside = ((x_canonical >= self.bounds_m[0]) & (x_canonical <= self.bounds_m[1])).all(-1)
         colour, density = self.radiance(x_canonical)
         return colour, density * inside

@@ -35,7 +35,7 @@ class FieldConfig(Config):
     border_px: int = Option(4, ge=1, description="half width of the border, px")
 
     occupancy: Literal["attention", "plain"] = Option("attention", description="how the occupancy grid is updated")
-    occupancy_every: int = Option(16, ge=1, description="steps between updates of the occupancy grid")
+    occupancy_every: int = Option(8, ge=1, description="steps between updates of the occupancy grid")
     occupancy_start: int = Option(128, ge=0, description="step of the first update that may empty a cell")
     occupancy_threshold: float = Option(
         0.01, ge=0, le=1, description="mean opacity of a step above which a cell is occupied"

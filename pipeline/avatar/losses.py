@@ -18,7 +18,9 @@ def huber(error: Float[Tensor, "..."], delta: float) -> Float[Tensor, "..."]:
 
 
 def hard_surface(alpha: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-    """-log(exp(-|a|) + exp(-|a - 1|)) + const: 0 for alpha in {0, 1}, largest at one half (LOLNeRF, Rebain et al. 2022)."""
+    """-log(exp(-|a|) + exp(-|a - 1|)) + const: 0 for alpha in {0, 1}, largest at one half (LOLNeRF, Rebain et al.
+    2022).
+    """
     return HARD_OFFSET - torch.log(torch.exp(-alpha.abs()) + torch.exp(-(alpha - 1).abs()))
 
 
@@ -32,8 +34,8 @@ def field_losses(
 ) -> dict[str, Tensor]:
     """Weighted losses of one batch of rays.
 
-    image: premultiplied. rgba: straight colour and mask of the pixels. background: laid behind both, random for each ray,
-    so that no colour can pass for transparency.
+    image: premultiplied. rgba: straight colour and mask of the pixels. background: laid behind both, random for each
+    ray, so that no colour can pass for transparency.
     """
     mask = rgba[:, 3]
     target = rgba[:, :3] * mask[:, None] + background * (1 - mask[:, None])

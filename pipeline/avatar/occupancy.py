@@ -1,10 +1,10 @@
 """Which cells of canonical space may hold something: 64³ voxels, one grid for the whole sequence.
 
-IHM (Wang et al. 2025), section 2.2: starts from the A-posed body, and is updated by a moving average of the field's density,
-weighted by voxel attention, a two-layer network on density, distance to the body surface and frequency over time. The paper
-does not say how that network learns. Here it learns from what the training rays saw: a voxel that light reached is an example,
-positive if it gave weight to a pixel, negative if the light went through. Voxels that no light reached (the inside of the body)
-give no example and are judged by what the network learnt from the others.
+IHM (Wang et al. 2025), section 2.2: starts from the A-posed body, and is updated by a moving average of the field's
+density, weighted by voxel attention, a two-layer network on density, distance to the body surface and frequency over
+time. The paper does not say how that network learns. Here it learns from what the training rays saw: a voxel that
+light reached is an example, positive if it gave weight to a pixel, negative if the light went through. Voxels that
+no light reached (the inside of the body) give no example and are judged by what the network learnt from the others.
 """
 
 from dataclasses import dataclass
@@ -18,6 +18,8 @@ from pipeline.kernels.visits import record_visits
 
 RESOLUTION = 64
 HIDDEN = 16
+START_AVERAGE = 0.05
+"""Of a cell before it was asked: it stays occupied for some thirty updates in which its density is zero."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,7 @@ class OccupancyUpdate:
         self.centres_m = torch.from_numpy(cell_centres(bounds_m, shell.shape[0]))[self.cells]
         self.distance_m = torch.from_numpy(distance_m.reshape(-1).astype(np.float32))[self.cells]
         self.frequency = torch.from_numpy(frequency.reshape(-1).astype(np.float32))[self.cells]
-        self.average = torch.ones(len(self.cells))
+        self.average = torch.full((len(self.cells),), START_AVERAGE)
         self.reached, self.gave = torch.zeros(shell.size), torch.zeros(shell.size)
         self.decay = decay
         self.attention = VoxelAttention(margin_m, seed) if attention else None
@@ -98,6 +100,7 @@ class OccupancyUpdate:
         self.occupied.view(-1)[self.cells] = 1
 
     def grid(self) -> Occupancy:
+        """The cells as they are occupied now; later updates show in it."""
         return Occupancy(self.occupied, self.bounds_m)
 
     def record(self, points_m: Float[Tensor, "s 3"], light: Float[Tensor, "s"], weights: Float[Tensor, "s"]) -> None:

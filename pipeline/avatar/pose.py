@@ -19,7 +19,8 @@ MAIN_JOINTS = (
 class PoseCorrection:
     """An axis-angle vector for each main joint and a shift of the root, for each training frame, in time order.
 
-    A joint turns by its correction before its fitted local rotation is applied to what hangs on it: R = R_fit · exp(correction).
+    A joint turns by its correction before its fitted local rotation is applied to what hangs on it: R = R_fit ·
+    exp(correction).
     """
 
     def __init__(self, body: Body, motion: Motion) -> None:

@@ -25,14 +25,17 @@ class PixelPool:
 
     @property
     def frames(self) -> int:
+        """Number of frames."""
         return len(self.start)
 
     def draw(
         self, frames: Int[np.ndarray, "k"], rays: int, shares: tuple[float, float, float], random: np.random.Generator
     ) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
-        """Rows of random pixels, about `rays` in all, and the slot (position in `frames`) of each; sorted by slot, then place.
+        """Rows of random pixels, about `rays` in all, and the slot (position in `frames`) of each; sorted by slot,
+        then place.
 
-        shares: parts of the rays on the body, its border and outside; a frame without pixels of a kind draws none of it.
+        shares: parts of the rays on the body, its border and outside; a frame without pixels of a kind draws none of
+        it.
         """
         rows, slots = [], []
         for slot, frame in enumerate(frames):
@@ -52,8 +55,8 @@ def build_pool(
 ) -> PixelPool:
     """Sort the pixels of each (image, mask) into the three kinds.
 
-    border_px: half width of the band around the mask's edge. Outside pixels come from the body's box, widened by a tenth,
-    and are thinned to a fixed number a frame.
+    border_px: half width of the band around the mask's edge. Outside pixels come from the body's box, widened by a
+    tenth, and are thinned to a fixed number a frame.
     """
     xy, rgba, starts, total = [], [], [], 0
     for index, (image, mask) in enumerate(images):

@@ -27,7 +27,8 @@ def render_field(
 ) -> Float[Tensor, "h w 4"]:
     """Premultiplied colour and alpha of every pixel, without gradient.
 
-    skin: the body's skin grid, from `build_skin_grid`; give it when many images are rendered, it takes a second to build.
+    skin: the body's skin grid, from `build_skin_grid`; give it when many images are rendered, it takes a second to
+    build.
     """
     skin = skin or build_skin_grid(body, skin_margin_m(body, occupancy.bounds_m.numpy()))
     canonical_to_world = canonical_to_world.float()

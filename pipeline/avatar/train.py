@@ -59,7 +59,8 @@ class DivergedError(ArithmeticError):
 class Learning:
     """The state of stage one: everything that a step changes is here and in `state()`.
 
-    Random numbers come from a generator keyed by (seed, step), so a resumed run draws what an unbroken one would have drawn.
+    Random numbers come from a generator keyed by (seed, step), so a resumed run draws what an unbroken one would
+    have drawn.
     """
 
     def __init__(self, scene: Scene, field: Field, occupancy: OccupancyUpdate, config: FieldConfig) -> None:
@@ -88,6 +89,7 @@ class Learning:
 
     @property
     def refines_poses(self) -> bool:
+        """True once the poses take part in the learning."""
         return self.config.pose_refinement and self.done >= self.config.pose_start * self.config.steps
 
     def _random(self) -> np.random.Generator:

@@ -1,7 +1,7 @@
 """Skin weights around the canonical body, and the warp grids of a motion.
 
-The posed space of a frame is the world seen from the moving root: the root's skinning matrix is the identity there, so global
-orientation and translation are factored out and a frame's box is as tight as the body.
+The posed space of a frame is the world seen from the moving root: the root's skinning matrix is the identity there,
+so global orientation and translation are factored out and a frame's box is as tight as the body.
 """
 
 from collections.abc import Sequence
@@ -24,8 +24,9 @@ NEIGHBOURS = 24
 def build_skin_grid(body: Body, margin_m: float, cell_m: float = 0.03) -> SkinGrid:
     """Skin weights on all nodes within `margin_m` (and two cells) of the canonical surface, inside or outside.
 
-    InstantAvatar gives each voxel the weights of its nearest vertex, which jump where two limbs are equally near. Here they are
-    a Gaussian mean over the nearest vertices, whose width grows with the distance, so that skinning is continuous.
+    InstantAvatar gives each voxel the weights of its nearest vertex, which jump where two limbs are equally near.
+    Here they are a Gaussian mean over the nearest vertices, whose width grows with the distance, so that skinning is
+    continuous.
     """
     reach = margin_m + 2.5 * cell_m
     origin = (np.floor((body.vertices.min(0) - reach) / cell_m) * cell_m).astype(np.float32)

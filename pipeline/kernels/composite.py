@@ -1,4 +1,6 @@
-"""Alpha compositing of packed, ragged rays: alpha_i = 1 - exp(-density_i · step_i), weight_i = alpha_i · prod_{k<i} (1 - alpha_k).
+"""Alpha compositing of packed, ragged rays.
+
+alpha_i = 1 - exp(-density_i · step_i), weight_i = alpha_i · prod_{k<i} (1 - alpha_k).
 
 Letters: n rays, s samples, c channels. Samples of a ray lie together, near to far; ray r owns samples
 ray_start[r] : ray_start[r + 1]. IHM (Wang et al. 2025), section 2.2; Max 1995.

@@ -3,8 +3,8 @@
 Müller et al. 2022, "Instant Neural Graphics Primitives", section 3. Letters: n points, l levels, f features a level.
 
 Two things differ from the paper, both measured (docs/decisions.md):
-a level's cells are cubes in metres, so the number of cells is given per axis and a standing body wastes no table rows on
-the empty half of a cube; levels whose nodes fit in the table are dense and have no collisions.
+a level's cells are cubes in metres, so the number of cells is given per axis and a standing body wastes no table
+rows on the empty half of a cube; levels whose nodes fit in the table are dense and have no collisions.
 """
 
 from dataclasses import dataclass
@@ -26,8 +26,8 @@ BLOCK_FEATURES = (1, 2, 4, 8)
 class GridLayout:
     """Where each level's rows lie in the one table.
 
-    `cells_per_axis` has a triple (x, y, z) of cell counts a level, coarse to fine; a level has at most 2**`log2_rows` rows of
-    `features` floats each.
+    `cells_per_axis` has a triple (x, y, z) of cell counts a level, coarse to fine; a level has at most
+    2**`log2_rows` rows of `features` floats each.
     """
 
     cells_per_axis: tuple[tuple[int, int, int], ...]
@@ -40,6 +40,7 @@ class GridLayout:
 
     @property
     def levels(self) -> int:
+        """Number of levels."""
         return len(self.cells_per_axis)
 
     @property
@@ -49,6 +50,7 @@ class GridLayout:
 
     @cached_property
     def rows_per_level(self) -> tuple[int, ...]:
+        """Table rows of each level: all its nodes, or 2**`log2_rows` that they share."""
         limit = 1 << self.log2_rows
         return tuple(min(limit, (x + 1) * (y + 1) * (z + 1)) for x, y, z in self.cells_per_axis)
 
@@ -104,8 +106,9 @@ def encode(
 ) -> Float[Tensor, "n width"]:
     """Features of points in the unit box, level after level; differentiable in the points and the table.
 
-    Points outside [0, 1] are read at the nearest point of the box. With `table_gradient` (numba only), backward adds the
-    table's gradient to that buffer and autograd gets none: a training step then neither allocates nor clears a table.
+    Points outside [0, 1] are read at the nearest point of the box. With `table_gradient` (numba only), backward adds
+    the table's gradient to that buffer and autograd gets none: a training step then neither allocates nor clears a
+    table.
     """
     if not runs_on_numba(points_unit, table):
         return reference.encode(points_unit, table, layout.plan)

@@ -1,7 +1,8 @@
 """Ray marching: where along each ray the canonical field has to be asked.
 
-Each ray walks through the posed box of its own frame in steps of constant length in metres; each stop is looked up in the
-frame's warp grid, and kept if its canonical point lies in an occupied cell. What is kept is packed, ray after ray.
+Each ray walks through the posed box of its own frame in steps of constant length in metres; each stop is looked up
+in the frame's warp grid, and kept if its canonical point lies in an occupied cell. What is kept is packed, ray after
+ray.
 
 Letters: n rays, s samples, k frames.
 """
@@ -24,8 +25,7 @@ from pipeline.kernels.warp import WarpGrid
 class WarpSet:
     """The warp grids of several frames, one behind the other, all with the same cell.
 
-    table has a row a frame: origin and size are in `origin_m` (k, 3) and `dims` (k, 3); `first` (k, 3) says where the frame's
-    nodes, cells and maps begin.
+    A frame is a row of `origin_m` and `dims`; `first` says where its nodes, cells and maps begin.
     """
 
     cell_m: float
@@ -38,6 +38,7 @@ class WarpSet:
 
     @staticmethod
     def of(grids: Sequence[WarpGrid], cell_m: float) -> "WarpSet":
+        """Lay warp grids one behind the other; `cell_m` is the cell of all of them."""
         sizes = np.array([(len(g.canonical_m), len(g.codes), len(g.maps)) for g in grids], dtype=np.int64)
         return WarpSet(
             cell_m=cell_m,

@@ -1,9 +1,10 @@
 """Inverse skinning: from posed points back to the canonical A-pose.
 
-A `SkinGrid` holds skin weights on the nodes near the canonical body. For one frame, `bake` turns its skinning matrices into a
-`WarpGrid` that says for each node of a posed grid where it lies in canonical space; a lookup there, and at most one Newton step
-(`newton`), replaces the 13-start Broyden search of SNARF and InstantAvatar (Chen et al. 2021, Jiang et al. 2023).
-Where limbs come near each other a posed cell has several inverses: it then holds one affine map for each.
+A `SkinGrid` holds skin weights on the nodes near the canonical body. For one frame, `bake` turns its skinning
+matrices into a `WarpGrid` that says for each node of a posed grid where it lies in canonical space; a lookup there,
+and at most one Newton step (`newton`), replaces the 13-start Broyden search of SNARF and InstantAvatar (Chen et al.
+2021, Jiang et al. 2023). Where limbs come near each other a posed cell has several inverses: it then holds one
+affine map for each.
 
 Letters: m skin-grid nodes, j joints, k frames of a batch, s samples.
 """
@@ -103,7 +104,8 @@ def newton(
     """One Newton step towards the canonical points that skinning carries to `posed_m`.
 
     Args:
-        blended: `SkinGrid.blend` of the batch's frames. Differentiable, by the implicit function theorem: dx = -J^-1 dA x.
+        blended: `SkinGrid.blend` of the batch's frames. Differentiable, by the implicit function theorem: dx = -J^-1
+        dA x.
         start_m: canonical points to start from (a warp grid's answer). Where no step is possible they are the result.
         slot_start: k + 1 offsets; the samples of frame f are slot_start[f] : slot_start[f + 1].
     """

@@ -1,7 +1,7 @@
 """Compiled loops of inverse skinning.
 
-Forward, a canonical point x is carried by A(x) = sum_j w_j(x) B_j, whose 12 numbers are interpolated trilinearly between
-the nodes of the skin grid. Inverse, x(p) solves A(x) x = p: Newton's method with the exact Jacobian
+Forward, a canonical point x is carried by A(x) = sum_j w_j(x) B_j, whose 12 numbers are interpolated trilinearly
+between the nodes of the skin grid. Inverse, x(p) solves A(x) x = p: Newton's method with the exact Jacobian
 J = A_3x3 + sum_corners (A_corner x) grad(weight_corner)^T.
 
 Grid arguments, everywhere: origin (3), cell (m), row_of_node (gx, gy, gz) int32 with -1 where the grid has no node,

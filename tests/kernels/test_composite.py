@@ -1,0 +1,89 @@
+import math
+
+import pytest
+import torch
+
+from pipeline.kernels.composite import composite
+from pipeline.kernels.reference import composite as reference
+from pipeline.kernels.visits import light_before
+
+RAY_START = torch.tensor([0, 3, 3, 4, 9, 12])
+
+
+def make(dtype=torch.float32, samples=12, channels=3):
+    random = torch.Generator().manual_seed(4)
+    density = 30 * torch.rand(samples, generator=random, dtype=dtype)
+    colour = torch.rand(samples, channels, generator=random, dtype=dtype)
+    step = 0.01 + 0.1 * torch.rand(samples, generator=random, dtype=dtype)
+    return density, colour, step
+
+
+def by_definition(density, colour, step, first, last):
+    """One ray, sample after sample."""
+    light, image, weights = 1.0, [0.0] * colour.shape[1], []
+    for i in range(first, last):
+        alpha = 1 - math.exp(-float(density[i]) * float(step[i]))
+        weights.append(light * alpha)
+        image = [old + light * alpha * float(c) for old, c in zip(image, colour[i], strict=True)]
+        light *= 1 - alpha
+    return image, 1 - light, weights
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_each_ray_is_the_sum_by_definition(dtype):
+    density, colour, step = make(dtype)
+    image, alpha, weights = composite(density, colour, step, RAY_START)
+    for ray in range(5):
+        first, last = int(RAY_START[ray]), int(RAY_START[ray + 1])
+        true_image, true_alpha, true_weights = by_definition(density, colour, step, first, last)
+        assert image[ray].tolist() == pytest.approx(true_image, abs=2e-6)
+        assert float(alpha[ray]) == pytest.approx(true_alpha, abs=2e-6)
+        assert weights[first:last].tolist() == pytest.approx(true_weights, abs=2e-6)
+
+
+def test_uniform_fog_has_its_closed_form():
+    count, length, density = 500, 2.0, 0.8
+    full = torch.full((count,), density)
+    colour, step = torch.full((count, 3), 0.25), torch.full((count,), length / count)
+    image, alpha, _ = composite(full, colour, step, torch.tensor([0, count]))
+    expected = 1 - math.exp(-density * length)
+    assert float(alpha) == pytest.approx(expected, abs=1e-5)
+    assert image[0].tolist() == pytest.approx([0.25 * expected] * 3, abs=1e-5)
+
+
+def test_empty_rays_see_nothing():
+    density, colour, step = make()
+    image, alpha, _ = composite(density, colour, step, RAY_START)
+    assert image[1].tolist() == [0, 0, 0]
+    assert float(alpha[1]) == 0
+
+
+def test_gradients_match_the_twin_in_double():
+    density, colour, step = make()
+    inputs = [tensor.clone().requires_grad_(True) for tensor in (density, colour)]
+    exact = [tensor.double().requires_grad_(True) for tensor in (density, colour)]
+    random = torch.Generator().manual_seed(0)
+    to_image, to_alpha = torch.randn(5, 3, generator=random), torch.randn(5, generator=random)
+    image, alpha, _ = composite(*inputs, step, RAY_START)
+    ((image * to_image).sum() + (alpha * to_alpha).sum()).backward()
+    image, alpha, _ = composite(*exact, step.double(), RAY_START)
+    ((image * to_image.double()).sum() + (alpha * to_alpha.double()).sum()).backward()
+    for ours, truth in zip(inputs, exact, strict=True):
+        torch.testing.assert_close(ours.grad.double(), truth.grad, atol=1e-6, rtol=1e-5)
+
+
+def test_twin_passes_gradcheck():
+    density, colour, step = make(torch.float64)
+    assert torch.autograd.gradcheck(
+        lambda d, c: reference.composite(d, c, step, RAY_START)[:2],
+        (density.requires_grad_(True), colour.requires_grad_(True)),
+    )
+
+
+def test_light_before_is_what_the_samples_in_front_left():
+    density, colour, step = make()
+    _, _, weights = composite(density, colour, step, RAY_START)
+    light = light_before(weights, RAY_START)
+    assert float(light[0]) == float(light[3]) == 1
+    passed = torch.exp(-density * step)
+    assert float(light[2]) == pytest.approx(float(passed[0] * passed[1]), abs=1e-6)
