@@ -1,0 +1,255 @@
+"""Fit the parametric body to a recording: one shape, a pose a frame, the focal length where it is unknown.
+
+Shape, focal length and landmark offsets are found on some frames spread over the recording, first from landmarks, then
+from outlines as well; then every frame gets its pose with those held fixed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from pipeline.avatar.body import Body
+from pipeline.avatar.fit_init import initial_state, interpolated_state, torso_found
+from pipeline.avatar.fit_landmarks import LandmarkRegressor, landmark_regressor
+from pipeline.avatar.fit_model import FitModel, ParametricBody, linearise, pose_points, pose_skeleton
+from pipeline.avatar.fit_objective import (
+    FitState,
+    Objective,
+    Observations,
+    Weights,
+    image_scale,
+    project_with_covectors,
+)
+from pipeline.avatar.fit_priors import JointPrior, ShapePrior, joint_prior, shape_prior
+from pipeline.avatar.fit_silhouette import Window, focused_camera, match_all
+from pipeline.avatar.fit_solver import NormalEquations, minimise, shared_covariance
+from pipeline.avatar.fit_swaps import LIMBS, exchange_bodies, exchange_limbs, exchanged_bodies, exchanged_limbs
+from pipeline.core.progress import track
+from pipeline.geometry.camera import Camera
+from pipeline.geometry.rotation import continuous_quaternions, matrix_to_quaternion
+
+MINIMUM_FRAMES = 3
+LANDMARK_STEPS = 12
+OUTLINE_STEPS = 3
+POSE_ROUNDS = 3
+OUTLINE_LANDMARK_M = 0.04
+"""Standard deviation of a landmark once outlines help: they are the more exact of the two."""
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """`height_m` and `focal_known` take unknowns away; `shared_frames` and `rounds` are the effort."""
+
+    height_m: float | None = None
+    focal_known: bool = False
+    shared_frames: int = 48
+    rounds: int = 8
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """The fitted person, n frames. Deviations are one standard deviation, from the fit's own curvature."""
+
+    body: Body
+    rotations_wxyz: Float[np.ndarray, "n full 4"]
+    root_translation_m: Float[np.ndarray, "n 3"]
+    camera: Camera
+    landmark_error_px: Float[np.ndarray, "n"]
+    overlap: Float[np.ndarray, "n"]
+    exchanged: dict[str, Bool[np.ndarray, "n"]]
+    focal_deviation: float
+    height_deviation_m: float
+
+
+@dataclass(frozen=True)
+class _Tools:
+    """What does not change during a fit."""
+
+    body: ParametricBody
+    regressor: LandmarkRegressor
+    joint_prior: JointPrior
+    shape_prior: ShapePrior
+    default: FitModel
+
+
+def fit_body(
+    body: ParametricBody, observations: Observations, windows: Sequence[Window | None], options: FitOptions
+) -> FitResult:
+    """Fit a body to landmarks and masks.
+
+    observations.camera holds the focal length to start from. Windows come from `fit_silhouette.matching_window`.
+    Raises ValueError when fewer than three frames have a torso in pixels and in 3D.
+    """
+    if torso_found(observations).sum() < MINIMUM_FRAMES:
+        raise ValueError(f"fewer than {MINIMUM_FRAMES} frames have hips and shoulders in pixels and in 3D")
+    tools = _tools(body)
+    rest_m = tools.regressor.points(tools.default, torch.zeros(_offsets(tools), dtype=torch.float64)).rest[0]
+    observations, exchanged = _with_sides_mended(observations, rest_m)
+    start = initial_state(
+        observations, rest_m, tools.default.joints, body.shape_defaults.double(), _offsets(tools)
+    )
+    chosen = shared_rows(observations, windows, options.shared_frames)
+    state, weights, system = _fit_shared(
+        tools, observations.rows(chosen), [windows[row] for row in chosen], start.rows(chosen), options
+    )
+    state = interpolated_state(state, chosen, observations.time_s)
+    state, model, overlap = _fit_poses(tools, observations, windows, state, weights)
+    return _result(tools, model, state, system, observations, overlap, exchanged)
+
+
+def shared_rows(
+    observations: Observations, windows: Sequence[Window | None], count: int
+) -> Int[np.ndarray, "k"]:
+    """Frames for the shared unknowns: evenly spread over those with landmarks and mask (without masks: landmarks)."""
+    found = torso_found(observations)
+    with_mask = found & np.array([window is not None for window in windows])
+    candidates = np.flatnonzero(with_mask if with_mask.sum() >= MINIMUM_FRAMES else found)
+    return np.unique(candidates[np.linspace(0, len(candidates) - 1, min(count, len(candidates))).astype(np.int64)])
+
+
+def _tools(body: ParametricBody) -> _Tools:
+    default = linearise(body, body.shape_defaults)
+    return _Tools(
+        body,
+        landmark_regressor(default),
+        joint_prior(default),
+        shape_prior(body.shape_names, body.shape_defaults),
+        default,
+    )
+
+
+def _offsets(tools: _Tools) -> int:
+    return tools.regressor.by_offset.shape[-1]
+
+
+def _with_sides_mended(
+    observations: Observations, rest_m: Float[Tensor, "33 3"]
+) -> tuple[Observations, dict[str, Bool[np.ndarray, "n"]]]:
+    """Observations with exchanged sides put right, and in which frames that happened."""
+    exchanged = {"whole body": exchanged_bodies(observations, rest_m)}
+    observations = exchange_bodies(observations, exchanged["whole body"])
+    for limb in LIMBS:
+        exchanged[limb] = exchanged_limbs(observations, limb)
+        observations = exchange_limbs(observations, exchanged[limb], limb)
+    return observations, exchanged
+
+
+def _fit_shared(
+    tools: _Tools,
+    observations: Observations,
+    windows: Sequence[Window | None],
+    state: FitState,
+    options: FitOptions,
+) -> tuple[FitState, Weights, NormalEquations]:
+    """Shape, focal length and landmark offsets (with the poses of these frames), and the last normal equations."""
+    weights = Weights() if options.height_m is None else Weights(height_m=options.height_m, height_deviation_m=0.005)
+    state, _ = _minimised(tools, tools.default, observations, weights, state, LANDMARK_STEPS)
+    weights = replace(weights, free_offsets=True, free_focal=not options.focal_known)
+    model = linearise(tools.body, state.shape)
+    state, system = _minimised(tools, model, observations, weights, state, LANDMARK_STEPS)
+    weights = replace(weights, landmark_m=OUTLINE_LANDMARK_M)
+    for _ in track(range(options.rounds), "shape and focal length"):
+        model = linearise(tools.body, state.shape)
+        state, system, _ = _outline_round(tools, model, observations, windows, weights, state)
+    return state, weights, system
+
+
+def _fit_poses(
+    tools: _Tools,
+    observations: Observations,
+    windows: Sequence[Window | None],
+    state: FitState,
+    weights: Weights,
+) -> tuple[FitState, FitModel, Float[np.ndarray, "n"]]:
+    """The pose of every frame with all that is shared held fixed, and each frame's overlap with its mask."""
+    weights = replace(weights, free_shape=False, free_offsets=False, free_focal=False)
+    model = linearise(tools.body, state.shape)
+    landmarks_only = replace(weights, landmark_m=Weights.landmark_m)
+    state, _ = _minimised(tools, model, observations, landmarks_only, state, OUTLINE_STEPS)
+    for _ in track(range(POSE_ROUNDS), "poses"):
+        state, _, _ = _outline_round(tools, model, observations, windows, weights, state)
+    _, overlap = match_all(model, state, observations, windows)
+    return state, model, overlap
+
+
+def _outline_round(
+    tools: _Tools,
+    model: FitModel,
+    observations: Observations,
+    windows: Sequence[Window | None],
+    weights: Weights,
+    state: FitState,
+) -> tuple[FitState, NormalEquations, Float[np.ndarray, "n"]]:
+    """Pair outlines for the body as it stands, then move it."""
+    contour, overlap = match_all(model, state, observations, windows)
+    objective = Objective(
+        model,
+        tools.regressor,
+        tools.joint_prior,
+        tools.shape_prior,
+        observations,
+        weights,
+        image_scale(state, observations.camera),
+        contour,
+    )
+    state, system = minimise(state, objective, objective.retract, OUTLINE_STEPS)
+    return state, system, overlap
+
+
+def _minimised(
+    tools: _Tools, model: FitModel, observations: Observations, weights: Weights, state: FitState, steps: int
+) -> tuple[FitState, NormalEquations]:
+    """Fit to landmarks alone."""
+    objective = Objective(
+        model,
+        tools.regressor,
+        tools.joint_prior,
+        tools.shape_prior,
+        observations,
+        weights,
+        image_scale(state, observations.camera),
+    )
+    return minimise(state, objective, objective.retract, steps)
+
+
+def landmark_errors_px(
+    regressor: LandmarkRegressor, model: FitModel, state: FitState, observations: Observations
+) -> Float[np.ndarray, "n"]:
+    """Median distance of each frame's well-seen landmarks from the body's; nan in frames without any."""
+    skeleton = pose_skeleton(model, state.rotations, state.root_m)
+    world, _ = pose_points(model, skeleton, regressor.points(model, state.offsets_m))
+    pixels, _ = project_with_covectors(world, observations.camera, state.focal_log)
+    error = (pixels - observations.landmarks_px).norm(dim=-1)
+    return torch.where(observations.confidence > 0.5, error, torch.nan).nanmedian(1).values.numpy()
+
+
+def _result(
+    tools: _Tools,
+    model: FitModel,
+    state: FitState,
+    system: NormalEquations,
+    observations: Observations,
+    overlap: Float[np.ndarray, "n"],
+    exchanged: dict[str, Bool[np.ndarray, "n"]],
+) -> FitResult:
+    covariance = shared_covariance(system)
+    shapes = len(state.shape)
+    height_gradient = model.height_m()[1].numpy()
+    quaternions = matrix_to_quaternion(model.rotations_of_all(state.rotations))
+    return FitResult(
+        body=tools.body.body(state.shape.float()),
+        rotations_wxyz=continuous_quaternions(quaternions).float().numpy(),
+        root_translation_m=state.root_m.float().numpy(),
+        camera=focused_camera(observations.camera, state),
+        landmark_error_px=landmark_errors_px(tools.regressor, model, state, observations),
+        overlap=overlap,
+        exchanged=exchanged,
+        focal_deviation=float(np.sqrt(covariance[-1, -1])) if system.border[..., -1].any() else 0.0,
+        height_deviation_m=float(np.sqrt(height_gradient @ covariance[:shapes, :shapes] @ height_gradient)),
+    )

@@ -1,0 +1,134 @@
+"""The 33 BlazePose landmarks as places on the body: where the detector's "left hip" lies on the skeleton.
+
+Order and meaning: Bazarevsky et al., "BlazePose: On-device real-time body pose tracking", 2020, figure 3.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pipeline.avatar.fit_model import ACTIVE_JOINTS, FitModel, Points
+
+LANDMARK_COUNT = 33
+
+
+@dataclass(frozen=True)
+class Landmark:
+    """One left or central landmark.
+
+    `carrier` is the joint it moves with; `anchor` the joint it is measured from (None: the nearest point of the
+    surface). `place_m` is where it lies on the default A-pose body. `noise` scales the detector's usual error.
+    """
+
+    name: str
+    indices: tuple[int, ...]
+    carrier: str
+    anchor: str | None
+    place_m: tuple[float, float, float]
+    noise: float
+
+
+# The right landmark mirrors the left one: x changes sign, "Left" becomes "Right".
+LANDMARKS = (
+    Landmark("nose", (0,), "Head", None, (0.0, 1.683, 0.157), 0.8),
+    Landmark("eye_inner", (1, 4), "Head", None, (0.018, 1.724, 0.125), 0.8),
+    Landmark("eye", (2, 5), "Head", None, (0.032, 1.724, 0.124), 0.8),
+    Landmark("eye_outer", (3, 6), "Head", None, (0.046, 1.724, 0.115), 0.8),
+    Landmark("ear", (7, 8), "Head", None, (0.078, 1.704, 0.037), 1.0),
+    Landmark("mouth", (9, 10), "Head", None, (0.026, 1.643, 0.131), 0.8),
+    Landmark("shoulder", (11, 12), "LeftShoulder", "LeftArm", (0.174, 1.485, 0.003), 1.0),
+    Landmark("elbow", (13, 14), "LeftArm", "LeftForeArm", (0.370, 1.262, 0.015), 1.0),
+    Landmark("wrist", (15, 16), "LeftForeArm", "LeftHand", (0.505, 1.122, 0.188), 1.0),
+    Landmark("pinky", (17, 18), "LeftHand", "LeftHandPinky1", (0.567, 1.044, 0.233), 1.5),
+    Landmark("index", (19, 20), "LeftHand", "LeftHandIndex1", (0.539, 1.075, 0.293), 1.5),
+    Landmark("thumb", (21, 22), "LeftHand", "LeftHandThumb2", (0.486, 1.102, 0.260), 1.5),
+    Landmark("hip", (23, 24), "Hips", "LeftUpLeg", (0.100, 0.960, 0.000), 1.2),
+    Landmark("knee", (25, 26), "LeftUpLeg", "LeftLeg", (0.155, 0.530, 0.020), 1.0),
+    Landmark("ankle", (27, 28), "LeftLeg", "LeftFoot", (0.195, 0.090, -0.008), 1.0),
+    Landmark("heel", (29, 30), "LeftFoot", "LeftFoot", (0.200, 0.030, -0.050), 1.3),
+    Landmark("foot_index", (31, 32), "LeftFoot", "LeftToeBase", (0.190, 0.015, 0.195), 1.3),
+)
+
+OFFSET_COUNT = 3 * len(LANDMARKS)
+"""Numbers that shift the landmarks on the body for one video: x, y, z a `Landmark`, mirrored for the right one."""
+
+PAIRS = tuple(landmark.indices for landmark in LANDMARKS if len(landmark.indices) == 2)
+
+SWAP_GROUPS = {
+    "arms": tuple(pair for pair in PAIRS if 13 <= pair[0] <= 21),
+    "legs": tuple(pair for pair in PAIRS if pair[0] >= 25),
+    "whole body": PAIRS,
+}
+"""Pairs that the detector confuses together."""
+
+
+def mirror_permutation(pairs: tuple[tuple[int, ...], ...]) -> list[int]:
+    """Order of the 33 landmarks with left and right exchanged in the given pairs."""
+    order = list(range(LANDMARK_COUNT))
+    for left, right in pairs:
+        order[left], order[right] = right, left
+    return order
+
+
+def landmark_noise() -> Float[Tensor, "33"]:
+    """Each landmark's usual error relative to the detector's typical one."""
+    noise = torch.ones(LANDMARK_COUNT, dtype=torch.float64)
+    for landmark in LANDMARKS:
+        noise[list(landmark.indices)] = landmark.noise
+    return noise
+
+
+@dataclass(frozen=True)
+class LandmarkRegressor:
+    """Landmarks as anchors (weights over all joints and vertices) plus fixed shifts; made once, on the default shape."""
+
+    anchor_joint: tuple[int | None, ...]
+    anchor_vertex: tuple[int | None, ...]
+    shift_m: Float[Tensor, "33 3"]
+    carrier: Float[Tensor, "33 j"]
+    by_offset: Float[Tensor, "33 3 o"]
+
+    def points(self, model: FitModel, offsets_m: Float[Tensor, "o"]) -> Points:
+        """The landmarks on a rest body; the shape axis is the body's shape followed by the offsets."""
+        places, derivatives = [], []
+        for joint, vertex in zip(self.anchor_joint, self.anchor_vertex, strict=True):
+            if joint is not None:
+                places.append(model.full_joints[joint])
+                derivatives.append(model.full_joints_by_shape[joint])
+            else:
+                places.append(model.vertices[vertex])
+                derivatives.append(model.vertices_by_shape[vertex])
+        rest = torch.stack(places) + self.shift_m + self.by_offset @ offsets_m
+        by_shape = torch.cat([torch.stack(derivatives), self.by_offset], dim=-1)
+        return Points(rest[None], self.carrier[None], by_shape[None])
+
+
+def landmark_regressor(default: FitModel) -> LandmarkRegressor:
+    """Tie the table's places to joints and vertices of a body of the default shape."""
+    joints: list[int | None] = [None] * LANDMARK_COUNT
+    vertices: list[int | None] = [None] * LANDMARK_COUNT
+    shift = torch.zeros(LANDMARK_COUNT, 3, dtype=torch.float64)
+    carrier = torch.zeros(LANDMARK_COUNT, len(ACTIVE_JOINTS), dtype=torch.float64)
+    by_offset = torch.zeros(LANDMARK_COUNT, 3, OFFSET_COUNT, dtype=torch.float64)
+    for row, landmark in enumerate(LANDMARKS):
+        for side, index in enumerate(landmark.indices):
+            mirror = torch.tensor([-1.0 if side else 1.0, 1.0, 1.0], dtype=torch.float64)
+            place = torch.tensor(landmark.place_m, dtype=torch.float64) * mirror
+            if landmark.anchor is None:
+                vertices[index] = int((default.vertices - place).norm(dim=1).argmin())
+                anchor = default.vertices[vertices[index]]
+            else:
+                joints[index] = default.full_by_name[_on_side(landmark.anchor, side)]
+                anchor = default.full_joints[joints[index]]
+            shift[index] = place - anchor
+            carrier[index, ACTIVE_JOINTS.index(_on_side(landmark.carrier, side))] = 1.0
+            by_offset[index, :, 3 * row : 3 * row + 3] = torch.diag(mirror)
+    return LandmarkRegressor(tuple(joints), tuple(vertices), shift, carrier, by_offset)
+
+
+def _on_side(name: str, side: int) -> str:
+    return name.replace("Left", "Right") if side else name

@@ -1,0 +1,363 @@
+"""What a fit minimises: landmarks, silhouette, pose, motion and shape terms, as one system of normal equations.
+
+All residuals are in standard deviations. Distances in the image are judged in metres at the person's depth, so that
+the weights hold for any resolution. Robust terms use Geman-McClure, rho(r) = r^2 / (1 + r^2 / c^2) (Barron 2019).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from pipeline.avatar.fit_landmarks import OFFSET_COUNT, LandmarkRegressor, landmark_noise
+from pipeline.avatar.fit_model import (
+    ACTIVE_JOINTS,
+    FitModel,
+    Points,
+    PosedSkeleton,
+    pose_points,
+    pose_rows,
+    pose_skeleton,
+    shape_rows,
+    surface_points,
+)
+from pipeline.avatar.fit_priors import (
+    JointPrior,
+    ShapePrior,
+    interval_factors,
+    motion_residuals,
+    pose_residuals,
+)
+from pipeline.avatar.fit_solver import NormalEquations
+from pipeline.geometry.camera import Camera
+from pipeline.geometry.rotation import axis_angle_to_matrix
+
+FACE_LANDMARKS = 11
+LEFT_HIP, RIGHT_HIP = 23, 24
+MINIMUM_DEPTH_M = 0.2
+
+
+@dataclass(frozen=True)
+class FitState:
+    """The unknowns. `focal_log` is the logarithm of the focal length over that of the given camera."""
+
+    rotations: Float[Tensor, "n j 3 3"]
+    root_m: Float[Tensor, "n 3"]
+    shape: Float[Tensor, "s"]
+    offsets_m: Float[Tensor, "o"]
+    focal_log: Float[Tensor, ""]
+
+    def moved(self, frame_step: Float[Tensor, "n p"], shared_step: Float[Tensor, "g"]) -> FitState:
+        """The state after a step; an empty shared step leaves what is shared as it is."""
+        turn = axis_angle_to_matrix(frame_step[:, :-3].reshape(*self.rotations.shape[:2], 3))
+        moved = replace(self, rotations=turn @ self.rotations, root_m=self.root_m + frame_step[:, -3:])
+        if len(shared_step) == 0:
+            return moved
+        shapes = len(self.shape)
+        return replace(
+            moved,
+            shape=self.shape + shared_step[:shapes],
+            offsets_m=self.offsets_m + shared_step[shapes:-1],
+            focal_log=self.focal_log + shared_step[-1],
+        )
+
+    def rows(self, rows: Int[np.ndarray, "k"]) -> FitState:
+        """The poses of some frames."""
+        return replace(self, rotations=self.rotations[rows], root_m=self.root_m[rows])
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What was seen. `directions_m` are landmarks in world axes relative to the middle of the hips, of unknown overall
+    scale. `confidence` of pixels and of directions is in [0, 1], 0 where there is none; no value is nan."""
+
+    time_s: Float[Tensor, "n"]
+    landmarks_px: Float[Tensor, "n 33 2"]
+    directions_m: Float[Tensor, "n 33 3"]
+    confidence: Float[Tensor, "n 33"]
+    direction_confidence: Float[Tensor, "n 33"]
+    camera: Camera
+
+    def rows(self, rows: Int[np.ndarray, "k"]) -> Observations:
+        """What was seen in some frames."""
+        return Observations(
+            self.time_s[rows],
+            self.landmarks_px[rows],
+            self.directions_m[rows],
+            self.confidence[rows],
+            self.direction_confidence[rows],
+            self.camera,
+        )
+
+
+@dataclass(frozen=True)
+class Contour:
+    """Points of the body that should lie on a line in the image: normal · (projection - target) = 0; weight 0 = unused."""
+
+    corners: Int[Tensor, "n m 3"]
+    barycentric: Float[Tensor, "n m 3"]
+    target_px: Float[Tensor, "n m 2"]
+    normal: Float[Tensor, "n m 2"]
+    weight: Float[Tensor, "n m"]
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Standard deviations of the terms; None leaves a term out."""
+
+    landmark_m: float = 0.025
+    landmark_cutoff: float = 3.0
+    direction_m: float = 0.08
+    contour_m: float = 0.010
+    contour_cutoff: float = 4.0
+    motion_rad: float = 0.03
+    motion_m: float = 0.01
+    motion_cutoff: float = 4.0
+    offset_m: float = 0.012
+    height_m: float = 1.70
+    height_deviation_m: float = 0.08
+    focal_log: float = 0.5
+    free_shape: bool = True
+    free_offsets: bool = False
+    free_focal: bool = False
+
+    def anything_shared(self) -> bool:
+        """Whether any number that all frames share may move."""
+        return self.free_shape or self.free_offsets or self.free_focal
+
+
+@dataclass(frozen=True)
+class Objective:
+    """All terms at hand; call it with a state.
+
+    `px_per_m` is the image scale at each frame's person, held fixed while the state moves.
+    """
+
+    model: FitModel
+    regressor: LandmarkRegressor
+    joint_prior: JointPrior
+    shape_prior: ShapePrior
+    observations: Observations
+    weights: Weights
+    px_per_m: Float[Tensor, "n"]
+    contour: Contour | None = None
+
+    def __call__(self, state: FitState) -> NormalEquations:
+        model = self.model.moved(state.shape)
+        frames, joints = state.rotations.shape[:2]
+        shapes = len(state.shape)
+        shared = shapes + OFFSET_COUNT + 1 if self.weights.anything_shared() else 0
+        system = NormalEquations.zeros(frames, 3 * joints + 3, shared)
+        skeleton = pose_skeleton(model, state.rotations, state.root_m)
+        self._add_landmarks(system, model, skeleton, state)
+        if self.contour is not None:
+            self._add_contour(system, model, skeleton, state, self.contour)
+        self._add_pose(system, state)
+        self._add_motion(system, state)
+        if shared:
+            self._add_shared(system, model, state)
+            system.freeze(self._free(shapes))
+        return system
+
+    def retract(self, state: FitState, frame_step: Tensor, shared_step: Tensor) -> FitState:
+        """The state after a step, its shape inside the allowed range."""
+        moved = state.moved(frame_step, shared_step)
+        return replace(moved, shape=moved.shape.clamp(self.shape_prior.lowest, self.shape_prior.highest))
+
+    def _free(self, shapes: int) -> Bool[Tensor, "g"]:
+        free = torch.ones(shapes + OFFSET_COUNT + 1, dtype=torch.bool)
+        free[:shapes], free[shapes:-1] = self.weights.free_shape, self.weights.free_offsets
+        free[-1] = self.weights.free_focal
+        return free
+
+    def _add_landmarks(
+        self, system: NormalEquations, model: FitModel, skeleton: PosedSkeleton, state: FitState
+    ) -> None:
+        seen, weights = self.observations, self.weights
+        points = self.regressor.points(model, state.offsets_m)
+        world, arms = pose_points(model, skeleton, points)
+        pixels, covectors = project_with_covectors(world, seen.camera, state.focal_log)
+        noise = landmark_noise()
+        facing = facing_factor(skeleton, seen.camera)
+        confidence = seen.confidence * facing
+        inverse = confidence.sqrt() / (weights.landmark_m * noise * self.px_per_m[:, None])
+        residual = (pixels - seen.landmarks_px) * inverse[..., None]
+        weight = _robust(system, residual.square().sum(-1), weights.landmark_cutoff)
+        for axis in range(2):
+            covector = covectors[:, :, axis] * inverse[..., None]
+            by_focal = (pixels[..., axis] - _centre(seen.camera)[axis]) * inverse
+            by_shared = self._shared_rows(model, skeleton, points, covector, by_focal)
+            system.add(pose_rows(skeleton, arms, covector), by_shared, residual[..., axis], weight)
+        trust = seen.direction_confidence * facing / noise.square()
+        self._add_directions(system, model, skeleton, points, world, arms, trust)
+
+    def _add_directions(
+        self,
+        system: NormalEquations,
+        model: FitModel,
+        skeleton: PosedSkeleton,
+        points: Points,
+        world: Float[Tensor, "n 33 3"],
+        arms: Float[Tensor, "n 33 j 3"],
+        confidence: Float[Tensor, "n 33"],
+    ) -> None:
+        """The detector's 3D landmarks, relative to the hips and of unknown overall scale."""
+        seen, cutoff = self.observations, self.weights.landmark_cutoff
+        relative = world - _hip_middle(world)
+        lengths = (confidence * seen.directions_m.norm(dim=-1)).sum().clamp(min=1e-6)
+        scale = (confidence * relative.norm(dim=-1)).sum() / lengths
+        inverse = confidence.sqrt() / self.weights.direction_m
+        residual = (relative - scale * seen.directions_m) * inverse[..., None]
+        weight = _robust(system, residual.square().sum(-1), cutoff)
+        for axis in range(3):
+            covector = torch.zeros_like(world)
+            covector[..., axis] = 1.0
+            rows = pose_rows(skeleton, arms, covector)
+            shared = self._shared_rows(model, skeleton, points, covector, torch.zeros_like(inverse))
+            rows = (rows - _hip_middle(rows)) * inverse[..., None]
+            shared = (shared - _hip_middle(shared)) * inverse[..., None]
+            system.add(rows, shared, residual[..., axis], weight)
+
+    def _add_contour(
+        self, system: NormalEquations, model: FitModel, skeleton: PosedSkeleton, state: FitState, contour: Contour
+    ) -> None:
+        seen = self.observations
+        points = surface_points(model, contour.corners, contour.barycentric)
+        world, arms = pose_points(model, skeleton, points)
+        pixels, covectors = project_with_covectors(world, seen.camera, state.focal_log)
+        inverse = 1.0 / (self.px_per_m[:, None] * self.weights.contour_m)
+        residual = ((pixels - contour.target_px) * contour.normal).sum(-1) * inverse
+        weight = contour.weight * _robust(system, residual.square(), self.weights.contour_cutoff, contour.weight)
+        covector = (covectors * contour.normal[..., None]).sum(2) * inverse[..., None]
+        centred = pixels - pixels.new_tensor(_centre(seen.camera))
+        by_focal = (centred * contour.normal).sum(-1) * inverse
+        by_shared = self._shared_rows(model, skeleton, points, covector, by_focal)
+        system.add(pose_rows(skeleton, arms, covector), by_shared, residual, weight)
+
+    def _shared_rows(
+        self,
+        model: FitModel,
+        skeleton: PosedSkeleton,
+        points: Points,
+        covector: Float[Tensor, "n m 3"],
+        by_focal: Float[Tensor, "n m"],
+    ) -> Float[Tensor, "n m g"]:
+        """Derivative of covector · point by shape, landmark offsets and focal length; no columns when all are fixed."""
+        if not self.weights.anything_shared():
+            return covector[..., :0]
+        by_shape = shape_rows(model, skeleton, points, covector)
+        missing = len(model.shape) + OFFSET_COUNT - by_shape.shape[-1]
+        offsets = by_shape.new_zeros(*by_shape.shape[:2], missing)
+        return torch.cat([by_shape, offsets, by_focal[..., None]], dim=-1)
+
+    def _add_pose(self, system: NormalEquations, state: FitState) -> None:
+        residual, derivative = pose_residuals(self.joint_prior, state.rotations)
+        system.cost += float(residual.square().sum())
+        gradient = (derivative.transpose(-1, -2) @ residual[..., None]).squeeze(-1)
+        system.frame_gradient[:, :-3] += gradient.flatten(1)
+        blocks = derivative.transpose(-1, -2) @ derivative
+        for joint in range(blocks.shape[1]):
+            span = slice(3 * joint, 3 * joint + 3)
+            system.frame[:, span, span] += blocks[:, joint]
+
+    def _add_motion(self, system: NormalEquations, state: FitState) -> None:
+        if len(state.root_m) < 3:
+            return
+        weights, time_s = self.weights, self.observations.time_s
+        residual = motion_residuals(state.rotations, state.root_m, time_s)
+        deviation = residual.new_full((residual.shape[1],), weights.motion_rad)
+        deviation[-3:] = weights.motion_m
+        residual = residual / deviation
+        weight = _robust(system, residual.square(), weights.motion_cutoff)
+        before, after, scale = (factor[:, None] for factor in interval_factors(time_s))
+        factors = (before * scale / deviation, -(before + after) * scale / deviation, after * scale / deviation)
+        diagonal = torch.diagonal(system.frame, dim1=1, dim2=2)
+        inner = len(residual)
+        for shift, factor in enumerate(factors):
+            diagonal[shift : shift + inner] += weight * factor**2
+            system.frame_gradient[shift : shift + inner] += weight * factor * residual
+        system.next_frame[:inner] += weight * factors[0] * factors[1]
+        system.next_frame[1 : inner + 1] += weight * factors[1] * factors[2]
+        system.after_next_frame[:inner] += weight * factors[0] * factors[2]
+
+    def _add_shared(self, system: NormalEquations, model: FitModel, state: FitState) -> None:
+        """Priors on shape, stature, landmark offsets and focal length."""
+        weights, shapes = self.weights, len(state.shape)
+        deviation = torch.cat(
+            [
+                self.shape_prior.deviation,
+                torch.full((OFFSET_COUNT,), weights.offset_m, dtype=torch.float64),
+                torch.tensor([weights.focal_log], dtype=torch.float64),
+            ]
+        )
+        value = torch.cat([state.shape - self.shape_prior.mean, state.offsets_m, state.focal_log[None]]) / deviation
+        system.cost += float(value.square().sum())
+        system.shared += torch.diag(deviation**-2)
+        system.shared_gradient += value / deviation
+        height_m, gradient = model.height_m()
+        gradient = gradient / weights.height_deviation_m
+        residual = (height_m - weights.height_m) / weights.height_deviation_m
+        system.cost += residual**2
+        system.shared[:shapes, :shapes] += torch.outer(gradient, gradient)
+        system.shared_gradient[:shapes] += gradient * residual
+
+
+def project_with_covectors(
+    world: Float[Tensor, "n m 3"], camera: Camera, focal_log: Float[Tensor, ""]
+) -> tuple[Float[Tensor, "n m 2"], Float[Tensor, "n m 2 3"]]:
+    """Pixels and their derivative by the world point."""
+    scale = float(torch.exp(focal_log))
+    pose = torch.as_tensor(camera.world_to_camera, dtype=world.dtype)
+    x, y, depth = (world @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
+    depth = depth.clamp(min=MINIMUM_DEPTH_M)
+    fx, fy, zero = camera.fx * scale, camera.fy * scale, torch.zeros_like(x)
+    pixels = torch.stack([fx * x / depth + camera.cx, fy * y / depth + camera.cy], dim=-1)
+    in_camera = torch.stack(
+        [
+            torch.stack([fx / depth, zero, -fx * x / depth**2], dim=-1),
+            torch.stack([zero, fy / depth, -fy * y / depth**2], dim=-1),
+        ],
+        dim=-2,
+    )
+    return pixels, in_camera @ pose[:3, :3]
+
+
+def facing_factor(skeleton: PosedSkeleton, camera: Camera) -> Float[Tensor, "n 33"]:
+    """Trust in each landmark by where the head looks: a face found on the back of a head is the detector's guess."""
+    head = ACTIVE_JOINTS.index("Head")
+    to_camera = torch.nn.functional.normalize(
+        torch.as_tensor(camera.centre_m(), dtype=torch.float64) - skeleton.position[:, head], dim=-1
+    )
+    cosine = (skeleton.rotation[:, head, :, 2] * to_camera).sum(-1)
+    factor = torch.ones(len(cosine), 33, dtype=torch.float64)
+    factor[:, :FACE_LANDMARKS] = (0.5 + 2.0 * cosine).clamp(0.05, 1.0)[:, None]
+    return factor
+
+
+def _robust(
+    system: NormalEquations, squared: Tensor, cutoff: float, share: Tensor | float = 1.0
+) -> Tensor:
+    """Geman-McClure weights rho'(r) for squared residuals; their cost is added to the system."""
+    relative = 1.0 + squared / cutoff**2
+    system.cost += float((share * squared / relative).sum())
+    return relative**-2
+
+
+def image_scale(state: FitState, camera: Camera) -> Float[Tensor, "n"]:
+    """Pixels a metre at each frame's person."""
+    pose = torch.as_tensor(camera.world_to_camera, dtype=state.root_m.dtype)
+    depth_m = (state.root_m @ pose[2, :3] + pose[2, 3]).clamp(min=MINIMUM_DEPTH_M)
+    return camera.fx * torch.exp(state.focal_log) / depth_m
+
+
+def _centre(camera: Camera) -> tuple[float, float]:
+    return camera.cx, camera.cy
+
+
+def _hip_middle(values: Float[Tensor, "n 33 c"]) -> Float[Tensor, "n 1 c"]:
+    return 0.5 * (values[:, LEFT_HIP] + values[:, RIGHT_HIP])[:, None]
+

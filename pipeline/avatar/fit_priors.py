@@ -1,0 +1,181 @@
+"""What is known before any picture: how joints bend, how people move, how tall and how shaped they are.
+
+Residuals are in standard deviations. Angles are rotation vectors of the local rotation, resolved along each joint's own
+axes (rows of `JointPrior.axes`): for hinges (twist along the bone, flexion, sideways), else the body's x, y, z.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pipeline.avatar.fit_model import ACTIVE_JOINTS, FitModel
+from pipeline.geometry.rotation import matrix_to_quaternion, quaternion_to_axis_angle
+
+FRAME_S = 1.0 / 30.0
+"""Interval that the motion prior's deviations are given for."""
+
+LIMIT_RAD = 0.06
+"""Softness of a joint limit: going this far beyond costs one standard deviation."""
+
+FREE_RAD = 10.0
+
+# (deviation about the three axes, rad), symmetric about the A-pose
+BALL_JOINTS = {
+    "Hips": (FREE_RAD, FREE_RAD, FREE_RAD),
+    "Spine": (0.15, 0.10, 0.10),
+    "Spine1": (0.15, 0.10, 0.10),
+    "Spine2": (0.15, 0.10, 0.10),
+    "Neck": (0.20, 0.25, 0.15),
+    "Head": (0.25, 0.35, 0.15),
+    "Shoulder": (0.12, 0.12, 0.12),
+    "Arm": (0.7, 0.7, 0.7),
+    "Hand": (0.25, 0.25, 0.25),
+    "UpLeg": (0.6, 0.3, 0.3),
+    "Foot": (0.25, 0.15, 0.15),
+    "ToeBase": (0.12, 0.04, 0.04),
+}
+# (deviation of twist, flexion, sideways; flexion's limits from the straight limb)
+HINGE_JOINTS = {"ForeArm": (0.5, 0.7, 0.05, -0.05, 2.6), "Leg": (0.12, 0.7, 0.05, -0.05, 2.5)}
+
+SHAPE_DEVIATION = {
+    "gender": 0.35,
+    "age": 0.08,
+    "muscle": 0.25,
+    "weight": 0.25,
+    "height": 0.35,
+    "proportions": 0.3,
+    "cupsize": 0.2,
+    "firmness": 0.1,
+    "african": 0.15,
+    "asian": 0.15,
+    "caucasian": 0.15,
+}
+LOCAL_CHANGE_DEVIATION = 0.3
+"""For shape numbers that are no phenotypes: local changes about 0."""
+
+PHENOTYPE_RANGE = (0.02, 0.98)
+LOCAL_CHANGE_RANGE = (-1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class ShapePrior:
+    """Expected shape, its standard deviation and its allowed range."""
+
+    mean: Float[Tensor, "s"]
+    deviation: Float[Tensor, "s"]
+    lowest: Float[Tensor, "s"]
+    highest: Float[Tensor, "s"]
+
+
+def shape_prior(names: Sequence[str], defaults: Float[Tensor, "s"]) -> ShapePrior:
+    """The prior for a body's shape numbers, by their names; unknown names count as local changes."""
+    deviation = [SHAPE_DEVIATION.get(name, LOCAL_CHANGE_DEVIATION) for name in names]
+    ranges = [PHENOTYPE_RANGE if name in SHAPE_DEVIATION else LOCAL_CHANGE_RANGE for name in names]
+    lowest, highest = torch.tensor(ranges, dtype=torch.float64).unbind(1)
+    return ShapePrior(defaults.double(), torch.tensor(deviation, dtype=torch.float64), lowest, highest)
+
+
+@dataclass(frozen=True)
+class JointPrior:
+    """Axes (rows), deviations and flexion limits of every active joint."""
+
+    axes: Float[Tensor, "j 3 3"]
+    deviation_rad: Float[Tensor, "j 3"]
+    lowest_rad: Float[Tensor, "j 3"]
+    highest_rad: Float[Tensor, "j 3"]
+
+
+def joint_prior(model: FitModel) -> JointPrior:
+    """The prior for a skeleton's rest pose: hinge axes and the straight limb follow from its joints."""
+    count = len(ACTIVE_JOINTS)
+    axes = torch.eye(3, dtype=torch.float64).repeat(count, 1, 1)
+    deviation = torch.ones(count, 3, dtype=torch.float64)
+    lowest, highest = torch.full_like(deviation, -FREE_RAD), torch.full_like(deviation, FREE_RAD)
+    for joint, name in enumerate(ACTIVE_JOINTS):
+        kind = name.removeprefix("Left").removeprefix("Right")
+        if kind in BALL_JOINTS:
+            deviation[joint] = torch.tensor(BALL_JOINTS[kind], dtype=torch.float64)
+            continue
+        axes[joint], bent = _hinge_axes(model, joint, kind)
+        twist, flexion, sideways, straight, most = HINGE_JOINTS[kind]
+        deviation[joint] = torch.tensor([twist, flexion, sideways], dtype=torch.float64)
+        lowest[joint, 1], highest[joint, 1] = straight - bent, most - bent
+    return JointPrior(axes, deviation, lowest, highest)
+
+
+def _hinge_axes(model: FitModel, joint: int, kind: str) -> tuple[Float[Tensor, "3 3"], float]:
+    """Rows (along the bone, flexion axis, sideways) of an elbow or knee, and how far the rest pose bends it (rad)."""
+    parent, child = model.parents[joint], model.parents.index(joint)
+    upper = torch.nn.functional.normalize(model.joints[joint] - model.joints[parent], dim=0)
+    lower = torch.nn.functional.normalize(model.joints[child] - model.joints[joint], dim=0)
+    bend = torch.linalg.cross(upper, lower)
+    if kind == "Leg":  # nearly straight at rest, so its axis is the body's x: a positive angle takes the foot back
+        flexion, bent = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64), float(bend[0])
+    else:
+        flexion, bent = torch.nn.functional.normalize(bend, dim=0), float(torch.asin(bend.norm()))
+    along = torch.nn.functional.normalize(lower - (lower @ flexion) * flexion, dim=0)
+    return torch.stack([along, flexion, torch.linalg.cross(along, flexion)]), bent
+
+
+def rotation_logarithm(rotation: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 3"]:
+    """Rotation vector (rad) of a rotation matrix."""
+    return quaternion_to_axis_angle(matrix_to_quaternion(rotation))
+
+
+def cross_matrix(vector: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
+    """[v]x, so that [v]x u = v x u."""
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    rows = [torch.stack([zero, -z, y], -1), torch.stack([z, zero, -x], -1), torch.stack([-y, x, zero], -1)]
+    return torch.stack(rows, dim=-2)
+
+
+def logarithm_jacobian(vector: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
+    """Derivative of log(exp(delta) exp(vector)) by delta at 0: the inverse left Jacobian of SO(3)."""
+    angle = vector.norm(dim=-1)[..., None, None].clamp(min=1e-4, max=3.1)
+    bracket = cross_matrix(vector)
+    curve = 1.0 / angle**2 - (1.0 + torch.cos(angle)) / (2.0 * angle * torch.sin(angle))
+    return torch.eye(3, dtype=vector.dtype) - 0.5 * bracket + curve * (bracket @ bracket)
+
+
+def pose_residuals(
+    prior: JointPrior, rotations: Float[Tensor, "n j 3 3"]
+) -> tuple[Float[Tensor, "n j 6"], Float[Tensor, "n j 6 3"]]:
+    """Deviations from the A-pose and excess over joint limits, and their derivative by the joint's rotation."""
+    vector = rotation_logarithm(rotations)
+    angle = (prior.axes @ vector[..., None]).squeeze(-1)
+    by_rotation = prior.axes @ logarithm_jacobian(vector)
+    beyond = (angle - prior.highest_rad).clamp(min=0.0) - (prior.lowest_rad - angle).clamp(min=0.0)
+    outside = (beyond != 0).to(angle.dtype) / LIMIT_RAD
+    residual = torch.cat([angle / prior.deviation_rad, beyond / LIMIT_RAD], dim=-1)
+    derivative = torch.cat([by_rotation / prior.deviation_rad[..., None], by_rotation * outside[..., None]], dim=-2)
+    return residual, derivative
+
+
+def interval_factors(time_s: Float[Tensor, "n"]) -> tuple[Float[Tensor, "t"], Float[Tensor, "t"], Float[Tensor, "t"]]:
+    """For each inner frame: factors on the step before it, the step after it, and on the whole residual.
+
+    Velocities are taken over the true intervals; a change of velocity is allowed in proportion to the root of the time
+    it took (white acceleration), so that dropped frames loosen the coupling.
+    """
+    interval = torch.diff(time_s).clamp(min=1e-4) / FRAME_S
+    before, after = 1.0 / interval[:-1], 1.0 / interval[1:]
+    return before, after, 1.0 / (0.5 * (interval[:-1] + interval[1:])).sqrt()
+
+
+def motion_residuals(
+    rotations: Float[Tensor, "n j 3 3"], root_m: Float[Tensor, "n 3"], time_s: Float[Tensor, "n"]
+) -> Float[Tensor, "t p"]:
+    """Change of velocity at each inner frame: rotations (rad a frame, parent's axes), then the root (m a frame).
+
+    To first order its derivative by the rotation steps of frames t - 1, t, t + 1 is (before, -before - after, after).
+    """
+    steps = rotation_logarithm(rotations[1:] @ rotations[:-1].transpose(-1, -2)).flatten(1)
+    steps = torch.cat([steps, torch.diff(root_m, dim=0)], dim=1)
+    before, after, scale = interval_factors(time_s)
+    return (steps[1:] * after[:, None] - steps[:-1] * before[:, None]) * scale[:, None]

@@ -1,0 +1,152 @@
+"""Levenberg-Marquardt on all frames at once: small dense blocks a frame, neighbours in time coupled, few shared numbers.
+
+Letters: n frames, p numbers a frame, g shared numbers. The normal matrix is banded (a frame's block, and diagonals that
+couple it with the next two frames) with a border for the shared numbers, so a step costs O(n p^3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
+from torch import Tensor
+
+DAMPING_START = 1e-3
+DAMPING_UP = 8.0
+DAMPING_DOWN = 0.3
+DAMPING_LIMIT = 1e6
+
+
+@dataclass
+class NormalEquations:
+    """Sum of w J^T J, w J^T r and the robust cost; float64. `next_frame[t]` couples frames t and t + 1, number by number."""
+
+    frame: Float[Tensor, "n p p"]
+    border: Float[Tensor, "n p g"]
+    shared: Float[Tensor, "g g"]
+    frame_gradient: Float[Tensor, "n p"]
+    shared_gradient: Float[Tensor, "g"]
+    next_frame: Float[Tensor, "n p"]
+    after_next_frame: Float[Tensor, "n p"]
+    cost: float = 0.0
+
+    @staticmethod
+    def zeros(frames: int, numbers: int, shared: int) -> NormalEquations:
+        def empty(*size: int) -> Tensor:
+            return torch.zeros(*size, dtype=torch.float64)
+
+        return NormalEquations(
+            frame=empty(frames, numbers, numbers),
+            border=empty(frames, numbers, shared),
+            shared=empty(shared, shared),
+            frame_gradient=empty(frames, numbers),
+            shared_gradient=empty(shared),
+            next_frame=empty(frames, numbers),
+            after_next_frame=empty(frames, numbers),
+        )
+
+    def add(
+        self,
+        by_frame: Float[Tensor, "n r p"],
+        by_shared: Float[Tensor, "n r g"],
+        residual: Float[Tensor, "n r"],
+        weight: Float[Tensor, "n r"],
+    ) -> None:
+        """Accumulate rows that concern one frame each and the shared numbers; the cost is the caller's."""
+        weighted = by_frame * weight[..., None]
+        weighted_shared = (by_shared * weight[..., None]).flatten(0, 1)
+        self.frame += weighted.transpose(1, 2) @ by_frame
+        self.border += weighted.transpose(1, 2) @ by_shared
+        self.shared += weighted_shared.T @ by_shared.flatten(0, 1)
+        self.frame_gradient += (weighted * residual[..., None]).sum(1)
+        self.shared_gradient += weighted_shared.T @ residual.flatten()
+
+    def freeze(self, free: Bool[Tensor, "g"]) -> None:
+        """Take shared numbers that are not free out of the system: their step becomes zero."""
+        self.border[:, :, ~free] = 0.0
+        self.shared[~free] = 0.0
+        self.shared[:, ~free] = 0.0
+        self.shared[~free, ~free] = 1.0
+        self.shared_gradient[~free] = 0.0
+
+
+def _banded_factor(system: NormalEquations, damping: float) -> np.ndarray:
+    """Lower banded Cholesky factor of the frames' part, its diagonal raised by the factor 1 + damping."""
+    n, p = system.frame_gradient.shape
+    band = np.zeros((2 * p + 1, n, p))
+    rows, columns = np.tril_indices(p)
+    band[rows - columns, :, columns] = system.frame[:, rows, columns].numpy().T
+    band[0] = band[0] * (1.0 + damping) + 1e-9
+    band[p] = system.next_frame.numpy()
+    band[2 * p] = system.after_next_frame.numpy()
+    return cholesky_banded(band.reshape(2 * p + 1, n * p), lower=True, check_finite=False)
+
+
+def _shared_schur(
+    system: NormalEquations, factor: np.ndarray, damping: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(matrix of the shared numbers after the frames are eliminated, border solved, frames' gradient solved)."""
+    n, p = system.frame_gradient.shape
+    border = system.border.reshape(n * p, -1).numpy()
+    right = np.concatenate([border, system.frame_gradient.reshape(-1, 1).numpy()], axis=1)
+    solved = cho_solve_banded((factor, True), right, check_finite=False)
+    shared = system.shared.numpy().copy()
+    shared[np.diag_indices_from(shared)] *= 1.0 + damping
+    return shared - border.T @ solved[:, :-1], solved[:, :-1], solved[:, -1]
+
+
+def solve(system: NormalEquations, damping: float) -> tuple[Float[Tensor, "n p"], Float[Tensor, "g"]]:
+    """The step that lowers the quadratic model: frames' numbers, shared numbers."""
+    n, p = system.frame_gradient.shape
+    factor = _banded_factor(system, damping)
+    if len(system.shared_gradient) == 0:
+        step = -cho_solve_banded((factor, True), system.frame_gradient.flatten().numpy(), check_finite=False)
+        return torch.from_numpy(step.reshape(n, p)), system.shared_gradient
+    matrix, solved_border, solved_gradient = _shared_schur(system, factor, damping)
+    border = system.border.reshape(n * p, -1).numpy()
+    right = system.shared_gradient.numpy() - border.T @ solved_gradient
+    shared_step = -cho_solve(cho_factor(matrix, check_finite=False), right, check_finite=False)
+    frame_step = -(solved_gradient + solved_border @ shared_step)
+    return torch.from_numpy(frame_step.reshape(n, p)), torch.from_numpy(shared_step)
+
+
+def shared_covariance(system: NormalEquations) -> Float[np.ndarray, "g g"]:
+    """Covariance of the shared numbers with the frames' numbers marginalised out, for residuals of unit variance."""
+    matrix, _, _ = _shared_schur(system, _banded_factor(system, 0.0), 0.0)
+    return np.linalg.inv(matrix)
+
+
+State = TypeVar("State")
+
+
+def minimise(
+    state: State,
+    evaluate: Callable[[State], NormalEquations],
+    retract: Callable[[State, Tensor, Tensor], State],
+    iterations: int,
+    tolerance: float = 1e-3,
+) -> tuple[State, NormalEquations]:
+    """Levenberg-Marquardt; ends when a step lowers the cost by less than `tolerance` of it.
+
+    evaluate: the normal equations at a state. retract: the state moved by (frames' step, shared step).
+    Returns the best state and its normal equations.
+    """
+    system, damping = evaluate(state), DAMPING_START
+    for _ in range(iterations):
+        trial = retract(state, *solve(system, damping))
+        trial_system = evaluate(trial)
+        if trial_system.cost < system.cost:
+            gain = (system.cost - trial_system.cost) / max(system.cost, 1e-12)
+            state, system, damping = trial, trial_system, max(damping * DAMPING_DOWN, 1e-7)
+            if gain < tolerance:
+                break
+        else:
+            damping *= DAMPING_UP
+            if damping > DAMPING_LIMIT:
+                break
+    return state, system

@@ -1,0 +1,136 @@
+"""Landmarks whose left and right the detector took for each other, found before the fit by what cannot happen in time.
+
+A person does not turn by half a circle between two frames, and a limb does not jump to where the other one was. Both are
+decided by dynamic programming over two labels a frame (as found, exchanged), so that a whole run of wrong frames is seen
+by its two ends.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+
+from pipeline.avatar.fit_init import facing_yaw, torso_found, torso_rotations
+from pipeline.avatar.fit_landmarks import PAIRS, mirror_permutation
+from pipeline.avatar.fit_objective import Observations
+
+EXCHANGE_COST = 0.25
+"""What it takes to believe that a frame is exchanged; the costs below are counted against it."""
+
+TURN_COST = 2.0
+TURN_FREE_RAD = 0.35
+"""Radians of turning between two frames that cost nothing; a swap looks like a turn of pi."""
+
+JUMP_COST = 1.5
+"""For limbs: cost of moving by the size of the torso between two frames, mean over the limb's landmarks."""
+
+SIDE_COST = 1.0
+SIDE_M = 0.15
+"""For limbs: cost of lying this far on the wrong side of the body (left knee right of the right one)."""
+
+LIMBS = {
+    "arms": (tuple(pair for pair in PAIRS if 13 <= pair[0] <= 21), (13, 14), (11, 12)),
+    "legs": (tuple(pair for pair in PAIRS if pair[0] >= 25), (25, 26), (23, 24)),
+}
+"""Pairs that are exchanged together, the pair whose order tells, and the pair of the torso that it is compared with."""
+
+
+def two_label_path(
+    unary: Float[np.ndarray, "n 2"], same: Float[np.ndarray, "k"], other: Float[np.ndarray, "k"]
+) -> Bool[np.ndarray, "n"]:
+    """Cheapest sequence of labels (Viterbi): `unary` costs a frame, `same` and `other` cost keeping or changing the
+    label between neighbours. True where label 1 wins."""
+    cost = unary[0]
+    back = np.zeros(unary.shape, dtype=np.int64)
+    for step in range(1, len(unary)):
+        total = cost[:, None] + np.array([[same[step - 1], other[step - 1]], [other[step - 1], same[step - 1]]])
+        back[step] = total.argmin(axis=0)
+        cost = total.min(axis=0) + unary[step]
+    labels = np.zeros(len(unary), dtype=bool)
+    label = int(cost.argmin())
+    for step in range(len(unary) - 1, -1, -1):
+        labels[step] = bool(label)
+        label = int(back[step, label])
+    return labels
+
+
+def exchanged_bodies(observations: Observations, rest_m: Float[torch.Tensor, "33 3"]) -> Bool[np.ndarray, "n"]:
+    """Frames in which the whole person was taken for one who faces the other way, by the continuity of turning."""
+    rows = np.flatnonzero(torso_found(observations))
+    yaw_rad = facing_yaw(torso_rotations(rest_m, observations.directions_m[rows])).numpy()
+    turn, free = np.diff(yaw_rad), TURN_FREE_RAD * np.diff(rows)
+    same, other = (
+        TURN_COST * np.maximum(np.abs(_wrapped(turn + extra)) - free, 0.0) for extra in (0.0, np.pi)
+    )
+    unary = np.tile([0.0, EXCHANGE_COST], (len(rows), 1))
+    return _spread(two_label_path(unary, same, other), rows, len(observations.time_s))
+
+
+def exchanged_limbs(observations: Observations, limb: str) -> Bool[np.ndarray, "n"]:
+    """Frames in which the landmarks of arms or legs are exchanged, by jumps in the image and by the side they lie on."""
+    pairs, telling, torso = LIMBS[limb]
+    rows = np.flatnonzero(torso_found(observations))
+    landmarks = observations.landmarks_px[rows].numpy()
+    directions = observations.directions_m[rows].numpy()
+    torso_px = np.linalg.norm(landmarks[:, [11, 12]].mean(1) - landmarks[:, [23, 24]].mean(1), axis=1)
+    left, right = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
+    limb_px, exchanged_px = landmarks[:, left + right], landmarks[:, right + left]
+    size = JUMP_COST / np.maximum(np.median(torso_px), 1.0)
+    same = size * np.linalg.norm(limb_px[1:] - limb_px[:-1], axis=2).mean(1)
+    other = size * np.linalg.norm(limb_px[1:] - exchanged_px[:-1], axis=2).mean(1)
+    across = directions[:, torso[0]] - directions[:, torso[1]]
+    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-6)
+    side = ((directions[:, telling[0]] - directions[:, telling[1]]) * across).sum(1) / SIDE_M
+    unary = SIDE_COST * np.stack([np.clip(-side, 0.0, 1.0), EXCHANGE_COST + np.clip(side, 0.0, 1.0)], axis=1)
+    return _spread(two_label_path(unary, same, other), rows, len(observations.time_s))
+
+
+def exchange_bodies(observations: Observations, exchanged: Bool[np.ndarray, "n"]) -> Observations:
+    """All left and right landmarks trade places in some frames; their 3D positions are mirrored in depth.
+
+    A picture does not tell front from back: the same pixels with left and right exchanged belong to the person seen from
+    the other side, whose depths are opposite.
+    """
+    pose = torch.as_tensor(observations.camera.world_to_camera, dtype=torch.float64)[:3, :3]
+    mirror = pose.T @ torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)) @ pose
+    swapped = _exchange(observations, exchanged, PAIRS)
+    directions = swapped.directions_m.clone()
+    directions[torch.from_numpy(exchanged)] @= mirror.T
+    return replace(swapped, directions_m=directions)
+
+
+def exchange_limbs(observations: Observations, exchanged: Bool[np.ndarray, "n"], limb: str) -> Observations:
+    """The landmarks of arms or legs trade places in some frames."""
+    return _exchange(observations, exchanged, LIMBS[limb][0])
+
+
+def _exchange(
+    observations: Observations, exchanged: Bool[np.ndarray, "n"], pairs: tuple[tuple[int, ...], ...]
+) -> Observations:
+    order, rows = mirror_permutation(pairs), torch.from_numpy(exchanged)
+
+    def traded(values: torch.Tensor) -> torch.Tensor:
+        result = values.clone()
+        result[rows] = values[rows][:, order]
+        return result
+
+    return replace(
+        observations,
+        landmarks_px=traded(observations.landmarks_px),
+        directions_m=traded(observations.directions_m),
+        confidence=traded(observations.confidence),
+        direction_confidence=traded(observations.direction_confidence),
+    )
+
+
+def _spread(labels: Bool[np.ndarray, "k"], rows: np.ndarray, frames: int) -> Bool[np.ndarray, "n"]:
+    everywhere = np.zeros(frames, dtype=bool)
+    everywhere[rows] = labels
+    return everywhere
+
+
+def _wrapped(angle_rad: np.ndarray) -> np.ndarray:
+    return (angle_rad + np.pi) % (2 * np.pi) - np.pi

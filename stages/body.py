@@ -1,0 +1,142 @@
+"""body: one parametric body, its pose in every frame, and the camera, fitted to landmarks and masks."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from pydantic import Field
+
+from pipeline.avatar.body import Motion, canonical_to_world, load_anny
+from pipeline.avatar.fit import FitOptions, FitResult, fit_body
+from pipeline.avatar.fit_quality import doubts, make_observations, suspicious_frames
+from pipeline.avatar.fit_silhouette import matching_window
+from pipeline.avatar.overlay import draw_overlay, overlay_grid, posed_frame
+from pipeline.core.cli import main
+from pipeline.core.config import Config as BaseConfig
+from pipeline.core.errors import UserError
+from pipeline.core.progress import warn
+from pipeline.core.stage import Stage
+from pipeline.geometry.camera import Camera
+from pipeline.io.capture import Capture, load_capture
+from pipeline.io.image import to_uint8, write_rgb
+from pipeline.io.npz import save_body, save_camera, save_motion, save_npz
+
+_BODY, _MOTION, _CAMERA, _SCORES, _OVERLAY = "body.npz", "motion.npz", "camera.npz", "scores.npz", "overlay.png"
+_OVERLAY_FRAMES = 12
+
+
+class Config(BaseConfig):
+    """Options of the body stage."""
+
+    height_m: float | None = Field(
+        None, ge=0.5, le=2.5, description="Stature of the person, metres; null: about 1.70 m, as the pictures suggest."
+    )
+    field_of_view_deg: float | None = Field(
+        None, ge=5.0, le=150.0, description="Angle of view along the longer image side, degrees; null: estimated."
+    )
+    usual_focal: float = Field(
+        1.2, ge=0.3, le=5.0, description="Where the estimate of the focal length starts, times the longer image side."
+    )
+    shared_frames: int = Field(48, ge=8, le=500, description="Frames from which shape and focal length are found.")
+    rounds: int = Field(8, ge=1, le=50, description="Rounds of matching outlines to find shape and focal length.")
+    min_overlap: float = Field(
+        0.5, ge=0.0, le=1.0, description="A fit is refused whose median overlap with the masks (IoU, 0 to 1) is lower."
+    )
+
+
+def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, float]:
+    """Fit the body; write body, motion, camera, a score per frame and the overlay picture."""
+    capture = load_capture(inputs["frames"])
+    masks = [to_uint8(capture.mask(position)) for position in range(len(capture))]
+    result = fit(capture, masks, inputs["frames"], config)
+    motion = Motion(capture.frame_index, capture.time_s, result.rotations_wxyz, result.root_translation_m)
+    exchanged = np.stack(list(result.exchanged.values())).any(axis=0)
+    write_rgb(out / _OVERLAY, overlay(capture, masks, result, motion))
+    save_body(out / _BODY, result.body)
+    save_motion(out / _MOTION, motion)
+    save_camera(out / _CAMERA, result.camera)
+    scores = {"silhouette_iou": result.overlap, "landmark_error_px": result.landmark_error_px, "exchanged": exchanged}
+    save_npz(out / _SCORES, {"frame_index": capture.frame_index, **scores})
+    for sentence in doubts(result, capture.frame_index):
+        warn(sentence)
+    return {
+        "silhouette_iou": float(np.nanmedian(result.overlap)),
+        "silhouette_iou_worst": float(np.nanmin(result.overlap)),
+        "landmark_error_px": float(np.nanmedian(result.landmark_error_px)),
+        "focal_px": result.camera.fx,
+        "focal_deviation": result.focal_deviation,
+        "height_m": result.body.height_m(),
+        "height_deviation_m": result.height_deviation_m,
+        "exchanged_frames": int(exchanged.sum()),
+        "suspicious_frames": int(suspicious_frames(result).sum()),
+    }
+
+
+def fit(capture: Capture, masks: Sequence[UInt8[np.ndarray, "h w"]], frames_dir: Path, config: Config) -> FitResult:
+    """Fit and judge; UserError when the landmarks or the result are of no use."""
+    camera, focal_known = starting_camera(capture, config)
+    observations = make_observations(
+        capture.time_s, capture.landmarks_px, capture.landmarks_visibility, capture.landmarks_world_m, camera
+    )
+    options = FitOptions(config.height_m, focal_known, config.shared_frames, config.rounds)
+    try:
+        result = fit_body(load_anny(), observations, [matching_window(mask) for mask in masks], options)
+    except ValueError as error:
+        raise UserError(
+            f"the body cannot be fitted to {frames_dir}: {error}; let the detector find the landmarks "
+            "(remove landmarks.npz from the video folder), or supply `landmarks_world_m` too"
+        ) from error
+    overlap = float(np.nanmedian(result.overlap))
+    if overlap < config.min_overlap:
+        raise UserError(
+            f"the body does not fit the person in {frames_dir}: median overlap with the masks {overlap:.2f}, needed "
+            f"{config.min_overlap:.2f}; look at {frames_dir / 'contact.jpg'} for wrong masks or landmarks, film the whole "
+            "body unoccluded, or lower body.min_overlap"
+        )
+    return result
+
+
+def starting_camera(capture: Capture, config: Config) -> tuple[Camera, bool]:
+    """The camera to start from, and whether its focal length is known: supplied, else from the options, else a guess."""
+    if capture.camera is not None:
+        return capture.camera, True
+    side_px = max(capture.width, capture.height)
+    focal_px = config.usual_focal * side_px
+    if config.field_of_view_deg is not None:
+        focal_px = 0.5 * side_px / float(np.tan(np.radians(0.5 * config.field_of_view_deg)))
+    camera = Camera(focal_px, focal_px, 0.5 * capture.width, 0.5 * capture.height, capture.width, capture.height)
+    return camera, config.field_of_view_deg is not None
+
+
+def overlay(
+    capture: Capture, masks: Sequence[UInt8[np.ndarray, "h w"]], result: FitResult, motion: Motion
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Tiles of frames spread evenly over the capture."""
+    positions = np.unique(np.linspace(0, len(capture) - 1, _OVERLAY_FRAMES).astype(np.int64))
+    transforms = canonical_to_world(result.body, motion.select(positions))
+    tiles = [
+        draw_overlay(
+            to_uint8(capture.image(int(position))),
+            masks[position],
+            posed_frame(result.body, transforms[tile]),
+            result.body,
+            result.camera,
+            f"frame {capture.frame_index[position]}  overlap {result.overlap[position]:.2f}",
+        )
+        for tile, position in enumerate(positions)
+    ]
+    return overlay_grid(tiles)
+
+
+STAGE = Stage(
+    "body",
+    version=1,
+    needs=("frames",),
+    makes=(_BODY, _MOTION, _CAMERA, _SCORES, _OVERLAY),
+    config=Config,
+    run=run,
+)
+
+if __name__ == "__main__":
+    raise SystemExit(main(STAGE))
