@@ -5,6 +5,7 @@ Every value remembers the layer it came from, so that an error can name the plac
 """
 
 import difflib
+import textwrap
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,12 +14,13 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic.fields import FieldInfo
-from pydantic_core import ErrorDetails
 
 from pipeline.core.errors import UserError
 
 CONFIG_DIR = Path(__file__).resolve().parents[2] / "configs"
 KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
+YAML_WIDTH = 10_000
+YAML_SCALAR_END = "...\n"
 PRESET_SUFFIXES = (".yaml", ".yml")
 
 
@@ -117,9 +119,9 @@ def default_yaml(sections: Mapping[str, type[Config]]) -> str:
         lines += ["", f"{section}:" if config_type.model_fields else f"{section}: {{}}"]
         defaults = config_type().model_dump(mode="json")
         for key, info in config_type.model_fields.items():
-            text = yaml.safe_dump({key: defaults[key]}, default_flow_style=None, sort_keys=False, width=1000)
-            lines += [f"  # {info.description}"] if info.description else []
-            lines += [f"  {line}" for line in text.rstrip().splitlines()]
+            value = yaml.safe_dump(defaults[key], default_flow_style=True, sort_keys=False, width=YAML_WIDTH)
+            lines += textwrap.wrap(info.description or "", 116, initial_indent="  # ", subsequent_indent="  # ")
+            lines += [f"  {key}: {value.removesuffix(YAML_SCALAR_END).rstrip()}"]
     return "\n".join(lines) + "\n"
 
 
@@ -157,7 +159,7 @@ def _dotted_keys(values: Mapping[str, Any], prefix: str = "") -> Iterable[str]:
             yield from _dotted_keys(value, f"{prefix}{key}.")
 
 
-def _explain(section: str, config_type: type[Config], error: ErrorDetails, layers: Layers) -> str:
+def _explain(section: str, config_type: type[Config], error: Mapping[str, Any], layers: Layers) -> str:
     """Say in one sentence what pydantic found: origin, key, value, what is allowed."""
     path = [str(part) for part in error["loc"]]
     dotted = ".".join([section, *path])
@@ -184,7 +186,7 @@ def _find_field(config_type: type[BaseModel], path: list[str]) -> tuple[type[Bas
     return owner, info
 
 
-def _allowed(info: FieldInfo, error: ErrorDetails) -> str:
+def _allowed(info: FieldInfo, error: Mapping[str, Any]) -> str:
     """What a field takes, in words: its kind and limits; for other kinds, pydantic's own words."""
     words = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
     limits = [

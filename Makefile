@@ -1,0 +1,92 @@
+# make help says what there is.
+
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV := .venv
+RUN_PYTHON := $(VENV)/bin/python
+STAGES := frames body field mesh texture export report
+
+# What a run is made of; all may be left out.
+VIDEO ?=
+RUN ?=
+PRESET ?=
+SET ?=
+EXTRA ?=
+ARGS ?=
+
+TORCH_VERSION := 2.13.0
+SAMPLE_RUN := runs/sample
+SAMPLE := runs/sample-capture
+ONE_RUN := $(or $(RUN),$(SAMPLE_RUN))
+OPTIONS = $(if $(PRESET),--preset $(PRESET)) $(foreach item,$(SET),--set $(item)) $(ARGS)
+STAMP := $(VENV)/.stamp$(if $(EXTRA),-$(EXTRA))
+
+.DEFAULT_GOAL := help
+.PHONY: help all $(STAGES) test test-all check format bench doctor venv lock configs clean
+
+help:  ## this list
+	@awk -F ':.*## ' '/^[a-z$$()A-Z -]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST) | sed 's/$$(STAGES)/STAGE       /'
+	@echo "  STAGE is one of: $(STAGES)"
+	@echo "  variables: VIDEO=file-or-folder RUN=runs/name PRESET=instant|default|fine SET='mesh.key=value' EXTRA=cuda"
+
+ifeq ($(VIDEO)$(RUN),)
+all: $(STAMP) $(SAMPLE)/.done  ## the whole way; without VIDEO: a generated sample with known truth
+	$(RUN_PYTHON) -m stages --run $(SAMPLE_RUN) --video $(SAMPLE)/video $(OPTIONS)
+else
+all: $(STAMP)
+	$(RUN_PYTHON) -m stages $(if $(RUN),--run "$(RUN)") $(if $(VIDEO),--video "$(VIDEO)") $(OPTIONS)
+endif
+
+$(STAGES): $(STAMP)  ## one stage of RUN=runs/name
+	$(RUN_PYTHON) -m stages.$@ "$(ONE_RUN)" $(if $(VIDEO),--video "$(VIDEO)") $(OPTIONS)
+
+# Made once; a half-made one, which has no .done, is made anew.
+$(SAMPLE)/.done: | $(STAMP)
+	rm -rf $(SAMPLE)
+	$(RUN_PYTHON) -m data_tools.sample $(SAMPLE)
+	@touch $@
+
+test: $(STAMP)  ## the fast tests, with the skip count
+	$(RUN_PYTHON) -m pytest -m "not slow" $(ARGS)
+
+test-all: $(STAMP)  ## all tests, the slow ones too
+	$(RUN_PYTHON) -m pytest $(ARGS)
+
+check: $(STAMP)  ## lint, format, types, import layers
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/mypy
+	$(VENV)/bin/lint-imports
+
+format: $(STAMP)  ## mend what ruff can mend
+	$(VENV)/bin/ruff check --fix .
+	$(VENV)/bin/ruff format .
+
+bench: $(STAMP)  ## measure speed
+	$(RUN_PYTHON) -m pytest tests/bench -m "slow or not slow" -s $(ARGS)
+
+doctor:  ## what this machine lacks, and the command that mends it
+	@$(PYTHON) -m pipeline.core.doctor
+
+venv: $(STAMP)  ## install the pinned dependencies into .venv (EXTRA=cuda for a graphics card)
+
+$(STAMP): requirements.lock pyproject.toml
+	@test -x $(RUN_PYTHON) || $(PYTHON) -m venv $(VENV) || \
+		{ echo "error: $(PYTHON) cannot make a virtual environment: run make doctor"; rm -rf $(VENV); exit 2; }
+	$(RUN_PYTHON) -m pipeline.core.install requirements.lock $(EXTRA)
+	@touch $@
+
+# The CPU build must be the one that pip sees (TORCH_INDEX=https://download.pytorch.org/whl/cpu where PyPI is all there
+# is): the CUDA build would fill the lock file with its own packages.
+lock:  ## resolve pyproject.toml anew into requirements.lock
+	$(PYTHON) -m venv --clear build/lock
+	build/lock/bin/python -m pip install --quiet $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) torch==$(TORCH_VERSION) ".[dev]"
+	build/lock/bin/python -m pip freeze --exclude avatar-from-video | sed 's/+cpu$$//' > build/requirements.lock
+	mv build/requirements.lock requirements.lock
+
+configs: $(STAMP)  ## write configs/default.yaml from the defaults in code
+	$(RUN_PYTHON) -m stages --defaults > configs/default.yaml.new
+	mv configs/default.yaml.new configs/default.yaml
+
+clean:  ## remove caches and builds; runs/ and .venv stay
+	rm -rf build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	find . -path ./$(VENV) -prune -o -name __pycache__ -type d -print0 | xargs -0 rm -rf

@@ -1,0 +1,141 @@
+"""Strict configuration: layers win in order, and every mistake is one sentence that names its place."""
+
+from pathlib import Path
+from typing import Literal
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import Field, field_validator
+
+from pipeline.core.config import Config, Layers, build, check_sections, default_yaml, load_layers, parse_overrides
+from pipeline.core.errors import UserError
+
+
+class Inner(Config):
+    rate: float = Field(0.1, gt=0, le=1, description="learning rate, per step")
+
+
+class Options(Config):
+    size: int = Field(64, ge=16, le=256, description="cells along the longest side")
+    kind: Literal["fast", "fine"] = Field("fast", description="which way")
+    name: str = Field("x", description="a name")
+    sides_m: tuple[float, float] = Field((1.0, 2.0), description="metres")
+    inner: Inner = Field(Inner(), description="the optimiser")
+
+    @field_validator("name")
+    @classmethod
+    def _no_spaces(cls, name: str) -> str:
+        if " " in name:
+            raise ValueError("text without spaces")
+        return name
+
+
+@pytest.fixture
+def config_dir(tmp_path: Path) -> Path:
+    (tmp_path / "default.yaml").write_text("mesh:\n  size: 100\n  name: base\n")
+    (tmp_path / "fine.yaml").write_text("mesh:\n  size: 200\n  inner: {rate: 1e-2}\n")
+    return tmp_path
+
+
+def built(config_dir: Path, preset: str = "default", *assignments: str) -> Options:
+    return build("mesh", Options, load_layers(preset, parse_overrides(assignments), config_dir))
+
+
+def complaint(config_dir: Path, preset: str, *assignments: str) -> str:
+    with pytest.raises(UserError) as caught:
+        built(config_dir, preset, *assignments)
+    return str(caught.value)
+
+
+def test_later_layers_win(config_dir: Path) -> None:
+    assert built(config_dir).size == 100
+    fine = built(config_dir, "fine", "mesh.kind=fine", "mesh.inner.rate=0.5")
+    assert (fine.size, fine.name, fine.kind, fine.inner.rate) == (200, "base", "fine", 0.5)
+
+
+def test_yaml_numbers_without_a_dot_are_numbers(config_dir: Path) -> None:
+    assert built(config_dir, "fine").inner.rate == 0.01
+
+
+@pytest.mark.parametrize(
+    ("assignment", "words"),
+    [
+        ("mesh.size=8", ("mesh.size = 8", "a whole number, at least 16, at most 256", "cells along the longest side")),
+        ("mesh.size=abc", ("mesh.size = 'abc'", "a whole number")),
+        ("mesh.size=1.5", ("mesh.size = 1.5", "a whole number")),
+        ("mesh.kind=slow", ("mesh.kind = 'slow'", "'fast' or 'fine'")),
+        ("mesh.name=a b", ("mesh.name = 'a b'", "text without spaces")),
+        ("mesh.inner.rate=.nan", ("mesh.inner.rate = nan", "a number, above 0, at most 1", "per step")),
+        ("mesh.inner.rate=2", ("mesh.inner.rate = 2", "above 0, at most 1")),
+        ("mesh.sides_m=[1, x]", ("mesh.sides_m.1 = 'x'",)),
+        ("mesh.sizes=8", ("mesh.sizes is no known key", "did you mean size?", "size, kind, name, sides_m, inner")),
+        ("mesh.inner.rat=8", ("mesh.inner.rat is no known key", "known keys of mesh.inner: rate")),
+        ("mesh.inner=8", ("mesh.inner = 8",)),
+    ],
+)
+def test_a_bad_value_is_one_sentence(config_dir: Path, assignment: str, words: tuple[str, ...]) -> None:
+    sentence = complaint(config_dir, "default", assignment)
+    assert all(word in sentence for word in words), sentence
+    assert "\n" not in sentence
+
+
+def test_a_bad_value_in_a_file_names_the_file(config_dir: Path) -> None:
+    (config_dir / "odd.yaml").write_text("mesh:\n  size: 8\n")
+    assert complaint(config_dir, "odd").startswith(str(config_dir / "odd.yaml"))
+    (config_dir / "odd.yaml").write_text("mesh:\n  sice: 8\n")
+    assert complaint(config_dir, "odd").startswith(f"{config_dir / 'odd.yaml'}: mesh.sice")
+
+
+def test_a_default_overridden_in_a_file_is_not_blamed_on_it(config_dir: Path) -> None:
+    layers = load_layers("fine", {"mesh.size": 3}, config_dir)
+    assert layers.origin_of("mesh.size") == "--set mesh.size"
+    assert layers.origin_of("mesh.name") == str(config_dir / "default.yaml")
+
+
+@pytest.mark.parametrize("text", ["mesh: [1, 2", "- a\n- b\n", "mesh: 3\n", "just words"])
+def test_a_broken_file_is_named(config_dir: Path, text: str) -> None:
+    (config_dir / "broken.yaml").write_text(text)
+    with pytest.raises(UserError, match=r"broken\.yaml"):
+        load_layers("broken", {}, config_dir)
+
+
+@pytest.mark.parametrize("assignment", ["mesh.size", "size=3", ".size=3", "mesh.=3", "mesh.size=[1"])
+def test_a_broken_assignment_is_named(assignment: str) -> None:
+    with pytest.raises(UserError, match="--set"):
+        parse_overrides([assignment])
+
+
+def test_an_unknown_preset_lists_the_known(config_dir: Path) -> None:
+    with pytest.raises(UserError, match="default, fine"):
+        load_layers("fien", {}, config_dir)
+
+
+def test_a_preset_may_be_a_path(config_dir: Path) -> None:
+    assert built(config_dir, str(config_dir / "fine.yaml")).size == 200
+
+
+def test_an_unknown_section_lists_the_known() -> None:
+    layers = Layers()
+    layers.add({"mehs": {"size": 1}}, "--set mehs.size")
+    with pytest.raises(UserError, match=r"did you mean mesh\?.*known keys of the configuration: body, mesh"):
+        check_sections(layers, ["body", "mesh"])
+
+
+def test_configs_are_frozen() -> None:
+    with pytest.raises(ValueError, match="frozen"):
+        Options().size = 3  # type: ignore[misc]
+
+
+def test_default_yaml_reads_back_as_the_defaults() -> None:
+    text = default_yaml({"mesh": Options, "empty": Config})
+    values = yaml.safe_load(text)
+    assert Options.model_validate(values["mesh"]) == Options()
+    assert values["empty"] == {}
+    assert "  # cells along the longest side\n  size: 64\n" in text
+
+
+@given(st.integers(-(10**6), 10**6))
+def test_overrides_keep_whole_numbers(number: int) -> None:
+    assert parse_overrides([f"a.b={number}"]) == {"a.b": number}

@@ -1,0 +1,107 @@
+"""Manifests and digests: what changes a fingerprint and what does not; damage is found."""
+
+import hashlib
+import json
+from pathlib import Path
+
+import pytest
+
+from pipeline.core.errors import UserError
+from pipeline.core.manifest import (
+    MANIFEST,
+    Manifest,
+    digest_file,
+    digest_files,
+    digest_json,
+    digest_source,
+    find_damage,
+    fingerprint,
+    read_manifest,
+    write_manifest,
+)
+
+BASE = {"stage": "mesh", "version": 1, "config": {"size": 3, "kind": "a"}, "inputs": {"field": "0a"}}
+
+
+def finished(folder: Path) -> Manifest:
+    """Make a finished stage folder with two files."""
+    (folder / "deep").mkdir(parents=True)
+    (folder / "mesh.npz").write_bytes(b"vertices")
+    (folder / "deep" / "a.png").write_bytes(b"pixels")
+    manifest = Manifest(
+        **BASE, fingerprint="f", outputs=digest_files(folder), metrics={}, seconds=1.0, peak_rss_mib=2.0
+    )
+    write_manifest(manifest, folder / MANIFEST)
+    return manifest
+
+
+def test_a_digest_is_sha256(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"abc")
+    assert digest_file(tmp_path / "a") == hashlib.sha256(b"abc").hexdigest()
+
+
+def test_the_fingerprint_ignores_the_order_of_keys() -> None:
+    turned = {**BASE, "config": {"kind": "a", "size": 3}}
+    assert fingerprint(**BASE) == fingerprint(**turned)
+
+
+@pytest.mark.parametrize(
+    "change", [{"stage": "body"}, {"version": 2}, {"config": {"size": 4, "kind": "a"}}, {"inputs": {"field": "0b"}}]
+)
+def test_each_part_decides_the_fingerprint(change: dict[str, object]) -> None:
+    assert fingerprint(**{**BASE, **change}) != fingerprint(**BASE)
+
+
+def test_a_video_file_is_known_by_its_content(tmp_path: Path) -> None:
+    (tmp_path / "a.mp4").write_bytes(b"abc")
+    (tmp_path / "b.mp4").write_bytes(b"abc")
+    assert digest_source(tmp_path / "a.mp4") == digest_source(tmp_path / "b.mp4")
+
+
+def test_a_video_folder_is_known_by_names_and_contents(tmp_path: Path) -> None:
+    (tmp_path / "0.png").write_bytes(b"abc")
+    before = digest_source(tmp_path)
+    (tmp_path / ".DS_Store").write_bytes(b"junk of a file browser")
+    assert digest_source(tmp_path) == before
+    (tmp_path / "0.png").rename(tmp_path / "1.png")
+    renamed = digest_source(tmp_path)
+    (tmp_path / "1.png").write_bytes(b"abd")
+    assert len({before, renamed, digest_source(tmp_path)}) == 3
+
+
+def test_a_missing_video_is_a_sentence(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="--video"):
+        digest_source(tmp_path / "none.mp4")
+
+
+def test_a_manifest_reads_back(tmp_path: Path) -> None:
+    manifest = finished(tmp_path / "mesh")
+    assert read_manifest(tmp_path / "mesh") == manifest
+    assert manifest.outputs_digest == digest_json(manifest.outputs)
+    assert read_manifest(tmp_path / "nothing") is None
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"stage": "mesh"}', '{"strange": 1}'])
+def test_a_damaged_manifest_is_a_sentence(tmp_path: Path, text: str) -> None:
+    (tmp_path / MANIFEST).write_text(text)
+    with pytest.raises(UserError, match="damaged"):
+        read_manifest(tmp_path)
+
+
+def test_damage_is_found(tmp_path: Path) -> None:
+    folder = tmp_path / "mesh"
+    finished(folder)
+    assert find_damage(folder) == []
+    (folder / "mesh.npz").write_bytes(b"verticeS")
+    assert find_damage(folder) == ["mesh.npz"]
+    (folder / "deep" / "a.png").unlink()
+    (folder / "new.txt").write_text("strange")
+    assert find_damage(folder) == ["deep/a.png", "mesh.npz", "new.txt"]
+    (folder / MANIFEST).unlink()
+    assert find_damage(folder) == [MANIFEST]
+
+
+def test_a_manifest_is_strict_json(tmp_path: Path) -> None:
+    finished(tmp_path / "mesh")
+    values = json.loads((tmp_path / "mesh" / MANIFEST).read_text())
+    assert {"stage", "version", "fingerprint", "config", "inputs", "outputs", "metrics", "seconds"} <= values.keys()

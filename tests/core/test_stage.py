@@ -1,0 +1,199 @@
+"""One stage, whole or absent: fresh results stay, unfinished ones vanish, faults of a stage's code are loud."""
+
+import errno
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.core import stage as stage_module
+from pipeline.core.config import Config
+from pipeline.core.errors import UserError
+from pipeline.core.manifest import MANIFEST, read_manifest
+from pipeline.core.progress import warn
+from pipeline.core.stage import Plan, Stage, plan_stage, run_stage
+
+Work = Callable[[Mapping[str, Path], Path, Any], Mapping[str, float]]
+
+
+class Options(Config):
+    number: int = 1
+
+
+def write_number(inputs: Mapping[str, Path], out: Path, config: Options) -> Mapping[str, float]:
+    (out / "number.txt").write_text(str(config.number))
+    return {"number": config.number, "loss": float("nan")}
+
+
+def plan(tmp_path: Path, work: Work = write_number, number: int = 1, version: int = 1) -> Plan:
+    """The plan of a stage `count` that reads a video and makes number.txt."""
+    video = tmp_path / "video.txt"
+    if not video.exists():
+        video.write_text("frames")
+    stage = Stage("count", version, ("video",), ("number.txt",), Options, work)
+    return plan_stage(stage, Options(number=number), tmp_path / "run", video)
+
+
+def names(tmp_path: Path) -> set[str]:
+    return {path.name for path in (tmp_path / "run").iterdir()}
+
+
+def test_a_result_is_made_once(tmp_path: Path) -> None:
+    assert run_stage(plan(tmp_path))
+    assert not run_stage(plan(tmp_path))
+    assert names(tmp_path) == {"count"}
+    assert {path.name for path in (tmp_path / "run" / "count").iterdir()} == {"number.txt", MANIFEST}
+
+
+def test_the_manifest_tells_what_happened(tmp_path: Path) -> None:
+    def work(inputs: Mapping[str, Path], out: Path, config: Options) -> Mapping[str, float]:
+        warn("3 frames show nobody and are left out")
+        return write_number(inputs, out, config)
+
+    warn("said before this stage")
+    run_stage(plan(tmp_path, work, number=7))
+    manifest = read_manifest(tmp_path / "run" / "count")
+    assert manifest is not None
+    assert manifest.config == {"number": 7}
+    assert manifest.metrics == {"number": 7.0, "loss": None}
+    assert manifest.warnings == ["3 frames show nobody and are left out"]
+    assert manifest.peak_rss_mib > 1
+    assert {"commit", "cpu", "packages", "gpu"} <= manifest.environment.keys()
+
+
+@pytest.mark.parametrize("change", [{"number": 2}, {"version": 2}])
+def test_config_and_version_make_it_stale(tmp_path: Path, change: dict[str, int]) -> None:
+    run_stage(plan(tmp_path))
+    assert run_stage(plan(tmp_path, **change))
+
+
+def test_the_content_of_the_video_makes_it_stale(tmp_path: Path) -> None:
+    run_stage(plan(tmp_path))
+    (tmp_path / "video.txt").write_text("other frames")
+    assert not plan(tmp_path).is_fresh()
+
+
+def test_a_lost_file_makes_it_stale(tmp_path: Path) -> None:
+    run_stage(plan(tmp_path))
+    (tmp_path / "run" / "count" / "number.txt").unlink()
+    assert run_stage(plan(tmp_path))
+
+
+def test_force_runs_again(tmp_path: Path) -> None:
+    run_stage(plan(tmp_path))
+    assert run_stage(plan(tmp_path), force=True)
+
+
+@pytest.mark.parametrize("fault", [UserError("no person"), OSError(errno.ENOSPC, "full"), MemoryError()])
+def test_what_the_user_can_mend_leaves_no_folder(tmp_path: Path, fault: Exception) -> None:
+    def work(inputs: Mapping[str, Path], out: Path, config: Options) -> Mapping[str, float]:
+        (out / "checkpoint.txt").write_text("half")
+        raise fault
+
+    with pytest.raises(type(fault)):
+        run_stage(plan(tmp_path, work))
+    assert names(tmp_path) == set()
+
+
+def test_a_failure_leaves_the_older_result(tmp_path: Path) -> None:
+    def work(inputs: Mapping[str, Path], out: Path, config: Options) -> Mapping[str, float]:
+        raise UserError("no person")
+
+    run_stage(plan(tmp_path))
+    with pytest.raises(UserError):
+        run_stage(plan(tmp_path, work, number=2))
+    assert (tmp_path / "run" / "count" / "number.txt").read_text() == "1"
+
+
+def interrupted(inputs: Mapping[str, Path], out: Path, config: Options) -> Mapping[str, float]:
+    (out / "checkpoint.txt").write_text("half")
+    (out / "checkpoints").mkdir()
+    (out / "stray.txt").write_text("half")
+    raise KeyboardInterrupt
+
+
+def test_checkpoints_of_the_same_fingerprint_are_gone_on_from(tmp_path: Path) -> None:
+    seen: list[set[str]] = []
+
+    def work(inputs: Mapping[str, Path], out: Path, config: Options) -> Mapping[str, float]:
+        seen.append({path.name for path in out.iterdir() if not path.name.startswith(".")})
+        return write_number(inputs, out, config)
+
+    with pytest.raises(KeyboardInterrupt):
+        run_stage(plan(tmp_path, interrupted))
+    run_stage(plan(tmp_path, work))
+    assert seen == [{"checkpoint.txt", "checkpoints"}]
+    manifest = read_manifest(tmp_path / "run" / "count")
+    assert manifest is not None
+    assert manifest.resumed
+    assert list(manifest.outputs) == ["number.txt"]
+
+
+@pytest.mark.parametrize(("number", "force"), [(2, False), (1, True)])
+def test_checkpoints_of_another_fingerprint_are_dropped(tmp_path: Path, number: int, force: bool) -> None:
+    def work(inputs: Mapping[str, Path], out: Path, config: Options) -> Mapping[str, float]:
+        assert not (out / "checkpoint.txt").exists()
+        return write_number(inputs, out, config)
+
+    with pytest.raises(KeyboardInterrupt):
+        run_stage(plan(tmp_path, interrupted))
+    assert run_stage(plan(tmp_path, work, number=number), force)
+
+
+def test_a_kill_just_before_the_rename_costs_no_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def die(plan: Plan, previous: Path) -> None:
+        raise KeyboardInterrupt
+
+    def never(inputs: Mapping[str, Path], out: Path, config: Options) -> Mapping[str, float]:
+        raise AssertionError("the work was done already")
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(stage_module, "_publish", die)
+        run_stage(plan(tmp_path))
+    assert names(tmp_path) == {"count.part"}
+    run_stage(plan(tmp_path, never))
+    assert names(tmp_path) == {"count"}
+
+
+def test_a_missing_output_is_a_fault(tmp_path: Path) -> None:
+    def work(inputs: Mapping[str, Path], out: Path, config: Options) -> Mapping[str, float]:
+        (out / "number.txt").touch()
+        return {}
+
+    with pytest.raises(RuntimeError, match=r"did not make number\.txt"):
+        run_stage(plan(tmp_path, work))
+
+
+def test_an_undeclared_output_is_a_fault(tmp_path: Path) -> None:
+    def work(inputs: Mapping[str, Path], out: Path, config: Options) -> Mapping[str, float]:
+        (out / "debug.png").write_text("pixels")
+        return write_number(inputs, out, config)
+
+    with pytest.raises(RuntimeError, match=r"debug\.png"):
+        run_stage(plan(tmp_path, work))
+
+
+def test_a_missing_input_names_the_command(tmp_path: Path) -> None:
+    stage = Stage("paint", 1, ("count",), ("paint.txt",), Options, write_number)
+    with pytest.raises(UserError, match=r"python -m stages\.count"):
+        plan_stage(stage, Options(), tmp_path / "run", None)
+    with pytest.raises(UserError, match="--video"):
+        plan_stage(plan(tmp_path).stage, Options(), tmp_path / "run", None)
+
+
+def test_equal_outputs_upstream_keep_downstream_fresh(tmp_path: Path) -> None:
+    paint = Stage("paint", 1, ("count",), ("number.txt",), Options, write_number)
+    run_stage(plan(tmp_path))
+    run_stage(plan_stage(paint, Options(), tmp_path / "run", None))
+    run_stage(plan(tmp_path, version=2))
+    assert plan_stage(paint, Options(), tmp_path / "run", None).is_fresh()
+    run_stage(plan(tmp_path, number=2))
+    assert not plan_stage(paint, Options(), tmp_path / "run", None).is_fresh()
+
+
+def test_manifests_hold_no_nan(tmp_path: Path) -> None:
+    run_stage(plan(tmp_path))
+    text = (tmp_path / "run" / "count" / MANIFEST).read_text()
+    json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
