@@ -90,12 +90,16 @@ def novel_motion(body: Body, ground_m: Float[np.ndarray, "3"], count: int) -> Mo
 
 def grounded(body: Body, motion: Motion, floor_y_m: float) -> Motion:
     """The same motion, raised or lowered frame by frame until the lowest foot stands on the floor as in the A-pose."""
+    root = motion.root_translation_m.copy()
+    root[:, 1] += floor_y_m - above_rest_m(body, motion)
+    return motion.with_pose(motion.rotations_wxyz, root)
+
+
+def above_rest_m(body: Body, motion: Motion) -> Float[np.ndarray, "n"]:
+    """Height of the lowest ankle or ball of a foot over its place in the A-pose, which stands on y = 0."""
     joint_to_world = _joints(body, motion.rotations_wxyz, motion.root_translation_m)
     feet = [body.joint(side + part) for side in ("Left", "Right") for part in ("Foot", "ToeBase")]
-    above_rest = joint_to_world[:, feet, 1, 3].numpy() - body.joints_m[feet, 1]
-    root = motion.root_translation_m.copy()
-    root[:, 1] += floor_y_m - above_rest.min(axis=1)
-    return motion.with_pose(motion.rotations_wxyz, root)
+    return (joint_to_world[:, feet, 1, 3].numpy() - body.joints_m[feet, 1]).min(axis=1)
 
 
 def _wandering(time_s: np.ndarray, period_s: float, random: np.random.Generator) -> Float[np.ndarray, "n 3"]:

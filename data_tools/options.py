@@ -48,7 +48,7 @@ def check_options(options: argparse.Namespace) -> None:
     """
     bounds = (
         ("frames", LEAST_FRAMES, 100_000),
-        ("fps", 1.0, 1000.0),
+        ("fps", 0.1, 1000.0),
         ("size", LEAST_SIZE_PX, 4096),
         ("distance", 1.0, 50.0),
         ("fill", 0.05, 0.95),

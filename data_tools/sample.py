@@ -16,7 +16,7 @@ from data_tools.person import make_person
 
 def main(argv: Sequence[str]) -> None:
     """Make one capture."""
-    parser = capture_parser("sample", __doc__.splitlines()[0])
+    parser = capture_parser("sample", (__doc__ or "").splitlines()[0])
     parser.add_argument("out", type=Path, help="folder to make: OUT/video for the pipeline, OUT/truth beside it")
     options = parser.parse_args(argv)
     check_options(options)

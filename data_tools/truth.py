@@ -89,7 +89,7 @@ def check(out: Path, every: int = 1) -> Agreement:
 
 
 def _main(argv: Sequence[str]) -> None:
-    parser = argparse.ArgumentParser(prog="python -m data_tools.truth", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(prog="python -m data_tools.truth", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("out", type=Path, help="folder of a synthetic capture")
     parser.add_argument("--every", type=int, default=8, help="look at each n-th frame (default 8)")
     options = parser.parse_args(argv)

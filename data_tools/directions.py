@@ -1,0 +1,17 @@
+"""Rotations from directions."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pipeline.geometry.rotation import axis_angle_to_matrix
+
+
+def shortest_arc(start: Float[Tensor, "*n 3"], end: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
+    """The smallest rotation that takes one direction (any length > 0) to another; any axis will do for opposites."""
+    start, end = torch.nn.functional.normalize(start, dim=-1), torch.nn.functional.normalize(end, dim=-1)
+    cross = torch.linalg.cross(start, end)
+    sine, cosine = cross.norm(dim=-1, keepdim=True), (start * end).sum(-1, keepdim=True)
+    spare = torch.linalg.cross(start, torch.eye(3, dtype=start.dtype)[start.abs().argmin(-1)])
+    axis = torch.nn.functional.normalize(torch.where(sine > 1e-7, cross, spare), dim=-1)
+    return axis_angle_to_matrix(axis * torch.atan2(sine, cosine))

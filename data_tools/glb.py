@@ -1,0 +1,143 @@
+"""The parts of glTF 2.0 that a skinned, textured person needs, read from a .glb file into plain arrays."""
+
+import io
+import json
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from pipeline.core.errors import UserError
+
+_COMPONENT = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTH = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+_JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
+
+
+@dataclass(frozen=True)
+class Primitive:
+    """One skinned triangle list; UV origin is glTF's, top-left. `joints` index the skin's joint list."""
+
+    positions: Float[np.ndarray, "v 3"]
+    uv: Float[np.ndarray, "v 2"]
+    joints: Int[np.ndarray, "v 4"]
+    weights: Float[np.ndarray, "v 4"]
+    faces: Int[np.ndarray, "f 3"]
+    skin: int
+    material: int
+
+
+class Glb:
+    """A .glb file: its JSON tree and its binary chunk."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises UserError when the file is no binary glTF 2."""
+        self.path = path
+        data = path.read_bytes() if path.is_file() else b""
+        if len(data) < 20 or data[:4] != b"glTF" or struct.unpack_from("<I", data, 4)[0] != 2:
+            raise UserError(f"{path} is no binary glTF 2 file; give a .glb")
+        chunks, offset = {}, 12
+        while offset + 8 <= len(data):
+            length, kind = struct.unpack_from("<II", data, offset)
+            chunks[kind] = data[offset + 8 : offset + 8 + length]
+            offset += 8 + length
+        self.tree: dict[str, Any] = json.loads(chunks[_JSON_CHUNK])
+        self._binary = chunks.get(_BINARY_CHUNK, b"")
+
+    def accessor(self, index: int) -> np.ndarray:
+        """Values as stored, one row an element; normalised integers become floats in [-1, 1] or [0, 1]."""
+        accessor = self.tree["accessors"][index]
+        view = self.tree["bufferViews"][accessor["bufferView"]]
+        kind, width = np.dtype(_COMPONENT[accessor["componentType"]]), _WIDTH[accessor["type"]]
+        start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        stride = view.get("byteStride", kind.itemsize * width)
+        shape, strides = (accessor["count"], width), (stride, kind.itemsize)
+        values: np.ndarray = np.ndarray(shape, kind, self._binary, start, strides)
+        if accessor.get("normalized"):
+            return np.maximum(values.astype(np.float32) / np.iinfo(kind).max, -1.0)
+        return values.astype(np.float32 if kind.kind == "f" else np.int64)
+
+    def node_to_world(self) -> Float[np.ndarray, "n 4 4"]:
+        """Rest-pose matrix of every node."""
+        nodes = self.tree["nodes"]
+        world = np.tile(np.eye(4), (len(nodes), 1, 1))
+        is_child = {child for node in nodes for child in node.get("children", ())}
+        pending = [(index, np.eye(4)) for index in range(len(nodes)) if index not in is_child]
+        while pending:
+            index, parent_to_world = pending.pop()
+            world[index] = parent_to_world @ _local_matrix(nodes[index])
+            pending += [(child, world[index]) for child in nodes[index].get("children", ())]
+        return world
+
+    def skinned_primitives(self) -> list[Primitive]:
+        """All triangle lists that hang on a skin.
+
+        Raises:
+            UserError: there is none.
+        """
+        found = [
+            self._primitive(primitive, node["skin"])
+            for node in self.tree["nodes"]
+            if "mesh" in node and "skin" in node
+            for primitive in self.tree["meshes"][node["mesh"]]["primitives"]
+            if primitive.get("mode", 4) == 4 and "JOINTS_0" in primitive["attributes"]
+        ]
+        if not found:
+            raise UserError(f"{self.path} holds no skinned triangles; export the character with its armature")
+        return found
+
+    def base_colour(self, material: int) -> UInt8[np.ndarray, "h w 3"]:
+        """A material's base colour picture, times its factor; 8 x 8 texels when it has no picture."""
+        surface = self.tree["materials"][material].get("pbrMetallicRoughness", {}) if material >= 0 else {}
+        factor = np.asarray(surface.get("baseColorFactor", [1.0] * 4)[:3])
+        if "baseColorTexture" not in surface:
+            return np.tile(np.rint(255 * factor).astype(np.uint8), (8, 8, 1))
+        source = self.tree["textures"][surface["baseColorTexture"]["index"]]["source"]
+        return np.rint(self._picture(source) * factor).astype(np.uint8)
+
+    def _primitive(self, primitive: dict[str, Any], skin: int) -> Primitive:
+        names = primitive["attributes"]
+        positions = self.accessor(names["POSITION"]).astype(np.float32)
+        indices = self.accessor(primitive["indices"]) if "indices" in primitive else np.arange(len(positions))
+        weights = self.accessor(names["WEIGHTS_0"])
+        uv = self.accessor(names["TEXCOORD_0"]) if "TEXCOORD_0" in names else np.zeros((len(positions), 2), np.float32)
+        return Primitive(
+            positions,
+            uv,
+            self.accessor(names["JOINTS_0"]),
+            weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-9),
+            indices.reshape(-1, 3).astype(np.int32),
+            skin,
+            primitive.get("material", -1),
+        )
+
+    def _picture(self, index: int) -> UInt8[np.ndarray, "h w 3"]:
+        view = self.tree["bufferViews"][self.tree["images"][index]["bufferView"]]
+        start = view.get("byteOffset", 0)
+        data = np.frombuffer(io.BytesIO(self._binary[start : start + view["byteLength"]]).getbuffer(), np.uint8)
+        pixels = cv2.imdecode(data, cv2.IMREAD_COLOR)
+        if pixels is None:
+            raise UserError(f"{self.path} holds a picture ({index}) that cannot be decoded; save it with PNG or JPEG")
+        return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
+
+
+def _local_matrix(node: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
+    """A node's matrix: given as such (column-major), or as translation, rotation (xyzw) and scale."""
+    if "matrix" in node:
+        return np.array(node["matrix"], dtype=float).reshape(4, 4).T
+    x, y, z, w = node.get("rotation", (0.0, 0.0, 0.0, 1.0))
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation * np.asarray(node.get("scale", (1.0, 1.0, 1.0)))
+    matrix[:3, 3] = node.get("translation", (0.0, 0.0, 0.0))
+    return matrix
