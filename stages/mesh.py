@@ -1,4 +1,4 @@
-"""Stage two: a watertight, manifold mesh of the canonical field, its vertices and triangles refined against the video."""
+"""Stage two: a watertight, manifold mesh of the canonical field, refined against the video."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,7 +17,7 @@ from pipeline.avatar.extract import (
     transfer_skin_weights,
 )
 from pipeline.avatar.mesh_views import Shade, View, crop_view, pixel_footprint_m, silhouette_iou, skin_of
-from pipeline.avatar.refine import Refined, RefineConfig, refine
+from pipeline.avatar.refine import RefineConfig, Refined, refine
 from pipeline.avatar.turntable import turntable_sheet
 from pipeline.core.atomic import atomic_path
 from pipeline.core.cli import main

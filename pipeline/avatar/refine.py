@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from pydantic import Field
-from scipy.sparse import csc_array, diags_array, eye_array
+from scipy.sparse import csc_array, csr_array, diags_array, eye_array
 from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
@@ -248,7 +248,7 @@ class _UniformAdam:
                 parameter -= rate * rate_factor * update
 
 
-def _to_torch(matrix: csc_array) -> Tensor:
+def _to_torch(matrix: csr_array) -> Tensor:
     entries = matrix.tocoo()
     positions = torch.from_numpy(np.stack(entries.coords).astype(np.int64))
     values = torch.from_numpy(entries.data.astype(np.float32))

@@ -218,7 +218,8 @@ def closest_on_mesh(
     )
     a, b, c = (vertices[faces[face, k]] for k in range(3))
     barycentric = np.clip(_barycentric(nearest, a, b, c), 0.0, 1.0)
-    return np.sqrt(np.maximum(squared, 0.0)), face, barycentric / barycentric.sum(axis=1, keepdims=True)
+    barycentric /= barycentric.sum(axis=1, keepdims=True)
+    return np.sqrt(np.maximum(squared, 0.0)), face.astype(np.int64), barycentric
 
 
 def _barycentric(p: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> Float[np.ndarray, "n 3"]:

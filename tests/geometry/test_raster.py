@@ -1,4 +1,4 @@
-"""Differentiable rendering: topology, colours of a known plane, gradients against finite differences, a fit that converges."""
+"""Differentiable rendering: topology, colours of a known plane, gradients against differences, a fit that converges."""
 
 import numpy as np
 import pytest

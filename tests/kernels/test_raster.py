@@ -183,7 +183,7 @@ def test_antialias_gradient_equals_finite_differences() -> None:
     for vertex, axis in ((1, 0), (3, 1), (7, 0)):
         moved = torch.zeros_like(vertices)
         moved[vertex, axis] = step
-        # the share of rows and columns is held fixed by design, so its small derivative is missing in the analytic gradient
+        # the share of rows and columns is held fixed by design: its small derivative is missing in the gradient
         slope = float(loss(vertices + moved) - loss(vertices - moved)) / (2 * step)
         assert float(points.grad[vertex, axis]) == pytest.approx(slope, rel=0.2, abs=0.3)
 

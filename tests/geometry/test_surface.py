@@ -1,0 +1,219 @@
+"""Closed surfaces: spheres and tori with known distance, area and topology, and meshes broken on purpose."""
+
+import numpy as np
+import pytest
+
+from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.surface import (
+    closest_on_mesh,
+    compact,
+    is_closed_manifold,
+    isosurface,
+    laplacian,
+    largest_component,
+    remesh,
+    repair,
+    signed_distance_m,
+    solid_body,
+    split_fans,
+    subdivide,
+    transfer,
+)
+
+TETRAHEDRON = Mesh(
+    np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], dtype=np.float32),
+    np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], dtype=np.int32),
+)
+
+
+def ball_grid(radius: float = 0.5, spacing: float = 0.05) -> tuple[np.ndarray, np.ndarray]:
+    """Radius minus distance to the origin, on a grid, and the grid's origin."""
+    axis = np.arange(-0.7, 0.7001, spacing)
+    points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+    return radius - np.linalg.norm(points, axis=-1), np.full(3, axis[0])
+
+
+@pytest.fixture(scope="module")
+def sphere() -> Mesh:
+    values, origin = ball_grid()
+    return isosurface(values, 0.0, origin, 0.05)
+
+
+def volume(mesh: Mesh) -> float:
+    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
+    return float(np.einsum("ij,ij", a, np.cross(b, c)) / 6.0)
+
+
+def euler(mesh: Mesh) -> int:
+    return len(compact(mesh).vertices) - len(mesh.edges()) + len(mesh.faces)
+
+
+def moved(mesh: Mesh, shift: tuple[float, float, float]) -> Mesh:
+    return Mesh(mesh.vertices + np.array(shift, dtype=np.float32), mesh.faces)
+
+
+def joined(*meshes: Mesh) -> Mesh:
+    offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])[:-1]
+    faces = [mesh.faces + np.int32(offset) for mesh, offset in zip(meshes, offsets, strict=True)]
+    return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))
+
+
+def test_isosurface_of_a_ball(sphere: Mesh) -> None:
+    np.testing.assert_allclose(np.linalg.norm(sphere.vertices, axis=1), 0.5, atol=0.004)
+    assert volume(sphere) == pytest.approx(4 / 3 * np.pi * 0.125, rel=0.01)  # positive: faces look outward
+    assert is_closed_manifold(sphere)
+    assert euler(sphere) == 2
+
+
+def test_isosurface_is_closed_where_the_solid_leaves_the_grid() -> None:
+    values, origin = ball_grid(radius=0.8)
+    assert is_closed_manifold(isosurface(values, 0.0, origin, 0.05))
+
+
+def test_isosurface_with_samples_on_the_level_has_no_pinches() -> None:
+    values = np.zeros((6, 6, 6))
+    values[2:4, 2:4, 2:4] = 1.0
+    mesh = isosurface(values, 1.0, np.zeros(3), 1.0)
+    assert is_closed_manifold(mesh)
+    assert (mesh.face_areas_m2() > 0).all()
+
+
+def test_isosurface_of_nothing_names_the_level() -> None:
+    with pytest.raises(ValueError, match=r"reaches the level 2; the largest is 1"):
+        isosurface(np.ones((3, 3, 3)), 2.0, np.zeros(3), 1.0)
+
+
+def test_solid_body_keeps_the_largest_part_and_fills_its_cavity() -> None:
+    inside = np.zeros((12, 12, 12), dtype=bool)
+    inside[1:8, 1:8, 1:8] = True
+    inside[4, 4, 4] = False
+    inside[10, 10, 10] = True
+    expected = np.zeros_like(inside)
+    expected[1:8, 1:8, 1:8] = True
+    np.testing.assert_array_equal(solid_body(inside), expected)
+    assert not solid_body(np.zeros((2, 2, 2), dtype=bool)).any()
+
+
+def test_largest_component_is_by_area_and_drops_unused_vertices(sphere: Mesh) -> None:
+    both = joined(TETRAHEDRON, moved(sphere, (5.0, 0.0, 0.0)))
+    kept = largest_component(both)
+    np.testing.assert_allclose(kept.vertices, sphere.vertices + np.array([5.0, 0.0, 0.0]), atol=1e-6)
+    assert len(kept.faces) == len(sphere.faces)
+
+
+def test_split_fans_separates_two_bodies_that_touch_in_a_point() -> None:
+    touching = joined(TETRAHEDRON, moved(TETRAHEDRON, (1.0, 0.0, 0.0)))
+    faces = np.where(touching.faces == 4, 1, touching.faces)  # the second's corner 0 is the first's corner 1
+    pinched = compact(Mesh(touching.vertices, faces))
+    assert len(pinched.vertices) == 7
+    assert pinched.is_watertight()
+    assert not is_closed_manifold(pinched)
+    split = split_fans(pinched)
+    assert len(split.vertices) == 8
+    assert is_closed_manifold(split)
+    assert split_fans(split) is split
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_repair_closes_holes_and_removes_fins(sphere: Mesh, seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    kept = sphere.faces[generator.random(len(sphere.faces)) > 0.03]
+    fins = np.concatenate([sphere.faces[:5, [0, 1]], np.full((5, 1), len(sphere.vertices), dtype=np.int32)], axis=1)
+    broken = Mesh(
+        np.concatenate([sphere.vertices, [[9.0, 9.0, 9.0]]]).astype(np.float32),
+        np.concatenate([kept, kept[:3], fins.astype(np.int32), [[0, 0, 1]]]).astype(np.int32),
+    )
+    assert not is_closed_manifold(broken)
+    mended = repair(broken)
+    assert is_closed_manifold(mended)
+    assert volume(mended) == pytest.approx(volume(sphere), rel=0.02)
+
+
+def test_repair_leaves_a_sound_mesh_alone(sphere: Mesh) -> None:
+    np.testing.assert_array_equal(repair(sphere).faces, sphere.faces)
+
+
+def test_remesh_reaches_the_edge_length_and_keeps_the_shape(sphere: Mesh) -> None:
+    coarse = remesh(sphere, 0.09)
+    ends = coarse.vertices[coarse.edges()]
+    lengths = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
+    assert np.median(lengths) == pytest.approx(0.09, rel=0.2)
+    assert is_closed_manifold(coarse)
+    assert np.abs(np.linalg.norm(coarse.vertices, axis=1) - 0.5).max() < 0.01
+    assert len(coarse.faces) < 0.5 * len(sphere.faces)
+
+
+def test_remesh_of_a_selection_leaves_the_rest_alone(sphere: Mesh) -> None:
+    upper = sphere.vertices[sphere.faces][:, :, 1].mean(axis=1) > 0.05
+    result = remesh(sphere, 0.12, selected=upper)
+    assert is_closed_manifold(result)
+    old = {tuple(np.round(v, 5)) for v in sphere.vertices[np.unique(sphere.faces[~upper])]}
+    new = {tuple(np.round(v, 5)) for v in result.vertices}
+    assert old <= new
+    assert len(result.faces) < len(sphere.faces)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.05, 0.3, 0.7, 1.0])
+def test_subdivision_is_conforming(sphere: Mesh, share: float) -> None:
+    marked = np.random.default_rng(1).random(len(sphere.faces)) < share
+    fine, ends = subdivide(sphere, marked)
+    assert is_closed_manifold(fine)
+    assert euler(fine) == euler(sphere)
+    assert volume(fine) == pytest.approx(volume(sphere), rel=1e-6)
+    assert fine.face_areas_m2().sum() == pytest.approx(sphere.face_areas_m2().sum(), rel=1e-6)
+    np.testing.assert_array_equal(fine.vertices[: len(sphere.vertices)], sphere.vertices)
+    np.testing.assert_allclose(fine.vertices[len(sphere.vertices) :], sphere.vertices[ends].mean(axis=1), atol=1e-7)
+
+
+def test_subdivision_counts_of_one_face() -> None:
+    marked = np.array([True, False, False, False])
+    fine, ends = subdivide(TETRAHEDRON, marked)
+    assert len(fine.faces) == 4 + 3 * 2  # the face in four, each neighbour in two
+    assert {tuple(e) for e in ends.tolist()} == {(0, 1), (0, 2), (1, 2)}
+
+
+def test_subdivided_faces_keep_their_orientation(sphere: Mesh) -> None:
+    marked = np.random.default_rng(2).random(len(sphere.faces)) < 0.4
+    fine, _ = subdivide(sphere, marked)
+    centres = fine.vertices[fine.faces].mean(axis=1)
+    assert (np.sum(fine.face_normals() * centres, axis=1) > 0).all()
+
+
+def test_laplacian_rows_vanish_on_constants_and_shrink_the_sphere(sphere: Mesh) -> None:
+    operator = laplacian(sphere)
+    np.testing.assert_allclose(operator @ np.ones(len(sphere.vertices)), 0.0, atol=1e-12)
+    dense = np.zeros(len(sphere.vertices))
+    neighbours = np.unique(sphere.faces[(sphere.faces == 7).any(axis=1)])
+    dense[neighbours] = 1.0
+    assert (operator @ dense)[7] == pytest.approx(0.0)  # all neighbours are one, as it is itself
+    smoothed = sphere.vertices - 0.5 * (operator @ sphere.vertices)
+    assert np.linalg.norm(smoothed, axis=1).mean() < np.linalg.norm(sphere.vertices, axis=1).mean()
+
+
+def test_closest_point_against_brute_force(sphere: Mesh) -> None:
+    points = np.random.default_rng(3).normal(size=(50, 3)) * 0.5
+    distance, face, barycentric = closest_on_mesh(points, sphere)
+    np.testing.assert_allclose(barycentric.sum(axis=1), 1.0)
+    assert barycentric.min() >= 0.0
+    nearest = np.einsum("nk,nkc->nc", barycentric, sphere.vertices[sphere.faces[face]])
+    np.testing.assert_allclose(np.linalg.norm(nearest - points, axis=1), distance, atol=1e-6)
+    weights = np.random.default_rng(4).dirichlet(np.ones(3), size=200)
+    samples = np.einsum("sk,fkc->fsc", weights, sphere.vertices[sphere.faces]).reshape(-1, 3)
+    brute = np.sqrt(((points[:, None] - samples[None, ::7]) ** 2).sum(axis=2)).min(axis=1)
+    assert (distance <= brute + 1e-6).all()
+    assert (brute - distance).max() < 0.02
+
+
+def test_transfer_of_a_linear_function_is_exact_on_a_plane() -> None:
+    plane = Mesh(
+        np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=np.float32), np.array([[0, 1, 2], [0, 2, 3]])
+    )
+    values = plane.vertices[:, :2] @ np.array([[2.0, 0.0], [1.0, -1.0]], dtype=np.float32)
+    points = np.random.default_rng(5).random((20, 3)).astype(np.float32)
+    expected = points[:, :2] @ np.array([[2.0, 0.0], [1.0, -1.0]])
+    np.testing.assert_allclose(transfer(points, plane, values), expected, atol=1e-5)
+
+
+def test_signed_distance_of_a_sphere(sphere: Mesh) -> None:
+    points = np.random.default_rng(6).uniform(-0.7, 0.7, size=(300, 3))
+    np.testing.assert_allclose(signed_distance_m(points, sphere), np.linalg.norm(points, axis=1) - 0.5, atol=0.005)
