@@ -1,0 +1,35 @@
+"""A bar of two bones along x that bends in its middle: the smallest thing that inverse skinning is hard for."""
+
+import numpy as np
+import torch
+
+from pipeline.kernels.warp import SkinGrid
+
+CELL_M = 0.05
+
+
+def bar_skin(half_length_m=0.6, half_width_m=0.15) -> SkinGrid:
+    """Nodes fill the bar's box; the second bone's weight rises smoothly from x = -0.15 m to 0.15 m."""
+    axes = [np.arange(-half, half + 1e-6, CELL_M) for half in (half_length_m, half_width_m, half_width_m)]
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).astype(np.float32)
+    shape = nodes.shape[:3]
+    nodes = nodes.reshape(-1, 3)
+    second = 1 / (1 + np.exp(-nodes[:, 0] / 0.04))
+    weights = torch.from_numpy(np.stack([1 - second, second], axis=-1).astype(np.float32))
+    distance = np.abs(nodes[:, 1:]).max(1) - 0.1
+    rows = np.arange(len(nodes), dtype=np.int32).reshape(shape)
+    return SkinGrid(nodes.min(0), CELL_M, rows, nodes, distance.astype(np.float32), weights)
+
+
+def bend(angle_rad: float, dtype=torch.float32) -> torch.Tensor:
+    """Skinning matrices (2, 4, 4): the second bone turns about z at the origin."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    turn = torch.eye(4, dtype=dtype)
+    turn[:2, :2] = torch.tensor([[c, -s], [s, c]], dtype=dtype)
+    return torch.stack([torch.eye(4, dtype=dtype), turn])
+
+
+def bar_points(count: int, seed: int = 0) -> torch.Tensor:
+    """Random canonical points well inside the bar."""
+    random = torch.Generator().manual_seed(seed)
+    return (2 * torch.rand(count, 3, generator=random) - 1) * torch.tensor([0.5, 0.09, 0.09])
