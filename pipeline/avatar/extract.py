@@ -49,7 +49,7 @@ class ExtractConfig(Config):
     voxel_m: float = Field(0.005, gt=0.001, le=0.03, description="spacing of the density samples, m")
     reach_m: float = Field(0.12, gt=0.0, le=0.5, description="farthest a surface may lie outside the fitted body, m")
     inset_m: float = Field(
-        0.025, ge=0.0, le=0.2, description="what lies deeper inside the fitted body than this is solid, m"
+        0.025, ge=0.0, le=0.2, description="deeper inside the fitted body than this all is solid, m"
     )
     blur_voxels: float = Field(
         1.0, ge=0.0, le=4.0, description="Gaussian blur of the solid before its surface is taken, voxels"
