@@ -38,7 +38,7 @@ COARSE_STEP = 3
 EXACT_BAND_VOXELS = 2.75
 """Between samples 3 voxels apart a distance is wrong by at most half their cube's diagonal, 2.6 voxels."""
 COUNT_STEP = 12
-"""Sample counts less one are multiples of this, so that every second sample of every second sample ends at the border."""
+"""Sample counts less one are multiples of this: every second sample of every second sample ends at the border."""
 DECIMATION_SURPLUS = 3.0
 HALF = 0.5
 

@@ -1,4 +1,4 @@
-"""The mesh stage on a small capture drawn from a known solid: what it writes, its figures, and going on after a kill."""
+"""The mesh stage on a small capture drawn from a known solid: what it writes, its figures, and resuming."""
 
 from pathlib import Path
 
