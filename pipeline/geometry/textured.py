@@ -1,7 +1,5 @@
 """Pictures of a textured mesh, and the cameras that walk around one."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -44,7 +42,7 @@ def render_textured(
     Args:
         vertices_world: metres. faces: corners into the vertices. faces_uv: corners of the same faces into `uv`.
     """
-    fine = camera.scaled(samples)
+    fine = camera.scaled(float(samples))
     vertices_px, depth_m = project(vertices_world, fine)
     face_id, barycentric, _ = rasterize(vertices_px, depth_m, faces, fine.height, fine.width)
     seen = face_id >= 0

@@ -1,6 +1,4 @@
-"""Small charts as inline SVG. Colours and fonts come from the page's style sheet, so they follow its light or dark theme."""
-
-from __future__ import annotations
+"""Small charts as inline SVG. Colours and fonts come from the page's style sheet, and follow its light or dark theme."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -76,7 +74,9 @@ def legend(names: Sequence[str]) -> str:
 
 def _ticks(low: float, high: float) -> list[float]:
     """Between three and eight round numbers that enclose [low, high]; at least two different ones."""
-    span = (high - low) or max(abs(high), 1.0) * 0.1
+    span = high - low
+    if span < 1e-6 * max(abs(low), abs(high), 1.0):  # one value: room around it
+        span = 0.1 * max(abs(high), 1.0)
     step = 10.0 ** math.floor(math.log10(span / 4.0))
     step *= next(factor for factor in (1, 2, 5, 10) if span / (factor * step) <= 5.0)
     first, last = math.floor(low / step), math.ceil(high / step)

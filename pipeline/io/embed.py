@@ -1,7 +1,5 @@
 """Pictures and models inside one HTML file: data URIs, and a GLB made light enough to be carried along."""
 
-from __future__ import annotations
-
 import base64
 import json
 import struct

@@ -1,7 +1,5 @@
 """The report as one HTML file: pictures, charts and the 3D viewer inside, nothing fetched from anywhere."""
 
-from __future__ import annotations
-
 import base64
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,6 +19,8 @@ from pipeline.io.embed import light_glb, webp_uri
 ASSETS = Path(__file__).parent / "assets"
 ERROR_RANGE = 64
 """Mean absolute difference, in steps of 255, that the error maps show in their brightest colour."""
+
+MAX_PICTURE_PX = 1600
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ class PageContent:
     title: str
     report: Mapping[str, Any]
     frames: Sequence[FramePictures]
-    turntable: Sequence[tuple[str, Sequence[UInt8[np.ndarray, "h w 4"]]]]
-    pictures: Sequence[tuple[str, UInt8[np.ndarray, "h2 w2 3"]]]
+    turntable: Sequence[tuple[str, Sequence[UInt8[np.ndarray, "_ _ 4"]]]]
+    pictures: Sequence[tuple[str, UInt8[np.ndarray, "_ _ 3"]]]
     glb: bytes
 
 
@@ -109,7 +109,7 @@ def _headline(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
         (_decibel(mesh["psnr_body"]), "dB", "mesh, body pixels alone"),
         (_decibel(field["psnr_full"]), "dB", "field, full held-out image"),
         (_decibel(field["psnr_body"]), "dB", "field, body pixels alone"),
-        (figure_text(round(mesh["ssim_full"], 4)), "SSIM", "mesh, full held-out image"),
+        (figure_text(mesh["ssim_full"]), "SSIM", "mesh, full held-out image"),
         (figure_text(report["body"]["silhouette_iou"]), "IoU", "body against the masks"),
         (f"{health['faces']:,}", "faces", whole),
         (f"{report['seconds']['total']:.0f}", "s", "all stages"),
@@ -132,7 +132,7 @@ def _warnings(messages: Sequence[str]) -> str:
     return f'<div class="warnings"><ul>{"".join(f"<li>{escape(message)}</li>" for message in messages)}</ul></div>'
 
 
-def _turntable_row(title: str, views: Sequence[UInt8[np.ndarray, "h w 4"]]) -> str:
+def _turntable_row(title: str, views: Sequence[UInt8[np.ndarray, "_ _ 4"]]) -> str:
     degrees = (round(360 * number / len(views)) for number in range(len(views)))
     images = [
         f'<span style="flex:{view.shape[1] / view.shape[0]:.3f}">{_image(view, f"{title}, {angle} degrees")}</span>'
@@ -164,16 +164,14 @@ def _frame_row(frame: FramePictures, report: Mapping[str, Any]) -> str:
         f"<span>{name} {_decibel(scores[name]['psnr_full'])} dB, body {_decibel(scores[name]['psnr_body'])} dB</span>"
         for name in ("field", "mesh")
     )
-    return (
-        f'<div class="card frame" data-frame="{frame.index}"><h3>Frame {frame.index} {values}</h3>{figures}</div>'
-    )
+    return f'<div class="card frame" data-frame="{frame.index}"><h3>Frame {frame.index} {values}</h3>{figures}</div>'
 
 
 def _error_charts(frames: Sequence[Mapping[str, Any]]) -> str:
     charts = []
     for score, title in (("psnr_full", "PSNR, full image on white"), ("psnr_body", "PSNR, body pixels")):
         series = {
-            name: [(row["index"], math.nan if row[name][score] is None else row[name][score]) for row in frames]
+            name: [(float(row["index"]), math.nan if row[name][score] is None else row[name][score]) for row in frames]
             for name in ("field", "mesh")
         }
         chart = line_chart(series, "frame of the video", "dB")
@@ -184,12 +182,15 @@ def _error_charts(frames: Sequence[Mapping[str, Any]]) -> str:
 def _cost_charts(report: Mapping[str, Any]) -> str:
     charts = []
     for key, title, unit in (("seconds", "Time a stage", "s"), ("peak_rss_mib", "Peak memory a stage", "MiB")):
-        rows = [(stage, value) for stage, value in report[key].items() if stage != "total"]
+        rows = [(stage, float(value)) for stage, value in report[key].items() if stage != "total"]
         charts.append(f'<div class="card"><h3>{title}</h3>{bar_chart(rows, unit)}</div>')
     return "".join(charts)
 
 
 def _picture(caption: str, pixels: UInt8[np.ndarray, "h w 3"]) -> str:
+    shrink = MAX_PICTURE_PX / max(pixels.shape[:2])
+    if shrink < 1.0:
+        pixels = cv2.resize(pixels, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
     return f'<figure class="card">{_image(pixels, caption)}<figcaption>{escape(caption)}</figcaption></figure>'
 
 

@@ -1,7 +1,5 @@
 """Is a triangle mesh sound: closed, manifold, in one piece, well shaped, free of self-intersections?"""
 
-from __future__ import annotations
-
 import numpy as np
 import pymeshlab
 from jaxtyping import Float, Int
@@ -13,7 +11,7 @@ from pipeline.geometry.mesh import Mesh
 SLIVER_ANGLE_DEG = 10.0
 
 
-def mesh_health(mesh: Mesh) -> dict[str, float | bool]:
+def mesh_health(mesh: Mesh) -> dict[str, float | int | bool]:
     """Everything that the report says about a mesh.
 
     Returns:

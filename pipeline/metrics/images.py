@@ -5,8 +5,6 @@ CVPR 2023) does, and PSNR and SSIM follow torchmetrics' definitions (data range 
 image is white on white, which flatters: hence the same figures on body pixels and on the body's bounding box.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 

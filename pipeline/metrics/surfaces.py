@@ -3,8 +3,6 @@
 Nothing is aligned here: both surfaces are compared where they lie, and the caller says which alignment it made before.
 """
 
-from __future__ import annotations
-
 import igl
 import numpy as np
 from jaxtyping import Float, Int
@@ -12,9 +10,7 @@ from jaxtyping import Float, Int
 from pipeline.geometry.mesh import Mesh
 
 
-def sample_surface(
-    mesh: Mesh, count: int, seed: int = 0
-) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
+def sample_surface(mesh: Mesh, count: int, seed: int = 0) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
     """Points spread evenly by area (float64), and the face of each. Deterministic in the seed."""
     generator = np.random.default_rng(seed)
     areas_m2 = mesh.face_areas_m2()
@@ -35,7 +31,7 @@ def distances_to_surface(
         np.ascontiguousarray(mesh.vertices, dtype=np.float64),
         np.ascontiguousarray(mesh.faces, dtype=np.int64),
     )
-    return np.sqrt(np.maximum(squared, 0.0)), np.asarray(faces)
+    return np.sqrt(np.maximum(squared, 0.0)), faces.astype(np.int64)
 
 
 def surface_scores(

@@ -48,7 +48,9 @@ def test_samples_average_the_texels_under_a_pixel():
 
 
 def test_coverage_of_a_cut_pixel_is_its_area():
-    shifted = SQUARE + torch.tensor([0.25, 0.0, 0.0])  # 1 px of 8 to the right: half of the 4 px wide image's first column
+    shifted = SQUARE + torch.tensor(
+        [0.25, 0.0, 0.0]
+    )  # 1 px of 8 to the right: half of the 4 px wide image's first column
     image = render_textured(shifted, FACES, FACES, UV, torch.ones(2, 2, 3), square_camera(4), samples=4)
     assert image[:, 0, 3].tolist() == pytest.approx([0.5] * 4)
     assert torch.allclose(image[..., :3], image[..., 3:].expand(-1, -1, 3))  # colours are premultiplied
@@ -70,11 +72,14 @@ def test_turntable_sees_the_whole_box_upright(angle):
     corners = torch.tensor([[x, y, z] for x in (-0.5, 0.6) for y in (0.0, 1.8) for z in (-0.2, 0.3)]).float()
     pixels, depth_m = project(corners, camera)
     assert (depth_m > 0).all()
-    assert (pixels >= 0).all() and (pixels[:, 0] <= 300).all() and (pixels[:, 1] <= 500).all()
+    assert (pixels >= 0).all()
+    assert (pixels[:, 0] <= 300).all()
+    assert (pixels[:, 1] <= 500).all()
     heights = pixels[:, 1]
     assert heights[corners[:, 1] > 1].max() < heights[corners[:, 1] < 1].min()  # the head is above the feet
     rotation = camera.world_to_camera[:3, :3]
-    assert np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) and np.linalg.det(rotation) == pytest.approx(1.0)
+    assert np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
+    assert np.linalg.det(rotation) == pytest.approx(1.0)
 
 
 def test_turntable_starts_at_the_front_and_goes_to_the_left_hand():

@@ -33,7 +33,8 @@ def test_glb_round_trip_and_refusals():
     document, binary = {"asset": {"version": "2.0"}, "name": "ä"}, bytes(range(7))
     back, chunk = split_glb(join_glb(document, binary))
     assert back == document
-    assert chunk[:7] == binary and len(chunk) % 4 == 0
+    assert chunk[:7] == binary
+    assert len(chunk) % 4 == 0
     with pytest.raises(ValueError, match="no binary glTF"):
         split_glb(b"PK\x03\x04 this is a zip archive")
 

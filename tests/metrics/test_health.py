@@ -71,7 +71,11 @@ def test_boxes_that_cut_each_other_are_seen():
 def test_smallest_angle_is_the_law_of_cosines(rng):
     mesh = Mesh(rng.normal(size=(3, 3)), np.array([[0, 1, 2]], dtype=np.int32))
     a, b, c = (np.linalg.norm(mesh.vertices[i] - mesh.vertices[(i + 1) % 3]) for i in range(3))
-    cosines = [(a * a + b * b - c * c) / (2 * a * b), (b * b + c * c - a * a) / (2 * b * c), (a * a + c * c - b * b) / (2 * a * c)]
+    cosines = [
+        (a * a + b * b - c * c) / (2 * a * b),
+        (b * b + c * c - a * a) / (2 * b * c),
+        (a * a + c * c - b * b) / (2 * a * c),
+    ]
     assert smallest_angles_deg(mesh)[0] == pytest.approx(np.degrees(np.arccos(cosines)).min())
     flat = Mesh(np.array([[0, 0, 0], [1.0, 0, 0], [2, 0, 0]]), mesh.faces)
     assert smallest_angles_deg(flat)[0] == pytest.approx(0.0)

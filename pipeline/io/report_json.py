@@ -1,0 +1,82 @@
+"""The document of report.json: what all stages cost and how good the result is, for programs and for the page."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pipeline.core.errors import UserError
+from pipeline.core.manifest import Manifest
+from pipeline.metrics.images import mean_scores
+
+PROTOCOL = (
+    "{count} frames whose index in the video is divisible by eight were held out: field, mesh and texture never saw "
+    "their pixels, and no decision was made on them. Their poses come from the body stage, which reads the landmarks "
+    "and the mask of every frame, and from the field's pose corrections, interpolated in time between training frames; "
+    "no pose was fitted to a held-out image. Renders and frames are laid over white by the mask and rounded to 8 bits. "
+    "psnr_full and ssim_full count the whole image, psnr_body the pixels of the mask, psnr_box and ssim_box the "
+    "smallest box around it; each is the mean over frames. field is the radiance field, mesh the exported mesh with "
+    "its diffuse map, unlit."
+)
+UNREFINED = " The rows named unrefined use the body stage's poses alone."
+
+
+def build_report(
+    manifests: Mapping[str, Manifest],
+    frames: Sequence[Mapping[str, Any]],
+    figures: Mapping[str, Mapping[str, float | int | bool]],
+    environment: Mapping[str, Any],
+    cost: tuple[float, float],
+) -> dict[str, Any]:
+    """Everything the report says.
+
+    Args:
+        manifests: of the stages before the report, in order.
+        frames: a row a held-out frame, `index` and the scores of each render by name.
+        figures: sections that the report measures: `mesh` (health), `export` (glb_bytes, texture_px), `masks` (count).
+        cost: the report's own seconds and peak memory (MiB) until now.
+
+    Raises:
+        UserError: the body stage's manifest lacks a figure.
+    """
+    seconds = {name: manifest.seconds for name, manifest in manifests.items()} | {"report": round(cost[0], 3)}
+    peaks = {name: manifest.peak_rss_mib for name, manifest in manifests.items()} | {"report": round(cost[1], 1)}
+    renders = [name for name in frames[0] if name != "index"]
+    protocol = PROTOCOL.format(count=len(frames))
+    return {
+        "seconds": seconds | {"total": round(sum(seconds.values()), 3)},
+        "peak_rss_mib": peaks | {"total": max(peaks.values())},
+        "heldout": {name: mean_scores([row[name] for row in frames]) for name in renders}
+        | {
+            "protocol": protocol + UNREFINED if "mesh_unrefined" in renders else protocol,
+            "frames": list(frames),
+        },
+        **{name: dict(section) for name, section in figures.items()},
+        "body": {name: _figure(manifests["body"], name) for name in ("landmark_error_px", "silhouette_iou")},
+        "stages": {name: dict(manifest.metrics) for name, manifest in manifests.items()},
+        "warnings": [f"{name}: {text}" for name, manifest in manifests.items() for text in manifest.warnings],
+        "environment": {name: value for name, value in environment.items() if name != "packages"},
+    }
+
+
+def report_text(report: Mapping[str, Any]) -> str:
+    """JSON text of the document; a figure that is not finite (the PSNR of equal images) becomes null."""
+    return json.dumps(finite(report), indent=2, allow_nan=False) + "\n"
+
+
+def finite(value: Any) -> Any:
+    """The same document with None in place of infinities and NaN."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Mapping):
+        return {key: finite(inner) for key, inner in value.items()}
+    return [finite(inner) for inner in value] if isinstance(value, list | tuple) else value
+
+
+def _figure(manifest: Manifest, name: str) -> float | None:
+    if name not in manifest.metrics:
+        raise UserError(
+            f"the manifest of stage {manifest.stage} has no figure {name}: "
+            f"run it again with python -m stages.{manifest.stage} RUN --force"
+        )
+    return manifest.metrics[name]

@@ -1,0 +1,167 @@
+"""The last stage: held-out frames against renders of the field and of the exported mesh, figures, charts, a page."""
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from pydantic import Field
+from torch import Tensor
+
+from pipeline.avatar.selection import HELDOUT
+from pipeline.core.cli import main
+from pipeline.core.config import Config as BaseConfig
+from pipeline.core.errors import UserError
+from pipeline.core.manifest import Manifest, read_manifest
+from pipeline.core.measure import environment, peak_rss_mib
+from pipeline.core.progress import track
+from pipeline.core.stage import Stage
+from pipeline.io.avatar import FinishedRun, load_finished_run
+from pipeline.io.image import read_rgb, to_uint8, write_rgb
+from pipeline.io.report_json import build_report, finite, report_text
+from pipeline.io.report_page import FramePictures, PageContent, error_map, render_page
+from pipeline.io.sheet import on_white_8bit, picture_sheet
+from pipeline.metrics.health import mesh_health
+from pipeline.metrics.images import body_box, body_pixels, frame_scores, on_white, premultiplied_on_white
+
+NEEDS = ("frames", "body", "field", "mesh", "texture", "export")
+PICTURES = (
+    ("body", "overlay.png", "Fit of the body, laid over the video"),
+    ("frames", "contact.jpg", "Chosen frames and their masks"),
+    ("texture", "diffuse.png", "Diffuse map"),
+    ("mesh", "preview.png", "Mesh"),
+)
+CROP_MARGIN_PX = 12
+
+
+class Config(BaseConfig):
+    """Options of the report."""
+
+    samples: int = Field(
+        3, ge=1, le=8, description="texture look-ups along each side of a pixel when the mesh is drawn"
+    )
+    unrefined: bool = Field(
+        True, description="score renders in the body stage's poses as well, without the field's corrections"
+    )
+    shown_frames: int = Field(8, ge=1, le=64, description="held-out frames that the page shows; all are scored")
+    views: int = Field(8, ge=2, le=36, description="sides from which the turntable shows the avatar")
+    view_height_px: int = Field(480, ge=64, le=2048, description="height of a turntable picture, px")
+
+
+def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, float]:
+    """Score held-out frames, measure mesh and files, write report.json, the page and two sheets of pictures."""
+    started = time.monotonic()
+    manifests = {name: _manifest(inputs[name]) for name in NEEDS}
+    loaded = load_finished_run(inputs)
+    positions = loaded.capture.positions(HELDOUT)
+    if len(positions) == 0:
+        raise UserError(
+            f"{inputs['frames']} holds no frame whose index is divisible by eight, so nothing can be scored: "
+            "film longer, or choose more frames"
+        )
+    rows, pictures = score(loaded, positions, config)
+    turntable = draw_turntable(loaded, int(positions[len(positions) // 2]), config)
+    write_rgb(out / "turntable.jpg", picture_sheet([[on_white_8bit(view) for view in views] for _, views in turntable]))
+    write_rgb(out / "heldout.jpg", picture_sheet([_strip(frame) for frame in pictures]))
+    glb = (inputs["export"] / "avatar.glb").read_bytes()
+    figures: dict[str, Mapping[str, float | int | bool]] = {
+        "mesh": mesh_health(loaded.avatar.mesh()),
+        "export": {"glb_bytes": len(glb), "texture_px": len(loaded.avatar.diffuse)},
+        "masks": {"count": len(loaded.capture)},
+    }
+    cost = (time.monotonic() - started, peak_rss_mib())
+    report = finite(build_report(manifests, rows, figures, environment(), cost))
+    page = PageContent(
+        title=out.resolve().parent.name,
+        report=report,
+        frames=pictures,
+        turntable=turntable,
+        pictures=[(caption, read_rgb(inputs[stage] / name)) for stage, name, caption in PICTURES],
+        glb=glb,
+    )
+    (out / "index.html").write_text(render_page(page), encoding="utf-8")
+    (out / "report.json").write_text(report_text(report), encoding="utf-8")
+    heldout = report["heldout"]
+    return {
+        f"{name}_{score}": heldout[name][score]
+        for name in ("field", "mesh")
+        for score in ("psnr_full", "psnr_body", "ssim_full")
+        if heldout[name][score] is not None
+    }
+
+
+def score(
+    loaded: FinishedRun, positions: np.ndarray, config: Config
+) -> tuple[list[dict[str, Any]], list[FramePictures]]:
+    """Scores of every held-out frame by render, and the pictures of some of them."""
+
+    def draw_mesh(pose: Float[Tensor, "j 4 4"]) -> Float[np.ndarray, "h w 4"]:
+        return loaded.avatar.render(loaded.avatar.posed(pose), loaded.camera, config.samples)
+
+    draws = {
+        "field": (loaded.draw_field, loaded.refined),
+        "mesh": (draw_mesh, loaded.refined),
+    }
+    if config.unrefined:
+        draws |= {"field_unrefined": (loaded.draw_field, loaded.fitted), "mesh_unrefined": (draw_mesh, loaded.fitted)}
+    shown = set(positions[np.linspace(0, len(positions) - 1, config.shown_frames).round().astype(int)].tolist())
+    rows, pictures = [], []
+    for position in track(positions.tolist(), "held-out frames"):
+        image, mask = (to_uint8(part(position)) for part in (loaded.capture.image, loaded.capture.mask))
+        renders = {name: draw(poses[position]) for name, (draw, poses) in draws.items()}
+        index = int(loaded.capture.frame_index[position])
+        rows.append({"index": index} | {name: frame_scores(rgba, image, mask) for name, rgba in renders.items()})
+        if position in shown:
+            pictures.append(_pictures(index, image, mask, renders))
+    return rows, pictures
+
+
+def draw_turntable(
+    loaded: FinishedRun, position: int, config: Config
+) -> list[tuple[str, list[UInt8[np.ndarray, "_ _ 4"]]]]:
+    """The avatar from all sides, in its A-pose and as it stood in one frame."""
+    index = int(loaded.capture.frame_index[position])
+    bodies = {
+        "A-pose": loaded.avatar.vertices,
+        f"As in frame {index}, a held-out one": loaded.avatar.posed(loaded.refined[position]),
+    }
+    return [
+        (title, loaded.avatar.turntable(vertices, config.views, config.view_height_px, config.samples))
+        for title, vertices in bodies.items()
+    ]
+
+
+def _pictures(
+    index: int, image: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"], renders: Mapping[str, np.ndarray]
+) -> FramePictures:
+    rows, columns = body_box(body_pixels(mask))
+    crop = tuple(slice(max(0, part.start - CROP_MARGIN_PX), part.stop + CROP_MARGIN_PX) for part in (rows, columns))
+    field, mesh = (premultiplied_on_white(renders[name])[crop] for name in ("field", "mesh"))
+    return FramePictures(index, on_white(image, mask)[crop], field, mesh)
+
+
+def _strip(frame: FramePictures) -> list[UInt8[np.ndarray, "h w 3"]]:
+    errors = [error_map(render, frame.video) for render in (frame.field, frame.mesh)]
+    return [frame.video, frame.field, frame.mesh, *errors]
+
+
+def _manifest(folder: Path) -> Manifest:
+    manifest = read_manifest(folder)
+    if manifest is None:
+        raise UserError(f"{folder} has no manifest: run python -m stages.{folder.name} {folder.parent}")
+    return manifest
+
+
+STAGE = Stage(
+    name="report",
+    version=1,
+    needs=NEEDS,
+    makes=("report.json", "index.html", "turntable.jpg", "heldout.jpg"),
+    config=Config,
+    run=run,
+)
+
+if __name__ == "__main__":
+    raise SystemExit(main(STAGE))

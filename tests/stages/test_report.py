@@ -1,0 +1,115 @@
+"""The report of a small run whose errors are known in closed form."""
+
+import json
+import math
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pipeline.core.errors import UserError
+from pipeline.core.manifest import digest_files
+from pipeline.io.capture import Capture, load_capture, save_capture
+from stages.report import STAGE, Config, run
+from tests.stages.report_run import COLOUR_ERROR, FRAME_INDEX, make_run
+
+CONFIG = Config(samples=3, shown_frames=2, views=4, view_height_px=64)
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return make_run(tmp_path_factory.mktemp("runs") / "small")
+
+
+@pytest.fixture(scope="module")
+def out(inputs: dict[str, Path]) -> Path:
+    folder = inputs["frames"].parent / "report.part"
+    folder.mkdir()
+    before = {name: digest_files(path) for name, path in inputs.items()}
+    metrics = run(inputs, folder, CONFIG)
+    assert metrics["mesh_psnr_body"] > metrics["field_psnr_body"]
+    assert before == {name: digest_files(path) for name, path in inputs.items()}  # inputs are read only
+    return folder
+
+
+@pytest.fixture(scope="module")
+def report(out: Path) -> dict:
+    return json.loads((out / "report.json").read_text())
+
+
+def test_all_promised_files_are_made(out: Path):
+    assert {path.name for path in out.iterdir()} == set(STAGE.makes)
+
+
+def test_the_mesh_error_is_the_colour_error_that_was_put_in(report: dict):
+    expected_db = 20 * math.log10(255 / COLOUR_ERROR)
+    scores = report["heldout"]["mesh"]
+    # Pixels on the outline are half white, so their error is smaller: 0.2 dB on so small a picture.
+    assert expected_db - 0.05 < scores["psnr_body"] < expected_db + 0.4
+    assert scores["mask_iou"] > 0.99
+    assert scores["psnr_full"] > scores["psnr_box"] > scores["psnr_body"] - 0.1  # white on white flatters
+
+
+def test_the_full_image_dilutes_the_body_error_by_its_share(report: dict, inputs: dict[str, Path]):
+    capture = load_capture(inputs["frames"])
+    shares = {int(i): capture.mask(k).mean() for k, i in enumerate(capture.frame_index)}
+    for row in report["heldout"]["frames"]:
+        gained_db = -10 * math.log10(shares[row["index"]])
+        assert row["mesh"]["psnr_full"] - row["mesh"]["psnr_body"] == pytest.approx(gained_db, abs=0.4)
+
+
+def test_only_frames_divisible_by_eight_are_scored(report: dict):
+    assert [row["index"] for row in report["heldout"]["frames"]] == [0, 8, 16]
+    assert "3 frames" in report["heldout"]["protocol"]
+
+
+def test_poses_without_refinement_score_worse(report: dict):
+    heldout = report["heldout"]
+    assert heldout["mesh_unrefined"]["mask_iou"] < heldout["mesh"]["mask_iou"] - 0.05
+    assert heldout["mesh_unrefined"]["psnr_body"] < heldout["mesh"]["psnr_body"] - 1
+
+
+def test_an_untrained_field_is_worse_than_the_mesh(report: dict):
+    assert report["heldout"]["field"]["psnr_body"] < report["heldout"]["mesh"]["psnr_body"]
+
+
+def test_figures_of_the_other_stages_are_passed_on(report: dict, inputs: dict[str, Path]):
+    assert report["masks"]["count"] == len(FRAME_INDEX)
+    assert report["body"] == {"landmark_error_px": 3.5, "silhouette_iou": 0.9}
+    assert report["export"]["texture_px"] == 64
+    assert report["export"]["glb_bytes"] == (inputs["export"] / "avatar.glb").stat().st_size
+    assert report["mesh"]["watertight"] is True
+    assert report["mesh"]["components"] == 1
+    assert report["seconds"]["total"] == pytest.approx(21 + report["seconds"]["report"], abs=1e-2)
+    assert report["seconds"]["report"] > 0
+    assert report["peak_rss_mib"]["report"] > 50
+
+
+def test_the_page_shows_the_chosen_frames(out: Path):
+    page = (out / "index.html").read_text()
+    assert page.count('class="card frame"') == CONFIG.shown_frames
+    assert page.count('data-kind="mesh"') == CONFIG.shown_frames
+    assert "<title>small</title>" in page
+
+
+def test_sheets_show_the_avatar(out: Path):
+    turntable = cv2.imread(str(out / "turntable.jpg"))
+    assert turntable.shape[0] > 2 * CONFIG.view_height_px
+    assert (turntable < 200).any(axis=2).mean() > 0.1
+    assert cv2.imread(str(out / "heldout.jpg")) is not None
+
+
+def test_without_held_out_frames_the_reason_is_named(inputs: dict[str, Path], tmp_path: Path):
+    frames = tmp_path / "frames"
+    shutil.copytree(inputs["frames"], frames)
+    fields = load_capture(frames).__dict__ | {"split": np.zeros(len(FRAME_INDEX), dtype=np.uint8)}
+    save_capture(Capture(**fields))
+    with pytest.raises(UserError, match="divisible by eight"):
+        run(inputs | {"frames": frames}, tmp_path, CONFIG)
+
+
+def test_without_a_manifest_the_command_is_named(inputs: dict[str, Path], tmp_path: Path):
+    with pytest.raises(UserError, match="python -m stages.mesh"):
+        run(inputs | {"mesh": tmp_path / "mesh"}, tmp_path, CONFIG)
