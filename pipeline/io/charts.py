@@ -1,4 +1,4 @@
-"""Small charts as inline SVG. Colours and fonts come from the page's style sheet, and follow its light or dark theme."""
+"""Small charts as inline SVG. Colours and fonts come from the page, so that they follow its light or dark theme."""
 
 import math
 from collections.abc import Mapping, Sequence
