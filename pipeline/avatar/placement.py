@@ -1,9 +1,12 @@
 """Where an avatar's scene has its origin: on the floor, where the person stood."""
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.avatar.body import Motion
+from pipeline.geometry.camera import Camera
 
 FLOOR_PERCENTILE = 10.0
 
@@ -11,15 +14,28 @@ FLOOR_PERCENTILE = 10.0
 def scene_from_world_m(motion: Motion, lowest_m: Float[np.ndarray, "n"]) -> Float[np.ndarray, "3"]:
     """Translation (m) that carries world points into the scene of the exported file.
 
-    The floor (y = 0) is where the feet are: the lowest tenth of the frames' lowest points, since a jump lifts some frames
-    and a wrong pose sinks few. x = z = 0 is the middle (median) of the root's places, so that viewers, which look at the
-    rest pose, find the moving person. Nothing is scaled or turned: displacements and the camera's relative place stay.
+    The floor (y = 0) is where the feet are: the lowest tenth of the frames' lowest points, since a jump lifts some
+    frames and a wrong pose sinks few. x = z = 0 is the middle (median) of the root's places, so that viewers, which
+    look at the rest pose, find the moving person. Nothing is scaled or turned: displacements and the camera's relative
+    place stay.
 
     lowest_m: y of the lowest point of the posed surface, a frame, world.
     """
     middle = np.median(motion.root_translation_m, axis=0)
     floor_m = np.percentile(lowest_m, FLOOR_PERCENTILE)
     return -np.array([middle[0], floor_m, middle[2]], dtype=np.float32)
+
+
+def move_motion(motion: Motion, offset_m: Float[np.ndarray, "3"]) -> Motion:
+    """The same motion with the world's points shifted by `offset_m`."""
+    return motion.with_pose(motion.rotations_wxyz, motion.root_translation_m + offset_m)
+
+
+def move_camera(camera: Camera, offset_m: Float[np.ndarray, "3"]) -> Camera:
+    """The camera that sees the shifted world as it saw the world before."""
+    world_to_camera = camera.world_to_camera.copy()
+    world_to_camera[:3, 3] -= world_to_camera[:3, :3] @ offset_m
+    return replace(camera, world_to_camera=world_to_camera)
 
 
 def hold_ends(motion: Motion, frame_rate: float, video_frame_count: int) -> Motion:

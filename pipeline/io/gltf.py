@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 
 from pipeline.avatar.body import Body, Motion
 from pipeline.geometry.camera import Camera
@@ -124,6 +124,16 @@ def encode_glb(
     if camera is not None:
         document.json["scenes"][0]["nodes"].append(_add_camera(document, camera))
     return document.pack()
+
+
+def highlight(specular: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 4"]:
+    """A specular map as KHR_materials_specular wants it: hue in RGB, strength (the largest channel) in alpha.
+
+    The strength must scale the reflection at grazing angles too, which the colour alone leaves at full.
+    """
+    strength = specular.max(axis=2, keepdims=True)
+    hue = np.rint(255.0 * specular / np.maximum(strength, 1)).astype(np.uint8)
+    return np.concatenate([np.where(strength > 0, hue, np.uint8(255)), strength], axis=2)
 
 
 def write_glb(path: Path, data: bytes) -> None:

@@ -59,6 +59,12 @@ def write_rgba(path: Path, pixels: UInt8[np.ndarray, "h w 4"]) -> None:
     _write(path, cv2.cvtColor(pixels, cv2.COLOR_RGBA2BGRA))
 
 
+def png_bytes(pixels: UInt8[np.ndarray, "h w c"], compression: int = 6) -> bytes:
+    """An RGB or RGBA image as a PNG file's bytes, for files that carry images inside; compression 0 to 9."""
+    code = cv2.COLOR_RGB2BGR if pixels.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
+    return cv2.imencode(".png", cv2.cvtColor(pixels, code), (cv2.IMWRITE_PNG_COMPRESSION, compression))[1].tobytes()
+
+
 def to_float(pixels: UInt8[np.ndarray, "..."]) -> np.ndarray:
     """uint8 [0, 255] to float32 [0, 1]."""
     return pixels.astype(np.float32) / np.float32(255.0)

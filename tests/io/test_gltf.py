@@ -1,4 +1,4 @@
-"""The .glb, played back by an independent reading of the glTF specification, and by the Khronos validator where it is."""
+"""The .glb, played back by an independent reading of the glTF specification; the Khronos validator where it is."""
 
 from pathlib import Path
 

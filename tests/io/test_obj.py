@@ -26,7 +26,7 @@ def written(folder: Path, mesh: Mesh, specular_name: str | None = None) -> Path:
 
 
 def test_reading_it_back_gives_the_same_corners(tmp_path: Path, tetrahedron: Mesh) -> None:
-    read = trimesh.load(written(tmp_path, tetrahedron), process=False, maintain_order=True)
+    read = trimesh.load(written(tmp_path, tetrahedron), process=False)
     corners = np.asarray(read.vertices)[read.faces]
     np.testing.assert_allclose(corners, tetrahedron.vertices[tetrahedron.faces], atol=1e-6)
     np.testing.assert_allclose(np.asarray(read.visual.uv)[read.faces], UV[FACES_UV], atol=1e-6)

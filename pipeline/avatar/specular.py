@@ -1,0 +1,185 @@
+"""Highlights that move over the surface, told apart from shading: the specular map.
+
+Letters: c residual colour of a vertex in a frame (observed minus the vertex's mean over frames), a its mean colour,
+n world normal, r world direction of the mirrored view. Camera and light stand still while the person turns, so
+    c = a · (E(n) - mean E) + s · (L(r) - mean L),
+with E (shading, scales the colour) and L (highlight, adds light) shared by all vertices as spherical harmonics without
+their constant, and s >= 0 each vertex's specular colour: nerf2mesh's split into diffuse colour and specular features
+(Tang et al. 2023) with a linear lobe instead of a network, so that it is solved and not trained. The split counts only
+if it foretells frames that it has not seen; else the surface is matte.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipeline.avatar.bake import BakeConfig, Surface, observe
+from pipeline.avatar.bake_views import View, pixel_trust, seen_depth, vertex_normals
+from pipeline.geometry.atlas import Texels
+
+ALTERNATIONS = 8
+RIDGE = 1e-3
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What frames show of vertices, a row an observation: vertex, colour, weight, normal and mirrored view (world)."""
+
+    vertex: Int[np.ndarray, "k"]
+    colour: Float[np.ndarray, "k 3"]
+    weight: Float[np.ndarray, "k"]
+    normal: Float[np.ndarray, "k 3"]
+    mirrored: Float[np.ndarray, "k 3"]
+
+
+@dataclass(frozen=True)
+class Specular:
+    """strength: each vertex's highlight colour, sRGB in [0, 1], 0 everywhere when highlights explain nothing.
+
+    gain: share of the error on unseen frames that the highlights explain beyond shading (negative: they mislead).
+    """
+
+    strength: Float[np.ndarray, "v 3"]
+    gain: float
+
+
+def corner_texels(faces: Int[np.ndarray, "f 3"], vertex_count: int) -> Texels:
+    """One "texel" a vertex, so that vertices can be observed as texels are; vertices without a face are left out."""
+    flat = faces.reshape(-1)
+    vertices, first = np.unique(flat, return_index=True)
+    barycentric = np.eye(3, dtype=np.float32)[first % 3]
+    zeros = np.zeros(len(vertices), dtype=np.int32)
+    return Texels(vertex_count, zeros, vertices.astype(np.int32), (first // 3).astype(np.int32), barycentric)
+
+
+def observe_vertices(views: Iterable[View], surface: Surface, config: BakeConfig) -> Observations:
+    """Colours of all vertices in all views where they can be seen. `surface.texels` must come from `corner_texels`."""
+    parts = []
+    vertices = surface.texels.columns
+    for view in views:
+        depth_m = seen_depth(view, surface.faces)
+        trust = pixel_trust(view.mask, depth_m.numpy(), config.edge_px)
+        colour, weight = observe(view, surface, view.image.astype(np.float32) / 255.0, trust, depth_m, config)
+        seen = (weight > 0).numpy()
+        normal = vertex_normals(view.vertices_world, surface.faces).numpy()[vertices[seen]]
+        to_camera = view.camera.centre_m() - view.vertices_world.numpy()[vertices[seen]]
+        to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
+        mirrored = 2.0 * np.sum(normal * to_camera, axis=1, keepdims=True) * normal - to_camera
+        parts.append((vertices[seen], colour.numpy()[seen], weight.numpy()[seen], normal, mirrored.astype(np.float32)))
+    return Observations(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
+def harmonics(directions: Float[np.ndarray, "k 3"], degree: int) -> Float[np.ndarray, "k m"]:
+    """Real spherical harmonics up to a degree (2 or 3) without the constant, not normalised.
+
+    (Ramamoorthi and Hanrahan 2001 show that degree 2 holds 99 % of diffuse shading.)
+    """
+    x, y, z = directions.T
+    terms = [x, y, z, x * y, y * z, 3.0 * z * z - 1.0, x * z, x * x - y * y]
+    if degree >= 3:
+        terms += [
+            y * (3.0 * x * x - y * y),
+            x * y * z,
+            y * (5.0 * z * z - 1.0),
+            z * (5.0 * z * z - 3.0),
+            x * (5.0 * z * z - 1.0),
+            z * (x * x - y * y),
+            x * (x * x - 3.0 * y * y),
+        ]
+    return np.stack(terms, axis=1)
+
+
+class _Centred:
+    """Observations relative to their vertex's weighted mean over the training frames."""
+
+    def __init__(self, train: Observations, count: int) -> None:
+        self.count = count
+        self.total = np.maximum(np.bincount(train.vertex, train.weight, count), 1e-9)
+        self.mean_colour = self.mean(train, train.colour)
+
+    def mean(self, train: Observations, values: np.ndarray) -> np.ndarray:
+        columns = [np.bincount(train.vertex, train.weight * column, self.count) for column in values.T]
+        return np.stack(columns, axis=1) / self.total[:, None]
+
+
+def fit_specular(train: Observations, validation: Observations, count: int, least_gain: float) -> Specular:
+    """Shading and highlights from training frames, judged on validation frames.
+
+    count: number of vertices. least_gain: share of the validation error that highlights must explain to be kept.
+    """
+    centred = _Centred(train, count)
+    shade_mean = centred.mean(train, harmonics(train.normal, 2))
+    lobe_mean = centred.mean(train, harmonics(train.mirrored, 3))
+
+    def terms(seen: Observations) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        residual = seen.colour - centred.mean_colour[seen.vertex]
+        shade = harmonics(seen.normal, 2) - shade_mean[seen.vertex]
+        lobe = harmonics(seen.mirrored, 3) - lobe_mean[seen.vertex]
+        return residual, shade, lobe
+
+    residual, shade, lobe = terms(train)
+    albedo = centred.mean_colour
+    highlights = np.zeros_like(residual)
+    strength = np.ones((count, 3))
+    for _ in range(ALTERNATIONS):
+        shading = _solve_shared(shade, albedo[train.vertex], residual - highlights, train.weight)
+        rest = residual - (shade @ shading)[:, None] * albedo[train.vertex]
+        direction = _solve_shared(lobe, strength[train.vertex], rest, train.weight)
+        # without a fixed size of L the ridge would pull s down and L would grow in its place, round after round
+        direction /= max(float(np.sqrt(np.average((lobe @ direction) ** 2, weights=train.weight))), 1e-9)
+        height = lobe @ direction
+        strength = _solve_strength(train, height, rest, count)
+        highlights = height[:, None] * strength[train.vertex]
+    gain = _gain(terms(validation), validation, albedo, shading, direction, strength)
+    span = np.ptp(np.percentile(harmonics(train.mirrored, 3) @ direction, [1.0, 99.0]))
+    kept = np.clip(strength * span, 0.0, 1.0) if gain >= least_gain else np.zeros_like(strength)
+    return Specular(kept.astype(np.float32), float(gain))
+
+
+def _solve_shared(
+    basis: np.ndarray, scale: np.ndarray, target: np.ndarray, weight: np.ndarray
+) -> Float[np.ndarray, "m"]:
+    """Coefficients x that minimise sum w |scale · (basis x) - target|^2."""
+    power = weight * np.sum(scale**2, axis=1)
+    matrix = (basis * power[:, None]).T @ basis
+    right = basis.T @ (weight * np.sum(scale * target, axis=1))
+    return np.linalg.solve(matrix + RIDGE * np.trace(matrix) / len(matrix) * np.eye(len(matrix)), right)
+
+
+def _solve_strength(train: Observations, height: np.ndarray, rest: np.ndarray, count: int) -> Float[np.ndarray, "v 3"]:
+    """Each vertex's s >= 0 for given highlights, pulled to 0 where few or weak ones were seen."""
+    power = np.bincount(train.vertex, train.weight * height**2, count)
+    evidence = np.stack([np.bincount(train.vertex, train.weight * height * c, count) for c in rest.T], axis=1)
+    ridge = np.median(power[power > 0]) if np.any(power > 0) else 1.0
+    return np.maximum(evidence / (power + ridge)[:, None], 0.0)
+
+
+def _gain(
+    terms: tuple[np.ndarray, np.ndarray, np.ndarray],
+    seen: Observations,
+    albedo: np.ndarray,
+    shading: np.ndarray,
+    direction: np.ndarray,
+    strength: np.ndarray,
+) -> float:
+    residual, shade, lobe = terms
+    rest = residual - (shade @ shading)[:, None] * albedo[seen.vertex]
+    left = rest - (lobe @ direction)[:, None] * strength[seen.vertex]
+    before = float(np.sum(seen.weight[:, None] * rest**2))
+    return 1.0 - float(np.sum(seen.weight[:, None] * left**2)) / before if before > 0 else 0.0
+
+
+def smooth_over_edges(
+    values: Float[np.ndarray, "v c"], edges: Int[np.ndarray, "e 2"], rounds: int
+) -> Float[np.ndarray, "v c"]:
+    """Each round replaces every vertex by the mean of itself and the mean of its neighbours."""
+    degree = np.maximum(np.bincount(edges.ravel(), minlength=len(values)), 1)[:, None]
+    for _ in range(rounds):
+        summed = np.zeros_like(values)
+        for column in range(values.shape[1]):
+            summed[:, column] += np.bincount(edges[:, 0], values[edges[:, 1], column], len(values))
+            summed[:, column] += np.bincount(edges[:, 1], values[edges[:, 0], column], len(values))
+        values = (0.5 * values + 0.5 * summed / degree).astype(values.dtype)
+    return values

@@ -1,0 +1,113 @@
+"""export: the avatar as a skinned, animated .glb and as a textured .obj."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from pydantic import Field
+
+from pipeline.avatar.body import Body, Motion, canonical_to_world
+from pipeline.avatar.placement import hold_ends, move_camera, move_motion, scene_from_world_m
+from pipeline.core.cli import main
+from pipeline.core.config import Config as BaseConfig
+from pipeline.core.stage import Stage
+from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.skinning import dense_weights, linear_blend_skinning
+from pipeline.io.capture import load_capture
+from pipeline.io.gltf import Maps, SkinnedMesh, encode_glb, highlight, write_glb
+from pipeline.io.image import png_bytes, read_rgb
+from pipeline.io.npz import load_body, load_camera, load_motion, load_npz
+from pipeline.io.obj import write_obj
+
+DIFFUSE, SPECULAR = "avatar_diffuse.png", "avatar_specular.png"
+
+
+class Config(BaseConfig):
+    """Options of the export stage."""
+
+    roughness: float = Field(
+        0.85, ge=0.0, le=1.0, description="glTF roughness of the whole surface, 0 mirror to 1 matte"
+    )
+    licence_note: str = Field(
+        "Made from a video of a person: ask that person before you share it.",
+        description="text for asset.extras, no unit",
+    )
+
+
+def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, float]:
+    """Writes `avatar.glb`, and `avatar.obj` with its `.mtl` and maps."""
+    body, arrays = load_body(inputs["body"] / "body.npz"), load_npz(inputs["mesh"] / "mesh.npz")
+    atlas = load_npz(inputs["texture"] / "atlas.npz")
+    diffuse, specular = (read_rgb(inputs["texture"] / f"{name}.png") for name in ("diffuse", "specular"))
+    mesh = Mesh(arrays["vertices"], arrays["faces"])
+    shines = bool(specular.any())
+
+    capture, motion = load_capture(inputs["frames"]), load_motion(inputs["field"] / "motion.npz")
+    offset_m = scene_from_world_m(motion, lowest_points_m(arrays, body, motion))
+    clip = hold_ends(move_motion(motion, offset_m), capture.fps, capture.n_video_frames)
+    diffuse_png, specular_png = png_bytes(diffuse), png_bytes(specular)
+    data = encode_glb(
+        skinned_mesh(mesh, arrays, atlas),
+        body,
+        clip,
+        Maps(diffuse_png, png_bytes(highlight(specular)) if shines else None, config.roughness),
+        move_camera(load_camera(inputs["body"] / "camera.npz"), offset_m),
+        about(config, offset_m, capture.fps),
+    )
+    write_glb(out / "avatar.glb", data)
+    (out / DIFFUSE).write_bytes(diffuse_png)
+    (out / SPECULAR).write_bytes(specular_png)
+    names = (DIFFUSE, SPECULAR if shines else None)
+    write_obj(out / "avatar.obj", mesh, atlas["uv"], atlas["faces_uv"], mesh.vertex_normals(), *names)
+    return {
+        "glb_bytes": float(len(data)),
+        "texture_px": float(len(diffuse)),
+        "animation_s": float(clip.time_s[-1]),
+        "vertices": float(len(atlas["uv"])),
+        "faces": float(len(mesh.faces)),
+    }
+
+
+def skinned_mesh(mesh: Mesh, arrays: Mapping[str, np.ndarray], atlas: Mapping[str, np.ndarray]) -> SkinnedMesh:
+    """The mesh with its vertices repeated along the atlas's seams, which share their position, normal and weights."""
+    of = atlas["vertex_of_uv"]
+    skin = (arrays["joint_indices"][of], arrays["joint_weights"][of])
+    return SkinnedMesh(mesh.vertices[of], mesh.vertex_normals()[of], atlas["uv"], *skin, atlas["faces_uv"])
+
+
+def lowest_points_m(arrays: Mapping[str, np.ndarray], body: Body, motion: Motion) -> Float[np.ndarray, "n"]:
+    """Height of the posed mesh's lowest vertex in every frame, world."""
+    indices, weights = (torch.from_numpy(arrays[f"joint_{name}"]) for name in ("indices", "weights"))
+    dense, vertices = dense_weights(indices, weights, len(body.joint_names)), torch.from_numpy(arrays["vertices"])
+    transforms = canonical_to_world(body, motion)
+    lowest = [linear_blend_skinning(vertices, dense, part)[..., 1].amin(dim=1) for part in transforms.split(8)]
+    return torch.cat(lowest).numpy()
+
+
+def about(config: Config, offset_m: Float[np.ndarray, "3"], frame_rate: float) -> dict[str, Any]:
+    """What `asset.extras` says."""
+    return {
+        "unit": "metre",
+        "axes": "+Y up, the rest pose looks along +Z",
+        "scene_from_world_translation_m": [float(value) for value in offset_m],
+        "world": "the capture camera's frame of reference: +Y up, camera at the origin unless it was supplied",
+        "frame_rate_hz": frame_rate,
+        "source": "reconstructed from one video",
+        "licence_note": config.licence_note,
+    }
+
+
+STAGE = Stage(
+    "export",
+    version=1,
+    needs=("frames", "body", "field", "mesh", "texture"),
+    makes=("avatar.glb", "avatar.obj", "avatar.mtl", DIFFUSE, SPECULAR),
+    config=Config,
+    run=run,
+)
+
+if __name__ == "__main__":
+    raise SystemExit(main(STAGE))

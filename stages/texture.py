@@ -1,0 +1,161 @@
+"""texture: an atlas of the mesh, and its diffuse and specular maps, baked from the video."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from pydantic import Field
+
+from pipeline.avatar.bake import (
+    ENOUGH_WEIGHT,
+    BakeConfig,
+    Surface,
+    bake_diffuse,
+    paint,
+    validation_psnr_db,
+)
+from pipeline.avatar.bake_views import View, crop_view, footprint_m, weigh_by_resolution
+from pipeline.avatar.body import Body, canonical_to_world
+from pipeline.avatar.parts import part_of_faces
+from pipeline.avatar.specular import corner_texels, fit_specular, observe_vertices, smooth_over_edges
+from pipeline.core.cli import main
+from pipeline.core.errors import UserError
+from pipeline.core.progress import track, warn
+from pipeline.core.stage import Stage
+from pipeline.geometry.atlas import Atlas, rasterize_texels, texture_size_px, unwrap
+from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.skinning import dense_weights, linear_blend_skinning
+from pipeline.io.capture import load_capture
+from pipeline.io.checkpoint import load_field
+from pipeline.io.image import to_uint8, write_gray, write_rgb
+from pipeline.io.npz import load_body, load_camera, load_motion, load_npz, save_npz
+
+TRAIN, VALIDATION = 0, 1
+
+
+class Config(BakeConfig):
+    """Options of the texture stage."""
+
+    smallest_px: int = Field(512, ge=64, le=8192, description="side of the texture at least, pixels, a power of two")
+    largest_px: int = Field(2048, ge=64, le=8192, description="side of the texture at most, pixels, a power of two")
+    texels_per_pixel: float = Field(
+        1.5, gt=0.1, le=8.0, description="texels along the side of what one pixel of the capture sees on the person"
+    )
+    padding_px: int = Field(4, ge=1, le=64, description="gutter between charts, texels")
+    max_frames: int = Field(150, ge=1, description="training frames used, evenly spread over the recording")
+    specular_least_gain: float = Field(
+        0.02,
+        ge=0.0,
+        le=1.0,
+        description="share of the error on validation frames that highlights must explain, or matte",
+    )
+
+
+@dataclass(frozen=True)
+class SkinnedMesh:
+    """The artifact of the mesh stage."""
+
+    mesh: Mesh
+    joint_indices: Int[np.ndarray, "v 4"]
+    joint_weights: Float[np.ndarray, "v 4"]
+
+
+def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, float]:
+    """Writes `atlas.npz`, `diffuse.png`, `specular.png` and `coverage.png`."""
+    body, skinned = load_body(inputs["body"] / "body.npz"), load_mesh(inputs["mesh"])
+    train, validation = (load_views(inputs, body, skinned, split, config.max_frames) for split in (TRAIN, VALIDATION))
+    if not train:
+        raise UserError(f"{inputs['frames']} has no training frames; run `python -m stages.frames` again")
+    atlas, size_px = make_atlas(skinned, body, train, config)
+    texels = rasterize_texels(atlas, size_px)
+    surface = Surface.of(skinned.mesh.faces, atlas, texels)
+    fallback = field_colours(inputs, texels.interpolate(skinned.mesh.faces, skinned.mesh.vertices))
+    diffuse, weight = bake_diffuse(train, surface, fallback, config)
+    strength, gain = bake_specular(train, validation, skinned.mesh, config)
+    specular = paint(torch.from_numpy(texels.interpolate(skinned.mesh.faces, strength)), texels)
+    seen = weight / (weight + ENOUGH_WEIGHT)
+    save_npz(out / "atlas.npz", {"uv": atlas.uv, "faces_uv": atlas.faces_uv, "vertex_of_uv": atlas.vertex_of_uv})
+    write_rgb(out / "diffuse.png", to_uint8(diffuse))
+    write_rgb(out / "specular.png", to_uint8(specular))
+    write_gray(out / "coverage.png", to_uint8(texels.image(seen[:, None])[..., 0]))
+    shown = to_uint8(diffuse).astype(np.float32) / 255.0
+    return {
+        "texture_px": float(size_px),
+        "seen_share": float((seen > 0.5).mean()),
+        "used_share": float(len(texels.face) / size_px**2),
+        "validation_psnr_body_db": validation_psnr_db(shown, validation, surface),
+        "specular_gain": gain,
+    }
+
+
+def load_mesh(folder: Path) -> SkinnedMesh:
+    """Reads `mesh.npz`."""
+    arrays = load_npz(folder / "mesh.npz")
+    return SkinnedMesh(Mesh(arrays["vertices"], arrays["faces"]), arrays["joint_indices"], arrays["joint_weights"])
+
+
+def load_views(inputs: Mapping[str, Path], body: Body, skinned: SkinnedMesh, split: int, max_frames: int) -> list[View]:
+    """Crops of the frames of one split, evenly thinned, each with the mesh in its pose."""
+    capture, camera = load_capture(inputs["frames"]), load_camera(inputs["body"] / "camera.npz")
+    transforms = canonical_to_world(body, load_motion(inputs["field"] / "motion.npz"))
+    vertices = torch.from_numpy(skinned.mesh.vertices)
+    weights = dense_weights(
+        torch.from_numpy(skinned.joint_indices), torch.from_numpy(skinned.joint_weights), len(body.joint_names)
+    )
+    faces = torch.from_numpy(skinned.mesh.faces)
+    positions = capture.positions(split)
+    if len(positions) > max_frames:
+        positions = positions[np.linspace(0, len(positions) - 1, max_frames).round().astype(int)]
+    views = []
+    for k in track(positions.tolist(), "reading frames"):
+        posed = linear_blend_skinning(vertices, weights, transforms[k : k + 1])[0]
+        image, mask = to_uint8(capture.image(k)), to_uint8(capture.mask(k))
+        views.append(crop_view(image, mask, camera, posed, faces))
+    return weigh_by_resolution(views) if views else []
+
+
+def make_atlas(skinned: SkinnedMesh, body: Body, views: list[View], config: Config) -> tuple[Atlas, int]:
+    """The atlas, and the side of its textures from what the capture can resolve."""
+    finest_m = float(np.median([footprint_m(view) for view in views])) / config.texels_per_pixel
+    area_m2 = float(skinned.mesh.face_areas_m2().sum())
+    size_px = texture_size_px(area_m2, finest_m, config.smallest_px, config.largest_px)
+    part = part_of_faces(skinned.mesh.faces, skinned.joint_indices, skinned.joint_weights, body.joint_names)
+    return unwrap(skinned.mesh, part, size_px, config.padding_px), size_px
+
+
+def field_colours(inputs: Mapping[str, Path], points_m: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "t 3"]:
+    """The canonical field's colours at surface points."""
+    field = load_field(inputs["field"] / "field.safetensors").requires_grad_(False)
+    return field.colour(torch.from_numpy(points_m.astype(np.float32))).numpy()
+
+
+def bake_specular(
+    train: list[View], validation: list[View], mesh: Mesh, config: Config
+) -> tuple[Float[np.ndarray, "v 3"], float]:
+    """Each vertex's highlight colour, and the share of the error on validation frames that highlights explain."""
+    if not validation:
+        warn("there are no validation frames to judge highlights on: the surface stays matte")
+        return np.zeros_like(mesh.vertices), 0.0
+    count = len(mesh.vertices)
+    texels = corner_texels(mesh.faces, count)
+    faces = torch.from_numpy(mesh.faces)
+    surface = Surface(faces, faces, torch.zeros(count, 2), texels)
+    seen = [observe_vertices(views, surface, config) for views in (train, validation)]
+    fitted = fit_specular(seen[0], seen[1], count, config.specular_least_gain)
+    return smooth_over_edges(fitted.strength, mesh.edges(), rounds=2), fitted.gain
+
+
+STAGE = Stage(
+    "texture",
+    version=1,
+    needs=("frames", "body", "field", "mesh"),
+    makes=("atlas.npz", "diffuse.png", "specular.png", "coverage.png"),
+    config=Config,
+    run=run,
+)
+
+if __name__ == "__main__":
+    raise SystemExit(main(STAGE))

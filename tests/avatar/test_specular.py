@@ -1,0 +1,99 @@
+"""Highlights, shading and plain paint, told apart on observations made from the model's own equation and on others."""
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.avatar.bake import BakeConfig, Surface
+from pipeline.avatar.specular import (
+    Observations,
+    corner_texels,
+    fit_specular,
+    harmonics,
+    observe_vertices,
+    smooth_over_edges,
+)
+from tests.avatar.painted_ball import PaintedBall, paint_of
+
+VERTICES, LIGHT = 400, np.array([0.3, 0.6, 0.74])
+
+
+def filmed(frames: int, shine: np.ndarray, shade: float, noise: float, seed: int) -> Observations:
+    """A turning cloud of oriented vertices under one light, seen from +Z; shine: each vertex's highlight strength."""
+    base = np.random.default_rng(0)
+    normals = base.normal(size=(VERTICES, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    albedo = base.uniform(0.2, 0.6, (VERTICES, 3))
+    random = np.random.default_rng(seed)
+    parts = []
+    for angle in random.uniform(0, 2 * np.pi, frames):
+        c, s = np.cos(angle), np.sin(angle)
+        normal = normals @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]).T
+        seen = np.flatnonzero(normal[:, 2] > 0.1)
+        n = normal[seen]
+        mirrored = 2.0 * n[:, 2:] * n - [0.0, 0.0, 1.0]
+        lambert = 1.0 + shade * (n @ LIGHT)
+        highlight = np.maximum(mirrored @ LIGHT, 0.0) ** 6
+        colour = albedo[seen] * lambert[:, None] + shine[seen] * highlight[:, None]
+        colour += noise * random.normal(size=colour.shape)
+        parts.append((seen.astype(np.int32), colour, n[:, 2] ** 2, n, mirrored))
+    joined = [np.concatenate(part) for part in zip(*parts, strict=True)]
+    return Observations(joined[0], *(values.astype(np.float32) for values in joined[1:]))
+
+
+def fitted(shine: np.ndarray, shade: float, noise: float = 0.01):
+    sets = [filmed(frames, shine, shade, noise, seed) for frames, seed in ((60, 1), (15, 2))]
+    return fit_specular(*sets, VERTICES, least_gain=0.02)
+
+
+def test_highlights_are_found_where_they_are() -> None:
+    shine = np.zeros((VERTICES, 3))
+    shine[: VERTICES // 2] = [0.4, 0.4, 0.2]
+    result = fitted(shine, shade=0.3)
+    shiny, matte = result.strength[: VERTICES // 2], result.strength[VERTICES // 2 :]
+    assert result.gain > 0.3
+    assert shiny[:, 0].mean() > 4.0 * matte[:, 0].mean()
+    assert shiny[:, 0].mean() > 1.5 * shiny[:, 2].mean()
+    assert 0.1 < np.quantile(shiny[:, 0], 0.75) < 0.5
+    assert result.strength.min() >= 0.0
+    assert result.strength.max() <= 1.0
+
+
+@pytest.mark.parametrize("shade", [0.0, 0.5])
+def test_paint_and_shading_alone_stay_matte(shade: float) -> None:
+    result = fitted(np.zeros((VERTICES, 3)), shade)
+    assert result.gain < 0.02
+    assert not result.strength.any()
+
+
+def test_harmonics_are_orthogonal_to_each_other_and_to_constants() -> None:
+    directions = np.random.default_rng(0).normal(size=(200_000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    values = harmonics(directions, 3)
+    values = values / np.sqrt((values**2).mean(axis=0))
+    products = values.T @ values / len(values)
+    np.testing.assert_allclose(products, np.eye(15), atol=0.02)
+    np.testing.assert_allclose(values.mean(axis=0), 0.0, atol=0.02)
+    assert harmonics(directions[:5], 2).shape == (5, 8)
+
+
+def test_vertices_are_observed_at_their_own_colour() -> None:
+    ball = PaintedBall(4)
+    count = len(ball.mesh.vertices)
+    faces = torch.from_numpy(ball.mesh.faces)
+    surface = Surface(faces, faces, torch.zeros(count, 2), corner_texels(ball.mesh.faces, count))
+    seen = observe_vertices(ball.views, surface, BakeConfig(edge_px=2.0))
+    sure = seen.weight > 0.3
+    assert sure.sum() > 200
+    assert np.abs(seen.colour - paint_of(ball.mesh.vertices[seen.vertex]))[sure].mean() < 0.02
+    np.testing.assert_allclose(np.linalg.norm(seen.mirrored, axis=1), 1.0, atol=1e-4)
+    # the camera lies along +Z of the ball: the mirrored view and the view stand symmetric about the normal
+    towards = seen.mirrored - 2.0 * np.sum(seen.mirrored * seen.normal, axis=1, keepdims=True) * seen.normal
+    assert np.all(-towards[:, 2] > 0.95)
+
+
+def test_smoothing_keeps_constants_and_the_range() -> None:
+    edges = np.array([[0, 1], [1, 2], [2, 3], [0, 3]], dtype=np.int32)
+    np.testing.assert_allclose(smooth_over_edges(np.full((4, 3), 0.3, np.float32), edges, 3), 0.3, rtol=1e-6)
+    peak = smooth_over_edges(np.eye(4, 3, dtype=np.float32), edges, 1)
+    np.testing.assert_allclose(peak[:, 0], [0.5, 0.25, 0.0, 0.25])
