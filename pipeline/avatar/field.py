@@ -39,7 +39,7 @@ class _Decode(torch.autograd.Function):
     @staticmethod
     def backward(ctx, colour_gradient, density_gradient):
         features, hidden, output, activation, colour, density = ctx.saved_tensors
-        raw_gradient = torch.empty_like(features[:, :4])
+        raw_gradient = colour.new_empty(len(colour), 4)
         torch.mul(colour_gradient, colour * (1 - colour), out=raw_gradient[:, :3])
         torch.mul(density_gradient, density, out=raw_gradient[:, 3])
         activation_gradient = (raw_gradient @ output.T).mul_(activation > 0)
