@@ -91,6 +91,13 @@ def is_closed_manifold(mesh: Mesh) -> bool:
     return mesh.is_watertight() and split_fans(mesh) is mesh
 
 
+def self_intersecting_faces(mesh: Mesh) -> int:
+    """Number of faces that cut through another face."""
+    meshes = _meshset(mesh)
+    meshes.compute_selection_by_self_intersections_per_face()
+    return int(meshes.current_mesh().selected_face_number())
+
+
 def repair(mesh: Mesh) -> Mesh:
     """The largest piece of a mesh made watertight and manifold by removing bad faces and closing the holes.
 

@@ -3,11 +3,11 @@
 Nothing is aligned here: both surfaces are compared where they lie, and the caller says which alignment it made before.
 """
 
-import igl
 import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.surface import closest_on_mesh
 
 
 def sample_surface(mesh: Mesh, count: int, seed: int = 0) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
@@ -20,18 +20,6 @@ def sample_surface(mesh: Mesh, count: int, seed: int = 0) -> tuple[Float[np.ndar
     root, v = np.sqrt(generator.random((count, 1))), generator.random((count, 1))
     a, b, c = (mesh.vertices[mesh.faces[faces, corner]].astype(np.float64) for corner in range(3))
     return (1.0 - root) * a + root * (1.0 - v) * b + root * v * c, faces
-
-
-def distances_to_surface(
-    points: Float[np.ndarray, "n 3"], mesh: Mesh
-) -> tuple[Float[np.ndarray, "n"], Int[np.ndarray, "n"]]:
-    """Exact distance (m) of each point to the nearest triangle, and which triangle that is."""
-    squared, faces, _ = igl.point_mesh_squared_distance(
-        np.ascontiguousarray(points, dtype=np.float64),
-        np.ascontiguousarray(mesh.vertices, dtype=np.float64),
-        np.ascontiguousarray(mesh.faces, dtype=np.int64),
-    )
-    return np.sqrt(np.maximum(squared, 0.0)), faces.astype(np.int64)
 
 
 def surface_scores(
@@ -72,6 +60,6 @@ def _one_way(
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """Distances (m) and normal angles (degrees) of points on `source` to their nearest place on `target`."""
     points, source_faces = sample_surface(source, count, seed)
-    distances_m, target_faces = distances_to_surface(points, target)
+    distances_m, target_faces, _ = closest_on_mesh(points, target)
     cosines = np.sum(source.face_normals()[source_faces] * target.face_normals()[target_faces], axis=1)
     return distances_m, np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))

@@ -5,11 +5,11 @@ import pytest
 import trimesh
 
 from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.surface import self_intersecting_faces
 from pipeline.metrics.health import (
     component_count,
     is_manifold,
     mesh_health,
-    self_intersecting_faces,
     smallest_angles_deg,
 )
 

@@ -5,7 +5,8 @@ import pytest
 import trimesh
 
 from pipeline.geometry.mesh import Mesh
-from pipeline.metrics.surfaces import distances_to_surface, joint_error_m, sample_surface, surface_scores
+from pipeline.geometry.surface import closest_on_mesh
+from pipeline.metrics.surfaces import joint_error_m, sample_surface, surface_scores
 
 
 def sphere(radius_m: float) -> Mesh:
@@ -45,7 +46,7 @@ def test_missing_half_shows_in_recall_only():
 def test_distances_are_those_of_a_brute_force_search(rng):
     mesh = Mesh(rng.normal(size=(12, 3)), rng.permutation(12)[:12].reshape(4, 3).astype(np.int32))
     points = rng.normal(size=(20, 3))
-    distances_m, faces = distances_to_surface(points, mesh)
+    distances_m, faces, _ = closest_on_mesh(points, mesh)
     steps = np.linspace(0, 1, 201)
     u, v = np.meshgrid(steps, steps)
     inside = u + v <= 1 + 1e-12
