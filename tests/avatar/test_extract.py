@@ -102,12 +102,15 @@ def test_samples_hold_density_only_within_reach(body: Body) -> None:
     assert solid(samples, 3.0, CONFIG).max() <= 1.0
 
 
-def test_distance_grid_equals_the_capsule(body: Body) -> None:
+def test_distance_is_exact_at_the_hand_and_interpolated_elsewhere(body: Body) -> None:
     samples = sample_canonical(shell, body, CONFIG)
     index = np.stack(np.meshgrid(*map(np.arange, samples.density.shape), indexing="ij"), axis=-1)
     truth = capsule_distance(index * samples.spacing_m + samples.origin_m) - RADIUS_M
-    near = np.abs(truth) < 0.04
-    np.testing.assert_allclose(samples.body_distance_m[near], truth[near], atol=0.006)
+    hand = (np.abs(truth) < 0.04) & (samples.hand_share > 0)
+    assert hand.sum() > 1000
+    np.testing.assert_allclose(samples.body_distance_m[hand], truth[hand], atol=0.006)
+    beyond = (truth > 0.05) & (truth < 0.12)
+    np.testing.assert_allclose(samples.body_distance_m[beyond], truth[beyond], atol=0.03)
 
 
 def test_the_level_that_scores_best_is_chosen(body: Body) -> None:
