@@ -70,8 +70,8 @@ doctor:  ## what this machine lacks, and the command that mends it
 venv: $(STAMP)  ## install the pinned dependencies into .venv (EXTRA=cuda for a graphics card)
 
 $(STAMP): requirements.lock pyproject.toml
-	@test -x $(RUN_PYTHON) || $(PYTHON) -m venv $(VENV) || \
-		{ echo "error: $(PYTHON) cannot make a virtual environment: run make doctor"; rm -rf $(VENV); exit 2; }
+	@$(PYTHON) -m pipeline.core.doctor
+	@test -x $(RUN_PYTHON) || $(PYTHON) -m venv $(VENV)
 	$(RUN_PYTHON) -m pipeline.core.install requirements.lock $(EXTRA)
 	@touch $@
 
@@ -80,7 +80,8 @@ $(STAMP): requirements.lock pyproject.toml
 lock:  ## resolve pyproject.toml anew into requirements.lock
 	$(PYTHON) -m venv --clear build/lock
 	build/lock/bin/python -m pip install --quiet $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) torch==$(TORCH_VERSION) ".[dev]"
-	build/lock/bin/python -m pip freeze --exclude avatar-from-video | sed 's/+cpu$$//' > build/requirements.lock
+	echo "# Written by make lock: the full resolution of pyproject.toml with its dev extra." > build/requirements.lock
+	build/lock/bin/python -m pip freeze --exclude avatar-from-video | sed 's/+cpu$$//' >> build/requirements.lock
 	mv build/requirements.lock requirements.lock
 
 configs: $(STAMP)  ## write configs/default.yaml from the defaults in code

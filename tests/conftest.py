@@ -1,17 +1,20 @@
 """What all tests share: checked array shapes, the data folder, the graphics card."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from jaxtyping import install_import_hook
 
+from pipeline.core.measure import REPOSITORY
+from tests.core.toy_pipeline import Toy
+
 # Before any of these is imported: from here on every annotated shape and dtype in them is checked at each call.
 # The numba kernels are left out, because numba compiles the plain functions.
 CHECKED_PACKAGES = ["pipeline.geometry", "pipeline.avatar", "pipeline.metrics", "pipeline.io"]
 install_import_hook(CHECKED_PACKAGES, "beartype.beartype")
-
-REPOSITORY = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(scope="session")
@@ -37,3 +40,24 @@ def cuda() -> str:
 def repository() -> Path:
     """The root of the checkout."""
     return REPOSITORY
+
+
+@pytest.fixture
+def toy(tmp_path: Path) -> Toy:
+    """A three-stage pipeline on numbers with the real runner, in a folder of its own."""
+    return Toy(tmp_path / "toy")
+
+
+@pytest.fixture(scope="session")
+def smoke_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The whole pipeline, by its commands, on a small generated capture with the smoke preset: the finished run folder.
+
+    Beside it lies `capture/`, with the video and its truth.
+    """
+    folder = tmp_path_factory.mktemp("smoke")
+    size = ["--frames", "24", "--size", "192"]
+    make_sample = [sys.executable, "-m", "data_tools.sample", str(folder / "capture"), *size]
+    subprocess.run(make_sample, cwd=REPOSITORY, check=True)
+    run_all = [sys.executable, "-m", "stages", "--run", str(folder / "run"), "--preset", "smoke"]
+    subprocess.run([*run_all, "--video", str(folder / "capture" / "video")], cwd=REPOSITORY, check=True)
+    return folder / "run"

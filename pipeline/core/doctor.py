@@ -13,7 +13,7 @@ from pathlib import Path
 
 PYTHON = (3, 11)
 FREE_DISK_GIB = 6.0
-MEMORY_GIB = 4.0
+MEMORY_GIB = 3.0
 GIB = 1024.0**3
 
 # What the wheels load from the system and a bare Debian 12 may lack, beside glibc: the shared library, then its Debian

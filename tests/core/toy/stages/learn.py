@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import time
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -22,7 +23,7 @@ class LearnConfig(Config):
 
 
 def run(inputs: Mapping[str, Path], out: Path, config: LearnConfig) -> Mapping[str, float]:
-    """Write state.json and, per step, a file in trail/; die at the step named by TOY_KILL_STEP if it is set."""
+    """Write trail/state.json. TOY_KILL_STEP: the step to be killed at. TOY_SLEEP_S: how long the first step takes."""
     checkpoint = out / "checkpoint.json"
     step, state = json.loads(checkpoint.read_text()) if checkpoint.exists() else (0, 1)
     first = step
@@ -33,6 +34,8 @@ def run(inputs: Mapping[str, Path], out: Path, config: LearnConfig) -> Mapping[s
         with atomic_path(checkpoint) as path:
             path.write_text(json.dumps([step, state]))
         (out / f"stray-{step}.txt").write_text("what a kill leaves behind")
+        if step == 1:
+            time.sleep(float(os.environ.get("TOY_SLEEP_S", "0")))
         if step == int(os.environ.get("TOY_KILL_STEP", "-1")):
             os.kill(os.getpid(), signal.SIGKILL)
         (out / f"stray-{step}.txt").unlink()

@@ -1,0 +1,33 @@
+"""A file is whole or absent."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.core.atomic import atomic_path
+
+
+def test_the_file_appears_at_the_end(tmp_path: Path) -> None:
+    target = tmp_path / "state.json"
+    with atomic_path(target) as path:
+        path.write_text("new")
+        assert not target.exists()
+    assert target.read_text() == "new"
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_a_failure_leaves_the_old_file(tmp_path: Path) -> None:
+    target = tmp_path / "state.json"
+    target.write_text("old")
+    with pytest.raises(ZeroDivisionError), atomic_path(target) as path:
+        path.write_text("half")
+        raise ZeroDivisionError
+    assert target.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_the_suffix_is_kept_for_writers_that_look_at_it(tmp_path: Path) -> None:
+    with atomic_path(tmp_path / "checkpoint.npz") as path:
+        np.savez(path, step=3)
+    assert np.load(tmp_path / "checkpoint.npz")["step"] == 3

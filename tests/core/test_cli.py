@@ -1,0 +1,178 @@
+"""The commands of the toy pipeline: what is cached, what runs, what is remembered, and how mistakes are answered."""
+
+import json
+import os
+import signal
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from pipeline.core.cli import default_run_dir
+from pipeline.core.errors import UserError
+from tests.core.toy_pipeline import Toy
+
+
+def states(table: str) -> list[str]:
+    """The middle column of the summary or status table."""
+    return [line.split()[1] for line in table.splitlines() if line.split()[0] in ("read", "learn", "tell")]
+
+
+def test_all_stages_run_and_then_are_cached(toy: Toy) -> None:
+    first = toy.all("--video", "numbers.txt")
+    assert first.returncode == 0, first.stderr
+    assert states(first.stdout) == ["run"] * 3
+    assert {"stage", "state", "seconds", "peak", "total"} <= set(first.stdout.split())
+    assert (toy.run_dir / "tell" / "story.txt").read_text().startswith("3 numbers, state ")
+    assert states(toy.all().stdout) == ["cached"] * 3
+    assert states(toy.all("--status").stdout) == ["fresh"] * 3
+
+
+def test_the_video_is_never_written(toy: Toy) -> None:
+    before = toy.video.stat()
+    toy.all("--video", "numbers.txt")
+    after = toy.video.stat()
+    assert (before.st_mtime_ns, before.st_ino, before.st_size) == (after.st_mtime_ns, after.st_ino, after.st_size)
+
+
+def test_a_change_reruns_what_reads_it(toy: Toy) -> None:
+    toy.all("--video", "numbers.txt")
+    assert states(toy.all("--set", "tell.word=value").stdout) == ["cached", "cached", "run"]
+    assert states(toy.all("--set", "learn.steps=21").stdout) == ["cached", "run", "run"]
+
+
+def test_equal_outputs_keep_what_follows_cached(toy: Toy) -> None:
+    toy.all("--video", "numbers.txt")
+    toy.video.write_text("1 2 0\n")
+    assert states(toy.all().stdout) == ["run", "cached", "cached"]
+
+
+def test_from_and_force_run_again(toy: Toy) -> None:
+    toy.all("--video", "numbers.txt")
+    assert states(toy.all("--from", "learn").stdout) == ["cached", "run", "run"]
+    assert states(toy.all("--force").stdout) == ["run"] * 3
+
+
+def test_one_stage_knows_what_the_run_remembers(toy: Toy) -> None:
+    toy.all("--video", "numbers.txt", "--preset", "quick", "--set", "tell.word=value")
+    record = json.loads((toy.run_dir / "run.json").read_text())
+    assert record == {"video": str(toy.video), "preset": "quick", "overrides": {"tell.word": "value"}}
+    for name in ("read", "learn", "tell"):
+        assert toy.call(f"stages.{name}", "runs/a").stdout == f"runs/a/{name}: cached\n"
+    assert toy.call("stages.learn", "runs/a", "--set", "learn.steps=7").stdout == "runs/a/learn: done\n"
+    assert states(toy.all("--status").stdout) == ["fresh", "fresh", "stale"]
+    toy.all("--preset", "default")
+    assert json.loads((toy.run_dir / "run.json").read_text())["overrides"] == {}
+
+
+def test_stages_run_one_by_one_make_the_same(toy: Toy) -> None:
+    toy.all("--video", "numbers.txt")
+    toy.call("stages.read", "runs/b", "--video", "numbers.txt")
+    toy.call("stages.learn", "runs/b")
+    toy.call("stages.tell", "runs/b")
+    stories = [(toy.folder / "runs" / name / "tell" / "story.txt").read_bytes() for name in "ab"]
+    assert stories[0] == stories[1]
+
+
+def test_verify_finds_a_changed_file(toy: Toy) -> None:
+    toy.all("--video", "numbers.txt")
+    assert toy.all("--verify").stdout.count("whole") == 3
+    (toy.run_dir / "learn" / "trail" / "state.json").write_text("{}")
+    sentence = toy.refusal("stages", "--run", "runs/a", "--verify")
+    assert "trail/state.json" in sentence
+    assert sentence.endswith("python -m stages --run runs/a --from learn")
+    assert toy.all("--from", "learn").returncode == 0
+    assert toy.all("--verify").returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--set", "learn.steps=0"), ("learn.steps = 0", "at least 1")),
+        (("--set", "learn.stepz=3"), ("did you mean steps?", "known keys of learn: steps")),
+        (("--set", "lern.steps=3"), ("did you mean learn?", "read, learn, tell")),
+        (("--set", "steps=3"), ("--set section.key=value",)),
+        (("--preset", "quik"), ("default, quick",)),
+        (("--from", "lern"), ("lern", "'learn'")),
+        (("--bla",), ("--bla", "--help")),
+        (("--vid", "numbers.txt"), ("--vid", "--help")),
+        (("--video", "none.txt"), ("none.txt does not exist",)),
+        (("--video", "."), ("inside the video folder",)),
+        ((), ("has no video yet", "--video")),
+    ],
+)
+def test_a_mistake_is_one_sentence_and_leaves_nothing(toy: Toy, arguments: Sequence[str], words: Sequence[str]) -> None:
+    sentence = toy.refusal("stages", "--run", "runs/a", *arguments)
+    assert all(word in sentence for word in words), sentence
+    assert not toy.run_dir.exists()
+
+
+def test_a_stage_refuses_options_of_others(toy: Toy) -> None:
+    assert "learn.key=value" in toy.refusal("stages.learn", "runs/a", "--set", "tell.word=x")
+    assert "python -m stages.read runs/a" in toy.refusal("stages.learn", "runs/a")
+    assert "see python -m stages.learn --help" in toy.refusal("stages.learn")
+
+
+def test_bad_input_leaves_no_folder(toy: Toy) -> None:
+    toy.video.write_text("1 two 3")
+    assert "holds two" in toy.refusal("stages", "--run", "runs/a", "--video", "numbers.txt")
+    assert not toy.run_dir.exists()
+    assert "holds two" in toy.refusal("stages.read", "runs/a", "--video", "numbers.txt")
+    assert not toy.run_dir.exists()
+
+
+def test_bad_input_leaves_earlier_results(toy: Toy) -> None:
+    toy.all("--video", "numbers.txt")
+    toy.video.write_text("1 two 3")
+    toy.refusal("stages", "--run", "runs/a")
+    assert {path.name for path in toy.run_dir.iterdir()} == {"read", "learn", "tell", "run.json", ".lock"}
+
+
+def test_another_video_needs_force(toy: Toy) -> None:
+    toy.all("--video", "numbers.txt")
+    copy, other = toy.folder / "copy.txt", toy.folder / "other.txt"
+    copy.write_bytes(toy.video.read_bytes())
+    other.write_text("4 5 6")
+    assert states(toy.all("--video", "copy.txt").stdout) == ["cached"] * 3
+    assert "--force" in toy.refusal("stages", "--run", "runs/a", "--video", "other.txt")
+    assert states(toy.all("--video", "other.txt", "--force").stdout) == ["run"] * 3
+
+
+def test_the_run_is_named_after_the_video(tmp_path: Path) -> None:
+    (tmp_path / "ann").mkdir()
+    (tmp_path / "ann" / "video.mp4").touch()
+    (tmp_path / "ann" / "walk.mp4").touch()
+    named = [default_run_dir(tmp_path / "ann" / name) for name in ("video.mp4", "walk.mp4", "")]
+    assert named == [Path("runs/ann"), Path("runs/walk"), Path("runs/ann")]
+    with pytest.raises(UserError, match="--run"):
+        default_run_dir(None)
+
+
+def test_ctrl_c_is_answered_in_one_line(toy: Toy) -> None:
+    process = toy.start("stages", "--run", "runs/a", "--video", "numbers.txt", TOY_SLEEP_S="30")
+    wait_for(toy.run_dir / "learn.part" / "checkpoint.json")
+    os.killpg(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert err.splitlines()[-1] == "interrupted: the same command goes on from here"
+    assert "Traceback" not in err
+    assert states(toy.all().stdout) == ["cached", "run", "run"]
+
+
+def test_the_defaults_print_as_yaml(toy: Toy) -> None:
+    text = toy.call("stages", "--defaults").stdout
+    assert "learn:\n  # steps of the chain\n  steps: 20\n" in text
+
+
+def test_a_stage_module_is_not_imported_twice(toy: Toy) -> None:
+    done = toy.call("stages.read", "runs/a", "--video", "numbers.txt")
+    assert "RuntimeWarning" not in done.stderr
+
+
+def wait_for(path: Path, patience_s: float = 30.0) -> None:
+    """Wait until a file is there."""
+    deadline = time.monotonic() + patience_s
+    while not path.exists():
+        assert time.monotonic() < deadline, f"{path} did not appear"
+        time.sleep(0.02)
