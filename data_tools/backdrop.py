@@ -45,7 +45,7 @@ def make_room(camera: Camera, ground_m: Float[np.ndarray, "3"], busy: bool, nois
 
     busy: with a door, a picture, a sofa and a pot on the wall's side; otherwise a bare wall.
     """
-    fine = camera.scaled(_SAMPLES)
+    fine = camera.scaled(float(_SAMPLES))
     colours = _room_colours(*_hits(fine, ground_m), ground_m, busy, noise)
     shape = (camera.height, _SAMPLES, camera.width, _SAMPLES, 3)
     return Room(colours.reshape(shape).mean(axis=(1, 3)).astype(np.float32), floor_points(camera, ground_m))

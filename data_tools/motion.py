@@ -69,7 +69,7 @@ def turn_in_a_pose(body: Body, frame_count: int, fps: float, ground_m: Float[np.
     random = np.random.default_rng([seed, 2])
     axis_angles = np.zeros((frame_count, len(body.joint_names), 3))
     for name, (reach, period) in _SWAY.items():
-        axis_angles[:, body.joint(name)] = _wandering(time_s, period, random) * reach
+        _add(axis_angles, body, name, _wandering(time_s, period, random) * reach)
     _breathe(axis_angles, body, time_s)
     _shift_weight(axis_angles, body, time_s)
     turned = np.arange(frame_count) / frame_count
@@ -83,7 +83,7 @@ def novel_motion(body: Body, ground_m: Float[np.ndarray, "3"], count: int) -> Mo
     poses = list(NOVEL_POSES.values())
     for frame in range(count):
         for name, angles in poses[frame % len(poses)].items():
-            axis_angles[frame, body.joint(name)] = angles
+            _add(axis_angles[frame : frame + 1], body, name, np.array(angles))
     heading = np.resize([0.35, -0.70, 0.90, -0.20], count) + 2.1 * (np.arange(count) // len(poses))
     return _planted(body, axis_angles, heading, ground_m, np.arange(count, dtype=float))
 
@@ -109,24 +109,28 @@ def _wandering(time_s: np.ndarray, period_s: float, random: np.random.Generator)
     return 0.65 * slow + 0.35 * np.sin(2.0 * np.pi * time_s[:, None] / (0.71 * period_s) + phase[1])
 
 
+def _add(axis_angles: Float[np.ndarray, "n j 3"], body: Body, name: str, angles: np.ndarray) -> None:
+    """Turn a joint further, in place; rigs may lack one (a second spine joint, a collar bone)."""
+    if name in body.joint_names:
+        axis_angles[:, body.joint(name)] += angles
+
+
 def _breathe(axis_angles: np.ndarray, body: Body, time_s: np.ndarray) -> None:
     """The chest rises a little and the shoulders follow."""
     breath = np.sin(2.0 * np.pi * time_s / BREATH_PERIOD_S)
-    axis_angles[:, body.joint("Spine2"), 0] -= 0.014 * breath
-    axis_angles[:, body.joint("LeftShoulder"), 2] += 0.016 * breath
-    axis_angles[:, body.joint("RightShoulder"), 2] -= 0.016 * breath
+    for name, reach in (("Spine2", (-0.014, 0, 0)), ("LeftShoulder", (0, 0, 0.016)), ("RightShoulder", (0, 0, -0.016))):
+        _add(axis_angles, body, name, breath[:, None] * reach)
 
 
 def _shift_weight(axis_angles: np.ndarray, body: Body, time_s: np.ndarray) -> None:
     """The hips tip from side to side; legs and spine counter it, so that feet stay flat and the head level."""
     tip = 0.022 * np.sin(2.0 * np.pi * time_s / 2.1)
-    axis_angles[:, body.joint("Hips"), 2] += tip
-    for name in ("LeftUpLeg", "RightUpLeg", "Spine"):
-        axis_angles[:, body.joint(name), 2] -= tip
+    for name, sign in (("Hips", 1.0), ("LeftUpLeg", -1.0), ("RightUpLeg", -1.0), ("Spine", -1.0)):
+        _add(axis_angles, body, name, tip[:, None] * (0.0, 0.0, sign))
     step = np.maximum(np.sin(2.0 * np.pi * time_s / 1.05), 0.0), np.maximum(-np.sin(2.0 * np.pi * time_s / 1.05), 0.0)
     for side, lift in zip(("Left", "Right"), step, strict=True):
         for part, angle in (("UpLeg", -0.07), ("Leg", 0.13), ("Foot", -0.06)):
-            axis_angles[:, body.joint(side + part), 0] += angle * lift
+            _add(axis_angles, body, side + part, lift[:, None] * (angle, 0.0, 0.0))
 
 
 def _planted(

@@ -55,10 +55,11 @@ def check_options(options: argparse.Namespace) -> None:
         ("samples", 1, 8),
         ("novel_views", 0, 1000),
         ("novel_poses", 0, 1000),
+        ("texture", 64, 8192),
         ("seed", 0, 2**31 - 1),
     )
     for name, low, high in bounds:
-        value = getattr(options, name)
+        value = getattr(options, name, low)
         if not low <= value <= high:
             raise UserError(f"--{name.replace('_', '-')} {value} is outside {low} to {high}; choose a value within")
     if options.size % 2:

@@ -56,7 +56,7 @@ def render_subject(
     if window is None:
         return image
     left, top, width, height = window
-    fine = camera.cropped(left, top, width, height).scaled(samples)
+    fine = camera.cropped(left, top, width, height).scaled(float(samples))
     shaded = _shade_window(subject, vertices_world, fine, light)
     mean = shaded.reshape(height, samples, width, samples, 4).mean(axis=(1, 3))
     image[top : top + height, left : left + width] = mean

@@ -18,10 +18,11 @@ def main(argv: Sequence[str]) -> None:
     """Make one capture."""
     parser = capture_parser("sample", (__doc__ or "").splitlines()[0])
     parser.add_argument("out", type=Path, help="folder to make: OUT/video for the pipeline, OUT/truth beside it")
+    parser.add_argument("--texture", type=int, default=2048, help="side of the true texture in pixels")
     options = parser.parse_args(argv)
     check_options(options)
     refuse_existing(options.out)
-    subject, bare = make_person(options.seed)
+    subject, bare = make_person(options.seed, options.texture)
     scene = stage_scene(options, subject.body)
     motion = turn_in_a_pose(subject.body, options.frames, options.fps, scene[1], options.seed)
     capture, heldout = assemble(options, subject, motion, scene)

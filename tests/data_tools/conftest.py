@@ -1,0 +1,38 @@
+"""One small synthetic person and one small capture for all tests of this folder."""
+
+from pathlib import Path
+
+import pytest
+from jaxtyping import install_import_hook
+
+install_import_hook(["data_tools"], "beartype.beartype")
+
+from data_tools.sample import main as make_sample  # noqa: E402 (after the hook, so that shapes are checked)
+from data_tools.subject import Subject, load_subject  # noqa: E402
+from pipeline.avatar.body import Body  # noqa: E402
+from pipeline.io.npz import load_body  # noqa: E402
+
+SAMPLE_OPTIONS = [
+    *("--frames", "6", "--fps", "6", "--size", "200", "--texture", "512"),
+    *("--novel-views", "2", "--novel-poses", "2"),
+]
+
+
+@pytest.fixture(scope="session")
+def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a capture of the built-in person, 6 frames of 200 x 200."""
+    out = tmp_path_factory.mktemp("captures") / "sample"
+    make_sample([str(out), *SAMPLE_OPTIONS])
+    return out
+
+
+@pytest.fixture(scope="session")
+def subject(sample: Path) -> Subject:
+    """The built-in person of seed 0, clothed."""
+    return load_subject(sample / "truth")
+
+
+@pytest.fixture(scope="session")
+def bare(sample: Path) -> Body:
+    """The body beneath the clothes."""
+    return load_body(sample / "truth" / "bare.npz")
