@@ -54,6 +54,7 @@ class PersonDetector:
             self._pose = mediapipe.solutions.pose.Pose(
                 static_image_mode=True, model_complexity=1, enable_segmentation=True, min_detection_confidence=0.5
             )
+            self._pose.process(np.zeros((64, 64, 3), dtype=np.uint8))
         self._has_spoken = False
 
     def detect(self, rgb: UInt8[np.ndarray, "h w 3"]) -> Detection | None:

@@ -4,6 +4,7 @@ The letters used here: I colour of a pixel, F and B the colours of person and ba
 the pixel that the person covers, so that I = alpha F + (1 - alpha) B. Alphas are float32 in [0, 1].
 """
 
+from functools import reduce
 from typing import NamedTuple
 
 import cv2
@@ -20,13 +21,17 @@ _COLOUR_NOISE = 4.0 / 255.0
 # How much the detector's word weighs, in the unit of a squared Mahalanobis distance: at its outline, and far from it.
 _PRIOR_AT_EDGE, _PRIOR_CERTAIN = 0.3, 10.0
 _PRIOR_RAMP = 0.2
+# A cloud counts from this mean weight on: one certain pixel in a window of 13 x 13.
+_LEAST_WEIGHT = 1.0 / 169.0
+# A backdrop is painted when this share of the pixels away from the person is within two levels of one colour.
+_PAINTED_SHARE, _PAINTED_LEVELS = 0.95, 2
 _RIM_PX = 2
 # Parts smaller than this share of the person are specks, holes smaller than this share are noise.
 _SPECK_SHARE, _HOLE_SHARE = 0.05, 2e-4
 
 
 class _Cloud(NamedTuple):
-    """Colours around each pixel: total weight, mean and covariance (xx, xy, xz, yy, yz, zz)."""
+    """Colours around each grid point: mean weight, mean and covariance (xx, xy, xz, yy, yz, zz)."""
 
     weight: Float[np.ndarray, "h w"]
     mean: Float[np.ndarray, "h w 3"]
@@ -71,6 +76,31 @@ def clean_alpha(alpha: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     return np.where(inner, 1.0, np.where(outer, soft, 0.0)).astype(np.float32)
 
 
+def with_painted_backdrop(rgb: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
+    """The mask with what it misses of a person in front of one painted colour (a recording that is matted already).
+
+    Only when nearly all pixels away from the person have that colour exactly, as no camera sees it; then whatever has
+    another colour, hangs together with the person and reaches more than the detector's error beyond the mask is added.
+    """
+    body = mask > 127
+    if not body.any():
+        return mask
+    cell_px = _cell_px(body)
+    near = cv2.dilate(body.astype(np.uint8), _disc(round(_BAND_CELLS * cell_px))) > 0
+    away = rgb[cv2.dilate(near.astype(np.uint8), _disc(round(_BAND_CELLS * cell_px))) == 0]
+    if len(away) == 0:
+        return mask
+    backdrop = np.median(away, axis=0)
+    painted = (np.abs(rgb.astype(np.int16) - backdrop.astype(np.int16)) <= _PAINTED_LEVELS).all(axis=-1)
+    if painted[~near].mean() < _PAINTED_SHARE:
+        return mask
+    support = cv2.morphologyEx((~painted).astype(np.uint8), cv2.MORPH_OPEN, _disc(2)) > 0
+    _, labels = cv2.connectedComponents((support | body).astype(np.uint8), connectivity=8)
+    attached = support & np.isin(labels, np.unique(labels[body]))
+    beyond = cv2.dilate((attached & ~near).astype(np.uint8), _disc(round(2 * _BAND_CELLS * cell_px))) > 0
+    return np.where(attached & beyond, np.uint8(255), mask)
+
+
 def steady_mask(
     images: UInt8[np.ndarray, "t h w 3"], masks: UInt8[np.ndarray, "t h w"], centre: int, noise: float
 ) -> UInt8[np.ndarray, "h w"]:
@@ -79,16 +109,16 @@ def steady_mask(
     A mask that changes where the image does not is flicker. The weight of another time falls with the squared change of
     the (slightly blurred) colour in units of `noise` (levels of 255), so that moving limbs are left alone.
     """
-    blurred = [cv2.blur(image, (5, 5)).astype(np.float32) for image in images]
+    blurred = [cv2.blur(image, (5, 5)) for image in images]
+    falloff = np.exp(-((np.arange(256) / (3.0 * noise)) ** 2)).astype(np.float32)
     total = masks[centre].astype(np.float32)
     weights = np.ones_like(total)
     for time in range(len(images)):
-        if time == centre:
-            continue
-        change = np.abs(blurred[time] - blurred[centre]).max(axis=-1) / (3.0 * noise)
-        weight = np.exp(-(change**2)).astype(np.float32)
-        total += weight * masks[time]
-        weights += weight
+        if time != centre:
+            change = reduce(cv2.max, cv2.split(cv2.absdiff(blurred[time], blurred[centre])))
+            weight = cv2.LUT(change, falloff)
+            total += weight * masks[time]
+            weights += weight
     return np.rint(total / weights).astype(np.uint8)
 
 
@@ -118,65 +148,70 @@ def _recolour(
     guess: Float[np.ndarray, "h w"],
     cell_px: float,
 ) -> Float[np.ndarray, "h w"]:
-    """One round of `sharpen_mask`: new alpha from the clouds that the old alpha separates, and the detector's guess."""
-    radius_px = max(2, round(_COLOUR_CELLS * cell_px))
-    person = _gather(image, np.clip(2.0 * alpha - 1.0, 0.0, 1.0) ** 2, radius_px)
-    background = _gather(image, np.clip(1.0 - 2.0 * alpha, 0.0, 1.0) ** 2, 2 * radius_px)
-    position, distance = _discriminate(image, person, background)
-    distance = np.where((person.weight > 1.0) & (background.weight > 1.0), distance, 0.0)
+    """One round of `sharpen_mask`: new alpha from the clouds that the old alpha separates, and the detector's guess.
+
+    The clouds are smooth, so they and the discriminant are found on a grid as coarse as the detector's, then enlarged.
+    """
+    height, width = alpha.shape
+    small = (max(1, round(width / cell_px)), max(1, round(height / cell_px)))
+    radius = round(_COLOUR_CELLS)
+    person = _gather(image, np.clip(2.0 * alpha - 1.0, 0.0, 1.0) ** 2, small, radius)
+    background = _gather(image, np.clip(1.0 - 2.0 * alpha, 0.0, 1.0) ** 2, small, 2 * radius)
+    direction, offset, certainty = (
+        cv2.resize(field, (width, height), interpolation=cv2.INTER_LINEAR)
+        for field in _discriminant(person, background)
+    )
+    position = cv2.transform(image * direction, np.ones((1, 3), dtype=np.float32)) - offset
     prior = np.clip((guess - 0.5) / (2.0 * _PRIOR_RAMP) + 0.5, 0.0, 1.0)
     prior_weight = _PRIOR_AT_EDGE + _PRIOR_CERTAIN * (2.0 * guess - 1.0) ** 2
-    return np.clip((distance * position + prior_weight * prior) / (distance + prior_weight), 0.0, 1.0)
+    total = certainty * np.clip(position, -0.2, 1.2) + prior_weight * prior
+    return np.clip(total / (certainty + prior_weight), 0.0, 1.0)
 
 
-def _gather(image: Float[np.ndarray, "h w 3"], weight: Float[np.ndarray, "h w"], radius_px: int) -> _Cloud:
-    """Weighted mean and covariance of the colours in the square window around each pixel."""
-    size = (2 * radius_px + 1, 2 * radius_px + 1)
+def _gather(
+    image: Float[np.ndarray, "h w 3"], weight: Float[np.ndarray, "h w"], small: tuple[int, int], radius: int
+) -> _Cloud:
+    """Weighted mean and covariance of the colours in a square window around each point of a coarse grid.
+
+    small: the grid's columns and rows; radius: half of the window, in grid points. Colours are averaged over
+    the grid's cells before they are multiplied: texture finer than a cell does not count as spread.
+    """
+    weight = weight.astype(np.float32)
+    share = cv2.resize(weight, small, interpolation=cv2.INTER_AREA)
+    weighted = cv2.resize(image * weight[..., None], small, interpolation=cv2.INTER_AREA)
+    colour = weighted / (share[..., None] + 1e-6)
 
     def windowed(values: np.ndarray) -> np.ndarray:
-        return cv2.boxFilter(values, cv2.CV_32F, size, normalize=False)
+        return cv2.blur(values, (2 * radius + 1, 2 * radius + 1), borderType=cv2.BORDER_CONSTANT)
 
-    x, y, z = cv2.split(image)
-    total = windowed(weight)
-    scale = 1.0 / (total + 1e-6)
-    mean = [windowed(channel * weight) * scale for channel in (x, y, z)]
-    pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-    channels = (x, y, z)
-    covariance = [windowed(channels[a] * channels[b] * weight) * scale - mean[a] * mean[b] for a, b in pairs]
-    return _Cloud(total, np.stack(mean, axis=-1), np.stack(covariance, axis=-1))
+    first, second = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
+    total = windowed(share)
+    scale = (1.0 / (total + 1e-6))[..., None]
+    mean = windowed(weighted) * scale
+    products = weighted[..., first] * colour[..., second]
+    square = np.concatenate([windowed(products[..., :3].copy()), windowed(products[..., 3:].copy())], axis=2) * scale
+    return _Cloud(total, mean, square - mean[..., first] * mean[..., second])
 
 
-def _discriminate(
-    image: Float[np.ndarray, "h w 3"], person: _Cloud, background: _Cloud
-) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
-    """Position of each colour on Fisher's discriminant (0 at B, 1 at F, cut off at -0.2 and 1.2), and its certainty.
+def _discriminant(
+    person: _Cloud, background: _Cloud
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
+    """Fisher's linear discriminant of two colour clouds, for each grid point: direction, offset, certainty.
 
-    With S the sum of both covariances and d = F - B: w = S^-1 d, position = w.(I - B) / w.d, certainty = w.d, the
-    squared Mahalanobis distance of the clouds. S^-1 is written out as adjugate over determinant, for every pixel.
+    direction . I - offset is 0 for I = B and 1 for I = F. With S the sum of both covariances and d = F - B:
+    w = S^-1 d, direction = w / w.d, offset = direction . B, certainty = w.d, the squared Mahalanobis distance of the
+    clouds (0 where one of them is empty).
     """
-    xx, xy, xz, yy, yz, zz = cv2.split((person.covariance + background.covariance).reshape(-1, 1, 6))
-    floor = np.float32(_COLOUR_NOISE**2)
-    xx, yy, zz = xx + floor, yy + floor, zz + floor
-    d = (person.mean - background.mean).reshape(-1, 3)
-    dx, dy, dz = (d[:, i : i + 1] for i in range(3))
-    adjugate = (
-        yy * zz - yz * yz,
-        xz * yz - xy * zz,
-        xy * yz - xz * yy,
-        xx * zz - xz * xz,
-        xy * xz - xx * yz,
-        xx * yy - xy * xy,
-    )
-    axx, axy, axz, ayy, ayz, azz = adjugate
-    determinant = np.maximum(xx * axx + xy * axy + xz * axz, floor**3)
-    w = np.concatenate(
-        [axx * dx + axy * dy + axz * dz, axy * dx + ayy * dy + ayz * dz, axz * dx + ayz * dy + azz * dz], axis=1
-    )
-    w /= determinant
-    distance = (w * d).sum(axis=1)
-    position = (w * (image - background.mean).reshape(-1, 3)).sum(axis=1) / np.maximum(distance, 1e-6)
-    shape = image.shape[:2]
-    return np.clip(position, -0.2, 1.2).reshape(shape), distance.reshape(shape)
+    pooled = person.covariance + background.covariance
+    spread = pooled[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(*pooled.shape[:2], 3, 3).astype(np.float64)
+    spread += np.eye(3) * _COLOUR_NOISE**2
+    difference = (person.mean - background.mean).astype(np.float64)
+    w = np.linalg.solve(spread, difference[..., None])[..., 0]
+    certainty = (w * difference).sum(axis=-1)
+    direction = w / np.maximum(certainty, 1e-6)[..., None]
+    offset = (direction * background.mean).sum(axis=-1)
+    certainty = np.where(np.minimum(person.weight, background.weight) > _LEAST_WEIGHT, certainty, 0.0)
+    return direction.astype(np.float32), offset.astype(np.float32), certainty.astype(np.float32)
 
 
 def _largest_parts(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

@@ -44,25 +44,25 @@ class Capture:
     def __len__(self) -> int:
         return len(self.frame_index)
 
-    def positions(self, split: int) -> Int[np.ndarray, "k"]:
+    def positions(self, split: int | np.integer) -> Int[np.ndarray, "k"]:
         """Positions (0..n-1) of the frames of one split."""
         return np.flatnonzero(self.split == split)
 
-    def image(self, position: int) -> Float[np.ndarray, "h w 3"]:
+    def image(self, position: int | np.integer) -> Float[np.ndarray, "h w 3"]:
         """Colours of the frame at this position (not its index in the recording), sRGB in [0, 1]."""
-        return to_float(read_rgb(image_path(self.folder, int(self.frame_index[position]))))
+        return to_float(read_rgb(image_path(self.folder, self.frame_index[position])))
 
-    def mask(self, position: int) -> Float[np.ndarray, "h w"]:
+    def mask(self, position: int | np.integer) -> Float[np.ndarray, "h w"]:
         """Alpha of the person in [0, 1], soft along the outline."""
-        return to_float(read_gray(mask_path(self.folder, int(self.frame_index[position]))))
+        return to_float(read_gray(mask_path(self.folder, self.frame_index[position])))
 
 
-def image_path(folder: Path, frame_index: int) -> Path:
+def image_path(folder: Path, frame_index: int | np.integer) -> Path:
     """Where the picture with this index in the recording lies."""
     return folder / IMAGES_FOLDER / f"{frame_index:06d}.png"
 
 
-def mask_path(folder: Path, frame_index: int) -> Path:
+def mask_path(folder: Path, frame_index: int | np.integer) -> Path:
     """Where its mask lies."""
     return folder / MASKS_FOLDER / f"{frame_index:06d}.png"
 
@@ -104,21 +104,22 @@ def load_capture(frames_dir: Path) -> Capture:
         frame_index=arrays["frame_index"],
         time_s=arrays["time_s"],
         split=arrays["split"],
-        fps=float(arrays["fps"]),
-        width=int(arrays["width"]),
-        height=int(arrays["height"]),
+        fps=float(arrays["fps"].item()),
+        width=int(arrays["width"].item()),
+        height=int(arrays["height"].item()),
         landmarks_px=arrays["landmarks_px"],
         landmarks_visibility=arrays["landmarks_visibility"],
         landmarks_world_m=arrays["landmarks_world_m"],
         camera=_camera(arrays),
-        mask_source=str(arrays["mask_source"]),
-        n_video_frames=int(arrays["n_video_frames"]),
-        scale=float(arrays["scale"]),
+        mask_source=str(arrays["mask_source"].item()),
+        n_video_frames=int(arrays["n_video_frames"].item()),
+        scale=float(arrays["scale"].item()),
     )
 
 
 def _camera(arrays: Mapping[str, np.ndarray]) -> Camera | None:
-    fx, fy, cx, cy = (float(arrays[f"camera_{name}"]) for name in ("fx", "fy", "cx", "cy"))
+    fx, fy, cx, cy = (float(arrays[f"camera_{name}"].item()) for name in ("fx", "fy", "cx", "cy"))
     if not np.isfinite([fx, fy, cx, cy]).all():
         return None
-    return Camera(fx, fy, cx, cy, int(arrays["width"]), int(arrays["height"]), arrays["camera_world_to_camera"])
+    width, height = int(arrays["width"].item()), int(arrays["height"].item())
+    return Camera(fx, fy, cx, cy, width, height, arrays["camera_world_to_camera"])

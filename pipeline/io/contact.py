@@ -51,9 +51,5 @@ def _box(body: np.ndarray) -> tuple[int, int, int, int]:
         return 0, body.shape[0], 0, body.shape[1]
     rows, columns = np.flatnonzero(body.any(axis=1)), np.flatnonzero(body.any(axis=0))
     margin = round(0.05 * (rows[-1] - rows[0])) + 1
-    return (
-        max(0, rows[0] - margin),
-        min(body.shape[0], rows[-1] + margin + 1),
-        max(0, columns[0] - margin),
-        min(body.shape[1], columns[-1] + margin + 1),
-    )
+    top, left = max(0, int(rows[0]) - margin), max(0, int(columns[0]) - margin)
+    return top, min(body.shape[0], int(rows[-1]) + margin + 1), left, min(body.shape[1], int(columns[-1]) + margin + 1)

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from pipeline.avatar.person import PersonDetector
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track
-from pipeline.geometry.matte import sharpen_mask, steady_mask
+from pipeline.geometry.matte import sharpen_mask, steady_mask, with_painted_backdrop
 from pipeline.io.capture import IMAGES_FOLDER, MASKS_FOLDER, image_path, mask_path
 from pipeline.io.image import to_uint8, write_gray, write_rgb
 from pipeline.io.supplied import N_LANDMARKS, Supplied
@@ -242,5 +242,6 @@ def _write_sharpened(
 ) -> None:
     """Runs in a worker: the finished mask of one frame."""
     masks = np.stack([cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) for data in masks_png])
-    alpha = sharpen_mask(images[centre], steady_mask(images, masks, centre, noise))
+    mask = with_painted_backdrop(images[centre], steady_mask(images, masks, centre, noise))
+    alpha = sharpen_mask(images[centre], mask)
     _write_supplied(images[centre], to_uint8(alpha), out, frame_index)

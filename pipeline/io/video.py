@@ -7,6 +7,7 @@ A frame keeps its index in the whole recording, however few frames are read.
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -138,11 +139,10 @@ def _video(source: Source, is_wanted: Callable[[int], bool]) -> Iterator[tuple[i
             warn(f"{source.path} breaks off after {index + 1} frames ({error.strerror}); going on with those")
 
 
-def _upright_rgb(picture: av.VideoFrame, aspect: "float | None") -> UInt8[np.ndarray, "h w 3"]:
+def _upright_rgb(picture: av.VideoFrame, aspect: Fraction | None) -> UInt8[np.ndarray, "h w 3"]:
     """Colour pixels of a decoded picture with square pixels, turned as the container asks."""
     rgb = picture.reformat(format="rgb24", interpolation=_FULL_CHROMA).to_ndarray()
-    aspect = float(aspect or 1.0)
-    if abs(aspect - 1.0) > 1e-3:
+    if aspect and aspect != 1:
         rgb = cv2.resize(rgb, (round(rgb.shape[1] * aspect), rgb.shape[0]), interpolation=cv2.INTER_CUBIC)
     return np.ascontiguousarray(np.rot90(rgb, k=round(picture.rotation / 90) % 4))
 

@@ -1,0 +1,71 @@
+"""The detector on real pictures (one person, two, none), and the rules about legs and crops on numbers."""
+
+import numpy as np
+import pytest
+
+from pipeline.avatar import person
+from pipeline.io.video import open_source, read_frames
+
+
+@pytest.fixture(scope="module")
+def detector() -> person.PersonDetector:
+    return person.PersonDetector()
+
+
+@pytest.fixture(scope="module")
+def photograph(shared_data) -> np.ndarray:
+    source = open_source(shared_data / "real" / "dakse" / "video.mp4")
+    return next(read_frames(source, lambda index: index == 0, 2000)).rgb
+
+
+def test_every_landmark_has_a_name():
+    assert len(person.LANDMARK_NAMES) == 33
+    assert [person.LANDMARK_NAMES[k] for k in (*person.KNEES, *person.ANKLES)] == [
+        "left_knee", "right_knee", "left_ankle", "right_ankle"
+    ]  # fmt: skip
+    assert {person.LANDMARK_NAMES[k].split("_")[1] for k in person.TORSO} == {"shoulder", "hip"}
+
+
+def test_nobody_in_an_empty_picture(detector):
+    assert detector.detect(np.full((120, 160, 3), 128, np.uint8)) is None
+    assert detector.count_people(np.full((120, 160, 3), 128, np.uint8)) == 0
+
+
+def test_a_person_is_found_where_he_stands(detector, photograph):
+    found = detector.detect(photograph)
+    names = dict(zip(person.LANDMARK_NAMES, found.landmarks_px, strict=True))
+    assert found.mask.shape == photograph.shape[:2]
+    assert 0.12 < (found.mask > 127).mean() < 0.16
+    assert names["nose"][1] < names["left_hip"][1] < names["left_ankle"][1] < 630
+    assert names["right_wrist"][0] < names["right_shoulder"][0] < names["left_shoulder"][0] < names["left_wrist"][0]
+    assert found.visibility.min() > 0.5
+    world = dict(zip(person.LANDMARK_NAMES, found.landmarks_world_m, strict=True))
+    assert 1.0 < world["left_ankle"][1] - world["nose"][1] < 2.0
+
+
+def test_people_are_counted(detector, photograph):
+    assert detector.count_people(photograph) == 1
+    cut = photograph[:, 120:540]
+    assert detector.count_people(np.concatenate([cut, cut], axis=1)) == 2
+
+
+def test_legs_are_seen_when_one_ankle_is():
+    landmarks = np.full((4, 33, 2), 50.0, np.float32)
+    visibility = np.ones((4, 33), np.float32)
+    landmarks[1, 27, 1] = 130
+    landmarks[2, [27, 28], 1] = 130
+    visibility[3, [27, 28]] = 0.02
+    np.testing.assert_array_equal(person.legs_in_image(landmarks, visibility, 100), [True, True, False, False])
+
+
+@pytest.mark.parametrize(("height", "width"), [(100, 100), (90, 160), (160, 90)])
+def test_crops_cover_the_image_and_stay_inside(height, width):
+    crops = list(person._crops(height, width))
+    assert crops[0] == (0, 0, width, height)
+    assert len(set(crops)) == len(crops)
+    covered = np.zeros((height, width), int)
+    for left, top, right, bottom in crops[1:]:
+        assert 0 <= left < right <= width
+        assert 0 <= top < bottom <= height
+        covered[top:bottom, left:right] += 1
+    assert covered.min() >= 1

@@ -1,0 +1,135 @@
+"""The frames stage from folder to artifact: on drawn recordings with masks beside them, and on the real ones."""
+
+import cv2
+import numpy as np
+import pytest
+
+from pipeline.core.errors import UserError
+from pipeline.core.progress import take_warnings
+from pipeline.io.capture import load_capture
+from pipeline.io.image import write_gray, write_rgb
+from pipeline.io.npz import save_npz
+from stages import frames
+
+
+def draw_recording(folder, n=40, repeats=1):
+    """A block that walks, each picture `repeats` times, with masks, landmarks that turn around, and a camera."""
+    (folder / "masks").mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    landmarks_px = np.full((n, 33, 2), 20.0)
+    world = np.zeros((n, 33, 3))
+    for k in range(n):
+        place = k // repeats
+        yaw = 2 * np.pi * k / n
+        world[k, [11, 23]] = 0.2 * np.array([np.cos(yaw), 0, np.sin(yaw)])
+        mask = np.zeros((96, 128), np.uint8)
+        mask[20:80, place : place + 40] = 255
+        texture = rng.integers(-1, 2, (96, 128, 3)) + np.where(mask[..., None] > 0, 150 + 2 * place, 60)
+        write_rgb(folder / f"{k}.png", texture.astype(np.uint8))
+        write_gray(folder / "masks" / f"{k}.png", mask)
+    save_npz(folder / "landmarks.npz", {"landmarks_px": landmarks_px, "landmarks_world_m": world})
+    (folder / "camera.json").write_text('{"fx": 100, "fy": 100, "cx": 64, "cy": 48}')
+    return folder
+
+
+def run(video, out, **options):
+    out.mkdir()
+    return frames.run({"video": video}, out, frames.Config(workers=1, **options))
+
+
+def test_a_whole_recording(tmp_path):
+    metrics = run(draw_recording(tmp_path / "in"), tmp_path / "out")
+    capture = load_capture(tmp_path / "out")
+    np.testing.assert_array_equal(capture.frame_index, np.arange(40))
+    assert (capture.frame_index[capture.positions(2)] % 8 == 0).all()
+    assert (capture.frame_index[capture.positions(1)] % 8 == 4).all()
+    assert (metrics["frames"], metrics["frames_heldout"], metrics["frames_validation"]) == (40, 5, 5)
+    assert metrics["masks_count"] == 40
+    assert metrics["unseen_arc_deg"] == pytest.approx(9, abs=0.1)
+    assert capture.camera.fx == 100
+    assert capture.mask_source == "masks/"
+    assert capture.n_video_frames == 40
+    assert capture.mask(7)[50, 20] == 1
+    for name in frames.STAGE.makes:
+        assert (tmp_path / "out" / name).exists()
+    assert take_warnings() == []
+
+
+def test_duplicates_are_dropped_and_the_rest_is_thinned_out(tmp_path):
+    metrics = run(draw_recording(tmp_path / "in", n=80, repeats=2), tmp_path / "out", max_frames=24)
+    capture = load_capture(tmp_path / "out")
+    assert metrics["dropped_duplicates"] == 40
+    assert metrics["frames"] <= 24
+    assert metrics["frames_heldout"] == metrics["frames_validation"] == 3
+    assert (capture.frame_index % 2 == 0).all()
+    assert capture.frame_index[0] == 0
+    assert capture.frame_index[-1] == 78
+
+
+def test_large_images_are_stored_smaller_and_the_camera_with_them(tmp_path):
+    run(draw_recording(tmp_path / "in", n=17), tmp_path / "out", max_side_px=64)
+    capture = load_capture(tmp_path / "out")
+    assert capture.image(0).shape == (48, 64, 3)
+    assert (capture.camera.fx, capture.camera.width, capture.scale) == (50, 64, 0.5)
+    np.testing.assert_allclose(capture.landmarks_px, 10)
+
+
+def test_the_same_recording_gives_the_same_bytes(tmp_path):
+    folder = draw_recording(tmp_path / "in", n=17)
+    for name in ("a", "b"):
+        run(folder, tmp_path / name)
+    written = sorted(path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*") if path.is_file())
+    assert len(written) == 2 * 17 + 2
+    for path in written:
+        assert (tmp_path / "a" / path).read_bytes() == (tmp_path / "b" / path).read_bytes()
+
+
+def test_too_few_frames_are_refused(tmp_path):
+    with pytest.raises(UserError, match="has 9 frames, too few"):
+        run(draw_recording(tmp_path / "in", n=9), tmp_path / "out")
+
+
+def test_a_person_who_stands_still_is_refused(tmp_path):
+    with pytest.raises(UserError, match="only 2 frames in which the person has moved"):
+        run(draw_recording(tmp_path / "in", n=40, repeats=20), tmp_path / "out")
+
+
+def test_black_frames_are_refused(tmp_path):
+    (tmp_path / "in").mkdir()
+    for k in range(16):
+        write_rgb(tmp_path / "in" / f"{k}.png", np.zeros((64, 64, 3), np.uint8))
+    with pytest.raises(UserError, match="are black"):
+        run(tmp_path / "in", tmp_path / "out")
+
+
+def test_a_picture_of_nobody_is_refused(tmp_path):
+    (tmp_path / "in").mkdir()
+    rng = np.random.default_rng(0)
+    for k in range(16):
+        landscape = cv2.resize(rng.integers(0, 255, (4, 4, 3), dtype=np.uint8), (64, 64))
+        write_rgb(tmp_path / "in" / f"{k}.png", landscape)
+    with pytest.raises(UserError, match="no person was found"):
+        run(tmp_path / "in", tmp_path / "out")
+
+
+@pytest.mark.parametrize(("n", "limit", "stride"), [(100, 900, 1), (900, 900, 1), (901, 900, 3), (3000, 900, 5)])
+def test_looking_stride_is_odd_and_enough(n, limit, stride):
+    assert frames.looking_stride(n, limit) == stride
+    assert {index % 8 for index in range(0, 64 * stride, stride)} == set(range(8))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "message"), [("no_feet", "cut off above the feet"), ("several_people", "several people")]
+)
+def test_real_recordings_that_make_no_avatar(shared_data, tmp_path, name, message):
+    with pytest.raises(UserError, match=message):
+        run(shared_data / "error" / f"{name}.mp4", tmp_path / "out", max_looked_at=60)
+
+
+@pytest.mark.slow
+def test_a_real_recording(shared_data, tmp_path):
+    metrics = run(shared_data / "real" / "dakse" / "video.mp4", tmp_path / "out", max_frames=24)
+    assert 35 <= metrics["dropped_duplicates"] <= 60
+    assert metrics["dropped_no_person"] == 0
+    assert metrics["unseen_arc_deg"] < 30
