@@ -12,6 +12,7 @@ from pipeline.io.image import read_gray, read_rgb, to_float
 from pipeline.io.npz import load_npz, save_npz
 
 FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, CONTACT_SHEET = "frames.npz", "images", "masks", "contact.jpg"
+_INTRINSICS = ("camera_fx", "camera_fy", "camera_cx", "camera_cy")
 
 
 @dataclass(frozen=True)
@@ -70,27 +71,26 @@ def mask_path(folder: Path, frame_index: int | np.integer) -> Path:
 def save_capture(capture: Capture) -> None:
     """Write `frames.npz` into the capture's folder; images and masks are written beside it as they are made."""
     camera = capture.camera
-    intrinsics = {
-        f"camera_{name}": np.float64(getattr(camera, name) if camera else np.nan) for name in ("fx", "fy", "cx", "cy")
-    }
-    pose = camera.world_to_camera if camera else UPRIGHT_WORLD_TO_CAMERA
+    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy) if camera else (np.nan,) * 4
     arrays: dict[str, np.ndarray] = {
         "frame_index": capture.frame_index.astype(np.int32),
         "time_s": capture.time_s.astype(np.float64),
         "split": capture.split,
-        "fps": np.float64(capture.fps),
-        "width": np.int32(capture.width),
-        "height": np.int32(capture.height),
+        "fps": np.array(capture.fps),
+        "width": np.array(capture.width, dtype=np.int32),
+        "height": np.array(capture.height, dtype=np.int32),
         "landmarks_px": capture.landmarks_px.astype(np.float32),
         "landmarks_visibility": capture.landmarks_visibility.astype(np.float32),
         "landmarks_world_m": capture.landmarks_world_m.astype(np.float32),
-        "camera_world_to_camera": np.asarray(pose, dtype=np.float32),
+        "camera_world_to_camera": camera.world_to_camera if camera else UPRIGHT_WORLD_TO_CAMERA,
         "camera_distortion": np.zeros(0),
         "mask_source": np.array(capture.mask_source),
-        "n_video_frames": np.int32(capture.n_video_frames),
-        "scale": np.float64(capture.scale),
+        "n_video_frames": np.array(capture.n_video_frames, dtype=np.int32),
+        "scale": np.array(capture.scale),
     }
-    save_npz(capture.folder / FRAMES_NPZ, arrays | intrinsics)
+    for name, value in zip(_INTRINSICS, intrinsics, strict=True):
+        arrays[name] = np.array(value)
+    save_npz(capture.folder / FRAMES_NPZ, arrays)
 
 
 def load_capture(frames_dir: Path) -> Capture:
@@ -118,7 +118,7 @@ def load_capture(frames_dir: Path) -> Capture:
 
 
 def _camera(arrays: Mapping[str, np.ndarray]) -> Camera | None:
-    fx, fy, cx, cy = (float(arrays[f"camera_{name}"].item()) for name in ("fx", "fy", "cx", "cy"))
+    fx, fy, cx, cy = (float(arrays[name].item()) for name in _INTRINSICS)
     if not np.isfinite([fx, fy, cx, cy]).all():
         return None
     width, height = int(arrays["width"].item()), int(arrays["height"].item())

@@ -74,7 +74,7 @@ def look_at_all(
     def tasks() -> Iterator[tuple[object, ...]]:
         for frame in read_undistorted(source, supplied, lambda index: index % stride == 0, max_side_px):
             seen.append((frame.index, frame.time_s))
-            shape.append((*frame.rgb.shape[:2], frame.scale))
+            shape.append((frame.rgb.shape[0], frame.rgb.shape[1], frame.scale))
             mask = supplied_mask(supplied, frame)
             yield frame.rgb, mask, supplied.landmarks is None, frame.index in counted
 

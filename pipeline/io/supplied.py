@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from pipeline.core.errors import UserError
-from pipeline.geometry.camera import Camera
+from pipeline.geometry.camera import UPRIGHT_WORLD_TO_CAMERA, Camera
 from pipeline.io.image import IMAGE_SUFFIXES, read_gray
 from pipeline.io.npz import load_npz
 from pipeline.io.video import Source, natural_key
@@ -41,8 +41,9 @@ class SuppliedCamera:
 
     def at(self, scale: float, width: int, height: int) -> Camera:
         """The camera of undistorted images of this scale and size."""
-        pose = {} if self.world_to_camera is None else {"world_to_camera": self.world_to_camera}
-        return Camera(self.fx * scale, self.fy * scale, self.cx * scale, self.cy * scale, width, height, **pose)
+        pose = UPRIGHT_WORLD_TO_CAMERA if self.world_to_camera is None else self.world_to_camera
+        fx, fy, cx, cy = (scale * value for value in (self.fx, self.fy, self.cx, self.cy))
+        return Camera(fx, fy, cx, cy, width, height, pose)
 
     def undistort(self, rgb: UInt8[np.ndarray, "h w c"], scale: float) -> UInt8[np.ndarray, "h w c"]:
         """The picture as a lens without distortion would show it; `scale` is its size relative to the original."""
@@ -164,17 +165,17 @@ def _read_landmarks(path: Path, source: Source) -> SuppliedLandmarks:
 def _read_camera(path: Path) -> SuppliedCamera:
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
-        intrinsics = [float(values[key]) for key in ("fx", "fy", "cx", "cy")]
+        fx, fy, cx, cy = (float(values[key]) for key in ("fx", "fy", "cx", "cy"))
         distortion = tuple(float(value) for value in values.get("distortion") or ())
         pose = values.get("world_to_camera")
         world_to_camera = None if pose is None else np.array(pose, dtype=np.float32).reshape(4, 4)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{path} is no camera ({error}); it needs numbers fx, fy, cx, cy in pixels") from None
-    if min(intrinsics[:2]) <= 0 or not np.isfinite(intrinsics).all():
-        raise UserError(f"{path}: fx and fy must be above 0 pixels, found {intrinsics[0]} and {intrinsics[1]}")
+    if min(fx, fy) <= 0 or not np.isfinite([fx, fy, cx, cy]).all():
+        raise UserError(f"{path}: fx and fy must be above 0 pixels, found {fx} and {fy}")
     if len(distortion) not in (0, 4, 5, 8):
         raise UserError(f"{path}: distortion needs 4, 5 or 8 numbers (k1 k2 p1 p2 ...), found {len(distortion)}")
-    return SuppliedCamera(*intrinsics, distortion, world_to_camera)
+    return SuppliedCamera(fx, fy, cx, cy, distortion, world_to_camera)
 
 
 def _check_count(path: Path, count: int, source: Source) -> None:

@@ -141,7 +141,7 @@ def _video(source: Source, is_wanted: Callable[[int], bool]) -> Iterator[tuple[i
 
 def _upright_rgb(picture: av.VideoFrame, aspect: Fraction | None) -> UInt8[np.ndarray, "h w 3"]:
     """Colour pixels of a decoded picture with square pixels, turned as the container asks."""
-    rgb = picture.reformat(format="rgb24", interpolation=_FULL_CHROMA).to_ndarray()
+    rgb: np.ndarray = picture.reformat(format="rgb24", interpolation=_FULL_CHROMA).to_ndarray()
     if aspect and aspect != 1:
         rgb = cv2.resize(rgb, (round(rgb.shape[1] * aspect), rgb.shape[0]), interpolation=cv2.INTER_CUBIC)
     return np.ascontiguousarray(np.rot90(rgb, k=round(picture.rotation / 90) % 4))
