@@ -91,14 +91,14 @@ def fit(capture: Capture, masks: Sequence[UInt8[np.ndarray, "h w"]], frames_dir:
     if overlap < config.min_overlap:
         raise UserError(
             f"the body does not fit the person in {frames_dir}: median overlap with the masks {overlap:.2f}, needed "
-            f"{config.min_overlap:.2f}; look at {frames_dir / 'contact.jpg'} for wrong masks or landmarks, film the whole "
-            "body unoccluded, or lower body.min_overlap"
+            f"{config.min_overlap:.2f}; look at {frames_dir / 'contact.jpg'} for wrong masks or landmarks, film the "
+            "whole body unoccluded, or lower body.min_overlap"
         )
     return result
 
 
 def starting_camera(capture: Capture, config: Config) -> tuple[Camera, bool]:
-    """The camera to start from, and whether its focal length is known: supplied, else from the options, else a guess."""
+    """The camera to start from (supplied, by the options, or a guess), and whether its focal length is known."""
     if capture.camera is not None:
         return capture.camera, True
     side_px = max(capture.width, capture.height)

@@ -4,8 +4,6 @@ Shape, focal length and landmark offsets are found on some frames spread over th
 from outlines as well; then every frame gets its pose with those held fixed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -91,9 +89,7 @@ def fit_body(
     tools = _tools(body)
     rest_m = tools.regressor.points(tools.default, torch.zeros(_offsets(tools), dtype=torch.float64)).rest[0]
     observations, exchanged = _with_sides_mended(observations, rest_m)
-    start = initial_state(
-        observations, rest_m, tools.default.joints, body.shape_defaults.double(), _offsets(tools)
-    )
+    start = initial_state(observations, rest_m, tools.default.joints, body.shape_defaults.double(), _offsets(tools))
     chosen = shared_rows(observations, windows, options.shared_frames)
     state, weights, system = _fit_shared(
         tools, observations.rows(chosen), [windows[row] for row in chosen], start.rows(chosen), options
@@ -103,9 +99,7 @@ def fit_body(
     return _result(tools, model, state, system, observations, overlap, exchanged)
 
 
-def shared_rows(
-    observations: Observations, windows: Sequence[Window | None], count: int
-) -> Int[np.ndarray, "k"]:
+def shared_rows(observations: Observations, windows: Sequence[Window | None], count: int) -> Int[np.ndarray, "k"]:
     """Frames for the shared unknowns: evenly spread over those with landmarks and mask (without masks: landmarks)."""
     found = torso_found(observations)
     with_mask = found & np.array([window is not None for window in windows])

@@ -1,7 +1,5 @@
 """Where a fit starts: which way the person faces in each frame, and where the person stands."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -14,9 +12,8 @@ from pipeline.geometry.rotation import matrix_to_quaternion, quaternion_to_matri
 
 TORSO = (11, 12, 23, 24)
 
-def torso_rotations(
-    rest_m: Float[Tensor, "33 3"], directions_m: Float[Tensor, "n 33 3"]
-) -> Float[Tensor, "n 3 3"]:
+
+def torso_rotations(rest_m: Float[Tensor, "33 3"], directions_m: Float[Tensor, "n 33 3"]) -> Float[Tensor, "n 3 3"]:
     """Rotation that carries the rest torso (hips, shoulders) onto each frame's 3D landmarks (Kabsch 1976)."""
     rows = list(TORSO)
     rest = rest_m[rows] - rest_m[rows].mean(0)
@@ -30,7 +27,9 @@ def torso_rotations(
 def torso_found(observations: Observations) -> Bool[np.ndarray, "n"]:
     """Frames whose hips and shoulders are known, and are no point (a failing detector may put all in one place)."""
     rows = list(TORSO)
-    known = torch.minimum(observations.confidence[:, rows], observations.direction_confidence[:, rows]).min(1).values > 0
+    known = (
+        torch.minimum(observations.confidence[:, rows], observations.direction_confidence[:, rows]).min(1).values > 0
+    )
     return (known & (torso_size(observations.directions_m) > 1e-3)).numpy()
 
 
@@ -75,9 +74,7 @@ def initial_state(
     )
 
 
-def place_by_landmarks(
-    observations: Observations, relative_m: Float[Tensor, "n 33 3"]
-) -> Float[Tensor, "n 3"]:
+def place_by_landmarks(observations: Observations, relative_m: Float[Tensor, "n 33 3"]) -> Float[Tensor, "n 3"]:
     """World position of the root from pixels of points known relative to it.
 
     Each pixel gives two equations linear in the unknown place t: fx (X + t_x) - (u - cx) (Z + t_z) = 0, likewise y.

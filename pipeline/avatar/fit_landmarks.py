@@ -3,8 +3,6 @@
 Order and meaning: Bazarevsky et al., "BlazePose: On-device real-time body pose tracking", 2020, figure 3.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -84,7 +82,7 @@ def landmark_noise() -> Float[Tensor, "33"]:
 
 @dataclass(frozen=True)
 class LandmarkRegressor:
-    """Landmarks as anchors (weights over all joints and vertices) plus fixed shifts; made once, on the default shape."""
+    """Landmarks as a joint or a vertex each, plus a fixed shift; made once, on the default shape."""
 
     anchor_joint: tuple[int | None, ...]
     anchor_vertex: tuple[int | None, ...]

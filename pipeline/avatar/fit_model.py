@@ -6,11 +6,9 @@ carry a point to and w_k its skin weight, turning joint j moves the point by (pa
 arm_j = sum over k at or below j of w_k (x_k - joint_j).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -33,6 +31,7 @@ SHAPE_STEP = 0.01
 """Finite-difference step, in units of a phenotype; phenotypes are piecewise linear, so a larger one buys nothing."""
 
 
+@runtime_checkable
 class ParametricBody(Protocol):
     """What a body model must offer to be fitted (`pipeline.avatar.body.AnnyBody` is one)."""
 
@@ -43,14 +42,16 @@ class ParametricBody(Protocol):
     faces: np.ndarray
     skin_weights: np.ndarray
 
-    def rest(self, shape: Tensor) -> tuple[Tensor, Tensor]: ...
+    def rest(self, shape: Tensor) -> tuple[Tensor, Tensor]:
+        """A-pose vertices (v, 3) and joints (j, 3) of a shape, metres."""
+        ...
 
 
 @dataclass(frozen=True)
 class FitModel:
     """Rest body of shape `shape` and its derivative; float64, canonical A-pose, metres.
 
-    `descends[j, k]` is 1 when joint k is joint j or hangs below it. Fingers are bent into `grip` and move with the hand.
+    `descends[j, k]` is 1 when joint k is joint j or hangs below it. Fingers are bent by `grip` and move with the hand.
     """
 
     shape: Float[Tensor, "s"]
@@ -68,7 +69,7 @@ class FitModel:
     full_joints: Float[Tensor, "full 3"]
     full_joints_by_shape: Float[Tensor, "full 3 s"]
 
-    def moved(self, shape: Float[Tensor, "s"]) -> FitModel:
+    def moved(self, shape: Float[Tensor, "s"]) -> "FitModel":
         """The same linear model at another shape (values move along the derivative, which stays)."""
         step = shape - self.shape
         return replace(
@@ -198,9 +199,8 @@ class PosedSkeleton:
     position: Float[Tensor, "n j 3"]
 
 
-def pose_skeleton(
-    model: FitModel, rotations: Float[Tensor, "n j 3 3"], root_m: Float[Tensor, "n 3"]
-) -> PosedSkeleton:
+def pose_skeleton(model: FitModel, rotations: Float[Tensor, "n j 3 3"], root_m: Float[Tensor, "n 3"]) -> PosedSkeleton:
+    """Forward kinematics of the active joints (`skinning.forward_kinematics`)."""
     joint_to_world = forward_kinematics(rotations, root_m, model.joints, model.parents)
     rotation = joint_to_world[..., :3, :3]
     identity = torch.eye(3, dtype=rotation.dtype).expand(len(rotations), 1, 3, 3)
@@ -221,7 +221,7 @@ class Points:
 
 
 def surface_points(model: FitModel, corners: Int[Tensor, "n m 3"], barycentric: Float[Tensor, "n m 3"]) -> Points:
-    """Points on the body's faces; `corners` are vertex indices. The shape's derivative is that of the nearest corner."""
+    """Points on the body's faces; `corners` are vertices. The shape's derivative is that of the nearest corner."""
     share = barycentric[..., None]
     nearest = corners.gather(2, barycentric.argmax(dim=2, keepdim=True)).squeeze(2)
     return Points(
@@ -266,7 +266,9 @@ def shape_rows(
         step = joints_by_shape[joint] - joints_by_shape[parent]
         moved.append(moved[parent] + skeleton.rotation[:, parent] @ step)
     slide = torch.stack(moved, dim=1) - skeleton.rotation @ joints_by_shape
-    turned = torch.einsum("nmj,njab,nma->nmb", points.weights.expand(*covector.shape[:2], -1), skeleton.rotation, covector)
+    turned = torch.einsum(
+        "nmj,njab,nma->nmb", points.weights.expand(*covector.shape[:2], -1), skeleton.rotation, covector
+    )
     rows = (turned[..., None] * points.by_shape).sum(2)
     pulled = torch.einsum("nma,njas->nmjs", covector, slide)
     rows[..., : slide.shape[-1]] += (points.weights[..., None] * pulled).sum(2)

@@ -4,8 +4,6 @@ All residuals are in standard deviations. Distances in the image are judged in m
 the weights hold for any resolution. Robust terms use Geman-McClure, rho(r) = r^2 / (1 + r^2 / c^2) (Barron 2019).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -51,7 +49,7 @@ class FitState:
     offsets_m: Float[Tensor, "o"]
     focal_log: Float[Tensor, ""]
 
-    def moved(self, frame_step: Float[Tensor, "n p"], shared_step: Float[Tensor, "g"]) -> FitState:
+    def moved(self, frame_step: Float[Tensor, "n p"], shared_step: Float[Tensor, "g"]) -> "FitState":
         """The state after a step; an empty shared step leaves what is shared as it is."""
         turn = axis_angle_to_matrix(frame_step[:, :-3].reshape(*self.rotations.shape[:2], 3))
         moved = replace(self, rotations=turn @ self.rotations, root_m=self.root_m + frame_step[:, -3:])
@@ -65,7 +63,7 @@ class FitState:
             focal_log=self.focal_log + shared_step[-1],
         )
 
-    def rows(self, rows: Int[np.ndarray, "k"]) -> FitState:
+    def rows(self, rows: Int[np.ndarray, "k"]) -> "FitState":
         """The poses of some frames."""
         return replace(self, rotations=self.rotations[rows], root_m=self.root_m[rows])
 
@@ -82,21 +80,21 @@ class Observations:
     direction_confidence: Float[Tensor, "n 33"]
     camera: Camera
 
-    def rows(self, rows: Int[np.ndarray, "k"]) -> Observations:
+    def rows(self, rows: Int[np.ndarray, "k"]) -> "Observations":
         """What was seen in some frames."""
-        return Observations(
-            self.time_s[rows],
-            self.landmarks_px[rows],
-            self.directions_m[rows],
-            self.confidence[rows],
-            self.direction_confidence[rows],
-            self.camera,
+        return replace(
+            self,
+            time_s=self.time_s[rows],
+            landmarks_px=self.landmarks_px[rows],
+            directions_m=self.directions_m[rows],
+            confidence=self.confidence[rows],
+            direction_confidence=self.direction_confidence[rows],
         )
 
 
 @dataclass(frozen=True)
 class Contour:
-    """Points of the body that should lie on a line in the image: normal · (projection - target) = 0; weight 0 = unused."""
+    """Points of the body that belong on a line in the image: normal · (projection - target) = 0; weight 0: unused."""
 
     corners: Int[Tensor, "n m 3"]
     barycentric: Float[Tensor, "n m 3"]
@@ -147,6 +145,7 @@ class Objective:
     contour: Contour | None = None
 
     def __call__(self, state: FitState) -> NormalEquations:
+        """The normal equations of all terms at a state."""
         model = self.model.moved(state.shape)
         frames, joints = state.rotations.shape[:2]
         shapes = len(state.shape)
@@ -338,9 +337,7 @@ def facing_factor(skeleton: PosedSkeleton, camera: Camera) -> Float[Tensor, "n 3
     return factor
 
 
-def _robust(
-    system: NormalEquations, squared: Tensor, cutoff: float, share: Tensor | float = 1.0
-) -> Tensor:
+def _robust(system: NormalEquations, squared: Tensor, cutoff: float, share: Tensor | float = 1.0) -> Tensor:
     """Geman-McClure weights rho'(r) for squared residuals; their cost is added to the system."""
     relative = 1.0 + squared / cutoff**2
     system.cost += float((share * squared / relative).sum())
@@ -360,4 +357,3 @@ def _centre(camera: Camera) -> tuple[float, float]:
 
 def _hip_middle(values: Float[Tensor, "n 33 c"]) -> Float[Tensor, "n 1 c"]:
     return 0.5 * (values[:, LEFT_HIP] + values[:, RIGHT_HIP])[:, None]
-

@@ -4,8 +4,6 @@ Residuals are in standard deviations. Angles are rotation vectors of the local r
 axes (rows of `JointPrior.axes`): for hinges (twist along the bone, flexion, sideways), else the body's x, y, z.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

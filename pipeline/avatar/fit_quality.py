@@ -1,6 +1,4 @@
-"""What goes into a fit and what came out of it: observations from a capture's arrays, and words about doubtful frames."""
-
-from __future__ import annotations
+"""What goes into a fit (observations from a detector's arrays), and words about the doubtful frames that come out."""
 
 import numpy as np
 import torch
@@ -55,13 +53,19 @@ def doubts(result: FitResult, frame_index: Int[np.ndarray, "n"]) -> list[str]:
     for what, rows in result.exchanged.items():
         if rows.any():
             limbs = "left and right" if what == "whole body" else f"left and right {what}"
-            sentences.append(f"frames {frame_ranges(frame_index, rows)}: the detector took {limbs} for each other; mended")
+            sentences.append(
+                f"frames {frame_ranges(frame_index, rows)}: the detector took {limbs} for each other; mended"
+            )
     missing = np.isnan(result.landmark_error_px)
     if missing.any():
-        sentences.append(f"frames {frame_ranges(frame_index, missing)}: no landmarks; the pose follows the mask and time")
+        sentences.append(
+            f"frames {frame_ranges(frame_index, missing)}: no landmarks; the pose follows the mask and time"
+        )
     poor = suspicious_frames(result) & ~missing
     if poor.any():
-        sentences.append(f"frames {frame_ranges(frame_index, poor)}: the body fits worse than elsewhere; see overlay.png")
+        sentences.append(
+            f"frames {frame_ranges(frame_index, poor)}: the body fits worse than elsewhere; see overlay.png"
+        )
     return sentences
 
 

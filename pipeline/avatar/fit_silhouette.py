@@ -5,8 +5,6 @@ cancels. Two kinds of pairs: every point of the body's outline belongs on the ma
 mask's outline wants the body's nearest outline with a similar normal. Outlines inside the body have no pair.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -121,6 +119,7 @@ class Drawing:
 def draw_in_window(
     vertices_world: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], camera: Camera, window: Window
 ) -> Drawing:
+    """Rasterise a posed body in a window's pixels."""
     vertices_px, depth_m = project(vertices_world, camera)
     corner = vertices_px.new_tensor([window.left_px, window.top_px])
     height, width = window.mask.shape
@@ -129,6 +128,7 @@ def draw_in_window(
 
 
 def intersection_over_union(first: Bool[np.ndarray, "h w"], second: Bool[np.ndarray, "h w"]) -> float:
+    """Shared area over joint area, 0 to 1; 1 when both are empty."""
     union = int((first | second).sum())
     return float((first & second).sum()) / union if union else 1.0
 

@@ -1,10 +1,8 @@
-"""Levenberg-Marquardt on all frames at once: small dense blocks a frame, neighbours in time coupled, few shared numbers.
+"""Levenberg-Marquardt on all frames at once: a dense block a frame, neighbours in time coupled, few shared numbers.
 
 Letters: n frames, p numbers a frame, g shared numbers. The normal matrix is banded (a frame's block, and diagonals that
 couple it with the next two frames) with a border for the shared numbers, so a step costs O(n p^3).
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,7 +22,7 @@ DAMPING_LIMIT = 1e6
 
 @dataclass
 class NormalEquations:
-    """Sum of w J^T J, w J^T r and the robust cost; float64. `next_frame[t]` couples frames t and t + 1, number by number."""
+    """Sums of w J^T J and w J^T r, and the robust cost; float64. `next_frame[t]` couples frames t and t + 1."""
 
     frame: Float[Tensor, "n p p"]
     border: Float[Tensor, "n p g"]
@@ -35,12 +33,14 @@ class NormalEquations:
     after_next_frame: Float[Tensor, "n p"]
     cost: float = 0.0
 
-    @staticmethod
-    def zeros(frames: int, numbers: int, shared: int) -> NormalEquations:
+    @classmethod
+    def zeros(cls, frames: int, numbers: int, shared: int) -> "NormalEquations":
+        """Nothing known yet."""
+
         def empty(*size: int) -> Tensor:
             return torch.zeros(*size, dtype=torch.float64)
 
-        return NormalEquations(
+        return cls(
             frame=empty(frames, numbers, numbers),
             border=empty(frames, numbers, shared),
             shared=empty(shared, shared),

@@ -1,11 +1,9 @@
-"""Landmarks whose left and right the detector took for each other, found before the fit by what cannot happen in time.
+"""Landmarks whose left and right the detector took for each other, found by what cannot happen in time.
 
-A person does not turn by half a circle between two frames, and a limb does not jump to where the other one was. Both are
-decided by dynamic programming over two labels a frame (as found, exchanged), so that a whole run of wrong frames is seen
-by its two ends.
+A person does not turn by half a circle between two frames, and a limb does not jump to where the other one was. Both
+are decided by dynamic programming over two labels a frame (as found, exchanged), so that a whole run of wrong frames is
+seen by its two ends.
 """
-
-from __future__ import annotations
 
 from dataclasses import replace
 
@@ -62,15 +60,13 @@ def exchanged_bodies(observations: Observations, rest_m: Float[torch.Tensor, "33
     rows = np.flatnonzero(torso_found(observations))
     yaw_rad = facing_yaw(torso_rotations(rest_m, observations.directions_m[rows])).numpy()
     turn, free = np.diff(yaw_rad), TURN_FREE_RAD * np.diff(rows)
-    same, other = (
-        TURN_COST * np.maximum(np.abs(_wrapped(turn + extra)) - free, 0.0) for extra in (0.0, np.pi)
-    )
+    same, other = (TURN_COST * np.maximum(np.abs(_wrapped(turn + extra)) - free, 0.0) for extra in (0.0, np.pi))
     unary = np.tile([0.0, EXCHANGE_COST], (len(rows), 1))
     return _spread(two_label_path(unary, same, other), rows, len(observations.time_s))
 
 
 def exchanged_limbs(observations: Observations, limb: str) -> Bool[np.ndarray, "n"]:
-    """Frames in which the landmarks of arms or legs are exchanged, by jumps in the image and by the side they lie on."""
+    """Frames in which arms or legs are exchanged, by jumps in the image and by the side they lie on."""
     pairs, telling, torso = LIMBS[limb]
     rows = np.flatnonzero(torso_found(observations))
     landmarks = observations.landmarks_px[rows].numpy()
@@ -91,8 +87,8 @@ def exchanged_limbs(observations: Observations, limb: str) -> Bool[np.ndarray, "
 def exchange_bodies(observations: Observations, exchanged: Bool[np.ndarray, "n"]) -> Observations:
     """All left and right landmarks trade places in some frames; their 3D positions are mirrored in depth.
 
-    A picture does not tell front from back: the same pixels with left and right exchanged belong to the person seen from
-    the other side, whose depths are opposite.
+    A picture does not tell front from back: the same pixels with left and right exchanged belong to the person seen
+    from the other side, whose depths are opposite.
     """
     pose = torch.as_tensor(observations.camera.world_to_camera, dtype=torch.float64)[:3, :3]
     mirror = pose.T @ torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)) @ pose

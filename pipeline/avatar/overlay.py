@@ -1,7 +1,5 @@
 """The picture by which a person judges a fit: the body drawn over some frames, left side orange, right side blue."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import cv2

@@ -1,0 +1,106 @@
+"""A person with known shape, motion and camera, and what a detector would see of them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from pipeline.avatar.fit_landmarks import OFFSET_COUNT, landmark_regressor
+from pipeline.avatar.fit_model import ACTIVE_JOINTS, FitModel, ParametricBody, linearise, pose_points, pose_skeleton
+from pipeline.avatar.fit_objective import FitState, Observations
+from pipeline.avatar.fit_quality import make_observations
+from pipeline.avatar.fit_silhouette import Window, matching_window, posed_vertices
+from pipeline.geometry.camera import Camera, project
+from pipeline.geometry.rotation import axis_angle_to_matrix
+from pipeline.kernels.raster import rasterize
+
+
+@dataclass(frozen=True)
+class Act:
+    """The truth (`state`, `model`, `camera`) and the detector's view of it."""
+
+    model: FitModel
+    state: FitState
+    camera: Camera
+    time_s: np.ndarray
+    landmarks_px: np.ndarray
+    landmarks_world_m: np.ndarray
+
+    def observations(self, camera: Camera) -> Observations:
+        return make_observations(
+            self.time_s, self.landmarks_px, np.ones((len(self.time_s), 33)), self.landmarks_world_m, camera
+        )
+
+    def joints_m(self) -> torch.Tensor:
+        return pose_skeleton(self.model, self.state.rotations, self.state.root_m).position
+
+    def masks(self) -> list[np.ndarray]:
+        masks = []
+        for vertices in posed_vertices(self.model, self.state):
+            vertices_px, depth_m = project(vertices, self.camera)
+            face_id, _, _ = rasterize(vertices_px, depth_m, self.model.faces, self.camera.height, self.camera.width)
+            masks.append(np.where(face_id.numpy() >= 0, 255, 0).astype(np.uint8))
+        return masks
+
+    def windows(self) -> list[Window | None]:
+        return [matching_window(mask) for mask in self.masks()]
+
+
+def act(
+    body: ParametricBody,
+    frames: int = 24,
+    shape: dict[str, float] | None = None,
+    focal_px: float = 520.0,
+    noise_m: float = 0.0,
+    turn_rad: float = 2 * np.pi,
+    seed: int = 0,
+) -> Act:
+    """A person who turns on the spot at 3 m with swinging arms and legs, seen at 256 x 320 pixels, 10 frames a second.
+
+    noise_m: standard deviation of landmarks, at the person's depth.
+    """
+    values = body.shape_defaults.clone()
+    for name, value in (shape or {}).items():
+        values[body.shape_names.index(name)] = value
+    model = linearise(body, values)
+    time_s = np.arange(frames) / 10.0
+    phase = torch.linspace(0.0, 1.0, frames, dtype=torch.float64)
+    camera = Camera(focal_px, focal_px, 128.0, 160.0, 256, 320)
+    root = torch.stack([0.1 * torch.sin(6 * phase), 0.02 * torch.cos(9 * phase) - 0.05, -3.0 + 0.2 * phase], dim=1)
+    state = FitState(
+        _dance(phase, turn_rad),
+        root,
+        values.double(),
+        torch.zeros(OFFSET_COUNT, dtype=torch.float64),
+        torch.zeros((), dtype=torch.float64),
+    )
+    regressor = landmark_regressor(linearise(body, body.shape_defaults))
+    skeleton = pose_skeleton(model, state.rotations, state.root_m)
+    world, _ = pose_points(model, skeleton, regressor.points(model, state.offsets_m))
+    pixels, depth_m = project(world, camera)
+    random = np.random.default_rng(seed)
+    noise_px = noise_m * focal_px / float(depth_m.mean())
+    landmarks_px = pixels.numpy() + noise_px * random.standard_normal(pixels.shape)
+    relative = (world - 0.5 * (world[:, 23:24] + world[:, 24:25])).numpy() * [1.0, -1.0, -1.0]
+    return Act(
+        model, state, camera, time_s, landmarks_px, relative + 2 * noise_m * random.standard_normal(relative.shape)
+    )
+
+
+def _dance(phase: torch.Tensor, turn_rad: float) -> torch.Tensor:
+    angles = torch.zeros(len(phase), len(ACTIVE_JOINTS), 3, dtype=torch.float64)
+    swing = torch.sin(10 * phase)
+    angles[:, ACTIVE_JOINTS.index("Hips"), 1] = turn_rad * phase
+    for side, sign in (("Left", 1.0), ("Right", -1.0)):
+        angles[:, ACTIVE_JOINTS.index(f"{side}Arm"), 0] = -0.3 * sign * swing
+        angles[:, ACTIVE_JOINTS.index(f"{side}Arm"), 2] = -0.3 * sign
+        angles[:, ACTIVE_JOINTS.index(f"{side}UpLeg"), 0] = 0.25 * sign * swing
+        angles[:, ACTIVE_JOINTS.index(f"{side}Leg"), 0] = 0.3 + 0.2 * sign * swing
+    angles[:, ACTIVE_JOINTS.index("Head"), 1] = 0.3 * torch.cos(7 * phase)
+    return axis_angle_to_matrix(angles)
+
+
+def joint_errors_m(found_m: torch.Tensor, true_m: torch.Tensor) -> tuple[float, float]:
+    """Mean distance of joints with the root joint aligned, and as they are."""
+    aligned = (found_m - found_m[:, :1]) - (true_m - true_m[:, :1])
+    return float(aligned.norm(dim=-1).mean()), float((found_m - true_m).norm(dim=-1).mean())
