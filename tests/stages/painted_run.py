@@ -1,0 +1,59 @@
+"""A run folder up to the mesh stage, made from a scene with known truth, for the stages that come after."""
+
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.avatar.body import Body, Motion
+from pipeline.avatar.field import Field, choose_layout
+from pipeline.avatar.selection import split_of
+from pipeline.geometry.camera import Camera
+from pipeline.geometry.skinning import top_k_weights
+from pipeline.io.capture import Capture, image_path, mask_path, save_capture
+from pipeline.io.checkpoint import save_field
+from pipeline.io.image import write_gray, write_rgb
+from pipeline.io.npz import save_body, save_camera, save_motion, save_npz
+
+FPS = 24.0
+
+
+def make_run(
+    folder: Path, body: Body, motion: Motion, camera: Camera, images: list[np.ndarray], masks: list[np.ndarray]
+) -> dict[str, Path]:
+    """The folders `frames`, `body`, `field` (untrained: its colours mean nothing) and `mesh` (the body's surface)."""
+    inputs = {name: folder / name for name in ("frames", "body", "field", "mesh")}
+    for path in (*inputs.values(), inputs["frames"] / "images", inputs["frames"] / "masks"):
+        path.mkdir(parents=True)
+    unknown = np.full((len(images), 33, 3), np.nan, dtype=np.float32)
+    save_capture(
+        Capture(
+            folder=inputs["frames"],
+            frame_index=motion.frame_index,
+            time_s=motion.frame_index / FPS,
+            split=split_of(motion.frame_index),
+            fps=FPS,
+            width=camera.width,
+            height=camera.height,
+            landmarks_px=unknown[..., :2],
+            landmarks_visibility=unknown[..., 0],
+            landmarks_world_m=unknown,
+            camera=camera,
+            mask_source="truth",
+            n_video_frames=int(motion.frame_index[-1]) + 1,
+            scale=1.0,
+        )
+    )
+    for index, image, mask in zip(motion.frame_index.tolist(), images, masks, strict=True):
+        write_rgb(image_path(inputs["frames"], index), image)
+        write_gray(mask_path(inputs["frames"], index), mask)
+    save_body(inputs["body"] / "body.npz", body)
+    save_camera(inputs["body"] / "camera.npz", camera)
+    save_motion(inputs["field"] / "motion.npz", motion)
+    bounds_m = np.stack([body.vertices.min(axis=0) - 0.1, body.vertices.max(axis=0) + 0.1]).astype(np.float32)
+    save_field(inputs["field"] / "field.safetensors", Field(bounds_m, choose_layout(bounds_m, 0.05, 2, 2, 10)))
+    indices, weights = top_k_weights(body.skin_weights)
+    save_npz(
+        inputs["mesh"] / "mesh.npz",
+        {"vertices": body.vertices, "faces": body.faces, "joint_indices": indices, "joint_weights": weights},
+    )
+    return inputs
