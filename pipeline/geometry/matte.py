@@ -53,7 +53,7 @@ def sharpen_mask(rgb: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"]
     image = rgb[window].astype(np.float32) / 255.0
     guess = mask[window].astype(np.float32) / 255.0
     cell_px = _cell_px(guess > 0.5)
-    reach = cv2.dilate((guess > 0.5).astype(np.uint8), _disc(round(_BAND_CELLS * cell_px))) > 0
+    reach = _grown(guess > 0.5, _BAND_CELLS * cell_px)
     alpha = guess
     for _ in range(2):
         alpha = np.where(reach, _recolour(image, alpha, guess, cell_px), 0.0).astype(np.float32)
@@ -69,9 +69,7 @@ def clean_alpha(alpha: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     """
     body = _largest_parts(alpha > 0.5)
     body = ~_without_specks(~body, _HOLE_SHARE * body.sum())
-    kernel = _disc(_RIM_PX)
-    outer = cv2.dilate(body.astype(np.uint8), kernel) > 0
-    inner = cv2.erode(body.astype(np.uint8), kernel) > 0
+    outer, inner = _grown(body, _RIM_PX), ~_grown(~body, _RIM_PX)
     soft = np.where(body, np.maximum(alpha, 0.5), np.minimum(alpha, 0.5))
     return np.where(inner, 1.0, np.where(outer, soft, 0.0)).astype(np.float32)
 
@@ -86,18 +84,18 @@ def with_painted_backdrop(rgb: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarra
     if not body.any():
         return mask
     cell_px = _cell_px(body)
-    near = cv2.dilate(body.astype(np.uint8), _disc(round(_BAND_CELLS * cell_px))) > 0
-    away = rgb[cv2.dilate(near.astype(np.uint8), _disc(round(_BAND_CELLS * cell_px))) == 0]
+    near = _grown(body, _BAND_CELLS * cell_px)
+    away = rgb[~_grown(body, 2 * _BAND_CELLS * cell_px)]
     if len(away) == 0:
         return mask
     backdrop = np.median(away, axis=0)
     painted = (np.abs(rgb.astype(np.int16) - backdrop.astype(np.int16)) <= _PAINTED_LEVELS).all(axis=-1)
     if painted[~near].mean() < _PAINTED_SHARE:
         return mask
-    support = cv2.morphologyEx((~painted).astype(np.uint8), cv2.MORPH_OPEN, _disc(2)) > 0
+    support = cv2.morphologyEx((~painted).astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)) > 0
     _, labels = cv2.connectedComponents((support | body).astype(np.uint8), connectivity=8)
     attached = support & np.isin(labels, np.unique(labels[body]))
-    beyond = cv2.dilate((attached & ~near).astype(np.uint8), _disc(round(2 * _BAND_CELLS * cell_px))) > 0
+    beyond = _grown(attached & ~near, 2 * _BAND_CELLS * cell_px)
     return np.where(attached & beyond, np.uint8(255), mask)
 
 
@@ -231,6 +229,8 @@ def _without_specks(mask: Bool[np.ndarray, "h w"], smallest_area_px: float) -> B
     return keep[labels]
 
 
-def _disc(radius_px: int) -> UInt8[np.ndarray, "k k"]:
-    size = 2 * max(0, radius_px) + 1
-    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+def _grown(mask: Bool[np.ndarray, "h w"], radius_px: float) -> Bool[np.ndarray, "h w"]:
+    """All pixels within a distance of the mask; by distance transform, which takes no longer for a larger radius."""
+    if not mask.any():
+        return mask.copy()
+    return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5) <= radius_px

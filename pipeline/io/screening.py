@@ -11,6 +11,8 @@ from pipeline.io.sightings import Sightings
 
 _BLACK_LEVEL = 8
 _FEET = (29, 30, 31, 32)
+# A shoe reaches this share of the image's height below the joints of heel and toe.
+_SOLE_SHARE = 0.02
 _UNSEEN_ARC_DEG = 120.0
 
 
@@ -48,7 +50,7 @@ def warn_of_gaps(sightings: Sightings, unseen_rad: float, path: Path) -> None:
     if missing:
         warn(f"{missing} of {len(sightings.found)} frames of {path} show no person and are dropped")
     feet_px = sightings.landmarks_px[sightings.found][:, _FEET, 1]
-    cropped = int((feet_px.max(axis=1) > sightings.height).sum())
+    cropped = int((feet_px.max(axis=1) > (1.0 - _SOLE_SHARE) * sightings.height).sum())
     if cropped:
         warn(f"the feet are cut off in {cropped} frames of {path}; they will be less sharp in the avatar")
     if unseen_rad > np.radians(_UNSEEN_ARC_DEG):
