@@ -14,6 +14,7 @@ EXTRA ?=
 ARGS ?=
 
 TORCH_VERSION := 2.13.0
+GLTF_VALIDATOR_VERSION := 2.0.0-dev.3.10
 SAMPLE_RUN := runs/sample
 SAMPLE := runs/sample-capture
 ONE_RUN := $(or $(RUN),$(SAMPLE_RUN))
@@ -21,10 +22,10 @@ OPTIONS = $(if $(PRESET),--preset $(PRESET)) $(foreach item,$(SET),--set $(item)
 STAMP := $(VENV)/.stamp$(if $(EXTRA),-$(EXTRA))
 
 .DEFAULT_GOAL := help
-.PHONY: help all $(STAGES) test test-all check format bench doctor venv lock configs clean
+.PHONY: help all $(STAGES) test test-all check format bench doctor venv lock configs gltf-validator clean
 
 help:  ## this list
-	@awk -F ':.*## ' '/^[a-z$$()A-Z -]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST) | sed 's/$$(STAGES)/STAGE       /'
+	@awk -F ':.*## ' '/^[a-z$$()A-Z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST) | sed 's/$$(STAGES)/STAGE    /'
 	@echo "  STAGE is one of: $(STAGES)"
 	@echo "  variables: VIDEO=file-or-folder RUN=runs/name PRESET=instant|default|fine SET='mesh.key=value' EXTRA=cuda"
 
@@ -87,6 +88,11 @@ lock:  ## resolve pyproject.toml anew into requirements.lock
 configs: $(STAMP)  ## write configs/default.yaml from the defaults in code
 	$(RUN_PYTHON) -m stages --defaults > configs/default.yaml.new
 	mv configs/default.yaml.new configs/default.yaml
+
+gltf-validator: node_modules/gltf-validator  ## install the Khronos validator for the tests (needs npm)
+
+node_modules/gltf-validator:
+	npm install --no-save --no-audit --no-fund --loglevel=error gltf-validator@$(GLTF_VALIDATOR_VERSION)
 
 clean:  ## remove caches and builds; runs/ and .venv stay
 	rm -rf build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -9,7 +9,7 @@ import pytest
 from jaxtyping import install_import_hook
 
 from pipeline.core.measure import REPOSITORY
-from tests.core.toy_pipeline import Toy
+from tests.core.toy_pipeline import Toy, user_environment
 
 # Before any of these is imported: from here on every annotated shape and dtype in them is checked at each call.
 # The numba kernels are left out, because numba compiles the plain functions.
@@ -55,9 +55,9 @@ def smoke_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     Beside it lies `capture/`, with the video and its truth.
     """
     folder = tmp_path_factory.mktemp("smoke")
-    size = ["--frames", "24", "--size", "192"]
-    make_sample = [sys.executable, "-m", "data_tools.sample", str(folder / "capture"), *size]
-    subprocess.run(make_sample, cwd=REPOSITORY, check=True)
-    run_all = [sys.executable, "-m", "stages", "--run", str(folder / "run"), "--preset", "smoke"]
-    subprocess.run([*run_all, "--video", str(folder / "capture" / "video")], cwd=REPOSITORY, check=True)
+    video = folder / "capture" / "video"
+    make_sample = ["data_tools.sample", str(folder / "capture"), "--frames", "24", "--size", "192"]
+    run_all = ["stages", "--run", str(folder / "run"), "--preset", "smoke", "--video", str(video)]
+    for command in (make_sample, run_all):
+        subprocess.run([sys.executable, "-m", *command], cwd=REPOSITORY, env=user_environment(), check=True)
     return folder / "run"

@@ -10,11 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.core.lock import LOCK_FD_VARIABLE, PARENT_VARIABLE
 from pipeline.core.manifest import digest_json, list_files, read_manifest
 from pipeline.core.measure import REPOSITORY
 from stages import STAGES
-from tests.core.toy_pipeline import Toy
+from tests.core.toy_pipeline import Toy, user_environment
 
 TOY_STAGES = ("read", "learn", "tell")
 
@@ -82,16 +81,15 @@ def test_a_kill_at_any_moment_does_no_harm(toy: Toy, unbroken: dict[str, str], d
 
 def real_run(run_dir: Path, video: Path) -> subprocess.Popen[bytes]:
     """Start the real pipeline with the smoke preset, in a process group of its own."""
-    environment = {key: value for key, value in os.environ.items() if key not in (LOCK_FD_VARIABLE, PARENT_VARIABLE)}
     command = [sys.executable, "-m", "stages", "--run", str(run_dir), "--video", str(video), "--preset", "smoke"]
-    return subprocess.Popen(command, cwd=REPOSITORY, env=environment, start_new_session=True)
+    return subprocess.Popen(command, cwd=REPOSITORY, env=user_environment(), start_new_session=True)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", STAGES)
 @pytest.mark.parametrize("share", [0.3, 0.8])
 def test_each_real_stage_survives_a_kill(smoke_run: Path, tmp_path: Path, name: str, share: float) -> None:
-    """The killed run starts from copies of what comes before the stage; the report, which holds times, need only end."""
+    """The killed run starts from copies of what comes before; the report, which holds times, need only end."""
     whole = read_manifest(smoke_run / name)
     assert whole is not None
     run_dir = tmp_path / "killed"

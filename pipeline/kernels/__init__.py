@@ -1,0 +1,6 @@
+"""Kernels: one public operation a module, a numba version for the CPU and a plain-torch twin for all else."""
+
+import os
+
+# pymeshlab brings an old libtbb along, at which numba's default layer only warns; OpenMP is what it would fall back to.
+os.environ.setdefault("NUMBA_THREADING_LAYER_PRIORITY", "omp tbb workqueue")

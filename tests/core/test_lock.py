@@ -18,7 +18,9 @@ TAKE += "with run_lock(Path(sys.argv[1]), patience_s=0.0): print('taken')"
 
 def take(run_dir: Path, **options: Any) -> subprocess.CompletedProcess[str]:
     """Try to take the lock in another process."""
-    return subprocess.run([sys.executable, "-c", TAKE, str(run_dir)], capture_output=True, text=True, cwd=REPOSITORY, **options)
+    return subprocess.run(
+        [sys.executable, "-c", TAKE, str(run_dir)], capture_output=True, text=True, cwd=REPOSITORY, **options
+    )
 
 
 def test_a_second_writer_is_refused_and_told_by_whom(tmp_path: Path) -> None:

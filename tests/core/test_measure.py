@@ -9,7 +9,9 @@ ALLOCATE = "from pipeline.core.measure import peak_rss_mib; b = bytearray({mib} 
 
 
 def peak_after_allocating(mib: int) -> float:
-    done = subprocess.run([sys.executable, "-c", ALLOCATE.format(mib=mib)], capture_output=True, text=True, check=True, cwd=REPOSITORY)
+    done = subprocess.run(
+        [sys.executable, "-c", ALLOCATE.format(mib=mib)], capture_output=True, text=True, check=True, cwd=REPOSITORY
+    )
     return float(done.stdout)
 
 

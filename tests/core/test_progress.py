@@ -10,7 +10,9 @@ def test_all_items_pass_unchanged() -> None:
     assert list(progress.track(iter("abc"), "spelling")) == ["a", "b", "c"]
 
 
-def test_a_log_gets_lines_with_what_is_left(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_log_gets_lines_with_what_is_left(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(progress, "LOG_INTERVAL_S", 0.0)
     assert len(list(progress.track(range(2), "fitting", total=5, initial=3))) == 2
     first, last = capsys.readouterr().err.splitlines()

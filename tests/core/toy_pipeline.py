@@ -10,6 +10,11 @@ from pipeline.core.lock import LOCK_FD_VARIABLE, PARENT_VARIABLE
 from pipeline.core.measure import REPOSITORY
 
 
+def user_environment() -> dict[str, str]:
+    """This process's environment as a user's shell would have it: not inside a run."""
+    return {key: value for key, value in os.environ.items() if key not in (LOCK_FD_VARIABLE, PARENT_VARIABLE)}
+
+
 class Toy:
     """A folder with the toy's `stages` and `configs`, a video of numbers, and the commands."""
 
@@ -22,8 +27,7 @@ class Toy:
 
     def start(self, *arguments: str, **variables: str) -> subprocess.Popen[str]:
         """Start `python -m <arguments>` in a process group of its own; the caller waits."""
-        environment = {key: value for key, value in os.environ.items() if key not in (LOCK_FD_VARIABLE, PARENT_VARIABLE)}
-        environment |= {"PYTHONPATH": str(REPOSITORY), **variables}
+        environment = user_environment() | {"PYTHONPATH": str(REPOSITORY), **variables}
         command = [sys.executable, "-m", *arguments]
         pipe = subprocess.PIPE
         return subprocess.Popen(
@@ -48,4 +52,3 @@ class Toy:
         (sentence,) = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
         assert done.stderr.splitlines()[-1] == sentence
         return sentence
-
