@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from pydantic import Field
 from torch import Tensor
 
-from pipeline.avatar.bake_views import View, align, pixel_trust, seen_depth
+from pipeline.avatar.bake_views import View, align, footprint_m, pixel_trust, seen_depth
 from pipeline.core.config import Config
 from pipeline.core.progress import track
 from pipeline.geometry.atlas import Atlas, Texels, fill_gaps
@@ -33,18 +33,18 @@ class BakeConfig(Config):
     """Options of the bake."""
 
     cosine_power: float = Field(
-        4.0, ge=0.0, le=16.0, description="weight of a view: the cosine between normal and view to this power"
+        2.0, ge=0.0, le=16.0, description="weight of a view: the cosine between normal and view to this power"
     )
-    edge_px: float = Field(
-        4.0, gt=0.0, le=64.0, description="trust grows from 0 to 1 over this distance from a silhouette, pixels"
+    edge_m: float = Field(
+        0.012, gt=0.0, le=0.2, description="trust grows from 0 to 1 over this distance from a silhouette, m"
     )
     tolerance_m: float = Field(0.01, gt=0.0, le=0.2, description="depth difference up to which a texel is visible, m")
     rounds: int = Field(3, ge=0, le=20, description="rounds of aligning frames and adding their residuals")
-    flow_smoothing_px: float = Field(
-        3.0, ge=0.0, le=50.0, description="standard deviation of the blur of the alignment, pixels"
+    flow_smoothing_m: float = Field(
+        0.01, ge=0.0, le=0.2, description="standard deviation of the blur of the alignment, m"
     )
-    largest_flow_px: float = Field(
-        8.0, ge=0.0, le=100.0, description="frames are moved by at most this much, pixels; 0 aligns nothing"
+    largest_flow_m: float = Field(
+        0.03, ge=0.0, le=0.5, description="frames are moved by at most this much, m; 0 aligns nothing"
     )
     outlier: float = Field(
         0.15, gt=0.0, le=2.0, description="residual (sRGB, 0 to 1) at which a pixel counts a quarter of a right one"
@@ -120,7 +120,7 @@ def first_texture(views: Iterable[View], surface: Surface, config: BakeConfig) -
     mean = Mean.empty(len(surface.texels.face))
     for view in views:
         depth_m = seen_depth(view, surface.faces)
-        trust = pixel_trust(view.mask, depth_m.numpy(), config.edge_px)
+        trust = pixel_trust(view.mask, depth_m.numpy(), config.edge_m / footprint_m(view))
         mean.add(*observe(view, surface, view.image.astype(np.float32) / 255.0, trust, depth_m, config))
     return mean
 
@@ -131,10 +131,10 @@ def residual_round(
     """Weighted mean of what the aligned views show more than the texture does."""
     mean = Mean.empty(len(surface.texels.face))
     for view in views:
-        rendered = render_view(texture, view, surface)
-        moved, moved_mask = align(view, rendered, config.flow_smoothing_px, config.largest_flow_px)
+        rendered, pixel_m = render_view(texture, view, surface), footprint_m(view)
+        moved, moved_mask = align(view, rendered, config.flow_smoothing_m / pixel_m, config.largest_flow_m / pixel_m)
         depth_m = seen_depth(view, surface.faces)
-        trust = pixel_trust(moved_mask, depth_m.numpy(), config.edge_px)
+        trust = pixel_trust(moved_mask, depth_m.numpy(), config.edge_m / pixel_m)
         residual = moved - rendered[..., :3] / np.maximum(rendered[..., 3:], 1e-3)
         trust /= (1.0 + (np.linalg.norm(residual, axis=2) / config.outlier) ** 2) ** 2
         mean.add(*observe(view, surface, residual, trust, depth_m, config))

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.avatar.bake import BakeConfig, Surface, observe
-from pipeline.avatar.bake_views import View, pixel_trust, seen_depth, vertex_normals
+from pipeline.avatar.bake_views import View, footprint_m, pixel_trust, seen_depth, vertex_normals
 from pipeline.geometry.atlas import Texels
 
 ALTERNATIONS = 8
@@ -60,7 +60,7 @@ def observe_vertices(views: Iterable[View], surface: Surface, config: BakeConfig
     vertices = surface.texels.columns
     for view in views:
         depth_m = seen_depth(view, surface.faces)
-        trust = pixel_trust(view.mask, depth_m.numpy(), config.edge_px)
+        trust = pixel_trust(view.mask, depth_m.numpy(), config.edge_m / footprint_m(view))
         colour, weight = observe(view, surface, view.image.astype(np.float32) / 255.0, trust, depth_m, config)
         seen = (weight > 0).numpy()
         normal = vertex_normals(view.vertices_world, surface.faces).numpy()[vertices[seen]]

@@ -31,7 +31,7 @@ def baked_colours(ball: PaintedBall, **options: float) -> tuple[np.ndarray, np.n
 
 
 def test_the_paint_comes_back_where_it_was_seen(ball: PaintedBall) -> None:
-    colour, weight = baked_colours(ball, rounds=3, largest_flow_px=0.0)
+    colour, weight = baked_colours(ball, rounds=3, largest_flow_m=0.0)
     seen = weight > 2.0
     error = np.abs(colour - ball.truth)[seen]
     assert seen.mean() > 0.15
@@ -40,7 +40,7 @@ def test_the_paint_comes_back_where_it_was_seen(ball: PaintedBall) -> None:
 
 
 def test_rounds_undo_the_blur_of_pixels(ball: PaintedBall) -> None:
-    colours = [baked_colours(ball, rounds=rounds, largest_flow_px=0.0) for rounds in (0, 2)]
+    colours = [baked_colours(ball, rounds=rounds, largest_flow_m=0.0) for rounds in (0, 2)]
     before, after = (np.abs(colour - ball.truth)[weight > 2.0].mean() for colour, weight in colours)
     assert after < 0.25 * before
 

@@ -82,7 +82,7 @@ def test_vertices_are_observed_at_their_own_colour() -> None:
     count = len(ball.mesh.vertices)
     faces = torch.from_numpy(ball.mesh.faces)
     surface = Surface(faces, faces, torch.zeros(count, 2), corner_texels(ball.mesh.faces, count))
-    seen = observe_vertices(ball.views, surface, BakeConfig(edge_px=2.0))
+    seen = observe_vertices(ball.views, surface, BakeConfig(edge_m=0.015))
     sure = seen.weight > 0.3
     assert sure.sum() > 200
     assert np.abs(seen.colour - paint_of(ball.mesh.vertices[seen.vertex]))[sure].mean() < 0.02

@@ -22,7 +22,7 @@ from tests.io.test_gltf import Player
 from tests.stages.painted_run import FPS, make_run
 from tests.tools.khronos import validator_issues
 
-OPTIONS = {"largest_px": 512, "rounds": 1, "edge_px": 1.5}
+OPTIONS = {"largest_px": 512, "rounds": 1, "edge_m": 0.01}
 HELD_OUT = 8
 
 

@@ -1,0 +1,25 @@
+"""Blender for tests: `bpy` from PyPI in an environment of its own, as it pins its own numpy; skips where it is not."""
+
+import json
+import os
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+
+def blender_finds(glb: Path, picture: Path, seconds: float) -> dict[str, Any]:
+    """What Blender finds in a .glb at a time of its animation; also renders `picture` for a person to judge.
+
+    BLENDER_PYTHON names the Python that can `import bpy` (`python3.11 -m venv DIR && DIR/bin/pip install bpy`).
+    """
+    python = os.environ.get("BLENDER_PYTHON", "")
+    if not Path(python).is_file():
+        pytest.skip("BLENDER_PYTHON does not name a Python with bpy")
+    script = Path(__file__).with_name("blender_import.py")
+    command = [python, script, glb, picture, str(seconds)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
+    found = [line for line in done.stdout.splitlines() if line.startswith("FOUND ")]
+    assert found, done.stderr[-2000:]
+    return json.loads(found[0].removeprefix("FOUND "))
