@@ -1,7 +1,7 @@
 """Run by the Python that has Blender (`bpy` from PyPI, in an environment of its own), not by the project's.
 
-python blender_import.py avatar.glb picture.png [seconds]: imports the file, goes to that time, renders a picture, prints
-what it found as JSON.
+python blender_import.py avatar.glb picture.png [seconds]: imports the file, goes to that time, renders a picture and
+prints what it found as JSON.
 """
 
 import json
