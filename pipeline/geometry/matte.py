@@ -25,7 +25,7 @@ _PRIOR_RAMP = 0.2
 _LEAST_WEIGHT = 1.0 / 169.0
 # A backdrop is painted when this share of the pixels away from the person is within two levels of one colour.
 _PAINTED_SHARE, _PAINTED_LEVELS = 0.95, 2
-_RIM_PX = 2
+_RIM_PX = 2.0
 # Parts smaller than this share of the person are specks, holes smaller than this share are noise.
 _SPECK_SHARE, _HOLE_SHARE = 0.05, 2e-4
 
