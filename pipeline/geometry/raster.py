@@ -8,8 +8,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pipeline.geometry.camera import Camera, project
+from pipeline.kernels.interpolate import interpolate
 from pipeline.kernels.raster import antialias, rasterize
-from pipeline.kernels.reference.raster import pixel_centres_px, weighted_inverse_depth
 
 
 def face_adjacency(faces: Int[Tensor, "f 3"]) -> Int[Tensor, "f 3"]:
@@ -27,24 +27,6 @@ def face_adjacency(faces: Int[Tensor, "f 3"]) -> Int[Tensor, "f 3"]:
     neighbour = torch.full((len(edges),), -1, dtype=torch.int64, device=faces.device)
     neighbour[left], neighbour[right] = right // 3, left // 3
     return neighbour.view(-1, 3)
-
-
-def interpolate_covered(
-    face_id: Int[Tensor, "h w"],
-    vertices_px: Float[Tensor, "v 2"],
-    depth_m: Float[Tensor, "v"],
-    faces: Int[Tensor, "f 3"],
-    attributes: Float[Tensor, "v c"],
-) -> tuple[Int[Tensor, "n"], Float[Tensor, "n c"]]:
-    """Row-major numbers of the pixels where a face is seen, and the attributes there. Differentiable in positions,
-    depth, attributes."""
-    width = face_id.shape[1]
-    covered = torch.nonzero(face_id.reshape(-1) >= 0).squeeze(1)
-    corner = faces.long()[face_id.reshape(-1)[covered].long()]
-    q = weighted_inverse_depth(
-        vertices_px[corner], depth_m[corner], pixel_centres_px(covered, width, vertices_px.dtype)
-    )
-    return covered, ((q / q.sum(1, keepdim=True))[..., None] * attributes[corner]).sum(1)
 
 
 def render_shaded(
@@ -66,8 +48,9 @@ def render_shaded(
     vertices_px, depth_m = project(vertices_world, camera)
     face_id, _, depth = rasterize(vertices_px, depth_m, faces, camera.height, camera.width)
     adjacency = face_adjacency(faces) if adjacency is None else adjacency
-    covered, values = interpolate_covered(face_id, vertices_px, depth_m, faces, attributes)
-    shaded = shade(values)
+    covered = torch.nonzero(face_id.reshape(-1) >= 0).squeeze(1)
+    face_of = face_id.reshape(-1)[covered]
+    shaded = shade(interpolate(covered, face_of, camera.width, vertices_px, depth_m, faces, attributes))
     with_alpha = torch.cat([shaded, torch.ones_like(shaded[:, :1])], dim=1)
     flat = torch.zeros(face_id.numel(), with_alpha.shape[1], dtype=with_alpha.dtype, device=with_alpha.device)
     image = flat.index_copy(0, covered, with_alpha).view(*face_id.shape, -1)
