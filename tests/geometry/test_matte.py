@@ -63,6 +63,14 @@ def test_the_gap_between_arm_and_trunk_stays():
     assert matte.sharpen_mask(composite(alpha), detector_mask(alpha))[gap].max() < 0.5
 
 
+def test_a_trim_in_the_walls_colour_stays_with_the_person():
+    alpha = figure()
+    image = np.where(alpha[..., None] > 0.5, np.uint8([190, 40, 40]), np.uint8([200, 205, 200])).astype(np.uint8)
+    image[150:156][alpha[150:156] > 0.5] = (235, 235, 230)
+    sharp = matte.sharpen_mask(image, detector_mask(alpha, shift_px=0))
+    assert sharp[150:156, 130:190].min() > 0.5
+
+
 def test_without_a_person_the_mask_is_empty():
     assert not matte.sharpen_mask(composite(figure()), np.zeros((320, 320), np.uint8)).any()
 
