@@ -85,7 +85,7 @@ def below_neckline(points_m: Float[np.ndarray, "n 3"], anatomy: Anatomy) -> Floa
     """Depth below a crew neck: a plane through the root of the neck that falls towards the front."""
     normal = np.array([0.0, 1.0, 0.62]) / np.hypot(1.0, 0.62)
     root = anatomy.joints_m["Neck"] + np.array([0.0, 0.012, 0.0])
-    return (root - points_m) @ normal
+    return _dot(root - points_m, normal)
 
 
 def _inside_sleeve(points_m: Float[np.ndarray, "n 3"], anatomy: Anatomy, outfit: Outfit) -> Float[np.ndarray, "n"]:
@@ -96,7 +96,7 @@ def _inside_sleeve(points_m: Float[np.ndarray, "n 3"], anatomy: Anatomy, outfit:
     for side, rows in (("Left", is_left), ("Right", ~is_left)):
         shoulder, elbow = joints[f"{side}Arm"], joints[f"{side}ForeArm"]
         length = np.linalg.norm(elbow - shoulder)
-        along = (points_m[rows] - shoulder) @ (elbow - shoulder) / length
+        along = _dot(points_m[rows] - shoulder, elbow - shoulder) / length
         depth[rows] = outfit.sleeve_fraction * length - along
     return depth
 
@@ -109,3 +109,8 @@ def _inside_hair(points_m: Float[np.ndarray, "n 3"], anatomy: Anatomy) -> Float[
     nape = points_m[:, 1] - (anatomy.mouth_m[1] + 0.012)
     beside_ear = np.linalg.norm((points_m[:, None] - anatomy.ears_m) / np.array([2.0, 1.0, 0.72]), axis=2).min(axis=1)
     return np.minimum(np.minimum(hairline, nape), beside_ear - 0.037)
+
+
+def _dot(points: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n"]:
+    """Inner products, summed in one order: the last bits of a BLAS product depend on the number of threads."""
+    return points[:, 0] * direction[0] + points[:, 1] * direction[1] + points[:, 2] * direction[2]
