@@ -3,12 +3,13 @@
 import math
 
 import numpy as np
-import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from pipeline.geometry.camera import Camera, project
 from pipeline.kernels.raster import rasterize
+from pipeline.kernels.reference.shade import sample_texture_reference
+from pipeline.kernels.shade import shade_texture
 
 
 def sample_texture(texture: Float[Tensor, "th tw c"], uv: Float[Tensor, "n 2"]) -> Float[Tensor, "n c"]:
@@ -19,11 +20,7 @@ def sample_texture(texture: Float[Tensor, "th tw c"], uv: Float[Tensor, "n 2"]) 
     >>> sample_texture(torch.tensor([[[1.0], [0.0]]]), torch.tensor([[0.25, 0.5], [0.5, 0.5]])).tolist()
     [[1.0], [0.5]]
     """
-    grid = torch.stack([2.0 * uv[:, 0] - 1.0, 1.0 - 2.0 * uv[:, 1]], dim=-1)
-    sampled = torch.nn.functional.grid_sample(
-        texture.permute(2, 0, 1)[None], grid[None, None], mode="bilinear", padding_mode="border", align_corners=False
-    )
-    return sampled[0, :, 0].T
+    return sample_texture_reference(texture, uv)
 
 
 def render_textured(
@@ -45,12 +42,7 @@ def render_textured(
     fine = camera.scaled(float(samples))
     vertices_px, depth_m = project(vertices_world, fine)
     face_id, barycentric, _ = rasterize(vertices_px, depth_m, faces, fine.height, fine.width)
-    seen = face_id >= 0
-    corners_uv = uv[faces_uv.long()[face_id[seen].long()]]
-    colour = sample_texture(texture, (barycentric[seen][..., None] * corners_uv).sum(dim=1))
-    image = torch.zeros(fine.height, fine.width, texture.shape[2] + 1, dtype=texture.dtype)
-    image[seen] = torch.cat([colour, torch.ones_like(colour[:, :1])], dim=1)
-    return image.view(camera.height, samples, camera.width, samples, -1).mean(dim=(1, 3))
+    return shade_texture(face_id, barycentric, faces_uv, uv, texture, samples)
 
 
 def turntable_camera(
