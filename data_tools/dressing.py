@@ -28,7 +28,7 @@ TOE_BOX_HEIGHT_M = 0.075
 SHOE_M = 0.008
 """Thickness of the shoes' upper."""
 
-_HULL_ROUNDS = 40
+_HULL_ROUNDS = 10
 _SMOOTHING_ROUNDS = {"shoes": 2, "trousers": 24, "shirt": 40, "hair": 6}
 
 
@@ -101,7 +101,7 @@ def _with_toe_boxes(
         on_foot = skin_vertices & (np.abs(bare_m[:, 0] - ankle[0]) < 0.15) & (bare_m[:, 1] < TOE_BOX_HEIGHT_M)
         hull = ConvexHull(bare_m[on_foot]).equations
         for _ in range(_HULL_ROUNDS):
-            vertices = np.where(on_foot[:, None], smoothed(vertices, mean, 1), vertices)
+            vertices = np.where(on_foot[:, None], smoothed(vertices, mean, 4), vertices)
             vertices[on_foot] = _onto_hull(vertices[on_foot], hull, toes)
     return vertices
 
