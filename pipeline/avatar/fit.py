@@ -36,8 +36,9 @@ MINIMUM_FRAMES = 3
 LANDMARK_STEPS = 12
 OUTLINE_STEPS = 3
 POSE_ROUNDS = 3
-OUTLINE_LANDMARK_M = 0.04
-"""Standard deviation of a landmark once outlines help: they are the more exact of the two."""
+OUTLINE_LANDMARK_M = 0.06
+OUTLINE_DIRECTION_M = 0.2
+"""Standard deviations of a landmark in the image and in 3D once outlines help, which err less and in no fixed way."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +148,7 @@ def _fit_shared(
     weights = replace(weights, free_offsets=True, free_focal=not options.focal_known)
     model = linearise(tools.body, state.shape)
     state, system = _minimised(tools, model, observations, weights, state, LANDMARK_STEPS)
-    weights = replace(weights, landmark_m=OUTLINE_LANDMARK_M)
+    weights = replace(weights, landmark_m=OUTLINE_LANDMARK_M, direction_m=OUTLINE_DIRECTION_M)
     for _ in track(range(options.rounds), "shape and focal length"):
         model = linearise(tools.body, state.shape)
         state, system, _ = _outline_round(tools, model, observations, windows, weights, state)
@@ -164,7 +165,7 @@ def _fit_poses(
     """The pose of every frame with all that is shared held fixed, and each frame's overlap with its mask."""
     weights = replace(weights, free_shape=False, free_offsets=False, free_focal=False)
     model = linearise(tools.body, state.shape)
-    landmarks_only = replace(weights, landmark_m=Weights.landmark_m)
+    landmarks_only = replace(weights, landmark_m=Weights.landmark_m, direction_m=Weights.direction_m)
     state, _ = _minimised(tools, model, observations, landmarks_only, state, OUTLINE_STEPS)
     for _ in track(range(POSE_ROUNDS), "poses"):
         state, _, _ = _outline_round(tools, model, observations, windows, weights, state)

@@ -117,7 +117,7 @@ class Weights:
     motion_cutoff: float = 4.0
     offset_m: float = 0.012
     height_m: float = 1.70
-    height_deviation_m: float = 0.08
+    height_deviation_m: float = 0.05
     focal_log: float = 0.5
     free_shape: bool = True
     free_offsets: bool = False

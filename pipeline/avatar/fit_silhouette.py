@@ -44,13 +44,15 @@ SKIN_CHUNK = 32
 
 @dataclass(frozen=True)
 class Window:
-    """One frame's mask in its matching window: distance to the outline (px of the window, positive outside)."""
+    """One frame's mask in its matching window: signed distance to the outline (window pixels), its unit gradient, and
+    the outline's pixels (row, column)."""
 
     left_px: int
     top_px: int
     scale: float
     mask: Bool[np.ndarray, "h w"]
     distance: Float[np.ndarray, "h w"]
+    normal: Float[np.ndarray, "h w 2"]
     outline: Int[np.ndarray, "q 2"]
     person_px: float
 
@@ -67,7 +69,8 @@ def matching_window(mask: UInt8[np.ndarray, "h w"]) -> Window | None:
     scale = min(1.0, PERSON_ROWS / person)
     size = (max(1, round((right - left) * scale)), max(1, round((bottom - top) * scale)))
     small = cv2.resize(mask[top:bottom, left:right], size, interpolation=cv2.INTER_AREA) > 127
-    return Window(left, top, scale, small, signed_distance(small), outline_pixels(small), person * scale)
+    distance = signed_distance(small)
+    return Window(left, top, scale, small, distance, outward_normals(distance), outline_pixels(small), person * scale)
 
 
 def signed_distance(inside: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
@@ -87,8 +90,9 @@ def outline_pixels(inside: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "q 2"]:
 def outward_normals(distance: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 2"]:
     """Unit gradient (x, y) of a signed distance, smoothed over a few pixels."""
     smooth = cv2.GaussianBlur(distance, (0, 0), 1.5)
-    gradient = np.stack([cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)], axis=-1)
-    return gradient / np.maximum(np.linalg.norm(gradient, axis=-1, keepdims=True), 1e-6)
+    across, down = cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)
+    length = np.maximum(cv2.magnitude(across, down), 1e-6)
+    return np.stack([across / length, down / length], axis=-1)
 
 
 def posed_vertices(model: FitModel, state: FitState) -> Float[Tensor, "n v 3"]:
@@ -149,7 +153,7 @@ def match_outlines(window: Window, drawn: Bool[np.ndarray, "h w"], on_head: Bool
     if len(body_outline) == 0 or len(window.outline) == 0:
         empty = np.zeros((0, 2))
         return Pairs(empty.astype(np.int64), empty, empty, np.zeros(0))
-    mask_normal, body_normal = outward_normals(window.distance), outward_normals(signed_distance(drawn))
+    mask_normal, body_normal = window.normal, outward_normals(signed_distance(drawn))
     reach = REACH * window.person_px
     forward = _thinned(body_outline)
     normal = mask_normal[forward[:, 0], forward[:, 1]]

@@ -20,7 +20,7 @@ EXCHANGE_COST = 0.25
 
 TURN_COST = 2.0
 TURN_FREE_RAD = 0.35
-"""Radians of turning between two frames that cost nothing; a swap looks like a turn of pi."""
+"""Radians of turning between two frames that cost nothing."""
 
 JUMP_COST = 1.5
 """For limbs: cost of moving by the size of the torso between two frames, mean over the limb's landmarks."""
@@ -56,11 +56,16 @@ def two_label_path(
 
 
 def exchanged_bodies(observations: Observations, rest_m: Float[torch.Tensor, "33 3"]) -> Bool[np.ndarray, "n"]:
-    """Frames in which the whole person was taken for one who faces the other way, by the continuity of turning."""
+    """Frames in which the whole person was taken for one who faces the other way, by the continuity of turning.
+
+    Exchanged sides with mirrored depths turn a yaw into pi minus the yaw: a jump in front and back views. In a side view
+    the two agree, and nothing tells them apart.
+    """
     rows = np.flatnonzero(torso_found(observations))
     yaw_rad = facing_yaw(torso_rotations(rest_m, observations.directions_m[rows])).numpy()
-    turn, free = np.diff(yaw_rad), TURN_FREE_RAD * np.diff(rows)
-    same, other = (TURN_COST * np.maximum(np.abs(_wrapped(turn + extra)) - free, 0.0) for extra in (0.0, np.pi))
+    free = TURN_FREE_RAD * np.diff(rows)
+    same = TURN_COST * np.maximum(np.abs(_wrapped(yaw_rad[1:] - yaw_rad[:-1])) - free, 0.0)
+    other = TURN_COST * np.maximum(np.abs(_wrapped(np.pi - yaw_rad[1:] - yaw_rad[:-1])) - free, 0.0)
     unary = np.tile([0.0, EXCHANGE_COST], (len(rows), 1))
     return _spread(two_label_path(unary, same, other), rows, len(observations.time_s))
 

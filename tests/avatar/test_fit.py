@@ -1,0 +1,114 @@
+"""The whole fit on people whose truth is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.avatar.body import load_anny
+from pipeline.avatar.fit import FitOptions, FitResult, fit_body
+from pipeline.avatar.fit_landmarks import PAIRS, mirror_permutation
+from pipeline.geometry.rotation import quaternion_to_matrix
+from pipeline.geometry.skinning import forward_kinematics
+from tests.avatar.acting import Act, act, joint_errors_m
+
+FRAMES = 20
+SHAPE = {"gender": 0.2, "height": 0.45, "weight": 0.65, "upperleg-length": 0.2, "waist-girth": 0.3}
+
+
+def fitted_joints_m(result: FitResult, scene: Act) -> torch.Tensor:
+    joint_to_world = forward_kinematics(
+        quaternion_to_matrix(torch.tensor(result.rotations_wxyz)),
+        torch.tensor(result.root_translation_m),
+        torch.tensor(result.body.joints_m),
+        result.body.parents,
+    )
+    return joint_to_world[:, list(scene.model.full_joint), :3, 3].double()
+
+
+def options(scene: Act, focal_known: bool = True, rounds: int = 4) -> FitOptions:
+    return FitOptions(scene.model.height_m()[0], focal_known, shared_frames=FRAMES, rounds=rounds)
+
+
+@pytest.fixture(scope="module")
+def hurt() -> tuple[Act, FitResult]:
+    """A full turn with noise, five frames seen the wrong way round, three frames unseen and one landmark that jumps."""
+    scene = act(load_anny(), FRAMES, shape=SHAPE, noise_m=0.008)
+    order = mirror_permutation(PAIRS)
+    scene.landmarks_px[10:13] = scene.landmarks_px[10:13][:, order]
+    scene.landmarks_world_m[10:13] = scene.landmarks_world_m[10:13][:, order] * [1.0, 1.0, -1.0]
+    scene.landmarks_px[4] = np.nan
+    scene.landmarks_world_m[4] = np.nan
+    scene.landmarks_px[7, 15] += [60.0, -40.0]
+    return scene, fit_body(load_anny(), scene.observations(scene.camera), scene.windows(), options(scene))
+
+
+def test_joints_are_found_with_known_focal_length(hurt: tuple[Act, FitResult]) -> None:
+    scene, result = hurt
+    aligned, absolute = joint_errors_m(fitted_joints_m(result, scene), scene.joints_m())
+    assert aligned < 0.015
+    assert absolute < 0.030
+    assert np.median(result.overlap) > 0.95
+
+
+def test_exchanged_sides_are_mended_in_a_full_turn(hurt: tuple[Act, FitResult]) -> None:
+    scene, result = hurt
+    assert np.flatnonzero(result.exchanged["whole body"]).tolist() == [10, 11, 12]
+    found, true = fitted_joints_m(result, scene), scene.joints_m()
+    names = [name for name in result.body.joint_names if name in ("LeftUpLeg", "RightUpLeg")]
+    left, right = (list(scene.model.full_joint).index(result.body.joint(name)) for name in sorted(names))
+    across = ((found[:, left] - found[:, right]) * (true[:, left] - true[:, right])).sum(-1)
+    assert (across > 0).all()
+
+
+def test_a_frame_without_landmarks_gets_a_pose_and_is_marked(hurt: tuple[Act, FitResult]) -> None:
+    scene, result = hurt
+    assert np.flatnonzero(np.isnan(result.landmark_error_px)).tolist() == [4]
+    aligned, _ = joint_errors_m(fitted_joints_m(result, scene)[4:5], scene.joints_m()[4:5])
+    assert aligned < 0.06
+
+
+def test_fast_motion_is_not_frozen(hurt: tuple[Act, FitResult]) -> None:
+    """Accelerations of the hands stay within half of the true ones (root mean square)."""
+    scene, result = hurt
+    hand = list(scene.model.full_joint).index(result.body.joint("LeftHand"))
+
+    def jitter(joints: torch.Tensor) -> float:
+        return float(torch.diff(joints[:, hand], n=2, dim=0).square().mean().sqrt())
+
+    ratio = jitter(fitted_joints_m(result, scene)) / jitter(scene.joints_m())
+    assert 0.7 < ratio < 1.5
+
+
+def test_quaternions_are_unit_and_continuous(hurt: tuple[Act, FitResult]) -> None:
+    _, result = hurt
+    assert np.allclose(np.linalg.norm(result.rotations_wxyz, axis=-1), 1.0, atol=1e-5)
+    assert ((result.rotations_wxyz[1:] * result.rotations_wxyz[:-1]).sum(-1) >= 0).all()
+
+
+def test_unknown_focal_length_is_found() -> None:
+    scene = act(load_anny(), FRAMES, shape=SHAPE, noise_m=0.004)
+    start = replace(scene.camera, fx=384.0, fy=384.0)
+    result = fit_body(load_anny(), scene.observations(start), scene.windows(), options(scene, False, rounds=6))
+    assert result.camera.fx == pytest.approx(scene.camera.fx, rel=0.10)
+    assert 0.0 < result.focal_deviation < 0.3
+    aligned, _ = joint_errors_m(fitted_joints_m(result, scene), scene.joints_m())
+    assert aligned < 0.025
+
+
+def test_the_same_input_gives_the_same_bytes() -> None:
+    scene = act(load_anny(), 8)
+    results = [
+        fit_body(load_anny(), scene.observations(scene.camera), scene.windows(), options(scene, rounds=1))
+        for _ in range(2)
+    ]
+    assert results[0].rotations_wxyz.tobytes() == results[1].rotations_wxyz.tobytes()
+    assert results[0].body.vertices.tobytes() == results[1].body.vertices.tobytes()
+
+
+def test_too_few_landmarks_are_refused() -> None:
+    scene = act(load_anny(), 4)
+    scene.landmarks_px[2:] = np.nan
+    with pytest.raises(ValueError, match="fewer than 3 frames"):
+        fit_body(load_anny(), scene.observations(scene.camera), scene.windows(), options(scene))

@@ -1,0 +1,79 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from pipeline.avatar.body import load_anny
+from pipeline.avatar.fit_landmarks import OFFSET_COUNT, landmark_regressor
+from pipeline.avatar.fit_model import ACTIVE_JOINTS, linearise, pose_skeleton
+from pipeline.avatar.fit_objective import FitState, Objective, Weights, facing_factor, image_scale
+from pipeline.avatar.fit_priors import joint_prior, shape_prior
+from pipeline.avatar.fit_silhouette import match_all
+from pipeline.geometry.rotation import axis_angle_to_matrix
+from tests.avatar.acting import act
+
+FRAMES = 4
+NUMBERS = 3 * len(ACTIVE_JOINTS) + 3
+# Without motion, whose derivative is of first order in the turn between frames, the gradient is exact.
+EXACT = Weights(free_offsets=True, free_focal=True, motion_rad=1e3, motion_m=1e3)
+
+
+def build(weights: Weights, outlines: bool = True) -> tuple[Objective, FitState]:
+    """An objective near, not at, its minimum."""
+    body = load_anny()
+    scene = act(body, FRAMES, turn_rad=0.6, noise_m=0.02)
+    model = linearise(body, body.shape_defaults)
+    generator = torch.Generator().manual_seed(5)
+    step = 0.03 * torch.randn(FRAMES, NUMBERS, generator=generator, dtype=torch.float64)
+    shared = 0.01 * torch.randn(len(model.shape) + OFFSET_COUNT + 1, generator=generator, dtype=torch.float64)
+    state = scene.state.moved(step, shared)
+    observations = scene.observations(scene.camera)
+    contour = match_all(model, state, observations, scene.windows())[0] if outlines else None
+    scale = image_scale(state, scene.camera)
+    priors = joint_prior(model), shape_prior(body.shape_names, body.shape_defaults)
+    return Objective(model, landmark_regressor(model), *priors, observations, weights, scale, contour), state
+
+
+@pytest.mark.parametrize("weights", [EXACT, replace(EXACT, free_shape=False, free_offsets=False, free_focal=False)])
+def test_gradient_agrees_with_differences_of_the_cost(weights: Weights) -> None:
+    objective, state = build(weights)
+    system = objective(state)
+    generator = torch.Generator().manual_seed(6)
+    by_frame = torch.randn(FRAMES, NUMBERS, generator=generator, dtype=torch.float64)
+    by_shared = 0.1 * torch.randn(len(system.shared_gradient), generator=generator, dtype=torch.float64)
+    ahead = objective(state.moved(1e-6 * by_frame, 1e-6 * by_shared)).cost
+    behind = objective(state.moved(-1e-6 * by_frame, -1e-6 * by_shared)).cost
+    slope = 2.0 * float((system.frame_gradient * by_frame).sum() + system.shared_gradient @ by_shared)
+    # the surface's derivative by shape is that of the nearest corner, hence the tolerance
+    assert (ahead - behind) / 2e-6 == pytest.approx(slope, rel=5e-3)
+
+
+def test_gradient_of_motion_is_right_for_small_turns() -> None:
+    objective, state = build(Weights(landmark_m=1e3, direction_m=1e3, free_shape=False), outlines=False)
+    system = objective(state)
+    generator = torch.Generator().manual_seed(7)
+    by_frame = torch.randn(FRAMES, NUMBERS, generator=generator, dtype=torch.float64)
+    nothing = torch.zeros(0, dtype=torch.float64)
+    ahead, behind = (objective(state.moved(sign * 1e-6 * by_frame, nothing)).cost for sign in (1.0, -1.0))
+    slope = 2.0 * float((system.frame_gradient * by_frame).sum())
+    assert (ahead - behind) / 2e-6 == pytest.approx(slope, rel=0.05)
+
+
+def test_the_truth_costs_less_than_its_neighbourhood() -> None:
+    objective, wrong = build(Weights(motion_rad=1e3, motion_m=1e3), outlines=False)
+    scene = act(load_anny(), FRAMES, turn_rad=0.6)
+    objective = replace(objective, observations=scene.observations(scene.camera))
+    assert objective(scene.state).cost < 0.5 * objective(wrong).cost
+
+
+def test_faces_seen_from_behind_are_not_trusted() -> None:
+    body = load_anny()
+    scene = act(body, 3)
+    turned = torch.tensor([0.0, torch.pi / 2, torch.pi], dtype=torch.float64)
+    angles = torch.zeros(3, len(ACTIVE_JOINTS), 3, dtype=torch.float64)
+    angles[:, 0, 1] = turned
+    factor = facing_factor(pose_skeleton(scene.model, axis_angle_to_matrix(angles), scene.state.root_m), scene.camera)
+    assert torch.allclose(factor[0], torch.ones(33, dtype=torch.float64))
+    assert factor[2, 0] == pytest.approx(0.05)
+    assert 0.05 < factor[1, 0] < 1.0
+    assert torch.equal(factor[:, 11:], torch.ones(3, 22, dtype=torch.float64))
