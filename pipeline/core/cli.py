@@ -121,7 +121,7 @@ def _open_run(run_dir: Path, options: argparse.Namespace, replace_video: bool) -
     with run_lock(run_dir) as lock_fd:
         try:
             yield record, lock_fd
-        except (UserError, StageFailed):
+        except (UserError, StageFailed, OSError, MemoryError):
             if is_new and {path.name for path in run_dir.iterdir()} <= {RUN_FILE, ".lock"}:
                 for path in list(run_dir.iterdir()):
                     path.unlink()

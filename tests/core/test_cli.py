@@ -176,3 +176,13 @@ def wait_for(path: Path, patience_s: float = 30.0) -> None:
     while not path.exists():
         assert time.monotonic() < deadline, f"{path} did not appear"
         time.sleep(0.02)
+
+
+def test_a_full_disk_is_one_sentence_and_leaves_nothing(toy: Toy) -> None:
+    full = "import errno, pathlib, sys, stages.read as read; from stages import CONFIG_DIR\n"
+    full += "def write(*arguments, **options): raise OSError(errno.ENOSPC, 'full')\n"
+    full += "pathlib.Path.write_text = write\n"
+    full += "raise SystemExit(read.main(read.STAGE, ['runs/a', '--video', 'numbers.txt'], CONFIG_DIR))"
+    (toy.folder / "full.py").write_text(full)
+    assert "the disk is full: free some space" in toy.refusal("full")
+    assert not toy.run_dir.exists()
