@@ -1,0 +1,107 @@
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from pipeline.avatar.body import load_anny
+from pipeline.core.errors import UserError
+from pipeline.core.progress import take_warnings
+from pipeline.geometry.camera import Camera
+from pipeline.io.capture import IMAGES_FOLDER, MASKS_FOLDER, Capture, image_path, load_capture, mask_path, save_capture
+from pipeline.io.image import read_rgb, write_gray, write_rgb
+from pipeline.io.npz import load_body, load_camera, load_motion, load_npz
+from stages.body import STAGE, Config, run, starting_camera
+from tests.avatar.acting import Act, act
+
+FRAMES = 8
+
+
+@pytest.fixture(scope="module")
+def scene() -> Act:
+    return act(load_anny(), FRAMES, turn_rad=2.0, noise_m=0.005)
+
+
+def write_capture(folder, scene: Act, camera: Camera | None, masks: list[np.ndarray]) -> None:
+    """What the frames stage would write of a scene: grey pictures, masks, landmarks."""
+    for name in (IMAGES_FOLDER, MASKS_FOLDER):
+        (folder / name).mkdir(parents=True)
+    index = 3 * np.arange(FRAMES, dtype=np.int32)
+    for position, mask in enumerate(masks):
+        write_gray(mask_path(folder, int(index[position])), mask)
+        write_rgb(image_path(folder, int(index[position])), np.repeat(mask[..., None] // 3 + 60, 3, axis=2))
+    save_capture(
+        Capture(
+            folder=folder,
+            frame_index=index,
+            time_s=scene.time_s,
+            split=np.zeros(FRAMES, dtype=np.uint8),
+            fps=10.0,
+            width=scene.camera.width,
+            height=scene.camera.height,
+            landmarks_px=scene.landmarks_px.astype(np.float32),
+            landmarks_visibility=np.ones((FRAMES, 33), dtype=np.float32),
+            landmarks_world_m=scene.landmarks_world_m.astype(np.float32),
+            camera=camera,
+            mask_source="truth",
+            n_video_frames=3 * FRAMES,
+            scale=1.0,
+        )
+    )
+
+
+def test_stage_writes_body_motion_camera_scores_and_overlay(tmp_path, scene: Act) -> None:
+    frames, out = tmp_path / "frames", tmp_path / "body"
+    out.mkdir()
+    write_capture(frames, scene, scene.camera, scene.masks())
+    metrics = run({"frames": frames}, out, Config(height_m=scene.model.height_m()[0], rounds=2))
+    assert {path.name for path in out.iterdir()} == set(STAGE.makes)
+    assert metrics["silhouette_iou"] > 0.94
+    assert metrics["landmark_error_px"] < 4.0
+    assert metrics["focal_px"] == scene.camera.fx
+    assert metrics["exchanged_frames"] == 0
+    motion, body = load_motion(out / "motion.npz"), load_body(out / "body.npz")
+    assert np.array_equal(motion.frame_index, 3 * np.arange(FRAMES))
+    assert np.abs(motion.root_translation_m - scene.state.root_m.numpy()).max() < 0.05
+    assert body.height_m() == pytest.approx(scene.model.height_m()[0], abs=0.03)
+    assert load_camera(out / "camera.npz").fx == scene.camera.fx
+    assert load_npz(out / "scores.npz")["silhouette_iou"].shape == (FRAMES,)
+    assert read_rgb(out / "overlay.png").std() > 10
+    assert take_warnings() == []
+
+
+def test_masks_of_something_else_are_refused_with_a_remedy(tmp_path, scene: Act) -> None:
+    frames, out = tmp_path / "frames", tmp_path / "body"
+    out.mkdir()
+    elsewhere = np.zeros((scene.camera.height, scene.camera.width), dtype=np.uint8)
+    elsewhere[280:315, 5:250] = 255
+    write_capture(frames, scene, scene.camera, [elsewhere] * FRAMES)
+    with pytest.raises(UserError, match=r"does not fit the person .* body.min_overlap"):
+        run({"frames": frames}, out, Config(rounds=1))
+
+
+def test_landmarks_without_depth_are_refused_with_a_remedy(tmp_path, scene: Act) -> None:
+    frames, out = tmp_path / "frames", tmp_path / "body"
+    out.mkdir()
+    flat = act(load_anny(), FRAMES)
+    flat.landmarks_world_m[:] = np.nan
+    write_capture(frames, flat, flat.camera, scene.masks())
+    with pytest.raises(UserError, match="landmarks_world_m"):
+        run({"frames": frames}, out, Config())
+
+
+def test_camera_supplied_then_given_then_guessed(tmp_path, scene: Act) -> None:
+    for name, camera in (("known", scene.camera), ("unknown", None)):
+        write_capture(tmp_path / name, scene, camera, [])
+    known, unknown = (load_capture(tmp_path / name) for name in ("known", "unknown"))
+    assert starting_camera(known, Config(field_of_view_deg=90.0)) == (known.camera, True)
+    camera, sure = starting_camera(unknown, Config(field_of_view_deg=90.0))
+    assert sure
+    assert camera.fx == pytest.approx(0.5 * scene.camera.height)
+    camera, sure = starting_camera(unknown, Config(usual_focal=1.5))
+    assert not sure
+    assert camera.fx == pytest.approx(1.5 * scene.camera.height)
+
+
+@pytest.mark.parametrize("values", [{"height_m": 30.0}, {"rounds": 0}, {"min_overlap": 2.0}, {"heigth_m": 1.7}])
+def test_values_out_of_range_and_typos_are_refused(values: dict) -> None:
+    with pytest.raises(ValidationError):
+        Config(**values)
