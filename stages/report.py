@@ -43,8 +43,9 @@ class Config(BaseConfig):
         3, ge=1, le=8, description="texture look-ups along each side of a pixel when the mesh is drawn"
     )
     unrefined: bool = Field(
-        True, description="score renders in the body stage's poses as well, without the field's corrections"
+        True, description="score the mesh in the body stage's poses as well, without the field's corrections"
     )
+    unrefined_field: bool = Field(False, description="score the field in those poses too; doubles the report's time")
     shown_frames: int = Field(8, ge=1, le=64, description="held-out frames that the page shows; all are scored")
     views: int = Field(8, ge=2, le=36, description="sides from which the turntable shows the avatar")
     view_height_px: int = Field(480, ge=64, le=2048, description="height of a turntable picture, px")
@@ -105,7 +106,9 @@ def score(
         "mesh": (draw_mesh, loaded.refined),
     }
     if config.unrefined:
-        draws |= {"field_unrefined": (loaded.draw_field, loaded.fitted), "mesh_unrefined": (draw_mesh, loaded.fitted)}
+        draws["mesh_unrefined"] = (draw_mesh, loaded.fitted)
+    if config.unrefined_field:
+        draws["field_unrefined"] = (loaded.draw_field, loaded.fitted)
     shown = set(positions[np.linspace(0, len(positions) - 1, config.shown_frames).round().astype(int)].tolist())
     rows, pictures = [], []
     for position in track(positions.tolist(), "held-out frames"):

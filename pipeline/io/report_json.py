@@ -48,7 +48,7 @@ def build_report(
         "peak_rss_mib": peaks | {"total": max(peaks.values())},
         "heldout": {name: mean_scores([row[name] for row in frames]) for name in renders}
         | {
-            "protocol": protocol + UNREFINED if "mesh_unrefined" in renders else protocol,
+            "protocol": protocol + UNREFINED if {"field_unrefined", "mesh_unrefined"} & set(renders) else protocol,
             "frames": list(frames),
         },
         **{name: dict(section) for name, section in figures.items()},

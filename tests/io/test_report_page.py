@@ -105,7 +105,6 @@ def test_figures_are_short(value: object, text: str):
     assert figure_text(value) == text
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
 def test_a_browser_shows_the_avatar(page: str, tmp_path: Path):
     """The viewer marks itself ready only after the model was read and drawn."""

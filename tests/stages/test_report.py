@@ -71,6 +71,11 @@ def test_poses_without_refinement_score_worse(report: dict):
     assert heldout["mesh_unrefined"]["psnr_body"] < heldout["mesh"]["psnr_body"] - 1
 
 
+def test_the_field_without_refinement_is_scored_only_on_request(report: dict):
+    assert "field_unrefined" not in report["heldout"]
+    assert "mesh_unrefined" in report["heldout"]["frames"][0]
+
+
 def test_an_untrained_field_is_worse_than_the_mesh(report: dict):
     assert report["heldout"]["field"]["psnr_body"] < report["heldout"]["mesh"]["psnr_body"]
 
