@@ -1,11 +1,13 @@
 """Stage two: a watertight, manifold mesh of the canonical field, refined against the video."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from pydantic import Field
+from torch import Tensor
 
 from pipeline.avatar.body import Body, canonical_to_world
 from pipeline.avatar.extract import (
@@ -16,10 +18,10 @@ from pipeline.avatar.extract import (
     simplify,
     transfer_skin_weights,
 )
-from pipeline.avatar.mesh_views import Shade, View, crop_view, pixel_footprint_m, silhouette_iou, skin_of
-from pipeline.avatar.refine import RefineConfig, Refined, refine
+from pipeline.avatar.mesh_optimise import RefineConfig, RefineTask
+from pipeline.avatar.mesh_views import View, crop_view, pixel_footprint_m, silhouette_iou, skin_of
+from pipeline.avatar.refine import Refined, refine
 from pipeline.avatar.turntable import turntable_sheet
-from pipeline.core.atomic import atomic_path
 from pipeline.core.cli import main
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track, warn
@@ -27,13 +29,13 @@ from pipeline.core.stage import Stage
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import top_k_weights
 from pipeline.io.capture import load_capture
-from pipeline.io.checkpoint import load_field, load_occupancy
+from pipeline.io.checkpoint import load_field, load_occupancy, load_tensors, save_tensors
 from pipeline.io.image import write_rgb
-from pipeline.io.npz import load_body, load_camera, load_motion, load_npz, save_npz
+from pipeline.io.npz import load_body, load_camera, load_motion, save_npz
 from pipeline.metrics.health import mesh_health
 
 TRAIN, VALIDATION = 0, 1
-CHECKPOINT = "checkpoint_round.npz"
+CHECKPOINT, APPEARANCE = "checkpoint_round.safetensors", "appearance."
 
 
 class Config(ExtractConfig, RefineConfig):
@@ -53,7 +55,7 @@ class Config(ExtractConfig, RefineConfig):
 def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, float]:
     """Extracts, refines and writes `mesh.npz` and `preview.png`."""
     body = load_body(inputs["body"] / "body.npz")
-    field = load_field(inputs["field"] / "field.safetensors").requires_grad_(False)
+    field = load_field(inputs["field"] / "field.safetensors").requires_grad_(config.appearance_rate > 0.0)
     occupancy = load_occupancy(inputs["field"] / "occupancy.npz")
     train, validation = (load_views(inputs, body, split, config) for split in (TRAIN, VALIDATION))
     if not train:
@@ -61,40 +63,45 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     if not validation:
         warn("there are no validation frames: the level and every round are kept without being judged")
 
-    def shade(points_m: torch.Tensor) -> torch.Tensor:
-        return field(points_m)[0]
-
     footprint_m = float(np.median([pixel_footprint_m(view, body.vertices, body.skin_weights) for view in train]))
     edge_m = float(np.clip(config.edge_px * footprint_m, config.min_edge_m, config.max_edge_m))
-    start, level_per_m = _resume(out / CHECKPOINT), float("nan")
+    start = load_state(out / CHECKPOINT)
     if start is None:
-        samples = sample_canonical(lambda points: field.density(points) * occupancy.contains(points), body, config)
         judged = (validation or train)[:: max(1, len(validation or train) // config.level_frames)]
-        level_per_m, _ = choose_level(
-            samples, config, config.levels_per_m, lambda mesh: silhouette_iou(mesh, skin_of(mesh, body), judged)
-        )
-        start = simplify(extract_mesh(samples, level_per_m, config), edge_m)
-    refined = refine(
-        start,
-        body,
-        (train, validation),
-        shade,
-        edge_m,
-        config,
-        config.seed,
-        lambda state: _save(out / CHECKPOINT, state),
-    )
-    _write(out, refined.mesh, body, shade)
-    health = {key: float(value) for key, value in mesh_health(refined.mesh).items()}
+
+        def density_of(points_m: Tensor) -> Tensor:
+            return field.density(points_m) * occupancy.contains(points_m)
+
+        start = simplify(first_mesh(density_of, body, judged, config), edge_m)
+    task = RefineTask(body, train, validation, SurfaceColour(field), edge_m, config, config.seed)
+    refined = refine(start, task, lambda state: save_state(out / CHECKPOINT, state))
+    write_results(out, refined.mesh, task)
     psnr_db = {"psnr_db_extracted": refined.validation_psnr_db[0], "psnr_db_refined": refined.validation_psnr_db[-1]}
     iou = silhouette_iou(refined.mesh, skin_of(refined.mesh, body), validation)
-    return {
-        **health,
-        **psnr_db,
-        "silhouette_iou": iou,
-        "edge_m": edge_m,
-        "rounds_kept": len(refined.validation_psnr_db) - 1.0,
-    }
+    health = {key: float(value) for key, value in mesh_health(refined.mesh).items()}
+    kept = len(refined.validation_psnr_db) - 1.0
+    return {**health, **psnr_db, "silhouette_iou": iou, "edge_m": edge_m, "rounds_kept": kept}
+
+
+class SurfaceColour(torch.nn.Module):
+    """The field's colours alone; its parameters are refined with the mesh."""
+
+    def __init__(self, field: torch.nn.Module) -> None:
+        super().__init__()
+        self.field = field
+
+    def forward(self, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Colours in [0, 1] at canonical points."""
+        return self.field(points_m)[0]
+
+
+def first_mesh(density_of: Callable[[Tensor], Tensor], body: Body, judged: Sequence[View], config: Config) -> Mesh:
+    """The density's surface at the level whose silhouettes fit the judged views best."""
+    samples = sample_canonical(density_of, body, config)
+    level_per_m, _ = choose_level(
+        samples, config, config.levels_per_m, lambda mesh: silhouette_iou(mesh, skin_of(mesh, body), judged)
+    )
+    return extract_mesh(samples, level_per_m, config)
 
 
 def load_views(inputs: Mapping[str, Path], body: Body, split: int, config: Config) -> list[View]:
@@ -110,37 +117,37 @@ def load_views(inputs: Mapping[str, Path], body: Body, split: int, config: Confi
     ]
 
 
-def _save(path: Path, state: Refined) -> None:
-    with atomic_path(path) as unfinished:
-        save_npz(
-            unfinished,
-            {
-                "vertices": state.mesh.vertices,
-                "faces": state.mesh.faces,
-                "rounds_done": np.int64(state.rounds_done),
-                "validation_psnr_db": np.array(state.validation_psnr_db),
-                "finished": np.bool_(state.finished),
-            },
-        )
+def save_state(path: Path, state: Refined) -> None:
+    """Write a round's result, whole or not at all."""
+    progress = [float(state.rounds_done), float(state.finished), *state.validation_psnr_db]
+    tensors = {
+        "vertices": torch.from_numpy(state.mesh.vertices),
+        "faces": torch.from_numpy(state.mesh.faces),
+        "progress": torch.tensor(progress, dtype=torch.float64),
+    }
+    save_tensors(path, tensors | {f"{APPEARANCE}{name}": tensor for name, tensor in state.appearance.items()})
 
 
-def _resume(path: Path) -> Refined | None:
+def load_state(path: Path) -> Refined | None:
+    """What `save_state` wrote, or None when there is nothing."""
     if not path.exists():
         return None
-    arrays = load_npz(path)
-    psnr_db = tuple(float(value) for value in arrays["validation_psnr_db"])
-    mesh = Mesh(arrays["vertices"], arrays["faces"])
-    return Refined(mesh, int(arrays["rounds_done"]), psnr_db, bool(arrays["finished"]))
+    tensors, _ = load_tensors(path)
+    rounds_done, finished, *psnr_db = tensors["progress"].tolist()
+    appearance = {name.removeprefix(APPEARANCE): t for name, t in tensors.items() if name.startswith(APPEARANCE)}
+    mesh = Mesh(tensors["vertices"].numpy(), tensors["faces"].numpy())
+    return Refined(mesh, appearance, int(rounds_done), tuple(psnr_db), bool(finished))
 
 
-def _write(out: Path, mesh: Mesh, body: Body, shade: Shade) -> None:
-    joint_indices, joint_weights = top_k_weights(transfer_skin_weights(mesh, body))
+def write_results(out: Path, mesh: Mesh, task: RefineTask) -> None:
+    """The mesh with its skin and vertex colours, and the contact sheet."""
+    joint_indices, joint_weights = top_k_weights(transfer_skin_weights(mesh, task.body))
     with torch.no_grad():
-        vertex_colors = shade(torch.from_numpy(mesh.vertices)).numpy()
+        vertex_colors = task.shade(torch.from_numpy(mesh.vertices)).numpy()
     arrays = {"vertices": mesh.vertices.astype(np.float32), "faces": mesh.faces.astype(np.int32)}
     arrays |= {"joint_indices": joint_indices, "joint_weights": joint_weights, "vertex_colors": vertex_colors}
     save_npz(out / "mesh.npz", arrays)
-    write_rgb(out / "preview.png", turntable_sheet(mesh, shade))
+    write_rgb(out / "preview.png", turntable_sheet(mesh, task.shade))
 
 
 STAGE = Stage(

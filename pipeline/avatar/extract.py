@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import fast_simplification
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from pydantic import Field
 from scipy import ndimage
 from scipy.sparse import csr_array
@@ -30,6 +30,7 @@ from pipeline.geometry.surface import (
     remesh,
     repair,
     signed_distance_m,
+    smooth,
     solid_body,
 )
 
@@ -50,6 +51,9 @@ class ExtractConfig(Config):
     inset_m: float = Field(0.025, ge=0.0, le=0.2, description="deeper inside the fitted body than this all is solid, m")
     blur_voxels: float = Field(
         1.0, ge=0.0, le=4.0, description="Gaussian blur of the solid before its surface is taken, voxels"
+    )
+    pit_m: float = Field(
+        0.03, ge=0.0, le=0.2, description="pits that a ball of this radius cannot enter are filled, inside the body, m"
     )
     body_hands: bool = Field(True, description="take hands and fingers from the fitted body, not from the field")
 
@@ -119,13 +123,7 @@ def _distance_grid(
     ]
     coarse_points = np.stack(np.meshgrid(*coarse_axes, indexing="ij"), axis=-1)
     coarse = signed_distance_m(coarse_points.reshape(-1, 3), mesh).reshape(coarse_points.shape[:3])
-    upsampled = torch.nn.functional.interpolate(
-        torch.from_numpy(coarse).float()[None, None],
-        size=tuple(int(c) for c in counts),
-        mode="trilinear",
-        align_corners=True,
-    )
-    return upsampled[0, 0].numpy()
+    return _upsampled(coarse, tuple(counts.tolist()))
 
 
 def solid(samples: CanonicalSamples, level_per_m: float, config: ExtractConfig) -> Float[np.ndarray, "x y z"]:
@@ -137,6 +135,7 @@ def solid(samples: CanonicalSamples, level_per_m: float, config: ExtractConfig) 
     core = np.clip(HALF + (_depth_inside_m(samples) - config.inset_m) / ramp_m, 0.0, 1.0)
     hand = np.clip(HALF - samples.body_distance_m / ramp_m, 0.0, 1.0)
     value = np.maximum(seen, core)
+    value = np.maximum(value, _pits(value >= HALF, samples, config.pit_m))
     value += samples.hand_share * (hand - value)
     inside = solid_body(value >= HALF)
     # what the fill adds becomes solid, what belongs to another component becomes empty
@@ -149,10 +148,26 @@ def _depth_inside_m(samples: CanonicalSamples) -> Float[np.ndarray, "x y z"]:
     inside = samples.body_distance_m[::2, ::2, ::2] < 0.0
     closed = solid_body(ndimage.binary_closing(inside, ndimage.generate_binary_structure(3, 1), iterations=2))
     depth_m = 2.0 * samples.spacing_m * ndimage.gaussian_filter(ndimage.distance_transform_edt(closed), 1.0)
-    upsampled = torch.nn.functional.interpolate(
-        torch.from_numpy(depth_m).float()[None, None], size=samples.density.shape, mode="trilinear", align_corners=True
-    )
-    return upsampled[0, 0].numpy()
+    return _upsampled(depth_m, samples.density.shape)
+
+
+def _pits(inside: Bool[np.ndarray, "x y z"], samples: CanonicalSamples, radius_m: float) -> Float[np.ndarray, "x y z"]:
+    """Solidity in [0, 1] of what a ball of the radius cannot enter from outside and the fitted body fills.
+
+    Where a surface moved little against the camera its density has holes; the body says that there is no real one.
+    Counted on every second sample.
+    """
+    spacing_m = 2.0 * samples.spacing_m
+    outside_m = spacing_m * ndimage.distance_transform_edt(~inside[::2, ::2, ::2])
+    closed = spacing_m * ndimage.distance_transform_edt(outside_m <= radius_m) > radius_m
+    filled = closed & (samples.body_distance_m[::2, ::2, ::2] < 0.0)
+    return _upsampled(ndimage.gaussian_filter(filled.astype(np.float64), 0.7), samples.density.shape)
+
+
+def _upsampled(grid: Float[np.ndarray, "a b c"], shape: tuple[int, ...]) -> Float[np.ndarray, "x y z"]:
+    """A grid of every n-th sample, interpolated at all samples (float32)."""
+    source = torch.from_numpy(grid).float()[None, None]
+    return torch.nn.functional.interpolate(source, size=shape, mode="trilinear", align_corners=True)[0, 0].numpy()
 
 
 def extract_mesh(samples: CanonicalSamples, level_per_m: float, config: ExtractConfig) -> Mesh:
@@ -176,13 +191,16 @@ def choose_level(
     return float(levels_per_m[best]), scores[best]
 
 
-def simplify(mesh: Mesh, edge_m: float) -> Mesh:
-    """The surface with well-shaped triangles of about one edge length (m), shorter where it is strongly curved."""
+def simplify(mesh: Mesh, edge_m: float, smoothing: int = 10) -> Mesh:
+    """The surface with well-shaped triangles of about one edge length (m), shorter where it is strongly curved.
+
+    smoothing: steps of Taubin smoothing at the end, which take the density's noise and leave the volume.
+    """
     dense = mesh.face_areas_m2().sum() / (0.43 * edge_m**2) * DECIMATION_SURPLUS
     if len(mesh.faces) > dense:
         vertices, faces = fast_simplification.simplify(mesh.vertices, mesh.faces, target_count=int(dense))
         mesh = repair(Mesh(vertices.astype(np.float32), faces.astype(np.int32)))
-    return remesh(mesh, edge_m, iterations=6, tolerance_m=0.15 * edge_m)
+    return smooth(remesh(mesh, edge_m, iterations=6, tolerance_m=0.15 * edge_m), smoothing)
 
 
 def transfer_skin_weights(

@@ -214,6 +214,17 @@ def laplacian(mesh: Mesh) -> csr_array:
     return csr_array(diags_array(np.ones(count)) - diags_array(1.0 / degree) @ adjacency)
 
 
+def smooth(mesh: Mesh, steps: int, shrink: float = 0.5, swell: float = 0.52) -> Mesh:
+    """Taubin's smoothing ("A signal processing approach to fair surface design", 1995): a step moves vertices towards
+    the mean of their neighbours by ``shrink``, then back by ``swell``, so that noise goes and volume stays.
+    """
+    operator, vertices = laplacian(mesh), mesh.vertices.astype(np.float64)
+    for _ in range(steps):
+        vertices = vertices - shrink * (operator @ vertices)
+        vertices = vertices + swell * (operator @ vertices)
+    return Mesh(vertices.astype(np.float32), mesh.faces)
+
+
 def closest_on_mesh(
     points: Float[np.ndarray, "n 3"], mesh: Mesh
 ) -> tuple[Float[np.ndarray, "n"], Int[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:

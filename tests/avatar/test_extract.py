@@ -82,6 +82,24 @@ def test_hands_come_from_the_body(body: Body) -> None:
     np.testing.assert_allclose(trunk, 0.14, atol=0.016)
 
 
+def test_pits_inside_the_body_are_filled_and_hollows_outside_it_are_not(body: Body) -> None:
+    """A bore of 4 cm through the trunk goes; the same bore through a second, thicker layer of clothes stays open."""
+
+    def bored(points: Tensor) -> Tensor:
+        distance = torch.from_numpy(capsule_distance(points.numpy().astype(np.float64)))
+        bore = (points[:, [0, 2]] - torch.tensor([-0.15, 0.0])).norm(dim=1) < 0.02
+        return torch.where((distance < 0.16) & ~bore, 300.0, 0.0).float()
+
+    config = CONFIG.model_copy(update={"body_hands": False, "voxel_m": 0.01, "inset_m": 0.2, "blur_voxels": 0.0})
+    samples = sample_canonical(bored, body, config)
+    column = ((np.array([-0.15, 0.5, 0.0]) - samples.origin_m) / 0.01).round().astype(int)
+    heights = samples.origin_m[1] + 0.01 * np.arange(samples.density.shape[1]) - 0.5
+    for pit_m, bottom in ((0.04, RADIUS_M), (0.0, 0.0)):
+        value = solid(samples, 50.0, config.model_copy(update={"pit_m": pit_m}))[column[0], :, column[2]]
+        assert (value[np.abs(heights) < bottom - 0.015] >= 0.5).all()
+        assert (value[np.abs(heights) > bottom + 0.015] < 0.5).all()
+
+
 def test_hand_weights_count_every_joint_of_a_hand(body: Body) -> None:
     weights = hand_weights(body)
     assert weights.min() == 0.0

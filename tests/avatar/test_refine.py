@@ -9,6 +9,7 @@ from torch import Tensor
 
 from pipeline.avatar import refine as refine_module
 from pipeline.avatar.body import Body
+from pipeline.avatar.mesh_optimise import RefineConfig, RefineTask, SmoothOffset, optimise, smoothing_factor
 from pipeline.avatar.mesh_views import (
     View,
     crop_view,
@@ -20,15 +21,7 @@ from pipeline.avatar.mesh_views import (
     target_over,
     validation_psnr_db,
 )
-from pipeline.avatar.refine import (
-    RefineConfig,
-    Refined,
-    SmoothOffset,
-    adapt_triangles,
-    optimise,
-    refine,
-    smoothing_factor,
-)
+from pipeline.avatar.refine import Refined, adapt_triangles, refine
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.rotation import axis_angle_to_matrix
@@ -49,9 +42,19 @@ def egg(spacing: float = 0.05) -> Mesh:
     return remesh(isosurface(radius - np.sqrt(x**2 + (0.8 * y) ** 2 + z**2), 0.0, np.full(3, -0.5), spacing), EDGE_M)
 
 
-def shade(points: Tensor) -> Tensor:
-    """A smooth coloured pattern in canonical space."""
-    return 0.5 + 0.4 * torch.sin(points * torch.tensor([14.0, 11.0, 17.0]) + torch.tensor([0.0, 1.0, 2.0]))
+class Pattern(torch.nn.Module):
+    """A smooth coloured pattern in canonical space, whose contrast can be learnt."""
+
+    def __init__(self, contrast: float = 0.4) -> None:
+        super().__init__()
+        self.contrast = torch.nn.Parameter(torch.tensor(contrast))
+
+    def forward(self, points: Tensor) -> Tensor:
+        waves = torch.sin(points * torch.tensor([14.0, 11.0, 17.0]) + torch.tensor([0.0, 1.0, 2.0]))
+        return 0.5 + self.contrast * waves
+
+
+shade = Pattern().requires_grad_(False)
 
 
 @pytest.fixture(scope="module")
@@ -93,6 +96,12 @@ def dented(truth: Mesh) -> Mesh:
     return Mesh((truth.vertices + wave * truth.vertex_normals()).astype(np.float32), truth.faces)
 
 
+def task_of(body: Body, views: tuple, config: RefineConfig = CONFIG, seed: int = 0, **changes: object) -> RefineTask:
+    return replace(
+        RefineTask(body, views[0], views[1], Pattern().requires_grad_(False), EDGE_M, config, seed), **changes
+    )
+
+
 def distance_m(mesh: Mesh, truth: Mesh) -> float:
     """Mean distance along the normal of corresponding vertices (same triangles)."""
     return float(np.abs(np.sum((mesh.vertices - truth.vertices) * truth.vertex_normals(), axis=1)).mean())
@@ -107,7 +116,7 @@ def test_truth_renders_as_its_pictures(truth: Mesh, body: Body, views: tuple) ->
 
 def test_optimisation_finds_the_shape_again(truth: Mesh, dented: Mesh, body: Body, views: tuple) -> None:
     skin = skin_of(dented, body)
-    result = optimise(dented, skin, views[0], shade, EDGE_M, CONFIG.model_copy(update={"steps": 80}), seed=0)
+    result = optimise(dented, skin, task_of(body, views, CONFIG.model_copy(update={"steps": 80})), seed=0)
     assert distance_m(result, truth) < 0.4 * distance_m(dented, truth)
     gain_db = validation_psnr_db(result, skin, views[1], shade) - validation_psnr_db(dented, skin, views[1], shade)
     assert gain_db > 4.0
@@ -118,7 +127,7 @@ def test_the_global_offset_moves_all_vertices_alike(truth: Mesh, body: Body, vie
     shift = np.array([0.01, -0.015, 0.0], dtype=np.float32)
     config = CONFIG.model_copy(update={"learning_rate": 1e-9, "global_learning_rate": 0.002, "steps": 60})
     moved = Mesh(truth.vertices + shift, truth.faces)
-    result = optimise(moved, skin_of(moved, body), views[0], shade, EDGE_M, config, seed=0)
+    result = optimise(moved, skin_of(moved, body), task_of(body, views, config), seed=0)
     offset = result.vertices - moved.vertices
     np.testing.assert_allclose(offset, np.broadcast_to(offset[0], offset.shape), atol=1e-5)
     np.testing.assert_allclose(offset[0], -shift, atol=0.003)
@@ -126,7 +135,7 @@ def test_the_global_offset_moves_all_vertices_alike(truth: Mesh, body: Body, vie
 
 def test_rounds_improve_and_stay_sound(dented: Mesh, body: Body, views: tuple) -> None:
     seen = []
-    result = refine(dented, body, views, shade, EDGE_M, CONFIG, seed=0, on_round=seen.append)
+    result = refine(dented, task_of(body, views), seen.append)
     assert result.finished
     assert list(result.validation_psnr_db) == sorted(result.validation_psnr_db)
     assert result.validation_psnr_db[-1] > result.validation_psnr_db[0] + 3.0
@@ -137,27 +146,44 @@ def test_rounds_improve_and_stay_sound(dented: Mesh, body: Body, views: tuple) -
 def test_going_on_from_a_round_ends_with_the_same_bytes(dented: Mesh, body: Body, views: tuple) -> None:
     config = CONFIG.model_copy(update={"steps": 8})
     seen: list[Refined] = []
-    whole = refine(dented, body, views, shade, EDGE_M, config, seed=3, on_round=seen.append)
+    whole = refine(dented, task_of(body, views, config, 3, shade=Pattern()), seen.append)
     assert not seen[0].finished
-    resumed = refine(seen[0], body, views, shade, EDGE_M, config, seed=3)
+    resumed = refine(seen[0], task_of(body, views, config, 3, shade=Pattern()))
     assert whole.mesh.vertices.tobytes() == resumed.mesh.vertices.tobytes()
     assert whole.mesh.faces.tobytes() == resumed.mesh.faces.tobytes()
     assert whole.validation_psnr_db == resumed.validation_psnr_db
+    assert torch.equal(whole.appearance["contrast"], resumed.appearance["contrast"])
 
 
 def test_a_round_that_makes_validation_worse_is_undone(
     dented: Mesh, body: Body, views: tuple, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(refine_module, "optimise", lambda mesh, *_: Mesh(mesh.vertices * np.float32(1.3), mesh.faces))
-    result = refine(dented, body, views, shade, EDGE_M, CONFIG, seed=0)
+    task = task_of(body, views, shade=Pattern())
+
+    def spoil(mesh: Mesh, *_: object) -> Mesh:
+        task.shade.contrast.data.fill_(0.1)
+        return Mesh(mesh.vertices * np.float32(1.3), mesh.faces)
+
+    monkeypatch.setattr(refine_module, "optimise", spoil)
+    result = refine(dented, task)
     assert result.finished
     assert result.rounds_done == 1
     assert len(result.validation_psnr_db) == 1
     assert result.mesh is dented
+    assert float(task.shade.contrast) == pytest.approx(0.4)
+
+
+def test_colours_are_learnt_first_and_the_surface_stays_meanwhile(truth: Mesh, body: Body, views: tuple) -> None:
+    pale = Pattern(0.1)
+    config = CONFIG.model_copy(update={"appearance_rate": 0.05, "appearance_steps": 40, "steps": 1})
+    config = config.model_copy(update={"learning_rate": 1e-9, "global_learning_rate": 0.0})
+    result = optimise(truth, skin_of(truth, body), task_of(body, views, config, shade=pale), seed=0)
+    assert float(pale.contrast) == pytest.approx(0.4, abs=0.03)
+    np.testing.assert_allclose(result.vertices, truth.vertices, atol=1e-6)
 
 
 def test_no_rounds_leaves_the_mesh(dented: Mesh, body: Body, views: tuple) -> None:
-    result = refine(dented, body, views, shade, EDGE_M, CONFIG.model_copy(update={"rounds": 0}))
+    result = refine(dented, task_of(body, views, CONFIG.model_copy(update={"rounds": 0})))
     assert result.finished
     assert result.mesh is dented
 

@@ -14,6 +14,7 @@ from pipeline.geometry.surface import (
     remesh,
     repair,
     signed_distance_m,
+    smooth,
     solid_body,
     split_fans,
     subdivide,
@@ -188,6 +189,15 @@ def test_laplacian_rows_vanish_on_constants_and_shrink_the_sphere(sphere: Mesh) 
     assert (operator @ dense)[7] == pytest.approx(0.0)  # all neighbours are one, as it is itself
     smoothed = sphere.vertices - 0.5 * (operator @ sphere.vertices)
     assert np.linalg.norm(smoothed, axis=1).mean() < np.linalg.norm(sphere.vertices, axis=1).mean()
+
+
+def test_smoothing_takes_noise_and_leaves_volume(sphere: Mesh) -> None:
+    noise = np.random.default_rng(8).normal(scale=0.01, size=sphere.vertices.shape)
+    noisy = Mesh((sphere.vertices + noise).astype(np.float32), sphere.faces)
+    result = smooth(noisy, 10)
+    assert np.std(np.linalg.norm(result.vertices, axis=1)) < 0.5 * np.std(np.linalg.norm(noisy.vertices, axis=1))
+    assert volume(result) == pytest.approx(volume(sphere), rel=0.02)
+    np.testing.assert_array_equal(smooth(noisy, 0).vertices, noisy.vertices)
 
 
 def test_closest_point_against_brute_force(sphere: Mesh) -> None:

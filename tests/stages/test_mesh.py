@@ -42,10 +42,14 @@ def pill_mesh(radius: float) -> Mesh:
 
 
 class PillField(torch.nn.Module):
-    """Density and colour of a pill that is 3 cm thicker than the body."""
+    """Density and colour of a pill that is 3 cm thicker than the body; its mean brightness can be learnt."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.mean = torch.nn.Parameter(torch.tensor(0.5))
 
     def forward(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        return 0.5 + 0.4 * torch.sin(points * 20.0), self.density(points)
+        return self.mean + 0.4 * torch.sin(points * 20.0), self.density(points)
 
     def density(self, points: Tensor) -> Tensor:
         return torch.from_numpy(600.0 * (pill(points.detach().numpy(), 0.18) > 0)).float()
@@ -95,7 +99,8 @@ def draw_frames(folder: Path, mesh: Mesh, body: Body, motion: Motion) -> None:
     blank = torch.zeros(SIZE_PX, SIZE_PX, dtype=torch.uint8)
     for k, transforms in enumerate(mesh_stage.canonical_to_world(body, motion)):
         view = View(blank[..., None].expand(-1, -1, 3), blank, CAMERA, transforms)
-        image, alpha, _ = render_view(torch.from_numpy(mesh.vertices), skin, view, lambda p: PillField()(p)[0])
+        with torch.no_grad():
+            image, alpha, _ = render_view(torch.from_numpy(mesh.vertices), skin, view, lambda p: PillField()(p)[0])
         pixels = (255 * (image + 1 - alpha[..., None])).clamp(0, 255).round().byte().numpy()
         write_rgb(image_path(folder, k), pixels)
         write_gray(mask_path(folder, k), (255 * alpha).clamp(0, 255).round().byte().numpy())
@@ -115,7 +120,7 @@ def test_writes_a_sound_mesh_with_skin_and_colours(inputs: dict[str, Path], tmp_
     np.testing.assert_allclose(arrays["joint_weights"].sum(axis=1), 1.0, atol=1e-5)
     assert arrays["joint_indices"].shape == arrays["joint_weights"].shape
     expected = 0.5 + 0.4 * np.sin(arrays["vertices"] * 20.0)
-    np.testing.assert_allclose(arrays["vertex_colors"], expected, atol=1e-5)
+    np.testing.assert_allclose(arrays["vertex_colors"], expected, atol=0.02)
     preview = read_rgb(out / "preview.png")
     assert (preview < 250).any(axis=2).mean() > 0.1
 
@@ -127,18 +132,18 @@ def test_goes_on_from_a_killed_round_to_the_same_bytes(
     whole.mkdir()
     killed.mkdir()
     metrics = run(inputs, whole, CONFIG)
-    save, calls = mesh_stage._save, []
+    save, calls = mesh_stage.save_state, []
 
     def dies_after_the_first_round(path: Path, state: object) -> None:
         save(path, state)
         calls.append(state)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(mesh_stage, "_save", dies_after_the_first_round)
+    monkeypatch.setattr(mesh_stage, "save_state", dies_after_the_first_round)
     with pytest.raises(KeyboardInterrupt):
         run(inputs, killed, CONFIG)
     assert len(calls) == 1
-    monkeypatch.setattr(mesh_stage, "_save", save)
+    monkeypatch.setattr(mesh_stage, "save_state", save)
     monkeypatch.setattr(mesh_stage, "sample_canonical", None)  # extraction must not happen again
     assert run(inputs, killed, CONFIG) == metrics
     assert (whole / "mesh.npz").read_bytes() == (killed / "mesh.npz").read_bytes()
