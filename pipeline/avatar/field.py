@@ -17,11 +17,19 @@ START_DENSITY_PER_M = 10.0
 none.
 """
 
+DENSITY_GAIN, LIMIT = 1.0, 7.0
+"""density = START · exp(gain · raw), with raw cut at plus and minus the limit."""
+
+ROWS = 8192
+"""Points that go through the network at once: what lies between its layers stays in the cache."""
+
 QUERY_POINTS = 1 << 18
 
 
 class _Decode(torch.autograd.Function):
-    """relu(features W1) W2 + b, sigmoid for three colours, exp for the density; four matrix products back.
+    """relu(features W1) W2 + b, sigmoid for three colours, exp for the density.
+
+    Backward computes the hidden layer again rather than store it: that is less than the memory traffic it saves.
 
     The exponent is clamped, but its gradient is not cut there (as the truncated exponential of Instant-NGP), so that
     a density that ran away comes back.
@@ -29,26 +37,30 @@ class _Decode(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, features, hidden, output, bias):
-        activation = (features @ hidden).clamp_(min=0)
-        raw = torch.addmm(bias, activation, output)
+        raw = features.new_empty(len(features), 4)
+        for part, into in zip(features.split(ROWS), raw.split(ROWS), strict=True):
+            torch.addmm(bias, (part @ hidden).clamp_(min=0), output, out=into)
         colour = torch.sigmoid(raw[:, :3])
-        density = START_DENSITY_PER_M * torch.exp(raw[:, 3].clamp(-12.0, 7.0))
-        ctx.save_for_backward(features, hidden, output, activation, colour, density)
+        density = START_DENSITY_PER_M * torch.exp(DENSITY_GAIN * raw[:, 3].clamp(-LIMIT, LIMIT))
+        ctx.save_for_backward(features, hidden, output, colour, density)
         return colour, density
 
     @staticmethod
     def backward(ctx, colour_gradient, density_gradient):
-        features, hidden, output, activation, colour, density = ctx.saved_tensors
-        raw_gradient = colour.new_empty(len(colour), 4)
+        features, hidden, output, colour, density = ctx.saved_tensors
+        raw_gradient = torch.empty(len(colour), 4).to(colour)
         torch.mul(colour_gradient, colour * (1 - colour), out=raw_gradient[:, :3])
-        torch.mul(density_gradient, density, out=raw_gradient[:, 3])
-        activation_gradient = (raw_gradient @ output.T).mul_(activation > 0)
-        return (
-            activation_gradient @ hidden.T,
-            features.T @ activation_gradient,
-            activation.T @ raw_gradient,
-            raw_gradient.sum(0),
-        )
+        torch.mul(density_gradient, DENSITY_GAIN * density, out=raw_gradient[:, 3])
+        features_gradient = torch.empty_like(features)
+        hidden_gradient, output_gradient = torch.zeros_like(hidden), torch.zeros_like(output)
+        parts = (features.split(ROWS), raw_gradient.split(ROWS), features_gradient.split(ROWS))
+        for part, towards, into in zip(*parts, strict=True):
+            activation = (part @ hidden).clamp_(min=0)
+            output_gradient.addmm_(activation.T, towards)
+            passed = (towards @ output.T).mul_(activation.sign_())
+            hidden_gradient.addmm_(part.T, passed)
+            torch.mm(passed, hidden.T, out=into)
+        return features_gradient, hidden_gradient, output_gradient, raw_gradient.sum(0)
 
 
 class Field(torch.nn.Module):

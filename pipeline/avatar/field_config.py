@@ -36,7 +36,7 @@ class FieldConfig(Config):
 
     occupancy: Literal["attention", "plain"] = Option("attention", description="how the occupancy grid is updated")
     occupancy_every: int = Option(8, ge=1, description="steps between updates of the occupancy grid")
-    occupancy_start: int = Option(128, ge=0, description="step of the first update that may empty a cell")
+    occupancy_start: int = Option(64, ge=0, description="step of the first update that may empty a cell")
     occupancy_threshold: float = Option(
         0.01, ge=0, le=1, description="mean opacity of a step above which a cell is occupied"
     )
@@ -48,14 +48,17 @@ class FieldConfig(Config):
         0.6, ge=0, le=1, description="part of the frames whose mask must hold a cell, at the start"
     )
 
-    table_rate: float = Option(1e-2, gt=0, description="learning rate of the hash table")
-    network_rate: float = Option(3e-3, gt=0, description="learning rate of the network")
+    table_rate: float = Option(1e-1, gt=0, description="learning rate of the hash table")
+    network_rate: float = Option(2e-2, gt=0, description="learning rate of the network")
     final_rate: float = Option(
         0.03, gt=0, le=1, description="learning rates at the end, as a part of those at the start"
     )
-    huber_delta: float = Option(0.1, gt=0, description="colour error where the Huber loss turns from square to linear")
+    huber_delta: float = Option(0.3, gt=0, description="colour error where the Huber loss turns from square to linear")
     weight_alpha: float = Option(0.3, ge=0, description="weight of the alpha loss")
     weight_hard: float = Option(0.02, ge=0, description="weight of the hard-surface loss")
+    weight_thin: float = Option(
+        0.02, ge=0, description="weight of the loss on light caught by thin, see-through samples"
+    )
     weight_density: float = Option(0.05, ge=0, description="weight of the density loss in empty cells")
     empty_points: int = Option(2048, ge=0, description="points a step at which emptiness is asked for")
 

@@ -11,15 +11,19 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from pipeline.kernels.visits import record_visits
 
 RESOLUTION = 64
 HIDDEN = 16
-START_AVERAGE = 0.05
-"""Of a cell before it was asked: it stays occupied for some thirty updates in which its density is zero."""
+START_AVERAGE = 0.03
+"""Of a cell before it was asked: it stays occupied for some twenty updates in which its density is zero."""
+FADING = 0.8
+"""What is left, an update later, of what the rays saw in a cell."""
+DARK = 0.02
+"""Light below which a cell counts as unlit; what is behind it gives a pixel at most so much."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +78,7 @@ class OccupancyUpdate:
 
     def __init__(
         self,
-        shell: Float[np.ndarray, "gx gy gz"],
+        shell: Bool[np.ndarray, "gx gy gz"],
         distance_m: Float[np.ndarray, "gx gy gz"],
         frequency: Float[np.ndarray, "gx gy gz"],
         bounds_m: Float[np.ndarray, "2 3"],
@@ -103,6 +107,14 @@ class OccupancyUpdate:
         """The cells as they are occupied now; later updates show in it."""
         return Occupancy(self.occupied, self.bounds_m)
 
+    def lit_grid(self) -> Occupancy:
+        """The occupied cells without those that no light reached lately: the inside of a body that has become opaque.
+
+        Training rays need not stop there. A cell that was never visited counts as lit.
+        """
+        dark = (self.reached > 0) & (self.reached < DARK)
+        return Occupancy(self.occupied * ~dark.view(self.shape), self.bounds_m)
+
     def record(self, points_m: Float[Tensor, "s 3"], light: Float[Tensor, "s"], weights: Float[Tensor, "s"]) -> None:
         """Note for each sample's cell how much light reached it and how much of a pixel it gave."""
         record_visits(points_m, light, weights, self.bounds_m, self.shape, self.reached, self.gave)
@@ -125,8 +137,8 @@ class OccupancyUpdate:
             self.average = self.decay * self.average + (1 - self.decay) * weight * opacity
         kept = self.average > min(threshold, float(self.average.mean()))
         self.occupied.view(-1)[self.cells] = kept.to(torch.uint8)
-        self.reached *= 0.8
-        self.gave *= 0.8
+        self.reached *= FADING
+        self.gave *= FADING
 
     def _learn(self, density: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
         """One step of the attention network on the cells that light reached lately; returns the logits of all cells."""

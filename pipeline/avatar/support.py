@@ -3,6 +3,7 @@
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pipeline.avatar.body import Body
@@ -12,16 +13,23 @@ from pipeline.geometry.surface import signed_distance_m
 from pipeline.kernels.reference.warp import skin_points
 from pipeline.kernels.warp import SkinGrid
 
+DEEPEST_M = 0.3
+"""No point inside a body is farther from its surface."""
+
 
 def field_bounds_m(body: Body, margin_m: float) -> Float[np.ndarray, "2 3"]:
     """The body's canonical box, widened on all sides."""
     return np.stack([body.vertices.min(0) - margin_m, body.vertices.max(0) + margin_m]).astype(np.float32)
 
 
-def cell_distances_m(body: Body, bounds_m: Float[np.ndarray, "2 3"]) -> Float[np.ndarray, "gx gy gz"]:
-    """Signed distance of each cell's centre to the canonical body, negative inside."""
-    distance = signed_distance_m(cell_centres(bounds_m), body.mesh())
-    return distance.astype(np.float32).reshape(RESOLUTION, RESOLUTION, RESOLUTION)
+def cell_distances_m(body: Body, bounds_m: Float[np.ndarray, "2 3"], reach_m: float) -> Float[np.ndarray, "gx gy gz"]:
+    """Signed distance of each cell's centre to the canonical body, negative inside; at most `reach_m`."""
+    centres = cell_centres(bounds_m)
+    nearest_m, _ = cKDTree(body.vertices).query(centres, distance_upper_bound=max(reach_m, DEEPEST_M))
+    near = np.isfinite(nearest_m)
+    distance = np.full(len(centres), reach_m, dtype=np.float32)
+    distance[near] = np.minimum(signed_distance_m(centres[near], body.mesh()), reach_m)
+    return distance.reshape(RESOLUTION, RESOLUTION, RESOLUTION)
 
 
 def mask_frequency(
@@ -50,10 +58,10 @@ def mask_frequency(
 
 
 def starting_shell(
-    distance_m: Float[np.ndarray, "gx gy gz"],
-    frequency: Float[np.ndarray, "gx gy gz"],
+    distance_m: Float[np.ndarray, "*grid"],
+    frequency: Float[np.ndarray, "*grid"],
     margin_m: float,
     mask_support: float,
-) -> Bool[np.ndarray, "gx gy gz"]:
+) -> Bool[np.ndarray, "*grid"]:
     """Cells within the clothing margin that enough masks hold, and all cells inside the body."""
     return (distance_m < 0) | ((distance_m < margin_m) & (frequency >= mask_support))

@@ -26,6 +26,9 @@ from pipeline.kernels.warp import SkinGrid, newton
 WARM_UP = 20
 MAX_BAD_STEPS = 20
 REBAKES = (0.5, 0.75)
+"""Parts of the training at which the warp grids follow the refined poses."""
+LOOK_EVERYWHERE = 8
+"""Every so many steps rays stop in unlit cells too, so that these may come to light again."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +142,8 @@ class Learning:
         if self.refines_poses and self.done in {round(part * config.steps) for part in REBAKES}:
             self._bake()
         batch = self._draw(random)
-        grid = self.occupancy.grid()
+        look_everywhere = self.done % LOOK_EVERYWHERE == 0 or self.done < config.occupancy_start
+        grid = self.occupancy.grid() if look_everywhere else self.occupancy.lit_grid()
         samples = march(
             batch.origins_m,
             batch.directions,
@@ -154,7 +158,9 @@ class Learning:
         points = torch.cat([self._place(batch, samples), self._empty_points(random)])
         colour, density = self.field.radiance(points, self.table_gradient)
         step_m = torch.full((count,), self.step_m)
-        image, alpha, weights = composite(density[:count], colour[:count], step_m, samples.ray_start)
+        opacity = -torch.expm1(-density[:count, None] * self.step_m)
+        channels = torch.cat([colour[:count], opacity], dim=1)
+        image, alpha, weights = composite(density[:count], channels, step_m, samples.ray_start)
         losses = field_losses(image, alpha, density[count:], batch.rgba, batch.background, config)
         total = sum(losses.values())
         if self.refines_poses:
@@ -171,6 +177,11 @@ class Learning:
         """Part of the full learning rate: a short warm-up, then an exponential decay that ends at `final_rate`."""
         return min(1.0, (self.done + 1) / WARM_UP) * self.config.final_rate ** (self.done / self.config.steps)
 
+    def _pose_rate(self) -> float:
+        """Part of the poses' learning rate: full when they begin to be refined, a tenth at the end."""
+        begun = self.config.pose_start * self.config.steps
+        return 0.1 ** ((self.done - begun) / max(self.config.steps - begun, 1))
+
     def _update_parameters(self, finite: bool) -> None:
         self.bad_steps = 0 if finite else self.bad_steps + 1
         if self.bad_steps >= MAX_BAD_STEPS:
@@ -186,7 +197,7 @@ class Learning:
                 continue
             is_pose = name in ("rotation_rad", "shift_m")
             begun = round(config.pose_start * config.steps) if is_pose else 0
-            rate = rates.get(name, config.network_rate) * self._rate()
+            rate = rates.get(name, config.network_rate) * (self._pose_rate() if is_pose else self._rate())
             adam_step_(parameter, gradient, *self.moments[name], self.done - begun + 1, rate, epsilon=1e-15)
 
     def state(self) -> dict[str, Tensor]:

@@ -1,0 +1,86 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.avatar.field_config import FieldConfig
+from pipeline.avatar.losses import field_losses, hard_surface, huber
+from pipeline.avatar.rays import build_pool
+
+CONFIG = FieldConfig(huber_delta=0.1, weight_alpha=0.5, weight_hard=0.2, weight_density=0.1, weight_thin=0.3)
+
+
+def test_huber_is_square_then_linear():
+    values = huber(torch.tensor([0.0, 0.05, -0.05, 1.0, -3.0]), 0.1)
+    assert values.tolist() == pytest.approx([0, 0.0125, 0.0125, 0.95, 2.95])
+
+
+def test_hard_surface_is_zero_at_both_ends_and_largest_between():
+    alpha = torch.linspace(0, 1, 101)
+    values = hard_surface(alpha)
+    assert float(values[0]) == pytest.approx(0, abs=1e-6)
+    assert float(values[100]) == pytest.approx(0, abs=1e-6)
+    assert int(values.argmax()) == 50
+    assert float(values[50]) == pytest.approx(math.log(1 + math.exp(-1)) - math.log(2 * math.exp(-0.5)), abs=1e-6)
+
+
+def test_perfect_image_costs_nothing():
+    rgba = torch.tensor([[0.2, 0.4, 0.6, 1.0], [0.9, 0.1, 0.5, 0.0]])
+    solid = rgba.clone()
+    solid[:, :3] *= rgba[:, 3:]
+    losses = field_losses(solid, rgba[:, 3], torch.zeros(5), rgba, torch.rand(2, 3), CONFIG)
+    for name, value in losses.items():
+        assert float(value) == pytest.approx(0, abs=1e-6), name
+
+
+def test_a_hole_in_the_body_costs_whatever_its_colour_and_background():
+    rgba = torch.tensor([[1.0, 1.0, 1.0, 1.0]])
+    losses = field_losses(torch.zeros(1, 4), torch.zeros(1), torch.zeros(0), rgba, torch.ones(1, 3), CONFIG)
+    assert float(losses["colour"]) == 0
+    assert float(losses["alpha"]) == pytest.approx(0.5 * 0.95)
+    assert "density" not in losses
+
+
+def test_light_caught_by_fog_costs_more_than_light_caught_by_a_wall():
+    rgba = torch.ones(1, 4)
+    fog, wall = torch.tensor([[1.0, 1, 1, 0.1]]), torch.tensor([[1.0, 1, 1, 0.95]])
+    costs = [
+        field_losses(image, torch.ones(1), torch.zeros(0), rgba, rgba[:, :3], CONFIG)["thin"] for image in (fog, wall)
+    ]
+    assert float(costs[0]) == pytest.approx(0.3 * 0.9)
+    assert float(costs[1]) == pytest.approx(0.3 * 0.05)
+
+
+def make_pool():
+    mask = np.zeros((60, 40), np.uint8)
+    mask[10:50, 10:30] = 255
+    image = np.random.default_rng(0).integers(0, 256, (60, 40, 3), dtype=np.uint8)
+    empty = np.zeros_like(mask)
+    return build_pool([(image, mask), (image, empty), (image, mask)], 3, seed=0), image, mask
+
+
+def test_pool_sorts_pixels_into_kinds():
+    pool, image, mask = make_pool()
+    columns, rows = pool.xy_px.T
+    np.testing.assert_array_equal(pool.rgba[:, :3], np.concatenate([image[rows, columns]]))
+    body = slice(pool.start[0, 0], pool.start[0, 1])
+    outside = slice(pool.start[0, 2], pool.start[0, 3])
+    assert (pool.rgba[body, 3] == 255).all()
+    assert (pool.rgba[outside, 3] == 0).all()
+    assert body.stop - body.start == (40 - 6) * (20 - 6)
+    assert (pool.start[1] == pool.start[1, 0]).all()
+    places = pool.xy_px[pool.start[0, 0] : pool.start[0, 3]]
+    assert len(np.unique(places, axis=0)) == len(places)
+
+
+def test_rays_are_shared_out_as_asked():
+    pool, _, _ = make_pool()
+    rows, slots = pool.draw(np.array([0, 1, 2]), 900, (0.6, 0.3, 0.1), np.random.default_rng(0))
+    assert np.bincount(slots).tolist() == [300, 0, 300]
+    first = rows[slots == 0]
+    assert (np.diff(first) >= 0).all()
+    kinds = np.searchsorted(pool.start[0], first, side="right") - 1
+    assert np.bincount(kinds).tolist() == [180, 90, 30]
+    again, _ = pool.draw(np.array([0, 1, 2]), 900, (0.6, 0.3, 0.1), np.random.default_rng(0))
+    np.testing.assert_array_equal(rows, again)

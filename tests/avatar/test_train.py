@@ -1,0 +1,113 @@
+import numpy as np
+import pytest
+import torch
+
+from pipeline.avatar.body import canonical_to_world
+from pipeline.avatar.field_config import FieldConfig
+from pipeline.avatar.prepare import spread, start_learning, training_scale
+from pipeline.avatar.render import over_white, render_field
+from pipeline.avatar.train import DivergedError
+from tests.avatar.scene import painted_scene
+
+TRAIN = np.array([0, 1, 3, 4, 6, 7, 9, 10])
+TINY = {
+    "rays": 768,
+    "frames_per_step": 3,
+    "levels": 4,
+    "features": 4,
+    "log2_rows": 14,
+    "hidden_width": 32,
+    "finest_cell_px": 1.5,
+    "margin_m": 0.04,
+    "step_fraction": 0.012,
+    "occupancy_start": 24,
+    "border_px": 2,
+}
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return painted_scene(12, 110)
+
+
+def begin(scene, **options):
+    config = FieldConfig(**(TINY | options))
+    pictures = [(scene.images[row], scene.masks[row]) for row in TRAIN]
+    return start_learning(scene.body, scene.motion.select(TRAIN), scene.camera, pictures, config)
+
+
+def error_on(scene, learning, row):
+    pose = canonical_to_world(scene.body, scene.motion.select(np.array([row])))[0]
+    grid, skin = learning.occupancy.grid(), learning.scene.skin
+    shown = over_white(render_field(learning.field, grid, scene.body, pose, scene.camera, skin))
+    mask = torch.from_numpy(scene.masks[row])[..., None] / 255
+    truth = torch.from_numpy(scene.images[row]) / 255 * mask + 1 - mask
+    return -10 * float((shown - truth).square().mean().log10())
+
+
+def test_learns_a_painted_body_and_shows_it_in_a_new_pose(scene):
+    learning = begin(scene, steps=120, pose_refinement=False)
+    shell = int(learning.occupancy.occupied.sum())
+    before = error_on(scene, learning, 2)
+    losses = [learning.step() for _ in range(120)]
+    assert losses[-1]["colour"] < 0.3 * losses[0]["colour"]
+    assert error_on(scene, learning, 2) > max(23.0, before + 6)
+    assert int(learning.occupancy.occupied.sum()) < shell
+
+
+def test_refinement_finds_a_shift_of_the_body(scene):
+    wrong = scene.motion.root_translation_m + np.array([0.03, 0, 0], dtype=np.float32)
+    moved = scene.motion.with_pose(scene.motion.rotations_wxyz, wrong)
+    pictures = [(scene.images[row], scene.masks[row]) for row in TRAIN]
+    # One frame alone is wrong: the others say where the body is.
+    root = scene.motion.root_translation_m.copy()
+    root[4] = moved.root_translation_m[4]
+    motion = scene.motion.with_pose(scene.motion.rotations_wxyz, root).select(TRAIN)
+    config = FieldConfig(**TINY, steps=160, pose_start=0.35, pose_rate=2e-3, pose_smoothness=0.0)
+    learning = start_learning(scene.body, motion, scene.camera, pictures, config)
+    for _ in range(160):
+        learning.step()
+    shift = learning.poses.shift_m.detach()
+    assert float(shift[3, 0]) < -0.012
+    assert float(shift[[0, 1, 2, 4, 5], 0].abs().max()) < 0.009
+
+
+@pytest.mark.parametrize("occupancy", ["attention", "plain"])
+def test_a_resumed_run_ends_with_the_same_bytes(scene, occupancy):
+    options = {"steps": 30, "pose_start": 0.2, "occupancy": occupancy, "occupancy_start": 8}
+    whole = begin(scene, **options)
+    for _ in range(30):
+        whole.step()
+    first = begin(scene, **options)
+    for _ in range(19):
+        first.step()
+    kept = {name: value.clone() for name, value in first.state().items()}
+    second = begin(scene, **options)
+    second.load_state(kept)
+    for _ in range(11):
+        second.step()
+    for name, value in whole.state().items():
+        assert torch.equal(value, second.state()[name]), name
+
+
+def test_a_nan_never_reaches_a_parameter(scene):
+    learning = begin(scene, steps=50, pose_refinement=False)
+    learning.step()
+    learning.field.hidden.data[0, 0] = float("nan")
+    before = learning.field.table.detach().clone()
+    for _ in range(19):
+        learning.step()
+    with pytest.raises(DivergedError, match="20 steps"):
+        learning.step()
+    assert torch.equal(learning.field.table.detach(), before)
+
+
+def test_images_shrink_to_the_size_asked_for(scene):
+    tall_px = scene.body.height_m() * scene.camera.fy / 3.0
+    assert training_scale(scene.body, scene.motion, scene.camera, 1000) == 1.0
+    assert training_scale(scene.body, scene.motion, scene.camera, round(tall_px / 2)) == pytest.approx(0.5, rel=0.02)
+
+
+def test_spread_keeps_both_ends():
+    assert spread(10, 4).tolist() == [0, 3, 6, 9]
+    assert spread(3, 9).tolist() == [0, 1, 2]
