@@ -33,6 +33,8 @@ def run(inputs: Mapping[str, Path], out: Path, config: FieldConfig) -> Mapping[s
     """Learn the field on training frames, judge the refined poses on validation frames, write field, occupancy,
     motion.
     """
+    for kind in (np.float32, np.float64):
+        np.finfo(kind)  # Asked for the first time with denormals off, numpy would warn.
     torch.set_flush_denormal(True)
     capture, camera = load_capture(inputs["frames"]), load_camera(inputs["body"] / "camera.npz")
     body, motion = load_body(inputs["body"] / "body.npz"), load_motion(inputs["body"] / "motion.npz")

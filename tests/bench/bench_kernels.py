@@ -1,0 +1,171 @@
+"""Seconds of each kernel and of a whole step of stage one, beside what memory and arithmetic allow.
+
+    python -m tests.bench.bench_kernels [--json out.json] [--repeats 15]
+
+Medians of warm runs on made-up data of the default preset's size; the machine should do nothing else. A row of figures
+is appended to tests/bench/results/<machine>.csv.
+"""
+
+import argparse
+import csv
+import json
+import platform
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from pipeline.avatar.field import Field, choose_layout
+from pipeline.avatar.field_config import FieldConfig
+from pipeline.kernels.adam import adam_step_
+from pipeline.kernels.composite import composite
+from pipeline.kernels.hashgrid import encode
+from pipeline.kernels.march import WarpSet, march
+from pipeline.kernels.warp import bake, newton
+from tests.kernels.bar import CELL_M, bar_skin, bend
+
+RESULTS = Path(__file__).parent / "results"
+BOUNDS = np.array([[-0.8, -0.1, -0.3], [0.8, 1.9, 0.5]], dtype=np.float32)
+RAYS, SAMPLES_A_RAY = 4096, 16
+
+
+def median_ms(run: Callable[[], object], repeats: int) -> float:
+    """Median of warm runs."""
+    run()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        run()
+        times.append(time.perf_counter() - start)
+    return 1e3 * float(np.median(times))
+
+
+def memory_gb_s(repeats: int) -> float:
+    """Bandwidth of a copy that does not fit into the caches."""
+    source, target = torch.ones(1 << 25), torch.empty(1 << 25)
+    return 2 * source.numel() * 4 / 1e6 / median_ms(lambda: target.copy_(source), repeats)
+
+
+def multiply_gflop_s(repeats: int) -> float:
+    """Rate of a large matrix product."""
+    a, b = torch.rand(2048, 2048), torch.rand(2048, 2048)
+    return 2 * 2048**3 / 1e6 / median_ms(lambda: a @ b, repeats)
+
+
+def ray_points(random: torch.Generator) -> torch.Tensor:
+    """Samples in runs of a few centimetres, as rays near a surface give them, in the unit box."""
+    start = torch.rand(RAYS, 1, 3, generator=random) * 0.8 + 0.1
+    direction = torch.nn.functional.normalize(torch.randn(RAYS, 1, 3, generator=random), dim=-1)
+    reach = torch.linspace(0, 0.06, SAMPLES_A_RAY)[None, :, None]
+    return (start + reach * direction).reshape(-1, 3).clamp(0, 1)
+
+
+def field_parts(config: FieldConfig, repeats: int) -> dict[str, float]:
+    """Encoding, network, compositing and update, forward and backward."""
+    random = torch.Generator().manual_seed(0)
+    layout = choose_layout(BOUNDS, 0.003, config.levels, config.features, config.log2_rows)
+    field = Field(BOUNDS, layout, config.hidden_width)
+    points, sums = ray_points(random), torch.zeros_like(field.table)
+    features = encode(points, field.table, layout, sums)
+    towards = torch.randn(features.shape, generator=random)
+    low, high = field.bounds_m
+    placed = points * (high - low) + low
+    colour, density = field.radiance(placed, sums)
+    ray_start = torch.arange(0, len(points) + 1, SAMPLES_A_RAY)
+    step_m = torch.full((len(points),), 0.004)
+
+    def shade() -> None:
+        inputs = (density.detach().requires_grad_(True), colour.detach().requires_grad_(True))
+        image, alpha, _ = composite(*inputs, step_m, ray_start)
+        (image.sum() + alpha.sum()).backward()
+
+    def whole() -> None:
+        rgb, sigma = field.radiance(placed, sums)
+        (rgb.sum() + sigma.sum()).backward()
+
+    moments = torch.zeros_like(field.table), torch.zeros_like(field.table)
+    with torch.no_grad():
+        forward = median_ms(lambda: encode(points, field.table, layout, sums), repeats)
+    return {
+        "encode_forward_ms": forward,
+        "encode_backward_ms": median_ms(lambda: encode(points, field.table, layout, sums).backward(towards), repeats)
+        - forward,
+        "field_forward_backward_ms": median_ms(whole, repeats),
+        "composite_ms": median_ms(shade, repeats),
+        "adam_ms": median_ms(lambda: adam_step_(field.table, sums, *moments, 1, 1e-3), repeats),
+    }
+
+
+def warp_parts(repeats: int) -> dict[str, float]:
+    """Baking a frame, marching and one Newton step with its gradient, on a bending bar."""
+    skin, matrices = bar_skin(half_length_m=0.9, half_width_m=0.3), bend(0.6)
+    warps = WarpSet.of([bake(skin, matrices)], CELL_M)
+    random = torch.Generator().manual_seed(0)
+    targets = (torch.rand(RAYS, 3, generator=random) - 0.5) * torch.tensor([0.8, 0.2, 0.0])
+    origins = torch.tensor([0.0, 0.0, 3.0]).expand(RAYS, 3).contiguous()
+    directions = torch.nn.functional.normalize(targets - origins, dim=-1)
+    box = torch.tensor([[-0.9, -0.3, -0.1], [0.9, 0.3, 0.1]])
+    occupied = torch.ones(64, 64, 64, dtype=torch.uint8)
+    rays = (origins, directions, torch.zeros(RAYS, dtype=torch.long), torch.rand(RAYS, generator=random))
+
+    def walk():
+        return march(*rays, 0.2 / SAMPLES_A_RAY, warps, occupied, box)
+
+    samples = walk()
+    ray = torch.repeat_interleave(torch.arange(RAYS), samples.ray_start.diff())
+    posed = origins[ray] + samples.distance_m[:, None] * directions[ray]
+    slots = torch.tensor([0, len(ray)])
+    blended = skin.blend(matrices[None]).requires_grad_(True)
+    return {
+        "bake_frame_ms": median_ms(lambda: bake(skin, matrices), max(3, repeats // 3)),
+        "march_ms": median_ms(walk, repeats),
+        "newton_and_pose_gradient_ms": median_ms(
+            lambda: newton(blended, samples.canonical_m, posed, slots, skin).sum().backward(), repeats
+        ),
+        "march_samples": float(len(ray)),
+    }
+
+
+def commit() -> str:
+    """Short name of the commit that is measured."""
+    shown = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=RESULTS.parent, check=False
+    )
+    return shown.stdout.strip() or "unknown"
+
+
+def append_row(figures: dict[str, float]) -> Path:
+    """Add a row to the machine's table."""
+    RESULTS.mkdir(exist_ok=True)
+    path = RESULTS / f"{platform.node()}.csv"
+    row = {"commit": commit(), "threads": torch.get_num_threads()} | {k: round(v, 3) for k, v in figures.items()}
+    new = not path.exists()
+    with path.open("a", newline="", encoding="utf-8") as stream:
+        writer = csv.DictWriter(stream, list(row))
+        if new:
+            writer.writeheader()
+        writer.writerow(row)
+    return path
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--repeats", type=int, default=15, help="runs of each part")
+    arguments = parser.parse_args()
+    torch.set_flush_denormal(True)
+    figures = {"memory_gb_s": memory_gb_s(arguments.repeats), "multiply_gflop_s": multiply_gflop_s(arguments.repeats)}
+    figures |= field_parts(FieldConfig(), arguments.repeats) | warp_parts(arguments.repeats)
+    for name, value in figures.items():
+        print(f"{name:32s} {value:10.2f}")
+    print(append_row(figures))
+    if arguments.json:
+        arguments.json.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
