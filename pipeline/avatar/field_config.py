@@ -28,7 +28,7 @@ class FieldConfig(Config):
     margin_m: float = Option(
         0.10, gt=0, le=0.6, description="how far clothing and hair may stand off the fitted body, m"
     )
-    step_fraction: float = Option(0.005, gt=0, le=0.1, description="ray step, as a part of the body's height")
+    step_fraction: float = Option(0.007, gt=0, le=0.1, description="ray step, as a part of the body's height")
     pixel_jitter: bool = Option(True, description="rays start anywhere in their pixel instead of its centre")
     share_border: float = Option(0.25, ge=0, le=1, description="part of the rays along the mask's border")
     share_outside: float = Option(0.1, ge=0, le=1, description="part of the rays outside the mask")
@@ -63,8 +63,8 @@ class FieldConfig(Config):
     empty_points: int = Option(2048, ge=0, description="points a step at which emptiness is asked for")
 
     pose_refinement: bool = Option(True, description="learn small corrections of the poses")
-    pose_start: float = Option(0.25, ge=0, le=1, description="part of the steps after which poses are refined")
-    pose_rate: float = Option(5e-4, gt=0, description="learning rate of the poses, rad (shifts: a third of it, m)")
-    pose_smoothness: float = Option(0.3, ge=0, description="weight of the change of corrections from frame to frame")
-    pose_size: float = Option(0.03, ge=0, description="weight of the size of corrections")
+    pose_start: float = Option(0.2, ge=0, le=1, description="part of the steps after which poses are refined")
+    pose_rate: float = Option(3e-3, gt=0, description="learning rate of the poses, rad (shifts: a third of it, m)")
+    pose_smoothness: float = Option(0.02, ge=0, description="weight of the change of corrections from frame to frame")
+    pose_size: float = Option(0.002, ge=0, description="weight of the size of corrections")
     validation_frames: int = Option(4, ge=0, description="validation frames that are rendered to judge the result")
