@@ -10,8 +10,8 @@ from jaxtyping import Float, Int
 from pydantic import Field
 
 from pipeline.avatar.bake import (
-    ENOUGH_WEIGHT,
     BakeConfig,
+    Fill,
     Surface,
     bake_diffuse,
     paint,
@@ -20,16 +20,17 @@ from pipeline.avatar.bake import (
 from pipeline.avatar.bake_views import View, crop_view, footprint_m, weigh_by_resolution
 from pipeline.avatar.body import Body, canonical_to_world
 from pipeline.avatar.parts import part_of_faces
-from pipeline.avatar.specular import corner_texels, fit_specular, observe_vertices, smooth_over_edges
+from pipeline.avatar.specular import corner_texels, fit_specular, observe_vertices
+from pipeline.avatar.spread import spread, vertex_means
 from pipeline.core.cli import main
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
-from pipeline.geometry.atlas import Atlas, rasterize_texels, texture_size_px, unwrap
+from pipeline.geometry.atlas import Atlas, Texels, rasterize_texels, texture_size_px, unwrap
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import dense_weights, linear_blend_skinning
+from pipeline.geometry.surface import laplacian
 from pipeline.io.capture import load_capture
-from pipeline.io.checkpoint import load_field
 from pipeline.io.image import to_uint8, write_gray, write_rgb
 from pipeline.io.npz import load_body, load_camera, load_motion, load_npz, save_npz
 
@@ -45,7 +46,7 @@ class Config(BakeConfig):
         1.5, gt=0.1, le=8.0, description="texels along the side of what one pixel of the capture sees on the person"
     )
     padding_px: int = Field(4, ge=1, le=64, description="gutter between charts, texels")
-    max_frames: int = Field(150, ge=1, description="training frames used, evenly spread over the recording")
+    max_frames: int = Field(100, ge=1, description="training frames used, evenly spread over the recording")
     specular_least_gain: float = Field(
         0.02,
         ge=0.0,
@@ -72,11 +73,9 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     atlas, size_px = make_atlas(skinned, body, train, config)
     texels = rasterize_texels(atlas, size_px)
     surface = Surface.of(skinned.mesh.faces, atlas, texels)
-    fallback = field_colours(inputs, texels.interpolate(skinned.mesh.faces, skinned.mesh.vertices))
-    diffuse, weight = bake_diffuse(train, surface, fallback, config)
+    diffuse, seen = bake_diffuse(train, surface, spread_over(skinned.mesh, texels), config)
     strength, gain = bake_specular(train, validation, skinned.mesh, config)
     specular = paint(torch.from_numpy(texels.interpolate(skinned.mesh.faces, strength)), texels)
-    seen = weight / (weight + ENOUGH_WEIGHT)
     save_npz(out / "atlas.npz", {"uv": atlas.uv, "faces_uv": atlas.faces_uv, "vertex_of_uv": atlas.vertex_of_uv})
     write_rgb(out / "diffuse.png", to_uint8(diffuse))
     write_rgb(out / "specular.png", to_uint8(specular))
@@ -126,10 +125,14 @@ def make_atlas(skinned: SkinnedMesh, body: Body, views: list[View], config: Conf
     return unwrap(skinned.mesh, part, size_px, config.padding_px), size_px
 
 
-def field_colours(inputs: Mapping[str, Path], points_m: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "t 3"]:
-    """The canonical field's colours at surface points."""
-    field = load_field(inputs["field"] / "field.safetensors").requires_grad_(False)
-    return field.colour(torch.from_numpy(points_m.astype(np.float32))).numpy()
+def spread_over(mesh: Mesh, texels: Texels) -> Fill:
+    """Colours for what no frame shows, from what is seen around it on the mesh."""
+
+    def fill(colour: Float[np.ndarray, "t 3"], seen: Float[np.ndarray, "t"]) -> Float[np.ndarray, "t 3"]:
+        means, weights = vertex_means(texels, mesh.faces, len(mesh.vertices), colour, seen)
+        return texels.interpolate(mesh.faces, spread(mesh, means, weights))
+
+    return fill
 
 
 def bake_specular(
@@ -145,7 +148,7 @@ def bake_specular(
     surface = Surface(faces, faces, torch.zeros(count, 2), texels)
     seen = [observe_vertices(views, surface, config) for views in (train, validation)]
     fitted = fit_specular(seen[0], seen[1], count, config.specular_least_gain)
-    return smooth_over_edges(fitted.strength, mesh.edges(), rounds=2), fitted.gain
+    return (fitted.strength - 0.5 * (laplacian(mesh) @ fitted.strength)).astype(np.float32), fitted.gain
 
 
 STAGE = Stage(

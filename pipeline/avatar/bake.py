@@ -7,7 +7,7 @@ the residual I_n - R_n(T) to T: alignment against the model instead of between f
 optimization", 2014), and back-projection, which also undoes the blur of the pixels' own size (Irani and Peleg, 1991).
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,8 +25,11 @@ from pipeline.geometry.textured import render_textured
 from pipeline.kernels.observe import observe_texels
 from pipeline.metrics.images import body_pixels, on_white, premultiplied_on_white, psnr_db
 
-ENOUGH_WEIGHT = 0.5
-"""A texel with this sum of weights (1: an ordinary frame that looks straight at it) is half its own, half fallback."""
+ENOUGH_SHARE = 0.1
+"""A texel with this share of the median sum of weights is half its own, half filled: of the texels below it on a real
+video a tenth hold the backdrop's colour, of the well seen ones a thousandth."""
+
+Fill = Callable[[Float[np.ndarray, "t 3"], Float[np.ndarray, "t"]], Float[np.ndarray, "t 3"]]
 
 
 class BakeConfig(Config):
@@ -47,7 +50,7 @@ class BakeConfig(Config):
         0.03, ge=0.0, le=0.5, description="frames are moved by at most this much, m; 0 aligns nothing"
     )
     outlier: float = Field(
-        0.15, gt=0.0, le=2.0, description="residual (sRGB, 0 to 1) at which a pixel counts a quarter of a right one"
+        0.3, gt=0.0, le=2.0, description="residual (sRGB, 0 to 1) at which a pixel counts a quarter of a right one"
     )
 
 
@@ -155,22 +158,29 @@ def render_view(texture: Float[np.ndarray, "s s 3"], view: View, surface: Surfac
 
 
 def bake_diffuse(
-    views: Sequence[View], surface: Surface, fallback: Float[np.ndarray, "t 3"], config: BakeConfig
+    views: Sequence[View], surface: Surface, fill: Fill, config: BakeConfig
 ) -> tuple[Float[np.ndarray, "s s 3"], Float[np.ndarray, "t"]]:
-    """The diffuse texture (sRGB, gutters filled), and how much was seen of every texel (sum of weights).
+    """The diffuse texture (sRGB, gutters filled), and how well every texel was seen, in [0, 1].
 
-    fallback: colours of the texels where no view helps, for instance the field's.
+    fill: colours for all texels from those of the first mean and how well they were seen, for those that were not.
     """
     first = first_texture(track(views, "texture: first mean"), surface, config)
-    seen = (first.weight / (first.weight + ENOUGH_WEIGHT))[:, None]
-    colour = seen * first.value() + (1.0 - seen) * torch.from_numpy(fallback)
+    enough = ENOUGH_SHARE * float(first.weight[first.weight > 0].median()) if bool(first.weight.any()) else 1.0
+    seen = confidence(first.weight, enough)
+    fallback = torch.from_numpy(fill(first.value().numpy(), seen.numpy()))
+    colour = torch.lerp(fallback, first.value(), seen[:, None])
     for number in range(config.rounds):
         texture = paint(colour, surface.texels)
         label = f"texture: round {number + 1}/{config.rounds}"
         change = residual_round(texture, track(views, label, total=len(views)), surface, config)
-        sure = (change.weight / (change.weight + ENOUGH_WEIGHT))[:, None]
+        sure = confidence(change.weight, enough)[:, None]
         colour = (colour + sure * change.value()).clamp(0.0, 1.0)
-    return paint(colour, surface.texels), first.weight.numpy()
+    return paint(colour, surface.texels), seen.numpy()
+
+
+def confidence(weight: Float[Tensor, "t"], enough: float) -> Float[Tensor, "t"]:
+    """How far a sum of weights is to be believed: 0 for none, 1/2 at `enough`, 1 for many."""
+    return weight**2 / (weight**2 + enough**2)
 
 
 def paint(colour: Float[Tensor, "t 3"], texels: Texels) -> Float[np.ndarray, "s s 3"]:

@@ -169,17 +169,3 @@ def _gain(
     left = rest - (lobe @ direction)[:, None] * strength[seen.vertex]
     before = float(np.sum(seen.weight[:, None] * rest**2))
     return 1.0 - float(np.sum(seen.weight[:, None] * left**2)) / before if before > 0 else 0.0
-
-
-def smooth_over_edges(
-    values: Float[np.ndarray, "v c"], edges: Int[np.ndarray, "e 2"], rounds: int
-) -> Float[np.ndarray, "v c"]:
-    """Each round replaces every vertex by the mean of itself and the mean of its neighbours."""
-    degree = np.maximum(np.bincount(edges.ravel(), minlength=len(values)), 1)[:, None]
-    for _ in range(rounds):
-        summed = np.zeros_like(values)
-        for column in range(values.shape[1]):
-            summed[:, column] += np.bincount(edges[:, 0], values[edges[:, 1], column], len(values))
-            summed[:, column] += np.bincount(edges[:, 1], values[edges[:, 0], column], len(values))
-        values = (0.5 * values + 0.5 * summed / degree).astype(values.dtype)
-    return values

@@ -12,11 +12,13 @@ import xatlas
 from jaxtyping import Bool, Float, Int
 
 from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.surface import smooth
 from pipeline.kernels.raster import rasterize
 
 # xatlas estimates its scale and overshoots the asked resolution, by up to 38 % in the cases measured: the gutter must
 # survive being shrunk by as much
 _XATLAS_OVERSHOOT = 1.4
+SMOOTHING_STEPS = 5
 
 
 @dataclass(frozen=True)
@@ -84,16 +86,17 @@ def unwrap(mesh: Mesh, part_of_face: Int[np.ndarray, "f"], size_px: int, padding
 
     Cutting at `part_of_face` (any labels) first costs charts (120 instead of 66 on a body of 51k faces) and saves time
     (4 s instead of 19 s): growing charts takes worse than linear time in the faces of a connected piece, and pieces are
-    worked on in parallel. The result does not depend on the number of threads.
+    worked on in parallel. The result does not depend on the number of threads. What is unfolded is a smoothed copy: on
+    the noise of a reconstructed surface charts end at every dent (756 charts, smoothed 282, on a mesh of 46k faces).
 
     padding_px: least gutter between charts in a texture of `size_px`.
     """
-    atlas = xatlas.Atlas()
+    atlas, smoothed = xatlas.Atlas(), smooth(mesh, SMOOTHING_STEPS).vertices
     rows_of_part, vertices_of_part = [], []
     for part in np.unique(part_of_face):
         rows = np.flatnonzero(part_of_face == part)
         vertices, corners = np.unique(mesh.faces[rows], return_inverse=True)
-        atlas.add_mesh(np.ascontiguousarray(mesh.vertices[vertices]), corners.reshape(-1, 3).astype(np.uint32))
+        atlas.add_mesh(np.ascontiguousarray(smoothed[vertices]), corners.reshape(-1, 3).astype(np.uint32))
         rows_of_part.append(rows)
         vertices_of_part.append(vertices)
     packing = xatlas.PackOptions()

@@ -11,7 +11,6 @@ from pipeline.avatar.specular import (
     fit_specular,
     harmonics,
     observe_vertices,
-    smooth_over_edges,
 )
 from tests.avatar.painted_ball import PaintedBall, paint_of
 
@@ -90,10 +89,3 @@ def test_vertices_are_observed_at_their_own_colour() -> None:
     # the camera lies along +Z of the ball: the mirrored view and the view stand symmetric about the normal
     towards = seen.mirrored - 2.0 * np.sum(seen.mirrored * seen.normal, axis=1, keepdims=True) * seen.normal
     assert np.all(-towards[:, 2] > 0.95)
-
-
-def test_smoothing_keeps_constants_and_the_range() -> None:
-    edges = np.array([[0, 1], [1, 2], [2, 3], [0, 3]], dtype=np.int32)
-    np.testing.assert_allclose(smooth_over_edges(np.full((4, 3), 0.3, np.float32), edges, 3), 0.3, rtol=1e-6)
-    peak = smooth_over_edges(np.eye(4, 3, dtype=np.float32), edges, 1)
-    np.testing.assert_allclose(peak[:, 0], [0.5, 0.25, 0.0, 0.25])
