@@ -124,7 +124,10 @@ LOCAL_CHANGES = {
 }
 """Symmetric deviations from the phenotypes, each in [-1, 1] with default 0, and the names that anny has for them."""
 
-SHAPE_DEFAULTS = {**PHENOTYPE_DEFAULTS, **dict.fromkeys(LOCAL_CHANGES, 0.0)}
+SCALE = "scale"
+"""Uniform enlargement: stature alone, where the phenotype `height` changes the proportions too."""
+
+SHAPE_DEFAULTS = {**PHENOTYPE_DEFAULTS, **dict.fromkeys(LOCAL_CHANGES, 0.0), SCALE: 1.0}
 """Every number of a shape with its default."""
 
 
@@ -171,7 +174,7 @@ class AnnyBody:
         turn = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
         vertices, joints_m = vertices @ turn.T, heads @ turn.T
         origin = torch.stack([joints_m[0, 0], vertices[:, 1].min(), joints_m[0, 2]])
-        return vertices - origin, joints_m - origin
+        return (vertices - origin) * values[SCALE], (joints_m - origin) * values[SCALE]
 
     def body(self, shape: Float[Tensor, "p"]) -> Body:
         """Freeze a shape into one person's body."""

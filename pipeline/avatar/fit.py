@@ -36,6 +36,8 @@ MINIMUM_FRAMES = 3
 LANDMARK_STEPS = 12
 OUTLINE_STEPS = 3
 POSE_ROUNDS = 3
+STATURE_DEVIATION_M = 0.09
+"""Spread of adults' stature, which is how well an assumed one is known."""
 OUTLINE_LANDMARK_M = 0.06
 OUTLINE_DIRECTION_M = 0.2
 """Standard deviations of a landmark in the image and in 3D once outlines help, which err less and in no fixed way."""
@@ -97,7 +99,8 @@ def fit_body(
     )
     state = interpolated_state(state, chosen, observations.time_s)
     state, model, overlap = _fit_poses(tools, observations, windows, state, weights)
-    return _result(tools, model, state, system, observations, overlap, exchanged)
+    spread_m = STATURE_DEVIATION_M if options.height_m is None else 0.0
+    return _result(tools, model, state, system, observations, overlap, exchanged, spread_m)
 
 
 def shared_rows(observations: Observations, windows: Sequence[Window | None], count: int) -> Int[np.ndarray, "k"]:
@@ -232,10 +235,12 @@ def _result(
     observations: Observations,
     overlap: Float[np.ndarray, "n"],
     exchanged: dict[str, Bool[np.ndarray, "n"]],
+    stature_spread_m: float,
 ) -> FitResult:
     covariance = shared_covariance(system)
     shapes = len(state.shape)
     height_gradient = model.height_m()[1].numpy()
+    height_variance = height_gradient @ covariance[:shapes, :shapes] @ height_gradient
     quaternions = matrix_to_quaternion(model.rotations_of_all(state.rotations))
     return FitResult(
         body=tools.body.body(state.shape.float()),
@@ -246,5 +251,5 @@ def _result(
         overlap=overlap,
         exchanged=exchanged,
         focal_deviation=float(np.sqrt(covariance[-1, -1])) if system.border[..., -1].any() else 0.0,
-        height_deviation_m=float(np.sqrt(height_gradient @ covariance[:shapes, :shapes] @ height_gradient)),
+        height_deviation_m=float(np.hypot(np.sqrt(height_variance), stature_spread_m)),
     )

@@ -92,8 +92,8 @@ def place_by_landmarks(observations: Observations, relative_m: Float[Tensor, "n 
         right.append((offset_px * in_camera[..., 2] - focal * in_camera[..., axis]) * weight)
     matrix, vector = torch.cat(rows, dim=1), torch.cat(right, dim=1)
     normal = matrix.transpose(1, 2) @ matrix + 1e-6 * torch.eye(3, dtype=torch.float64)
-    place = torch.linalg.solve(normal, (matrix * vector[..., None]).sum(1))
-    return (place - pose[:3, 3]) @ pose[:3, :3]
+    root_in_camera = torch.linalg.solve(normal, (matrix * vector[..., None]).sum(1))
+    return (root_in_camera - pose[:3, 3]) @ pose[:3, :3]
 
 
 def _fill_gaps(

@@ -1,7 +1,8 @@
 """The parametric body reduced to what a fit moves: 22 joints, a relaxed grip, a shape that is linear around a point.
 
 Letters: n frames, m points, j active joints, p rotation + translation numbers of a frame (3 j + 3), s shape numbers.
-A small rotation is applied in the parent's frame: R_j <- exp(delta_j) R_j. With x_k the place that joint k alone would
+A small rotation is applied in the parent's frame: R_j <- exp(delta_j) R_j; the root moves in the coordinates of
+`fit_place`. With x_k the place that joint k alone would
 carry a point to and w_k its skin weight, turning joint j moves the point by (parent rotation · delta_j) x arm_j, where
 arm_j = sum over k at or below j of w_k (x_k - joint_j).
 """
@@ -15,6 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pipeline.avatar.body import Body
 from pipeline.geometry.rotation import axis_angle_to_matrix
 from pipeline.geometry.skinning import forward_kinematics, linear_blend_skinning, skinning_transforms
 
@@ -44,6 +46,10 @@ class ParametricBody(Protocol):
 
     def rest(self, shape: Tensor) -> tuple[Tensor, Tensor]:
         """A-pose vertices (v, 3) and joints (j, 3) of a shape, metres."""
+        ...
+
+    def body(self, shape: Tensor) -> Body:
+        """The body of one shape, frozen."""
         ...
 
 
@@ -245,12 +251,15 @@ def pose_points(
 
 
 def pose_rows(
-    skeleton: PosedSkeleton, arms: Float[Tensor, "n m j 3"], covector: Float[Tensor, "n m 3"]
+    skeleton: PosedSkeleton,
+    arms: Float[Tensor, "n m j 3"],
+    root_by_place: Float[Tensor, "n 3 3"],
+    covector: Float[Tensor, "n m 3"],
 ) -> Float[Tensor, "n m p"]:
-    """Derivative of covector · point by the frame's joint rotations (3 j numbers) and root translation (3)."""
+    """Derivative of covector · point by the frame's joint rotations (3 j numbers) and the root's place (3)."""
     torque = torch.linalg.cross(arms, covector[:, :, None].expand_as(arms))
     by_rotation = torch.einsum("njba,nmjb->nmja", skeleton.parent_rotation, torque)
-    return torch.cat([by_rotation.flatten(2), covector], dim=2)
+    return torch.cat([by_rotation.flatten(2), covector @ root_by_place], dim=2)
 
 
 def shape_rows(

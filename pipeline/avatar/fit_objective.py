@@ -23,6 +23,7 @@ from pipeline.avatar.fit_model import (
     shape_rows,
     surface_points,
 )
+from pipeline.avatar.fit_place import MINIMUM_DEPTH_M, place_of_root, root_by_place, root_of_place
 from pipeline.avatar.fit_priors import (
     JointPrior,
     ShapePrior,
@@ -36,7 +37,7 @@ from pipeline.geometry.rotation import axis_angle_to_matrix
 
 FACE_LANDMARKS = 11
 LEFT_HIP, RIGHT_HIP = 23, 24
-MINIMUM_DEPTH_M = 0.2
+SCALE_PASSES = 3
 
 
 @dataclass(frozen=True)
@@ -49,10 +50,11 @@ class FitState:
     offsets_m: Float[Tensor, "o"]
     focal_log: Float[Tensor, ""]
 
-    def moved(self, frame_step: Float[Tensor, "n p"], shared_step: Float[Tensor, "g"]) -> "FitState":
+    def moved(self, frame_step: Float[Tensor, "n p"], shared_step: Float[Tensor, "g"], camera: Camera) -> "FitState":
         """The state after a step; an empty shared step leaves what is shared as it is."""
         turn = axis_angle_to_matrix(frame_step[:, :-3].reshape(*self.rotations.shape[:2], 3))
-        moved = replace(self, rotations=turn @ self.rotations, root_m=self.root_m + frame_step[:, -3:])
+        place = place_of_root(self.root_m, camera) + frame_step[:, -3:]
+        moved = replace(self, rotations=turn @ self.rotations, root_m=root_of_place(place, camera))
         if len(shared_step) == 0:
             return moved
         shapes = len(self.shape)
@@ -113,11 +115,11 @@ class Weights:
     contour_m: float = 0.010
     contour_cutoff: float = 4.0
     motion_rad: float = 0.03
-    motion_m: float = 0.01
+    motion_place: float = 0.003
     motion_cutoff: float = 4.0
     offset_m: float = 0.012
     height_m: float = 1.70
-    height_deviation_m: float = 0.05
+    height_deviation_m: float = 0.02
     focal_log: float = 0.5
     free_shape: bool = True
     free_offsets: bool = False
@@ -164,7 +166,7 @@ class Objective:
 
     def retract(self, state: FitState, frame_step: Tensor, shared_step: Tensor) -> FitState:
         """The state after a step, its shape inside the allowed range."""
-        moved = state.moved(frame_step, shared_step)
+        moved = state.moved(frame_step, shared_step, self.observations.camera)
         return replace(moved, shape=moved.shape.clamp(self.shape_prior.lowest, self.shape_prior.highest))
 
     def _free(self, shapes: int) -> Bool[Tensor, "g"]:
@@ -186,11 +188,12 @@ class Objective:
         inverse = confidence.sqrt() / (weights.landmark_m * noise * self.px_per_m[:, None])
         residual = (pixels - seen.landmarks_px) * inverse[..., None]
         weight = _robust(system, residual.square().sum(-1), weights.landmark_cutoff)
+        by_place = root_by_place(state.root_m, seen.camera)
         for axis in range(2):
             covector = covectors[:, :, axis] * inverse[..., None]
             by_focal = (pixels[..., axis] - _centre(seen.camera)[axis]) * inverse
             by_shared = self._shared_rows(model, skeleton, points, covector, by_focal)
-            system.add(pose_rows(skeleton, arms, covector), by_shared, residual[..., axis], weight)
+            system.add(pose_rows(skeleton, arms, by_place, covector), by_shared, residual[..., axis], weight)
         trust = seen.direction_confidence * facing / noise.square()
         self._add_directions(system, model, skeleton, points, world, arms, trust)
 
@@ -207,15 +210,15 @@ class Objective:
         """The detector's 3D landmarks, relative to the hips and of unknown overall scale."""
         seen, cutoff = self.observations, self.weights.landmark_cutoff
         relative = world - _hip_middle(world)
-        lengths = (confidence * seen.directions_m.norm(dim=-1)).sum().clamp(min=1e-6)
-        scale = (confidence * relative.norm(dim=-1)).sum() / lengths
         inverse = confidence.sqrt() / self.weights.direction_m
-        residual = (relative - scale * seen.directions_m) * inverse[..., None]
+        scale = _direction_scale(relative, seen.directions_m, inverse, cutoff)
+        residual = (scale * relative - seen.directions_m) * inverse[..., None]
         weight = _robust(system, residual.square().sum(-1), cutoff)
+        by_place = torch.zeros(len(world), 3, 3, dtype=torch.float64)  # hips and landmarks move together
         for axis in range(3):
             covector = torch.zeros_like(world)
-            covector[..., axis] = 1.0
-            rows = pose_rows(skeleton, arms, covector)
+            covector[..., axis] = scale
+            rows = pose_rows(skeleton, arms, by_place, covector)
             shared = self._shared_rows(model, skeleton, points, covector, torch.zeros_like(inverse))
             rows = (rows - _hip_middle(rows)) * inverse[..., None]
             shared = (shared - _hip_middle(shared)) * inverse[..., None]
@@ -235,7 +238,8 @@ class Objective:
         centred = pixels - pixels.new_tensor(_centre(seen.camera))
         by_focal = (centred * contour.normal).sum(-1) * inverse
         by_shared = self._shared_rows(model, skeleton, points, covector, by_focal)
-        system.add(pose_rows(skeleton, arms, covector), by_shared, residual, weight)
+        by_place = root_by_place(state.root_m, seen.camera)
+        system.add(pose_rows(skeleton, arms, by_place, covector), by_shared, residual, weight)
 
     def _shared_rows(
         self,
@@ -267,9 +271,9 @@ class Objective:
         if len(state.root_m) < 3:
             return
         weights, time_s = self.weights, self.observations.time_s
-        residual = motion_residuals(state.rotations, state.root_m, time_s)
+        residual = motion_residuals(state.rotations, place_of_root(state.root_m, self.observations.camera), time_s)
         deviation = residual.new_full((residual.shape[1],), weights.motion_rad)
-        deviation[-3:] = weights.motion_m
+        deviation[-3:] = weights.motion_place
         residual = residual / deviation
         weight = _robust(system, residual.square(), weights.motion_cutoff)
         before, after, scale = (factor[:, None] for factor in interval_factors(time_s))
@@ -337,6 +341,24 @@ def facing_factor(skeleton: PosedSkeleton, camera: Camera) -> Float[Tensor, "n 3
     return factor
 
 
+def _direction_scale(
+    relative_m: Float[Tensor, "n 33 3"],
+    directions_m: Float[Tensor, "n 33 3"],
+    inverse: Float[Tensor, "n 33"],
+    cutoff: float,
+) -> float:
+    """Factor that carries the body's 3D landmarks onto the detector's with the least robust cost.
+
+    Being the best factor, its own change costs nothing to first order, so the derivatives may treat it as a constant.
+    """
+    weight, scale = inverse.square(), 1.0
+    for _ in range(SCALE_PASSES):
+        scale = float((weight[..., None] * relative_m * directions_m).sum() / (weight[..., None] * relative_m**2).sum())
+        squared = (scale * relative_m - directions_m).square().sum(-1) * inverse.square()
+        weight = inverse.square() * (1.0 + squared / cutoff**2) ** -2
+    return scale
+
+
 def _robust(system: NormalEquations, squared: Tensor, cutoff: float, share: Tensor | float = 1.0) -> Tensor:
     """Geman-McClure weights rho'(r) for squared residuals; their cost is added to the system."""
     relative = 1.0 + squared / cutoff**2
@@ -346,9 +368,7 @@ def _robust(system: NormalEquations, squared: Tensor, cutoff: float, share: Tens
 
 def image_scale(state: FitState, camera: Camera) -> Float[Tensor, "n"]:
     """Pixels a metre at each frame's person."""
-    pose = torch.as_tensor(camera.world_to_camera, dtype=state.root_m.dtype)
-    depth_m = (state.root_m @ pose[2, :3] + pose[2, 3]).clamp(min=MINIMUM_DEPTH_M)
-    return camera.fx * torch.exp(state.focal_log) / depth_m
+    return camera.fx * torch.exp(state.focal_log - place_of_root(state.root_m, camera)[:, 2])
 
 
 def _centre(camera: Camera) -> tuple[float, float]:

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pipeline.avatar.body import SCALE
 from pipeline.avatar.fit_model import ACTIVE_JOINTS, FitModel
 from pipeline.geometry.rotation import matrix_to_quaternion, quaternion_to_axis_angle
 
@@ -58,6 +59,8 @@ LOCAL_CHANGE_DEVIATION = 0.3
 
 PHENOTYPE_RANGE = (0.02, 0.98)
 LOCAL_CHANGE_RANGE = (-1.0, 1.0)
+SCALE_DEVIATION = 0.1
+SCALE_RANGE = (0.6, 1.4)
 
 
 @dataclass(frozen=True)
@@ -72,10 +75,10 @@ class ShapePrior:
 
 def shape_prior(names: Sequence[str], defaults: Float[Tensor, "s"]) -> ShapePrior:
     """The prior for a body's shape numbers, by their names; unknown names count as local changes."""
-    deviation = [SHAPE_DEVIATION.get(name, LOCAL_CHANGE_DEVIATION) for name in names]
-    ranges = [PHENOTYPE_RANGE if name in SHAPE_DEVIATION else LOCAL_CHANGE_RANGE for name in names]
-    lowest, highest = torch.tensor(ranges, dtype=torch.float64).unbind(1)
-    return ShapePrior(defaults.double(), torch.tensor(deviation, dtype=torch.float64), lowest, highest)
+    known = {name: (deviation, *PHENOTYPE_RANGE) for name, deviation in SHAPE_DEVIATION.items()}
+    known[SCALE] = (SCALE_DEVIATION, *SCALE_RANGE)
+    rows = [known.get(name, (LOCAL_CHANGE_DEVIATION, *LOCAL_CHANGE_RANGE)) for name in names]
+    return ShapePrior(defaults.double(), *torch.tensor(rows, dtype=torch.float64).unbind(1))
 
 
 @dataclass(frozen=True)
@@ -167,13 +170,13 @@ def interval_factors(time_s: Float[Tensor, "n"]) -> tuple[Float[Tensor, "t"], Fl
 
 
 def motion_residuals(
-    rotations: Float[Tensor, "n j 3 3"], root_m: Float[Tensor, "n 3"], time_s: Float[Tensor, "n"]
+    rotations: Float[Tensor, "n j 3 3"], place: Float[Tensor, "n 3"], time_s: Float[Tensor, "n"]
 ) -> Float[Tensor, "t p"]:
-    """Change of velocity at each inner frame: rotations (rad a frame, parent's axes), then the root (m a frame).
+    """Change of velocity at each inner frame: joint rotations (rad a frame), then `fit_place`.
 
     To first order its derivative by the rotation steps of frames t - 1, t, t + 1 is (before, -before - after, after).
     """
     steps = rotation_logarithm(rotations[1:] @ rotations[:-1].transpose(-1, -2)).flatten(1)
-    steps = torch.cat([steps, torch.diff(root_m, dim=0)], dim=1)
+    steps = torch.cat([steps, torch.diff(place, dim=0)], dim=1)
     before, after, scale = interval_factors(time_s)
     return (steps[1:] * after[:, None] - steps[:-1] * before[:, None]) * scale[:, None]

@@ -39,6 +39,11 @@ CLOTHING_SHARE = 0.5
 HAIR_SHARE = 0.15
 """The same for pairs on the head."""
 
+DOUBT_FROM, DOUBT_TO = 0.05, 0.15
+"""A frame's outlines count fully while its overlap is this near to the median, and hardly when it is that far below."""
+
+LEAST_TRUST = 0.05
+
 SKIN_CHUNK = 32
 
 
@@ -190,6 +195,17 @@ def _thinned(pixels: Int[np.ndarray, "q 2"]) -> Int[np.ndarray, "m 2"]:
     return pixels[np.linspace(0, len(pixels) - 1, min(POINTS_PER_SIDE, len(pixels))).astype(np.int64)]
 
 
+def mask_trust(overlap: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """Share of each frame's outlines that counts: a mask that agrees much less with the body than others is doubtful.
+
+    Frames without a mask (nan) get full trust, which multiplies nothing.
+    """
+    if np.isnan(overlap).all():
+        return np.ones_like(overlap)
+    behind = np.nanmedian(overlap) - overlap
+    return np.nan_to_num(np.clip((DOUBT_TO - behind) / (DOUBT_TO - DOUBT_FROM), LEAST_TRUST, 1.0), nan=1.0)
+
+
 def match_all(
     model: FitModel, state: FitState, observations: Observations, windows: Sequence[Window | None]
 ) -> tuple[Contour, Float[np.ndarray, "n"]]:
@@ -217,4 +233,5 @@ def match_all(
         target[frame, :count] = torch.from_numpy(pairs.target / window.scale + [window.left_px, window.top_px])
         normal[frame, :count] = torch.from_numpy(pairs.normal).double()
         weight[frame, :count] = torch.from_numpy(pairs.weight * (FRAME_SHARE / max(used, 1)))
+    weight *= torch.from_numpy(mask_trust(overlap))[:, None]
     return Contour(corners, barycentric, target, normal, weight), overlap

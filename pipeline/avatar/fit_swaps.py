@@ -58,8 +58,8 @@ def two_label_path(
 def exchanged_bodies(observations: Observations, rest_m: Float[torch.Tensor, "33 3"]) -> Bool[np.ndarray, "n"]:
     """Frames in which the whole person was taken for one who faces the other way, by the continuity of turning.
 
-    Exchanged sides with mirrored depths turn a yaw into pi minus the yaw: a jump in front and back views. In a side view
-    the two agree, and nothing tells them apart.
+    Exchanged sides with mirrored depths turn a yaw into pi minus the yaw: a jump in front and back views. In a side
+    view the two agree, and nothing tells them apart.
     """
     rows = np.flatnonzero(torso_found(observations))
     yaw_rad = facing_yaw(torso_rotations(rest_m, observations.directions_m[rows])).numpy()

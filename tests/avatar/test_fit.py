@@ -98,7 +98,7 @@ def test_unknown_focal_length_is_found() -> None:
 
 
 def test_the_same_input_gives_the_same_bytes() -> None:
-    scene = act(load_anny(), 8)
+    scene = act(load_anny(), 4)
     results = [
         fit_body(load_anny(), scene.observations(scene.camera), scene.windows(), options(scene, rounds=1))
         for _ in range(2)

@@ -63,9 +63,13 @@ def test_derivatives_agree_with_differences(model: FitModel) -> None:
 
     step = 1e-5 * torch.randn(FRAMES, 3 * len(ACTIVE_JOINTS) + 3, generator=generator, dtype=torch.float64)
     turned = axis_angle_to_matrix(step[:, :-3].reshape(FRAMES, -1, 3)) @ rotations
-    moved, _ = pose_points(model, pose_skeleton(model, turned, root + step[:, -3:]), points)
+    by_place = torch.randn(FRAMES, 3, 3, generator=generator, dtype=torch.float64)
+    moved_root = root + (by_place @ step[:, -3:, None])[..., 0]
+    moved, _ = pose_points(model, pose_skeleton(model, turned, moved_root), points)
     expected = ((moved - world) * covector).sum(-1)
-    assert torch.allclose((pose_rows(skeleton, arms, covector) @ step[..., None])[..., 0], expected, atol=1e-8)
+    assert torch.allclose(
+        (pose_rows(skeleton, arms, by_place, covector) @ step[..., None])[..., 0], expected, atol=1e-8
+    )
 
     shape_step = 1e-4 * torch.randn(len(model.shape), generator=generator, dtype=torch.float64)
     offset_step = 1e-4 * torch.randn(OFFSET_COUNT, generator=generator, dtype=torch.float64)

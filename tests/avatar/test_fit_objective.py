@@ -15,7 +15,7 @@ from tests.avatar.acting import act
 FRAMES = 4
 NUMBERS = 3 * len(ACTIVE_JOINTS) + 3
 # Without motion, whose derivative is of first order in the turn between frames, the gradient is exact.
-EXACT = Weights(free_offsets=True, free_focal=True, motion_rad=1e3, motion_m=1e3)
+EXACT = Weights(free_offsets=True, free_focal=True, motion_rad=1e3, motion_place=1e3)
 
 
 def build(weights: Weights, outlines: bool = True) -> tuple[Objective, FitState]:
@@ -26,7 +26,7 @@ def build(weights: Weights, outlines: bool = True) -> tuple[Objective, FitState]
     generator = torch.Generator().manual_seed(5)
     step = 0.03 * torch.randn(FRAMES, NUMBERS, generator=generator, dtype=torch.float64)
     shared = 0.01 * torch.randn(len(model.shape) + OFFSET_COUNT + 1, generator=generator, dtype=torch.float64)
-    state = scene.state.moved(step, shared)
+    state = scene.state.moved(step, shared, scene.camera)
     observations = scene.observations(scene.camera)
     contour = match_all(model, state, observations, scene.windows())[0] if outlines else None
     scale = image_scale(state, scene.camera)
@@ -40,9 +40,10 @@ def test_gradient_agrees_with_differences_of_the_cost(weights: Weights) -> None:
     system = objective(state)
     generator = torch.Generator().manual_seed(6)
     by_frame = torch.randn(FRAMES, NUMBERS, generator=generator, dtype=torch.float64)
+    camera = objective.observations.camera
     by_shared = 0.1 * torch.randn(len(system.shared_gradient), generator=generator, dtype=torch.float64)
-    ahead = objective(state.moved(1e-6 * by_frame, 1e-6 * by_shared)).cost
-    behind = objective(state.moved(-1e-6 * by_frame, -1e-6 * by_shared)).cost
+    ahead = objective(state.moved(1e-6 * by_frame, 1e-6 * by_shared, camera)).cost
+    behind = objective(state.moved(-1e-6 * by_frame, -1e-6 * by_shared, camera)).cost
     slope = 2.0 * float((system.frame_gradient * by_frame).sum() + system.shared_gradient @ by_shared)
     # the surface's derivative by shape is that of the nearest corner, hence the tolerance
     assert (ahead - behind) / 2e-6 == pytest.approx(slope, rel=5e-3)
@@ -53,14 +54,15 @@ def test_gradient_of_motion_is_right_for_small_turns() -> None:
     system = objective(state)
     generator = torch.Generator().manual_seed(7)
     by_frame = torch.randn(FRAMES, NUMBERS, generator=generator, dtype=torch.float64)
+    camera = objective.observations.camera
     nothing = torch.zeros(0, dtype=torch.float64)
-    ahead, behind = (objective(state.moved(sign * 1e-6 * by_frame, nothing)).cost for sign in (1.0, -1.0))
+    ahead, behind = (objective(state.moved(sign * 1e-6 * by_frame, nothing, camera)).cost for sign in (1.0, -1.0))
     slope = 2.0 * float((system.frame_gradient * by_frame).sum())
     assert (ahead - behind) / 2e-6 == pytest.approx(slope, rel=0.05)
 
 
 def test_the_truth_costs_less_than_its_neighbourhood() -> None:
-    objective, wrong = build(Weights(motion_rad=1e3, motion_m=1e3), outlines=False)
+    objective, wrong = build(Weights(motion_rad=1e3, motion_place=1e3), outlines=False)
     scene = act(load_anny(), FRAMES, turn_rad=0.6)
     objective = replace(objective, observations=scene.observations(scene.camera))
     assert objective(scene.state).cost < 0.5 * objective(wrong).cost

@@ -5,6 +5,7 @@ import torch
 from pipeline.avatar.body import load_anny
 from pipeline.avatar.fit_silhouette import (
     intersection_over_union,
+    mask_trust,
     match_all,
     match_outlines,
     matching_window,
@@ -69,6 +70,14 @@ def test_a_mask_inside_the_body_pulls_harder_than_one_outside() -> None:
     assert weights[0] < 0.7 * weights[1]
     drawn = disc(27.0, *middle, size=window.mask.shape[0])[:, : window.mask.shape[1]]
     assert match_outlines(window, drawn, drawn).weight.mean() < 0.5 * weights[0]
+
+
+def test_a_mask_that_agrees_less_than_the_others_counts_less() -> None:
+    trust = mask_trust(np.array([0.93, 0.92, 0.94, 0.83, 0.6, np.nan]))
+    assert trust[[0, 1, 2, 5]].tolist() == [1.0] * 4
+    assert 0.3 < trust[3] < 0.8
+    assert trust[4] == pytest.approx(0.05)
+    assert mask_trust(np.full(3, np.nan)).tolist() == [1.0] * 3
 
 
 def test_an_empty_mask_has_no_window() -> None:
