@@ -13,7 +13,7 @@ class FieldConfig(Config):
     seed: int = Option(0, ge=0, description="seed of all random draws")
     steps: int = Option(1600, ge=1, le=200_000, description="training steps")
     rays: int = Option(4096, ge=64, le=1 << 18, description="rays a step")
-    frames_per_step: int = Option(8, ge=1, le=64, description="frames that a step's rays come from")
+    frames_per_step: int = Option(16, ge=1, le=64, description="frames that a step's rays come from")
     max_frames: int = Option(120, ge=2, description="training frames kept, evenly spread; each holds about 3 MB")
     max_person_px: int = Option(
         640, ge=32, description="images are scaled down until the person is at most this tall, px"
@@ -51,13 +51,13 @@ class FieldConfig(Config):
     table_rate: float = Option(1e-1, gt=0, description="learning rate of the hash table")
     network_rate: float = Option(2e-2, gt=0, description="learning rate of the network")
     final_rate: float = Option(
-        0.03, gt=0, le=1, description="learning rates at the end, as a part of those at the start"
+        0.05, gt=0, le=1, description="learning rates at the end, as a part of those at the start"
     )
     huber_delta: float = Option(0.3, gt=0, description="colour error where the Huber loss turns from square to linear")
     weight_alpha: float = Option(0.3, ge=0, description="weight of the alpha loss")
     weight_hard: float = Option(0.02, ge=0, description="weight of the hard-surface loss")
     weight_thin: float = Option(
-        0.02, ge=0, description="weight of the loss on light caught by thin, see-through samples"
+        0.0, ge=0, description="weight of the loss on light caught by thin, see-through samples"
     )
     weight_density: float = Option(0.05, ge=0, description="weight of the density loss in empty cells")
     empty_points: int = Option(2048, ge=0, description="points a step at which emptiness is asked for")
