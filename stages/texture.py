@@ -35,6 +35,7 @@ from pipeline.io.image import to_uint8, write_gray, write_rgb
 from pipeline.io.npz import load_body, load_camera, load_motion, load_npz, save_npz
 
 TRAIN, VALIDATION = 0, 1
+SPECULAR_SMOOTHING = 8
 
 
 class Config(BakeConfig):
@@ -48,7 +49,7 @@ class Config(BakeConfig):
     padding_px: int = Field(4, ge=1, le=64, description="gutter between charts, texels")
     max_frames: int = Field(100, ge=1, description="training frames used, evenly spread over the recording")
     specular_least_gain: float = Field(
-        0.02,
+        0.1,
         ge=0.0,
         le=1.0,
         description="share of the error on validation frames that highlights must explain, or matte",
@@ -147,8 +148,11 @@ def bake_specular(
     faces = torch.from_numpy(mesh.faces)
     surface = Surface(faces, faces, torch.zeros(count, 2), texels)
     seen = [observe_vertices(views, surface, config) for views in (train, validation)]
-    fitted = fit_specular(seen[0], seen[1], count, config.specular_least_gain)
-    return (fitted.strength - 0.5 * (laplacian(mesh) @ fitted.strength)).astype(np.float32), fitted.gain
+    fitted = fit_specular(seen[0], seen[1], mesh.edges(), count, config.specular_least_gain)
+    strength, operator = fitted.strength.astype(np.float64), laplacian(mesh)
+    for _ in range(SPECULAR_SMOOTHING):
+        strength = strength - 0.5 * (operator @ strength)
+    return strength.astype(np.float32), fitted.gain
 
 
 STAGE = Stage(

@@ -4,13 +4,14 @@ Letters: c residual colour of a vertex in a frame (observed minus the vertex's m
 n world normal, r world direction of the mirrored view. Camera and light stand still while the person turns, so
     c = a · (E(n) - mean E) + s · (L(r) - mean L),
 with E (shading, scales the colour) and L (highlight, adds light) shared by all vertices as spherical harmonics without
-their constant, and s >= 0 each vertex's specular colour: nerf2mesh's split into diffuse colour and specular features
-(Tang et al. 2023) with a linear lobe instead of a network, so that it is solved and not trained. The split counts only
-if it foretells frames that it has not seen; else the surface is matte.
+their constant, and s >= 0 each vertex's specular strength: nerf2mesh's split into diffuse colour and specular features
+(Tang et al. 2023) with a linear lobe instead of a network, so that it is solved and not trained. s is grey, because
+what is neither metal nor lacquer reflects light without colouring it. The split counts only if it foretells frames that
+it has not seen; else the surface is matte.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -21,6 +22,8 @@ from pipeline.geometry.atlas import Texels
 
 ALTERNATIONS = 8
 RIDGE = 1e-3
+EDGE_CONTRAST = 0.05
+TINT_PENALTY = 4.0
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,7 @@ class Observations:
 
 @dataclass(frozen=True)
 class Specular:
-    """strength: each vertex's highlight colour, sRGB in [0, 1], 0 everywhere when highlights explain nothing.
+    """strength: each vertex's highlight (grey), sRGB in [0, 1], 0 everywhere when highlights explain nothing.
 
     gain: share of the error on unseen frames that the highlights explain beyond shading (negative: they mislead).
     """
@@ -104,38 +107,57 @@ class _Centred:
         return np.stack(columns, axis=1) / self.total[:, None]
 
 
-def fit_specular(train: Observations, validation: Observations, count: int, least_gain: float) -> Specular:
+def fit_specular(
+    train: Observations, validation: Observations, edges: Int[np.ndarray, "e 2"], count: int, least_gain: float
+) -> Specular:
     """Shading and highlights from training frames, judged on validation frames.
 
-    count: number of vertices. least_gain: share of the validation error that highlights must explain to be kept.
+    edges: of the mesh; count: number of vertices. least_gain: share of the validation error that highlights must
+    explain to be kept.
+
+    A wrong pose changes a vertex's colour with the view as a highlight does, and foretells other frames as well: on a
+    real video the hem of a shirt and a print came out as the brightest highlights. So only changes count that light
+    reflected at a surface can make, colourless ones, and only where the paint around is flat.
     """
     centred = _Centred(train, count)
     shade_mean = centred.mean(train, harmonics(train.normal, 2))
     lobe_mean = centred.mean(train, harmonics(train.mirrored, 3))
+    albedo = centred.mean_colour
+    flat = flatness(albedo, edges)
+    train = replace(train, weight=(train.weight * flat[train.vertex]).astype(np.float32))
+    validation = replace(validation, weight=(validation.weight * flat[validation.vertex]).astype(np.float32))
 
     def terms(seen: Observations) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        residual = seen.colour - centred.mean_colour[seen.vertex]
+        residual = seen.colour - albedo[seen.vertex]
         shade = harmonics(seen.normal, 2) - shade_mean[seen.vertex]
         lobe = harmonics(seen.mirrored, 3) - lobe_mean[seen.vertex]
         return residual, shade, lobe
 
     residual, shade, lobe = terms(train)
-    albedo = centred.mean_colour
     highlights = np.zeros_like(residual)
-    strength = np.ones((count, 3))
+    strength = np.ones(count)
     for _ in range(ALTERNATIONS):
         shading = _solve_shared(shade, albedo[train.vertex], residual - highlights, train.weight)
         rest = residual - (shade @ shading)[:, None] * albedo[train.vertex]
-        direction = _solve_shared(lobe, strength[train.vertex], rest, train.weight)
+        grey = np.repeat(strength[train.vertex, None], 3, axis=1)
+        direction = _solve_shared(lobe, grey, rest, train.weight)
         # without a fixed size of L the ridge would pull s down and L would grow in its place, round after round
         direction /= max(float(np.sqrt(np.average((lobe @ direction) ** 2, weights=train.weight))), 1e-9)
         height = lobe @ direction
         strength = _solve_strength(train, height, rest, count)
-        highlights = height[:, None] * strength[train.vertex]
+        highlights = np.repeat((height * strength[train.vertex])[:, None], 3, axis=1)
     gain = _gain(terms(validation), validation, albedo, shading, direction, strength)
     span = np.ptp(np.percentile(harmonics(train.mirrored, 3) @ direction, [1.0, 99.0]))
-    kept = np.clip(strength * span, 0.0, 1.0) if gain >= least_gain else np.zeros_like(strength)
-    return Specular(kept.astype(np.float32), float(gain))
+    kept = np.clip(strength * span, 0.0, 1.0) if gain >= least_gain else np.zeros(count)
+    return Specular(np.repeat(kept[:, None], 3, axis=1).astype(np.float32), float(gain))
+
+
+def flatness(albedo: Float[np.ndarray, "v 3"], edges: Int[np.ndarray, "e 2"]) -> Float[np.ndarray, "v"]:
+    """1 where a vertex has its neighbours' colour, towards 0 where they differ by more than `EDGE_CONTRAST`."""
+    step = np.abs(albedo[edges[:, 0]] - albedo[edges[:, 1]]).max(axis=1)
+    largest = np.zeros(len(albedo))
+    np.maximum.at(largest, edges.ravel(), np.repeat(step, 2))
+    return 1.0 / (1.0 + (largest / EDGE_CONTRAST) ** 2) ** 2
 
 
 def _solve_shared(
@@ -148,12 +170,15 @@ def _solve_shared(
     return np.linalg.solve(matrix + RIDGE * np.trace(matrix) / len(matrix) * np.eye(len(matrix)), right)
 
 
-def _solve_strength(train: Observations, height: np.ndarray, rest: np.ndarray, count: int) -> Float[np.ndarray, "v 3"]:
-    """Each vertex's s >= 0 for given highlights, pulled to 0 where few or weak ones were seen."""
+def _solve_strength(train: Observations, height: np.ndarray, rest: np.ndarray, count: int) -> Float[np.ndarray, "v"]:
+    """Each vertex's s >= 0 for given highlights: near 0 where few or weak ones were seen, or coloured ones."""
     power = np.bincount(train.vertex, train.weight * height**2, count)
     evidence = np.stack([np.bincount(train.vertex, train.weight * height * c, count) for c in rest.T], axis=1)
     ridge = np.median(power[power > 0]) if np.any(power > 0) else 1.0
-    return np.maximum(evidence / (power + ridge)[:, None], 0.0)
+    channels = evidence / (power + ridge)[:, None]
+    grey = np.maximum(channels.mean(axis=1), 0.0)
+    tint = np.sum((channels - grey[:, None]) ** 2, axis=1)
+    return grey**3 / np.maximum(grey**2 + TINT_PENALTY * tint, 1e-12)
 
 
 def _gain(
@@ -166,6 +191,6 @@ def _gain(
 ) -> float:
     residual, shade, lobe = terms
     rest = residual - (shade @ shading)[:, None] * albedo[seen.vertex]
-    left = rest - (lobe @ direction)[:, None] * strength[seen.vertex]
+    left = rest - (lobe @ direction * strength[seen.vertex])[:, None]
     before = float(np.sum(seen.weight[:, None] * rest**2))
     return 1.0 - float(np.sum(seen.weight[:, None] * left**2)) / before if before > 0 else 0.0
