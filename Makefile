@@ -62,8 +62,8 @@ format: $(STAMP)  ## mend what ruff can mend
 	$(VENV)/bin/ruff check --fix .
 	$(VENV)/bin/ruff format .
 
-bench: $(STAMP)  ## measure speed
-	$(RUN_PYTHON) -m pytest tests/bench -m "slow or not slow" -s $(ARGS)
+bench: $(STAMP)  ## measure the speed of the kernels; the machine should do nothing else
+	$(RUN_PYTHON) -m tests.bench.bench_kernels $(ARGS)
 
 doctor:  ## what this machine lacks, and the command that mends it
 	@$(PYTHON) -m pipeline.core.doctor
