@@ -65,7 +65,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
 
     footprint_m = float(np.median([pixel_footprint_m(view, body.vertices, body.skin_weights) for view in train]))
     edge_m = float(np.clip(config.edge_px * footprint_m, config.min_edge_m, config.max_edge_m))
-    start = load_state(out / CHECKPOINT)
+    start: Mesh | Refined | None = load_state(out / CHECKPOINT)
     if start is None:
         judged = (validation or train)[:: max(1, len(validation or train) // config.level_frames)]
 

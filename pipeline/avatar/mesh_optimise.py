@@ -32,7 +32,7 @@ class RefineConfig(Config):
     rounds: int = Field(
         3, ge=0, le=10, description="rounds of optimisation; each after the first starts with new triangles"
     )
-    steps: int = Field(120, ge=1, le=5000, description="optimiser steps a round")
+    steps: int = Field(60, ge=1, le=5000, description="optimiser steps a round")
     frames_per_step: int = Field(3, ge=1, le=16, description="training frames a step looks at")
     person_height_px: int = Field(
         480, ge=64, le=4096, description="images are reduced until the person is at most this high, px"
@@ -51,7 +51,7 @@ class RefineConfig(Config):
     colour_weight: float = Field(1.0, ge=0.0, description="weight of the Huber colour loss")
     alpha_weight: float = Field(1.0, ge=0.0, description="weight of the silhouette loss, alpha against mask")
     smooth_weight: float = Field(
-        0.02, ge=0.0, description="weight of the uniform Laplacian of the positions, in units of the edge length"
+        0.5, ge=0.0, description="weight of the uniform Laplacian of the positions, in units of the edge length"
     )
     offset_weight: float = Field(
         0.002, ge=0.0, description="weight of the squared vertex offsets, in units of the edge length"
@@ -123,7 +123,7 @@ def optimise(mesh: Mesh, skin: Skin, task: RefineTask, seed: int, label: str = "
     coordinates, shift = torch.zeros_like(start, requires_grad=True), torch.zeros(3, requires_grad=True)
     rates = [config.learning_rate * (1.0 + config.stiffness), config.global_learning_rate]
     movement = UniformAdam([coordinates, shift], rates)
-    colours = [parameter for parameter in task.shade.parameters() if parameter.requires_grad]
+    colours: list[Tensor] = [parameter for parameter in task.shade.parameters() if parameter.requires_grad]
     appearance = torch.optim.Adam(colours, lr=config.appearance_rate, betas=(0.9, 0.99), eps=1e-12) if colours else None
     warm_up = config.appearance_steps if appearance else 0
     for step in track(range(warm_up + config.steps), label):
