@@ -33,6 +33,7 @@ class Body:
     shape: dict[str, float]
 
     def mesh(self) -> Mesh:
+        """The A-pose surface."""
         return Mesh(self.vertices, self.faces)
 
     def joint(self, name: str) -> int:
@@ -40,6 +41,7 @@ class Body:
         return self.joint_names.index(name)
 
     def height_m(self) -> float:
+        """Height of the A-pose, sole to crown."""
         return float(np.ptp(self.vertices[:, 1]))
 
 
@@ -92,7 +94,10 @@ PHENOTYPE_DEFAULTS = {
     "asian": 1.0 / 3.0,
     "caucasian": 1.0 / 3.0,
 }
-"""Anny's phenotypes, each in [0, 1]; gender 0 is male, age 2/3 is a young adult (anchors at 0 baby, 1/3 child, 1 old)."""
+"""Anny's phenotypes, each in [0, 1].
+
+Gender 0 is male; age 2/3 is a young adult (its anchors: 0 baby, 1/3 child, 2/3 young, 1 old).
+"""
 
 LOCAL_CHANGES = {
     "upperarm-length": ("measure-upperarm-length-incr",),

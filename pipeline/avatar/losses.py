@@ -34,7 +34,8 @@ def field_losses(
 ) -> dict[str, Tensor]:
     """Weighted losses of one batch of rays.
 
-    image: premultiplied colour, and the samples' own opacities, composited like a colour. rgba: straight colour and mask of the pixels. background: laid behind both, random for each
+    image: premultiplied colour, and the samples' own opacities, composited like a colour.
+    rgba: straight colour and mask of the pixels. background: laid behind both, random for each
     ray, so that no colour can pass for transparency.
     """
     mask = rgba[:, 3]

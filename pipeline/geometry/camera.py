@@ -73,6 +73,7 @@ class Camera:
 
     @staticmethod
     def from_arrays(arrays: Mapping[str, np.ndarray]) -> Camera:
+        """Inverse of `arrays`; other names in the mapping are ignored."""
         fx, fy, cx, cy = (float(value) for value in arrays["camera_intrinsics_px"])
         width, height = (int(value) for value in arrays["camera_size_px"])
         distortion = tuple(float(value) for value in arrays["camera_distortion"])

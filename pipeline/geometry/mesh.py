@@ -21,6 +21,7 @@ class Mesh:
         return cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-20)
 
     def face_areas_m2(self) -> Float[np.ndarray, "f"]:
+        """Area of each face, square metres."""
         return 0.5 * np.linalg.norm(self._face_cross_products(), axis=1)
 
     def vertex_normals(self) -> Float[np.ndarray, "v 3"]:

@@ -37,6 +37,7 @@ def load_npz(path: Path) -> dict[str, np.ndarray]:
 
 
 def save_body(path: Path, body: Body) -> None:
+    """Write one person's body; `load_body` is the inverse."""
     save_npz(
         path,
         {
@@ -53,6 +54,7 @@ def save_body(path: Path, body: Body) -> None:
 
 
 def load_body(path: Path) -> Body:
+    """Read what `save_body` wrote."""
     arrays = load_npz(path)
     names = [str(name) for name in arrays["shape_names"]]
     return Body(
@@ -67,6 +69,7 @@ def load_body(path: Path) -> Body:
 
 
 def save_motion(path: Path, motion: Motion) -> None:
+    """Write the pose of every frame; `load_motion` is the inverse."""
     save_npz(
         path,
         {
@@ -79,13 +82,16 @@ def save_motion(path: Path, motion: Motion) -> None:
 
 
 def load_motion(path: Path) -> Motion:
+    """Read what `save_motion` wrote."""
     arrays = load_npz(path)
     return Motion(arrays["frame_index"], arrays["time_s"], arrays["rotations_wxyz"], arrays["root_translation_m"])
 
 
 def save_camera(path: Path, camera: Camera) -> None:
+    """Write a camera; `load_camera` is the inverse."""
     save_npz(path, camera.arrays())
 
 
 def load_camera(path: Path) -> Camera:
+    """Read what `save_camera` wrote."""
     return Camera.from_arrays(load_npz(path))

@@ -32,7 +32,8 @@ def test_body_round_trip(tmp_path) -> None:
     body = parametric.body(parametric.shape_defaults)
     npz.save_body(tmp_path / "body.npz", body)
     again = npz.load_body(tmp_path / "body.npz")
-    assert again.joint_names == body.joint_names and again.shape == body.shape
+    assert again.joint_names == body.joint_names
+    assert again.shape == body.shape
     for name in ("parents", "joints_m", "vertices", "faces", "skin_weights"):
         np.testing.assert_array_equal(getattr(again, name), getattr(body, name))
 
@@ -41,4 +42,6 @@ def test_camera_round_trip(tmp_path) -> None:
     camera = Camera(1.5, 2.5, 3.0, 4.0, 50, 60, distortion=(0.1, -0.2, 0.0, 0.0))
     npz.save_camera(tmp_path / "camera.npz", camera)
     again = npz.load_camera(tmp_path / "camera.npz")
-    assert again.distortion == camera.distortion and again.fx == 1.5 and again.height == 60
+    assert again.distortion == camera.distortion
+    assert again.fx == 1.5
+    assert again.height == 60
