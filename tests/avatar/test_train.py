@@ -21,6 +21,7 @@ TINY = {
     "margin_m": 0.04,
     "step_fraction": 0.012,
     "occupancy_start": 24,
+    "occupancy_decay": 0.7,
     "border_px": 2,
 }
 
@@ -63,7 +64,7 @@ def test_refinement_finds_a_shift_of_the_body(scene):
     root = scene.motion.root_translation_m.copy()
     root[4] = moved.root_translation_m[4]
     motion = scene.motion.with_pose(scene.motion.rotations_wxyz, root).select(TRAIN)
-    config = FieldConfig(**TINY, steps=160, pose_start=0.35, pose_rate=2e-3, pose_smoothness=0.0)
+    config = FieldConfig(**TINY, steps=160, pose_start=0.35, pose_rate=6e-3, pose_smoothness=0.0, pose_size=0.0)
     learning = start_learning(scene.body, motion, scene.camera, pictures, config)
     for _ in range(160):
         learning.step()
