@@ -41,15 +41,15 @@ def test_nothing_is_exchanged_in_a_clean_full_turn(scene: Act) -> None:
         assert not exchanged_limbs(observations, limb).any()
 
 
-def test_a_body_seen_the_wrong_way_round_is_found_and_mended(scene: Act) -> None:
+@pytest.mark.parametrize("wrong", [slice(14, 19), slice(23, 27)])
+def test_a_body_seen_the_wrong_way_round_is_found_and_mended(scene: Act, wrong: slice) -> None:
     truth = scene.observations(scene.camera)
     order = mirror_permutation(PAIRS)
-    wrong = slice(14, 19)
     scene.landmarks_px[wrong] = scene.landmarks_px[wrong][:, order]
     scene.landmarks_world_m[wrong] = scene.landmarks_world_m[wrong][:, order] * [1.0, 1.0, -1.0]
     observations = scene.observations(scene.camera)
     exchanged = exchanged_bodies(observations, rest_landmarks())
-    assert np.flatnonzero(exchanged).tolist() == list(range(14, 19))
+    assert np.flatnonzero(exchanged).tolist() == list(range(wrong.start, wrong.stop))
     mended = exchange_bodies(observations, exchanged)
     assert np.allclose(mended.landmarks_px, truth.landmarks_px)
     assert np.allclose(mended.directions_m, truth.directions_m)
