@@ -4,6 +4,7 @@ Colour depends on the place alone: an avatar's texture must not hold the light o
 """
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -36,7 +37,7 @@ class _Decode(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, features, hidden, output, bias):
+    def forward(ctx: Any, features: Tensor, hidden: Tensor, output: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
         raw = features.new_empty(len(features), 4)
         for part, into in zip(features.split(ROWS), raw.split(ROWS), strict=True):
             torch.addmm(bias, (part @ hidden).clamp_(min=0), output, out=into)
@@ -46,7 +47,7 @@ class _Decode(torch.autograd.Function):
         return colour, density
 
     @staticmethod
-    def backward(ctx, colour_gradient, density_gradient):
+    def backward(ctx: Any, colour_gradient: Tensor, density_gradient: Tensor) -> tuple[Tensor, ...]:
         features, hidden, output, colour, density = ctx.saved_tensors
         raw_gradient = torch.empty(len(colour), 4).to(colour)
         torch.mul(colour_gradient, colour * (1 - colour), out=raw_gradient[:, :3])
@@ -68,6 +69,8 @@ class Field(torch.nn.Module):
 
     bounds_m: (2, 3) box outside which there is nothing. layout: the hash grid's levels, over that box.
     """
+
+    bounds_m: Tensor
 
     def __init__(
         self, bounds_m: Float[np.ndarray, "2 3"], layout: GridLayout, hidden_width: int = 64, seed: int = 0

@@ -7,6 +7,7 @@ light reached is an example, positive if it gave weight to a pixel, negative if 
 no light reached (the inside of the body) give no example and are judged by what the network learnt from the others.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,7 +90,8 @@ class OccupancyUpdate:
         seed: int,
     ) -> None:
         self.bounds_m = torch.tensor(bounds_m, dtype=torch.float32)
-        self.shape = shell.shape
+        x, y, z = shell.shape
+        self.shape: tuple[int, int, int] = (x, y, z)
         self.cells = torch.from_numpy(np.flatnonzero(shell))
         self.centres_m = torch.from_numpy(cell_centres(bounds_m, shell.shape[0]))[self.cells]
         self.distance_m = torch.from_numpy(distance_m.reshape(-1).astype(np.float32))[self.cells]
@@ -120,7 +122,9 @@ class OccupancyUpdate:
         record_visits(points_m, light, weights, self.bounds_m, self.shape, self.reached, self.gave)
 
     @torch.no_grad()
-    def update(self, density_of, step_m: float, threshold: float, random: np.random.Generator) -> None:
+    def update(
+        self, density_of: Callable[[Tensor], Tensor], step_m: float, threshold: float, random: np.random.Generator
+    ) -> None:
         """One update of all cells of the shell.
 
         density_of: canonical points (n, 3) -> density (n); asked at a random point of each cell.
@@ -133,20 +137,20 @@ class OccupancyUpdate:
         if self.attention is None:
             self.average = torch.maximum(self.average * self.decay, opacity)
         else:
-            weight = torch.sigmoid(self._learn(density))
+            weight = torch.sigmoid(self._learn(self.attention, density))
             self.average = self.decay * self.average + (1 - self.decay) * weight * opacity
         kept = self.average > min(threshold, float(self.average.mean()))
         self.occupied.view(-1)[self.cells] = kept.to(torch.uint8)
         self.reached *= FADING
         self.gave *= FADING
 
-    def _learn(self, density: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+    def _learn(self, attention: VoxelAttention, density: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
         """One step of the attention network on the cells that light reached lately; returns the logits of all cells."""
         reached, gave = self.reached[self.cells], self.gave[self.cells]
         seen = (reached > 0.25).float()
         target = (gave / 0.05).clamp(max=1)
         with torch.enable_grad():
-            logit = self.attention(density, self.distance_m, self.frequency)
+            logit = attention(density, self.distance_m, self.frequency)
             loss = torch.nn.functional.binary_cross_entropy_with_logits(logit, target, seen, reduction="sum")
             self.optimiser.zero_grad()
             (loss / seen.sum().clamp(min=1)).backward()

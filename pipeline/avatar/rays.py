@@ -75,7 +75,7 @@ def _kinds(mask: UInt8[np.ndarray, "h w"], border_px: int, random: np.random.Gen
     """Rows and columns of the body, border and outside pixels of one mask."""
     solid = (mask >= 128).astype(np.uint8)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * border_px + 1, 2 * border_px + 1))
-    outer, inner = cv2.dilate(solid, kernel), cv2.erode(solid, kernel, borderValue=0)
+    outer, inner = cv2.dilate(solid, kernel), cv2.erode(solid, kernel, borderValue=(0,))
     border = (outer > inner) | ((mask > 0) & (mask < 255) & (outer > 0))
     rows, columns = np.nonzero(outer)
     outside = np.zeros(mask.shape, dtype=bool)

@@ -1,5 +1,7 @@
 """Full images of the canonical field in a pose."""
 
+from collections.abc import Iterator
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -51,7 +53,7 @@ def _carry(origins: Tensor, directions: Tensor, matrix: Float[Tensor, "4 4"]) ->
     return origins @ rotation.T + matrix[:3, 3], directions @ rotation.T
 
 
-def _pixels_in_box(warps: WarpSet, to_posed: Float[Tensor, "4 4"], camera: Camera):
+def _pixels_in_box(warps: WarpSet, to_posed: Float[Tensor, "4 4"], camera: Camera) -> Iterator[tuple[Tensor, Tensor]]:
     """Rows and columns of the pixels that may see the posed box, in parts."""
     low = torch.from_numpy(warps.origin_m[0])
     high = low + warps.cell_m * torch.from_numpy(warps.dims[0] - 1)
@@ -70,7 +72,15 @@ def _pixels_in_box(warps: WarpSet, to_posed: Float[Tensor, "4 4"], camera: Camer
         yield part[:, 0], part[:, 1]
 
 
-def _shade(field, occupancy, skin, blended, warps, rays, step_m) -> Float[Tensor, "n 4"]:
+def _shade(
+    field: Field,
+    occupancy: Occupancy,
+    skin: SkinGrid,
+    blended: Tensor,
+    warps: WarpSet,
+    rays: tuple[Tensor, Tensor],
+    step_m: float,
+) -> Float[Tensor, "n 4"]:
     origins, directions = rays
     count = len(origins)
     frame, jitter = torch.zeros(count, dtype=torch.long), torch.full((count,), 0.5)

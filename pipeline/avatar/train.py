@@ -73,9 +73,9 @@ class Learning:
         self.done = 0
         self.bad_steps = 0
         self.table_gradient = torch.zeros_like(field.table)
-        parameters = dict(field.named_parameters())
+        parameters: dict[str, Tensor] = dict(field.named_parameters())
         parameters |= {"rotation_rad": self.poses.rotation_rad, "shift_m": self.poses.shift_m}
-        self.parameters: dict[str, Tensor] = parameters
+        self.parameters = parameters
         self.moments = {name: (torch.zeros_like(p), torch.zeros_like(p)) for name, p in parameters.items()}
         self.baked_rotation_rad, self.baked_shift_m = torch.zeros(()), torch.zeros(())
         self._bake()
@@ -105,10 +105,10 @@ class Learning:
         rows, slots = pool.draw(frames, config.rays, shares, random)
         inside = random.random((len(rows), 2), dtype=np.float32) if config.pixel_jitter else np.float32(0.5)
         origins, directions = pixel_rays(self.scene.camera, torch.from_numpy(pool.xy_px[rows] + inside))
-        slot, frames = torch.from_numpy(slots), torch.from_numpy(frames)
-        matrix = self.posed_from_world[frames][slot]
+        slot, chosen = torch.from_numpy(slots), torch.from_numpy(frames)
+        matrix = self.posed_from_world[chosen][slot]
         return Batch(
-            frames=frames,
+            frames=chosen,
             slot=slot,
             origins_m=(matrix[:, :3, :3] @ origins[:, :, None])[:, :, 0] + matrix[:, :3, 3],
             directions=(matrix[:, :3, :3] @ directions[:, :, None])[:, :, 0],
@@ -162,7 +162,7 @@ class Learning:
         channels = torch.cat([colour[:count], opacity], dim=1)
         image, alpha, weights = composite(density[:count], channels, step_m, samples.ray_start)
         losses = field_losses(image, alpha, density[count:], batch.rgba, batch.background, config)
-        total = sum(losses.values())
+        total = torch.stack(list(losses.values())).sum()
         if self.refines_poses:
             total = total + config.pose_smoothness * self.poses.roughness() + config.pose_size * self.poses.size()
         total.backward()
@@ -218,8 +218,8 @@ class Learning:
             self._bake()
             for name, parameter in self.parameters.items():
                 parameter.copy_(tensors[f"parameter.{name}"])
-                for moment, kept in zip(self.moments[name], ("first", "second"), strict=True):
-                    moment.copy_(tensors[f"{kept}.{name}"])
+                for moment, order in zip(self.moments[name], ("first", "second"), strict=True):
+                    moment.copy_(tensors[f"{order}.{name}"])
         prefix = "occupancy."
         kept = {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
         self.occupancy.load_state(kept)

@@ -34,6 +34,7 @@ def adam_step_(
     floor = epsilon * (1 - betas[1] ** step) ** 0.5
     with torch.no_grad():
         if runs_on_numba(*tensors):
-            adam_cpu.update(*(tensor.view(-1).numpy() for tensor in tensors), rate, betas[0], betas[1], floor)
+            flat = [tensor.view(-1).numpy() for tensor in tensors]
+            adam_cpu.update(flat[0], flat[1], flat[2], flat[3], rate, betas[0], betas[1], floor)
         else:
             reference.update(*tensors, rate, betas[0], betas[1], floor)

@@ -6,6 +6,8 @@ Letters: n rays, s samples, c channels. Samples of a ray lie together, near to f
 ray_start[r] : ray_start[r + 1]. IHM (Wang et al. 2025), section 2.2; Max 1995.
 """
 
+from typing import Any
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -17,7 +19,9 @@ from pipeline.kernels.reference import composite as reference
 
 class _Composite(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, density, colour, step_m, ray_start):
+    def forward(
+        ctx: Any, density: Tensor, colour: Tensor, step_m: Tensor, ray_start: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         weights = torch.empty_like(density)
         image = torch.empty(len(ray_start) - 1, colour.shape[1])
         alpha = torch.empty(len(ray_start) - 1)
@@ -27,7 +31,9 @@ class _Composite(torch.autograd.Function):
         return image, alpha, weights
 
     @staticmethod
-    def backward(ctx, image_gradient, alpha_gradient, _weights_gradient):
+    def backward(
+        ctx: Any, image_gradient: Tensor, alpha_gradient: Tensor, _weights_gradient: Tensor
+    ) -> tuple[Tensor | None, ...]:
         density, colour, step_m, ray_start, weights, alpha = ctx.saved_tensors
         density_gradient, colour_gradient = torch.empty_like(density), torch.empty_like(colour)
         composite_cpu.backward(

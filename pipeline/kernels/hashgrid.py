@@ -9,6 +9,7 @@ rows on the empty half of a cube; levels whose nodes fit in the table are dense 
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -73,7 +74,7 @@ class _Encode(torch.autograd.Function):
     """float32 on the CPU. `table_gradient`, if given, takes the table's gradient in autograd's place."""
 
     @staticmethod
-    def forward(ctx, points, table, layout, table_gradient):
+    def forward(ctx: Any, points: Tensor, table: Tensor, layout: GridLayout, table_gradient: Tensor | None) -> Tensor:
         features = torch.empty(len(points), layout.width)
         hashgrid_cpu.forward(layout.features)(points.numpy(), table.detach().numpy(), layout.plan, features.numpy())
         ctx.save_for_backward(points, table)
@@ -81,20 +82,20 @@ class _Encode(torch.autograd.Function):
         return features
 
     @staticmethod
-    def backward(ctx, gradient):
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         points, table = (saved.detach() for saved in ctx.saved_tensors)
         layout, sums = ctx.layout, ctx.table_gradient
-        gradient = gradient.contiguous().numpy()
+        towards = gradient.contiguous().numpy()
         points_gradient = None
         if ctx.needs_input_grad[0]:
             points_gradient = torch.zeros_like(points)
             hashgrid_cpu.backward_points(layout.features)(
-                points.numpy(), table.numpy(), layout.plan, gradient, points_gradient.numpy()
+                points.numpy(), table.numpy(), layout.plan, towards, points_gradient.numpy()
             )
         if not ctx.needs_input_grad[1]:
             return points_gradient, None, None, None
         target = torch.zeros_like(table) if sums is None else sums
-        hashgrid_cpu.backward_table(layout.features)(points.numpy(), layout.plan, gradient, target.numpy())
+        hashgrid_cpu.backward_table(layout.features)(points.numpy(), layout.plan, towards, target.numpy())
         return points_gradient, target if sums is None else None, None, None
 
 

@@ -9,6 +9,7 @@ Letters: n rays, s samples, k frames.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -50,7 +51,7 @@ class WarpSet:
             maps=np.concatenate([grid.maps for grid in grids]),
         )
 
-    def arrays(self) -> tuple[np.ndarray, ...]:
+    def arrays(self) -> tuple[Any, ...]:
         """In the order that the compiled loops take."""
         cell = np.float32(self.cell_m)
         return cell, self.origin_m, self.dims, self.first, self.canonical_m, self.codes, self.maps

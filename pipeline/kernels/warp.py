@@ -10,6 +10,7 @@ Letters: m skin-grid nodes, j joints, k frames of a batch, s samples.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -74,7 +75,7 @@ def bake(skin: SkinGrid, canonical_to_posed: Float[Tensor, "j 4 4"]) -> WarpGrid
 
 class _Newton(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, blended, start, posed, slot_start, skin):
+    def forward(ctx: Any, blended: Tensor, start: Tensor, posed: Tensor, slot_start: Tensor, skin: SkinGrid) -> Tensor:
         slot = torch.repeat_interleave(torch.arange(len(blended)), slot_start.diff())
         refined = torch.empty_like(start)
         grid = (skin.origin_m, np.float32(skin.cell_m), skin.row_of_node)
@@ -84,7 +85,7 @@ class _Newton(torch.autograd.Function):
         return refined
 
     @staticmethod
-    def backward(ctx, gradient):
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         blended, refined, slot_start = (tensor.detach() for tensor in ctx.saved_tensors)
         skin = ctx.skin
         total = torch.zeros_like(blended)

@@ -27,7 +27,7 @@ def encode(
         scaled = points_unit * limit
         low = torch.minimum(scaled.detach().long(), limit - 1)
         part = scaled - low
-        total = 0
+        total = table.new_zeros(len(points_unit), table.shape[1])
         for corner in range(8):
             bits = torch.tensor([corner & 1, corner >> 1 & 1, corner >> 2 & 1], device=table.device)
             weight = torch.where(bits == 1, part, 1 - part).prod(-1, keepdim=True)

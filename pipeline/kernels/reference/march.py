@@ -5,14 +5,14 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 
-def _near_far(origins, directions, low, high):
+def _near_far(origins: Tensor, directions: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
     safe = torch.where(directions.abs() < 1e-9, torch.full_like(directions, 1e-9), directions)
     a, b = (low - origins) / safe, (high - origins) / safe
     near = torch.minimum(a, b).amax(-1).clamp(min=0)
     return near, torch.maximum(a, b).amin(-1)
 
 
-def _look_up(posed, frame, warp):
+def _look_up(posed: Tensor, frame: Tensor, warp: tuple) -> tuple[Tensor, Tensor]:
     """Canonical candidates (n, stops, 4, 3) of posed points (n, stops, 3), and which of the four exist."""
     cell, origin, dims, first, nodes, codes, maps = warp
     dims, first = dims[frame][:, None], first[frame][:, None]
@@ -21,7 +21,7 @@ def _look_up(posed, frame, warp):
     i, j, k = low.unbind(-1)
     cell_index = first[..., 1] + (i * (dims[..., 1] - 1) + j) * (dims[..., 2] - 1) + k
     code = codes[cell_index.clamp(max=len(codes) - 1)]
-    part, smooth = scaled - low, 0
+    part, smooth = scaled - low, torch.zeros_like(posed)
     for corner in range(8):
         bits = torch.tensor([corner & 1, corner >> 1 & 1, corner >> 2 & 1], device=posed.device)
         at = low + bits

@@ -4,7 +4,15 @@ import torch
 from torch import Tensor
 
 
-def record(points: Tensor, light: Tensor, weight: Tensor, bounds: Tensor, shape, reached: Tensor, gave: Tensor) -> None:
+def record(
+    points: Tensor,
+    light: Tensor,
+    weight: Tensor,
+    bounds: Tensor,
+    shape: tuple[int, int, int],
+    reached: Tensor,
+    gave: Tensor,
+) -> None:
     """Same as `pipeline.kernels.visits.record_visits`."""
     size = torch.tensor(shape, device=points.device)
     index = ((points - bounds[0]) * (size / (bounds[1] - bounds[0]))).floor().long()

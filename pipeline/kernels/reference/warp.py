@@ -32,14 +32,16 @@ def interpolate(
     return result
 
 
-def _gather(points_m, origin_m, cell_m, row_of_node, values):
+def _gather(
+    points_m: Tensor, origin_m: np.ndarray, cell_m: float, row_of_node: np.ndarray, values: Tensor
+) -> tuple[Tensor, Tensor]:
     """Weighted sum of the eight corners' values, and the sum of the weights of those that exist."""
     rows = torch.as_tensor(row_of_node, device=points_m.device).long()
     size = torch.tensor(rows.shape, device=points_m.device)
     scaled = (points_m - torch.as_tensor(origin_m).to(points_m)) / cell_m
     low = torch.minimum(scaled.detach().floor().long().clamp(min=0), size - 2)
     part = (scaled - low).clamp(0, 1)
-    total, mass = 0, 0
+    total, mass = values.new_zeros(len(points_m), values.shape[1]), torch.zeros_like(part[:, 0])
     for corner in range(8):
         bits = torch.tensor([corner & 1, corner >> 1 & 1, corner >> 2 & 1], device=points_m.device)
         row = rows[tuple((low + bits).unbind(-1))]
@@ -87,7 +89,9 @@ def newton(
     return torch.cat(parts)
 
 
-def _solve(points, posed, blended, grid, forward=True):
+def _solve(
+    points: Tensor, posed: Tensor, blended: Tensor, grid: tuple[np.ndarray, float, np.ndarray], forward: bool = True
+) -> Tensor:
     """J(points)^-1 (posed - A x) if forward, else -J^-1 (posed - detached posed): zero in value, with a gradient."""
     known = _gather(points, *grid, blended.detach())[1] > 1 - 1e-4
     inputs = points.detach().requires_grad_(True)
