@@ -82,7 +82,7 @@ lock:  ## resolve pyproject.toml anew into requirements.lock
 	$(PYTHON) -m venv --clear build/lock
 	build/lock/bin/python -m pip install --quiet $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) torch==$(TORCH_VERSION) ".[dev]"
 	echo "# Written by make lock: the full resolution of pyproject.toml with its dev extra." > build/requirements.lock
-	build/lock/bin/python -m pip freeze --exclude avatar-from-video | sed 's/+cpu$$//' >> build/requirements.lock
+	build/lock/bin/python -m pip freeze --exclude instant-human-mesh | sed 's/+cpu$$//' >> build/requirements.lock
 	mv build/requirements.lock requirements.lock
 
 configs: $(STAMP)  ## write configs/default.yaml from the defaults in code

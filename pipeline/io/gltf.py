@@ -110,7 +110,7 @@ def encode_glb(
     if not len(motion.time_s) or np.any(np.diff(motion.time_s) <= 0):
         raise ValueError("an animation needs frames whose times increase")
     document = _Document()
-    document.json["asset"] = {"version": "2.0", "generator": "avatar-from-video"}
+    document.json["asset"] = {"version": "2.0", "generator": "instant-human-mesh"}
     if extras:
         document.json["asset"]["extras"] = dict(extras)
     first_joint = 1
