@@ -28,7 +28,7 @@ _PAINTED_SHARE, _PAINTED_LEVELS = 0.95, 2
 # Where the detector is this sure, a colour belongs to the person even when the first round said otherwise. Without that
 # a white hem before a white wall is lost (synthetic captures: IoU median and worst 0.978, 0.945; with it 0.991, 0.959).
 _SURE = 0.97
-_RIM_PX = 2.0
+_RIM_PX = 1.0
 # Parts smaller than this share of the person are specks, holes smaller than this share are noise.
 _SPECK_SHARE, _HOLE_SHARE = 0.05, 2e-4
 

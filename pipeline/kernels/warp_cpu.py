@@ -11,7 +11,7 @@ blended (m, 12), the rows of A (3, 4) at the nodes that exist.
 import numpy as np
 from numba import njit, prange
 
-_OPTIONS = {"cache": True, "fastmath": {"contract", "reassoc", "arcp", "nsz"}, "error_model": "numpy"}
+_OPTIONS = {"cache": True, "fastmath": {"arcp", "nsz"}, "error_model": "numpy"}
 _ZERO, _ONE = np.float32(0), np.float32(1)
 BLOCK = 256
 
