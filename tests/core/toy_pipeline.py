@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -31,7 +32,14 @@ class Toy:
         command = [sys.executable, "-m", *arguments]
         pipe = subprocess.PIPE
         return subprocess.Popen(
-            command, cwd=self.folder, env=environment, stdout=pipe, stderr=pipe, text=True, start_new_session=True
+            command,
+            cwd=self.folder,
+            env=environment,
+            stdout=pipe,
+            stderr=pipe,
+            text=True,
+            start_new_session=True,
+            preexec_fn=_hear_interrupts,
         )
 
     def call(self, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
@@ -52,3 +60,8 @@ class Toy:
         (sentence,) = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
         assert done.stderr.splitlines()[-1] == sentence
         return sentence
+
+
+def _hear_interrupts() -> None:
+    """A shell's background jobs ignore SIGINT, and so would their children; a user at a terminal is what is tested."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
