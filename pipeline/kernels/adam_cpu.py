@@ -4,7 +4,7 @@ import numpy as np
 from numba import njit, prange
 
 CHUNK = 1 << 15
-_OPTIONS = {"cache": True, "fastmath": {"contract", "reassoc", "arcp", "nsz"}, "error_model": "numpy"}
+_OPTIONS = {"cache": True, "fastmath": {"arcp", "nsz"}, "error_model": "numpy"}
 
 
 @njit(**_OPTIONS)

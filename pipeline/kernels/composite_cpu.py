@@ -8,7 +8,7 @@ dims everything behind it and adds to the alpha by the light T_end that is left 
 import numpy as np
 from numba import njit, prange
 
-_OPTIONS = {"cache": True, "fastmath": {"contract", "reassoc", "arcp", "nsz"}, "error_model": "numpy"}
+_OPTIONS = {"cache": True, "fastmath": {"arcp", "nsz"}, "error_model": "numpy"}
 
 
 @njit(parallel=True, **_OPTIONS)

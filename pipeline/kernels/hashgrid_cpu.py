@@ -15,7 +15,7 @@ from pipeline.kernels.hashing import PRIMES
 
 BLOCK = 128
 _PRIME_Y, _PRIME_Z = np.uint32(PRIMES[0]), np.uint32(PRIMES[1])
-_OPTIONS = {"cache": True, "fastmath": True, "error_model": "numpy"}
+_OPTIONS = {"cache": True, "fastmath": {"arcp", "nsz"}, "error_model": "numpy"}
 
 
 @njit(**_OPTIONS)

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit, prange
 
 BLOCKS = 8
-_FLAGS: dict[str, Any] = {"cache": True, "error_model": "numpy", "fastmath": True}
+_FLAGS: dict[str, Any] = {"cache": True, "error_model": "numpy", "fastmath": {"arcp", "nsz"}}
 
 
 @njit(**_FLAGS)

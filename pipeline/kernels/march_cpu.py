@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit, prange
 
-_OPTIONS = {"cache": True, "fastmath": {"contract", "reassoc", "arcp", "nsz"}, "error_model": "numpy"}
+_OPTIONS = {"cache": True, "fastmath": {"arcp", "nsz"}, "error_model": "numpy"}
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
 

@@ -7,7 +7,7 @@ its corners' pixels.
 import numpy as np
 from numba import njit, prange
 
-_FLAGS = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "arcp", "nsz"}}
+_FLAGS = {"cache": True, "error_model": "numpy", "fastmath": {"arcp", "nsz"}}
 
 
 @njit(parallel=True, **_FLAGS)

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit, prange
 
 BAND_ROWS = 16
-_FLAGS: dict[str, Any] = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "arcp", "nsz"}}
+_FLAGS: dict[str, Any] = {"cache": True, "error_model": "numpy", "fastmath": {"arcp", "nsz"}}
 
 
 @njit(**_FLAGS)

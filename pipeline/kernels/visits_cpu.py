@@ -4,7 +4,7 @@ import numpy as np
 from numba import njit
 
 
-@njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath={"arcp", "nsz"}, error_model="numpy")
 def record(points, light, weight, bounds, shape, reached, gave):
     """See `pipeline.kernels.visits.record_visits`."""
     scale_x = np.float32(shape[0]) / (bounds[1, 0] - bounds[0, 0])
