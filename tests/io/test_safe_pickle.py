@@ -1,0 +1,172 @@
+"""Pickles: arrays of all protocols and of Python 2 come back, and nothing a pickle names is ever run."""
+
+import os
+import pickle
+from collections import OrderedDict
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.core.errors import UserError
+from pipeline.io import safe_pickle
+from pipeline.io.safe_pickle import Record, load_pickle
+
+
+class Call:
+    """Pickles to a call of any function."""
+
+    def __init__(self, function, *arguments):
+        self.call = (function, arguments)
+
+    def __reduce__(self):
+        return self.call
+
+
+class Foreign:
+    """Stands for a class of a package that must not be run."""
+
+    def __init__(self) -> None:
+        self.x = np.arange(3.0)
+
+    def __setstate__(self, state) -> None:
+        raise AssertionError("a foreign class was built")
+
+
+FOREIGN = f"{Foreign.__module__}.Foreign"
+
+
+def written(folder: Path, content: object, protocol: int = 2) -> Path:
+    path = folder / "some.pkl"
+    path.write_bytes(pickle.dumps(content, protocol=protocol))
+    return path
+
+
+@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+def test_arrays_and_containers_come_back(tmp_path, protocol):
+    content = {
+        "floats": np.linspace(0, 1, 6).reshape(2, 3),
+        "column order": np.asfortranarray(np.arange(6, dtype=np.uint32).reshape(2, 3)),
+        "objects": np.array([None, "x", (1, 2)], dtype=object),
+        "fields": np.zeros(2, dtype=[("a", "f4"), ("b", "i2", (3,))]),
+        "scalar": np.float32(2.5),
+        "rest": [1, 2.5, True, None, "text", b"\x00\xff", (1,), {3}, frozenset({4}), 1j, OrderedDict(a=1)],
+    }
+    read = load_pickle(written(tmp_path, content, protocol))
+    for name in ("floats", "column order", "fields"):
+        np.testing.assert_array_equal(read[name], content[name])
+        assert read[name].dtype == content[name].dtype
+    assert read["objects"].tolist() == content["objects"].tolist()
+    assert read["scalar"] == content["scalar"]
+    assert read["rest"] == content["rest"]
+
+
+def test_python_2_bytes_are_latin1(tmp_path):
+    """`pickle.dumps({'c': numpy.array([1.5, -2.0])}, 0)` as Python 2 writes it, by hand."""
+    buffer = np.array([1.5, -2.0]).tobytes()
+    lines = (
+        b"(dp0\nS'c'\np1\ncnumpy.core.multiarray\n_reconstruct\np2\n(cnumpy\nndarray\np3\n(I0\ntp4\nS'b'\np5\ntp6\nRp7\n"
+        b"(I1\n(I2\ntp8\ncnumpy\ndtype\np9\n(S'f8'\np10\nI0\nI1\ntp11\nRp12\n"
+        b"(I3\nS'<'\np13\nNNNI-1\nI-1\nI0\ntp14\nbI00\nS" + ascii(buffer)[1:].encode() + b"\np15\ntp16\nbs."
+    )
+    path = tmp_path / "two.pkl"
+    path.write_bytes(lines)
+    np.testing.assert_array_equal(load_pickle(path)["c"], [1.5, -2.0])
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments", "name"),
+    [
+        (os.system, ("touch {marker}",), "system"),
+        (eval, ("open('{marker}', 'w')",), "eval"),
+        (exec, ("open('{marker}', 'w')",), "exec"),
+        (getattr, (np, "load"), "getattr"),
+        (open, ("{marker}", "w"), "open"),
+        (np.fromfile, ("{marker}",), "fromfile"),
+        (Path, ("{marker}",), "Path"),
+    ],
+)
+@pytest.mark.parametrize("protocol", [0, 2, 4])
+def test_a_call_is_refused_by_name_and_not_made(tmp_path, function, arguments, name, protocol):
+    marker = tmp_path / "marker"
+    filled = [a.format(marker=marker) if isinstance(a, str) else "numpy" for a in arguments]
+    path = written(tmp_path, {"camera_f": Call(function, *filled)}, protocol)
+    with pytest.raises(UserError, match=rf"some.pkl is refused: it asks for `.*{name}`"):
+        load_pickle(path)
+    assert not marker.exists()
+
+
+def test_a_marker_would_have_been_made(tmp_path):
+    """The attack is a real one: the plain unpickler runs it."""
+    marker = tmp_path / "marker"
+    pickle.loads(pickle.dumps(Call(os.system, f"touch {marker}")))
+    assert marker.exists()
+
+
+def test_dotted_names_lead_nowhere(tmp_path):
+    """Protocol 4 can name `numpy` and `ndarray.tofile`, which starts like an allowed name."""
+    path = tmp_path / "dotted.pkl"
+    path.write_bytes(b"\x80\x04\x8c\x05numpy\x8c\x0endarray.tofile\x93.")
+    with pytest.raises(UserError, match="`numpy.ndarray.tofile`"):
+        load_pickle(path)
+
+
+@pytest.mark.parametrize("protocol", [0, 2, 4])
+def test_foreign_objects_are_records_only_when_asked_for(tmp_path, protocol):
+    path = written(tmp_path, {"shape": Foreign()}, protocol)
+    with pytest.raises(UserError, match="Foreign|_reconstructor"):
+        load_pickle(path)
+    record = load_pickle(path, records=[FOREIGN])["shape"]
+    assert isinstance(record, Record)
+    np.testing.assert_array_equal(record.state["x"], np.arange(3.0))
+
+
+def test_a_pickle_cannot_change_records_for_the_next_one(tmp_path):
+    """BUILD on a class sets its attributes; the next load must not see them."""
+    module, _, name = FOREIGN.rpartition(".")
+    path = tmp_path / "poison.pkl"
+    path.write_bytes(f"c{module}\n{name}\n".encode() + b"(N(S'state'\nI7\ndtb.")
+    poisoned = load_pickle_or_none(path)
+    assert poisoned is None or poisoned.state == 7
+    assert Record.state is None
+    assert load_pickle(written(tmp_path, Foreign()), records=[FOREIGN]).state["x"].shape == (3,)
+
+
+def load_pickle_or_none(path: Path):
+    try:
+        return load_pickle(path, records=[FOREIGN])
+    except UserError:
+        return None
+
+
+def test_the_reconstructor_makes_records_alone(tmp_path):
+    path = tmp_path / "set.pkl"
+    path.write_bytes(b"ccopy_reg\n_reconstructor\n(c__builtin__\nset\nc__builtin__\nobject\nNtR.")
+    with pytest.raises(UserError, match=r"copyreg\._reconstructor"):
+        load_pickle(path)
+
+
+def test_bytes_in_other_encodings_are_refused(tmp_path):
+    path = tmp_path / "bytes.pkl"
+    path.write_bytes(b"c_codecs\nencode\n(S'x'\nS'zlib'\ntR.")
+    with pytest.raises(UserError, match="zlib"):
+        load_pickle(path)
+
+
+def test_damaged_and_absent_files_are_named(tmp_path):
+    path = written(tmp_path, np.zeros(100))
+    whole = path.read_bytes()
+    for damaged in (b"", whole[:40], whole[:-1], b"not a pickle", whole.replace(b"f8", b"q9")):
+        path.write_bytes(damaged)
+        with pytest.raises(UserError, match=r"some\.pkl cannot be read"):
+            load_pickle(path)
+    with pytest.raises(UserError, match="does not exist"):
+        load_pickle(tmp_path / "none.pkl")
+
+
+def test_every_allowed_name_makes_plain_things_only():
+    """Whoever adds a name to the list has to think about it here too."""
+    assert sorted({name.rpartition(".")[2] for name in safe_pickle._ALLOWED}) == [
+        "OrderedDict", "_frombuffer", "_reconstruct", "_reconstructor", "bytearray", "complex", "dtype", "encode",
+        "frozenset", "ndarray", "object", "scalar", "set",
+    ]  # fmt: skip
