@@ -11,10 +11,15 @@ from collections.abc import Iterable, Mapping
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from pipeline.metrics.flip import flip_map
+from pipeline.metrics.lpips import lpips
 
 SSIM_SIGMA_PX = 1.5
 SSIM_RADIUS_PX = 5  # torchmetrics: int(3.5 sigma + 0.5), so an 11 x 11 window
 _SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2
+_INSIDE = slice(SSIM_RADIUS_PX, -SSIM_RADIUS_PX)
 
 
 def on_white(rgb: UInt8[np.ndarray, "h w 3"], alpha: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
@@ -59,11 +64,18 @@ def psnr_db(
     return math.inf if mean_squared_error == 0.0 else -10.0 * math.log10(mean_squared_error)
 
 
-def ssim(render: UInt8[np.ndarray, "h w 3"], image: UInt8[np.ndarray, "h w 3"]) -> float:
+def ssim(
+    render: UInt8[np.ndarray, "h w 3"], image: UInt8[np.ndarray, "h w 3"], where: Bool[np.ndarray, "h w"] | None = None
+) -> float:
     """Structural similarity (Wang et al. 2004) in [-1, 1], mean over channels and over windows inside the image.
 
     Gaussian window of sigma 1.5 px cut at 11 x 11, k1 = 0.01, k2 = 0.03, population variances: torchmetrics' defaults.
-    Raises ValueError when a side is shorter than the window.
+
+    Args:
+        where: windows with these pixels in their middle count; all when None.
+
+    Raises:
+        ValueError: a side is shorter than the window, or no window counts.
     """
     if min(image.shape[:2]) <= 2 * SSIM_RADIUS_PX:
         raise ValueError(f"an image of {image.shape[1]} x {image.shape[0]} px is smaller than the 11 px window")
@@ -74,7 +86,13 @@ def ssim(render: UInt8[np.ndarray, "h w 3"], image: UInt8[np.ndarray, "h w 3"]) 
     covariance = _window_mean(x * y) - mean_x * mean_y
     luminance = (2.0 * mean_x * mean_y + _SSIM_C1) / (mean_x**2 + mean_y**2 + _SSIM_C1)
     structure = (2.0 * covariance + _SSIM_C2) / (variance_x + variance_y + _SSIM_C2)
-    return float(np.mean(luminance * structure))
+    similarity = luminance * structure
+    if where is not None:
+        middles = where[_INSIDE, _INSIDE]
+        if not middles.any():
+            raise ValueError("no window to compare")
+        similarity = similarity[middles]
+    return float(np.mean(similarity))
 
 
 def mask_iou(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"]) -> float:
@@ -84,7 +102,10 @@ def mask_iou(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"]) -> float:
 
 
 def frame_scores(
-    rgba: Float[np.ndarray, "h w 4"], image: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"]
+    rgba: Float[np.ndarray, "h w 4"],
+    image: UInt8[np.ndarray, "h w 3"],
+    mask: UInt8[np.ndarray, "h w"],
+    lpips_weights: Mapping[str, Tensor] | None = None,
 ) -> dict[str, float]:
     """All image scores of one frame.
 
@@ -92,19 +113,28 @@ def frame_scores(
         rgba: the render, premultiplied colours and alpha in [0, 1].
         image: the video frame.
         mask: the person's soft alpha in that frame.
+        lpips_weights: see `pipeline.metrics.lpips`; without them there is no LPIPS.
 
     Returns:
-        psnr_full, psnr_body, psnr_box (dB), ssim_full, ssim_box, and mask_iou of the two silhouettes.
+        psnr, ssim (higher is better) and flip (lower) each of the full image, of the body's pixels and of the body's
+        box: psnr_full (dB), psnr_body, ..., flip_box. mask_iou of the two silhouettes. lpips_full (lower) with weights.
     """
     render, target, body = premultiplied_on_white(rgba), on_white(image, mask), body_pixels(mask)
     box = body_box(body)
+    flip = flip_map(render, target)
+    perceptual = {} if lpips_weights is None else {"lpips_full": lpips(render, target, lpips_weights)}
     return {
         "psnr_full": psnr_db(render, target),
         "psnr_body": psnr_db(render, target, body),
         "psnr_box": psnr_db(render[box], target[box]),
         "ssim_full": ssim(render, target),
+        "ssim_body": ssim(render, target, body),
         "ssim_box": ssim(render[box], target[box]),
+        "flip_full": float(flip.mean()),
+        "flip_body": float(flip[body].mean()),
+        "flip_box": float(flip[box].mean()),
         "mask_iou": mask_iou(rgba[..., 3] >= 0.5, body),
+        **perceptual,
     }
 
 
@@ -121,5 +151,4 @@ def _window_mean(values: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h2 w2
     offsets = np.arange(-SSIM_RADIUS_PX, SSIM_RADIUS_PX + 1)
     window = np.exp(-0.5 * (offsets / SSIM_SIGMA_PX) ** 2)
     window /= window.sum()
-    inside = slice(SSIM_RADIUS_PX, -SSIM_RADIUS_PX)
-    return cv2.sepFilter2D(values, -1, window, window)[inside, inside]
+    return cv2.sepFilter2D(values, -1, window, window)[_INSIDE, _INSIDE]

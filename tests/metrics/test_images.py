@@ -62,6 +62,18 @@ def test_ssim_of_equal_images_is_one_and_small_images_are_refused(pair):
         ssim(pair[0][:10], pair[1][:10])
 
 
+def test_ssim_of_some_pixels_is_the_mean_over_their_windows(pair):
+    noisy, image = pair
+    where = np.zeros(image.shape[:2], dtype=bool)
+    where[12, 9] = where[30, 20] = True
+    alone = [
+        ssim(noisy[r - 5 : r + 6, c - 5 : c + 6], image[r - 5 : r + 6, c - 5 : c + 6]) for r, c in ((12, 9), (30, 20))
+    ]
+    assert ssim(noisy, image, where) == pytest.approx(np.mean(alone))
+    with pytest.raises(ValueError, match="no window"):
+        ssim(noisy, image, np.zeros_like(where))
+
+
 @pytest.mark.parametrize("step", [1, 10, 255])
 def test_psnr_of_a_constant_offset_is_closed_form(step):
     dark = np.zeros((5, 7, 3), dtype=np.uint8)
@@ -118,6 +130,11 @@ def test_frame_scores_of_a_perfect_render_and_of_a_missing_person(rng):
     share = body_pixels(mask).mean()  # all error lies on the body, so the full image only dilutes it
     assert nobody["psnr_full"] - nobody["psnr_body"] == pytest.approx(-10 * math.log10(share))
     assert nobody["psnr_box"] == pytest.approx(nobody["psnr_body"])
+    assert scores["flip_full"] == scores["flip_body"] == 0.0
+    assert nobody["flip_body"] == pytest.approx(nobody["flip_box"])
+    assert nobody["flip_full"] < nobody["flip_body"]
+    assert scores["ssim_body"] == pytest.approx(1.0)
+    assert "lpips_full" not in scores
 
 
 def test_mean_scores():

@@ -1,0 +1,56 @@
+"""LPIPS, the distance between two pictures in the features of a trained network.
+
+Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018, version 0.1 with
+AlexNet: the features after each of its five convolutions, scaled to unit length over channels, their squared
+differences weighted by channel, averaged over the picture and summed over layers. The weights are not part of this
+project; `pipeline.io.lpips_weights` looks for them.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+SMALLEST_SIDE_PX = 63
+"""Below this nothing is left after AlexNet's third shrinking."""
+
+_SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+_CONVOLUTIONS = (("0", 4, 2, False), ("3", 1, 2, True), ("6", 1, 1, True), ("8", 1, 1, False), ("10", 1, 1, False))
+"""Name, stride, padding of each convolution of AlexNet, and whether a 3 x 3 maximum of stride 2 stands before it."""
+
+
+@torch.no_grad()
+def lpips(
+    render: UInt8[np.ndarray, "h w 3"], image: UInt8[np.ndarray, "h w 3"], weights: Mapping[str, Tensor]
+) -> float:
+    """Distance of two sRGB pictures, 0 for equal ones and about 1 for very different ones.
+
+    Args:
+        weights: `features.N.weight` and `.bias` of torchvision's AlexNet, and `linK.model.1.weight` of the five layers.
+
+    Raises:
+        ValueError: a side is shorter than 63 px.
+    """
+    if min(image.shape[:2]) < SMALLEST_SIDE_PX:
+        raise ValueError(f"an image of {image.shape[1]} x {image.shape[0]} px is smaller than {SMALLEST_SIDE_PX} px")
+    total = 0.0
+    for layer, (a, b) in enumerate(zip(_features(render, weights), _features(image, weights), strict=True)):
+        channel_weights = weights[f"lin{layer}.model.1.weight"].view(-1, 1, 1)
+        total += float(((a - b).square() * channel_weights).sum(0).mean())
+    return total
+
+
+def _features(picture: UInt8[np.ndarray, "h w 3"], weights: Mapping[str, Tensor]) -> list[Float[Tensor, "c fh fw"]]:
+    """Rectified outputs of the convolutions, each pixel's channels scaled to unit length."""
+    shift, scale = (torch.tensor(values).view(3, 1, 1) for values in (_SHIFT, _SCALE))
+    values = (torch.from_numpy(picture).permute(2, 0, 1).float() / 127.5 - 1.0 - shift) / scale
+    layers = []
+    for name, stride, padding, after_maximum in _CONVOLUTIONS:
+        if after_maximum:
+            values = torch.nn.functional.max_pool2d(values, 3, 2)
+        kernel, bias = weights[f"features.{name}.weight"], weights[f"features.{name}.bias"]
+        values = torch.nn.functional.conv2d(values[None], kernel, bias, stride, padding)[0].relu()
+        layers.append(values / (values.square().sum(0, keepdim=True).sqrt() + 1e-10))
+    return layers

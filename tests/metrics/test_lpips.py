@@ -1,0 +1,66 @@
+"""LPIPS with made-up weights against the definition written with loops."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.signal import correlate
+
+from pipeline.metrics.lpips import lpips
+
+CHANNELS = (3, 4, 5, 6, 5, 4)
+KERNELS = (("0", 11, 4, 2), ("3", 5, 1, 2), ("6", 3, 1, 1), ("8", 3, 1, 1), ("10", 3, 1, 1))
+
+
+@pytest.fixture
+def weights(rng: np.random.Generator) -> dict[str, torch.Tensor]:
+    """A narrow AlexNet."""
+    made: dict[str, np.ndarray] = {}
+    for layer, (name, side, _, _) in enumerate(KERNELS):
+        before, after = CHANNELS[layer : layer + 2]
+        made[f"features.{name}.weight"] = rng.normal(size=(after, before, side, side)) / side
+        made[f"features.{name}.bias"] = rng.normal(size=after) * 0.1
+        made[f"lin{layer}.model.1.weight"] = rng.random((1, after, 1, 1))
+    return {name: torch.from_numpy(values).float() for name, values in made.items()}
+
+
+def slow_features(picture: np.ndarray, weights: dict[str, torch.Tensor]) -> list[np.ndarray]:
+    values = np.moveaxis(picture / 255 * 2 - 1, 2, 0)
+    values = (values - np.array([-0.030, -0.088, -0.188])[:, None, None]) / np.array([0.458, 0.448, 0.450])[
+        :, None, None
+    ]
+    layers = []
+    for layer, (name, _, stride, padding) in enumerate(KERNELS):
+        if layer in (1, 2):
+            rows, columns = ((size - 3) // 2 + 1 for size in values.shape[1:])
+            windows = [[values[:, 2 * r : 2 * r + 3, 2 * c : 2 * c + 3] for c in range(columns)] for r in range(rows)]
+            values = np.array([[window.max(axis=(1, 2)) for window in row] for row in windows]).transpose(2, 0, 1)
+        padded = np.pad(values, ((0, 0), (padding, padding), (padding, padding)))
+        kernels = weights[f"features.{name}.weight"].numpy().astype(float)
+        biases = weights[f"features.{name}.bias"].numpy()
+        values = np.stack(
+            [correlate(padded, kernel, mode="valid")[0] + bias for kernel, bias in zip(kernels, biases, strict=True)]
+        )[:, ::stride, ::stride]
+        values = np.maximum(values, 0)
+        layers.append(values / (np.sqrt((values**2).sum(axis=0)) + 1e-10))
+    return layers
+
+
+def test_it_is_the_definition(rng: np.random.Generator, weights: dict[str, torch.Tensor]):
+    a, b = (rng.integers(0, 256, (67, 75, 3)).astype(np.uint8) for _ in range(2))
+    expected = 0.0
+    for layer, (x, y) in enumerate(zip(slow_features(a, weights), slow_features(b, weights), strict=True)):
+        squared = (x - y) ** 2 * weights[f"lin{layer}.model.1.weight"].numpy()[0]
+        expected += squared.sum(axis=0).mean()
+    assert lpips(a, b, weights) == pytest.approx(expected, rel=1e-4)
+    assert math.isclose(lpips(a, b, weights), lpips(b, a, weights), rel_tol=1e-6)
+
+
+def test_equal_pictures_have_no_distance_and_small_ones_are_refused(
+    rng: np.random.Generator, weights: dict[str, torch.Tensor]
+):
+    picture = rng.integers(0, 256, (63, 63, 3)).astype(np.uint8)
+    assert lpips(picture, picture, weights) == 0.0
+    with pytest.raises(ValueError, match="smaller than 63"):
+        lpips(picture[1:], picture[1:], weights)
