@@ -6,10 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float, UInt8
 from pydantic import Field
 from torch import Tensor
 
+from pipeline.avatar.body import canonical_to_world
+from pipeline.avatar.mesh_views import crop_view
+from pipeline.avatar.pose_fit import PERSON_HEIGHT_PX, fit_poses
 from pipeline.avatar.selection import HELDOUT
 from pipeline.core.cli import main
 from pipeline.core.config import Config as BaseConfig
@@ -20,6 +24,7 @@ from pipeline.core.progress import track
 from pipeline.core.stage import Stage
 from pipeline.io.avatar import FinishedRun, load_finished_run
 from pipeline.io.image import read_rgb, to_uint8, write_rgb
+from pipeline.io.lpips_weights import find_lpips_weights
 from pipeline.io.report_json import build_report, finite, report_text
 from pipeline.io.report_page import FramePictures, PageContent, error_map, render_page
 from pipeline.io.sheet import on_white_8bit, picture_sheet
@@ -46,6 +51,11 @@ class Config(BaseConfig):
         True, description="score the mesh in the body stage's poses as well, without the field's corrections"
     )
     unrefined_field: bool = Field(False, description="score the field in those poses too; doubles the report's time")
+    fit_held_out_poses: bool = Field(
+        False,
+        description="score field and mesh once more, apart, in poses fitted to the held-out images; costs minutes",
+    )
+    fit_steps: int = Field(40, ge=1, le=1000, description="optimiser steps of that fit, all held-out frames in each")
     shown_frames: int = Field(8, ge=1, le=64, description="held-out frames that the page shows; all are scored")
     views: int = Field(8, ge=2, le=36, description="sides from which the turntable shows the avatar")
     view_height_px: int = Field(480, ge=64, le=2048, description="height of a turntable picture, px")
@@ -109,16 +119,37 @@ def score(
         draws["mesh_unrefined"] = (draw_mesh, loaded.fitted)
     if config.unrefined_field:
         draws["field_unrefined"] = (loaded.draw_field, loaded.fitted)
+    if config.fit_held_out_poses:
+        poses_fitted = fit_held_out(loaded, positions, config.fit_steps)
+        draws |= {"field_pose_fitted": (loaded.draw_field, poses_fitted), "mesh_pose_fitted": (draw_mesh, poses_fitted)}
+    weights = find_lpips_weights()
     shown = set(positions[np.linspace(0, len(positions) - 1, config.shown_frames).round().astype(int)].tolist())
     rows, pictures = [], []
     for position in track(positions.tolist(), "held-out frames"):
         image, mask = (to_uint8(part(position)) for part in (loaded.capture.image, loaded.capture.mask))
         renders = {name: draw(poses[position]) for name, (draw, poses) in draws.items()}
         index = int(loaded.capture.frame_index[position])
-        rows.append({"index": index} | {name: frame_scores(rgba, image, mask) for name, rgba in renders.items()})
+        scores = {name: frame_scores(rgba, image, mask, weights) for name, rgba in renders.items()}
+        rows.append({"index": index} | scores)
         if position in shown:
             pictures.append(_pictures(index, image, mask, renders))
     return rows, pictures
+
+
+def fit_held_out(loaded: FinishedRun, positions: np.ndarray, steps: int) -> Float[Tensor, "n j 4 4"]:
+    """The refined poses of all frames, those of the held-out ones fitted to their own pictures through the mesh."""
+    views = [
+        crop_view(
+            loaded.capture.image(position),
+            loaded.capture.mask(position),
+            loaded.camera,
+            loaded.refined[position],
+            PERSON_HEIGHT_PX,
+        )
+        for position in positions.tolist()
+    ]
+    motion = fit_poses(loaded.avatar, loaded.body, loaded.motion.select(positions), views, steps)
+    return loaded.refined.index_copy(0, torch.from_numpy(positions), canonical_to_world(loaded.body, motion))
 
 
 def draw_turntable(
@@ -159,7 +190,7 @@ def _manifest(folder: Path) -> Manifest:
 
 STAGE = Stage(
     name="report",
-    version=1,
+    version=2,
     needs=NEEDS,
     makes=("report.json", "index.html", "turntable.jpg", "heldout.jpg"),
     config=Config,

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pipeline.avatar.body import Body, canonical_to_world
+from pipeline.avatar.body import Body, Motion, canonical_to_world
 from pipeline.avatar.render import render_field
 from pipeline.avatar.textured import TexturedAvatar
 from pipeline.avatar.warp import build_skin_grid, skin_margin_m
@@ -27,11 +27,14 @@ Draw = Callable[[Float[Tensor, "j 4 4"]], Float[np.ndarray, "h w 4"]]
 class FinishedRun:
     """What there is to look at when all stages have run.
 
-    refined: skinning matrices of every chosen frame with the field's pose corrections; fitted: the body stage's alone.
+    motion: of every chosen frame, with the field's pose corrections. refined: its skinning matrices; fitted: those of
+    the body stage alone.
     """
 
     capture: Capture
     camera: Camera
+    body: Body
+    motion: Motion
     avatar: TexturedAvatar
     draw_field: Draw
     refined: Float[Tensor, "n j 4 4"]
@@ -42,12 +45,15 @@ def load_finished_run(inputs: Mapping[str, Path]) -> FinishedRun:
     """Read the folders of `frames`, `body`, `field`, `mesh` and `texture`. Raises UserError as the readers do."""
     body = load_body(inputs["body"] / "body.npz")
     camera = load_camera(inputs["body"] / "camera.npz")
+    motion = load_motion(inputs["field"] / "motion.npz")
     return FinishedRun(
         capture=load_capture(inputs["frames"]),
         camera=camera,
+        body=body,
+        motion=motion,
         avatar=load_textured_avatar(inputs["mesh"], inputs["texture"]),
         draw_field=_field_drawer(inputs["field"], body, camera),
-        refined=canonical_to_world(body, load_motion(inputs["field"] / "motion.npz")),
+        refined=canonical_to_world(body, motion),
         fitted=canonical_to_world(body, load_motion(inputs["body"] / "motion.npz")),
     )
 

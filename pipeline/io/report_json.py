@@ -7,6 +7,7 @@ from typing import Any
 
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import Manifest
+from pipeline.io.lpips_weights import ABSENT as LPIPS_ABSENT
 from pipeline.metrics.images import mean_scores
 
 PROTOCOL = (
@@ -14,11 +15,16 @@ PROTOCOL = (
     "their pixels, and no decision was made on them. Their poses come from the body stage, which reads the landmarks "
     "and the mask of every frame, and from the field's pose corrections, interpolated in time between training frames; "
     "no pose was fitted to a held-out image. Renders and frames are laid over white by the mask and rounded to 8 bits. "
-    "psnr_full and ssim_full count the whole image, psnr_body the pixels of the mask, psnr_box and ssim_box the "
-    "smallest box around it; each is the mean over frames. field is the radiance field, mesh the exported mesh with "
-    "its diffuse map, unlit."
+    "Of psnr, ssim and flip (67 pixels a degree, lower is better), _full counts the whole image, _body the pixels of "
+    "the mask, _box the smallest box around it; each is the mean over frames. field is the radiance field, mesh the "
+    "exported mesh with its diffuse map, unlit."
 )
 UNREFINED = " The rows named unrefined use the body stage's poses alone."
+POSE_FITTED_ENDING = "_pose_fitted"
+POSE_FITTED = (
+    " The rows named pose_fitted are no held-out scores: there the pose of each frame was fitted to that frame's own "
+    "image and mask through the mesh. They say how much of the error is the pose's."
+)
 
 
 def build_report(
@@ -43,12 +49,16 @@ def build_report(
     peaks = {name: manifest.peak_rss_mib for name, manifest in manifests.items()} | {"report": round(cost[1], 1)}
     renders = [name for name in frames[0] if name != "index"]
     protocol = PROTOCOL.format(count=len(frames))
+    protocol += UNREFINED * any(name.endswith("_unrefined") for name in renders)
+    protocol += POSE_FITTED * any(name.endswith(POSE_FITTED_ENDING) for name in renders)
+    perceptual = "lpips_full" in frames[0][renders[0]]
     return {
         "seconds": seconds | {"total": round(sum(seconds.values()), 3)},
         "peak_rss_mib": peaks | {"total": max(peaks.values())},
         "heldout": {name: mean_scores([row[name] for row in frames]) for name in renders}
         | {
-            "protocol": protocol + UNREFINED if {"field_unrefined", "mesh_unrefined"} & set(renders) else protocol,
+            "protocol": protocol,
+            "lpips": "AlexNet, version 0.1, full image on white" if perceptual else LPIPS_ABSENT,
             "frames": list(frames),
         },
         **{name: dict(section) for name, section in figures.items()},

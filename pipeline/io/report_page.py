@@ -2,7 +2,7 @@
 
 import base64
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -15,6 +15,7 @@ from jaxtyping import UInt8
 
 from pipeline.io.charts import bar_chart, legend, line_chart
 from pipeline.io.embed import light_glb, webp_uri
+from pipeline.io.report_json import POSE_FITTED_ENDING
 
 ASSETS = Path(__file__).parent / "assets"
 ERROR_RANGE = 64
@@ -60,7 +61,7 @@ def render_page(content: PageContent) -> str:
         tiles="".join(_tile(*tile) for tile in _headline(report)),
         warnings=_warnings(report["warnings"]),
         turntable="".join(_turntable_row(title, views) for title, views in content.turntable),
-        protocol=escape(report["heldout"]["protocol"]) + _scale_note(),
+        protocol=escape(f"{report['heldout']['protocol']} LPIPS: {report['heldout']['lpips']}.") + _scale_note(),
         frames="".join(_frame_row(frame, report) for frame in content.frames),
         error_charts=_error_charts(report["heldout"]["frames"]),
         cost_charts=_cost_charts(report),
@@ -201,18 +202,24 @@ def _image(pixels: UInt8[np.ndarray, "h w c"], alt: str, kind: str | None = None
 
 
 def _tables(report: Mapping[str, Any]) -> str:
-    heldout = report["heldout"]
-    sections: list[tuple[str, Iterable[tuple[str, object]]]] = [
-        (f"Held out: {name.replace('_', ', ')}", scores.items())
-        for name, scores in heldout.items()
-        if isinstance(scores, Mapping)
-    ]
-    sections += [(name.capitalize(), report[name].items()) for name in ("mesh", "body", "export", "masks")]
-    return "".join(_table(title, rows) for title, rows in sections)
+    renders = {name: scores for name, scores in report["heldout"].items() if isinstance(scores, Mapping)}
+    apart = {name: scores for name, scores in renders.items() if name.endswith(POSE_FITTED_ENDING)}
+    held_out = {name: scores for name, scores in renders.items() if name not in apart}
+    tables = [table("Held-out frames", held_out)]
+    tables += [table("Poses fitted to these frames: not held out", apart)] if apart else []
+    tables += [table(name.capitalize(), {"": report[name]}) for name in ("mesh", "body", "export", "masks")]
+    return "".join(tables)
 
 
-def _table(title: str, rows: Iterable[tuple[str, object]]) -> str:
-    lines = (f"<tr><th>{escape(name)}</th><td>{escape(figure_text(value))}</td></tr>" for name, value in rows)
+def table(title: str, columns: Mapping[str, Mapping[str, object]]) -> str:
+    """A card with a row for each figure of the first column, and a column for each of `columns`; one nameless column
+    has no heading."""
+    names = next(iter(columns.values()))
+    head = "".join(f"<td>{escape(name.replace('_', ' '))}</td>" for name in columns)
+    lines = [f"<tr><th></th>{head}</tr>"] if any(columns) else []
+    for name in names:
+        cells = "".join(f"<td>{escape(figure_text(column.get(name)))}</td>" for column in columns.values())
+        lines.append(f"<tr><th>{escape(name)}</th>{cells}</tr>")
     return f'<div class="card"><h3>{escape(title)}</h3><table>{"".join(lines)}</table></div>'
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import shutil
 from pathlib import Path
 
@@ -12,10 +13,11 @@ import pytest
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import digest_files
 from pipeline.io.capture import Capture, load_capture, save_capture
+from pipeline.io.lpips_weights import find_lpips_weights
 from stages.report import STAGE, Config, run
 from tests.stages.report_run import COLOUR_ERROR, FRAME_INDEX, make_run
 
-CONFIG = Config(samples=3, shown_frames=2, views=4, view_height_px=64)
+CONFIG = Config(samples=3, shown_frames=2, views=4, view_height_px=64, fit_held_out_poses=True, fit_steps=5)
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +76,25 @@ def test_poses_without_refinement_score_worse(report: dict):
 def test_the_field_without_refinement_is_scored_only_on_request(report: dict):
     assert "field_unrefined" not in report["heldout"]
     assert "mesh_unrefined" in report["heldout"]["frames"][0]
+
+
+def test_poses_fitted_to_held_out_images_are_scored_apart(report: dict, out: Path):
+    heldout = report["heldout"]
+    assert {"field_pose_fitted", "mesh_pose_fitted"} <= heldout.keys()
+    assert "pose_fitted are no held-out scores" in heldout["protocol"]
+    # the refined poses of this run are the true ones, so the fit has nothing to find
+    assert heldout["mesh_pose_fitted"]["psnr_body"] == pytest.approx(heldout["mesh"]["psnr_body"], abs=1.0)
+    held_out, apart = re.findall(
+        r"<h3>((?:Held-out|Poses fitted)[^<]*)</h3><table>(.*?)</table>", (out / "index.html").read_text()
+    )
+    assert "pose fitted" not in held_out[1]
+    assert "mesh pose fitted" in apart[1]
+
+
+def test_lpips_is_there_or_said_to_be_absent(report: dict):
+    has_weights = find_lpips_weights() is not None
+    assert ("lpips_full" in report["heldout"]["mesh"]) == has_weights
+    assert report["heldout"]["lpips"].startswith("AlexNet" if has_weights else "absent")
 
 
 def test_an_untrained_field_is_worse_than_the_mesh(report: dict):
