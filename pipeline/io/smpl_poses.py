@@ -1,0 +1,75 @@
+"""SMPL poses that others have fitted to a recording: one layout for whatever file they came in.
+
+`smpl_poses.npz` beside the video, one row for each of n frames (not necessarily all frames of the recording):
+
+    frame_index     (n,) index of the frame in the recording, rising
+    global_orient   (n, 3) axis-angle of the root, radians
+    body_pose       (n, 69) axis-angle of SMPL's 23 other joints in SMPL's order, radians
+    transl          (n, 3) added to SMPL's vertices, metres
+    betas           (n, 10) shape, as the source gives it for each frame
+    smpl_to_camera  (n, 4, 4) from the space of SMPL's output (with `transl`) to the camera's axes (x right, y down,
+                    z forward), metres, column vectors
+    gender          male, female, neutral or unknown: whose SMPL model the numbers belong to
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipeline.core.errors import UserError
+from pipeline.io.npz import load_npz, save_npz
+
+SMPL_POSES_NPZ = "smpl_poses.npz"
+N_BODY_POSE, N_BETAS = 69, 10
+GENDERS = ("male", "female", "neutral", "unknown")
+_ROW_SHAPES = {
+    "frame_index": (),
+    "global_orient": (3,),
+    "body_pose": (N_BODY_POSE,),
+    "transl": (3,),
+    "betas": (N_BETAS,),
+    "smpl_to_camera": (4, 4),
+}
+
+
+@dataclass(frozen=True)
+class SmplPoses:
+    """What the file holds; see the module."""
+
+    frame_index: Int[np.ndarray, "n"]
+    global_orient: Float[np.ndarray, "n 3"]
+    body_pose: Float[np.ndarray, "n 69"]
+    transl: Float[np.ndarray, "n 3"]
+    betas: Float[np.ndarray, "n 10"]
+    smpl_to_camera: Float[np.ndarray, "n 4 4"]
+    gender: str
+
+
+def save_smpl_poses(path: Path, poses: SmplPoses) -> None:
+    """Write the poses; `load_smpl_poses` is the inverse."""
+    arrays = {name: getattr(poses, name).astype(np.float32) for name in _ROW_SHAPES}
+    arrays["frame_index"] = poses.frame_index.astype(np.int32)
+    save_npz(path, {**arrays, "gender": np.array(poses.gender)})
+
+
+def load_smpl_poses(path: Path) -> SmplPoses:
+    """Read what `save_smpl_poses`, or a user after the module's description, wrote.
+
+    Raises:
+        UserError: the file cannot be read, an array is missing or of another shape, frames do not rise.
+    """
+    arrays = load_npz(path)
+    n = len(np.atleast_1d(arrays.get("frame_index", np.zeros(0))))
+    for name, shape in _ROW_SHAPES.items():
+        found = arrays[name].shape if name in arrays else None
+        if found != (n, *shape):
+            raise UserError(f"{path}: `{name}` must have shape {(n, *shape)}, found {found}; write it so")
+    if (np.diff(arrays["frame_index"]) <= 0).any():
+        raise UserError(f"{path}: `frame_index` does not rise; sort the rows, one for each frame")
+    gender = str(arrays["gender"].item()) if "gender" in arrays else "unknown"
+    if gender not in GENDERS:
+        raise UserError(f"{path}: gender is {gender}; write one of {', '.join(GENDERS)}")
+    floats = {name: arrays[name].astype(np.float32) for name in _ROW_SHAPES if name != "frame_index"}
+    return SmplPoses(frame_index=arrays["frame_index"].astype(np.int32), **floats, gender=gender)
