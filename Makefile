@@ -13,21 +13,29 @@ SET ?=
 EXTRA ?=
 ARGS ?=
 
+# Many videos.
+VIDEOS ?=
+RUNS ?= runs
+JOBS ?=
+CLUSTER ?=
+
 TORCH_VERSION := 2.13.0
 GLTF_VALIDATOR_VERSION := 2.0.0-dev.3.10
 SAMPLE_RUN := runs/sample
 SAMPLE := runs/sample-capture
 ONE_RUN := $(or $(RUN),$(SAMPLE_RUN))
-OPTIONS = $(if $(PRESET),--preset $(PRESET)) $(foreach item,$(SET),--set $(item)) $(ARGS)
+RUN_OPTIONS = $(if $(PRESET),--preset $(PRESET)) $(foreach item,$(SET),--set $(item))
+OPTIONS = $(RUN_OPTIONS) $(ARGS)
 STAMP := $(VENV)/.stamp$(if $(EXTRA),-$(EXTRA))
 
 .DEFAULT_GOAL := help
-.PHONY: help all $(STAGES) test test-all check format bench doctor venv lock configs gltf-validator clean
+.PHONY: help all $(STAGES) batch test test-all check format bench doctor venv lock configs gltf-validator clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z$$()A-Z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST) | sed 's/$$(STAGES)/STAGE    /'
 	@echo "  STAGE is one of: $(STAGES)"
-	@echo "  variables: VIDEO=file-or-folder RUN=runs/name PRESET=instant|default|fine SET='mesh.key=value' EXTRA=cuda"
+	@echo "  variables: VIDEO=file-or-folder RUN=runs/name PRESET=instant|default|fine SET='mesh.key=value'"
+	@echo "             EXTRA=cuda (a graphics card) or EXTRA=cluster (Snakemake)"
 
 ifeq ($(VIDEO)$(RUN),)
 all: $(STAMP) $(SAMPLE)/.done  ## the whole way; without VIDEO: a generated sample with known truth
@@ -39,6 +47,16 @@ endif
 
 $(STAGES): $(STAMP)  ## one stage of RUN=runs/name
 	$(RUN_PYTHON) -m stages.$@ "$(ONE_RUN)" $(if $(VIDEO),--video "$(VIDEO)") $(OPTIONS)
+
+batch: $(STAMP)  ## all videos of VIDEOS=folder, with a table; JOBS=n at once, or CLUSTER=local|slurm|kubernetes
+ifeq ($(CLUSTER),)
+	$(RUN_PYTHON) -m data_tools.batch $(if $(VIDEOS),"$(VIDEOS)") --runs "$(RUNS)" $(if $(JOBS),--jobs $(JOBS)) $(OPTIONS)
+else
+	@test -x $(VENV)/bin/snakemake || { echo "error: Snakemake is not installed: make venv EXTRA=cluster" >&2; exit 2; }
+	$(VENV)/bin/snakemake --snakefile configs/cluster/Snakefile --profile configs/cluster/$(CLUSTER) \
+		$(if $(JOBS),--jobs $(JOBS)) $(ARGS) --config videos="$(VIDEOS)" runs="$(RUNS)" project="$(CURDIR)" \
+		python="$(CURDIR)/$(RUN_PYTHON)" options="$(RUN_OPTIONS)"
+endif
 
 # Made once; a half-made one, which has no .done, is made anew.
 $(SAMPLE)/.done: | $(STAMP)

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 
 from pipeline.core.cli import USER_ERROR
 from pipeline.core.errors import UserError, os_error_sentence
+from pipeline.core.runner import INTERRUPTED
 
 
 def run_command(work: Callable[[Sequence[str]], None], argv: Sequence[str]) -> int:
@@ -17,6 +18,9 @@ def run_command(work: Callable[[Sequence[str]], None], argv: Sequence[str]) -> i
         sentence = os_error_sentence(error)
         if sentence is None:
             raise
+    except KeyboardInterrupt:
+        print("interrupted: run the same command again", file=sys.stderr)
+        return INTERRUPTED
     else:
         return 0
     print(f"error: {sentence}", file=sys.stderr)

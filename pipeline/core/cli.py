@@ -30,6 +30,7 @@ def main_all(
     names: Sequence[str], load: LoadStage, argv: Sequence[str] | None = None, config_dir: Path = CONFIG_DIR
 ) -> int:
     """Run, or report on, all stages of one run folder; return the exit status."""
+    die_with_parent()
     return _guarded(lambda: _run_every(names, load, argv, config_dir))
 
 

@@ -39,16 +39,21 @@ def run_lock(run_dir: Path, patience_s: float = PATIENCE_S) -> Iterator[int]:
 
 def child_environment(lock_fd: int) -> dict[str, str]:
     """Environment for a stage process that works under this process's lock."""
-    return {**os.environ, LOCK_FD_VARIABLE: str(lock_fd), PARENT_VARIABLE: str(os.getpid())}
+    return {**bound_environment(), LOCK_FD_VARIABLE: str(lock_fd)}
+
+
+def bound_environment() -> dict[str, str]:
+    """Environment for a child that ends with this process, if it calls `die_with_parent`."""
+    return {**os.environ, PARENT_VARIABLE: str(os.getpid())}
 
 
 def is_runner_child() -> bool:
-    """True in a stage process that the runner started."""
+    """True in a process that was started by the runner, or by a program of many runs."""
     return PARENT_VARIABLE in os.environ
 
 
 def die_with_parent() -> None:
-    """In a stage process of the runner: end when the runner ends, even when it is killed (Linux; elsewhere no-op)."""
+    """In a process with `bound_environment`: end when its parent ends, even when killed (Linux; elsewhere no-op)."""
     parent = os.environ.get(PARENT_VARIABLE)
     if not parent or sys.platform != "linux":
         return

@@ -14,6 +14,7 @@ from pipeline.core.record import RunRecord
 from pipeline.core.stage import Stage, discard_part, plan_stage
 
 INTERRUPTED = 130
+FRESH = "fresh"
 
 
 @dataclass(frozen=True)
@@ -95,23 +96,30 @@ def summary(outcomes: Sequence[Outcome], wall_s: float) -> str:
 
 
 def status(stages: Sequence[Stage], configs: dict[str, Config], run_dir: Path, record: RunRecord) -> str:
-    """A table of what is there: fresh, stale, unfinished, missing, or waiting for a stage before it."""
-    lines, not_fresh = [], set[str]()
-    for stage in stages:
-        manifest = read_manifest(run_dir / stage.name)
-        state = _state(stage, configs[stage.name], run_dir, record, not_fresh)
-        if state != "fresh":
-            not_fresh.add(stage.name)
+    """A table of what is there: the state of every stage and what it cost."""
+    lines = []
+    for name, state in stage_states(stages, configs, run_dir, record).items():
+        manifest = read_manifest(run_dir / name)
         cost = f"{manifest.seconds:>9.1f} s {manifest.peak_rss_mib:>7.0f} MiB" if manifest else ""
-        lines.append(f"{stage.name:<10} {state:<18} {cost}".rstrip())
+        lines.append(f"{name:<10} {state:<18} {cost}".rstrip())
     return "\n".join(lines)
 
 
-def _state(stage: Stage, config: Config, run_dir: Path, record: RunRecord, not_fresh: set[str]) -> str:
-    waits_for = next((need for need in stage.needs if need in not_fresh), None)
+def stage_states(
+    stages: Sequence[Stage], configs: dict[str, Config], run_dir: Path, record: RunRecord
+) -> dict[str, str]:
+    """Of every stage, in order: fresh, stale, unfinished, missing, or waiting for a stage before it."""
+    states: dict[str, str] = {}
+    for stage in stages:
+        states[stage.name] = _state(stage, configs[stage.name], run_dir, record, states)
+    return states
+
+
+def _state(stage: Stage, config: Config, run_dir: Path, record: RunRecord, states: dict[str, str]) -> str:
+    waits_for = next((need for need in stage.needs if states.get(need, FRESH) != FRESH), None)
     there = (run_dir / stage.name).exists()
     if there and not waits_for and plan_stage(stage, config, run_dir, record.video_path).is_fresh():
-        return "fresh"
+        return FRESH
     if (run_dir / f"{stage.name}.part").exists():
         return "unfinished"
     if waits_for:

@@ -1,0 +1,62 @@
+"""What a run folder and its log tell to a program of many runs."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from data_tools.runs import check_options, last_failure, read_run, read_scores, video_in
+from pipeline.core.errors import UserError
+from stages import STAGES
+
+CRASH = "Traceback (most recent call last):\n  File\nValueError: too small\n"
+
+
+def test_a_failure_is_the_last_error_or_the_end_of_a_traceback(tmp_path: Path) -> None:
+    log = tmp_path / "a.log"
+    assert last_failure(log) == ""
+    for text, sentence in (
+        ("[1/7] frames\nfield: 3/10\n", ""),
+        ("warning: dark\nerror: no person in frame 3: film again\n", "no person in frame 3: film again"),
+        (CRASH, "ValueError: too small"),
+        (CRASH + "error: the disk is full\n", "the disk is full"),
+    ):
+        log.write_text(text)
+        assert last_failure(log) == sentence
+
+
+def test_scores_that_are_absent_or_null_are_left_out(tmp_path: Path) -> None:
+    assert read_scores(tmp_path) == {}
+    heldout = {"field": {"psnr_full": 30.5, "psnr_body": None}, "mesh": {"psnr_full": 28}}
+    (tmp_path / "report.json").write_text(json.dumps({"heldout": heldout}))
+    assert read_scores(tmp_path) == {"field_psnr_full_db": 30.5, "mesh_psnr_full_db": 28.0}
+
+
+def test_an_empty_run_is_unfinished_until_its_log_tells_of_a_failure(tmp_path: Path) -> None:
+    run = read_run(tmp_path / "me")
+    assert list(run.states) == list(STAGES)
+    assert (run.verdict, run.seconds(STAGES), run.scores) == ("unfinished", 0.0, {})
+    (tmp_path / "me.log").write_text("error: me.mp4 cannot be read: convert it\n")
+    assert read_run(tmp_path / "me").verdict == "failed"
+
+
+def test_a_damaged_record_is_told_not_thrown(tmp_path: Path) -> None:
+    (tmp_path / "me").mkdir()
+    (tmp_path / "me" / "run.json").write_text("{")
+    run = read_run(tmp_path / "me")
+    assert run.verdict == "failed"
+    assert "run.json is damaged" in run.failure
+
+
+def test_a_captures_video_lies_beside_its_truth(tmp_path: Path) -> None:
+    (tmp_path / "capture" / "video").mkdir(parents=True)
+    assert video_in(tmp_path / "capture") == tmp_path / "capture" / "video"
+    assert video_in(tmp_path / "me.mp4") == tmp_path / "me.mp4"
+
+
+def test_unknown_options_are_refused_before_any_run() -> None:
+    check_options("instant", ["mesh.edge_px=2"])
+    with pytest.raises(UserError, match="instant"):
+        check_options("instnt", [])
+    with pytest.raises(UserError, match="edge_px"):
+        check_options("instant", ["mesh.edge_pz=2"])
