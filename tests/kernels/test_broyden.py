@@ -1,0 +1,75 @@
+import numpy as np
+import pytest
+import torch
+
+from pipeline.kernels.broyden import CANDIDATES, search
+from pipeline.kernels.march import WarpSet
+from pipeline.kernels.reference.warp import skin_points
+from pipeline.kernels.warp import SkinGrid, bake, newton
+from tests.kernels.bar import CELL_M, bar_points, bar_skin, bend
+from tests.kernels.test_warp import grid_of, look_up
+
+
+def run(skin, matrices, posed, frame=None):
+    """Search with all bones as starts; matrices (j, 4, 4) of one frame or (k, j, 4, 4)."""
+    matrices = matrices if matrices.dim() == 4 else matrices[None]
+    frame = torch.zeros(len(posed), dtype=torch.long) if frame is None else frame
+    return search(posed, frame, matrices, skin.blend(matrices), skin)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_single_bone_is_undone_by_its_inverse(dtype):
+    bar = bar_skin()
+    skin = SkinGrid(bar.origin_m, bar.cell_m, bar.row_of_node, bar.nodes_m, bar.distance_m, bar.weights[:, :1] * 0 + 1)
+    matrix = bend(0.8, dtype)[1]
+    matrix[:3, 3] = torch.tensor([0.3, -1.0, 0.2], dtype=dtype)
+    posed = bar_points(200).to(dtype) @ matrix[:3, :3].T + matrix[:3, 3]
+    roots, exists = run(skin, matrix[None], posed)
+    closed_form = (posed - matrix[:3, 3]) @ matrix[:3, :3]
+    assert exists.sum(1).tolist() == [1] * 200
+    torch.testing.assert_close(roots[:, 0], closed_form, atol=2e-6, rtol=0)
+
+
+@pytest.mark.parametrize("angle", [0.5, 1.2])
+def test_undoes_the_bent_bar_and_agrees_with_the_baked_grid(angle):
+    skin, matrices, points = bar_skin(), bend(angle), bar_points(2000)
+    blended = skin.blend(matrices[None])
+    posed = skin_points(points, blended[:, 0], *grid_of(skin))
+    roots, exists = run(skin, matrices, posed)
+    truth = ((roots - points[:, None]).norm(dim=2) < 1e-3) & exists
+    assert float(truth.any(1).float().mean()) > 0.995
+    baked, owner = look_up(posed, WarpSet.of([bake(skin, matrices)], CELL_M))
+    refined = newton(blended, baked, posed[owner], torch.tensor([0, len(owner)]), skin)
+    apart_m = (roots[owner] - refined[:, None]).norm(dim=2).masked_fill(~exists[owner], np.inf).amin(1)
+    assert float((apart_m < 1e-3).float().mean()) > 0.99
+
+
+def test_every_answer_is_a_root_and_none_comes_twice():
+    skin, matrices = bar_skin(), bend(np.pi - 0.35)
+    points = torch.cat([bar_points(1000), torch.tensor([[-0.4, 0.073, 0.0], [-0.45, 0.081, 0.03]])])
+    roots, exists = run(skin, matrices, points)
+    assert exists[-2:].sum(1).tolist() == [2, 2], "the folded bar covers these twice"
+    point, candidate = torch.nonzero(exists, as_tuple=True)
+    back = skin_points(roots[point, candidate], skin.blend(matrices[None])[:, 0], *grid_of(skin))
+    assert float((back - points[point]).norm(dim=1).max()) < 2e-5
+    for first in range(CANDIDATES):
+        for second in range(first):
+            both = exists[:, first] & exists[:, second]
+            assert bool(((roots[:, first] - roots[:, second]).norm(dim=1)[both] > 1e-3).all())
+
+
+def test_matches_its_twin():
+    skin, matrices = bar_skin(), torch.stack([bend(0.9), bend(np.pi - 0.5)])
+    points = torch.cat([bar_points(400), 2 * bar_points(200, seed=3)])
+    frame = torch.arange(len(points)) % 2
+    ours, twin = run(skin, matrices, points, frame), run(skin, matrices.double(), points.double(), frame)
+    same = (ours[1] == twin[1]).all(1)
+    # A search that ends on the verge of arriving within float32 may go either way.
+    assert float(same.float().mean()) > 0.98
+    assert int(ours[1][:, 1].sum()) > 20
+    torch.testing.assert_close(ours[0][same].double(), twin[0][same], atol=5e-4, rtol=0)
+
+
+def test_far_points_have_no_answer():
+    far = torch.tensor([[0.0, 0.0, 0.5], [3.0, 0.0, 0.0]])
+    assert not run(bar_skin(), bend(0.3), far)[1].any()
