@@ -1,6 +1,6 @@
 """frames: from a recording to the pictures that matter, each with the person's mask and 33 landmarks."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from pipeline.io.contact import contact_sheet
 from pipeline.io.image import write_rgb
 from pipeline.io.screening import refuse_bad_input, warn_of_gaps
 from pipeline.io.sightings import Sightings, look_at_all, write_frames
-from pipeline.io.supplied import Supplied, find_supplied
+from pipeline.io.supplied import Supplied, SuppliedSplit, find_supplied
 from pipeline.io.video import Source, open_source
 from pipeline.io.workers import start_workers
 
@@ -43,11 +43,14 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     if source.n_frames < config.min_frames:
         raise UserError(f"{source.path} has {source.n_frames} frames, too few: give at least {config.min_frames}")
     with start_workers(config.workers) as workers:
-        stride = looking_stride(source.n_frames, config.max_looked_at)
-        sightings = look_at_all(source, supplied, stride, _COUNTED_FRAMES, config.max_side_px, workers)
+        looked_at = frames_to_look_at(source, supplied, config)
+        sightings = look_at_all(source, supplied, looked_at, _COUNTED_FRAMES, config.max_side_px, workers)
         refuse_bad_input(sightings, source.path, config.min_frames)
         noise = selection.noise_level(sightings.grays)
-        chosen, n_duplicates = choose(sightings, source.path, config, noise)
+        if supplied.split is None:
+            chosen, n_duplicates = choose(sightings, source.path, config, noise)
+        else:
+            chosen, n_duplicates = keep_listed(sightings, supplied.split, source.path), 0
         # Colour noise of a small blurred patch is never below one level, whatever the small grey pictures say.
         write_frames(source, supplied, sightings, chosen, out, config.max_side_px, max(1.0, noise), workers)
     capture = make_capture(sightings, chosen, out, source, supplied)
@@ -69,6 +72,23 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
         "unseen_arc_deg": float(np.degrees(unseen_rad)),
         "scale": sightings.scale,
     }
+
+
+def frames_to_look_at(source: Source, supplied: Supplied, config: Config) -> Sequence[int]:
+    """Indices of the frames in which the person is looked for: all that a supplied split lists, else evenly spread.
+
+    Raises:
+        UserError: the split lists more frames than may be kept.
+    """
+    if supplied.split is None:
+        return range(0, source.n_frames, looking_stride(source.n_frames, config.max_looked_at))
+    listed: list[int] = supplied.split.frame_index.tolist()
+    if len(listed) > config.max_frames:
+        raise UserError(
+            f"split.json of {source.path} lists {len(listed)} frames, frames.max_frames is {config.max_frames}; "
+            f"list fewer, or allow them with --set frames.max_frames={len(listed)}"
+        )
+    return listed
 
 
 def looking_stride(n_frames: int, max_looked_at: int) -> int:
@@ -93,6 +113,14 @@ def choose(sightings: Sightings, path: Path, config: Config, noise: float) -> tu
     return [int(position) for position in chosen], int((~distinct).sum())
 
 
+def keep_listed(sightings: Sightings, split: SuppliedSplit, path: Path) -> list[int]:
+    """Positions of the frames that a supplied split lists and that show the person."""
+    kept = np.flatnonzero(sightings.found)
+    if len(np.unique(split.of(sightings.frame_index[kept]))) < 3:
+        raise UserError(f"no person was found in any frame of one kind in split.json of {path}; list other frames")
+    return [int(position) for position in kept]
+
+
 def make_capture(sightings: Sightings, chosen: list[int], out: Path, source: Source, supplied: Supplied) -> Capture:
     """Gather what is known about the chosen frames."""
     frame_index = sightings.frame_index[chosen]
@@ -100,7 +128,7 @@ def make_capture(sightings: Sightings, chosen: list[int], out: Path, source: Sou
         folder=out,
         frame_index=frame_index,
         time_s=sightings.time_s[chosen],
-        split=selection.split_of(frame_index),
+        split=selection.split_of(frame_index) if supplied.split is None else supplied.split.of(frame_index),
         fps=source.fps,
         width=sightings.width,
         height=sightings.height,

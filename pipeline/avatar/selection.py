@@ -1,6 +1,7 @@
 """Which frames of a recording are worth keeping. Pure functions on small grey pictures and landmarks.
 
-The split is fixed by a frame's index in the whole recording, so that it does not move when the choice does.
+The split is fixed by a frame's index in the whole recording, so that it does not move when the choice does; a split
+that the user supplies (`pipeline.io.supplied`) takes the place of both.
 """
 
 import numpy as np
@@ -8,7 +9,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 TRAIN, VALIDATION, HELDOUT = 0, 1, 2
 SPLIT_PERIOD = 8
-_VALIDATION_PHASE = 4
+VALIDATION_PHASE = 4
 # Mean absolute difference of two pictures of the same thing when rounding to whole levels is the only noise:
 # E|round(a + e1) - round(a + e2)| with independent uniform dither = 1/3.
 _ROUNDING_NOISE = 1.0 / 3.0
@@ -18,7 +19,7 @@ _BLOCK_PX = 16
 def split_of(frame_index: Int[np.ndarray, "n"]) -> UInt8[np.ndarray, "n"]:
     """HELDOUT for indices divisible by eight, VALIDATION for index = 4 modulo 8, TRAIN for the rest."""
     phase = frame_index % SPLIT_PERIOD
-    return np.select([phase == 0, phase == _VALIDATION_PHASE], [HELDOUT, VALIDATION], TRAIN).astype(np.uint8)
+    return np.select([phase == 0, phase == VALIDATION_PHASE], [HELDOUT, VALIDATION], TRAIN).astype(np.uint8)
 
 
 def noise_level(grays: UInt8[np.ndarray, "n h w"]) -> float:

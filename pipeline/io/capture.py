@@ -20,7 +20,7 @@ class Capture:
     """The chosen frames of a recording: n frames, all of one size.
 
     frame_index: index in the whole recording; time_s: since its first frame.
-    split: 0 train, 1 validation, 2 held out (see `pipeline.avatar.selection.split_of`).
+    split: 0 train, 1 validation, 2 held out (`pipeline.avatar.selection.split_of`, or supplied with the video).
     landmarks_px: MediaPipe's 33 points, pixel centres at +0.5; nan where unknown. Visibility in [0, 1].
     landmarks_world_m: metres about the hips' centre in camera axes; nan where unknown.
     camera: what was supplied with the video, for these images; None when unknown.

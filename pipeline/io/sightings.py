@@ -60,19 +60,19 @@ class Sightings:
 
 
 def look_at_all(
-    source: Source, supplied: Supplied, stride: int, n_counted: int, max_side_px: int, workers: Workers
+    source: Source, supplied: Supplied, looked_at: Sequence[int], n_counted: int, max_side_px: int, workers: Workers
 ) -> Sightings:
-    """Find the person in every `stride`-th frame; in `n_counted` of them, evenly spread, count the people.
+    """Find the person in the frames `looked_at`; in `n_counted` of them, evenly spread, count the people.
 
     Raises UserError when the recording yields no frame.
     """
-    looked_at = range(0, source.n_frames, stride)
     counted = {looked_at[int(k)] for k in np.linspace(0, len(looked_at) - 1, n_counted)} if looked_at else set()
+    wanted = set(looked_at)
     seen: list[tuple[int, float]] = []
     shape: list[tuple[int, int, float]] = []
 
     def tasks() -> Iterator[tuple[object, ...]]:
-        for frame in read_undistorted(source, supplied, lambda index: index % stride == 0, max_side_px):
+        for frame in read_undistorted(source, supplied, wanted.__contains__, max_side_px):
             seen.append((frame.index, frame.time_s))
             shape.append((frame.rgb.shape[0], frame.rgb.shape[1], frame.scale))
             mask = supplied_mask(supplied, frame)

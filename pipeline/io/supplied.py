@@ -1,4 +1,4 @@
-"""What lies beside a video and wins over the detector: masks, landmarks, a camera.
+"""What lies beside a video and wins: masks, landmarks, a camera over the detector, a split over index modulo eight.
 
     masks/        one image a frame, in natural order or named as the images are
     masks.npz     array `masks` (n, h, w);  masks.hdf5: the same, as PeopleSnapshot ships it
@@ -6,19 +6,23 @@
                   and `landmarks_world_m` (n, 33, 3); MediaPipe's 33 points in its order
     camera.json   fx, fy, cx, cy in pixels of the original frames, optionally `distortion` (OpenCV's k1 k2 p1 p2 [k3])
                   and `world_to_camera` (4 x 4, row-major)
+    split.json    lists of frame indices `train` and `heldout`, optionally `validation` (else every eighth training
+                  frame, from the fifth on); the frames that stand in none are left out
 
 Row i of each belongs to frame i of the recording.
 """
 
 import json
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
+from pipeline.avatar.selection import HELDOUT, SPLIT_PERIOD, TRAIN, VALIDATION, VALIDATION_PHASE
 from pipeline.core.errors import UserError
 from pipeline.geometry.camera import UPRIGHT_WORLD_TO_CAMERA, Camera
 from pipeline.io.image import IMAGE_SUFFIXES, read_gray
@@ -26,6 +30,7 @@ from pipeline.io.npz import load_npz
 from pipeline.io.video import Source, natural_key
 
 N_LANDMARKS = 33
+_SPLITS = {"train": TRAIN, "validation": VALIDATION, "heldout": HELDOUT}
 
 
 @dataclass(frozen=True)
@@ -78,6 +83,18 @@ class SuppliedLandmarks:
 
 
 @dataclass(frozen=True)
+class SuppliedSplit:
+    """Which frames of the recording are to be used, in rising order, and what for (as `Capture.split`)."""
+
+    frame_index: Int[np.ndarray, "m"]
+    split: UInt8[np.ndarray, "m"]
+
+    def of(self, frame_index: Int[np.ndarray, "n"]) -> UInt8[np.ndarray, "n"]:
+        """What these frames, all of them listed, are for."""
+        return self.split[np.searchsorted(self.frame_index, frame_index)]
+
+
+@dataclass(frozen=True)
 class Supplied:
     """What was found; None for what was not. `read_mask(index)` gives uint8 [0, 255] at its own size."""
 
@@ -85,6 +102,7 @@ class Supplied:
     mask_source: str
     landmarks: SuppliedLandmarks | None
     camera: SuppliedCamera | None
+    split: SuppliedSplit | None = None
 
 
 def find_supplied(path: Path, source: Source) -> Supplied:
@@ -95,12 +113,13 @@ def find_supplied(path: Path, source: Source) -> Supplied:
     if not path.is_dir():
         return Supplied(None, "", None, None)
     read_mask, mask_source = _find_masks(path, source)
-    landmarks_path, camera_path = path / "landmarks.npz", path / "camera.json"
+    landmarks_path, camera_path, split_path = (path / f for f in ("landmarks.npz", "camera.json", "split.json"))
     return Supplied(
         read_mask,
         mask_source,
         _read_landmarks(landmarks_path, source) if landmarks_path.is_file() else None,
         _read_camera(camera_path) if camera_path.is_file() else None,
+        _read_split(split_path, source) if split_path.is_file() else None,
     )
 
 
@@ -176,6 +195,31 @@ def _read_camera(path: Path) -> SuppliedCamera:
     if len(distortion) not in (0, 4, 5, 8):
         raise UserError(f"{path}: distortion needs 4, 5 or 8 numbers (k1 k2 p1 p2 ...), found {len(distortion)}")
     return SuppliedCamera(fx, fy, cx, cy, distortion, world_to_camera)
+
+
+def _read_split(path: Path, source: Source) -> SuppliedSplit:
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        lists = {name: [operator.index(value) for value in indices] for name, indices in values.items()}
+    except (ValueError, TypeError, AttributeError) as error:
+        raise UserError(f"{path} is no split ({error}); it needs lists of frame indices, train and heldout") from None
+    if unknown := set(lists) - set(_SPLITS):
+        raise UserError(f"{path}: unknown list {sorted(unknown)[0]}; there are {', '.join(_SPLITS)}")
+    if "validation" not in lists:
+        train = sorted(lists.get("train", []))
+        lists["validation"] = train[VALIDATION_PHASE::SPLIT_PERIOD]
+        lists["train"] = sorted(set(train) - set(lists["validation"]))
+    for name in _SPLITS:
+        if not lists.get(name):
+            raise UserError(f"{path} lists no frame for {name}; list some of each kind, and 5 training ones or more")
+    indices = np.concatenate([lists[name] for name in _SPLITS])
+    if len(np.unique(indices)) != len(indices):
+        raise UserError(f"{path} lists a frame twice; give each frame one use")
+    if indices.min() < 0 or indices.max() >= source.n_frames:
+        raise UserError(f"{path} lists frames up to {indices.max()}, {source.path} has 0 to {source.n_frames - 1}")
+    kinds = np.concatenate([np.full(len(lists[name]), kind, np.uint8) for name, kind in _SPLITS.items()])
+    order = np.argsort(indices)
+    return SuppliedSplit(indices[order], kinds[order])
 
 
 def _check_count(path: Path, count: int, source: Source) -> None:

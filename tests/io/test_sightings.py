@@ -35,7 +35,8 @@ def look(folder, stride=1, max_side_px=60):
     source = open_source(folder / "in")
     supplied = find_supplied(folder / "in", source)
     with start_workers(1) as workers:
-        return source, supplied, look_at_all(source, supplied, stride, 2, max_side_px, workers)
+        looked_at = range(0, source.n_frames, stride)
+        return source, supplied, look_at_all(source, supplied, looked_at, 2, max_side_px, workers)
 
 
 def test_all_frames_are_seen_and_an_empty_one_is_not_found(folder):

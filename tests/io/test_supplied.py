@@ -69,6 +69,23 @@ def test_camera_for_smaller_images(tmp_path, source):
     np.testing.assert_array_equal(camera.world_to_camera, pose)
 
 
+def test_a_split_says_what_each_listed_frame_is_for(tmp_path):
+    recording = Source(tmp_path, (), 30, 25.0)
+    (tmp_path / "split.json").write_text('{"train": [12, 3, 4], "validation": [8], "heldout": [29, 0]}')
+    split = find_supplied(tmp_path, recording).split
+    np.testing.assert_array_equal(split.frame_index, [0, 3, 4, 8, 12, 29])
+    np.testing.assert_array_equal(split.split, [2, 0, 0, 1, 0, 2])
+    np.testing.assert_array_equal(split.of(np.array([29, 8, 3])), [2, 1, 0])
+
+
+def test_a_split_without_validation_takes_every_eighth_training_frame(tmp_path):
+    recording = Source(tmp_path, (), 60, 25.0)
+    (tmp_path / "split.json").write_text(json.dumps({"train": list(range(0, 40, 2)), "heldout": [41]}))
+    split = find_supplied(tmp_path, recording).split
+    np.testing.assert_array_equal(split.frame_index[split.split == 1], [8, 24])
+    assert (split.split == 0).sum() == 18
+
+
 def test_lens_distortion_is_taken_out_of_pictures_and_points():
     """A bright dot drawn where the distorted lens sees it must land where the ideal pinhole projects it."""
     k1, focal, centre = -0.25, 100.0, 64.0
@@ -101,6 +118,14 @@ def test_without_distortion_nothing_is_resampled():
         ("camera.json", json.dumps(CAMERA | {"fx": -1}), "above 0"),
         ("camera.json", json.dumps(CAMERA | {"distortion": [0.1]}), "distortion needs"),
         ("camera.json", json.dumps(CAMERA | {"world_to_camera": [1, 2]}), "is no camera"),
+        ("split.json", "[0, 1]", "is no split"),
+        ("split.json", '{"train": 3, "heldout": [1]}', "is no split"),
+        ("split.json", '{"train": [0.5], "heldout": [1]}', "is no split"),
+        ("split.json", '{"train": [0], "test": [1]}', "unknown list test; there are train, validation, heldout"),
+        ("split.json", '{"train": [0], "heldout": [1]}', "no frame for validation"),
+        ("split.json", '{"train": [0], "validation": [1], "heldout": []}', "no frame for heldout"),
+        ("split.json", '{"train": [0], "validation": [1], "heldout": [0]}', "a frame twice"),
+        ("split.json", '{"train": [0], "validation": [1], "heldout": [3]}', "up to 3, .* has 0 to 2"),
         ("masks.npz", "x", "masks.npz"),
         ("masks.hdf5", "x", "masks.hdf5"),
         ("landmarks.npz", "x", "landmarks.npz"),

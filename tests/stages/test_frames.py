@@ -1,5 +1,7 @@
 """The frames stage from folder to artifact: on drawn recordings with masks beside them, and on the real ones."""
 
+import json
+
 import cv2
 import numpy as np
 import pytest
@@ -64,6 +66,36 @@ def test_duplicates_are_dropped_and_the_rest_is_thinned_out(tmp_path):
     assert (capture.frame_index % 2 == 0).all()
     assert capture.frame_index[0] == 0
     assert capture.frame_index[-1] == 78
+
+
+def write_split(folder, train, heldout):
+    (folder / "split.json").write_text(json.dumps({"train": list(train), "heldout": list(heldout)}))
+    return folder
+
+
+def test_a_supplied_split_is_kept_frame_by_frame(tmp_path):
+    """Every listed frame is used for what it is listed for, near-duplicates too; no other frame is."""
+    folder = write_split(draw_recording(tmp_path / "in", n=40, repeats=2), range(3, 24), range(30, 40, 3))
+    metrics = run(folder, tmp_path / "out")
+    capture = load_capture(tmp_path / "out")
+    np.testing.assert_array_equal(capture.frame_index, [*range(3, 24), *range(30, 40, 3)])
+    np.testing.assert_array_equal(capture.frame_index[capture.positions(2)], range(30, 40, 3))
+    np.testing.assert_array_equal(capture.frame_index[capture.positions(1)], [7, 15, 23])
+    assert (metrics["frames_train"], metrics["frames_validation"], metrics["frames_heldout"]) == (18, 3, 4)
+    assert metrics["dropped_duplicates"] == 0
+
+
+def test_a_split_with_more_frames_than_may_be_kept_is_refused(tmp_path):
+    folder = write_split(draw_recording(tmp_path / "in", n=40), range(30), [35])
+    with pytest.raises(UserError, match=r"lists 31 frames, frames.max_frames is 20; .* --set frames.max_frames=31"):
+        run(folder, tmp_path / "out", max_frames=20)
+
+
+def test_a_split_whose_heldout_frames_show_nobody_is_refused(tmp_path):
+    folder = write_split(draw_recording(tmp_path / "in", n=40), range(30), [35])
+    write_gray(folder / "masks" / "35.png", np.zeros((96, 128), np.uint8))
+    with pytest.raises(UserError, match="no person was found in any frame of one kind"):
+        run(folder, tmp_path / "out")
 
 
 def test_large_images_are_stored_smaller_and_the_camera_with_them(tmp_path):
