@@ -1,5 +1,6 @@
 """The last stage: held-out frames against renders of the field and of the exported mesh, figures, charts, a page."""
 
+import math
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,7 +15,7 @@ from torch import Tensor
 from pipeline.avatar.body import canonical_to_world
 from pipeline.avatar.mesh_views import crop_view
 from pipeline.avatar.pose_fit import PERSON_HEIGHT_PX, fit_poses
-from pipeline.avatar.selection import HELDOUT
+from pipeline.avatar.selection import HELDOUT, TRAIN
 from pipeline.core.cli import main
 from pipeline.core.config import Config as BaseConfig
 from pipeline.core.errors import UserError
@@ -22,6 +23,7 @@ from pipeline.core.manifest import Manifest, read_manifest
 from pipeline.core.measure import environment, peak_rss_mib
 from pipeline.core.progress import track
 from pipeline.core.stage import Stage
+from pipeline.geometry.textured import soften_outline
 from pipeline.io.avatar import FinishedRun, load_finished_run
 from pipeline.io.image import read_rgb, to_uint8, write_rgb
 from pipeline.io.lpips_weights import find_lpips_weights
@@ -29,7 +31,14 @@ from pipeline.io.report_json import build_report, finite, report_text
 from pipeline.io.report_page import FramePictures, PageContent, error_map, render_page
 from pipeline.io.sheet import on_white_8bit, picture_sheet
 from pipeline.metrics.health import mesh_health
-from pipeline.metrics.images import body_box, body_pixels, frame_scores, on_white, premultiplied_on_white
+from pipeline.metrics.images import (
+    body_box,
+    body_pixels,
+    edge_spread_px,
+    frame_scores,
+    on_white,
+    premultiplied_on_white,
+)
 
 NEEDS = ("frames", "body", "field", "mesh", "texture", "export")
 PICTURES = (
@@ -39,6 +48,9 @@ PICTURES = (
     ("mesh", "preview.png", "Mesh"),
 )
 CROP_MARGIN_PX = 12
+SPREAD_FRAMES = 16
+PIXEL_SPREAD_PX = math.sqrt(1.0 / 12.0)
+"""Standard deviation of a square pixel: what a sharp outline is blurred by in any picture."""
 
 
 class Config(BaseConfig):
@@ -72,7 +84,8 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
             f"{inputs['frames']} holds no frame whose index is divisible by eight, so nothing can be scored: "
             "film longer, or choose more frames"
         )
-    rows, pictures = score(loaded, positions, config)
+    spread_px = outline_spread_px(loaded)
+    rows, pictures = score(loaded, positions, spread_px, config)
     turntable = draw_turntable(loaded, int(positions[len(positions) // 2]), config)
     write_rgb(out / "turntable.jpg", picture_sheet([[on_white_8bit(view) for view in views] for _, views in turntable]))
     write_rgb(out / "heldout.jpg", picture_sheet([_strip(frame) for frame in pictures]))
@@ -80,7 +93,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     figures: dict[str, Mapping[str, float | int | bool]] = {
         "mesh": mesh_health(loaded.avatar.mesh()),
         "export": {"glb_bytes": len(glb), "texture_px": len(loaded.avatar.diffuse)},
-        "masks": {"count": len(loaded.capture)},
+        "masks": {"count": len(loaded.capture), "edge_spread_px": spread_px},
     }
     cost = (time.monotonic() - started, peak_rss_mib())
     report = finite(build_report(manifests, rows, figures, environment(), cost))
@@ -103,17 +116,34 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     }
 
 
+def outline_spread_px(loaded: FinishedRun) -> float:
+    """How soft the capture's outlines are: the median over some of the frames that are not scored."""
+    others = loaded.capture.positions(TRAIN)
+    some = others[:: max(1, len(others) // SPREAD_FRAMES)]
+    spreads = [edge_spread_px(to_uint8(loaded.capture.mask(position))) for position in some.tolist()]
+    return float(np.median(spreads)) if spreads else PIXEL_SPREAD_PX
+
+
 def score(
-    loaded: FinishedRun, positions: np.ndarray, config: Config
+    loaded: FinishedRun, positions: np.ndarray, spread_px: float, config: Config
 ) -> tuple[list[dict[str, Any]], list[FramePictures]]:
-    """Scores of every held-out frame by render, and the pictures of some of them."""
+    """Scores of every held-out frame by render, and the pictures of some of them.
+
+    The mesh is drawn with outlines as soft as the capture's (`spread_px`), as the field has learnt them; the row
+    `mesh_sharp` is the mesh as square pixels give it.
+    """
+    blur_px = math.sqrt(max(0.0, spread_px**2 - PIXEL_SPREAD_PX**2))
+
+    def draw_sharp(pose: Float[Tensor, "j 4 4"]) -> Float[np.ndarray, "h w 4"]:
+        return loaded.avatar.render(loaded.avatar.posed(pose), loaded.camera, config.samples)
 
     def draw_mesh(pose: Float[Tensor, "j 4 4"]) -> Float[np.ndarray, "h w 4"]:
-        return loaded.avatar.render(loaded.avatar.posed(pose), loaded.camera, config.samples)
+        return soften_outline(draw_sharp(pose), blur_px)
 
     draws = {
         "field": (loaded.draw_field, loaded.refined),
         "mesh": (draw_mesh, loaded.refined),
+        "mesh_sharp": (draw_sharp, loaded.refined),
     }
     if config.unrefined:
         draws["mesh_unrefined"] = (draw_mesh, loaded.fitted)
@@ -190,7 +220,7 @@ def _manifest(folder: Path) -> Manifest:
 
 STAGE = Stage(
     name="report",
-    version=2,
+    version=3,
     needs=NEEDS,
     makes=("report.json", "index.html", "turntable.jpg", "heldout.jpg"),
     config=Config,

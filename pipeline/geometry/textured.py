@@ -2,6 +2,7 @@
 
 import math
 
+import cv2
 import numpy as np
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -43,6 +44,28 @@ def render_textured(
     vertices_px, depth_m = project(vertices_world, fine)
     face_id, barycentric, _ = rasterize(vertices_px, depth_m, faces, fine.height, fine.width)
     return shade_texture(face_id, barycentric, faces_uv, uv, texture, samples)
+
+
+def soften_outline(
+    premultiplied: Float[np.ndarray, "h w channels"], spread_px: float
+) -> Float[np.ndarray, "h w channels"]:
+    """The picture with the coverage in its last channel blurred, as by a lens and a mask that are not sharp.
+
+    Colours are not blurred where the surface covers a pixel: a texture made from pictures has their blur already. Where
+    it covers none they are carried outward.
+
+    Args:
+        spread_px: standard deviation of the Gaussian.
+    """
+    if spread_px <= 0.0:
+        return premultiplied
+    size = 2 * math.ceil(4.0 * spread_px) + 1
+    blurred = cv2.GaussianBlur(premultiplied, (size, size), spread_px, borderType=cv2.BORDER_REPLICATE)
+    coverage, softened = premultiplied[..., -1:], blurred[..., -1:]
+    carried = blurred[..., :-1] / np.maximum(softened, 1e-6)
+    own = premultiplied[..., :-1] / np.maximum(coverage, 1e-6)
+    colour = np.where(coverage > 0.5, own, carried)
+    return np.concatenate([colour * softened, softened], axis=2)
 
 
 def turntable_camera(

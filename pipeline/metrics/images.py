@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
+from skimage.measure import perimeter_crofton
 from torch import Tensor
 
 from pipeline.metrics.flip import flip_map
@@ -93,6 +94,17 @@ def ssim(
             raise ValueError("no window to compare")
         similarity = similarity[middles]
     return float(np.mean(similarity))
+
+
+def edge_spread_px(alpha: UInt8[np.ndarray, "h w"]) -> float:
+    """How soft a mask's outline is: standard deviation in pixels of the blur that would make it from a step.
+
+    Across an edge with that profile, a Gaussian's, alpha (1 - alpha) integrates to spread / sqrt(pi); the length of the
+    outline is Crofton's. A sharp outline seen by square pixels has 0.29; a mask without outline has 0.
+    """
+    opacity = alpha.astype(np.float64) / 255.0
+    length_px = perimeter_crofton(alpha >= 128, directions=4)
+    return math.sqrt(math.pi) * float((opacity * (1.0 - opacity)).sum()) / length_px if length_px > 0.0 else 0.0
 
 
 def mask_iou(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"]) -> float:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from pipeline.geometry.camera import Camera, project
-from pipeline.geometry.textured import render_textured, sample_texture, turntable_camera
+from pipeline.geometry.textured import render_textured, sample_texture, soften_outline, turntable_camera
 
 SQUARE = torch.tensor([[-1.0, -1.0, -2.0], [1.0, -1.0, -2.0], [1.0, 1.0, -2.0], [-1.0, 1.0, -2.0]])
 FACES = torch.tensor([[0, 1, 2], [0, 2, 3]], dtype=torch.int32)
@@ -86,3 +86,21 @@ def test_turntable_starts_at_the_front_and_goes_to_the_left_hand():
     lowest, highest = np.zeros(3), np.ones(3)
     assert turntable_camera(lowest, highest, 0.0, 9, 9).centre_m()[2] > 5
     assert turntable_camera(lowest, highest, math.pi / 2, 9, 9).centre_m()[0] > 5
+
+
+def test_a_softened_outline_has_the_blur_and_the_colours_of_the_surface():
+    picture = np.zeros((40, 60, 4), dtype=np.float32)
+    picture[:, :30] = [0.2, 0.4, 0.6, 1.0]
+    picture[20:, :30, 0] = 0.9
+    soft = soften_outline(picture, 1.2)
+    step = 0.5 * (1 - np.array([math.erf((x + 0.5 - 30) / (1.2 * 2**0.5)) for x in range(60)]))
+    np.testing.assert_allclose(soft[5, :, 3], step, atol=0.02)
+    covered = soft[..., 3] > 0.01
+    np.testing.assert_allclose(soft[..., 1][covered] / soft[..., 3][covered], 0.4, atol=1e-4)
+    # The edge between two colours inside the surface is not the outline and stays sharp.
+    np.testing.assert_allclose(soft[19:21, 10, 0], [0.2, 0.9], atol=1e-4)
+
+
+def test_no_blur_changes_nothing():
+    picture = np.random.default_rng(0).random((9, 9, 4)).astype(np.float32)
+    assert soften_outline(picture, 0.0) is picture

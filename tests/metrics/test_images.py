@@ -2,6 +2,7 @@
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 from skimage.metrics import structural_similarity
@@ -9,6 +10,7 @@ from skimage.metrics import structural_similarity
 from pipeline.metrics.images import (
     body_box,
     body_pixels,
+    edge_spread_px,
     frame_scores,
     mask_iou,
     mean_scores,
@@ -141,3 +143,17 @@ def test_mean_scores():
     assert mean_scores([{"a": 1.0, "b": 2.0}, {"a": 3.0, "b": 4.0}]) == {"a": 2.0, "b": 3.0}
     with pytest.raises(ValueError, match="no frame"):
         mean_scores([])
+
+
+@pytest.mark.parametrize("sigma_px", [0.0, 0.7, 1.5])
+def test_edge_spread_is_that_of_the_blur(sigma_px):
+    rows, columns = np.mgrid[:1200, :1200] / 4.0
+    disc = (np.hypot(rows - 149.3, columns - 151.1) < 90.2).astype(np.float32)
+    square_pixels = disc.reshape(300, 4, 300, 4).mean((1, 3))
+    soft = square_pixels if sigma_px == 0.0 else cv2.GaussianBlur(square_pixels, (0, 0), sigma_px)
+    spread_px = edge_spread_px(np.rint(255 * soft).astype(np.uint8))
+    assert spread_px == pytest.approx(np.hypot(sigma_px, 12**-0.5), rel=0.04)
+
+
+def test_a_mask_without_outline_has_no_edge_spread():
+    assert edge_spread_px(np.zeros((20, 20), dtype=np.uint8)) == 0.0

@@ -73,6 +73,14 @@ def test_poses_without_refinement_score_worse(report: dict):
     assert heldout["mesh_unrefined"]["psnr_body"] < heldout["mesh"]["psnr_body"] - 1
 
 
+def test_the_mesh_is_drawn_with_the_softness_of_the_masks(report: dict):
+    # The painted masks are antialiased by square pixels: nothing is left to soften.
+    assert report["masks"]["edge_spread_px"] == pytest.approx(12**-0.5, abs=0.08)
+    assert report["heldout"]["mesh_sharp"]["psnr_full"] == pytest.approx(
+        report["heldout"]["mesh"]["psnr_full"], abs=0.3
+    )
+
+
 def test_the_field_without_refinement_is_scored_only_on_request(report: dict):
     assert "field_unrefined" not in report["heldout"]
     assert "mesh_unrefined" in report["heldout"]["frames"][0]
