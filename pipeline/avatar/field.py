@@ -38,9 +38,10 @@ class _Decode(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, features: Tensor, hidden: Tensor, output: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
-        raw = features.new_empty(len(features), 4)
-        for part, into in zip(features.split(ROWS), raw.split(ROWS), strict=True):
-            torch.addmm(bias, (part @ hidden).clamp_(min=0), output, out=into)
+        raw = features.new_empty(4, len(features))
+        for part, into in zip(features.split(ROWS), raw.split(ROWS, dim=1), strict=True):
+            torch.mm(output.T, (part @ hidden).clamp_(min=0).T, out=into)
+        raw = raw.T + bias
         colour = torch.sigmoid(raw[:, :3])
         density = START_DENSITY_PER_M * torch.exp(DENSITY_GAIN * raw[:, 3].clamp(-LIMIT, LIMIT))
         ctx.save_for_backward(features, hidden, output, colour, density)
@@ -57,7 +58,7 @@ class _Decode(torch.autograd.Function):
         parts = (features.split(ROWS), raw_gradient.split(ROWS), features_gradient.split(ROWS))
         for part, towards, into in zip(*parts, strict=True):
             activation = (part @ hidden).clamp_(min=0)
-            output_gradient.addmm_(activation.T, towards)
+            output_gradient.T.addmm_(towards.T, activation)
             passed = (towards @ output.T).mul_(activation.sign_())
             hidden_gradient.addmm_(part.T, passed)
             torch.mm(passed, hidden.T, out=into)

@@ -64,6 +64,7 @@ class FieldConfig(Config):
 
     pose_refinement: bool = Option(True, description="learn small corrections of the poses")
     pose_start: float = Option(0.2, ge=0, le=1, description="part of the steps after which poses are refined")
+    pose_every: int = Option(4, ge=1, description="steps between two in which poses move, once they do")
     pose_rate: float = Option(3e-3, gt=0, description="learning rate of the poses, rad (shifts: a third of it, m)")
     pose_smoothness: float = Option(0.02, ge=0, description="weight of the change of corrections from frame to frame")
     pose_size: float = Option(0.002, ge=0, description="weight of the size of corrections")

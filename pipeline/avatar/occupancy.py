@@ -34,6 +34,13 @@ class Occupancy:
     occupied: UInt8[Tensor, "gx gy gz"]
     bounds_m: Float[Tensor, "2 3"]
 
+    def boxes_m(self) -> Float[np.ndarray, "b 2 3"]:
+        """Low and high corner (m) of each occupied cell."""
+        low, high = self.bounds_m.numpy()
+        cell_m = (high - low) / np.array(self.occupied.shape, dtype=np.float32)
+        index = np.argwhere(self.occupied.numpy() != 0).astype(np.float32)
+        return low + np.stack([index, index + 1], axis=1) * cell_m
+
     def contains(self, points_m: Float[Tensor, "n 3"]) -> Tensor:
         """True for each canonical point in an occupied cell."""
         size = torch.tensor(self.occupied.shape, device=points_m.device)

@@ -78,6 +78,7 @@ class Learning:
         self.parameters = parameters
         self.moments = {name: (torch.zeros_like(p), torch.zeros_like(p)) for name, p in parameters.items()}
         self.baked_rotation_rad, self.baked_shift_m = torch.zeros(()), torch.zeros(())
+        self.skin = scene.skin
         self._bake()
 
     def _bake(self) -> None:
@@ -90,10 +91,19 @@ class Learning:
             self.posed_from_world = posed_from_world(canonical_to_world)
             self.warps = bake_motion(self.scene.skin, self.posed_from_world[:, None] @ canonical_to_world)
 
+    def _follow_occupancy(self) -> None:
+        """Blend skinning only where samples can lie: a fifth of the nodes, and of the memory that a step touches."""
+        self.skin = self.scene.skin.around(self.occupancy.grid().boxes_m()) if self.refines_poses else self.scene.skin
+
     @property
     def refines_poses(self) -> bool:
         """True once the poses take part in the learning."""
         return self.config.pose_refinement and self.done >= self.config.pose_start * self.config.steps
+
+    @property
+    def moves_poses(self) -> bool:
+        """True in steps that change poses; in the others the field alone learns, at half of the cost."""
+        return self.refines_poses and self.done % self.config.pose_every == 0
 
     def _random(self) -> np.random.Generator:
         return np.random.Generator(np.random.Philox(key=[self.config.seed, self.done]))
@@ -121,14 +131,18 @@ class Learning:
         """Canonical positions of the samples: as looked up, or exact and differentiable once poses are refined."""
         if not self.refines_poses:
             return samples.canonical_m
+        with torch.set_grad_enabled(self.moves_poses):
+            return self._follow_poses(batch, samples)
+
+    def _follow_poses(self, batch: Batch, samples: Samples) -> Float[Tensor, "s 3"]:
         to_world = self.poses.canonical_to_world(batch.frames)
-        blended = self.scene.skin.blend(self.posed_from_world[batch.frames][:, None] @ to_world)
+        blended = self.skin.blend(self.posed_from_world[batch.frames][:, None] @ to_world)
         counts = samples.ray_start.diff()
         ray = torch.repeat_interleave(torch.arange(len(counts)), counts)
         posed = batch.origins_m[ray] + samples.distance_m[:, None] * batch.directions[ray]
         slots = torch.arange(len(batch.frames) + 1)
         slot_start = samples.ray_start[torch.searchsorted(batch.slot, slots)]
-        return newton(blended, samples.canonical_m, posed, slot_start, self.scene.skin)
+        return newton(blended, samples.canonical_m, posed, slot_start, self.skin)
 
     def _empty_points(self, random: np.random.Generator) -> Float[Tensor, "e 3"]:
         """Random points of the box that lie in empty cells."""
@@ -163,7 +177,7 @@ class Learning:
         image, alpha, weights = composite(density[:count], channels, step_m, samples.ray_start)
         losses = field_losses(image, alpha, density[count:], batch.rgba, batch.background, config)
         total = torch.stack(list(losses.values())).sum()
-        if self.refines_poses:
+        if self.moves_poses:
             total = total + config.pose_smoothness * self.poses.roughness() + config.pose_size * self.poses.size()
         total.backward()
         self._update_parameters(bool(torch.isfinite(total)))
@@ -171,6 +185,7 @@ class Learning:
         self.done += 1
         if self.done % config.occupancy_every == 0 and self.done >= config.occupancy_start:
             self.occupancy.update(self.field.density, self.step_m, config.occupancy_threshold, random)
+            self._follow_occupancy()
         return {name: float(loss.detach()) for name, loss in losses.items()} | {"samples": float(count)}
 
     def _rate(self) -> float:
@@ -196,9 +211,14 @@ class Learning:
                 gradient.zero_()
                 continue
             is_pose = name in ("rotation_rad", "shift_m")
-            begun = round(config.pose_start * config.steps) if is_pose else 0
+            if is_pose and not self.moves_poses:
+                continue
+            updates = self.done + 1
+            if is_pose:
+                begun = math.ceil(config.pose_start * config.steps / config.pose_every)
+                updates = self.done // config.pose_every - begun + 1
             rate = rates.get(name, config.network_rate) * (self._pose_rate() if is_pose else self._rate())
-            adam_step_(parameter, gradient, *self.moments[name], self.done - begun + 1, rate, epsilon=1e-15)
+            adam_step_(parameter, gradient, *self.moments[name], updates, rate, epsilon=1e-15)
 
     def state(self) -> dict[str, Tensor]:
         """Everything that a resumed run needs."""
@@ -223,6 +243,7 @@ class Learning:
         prefix = "occupancy."
         kept = {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
         self.occupancy.load_state(kept)
+        self._follow_occupancy()
 
 
 def training_step_m(height_m: float, config: FieldConfig) -> float:

@@ -87,6 +87,13 @@ def forward(features: int):
     return encode
 
 
+@njit(**_OPTIONS)
+def _level_of_turn(turn, levels):
+    """0, 2, 4, ... and then 1, 3, 5, ...: two threads that take half of the turns each get coarse and fine levels."""
+    even = (levels + 1) // 2
+    return 2 * turn if turn < even else 2 * (turn - even) + 1
+
+
 @cache
 def backward_table(features: int):
     """(points (n, 3), plan (l, 6), gradient (n, l*f), table_gradient (rows, f)) -> None; adds to `table_gradient`."""
@@ -104,7 +111,9 @@ def backward_table(features: int):
     @njit(parallel=True, **_OPTIONS)
     def scatter(points, plan, gradient, table_gradient):
         count = points.shape[0]
-        for level in prange(plan.shape[0]):
+        levels = plan.shape[0]
+        for turn in prange(levels):
+            level = _level_of_turn(turn, levels)
             rows = np.empty((8, BLOCK), np.uint32)
             weights = np.empty((8, BLOCK), np.float32)
             parts = np.empty((3, BLOCK), np.float32)

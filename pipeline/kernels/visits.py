@@ -29,6 +29,8 @@ def record_visits(
 
 def light_before(weight: Float[Tensor, "s"], ray_start: Int[Tensor, "m"]) -> Float[Tensor, "s"]:
     """Light in [0, 1] that reached each sample: what the samples before it on its ray have left."""
-    before = weight.detach().double().cumsum(0) - weight
-    first = torch.repeat_interleave(ray_start[:-1], ray_start.diff())
-    return (1 - (before - before[first])).clamp(0, 1).to(weight.dtype)
+    if not runs_on_numba(weight):
+        return reference.light_before(weight.detach(), ray_start)
+    light = torch.empty_like(weight)
+    visits_cpu.light_before(weight.detach().numpy(), ray_start.numpy(), light.numpy())
+    return light

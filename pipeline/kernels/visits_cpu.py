@@ -1,10 +1,22 @@
-"""Compiled loop that notes the largest values in each voxel; one thread, so that there is nothing to race for."""
+"""Compiled loops that note what rays saw. Voxels are written by one thread, so that there is nothing to race for."""
 
 import numpy as np
-from numba import njit
+from numba import njit, prange
+
+_OPTIONS = {"cache": True, "fastmath": {"arcp", "nsz"}, "error_model": "numpy"}
 
 
-@njit(cache=True, fastmath={"arcp", "nsz"}, error_model="numpy")
+@njit(parallel=True, **_OPTIONS)
+def light_before(weight, ray_start, light):
+    """Fill `light`: see `pipeline.kernels.visits.light_before`."""
+    for ray in prange(ray_start.shape[0] - 1):
+        left = np.float32(1)
+        for s in range(ray_start[ray], ray_start[ray + 1]):
+            light[s] = max(left, np.float32(0))
+            left -= weight[s]
+
+
+@njit(**_OPTIONS)
 def record(points, light, weight, bounds, shape, reached, gave):
     """See `pipeline.kernels.visits.record_visits`."""
     scale_x = np.float32(shape[0]) / (bounds[1, 0] - bounds[0, 0])

@@ -33,11 +33,28 @@ class SkinGrid:
     distance_m: Float[np.ndarray, "m"]
     weights: Float[Tensor, "m j"]
 
-    def blend(self, canonical_to_posed: Float[Tensor, "k j 4 4"]) -> Float[Tensor, "k m 12"]:
-        """The blended skinning matrix (rows of its upper 3x4 part) at every node."""
+    def blend(self, canonical_to_posed: Float[Tensor, "k j 4 4"]) -> Float[Tensor, "m k 12"]:
+        """The blended skinning matrix (rows of its upper 3x4 part) at every node: one product for all frames."""
         count, joints = canonical_to_posed.shape[:2]
-        flat = canonical_to_posed[:, :, :3].reshape(count, joints, 12)
-        return torch.matmul(self.weights.to(flat), flat)
+        flat = canonical_to_posed[:, :, :3].transpose(0, 1).reshape(joints, count * 12)
+        return torch.matmul(self.weights.to(flat), flat).view(-1, count, 12)
+
+    def around(self, boxes_m: Float[np.ndarray, "b 2 3"]) -> "SkinGrid":
+        """The same grid without the nodes that no point of the boxes (low and high corners, m) is interpolated from."""
+        size = np.array(self.row_of_node.shape)
+        cells = (boxes_m - self.origin_m) / self.cell_m
+        low = np.clip(np.floor(cells[:, 0]), 0, size - 1).astype(np.int64)
+        count = np.clip(np.floor(cells[:, 1]) + 2, 1, size).astype(np.int64) - low
+        wanted = np.zeros(self.row_of_node.shape, dtype=bool)
+        for offset in np.ndindex(*count.max(0)):
+            covered = (np.array(offset) < count).all(1)
+            wanted[tuple((low[covered] + offset).T)] = True
+        rows = self.row_of_node[wanted & (self.row_of_node >= 0)]
+        row_of_node = np.full(self.row_of_node.shape, -1, dtype=np.int32)
+        row_of_node[wanted & (self.row_of_node >= 0)] = np.arange(len(rows))
+        return SkinGrid(
+            self.origin_m, self.cell_m, row_of_node, self.nodes_m[rows], self.distance_m[rows], self.weights[rows]
+        )
 
     def weights_at(self, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "n j"]:
         """Skin weights of canonical points; outside the grid, those of the nearest node that exists."""
@@ -62,7 +79,7 @@ class WarpGrid:
 
 def bake(skin: SkinGrid, canonical_to_posed: Float[Tensor, "j 4 4"]) -> WarpGrid:
     """Invert the skinning of one frame. Runs on the CPU and without the GIL: threads may bake different frames."""
-    blended = skin.blend(canonical_to_posed.detach().float().cpu()[None])[0].numpy()
+    blended = skin.blend(canonical_to_posed.detach().float().cpu()[None]).numpy()
     posed, box = warp_cpu.carry_nodes(skin.nodes_m, blended)
     cell = np.float32(skin.cell_m)
     origin = (np.floor(box[0] / cell) * cell).astype(np.float32)
@@ -76,7 +93,7 @@ def bake(skin: SkinGrid, canonical_to_posed: Float[Tensor, "j 4 4"]) -> WarpGrid
 class _Newton(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, blended: Tensor, start: Tensor, posed: Tensor, slot_start: Tensor, skin: SkinGrid) -> Tensor:
-        slot = torch.repeat_interleave(torch.arange(len(blended)), slot_start.diff())
+        slot = torch.repeat_interleave(torch.arange(blended.shape[1]), slot_start.diff())
         refined = torch.empty_like(start)
         grid = (skin.origin_m, np.float32(skin.cell_m), skin.row_of_node)
         warp_cpu.refine(posed.numpy(), start.numpy(), slot.numpy(), *grid, blended.detach().numpy(), refined.numpy())
@@ -96,7 +113,7 @@ class _Newton(torch.autograd.Function):
 
 
 def newton(
-    blended: Float[Tensor, "k m 12"],
+    blended: Float[Tensor, "m k 12"],
     start_m: Float[Tensor, "s 3"],
     posed_m: Float[Tensor, "s 3"],
     slot_start: Int[Tensor, "k1"],

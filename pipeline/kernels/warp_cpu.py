@@ -5,7 +5,7 @@ between the nodes of the skin grid. Inverse, x(p) solves A(x) x = p: Newton's me
 J = A_3x3 + sum_corners (A_corner x) grad(weight_corner)^T.
 
 Grid arguments, everywhere: origin (3), cell (m), row_of_node (gx, gy, gz) int32 with -1 where the grid has no node,
-blended (m, 12), the rows of A (3, 4) at the nodes that exist.
+blended (m, k, 12), the rows of A (3, 4) at the nodes that exist, for each of k frames.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ BLOCK = 256
 
 
 @njit(**_OPTIONS)
-def skin(x, y, z, origin, cell, row_of_node, blended):
+def skin(x, y, z, frame, origin, cell, row_of_node, blended):
     """Posed position of a canonical point and the Jacobian, as 13 numbers: inside, position, J by rows."""
     inverse = _ONE / cell
     gx, gy, gz = (x - origin[0]) * inverse, (y - origin[1]) * inverse, (z - origin[2]) * inverse
@@ -38,7 +38,7 @@ def skin(x, y, z, origin, cell, row_of_node, blended):
             wx, dx = (u, inverse) if a == 1 else (_ONE - u, -inverse)
             wy, dy = (v, inverse) if b == 1 else (_ONE - v, -inverse)
             wz, dz = (w, inverse) if c == 1 else (_ONE - w, -inverse)
-            m = blended[row]
+            m = blended[row, frame]
             qx = m[0] * x + m[1] * y + m[2] * z + m[3]
             qy = m[4] * x + m[5] * y + m[6] * z + m[7]
             qz = m[8] * x + m[9] * y + m[10] * z + m[11]
@@ -88,7 +88,7 @@ def _newton(px, py, pz, x, y, z, iterations, tolerance, origin, cell, row_of_nod
     """Solve A(x) x = p from a start; fills the inverse Jacobian (9). Returns converged, x, y, z, squared residual."""
     squared = np.float32(1e9)
     for iteration in range(iterations + 1):
-        inside, qx, qy, qz, a, b, c, d, e, f, g, h, k = skin(x, y, z, origin, cell, row_of_node, blended)
+        inside, qx, qy, qz, a, b, c, d, e, f, g, h, k = skin(x, y, z, 0, origin, cell, row_of_node, blended)
         if not inside:
             return False, x, y, z, squared
         sound, a, b, c, d, e, f, g, h, k = invert(a, b, c, d, e, f, g, h, k)
@@ -116,7 +116,7 @@ def carry_nodes(nodes, blended):
     box[0], box[1] = np.float32(1e9), np.float32(-1e9)
     for row in range(nodes.shape[0]):
         x, y, z = nodes[row, 0], nodes[row, 1], nodes[row, 2]
-        m = blended[row]
+        m = blended[row, 0]
         for axis in range(3):
             value = m[4 * axis] * x + m[4 * axis + 1] * y + m[4 * axis + 2] * z + m[4 * axis + 3]
             posed[row, axis] = value
@@ -158,7 +158,7 @@ def _solve_nodes(row_of, nodes, posed, posed_origin, dims, origin, cell, row_of_
         px = posed_origin[0] + np.float32(node // (dims[1] * dims[2])) * cell
         py = posed_origin[1] + np.float32(node // dims[2] % dims[1]) * cell
         pz = posed_origin[2] + np.float32(node % dims[2]) * cell
-        m = blended[row]
+        m = blended[row, 0]
         sound, a, b, c, d, e, f, g, h, k = invert(m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10])
         rx, ry, rz = px - posed[row, 0], py - posed[row, 1], pz - posed[row, 2]
         x = nodes[row, 0] + a * rx + b * ry + c * rz
@@ -302,13 +302,13 @@ def bake(nodes, posed, distance, posed_origin, dims, origin, cell, row_of_node, 
 def refine(points_posed, start, slot, origin, cell, row_of_node, blended, refined):
     """One Newton step for each point (s, 3) from its start; the start itself where a step is not possible.
 
-    blended has a leading axis of frames, and slot (s) says which one a point belongs to.
+    slot (s) says which frame of `blended` a point belongs to.
     """
     count = points_posed.shape[0]
     for block in prange((count + BLOCK - 1) // BLOCK):
         for s in range(block * BLOCK, min(block * BLOCK + BLOCK, count)):
             x, y, z = start[s, 0], start[s, 1], start[s, 2]
-            inside, qx, qy, qz, a, b, c, d, e, f, g, h, k = skin(x, y, z, origin, cell, row_of_node, blended[slot[s]])
+            inside, qx, qy, qz, a, b, c, d, e, f, g, h, k = skin(x, y, z, slot[s], origin, cell, row_of_node, blended)
             sound, a, b, c, d, e, f, g, h, k = invert(a, b, c, d, e, f, g, h, k)
             if inside and sound:
                 rx, ry, rz = points_posed[s, 0] - qx, points_posed[s, 1] - qy, points_posed[s, 2] - qz
@@ -318,7 +318,7 @@ def refine(points_posed, start, slot, origin, cell, row_of_node, blended, refine
 
 @njit(parallel=True, **_OPTIONS)
 def pose_gradient(points, gradient, slot_start, origin, cell, row_of_node, blended, blended_gradient):
-    """Add dL/dA (frames, m, 12) for dL/dx = gradient at the solutions x of A(x) x = p: dL/d(A x) = -J^-T dL/dx.
+    """Add dL/dA (m, frames, 12) for dL/dx = gradient at the solutions x of A(x) x = p: dL/d(A x) = -J^-T dL/dx.
 
     The samples of frame f are slot_start[f] : slot_start[f + 1]; a thread owns whole frames.
     """
@@ -329,7 +329,7 @@ def pose_gradient(points, gradient, slot_start, origin, cell, row_of_node, blend
             gx, gy, gz = gradient[s, 0], gradient[s, 1], gradient[s, 2]
             if gx == _ZERO and gy == _ZERO and gz == _ZERO:
                 continue
-            inside, _, _, _, a, b, c, d, e, f, g, h, k = skin(x, y, z, origin, cell, row_of_node, blended[frame])
+            inside, _, _, _, a, b, c, d, e, f, g, h, k = skin(x, y, z, frame, origin, cell, row_of_node, blended)
             sound, a, b, c, d, e, f, g, h, k = invert(a, b, c, d, e, f, g, h, k)
             if not inside or not sound:
                 continue
@@ -340,7 +340,7 @@ def pose_gradient(points, gradient, slot_start, origin, cell, row_of_node, blend
             for corner in range(8):
                 p, q, r = corner & 1, (corner >> 1) & 1, corner >> 2
                 weight = (ui if p == 1 else _ONE - ui) * (uj if q == 1 else _ONE - uj) * (uk if r == 1 else _ONE - uk)
-                target = blended_gradient[frame, row_of_node[i + p, j + q, m + r]]
+                target = blended_gradient[row_of_node[i + p, j + q, m + r], frame]
                 wx, wy, wz = weight * lx, weight * ly, weight * lz
                 target[0] += wx * x
                 target[1] += wx * y

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.avatar.occupancy import RESOLUTION, OccupancyUpdate, VoxelAttention, cell_centres
+from pipeline.avatar.occupancy import RESOLUTION, Occupancy, OccupancyUpdate, VoxelAttention, cell_centres
 from pipeline.avatar.support import starting_shell
 
 BOUNDS = np.array([[-1.0, -1, -1], [1, 1, 1]], dtype=np.float32)
@@ -87,3 +87,13 @@ def test_starting_shell_needs_mask_support_outside_the_body_only():
     distance = np.array([-0.1, 0.05, 0.05, 0.2])
     frequency = np.array([0.0, 0.9, 0.3, 1.0])
     assert starting_shell(distance, frequency, 0.1, 0.6).tolist() == [True, True, False, False]
+
+
+def test_boxes_are_those_of_the_occupied_cells():
+    occupied = torch.zeros(4, 5, 6, dtype=torch.uint8)
+    occupied[1, 2, 3] = occupied[3, 4, 5] = 1
+    grid = Occupancy(occupied, torch.tensor([[-1.0, 0, 2], [1, 5, 5]]))
+    boxes = torch.from_numpy(grid.boxes_m())
+    torch.testing.assert_close(boxes[0], torch.tensor([[-0.5, 2, 3.5], [0, 3, 4]]))
+    torch.testing.assert_close(boxes[1, 1], torch.tensor([1.0, 5, 5]))
+    assert grid.contains(boxes.mean(1)).all()

@@ -7,6 +7,7 @@ from pipeline.avatar.field_config import FieldConfig
 from pipeline.avatar.prepare import spread, start_learning, training_scale
 from pipeline.avatar.render import over_white, render_field
 from pipeline.avatar.train import DivergedError
+from pipeline.kernels.march import march
 from tests.avatar.scene import painted_scene
 
 TRAIN = np.array([0, 1, 3, 4, 6, 7, 9, 10])
@@ -64,7 +65,9 @@ def test_refinement_finds_a_shift_of_the_body(scene):
     root = scene.motion.root_translation_m.copy()
     root[4] = moved.root_translation_m[4]
     motion = scene.motion.with_pose(scene.motion.rotations_wxyz, root).select(TRAIN)
-    config = FieldConfig(**TINY, steps=160, pose_start=0.35, pose_rate=6e-3, pose_smoothness=0.0, pose_size=0.0)
+    config = FieldConfig(
+        **TINY, steps=160, pose_start=0.35, pose_rate=6e-3, pose_smoothness=0.0, pose_size=0.0, pose_every=1
+    )
     learning = start_learning(scene.body, motion, scene.camera, pictures, config)
     for _ in range(160):
         learning.step()
@@ -89,6 +92,31 @@ def test_a_resumed_run_ends_with_the_same_bytes(scene, occupancy):
         second.step()
     for name, value in whole.state().items():
         assert torch.equal(value, second.state()[name]), name
+
+
+def test_poses_move_now_and_then_and_samples_follow_them_always(scene):
+    learning = begin(scene, steps=40, pose_start=0.25, pose_every=4, occupancy_start=8)
+    moved = []
+    for _ in range(20):
+        before = learning.poses.shift_m.detach().clone()
+        learning.step()
+        moved.append(not torch.equal(before, learning.poses.shift_m.detach()))
+    assert [step for step, there in enumerate(moved) if there] == [12, 16]
+    assert 0 < len(learning.skin.nodes_m) < len(learning.scene.skin.nodes_m)
+    batch = learning._draw(np.random.default_rng(0))
+    samples = march_of(learning, batch)
+    with torch.no_grad():
+        still = learning._place(batch, samples)
+        learning.poses.shift_m += 0.01
+        there = learning._place(batch, samples)
+    assert float((there - still).detach().norm(dim=1).median()) == pytest.approx(0.01 * 3**0.5, rel=0.3)
+
+
+def march_of(learning, batch):
+    grid = learning.occupancy.grid()
+    frames = batch.frames[batch.slot]
+    rays = (batch.origins_m, batch.directions, frames, batch.jitter)
+    return march(*rays, learning.step_m, learning.warps, grid.occupied, grid.bounds_m)
 
 
 def test_a_nan_never_reaches_a_parameter(scene):

@@ -36,7 +36,7 @@ def test_grid_carries_the_surface_as_the_bodys_own_weights_do(body, skin):
     matrices = canonical_to_world(body, motion)
     vertices = torch.from_numpy(body.vertices)
     truth = linear_blend_skinning(vertices, torch.from_numpy(body.skin_weights), matrices)[1]
-    ours = skin_points(vertices, skin.blend(matrices[1:])[0], skin.origin_m, skin.cell_m, skin.row_of_node)
+    ours = skin_points(vertices, skin.blend(matrices[1:])[:, 0], skin.origin_m, skin.cell_m, skin.row_of_node)
     error_m = (ours - truth).norm(dim=1)
     # Weights are smoothed over half a cell: hands, whose bones are as thin as that, differ by millimetres.
     assert float(error_m.median()) < 1e-3
@@ -70,7 +70,7 @@ def test_lookup_and_one_step_undo_skinning(body, skin):
     points = points + random.uniform(-0.5, 0.5, points.shape).astype(np.float32) * skin.cell_m
     points = torch.from_numpy(points[signed_distance_m(points, body.mesh()) < 0.05])
     blended = skin.blend(posed_matrices[2:])
-    posed = skin_points(points, blended[0], skin.origin_m, skin.cell_m, skin.row_of_node)
+    posed = skin_points(points, blended[:, 0], skin.origin_m, skin.cell_m, skin.row_of_node)
     count = len(points)
     samples = march(
         posed,
@@ -85,7 +85,7 @@ def test_lookup_and_one_step_undo_skinning(body, skin):
     owner = torch.repeat_interleave(torch.arange(count), samples.ray_start.diff())
     assert float((samples.ray_start.diff() > 0).float().mean()) > 0.995
     refined = newton(blended, samples.canonical_m, posed[owner], torch.tensor([0, len(owner)]), skin)
-    back = skin_points(refined, blended[0], skin.origin_m, skin.cell_m, skin.row_of_node)
+    back = skin_points(refined, blended[:, 0], skin.origin_m, skin.cell_m, skin.row_of_node)
     assert float((back - posed[owner]).norm(dim=1).quantile(0.99)) < 1e-3
     error_m = (refined - points[owner]).norm(dim=1)
     assert float(error_m.median()) < 1e-4

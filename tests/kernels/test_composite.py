@@ -5,7 +5,6 @@ import torch
 
 from pipeline.kernels.composite import composite
 from pipeline.kernels.reference import composite as reference
-from pipeline.kernels.visits import light_before
 
 RAY_START = torch.tensor([0, 3, 3, 4, 9, 12])
 
@@ -78,12 +77,3 @@ def test_twin_passes_gradcheck():
         lambda d, c: reference.composite(d, c, step, RAY_START)[:2],
         (density.requires_grad_(True), colour.requires_grad_(True)),
     )
-
-
-def test_light_before_is_what_the_samples_in_front_left():
-    density, colour, step = make()
-    _, _, weights = composite(density, colour, step, RAY_START)
-    light = light_before(weights, RAY_START)
-    assert float(light[0]) == float(light[3]) == 1
-    passed = torch.exp(-density * step)
-    assert float(light[2]) == pytest.approx(float(passed[0] * passed[1]), abs=1e-6)

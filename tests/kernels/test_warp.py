@@ -36,7 +36,7 @@ def by_hand(skin, matrices, point):
 
 def test_forward_skinning_is_linear_blending_by_hand():
     skin, matrices, points = bar_skin(), bend(0.7), bar_points(20)
-    posed = skin_points(points, skin.blend(matrices[None])[0], *grid_of(skin))
+    posed = skin_points(points, skin.blend(matrices[None])[:, 0], *grid_of(skin))
     for point, carried in zip(points.numpy(), posed.numpy(), strict=True):
         np.testing.assert_allclose(carried, by_hand(skin, matrices, point), atol=1e-6)
 
@@ -45,7 +45,7 @@ def test_forward_skinning_is_linear_blending_by_hand():
 def test_baked_grid_undoes_skinning_to_a_millimetre(angle):
     skin, matrices, points = bar_skin(), bend(angle), bar_points(3000)
     blended = skin.blend(matrices[None])
-    posed = skin_points(points, blended[0], *grid_of(skin))
+    posed = skin_points(points, blended[:, 0], *grid_of(skin))
     found, owner = look_up(posed, WarpSet.of([bake(skin, matrices)], CELL_M))
     assert torch.equal(owner, torch.arange(len(points)))
     error_m = (found - points).norm(dim=1)
@@ -53,7 +53,7 @@ def test_baked_grid_undoes_skinning_to_a_millimetre(angle):
     assert float(error_m.quantile(0.5)) < 1e-3
     refined = newton(blended, found, posed, torch.tensor([0, len(found)]), skin)
     assert float((refined - points).norm(dim=1).quantile(0.99)) < 1e-3
-    back = skin_points(refined, blended[0], *grid_of(skin))
+    back = skin_points(refined, blended[:, 0], *grid_of(skin))
     assert float((back - posed).norm(dim=1).quantile(0.99)) < 1e-3
 
 
@@ -62,7 +62,7 @@ def test_where_the_bar_folds_onto_itself_both_answers_are_found():
     # The second bone, turned by nearly half a turn, comes back over the first; these points are equally deep in both.
     points = torch.tensor([[-0.4, 0.073, 0.0], [-0.45, 0.081, 0.03], [-0.5, 0.09, -0.04]])
     found, owner = look_up(points, WarpSet.of([bake(skin, matrices)], CELL_M))
-    blended = skin.blend(matrices[None])[0]
+    blended = skin.blend(matrices[None])[:, 0]
     for index in range(len(points)):
         mine = found[owner == index]
         assert len(mine) == 2
@@ -82,7 +82,9 @@ def two_frames():
     blended = skin.blend(torch.stack([bend(0.4), bend(-0.8)]))
     points = bar_points(60)
     slot_start = torch.tensor([0, 25, 60])
-    posed = torch.cat([skin_points(points[a:b], blended[f], *grid_of(skin)) for f, a, b in ((0, 0, 25), (1, 25, 60))])
+    posed = torch.cat(
+        [skin_points(points[a:b], blended[:, f], *grid_of(skin)) for f, a, b in ((0, 0, 25), (1, 25, 60))]
+    )
     random = torch.Generator().manual_seed(9)
     start = points + 0.004 * torch.randn(points.shape, generator=random)
     return skin, blended, start, posed, slot_start
@@ -104,7 +106,7 @@ def test_newton_matches_its_twin_in_value_and_gradient():
 def test_pose_gradient_is_the_finite_difference_of_the_solution():
     skin = bar_skin()
     point = bar_points(8, seed=5).double()
-    posed = skin_points(point, skin.blend(bend(0.6, torch.float64)[None])[0], *grid_of(skin))
+    posed = skin_points(point, skin.blend(bend(0.6, torch.float64)[None])[:, 0], *grid_of(skin))
     slot_start = torch.tensor([0, 8])
 
     def solve(angle):
@@ -141,3 +143,22 @@ def test_interpolation_leaves_out_missing_nodes():
     values = torch.ones(8, 1, dtype=torch.float64)
     inside = torch.full((1, 3), 0.5, dtype=torch.float64)
     assert float(interpolate(inside, np.zeros(3), 1.0, rows, values)) == pytest.approx(1.0)
+
+
+def test_a_grid_around_boxes_answers_there_as_the_whole_grid_does():
+    skin = bar_skin()
+    boxes = np.array([[[-0.31, -0.02, -0.02], [-0.17, 0.03, 0.01]], [[0.2, 0.0, 0.0], [0.21, 0.01, 0.01]]], np.float32)
+    part = skin.around(boxes)
+    assert 0 < len(part.nodes_m) < 0.3 * len(skin.nodes_m)
+    random = np.random.default_rng(0)
+    points = np.concatenate([random.uniform(low, high, (40, 3)) for low, high in boxes])
+    inside = torch.from_numpy(points.astype(np.float32))
+    matrices = bend(0.5)[None]
+    for grid in (skin, part):
+        rows = grid.row_of_node[grid.row_of_node >= 0]
+        assert rows.tolist() == list(range(len(grid.nodes_m)))
+    truth = skin_points(inside, skin.blend(matrices)[:, 0], *grid_of(skin))
+    torch.testing.assert_close(skin_points(inside, part.blend(matrices)[:, 0], *grid_of(part)), truth, atol=0, rtol=0)
+    away = torch.tensor([[0.0, 0.1, 0.1]])
+    start = newton(part.blend(matrices), away, away, torch.tensor([0, 1]), part)
+    assert torch.equal(start, away)

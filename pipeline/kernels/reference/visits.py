@@ -4,6 +4,13 @@ import torch
 from torch import Tensor
 
 
+def light_before(weight: Tensor, ray_start: Tensor) -> Tensor:
+    """Same as `pipeline.kernels.visits.light_before`."""
+    before = weight.double().cumsum(0) - weight
+    first = torch.repeat_interleave(ray_start[:-1], ray_start.diff())
+    return (1 - (before - before[first])).clamp(0, 1).to(weight.dtype)
+
+
 def record(
     points: Tensor,
     light: Tensor,

@@ -17,7 +17,7 @@ def interpolate(
 
     Points in cells without any node get the values of the nearest node.
     """
-    total, mass = _gather(points_m, origin_m, cell_m, row_of_node, values)
+    total, mass = gather(points_m, origin_m, cell_m, row_of_node, values)
     known = mass > 1e-6
     result = total / mass.clamp(min=1e-6)[:, None]
     if bool(known.all()):
@@ -32,10 +32,10 @@ def interpolate(
     return result
 
 
-def _gather(
+def gather(
     points_m: Tensor, origin_m: np.ndarray, cell_m: float, row_of_node: np.ndarray, values: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Weighted sum of the eight corners' values, and the sum of the weights of those that exist."""
+    """Weighted sum (n, c) of the eight corners' values, and the sum (n) of the weights of those that exist."""
     rows = torch.as_tensor(row_of_node, device=points_m.device).long()
     size = torch.tensor(rows.shape, device=points_m.device)
     scaled = (points_m - torch.as_tensor(origin_m).to(points_m)) / cell_m
@@ -64,7 +64,7 @@ def skin_points(
 
 
 def newton(
-    blended: Float[Tensor, "k m 12"],
+    blended: Float[Tensor, "m k 12"],
     start_m: Float[Tensor, "s 3"],
     posed_m: Float[Tensor, "s 3"],
     slot_start: Int[Tensor, "k1"],
@@ -79,13 +79,13 @@ def newton(
     """
     parts = []
     grid = (origin_m, cell_m, row_of_node)
-    for frame in range(len(blended)):
+    for frame in range(blended.shape[1]):
         start = start_m[slot_start[frame] : slot_start[frame + 1]].detach()
         posed = posed_m[slot_start[frame] : slot_start[frame + 1]].detach()
         with torch.no_grad():
-            solution = start + _solve(start, posed, blended[frame], grid)
-        image = skin_points(solution, blended[frame], *grid)
-        parts.append(solution + _solve(solution, image, blended[frame].detach(), grid, forward=False))
+            solution = start + _solve(start, posed, blended[:, frame], grid)
+        image = skin_points(solution, blended[:, frame], *grid)
+        parts.append(solution + _solve(solution, image, blended[:, frame].detach(), grid, forward=False))
     return torch.cat(parts)
 
 
@@ -93,7 +93,7 @@ def _solve(
     points: Tensor, posed: Tensor, blended: Tensor, grid: tuple[np.ndarray, float, np.ndarray], forward: bool = True
 ) -> Tensor:
     """J(points)^-1 (posed - A x) if forward, else -J^-1 (posed - detached posed): zero in value, with a gradient."""
-    known = _gather(points, *grid, blended.detach())[1] > 1 - 1e-4
+    known = gather(points, *grid, blended.detach())[1] > 1 - 1e-4
     inputs = points.detach().requires_grad_(True)
     with torch.enable_grad():
         carried = skin_points(inputs, blended.detach(), *grid)
