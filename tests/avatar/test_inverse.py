@@ -146,20 +146,22 @@ def test_samples_lie_on_their_rays_and_in_occupied_cells(way, body, skin, poses,
 
 
 @pytest.mark.parametrize("way", ["broyden", "nearest"])
-def test_placing_has_the_gradient_of_the_finite_difference(way, body, skin, poses, shell):
-    _, _, posed = carried(body, skin, poses, 200)
+def test_placing_keeps_the_samples_and_has_the_gradient_of_the_finite_difference(way, body, skin, poses, shell):
+    _, _, posed = carried(body, skin, poses[1:2], 200)
     posed = posed[:30]
     inverse = invert_motion(way, body, skin, poses)
-    samples, owner = samples_at(inverse, posed, torch.zeros(30, dtype=torch.long), shell)
+    samples, owner = samples_at(inverse, posed, torch.ones(30, dtype=torch.long), shell)
     shift = torch.zeros(3, requires_grad=True)
-    fixed = (torch.tensor([0]), samples.canonical_m, posed[owner], torch.tensor([0, len(owner)]))
+    fixed = (torch.tensor([1]), samples.canonical_m, posed[owner], torch.tensor([0, len(owner)]))
 
     def place(offset):
-        moved = poses[:1].clone()
+        moved = poses[1:2].clone()
         moved[:, :, :3, 3] += offset
         return inverse.place(skin, moved, *fixed)
 
-    place(shift).sum().backward()
+    placed = place(shift)
+    torch.testing.assert_close(placed, samples.canonical_m, atol=2e-5, rtol=0)
+    placed.sum().backward()
     ahead, behind = (place(torch.tensor([0.0, sign * 2e-3, 0.0])).sum() for sign in (1, -1))
     assert float(shift.grad[1]) == pytest.approx(float(ahead - behind) / 4e-3, rel=0.02)
 
