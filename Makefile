@@ -19,6 +19,11 @@ RUNS ?= runs
 JOBS ?=
 CLUSTER ?=
 
+# What the chart compares; all may be left out.
+CAPTURES ?=
+PRESETS ?=
+SEEDS ?=
+
 TORCH_VERSION := 2.13.0
 GLTF_VALIDATOR_VERSION := 2.0.0-dev.3.10
 SAMPLE_RUN := runs/sample
@@ -29,7 +34,7 @@ OPTIONS = $(RUN_OPTIONS) $(ARGS)
 STAMP := $(VENV)/.stamp$(if $(EXTRA),-$(EXTRA))
 
 .DEFAULT_GOAL := help
-.PHONY: help all $(STAGES) batch test test-all check format bench doctor venv lock configs gltf-validator clean
+.PHONY: help all $(STAGES) batch chart test test-all check format bench doctor venv lock configs gltf-validator clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z$$()A-Z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST) | sed 's/$$(STAGES)/STAGE    /'
@@ -57,6 +62,9 @@ else
 		$(if $(JOBS),--jobs $(JOBS)) $(ARGS) --config videos="$(VIDEOS)" runs="$(RUNS)" project="$(CURDIR)" \
 		python="$(CURDIR)/$(RUN_PYTHON)" options="$(RUN_OPTIONS)"
 endif
+
+chart: $(STAMP)  ## accuracy against seconds: PRESETS over CAPTURES (all presets, two generated people) with SEEDS
+	$(RUN_PYTHON) -m data_tools.chart $(CAPTURES) $(if $(PRESETS),--presets $(PRESETS)) $(if $(SEEDS),--seeds $(SEEDS)) $(ARGS)
 
 # Made once; a half-made one, which has no .done, is made anew.
 $(SAMPLE)/.done: | $(STAMP)

@@ -1,0 +1,157 @@
+"""Presets over captures: accuracy against seconds, as a chart and as tables.
+
+python -m data_tools.chart [CAPTURE ...] [--presets instant default --seeds 0 1 --out runs/chart]
+
+Every combination is a run folder below OUT, so an interrupted sweep goes on where it was; the stage that was cut starts
+from its beginning, because its seconds are what the chart is about. OUT then holds `chart.svg`, `chart.png`,
+`chart.csv` (a line a run) and `anytime.csv` (the field's scores while it learnt).
+"""
+
+import argparse
+import csv
+import sys
+from collections.abc import Mapping, Sequence
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from data_tools.chart_figure import PANELS, Point, draw_chart, pareto_front, preset_means, save_chart
+from data_tools.chart_trials import (
+    PROGRESS_COLUMNS,
+    UNTIL_AVATAR,
+    Trial,
+    compare_with_truth,
+    point_of,
+    run_trial,
+    table_row,
+    together,
+)
+from data_tools.command import run_command
+from data_tools.runs import CONFIGS, RunState, check_options, log_path, read_run
+from data_tools.sample import main as make_sample
+from pipeline.core.atomic import atomic_path
+from pipeline.core.errors import UserError
+from pipeline.core.progress import track
+
+# The generated people that are taken when no capture is named: where they lie, and the seed that makes them.
+BUILT_IN = {Path("runs/sample-capture"): 0, Path("runs/sample-capture-1"): 1}
+ONLY_FOR_TESTS = "smoke"
+
+
+def main(argv: Sequence[str]) -> None:
+    """Run what is missing, then draw.
+
+    Raises:
+        UserError: a capture or preset is not there, or some runs are not done (the others are drawn all the same).
+    """
+    options = _parse(argv)
+    for preset in options.presets:
+        check_options(preset, [])
+    captures = options.captures or list(BUILT_IN)
+    if not options.captures:
+        _make_built_in()
+    missing = [str(path) for path in captures if not path.exists()]
+    if missing:
+        raise UserError(f"{missing[0]} does not exist: give synthetic captures, videos or folders of images")
+    combinations = product(options.seeds, captures, options.presets)
+    trials = [Trial(capture, preset, seed, options.out) for seed, capture, preset in combinations]
+    visit = _look_at if options.draw else bring_up_to_date
+    runs = {trial: visit(trial) for trial in track(trials, "runs")}
+    write_results(options.out, runs)
+    bad = [trial.run_dir.name for trial, run in runs.items() if run.verdict != "done"]
+    if bad:
+        raise UserError(
+            f"{len(bad)} of {len(runs)} runs are not done ({', '.join(bad)}): see {options.out}/chart.csv; "
+            "the same command tries them again"
+        )
+    print(f"{len(runs)} runs: {options.out}/chart.svg, chart.png, chart.csv, anytime.csv")
+
+
+def bring_up_to_date(trial: Trial) -> RunState:
+    """Run and compare what is not done yet. One trial at a time: they are timed, so nothing runs beside them."""
+    run = read_run(trial.run_dir)
+    if run.verdict != "done":
+        tqdm.write(f"{trial.run_dir.name}: started, says what it does in {log_path(trial.run_dir)}", file=sys.stderr)
+        run_trial(trial)
+        run = read_run(trial.run_dir)
+    if run.verdict == "done":
+        compare_with_truth(trial)
+        run = read_run(trial.run_dir)
+    said = f"{trial.run_dir.name}: {run.verdict}, {run.seconds(UNTIL_AVATAR):.0f} s"
+    tqdm.write(f"{said}, {run.failure}" if run.verdict == "failed" else said, file=sys.stderr)
+    return run
+
+
+def write_results(out: Path, runs: Mapping[Trial, RunState]) -> None:
+    """Tables of all runs, and the chart of those that are done."""
+    out.mkdir(parents=True, exist_ok=True)
+    points = [point_of(trial, run) for trial, run in runs.items() if run.verdict == "done"]
+    rows = [table_row(trial, run) | {"on_front_of": _fronts(trial, points)} for trial, run in runs.items()]
+    write_csv(out / "chart.csv", rows)
+    curves = [
+        {
+            "capture": point.capture,
+            "preset": point.preset,
+            "seed": point.seed,
+            **dict(zip(PROGRESS_COLUMNS, row, strict=True)),
+        }
+        for point in points
+        for row in point.curve
+    ]
+    write_csv(out / "anytime.csv", curves)
+    if any(point.scores for point in points):
+        save_chart(draw_chart(points, origin(rows)), out)
+
+
+def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """A table with the first row's columns; an empty file without rows."""
+    with atomic_path(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[0]) if rows else [])
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def origin(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Commit, machine and seeds of the runs that are done."""
+    done = [row for row in rows if row["status"] == "done"]
+    commit, machine, seeds = (together(str(row[name]) for row in done) for name in ("commit", "machine", "seed"))
+    return f"commit {commit}; {machine}; seed {seeds}"
+
+
+def _fronts(trial: Trial, points: Sequence[Point]) -> str:
+    """The scores on whose Pareto front the trial's preset lies."""
+    on = []
+    for panel in PANELS:
+        means = preset_means([point for point in points if point.capture == trial.capture_name], panel.mesh)
+        front = pareto_front(list(means.values()), panel.higher_is_better)
+        if trial.preset_name in [list(means)[index] for index in front]:
+            on.append(panel.mesh)
+    return " ".join(on)
+
+
+def _look_at(trial: Trial) -> RunState:
+    return read_run(trial.run_dir)
+
+
+def _make_built_in() -> None:
+    """The generated people's captures, where they are not there yet."""
+    for path, seed in BUILT_IN.items():
+        if not path.exists():
+            make_sample([str(path), "--seed", str(seed)])
+
+
+def _parse(argv: Sequence[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m data_tools.chart", description=(__doc__ or "").splitlines()[0])
+    presets = sorted(path.stem for path in CONFIGS.glob("*.yaml") if path.stem != ONLY_FOR_TESTS)
+    parser.add_argument("captures", nargs="*", type=Path, help="captures, videos or image folders; two people if none")
+    parser.add_argument("--presets", nargs="+", default=presets, help="names in configs/ or .yaml files; all if none")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0], help="seeds of the stages that draw at random")
+    parser.add_argument("--out", type=Path, default=Path("runs/chart"), help="where runs, tables and chart are made")
+    parser.add_argument("--draw", action="store_true", help="run nothing, draw what is done")
+    return parser.parse_args(argv)
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_command(main, sys.argv[1:]))

@@ -1,0 +1,128 @@
+"""One combination of capture, preset and seed: its run, what it found, and what that cost."""
+
+import csv
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import stages
+from data_tools.chart_figure import Point
+from data_tools.runs import SCORES, RunState, log_path, start_run, video_in
+from pipeline.core.cli import default_run_dir
+from pipeline.core.errors import UserError
+from pipeline.core.lock import run_lock
+from pipeline.core.progress import warn
+
+UNTIL_FIELD = ("frames", "body", "field")
+BEFORE_FIELD = UNTIL_FIELD[:-1]
+UNTIL_AVATAR = tuple(name for name in stages.STAGES if name != "report")
+PROGRESS_COLUMNS = ("seconds", "validation_psnr_db", "validation_psnr_body_db")
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What runs, and below which folder."""
+
+    capture: Path
+    preset: str
+    seed: int
+    out: Path
+
+    @property
+    def capture_name(self) -> str:
+        """How tables and the chart call the capture."""
+        return default_run_dir(self.capture).name
+
+    @property
+    def preset_name(self) -> str:
+        """The preset's name, also where a file was given."""
+        return Path(self.preset).stem
+
+    @property
+    def run_dir(self) -> Path:
+        """The folder of the run."""
+        return self.out / f"{self.capture_name}-{self.preset_name}-{self.seed}"
+
+
+def run_trial(trial: Trial) -> None:
+    """Run what is not fresh; a stage that was cut starts from its beginning.
+
+    Gone on with from its checkpoint, it would tell only the seconds after the cut.
+    """
+    if trial.run_dir.is_dir():
+        with run_lock(trial.run_dir):
+            for part in trial.run_dir.glob("*.part"):
+                shutil.rmtree(part)
+    seeded = [name for name in stages.STAGES if "seed" in stages.load(name).config.model_fields]
+    seeds = [word for name in seeded for word in ("--set", f"{name}.seed={trial.seed}")]
+    start_run(trial.run_dir, ["--video", str(video_in(trial.capture)), "--preset", trial.preset, *seeds])
+
+
+def compare_with_truth(trial: Trial) -> None:
+    """Write `report/truth.json` where the capture has a truth and this report was not compared with it yet."""
+    if not (trial.capture / "truth").is_dir() or (trial.run_dir / "report" / "truth.json").is_file():
+        return
+    command = [sys.executable, "-m", "data_tools.compare", str(trial.capture), str(trial.run_dir)]
+    with log_path(trial.run_dir).open("a", encoding="utf-8") as log:
+        done = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, check=False)
+    if done.returncode != 0:
+        warn(f"{trial.run_dir.name} could not be compared with its truth: see {log_path(trial.run_dir)}")
+
+
+def point_of(trial: Trial, run: RunState) -> Point:
+    """What the figure needs of a finished run."""
+    before = run.seconds(BEFORE_FIELD)
+    curve = [(before + seconds, full, body) for seconds, full, body in read_progress(trial.run_dir / "field")]
+    seconds = (run.seconds(UNTIL_FIELD), run.seconds(UNTIL_AVATAR))
+    return Point(trial.capture_name, trial.preset_name, trial.seed, *seconds, run.scores, curve)
+
+
+def read_progress(field: Path) -> list[tuple[float, float, float]]:
+    """Rows of `progress.csv`: seconds of learning, validation PSNR (dB) of whole image and body; empty without it.
+
+    Raises:
+        UserError: a column is missing or holds no number.
+    """
+    path = field / "progress.csv"
+    if not path.is_file():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    try:
+        columns = [[float(row[name]) for row in rows] for name in PROGRESS_COLUMNS]
+    except (KeyError, ValueError, TypeError):
+        raise UserError(f"{path} needs numbers in {', '.join(PROGRESS_COLUMNS)}: run its stage with --force") from None
+    return list(zip(*columns, strict=True))
+
+
+def table_row(trial: Trial, run: RunState) -> dict[str, Any]:
+    """One line of chart.csv. `resumed`: stages whose seconds tell only of the time after an interruption."""
+    environments = [manifest.environment for manifest in run.manifests.values()]
+    return {
+        "capture": trial.capture_name,
+        "preset": trial.preset_name,
+        "seed": trial.seed,
+        "status": run.verdict,
+        "field_seconds": round(run.seconds(UNTIL_FIELD), 3),
+        "seconds": round(run.seconds(UNTIL_AVATAR), 3),
+        **{score: run.scores.get(score) for score in SCORES},
+        "peak_rss_mib": max((manifest.peak_rss_mib for manifest in run.manifests.values()), default=None),
+        "resumed": " ".join(name for name, manifest in run.manifests.items() if manifest.resumed),
+        "commit": together(environment.get("commit") for environment in environments),
+        "machine": together(map(_machine, environments)),
+        "message": "" if run.verdict == "done" else run.failure,
+    }
+
+
+def together(texts: Iterable[str | None]) -> str:
+    """The different ones among texts, in their order."""
+    return "; ".join(dict.fromkeys(text for text in texts if text))
+
+
+def _machine(environment: dict[str, Any]) -> str:
+    parts = [environment.get("cpu"), f"{environment.get('cores')} cores", environment.get("gpu")]
+    return ", ".join(part for part in parts if part)

@@ -1,0 +1,118 @@
+"""A sweep of presets over captures: it goes on where it was, and its tables say what was measured where."""
+
+import csv
+import shutil
+from pathlib import Path
+
+import pytest
+
+from data_tools.chart import origin, write_results
+from data_tools.chart_trials import Trial, point_of, read_progress, table_row
+from data_tools.runs import RunState
+from pipeline.core.errors import UserError
+from pipeline.core.manifest import Manifest, read_manifest
+from stages import STAGES
+from tests.core.toy_pipeline import Toy
+from tests.test_resume import wait_for
+
+SWEEP = ("data_tools.chart", "numbers.mp4", "--presets", "quick", "default", "--out", "runs/chart")
+SCORES = {"mesh_psnr_full_db": 28.0, "field_psnr_full_db": 30.0, "chamfer_mm": 6.5}
+
+
+@pytest.fixture
+def sweep(toy: Toy) -> Toy:
+    """The toy with a capture."""
+    shutil.copy(toy.video, toy.folder / "numbers.mp4")
+    return toy
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def finished(seconds: float, scores: dict[str, float], resumed: tuple[str, ...] = ()) -> RunState:
+    """A run in which every stage took as long."""
+    place = {"commit": "abc", "cpu": "Xeon", "cores": 2, "gpu": None}
+    manifests = {
+        name: Manifest(name, 1, "", {}, {}, {}, {}, seconds, 100.0, name in resumed, [], place) for name in STAGES
+    }
+    return RunState(dict.fromkeys(STAGES, "fresh"), manifests, scores, "")
+
+
+def test_a_killed_sweep_goes_on_and_times_the_cut_stage_from_its_start(sweep: Toy) -> None:
+    runner = sweep.start(*SWEEP, TOY_SLEEP_S="3")
+    wait_for(sweep.folder / "runs/chart/numbers-default-0/learn.part/checkpoint.json", runner)
+    runner.kill()
+    runner.communicate()
+    first = sweep.folder / "runs" / "chart" / "numbers-quick-0" / "learn"
+    before = first.stat().st_ctime_ns
+    done = sweep.call(*SWEEP)
+    assert done.returncode == 0, done.stderr
+    assert first.stat().st_ctime_ns == before
+    cut = read_manifest(sweep.folder / "runs" / "chart" / "numbers-default-0" / "learn")
+    assert cut is not None
+    assert (cut.resumed, cut.metrics) == (False, {"first_step": 0})
+    table = rows(sweep.folder / "runs" / "chart" / "chart.csv")
+    assert [(row["preset"], row["seed"], row["status"]) for row in table] == [
+        ("quick", "0", "done"),
+        ("default", "0", "done"),
+    ]
+    assert all(row["commit"] and "cores" in row["machine"] for row in table)
+    assert float(table[0]["seconds"]) > 2.9  # the toy's long step
+    assert not table[1]["resumed"]
+
+
+def test_a_failed_run_stops_no_other(sweep: Toy) -> None:
+    (sweep.folder / "words.mp4").write_text("one two")
+    sentence = sweep.refusal("data_tools.chart", "words.mp4", "numbers.mp4", "--presets", "quick", "--out", "chart")
+    assert "1 of 2 runs are not done (words-quick-0)" in sentence
+    table = rows(sweep.folder / "chart" / "chart.csv")
+    assert [row["status"] for row in table] == ["failed", "done"]
+    assert "no number" in table[0]["message"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [(("none.mp4", "--presets", "quick"), "none.mp4"), (("numbers.mp4", "--presets", "x"), "quick")],
+)
+def test_a_mistake_is_refused_before_any_run(sweep: Toy, arguments: tuple[str, ...], word: str) -> None:
+    assert word in sweep.refusal("data_tools.chart", *arguments)
+    assert not (sweep.folder / "runs").exists()
+
+
+def test_seconds_are_those_until_field_and_avatar(tmp_path: Path) -> None:
+    trial = Trial(tmp_path / "ann.mp4", "configs/mine.yaml", 3, tmp_path)
+    assert trial.run_dir == tmp_path / "ann.mp4-mine-3"
+    (trial.run_dir / "field").mkdir(parents=True)
+    (trial.run_dir / "field" / "progress.csv").write_text(
+        "step,seconds,validation_psnr_db,validation_psnr_body_db\n50,2.5,20,15\n100,5,22,17.5\n"
+    )
+    point = point_of(trial, finished(10.0, SCORES))
+    assert (point.field_seconds, point.seconds) == (30.0, 60.0)  # the report is not needed for the avatar
+    assert point.curve == [(22.5, 20.0, 15.0), (25.0, 22.0, 17.5)]
+    row = table_row(trial, finished(10.0, SCORES, resumed=("field", "mesh")))
+    assert (row["resumed"], row["commit"], row["machine"]) == ("field mesh", "abc", "Xeon, 2 cores")
+    assert origin([row]) == "commit abc; Xeon, 2 cores; seed 3"
+
+
+def test_progress_that_is_absent_or_damaged(tmp_path: Path) -> None:
+    assert read_progress(tmp_path) == []
+    (tmp_path / "progress.csv").write_text("seconds,validation_psnr_db\n1,2\n")
+    with pytest.raises(UserError, match="validation_psnr_body_db"):
+        read_progress(tmp_path)
+
+
+def test_tables_and_chart_of_finished_runs(tmp_path: Path) -> None:
+    quick, slow, bad = (Trial(tmp_path / "ann", preset, 0, tmp_path) for preset in ("quick", "slow", "bad"))
+    runs = {
+        quick: finished(10.0, SCORES),
+        slow: finished(20.0, SCORES | {"chamfer_mm": 5.0}),
+        bad: RunState(dict.fromkeys(STAGES, "missing"), {}, {}, "no person"),
+    }
+    write_results(tmp_path, runs)
+    table = rows(tmp_path / "chart.csv")
+    assert [row["on_front_of"] for row in table] == ["mesh_psnr_full_db chamfer_mm", "chamfer_mm", ""]
+    assert [row["message"] for row in table] == ["", "", "no person"]
+    assert (tmp_path / "chart.svg").is_file()
+    assert rows(tmp_path / "anytime.csv") == []
