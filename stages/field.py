@@ -1,5 +1,6 @@
 """field: the instant avatar, a radiance field in the canonical A-pose, learnt from the frames in half a minute."""
 
+import csv
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,13 +10,14 @@ import numpy as np
 import torch
 
 from pipeline.avatar import selection
-from pipeline.avatar.body import Body, Motion, canonical_to_world
+from pipeline.avatar.body import Motion
 from pipeline.avatar.field_config import FieldConfig
+from pipeline.avatar.judge import Judge
 from pipeline.avatar.prepare import Picture, spread, start_learning, training_scale
-from pipeline.avatar.render import render_field
 from pipeline.avatar.train import DivergedError, Learning
 from pipeline.core.cli import main
 from pipeline.core.errors import UserError
+from pipeline.core.manifest import PROGRESS
 from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
 from pipeline.geometry.camera import Camera
@@ -23,10 +25,12 @@ from pipeline.io.capture import Capture, load_capture
 from pipeline.io.checkpoint import load_tensors, save_field, save_occupancy, save_tensors
 from pipeline.io.image import to_uint8, write_rgb
 from pipeline.io.npz import load_body, load_camera, load_motion, save_motion
-from pipeline.metrics.images import body_pixels, on_white, premultiplied_on_white, psnr_db
+from pipeline.metrics.images import on_white
 
 CHECKPOINT, CHECKPOINT_EVERY_S = "checkpoint.safetensors", 15.0
 PREVIEW_FRAMES = 4
+LOOKS = (1 / 32, 1 / 16, 1 / 8, 1 / 4, 3 / 8, 1 / 2, 5 / 8, 3 / 4, 7 / 8, 1)
+"""Parts of the steps after which the field is scored on validation frames, for the curve of accuracy over time."""
 
 
 def run(inputs: Mapping[str, Path], out: Path, config: FieldConfig) -> Mapping[str, float]:
@@ -43,15 +47,13 @@ def run(inputs: Mapping[str, Path], out: Path, config: FieldConfig) -> Mapping[s
     train = train[spread(len(train), config.max_frames)]
     pictures = [read_picture(capture, position, camera) for position in track(train, "read frames")]
     learning = start_learning(body, motion.select(train), camera, pictures, config)
-    seconds_per_step = learn(learning, out / CHECKPOINT)
-    chosen = capture.positions(selection.VALIDATION)
-    chosen = chosen[spread(len(chosen), config.validation_frames)] if len(chosen) else chosen
-    truths = [read_picture(capture, position, camera) for position in chosen]
-    motion, metrics, renders = judge_poses(learning, body, motion, camera, chosen, truths)
+    judge = gather_judge(capture, motion, camera, config)
+    seconds_per_step = learn(learning, judge, out)
+    motion, metrics, renders = judge_poses(learning, judge, motion)
     save_field(out / "field.safetensors", learning.field)
     save_occupancy(out / "occupancy.npz", learning.occupancy.grid())
     save_motion(out / "motion.npz", motion)
-    write_preview(out / "preview.png", renders, truths)
+    write_preview(out / "preview.png", renders, judge)
     return metrics | {
         "steps": learning.done,
         "seconds_per_step": seconds_per_step,
@@ -70,10 +72,20 @@ def read_picture(capture: Capture, position: int, camera: Camera) -> Picture:
     return to_uint8(image), to_uint8(mask)
 
 
-def learn(learning: Learning, checkpoint: Path) -> float:
+def gather_judge(capture: Capture, motion: Motion, camera: Camera, config: FieldConfig) -> Judge:
+    """Some of the validation frames, evenly spread."""
+    chosen = capture.positions(selection.VALIDATION)
+    chosen = chosen[spread(len(chosen), config.validation_frames)] if len(chosen) else chosen
+    return Judge(motion.select(chosen), camera, [read_picture(capture, position, camera) for position in chosen])
+
+
+def learn(learning: Learning, judge: Judge, out: Path) -> float:
     """All steps that are still to do, with a checkpoint now and then; returns the median seconds of a step."""
+    checkpoint = out / CHECKPOINT
     if checkpoint.exists():
         learning.load_state(load_tensors(checkpoint)[0])
+    progress, thin = Progress(out, learning.done), judge.thinned()
+    looks = {round(part * learning.config.steps) for part in LOOKS}
     seconds, saved = [], time.monotonic()
     steps = range(learning.done, learning.config.steps)
     for _ in track(steps, "field", total=learning.config.steps, initial=learning.done):
@@ -83,62 +95,71 @@ def learn(learning: Learning, checkpoint: Path) -> float:
         except DivergedError as error:
             raise UserError(f"the field does not learn ({error}); lower field.table_rate and try again") from None
         seconds.append(time.monotonic() - start)
+        if learning.done in looks and judge.truths:
+            progress.add(learning.done, sum(seconds), *thin.score(thin.render(learning, learning.refines_poses)))
         if time.monotonic() - saved > CHECKPOINT_EVERY_S:
             save_tensors(checkpoint, learning.state())
             saved = time.monotonic()
+    progress.finish()
     return float(np.median(seconds)) if seconds else 0.0
 
 
-def judge_poses(
-    learning: Learning, body: Body, motion: Motion, camera: Camera, positions: np.ndarray, truths: list[Picture]
-) -> tuple[Motion, dict[str, float], list[np.ndarray]]:
+class Progress:
+    """The curve of accuracy over time, kept beside the checkpoint and published as `progress.csv`."""
+
+    COLUMNS = ("step", "seconds", "validation_psnr_db", "validation_psnr_body_db")
+
+    def __init__(self, out: Path, done: int) -> None:
+        """Go on after the rows of the steps that a checkpoint holds."""
+        self.kept, self.published = out / f"checkpoint_{PROGRESS}", out / PROGRESS
+        self.rows: list[tuple[float, ...]] = []
+        if self.kept.exists():
+            with self.kept.open(newline="", encoding="utf-8") as file:
+                rows = [tuple(float(value) for value in row) for row in list(csv.reader(file))[1:]]
+            self.rows = [row for row in rows if row[0] <= done]
+        self.before_s = self.rows[-1][1] if self.rows else 0.0
+
+    def add(self, step: int, seconds: float, *scores_db: float) -> None:
+        """Note the scores after a step and the seconds of learning since this process began with it."""
+        self.rows.append((step, round(self.before_s + seconds, 3), *(round(score, 4) for score in scores_db)))
+        with self.kept.open("w", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerows([self.COLUMNS, *self.rows])
+
+    def finish(self) -> None:
+        """Publish what there is."""
+        if self.rows:
+            self.kept.replace(self.published)
+
+
+def judge_poses(learning: Learning, judge: Judge, motion: Motion) -> tuple[Motion, dict[str, float], list[np.ndarray]]:
     """Keep the pose corrections only if they make validation frames better, to which they come by interpolation in
     time.
     """
-    motions = {"fitted": motion}
-    if learning.config.pose_refinement:
-        motions["refined"] = learning.poses.corrected(motion)
-    shown = {name: render_frames(learning, body, one, camera, positions) for name, one in motions.items()}
-    errors = {name: mean_psnr(renders, truths) for name, renders in shown.items()}
-    best = max(errors, key=lambda name: errors[name][0]) if truths else list(motions)[-1]
+    ways = {"fitted": False} | ({"refined": True} if learning.config.pose_refinement else {})
+    shown = {name: judge.render(learning, refined) for name, refined in ways.items()}
+    scores = {name: judge.score(renders) for name, renders in shown.items()}
+    best = max(scores, key=lambda name: scores[name][0]) if judge.truths else list(ways)[-1]
     if best == "fitted" and learning.config.pose_refinement:
         warn("the refined poses did not make validation frames better and were dropped")
-    metrics = {f"psnr_{name}": error[0] for name, error in errors.items()} if truths else {}
-    if truths:
-        metrics |= {"psnr": errors[best][0], "psnr_body": errors[best][1]}
-    return motions[best], metrics | {"poses_kept": float(best == "refined")}, shown[best]
+    metrics = {f"psnr_{name}": score[0] for name, score in scores.items()} if judge.truths else {}
+    if judge.truths:
+        metrics |= {"psnr": scores[best][0], "psnr_body": scores[best][1]}
+    kept = learning.poses.corrected(motion) if ways[best] else motion
+    return kept, metrics | {"poses_kept": float(ways[best])}, shown[best]
 
 
-def render_frames(
-    learning: Learning, body: Body, motion: Motion, camera: Camera, positions: np.ndarray
-) -> list[np.ndarray]:
-    """Pictures on white, uint8, of the field in the poses of some frames."""
-    poses = canonical_to_world(body, motion.select(positions))
-    grid, skin = learning.occupancy.grid(), learning.scene.skin
-    return [
-        premultiplied_on_white(render_field(learning.field, grid, body, pose, camera, skin).numpy()) for pose in poses
-    ]
-
-
-def mean_psnr(renders: list[np.ndarray], truths: list[Picture]) -> tuple[float, float]:
-    """Mean decibels of whole images on white, and of body pixels alone."""
-    pairs = [(render, on_white(*truth), body_pixels(truth[1])) for render, truth in zip(renders, truths, strict=True)]
-    if not pairs:
-        return 0.0, 0.0
-    full = np.mean([psnr_db(render, truth) for render, truth, _ in pairs])
-    return float(full), float(np.mean([psnr_db(*pair) for pair in pairs if pair[2].any()]))
-
-
-def write_preview(path: Path, renders: list[np.ndarray], truths: list[Picture]) -> None:
+def write_preview(path: Path, renders: list[np.ndarray], judge: Judge) -> None:
     """Validation frames in pairs: the field's render beside the truth."""
-    pairs = [np.concatenate([render, on_white(*truth)], axis=1) for render, truth in zip(renders, truths, strict=True)]
+    pairs = [
+        np.concatenate([render, on_white(*truth)], axis=1) for render, truth in zip(renders, judge.truths, strict=True)
+    ]
     if pairs:
         write_rgb(path, np.concatenate(pairs[:PREVIEW_FRAMES], axis=0))
 
 
 STAGE = Stage(
     "field",
-    version=1,
+    version=2,
     needs=("frames", "body"),
     makes=("field.safetensors", "occupancy.npz", "motion.npz"),
     config=FieldConfig,

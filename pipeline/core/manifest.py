@@ -10,6 +10,8 @@ from typing import Any
 from pipeline.core.errors import UserError
 
 MANIFEST = "manifest.json"
+PROGRESS = "progress.csv"
+"""How a stage's work went, second by second: a result like others, but never the same twice."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +33,8 @@ class Manifest:
 
     @property
     def outputs_digest(self) -> str:
-        """One digest for all outputs: what a downstream stage's fingerprint depends on."""
-        return digest_json(self.outputs)
+        """One digest for all outputs but the record of progress: what a downstream stage's fingerprint depends on."""
+        return digest_json({name: digest for name, digest in self.outputs.items() if name != PROGRESS})
 
 
 def write_manifest(manifest: Manifest, path: Path) -> None:

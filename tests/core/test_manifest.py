@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import (
     MANIFEST,
+    PROGRESS,
     Manifest,
     digest_file,
     digest_files,
@@ -79,6 +81,12 @@ def test_a_manifest_reads_back(tmp_path: Path) -> None:
     assert read_manifest(tmp_path / "mesh") == manifest
     assert manifest.outputs_digest == digest_json(manifest.outputs)
     assert read_manifest(tmp_path / "nothing") is None
+
+
+def test_nothing_depends_on_the_record_of_progress(tmp_path: Path) -> None:
+    manifest = finished(tmp_path / "mesh")
+    timed = replace(manifest, outputs=manifest.outputs | {PROGRESS: "0" * 64})
+    assert timed.outputs_digest == manifest.outputs_digest
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"stage": "mesh"}', '{"strange": 1}'])

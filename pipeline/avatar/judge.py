@@ -1,0 +1,57 @@
+"""Frames that are kept back from the learning, and the scores of a field on them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import UInt8
+
+from pipeline.avatar.body import Motion, canonical_to_world
+from pipeline.avatar.prepare import Picture
+from pipeline.avatar.render import render_field
+from pipeline.avatar.train import Learning
+from pipeline.geometry.camera import Camera
+from pipeline.metrics.images import body_pixels, on_white, premultiplied_on_white, psnr_db
+
+THINNING = 5
+"""Odd, so that the centre of a thinned picture's pixel is the centre of a pixel."""
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Pictures of some frames for one camera, and the poses that the body stage gave them."""
+
+    motion: Motion
+    camera: Camera
+    truths: Sequence[Picture]
+
+    def thinned(self) -> "Judge":
+        """Every fifth row and column of the pictures: an unbiased estimate of their errors at a 25th of the cost."""
+        whole = self.camera.width // THINNING * THINNING, self.camera.height // THINNING * THINNING
+        camera = self.camera.cropped(0, 0, *whole).scaled(1 / THINNING)
+        kept = tuple(slice(THINNING // 2, side, THINNING) for side in reversed(whole))
+        return Judge(self.motion, camera, [(image[kept], mask[kept]) for image, mask in self.truths])
+
+    def render(self, learning: Learning, refined: bool) -> list[UInt8[np.ndarray, "h w 3"]]:
+        """Pictures on white as the field is now; `refined` poses come by interpolation in time from the learnt ones."""
+        motion = learning.poses.corrected(self.motion) if refined else self.motion
+        body, grid, skin = learning.scene.body, learning.occupancy.grid(), learning.scene.skin
+        renders = [
+            render_field(learning.field, grid, body, pose, self.camera, skin)
+            for pose in canonical_to_world(body, motion)
+        ]
+        return [premultiplied_on_white(render.numpy()) for render in renders]
+
+    def score(self, renders: Sequence[UInt8[np.ndarray, "h w 3"]]) -> tuple[float, float]:
+        """Mean decibels of whole images on white, and of body pixels alone; NaN where there is nothing to score."""
+        full = [psnr_db(render, on_white(*truth)) for render, truth in zip(renders, self.truths, strict=True)]
+        body = [
+            psnr_db(render, on_white(image, mask), body_pixels(mask))
+            for render, (image, mask) in zip(renders, self.truths, strict=True)
+            if body_pixels(mask).any()
+        ]
+        return _mean(full), _mean(body)
+
+
+def _mean(values: list[float]) -> float:
+    return float(np.mean(values)) if values else float("nan")

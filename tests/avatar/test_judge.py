@@ -1,0 +1,49 @@
+import numpy as np
+import pytest
+
+from pipeline.avatar.judge import Judge
+from pipeline.avatar.train import Learning
+from pipeline.metrics.images import on_white
+from tests.avatar.scene import painted_scene
+from tests.avatar.test_train import begin
+
+HELD = np.array([2, 5])
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return painted_scene(12, 110)
+
+
+@pytest.fixture(scope="module")
+def learning(scene) -> Learning:
+    learning = begin(scene, steps=60, pose_refinement=False)
+    for _ in range(60):
+        learning.step()
+    return learning
+
+
+@pytest.fixture(scope="module")
+def judge(scene) -> Judge:
+    return Judge(scene.motion.select(HELD), scene.camera, [(scene.images[row], scene.masks[row]) for row in HELD])
+
+
+def test_thinned_pictures_are_pixels_of_the_whole_ones(judge: Judge, learning: Learning):
+    thin = judge.thinned()
+    whole, few = judge.render(learning, refined=False)[0], thin.render(learning, refined=False)[0]
+    sides = few.shape[:2]
+    picked = whole[2::5, 2::5][: sides[0], : sides[1]].astype(int)
+    assert np.array_equal(thin.truths[0][0], judge.truths[0][0][2::5, 2::5][: sides[0], : sides[1]])
+    # The same rays but for rounding; a sample that falls to the other side of a cell's wall changes a pixel or two.
+    assert np.quantile(np.abs(few - picked), 0.99) <= 2
+
+
+def test_a_thinned_score_is_that_of_the_pixels_it_keeps(judge: Judge, learning: Learning):
+    thin = judge.thinned()
+    kept = [render[2::5, 2::5][: thin.camera.height, : thin.camera.width] for render in judge.render(learning, False)]
+    assert thin.score(thin.render(learning, refined=False)) == pytest.approx(thin.score(kept), abs=0.2)
+
+
+def test_the_truth_itself_scores_without_end_and_nothing_scores_nan(judge: Judge):
+    assert judge.score([on_white(*truth) for truth in judge.truths]) == (np.inf, np.inf)
+    assert all(np.isnan(Judge(judge.motion.select(np.zeros(0, int)), judge.camera, []).score([])))
