@@ -5,8 +5,6 @@ OUT/truth/...                  what it must never see: see `write_truth`
 """
 
 import json
-import os
-import shutil
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -18,11 +16,11 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from data_tools.backdrop import Room, foot_shadow
+from data_tools.folder import whole_folder
 from data_tools.movie import write_movie
 from data_tools.renderer import Light, pose_vertices, render_subject
 from data_tools.subject import Subject, save_subject
 from pipeline.avatar.body import Body, Motion, canonical_to_world
-from pipeline.core.errors import UserError
 from pipeline.core.progress import track
 from pipeline.geometry.camera import Camera
 from pipeline.io.image import to_uint8, write_gray, write_rgb, write_rgba
@@ -116,23 +114,14 @@ def _looking_at(middle_m: np.ndarray, distance_m: float, angle: float, rise: flo
     return world_to_camera.astype(np.float32)
 
 
-def refuse_existing(out: Path) -> None:
-    """UserError when there is something at `out`: nothing is overwritten."""
-    if out.exists():
-        raise UserError(f"{out} exists already; remove it or name another folder")
-
-
 def write_capture(out: Path, capture: Capture, bare: Body | None, heldout: Heldout, recipe: dict[str, object]) -> None:
     """Render everything into `out`, which is whole or absent. UserError when it exists already."""
-    refuse_existing(out)
-    part = out.with_name(out.name + ".part")
-    shutil.rmtree(part, ignore_errors=True)
-    for folder in ("video", "truth/masks"):
-        (part / folder).mkdir(parents=True)
-    write_movie(part / "video" / "video.mp4", _frames(capture, part / "truth" / "masks"), capture.fps)
-    write_truth(part / "truth", capture, bare, recipe)
-    write_heldout(part / "truth", capture, heldout)
-    os.rename(part, out)
+    with whole_folder(out) as part:
+        for folder in ("video", "truth/masks"):
+            (part / folder).mkdir(parents=True)
+        write_movie(part / "video" / "video.mp4", _frames(capture, part / "truth" / "masks"), capture.fps)
+        write_truth(part / "truth", capture, bare, recipe)
+        write_heldout(part / "truth", capture, heldout)
 
 
 def _frames(capture: Capture, masks: Path) -> Iterator[UInt8[np.ndarray, "h w 3"]]:

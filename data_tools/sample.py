@@ -7,8 +7,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from data_tools.capture import refuse_existing, write_capture
+from data_tools.capture import write_capture
 from data_tools.command import run_command
+from data_tools.folder import refuse_existing
 from data_tools.motion import turn_in_a_pose
 from data_tools.options import assemble, capture_parser, check_options, recipe_of, stage_scene
 from data_tools.person import make_person

@@ -6,8 +6,10 @@ the packages are neither needed nor run. Python 2's pickles are read too; their 
 """
 
 import pickle
+import struct
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
@@ -26,6 +28,7 @@ _DAMAGE = (
     MemoryError,
     TypeError,
     ValueError,
+    struct.error,
 )
 
 
@@ -107,15 +110,32 @@ def load_pickle(path: Path, records: Iterable[str] = ()) -> Any:
     Raises:
         UserError: naming the file and what it asks for beyond that, or that it is damaged or absent.
     """
+    with opened(path) as file:
+        return RestrictedUnpickler(file, records).load()
+
+
+def load_npy(path: Path) -> np.ndarray:
+    """Read a `.npy` file; what an array of objects holds is read as by `load_pickle`. Raises UserError as it does."""
+    with opened(path) as file:
+        is_first_version = np.lib.format.read_magic(file) == (1, 0)
+        if is_first_version and np.lib.format.read_array_header_1_0(file)[2].hasobject:
+            return np.asarray(RestrictedUnpickler(file).load())
+        file.seek(0)
+        return np.asarray(np.load(file, allow_pickle=False))
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[IO[bytes]]:
+    """The open file; whatever unpickling from it can raise becomes a UserError that names it."""
     try:
         with path.open("rb") as file:
-            return RestrictedUnpickler(file, records).load()
+            yield file
     except FileNotFoundError:
-        raise UserError(f"{path} does not exist; give a pickle of arrays") from None
+        raise UserError(f"{path} does not exist; give a file of arrays") from None
     except RefusedGlobalError as refused:
         raise UserError(
             f"{path} is refused: it asks for `{refused}`, and only numpy arrays and plain containers are read; "
             "store the arrays as .npz"
         ) from None
     except _DAMAGE as error:
-        raise UserError(f"{path} cannot be read as a pickle ({error}); fetch or write it again") from None
+        raise UserError(f"{path} cannot be read as pickled arrays ({error}); fetch or write it again") from None

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.core.errors import UserError
 from pipeline.io import safe_pickle
-from pipeline.io.safe_pickle import Record, load_pickle
+from pipeline.io.safe_pickle import Record, load_npy, load_pickle
 
 
 class Call:
@@ -162,6 +162,24 @@ def test_damaged_and_absent_files_are_named(tmp_path):
             load_pickle(path)
     with pytest.raises(UserError, match="does not exist"):
         load_pickle(tmp_path / "none.pkl")
+
+
+@pytest.mark.parametrize("array", [np.arange(6.0).reshape(2, 3), np.array({"a.png": np.eye(3)}, dtype=object)])
+def test_npy_files_of_numbers_and_of_objects(tmp_path, array):
+    np.save(tmp_path / "a.npy", array, allow_pickle=True)
+    read = load_npy(tmp_path / "a.npy")
+    assert read.shape == array.shape
+    np.testing.assert_equal(read.tolist(), array.tolist())
+
+
+def test_npy_files_run_nothing(tmp_path):
+    np.save(tmp_path / "a.npy", np.array(Call(os.system, f"touch {tmp_path / 'marker'}"), dtype=object))
+    with pytest.raises(UserError, match=r"a\.npy is refused: it asks for `.*system`"):
+        load_npy(tmp_path / "a.npy")
+    assert not (tmp_path / "marker").exists()
+    (tmp_path / "a.npy").write_bytes(b"rubbish")
+    with pytest.raises(UserError, match=r"a\.npy cannot be read"):
+        load_npy(tmp_path / "a.npy")
 
 
 def test_every_allowed_name_makes_plain_things_only():

@@ -1,0 +1,92 @@
+"""Folders as InstantAvatar's scripts make them (Jiang et al. 2023), one a subject.
+
+    images/                   undistorted pictures
+    masks/                    as many masks, .npy (0 and 1) or .png
+    cameras.npz               intrinsic (3, 3), extrinsic (4, 4) world to camera, height, width
+    poses/anim_nerf_train.npz, anim_nerf_test.npz
+                              SMPL poses of the frames of each set (not for all subjects): global_orient, body_pose,
+                              transl for each frame, betas once
+    poses_optimized.npz, poses.npz
+                              poses of all frames: thetas (n, 72) or global_orient and body_pose, transl, betas
+
+Masks and poses may be absent. Which frames belong to a set stands in InstantAvatar's configuration, not in the folder:
+`protocol.py` has it. Its rays go through whole pixel numbers; the camera is taken as in `people_snapshot.py`, where it
+comes from.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Shaped
+
+from data_tools.convert.protocol import split_of_subject
+from data_tools.convert.recording import Recording, check_size, mask_folder
+from data_tools.convert.smpl_rows import gender_of, joined, smpl_rows
+from pipeline.core.errors import UserError
+from pipeline.core.progress import warn
+from pipeline.io.npz import load_npz
+from pipeline.io.smpl_poses import SmplPoses
+from pipeline.io.supplied import SuppliedCamera
+from pipeline.io.video import Source, open_source
+
+_CAMERA = "cameras.npz"
+_POSES_OF_SETS = {"train": "poses/anim_nerf_train.npz", "heldout": "poses/anim_nerf_test.npz"}
+_POSES_OF_ALL = ("poses_optimized.npz", "poses.npz")
+
+
+def is_instant_avatar(folder: Path) -> bool:
+    """True for a folder with this format's camera and pictures."""
+    return (folder / _CAMERA).is_file() and (folder / "images").is_dir()
+
+
+def read_instant_avatar(folder: Path) -> Recording:
+    """Look at one subject's folder; pictures and masks are read later.
+
+    Raises:
+        UserError: a file that is there cannot be read or does not fit the pictures.
+    """
+    source = open_source(folder)
+    camera, world_to_camera = _read_camera(folder / _CAMERA, source)
+    subject = folder.resolve().name
+    split = split_of_subject(subject, source)
+    return Recording(
+        source=source,
+        read_mask=mask_folder(folder / "masks", source) if (folder / "masks").is_dir() else None,
+        camera=camera,
+        split=split,
+        poses=_read_poses(folder, split, source.n_frames, world_to_camera, gender_of(subject)),
+    )
+
+
+def _read_camera(path: Path, source: Source) -> tuple[SuppliedCamera, Float[np.ndarray, "4 4"]]:
+    arrays = load_npz(path)
+    for name, shape in (("intrinsic", (3, 3)), ("extrinsic", (4, 4)), ("height", ()), ("width", ())):
+        found = arrays[name].shape if name in arrays else None
+        if found != shape:
+            raise UserError(f"{path}: `{name}` must have shape {shape}, found {found}; give another cameras.npz")
+    check_size(source, float(arrays["width"]), float(arrays["height"]), path)
+    matrix = arrays["intrinsic"].astype(np.float64)
+    camera = SuppliedCamera(float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2]))
+    return camera, arrays["extrinsic"].astype(np.float64)
+
+
+def _read_poses(
+    folder: Path,
+    split: Mapping[str, Sequence[int]] | None,
+    n_frames: int,
+    world_to_camera: Float[np.ndarray, "4 4"],
+    gender: str,
+) -> SmplPoses | None:
+    """The poses of the two sets where it is known which frames they are of, else those of all frames."""
+
+    def rows(name: str, frame_index: Sequence[int]) -> SmplPoses:
+        arrays: dict[str, Shaped[np.ndarray, "..."]] = load_npz(folder / name)
+        return smpl_rows(arrays, np.array(frame_index), world_to_camera, gender, folder / name)
+
+    of_sets = {name: file for name, file in _POSES_OF_SETS.items() if (folder / file).is_file()}
+    if of_sets and split is not None:
+        return joined([rows(file, split[name]) for name, file in of_sets.items()])
+    if of_sets:
+        warn(f"nothing says which frames {folder / 'poses'} is of; its poses are left out")
+    return next((rows(name, range(n_frames)) for name in _POSES_OF_ALL if (folder / name).is_file()), None)

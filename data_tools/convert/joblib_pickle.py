@@ -1,0 +1,53 @@
+"""Files of joblib's `dump` without compression, read under the rules of `pipeline.io.safe_pickle`.
+
+Such a file is a pickle that stands still after each array: an object with the array's shape, order and type, and then
+the array's bytes, raw (since joblib 1.2 after a byte that counts filling bytes, and these).
+"""
+
+import pickle
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from pipeline.io.safe_pickle import Record, RestrictedUnpickler, opened
+
+_WRAPPER = "joblib.numpy_pickle.NumpyArrayWrapper"
+
+
+def load_joblib(path: Path) -> Any:
+    """Read arrays and plain containers. Raises UserError as `pipeline.io.safe_pickle.load_pickle`."""
+    with opened(path) as file:
+        return _JoblibUnpickler(file).load()
+
+
+# The unpickler in Python, which joblib uses too: the one in C reads ahead, beyond where the arrays lie.
+_PythonUnpickler: Any = pickle._Unpickler
+
+
+class _JoblibUnpickler(_PythonUnpickler):
+    def __init__(self, file: IO[bytes]) -> None:
+        super().__init__(file, encoding="latin1")
+        self._raw = file
+        self._guard = RestrictedUnpickler(file, records=[_WRAPPER])
+
+    def find_class(self, module_name: str, global_name: str) -> Any:
+        return self._guard.find_class(module_name, global_name)
+
+    def load_build(self) -> None:
+        """As in pickle; an array's description then gives way to the array."""
+        super().load_build()
+        if isinstance(self.stack[-1], Record):
+            self.stack[-1] = self._read_array(self.stack[-1].state)
+
+    def _read_array(self, facts: dict[str, Any]) -> np.ndarray:
+        shape, dtype = facts["shape"], np.dtype(facts["dtype"])
+        if dtype.hasobject:
+            raise pickle.UnpicklingError("it holds an array of objects")
+        if facts.get("numpy_array_alignment_bytes") is not None:
+            self._raw.read(self._raw.read(1)[0])
+        count = int(np.prod([int(side) for side in shape], dtype=object))
+        data = self._raw.read(count * dtype.itemsize)
+        return np.frombuffer(data, dtype, count).reshape(shape, order=facts["order"]).copy()
+
+    dispatch = {**_PythonUnpickler.dispatch, pickle.BUILD[0]: load_build}

@@ -1,0 +1,101 @@
+"""PeopleSnapshot as it is distributed (Alldieck et al. 2018), one folder a subject.
+
+    SUBJECT.mp4               the video
+    camera.pkl                camera_f, camera_c (pixels), camera_k (OpenCV's five), camera_rt (axis-angle), camera_t,
+                              width, height
+    masks.hdf5                `masks` (n, h, w), 0 and 1
+    reconstructed_poses.hdf5  `pose` (n, 72), `trans` (n, 3), `betas` (10,)
+    keypoints.hdf5            18 OpenPose joints a frame: left to the detector, whose 33 landmarks the body fit reads
+
+All but the video may be absent. The principal point is taken as it stands: it is half of the picture, which is the
+centre where pixel centres lie at +0.5.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import h5py
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from data_tools.convert.protocol import split_of_subject
+from data_tools.convert.recording import Recording, check_size, mask_levels
+from data_tools.convert.smpl_rows import gender_of, smpl_rows
+from pipeline.core.errors import UserError
+from pipeline.io.safe_pickle import load_pickle
+from pipeline.io.smpl_poses import SmplPoses
+from pipeline.io.supplied import SuppliedCamera
+from pipeline.io.video import Source, open_source
+
+_CAMERA, _MASKS, _POSES = "camera.pkl", "masks.hdf5", "reconstructed_poses.hdf5"
+_CAMERA_SIZES = {"camera_f": 2, "camera_c": 2, "camera_k": 5, "camera_rt": 3, "camera_t": 3, "width": 1, "height": 1}
+
+
+def is_people_snapshot(folder: Path) -> bool:
+    """True for a folder with a file that only this format has."""
+    return any((folder / name).is_file() for name in (_CAMERA, _MASKS, _POSES))
+
+
+def read_people_snapshot(folder: Path) -> Recording:
+    """Look at one subject's folder; pictures and masks are read later.
+
+    Raises:
+        UserError: a file that is there cannot be read or does not fit the video.
+    """
+    source = open_source(folder)
+    subject, camera, poses, world_to_camera = folder.resolve().name, None, None, np.eye(4)
+    if (folder / _CAMERA).is_file():
+        camera, world_to_camera = _read_camera(folder / _CAMERA, source)
+    if (folder / _POSES).is_file():
+        poses = _read_poses(folder / _POSES, world_to_camera, gender_of(subject))
+    return Recording(
+        source=source,
+        read_mask=_mask_reader(folder / _MASKS, source) if (folder / _MASKS).is_file() else None,
+        camera=camera,
+        split=split_of_subject(subject, source),
+        poses=poses,
+    )
+
+
+def _read_camera(path: Path, source: Source) -> tuple[SuppliedCamera, Float[np.ndarray, "4 4"]]:
+    """Intrinsics with distortion, and world_to_camera."""
+    stored = load_pickle(path)
+    values = {}
+    for name, size in _CAMERA_SIZES.items():
+        number = np.asarray(stored.get(name) if isinstance(stored, dict) else None)
+        if number.size != size or not np.issubdtype(number.dtype, np.number):
+            raise UserError(f"{path} has no `{name}` of {size} numbers; give PeopleSnapshot's own camera.pkl")
+        values[name] = number.astype(np.float64).reshape(-1)
+    check_size(source, float(values["width"][0]), float(values["height"][0]), path)
+    world_to_camera = np.eye(4)
+    world_to_camera[:3, :3] = cv2.Rodrigues(values["camera_rt"])[0]
+    world_to_camera[:3, 3] = values["camera_t"]
+    (fx, fy), (cx, cy), distortion = (values[f"camera_{letter}"].tolist() for letter in "fck")
+    return SuppliedCamera(fx, fy, cx, cy, tuple(distortion)), world_to_camera
+
+
+def _mask_reader(path: Path, source: Source) -> Callable[[int], UInt8[np.ndarray, "h w"]]:
+    """Reads one mask at a time: all of them together would fill the memory."""
+    shape = _read_hdf5(path, "masks", lambda masks: masks.shape)
+    if len(shape) != 3 or shape[0] < source.n_frames:
+        raise UserError(
+            f"{path}: `masks` has shape {shape} for the {source.n_frames} frames of {source.path}; "
+            "give the (frames, height, width) masks of this video"
+        )
+    return lambda index: mask_levels(_read_hdf5(path, "masks", lambda masks: masks[index]), path)
+
+
+def _read_poses(path: Path, world_to_camera: Float[np.ndarray, "4 4"], gender: str) -> SmplPoses:
+    arrays = {name: _read_hdf5(path, name, np.asarray) for name in ("pose", "trans", "betas")}
+    return smpl_rows(arrays, np.arange(len(arrays["pose"])), world_to_camera, gender, path)
+
+
+def _read_hdf5(path: Path, name: str, take: Callable[[h5py.Dataset], Any]) -> Any:
+    """What `take` takes from the data set of this name."""
+    try:
+        with h5py.File(path, "r") as file:
+            return take(file[name])
+    except (OSError, KeyError) as error:
+        raise UserError(f"{path} cannot be read as HDF5 with a data set `{name}` ({error}); replace it") from None

@@ -1,0 +1,80 @@
+"""SMPL parameters under the names that research code stores them by, as rows of one layout."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int, Shaped
+
+from pipeline.core.errors import UserError
+from pipeline.io.smpl_poses import N_BETAS, N_BODY_POSE, SmplPoses
+
+_WHOLE_POSE = ("thetas", "pose")
+_TRANSLATION = ("transl", "trans")
+
+
+def smpl_rows(
+    arrays: Mapping[str, Shaped[np.ndarray, "..."]],
+    frame_index: Int[np.ndarray, "n"],
+    smpl_to_camera: Float[np.ndarray, "... 4 4"],
+    gender: str,
+    path: Path,
+) -> SmplPoses:
+    """Poses of n frames.
+
+    Args:
+        arrays: `thetas` or `pose` (n or more, 72), or `global_orient` (.., 3) and `body_pose` (.., 69); `transl` or
+            `trans` (.., 3); `betas` (10,), (1, 10) or (.., 10). Rows beyond n are left out.
+        smpl_to_camera: one for all, or one a frame.
+        path: named in errors.
+
+    Raises:
+        UserError: an array is missing, too short or of another width.
+    """
+    n = len(frame_index)
+    whole = [arrays[name] for name in _WHOLE_POSE if name in arrays]
+    if whole:
+        pose = _rows(whole[0], n, 3 + N_BODY_POSE, "the pose", path)
+    else:
+        orient = _rows(arrays.get("global_orient"), n, 3, "`global_orient`", path)
+        pose = np.concatenate([orient, _rows(arrays.get("body_pose"), n, N_BODY_POSE, "`body_pose`", path)], axis=1)
+    translation = next((arrays[name] for name in _TRANSLATION if name in arrays), None)
+    return SmplPoses(
+        frame_index=frame_index.astype(np.int32),
+        global_orient=pose[:, :3],
+        body_pose=pose[:, 3:],
+        transl=_rows(translation, n, 3, "the translation", path),
+        betas=_rows(_for_all(arrays.get("betas"), n), n, N_BETAS, "`betas`", path),
+        smpl_to_camera=np.broadcast_to(smpl_to_camera, (n, 4, 4)).astype(np.float32),
+        gender=gender,
+    )
+
+
+def joined(parts: Sequence[SmplPoses]) -> SmplPoses:
+    """Poses of different frames as one table in rising order; all of one gender."""
+    index = np.concatenate([part.frame_index for part in parts])
+    order = np.argsort(index)
+    rows = {
+        name: np.concatenate([getattr(part, name) for part in parts])[order]
+        for name in ("global_orient", "body_pose", "transl", "betas", "smpl_to_camera")
+    }
+    return SmplPoses(frame_index=index[order], **rows, gender=parts[0].gender)
+
+
+def gender_of(subject: str) -> str:
+    """What PeopleSnapshot's names of subjects begin with; unknown for other names."""
+    return next((gender for gender in ("female", "male", "neutral") if subject.startswith(gender)), "unknown")
+
+
+def _for_all(betas: Shaped[np.ndarray, "..."] | None, n: int) -> Shaped[np.ndarray, "..."] | None:
+    """One shape repeated for every frame; anything else as it is."""
+    return np.tile(betas.reshape(1, -1), (n, 1)) if betas is not None and betas.size == N_BETAS else betas
+
+
+def _rows(
+    values: Shaped[np.ndarray, "..."] | None, n: int, width: int, name: str, path: Path
+) -> Float[np.ndarray, "n w"]:
+    if values is None or values.ndim != 2 or values.shape[1] != width or len(values) < n:
+        found = None if values is None else values.shape
+        raise UserError(f"{path}: {name} must have {n} rows of {width} numbers, found {found}; give the right file")
+    return values[:n].astype(np.float32)

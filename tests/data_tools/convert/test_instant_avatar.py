@@ -1,0 +1,139 @@
+"""InstantAvatar's folders: round trips, its sets of frames, and the real pose files."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from data_tools.convert.instant_avatar import is_instant_avatar, read_instant_avatar
+from data_tools.convert.protocol import _SETS
+from data_tools.convert.recording import write_recording
+from pipeline.core.errors import UserError
+from pipeline.core.progress import take_warnings
+from pipeline.io.image import read_rgb, write_gray
+from pipeline.io.smpl_poses import load_smpl_poses
+from pipeline.io.supplied import find_supplied
+from pipeline.io.video import open_source
+from tests.data_tools.convert import made_up
+
+SUBJECT = "male-3-casual"
+TRAIN, HELDOUT = list(range(0, 456, 4)), list(range(456, 676, 4))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """One unknown subject of six frames."""
+    made_up.instant_avatar(tmp_path / "somebody")
+    return tmp_path / "somebody"
+
+
+@pytest.fixture(scope="module")
+def subject(tmp_path_factory):
+    """A known subject of 673 frames, just enough for its split, without poses of the sets."""
+    folder = tmp_path_factory.mktemp("known") / SUBJECT
+    made_up.instant_avatar(folder, HELDOUT[-1] + 1)
+    return folder
+
+
+def test_round_trip(folder, tmp_path):
+    assert is_instant_avatar(folder)
+    write_recording(read_instant_avatar(folder), tmp_path / "out")
+    source = open_source(tmp_path / "out")
+    supplied = find_supplied(tmp_path / "out", source)
+    for k, (picture, mask) in enumerate(zip(made_up.pictures(6), made_up.masks(6), strict=True)):
+        np.testing.assert_array_equal(read_rgb(source.files[k]), picture)
+        np.testing.assert_array_equal(supplied.read_mask(k), 255 * mask)
+    assert (supplied.camera.fx, supplied.camera.fy, supplied.camera.cx, supplied.camera.cy) == (30, 31, 8, 6)
+    assert supplied.camera.distortion == ()
+    assert supplied.split is None
+    poses = load_smpl_poses(tmp_path / "out" / "smpl_poses.npz")
+    pose = made_up.numbers("pose", 6)
+    np.testing.assert_array_equal(np.concatenate([poses.global_orient, poses.body_pose], axis=1), pose)
+    np.testing.assert_array_equal(poses.transl, made_up.numbers("transl", 6))
+    assert poses.gender == "unknown"
+    assert (poses.smpl_to_camera[:, 2, 3] == 1).all()
+
+
+def test_a_known_subject_keeps_its_sets_and_their_poses(subject, tmp_path):
+    train, test = made_up.poses_of_set(len(TRAIN), 5), made_up.poses_of_set(len(HELDOUT), 6)
+    shutil.copytree(subject, tmp_path / SUBJECT)
+    np.savez(tmp_path / SUBJECT / "poses" / "anim_nerf_train.npz", **train)
+    np.savez(tmp_path / SUBJECT / "poses" / "anim_nerf_test.npz", **test)
+    write_recording(read_instant_avatar(tmp_path / SUBJECT), tmp_path / "out")
+    split = find_supplied(tmp_path / "out", open_source(tmp_path / "out")).split
+    np.testing.assert_array_equal(split.frame_index, TRAIN + HELDOUT)
+    np.testing.assert_array_equal(split.frame_index[split.split == 2], HELDOUT)
+    np.testing.assert_array_equal(split.frame_index[split.split == 1], TRAIN[4::8])
+    poses = load_smpl_poses(tmp_path / "out" / "smpl_poses.npz")
+    np.testing.assert_array_equal(poses.frame_index, TRAIN + HELDOUT)
+    for name in ("global_orient", "body_pose", "transl"):
+        np.testing.assert_array_equal(getattr(poses, name), np.concatenate([train[name], test[name]]))
+    np.testing.assert_array_equal(poses.betas[[0, -1]], np.concatenate([train["betas"], test["betas"]]))
+    assert poses.gender == "male"
+    assert take_warnings() == []
+
+
+def test_the_real_pose_files_fit_the_split(subject, shared_data, tmp_path):
+    """The table of frames is right about the numbers of poses that InstantAvatar ships."""
+    shutil.copytree(subject, tmp_path / SUBJECT)
+    stored = {}
+    for name in ("train", "test"):
+        path = shared_data / "formats" / f"{SUBJECT}_{name}.npz"
+        shutil.copyfile(path, tmp_path / SUBJECT / "poses" / f"anim_nerf_{name}.npz")
+        stored[name] = np.load(path)
+    assert [len(stored[name]["transl"]) for name in stored] == [len(TRAIN), len(HELDOUT)]
+    poses = read_instant_avatar(tmp_path / SUBJECT).poses
+    np.testing.assert_array_equal(poses.transl[0], stored["train"]["transl"][0])
+    np.testing.assert_array_equal(poses.body_pose[-1], stored["test"]["body_pose"][-1])
+    assert (poses.transl[:, 2] > 5).all()
+
+
+@pytest.mark.parametrize("name", sorted(_SETS))
+def test_no_set_shares_a_frame(name):
+    train, heldout = _SETS[name]
+    assert not set(train) & set(heldout)
+
+
+def test_a_shorter_video_of_a_known_subject_gets_no_split(tmp_path):
+    made_up.instant_avatar(tmp_path / SUBJECT)
+    np.savez(tmp_path / SUBJECT / "poses" / "anim_nerf_train.npz", **made_up.poses_of_set(3, 5))
+    recording = read_instant_avatar(tmp_path / SUBJECT)
+    assert recording.split is None
+    assert len(recording.poses.frame_index) == 6
+    warnings = take_warnings()
+    assert "needs 673" in warnings[0]
+    assert "its poses are left out" in warnings[1]
+
+
+def test_masks_may_be_images_and_poses_absent(folder):
+    for k, mask in enumerate(made_up.masks(6)):
+        (folder / "masks" / f"mask_{k:04d}.npy").unlink()
+        write_gray(folder / "masks" / f"{k}.png", 200 * mask)
+    (folder / "poses.npz").unlink()
+    recording = read_instant_avatar(folder)
+    np.testing.assert_array_equal(recording.read_mask(3), 200 * made_up.masks(6)[3])
+    assert recording.poses is None
+
+
+def test_what_does_not_fit_is_named(folder):
+    np.savez(folder / "poses.npz", thetas=np.zeros((6, 69)), transl=np.zeros((6, 3)), betas=np.zeros(10))
+    with pytest.raises(UserError, match=r"poses.npz: the pose must have 6 rows of 72 numbers, found \(6, 69\)"):
+        read_instant_avatar(folder)
+    np.savez(folder / "poses.npz", thetas=np.zeros((6, 72)), betas=np.zeros(10))
+    with pytest.raises(UserError, match="the translation must have 6 rows of 3 numbers, found None"):
+        read_instant_avatar(folder)
+    (folder / "masks" / "mask_0003.npy").unlink()
+    with pytest.raises(UserError, match="5 masks for 6 pictures"):
+        read_instant_avatar(folder)
+    np.savez(folder / "cameras.npz", intrinsic=np.eye(3), extrinsic=np.eye(4), height=540, width=540)
+    with pytest.raises(UserError, match="for pictures of 540x540, those of .* are 16x12"):
+        read_instant_avatar(folder)
+    np.savez(folder / "cameras.npz", intrinsic=np.eye(4))
+    with pytest.raises(UserError, match="`intrinsic` must have shape"):
+        read_instant_avatar(folder)
+
+
+def test_a_mask_of_colours_is_refused(folder):
+    np.save(folder / "masks" / "mask_0002.npy", np.zeros((4, 4, 3)))
+    with pytest.raises(UserError, match=r"mask_0002.npy: a mask has shape \(4, 4, 3\)"):
+        read_instant_avatar(folder).read_mask(2)

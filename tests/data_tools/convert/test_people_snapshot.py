@@ -1,0 +1,136 @@
+"""PeopleSnapshot's folders: what goes in comes out, and every file that does not fit is named."""
+
+import os
+import pickle
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+
+from data_tools.convert.people_snapshot import is_people_snapshot, read_people_snapshot
+from data_tools.convert.recording import write_recording
+from pipeline.core.errors import UserError
+from pipeline.core.progress import take_warnings
+from pipeline.io.smpl_poses import load_smpl_poses
+from pipeline.io.supplied import find_supplied
+from pipeline.io.video import open_source, read_frames
+from tests.data_tools.convert import made_up
+
+
+def test_round_trip(tmp_path):
+    folder, target = tmp_path / "female-9-casual", tmp_path / "out"
+    camera = made_up.people_snapshot(folder)
+    assert is_people_snapshot(folder)
+    write_recording(read_people_snapshot(folder), target)
+    source = open_source(target)
+    read = np.stack([frame.rgb for frame in read_frames(source, lambda _: True, 999)])
+    np.testing.assert_allclose(read.astype(int), made_up.pictures(6), atol=3)
+    supplied = find_supplied(target, source)
+    for k, mask in enumerate(made_up.masks(6)):
+        np.testing.assert_array_equal(supplied.read_mask(k), 255 * mask)
+    assert (supplied.camera.fx, supplied.camera.fy, supplied.camera.cx, supplied.camera.cy) == (30, 31, 8, 6)
+    assert supplied.camera.distortion == tuple(camera["camera_k"])
+    assert supplied.camera.world_to_camera is None
+    assert supplied.split is None
+    assert "no split is known for female-9-casual" in take_warnings()[0]
+    poses = load_smpl_poses(target / "smpl_poses.npz")
+    np.testing.assert_array_equal(poses.frame_index, np.arange(6))
+    pose = made_up.numbers("pose", 6)
+    np.testing.assert_array_equal(np.concatenate([poses.global_orient, poses.body_pose], axis=1), pose)
+    np.testing.assert_array_equal(poses.transl, made_up.numbers("trans", 6))
+    np.testing.assert_array_equal(poses.betas, made_up.numbers("betas", 1).repeat(6, axis=0))
+    assert poses.gender == "female"
+    quarter_turn = np.array([[0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 3.0], [0, 0, 0, 1]])
+    np.testing.assert_allclose(poses.smpl_to_camera, np.tile(quarter_turn, (6, 1, 1)), atol=1e-6)
+
+
+def test_a_pickle_of_python_2_with_float_scalars(tmp_path):
+    made_up.people_snapshot(tmp_path / "s")
+    stored = pickle.loads((tmp_path / "s" / "camera.pkl").read_bytes())
+    stored |= {"width": np.float64(made_up.WIDTH), "height": np.array([made_up.HEIGHT])}
+    (tmp_path / "s" / "camera.pkl").write_bytes(pickle.dumps(stored, protocol=0))
+    assert read_people_snapshot(tmp_path / "s").camera.fx == 30
+
+
+def test_everything_but_the_video_may_be_absent(tmp_path):
+    made_up.people_snapshot(tmp_path / "s")
+    for name in ("camera.pkl", "reconstructed_poses.hdf5"):
+        (tmp_path / "s" / name).unlink()
+    recording = read_people_snapshot(tmp_path / "s")
+    assert (recording.camera, recording.poses) == (None, None)
+    assert recording.read_mask(2).max() == 255
+    (tmp_path / "s" / "masks.hdf5").unlink()
+    assert not is_people_snapshot(tmp_path / "s")
+
+
+def test_a_malicious_camera_is_refused_and_not_run(tmp_path):
+    made_up.people_snapshot(tmp_path / "s")
+
+    class Malice:
+        def __reduce__(self):
+            return os.system, (f"touch {tmp_path / 'marker'}",)
+
+    (tmp_path / "s" / "camera.pkl").write_bytes(pickle.dumps({"camera_f": Malice()}, protocol=2))
+    with pytest.raises(UserError, match=r"camera\.pkl is refused"):
+        read_people_snapshot(tmp_path / "s")
+    assert not (tmp_path / "marker").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"camera_f": np.zeros(3)}, "no `camera_f` of 2 numbers"),
+        ({"camera_k": None}, "no `camera_k` of 5 numbers"),
+        ({"width": 1080, "height": 1080}, "for pictures of 1080x1080, those of .* are 16x12"),
+    ],
+)
+def test_a_camera_that_does_not_fit_is_named(tmp_path, change, message):
+    camera = made_up.people_snapshot(tmp_path / "s")
+    (tmp_path / "s" / "camera.pkl").write_bytes(pickle.dumps(camera | change))
+    with pytest.raises(UserError, match=message):
+        read_people_snapshot(tmp_path / "s")
+    (tmp_path / "s" / "camera.pkl").write_bytes(pickle.dumps([1, 2]))
+    with pytest.raises(UserError, match="no `camera_f`"):
+        read_people_snapshot(tmp_path / "s")
+
+
+def test_masks_and_poses_that_do_not_fit_are_named(tmp_path):
+    made_up.people_snapshot(tmp_path / "s")
+    with h5py.File(tmp_path / "s" / "masks.hdf5", "w") as file:
+        file["masks"] = made_up.masks(5)
+    with pytest.raises(UserError, match=r"masks.hdf5: `masks` has shape \(5, 12, 16\) for the 6 frames"):
+        read_people_snapshot(tmp_path / "s")
+    with h5py.File(tmp_path / "s" / "masks.hdf5", "w") as file:
+        file["mask"] = made_up.masks(6)
+    with pytest.raises(UserError, match="data set `masks`"):
+        read_people_snapshot(tmp_path / "s")
+    (tmp_path / "s" / "masks.hdf5").unlink()
+    with h5py.File(tmp_path / "s" / "reconstructed_poses.hdf5", "a") as file:
+        del file["trans"]
+        file["trans"] = np.zeros((2, 3))
+    with pytest.raises(UserError, match=r"the translation must have 6 rows of 3 numbers, found \(2, 3\)"):
+        read_people_snapshot(tmp_path / "s")
+
+
+def test_poses_of_a_longer_video_are_refused(tmp_path):
+    made_up.people_snapshot(tmp_path / "s")
+    with h5py.File(tmp_path / "s" / "reconstructed_poses.hdf5", "a") as file:
+        for name in ("pose", "trans"):
+            del file[name]
+            file[name] = made_up.numbers(name, 9)
+    with pytest.raises(UserError, match="has 6 frames, its SMPL poses go to frame 8"):
+        write_recording(read_people_snapshot(tmp_path / "s"), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_real_folder(shared_data):
+    """A re-encoded subject, without camera and poses: its masks lie on the person."""
+    recording = read_people_snapshot(shared_data / "real" / "dakse")
+    frame = next(read_frames(recording.source, lambda index: index == 100, 999))
+    mask = recording.read_mask(100)
+    assert mask.shape == frame.rgb.shape[:2]
+    green = frame.rgb[..., 1].astype(int) - frame.rgb[..., ::2].max(axis=-1)
+    inside = cv2.erode(mask, np.ones((9, 9), np.uint8)) > 0
+    assert (green[inside] < 14).mean() > 0.97
+    assert (green[cv2.dilate(mask, np.ones((9, 9), np.uint8)) == 0] >= 14).mean() > 0.97
