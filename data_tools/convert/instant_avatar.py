@@ -65,7 +65,7 @@ def _read_camera(path: Path, source: Source) -> tuple[SuppliedCamera, Float[np.n
         found = arrays[name].shape if name in arrays else None
         if found != shape:
             raise UserError(f"{path}: `{name}` must have shape {shape}, found {found}; give another cameras.npz")
-    check_size(source, float(arrays["width"]), float(arrays["height"]), path)
+    check_size(source, int(arrays["width"]), int(arrays["height"]), path)
     matrix = arrays["intrinsic"].astype(np.float64)
     camera = SuppliedCamera(float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2]))
     return camera, arrays["extrinsic"].astype(np.float64)

@@ -68,7 +68,7 @@ def _read_camera(path: Path, source: Source) -> tuple[SuppliedCamera, Float[np.n
         if number.size != size or not np.issubdtype(number.dtype, np.number):
             raise UserError(f"{path} has no `{name}` of {size} numbers; give PeopleSnapshot's own camera.pkl")
         values[name] = number.astype(np.float64).reshape(-1)
-    check_size(source, float(values["width"][0]), float(values["height"][0]), path)
+    check_size(source, int(values["width"][0]), int(values["height"][0]), path)
     world_to_camera = np.eye(4)
     world_to_camera[:3, :3] = cv2.Rodrigues(values["camera_rt"])[0]
     world_to_camera[:3, 3] = values["camera_t"]

@@ -118,15 +118,15 @@ def mask_levels(mask: Shaped[np.ndarray, "..."], path: Path) -> UInt8[np.ndarray
     return np.clip(np.rint(values * (255.0 if values.max(initial=0.0) <= 1.0 else 1.0)), 0, 255).astype(np.uint8)
 
 
-def check_size(source: Source, width_px: float, height_px: float, path: Path) -> None:
+def check_size(source: Source, width_px: int, height_px: int, path: Path) -> None:
     """Raise UserError when the pictures are not of the size that the camera in `path` was calibrated for."""
     frame = next(read_frames(source, lambda index: index == 0, max_side_px=1 << 30), None)
     if frame is None:
         raise UserError(f"{source.path} has no picture that can be read; give another recording")
     height, width = frame.rgb.shape[:2]
-    if (width, height) != (round(width_px), round(height_px)):
+    if (width, height) != (width_px, height_px):
         raise UserError(
-            f"{path} is for pictures of {width_px:g}x{height_px:g}, those of {source.path} are {width}x{height}; "
+            f"{path} is for pictures of {width_px}x{height_px}, those of {source.path} are {width}x{height}; "
             "give the original pictures"
         )
 

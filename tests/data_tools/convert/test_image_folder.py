@@ -1,0 +1,48 @@
+"""Image folders: masks under other names, or in the pictures' alpha."""
+
+import json
+
+import numpy as np
+import pytest
+
+from data_tools.convert.image_folder import is_image_folder, read_image_folder
+from data_tools.convert.recording import write_recording
+from pipeline.core.errors import UserError
+from pipeline.io.image import read_rgb, write_rgba
+from pipeline.io.supplied import find_supplied
+from pipeline.io.video import open_source
+from tests.data_tools.convert import made_up
+
+
+def check(target):
+    source = open_source(target)
+    supplied = find_supplied(target, source)
+    for k, (picture, mask) in enumerate(zip(made_up.pictures(6), made_up.masks(6), strict=True)):
+        np.testing.assert_array_equal(read_rgb(source.files[k]), picture)
+        np.testing.assert_array_equal(supplied.read_mask(k), 255 * mask)
+    return supplied
+
+
+@pytest.mark.parametrize("name", ["masks", "matte"])
+def test_masks_in_a_folder_of_any_usual_name(tmp_path, name):
+    made_up.images_with(tmp_path / "in", name)
+    assert is_image_folder(tmp_path / "in")
+    (tmp_path / "in" / "camera.json").write_text(json.dumps({"fx": 9, "fy": 9, "cx": 8, "cy": 6}))
+    write_recording(read_image_folder(tmp_path / "in"), tmp_path / "out")
+    assert check(tmp_path / "out").camera.fx == 9
+
+
+def test_masks_in_the_alpha_channel(tmp_path):
+    (tmp_path / "in").mkdir()
+    for k, (picture, mask) in enumerate(zip(made_up.pictures(6), made_up.masks(6), strict=True)):
+        write_rgba(tmp_path / "in" / f"{k}.png", np.concatenate([picture, 255 * mask[..., None]], axis=2))
+    assert is_image_folder(tmp_path / "in")
+    write_recording(read_image_folder(tmp_path / "in"), tmp_path / "out")
+    check(tmp_path / "out")
+
+
+def test_pictures_without_masks_need_no_conversion(tmp_path):
+    made_up.images_with(tmp_path / "in", "other")
+    assert not is_image_folder(tmp_path / "in")
+    with pytest.raises(UserError, match="no masks beside its pictures"):
+        read_image_folder(tmp_path / "in")

@@ -1,0 +1,123 @@
+"""NeuMan's scenes: cameras and poses against hand-made truth, masks inverted, splits by name."""
+
+import numpy as np
+import pytest
+
+from data_tools.convert.neuman import is_neuman, read_neuman
+from data_tools.convert.recording import write_recording
+from pipeline.core.errors import UserError
+from pipeline.io.image import write_gray
+from pipeline.io.smpl_poses import load_smpl_poses
+from pipeline.io.supplied import find_supplied
+from pipeline.io.video import open_source
+from tests.data_tools.convert import made_up
+from tests.data_tools.convert.joblib_writer import dump_joblib
+
+SCALE = 0.25
+PERSON = np.array([0.3, -0.2, 1.5])
+
+
+def camera_pose(k: int) -> tuple[np.ndarray, np.ndarray]:
+    """A camera that turns about +Z by k degrees (rotation and translation, world to camera)."""
+    angle = np.radians(k)
+    rotation = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    return rotation, np.array([0.01 * k, 0.0, 0.5])
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """Six pictures, the fifth of them not registered by COLMAP; the world's unit is four metres."""
+    folder = tmp_path / "scene"
+    made_up.images_with(folder, "segmentations")
+    for k, mask in enumerate(made_up.masks(6)):
+        write_gray(folder / "segmentations" / f"{k:05d}.png", 255 - 255 * mask)
+    (folder / "sparse").mkdir()
+    (folder / "sparse" / "cameras.txt").write_text("# Camera list\n1 PINHOLE 16 12 30.5 31.5 8.25 6.5\n")
+    lines = ["# Image list with two lines of data per image:"]
+    for k in (3, 0, 1, 2, 5):
+        half = np.radians(k) / 2
+        place = " ".join(map(str, camera_pose(k)[1]))
+        lines += [f"{k + 1} {np.cos(half)} 0 0 {np.sin(half)} {place} 1 {k:05d}.png", "1.5 2.5 -1" if k else ""]
+    (folder / "sparse" / "images.txt").write_text("\n".join(lines) + "\n")
+    rows = {"pose": list(made_up.numbers("pose", 6)), "betas": made_up.numbers("betas", 6)}
+    dump_joblib({1: rows}, folder / "smpl_output_optimized.pkl")
+    alignment = np.concatenate([SCALE * np.eye(3), SCALE * PERSON[None]])
+    np.save(folder / "alignments.npy", {f"{k:05d}.png": alignment for k in range(6)}, allow_pickle=True)
+    return folder
+
+
+def test_round_trip(scene, tmp_path):
+    assert is_neuman(scene)
+    write_recording(read_neuman(scene), tmp_path / "out")
+    source = open_source(tmp_path / "out")
+    supplied = find_supplied(tmp_path / "out", source)
+    assert source.n_frames == 6
+    for k, mask in enumerate(made_up.masks(6)):
+        np.testing.assert_array_equal(supplied.read_mask(k), 255 * mask)
+    camera = supplied.camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion) == (30.5, 31.5, 8.25, 6.5, ())
+    poses = load_smpl_poses(tmp_path / "out" / "smpl_poses.npz")
+    registered = [0, 1, 2, 3, 5]
+    np.testing.assert_array_equal(poses.frame_index, registered)
+    pose = made_up.numbers("pose", 6)[registered]
+    np.testing.assert_array_equal(np.concatenate([poses.global_orient, poses.body_pose], axis=1), pose)
+    np.testing.assert_array_equal(poses.betas, made_up.numbers("betas", 6)[registered])
+    assert poses.gender == "neutral"
+    assert (poses.transl == 0).all()
+
+
+def test_bodies_are_carried_to_the_camera_in_metres(scene):
+    """A point of SMPL's output, through the alignment, COLMAP's pose and back to metres, step by step."""
+    poses = read_neuman(scene).poses
+    point_m = np.array([0.1, 0.9, -0.05])
+    for row, k in enumerate(poses.frame_index):
+        rotation, translation = camera_pose(k)
+        in_world = SCALE * (point_m + PERSON)
+        in_camera = (rotation @ in_world + translation) / SCALE
+        found = poses.smpl_to_camera[row] @ np.append(point_m, 1.0)
+        np.testing.assert_allclose(found[:3], in_camera, atol=1e-5)
+
+
+def test_romps_poses_when_there_are_no_better_ones(scene):
+    (scene / "smpl_output_optimized.pkl").unlink()
+    dump_joblib(
+        {1: {"pose": 2 * made_up.numbers("pose", 6), "betas": np.zeros((6, 10))}}, scene / "smpl_output_romp.pkl"
+    )
+    poses = read_neuman(scene).poses
+    np.testing.assert_array_equal(poses.global_orient[1], 2 * made_up.numbers("pose", 6)[1, :3])
+    (scene / "alignments.npy").unlink()
+    assert read_neuman(scene).poses is None
+
+
+def test_split_files_name_pictures(scene, tmp_path):
+    for name, words in (("train", ["00000.png", "00002.png", "00004.png"]), ("val", ["00001.png"])):
+        (scene / f"{name}_split.txt").write_text("\n".join(words) + "\n")
+    assert read_neuman(scene).split is None
+    (scene / "test_split.txt").write_text("00005.png\n00003.png\n")
+    write_recording(read_neuman(scene), tmp_path / "out")
+    split = find_supplied(tmp_path / "out", open_source(tmp_path / "out")).split
+    np.testing.assert_array_equal(split.split, [0, 1, 0, 2, 0, 2])
+    (scene / "test_split.txt").write_text("00099.png\n")
+    with pytest.raises(UserError, match="names 00099.png, which is not in images/"):
+        read_neuman(scene)
+
+
+def test_what_does_not_fit_is_named(scene):
+    (scene / "segmentations" / "00002.png").unlink()
+    with pytest.raises(UserError, match="5 masks for 6 pictures"):
+        read_neuman(scene)
+    dump_joblib({1: {"pose": made_up.numbers("pose", 3), "betas": np.zeros((3, 10))}}, scene / "smpl_output_romp.pkl")
+    (scene / "smpl_output_optimized.pkl").unlink()
+    (scene / "segmentations" / "00002.png").write_bytes((scene / "segmentations" / "00001.png").read_bytes())
+    with pytest.raises(UserError, match="has poses of 3 pictures"):
+        read_neuman(scene)
+    dump_joblib({1: {}, 2: {}}, scene / "smpl_output_romp.pkl")
+    with pytest.raises(UserError, match="does not hold one person's poses"):
+        read_neuman(scene)
+    cameras = scene / "sparse" / "cameras.txt"
+    cameras.write_text("1 PINHOLE 32 24 61 63 16.5 13\n")
+    with pytest.raises(UserError, match="for pictures of 32x24, those of .* are 16x12"):
+        read_neuman(scene)
+    cameras.write_text("2 PINHOLE 16 12 61 63 16.5 13\n")
+    with pytest.raises(UserError, match="0 different cameras"):
+        read_neuman(scene)
