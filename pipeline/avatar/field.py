@@ -11,7 +11,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pipeline.avatar.frequency import FrequencyTrunk
 from pipeline.kernels.hashgrid import GridLayout, encode
+
+NO_GRID = GridLayout((), 1, 0)
 
 START_DENSITY_PER_M = 10.0
 """Before training a torso of 0.2 m is seen as 86 % opaque: enough for a signal, not so much that the inside gets
@@ -68,20 +71,29 @@ class _Decode(torch.autograd.Function):
 class Field(torch.nn.Module):
     """Colour and density of canonical points.
 
-    bounds_m: (2, 3) box outside which there is nothing. layout: the hash grid's levels, over that box.
+    bounds_m: (2, 3) box outside which there is nothing. layout: the hash grid's levels, over that box. trunk: a network
+    in the grid's place, whose layout then is NO_GRID. inverse_skinning: the way in which posed points come to the field
+    when it is shown, as in `pipeline.avatar.inverse`; it is the one that the field learnt with.
     """
 
     bounds_m: Tensor
 
     def __init__(
-        self, bounds_m: Float[np.ndarray, "2 3"], layout: GridLayout, hidden_width: int = 64, seed: int = 0
+        self,
+        bounds_m: Float[np.ndarray, "2 3"],
+        layout: GridLayout,
+        hidden_width: int = 64,
+        seed: int = 0,
+        trunk: FrequencyTrunk | None = None,
+        inverse_skinning: str = "baked",
     ) -> None:
         super().__init__()
-        self.layout = layout
+        self.layout, self.trunk, self.inverse_skinning = layout, trunk, inverse_skinning
+        width = trunk.width if trunk else layout.width
         self.register_buffer("bounds_m", torch.tensor(bounds_m, dtype=torch.float32))
         random = torch.Generator().manual_seed(seed)
         self.table = _uniform((layout.rows, layout.features), 1e-4, random)
-        self.hidden = _uniform((layout.width, hidden_width), math.sqrt(6 / layout.width), random)
+        self.hidden = _uniform((width, hidden_width), math.sqrt(6 / width), random)
         self.output = _uniform((hidden_width, 4), math.sqrt(1 / hidden_width), random)
         self.bias = torch.nn.Parameter(torch.zeros(4))
 
@@ -90,7 +102,7 @@ class Field(torch.nn.Module):
     ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
         """Colour and density without the cut at the bounds; for training. `table_gradient`: see `encode`."""
         unit = (x_canonical_m - self.bounds_m[0]) / (self.bounds_m[1] - self.bounds_m[0])
-        features = encode(unit, self.table, self.layout, table_gradient)
+        features = self.trunk(unit) if self.trunk else encode(unit, self.table, self.layout, table_gradient)
         return _Decode.apply(features, self.hidden, self.output, self.bias)
 
     def forward(self, x_canonical: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:

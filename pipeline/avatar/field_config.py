@@ -11,7 +11,7 @@ class FieldConfig(Config):
     """What steers the learning of the canonical field."""
 
     seed: int = Option(0, ge=0, description="seed of all random draws")
-    steps: int = Option(1600, ge=1, le=200_000, description="training steps")
+    steps: int = Option(1600, ge=0, le=200_000, description="training steps")
     rays: int = Option(4096, ge=64, le=1 << 18, description="rays a step")
     frames_per_step: int = Option(16, ge=1, le=64, description="frames that a step's rays come from")
     max_frames: int = Option(120, ge=2, description="training frames kept, evenly spread; each holds about 3 MB")
@@ -19,11 +19,19 @@ class FieldConfig(Config):
         640, ge=32, description="images are scaled down until the person is at most this tall, px"
     )
 
+    network: Literal["hashgrid", "frequency", "hull"] = Option(
+        "hashgrid", description="hash grid and one layer; sines and eight layers; or a dense grid carved from the masks"
+    )
+    inverse_skinning: Literal["baked", "broyden", "nearest"] = Option(
+        "baked", description="from posed to canonical: warp grids, a search for every sample, or the nearest vertex"
+    )
     levels: int = Option(6, ge=1, le=16, description="levels of the hash grid")
     features: Literal[1, 2, 4, 8] = Option(4, description="features a level")
     log2_rows: int = Option(17, ge=8, le=24, description="log2 of the most rows a level may have")
-    finest_cell_px: float = Option(1.0, gt=0, description="finest cell of the hash grid, in pixels at the body's depth")
+    finest_cell_px: float = Option(1.0, gt=0, description="finest cell of the grid, in pixels at the body's depth")
     hidden_width: int = Option(64, ge=8, le=512, description="width of the hidden layer")
+
+    hull_votes: float = Option(0.9, gt=0, le=1, description="part of the frames whose mask must hold a point of a hull")
 
     margin_m: float = Option(
         0.10, gt=0, le=0.6, description="how far clothing and hair may stand off the fitted body, m"

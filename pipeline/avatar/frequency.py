@@ -8,6 +8,8 @@ from torch import Tensor
 
 FREQUENCIES = 10
 """Octaves of the encoding (Mildenhall et al. 2020, section 5.1)."""
+LAYERS = 8
+"""Of the whole network, the field's own hidden layer included (Anim-NeRF's width is 256)."""
 SKIP = 4
 """Before this layer the encoding enters again."""
 

@@ -5,11 +5,13 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
 from pipeline.avatar.body import Body, Motion, canonical_to_world
-from pipeline.avatar.field import Field, choose_layout
+from pipeline.avatar.field import NO_GRID, Field, choose_layout
 from pipeline.avatar.field_config import FieldConfig
+from pipeline.avatar.frequency import LAYERS, FrequencyTrunk
+from pipeline.avatar.hull import carve, dense_layout
 from pipeline.avatar.occupancy import OccupancyUpdate, cell_centres
 from pipeline.avatar.rays import build_pool
 from pipeline.avatar.support import cell_distances_m, field_bounds_m, mask_frequency, starting_shell
@@ -62,7 +64,6 @@ def start_learning(
         camera,
         [dilate(pictures[row][1] >= 128, cell_px) for row in rows],
     )
-    layout = choose_layout(bounds_m, pixel_m * config.finest_cell_px, config.levels, config.features, config.log2_rows)
     occupancy = OccupancyUpdate(
         starting_shell(distance_m, frequency, config.margin_m, config.mask_support),
         distance_m,
@@ -75,8 +76,30 @@ def start_learning(
         seed=config.seed,
     )
     pool = build_pool(pictures, config.border_px, config.seed)
-    field = Field(bounds_m, layout, config.hidden_width, config.seed)
-    return Learning(Scene(body, motion, camera, pool, skin), field, occupancy, config)
+    scene = Scene(body, motion, camera, pool, skin)
+    return Learning(scene, first_field(scene, pictures, bounds_m, pixel_m, config), occupancy, config)
+
+
+def first_field(
+    scene: Scene,
+    pictures: Sequence[Picture],
+    bounds_m: Float[np.ndarray, "2 3"],
+    pixel_m: float,
+    config: FieldConfig,
+) -> Field:
+    """The field as it is before training: thin fog, or a hull carved from the masks. pixel_m: what a pixel covers."""
+    cell_m = pixel_m * config.finest_cell_px
+    if config.network == "hull":
+        poses = canonical_to_world(scene.body, scene.motion)
+        layout = dense_layout(bounds_m, cell_m, config.log2_rows)
+        return carve(scene.body, scene.skin, poses, scene.camera, pictures, bounds_m, layout, config.hull_votes)
+    # What Broyden's search finds, the warp grid and one Newton step find too, in a fraction of the time.
+    shown_by = "nearest" if config.inverse_skinning == "nearest" else "baked"
+    if config.network == "frequency":
+        trunk = FrequencyTrunk(LAYERS - 1, config.hidden_width, config.seed)
+        return Field(bounds_m, NO_GRID, config.hidden_width, config.seed, trunk, shown_by)
+    layout = choose_layout(bounds_m, cell_m, config.levels, config.features, config.log2_rows)
+    return Field(bounds_m, layout, config.hidden_width, config.seed, None, shown_by)
 
 
 def dilate(mask: np.ndarray, radius_px: float) -> UInt8[np.ndarray, "h w"]:

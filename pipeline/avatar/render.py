@@ -8,15 +8,15 @@ from torch import Tensor
 
 from pipeline.avatar.body import Body
 from pipeline.avatar.field import Field
+from pipeline.avatar.inverse import Inverse, Rays, invert_motion
 from pipeline.avatar.occupancy import Occupancy
 from pipeline.avatar.warp import build_skin_grid, posed_from_world, skin_margin_m
 from pipeline.geometry.camera import Camera, pixel_rays, project
 from pipeline.kernels.composite import composite
-from pipeline.kernels.march import WarpSet, march
-from pipeline.kernels.warp import SkinGrid, bake, newton
+from pipeline.kernels.warp import SkinGrid
 
 RAYS_AT_ONCE = 1 << 14
-STEPS_PER_HEIGHT = 250
+STEPS_PER_HEIGHT, MAX_SAMPLES = 250, 256
 
 
 def render_field(
@@ -36,15 +36,14 @@ def render_field(
     canonical_to_world = canonical_to_world.float()
     to_posed = posed_from_world(canonical_to_world[None])[0]
     canonical_to_posed = to_posed @ canonical_to_world
-    warps = WarpSet.of([bake(skin, canonical_to_posed)], skin.cell_m)
-    blended = skin.blend(canonical_to_posed[None])
+    inverse = invert_motion(field.inverse_skinning, body, skin, canonical_to_posed[None])
     step_m = body.height_m() / STEPS_PER_HEIGHT
     image = torch.zeros(camera.height, camera.width, 4)
-    for rows, columns in _pixels_in_box(warps, to_posed, camera):
+    for rows, columns in _pixels_in_box(inverse.boxes_m[0], to_posed, camera):
         pixels_px = torch.stack([columns, rows], dim=-1) + 0.5
         rays = _carry(*pixel_rays(camera, pixels_px), to_posed)
         with torch.no_grad():
-            image[rows, columns] = _shade(field, occupancy, skin, blended, warps, rays, step_m)
+            image[rows, columns] = _shade(field, occupancy, skin, canonical_to_posed, inverse, rays, step_m)
     return image
 
 
@@ -53,12 +52,12 @@ def _carry(origins: Tensor, directions: Tensor, matrix: Float[Tensor, "4 4"]) ->
     return origins @ rotation.T + matrix[:3, 3], directions @ rotation.T
 
 
-def _pixels_in_box(warps: WarpSet, to_posed: Float[Tensor, "4 4"], camera: Camera) -> Iterator[tuple[Tensor, Tensor]]:
+def _pixels_in_box(
+    box_m: Float[Tensor, "2 3"], to_posed: Float[Tensor, "4 4"], camera: Camera
+) -> Iterator[tuple[Tensor, Tensor]]:
     """Rows and columns of the pixels that may see the posed box, in parts."""
-    low = torch.from_numpy(warps.origin_m[0])
-    high = low + warps.cell_m * torch.from_numpy(warps.dims[0] - 1)
     unit = torch.tensor([[i & 1, i >> 1 & 1, i >> 2 & 1] for i in range(8)])
-    corners = (low + unit * (high - low) - to_posed[:3, 3]) @ to_posed[:3, :3]
+    corners = (box_m[0] + unit * (box_m[1] - box_m[0]) - to_posed[:3, 3]) @ to_posed[:3, :3]
     corners_px, depth_m = project(corners, camera)
     x0, y0, x1, y1 = 0, 0, camera.width, camera.height
     if bool((depth_m > 0.05).all()):
@@ -76,21 +75,19 @@ def _shade(
     field: Field,
     occupancy: Occupancy,
     skin: SkinGrid,
-    blended: Tensor,
-    warps: WarpSet,
+    canonical_to_posed: Float[Tensor, "j 4 4"],
+    inverse: Inverse,
     rays: tuple[Tensor, Tensor],
     step_m: float,
 ) -> Float[Tensor, "n 4"]:
     origins, directions = rays
     count = len(origins)
     frame, jitter = torch.zeros(count, dtype=torch.long), torch.full((count,), 0.5)
-    samples = march(
-        origins, directions, frame, jitter, step_m, warps, occupancy.occupied, occupancy.bounds_m, max_samples=256
-    )
+    samples = inverse.sample(Rays(origins, directions, frame, jitter), step_m, occupancy, MAX_SAMPLES)
     ray = torch.repeat_interleave(torch.arange(count), samples.ray_start.diff())
     posed = origins[ray] + samples.distance_m[:, None] * directions[ray]
-    slot_start = torch.tensor([0, len(ray)])
-    points = newton(blended, samples.canonical_m, posed, slot_start, skin)
+    slots = (torch.tensor([0]), samples.canonical_m, posed, torch.tensor([0, len(ray)]))
+    points = inverse.place(skin, canonical_to_posed[None], *slots)
     colour, density = field(points)
     image, alpha, _ = composite(density, colour, torch.full_like(density, step_m), samples.ray_start)
     return torch.cat([image, alpha[:, None]], dim=-1)

@@ -11,22 +11,25 @@ from torch import Tensor
 from pipeline.avatar.body import Body, Motion
 from pipeline.avatar.field import Field
 from pipeline.avatar.field_config import FieldConfig
+from pipeline.avatar.inverse import Rays, invert_motion
 from pipeline.avatar.losses import field_losses
 from pipeline.avatar.occupancy import OccupancyUpdate
 from pipeline.avatar.pose import PoseCorrection
 from pipeline.avatar.rays import PixelPool
-from pipeline.avatar.warp import bake_motion, posed_from_world
+from pipeline.avatar.warp import posed_from_world
 from pipeline.geometry.camera import Camera, pixel_rays
 from pipeline.kernels.adam import adam_step_
 from pipeline.kernels.composite import composite
-from pipeline.kernels.march import Samples, march
+from pipeline.kernels.march import Samples
 from pipeline.kernels.visits import light_before
-from pipeline.kernels.warp import SkinGrid, newton
+from pipeline.kernels.warp import SkinGrid
 
 WARM_UP = 20
 MAX_BAD_STEPS = 20
 REBAKES = (0.5, 0.75)
 """Parts of the training at which the warp grids follow the refined poses."""
+MAX_SAMPLES = 160
+"""Of a ray; those farther back are dropped."""
 LOOK_EVERYWHERE = 8
 """Every so many steps rays stop in unlit cells too, so that these may come to light again."""
 
@@ -89,7 +92,8 @@ class Learning:
             everything = torch.arange(self.scene.pool.frames)
             canonical_to_world = self.poses.canonical_to_world(everything)
             self.posed_from_world = posed_from_world(canonical_to_world)
-            self.warps = bake_motion(self.scene.skin, self.posed_from_world[:, None] @ canonical_to_world)
+            poses = self.posed_from_world[:, None] @ canonical_to_world
+            self.inverse = invert_motion(self.config.inverse_skinning, self.scene.body, self.scene.skin, poses)
 
     def _follow_occupancy(self) -> None:
         """Blend skinning only where samples can lie: a fifth of the nodes, and of the memory that a step touches."""
@@ -136,13 +140,13 @@ class Learning:
 
     def _follow_poses(self, batch: Batch, samples: Samples) -> Float[Tensor, "s 3"]:
         to_world = self.poses.canonical_to_world(batch.frames)
-        blended = self.skin.blend(self.posed_from_world[batch.frames][:, None] @ to_world)
+        poses = self.posed_from_world[batch.frames][:, None] @ to_world
         counts = samples.ray_start.diff()
         ray = torch.repeat_interleave(torch.arange(len(counts)), counts)
         posed = batch.origins_m[ray] + samples.distance_m[:, None] * batch.directions[ray]
         slots = torch.arange(len(batch.frames) + 1)
         slot_start = samples.ray_start[torch.searchsorted(batch.slot, slots)]
-        return newton(blended, samples.canonical_m, posed, slot_start, self.skin)
+        return self.inverse.place(self.skin, poses, batch.frames, samples.canonical_m, posed, slot_start)
 
     def _empty_points(self, random: np.random.Generator) -> Float[Tensor, "e 3"]:
         """Random points of the box that lie in empty cells."""
@@ -158,16 +162,8 @@ class Learning:
         batch = self._draw(random)
         look_everywhere = self.done % LOOK_EVERYWHERE == 0 or self.done < config.occupancy_start
         grid = self.occupancy.grid() if look_everywhere else self.occupancy.lit_grid()
-        samples = march(
-            batch.origins_m,
-            batch.directions,
-            batch.frames[batch.slot],
-            batch.jitter,
-            self.step_m,
-            self.warps,
-            grid.occupied,
-            grid.bounds_m,
-        )
+        rays = Rays(batch.origins_m, batch.directions, batch.frames[batch.slot], batch.jitter)
+        samples = self.inverse.sample(rays, self.step_m, grid, MAX_SAMPLES)
         count = len(samples.distance_m)
         points = torch.cat([self._place(batch, samples), self._empty_points(random)])
         colour, density = self.field.radiance(points, self.table_gradient)

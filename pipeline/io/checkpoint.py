@@ -10,6 +10,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from pipeline.avatar.field import Field
+from pipeline.avatar.frequency import FrequencyTrunk
 from pipeline.avatar.occupancy import Occupancy
 from pipeline.core.atomic import atomic_path
 from pipeline.core.errors import UserError
@@ -43,13 +44,15 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict]:
 
 
 def save_field(path: Path, field: Field) -> None:
-    """Write a field's weights and the shape of its hash grid."""
+    """Write a field's weights, the shape of its hash grid or network, and its way of inverse skinning."""
     layout = field.layout
     description = {
         "cells_per_axis": [list(cells) for cells in layout.cells_per_axis],
         "features": layout.features,
         "log2_rows": layout.log2_rows,
         "hidden_width": field.hidden.shape[1],
+        "trunk": [len(field.trunk.layers), field.trunk.width] if field.trunk else None,
+        "inverse_skinning": field.inverse_skinning,
     }
     save_tensors(path, dict(field.state_dict()), description)
 
@@ -60,7 +63,11 @@ def load_field(path: Path) -> Field:
     try:
         cells = tuple((int(x), int(y), int(z)) for x, y, z in description["cells_per_axis"])
         layout = GridLayout(cells, description["features"], description["log2_rows"])
-        field = Field(tensors["bounds_m"].numpy(), layout, description["hidden_width"])
+        # Files from before there was a choice have neither key.
+        trunk = FrequencyTrunk(*description["trunk"]) if description.get("trunk") else None
+        way = description.get("inverse_skinning", "baked")
+        bounds_m, width = tensors["bounds_m"].numpy(), description["hidden_width"]
+        field = Field(bounds_m, layout, width, trunk=trunk, inverse_skinning=way)
         field.load_state_dict(tensors)
     except (KeyError, RuntimeError, TypeError) as error:
         raise UserError(f"{path} holds no field ({error}); run stages.field again") from None

@@ -4,10 +4,10 @@ import torch
 
 from pipeline.avatar.body import canonical_to_world
 from pipeline.avatar.field_config import FieldConfig
+from pipeline.avatar.inverse import Rays
 from pipeline.avatar.prepare import spread, start_learning, training_scale
 from pipeline.avatar.render import over_white, render_field
-from pipeline.avatar.train import DivergedError
-from pipeline.kernels.march import march
+from pipeline.avatar.train import MAX_SAMPLES, DivergedError
 from tests.avatar.scene import painted_scene
 
 TRAIN = np.array([0, 1, 3, 4, 6, 7, 9, 10])
@@ -115,8 +115,8 @@ def test_poses_move_now_and_then_and_samples_follow_them_always(scene):
 def march_of(learning, batch):
     grid = learning.occupancy.grid()
     frames = batch.frames[batch.slot]
-    rays = (batch.origins_m, batch.directions, frames, batch.jitter)
-    return march(*rays, learning.step_m, learning.warps, grid.occupied, grid.bounds_m)
+    rays = Rays(batch.origins_m, batch.directions, frames, batch.jitter)
+    return learning.inverse.sample(rays, learning.step_m, grid, MAX_SAMPLES)
 
 
 def test_a_nan_never_reaches_a_parameter(scene):
