@@ -34,7 +34,7 @@ OPTIONS = $(RUN_OPTIONS) $(ARGS)
 STAMP := $(VENV)/.stamp$(if $(EXTRA),-$(EXTRA))
 
 .DEFAULT_GOAL := help
-.PHONY: help all $(STAGES) batch chart test test-all check format bench doctor venv lock configs gltf-validator clean
+.PHONY: help all $(STAGES) batch chart compare test test-all check format bench doctor venv lock configs gltf-validator clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z$$()A-Z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST) | sed 's/$$(STAGES)/STAGE    /'
@@ -71,6 +71,9 @@ $(SAMPLE)/.done: | $(STAMP)
 	rm -rf $(SAMPLE)
 	$(RUN_PYTHON) -m data_tools.sample $(SAMPLE)
 	@touch $@
+
+compare: $(STAMP)  ## RUN=runs/name against the truth of TRUTH=capture (the sample's by default): report/truth.html
+	$(RUN_PYTHON) -m data_tools.compare "$(or $(TRUTH),$(SAMPLE))" "$(ONE_RUN)"
 
 test: $(STAMP)  ## the fast tests, with the skip count
 	$(RUN_PYTHON) -m pytest -m "not slow" $(ARGS)

@@ -240,6 +240,20 @@ def closest_on_mesh(
     return np.sqrt(np.maximum(squared, 0.0)), face.astype(np.int64), barycentric
 
 
+class SurfaceTree:
+    """One mesh prepared for many rounds of questions: building the tree costs more than some thousand answers."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        self._arrays = mesh.vertices.astype(np.float64), mesh.faces.astype(np.int64)
+        self._tree = igl.AABB()
+        self._tree.init(*self._arrays)
+
+    def nearest(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """The place on the mesh nearest to each point."""
+        nearest: np.ndarray = self._tree.squared_distance(*self._arrays, np.ascontiguousarray(points, np.float64))[2]
+        return nearest
+
+
 def _barycentric(p: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> Float[np.ndarray, "n 3"]:
     """Barycentrics of points in the planes of triangles; all weight on a corner where the triangle has no area."""
     normal = np.cross(b - a, c - a)

@@ -54,11 +54,11 @@ class PageContent:
 def render_page(content: PageContent) -> str:
     """The whole HTML text."""
     report = content.report
-    return Template(_asset("report.html")).substitute(
+    return Template(asset("report.html")).substitute(
         title=escape(content.title),
         lead=escape(_lead(report)),
-        style=_asset("report.css"),
-        tiles="".join(_tile(*tile) for tile in _headline(report)),
+        style=asset("report.css"),
+        tiles="".join(tile(*texts) for texts in _headline(report)),
         warnings=_warnings(report["warnings"]),
         turntable="".join(_turntable_row(title, views) for title, views in content.turntable),
         protocol=escape(f"{report['heldout']['protocol']} LPIPS: {report['heldout']['lpips']}.") + _scale_note(),
@@ -69,8 +69,8 @@ def render_page(content: PageContent) -> str:
         tables=_tables(report),
         footer=escape(_footer(report["environment"])),
         glb=base64.b64encode(light_glb(content.glb)).decode(),
-        viewer_script=_asset("viewer.min.js"),
-        page_script=_asset("report.js"),
+        viewer_script=asset("viewer.min.js"),
+        page_script=asset("report.js"),
     )
 
 
@@ -123,7 +123,8 @@ def _decibel(value: float | None) -> str:
     return "–" if value is None else f"{value:.1f}"
 
 
-def _tile(value: str, unit: str, label: str) -> str:
+def tile(value: str, unit: str, label: str) -> str:
+    """One large figure."""
     return f'<div class="tile"><b>{escape(value)} <small>{escape(unit)}</small></b><span>{escape(label)}</span></div>'
 
 
@@ -136,7 +137,7 @@ def _warnings(messages: Sequence[str]) -> str:
 def _turntable_row(title: str, views: Sequence[UInt8[np.ndarray, "_ _ 4"]]) -> str:
     degrees = (round(360 * number / len(views)) for number in range(len(views)))
     images = [
-        f'<span style="flex:{view.shape[1] / view.shape[0]:.3f}">{_image(view, f"{title}, {angle} degrees")}</span>'
+        f'<span style="flex:{view.shape[1] / view.shape[0]:.3f}">{image_tag(view, f"{title}, {angle} degrees")}</span>'
         for view, angle in zip(views, degrees, strict=True)
     ]
     half = (len(images) + 1) // 2
@@ -158,7 +159,8 @@ def _frame_row(frame: FramePictures, report: Mapping[str, Any]) -> str:
         ("mesh-error", "error of the mesh", error_map(frame.mesh, frame.video)),
     ]
     figures = "".join(
-        f"<figure>{_image(pixels, f'frame {frame.index}, {caption}', kind)}<figcaption>{caption}</figcaption></figure>"
+        f"<figure>{image_tag(pixels, f'frame {frame.index}, {caption}', kind)}"
+        f"<figcaption>{caption}</figcaption></figure>"
         for kind, caption, pixels in pictures
     )
     values = "".join(
@@ -192,10 +194,11 @@ def _picture(caption: str, pixels: UInt8[np.ndarray, "h w 3"]) -> str:
     shrink = MAX_PICTURE_PX / max(pixels.shape[:2])
     if shrink < 1.0:
         pixels = cv2.resize(pixels, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-    return f'<figure class="card">{_image(pixels, caption)}<figcaption>{escape(caption)}</figcaption></figure>'
+    return f'<figure class="card">{image_tag(pixels, caption)}<figcaption>{escape(caption)}</figcaption></figure>'
 
 
-def _image(pixels: UInt8[np.ndarray, "h w c"], alt: str, kind: str | None = None) -> str:
+def image_tag(pixels: UInt8[np.ndarray, "h w c"], alt: str, kind: str | None = None) -> str:
+    """A picture inside the page."""
     mark = f' data-kind="{kind}"' if kind else ""
     height, width = pixels.shape[:2]
     return f'<img src="{webp_uri(pixels)}" alt="{escape(alt)}" width="{width}" height="{height}"{mark}>'
@@ -231,5 +234,6 @@ def _footer(environment: Mapping[str, Any]) -> str:
     return " · ".join(parts)
 
 
-def _asset(name: str) -> str:
+def asset(name: str) -> str:
+    """Text of a template, style or script."""
     return (ASSETS / name).read_text(encoding="utf-8")

@@ -6,8 +6,11 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.geometry.mesh import Mesh
-from pipeline.geometry.surface import closest_on_mesh
+from pipeline.geometry.surface import SurfaceTree
 from pipeline.metrics.surfaces import sample_surface
+
+SETTLED_M = 2e-5
+"""An alignment that moves no point farther than this in a round is finished."""
 
 
 @dataclass(frozen=True)
@@ -60,13 +63,11 @@ def align_surfaces(
     targets, _ = sample_surface(target, count, seed + 1)
     start_scale = float(np.sqrt(targets.var(axis=0).sum() / points.var(axis=0).sum())) if with_scale else 1.0
     found = Similarity(start_scale, np.eye(3), targets.mean(axis=0) - start_scale * points.mean(axis=0))
+    source_tree, target_tree = SurfaceTree(source), SurfaceTree(target)
     for _ in range(rounds):
-        sources = np.concatenate([points, _nearest(found.inverse()(targets), source)])
-        found = similarity_between(sources, np.concatenate([_nearest(found(points), target), targets]), with_scale)
+        before = found(points)
+        sources = np.concatenate([points, source_tree.nearest(found.inverse()(targets))])
+        found = similarity_between(sources, np.concatenate([target_tree.nearest(before), targets]), with_scale)
+        if np.abs(found(points) - before).max() < SETTLED_M:
+            break
     return found
-
-
-def _nearest(points: Float[np.ndarray, "n 3"], mesh: Mesh) -> Float[np.ndarray, "n 3"]:
-    """The place on the mesh nearest to each point."""
-    _, faces, barycentric = closest_on_mesh(points, mesh)
-    return np.einsum("nk,nkc->nc", barycentric, mesh.vertices[mesh.faces[faces]].astype(np.float64))

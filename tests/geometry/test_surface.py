@@ -5,6 +5,7 @@ import pytest
 
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import (
+    SurfaceTree,
     closest_on_mesh,
     compact,
     is_closed_manifold,
@@ -207,6 +208,7 @@ def test_closest_point_against_brute_force(sphere: Mesh) -> None:
     assert barycentric.min() >= 0.0
     nearest = np.einsum("nk,nkc->nc", barycentric, sphere.vertices[sphere.faces[face]])
     np.testing.assert_allclose(np.linalg.norm(nearest - points, axis=1), distance, atol=1e-6)
+    np.testing.assert_allclose(SurfaceTree(sphere).nearest(points), nearest, atol=1e-6)
     weights = np.random.default_rng(4).dirichlet(np.ones(3), size=200)
     samples = np.einsum("sk,fkc->fsc", weights, sphere.vertices[sphere.faces]).reshape(-1, 3)
     brute = np.sqrt(((points[:, None] - samples[None, ::7]) ** 2).sum(axis=2)).min(axis=1)

@@ -1,0 +1,96 @@
+"""A run that found the truth of the sample, in memory, to be spoilt in known ways."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from data_tools.compare_avatar import Comparison
+from data_tools.truth import load_truth
+from pipeline.avatar.body import Motion, canonical_to_world
+from pipeline.avatar.selection import split_of
+from pipeline.avatar.textured import TexturedAvatar
+from pipeline.geometry.rotation import axis_angle_to_quaternion, quaternion_multiply
+from pipeline.geometry.skinning import top_k_weights
+from pipeline.io.avatar import FinishedRun
+from pipeline.io.capture import Capture, image_path, mask_path
+from pipeline.io.image import write_gray, write_rgb
+
+
+def perfect_run(sample: Path, folder: Path) -> Comparison:
+    """The true person, texture, poses and camera as if the pipeline had found them; its frames lie in `folder`."""
+    truth = load_truth(sample)
+    subject, index = truth.subject, truth.motion.frame_index
+    for path in (image_path(folder, 0), mask_path(folder, 0)):
+        path.parent.mkdir(parents=True)
+    for frame in index.tolist():
+        picture, coverage = truth.frame(frame)
+        write_rgb(image_path(folder, frame), picture)
+        write_gray(mask_path(folder, frame), coverage)
+    indices, weights = top_k_weights(subject.body.skin_weights)
+    avatar = TexturedAvatar(
+        vertices=torch.from_numpy(subject.body.vertices),
+        faces=torch.from_numpy(subject.body.faces),
+        joint_indices=torch.from_numpy(indices.astype(np.int64)),
+        joint_weights=torch.from_numpy(weights),
+        uv=torch.from_numpy(subject.uv),
+        faces_uv=torch.from_numpy(subject.faces_uv),
+        diffuse=subject.texture_tensor(),
+    )
+    run = FinishedRun(
+        capture=_capture(folder, truth.motion, truth.camera.width, truth.fps),
+        camera=truth.camera,
+        body=subject.body,
+        motion=truth.motion,
+        avatar=avatar,
+        draw_field=lambda pose: np.zeros((truth.camera.height, truth.camera.width, 4), dtype=np.float32),
+        refined=canonical_to_world(subject.body, truth.motion),
+        fitted=canonical_to_world(subject.body, truth.motion),
+    )
+    coverage = np.ones(subject.texture.shape[:2], dtype=np.float32)
+    return Comparison(run, coverage, truth, sample / "truth")
+
+
+def _capture(folder: Path, motion: Motion, side_px: int, fps: float) -> Capture:
+    count = len(motion.frame_index)
+    return Capture(
+        folder=folder,
+        frame_index=motion.frame_index,
+        time_s=motion.time_s,
+        split=split_of(motion.frame_index),
+        fps=fps,
+        width=side_px,
+        height=side_px,
+        landmarks_px=np.zeros((count, 33, 2), dtype=np.float32),
+        landmarks_visibility=np.zeros((count, 33), dtype=np.float32),
+        landmarks_world_m=np.zeros((count, 33, 3), dtype=np.float32),
+        camera=None,
+        mask_source="supplied",
+        n_video_frames=count,
+        scale=1.0,
+    )
+
+
+def with_motion(pair: Comparison, motion: Motion) -> Comparison:
+    """The same run, had it found other poses."""
+    refined = canonical_to_world(pair.run.body, motion)
+    return replace(pair, run=replace(pair.run, motion=motion, refined=refined))
+
+
+def shrunk(pair: Comparison, factor: float) -> Comparison:
+    """The same run, had it taken the person for smaller and nearer."""
+    run = pair.run
+    body = replace(run.body, joints_m=run.body.joints_m * factor, vertices=run.body.vertices * factor)
+    avatar = replace(run.avatar, vertices=run.avatar.vertices * factor)
+    nearer = run.motion.with_pose(run.motion.rotations_wxyz, run.motion.root_translation_m * factor)
+    return with_motion(replace(pair, run=replace(run, body=body, avatar=avatar)), nearer)
+
+
+def bent_arm(pair: Comparison, frames: np.ndarray, angle_rad: float) -> Motion:
+    """The motion with the left arm raised by an angle in some frames."""
+    motion, joint = pair.run.motion, pair.run.body.joint("LeftArm")
+    rotations = torch.from_numpy(motion.rotations_wxyz).clone()
+    turn = axis_angle_to_quaternion(torch.tensor([0.0, 0.0, angle_rad]))
+    rotations[frames, joint] = quaternion_multiply(rotations[frames, joint], turn.expand(len(frames), 4))
+    return motion.with_pose(rotations.numpy(), motion.root_translation_m)

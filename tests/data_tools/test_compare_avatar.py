@@ -1,0 +1,109 @@
+"""The comparison of a finished avatar: nothing is found wrong with the truth itself, and known errors are found."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from data_tools.compare_avatar import (
+    Comparison,
+    absorbed,
+    ceiling,
+    compare_filmed,
+    compare_novel_poses,
+    compare_novel_views,
+    compare_shape,
+    compare_texture,
+    taken_over,
+)
+from pipeline.avatar.body import Body
+from pipeline.metrics.images import mean_scores
+from tests.data_tools.finished import bent_arm, perfect_run, shrunk, with_motion
+
+
+@pytest.fixture(scope="module")
+def perfect(sample: Path, tmp_path_factory: pytest.TempPathFactory) -> Comparison:
+    return perfect_run(sample, tmp_path_factory.mktemp("perfect"))
+
+
+@pytest.fixture(scope="module")
+def perfect_ceiling(perfect: Comparison) -> dict[str, float]:
+    return mean_scores(ceiling(perfect))
+
+
+def test_the_truth_has_no_error(perfect: Comparison) -> None:
+    for scores in (compare_shape(perfect), compare_filmed(perfect)):
+        assert scores["chamfer_mm"] < 0.2  # four joints a vertex are kept in the export
+        assert scores["f_score"] > 0.999
+        assert scores["scale_to_truth"] == pytest.approx(1.0, abs=1e-3)
+    texture = compare_texture(perfect)
+    assert texture["coverage"] == 1.0
+    assert texture["colour_error"] < 1.0
+
+
+def test_a_smaller_person_has_the_same_shape(perfect: Comparison) -> None:
+    scores = compare_shape(shrunk(perfect, 0.9))
+    assert scores["chamfer_mm"] < 0.2
+    assert scores["scale_to_truth"] == pytest.approx(1 / 0.9, abs=1e-3)
+
+
+def test_a_motion_that_was_never_filmed(perfect: Comparison) -> None:
+    scores, pictures = compare_novel_poses(perfect)
+    assert scores["chamfer_mm"] < 1.0
+    assert len(pictures) == 2
+    assert min(picture.scores()["mask_iou"] for picture in pictures) > 0.97
+
+
+def test_cameras_that_never_filmed(perfect: Comparison) -> None:
+    """The truth is lit and the avatar is not: colours that are made brighter by a fifth cost what that is in dB."""
+    pictures = compare_novel_views(perfect)
+    assert len(pictures) == 2
+    assert min(picture.scores()["mask_iou"] for picture in pictures) > 0.98
+    black = replace(perfect, run=replace(perfect.run, avatar=replace(perfect.run.avatar, diffuse=torch.zeros(4, 4, 3))))
+    dark = compare_novel_views(black)
+    assert dark[0].scores()["psnr_body"] < pictures[0].scores()["psnr_body"] - 3.0
+
+
+def test_a_texture_of_known_error(perfect: Comparison) -> None:
+    """Darker by a fifth, and only its left half seen."""
+    avatar = perfect.run.avatar
+    darker = replace(perfect.run, avatar=replace(avatar, diffuse=0.8 * avatar.diffuse))
+    half = perfect.coverage.copy()
+    half[:, half.shape[1] // 2 :] = 0.0
+    scores = compare_texture(replace(perfect, run=darker, coverage=half))
+    whole = compare_texture(perfect)
+    assert 0.2 < scores["coverage"] < 0.8
+    assert scores["colour_error"] > whole["colour_error"] + 10.0
+    assert scores["balanced_colour_error"] < 1.0
+
+
+def test_true_poses_leave_nothing_to_miss(perfect: Comparison, perfect_ceiling: dict[str, float]) -> None:
+    assert np.abs(absorbed(perfect) - perfect.truth.subject.body.vertices).max() < 1e-3
+    assert perfect_ceiling["psnr_body"] > 40.0
+    assert perfect_ceiling["mask_iou"] > 0.99
+
+
+def test_size_and_distance_are_no_error_of_the_pose(perfect: Comparison, perfect_ceiling: dict[str, float]) -> None:
+    smaller = mean_scores(ceiling(shrunk(perfect, 0.9)))
+    assert smaller["psnr_body"] == pytest.approx(perfect_ceiling["psnr_body"], abs=0.5)
+
+
+def test_an_arm_that_is_always_off_belongs_to_the_shape(perfect: Comparison, perfect_ceiling: dict[str, float]) -> None:
+    """The same error in all frames can be made good in the A-pose; in the held-out frame alone it cannot."""
+    frames = np.arange(len(perfect.run.motion.frame_index))
+    always = mean_scores(ceiling(with_motion(perfect, bent_arm(perfect, frames, 0.15))))
+    once = mean_scores(ceiling(with_motion(perfect, bent_arm(perfect, frames[:1], 0.15))))
+    assert always["psnr_body"] > perfect_ceiling["psnr_body"] - 4.0
+    assert once["psnr_body"] < always["psnr_body"] - 4.0
+
+
+def test_rotations_go_by_name(bare: Body, perfect: Comparison) -> None:
+    """Joints that the actor lacks keep still."""
+    motion = perfect.truth.motion
+    renamed = replace(bare, joint_names=tuple("Tail" if name == "Head" else name for name in bare.joint_names))
+    taken = taken_over(renamed, perfect.truth.subject.body, motion)
+    head, arm = renamed.joint("Tail"), renamed.joint("LeftArm")
+    assert taken.rotations_wxyz[:, head].tolist() == [[1.0, 0.0, 0.0, 0.0]] * len(motion.frame_index)
+    assert np.array_equal(taken.rotations_wxyz[:, arm], motion.rotations_wxyz[:, arm])
