@@ -7,7 +7,6 @@ an interruption. The table is written as `batch.csv` and `batch.html` into `runs
 """
 
 import argparse
-import csv
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -19,7 +18,17 @@ from tqdm import tqdm
 
 import stages
 from data_tools.command import run_command
-from data_tools.runs import SCORES, RunState, check_options, cpu_cores, log_path, read_run, start_run, video_in
+from data_tools.runs import (
+    SCORES,
+    RunState,
+    check_options,
+    cpu_cores,
+    log_path,
+    read_run,
+    start_run,
+    video_in,
+    write_csv,
+)
 from pipeline.core.atomic import atomic_path
 from pipeline.core.cli import default_run_dir
 from pipeline.core.errors import UserError
@@ -114,10 +123,7 @@ def write_table(runs: Path, rows: Iterable[Mapping[str, str]]) -> None:
     """`batch.csv` and `batch.html` in the folder of the runs."""
     rows = list(rows)
     runs.mkdir(parents=True, exist_ok=True)
-    with atomic_path(runs / "batch.csv") as path, path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    write_csv(runs / "batch.csv", list(rows[0]), [list(row.values()) for row in rows])
     done = sum(row["status"] == "done" for row in rows)
     heading = "".join(f"<th>{escape(cell)}</th>" for cell in [*_heading(), "message"])
     page = PAGE.substitute(

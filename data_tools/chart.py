@@ -8,7 +8,6 @@ from its beginning, because its seconds are what the chart is about. OUT then ho
 """
 
 import argparse
-import csv
 import sys
 from collections.abc import Mapping, Sequence
 from itertools import product
@@ -29,9 +28,8 @@ from data_tools.chart_trials import (
     together,
 )
 from data_tools.command import run_command
-from data_tools.runs import CONFIGS, RunState, check_options, log_path, read_run
+from data_tools.runs import CONFIGS, RunState, check_options, log_path, read_run, write_csv
 from data_tools.sample import main as make_sample
-from pipeline.core.atomic import atomic_path
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track
 
@@ -89,28 +87,11 @@ def write_results(out: Path, runs: Mapping[Trial, RunState]) -> None:
     out.mkdir(parents=True, exist_ok=True)
     points = [point_of(trial, run) for trial, run in runs.items() if run.verdict == "done"]
     rows = [table_row(trial, run) | {"on_front_of": _fronts(trial, points)} for trial, run in runs.items()]
-    write_csv(out / "chart.csv", rows)
-    curves = [
-        {
-            "capture": point.capture,
-            "preset": point.preset,
-            "seed": point.seed,
-            **dict(zip(PROGRESS_COLUMNS, row, strict=True)),
-        }
-        for point in points
-        for row in point.curve
-    ]
-    write_csv(out / "anytime.csv", curves)
+    write_csv(out / "chart.csv", list(rows[0]), [list(row.values()) for row in rows])
+    curves = [(point.capture, point.preset, point.seed, *row) for point in points for row in point.curve]
+    write_csv(out / "anytime.csv", ("capture", "preset", "seed", *PROGRESS_COLUMNS), curves)
     if any(point.scores for point in points):
         save_chart(draw_chart(points, origin(rows)), out)
-
-
-def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """A table with the first row's columns; an empty file without rows."""
-    with atomic_path(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]) if rows else [])
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def origin(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -1,15 +1,17 @@
 """Many runs of the pipeline: each is started as a command of its own, and its folder tells how far it came."""
 
+import csv
 import json
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import stages
+from pipeline.core.atomic import atomic_path
 from pipeline.core.config import Config, parse_overrides
 from pipeline.core.errors import UserError
 from pipeline.core.lock import bound_environment
@@ -123,6 +125,12 @@ def read_scores(report: Path) -> dict[str, float]:
         if isinstance(value, int | float):
             scores[column] = float(value)
     return scores
+
+
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """A table with a line of headings, whole or not at all."""
+    with atomic_path(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([columns, *rows])
 
 
 def cpu_cores() -> int:

@@ -110,9 +110,14 @@ def test_tables_and_chart_of_finished_runs(tmp_path: Path) -> None:
         slow: finished(20.0, SCORES | {"chamfer_mm": 5.0}),
         bad: RunState(dict.fromkeys(STAGES, "missing"), {}, {}, "no person"),
     }
+    (slow.run_dir / "field").mkdir(parents=True)
+    (slow.run_dir / "field" / "progress.csv").write_text(
+        "step,seconds,validation_psnr_db,validation_psnr_body_db\n9,1,20,15\n"
+    )
     write_results(tmp_path, runs)
     table = rows(tmp_path / "chart.csv")
     assert [row["on_front_of"] for row in table] == ["mesh_psnr_full_db chamfer_mm", "chamfer_mm", ""]
     assert [row["message"] for row in table] == ["", "", "no person"]
     assert (tmp_path / "chart.svg").is_file()
-    assert rows(tmp_path / "anytime.csv") == []
+    (curve,) = rows(tmp_path / "anytime.csv")
+    assert list(curve.values()) == ["ann", "slow", "0", "41.0", "20.0", "15.0"]
