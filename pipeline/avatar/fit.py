@@ -24,7 +24,8 @@ from pipeline.avatar.fit_objective import (
     image_scale,
     project_with_covectors,
 )
-from pipeline.avatar.fit_priors import JointPrior, ShapePrior, joint_prior, shape_prior
+from pipeline.avatar.fit_place import place_of_root
+from pipeline.avatar.fit_priors import JointPrior, ShapePrior, joint_prior, observed_motion, shape_prior
 from pipeline.avatar.fit_silhouette import Window, focused_camera, match_all
 from pipeline.avatar.fit_solver import NormalEquations, minimise, shared_covariance
 from pipeline.avatar.fit_swaps import LIMBS, exchange_bodies, exchange_limbs, exchanged_bodies, exchanged_limbs
@@ -39,7 +40,7 @@ POSE_ROUNDS = 3
 STATURE_DEVIATION_M = 0.09
 """Spread of adults' stature, which is how well an assumed one is known."""
 OUTLINE_LANDMARK_M = 0.06
-OUTLINE_DIRECTION_M = 0.2
+OUTLINE_DIRECTION_M = 0.4
 """Standard deviations of a landmark in the image and in 3D once outlines help, which err less and in no fixed way."""
 
 
@@ -170,8 +171,11 @@ def _fit_poses(
     model = linearise(tools.body, state.shape)
     landmarks_only = replace(weights, landmark_m=Weights.landmark_m, direction_m=Weights.direction_m)
     state, _ = _minimised(tools, model, observations, landmarks_only, state, OUTLINE_STEPS)
+    motion = None
     for _ in track(range(POSE_ROUNDS), "poses"):
-        state, _, _ = _outline_round(tools, model, observations, windows, weights, state)
+        state, _, _ = _outline_round(tools, model, observations, windows, weights, state, motion)
+        place = place_of_root(state.root_m, observations.camera)
+        motion = observed_motion(state.rotations, place, observations.time_s)
     _, overlap = match_all(model, state, observations, windows)
     return state, model, overlap
 
@@ -183,6 +187,7 @@ def _outline_round(
     windows: Sequence[Window | None],
     weights: Weights,
     state: FitState,
+    motion: Float[Tensor, "p"] | None = None,
 ) -> tuple[FitState, NormalEquations, Float[np.ndarray, "n"]]:
     """Pair outlines for the body as it stands, then move it."""
     contour, overlap = match_all(model, state, observations, windows)
@@ -195,6 +200,7 @@ def _outline_round(
         weights,
         image_scale(state, observations.camera),
         contour,
+        motion,
     )
     state, system = minimise(state, objective, objective.retract, OUTLINE_STEPS)
     return state, system, overlap

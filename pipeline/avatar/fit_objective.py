@@ -30,6 +30,7 @@ from pipeline.avatar.fit_priors import (
     interval_factors,
     motion_residuals,
     pose_residuals,
+    usual_motion,
 )
 from pipeline.avatar.fit_solver import NormalEquations
 from pipeline.geometry.camera import Camera
@@ -38,6 +39,10 @@ from pipeline.geometry.rotation import axis_angle_to_matrix
 FACE_LANDMARKS = 11
 LEFT_HIP, RIGHT_HIP = 23, 24
 SCALE_PASSES = 3
+DEPTH_NOISE = 2.0
+"""How much worse the detector knows a landmark's depth than its place across the view."""
+LEAST_DEPTH, MOST_DEPTH = 0.4, 1.2
+"""Range of the detector's scale of depths over its scale across the view."""
 
 
 @dataclass(frozen=True)
@@ -114,8 +119,7 @@ class Weights:
     direction_m: float = 0.08
     contour_m: float = 0.010
     contour_cutoff: float = 4.0
-    motion_rad: float = 0.03
-    motion_place: float = 0.003
+    motion: float = 1.0
     motion_cutoff: float = 4.0
     offset_m: float = 0.012
     height_m: float = 1.70
@@ -134,7 +138,8 @@ class Weights:
 class Objective:
     """All terms at hand; call it with a state.
 
-    `px_per_m` is the image scale at each frame's person, held fixed while the state moves.
+    `px_per_m` is the image scale at each frame's person, held fixed while the state moves. `motion` are standard
+    deviations of `motion_residuals`; None: `usual_motion`, which fast people need.
     """
 
     model: FitModel
@@ -145,6 +150,7 @@ class Objective:
     weights: Weights
     px_per_m: Float[Tensor, "n"]
     contour: Contour | None = None
+    motion: Float[Tensor, "p"] | None = None
 
     def __call__(self, state: FitState) -> NormalEquations:
         """The normal equations of all terms at a state."""
@@ -207,21 +213,22 @@ class Objective:
         arms: Float[Tensor, "n 33 j 3"],
         confidence: Float[Tensor, "n 33"],
     ) -> None:
-        """The detector's 3D landmarks, relative to the hips and of unknown overall scale."""
+        """The detector's 3D landmarks, relative to the hips, in camera axes and of unknown scale."""
         seen, cutoff = self.observations, self.weights.landmark_cutoff
-        relative = world - _hip_middle(world)
-        inverse = confidence.sqrt() / self.weights.direction_m
-        scale = _direction_scale(relative, seen.directions_m, inverse, cutoff)
-        residual = (scale * relative - seen.directions_m) * inverse[..., None]
+        to_camera = torch.as_tensor(seen.camera.world_to_camera, dtype=world.dtype)[:3, :3]
+        relative, found = (world - _hip_middle(world)) @ to_camera.T, seen.directions_m @ to_camera.T
+        deviation = self.weights.direction_m * world.new_tensor([1.0, 1.0, DEPTH_NOISE])
+        inverse = confidence.sqrt()[..., None] / deviation
+        scale = direction_scale(relative, found, inverse, cutoff)
+        residual = (scale * relative - found) * inverse
         weight = _robust(system, residual.square().sum(-1), cutoff)
         by_place = torch.zeros(len(world), 3, 3, dtype=torch.float64)  # hips and landmarks move together
         for axis in range(3):
-            covector = torch.zeros_like(world)
-            covector[..., axis] = scale
+            covector = (scale[axis] * to_camera[axis]).expand_as(world)
             rows = pose_rows(skeleton, arms, by_place, covector)
-            shared = self._shared_rows(model, skeleton, points, covector, torch.zeros_like(inverse))
-            rows = (rows - _hip_middle(rows)) * inverse[..., None]
-            shared = (shared - _hip_middle(shared)) * inverse[..., None]
+            shared = self._shared_rows(model, skeleton, points, covector, torch.zeros_like(confidence))
+            rows = (rows - _hip_middle(rows)) * inverse[..., axis, None]
+            shared = (shared - _hip_middle(shared)) * inverse[..., axis, None]
             system.add(rows, shared, residual[..., axis], weight)
 
     def _add_contour(
@@ -272,9 +279,8 @@ class Objective:
             return
         weights, time_s = self.weights, self.observations.time_s
         residual = motion_residuals(state.rotations, place_of_root(state.root_m, self.observations.camera), time_s)
-        deviation = residual.new_full((residual.shape[1],), weights.motion_rad)
-        deviation[-3:] = weights.motion_place
-        residual = residual / deviation
+        deviation = usual_motion(state.rotations.shape[1]) if self.motion is None else self.motion
+        residual = residual / (weights.motion * deviation)
         weight = _robust(system, residual.square(), weights.motion_cutoff)
         before, after, scale = (factor[:, None] for factor in interval_factors(time_s))
         factors = (before * scale / deviation, -(before + after) * scale / deviation, after * scale / deviation)
@@ -341,21 +347,25 @@ def facing_factor(skeleton: PosedSkeleton, camera: Camera) -> Float[Tensor, "n 3
     return factor
 
 
-def _direction_scale(
+def direction_scale(
     relative_m: Float[Tensor, "n 33 3"],
     directions_m: Float[Tensor, "n 33 3"],
-    inverse: Float[Tensor, "n 33"],
+    inverse: Float[Tensor, "n 33 3"],
     cutoff: float,
-) -> float:
-    """Factor that carries the body's 3D landmarks onto the detector's with the least robust cost.
+) -> Float[Tensor, "3"]:
+    """Factors (across, across, depth; camera axes) that carry the body's 3D landmarks onto the detector's with the
+    least robust cost. The detector makes people flatter than they are, so depth has a factor of its own.
 
-    Being the best factor, its own change costs nothing to first order, so the derivatives may treat it as a constant.
+    Being the best factors, their own change costs nothing to first order, so the derivatives take them as constant.
     """
-    weight, scale = inverse.square(), 1.0
+    weight, scale = inverse.square(), relative_m.new_ones(3)
     for _ in range(SCALE_PASSES):
-        scale = float((weight[..., None] * relative_m * directions_m).sum() / (weight[..., None] * relative_m**2).sum())
-        squared = (scale * relative_m - directions_m).square().sum(-1) * inverse.square()
-        weight = inverse.square() * (1.0 + squared / cutoff**2) ** -2
+        above, below = ((weight * relative_m * other).sum((0, 1)) for other in (directions_m, relative_m))
+        across = above[:2].sum() / below[:2].sum()
+        depth = (above[2] / below[2]).clamp(LEAST_DEPTH * across, MOST_DEPTH * across)
+        scale = torch.stack([across, across, depth])
+        squared = ((scale * relative_m - directions_m) * inverse).square().sum(-1)
+        weight = inverse.square() * ((1.0 + squared / cutoff**2) ** -2)[..., None]
     return scale
 
 

@@ -18,6 +18,18 @@ from pipeline.geometry.rotation import matrix_to_quaternion, quaternion_to_axis_
 FRAME_S = 1.0 / 30.0
 """Interval that the motion prior's deviations are given for."""
 
+MOTION_RAD, MOTION_PLACE = 0.03, 0.003
+"""How much joints turn faster and the root moves faster (`fit_place`) from frame to frame, for the fastest people."""
+
+LEAST_MOTION = 0.15
+"""The calmest that a joint is believed to be, as a share of that."""
+
+MOTION_LAG = 2
+"""Frames over which a motion is told from noise."""
+
+MOTION_SLACK = 2.0
+"""People do not move evenly: more is allowed than was seen."""
+
 LIMIT_RAD = 0.06
 """Softness of a joint limit: going this far beyond costs one standard deviation."""
 
@@ -57,6 +69,10 @@ SHAPE_DEVIATION = {
 LOCAL_CHANGE_DEVIATION = 0.3
 """For shape numbers that are no phenotypes: local changes about 0."""
 
+BETA_DEVIATION = 1.0
+"""For the betas of SMPL, which are principal components scaled to unit variance."""
+
+BETA_RANGE = (-5.0, 5.0)
 PHENOTYPE_RANGE = (0.02, 0.98)
 LOCAL_CHANGE_RANGE = (-1.0, 1.0)
 SCALE_DEVIATION = 0.1
@@ -77,6 +93,7 @@ def shape_prior(names: Sequence[str], defaults: Float[Tensor, "s"]) -> ShapePrio
     """The prior for a body's shape numbers, by their names; unknown names count as local changes."""
     known = {name: (deviation, *PHENOTYPE_RANGE) for name, deviation in SHAPE_DEVIATION.items()}
     known[SCALE] = (SCALE_DEVIATION, *SCALE_RANGE)
+    known.update({name: (BETA_DEVIATION, *BETA_RANGE) for name in names if name.startswith("beta_")})
     rows = [known.get(name, (LOCAL_CHANGE_DEVIATION, *LOCAL_CHANGE_RANGE)) for name in names]
     return ShapePrior(defaults.double(), *torch.tensor(rows, dtype=torch.float64).unbind(1))
 
@@ -180,3 +197,30 @@ def motion_residuals(
     steps = torch.cat([steps, torch.diff(place, dim=0)], dim=1)
     before, after, scale = interval_factors(time_s)
     return (steps[1:] * after[:, None] - steps[:-1] * before[:, None]) * scale[:, None]
+
+
+def usual_motion(joints: int) -> Float[Tensor, "p"]:
+    """Standard deviations of `motion_residuals` when nothing is known about the motion."""
+    deviation = torch.full((3 * joints + 3,), MOTION_RAD, dtype=torch.float64)
+    deviation[-3:] = MOTION_PLACE
+    return deviation
+
+
+def observed_motion(
+    rotations: Float[Tensor, "n j 3 3"], place: Float[Tensor, "n 3"], time_s: Float[Tensor, "n"]
+) -> Float[Tensor, "p"]:
+    """Standard deviations of `motion_residuals` for the person in this recording, one a joint, from its fitted poses.
+
+    Errors that change from frame to frame look like motion, but do not add up. With k times the interval, the squared
+    residual of white acceleration of variance s^2 under white noise is s^2 + noise / k^3; from k = 1 and
+    `MOTION_LAG` follows s^2. `MOTION_SLACK` times s is allowed, at least `LEAST_MOTION` of `usual_motion`, at most all.
+    """
+    usual = usual_motion(rotations.shape[1])
+    if len(time_s) < 4 * MOTION_LAG:
+        return usual
+    near = motion_residuals(rotations, place, time_s).square().mean(0)
+    spans = [slice(start, None, MOTION_LAG) for start in range(MOTION_LAG)]
+    far = torch.cat([motion_residuals(rotations[span], place[span], time_s[span]) for span in spans]).square().mean(0)
+    variance = (MOTION_LAG**3 * far - near) / (MOTION_LAG**3 - 1)
+    variance = variance.reshape(-1, 3).mean(1).clamp(min=0.0).repeat_interleave(3)
+    return torch.minimum(torch.maximum(MOTION_SLACK * variance.sqrt(), LEAST_MOTION * usual), usual)

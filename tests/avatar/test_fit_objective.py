@@ -6,7 +6,16 @@ import torch
 from pipeline.avatar.body import load_anny
 from pipeline.avatar.fit_landmarks import OFFSET_COUNT, landmark_regressor
 from pipeline.avatar.fit_model import ACTIVE_JOINTS, linearise, pose_skeleton
-from pipeline.avatar.fit_objective import FitState, Objective, Weights, facing_factor, image_scale
+from pipeline.avatar.fit_objective import (
+    LEAST_DEPTH,
+    MOST_DEPTH,
+    FitState,
+    Objective,
+    Weights,
+    direction_scale,
+    facing_factor,
+    image_scale,
+)
 from pipeline.avatar.fit_priors import joint_prior, shape_prior
 from pipeline.avatar.fit_silhouette import match_all
 from pipeline.geometry.rotation import axis_angle_to_matrix
@@ -15,7 +24,7 @@ from tests.avatar.acting import act
 FRAMES = 4
 NUMBERS = 3 * len(ACTIVE_JOINTS) + 3
 # Without motion, whose derivative is of first order in the turn between frames, the gradient is exact.
-EXACT = Weights(free_offsets=True, free_focal=True, motion_rad=1e3, motion_place=1e3)
+EXACT = Weights(free_offsets=True, free_focal=True, motion=1e5)
 
 
 def build(weights: Weights, outlines: bool = True) -> tuple[Objective, FitState]:
@@ -62,7 +71,7 @@ def test_gradient_of_motion_is_right_for_small_turns() -> None:
 
 
 def test_the_truth_costs_less_than_its_neighbourhood() -> None:
-    objective, wrong = build(Weights(motion_rad=1e3, motion_place=1e3), outlines=False)
+    objective, wrong = build(Weights(motion=1e5), outlines=False)
     scene = act(load_anny(), FRAMES, turn_rad=0.6)
     objective = replace(objective, observations=scene.observations(scene.camera))
     assert objective(scene.state).cost < 0.5 * objective(wrong).cost
@@ -79,3 +88,15 @@ def test_faces_seen_from_behind_are_not_trusted() -> None:
     assert factor[2, 0] == pytest.approx(0.05)
     assert 0.05 < factor[1, 0] < 1.0
     assert torch.equal(factor[:, 11:], torch.ones(3, 22, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(("flatness", "found"), [(0.6, 0.6), (0.1, LEAST_DEPTH), (3.0, MOST_DEPTH)])
+def test_depths_have_a_scale_of_their_own(flatness: float, found: float) -> None:
+    """A detector that makes people smaller, flatter, and puts one landmark in a wrong place."""
+    generator = torch.Generator().manual_seed(8)
+    relative = 0.4 * torch.randn(5, 33, 3, generator=generator, dtype=torch.float64)
+    directions = relative * torch.tensor([0.8, 0.8, 0.8 * flatness], dtype=torch.float64)
+    directions[:, 15, 1] += 2.0
+    inverse = torch.full((5, 33, 3), 1 / 0.08, dtype=torch.float64)
+    scale = direction_scale(relative, directions, inverse, 3.0)
+    assert scale.tolist() == pytest.approx([0.8, 0.8, 0.8 * found], rel=0.03)

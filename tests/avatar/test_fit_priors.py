@@ -5,14 +5,18 @@ import torch
 from pipeline.avatar.body import load_anny
 from pipeline.avatar.fit_model import ACTIVE_JOINTS, linearise
 from pipeline.avatar.fit_priors import (
+    FRAME_S,
+    LEAST_MOTION,
     JointPrior,
     cross_matrix,
     joint_prior,
     logarithm_jacobian,
     motion_residuals,
+    observed_motion,
     pose_residuals,
     rotation_logarithm,
     shape_prior,
+    usual_motion,
 )
 from pipeline.geometry.rotation import axis_angle_to_matrix
 
@@ -92,3 +96,23 @@ def test_shape_prior_tells_phenotypes_from_local_changes() -> None:
     prior = shape_prior(("gender", "waist-girth"), torch.tensor([0.5, 0.0]))
     assert np.allclose(prior.lowest, [0.02, -1.0])
     assert np.allclose(prior.mean, [0.5, 0.0])
+
+
+@pytest.mark.parametrize(("pushed", "expected"), [(0.2, 0.4), (0.0, LEAST_MOTION), (5.0, 1.0)])
+def test_motion_is_told_from_noise(pushed: float, expected: float) -> None:
+    """White acceleration of a known size, seen under errors that change from frame to frame."""
+    generator = torch.Generator().manual_seed(3)
+    usual = usual_motion(1)
+    acceleration = pushed * usual * torch.randn(4000, 6, generator=generator, dtype=torch.float64)
+    path = acceleration.cumsum(0).cumsum(0) + 0.1 * usual * torch.randn(4000, 6, generator=generator).double()
+    angles = path[:, :3] * torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+    rotations = axis_angle_to_matrix(angles)[:, None]
+    time_s = torch.arange(4000, dtype=torch.float64) * FRAME_S
+    share = observed_motion(rotations, path[:, 3:], time_s) / usual
+    assert share[3:].tolist() == pytest.approx([expected] * 3, rel=0.3)
+
+
+def test_a_short_recording_tells_nothing_about_motion() -> None:
+    time_s = torch.arange(5, dtype=torch.float64)
+    still = torch.eye(3, dtype=torch.float64).repeat(5, 2, 1, 1)
+    assert torch.equal(observed_motion(still, torch.zeros(5, 3, dtype=torch.float64), time_s), usual_motion(2))
