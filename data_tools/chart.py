@@ -98,7 +98,7 @@ def origin(rows: Sequence[Mapping[str, Any]]) -> str:
     """Commit, machine and seeds of the runs that are done."""
     done = [row for row in rows if row["status"] == "done"]
     commit, machine, seeds = (together(str(row[name]) for row in done) for name in ("commit", "machine", "seed"))
-    return f"commit {commit}; {machine}; seed {seeds}"
+    return f"commit {commit or 'unknown'}; {machine}; seed {seeds}"
 
 
 def _fronts(trial: Trial, points: Sequence[Point]) -> str:

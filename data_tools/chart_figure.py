@@ -14,7 +14,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator
 PANEL_INCHES = (4.8, 3.6)
 FOOT_INCHES = 1.1
 INK, FAINT = "#222222", "#888888"
-TICKS = (1.0, 3.0)
+FEW_TICKS, MANY_TICKS = (1.0, 3.0), (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
 
 Colour = tuple[float, float, float, float]
 
@@ -96,7 +96,9 @@ def draw_chart(points: Sequence[Point], origin: str) -> Figure:
             _draw_presets(axes, panel, chosen, colours)
             _dress(axes, f"{capture}: {panel.title}")
     keys = [Line2D([], [], color=colour, marker="o", label=preset) for preset, colour in colours.items()]
-    figure.legend(handles=[*keys, *_meanings()], loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    figure.legend(
+        handles=[*keys, *_meanings()], loc="outside lower center", ncols=2 * len(panels), frameon=False, fontsize=9
+    )
     figure.suptitle(origin, x=0.01, ha="left", fontsize=8, color=FAINT)
     return figure
 
@@ -138,11 +140,12 @@ def _draw_presets(axes: Axes, panel: Panel, points: Sequence[Point], colours: di
 def _dress(axes: Axes, title: str) -> None:
     axes.set_title(title, fontsize=10, loc="left")
     axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=TICKS))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda seconds, _: f"{seconds:,.12g}"))
     axes.xaxis.set_minor_formatter(FuncFormatter(lambda *_: ""))
     axes.set_xlabel("seconds", fontsize=9, color=FAINT)
     axes.margins(x=0.15, y=0.12)
+    shortest, longest = axes.get_xlim()
+    axes.xaxis.set_major_locator(LogLocator(subs=FEW_TICKS if longest > 10.0 * shortest else MANY_TICKS))
     axes.grid(color=FAINT, alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
 
