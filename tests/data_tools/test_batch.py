@@ -3,6 +3,7 @@
 import csv
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -80,6 +81,16 @@ def test_a_killed_batch_takes_its_runs_along_and_goes_on(batch: Toy) -> None:
         assert undisturbed.returncode == 0
         runs = batch.folder / "runs"
         assert artifacts(runs / name, TOY_STAGES) == artifacts(runs / "alone", TOY_STAGES)
+
+
+def test_ctrl_c_stops_all_and_starts_no_other(batch: Toy) -> None:
+    process = batch.start("data_tools.batch", "videos", TOY_SLEEP_S="30")
+    wait_for(batch.folder / "runs" / "ann" / "learn.part" / "checkpoint.json", process)
+    os.killpg(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=25)
+    assert process.returncode == 130
+    assert err.splitlines()[-1] == "interrupted: run the same command again"
+    assert not (batch.folder / "runs" / "carl").exists()
 
 
 def test_the_table_alone_runs_nothing(batch: Toy) -> None:
@@ -172,3 +183,28 @@ def test_the_workflow_survives_a_broken_video_and_a_kill(batch: Toy) -> None:
     text, _ = mended.communicate(timeout=60)
     assert mended.returncode == 0, text
     assert {row["status"] for row in rows(batch).values()} == {"done"}
+
+
+@pytest.mark.slow
+def test_three_real_captures_one_of_them_broken(smoke_run: Path, tmp_path: Path) -> None:
+    """A video, a file that is none, and a folder of images, by the real stages; killed once on the way."""
+    videos, runs = tmp_path / "videos", tmp_path / "runs"
+    videos.mkdir()
+    shutil.copy(smoke_run.parent / "capture" / "video" / "video.mp4", videos / "ann.mp4")
+    (videos / "bob.mp4").write_bytes(b"no video at all" * 100)
+    shutil.copytree(smoke_run / "frames" / "images", videos / "carl")
+    command = [sys.executable, "-m", "data_tools.batch", str(videos), "--runs", str(runs), "--preset", "smoke"]
+    command += ["--set", "field.steps=20", "--set", "mesh.steps=2"]
+    killed = subprocess.Popen(command, cwd=REPOSITORY, env=user_environment())
+    wait_for(runs / "ann" / "body.part", killed)
+    killed.kill()
+    killed.wait()
+    done = subprocess.run(command, cwd=REPOSITORY, env=user_environment(), capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    with (runs / "batch.csv").open(newline="") as file:
+        table = {row["video"]: row for row in csv.DictReader(file)}
+    assert {name: row["status"] for name, row in table.items()} == OUTCOME, done.stdout
+    assert "bob.mp4" in table[BROKEN]["message"]
+    for name in GOOD:
+        assert (runs / name / "export" / "avatar.glb").is_file()
+        assert float(table[name]["mesh_psnr_full_db"]) > 10
