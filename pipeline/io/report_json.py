@@ -13,11 +13,12 @@ from pipeline.metrics.images import mean_scores
 PROTOCOL = (
     "{count} frames, those that the video's split.json names or else those whose index in the video is divisible by "
     "eight, were held out: field, mesh and texture never saw their pixels, and no decision was made on them. Their "
-    "poses come from the body stage, which reads the landmarks and the mask of every frame, and from the field's pose"
-    " corrections, interpolated in time between training frames; no pose was fitted to a held-out image. Renders and "
-    "frames are laid over white by the mask and rounded to 8 bits. Of psnr, ssim and flip (67 pixels a degree, lower "
-    "is better), _full counts the whole image, _body the pixels of the mask, _box the smallest box around it; each is"
-    " the mean over frames. field is the radiance field, mesh the exported mesh with its diffuse map, unlit."
+    "poses come from the body stage, which reads the landmarks and the mask of every frame, and from the field's pose "
+    "corrections, interpolated in time between training frames and held beyond them; no pose was fitted to a held-out "
+    "image. Renders and frames are laid over white by the mask and rounded to 8 bits. Of psnr, ssim and flip (67 "
+    "pixels a degree, lower is better), _full counts the whole image, _body the pixels of the mask, _box the smallest "
+    "box around it; each is the mean over frames. field is the radiance field, mesh the exported mesh with its "
+    "diffuse map, unlit."
 )
 UNREFINED = " The rows named unrefined use the body stage's poses alone."
 POSE_FITTED_ENDING = "_pose_fitted"
