@@ -15,9 +15,13 @@ def test_a_folder_appears_when_its_work_is_done(tmp_path):
 
 
 def test_what_broke_off_leaves_no_folder_and_does_not_mix_with_the_next(tmp_path):
-    with pytest.raises(ValueError, match="half"), whole_folder(tmp_path / "out") as part:
-        (part / "old").write_text("1")
-        raise ValueError("half")
+    def half() -> None:
+        with whole_folder(tmp_path / "out") as part:
+            (part / "old").write_text("1")
+            raise ValueError("half")
+
+    with pytest.raises(ValueError, match="half"):
+        half()
     assert not (tmp_path / "out").exists()
     with whole_folder(tmp_path / "out") as part:
         assert not any(part.iterdir())
