@@ -26,3 +26,5 @@ def test_both_files_are_needed(machine: tuple[Path, Path]):
     found = find_lpips_weights()
     assert found is not None
     assert set(found) == {"features.0.weight", "lin0.model.1.weight"}
+    machine[0].unlink()
+    assert find_lpips_weights() is None
