@@ -13,7 +13,8 @@ PRESETS = sorted(path.stem for path in CONFIG_DIR.glob("*.yaml"))
 
 
 def test_the_presets_are_there() -> None:
-    assert {"default", "fine", "instant", "smoke"} <= set(PRESETS)
+    baselines = {"instantavatar", "ihm", "animnerf", "visual-hull"}
+    assert {"default", "fine", "instant", "smoke"} | baselines <= set(PRESETS)
 
 
 def test_default_yaml_equals_the_defaults_in_code() -> None:
