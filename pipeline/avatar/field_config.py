@@ -11,7 +11,7 @@ class FieldConfig(Config):
     """What steers the learning of the canonical field."""
 
     seed: int = Option(0, ge=0, description="seed of all random draws")
-    steps: int = Option(1600, ge=0, le=200_000, description="training steps")
+    steps: int = Option(1000, ge=0, le=200_000, description="training steps")
     rays: int = Option(4096, ge=64, le=1 << 18, description="rays a step")
     frames_per_step: int = Option(16, ge=1, le=64, description="frames that a step's rays come from")
     max_frames: int = Option(120, ge=2, description="training frames kept, evenly spread; each holds about 3 MB")
@@ -25,18 +25,18 @@ class FieldConfig(Config):
     inverse_skinning: Literal["baked", "broyden", "nearest"] = Option(
         "baked", description="from posed to canonical: warp grids, a search for every sample, or the nearest vertex"
     )
-    levels: int = Option(6, ge=1, le=16, description="levels of the hash grid")
+    levels: int = Option(5, ge=1, le=16, description="levels of the hash grid")
     features: Literal[1, 2, 4, 8] = Option(4, description="features a level")
     log2_rows: int = Option(17, ge=8, le=24, description="log2 of the most rows a level may have")
-    finest_cell_px: float = Option(1.0, gt=0, description="finest cell of the grid, in pixels at the body's depth")
-    hidden_width: int = Option(64, ge=8, le=512, description="width of the hidden layer")
+    finest_cell_px: float = Option(2.0, gt=0, description="finest cell of the grid, in pixels at the body's depth")
+    hidden_width: int = Option(32, ge=8, le=512, description="width of the hidden layer")
 
     hull_votes: float = Option(0.9, gt=0, le=1, description="part of the frames whose mask must hold a point of a hull")
 
     margin_m: float = Option(
         0.10, gt=0, le=0.6, description="how far clothing and hair may stand off the fitted body, m"
     )
-    step_fraction: float = Option(0.007, gt=0, le=0.1, description="ray step, as a part of the body's height")
+    step_fraction: float = Option(0.01, gt=0, le=0.1, description="ray step, as a part of the body's height")
     pixel_jitter: bool = Option(True, description="rays start anywhere in their pixel instead of its centre")
     share_border: float = Option(0.25, ge=0, le=1, description="part of the rays along the mask's border")
     share_outside: float = Option(0.1, ge=0, le=1, description="part of the rays outside the mask")
@@ -71,7 +71,7 @@ class FieldConfig(Config):
     empty_points: int = Option(2048, ge=0, description="points a step at which emptiness is asked for")
 
     pose_refinement: bool = Option(True, description="learn small corrections of the poses")
-    pose_start: float = Option(0.2, ge=0, le=1, description="part of the steps after which poses are refined")
+    pose_start: float = Option(0.1, ge=0, le=1, description="part of the steps after which poses are refined")
     pose_every: int = Option(4, ge=1, description="steps between two in which poses move, once they do")
     pose_rate: float = Option(3e-3, gt=0, description="learning rate of the poses, rad (shifts: a third of it, m)")
     pose_smoothness: float = Option(0.02, ge=0, description="weight of the change of corrections from frame to frame")
