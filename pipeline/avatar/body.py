@@ -7,6 +7,7 @@ Unity's humanoid mapping use, and identity rest orientations, so a pose here is 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -135,6 +136,27 @@ SCALE = "scale"
 SHAPE_DEFAULTS = {**PHENOTYPE_DEFAULTS, **dict.fromkeys(LOCAL_CHANGES, 0.0), SCALE: 1.0}
 """Every number of a shape with its default."""
 
+ANNY_LANDMARKS_M = {
+    "nose": (0.000, 1.703, 0.141),
+    "eye_inner": (0.018, 1.739, 0.117),
+    "eye": (0.027, 1.739, 0.114),
+    "eye_outer": (0.038, 1.739, 0.107),
+    "ear": (0.058, 1.719, 0.057),
+    "mouth": (0.018, 1.665, 0.131),
+    "shoulder": (0.174, 1.495, 0.006),
+    "elbow": (0.364, 1.270, 0.023),
+    "wrist": (0.509, 1.115, 0.200),
+    "pinky": (0.552, 1.056, 0.243),
+    "index": (0.539, 1.062, 0.273),
+    "thumb": (0.516, 1.082, 0.260),
+    "hip": (0.100, 0.953, 0.015),
+    "knee": (0.155, 0.530, 0.020),
+    "ankle": (0.195, 0.110, -0.002),
+    "heel": (0.194, 0.045, -0.046),
+    "foot_index": (0.190, 0.035, 0.185),
+}
+"""Where the left and central landmarks of `fit_landmarks.LANDMARKS` lie on the A-pose of the default shape."""
+
 
 class AnnyBody:
     """Anny (Apache-2.0 code, CC0 data) behind the interface that the fit needs, with the 52-joint Mixamo rig.
@@ -156,6 +178,7 @@ class AnnyBody:
         self.parents: Int[np.ndarray, "j"] = np.array(model.bone_parents, dtype=np.int32)
         self.faces: Int[np.ndarray, "f 3"] = model.get_triangular_faces().numpy().astype(np.int32)
         self.skin_weights: Float[np.ndarray, "v j"] = self._dense_weights()
+        self.landmark_places_m: Mapping[str, tuple[float, float, float]] = ANNY_LANDMARKS_M
         self.uv: Float[np.ndarray, "t 2"] = model.texture_coordinates.numpy().astype(np.float32)
         self.faces_uv: Int[np.ndarray, "f 3"] = model.face_texture_coordinate_indices.numpy().astype(np.int32)
 

@@ -19,36 +19,36 @@ class Landmark:
     """One left or central landmark.
 
     `carrier` is the joint it moves with; `anchor` the joint it is measured from (None: the nearest point of the
-    surface). `place_m` is where it lies on the default A-pose body. `noise` scales the detector's usual error.
+    surface; the carrier where a body has no such joint). `noise` scales the detector's usual error. Where it lies is
+    told by each body (`ParametricBody.landmark_places_m`).
     """
 
     name: str
     indices: tuple[int, ...]
     carrier: str
     anchor: str | None
-    place_m: tuple[float, float, float]
     noise: float
 
 
 # The right landmark mirrors the left one: x changes sign, "Left" becomes "Right".
 LANDMARKS = (
-    Landmark("nose", (0,), "Head", None, (0.0, 1.683, 0.157), 0.8),
-    Landmark("eye_inner", (1, 4), "Head", None, (0.018, 1.724, 0.125), 0.8),
-    Landmark("eye", (2, 5), "Head", None, (0.032, 1.724, 0.124), 0.8),
-    Landmark("eye_outer", (3, 6), "Head", None, (0.046, 1.724, 0.115), 0.8),
-    Landmark("ear", (7, 8), "Head", None, (0.078, 1.704, 0.037), 1.0),
-    Landmark("mouth", (9, 10), "Head", None, (0.026, 1.643, 0.131), 0.8),
-    Landmark("shoulder", (11, 12), "LeftShoulder", "LeftArm", (0.174, 1.485, 0.003), 1.0),
-    Landmark("elbow", (13, 14), "LeftArm", "LeftForeArm", (0.370, 1.262, 0.015), 1.0),
-    Landmark("wrist", (15, 16), "LeftForeArm", "LeftHand", (0.505, 1.122, 0.188), 1.0),
-    Landmark("pinky", (17, 18), "LeftHand", "LeftHandPinky1", (0.567, 1.044, 0.233), 1.5),
-    Landmark("index", (19, 20), "LeftHand", "LeftHandIndex1", (0.539, 1.075, 0.293), 1.5),
-    Landmark("thumb", (21, 22), "LeftHand", "LeftHandThumb2", (0.486, 1.102, 0.260), 1.5),
-    Landmark("hip", (23, 24), "Hips", "LeftUpLeg", (0.100, 0.960, 0.000), 1.2),
-    Landmark("knee", (25, 26), "LeftUpLeg", "LeftLeg", (0.155, 0.530, 0.020), 1.0),
-    Landmark("ankle", (27, 28), "LeftLeg", "LeftFoot", (0.195, 0.090, -0.008), 1.0),
-    Landmark("heel", (29, 30), "LeftFoot", "LeftFoot", (0.200, 0.030, -0.050), 1.3),
-    Landmark("foot_index", (31, 32), "LeftFoot", "LeftToeBase", (0.190, 0.015, 0.195), 1.3),
+    Landmark("nose", (0,), "Head", None, 0.8),
+    Landmark("eye_inner", (1, 4), "Head", None, 0.8),
+    Landmark("eye", (2, 5), "Head", None, 0.8),
+    Landmark("eye_outer", (3, 6), "Head", None, 0.8),
+    Landmark("ear", (7, 8), "Head", None, 1.0),
+    Landmark("mouth", (9, 10), "Head", None, 0.8),
+    Landmark("shoulder", (11, 12), "LeftShoulder", "LeftArm", 1.0),
+    Landmark("elbow", (13, 14), "LeftArm", "LeftForeArm", 1.0),
+    Landmark("wrist", (15, 16), "LeftForeArm", "LeftHand", 1.0),
+    Landmark("pinky", (17, 18), "LeftHand", "LeftHandPinky1", 1.5),
+    Landmark("index", (19, 20), "LeftHand", "LeftHandIndex1", 1.5),
+    Landmark("thumb", (21, 22), "LeftHand", "LeftHandThumb2", 1.5),
+    Landmark("hip", (23, 24), "Hips", "LeftUpLeg", 1.2),
+    Landmark("knee", (25, 26), "LeftUpLeg", "LeftLeg", 1.0),
+    Landmark("ankle", (27, 28), "LeftLeg", "LeftFoot", 1.0),
+    Landmark("heel", (29, 30), "LeftFoot", "LeftFoot", 1.3),
+    Landmark("foot_index", (31, 32), "LeftFoot", "LeftToeBase", 1.3),
 )
 
 OFFSET_COUNT = 3 * len(LANDMARKS)
@@ -106,7 +106,7 @@ class LandmarkRegressor:
 
 
 def landmark_regressor(default: FitModel) -> LandmarkRegressor:
-    """Tie the table's places to joints and vertices of a body of the default shape."""
+    """Tie a body's landmark places to joints and vertices of its default shape."""
     joints: list[int | None] = [None] * LANDMARK_COUNT
     vertices: list[int | None] = [None] * LANDMARK_COUNT
     shift = torch.zeros(LANDMARK_COUNT, 3, dtype=torch.float64)
@@ -115,12 +115,13 @@ def landmark_regressor(default: FitModel) -> LandmarkRegressor:
     for row, landmark in enumerate(LANDMARKS):
         for side, index in enumerate(landmark.indices):
             mirror = torch.tensor([-1.0 if side else 1.0, 1.0, 1.0], dtype=torch.float64)
-            place = torch.tensor(landmark.place_m, dtype=torch.float64) * mirror
+            place = torch.tensor(default.landmark_places_m[landmark.name], dtype=torch.float64) * mirror
             if landmark.anchor is None:
                 vertices[index] = int((default.vertices - place).norm(dim=1).argmin())
                 anchor = default.vertices[vertices[index]]
             else:
-                joints[index] = default.full_by_name[_on_side(landmark.anchor, side)]
+                carried = default.full_by_name[_on_side(landmark.carrier, side)]
+                joints[index] = default.full_by_name.get(_on_side(landmark.anchor, side), carried)
                 anchor = default.full_joints[joints[index]]
             shift[index] = place - anchor
             carrier[index, ACTIVE_JOINTS.index(_on_side(landmark.carrier, side))] = 1.0

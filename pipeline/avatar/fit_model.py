@@ -7,7 +7,7 @@ carry a point to and w_k its skin weight, turning joint j moves the point by (pa
 arm_j = sum over k at or below j of w_k (x_k - joint_j).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
@@ -35,7 +35,11 @@ SHAPE_STEP = 0.01
 
 @runtime_checkable
 class ParametricBody(Protocol):
-    """What a body model must offer to be fitted (`pipeline.avatar.body.AnnyBody` is one)."""
+    """What a body model must offer to be fitted: `AnnyBody` in `body.py`, `SmplBody` in `smpl.py`.
+
+    Its joints have Mixamo's names, at least `ACTIVE_JOINTS`. `landmark_places_m` is where the left and central
+    landmarks (`fit_landmarks.LANDMARKS`, by name) lie on the A-pose of the default shape.
+    """
 
     shape_names: tuple[str, ...]
     shape_defaults: Tensor
@@ -43,6 +47,7 @@ class ParametricBody(Protocol):
     parents: np.ndarray
     faces: np.ndarray
     skin_weights: np.ndarray
+    landmark_places_m: Mapping[str, tuple[float, float, float]]
 
     def rest(self, shape: Tensor) -> tuple[Tensor, Tensor]:
         """A-pose vertices (v, 3) and joints (j, 3) of a shape, metres."""
@@ -74,6 +79,7 @@ class FitModel:
     full_by_name: dict[str, int]
     full_joints: Float[Tensor, "full 3"]
     full_joints_by_shape: Float[Tensor, "full 3 s"]
+    landmark_places_m: Mapping[str, tuple[float, float, float]]
 
     def moved(self, shape: Float[Tensor, "s"]) -> "FitModel":
         """The same linear model at another shape (values move along the derivative, which stays)."""
@@ -129,6 +135,7 @@ def linearise(body: ParametricBody, shape: Float[Tensor, "s"]) -> FitModel:
         full_by_name={name: index for index, name in enumerate(body.joint_names)},
         full_joints=joints,
         full_joints_by_shape=joints_by_shape,
+        landmark_places_m=body.landmark_places_m,
     )
 
 
@@ -168,11 +175,14 @@ def fold_weights(body: ParametricBody, active: Sequence[int]) -> Float[Tensor, "
 def grip_rotations(body: ParametricBody) -> Float[Tensor, "full 3 3"]:
     """Local rotations of all joints in which the fingers are relaxed and the rest is the A-pose.
 
-    Fingers bend further the way in which the middle finger of the rest pose is bent already.
+    Fingers bend further the way in which the middle finger of the rest pose is bent already; a body without fingers
+    (SMPL) keeps its hands.
     """
     _, joints = body.rest(body.shape_defaults)
     axis_angle = torch.zeros(len(body.joint_names), 3, dtype=torch.float64)
     for side in ("Left", "Right"):
+        if f"{side}HandMiddle3" not in body.joint_names:
+            continue
         hand, knuckle, tip = (
             joints[body.joint_names.index(f"{side}Hand{part}")].double() for part in ("", "Middle1", "Middle3")
         )
