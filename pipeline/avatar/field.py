@@ -73,10 +73,11 @@ class Field(torch.nn.Module):
 
     bounds_m: (2, 3) box outside which there is nothing. layout: the hash grid's levels, over that box. trunk: a network
     in the grid's place, whose layout then is NO_GRID. inverse_skinning: the way in which posed points come to the field
-    when it is shown, as in `pipeline.avatar.inverse`; it is the one that the field learnt with.
+    when it is shown, as in `pipeline.avatar.inverse`; it finds the same points as the one that the field learnt with.
     """
 
     bounds_m: Tensor
+    table: Tensor
 
     def __init__(
         self,
@@ -92,7 +93,12 @@ class Field(torch.nn.Module):
         width = trunk.width if trunk else layout.width
         self.register_buffer("bounds_m", torch.tensor(bounds_m, dtype=torch.float32))
         random = torch.Generator().manual_seed(seed)
-        self.table = _uniform((layout.rows, layout.features), 1e-4, random)
+        table = _uniform((layout.rows, layout.features), 1e-4, random)
+        if trunk:
+            # It has no rows then: nothing that an optimiser could move.
+            self.register_buffer("table", table.detach())
+        else:
+            self.table = table
         self.hidden = _uniform((width, hidden_width), math.sqrt(6 / width), random)
         self.output = _uniform((hidden_width, 4), math.sqrt(1 / hidden_width), random)
         self.bias = torch.nn.Parameter(torch.zeros(4))

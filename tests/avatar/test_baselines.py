@@ -5,7 +5,9 @@ import pytest
 import torch
 
 from pipeline.avatar.body import canonical_to_world
+from pipeline.avatar.field import NO_GRID, Field, choose_layout
 from pipeline.avatar.field_config import FieldConfig
+from pipeline.avatar.frequency import FrequencyTrunk
 from pipeline.avatar.prepare import start_learning
 from pipeline.avatar.render import over_white, render_field
 from pipeline.core.config import build, load_layers
@@ -93,6 +95,17 @@ def test_a_hull_shows_a_new_pose_without_a_step_and_returns_from_disk(scene, tmp
     assert learning.config.steps == 0
     assert psnr_db(scene, learning) > 20
     assert shown_again_db(scene, learning, tmp_path, "baked") == psnr_db(scene, learning)
+
+
+@pytest.mark.parametrize("trunk", [None, FrequencyTrunk(2, 16)])
+def test_colour_reaches_every_parameter_of_a_field(trunk):
+    """The mesh stage asks for the gradients of all of them."""
+    bounds_m = np.array([[0, 0, 0], [1, 1, 1]], dtype=np.float32)
+    layout = NO_GRID if trunk else choose_layout(bounds_m, 0.1, 2, 2, 10)
+    field = Field(bounds_m, layout, 16, trunk=trunk)
+    colour, _ = field(torch.rand(50, 3, generator=torch.Generator().manual_seed(0)))
+    gradients = torch.autograd.grad(colour.sum(), list(field.parameters()))
+    assert all(bool(gradient.abs().sum() > 0) for gradient in gradients)
 
 
 def shown_again_db(scene, learning, folder, shown_by):
