@@ -14,6 +14,7 @@ from pipeline.core.stage import Stage
 from pipeline.io.capture import CONTACT_SHEET, FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, Capture, save_capture
 from pipeline.io.contact import contact_sheet
 from pipeline.io.image import write_rgb
+from pipeline.io.lens import recorded_focal_px
 from pipeline.io.screening import refuse_bad_input, warn_of_gaps
 from pipeline.io.sightings import Sightings, look_at_all, write_frames
 from pipeline.io.supplied import Supplied, SuppliedSplit, find_supplied
@@ -141,12 +142,13 @@ def make_capture(sightings: Sightings, chosen: list[int], out: Path, source: Sou
         mask_source=supplied.mask_source or "detector",
         n_video_frames=source.n_frames,
         scale=sightings.scale,
+        recorded_focal_px=recorded_focal_px(source, sightings.width, sightings.height),
     )
 
 
 STAGE = Stage(
     "frames",
-    version=1,
+    version=2,
     needs=("video",),
     makes=(FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, CONTACT_SHEET),
     config=Config,

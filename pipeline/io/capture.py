@@ -24,6 +24,7 @@ class Capture:
     landmarks_px: MediaPipe's 33 points, pixel centres at +0.5; nan where unknown. Visibility in [0, 1].
     landmarks_world_m: metres about the hips' centre in camera axes; nan where unknown.
     camera: what was supplied with the video, for these images; None when unknown.
+    recorded_focal_px: focal length in these images by the recording's own metadata; None when they say nothing.
     scale: size of these images relative to the recording's. Images are undistorted.
     """
 
@@ -41,6 +42,7 @@ class Capture:
     mask_source: str
     n_video_frames: int
     scale: float
+    recorded_focal_px: float | None = None
 
     def __len__(self) -> int:
         return len(self.frame_index)
@@ -87,6 +89,7 @@ def save_capture(capture: Capture) -> None:
         "mask_source": np.array(capture.mask_source),
         "n_video_frames": np.array(capture.n_video_frames, dtype=np.int32),
         "scale": np.array(capture.scale),
+        "recorded_focal_px": np.array(np.nan if capture.recorded_focal_px is None else capture.recorded_focal_px),
     }
     for name, value in zip(_INTRINSICS, intrinsics, strict=True):
         arrays[name] = np.array(value)
@@ -114,7 +117,13 @@ def load_capture(frames_dir: Path) -> Capture:
         mask_source=str(arrays["mask_source"].item()),
         n_video_frames=int(arrays["n_video_frames"].item()),
         scale=float(arrays["scale"].item()),
+        recorded_focal_px=_recorded_focal_px(arrays),
     )
+
+
+def _recorded_focal_px(arrays: Mapping[str, np.ndarray]) -> float | None:
+    found = float(np.ravel(arrays.get("recorded_focal_px", np.nan))[0])
+    return found if np.isfinite(found) else None
 
 
 def _camera(arrays: Mapping[str, np.ndarray]) -> Camera | None:

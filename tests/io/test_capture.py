@@ -38,6 +38,7 @@ def capture(tmp_path) -> Capture:
         mask_source="detector",
         n_video_frames=9,
         scale=0.5,
+        recorded_focal_px=88.0,
     )
 
 
@@ -52,8 +53,9 @@ def test_round_trip(capture):
 
 
 def test_unknown_camera_stays_unknown(capture):
-    save_capture(dataclasses.replace(capture, camera=None))
+    save_capture(dataclasses.replace(capture, camera=None, recorded_focal_px=None))
     assert load_capture(capture.folder).camera is None
+    assert load_capture(capture.folder).recorded_focal_px is None
 
 
 def test_pictures_are_found_by_position(capture):
