@@ -21,6 +21,7 @@ from pipeline.geometry.camera import Camera
 from pipeline.io.capture import Capture, load_capture
 from pipeline.io.image import to_uint8, write_rgb
 from pipeline.io.npz import save_body, save_camera, save_motion, save_npz
+from pipeline.io.smpl_model import load_smpl
 
 _BODY, _MOTION, _CAMERA, _SCORES, _OVERLAY = "body.npz", "motion.npz", "camera.npz", "scores.npz", "overlay.png"
 _OVERLAY_FRAMES = 12
@@ -29,6 +30,9 @@ _OVERLAY_FRAMES = 12
 class Config(BaseConfig):
     """Options of the body stage."""
 
+    model_file: str | None = Field(
+        None, description="SMPL, SMPL-H or SMPL-X model to fit, a path to .npz or .pkl; null: the built-in body."
+    )
     height_m: float | None = Field(
         None, ge=0.5, le=2.5, description="Stature of the person, metres; null: about 1.70 m, as the pictures suggest."
     )
@@ -80,8 +84,9 @@ def fit(capture: Capture, masks: Sequence[UInt8[np.ndarray, "h w"]], frames_dir:
         capture.time_s, capture.landmarks_px, capture.landmarks_visibility, capture.landmarks_world_m, camera
     )
     options = FitOptions(config.height_m, focal_known, config.shared_frames, config.rounds)
+    model = load_anny() if config.model_file is None else load_smpl(Path(config.model_file))
     try:
-        result = fit_body(load_anny(), observations, [matching_window(mask) for mask in masks], options)
+        result = fit_body(model, observations, [matching_window(mask) for mask in masks], options)
     except ValueError as error:
         raise UserError(
             f"the body cannot be fitted to {frames_dir}: {error}; let the detector find the landmarks "
