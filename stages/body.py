@@ -25,6 +25,8 @@ from pipeline.io.smpl_model import load_smpl
 
 _BODY, _MOTION, _CAMERA, _SCORES, _OVERLAY = "body.npz", "motion.npz", "camera.npz", "scores.npz", "overlay.png"
 _OVERLAY_FRAMES = 12
+_GUESS_DEVIATION, _RECORDED_DEVIATION = 0.5, 0.1
+"""Relative deviations of a guessed focal length and of one in the recording's metadata (`pipeline.io.lens`)."""
 
 
 class Config(BaseConfig):
@@ -79,11 +81,11 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
 
 def fit(capture: Capture, masks: Sequence[UInt8[np.ndarray, "h w"]], frames_dir: Path, config: Config) -> FitResult:
     """Fit and judge; UserError when the landmarks or the result are of no use."""
-    camera, focal_known = starting_camera(capture, config)
+    camera, focal_deviation = starting_camera(capture, config)
     observations = make_observations(
         capture.time_s, capture.landmarks_px, capture.landmarks_visibility, capture.landmarks_world_m, camera
     )
-    options = FitOptions(config.height_m, focal_known, config.shared_frames, config.rounds)
+    options = FitOptions(config.height_m, focal_deviation, config.shared_frames, config.rounds)
     model = load_anny() if config.model_file is None else load_smpl(Path(config.model_file))
     try:
         result = fit_body(model, observations, [matching_window(mask) for mask in masks], options)
@@ -102,16 +104,21 @@ def fit(capture: Capture, masks: Sequence[UInt8[np.ndarray, "h w"]], frames_dir:
     return result
 
 
-def starting_camera(capture: Capture, config: Config) -> tuple[Camera, bool]:
-    """The camera to start from (supplied, by the options, or a guess), and whether its focal length is known."""
+def starting_camera(capture: Capture, config: Config) -> tuple[Camera, float]:
+    """The camera to start from, and the relative deviation of its focal length (0: known).
+
+    Supplied, by the options, as the recording's metadata say, or a guess, in this order.
+    """
     if capture.camera is not None:
-        return capture.camera, True
+        return capture.camera, 0.0
     side_px = max(capture.width, capture.height)
-    focal_px = config.usual_focal * side_px
+    focal_px, deviation = config.usual_focal * side_px, _GUESS_DEVIATION
     if config.field_of_view_deg is not None:
-        focal_px = 0.5 * side_px / float(np.tan(np.radians(0.5 * config.field_of_view_deg)))
+        focal_px, deviation = 0.5 * side_px / float(np.tan(np.radians(0.5 * config.field_of_view_deg))), 0.0
+    elif capture.recorded_focal_px is not None:
+        focal_px, deviation = capture.recorded_focal_px, _RECORDED_DEVIATION
     camera = Camera(focal_px, focal_px, 0.5 * capture.width, 0.5 * capture.height, capture.width, capture.height)
-    return camera, config.field_of_view_deg is not None
+    return camera, deviation
 
 
 def overlay(
@@ -136,7 +143,7 @@ def overlay(
 
 STAGE = Stage(
     "body",
-    version=1,
+    version=2,
     needs=("frames",),
     makes=(_BODY, _MOTION, _CAMERA, _SCORES, _OVERLAY),
     config=Config,

@@ -46,10 +46,13 @@ OUTLINE_DIRECTION_M = 0.4
 
 @dataclass(frozen=True)
 class FitOptions:
-    """`height_m` and `focal_known` take unknowns away; `shared_frames` and `rounds` are the effort."""
+    """`height_m` and a `focal_deviation` of 0 take unknowns away; `shared_frames` and `rounds` are the effort.
+
+    focal_deviation: standard deviation of the logarithm of the true focal length over the one to start from.
+    """
 
     height_m: float | None = None
-    focal_known: bool = False
+    focal_deviation: float = 0.5
     shared_frames: int = 48
     rounds: int = 8
 
@@ -149,7 +152,9 @@ def _fit_shared(
     """Shape, focal length and landmark offsets (with the poses of these frames), and the last normal equations."""
     weights = Weights() if options.height_m is None else Weights(height_m=options.height_m, height_deviation_m=0.005)
     state, _ = _minimised(tools, tools.default, observations, weights, state, LANDMARK_STEPS)
-    weights = replace(weights, free_offsets=True, free_focal=not options.focal_known)
+    weights = replace(weights, free_offsets=True)
+    if options.focal_deviation > 0.0:
+        weights = replace(weights, free_focal=True, focal_log=options.focal_deviation)
     model = linearise(tools.body, state.shape)
     state, system = _minimised(tools, model, observations, weights, state, LANDMARK_STEPS)
     weights = replace(weights, landmark_m=OUTLINE_LANDMARK_M, direction_m=OUTLINE_DIRECTION_M)

@@ -14,6 +14,9 @@ LEAST_CONFIDENCE = 0.1
 LOW_OVERLAP = 0.10
 """A frame is doubtful when its overlap lies this far below the median."""
 
+UNSURE_FOCAL = 0.15
+"""A focal length is worth a word when it is known no better than this share of it."""
+
 HIGH_ERROR = 3.0
 """A frame is doubtful when its landmark error is this many times the median."""
 
@@ -65,6 +68,11 @@ def doubts(result: FitResult, frame_index: Int[np.ndarray, "n"]) -> list[str]:
     if poor.any():
         sentences.append(
             f"frames {frame_ranges(frame_index, poor)}: the body fits worse than elsewhere; see overlay.png"
+        )
+    if result.focal_deviation > UNSURE_FOCAL:
+        sentences.append(
+            f"focal length {result.camera.fx:.0f} px is known to {100 * result.focal_deviation:.0f} % only: supply "
+            "camera.json or body.field_of_view_deg, or film a full turn from nearer"
         )
     return sentences
 

@@ -54,6 +54,12 @@ def test_doubtful_frames_are_named(changes: dict[str, float], row: int, words: s
     assert sentence.startswith(words)
 
 
+def test_an_unsure_focal_length_is_told_with_a_remedy() -> None:
+    (sentence,) = doubts(result(focal_deviation=0.2), np.arange(FRAMES))
+    assert sentence.startswith("focal length 500 px is known to 20 % only")
+    assert "camera.json" in sentence
+
+
 def test_exchanged_legs_are_told() -> None:
     legs = np.arange(FRAMES) > 8
     (sentence,) = doubts(result(exchanged={"legs": legs}), np.arange(FRAMES))

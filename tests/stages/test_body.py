@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -92,13 +94,15 @@ def test_camera_supplied_then_given_then_guessed(tmp_path, scene: Act) -> None:
     for name, camera in (("known", scene.camera), ("unknown", None)):
         write_capture(tmp_path / name, scene, camera, [])
     known, unknown = (load_capture(tmp_path / name) for name in ("known", "unknown"))
-    assert starting_camera(known, Config(field_of_view_deg=90.0)) == (known.camera, True)
-    camera, sure = starting_camera(unknown, Config(field_of_view_deg=90.0))
-    assert sure
+    assert starting_camera(known, Config(field_of_view_deg=90.0)) == (known.camera, 0.0)
+    camera, deviation = starting_camera(unknown, Config(field_of_view_deg=90.0))
+    assert deviation == 0.0
     assert camera.fx == pytest.approx(0.5 * scene.camera.height)
-    camera, sure = starting_camera(unknown, Config(usual_focal=1.5))
-    assert not sure
+    camera, deviation = starting_camera(unknown, Config(usual_focal=1.5))
+    assert deviation == 0.5
     assert camera.fx == pytest.approx(1.5 * scene.camera.height)
+    camera, deviation = starting_camera(replace(unknown, recorded_focal_px=333.0), Config(usual_focal=1.5))
+    assert (camera.fx, deviation) == (333.0, 0.1)
 
 
 @pytest.mark.parametrize("values", [{"height_m": 30.0}, {"rounds": 0}, {"min_overlap": 2.0}, {"heigth_m": 1.7}])
