@@ -59,6 +59,7 @@ def start_learning(
     cell_px = 0.5 * float((bounds_m[1] - bounds_m[0]).max()) / distance_m.shape[0] / pixel_m
     frequency[near] = mask_frequency(
         cell_centres(bounds_m)[near.reshape(-1)],
+        distance_m[near],
         skin,
         canonical_to_world(body, motion.select(rows)),
         camera,

@@ -13,6 +13,10 @@ from pipeline.geometry.surface import signed_distance_m
 from pipeline.kernels.reference.warp import skin_points
 from pipeline.kernels.warp import SkinGrid
 
+UNSEEN_REACH_M = 0.08
+"""Beyond this distance from the body nothing is expected unseen; at half of it, as likely as not."""
+UNSEEN_WEIGHT = 8.0
+"""Frames that the expectation counts for where no frame shows a point."""
 DEEPEST_M = 0.3
 """No point inside a body is farther from its surface."""
 
@@ -34,6 +38,7 @@ def cell_distances_m(body: Body, bounds_m: Float[np.ndarray, "2 3"], reach_m: fl
 
 def mask_frequency(
     centres_m: Float[np.ndarray, "n 3"],
+    distance_m: Float[np.ndarray, "n"],
     skin: SkinGrid,
     canonical_to_world: Float[Tensor, "k j 4 4"],
     camera: Camera,
@@ -41,7 +46,9 @@ def mask_frequency(
 ) -> Float[np.ndarray, "n"]:
     """Part of the frames in which each canonical point, carried by its skin weights, projects into the mask.
 
-    Frames in which a point lies outside the image do not count; a point that is never in an image gets 1.
+    Frames in which a point lies outside the image do not count. In their place stands, with the weight of a few frames,
+    what one expects unseen: clothing near the body (at `distance_m` from it) and nothing farther off, so that feet which
+    the image cuts off do not grow lumps.
     masks: one a frame, dilated by as much as a point stands for.
     """
     points = torch.from_numpy(centres_m)
@@ -54,7 +61,9 @@ def mask_frequency(
         inside = (depth_m.numpy() > 0) & (column >= 0) & (line >= 0) & (column < mask.shape[1]) & (line < mask.shape[0])
         seen += inside
         hits[inside] += mask[line[inside], column[inside]] > 0
-    return np.where(seen > 0, hits / np.maximum(seen, 1), 1.0).astype(np.float32)
+    expected = np.clip(1.0 - distance_m / UNSEEN_REACH_M, 0.0, 1.0)
+    missing = UNSEEN_WEIGHT * (1.0 - seen / max(len(masks), 1))
+    return ((hits + missing * expected) / np.maximum(seen + missing, 1e-6)).astype(np.float32)
 
 
 def starting_shell(

@@ -14,6 +14,10 @@ from numba import njit, prange
 _OPTIONS = {"cache": True, "fastmath": {"arcp", "nsz"}, "error_model": "numpy"}
 _ZERO, _ONE = np.float32(0), np.float32(1)
 BLOCK = 256
+FARTHER_M = np.float32(0.03)
+"""An inverse that much farther from the body than another is not believed: the side of a torso would else become a flap
+below the arm that hung beside it.
+"""
 
 
 @njit(**_OPTIONS)
@@ -191,9 +195,38 @@ def _is_smooth(canonical, corners, limit):
 
 
 @njit(**_OPTIONS)
-def _roots_in_cell(canonical, corners, centre, origin, cell, row_of_node, blended, maps):
+def _distance_at(x, y, z, origin, cell, row_of_node, distance):
+    """Distance to the body at a canonical point whose cell has all its nodes."""
+    gx, gy, gz = (x - origin[0]) / cell, (y - origin[1]) / cell, (z - origin[2]) / cell
+    i, j, k = int(np.floor(gx)), int(np.floor(gy)), int(np.floor(gz))
+    u, v, w = gx - np.float32(i), gy - np.float32(j), gz - np.float32(k)
+    total = _ZERO
+    for corner in range(8):
+        a, b, c = corner & 1, (corner >> 1) & 1, corner >> 2
+        weight = (u if a == 1 else _ONE - u) * (v if b == 1 else _ONE - v) * (w if c == 1 else _ONE - w)
+        total += weight * distance[row_of_node[i + a, j + b, k + c]]
+    return total
+
+
+@njit(**_OPTIONS)
+def _keep_near(maps, distances, found):
+    """Drop the inverses that lie much farther from the body than the nearest one; returns how many are left."""
+    nearest = distances[0]
+    for root in range(1, found):
+        nearest = min(nearest, distances[root])
+    kept = 0
+    for root in range(found):
+        if distances[root] <= nearest + FARTHER_M:
+            maps[kept] = maps[root]
+            kept += 1
+    return kept
+
+
+@njit(**_OPTIONS)
+def _roots_in_cell(canonical, corners, centre, origin, cell, row_of_node, blended, distance, maps):
     """Distinct inverses at a cell's centre, started from its corners, as affine maps (4, 12); returns their number."""
     found = 0
+    distances = np.empty(4, np.float32)
     inverse_jacobian = np.empty(9, np.float32)
     for corner in range(8):
         node = corners[corner]
@@ -246,12 +279,13 @@ def _roots_in_cell(canonical, corners, centre, origin, cell, row_of_node, blende
                 maps[found, 4 * axis + column] = inverse_jacobian[3 * axis + column]
                 value -= inverse_jacobian[3 * axis + column] * centre[column]
             maps[found, 4 * axis + 3] = value
+        distances[found] = _distance_at(x, y, z, origin, cell, row_of_node, distance)
         found += 1
-    return found
+    return _keep_near(maps, distances, found) if found > 1 else found
 
 
 @njit(**_OPTIONS)
-def _code_cells(canonical, posed_origin, dims, origin, cell, row_of_node, blended):
+def _code_cells(canonical, posed_origin, dims, origin, cell, row_of_node, blended, distance):
     """A code per posed cell and the affine maps of the cells without one smooth inverse: see `bake`."""
     codes = np.full((dims[0] - 1) * (dims[1] - 1) * (dims[2] - 1), -1, np.int32)
     capacity, used = 256, 0
@@ -275,7 +309,7 @@ def _code_cells(canonical, posed_origin, dims, origin, cell, row_of_node, blende
                 centre[0] = posed_origin[0] + (np.float32(i) + np.float32(0.5)) * cell
                 centre[1] = posed_origin[1] + (np.float32(j) + np.float32(0.5)) * cell
                 centre[2] = posed_origin[2] + (np.float32(k) + np.float32(0.5)) * cell
-                count = _roots_in_cell(canonical, corners, centre, origin, cell, row_of_node, blended, maps)
+                count = _roots_in_cell(canonical, corners, centre, origin, cell, row_of_node, blended, distance, maps)
                 if count == 0:
                     continue
                 if used + count > capacity:
@@ -294,7 +328,7 @@ def bake(nodes, posed, distance, posed_origin, dims, origin, cell, row_of_node, 
     """The warp grid of one frame: see `pipeline.kernels.warp.bake`."""
     row_of = _claim(posed, distance, posed_origin, cell, dims)
     canonical = _solve_nodes(row_of, nodes, posed, posed_origin, dims, origin, cell, row_of_node, blended)
-    codes, maps = _code_cells(canonical, posed_origin, dims, origin, cell, row_of_node, blended)
+    codes, maps = _code_cells(canonical, posed_origin, dims, origin, cell, row_of_node, blended, distance)
     return canonical, codes, maps
 
 

@@ -1,0 +1,48 @@
+import numpy as np
+import torch
+
+from pipeline.avatar.support import mask_frequency, starting_shell
+from pipeline.geometry.camera import Camera
+from tests.kernels.bar import bar_skin
+
+UPRIGHT = torch.eye(4).expand(1, 2, 4, 4)
+LOOKING_BACK = np.diag([1.0, -1.0, -1.0, 1.0])
+LOOKING_BACK[2, 3] = 2.0
+
+
+def frequency_of(points, distances, masks, width=40):
+    """Of points of the unbent bar, before a camera 2 m away for which a decimetre is five pixels."""
+    camera = Camera(100.0, 100.0, width / 2, 20.0, width, 40, LOOKING_BACK.astype(np.float32))
+    matrices = UPRIGHT.expand(len(masks), 2, 4, 4)
+    points, distances = np.array(points, dtype=np.float32), np.array(distances, dtype=np.float32)
+    return mask_frequency(points, distances, bar_skin(), matrices, camera, masks)
+
+
+def test_counts_the_masks_that_hold_a_point():
+    left = np.zeros((40, 40), dtype=np.uint8)
+    left[:, :20] = 1
+    masks = [left, left, left, 1 - left]
+    frequency = frequency_of([[-0.3, 0, 0], [0.3, 0, 0]], [0.1, 0.1], masks)
+    np.testing.assert_allclose(frequency, [0.75, 0.25], atol=1e-6)
+
+
+def test_unseen_points_are_expected_near_the_body_only():
+    masks = [np.ones((40, 20), dtype=np.uint8)] * 8
+    seen, near, far = frequency_of([[0, 0, 0], [0.5, 0, 0], [0.5, 0, 0]], [0.1, 0.0, 0.1], masks, width=20)
+    assert seen == 1
+    assert near == 1
+    assert far == 0
+
+
+def test_few_sights_of_a_far_point_do_not_outweigh_the_expectation():
+    masks = [np.ones((40, 40), dtype=np.uint8)] * 2
+    blank = [np.zeros((40, 40), dtype=np.uint8)] * 2
+    assert frequency_of([[0, 0, 0]], [0.1], masks + blank)[0] == 0.5
+    narrow = [np.ones((40, 40), dtype=np.uint8)] * 4
+    assert frequency_of([[0.42, 0, 0]], [0.1], narrow)[0] < 0.1
+
+
+def test_the_shell_holds_the_body_and_what_masks_support():
+    distance = np.array([-0.01, 0.05, 0.05, 0.2])
+    frequency = np.array([0.0, 0.7, 0.5, 1.0])
+    assert starting_shell(distance, frequency, 0.1, 0.6).tolist() == [True, True, False, False]
