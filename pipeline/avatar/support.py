@@ -46,9 +46,9 @@ def mask_frequency(
 ) -> Float[np.ndarray, "n"]:
     """Part of the frames in which each canonical point, carried by its skin weights, projects into the mask.
 
-    Frames in which a point lies outside the image do not count. In their place stands, with the weight of a few frames,
-    what one expects unseen: clothing near the body (at `distance_m` from it) and nothing farther off, so that feet which
-    the image cuts off do not grow lumps.
+    Frames in which a point lies outside the image do not count. In their place stands, with the weight of a few
+    frames, what one expects unseen: clothing near the body (at `distance_m` from it) and nothing farther off, so that
+    feet which the image cuts off do not grow lumps.
     masks: one a frame, dilated by as much as a point stands for.
     """
     points = torch.from_numpy(centres_m)
