@@ -45,28 +45,28 @@ ARM_DIRECTIONS = {"Arm": (0.662, -0.749, 0.024), "ForeArm": (0.515, -0.519, 0.68
 FINGER_BEND_RAD = 0.2
 
 HEAD_PLACES = {
-    "nose": (0.0, 0.390, 1.0),
-    "eye_inner": (0.198, 0.551, 0.857),
-    "eye": (0.352, 0.551, 0.853),
-    "eye_outer": (0.507, 0.551, 0.813),
-    "ear": (0.859, 0.472, 0.468),
-    "mouth": (0.286, 0.232, 0.884),
+    "nose": (0.0, 0.468, 0.928),
+    "eye_inner": (0.198, 0.61, 0.822),
+    "eye": (0.297, 0.61, 0.809),
+    "eye_outer": (0.419, 0.61, 0.778),
+    "ear": (0.639, 0.532, 0.556),
+    "mouth": (0.198, 0.319, 0.884),
 }
 """Landmarks of the face in the box of the head's vertices, as on the built-in body: share of the half width to the
 left, of the height from below, of the depth from behind. They hold for any numbering of the vertices."""
 
 JOINT_PLACES = {
-    "shoulder": (("LeftArm", (-0.012, 0.015, -0.001)),),
-    "elbow": (("LeftForeArm", (-0.006, 0.007, 0.004)),),
-    "wrist": (("LeftHand", (-0.004, 0.001, 0.001)),),
-    "pinky": (("LeftHandPinky1", (0.0, 0.0, 0.0)), ("LeftHand", (0.058, -0.077, 0.046))),
-    "index": (("LeftHandIndex1", (0.0, 0.0, 0.0)), ("LeftHand", (0.030, -0.046, 0.106))),
-    "thumb": (("LeftHandThumb2", (0.0, 0.0, 0.0)), ("LeftHand", (-0.023, -0.019, 0.073))),
-    "hip": (("LeftUpLeg", (-0.013, -0.017, 0.013)),),
+    "shoulder": (("LeftArm", (-0.012, 0.025, 0.002)),),
+    "elbow": (("LeftForeArm", (-0.012, 0.015, 0.012)),),
+    "wrist": (("LeftHand", (0.0, -0.006, 0.013)),),
+    "pinky": (("LeftHandPinky1", (-0.015, 0.012, 0.01)), ("LeftHand", (0.043, -0.065, 0.056))),
+    "index": (("LeftHandIndex1", (0.0, -0.013, -0.02)), ("LeftHand", (0.03, -0.059, 0.086))),
+    "thumb": (("LeftHandThumb2", (0.03, -0.02, 0.0)), ("LeftHand", (0.007, -0.039, 0.073))),
+    "hip": (("LeftUpLeg", (-0.013, -0.024, 0.028)),),
     "knee": (("LeftLeg", (0.004, -0.002, -0.002)),),
-    "ankle": (("LeftFoot", (0.001, 0.009, 0.0)),),
-    "heel": (("LeftFoot", (0.006, -0.051, -0.042)),),
-    "foot_index": (("LeftToeBase", (-0.001, -0.014, 0.046)),),
+    "ankle": (("LeftFoot", (0.001, 0.029, 0.006)),),
+    "heel": (("LeftFoot", (0.0, -0.036, -0.038)),),
+    "foot_index": (("LeftToeBase", (-0.001, 0.006, 0.036)),),
 }
 """The other landmarks: shift (m) from a joint, as on the built-in body; the first joint that the model has counts."""
 
