@@ -3,11 +3,12 @@
 import numpy as np
 from numba import njit, prange
 
+from pipeline.kernels.options import OPTIONS
+
 CHUNK = 1 << 15
-_OPTIONS = {"cache": True, "fastmath": {"arcp", "nsz"}, "error_model": "numpy"}
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _update_slice(parameter, gradient, first, second, rate, beta1, beta2, floor):
     limit, tiny, zero = np.float32(1e18), np.float32(1e-30), np.float32(0)
     rest1, rest2 = np.float32(1) - beta1, np.float32(1) - beta2
@@ -24,7 +25,7 @@ def _update_slice(parameter, gradient, first, second, rate, beta1, beta2, floor)
         parameter[i] -= rate * m / (np.sqrt(v) + floor)
 
 
-@njit(parallel=True, **_OPTIONS)
+@njit(parallel=True, **OPTIONS)
 def _update(parameter, gradient, first, second, rate, beta1, beta2, floor):
     count = parameter.shape[0]
     for chunk in prange((count + CHUNK - 1) // CHUNK):

@@ -3,13 +3,13 @@
 import numpy as np
 from numba import njit, prange
 
+from pipeline.kernels.options import OPTIONS
 from pipeline.kernels.warp_cpu import invert
 
-_OPTIONS = {"cache": True, "fastmath": {"arcp", "nsz"}, "error_model": "numpy"}
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _blend(x, frame, origin, cell, row_of_node, blended, matrix):
     """Fill the skinning matrix (12) at a canonical point; False outside the grid."""
     gx, gy, gz = (x[0] - origin[0]) / cell, (x[1] - origin[1]) / cell, (x[2] - origin[2]) / cell
@@ -30,7 +30,7 @@ def _blend(x, frame, origin, cell, row_of_node, blended, matrix):
     return True
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _miss(matrix, x, target, miss):
     """A(x) x - p into `miss`; returns its squared length."""
     squared = _ZERO
@@ -42,7 +42,7 @@ def _miss(matrix, x, target, miss):
     return squared
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _update(inverse, move, change):
     """Broyden's good update of the inverse Jacobian; False if it is not possible."""
     along, ahead = np.empty(3, np.float32), np.empty(3, np.float32)
@@ -59,7 +59,7 @@ def _update(inverse, move, change):
     return True
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _search(target, x, frame, iterations, converged, diverged, origin, cell, row_of_node, blended, inverse, matrix):
     """Move `x` to a root of A(x) x = target; True if it got there."""
     miss, before, move = np.empty(3, np.float32), np.empty(3, np.float32), np.empty(3, np.float32)
@@ -93,7 +93,7 @@ def _search(target, x, frame, iterations, converged, diverged, origin, cell, row
     return squared < converged * converged
 
 
-@njit(parallel=True, **_OPTIONS)
+@njit(parallel=True, **OPTIONS)
 def search(
     posed,
     frame,

@@ -8,10 +8,10 @@ dims everything behind it and adds to the alpha by the light T_end that is left 
 import numpy as np
 from numba import njit, prange
 
-_OPTIONS = {"cache": True, "fastmath": {"arcp", "nsz"}, "error_model": "numpy"}
+from pipeline.kernels.options import OPTIONS
 
 
-@njit(parallel=True, **_OPTIONS)
+@njit(parallel=True, **OPTIONS)
 def forward(density, colour, step, ray_start, weights, image, alpha):
     """Fill weights (s), image (n, c) and alpha (n)."""
     channels = colour.shape[1]
@@ -29,7 +29,7 @@ def forward(density, colour, step, ray_start, weights, image, alpha):
         alpha[ray] = np.float32(1) - light
 
 
-@njit(parallel=True, **_OPTIONS)
+@njit(parallel=True, **OPTIONS)
 def backward(
     density,
     colour,

@@ -12,13 +12,13 @@ import numpy as np
 from numba import njit, prange
 
 from pipeline.kernels.hashing import PRIMES
+from pipeline.kernels.options import OPTIONS
 
 BLOCK = 128
 _PRIME_Y, _PRIME_Z = np.uint32(PRIMES[0]), np.uint32(PRIMES[1])
-_OPTIONS = {"cache": True, "fastmath": {"arcp", "nsz"}, "error_model": "numpy"}
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _corners(points, start, stop, level_plan, rows, weights, parts):
     """Table rows (8, BLOCK), weights (8, BLOCK) and positions in the cell (3, BLOCK) of a block of points."""
     cells_x, cells_y, cells_z, first = level_plan[0], level_plan[1], level_plan[2], level_plan[3]
@@ -59,7 +59,7 @@ def _corners(points, start, stop, level_plan, rows, weights, parts):
 def forward(features: int):
     """(points (n, 3), table (rows, f), plan (l, 6), encoded (n, l*f)) -> None; fills `encoded`."""
 
-    @njit(**_OPTIONS)
+    @njit(**OPTIONS)
     def encode_block(points, table, level_plan, encoded, column, start, stop):
         rows = np.empty((8, BLOCK), np.uint32)
         weights = np.empty((8, BLOCK), np.float32)
@@ -76,7 +76,7 @@ def forward(features: int):
                     (w0 * level[r0, f] + w1 * level[r1, f]) + (w2 * level[r2, f] + w3 * level[r3, f])
                 ) + ((w4 * level[r4, f] + w5 * level[r5, f]) + (w6 * level[r6, f] + w7 * level[r7, f]))
 
-    @njit(parallel=True, **_OPTIONS)
+    @njit(parallel=True, **OPTIONS)
     def encode(points, table, plan, encoded):
         count = points.shape[0]
         for level in range(plan.shape[0]):
@@ -87,7 +87,7 @@ def forward(features: int):
     return encode
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _level_of_turn(turn, levels):
     """0, 2, 4, ... and then 1, 3, 5, ...: two threads that take half of the turns each get coarse and fine levels."""
     even = (levels + 1) // 2
@@ -98,7 +98,7 @@ def _level_of_turn(turn, levels):
 def backward_table(features: int):
     """(points (n, 3), plan (l, 6), gradient (n, l*f), table_gradient (rows, f)) -> None; adds to `table_gradient`."""
 
-    @njit(**_OPTIONS)
+    @njit(**OPTIONS)
     def scatter_block(points, level_plan, gradient, column, table_gradient, start, stop, rows, weights, parts):
         first = _corners(points, start, stop, level_plan, rows, weights, parts)
         level = table_gradient[first:]
@@ -108,7 +108,7 @@ def backward_table(features: int):
                 for f in range(features):
                     level[row, f] += weight * gradient[start + k, column + f]
 
-    @njit(parallel=True, **_OPTIONS)
+    @njit(parallel=True, **OPTIONS)
     def scatter(points, plan, gradient, table_gradient):
         count = points.shape[0]
         levels = plan.shape[0]
@@ -131,7 +131,7 @@ def backward_table(features: int):
 def backward_points(features: int):
     """(points (n, 3), table (rows, f), plan, gradient (n, l*f), points_gradient (n, 3)) -> None; adds to the last."""
 
-    @njit(**_OPTIONS)
+    @njit(**OPTIONS)
     def gather_block(points, table, level_plan, gradient, column, points_gradient, start, stop):
         rows = np.empty((8, BLOCK), np.uint32)
         weights = np.empty((8, BLOCK), np.float32)
@@ -169,7 +169,7 @@ def backward_points(features: int):
             points_gradient[start + k, 1] += along_y * np.float32(level_plan[1])
             points_gradient[start + k, 2] += along_z * np.float32(level_plan[2])
 
-    @njit(parallel=True, **_OPTIONS)
+    @njit(parallel=True, **OPTIONS)
     def gather(points, table, plan, gradient, points_gradient):
         count = points.shape[0]
         for level in range(plan.shape[0]):

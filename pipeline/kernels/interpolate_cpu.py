@@ -5,16 +5,15 @@ A their sum, q_k = e_k / (A z_k), S = q_0 + q_1 + q_2, barycentrics b_k = q_k / 
 private copy per block of pixels, added up in block order: the same bytes with any number of threads.
 """
 
-from typing import Any
-
 import numpy as np
 from numba import njit, prange
 
+from pipeline.kernels.options import OPTIONS
+
 BLOCKS = 8
-_FLAGS: dict[str, Any] = {"cache": True, "error_model": "numpy", "fastmath": {"arcp", "nsz"}}
 
 
-@njit(**_FLAGS)
+@njit(**OPTIONS)
 def _geometry(
     face: int, pixel: int, width: int, vertices_px: np.ndarray, depth_m: np.ndarray, faces: np.ndarray
 ) -> tuple:
@@ -30,7 +29,7 @@ def _geometry(
     return (i, j, k), (ax, ay, bx, by, cx, cy), area, (q0, q1, q2), q0 + q1 + q2
 
 
-@njit(**_FLAGS)
+@njit(**OPTIONS)
 def _fill_pixel(
     pixel: tuple,
     width: int,
@@ -46,7 +45,7 @@ def _fill_pixel(
         out[c] = b0 * attributes[corners[0], c] + b1 * attributes[corners[1], c] + b2 * attributes[corners[2], c]
 
 
-@njit(parallel=True, **_FLAGS)
+@njit(parallel=True, **OPTIONS)
 def interpolate_forward(
     covered: np.ndarray,
     face_of: np.ndarray,
@@ -63,7 +62,7 @@ def interpolate_forward(
     return values
 
 
-@njit(**_FLAGS)
+@njit(**OPTIONS)
 def _add_pixel(
     pixel: tuple,
     width: int,
@@ -103,7 +102,7 @@ def _add_pixel(
     out[k, 1] += f0 * bx - f1 * ax
 
 
-@njit(parallel=True, **_FLAGS)
+@njit(parallel=True, **OPTIONS)
 def interpolate_backward(
     covered: np.ndarray,
     face_of: np.ndarray,

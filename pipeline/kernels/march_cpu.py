@@ -3,11 +3,13 @@
 import numpy as np
 from numba import njit, prange
 
-_OPTIONS = {"cache": True, "fastmath": {"arcp", "nsz"}, "error_model": "numpy"}
+from pipeline.kernels.options import OPTIONS
+from pipeline.kernels.warp_cpu import apply_affine
+
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _slab(origin, direction, low, high, near, far):
     """Narrow [near, far] to the part of a ray between two planes of one axis."""
     if abs(direction) < np.float32(1e-9):
@@ -16,7 +18,7 @@ def _slab(origin, direction, low, high, near, far):
     return max(near, min(a, b)), min(far, max(a, b))
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _is_occupied(x, y, z, occupied, low, scale):
     i = int(np.floor((x - low[0]) * scale[0]))
     j = int(np.floor((y - low[1]) * scale[1]))
@@ -25,7 +27,7 @@ def _is_occupied(x, y, z, occupied, low, scale):
     return inside and occupied[i, j, k] != 0
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _interpolate(nodes, first, dims, i, j, k, u, v, w):
     """Trilinear interpolation of the canonical positions at a posed cell's corners."""
     x = y = z = _ZERO
@@ -37,7 +39,7 @@ def _interpolate(nodes, first, dims, i, j, k, u, v, w):
     return x, y, z
 
 
-@njit(parallel=True, **_OPTIONS)
+@njit(parallel=True, **OPTIONS)
 def march(
     origins,
     directions,
@@ -90,9 +92,7 @@ def march(
                 else:
                     m = warp_maps[warp_first[f, 2] + (code - 1) // 4 + candidate]
                     qx, qy, qz = px * cell + origin[0], py * cell + origin[1], pz * cell + origin[2]
-                    x = m[0] * qx + m[1] * qy + m[2] * qz + m[3]
-                    y = m[4] * qx + m[5] * qy + m[6] * qz + m[7]
-                    z = m[8] * qx + m[9] * qy + m[10] * qz + m[11]
+                    x, y, z = apply_affine(m, qx, qy, qz)
                 if count < max_samples and _is_occupied(x, y, z, occupied, low, scale):
                     found[ray, count, 0], found[ray, count, 1] = x, y
                     found[ray, count, 2], found[ray, count, 3] = z, t
@@ -101,7 +101,7 @@ def march(
     return _pack(found, counts)
 
 
-@njit(parallel=True, **_OPTIONS)
+@njit(parallel=True, **OPTIONS)
 def _pack(found, counts):
     rays = counts.shape[0]
     ray_start = np.zeros(rays + 1, np.int64)

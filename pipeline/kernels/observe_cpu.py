@@ -7,10 +7,10 @@ its corners' pixels.
 import numpy as np
 from numba import njit, prange
 
-_FLAGS = {"cache": True, "error_model": "numpy", "fastmath": {"arcp", "nsz"}}
+from pipeline.kernels.options import OPTIONS
 
 
-@njit(parallel=True, **_FLAGS)
+@njit(parallel=True, **OPTIONS)
 def observe_texels_cpu(
     vertices_px: np.ndarray,
     depth_m: np.ndarray,

@@ -7,28 +7,27 @@ w_k / z_k and depth = 1 / sum(q). Edge functions are float64: in float32 a pixel
 can fall outside both. NaN must compare false (a face with a NaN corner is dropped), hence no full fastmath.
 """
 
-from typing import Any
-
 import numpy as np
 from numba import njit, prange
 
+from pipeline.kernels.options import OPTIONS
+
 BAND_ROWS = 16
-_FLAGS: dict[str, Any] = {"cache": True, "error_model": "numpy", "fastmath": {"arcp", "nsz"}}
 
 
-@njit(**_FLAGS)
+@njit(**OPTIONS)
 def _first_centre(low: float, size: int) -> int:
     """First pixel index whose centre is at or right of ``low``, within [0, size]."""
     return int(np.ceil(min(max(low - 0.5, 0.0), float(size))))
 
 
-@njit(**_FLAGS)
+@njit(**OPTIONS)
 def _last_centre(high: float, size: int) -> int:
     """Last pixel index whose centre is at or left of ``high``, within [-1, size - 1]."""
     return int(np.floor(min(max(high - 0.5, -1.0), float(size - 1))))
 
 
-@njit(parallel=True, **_FLAGS)
+@njit(parallel=True, **OPTIONS)
 def face_boxes(
     vertices_px: np.ndarray, depth_m: np.ndarray, faces: np.ndarray, size_wh: tuple, near_m: float, cull: bool
 ) -> np.ndarray:
@@ -55,7 +54,7 @@ def face_boxes(
     return boxes
 
 
-@njit(**_FLAGS)
+@njit(**OPTIONS)
 def bin_faces(boxes: np.ndarray, n_bands: int) -> tuple:
     """Faces touching each band of rows in ascending order: (start (n_bands + 1,), face list)."""
     start = np.zeros(n_bands + 1, np.int64)
@@ -75,13 +74,13 @@ def bin_faces(boxes: np.ndarray, n_bands: int) -> tuple:
     return start, listed
 
 
-@njit(**_FLAGS)
+@njit(**OPTIONS)
 def _edge_plane(ax: float, ay: float, bx: float, by: float, scale: float) -> tuple:
     """(A, B, C) with A x + B y + C = scale * ((b - a) x (p - a))."""
     return -(by - ay) * scale, (bx - ax) * scale, ((by - ay) * ax - (bx - ax) * ay) * scale
 
 
-@njit(**_FLAGS)
+@njit(**OPTIONS)
 def _draw_face(
     f: int,
     box: tuple,
@@ -112,7 +111,7 @@ def _draw_face(
                     face_id[y, x] = f
 
 
-@njit(parallel=True, **_FLAGS)
+@njit(parallel=True, **OPTIONS)
 def draw_bands(
     vertices_px: np.ndarray,
     depth_m: np.ndarray,
@@ -133,7 +132,7 @@ def draw_bands(
             _draw_face(f, box, vertices_px, depth_m, faces, face_id, inverse)
 
 
-@njit(parallel=True, **_FLAGS)
+@njit(parallel=True, **OPTIONS)
 def resolve(
     vertices_px: np.ndarray,
     depth_m: np.ndarray,

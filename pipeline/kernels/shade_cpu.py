@@ -3,10 +3,10 @@
 import numpy as np
 from numba import njit, prange
 
-_FLAGS = {"cache": True, "error_model": "numpy", "fastmath": {"arcp", "nsz"}}
+from pipeline.kernels.options import OPTIONS
 
 
-@njit(parallel=True, **_FLAGS)
+@njit(parallel=True, **OPTIONS)
 def shade_texture_cpu(
     face_id: np.ndarray,
     barycentric: np.ndarray,

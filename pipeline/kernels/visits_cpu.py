@@ -3,10 +3,10 @@
 import numpy as np
 from numba import njit, prange
 
-_OPTIONS = {"cache": True, "fastmath": {"arcp", "nsz"}, "error_model": "numpy"}
+from pipeline.kernels.options import OPTIONS
 
 
-@njit(parallel=True, **_OPTIONS)
+@njit(parallel=True, **OPTIONS)
 def light_before(weight, ray_start, light):
     """Fill `light`: see `pipeline.kernels.visits.light_before`."""
     for ray in prange(ray_start.shape[0] - 1):
@@ -16,7 +16,7 @@ def light_before(weight, ray_start, light):
             left -= weight[s]
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def record(points, light, weight, bounds, shape, reached, gave):
     """See `pipeline.kernels.visits.record_visits`."""
     scale_x = np.float32(shape[0]) / (bounds[1, 0] - bounds[0, 0])

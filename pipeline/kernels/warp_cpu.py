@@ -11,7 +11,8 @@ blended (m, k, 12), the rows of A (3, 4) at the nodes that exist, for each of k 
 import numpy as np
 from numba import njit, prange
 
-_OPTIONS = {"cache": True, "fastmath": {"arcp", "nsz"}, "error_model": "numpy"}
+from pipeline.kernels.options import OPTIONS
+
 _ZERO, _ONE = np.float32(0), np.float32(1)
 BLOCK = 256
 FARTHER_M = np.float32(0.03)
@@ -20,7 +21,17 @@ below the arm that hung beside it.
 """
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
+def apply_affine(m, x, y, z):
+    """m (12 numbers, a 3 x 4 matrix by rows) times (x, y, z, 1)."""
+    return (
+        m[0] * x + m[1] * y + m[2] * z + m[3],
+        m[4] * x + m[5] * y + m[6] * z + m[7],
+        m[8] * x + m[9] * y + m[10] * z + m[11],
+    )
+
+
+@njit(**OPTIONS)
 def skin(x, y, z, frame, origin, cell, row_of_node, blended):
     """Posed position of a canonical point and the Jacobian, as 13 numbers: inside, position, J by rows."""
     inverse = _ONE / cell
@@ -43,9 +54,7 @@ def skin(x, y, z, frame, origin, cell, row_of_node, blended):
             wy, dy = (v, inverse) if b == 1 else (_ONE - v, -inverse)
             wz, dz = (w, inverse) if c == 1 else (_ONE - w, -inverse)
             m = blended[row, frame]
-            qx = m[0] * x + m[1] * y + m[2] * z + m[3]
-            qy = m[4] * x + m[5] * y + m[6] * z + m[7]
-            qz = m[8] * x + m[9] * y + m[10] * z + m[11]
+            qx, qy, qz = apply_affine(m, x, y, z)
             weight, along_x, along_y, along_z = wx * wy * wz, dx * wy * wz, wx * dy * wz, wx * wy * dz
             px, py, pz = px + weight * qx, py + weight * qy, pz + weight * qz
             j00, j01, j02 = (
@@ -66,7 +75,7 @@ def skin(x, y, z, frame, origin, cell, row_of_node, blended):
     return inside, px, py, pz, j00, j01, j02, j10, j11, j12, j20, j21, j22
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def invert(j00, j01, j02, j10, j11, j12, j20, j21, j22):
     """Inverse of a 3x3 matrix by rows, and whether it is far from singular."""
     c00, c01, c02 = j11 * j22 - j12 * j21, j12 * j20 - j10 * j22, j10 * j21 - j11 * j20
@@ -87,7 +96,7 @@ def invert(j00, j01, j02, j10, j11, j12, j20, j21, j22):
     )
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _newton(px, py, pz, x, y, z, iterations, tolerance, origin, cell, row_of_node, blended, inverse_jacobian):
     """Solve A(x) x = p from a start; fills the inverse Jacobian (9). Returns converged, x, y, z, squared residual."""
     squared = np.float32(1e9)
@@ -112,7 +121,7 @@ def _newton(px, py, pz, x, y, z, iterations, tolerance, origin, cell, row_of_nod
     return squared < tolerance * tolerance, x, y, z, squared
 
 
-@njit(nogil=True, **_OPTIONS)
+@njit(nogil=True, **OPTIONS)
 def carry_nodes(nodes, blended):
     """Posed positions (m, 3) of the skin grid's nodes, and their box (2, 3)."""
     posed = np.empty((nodes.shape[0], 3), np.float32)
@@ -128,7 +137,7 @@ def carry_nodes(nodes, blended):
     return posed, box
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _claim(posed, distance, posed_origin, cell, dims):
     """For each posed node the skin-grid row to start from: near in space, and of the body part that is nearest."""
     best = np.full(dims[0] * dims[1] * dims[2], np.float32(1e9))
@@ -150,7 +159,7 @@ def _claim(posed, distance, posed_origin, cell, dims):
     return row_of
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _solve_nodes(row_of, nodes, posed, posed_origin, dims, origin, cell, row_of_node, blended):
     """Canonical positions (count, 3) of the posed nodes; NaN where none was found."""
     canonical = np.full((row_of.shape[0], 3), np.float32(np.nan))
@@ -176,7 +185,7 @@ def _solve_nodes(row_of, nodes, posed, posed_origin, dims, origin, cell, row_of_
     return canonical
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _is_smooth(canonical, corners, limit):
     """True if all eight corners have an inverse and no edge of the cell is stretched beyond `limit` metres."""
     for a in range(8):
@@ -194,7 +203,7 @@ def _is_smooth(canonical, corners, limit):
     return True
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _distance_at(x, y, z, origin, cell, row_of_node, distance):
     """Distance to the body at a canonical point whose cell has all its nodes."""
     gx, gy, gz = (x - origin[0]) / cell, (y - origin[1]) / cell, (z - origin[2]) / cell
@@ -208,7 +217,7 @@ def _distance_at(x, y, z, origin, cell, row_of_node, distance):
     return total
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _keep_near(maps, distances, found):
     """Drop the inverses that lie much farther from the body than the nearest one; returns how many are left."""
     nearest = distances[0]
@@ -222,7 +231,7 @@ def _keep_near(maps, distances, found):
     return kept
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _roots_in_cell(canonical, corners, centre, origin, cell, row_of_node, blended, distance, maps):
     """Distinct inverses at a cell's centre, started from its corners, as affine maps (4, 12); returns their number."""
     found = 0
@@ -233,44 +242,14 @@ def _roots_in_cell(canonical, corners, centre, origin, cell, row_of_node, blende
         x, y, z = canonical[node, 0], canonical[node, 1], canonical[node, 2]
         if found == maps.shape[0] or np.isnan(x):
             continue
+        px, py, pz = centre[0], centre[1], centre[2]
         converged, x, y, z, _ = _newton(
-            centre[0],
-            centre[1],
-            centre[2],
-            x,
-            y,
-            z,
-            5,
-            np.float32(2e-4),
-            origin,
-            cell,
-            row_of_node,
-            blended,
-            inverse_jacobian,
+            px, py, pz, x, y, z, 5, np.float32(2e-4), origin, cell, row_of_node, blended, inverse_jacobian
         )
         for other in range(found):
-            ox = (
-                maps[other, 0] * centre[0]
-                + maps[other, 1] * centre[1]
-                + maps[other, 2] * centre[2]
-                + maps[other, 3]
-                - x
-            )
-            oy = (
-                maps[other, 4] * centre[0]
-                + maps[other, 5] * centre[1]
-                + maps[other, 6] * centre[2]
-                + maps[other, 7]
-                - y
-            )
-            oz = (
-                maps[other, 8] * centre[0]
-                + maps[other, 9] * centre[1]
-                + maps[other, 10] * centre[2]
-                + maps[other, 11]
-                - z
-            )
-            converged &= ox * ox + oy * oy + oz * oz > np.float32(0.01) * cell * cell
+            ox, oy, oz = apply_affine(maps[other], px, py, pz)
+            squared = (ox - x) * (ox - x) + (oy - y) * (oy - y) + (oz - z) * (oz - z)
+            converged &= squared > np.float32(0.01) * cell * cell
         if not converged:
             continue
         for axis in range(3):
@@ -284,7 +263,7 @@ def _roots_in_cell(canonical, corners, centre, origin, cell, row_of_node, blende
     return _keep_near(maps, distances, found) if found > 1 else found
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _code_cells(canonical, posed_origin, dims, origin, cell, row_of_node, blended, distance):
     """A code per posed cell and the affine maps of the cells without one smooth inverse: see `bake`."""
     codes = np.full((dims[0] - 1) * (dims[1] - 1) * (dims[2] - 1), -1, np.int32)
@@ -323,7 +302,7 @@ def _code_cells(canonical, posed_origin, dims, origin, cell, row_of_node, blende
     return codes, table[:used].copy()
 
 
-@njit(nogil=True, **_OPTIONS)
+@njit(nogil=True, **OPTIONS)
 def bake(nodes, posed, distance, posed_origin, dims, origin, cell, row_of_node, blended):
     """The warp grid of one frame: see `pipeline.kernels.warp.bake`."""
     row_of = _claim(posed, distance, posed_origin, cell, dims)
@@ -332,7 +311,7 @@ def bake(nodes, posed, distance, posed_origin, dims, origin, cell, row_of_node, 
     return canonical, codes, maps
 
 
-@njit(parallel=True, **_OPTIONS)
+@njit(parallel=True, **OPTIONS)
 def refine(points_posed, start, slot, origin, cell, row_of_node, blended, refined):
     """One Newton step for each point (s, 3) from its start; the start itself where a step is not possible.
 
@@ -350,7 +329,7 @@ def refine(points_posed, start, slot, origin, cell, row_of_node, blended, refine
             refined[s, 0], refined[s, 1], refined[s, 2] = x, y, z
 
 
-@njit(parallel=True, **_OPTIONS)
+@njit(parallel=True, **OPTIONS)
 def pose_gradient(points, gradient, slot_start, origin, cell, row_of_node, blended, blended_gradient):
     """Add dL/dA (m, frames, 12) for dL/dx = gradient at the solutions x of A(x) x = p: dL/d(A x) = -J^-T dL/dx.
 
