@@ -25,7 +25,14 @@ from pipeline.avatar.fit_objective import (
     project_with_covectors,
 )
 from pipeline.avatar.fit_place import place_of_root
-from pipeline.avatar.fit_priors import JointPrior, ShapePrior, joint_prior, observed_motion, shape_prior
+from pipeline.avatar.fit_priors import (
+    JointPrior,
+    ShapePrior,
+    habitual_prior,
+    joint_prior,
+    observed_motion,
+    shape_prior,
+)
 from pipeline.avatar.fit_silhouette import Window, focused_camera, match_all
 from pipeline.avatar.fit_solver import NormalEquations, minimise, shared_covariance
 from pipeline.avatar.fit_swaps import LIMBS, exchange_bodies, exchange_limbs, exchanged_bodies, exchanged_limbs
@@ -199,7 +206,7 @@ def _outline_round(
     objective = Objective(
         model,
         tools.regressor,
-        tools.joint_prior,
+        habitual_prior(tools.joint_prior, state.rotations),
         tools.shape_prior,
         observations,
         weights,

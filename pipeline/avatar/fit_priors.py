@@ -5,7 +5,7 @@ axes (rows of `JointPrior.axes`): for hinges (twist along the bone, flexion, sid
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -34,6 +34,12 @@ LIMIT_RAD = 0.06
 """Softness of a joint limit: going this far beyond costs one standard deviation."""
 
 FREE_RAD = 10.0
+
+LOOSE_RAD, CALM_RAD = 0.25, 0.25
+"""Axes with at least this deviation, whose angles in a recording spread less than that, follow its mean pose."""
+
+HABIT_RAD, HABIT_SLACK = 0.02, 3.0
+"""The least that any joint moves, and how much more than the spread seen is allowed."""
 
 # (deviation about the three axes, rad), symmetric about the A-pose
 BALL_JOINTS = {
@@ -100,9 +106,10 @@ def shape_prior(names: Sequence[str], defaults: Float[Tensor, "s"]) -> ShapePrio
 
 @dataclass(frozen=True)
 class JointPrior:
-    """Axes (rows), deviations and flexion limits of every active joint."""
+    """Axes (rows), expected angles with their deviations, and flexion limits of every active joint."""
 
     axes: Float[Tensor, "j 3 3"]
+    mean_rad: Float[Tensor, "j 3"]
     deviation_rad: Float[Tensor, "j 3"]
     lowest_rad: Float[Tensor, "j 3"]
     highest_rad: Float[Tensor, "j 3"]
@@ -123,7 +130,23 @@ def joint_prior(model: FitModel) -> JointPrior:
         twist, flexion, sideways, straight, most = HINGE_JOINTS[kind]
         deviation[joint] = torch.tensor([twist, flexion, sideways], dtype=torch.float64)
         lowest[joint, 1], highest[joint, 1] = straight - bent, most - bent
-    return JointPrior(axes, deviation, lowest, highest)
+    return JointPrior(axes, torch.zeros_like(deviation), deviation, lowest, highest)
+
+
+def habitual_prior(prior: JointPrior, rotations: Float[Tensor, "n j 3 3"]) -> JointPrior:
+    """The prior with the joints that a recording hardly moves held near their mean over its n frames.
+
+    A person who turns in one pose is seen from all sides: each side tells what is depth from the others. Only axes
+    that the prior leaves loose take part, and only while they spread less than `CALM_RAD`.
+    """
+    angle = (prior.axes @ rotation_logarithm(rotations)[..., None]).squeeze(-1)
+    spread = HABIT_SLACK * (angle.var(0, correction=0) + HABIT_RAD**2).sqrt()
+    calm = (prior.deviation_rad >= LOOSE_RAD) & (prior.deviation_rad < FREE_RAD) & (spread < CALM_RAD)
+    return replace(
+        prior,
+        mean_rad=torch.where(calm, angle.mean(0), prior.mean_rad),
+        deviation_rad=torch.where(calm, spread, prior.deviation_rad),
+    )
 
 
 def _hinge_axes(model: FitModel, joint: int, kind: str) -> tuple[Float[Tensor, "3 3"], float]:
@@ -164,13 +187,13 @@ def logarithm_jacobian(vector: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]
 def pose_residuals(
     prior: JointPrior, rotations: Float[Tensor, "n j 3 3"]
 ) -> tuple[Float[Tensor, "n j 6"], Float[Tensor, "n j 6 3"]]:
-    """Deviations from the A-pose and excess over joint limits, and their derivative by the joint's rotation."""
+    """Deviations from the expected pose and excess over joint limits, and their derivative by the joint's rotation."""
     vector = rotation_logarithm(rotations)
     angle = (prior.axes @ vector[..., None]).squeeze(-1)
     by_rotation = prior.axes @ logarithm_jacobian(vector)
     beyond = (angle - prior.highest_rad).clamp(min=0.0) - (prior.lowest_rad - angle).clamp(min=0.0)
     outside = (beyond != 0).to(angle.dtype) / LIMIT_RAD
-    residual = torch.cat([angle / prior.deviation_rad, beyond / LIMIT_RAD], dim=-1)
+    residual = torch.cat([(angle - prior.mean_rad) / prior.deviation_rad, beyond / LIMIT_RAD], dim=-1)
     derivative = torch.cat([by_rotation / prior.deviation_rad[..., None], by_rotation * outside[..., None]], dim=-2)
     return residual, derivative
 

@@ -6,9 +6,12 @@ from pipeline.avatar.body import load_anny
 from pipeline.avatar.fit_model import ACTIVE_JOINTS, linearise
 from pipeline.avatar.fit_priors import (
     FRAME_S,
+    HABIT_RAD,
+    HABIT_SLACK,
     LEAST_MOTION,
     JointPrior,
     cross_matrix,
+    habitual_prior,
     joint_prior,
     logarithm_jacobian,
     motion_residuals,
@@ -116,3 +119,21 @@ def test_a_short_recording_tells_nothing_about_motion() -> None:
     time_s = torch.arange(5, dtype=torch.float64)
     still = torch.eye(3, dtype=torch.float64).repeat(5, 2, 1, 1)
     assert torch.equal(observed_motion(still, torch.zeros(5, 3, dtype=torch.float64), time_s), usual_motion(2))
+
+
+def test_joints_that_hardly_move_follow_their_mean(prior: JointPrior) -> None:
+    """An arm held up with a little sway is expected there; a leg that swings and the spine keep the general prior."""
+    arm, leg, spine = (ACTIVE_JOINTS.index(name) for name in ("LeftArm", "LeftUpLeg", "Spine"))
+    phase = torch.linspace(0.0, 6.0, 200, dtype=torch.float64)
+    angles = torch.zeros(200, len(ACTIVE_JOINTS), 3, dtype=torch.float64)
+    angles[:, arm, 2] = 0.9 + 0.05 * torch.sin(phase)
+    angles[:, leg, 0] = 0.5 * torch.sin(phase)
+    habit = habitual_prior(prior, axis_angle_to_matrix(angles))
+    spread = float(angles[:, arm, 2].var(correction=0))
+    assert habit.mean_rad[arm, 2] == pytest.approx(float(angles[:, arm, 2].mean()))
+    assert habit.deviation_rad[arm, 2] == pytest.approx(HABIT_SLACK * (spread + HABIT_RAD**2) ** 0.5)
+    assert habit.mean_rad[leg, 0] == 0.0
+    assert habit.deviation_rad[leg, 0] == prior.deviation_rad[leg, 0]
+    assert torch.equal(habit.deviation_rad[spine], prior.deviation_rad[spine])
+    residual, _ = pose_residuals(habit, axis_angle_to_matrix(angles))
+    assert residual[:, arm, 2].abs().max() < 1.0
