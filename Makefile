@@ -24,6 +24,9 @@ CAPTURES ?=
 PRESETS ?=
 SEEDS ?=
 
+# Where bench-field writes its figures.
+JSON ?=
+
 TORCH_VERSION := 2.13.0
 GLTF_VALIDATOR_VERSION := 2.0.0-dev.3.10
 SAMPLE_RUN := runs/sample
@@ -34,7 +37,7 @@ OPTIONS = $(RUN_OPTIONS) $(ARGS)
 STAMP := $(VENV)/.stamp$(if $(EXTRA),-$(EXTRA))
 
 .DEFAULT_GOAL := help
-.PHONY: help all $(STAGES) batch chart compare test test-all check format bench doctor venv lock configs gltf-validator clean
+.PHONY: help all $(STAGES) batch chart compare test test-all check format bench bench-field doctor venv lock configs gltf-validator clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z$$()A-Z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST) | sed 's/$$(STAGES)/STAGE    /'
@@ -93,6 +96,10 @@ format: $(STAMP)  ## mend what ruff can mend
 
 bench: $(STAMP)  ## measure the speed of the kernels; the machine should do nothing else
 	$(RUN_PYTHON) -m tests.bench.bench_kernels $(ARGS)
+
+bench-field: $(STAMP)  ## each part of a training step beside its floor: RUN=runs/name or a painted body; JSON=file
+	$(RUN_PYTHON) -m tests.bench.bench_field $(if $(RUN),--run "$(RUN)") $(if $(PRESET),--preset $(PRESET)) \
+		$(if $(JSON),--json "$(JSON)") $(ARGS)
 
 doctor:  ## what this machine lacks, and the command that mends it
 	@$(PYTHON) -m pipeline.core.doctor

@@ -7,12 +7,7 @@ is appended to tests/bench/results/<machine>.csv.
 """
 
 import argparse
-import csv
 import json
-import platform
-import subprocess
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -25,34 +20,11 @@ from pipeline.kernels.composite import composite
 from pipeline.kernels.hashgrid import encode
 from pipeline.kernels.march import WarpSet, march
 from pipeline.kernels.warp import bake, newton
+from tests.bench.machine import append_row, median_ms, memory_gb_s, multiply_gflop_s
 from tests.kernels.bar import CELL_M, bar_skin, bend
 
-RESULTS = Path(__file__).parent / "results"
 BOUNDS = np.array([[-0.8, -0.1, -0.3], [0.8, 1.9, 0.5]], dtype=np.float32)
 RAYS, SAMPLES_A_RAY = 4096, 16
-
-
-def median_ms(run: Callable[[], object], repeats: int) -> float:
-    """Median of warm runs."""
-    run()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        run()
-        times.append(time.perf_counter() - start)
-    return 1e3 * float(np.median(times))
-
-
-def memory_gb_s(repeats: int) -> float:
-    """Bandwidth of a copy that does not fit into the caches."""
-    source, target = torch.ones(1 << 25), torch.empty(1 << 25)
-    return 2 * source.numel() * 4 / 1e6 / median_ms(lambda: target.copy_(source), repeats)
-
-
-def multiply_gflop_s(repeats: int) -> float:
-    """Rate of a large matrix product."""
-    a, b = torch.rand(2048, 2048), torch.rand(2048, 2048)
-    return 2 * 2048**3 / 1e6 / median_ms(lambda: a @ b, repeats)
 
 
 def ray_points(random: torch.Generator) -> torch.Tensor:
@@ -129,28 +101,6 @@ def warp_parts(repeats: int) -> dict[str, float]:
     }
 
 
-def commit() -> str:
-    """Short name of the commit that is measured."""
-    shown = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=RESULTS.parent, check=False
-    )
-    return shown.stdout.strip() or "unknown"
-
-
-def append_row(figures: dict[str, float]) -> Path:
-    """Add a row to the machine's table."""
-    RESULTS.mkdir(exist_ok=True)
-    path = RESULTS / f"{platform.node()}.csv"
-    row = {"commit": commit(), "threads": torch.get_num_threads()} | {k: round(v, 3) for k, v in figures.items()}
-    new = not path.exists()
-    with path.open("a", newline="", encoding="utf-8") as stream:
-        writer = csv.DictWriter(stream, list(row))
-        if new:
-            writer.writeheader()
-        writer.writerow(row)
-    return path
-
-
 def main() -> None:
     """Measure, print, write."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -162,7 +112,7 @@ def main() -> None:
     figures |= field_parts(FieldConfig(), arguments.repeats) | warp_parts(arguments.repeats)
     for name, value in figures.items():
         print(f"{name:32s} {value:10.2f}")
-    print(append_row(figures))
+    print(append_row("kernels", figures))
     if arguments.json:
         arguments.json.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
 

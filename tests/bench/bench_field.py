@@ -1,0 +1,252 @@
+"""Where the time of a training step of stage one goes, beside the least that this machine could need for it.
+
+    python -m tests.bench.bench_field [--run runs/x] [--preset default] [--steps 80] [--json out.json]
+
+The step is that of a finished run's frames and body, or of a painted body. Warm-up steps come first, until poses are
+refined and cells that stay empty have been given up. Poses move and the occupancy is updated only every few steps:
+a block holds as many steps as it takes until all recurs, and a part's time is the median over blocks of its mean in a
+block. A row is appended to tests/bench/results/<machine>.csv.
+
+The floor of a part is the longest of three times, each at a rate that is measured in the same run: bytes at the rate of
+a copy as large as the table with its gradient and moments, multiplications and additions at that of a large matrix
+product, rows of tables at that of random rows loaded from a table as large as the largest level. Rows that lie
+together, as those of neighbouring samples do, come faster: a floor made of rows can be undercut. With n rays,
+s samples, p points (the samples, and those that should be empty), l levels of f features, w = l f, h the hidden width,
+and for poses k frames, j joints, m nodes of skin weights:
+
+| part | work a step |
+|---|---|
+| draw | 84 n bytes: pixel and colour read; origin, direction, colour, background, jitter, frame written |
+| march | 8 s rows of a warp grid, 16 s bytes written |
+| place | 24 m j k operations (blending, a dense product), 8 s rows of blended matrices, 40 s bytes |
+| encode_forward | 8 l p rows, (12 + 4 w) p bytes |
+| network_forward | 2 (w h + 4 h) p operations, (4 w + 16) p bytes |
+| composite | 76 s + 56 n bytes, forward and backward |
+| losses | 48 n bytes |
+| network_backward | twice the operations of network_forward, (8 w + 32) p bytes |
+| table_backward | 16 l p rows: each is read and written |
+| positions_backward | 8 l p rows, and for Newton 24 s: a node's matrix is read, its gradient read and written |
+| rest_backward | 48 n bytes (losses), 24 m j k operations (blending) |
+| adam | 32 bytes a parameter |
+| occupancy_record | 4 s rows, 24 s bytes |
+| occupancy_update | encode_forward and network_forward of one point a cell |
+| skin_cut | 8 m j bytes: the weights near occupied cells, copied |
+| other | none: joining, opacities, sums |
+
+What follows the poses (positions_backward, blending in rest_backward) counts by the part of the steps that move them,
+occupancy_update and skin_cut by the part of the steps that make one.
+"""
+
+import argparse
+import json
+import math
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from data_tools.command import run_command
+from pipeline.avatar import selection
+from pipeline.avatar.field_config import FieldConfig
+from pipeline.avatar.occupancy import START_AVERAGE
+from pipeline.avatar.prepare import spread, start_learning, training_scale
+from pipeline.avatar.train import LOOK_EVERYWHERE, Learning
+from pipeline.core.config import build, load_layers
+from pipeline.core.errors import UserError
+from pipeline.io.capture import load_capture
+from pipeline.io.npz import load_body, load_camera, load_motion
+from stages.field import read_picture
+from tests.avatar.scene import painted_scene
+from tests.bench.machine import append_row, circumstances, gather_mrow_s, memory_gb_s, multiply_gflop_s
+from tests.bench.parts import OTHER, UPDATE, Clock, watched
+
+PARTS = ("draw", "march", "place", "encode_forward", "network_forward", "composite", "losses", "network_backward")
+PARTS += (
+    "table_backward",
+    "positions_backward",
+    "rest_backward",
+    "adam",
+    "occupancy_record",
+    UPDATE,
+    "skin_cut",
+    OTHER,
+)
+PAINTED_FRAMES = 32
+IMAGE_HEIGHTS = 1.25
+"""Height of a painted image over that of the person in it, about."""
+
+
+@dataclass(frozen=True)
+class Peaks:
+    """Rates of this machine."""
+
+    memory_gb_s: float
+    multiply_gflop_s: float
+    gather_mrow_s: float
+
+
+@dataclass(frozen=True)
+class Work:
+    """What a part cannot do without."""
+
+    bytes: float = 0.0
+    operations: float = 0.0
+    rows: float = 0.0
+
+    def least_ms(self, peaks: Peaks) -> float:
+        """The longest of the three times: at best the others hide behind it."""
+        seconds = (self.bytes / peaks.memory_gb_s, self.operations / peaks.multiply_gflop_s)
+        return max(*(value / 1e6 for value in seconds), self.rows / peaks.gather_mrow_s / 1e3)
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Milliseconds a step, of the whole and of each part, and the mean number of samples."""
+
+    step_ms: float
+    parts_ms: dict[str, float]
+    samples: float
+
+
+def begin_run(run: Path, config: FieldConfig) -> Learning:
+    """Stage one as it begins in a finished run."""
+    capture, camera = load_capture(run / "frames"), load_camera(run / "body" / "camera.npz")
+    body, motion = load_body(run / "body" / "body.npz"), load_motion(run / "body" / "motion.npz")
+    camera = camera.scaled(training_scale(body, motion, camera, config.max_person_px))
+    chosen = capture.positions(selection.TRAIN)
+    chosen = chosen[spread(len(chosen), config.max_frames)]
+    pictures = [read_picture(capture, position, camera) for position in chosen]
+    return start_learning(body, motion.select(chosen), camera, pictures, config)
+
+
+def begin_painted(config: FieldConfig) -> Learning:
+    """Stage one on a painted body that turns, as tall as the preset lets it be."""
+    scene = painted_scene(min(PAINTED_FRAMES, config.max_frames), round(IMAGE_HEIGHTS * config.max_person_px))
+    pictures = list(zip(scene.images, scene.masks, strict=True))
+    return start_learning(scene.body, scene.motion, scene.camera, pictures, config)
+
+
+def period(config: FieldConfig) -> int:
+    """Steps after which all recurs: poses that move, rays that look everywhere, updates of the occupancy."""
+    return math.lcm(config.pose_every if config.pose_refinement else 1, LOOK_EVERYWHERE, config.occupancy_every)
+
+
+def settled(config: FieldConfig) -> int:
+    """Steps until poses are refined and a cell that was never anything but empty is given up; whole periods."""
+    lowest = max(config.occupancy_threshold, 1e-6)
+    updates = max(0, math.ceil(math.log(lowest / START_AVERAGE) / math.log(config.occupancy_decay)))
+    emptied = config.occupancy_start + updates * config.occupancy_every
+    poses = math.ceil(config.pose_start * config.steps) if config.pose_refinement else 0
+    return math.ceil(max(emptied, poses) / period(config)) * period(config)
+
+
+def time_steps(learning: Learning, clock: Clock, warm_up: int, steps: int) -> Timing:
+    """Take steps; `learning` was begun while `clock` watched."""
+    for _ in range(warm_up):
+        learning.step()
+    clock.take()
+    length = min(period(learning.config), steps)
+    blocks, whole_s, samples = [], [], []
+    for _ in range(max(1, steps // length)):
+        start = time.perf_counter()
+        samples += [learning.step()["samples"] for _ in range(length)]
+        whole_s.append((time.perf_counter() - start) / length)
+        taken = clock.take()
+        blocks.append([1e3 * taken.get(part, 0.0) / length for part in PARTS])
+    medians = np.median(np.array(blocks), axis=0).tolist()
+    return Timing(1e3 * float(np.median(whole_s)), dict(zip(PARTS, medians, strict=True)), float(np.mean(samples)))
+
+
+def least_work(learning: Learning, samples: float) -> dict[str, Work]:
+    """The table above, for a step as `learning` stands now."""
+    config, field, occupancy = learning.config, learning.field, learning.occupancy
+    n, levels, hidden = config.rays, field.layout.levels, config.hidden_width
+    points = samples + len(learning._empty_points(np.random.default_rng(0)))
+    width = len(field.hidden)
+    moving = 1 / config.pose_every if learning.refines_poses else 0.0
+    frames = min(config.frames_per_step, learning.scene.pool.frames)
+    blending = 24.0 * learning.skin.weights.numel() * frames if learning.refines_poses else 0.0
+    placed = samples if learning.refines_poses else 0.0
+    network = 2.0 * (width * hidden + 4 * hidden)
+    cells = len(occupancy.cells) / config.occupancy_every
+    return {
+        "draw": Work(bytes=84.0 * n),
+        "march": Work(bytes=16 * samples, rows=8 * samples),
+        "place": Work(bytes=40 * placed, operations=blending, rows=8 * placed),
+        "encode_forward": Work(bytes=(12 + 4 * width) * points, rows=8 * levels * points),
+        "network_forward": Work(bytes=(4 * width + 16) * points, operations=network * points),
+        "composite": Work(bytes=76 * samples + 56 * n),
+        "losses": Work(bytes=48.0 * n),
+        "network_backward": Work(bytes=(8 * width + 32) * points, operations=2 * network * points),
+        "table_backward": Work(rows=16 * levels * points),
+        "positions_backward": Work(rows=moving * (8 * levels * points + 24 * samples)),
+        "rest_backward": Work(bytes=48.0 * n, operations=moving * blending),
+        "adam": Work(bytes=32.0 * sum(parameter.numel() for parameter in field.parameters())),
+        "occupancy_record": Work(bytes=24 * samples, rows=4 * samples),
+        UPDATE: Work(bytes=(12 + 4 * width) * cells, operations=network * cells, rows=8 * levels * cells),
+        "skin_cut": Work(bytes=8.0 * learning.skin.weights.numel() / config.occupancy_every),
+        OTHER: Work(),
+    }
+
+
+def measure(learning: Learning, clock: Clock, warm_up: int, steps: int, repeats: int) -> dict[str, float]:
+    """All figures: the step, its parts, their floors, the peaks that the floors come from."""
+    timing = time_steps(learning, clock, warm_up, steps)
+    rows = max(learning.field.layout.rows_per_level, default=1 << 17)
+    peaks = Peaks(
+        memory_gb_s(repeats, 4 * max(learning.field.table.nbytes, 1 << 20)),
+        multiply_gflop_s(repeats),
+        gather_mrow_s(rows, learning.field.layout.features, repeats),
+    )
+    work = least_work(learning, timing.samples)
+    floors = {part: work[part].least_ms(peaks) for part in PARTS}
+    figures = {"step_ms": timing.step_ms, "floor_ms": sum(floors.values()), "samples": timing.samples}
+    figures |= {f"{part}_ms": timing.parts_ms[part] for part in PARTS}
+    return figures | {f"{part}_floor_ms": floors[part] for part in PARTS} | vars(peaks)
+
+
+def table(figures: dict[str, float]) -> str:
+    """Part, ms, floor, ratio."""
+    lines = [f"{'part':20s} {'ms':>8s} {'floor ms':>9s} {'ratio':>6s}"]
+    for name in (*PARTS, "step"):
+        spent, least = figures[f"{name}_ms"], figures["floor_ms" if name == "step" else f"{name}_floor_ms"]
+        lines.append(f"{name:20s} {spent:8.2f} {least:9.2f} {f'{spent / least:.1f}' if least else '-':>6s}")
+    return "\n".join(lines)
+
+
+def main(argv: Sequence[str]) -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--run", type=Path, help="a finished run; without it a painted body")
+    parser.add_argument("--preset", default="default", help="whose options of the field are taken")
+    parser.add_argument("--warm-up", type=int, help="steps before the first that is measured")
+    parser.add_argument("--steps", type=int, default=80, help="steps that are measured")
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--repeats", type=int, default=15, help="runs for each peak")
+    options = parser.parse_args(argv)
+    config = build("field", FieldConfig, load_layers(options.preset, {}))
+    if config.network != "hashgrid":
+        raise UserError(f"preset {options.preset} has no hash grid, whose floors these are; take PRESET=default")
+    warm_up = settled(config) if options.warm_up is None else options.warm_up
+    for kind in (np.float32, np.float64):
+        np.finfo(kind)  # Asked for the first time with denormals off, numpy would warn.
+    torch.set_flush_denormal(True)
+    clock = Clock()
+    with watched(clock):
+        learning = begin_run(options.run, config) if options.run else begin_painted(config)
+        figures = measure(learning, clock, warm_up, options.steps, options.repeats)
+    capture = str(options.run or "painted")
+    about = {"preset": options.preset, "capture": capture, "warm_up": warm_up, "steps": options.steps}
+    print(table(figures))
+    print(", ".join(f"{name} {value}" for name, value in (circumstances() | about).items()))
+    print(f"samples a step {figures['samples']:.0f}; row appended to {append_row('field', about | figures)}")
+    if options.json:
+        options.json.write_text(json.dumps(circumstances() | about | figures, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    sys.exit(run_command(main, sys.argv[1:]))

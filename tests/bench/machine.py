@@ -1,0 +1,78 @@
+"""What the benches share: medians, the peaks of this machine, and the table of its figures."""
+
+import csv
+import platform
+import time
+from collections.abc import Callable, Mapping
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+import torch
+from numba import get_num_threads
+
+from pipeline.core.measure import cpu_name, environment
+
+RESULTS = Path(__file__).parent / "results"
+CORNERS = 8
+"""Rows that are summed at a time: those of a cell's corners."""
+
+
+def median_ms(run: Callable[[], object], repeats: int) -> float:
+    """Median of warm runs."""
+    run()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        run()
+        times.append(time.perf_counter() - start)
+    return 1e3 * float(np.median(times))
+
+
+def memory_gb_s(repeats: int, touched_bytes: int = 1 << 28) -> float:
+    """Bandwidth of a copy; source and target are `touched_bytes` large together, by default too large for caches."""
+    source, target = torch.ones(touched_bytes // 8), torch.empty(touched_bytes // 8)
+    return 2 * source.numel() * 4 / 1e6 / median_ms(lambda: target.copy_(source), repeats)
+
+
+def multiply_gflop_s(repeats: int) -> float:
+    """Rate of a large matrix product."""
+    a, b = torch.rand(2048, 2048), torch.rand(2048, 2048)
+    return 2 * 2048**3 / 1e6 / median_ms(lambda: a @ b, repeats)
+
+
+def gather_mrow_s(rows: int, features: int, repeats: int) -> float:
+    """Millions of random rows of a table of float32 that are loaded a second, eight at a time and summed."""
+    random = torch.Generator().manual_seed(0)
+    table = torch.rand(rows, features, generator=random)
+    drawn = torch.randint(rows, (1 << 16, CORNERS), generator=random, dtype=torch.int32)
+    add = torch.nn.functional.embedding_bag
+    return drawn.numel() / 1e3 / median_ms(lambda: add(drawn, table, mode="sum"), repeats)
+
+
+def circumstances() -> dict[str, str | int]:
+    """What is measured, on what."""
+    return {
+        "commit": environment()["commit"] or "unknown",
+        "machine": platform.node(),
+        "cpu": cpu_name(),
+        "threads": torch.get_num_threads(),
+        "kernel_threads": get_num_threads(),
+    }
+
+
+def append_row(bench: str, figures: Mapping[str, object], folder: Path = RESULTS) -> Path:
+    """Add a row to the machine's table, which has the columns of all benches; returns the table."""
+    folder.mkdir(exist_ok=True)
+    path = folder / f"{platform.node()}.csv"
+    rows: list[Mapping[str, object]] = []
+    if path.exists():
+        with path.open(newline="", encoding="utf-8") as stream:
+            rows = list(csv.DictReader(stream))
+    rounded = {name: round(value, 3) if isinstance(value, float) else value for name, value in figures.items()}
+    rows.append({"bench": bench} | circumstances() | rounded)
+    with path.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.DictWriter(stream, list(dict.fromkeys(chain.from_iterable(rows))), restval="")
+        writer.writeheader()
+        writer.writerows(rows)
+    return path

@@ -1,0 +1,139 @@
+import json
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.avatar.field_config import FieldConfig
+from pipeline.avatar.train import Learning
+from pipeline.core.errors import UserError
+from pipeline.kernels.hashgrid import _Encode
+from tests.bench import bench_field
+from tests.bench.bench_field import PARTS, Peaks, Work, begin_painted, least_work, period, settled, table, time_steps
+from tests.bench.machine import append_row
+from tests.bench.parts import KERNEL_SEAMS, SEAMS, Clock, watched
+
+TINY = FieldConfig(
+    steps=40,
+    rays=512,
+    frames_per_step=2,
+    max_frames=3,
+    max_person_px=64,
+    levels=3,
+    log2_rows=12,
+    margin_m=0.04,
+    step_fraction=0.02,
+    occupancy_every=2,
+    occupancy_start=2,
+    pose_start=0.0,
+    pose_every=2,
+)
+
+
+@pytest.fixture(scope="module")
+def learning_and_timing():
+    clock = Clock()
+    with watched(clock):
+        learning = begin_painted(TINY)
+        return learning, time_steps(learning, clock, warm_up=2, steps=2)
+
+
+def test_parts_sum_to_the_step(learning_and_timing):
+    _, timing = learning_and_timing
+    assert sum(timing.parts_ms.values()) == pytest.approx(timing.step_ms, rel=0.15)
+    assert [part for part, spent_ms in timing.parts_ms.items() if spent_ms <= 0] == []
+    assert timing.samples > 0
+
+
+def test_watching_changes_nothing_that_is_learnt(learning_and_timing):
+    watched_one, _ = learning_and_timing
+    plain = begin_painted(TINY)
+    for _ in range(4):
+        plain.step()
+    assert plain.done == watched_one.done
+    expected = watched_one.state()
+    for name, tensor in plain.state().items():
+        assert torch.equal(tensor, expected[name]), name
+
+
+def test_the_seams_are_as_they_were_afterwards():
+    before = Learning.step, _Encode.forward, _Encode.backward
+    with watched(Clock()):
+        assert Learning.step is not before[0]
+    assert (Learning.step, _Encode.forward, _Encode.backward) == before
+
+
+def test_every_seam_has_a_part():
+    seams = {part for part, *_ in (*SEAMS, *KERNEL_SEAMS)} | {"march"}
+    assert seams == set(PARTS)
+
+
+def test_a_clock_counts_each_moment_once():
+    clock = Clock(iter(range(100)).__next__)
+    inner = clock.timed("inner", lambda: None)
+    clock.timed("outer", lambda: (inner(), inner()))()
+    assert clock.take() == {"outer": 3, "inner": 2}
+    clock.timed("occupancy_update", inner)()
+    assert clock.take() == {"occupancy_update": 1}
+    assert clock.take() == {}
+
+
+def test_a_part_that_fails_is_counted_and_left():
+    clock = Clock(iter(range(100)).__next__)
+
+    def fail():
+        raise LookupError
+
+    with pytest.raises(LookupError):
+        clock.timed("outer", clock.timed("inner", fail))()
+    clock.timed("after", lambda: None)()
+    assert clock.take() == {"outer": 2, "inner": 1, "after": 1}
+
+
+def test_the_floor_is_the_longest_of_three_times():
+    peaks = Peaks(memory_gb_s=10, multiply_gflop_s=100, gather_mrow_s=1000)
+    assert Work(bytes=1e7).least_ms(peaks) == pytest.approx(1)
+    assert Work(operations=1e8).least_ms(peaks) == pytest.approx(1)
+    assert Work(rows=1e6).least_ms(peaks) == pytest.approx(1)
+    assert Work(bytes=1e7, operations=3e8, rows=2e6).least_ms(peaks) == pytest.approx(3)
+
+
+def test_the_work_of_a_step(learning_and_timing):
+    learning, _ = learning_and_timing
+    work = least_work(learning, samples=1000)
+    assert set(work) == set(PARTS)
+    points = work["encode_forward"].rows / (8 * 3)
+    assert points == pytest.approx(1000 + len(learning._empty_points(np.random.default_rng(0))))
+    assert work["network_forward"].operations == pytest.approx(2 * points * (12 * 32 + 32 * 4))
+    assert work["adam"].bytes == 32 * (learning.field.table.numel() + 12 * 32 + 32 * 4 + 4)
+    assert work["positions_backward"].rows == pytest.approx((8 * 3 * points + 24 * 1000) / 2)
+
+
+def test_warm_up_lasts_until_poses_move_and_cells_are_given_up():
+    config = FieldConfig()
+    assert period(config) == 8
+    updates = (settled(config) - config.occupancy_start) // config.occupancy_every
+    assert 0.03 * config.occupancy_decay**updates <= config.occupancy_threshold
+    assert settled(config) % 8 == 0
+    assert settled(FieldConfig(steps=4000)) == 400
+
+
+def test_the_command_prints_and_writes(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(bench_field, "append_row", partial(append_row, folder=tmp_path))
+    monkeypatch.setattr(bench_field, "build", lambda *_: TINY)
+    monkeypatch.setattr(bench_field, "memory_gb_s", lambda *_: 10.0)
+    monkeypatch.setattr(bench_field, "multiply_gflop_s", lambda *_: 100.0)
+    path = tmp_path / "out.json"
+    bench_field.main(["--steps", "2", "--warm-up", "0", "--repeats", "1", "--json", str(path)])
+    figures = json.loads(path.read_text())
+    assert figures["step_ms"] > 0
+    assert figures["floor_ms"] == pytest.approx(sum(figures[f"{part}_floor_ms"] for part in PARTS))
+    assert np.isfinite(figures["samples"])
+    assert table(figures) in capsys.readouterr().out
+    assert len(list(tmp_path.glob("*.csv"))) == 1
+
+
+def test_a_field_without_a_hash_grid_is_refused():
+    with pytest.raises(UserError, match="hash grid"):
+        bench_field.main(["--preset", "animnerf"])
