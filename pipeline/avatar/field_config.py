@@ -69,6 +69,9 @@ class FieldConfig(Config):
     )
     weight_density: float = Option(0.05, ge=0, description="weight of the density loss in empty cells")
     empty_points: int = Option(2048, ge=0, description="points a step at which emptiness is asked for")
+    hidden_points: int = Option(
+        512, ge=0, description="points a step at which emptiness is asked for outside the body where no light comes"
+    )
 
     pose_refinement: bool = Option(True, description="learn small corrections of the poses")
     pose_start: float = Option(0.1, ge=0, le=1, description="part of the steps after which poses are refined")

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from pipeline.kernels.visits import record_visits
@@ -23,6 +23,8 @@ START_AVERAGE = 0.03
 """Of a cell before it was asked: it stays occupied for some twenty updates in which its density is zero."""
 FADING = 0.8
 """What is left, an update later, of what the rays saw in a cell."""
+HIDDEN_M = 0.03
+"""Clothing nearer to the body than this is believed unseen."""
 DARK = 0.02
 """Light below which a cell counts as unlit; what is behind it gives a pixel at most so much."""
 
@@ -33,13 +35,6 @@ class Occupancy:
 
     occupied: UInt8[Tensor, "gx gy gz"]
     bounds_m: Float[Tensor, "2 3"]
-
-    def boxes_m(self) -> Float[np.ndarray, "b 2 3"]:
-        """Low and high corner (m) of each occupied cell."""
-        low, high = self.bounds_m.numpy()
-        cell_m = (high - low) / np.array(self.occupied.shape, dtype=np.float32)
-        index = np.argwhere(self.occupied.numpy() != 0).astype(np.float32)
-        return low + np.stack([index, index + 1], axis=1) * cell_m
 
     def contains(self, points_m: Float[Tensor, "n 3"]) -> Tensor:
         """True for each canonical point in an occupied cell."""
@@ -123,6 +118,22 @@ class OccupancyUpdate:
         """
         dark = (self.reached > 0) & (self.reached < DARK)
         return Occupancy(self.occupied * ~dark.view(self.shape), self.bounds_m)
+
+    def hidden_cells(self) -> Int[Tensor, "h"]:
+        """Occupied cells (flat index) outside the body that no light reached lately: nothing says what is there.
+
+        Between an arm and the torso that it never left, say: unless asked to be empty, such a place keeps the density
+        that it began with and becomes a flap of cloth once the arm is lifted.
+        """
+        dark = (self.reached[self.cells] < DARK) & (self.occupied.view(-1)[self.cells] != 0)
+        return self.cells[dark & (self.distance_m > HIDDEN_M)]
+
+    def points_in(self, cells: Int[Tensor, "n"], random: np.random.Generator) -> Float[Tensor, "n 3"]:
+        """A random point (m) of each cell, given by flat index."""
+        size = torch.tensor(self.shape)
+        corner = torch.stack(torch.unravel_index(cells, self.shape), dim=-1)
+        inside = torch.from_numpy(random.random((len(cells), 3), dtype=np.float32))
+        return self.bounds_m[0] + (corner + inside) / size * (self.bounds_m[1] - self.bounds_m[0])
 
     def record(self, points_m: Float[Tensor, "s 3"], light: Float[Tensor, "s"], weights: Float[Tensor, "s"]) -> None:
         """Note for each sample's cell how much light reached it and how much of a pixel it gave."""

@@ -97,7 +97,9 @@ class Learning:
 
     def _follow_occupancy(self) -> None:
         """Blend skinning only where samples can lie: a fifth of the nodes, and of the memory that a step touches."""
-        self.skin = self.scene.skin.around(self.occupancy.grid().boxes_m()) if self.refines_poses else self.scene.skin
+        self.skin = self.scene.skin
+        if self.refines_poses:
+            self.skin = self.skin.around(self.occupancy.occupied.numpy(), self.occupancy.bounds_m.numpy())
 
     @property
     def refines_poses(self) -> bool:
@@ -149,10 +151,15 @@ class Learning:
         return self.inverse.place(self.skin, poses, batch.frames, samples.canonical_m, posed, slot_start)
 
     def _empty_points(self, random: np.random.Generator) -> Float[Tensor, "e 3"]:
-        """Random points of the box that lie in empty cells."""
+        """Random points that should be empty: of the box, in empty cells; and, once rays had time, of hidden cells."""
         low, high = self.occupancy.bounds_m
         points = torch.from_numpy(random.random((self.config.empty_points, 3), dtype=np.float32)) * (high - low) + low
-        return points[~self.occupancy.grid().contains(points)]
+        empty = points[~self.occupancy.grid().contains(points)]
+        hidden = self.occupancy.hidden_cells()
+        if self.done < self.config.occupancy_start or not len(hidden):
+            return empty
+        drawn = hidden[torch.from_numpy(random.integers(0, len(hidden), self.config.hidden_points))]
+        return torch.cat([empty, self.occupancy.points_in(drawn, random)])
 
     def step(self) -> dict[str, float]:
         """One step; returns the losses. Raises DivergedError after many steps without a finite gradient."""

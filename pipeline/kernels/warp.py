@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from pipeline.kernels import warp_cpu
@@ -39,19 +39,22 @@ class SkinGrid:
         flat = canonical_to_posed[:, :, :3].transpose(0, 1).reshape(joints, count * 12)
         return torch.matmul(self.weights.to(flat), flat).view(-1, count, 12)
 
-    def around(self, boxes_m: Float[np.ndarray, "b 2 3"]) -> "SkinGrid":
-        """The same grid without the nodes that no point of the boxes (low and high corners, m) is interpolated from."""
-        size = np.array(self.row_of_node.shape)
-        cells = (boxes_m - self.origin_m) / self.cell_m
-        low = np.clip(np.floor(cells[:, 0]), 0, size - 1).astype(np.int64)
-        count = np.clip(np.floor(cells[:, 1]) + 2, 1, size).astype(np.int64) - low
-        wanted = np.zeros(self.row_of_node.shape, dtype=bool)
-        for offset in np.ndindex(*count.max(0)):
-            covered = (np.array(offset) < count).all(1)
-            wanted[tuple((low[covered] + offset).T)] = True
-        rows = self.row_of_node[wanted & (self.row_of_node >= 0)]
+    def around(self, occupied: UInt8[np.ndarray, "ox oy oz"], bounds_m: Float[np.ndarray, "2 3"]) -> "SkinGrid":
+        """The same grid without the nodes that no point of an occupied cell is interpolated from.
+
+        occupied: not zero for the cells that are meant; they fill the box `bounds_m`. Along each axis a matrix says
+        which nodes are corners of a cell of this grid that meets which layer of occupied cells.
+        """
+        wanted = (occupied != 0).astype(np.float32)
+        for axis, (nodes, cells) in enumerate(zip(self.row_of_node.shape, occupied.shape, strict=True)):
+            at_m = self.origin_m[axis] + np.arange(nodes)[:, None] * self.cell_m
+            edges_m = np.linspace(bounds_m[0, axis], bounds_m[1, axis], cells + 1)
+            meets = (edges_m[:-1] <= at_m + self.cell_m) & (edges_m[1:] >= at_m - self.cell_m)
+            wanted = np.moveaxis(np.tensordot(meets.astype(np.float32), wanted, axes=(1, axis)), 0, axis)
+        kept = (wanted > 0) & (self.row_of_node >= 0)
+        rows = self.row_of_node[kept]
         row_of_node = np.full(self.row_of_node.shape, -1, dtype=np.int32)
-        row_of_node[wanted & (self.row_of_node >= 0)] = np.arange(len(rows))
+        row_of_node[kept] = np.arange(len(rows))
         return SkinGrid(
             self.origin_m, self.cell_m, row_of_node, self.nodes_m[rows], self.distance_m[rows], self.weights[rows]
         )

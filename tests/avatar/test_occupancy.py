@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.avatar.occupancy import RESOLUTION, Occupancy, OccupancyUpdate, VoxelAttention, cell_centres
+from pipeline.avatar.occupancy import RESOLUTION, OccupancyUpdate, VoxelAttention, cell_centres
 from pipeline.avatar.support import starting_shell
 
 BOUNDS = np.array([[-1.0, -1, -1], [1, 1, 1]], dtype=np.float32)
@@ -89,11 +89,17 @@ def test_starting_shell_needs_mask_support_outside_the_body_only():
     assert starting_shell(distance, frequency, 0.1, 0.6).tolist() == [True, True, False, False]
 
 
-def test_boxes_are_those_of_the_occupied_cells():
-    occupied = torch.zeros(4, 5, 6, dtype=torch.uint8)
-    occupied[1, 2, 3] = occupied[3, 4, 5] = 1
-    grid = Occupancy(occupied, torch.tensor([[-1.0, 0, 2], [1, 5, 5]]))
-    boxes = torch.from_numpy(grid.boxes_m())
-    torch.testing.assert_close(boxes[0], torch.tensor([[-0.5, 2, 3.5], [0, 3, 4]]))
-    torch.testing.assert_close(boxes[1, 1], torch.tensor([1.0, 5, 5]))
-    assert grid.contains(boxes.mean(1)).all()
+def test_hidden_cells_are_the_dark_ones_outside_the_body():
+    update, random = ball_update(False), np.random.default_rng(0)
+    centres = torch.from_numpy(cell_centres(BOUNDS))
+    radius = centres.norm(dim=1)
+    left = centres[:, 0] < 0
+    points = centres[left & (radius < 0.8)]
+    update.record(points, torch.ones(len(points)), torch.zeros(len(points)))
+    hidden = torch.zeros(len(centres), dtype=torch.bool)
+    hidden[update.hidden_cells()] = True
+    assert hidden[~left & (radius > 0.54) & (radius < 0.78)].all()
+    assert not hidden[left | (radius < 0.53) | (radius > 0.8)].any()
+    cells = update.hidden_cells()[:500]
+    inside = (update.points_in(cells, random) - centres[cells]).abs() * RESOLUTION / 2
+    assert 0.45 < float(inside.max()) <= 0.5 + 1e-5

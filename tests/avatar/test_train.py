@@ -119,6 +119,17 @@ def march_of(learning, batch):
     return learning.inverse.sample(rays, learning.step_m, grid, MAX_SAMPLES)
 
 
+def test_where_no_light_comes_the_field_becomes_empty(scene):
+    plain, asked = (begin(scene, steps=80, pose_refinement=False, hidden_points=count) for count in (0, 256))
+    for _ in range(80):
+        plain.step()
+        asked.step()
+    cells = plain.occupancy.hidden_cells()
+    assert len(cells) > 20
+    points = plain.occupancy.points_in(cells, np.random.default_rng(0))
+    assert float(asked.field.density(points).mean()) < 0.8 * float(plain.field.density(points).mean())
+
+
 def test_a_nan_never_reaches_a_parameter(scene):
     learning = begin(scene, steps=50, pose_refinement=False)
     learning.step()

@@ -156,11 +156,14 @@ def test_interpolation_leaves_out_missing_nodes():
 
 def test_a_grid_around_boxes_answers_there_as_the_whole_grid_does():
     skin = bar_skin()
-    boxes = np.array([[[-0.31, -0.02, -0.02], [-0.17, 0.03, 0.01]], [[0.2, 0.0, 0.0], [0.21, 0.01, 0.01]]], np.float32)
-    part = skin.around(boxes)
+    bounds = np.array([[-0.63, -0.16, -0.14], [0.62, 0.17, 0.15]], dtype=np.float32)
+    occupied = np.zeros((30, 9, 7), dtype=np.uint8)
+    occupied[3:5, 4, 2:4] = occupied[20, 6, 5] = 1
+    part = skin.around(occupied, bounds)
     assert 0 < len(part.nodes_m) < 0.3 * len(skin.nodes_m)
     random = np.random.default_rng(0)
-    points = np.concatenate([random.uniform(low, high, (40, 3)) for low, high in boxes])
+    cells = np.argwhere(occupied)[random.integers(0, occupied.sum(), 200)]
+    points = bounds[0] + (cells + random.random((200, 3))) / occupied.shape * (bounds[1] - bounds[0])
     inside = torch.from_numpy(points.astype(np.float32))
     matrices = bend(0.5)[None]
     for grid in (skin, part):
