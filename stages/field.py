@@ -7,7 +7,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 
 from pipeline.avatar import selection
 from pipeline.avatar.body import Motion
@@ -37,9 +36,6 @@ def run(inputs: Mapping[str, Path], out: Path, config: FieldConfig) -> Mapping[s
     """Learn the field on training frames, judge the refined poses on validation frames, write field, occupancy,
     motion.
     """
-    for kind in (np.float32, np.float64):
-        np.finfo(kind)  # Asked for the first time with denormals off, numpy would warn.
-    torch.set_flush_denormal(True)
     capture, camera = load_capture(inputs["frames"]), load_camera(inputs["body"] / "camera.npz")
     body, motion = load_body(inputs["body"] / "body.npz"), load_motion(inputs["body"] / "motion.npz")
     camera = camera.scaled(training_scale(body, motion, camera, config.max_person_px))

@@ -47,7 +47,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from data_tools.command import run_command
 from pipeline.avatar import selection
@@ -232,9 +231,6 @@ def main(argv: Sequence[str]) -> None:
     if config.network != "hashgrid":
         raise UserError(f"preset {options.preset} has no hash grid, whose floors these are; take PRESET=default")
     warm_up = settled(config) if options.warm_up is None else options.warm_up
-    for kind in (np.float32, np.float64):
-        np.finfo(kind)  # Asked for the first time with denormals off, numpy would warn.
-    torch.set_flush_denormal(True)
     clock = Clock()
     with watched(clock):
         learning = begin_run(options.run, config) if options.run else begin_painted(config)

@@ -107,7 +107,6 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--repeats", type=int, default=15, help="runs of each part")
     arguments = parser.parse_args()
-    torch.set_flush_denormal(True)
     figures = {"memory_gb_s": memory_gb_s(arguments.repeats), "multiply_gflop_s": multiply_gflop_s(arguments.repeats)}
     figures |= field_parts(FieldConfig(), arguments.repeats) | warp_parts(arguments.repeats)
     for name, value in figures.items():

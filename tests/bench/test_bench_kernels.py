@@ -1,12 +1,10 @@
 import pytest
-import torch
 
 from tests.bench import bench_kernels
 
 
 @pytest.mark.slow
 def test_kernels(capsys):
-    torch.set_flush_denormal(True)
     figures = bench_kernels.field_parts(bench_kernels.FieldConfig(), 7) | bench_kernels.warp_parts(7)
     with capsys.disabled():
         for name, value in figures.items():
