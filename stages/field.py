@@ -1,4 +1,4 @@
-"""field: the instant avatar, a radiance field in the canonical A-pose, learnt from the frames in half a minute."""
+"""field: the instant avatar, a radiance field in the canonical A-pose, learnt from the frames in about a minute."""
 
 import csv
 import time

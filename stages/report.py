@@ -140,11 +140,7 @@ def score(
     def draw_mesh(pose: Float[Tensor, "j 4 4"]) -> Float[np.ndarray, "h w 4"]:
         return soften_outline(draw_sharp(pose), blur_px)
 
-    draws = {
-        "field": (loaded.draw_field, loaded.refined),
-        "mesh": (draw_mesh, loaded.refined),
-        "mesh_sharp": (draw_sharp, loaded.refined),
-    }
+    draws = {"field": (loaded.draw_field, loaded.refined), "mesh_sharp": (draw_sharp, loaded.refined)}
     if config.unrefined:
         draws["mesh_unrefined"] = (draw_mesh, loaded.fitted)
     if config.unrefined_field:
@@ -158,6 +154,8 @@ def score(
     for position in track(positions.tolist(), "held-out frames"):
         image, mask = (to_uint8(part(position)) for part in (loaded.capture.image, loaded.capture.mask))
         renders = {name: draw(poses[position]) for name, (draw, poses) in draws.items()}
+        softened = soften_outline(renders["mesh_sharp"], blur_px)
+        renders = {"field": renders["field"], "mesh": softened} | renders
         index = int(loaded.capture.frame_index[position])
         scores = {name: frame_scores(rgba, image, mask, weights) for name, rgba in renders.items()}
         rows.append({"index": index} | scores)

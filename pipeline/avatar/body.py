@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -158,6 +159,46 @@ ANNY_LANDMARKS_M = {
 """Where the left and central landmarks of `fit_landmarks.LANDMARKS` lie on the A-pose of the default shape."""
 
 
+@runtime_checkable
+class ParametricBody(Protocol):
+    """What a body model must offer to be fitted: `AnnyBody` here, `SmplBody` in `smpl.py`.
+
+    Its joints have Mixamo's names, at least `fit_model.ACTIVE_JOINTS`. `landmark_places_m` is where the left and
+    central landmarks (`fit_landmarks.LANDMARKS`, by name) lie on the A-pose of the default shape.
+    """
+
+    shape_names: tuple[str, ...]
+    shape_defaults: Tensor
+    joint_names: tuple[str, ...]
+    parents: np.ndarray
+    faces: np.ndarray
+    skin_weights: np.ndarray
+    landmark_places_m: Mapping[str, tuple[float, float, float]]
+
+    def rest(self, shape: Tensor) -> tuple[Tensor, Tensor]:
+        """A-pose vertices (v, 3) and joints (j, 3) of a shape, metres."""
+        ...
+
+    def body(self, shape: Tensor) -> Body:
+        """The body of one shape, frozen."""
+        ...
+
+
+def freeze(model: ParametricBody, shape: Float[Tensor, "p"]) -> Body:
+    """One person's body: a model at one shape."""
+    with torch.no_grad():
+        vertices, joints_m = model.rest(shape)
+    return Body(
+        joint_names=model.joint_names,
+        parents=model.parents,
+        joints_m=joints_m.numpy(),
+        vertices=vertices.numpy(),
+        faces=model.faces,
+        skin_weights=model.skin_weights,
+        shape={name: float(value) for name, value in zip(model.shape_names, shape, strict=True)},
+    )
+
+
 class AnnyBody:
     """Anny (Apache-2.0 code, CC0 data) behind the interface that the fit needs, with the 52-joint Mixamo rig.
 
@@ -206,17 +247,7 @@ class AnnyBody:
 
     def body(self, shape: Float[Tensor, "p"]) -> Body:
         """Freeze a shape into one person's body."""
-        with torch.no_grad():
-            vertices, joints_m = self.rest(shape)
-        return Body(
-            joint_names=self.joint_names,
-            parents=self.parents,
-            joints_m=joints_m.numpy(),
-            vertices=vertices.numpy(),
-            faces=self.faces,
-            skin_weights=self.skin_weights,
-            shape={name: float(value) for name, value in zip(self.shape_names, shape, strict=True)},
-        )
+        return freeze(self, shape)
 
 
 @lru_cache(maxsize=1)

@@ -12,10 +12,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pipeline.avatar.body import Body
+from pipeline.avatar.body import Body, ParametricBody
 from pipeline.avatar.fit_init import initial_state, interpolated_state, torso_found
 from pipeline.avatar.fit_landmarks import LandmarkRegressor, landmark_regressor
-from pipeline.avatar.fit_model import FitModel, ParametricBody, linearise, pose_points, pose_skeleton
+from pipeline.avatar.fit_model import FitModel, linearise, pose_points, pose_skeleton
 from pipeline.avatar.fit_objective import (
     FitState,
     Objective,

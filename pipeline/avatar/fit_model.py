@@ -9,14 +9,13 @@ arm_j = sum over k at or below j of w_k (x_k - joint_j).
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pipeline.avatar.body import Body
+from pipeline.avatar.body import ParametricBody
 from pipeline.geometry.rotation import axis_angle_to_matrix
 from pipeline.geometry.skinning import forward_kinematics, linear_blend_skinning, skinning_transforms
 
@@ -31,31 +30,6 @@ GRIP_RAD = 0.25
 
 SHAPE_STEP = 0.01
 """Finite-difference step, in units of a phenotype; phenotypes are piecewise linear, so a larger one buys nothing."""
-
-
-@runtime_checkable
-class ParametricBody(Protocol):
-    """What a body model must offer to be fitted: `AnnyBody` in `body.py`, `SmplBody` in `smpl.py`.
-
-    Its joints have Mixamo's names, at least `ACTIVE_JOINTS`. `landmark_places_m` is where the left and central
-    landmarks (`fit_landmarks.LANDMARKS`, by name) lie on the A-pose of the default shape.
-    """
-
-    shape_names: tuple[str, ...]
-    shape_defaults: Tensor
-    joint_names: tuple[str, ...]
-    parents: np.ndarray
-    faces: np.ndarray
-    skin_weights: np.ndarray
-    landmark_places_m: Mapping[str, tuple[float, float, float]]
-
-    def rest(self, shape: Tensor) -> tuple[Tensor, Tensor]:
-        """A-pose vertices (v, 3) and joints (j, 3) of a shape, metres."""
-        ...
-
-    def body(self, shape: Tensor) -> Body:
-        """The body of one shape, frozen."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
 from pipeline.avatar.body import Body
-from pipeline.avatar.mesh_views import Skin, View, render_view, target_over
+from pipeline.avatar.mesh_views import Skin, View, render_view, view_losses
 from pipeline.core.config import Config
 from pipeline.core.progress import track
 from pipeline.geometry.mesh import Mesh
@@ -160,10 +160,8 @@ def _views_loss(
     for k in torch.randint(len(task.train), (config.frames_per_step,), generator=generator).tolist():
         background = torch.rand(3, generator=generator)
         image, alpha, _ = render_view(vertices, skin, task.train[k], task.shade)
-        target, mask = target_over(task.train[k], background)
-        colour = torch.nn.functional.huber_loss(image + (1.0 - alpha[..., None]) * background, target, delta=0.1)
-        # Huber with delta 0.1 is 0.1 |e| for large errors: the factor 10 makes weight 1 mean the mean absolute error
-        losses.append(config.colour_weight * 10.0 * colour + config.alpha_weight * (alpha - mask).abs().mean())
+        colour, outline = view_losses(image, alpha, task.train[k], background)
+        losses.append(config.colour_weight * colour + config.alpha_weight * outline)
     return torch.stack(losses).mean()
 
 

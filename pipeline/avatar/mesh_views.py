@@ -107,6 +107,18 @@ def target_over(view: View, background: Float[Tensor, "3"]) -> tuple[Float[Tenso
     return view.image.float() / 255.0 * mask[..., None] + (1.0 - mask[..., None]) * background, mask
 
 
+def view_losses(
+    image: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"], view: View, background: Float[Tensor, "3"]
+) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+    """How far a render (premultiplied colours, coverage) is from a view: colours before a background, and outlines.
+
+    Both near the mean absolute error: Huber with delta 0.1 is 0.1 |e| for large errors, hence the factor 10.
+    """
+    target, mask = target_over(view, background)
+    shown = image + (1.0 - alpha[..., None]) * background
+    return 10.0 * torch.nn.functional.huber_loss(shown, target, delta=0.1), (alpha - mask).abs().mean()
+
+
 @torch.no_grad()
 def face_errors(mesh: Mesh, skin: Skin, views: Sequence[View], shade: Shade) -> Float[np.ndarray, "f"]:
     """Colour error (sum over channels, pixels and views of the absolute difference, white behind) that lands on each

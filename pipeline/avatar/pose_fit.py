@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pipeline.avatar.body import Body, Motion
-from pipeline.avatar.mesh_views import View, target_over
+from pipeline.avatar.mesh_views import View, view_losses
 from pipeline.avatar.pose import PoseCorrection
 from pipeline.avatar.textured import TexturedAvatar
 from pipeline.core.progress import track
@@ -60,11 +60,9 @@ def fit_poses(avatar: TexturedAvatar, body: Body, motion: Motion, views: Sequenc
 
 
 def _difference(draw: "_Drawing", canonical_to_world: Float[Tensor, "j 4 4"], view: View) -> Float[Tensor, ""]:
-    """Colour before grey (Huber) and silhouette (absolute), both as a mean over pixels."""
-    image, alpha = draw(canonical_to_world, view)
-    target, mask = target_over(view, torch.full((3,), BACKGROUND))
-    colour = torch.nn.functional.huber_loss(image + (1.0 - alpha[..., None]) * BACKGROUND, target, delta=0.1)
-    return 10.0 * colour + (alpha - mask).abs().mean()  # Huber with delta 0.1 is 0.1 |e| for large errors
+    """Colour before grey, and silhouette."""
+    colour, outline = view_losses(*draw(canonical_to_world, view), view, torch.full((3,), BACKGROUND))
+    return colour + outline
 
 
 class _Drawing:

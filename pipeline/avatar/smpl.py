@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pipeline.avatar.body import Body
+from pipeline.avatar.body import Body, freeze
 from pipeline.geometry.rotation import axis_angle_to_matrix
 from pipeline.geometry.skinning import forward_kinematics, linear_blend_skinning, skinning_transforms
 
@@ -121,17 +121,7 @@ class SmplBody:
 
     def body(self, shape: Float[Tensor, "p"]) -> Body:
         """Freeze some betas into one person's body."""
-        with torch.no_grad():
-            vertices, joints_m = self.rest(shape)
-        return Body(
-            joint_names=self.joint_names,
-            parents=self.parents,
-            joints_m=joints_m.numpy(),
-            vertices=vertices.numpy(),
-            faces=self.faces,
-            skin_weights=self.skin_weights,
-            shape={name: float(value) for name, value in zip(self.shape_names, shape, strict=True)},
-        )
+        return freeze(self, shape)
 
     def local_rotations(self, smpl_rotations: Float[Tensor, "n j 3 3"]) -> Float[Tensor, "n j 3 3"]:
         """SMPL's local rotations (identity: T-pose) as this house's (identity: A-pose with joints along the axes).

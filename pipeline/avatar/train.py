@@ -96,7 +96,7 @@ class Learning:
             self.inverse = invert_motion(self.config.inverse_skinning, self.scene.body, self.scene.skin, poses)
 
     def _follow_occupancy(self) -> None:
-        """Blend skinning only where samples can lie: a fifth of the nodes, and of the memory that a step touches."""
+        """Blend skinning only where samples can lie: a third of the nodes, and of the memory that a step touches."""
         self.skin = self.scene.skin
         if self.refines_poses:
             self.skin = self.skin.around(self.occupancy.occupied.numpy(), self.occupancy.bounds_m.numpy())
@@ -155,8 +155,10 @@ class Learning:
         low, high = self.occupancy.bounds_m
         points = torch.from_numpy(random.random((self.config.empty_points, 3), dtype=np.float32)) * (high - low) + low
         empty = points[~self.occupancy.grid().contains(points)]
+        if self.done < self.config.occupancy_start:
+            return empty
         hidden = self.occupancy.hidden_cells()
-        if self.done < self.config.occupancy_start or not len(hidden):
+        if not len(hidden):
             return empty
         drawn = hidden[torch.from_numpy(random.integers(0, len(hidden), self.config.hidden_points))]
         return torch.cat([empty, self.occupancy.points_in(drawn, random)])
@@ -247,13 +249,3 @@ class Learning:
         kept = {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
         self.occupancy.load_state(kept)
         self._follow_occupancy()
-
-
-def training_step_m(height_m: float, config: FieldConfig) -> float:
-    """Length of a ray step in metres."""
-    return height_m * config.step_fraction
-
-
-def psnr(mean_square: float) -> float:
-    """Decibels of a mean squared error of values in [0, 1]."""
-    return -10 * math.log10(max(mean_square, 1e-12))

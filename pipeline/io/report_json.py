@@ -18,7 +18,8 @@ PROTOCOL = (
     "image. Renders and frames are laid over white by the mask and rounded to 8 bits. Of psnr, ssim and flip (67 "
     "pixels a degree, lower is better), _full counts the whole image, _body the pixels of the mask, _box the smallest "
     "box around it; each is the mean over frames. field is the radiance field, mesh the exported mesh with its "
-    "diffuse map, unlit."
+    "diffuse map, unlit, its outline blurred until it is as soft as the masks (masks.edge_spread_px, measured on "
+    "frames that are not scored); mesh_sharp is the mesh as square pixels give it."
 )
 UNREFINED = " The rows named unrefined use the body stage's poses alone."
 POSE_FITTED_ENDING = "_pose_fitted"

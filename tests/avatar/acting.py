@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from pipeline.avatar.body import ParametricBody
 from pipeline.avatar.fit_landmarks import OFFSET_COUNT, landmark_regressor
-from pipeline.avatar.fit_model import ACTIVE_JOINTS, FitModel, ParametricBody, linearise, pose_points, pose_skeleton
+from pipeline.avatar.fit_model import ACTIVE_JOINTS, FitModel, linearise, pose_points, pose_skeleton
 from pipeline.avatar.fit_objective import FitState, Observations
 from pipeline.avatar.fit_quality import make_observations
 from pipeline.avatar.fit_silhouette import Window, matching_window, posed_vertices

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.avatar.body import load_anny
+from pipeline.avatar.body import ParametricBody, load_anny
 from pipeline.avatar.fit import FitOptions, FitResult, fit_body
 from pipeline.avatar.fit_landmarks import LANDMARKS
-from pipeline.avatar.fit_model import ACTIVE_JOINTS, GRIP_RAD, ParametricBody, grip_rotations
+from pipeline.avatar.fit_model import ACTIVE_JOINTS, GRIP_RAD, grip_rotations
 from pipeline.avatar.fit_priors import shape_prior
 from pipeline.avatar.smpl import ARM_DIRECTIONS, FINGER_BEND_RAD, JOINT_NAMES, SmplBody, rotation_between
 from pipeline.geometry.rotation import (

@@ -60,6 +60,11 @@ def test_an_index_that_does_not_answer_is_noticed() -> None:
 
 
 def test_extras_come_from_the_project_file() -> None:
-    assert install.extra_packages("cluster")[0] == "snakemake>=8"
+    assert install.extra_packages("cluster") == [
+        "snakemake>=8",
+        "snakemake-executor-plugin-kubernetes",
+        "snakemake-executor-plugin-slurm",
+        "snakemake-storage-plugin-fs",
+    ]
     with pytest.raises(SystemExit, match="cuda, cluster, dev"):
         install.extra_packages("gpu")

@@ -10,7 +10,7 @@ from data_tools.compare_avatar import Comparison
 from data_tools.truth import load_truth
 from pipeline.avatar.body import Motion, canonical_to_world
 from pipeline.avatar.selection import split_of
-from pipeline.avatar.textured import TexturedAvatar
+from pipeline.avatar.textured import TexturedAvatar, straight_rgba
 from pipeline.geometry.rotation import axis_angle_to_quaternion, quaternion_multiply
 from pipeline.geometry.skinning import top_k_weights
 from pipeline.io.avatar import FinishedRun
@@ -25,9 +25,10 @@ def perfect_run(sample: Path, folder: Path) -> Comparison:
     for path in (image_path(folder, 0), mask_path(folder, 0)):
         path.parent.mkdir(parents=True)
     for frame in index.tolist():
-        picture, coverage = truth.frame(frame)
-        write_rgb(image_path(folder, frame), picture)
-        write_gray(mask_path(folder, frame), coverage)
+        # Straight colours, so that nothing of the room is in the pixels along the outline.
+        person = straight_rgba(truth.person(frame))
+        write_rgb(image_path(folder, frame), np.ascontiguousarray(person[..., :3]))
+        write_gray(mask_path(folder, frame), np.ascontiguousarray(person[..., 3]))
     indices, weights = top_k_weights(subject.body.skin_weights)
     avatar = TexturedAvatar(
         vertices=torch.from_numpy(subject.body.vertices),
