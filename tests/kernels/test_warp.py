@@ -74,10 +74,10 @@ def test_where_the_bar_folds_onto_itself_both_answers_are_found():
 def test_of_two_answers_the_one_much_farther_from_the_body_is_dropped():
     skin, matrices = bar_skin(), bend(np.pi - 0.35)
     # As above, but deep in one bone and at the rim of the other: where arm and torso meet, a point is of one of them.
-    points = torch.tensor([[-0.4, 0.0, 0.0], [-0.4, 0.145, 0.0]])
+    points = torch.tensor([[-0.4, 0.0, 0.0], [-0.4, 0.145, 0.0], [-0.3, 0.02, 0.0]])
     found, owner = look_up(points, WarpSet.of([bake(skin, matrices)], CELL_M))
-    assert owner.tolist() == [0, 1]
-    assert torch.sign(found[:, 0]).tolist() == [-1, 1]
+    assert owner.tolist() == [0, 1, 2]
+    assert torch.sign(found[:2, 0]).tolist() == [-1, 1]
 
 
 def test_points_far_from_the_body_have_no_answer():
