@@ -8,8 +8,8 @@ from jaxtyping import Float, Int
 from data_tools.surface import face_parts
 from pipeline.avatar.body import AnnyBody, Body
 
-SKIN, EYE, TONGUE = 0, 1, 2
-"""Kinds of connected part of the body's surface."""
+SKIN, EYE, TONGUE, SKIRT = 0, 1, 2, 3
+"""Kinds of connected part of the dressed surface; the last is no part of the body's."""
 
 _ARM_JOINTS = ("Arm", "ForeArm", "Hand")
 _MOUTH_UV = (0.909, 0.483)

@@ -2,7 +2,8 @@
 
 The body's surface is refined, smoothed where cloth does not follow it (navel, shoulder blades), pushed out along its
 normals by the thickness and the folds of each layer, and keeps the body's skin weights. It is draped twice: the second
-time the cuts are measured on the first drape, where cloth is smooth, so that hems and prints run straight.
+time the cuts are measured on the first drape, where cloth is smooth, so that hems and prints run straight. A skirt is a
+second closed surface around the legs.
 """
 
 from dataclasses import dataclass, replace
@@ -12,9 +13,10 @@ import scipy.sparse as sparse
 from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull
 
-from data_tools.anatomy import SKIN, Anatomy, limb_weights, surface_kinds
+from data_tools.anatomy import SKIN, SKIRT, Anatomy, limb_weights, surface_kinds
 from data_tools.noise import Noise
 from data_tools.outfit import LAYERS, Outfit, layer_depths
+from data_tools.skirt import ATLAS_SHARE, hang_skirt
 from data_tools.surface import neighbour_mean, smoothed, split_at_midpoints, with_midpoints
 from pipeline.avatar.body import AnnyBody, Body
 from pipeline.geometry.mesh import Mesh
@@ -64,7 +66,28 @@ def dress(model: AnnyBody, body: Body, anatomy: Anatomy, outfit: Outfit, noise: 
         depths = np.where(skin_vertices[:, None], layer_depths(drape, limbs, anatomy, outfit), -1.0)
         vertices = _with_layers(shod, faces, mean, depths, anatomy, noise)
     dressed = replace(body, vertices=vertices, faces=faces, skin_weights=with_midpoints(body.skin_weights, pairs))
-    return Dressed(dressed, with_midpoints(model.uv, uv_pairs), faces_uv, drape, limbs, kinds)
+    whole = Dressed(dressed, with_midpoints(model.uv, uv_pairs), faces_uv, drape, limbs, kinds)
+    return _with_skirt(whole, anatomy, noise) if outfit.legwear == "skirt" else whole
+
+
+def _with_skirt(person: Dressed, anatomy: Anatomy, noise: Noise) -> Dressed:
+    """Add the sheet around the legs; the body's charts make room for its own at the top of the atlas."""
+    sheet = hang_skirt(person.body, person.limbs[:, 0], anatomy, noise)
+    worn, start, start_uv = person.body, len(person.body.vertices), len(person.uv)
+    body = replace(
+        worn,
+        vertices=np.concatenate([worn.vertices, sheet.vertices]),
+        faces=np.concatenate([worn.faces, sheet.faces + start]),
+        skin_weights=np.concatenate([worn.skin_weights, sheet.skin_weights]),
+    )
+    return Dressed(
+        body=body,
+        uv=np.concatenate([person.uv * np.array([1.0, 1.0 - ATLAS_SHARE], np.float32), sheet.uv]),
+        faces_uv=np.concatenate([person.faces_uv, sheet.faces_uv + start_uv]),
+        drape_m=np.concatenate([person.drape_m, sheet.vertices]),
+        limbs=np.concatenate([person.limbs, np.zeros((len(sheet.vertices), 2), np.float32)]),
+        kinds=np.concatenate([person.kinds, np.full(len(sheet.faces), SKIRT, person.kinds.dtype)]),
+    )
 
 
 def _with_layers(

@@ -6,16 +6,22 @@ from pathlib import Path
 import numpy as np
 
 from data_tools.backdrop import Room, make_room
+from data_tools.bvh import read_bvh
 from data_tools.capture import Capture, Heldout, novel_cameras, portrait_camera
-from data_tools.motion import novel_motion
+from data_tools.motion import novel_motion, turn_in_a_pose
 from data_tools.noise import Noise
 from data_tools.renderer import LIGHTS
+from data_tools.retarget import resampled, retarget
 from data_tools.subject import Subject
 from pipeline.avatar.body import Body, Motion
 from pipeline.core.errors import UserError
 from pipeline.geometry.camera import Camera
 from pipeline.io.image import to_float, to_uint8
 
+LIGHT_HELP = (
+    "studio: ambient and key light that shade; flat: the bare texture, shadow-free; shiny: studio with highlights; "
+    "hard: a strong key light that the person hides from itself"
+)
 LEAST_FRAMES, LEAST_SIZE_PX = 2, 32
 
 
@@ -31,11 +37,14 @@ def capture_parser(command: str, description: str) -> argparse.ArgumentParser:
     parser.add_argument("--size", type=int, default=540, help="side of the square image in pixels, even")
     parser.add_argument("--distance", type=float, default=3.6, help="from camera to person, metres")
     parser.add_argument("--fill", type=float, default=0.82, help="share of the image's height that the person takes")
-    parser.add_argument("--light", choices=sorted(LIGHTS), default="studio", help="flat shows the bare texture")
+    parser.add_argument("--light", choices=sorted(LIGHTS), default="studio", help=LIGHT_HELP)
     parser.add_argument("--background", choices=("busy", "plain"), default="busy", help="the room")
     parser.add_argument("--samples", type=int, default=2, help="antialiasing: samples a pixel along each axis")
     parser.add_argument("--novel-views", type=int, default=4, help="held-out cameras to render into truth/")
     parser.add_argument("--novel-poses", type=int, default=4, help="held-out poses to render into truth/")
+    parser.add_argument("--bvh", type=Path, help="motion capture to follow instead of the turn in A-pose")
+    parser.add_argument("--start", type=float, default=0.0, help="where in the motion to start, seconds")
+    parser.add_argument("--in-place", action="store_true", help="stay on the spot whatever the motion does")
     parser.add_argument("--seed", type=int, default=0, help="person, clothes and sway; same seed, same bytes")
     return parser
 
@@ -73,6 +82,14 @@ def stage_scene(options: argparse.Namespace, body: Body) -> tuple[Camera, np.nda
     return camera, ground_m, Room(to_float(to_uint8(room.image)), room.floor_m)
 
 
+def choose_motion(options: argparse.Namespace, body: Body, ground_m: np.ndarray) -> Motion:
+    """The turn in A-pose, or the part of a BVH file that is asked for."""
+    if options.bvh:
+        whole = retarget(read_bvh(options.bvh), body, ground_m, options.in_place)
+        return resampled(whole, options.start, options.frames, options.fps)
+    return turn_in_a_pose(body, options.frames, options.fps, ground_m, options.seed)
+
+
 def assemble(
     options: argparse.Namespace, subject: Subject, motion: Motion, scene: tuple[Camera, np.ndarray, Room]
 ) -> tuple[Capture, Heldout]:
@@ -85,9 +102,10 @@ def assemble(
 
 
 def recipe_of(options: argparse.Namespace) -> dict[str, object]:
-    """The options by name, as they go into the truth's recipe."""
-    return {
+    """The options by name, as they go into the truth's recipe; of paths only the motion's name."""
+    chosen = {
         name: value if isinstance(value, int | float | str) else str(value)
         for name, value in sorted(vars(options).items())
         if value is not None and not isinstance(value, Path)
     }
+    return chosen | {"motion": options.bvh.name if options.bvh else "turn"}

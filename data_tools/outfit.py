@@ -8,7 +8,13 @@ from jaxtyping import Float
 from data_tools.anatomy import Anatomy
 
 LAYERS = ("shoes", "trousers", "shirt", "hair")
-"""From the skin outwards: a later layer hides an earlier one."""
+"""Offset surfaces, from the skin outwards: a later layer hides an earlier one."""
+
+LEGWEAR = ("trousers", "skirt")
+"""What covers the legs: a layer, or the loose sheet of `data_tools.skirt` over bare legs."""
+
+TUCKED_M = -0.03
+"""Where a shirt that is tucked into a skirt ends, as `Outfit.shirt_drop_m`."""
 
 Colour = tuple[float, float, float]
 
@@ -17,11 +23,14 @@ Colour = tuple[float, float, float]
 class Outfit:
     """Cuts in metres and fractions, colours in sRGB [0, 1]."""
 
+    legwear: str
     sleeve_fraction: float
     shirt_drop_m: float
     shirt: Colour
     stripe: Colour
     trousers: Colour
+    skirt: Colour
+    check: Colour
     shoes: Colour
     hair: Colour
     iris: Colour
@@ -36,22 +45,31 @@ _SHIRTS: tuple[tuple[Colour, Colour], ...] = (
     ((0.16, 0.45, 0.30), (0.94, 0.93, 0.88)),
 )
 _TROUSERS: tuple[Colour, ...] = ((0.22, 0.29, 0.42), (0.55, 0.47, 0.35), (0.20, 0.20, 0.22))
+_SKIRTS: tuple[tuple[Colour, Colour], ...] = (
+    ((0.16, 0.36, 0.40), (0.93, 0.76, 0.33)),
+    ((0.52, 0.16, 0.26), (0.92, 0.88, 0.80)),
+    ((0.74, 0.66, 0.50), (0.28, 0.20, 0.34)),
+)
 _SHOES: tuple[Colour, ...] = ((0.16, 0.17, 0.20), (0.50, 0.20, 0.16), (0.30, 0.36, 0.40))
 _HAIR: tuple[Colour, ...] = ((0.17, 0.11, 0.08), (0.07, 0.06, 0.06), (0.42, 0.27, 0.14))
 _IRIS: tuple[Colour, ...] = ((0.30, 0.19, 0.10), (0.25, 0.38, 0.48), (0.28, 0.36, 0.22))
 _SKIN: tuple[Colour, ...] = ((0.86, 0.65, 0.54), (0.72, 0.51, 0.39), (0.52, 0.35, 0.26))
 
 
-def choose_outfit(seed: int) -> Outfit:
-    """The wardrobe's entry for a seed; seed 0 is the first of everything."""
+def choose_outfit(seed: int, legwear: str = "trousers") -> Outfit:
+    """The wardrobe's entry for a seed; seed 0 is the first of everything. legwear: one of `LEGWEAR`."""
     digits = np.random.default_rng(seed).integers(0, 1_000_000, 6) if seed else np.zeros(6, dtype=np.int64)
     shirt, stripe = _SHIRTS[digits[0] % len(_SHIRTS)]
+    skirt, check = _SKIRTS[digits[1] % len(_SKIRTS)]
     return Outfit(
+        legwear=legwear,
         sleeve_fraction=0.66,
-        shirt_drop_m=0.07,
+        shirt_drop_m=0.07 if legwear == "trousers" else TUCKED_M,
         shirt=shirt,
         stripe=stripe,
         trousers=_TROUSERS[digits[1] % len(_TROUSERS)],
+        skirt=skirt,
+        check=check,
         shoes=_SHOES[digits[2] % len(_SHOES)],
         hair=_HAIR[digits[3] % len(_HAIR)],
         iris=_IRIS[digits[4] % len(_IRIS)],
@@ -71,6 +89,8 @@ def layer_depths(
     on_arm, on_head = limbs[:, 0] > 0.5, limbs[:, 1] > 0.35
     foot, hips = anatomy.joints_m["LeftFoot"], anatomy.joints_m["Hips"]
     trousers = np.minimum(hips[1] + 0.03 - height, height - (foot[1] - 0.025))
+    if outfit.legwear != "trousers":
+        trousers = np.full_like(trousers, -1.0)
     shirt = np.minimum(below_neckline(points_m, anatomy), height - (hips[1] - outfit.shirt_drop_m))
     depths = [
         foot[1] + 0.02 - height,

@@ -8,11 +8,12 @@ import torch
 from jaxtyping import Float, Int
 from scipy.ndimage import distance_transform_edt
 
-from data_tools.anatomy import EYE, TONGUE, Anatomy
+from data_tools.anatomy import EYE, SKIRT, TONGUE, Anatomy
 from data_tools.dressing import Dressed
 from data_tools.face import paint_eyes, paint_skin
 from data_tools.noise import Noise
 from data_tools.outfit import LAYERS, Outfit, below_neckline, layer_depths
+from data_tools.skirt import waist_and_hem_m
 from pipeline.io.image import to_float
 from pipeline.kernels.raster import rasterize
 
@@ -80,6 +81,8 @@ def _colours(texels: Texels, anatomy: Anatomy, outfit: Outfit, noise: Noise) -> 
     rows = texels.kinds == EYE
     colours[rows] = paint_eyes(texels.points_m[rows], anatomy, outfit)
     colours[texels.kinds == TONGUE] = (0.55, 0.25, 0.25)
+    rows = texels.kinds == SKIRT
+    colours[rows] = _paint_skirt(texels.points_m[rows], anatomy, outfit, noise)
     return np.clip(colours, 0.0, 1.0)
 
 
@@ -174,6 +177,19 @@ def _paint_trousers(
     colours[on_side_seam] *= 0.62
     colours[stitched] = colours[stitched] * 0.3 + np.array([0.55, 0.42, 0.22]) * 0.7
     return colours
+
+
+def _paint_skirt(points: np.ndarray, anatomy: Anatomy, outfit: Outfit, noise: Noise) -> Float[np.ndarray, "n 3"]:
+    """Checked wool: bands around and bands downwards, each half see-through, with two lines above the hem."""
+    hips, weave = anatomy.joints_m["Hips"], noise(points, 0.0025) * 0.06 + noise.fractal(points, 0.08) * 0.06
+    angle = np.arctan2(points[:, 2] - hips[2], points[:, 0] - hips[0])
+    above_hem = points[:, 1] - waist_and_hem_m(anatomy)[1]
+    colours = _shaded(outfit.skirt, 1.0 + weave)
+    around, down = np.mod(above_hem + 0.02, 0.11) < 0.035, np.mod(angle / (2.0 * np.pi) * 16.0, 1.0) < 0.3
+    thin = (np.abs(np.mod(above_hem, 0.11) - 0.062) < 0.003) | (np.abs(above_hem - 0.012) < 0.004)
+    ink = _shaded(outfit.check, 1.0 + weave)
+    share = 0.45 * around + 0.30 * down + 0.5 * thin
+    return colours + np.minimum(share, 0.9)[:, None] * (ink - colours)
 
 
 def _paint_shoes(

@@ -24,9 +24,9 @@ _BUILD = {
 """Phenotypes of the built-in person and their spread over seeds, each clipped to [0, 1]."""
 
 
-def make_person(seed: int, texture_px: int = 2048) -> tuple[Subject, Body]:
+def make_person(seed: int, texture_px: int = 2048, legwear: str = "trousers") -> tuple[Subject, Body]:
     """The person of a seed: dressed and painted, and the bare body beneath. The same seed gives the same arrays."""
-    model, noise, outfit = load_anny(), Noise(seed), choose_outfit(seed)
+    model, noise, outfit = load_anny(), Noise(seed), choose_outfit(seed, legwear)
     bare = model.body(_shape(model, seed))
     anatomy = measure(model, bare)
     dressed = dress(model, bare, anatomy, outfit, noise)

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from data_tools.shadow import ShadowMap, cast_shadows
 from data_tools.subject import Subject
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.skinning import linear_blend_skinning
@@ -18,7 +19,8 @@ from pipeline.kernels.raster import rasterize
 class Light:
     """One key light from a fixed direction of the world, and ambient light that is stronger from above.
 
-    A key of 0 and an ambient of 1 with no sky shows the bare texture (shadow-free).
+    A key of 0 and an ambient of 1 with no sky shows the bare texture (shadow-free). wrap: how far the key reaches round
+    the terminator (0: Lambert). casts_shadows: the person hides the key from parts of the person.
     """
 
     key: float = 0.55
@@ -26,12 +28,15 @@ class Light:
     ambient: float = 0.62
     sky: float = 0.10
     shine: float = 0.0
+    wrap: float = 0.25
+    casts_shadows: bool = False
 
 
 STUDIO = Light()
 FLAT = Light(key=0.0, ambient=1.0, sky=0.0)
 SHINY = Light(shine=0.35)
-LIGHTS = {"studio": STUDIO, "flat": FLAT, "shiny": SHINY}
+HARD = Light(key=0.75, ambient=0.42, wrap=0.0, casts_shadows=True)
+LIGHTS = {"studio": STUDIO, "flat": FLAT, "shiny": SHINY, "hard": HARD}
 
 SHININESS = 24.0
 
@@ -57,7 +62,9 @@ def render_subject(
         return image
     left, top, width, height = window
     fine = camera.cropped(left, top, width, height).scaled(float(samples))
-    shaded = _shade_window(subject, vertices_world, fine, light)
+    faces = torch.from_numpy(subject.body.faces)
+    shadows = cast_shadows(vertices_world, faces, light.key_from) if light.casts_shadows else None
+    shaded = _shade_window(subject, vertices_world, fine, light, shadows)
     mean = shaded.reshape(height, samples, width, samples, 4).mean(axis=(1, 3))
     image[top : top + height, left : left + width] = mean
     return image
@@ -75,7 +82,7 @@ def _window(vertices_world: Float[Tensor, "v 3"], camera: Camera) -> tuple[int, 
 
 
 def _shade_window(
-    subject: Subject, vertices_world: Float[Tensor, "v 3"], camera: Camera, light: Light
+    subject: Subject, vertices_world: Float[Tensor, "v 3"], camera: Camera, light: Light, shadows: ShadowMap | None
 ) -> Float[np.ndarray, "h w 4"]:
     """One shaded look-up a pixel."""
     faces, faces_uv = torch.from_numpy(subject.body.faces), torch.from_numpy(subject.faces_uv)
@@ -91,7 +98,8 @@ def _shade_window(
     point = (vertices_world[corners] * blend).sum(1)
     to_camera = torch.nn.functional.normalize(torch.from_numpy(camera.centre_m()) - point, dim=1)
     image = np.zeros((camera.height, camera.width, 4), dtype=np.float32)
-    image[seen.numpy(), :3] = shade(albedo, normal, to_camera, light).numpy()
+    lit = shadows.lit(point, normal) if shadows else torch.ones(len(point))
+    image[seen.numpy(), :3] = shade(albedo, normal, to_camera, lit, light).numpy()
     image[seen.numpy(), 3] = 1.0
     return image
 
@@ -107,17 +115,22 @@ def _normals(vertices: Float[Tensor, "v 3"], faces: Tensor) -> Float[Tensor, "v 
 
 
 def shade(
-    albedo: Float[Tensor, "n 3"], normal: Float[Tensor, "n 3"], to_camera: Float[Tensor, "n 3"], light: Light
+    albedo: Float[Tensor, "n 3"],
+    normal: Float[Tensor, "n 3"],
+    to_camera: Float[Tensor, "n 3"],
+    lit: Float[Tensor, "n"],
+    light: Light,
 ) -> Float[Tensor, "n 3"]:
     """sRGB colours under the light: Lambert with a wrapped key light, hemispheric ambient, Blinn-Phong shine.
 
-    All directions are unit vectors in the world; albedo is sRGB, the sum is taken in linear light.
+    All directions are unit vectors in the world; albedo is sRGB, the sum is taken in linear light. lit: share of the
+    key light that nothing hides.
     """
     key_from = torch.nn.functional.normalize(torch.tensor(light.key_from), dim=0)
-    wrapped = ((normal @ key_from + 0.25) / 1.25).clamp_min(0.0)
+    wrapped = lit * ((normal @ key_from + light.wrap) / (1.0 + light.wrap)).clamp_min(0.0)
     irradiance = light.ambient + light.sky * normal[:, 1] + light.key * wrapped
     half = torch.nn.functional.normalize(key_from + to_camera, dim=1)
-    gloss = light.shine * (normal * half).sum(1).clamp_min(0.0) ** SHININESS
+    gloss = light.shine * lit * (normal * half).sum(1).clamp_min(0.0) ** SHININESS
     return _to_srgb(_to_linear(albedo) * irradiance[:, None] + gloss[:, None])
 
 

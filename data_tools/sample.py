@@ -1,6 +1,6 @@
 """The built-in sample: a clothed person, generated from the embedded body, turns once before a camera.
 
-python -m data_tools.sample OUT [--frames 96 --size 540 --seed 0 ...]
+python -m data_tools.sample OUT [--frames 96 --size 540 --seed 0 --legwear skirt --bvh MOTION.bvh ...]
 """
 
 import sys
@@ -10,8 +10,8 @@ from pathlib import Path
 from data_tools.capture import write_capture
 from data_tools.command import run_command
 from data_tools.folder import refuse_existing
-from data_tools.motion import turn_in_a_pose
-from data_tools.options import assemble, capture_parser, check_options, recipe_of, stage_scene
+from data_tools.options import assemble, capture_parser, check_options, choose_motion, recipe_of, stage_scene
+from data_tools.outfit import LEGWEAR
 from data_tools.person import make_person
 
 
@@ -20,12 +20,13 @@ def main(argv: Sequence[str]) -> None:
     parser = capture_parser("sample", (__doc__ or "").splitlines()[0])
     parser.add_argument("out", type=Path, help="folder to make: OUT/video for the pipeline, OUT/truth beside it")
     parser.add_argument("--texture", type=int, default=2048, help="side of the true texture in pixels")
+    parser.add_argument("--legwear", choices=LEGWEAR, default=LEGWEAR[0], help="trousers, or a skirt over bare legs")
     options = parser.parse_args(argv)
     check_options(options)
     refuse_existing(options.out)
-    subject, bare = make_person(options.seed, options.texture)
+    subject, bare = make_person(options.seed, options.texture, options.legwear)
     scene = stage_scene(options, subject.body)
-    motion = turn_in_a_pose(subject.body, options.frames, options.fps, scene[1], options.seed)
+    motion = choose_motion(options, subject.body, scene[1])
     capture, heldout = assemble(options, subject, motion, scene)
     write_capture(options.out, capture, bare, heldout, {"source": "sample", **recipe_of(options)})
     print(f"{options.out}/video/video.mp4 and its truth in {options.out}/truth")

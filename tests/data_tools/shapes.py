@@ -25,3 +25,13 @@ def sphere(radius_m: float, centre_m: tuple[float, float, float], rounds: int = 
         vertices = with_midpoints(vertices, pairs)
         vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
     return (vertices * radius_m + np.array(centre_m)).astype(np.float32), faces
+
+
+def crossings(origin: np.ndarray, direction: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Distances at which a ray meets triangles (Moeller and Trumbore 1997), by brute force, sorted."""
+    edge_1, edge_2, to_origin = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], origin - corners[:, 0]
+    p, q = np.cross(direction, edge_2), np.cross(to_origin, edge_1)
+    determinant = (edge_1 * p).sum(axis=1)
+    determinant[np.abs(determinant) < 1e-14] = np.nan
+    u, v, t = (to_origin * p).sum(axis=1) / determinant, q @ direction / determinant, (edge_2 * q).sum(1) / determinant
+    return np.sort(t[(u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)])

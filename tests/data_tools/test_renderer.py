@@ -68,7 +68,7 @@ def test_key_light_comes_from_its_side() -> None:
 
 def lit(normal: tuple[float, float, float], light: Light, albedo: float = 0.5) -> float:
     to_camera = torch.tensor([[0.0, 0.0, 1.0]])
-    return float(shade(torch.full((1, 3), albedo), torch.tensor([normal]), to_camera, light)[0, 0])
+    return float(shade(torch.full((1, 3), albedo), torch.tensor([normal]), to_camera, torch.ones(1), light)[0, 0])
 
 
 def test_shade_against_the_formula() -> None:
