@@ -1,9 +1,10 @@
 """Presets over captures: accuracy against seconds, as a chart and as tables.
 
-python -m data_tools.chart [CAPTURE ...] [--presets instant default --seeds 0 1 --out runs/chart]
+python -m data_tools.chart [CAPTURE ...] [--presets instant ihm --steps ihm=600 --seeds 0 1 --out runs/chart]
 
 Every combination is a run folder below OUT, so an interrupted sweep goes on where it was; the stage that was cut starts
-from its beginning, because its seconds are what the chart is about. OUT then holds `chart.svg`, `chart.png`,
+from its beginning, because its seconds are what the chart is about. What the first stages of two runs have in common is
+computed once and copied; its seconds count for both. OUT then holds `chart.svg`, `chart.png`,
 `chart.csv` (a line a run) and `anytime.csv` (the field's scores while it learnt).
 """
 
@@ -18,6 +19,7 @@ from tqdm import tqdm
 
 from data_tools.chart_figure import PANELS, Point, draw_chart, pareto_front, preset_means, save_chart
 from data_tools.chart_trials import (
+    FIELD,
     PROGRESS_COLUMNS,
     UNTIL_AVATAR,
     Trial,
@@ -45,8 +47,9 @@ def main(argv: Sequence[str]) -> None:
         UserError: a capture or preset is not there, or some runs are not done (the others are drawn all the same).
     """
     options = _parse(argv)
+    steps = _steps_of(options)
     for preset in options.presets:
-        check_options(preset, [])
+        check_options(preset, [f"{FIELD}.steps={steps[preset]}"] if preset in steps else [])
     captures = options.captures or list(BUILT_IN)
     if not options.captures:
         _make_built_in()
@@ -54,9 +57,9 @@ def main(argv: Sequence[str]) -> None:
     if missing:
         raise UserError(f"{missing[0]} does not exist: give synthetic captures, videos or folders of images")
     combinations = product(options.seeds, captures, options.presets)
-    trials = [Trial(capture, preset, seed, options.out) for seed, capture, preset in combinations]
+    trials = [Trial(capture, preset, seed, options.out, steps.get(preset)) for seed, capture, preset in combinations]
     visit = _look_at if options.draw else bring_up_to_date
-    runs = {trial: visit(trial) for trial in track(trials, "runs")}
+    runs = {trial: visit(trial, trials) for trial in track(trials, "runs")}
     write_results(options.out, runs)
     bad = [trial.run_dir.name for trial, run in runs.items() if run.verdict != "done"]
     if bad:
@@ -67,12 +70,15 @@ def main(argv: Sequence[str]) -> None:
     print(f"{len(runs)} runs: {options.out}/chart.svg, chart.png, chart.csv, anytime.csv")
 
 
-def bring_up_to_date(trial: Trial) -> RunState:
-    """Run and compare what is not done yet. One trial at a time: they are timed, so nothing runs beside them."""
+def bring_up_to_date(trial: Trial, others: Sequence[Trial]) -> RunState:
+    """Run and compare what is not done yet. One trial at a time: they are timed, so nothing runs beside them.
+
+    others: what came out the same in their folders is copied, with its seconds.
+    """
     run = read_run(trial.run_dir)
     if run.verdict != "done":
         tqdm.write(f"{trial.run_dir.name}: started, says what it does in {log_path(trial.run_dir)}", file=sys.stderr)
-        run_trial(trial)
+        run_trial(trial, others)
         run = read_run(trial.run_dir)
     if run.verdict == "done":
         compare_with_truth(trial)
@@ -107,12 +113,12 @@ def _fronts(trial: Trial, points: Sequence[Point]) -> str:
     for panel in PANELS:
         means = preset_means([point for point in points if point.capture == trial.capture_name], panel.mesh)
         front = pareto_front(list(means.values()), panel.higher_is_better)
-        if trial.preset_name in [list(means)[index] for index in front]:
+        if trial.label in [list(means)[index] for index in front]:
             on.append(panel.mesh)
     return " ".join(on)
 
 
-def _look_at(trial: Trial) -> RunState:
+def _look_at(trial: Trial, others: Sequence[Trial]) -> RunState:
     return read_run(trial.run_dir)
 
 
@@ -123,11 +129,27 @@ def _make_built_in() -> None:
             make_sample([str(path), "--seed", str(seed)])
 
 
+def _steps_of(options: argparse.Namespace) -> dict[str, int]:
+    """Training steps by preset, of those whose own number is not taken.
+
+    Raises:
+        UserError: an entry names no chosen preset, or no whole number.
+    """
+    steps = {}
+    for entry in options.steps:
+        preset, _, number = entry.rpartition("=")
+        if preset not in options.presets or not number.isdecimal():
+            raise UserError(f"--steps {entry}: give PRESET=N with one of {', '.join(options.presets)}")
+        steps[preset] = int(number)
+    return steps
+
+
 def _parse(argv: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m data_tools.chart", description=(__doc__ or "").splitlines()[0])
     presets = sorted(path.stem for path in CONFIGS.glob("*.yaml") if path.stem != ONLY_FOR_TESTS)
     parser.add_argument("captures", nargs="*", type=Path, help="captures, videos or image folders; two people if none")
     parser.add_argument("--presets", nargs="+", default=presets, help="names in configs/ or .yaml files; all if none")
+    parser.add_argument("--steps", nargs="+", default=[], help="PRESET=N: so many training steps of its field instead")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0], help="seeds of the stages that draw at random")
     parser.add_argument("--out", type=Path, default=Path("runs/chart"), help="where runs, tables and chart are made")
     parser.add_argument("--draw", action="store_true", help="run nothing, draw what is done")

@@ -11,13 +11,16 @@ from typing import Any
 
 import stages
 from data_tools.chart_figure import Point
-from data_tools.runs import SCORES, RunState, log_path, start_run, video_in
+from data_tools.folder import whole_folder
+from data_tools.runs import SCORES, RunState, fresh_stages, log_path, start_run, video_in
 from pipeline.core.cli import default_run_dir
 from pipeline.core.errors import UserError
 from pipeline.core.lock import run_lock
 from pipeline.core.progress import warn
+from pipeline.core.record import RunRecord, update_record
 
-UNTIL_FIELD = ("frames", "body", "field")
+FIELD = "field"
+UNTIL_FIELD = ("frames", "body", FIELD)
 BEFORE_FIELD = UNTIL_FIELD[:-1]
 UNTIL_AVATAR = tuple(name for name in stages.STAGES if name != "report")
 PROGRESS_COLUMNS = ("seconds", "validation_psnr_db", "validation_psnr_body_db")
@@ -25,12 +28,13 @@ PROGRESS_COLUMNS = ("seconds", "validation_psnr_db", "validation_psnr_body_db")
 
 @dataclass(frozen=True)
 class Trial:
-    """What runs, and below which folder."""
+    """What runs, and below which folder. steps: those of the field where they are not the preset's own."""
 
     capture: Path
     preset: str
     seed: int
     out: Path
+    steps: int | None = None
 
     @property
     def capture_name(self) -> str:
@@ -43,23 +47,56 @@ class Trial:
         return Path(self.preset).stem
 
     @property
+    def label(self) -> str:
+        """How the chart calls the preset."""
+        return self.preset_name if self.steps is None else f"{self.preset_name}, {self.steps} steps"
+
+    @property
     def run_dir(self) -> Path:
         """The folder of the run."""
-        return self.out / f"{self.capture_name}-{self.preset_name}-{self.seed}"
+        name = f"{self.capture_name}-{self.preset_name}-{self.seed}"
+        return self.out / (name if self.steps is None else f"{name}-{self.steps}-steps")
+
+    @property
+    def assignments(self) -> list[str]:
+        """What differs from the preset, as `section.key=value`."""
+        seeded = [name for name in stages.STAGES if "seed" in stages.load(name).config.model_fields]
+        seeds = [f"{name}.seed={self.seed}" for name in seeded]
+        return seeds if self.steps is None else [*seeds, f"{FIELD}.steps={self.steps}"]
+
+    @property
+    def record(self) -> RunRecord:
+        """What the run's folder will remember."""
+        record, video = RunRecord(), video_in(self.capture)
+        return update_record(record, self.run_dir, video, self.preset, self.assignments, replace_video=False)
 
 
-def run_trial(trial: Trial) -> None:
+def run_trial(trial: Trial, others: Iterable[Trial] = ()) -> None:
     """Run what is not fresh; a stage that was cut starts from its beginning.
 
-    Gone on with from its checkpoint, it would tell only the seconds after the cut.
+    Gone on with from its checkpoint, it would tell only the seconds after the cut. others: see `share_stages`.
     """
     if trial.run_dir.is_dir():
         with run_lock(trial.run_dir):
             for part in trial.run_dir.glob("*.part"):
                 shutil.rmtree(part)
-    seeded = [name for name in stages.STAGES if "seed" in stages.load(name).config.model_fields]
-    seeds = [word for name in seeded for word in ("--set", f"{name}.seed={trial.seed}")]
-    start_run(trial.run_dir, ["--video", str(video_in(trial.capture)), "--preset", trial.preset, *seeds])
+    share_stages(trial, others)
+    chosen = [word for assignment in trial.assignments for word in ("--set", assignment)]
+    start_run(trial.run_dir, ["--video", str(video_in(trial.capture)), "--preset", trial.preset, *chosen])
+
+
+def share_stages(trial: Trial, others: Iterable[Trial]) -> None:
+    """Copy what would come out the same here from runs of the same capture, stage after stage until one differs.
+
+    The copies keep their manifests: their seconds, machine and commit count here as there.
+    """
+    for other in others:
+        if other.capture != trial.capture or other.run_dir == trial.run_dir:
+            continue
+        for name in fresh_stages(other.run_dir, trial.record):
+            if not (trial.run_dir / name).exists():
+                with whole_folder(trial.run_dir / name) as part:
+                    shutil.copytree(other.run_dir / name, part, dirs_exist_ok=True)
 
 
 def compare_with_truth(trial: Trial) -> None:
@@ -78,7 +115,7 @@ def point_of(trial: Trial, run: RunState) -> Point:
     before = run.seconds(BEFORE_FIELD)
     curve = [(before + seconds, full, body) for seconds, full, body in read_progress(trial.run_dir / "field")]
     seconds = (run.seconds(UNTIL_FIELD), run.seconds(UNTIL_AVATAR))
-    return Point(trial.capture_name, trial.preset_name, trial.seed, *seconds, run.scores, curve)
+    return Point(trial.capture_name, trial.label, trial.seed, *seconds, run.scores, curve)
 
 
 def read_progress(field: Path) -> list[tuple[float, float, float]]:
@@ -100,12 +137,16 @@ def read_progress(field: Path) -> list[tuple[float, float, float]]:
 
 
 def table_row(trial: Trial, run: RunState) -> dict[str, Any]:
-    """One line of chart.csv. `resumed`: stages whose seconds tell only of the time after an interruption."""
+    """One line of chart.csv.
+
+    steps: of the field's training. resumed: stages whose seconds tell only of the time after an interruption.
+    """
     environments = [manifest.environment for manifest in run.manifests.values()]
     return {
         "capture": trial.capture_name,
         "preset": trial.preset_name,
         "seed": trial.seed,
+        "steps": run.manifests[FIELD].config.get("steps") if FIELD in run.manifests else None,
         "status": run.verdict,
         "field_seconds": round(run.seconds(UNTIL_FIELD), 3),
         "seconds": round(run.seconds(UNTIL_AVATAR), 3),

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +76,12 @@ def read_run(run_dir: Path) -> RunState:
     manifests = {name: manifest for name, manifest in found.items() if manifest}
     is_done = len(manifests) == len(states)
     return RunState(states, manifests, read_scores(run_dir / "report") if is_done else {}, failure)
+
+
+def fresh_stages(run_dir: Path, record: RunRecord) -> list[str]:
+    """The first stages of a folder, in order, that a run with this record would take over as they are."""
+    states = stage_states(_load_stages(), _configs(record), run_dir, record)
+    return list(takewhile(lambda name: states[name] == FRESH, states))
 
 
 def video_in(path: Path) -> Path:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from data_tools.chart import main as chart
 from data_tools.chart import origin, write_results
 from data_tools.chart_trials import Trial, point_of, read_progress, table_row
 from data_tools.runs import RunState
@@ -61,6 +62,36 @@ def test_a_killed_sweep_goes_on_and_times_the_cut_stage_from_its_start(sweep: To
     assert all(row["commit"] and "cores" in row["machine"] for row in table)
     assert float(table[0]["seconds"]) > 2.9  # the toy's long step
     assert not table[1]["resumed"]
+
+
+def test_what_two_runs_have_in_common_is_computed_once(sweep: Toy) -> None:
+    """Both read the same numbers; what they learn differs. A seed or option that reaches a stage keeps it apart."""
+    done = sweep.call(*SWEEP)
+    assert done.returncode == 0, done.stderr
+    quick, default = (sweep.folder / "runs" / "chart" / f"numbers-{preset}-0" for preset in ("quick", "default"))
+    assert (quick / "read" / "manifest.json").read_bytes() == (default / "read" / "manifest.json").read_bytes()
+    assert (quick / "learn" / "manifest.json").read_bytes() != (default / "learn" / "manifest.json").read_bytes()
+    assert not list(default.glob("*.part"))
+    assert "read: cached" in (default.parent / f"{default.name}.log").read_text()
+
+
+def test_fewer_steps_are_said_everywhere(tmp_path: Path) -> None:
+    own, fewer = (Trial(tmp_path / "ann", "ihm", 2, tmp_path, steps) for steps in (None, 600))
+    assert (own.label, fewer.label) == ("ihm", "ihm, 600 steps")
+    assert own.run_dir != fewer.run_dir
+    assert set(fewer.assignments) - set(own.assignments) == {"field.steps=600"}
+    run = finished(10.0, SCORES)
+    run.manifests["field"].config["steps"] = 600
+    assert point_of(fewer, run).preset == "ihm, 600 steps"
+    assert table_row(fewer, run)["steps"] == 600
+    write_results(tmp_path, {fewer: run})
+    assert "ihm, 600 steps" in (tmp_path / "chart.svg").read_text()
+
+
+@pytest.mark.parametrize("entry", ["ihm=600", "default", "default=many", "default=-3"])
+def test_steps_for_no_preset_are_refused(entry: str) -> None:
+    with pytest.raises(UserError, match=r"--steps .*: give PRESET=N with one of default"):
+        chart(["none.mp4", "--presets", "default", "--steps", entry])
 
 
 def test_a_failed_run_stops_no_other(sweep: Toy) -> None:
