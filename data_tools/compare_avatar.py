@@ -15,12 +15,15 @@ from torch import Tensor
 
 from data_tools.capture import Capture
 from data_tools.renderer import pose_vertices, render_subject
+from data_tools.retarget import carried_rotations, local_rotations
 from data_tools.truth import load_truth
 from pipeline.avatar.body import Body, Motion, canonical_to_world
 from pipeline.avatar.selection import HELDOUT, TRAIN
 from pipeline.core.progress import track
 from pipeline.geometry.camera import Camera, world_to_camera_points
 from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.rotation import quaternion_to_matrix
+from pipeline.geometry.skinning import forward_kinematics
 from pipeline.geometry.surface import closest_on_mesh
 from pipeline.geometry.textured import sample_texture
 from pipeline.io.avatar import FinishedRun, load_finished_run
@@ -61,9 +64,17 @@ class Comparison:
     folder: Path
 
     @cached_property
+    def rest(self) -> Mesh:
+        """The avatar in the true rig's A-pose."""
+        body, joints = self.truth.subject.body, len(self.truth.subject.body.joint_names)
+        still = np.tile(np.array([1.0, 0.0, 0.0, 0.0], dtype=np.float32), (1, joints, 1))
+        motion = Motion(np.zeros(1, np.int32), np.zeros(1), still, body.joints_m[:1])
+        return acted(self, motion)[0]
+
+    @cached_property
     def alignment(self) -> Similarity:
-        """What lays the avatar's A-pose over the true one."""
-        return align_surfaces(self.run.avatar.mesh(), self.truth.subject.body.mesh())
+        """What lays the avatar over the truth in the true rig's A-pose."""
+        return align_surfaces(self.rest, self.truth.subject.body.mesh())
 
     def true_surface(self, pose: Float[Tensor, "j 4 4"]) -> Mesh:
         """The clothed person in one pose."""
@@ -85,8 +96,8 @@ def load_comparison(out: Path, run: Path) -> Comparison:
 
 
 def compare_shape(pair: Comparison) -> dict[str, float]:
-    """The surfaces in the A-pose that both rigs call their rest."""
-    return _aligned_scores(pair.run.avatar.mesh(), pair.truth.subject.body.mesh(), pair.alignment)
+    """The surfaces in the true rig's A-pose."""
+    return _aligned_scores(pair.rest, pair.truth.subject.body.mesh(), pair.alignment)
 
 
 def compare_filmed(pair: Comparison) -> dict[str, float]:
@@ -127,13 +138,15 @@ def compare_novel_views(pair: Comparison) -> list[Pair]:
 
 
 def compare_texture(pair: Comparison, seed: int = 0) -> dict[str, float]:
-    """Colours at points spread evenly over the avatar against the true texture at the nearest place, both in A-pose.
+    """Colours at points spread evenly over the avatar against the true texture at the nearest place.
+
+    Both stand in the true rig's A-pose.
 
     Returns:
         coverage: share of the surface that the video showed. colour_error: mean absolute difference there, of 255.
         balanced_colour_error: after one gain a channel, because the light of the video is in the texture.
     """
-    avatar, true = pair.run.avatar.mesh(), pair.truth.subject.body.mesh()
+    avatar, true = pair.rest, pair.truth.subject.body.mesh()
     points, _ = sample_surface(avatar, SURFACE_POINTS, seed)
     uv = _uv_at(points, avatar, pair.run.avatar.uv, pair.run.avatar.faces_uv.numpy())
     seen = sample_texture(torch.from_numpy(pair.coverage)[..., None], uv)[:, 0].numpy() > 0.5
@@ -228,13 +241,17 @@ def _into_fitted_world(
 
 
 def taken_over(body: Body, actor: Body, motion: Motion) -> Motion:
-    """The actor's motion for another rig: local rotations by the joint's name, none for joints that the actor lacks."""
-    rotations = np.zeros((len(motion.frame_index), len(body.joint_names), 4), dtype=np.float32)
-    rotations[..., 0] = 1.0
-    for joint, name in enumerate(body.joint_names):
-        if name in actor.joint_names:
-            rotations[:, joint] = motion.rotations_wxyz[:, actor.joint(name)]
-    return motion.with_pose(rotations, motion.root_translation_m)
+    """The actor's motion for another rig: limbs point where the actor's do, whatever A-pose each rig calls its rest.
+
+    Joints are matched by name; those that the actor lacks follow their parent.
+    """
+    source = {name: actor.joint(name) for name in body.joint_names if name in actor.joint_names}
+    local = quaternion_to_matrix(torch.from_numpy(motion.rotations_wxyz).double())
+    places = torch.from_numpy(actor.joints_m).double()
+    world = forward_kinematics(local, torch.from_numpy(motion.root_translation_m).double(), places, actor.parents)
+    reference = (np.tile(np.eye(3), (len(places), 1, 1)), places.numpy())
+    rotations = carried_rotations(body, source, world[..., :3, :3].numpy(), reference, np.eye(3))
+    return motion.with_pose(local_rotations(rotations, body.parents), motion.root_translation_m)
 
 
 def acted(pair: Comparison, motion: Motion) -> list[Mesh]:

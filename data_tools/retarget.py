@@ -61,17 +61,14 @@ def retarget(recording: Recording, body: Body, ground_m: Float[np.ndarray, "3"],
     reference = _reference_pose(recording, body, source, world, positions)
     motion_to_world = _basis(positions, source).mean(axis=0)
     motion_to_world = _upright(motion_to_world, _basis(positions[:1], source)[0])
-    rotations = _world_rotations(body, source, world, reference, motion_to_world)
-    local = rotations.copy()
-    for joint, parent in enumerate(body.parents):
-        if parent >= 0:
-            local[:, joint] = rotations[:, parent].transpose(0, 2, 1) @ rotations[:, joint]
+    rotations = carried_rotations(body, source, world, reference, motion_to_world)
+    local = local_rotations(rotations, body.parents)
     root = _root_path(recording, body, source, motion_to_world, ground_m, in_place)
     count = len(local)
     motion = Motion(
         np.arange(count, dtype=np.int32),
         np.arange(count) / recording.fps,
-        matrix_to_quaternion(torch.from_numpy(local)).numpy().astype(np.float32),
+        local,
         root.astype(np.float32),
     )
     lowest_m = above_rest_m(body, motion)
@@ -176,14 +173,27 @@ def _reference_pose(
     return worlds[best].transpose(0, 2, 1) @ to_canonical[best].T, places[best]
 
 
-def _world_rotations(
+def local_rotations(world: Float[np.ndarray, "n j 3 3"], parents: np.ndarray) -> Float[np.ndarray, "n j 4"]:
+    """Quaternions (wxyz) of joints relative to their parents."""
+    local = world.copy()
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            local[:, joint] = world[:, parent].transpose(0, 2, 1) @ world[:, joint]
+    return matrix_to_quaternion(torch.from_numpy(local)).numpy().astype(np.float32)
+
+
+def carried_rotations(
     body: Body,
     source: dict[str, int],
     world: Float[np.ndarray, "n s 3 3"],
     reference: tuple[np.ndarray, np.ndarray],
     motion_to_world: Float[np.ndarray, "3 3"],
 ) -> Float[np.ndarray, "n j 3 3"]:
-    """World rotation of each of the body's joints; joints without a recorded one follow their parent."""
+    """World rotation of each of the body's joints; joints without a recorded one follow their parent.
+
+    source: row of `world` for each joint that has one. reference: what undoes the reference pose's rotations, and where
+    the recorded joints lie in it, canonical axes.
+    """
     undo, places = reference
     bones = _bones(body.joint_names, source)
     rotations = np.tile(np.eye(3), (len(world), len(body.joint_names), 1, 1))

@@ -11,8 +11,8 @@ from data_tools.truth import load_truth
 from pipeline.avatar.body import Motion, canonical_to_world
 from pipeline.avatar.selection import split_of
 from pipeline.avatar.textured import TexturedAvatar, straight_rgba
-from pipeline.geometry.rotation import axis_angle_to_quaternion, quaternion_multiply
-from pipeline.geometry.skinning import top_k_weights
+from pipeline.geometry.rotation import axis_angle_to_matrix, axis_angle_to_quaternion, quaternion_multiply
+from pipeline.geometry.skinning import forward_kinematics, skinning_transforms, top_k_weights
 from pipeline.io.avatar import FinishedRun
 from pipeline.io.capture import Capture, image_path, mask_path
 from pipeline.io.image import write_gray, write_rgb
@@ -86,6 +86,18 @@ def shrunk(pair: Comparison, factor: float) -> Comparison:
     avatar = replace(run.avatar, vertices=run.avatar.vertices * factor)
     nearer = run.motion.with_pose(run.motion.rotations_wxyz, run.motion.root_translation_m * factor)
     return with_motion(replace(pair, run=replace(run, body=body, avatar=avatar)), nearer)
+
+
+def resting_otherwise(pair: Comparison, angle_rad: float) -> Comparison:
+    """The same run on a rig whose A-pose has the left arm raised by an angle."""
+    body, avatar = pair.run.body, pair.run.avatar
+    turn = torch.eye(3).repeat(1, len(body.joint_names), 1, 1)
+    turn[0, body.joint("LeftArm")] = axis_angle_to_matrix(torch.tensor([0.0, 0.0, angle_rad]))
+    joints_m = torch.from_numpy(body.joints_m)
+    joint_to_world = forward_kinematics(turn, joints_m[:1], joints_m, body.parents)
+    raised = avatar.posed(skinning_transforms(joint_to_world, joints_m)[0])
+    rig = replace(body, joints_m=joint_to_world[0, :, :3, 3].numpy(), vertices=raised.numpy())
+    return replace(pair, run=replace(pair.run, body=rig, avatar=replace(avatar, vertices=raised)))
 
 
 def bent_arm(pair: Comparison, frames: np.ndarray, angle_rad: float) -> Motion:

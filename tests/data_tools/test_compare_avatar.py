@@ -20,7 +20,7 @@ from data_tools.compare_avatar import (
 )
 from pipeline.avatar.body import Body
 from pipeline.metrics.images import mean_scores
-from tests.data_tools.finished import bent_arm, perfect_run, shrunk, with_motion
+from tests.data_tools.finished import bent_arm, perfect_run, resting_otherwise, shrunk, with_motion
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +54,18 @@ def test_a_motion_that_was_never_filmed(perfect: Comparison) -> None:
     assert scores["chamfer_mm"] < 1.0
     assert len(pictures) == 2
     assert min(picture.scores()["mask_iou"] for picture in pictures) > 0.97
+
+
+def test_another_a_pose_is_no_error(perfect: Comparison) -> None:
+    """A rig that rests with a raised arm (as those of other makers do) is compared in the true rig's A-pose.
+
+    Blending twice squeezes the shoulder by some millimetres; left as it rests, the hand is 20 cm away.
+    """
+    other = resting_otherwise(perfect, 0.35)
+    assert compare_shape(other)["chamfer_mm"] < 1.0
+    assert compare_shape(other)["hausdorff95_mm"] < 4.0
+    assert compare_novel_poses(other)[0]["chamfer_mm"] < 1.5
+    assert compare_texture(other)["colour_error"] < 2.0
 
 
 def test_cameras_that_never_filmed(perfect: Comparison) -> None:
@@ -106,5 +118,5 @@ def test_rotations_go_by_name(bare: Body, perfect: Comparison) -> None:
     renamed = replace(bare, joint_names=tuple("Tail" if name == "Head" else name for name in bare.joint_names))
     taken = taken_over(renamed, perfect.truth.subject.body, motion)
     head, arm = renamed.joint("Tail"), renamed.joint("LeftArm")
-    assert taken.rotations_wxyz[:, head].tolist() == [[1.0, 0.0, 0.0, 0.0]] * len(motion.frame_index)
-    assert np.array_equal(taken.rotations_wxyz[:, arm], motion.rotations_wxyz[:, arm])
+    assert np.allclose(taken.rotations_wxyz[:, head], [1.0, 0.0, 0.0, 0.0], atol=1e-6)
+    assert np.allclose(np.abs(taken.rotations_wxyz[:, arm]), np.abs(motion.rotations_wxyz[:, arm]), atol=1e-5)
