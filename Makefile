@@ -24,8 +24,9 @@ CAPTURES ?=
 PRESETS ?=
 SEEDS ?=
 
-# Where bench-field writes its figures.
+# Where bench-field writes its figures, and the run of another preset that RUN is compared with.
 JSON ?=
+BASELINE ?=
 
 TORCH_VERSION := 2.13.0
 GLTF_VALIDATOR_VERSION := 2.0.0-dev.3.10
@@ -99,7 +100,7 @@ bench: $(STAMP)  ## measure the speed of the kernels; the machine should do noth
 
 bench-field: $(STAMP)  ## each part of a training step beside its floor: RUN=runs/name or a painted body; JSON=file
 	$(RUN_PYTHON) -m tests.bench.bench_field $(if $(RUN),--run "$(RUN)") $(if $(PRESET),--preset $(PRESET)) \
-		$(if $(JSON),--json "$(JSON)") $(ARGS)
+		$(if $(BASELINE),--baseline "$(BASELINE)") $(if $(JSON),--json "$(JSON)") $(ARGS)
 
 doctor:  ## what this machine lacks, and the command that mends it
 	@$(PYTHON) -m pipeline.core.doctor

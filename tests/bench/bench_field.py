@@ -1,6 +1,8 @@
 """Where the time of a training step of stage one goes, beside the least that this machine could need for it.
 
-    python -m tests.bench.bench_field [--run runs/x] [--preset default] [--steps 80] [--json out.json]
+    python -m tests.bench.bench_field [--run runs/x] [--baseline runs/y] [--preset default] [--json out.json]
+
+What finished runs say of quality is added: see `tests.bench.quality`.
 
 The step is that of a finished run's frames and body, or of a painted body. Warm-up steps come first, until poses are
 refined and cells that stay empty have been given up. Poses move and the occupancy is updated only every few steps:
@@ -56,12 +58,14 @@ from pipeline.avatar.prepare import spread, start_learning, training_scale
 from pipeline.avatar.train import LOOK_EVERYWHERE, Learning
 from pipeline.core.config import build, load_layers
 from pipeline.core.errors import UserError
+from pipeline.core.progress import warn
 from pipeline.io.capture import load_capture
 from pipeline.io.npz import load_body, load_camera, load_motion
 from stages.field import read_picture
 from tests.avatar.scene import painted_scene
 from tests.bench.machine import append_row, circumstances, gather_mrow_s, memory_gb_s, multiply_gflop_s
 from tests.bench.parts import OTHER, UPDATE, Clock, watched
+from tests.bench.quality import quality
 
 PARTS = ("draw", "march", "place", "encode_forward", "network_forward", "composite", "losses", "network_backward")
 PARTS += (
@@ -221,6 +225,7 @@ def main(argv: Sequence[str]) -> None:
     """Measure, print, write."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--run", type=Path, help="a finished run; without it a painted body")
+    parser.add_argument("--baseline", type=Path, help="a finished run of another preset on the same video")
     parser.add_argument("--preset", default="default", help="whose options of the field are taken")
     parser.add_argument("--warm-up", type=int, help="steps before the first that is measured")
     parser.add_argument("--steps", type=int, default=80, help="steps that are measured")
@@ -230,18 +235,22 @@ def main(argv: Sequence[str]) -> None:
     config = build("field", FieldConfig, load_layers(options.preset, {}))
     if config.network != "hashgrid":
         raise UserError(f"preset {options.preset} has no hash grid, whose floors these are; take PRESET=default")
+    gained, reasons = quality(options.run, options.baseline)
     warm_up = settled(config) if options.warm_up is None else options.warm_up
     clock = Clock()
     with watched(clock):
         learning = begin_run(options.run, config) if options.run else begin_painted(config)
         figures = measure(learning, clock, warm_up, options.steps, options.repeats)
+    for reason in reasons:
+        warn(reason)
     capture = str(options.run or "painted")
     about = {"preset": options.preset, "capture": capture, "warm_up": warm_up, "steps": options.steps}
+    found = about | figures | gained
     print(table(figures))
-    print(", ".join(f"{name} {value}" for name, value in (circumstances() | about).items()))
-    print(f"samples a step {figures['samples']:.0f}; row appended to {append_row('field', about | figures)}")
+    print(", ".join(f"{name} {value}" for name, value in (circumstances() | about | gained).items()))
+    print(f"samples a step {figures['samples']:.0f}; row appended to {append_row('field', found)}")
     if options.json:
-        options.json.write_text(json.dumps(circumstances() | about | figures, indent=2) + "\n", encoding="utf-8")
+        options.json.write_text(json.dumps(circumstances() | found, indent=2) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

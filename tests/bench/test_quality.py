@@ -1,0 +1,71 @@
+"""Closed forms on made-up runs: when a curve reaches another's end, what is gained, and what cannot be told."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pipeline.core.errors import UserError
+from pipeline.core.manifest import Manifest, write_manifest
+from tests.bench.quality import quality, speedup
+
+SLOW = [(100.0, 25.0, 18.0), (400.0, 29.0, 21.0), (1000.0, 30.0, 22.0)]
+QUICK = [(10.0, 24.0, 17.0), (20.0, 29.89, 21.9), (25.0, 29.9, 21.9), (40.0, 31.0, 23.0)]
+
+
+def finished_run(folder: Path, curve: list[tuple[float, float, float]], held_out_db: float | None, video: str) -> Path:
+    place = Manifest("", 1, "", {}, {"video": video}, {}, {}, 45.5, 100.0)
+    for stage in ("frames", "field", "report"):
+        (folder / stage).mkdir(parents=True)
+        write_manifest(replace(place, stage=stage), folder / stage / "manifest.json")
+    lines = ["step,seconds,validation_psnr_db,validation_psnr_body_db"]
+    lines += [f"{step},{seconds},{full},{body}" for step, (seconds, full, body) in enumerate(curve)]
+    (folder / "field" / "progress.csv").write_text("\n".join(lines) + "\n")
+    (folder / "report" / "report.json").write_text(json.dumps({"heldout": {"field": {"psnr_full": held_out_db}}}))
+    return folder
+
+
+def test_a_tenth_of_a_decibel_below_the_end_is_as_good() -> None:
+    """30.0 dB are reached within 0.1 dB after 25 s, not yet after 20 s: 1000 / 25."""
+    assert speedup(QUICK, SLOW) == (40.0, "")
+
+
+def test_a_run_that_falls_again_counts_from_where_it_was_good() -> None:
+    assert speedup([(5.0, 30.5, 20.0), (50.0, 20.0, 10.0)], SLOW) == (200.0, "")
+
+
+def test_what_is_never_reached_is_said() -> None:
+    factor, reason = speedup(SLOW, QUICK)
+    assert factor is None
+    assert "never reaches the baseline's 31.00 dB - 0.1 dB: 30.00 dB at best" in reason
+    assert speedup([], SLOW)[0] is None
+
+
+def test_two_runs(tmp_path: Path) -> None:
+    run, baseline = finished_run(tmp_path / "a", QUICK, 30.75, "x"), finished_run(tmp_path / "b", SLOW, 30.5, "x")
+    figures, reasons = quality(run, baseline)
+    assert figures == {"field_seconds": 45.5, "speedup_to_quality": 40.0, "psnr_gain_db": 0.25}
+    assert reasons == []
+
+
+def test_what_is_not_given_is_null_with_a_reason(tmp_path: Path) -> None:
+    run = finished_run(tmp_path / "a", QUICK, None, "x")
+    assert quality(None, None) == (
+        dict.fromkeys(("field_seconds", "speedup_to_quality", "psnr_gain_db")),
+        ["no RUN is given: its field's seconds, speedup and gain are unknown"],
+    )
+    figures, (reason,) = quality(run, None)
+    assert (figures["field_seconds"], figures["speedup_to_quality"], figures["psnr_gain_db"]) == (45.5, None, None)
+    assert "no BASELINE" in reason
+    unscored, (reason,) = quality(run, finished_run(tmp_path / "b", SLOW, 30.5, "x"))
+    assert unscored["psnr_gain_db"] is None
+    assert "report is not finished" in reason
+
+
+def test_runs_of_two_videos_are_refused(tmp_path: Path) -> None:
+    run, other = finished_run(tmp_path / "a", QUICK, 30.0, "x"), finished_run(tmp_path / "b", SLOW, 30.0, "y")
+    with pytest.raises(UserError, match="not of the same video"):
+        quality(run, other)
+    with pytest.raises(UserError, match="has no finished field"):
+        quality(tmp_path, None)
