@@ -143,7 +143,7 @@ def overlay(
 
 STAGE = Stage(
     "body",
-    version=2,
+    version=3,
     needs=("frames",),
     makes=(_BODY, _MOTION, _CAMERA, _SCORES, _OVERLAY),
     config=Config,

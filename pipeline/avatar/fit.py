@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pipeline.avatar.body import Body, ParametricBody
+from pipeline.avatar.fit_floor import Contact, floor_contact
 from pipeline.avatar.fit_init import initial_state, interpolated_state, torso_found
 from pipeline.avatar.fit_landmarks import LandmarkRegressor, landmark_regressor
 from pipeline.avatar.fit_model import FitModel, linearise, pose_points, pose_skeleton
@@ -185,7 +186,8 @@ def _fit_poses(
     state, _ = _minimised(tools, model, observations, landmarks_only, state, OUTLINE_STEPS)
     motion = None
     for _ in track(range(POSE_ROUNDS), "poses"):
-        state, _, _ = _outline_round(tools, model, observations, windows, weights, state, motion)
+        contact = floor_contact(model, state.rotations, state.root_m, observations.confidence, observations.time_s)
+        state, _, _ = _outline_round(tools, model, observations, windows, weights, state, motion, contact)
         place = place_of_root(state.root_m, observations.camera)
         motion = observed_motion(state.rotations, place, observations.time_s)
     _, overlap = match_all(model, state, observations, windows)
@@ -200,6 +202,7 @@ def _outline_round(
     weights: Weights,
     state: FitState,
     motion: Float[Tensor, "p"] | None = None,
+    contact: Contact | None = None,
 ) -> tuple[FitState, NormalEquations, Float[np.ndarray, "n"]]:
     """Pair outlines for the body as it stands, then move it."""
     contour, overlap = match_all(model, state, observations, windows)
@@ -213,6 +216,7 @@ def _outline_round(
         image_scale(state, observations.camera),
         contour,
         motion,
+        contact,
     )
     state, system = minimise(state, objective, objective.retract, OUTLINE_STEPS)
     return state, system, overlap

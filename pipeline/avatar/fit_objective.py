@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pipeline.avatar.fit_floor import Contact, add_contact
 from pipeline.avatar.fit_landmarks import OFFSET_COUNT, LandmarkRegressor, landmark_noise
 from pipeline.avatar.fit_model import (
     ACTIVE_JOINTS,
@@ -32,7 +33,7 @@ from pipeline.avatar.fit_priors import (
     pose_residuals,
     usual_motion,
 )
-from pipeline.avatar.fit_solver import NormalEquations
+from pipeline.avatar.fit_solver import NormalEquations, robust_weights
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.rotation import axis_angle_to_matrix
 
@@ -139,7 +140,8 @@ class Objective:
     """All terms at hand; call it with a state.
 
     `px_per_m` is the image scale at each frame's person, held fixed while the state moves. `motion` are standard
-    deviations of `motion_residuals`; None: `usual_motion`, which fast people need.
+    deviations of `motion_residuals`; None: `usual_motion`, which fast people need. `contact` needs all that is
+    shared to be fixed.
     """
 
     model: FitModel
@@ -151,6 +153,7 @@ class Objective:
     px_per_m: Float[Tensor, "n"]
     contour: Contour | None = None
     motion: Float[Tensor, "p"] | None = None
+    contact: Contact | None = None
 
     def __call__(self, state: FitState) -> NormalEquations:
         """The normal equations of all terms at a state."""
@@ -163,6 +166,8 @@ class Objective:
         self._add_landmarks(system, model, skeleton, state)
         if self.contour is not None:
             self._add_contour(system, model, skeleton, state, self.contour)
+        if self.contact is not None:
+            add_contact(system, model, skeleton, state.root_m, self.observations.camera, self.contact)
         self._add_pose(system, state)
         self._add_motion(system, state)
         if shared:
@@ -193,7 +198,7 @@ class Objective:
         confidence = seen.confidence * facing
         inverse = confidence.sqrt() / (weights.landmark_m * noise * self.px_per_m[:, None])
         residual = (pixels - seen.landmarks_px) * inverse[..., None]
-        weight = _robust(system, residual.square().sum(-1), weights.landmark_cutoff)
+        weight = robust_weights(system, residual.square().sum(-1), weights.landmark_cutoff)
         by_place = root_by_place(state.root_m, seen.camera)
         for axis in range(2):
             covector = covectors[:, :, axis] * inverse[..., None]
@@ -221,7 +226,7 @@ class Objective:
         inverse = confidence.sqrt()[..., None] / deviation
         scale = direction_scale(relative, found, inverse, cutoff)
         residual = (scale * relative - found) * inverse
-        weight = _robust(system, residual.square().sum(-1), cutoff)
+        weight = robust_weights(system, residual.square().sum(-1), cutoff)
         by_place = torch.zeros(len(world), 3, 3, dtype=torch.float64)  # hips and landmarks move together
         for axis in range(3):
             covector = (scale[axis] * to_camera[axis]).expand_as(world)
@@ -240,7 +245,7 @@ class Objective:
         pixels, covectors = project_with_covectors(world, seen.camera, state.focal_log)
         inverse = 1.0 / (self.px_per_m[:, None] * self.weights.contour_m)
         residual = ((pixels - contour.target_px) * contour.normal).sum(-1) * inverse
-        weight = contour.weight * _robust(system, residual.square(), self.weights.contour_cutoff, contour.weight)
+        weight = contour.weight * robust_weights(system, residual.square(), self.weights.contour_cutoff, contour.weight)
         covector = (covectors * contour.normal[..., None]).sum(2) * inverse[..., None]
         centred = pixels - pixels.new_tensor(_centre(seen.camera))
         by_focal = (centred * contour.normal).sum(-1) * inverse
@@ -281,7 +286,7 @@ class Objective:
         residual = motion_residuals(state.rotations, place_of_root(state.root_m, self.observations.camera), time_s)
         deviation = usual_motion(state.rotations.shape[1]) if self.motion is None else self.motion
         residual = residual / (weights.motion * deviation)
-        weight = _robust(system, residual.square(), weights.motion_cutoff)
+        weight = robust_weights(system, residual.square(), weights.motion_cutoff)
         before, after, scale = (factor[:, None] for factor in interval_factors(time_s))
         factors = (before * scale / deviation, -(before + after) * scale / deviation, after * scale / deviation)
         diagonal = torch.diagonal(system.frame, dim1=1, dim2=2)
@@ -367,13 +372,6 @@ def direction_scale(
         squared = ((scale * relative_m - directions_m) * inverse).square().sum(-1)
         weight = inverse.square() * ((1.0 + squared / cutoff**2) ** -2)[..., None]
     return scale
-
-
-def _robust(system: NormalEquations, squared: Tensor, cutoff: float, share: Tensor | float = 1.0) -> Tensor:
-    """Geman-McClure weights rho'(r) for squared residuals; their cost is added to the system."""
-    relative = 1.0 + squared / cutoff**2
-    system.cost += float((share * squared / relative).sum())
-    return relative**-2
 
 
 def image_scale(state: FitState, camera: Camera) -> Float[Tensor, "n"]:

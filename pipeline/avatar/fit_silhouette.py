@@ -27,7 +27,7 @@ PERSON_ROWS = 240
 POINTS_PER_SIDE = 120
 """Pairs a frame from the body's outline, and as many from the mask's."""
 
-FRAME_SHARE = 60.0
+FRAME_SHARE = 40.0
 """What all pairs of a frame weigh together: outline points next to each other err alike."""
 
 REACH = 0.10

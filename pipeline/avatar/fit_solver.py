@@ -75,6 +75,15 @@ class NormalEquations:
         self.shared_gradient[~free] = 0.0
 
 
+def robust_weights(
+    system: NormalEquations, squared: Float[Tensor, "*n"], cutoff: float, share: Float[Tensor, "*n"] | float = 1.0
+) -> Float[Tensor, "*n"]:
+    """Geman-McClure weights rho'(r) for squared residuals; their cost is added to the system."""
+    relative = 1.0 + squared / cutoff**2
+    system.cost += float((share * squared / relative).sum())
+    return relative**-2
+
+
 def _banded_factor(system: NormalEquations, damping: float) -> np.ndarray:
     """Lower banded Cholesky factor of the frames' part, its diagonal raised by the factor 1 + damping."""
     n, p = system.frame_gradient.shape
