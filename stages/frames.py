@@ -148,7 +148,7 @@ def make_capture(sightings: Sightings, chosen: list[int], out: Path, source: Sou
 
 STAGE = Stage(
     "frames",
-    version=2,
+    version=3,
     needs=("video",),
     makes=(FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, CONTACT_SHEET),
     config=Config,

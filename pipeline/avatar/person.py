@@ -2,6 +2,10 @@
 
 Both models ship inside the package, nothing is downloaded. Every frame is looked at on its own (no tracking), so the
 result does not depend on which process saw which frame before.
+
+The first model guesses a square around the person, the second finds landmarks and mask in it. A square that is guessed
+too small cuts off feet and pushes all landmarks up, so a mask that runs over its square is looked at again in the one
+that the landmarks ask for.
 """
 
 import os
@@ -9,6 +13,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -33,6 +38,47 @@ _SEPARATE_OVERLAP = 0.2
 _SURE_TORSO_VISIBILITY = 0.9
 _SAME_SIZE = 0.3
 
+_FULL_GRAPH = "mediapipe/modules/pose_landmark/pose_landmark_cpu.binarypb"
+_OUTPUTS = ("pose_landmarks", "pose_world_landmarks", "segmentation_mask", "pose_rect_from_landmarks")
+# The part of that graph that comes after the guess of the square.
+_IN_SQUARE_GRAPH = """
+input_stream: "image"
+input_stream: "square"
+input_side_packet: "model_complexity"
+input_side_packet: "enable_segmentation"
+output_stream: "pose_landmarks"
+output_stream: "pose_world_landmarks"
+output_stream: "segmentation_mask"
+output_stream: "pose_rect_from_landmarks"
+node {
+  calculator: "PoseLandmarkByRoiCpu"
+  input_side_packet: "MODEL_COMPLEXITY:model_complexity"
+  input_side_packet: "ENABLE_SEGMENTATION:enable_segmentation"
+  input_stream: "IMAGE:image"
+  input_stream: "ROI:square"
+  output_stream: "LANDMARKS:pose_landmarks"
+  output_stream: "AUXILIARY_LANDMARKS:auxiliary_landmarks"
+  output_stream: "WORLD_LANDMARKS:pose_world_landmarks"
+  output_stream: "SEGMENTATION_MASK:mask_image"
+}
+node { calculator: "ImagePropertiesCalculator" input_stream: "IMAGE_CPU:image" output_stream: "SIZE:image_size" }
+node {
+  calculator: "PoseLandmarksToRoi"
+  input_stream: "LANDMARKS:auxiliary_landmarks"
+  input_stream: "IMAGE_SIZE:image_size"
+  output_stream: "ROI:pose_rect_from_landmarks"
+}
+node {
+  calculator: "FromImageCalculator"
+  input_stream: "IMAGE:mask_image"
+  output_stream: "IMAGE_CPU:segmentation_mask"
+}
+"""
+_MODEL = {"model_complexity": 1, "enable_segmentation": True}
+# Looks at one image at most; the square grows by 10 to 20 % a look.
+_MOST_LOOKS = 3
+_CELLS_PER_SQUARE = 256
+
 
 @dataclass(frozen=True)
 class Detection:
@@ -49,12 +95,16 @@ class PersonDetector:
 
     def __init__(self) -> None:
         with _quiet_stderr():
-            import mediapipe  # here: its import takes seconds and writes to stderr
+            from mediapipe.python.solutions.pose import SolutionBase  # here: takes seconds and writes to stderr
 
-            self._pose = mediapipe.solutions.pose.Pose(
-                static_image_mode=True, model_complexity=1, enable_segmentation=True, min_detection_confidence=0.5
+            no_tracking = {"smooth_landmarks": False, "smooth_segmentation": False, "use_prev_landmarks": False}
+            self._guess_square = SolutionBase(
+                binary_graph_path=_FULL_GRAPH,
+                side_inputs={**_MODEL, **no_tracking},
+                outputs=[*_OUTPUTS, "pose_rect_from_detection"],
             )
-            self._pose.process(np.zeros((64, 64, 3), dtype=np.uint8))
+            self._in_square = SolutionBase(graph_config=_IN_SQUARE_GRAPH, side_inputs=_MODEL)
+            self._guess_square.process(np.zeros((64, 64, 3), dtype=np.uint8))
         self._has_spoken = False
 
     def detect(self, rgb: UInt8[np.ndarray, "h w 3"]) -> Detection | None:
@@ -65,7 +115,7 @@ class PersonDetector:
         1/200 of the person's height, where the model's own grid ends.
         """
         with nullcontext() if self._has_spoken else _quiet_stderr():
-            found = self._pose.process(rgb)
+            found = self._look(rgb)
         if found.pose_landmarks is None or found.segmentation_mask is None:
             return None
         self._has_spoken = True
@@ -76,6 +126,17 @@ class PersonDetector:
         world = np.array([(p.x, p.y, p.z) for p in found.pose_world_landmarks.landmark], np.float32)
         mask = np.rint(np.clip(found.segmentation_mask, 0.0, 1.0) * 255.0).astype(np.uint8)
         return Detection(points[:, :2].copy(), points[:, 2].copy(), world, mask)
+
+    def _look(self, rgb: UInt8[np.ndarray, "h w 3"]) -> Any:
+        """What the graph says about the most prominent person, in a square that holds all of it."""
+        found = self._guess_square.process(rgb)
+        square = found.pose_rect_from_detection
+        for _ in range(_MOST_LOOKS - 1):
+            if found.segmentation_mask is None or not runs_over(found.segmentation_mask > 0.5, square):
+                break
+            square = found.pose_rect_from_landmarks
+            found = self._in_square.process({"image": rgb, "square": square})
+        return found
 
     def count_people(self, rgb: UInt8[np.ndarray, "h w 3"]) -> int:
         """How many people of similar size are in the image.
@@ -94,6 +155,22 @@ class PersonDetector:
                 people.append(mask)
         largest = max((mask.sum() for mask in people), default=0)
         return sum(bool(mask.sum() > _SAME_SIZE * largest) for mask in people)
+
+
+def runs_over(person: Bool[np.ndarray, "h w"], square: Any) -> bool:
+    """True where the person touches the border of a rotated square inside the image.
+
+    square: centre, width and height relative to the image's, rotation in radians (MediaPipe's NormalizedRect).
+    """
+    size = np.array(person.shape[::-1])
+    along = (np.arange(_CELLS_PER_SQUARE) + 0.5) / _CELLS_PER_SQUARE - 0.5
+    edge = np.full_like(along, along[-1])
+    sides = [np.stack(side, axis=1) for side in ((along, edge), (along, -edge), (edge, along), (-edge, along))]
+    cosine, sine = np.cos(square.rotation), np.sin(square.rotation)
+    turned = np.concatenate(sides) * (square.width, square.height) * size @ np.array([[cosine, sine], [-sine, cosine]])
+    pixel = np.floor(turned + size * (square.x_center, square.y_center)).astype(int)
+    column, row = pixel[((pixel >= 0) & (pixel < size)).all(axis=1)].T
+    return bool(person[row, column].any())
 
 
 def legs_in_image(

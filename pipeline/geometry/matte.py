@@ -11,13 +11,16 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from pipeline.geometry.plate import Plate, covered
+
 # The detector's mask is a 256-cell grid over a square 1.25 times as high as the person.
 _CELLS_PER_PERSON = 256 / 1.25
 # In cells: how far the detector's outline may be wrong, and how far away colours are gathered. Widths of 3 / 6 / 9 / 12
 # cells for the latter give IoU 0.983 / 0.985 / 0.985 / 0.984 on the green-screen capture.
 _BAND_CELLS, _COLOUR_CELLS = 3.0, 6.0
-# Standard deviation (of 1) that no colour cloud goes below: video noise. 3 / 5 / 10 of 255: IoU 0.986 / 0.985 / 0.982.
-_COLOUR_NOISE = 4.0 / 255.0
+# Standard deviation (of 1) that no colour cloud goes below: rounding. Colours are averaged over cells before they are
+# gathered, so video noise is small there, and a white coat before a white wall needs every level.
+_COLOUR_NOISE = 1.0 / 255.0
 # How much the detector's word weighs, in the unit of a squared Mahalanobis distance: at its outline, and far from it.
 _PRIOR_AT_EDGE, _PRIOR_CERTAIN = 0.3, 10.0
 _PRIOR_RAMP = 0.2
@@ -29,6 +32,8 @@ _PAINTED_SHARE, _PAINTED_LEVELS = 0.95, 2
 # a white hem before a white wall is lost (synthetic captures: IoU median and worst 0.978, 0.945; with it 0.991, 0.959).
 _SURE = 0.97
 _RIM_PX = 1.0
+# Level of 255 from which the detector sees a trace of the person.
+_TRACE = 25
 # Parts smaller than this share of the person are specks, holes smaller than this share are noise.
 _SPECK_SHARE, _HOLE_SHARE = 0.05, 2e-4
 
@@ -41,25 +46,29 @@ class _Cloud(NamedTuple):
     covariance: Float[np.ndarray, "h w 6"]
 
 
-def sharpen_mask(rgb: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+def sharpen_mask(
+    rgb: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"], plate: Plate | None = None
+) -> Float[np.ndarray, "h w"]:
     """Alpha with the image's own edges from a soft mask (0..255) that is smooth where the image is sharp.
 
     The colours on both sides of the outline are gathered around each pixel (weighted Gaussian clouds); alpha is the
     position of the pixel's colour between them along Fisher's linear discriminant, where clouds that spread in some
     direction count less in it. It is then averaged with the mask, each weighted by how sure it is: the colours by the
     squared distance of the clouds, the mask by its distance from 0.5. Done twice, so that the colours are gathered
-    with the better outline. Only the surroundings of the outline can gain area.
+    with the better outline. Only the surroundings of the outline can gain area. What covers the plate there, where one
+    is given, belongs to the person whatever the rest says.
     """
     if not (mask > 127).any():
         return np.zeros(mask.shape, dtype=np.float32)
-    window = _window(mask > 25, margin_px=round((_BAND_CELLS + 2 * _COLOUR_CELLS) * _cell_px(mask > 127)) + 2)
+    window = _window(mask > _TRACE, margin_px=round((_BAND_CELLS + 2 * _COLOUR_CELLS) * _cell_px(mask > 127)) + 2)
     image = rgb[window].astype(np.float32) / 255.0
     guess = mask[window].astype(np.float32) / 255.0
     cell_px = _cell_px(guess > 0.5)
     reach = _grown(guess > 0.5, _BAND_CELLS * cell_px)
+    certain = np.zeros_like(reach) if plate is None else covered(rgb[window], plate.window(*window), reach)
     alpha = guess
     for _ in range(2):
-        alpha = np.where(reach, _recolour(image, alpha, guess, cell_px), 0.0).astype(np.float32)
+        alpha = np.where(reach, np.maximum(_recolour(image, alpha, guess, cell_px), certain), 0.0).astype(np.float32)
     whole = np.zeros(mask.shape, dtype=np.float32)
     whole[window] = clean_alpha(alpha)
     return whole
@@ -121,6 +130,12 @@ def steady_mask(
             total += weight * masks[time]
             weights += weight
     return np.rint(total / weights).astype(np.uint8)
+
+
+def beyond_doubt_outside(mask: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Where even a soft mask's outermost rim, and half a cell around it, shows no person."""
+    seen = mask > _TRACE
+    return ~_grown(seen, 0.5 * _cell_px(seen)) if seen.any() else ~seen
 
 
 def outline(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

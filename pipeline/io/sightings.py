@@ -13,7 +13,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 from pipeline.avatar.person import PersonDetector
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track
-from pipeline.geometry.matte import sharpen_mask, steady_mask, with_painted_backdrop
+from pipeline.geometry.matte import beyond_doubt_outside, sharpen_mask, steady_mask, with_painted_backdrop
+from pipeline.geometry.plate import Plate, find_plate
 from pipeline.io.capture import IMAGES_FOLDER, MASKS_FOLDER, image_path, mask_path
 from pipeline.io.image import to_uint8, write_gray, write_rgb
 from pipeline.io.supplied import N_LANDMARKS, Supplied
@@ -24,6 +25,8 @@ from pipeline.io.workers import Workers
 _SMALL_SIDE_PX = 320
 # Mask level of 255 from which a pixel counts as the person there.
 _PERSON_LEVEL = 100
+# Most pictures that the empty scene is put together from; they are in memory at the same time.
+_PLATE_PICTURES = 32
 
 
 class _Look(NamedTuple):
@@ -114,6 +117,7 @@ def write_frames(
 
     A supplied mask is written as it is; the detector's is steadied with its neighbours in time and sharpened.
     """
+    plate = None if supplied.read_mask is not None else scene_without_person(source, supplied, sightings, max_side_px)
     for folder in (IMAGES_FOLDER, MASKS_FOLDER):
         (out / folder).mkdir(exist_ok=True)
     wanted = set(positions)
@@ -128,11 +132,20 @@ def write_frames(
                 yield images[centre], supplied_mask(supplied, near[centre]), out, near[centre].index
             else:
                 masks = [sightings.masks_png[p] for p in _neighbours(position, sightings)]
-                yield images, masks, out, near[centre].index, centre, noise
+                yield images, masks, out, near[centre].index, centre, noise, plate
 
     function = _write_supplied if supplied.read_mask is not None else _write_sharpened
     for _ in track(workers.map(function, tasks()), "sharpening masks", total=len(wanted)):
         pass
+
+
+def scene_without_person(source: Source, supplied: Supplied, sightings: Sightings, max_side_px: int) -> Plate:
+    """The empty scene, from pictures that are spread evenly over the recording; masks must come from the detector."""
+    found = np.flatnonzero(sightings.found)
+    taken = found[np.unique(np.linspace(0, len(found) - 1, _PLATE_PICTURES).astype(int))]
+    is_taken = set(sightings.frame_index[taken].tolist()).__contains__
+    images = np.stack([frame.rgb for frame in read_undistorted(source, supplied, is_taken, max_side_px)])
+    return find_plate(images, np.stack([~beyond_doubt_outside(_decoded(sightings.masks_png[p])) for p in taken]))
 
 
 def read_undistorted(
@@ -239,9 +252,14 @@ def _write_sharpened(
     frame_index: int,
     centre: int,
     noise: float,
+    plate: Plate,
 ) -> None:
     """Runs in a worker: the finished mask of one frame."""
-    masks = np.stack([cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) for data in masks_png])
+    masks = np.stack([_decoded(data) for data in masks_png])
     mask = with_painted_backdrop(images[centre], steady_mask(images, masks, centre, noise))
-    alpha = sharpen_mask(images[centre], mask)
+    alpha = sharpen_mask(images[centre], mask, plate)
     _write_supplied(images[centre], to_uint8(alpha), out, frame_index)
+
+
+def _decoded(mask_png: bytes) -> UInt8[np.ndarray, "h w"]:
+    return cv2.imdecode(np.frombuffer(mask_png, np.uint8), cv2.IMREAD_GRAYSCALE)

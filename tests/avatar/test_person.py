@@ -1,5 +1,7 @@
 """The detector on real pictures (one person, two, none), and the rules about legs and crops on numbers."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -69,3 +71,51 @@ def test_crops_cover_the_image_and_stay_inside(height, width):
         assert 0 <= top < bottom <= height
         covered[top:bottom, left:right] += 1
     assert covered.min() >= 1
+
+
+def square(centre_x_px, centre_y_px, side_px, width_px=200, height_px=100, rotation=0.0):
+    """MediaPipe's description of a square."""
+    from mediapipe.framework.formats.rect_pb2 import NormalizedRect
+
+    return NormalizedRect(
+        x_center=centre_x_px / width_px,
+        y_center=centre_y_px / height_px,
+        width=side_px / width_px,
+        height=side_px / height_px,
+        rotation=rotation,
+    )
+
+
+@pytest.mark.parametrize(("right", "over"), [(69, False), (71, True)])
+def test_a_person_runs_over_the_square_when_it_touches_the_border(right, over):
+    mask = np.zeros((100, 200), bool)
+    mask[45:55, 55:right] = True
+    assert person.runs_over(mask, square(60, 50, 20)) == over
+
+
+def test_a_turned_square_has_turned_borders():
+    mask = np.zeros((100, 200), bool)
+    mask[48:52, 73:75] = True
+    assert not person.runs_over(mask, square(60, 50, 20))
+    assert person.runs_over(mask, square(60, 50, 20, rotation=np.pi / 4))
+
+
+def test_a_border_outside_of_the_image_is_not_touched():
+    assert not person.runs_over(np.ones((100, 200), bool), square(100, 50, 300))
+
+
+def test_a_square_that_cuts_off_the_feet_is_left_for_a_larger_one(photograph):
+    """The first model's guess is replaced by one that ends above the ankles."""
+    detector = person.PersonDetector()
+    whole = detector.detect(photograph).mask
+    small = square(315, 270, 430, *photograph.shape[1::-1])
+    cut = detector._in_square.process({"image": photograph, "square": small})
+    said = {name: getattr(cut, name) for name in person._OUTPUTS}
+    wrong_guess = SimpleNamespace(**said, pose_rect_from_detection=small)
+    detector._guess_square = SimpleNamespace(process=lambda _: wrong_guess)
+    mended = detector.detect(photograph).mask
+    lowest_px = [
+        np.flatnonzero(mask.any(axis=1))[-1] for mask in (cut.segmentation_mask > 0.5, mended > 127, whole > 127)
+    ]
+    assert lowest_px[0] < lowest_px[2] - 60
+    assert abs(lowest_px[1] - lowest_px[2]) < 15
