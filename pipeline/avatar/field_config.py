@@ -11,9 +11,9 @@ class FieldConfig(Config):
     """What steers the learning of the canonical field."""
 
     seed: int = Option(0, ge=0, description="seed of all random draws")
-    steps: int = Option(1000, ge=0, le=200_000, description="training steps")
+    steps: int = Option(600, ge=0, le=200_000, description="training steps")
     rays: int = Option(4096, ge=64, le=1 << 18, description="rays a step")
-    frames_per_step: int = Option(16, ge=1, le=64, description="frames that a step's rays come from")
+    frames_per_step: int = Option(8, ge=1, le=64, description="frames that a step's rays come from")
     max_frames: int = Option(120, ge=2, description="training frames kept, evenly spread; each holds about 3 MB")
     max_person_px: int = Option(
         640, ge=32, description="images are scaled down until the person is at most this tall, px"
@@ -75,8 +75,7 @@ class FieldConfig(Config):
 
     pose_refinement: bool = Option(True, description="learn small corrections of the poses")
     pose_start: float = Option(0.1, ge=0, le=1, description="part of the steps after which poses are refined")
-    pose_every: int = Option(4, ge=1, description="steps between two in which poses move, once they do")
-    pose_rate: float = Option(3e-3, gt=0, description="learning rate of the poses, rad (shifts: a third of it, m)")
+    pose_rate: float = Option(1e-3, gt=0, description="learning rate of the poses, rad (shifts: a third of it, m)")
     pose_smoothness: float = Option(0.02, ge=0, description="weight of the change of corrections from frame to frame")
     pose_size: float = Option(0.002, ge=0, description="weight of the size of corrections")
     validation_frames: int = Option(4, ge=0, description="validation frames that are rendered to judge the result")

@@ -16,7 +16,7 @@ from pipeline.kernels.composite import composite
 from pipeline.kernels.warp import SkinGrid
 
 RAYS_AT_ONCE = 1 << 14
-STEPS_PER_HEIGHT, MAX_SAMPLES = 250, 256
+STEPS_PER_HEIGHT, MAX_SAMPLES = 125, 256
 
 
 def render_field(

@@ -106,11 +106,6 @@ class Learning:
         """True once the poses take part in the learning."""
         return self.config.pose_refinement and self.done >= self.config.pose_start * self.config.steps
 
-    @property
-    def moves_poses(self) -> bool:
-        """True in steps that change poses; in the others the field alone learns, at half of the cost."""
-        return self.refines_poses and self.done % self.config.pose_every == 0
-
     def _random(self) -> np.random.Generator:
         return np.random.Generator(np.random.Philox(key=[self.config.seed, self.done]))
 
@@ -137,10 +132,6 @@ class Learning:
         """Canonical positions of the samples: as looked up, or exact and differentiable once poses are refined."""
         if not self.refines_poses:
             return samples.canonical_m
-        with torch.set_grad_enabled(self.moves_poses):
-            return self._follow_poses(batch, samples)
-
-    def _follow_poses(self, batch: Batch, samples: Samples) -> Float[Tensor, "s 3"]:
         to_world = self.poses.canonical_to_world(batch.frames)
         poses = self.posed_from_world[batch.frames][:, None] @ to_world
         counts = samples.ray_start.diff()
@@ -182,7 +173,7 @@ class Learning:
         image, alpha, weights = composite(density[:count], channels, step_m, samples.ray_start)
         losses = field_losses(image, alpha, density[count:], batch.rgba, batch.background, config)
         total = torch.stack(list(losses.values())).sum()
-        if self.moves_poses:
+        if self.refines_poses:
             total = total + config.pose_smoothness * self.poses.roughness() + config.pose_size * self.poses.size()
         total.backward()
         self._update_parameters(bool(torch.isfinite(total)))
@@ -216,12 +207,8 @@ class Learning:
                 gradient.zero_()
                 continue
             is_pose = name in ("rotation_rad", "shift_m")
-            if is_pose and not self.moves_poses:
-                continue
-            updates = self.done + 1
-            if is_pose:
-                begun = math.ceil(config.pose_start * config.steps / config.pose_every)
-                updates = self.done // config.pose_every - begun + 1
+            begun = math.ceil(config.pose_start * config.steps) if is_pose else 0
+            updates = self.done + 1 - begun
             rate = rates.get(name, config.network_rate) * (self._pose_rate() if is_pose else self._rate())
             adam_step_(parameter, gradient, *self.moments[name], updates, rate, epsilon=1e-15)
 

@@ -29,7 +29,6 @@ LITTLE = {
     "finest_cell_px": 0.5,
     "occupancy_start": 16,
     "pose_start": 0.85,
-    "pose_every": 1,
     "table_rate": 0.1,
     "network_rate": 0.02,
     "final_rate": 0.5,

@@ -5,9 +5,9 @@
 What finished runs say of quality is added: see `tests.bench.quality`.
 
 The step is that of a finished run's frames and body, or of a painted body. Warm-up steps come first, until poses are
-refined and cells that stay empty have been given up. Poses move and the occupancy is updated only every few steps:
-a block holds as many steps as it takes until all recurs, and a part's time is the median over blocks of its mean in a
-block. A row is appended to tests/bench/results/<machine>.csv.
+refined and cells that stay empty have been given up. The occupancy is updated only every few steps: a block holds as
+many steps as it takes until all recurs, and a part's time is the median over blocks of its mean in a block. A row is
+appended to tests/bench/results/<machine>.csv.
 
 The floor of a part is the longest of three times, each at a rate that is measured in the same run: bytes at the rate of
 a copy as large as the table with its gradient and moments, multiplications and additions at that of a large matrix
@@ -35,8 +35,7 @@ and for poses k frames, j joints, m nodes of skin weights:
 | skin_cut | 8 m j bytes: the weights near occupied cells, copied |
 | other | none: joining, opacities, sums |
 
-What follows the poses (positions_backward, blending in rest_backward) counts by the part of the steps that move them,
-occupancy_update and skin_cut by the part of the steps that make one.
+What occupancy_update and skin_cut need counts by the part of the steps that make one.
 """
 
 import argparse
@@ -135,7 +134,7 @@ def begin_painted(config: FieldConfig) -> Learning:
 
 def period(config: FieldConfig) -> int:
     """Steps after which all recurs: poses that move, rays that look everywhere, updates of the occupancy."""
-    return math.lcm(config.pose_every if config.pose_refinement else 1, LOOK_EVERYWHERE, config.occupancy_every)
+    return math.lcm(LOOK_EVERYWHERE, config.occupancy_every)
 
 
 def settled(config: FieldConfig) -> int:
@@ -170,7 +169,7 @@ def least_work(learning: Learning, samples: float) -> dict[str, Work]:
     n, levels, hidden = config.rays, field.layout.levels, config.hidden_width
     points = samples + len(learning._empty_points(np.random.default_rng(0)))
     width = len(field.hidden)
-    moving = 1 / config.pose_every if learning.refines_poses else 0.0
+    moving = float(learning.refines_poses)
     frames = min(config.frames_per_step, learning.scene.pool.frames)
     blending = 24.0 * learning.skin.weights.numel() * frames if learning.refines_poses else 0.0
     placed = samples if learning.refines_poses else 0.0
@@ -187,7 +186,7 @@ def least_work(learning: Learning, samples: float) -> dict[str, Work]:
         "network_backward": Work(bytes=(8 * width + 32) * points, operations=2 * network * points),
         "table_backward": Work(rows=16 * levels * points),
         "positions_backward": Work(rows=moving * (8 * levels * points + 24 * samples)),
-        "rest_backward": Work(bytes=48.0 * n, operations=moving * blending),
+        "rest_backward": Work(bytes=48.0 * n, operations=blending),
         "adam": Work(bytes=32.0 * sum(parameter.numel() for parameter in field.parameters())),
         "occupancy_record": Work(bytes=24 * samples, rows=4 * samples),
         UPDATE: Work(bytes=(12 + 4 * width) * cells, operations=network * cells, rows=8 * levels * cells),
