@@ -16,6 +16,7 @@ from torch import Tensor
 from data_tools.capture import Capture
 from data_tools.renderer import pose_vertices, render_subject
 from data_tools.retarget import carried_rotations, local_rotations
+from data_tools.shadow import seen_from_outside
 from data_tools.truth import load_truth
 from pipeline.avatar.body import Body, Motion, canonical_to_world
 from pipeline.avatar.selection import HELDOUT, TRAIN
@@ -74,15 +75,28 @@ class Comparison:
     @cached_property
     def alignment(self) -> Similarity:
         """What lays the avatar over the truth in the true rig's A-pose."""
-        return align_surfaces(self.rest, self.truth.subject.body.mesh())
+        return align_surfaces(self.rest, self.true_rest)
+
+    @cached_property
+    def true_rest(self) -> Mesh:
+        """The outside of the true A-pose."""
+        return Mesh(self.truth.subject.body.vertices, self._true_faces)
+
+    @cached_property
+    def _true_faces(self) -> Int[np.ndarray, "f 3"]:
+        return self.truth.subject.body.faces[seen_from_outside(self.truth.subject.body.mesh())]
+
+    @cached_property
+    def _avatar_faces(self) -> Int[np.ndarray, "f 3"]:
+        return self.run.avatar.mesh().faces[seen_from_outside(self.run.avatar.mesh())]
 
     def true_surface(self, pose: Float[Tensor, "j 4 4"]) -> Mesh:
-        """The clothed person in one pose."""
-        return Mesh(pose_vertices(self.truth.subject, pose).numpy(), self.truth.subject.body.faces)
+        """The clothed person in one pose, without what the A-pose hides inside."""
+        return Mesh(pose_vertices(self.truth.subject, pose).numpy(), self._true_faces)
 
     def avatar_surface(self, pose: Float[Tensor, "j 4 4"]) -> Mesh:
-        """The avatar in one pose."""
-        return Mesh(self.run.avatar.posed(pose).numpy(), self.run.avatar.faces.numpy())
+        """The avatar in one pose, without what its A-pose hides inside."""
+        return Mesh(self.run.avatar.posed(pose).numpy(), self._avatar_faces)
 
 
 def load_comparison(out: Path, run: Path) -> Comparison:
@@ -97,7 +111,7 @@ def load_comparison(out: Path, run: Path) -> Comparison:
 
 def compare_shape(pair: Comparison) -> dict[str, float]:
     """The surfaces in the true rig's A-pose."""
-    return _aligned_scores(pair.rest, pair.truth.subject.body.mesh(), pair.alignment)
+    return _aligned_scores(pair.rest, pair.true_rest, pair.alignment)
 
 
 def compare_filmed(pair: Comparison) -> dict[str, float]:
@@ -146,7 +160,8 @@ def compare_texture(pair: Comparison, seed: int = 0) -> dict[str, float]:
         coverage: share of the surface that the video showed. colour_error: mean absolute difference there, of 255.
         balanced_colour_error: after one gain a channel, because the light of the video is in the texture.
     """
-    avatar, true = pair.rest, pair.truth.subject.body.mesh()
+    avatar = Mesh(pair.rest.vertices, pair.run.avatar.faces.numpy())
+    true = pair.truth.subject.body.mesh()
     points, _ = sample_surface(avatar, SURFACE_POINTS, seed)
     uv = _uv_at(points, avatar, pair.run.avatar.uv, pair.run.avatar.faces_uv.numpy())
     seen = sample_texture(torch.from_numpy(pair.coverage)[..., None], uv)[:, 0].numpy() > 0.5

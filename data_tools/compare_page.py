@@ -27,16 +27,17 @@ from pipeline.metrics.images import body_box, body_pixels, mean_scores, on_white
 
 PROTOCOL = (
     "Surfaces are laid over the truth by rotation, shift and one scale, found by iterated closest points in both "
-    "directions, before they are compared (20,000 points a surface, nearest triangle): mesh in the true rig's A-pose, "
-    "filmed in some held-out frames, each rig in its own pose, novel_poses while both rigs do a motion that was never "
-    "filmed. scale_to_truth is that scale. Joints are compared root-aligned and absolute, without any other "
-    "alignment. Pictures: field and mesh are the held-out rows of the report. ceiling is the true mesh and texture, "
-    "truly lit, drawn in the refined poses by the fitted camera, on the same frames: what is missing there is the "
-    "fault of pose and camera, after all that another shape of the A-pose could make good. Squared error prefers a "
-    "blur to a sharp print in the wrong place, so a blurred avatar may score above it. novel_views and novel_poses "
-    "are the avatar whose limbs point where the true ones do, laid over the true surface and seen by the true "
-    "cameras, unlit while the truth is lit. colour_error and balanced_colour_error (one gain a channel) are mean "
-    "absolute differences of 255 on the texels that the video showed."
+    "directions, before they are compared (20,000 points a surface, nearest triangle, without faces that cannot be "
+    "seen from outside in the A-pose): mesh in the true rig's A-pose, filmed in some held-out frames, each rig in its "
+    "own pose, novel_poses while both rigs do a motion that was never filmed. scale_to_truth is that scale. Joints "
+    "are compared root-aligned and absolute, without any other alignment. Pictures: field and mesh are the held-out "
+    "rows of the report. ceiling is the true mesh and texture, truly lit, drawn in the refined poses by the fitted "
+    "camera, on the same frames: what is missing there is the fault of pose and camera, after all that another shape "
+    "of the A-pose could make good. Squared error prefers a blur to a sharp print in the wrong place, so a blurred "
+    "avatar may score above it. novel_views and novel_poses are the avatar whose limbs point where the true ones do, "
+    "laid over the true surface and seen by the true cameras, unlit while the truth is lit. colour_error and "
+    "balanced_colour_error (one gain a channel) are mean absolute differences of 255 on the texels that the video "
+    "showed."
 )
 STYLE = ".frame { grid-template-columns: repeat(6, 1fr); }"
 

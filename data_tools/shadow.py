@@ -3,10 +3,12 @@ surfaces", 1978), looked up with soft borders (percentage-closer filtering, Reev
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pipeline.geometry.mesh import Mesh
 from pipeline.kernels.raster import rasterize
 
 PIXEL_M = 0.003
@@ -18,6 +20,9 @@ LIFT_M = 0.012
 
 _FAR_M = 1000.0
 """The light's distance, at which depth is linear in float32 to a tenth of a millimetre."""
+
+_AROUND = 24
+"""Directions of `seen_from_outside`, a golden angle apart from top to bottom."""
 
 _MARGIN_PX = 2 * SOFT_PX + 1
 
@@ -60,3 +65,23 @@ def cast_shadows(
     width, height = (int(size) for size in position_px.amax(0).ceil() + _MARGIN_PX)
     _, _, depth = rasterize(position_px, along[:, 2] + _FAR_M, faces, height, width)
     return ShadowMap(axes, corner, depth)
+
+
+def seen_from_outside(mesh: Mesh) -> Bool[np.ndarray, "f"]:
+    """Whether light from any of `_AROUND` directions, spread evenly, reaches the middle of each face.
+
+    What none reaches is inside: a mouth, the far side of an eye, a body beneath its clothes.
+    """
+    vertices, faces = torch.from_numpy(mesh.vertices).float(), torch.from_numpy(mesh.faces)
+    corners = vertices[faces.long()]
+    middles = corners.mean(1)
+    across = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = torch.nn.functional.normalize(across, dim=1)
+    seen = torch.zeros(len(faces), dtype=torch.bool)
+    number = np.arange(_AROUND) + 0.5
+    rise, angle = 1.0 - 2.0 * number / _AROUND, number * np.pi * (3.0 - np.sqrt(5.0))
+    for up, right, front in zip(rise, np.cos(angle), np.sin(angle), strict=True):
+        level = np.sqrt(1.0 - up**2)
+        shadows = cast_shadows(vertices, faces, (float(right * level), float(up), float(front * level)))
+        seen |= shadows.lit(middles, normals) > 0
+    return seen.numpy()

@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from data_tools.renderer import FLAT, HARD, Light, render_subject, shade
-from data_tools.shadow import PIXEL_M, SOFT_PX, cast_shadows
+from data_tools.shadow import PIXEL_M, SOFT_PX, cast_shadows, seen_from_outside
 from data_tools.subject import Subject
 from pipeline.geometry.camera import Camera
+from pipeline.geometry.mesh import Mesh
 from tests.data_tools.shapes import sphere
 
 BALL_M, HEIGHT_M = 0.3, 1.0
@@ -65,3 +66,17 @@ def test_hidden_places_get_the_ambient_light_alone() -> None:
     ambient = shade(grey[:1], up[:1], up[:1], torch.ones(1), replace(FLAT, ambient=0.7))
     assert torch.allclose(shaded[1], ambient[0])
     assert float(shaded[0, 0]) == pytest.approx(1.055 * (0.21404 * 1.2 + 0.4) ** (1 / 2.4) - 0.055, abs=1e-4)
+
+
+def test_what_lies_inside_is_not_seen() -> None:
+    """A ball within a ball is hidden, all of the outer one is seen; through a hole above the upper side is seen."""
+    (outer, faces), (inner, _) = (sphere(radius_m, (0.0, 1.0, 0.0)) for radius_m in (0.4, 0.2))
+    both = np.concatenate([faces, faces + len(outer)])
+    seen = seen_from_outside(Mesh(np.concatenate([outer, inner]), both))
+    assert seen[: len(faces)].all()
+    assert not seen[len(faces) :].any()
+    open_above = faces[(outer[faces][:, :, 1] < 1.25).all(axis=1)]
+    holed = seen_from_outside(Mesh(np.concatenate([outer, inner]), np.concatenate([open_above, faces + len(outer)])))
+    height_m = inner[faces].mean(axis=1)[:, 1]
+    assert holed[len(open_above) :][height_m > 1.15].all()
+    assert not holed[len(open_above) :][height_m < 0.85].any()
