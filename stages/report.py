@@ -3,6 +3,8 @@
 import math
 import time
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -151,16 +153,17 @@ def score(
     weights = find_lpips_weights()
     shown = set(positions[np.linspace(0, len(positions) - 1, config.shown_frames).round().astype(int)].tolist())
     rows, pictures = [], []
-    for position in track(positions.tolist(), "held-out frames"):
-        image, mask = (to_uint8(part(position)) for part in (loaded.capture.image, loaded.capture.mask))
-        renders = {name: draw(poses[position]) for name, (draw, poses) in draws.items()}
-        softened = soften_outline(renders["mesh_sharp"], blur_px)
-        renders = {"field": renders["field"], "mesh": softened} | renders
-        index = int(loaded.capture.frame_index[position])
-        scores = {name: frame_scores(rgba, image, mask, weights) for name, rgba in renders.items()}
-        rows.append({"index": index} | scores)
-        if position in shown:
-            pictures.append(_pictures(index, image, mask, renders))
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        for position in track(positions.tolist(), "held-out frames"):
+            image, mask = (to_uint8(part(position)) for part in (loaded.capture.image, loaded.capture.mask))
+            renders = {name: draw(poses[position]) for name, (draw, poses) in draws.items()}
+            softened = soften_outline(renders["mesh_sharp"], blur_px)
+            renders = {"field": renders["field"], "mesh": softened} | renders
+            index = int(loaded.capture.frame_index[position])
+            scores = pool.map(partial(frame_scores, image=image, mask=mask, lpips_weights=weights), renders.values())
+            rows.append({"index": index} | dict(zip(renders, scores, strict=True)))
+            if position in shown:
+                pictures.append(_pictures(index, image, mask, renders))
     return rows, pictures
 
 
