@@ -48,6 +48,18 @@ def test_files_and_functions_stay_small(repository: Path) -> None:
     assert not too_long
 
 
+def test_compiled_functions_are_found_in_the_cache(repository: Path) -> None:
+    """A compiled closure that calls another one has a new key in numba's cache in every process: seconds each time."""
+    closures = [
+        f"{path.name}: {inner.name} in {outer.name}"
+        for path in (repository / "pipeline" / "kernels").glob("*_cpu.py")
+        for outer in functions(ast.parse(path.read_text(encoding="utf-8")))
+        for inner in functions(outer)
+        if inner is not outer
+    ]
+    assert not closures
+
+
 def test_every_import_is_a_declared_dependency(repository: Path) -> None:
     project = tomllib.loads((repository / "pyproject.toml").read_text())["project"]
     declared = {normal(line) for line in project["dependencies"]}

@@ -60,6 +60,11 @@ class GridLayout:
         """Rows of the whole table."""
         return sum(self.rows_per_level)
 
+    @property
+    def lanes(self) -> tuple[int, ...]:
+        """As long as a level has features: tells the kernels that number by its type."""
+        return (0,) * self.features
+
     @cached_property
     def plan(self) -> np.ndarray:
         """(l, 6) int64 for the kernels: cells x, y, z; first row; rows; 1 if the level is dense."""
@@ -76,7 +81,8 @@ class _Encode(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, points: Tensor, table: Tensor, layout: GridLayout, table_gradient: Tensor | None) -> Tensor:
         features = torch.empty(len(points), layout.width)
-        hashgrid_cpu.forward(layout.features)(points.numpy(), table.detach().numpy(), layout.plan, features.numpy())
+        arrays = (points.numpy(), table.detach().numpy(), layout.plan, features.numpy())
+        hashgrid_cpu.encode(*arrays, layout.lanes)
         ctx.save_for_backward(points, table)
         ctx.layout, ctx.table_gradient = layout, table_gradient
         return features
@@ -89,13 +95,12 @@ class _Encode(torch.autograd.Function):
         points_gradient = None
         if ctx.needs_input_grad[0]:
             points_gradient = torch.zeros_like(points)
-            hashgrid_cpu.backward_points(layout.features)(
-                points.numpy(), table.numpy(), layout.plan, towards, points_gradient.numpy()
-            )
+            arrays = (points.numpy(), table.numpy(), layout.plan, towards, points_gradient.numpy())
+            hashgrid_cpu.add_points_gradient(*arrays, layout.lanes)
         if not ctx.needs_input_grad[1]:
             return points_gradient, None, None, None
         target = torch.zeros_like(table) if sums is None else sums
-        hashgrid_cpu.backward_table(layout.features)(points.numpy(), layout.plan, towards, target.numpy())
+        hashgrid_cpu.add_table_gradient(points.numpy(), layout.plan, towards, target.numpy(), layout.lanes)
         return points_gradient, target if sums is None else None, None, None
 
 

@@ -2,11 +2,11 @@
 
 Levels are the outer loop, so that one level's table stays in the cache; in the table's gradient each thread owns whole
 levels: no atomics, and the same sums in the same order whatever the number of threads.
-The factories return one compiled function for each number of features a level: with that number a constant, the inner
-loop becomes one vector instruction. (`cache=True` keys on it.)
-"""
 
-from functools import cache
+`lanes` is a tuple as long as a level has features: its length is part of its type, hence a constant in the compiled
+code, and the inner loop becomes one vector instruction. (A closure over the number would do so too, but one that calls
+another closure is never found in numba's cache.)
+"""
 
 import numpy as np
 from numba import njit, prange
@@ -55,36 +55,33 @@ def _corners(points, start, stop, level_plan, rows, weights, parts):
     return first
 
 
-@cache
-def forward(features: int):
-    """(points (n, 3), table (rows, f), plan (l, 6), encoded (n, l*f)) -> None; fills `encoded`."""
+@njit(**OPTIONS)
+def _encode_block(points, table, plan, level, encoded, start, stop, lanes):
+    column = level * len(lanes)
+    rows = np.empty((8, BLOCK), np.uint32)
+    weights = np.empty((8, BLOCK), np.float32)
+    parts = np.empty((3, BLOCK), np.float32)
+    first = _corners(points, start, stop, plan[level], rows, weights, parts)
+    values = table[first:]
+    for k in range(stop - start):
+        r0, r1, r2, r3 = rows[0, k], rows[1, k], rows[2, k], rows[3, k]
+        r4, r5, r6, r7 = rows[4, k], rows[5, k], rows[6, k], rows[7, k]
+        w0, w1, w2, w3 = weights[0, k], weights[1, k], weights[2, k], weights[3, k]
+        w4, w5, w6, w7 = weights[4, k], weights[5, k], weights[6, k], weights[7, k]
+        for f in range(len(lanes)):
+            encoded[start + k, column + f] = (
+                (w0 * values[r0, f] + w1 * values[r1, f]) + (w2 * values[r2, f] + w3 * values[r3, f])
+            ) + ((w4 * values[r4, f] + w5 * values[r5, f]) + (w6 * values[r6, f] + w7 * values[r7, f]))
 
-    @njit(**OPTIONS)
-    def encode_block(points, table, level_plan, encoded, column, start, stop):
-        rows = np.empty((8, BLOCK), np.uint32)
-        weights = np.empty((8, BLOCK), np.float32)
-        parts = np.empty((3, BLOCK), np.float32)
-        first = _corners(points, start, stop, level_plan, rows, weights, parts)
-        level = table[first:]
-        for k in range(stop - start):
-            r0, r1, r2, r3 = rows[0, k], rows[1, k], rows[2, k], rows[3, k]
-            r4, r5, r6, r7 = rows[4, k], rows[5, k], rows[6, k], rows[7, k]
-            w0, w1, w2, w3 = weights[0, k], weights[1, k], weights[2, k], weights[3, k]
-            w4, w5, w6, w7 = weights[4, k], weights[5, k], weights[6, k], weights[7, k]
-            for f in range(features):
-                encoded[start + k, column + f] = (
-                    (w0 * level[r0, f] + w1 * level[r1, f]) + (w2 * level[r2, f] + w3 * level[r3, f])
-                ) + ((w4 * level[r4, f] + w5 * level[r5, f]) + (w6 * level[r6, f] + w7 * level[r7, f]))
 
-    @njit(parallel=True, **OPTIONS)
-    def encode(points, table, plan, encoded):
-        count = points.shape[0]
-        for level in range(plan.shape[0]):
-            for block in prange((count + BLOCK - 1) // BLOCK):
-                start = block * BLOCK
-                encode_block(points, table, plan[level], encoded, level * features, start, min(start + BLOCK, count))
-
-    return encode
+@njit(parallel=True, **OPTIONS)
+def encode(points, table, plan, encoded, lanes):
+    """Fill `encoded` (n, l*f) from points (n, 3), table (rows, f) and plan (l, 6)."""
+    count = points.shape[0]
+    for level in range(plan.shape[0]):
+        for block in prange((count + BLOCK - 1) // BLOCK):
+            start = block * BLOCK
+            _encode_block(points, table, plan, level, encoded, start, min(start + BLOCK, count), lanes)
 
 
 @njit(**OPTIONS)
@@ -94,88 +91,80 @@ def _level_of_turn(turn, levels):
     return 2 * turn if turn < even else 2 * (turn - even) + 1
 
 
-@cache
-def backward_table(features: int):
-    """(points (n, 3), plan (l, 6), gradient (n, l*f), table_gradient (rows, f)) -> None; adds to `table_gradient`."""
-
-    @njit(**OPTIONS)
-    def scatter_block(points, level_plan, gradient, column, table_gradient, start, stop, rows, weights, parts):
-        first = _corners(points, start, stop, level_plan, rows, weights, parts)
-        level = table_gradient[first:]
-        for k in range(stop - start):
-            for corner in range(8):
-                row, weight = rows[corner, k], weights[corner, k]
-                for f in range(features):
-                    level[row, f] += weight * gradient[start + k, column + f]
-
-    @njit(parallel=True, **OPTIONS)
-    def scatter(points, plan, gradient, table_gradient):
-        count = points.shape[0]
-        levels = plan.shape[0]
-        for turn in prange(levels):
-            level = _level_of_turn(turn, levels)
-            rows = np.empty((8, BLOCK), np.uint32)
-            weights = np.empty((8, BLOCK), np.float32)
-            parts = np.empty((3, BLOCK), np.float32)
-            for block in range((count + BLOCK - 1) // BLOCK):
-                start = block * BLOCK
-                stop = min(start + BLOCK, count)
-                scatter_block(
-                    points, plan[level], gradient, level * features, table_gradient, start, stop, rows, weights, parts
-                )
-
-    return scatter
+@njit(**OPTIONS)
+def _scatter_block(points, plan, level, gradient, table_gradient, start, stop, rows, weights, parts, lanes):
+    column = level * len(lanes)
+    first = _corners(points, start, stop, plan[level], rows, weights, parts)
+    values = table_gradient[first:]
+    for k in range(stop - start):
+        for corner in range(8):
+            row, weight = rows[corner, k], weights[corner, k]
+            for f in range(len(lanes)):
+                values[row, f] += weight * gradient[start + k, column + f]
 
 
-@cache
-def backward_points(features: int):
-    """(points (n, 3), table (rows, f), plan, gradient (n, l*f), points_gradient (n, 3)) -> None; adds to the last."""
-
-    @njit(**OPTIONS)
-    def gather_block(points, table, level_plan, gradient, column, points_gradient, start, stop):
+@njit(parallel=True, **OPTIONS)
+def add_table_gradient(points, plan, gradient, table_gradient, lanes):
+    """Add to `table_gradient` (rows, f) what gradient (n, l*f) means for the table."""
+    count = points.shape[0]
+    levels = plan.shape[0]
+    for turn in prange(levels):
+        level = _level_of_turn(turn, levels)
         rows = np.empty((8, BLOCK), np.uint32)
         weights = np.empty((8, BLOCK), np.float32)
         parts = np.empty((3, BLOCK), np.float32)
-        first = _corners(points, start, stop, level_plan, rows, weights, parts)
-        level = table[first:]
-        dots = np.empty(8, np.float32)
-        for k in range(stop - start):
-            for corner in range(8):
-                row, total = rows[corner, k], np.float32(0)
-                for f in range(features):
-                    total += level[row, f] * gradient[start + k, column + f]
-                dots[corner] = total
-            u, v, w = parts[0, k], parts[1, k], parts[2, k]
-            u0, v0, w0 = np.float32(1) - u, np.float32(1) - v, np.float32(1) - w
-            along_x = (
-                v0 * w0 * (dots[1] - dots[0])
-                + v * w0 * (dots[3] - dots[2])
-                + v0 * w * (dots[5] - dots[4])
-                + v * w * (dots[7] - dots[6])
-            )
-            along_y = (
-                u0 * w0 * (dots[2] - dots[0])
-                + u * w0 * (dots[3] - dots[1])
-                + u0 * w * (dots[6] - dots[4])
-                + u * w * (dots[7] - dots[5])
-            )
-            along_z = (
-                u0 * v0 * (dots[4] - dots[0])
-                + u * v0 * (dots[5] - dots[1])
-                + u0 * v * (dots[6] - dots[2])
-                + u * v * (dots[7] - dots[3])
-            )
-            points_gradient[start + k, 0] += along_x * np.float32(level_plan[0])
-            points_gradient[start + k, 1] += along_y * np.float32(level_plan[1])
-            points_gradient[start + k, 2] += along_z * np.float32(level_plan[2])
+        for block in range((count + BLOCK - 1) // BLOCK):
+            start = block * BLOCK
+            stop = min(start + BLOCK, count)
+            _scatter_block(points, plan, level, gradient, table_gradient, start, stop, rows, weights, parts, lanes)
 
-    @njit(parallel=True, **OPTIONS)
-    def gather(points, table, plan, gradient, points_gradient):
-        count = points.shape[0]
-        for level in range(plan.shape[0]):
-            for block in prange((count + BLOCK - 1) // BLOCK):
-                start = block * BLOCK
-                stop = min(start + BLOCK, count)
-                gather_block(points, table, plan[level], gradient, level * features, points_gradient, start, stop)
 
-    return gather
+@njit(**OPTIONS)
+def _gather_block(points, table, plan, level, gradient, points_gradient, start, stop, lanes):
+    column = level * len(lanes)
+    rows = np.empty((8, BLOCK), np.uint32)
+    weights = np.empty((8, BLOCK), np.float32)
+    parts = np.empty((3, BLOCK), np.float32)
+    first = _corners(points, start, stop, plan[level], rows, weights, parts)
+    values = table[first:]
+    dots = np.empty(8, np.float32)
+    for k in range(stop - start):
+        for corner in range(8):
+            row, total = rows[corner, k], np.float32(0)
+            for f in range(len(lanes)):
+                total += values[row, f] * gradient[start + k, column + f]
+            dots[corner] = total
+        u, v, w = parts[0, k], parts[1, k], parts[2, k]
+        u0, v0, w0 = np.float32(1) - u, np.float32(1) - v, np.float32(1) - w
+        along_x = (
+            v0 * w0 * (dots[1] - dots[0])
+            + v * w0 * (dots[3] - dots[2])
+            + v0 * w * (dots[5] - dots[4])
+            + v * w * (dots[7] - dots[6])
+        )
+        along_y = (
+            u0 * w0 * (dots[2] - dots[0])
+            + u * w0 * (dots[3] - dots[1])
+            + u0 * w * (dots[6] - dots[4])
+            + u * w * (dots[7] - dots[5])
+        )
+        along_z = (
+            u0 * v0 * (dots[4] - dots[0])
+            + u * v0 * (dots[5] - dots[1])
+            + u0 * v * (dots[6] - dots[2])
+            + u * v * (dots[7] - dots[3])
+        )
+        points_gradient[start + k, 0] += along_x * np.float32(plan[level, 0])
+        points_gradient[start + k, 1] += along_y * np.float32(plan[level, 1])
+        points_gradient[start + k, 2] += along_z * np.float32(plan[level, 2])
+
+
+@njit(parallel=True, **OPTIONS)
+def add_points_gradient(points, table, plan, gradient, points_gradient, lanes):
+    """Add to `points_gradient` (n, 3) what gradient (n, l*f) means for the points."""
+    count = points.shape[0]
+    for level in range(plan.shape[0]):
+        for block in prange((count + BLOCK - 1) // BLOCK):
+            start = block * BLOCK
+            stop = min(start + BLOCK, count)
+            _gather_block(points, table, plan, level, gradient, points_gradient, start, stop, lanes)
