@@ -37,6 +37,8 @@ SEAMS: tuple[tuple[str, Any, str], ...] = (
     ("losses", PoseCorrection, "roughness"),
     ("losses", PoseCorrection, "size"),
     ("network_backward", _Decode, "backward"),
+    ("table_backward", hashgrid_cpu, "add_table_gradient"),
+    ("positions_backward", hashgrid_cpu, "add_points_gradient"),
     ("positions_backward", _Newton, "backward"),
     ("rest_backward", torch.Tensor, "backward"),
     ("adam", train, "adam_step_"),
@@ -45,8 +47,6 @@ SEAMS: tuple[tuple[str, Any, str], ...] = (
     (UPDATE, OccupancyUpdate, "update"),
     ("skin_cut", Learning, "_follow_occupancy"),
 )
-KERNEL_SEAMS = (("table_backward", "backward_table"), ("positions_backward", "backward_points"))
-"""Of `hashgrid_cpu`: what makes the loop for a number of features."""
 
 
 class Clock:
@@ -100,14 +100,8 @@ def watched(clock: Clock) -> Iterator[None]:
 
         for part, owner, name in SEAMS:
             wrap(owner, name, partial(clock.timed, part))
-        for part, name in KERNEL_SEAMS:
-            wrap(hashgrid_cpu, name, partial(_timed_loops, clock, part))
         wrap(train, "invert_motion", partial(_timed_march, clock))
         yield
-
-
-def _timed_loops(clock: Clock, part: str, make: Callable[[int], Any]) -> Callable[[int], Any]:
-    return lambda features: clock.timed(part, make(features))
 
 
 def _timed_march(clock: Clock, invert: Callable[..., Any]) -> Callable[..., Any]:
