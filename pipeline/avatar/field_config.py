@@ -42,7 +42,9 @@ class FieldConfig(Config):
     share_outside: float = Option(0.1, ge=0, le=1, description="part of the rays outside the mask")
     border_px: int = Option(4, ge=1, description="half width of the border, px")
 
-    occupancy: Literal["attention", "plain"] = Option("attention", description="how the occupancy grid is updated")
+    occupancy: Literal["attention", "plain"] = Option(
+        "plain", description="how the occupancy grid is updated: by voxel attention (IHM) or by the mean opacity alone"
+    )
     occupancy_every: int = Option(8, ge=1, description="steps between updates of the occupancy grid")
     occupancy_start: int = Option(64, ge=0, description="step of the first update that may empty a cell")
     occupancy_threshold: float = Option(

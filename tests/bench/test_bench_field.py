@@ -12,7 +12,7 @@ from pipeline.kernels.hashgrid import _Encode
 from tests.bench import bench_field
 from tests.bench.bench_field import PARTS, Peaks, Work, begin_painted, least_work, period, settled, table, time_steps
 from tests.bench.machine import append_row
-from tests.bench.parts import KERNEL_SEAMS, SEAMS, Clock, watched
+from tests.bench.parts import SEAMS, Clock, watched
 
 TINY = FieldConfig(
     steps=40,
@@ -64,7 +64,7 @@ def test_the_seams_are_as_they_were_afterwards():
 
 
 def test_every_seam_has_a_part():
-    seams = {part for part, *_ in (*SEAMS, *KERNEL_SEAMS)} | {"march"}
+    seams = {part for part, *_ in SEAMS} | {"march"}
     assert seams == set(PARTS)
 
 
