@@ -38,15 +38,35 @@ def forward_kinematics(
     Raises:
         ValueError: a parent does not come before its child.
     """
-    joint_rotations, joint_positions = [rotations[:, 0]], [root_translation_m]
+    order, rotation, position = [0], rotations[:, :1], root_translation_m[:, None]
+    all_rotations, all_positions, before = [rotation], [position], {0: 0}
+    for joints in _generations(parents)[1:]:
+        above = [int(parents[joint]) for joint in joints]
+        places = [before[parent] for parent in above]
+        offset_m = joints_m[joints] - joints_m[above]
+        turned = rotation[:, places]
+        position = position[:, places] + (turned @ offset_m[:, :, None]).squeeze(-1)
+        rotation = turned @ rotations[:, joints]
+        all_rotations.append(rotation)
+        all_positions.append(position)
+        before = {joint: place for place, joint in enumerate(joints)}
+        order += joints
+    back = np.argsort(order).tolist()
+    return rigid(torch.cat(all_rotations, dim=1)[:, back], torch.cat(all_positions, dim=1)[:, back])
+
+
+def _generations(parents: Sequence[int] | Int[np.ndarray, "j"]) -> list[list[int]]:
+    """The joints by their distance from the root: those of a generation depend on the one before, not on each other."""
+    depth, generations = [0], [[0]]
     for joint in range(1, len(parents)):
         parent = int(parents[joint])
         if not 0 <= parent < joint:
             raise ValueError(f"joint {joint} has parent {parent}; parents must come before their children")
-        offset = joints_m[joint] - joints_m[parent]
-        joint_positions.append(joint_positions[parent] + joint_rotations[parent] @ offset)
-        joint_rotations.append(joint_rotations[parent] @ rotations[:, joint])
-    return rigid(torch.stack(joint_rotations, dim=1), torch.stack(joint_positions, dim=1))
+        depth.append(depth[parent] + 1)
+        if depth[joint] == len(generations):
+            generations.append([])
+        generations[depth[joint]].append(joint)
+    return generations
 
 
 def skinning_transforms(
