@@ -73,10 +73,7 @@ def seen_from_outside(mesh: Mesh) -> Bool[np.ndarray, "f"]:
     What none reaches is inside: a mouth, the far side of an eye, a body beneath its clothes.
     """
     vertices, faces = torch.from_numpy(mesh.vertices).float(), torch.from_numpy(mesh.faces)
-    corners = vertices[faces.long()]
-    middles = corners.mean(1)
-    across = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals = torch.nn.functional.normalize(across, dim=1)
+    middles, normals = vertices[faces.long()].mean(1), torch.from_numpy(mesh.face_normals()).float()
     seen = torch.zeros(len(faces), dtype=torch.bool)
     number = np.arange(_AROUND) + 0.5
     rise, angle = 1.0 - 2.0 * number / _AROUND, number * np.pi * (3.0 - np.sqrt(5.0))

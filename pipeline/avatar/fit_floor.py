@@ -44,7 +44,6 @@ PLANE_PASSES = 4
 LEAST_STANDING = 0.2
 """There is a floor when at least this share of the soles stands, on average over the frames."""
 
-
 CONTACT_M, CONTACT_CUTOFF = 0.02, 3.0
 """Standard deviation of a standing sole, and where its robust cost levels off, in deviations."""
 
