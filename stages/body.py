@@ -2,16 +2,20 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+import torch
 from jaxtyping import UInt8
 from pydantic import Field
 
-from pipeline.avatar.body import Motion, canonical_to_world, load_anny
-from pipeline.avatar.fit import FitOptions, FitResult, fit_body
+from pipeline.avatar.body import Motion, ParametricBody, canonical_to_world, load_anny
+from pipeline.avatar.fit import FitOptions, FitResult, fit_body, fit_given
+from pipeline.avatar.fit_given import GivenPoses
 from pipeline.avatar.fit_quality import doubts, make_observations, suspicious_frames
 from pipeline.avatar.fit_silhouette import matching_window
 from pipeline.avatar.overlay import draw_overlay, overlay_grid, posed_frame
+from pipeline.avatar.smpl import SmplBody
 from pipeline.core.cli import main
 from pipeline.core.config import Config as BaseConfig
 from pipeline.core.errors import UserError
@@ -22,6 +26,7 @@ from pipeline.io.capture import Capture, load_capture
 from pipeline.io.image import to_uint8, write_rgb
 from pipeline.io.npz import save_body, save_camera, save_motion, save_npz
 from pipeline.io.smpl_model import load_smpl
+from pipeline.io.smpl_poses import SMPL_POSES_NPZ
 
 _BODY, _MOTION, _CAMERA, _SCORES, _OVERLAY = "body.npz", "motion.npz", "camera.npz", "scores.npz", "overlay.png"
 _OVERLAY_FRAMES = 12
@@ -46,6 +51,11 @@ class Config(BaseConfig):
     )
     shared_frames: int = Field(48, ge=8, le=500, description="Frames from which shape and focal length are found.")
     rounds: int = Field(8, ge=1, le=50, description="Rounds of matching outlines to find shape and focal length.")
+    supplied_poses: Literal["keep", "start", "ignore"] = Field(
+        "keep",
+        description="With an SMPL model_file, of smpl_poses.npz beside the video: keep its shape and poses; keep its "
+        "shape and start from its poses, which landmarks and outlines refine; or ignore it.",
+    )
     min_overlap: float = Field(
         0.5, ge=0.0, le=1.0, description="A fit is refused whose median overlap with the masks (IoU, 0 to 1) is lower."
     )
@@ -86,9 +96,14 @@ def fit(capture: Capture, masks: Sequence[UInt8[np.ndarray, "h w"]], frames_dir:
         capture.time_s, capture.landmarks_px, capture.landmarks_visibility, capture.landmarks_world_m, camera
     )
     options = FitOptions(config.height_m, focal_deviation, config.shared_frames, config.rounds)
+    windows = [matching_window(mask) for mask in masks]
     model = load_anny() if config.model_file is None else load_smpl(Path(config.model_file))
+    given = supplied_poses(capture, model, camera, focal_deviation == 0.0, config)
     try:
-        result = fit_body(model, observations, [matching_window(mask) for mask in masks], options)
+        if given is None:
+            result = fit_body(model, observations, windows, options)
+        else:
+            result = fit_given(model, observations, windows, given, config.supplied_poses == "keep")
     except ValueError as error:
         raise UserError(
             f"the body cannot be fitted to {frames_dir}: {error}; let the detector find the landmarks "
@@ -99,9 +114,39 @@ def fit(capture: Capture, masks: Sequence[UInt8[np.ndarray, "h w"]], frames_dir:
         raise UserError(
             f"the body does not fit the person in {frames_dir}: median overlap with the masks {overlap:.2f}, needed "
             f"{config.min_overlap:.2f}; look at {frames_dir / 'contact.jpg'} for wrong masks or landmarks, film the "
-            "whole body unoccluded, or lower body.min_overlap"
+            f"whole body unoccluded, {'' if given is None else 'set body.supplied_poses=start, '}"
+            "or lower body.min_overlap"
         )
     return result
+
+
+def supplied_poses(
+    capture: Capture, model: ParametricBody, camera: Camera, focal_is_known: bool, config: Config
+) -> GivenPoses | None:
+    """What others fitted, for this model and in this world; None, with a warning, where that is of no use here.
+
+    The shape is the mean over frames: some sources fit one a frame.
+    """
+    poses = capture.smpl_poses
+    if poses is None or config.supplied_poses == "ignore":
+        return None
+    if not isinstance(model, SmplBody) or not model.takes_smpl_poses(poses.betas.shape[1]):
+        reason = f"it needs an SMPL or SMPL-H model file ({poses.gender}), --set body.model_file=FILE"
+    elif not focal_is_known:
+        reason = "the camera that it belongs to is not known; supply camera.json or body.field_of_view_deg"
+    elif len(poses.frame_index) == 0:
+        reason = "it has no pose of a chosen frame"
+    else:
+        pose = np.concatenate([poses.global_orient, poses.body_pose], axis=1).reshape(-1, 24, 3)
+        to_world = np.linalg.inv(camera.world_to_camera.astype(np.float64)) @ poses.smpl_to_camera
+        betas = torch.from_numpy(poses.betas)
+        rotations, root_m = model.placed(
+            torch.from_numpy(pose), torch.from_numpy(poses.transl), betas, torch.from_numpy(to_world).float()
+        )
+        rows = np.searchsorted(capture.frame_index, poses.frame_index)
+        return GivenPoses(rows, betas.mean(0), rotations, root_m)
+    warn(f"the supplied {SMPL_POSES_NPZ} is not used: {reason}")
+    return None
 
 
 def starting_camera(capture: Capture, config: Config) -> tuple[Camera, float]:

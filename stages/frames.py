@@ -143,12 +143,13 @@ def make_capture(sightings: Sightings, chosen: list[int], out: Path, source: Sou
         n_video_frames=source.n_frames,
         scale=sightings.scale,
         recorded_focal_px=recorded_focal_px(source, sightings.width, sightings.height),
+        smpl_poses=None if supplied.smpl_poses is None else supplied.smpl_poses.of(frame_index),
     )
 
 
 STAGE = Stage(
     "frames",
-    version=3,
+    version=4,
     needs=("video",),
     makes=(FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, CONTACT_SHEET),
     config=Config,

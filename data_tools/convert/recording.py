@@ -7,7 +7,7 @@
     TARGET/smpl_poses.npz          see `pipeline.io.smpl_poses`
     TARGET/...                     what the source has in this form already
 
-`pipeline.io.supplied` says how the frames stage reads them (all but the poses).
+`pipeline.io.supplied` says how the frames stage reads them.
 """
 
 import json

@@ -1,7 +1,8 @@
 """Fit the parametric body to a recording: one shape, a pose a frame, the focal length where it is unknown.
 
 Shape, focal length and landmark offsets are found on some frames spread over the recording, first from landmarks, then
-from outlines as well; then every frame gets its pose with those held fixed.
+from outlines as well; then every frame gets its pose with those held fixed. `fit_given` keeps shape and poses that
+others fitted, or starts from them.
 """
 
 from collections.abc import Sequence
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from pipeline.avatar.body import Body, ParametricBody
 from pipeline.avatar.fit_floor import Contact, floor_contact
+from pipeline.avatar.fit_given import GivenPoses
 from pipeline.avatar.fit_init import initial_state, interpolated_state, torso_found
 from pipeline.avatar.fit_landmarks import LandmarkRegressor, landmark_regressor
 from pipeline.avatar.fit_model import FitModel, linearise, pose_points, pose_skeleton
@@ -99,8 +101,7 @@ def fit_body(
     observations.camera holds the focal length to start from. Windows come from `fit_silhouette.matching_window`.
     Raises ValueError when fewer than three frames have a torso in pixels and in 3D.
     """
-    if torso_found(observations).sum() < MINIMUM_FRAMES:
-        raise ValueError(f"fewer than {MINIMUM_FRAMES} frames have hips and shoulders in pixels and in 3D")
+    _check_landmarks(observations)
     tools = _tools(body)
     rest_m = tools.regressor.points(tools.default, torch.zeros(_offsets(tools), dtype=torch.float64)).rest[0]
     observations, exchanged = _with_sides_mended(observations, rest_m)
@@ -115,12 +116,46 @@ def fit_body(
     return _result(tools, model, state, system, observations, overlap, exchanged, spread_m)
 
 
+def fit_given(
+    body: ParametricBody,
+    observations: Observations,
+    windows: Sequence[Window | None],
+    given: GivenPoses,
+    keep: bool,
+) -> FitResult:
+    """Take over shape and poses that others fitted; frames that they lack are fitted, from between their neighbours.
+
+    observations.camera is the camera that the given poses belong to.
+    keep: the given poses stay as they are; else every pose goes on from them to landmarks and outlines.
+    Raises ValueError when no frame has a pose, or as `fit_body` does.
+    """
+    _check_landmarks(observations)
+    tools = _tools(body)
+    model = linearise(body, given.shape)
+    state = given.state(model.full_joint, observations.time_s)
+    rest_m = tools.regressor.points(model, state.offsets_m).rest[0]
+    observations, exchanged = _with_sides_mended(observations, rest_m)
+    if not keep or len(given.rows) < len(windows):
+        weights = Weights(landmark_m=OUTLINE_LANDMARK_M, direction_m=OUTLINE_DIRECTION_M)
+        state, _, _ = _fit_poses(tools, observations, windows, state, weights)
+    if keep:
+        state = given.put_into(state, model.full_joint)
+    _, overlap = match_all(model, state, observations, windows)
+    result = _result(tools, model, state, None, observations, overlap, exchanged, 0.0)
+    return replace(result, rotations_wxyz=given.put_into_all(result.rotations_wxyz)) if keep else result
+
+
 def shared_rows(observations: Observations, windows: Sequence[Window | None], count: int) -> Int[np.ndarray, "k"]:
     """Frames for the shared unknowns: evenly spread over those with landmarks and mask (without masks: landmarks)."""
     found = torso_found(observations)
     with_mask = found & np.array([window is not None for window in windows])
     candidates = np.flatnonzero(with_mask if with_mask.sum() >= MINIMUM_FRAMES else found)
     return np.unique(candidates[np.linspace(0, len(candidates) - 1, min(count, len(candidates))).astype(np.int64)])
+
+
+def _check_landmarks(observations: Observations) -> None:
+    if torso_found(observations).sum() < MINIMUM_FRAMES:
+        raise ValueError(f"fewer than {MINIMUM_FRAMES} frames have hips and shoulders in pixels and in 3D")
 
 
 def _tools(body: ParametricBody) -> _Tools:
@@ -253,16 +288,13 @@ def _result(
     tools: _Tools,
     model: FitModel,
     state: FitState,
-    system: NormalEquations,
+    system: NormalEquations | None,
     observations: Observations,
     overlap: Float[np.ndarray, "n"],
     exchanged: dict[str, Bool[np.ndarray, "n"]],
     stature_spread_m: float,
 ) -> FitResult:
-    covariance = shared_covariance(system)
-    shapes = len(state.shape)
-    height_gradient = model.height_m()[1].numpy()
-    height_variance = height_gradient @ covariance[:shapes, :shapes] @ height_gradient
+    focal_deviation, height_deviation_m = (0.0, 0.0) if system is None else _deviations(model, system)
     quaternions = matrix_to_quaternion(model.rotations_of_all(state.rotations))
     return FitResult(
         body=tools.body.body(state.shape.float()),
@@ -272,6 +304,14 @@ def _result(
         landmark_error_px=landmark_errors_px(tools.regressor, model, state, observations),
         overlap=overlap,
         exchanged=exchanged,
-        focal_deviation=float(np.sqrt(covariance[-1, -1])) if system.border[..., -1].any() else 0.0,
-        height_deviation_m=float(np.hypot(np.sqrt(height_variance), stature_spread_m)),
+        focal_deviation=focal_deviation,
+        height_deviation_m=float(np.hypot(height_deviation_m, stature_spread_m)),
     )
+
+
+def _deviations(model: FitModel, system: NormalEquations) -> tuple[float, float]:
+    """Of the logarithm of the focal length, and of the stature (m)."""
+    covariance, gradient = shared_covariance(system), model.height_m()[1].numpy()
+    variance = gradient @ covariance[: len(gradient), : len(gradient)] @ gradient
+    focal = float(np.sqrt(covariance[-1, -1])) if system.border[..., -1].any() else 0.0
+    return focal, float(np.sqrt(variance))

@@ -133,6 +133,30 @@ class SmplBody:
         above = torch.cat([torch.eye(3)[None], bind[self.parents[1:].tolist()]])
         return above @ smpl_rotations @ bind.transpose(-1, -2)
 
+    def takes_smpl_poses(self, betas: int) -> bool:
+        """Whether this many betas, and poses, that were fitted with SMPL hold here: SMPL-X has other shapes."""
+        return "Jaw" not in self.joint_names and len(self.shape_names) == betas
+
+    def placed(
+        self,
+        axis_angle: Float[Tensor, "n 24 3"],
+        transl_m: Float[Tensor, "n 3"],
+        betas: Float[Tensor, "n b"],
+        smpl_to_world: Float[Tensor, "n 4 4"],
+    ) -> tuple[Float[Tensor, "n k 3 3"], Float[Tensor, "n 3"]]:
+        """SMPL's poses as this house's: local rotations of the first k joints, and where the root joint is (m).
+
+        SMPL turns about the pelvis where the regressor finds it, then adds `transl_m`. k is 24, or the 22 joints
+        that the other models share with SMPL.
+        """
+        known = len(axis_angle[0]) if len(self.joint_names) == len(axis_angle[0]) else len(_LIMBS)
+        local = torch.eye(3).repeat(len(axis_angle), len(self.joint_names), 1, 1)
+        local[:, :known] = axis_angle_to_matrix(axis_angle[:, :known])
+        rotations = self.local_rotations(local)[:, :known]
+        rotations[:, 0] = smpl_to_world[:, :3, :3] @ rotations[:, 0]
+        pelvis_m = self._joints[0] + betas @ self._joint_directions[0].T + transl_m
+        return rotations, (smpl_to_world[:, :3, :3] @ pelvis_m[..., None]).squeeze(-1) + smpl_to_world[:, :3, 3]
+
     def _landmark_places(self) -> dict[str, tuple[float, float, float]]:
         """Where the left and central landmarks lie on the body of the default shape, metres."""
         vertices, joints_m = (rest.double().numpy() for rest in self.rest(self.shape_defaults))

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int, UInt8
 from pipeline.geometry.camera import UPRIGHT_WORLD_TO_CAMERA, Camera
 from pipeline.io.image import read_gray, read_rgb, to_float
 from pipeline.io.npz import load_npz, save_npz
+from pipeline.io.smpl_poses import SMPL_POSES_NPZ, SmplPoses, load_smpl_poses, save_smpl_poses
 
 FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, CONTACT_SHEET = "frames.npz", "images", "masks", "contact.jpg"
 _INTRINSICS = ("camera_fx", "camera_fy", "camera_cx", "camera_cy")
@@ -26,6 +27,7 @@ class Capture:
     camera: what was supplied with the video, for these images; None when unknown.
     recorded_focal_px: focal length in these images by the recording's own metadata; None when they say nothing.
     scale: size of these images relative to the recording's. Images are undistorted.
+    smpl_poses: what others fitted to some of these frames; None when nothing was supplied.
     """
 
     folder: Path
@@ -43,6 +45,7 @@ class Capture:
     n_video_frames: int
     scale: float
     recorded_focal_px: float | None = None
+    smpl_poses: SmplPoses | None = None
 
     def __len__(self) -> int:
         return len(self.frame_index)
@@ -71,7 +74,10 @@ def mask_path(folder: Path, frame_index: int | np.integer) -> Path:
 
 
 def save_capture(capture: Capture) -> None:
-    """Write `frames.npz` into the capture's folder; images and masks are written beside it as they are made."""
+    """Write `frames.npz`, and `smpl_poses.npz` where there are poses, into the capture's folder.
+
+    Images and masks are written beside it as they are made.
+    """
     camera = capture.camera
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy) if camera else (np.nan,) * 4
     arrays: dict[str, np.ndarray] = {
@@ -94,6 +100,8 @@ def save_capture(capture: Capture) -> None:
     for name, value in zip(_INTRINSICS, intrinsics, strict=True):
         arrays[name] = np.array(value)
     save_npz(capture.folder / FRAMES_NPZ, arrays)
+    if capture.smpl_poses is not None:
+        save_smpl_poses(capture.folder / SMPL_POSES_NPZ, capture.smpl_poses)
 
 
 def load_capture(frames_dir: Path) -> Capture:
@@ -102,6 +110,7 @@ def load_capture(frames_dir: Path) -> Capture:
     Raises UserError when the folder holds no readable `frames.npz`.
     """
     arrays = load_npz(frames_dir / FRAMES_NPZ)
+    poses_path = frames_dir / SMPL_POSES_NPZ
     return Capture(
         folder=frames_dir,
         frame_index=arrays["frame_index"],
@@ -118,6 +127,7 @@ def load_capture(frames_dir: Path) -> Capture:
         n_video_frames=int(arrays["n_video_frames"].item()),
         scale=float(arrays["scale"].item()),
         recorded_focal_px=_recorded_focal_px(arrays),
+        smpl_poses=load_smpl_poses(poses_path) if poses_path.is_file() else None,
     )
 
 

@@ -1,5 +1,7 @@
 """SMPL poses that others have fitted to a recording: one layout for whatever file they came in.
 
+The body stage takes them when it gets an SMPL model file.
+
 `smpl_poses.npz` beside the video, one row for each of n frames (not necessarily all frames of the recording):
 
     frame_index     (n,) index of the frame in the recording, rising
@@ -12,7 +14,7 @@
     gender          male, female, neutral or unknown: whose SMPL model the numbers belong to
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +25,9 @@ from pipeline.io.npz import load_npz, save_npz
 
 SMPL_POSES_NPZ = "smpl_poses.npz"
 N_BODY_POSE, N_BETAS = 69, 10
+RIGID = 1e-3
+"""How far a rotation in `smpl_to_camera` may be from one."""
+
 GENDERS = ("male", "female", "neutral", "unknown")
 _ROW_SHAPES = {
     "frame_index": (),
@@ -46,6 +51,11 @@ class SmplPoses:
     smpl_to_camera: Float[np.ndarray, "n 4 4"]
     gender: str
 
+    def of(self, frame_index: Int[np.ndarray, "m"]) -> "SmplPoses":
+        """The rows of those of these frames that there are."""
+        rows = np.flatnonzero(np.isin(self.frame_index, frame_index))
+        return replace(self, **{name: getattr(self, name)[rows] for name in _ROW_SHAPES})
+
 
 def save_smpl_poses(path: Path, poses: SmplPoses) -> None:
     """Write the poses; `load_smpl_poses` is the inverse."""
@@ -58,7 +68,8 @@ def load_smpl_poses(path: Path) -> SmplPoses:
     """Read what `save_smpl_poses`, or a user after the module's description, wrote.
 
     Raises:
-        UserError: the file cannot be read, an array is missing or of another shape, frames do not rise.
+        UserError: the file cannot be read, an array is missing, of another shape or not finite, frames do not rise, or
+            `smpl_to_camera` is no rotation and shift.
     """
     arrays = load_npz(path)
     n = len(np.atleast_1d(arrays.get("frame_index", np.zeros(0))))
@@ -72,4 +83,9 @@ def load_smpl_poses(path: Path) -> SmplPoses:
     if gender not in GENDERS:
         raise UserError(f"{path}: gender is {gender}; write one of {', '.join(GENDERS)}")
     floats = {name: arrays[name].astype(np.float32) for name in _ROW_SHAPES if name != "frame_index"}
+    if broken := next((name for name, values in floats.items() if not np.isfinite(values).all()), None):
+        raise UserError(f"{path}: `{broken}` holds a number that is not finite; leave out frames without a pose")
+    turn = floats["smpl_to_camera"][:, :3, :3]
+    if (np.abs(turn @ turn.transpose(0, 2, 1) - np.eye(3)) > RIGID).any() or (np.linalg.det(turn) < 0).any():
+        raise UserError(f"{path}: `smpl_to_camera` must be a rotation and a shift; divide its scale out")
     return SmplPoses(frame_index=arrays["frame_index"].astype(np.int32), **floats, gender=gender)

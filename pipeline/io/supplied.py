@@ -8,8 +8,9 @@
                   and `world_to_camera` (4 x 4, row-major)
     split.json    lists of frame indices `train` and `heldout`, optionally `validation` (else every eighth training
                   frame, from the fifth on); the frames that stand in none are left out
+    smpl_poses.npz  poses that others fitted, of any frames (`pipeline.io.smpl_poses`); they need the camera they are of
 
-Row i of each belongs to frame i of the recording.
+Row i of each array belongs to frame i of the recording.
 """
 
 import json
@@ -27,6 +28,7 @@ from pipeline.core.errors import UserError
 from pipeline.geometry.camera import UPRIGHT_WORLD_TO_CAMERA, Camera
 from pipeline.io.image import IMAGE_SUFFIXES, read_gray
 from pipeline.io.npz import load_npz
+from pipeline.io.smpl_poses import SMPL_POSES_NPZ, SmplPoses, load_smpl_poses
 from pipeline.io.video import Source, natural_key
 
 N_LANDMARKS = 33
@@ -103,6 +105,7 @@ class Supplied:
     landmarks: SuppliedLandmarks | None
     camera: SuppliedCamera | None
     split: SuppliedSplit | None = None
+    smpl_poses: SmplPoses | None = None
 
 
 def find_supplied(path: Path, source: Source) -> Supplied:
@@ -113,13 +116,16 @@ def find_supplied(path: Path, source: Source) -> Supplied:
     if not path.is_dir():
         return Supplied(None, "", None, None)
     read_mask, mask_source = _find_masks(path, source)
-    landmarks_path, camera_path, split_path = (path / f for f in ("landmarks.npz", "camera.json", "split.json"))
+    landmarks_path, camera_path, split_path, poses_path = (
+        path / name for name in ("landmarks.npz", "camera.json", "split.json", SMPL_POSES_NPZ)
+    )
     return Supplied(
         read_mask,
         mask_source,
         _read_landmarks(landmarks_path, source) if landmarks_path.is_file() else None,
         _read_camera(camera_path) if camera_path.is_file() else None,
         _read_split(split_path, source) if split_path.is_file() else None,
+        _read_smpl_poses(poses_path, source) if poses_path.is_file() else None,
     )
 
 
@@ -220,6 +226,16 @@ def _read_split(path: Path, source: Source) -> SuppliedSplit:
     kinds = np.concatenate([np.full(len(lists[name]), kind, np.uint8) for name, kind in _SPLITS.items()])
     order = np.argsort(indices)
     return SuppliedSplit(indices[order], kinds[order])
+
+
+def _read_smpl_poses(path: Path, source: Source) -> SmplPoses:
+    poses = load_smpl_poses(path)
+    if len(poses.frame_index) and not 0 <= poses.frame_index[0] <= poses.frame_index[-1] < source.n_frames:
+        raise UserError(
+            f"{path} has poses of frames {poses.frame_index[0]} to {poses.frame_index[-1]}, {source.path} has 0 to "
+            f"{source.n_frames - 1}; give the recording that belongs to them"
+        )
+    return poses
 
 
 def _check_count(path: Path, count: int, source: Source) -> None:

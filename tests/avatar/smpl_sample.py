@@ -2,14 +2,15 @@
 
 from functools import lru_cache
 
+import cv2
 import fast_simplification
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
 from pipeline.avatar.body import AnnyBody, load_anny
-from pipeline.avatar.smpl import JOINT_NAMES, SmplArrays
-from pipeline.geometry.rotation import axis_angle_to_matrix
+from pipeline.avatar.smpl import JOINT_NAMES, SmplArrays, SmplBody
+from pipeline.geometry.rotation import axis_angle_to_matrix, matrix_to_quaternion, quaternion_to_axis_angle
 from pipeline.geometry.skinning import forward_kinematics, linear_blend_skinning, skinning_transforms
 
 CHANGES = (
@@ -112,6 +113,37 @@ def _regressor(template: np.ndarray, joints: np.ndarray) -> np.ndarray:
         matrix = np.vstack([template[near].T, np.ones(len(near))])
         regressor[row, near] = np.linalg.lstsq(matrix, np.append(joint, 1.0), rcond=None)[0]
     return regressor
+
+
+def smpl_vertices(
+    arrays: SmplArrays, betas: np.ndarray, axis_angle: np.ndarray, transl_m: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """SMPL's own formula for one frame, without pose blend shapes: vertices (v, 3) and joints (j, 3), metres."""
+    template = arrays.template_m + arrays.shape_directions_m @ betas
+    joints = arrays.joint_regressor @ template
+    world = np.zeros((len(joints), 4, 4))
+    for joint, parent in enumerate(arrays.parents):
+        local = np.eye(4)
+        local[:3, :3] = cv2.Rodrigues(axis_angle[joint].astype(np.float64))[0]
+        local[:3, 3] = joints[joint] - (joints[parent] if parent >= 0 else 0.0)
+        world[joint] = world[parent] @ local if parent >= 0 else local
+    posed = world[:, :3, 3] + transl_m
+    moved = np.einsum("jab,vjb->vja", world[:, :3, :3], template[:, None] - joints) + posed
+    weights = arrays.skin_weights / arrays.skin_weights.sum(axis=1, keepdims=True)
+    return np.einsum("vj,vja->va", weights, moved), posed
+
+
+def smpl_pose_of(body: SmplBody, rotations: torch.Tensor) -> np.ndarray:
+    """Axis-angles (n, 24, 3) of SMPL for local rotations (n, j, 3, 3) of this house: theta_j = Q_parent^T R_j Q_j.
+
+    The world rotations Q of the A-pose are undone by the local rotations that this house has for SMPL's T-pose.
+    """
+    still = body.local_rotations(torch.eye(3).repeat(1, len(body.parents), 1, 1))
+    t_pose = forward_kinematics(still, torch.zeros(1, 3), torch.zeros(len(body.parents), 3), body.parents)
+    bind = t_pose[0, :, :3, :3].transpose(-1, -2)
+    above = torch.cat([torch.eye(3)[None], bind[body.parents[1:].tolist()]])
+    theta = above.transpose(-1, -2) @ rotations.float() @ bind
+    return quaternion_to_axis_angle(matrix_to_quaternion(theta)).numpy()
 
 
 def file_contents(arrays: SmplArrays) -> dict[str, np.ndarray]:

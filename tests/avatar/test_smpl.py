@@ -1,12 +1,13 @@
 """SMPL-like models: bind pose, shape, landmarks, conversion of poses, and a fit that finds a known person."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from pipeline.avatar.body import ParametricBody, load_anny
+from pipeline.avatar.body import Motion, ParametricBody, canonical_to_world, load_anny
 from pipeline.avatar.fit import FitOptions, FitResult, fit_body
 from pipeline.avatar.fit_landmarks import LANDMARKS
 from pipeline.avatar.fit_model import ACTIVE_JOINTS, GRIP_RAD, grip_rotations
@@ -20,7 +21,7 @@ from pipeline.geometry.rotation import (
 )
 from pipeline.geometry.skinning import forward_kinematics, linear_blend_skinning, skinning_transforms
 from tests.avatar.acting import Act, act, joint_errors_m
-from tests.avatar.smpl_sample import made_up_arrays
+from tests.avatar.smpl_sample import made_up_arrays, smpl_vertices
 
 FRAMES = 16
 BETAS = {"beta_0": 1.0, "beta_1": 1.5, "beta_4": -1.0}
@@ -128,6 +129,53 @@ def test_a_pose_of_smpl_is_the_same_pose_here(smpl: SmplBody) -> None:
     rigid = weights.max(dim=1).values > 0.999
     assert rigid.sum() > 300
     assert torch.allclose(found[0, rigid], expected[0, rigid], atol=1e-4)
+
+
+@pytest.mark.parametrize("count", [24, 52])
+def test_poses_that_others_fitted_stand_where_smpl_puts_them(count: int) -> None:
+    """Shape, translation and a turned space included: every joint lies where SMPL's own formula has it."""
+    arrays, body = made_up_arrays(count), SmplBody(made_up_arrays(count))
+    random = np.random.default_rng(0)
+    pose, transl, betas = (random.normal(0.0, 0.4, (3, *shape)).astype(np.float32) for shape in ((24, 3), (3,), (10,)))
+    pose[:, 22:] = 0.0
+    to_world = np.tile(np.eye(4, dtype=np.float32), (3, 1, 1))
+    to_world[:, :3, :3] = axis_angle_to_matrix(torch.tensor([3.0, 0.2, -0.1])).numpy()
+    to_world[:, :3, 3] = [0.1, -0.2, 4.0]
+    rotations, root_m = body.placed(*map(torch.from_numpy, (pose, transl, betas, to_world)))
+    assert rotations.shape[1] == (24 if count == 24 else 22)
+    for frame in range(3):
+        theta = np.zeros((count, 3))
+        theta[:22] = pose[frame, :22]
+        _, expected = smpl_vertices(arrays, betas[frame], theta, transl[frame])
+        expected = expected @ to_world[frame, :3, :3].T + to_world[frame, :3, 3]
+        joints_m = body.rest(torch.from_numpy(betas[frame]))[1]
+        local = torch.eye(3).repeat(1, count, 1, 1)
+        local[0, : rotations.shape[1]] = rotations[frame]
+        found = forward_kinematics(local, root_m[frame : frame + 1], joints_m, body.parents)[0, :22, :3, 3]
+        np.testing.assert_allclose(found, expected[:22], atol=1e-4)
+
+
+def test_poses_of_the_real_data_set_stand_where_smpl_puts_them(shared_data: Path, smpl: SmplBody) -> None:
+    """InstantAvatar's own file: the surface too, where one joint alone moves it."""
+    with np.load(shared_data / "formats" / "male-3-casual_test.npz") as file:
+        pose = np.concatenate([file["global_orient"], file["body_pose"]], axis=1)[::20].reshape(-1, 24, 3)
+        transl, betas = file["transl"][::20], np.repeat(file["betas"], len(pose), axis=0)
+    here = torch.eye(4).repeat(len(pose), 1, 1)
+    rotations, root_m = smpl.placed(*map(torch.from_numpy, (pose, transl, betas)), here)
+    body = smpl.body(torch.from_numpy(betas[0]))
+    quaternions = matrix_to_quaternion(rotations).numpy()
+    motion = Motion(np.arange(len(pose), dtype=np.int32), np.arange(len(pose)) / 25.0, quaternions, root_m.numpy())
+    weights = torch.from_numpy(body.skin_weights)
+    found = linear_blend_skinning(torch.from_numpy(body.vertices), weights, canonical_to_world(body, motion))
+    rigid = (weights.max(dim=1).values > 0.999).numpy()
+    for frame in range(len(pose)):
+        expected, _ = smpl_vertices(made_up_arrays(24), betas[0], pose[frame], transl[frame])
+        np.testing.assert_allclose(found[frame, rigid], expected[rigid], atol=5e-4)
+
+
+def test_poses_fitted_with_smpl_hold_for_models_with_its_shapes() -> None:
+    assert [SmplBody(made_up_arrays(count)).takes_smpl_poses(10) for count in (24, 52, 55)] == [True, True, False]
+    assert not SmplBody(made_up_arrays(24)).takes_smpl_poses(16)
 
 
 def test_smallest_rotation_between_directions() -> None:

@@ -10,6 +10,7 @@ from pipeline.geometry.camera import Camera
 from pipeline.io.capture import IMAGES_FOLDER, MASKS_FOLDER, Capture, image_path, load_capture, mask_path, save_capture
 from pipeline.io.contact import contact_sheet
 from pipeline.io.image import write_gray, write_rgb
+from tests.io.test_smpl_poses import make_poses
 
 
 @pytest.fixture
@@ -50,6 +51,13 @@ def test_round_trip(capture):
             np.testing.assert_array_equal(getattr(loaded, field.name), getattr(capture, field.name), err_msg=field.name)
     assert dataclasses.astuple(loaded.camera)[:6] == dataclasses.astuple(capture.camera)[:6]
     assert len(loaded) == 4
+
+
+def test_supplied_poses_lie_beside(capture):
+    save_capture(dataclasses.replace(capture, smpl_poses=make_poses()))
+    poses = load_capture(capture.folder).smpl_poses
+    assert poses is not None
+    np.testing.assert_array_equal(poses.body_pose, make_poses().body_pose)
 
 
 def test_unknown_camera_stays_unknown(capture):

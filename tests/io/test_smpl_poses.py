@@ -15,7 +15,10 @@ def make_poses(n: int = 3) -> SmplPoses:
         return rng.normal(size=(n, *shape)).astype(np.float32)
 
     index = np.arange(n, dtype=np.int32) * 4
-    return SmplPoses(index, rows(3), rows(69), rows(3), rows(10), rows(4, 4), "female")
+    turned = rows(4, 4)
+    turned[:, :3, :3] = np.linalg.qr(turned[:, :3, :3])[0]
+    turned[:, :3, 0] *= np.linalg.det(turned[:, :3, :3])[:, None]
+    return SmplPoses(index, rows(3), rows(69), rows(3), rows(10), turned, "female")
 
 
 def test_round_trip(tmp_path):
@@ -24,6 +27,14 @@ def test_round_trip(tmp_path):
     read = load_smpl_poses(tmp_path / "p.npz")
     for name, value in vars(poses).items():
         np.testing.assert_array_equal(getattr(read, name), value)
+
+
+def test_rows_of_some_frames():
+    poses = make_poses(5)
+    some = poses.of(np.array([2, 4, 7, 16, 400]))
+    np.testing.assert_array_equal(some.frame_index, [4, 16])
+    np.testing.assert_array_equal(some.transl, poses.transl[[1, 4]])
+    assert some.gender == "female"
 
 
 def test_gender_may_be_left_out(tmp_path):
@@ -43,6 +54,9 @@ def test_gender_may_be_left_out(tmp_path):
         ("frame_index", None, "`frame_index` must have shape"),
         ("frame_index", np.array([0, 4, 4]), "does not rise"),
         ("gender", np.array("giant"), "gender is giant"),
+        ("transl", np.full((3, 3), np.nan), "`transl` holds a number that is not finite"),
+        ("smpl_to_camera", np.tile(2 * np.eye(4), (3, 1, 1)), "must be a rotation and a shift"),
+        ("smpl_to_camera", np.tile(np.diag([1.0, -1, 1, 1]), (3, 1, 1)), "must be a rotation and a shift"),
     ],
 )
 def test_what_does_not_fit_is_named(tmp_path, name, value, message):

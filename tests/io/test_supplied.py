@@ -9,8 +9,10 @@ import pytest
 from pipeline.core.errors import UserError
 from pipeline.io.image import write_gray
 from pipeline.io.npz import save_npz
+from pipeline.io.smpl_poses import save_smpl_poses
 from pipeline.io.supplied import SuppliedCamera, find_supplied
 from pipeline.io.video import Source
+from tests.io.test_smpl_poses import make_poses
 
 CAMERA = {"fx": 500.0, "fy": 510.0, "cx": 64.0, "cy": 48.0}
 
@@ -49,6 +51,14 @@ def test_mask_arrays_are_brought_to_255(tmp_path, source):
     supplied = find_supplied(tmp_path, source)
     assert supplied.mask_source == "masks.hdf5"
     assert [int(supplied.read_mask(i).max()) for i in range(3)] == [0, 0, 255]
+
+
+def test_poses_of_frames_that_there_are(tmp_path, source):
+    save_smpl_poses(tmp_path / "smpl_poses.npz", make_poses(1))
+    assert find_supplied(tmp_path, source).smpl_poses.gender == "female"
+    save_smpl_poses(tmp_path / "smpl_poses.npz", make_poses(2))
+    with pytest.raises(UserError, match="has poses of frames 0 to 4, .* has 0 to 2"):
+        find_supplied(tmp_path, source)
 
 
 def test_landmarks_with_and_without_the_rest(tmp_path, source):

@@ -1,15 +1,30 @@
 """Stage `body` with a model file of the user's: the same artifacts, with the model's joints."""
 
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
+import torch
 
+from pipeline.avatar.body import load_anny
 from pipeline.avatar.smpl import SmplBody
 from pipeline.core.errors import UserError
+from pipeline.core.progress import take_warnings
+from pipeline.geometry.camera import Camera
+from pipeline.geometry.rotation import quaternion_to_matrix
+from pipeline.geometry.skinning import forward_kinematics
+from pipeline.io.capture import load_capture
 from pipeline.io.npz import load_body, load_motion
-from stages.body import STAGE, Config, run
-from tests.avatar.acting import act
-from tests.avatar.smpl_sample import file_contents, made_up_arrays
+from pipeline.io.smpl_poses import SmplPoses, save_smpl_poses
+from stages.body import STAGE, Config, run, supplied_poses
+from tests.avatar.acting import Act, act
+from tests.avatar.smpl_sample import file_contents, made_up_arrays, smpl_pose_of
 from tests.stages.test_body import FRAMES, write_capture
+
+SPACE = np.array([[0.0, 0.0, 1.0, 0.4], [0.0, -1.0, 0.0, 0.1], [1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 0.0, 1.0]])
+"""Some space that poses may be given in, to camera axes."""
 
 
 @pytest.fixture
@@ -42,3 +57,124 @@ def test_a_missing_model_file_is_refused(tmp_path) -> None:
     write_capture(tmp_path / "frames", scene, scene.camera, scene.masks())
     with pytest.raises(UserError, match="SMPL_MALE.npz"):
         run({"frames": tmp_path / "frames"}, tmp_path, Config(model_file=str(tmp_path / "SMPL_MALE.npz")))
+
+
+@pytest.fixture(scope="module")
+def scene() -> Act:
+    """A person of known betas, with landmarks that err by 2 cm."""
+    return act(SmplBody(made_up_arrays(24)), FRAMES, shape={"beta_0": 1.0, "beta_1": 1.5}, turn_rad=2.0, noise_m=0.02)
+
+
+def true_poses(scene: Act) -> SmplPoses:
+    """The scene's poses as a data set would give them; `write_capture` says which frames they are of."""
+    arrays = made_up_arrays(24)
+    betas = scene.state.shape.float().numpy()
+    theta = smpl_pose_of(SmplBody(arrays), scene.model.rotations_of_all(scene.state.rotations))
+    world_to_smpl = np.linalg.inv(SPACE) @ scene.camera.world_to_camera
+    root = axis_angle_product(world_to_smpl[:3, :3], theta[:, 0])
+    pelvis = arrays.joint_regressor[0] @ (arrays.template_m + arrays.shape_directions_m @ betas)
+    place = scene.state.root_m.numpy() @ world_to_smpl[:3, :3].T + world_to_smpl[:3, 3] - pelvis
+    return SmplPoses(
+        frame_index=3 * np.arange(FRAMES, dtype=np.int32),
+        global_orient=root,
+        body_pose=theta[:, 1:].reshape(FRAMES, 69),
+        transl=place.astype(np.float32),
+        betas=np.tile(betas, (FRAMES, 1)),
+        smpl_to_camera=np.tile(SPACE.astype(np.float32), (FRAMES, 1, 1)),
+        gender="neutral",
+    )
+
+
+def axis_angle_product(matrix: np.ndarray, axis_angle: np.ndarray) -> np.ndarray:
+    """matrix @ exp(axis_angle), as axis-angle."""
+    turned = [cv2.Rodrigues(matrix @ cv2.Rodrigues(vector.astype(np.float64))[0])[0][:, 0] for vector in axis_angle]
+    return np.stack(turned).astype(np.float32)
+
+
+def errors_m(out: Path, scene: Act) -> np.ndarray:
+    """Mean distance of each frame's joints from the true ones."""
+    body, motion = load_body(out / "body.npz"), load_motion(out / "motion.npz")
+    joint_to_world = forward_kinematics(
+        quaternion_to_matrix(torch.tensor(motion.rotations_wxyz)),
+        torch.tensor(motion.root_translation_m),
+        torch.tensor(body.joints_m),
+        body.parents,
+    )
+    found = joint_to_world[:, list(scene.model.full_joint), :3, 3].double()
+    return (found - scene.joints_m()).norm(dim=-1).mean(1).numpy()
+
+
+def fitted(
+    folder: Path, scene: Act, poses: SmplPoses, camera: Camera | None, **options: object
+) -> tuple[Path, dict[str, float]]:
+    """Run the stage on a capture with these poses; its folder and figures."""
+    frames, out = folder / "frames", folder / "body"
+    out.mkdir()
+    write_capture(frames, scene, camera, scene.masks())
+    save_smpl_poses(frames / "smpl_poses.npz", poses)
+    return out, dict(run({"frames": frames}, out, Config(rounds=1, **options)))
+
+
+def test_supplied_poses_are_kept(tmp_path, model_file, scene: Act) -> None:
+    """Landmarks 2 cm off change nothing; the shape is that of the file."""
+    out, metrics = fitted(tmp_path, scene, true_poses(scene), scene.camera, model_file=str(model_file))
+    assert errors_m(out, scene).max() < 1e-4
+    assert metrics["silhouette_iou"] > 0.98
+    assert list(load_body(out / "body.npz").shape.values()) == pytest.approx(scene.state.shape.tolist(), abs=1e-5)
+    assert take_warnings() == []
+
+
+def test_frames_without_a_supplied_pose_are_fitted(tmp_path, model_file, scene: Act) -> None:
+    """The first frame lies before all given poses, the third between two of them."""
+    missing = np.isin(np.arange(FRAMES), [0, 2])
+    poses = true_poses(scene).of(3 * np.flatnonzero(~missing))
+    out, _ = fitted(tmp_path, scene, poses, scene.camera, model_file=str(model_file))
+    errors = errors_m(out, scene)
+    assert errors[~missing].max() < 1e-4
+    assert 1e-4 < errors[missing].max() < 0.06
+
+
+def test_supplied_poses_are_where_the_fit_starts(tmp_path, model_file, scene: Act) -> None:
+    """Poses that are 5 cm off and bent are drawn to the outlines; the shape stays that of the file."""
+    true = true_poses(scene)
+    random = np.random.default_rng(0)
+    bent = true.body_pose + random.normal(0.0, 0.05, true.body_pose.shape).astype(np.float32)
+    wrong = replace(true, body_pose=bent, transl=true.transl + np.float32(0.03))
+    (tmp_path / "kept").mkdir()
+    kept, _ = fitted(tmp_path / "kept", scene, wrong, scene.camera, model_file=str(model_file))
+    out, _ = fitted(tmp_path, scene, wrong, scene.camera, model_file=str(model_file), supplied_poses="start")
+    assert errors_m(kept, scene).mean() > 0.05
+    assert errors_m(out, scene).mean() < 0.025
+    assert list(load_body(out / "body.npz").shape.values()) == pytest.approx(scene.state.shape.tolist(), abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("joints", "knows_camera", "frames", "said"),
+    [
+        (0, True, slice(None), "an SMPL or SMPL-H model file (neutral), --set body.model_file"),
+        (55, True, slice(None), "an SMPL or SMPL-H model file"),
+        (24, False, slice(None), "supply camera.json"),
+        (24, True, slice(0), "no pose of a chosen frame"),
+    ],
+)
+def test_poses_that_cannot_be_used_are_said(
+    tmp_path, scene: Act, joints: int, knows_camera: bool, frames: slice, said: str
+) -> None:
+    model = SmplBody(made_up_arrays(joints)) if joints else load_anny()
+    write_capture(tmp_path / "frames", scene, scene.camera, [])
+    poses = true_poses(scene)
+    take_warnings()
+    capture = replace(load_capture(tmp_path / "frames"), smpl_poses=poses.of(poses.frame_index[frames]))
+    assert supplied_poses(capture, model, scene.camera, knows_camera, Config()) is None
+    (sentence,) = take_warnings()
+    assert "smpl_poses.npz is not used" in sentence
+    assert said in sentence
+    assert supplied_poses(capture, model, scene.camera, knows_camera, Config(supplied_poses="ignore")) is None
+    assert take_warnings() == []
+
+
+def test_poses_of_a_person_elsewhere_are_refused_with_a_remedy(tmp_path, model_file, scene: Act) -> None:
+    poses = true_poses(scene)
+    elsewhere = replace(poses, transl=poses.transl + np.float32(0.5))
+    with pytest.raises(UserError, match=r"does not fit the person .* body.supplied_poses=start, or lower"):
+        fitted(tmp_path, scene, elsewhere, scene.camera, model_file=str(model_file))

@@ -11,7 +11,9 @@ from pipeline.core.progress import take_warnings
 from pipeline.io.capture import load_capture
 from pipeline.io.image import write_gray, write_rgb
 from pipeline.io.npz import save_npz
+from pipeline.io.smpl_poses import save_smpl_poses
 from stages import frames
+from tests.io.test_smpl_poses import make_poses
 
 
 def draw_recording(folder, n=40, repeats=1):
@@ -83,6 +85,13 @@ def test_a_supplied_split_is_kept_frame_by_frame(tmp_path):
     np.testing.assert_array_equal(capture.frame_index[capture.positions(1)], [7, 15, 23])
     assert (metrics["frames_train"], metrics["frames_validation"], metrics["frames_heldout"]) == (18, 3, 4)
     assert metrics["dropped_duplicates"] == 0
+
+
+def test_supplied_poses_of_the_chosen_frames_go_on(tmp_path):
+    folder = write_split(draw_recording(tmp_path / "in", n=40), range(5, 24), range(30, 40, 3))
+    save_smpl_poses(folder / "smpl_poses.npz", make_poses(10))
+    run(folder, tmp_path / "out")
+    np.testing.assert_array_equal(load_capture(tmp_path / "out").smpl_poses.frame_index, [8, 12, 16, 20, 36])
 
 
 def test_a_split_with_more_frames_than_may_be_kept_is_refused(tmp_path):
