@@ -4,8 +4,8 @@ Both models ship inside the package, nothing is downloaded. Every frame is looke
 result does not depend on which process saw which frame before.
 
 The first model guesses a square around the person, the second finds landmarks and mask in it. A square that is guessed
-too small cuts off feet and pushes all landmarks up, so a mask that runs over its square is looked at again in the one
-that the landmarks ask for.
+too small cuts off feet and pushes all landmarks up, so it is left for the one that the landmarks ask for. The last two
+looks are averaged: what the second model makes of a person trembles with the square.
 """
 
 import os
@@ -13,7 +13,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -38,27 +38,45 @@ _SEPARATE_OVERLAP = 0.2
 _SURE_TORSO_VISIBILITY = 0.9
 _SAME_SIZE = 0.3
 
-_FULL_GRAPH = "mediapipe/modules/pose_landmark/pose_landmark_cpu.binarypb"
-_OUTPUTS = ("pose_landmarks", "pose_world_landmarks", "segmentation_mask", "pose_rect_from_landmarks")
-# The part of that graph that comes after the guess of the square.
-_IN_SQUARE_GRAPH = """
+# MediaPipe's own graphs smooth the squares over the frames they have seen; these two look at each frame by itself.
+_SQUARE_GRAPH = """
+input_stream: "image"
+output_stream: "square"
+node { calculator: "PoseDetectionCpu" input_stream: "IMAGE:image" output_stream: "DETECTIONS:detections" }
+node {
+  calculator: "SplitDetectionVectorCalculator"
+  input_stream: "detections"
+  output_stream: "detection"
+  node_options: {
+    [type.googleapis.com/mediapipe.SplitVectorCalculatorOptions] { ranges: { begin: 0 end: 1 } element_only: true }
+  }
+}
+node { calculator: "ImagePropertiesCalculator" input_stream: "IMAGE_CPU:image" output_stream: "SIZE:image_size" }
+node {
+  calculator: "PoseDetectionToRoi"
+  input_stream: "DETECTION:detection"
+  input_stream: "IMAGE_SIZE:image_size"
+  output_stream: "ROI:square"
+}
+"""
+_LANDMARKS_GRAPH = """
 input_stream: "image"
 input_stream: "square"
 input_side_packet: "model_complexity"
 input_side_packet: "enable_segmentation"
-output_stream: "pose_landmarks"
-output_stream: "pose_world_landmarks"
-output_stream: "segmentation_mask"
-output_stream: "pose_rect_from_landmarks"
+output_stream: "landmarks"
+output_stream: "world_landmarks"
+output_stream: "mask"
+output_stream: "next_square"
 node {
   calculator: "PoseLandmarkByRoiCpu"
   input_side_packet: "MODEL_COMPLEXITY:model_complexity"
   input_side_packet: "ENABLE_SEGMENTATION:enable_segmentation"
   input_stream: "IMAGE:image"
   input_stream: "ROI:square"
-  output_stream: "LANDMARKS:pose_landmarks"
+  output_stream: "LANDMARKS:landmarks"
   output_stream: "AUXILIARY_LANDMARKS:auxiliary_landmarks"
-  output_stream: "WORLD_LANDMARKS:pose_world_landmarks"
+  output_stream: "WORLD_LANDMARKS:world_landmarks"
   output_stream: "SEGMENTATION_MASK:mask_image"
 }
 node { calculator: "ImagePropertiesCalculator" input_stream: "IMAGE_CPU:image" output_stream: "SIZE:image_size" }
@@ -66,17 +84,20 @@ node {
   calculator: "PoseLandmarksToRoi"
   input_stream: "LANDMARKS:auxiliary_landmarks"
   input_stream: "IMAGE_SIZE:image_size"
-  output_stream: "ROI:pose_rect_from_landmarks"
+  output_stream: "ROI:next_square"
 }
 node {
   calculator: "FromImageCalculator"
   input_stream: "IMAGE:mask_image"
-  output_stream: "IMAGE_CPU:segmentation_mask"
+  output_stream: "IMAGE_CPU:mask"
 }
 """
 _MODEL = {"model_complexity": 1, "enable_segmentation": True}
-# Looks at one image at most; the square grows by 10 to 20 % a look.
+# Looks for a square that holds the person; it grows by 10 to 20 % a look.
 _MOST_LOOKS = 3
+# A square is too small when the landmarks ask for one this much larger, though the mask keeps off its border: a mask
+# that has lost the feet does.
+_MOST_GROWTH = 1.1
 _CELLS_PER_SQUARE = 256
 
 
@@ -90,20 +111,25 @@ class Detection:
     mask: UInt8[np.ndarray, "h w"]
 
 
+class _Look(NamedTuple):
+    """What the second model says about a square; `landmarks` are pixels and visibility, squares NormalizedRects."""
+
+    landmarks: Float[np.ndarray, "33 3"]
+    landmarks_world_m: Float[np.ndarray, "33 3"]
+    mask: Float[np.ndarray, "h w"]
+    square: Any
+    next_square: Any
+
+
 class PersonDetector:
-    """MediaPipe's pose model in its middle size; about 35 ms an image on one core, whatever the image's size."""
+    """MediaPipe's pose model in its middle size; about 55 ms an image on one core, whatever the image's size."""
 
     def __init__(self) -> None:
         with _quiet_stderr():
             from mediapipe.python.solutions.pose import SolutionBase  # here: takes seconds and writes to stderr
 
-            no_tracking = {"smooth_landmarks": False, "smooth_segmentation": False, "use_prev_landmarks": False}
-            self._guess_square = SolutionBase(
-                binary_graph_path=_FULL_GRAPH,
-                side_inputs={**_MODEL, **no_tracking},
-                outputs=[*_OUTPUTS, "pose_rect_from_detection"],
-            )
-            self._in_square = SolutionBase(graph_config=_IN_SQUARE_GRAPH, side_inputs=_MODEL)
+            self._guess_square = SolutionBase(graph_config=_SQUARE_GRAPH)
+            self._in_square = SolutionBase(graph_config=_LANDMARKS_GRAPH, side_inputs=_MODEL)
             self._guess_square.process(np.zeros((64, 64, 3), dtype=np.uint8))
         self._has_spoken = False
 
@@ -115,28 +141,35 @@ class PersonDetector:
         1/200 of the person's height, where the model's own grid ends.
         """
         with nullcontext() if self._has_spoken else _quiet_stderr():
-            found = self._look(rgb)
-        if found.pose_landmarks is None or found.segmentation_mask is None:
+            looks = self._looks(rgb)
+        if not looks:
             return None
         self._has_spoken = True
-        height, width = rgb.shape[:2]
-        points = np.array(
-            [(p.x * width, p.y * height, p.visibility) for p in found.pose_landmarks.landmark], np.float32
-        )
-        world = np.array([(p.x, p.y, p.z) for p in found.pose_world_landmarks.landmark], np.float32)
-        mask = np.rint(np.clip(found.segmentation_mask, 0.0, 1.0) * 255.0).astype(np.uint8)
-        return Detection(points[:, :2].copy(), points[:, 2].copy(), world, mask)
+        points = np.mean([look.landmarks for look in looks], axis=0)
+        world = np.mean([look.landmarks_world_m for look in looks], axis=0)
+        mask = np.mean([look.mask for look in looks], axis=0)
+        return Detection(points[:, :2].copy(), points[:, 2].copy(), world, np.rint(255.0 * mask).astype(np.uint8))
 
-    def _look(self, rgb: UInt8[np.ndarray, "h w 3"]) -> Any:
-        """What the graph says about the most prominent person, in a square that holds all of it."""
-        found = self._guess_square.process(rgb)
-        square = found.pose_rect_from_detection
-        for _ in range(_MOST_LOOKS - 1):
-            if found.segmentation_mask is None or not runs_over(found.segmentation_mask > 0.5, square):
+    def _looks(self, rgb: UInt8[np.ndarray, "h w 3"]) -> list[_Look]:
+        """The look in the first square that holds the most prominent person, and the one in the square it asks for."""
+        last, following = None, self._look(rgb, self._guess_square.process(rgb).square)
+        for _ in range(_MOST_LOOKS):
+            if following is None or (last is not None and not is_too_small(last)):
                 break
-            square = found.pose_rect_from_landmarks
-            found = self._in_square.process({"image": rgb, "square": square})
-        return found
+            last, following = following, self._look(rgb, following.next_square)
+        return [look for look in (last, following) if look is not None]
+
+    def _look(self, rgb: UInt8[np.ndarray, "h w 3"], square: Any) -> _Look | None:
+        """The second model's word on what is in a square; None without a square or a person in it."""
+        if square is None:
+            return None
+        found = self._in_square.process({"image": rgb, "square": square})
+        if found.landmarks is None or found.mask is None:
+            return None
+        size = np.array([rgb.shape[1], rgb.shape[0], 1.0], np.float32)
+        points = np.array([(p.x, p.y, p.visibility) for p in found.landmarks.landmark], np.float32) * size
+        world = np.array([(p.x, p.y, p.z) for p in found.world_landmarks.landmark], np.float32)
+        return _Look(points, world, np.clip(found.mask, 0.0, 1.0), square, found.next_square)
 
     def count_people(self, rgb: UInt8[np.ndarray, "h w 3"]) -> int:
         """How many people of similar size are in the image.
@@ -155,6 +188,11 @@ class PersonDetector:
                 people.append(mask)
         largest = max((mask.sum() for mask in people), default=0)
         return sum(bool(mask.sum() > _SAME_SIZE * largest) for mask in people)
+
+
+def is_too_small(look: _Look) -> bool:
+    """True where the square has cut the person: the mask touches its border, or the landmarks ask for a larger one."""
+    return look.next_square.height > _MOST_GROWTH * look.square.height or runs_over(look.mask > 0.5, look.square)
 
 
 def runs_over(person: Bool[np.ndarray, "h w"], square: Any) -> bool:

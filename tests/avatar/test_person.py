@@ -104,18 +104,57 @@ def test_a_border_outside_of_the_image_is_not_touched():
     assert not person.runs_over(np.ones((100, 200), bool), square(100, 50, 300))
 
 
+def look(square, next_square, mask):
+    """A look at a square; what it says about landmarks does not matter."""
+    return person._Look(np.zeros((33, 3), np.float32), np.zeros((33, 3), np.float32), mask, square, next_square)
+
+
+@pytest.mark.parametrize(("next_side", "too_small"), [(21, False), (23, True)])
+def test_a_square_is_too_small_when_a_much_larger_one_is_asked_for(next_side, too_small):
+    mask = np.zeros((100, 200), np.float32)
+    mask[45:55, 55:65] = 1.0
+    assert person.is_too_small(look(square(60, 50, 20), square(60, 50, next_side), mask)) == too_small
+
+
+def test_a_square_is_too_small_when_the_person_runs_over_it():
+    assert person.is_too_small(look(square(60, 50, 20), square(60, 50, 20), np.ones((100, 200), np.float32)))
+
+
+def with_first_guess(guess):
+    """A detector whose first model says what it is told."""
+    detector = person.PersonDetector()
+    detector._guess_square = SimpleNamespace(process=lambda _: SimpleNamespace(square=guess))
+    return detector
+
+
 def test_a_square_that_cuts_off_the_feet_is_left_for_a_larger_one(photograph):
     """The first model's guess is replaced by one that ends above the ankles."""
-    detector = person.PersonDetector()
-    whole = detector.detect(photograph).mask
-    small = square(315, 270, 430, *photograph.shape[1::-1])
-    cut = detector._in_square.process({"image": photograph, "square": small})
-    said = {name: getattr(cut, name) for name in person._OUTPUTS}
-    wrong_guess = SimpleNamespace(**said, pose_rect_from_detection=small)
-    detector._guess_square = SimpleNamespace(process=lambda _: wrong_guess)
+    whole = person.PersonDetector().detect(photograph).mask
+    detector = with_first_guess(square(315, 270, 430, *photograph.shape[1::-1]))
+    cut = detector._look(photograph, detector._guess_square.process(photograph).square)
     mended = detector.detect(photograph).mask
-    lowest_px = [
-        np.flatnonzero(mask.any(axis=1))[-1] for mask in (cut.segmentation_mask > 0.5, mended > 127, whole > 127)
-    ]
+    lowest_px = [np.flatnonzero(mask.any(axis=1))[-1] for mask in (cut.mask > 0.5, mended > 127, whole > 127)]
     assert lowest_px[0] < lowest_px[2] - 60
     assert abs(lowest_px[1] - lowest_px[2]) < 15
+
+
+def test_two_looks_are_averaged(photograph):
+    guess = square(315, 315, 640, *photograph.shape[1::-1])
+    detector = with_first_guess(guess)
+    first = detector._look(photograph, guess)
+    second = detector._look(photograph, first.next_square)
+    found = detector.detect(photograph)
+    assert np.abs(first.landmarks - second.landmarks).max() > 1.0
+    np.testing.assert_allclose(found.landmarks_px, 0.5 * (first.landmarks + second.landmarks)[:, :2], atol=1e-3)
+    np.testing.assert_allclose(found.mask, 127.5 * (first.mask + second.mask), atol=0.51)
+
+
+def test_what_was_seen_before_changes_nothing(detector, photograph):
+    """MediaPipe's whole graph smooths its squares in time, even when it is told not to."""
+    shrunk = np.full_like(photograph, 128)
+    shrunk[100:415, 20:335] = photograph[::2, ::2]
+    for _ in range(3):
+        detector.detect(shrunk)
+    after_others, fresh = detector.detect(photograph), person.PersonDetector().detect(photograph)
+    np.testing.assert_array_equal(after_others.mask, fresh.mask)
+    np.testing.assert_array_equal(after_others.landmarks_px, fresh.landmarks_px)
