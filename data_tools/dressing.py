@@ -17,7 +17,7 @@ from data_tools.anatomy import SKIN, SKIRT, Anatomy, limb_weights, surface_kinds
 from data_tools.noise import Noise
 from data_tools.outfit import LAYERS, Outfit, layer_depths
 from data_tools.skirt import ATLAS_SHARE, hang_skirt
-from data_tools.surface import neighbour_mean, smoothed, split_at_midpoints, with_midpoints
+from data_tools.surface import neighbour_mean, smoothed, split_at_midpoints, way_out_m, with_midpoints
 from pipeline.avatar.body import AnnyBody, Body
 from pipeline.geometry.mesh import Mesh
 
@@ -132,18 +132,12 @@ def _with_toe_boxes(
 def _onto_hull(
     points: Float[np.ndarray, "n 3"], hull: Float[np.ndarray, "h 4"], toes: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Where rays from the foot's axis through the points leave the hull widened by `SHOE_M`.
-
-    A half-space n·x + d <= 0 ends the ray a + t u at t = -(n·a + d) / (n·u); the smallest positive t is the surface.
-    """
+    """Where rays from the foot's axis through the points leave the hull widened by `SHOE_M`."""
     ahead = np.minimum(points[:, 2], toes[2] - 0.03)
     axis = np.stack([np.full(len(points), toes[0]), np.full(len(points), 0.012), ahead], axis=1)
     outwards = points - axis
     outwards /= np.maximum(np.linalg.norm(outwards, axis=1, keepdims=True), 1e-9)
-    slope = outwards @ hull[:, :3].T
-    room = SHOE_M - (axis @ hull[:, :3].T + hull[:, 3])
-    travel = np.where(slope > 1e-6, room / np.maximum(slope, 1e-6), np.inf).min(axis=1)
-    return (axis + travel[:, None] * outwards).astype(points.dtype)
+    return (axis + way_out_m(axis, outwards, hull, SHOE_M)[:, None] * outwards).astype(points.dtype)
 
 
 def _with_flat_sole(vertices: Float[np.ndarray, "v 3"], inside: Float[np.ndarray, "v"]) -> Float[np.ndarray, "v 3"]:

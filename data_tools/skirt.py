@@ -14,6 +14,7 @@ from scipy.spatial import ConvexHull
 
 from data_tools.anatomy import Anatomy
 from data_tools.noise import Noise
+from data_tools.surface import way_out_m
 from pipeline.avatar.body import Body
 
 ROWS, COLUMNS = 40, 192
@@ -105,14 +106,10 @@ def _axis_m(height_m: Float[np.ndarray, "r"], anatomy: Anatomy) -> Float[np.ndar
 def _hull_radius(
     points_m: Float[np.ndarray, "n 3"], middle_m: Float[np.ndarray, "3"], outwards: Float[np.ndarray, "c 3"]
 ) -> Float[np.ndarray, "c"]:
-    """Where horizontal rays from the middle leave the convex hull of the body near that height.
-
-    A half-plane n·x + d <= 0 ends the ray t u at t = -d / (n·u); the smallest positive t is the outline.
-    """
+    """Where horizontal rays from the middle leave the convex hull of the body near that height."""
     near = np.abs(points_m[:, 1] - middle_m[1]) < _SLICE_M
     hull = ConvexHull(points_m[near][:, [0, 2]] - middle_m[[0, 2]]).equations
-    slope = outwards[:, [0]] * hull[:, 0] + outwards[:, [2]] * hull[:, 1]
-    return np.where(slope > 1e-9, -hull[:, 2] / np.maximum(slope, 1e-9), np.inf).min(axis=1)
+    return way_out_m(np.zeros((1, 2)), outwards[:, [0, 2]], hull)
 
 
 def _shared_weights(

@@ -1,8 +1,11 @@
-"""Mesh operations that dressing a body needs: midpoint subdivision, smoothing, connected parts."""
+"""Mesh operations that dressing a body needs: midpoint subdivision, smoothing, connected parts, convex hulls."""
 
 import numpy as np
 import scipy.sparse as sparse
 from jaxtyping import Float, Int
+
+_PARALLEL = 1e-9
+"""A ray that nears a plane more slowly than this never meets it."""
 
 
 def split_at_midpoints(
@@ -55,3 +58,20 @@ def face_parts(faces: Int[np.ndarray, "f 3"], vertex_count: int) -> Int[np.ndarr
     rank = np.empty_like(by_size)
     rank[by_size] = np.arange(len(by_size))
     return rank[part].astype(np.int32)
+
+
+def way_out_m(
+    starts_m: Float[np.ndarray, "#n d"],
+    directions: Float[np.ndarray, "n d"],
+    half_spaces: Float[np.ndarray, "h e"],
+    margin_m: float = 0.0,
+) -> Float[np.ndarray, "n"]:
+    """How far rays from inside a convex hull run until they leave it, widened by a margin.
+
+    A half-space n·x + d <= 0 (a row of `ConvexHull.equations`: unit normal n, offset d) ends the ray a + t u at
+    t = (margin - n·a - d) / (n·u); the smallest positive t is the surface.
+    """
+    normals, offsets_m = half_spaces[:, :-1].T, half_spaces[:, -1]
+    slope = directions @ normals
+    room_m = margin_m - (starts_m @ normals + offsets_m)
+    return np.where(slope > _PARALLEL, room_m / np.maximum(slope, _PARALLEL), np.inf).min(axis=1)

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull
 
-from data_tools.surface import face_parts, neighbour_mean, smoothed, split_at_midpoints, with_midpoints
+from data_tools.surface import face_parts, neighbour_mean, smoothed, split_at_midpoints, way_out_m, with_midpoints
 from pipeline.geometry.mesh import Mesh
 from tests.data_tools.shapes import TETRAHEDRON, octahedron, sphere
 
@@ -67,3 +68,18 @@ def test_parts_are_numbered_by_size() -> None:
     both = np.concatenate([faces, octahedron()[1] + len(vertices)])
     parts = face_parts(both, 10)
     assert parts.tolist() == [1] * 4 + [0] * 8
+
+
+@pytest.mark.parametrize("size", [2, 3])
+def test_the_way_out_of_a_box(size: int) -> None:
+    """A ray leaves a box from -1 to 1 where its first coordinate reaches a side, which the margin moves."""
+    random = np.random.default_rng(0)
+    box = np.stack(np.meshgrid(*[[-1.0, 1.0]] * size), axis=-1).reshape(-1, size)
+    starts, directions = random.uniform(-0.9, 0.9, (50, size)), random.normal(size=(50, size))
+    directions[0] = np.eye(size)[0]  # along four sides of a cube
+    for margin in (0.0, 0.25):
+        ahead = ((1.0 + margin) * np.sign(directions) - starts) / np.where(directions == 0.0, np.nan, directions)
+        found = way_out_m(starts, directions, ConvexHull(box).equations, margin)
+        np.testing.assert_allclose(found, np.nanmin(ahead, axis=1), rtol=1e-9)
+    middle = way_out_m(np.zeros((1, size)), directions, ConvexHull(box).equations)
+    np.testing.assert_allclose(middle, 1.0 / np.abs(directions).max(axis=1), rtol=1e-9)
