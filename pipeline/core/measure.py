@@ -6,6 +6,7 @@ import re
 import resource
 import subprocess
 import sys
+from collections.abc import Iterable
 from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any
@@ -14,18 +15,24 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 MIB = 1024.0 * 1024.0
 
 
-def peak_rss_mib() -> float:
-    """Highest resident memory of this process so far, in MiB, or of its largest finished child if that is more.
+_worker_peaks_mib: dict[int, float] = {}
 
-    Linux: VmHWM of /proc, because getrusage's figure also counts the parent that started this process.
+
+def count_workers(pids: Iterable[int]) -> None:
+    """Add the peaks of these processes to `peak_rss_mib`; call it at the end of their work, while they still live."""
+    _worker_peaks_mib.update({pid: peak for pid in pids if (peak := _high_water_mib(str(pid))) is not None})
+
+
+def peak_rss_mib() -> float:
+    """Highest resident memory so far, in MiB: this process's and the peaks of the workers that were counted.
+
+    More than was held at once where the peaks did not coincide, and pages that processes share count for each. At
+    least what the largest finished child had: the system tells that one alone, and outside Linux nothing else.
     """
-    children = _maxrss_mib(resource.RUSAGE_CHILDREN)
-    status = Path("/proc/self/status")
-    if status.exists():
-        found = re.search(r"^VmHWM:\s+(\d+) kB", status.read_text(), re.MULTILINE)
-        if found:
-            return max(int(found.group(1)) * 1024 / MIB, children)
-    return max(_maxrss_mib(resource.RUSAGE_SELF), children)
+    # Not getrusage's figure for this process, where there is another: it also counts the parent that started it.
+    own = _high_water_mib("self")
+    together = (_maxrss_mib(resource.RUSAGE_SELF) if own is None else own) + sum(_worker_peaks_mib.values())
+    return max(together, _maxrss_mib(resource.RUSAGE_CHILDREN))
 
 
 def environment() -> dict[str, Any]:
@@ -46,6 +53,16 @@ def cpu_name() -> str:
     cpuinfo = Path("/proc/cpuinfo")
     found = re.search(r"^model name\s*:\s*(.+)$", cpuinfo.read_text(), re.MULTILINE) if cpuinfo.exists() else None
     return found.group(1) if found else platform.processor() or platform.machine()
+
+
+def _high_water_mib(process: str) -> float | None:
+    """VmHWM of a process in Linux's /proc; None elsewhere, and when the process is gone."""
+    try:
+        status = Path(f"/proc/{process}/status").read_text()
+    except (FileNotFoundError, ProcessLookupError):
+        return None
+    found = re.search(r"^VmHWM:\s+(\d+) kB", status, re.MULTILINE)
+    return int(found.group(1)) * 1024 / MIB if found else None
 
 
 def _maxrss_mib(who: int) -> float:

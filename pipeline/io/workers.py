@@ -12,6 +12,8 @@ from typing import Any, TypeVar
 
 import cv2
 
+from pipeline.core.measure import count_workers
+
 Result = TypeVar("Result")
 _WAITING_PER_WORKER = 3
 
@@ -52,6 +54,7 @@ def start_workers(count: int) -> Iterator[Workers]:
     try:
         yield Workers(executor, count)
     finally:
+        count_workers(process.pid for process in multiprocessing.active_children() if process.pid is not None)
         executor.shutdown(wait=True, cancel_futures=True)
 
 

@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 from pipeline.core.measure import REPOSITORY, cpu_name, environment, peak_rss_mib
 
 ALLOCATE = "from pipeline.core.measure import peak_rss_mib; b = bytearray({mib} << 20); del b; print(peak_rss_mib())"
@@ -24,6 +26,28 @@ def test_a_childs_peak_does_not_count_its_parents_memory() -> None:
     assert peak_rss_mib() > 300
     assert peak_after_allocating(0) < 200
     assert len(ballast) == 300 << 20
+
+
+COUNT = """
+import subprocess, sys
+from pipeline.core.measure import count_workers, peak_rss_mib
+held = "b = bytearray(100 << 20); del b; print(flush=True); input()"
+start = [sys.executable, "-c", held]
+workers = [subprocess.Popen(start, stdin=subprocess.PIPE, stdout=subprocess.PIPE) for _ in range(2)]
+before = peak_rss_mib()
+for worker in workers: worker.stdout.readline()
+count_workers([worker.pid for worker in workers] + [2**22 + 1])
+count_workers([workers[0].pid])
+for worker in workers: worker.communicate(b"x")
+print(peak_rss_mib() - before)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems tell the largest child alone")
+def test_workers_count_with_what_they_held() -> None:
+    """Two of 100 MiB and an interpreter each, one of them counted twice; a process that is gone adds nothing."""
+    done = subprocess.run([sys.executable, "-c", COUNT], capture_output=True, text=True, check=True, cwd=REPOSITORY)
+    assert 200 < float(done.stdout) < 240
 
 
 def test_the_environment_names_machine_and_packages() -> None:

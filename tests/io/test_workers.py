@@ -1,10 +1,12 @@
 """Order, laziness and errors of the process pool; the same answers with and without processes."""
 
 import os
+import sys
 
 import pytest
 
 from pipeline.core.errors import UserError
+from pipeline.core.measure import peak_rss_mib
 from pipeline.io.workers import start_workers
 
 
@@ -21,6 +23,14 @@ def test_results_come_in_order_from_other_processes():
         results = list(workers.map(square, ((k,) for k in range(20))))
     assert [value for value, _ in results] == [k * k for k in range(20)]
     assert os.getpid() not in {pid for _, pid in results}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems tell the largest child alone")
+def test_what_workers_held_counts():
+    before = peak_rss_mib()
+    with start_workers(2) as workers:
+        list(workers.map(square, [(3,), (4,)]))
+    assert peak_rss_mib() > before + 50  # each worker has loaded numpy and OpenCV
 
 
 def test_one_worker_is_this_process():
