@@ -2,6 +2,7 @@
 
 import csv
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ from tests.core.toy_pipeline import Toy
 from tests.test_resume import wait_for
 
 SWEEP = ("data_tools.chart", "numbers.mp4", "--presets", "quick", "default", "--out", "runs/chart")
+BOTH = "mesh_psnr_full_db chamfer_mm"
 SCORES = {"mesh_psnr_full_db": 28.0, "field_psnr_full_db": 30.0, "chamfer_mm": 6.5}
 
 
@@ -122,9 +124,12 @@ def test_seconds_are_those_until_field_and_avatar(tmp_path: Path) -> None:
     point = point_of(trial, finished(10.0, SCORES))
     assert (point.field_seconds, point.seconds) == (30.0, 60.0)  # the report is not needed for the avatar
     assert point.curve == [(22.5, 20.0, 15.0), (25.0, 22.0, 17.5)]
-    row = table_row(trial, finished(10.0, SCORES, resumed=("field", "mesh")))
+    run = finished(10.0, SCORES, resumed=("field", "mesh"))
+    run.manifests["field"] = replace(run.manifests["field"], peak_rss_mib=250.0)
+    row = table_row(trial, run)
+    assert row["peak_rss_mib"] == 250.0
     assert (row["resumed"], row["commit"], row["machine"]) == ("field mesh", "abc", "Xeon, 2 cores")
-    assert origin([row]) == "commit abc; Xeon, 2 cores; seed 3"
+    assert origin([row, row | {"seed": 4, "status": "failed"}]) == "commit abc; Xeon, 2 cores; seed 3"
 
 
 def test_progress_that_is_absent_or_damaged(tmp_path: Path) -> None:
@@ -135,11 +140,13 @@ def test_progress_that_is_absent_or_damaged(tmp_path: Path) -> None:
 
 
 def test_tables_and_chart_of_finished_runs(tmp_path: Path) -> None:
+    """Each capture has fronts of its own; a failure that was made good is no message."""
     quick, slow, bad = (Trial(tmp_path / "ann", preset, 0, tmp_path) for preset in ("quick", "slow", "bad"))
     runs = {
-        quick: finished(10.0, SCORES),
+        quick: replace(finished(10.0, SCORES), failure="killed"),
         slow: finished(20.0, SCORES | {"chamfer_mm": 5.0}),
         bad: RunState(dict.fromkeys(STAGES, "missing"), {}, {}, "no person"),
+        Trial(tmp_path / "bob", "quick", 0, tmp_path): finished(1.0, SCORES | {"chamfer_mm": 1.0}),
     }
     (slow.run_dir / "field").mkdir(parents=True)
     (slow.run_dir / "field" / "progress.csv").write_text(
@@ -147,8 +154,8 @@ def test_tables_and_chart_of_finished_runs(tmp_path: Path) -> None:
     )
     write_results(tmp_path, runs)
     table = rows(tmp_path / "chart.csv")
-    assert [row["on_front_of"] for row in table] == ["mesh_psnr_full_db chamfer_mm", "chamfer_mm", ""]
-    assert [row["message"] for row in table] == ["", "", "no person"]
+    assert [row["on_front_of"] for row in table] == [BOTH, "chamfer_mm", "", BOTH]
+    assert [row["message"] for row in table] == ["", "", "no person", ""]
     assert (tmp_path / "chart.svg").is_file()
     (curve,) = rows(tmp_path / "anytime.csv")
     assert list(curve.values()) == ["ann", "slow", "0", "41.0", "20.0", "15.0"]

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from data_tools.runs import check_options, last_failure, read_run, read_scores, video_in
+from data_tools.runs import RunState, check_options, last_failure, read_run, read_scores, video_in
 from pipeline.core.errors import UserError
 from stages import STAGES
 
@@ -20,6 +20,7 @@ def test_a_failure_is_the_last_error_or_the_end_of_a_traceback(tmp_path: Path) -
         ("warning: dark\nerror: no person in frame 3: film again\n", "no person in frame 3: film again"),
         (CRASH, "ValueError: too small"),
         (CRASH + "error: the disk is full\n", "the disk is full"),
+        ("error: 1 of 2 frames\nerror: the disk is full\n", "the disk is full"),
     ):
         log.write_text(text)
         assert last_failure(log) == sentence
@@ -38,6 +39,20 @@ def test_an_empty_run_is_unfinished_until_its_log_tells_of_a_failure(tmp_path: P
     assert (run.verdict, run.seconds(STAGES), run.scores) == ("unfinished", 0.0, {})
     (tmp_path / "me.log").write_text("error: me.mp4 cannot be read: convert it\n")
     assert read_run(tmp_path / "me").verdict == "failed"
+
+
+def test_a_run_is_done_when_its_last_stage_is() -> None:
+    states = dict.fromkeys(STAGES, "fresh")
+    assert RunState(states, {}, {}, "").verdict == "done"
+    assert RunState(states | {STAGES[-1]: "missing"}, {}, {}, "").verdict == "unfinished"
+    assert RunState(states | {STAGES[-1]: "missing"}, {}, {}, "dark").verdict == "failed"
+
+
+def test_scores_of_an_outdated_report_are_not_told(tmp_path: Path) -> None:
+    (tmp_path / "me" / "report").mkdir(parents=True)
+    (tmp_path / "me" / "report" / "truth.json").write_text('{"mesh": {"chamfer_mm": 6.5}}')
+    assert read_scores(tmp_path / "me" / "report") == {"chamfer_mm": 6.5}
+    assert read_run(tmp_path / "me").scores == {}
 
 
 def test_a_damaged_record_is_told_not_thrown(tmp_path: Path) -> None:
