@@ -12,8 +12,10 @@ from pydantic import Field
 from pipeline.avatar.body import Motion, ParametricBody, canonical_to_world, load_anny
 from pipeline.avatar.fit import FitOptions, FitResult, fit_body, fit_given
 from pipeline.avatar.fit_given import GivenPoses
+from pipeline.avatar.fit_hands import finger_curls_rad, trust_in_hands
 from pipeline.avatar.fit_quality import doubts, make_observations, suspicious_frames
 from pipeline.avatar.fit_silhouette import matching_window
+from pipeline.avatar.hands import no_hands
 from pipeline.avatar.overlay import draw_overlay, overlay_grid, posed_frame
 from pipeline.avatar.smpl import SmplBody
 from pipeline.core.cli import main
@@ -72,6 +74,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     save_body(out / _BODY, result.body)
     save_motion(out / _MOTION, motion)
     save_camera(out / _CAMERA, result.camera)
+    hands_used = trust_in_hands(capture.hands or no_hands(len(capture)), capture.landmarks_px) > 0.0
     scores = {"silhouette_iou": result.overlap, "landmark_error_px": result.landmark_error_px, "exchanged": exchanged}
     save_npz(out / _SCORES, {"frame_index": capture.frame_index, **scores})
     for sentence in doubts(result, capture.frame_index):
@@ -85,6 +88,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
         "height_m": result.body.height_m(),
         "height_deviation_m": result.height_deviation_m,
         "exchanged_frames": int(exchanged.sum()),
+        "hands_used": float(hands_used.mean()),
         "suspicious_frames": int(suspicious_frames(result).sum()),
     }
 
@@ -92,16 +96,17 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
 def fit(capture: Capture, masks: Sequence[UInt8[np.ndarray, "h w"]], frames_dir: Path, config: Config) -> FitResult:
     """Fit and judge; UserError when the landmarks or the result are of no use."""
     camera, focal_deviation = starting_camera(capture, config)
-    observations = make_observations(
-        capture.time_s, capture.landmarks_px, capture.landmarks_visibility, capture.landmarks_world_m, camera
-    )
+    hands = capture.hands or no_hands(len(capture))
+    landmarks = capture.landmarks_px, capture.landmarks_visibility, capture.landmarks_world_m
+    observations = make_observations(capture.time_s, *landmarks, camera, hands)
     options = FitOptions(config.height_m, focal_deviation, config.shared_frames, config.rounds)
     windows = [matching_window(mask) for mask in masks]
     model = load_anny() if config.model_file is None else load_smpl(Path(config.model_file))
     given = supplied_poses(capture, model, camera, focal_deviation == 0.0, config)
     try:
         if given is None:
-            result = fit_body(model, observations, windows, options)
+            curls_rad = finger_curls_rad(model, hands, trust_in_hands(hands, capture.landmarks_px))
+            result = fit_body(model, observations, windows, options, curls_rad)
         else:
             result = fit_given(model, observations, windows, given, config.supplied_poses == "keep")
     except ValueError as error:
@@ -188,7 +193,7 @@ def overlay(
 
 STAGE = Stage(
     "body",
-    version=3,
+    version=4,
     needs=("frames",),
     makes=(_BODY, _MOTION, _CAMERA, _SCORES, _OVERLAY),
     config=Config,

@@ -70,6 +70,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
         "dropped_duplicates": n_duplicates,
         "noise_levels": noise,
         "landmark_visibility": float(capture.landmarks_visibility.mean()),
+        "hands_found": float((sightings.hands.own_side[chosen] > 0.0).mean()),
         "unseen_arc_deg": float(np.degrees(unseen_rad)),
         "scale": sightings.scale,
     }
@@ -143,13 +144,14 @@ def make_capture(sightings: Sightings, chosen: list[int], out: Path, source: Sou
         n_video_frames=source.n_frames,
         scale=sightings.scale,
         recorded_focal_px=recorded_focal_px(source, sightings.width, sightings.height),
+        hands=sightings.hands.rows(chosen),
         smpl_poses=None if supplied.smpl_poses is None else supplied.smpl_poses.of(frame_index),
     )
 
 
 STAGE = Stage(
     "frames",
-    version=5,
+    version=6,
     needs=("video",),
     makes=(FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, CONTACT_SHEET),
     config=Config,

@@ -155,6 +155,10 @@ ANNY_LANDMARKS_M = {
     "ankle": (0.195, 0.110, -0.002),
     "heel": (0.194, 0.045, -0.046),
     "foot_index": (0.190, 0.035, 0.185),
+    "hand_wrist": (0.515, 1.114, 0.196),
+    "hand_thumb": (0.485, 1.101, 0.268),
+    "hand_index": (0.535, 1.077, 0.284),
+    "hand_pinky": (0.559, 1.048, 0.230),
 }
 """Where the left and central landmarks of `fit_landmarks.LANDMARKS` lie on the A-pose of the default shape."""
 

@@ -17,8 +17,8 @@ from pipeline.avatar.body import Body, ParametricBody
 from pipeline.avatar.fit_floor import Contact, floor_contact
 from pipeline.avatar.fit_given import GivenPoses
 from pipeline.avatar.fit_init import initial_state, interpolated_state, torso_found
-from pipeline.avatar.fit_landmarks import LandmarkRegressor, landmark_regressor
-from pipeline.avatar.fit_model import FitModel, linearise, pose_points, pose_skeleton
+from pipeline.avatar.fit_landmarks import POSE_LANDMARKS, LandmarkRegressor, landmark_regressor
+from pipeline.avatar.fit_model import FitModel, linearise, pose_points, pose_skeleton, relaxed_curls
 from pipeline.avatar.fit_objective import (
     FitState,
     Objective,
@@ -52,6 +52,10 @@ STATURE_DEVIATION_M = 0.09
 OUTLINE_LANDMARK_M = 0.06
 OUTLINE_DIRECTION_M = 0.4
 """Standard deviations of a landmark in the image and in 3D once outlines help, which err less and in no fixed way."""
+
+
+HAND_M = 0.012
+"""Standard deviation of a hand's points once the shape is known; before, the body's own errors are larger."""
 
 
 @dataclass(frozen=True)
@@ -91,18 +95,28 @@ class _Tools:
     joint_prior: JointPrior
     shape_prior: ShapePrior
     default: FitModel
+    curls_rad: Float[np.ndarray, "2 4"]
+
+    def model(self, shape: Float[Tensor, "s"]) -> FitModel:
+        """The body around a shape."""
+        return linearise(self.body, shape, self.curls_rad)
 
 
 def fit_body(
-    body: ParametricBody, observations: Observations, windows: Sequence[Window | None], options: FitOptions
+    body: ParametricBody,
+    observations: Observations,
+    windows: Sequence[Window | None],
+    options: FitOptions,
+    curls_rad: Float[np.ndarray, "2 4"] | None = None,
 ) -> FitResult:
     """Fit a body to landmarks and masks.
 
-    observations.camera holds the focal length to start from. Windows come from `fit_silhouette.matching_window`.
+    observations.camera holds the focal length to start from. Windows come from `fit_silhouette.matching_window`,
+    curls_rad from `fit_hands.finger_curls_rad` (None: a relaxed grip).
     Raises ValueError when fewer than three frames have a torso in pixels and in 3D.
     """
     _check_landmarks(observations)
-    tools = _tools(body)
+    tools = _tools(body, relaxed_curls() if curls_rad is None else curls_rad)
     rest_m = tools.regressor.points(tools.default, torch.zeros(_offsets(tools), dtype=torch.float64)).rest[0]
     observations, exchanged = _with_sides_mended(observations, rest_m)
     start = initial_state(observations, rest_m, tools.default.joints, body.shape_defaults.double(), _offsets(tools))
@@ -130,8 +144,8 @@ def fit_given(
     Raises ValueError when no frame has a pose, or as `fit_body` does.
     """
     _check_landmarks(observations)
-    tools = _tools(body)
-    model = linearise(body, given.shape)
+    tools = _tools(body, relaxed_curls())
+    model = tools.model(given.shape)
     state = given.state(model.full_joint, observations.time_s)
     rest_m = tools.regressor.points(model, state.offsets_m).rest[0]
     observations, exchanged = _with_sides_mended(observations, rest_m)
@@ -158,14 +172,15 @@ def _check_landmarks(observations: Observations) -> None:
         raise ValueError(f"fewer than {MINIMUM_FRAMES} frames have hips and shoulders in pixels and in 3D")
 
 
-def _tools(body: ParametricBody) -> _Tools:
-    default = linearise(body, body.shape_defaults)
+def _tools(body: ParametricBody, curls_rad: Float[np.ndarray, "2 4"]) -> _Tools:
+    default = linearise(body, body.shape_defaults, curls_rad)
     return _Tools(
         body,
         landmark_regressor(default),
         joint_prior(default),
         shape_prior(body.shape_names, body.shape_defaults),
         default,
+        curls_rad,
     )
 
 
@@ -174,7 +189,7 @@ def _offsets(tools: _Tools) -> int:
 
 
 def _with_sides_mended(
-    observations: Observations, rest_m: Float[Tensor, "33 3"]
+    observations: Observations, rest_m: Float[Tensor, "l 3"]
 ) -> tuple[Observations, dict[str, Bool[np.ndarray, "n"]]]:
     """Observations with exchanged sides put right, and in which frames that happened."""
     exchanged = {"whole body": exchanged_bodies(observations, rest_m)}
@@ -198,11 +213,11 @@ def _fit_shared(
     weights = replace(weights, free_offsets=True)
     if options.focal_deviation > 0.0:
         weights = replace(weights, free_focal=True, focal_log=options.focal_deviation)
-    model = linearise(tools.body, state.shape)
+    model = tools.model(state.shape)
     state, system = _minimised(tools, model, observations, weights, state, LANDMARK_STEPS)
     weights = replace(weights, landmark_m=OUTLINE_LANDMARK_M, direction_m=OUTLINE_DIRECTION_M)
     for _ in track(range(options.rounds), "shape and focal length"):
-        model = linearise(tools.body, state.shape)
+        model = tools.model(state.shape)
         state, system, _ = _outline_round(tools, model, observations, windows, weights, state)
     return state, weights, system
 
@@ -215,8 +230,8 @@ def _fit_poses(
     weights: Weights,
 ) -> tuple[FitState, FitModel, Float[np.ndarray, "n"]]:
     """The pose of every frame with all that is shared held fixed, and each frame's overlap with its mask."""
-    weights = replace(weights, free_shape=False, free_offsets=False, free_focal=False)
-    model = linearise(tools.body, state.shape)
+    weights = replace(weights, free_shape=False, free_offsets=False, free_focal=False, hand_m=HAND_M)
+    model = tools.model(state.shape)
     landmarks_only = replace(weights, landmark_m=Weights.landmark_m, direction_m=Weights.direction_m)
     state, _ = _minimised(tools, model, observations, landmarks_only, state, OUTLINE_STEPS)
     motion = None
@@ -276,12 +291,12 @@ def _minimised(
 def landmark_errors_px(
     regressor: LandmarkRegressor, model: FitModel, state: FitState, observations: Observations
 ) -> Float[np.ndarray, "n"]:
-    """Median distance of each frame's well-seen landmarks from the body's; nan in frames without any."""
+    """Median distance of each frame's well-seen pose landmarks from the body's; nan without any."""
     skeleton = pose_skeleton(model, state.rotations, state.root_m)
     world, _ = pose_points(model, skeleton, regressor.points(model, state.offsets_m))
     pixels, _ = project_with_covectors(world, observations.camera, state.focal_log)
-    error = (pixels - observations.landmarks_px).norm(dim=-1)
-    return torch.where(observations.confidence > 0.5, error, torch.nan).nanmedian(1).values.numpy()
+    error = (pixels - observations.landmarks_px).norm(dim=-1)[:, :POSE_LANDMARKS]
+    return torch.where(observations.confidence[:, :POSE_LANDMARKS] > 0.5, error, torch.nan).nanmedian(1).values.numpy()
 
 
 def _result(

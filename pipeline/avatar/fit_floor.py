@@ -73,7 +73,7 @@ def floor_contact(
     model: FitModel,
     rotations: Float[Tensor, "n j 3 3"],
     root_m: Float[Tensor, "n 3"],
-    confidence: Float[Tensor, "n 33"],
+    confidence: Float[Tensor, "n l"],
     time_s: Float[Tensor, "n"],
 ) -> Contact | None:
     """The contact term for a body in these poses; None where no floor shows.

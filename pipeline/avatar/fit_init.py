@@ -13,7 +13,7 @@ from pipeline.geometry.rotation import matrix_to_quaternion, quaternion_to_matri
 TORSO = (11, 12, 23, 24)
 
 
-def torso_rotations(rest_m: Float[Tensor, "33 3"], directions_m: Float[Tensor, "n 33 3"]) -> Float[Tensor, "n 3 3"]:
+def torso_rotations(rest_m: Float[Tensor, "l 3"], directions_m: Float[Tensor, "n l 3"]) -> Float[Tensor, "n 3 3"]:
     """Rotation that carries the rest torso (hips, shoulders) onto each frame's 3D landmarks (Kabsch 1976)."""
     rows = list(TORSO)
     rest = rest_m[rows] - rest_m[rows].mean(0)
@@ -33,7 +33,7 @@ def torso_found(observations: Observations) -> Bool[np.ndarray, "n"]:
     return (known & (torso_size(observations.directions_m) > 1e-3)).numpy()
 
 
-def torso_size(places_m: Float[Tensor, "n 33 3"]) -> Float[Tensor, "n"]:
+def torso_size(places_m: Float[Tensor, "n l 3"]) -> Float[Tensor, "n"]:
     """Root mean square distance (m) of hips and shoulders from their middle."""
     torso = places_m[:, list(TORSO)]
     return (torso - torso.mean(1, keepdim=True)).square().sum(-1).mean(1).sqrt()
@@ -46,7 +46,7 @@ def facing_yaw(rotation: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n"]:
 
 def initial_state(
     observations: Observations,
-    rest_m: Float[Tensor, "33 3"],
+    rest_m: Float[Tensor, "l 3"],
     joints_m: Float[Tensor, "j 3"],
     shape: Float[Tensor, "s"],
     offset_count: int,
@@ -74,7 +74,7 @@ def initial_state(
     )
 
 
-def place_by_landmarks(observations: Observations, relative_m: Float[Tensor, "n 33 3"]) -> Float[Tensor, "n 3"]:
+def place_by_landmarks(observations: Observations, relative_m: Float[Tensor, "n l 3"]) -> Float[Tensor, "n 3"]:
     """World position of the root from pixels of points known relative to it.
 
     Each pixel gives two equations linear in the unknown place t: fx (X + t_x) - (u - cx) (Z + t_z) = 0, likewise y.

@@ -1,6 +1,7 @@
-"""The 33 BlazePose landmarks as places on the body: where the detector's "left hip" lies on the skeleton.
+"""Landmarks as places on the body: where the detector's "left hip" lies on the skeleton.
 
-Order and meaning: Bazarevsky et al., "BlazePose: On-device real-time body pose tracking", 2020, figure 3.
+First BlazePose's 33 (Bazarevsky et al., "BlazePose: On-device real-time body pose tracking", 2020, figure 3), then some
+points of each hand, seen by a model of their own (`hands.py`).
 """
 
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from pipeline.avatar.fit_model import ACTIVE_JOINTS, FitModel, Points
 
-LANDMARK_COUNT = 33
+POSE_LANDMARKS = 33
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,16 @@ LANDMARKS = (
     Landmark("ankle", (27, 28), "LeftLeg", "LeftFoot", 1.0),
     Landmark("heel", (29, 30), "LeftFoot", "LeftFoot", 1.3),
     Landmark("foot_index", (31, 32), "LeftFoot", "LeftToeBase", 1.3),
+    Landmark("hand_wrist", (33, 34), "LeftHand", "LeftHand", 1.0),
+    Landmark("hand_thumb", (35, 36), "LeftHand", "LeftHandThumb2", 1.0),
+    Landmark("hand_index", (37, 38), "LeftHand", "LeftHandIndex1", 1.0),
+    Landmark("hand_pinky", (39, 40), "LeftHand", "LeftHandPinky1", 1.0),
 )
+
+LANDMARK_COUNT = 41
+
+HAND_LANDMARKS = (0, 2, 5, 17)
+"""The points of a hand that follow the pose's landmarks, left and right in turn: those that fingers do not move."""
 
 OFFSET_COUNT = 3 * len(LANDMARKS)
 """Numbers that shift the landmarks on the body for one video: x, y, z a `Landmark`, mirrored for the right one."""
@@ -57,22 +67,22 @@ OFFSET_COUNT = 3 * len(LANDMARKS)
 PAIRS = tuple(landmark.indices for landmark in LANDMARKS if len(landmark.indices) == 2)
 
 SWAP_GROUPS = {
-    "arms": tuple(pair for pair in PAIRS if 13 <= pair[0] <= 21),
-    "legs": tuple(pair for pair in PAIRS if pair[0] >= 25),
+    "arms": tuple(pair for pair in PAIRS if 13 <= pair[0] <= 21 or pair[0] >= POSE_LANDMARKS),
+    "legs": tuple(pair for pair in PAIRS if 25 <= pair[0] < POSE_LANDMARKS),
     "whole body": PAIRS,
 }
 """Pairs that the detector confuses together."""
 
 
 def mirror_permutation(pairs: tuple[tuple[int, ...], ...]) -> list[int]:
-    """Order of the 33 landmarks with left and right exchanged in the given pairs."""
+    """Order of the landmarks with left and right exchanged in the given pairs."""
     order = list(range(LANDMARK_COUNT))
     for left, right in pairs:
         order[left], order[right] = right, left
     return order
 
 
-def landmark_noise() -> Float[Tensor, "33"]:
+def landmark_noise() -> Float[Tensor, "l"]:
     """Each landmark's usual error relative to the detector's typical one."""
     noise = torch.ones(LANDMARK_COUNT, dtype=torch.float64)
     for landmark in LANDMARKS:
@@ -86,9 +96,9 @@ class LandmarkRegressor:
 
     anchor_joint: tuple[int | None, ...]
     anchor_vertex: tuple[int | None, ...]
-    shift_m: Float[Tensor, "33 3"]
-    carrier: Float[Tensor, "33 j"]
-    by_offset: Float[Tensor, "33 3 o"]
+    shift_m: Float[Tensor, "l 3"]
+    carrier: Float[Tensor, "l j"]
+    by_offset: Float[Tensor, "l 3 o"]
 
     def points(self, model: FitModel, offsets_m: Float[Tensor, "o"]) -> Points:
         """The landmarks on a rest body; the shape axis is the body's shape followed by the offsets."""

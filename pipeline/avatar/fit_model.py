@@ -25,6 +25,7 @@ ACTIVE_JOINTS = (
     *("Spine", "Spine1", "Spine2", "LeftShoulder", "LeftArm", "LeftForeArm", "LeftHand", "Neck", "Head"),
     *("RightShoulder", "RightArm", "RightForeArm", "RightHand"),
 )
+FINGERS = ("Index", "Middle", "Ring", "Pinky")
 GRIP_RAD = 0.25
 """How far each finger joint is bent in a hand at rest, beyond the A-pose."""
 
@@ -79,11 +80,16 @@ class FitModel:
         return float(self.vertices[top, 1] - self.vertices[bottom, 1]), gradient
 
 
-def linearise(body: ParametricBody, shape: Float[Tensor, "s"]) -> FitModel:
-    """The model around a shape, by forward differences (backward at the upper end of a phenotype's range)."""
+def linearise(
+    body: ParametricBody, shape: Float[Tensor, "s"], curls_rad: Float[np.ndarray, "2 4"] | None = None
+) -> FitModel:
+    """The model around a shape, by forward differences (backward at the upper end of a phenotype's range).
+
+    curls_rad: as in `grip_rotations`; None: a relaxed grip.
+    """
     active = tuple(body.joint_names.index(name) for name in ACTIVE_JOINTS)
     parents = reduced_parents(body.parents, active)
-    grip = grip_rotations(body)
+    grip = grip_rotations(body, relaxed_curls() if curls_rad is None else curls_rad)
     vertices, joints = _gripping_rest(body, shape, grip)
     vertex_columns, joint_columns = [], []
     for index, value in enumerate(shape.tolist()):
@@ -146,24 +152,29 @@ def fold_weights(body: ParametricBody, active: Sequence[int]) -> Float[Tensor, "
     return folded
 
 
-def grip_rotations(body: ParametricBody) -> Float[Tensor, "full 3 3"]:
-    """Local rotations of all joints in which the fingers are relaxed and the rest is the A-pose.
+def relaxed_curls() -> Float[np.ndarray, "2 4"]:
+    """Bend of every finger joint beyond the A-pose in a hand at rest (rad), for left and right `FINGERS`."""
+    return np.full((2, len(FINGERS)), GRIP_RAD)
+
+
+def grip_rotations(body: ParametricBody, curls_rad: Float[np.ndarray, "2 4"]) -> Float[Tensor, "full 3 3"]:
+    """Local rotations of all joints in which each finger's joints are bent by its curl and the rest is the A-pose.
 
     Fingers bend further the way in which the middle finger of the rest pose is bent already; a body without fingers
     (SMPL) keeps its hands.
     """
     _, joints = body.rest(body.shape_defaults)
     axis_angle = torch.zeros(len(body.joint_names), 3, dtype=torch.float64)
-    for side in ("Left", "Right"):
+    for side, curls in zip(("Left", "Right"), curls_rad.tolist(), strict=True):
         if f"{side}HandMiddle3" not in body.joint_names:
             continue
         hand, knuckle, tip = (
             joints[body.joint_names.index(f"{side}Hand{part}")].double() for part in ("", "Middle1", "Middle3")
         )
         bend = torch.nn.functional.normalize(torch.linalg.cross(knuckle - hand, tip - knuckle), dim=0)
-        for joint, name in enumerate(body.joint_names):
-            if name.startswith(f"{side}Hand") and name != f"{side}Hand" and "Thumb" not in name:
-                axis_angle[joint] = bend * GRIP_RAD
+        for finger, curl in zip(FINGERS, curls, strict=True):
+            for bone in (1, 2, 3):
+                axis_angle[body.joint_names.index(f"{side}Hand{finger}{bone}")] = bend * curl
     return axis_angle_to_matrix(axis_angle)
 
 

@@ -12,7 +12,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pipeline.avatar.fit_floor import Contact, add_contact
-from pipeline.avatar.fit_landmarks import OFFSET_COUNT, LandmarkRegressor, landmark_noise
+from pipeline.avatar.fit_landmarks import (
+    LANDMARK_COUNT,
+    OFFSET_COUNT,
+    POSE_LANDMARKS,
+    LandmarkRegressor,
+    landmark_noise,
+)
 from pipeline.avatar.fit_model import (
     ACTIVE_JOINTS,
     FitModel,
@@ -82,10 +88,10 @@ class Observations:
     scale. `confidence` of pixels and of directions is in [0, 1], 0 where there is none; no value is nan."""
 
     time_s: Float[Tensor, "n"]
-    landmarks_px: Float[Tensor, "n 33 2"]
-    directions_m: Float[Tensor, "n 33 3"]
-    confidence: Float[Tensor, "n 33"]
-    direction_confidence: Float[Tensor, "n 33"]
+    landmarks_px: Float[Tensor, "n l 2"]
+    directions_m: Float[Tensor, "n l 3"]
+    confidence: Float[Tensor, "n l"]
+    direction_confidence: Float[Tensor, "n l"]
     camera: Camera
 
     def rows(self, rows: Int[np.ndarray, "k"]) -> "Observations":
@@ -116,6 +122,7 @@ class Weights:
     """Standard deviations of the terms; None leaves a term out."""
 
     landmark_m: float = 0.025
+    hand_m: float = 0.060
     landmark_cutoff: float = 3.0
     direction_m: float = 0.08
     contour_m: float = 0.010
@@ -129,6 +136,12 @@ class Weights:
     free_shape: bool = True
     free_offsets: bool = False
     free_focal: bool = False
+
+    def landmarks_m(self) -> Float[Tensor, "l"]:
+        """Standard deviation of each landmark in the image, metres at the person."""
+        deviation = self.landmark_m * landmark_noise()
+        deviation[POSE_LANDMARKS:] = self.hand_m
+        return deviation
 
     def anything_shared(self) -> bool:
         """Whether any number that all frames share may move."""
@@ -196,7 +209,7 @@ class Objective:
         noise = landmark_noise()
         facing = facing_factor(skeleton, seen.camera)
         confidence = seen.confidence * facing
-        inverse = confidence.sqrt() / (weights.landmark_m * noise * self.px_per_m[:, None])
+        inverse = confidence.sqrt() / (weights.landmarks_m() * self.px_per_m[:, None])
         residual = (pixels - seen.landmarks_px) * inverse[..., None]
         weight = robust_weights(system, residual.square().sum(-1), weights.landmark_cutoff)
         by_place = root_by_place(state.root_m, seen.camera)
@@ -214,9 +227,9 @@ class Objective:
         model: FitModel,
         skeleton: PosedSkeleton,
         points: Points,
-        world: Float[Tensor, "n 33 3"],
-        arms: Float[Tensor, "n 33 j 3"],
-        confidence: Float[Tensor, "n 33"],
+        world: Float[Tensor, "n l 3"],
+        arms: Float[Tensor, "n l j 3"],
+        confidence: Float[Tensor, "n l"],
     ) -> None:
         """The detector's 3D landmarks, relative to the hips, in camera axes and of unknown scale."""
         seen, cutoff = self.observations, self.weights.landmark_cutoff
@@ -340,22 +353,22 @@ def project_with_covectors(
     return pixels, in_camera @ pose[:3, :3]
 
 
-def facing_factor(skeleton: PosedSkeleton, camera: Camera) -> Float[Tensor, "n 33"]:
+def facing_factor(skeleton: PosedSkeleton, camera: Camera) -> Float[Tensor, "n l"]:
     """Trust in each landmark by where the head looks: a face found on the back of a head is the detector's guess."""
     head = ACTIVE_JOINTS.index("Head")
     to_camera = torch.nn.functional.normalize(
         torch.as_tensor(camera.centre_m(), dtype=torch.float64) - skeleton.position[:, head], dim=-1
     )
     cosine = (skeleton.rotation[:, head, :, 2] * to_camera).sum(-1)
-    factor = torch.ones(len(cosine), 33, dtype=torch.float64)
+    factor = torch.ones(len(cosine), LANDMARK_COUNT, dtype=torch.float64)
     factor[:, :FACE_LANDMARKS] = (0.5 + 2.0 * cosine).clamp(0.05, 1.0)[:, None]
     return factor
 
 
 def direction_scale(
-    relative_m: Float[Tensor, "n 33 3"],
-    directions_m: Float[Tensor, "n 33 3"],
-    inverse: Float[Tensor, "n 33 3"],
+    relative_m: Float[Tensor, "n l 3"],
+    directions_m: Float[Tensor, "n l 3"],
+    inverse: Float[Tensor, "n l 3"],
     cutoff: float,
 ) -> Float[Tensor, "3"]:
     """Factors (across, across, depth; camera axes) that carry the body's 3D landmarks onto the detector's with the
@@ -383,5 +396,5 @@ def _centre(camera: Camera) -> tuple[float, float]:
     return camera.cx, camera.cy
 
 
-def _hip_middle(values: Float[Tensor, "n 33 c"]) -> Float[Tensor, "n 1 c"]:
+def _hip_middle(values: Float[Tensor, "n l c"]) -> Float[Tensor, "n 1 c"]:
     return 0.5 * (values[:, LEFT_HIP] + values[:, RIGHT_HIP])[:, None]

@@ -5,7 +5,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 
 from pipeline.avatar.fit import FitResult
+from pipeline.avatar.fit_hands import hand_landmarks, trust_in_hands
 from pipeline.avatar.fit_objective import Observations
+from pipeline.avatar.hands import Hands, no_hands
 from pipeline.geometry.camera import Camera
 
 LEAST_CONFIDENCE = 0.1
@@ -27,11 +29,16 @@ def make_observations(
     visibility: Float[np.ndarray, "n 33"],
     landmarks_world_m: Float[np.ndarray, "n 33 3"],
     camera: Camera,
+    hands: Hands | None = None,
 ) -> Observations:
     """Observations from a detector's output: nan where nothing was found, 3D in camera axes (y down, z away)."""
-    landmarks, directions = torch.tensor(landmarks_px).double(), torch.tensor(landmarks_world_m).double()
+    hands = hands or no_hands(len(time_s))
+    hands_px, hands_m, hands_trust = hand_landmarks(hands, trust_in_hands(hands, landmarks_px), landmarks_world_m)
+    landmarks = torch.tensor(np.concatenate([landmarks_px, hands_px], axis=1)).double()
+    directions = torch.tensor(np.concatenate([landmarks_world_m, hands_m], axis=1)).double()
     to_world = torch.as_tensor(camera.world_to_camera, dtype=torch.float64)[:3, :3]
-    trust = LEAST_CONFIDENCE + (1.0 - LEAST_CONFIDENCE) * torch.tensor(visibility).double().nan_to_num(0.0)
+    seen = LEAST_CONFIDENCE + (1.0 - LEAST_CONFIDENCE) * np.nan_to_num(visibility)
+    trust = torch.tensor(np.concatenate([seen, hands_trust], axis=1)).double()
     known = landmarks.isfinite().all(-1)
     return Observations(
         time_s=torch.tensor(time_s).double(),

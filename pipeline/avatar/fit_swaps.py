@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 
 from pipeline.avatar.fit_init import facing_yaw, torso_found, torso_rotations
-from pipeline.avatar.fit_landmarks import PAIRS, mirror_permutation
+from pipeline.avatar.fit_landmarks import PAIRS, POSE_LANDMARKS, SWAP_GROUPS, mirror_permutation
 from pipeline.avatar.fit_objective import Observations
 
 EXCHANGE_COST = 0.25
@@ -30,8 +30,8 @@ SIDE_M = 0.15
 """For limbs: cost of lying this far on the wrong side of the body (left knee right of the right one)."""
 
 LIMBS = {
-    "arms": (tuple(pair for pair in PAIRS if 13 <= pair[0] <= 21), (13, 14), (11, 12)),
-    "legs": (tuple(pair for pair in PAIRS if pair[0] >= 25), (25, 26), (23, 24)),
+    "arms": (SWAP_GROUPS["arms"], (13, 14), (11, 12)),
+    "legs": (SWAP_GROUPS["legs"], (25, 26), (23, 24)),
 }
 """Pairs that are exchanged together, the pair whose order tells, and the pair of the torso that it is compared with."""
 
@@ -55,7 +55,7 @@ def two_label_path(
     return labels
 
 
-def exchanged_bodies(observations: Observations, rest_m: Float[torch.Tensor, "33 3"]) -> Bool[np.ndarray, "n"]:
+def exchanged_bodies(observations: Observations, rest_m: Float[torch.Tensor, "l 3"]) -> Bool[np.ndarray, "n"]:
     """Frames in which the whole person was taken for one who faces the other way, by the continuity of turning.
 
     Exchanged sides with mirrored depths turn a yaw into pi minus the yaw: a jump in front and back views. In a side
@@ -77,7 +77,7 @@ def exchanged_limbs(observations: Observations, limb: str) -> Bool[np.ndarray, "
     landmarks = observations.landmarks_px[rows].numpy()
     directions = observations.directions_m[rows].numpy()
     torso_px = np.linalg.norm(landmarks[:, [11, 12]].mean(1) - landmarks[:, [23, 24]].mean(1), axis=1)
-    left, right = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
+    left, right = zip(*(pair for pair in pairs if pair[0] < POSE_LANDMARKS), strict=True)
     limb_px, exchanged_px = landmarks[:, left + right], landmarks[:, right + left]
     size = JUMP_COST / np.maximum(np.median(torso_px), 1.0)
     same = size * np.linalg.norm(limb_px[1:] - limb_px[:-1], axis=2).mean(1)

@@ -1,4 +1,4 @@
-"""Finding the person: MediaPipe's 33 pose landmarks and its person mask. The only file that touches MediaPipe.
+"""Finding the person: MediaPipe's 33 pose landmarks and its person mask. Only this file and `hands.py` touch MediaPipe.
 
 Both models ship inside the package, nothing is downloaded. Every frame is looked at on its own (no tracking), so the
 result does not depend on which process saw which frame before.
@@ -125,7 +125,7 @@ class PersonDetector:
     """MediaPipe's pose model in its middle size; about 55 ms an image on one core, whatever the image's size."""
 
     def __init__(self) -> None:
-        with _quiet_stderr():
+        with quiet_stderr():
             from mediapipe.python.solutions.pose import SolutionBase  # here: takes seconds and writes to stderr
 
             self._guess_square = SolutionBase(graph_config=_SQUARE_GRAPH)
@@ -140,7 +140,7 @@ class PersonDetector:
         centre, in camera axes (x right, y down, z away). The mask is soft, 0..255, and smooth at the scale of about
         1/200 of the person's height, where the model's own grid ends.
         """
-        with nullcontext() if self._has_spoken else _quiet_stderr():
+        with nullcontext() if self._has_spoken else quiet_stderr():
             looks = self._looks(rgb)
         if not looks:
             return None
@@ -246,7 +246,7 @@ def _overlap(first: Bool[np.ndarray, "h w"], second: Bool[np.ndarray, "h w"]) ->
 
 
 @contextmanager
-def _quiet_stderr() -> Iterator[None]:
+def quiet_stderr() -> Iterator[None]:
     """Keep the C++ libraries' notes, at loading and at the first person, off the terminal.
 
     They write to the descriptor itself.

@@ -67,6 +67,10 @@ JOINT_PLACES = {
     "ankle": (("LeftFoot", (0.001, 0.029, 0.006)),),
     "heel": (("LeftFoot", (0.0, -0.036, -0.038)),),
     "foot_index": (("LeftToeBase", (-0.001, 0.006, 0.036)),),
+    "hand_wrist": (("LeftHand", (0.006, -0.006, 0.009)),),
+    "hand_thumb": (("LeftHandThumb2", (-0.002, -0.001, 0.008)), ("LeftHand", (-0.024, -0.02, 0.081))),
+    "hand_index": (("LeftHandIndex1", (-0.004, 0.002, -0.009)), ("LeftHand", (0.027, -0.044, 0.097))),
+    "hand_pinky": (("LeftHandPinky1", (-0.008, 0.004, -0.003)), ("LeftHand", (0.05, -0.072, 0.043))),
 }
 """The other landmarks: shift (m) from a joint, as on the built-in body; the first joint that the model has counts."""
 

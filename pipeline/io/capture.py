@@ -1,12 +1,13 @@
 """The artifact of the `frames` stage, and the one reader of it that all later stages use."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from pipeline.avatar.hands import Hands
 from pipeline.geometry.camera import UPRIGHT_WORLD_TO_CAMERA, Camera
 from pipeline.io.image import read_gray, read_rgb, to_float
 from pipeline.io.npz import load_npz, save_npz
@@ -26,6 +27,7 @@ class Capture:
     landmarks_world_m: metres about the hips' centre in camera axes; nan where unknown.
     camera: what was supplied with the video, for these images; None when unknown.
     recorded_focal_px: focal length in these images by the recording's own metadata; None when they say nothing.
+    hands: both hands in every frame; None where they were not looked for.
     scale: size of these images relative to the recording's. Images are undistorted.
     smpl_poses: what others fitted to some of these frames; None when nothing was supplied.
     """
@@ -45,6 +47,7 @@ class Capture:
     n_video_frames: int
     scale: float
     recorded_focal_px: float | None = None
+    hands: Hands | None = None
     smpl_poses: SmplPoses | None = None
 
     def __len__(self) -> int:
@@ -99,6 +102,8 @@ def save_capture(capture: Capture) -> None:
     }
     for name, value in zip(_INTRINSICS, intrinsics, strict=True):
         arrays[name] = np.array(value)
+    if capture.hands is not None:
+        arrays |= {f"hands_{name}": value for name, value in vars(capture.hands).items()}
     save_npz(capture.folder / FRAMES_NPZ, arrays)
     if capture.smpl_poses is not None:
         save_smpl_poses(capture.folder / SMPL_POSES_NPZ, capture.smpl_poses)
@@ -127,6 +132,7 @@ def load_capture(frames_dir: Path) -> Capture:
         n_video_frames=int(arrays["n_video_frames"].item()),
         scale=float(arrays["scale"].item()),
         recorded_focal_px=_recorded_focal_px(arrays),
+        hands=_hands(arrays),
         smpl_poses=load_smpl_poses(poses_path) if poses_path.is_file() else None,
     )
 
@@ -134,6 +140,13 @@ def load_capture(frames_dir: Path) -> Capture:
 def _recorded_focal_px(arrays: Mapping[str, np.ndarray]) -> float | None:
     found = float(np.ravel(arrays.get("recorded_focal_px", np.nan))[0])
     return found if np.isfinite(found) else None
+
+
+def _hands(arrays: Mapping[str, np.ndarray]) -> Hands | None:
+    names = [field.name for field in fields(Hands)]
+    if any(f"hands_{name}" not in arrays for name in names):
+        return None
+    return Hands(*(arrays[f"hands_{name}"] for name in names))
 
 
 def _camera(arrays: Mapping[str, np.ndarray]) -> Camera | None:

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from pipeline.avatar.hands import HandDetector, Hands, no_hands, stack_hands
 from pipeline.avatar.person import PersonDetector
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track
@@ -37,6 +38,7 @@ class _Look(NamedTuple):
     landmarks: Float[np.ndarray, "33 6"] | None
     mask_png: bytes
     n_people: int
+    hands: Hands = no_hands()
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class Sightings:
     """All frames that were looked at, n of them, in order.
 
     grays, persons: small pictures and person masks; masks_png: the detector's soft masks, PNG-encoded to save memory.
-    landmarks as in `Capture`, nan where no person was found. n_people: -1 where people were not counted.
+    landmarks and hands as in `Capture`, nan where no person was found. n_people: -1 where people were not counted.
     """
 
     frame_index: Int[np.ndarray, "n"]
@@ -56,6 +58,7 @@ class Sightings:
     landmarks_px: Float[np.ndarray, "n 33 2"]
     landmarks_visibility: Float[np.ndarray, "n 33"]
     landmarks_world_m: Float[np.ndarray, "n 33 3"]
+    hands: Hands
     masks_png: tuple[bytes, ...]
     width: int
     height: int
@@ -96,6 +99,7 @@ def look_at_all(
         landmarks_px=landmarks[..., :2],
         landmarks_visibility=np.nan_to_num(landmarks[..., 2]),
         landmarks_world_m=landmarks[..., 3:],
+        hands=stack_hands([look.hands for look in looks]),
         masks_png=tuple(look.mask_png for look in looks),
         width=width,
         height=height,
@@ -180,6 +184,11 @@ def _detector() -> PersonDetector:
     return PersonDetector()
 
 
+@cache
+def _hand_detector() -> HandDetector:
+    return HandDetector()
+
+
 def _look(
     rgb: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"] | None, needs_landmarks: bool, is_counted: bool
 ) -> _Look:
@@ -189,18 +198,20 @@ def _look(
     factor = min(1.0, _SMALL_SIDE_PX / max(rgb.shape[:2]))
     size = (max(1, round(rgb.shape[1] * factor)), max(1, round(rgb.shape[0] * factor)))
     gray = cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
-    landmarks, mask_png = None, b""
+    landmarks, mask_png, hands = None, b"", no_hands()
     if detection is not None:
         landmarks = np.concatenate(
             [detection.landmarks_px, detection.visibility[:, None], detection.landmarks_world_m], axis=1
         )
+    if detection is not None and needs_landmarks:
+        hands = _hand_detector().look(rgb, detection.landmarks_px, detection.visibility, detection.landmarks_world_m)
     if mask is None and detection is not None:
         mask = detection.mask
         mask_png = cv2.imencode(".png", mask, (cv2.IMWRITE_PNG_COMPRESSION, 1))[1].tobytes()
     if mask is None:
         return _Look(gray, np.zeros(gray.shape, dtype=bool), None, b"", n_people)
     person = cv2.resize(mask, size, interpolation=cv2.INTER_AREA) > _PERSON_LEVEL
-    return _Look(gray, person, landmarks, mask_png, n_people)
+    return _Look(gray, person, landmarks, mask_png, n_people, hands)
 
 
 def _landmarks(

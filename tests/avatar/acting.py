@@ -6,11 +6,12 @@ import numpy as np
 import torch
 
 from pipeline.avatar.body import ParametricBody
-from pipeline.avatar.fit_landmarks import OFFSET_COUNT, landmark_regressor
+from pipeline.avatar.fit_landmarks import HAND_LANDMARKS, OFFSET_COUNT, POSE_LANDMARKS, landmark_regressor
 from pipeline.avatar.fit_model import ACTIVE_JOINTS, FitModel, linearise, pose_points, pose_skeleton
 from pipeline.avatar.fit_objective import FitState, Observations
 from pipeline.avatar.fit_quality import make_observations
 from pipeline.avatar.fit_silhouette import Window, matching_window, posed_vertices
+from pipeline.avatar.hands import HAND_POINTS, Hands
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.rotation import axis_angle_to_matrix
 from pipeline.kernels.raster import rasterize
@@ -26,6 +27,7 @@ class Act:
     time_s: np.ndarray
     landmarks_px: np.ndarray
     landmarks_world_m: np.ndarray
+    hands: Hands
 
     def observations(self, camera: Camera) -> Observations:
         return make_observations(
@@ -54,11 +56,13 @@ def act(
     focal_px: float = 520.0,
     noise_m: float = 0.0,
     turn_rad: float = 2 * np.pi,
+    wrists_rad: float = 0.0,
     seed: int = 0,
 ) -> Act:
     """A person who turns on the spot at 3 m with swinging arms and legs, seen at 256 x 320 pixels, 10 frames a second.
 
-    noise_m: standard deviation of landmarks, at the person's depth.
+    noise_m: standard deviation of landmarks, at the person's depth; hands are seen without noise.
+    wrists_rad: how far the hands are turned about each axis.
     """
     values = body.shape_defaults.clone()
     for name, value in (shape or {}).items():
@@ -69,7 +73,7 @@ def act(
     camera = Camera(focal_px, focal_px, 128.0, 160.0, 256, 320)
     root = torch.stack([0.1 * torch.sin(6 * phase), 0.02 * torch.cos(9 * phase) - 0.05, -3.0 + 0.2 * phase], dim=1)
     state = FitState(
-        _dance(phase, turn_rad),
+        _dance(phase, turn_rad, wrists_rad),
         root,
         values.double(),
         torch.zeros(OFFSET_COUNT, dtype=torch.float64),
@@ -78,23 +82,35 @@ def act(
     regressor = landmark_regressor(linearise(body, body.shape_defaults))
     skeleton = pose_skeleton(model, state.rotations, state.root_m)
     world, _ = pose_points(model, skeleton, regressor.points(model, state.offsets_m))
+    hands = _hands(world[:, POSE_LANDMARKS:], camera)
+    world = world[:, :POSE_LANDMARKS]
     pixels, depth_m = project(world, camera)
     random = np.random.default_rng(seed)
     noise_px = noise_m * focal_px / float(depth_m.mean())
     landmarks_px = pixels.numpy() + noise_px * random.standard_normal(pixels.shape)
     relative = (world - 0.5 * (world[:, 23:24] + world[:, 24:25])).numpy() * [1.0, -1.0, -1.0]
-    return Act(
-        model, state, camera, time_s, landmarks_px, relative + 2 * noise_m * random.standard_normal(relative.shape)
-    )
+    directions_m = relative + 2 * noise_m * random.standard_normal(relative.shape)
+    return Act(model, state, camera, time_s, landmarks_px, directions_m, hands)
 
 
-def _dance(phase: torch.Tensor, turn_rad: float) -> torch.Tensor:
+def _hands(points_m: torch.Tensor, camera: Camera) -> Hands:
+    """Sightings of the points of the hands that a fit looks at; the others, which it ignores, lie on one of them."""
+    copied = np.zeros(HAND_POINTS, dtype=np.int64)
+    copied[list(HAND_LANDMARKS)] = np.arange(len(HAND_LANDMARKS))
+    places_m = points_m.reshape(len(points_m), -1, 2, 3).transpose(1, 2)[:, :, copied]
+    pixels, _ = project(places_m.flatten(0, 2), camera)
+    in_camera = (places_m - places_m.mean(2, keepdim=True)).numpy() * [1.0, -1.0, -1.0]
+    return Hands(pixels.reshape(*places_m.shape[:3], 2).numpy(), in_camera, np.ones((len(points_m), 2)))
+
+
+def _dance(phase: torch.Tensor, turn_rad: float, wrists_rad: float) -> torch.Tensor:
     angles = torch.zeros(len(phase), len(ACTIVE_JOINTS), 3, dtype=torch.float64)
     swing = torch.sin(10 * phase)
     angles[:, ACTIVE_JOINTS.index("Hips"), 1] = turn_rad * phase
     for side, sign in (("Left", 1.0), ("Right", -1.0)):
         angles[:, ACTIVE_JOINTS.index(f"{side}Arm"), 0] = -0.3 * sign * swing
         angles[:, ACTIVE_JOINTS.index(f"{side}Arm"), 2] = -0.3 * sign
+        angles[:, ACTIVE_JOINTS.index(f"{side}Hand")] = sign * wrists_rad
         angles[:, ACTIVE_JOINTS.index(f"{side}UpLeg"), 0] = 0.25 * sign * swing
         angles[:, ACTIVE_JOINTS.index(f"{side}Leg"), 0] = 0.3 + 0.2 * sign * swing
     angles[:, ACTIVE_JOINTS.index("Head"), 1] = 0.3 * torch.cos(7 * phase)

@@ -8,7 +8,7 @@ import torch
 
 from pipeline.avatar.body import load_anny
 from pipeline.avatar.fit import FitOptions, FitResult, fit_body
-from pipeline.avatar.fit_landmarks import PAIRS, mirror_permutation
+from pipeline.avatar.fit_landmarks import PAIRS, POSE_LANDMARKS, mirror_permutation
 from pipeline.geometry.rotation import quaternion_to_matrix
 from pipeline.geometry.skinning import forward_kinematics
 from tests.avatar.acting import Act, act, joint_errors_m
@@ -35,7 +35,7 @@ def options(scene: Act, focal_deviation: float = 0.0, rounds: int = 4) -> FitOpt
 def hurt() -> tuple[Act, FitResult]:
     """A full turn with noise, five frames seen the wrong way round, three frames unseen and one landmark that jumps."""
     scene = act(load_anny(), FRAMES, shape=SHAPE, noise_m=0.008)
-    order = mirror_permutation(PAIRS)
+    order = mirror_permutation(PAIRS)[:POSE_LANDMARKS]
     scene.landmarks_px[10:13] = scene.landmarks_px[10:13][:, order]
     scene.landmarks_world_m[10:13] = scene.landmarks_world_m[10:13][:, order] * [1.0, 1.0, -1.0]
     scene.landmarks_px[4] = np.nan

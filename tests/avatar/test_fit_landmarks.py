@@ -2,6 +2,7 @@ import torch
 
 from pipeline.avatar.body import load_anny
 from pipeline.avatar.fit_landmarks import (
+    LANDMARK_COUNT,
     LANDMARKS,
     OFFSET_COUNT,
     PAIRS,
@@ -13,7 +14,7 @@ from pipeline.avatar.fit_model import linearise
 
 
 def test_the_table_names_every_landmark_once() -> None:
-    assert sorted(index for landmark in LANDMARKS for index in landmark.indices) == list(range(33))
+    assert sorted(index for landmark in LANDMARKS for index in landmark.indices) == list(range(LANDMARK_COUNT))
 
 
 def test_landmarks_lie_where_the_table_says_and_mirror_each_other() -> None:
@@ -58,7 +59,7 @@ def test_offsets_move_both_sides_in_mirror_image() -> None:
 
 def test_exchanging_twice_changes_nothing() -> None:
     order = mirror_permutation(PAIRS)
-    assert [order[index] for index in order] == list(range(33))
+    assert [order[index] for index in order] == list(range(LANDMARK_COUNT))
     assert order[0] == 0
     assert order[11] == 12
 

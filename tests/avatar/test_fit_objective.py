@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from pipeline.avatar.body import load_anny
-from pipeline.avatar.fit_landmarks import OFFSET_COUNT, landmark_regressor
+from pipeline.avatar.fit_landmarks import LANDMARK_COUNT, OFFSET_COUNT, landmark_regressor
 from pipeline.avatar.fit_model import ACTIVE_JOINTS, linearise, pose_skeleton
 from pipeline.avatar.fit_objective import (
     LEAST_DEPTH,
@@ -84,10 +84,10 @@ def test_faces_seen_from_behind_are_not_trusted() -> None:
     angles = torch.zeros(3, len(ACTIVE_JOINTS), 3, dtype=torch.float64)
     angles[:, 0, 1] = turned
     factor = facing_factor(pose_skeleton(scene.model, axis_angle_to_matrix(angles), scene.state.root_m), scene.camera)
-    assert torch.allclose(factor[0], torch.ones(33, dtype=torch.float64))
+    assert torch.allclose(factor[0], torch.ones(LANDMARK_COUNT, dtype=torch.float64))
     assert factor[2, 0] == pytest.approx(0.05)
     assert 0.05 < factor[1, 0] < 1.0
-    assert torch.equal(factor[:, 11:], torch.ones(3, 22, dtype=torch.float64))
+    assert torch.equal(factor[:, 11:], torch.ones(3, LANDMARK_COUNT - 11, dtype=torch.float64))
 
 
 @pytest.mark.parametrize(("flatness", "found"), [(0.6, 0.6), (0.1, LEAST_DEPTH), (3.0, MOST_DEPTH)])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.avatar.body import load_anny
-from pipeline.avatar.fit_landmarks import PAIRS, mirror_permutation
+from pipeline.avatar.fit_landmarks import PAIRS, POSE_LANDMARKS, mirror_permutation
 from pipeline.avatar.fit_swaps import (
     LIMBS,
     exchange_bodies,
@@ -44,7 +44,7 @@ def test_nothing_is_exchanged_in_a_clean_full_turn(scene: Act) -> None:
 @pytest.mark.parametrize("wrong", [slice(14, 19), slice(23, 27)])
 def test_a_body_seen_the_wrong_way_round_is_found_and_mended(scene: Act, wrong: slice) -> None:
     truth = scene.observations(scene.camera)
-    order = mirror_permutation(PAIRS)
+    order = mirror_permutation(PAIRS)[:POSE_LANDMARKS]
     scene.landmarks_px[wrong] = scene.landmarks_px[wrong][:, order]
     scene.landmarks_world_m[wrong] = scene.landmarks_world_m[wrong][:, order] * [1.0, 1.0, -1.0]
     observations = scene.observations(scene.camera)
@@ -58,7 +58,7 @@ def test_a_body_seen_the_wrong_way_round_is_found_and_mended(scene: Act, wrong: 
 @pytest.mark.parametrize("limb", list(LIMBS))
 def test_exchanged_limbs_are_found_and_mended(scene: Act, limb: str) -> None:
     truth = scene.observations(scene.camera)
-    order = mirror_permutation(LIMBS[limb][0])
+    order = mirror_permutation(LIMBS[limb][0])[:POSE_LANDMARKS]
     wrong = slice(0, 4)
     scene.landmarks_px[wrong] = scene.landmarks_px[wrong][:, order]
     scene.landmarks_world_m[wrong] = scene.landmarks_world_m[wrong][:, order]

@@ -10,7 +10,7 @@ import torch
 from pipeline.avatar.body import Motion, ParametricBody, canonical_to_world, load_anny
 from pipeline.avatar.fit import FitOptions, FitResult, fit_body
 from pipeline.avatar.fit_landmarks import LANDMARKS
-from pipeline.avatar.fit_model import ACTIVE_JOINTS, GRIP_RAD, grip_rotations
+from pipeline.avatar.fit_model import ACTIVE_JOINTS, GRIP_RAD, grip_rotations, relaxed_curls
 from pipeline.avatar.fit_priors import shape_prior
 from pipeline.avatar.smpl import ARM_DIRECTIONS, FINGER_BEND_RAD, JOINT_NAMES, SmplBody, rotation_between
 from pipeline.geometry.rotation import (
@@ -89,7 +89,7 @@ def test_shape_is_linear_in_the_t_pose_and_differentiable(smpl: SmplBody) -> Non
 def test_fingers_bend_towards_the_palm() -> None:
     """In SMPL's T-pose the palms face down; a bent finger's tip lies lower along the palm's normal."""
     body = SmplBody(made_up_arrays(55))
-    grip = quaternion_to_axis_angle(matrix_to_quaternion(grip_rotations(body)))
+    grip = quaternion_to_axis_angle(matrix_to_quaternion(grip_rotations(body, relaxed_curls())))
     for side, sign in (("Left", 1.0), ("Right", -1.0)):
         index = body.joint_names.index(f"{side}HandMiddle2")
         hand = body.local_rotations(torch.eye(3).repeat(1, 55, 1, 1))[0, 0]
@@ -102,7 +102,7 @@ def test_fingers_bend_towards_the_palm() -> None:
 
 
 def test_a_body_without_fingers_has_no_grip(smpl: SmplBody) -> None:
-    assert torch.equal(grip_rotations(smpl), torch.eye(3).double().repeat(24, 1, 1))
+    assert torch.equal(grip_rotations(smpl, relaxed_curls()), torch.eye(3).double().repeat(24, 1, 1))
 
 
 def _bind_rotations(body: SmplBody) -> torch.Tensor:

@@ -5,12 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 
+from pipeline.avatar.hands import Hands
 from pipeline.core.errors import UserError
 from pipeline.geometry.camera import Camera
 from pipeline.io.capture import IMAGES_FOLDER, MASKS_FOLDER, Capture, image_path, load_capture, mask_path, save_capture
 from pipeline.io.contact import contact_sheet
 from pipeline.io.image import write_gray, write_rgb
 from tests.io.test_smpl_poses import make_poses
+
+HAND_SHAPES = ((4, 2, 21, 2), (4, 2, 21, 3), (4, 2))
 
 
 @pytest.fixture
@@ -51,6 +54,15 @@ def test_round_trip(capture):
             np.testing.assert_array_equal(getattr(loaded, field.name), getattr(capture, field.name), err_msg=field.name)
     assert dataclasses.astuple(loaded.camera)[:6] == dataclasses.astuple(capture.camera)[:6]
     assert len(loaded) == 4
+
+
+def test_hands_come_back(capture):
+    hands = Hands(*(np.random.default_rng(1).random(shape).astype(np.float32) for shape in HAND_SHAPES))
+    save_capture(dataclasses.replace(capture, hands=hands))
+    loaded = load_capture(capture.folder).hands
+    assert loaded is not None
+    for name, values in vars(hands).items():
+        np.testing.assert_array_equal(getattr(loaded, name), values, err_msg=name)
 
 
 def test_supplied_poses_lie_beside(capture):

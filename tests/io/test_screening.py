@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.avatar.hands import no_hands
 from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
 from pipeline.io.screening import refuse_bad_input, warn_of_gaps
@@ -27,6 +28,7 @@ def good() -> Sightings:
         landmarks_px=np.full((n, 33, 2), 50, np.float32),
         landmarks_visibility=np.ones((n, 33), np.float32),
         landmarks_world_m=np.zeros((n, 33, 3), np.float32),
+        hands=no_hands(n),
         masks_png=(b"",) * n,
         width=100,
         height=100,

@@ -1,0 +1,67 @@
+"""The hand model on a real picture, and what is not looked at."""
+
+import numpy as np
+import pytest
+
+from pipeline.avatar.hands import HandDetector, no_hands, pixels_per_metre, stack_hands
+from pipeline.avatar.person import LANDMARK_NAMES, Detection, PersonDetector
+from pipeline.io.video import open_source, read_frames
+
+
+@pytest.fixture(scope="module")
+def detector() -> HandDetector:
+    return HandDetector()
+
+
+@pytest.fixture(scope="module")
+def photograph(shared_data) -> np.ndarray:
+    source = open_source(shared_data / "real" / "dakse" / "video.mp4")
+    return next(read_frames(source, lambda index: index == 185, 2000)).rgb
+
+
+@pytest.fixture(scope="module")
+def person(photograph) -> Detection:
+    found = PersonDetector().detect(photograph)
+    assert found is not None
+    return found
+
+
+def test_a_hand_seen_from_its_back_is_found_and_the_hidden_one_is_not(detector, photograph, person):
+    hands = detector.look(photograph, person.landmarks_px, person.visibility, person.landmarks_world_m)
+    assert hands.own_side[0] > 0.9
+    assert hands.own_side[1] == 0.0
+    assert np.isnan(hands.landmarks_px[1]).all()
+    wrist_px = person.landmarks_px[LANDMARK_NAMES.index("left_wrist")]
+    points_px = hands.landmarks_px[0]
+    assert np.linalg.norm(points_px[0] - wrist_px) < 12
+    assert (points_px[[8, 12, 16, 20], 1] > points_px[0, 1] + 25).all()  # fingers hang
+    assert points_px[4, 0] < points_px[20, 0]  # thumb towards the body, which stands left of it
+    assert 0.05 < np.linalg.norm(hands.landmarks_m[0, 9] - hands.landmarks_m[0, 0]) < 0.12
+
+
+def test_the_other_hand_is_known_as_such(detector, photograph, person):
+    """In a mirrored picture the left hand is a right one."""
+    mirrored = np.ascontiguousarray(photograph[:, ::-1])
+    pose_px = person.landmarks_px * [-1, 1] + [photograph.shape[1], 0]
+    hands = detector.look(mirrored, pose_px.astype(np.float32), person.visibility, person.landmarks_world_m)
+    assert 0.0 < hands.own_side[0] < 0.1
+
+
+def test_a_small_hand_is_not_looked_at(detector, photograph, person):
+    small = np.ascontiguousarray(photograph[::4, ::4])
+    hands = detector.look(small, person.landmarks_px / 4, person.visibility, person.landmarks_world_m)
+    assert (hands.own_side == 0.0).all()
+
+
+def test_hands_are_stacked_and_taken_apart():
+    one, other = no_hands(), no_hands()
+    other.own_side[1] = 0.75
+    both = stack_hands([one, other])
+    assert both.landmarks_px.shape == (2, 2, 21, 2)
+    np.testing.assert_array_equal(both.rows([1, 0]).own_side, [[0, 0.75], [0, 0]])
+
+
+def test_scale_is_independent_of_place():
+    points_m = np.random.default_rng(0).normal(size=(5, 9, 3))
+    points_px = 250.0 * points_m[..., :2] + np.arange(5)[:, None, None]
+    np.testing.assert_allclose(pixels_per_metre(points_px, points_m), np.full(5, 250.0))
