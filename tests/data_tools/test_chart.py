@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from data_tools.chart import bring_up_to_date, origin, write_results
 from data_tools.chart import main as chart
-from data_tools.chart import origin, write_results
 from data_tools.chart_trials import Trial, point_of, read_progress, table_row
 from data_tools.runs import RunState
 from pipeline.core.errors import UserError
@@ -88,6 +88,33 @@ def test_fewer_steps_are_said_everywhere(tmp_path: Path) -> None:
     assert table_row(fewer, run)["steps"] == 600
     write_results(tmp_path, {fewer: run})
     assert "ihm, 600 steps" in (tmp_path / "chart.svg").read_text()
+
+
+@pytest.fixture
+def nothing_may_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run or a comparison that is started is a failure."""
+    for what in ("chart.run_trial", "chart_trials.subprocess.run"):
+        monkeypatch.setattr(f"data_tools.{what}", lambda *_, **__: pytest.fail("started"))
+
+
+def test_what_is_done_and_compared_is_not_done_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, nothing_may_start: None
+) -> None:
+    trial = Trial(tmp_path / "ann", "quick", 0, tmp_path)
+    for folder in (trial.capture / "truth", trial.run_dir / "report"):
+        folder.mkdir(parents=True)
+    monkeypatch.setattr("data_tools.chart.read_run", lambda _: finished(1.0, SCORES))
+    (trial.run_dir / "report" / "truth.json").write_text("{}")
+    assert bring_up_to_date(trial, [trial]).verdict == "done"
+    (trial.run_dir / "report" / "truth.json").unlink()
+    with pytest.raises(pytest.fail.Exception, match="started"):
+        bring_up_to_date(trial, [trial])
+
+
+def test_drawing_runs_nothing(tmp_path: Path, nothing_may_start: None) -> None:
+    (tmp_path / "ann").mkdir()
+    with pytest.raises(UserError, match="1 of 1 runs are not done"):
+        chart([str(tmp_path / "ann"), "--presets", "default", "--out", str(tmp_path / "out"), "--draw"])
 
 
 @pytest.mark.parametrize("entry", ["ihm=600", "default", "default=many", "default=-3"])
