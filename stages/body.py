@@ -11,6 +11,7 @@ from pydantic import Field
 
 from pipeline.avatar.body import Motion, ParametricBody, canonical_to_world, load_anny
 from pipeline.avatar.fit import FitOptions, FitResult, fit_body, fit_given
+from pipeline.avatar.fit_beside import foreign_frames, lump_doubts, lump_shares
 from pipeline.avatar.fit_given import GivenPoses
 from pipeline.avatar.fit_hands import finger_curls_rad, trust_in_hands
 from pipeline.avatar.fit_quality import doubts, make_observations, suspicious_frames
@@ -75,9 +76,10 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     save_motion(out / _MOTION, motion)
     save_camera(out / _CAMERA, result.camera)
     hands_used = trust_in_hands(capture.hands or no_hands(len(capture)), capture.landmarks_px) > 0.0
+    lumps = lump_shares(result.body, canonical_to_world(result.body, motion), result.camera, masks)
     scores = {"silhouette_iou": result.overlap, "landmark_error_px": result.landmark_error_px, "exchanged": exchanged}
-    save_npz(out / _SCORES, {"frame_index": capture.frame_index, **scores})
-    for sentence in doubts(result, capture.frame_index):
+    save_npz(out / _SCORES, {"frame_index": capture.frame_index, **scores, "lump_share": lumps})
+    for sentence in doubts(result, capture.frame_index) + lump_doubts(lumps, capture.frame_index):
         warn(sentence)
     return {
         "silhouette_iou": float(np.nanmedian(result.overlap)),
@@ -90,6 +92,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
         "exchanged_frames": int(exchanged.sum()),
         "hands_used": float(hands_used.mean()),
         "suspicious_frames": int(suspicious_frames(result).sum()),
+        "foreign_frames": int(foreign_frames(lumps).sum()),
     }
 
 
@@ -193,7 +196,7 @@ def overlay(
 
 STAGE = Stage(
     "body",
-    version=4,
+    version=5,
     needs=("frames",),
     makes=(_BODY, _MOTION, _CAMERA, _SCORES, _OVERLAY),
     config=Config,

@@ -66,6 +66,8 @@ def test_stage_writes_body_motion_camera_scores_and_overlay(tmp_path, scene: Act
     assert body.height_m() == pytest.approx(scene.model.height_m()[0], abs=0.03)
     assert load_camera(out / "camera.npz").fx == scene.camera.fx
     assert load_npz(out / "scores.npz")["silhouette_iou"].shape == (FRAMES,)
+    assert load_npz(out / "scores.npz")["lump_share"].max() < 0.005
+    assert metrics["foreign_frames"] == 0
     assert read_rgb(out / "overlay.png").std() > 10
     assert take_warnings() == []
 
