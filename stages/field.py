@@ -155,7 +155,7 @@ def write_preview(path: Path, renders: list[np.ndarray], judge: Judge) -> None:
 
 STAGE = Stage(
     "field",
-    version=3,
+    version=4,
     needs=("frames", "body"),
     makes=("field.safetensors", "occupancy.npz", "motion.npz"),
     config=FieldConfig,

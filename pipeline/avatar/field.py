@@ -29,6 +29,11 @@ ROWS = 8192
 
 QUERY_POINTS = 1 << 18
 
+NEGLIGIBLE = 1e-3
+"""Points whose gradient is below this part of the mean one get none. That is half of them, most behind a surface, and
+together they hold less than a thousandth of the whole.
+"""
+
 
 class _Decode(torch.autograd.Function):
     """relu(features W1) W2 + b, sigmoid for three colours, exp for the density.
@@ -56,15 +61,16 @@ class _Decode(torch.autograd.Function):
         raw_gradient = torch.empty(len(colour), 4).to(colour)
         torch.mul(colour_gradient, colour * (1 - colour), out=raw_gradient[:, :3])
         torch.mul(density_gradient, DENSITY_GAIN * density, out=raw_gradient[:, 3])
-        features_gradient = torch.empty_like(features)
+        features_gradient = torch.zeros_like(features)
         hidden_gradient, output_gradient = torch.zeros_like(hidden), torch.zeros_like(output)
-        parts = (features.split(ROWS), raw_gradient.split(ROWS), features_gradient.split(ROWS))
-        for part, towards, into in zip(*parts, strict=True):
+        size = raw_gradient.abs().amax(1)
+        for rows in torch.nonzero(size > NEGLIGIBLE * size.mean())[:, 0].split(ROWS):
+            part, towards = features[rows], raw_gradient[rows]
             activation = (part @ hidden).clamp_(min=0)
             output_gradient.T.addmm_(towards.T, activation)
             passed = (towards @ output.T).mul_(activation.sign_())
             hidden_gradient.addmm_(part.T, passed)
-            torch.mm(passed, hidden.T, out=into)
+            features_gradient.index_copy_(0, rows, passed @ hidden.T)
         return features_gradient, hidden_gradient, output_gradient, raw_gradient.sum(0)
 
 

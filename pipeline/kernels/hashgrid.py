@@ -91,16 +91,19 @@ class _Encode(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         points, table = (saved.detach() for saved in ctx.saved_tensors)
         layout, sums = ctx.layout, ctx.table_gradient
-        towards = gradient.contiguous().numpy()
+        moved = torch.from_numpy(hashgrid_cpu.rows_that_are_not_zero(gradient.contiguous().numpy()))
+        towards, places = gradient[moved].numpy(), points[moved]
         points_gradient = None
         if ctx.needs_input_grad[0]:
-            points_gradient = torch.zeros_like(points)
-            arrays = (points.numpy(), table.numpy(), layout.plan, towards, points_gradient.numpy())
-            hashgrid_cpu.add_points_gradient(*arrays, layout.lanes)
+            found = torch.zeros_like(places)
+            hashgrid_cpu.add_points_gradient(
+                places.numpy(), table.numpy(), layout.plan, towards, found.numpy(), layout.lanes
+            )
+            points_gradient = torch.zeros_like(points).index_copy_(0, moved, found)
         if not ctx.needs_input_grad[1]:
             return points_gradient, None, None, None
         target = torch.zeros_like(table) if sums is None else sums
-        hashgrid_cpu.add_table_gradient(points.numpy(), layout.plan, towards, target.numpy(), layout.lanes)
+        hashgrid_cpu.add_table_gradient(places.numpy(), layout.plan, towards, target.numpy(), layout.lanes)
         return points_gradient, target if sums is None else None, None, None
 
 

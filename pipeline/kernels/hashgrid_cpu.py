@@ -85,6 +85,20 @@ def encode(points, table, plan, encoded, lanes):
 
 
 @njit(**OPTIONS)
+def rows_that_are_not_zero(values):
+    """Indices of the rows (n, c) that hold anything but zeros."""
+    rows = np.empty(values.shape[0], np.int64)
+    count = 0
+    for row in range(values.shape[0]):
+        for column in range(values.shape[1]):
+            if values[row, column] != np.float32(0):
+                rows[count] = row
+                count += 1
+                break
+    return rows[:count]
+
+
+@njit(**OPTIONS)
 def _level_of_turn(turn, levels):
     """0, 2, 4, ... and then 1, 3, 5, ...: two threads that take half of the turns each get coarse and fine levels."""
     even = (levels + 1) // 2

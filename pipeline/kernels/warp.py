@@ -97,21 +97,22 @@ class _Newton(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, blended: Tensor, start: Tensor, posed: Tensor, slot_start: Tensor, skin: SkinGrid) -> Tensor:
         slot = torch.repeat_interleave(torch.arange(blended.shape[1]), slot_start.diff())
-        refined = torch.empty_like(start)
+        refined, inverse_jacobian = torch.empty_like(start), start.new_empty(len(start), 9)
         grid = (skin.origin_m, np.float32(skin.cell_m), skin.row_of_node)
-        warp_cpu.refine(posed.numpy(), start.numpy(), slot.numpy(), *grid, blended.detach().numpy(), refined.numpy())
-        ctx.save_for_backward(blended, refined, slot_start)
+        arrays = (posed.numpy(), start.numpy(), slot.numpy())
+        warp_cpu.refine(*arrays, *grid, blended.detach().numpy(), refined.numpy(), inverse_jacobian.numpy())
+        ctx.save_for_backward(blended, start, inverse_jacobian, slot_start)
         ctx.skin = skin
         return refined
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        blended, refined, slot_start = (tensor.detach() for tensor in ctx.saved_tensors)
+        blended, *step, slot_start = (tensor.detach() for tensor in ctx.saved_tensors)
         skin = ctx.skin
         total = torch.zeros_like(blended)
         grid = (skin.origin_m, np.float32(skin.cell_m), skin.row_of_node)
-        arrays = (refined.numpy(), gradient.contiguous().numpy(), slot_start.numpy())
-        warp_cpu.pose_gradient(*arrays, *grid, blended.numpy(), total.numpy())
+        arrays = (tensor.numpy() for tensor in (*step, gradient.contiguous(), slot_start))
+        warp_cpu.pose_gradient(*arrays, *grid, total.numpy())
         return total, None, None, None, None
 
 
@@ -126,7 +127,7 @@ def newton(
 
     Args:
         blended: `SkinGrid.blend` of the batch's frames. Differentiable, by the implicit function theorem: dx = -J^-1
-        dA x.
+        dA x, with J and x of the start, which spares a second evaluation.
         start_m: canonical points to start from (a warp grid's answer). Where no step is possible they are the result.
         slot_start: k + 1 offsets; the samples of frame f are slot_start[f] : slot_start[f + 1].
     """

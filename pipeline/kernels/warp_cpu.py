@@ -312,10 +312,10 @@ def bake(nodes, posed, distance, posed_origin, dims, origin, cell, row_of_node, 
 
 
 @njit(parallel=True, **OPTIONS)
-def refine(points_posed, start, slot, origin, cell, row_of_node, blended, refined):
+def refine(points_posed, start, slot, origin, cell, row_of_node, blended, refined, inverse_jacobian):
     """One Newton step for each point (s, 3) from its start; the start itself where a step is not possible.
 
-    slot (s) says which frame of `blended` a point belongs to.
+    slot (s) says which frame of `blended` a point belongs to. inverse_jacobian (s, 9): that of the step, or zeros.
     """
     count = points_posed.shape[0]
     for block in prange((count + BLOCK - 1) // BLOCK):
@@ -326,34 +326,41 @@ def refine(points_posed, start, slot, origin, cell, row_of_node, blended, refine
             if inside and sound:
                 rx, ry, rz = points_posed[s, 0] - qx, points_posed[s, 1] - qy, points_posed[s, 2] - qz
                 x, y, z = x + a * rx + b * ry + c * rz, y + d * rx + e * ry + f * rz, z + g * rx + h * ry + k * rz
+            else:
+                a = b = c = d = e = f = g = h = k = _ZERO
             refined[s, 0], refined[s, 1], refined[s, 2] = x, y, z
+            inverse_jacobian[s, 0], inverse_jacobian[s, 1], inverse_jacobian[s, 2] = a, b, c
+            inverse_jacobian[s, 3], inverse_jacobian[s, 4], inverse_jacobian[s, 5] = d, e, f
+            inverse_jacobian[s, 6], inverse_jacobian[s, 7], inverse_jacobian[s, 8] = g, h, k
 
 
 @njit(parallel=True, **OPTIONS)
-def pose_gradient(points, gradient, slot_start, origin, cell, row_of_node, blended, blended_gradient):
-    """Add dL/dA (m, frames, 12) for dL/dx = gradient at the solutions x of A(x) x = p: dL/d(A x) = -J^-T dL/dx.
+def pose_gradient(points, inverse_jacobian, gradient, slot_start, origin, cell, row_of_node, blended_gradient):
+    """Add dL/dA (m, frames, 12) for dL/dx = gradient, where x solves A(x) x = p: dL/d(A x) = -J^-T dL/dx.
 
-    The samples of frame f are slot_start[f] : slot_start[f + 1]; a thread owns whole frames.
+    points (s, 3) and inverse_jacobian (s, 9) are the starts and what `refine` found there; the samples of frame f are
+    slot_start[f] : slot_start[f + 1]. A thread owns whole frames.
     """
     inverse = _ONE / cell
     for frame in prange(slot_start.shape[0] - 1):
         for s in range(slot_start[frame], slot_start[frame + 1]):
-            x, y, z = points[s, 0], points[s, 1], points[s, 2]
             gx, gy, gz = gradient[s, 0], gradient[s, 1], gradient[s, 2]
             if gx == _ZERO and gy == _ZERO and gz == _ZERO:
                 continue
-            inside, _, _, _, a, b, c, d, e, f, g, h, k = skin(x, y, z, frame, origin, cell, row_of_node, blended)
-            sound, a, b, c, d, e, f, g, h, k = invert(a, b, c, d, e, f, g, h, k)
-            if not inside or not sound:
+            m = inverse_jacobian[s]
+            lx = -(m[0] * gx + m[3] * gy + m[6] * gz)
+            ly = -(m[1] * gx + m[4] * gy + m[7] * gz)
+            lz = -(m[2] * gx + m[5] * gy + m[8] * gz)
+            if lx == _ZERO and ly == _ZERO and lz == _ZERO:
                 continue
-            lx, ly, lz = -(a * gx + d * gy + g * gz), -(b * gx + e * gy + h * gz), -(c * gx + f * gy + k * gz)
+            x, y, z = points[s, 0], points[s, 1], points[s, 2]
             ui, uj, uk = (x - origin[0]) * inverse, (y - origin[1]) * inverse, (z - origin[2]) * inverse
-            i, j, m = int(np.floor(ui)), int(np.floor(uj)), int(np.floor(uk))
-            ui, uj, uk = ui - np.float32(i), uj - np.float32(j), uk - np.float32(m)
+            i, j, k = int(np.floor(ui)), int(np.floor(uj)), int(np.floor(uk))
+            ui, uj, uk = ui - np.float32(i), uj - np.float32(j), uk - np.float32(k)
             for corner in range(8):
                 p, q, r = corner & 1, (corner >> 1) & 1, corner >> 2
                 weight = (ui if p == 1 else _ONE - ui) * (uj if q == 1 else _ONE - uj) * (uk if r == 1 else _ONE - uk)
-                target = blended_gradient[row_of_node[i + p, j + q, m + r], frame]
+                target = blended_gradient[row_of_node[i + p, j + q, k + r], frame]
                 wx, wy, wz = weight * lx, weight * ly, weight * lz
                 target[0] += wx * x
                 target[1] += wx * y

@@ -1,8 +1,11 @@
+from unittest import mock
+
 import numpy as np
 import pytest
 import torch
 
-from pipeline.avatar.field import START_DENSITY_PER_M, Field, _Decode, choose_layout
+from pipeline.avatar import field as field_module
+from pipeline.avatar.field import NEGLIGIBLE, START_DENSITY_PER_M, Field, _Decode, choose_layout
 from pipeline.avatar.occupancy import Occupancy
 from pipeline.core.errors import UserError
 from pipeline.io.checkpoint import load_field, load_occupancy, load_tensors, save_field, save_occupancy, save_tensors
@@ -34,6 +37,27 @@ def test_decoder_keeps_a_gradient_beyond_the_clamp():
     density.sum().backward()
     assert torch.isfinite(density).all()
     assert float(features.grad) > 0
+
+
+def test_points_that_hardly_matter_are_left_out_of_backward():
+    random = torch.Generator().manual_seed(0)
+    inputs = [
+        0.5 * torch.randn(shape, generator=random, dtype=torch.float64) for shape in ((90, 6), (6, 5), (5, 4), (4,))
+    ]
+    towards = [torch.randn(shape, generator=random, dtype=torch.float64) for shape in ((90, 3), (90,))]
+    for direction in towards:
+        direction[:40] *= 1e-5
+    gradients = []
+    for share in (0.0, NEGLIGIBLE):
+        leaves = [tensor.clone().requires_grad_(True) for tensor in inputs]
+        with mock.patch.object(field_module, "NEGLIGIBLE", share):
+            torch.autograd.backward(_Decode.apply(*leaves), towards)
+        gradients.append([leaf.grad for leaf in leaves])
+    assert gradients[0][0][:40].any()
+    assert not gradients[1][0][:40].any()
+    torch.testing.assert_close(gradients[1][0][40:], gradients[0][0][40:])
+    for truth, found in zip(gradients[0][1:], gradients[1][1:], strict=True):
+        assert float((found - truth).norm()) < NEGLIGIBLE * float(truth.norm())
 
 
 def test_starts_as_thin_grey_fog():

@@ -65,9 +65,9 @@ def test_refinement_finds_a_shift_of_the_body(scene):
     root = scene.motion.root_translation_m.copy()
     root[4] = moved.root_translation_m[4]
     motion = scene.motion.with_pose(scene.motion.rotations_wxyz, root).select(TRAIN)
-    config = FieldConfig(**TINY, steps=160, pose_start=0.35, pose_rate=6e-3, pose_smoothness=0.0, pose_size=0.0)
+    config = FieldConfig(**TINY, steps=220, pose_start=0.35, pose_rate=6e-3, pose_smoothness=0.0, pose_size=0.0)
     learning = start_learning(scene.body, motion, scene.camera, pictures, config)
-    for _ in range(160):
+    for _ in range(config.steps):
         learning.step()
     shift = learning.poses.shift_m.detach()
     assert float(shift[3, 0]) < -0.012

@@ -53,6 +53,9 @@ def test_matches_its_twin_in_double(features):
     encoded = encode(points, table, layout)
     random = torch.Generator().manual_seed(0)
     towards = torch.randn(encoded.shape, generator=random)
+    # Most points of a training step have no gradient and are left out.
+    towards[::3] = 0
+    towards[1::3, :-1] = 0
     encoded.backward(towards)
     points64, table64 = points.detach().double().requires_grad_(True), table.detach().double().requires_grad_(True)
     truth = encode(points64, table64, layout)

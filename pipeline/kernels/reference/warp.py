@@ -74,8 +74,8 @@ def newton(
 ) -> Float[Tensor, "s 3"]:
     """Same as `pipeline.kernels.warp.newton`.
 
-    Two steps make it differentiable: a first, without gradient, to x; then x - J(x)^-1 (A(x) x - A(x) x detached),
-    whose value is x and whose gradient is the implicit one.
+    To the step, which has no gradient, -J^-1 (A x - A x detached) is added, with J and x of the start: zero in value,
+    with the implicit gradient.
     """
     parts = []
     grid = (origin_m, cell_m, row_of_node)
@@ -84,8 +84,8 @@ def newton(
         posed = posed_m[slot_start[frame] : slot_start[frame + 1]].detach()
         with torch.no_grad():
             solution = start + _solve(start, posed, blended[:, frame], grid)
-        image = skin_points(solution, blended[:, frame], *grid)
-        parts.append(solution + _solve(solution, image, blended[:, frame].detach(), grid, forward=False))
+        image = skin_points(start, blended[:, frame], *grid)
+        parts.append(solution + _solve(start, image, blended[:, frame].detach(), grid, forward=False))
     return torch.cat(parts)
 
 
