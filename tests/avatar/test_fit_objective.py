@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from pipeline.avatar.body import load_anny
+from pipeline.avatar.fit_init import place_by_landmarks
 from pipeline.avatar.fit_landmarks import LANDMARK_COUNT, OFFSET_COUNT, landmark_regressor
 from pipeline.avatar.fit_model import ACTIVE_JOINTS, linearise, pose_skeleton
 from pipeline.avatar.fit_objective import (
@@ -56,6 +57,27 @@ def test_gradient_agrees_with_differences_of_the_cost(weights: Weights) -> None:
     slope = 2.0 * float((system.frame_gradient * by_frame).sum() + system.shared_gradient @ by_shared)
     # the surface's derivative by shape is that of the nearest corner, hence the tolerance
     assert (ahead - behind) / 2e-6 == pytest.approx(slope, rel=5e-3)
+
+
+def test_a_picture_cut_off_centre_costs_the_same() -> None:
+    """A window of the picture, with the principal point moved along, says the same about every unknown."""
+    left_px, top_px = 21, 10
+    objective, state = build(EXACT)
+    seen, contour = objective.observations, objective.contour
+    assert contour is not None
+    corner = seen.landmarks_px.new_tensor([left_px, top_px])
+    camera = seen.camera.cropped(left_px, top_px, 230, 300)
+    cut = replace(
+        objective,
+        observations=replace(seen, camera=camera, landmarks_px=seen.landmarks_px - corner),
+        contour=replace(contour, target_px=contour.target_px - corner),
+    )
+    whole, part = objective(state), cut(state)
+    assert part.cost == pytest.approx(whole.cost, rel=1e-9)
+    assert torch.allclose(part.frame_gradient, whole.frame_gradient)
+    assert torch.allclose(part.shared_gradient, whole.shared_gradient)
+    start, cut_start = (place_by_landmarks(each.observations, seen.directions_m) for each in (objective, cut))
+    assert torch.allclose(cut_start, start)
 
 
 def test_gradient_of_motion_is_right_for_small_turns() -> None:

@@ -29,7 +29,7 @@ def person(photograph) -> Detection:
 def test_a_hand_seen_from_its_back_is_found_and_the_hidden_one_is_not(detector, photograph, person):
     hands = detector.look(photograph, person.landmarks_px, person.visibility, person.landmarks_world_m)
     assert hands.own_side[0] > 0.9
-    assert hands.own_side[1] == 0.0
+    assert hands.own_side[1] == 0.0  # behind the back
     assert np.isnan(hands.landmarks_px[1]).all()
     wrist_px = person.landmarks_px[LANDMARK_NAMES.index("left_wrist")]
     points_px = hands.landmarks_px[0]
@@ -51,6 +51,13 @@ def test_a_small_hand_is_not_looked_at(detector, photograph, person):
     small = np.ascontiguousarray(photograph[::4, ::4])
     hands = detector.look(small, person.landmarks_px / 4, person.visibility, person.landmarks_world_m)
     assert (hands.own_side == 0.0).all()
+
+
+def test_a_hand_that_the_pose_calls_hidden_is_not_looked_at(detector, photograph, person):
+    visibility = person.visibility.copy()
+    visibility[LANDMARK_NAMES.index("left_wrist")] = 0.2
+    hands = detector.look(photograph, person.landmarks_px, visibility, person.landmarks_world_m)
+    assert hands.own_side[0] == 0.0
 
 
 def test_hands_are_stacked_and_taken_apart():

@@ -92,6 +92,14 @@ def test_landmarks_without_depth_are_refused_with_a_remedy(tmp_path, scene: Act)
         run({"frames": frames}, out, Config())
 
 
+def test_a_supplied_principal_point_is_kept(tmp_path, scene: Act) -> None:
+    """Also when an angle of view is given: the camera beside the video is the better word."""
+    camera = replace(scene.camera, cx=scene.camera.cx + 30.0, cy=scene.camera.cy - 20.0)
+    write_capture(tmp_path, scene, camera, [])
+    found, deviation = starting_camera(load_capture(tmp_path), Config(field_of_view_deg=90.0))
+    assert (found.cx, found.cy, deviation) == (camera.cx, camera.cy, 0.0)
+
+
 def test_camera_supplied_then_given_then_guessed(tmp_path, scene: Act) -> None:
     for name, camera in (("known", scene.camera), ("unknown", None)):
         write_capture(tmp_path / name, scene, camera, [])
