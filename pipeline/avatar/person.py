@@ -122,7 +122,7 @@ class _Look(NamedTuple):
 
 
 class PersonDetector:
-    """MediaPipe's pose model in its middle size; about 55 ms an image on one core, whatever the image's size."""
+    """MediaPipe's pose model in its middle size; about 65 ms an image on one core, whatever the image's size."""
 
     def __init__(self) -> None:
         with quiet_stderr():
