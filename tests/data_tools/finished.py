@@ -88,6 +88,16 @@ def shrunk(pair: Comparison, factor: float) -> Comparison:
     return with_motion(replace(pair, run=replace(run, body=body, avatar=avatar)), nearer)
 
 
+def seen_from_afar(pair: Comparison, factor: float) -> Comparison:
+    """The same run, had it taken the lens for longer and the person for as much farther away."""
+    camera, motion = pair.run.camera, pair.run.motion
+    longer = replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
+    turn, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+    roots = (motion.root_translation_m @ turn.T + shift) * np.array([1.0, 1.0, factor], np.float32)
+    farther = motion.with_pose(motion.rotations_wxyz, (roots - shift) @ turn)
+    return with_motion(replace(pair, run=replace(pair.run, camera=longer)), farther)
+
+
 def resting_otherwise(pair: Comparison, angle_rad: float) -> Comparison:
     """The same run on a rig whose A-pose has the left arm raised by an angle."""
     body, avatar = pair.run.body, pair.run.avatar

@@ -19,8 +19,10 @@ from data_tools.compare_avatar import (
     taken_over,
 )
 from pipeline.avatar.body import Body
+from pipeline.avatar.selection import HELDOUT, TRAIN
+from pipeline.geometry.mesh import Mesh
 from pipeline.metrics.images import mean_scores
-from tests.data_tools.finished import bent_arm, perfect_run, resting_otherwise, shrunk, with_motion
+from tests.data_tools.finished import bent_arm, perfect_run, resting_otherwise, seen_from_afar, shrunk, with_motion
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +43,14 @@ def test_the_truth_has_no_error(perfect: Comparison) -> None:
     texture = compare_texture(perfect)
     assert texture["coverage"] == 1.0
     assert texture["colour_error"] < 1.0
+
+
+def test_filmed_poses_are_those_of_held_out_frames(perfect: Comparison) -> None:
+    """A wrong arm counts where it is held out, and nowhere else."""
+    heldout, train = (perfect.run.capture.positions(kind) for kind in (HELDOUT, TRAIN))
+    wrong, trained = (compare_filmed(with_motion(perfect, bent_arm(perfect, rows, 0.3))) for rows in (heldout, train))
+    assert wrong["chamfer_mm"] > 1.0
+    assert trained["chamfer_mm"] < 0.2
 
 
 def test_a_smaller_person_has_the_same_shape(perfect: Comparison) -> None:
@@ -103,6 +113,14 @@ def test_size_and_distance_are_no_error_of_the_pose(perfect: Comparison, perfect
     assert smaller["psnr_body"] == pytest.approx(perfect_ceiling["psnr_body"], abs=0.5)
 
 
+def test_a_longer_lens_costs_its_perspective_alone(perfect: Comparison) -> None:
+    """A person who is taken for a fifth farther away, by a lens a fifth longer, keeps size, place and shape."""
+    afar = seen_from_afar(perfect, 1.2)
+    apart_m = np.linalg.norm(absorbed(afar) - perfect.truth.subject.body.vertices, axis=1)
+    assert apart_m.max() < 1e-3
+    assert mean_scores(ceiling(afar))["mask_iou"] > 0.97
+
+
 def test_an_arm_that_is_always_off_belongs_to_the_shape(perfect: Comparison, perfect_ceiling: dict[str, float]) -> None:
     """The same error in all frames can be made good in the A-pose; in the held-out frame alone it cannot."""
     frames = np.arange(len(perfect.run.motion.frame_index))
@@ -110,6 +128,31 @@ def test_an_arm_that_is_always_off_belongs_to_the_shape(perfect: Comparison, per
     once = mean_scores(ceiling(with_motion(perfect, bent_arm(perfect, frames[:1], 0.15))))
     assert always["psnr_body"] > perfect_ceiling["psnr_body"] - 4.0
     assert once["psnr_body"] < always["psnr_body"] - 4.0
+
+
+def test_a_frame_moves_what_it_sees_across_the_view(perfect: Comparison) -> None:
+    """One training frame 3 cm off: sideways it moves what faces the camera there; in depth it moves hardly anything."""
+    motion, camera, true = perfect.run.motion, perfect.run.camera, perfect.truth.subject.body.vertices
+    frame = int(perfect.run.capture.positions(TRAIN)[0])
+    moved = []
+    for axis in (0, 2):
+        root_m = motion.root_translation_m.copy()
+        root_m[frame] += 0.03 * camera.world_to_camera[axis, :3]
+        wrong = with_motion(perfect, motion.with_pose(motion.rotations_wxyz, root_m))
+        moved.append(np.linalg.norm(absorbed(wrong) - true, axis=1))
+    sideways, deeper = moved
+    posed = Mesh(perfect.run.avatar.posed(perfect.run.refined[frame]).numpy(), perfect.run.avatar.faces.numpy())
+    towards = posed.vertex_normals() @ -camera.world_to_camera[2, :3]
+    assert deeper.mean() < 0.3 * sideways.mean()
+    assert sideways[towards < -0.9].mean() < 0.3 * sideways[towards > 0.9].mean()
+
+
+def test_joints_that_the_fit_lacks_are_carried_by_their_parent(perfect: Comparison) -> None:
+    """A thumb's tip follows the thumb, which never bends here, wherever the hand goes."""
+    body, true = perfect.run.body, perfect.truth.subject.body.vertices
+    names = tuple("Tail" if name == "LeftHandThumb3" else name for name in body.joint_names)
+    lacking = replace(perfect, run=replace(perfect.run, body=replace(body, joint_names=names)))
+    assert np.abs(absorbed(lacking) - true).max() < 1e-3
 
 
 def test_rotations_go_by_name(bare: Body, perfect: Comparison) -> None:
