@@ -1,6 +1,7 @@
 """field: the instant avatar, a radiance field in the canonical A-pose, learnt from the frames in about a minute."""
 
 import csv
+import math
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -92,7 +93,10 @@ def learn(learning: Learning, judge: Judge, out: Path) -> float:
             raise UserError(f"the field does not learn ({error}); lower field.table_rate and try again") from None
         seconds.append(time.monotonic() - start)
         if learning.done in looks and judge.truths:
-            progress.add(learning.done, sum(seconds), *thin.score(thin.render(learning, learning.refines_poses)))
+            renders = thin.render(learning, learning.refines_poses)
+            progress.add(learning.done, sum(seconds), *thin.score(renders), *thin.frame_scores(renders))
+            if learning.config.early_stop and progress.has_settled(learning.config.steps / 2):
+                break
         if time.monotonic() - saved > CHECKPOINT_EVERY_S:
             save_tensors(checkpoint, learning.state())
             saved = time.monotonic()
@@ -101,7 +105,10 @@ def learn(learning: Learning, judge: Judge, out: Path) -> float:
 
 
 class Progress:
-    """The curve of accuracy over time, kept beside the checkpoint and published as `progress.csv`."""
+    """The curve of accuracy over time, kept beside the checkpoint and published as `progress.csv`.
+
+    A row has step, seconds, the two mean scores, and then the score of each validation frame.
+    """
 
     COLUMNS = ("step", "seconds", "validation_psnr_db", "validation_psnr_body_db")
 
@@ -118,8 +125,21 @@ class Progress:
     def add(self, step: int, seconds: float, *scores_db: float) -> None:
         """Note the scores after a step and the seconds of learning since this process began with it."""
         self.rows.append((step, round(self.before_s + seconds, 3), *(round(score, 4) for score in scores_db)))
+        frames = range(len(self.rows[0]) - len(self.COLUMNS))
         with self.kept.open("w", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerows([self.COLUMNS, *self.rows])
+            csv.writer(file).writerows([(*self.COLUMNS, *(f"frame_{frame}_db" for frame in frames)), *self.rows])
+
+    def has_settled(self, first_step: float) -> bool:
+        """True if neither of the last two looks, both after `first_step`, found a gain that stands out from its noise.
+
+        The noise is the standard error of the mean over frames, each compared with itself a look before.
+        """
+        late = [row[len(self.COLUMNS) :] for row in self.rows if row[0] >= first_step]
+        if len(late) < 3 or len(late[0]) < 2:
+            return False
+        gains_db = np.diff(np.array(late[-3:]), axis=0)
+        noise_db = gains_db.std(axis=1, ddof=1) / math.sqrt(gains_db.shape[1])
+        return bool((gains_db.mean(axis=1) <= noise_db).all())
 
     def finish(self) -> None:
         """Publish what there is."""

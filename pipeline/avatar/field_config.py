@@ -81,3 +81,6 @@ class FieldConfig(Config):
     pose_smoothness: float = Option(0.02, ge=0, description="weight of the change of corrections from frame to frame")
     pose_size: float = Option(0.002, ge=0, description="weight of the size of corrections")
     validation_frames: int = Option(4, ge=0, description="validation frames that are rendered to judge the result")
+    early_stop: bool = Option(
+        True, description="end before all steps are made, once validation frames gain no more than noise"
+    )

@@ -45,9 +45,12 @@ class Judge:
     def score(self, renders: Sequence[UInt8[np.ndarray, "h w 3"]]) -> tuple[float, float]:
         """Mean decibels of whole images on white, and of body pixels alone; NaN where there is nothing to score."""
         targets = [(on_white(image, mask), body_pixels(mask)) for image, mask in self.truths]
-        full = [psnr_db(render, target) for render, (target, _) in zip(renders, targets, strict=True)]
         body = [psnr_db(render, *target) for render, target in zip(renders, targets, strict=True) if target[1].any()]
-        return _mean(full), _mean(body)
+        return _mean(self.frame_scores(renders)), _mean(body)
+
+    def frame_scores(self, renders: Sequence[UInt8[np.ndarray, "h w 3"]]) -> list[float]:
+        """Decibels of each whole image on white."""
+        return [psnr_db(render, on_white(*truth)) for render, truth in zip(renders, self.truths, strict=True)]
 
 
 def _mean(values: list[float]) -> float:
