@@ -52,6 +52,13 @@ class Config(BaseConfig):
     usual_focal: float = Field(
         1.2, ge=0.3, le=5.0, description="Where the estimate of the focal length starts, times the longer image side."
     )
+    principal_point: float = Field(
+        0.05,
+        ge=0.0,
+        le=0.3,
+        description="Standard deviation of the principal point about the picture's centre where the camera is not "
+        "known, longer image sides; 0: it is the centre.",
+    )
     shared_frames: int = Field(48, ge=8, le=500, description="Frames from which shape and focal length are found.")
     rounds: int = Field(8, ge=1, le=50, description="Rounds of matching outlines to find shape and focal length.")
     supplied_poses: Literal["keep", "start", "ignore"] = Field(
@@ -87,6 +94,8 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
         "landmark_error_px": float(np.nanmedian(result.landmark_error_px)),
         "focal_px": result.camera.fx,
         "focal_deviation": result.focal_deviation,
+        "principal_x_px": result.camera.cx,
+        "principal_y_px": result.camera.cy,
         "height_m": result.body.height_m(),
         "height_deviation_m": result.height_deviation_m,
         "exchanged_frames": int(exchanged.sum()),
@@ -102,7 +111,9 @@ def fit(capture: Capture, masks: Sequence[UInt8[np.ndarray, "h w"]], frames_dir:
     hands = capture.hands or no_hands(len(capture))
     landmarks = capture.landmarks_px, capture.landmarks_visibility, capture.landmarks_world_m
     observations = make_observations(capture.time_s, *landmarks, camera, hands)
-    options = FitOptions(config.height_m, focal_deviation, config.shared_frames, config.rounds)
+    side_px = max(camera.width, camera.height)
+    centre_deviation = config.principal_point * side_px / camera.fx if focal_deviation > 0.0 else 0.0
+    options = FitOptions(config.height_m, focal_deviation, centre_deviation, config.shared_frames, config.rounds)
     windows = [matching_window(mask) for mask in masks]
     model = load_anny() if config.model_file is None else load_smpl(Path(config.model_file))
     given = supplied_poses(capture, model, camera, focal_deviation == 0.0, config)
@@ -196,7 +207,7 @@ def overlay(
 
 STAGE = Stage(
     "body",
-    version=5,
+    version=6,
     needs=("frames",),
     makes=(_BODY, _MOTION, _CAMERA, _SCORES, _OVERLAY),
     config=Config,

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pipeline.avatar.body import Body, ParametricBody
+from pipeline.avatar.fit_camera import project_with_covectors, through_lens
 from pipeline.avatar.fit_floor import Contact, floor_contact
 from pipeline.avatar.fit_given import GivenPoses
 from pipeline.avatar.fit_init import initial_state, interpolated_state, torso_found
@@ -25,7 +26,6 @@ from pipeline.avatar.fit_objective import (
     Observations,
     Weights,
     image_scale,
-    project_with_covectors,
 )
 from pipeline.avatar.fit_place import place_of_root
 from pipeline.avatar.fit_priors import (
@@ -36,7 +36,7 @@ from pipeline.avatar.fit_priors import (
     observed_motion,
     shape_prior,
 )
-from pipeline.avatar.fit_silhouette import Window, focused_camera, match_all
+from pipeline.avatar.fit_silhouette import Window, match_all
 from pipeline.avatar.fit_solver import NormalEquations, minimise, shared_covariance
 from pipeline.avatar.fit_swaps import LIMBS, exchange_bodies, exchange_limbs, exchanged_bodies, exchanged_limbs
 from pipeline.core.progress import track
@@ -60,13 +60,15 @@ HAND_M = 0.012
 
 @dataclass(frozen=True)
 class FitOptions:
-    """`height_m` and a `focal_deviation` of 0 take unknowns away; `shared_frames` and `rounds` are the effort.
+    """`height_m` and deviations of 0 take unknowns away; `shared_frames` and `rounds` are the effort.
 
     focal_deviation: standard deviation of the logarithm of the true focal length over the one to start from.
+    centre_deviation: standard deviation of the principal point about the one to start from, in focal lengths.
     """
 
     height_m: float | None = None
     focal_deviation: float = 0.5
+    centre_deviation: float = 0.0
     shared_frames: int = 48
     rounds: int = 8
 
@@ -213,6 +215,8 @@ def _fit_shared(
     weights = replace(weights, free_offsets=True)
     if options.focal_deviation > 0.0:
         weights = replace(weights, free_focal=True, focal_log=options.focal_deviation)
+    if options.centre_deviation > 0.0:
+        weights = replace(weights, free_centre=True, centre=options.centre_deviation)
     model = tools.model(state.shape)
     state, system = _minimised(tools, model, observations, weights, state, LANDMARK_STEPS)
     weights = replace(weights, landmark_m=OUTLINE_LANDMARK_M, direction_m=OUTLINE_DIRECTION_M)
@@ -230,7 +234,7 @@ def _fit_poses(
     weights: Weights,
 ) -> tuple[FitState, FitModel, Float[np.ndarray, "n"]]:
     """The pose of every frame with all that is shared held fixed, and each frame's overlap with its mask."""
-    weights = replace(weights, free_shape=False, free_offsets=False, free_focal=False, hand_m=HAND_M)
+    weights = replace(weights, free_shape=False, free_offsets=False, free_focal=False, free_centre=False, hand_m=HAND_M)
     model = tools.model(state.shape)
     landmarks_only = replace(weights, landmark_m=Weights.landmark_m, direction_m=Weights.direction_m)
     state, _ = _minimised(tools, model, observations, landmarks_only, state, OUTLINE_STEPS)
@@ -294,7 +298,7 @@ def landmark_errors_px(
     """Median distance of each frame's well-seen pose landmarks from the body's; nan without any."""
     skeleton = pose_skeleton(model, state.rotations, state.root_m)
     world, _ = pose_points(model, skeleton, regressor.points(model, state.offsets_m))
-    pixels, _ = project_with_covectors(world, observations.camera, state.focal_log)
+    pixels, _ = project_with_covectors(world, through_lens(observations.camera, state.lens))
     error = (pixels - observations.landmarks_px).norm(dim=-1)[:, :POSE_LANDMARKS]
     return torch.where(observations.confidence[:, :POSE_LANDMARKS] > 0.5, error, torch.nan).nanmedian(1).values.numpy()
 
@@ -315,7 +319,7 @@ def _result(
         body=tools.body.body(state.shape.float()),
         rotations_wxyz=continuous_quaternions(quaternions).float().numpy(),
         root_translation_m=state.root_m.float().numpy(),
-        camera=focused_camera(observations.camera, state),
+        camera=through_lens(observations.camera, state.lens),
         landmark_error_px=landmark_errors_px(tools.regressor, model, state, observations),
         overlap=overlap,
         exchanged=exchanged,

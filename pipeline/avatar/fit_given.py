@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pipeline.avatar.fit_camera import LENS_COUNT
 from pipeline.avatar.fit_init import interpolated_state
 from pipeline.avatar.fit_landmarks import OFFSET_COUNT
 from pipeline.avatar.fit_objective import FitState
@@ -35,7 +36,7 @@ class GivenPoses:
             self.root_m.double(),
             self.shape.double(),
             torch.zeros(OFFSET_COUNT, dtype=torch.float64),
-            torch.zeros((), dtype=torch.float64),
+            torch.zeros(LENS_COUNT, dtype=torch.float64),
         )
         return interpolated_state(state, self.rows, time_s)
 

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pipeline.avatar.fit_camera import LENS_COUNT
 from pipeline.avatar.fit_objective import FitState, Observations
 from pipeline.geometry.rotation import matrix_to_quaternion, quaternion_to_matrix, slerp
 
@@ -70,7 +71,7 @@ def initial_state(
         root,
         shape.double(),
         torch.zeros(offset_count, dtype=torch.float64),
-        torch.zeros((), dtype=torch.float64),
+        torch.zeros(LENS_COUNT, dtype=torch.float64),
     )
 
 

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pipeline.avatar.fit_camera import LENS_COUNT, pixels_by_lens, project_with_covectors, through_lens
 from pipeline.avatar.fit_floor import Contact, add_contact
 from pipeline.avatar.fit_landmarks import (
     LANDMARK_COUNT,
@@ -30,7 +31,7 @@ from pipeline.avatar.fit_model import (
     shape_rows,
     surface_points,
 )
-from pipeline.avatar.fit_place import MINIMUM_DEPTH_M, place_of_root, root_by_place, root_of_place
+from pipeline.avatar.fit_place import place_of_root, root_by_place, root_of_place
 from pipeline.avatar.fit_priors import (
     JointPrior,
     ShapePrior,
@@ -54,13 +55,13 @@ LEAST_DEPTH, MOST_DEPTH = 0.4, 1.2
 
 @dataclass(frozen=True)
 class FitState:
-    """The unknowns. `focal_log` is the logarithm of the focal length over that of the given camera."""
+    """The unknowns; `lens` as in `pipeline.avatar.fit_camera`."""
 
     rotations: Float[Tensor, "n j 3 3"]
     root_m: Float[Tensor, "n 3"]
     shape: Float[Tensor, "s"]
     offsets_m: Float[Tensor, "o"]
-    focal_log: Float[Tensor, ""]
+    lens: Float[Tensor, "3"]
 
     def moved(self, frame_step: Float[Tensor, "n p"], shared_step: Float[Tensor, "g"], camera: Camera) -> "FitState":
         """The state after a step; an empty shared step leaves what is shared as it is."""
@@ -73,8 +74,8 @@ class FitState:
         return replace(
             moved,
             shape=self.shape + shared_step[:shapes],
-            offsets_m=self.offsets_m + shared_step[shapes:-1],
-            focal_log=self.focal_log + shared_step[-1],
+            offsets_m=self.offsets_m + shared_step[shapes:-LENS_COUNT],
+            lens=self.lens + shared_step[-LENS_COUNT:],
         )
 
     def rows(self, rows: Int[np.ndarray, "k"]) -> "FitState":
@@ -133,9 +134,11 @@ class Weights:
     height_m: float = 1.70
     height_deviation_m: float = 0.02
     focal_log: float = 0.5
+    centre: float = 0.05
     free_shape: bool = True
     free_offsets: bool = False
     free_focal: bool = False
+    free_centre: bool = False
 
     def landmarks_m(self) -> Float[Tensor, "l"]:
         """Standard deviation of each landmark in the image, metres at the person."""
@@ -145,7 +148,7 @@ class Weights:
 
     def anything_shared(self) -> bool:
         """Whether any number that all frames share may move."""
-        return self.free_shape or self.free_offsets or self.free_focal
+        return self.free_shape or self.free_offsets or self.free_focal or self.free_centre
 
 
 @dataclass(frozen=True)
@@ -173,7 +176,7 @@ class Objective:
         model = self.model.moved(state.shape)
         frames, joints = state.rotations.shape[:2]
         shapes = len(state.shape)
-        shared = shapes + OFFSET_COUNT + 1 if self.weights.anything_shared() else 0
+        shared = shapes + OFFSET_COUNT + LENS_COUNT if self.weights.anything_shared() else 0
         system = NormalEquations.zeros(frames, 3 * joints + 3, shared)
         skeleton = pose_skeleton(model, state.rotations, state.root_m)
         self._add_landmarks(system, model, skeleton, state)
@@ -194,9 +197,9 @@ class Objective:
         return replace(moved, shape=moved.shape.clamp(self.shape_prior.lowest, self.shape_prior.highest))
 
     def _free(self, shapes: int) -> Bool[Tensor, "g"]:
-        free = torch.ones(shapes + OFFSET_COUNT + 1, dtype=torch.bool)
-        free[:shapes], free[shapes:-1] = self.weights.free_shape, self.weights.free_offsets
-        free[-1] = self.weights.free_focal
+        free = torch.ones(shapes + OFFSET_COUNT + LENS_COUNT, dtype=torch.bool)
+        free[:shapes], free[shapes:-LENS_COUNT] = self.weights.free_shape, self.weights.free_offsets
+        free[-LENS_COUNT:-1], free[-1] = self.weights.free_centre, self.weights.free_focal
         return free
 
     def _add_landmarks(
@@ -205,7 +208,8 @@ class Objective:
         seen, weights = self.observations, self.weights
         points = self.regressor.points(model, state.offsets_m)
         world, arms = pose_points(model, skeleton, points)
-        pixels, covectors = project_with_covectors(world, seen.camera, state.focal_log)
+        pixels, covectors = project_with_covectors(world, through_lens(seen.camera, state.lens))
+        by_lens = pixels_by_lens(pixels, seen.camera, state.lens)
         noise = landmark_noise()
         facing = facing_factor(skeleton, seen.camera)
         confidence = seen.confidence * facing
@@ -215,8 +219,7 @@ class Objective:
         by_place = root_by_place(state.root_m, seen.camera)
         for axis in range(2):
             covector = covectors[:, :, axis] * inverse[..., None]
-            by_focal = (pixels[..., axis] - _centre(seen.camera)[axis]) * inverse
-            by_shared = self._shared_rows(model, skeleton, points, covector, by_focal)
+            by_shared = self._shared_rows(model, skeleton, points, covector, by_lens[:, :, axis] * inverse[..., None])
             system.add(pose_rows(skeleton, arms, by_place, covector), by_shared, residual[..., axis], weight)
         trust = seen.direction_confidence * facing / noise.square()
         self._add_directions(system, model, skeleton, points, world, arms, trust)
@@ -244,7 +247,7 @@ class Objective:
         for axis in range(3):
             covector = (scale[axis] * to_camera[axis]).expand_as(world)
             rows = pose_rows(skeleton, arms, by_place, covector)
-            shared = self._shared_rows(model, skeleton, points, covector, torch.zeros_like(confidence))
+            shared = self._shared_rows(model, skeleton, points, covector, world.new_zeros(*world.shape[:2], LENS_COUNT))
             rows = (rows - _hip_middle(rows)) * inverse[..., axis, None]
             shared = (shared - _hip_middle(shared)) * inverse[..., axis, None]
             system.add(rows, shared, residual[..., axis], weight)
@@ -255,14 +258,15 @@ class Objective:
         seen = self.observations
         points = surface_points(model, contour.corners, contour.barycentric)
         world, arms = pose_points(model, skeleton, points)
-        pixels, covectors = project_with_covectors(world, seen.camera, state.focal_log)
+        pixels, covectors = project_with_covectors(world, through_lens(seen.camera, state.lens))
         inverse = 1.0 / (self.px_per_m[:, None] * self.weights.contour_m)
         residual = ((pixels - contour.target_px) * contour.normal).sum(-1) * inverse
         weight = contour.weight * robust_weights(system, residual.square(), self.weights.contour_cutoff, contour.weight)
         covector = (covectors * contour.normal[..., None]).sum(2) * inverse[..., None]
-        centred = pixels - pixels.new_tensor(_centre(seen.camera))
-        by_focal = (centred * contour.normal).sum(-1) * inverse
-        by_shared = self._shared_rows(model, skeleton, points, covector, by_focal)
+        by_lens = (pixels_by_lens(pixels, seen.camera, state.lens) * contour.normal[..., None]).sum(2) * inverse[
+            ..., None
+        ]
+        by_shared = self._shared_rows(model, skeleton, points, covector, by_lens)
         by_place = root_by_place(state.root_m, seen.camera)
         system.add(pose_rows(skeleton, arms, by_place, covector), by_shared, residual, weight)
 
@@ -272,15 +276,15 @@ class Objective:
         skeleton: PosedSkeleton,
         points: Points,
         covector: Float[Tensor, "n m 3"],
-        by_focal: Float[Tensor, "n m"],
+        by_lens: Float[Tensor, "n m 3"],
     ) -> Float[Tensor, "n m g"]:
-        """Derivative of covector · point by shape, landmark offsets and focal length; no columns when all are fixed."""
+        """Derivative of covector · point by shape, landmark offsets and lens; no columns when all are fixed."""
         if not self.weights.anything_shared():
             return covector[..., :0]
         by_shape = shape_rows(model, skeleton, points, covector)
         missing = len(model.shape) + OFFSET_COUNT - by_shape.shape[-1]
         offsets = by_shape.new_zeros(*by_shape.shape[:2], missing)
-        return torch.cat([by_shape, offsets, by_focal[..., None]], dim=-1)
+        return torch.cat([by_shape, offsets, by_lens], dim=-1)
 
     def _add_pose(self, system: NormalEquations, state: FitState) -> None:
         residual, derivative = pose_residuals(self.joint_prior, state.rotations)
@@ -312,16 +316,16 @@ class Objective:
         system.after_next_frame[:inner] += weight * factors[0] * factors[2]
 
     def _add_shared(self, system: NormalEquations, model: FitModel, state: FitState) -> None:
-        """Priors on shape, stature, landmark offsets and focal length."""
+        """Priors on shape, stature, landmark offsets and lens."""
         weights, shapes = self.weights, len(state.shape)
         deviation = torch.cat(
             [
                 self.shape_prior.deviation,
                 torch.full((OFFSET_COUNT,), weights.offset_m, dtype=torch.float64),
-                torch.tensor([weights.focal_log], dtype=torch.float64),
+                torch.tensor([weights.centre, weights.centre, weights.focal_log], dtype=torch.float64),
             ]
         )
-        value = torch.cat([state.shape - self.shape_prior.mean, state.offsets_m, state.focal_log[None]]) / deviation
+        value = torch.cat([state.shape - self.shape_prior.mean, state.offsets_m, state.lens]) / deviation
         system.cost += float(value.square().sum())
         system.shared += torch.diag(deviation**-2)
         system.shared_gradient += value / deviation
@@ -331,26 +335,6 @@ class Objective:
         system.cost += residual**2
         system.shared[:shapes, :shapes] += torch.outer(gradient, gradient)
         system.shared_gradient[:shapes] += gradient * residual
-
-
-def project_with_covectors(
-    world: Float[Tensor, "n m 3"], camera: Camera, focal_log: Float[Tensor, ""]
-) -> tuple[Float[Tensor, "n m 2"], Float[Tensor, "n m 2 3"]]:
-    """Pixels and their derivative by the world point."""
-    scale = float(torch.exp(focal_log))
-    pose = torch.as_tensor(camera.world_to_camera, dtype=world.dtype)
-    x, y, depth = (world @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
-    depth = depth.clamp(min=MINIMUM_DEPTH_M)
-    fx, fy, zero = camera.fx * scale, camera.fy * scale, torch.zeros_like(x)
-    pixels = torch.stack([fx * x / depth + camera.cx, fy * y / depth + camera.cy], dim=-1)
-    in_camera = torch.stack(
-        [
-            torch.stack([fx / depth, zero, -fx * x / depth**2], dim=-1),
-            torch.stack([zero, fy / depth, -fy * y / depth**2], dim=-1),
-        ],
-        dim=-2,
-    )
-    return pixels, in_camera @ pose[:3, :3]
 
 
 def facing_factor(skeleton: PosedSkeleton, camera: Camera) -> Float[Tensor, "n l"]:
@@ -389,11 +373,7 @@ def direction_scale(
 
 def image_scale(state: FitState, camera: Camera) -> Float[Tensor, "n"]:
     """Pixels a metre at each frame's person."""
-    return camera.fx * torch.exp(state.focal_log - place_of_root(state.root_m, camera)[:, 2])
-
-
-def _centre(camera: Camera) -> tuple[float, float]:
-    return camera.cx, camera.cy
+    return through_lens(camera, state.lens).fx * torch.exp(-place_of_root(state.root_m, camera)[:, 2])
 
 
 def _hip_middle(values: Float[Tensor, "n l c"]) -> Float[Tensor, "n 1 c"]:

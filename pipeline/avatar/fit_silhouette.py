@@ -6,7 +6,7 @@ mask's outline wants the body's nearest outline with a similar normal. Outlines 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from pipeline.avatar.fit_camera import through_lens
 from pipeline.avatar.fit_model import ACTIVE_JOINTS, FitModel, pose_skeleton
 from pipeline.avatar.fit_objective import Contour, FitState, Observations
 from pipeline.geometry.camera import Camera, project
@@ -111,12 +112,6 @@ def posed_vertices(model: FitModel, state: FitState) -> Float[Tensor, "n v 3"]:
     return torch.cat(chunks)
 
 
-def focused_camera(camera: Camera, state: FitState) -> Camera:
-    """The given camera with the state's focal length."""
-    scale = float(torch.exp(state.focal_log))
-    return replace(camera, fx=camera.fx * scale, fy=camera.fy * scale)
-
-
 @dataclass(frozen=True)
 class Drawing:
     """The body drawn into a window: which face each pixel shows, and where on it."""
@@ -210,7 +205,7 @@ def match_all(
     model: FitModel, state: FitState, observations: Observations, windows: Sequence[Window | None]
 ) -> tuple[Contour, Float[np.ndarray, "n"]]:
     """The contour term for the body as it stands, and each frame's overlap with its mask (nan without a mask)."""
-    camera = focused_camera(observations.camera, state)
+    camera = through_lens(observations.camera, state.lens)
     vertices = posed_vertices(model, state)
     head_faces = (model.weights[:, ACTIVE_JOINTS.index("Head")] > 0.5)[model.faces[:, 0].long()].numpy()
     size = 2 * POINTS_PER_SIDE

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from pipeline.avatar.body import ParametricBody
+from pipeline.avatar.fit_camera import LENS_COUNT
 from pipeline.avatar.fit_landmarks import HAND_LANDMARKS, OFFSET_COUNT, POSE_LANDMARKS, landmark_regressor
 from pipeline.avatar.fit_model import ACTIVE_JOINTS, FitModel, linearise, pose_points, pose_skeleton
 from pipeline.avatar.fit_objective import FitState, Observations
@@ -77,7 +78,7 @@ def act(
         root,
         values.double(),
         torch.zeros(OFFSET_COUNT, dtype=torch.float64),
-        torch.zeros((), dtype=torch.float64),
+        torch.zeros(LENS_COUNT, dtype=torch.float64),
     )
     regressor = landmark_regressor(linearise(body, body.shape_defaults))
     skeleton = pose_skeleton(model, state.rotations, state.root_m)

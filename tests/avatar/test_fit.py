@@ -97,6 +97,25 @@ def test_unknown_focal_length_is_found() -> None:
     assert aligned < 0.025
 
 
+def test_a_picture_cut_off_centre_tells_its_principal_point() -> None:
+    """A fifth of the width is missing on the left; the camera to start from has its point in the middle."""
+    scene = act(load_anny(), FRAMES, shape=SHAPE, noise_m=0.004)
+    left_px = 52
+    cut = scene.camera.cropped(left_px, 0, scene.camera.width - left_px, scene.camera.height)
+    start = replace(cut, cx=0.5 * cut.width, cy=0.5 * cut.height)
+    seen = scene.observations(scene.camera)
+    seen = replace(seen, camera=start, landmarks_px=seen.landmarks_px - seen.landmarks_px.new_tensor([left_px, 0]))
+    windows = [window and replace(window, left_px=window.left_px - left_px) for window in scene.windows()]
+    found = [
+        fit_body(load_anny(), seen, windows, replace(options(scene, 0.2, rounds=6), centre_deviation=deviation))
+        for deviation in (0.0, 0.1)
+    ]
+    assert found[0].camera.cx == start.cx
+    assert abs(found[1].camera.cx - cut.cx) < 0.4 * abs(start.cx - cut.cx)
+    error_m = [joint_errors_m(fitted_joints_m(result, scene), scene.joints_m())[0] for result in found]
+    assert error_m[1] < error_m[0]
+
+
 def test_the_same_input_gives_the_same_bytes() -> None:
     scene = act(load_anny(), 4)
     results = [

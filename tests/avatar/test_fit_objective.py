@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from pipeline.avatar.body import load_anny
+from pipeline.avatar.fit_camera import LENS_COUNT
 from pipeline.avatar.fit_init import place_by_landmarks
 from pipeline.avatar.fit_landmarks import LANDMARK_COUNT, OFFSET_COUNT, landmark_regressor
 from pipeline.avatar.fit_model import ACTIVE_JOINTS, linearise, pose_skeleton
@@ -25,7 +26,7 @@ from tests.avatar.acting import act
 FRAMES = 4
 NUMBERS = 3 * len(ACTIVE_JOINTS) + 3
 # Without motion, whose derivative is of first order in the turn between frames, the gradient is exact.
-EXACT = Weights(free_offsets=True, free_focal=True, motion=1e5)
+EXACT = Weights(free_offsets=True, free_focal=True, free_centre=True, motion=1e5)
 
 
 def build(weights: Weights, outlines: bool = True) -> tuple[Objective, FitState]:
@@ -35,7 +36,7 @@ def build(weights: Weights, outlines: bool = True) -> tuple[Objective, FitState]
     model = linearise(body, body.shape_defaults)
     generator = torch.Generator().manual_seed(5)
     step = 0.03 * torch.randn(FRAMES, NUMBERS, generator=generator, dtype=torch.float64)
-    shared = 0.01 * torch.randn(len(model.shape) + OFFSET_COUNT + 1, generator=generator, dtype=torch.float64)
+    shared = 0.01 * torch.randn(len(model.shape) + OFFSET_COUNT + LENS_COUNT, generator=generator, dtype=torch.float64)
     state = scene.state.moved(step, shared, scene.camera)
     observations = scene.observations(scene.camera)
     contour = match_all(model, state, observations, scene.windows())[0] if outlines else None
@@ -44,7 +45,9 @@ def build(weights: Weights, outlines: bool = True) -> tuple[Objective, FitState]
     return Objective(model, landmark_regressor(model), *priors, observations, weights, scale, contour), state
 
 
-@pytest.mark.parametrize("weights", [EXACT, replace(EXACT, free_shape=False, free_offsets=False, free_focal=False)])
+@pytest.mark.parametrize(
+    "weights", [EXACT, replace(EXACT, free_shape=False, free_offsets=False, free_focal=False, free_centre=False)]
+)
 def test_gradient_agrees_with_differences_of_the_cost(weights: Weights) -> None:
     objective, state = build(weights)
     system = objective(state)
