@@ -83,6 +83,17 @@ def test_a_picture_cut_off_centre_costs_the_same() -> None:
     assert torch.allclose(cut_start, start)
 
 
+def test_the_prior_pulls_the_principal_point_to_the_middle() -> None:
+    weights = Weights(landmark_m=1e4, hand_m=1e4, direction_m=1e4, motion=1e4, free_centre=True, centre=0.02)
+    objective, state = build(weights, outlines=False)
+    costs = [
+        objective(replace(state, lens=torch.tensor([*shift, 0.0], dtype=torch.float64))).cost
+        for shift in ((0.0, 0.0), (0.02, 0.0), (0.0, -0.04))
+    ]
+    assert costs[1] - costs[0] == pytest.approx(1.0, rel=1e-3)
+    assert costs[2] - costs[0] == pytest.approx(4.0, rel=1e-3)
+
+
 def test_gradient_of_motion_is_right_for_small_turns() -> None:
     objective, state = build(Weights(landmark_m=1e3, direction_m=1e3, free_shape=False), outlines=False)
     system = objective(state)
