@@ -6,7 +6,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.avatar.body import Body, Motion
-from pipeline.geometry.rotation import axis_angle_to_quaternion, quaternion_multiply, quaternion_to_matrix
+from pipeline.geometry.rotation import (
+    axis_angle_to_matrix,
+    axis_angle_to_quaternion,
+    quaternion_multiply,
+    quaternion_to_matrix,
+)
 from pipeline.geometry.skinning import forward_kinematics, skinning_transforms
 
 MAIN_JOINTS = (
@@ -25,12 +30,12 @@ class PoseCorrection:
 
     def __init__(self, body: Body, motion: Motion) -> None:
         self.body, self.motion = body, motion
-        self.joints = [body.joint(name) for name in MAIN_JOINTS if name in body.joint_names]
+        self.joints = torch.tensor([body.joint(name) for name in MAIN_JOINTS if name in body.joint_names])
         frames = len(motion.frame_index)
         self.rotation_rad = torch.zeros(frames, len(self.joints), 3, requires_grad=True)
         self.shift_m = torch.zeros(frames, 3, requires_grad=True)
         self._joints_m = torch.as_tensor(body.joints_m)
-        self._quaternions = torch.as_tensor(motion.rotations_wxyz)
+        self._rotations = quaternion_to_matrix(torch.as_tensor(motion.rotations_wxyz))
         self._root_m = torch.as_tensor(motion.root_translation_m)
         gaps_s = np.diff(motion.time_s.astype(np.float64)) if frames > 1 else np.zeros(0)
         self._gap = torch.tensor(
@@ -39,9 +44,10 @@ class PoseCorrection:
 
     def canonical_to_world(self, rows: Tensor) -> Float[Tensor, "k j 4 4"]:
         """Skinning matrices of some frames, differentiable in the corrections."""
-        quaternions = self._corrected(rows)
+        rotations = self._rotations[rows]
+        turned = rotations[:, self.joints] @ axis_angle_to_matrix(self.rotation_rad[rows])
         posed = forward_kinematics(
-            quaternion_to_matrix(quaternions),
+            rotations.index_copy(1, self.joints, turned),
             self._root_m[rows] + self.shift_m[rows],
             self._joints_m,
             self.body.parents,
@@ -69,12 +75,6 @@ class PoseCorrection:
         turn = axis_angle_to_quaternion(torch.from_numpy(rotation.reshape(len(wanted), -1, 3)))
         quaternions[:, self.joints] = quaternion_multiply(quaternions[:, self.joints], turn)
         return motion.with_pose(quaternions.numpy(), motion.root_translation_m + shift)
-
-    def _corrected(self, rows: Tensor) -> Float[Tensor, "k j 4"]:
-        base = self._quaternions[rows]
-        turn = axis_angle_to_quaternion(self.rotation_rad[rows])
-        turned = quaternion_multiply(base[:, self.joints], turn)
-        return base.index_copy(1, torch.tensor(self.joints), turned)
 
 
 def _interpolate(wanted: np.ndarray, known: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -121,8 +121,8 @@ class Learning:
         return Batch(
             frames=chosen,
             slot=slot,
-            origins_m=(matrix[:, :3, :3] @ origins[:, :, None])[:, :, 0] + matrix[:, :3, 3],
-            directions=(matrix[:, :3, :3] @ directions[:, :, None])[:, :, 0],
+            origins_m=(matrix[:, :3, :3] * origins[:, None]).sum(-1) + matrix[:, :3, 3],
+            directions=(matrix[:, :3, :3] * directions[:, None]).sum(-1),
             rgba=torch.from_numpy(pool.rgba[rows]).float() / 255,
             background=torch.from_numpy(random.random((len(rows), 3), dtype=np.float32)),
             jitter=torch.from_numpy(random.random(len(rows), dtype=np.float32)),

@@ -6,6 +6,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+_CROSS = torch.tensor(
+    [
+        [0, 0, 0, 0, 0, -1, 0, 1, 0],
+        [0, 0, 1, 0, 0, 0, -1, 0, 0],
+        [0, -1, 0, 1, 0, 0, 0, 0, 0],
+    ]
+)
+"""What x, y and z give to the rows of a vector's cross product matrix."""
+
 
 def axis_angle_to_quaternion(axis_angle_rad: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 4"]:
     """Exponential map; smooth at zero, where it uses the Taylor series of sin(a/2)/a."""
@@ -40,8 +49,15 @@ def quaternion_to_matrix(quaternion_wxyz: Float[Tensor, "*n 4"]) -> Float[Tensor
 
 
 def axis_angle_to_matrix(axis_angle_rad: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
-    """Rodrigues' formula."""
-    return quaternion_to_matrix(axis_angle_to_quaternion(axis_angle_rad))
+    """Rodrigues' formula, I + sin(a)/a K + (1 - cos(a))/a² K²; near zero with the Taylor series of both factors."""
+    squared = (axis_angle_rad**2).sum(-1)[..., None, None]
+    small = squared < 1e-4
+    safe = torch.where(small, torch.ones_like(squared), squared)
+    angle = safe.sqrt()
+    first = torch.where(small, 1 - squared / 6 * (1 - squared / 20), torch.sin(angle) / angle)
+    second = torch.where(small, 0.5 - squared / 24 * (1 - squared / 30), (1 - torch.cos(angle)) / safe)
+    cross = (axis_angle_rad @ _CROSS.to(axis_angle_rad)).unflatten(-1, (3, 3))
+    return torch.eye(3).to(cross) + first * cross + second * (cross @ cross)
 
 
 def matrix_to_quaternion(matrix: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 4"]:

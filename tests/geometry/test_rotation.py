@@ -1,6 +1,7 @@
 """Rotations against scipy's, and the axioms of a group."""
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -47,9 +48,19 @@ def test_logarithm_undoes_the_exponential(axis_angle: torch.Tensor) -> None:
     torch.testing.assert_close(rot.quaternion_to_matrix(again), rot.quaternion_to_matrix(quaternion), atol=1e-7, rtol=0)
 
 
-def test_gradients_are_finite_at_the_identity() -> None:
-    zero = torch.zeros(1, 3, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(rot.axis_angle_to_matrix, (zero,))
+@pytest.mark.parametrize("angle_rad", [1e-9, 1e-4, 0.0099, 0.0101, 1.0])
+def test_small_angles_are_as_exact_as_large_ones(angle_rad: float) -> None:
+    axis = torch.tensor([[0.48, -0.6, 0.64]], dtype=torch.float64)
+    expected = Rotation.from_rotvec(angle_rad * axis.numpy()).as_matrix()
+    np.testing.assert_allclose(rot.axis_angle_to_matrix(angle_rad * axis).numpy(), expected, atol=1e-15)
+    single = rot.axis_angle_to_matrix((angle_rad * axis).float())
+    np.testing.assert_allclose(single.numpy(), expected, atol=3e-7)
+
+
+@pytest.mark.parametrize("angle_rad", [0.0, 0.009, 0.011, 0.5, 3.0])
+def test_gradients_are_those_of_differences(angle_rad: float) -> None:
+    turn = (angle_rad * torch.tensor([[0.48, -0.6, 0.64]], dtype=torch.float64)).requires_grad_(True)
+    assert torch.autograd.gradcheck(rot.axis_angle_to_matrix, (turn,))
 
 
 def test_slerp_walks_the_shorter_arc_at_constant_speed() -> None:
