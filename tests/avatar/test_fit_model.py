@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from pipeline.avatar.body import load_anny
-from pipeline.avatar.fit_landmarks import OFFSET_COUNT, landmark_regressor
+from pipeline.avatar.fit_landmarks import LANDMARK_COUNT, OFFSET_COUNT, landmark_regressor
 from pipeline.avatar.fit_model import (
     ACTIVE_JOINTS,
     FitModel,
@@ -56,7 +56,7 @@ def test_derivatives_agree_with_differences(model: FitModel) -> None:
     offsets = torch.zeros(OFFSET_COUNT, dtype=torch.float64)
     rotations, root = random_pose()
     generator = torch.Generator().manual_seed(1)
-    covector = torch.randn(FRAMES, 33, 3, generator=generator, dtype=torch.float64)
+    covector = torch.randn(FRAMES, LANDMARK_COUNT, 3, generator=generator, dtype=torch.float64)
     points = regressor.points(model, offsets)
     skeleton = pose_skeleton(model, rotations, root)
     world, arms = pose_points(model, skeleton, points)
