@@ -262,10 +262,9 @@ class Objective:
         inverse = 1.0 / (self.px_per_m[:, None] * self.weights.contour_m)
         residual = ((pixels - contour.target_px) * contour.normal).sum(-1) * inverse
         weight = contour.weight * robust_weights(system, residual.square(), self.weights.contour_cutoff, contour.weight)
-        covector = (covectors * contour.normal[..., None]).sum(2) * inverse[..., None]
-        by_lens = (pixels_by_lens(pixels, seen.camera, state.lens) * contour.normal[..., None]).sum(2) * inverse[
-            ..., None
-        ]
+        normal, inverse = contour.normal[..., None], inverse[..., None]
+        covector = (covectors * normal).sum(2) * inverse
+        by_lens = (pixels_by_lens(pixels, seen.camera, state.lens) * normal).sum(2) * inverse
         by_shared = self._shared_rows(model, skeleton, points, covector, by_lens)
         by_place = root_by_place(state.root_m, seen.camera)
         system.add(pose_rows(skeleton, arms, by_place, covector), by_shared, residual, weight)

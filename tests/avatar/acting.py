@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from pipeline.avatar.body import ParametricBody
+from pipeline.avatar.fit import FitResult
 from pipeline.avatar.fit_camera import LENS_COUNT
 from pipeline.avatar.fit_landmarks import HAND_LANDMARKS, OFFSET_COUNT, POSE_LANDMARKS, landmark_regressor
 from pipeline.avatar.fit_model import ACTIVE_JOINTS, FitModel, linearise, pose_points, pose_skeleton
@@ -14,7 +15,8 @@ from pipeline.avatar.fit_quality import make_observations
 from pipeline.avatar.fit_silhouette import Window, matching_window, posed_vertices
 from pipeline.avatar.hands import HAND_POINTS, Hands
 from pipeline.geometry.camera import Camera, project
-from pipeline.geometry.rotation import axis_angle_to_matrix
+from pipeline.geometry.rotation import axis_angle_to_matrix, quaternion_to_matrix
+from pipeline.geometry.skinning import forward_kinematics
 from pipeline.kernels.raster import rasterize
 
 
@@ -116,6 +118,17 @@ def _dance(phase: torch.Tensor, turn_rad: float, wrists_rad: float) -> torch.Ten
         angles[:, ACTIVE_JOINTS.index(f"{side}Leg"), 0] = 0.3 + 0.2 * sign * swing
     angles[:, ACTIVE_JOINTS.index("Head"), 1] = 0.3 * torch.cos(7 * phase)
     return axis_angle_to_matrix(angles)
+
+
+def fitted_joints_m(result: FitResult, scene: Act) -> torch.Tensor:
+    """World positions of the active joints that a fit found."""
+    joint_to_world = forward_kinematics(
+        quaternion_to_matrix(torch.tensor(result.rotations_wxyz)),
+        torch.tensor(result.root_translation_m),
+        torch.tensor(result.body.joints_m),
+        result.body.parents,
+    )
+    return joint_to_world[:, list(scene.model.full_joint), :3, 3].double()
 
 
 def joint_errors_m(found_m: torch.Tensor, true_m: torch.Tensor) -> tuple[float, float]:

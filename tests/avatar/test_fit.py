@@ -9,22 +9,10 @@ import torch
 from pipeline.avatar.body import load_anny
 from pipeline.avatar.fit import FitOptions, FitResult, fit_body
 from pipeline.avatar.fit_landmarks import PAIRS, POSE_LANDMARKS, mirror_permutation
-from pipeline.geometry.rotation import quaternion_to_matrix
-from pipeline.geometry.skinning import forward_kinematics
-from tests.avatar.acting import Act, act, joint_errors_m
+from tests.avatar.acting import Act, act, fitted_joints_m, joint_errors_m
 
 FRAMES = 20
 SHAPE = {"gender": 0.2, "height": 0.45, "weight": 0.65, "upperleg-length": 0.2, "waist-girth": 0.3}
-
-
-def fitted_joints_m(result: FitResult, scene: Act) -> torch.Tensor:
-    joint_to_world = forward_kinematics(
-        quaternion_to_matrix(torch.tensor(result.rotations_wxyz)),
-        torch.tensor(result.root_translation_m),
-        torch.tensor(result.body.joints_m),
-        result.body.parents,
-    )
-    return joint_to_world[:, list(scene.model.full_joint), :3, 3].double()
 
 
 def options(scene: Act, focal_deviation: float = 0.0, rounds: int = 4) -> FitOptions:

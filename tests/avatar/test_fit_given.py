@@ -12,8 +12,7 @@ from pipeline.avatar.fit_given import GivenPoses
 from pipeline.avatar.fit_silhouette import matching_window
 from pipeline.avatar.smpl import SmplBody
 from pipeline.geometry.rotation import axis_angle_to_matrix, quaternion_to_matrix
-from pipeline.geometry.skinning import forward_kinematics
-from tests.avatar.acting import Act, act, joint_errors_m
+from tests.avatar.acting import Act, act, fitted_joints_m, joint_errors_m
 from tests.avatar.smpl_sample import made_up_arrays
 
 ACTIVE = (0, 2)
@@ -66,13 +65,7 @@ def errors_mm(scene: Act, body: SmplBody, given: GivenPoses, clothes_px: int, ke
     kernel = np.ones((2 * clothes_px + 1,) * 2, np.uint8)
     windows = [matching_window(cv2.dilate(mask, kernel)) for mask in scene.masks()]
     result = fit_given(body, scene.observations(scene.camera), windows, given, keep)
-    joint_to_world = forward_kinematics(
-        quaternion_to_matrix(torch.tensor(result.rotations_wxyz)),
-        torch.tensor(result.root_translation_m),
-        torch.tensor(result.body.joints_m),
-        result.body.parents,
-    )
-    found = joint_to_world[:, list(scene.model.full_joint), :3, 3].double()
+    found = fitted_joints_m(result, scene)
     aligned_m, absolute_m = joint_errors_m(found, scene.joints_m())
     return 1e3 * aligned_m, 1e3 * absolute_m
 

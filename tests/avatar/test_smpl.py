@@ -17,10 +17,9 @@ from pipeline.geometry.rotation import (
     axis_angle_to_matrix,
     matrix_to_quaternion,
     quaternion_to_axis_angle,
-    quaternion_to_matrix,
 )
 from pipeline.geometry.skinning import forward_kinematics, linear_blend_skinning, skinning_transforms
-from tests.avatar.acting import Act, act, joint_errors_m
+from tests.avatar.acting import Act, act, fitted_joints_m, joint_errors_m
 from tests.avatar.smpl_sample import made_up_arrays, smpl_vertices
 
 FRAMES = 16
@@ -213,13 +212,7 @@ def fitted(smpl: SmplBody) -> tuple[Act, FitResult]:
 
 def test_the_fit_finds_a_known_pose(fitted: tuple[Act, FitResult]) -> None:
     scene, result = fitted
-    joint_to_world = forward_kinematics(
-        quaternion_to_matrix(torch.tensor(result.rotations_wxyz)),
-        torch.tensor(result.root_translation_m),
-        torch.tensor(result.body.joints_m),
-        result.body.parents,
-    )
-    found = joint_to_world[:, list(scene.model.full_joint), :3, 3].double()
+    found = fitted_joints_m(result, scene)
     aligned, absolute = joint_errors_m(found, scene.joints_m())
     assert aligned < 0.015
     assert absolute < 0.030
