@@ -19,6 +19,13 @@ def test_same_arrays_give_the_same_bytes_and_come_back(tmp_path) -> None:
     assert again["a"].tolist() == ["x", "yy"]
 
 
+def test_a_single_number_stays_one(tmp_path) -> None:
+    arrays = {"number": np.array(2.5), "word": np.array("x"), "row": np.zeros(1), "turned": np.eye(3, 2).T}
+    npz.save_npz(tmp_path / "one.npz", arrays)
+    shapes = {name: array.shape for name, array in npz.load_npz(tmp_path / "one.npz").items()}
+    assert shapes == {name: array.shape for name, array in arrays.items()}
+
+
 def test_pickles_and_rubbish_are_refused(tmp_path) -> None:
     np.savez(tmp_path / "pickled.npz", a=np.array([{}], dtype=object))
     (tmp_path / "rubbish.npz").write_bytes(b"no zip")
