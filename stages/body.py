@@ -13,10 +13,10 @@ from pipeline.avatar.body import Motion, ParametricBody, canonical_to_world, loa
 from pipeline.avatar.fit import FitOptions, FitResult, fit_body, fit_given
 from pipeline.avatar.fit_beside import foreign_frames, lump_doubts, lump_shares
 from pipeline.avatar.fit_given import GivenPoses
-from pipeline.avatar.fit_hands import finger_curls_rad, trust_in_hands
+from pipeline.avatar.fit_hands import finger_curls_rad, trusted_hands
 from pipeline.avatar.fit_quality import doubts, make_observations, suspicious_frames
 from pipeline.avatar.fit_silhouette import matching_window
-from pipeline.avatar.hands import no_hands
+from pipeline.avatar.hands import Hands, no_hands
 from pipeline.avatar.overlay import draw_overlay, overlay_grid, posed_frame
 from pipeline.avatar.smpl import SmplBody
 from pipeline.core.cli import main
@@ -75,14 +75,14 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     """Fit the body; write body, motion, camera, a score per frame and the overlay picture."""
     capture = load_capture(inputs["frames"])
     masks = [to_uint8(capture.mask(position)) for position in range(len(capture))]
-    result = fit(capture, masks, inputs["frames"], config)
+    hands = trusted_hands(capture.hands or no_hands(len(capture)), capture.landmarks_px)
+    result = fit(capture, hands, masks, inputs["frames"], config)
     motion = Motion(capture.frame_index, capture.time_s, result.rotations_wxyz, result.root_translation_m)
     exchanged = np.stack(list(result.exchanged.values())).any(axis=0)
     write_rgb(out / _OVERLAY, overlay(capture, masks, result, motion))
     save_body(out / _BODY, result.body)
     save_motion(out / _MOTION, motion)
     save_camera(out / _CAMERA, result.camera)
-    hands_used = trust_in_hands(capture.hands or no_hands(len(capture)), capture.landmarks_px) > 0.0
     lumps = lump_shares(result.body, canonical_to_world(result.body, motion), result.camera, masks)
     scores = {"silhouette_iou": result.overlap, "landmark_error_px": result.landmark_error_px, "exchanged": exchanged}
     save_npz(out / _SCORES, {"frame_index": capture.frame_index, **scores, "lump_share": lumps})
@@ -99,16 +99,17 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
         "height_m": result.body.height_m(),
         "height_deviation_m": result.height_deviation_m,
         "exchanged_frames": int(exchanged.sum()),
-        "hands_used": float(hands_used.mean()),
+        "hands_used": float((hands.own_side > 0.0).mean()),
         "suspicious_frames": int(suspicious_frames(result).sum()),
         "foreign_frames": int(foreign_frames(lumps).sum()),
     }
 
 
-def fit(capture: Capture, masks: Sequence[UInt8[np.ndarray, "h w"]], frames_dir: Path, config: Config) -> FitResult:
+def fit(
+    capture: Capture, hands: Hands, masks: Sequence[UInt8[np.ndarray, "h w"]], frames_dir: Path, config: Config
+) -> FitResult:
     """Fit and judge; UserError when the landmarks or the result are of no use."""
     camera, focal_deviation = starting_camera(capture, config)
-    hands = capture.hands or no_hands(len(capture))
     landmarks = capture.landmarks_px, capture.landmarks_visibility, capture.landmarks_world_m
     observations = make_observations(capture.time_s, *landmarks, camera, hands)
     side_px = max(camera.width, camera.height)
@@ -119,8 +120,7 @@ def fit(capture: Capture, masks: Sequence[UInt8[np.ndarray, "h w"]], frames_dir:
     given = supplied_poses(capture, model, camera, focal_deviation == 0.0, config)
     try:
         if given is None:
-            curls_rad = finger_curls_rad(model, hands, trust_in_hands(hands, capture.landmarks_px))
-            result = fit_body(model, observations, windows, options, curls_rad)
+            result = fit_body(model, observations, windows, options, finger_curls_rad(model, hands))
         else:
             result = fit_given(model, observations, windows, given, config.supplied_poses == "keep")
     except ValueError as error:

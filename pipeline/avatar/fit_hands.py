@@ -4,6 +4,8 @@ Points of a hand are off by 3 to 5 mm, so they say where it is and how the wrist
 finger in one frame is off by 0.25 rad, so one number a finger is taken from all frames.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float
 
@@ -26,27 +28,27 @@ _KNUCKLES = (5, 9, 13, 17)
 """First of the four points of each of `FINGERS`; point 0 is the wrist."""
 
 
-def trust_in_hands(hands: Hands, landmarks_px: Float[np.ndarray, "n 33 2"]) -> Float[np.ndarray, "n 2"]:
-    """How far each hand is to be relied on, 0 to 1; 0 where it is the other one or far from the pose's wrist."""
+def trusted_hands(hands: Hands, landmarks_px: Float[np.ndarray, "n 33 2"]) -> Hands:
+    """The hands with `own_side` 0 also where a hand is not to be relied on: the other one, or far from the wrist."""
     apart_px = np.linalg.norm(hands.landmarks_px[:, :, 0] - landmarks_px[:, WRISTS], axis=-1)
     near = apart_px < MOST_APART_M * pixels_per_metre(hands.landmarks_px, hands.landmarks_m)
-    return np.where(near & (hands.own_side >= LEAST_OWN_SIDE), hands.own_side, 0.0)
+    return replace(hands, own_side=np.where(near & (hands.own_side >= LEAST_OWN_SIDE), hands.own_side, 0.0))
 
 
 def hand_landmarks(
-    hands: Hands, trust: Float[np.ndarray, "n 2"], pose_world_m: Float[np.ndarray, "n 33 3"]
+    hands: Hands, pose_world_m: Float[np.ndarray, "n 33 3"]
 ) -> tuple[Float[np.ndarray, "n k 2"], Float[np.ndarray, "n k 3"], Float[np.ndarray, "n k"]]:
     """Pixels, places about the hips (m, the pose's wrist plus what the hand model says) and trust of the points that
     follow the pose's landmarks in a fit, in their order."""
     points_px, points_m = hands.landmarks_px[:, :, HAND_LANDMARKS], hands.landmarks_m[:, :, HAND_LANDMARKS]
     places_m = pose_world_m[:, WRISTS, None] + points_m - hands.landmarks_m[:, :, :1]
     pixels, places = (
-        values.swapaxes(1, 2).reshape(len(trust), 2 * len(HAND_LANDMARKS), -1) for values in (points_px, places_m)
+        values.swapaxes(1, 2).reshape(len(values), 2 * len(HAND_LANDMARKS), -1) for values in (points_px, places_m)
     )
-    return pixels, places, np.tile(trust, len(HAND_LANDMARKS))
+    return pixels, places, np.tile(hands.own_side, len(HAND_LANDMARKS))
 
 
-def finger_curls_rad(body: ParametricBody, hands: Hands, trust: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "2 4"]:
+def finger_curls_rad(body: ParametricBody, hands: Hands) -> Float[np.ndarray, "2 4"]:
     """How much further than in the A-pose each finger joint is bent, of left and right `FINGERS`: median over frames.
 
     A hand that is hardly ever seen, and a body without fingers, keep the relaxed grip.
@@ -55,7 +57,7 @@ def finger_curls_rad(body: ParametricBody, hands: Hands, trust: Float[np.ndarray
     if "LeftHandPinky3" not in body.joint_names:
         return curls
     for side in range(2):
-        seen = hands.landmarks_m[trust[:, side] > 0.0, side]
+        seen = hands.landmarks_m[hands.own_side[:, side] > 0.0, side]
         if len(seen) >= LEAST_LOOKS:
             beyond = finger_bends_rad(seen, side) - finger_bends_rad(resting_hand_m(body, side), side)
             curls[side] = np.median(beyond.mean(-1), axis=0).clip(0.0, MOST_CURL_RAD)

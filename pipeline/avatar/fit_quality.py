@@ -5,7 +5,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 
 from pipeline.avatar.fit import FitResult
-from pipeline.avatar.fit_hands import hand_landmarks, trust_in_hands
+from pipeline.avatar.fit_hands import hand_landmarks
 from pipeline.avatar.fit_objective import Observations
 from pipeline.avatar.hands import Hands, no_hands
 from pipeline.geometry.camera import Camera
@@ -31,9 +31,11 @@ def make_observations(
     camera: Camera,
     hands: Hands | None = None,
 ) -> Observations:
-    """Observations from a detector's output: nan where nothing was found, 3D in camera axes (y down, z away)."""
-    hands = hands or no_hands(len(time_s))
-    hands_px, hands_m, hands_trust = hand_landmarks(hands, trust_in_hands(hands, landmarks_px), landmarks_world_m)
+    """Observations from a detector's output: nan where nothing was found, 3D in camera axes (y down, z away).
+
+    hands: from `fit_hands.trusted_hands`; None where they were not looked for.
+    """
+    hands_px, hands_m, hands_trust = hand_landmarks(hands or no_hands(len(time_s)), landmarks_world_m)
     landmarks = torch.tensor(np.concatenate([landmarks_px, hands_px], axis=1)).double()
     directions = torch.tensor(np.concatenate([landmarks_world_m, hands_m], axis=1)).double()
     to_world = torch.as_tensor(camera.world_to_camera, dtype=torch.float64)[:3, :3]

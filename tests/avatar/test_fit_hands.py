@@ -15,7 +15,7 @@ from pipeline.avatar.fit_hands import (
     finger_curls_rad,
     hand_landmarks,
     resting_hand_m,
-    trust_in_hands,
+    trusted_hands,
 )
 from pipeline.avatar.fit_landmarks import HAND_LANDMARKS, LANDMARKS, POSE_LANDMARKS, landmark_regressor
 from pipeline.avatar.fit_model import (
@@ -80,9 +80,9 @@ def pose_px(hands: Hands) -> np.ndarray:
 def test_curls_are_found_from_hands_that_turn() -> None:
     body = load_anny()
     hands = seen(body, CURLS, 40, noise_m=0.001)
-    trust = trust_in_hands(hands, pose_px(hands))
-    assert (trust == 0.9).all()
-    np.testing.assert_allclose(finger_curls_rad(body, hands, trust), CURLS, atol=0.06)
+    trusted = trusted_hands(hands, pose_px(hands))
+    assert (trusted.own_side == 0.9).all()
+    np.testing.assert_allclose(finger_curls_rad(body, trusted), CURLS, atol=0.06)
 
 
 def test_a_straight_chain_has_no_bend_and_a_fist_has_positive_ones() -> None:
@@ -97,15 +97,14 @@ def test_a_straight_chain_has_no_bend_and_a_fist_has_positive_ones() -> None:
 def test_a_hand_that_is_hardly_seen_keeps_the_relaxed_grip(looks: int) -> None:
     body = load_anny()
     hands = seen(body, CURLS, FRAMES)
-    trust = np.zeros((FRAMES, 2))
-    trust[:looks] = 1.0
-    np.testing.assert_array_equal(finger_curls_rad(body, hands, trust), np.full((2, 4), GRIP_RAD))
+    hands.own_side[looks:] = 0.0
+    np.testing.assert_array_equal(finger_curls_rad(body, hands), np.full((2, 4), GRIP_RAD))
 
 
 def test_a_body_without_fingers_has_the_relaxed_grip() -> None:
     hands = seen(load_anny(), CURLS, FRAMES)
     body = SmplBody(made_up_arrays(24))
-    np.testing.assert_array_equal(finger_curls_rad(body, hands, np.ones((FRAMES, 2))), relaxed_curls())
+    np.testing.assert_array_equal(finger_curls_rad(body, hands), relaxed_curls())
 
 
 def test_hands_of_the_other_side_or_away_from_the_wrist_are_not_trusted() -> None:
@@ -114,21 +113,21 @@ def test_hands_of_the_other_side_or_away_from_the_wrist_are_not_trusted() -> Non
     landmarks_px = pose_px(hands)
     landmarks_px[2, 16, 0] += 250.0 * 1.1 * MOST_APART_M
     landmarks_px[3, 15, 0] += 250.0 * 0.9 * MOST_APART_M
-    trust = trust_in_hands(hands, landmarks_px)
+    trust = trusted_hands(hands, landmarks_px).own_side
     np.testing.assert_array_equal(trust == 0.0, [[False, False], [True, False], [False, True], [False, False]])
-    assert (trust_in_hands(no_hands(4), landmarks_px) == 0.0).all()
+    assert (trusted_hands(no_hands(4), landmarks_px).own_side == 0.0).all()
 
 
 def test_points_are_in_the_order_of_the_fits_landmarks() -> None:
     hands = seen(load_anny(), CURLS, 3)
     world = np.random.default_rng(0).normal(size=(3, 33, 3))
-    trust = np.tile([0.7, 0.9], (3, 1))
-    pixels, places, weights = hand_landmarks(hands, trust, world)
+    hands.own_side[:, 0] = 0.7
+    pixels, places, weights = hand_landmarks(hands, world)
     indices = [index for landmark in LANDMARKS for index in landmark.indices if index >= POSE_LANDMARKS]
     assert indices == list(range(POSE_LANDMARKS, POSE_LANDMARKS + pixels.shape[1]))
     for place, (point, side) in enumerate((point, side) for point in HAND_LANDMARKS for side in range(2)):
         np.testing.assert_array_equal(pixels[:, place], hands.landmarks_px[:, side, point])
-        np.testing.assert_array_equal(weights[:, place], trust[:, side])
+        np.testing.assert_array_equal(weights[:, place], hands.own_side[:, side])
         from_wrist = hands.landmarks_m[:, side, point] - hands.landmarks_m[:, side, 0]
         np.testing.assert_allclose(places[:, place] - world[:, 15 + side], from_wrist, atol=1e-12)
 

