@@ -25,7 +25,6 @@ from pipeline.io.capture import Capture, load_capture
 from pipeline.io.checkpoint import load_tensors, save_field, save_occupancy, save_tensors
 from pipeline.io.image import to_uint8, write_rgb
 from pipeline.io.npz import load_body, load_camera, load_motion, save_motion
-from pipeline.metrics.images import on_white
 
 CHECKPOINT, CHECKPOINT_EVERY_S = "checkpoint.safetensors", 15.0
 PREVIEW_FRAMES = 4
@@ -166,9 +165,7 @@ def judge_poses(learning: Learning, judge: Judge, motion: Motion) -> tuple[Motio
 
 def write_preview(path: Path, renders: list[np.ndarray], judge: Judge) -> None:
     """Validation frames in pairs: the field's render beside the truth."""
-    pairs = [
-        np.concatenate([render, on_white(*truth)], axis=1) for render, truth in zip(renders, judge.truths, strict=True)
-    ]
+    pairs = [np.concatenate(pair, axis=1) for pair in zip(renders, judge.targets, strict=True)]
     if pairs:
         write_rgb(path, np.concatenate(pairs[:PREVIEW_FRAMES], axis=0))
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import UInt8
@@ -25,6 +26,11 @@ class Judge:
     camera: Camera
     truths: Sequence[Picture]
 
+    @cached_property
+    def targets(self) -> list[UInt8[np.ndarray, "h w 3"]]:
+        """The pictures on white, as a render without error would be."""
+        return [on_white(*truth) for truth in self.truths]
+
     def thinned(self) -> "Judge":
         """Every fifth row and column of the pictures: an unbiased estimate of their errors at a 25th of the cost."""
         whole = self.camera.width // THINNING * THINNING, self.camera.height // THINNING * THINNING
@@ -44,13 +50,14 @@ class Judge:
 
     def score(self, renders: Sequence[UInt8[np.ndarray, "h w 3"]]) -> tuple[float, float]:
         """Mean decibels of whole images on white, and of body pixels alone; NaN where there is nothing to score."""
-        targets = [(on_white(image, mask), body_pixels(mask)) for image, mask in self.truths]
-        body = [psnr_db(render, *target) for render, target in zip(renders, targets, strict=True) if target[1].any()]
+        bodies = [body_pixels(mask) for _, mask in self.truths]
+        looks = zip(renders, self.targets, bodies, strict=True)
+        body = [psnr_db(render, target, where) for render, target, where in looks if where.any()]
         return _mean(self.frame_scores(renders)), _mean(body)
 
     def frame_scores(self, renders: Sequence[UInt8[np.ndarray, "h w 3"]]) -> list[float]:
         """Decibels of each whole image on white."""
-        return [psnr_db(render, on_white(*truth)) for render, truth in zip(renders, self.truths, strict=True)]
+        return [psnr_db(*pair) for pair in zip(renders, self.targets, strict=True)]
 
 
 def _mean(values: list[float]) -> float:
