@@ -32,6 +32,7 @@ def test_clothes_that_stay_close_are_no_lump() -> None:
     reach = int(CLOTHING_REACH * ROWS)
     assert lump_share(blocks((50, 250, 100 - reach, 140 + reach)), blocks(BODY), ROWS) == 0.0
     assert lump_share(blocks((50, 250, 100, 140 + reach + 1)), blocks(BODY), ROWS) > 0.0
+    assert lump_share(blocks((50, 250, 100, 140 + reach)), blocks(BODY), 0.8 * ROWS) > 0.0
     assert lump_share(blocks(), blocks(BODY), ROWS) == 0.0
 
 
@@ -49,8 +50,10 @@ def test_only_what_comes_and_goes_is_foreign() -> None:
     assert np.flatnonzero(foreign_frames(wide_skirt)).tolist() == [6]
     assert not foreign_frames(np.full(3, np.nan)).any()
     (sentence,) = lump_doubts(wide_skirt, 3 * np.arange(9))
-    assert sentence.startswith("frames 18: the mask holds something beside the body")
-    assert "split.json" in sentence
+    assert sentence == (
+        "frames 18: the mask holds something beside the body (a ball, a bag, a caption?), or the pose is wrong; "
+        "leave them out with split.json, or supply masks/"
+    )
     assert lump_doubts(wide_skirt[:6], np.arange(6)) == []
 
 
@@ -71,5 +74,7 @@ def test_a_ball_at_the_hand_is_seen_in_the_frame_that_has_it() -> None:
     shares = lump_shares(body, here, camera, [alone, with_ball, np.zeros_like(alone), alone])
     assert np.isnan(shares).tolist() == [False, False, True, False]
     assert shares[[0, 3]].max() == 0.0
-    assert 0.01 < shares[1] < (np.pi * 20.0**2) / (with_ball > 0).sum()
+    assert shares[1] == pytest.approx(
+        lump_share(with_ball > 0, alone > 0, np.ptp(np.flatnonzero(alone.any(1))) + 1.0), abs=0.001
+    )
     assert foreign_frames(shares).tolist() == [False, True, False, False]

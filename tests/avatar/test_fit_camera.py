@@ -2,6 +2,7 @@ import pytest
 import torch
 
 from pipeline.avatar.fit_camera import pixels_by_lens, project_with_covectors, through_lens
+from pipeline.avatar.fit_place import MINIMUM_DEPTH_M
 from pipeline.geometry.camera import Camera, project
 
 CAMERA = Camera(300.0, 310.0, 140.0, 90.0, 256, 200)
@@ -25,6 +26,13 @@ def test_pixels_are_those_of_the_camera() -> None:
     camera = through_lens(CAMERA, LENS)
     pixels, _ = project_with_covectors(points(), camera)
     torch.testing.assert_close(pixels.view(-1, 2), project(points().view(-1, 3), camera)[0])
+
+
+def test_a_point_behind_the_camera_is_taken_as_just_before_it() -> None:
+    behind = torch.tensor([[[0.02, 0.0, 1.0]]], dtype=torch.float64)
+    pixels, covectors = project_with_covectors(behind, CAMERA)
+    assert pixels[0, 0].tolist() == pytest.approx([300.0 * 0.02 / MINIMUM_DEPTH_M + 140.0, 90.0])
+    assert covectors.isfinite().all()
 
 
 def test_derivatives_are_differences() -> None:

@@ -26,7 +26,9 @@ def turned(angles_rad: list[float]) -> torch.Tensor:
 @pytest.fixture
 def given() -> GivenPoses:
     """Poses of the frames 1 and 3."""
-    return GivenPoses(np.array([1, 3]), torch.zeros(2), turned([0.2, 0.6]), torch.tensor([[0.0] * 3, [1.0] * 3]))
+    return GivenPoses(
+        np.array([1, 3]), torch.tensor([0.5, -1.0]), turned([0.2, 0.6]), torch.tensor([[0.0] * 3, [1.0] * 3])
+    )
 
 
 def test_frames_between_follow_time_and_those_outside_the_nearest(given: GivenPoses) -> None:
@@ -34,6 +36,7 @@ def test_frames_between_follow_time_and_those_outside_the_nearest(given: GivenPo
     assert torch.allclose(state.rotations[:, 0], turned([0.2, 0.2, 0.3, 0.6, 0.6])[:, 0].double(), atol=1e-6)
     assert state.root_m[:, 1].tolist() == pytest.approx([0.0, 0.0, 0.25, 1.0, 1.0])
     assert state.rotations.shape[1] == len(ACTIVE)
+    assert state.shape.tolist() == given.shape.tolist()
 
 
 def test_no_pose_at_all_is_refused() -> None:
@@ -44,8 +47,10 @@ def test_no_pose_at_all_is_refused() -> None:
 
 def test_given_poses_come_back_and_others_stay(given: GivenPoses) -> None:
     state = given.state(ACTIVE, torch.arange(4).double())
-    moved = replace(state, rotations=turned([0.9] * 4)[:, :2].double(), root_m=state.root_m + 5.0)
+    moved = replace(state, rotations=turned([0.9] * 4)[:, :2].double(), root_m=torch.full((4, 3), 5.0).double())
     back = given.put_into(moved, ACTIVE)
+    assert (moved.root_m == 5.0).all()
+    assert torch.equal(moved.rotations, moved.rotations[:1].expand(4, -1, -1, -1))
     assert torch.allclose(back.rotations[[1, 3]], given.rotations[:, list(ACTIVE)].double())
     assert torch.allclose(back.root_m[[1, 3]], given.root_m.double())
     assert torch.equal(back.rotations[[0, 2]], moved.rotations[[0, 2]])
@@ -55,6 +60,7 @@ def test_given_poses_come_back_and_others_stay(given: GivenPoses) -> None:
 def test_joints_that_no_fit_moves_come_back_too(given: GivenPoses) -> None:
     still = np.tile(np.array([-1.0, 0.0, 0.0, 0.0], np.float32), (4, 4, 1))
     whole = given.put_into_all(still)
+    assert (still[..., 0] == -1.0).all()
     assert torch.allclose(quaternion_to_matrix(torch.from_numpy(whole))[[1, 3], :3], given.rotations, atol=1e-6)
     assert np.array_equal(np.abs(whole[:, 3]), np.abs(still[:, 3]))
     assert (np.einsum("njc,njc->nj", whole[1:], whole[:-1]) > 0).all()

@@ -11,6 +11,7 @@ from pipeline.avatar.fit import HAND_M
 from pipeline.avatar.fit_hands import (
     LEAST_LOOKS,
     MOST_APART_M,
+    MOST_CURL_RAD,
     finger_bends_rad,
     finger_curls_rad,
     hand_landmarks,
@@ -80,6 +81,7 @@ def pose_px(hands: Hands) -> np.ndarray:
 def test_curls_are_found_from_hands_that_turn() -> None:
     body = load_anny()
     hands = seen(body, CURLS, 40, noise_m=0.001)
+    hands.landmarks_m[:6] = hands.landmarks_m[:6, :, ::-1]  # a few looks go wild
     trusted = trusted_hands(hands, pose_px(hands))
     assert (trusted.own_side == 0.9).all()
     np.testing.assert_allclose(finger_curls_rad(body, trusted), CURLS, atol=0.06)
@@ -95,10 +97,21 @@ def test_a_straight_chain_has_no_bend_and_a_fist_has_positive_ones() -> None:
 
 @pytest.mark.parametrize("looks", [0, LEAST_LOOKS - 1])
 def test_a_hand_that_is_hardly_seen_keeps_the_relaxed_grip(looks: int) -> None:
+    """Whatever is seen of the other one."""
     body = load_anny()
     hands = seen(body, CURLS, FRAMES)
-    hands.own_side[looks:] = 0.0
-    np.testing.assert_array_equal(finger_curls_rad(body, hands), np.full((2, 4), GRIP_RAD))
+    hands.own_side[LEAST_LOOKS:, 0] = 0.0
+    hands.own_side[looks:, 1] = 0.0
+    left, right = finger_curls_rad(body, hands)
+    np.testing.assert_allclose(left, CURLS[0], atol=0.06)
+    np.testing.assert_array_equal(right, np.full(4, GRIP_RAD))
+
+
+@pytest.mark.parametrize(("made_rad", "found_rad"), [(-0.6, 0.0), (1.7, MOST_CURL_RAD)])
+def test_fingers_bend_no_further_than_fingers_do(made_rad: float, found_rad: float) -> None:
+    body = load_anny()
+    hands = seen(body, np.full((2, 4), made_rad), LEAST_LOOKS)
+    np.testing.assert_array_equal(finger_curls_rad(body, hands), np.full((2, 4), found_rad))
 
 
 def test_a_body_without_fingers_has_the_relaxed_grip() -> None:

@@ -1,5 +1,7 @@
 """The hand model on a real picture, and what is not looked at."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -36,6 +38,9 @@ def test_a_hand_seen_from_its_back_is_found_and_the_hidden_one_is_not(detector, 
     assert np.linalg.norm(points_px[0] - wrist_px) < 12
     assert (points_px[[8, 12, 16, 20], 1] > points_px[0, 1] + 25).all()  # fingers hang
     assert points_px[4, 0] < points_px[20, 0]  # thumb towards the body, which stands left of it
+    from_wrist_m = hands.landmarks_m[0] - hands.landmarks_m[0, 0]
+    assert (from_wrist_m[[8, 12, 16, 20], 1] > 0.06).all()
+    assert from_wrist_m[4, 0] < from_wrist_m[20, 0]
     assert 0.05 < np.linalg.norm(hands.landmarks_m[0, 9] - hands.landmarks_m[0, 0]) < 0.12
 
 
@@ -58,6 +63,23 @@ def test_a_hand_that_the_pose_calls_hidden_is_not_looked_at(detector, photograph
     visibility[LANDMARK_NAMES.index("left_wrist")] = 0.2
     hands = detector.look(photograph, person.landmarks_px, visibility, person.landmarks_world_m)
     assert hands.own_side[0] == 0.0
+
+
+def test_wrist_pinky_and_index_show_where_a_hand_is(detector, monkeypatch):
+    """In this order MediaPipe's graph takes them, as shares of the picture's sides."""
+    told = []
+
+    def process(inputs):
+        told.append([(point.x, point.y) for point in inputs["wrist_and_knuckles"].landmark])
+        return SimpleNamespace(landmarks=None)
+
+    monkeypatch.setattr(detector, "_graph", SimpleNamespace(process=process))
+    pose_px = np.stack([10.0 * np.arange(33), 300.0 - np.arange(33)], axis=1)
+    rgb = np.zeros((300, 400, 3), np.uint8)
+    detector.look(rgb, pose_px, np.ones(33), np.random.default_rng(0).normal(size=(33, 3)) * 0.01)
+    for side, points in zip(("left", "right"), told, strict=True):
+        rows = [LANDMARK_NAMES.index(f"{side}_{name}") for name in ("wrist", "pinky", "index")]
+        np.testing.assert_allclose(points, pose_px[rows] / (400, 300), atol=1e-6)
 
 
 def test_hands_are_stacked_and_taken_apart():
