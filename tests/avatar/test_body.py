@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.avatar.body import AnnyBody, Body, Motion, canonical_to_world, load_anny
+from pipeline.avatar.body import LOCAL_CHANGES, SCALE, AnnyBody, Body, Motion, canonical_to_world, load_anny
 from pipeline.geometry.rotation import axis_angle_to_quaternion
 from pipeline.geometry.skinning import linear_blend_skinning
 
@@ -33,6 +33,7 @@ def posed_vertices(body: Body, motion: Motion) -> np.ndarray:
 def test_frame_is_upright_and_faces_plus_z(body: Body) -> None:
     assert 1.5 < body.height_m() < 2.0
     assert abs(body.vertices[:, 1].min()) < 1e-5
+    assert np.abs(body.joints_m[0, [0, 2]]).max() < 1e-6  # the root stands above the origin
     assert body.joints_m[body.joint("Head"), 1] > body.joints_m[body.joint("Hips"), 1] > 0.8
     toe, ankle = body.joints_m[body.joint("LeftToeBase")], body.joints_m[body.joint("LeftFoot")]
     assert toe[2] > ankle[2] + 0.05  # toes point along +Z
@@ -64,6 +65,21 @@ def test_shape_is_differentiable_and_moves_what_it_names(parametric: AnnyBody) -
     assert shape.grad is not None
     assert torch.isfinite(shape.grad).all()
     assert shape.grad[parametric.shape_names.index("height")] > 0.05
+
+
+@pytest.mark.parametrize("name", LOCAL_CHANGES)
+def test_a_local_change_moves_the_surface(parametric: AnnyBody, body: Body, name: str) -> None:
+    shape = parametric.shape_defaults.clone()
+    shape[parametric.shape_names.index(name)] = 1.0
+    assert np.linalg.norm(parametric.body(shape).vertices - body.vertices, axis=1).max() > 0.005
+
+
+def test_scale_enlarges_flesh_and_bones_alike(parametric: AnnyBody, body: Body) -> None:
+    shape = parametric.shape_defaults.clone()
+    shape[parametric.shape_names.index(SCALE)] = 1.2
+    larger = parametric.body(shape)
+    np.testing.assert_allclose(larger.vertices, 1.2 * body.vertices, atol=1e-5)
+    np.testing.assert_allclose(larger.joints_m, 1.2 * body.joints_m, atol=1e-5)
 
 
 def test_weights_are_a_partition_of_unity(body: Body) -> None:

@@ -5,6 +5,7 @@ import pytest
 from pydantic import ValidationError
 
 from pipeline.avatar.body import load_anny
+from pipeline.avatar.overlay import BODY_OUTLINE_RGB, MASK_OUTLINE_RGB
 from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
 from pipeline.geometry.camera import Camera
@@ -67,14 +68,32 @@ def test_stage_writes_body_motion_camera_scores_and_overlay(tmp_path, scene: Act
     assert metrics["hands_used"] == 1.0 - 0.5 / FRAMES
     motion, body = load_motion(out / "motion.npz"), load_body(out / "body.npz")
     assert np.array_equal(motion.frame_index, 3 * np.arange(FRAMES))
+    assert np.array_equal(motion.time_s, scene.time_s)
     assert np.abs(motion.root_translation_m - scene.state.root_m.numpy()).max() < 0.05
     assert body.height_m() == pytest.approx(scene.model.height_m()[0], abs=0.03)
     assert load_camera(out / "camera.npz").fx == scene.camera.fx
-    assert load_npz(out / "scores.npz")["silhouette_iou"].shape == (FRAMES,)
-    assert load_npz(out / "scores.npz")["lump_share"].max() < 0.005
+    scores = load_npz(out / "scores.npz")
+    assert scores["silhouette_iou"].shape == (FRAMES,)
+    assert metrics["silhouette_iou_worst"] == scores["silhouette_iou"].min()
+    assert scores["lump_share"].max() < 0.005
     assert metrics["foreign_frames"] == 0
-    assert read_rgb(out / "overlay.png").std() > 10
+    tiles = read_rgb(out / "overlay.png")
+    mask_px, body_px = ((tiles == colour).all(-1).sum() for colour in (MASK_OUTLINE_RGB, BODY_OUTLINE_RGB))
+    assert 0 < mask_px < 0.6 * body_px  # where both agree, the body's outline hides that of the mask
     assert take_warnings() == []
+
+
+def test_a_thing_beside_the_person_is_told_of(tmp_path, scene: Act) -> None:
+    frames, out = tmp_path / "frames", tmp_path / "body"
+    out.mkdir()
+    masks = scene.masks()
+    top, left = np.argwhere(masks[3] > 0).min(axis=0)
+    masks[3][top : top + 30, left - 20 : left + 10] = 255
+    write_capture(frames, scene, scene.camera, masks)
+    take_warnings()
+    metrics = run({"frames": frames}, out, Config(rounds=1))
+    assert metrics["foreign_frames"] == 1
+    assert any(sentence.startswith("frames 9: the mask holds something beside") for sentence in take_warnings())
 
 
 def test_masks_of_something_else_are_refused_with_a_remedy(tmp_path, scene: Act) -> None:
