@@ -172,7 +172,7 @@ def write_preview(path: Path, renders: list[np.ndarray], judge: Judge) -> None:
 
 STAGE = Stage(
     "field",
-    version=4,
+    version=5,
     needs=("frames", "body"),
     makes=("field.safetensors", "occupancy.npz", "motion.npz"),
     config=FieldConfig,

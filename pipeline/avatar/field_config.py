@@ -37,7 +37,7 @@ class FieldConfig(Config):
         0.10, gt=0, le=0.6, description="how far clothing and hair may stand off the fitted body, m"
     )
     step_fraction: float = Option(0.01, gt=0, le=0.1, description="ray step, as a part of the body's height")
-    pixel_jitter: bool = Option(True, description="rays start anywhere in their pixel instead of its centre")
+    pixel_jitter: bool = Option(False, description="rays start anywhere in their pixel instead of its centre")
     share_border: float = Option(0.25, ge=0, le=1, description="part of the rays along the mask's border")
     share_outside: float = Option(0.1, ge=0, le=1, description="part of the rays outside the mask")
     border_px: int = Option(4, ge=1, description="half width of the border, px")
