@@ -172,7 +172,7 @@ def write_preview(path: Path, renders: list[np.ndarray], judge: Judge) -> None:
 
 STAGE = Stage(
     "field",
-    version=5,
+    version=6,
     needs=("frames", "body"),
     makes=("field.safetensors", "occupancy.npz", "motion.npz"),
     config=FieldConfig,

@@ -65,7 +65,7 @@ class _Decode(torch.autograd.Function):
         hidden_gradient, output_gradient = torch.zeros_like(hidden), torch.zeros_like(output)
         size = raw_gradient.abs().amax(1)
         for rows in torch.nonzero(size > NEGLIGIBLE * size.mean())[:, 0].split(ROWS):
-            part, towards = features[rows], raw_gradient[rows]
+            part, towards = features.index_select(0, rows), raw_gradient.index_select(0, rows)
             activation = (part @ hidden).clamp_(min=0)
             output_gradient.T.addmm_(towards.T, activation)
             passed = (towards @ output.T).mul_(activation.sign_())

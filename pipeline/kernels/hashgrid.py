@@ -92,7 +92,7 @@ class _Encode(torch.autograd.Function):
         points, table = (saved.detach() for saved in ctx.saved_tensors)
         layout, sums = ctx.layout, ctx.table_gradient
         moved = torch.from_numpy(hashgrid_cpu.rows_that_are_not_zero(gradient.contiguous().numpy()))
-        towards, places = gradient[moved].numpy(), points[moved]
+        towards, places = gradient.index_select(0, moved).numpy(), points.index_select(0, moved)
         points_gradient = None
         if ctx.needs_input_grad[0]:
             found = torch.zeros_like(places)

@@ -10,6 +10,7 @@ Letters: m skin-grid nodes, j joints, k frames of a batch, s samples.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from pipeline.kernels import warp_cpu
+from pipeline.kernels.blend import SparseWeights, blend
 from pipeline.kernels.dispatch import runs_on_numba
 from pipeline.kernels.reference import warp as reference
 
@@ -35,9 +37,13 @@ class SkinGrid:
 
     def blend(self, canonical_to_posed: Float[Tensor, "k j 4 4"]) -> Float[Tensor, "m k 12"]:
         """The blended skinning matrix (rows of its upper 3x4 part) at every node: one product for all frames."""
-        count, joints = canonical_to_posed.shape[:2]
-        flat = canonical_to_posed[:, :, :3].transpose(0, 1).reshape(joints, count * 12)
-        return torch.matmul(self.weights.to(flat), flat).view(-1, count, 12)
+        by_joint = canonical_to_posed[:, :, :3].transpose(0, 1).flatten(1)
+        return blend(self.sparse_weights, by_joint).view(-1, len(canonical_to_posed), 12)
+
+    @cached_property
+    def sparse_weights(self) -> SparseWeights:
+        """The weights without their zeros: a node hangs on two or three joints."""
+        return SparseWeights.of(self.weights)
 
     def around(self, occupied: UInt8[np.ndarray, "ox oy oz"], bounds_m: Float[np.ndarray, "2 3"]) -> "SkinGrid":
         """The same grid without the nodes that no point of an occupied cell is interpolated from.
@@ -82,7 +88,9 @@ class WarpGrid:
 
 def bake(skin: SkinGrid, canonical_to_posed: Float[Tensor, "j 4 4"]) -> WarpGrid:
     """Invert the skinning of one frame. Runs on the CPU and without the GIL: threads may bake different frames."""
-    blended = skin.blend(canonical_to_posed.detach().float().cpu()[None]).numpy()
+    # A dense product: not more than one thread may enter a parallel loop.
+    matrices = canonical_to_posed.detach().float().cpu()[:, :3].flatten(1)
+    blended = (skin.weights @ matrices)[:, None].numpy()
     posed, box = warp_cpu.carry_nodes(skin.nodes_m, blended)
     cell = np.float32(skin.cell_m)
     origin = (np.floor(box[0] / cell) * cell).astype(np.float32)

@@ -14,13 +14,13 @@ a copy as large as the table with its gradient and moments, multiplications and 
 product, rows of tables at that of random rows loaded from a table as large as the largest level. Rows that lie
 together, as those of neighbouring samples do, come faster: a floor made of rows can be undercut. With n rays,
 s samples, p points (the samples, and those that should be empty), l levels of f features, w = l f, h the hidden width,
-and for poses k frames, j joints, m nodes of skin weights:
+and for poses k frames, j joints, m nodes with e skin weights that are not zero:
 
 | part | work a step |
 |---|---|
 | draw | 84 n bytes: pixel and colour read; origin, direction, colour, background, jitter, frame written |
 | march | 8 s rows of a warp grid, 16 s bytes written |
-| place | 24 m j k operations (blending, a dense product), 8 s rows of blended matrices, 40 s bytes |
+| place | 24 e k operations (blending), 8 s rows of blended matrices, 40 s bytes |
 | encode_forward | 8 l p rows, (12 + 4 w) p bytes |
 | network_forward | 2 (w h + 4 h) p operations, (4 w + 16) p bytes |
 | composite | 76 s + 56 n bytes, forward and backward |
@@ -28,7 +28,7 @@ and for poses k frames, j joints, m nodes of skin weights:
 | network_backward | twice the operations of network_forward, (8 w + 32) p bytes |
 | table_backward | 16 l p rows: each is read and written |
 | positions_backward | 8 l p rows, and for Newton 24 s: a node's matrix is read, its gradient read and written |
-| rest_backward | 48 n bytes (losses), 24 m j k operations (blending) |
+| rest_backward | 48 n bytes (losses), 24 e k operations (blending) |
 | adam | 32 bytes a parameter |
 | occupancy_record | 4 s rows, 24 s bytes |
 | occupancy_update | encode_forward and network_forward of one point a cell |
@@ -171,7 +171,7 @@ def least_work(learning: Learning, samples: float) -> dict[str, Work]:
     width = len(field.hidden)
     moving = float(learning.refines_poses)
     frames = min(config.frames_per_step, learning.scene.pool.frames)
-    blending = 24.0 * learning.skin.weights.numel() * frames if learning.refines_poses else 0.0
+    blending = 24.0 * len(learning.skin.sparse_weights.weight) * frames if learning.refines_poses else 0.0
     placed = samples if learning.refines_poses else 0.0
     network = 2.0 * (width * hidden + 4 * hidden)
     cells = len(occupancy.cells) / config.occupancy_every

@@ -1,0 +1,15 @@
+"""Plain-torch twin of blending: any dtype, any device, gradients by autograd."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+def blend(
+    row_start: Int[Tensor, "m1"], joint: Int[Tensor, "e"], weight: Float[Tensor, "e"], values: Float[Tensor, "j c"]
+) -> Float[Tensor, "m c"]:
+    """Same as `pipeline.kernels.blend.blend`, of the arrays of `SparseWeights`."""
+    row_start, joint = row_start.to(values.device), joint.to(values.device)
+    node = torch.repeat_interleave(torch.arange(len(row_start) - 1).to(joint), row_start.diff())
+    blended = values.new_zeros(len(row_start) - 1, values.shape[1])
+    return blended.index_add(0, node, weight.to(values)[:, None] * values[joint])
