@@ -207,7 +207,7 @@ def overlay(
 
 STAGE = Stage(
     "body",
-    version=6,
+    version=7,
     needs=("frames",),
     makes=(_BODY, _MOTION, _CAMERA, _SCORES, _OVERLAY),
     config=Config,

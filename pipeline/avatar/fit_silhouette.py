@@ -37,8 +37,11 @@ REACH = 0.10
 CLOTHING_SHARE = 0.5
 """Weight of pairs where the mask lies outside the body, as clothes do, against those where the body sticks out."""
 
-HAIR_SHARE = 0.15
-"""The same for pairs on the head."""
+BULK_SHARE = 0.05
+"""The same on head and feet: hair and shoes add to the outline's height, which must not pass for a person who is
+nearer."""
+
+BULKY_JOINTS = ("Head", "LeftFoot", "LeftToeBase", "RightFoot", "RightToeBase")
 
 DOUBT_FROM, DOUBT_TO = 0.05, 0.15
 """A frame's outlines count fully while its overlap is this near to the median, and hardly when it is that far below."""
@@ -147,8 +150,11 @@ class Pairs:
     weight: Float[np.ndarray, "m"]
 
 
-def match_outlines(window: Window, drawn: Bool[np.ndarray, "h w"], on_head: Bool[np.ndarray, "h w"]) -> Pairs:
-    """Pairs between the outline of the drawn body and that of the mask (both kinds of the module's docstring)."""
+def match_outlines(window: Window, drawn: Bool[np.ndarray, "h w"], bulky: Bool[np.ndarray, "h w"]) -> Pairs:
+    """Pairs between the outline of the drawn body and that of the mask (both kinds of the module's docstring).
+
+    bulky: pixels of the body's head and feet.
+    """
     body_outline = outline_pixels(drawn)
     if len(body_outline) == 0 or len(window.outline) == 0:
         empty = np.zeros((0, 2))
@@ -163,7 +169,7 @@ def match_outlines(window: Window, drawn: Bool[np.ndarray, "h w"], on_head: Bool
         forward,
         forward[:, ::-1] + 0.5 - gap[:, None] * normal,
         normal,
-        ((np.abs(gap) < reach) & agree) * _slack(gap, on_head[forward[:, 0], forward[:, 1]]),
+        ((np.abs(gap) < reach) & agree) * _slack(gap, bulky[forward[:, 0], forward[:, 1]]),
     )
     backward = _thinned(window.outline)
     apart, nearest = cKDTree(body_outline).query(backward)
@@ -175,14 +181,14 @@ def match_outlines(window: Window, drawn: Bool[np.ndarray, "h w"], on_head: Bool
         partner,
         backward[:, ::-1] + 0.5,
         normal,
-        ((apart < reach) & agree) * _slack(gap, on_head[partner[:, 0], partner[:, 1]]),
+        ((apart < reach) & agree) * _slack(gap, bulky[partner[:, 0], partner[:, 1]]),
     )
     return Pairs(*(np.concatenate(pair) for pair in zip(vars(first).values(), vars(second).values(), strict=True)))
 
 
-def _slack(gap: Float[np.ndarray, "m"], on_head: Bool[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
-    """Less weight where the mask lies outside the body (gap < 0): clothes, and even more so hair."""
-    return np.where(gap < 0, np.where(on_head, HAIR_SHARE, CLOTHING_SHARE), 1.0)
+def _slack(gap: Float[np.ndarray, "m"], bulky: Bool[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
+    """Less weight where the mask lies outside the body (gap < 0): clothes, and even more so hair and shoes."""
+    return np.where(gap < 0, np.where(bulky, BULK_SHARE, CLOTHING_SHARE), 1.0)
 
 
 def _thinned(pixels: Int[np.ndarray, "q 2"]) -> Int[np.ndarray, "m 2"]:
@@ -207,7 +213,8 @@ def match_all(
     """The contour term for the body as it stands, and each frame's overlap with its mask (nan without a mask)."""
     camera = through_lens(observations.camera, state.lens)
     vertices = posed_vertices(model, state)
-    head_faces = (model.weights[:, ACTIVE_JOINTS.index("Head")] > 0.5)[model.faces[:, 0].long()].numpy()
+    carried = model.weights[:, [ACTIVE_JOINTS.index(name) for name in BULKY_JOINTS]].sum(1)
+    bulky_faces = (carried > 0.5)[model.faces[:, 0].long()].numpy()
     size = 2 * POINTS_PER_SIDE
     frames = len(windows)
     corners = torch.zeros(frames, size, 3, dtype=torch.int64)
@@ -220,7 +227,7 @@ def match_all(
         drawing = draw_in_window(vertices[frame], model.faces, camera, window)
         drawn = drawing.face_id >= 0
         overlap[frame] = intersection_over_union(drawn, window.mask)
-        pairs = match_outlines(window, drawn, drawn & head_faces[drawing.face_id])
+        pairs = match_outlines(window, drawn, drawn & bulky_faces[drawing.face_id])
         count, used = len(pairs.weight), (pairs.weight > 0).sum()
         rows, columns = pairs.pixel.T
         corners[frame, :count] = model.faces[drawing.face_id[rows, columns]].long()

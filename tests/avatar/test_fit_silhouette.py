@@ -1,3 +1,4 @@
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -97,6 +98,24 @@ def test_the_true_body_covers_its_mask_and_its_pairs_are_satisfied() -> None:
     assert np.isnan(overlap[2])
     assert contour.weight[2].max() == 0.0
     assert contour.weight[:2].sum(1).min() > 20.0
+
+
+def test_what_hair_and_shoes_add_hardly_pulls() -> None:
+    """They make the outline higher than the person, who would come nearer by it."""
+    body = load_anny()
+    scene = act(body, 6)
+    windows = [matching_window(cv2.dilate(mask, np.ones((7, 7), np.uint8))) for mask in scene.masks()]
+    contour, _ = match_all(scene.model, scene.state, scene.observations(scene.camera), windows)
+    frozen = body.body(body.shape_defaults)
+    carried_by = frozen.skin_weights[contour.corners[..., 0].numpy()]
+    weight = contour.weight.numpy()
+    head = carried_by[..., frozen.joint_names.index("Head")]
+    feet = carried_by[..., [row for row, name in enumerate(frozen.joint_names) if "Foot" in name]].sum(-1)
+    elsewhere = (head + feet < 0.1) & (weight > 0)
+    for end in (head, feet):
+        at_end = (end > 0.5) & (weight > 0)
+        assert at_end.any()
+        assert np.median(weight[at_end]) < 0.2 * np.median(weight[elsewhere])
 
 
 def test_posed_vertices_equal_whole_body_skinning() -> None:
