@@ -124,11 +124,11 @@ def _draw_runs(axes: Axes, panel: Panel, points: Sequence[Point], colours: dict[
 
 
 def _draw_presets(axes: Axes, panel: Panel, points: Sequence[Point], colours: dict[str, Colour]) -> None:
-    """Every preset's mean over seeds, and which of them no other beats."""
+    """Every preset's mean over seeds with its short name, and which of them no other beats."""
     means = preset_means(points, panel.mesh)
     for preset, place in means.items():
         axes.plot(*place, "o", color=colours[preset], markersize=7)
-        axes.annotate(preset, place, (7, 4), textcoords="offset points", fontsize=8, color=INK)
+        axes.annotate(preset.partition(",")[0], place, (7, 4), textcoords="offset points", fontsize=8, color=INK)
     places = list(means.values())
     front = [places[index] for index in pareto_front(places, panel.higher_is_better)]
     if front:
