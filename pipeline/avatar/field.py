@@ -25,7 +25,7 @@ DENSITY_GAIN, LIMIT = 1.0, 7.0
 """density = START · exp(gain · raw), with raw cut at plus and minus the limit."""
 
 ROWS = 8192
-"""Points that go through the network at once: what lies between its layers stays in the cache."""
+"""Points that go through the network at once on the CPU: what lies between its layers stays in the cache."""
 
 QUERY_POINTS = 1 << 18
 
@@ -46,8 +46,8 @@ class _Decode(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, features: Tensor, hidden: Tensor, output: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
-        raw = features.new_empty(4, len(features))
-        for part, into in zip(features.split(ROWS), raw.split(ROWS, dim=1), strict=True):
+        raw, at_once = features.new_empty(4, len(features)), _rows_at_once(features)
+        for part, into in zip(features.split(at_once), raw.split(at_once, dim=1), strict=True):
             torch.mm(output.T, (part @ hidden).clamp_(min=0).T, out=into)
         raw = raw.T + bias
         colour = torch.sigmoid(raw[:, :3])
@@ -64,7 +64,7 @@ class _Decode(torch.autograd.Function):
         features_gradient = torch.zeros_like(features)
         hidden_gradient, output_gradient = torch.zeros_like(hidden), torch.zeros_like(output)
         size = raw_gradient.abs().amax(1)
-        for rows in torch.nonzero(size > NEGLIGIBLE * size.mean())[:, 0].split(ROWS):
+        for rows in torch.nonzero(size > NEGLIGIBLE * size.mean())[:, 0].split(_rows_at_once(features)):
             part, towards = features.index_select(0, rows), raw_gradient.index_select(0, rows)
             activation = (part @ hidden).clamp_(min=0)
             output_gradient.T.addmm_(towards.T, activation)
@@ -72,6 +72,10 @@ class _Decode(torch.autograd.Function):
             hidden_gradient.addmm_(part.T, passed)
             features_gradient.index_copy_(0, rows, passed @ hidden.T)
         return features_gradient, hidden_gradient, output_gradient, raw_gradient.sum(0)
+
+
+def _rows_at_once(features: Tensor) -> int:
+    return ROWS if features.device.type == "cpu" else max(len(features), 1)
 
 
 class Field(torch.nn.Module):

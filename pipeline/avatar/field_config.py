@@ -3,14 +3,19 @@
 from typing import Literal
 
 from pydantic import Field as Option
+from pydantic import model_validator
 
 from pipeline.core.config import Config
+from pipeline.core.device import DeviceChoice
 
 
 class FieldConfig(Config):
     """What steers the learning of the canonical field."""
 
     seed: int = Option(0, ge=0, description="seed of all random draws")
+    device: DeviceChoice = Option(
+        "auto", description="where the field learns: auto takes a CUDA graphics card where there is one"
+    )
     steps: int = Option(600, ge=0, le=200_000, description="training steps")
     rays: int = Option(4096, ge=64, le=1 << 18, description="rays a step")
     frames_per_step: int = Option(8, ge=1, le=64, description="frames that a step's rays come from")
@@ -66,9 +71,6 @@ class FieldConfig(Config):
     huber_delta: float = Option(0.3, gt=0, description="colour error where the Huber loss turns from square to linear")
     weight_alpha: float = Option(0.3, ge=0, description="weight of the alpha loss")
     weight_hard: float = Option(0.02, ge=0, description="weight of the hard-surface loss")
-    weight_thin: float = Option(
-        0.0, ge=0, description="weight of the loss on light caught by thin, see-through samples"
-    )
     weight_density: float = Option(0.05, ge=0, description="weight of the density loss in empty cells")
     empty_points: int = Option(2048, ge=0, description="points a step at which emptiness is asked for")
     hidden_points: int = Option(
@@ -84,3 +86,9 @@ class FieldConfig(Config):
     early_stop: bool = Option(
         True, description="end before all steps are made, once validation frames gain no more than noise"
     )
+
+    @model_validator(mode="after")
+    def _leaves_a_rest(self) -> "FieldConfig":
+        if self.share_border + self.share_outside > 1:
+            raise ValueError("share_border and share_outside are together at most 1")
+        return self

@@ -81,10 +81,11 @@ def raw_field(bounds_m: Float[np.ndarray, "2 3"], layout: GridLayout, raw: Float
 
 def skin_reaches(points_m: Float[np.ndarray, "n 3"], skin: SkinGrid) -> np.ndarray:
     """True for each point with a node of the skin grid at the low corner of its cell."""
-    index = np.floor((points_m - skin.origin_m) / skin.cell_m).astype(np.int64)
-    inside = ((index >= 0) & (index < skin.row_of_node.shape)).all(1)
+    origin_m, row_of_node = skin.origin_m.numpy(), skin.row_of_node.numpy()
+    index = np.floor((points_m - origin_m) / skin.cell_m).astype(np.int64)
+    inside = ((index >= 0) & (index < row_of_node.shape)).all(1)
     reached = np.zeros(len(points_m), dtype=bool)
-    reached[inside] = skin.row_of_node[tuple(index[inside].T)] >= 0
+    reached[inside] = row_of_node[tuple(index[inside].T)] >= 0
     return reached
 
 
@@ -103,7 +104,7 @@ def _look(
     a point that is in none has no votes.
     """
     points = torch.from_numpy(points_m)
-    weights = interpolate(points, skin.origin_m, skin.cell_m, skin.row_of_node, skin.weights)
+    weights = interpolate(points, skin.lattice, skin.weights)
     nearest = cKDTree(body.vertices).query(points_m, workers=torch.get_num_threads())[1]
     normals = torch.from_numpy(body.mesh().vertex_normals()[nearest]).float()
     hits, seen, light = np.zeros(len(points_m)), np.zeros(len(points_m)), np.full(len(points_m), 1e-6)

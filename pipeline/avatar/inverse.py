@@ -74,8 +74,8 @@ def _baked(body: Body, skin: SkinGrid, canonical_to_posed: Float[Tensor, "k j 4 
     def sample(rays: Rays, step_m: float, occupancy: Occupancy, max_samples: int) -> Samples:
         return march(*rays, step_m, warps, occupancy.occupied, occupancy.bounds_m, max_samples)
 
-    low = torch.from_numpy(warps.origin_m)
-    high = low + warps.cell_m * torch.from_numpy(warps.dims - 1).float()
+    low = warps.origin_m
+    high = low + warps.cell_m * (warps.dims - 1).float()
     return Inverse(torch.stack([low, high], dim=1), sample, _newton_place)
 
 
@@ -92,7 +92,7 @@ def _broyden(body: Body, skin: SkinGrid, canonical_to_posed: Float[Tensor, "k j 
         def find(posed_m: Float[Tensor, "p 3"], slot: Int[Tensor, "p"]) -> tuple[Tensor, Tensor]:
             near = _nearest_in(trees, posed_m, slot, reach_m) >= 0
             points = posed_m.new_zeros(len(posed_m), broyden.CANDIDATES, 3)
-            exists = torch.zeros(points.shape[:2], dtype=torch.bool)
+            exists = torch.zeros(points.shape[:2], dtype=torch.bool, device=points.device)
             points[near], exists[near] = broyden.search(posed_m[near], slot[near], matrices[:, bones], blended, skin)
             return points, exists
 
@@ -109,21 +109,21 @@ def _posed_cells(
 
     They spare the search all stops in empty space, as a grid in posed space does in InstantAvatar.
     """
-    bounds_m, occupied = occupancy.bounds_m.numpy(), occupancy.occupied.numpy()
-    centres_m = torch.from_numpy(cell_centres(bounds_m, len(occupied))[occupied.reshape(-1) > 0])
-    grid = (skin.origin_m, skin.cell_m, skin.row_of_node)
+    bounds_m, occupied = occupancy.bounds_m.cpu().numpy(), occupancy.occupied.cpu().numpy()
+    centres_m = torch.from_numpy(cell_centres(bounds_m, len(occupied))[occupied.reshape(-1) > 0]).to(blended.device)
     trees = {
-        slot: cKDTree(skin_points(centres_m, matrix, *grid).numpy()) for slot, matrix in enumerate(blended.unbind(1))
+        slot: cKDTree(skin_points(centres_m, matrix, skin.lattice).cpu().numpy())
+        for slot, matrix in enumerate(blended.unbind(1))
     }
     # Half a diagonal would do where skinning does not stretch.
     return trees, float(np.linalg.norm((bounds_m[1] - bounds_m[0]) / occupied.shape))
 
 
 def _nearest(body: Body, skin: SkinGrid, canonical_to_posed: Float[Tensor, "k j 4 4"]) -> Inverse:
-    weights = torch.from_numpy(body.skin_weights)
+    weights = torch.from_numpy(body.skin_weights).to(canonical_to_posed.device)
     vertices_m = _posed_vertices_m(body, canonical_to_posed)
     boxes_m = _boxes_m(vertices_m, skin)
-    trees = {row: cKDTree(vertices.numpy()) for row, vertices in enumerate(vertices_m)}
+    trees = {row: cKDTree(vertices.cpu().numpy()) for row, vertices in enumerate(vertices_m)}
 
     def undo(matrices: Float[Tensor, "j 4 4"], vertex: Int[Tensor, "p"], posed_m: Float[Tensor, "p 3"]) -> Tensor:
         matrix = (weights[vertex] @ matrices[:, :3].reshape(-1, 12)).view(-1, 3, 4)
@@ -153,7 +153,8 @@ def _nearest(body: Body, skin: SkinGrid, canonical_to_posed: Float[Tensor, "k j 
 
 
 def _posed_vertices_m(body: Body, canonical_to_posed: Float[Tensor, "k j 4 4"]) -> Float[Tensor, "k v 3"]:
-    vertices, weights = torch.from_numpy(body.vertices), torch.from_numpy(body.skin_weights)
+    device = canonical_to_posed.device
+    vertices, weights = torch.from_numpy(body.vertices).to(device), torch.from_numpy(body.skin_weights).to(device)
     return linear_blend_skinning(vertices, weights, canonical_to_posed)
 
 
@@ -167,10 +168,10 @@ def _nearest_in(
     trees: dict[int, cKDTree], points_m: Float[Tensor, "p 3"], frame: Int[Tensor, "p"], reach_m: float
 ) -> Int[Tensor, "p"]:
     """For each point which of its frame's tree points is the nearest; -1 where none is within reach."""
-    nearest = torch.full((len(points_m),), -1)
+    nearest = torch.full((len(points_m),), -1, device=points_m.device)
     for row in frame.unique().tolist():
         chosen = torch.nonzero(frame == row)[:, 0]
-        at = points_m[chosen].detach().numpy()
+        at = points_m[chosen].detach().cpu().numpy()
         _, index = trees[row].query(at, distance_upper_bound=reach_m, workers=torch.get_num_threads())
-        nearest[chosen] = torch.from_numpy(np.where(index < trees[row].n, index, -1))
+        nearest[chosen] = torch.from_numpy(np.where(index < trees[row].n, index, -1)).to(nearest)
     return nearest

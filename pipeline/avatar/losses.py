@@ -25,7 +25,7 @@ def hard_surface(alpha: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
 
 
 def field_losses(
-    image: Float[Tensor, "n 4"],
+    image: Float[Tensor, "n 3"],
     alpha: Float[Tensor, "n"],
     empty_density_per_m: Float[Tensor, "e"],
     rgba: Float[Tensor, "n 4"],
@@ -34,18 +34,16 @@ def field_losses(
 ) -> dict[str, Tensor]:
     """Weighted losses of one batch of rays.
 
-    image: premultiplied colour, and the samples' own opacities, composited like a colour.
-    rgba: straight colour and mask of the pixels. background: laid behind both, random for each
-    ray, so that no colour can pass for transparency.
+    image: premultiplied colour. rgba: straight colour and mask of the pixels. background: laid behind both, random
+    for each ray, so that no colour can pass for transparency.
     """
     mask = rgba[:, 3]
     target = rgba[:, :3] * mask[:, None] + background * (1 - mask[:, None])
-    shown = image[:, :3] + background * (1 - alpha[:, None])
+    shown = image + background * (1 - alpha[:, None])
     losses = {
         "colour": huber(shown - target, config.huber_delta).mean(),
         "alpha": config.weight_alpha * huber(alpha - mask, config.huber_delta).mean(),
         "hard": config.weight_hard * hard_surface(alpha).mean(),
-        "thin": config.weight_thin * (alpha - image[:, 3]).mean(),
     }
     if len(empty_density_per_m):
         losses["density"] = config.weight_density * 0.01 * empty_density_per_m.mean()

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from pipeline.core.device import CPU
 from pipeline.kernels.visits import record_visits
 
 RESOLUTION = 64
@@ -35,6 +36,10 @@ class Occupancy:
 
     occupied: UInt8[Tensor, "gx gy gz"]
     bounds_m: Float[Tensor, "2 3"]
+
+    def to(self, device: torch.device) -> "Occupancy":
+        """The same grid on another device."""
+        return Occupancy(self.occupied.to(device), self.bounds_m.to(device))
 
     def contains(self, points_m: Float[Tensor, "n 3"]) -> Tensor:
         """True for each canonical point in an occupied cell."""
@@ -90,21 +95,23 @@ class OccupancyUpdate:
         learning_rate: float,
         decay: float,
         seed: int,
+        device: torch.device = CPU,
     ) -> None:
-        self.bounds_m = torch.tensor(bounds_m, dtype=torch.float32)
+        self.bounds_m = torch.tensor(bounds_m, dtype=torch.float32, device=device)
         x, y, z = shell.shape
         self.shape: tuple[int, int, int] = (x, y, z)
-        self.cells = torch.from_numpy(np.flatnonzero(shell))
-        self.centres_m = torch.from_numpy(cell_centres(bounds_m, shell.shape[0]))[self.cells]
-        self.distance_m = torch.from_numpy(distance_m.reshape(-1).astype(np.float32))[self.cells]
-        self.frequency = torch.from_numpy(frequency.reshape(-1).astype(np.float32))[self.cells]
-        self.average = torch.full((len(self.cells),), START_AVERAGE)
-        self.reached, self.gave = torch.zeros(shell.size), torch.zeros(shell.size)
+        cells = np.flatnonzero(shell)
+        of_cells = (array.reshape(-1)[cells].astype(np.float32) for array in (distance_m, frequency))
+        self.cells = torch.from_numpy(cells).to(device)
+        self.centres_m = torch.from_numpy(cell_centres(bounds_m, shell.shape[0])[cells]).to(device)
+        self.distance_m, self.frequency = (torch.from_numpy(array).to(device) for array in of_cells)
+        self.average = torch.full((len(cells),), START_AVERAGE, device=device)
+        self.reached, self.gave = torch.zeros(2, shell.size, device=device).unbind()
         self.decay = decay
-        self.attention = VoxelAttention(margin_m, seed) if attention else None
+        self.attention = VoxelAttention(margin_m, seed).to(device) if attention else None
         if self.attention is not None:
             self.optimiser = torch.optim.Adam(self.attention.parameters(), lr=learning_rate)
-        self.occupied = torch.zeros(shell.shape, dtype=torch.uint8)
+        self.occupied = torch.zeros(shell.shape, dtype=torch.uint8, device=device)
         self.occupied.view(-1)[self.cells] = 1
 
     def grid(self) -> Occupancy:
@@ -130,9 +137,9 @@ class OccupancyUpdate:
 
     def points_in(self, cells: Int[Tensor, "n"], random: np.random.Generator) -> Float[Tensor, "n 3"]:
         """A random point (m) of each cell, given by flat index."""
-        size = torch.tensor(self.shape)
+        size = torch.tensor(self.shape, device=cells.device)
         corner = torch.stack(torch.unravel_index(cells, self.shape), dim=-1)
-        inside = torch.from_numpy(random.random((len(cells), 3), dtype=np.float32))
+        inside = torch.from_numpy(random.random((len(cells), 3), dtype=np.float32)).to(cells.device)
         return self.bounds_m[0] + (corner + inside) / size * (self.bounds_m[1] - self.bounds_m[0])
 
     def record(self, points_m: Float[Tensor, "s 3"], light: Float[Tensor, "s"], weights: Float[Tensor, "s"]) -> None:
@@ -148,8 +155,9 @@ class OccupancyUpdate:
         density_of: canonical points (n, 3) -> density (n); asked at a random point of each cell.
         step_m: length over which a density becomes an opacity. threshold: average opacity at which a cell is occupied.
         """
-        cell_m = (self.bounds_m[1] - self.bounds_m[0]) / torch.tensor(self.shape)
-        offset = torch.from_numpy(random.random((len(self.cells), 3), dtype=np.float32)) - 0.5
+        device = self.cells.device
+        cell_m = (self.bounds_m[1] - self.bounds_m[0]) / torch.tensor(self.shape, device=device)
+        offset = torch.from_numpy(random.random((len(self.cells), 3), dtype=np.float32)).to(device) - 0.5
         density = density_of(self.centres_m + offset * cell_m)
         opacity = -torch.expm1(-density * step_m)
         if self.attention is None:
@@ -188,7 +196,8 @@ class OccupancyUpdate:
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
         """Go on from `state()`."""
-        self.average, self.reached, self.gave = (tensors[name].clone() for name in ("average", "reached", "gave"))
+        for name in ("average", "reached", "gave"):
+            setattr(self, name, tensors[name].clone().to(self.cells.device))
         self.occupied.copy_(tensors["occupied"])
         if self.attention is None:
             return
@@ -196,4 +205,7 @@ class OccupancyUpdate:
             parameter.data.copy_(tensors[f"attention.{name}"])
             keys = [key for key in ("step", "exp_avg", "exp_avg_sq") if f"attention.{name}.{key}" in tensors]
             if keys:
-                self.optimiser.state[parameter] = {key: tensors[f"attention.{name}.{key}"].clone() for key in keys}
+                kept = {key: tensors[f"attention.{name}.{key}"].clone() for key in keys}
+                # The count of steps stays on the CPU, as torch's Adam keeps it.
+                moved = {key: kept[key].to(parameter.device) for key in keys if key != "step"}
+                self.optimiser.state[parameter] = kept | moved

@@ -6,6 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.avatar.body import Body, Motion
+from pipeline.core.device import CPU
 from pipeline.geometry.rotation import (
     axis_angle_to_matrix,
     axis_angle_to_quaternion,
@@ -28,19 +29,19 @@ class PoseCorrection:
     exp(correction).
     """
 
-    def __init__(self, body: Body, motion: Motion) -> None:
+    def __init__(self, body: Body, motion: Motion, device: torch.device = CPU) -> None:
         self.body, self.motion = body, motion
-        self.joints = torch.tensor([body.joint(name) for name in MAIN_JOINTS if name in body.joint_names])
+        joints = [body.joint(name) for name in MAIN_JOINTS if name in body.joint_names]
+        self.joints = torch.tensor(joints, device=device)
         frames = len(motion.frame_index)
-        self.rotation_rad = torch.zeros(frames, len(self.joints), 3, requires_grad=True)
-        self.shift_m = torch.zeros(frames, 3, requires_grad=True)
-        self._joints_m = torch.as_tensor(body.joints_m)
-        self._rotations = quaternion_to_matrix(torch.as_tensor(motion.rotations_wxyz))
-        self._root_m = torch.as_tensor(motion.root_translation_m)
+        self.rotation_rad = torch.zeros(frames, len(joints), 3, device=device, requires_grad=True)
+        self.shift_m = torch.zeros(frames, 3, device=device, requires_grad=True)
+        self._joints_m = torch.as_tensor(body.joints_m).to(device)
+        self._rotations = quaternion_to_matrix(torch.as_tensor(motion.rotations_wxyz)).to(device)
+        self._root_m = torch.as_tensor(motion.root_translation_m).to(device)
         gaps_s = np.diff(motion.time_s.astype(np.float64)) if frames > 1 else np.zeros(0)
-        self._gap = torch.tensor(
-            np.maximum(gaps_s / max(np.median(gaps_s), 1e-9), 1e-3) if len(gaps_s) else gaps_s
-        ).float()
+        gaps = np.maximum(gaps_s / max(np.median(gaps_s), 1e-9), 1e-3) if len(gaps_s) else gaps_s
+        self._gap = torch.tensor(gaps, dtype=torch.float32, device=device)
 
     def canonical_to_world(self, rows: Tensor) -> Float[Tensor, "k j 4 4"]:
         """Skinning matrices of some frames, differentiable in the corrections."""
@@ -57,7 +58,7 @@ class PoseCorrection:
     def roughness(self) -> Tensor:
         """Mean squared change of the corrections from frame to frame (rad² and, in decimetres, m²)."""
         if len(self.shift_m) < 2:
-            return torch.zeros(())
+            return self.shift_m.new_zeros(())
         turn = self.rotation_rad.diff(dim=0).square().sum((1, 2)) / self._gap
         shift = (10 * self.shift_m.diff(dim=0)).square().sum(1) / self._gap
         return (turn + shift).mean()
@@ -69,11 +70,12 @@ class PoseCorrection:
     def corrected(self, motion: Motion) -> Motion:
         """Another motion (any frames) with the corrections interpolated to its times, held at the ends."""
         known, wanted = self.motion.time_s.astype(np.float64), motion.time_s.astype(np.float64)
-        rotation = _interpolate(wanted, known, self.rotation_rad.detach().numpy().reshape(len(known), -1))
-        shift = _interpolate(wanted, known, self.shift_m.detach().numpy())
+        rotation = _interpolate(wanted, known, self.rotation_rad.detach().cpu().numpy().reshape(len(known), -1))
+        shift = _interpolate(wanted, known, self.shift_m.detach().cpu().numpy())
         quaternions = torch.as_tensor(motion.rotations_wxyz).clone()
         turn = axis_angle_to_quaternion(torch.from_numpy(rotation.reshape(len(wanted), -1, 3)))
-        quaternions[:, self.joints] = quaternion_multiply(quaternions[:, self.joints], turn)
+        joints = self.joints.cpu()
+        quaternions[:, joints] = quaternion_multiply(quaternions[:, joints], turn)
         return motion.with_pose(quaternions.numpy(), motion.root_translation_m + shift)
 
 

@@ -17,6 +17,7 @@ from pipeline.avatar.rays import build_pool
 from pipeline.avatar.support import cell_distances_m, field_bounds_m, mask_frequency, starting_shell
 from pipeline.avatar.train import Learning, Scene
 from pipeline.avatar.warp import build_skin_grid, skin_margin_m
+from pipeline.core.device import CPU
 from pipeline.geometry.camera import Camera, world_to_camera_points
 
 SUPPORT_FRAMES = 32
@@ -43,9 +44,14 @@ def spread(count: int, limit: int) -> np.ndarray:
 
 
 def start_learning(
-    body: Body, motion: Motion, camera: Camera, pictures: Sequence[Picture], config: FieldConfig
+    body: Body,
+    motion: Motion,
+    camera: Camera,
+    pictures: Sequence[Picture],
+    config: FieldConfig,
+    device: torch.device = CPU,
 ) -> Learning:
-    """Choose box, grid levels and starting cells from the data, and set everything up.
+    """Choose box, grid levels and starting cells from the data, and set everything up; what learns lies on `device`.
 
     pictures: image and mask of each frame of `motion`, for `camera`.
     """
@@ -75,10 +81,12 @@ def start_learning(
         learning_rate=config.attention_rate,
         decay=config.occupancy_decay,
         seed=config.seed,
+        device=device,
     )
     pool = build_pool(pictures, config.border_px, config.seed)
     scene = Scene(body, motion, camera, pool, skin)
-    return Learning(scene, first_field(scene, pictures, bounds_m, pixel_m, config), occupancy, config)
+    field = first_field(scene, pictures, bounds_m, pixel_m, config).to(device)
+    return Learning(scene, field, occupancy, config)
 
 
 def first_field(

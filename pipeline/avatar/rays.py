@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Int, UInt8
 
 KINDS = ("body", "border", "outside")
 OUTSIDE_PER_FRAME = 20_000
@@ -87,8 +87,3 @@ def _kinds(mask: UInt8[np.ndarray, "h w"], border_px: int, random: np.random.Gen
     if len(far) > OUTSIDE_PER_FRAME:
         far = np.sort(random.choice(far, OUTSIDE_PER_FRAME, replace=False))
     return [np.nonzero(solid & ~border), np.nonzero(border), np.unravel_index(far, mask.shape)]
-
-
-def pixel_footprint_m(depths_m: Float[np.ndarray, "n"], focal_px: float) -> float:
-    """What one pixel covers at the typical depth of the body."""
-    return float(np.median(depths_m)) / focal_px

@@ -31,13 +31,14 @@ def render_field(
     camera: Camera,
     skin: SkinGrid | None = None,
 ) -> Float[Tensor, "h w 4"]:
-    """Premultiplied colour and alpha of every pixel, without gradient.
+    """Premultiplied colour and alpha of every pixel, without gradient, on the CPU; computed where the field is.
 
     skin: the body's skin grid, from `build_skin_grid`; give it when many images are rendered, it takes a second to
     build.
     """
-    skin = skin or build_skin_grid(body, skin_margin_m(body, occupancy.bounds_m.numpy()))
-    canonical_to_world = canonical_to_world.float()
+    device = field.bounds_m.device
+    skin = skin or build_skin_grid(body, skin_margin_m(body, occupancy.bounds_m.cpu().numpy()))
+    skin, occupancy, canonical_to_world = skin.to(device), occupancy.to(device), canonical_to_world.float().to(device)
     to_posed = posed_from_world(canonical_to_world[None])[0]
     canonical_to_posed = to_posed @ canonical_to_world
     inverse = invert_motion(field.inverse_skinning, body, skin, canonical_to_posed[None])
@@ -47,7 +48,8 @@ def render_field(
         pixels_px = torch.stack([columns, rows], dim=-1) + 0.5
         rays = _carry(*pixel_rays(camera, pixels_px), to_posed)
         with torch.no_grad():
-            image[rows, columns] = _shade(field, occupancy, skin, canonical_to_posed, inverse, rays, step_m)
+            shaded = _shade(field, occupancy, skin, canonical_to_posed, inverse, rays, step_m)
+        image[rows.cpu(), columns.cpu()] = shaded.cpu()
     return image
 
 
@@ -60,7 +62,7 @@ def _pixels_in_box(
     box_m: Float[Tensor, "2 3"], to_posed: Float[Tensor, "4 4"], camera: Camera
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """Rows and columns of the pixels that may see the posed box, in parts."""
-    unit = torch.tensor([[i & 1, i >> 1 & 1, i >> 2 & 1] for i in range(8)])
+    unit = torch.tensor([[i & 1, i >> 1 & 1, i >> 2 & 1] for i in range(8)], device=box_m.device)
     corners = (box_m[0] + unit * (box_m[1] - box_m[0]) - to_posed[:3, 3]) @ to_posed[:3, :3]
     corners_px, depth_m = project(corners, camera)
     x0, y0, x1, y1 = 0, 0, camera.width, camera.height
@@ -70,7 +72,7 @@ def _pixels_in_box(
         x1, y1 = min(x1, camera.width), min(y1, camera.height)
     if x1 <= x0 or y1 <= y0:
         return
-    pixels = torch.cartesian_prod(torch.arange(y0, y1), torch.arange(x0, x1))
+    pixels = torch.cartesian_prod(torch.arange(y0, y1), torch.arange(x0, x1)).to(box_m.device)
     for part in pixels.split(RAYS_AT_ONCE):
         yield part[:, 0], part[:, 1]
 
@@ -85,20 +87,21 @@ def _shade(
     step_m: float,
 ) -> Float[Tensor, "n 4"]:
     origins, directions = rays
-    count = len(origins)
-    frame, jitter = torch.zeros(count, dtype=torch.long), torch.full((count,), 0.5)
+    count, device = len(origins), origins.device
+    frame, jitter = torch.zeros(count, dtype=torch.long, device=device), torch.full((count,), 0.5, device=device)
     samples = inverse.sample(Rays(origins, directions, frame, jitter), step_m, occupancy, MAX_SAMPLES)
-    ray = torch.repeat_interleave(torch.arange(count), samples.ray_start.diff())
-    rank = torch.arange(len(ray)) - samples.ray_start[ray]
-    colour, density = torch.zeros(len(ray), 3), torch.zeros(len(ray))
-    optical_depth, waiting, reached = torch.zeros(count), torch.arange(len(ray)), 0
+    ray = torch.repeat_interleave(torch.arange(count, device=device), samples.ray_start.diff())
+    waiting, reached = torch.arange(len(ray), device=device), 0
+    rank = waiting - samples.ray_start[ray]
+    colour, density = torch.zeros(len(ray), 3, device=device), torch.zeros(len(ray), device=device)
+    optical_depth = torch.zeros(count, device=device)
     while len(waiting):
         reached += SAMPLES_AT_ONCE
         near = rank[waiting] < reached
         rows, waiting = waiting[near], waiting[~near]
         posed = origins[ray[rows]] + samples.distance_m[rows, None] * directions[ray[rows]]
-        slots = (torch.tensor([0]), samples.canonical_m[rows], posed, torch.tensor([0, len(rows)]))
-        points = inverse.place(skin, canonical_to_posed[None], *slots)
+        slot, slot_start = torch.tensor([0], device=device), torch.tensor([0, len(rows)], device=device)
+        points = inverse.place(skin, canonical_to_posed[None], slot, samples.canonical_m[rows], posed, slot_start)
         colour[rows], density[rows] = field(points)
         optical_depth.index_add_(0, ray[rows], density[rows] * step_m)
         waiting = waiting[optical_depth[ray[waiting]] < OPAQUE]

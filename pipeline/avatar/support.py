@@ -53,9 +53,8 @@ def mask_frequency(
     """
     points = torch.from_numpy(centres_m)
     hits, seen = np.zeros(len(centres_m)), np.zeros(len(centres_m))
-    grid = (skin.origin_m, skin.cell_m, skin.row_of_node)
     for row, mask in enumerate(masks):
-        posed = skin_points(points, skin.blend(canonical_to_world[row : row + 1])[:, 0], *grid)
+        posed = skin_points(points, skin.blend(canonical_to_world[row : row + 1])[:, 0], skin.lattice)
         pixels, depth_m = project(posed, camera)
         column, line = (pixels[:, axis].floor().long().numpy() for axis in range(2))
         inside = (depth_m.numpy() > 0) & (column >= 0) & (line >= 0) & (column < mask.shape[1]) & (line < mask.shape[0])

@@ -59,11 +59,11 @@ class Batch:
 
 
 class DivergedError(ArithmeticError):
-    """Many steps in a row gave no finite gradient."""
+    """Many steps in a row had no finite loss."""
 
 
 class Learning:
-    """The state of stage one: everything that a step changes is here and in `state()`.
+    """The state of stage one: everything that a step changes is here and in `state()`, on the field's device.
 
     Random numbers come from a generator keyed by (seed, step), so a resumed run draws what an unbroken one would
     have drawn.
@@ -71,7 +71,8 @@ class Learning:
 
     def __init__(self, scene: Scene, field: Field, occupancy: OccupancyUpdate, config: FieldConfig) -> None:
         self.scene, self.field, self.occupancy, self.config = scene, field, occupancy, config
-        self.poses = PoseCorrection(scene.body, scene.motion)
+        self.device = field.bounds_m.device
+        self.poses = PoseCorrection(scene.body, scene.motion, self.device)
         self.step_m = scene.body.height_m() * config.step_fraction
         self.done = 0
         self.bad_steps = 0
@@ -81,7 +82,7 @@ class Learning:
         self.parameters = parameters
         self.moments = {name: (torch.zeros_like(p), torch.zeros_like(p)) for name, p in parameters.items()}
         self.baked_rotation_rad, self.baked_shift_m = torch.zeros(()), torch.zeros(())
-        self.skin = scene.skin
+        self.whole_skin = self.skin = scene.skin.to(self.device)
         self._bake()
 
     def _bake(self) -> None:
@@ -89,7 +90,7 @@ class Learning:
         self.baked_rotation_rad = self.poses.rotation_rad.detach().clone()
         self.baked_shift_m = self.poses.shift_m.detach().clone()
         with torch.no_grad():
-            everything = torch.arange(self.scene.pool.frames)
+            everything = torch.arange(self.scene.pool.frames, device=self.device)
             canonical_to_world = self.poses.canonical_to_world(everything)
             self.posed_from_world = posed_from_world(canonical_to_world)
             poses = self.posed_from_world[:, None] @ canonical_to_world
@@ -97,9 +98,8 @@ class Learning:
 
     def _follow_occupancy(self) -> None:
         """Blend skinning only where samples can lie: a third of the nodes, and of the memory that a step touches."""
-        self.skin = self.scene.skin
         if self.refines_poses:
-            self.skin = self.skin.around(self.occupancy.occupied.numpy(), self.occupancy.bounds_m.numpy())
+            self.skin = self.whole_skin.around(self.occupancy.occupied, self.occupancy.bounds_m)
 
     @property
     def refines_poses(self) -> bool:
@@ -115,18 +115,21 @@ class Learning:
         shares = (1 - config.share_border - config.share_outside, config.share_border, config.share_outside)
         rows, slots = pool.draw(frames, config.rays, shares, random)
         inside = random.random((len(rows), 2), dtype=np.float32) if config.pixel_jitter else np.float32(0.5)
-        origins, directions = pixel_rays(self.scene.camera, torch.from_numpy(pool.xy_px[rows] + inside))
-        slot, chosen = torch.from_numpy(slots), torch.from_numpy(frames)
+        origins, directions = pixel_rays(self.scene.camera, self._here(pool.xy_px[rows] + inside))
+        slot, chosen = self._here(slots), self._here(frames)
         matrix = self.posed_from_world[chosen].index_select(0, slot)
         return Batch(
             frames=chosen,
             slot=slot,
             origins_m=(matrix[:, :3, :3] * origins[:, None]).sum(-1) + matrix[:, :3, 3],
             directions=(matrix[:, :3, :3] * directions[:, None]).sum(-1),
-            rgba=torch.from_numpy(pool.rgba[rows]).float() / 255,
-            background=torch.from_numpy(random.random((len(rows), 3), dtype=np.float32)),
-            jitter=torch.from_numpy(random.random(len(rows), dtype=np.float32)),
+            rgba=self._here(pool.rgba[rows]).float() / 255,
+            background=self._here(random.random((len(rows), 3), dtype=np.float32)),
+            jitter=self._here(random.random(len(rows), dtype=np.float32)),
         )
+
+    def _here(self, array: np.ndarray) -> Tensor:
+        return torch.from_numpy(array).to(self.device)
 
     def _place(self, batch: Batch, samples: Samples) -> Float[Tensor, "s 3"]:
         """Canonical positions of the samples: as looked up, or exact and differentiable once poses are refined."""
@@ -135,32 +138,34 @@ class Learning:
         to_world = self.poses.canonical_to_world(batch.frames)
         poses = self.posed_from_world[batch.frames][:, None] @ to_world
         counts = samples.ray_start.diff()
-        ray = torch.repeat_interleave(torch.arange(len(counts)), counts)
+        ray = torch.repeat_interleave(torch.arange(len(counts), device=self.device), counts)
         # Rows by index_select: plain indexing takes three times as long for tensors of this size.
         offset = samples.distance_m[:, None] * batch.directions.index_select(0, ray)
         posed = batch.origins_m.index_select(0, ray) + offset
-        slots = torch.arange(len(batch.frames) + 1)
+        slots = torch.arange(len(batch.frames) + 1, device=self.device)
         slot_start = samples.ray_start[torch.searchsorted(batch.slot, slots)]
         return self.inverse.place(self.skin, poses, batch.frames, samples.canonical_m, posed, slot_start)
 
     def _empty_points(self, random: np.random.Generator) -> Float[Tensor, "e 3"]:
         """Random points that should be empty: of the box, in empty cells; and, once rays had time, of hidden cells."""
         low, high = self.occupancy.bounds_m
-        points = torch.from_numpy(random.random((self.config.empty_points, 3), dtype=np.float32)) * (high - low) + low
+        points = self._here(random.random((self.config.empty_points, 3), dtype=np.float32)) * (high - low) + low
         empty = points[~self.occupancy.grid().contains(points)]
         if self.done < self.config.occupancy_start:
             return empty
         hidden = self.occupancy.hidden_cells()
         if not len(hidden):
             return empty
-        drawn = hidden[torch.from_numpy(random.integers(0, len(hidden), self.config.hidden_points))]
+        drawn = hidden[self._here(random.integers(0, len(hidden), self.config.hidden_points))]
         return torch.cat([empty, self.occupancy.points_in(drawn, random)])
 
     def step(self) -> dict[str, float]:
-        """One step; returns the losses. Raises DivergedError after many steps without a finite gradient."""
+        """One step; returns the losses. Raises DivergedError after many steps without a finite loss."""
         config, random = self.config, self._random()
         if self.refines_poses and self.done in {round(part * config.steps) for part in REBAKES}:
             self._bake()
+        if self.refines_poses and self.skin is self.whole_skin:
+            self._follow_occupancy()
         batch = self._draw(random)
         look_everywhere = self.done % LOOK_EVERYWHERE == 0 or self.done < config.occupancy_start
         grid = self.occupancy.grid() if look_everywhere else self.occupancy.lit_grid()
@@ -169,17 +174,17 @@ class Learning:
         count = len(samples.distance_m)
         points = torch.cat([self._place(batch, samples), self._empty_points(random)])
         colour, density = self.field.radiance(points, self.table_gradient)
-        step_m = torch.full((count,), self.step_m)
-        opacity = -torch.expm1(-density[:count, None] * self.step_m)
-        channels = torch.cat([colour[:count], opacity], dim=1)
-        image, alpha, weights = composite(density[:count], channels, step_m, samples.ray_start)
+        step_m = torch.full((count,), self.step_m, device=self.device)
+        image, alpha, weights = composite(density[:count], colour[:count], step_m, samples.ray_start)
         losses = field_losses(image, alpha, density[count:], batch.rgba, batch.background, config)
         total = torch.stack(list(losses.values())).sum()
         if self.refines_poses:
             total = total + config.pose_smoothness * self.poses.roughness() + config.pose_size * self.poses.size()
         total.backward()
-        self._update_parameters(bool(torch.isfinite(total)))
-        self.occupancy.record(samples.canonical_m, light_before(weights, samples.ray_start), weights)
+        finite = bool(torch.isfinite(total))
+        self._update_parameters(finite)
+        if finite:
+            self.occupancy.record(samples.canonical_m, light_before(weights, samples.ray_start), weights)
         self.done += 1
         if self.done % config.occupancy_every == 0 and self.done >= config.occupancy_start:
             self.occupancy.update(self.field.density, self.step_m, config.occupancy_threshold, random)
@@ -202,7 +207,8 @@ class Learning:
         config = self.config
         rates = {"table": config.table_rate, "rotation_rad": config.pose_rate, "shift_m": config.pose_rate / 3}
         for name, parameter in self.parameters.items():
-            gradient = self.table_gradient if name == "table" else parameter.grad
+            # The compiled encoding fills a buffer of ours; its plain twin, for other devices, fills autograd's.
+            gradient = self.table_gradient if name == "table" and parameter.grad is None else parameter.grad
             if gradient is None:
                 continue
             if not finite:

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pipeline.avatar.body import Body
+from pipeline.core.device import CPU
 from pipeline.geometry.surface import signed_distance_m
 from pipeline.kernels.march import WarpSet
 from pipeline.kernels.warp import SkinGrid, WarpGrid, bake
@@ -40,7 +41,9 @@ def build_skin_grid(body: Body, margin_m: float, cell_m: float = 0.03) -> SkinGr
     kept = distance < reach
     row_of_node = np.where(kept, np.cumsum(kept) - 1, -1).astype(np.int32).reshape(tuple(size))
     weights = _smooth_weights(nodes[kept], tree, body.skin_weights, cell_m)
-    return SkinGrid(origin, cell_m, row_of_node, nodes[kept], distance[kept], torch.from_numpy(weights))
+    arrays = (origin, row_of_node, nodes[kept], distance[kept], weights)
+    origin_m, rows, nodes_m, distance_m, weights_of = (torch.from_numpy(array) for array in arrays)
+    return SkinGrid(origin_m, cell_m, rows, nodes_m, distance_m, weights_of)
 
 
 def skin_margin_m(body: Body, bounds_m: Float[np.ndarray, "2 3"]) -> float:
@@ -70,11 +73,15 @@ def posed_from_world(canonical_to_world: Float[Tensor, "n j 4 4"]) -> Float[Tens
 
 
 def bake_motion(skin: SkinGrid, canonical_to_posed: Float[Tensor, "n j 4 4"]) -> WarpSet:
-    """The warp grids of all frames; frames are shared out to as many threads as torch uses."""
+    """The warp grids of all frames, on the device of the matrices.
+
+    They are baked on the CPU; frames are shared out to as many threads as torch uses.
+    """
+    skin, matrices = skin.to(CPU), canonical_to_posed.cpu()
 
     def bake_row(row: int) -> WarpGrid:
-        return bake(skin, canonical_to_posed[row])
+        return bake(skin, matrices[row])
 
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        grids: Sequence[WarpGrid] = list(pool.map(bake_row, range(len(canonical_to_posed))))
-    return WarpSet.of(grids, skin.cell_m)
+        grids: Sequence[WarpGrid] = list(pool.map(bake_row, range(len(matrices))))
+    return WarpSet.of(grids, skin.cell_m).to(canonical_to_posed.device)

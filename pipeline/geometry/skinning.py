@@ -39,18 +39,18 @@ def forward_kinematics(
         ValueError: a parent does not come before its child.
     """
     above = np.array(parents, dtype=np.int64)
-    count = len(above)
+    count, device = len(above), rotations.device
     wrong = np.flatnonzero((above[1:] < 0) | (above[1:] >= np.arange(1, count))) + 1
     if len(wrong):
         raise ValueError(f"joint {wrong[0]} has parent {above[wrong[0]]}; parents must come before their children")
-    offset_m = (joints_m[1:] - joints_m[above[1:]]).expand(len(rotations), -1, 3)
+    offset_m = (joints_m[1:] - joints_m[torch.from_numpy(above[1:]).to(device)]).expand(len(rotations), -1, 3)
     local = rigid(rotations, torch.cat([root_translation_m[:, None], offset_m], dim=1))
     # Row `count` is the world, above the root. Each round joins every chain of joints with the one above it, so chains
     # double in length and a body of sixteen generations takes four rounds.
-    world = torch.cat([local, torch.eye(4).to(local).expand(len(local), 1, 4, 4)], dim=1)
+    world = torch.cat([local, torch.eye(4, dtype=local.dtype, device=device).expand(len(local), 1, 4, 4)], dim=1)
     above = np.append(np.where(above < 0, count, above), count)
     while (above < count).any():
-        world = world[:, torch.from_numpy(above)] @ world
+        world = world[:, torch.from_numpy(above).to(device)] @ world
         above = above[above]
     return world[:, :count]
 

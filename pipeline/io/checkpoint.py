@@ -76,7 +76,7 @@ def load_field(path: Path) -> Field:
 
 def save_occupancy(path: Path, occupancy: Occupancy) -> None:
     """Write the occupied cells and their box."""
-    save_npz(path, {"occupied": occupancy.occupied.numpy(), "bounds_m": occupancy.bounds_m.numpy()})
+    save_npz(path, {"occupied": occupancy.occupied.cpu().numpy(), "bounds_m": occupancy.bounds_m.cpu().numpy()})
 
 
 def load_occupancy(path: Path) -> Occupancy:

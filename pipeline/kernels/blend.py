@@ -25,7 +25,7 @@ class SparseWeights(NamedTuple):
     def of(weights: Float[Tensor, "m j"]) -> "SparseWeights":
         """Without the zeros."""
         node, joint = torch.nonzero(weights, as_tuple=True)
-        row_start = torch.searchsorted(node, torch.arange(len(weights) + 1))
+        row_start = torch.searchsorted(node, torch.arange(len(weights) + 1, device=node.device))
         return SparseWeights(row_start, joint, weights[node, joint])
 
 

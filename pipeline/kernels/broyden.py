@@ -40,13 +40,12 @@ def search(
         blended: `SkinGrid.blend` of the frames.
     """
     starts = torch.linalg.inv(bone_to_posed.detach())[:, :, :3].reshape(*bone_to_posed.shape[:2], 12).contiguous()
-    grid = (skin.origin_m, skin.cell_m, skin.row_of_node)
     limits = (ITERATIONS, CONVERGED_M, DIVERGED_M, SAME_ROOT_M)
     if not runs_on_numba(posed_m, starts, blended):
-        return reference.search(posed_m.detach(), frame, starts, blended.detach(), grid, limits, CANDIDATES)
+        return reference.search(posed_m.detach(), frame, starts, blended.detach(), skin.lattice, limits, CANDIDATES)
     roots, counts = np.zeros((len(posed_m), CANDIDATES, 3), np.float32), np.zeros(len(posed_m), np.int64)
     points, table = posed_m.detach().contiguous().numpy(), blended.detach().contiguous().numpy()
-    origin, cell, rows = skin.origin_m, np.float32(skin.cell_m), skin.row_of_node
+    origin, cell, rows = skin.origin_m.numpy(), np.float32(skin.cell_m), skin.row_of_node.numpy()
     residuals = [np.float32(limit) for limit in limits[1:]]
     broyden_cpu.search(
         points, frame.numpy(), starts.numpy(), table, origin, cell, rows, ITERATIONS, *residuals, roots, counts

@@ -9,7 +9,6 @@ Letters: n rays, s samples, k frames.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -30,31 +29,30 @@ class WarpSet:
     """
 
     cell_m: float
-    origin_m: Float[np.ndarray, "k 3"]
-    dims: Int[np.ndarray, "k 3"]
-    first: Int[np.ndarray, "k 3"]
-    canonical_m: Float[np.ndarray, "nodes 3"]
-    codes: Int[np.ndarray, "cells"]
-    maps: Float[np.ndarray, "maps 12"]
+    origin_m: Float[Tensor, "k 3"]
+    dims: Int[Tensor, "k 3"]
+    first: Int[Tensor, "k 3"]
+    canonical_m: Float[Tensor, "nodes 3"]
+    codes: Int[Tensor, "cells"]
+    maps: Float[Tensor, "maps 12"]
 
     @staticmethod
     def of(grids: Sequence[WarpGrid], cell_m: float) -> "WarpSet":
         """Lay warp grids one behind the other; `cell_m` is the cell of all of them."""
         sizes = np.array([(len(g.canonical_m), len(g.codes), len(g.maps)) for g in grids], dtype=np.int64)
-        return WarpSet(
-            cell_m=cell_m,
-            origin_m=np.stack([grid.origin_m for grid in grids]),
-            dims=np.stack([grid.dims for grid in grids]),
-            first=np.cumsum(sizes, axis=0) - sizes,
-            canonical_m=np.concatenate([grid.canonical_m for grid in grids]),
-            codes=np.concatenate([grid.codes for grid in grids]),
-            maps=np.concatenate([grid.maps for grid in grids]),
-        )
+        names = ("canonical_m", "codes", "maps")
+        joined = {name: np.concatenate([getattr(grid, name) for grid in grids]) for name in names}
+        joined |= {name: np.stack([getattr(grid, name) for grid in grids]) for name in ("origin_m", "dims")}
+        joined["first"] = np.cumsum(sizes, axis=0) - sizes
+        return WarpSet(cell_m, **{name: torch.from_numpy(array) for name, array in joined.items()})
 
-    def arrays(self) -> tuple[Any, ...]:
-        """In the order that the compiled loops take."""
-        cell = np.float32(self.cell_m)
-        return cell, self.origin_m, self.dims, self.first, self.canonical_m, self.codes, self.maps
+    def to(self, device: torch.device) -> "WarpSet":
+        """The same grids on another device."""
+        return WarpSet(self.cell_m, *(tensor.to(device) for tensor in self.tensors()))
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        """In the order that the loops and their twin take."""
+        return self.origin_m, self.dims, self.first, self.canonical_m, self.codes, self.maps
 
 
 @dataclass(frozen=True)
@@ -91,11 +89,21 @@ def march(
     if not runs_on_numba(origins_m, directions, jitter):
         return Samples(
             *reference.march(
-                origins_m, directions, frame, jitter, step_m, warps.arrays(), occupied, bounds_m, max_samples
+                origins_m,
+                directions,
+                frame,
+                jitter,
+                step_m,
+                warps.cell_m,
+                warps.tensors(),
+                occupied,
+                bounds_m,
+                max_samples,
             )
         )
     arrays = (tensor.contiguous().numpy() for tensor in (origins_m, directions, frame, jitter))
+    grids = (tensor.numpy() for tensor in (*warps.tensors(), occupied, bounds_m))
     points, distance, ray_start = march_cpu.march(
-        *arrays, np.float32(step_m), *warps.arrays(), occupied.numpy(), bounds_m.numpy(), max_samples
+        *arrays, np.float32(step_m), np.float32(warps.cell_m), *grids, max_samples
     )
     return Samples(torch.from_numpy(points), torch.from_numpy(distance), torch.from_numpy(ray_start))

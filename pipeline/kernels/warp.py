@@ -22,18 +22,31 @@ from pipeline.kernels import warp_cpu
 from pipeline.kernels.blend import SparseWeights, blend
 from pipeline.kernels.dispatch import runs_on_numba
 from pipeline.kernels.reference import warp as reference
+from pipeline.kernels.reference.warp import Lattice
 
 
 @dataclass(frozen=True)
 class SkinGrid:
     """Skin weights near the canonical body, continuous in space: trilinear between nodes `cell_m` apart."""
 
-    origin_m: Float[np.ndarray, "3"]
+    origin_m: Float[Tensor, "3"]
     cell_m: float
-    row_of_node: Int[np.ndarray, "gx gy gz"]
-    nodes_m: Float[np.ndarray, "m 3"]
-    distance_m: Float[np.ndarray, "m"]
+    row_of_node: Int[Tensor, "gx gy gz"]
+    nodes_m: Float[Tensor, "m 3"]
+    distance_m: Float[Tensor, "m"]
     weights: Float[Tensor, "m j"]
+
+    @property
+    def lattice(self) -> Lattice:
+        """Where the nodes are; what `pipeline.kernels.reference.warp` interpolates on."""
+        return self.origin_m, self.cell_m, self.row_of_node
+
+    def to(self, device: torch.device) -> "SkinGrid":
+        """The same grid on another device; itself if it is there already."""
+        if self.weights.device == device:
+            return self
+        moved = (tensor.to(device) for tensor in (self.row_of_node, self.nodes_m, self.distance_m, self.weights))
+        return SkinGrid(self.origin_m.to(device), self.cell_m, *moved)
 
     def blend(self, canonical_to_posed: Float[Tensor, "k j 4 4"]) -> Float[Tensor, "m k 12"]:
         """The blended skinning matrix (rows of its upper 3x4 part) at every node: one product for all frames."""
@@ -45,29 +58,30 @@ class SkinGrid:
         """The weights without their zeros: a node hangs on two or three joints."""
         return SparseWeights.of(self.weights)
 
-    def around(self, occupied: UInt8[np.ndarray, "ox oy oz"], bounds_m: Float[np.ndarray, "2 3"]) -> "SkinGrid":
+    def around(self, occupied: UInt8[Tensor, "ox oy oz"], bounds_m: Float[Tensor, "2 3"]) -> "SkinGrid":
         """The same grid without the nodes that no point of an occupied cell is interpolated from.
 
         occupied: not zero for the cells that are meant; they fill the box `bounds_m`. Along each axis a matrix says
         which nodes are corners of a cell of this grid that meets which layer of occupied cells.
         """
-        wanted = (occupied != 0).astype(np.float32)
+        wanted, device = (occupied != 0).float(), occupied.device
+        low_m, high_m = bounds_m.double()
         for axis, (nodes, cells) in enumerate(zip(self.row_of_node.shape, occupied.shape, strict=True)):
-            at_m = self.origin_m[axis] + np.arange(nodes)[:, None] * self.cell_m
-            edges_m = np.linspace(bounds_m[0, axis], bounds_m[1, axis], cells + 1)
+            at_m = self.origin_m[axis] + torch.arange(nodes, device=device).double()[:, None] * self.cell_m
+            part = torch.arange(cells + 1, device=device).double() / cells
+            edges_m = low_m[axis] + part * (high_m[axis] - low_m[axis])
             meets = (edges_m[:-1] <= at_m + self.cell_m) & (edges_m[1:] >= at_m - self.cell_m)
-            wanted = np.moveaxis(np.tensordot(meets.astype(np.float32), wanted, axes=(1, axis)), 0, axis)
+            wanted = torch.tensordot(meets.float(), wanted, dims=([1], [axis])).movedim(0, axis)
         kept = (wanted > 0) & (self.row_of_node >= 0)
-        rows = self.row_of_node[kept]
-        row_of_node = np.full(self.row_of_node.shape, -1, dtype=np.int32)
-        row_of_node[kept] = np.arange(len(rows))
-        return SkinGrid(
-            self.origin_m, self.cell_m, row_of_node, self.nodes_m[rows], self.distance_m[rows], self.weights[rows]
-        )
+        rows = self.row_of_node[kept].long()
+        row_of_node = torch.full_like(self.row_of_node, -1)
+        row_of_node[kept] = torch.arange(len(rows), device=device).to(row_of_node)
+        nodes_m, distance_m, weights = (x.index_select(0, rows) for x in (self.nodes_m, self.distance_m, self.weights))
+        return SkinGrid(self.origin_m, self.cell_m, row_of_node, nodes_m, distance_m, weights)
 
     def weights_at(self, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "n j"]:
         """Skin weights of canonical points; outside the grid, those of the nearest node that exists."""
-        return reference.interpolate(points_m, self.origin_m, self.cell_m, self.row_of_node, self.weights.to(points_m))
+        return reference.interpolate(points_m, self.lattice, self.weights.to(points_m))
 
 
 @dataclass(frozen=True)
@@ -87,17 +101,18 @@ class WarpGrid:
 
 
 def bake(skin: SkinGrid, canonical_to_posed: Float[Tensor, "j 4 4"]) -> WarpGrid:
-    """Invert the skinning of one frame. Runs on the CPU and without the GIL: threads may bake different frames."""
+    """Invert the skinning of one frame; `skin` is on the CPU. Without the GIL: threads may bake different frames."""
     # A dense product: not more than one thread may enter a parallel loop.
     matrices = canonical_to_posed.detach().float().cpu()[:, :3].flatten(1)
     blended = (skin.weights @ matrices)[:, None].numpy()
-    posed, box = warp_cpu.carry_nodes(skin.nodes_m, blended)
+    nodes, distance, skin_origin, rows = (
+        tensor.numpy() for tensor in (skin.nodes_m, skin.distance_m, skin.origin_m, skin.row_of_node)
+    )
+    posed, box = warp_cpu.carry_nodes(nodes, blended)
     cell = np.float32(skin.cell_m)
     origin = (np.floor(box[0] / cell) * cell).astype(np.float32)
     dims = (np.ceil((box[1] - origin) / cell) + 1).astype(np.int64)
-    canonical, codes, maps = warp_cpu.bake(
-        skin.nodes_m, posed, skin.distance_m, origin, dims, skin.origin_m, cell, skin.row_of_node, blended
-    )
+    canonical, codes, maps = warp_cpu.bake(nodes, posed, distance, origin, dims, skin_origin, cell, rows, blended)
     return WarpGrid(origin, dims, canonical, codes, maps)
 
 
@@ -106,7 +121,7 @@ class _Newton(torch.autograd.Function):
     def forward(ctx: Any, blended: Tensor, start: Tensor, posed: Tensor, slot_start: Tensor, skin: SkinGrid) -> Tensor:
         slot = torch.repeat_interleave(torch.arange(blended.shape[1]), slot_start.diff())
         refined, inverse_jacobian = torch.empty_like(start), start.new_empty(len(start), 9)
-        grid = (skin.origin_m, np.float32(skin.cell_m), skin.row_of_node)
+        grid = (skin.origin_m.numpy(), np.float32(skin.cell_m), skin.row_of_node.numpy())
         arrays = (posed.numpy(), start.numpy(), slot.numpy())
         warp_cpu.refine(*arrays, *grid, blended.detach().numpy(), refined.numpy(), inverse_jacobian.numpy())
         ctx.save_for_backward(blended, start, inverse_jacobian, slot_start)
@@ -118,7 +133,7 @@ class _Newton(torch.autograd.Function):
         blended, *step, slot_start = (tensor.detach() for tensor in ctx.saved_tensors)
         skin = ctx.skin
         total = torch.zeros_like(blended)
-        grid = (skin.origin_m, np.float32(skin.cell_m), skin.row_of_node)
+        grid = (skin.origin_m.numpy(), np.float32(skin.cell_m), skin.row_of_node.numpy())
         arrays = (tensor.numpy() for tensor in (*step, gradient.contiguous(), slot_start))
         warp_cpu.pose_gradient(*arrays, *grid, total.numpy())
         return total, None, None, None, None
@@ -140,5 +155,5 @@ def newton(
         slot_start: k + 1 offsets; the samples of frame f are slot_start[f] : slot_start[f + 1].
     """
     if not runs_on_numba(blended, start_m, posed_m):
-        return reference.newton(blended, start_m, posed_m, slot_start, skin.origin_m, skin.cell_m, skin.row_of_node)
+        return reference.newton(blended, start_m, posed_m, slot_start, skin.lattice)
     return _Newton.apply(blended.contiguous(), start_m.contiguous(), posed_m.contiguous(), slot_start, skin)

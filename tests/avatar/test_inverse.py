@@ -44,13 +44,14 @@ def shell(body):
 def carried(body, skin, poses, count=3000):
     """Canonical points in and around the body, what frame it is, and where skinning carries them."""
     random = np.random.default_rng(1)
-    points = skin.nodes_m[random.integers(0, len(skin.nodes_m), count)]
+    points = skin.nodes_m.numpy()[random.integers(0, len(skin.nodes_m), count)]
     points = points + random.uniform(-0.5, 0.5, points.shape).astype(np.float32) * skin.cell_m
     points = torch.from_numpy(points[signed_distance_m(points, body.mesh()) < 0.04])
     frame = torch.arange(len(points)) % len(poses)
     blended = skin.blend(poses)
-    grid = (skin.origin_m, skin.cell_m, skin.row_of_node)
-    posed = torch.stack([skin_points(p[None], blended[:, f], *grid)[0] for p, f in zip(points, frame, strict=True)])
+    posed = torch.stack(
+        [skin_points(p[None], blended[:, f], skin.lattice)[0] for p, f in zip(points, frame, strict=True)]
+    )
     return points, frame, posed
 
 
@@ -139,8 +140,7 @@ def test_samples_lie_on_their_rays_and_in_occupied_cells(way, body, skin, poses,
     assert bool(occupancy.contains(samples.canonical_m).all())
     if way != "nearest":
         owner = torch.repeat_interleave(torch.arange(150), counts)
-        grid = (skin.origin_m, skin.cell_m, skin.row_of_node)
-        back = skin_points(samples.canonical_m, skin.blend(poses)[:, 2], *grid)
+        back = skin_points(samples.canonical_m, skin.blend(poses)[:, 2], skin.lattice)
         on_ray = origins[owner] + samples.distance_m[:, None] * directions[owner]
         assert float((back - on_ray).norm(dim=1).quantile(0.99)) < 0.01
 

@@ -17,8 +17,9 @@ def bar_skin(half_length_m=0.6, half_width_m=0.15) -> SkinGrid:
     second = 1 / (1 + np.exp(-nodes[:, 0] / 0.04))
     weights = torch.from_numpy(np.stack([1 - second, second], axis=-1).astype(np.float32))
     distance = np.abs(nodes[:, 1:]).max(1) - 0.1
-    rows = np.arange(len(nodes), dtype=np.int32).reshape(shape)
-    return SkinGrid(nodes.min(0), CELL_M, rows, nodes, distance.astype(np.float32), weights)
+    rows = torch.arange(len(nodes), dtype=torch.int32).view(shape)
+    nodes_m, distance_m = torch.from_numpy(nodes), torch.from_numpy(distance.astype(np.float32))
+    return SkinGrid(nodes_m.amin(0), CELL_M, rows, nodes_m, distance_m, weights)
 
 
 def bend(angle_rad: float, dtype=torch.float32) -> torch.Tensor:

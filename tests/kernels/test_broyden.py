@@ -7,7 +7,7 @@ from pipeline.kernels.march import WarpSet
 from pipeline.kernels.reference.warp import skin_points
 from pipeline.kernels.warp import SkinGrid, bake, newton
 from tests.kernels.bar import CELL_M, bar_points, bar_skin, bend
-from tests.kernels.test_warp import grid_of, look_up
+from tests.kernels.test_warp import look_up
 
 
 def run(skin, matrices, posed, frame=None):
@@ -34,7 +34,7 @@ def test_a_single_bone_is_undone_by_its_inverse(dtype):
 def test_undoes_the_bent_bar_and_agrees_with_the_baked_grid(angle):
     skin, matrices, points = bar_skin(), bend(angle), bar_points(2000)
     blended = skin.blend(matrices[None])
-    posed = skin_points(points, blended[:, 0], *grid_of(skin))
+    posed = skin_points(points, blended[:, 0], skin.lattice)
     roots, exists = run(skin, matrices, posed)
     truth = ((roots - points[:, None]).norm(dim=2) < 1e-3) & exists
     assert float(truth.any(1).float().mean()) > 0.995
@@ -50,7 +50,7 @@ def test_every_answer_is_a_root_and_none_comes_twice():
     roots, exists = run(skin, matrices, points)
     assert exists[-2:].sum(1).tolist() == [2, 2], "the folded bar covers these twice"
     point, candidate = torch.nonzero(exists, as_tuple=True)
-    back = skin_points(roots[point, candidate], skin.blend(matrices[None])[:, 0], *grid_of(skin))
+    back = skin_points(roots[point, candidate], skin.blend(matrices[None])[:, 0], skin.lattice)
     assert float((back - points[point]).norm(dim=1).max()) < 2e-5
     for first in range(CANDIDATES):
         for second in range(first):

@@ -77,3 +77,12 @@ def test_twin_passes_gradcheck():
         lambda d, c: reference.composite(d, c, step, RAY_START)[:2],
         (density.requires_grad_(True), colour.requires_grad_(True)),
     )
+
+
+def test_twin_in_float32_sees_thin_rays_behind_many_opaque_ones():
+    """On a graphics card the twin runs in float32, over all rays of a step at once."""
+    density = torch.cat([torch.full((50_000,), 1e4), torch.tensor([0.3, 0.2, 0.1])])
+    step, colour, ray_start = torch.full_like(density, 0.02), torch.ones(50_003, 1), torch.tensor([0, 50_000, 50_003])
+    _, alpha, weights = reference.composite(density, colour, step, ray_start)
+    assert float(alpha[1]) == pytest.approx(1 - math.exp(-0.6 * 0.02), rel=1e-4)
+    assert weights[-1].item() == pytest.approx(math.exp(-0.5 * 0.02) * (1 - math.exp(-0.1 * 0.02)), rel=1e-4)

@@ -10,10 +10,6 @@ from tests.kernels.bar import CELL_M, bar_points, bar_skin, bend
 EVERYWHERE = (torch.ones(2, 2, 2, dtype=torch.uint8), torch.tensor([[-9.0, -9, -9], [9, 9, 9]]))
 
 
-def grid_of(skin):
-    return skin.origin_m, skin.cell_m, skin.row_of_node
-
-
 def look_up(posed, warps, frame=0):
     """Canonical candidates of posed points, and the point that each belongs to: rays of a single stop."""
     count = len(posed)
@@ -24,8 +20,9 @@ def look_up(posed, warps, frame=0):
 
 def by_hand(skin, matrices, point):
     """A(x) x of one point with weights interpolated by hand."""
-    low = np.floor((point - skin.origin_m) / skin.cell_m).astype(int)
-    part = (point - skin.origin_m) / skin.cell_m - low
+    origin_m = skin.origin_m.numpy()
+    low = np.floor((point - origin_m) / skin.cell_m).astype(int)
+    part = (point - origin_m) / skin.cell_m - low
     matrix = np.zeros((4, 4))
     for corner in np.ndindex(2, 2, 2):
         share = np.prod([p if bit else 1 - p for p, bit in zip(part, corner, strict=True)])
@@ -36,7 +33,7 @@ def by_hand(skin, matrices, point):
 
 def test_forward_skinning_is_linear_blending_by_hand():
     skin, matrices, points = bar_skin(), bend(0.7), bar_points(20)
-    posed = skin_points(points, skin.blend(matrices[None])[:, 0], *grid_of(skin))
+    posed = skin_points(points, skin.blend(matrices[None])[:, 0], skin.lattice)
     for point, carried in zip(points.numpy(), posed.numpy(), strict=True):
         np.testing.assert_allclose(carried, by_hand(skin, matrices, point), atol=1e-6)
 
@@ -45,7 +42,7 @@ def test_forward_skinning_is_linear_blending_by_hand():
 def test_baked_grid_undoes_skinning_to_a_millimetre(angle):
     skin, matrices, points = bar_skin(), bend(angle), bar_points(3000)
     blended = skin.blend(matrices[None])
-    posed = skin_points(points, blended[:, 0], *grid_of(skin))
+    posed = skin_points(points, blended[:, 0], skin.lattice)
     found, owner = look_up(posed, WarpSet.of([bake(skin, matrices)], CELL_M))
     assert torch.equal(owner, torch.arange(len(points)))
     error_m = (found - points).norm(dim=1)
@@ -53,7 +50,7 @@ def test_baked_grid_undoes_skinning_to_a_millimetre(angle):
     assert float(error_m.quantile(0.5)) < 1e-3
     refined = newton(blended, found, posed, torch.tensor([0, len(found)]), skin)
     assert float((refined - points).norm(dim=1).quantile(0.99)) < 1e-3
-    back = skin_points(refined, blended[:, 0], *grid_of(skin))
+    back = skin_points(refined, blended[:, 0], skin.lattice)
     assert float((back - posed).norm(dim=1).quantile(0.99)) < 1e-3
 
 
@@ -66,7 +63,7 @@ def test_where_the_bar_folds_onto_itself_both_answers_are_found():
     for index in range(len(points)):
         mine = found[owner == index]
         assert len(mine) == 2
-        carried = skin_points(mine, blended, *grid_of(skin))
+        carried = skin_points(mine, blended, skin.lattice)
         assert float((carried - points[index]).norm(dim=1).max()) < 3e-3
         assert sorted(torch.sign(mine[:, 0]).tolist()) == [-1, 1]
 
@@ -91,9 +88,7 @@ def two_frames():
     blended = skin.blend(torch.stack([bend(0.4), bend(-0.8)]))
     points = bar_points(60)
     slot_start = torch.tensor([0, 25, 60])
-    posed = torch.cat(
-        [skin_points(points[a:b], blended[:, f], *grid_of(skin)) for f, a, b in ((0, 0, 25), (1, 25, 60))]
-    )
+    posed = torch.cat([skin_points(points[a:b], blended[:, f], skin.lattice) for f, a, b in ((0, 0, 25), (1, 25, 60))])
     random = torch.Generator().manual_seed(9)
     start = points + 0.004 * torch.randn(points.shape, generator=random)
     return skin, blended, start, posed, slot_start
@@ -115,7 +110,7 @@ def test_newton_matches_its_twin_in_value_and_gradient():
 def test_pose_gradient_is_the_finite_difference_of_the_solution():
     skin = bar_skin()
     point = bar_points(8, seed=5).double()
-    posed = skin_points(point, skin.blend(bend(0.6, torch.float64)[None])[:, 0], *grid_of(skin))
+    posed = skin_points(point, skin.blend(bend(0.6, torch.float64)[None])[:, 0], skin.lattice)
     slot_start = torch.tensor([0, 8])
 
     def solve(angle):
@@ -147,11 +142,11 @@ def test_weights_outside_the_grid_are_those_of_the_nearest_node():
 
 
 def test_interpolation_leaves_out_missing_nodes():
-    rows = np.arange(8, dtype=np.int32).reshape(2, 2, 2)
+    rows = torch.arange(8).view(2, 2, 2)
     rows[1, 1, 1] = -1
     values = torch.ones(8, 1, dtype=torch.float64)
     inside = torch.full((1, 3), 0.5, dtype=torch.float64)
-    assert float(interpolate(inside, np.zeros(3), 1.0, rows, values)) == pytest.approx(1.0)
+    assert float(interpolate(inside, (torch.zeros(3), 1.0, rows), values)) == pytest.approx(1.0)
 
 
 def test_a_grid_around_boxes_answers_there_as_the_whole_grid_does():
@@ -159,7 +154,7 @@ def test_a_grid_around_boxes_answers_there_as_the_whole_grid_does():
     bounds = np.array([[-0.63, -0.16, -0.14], [0.62, 0.17, 0.15]], dtype=np.float32)
     occupied = np.zeros((30, 9, 7), dtype=np.uint8)
     occupied[3:5, 4, 2:4] = occupied[20, 6, 5] = 1
-    part = skin.around(occupied, bounds)
+    part = skin.around(torch.from_numpy(occupied), torch.from_numpy(bounds))
     assert 0 < len(part.nodes_m) < 0.3 * len(skin.nodes_m)
     random = np.random.default_rng(0)
     cells = np.argwhere(occupied)[random.integers(0, occupied.sum(), 200)]
@@ -169,8 +164,8 @@ def test_a_grid_around_boxes_answers_there_as_the_whole_grid_does():
     for grid in (skin, part):
         rows = grid.row_of_node[grid.row_of_node >= 0]
         assert rows.tolist() == list(range(len(grid.nodes_m)))
-    truth = skin_points(inside, skin.blend(matrices)[:, 0], *grid_of(skin))
-    torch.testing.assert_close(skin_points(inside, part.blend(matrices)[:, 0], *grid_of(part)), truth, atol=0, rtol=0)
+    truth = skin_points(inside, skin.blend(matrices)[:, 0], skin.lattice)
+    torch.testing.assert_close(skin_points(inside, part.blend(matrices)[:, 0], part.lattice), truth, atol=0, rtol=0)
     away = torch.tensor([[0.0, 0.1, 0.1]])
     start = newton(part.blend(matrices), away, away, torch.tensor([0, 1]), part)
     assert torch.equal(start, away)

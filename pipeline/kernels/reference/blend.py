@@ -9,7 +9,6 @@ def blend(
     row_start: Int[Tensor, "m1"], joint: Int[Tensor, "e"], weight: Float[Tensor, "e"], values: Float[Tensor, "j c"]
 ) -> Float[Tensor, "m c"]:
     """Same as `pipeline.kernels.blend.blend`, of the arrays of `SparseWeights`."""
-    row_start, joint = row_start.to(values.device), joint.to(values.device)
-    node = torch.repeat_interleave(torch.arange(len(row_start) - 1).to(joint), row_start.diff())
+    node = torch.repeat_interleave(torch.arange(len(row_start) - 1, device=joint.device), row_start.diff())
     blended = values.new_zeros(len(row_start) - 1, values.shape[1])
-    return blended.index_add(0, node, weight.to(values)[:, None] * values[joint])
+    return blended.index_add(0, node, weight.to(values)[:, None] * values.index_select(0, joint))

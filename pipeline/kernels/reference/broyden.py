@@ -1,13 +1,10 @@
 """Plain-torch twin of the Broyden search: all points and starts at once, any dtype, any device."""
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pipeline.kernels.reference.warp import gather
-
-Grid = tuple[np.ndarray, float, np.ndarray]
+from pipeline.kernels.reference.warp import Lattice, gather
 
 
 def search(
@@ -15,7 +12,7 @@ def search(
     frame: Int[Tensor, "n"],
     posed_to_start: Float[Tensor, "k b 12"],
     blended: Float[Tensor, "m k 12"],
-    grid: Grid,
+    lattice: Lattice,
     limits: tuple[int, float, float, float],
     candidates: int,
 ) -> tuple[Float[Tensor, "n c 3"], Bool[Tensor, "n c"]]:
@@ -27,25 +24,27 @@ def search(
         for bone in range(posed_to_start.shape[1]):
             matrix = posed_to_start[row, bone].view(3, 4)
             start = posed_m[chosen] @ matrix[:, :3].T + matrix[:, 3]
-            found, arrived = _descend(start, posed_m[chosen], blended[:, row], grid, limits)
+            found, arrived = _descend(start, posed_m[chosen], blended[:, row], lattice, limits)
             _keep(found, arrived, chosen, roots, exists, same_m=limits[3])
     return roots, exists
 
 
 def _descend(
-    x: Tensor, posed: Tensor, blended: Tensor, grid: Grid, limits: tuple[int, float, float, float]
+    x: Tensor, posed: Tensor, blended: Tensor, lattice: Lattice, limits: tuple[int, float, float, float]
 ) -> tuple[Tensor, Tensor]:
     """Where Broyden's method goes from each start (s, 3), and whether that is a root."""
     iterations, arrived_m, lost_m, _ = limits
-    matrix, alive = _blend(x, blended, grid)
+    matrix, alive = _blend(x, blended, lattice)
     alive &= torch.linalg.det(matrix[:, :, :3]).abs() > 1e-3
-    inverse = torch.linalg.inv(torch.where(alive[:, None, None], matrix[:, :, :3], torch.eye(3).to(x)))
+    inverse = torch.linalg.inv(
+        torch.where(alive[:, None, None], matrix[:, :, :3], torch.eye(3, dtype=x.dtype, device=x.device))
+    )
     miss = _carry(matrix, x) - posed
     for _ in range(iterations):
         active = alive & (miss.norm(dim=1) >= arrived_m)
         move = -(inverse @ miss[:, :, None])[:, :, 0] * active[:, None]
         x = x + move
-        matrix, inside = _blend(x, blended, grid)
+        matrix, inside = _blend(x, blended, lattice)
         after = torch.where(active[:, None], _carry(matrix, x) - posed, miss)
         alive &= ~active | (inside & (after.norm(dim=1) <= lost_m))
         along = (move[:, None] @ inverse)[:, 0]
@@ -59,12 +58,12 @@ def _descend(
     return x, alive & (miss.norm(dim=1) < arrived_m)
 
 
-def _blend(x: Tensor, blended: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
+def _blend(x: Tensor, blended: Tensor, lattice: Lattice) -> tuple[Tensor, Tensor]:
     """Skinning matrices (s, 3, 4) at canonical points, and which of these lie in cells with all their nodes."""
-    origin_m, cell_m, row_of_node = grid
-    scaled = (x - torch.as_tensor(origin_m).to(x)) / cell_m
-    inside = ((scaled >= 0) & (scaled < torch.tensor(row_of_node.shape).to(x) - 1)).all(1)
-    matrix, share = gather(torch.where(inside[:, None], x, torch.zeros_like(x)), *grid, blended)
+    origin_m, cell_m, row_of_node = lattice
+    scaled = (x - origin_m.to(x)) / cell_m
+    inside = ((scaled >= 0) & (scaled < torch.tensor(row_of_node.shape, device=x.device) - 1)).all(1)
+    matrix, share = gather(torch.where(inside[:, None], x, torch.zeros_like(x)), lattice, blended)
     return matrix.view(-1, 3, 4), inside & (share > 1 - 1e-4)
 
 

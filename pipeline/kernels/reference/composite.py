@@ -15,9 +15,10 @@ def composite(
     counts = ray_start.diff()
     ray = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
     depth = density_per_m * step_m
-    before = depth.cumsum(0) - depth
+    # One sum runs over all rays: in float32 the first rays' depths would swallow the last ones'.
+    before = depth.double().cumsum(0) - depth
     ray_before = torch.cat([before, before.new_zeros(1)])[ray_start[:-1].clamp(max=len(before))]
-    weights = torch.exp(ray_before[ray] - before) * -torch.expm1(-depth)
+    weights = torch.exp(ray_before[ray] - before).to(depth) * -torch.expm1(-depth)
     image = colour.new_zeros(len(counts), colour.shape[1]).index_add(0, ray, weights[:, None] * colour)
     alpha = weights.new_zeros(len(counts)).index_add(0, ray, weights)
     return image, alpha, weights.detach()

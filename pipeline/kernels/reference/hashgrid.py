@@ -2,35 +2,25 @@
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.kernels.hashing import PRIMES
+from pipeline.kernels.reference.corners import corners_of
 
-
-def _rows(corner: Int[Tensor, "n 3"], cells: tuple[int, int, int], rows: int, dense: bool) -> Int[Tensor, "n"]:
-    x, y, z = corner.unbind(-1)
-    if dense:
-        return x + (cells[0] + 1) * (y + (cells[1] + 1) * z)
-    low32 = 0xFFFFFFFF
-    return (x ^ (y * PRIMES[0] & low32) ^ (z * PRIMES[1] & low32)) & (rows - 1)
+LOW_32 = 0xFFFFFFFF
 
 
 def encode(
     points_unit: Float[Tensor, "n 3"], table: Float[Tensor, "rows f"], plan: np.ndarray
 ) -> Float[Tensor, "n width"]:
-    """Same as `pipeline.kernels.hashgrid.encode`; `plan` is `GridLayout.plan`."""
-    points_unit = points_unit.clamp(0, 1)
-    levels = []
-    for *cells, first, rows, dense in plan.tolist():
-        limit = torch.tensor(cells, device=table.device)
-        scaled = points_unit * limit
-        low = torch.minimum(scaled.detach().long(), limit - 1)
-        part = scaled - low
-        total = table.new_zeros(len(points_unit), table.shape[1])
-        for corner in range(8):
-            bits = torch.tensor([corner & 1, corner >> 1 & 1, corner >> 2 & 1], device=table.device)
-            weight = torch.where(bits == 1, part, 1 - part).prod(-1, keepdim=True)
-            total = total + weight * table[first + _rows(low + bits, cells, rows, bool(dense))]
-        levels.append(total)
-    return torch.cat(levels, -1)
+    """Same as `pipeline.kernels.hashgrid.encode`, all levels at once; `plan` is `GridLayout.plan`."""
+    levels = torch.from_numpy(plan).to(table.device)
+    cells, (first, rows, dense) = levels[:, :3], levels[:, 3:, None].unbind(1)
+    corner, shares = corners_of(points_unit.clamp(0, 1)[:, None] * cells, cells)
+    x, y, z = corner.unbind(-1)
+    in_grid = x + (cells[:, :1] + 1) * (y + (cells[:, 1:2] + 1) * z)
+    hashed = (x ^ (y * PRIMES[0] & LOW_32) ^ (z * PRIMES[1] & LOW_32)) & (rows - 1)
+    row = first + torch.where(dense == 1, in_grid, hashed)
+    features = table.index_select(0, row.view(-1)).view(*row.shape, -1)
+    return (shares.prod(-1, keepdim=True) * features).sum(2).flatten(1)

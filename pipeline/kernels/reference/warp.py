@@ -1,66 +1,64 @@
 """Plain-torch twin of inverse skinning: any dtype, any device, gradients by autograd."""
 
-import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pipeline.kernels.reference.corners import corner_bits, corners_of
 
-def interpolate(
-    points_m: Float[Tensor, "n 3"],
-    origin_m: np.ndarray,
-    cell_m: float,
-    row_of_node: Int[np.ndarray, "gx gy gz"],
-    values: Float[Tensor, "m c"],
-) -> Float[Tensor, "n c"]:
+Lattice = tuple[Float[Tensor, "3"], float, Int[Tensor, "gx gy gz"]]
+"""Where the nodes of a skin grid are: the place of the first (m), their distance (m), and the row of each that exists,
+-1 of others."""
+
+
+def interpolate(points_m: Float[Tensor, "n 3"], lattice: Lattice, values: Float[Tensor, "m c"]) -> Float[Tensor, "n c"]:
     """Trilinear interpolation of node values; nodes that do not exist have no share in it.
 
     Points in cells without any node get the values of the nearest node.
     """
-    total, mass = gather(points_m, origin_m, cell_m, row_of_node, values)
+    origin_m, cell_m, row_of_node = lattice
+    total, mass = gather(points_m, lattice, values)
     known = mass > 1e-6
     result = total / mass.clamp(min=1e-6)[:, None]
     if bool(known.all()):
         return result
-    nodes = torch.from_numpy(np.argwhere(row_of_node >= 0)).to(points_m) * cell_m
-    nodes = nodes + torch.as_tensor(origin_m).to(points_m)
-    rows = torch.from_numpy(row_of_node[row_of_node >= 0]).to(points_m.device).long()
+    exists = row_of_node >= 0
+    nodes_m = torch.nonzero(exists).to(points_m) * cell_m + origin_m.to(points_m)
+    rows = row_of_node[exists].long()
     lost = torch.nonzero(~known)[:, 0]
     for part in lost.split(1024):
-        nearest = torch.cdist(points_m[part].detach(), nodes).argmin(1)
+        nearest = torch.cdist(points_m[part].detach(), nodes_m).argmin(1)
         result = result.index_put((part,), values[rows[nearest]])
     return result
 
 
 def gather(
-    points_m: Tensor, origin_m: np.ndarray, cell_m: float, row_of_node: np.ndarray, values: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Weighted sum (n, c) of the eight corners' values, and the sum (n) of the weights of those that exist."""
-    rows = torch.as_tensor(row_of_node, device=points_m.device).long()
-    size = torch.tensor(rows.shape, device=points_m.device)
-    scaled = (points_m - torch.as_tensor(origin_m).to(points_m)) / cell_m
-    low = torch.minimum(scaled.detach().floor().long().clamp(min=0), size - 2)
-    part = (scaled - low).clamp(0, 1)
-    total, mass = values.new_zeros(len(points_m), values.shape[1]), torch.zeros_like(part[:, 0])
-    for corner in range(8):
-        bits = torch.tensor([corner & 1, corner >> 1 & 1, corner >> 2 & 1], device=points_m.device)
-        row = rows[tuple((low + bits).unbind(-1))]
-        weight = torch.where(bits == 1, part, 1 - part).prod(-1) * (row >= 0)
-        total = total + weight[:, None] * values[row.clamp(min=0)]
-        mass = mass + weight
-    return total, mass
+    points_m: Float[Tensor, "n 3"], lattice: Lattice, values: Float[Tensor, "m c"]
+) -> tuple[Float[Tensor, "n c"], Float[Tensor, "n"]]:
+    """Weighted sum of the eight corners' values, and the sum of the weights of those that exist."""
+    row, shares = _corners(points_m, lattice)
+    weight = shares.prod(-1) * (row >= 0)
+    picked = values.index_select(0, row.clamp(min=0).view(-1)).view(*row.shape, -1)
+    return (weight[..., None] * picked).sum(1), weight.sum(1)
+
+
+def _corners(points_m: Float[Tensor, "n 3"], lattice: Lattice) -> tuple[Int[Tensor, "n 8"], Float[Tensor, "n 8 3"]]:
+    """Rows of the nodes around each point, -1 where there is none, and their shares along each axis."""
+    origin_m, cell_m, row_of_node = lattice
+    cells = torch.tensor(row_of_node.shape, device=points_m.device) - 1
+    corner, shares = corners_of((points_m - origin_m.to(points_m)) / cell_m, cells, clamp=True)
+    return row_of_node[corner.unbind(-1)].long(), shares
 
 
 def skin_points(
-    points_m: Float[Tensor, "n 3"],
-    blended: Float[Tensor, "m 12"],
-    origin_m: np.ndarray,
-    cell_m: float,
-    row_of_node: Int[np.ndarray, "gx gy gz"],
+    points_m: Float[Tensor, "n 3"], blended: Float[Tensor, "m 12"], lattice: Lattice
 ) -> Float[Tensor, "n 3"]:
     """Canonical points carried into the pose: A(x) x."""
-    matrix = interpolate(points_m, origin_m, cell_m, row_of_node, blended).view(-1, 3, 4)
-    return (matrix[:, :, :3] @ points_m[:, :, None])[:, :, 0] + matrix[:, :, 3]
+    return _carry(interpolate(points_m, lattice, blended).view(-1, 3, 4), points_m)
+
+
+def _carry(matrix: Float[Tensor, "n 3 4"], points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    return (matrix[:, :, :3] * points_m[:, None]).sum(-1) + matrix[:, :, 3]
 
 
 def newton(
@@ -68,38 +66,50 @@ def newton(
     start_m: Float[Tensor, "s 3"],
     posed_m: Float[Tensor, "s 3"],
     slot_start: Int[Tensor, "k1"],
-    origin_m: np.ndarray,
-    cell_m: float,
-    row_of_node: Int[np.ndarray, "gx gy gz"],
+    lattice: Lattice,
 ) -> Float[Tensor, "s 3"]:
     """Same as `pipeline.kernels.warp.newton`.
 
     To the step, which has no gradient, -J^-1 (A x - A x detached) is added, with J and x of the start: zero in value,
     with the implicit gradient.
     """
-    parts = []
-    grid = (origin_m, cell_m, row_of_node)
-    for frame in range(blended.shape[1]):
-        start = start_m[slot_start[frame] : slot_start[frame + 1]].detach()
-        posed = posed_m[slot_start[frame] : slot_start[frame + 1]].detach()
-        with torch.no_grad():
-            solution = start + _solve(start, posed, blended[:, frame], grid)
-        image = skin_points(start, blended[:, frame], *grid)
-        parts.append(solution + _solve(start, image, blended[:, frame].detach(), grid, forward=False))
-    return torch.cat(parts)
+    frames, start_m, posed_m = blended.shape[1], start_m.detach(), posed_m.detach()
+    slot = torch.repeat_interleave(torch.arange(frames, device=slot_start.device), slot_start.diff())
+    node, shares = _corners(start_m, lattice)
+    exists = node >= 0
+    # The matrices of all frames are rows of one table, those of a node one behind the other.
+    row = node.clamp(min=0) * frames + slot[:, None]
+    corner_matrix = blended.flatten(0, 1).index_select(0, row.view(-1)).view(-1, 8, 3, 4)
+    weight = shares.prod(-1) * exists
+    matrix = (weight[..., None, None] * corner_matrix).sum(1)
+    jacobian = _jacobian(start_m, corner_matrix.detach(), shares, exists, lattice[1]) + matrix.detach()[..., :3]
+    determinant, adjugate = _adjugate(jacobian)
+    sound = (weight.sum(1) > 1 - 1e-4) & (determinant.abs() > 1e-3)
+    inverse = adjugate * (sound / torch.where(sound, determinant, 1.0))[:, None, None]
+    image_m = _carry(matrix, start_m)
+    still_m = image_m.detach()
+    return start_m + (inverse * (posed_m - still_m - (image_m - still_m))[:, None]).sum(-1)
 
 
-def _solve(
-    points: Tensor, posed: Tensor, blended: Tensor, grid: tuple[np.ndarray, float, np.ndarray], forward: bool = True
-) -> Tensor:
-    """J(points)^-1 (posed - A x) if forward, else -J^-1 (posed - detached posed): zero in value, with a gradient."""
-    known = gather(points, *grid, blended.detach())[1] > 1 - 1e-4
-    inputs = points.detach().requires_grad_(True)
-    with torch.enable_grad():
-        carried = skin_points(inputs, blended.detach(), *grid)
-        rows = [torch.autograd.grad(carried[:, axis].sum(), inputs, retain_graph=True)[0] for axis in range(3)]
-    jacobian = torch.stack(rows, 1)
-    sound = known & (torch.linalg.det(jacobian).abs() > 1e-3)
-    jacobian = torch.where(sound[:, None, None], jacobian, torch.eye(3).to(jacobian))
-    right = posed - carried.detach() if forward else posed.detach() - posed
-    return torch.linalg.solve(jacobian, right) * sound[:, None]
+def _jacobian(
+    points_m: Float[Tensor, "s 3"],
+    corner_matrix: Float[Tensor, "s 8 3 4"],
+    shares: Float[Tensor, "s 8 3"],
+    exists: Bool[Tensor, "s 8"],
+    cell_m: float,
+) -> Float[Tensor, "s 3 3"]:
+    """What the change of the weights adds to A in the derivative of A(x) x: the corners' images times the gradients of
+    their weights, each the product of the other two shares.
+    """
+    x, y, z = shares.unbind(-1)
+    sign = 2 * corner_bits(points_m.device) - 1
+    gradient = torch.stack([y * z, x * z, x * y], -1) * sign * exists[..., None] / cell_m
+    image_m = (corner_matrix[..., :3] * points_m[:, None, None]).sum(-1) + corner_matrix[..., 3]
+    return (image_m[..., None] * gradient[..., None, :]).sum(1)
+
+
+def _adjugate(matrix: Float[Tensor, "s 3 3"]) -> tuple[Float[Tensor, "s"], Float[Tensor, "s 3 3"]]:
+    """Determinant and adjugate: their quotient is the inverse. A batched solver would take a thousand times as long."""
+    a, b, c = matrix.unbind(1)
+    columns = torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)
+    return (a * columns[0]).sum(-1), torch.stack(columns, -1)

@@ -1,0 +1,99 @@
+"""A device that is not the CPU, on any machine: tensors that hold real values but keep a graphics card's rules.
+
+A tensor moved to `ELSEWHERE` computes what it would compute on the CPU, and refuses what a tensor on a graphics card
+refuses: to meet a tensor on the CPU (single numbers apart), and to be handed to numpy or numba. So code that would
+break or fall back on a graphics card breaks here as well. Speed cannot be told so; the number of operations can.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
+from torch.utils._pytree import tree_leaves, tree_map
+
+ELSEWHERE = torch.device("lazy")
+"""A device type that no build of torch without its own plugin computes on, and whose gradients need no extra thread."""
+ATEN = torch.ops.aten
+MAY_MIX = (ATEN._to_copy.default, ATEN.copy_.default)
+
+
+class TensorElsewhere(Tensor):
+    """A tensor on the device `ELSEWHERE`; `held` has its values."""
+
+    held: Tensor
+    __torch_function__ = torch._C._disabled_torch_function_impl
+
+    @staticmethod
+    def __new__(cls, held: Tensor) -> "TensorElsewhere":
+        """Same shape, strides and type as what it holds."""
+        layout = (held.shape, held.stride(), held.storage_offset())
+        return Tensor._make_wrapper_subclass(cls, *layout, dtype=held.dtype, device=ELSEWHERE)
+
+    def __init__(self, held: Tensor) -> None:
+        self.held = held
+
+    @classmethod
+    def __torch_dispatch__(cls, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Compute with what the tensors hold."""
+        return _compute(operation, args, kwargs or {})
+
+    def tolist(self) -> list:
+        """As on a graphics card, by way of the CPU."""
+        return self.cpu().tolist()
+
+
+def _is_elsewhere(device: Any) -> bool:
+    return device is not None and torch.device(device).type == ELSEWHERE.type
+
+
+def _strip(value: Any) -> Any:
+    if isinstance(value, TensorElsewhere):
+        return value.held
+    return torch.device("cpu") if isinstance(value, torch.device) else value
+
+
+def _compute(operation: Any, args: Any, kwargs: dict[str, Any]) -> Any:
+    tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
+    ours = [isinstance(tensor, TensorElsewhere) for tensor in tensors]
+    if any(ours) and operation not in MAY_MIX:
+        for tensor, is_ours in zip(tensors, ours, strict=True):
+            if not is_ours and tensor.dim():
+                raise RuntimeError(f"{operation}: {tuple(tensor.shape)} lies on the CPU, other tensors elsewhere")
+    result = operation(*tree_map(_strip, args), **tree_map(_strip, kwargs))
+    stays = _is_elsewhere(kwargs["device"]) if kwargs.get("device") is not None else any(ours)
+    if operation is ATEN.copy_.default:
+        return args[0]
+    if not stays:
+        return result
+    wrapped = tree_map(lambda x: TensorElsewhere(x) if isinstance(x, Tensor) else x, result)
+    return return_and_correct_aliasing(operation, args, kwargs, wrapped)
+
+
+class _Calls(TorchDispatchMode):
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        here = not any(isinstance(leaf, TensorElsewhere) for leaf in tree_leaves((args, kwargs)))
+        if here and not _is_elsewhere(kwargs.get("device")):
+            return operation(*args, **kwargs)
+        self.count += not operation.is_view
+        return _compute(operation, args, kwargs)
+
+
+@contextmanager
+def elsewhere() -> Iterator[_Calls]:
+    """While it lasts, `ELSEWHERE` can be computed on; `count` of what it yields is the number of operations there, views apart."""
+    # Without this, torch.tensor(..., device=ELSEWHERE) asks torch itself for memory there.
+    before = torch._C._only_lift_cpu_tensors()
+    torch._C._set_only_lift_cpu_tensors(True)
+    try:
+        with _Calls() as calls:
+            yield calls
+    finally:
+        torch._C._set_only_lift_cpu_tensors(before)
