@@ -24,11 +24,12 @@ def _corners(points, start, stop, level_plan, rows, weights, parts):
     cells_x, cells_y, cells_z, first = level_plan[0], level_plan[1], level_plan[2], level_plan[3]
     mask, dense = np.uint32(level_plan[4] - 1), level_plan[5] == 1
     stride_y, stride_z = np.uint32(cells_x + 1), np.uint32((cells_x + 1) * (cells_y + 1))
-    one = np.float32(1)
+    zero, one = np.float32(0), np.float32(1)
     for k in range(stop - start):
-        x = min(max(points[start + k, 0], np.float32(0)), one) * np.float32(cells_x)
-        y = min(max(points[start + k, 1], np.float32(0)), one) * np.float32(cells_y)
-        z = min(max(points[start + k, 2], np.float32(0)), one) * np.float32(cells_z)
+        # The zero comes first: the second argument is taken if it is larger, and a NaN, whose row no table has, is not.
+        x = min(max(zero, points[start + k, 0]), one) * np.float32(cells_x)
+        y = min(max(zero, points[start + k, 1]), one) * np.float32(cells_y)
+        z = min(max(zero, points[start + k, 2]), one) * np.float32(cells_z)
         i = np.uint32(min(np.int32(x), np.int32(cells_x - 1)))
         j = np.uint32(min(np.int32(y), np.int32(cells_y - 1)))
         m = np.uint32(min(np.int32(z), np.int32(cells_z - 1)))

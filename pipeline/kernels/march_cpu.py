@@ -7,6 +7,7 @@ from pipeline.kernels.options import OPTIONS
 from pipeline.kernels.warp_cpu import apply_affine
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
+_ENDLESS_M = np.float32(1e9)
 
 
 @njit(**OPTIONS)
@@ -68,12 +69,14 @@ def march(
     for ray in prange(rays):
         f = frame[ray]
         origin, dims = warp_origin[f], warp_dims[f]
-        near, far = _ZERO, np.float32(1e9)
+        near, far = _ZERO, _ENDLESS_M
         for axis in range(3):
             high = origin[axis] + cell * np.float32(dims[axis] - 1)
             near, far = _slab(origins[ray, axis], directions[ray, axis], origin[axis], high, near, far)
+        # A ray that no plane ends is no ray (NaN, or a direction of zeros): it would make 1e11 stops.
+        stops = max(0, int(np.ceil((far - near) / step - jitter[ray]))) if far < _ENDLESS_M else 0
         count = 0
-        for stop in range(max(0, int(np.ceil((far - near) / step - jitter[ray])))):
+        for stop in range(stops):
             t = near + (np.float32(stop) + jitter[ray]) * step
             px = (origins[ray, 0] + t * directions[ray, 0] - origin[0]) * inverse
             py = (origins[ray, 1] + t * directions[ray, 1] - origin[1]) * inverse

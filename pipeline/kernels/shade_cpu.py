@@ -31,9 +31,10 @@ def shade_texture_cpu(
                     corner = faces_uv[face, k]
                     u += barycentric[fine_row, fine_column, k] * uv[corner, 0]
                     v += barycentric[fine_row, fine_column, k] * uv[corner, 1]
-                x = min(max(u * texture_width - np.float32(0.5), np.float32(0.0)), np.float32(texture_width - 1))
+                # The zero first: a NaN, which is no texel, then becomes zero.
+                x = min(max(np.float32(0.0), u * texture_width - np.float32(0.5)), np.float32(texture_width - 1))
                 y = min(
-                    max((np.float32(1.0) - v) * texture_height - np.float32(0.5), np.float32(0.0)),
+                    max(np.float32(0.0), (np.float32(1.0) - v) * texture_height - np.float32(0.5)),
                     np.float32(texture_height - 1),
                 )
                 left, top = int(x), int(y)

@@ -351,7 +351,8 @@ def pose_gradient(points, inverse_jacobian, gradient, slot_start, origin, cell, 
             lx = -(m[0] * gx + m[3] * gy + m[6] * gz)
             ly = -(m[1] * gx + m[4] * gy + m[7] * gz)
             lz = -(m[2] * gx + m[5] * gy + m[8] * gz)
-            if lx == _ZERO and ly == _ZERO and lz == _ZERO:
+            # Not `== 0`: a NaN would go on, and a point outside, whose m is zeros, has no nodes to add to.
+            if not abs(lx) + abs(ly) + abs(lz) > _ZERO:
                 continue
             x, y, z = points[s, 0], points[s, 1], points[s, 2]
             ui, uj, uk = (x - origin[0]) * inverse, (y - origin[1]) * inverse, (z - origin[2]) * inverse

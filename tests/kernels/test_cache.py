@@ -1,0 +1,94 @@
+"""What was compiled is found again by the next process, and by no process whose loops would differ.
+
+Each process works on a copy of the kernels, so that a file can change between two of them.
+"""
+
+import ast
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pipeline.kernels.options import COMPILED
+
+ROWS_OF_A_POINT = """
+import json
+import numpy as np
+from numba import config
+from pipeline.kernels.hashgrid_cpu import _corners
+
+point, rows = np.full((1, 3), 0.3, np.float32), np.zeros((8, 1), np.uint32)
+hashed_level = np.array([40, 40, 40, 0, 1 << 20, 0])
+_corners(point, 0, 1, hashed_level, rows, np.zeros((8, 1), np.float32), np.zeros((3, 1), np.float32))
+found, made = (sum(counts.values()) for counts in (_corners.stats.cache_hits, _corners.stats.cache_misses))
+print(json.dumps({"rows": rows.tolist(), "found": found, "made": made, "vectors": config.SLP_VECTORIZE}))
+"""
+WHERE = "from numba import config; import pipeline.kernels.options; print(config.CACHE_DIR)"
+
+
+@pytest.fixture
+def kernels(repository: Path, tmp_path: Path) -> Path:
+    """A copy of the kernels that imports as `pipeline.kernels` from the folder above it."""
+    copy = tmp_path / "code" / "pipeline" / "kernels"
+    shutil.copytree(repository / "pipeline" / "kernels", copy, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(repository / "pipeline" / "__init__.py", copy.parent)
+    return copy
+
+
+def output(kernels: Path, code: str, **environment: str) -> str:
+    """What Python code prints that imports these kernels."""
+    plain = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
+    command, folder = [sys.executable, "-c", code], kernels.parents[1]
+    done = subprocess.run(command, cwd=folder, env=plain | environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def test_a_second_process_compiles_nothing(kernels: Path) -> None:
+    first, second = (json.loads(output(kernels, ROWS_OF_A_POINT)) for _ in range(2))
+    assert (first["found"], first["made"]) == (0, 1)
+    assert (second["found"], second["made"]) == (1, 0)
+    assert second["rows"] == first["rows"]
+
+
+def test_a_constant_of_another_file_is_not_taken_from_the_cache(kernels: Path) -> None:
+    before = json.loads(output(kernels, ROWS_OF_A_POINT))
+    (kernels / "hashing.py").write_text("PRIMES = (2654435769, 805459861)\n")
+    after = json.loads(output(kernels, ROWS_OF_A_POINT))
+    assert after["made"] == 1
+    assert after["rows"] != before["rows"]
+
+
+def test_the_order_of_imports_does_not_matter(kernels: Path) -> None:
+    """numba reads the environment when it is imported; the kernels' own settings come later then."""
+    late, early = (json.loads(output(kernels, f"import {first}\n{ROWS_OF_A_POINT}")) for first in ("numba", "json"))
+    assert late["vectors"] == early["vectors"] == 1
+    assert (early["found"], early["made"]) == (1, 0)
+
+
+def test_loops_without_vector_instructions_are_kept_apart(kernels: Path) -> None:
+    output(kernels, ROWS_OF_A_POINT, NUMBA_SLP_VECTORIZE="0")
+    assert json.loads(output(kernels, ROWS_OF_A_POINT))["made"] == 1
+
+
+def test_the_cache_lies_beside_the_sources_or_where_the_user_wants_it(kernels: Path, tmp_path: Path) -> None:
+    beside = Path(output(kernels, WHERE))
+    assert beside.parent == kernels / "__pycache__"
+    wanted = Path(output(kernels, WHERE, NUMBA_CACHE_DIR=str(tmp_path / "wanted")))
+    assert wanted == tmp_path / "wanted" / beside.name
+    read_only = f"import os; os.access = lambda *_: False; {WHERE}"
+    assert Path(output(kernels, read_only, XDG_CACHE_HOME=str(tmp_path))).is_relative_to(tmp_path / "numba")
+
+
+def test_compiled_loops_are_made_of_the_files_that_the_cache_watches(repository: Path) -> None:
+    watched = {path.stem for path in COMPILED}
+    for path in (repository / "pipeline" / "kernels").glob("*_cpu.py"):
+        imports = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
+        modules = [node.module or "" for node in imports]
+        ours = {name.rpartition(".")[2] for name in modules if name.startswith("pipeline")}
+        assert ours <= watched, path.name
+        assert path.stem in watched
