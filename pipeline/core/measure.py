@@ -81,6 +81,12 @@ def _commit() -> str | None:
 
 
 def _gpu_name() -> str | None:
-    """The first CUDA device, if the stage that ran has loaded torch; this module does not load it."""
+    """The first CUDA device, if the stage that ran has loaded torch; this module does not load it.
+
+    None also where a card lets nobody in (busy in exclusive mode): its name is not worth the finished work.
+    """
     torch = sys.modules.get("torch")
-    return str(torch.cuda.get_device_name(0)) if torch and torch.cuda.is_available() else None
+    try:
+        return str(torch.cuda.get_device_name(0)) if torch and torch.cuda.is_available() else None
+    except RuntimeError:
+        return None

@@ -82,9 +82,18 @@ def save_motion(path: Path, motion: Motion) -> None:
 
 
 def load_motion(path: Path) -> Motion:
-    """Read what `save_motion` wrote."""
+    """Read what `save_motion` wrote.
+
+    Raises:
+        UserError: no readable npz, or a frame whose pose holds a number that is not finite.
+    """
     arrays = load_npz(path)
-    return Motion(arrays["frame_index"], arrays["time_s"], arrays["rotations_wxyz"], arrays["root_translation_m"])
+    motion = Motion(arrays["frame_index"], arrays["time_s"], arrays["rotations_wxyz"], arrays["root_translation_m"])
+    sound = np.isfinite(motion.rotations_wxyz).all((1, 2)) & np.isfinite(motion.root_translation_m).all(1)
+    if not sound.all():
+        frames = ", ".join(map(str, motion.frame_index[~sound]))
+        raise UserError(f"{path}: the poses of frames {frames} are not finite; run the stage that writes it again")
+    return motion
 
 
 def save_camera(path: Path, camera: Camera) -> None:

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 
@@ -55,3 +56,18 @@ def test_the_environment_names_machine_and_packages() -> None:
     assert found["packages"]["numpy"]
     assert found["cpu"] == cpu_name() != ""
     assert found["cores"] >= 1
+
+
+def test_a_card_that_lets_nobody_in_ends_no_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One in exclusive mode that another process holds is there, and raises as soon as it is asked for its name."""
+
+    def refuse(_: int) -> str:
+        raise RuntimeError("CUDA error: all CUDA-capable devices are busy or unavailable")
+
+    busy, free = (
+        SimpleNamespace(is_available=lambda: True, get_device_name=name) for name in (refuse, lambda _: "Card")
+    )
+    monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(cuda=busy))
+    assert environment()["gpu"] is None
+    monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(cuda=free))
+    assert environment()["gpu"] == "Card"
