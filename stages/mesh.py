@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from pydantic import Field
 from torch import Tensor
 
@@ -16,11 +16,12 @@ from pipeline.avatar.extract import (
     extract_mesh,
     sample_canonical,
     simplify,
-    transfer_skin_weights,
 )
 from pipeline.avatar.mesh_optimise import RefineConfig, RefineTask
-from pipeline.avatar.mesh_views import View, crop_view, pixel_footprint_m, silhouette_iou, skin_of
+from pipeline.avatar.mesh_views import View, bind, crop_view, pixel_footprint_m, silhouette_iou, skin_of
+from pipeline.avatar.prepare import spread
 from pipeline.avatar.refine import Refined, refine
+from pipeline.avatar.selection import VALIDATION
 from pipeline.avatar.turntable import turntable_sheet
 from pipeline.core.cli import main
 from pipeline.core.errors import UserError
@@ -28,13 +29,13 @@ from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import top_k_weights
-from pipeline.io.capture import load_capture
+from pipeline.io.capture import Capture, load_capture
 from pipeline.io.checkpoint import load_field, load_occupancy, load_tensors, save_tensors
 from pipeline.io.image import write_rgb
 from pipeline.io.npz import load_body, load_camera, load_motion, save_npz
+from pipeline.io.scores import training_positions
 from pipeline.metrics.health import mesh_health
 
-TRAIN, VALIDATION = 0, 1
 CHECKPOINT, APPEARANCE = "checkpoint_round.safetensors", "appearance."
 
 
@@ -57,7 +58,9 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     body = load_body(inputs["body"] / "body.npz")
     field = load_field(inputs["field"] / "field.safetensors").requires_grad_(config.appearance_rate > 0.0)
     occupancy = load_occupancy(inputs["field"] / "occupancy.npz")
-    train, validation = (load_views(inputs, body, split, config) for split in (TRAIN, VALIDATION))
+    capture = load_capture(inputs["frames"])
+    chosen = training_positions(capture, inputs["body"]), capture.positions(VALIDATION)
+    train, validation = (load_views(capture, positions, inputs, body, config) for positions in chosen)
     if not train:
         raise UserError(f"{inputs['frames']} has no training frames; run `python -m stages.frames` again")
     if not validation:
@@ -67,7 +70,8 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     edge_m = float(np.clip(config.edge_px * footprint_m, config.min_edge_m, config.max_edge_m))
     start: Mesh | Refined | None = load_state(out / CHECKPOINT)
     if start is None:
-        judged = (validation or train)[:: max(1, len(validation or train) // config.level_frames)]
+        views = validation or train
+        judged = [views[k] for k in spread(len(views), config.level_frames)]
 
         def density_of(points_m: Tensor) -> Tensor:
             return field.density(points_m) * occupancy.contains(points_m)
@@ -75,9 +79,9 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
         start = simplify(first_mesh(density_of, body, judged, config), edge_m)
     task = RefineTask(body, train, validation, SurfaceColour(field), edge_m, config, config.seed)
     refined = refine(start, task, lambda state: save_state(out / CHECKPOINT, state))
-    write_results(out, refined.mesh, task)
+    write_results(out, refined, task.shade)
     psnr_db = {"psnr_db_extracted": refined.validation_psnr_db[0], "psnr_db_refined": refined.validation_psnr_db[-1]}
-    iou = silhouette_iou(refined.mesh, skin_of(refined.mesh, body), validation)
+    iou = silhouette_iou(refined.mesh, refined.skin, validation)
     health = {key: float(value) for key, value in mesh_health(refined.mesh).items()}
     kept = len(refined.validation_psnr_db) - 1.0
     return {**health, **psnr_db, "silhouette_iou": iou, "edge_m": edge_m, "rounds_kept": kept}
@@ -104,16 +108,16 @@ def first_mesh(density_of: Callable[[Tensor], Tensor], body: Body, judged: Seque
     return extract_mesh(samples, level_per_m, config)
 
 
-def load_views(inputs: Mapping[str, Path], body: Body, split: int, config: Config) -> list[View]:
-    """Crops of the frames of one split, evenly thinned to `max_frames`."""
-    capture, camera = load_capture(inputs["frames"]), load_camera(inputs["body"] / "camera.npz")
+def load_views(
+    capture: Capture, positions: Int[np.ndarray, "k"], inputs: Mapping[str, Path], body: Body, config: Config
+) -> list[View]:
+    """Crops of the frames at these positions, evenly thinned to `max_frames`."""
+    camera = load_camera(inputs["body"] / "camera.npz")
     transforms = canonical_to_world(body, load_motion(inputs["field"] / "motion.npz"))
-    positions = capture.positions(split)
-    if len(positions) > config.max_frames:
-        positions = positions[np.linspace(0, len(positions) - 1, config.max_frames).round().astype(int)]
+    thinned = positions[spread(len(positions), config.max_frames)]
     return [
         crop_view(capture.image(k), capture.mask(k), camera, transforms[k], config.person_height_px)
-        for k in track(positions.tolist(), "reading frames")
+        for k in track(thinned.tolist(), "reading frames")
     ]
 
 
@@ -123,6 +127,7 @@ def save_state(path: Path, state: Refined) -> None:
     tensors = {
         "vertices": torch.from_numpy(state.mesh.vertices),
         "faces": torch.from_numpy(state.mesh.faces),
+        "skin_weights": state.skin.weights,
         "progress": torch.tensor(progress, dtype=torch.float64),
     }
     save_tensors(path, tensors | {f"{APPEARANCE}{name}": tensor for name, tensor in state.appearance.items()})
@@ -136,23 +141,25 @@ def load_state(path: Path) -> Refined | None:
     rounds_done, finished, *psnr_db = tensors["progress"].tolist()
     appearance = {name.removeprefix(APPEARANCE): t for name, t in tensors.items() if name.startswith(APPEARANCE)}
     mesh = Mesh(tensors["vertices"].numpy(), tensors["faces"].numpy())
-    return Refined(mesh, appearance, int(rounds_done), tuple(psnr_db), bool(finished))
+    skin = bind(mesh, tensors["skin_weights"])
+    return Refined(mesh, skin, appearance, int(rounds_done), tuple(psnr_db), bool(finished))
 
 
-def write_results(out: Path, mesh: Mesh, task: RefineTask) -> None:
+def write_results(out: Path, refined: Refined, shade: torch.nn.Module) -> None:
     """The mesh with its skin and vertex colours, and the contact sheet."""
-    joint_indices, joint_weights = top_k_weights(transfer_skin_weights(mesh, task.body))
+    mesh = refined.mesh
+    joint_indices, joint_weights = top_k_weights(refined.skin.weights.numpy())
     with torch.no_grad():
-        vertex_colors = task.shade(torch.from_numpy(mesh.vertices)).numpy()
+        vertex_colors = shade(torch.from_numpy(mesh.vertices)).numpy()
     arrays = {"vertices": mesh.vertices.astype(np.float32), "faces": mesh.faces.astype(np.int32)}
     arrays |= {"joint_indices": joint_indices, "joint_weights": joint_weights, "vertex_colors": vertex_colors}
     save_npz(out / "mesh.npz", arrays)
-    write_rgb(out / "preview.png", turntable_sheet(mesh, task.shade))
+    write_rgb(out / "preview.png", turntable_sheet(mesh, shade))
 
 
 STAGE = Stage(
     "mesh",
-    version=1,
+    version=2,
     needs=("frames", "body", "field"),
     makes=("mesh.npz", "preview.png"),
     config=Config,

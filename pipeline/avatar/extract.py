@@ -22,8 +22,10 @@ from torch import Tensor
 
 from pipeline.avatar.body import Body
 from pipeline.core.config import Config
+from pipeline.core.progress import warn
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import (
+    OpenSurfaceError,
     closest_on_mesh,
     isosurface,
     laplacian,
@@ -196,11 +198,28 @@ def simplify(mesh: Mesh, edge_m: float, smoothing: int = 10) -> Mesh:
 
     smoothing: steps of Taubin smoothing at the end, which take the density's noise and leave the volume.
     """
-    dense = mesh.face_areas_m2().sum() / (0.43 * edge_m**2) * DECIMATION_SURPLUS
+    dense = int(mesh.face_areas_m2().sum() / (0.43 * edge_m**2) * DECIMATION_SURPLUS)
     if len(mesh.faces) > dense:
-        vertices, faces = fast_simplification.simplify(mesh.vertices, mesh.faces, target_count=int(dense))
-        mesh = repair(Mesh(vertices.astype(np.float32), faces.astype(np.int32)))
-    return smooth(remesh(mesh, edge_m, iterations=6, tolerance_m=0.15 * edge_m), smoothing)
+        mesh = unless_open(lambda: decimate(mesh, dense), mesh, "its triangles were not reduced before remeshing")
+    even = unless_open(
+        lambda: remesh(mesh, edge_m, iterations=6, tolerance_m=0.15 * edge_m), mesh, "its triangles stay uneven"
+    )
+    return smooth(even, smoothing)
+
+
+def decimate(mesh: Mesh, face_count: int) -> Mesh:
+    """The surface with about that many triangles, closed; raises OpenSurfaceError."""
+    vertices, faces = fast_simplification.simplify(mesh.vertices, mesh.faces, target_count=face_count)
+    return repair(Mesh(vertices.astype(np.float32), faces.astype(np.int32)))
+
+
+def unless_open(change: Callable[[], Mesh], before: Mesh, consequence: str) -> Mesh:
+    """The changed surface; the one before, with a warning, where the change tears holes that cannot be closed."""
+    try:
+        return change()
+    except OpenSurfaceError as error:
+        warn(f"{error}; {consequence}")
+        return before
 
 
 def transfer_skin_weights(

@@ -84,12 +84,17 @@ def pixel_footprint_m(view: View, vertices: Float[np.ndarray, "v 3"], skin_weigh
 
 
 def skin_of(mesh: Mesh, body: Body) -> Skin:
-    """Four influences a vertex (as exported), in dense rows; adjacency for the silhouettes."""
+    """Four influences a vertex, as exported, from the body."""
     indices, kept = top_k_weights(transfer_skin_weights(mesh, body))
     dense = np.zeros((len(mesh.vertices), len(body.joint_names)), dtype=np.float32)
     np.add.at(dense, (np.arange(len(dense))[:, None], indices), kept)
+    return bind(mesh, torch.from_numpy(dense))
+
+
+def bind(mesh: Mesh, weights: Float[Tensor, "v j"]) -> Skin:
+    """The skin of a mesh whose weights are known."""
     faces = torch.from_numpy(mesh.faces.astype(np.int64))
-    return Skin(faces, face_adjacency(faces), torch.from_numpy(dense))
+    return Skin(faces, face_adjacency(faces), weights)
 
 
 def render_view(

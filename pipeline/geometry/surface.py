@@ -15,6 +15,10 @@ from pipeline.geometry.mesh import Mesh
 REPAIR_ROUNDS = 4
 
 
+class OpenSurfaceError(ValueError):
+    """A surface has holes that could not be closed; rebuild it with `isosurface` of its solid."""
+
+
 def solid_body(inside: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
     """The largest 6-connected part of a grid, with the cavities that the outside cannot reach filled."""
     labels, count = ndimage.label(inside)
@@ -101,7 +105,7 @@ def self_intersecting_faces(mesh: Mesh) -> int:
 def repair(mesh: Mesh) -> Mesh:
     """The largest piece of a mesh made watertight and manifold by removing bad faces and closing the holes.
 
-    Raises ValueError when that does not succeed within a few rounds; rebuild it with `isosurface` of its solid then.
+    Raises OpenSurfaceError when that does not succeed within a few rounds.
     """
     for _ in range(REPAIR_ROUNDS):
         mesh = largest_component(split_fans(_without_bad_faces(mesh)))
@@ -111,7 +115,7 @@ def repair(mesh: Mesh) -> Mesh:
         meshes.meshing_re_orient_faces_coherently()
         meshes.meshing_close_holes(maxholesize=len(mesh.faces), selfintersection=False)
         mesh = _from_meshset(meshes)
-    raise ValueError("the surface could not be closed: its holes border on each other")
+    raise OpenSurfaceError("a surface could not be closed: its holes border on each other")
 
 
 def _without_bad_faces(mesh: Mesh) -> Mesh:
@@ -139,7 +143,8 @@ def remesh(
     turn.
 
     edge_m: edge length to reach. selected: only these faces change; their border stays. tolerance_m: no change may move
-    the surface farther than this (a tenth of the edge when None), so thin parts keep short edges.
+    the surface farther than this (a tenth of the edge when None), so thin parts keep short edges. Raises
+    OpenSurfaceError when the result cannot be repaired.
     """
     meshes = _meshset(mesh, selected)
     meshes.meshing_isotropic_explicit_remeshing(

@@ -5,6 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from pipeline.avatar import extract as extract_module
 from pipeline.avatar.body import Body
 from pipeline.avatar.extract import (
     ExtractConfig,
@@ -16,8 +17,9 @@ from pipeline.avatar.extract import (
     solid,
     transfer_skin_weights,
 )
+from pipeline.core.progress import take_warnings
 from pipeline.geometry.mesh import Mesh
-from pipeline.geometry.surface import is_closed_manifold, isosurface
+from pipeline.geometry.surface import OpenSurfaceError, is_closed_manifold, isosurface
 
 CONFIG = ExtractConfig(voxel_m=0.02, reach_m=0.12, inset_m=0.05)
 SEGMENTS = {"Hips": (-0.25, 0.05), "RightHand": (0.05, 0.3)}
@@ -160,6 +162,24 @@ def test_simplify_reaches_the_edge_length(body: Body) -> None:
     lengths = np.linalg.norm(np.diff(mesh.vertices[mesh.edges()], axis=1), axis=2)
     assert np.median(lengths) == pytest.approx(0.04, rel=0.25)
     assert is_closed_manifold(mesh)
+
+
+@pytest.mark.parametrize(("torn", "told"), [("remesh", "stay uneven"), ("repair", "not reduced before remeshing")])
+def test_a_step_of_simplifying_that_tears_the_surface_is_left_out(
+    body: Body, monkeypatch: pytest.MonkeyPatch, torn: str, told: str
+) -> None:
+    fine = extract_mesh(sample_canonical(shell, body, CONFIG), 50.0, CONFIG)
+
+    def tear(*_: object, **__: object) -> Mesh:
+        raise OpenSurfaceError("a surface could not be closed: its holes border on each other")
+
+    monkeypatch.setattr(extract_module, torn, tear)
+    take_warnings()
+    mesh = simplify(fine, 0.05)
+    assert is_closed_manifold(mesh)
+    assert len(mesh.faces) < len(fine.faces)  # the other step still makes triangles larger
+    (warning,) = take_warnings()
+    assert told in warning
 
 
 def test_weights_of_the_body_itself_are_kept(body: Body) -> None:

@@ -11,6 +11,7 @@ from pipeline.avatar import refine as refine_module
 from pipeline.avatar.body import Body
 from pipeline.avatar.mesh_optimise import RefineConfig, RefineTask, SmoothOffset, optimise, smoothing_factor
 from pipeline.avatar.mesh_views import (
+    Skin,
     View,
     crop_view,
     face_errors,
@@ -22,11 +23,12 @@ from pipeline.avatar.mesh_views import (
     validation_psnr_db,
 )
 from pipeline.avatar.refine import Refined, adapt_triangles, refine
+from pipeline.core.progress import take_warnings
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.rotation import axis_angle_to_matrix
 from pipeline.geometry.skinning import rigid
-from pipeline.geometry.surface import is_closed_manifold, isosurface, remesh
+from pipeline.geometry.surface import OpenSurfaceError, is_closed_manifold, isosurface, remesh
 
 SIZE_PX = 72
 CAMERA = Camera(150.0, 150.0, SIZE_PX / 2, SIZE_PX / 2, SIZE_PX, SIZE_PX)
@@ -173,6 +175,42 @@ def test_a_round_that_makes_validation_worse_is_undone(
     assert float(task.shade.contrast) == pytest.approx(0.4)
 
 
+def test_a_round_is_judged_with_the_weights_it_was_optimised_with(
+    truth: Mesh, body: Body, views: tuple, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Vertices that move past a jump of the body's weights keep their own; the body's would be others there."""
+    above = (body.vertices[:, 1:2] > 0.0).astype(np.float32)
+    two = replace(
+        body,
+        joint_names=("Hips", "Spine"),
+        parents=np.array([-1, 0], dtype=np.int32),
+        joints_m=np.zeros((2, 3), dtype=np.float32),
+        skin_weights=np.concatenate([1.0 - above, above], axis=1),
+    )
+    lift = rigid(torch.eye(3)[None], torch.tensor([[0.0, 0.05, 0.0]]))[0]
+    bent = [
+        replace(
+            view, canonical_to_world=torch.cat([view.canonical_to_world, (lift @ view.canonical_to_world[0])[None]])
+        )
+        for view in views[1]
+    ]
+    used: list[Skin] = []
+
+    def sink(mesh: Mesh, skin: Skin, *_: object) -> Mesh:
+        used.append(skin)
+        return Mesh(mesh.vertices - np.array([0.0, 0.1, 0.0], dtype=np.float32), mesh.faces)
+
+    monkeypatch.setattr(refine_module, "optimise", sink)
+    config = CONFIG.model_copy(update={"rounds": 1})
+    begun = refine(truth, task_of(two, ([], bent), config.model_copy(update={"rounds": 0})))
+    result = refine(replace(begun, validation_psnr_db=(0.0,), finished=False), task_of(two, ([], bent), config))
+    assert result.rounds_done == 1
+    assert torch.equal(result.skin.weights, used[0].weights)
+    assert result.validation_psnr_db[-1] == validation_psnr_db(result.mesh, result.skin, bent, shade)
+    anew = validation_psnr_db(result.mesh, skin_of(result.mesh, two), bent, shade)
+    assert abs(anew - result.validation_psnr_db[-1]) > 1e-3
+
+
 def test_colours_are_learnt_first_and_the_surface_stays_meanwhile(truth: Mesh, body: Body, views: tuple) -> None:
     pale = Pattern(0.1)
     config = CONFIG.model_copy(update={"appearance_rate": 0.05, "appearance_steps": 40, "steps": 1})
@@ -209,6 +247,19 @@ def test_triangles_go_where_the_error_is(truth: Mesh) -> None:
     assert share_above(adapted) > 1.5 * share_above(truth)
     below = adapted.vertices[adapted.faces].mean(axis=1)[:, 1] < -0.05
     assert below.sum() < (centres[:, 1] < -0.05).sum()
+
+
+def test_triangles_that_cannot_be_joined_stay(truth: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    def tear(*_: object, **__: object) -> Mesh:
+        raise OpenSurfaceError("a surface could not be closed: its holes border on each other")
+
+    monkeypatch.setattr(refine_module, "remesh", tear)
+    take_warnings()
+    adapted = adapt_triangles(truth, np.arange(len(truth.faces), dtype=np.float64), EDGE_M, CONFIG)
+    assert is_closed_manifold(adapted)
+    assert len(adapted.faces) > len(truth.faces)  # those with much error are split all the same
+    (warning,) = take_warnings()
+    assert "triangles with little error were not joined" in warning
 
 
 def test_face_limit_stops_subdivision(truth: Mesh) -> None:

@@ -5,6 +5,7 @@ import pytest
 
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import (
+    OpenSurfaceError,
     SurfaceTree,
     closest_on_mesh,
     compact,
@@ -129,6 +130,11 @@ def test_repair_closes_holes_and_removes_fins(sphere: Mesh, seed: int) -> None:
     mended = repair(broken)
     assert is_closed_manifold(mended)
     assert volume(mended) == pytest.approx(volume(sphere), rel=0.02)
+
+
+def test_what_cannot_be_closed_is_an_error_of_its_own() -> None:
+    with pytest.raises(OpenSurfaceError, match="could not be closed"):
+        repair(Mesh(TETRAHEDRON.vertices, TETRAHEDRON.faces[:1]))
 
 
 def test_repair_leaves_a_sound_mesh_alone(sphere: Mesh) -> None:

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from pipeline.avatar.body import Body, Motion
-from pipeline.avatar.mesh_views import View, render_view, skin_of
+from pipeline.avatar.mesh_views import View, bind, render_view, skin_of
+from pipeline.avatar.refine import Refined
 from pipeline.core.errors import UserError
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
@@ -16,7 +17,8 @@ from pipeline.geometry.rotation import axis_angle_to_quaternion
 from pipeline.geometry.surface import isosurface
 from pipeline.io.capture import Capture, image_path, mask_path, save_capture
 from pipeline.io.image import read_rgb, write_gray, write_rgb
-from pipeline.io.npz import load_npz, save_body, save_camera, save_motion
+from pipeline.io.npz import load_npz, save_body, save_camera, save_motion, save_npz
+from pipeline.io.scores import SCORES_NPZ
 from stages import mesh as mesh_stage
 from stages.mesh import Config, run
 
@@ -78,6 +80,7 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
     motion = Motion(index, index / 30.0, axis_angle_to_quaternion(turns)[:, None].numpy(), place)
     save_body(folders["body"] / "body.npz", body)
     save_camera(folders["body"] / "camera.npz", CAMERA)
+    save_npz(folders["body"] / SCORES_NPZ, {"usable": np.ones(FRAMES, dtype=bool)})
     save_motion(folders["field"] / "motion.npz", motion)
     save_capture(capture_in(folders["frames"]))
     draw_frames(folders["frames"], thick, body, motion)
@@ -147,6 +150,37 @@ def test_goes_on_from_a_killed_round_to_the_same_bytes(
     monkeypatch.setattr(mesh_stage, "sample_canonical", None)  # extraction must not happen again
     assert run(inputs, killed, CONFIG) == metrics
     assert (whole / "mesh.npz").read_bytes() == (killed / "mesh.npz").read_bytes()
+
+
+def test_a_state_keeps_its_weights_and_they_are_what_is_exported(tmp_path: Path) -> None:
+    mesh = pill_mesh(0.18)
+    share = torch.linspace(0.0, 1.0, len(mesh.vertices))
+    kept = Refined(mesh, bind(mesh, torch.stack([1 - share, share], dim=1)), {}, 1, (20.0,), False)
+    mesh_stage.save_state(tmp_path / "state.safetensors", kept)
+    state = mesh_stage.load_state(tmp_path / "state.safetensors")
+    assert state is not None
+    mesh_stage.write_results(tmp_path, state, mesh_stage.SurfaceColour(PillField()))
+    arrays = load_npz(tmp_path / "mesh.npz")
+    exported = np.zeros((len(share), 2), dtype=np.float32)
+    np.add.at(exported, (np.arange(len(share))[:, None], arrays["joint_indices"]), arrays["joint_weights"])
+    np.testing.assert_allclose(exported[:, 1], share, atol=1e-6)
+
+
+def test_the_level_is_chosen_on_no_more_frames_than_asked_for(
+    inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Judged(Exception):
+        pass
+
+    def count(density: object, body: object, judged: list[View], config: Config) -> None:
+        raise Judged(len(judged))
+
+    split = np.where(np.arange(FRAMES) < 5, 0, 1).astype(np.uint8)  # seven of them are for validation
+    arrays = load_npz(inputs["frames"] / "frames.npz")
+    np.savez(inputs["frames"] / "frames.npz", **(arrays | {"split": split}))
+    monkeypatch.setattr(mesh_stage, "first_mesh", count)
+    with pytest.raises(Judged, match="^4$"):
+        run(inputs, tmp_path, CONFIG.model_copy(update={"level_frames": 4}))
 
 
 def test_without_training_frames_the_error_names_the_command(inputs: dict[str, Path], tmp_path: Path) -> None:
