@@ -1,13 +1,14 @@
 """Where the time of a training step of stage one goes, beside the least that this machine could need for it.
 
-    python -m tests.bench.bench_field [--run runs/x] [--baseline runs/y] [--preset default] [--json out.json]
+    python -m tests.bench.bench_field [--run runs/x ...] [--baseline runs/y ...] [--preset default] [--json out.json]
 
 What finished runs say of quality is added: see `tests.bench.quality`.
 
-The step is that of a finished run's frames and body, or of a painted body. Warm-up steps come first, until poses are
+The step is that of the first run's frames and body, or of a painted body. Warm-up steps come first, until poses are
 refined and cells that stay empty have been given up. The occupancy is updated only every few steps: a block holds as
-many steps as it takes until all recurs, and a part's time is the median over blocks of its mean in a block. A row is
-appended to tests/bench/results/<machine>.csv.
+many steps as it takes until all recurs, and a part's time is the median over blocks of its mean in a block. That median
+passes over the few steps of a training that begin with a rebake of the warp grids: rebake_ms is the time of one, in no
+step. A row is appended to tests/bench/results/<machine>.csv.
 
 The floor of a part is the longest of three times, each at a rate that is measured in the same run: bytes at the rate of
 a copy as large as the table with its gradient and moments, multiplications and additions at that of a large matrix
@@ -23,12 +24,12 @@ and for poses k frames, j joints, m nodes with e skin weights that are not zero:
 | place | 24 e k operations (blending), 8 s rows of blended matrices, 40 s bytes |
 | encode_forward | 8 l p rows, (12 + 4 w) p bytes |
 | network_forward | 2 (w h + 4 h) p operations, (4 w + 16) p bytes |
-| composite | 76 s + 56 n bytes, forward and backward |
-| losses | 48 n bytes |
+| composite | 64 s + 48 n bytes, forward and backward |
+| losses | 44 n bytes |
 | network_backward | twice the operations of network_forward, (8 w + 32) p bytes |
 | table_backward | 16 l p rows: each is read and written |
 | positions_backward | 8 l p rows, and for Newton 24 s: a node's matrix is read, its gradient read and written |
-| rest_backward | 48 n bytes (losses), 24 e k operations (blending) |
+| rest_backward | 44 n bytes (losses), 24 e k operations (blending) |
 | adam | 32 bytes a parameter |
 | occupancy_record | 4 s rows, 24 s bytes |
 | occupancy_update | encode_forward and network_forward of one point a cell |
@@ -39,7 +40,6 @@ What occupancy_update and skin_cut need counts by the part of the steps that mak
 """
 
 import argparse
-import json
 import math
 import sys
 import time
@@ -50,20 +50,20 @@ from pathlib import Path
 import numpy as np
 
 from data_tools.command import run_command
-from pipeline.avatar import selection
 from pipeline.avatar.field_config import FieldConfig
 from pipeline.avatar.occupancy import START_AVERAGE
 from pipeline.avatar.prepare import spread, start_learning, training_scale
-from pipeline.avatar.train import LOOK_EVERYWHERE, Learning
+from pipeline.avatar.train import LOOK_EVERYWHERE, REBAKES, Learning
 from pipeline.core.config import build, load_layers
 from pipeline.core.errors import UserError
 from pipeline.core.progress import warn
 from pipeline.io.capture import load_capture
 from pipeline.io.npz import load_body, load_camera, load_motion
+from pipeline.io.scores import training_positions
 from stages.field import read_picture
 from tests.avatar.scene import painted_scene
-from tests.bench.machine import append_row, circumstances, gather_mrow_s, memory_gb_s, multiply_gflop_s
-from tests.bench.parts import OTHER, UPDATE, Clock, watched
+from tests.bench.machine import circumstances, gather_mrow_s, keep, median_ms, memory_gb_s, multiply_gflop_s
+from tests.bench.parts import OTHER, REBAKE, UPDATE, Clock, watched
 from tests.bench.quality import quality
 
 PARTS = ("draw", "march", "place", "encode_forward", "network_forward", "composite", "losses", "network_backward")
@@ -78,6 +78,8 @@ PARTS += (
     OTHER,
 )
 PAINTED_FRAMES = 32
+BAKES = 3
+"""Times that a rebake is made to be timed."""
 IMAGE_HEIGHTS = 1.25
 """Height of a painted image over that of the person in it, about."""
 
@@ -119,7 +121,7 @@ def begin_run(run: Path, config: FieldConfig) -> Learning:
     capture, camera = load_capture(run / "frames"), load_camera(run / "body" / "camera.npz")
     body, motion = load_body(run / "body" / "body.npz"), load_motion(run / "body" / "motion.npz")
     camera = camera.scaled(training_scale(body, motion, camera, config.max_person_px))
-    chosen = capture.positions(selection.TRAIN)
+    chosen = training_positions(capture, run / "body")
     chosen = chosen[spread(len(chosen), config.max_frames)]
     pictures = [read_picture(capture, position, camera) for position in chosen]
     return start_learning(body, motion.select(chosen), camera, pictures, config)
@@ -181,12 +183,12 @@ def least_work(learning: Learning, samples: float) -> dict[str, Work]:
         "place": Work(bytes=40 * placed, operations=blending, rows=8 * placed),
         "encode_forward": Work(bytes=(12 + 4 * width) * points, rows=8 * levels * points),
         "network_forward": Work(bytes=(4 * width + 16) * points, operations=network * points),
-        "composite": Work(bytes=76 * samples + 56 * n),
-        "losses": Work(bytes=48.0 * n),
+        "composite": Work(bytes=64 * samples + 48 * n),
+        "losses": Work(bytes=44.0 * n),
         "network_backward": Work(bytes=(8 * width + 32) * points, operations=2 * network * points),
         "table_backward": Work(rows=16 * levels * points),
         "positions_backward": Work(rows=moving * (8 * levels * points + 24 * samples)),
-        "rest_backward": Work(bytes=48.0 * n, operations=blending),
+        "rest_backward": Work(bytes=44.0 * n, operations=blending),
         "adam": Work(bytes=32.0 * sum(parameter.numel() for parameter in field.parameters())),
         "occupancy_record": Work(bytes=24 * samples, rows=4 * samples),
         UPDATE: Work(bytes=(12 + 4 * width) * cells, operations=network * cells, rows=8 * levels * cells),
@@ -196,7 +198,7 @@ def least_work(learning: Learning, samples: float) -> dict[str, Work]:
 
 
 def measure(learning: Learning, clock: Clock, warm_up: int, steps: int, repeats: int) -> dict[str, float]:
-    """All figures: the step, its parts, their floors, the peaks that the floors come from."""
+    """All figures: the step, its parts, a rebake, the parts' floors, the peaks that the floors come from."""
     timing = time_steps(learning, clock, warm_up, steps)
     rows = max(learning.field.layout.rows_per_level, default=1 << 17)
     peaks = Peaks(
@@ -208,23 +210,27 @@ def measure(learning: Learning, clock: Clock, warm_up: int, steps: int, repeats:
     floors = {part: work[part].least_ms(peaks) for part in PARTS}
     figures = {"step_ms": timing.step_ms, "floor_ms": sum(floors.values()), "samples": timing.samples}
     figures |= {f"{part}_ms": timing.parts_ms[part] for part in PARTS}
+    figures[f"{REBAKE}_ms"] = median_ms(learning._bake, BAKES)
     return figures | {f"{part}_floor_ms": floors[part] for part in PARTS} | vars(peaks)
 
 
 def table(figures: dict[str, float]) -> str:
-    """Part, ms, floor, ratio."""
+    """Part, ms, floor, ratio; and a rebake."""
     lines = [f"{'part':20s} {'ms':>8s} {'floor ms':>9s} {'ratio':>6s}"]
     for name in (*PARTS, "step"):
         spent, least = figures[f"{name}_ms"], figures["floor_ms" if name == "step" else f"{name}_floor_ms"]
         lines.append(f"{name:20s} {spent:8.2f} {least:9.2f} {f'{spent / least:.1f}' if least else '-':>6s}")
+    lines.append(f"{REBAKE:20s} {figures[f'{REBAKE}_ms']:8.2f} each; {len(REBAKES)} in a training, in no step above")
     return "\n".join(lines)
 
 
 def main(argv: Sequence[str]) -> None:
     """Measure, print, write."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--run", type=Path, help="a finished run; without it a painted body")
-    parser.add_argument("--baseline", type=Path, help="a finished run of another preset on the same video")
+    parser.add_argument("--run", type=Path, nargs="+", default=[], help="finished runs; without them a painted body")
+    parser.add_argument(
+        "--baseline", type=Path, nargs="+", default=[], help="finished runs of another preset on the same videos"
+    )
     parser.add_argument("--preset", default="default", help="whose options of the field are taken")
     parser.add_argument("--warm-up", type=int, help="steps before the first that is measured")
     parser.add_argument("--steps", type=int, default=80, help="steps that are measured")
@@ -238,18 +244,23 @@ def main(argv: Sequence[str]) -> None:
     warm_up = settled(config) if options.warm_up is None else options.warm_up
     clock = Clock()
     with watched(clock):
-        learning = begin_run(options.run, config) if options.run else begin_painted(config)
+        learning = begin_run(options.run[0], config) if options.run else begin_painted(config)
         figures = measure(learning, clock, warm_up, options.steps, options.repeats)
     for reason in reasons:
         warn(reason)
-    capture = str(options.run or "painted")
-    about = {"preset": options.preset, "capture": capture, "warm_up": warm_up, "steps": options.steps}
-    found = about | figures | gained
+    about = {
+        "preset": options.preset,
+        "seed": config.seed,
+        "capture": str(options.run[0]) if options.run else "painted",
+        "runs": len(options.run),
+        "baselines": len(options.baseline),
+        "warm_up": warm_up,
+        "steps": options.steps,
+    }
     print(table(figures))
     print(", ".join(f"{name} {value}" for name, value in (circumstances() | about | gained).items()))
-    print(f"samples a step {figures['samples']:.0f}; row appended to {append_row('field', found)}")
-    if options.json:
-        options.json.write_text(json.dumps(circumstances() | found, indent=2) + "\n", encoding="utf-8")
+    results = keep("field", about | figures | gained, options.json)
+    print(f"samples a step {figures['samples']:.0f}; row appended to {results}")
 
 
 if __name__ == "__main__":

@@ -1,13 +1,14 @@
-"""Seconds of each kernel and of a whole step of stage one, beside what memory and arithmetic allow.
+"""Milliseconds of the kernels of stage one on made-up data of the default preset's size, and the machine's peaks.
 
     python -m tests.bench.bench_kernels [--json out.json] [--repeats 15]
 
-Medians of warm runs on made-up data of the default preset's size; the machine should do nothing else. A row of figures
-is appended to tests/bench/results/<machine>.csv.
+Medians of warm runs; the machine should do nothing else. A row of figures is appended to
+tests/bench/results/<machine>.csv. A whole step, and the floor of each of its parts, is what `tests.bench.bench_field`
+measures.
 """
 
 import argparse
-import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,11 +21,13 @@ from pipeline.kernels.composite import composite
 from pipeline.kernels.hashgrid import encode
 from pipeline.kernels.march import WarpSet, march
 from pipeline.kernels.warp import bake, newton
-from tests.bench.machine import append_row, median_ms, memory_gb_s, multiply_gflop_s
+from tests.bench.machine import keep, median_ms, memory_gb_s, multiply_gflop_s
 from tests.kernels.bar import CELL_M, bar_skin, bend
 
 BOUNDS = np.array([[-0.8, -0.1, -0.3], [0.8, 1.9, 0.5]], dtype=np.float32)
 RAYS, SAMPLES_A_RAY = 4096, 16
+SEED = 0
+"""Of the made-up data."""
 
 
 def ray_points(random: torch.Generator) -> torch.Tensor:
@@ -37,7 +40,7 @@ def ray_points(random: torch.Generator) -> torch.Tensor:
 
 def field_parts(config: FieldConfig, repeats: int) -> dict[str, float]:
     """Encoding, network, compositing and update, forward and backward."""
-    random = torch.Generator().manual_seed(0)
+    random = torch.Generator().manual_seed(SEED)
     layout = choose_layout(BOUNDS, 0.003, config.levels, config.features, config.log2_rows)
     field = Field(BOUNDS, layout, config.hidden_width)
     points, sums = ray_points(random), torch.zeros_like(field.table)
@@ -75,7 +78,7 @@ def warp_parts(repeats: int) -> dict[str, float]:
     """Baking a frame, marching and one Newton step with its gradient, on a bending bar."""
     skin, matrices = bar_skin(half_length_m=0.9, half_width_m=0.3), bend(0.6)
     warps = WarpSet.of([bake(skin, matrices)], CELL_M)
-    random = torch.Generator().manual_seed(0)
+    random = torch.Generator().manual_seed(SEED)
     targets = (torch.rand(RAYS, 3, generator=random) - 0.5) * torch.tensor([0.8, 0.2, 0.0])
     origins = torch.tensor([0.0, 0.0, 3.0]).expand(RAYS, 3).contiguous()
     directions = torch.nn.functional.normalize(targets - origins, dim=-1)
@@ -101,19 +104,17 @@ def warp_parts(repeats: int) -> dict[str, float]:
     }
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> None:
     """Measure, print, write."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--repeats", type=int, default=15, help="runs of each part")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(argv)
     figures = {"memory_gb_s": memory_gb_s(arguments.repeats), "multiply_gflop_s": multiply_gflop_s(arguments.repeats)}
     figures |= field_parts(FieldConfig(), arguments.repeats) | warp_parts(arguments.repeats)
     for name, value in figures.items():
         print(f"{name:32s} {value:10.2f}")
-    print(append_row("kernels", figures))
-    if arguments.json:
-        arguments.json.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+    print(keep("kernels", {"seed": SEED, "repeats": arguments.repeats} | figures, arguments.json))
 
 
 if __name__ == "__main__":

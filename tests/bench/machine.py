@@ -1,6 +1,7 @@
 """What the benches share: medians, the peaks of this machine, and the table of its figures."""
 
 import csv
+import json
 import platform
 import time
 from collections.abc import Callable, Mapping
@@ -61,16 +62,21 @@ def circumstances() -> dict[str, str | int]:
     }
 
 
-def append_row(bench: str, figures: Mapping[str, object], folder: Path = RESULTS) -> Path:
-    """Add a row to the machine's table, which has the columns of all benches; returns the table."""
+def keep(bench: str, figures: Mapping[str, object], json_path: Path | None = None, folder: Path = RESULTS) -> Path:
+    """Add a row to the machine's table, which has the columns of all benches; returns the table.
+
+    json_path: a file for the same row alone, not rounded.
+    """
+    row = {"bench": bench} | circumstances() | figures
+    if json_path:
+        json_path.write_text(json.dumps(row, indent=2) + "\n", encoding="utf-8")
     folder.mkdir(exist_ok=True)
     path = folder / f"{platform.node()}.csv"
     rows: list[Mapping[str, object]] = []
     if path.exists():
         with path.open(newline="", encoding="utf-8") as stream:
             rows = list(csv.DictReader(stream))
-    rounded = {name: round(value, 3) if isinstance(value, float) else value for name, value in figures.items()}
-    rows.append({"bench": bench} | circumstances() | rounded)
+    rows.append({name: round(value, 3) if isinstance(value, float) else value for name, value in row.items()})
     with path.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.DictWriter(stream, list(dict.fromkeys(chain.from_iterable(rows))), restval="")
         writer.writeheader()

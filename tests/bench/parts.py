@@ -24,8 +24,10 @@ from pipeline.kernels.warp import _Newton
 
 OTHER = "other"
 UPDATE = "occupancy_update"
+REBAKE = "rebake"
 SEAMS: tuple[tuple[str, Any, str], ...] = (
     (OTHER, Learning, "step"),
+    (REBAKE, Learning, "_bake"),
     ("draw", Learning, "_draw"),
     ("draw", Learning, "_empty_points"),
     ("place", Learning, "_place"),

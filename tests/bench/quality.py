@@ -1,7 +1,8 @@
-"""What finished runs say of quality: seconds of the field, and what it gains over a baseline on the same video."""
+"""What finished runs say of quality: seconds of the field, and what it gains over baselines on the same videos."""
 
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import median
 
 from data_tools.chart_trials import FIELD, read_progress
 from data_tools.runs import read_scores
@@ -18,31 +19,29 @@ Curve = Sequence[tuple[float, float, float]]
 """Rows of `field/progress.csv`: seconds of learning, validation PSNR (dB) of whole image and body."""
 
 
-def quality(run: Path | None, baseline: Path | None) -> tuple[dict[str, float | None], list[str]]:
+def quality(runs: Sequence[Path], baselines: Sequence[Path]) -> tuple[dict[str, float | None], list[str]]:
     """`FIGURES`, None where they cannot be told, and why they cannot.
 
-    field_seconds: of the run's stage. speedup_to_quality: see `speedup`, of the two `field/progress.csv`. psnr_gain_db:
-    of the field on held-out frames, whole image, run minus baseline, as the two reports have it.
+    Several runs, of several seeds or videos, count by their medians: field_seconds over the runs, the others over all
+    pairs of a run and a baseline of the same video. field_seconds: of the run's stage. speedup_to_quality: see
+    `speedup`, of the two `field/progress.csv`. psnr_gain_db: of the field on held-out frames, whole image, run minus
+    baseline, as the two reports have it. What a single pair does not tell is not told.
 
     Raises:
-        UserError: a field is not finished, or the two runs are not of the same video.
+        UserError: a field is not finished, or a run has no baseline of its video.
     """
-    if run is None:
-        return dict.fromkeys(FIGURES), ["no RUN is given: its field's seconds, speedup and gain are unknown"]
     figures: dict[str, float | None] = dict.fromkeys(FIGURES)
-    figures["field_seconds"] = _finished(run, FIELD).seconds
-    if baseline is None:
+    if not runs:
+        return figures, ["no RUN is given: its field's seconds, speedup and gain are unknown"]
+    figures["field_seconds"] = median(_finished(run, FIELD).seconds for run in runs)
+    if not baselines:
         return figures, ["no BASELINE is given: speedup and gain are unknown"]
-    _finished(baseline, FIELD)
-    if _finished(run, "frames").inputs != _finished(baseline, "frames").inputs:
-        raise UserError(f"{run} and {baseline} are not of the same video: give a BASELINE of the video of RUN")
-    reasons = []
-    figures["speedup_to_quality"], reason = speedup(read_progress(run / FIELD), read_progress(baseline / FIELD))
-    reasons += [reason] if reason else []
-    scores, others = read_scores(run / "report"), read_scores(baseline / "report")
-    if _HELD_OUT in scores and _HELD_OUT in others:
-        figures["psnr_gain_db"] = scores[_HELD_OUT] - others[_HELD_OUT]
-    else:
+    pairs = _pairs(runs, baselines)
+    found = [speedup(*(read_progress(run / FIELD) for run in pair)) for pair in pairs]
+    reasons = [f"{run} and {other}: {reason}" for (run, other), (_, reason) in zip(pairs, found, strict=True) if reason]
+    figures["speedup_to_quality"] = _median_of_all([factor for factor, _ in found])
+    figures["psnr_gain_db"] = _median_of_all([_gain_db(*pair) for pair in pairs])
+    if figures["psnr_gain_db"] is None:
         reasons.append("a report is not finished: the gain on held-out frames is unknown")
     return figures, reasons
 
@@ -70,3 +69,29 @@ def _finished(run: Path, stage: str) -> Manifest:
     if manifest is None:
         raise UserError(f"{run} has no finished {stage}: run python -m stages --run {run}")
     return manifest
+
+
+def _pairs(runs: Sequence[Path], baselines: Sequence[Path]) -> list[tuple[Path, Path]]:
+    """Each run with each baseline of its video."""
+    for baseline in baselines:
+        _finished(baseline, FIELD)
+    videos = {baseline: _finished(baseline, "frames").inputs for baseline in baselines}
+    pairs = []
+    for run in runs:
+        mine = [(run, baseline) for baseline in baselines if videos[baseline] == _finished(run, "frames").inputs]
+        if not mine:
+            given = ", ".join(map(str, baselines))
+            raise UserError(f"{run} and {given} are not of the same video: give a BASELINE of each RUN's video")
+        pairs += mine
+    return pairs
+
+
+def _gain_db(run: Path, baseline: Path) -> float | None:
+    ours, theirs = read_scores(run / "report"), read_scores(baseline / "report")
+    return ours[_HELD_OUT] - theirs[_HELD_OUT] if _HELD_OUT in ours and _HELD_OUT in theirs else None
+
+
+def _median_of_all(values: Sequence[float | None]) -> float | None:
+    """The median, or None if one is not known: leaving it out would flatter the rest."""
+    known = [value for value in values if value is not None]
+    return median(known) if len(known) == len(values) else None

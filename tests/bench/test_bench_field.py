@@ -11,8 +11,8 @@ from pipeline.core.errors import UserError
 from pipeline.kernels.hashgrid import _Encode
 from tests.bench import bench_field
 from tests.bench.bench_field import PARTS, Peaks, Work, begin_painted, least_work, period, settled, table, time_steps
-from tests.bench.machine import append_row
-from tests.bench.parts import SEAMS, Clock, watched
+from tests.bench.machine import circumstances, keep
+from tests.bench.parts import REBAKE, SEAMS, Clock, watched
 
 TINY = FieldConfig(
     steps=40,
@@ -63,9 +63,22 @@ def test_the_seams_are_as_they_were_afterwards():
     assert (Learning.step, _Encode.forward, _Encode.backward) == before
 
 
+def test_a_rebake_counts_for_no_part_of_a_step(monkeypatch):
+    """Step 20 of 40 begins with one; by this clock nothing else takes time."""
+    learning, now_s = begin_painted(TINY), [0.0]
+    monkeypatch.setattr(Learning, "_bake", lambda _: now_s.append(now_s[-1] + 1000.0))
+    clock = Clock(lambda: now_s[-1])
+    learning.done = 20
+    with watched(clock):
+        learning.step()
+    taken = clock.take()
+    assert taken.pop(REBAKE) == 1000.0
+    assert sum(taken.values()) == 0.0
+
+
 def test_every_seam_has_a_part():
     seams = {part for part, *_ in SEAMS} | {"march"}
-    assert seams == set(PARTS)
+    assert seams == {*PARTS, REBAKE}
 
 
 def test_a_clock_counts_each_moment_once():
@@ -119,7 +132,7 @@ def test_warm_up_lasts_until_poses_move_and_cells_are_given_up():
 
 
 def test_the_command_prints_and_writes(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(bench_field, "append_row", partial(append_row, folder=tmp_path))
+    monkeypatch.setattr(bench_field, "keep", partial(keep, folder=tmp_path))
     monkeypatch.setattr(bench_field, "build", lambda *_: TINY)
     monkeypatch.setattr(bench_field, "memory_gb_s", lambda *_: 10.0)
     monkeypatch.setattr(bench_field, "multiply_gflop_s", lambda *_: 100.0)
@@ -129,6 +142,8 @@ def test_the_command_prints_and_writes(tmp_path, monkeypatch, capsys):
     assert figures["step_ms"] > 0
     assert figures["floor_ms"] == pytest.approx(sum(figures[f"{part}_floor_ms"] for part in PARTS))
     assert np.isfinite(figures["samples"])
+    assert figures.items() >= (circumstances() | {"seed": 0, "capture": "painted", "runs": 0}).items()
+    assert figures["rebake_ms"] > 0
     assert table(figures) in capsys.readouterr().out
     assert len(list(tmp_path.glob("*.csv"))) == 1
 

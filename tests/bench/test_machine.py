@@ -1,15 +1,16 @@
 import csv
+import json
 
 import torch
 
-from tests.bench.machine import append_row, circumstances, gather_mrow_s
+from tests.bench.machine import circumstances, gather_mrow_s, keep
 
 
 def test_rows_of_all_benches_share_a_table(tmp_path):
     folder = tmp_path / "results"
-    append_row("kernels", {"adam_ms": 1.23456}, folder)
-    append_row("field", {"step_ms": 20, "preset": "default"}, folder)
-    path = append_row("kernels", {"adam_ms": 2.0}, folder)
+    keep("kernels", {"adam_ms": 1.23456}, folder=folder)
+    keep("field", {"step_ms": 20, "preset": "default"}, folder=folder)
+    path = keep("kernels", {"adam_ms": 2.0}, folder=folder)
     with path.open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert [row["bench"] for row in rows] == ["kernels", "field", "kernels"]
@@ -19,13 +20,18 @@ def test_rows_of_all_benches_share_a_table(tmp_path):
 
 
 def test_a_table_of_fewer_columns_is_continued(tmp_path):
-    path = append_row("kernels", {}, tmp_path)
+    path = keep("kernels", {}, folder=tmp_path)
     path.write_text("commit,adam_ms\nabc,3\n")
-    append_row("field", {"step_ms": 4}, tmp_path)
+    keep("field", {"step_ms": 4}, folder=tmp_path)
     with path.open(newline="") as stream:
         first, second = csv.DictReader(stream)
     assert (first["commit"], first["adam_ms"], first["step_ms"]) == ("abc", "3", "")
     assert (second["commit"], second["adam_ms"], second["step_ms"]) == (circumstances()["commit"], "", "4")
+
+
+def test_a_file_of_figures_says_what_was_measured_on_what(tmp_path):
+    keep("kernels", {"adam_ms": 1.23456}, tmp_path / "out.json", tmp_path)
+    assert json.loads((tmp_path / "out.json").read_text()) == {"bench": "kernels", "adam_ms": 1.23456} | circumstances()
 
 
 def test_random_rows_are_counted():

@@ -14,8 +14,10 @@ SLOW = [(100.0, 25.0, 18.0), (400.0, 29.0, 21.0), (1000.0, 30.0, 22.0)]
 QUICK = [(10.0, 24.0, 17.0), (20.0, 29.89, 21.9), (25.0, 29.9, 21.9), (40.0, 31.0, 23.0)]
 
 
-def finished_run(folder: Path, curve: list[tuple[float, float, float]], held_out_db: float | None, video: str) -> Path:
-    place = Manifest("", 1, "", {}, {"video": video}, {}, {}, 45.5, 100.0)
+def finished_run(
+    folder: Path, curve: list[tuple[float, float, float]], held_out_db: float | None, video: str, seconds: float = 45.5
+) -> Path:
+    place = Manifest("", 1, "", {}, {"video": video}, {}, {}, seconds, 100.0)
     for stage in ("frames", "field", "report"):
         (folder / stage).mkdir(parents=True)
         write_manifest(replace(place, stage=stage), folder / stage / "manifest.json")
@@ -44,28 +46,65 @@ def test_what_is_never_reached_is_said() -> None:
 
 def test_two_runs(tmp_path: Path) -> None:
     run, baseline = finished_run(tmp_path / "a", QUICK, 30.75, "x"), finished_run(tmp_path / "b", SLOW, 30.5, "x")
-    figures, reasons = quality(run, baseline)
+    figures, reasons = quality([run], [baseline])
     assert figures == {"field_seconds": 45.5, "speedup_to_quality": 40.0, "psnr_gain_db": 0.25}
     assert reasons == []
 
 
+def test_several_seeds_and_videos_count_by_their_medians(tmp_path: Path) -> None:
+    """Pairs by hand: two runs of video x with one baseline, one of video y with two; 40, 20, 8, 16 times as fast."""
+
+    def slower(factor: float) -> list[tuple[float, float, float]]:
+        return [(factor * seconds, full, body) for seconds, full, body in QUICK]
+
+    runs = [
+        finished_run(tmp_path / "x0", QUICK, 30.5, "x"),
+        finished_run(tmp_path / "x1", slower(2), 30.6, "x"),
+        finished_run(tmp_path / "y0", slower(5), 31.0, "y"),
+    ]
+    longer = [(2 * seconds, full, body) for seconds, full, body in SLOW]
+    baselines = [
+        finished_run(tmp_path / "bx", SLOW, 30.5, "x"),
+        finished_run(tmp_path / "by0", SLOW, 30.5, "y"),
+        finished_run(tmp_path / "by1", longer, 30.8, "y"),
+    ]
+    figures, reasons = quality(runs, baselines)
+    assert reasons == []
+    assert figures["speedup_to_quality"] == pytest.approx((20 + 16) / 2)
+    assert figures["psnr_gain_db"] == pytest.approx((0.1 + 0.2) / 2)
+
+
+def test_one_pair_that_cannot_be_told_is_not_left_out(tmp_path: Path) -> None:
+    runs = [finished_run(tmp_path / "a", QUICK, 30.5, "x"), finished_run(tmp_path / "b", SLOW[:1], None, "x")]
+    figures, reasons = quality(runs, [finished_run(tmp_path / "c", SLOW, 30.5, "x")])
+    assert (figures["speedup_to_quality"], figures["psnr_gain_db"]) == (None, None)
+    assert any("b and" in reason and "never reaches" in reason for reason in reasons)
+
+
 def test_what_is_not_given_is_null_with_a_reason(tmp_path: Path) -> None:
     run = finished_run(tmp_path / "a", QUICK, None, "x")
-    assert quality(None, None) == (
+    assert quality([], []) == (
         dict.fromkeys(("field_seconds", "speedup_to_quality", "psnr_gain_db")),
         ["no RUN is given: its field's seconds, speedup and gain are unknown"],
     )
-    figures, (reason,) = quality(run, None)
+    figures, (reason,) = quality([run], [])
     assert (figures["field_seconds"], figures["speedup_to_quality"], figures["psnr_gain_db"]) == (45.5, None, None)
     assert "no BASELINE" in reason
-    unscored, (reason,) = quality(run, finished_run(tmp_path / "b", SLOW, 30.5, "x"))
+    unscored, (reason,) = quality([run], [finished_run(tmp_path / "b", SLOW, 30.5, "x")])
     assert unscored["psnr_gain_db"] is None
     assert "report is not finished" in reason
+
+
+def test_seconds_are_the_median_of_the_runs(tmp_path: Path) -> None:
+    runs = [
+        finished_run(tmp_path / name, QUICK, None, "x", seconds) for name, seconds in (("a", 9), ("b", 5), ("c", 6))
+    ]
+    assert quality(runs, [])[0]["field_seconds"] == 6
 
 
 def test_runs_of_two_videos_are_refused(tmp_path: Path) -> None:
     run, other = finished_run(tmp_path / "a", QUICK, 30.0, "x"), finished_run(tmp_path / "b", SLOW, 30.0, "y")
     with pytest.raises(UserError, match="not of the same video"):
-        quality(run, other)
+        quality([run], [other])
     with pytest.raises(UserError, match="has no finished field"):
-        quality(tmp_path, None)
+        quality([tmp_path], [])
