@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 from pydantic import Field
 
 from pipeline.avatar.body import Motion, ParametricBody, canonical_to_world, load_anny
@@ -14,10 +14,21 @@ from pipeline.avatar.fit import FitOptions, FitResult, fit_body, fit_given
 from pipeline.avatar.fit_beside import foreign_frames, lump_doubts, lump_shares
 from pipeline.avatar.fit_given import GivenPoses
 from pipeline.avatar.fit_hands import finger_curls_rad, trusted_hands
-from pipeline.avatar.fit_quality import doubts, make_observations, suspicious_frames
+from pipeline.avatar.fit_quality import (
+    VERDICTS,
+    doubts,
+    frames_to_show,
+    known_median,
+    make_observations,
+    median_overlap,
+    suspicious_frames,
+    usable_frames,
+    verdicts,
+)
 from pipeline.avatar.fit_silhouette import matching_window
 from pipeline.avatar.hands import Hands, no_hands
 from pipeline.avatar.overlay import draw_overlay, overlay_grid, posed_frame
+from pipeline.avatar.selection import TRAIN, frame_ranges
 from pipeline.avatar.smpl import SmplBody
 from pipeline.core.cli import main
 from pipeline.core.config import Config as BaseConfig
@@ -28,10 +39,11 @@ from pipeline.geometry.camera import Camera
 from pipeline.io.capture import Capture, load_capture
 from pipeline.io.image import to_uint8, write_rgb
 from pipeline.io.npz import save_body, save_camera, save_motion, save_npz
+from pipeline.io.scores import SCORES_NPZ
 from pipeline.io.smpl_model import load_smpl
 from pipeline.io.smpl_poses import SMPL_POSES_NPZ
 
-_BODY, _MOTION, _CAMERA, _SCORES, _OVERLAY = "body.npz", "motion.npz", "camera.npz", "scores.npz", "overlay.png"
+_BODY, _MOTION, _CAMERA, _OVERLAY = "body.npz", "motion.npz", "camera.npz", "overlay.png"
 _OVERLAY_FRAMES = 12
 _GUESS_DEVIATION, _RECORDED_DEVIATION = 0.5, 0.1
 """Relative deviations of a guessed focal length and of one in the recording's metadata (`pipeline.io.lens`)."""
@@ -69,6 +81,13 @@ class Config(BaseConfig):
     min_overlap: float = Field(
         0.5, ge=0.0, le=1.0, description="A fit is refused whose median overlap with the masks (IoU, 0 to 1) is lower."
     )
+    max_dropped: float = Field(
+        0.3,
+        ge=0.0,
+        le=0.9,
+        description="A fit is refused that misses the person in a larger share of the training frames; fewer are "
+        "left out of the training.",
+    )
 
 
 def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, float]:
@@ -79,19 +98,21 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     result = fit(capture, hands, masks, inputs["frames"], config)
     motion = Motion(capture.frame_index, capture.time_s, result.rotations_wxyz, result.root_translation_m)
     exchanged = np.stack(list(result.exchanged.values())).any(axis=0)
-    write_rgb(out / _OVERLAY, overlay(capture, masks, result, motion))
     save_body(out / _BODY, result.body)
     save_motion(out / _MOTION, motion)
     save_camera(out / _CAMERA, result.camera)
     lumps = lump_shares(result.body, canonical_to_world(result.body, motion), result.camera, masks)
+    usable, training = usable_frames(result), capture.split == TRAIN
     scores = {"silhouette_iou": result.overlap, "landmark_error_px": result.landmark_error_px, "exchanged": exchanged}
-    save_npz(out / _SCORES, {"frame_index": capture.frame_index, **scores, "lump_share": lumps})
-    for sentence in doubts(result, capture.frame_index) + lump_doubts(lumps, capture.frame_index):
+    scores |= {"lump_share": lumps, "usable": usable}
+    save_npz(out / SCORES_NPZ, {"frame_index": capture.frame_index, **scores})
+    write_rgb(out / _OVERLAY, overlay(capture, masks, result, motion, foreign_frames(lumps)))
+    for sentence in doubts(result, capture.frame_index, training) + lump_doubts(lumps, capture.frame_index):
         warn(sentence)
     return {
         "silhouette_iou": float(np.nanmedian(result.overlap)),
         "silhouette_iou_worst": float(np.nanmin(result.overlap)),
-        "landmark_error_px": float(np.nanmedian(result.landmark_error_px)),
+        "landmark_error_px": known_median(result.landmark_error_px),
         "focal_px": result.camera.fx,
         "focal_deviation": result.focal_deviation,
         "principal_x_px": result.camera.cx,
@@ -101,6 +122,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
         "exchanged_frames": int(exchanged.sum()),
         "hands_used": float((hands.own_side > 0.0).mean()),
         "suspicious_frames": int(suspicious_frames(result).sum()),
+        "dropped_frames": int((training & ~usable).sum()),
         "foreign_frames": int(foreign_frames(lumps).sum()),
     }
 
@@ -128,15 +150,30 @@ def fit(
             f"the body cannot be fitted to {frames_dir}: {error}; let the detector find the landmarks "
             "(remove landmarks.npz from the video folder), or supply `landmarks_world_m` too"
         ) from error
-    overlap = float(np.nanmedian(result.overlap))
+    refuse_poor_fit(result, capture, config, given is not None)
+    return result
+
+
+def refuse_poor_fit(result: FitResult, capture: Capture, config: Config, poses_are_given: bool) -> None:
+    """UserError when the body fits the person poorly all over, or not at all in too many of the training frames."""
+    remedy = (
+        f"look at {capture.folder / 'contact.jpg'} for wrong masks or landmarks, film the whole body unoccluded, "
+        f"{'set body.supplied_poses=start, ' if poses_are_given else ''}or"
+    )
+    overlap = median_overlap(result)
     if overlap < config.min_overlap:
         raise UserError(
-            f"the body does not fit the person in {frames_dir}: median overlap with the masks {overlap:.2f}, needed "
-            f"{config.min_overlap:.2f}; look at {frames_dir / 'contact.jpg'} for wrong masks or landmarks, film the "
-            f"whole body unoccluded, {'' if given is None else 'set body.supplied_poses=start, '}"
-            "or lower body.min_overlap"
+            f"the body does not fit the person in {capture.folder}: median overlap with the masks {overlap:.2f}, "
+            f"needed {config.min_overlap:.2f}; {remedy} lower body.min_overlap"
         )
-    return result
+    training, wrecked = capture.split == TRAIN, ~usable_frames(result)
+    dropped = np.count_nonzero(training & wrecked)
+    if dropped > config.max_dropped * np.count_nonzero(training):
+        raise UserError(
+            f"the body does not fit the person in {dropped} of {np.count_nonzero(training)} training frames of "
+            f"{capture.folder} (frames {frame_ranges(capture.frame_index, wrecked)}); {remedy} leave these frames out "
+            "with split.json, or raise body.max_dropped"
+        )
 
 
 def supplied_poses(
@@ -186,10 +223,15 @@ def starting_camera(capture: Capture, config: Config) -> tuple[Camera, float]:
 
 
 def overlay(
-    capture: Capture, masks: Sequence[UInt8[np.ndarray, "h w"]], result: FitResult, motion: Motion
+    capture: Capture,
+    masks: Sequence[UInt8[np.ndarray, "h w"]],
+    result: FitResult,
+    motion: Motion,
+    foreign: Bool[np.ndarray, "n"],
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Tiles of frames spread evenly over the capture."""
-    positions = np.unique(np.linspace(0, len(capture) - 1, _OVERLAY_FRAMES).astype(np.int64))
+    """Tiles of frames: up to half are the worst of those that a warning may name, marked, the others evenly spread."""
+    verdict = verdicts(result, suspicious_frames(result) | foreign)
+    positions = frames_to_show(verdict, result.overlap, _OVERLAY_FRAMES)
     transforms = canonical_to_world(result.body, motion.select(positions))
     tiles = [
         draw_overlay(
@@ -199,6 +241,7 @@ def overlay(
             result.body,
             result.camera,
             f"frame {capture.frame_index[position]}  overlap {result.overlap[position]:.2f}",
+            VERDICTS[verdict[position]],
         )
         for tile, position in enumerate(positions)
     ]
@@ -207,9 +250,9 @@ def overlay(
 
 STAGE = Stage(
     "body",
-    version=7,
+    version=8,
     needs=("frames",),
-    makes=(_BODY, _MOTION, _CAMERA, _SCORES, _OVERLAY),
+    makes=(_BODY, _MOTION, _CAMERA, SCORES_NPZ, _OVERLAY),
     config=Config,
     run=run,
 )

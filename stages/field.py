@@ -25,6 +25,7 @@ from pipeline.io.capture import Capture, load_capture
 from pipeline.io.checkpoint import load_tensors, save_field, save_occupancy, save_tensors
 from pipeline.io.image import to_uint8, write_rgb
 from pipeline.io.npz import load_body, load_camera, load_motion, save_motion
+from pipeline.io.scores import training_positions
 
 CHECKPOINT, CHECKPOINT_EVERY_S = "checkpoint.safetensors", 15.0
 PREVIEW_FRAMES = 4
@@ -39,7 +40,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: FieldConfig) -> Mapping[s
     capture, camera = load_capture(inputs["frames"]), load_camera(inputs["body"] / "camera.npz")
     body, motion = load_body(inputs["body"] / "body.npz"), load_motion(inputs["body"] / "motion.npz")
     camera = camera.scaled(training_scale(body, motion, camera, config.max_person_px))
-    train = capture.positions(selection.TRAIN)
+    train = training_positions(capture, inputs["body"])
     train = train[spread(len(train), config.max_frames)]
     pictures = [read_picture(capture, position, camera) for position in track(train, "read frames")]
     learning = start_learning(body, motion.select(train), camera, pictures, config)

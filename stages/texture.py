@@ -20,6 +20,7 @@ from pipeline.avatar.bake import (
 from pipeline.avatar.bake_views import View, crop_view, footprint_m, weigh_by_resolution
 from pipeline.avatar.body import Body, canonical_to_world
 from pipeline.avatar.parts import part_of_faces
+from pipeline.avatar.selection import VALIDATION
 from pipeline.avatar.specular import corner_texels, fit_specular, observe_vertices
 from pipeline.avatar.spread import spread, vertex_means
 from pipeline.core.cli import main
@@ -30,11 +31,11 @@ from pipeline.geometry.atlas import Atlas, Texels, rasterize_texels, texture_siz
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import dense_weights, linear_blend_skinning
 from pipeline.geometry.surface import laplacian
-from pipeline.io.capture import load_capture
+from pipeline.io.capture import Capture, load_capture
 from pipeline.io.image import to_uint8, write_gray, write_rgb
 from pipeline.io.npz import load_body, load_camera, load_motion, load_npz, save_npz
+from pipeline.io.scores import training_positions
 
-TRAIN, VALIDATION = 0, 1
 SPECULAR_SMOOTHING = 8
 
 
@@ -68,7 +69,11 @@ class SkinnedMesh:
 def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, float]:
     """Writes `atlas.npz`, `diffuse.png`, `specular.png` and `coverage.png`."""
     body, skinned = load_body(inputs["body"] / "body.npz"), load_mesh(inputs["mesh"])
-    train, validation = (load_views(inputs, body, skinned, split, config.max_frames) for split in (TRAIN, VALIDATION))
+    capture = load_capture(inputs["frames"])
+    chosen = training_positions(capture, inputs["body"]), capture.positions(VALIDATION)
+    train, validation = (
+        load_views(capture, positions, inputs, body, skinned, config.max_frames) for positions in chosen
+    )
     if not train:
         raise UserError(f"{inputs['frames']} has no training frames; run `python -m stages.frames` again")
     atlas, size_px = make_atlas(skinned, body, train, config)
@@ -97,16 +102,22 @@ def load_mesh(folder: Path) -> SkinnedMesh:
     return SkinnedMesh(Mesh(arrays["vertices"], arrays["faces"]), arrays["joint_indices"], arrays["joint_weights"])
 
 
-def load_views(inputs: Mapping[str, Path], body: Body, skinned: SkinnedMesh, split: int, max_frames: int) -> list[View]:
-    """Crops of the frames of one split, evenly thinned, each with the mesh in its pose."""
-    capture, camera = load_capture(inputs["frames"]), load_camera(inputs["body"] / "camera.npz")
+def load_views(
+    capture: Capture,
+    positions: Int[np.ndarray, "k"],
+    inputs: Mapping[str, Path],
+    body: Body,
+    skinned: SkinnedMesh,
+    max_frames: int,
+) -> list[View]:
+    """Crops of the frames at these positions, evenly thinned, each with the mesh in its pose."""
+    camera = load_camera(inputs["body"] / "camera.npz")
     transforms = canonical_to_world(body, load_motion(inputs["field"] / "motion.npz"))
     vertices = torch.from_numpy(skinned.mesh.vertices)
     weights = dense_weights(
         torch.from_numpy(skinned.joint_indices), torch.from_numpy(skinned.joint_weights), len(body.joint_names)
     )
     faces = torch.from_numpy(skinned.mesh.faces)
-    positions = capture.positions(split)
     if len(positions) > max_frames:
         positions = positions[np.linspace(0, len(positions) - 1, max_frames).round().astype(int)]
     views = []
@@ -157,7 +168,7 @@ def bake_specular(
 
 STAGE = Stage(
     "texture",
-    version=1,
+    version=2,
     needs=("frames", "body", "field", "mesh"),
     makes=("atlas.npz", "diffuse.png", "specular.png", "coverage.png"),
     config=Config,

@@ -54,6 +54,9 @@ OUTLINE_DIRECTION_M = 0.4
 """Standard deviations of a landmark in the image and in 3D once outlines help, which err less and in no fixed way."""
 
 
+WELL_SEEN = 0.5
+"""Trust from which a landmark's distance tells how good a fit is."""
+
 HAND_M = 0.012
 """Standard deviation of a hand's points once the shape is known; before, the body's own errors are larger."""
 
@@ -143,15 +146,19 @@ def fit_given(
 
     observations.camera is the camera that the given poses belong to.
     keep: the given poses stay as they are; else every pose goes on from them to landmarks and outlines.
-    Raises ValueError when no frame has a pose, or as `fit_body` does.
+    Raises ValueError when no frame has a pose, or as `fit_body` does where a frame is fitted.
     """
-    _check_landmarks(observations)
+    to_fit = np.ones(len(windows), dtype=bool)
+    to_fit[given.rows] = not keep
+    if to_fit.any():
+        _check_landmarks(observations)
     tools = _tools(body, relaxed_curls())
     model = tools.model(given.shape)
     state = given.state(model.full_joint, observations.time_s)
     rest_m = tools.regressor.points(model, state.offsets_m).rest[0]
     observations, exchanged = _with_sides_mended(observations, rest_m)
-    if not keep or len(given.rows) < len(windows):
+    exchanged = {sides: rows & to_fit for sides, rows in exchanged.items()}
+    if to_fit.any():
         weights = Weights(landmark_m=OUTLINE_LANDMARK_M, direction_m=OUTLINE_DIRECTION_M)
         state, _, _ = _fit_poses(tools, observations, windows, state, weights)
     if keep:
@@ -295,12 +302,17 @@ def _minimised(
 def landmark_errors_px(
     regressor: LandmarkRegressor, model: FitModel, state: FitState, observations: Observations
 ) -> Float[np.ndarray, "n"]:
-    """Median distance of each frame's well-seen pose landmarks from the body's; nan without any."""
+    """Median distance of each frame's well-seen pose landmarks from the body's, of all that are known where none is
+    well seen; nan without any.
+    """
     skeleton = pose_skeleton(model, state.rotations, state.root_m)
     world, _ = pose_points(model, skeleton, regressor.points(model, state.offsets_m))
     pixels, _ = project_with_covectors(world, through_lens(observations.camera, state.lens))
     error = (pixels - observations.landmarks_px).norm(dim=-1)[:, :POSE_LANDMARKS]
-    return torch.where(observations.confidence[:, :POSE_LANDMARKS] > 0.5, error, torch.nan).nanmedian(1).values.numpy()
+    trust = observations.confidence[:, :POSE_LANDMARKS]
+    well_seen = trust > WELL_SEEN
+    counted = torch.where(well_seen.any(1, keepdim=True), well_seen, trust > 0.0)
+    return torch.where(counted, error, torch.nan).nanmedian(1).values.numpy()
 
 
 def _result(

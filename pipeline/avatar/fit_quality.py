@@ -1,4 +1,4 @@
-"""What goes into a fit (observations from a detector's arrays), and words about the doubtful frames that come out."""
+"""What goes into a fit (observations from a detector's arrays), and what to think of the frames that come out of it."""
 
 import numpy as np
 import torch
@@ -8,6 +8,7 @@ from pipeline.avatar.fit import FitResult
 from pipeline.avatar.fit_hands import hand_landmarks
 from pipeline.avatar.fit_objective import Observations
 from pipeline.avatar.hands import Hands, no_hands
+from pipeline.avatar.selection import frame_ranges
 from pipeline.geometry.camera import Camera
 
 LEAST_CONFIDENCE = 0.1
@@ -21,6 +22,24 @@ UNSURE_FOCAL = 0.15
 
 HIGH_ERROR = 3.0
 """A frame is doubtful when its landmark error is this many times the median."""
+
+WRECKED_OVERLAP = 0.20
+"""A frame is unusable when its overlap lies this far below the median: about what a leg beside its mask costs.
+
+Worst behind the median in finished runs: turns 0.03, a self-capture 0.11, skirts 0.08; a ball in the mask 0.20.
+"""
+
+WRECKED_ERROR = 0.08
+"""A frame is unusable when half of its landmarks lie this far from the body's, as a share of the person's height.
+
+Most in finished runs: turns 0.013, a self-capture 0.047.
+"""
+
+ROUGH_OVERLAP = 0.85
+"""A fit is worth a word whose median overlap is lower. In finished runs: turns 0.93, a skirt 0.87."""
+
+VERDICTS = ("", "sides mended", "doubtful", "unusable")
+"""What may be said of a frame, from well to worst."""
 
 
 def make_observations(
@@ -54,14 +73,71 @@ def make_observations(
 
 def suspicious_frames(result: FitResult) -> Bool[np.ndarray, "n"]:
     """Frames whose overlap or landmark error falls far behind the rest, and frames without landmarks."""
-    low = result.overlap < np.nanmedian(result.overlap) - LOW_OVERLAP
+    near = result.overlap >= median_overlap(result) - LOW_OVERLAP
     error = result.landmark_error_px
-    return low | (error > HIGH_ERROR * np.nanmedian(error)) | np.isnan(error)
+    return ~near | np.isnan(error) | (np.nan_to_num(error) > HIGH_ERROR * known_median(error))
 
 
-def doubts(result: FitResult, frame_index: Int[np.ndarray, "n"]) -> list[str]:
-    """Sentences about frames that a person should look at, for example "frames 81-96: ...". Empty when all is well."""
+def usable_frames(result: FitResult) -> Bool[np.ndarray, "n"]:
+    """Frames that can be learnt from: False only where the body clearly is not where the person is.
+
+    That is a frame without a mask, or whose overlap or landmarks miss by `WRECKED_OVERLAP` or `WRECKED_ERROR`. One
+    without landmarks is judged by its overlap.
+    """
+    near = result.overlap >= median_overlap(result) - WRECKED_OVERLAP
+    to_camera = result.camera.world_to_camera
+    depth_m = result.root_translation_m @ to_camera[2, :3] + to_camera[2, 3]
+    person_px = result.camera.fy * result.body.height_m() / depth_m
+    return near & (np.nan_to_num(result.landmark_error_px) <= WRECKED_ERROR * person_px)
+
+
+def median_overlap(result: FitResult) -> float:
+    """Median over frames of the overlap with the masks, 0 to 1; a frame without a mask counts as 0."""
+    return float(np.median(np.nan_to_num(result.overlap)))
+
+
+def known_median(values: Float[np.ndarray, "n"]) -> float:
+    """Median of the finite values; nan without any."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else float("nan")
+
+
+def verdicts(result: FitResult, doubtful: Bool[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
+    """Position in `VERDICTS` of the worst that holds of each frame, given which are doubtful."""
+    mended = np.stack(list(result.exchanged.values())).any(axis=0)
+    return np.select([~usable_frames(result), doubtful, mended], [3, 2, 1], 0)
+
+
+def frames_to_show(verdict: Int[np.ndarray, "n"], overlap: Float[np.ndarray, "n"], count: int) -> Int[np.ndarray, "k"]:
+    """Positions, rising, of at most `count` frames: up to half of them those with the worst verdicts (and there the
+    lowest overlap), the others evenly spread over the rest.
+    """
+    worst = np.lexsort((np.nan_to_num(overlap), -verdict))[: min(count // 2, np.count_nonzero(verdict))]
+    others = np.setdiff1d(np.arange(len(verdict)), worst)
+    even = np.linspace(0, len(others) - 1, min(count - len(worst), len(others))).astype(np.int64)
+    return np.sort(np.concatenate([worst, others[even]]))
+
+
+def doubts(result: FitResult, frame_index: Int[np.ndarray, "n"], training: Bool[np.ndarray, "n"]) -> list[str]:
+    """Sentences about what a person should look at, for example "frames 81-96: ...". Empty when all is well.
+
+    training: frames that later stages learn from, unless they are unusable.
+    """
     sentences = []
+    overlap = median_overlap(result)
+    if overlap < ROUGH_OVERLAP:
+        sentences.append(
+            f"the body fits the masks only roughly (median overlap {overlap:.2f}): wide clothes, or wrong masks or "
+            "camera; see overlay.png, and supply masks/, camera.json or body.height_m"
+        )
+    usable = usable_frames(result)
+    if not usable.all():
+        dropped = np.count_nonzero(training & ~usable)
+        sentences.append(
+            f"frames {frame_ranges(frame_index, ~usable)}: the body is not where the person is; {dropped} "
+            f"frame{'' if dropped == 1 else 's'} dropped from the training; see overlay.png, and supply masks/ or "
+            "landmarks.npz that are right there, or film it again"
+        )
     for what, rows in result.exchanged.items():
         if rows.any():
             limbs = "left and right" if what == "whole body" else f"left and right {what}"
@@ -71,9 +147,10 @@ def doubts(result: FitResult, frame_index: Int[np.ndarray, "n"]) -> list[str]:
     missing = np.isnan(result.landmark_error_px)
     if missing.any():
         sentences.append(
-            f"frames {frame_ranges(frame_index, missing)}: no landmarks; the pose follows the mask and time"
+            f"frames {frame_ranges(frame_index, missing)}: no landmarks; the pose, unless it was supplied, follows the "
+            "mask and time"
         )
-    poor = suspicious_frames(result) & ~missing
+    poor = suspicious_frames(result) & ~missing & usable
     if poor.any():
         sentences.append(
             f"frames {frame_ranges(frame_index, poor)}: the body fits worse than elsewhere; see overlay.png"
@@ -84,10 +161,3 @@ def doubts(result: FitResult, frame_index: Int[np.ndarray, "n"]) -> list[str]:
             "camera.json or body.field_of_view_deg, or film a full turn from nearer"
         )
     return sentences
-
-
-def frame_ranges(frame_index: Int[np.ndarray, "n"], rows: Bool[np.ndarray, "n"]) -> str:
-    """Marked frames in words: neighbours among the chosen frames are joined, "3, 81-96"."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], rows.astype(np.int8), [0]])))
-    spans = [(int(frame_index[start]), int(frame_index[end - 1])) for start, end in edges.reshape(-1, 2)]
-    return ", ".join(str(first) if first == last else f"{first}-{last}" for first, last in spans)

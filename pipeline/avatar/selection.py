@@ -99,6 +99,13 @@ def largest_gap_rad(yaw_rad: Float[np.ndarray, "n"]) -> float:
     return float(np.diff(np.append(angles, angles[0] + 2 * np.pi)).max())
 
 
+def frame_ranges(frame_index: Int[np.ndarray, "n"], rows: Bool[np.ndarray, "n"]) -> str:
+    """Marked frames in words: neighbours among the n frames are joined, "3, 81-96"."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], rows.astype(np.int8), [0]])))
+    spans = [(int(frame_index[start]), int(frame_index[end - 1])) for start, end in edges.reshape(-1, 2)]
+    return ", ".join(str(first) if first == last else f"{first}-{last}" for first, last in spans)
+
+
 def _evenly(way: Float[np.ndarray, "m"], quota: int) -> Int[np.ndarray, "k"]:
     """Positions of `quota` entries of a non-decreasing sequence, as evenly spread over its values as they lie."""
     if len(way) <= quota:

@@ -5,6 +5,7 @@ from pipeline.avatar.body import load_anny
 from pipeline.avatar.fit_silhouette import posed_vertices
 from pipeline.avatar.overlay import (
     BODY_OUTLINE_RGB,
+    MARK_RGB,
     MASK_OUTLINE_RGB,
     TILE_COLUMNS,
     TILE_ROWS,
@@ -18,6 +19,10 @@ from tests.avatar.acting import act
 
 @pytest.fixture(scope="module")
 def tile() -> np.ndarray:
+    return drawn("")
+
+
+def drawn(mark: str) -> np.ndarray:
     """A person who faces the camera, drawn over grey."""
     scene = act(load_anny(), 3, turn_rad=0.0)
     image = np.full((scene.camera.height, scene.camera.width, 3), 90, dtype=np.uint8)
@@ -25,13 +30,22 @@ def tile() -> np.ndarray:
     body = load_anny().body(load_anny().shape_defaults)
     mask = np.zeros(image.shape[:2], dtype=np.uint8)
     mask[20:300, 60:200] = 255
-    return draw_overlay(image, mask, vertices, body, scene.camera, "frame 0")
+    return draw_overlay(image, mask, vertices, body, scene.camera, "frame 0", mark)
 
 
 def test_both_outlines_are_drawn(tile: np.ndarray) -> None:
     assert tile.shape == (TILE_ROWS, TILE_COLUMNS, 3)
     for colour in (BODY_OUTLINE_RGB, MASK_OUTLINE_RGB):
         assert (tile == colour).all(-1).sum() > 200
+
+
+def test_a_marked_frame_has_a_border_and_a_word(tile: np.ndarray) -> None:
+    marked, short = drawn("unusable"), drawn("u")
+    red = (marked == MARK_RGB).all(-1)
+    assert not (tile == MARK_RGB).all(-1).any()
+    assert all(side.all() for side in (red[1, 1:-1], red[-2, 1:-1], red[1:-1, 1], red[1:-1, -2]))
+    assert (marked != short).any()
+    assert np.array_equal(marked[20:400, 20:-20], tile[20:400, 20:-20])
 
 
 def test_the_persons_left_is_orange_and_lies_right_in_the_picture(tile: np.ndarray) -> None:

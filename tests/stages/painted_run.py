@@ -13,6 +13,7 @@ from pipeline.io.capture import Capture, image_path, mask_path, save_capture
 from pipeline.io.checkpoint import save_field
 from pipeline.io.image import write_gray, write_rgb
 from pipeline.io.npz import save_body, save_camera, save_motion, save_npz
+from pipeline.io.scores import SCORES_NPZ
 
 FPS = 24.0
 
@@ -48,6 +49,7 @@ def make_run(
         write_gray(mask_path(inputs["frames"], index), mask)
     save_body(inputs["body"] / "body.npz", body)
     save_camera(inputs["body"] / "camera.npz", camera)
+    save_npz(inputs["body"] / SCORES_NPZ, {"usable": np.ones(len(images), dtype=bool)})
     save_motion(inputs["field"] / "motion.npz", motion)
     bounds_m = np.stack([body.vertices.min(axis=0) - 0.1, body.vertices.max(axis=0) + 0.1]).astype(np.float32)
     save_field(inputs["field"] / "field.safetensors", Field(bounds_m, choose_layout(bounds_m, 0.05, 2, 2, 10)))

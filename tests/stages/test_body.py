@@ -1,19 +1,22 @@
 from dataclasses import replace
+from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
 from pydantic import ValidationError
 
 from pipeline.avatar.body import load_anny
-from pipeline.avatar.overlay import BODY_OUTLINE_RGB, MASK_OUTLINE_RGB
+from pipeline.avatar.overlay import BODY_OUTLINE_RGB, MARK_RGB, MASK_OUTLINE_RGB
 from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
 from pipeline.geometry.camera import Camera
 from pipeline.io.capture import IMAGES_FOLDER, MASKS_FOLDER, Capture, image_path, load_capture, mask_path, save_capture
 from pipeline.io.image import read_rgb, write_gray, write_rgb
 from pipeline.io.npz import load_body, load_camera, load_motion, load_npz
-from stages.body import STAGE, Config, run, starting_camera
+from stages.body import STAGE, Config, refuse_poor_fit, run, starting_camera
 from tests.avatar.acting import Act, act
+from tests.avatar.test_fit_quality import result
 
 FRAMES = 8
 
@@ -76,11 +79,52 @@ def test_stage_writes_body_motion_camera_scores_and_overlay(tmp_path, scene: Act
     assert scores["silhouette_iou"].shape == (FRAMES,)
     assert metrics["silhouette_iou_worst"] == scores["silhouette_iou"].min()
     assert scores["lump_share"].max() < 0.005
-    assert metrics["foreign_frames"] == 0
+    assert metrics["foreign_frames"] == metrics["dropped_frames"] == 0
+    assert scores["usable"].all()
     tiles = read_rgb(out / "overlay.png")
     mask_px, body_px = ((tiles == colour).all(-1).sum() for colour in (MASK_OUTLINE_RGB, BODY_OUTLINE_RGB))
     assert 0 < mask_px < 0.6 * body_px  # where both agree, the body's outline hides that of the mask
+    assert not (tiles == MARK_RGB).all(-1).any()
     assert take_warnings() == []
+
+
+def test_a_wrecked_frame_is_marked_named_and_dropped(tmp_path, scene: Act) -> None:
+    frames, out = tmp_path / "frames", tmp_path / "body"
+    out.mkdir()
+    masks = scene.masks()
+    masks[3] = np.roll(masks[3], 70, axis=1)
+    write_capture(frames, scene, scene.camera, masks)
+    take_warnings()
+    metrics = run({"frames": frames}, out, Config(rounds=1))
+    assert metrics["dropped_frames"] == 1
+    assert np.flatnonzero(~load_npz(out / "scores.npz")["usable"]).tolist() == [3]
+    assert any(
+        sentence.startswith("frames 9: the body is not where the person is; 1 frame") for sentence in take_warnings()
+    )
+    assert (read_rgb(out / "overlay.png") == MARK_RGB).all(-1).any()
+
+
+def capture_of(split: list[int]) -> Capture:
+    """The little that is asked of a capture whose fit is judged."""
+    index = 2 * np.arange(len(split))
+    return mock.MagicMock(spec=Capture, folder=Path("frames"), split=np.array(split), frame_index=index)
+
+
+def test_a_fit_without_masks_is_refused() -> None:
+    fit = result(overlap=np.full(12, np.nan))
+    with pytest.raises(UserError, match="median overlap with the masks 0.00"):
+        refuse_poor_fit(fit, capture_of([0] * 12), Config(), False)
+    with pytest.raises(UserError, match="in 12 of 12 training frames"):
+        refuse_poor_fit(fit, capture_of([0] * 12), Config(min_overlap=0.0), False)
+
+
+def test_a_fit_is_refused_where_too_few_frames_are_left_to_learn_from() -> None:
+    overlap = np.where(np.arange(12) < 4, 0.3, 0.9)
+    with pytest.raises(UserError, match=r"in 4 of 12 training frames.*frames 0-6.*split.json.*body.max_dropped"):
+        refuse_poor_fit(result(overlap=overlap), capture_of([0] * 12), Config(), False)
+    refuse_poor_fit(result(overlap=overlap), capture_of([0] * 12), Config(max_dropped=0.34), False)
+    refuse_poor_fit(result(overlap=overlap), capture_of([0, 0, 1, 2] + [0] * 8), Config(), False)
+    refuse_poor_fit(result(overlap=np.maximum(overlap, 0.75)), capture_of([0] * 12), Config(max_dropped=0.0), False)
 
 
 def test_a_thing_beside_the_person_is_told_of(tmp_path, scene: Act) -> None:
@@ -139,7 +183,7 @@ def test_camera_supplied_then_given_then_guessed(tmp_path, scene: Act) -> None:
     assert (camera.fx, deviation) == (333.0, 0.1)
 
 
-@pytest.mark.parametrize("values", [{"height_m": 30.0}, {"rounds": 0}, {"min_overlap": 2.0}, {"heigth_m": 1.7}])
+@pytest.mark.parametrize("values", [{"height_m": 30.0}, {"rounds": 0}, {"max_dropped": 1.0}, {"heigth_m": 1.7}])
 def test_values_out_of_range_and_typos_are_refused(values: dict) -> None:
     with pytest.raises(ValidationError):
         Config(**values)

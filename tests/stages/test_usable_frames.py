@@ -1,0 +1,64 @@
+"""What field, mesh and texture read of a capture where the fit failed in some frames."""
+
+from importlib import import_module
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import pytest
+
+from pipeline.io.capture import Capture
+from pipeline.io.npz import save_motion, save_npz
+from pipeline.io.scores import SCORES_NPZ
+from tests.avatar.scene import painted_scene
+from tests.stages.painted_run import make_run
+
+FRAMES = 14
+HELD_OUT, VALIDATION, WRECKED = {0, 8}, {4, 12}, [0, 4, 5, 6]
+
+
+class EnoughRead(Exception):
+    """The stage has its pictures; the rest takes long and is tested elsewhere."""
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    scene = painted_scene(FRAMES, height_px=96)
+    folders = make_run(
+        tmp_path_factory.mktemp("run"), scene.body, scene.motion, scene.camera, scene.images, scene.masks
+    )
+    save_motion(folders["body"] / "motion.npz", scene.motion)
+    save_npz(folders["body"] / SCORES_NPZ, {"usable": ~np.isin(np.arange(FRAMES), WRECKED)})
+    return folders
+
+
+@pytest.mark.parametrize(
+    ("stage", "not_needed", "after_reading"),
+    [
+        ("field", ["start_learning"], "learn"),
+        ("mesh", ["load_occupancy"], "pixel_footprint_m"),
+        ("texture", [], "make_atlas"),
+    ],
+)
+def test_no_stage_learns_from_a_wrecked_frame_or_loses_a_validation_frame(
+    inputs: dict[str, Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    stage: str,
+    not_needed: list[str],
+    after_reading: str,
+) -> None:
+    read: set[int] = set()
+    image, module = Capture.image, import_module(f"stages.{stage}")
+
+    def noted(capture: Capture, position: int) -> np.ndarray:
+        read.add(int(position))
+        return image(capture, position)
+
+    monkeypatch.setattr(Capture, "image", noted)
+    for name in not_needed:
+        monkeypatch.setattr(module, name, mock.Mock())
+    monkeypatch.setattr(module, after_reading, mock.Mock(side_effect=EnoughRead))
+    with pytest.raises(EnoughRead):
+        module.STAGE.run(inputs, tmp_path, module.STAGE.config())
+    assert read == set(range(FRAMES)) - HELD_OUT - set(WRECKED) | VALIDATION
