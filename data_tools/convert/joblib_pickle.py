@@ -21,27 +21,19 @@ def load_joblib(path: Path) -> Any:
         return _JoblibUnpickler(file).load()
 
 
-# The unpickler in Python, which joblib uses too: the one in C reads ahead, beyond where the arrays lie.
-_PythonUnpickler: Any = pickle._Unpickler
-
-
-class _JoblibUnpickler(_PythonUnpickler):
+class _JoblibUnpickler(RestrictedUnpickler):
     def __init__(self, file: IO[bytes]) -> None:
-        super().__init__(file, encoding="latin1")
+        super().__init__(file, records=[_WRAPPER])
         self._raw = file
-        self._guard = RestrictedUnpickler(file, records=[_WRAPPER])
-
-    def find_class(self, module_name: str, global_name: str) -> Any:
-        return self._guard.find_class(module_name, global_name)
 
     def load_build(self) -> None:
-        """As in pickle; an array's description then gives way to the array."""
+        """As there; an array's description then gives way to the array."""
         super().load_build()
         if isinstance(self.stack[-1], Record):
             self.stack[-1] = self._read_array(self.stack[-1].state)
 
     def _read_array(self, facts: dict[str, Any]) -> np.ndarray:
-        shape, dtype = facts["shape"], np.dtype(facts["dtype"])
+        shape, dtype = facts["shape"], facts["dtype"].dtype
         if dtype.hasobject:
             raise pickle.UnpicklingError("it holds an array of objects")
         if facts.get("numpy_array_alignment_bytes") is not None:
@@ -50,4 +42,4 @@ class _JoblibUnpickler(_PythonUnpickler):
         data = self._raw.read(count * dtype.itemsize)
         return np.frombuffer(data, dtype, count).reshape(shape, order=facts["order"]).copy()
 
-    dispatch = {**_PythonUnpickler.dispatch, pickle.BUILD[0]: load_build}
+    dispatch = {**RestrictedUnpickler.dispatch, pickle.BUILD[0]: load_build}

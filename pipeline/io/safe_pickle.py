@@ -1,10 +1,13 @@
 """Pickles from strangers, read without running anything: arrays and plain containers, everything else is refused.
 
 A pickle is a program that may call any function it names. Here it may name only those that make numpy arrays and plain
-containers. Objects of other packages (chumpy, scipy) are read as `Record`s when the caller asks for it by name, so that
-the packages are neither needed nor run. Python 2's pickles are read too; their byte strings come back as Latin-1 text.
+containers. Those of numpy itself are replaced: they take a type's flags, an array's length and even pointers to objects
+as the pickle gives them. Objects of other packages (chumpy, scipy) are read as `Record`s when the caller asks for it by
+name, so that the packages are neither needed nor run. Python 2's pickles are read too; their byte strings come back as
+Latin-1 text.
 """
 
+import math
 import pickle
 import struct
 from collections import OrderedDict
@@ -26,6 +29,7 @@ _DAMAGE = (
     ImportError,
     LookupError,
     MemoryError,
+    RecursionError,
     TypeError,
     ValueError,
     struct.error,
@@ -46,6 +50,63 @@ class Record:
         self.state = state
 
 
+class _Array:
+    """Stands where a pickle names `numpy.ndarray`, which would take any bytes for pointers to objects."""
+
+
+class _Type:
+    """A numpy type as a pickle describes it: a name and, after BUILD, its parts."""
+
+    def __init__(self, name: object, *_: object) -> None:
+        if not isinstance(name, str):
+            raise pickle.UnpicklingError("a type of numpy has no name")
+        self.name, self.parts = name, None
+
+    def __setstate__(self, state: Any) -> None:
+        """Keep what the pickle hands over."""
+        self.parts = state
+
+    @property
+    def dtype(self) -> np.dtype:
+        """The type that numpy itself makes of the parts, with its own flags; ValueError where the parts contradict."""
+        if self.parts is None:
+            return np.dtype(self.name)
+        _, byte_order, subarray, names, fields, itemsize, *_ = self.parts
+        if fields:
+            formats, offsets = ([fields[name][part] for name in names] for part in (0, 1))
+            formats = [kind.dtype for kind in formats]
+            return np.dtype({"names": list(names), "formats": formats, "offsets": offsets, "itemsize": itemsize})
+        if subarray:
+            return np.dtype((subarray[0].dtype, subarray[1]))
+        return np.dtype(self.name).newbyteorder(byte_order)
+
+
+def _empty_array(*_: object) -> np.ndarray:
+    """What `_reconstruct` does; the array gets its content by BUILD."""
+    return np.empty(0)
+
+
+def _array_state(state: Any) -> tuple[Any, ...]:
+    """What BUILD gives an array: of objects numpy would read on where the shape asks for more than there are."""
+    version, shape, kind, is_fortran, content = state
+    dtype = kind.dtype
+    if dtype.hasobject and len(content) != math.prod(shape):
+        raise pickle.UnpicklingError(f"the content of an array does not fill its shape {shape}")
+    return version, shape, dtype, is_fortran, content
+
+
+def _array_of_bytes(content: Any, kind: Any, shape: Any, order: Any) -> np.ndarray:
+    """What `_frombuffer` does, of bytes alone: no other buffer stays where it is. ValueError for objects."""
+    if not isinstance(content, bytes | bytearray):
+        raise pickle.UnpicklingError("an array's content is no bytes")
+    return np.frombuffer(content, kind.dtype).reshape(shape, order=order)
+
+
+def _scalar(kind: Any, content: Any) -> Any:
+    """What `scalar` does; Python 2's bytes are text by now."""
+    return _array_of_bytes(content.encode("latin1") if isinstance(content, str) else content, kind, 1, "C")[0]
+
+
 def _latin1_bytes(text: str, encoding: str) -> bytes:
     """What Python 3 names `_codecs.encode` for in protocol 2: bytes written as text."""
     if encoding not in ("latin1", "latin-1"):
@@ -60,16 +121,16 @@ def _empty_record(kind: type, base: type, state: object) -> Record:
     return kind()
 
 
-# What numpy itself names when it pickles an array (protocols 0 to 4, and 5) and a scalar; its module moved in numpy 2.
-_NUMPY_BUILDERS: dict[str, Any] = {
-    "multiarray._reconstruct": np.zeros(1).__reduce__()[0],
-    "multiarray.scalar": np.float32(0).__reduce__()[0],
-    "numeric._frombuffer": np.zeros(1).__reduce_ex__(5)[0],
+# What numpy names when it pickles an array (protocols 0 to 4, and 5) and a scalar; its module moved in numpy 2.
+_NUMPY_BUILDERS: dict[str, Callable[..., Any]] = {
+    "multiarray._reconstruct": _empty_array,
+    "multiarray.scalar": _scalar,
+    "numeric._frombuffer": _array_of_bytes,
 }
 
 _ALLOWED: dict[str, Callable[..., Any]] = {
-    "numpy.ndarray": np.ndarray,
-    "numpy.dtype": np.dtype,
+    "numpy.ndarray": _Array,
+    "numpy.dtype": _Type,
     **{f"numpy.{core}.{name}": builder for core in ("core", "_core") for name, builder in _NUMPY_BUILDERS.items()},
     "_codecs.encode": _latin1_bytes,
     "collections.OrderedDict": OrderedDict,
@@ -83,7 +144,11 @@ _ALLOWED: dict[str, Callable[..., Any]] = {
 }
 
 
-class RestrictedUnpickler(pickle.Unpickler):
+# The unpickler in Python: that in C lets nobody look at what BUILD does. It reads no byte ahead, either.
+_PythonUnpickler: Any = pickle._Unpickler
+
+
+class RestrictedUnpickler(_PythonUnpickler):
     """Reads arrays and plain containers; `records` are dotted names of classes that come back as `Record`s."""
 
     def __init__(self, file: IO[bytes], records: Iterable[str] = ()) -> None:
@@ -98,6 +163,17 @@ class RestrictedUnpickler(pickle.Unpickler):
         if found is None:
             raise RefusedGlobalError(name)
         return found
+
+    def load_build(self) -> None:
+        """As in pickle, for what has a state here: it would set any attribute of anything else."""
+        state, instance = self.stack[-1], self.stack[-2]
+        if isinstance(instance, np.ndarray):
+            self.stack[-1] = _array_state(state)
+        elif not isinstance(instance, _Type | Record):
+            raise pickle.UnpicklingError(f"it gives a state to {type(instance).__name__}")
+        super().load_build()
+
+    dispatch = {**_PythonUnpickler.dispatch, pickle.BUILD[0]: load_build}
 
 
 def load_pickle(path: Path, records: Iterable[str] = ()) -> Any:

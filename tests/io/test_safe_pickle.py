@@ -23,6 +23,23 @@ class Call:
         return self.call
 
 
+class Made:
+    """Pickles to any call and any state of what it returns (BUILD)."""
+
+    def __init__(self, function, arguments, state):
+        self.parts = (function, arguments, state)
+
+    def __reduce__(self):
+        return self.parts
+
+
+class Circular:
+    """Pickles to a numpy type that is a field of itself."""
+
+    def __reduce__(self):
+        return np.dtype, ("V8", False, True), (3, "|", None, ("a",), {"a": (self, 0)}, 8, 1, 16)
+
+
 class Foreign:
     """Stands for a class of a package that must not be run."""
 
@@ -49,13 +66,16 @@ def test_arrays_and_containers_come_back(tmp_path, protocol):
         "column order": np.asfortranarray(np.arange(6, dtype=np.uint32).reshape(2, 3)),
         "objects": np.array([None, "x", (1, 2)], dtype=object),
         "fields": np.zeros(2, dtype=[("a", "f4"), ("b", "i2", (3,))]),
+        "other byte order": np.arange(3, dtype=">i4"),
+        "words": np.array(["one", "four"]),
         "scalar": np.float32(2.5),
         "rest": [1, 2.5, True, None, "text", b"\x00\xff", (1,), {3}, frozenset({4}), 1j, OrderedDict(a=1)],
     }
     read = load_pickle(written(tmp_path, content, protocol))
-    for name in ("floats", "column order", "fields"):
+    for name in ("floats", "column order", "fields", "words"):
         np.testing.assert_array_equal(read[name], content[name])
         assert read[name].dtype == content[name].dtype
+    np.testing.assert_array_equal(read["other byte order"], [0, 1, 2])
     assert read["objects"].tolist() == content["objects"].tolist()
     assert read["scalar"] == content["scalar"]
     assert read["rest"] == content["rest"]
@@ -101,6 +121,74 @@ def test_a_marker_would_have_been_made(tmp_path):
     marker = tmp_path / "marker"
     pickle.loads(pickle.dumps(Call(os.system, f"touch {marker}")))
     assert marker.exists()
+
+
+POINTER = id(None).to_bytes(8, "little")
+RECONSTRUCT, SCALAR = np.zeros(1).__reduce__()[0], np.float64(0).__reduce__()[0]
+FROM_BUFFER = np.zeros(1).__reduce_ex__(5)[0]
+
+
+@pytest.mark.parametrize("opcode", [pickle.REDUCE, pickle.NEWOBJ])
+def test_no_array_is_made_of_pointers(tmp_path, opcode):
+    """`numpy.ndarray((1,), "O", 8 bytes)` takes the bytes for the address of an object, whatever lies there."""
+    assert np.ndarray((1,), "O", POINTER).tolist() == [None]  # the attack is a real one
+    arguments = pickle.dumps(((1,), "O", POINTER), 3)[2:-1]
+    path = tmp_path / "some.pkl"
+    path.write_bytes(pickle.PROTO + b"\3" + b"cnumpy\nndarray\n" + arguments + opcode + b".")
+    with pytest.raises(UserError, match=r"some\.pkl cannot be read"):
+        load_pickle(path)
+
+
+def made_array(kind: object, shape: tuple[int, ...], content: object) -> Made:
+    return Made(RECONSTRUCT, (np.ndarray, (0,), b"b"), (1, shape, kind, False, content))
+
+
+def made_type(name: str, state: tuple) -> Made:
+    return Made(np.dtype, (name, False, True), state)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        made_array(made_type("O8", (3, "|", None, None, None, -1, -1, 0)), (1,), POINTER),
+        made_array(made_type("V8", (3, "|", None, ("a",), {"a": (np.dtype("O"), 0)}, 8, 1, 0)), (1,), POINTER),
+        made_array(made_type("V8", (3, "|", None, ("a",), {"a": (np.dtype("f8"), 4096)}, 8, 1, 0)), (1,), POINTER),
+        made_array(np.dtype("O"), (3,), [1]),
+        made_array(Circular(), (1,), POINTER),
+        Call(SCALAR, np.dtype([("a", "O")]), np.frombuffer(POINTER)),
+        Call(SCALAR, np.dtype("O"), POINTER),
+        Call(FROM_BUFFER, np.zeros(2), np.dtype("f8"), (2,), "C"),
+    ],
+    ids=[
+        *("type of objects that denies it", "field of objects that denies it", "field beyond the end"),
+        *("fewer objects than places", "type within itself", "scalar of a foreign pointer"),
+        *("scalar object", "view of another array"),
+    ],
+)
+@pytest.mark.parametrize("protocol", [2, 4])
+def test_numpy_is_not_told_lies(tmp_path, content, protocol):
+    """Each of these makes numpy read where nothing of the pickle lies, or could."""
+    with pytest.raises(UserError, match=r"some\.pkl (cannot be read|is refused)"):
+        load_pickle(written(tmp_path, content, protocol))
+
+
+def test_a_type_cannot_be_changed_under_an_array(tmp_path):
+    """BUILD on a type that an array has already: its bytes would become pointers."""
+    late = pickle.dumps((3, "|", None, ("a",), {"a": (np.dtype("O"), 0)}, 8, 1, 63), 3)[2:-1]
+    kind = b"cnumpy\ndtype\n(S'V8'\nI00\nI01\ntRp900\n"
+    array = b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(I0\ntC\1btR"
+    array += b"(I1\n(I1\ntg900\nI00\nC\x08" + POINTER + b"tb"
+    path = tmp_path / "late.pkl"
+    path.write_bytes(pickle.PROTO + b"\3]" + kind + b"0" + array + b"ag900\n" + late + b"b0.")
+    assert [array.dtype for array in load_pickle(path)] == [np.dtype("V8")]
+
+
+def test_nothing_but_arrays_types_and_records_gets_a_state(tmp_path):
+    """It would be set as attributes, here as the defaults of a function that the next pickle calls."""
+    path = tmp_path / "some.pkl"
+    path.write_bytes(b"c_codecs\nencode\n(N(S'__defaults__'\n(S'latin1'\ntdtb.")
+    with pytest.raises(UserError, match="it gives a state to function"):
+        load_pickle(path)
 
 
 def test_dotted_names_lead_nowhere(tmp_path):
