@@ -18,7 +18,7 @@ from pipeline.io.lens import recorded_focal_px
 from pipeline.io.screening import refuse_bad_input, warn_of_gaps
 from pipeline.io.sightings import Sightings, look_at_all, write_frames
 from pipeline.io.supplied import Supplied, SuppliedSplit, find_supplied
-from pipeline.io.video import Source, open_source
+from pipeline.io.video import IMAGE_FOLDER_FPS, Source, open_source
 from pipeline.io.workers import start_workers
 
 _COUNTED_FRAMES = 6
@@ -34,15 +34,20 @@ class Config(BaseConfig):
     duplicate_noise: float = Field(
         3.0, ge=0.0, le=100.0, description="Frames nearer than this to the last kept one are dropped, times the noise."
     )
+    fps: float | None = Field(
+        None, gt=0.0, le=1000.0, description="Frames a second of a folder of images; null: 30. A video says its own."
+    )
     workers: int = Field(2, ge=1, le=64, description="Processes that look for the person and sharpen masks.")
 
 
 def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, float]:
     """Find the person in all frames, choose frames, write images, masks, landmarks and a contact sheet."""
-    source = open_source(inputs["video"])
-    supplied = find_supplied(inputs["video"], source)
+    source = open_source(inputs["video"], config.fps or IMAGE_FOLDER_FPS)
+    if config.fps is not None and not source.files:
+        raise UserError(f"{source.path} is a video, which says its own frames a second; leave frames.fps out")
     if source.n_frames < config.min_frames:
         raise UserError(f"{source.path} has {source.n_frames} frames, too few: give at least {config.min_frames}")
+    supplied = find_supplied(inputs["video"], source)
     with start_workers(config.workers) as workers:
         looked_at = frames_to_look_at(source, supplied, config)
         sightings = look_at_all(source, supplied, looked_at, _COUNTED_FRAMES, config.max_side_px, workers)
@@ -151,7 +156,7 @@ def make_capture(sightings: Sightings, chosen: list[int], out: Path, source: Sou
 
 STAGE = Stage(
     "frames",
-    version=6,
+    version=7,
     needs=("video",),
     makes=(FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, CONTACT_SHEET),
     config=Config,

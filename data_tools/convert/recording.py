@@ -26,7 +26,7 @@ from pipeline.io.image import IMAGE_SUFFIXES, read_gray, write_gray
 from pipeline.io.safe_pickle import load_npy
 from pipeline.io.smpl_poses import SMPL_POSES_NPZ, SmplPoses, save_smpl_poses
 from pipeline.io.supplied import SuppliedCamera
-from pipeline.io.video import Source, natural_key, read_frames
+from pipeline.io.video import Source, natural_key, picture_size_px
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def mask_folder(folder: Path, source: Source) -> Callable[[int], UInt8[np.ndarra
     found = (path for path in folder.iterdir() if path.suffix.lower() in (".npy", *IMAGE_SUFFIXES))
     files = sorted(found, key=natural_key)
     by_stem = {path.stem: path for path in files}
-    if all(image.stem in by_stem for image in source.files):
+    if source.files and all(image.stem in by_stem for image in source.files):
         files = [by_stem[image.stem] for image in source.files]
     if len(files) != source.n_frames:
         raise UserError(f"{folder} has {len(files)} masks for {source.n_frames} pictures; give one for each")
@@ -120,10 +120,7 @@ def mask_levels(mask: Shaped[np.ndarray, "..."], path: Path) -> UInt8[np.ndarray
 
 def check_size(source: Source, width_px: int, height_px: int, path: Path) -> None:
     """Raise UserError when the pictures are not of the size that the camera in `path` was calibrated for."""
-    frame = next(read_frames(source, lambda index: index == 0, max_side_px=1 << 30), None)
-    if frame is None:
-        raise UserError(f"{source.path} has no picture that can be read; give another recording")
-    height, width = frame.rgb.shape[:2]
+    width, height = picture_size_px(source)
     if (width, height) != (width_px, height_px):
         raise UserError(
             f"{path} is for pictures of {width_px}x{height_px}, those of {source.path} are {width}x{height}; "

@@ -9,9 +9,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from pipeline.avatar.body import Body
-from pipeline.avatar.fit_quality import frame_ranges
 from pipeline.avatar.fit_silhouette import draw_in_window, matching_window
 from pipeline.avatar.overlay import posed_frame
+from pipeline.avatar.selection import frame_ranges
 from pipeline.geometry.camera import Camera
 
 CLOTHING_REACH = 0.03

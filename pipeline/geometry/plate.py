@@ -53,12 +53,33 @@ def covered(
     A shadow scales the plate's colour. Neighbours count so that pixels that the person covers in part are left out.
     Nothing is covered when the scene away from `near_person` has changed as well: the camera has moved.
     """
+    changed = _changed(rgb, plate)
+    share = _share_away(changed, plate, near_person)
+    if np.isnan(share) or share > _MOST_CHANGED:
+        return np.zeros_like(changed)
+    return cv2.erode(changed.astype(np.uint8), np.ones((2 * _MIXED_PX + 1, 2 * _MIXED_PX + 1), np.uint8)) > 0
+
+
+def scene_differs(images: UInt8[np.ndarray, "t h w 3"], persons: Bool[np.ndarray, "t h w"]) -> Bool[np.ndarray, "t"]:
+    """Pictures that show another scene than the rest: there the camera, or the light, has moved.
+
+    `persons` must be generous.
+    """
+    plate = find_plate(images.copy(), persons)
+    pairs = zip(images, persons, strict=True)
+    return np.array([_share_away(_changed(image, plate), plate, person) > _MOST_CHANGED for image, person in pairs])
+
+
+def _changed(rgb: UInt8[np.ndarray, "h w 3"], plate: Plate) -> Bool[np.ndarray, "h w"]:
+    """Pixels whose colour neither the plate nor a shadow on it explains."""
     image, colour = rgb.astype(np.float32), plate.colour.astype(np.float32)
     ones = np.ones((1, 3), dtype=np.float32)
     light = cv2.transform(image * colour, ones) / np.maximum(cv2.transform(colour * colour, ones), 1.0)
     shaded = colour * np.clip(light, _DEEPEST_SHADOW, 1.0)[..., None]
-    changed = plate.known & (np.abs(image - shaded).max(axis=-1) > _CHANGE_LEVELS)
+    return plate.known & (np.abs(image - shaded).max(axis=-1) > _CHANGE_LEVELS)
+
+
+def _share_away(changed: Bool[np.ndarray, "h w"], plate: Plate, near_person: Bool[np.ndarray, "h w"]) -> float:
+    """How much of the known scene away from the person has changed; nan where none is known."""
     away = plate.known & ~near_person
-    if not away.any() or changed[away].mean() > _MOST_CHANGED:
-        return np.zeros_like(changed)
-    return cv2.erode(changed.astype(np.uint8), np.ones((2 * _MIXED_PX + 1, 2 * _MIXED_PX + 1), np.uint8)) > 0
+    return float(changed[away].mean()) if away.any() else float("nan")

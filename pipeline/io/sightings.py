@@ -14,7 +14,13 @@ from pipeline.avatar.hands import HandDetector, Hands, no_hands, stack_hands
 from pipeline.avatar.person import PersonDetector
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track
-from pipeline.geometry.matte import beyond_doubt_outside, sharpen_mask, steady_mask, with_painted_backdrop
+from pipeline.geometry.matte import (
+    beyond_doubt_outside,
+    sharpen_mask,
+    steady_mask,
+    with_painted_backdrop,
+    without_backdrop,
+)
 from pipeline.geometry.plate import Plate, find_plate
 from pipeline.io.capture import IMAGES_FOLDER, MASKS_FOLDER, image_path, mask_path
 from pipeline.io.image import to_uint8, write_gray, write_rgb
@@ -26,6 +32,8 @@ from pipeline.io.workers import Workers
 _SMALL_SIDE_PX = 320
 # Mask level of 255 from which a pixel counts as the person there.
 _PERSON_LEVEL = 100
+# A mask shows the person when it has this share of the usual area: specks of a supplied mask are nobody.
+_LEAST_AREA = 0.1
 # Most pictures that the empty scene is put together from; they are in memory at the same time.
 _PLATE_PICTURES = 32
 
@@ -45,8 +53,9 @@ class _Look(NamedTuple):
 class Sightings:
     """All frames that were looked at, n of them, in order.
 
+    found: the mask shows the person, who may have no landmarks when masks are supplied.
     grays, persons: small pictures and person masks; masks_png: the detector's soft masks, PNG-encoded to save memory.
-    landmarks and hands as in `Capture`, nan where no person was found. n_people: -1 where people were not counted.
+    landmarks and hands as in `Capture`, nan where unknown. n_people: -1 where people were not counted.
     """
 
     frame_index: Int[np.ndarray, "n"]
@@ -74,6 +83,7 @@ def look_at_all(
     """
     counted = {looked_at[int(k)] for k in np.linspace(0, len(looked_at) - 1, n_counted)} if looked_at else set()
     wanted = set(looked_at)
+    needs_landmarks = supplied.landmarks is None or supplied.landmarks.landmarks_world_m is None
     seen: list[tuple[int, float]] = []
     shape: list[tuple[int, int, float]] = []
 
@@ -82,20 +92,21 @@ def look_at_all(
             seen.append((frame.index, frame.time_s))
             shape.append((frame.rgb.shape[0], frame.rgb.shape[1], frame.scale))
             mask = supplied_mask(supplied, frame)
-            yield frame.rgb, mask, supplied.landmarks is None, frame.index in counted
+            yield frame.rgb, mask, needs_landmarks, frame.index in counted
 
     looks = list(track(workers.map(_look, tasks()), "looking for the person", total=len(looked_at)))
     if not looks:
         raise UserError(f"{source.path} has no frame that can be read; give another video")
     height, width, scale = shape[0]
     landmarks = _landmarks(looks, np.array([index for index, _ in seen]), supplied, scale)
+    persons = np.stack([look.person for look in looks])
     return Sightings(
         frame_index=np.array([index for index, _ in seen], dtype=np.int32),
         time_s=np.array([time_s for _, time_s in seen]),
-        found=np.isfinite(landmarks[..., :2]).all(axis=(1, 2)) & np.array([bool(look.person.any()) for look in looks]),
+        found=_shows_person(persons),
         n_people=np.array([look.n_people for look in looks], dtype=np.int32),
         grays=np.stack([look.gray for look in looks]),
-        persons=np.stack([look.person for look in looks]),
+        persons=persons,
         landmarks_px=landmarks[..., :2],
         landmarks_visibility=np.nan_to_num(landmarks[..., 2]),
         landmarks_world_m=landmarks[..., 3:],
@@ -119,7 +130,8 @@ def write_frames(
 ) -> None:
     """Write the picture and the mask of the sightings at `positions` into `out`.
 
-    A supplied mask is written as it is; the detector's is steadied with its neighbours in time and sharpened.
+    A supplied mask is written as it is; the detector's is steadied with its neighbours in time and sharpened. Where the
+    mask is soft the picture holds the person's colour alone.
     """
     plate = None if supplied.read_mask is not None else scene_without_person(source, supplied, sightings, max_side_px)
     for folder in (IMAGES_FOLDER, MASKS_FOLDER):
@@ -217,16 +229,26 @@ def _look(
 def _landmarks(
     looks: Sequence[_Look], frame_index: Int[np.ndarray, "n"], supplied: Supplied, scale: float
 ) -> Float[np.ndarray, "n 33 6"]:
-    """Pixel position, visibility and world position of all landmarks; nan where no person was found."""
-    if supplied.landmarks is None:
-        missing = np.full((N_LANDMARKS, 6), np.nan, dtype=np.float32)
-        return np.stack([missing if look.landmarks is None else look.landmarks for look in looks])
+    """Pixel position, visibility and world position of all landmarks, as supplied or else detected; nan: unknown."""
+    missing = np.full((N_LANDMARKS, 6), np.nan, dtype=np.float32)
+    landmarks = np.stack([missing if look.landmarks is None else look.landmarks for look in looks])
     given = supplied.landmarks
+    if given is None:
+        return landmarks
     points_px = given.landmarks_px[frame_index]
     if supplied.camera is not None:
         points_px = supplied.camera.undistort_points(points_px)
-    parts = [points_px * scale, given.visibility[frame_index][..., None], given.landmarks_world_m[frame_index]]
-    return np.concatenate(parts, axis=-1).astype(np.float32)
+    landmarks[..., :2], landmarks[..., 2] = points_px * scale, given.visibility[frame_index]
+    if given.landmarks_world_m is not None:
+        landmarks[..., 3:] = given.landmarks_world_m[frame_index]
+    return landmarks
+
+
+def _shows_person(persons: Bool[np.ndarray, "n h w"]) -> Bool[np.ndarray, "n"]:
+    """Whose mask has more than specks, beside the median area of those that have anything."""
+    area_px = persons.sum(axis=(1, 2))
+    usual_px = np.median(area_px[area_px > 0]) if area_px.any() else 0.0
+    return (area_px > 0) & (area_px >= _LEAST_AREA * usual_px)
 
 
 def _neighbours(position: int, sightings: Sightings) -> list[int]:
@@ -252,7 +274,7 @@ def _windows(frames: Iterable[Frame], sightings: Sightings, wanted: set[int]) ->
 def _write_supplied(
     rgb: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"], out: Path, frame_index: int
 ) -> None:
-    write_rgb(image_path(out, frame_index), rgb)
+    write_rgb(image_path(out, frame_index), without_backdrop(rgb, mask))
     write_gray(mask_path(out, frame_index), mask)
 
 

@@ -26,7 +26,7 @@ from pipeline.io.npz import load_npz, save_npz
 SMPL_POSES_NPZ = "smpl_poses.npz"
 N_BODY_POSE, N_BETAS = 69, 10
 RIGID = 1e-3
-"""How far a rotation in `smpl_to_camera` may be from one."""
+"""How far a rotation that somebody supplies may be from one."""
 
 GENDERS = ("male", "female", "neutral", "unknown")
 _ROW_SHAPES = {
@@ -57,6 +57,17 @@ class SmplPoses:
         return replace(self, **{name: getattr(self, name)[rows] for name in _ROW_SHAPES})
 
 
+def is_rigid(transforms: Float[np.ndarray, "*n 4 4"]) -> bool:
+    """Whether each is a rotation and a shift on column vectors: finite, no scale, no mirror, last row 0 0 0 1."""
+    turn = transforms[..., :3, :3]
+    return bool(
+        np.isfinite(transforms).all()
+        and (np.abs(turn @ np.swapaxes(turn, -1, -2) - np.eye(3)) <= RIGID).all()
+        and (np.linalg.det(turn) > 0).all()
+        and (np.abs(transforms[..., 3, :] - np.eye(4)[3]) <= RIGID).all()
+    )
+
+
 def save_smpl_poses(path: Path, poses: SmplPoses) -> None:
     """Write the poses; `load_smpl_poses` is the inverse."""
     arrays = {name: getattr(poses, name).astype(np.float32) for name in _ROW_SHAPES}
@@ -85,7 +96,6 @@ def load_smpl_poses(path: Path) -> SmplPoses:
     floats = {name: arrays[name].astype(np.float32) for name in _ROW_SHAPES if name != "frame_index"}
     if broken := next((name for name, values in floats.items() if not np.isfinite(values).all()), None):
         raise UserError(f"{path}: `{broken}` holds a number that is not finite; leave out frames without a pose")
-    turn = floats["smpl_to_camera"][:, :3, :3]
-    if (np.abs(turn @ turn.transpose(0, 2, 1) - np.eye(3)) > RIGID).any() or (np.linalg.det(turn) < 0).any():
+    if not is_rigid(floats["smpl_to_camera"]):
         raise UserError(f"{path}: `smpl_to_camera` must be a rotation and a shift; divide its scale out")
     return SmplPoses(frame_index=arrays["frame_index"].astype(np.int32), **floats, gender=gender)

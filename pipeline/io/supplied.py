@@ -1,16 +1,19 @@
 """What lies beside a video and wins: masks, landmarks, a camera over the detector, a split over index modulo eight.
 
-    masks/        one image a frame, in natural order or named as the images are
+    masks/        one image a frame, named as the images are or else in natural order; 0 to 255, or 0 and 1
     masks.npz     array `masks` (n, h, w);  masks.hdf5: the same, as PeopleSnapshot ships it
-    landmarks.npz `landmarks_px` (n, 33, 2) in pixels of the original frames, optionally `landmarks_visibility` (n, 33)
-                  and `landmarks_world_m` (n, 33, 3); MediaPipe's 33 points in its order
-    camera.json   fx, fy, cx, cy in pixels of the original frames, optionally `distortion` (OpenCV's k1 k2 p1 p2 [k3])
-                  and `world_to_camera` (4 x 4, row-major)
+    landmarks.npz MediaPipe's 33 points in its order: `landmarks_px` (n, 33, 2) in pixels of the original frames, nan
+                  where unknown, optionally `landmarks_visibility` (n, 33), 0 to 1, and `landmarks_world_m` (n, 33, 3),
+                  metres about the hips' centre in camera axes, which else the detector gives
+    camera.json   fx, fy, cx, cy in pixels of the original frames, optionally `width` and `height` of the pictures that
+                  they are for, `distortion` (OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]]) and `world_to_camera` (4 x 4,
+                  row-major, a rotation and a shift in metres; the world is +Y up)
     split.json    lists of frame indices `train` and `heldout`, optionally `validation` (else every eighth training
                   frame, from the fifth on); the frames that stand in none are left out
     smpl_poses.npz  poses that others fitted, of any frames (`pipeline.io.smpl_poses`); they need the camera they are of
 
-Row i of each array belongs to frame i of the recording.
+Row i of each array belongs to frame i of the recording, and there are as many rows as frames. The original frames are
+those that a viewer shows: turned upright as the container or EXIF asks, with square pixels, lens distortion still in.
 """
 
 import json
@@ -28,10 +31,15 @@ from pipeline.core.errors import UserError
 from pipeline.geometry.camera import UPRIGHT_WORLD_TO_CAMERA, Camera
 from pipeline.io.image import IMAGE_SUFFIXES, read_gray
 from pipeline.io.npz import load_npz
-from pipeline.io.smpl_poses import SMPL_POSES_NPZ, SmplPoses, load_smpl_poses
-from pipeline.io.video import Source, natural_key
+from pipeline.io.smpl_poses import SMPL_POSES_NPZ, SmplPoses, is_rigid, load_smpl_poses
+from pipeline.io.video import Source, natural_key, picture_size_px
 
 N_LANDMARKS = 33
+# How far from the middle a principal point may lie, as a share of the picture's side, when nothing says what size of
+# picture it is for. That of a calibration for pictures of half the size lies at a quarter.
+_MOST_OFF_CENTRE = 0.2
+# So many masks tell whether a folder holds levels or zeros and ones.
+_MASKS_TRIED = 8
 _SPLITS = {"train": TRAIN, "validation": VALIDATION, "heldout": HELDOUT}
 
 
@@ -77,11 +85,14 @@ class SuppliedCamera:
 
 @dataclass(frozen=True)
 class SuppliedLandmarks:
-    """Landmarks for every frame of the recording, in pixels of the original frames."""
+    """Landmarks for every frame of the recording, in pixels of the original frames; nan where unknown.
+
+    landmarks_world_m: None where the file does not give them.
+    """
 
     landmarks_px: Float[np.ndarray, "n 33 2"]
     visibility: Float[np.ndarray, "n 33"]
-    landmarks_world_m: Float[np.ndarray, "n 33 3"]
+    landmarks_world_m: Float[np.ndarray, "n 33 3"] | None
 
 
 @dataclass(frozen=True)
@@ -123,7 +134,7 @@ def find_supplied(path: Path, source: Source) -> Supplied:
         read_mask,
         mask_source,
         _read_landmarks(landmarks_path, source) if landmarks_path.is_file() else None,
-        _read_camera(camera_path) if camera_path.is_file() else None,
+        _read_camera(camera_path, source) if camera_path.is_file() else None,
         _read_split(split_path, source) if split_path.is_file() else None,
         _read_smpl_poses(poses_path, source) if poses_path.is_file() else None,
     )
@@ -145,10 +156,18 @@ def _find_masks(path: Path, source: Source) -> tuple[Callable[[int], np.ndarray]
 def _mask_folder(folder: Path, source: Source) -> Callable[[int], np.ndarray]:
     files = sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES), key=natural_key)
     by_stem = {p.stem: p for p in files}
-    if source.files and all(image.stem in by_stem for image in source.files):
-        files = [by_stem[image.stem] for image in source.files]
+    names = [image.stem for image in source.files]
+    if any(name in by_stem for name in names):
+        if missing := next((name for name in names if name not in by_stem), None):
+            raise UserError(
+                f"{folder} has masks named as the images are, but none for {missing}; add it, or number the masks so "
+                "that none is named as an image"
+            )
+        files = [by_stem[name] for name in names]
     _check_count(folder, len(files), source)
-    return lambda index: read_gray(files[index])
+    tried = {int(k) for k in np.linspace(0, len(files) - 1, _MASKS_TRIED)}
+    unit = 255 if all(read_gray(files[k]).max() <= 1 for k in sorted(tried)) else 1
+    return lambda index: cv2.convertScaleAbs(read_gray(files[index]), alpha=unit)
 
 
 def _mask_array(masks: np.ndarray, path: Path, source: Source) -> Callable[[int], np.ndarray]:
@@ -179,28 +198,62 @@ def _read_landmarks(path: Path, source: Source) -> SuppliedLandmarks:
         raise UserError(f"{path}: `landmarks_px` must have shape (frames, {N_LANDMARKS}, 2), found {shape}")
     _check_count(path, len(points), source)
     visibility = arrays.get("landmarks_visibility", np.isfinite(points).all(-1))
-    world = arrays.get("landmarks_world_m", np.full((*points.shape[:2], 3), np.nan))
-    if visibility.shape != points.shape[:2] or world.shape != (*points.shape[:2], 3):
+    world = arrays.get("landmarks_world_m")
+    if visibility.shape != points.shape[:2] or (world is not None and world.shape != (*points.shape[:2], 3)):
         raise UserError(
             f"{path}: `landmarks_visibility` or `landmarks_world_m` does not fit `landmarks_px`; mend its shape"
         )
-    return SuppliedLandmarks(points.astype(np.float32), visibility.astype(np.float32), world.astype(np.float32))
+    if (outside := ((visibility < 0) | (visibility > 1)).any(axis=1)).any():
+        raise UserError(
+            f"{path}: `landmarks_visibility` of frame {outside.argmax()} leaves [0, 1]; bring it to that range"
+        )
+    return SuppliedLandmarks(
+        points.astype(np.float32),
+        visibility.astype(np.float32),
+        None if world is None else world.astype(np.float32),
+    )
 
 
-def _read_camera(path: Path) -> SuppliedCamera:
+def _read_camera(path: Path, source: Source) -> SuppliedCamera:
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
         fx, fy, cx, cy = (float(values[key]) for key in ("fx", "fy", "cx", "cy"))
+        size_px = (int(values["width"]), int(values["height"])) if {"width", "height"} & set(values) else None
         distortion = tuple(float(value) for value in values.get("distortion") or ())
         pose = values.get("world_to_camera")
         world_to_camera = None if pose is None else np.array(pose, dtype=np.float32).reshape(4, 4)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise UserError(f"{path} is no camera ({error}); it needs numbers fx, fy, cx, cy in pixels") from None
-    if min(fx, fy) <= 0 or not np.isfinite([fx, fy, cx, cy]).all():
-        raise UserError(f"{path}: fx and fy must be above 0 pixels, found {fx} and {fy}")
+    if min(fx, fy) <= 0 or not np.isfinite([fx, fy, cx, cy, *distortion]).all():
+        raise UserError(
+            f"{path}: fx and fy must be above 0 pixels and all numbers finite, found fx {fx}, fy {fy}, cx {cx}, "
+            f"cy {cy}, distortion {list(distortion)}; mend them"
+        )
     if len(distortion) not in (0, 4, 5, 8):
         raise UserError(f"{path}: distortion needs 4, 5 or 8 numbers (k1 k2 p1 p2 ...), found {len(distortion)}")
+    if world_to_camera is not None and not is_rigid(world_to_camera):
+        raise UserError(
+            f"{path}: `world_to_camera` must be a rotation and a shift in metres, with 0 0 0 1 in its last row; "
+            "divide its scale out, or leave it out"
+        )
+    _check_picture(path, cx, cy, size_px, source)
     return SuppliedCamera(fx, fy, cx, cy, distortion, world_to_camera)
+
+
+def _check_picture(path: Path, cx: float, cy: float, size_px: tuple[int, int] | None, source: Source) -> None:
+    """UserError for a calibration of pictures of another size: everything would be fitted wrongly without a sign."""
+    width, height = picture_size_px(source)
+    if size_px is not None and size_px != (width, height):
+        raise UserError(
+            f"{path} is for pictures of {size_px[0]}x{size_px[1]}, those of {source.path} are {width}x{height}; "
+            "give the camera of these pictures, or the original pictures"
+        )
+    if size_px is None and max(abs(cx / width - 0.5), abs(cy / height - 0.5)) > _MOST_OFF_CENTRE:
+        raise UserError(
+            f"{path}: cx {cx:g}, cy {cy:g} lie far from the middle of the pictures of {source.path}, which are "
+            f"{width}x{height}; give the camera of these pictures, or, where they were cut out of larger ones, confirm "
+            f'it with "width": {width}, "height": {height} in that file'
+        )
 
 
 def _read_split(path: Path, source: Source) -> SuppliedSplit:
@@ -239,7 +292,8 @@ def _read_smpl_poses(path: Path, source: Source) -> SmplPoses:
 
 
 def _check_count(path: Path, count: int, source: Source) -> None:
-    if count < source.n_frames:
+    """UserError for too few, and for too many as well: nothing says which frame each belongs to."""
+    if count != source.n_frames:
         raise UserError(
             f"{path} has {count} entries for {source.n_frames} frames of {source.path}; "
             "give one for each frame, or remove it and the detector will be used"

@@ -47,10 +47,11 @@ class Frame:
     scale: float
 
 
-def open_source(path: Path) -> Source:
+def open_source(path: Path, image_fps: float = IMAGE_FOLDER_FPS) -> Source:
     """Look at a file or folder and say what recording it holds.
 
-    A folder may hold images, one video file, or a folder `images`/`frames` with images.
+    A folder may hold images, one video file, or a folder `images`/`frames` with images. Images do not say how many a
+    second there were; `image_fps` does.
     Raises UserError when there is none, or when the file cannot be read as a video.
     """
     if path.is_file():
@@ -60,7 +61,7 @@ def open_source(path: Path) -> Source:
     files = _images_in(path)
     videos = sorted(p for p in path.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES)
     if files:
-        return Source(path, files, len(files), IMAGE_FOLDER_FPS)
+        return Source(path, files, len(files), image_fps)
     if len(videos) == 1:
         return _open_video(videos[0])
     if videos:
@@ -68,7 +69,7 @@ def open_source(path: Path) -> Source:
     for folder in (path / name for name in _IMAGE_FOLDER_NAMES):
         if folder.is_dir() and _images_in(folder):
             files = _images_in(folder)
-            return Source(folder, files, len(files), IMAGE_FOLDER_FPS)
+            return Source(folder, files, len(files), image_fps)
     if not any(path.iterdir()):
         raise UserError(f"folder {path} is empty; put a video or images of the person into it")
     raise UserError(f"folder {path} holds neither a video nor images; put one of them into it")
@@ -90,6 +91,17 @@ def read_frames(source: Source, is_wanted: Callable[[int], bool], max_side_px: i
             )
         size_px = rgb.shape[:2]
         yield Frame(index, time_s, *_shrunk(rgb, max_side_px))
+
+
+def picture_size_px(source: Source) -> tuple[int, int]:
+    """Width and height of the recording's first picture, upright and with square pixels.
+
+    Raises UserError when no picture can be read.
+    """
+    first = next(read_frames(source, lambda index: index == 0, max_side_px=1 << 30), None)
+    if first is None:
+        raise UserError(f"{source.path} has no picture that can be read; give another recording")
+    return first.rgb.shape[1], first.rgb.shape[0]
 
 
 def natural_key(path: Path) -> list[tuple[int, str]]:
@@ -125,18 +137,26 @@ def _images(source: Source, is_wanted: Callable[[int], bool]) -> Iterator[tuple[
 
 def _video(source: Source, is_wanted: Callable[[int], bool]) -> Iterator[tuple[int, float, np.ndarray]]:
     start_s: float | None = None
+    time_s: float | None = None
     index = -1
     with av.open(str(source.path)) as container:
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
         try:
             for index, picture in enumerate(container.decode(stream)):
-                time_s = picture.time if picture.time is not None else index / source.fps
+                time_s = _later(picture.time, time_s, 1.0 / source.fps)
                 start_s = time_s if start_s is None else start_s
                 if is_wanted(index):
                     yield index, time_s - start_s, _upright_rgb(picture, stream.sample_aspect_ratio)
         except av.FFmpegError as error:
             warn(f"{source.path} breaks off after {index + 1} frames ({error.strerror}); going on with those")
+
+
+def _later(stamp_s: float | None, before_s: float | None, step_s: float) -> float:
+    """A frame's time stamp, or one step after the frame before where it is missing or does not lie after that one."""
+    if before_s is None:
+        return stamp_s or 0.0
+    return stamp_s if stamp_s is not None and stamp_s > before_s else before_s + step_s
 
 
 def _upright_rgb(picture: av.VideoFrame, aspect: Fraction | None) -> UInt8[np.ndarray, "h w 3"]:

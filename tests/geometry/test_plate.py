@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.geometry.matte import sharpen_mask
-from pipeline.geometry.plate import covered, find_plate
+from pipeline.geometry.plate import covered, find_plate, scene_differs
 
 SHAPE = (80, 120)
 
@@ -87,6 +87,21 @@ def test_nothing_is_covered_when_the_camera_has_moved():
     plate = find_plate(images.copy(), persons)
     moved = np.roll(images[0], 5, axis=0)
     assert not covered(moved, plate, near(persons[0])).any()
+
+
+@pytest.mark.parametrize("moved", [[], [0, 7], [2, 7, 12]])
+def test_pictures_from_elsewhere_are_told_from_the_rest(moved):
+    images, persons = recording()
+    for k in moved:
+        images[k] = np.roll(images[k], 5, axis=0)
+    before = images.copy()
+    np.testing.assert_array_equal(np.flatnonzero(scene_differs(images, np.stack([near(p) for p in persons]))), moved)
+    np.testing.assert_array_equal(images, before)
+
+
+def test_where_the_person_fills_the_picture_no_scene_differs():
+    images, persons = recording()
+    assert not scene_differs(images, np.ones_like(persons)).any()
 
 
 @pytest.mark.parametrize("has_plate", [False, True])

@@ -22,13 +22,17 @@ def tiff(order: str, focal_mm: int) -> bytes:
     return start + main + struct.pack(order + "I", 0) + exif + struct.pack(order + "HHIHH", 0xA405, 3, 1, focal_mm, 0)
 
 
+def with_exif(jpeg: bytes, exif: bytes) -> bytes:
+    """A JPEG file with this TIFF structure as its APP1 segment."""
+    body = b"Exif\0\0" + exif
+    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + jpeg[2:]
+
+
 def write_folder(folder: Path, exif: bytes) -> Path:
     """Two pictures of 300 x 400 pixels, the first with metadata."""
     folder.mkdir()
     jpeg = cv2.imencode(".jpg", np.full((400, 300, 3), 90, dtype=np.uint8))[1].tobytes()
-    body = b"Exif\0\0" + exif
-    segment = b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body
-    (folder / "0.jpg").write_bytes(jpeg[:2] + segment + jpeg[2:])
+    (folder / "0.jpg").write_bytes(with_exif(jpeg, exif))
     (folder / "1.jpg").write_bytes(jpeg)
     return folder
 

@@ -18,6 +18,7 @@ def make_poses(n: int = 3) -> SmplPoses:
     turned = rows(4, 4)
     turned[:, :3, :3] = np.linalg.qr(turned[:, :3, :3])[0]
     turned[:, :3, 0] *= np.linalg.det(turned[:, :3, :3])[:, None]
+    turned[:, 3] = [0, 0, 0, 1]
     return SmplPoses(index, rows(3), rows(69), rows(3), rows(10), turned, "female")
 
 
@@ -57,6 +58,7 @@ def test_gender_may_be_left_out(tmp_path):
         ("transl", np.full((3, 3), np.nan), "`transl` holds a number that is not finite"),
         ("smpl_to_camera", np.tile(2 * np.eye(4), (3, 1, 1)), "must be a rotation and a shift"),
         ("smpl_to_camera", np.tile(np.diag([1.0, -1, 1, 1]), (3, 1, 1)), "must be a rotation and a shift"),
+        ("smpl_to_camera", np.tile(np.diag([1.0, 1, 1, 2]), (3, 1, 1)), "must be a rotation and a shift"),
     ],
 )
 def test_what_does_not_fit_is_named(tmp_path, name, value, message):

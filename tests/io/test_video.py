@@ -58,6 +58,49 @@ def test_variable_frame_rate_keeps_its_times(tmp_path):
     assert [frame.time_s for frame in frames] == pytest.approx([t / 25 for t in times])
 
 
+def test_a_stamp_that_goes_back_counts_one_frame_later(tmp_path):
+    """Matroska keeps milliseconds in two bytes behind each block's track number; the fourth frame's become 40."""
+    write_video(tmp_path / "a.mkv", [ramp(20 * k) for k in range(6)])
+    data = bytearray((tmp_path / "a.mkv").read_bytes())
+    at = data.index(b"\x81" + (120).to_bytes(2, "big") + b"\0")
+    data[at + 1 : at + 3] = (40).to_bytes(2, "big")
+    (tmp_path / "odd.mkv").write_bytes(data)
+    frames = list(video.read_frames(video.open_source(tmp_path / "odd.mkv"), everything, 1000))
+    assert [frame.time_s for frame in frames] == pytest.approx([k / 25 for k in range(6)])
+
+
+def test_a_video_without_stamps_runs_at_its_rate(tmp_path):
+    write_video(tmp_path / "a.h264", [ramp(20 * k) for k in range(6)])
+    frames = list(video.read_frames(video.open_source(tmp_path / "a.h264"), everything, 1000))
+    assert [frame.time_s for frame in frames] == pytest.approx([k / 25 for k in range(6)])
+
+
+@pytest.mark.parametrize(
+    ("matrix", "red_weight", "blue_weight"), [(1, 0.2126, 0.0722), (6, 0.299, 0.114), (9, 0.2627, 0.0593)]
+)
+def test_colours_are_read_with_the_matrix_that_the_file_names(tmp_path, matrix, red_weight, blue_weight):
+    """ITU-R BT.709, BT.601 and BT.2020 (H.273's numbers 1, 6, 9), encoded here by their own equations."""
+    colours = np.array([[200, 60, 50], [40, 160, 70], [60, 80, 190], [225, 175, 150]])
+    path = tmp_path / "a.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=25, options={"crf": "1", "bf": "0"})
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        stream.codec_context.colorspace = matrix
+        stream.codec_context.color_range = 1  # 16 to 235
+        for red, green, blue in colours / 255.0:
+            luma = red_weight * red + (1.0 - red_weight - blue_weight) * green + blue_weight * blue
+            chroma = (blue - luma) / (2.0 - 2.0 * blue_weight), (red - luma) / (2.0 - 2.0 * red_weight)
+            levels = np.rint([16 + 219 * luma, 128 + 224 * chroma[0], 128 + 224 * chroma[1]])
+            planes = np.repeat(levels, [48 * 64, 24 * 32, 24 * 32]).reshape(72, 64).astype(np.uint8)
+            frame = av.VideoFrame.from_ndarray(planes, format="yuv420p")
+            frame.colorspace, frame.color_range = matrix, 1
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    frames = list(video.read_frames(video.open_source(path), everything, 1000))
+    shown = np.array([frame.rgb.mean(axis=(0, 1)) for frame in frames])
+    np.testing.assert_allclose(shown, colours, atol=2.5)
+
+
 def test_rotation_in_the_container_is_honoured(tmp_path):
     """The track header's matrix (0 1; -1 0) sends the picture's right side to the bottom: a clockwise quarter turn."""
     picture = ramp(30)
@@ -110,6 +153,17 @@ def test_image_folder_in_natural_order_at_thirty_a_second(tmp_path):
     frames = list(video.read_frames(source, everything, 1000))
     assert [int(frame.rgb.mean()) for frame in frames] == [20, 40, 200]
     assert [frame.time_s for frame in frames] == pytest.approx([0, 1 / 30, 2 / 30])
+    slow = video.open_source(tmp_path, image_fps=12.5)
+    assert slow.fps == 12.5
+    assert [frame.time_s for frame in video.read_frames(slow, everything, 1000)] == pytest.approx([0, 0.08, 0.16])
+
+
+def test_the_size_of_pictures_is_that_which_a_viewer_shows(tmp_path):
+    write_video(tmp_path / "a.mp4", [ramp(90)] * 3, aspect=Fraction(4, 3))
+    assert video.picture_size_px(video.open_source(tmp_path / "a.mp4")) == (85, 48)
+    (tmp_path / "images").mkdir()
+    write_rgb(tmp_path / "images" / "0.png", ramp(9, 20, 30))
+    assert video.picture_size_px(video.open_source(tmp_path / "images")) == (30, 20)
 
 
 def test_folder_with_a_video_or_a_folder_of_frames(tmp_path):

@@ -6,13 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
+from data_tools.movie import write_movie
 from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
 from pipeline.io.capture import load_capture
 from pipeline.io.image import write_gray, write_rgb
-from pipeline.io.npz import save_npz
+from pipeline.io.npz import load_npz, save_npz
 from pipeline.io.smpl_poses import save_smpl_poses
 from stages import frames
+from tests.io.test_lens import tiff, with_exif
 from tests.io.test_smpl_poses import make_poses
 
 
@@ -113,6 +115,93 @@ def test_large_images_are_stored_smaller_and_the_camera_with_them(tmp_path):
     assert capture.image(0).shape == (48, 64, 3)
     assert (capture.camera.fx, capture.camera.width, capture.scale) == (50, 64, 0.5)
     np.testing.assert_allclose(capture.landmarks_px, 10)
+
+
+def bent(points_px: np.ndarray) -> np.ndarray:
+    """Where a lens with OpenCV's k1 = 0.4 shows what a pinhole would show at these points (pixel centres at +0.5)."""
+    ideal = (points_px - (64, 48)) / 80
+    return 80 * ideal * (1 + 0.4 * (ideal**2).sum(axis=-1, keepdims=True)) + (64, 48)
+
+
+def film_through_a_lens(folder, n=17):
+    """A disc of 14 pixels walks away from the centre's left, bent by a lens in pictures, masks and landmarks.
+
+    Returns where a pinhole would show its centre in each frame.
+    """
+    (folder / "masks").mkdir(parents=True)
+    (folder / "camera.json").write_text('{"fx": 80, "fy": 80, "cx": 64, "cy": 48, "distortion": [0.4, 0, 0, 0]}')
+    rows, columns = np.mgrid[:96, :128] + 0.5
+    seen_px = np.stack([columns, rows], axis=-1)
+    ideal_px = seen_px
+    for _ in range(40):
+        ideal_px = ideal_px + seen_px - bent(ideal_px)
+    centres_px = np.array([[46.0 - k, 38.0 - 0.5 * k] for k in range(n)])
+    for k, centre_px in enumerate(centres_px):
+        inside = np.linalg.norm(ideal_px - centre_px, axis=-1) < 14
+        write_rgb(folder / f"{k}.png", np.where(inside[..., None], np.uint8([200, 150, 90]), np.uint8(30)))
+        write_gray(folder / "masks" / f"{k}.png", np.where(inside, np.uint8(255), np.uint8(0)))
+    points_px = bent(centres_px)[:, None].repeat(33, axis=1)
+    points_px[3, 13] = np.nan
+    save_npz(folder / "landmarks.npz", {"landmarks_px": points_px, "landmarks_world_m": np.zeros((n, 33, 3))})
+    return centres_px
+
+
+@pytest.mark.parametrize("max_side_px", [128, 64])
+def test_picture_mask_and_landmarks_are_undistorted_together(tmp_path, max_side_px):
+    centres_px = film_through_a_lens(tmp_path / "in")
+    run(tmp_path / "in", tmp_path / "out", max_side_px=max_side_px)
+    capture = load_capture(tmp_path / "out")
+    scale = max_side_px / 128
+    assert np.abs(bent(centres_px) - centres_px).max() > 3
+    rows, columns = np.mgrid[: capture.height, : capture.width] + 0.5
+    for position, index in enumerate(capture.frame_index):
+        expected_px = scale * centres_px[index]
+        red = np.clip((255 * capture.image(position)[..., 0] - 30) / 170, 0, 1)
+        for share in (capture.mask(position), red):
+            found_px = np.array([(share * columns).sum(), (share * rows).sum()]) / share.sum()
+            np.testing.assert_allclose(found_px, expected_px, atol=0.3 * scale)
+            assert np.sqrt(share.sum() / np.pi) == pytest.approx(14 * scale, rel=0.03)
+        points_px = capture.landmarks_px[position]
+        assert np.isnan(points_px).any() == (index == 3)
+        np.testing.assert_allclose(points_px[np.isfinite(points_px).all(axis=1)] - expected_px, 0, atol=0.02)
+    take_warnings()
+
+
+@pytest.mark.parametrize(("max_side_px", "diagonal_px"), [(128, 160), (64, 80)])
+def test_the_lens_that_the_camera_wrote_reaches_the_capture(tmp_path, max_side_px, diagonal_px):
+    """26 mm on 43.27 mm of film: the focal length is this share of the picture's diagonal."""
+    folder = draw_recording(tmp_path / "in", n=17)
+    jpeg = cv2.imencode(".jpg", cv2.imread(str(folder / "0.png")))[1].tobytes()
+    (folder / "0.png").unlink()
+    (folder / "0.jpg").write_bytes(with_exif(jpeg, tiff("<", 26)))
+    run(folder, tmp_path / "out", max_side_px=max_side_px)
+    assert load_capture(tmp_path / "out").recorded_focal_px == pytest.approx(26 / 43.27 * diagonal_px)
+
+
+def test_images_a_second_can_be_given(tmp_path):
+    run(draw_recording(tmp_path / "in", n=17), tmp_path / "out", fps=12.5)
+    capture = load_capture(tmp_path / "out")
+    assert capture.fps == 12.5
+    np.testing.assert_allclose(capture.time_s, np.arange(17) * 0.08)
+
+
+def test_a_video_says_its_own_frames_a_second(tmp_path):
+    write_movie(tmp_path / "a.mp4", np.zeros((17, 48, 64, 3), np.uint8), 25.0)
+    with pytest.raises(UserError, match="a.mp4 is a video, .* leave frames.fps out"):
+        run(tmp_path / "a.mp4", tmp_path / "out", fps=30.0)
+
+
+def test_a_frame_with_a_mask_and_without_landmarks_is_kept(tmp_path):
+    folder = draw_recording(tmp_path / "in", n=40)
+    arrays = load_npz(folder / "landmarks.npz")
+    arrays["landmarks_px"][7], arrays["landmarks_world_m"][7] = np.nan, np.nan
+    save_npz(folder / "landmarks.npz", arrays)
+    metrics = run(folder, tmp_path / "out")
+    assert (metrics["frames"], metrics["dropped_no_person"]) == (40, 0)
+    capture = load_capture(tmp_path / "out")
+    assert np.isnan(capture.landmarks_px[7]).all()
+    assert (capture.landmarks_visibility[7] == 0).all()
+    assert np.isfinite(np.delete(capture.landmarks_px, 7, axis=0)).all()
 
 
 def test_the_same_recording_gives_the_same_bytes(tmp_path):
