@@ -20,11 +20,7 @@ UPRIGHT_WORLD_TO_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32)
 
 @dataclass(frozen=True)
 class Camera:
-    """Pinhole intrinsics in pixels and a rigid pose.
-
-    `distortion` holds OpenCV's (k1, k2, p1, p2[, k3]). It is honoured once, when frames are undistorted on reading;
-    `project` and `pixel_rays` speak of the undistorted image.
-    """
+    """Pinhole intrinsics in pixels and a rigid pose, for images without lens distortion."""
 
     fx: float
     fy: float
@@ -33,7 +29,6 @@ class Camera:
     width: int
     height: int
     world_to_camera: Float[np.ndarray, "4 4"] = field(default_factory=UPRIGHT_WORLD_TO_CAMERA.copy)
-    distortion: tuple[float, ...] = ()
 
     def matrix(self) -> Float[np.ndarray, "3 3"]:
         """Intrinsic matrix K in pixels."""
@@ -68,7 +63,6 @@ class Camera:
             "camera_intrinsics_px": np.array([self.fx, self.fy, self.cx, self.cy], dtype=np.float64),
             "camera_size_px": np.array([self.width, self.height], dtype=np.int32),
             "camera_world_to_camera": np.asarray(self.world_to_camera, dtype=np.float32),
-            "camera_distortion": np.array(self.distortion, dtype=np.float64),
         }
 
     @staticmethod
@@ -76,8 +70,7 @@ class Camera:
         """Inverse of `arrays`; other names in the mapping are ignored."""
         fx, fy, cx, cy = (float(value) for value in arrays["camera_intrinsics_px"])
         width, height = (int(value) for value in arrays["camera_size_px"])
-        distortion = tuple(float(value) for value in arrays["camera_distortion"])
-        return Camera(fx, fy, cx, cy, width, height, np.asarray(arrays["camera_world_to_camera"]), distortion)
+        return Camera(fx, fy, cx, cy, width, height, np.asarray(arrays["camera_world_to_camera"]))
 
 
 def world_to_camera_points(points_world: Float[Tensor, "*n 3"], camera: Camera) -> Float[Tensor, "*n 3"]:

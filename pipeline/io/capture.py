@@ -94,7 +94,6 @@ def save_capture(capture: Capture) -> None:
         "landmarks_visibility": capture.landmarks_visibility.astype(np.float32),
         "landmarks_world_m": capture.landmarks_world_m.astype(np.float32),
         "camera_world_to_camera": camera.world_to_camera if camera else UPRIGHT_WORLD_TO_CAMERA,
-        "camera_distortion": np.zeros(0),
         "mask_source": np.array(capture.mask_source),
         "n_video_frames": np.array(capture.n_video_frames, dtype=np.int32),
         "scale": np.array(capture.scale),
