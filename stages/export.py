@@ -6,19 +6,20 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from pydantic import Field
 
 from pipeline.avatar.body import Body, Motion, canonical_to_world
 from pipeline.avatar.placement import hold_ends, move_camera, move_motion, scene_from_world_m
+from pipeline.avatar.specular import dielectric_share
 from pipeline.core.cli import main
 from pipeline.core.config import Config as BaseConfig
 from pipeline.core.stage import Stage
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import dense_weights, linear_blend_skinning
 from pipeline.io.capture import load_capture
-from pipeline.io.gltf import Maps, SkinnedMesh, encode_glb, highlight, write_glb
-from pipeline.io.image import png_bytes, read_rgb
+from pipeline.io.gltf import Maps, SkinnedMesh, encode_glb, specular_texture, write_glb
+from pipeline.io.image import png_bytes, read_gray, read_rgb, to_float, to_uint8, write_gray
 from pipeline.io.npz import load_body, load_camera, load_motion, load_npz
 from pipeline.io.obj import write_obj
 
@@ -31,6 +32,10 @@ class Config(BaseConfig):
     roughness: float = Field(
         0.85, ge=0.0, le=1.0, description="glTF roughness of the whole surface, 0 mirror to 1 matte"
     )
+    unlit: bool = Field(
+        False,
+        description="mark the .glb's material as unlit: viewers show the video's own light and add none, no highlights",
+    )
     licence_note: str = Field(
         "Made from a video of a person: ask that person before you share it.",
         description="text for asset.extras, no unit",
@@ -41,26 +46,30 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     """Writes `avatar.glb`, and `avatar.obj` with its `.mtl` and maps."""
     body, arrays = load_body(inputs["body"] / "body.npz"), load_npz(inputs["mesh"] / "mesh.npz")
     atlas = load_npz(inputs["texture"] / "atlas.npz")
-    diffuse, specular = (read_rgb(inputs["texture"] / f"{name}.png") for name in ("diffuse", "specular"))
+    diffuse, specular = read_rgb(inputs["texture"] / "diffuse.png"), read_gray(inputs["texture"] / "specular.png")
     mesh = Mesh(arrays["vertices"], arrays["faces"])
-    shines = bool(specular.any())
+    maps = Maps(
+        png_bytes(diffuse),
+        specular_png(specular, diffuse, config.roughness) if specular.any() and not config.unlit else None,
+        config.roughness,
+        config.unlit,
+    )
 
     capture, motion = load_capture(inputs["frames"]), load_motion(inputs["field"] / "motion.npz")
     offset_m = scene_from_world_m(motion, lowest_points_m(arrays, body, motion))
     clip = hold_ends(move_motion(motion, offset_m), capture.fps, capture.n_video_frames)
-    diffuse_png, specular_png = png_bytes(diffuse), png_bytes(specular)
     data = encode_glb(
         skinned_mesh(mesh, arrays, atlas),
         body,
         clip,
-        Maps(diffuse_png, png_bytes(highlight(specular)) if shines else None, config.roughness),
+        maps,
         move_camera(load_camera(inputs["body"] / "camera.npz"), offset_m),
         about(config, offset_m, capture.fps),
     )
     write_glb(out / "avatar.glb", data)
-    (out / DIFFUSE).write_bytes(diffuse_png)
-    (out / SPECULAR).write_bytes(specular_png)
-    names = (DIFFUSE, SPECULAR if shines else None)
+    (out / DIFFUSE).write_bytes(maps.diffuse_png)
+    write_gray(out / SPECULAR, specular)
+    names = (DIFFUSE, SPECULAR if specular.any() else None)
     write_obj(out / "avatar.obj", mesh, atlas["uv"], atlas["faces_uv"], mesh.vertex_normals(), *names)
     return {
         "glb_bytes": float(len(data)),
@@ -69,6 +78,12 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
         "vertices": float(len(atlas["uv"])),
         "faces": float(len(mesh.faces)),
     }
+
+
+def specular_png(amplitude: UInt8[np.ndarray, "s s"], diffuse: UInt8[np.ndarray, "s s 3"], roughness: float) -> bytes:
+    """The texture stage's map, in sRGB, as glTF's share of a dielectric's reflection."""
+    share = dielectric_share(to_float(amplitude), to_float(diffuse), roughness)
+    return png_bytes(specular_texture(to_uint8(share)))
 
 
 def skinned_mesh(mesh: Mesh, arrays: Mapping[str, np.ndarray], atlas: Mapping[str, np.ndarray]) -> SkinnedMesh:
@@ -102,7 +117,7 @@ def about(config: Config, offset_m: Float[np.ndarray, "3"], frame_rate: float) -
 
 STAGE = Stage(
     "export",
-    version=1,
+    version=2,
     needs=("frames", "body", "field", "mesh", "texture"),
     makes=("avatar.glb", "avatar.obj", "avatar.mtl", DIFFUSE, SPECULAR),
     config=Config,

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from pydantic import Field
+from pydantic import Field, ValidationInfo, field_validator
 
+from pipeline.avatar import prepare
 from pipeline.avatar.bake import (
     BakeConfig,
     Fill,
@@ -56,6 +57,21 @@ class Config(BakeConfig):
         description="share of the error on validation frames that highlights must explain, or matte",
     )
 
+    @field_validator("smallest_px", "largest_px")
+    @classmethod
+    def _power_of_two(cls, side_px: int) -> int:
+        if side_px.bit_count() != 1:
+            raise ValueError("a power of two")
+        return side_px
+
+    @field_validator("largest_px")
+    @classmethod
+    def _not_below_smallest(cls, side_px: int, checked: ValidationInfo) -> int:
+        smallest_px = checked.data.get("smallest_px", side_px)
+        if side_px < smallest_px:
+            raise ValueError(f"at least smallest_px, which is {smallest_px}")
+        return side_px
+
 
 @dataclass(frozen=True)
 class SkinnedMesh:
@@ -80,11 +96,11 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     texels = rasterize_texels(atlas, size_px)
     surface = Surface.of(skinned.mesh.faces, atlas, texels)
     diffuse, seen = bake_diffuse(train, surface, spread_over(skinned.mesh, texels), config)
-    strength, gain = bake_specular(train, validation, skinned.mesh, config)
-    specular = paint(torch.from_numpy(texels.interpolate(skinned.mesh.faces, strength)), texels)
+    amplitude, gain = bake_specular(train, validation, skinned.mesh, config)
+    specular = paint(torch.from_numpy(texels.interpolate(skinned.mesh.faces, amplitude[:, None])), texels)[..., 0]
     save_npz(out / "atlas.npz", {"uv": atlas.uv, "faces_uv": atlas.faces_uv, "vertex_of_uv": atlas.vertex_of_uv})
     write_rgb(out / "diffuse.png", to_uint8(diffuse))
-    write_rgb(out / "specular.png", to_uint8(specular))
+    write_gray(out / "specular.png", to_uint8(specular))
     write_gray(out / "coverage.png", to_uint8(texels.image(seen[:, None])[..., 0]))
     shown = to_uint8(diffuse).astype(np.float32) / 255.0
     return {
@@ -118,10 +134,9 @@ def load_views(
         torch.from_numpy(skinned.joint_indices), torch.from_numpy(skinned.joint_weights), len(body.joint_names)
     )
     faces = torch.from_numpy(skinned.mesh.faces)
-    if len(positions) > max_frames:
-        positions = positions[np.linspace(0, len(positions) - 1, max_frames).round().astype(int)]
+    thinned = positions[prepare.spread(len(positions), max_frames)]
     views = []
-    for k in track(positions.tolist(), "reading frames"):
+    for k in track(thinned.tolist(), "reading frames"):
         posed = linear_blend_skinning(vertices, weights, transforms[k : k + 1])[0]
         image, mask = to_uint8(capture.image(k)), to_uint8(capture.mask(k))
         views.append(crop_view(image, mask, camera, posed, faces))
@@ -149,26 +164,26 @@ def spread_over(mesh: Mesh, texels: Texels) -> Fill:
 
 def bake_specular(
     train: list[View], validation: list[View], mesh: Mesh, config: Config
-) -> tuple[Float[np.ndarray, "v 3"], float]:
-    """Each vertex's highlight colour, and the share of the error on validation frames that highlights explain."""
+) -> tuple[Float[np.ndarray, "v"], float]:
+    """What highlights add to each vertex's colour, and the share of the validation error that they explain."""
     if not validation:
         warn("there are no validation frames to judge highlights on: the surface stays matte")
-        return np.zeros_like(mesh.vertices), 0.0
+        return np.zeros(len(mesh.vertices), dtype=np.float32), 0.0
     count = len(mesh.vertices)
     texels = corner_texels(mesh.faces, count)
     faces = torch.from_numpy(mesh.faces)
     surface = Surface(faces, faces, torch.zeros(count, 2), texels)
     seen = [observe_vertices(views, surface, config) for views in (train, validation)]
     fitted = fit_specular(seen[0], seen[1], mesh.edges(), count, config.specular_least_gain)
-    strength, operator = fitted.strength.astype(np.float64), laplacian(mesh)
+    amplitude, operator = fitted.amplitude.astype(np.float64), laplacian(mesh)
     for _ in range(SPECULAR_SMOOTHING):
-        strength = strength - 0.5 * (operator @ strength)
-    return strength.astype(np.float32), fitted.gain
+        amplitude = amplitude - 0.5 * (operator @ amplitude)
+    return amplitude.astype(np.float32), fitted.gain
 
 
 STAGE = Stage(
     "texture",
-    version=2,
+    version=3,
     needs=("frames", "body", "field", "mesh"),
     makes=("atlas.npz", "diffuse.png", "specular.png", "coverage.png"),
     config=Config,

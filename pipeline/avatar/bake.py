@@ -183,8 +183,8 @@ def confidence(weight: Float[Tensor, "t"], enough: float) -> Float[Tensor, "t"]:
     return weight**2 / (weight**2 + enough**2)
 
 
-def paint(colour: Float[Tensor, "t 3"], texels: Texels) -> Float[np.ndarray, "s s 3"]:
-    """Texel colours as a texture with filled gutters."""
+def paint(colour: Float[Tensor, "t c"], texels: Texels) -> Float[np.ndarray, "s s c"]:
+    """Texel colours (or other values) as a texture with filled gutters."""
     return fill_gaps(texels.image(colour.numpy()), texels.covered())
 
 

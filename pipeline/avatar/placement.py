@@ -41,18 +41,17 @@ def move_camera(camera: Camera, offset_m: Float[np.ndarray, "3"]) -> Camera:
 def hold_ends(motion: Motion, frame_rate: float, video_frame_count: int) -> Motion:
     """The motion over the whole video: the first and last pose held to the first and last frame of the video.
 
-    frame_rate: frames a second, so that time = frame index / frame_rate.
+    Frames keep their own times, whose steps vary in a phone's video. An added first frame is at 0, an added last one
+    as far behind its neighbour as the frames between them take at the video's mean rate.
+
+    frame_rate: the video's mean, frames a second.
     """
-    rows = np.arange(len(motion.frame_index))
-    frames = motion.frame_index
+    rows, frames, time_s = np.arange(len(motion.frame_index)), motion.frame_index, motion.time_s
     if frames[0] > 0:
-        rows, frames = np.concatenate([rows[:1], rows]), np.concatenate([[0], frames])
-    if frames[-1] < video_frame_count - 1:
-        rows, frames = np.concatenate([rows, rows[-1:]]), np.concatenate([frames, [video_frame_count - 1]])
-    frames = frames.astype(np.int32)
-    return Motion(
-        frames,
-        (frames / frame_rate).astype(motion.time_s.dtype),
-        motion.rotations_wxyz[rows],
-        motion.root_translation_m[rows],
-    )
+        rows, frames, time_s = np.r_[rows[0], rows], np.r_[0, frames], np.r_[0.0, time_s]
+    missing = video_frame_count - 1 - frames[-1]
+    if missing > 0:
+        rows, frames = np.r_[rows, rows[-1]], np.r_[frames, video_frame_count - 1]
+        time_s = np.r_[time_s, time_s[-1] + missing / frame_rate]
+    held = motion.select(rows)
+    return replace(held, frame_index=frames.astype(np.int32), time_s=time_s.astype(motion.time_s.dtype))

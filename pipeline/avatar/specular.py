@@ -19,6 +19,7 @@ from jaxtyping import Float, Int
 from pipeline.avatar.bake import BakeConfig, Surface, observe
 from pipeline.avatar.bake_views import View, footprint_m, pixel_trust, seen_depth, vertex_normals
 from pipeline.geometry.atlas import Texels
+from pipeline.metrics.flip import linear_light
 
 ALTERNATIONS = 8
 RIDGE = 1e-3
@@ -39,12 +40,12 @@ class Observations:
 
 @dataclass(frozen=True)
 class Specular:
-    """strength: each vertex's highlight (grey), sRGB in [0, 1], 0 everywhere when highlights explain nothing.
+    """amplitude: what a highlight adds to a vertex's colour, sRGB in [0, 1]; 0 everywhere when that explains nothing.
 
     gain: share of the error on unseen frames that the highlights explain beyond shading (negative: they mislead).
     """
 
-    strength: Float[np.ndarray, "v 3"]
+    amplitude: Float[np.ndarray, "v"]
     gain: float
 
 
@@ -149,7 +150,23 @@ def fit_specular(
     gain = _gain(terms(validation), validation, albedo, shading, direction, strength)
     span = np.ptp(np.percentile(harmonics(train.mirrored, 3) @ direction, [1.0, 99.0]))
     kept = np.clip(strength * span, 0.0, 1.0) if gain >= least_gain else np.zeros(count)
-    return Specular(np.repeat(kept[:, None], 3, axis=1).astype(np.float32), float(gain))
+    return Specular(kept.astype(np.float32), float(gain))
+
+
+def dielectric_share(
+    amplitude: Float[np.ndarray, "*n"], base: Float[np.ndarray, "*n 3"], roughness: float
+) -> Float[np.ndarray, "*n"]:
+    """How much of a dielectric's reflection shows highlights of this amplitude, in [0, 1]: glTF's specular factor.
+
+    glTF's microfacet model (specification, appendix B; α = roughness²) reflects 4 % of the light along the normal. At a
+    highlight's peak, where D = 1 / (π α²) and V = 1/4, that adds π · 0.04 · D · V = 0.01 / α² where the same lamp shows
+    white paint as 1. What the lamps were is unknown: one that shows white paint as 1 is taken. 1 stands for all that is
+    brighter as well, since no other dielectric reflects much more.
+
+    amplitude: on top of `base`, both sRGB in [0, 1]. roughness: glTF's, in [0, 1].
+    """
+    added = (linear_light(base + amplitude[..., None]) - linear_light(base)).mean(axis=-1)
+    return np.clip(added * roughness**4 / 0.01, 0.0, 1.0)
 
 
 def flatness(albedo: Float[np.ndarray, "v 3"], edges: Int[np.ndarray, "e 2"]) -> Float[np.ndarray, "v"]:

@@ -24,6 +24,8 @@ _VERTICES, _INDICES = 34962, 34963
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 _COMPONENTS = {"float32": _FLOAT, "uint8": _U8, "uint16": _U16, "uint32": _U32}
 _STILL_RAD = 1e-4
+_LEAST_LENGTH = 1e-12
+_MOST_JOINTS = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -43,12 +45,16 @@ class SkinnedMesh:
 
 @dataclass(frozen=True)
 class Maps:
-    """PNG files' bytes. diffuse_png: RGB, sRGB. specular_png: RGBA, or None for a matte surface: the colour of the
-    highlight (sRGB) and, as alpha, its strength."""
+    """PNG files' bytes and what else describes the surface.
+
+    diffuse_png: RGB, sRGB. specular_png: what `specular_texture` makes, or None for a matte surface. unlit: the diffuse
+    map is shown as it is, whatever lamps a scene has; there are no highlights then.
+    """
 
     diffuse_png: bytes
     specular_png: bytes | None = None
     roughness: float = 0.9
+    unlit: bool = False
 
 
 @dataclass
@@ -105,10 +111,12 @@ def encode_glb(
     camera: becomes a node of the scene, so that the picture that was filmed can be laid under the avatar.
     extras: what `asset.extras` says about the file.
 
-    Raises ValueError when there are more than 65535 joints, no frame, or times that do not increase.
+    Raises ValueError when there are more than 65536 joints (indices have 16 bits), no frame, times that do not
+    increase, a pose that is not finite, or a quaternion without length.
     """
-    if not len(motion.time_s) or np.any(np.diff(motion.time_s) <= 0):
-        raise ValueError("an animation needs frames whose times increase")
+    if len(body.joint_names) > _MOST_JOINTS:
+        raise ValueError(f"glTF counts joints in 16 bits: {len(body.joint_names)} are more than {_MOST_JOINTS}")
+    _check_motion(motion)
     document = _Document()
     document.json["asset"] = {"version": "2.0", "generator": "instant-human-mesh"}
     if extras:
@@ -126,14 +134,12 @@ def encode_glb(
     return document.pack()
 
 
-def highlight(specular: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 4"]:
-    """A specular map as KHR_materials_specular wants it: hue in RGB, strength (the largest channel) in alpha.
+def specular_texture(factor: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 4"]:
+    """A picture with the specular factor where KHR_materials_specular reads it: linear, in alpha; the rest is white.
 
-    The strength must scale the reflection at grazing angles too, which the colour alone leaves at full.
+    factor: 255 reflects as any dielectric does (4 % seen along the normal), 0 not at all.
     """
-    strength = specular.max(axis=2, keepdims=True)
-    hue = np.rint(255.0 * specular / np.maximum(strength, 1)).astype(np.uint8)
-    return np.concatenate([np.where(strength > 0, hue, np.uint8(255)), strength], axis=2)
+    return np.concatenate([np.full((*factor.shape, 3), 255, dtype=np.uint8), factor[..., None]], axis=2)
 
 
 def write_glb(path: Path, data: bytes) -> None:
@@ -164,6 +170,17 @@ def read_accessor(document: Mapping[str, Any], binary: bytes, index: int) -> np.
     return values.reshape(accessor["count"], width) if width > 1 else values
 
 
+def _check_motion(motion: Motion) -> None:
+    """Raises ValueError for what would play as something else than was filmed."""
+    times = motion.time_s.astype(np.float32)  # as they are stored
+    if not len(times) or not np.all(np.diff(times) > 0):
+        raise ValueError("an animation needs frames whose times increase")
+    if not all(np.isfinite(values).all() for values in (times, motion.rotations_wxyz, motion.root_translation_m)):
+        raise ValueError("an animation needs times, rotations and translations that are finite")
+    if np.linalg.norm(motion.rotations_wxyz, axis=-1).min() < _LEAST_LENGTH:
+        raise ValueError("an animation needs quaternions with a length")
+
+
 def _add_primitive(document: _Document, mesh: SkinnedMesh, joint_count: int) -> dict[str, Any]:
     joints = mesh.joint_indices.astype(np.uint8 if joint_count <= 256 else np.uint16)
     uv = np.stack([mesh.uv[:, 0], 1.0 - mesh.uv[:, 1]], axis=1).astype(np.float32)
@@ -171,7 +188,7 @@ def _add_primitive(document: _Document, mesh: SkinnedMesh, joint_count: int) -> 
     faces = mesh.faces.astype(np.uint16 if len(mesh.positions_m) < 65535 else np.uint32)
     attributes = {
         "POSITION": document.add_array(mesh.positions_m.astype(np.float32), _VERTICES, bounds=True),
-        "NORMAL": document.add_array(_unit(mesh.normals), _VERTICES),
+        "NORMAL": document.add_array(_unit_normals(mesh.normals), _VERTICES),
         "TEXCOORD_0": document.add_array(uv, _VERTICES),
         "JOINTS_0": document.add_array(joints, _VERTICES),
         "WEIGHTS_0": document.add_array(_summing_to_one(mesh.joint_weights), _VERTICES),
@@ -189,12 +206,14 @@ def _add_material(document: _Document, maps: Maps) -> int:
             "roughnessFactor": maps.roughness,
         },
     }
-    specular: dict[str, Any] = {"specularFactor": 0.0}
-    if maps.specular_png is not None:
+    extensions: dict[str, Any] = {"KHR_materials_specular": {"specularFactor": 0.0}}
+    if maps.unlit:  # KHR_materials_specular must not stand beside it
+        extensions = {"KHR_materials_unlit": {}}
+    elif maps.specular_png is not None:
         texture = {"index": _add_texture(document, "specular", maps.specular_png)}
-        specular = {"specularTexture": texture, "specularColorTexture": texture}
-    document.json["extensionsUsed"] = ["KHR_materials_specular"]
-    return document.add("materials", surface | {"extensions": {"KHR_materials_specular": specular}})
+        extensions = {"KHR_materials_specular": {"specularTexture": texture}}
+    document.json["extensionsUsed"] = list(extensions)
+    return document.add("materials", surface | {"extensions": extensions})
 
 
 def _add_texture(document: _Document, name: str, png: bytes) -> int:
@@ -236,12 +255,12 @@ def _add_animation(document: _Document, motion: Motion, first_joint: int) -> Non
         channels.append({"sampler": len(samplers) - 1, "target": {"node": node, "path": path}})
 
     add_channel(first_joint, "translation", motion.root_translation_m.astype(np.float32))
-    continuous = continuous_quaternions(torch.from_numpy(motion.rotations_wxyz)).numpy()
+    continuous = continuous_quaternions(torch.from_numpy(motion.rotations_wxyz.astype(np.float64))).numpy()
     for joint in range(continuous.shape[1]):
-        rotations = _unit(continuous[:, joint])
+        rotations = continuous[:, joint] / np.linalg.norm(continuous[:, joint], axis=1, keepdims=True)
         angle = 2.0 * np.arctan2(np.linalg.norm(rotations[:, 1:], axis=1), np.abs(rotations[:, 0]))
         if angle.max() > _STILL_RAD:
-            add_channel(first_joint + joint, "rotation", rotations[:, [1, 2, 3, 0]])
+            add_channel(first_joint + joint, "rotation", rotations[:, [1, 2, 3, 0]].astype(np.float32))
     document.add("animations", {"name": "capture", "samplers": samplers, "channels": channels})
 
 
@@ -270,12 +289,12 @@ def _add_camera(document: _Document, camera: Camera) -> int:
     return document.add("nodes", node)
 
 
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    """Rows of length 1 in float32; rows without length become (0, 1, 0, ...)."""
-    vectors = vectors.astype(np.float64)
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    fallback = np.eye(vectors.shape[1])[1]
-    return np.where(length > 1e-12, vectors / np.maximum(length, 1e-12), fallback).astype(np.float32)
+def _unit_normals(normals: np.ndarray) -> np.ndarray:
+    """Rows of length 1 in float32; a normal without length, as of a vertex without area, becomes (0, 1, 0)."""
+    normals = normals.astype(np.float64)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    upright = np.array([0.0, 1.0, 0.0])
+    return np.where(length > _LEAST_LENGTH, normals / np.maximum(length, _LEAST_LENGTH), upright).astype(np.float32)
 
 
 def _summing_to_one(weights: np.ndarray) -> np.ndarray:

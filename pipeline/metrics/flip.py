@@ -35,7 +35,7 @@ def flip_map(
     render: UInt8[np.ndarray, "h w 3"], image: UInt8[np.ndarray, "h w 3"], pixels_per_degree: float = PIXELS_PER_DEGREE
 ) -> Float[np.ndarray, "h w"]:
     """Perceived error of each pixel in [0, 1], 0 where nothing differs; sRGB pictures, symmetric in the two."""
-    opponent = [_opponent(_linear(picture / 255.0)) for picture in (render, image)]
+    opponent = [_opponent(linear_light(picture / 255.0)) for picture in (render, image)]
     seen = [_hunt_lab(_blurred(channels, pixels_per_degree)) for channels in opponent]
     colour = _redistributed(_hyab(*seen) ** QC)
     brightness = [(channels[..., 0] + 16.0) / 116.0 for channels in opponent]
@@ -47,8 +47,8 @@ def flip_map(
     return colour ** (1.0 - np.minimum(feature, 1.0))
 
 
-def _linear(srgb: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-    """IEC 61966-2-1."""
+def linear_light(srgb: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    """Light that sRGB colours (white = 1) stand for (IEC 61966-2-1)."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 

@@ -7,11 +7,12 @@ from pipeline.avatar.body import Motion
 from pipeline.avatar.placement import hold_ends, scene_from_world_m
 
 
-def motion_at(frames: list[int], places: np.ndarray) -> Motion:
+def motion_at(frames: list[int], places: np.ndarray, time_s: list[float] | None = None) -> Motion:
     index = np.array(frames, dtype=np.int32)
+    times = index / 30.0 if time_s is None else np.array(time_s)
     rotations = np.tile(np.array([1.0, 0, 0, 0], dtype=np.float32), (len(frames), 2, 1))
     rotations[:, 1, 0] = np.arange(len(frames))  # marks which frame a row came from
-    return Motion(index, (index / 30.0).astype(np.float32), rotations, places.astype(np.float32))
+    return Motion(index, times, rotations, places.astype(np.float32))
 
 
 def test_the_floor_survives_jumps_and_one_wrong_pose() -> None:
@@ -25,11 +26,17 @@ def test_the_floor_survives_jumps_and_one_wrong_pose() -> None:
 
 
 def test_the_clip_lasts_as_long_as_the_video() -> None:
-    held = hold_ends(motion_at([4, 6, 9], np.eye(3)), frame_rate=25.0, video_frame_count=21)
+    held = hold_ends(motion_at([4, 6, 9], np.eye(3)), frame_rate=30.0, video_frame_count=21)
     np.testing.assert_array_equal(held.frame_index, [0, 4, 6, 9, 20])
-    np.testing.assert_allclose(held.time_s, held.frame_index / 25.0, rtol=1e-6)
+    np.testing.assert_allclose(held.time_s, held.frame_index / 30.0, rtol=1e-12)
     np.testing.assert_array_equal(held.rotations_wxyz[:, 1, 0], [0, 0, 1, 2, 2])
     np.testing.assert_array_equal(held.root_translation_m[[0, -1]], np.eye(3)[[0, 2]])
+
+
+def test_frames_keep_the_times_of_a_video_without_a_steady_rate() -> None:
+    """Frame 6 came late and frame 9 on time; 11 frames are missing at the end, which 20 frames a second take 0.55 s."""
+    held = hold_ends(motion_at([4, 6, 9], np.eye(3), [0.13, 0.29, 0.36]), frame_rate=20.0, video_frame_count=21)
+    np.testing.assert_allclose(held.time_s, [0.0, 0.13, 0.29, 0.36, 0.91], rtol=1e-12)
 
 
 @pytest.mark.parametrize("frames", [[0, 1, 2], [0, 7, 20]])

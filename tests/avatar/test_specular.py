@@ -8,6 +8,7 @@ from pipeline.avatar.bake import BakeConfig, Surface
 from pipeline.avatar.specular import (
     Observations,
     corner_texels,
+    dielectric_share,
     fit_specular,
     flatness,
     harmonics,
@@ -19,7 +20,7 @@ VERTICES, LIGHT = 400, np.array([0.3, 0.6, 0.74])
 
 
 def filmed(frames: int, shine: np.ndarray, shade: float, noise: float, seed: int) -> Observations:
-    """A turning cloud of oriented vertices under one light, seen from +Z; shine: each vertex's highlight strength."""
+    """A turning cloud of oriented vertices under one light, seen from +Z; shine: each vertex's highlight amplitude."""
     base = np.random.default_rng(0)
     normals = base.normal(size=(VERTICES, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -51,26 +52,55 @@ def test_highlights_are_found_where_they_are() -> None:
     shine = np.zeros((VERTICES, 3))
     shine[: VERTICES // 2] = 0.4
     result = fitted(shine, shade=0.3)
-    shiny, matte = result.strength[: VERTICES // 2], result.strength[VERTICES // 2 :]
+    shiny, matte = result.amplitude[: VERTICES // 2], result.amplitude[VERTICES // 2 :]
     assert result.gain > 0.3
-    assert shiny[:, 0].mean() > 4.0 * matte[:, 0].mean()
-    assert 0.05 < np.quantile(shiny[:, 0], 0.75) < 0.5  # true is 0.4: what was weakly seen is held down
-    assert result.strength.min() >= 0.0
-    assert result.strength.max() <= 1.0
+    assert shiny.mean() > 4.0 * matte.mean()
+    assert 0.05 < np.quantile(shiny, 0.75) < 0.5  # true is 0.4: what was weakly seen is held down
+    assert result.amplitude.min() >= 0.0
+    assert result.amplitude.max() <= 1.0
 
 
 @pytest.mark.parametrize("shade", [0.0, 0.5])
 def test_paint_and_shading_alone_stay_matte(shade: float) -> None:
     result = fitted(np.zeros((VERTICES, 3)), shade)
     assert result.gain < 0.02
-    assert not result.strength.any()
+    assert not result.amplitude.any()
 
 
 def test_changes_with_a_colour_are_no_highlights() -> None:
     tinted = np.zeros((VERTICES, 3))
     tinted[: VERTICES // 2], tinted[VERTICES // 2 :] = [0.4, 0.0, 0.0], [0.0, 0.4, 0.4]
     white = fitted(np.full((VERTICES, 3), 0.3), shade=0.2)
-    assert white.strength.mean() > 4.0 * fitted(tinted, shade=0.2).strength.mean()
+    assert white.amplitude.mean() > 4.0 * fitted(tinted, shade=0.2).amplitude.mean()
+
+
+def reflected_at_the_peak(factor: float, roughness: float, lamp: float) -> float:
+    """glTF 2.0, appendix B.3, and KHR_materials_specular: linear light that a dielectric's mirror reflection adds.
+
+    View, lamp and normal coincide. A `lamp` of pi shows white paint (albedo / pi) as 1.
+    """
+    n_dot_h = n_dot_l = n_dot_v = h_dot_v = 1.0
+    alpha = roughness**2
+    d = alpha**2 / (np.pi * (n_dot_h**2 * (alpha**2 - 1.0) + 1.0) ** 2)
+    shadowed = [x + np.sqrt(alpha**2 + (1.0 - alpha**2) * x**2) for x in (n_dot_l, n_dot_v)]
+    visibility = (2.0 * n_dot_l / shadowed[0]) * (2.0 * n_dot_v / shadowed[1]) / (4.0 * n_dot_l * n_dot_v)
+    f0, f90 = 0.04 * factor, factor
+    fresnel = f0 + (f90 - f0) * (1.0 - abs(h_dot_v)) ** 5
+    return lamp * n_dot_l * fresnel * visibility * d
+
+
+@pytest.mark.parametrize("roughness", [0.3, 0.5, 0.85, 1.0])
+@pytest.mark.parametrize("factor", [0.0, 0.2, 0.7, 1.0])
+def test_a_viewer_shows_the_highlight_that_was_seen(roughness: float, factor: float) -> None:
+    base = np.array([[0.3, 0.3, 0.3], [0.6, 0.6, 0.6]])
+    linear = ((base + 0.055) / 1.055) ** 2.4 + reflected_at_the_peak(factor, roughness, np.pi)
+    amplitude = (1.055 * linear ** (1 / 2.4) - 0.055 - base)[:, 0]
+    np.testing.assert_allclose(dielectric_share(amplitude, base, roughness), factor, atol=1e-6)
+
+
+def test_no_surface_reflects_more_than_a_dielectric() -> None:
+    share = dielectric_share(np.array([0.0, 0.9]), np.full((2, 3), 0.5), 0.85)
+    np.testing.assert_array_equal(share, [0.0, 1.0])
 
 
 def test_flatness_finds_the_border_of_a_print() -> None:

@@ -1,7 +1,9 @@
 """The .glb, played back by an independent reading of the glTF specification; the Khronos validator where it is."""
 
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -10,7 +12,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from pipeline.avatar.body import canonical_to_world
 from pipeline.geometry.camera import project
 from pipeline.geometry.skinning import linear_blend_skinning
-from pipeline.io.gltf import Maps, encode_glb, read_accessor, read_glb, write_glb
+from pipeline.io.gltf import Maps, encode_glb, read_accessor, read_glb, specular_texture, write_glb
+from pipeline.io.image import png_bytes
 from tests.io.avatar_sample import (
     sample_body,
     sample_camera,
@@ -154,16 +157,73 @@ def test_the_same_avatar_gives_the_same_bytes() -> None:
     assert encoded() == encoded()
 
 
-def test_a_matte_surface_has_no_highlight() -> None:
-    maps = sample_maps()
-    matte = encoded(maps=Maps(maps.diffuse_png))
-    assert b'"specularFactor":0.0' in matte
-    assert b"specularColorTexture" not in matte
+def material_of(data: bytes, folder: Path) -> tuple[dict, list[str]]:
+    write_glb(folder / "one.glb", data)
+    document, _ = read_glb(folder / "one.glb")
+    return document["materials"][0]["extensions"], document["extensionsUsed"]
+
+
+def test_a_matte_surface_has_no_highlight(tmp_path: Path) -> None:
+    extensions, used = material_of(encoded(maps=Maps(sample_maps().diffuse_png)), tmp_path)
+    assert extensions == {"KHR_materials_specular": {"specularFactor": 0.0}}
+    assert used == ["KHR_materials_specular"]
+
+
+def test_a_highlight_has_no_colour_of_its_own(tmp_path: Path) -> None:
+    extensions, _ = material_of(encoded(), tmp_path)
+    assert extensions == {"KHR_materials_specular": {"specularTexture": {"index": 1}}}
+
+
+def test_an_unlit_surface_has_no_other_shading(tmp_path: Path) -> None:
+    """KHR_materials_specular "must not be used on a material that also uses KHR_materials_unlit"."""
+    unlit = encoded(maps=replace(sample_maps(), unlit=True))
+    assert material_of(unlit, tmp_path) == ({"KHR_materials_unlit": {}}, ["KHR_materials_unlit"])
+    assert validator_issues(tmp_path / "one.glb") == []
+
+
+def test_the_factor_lies_in_alpha_as_it_is() -> None:
+    factor = np.random.default_rng(0).integers(0, 256, (5, 7), dtype=np.uint8)
+    png = png_bytes(specular_texture(factor))
+    pixels = cv2.imdecode(np.frombuffer(png, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(pixels[..., 3], factor)
+    assert (pixels[..., :3] == 255).all()
 
 
 def test_times_must_increase() -> None:
     with pytest.raises(ValueError, match="increase"):
         encoded(motion=sample_motion(np.array([0, 5, 5])))
+
+
+@pytest.mark.parametrize("name", ["time_s", "rotations_wxyz", "root_translation_m"])
+def test_what_is_not_finite_is_refused(name: str) -> None:
+    values = getattr(sample_motion(FRAMES), name).copy()
+    values[-1] = np.nan if name != "time_s" else np.inf
+    with pytest.raises(ValueError, match="finite"):
+        encoded(motion=replace(sample_motion(FRAMES), **{name: values}))
+
+
+def test_a_quaternion_without_length_is_refused() -> None:
+    motion = sample_motion(FRAMES)
+    motion.rotations_wxyz[3, 1] = 0.0
+    with pytest.raises(ValueError, match="length"):
+        encoded(motion=motion)
+
+
+def test_more_joints_than_sixteen_bits_count_are_refused() -> None:
+    names = tuple(map(str, range(65537)))
+    with pytest.raises(ValueError, match="65537"):
+        encoded(body=replace(sample_body(), joint_names=names))
+
+
+def test_a_normal_without_length_points_up(tmp_path: Path) -> None:
+    mesh = sample_skinned_mesh(sample_body())[0]
+    normals = mesh.normals.copy()
+    normals[4] = 0.0
+    write_glb(tmp_path / "one.glb", encoded(mesh=replace(mesh, normals=normals)))
+    player = Player(tmp_path / "one.glb")
+    stored = player.array(player.json["meshes"][0]["primitives"][0]["attributes"]["NORMAL"])
+    np.testing.assert_array_equal(stored[4], [0.0, 1.0, 0.0])
+    np.testing.assert_allclose(np.linalg.norm(stored, axis=1), 1.0, atol=1e-6)
 
 
 def test_reading_something_else_is_refused(tmp_path: Path) -> None:

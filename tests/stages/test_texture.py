@@ -1,5 +1,6 @@
 """The texture and export stages on a painted body whose mesh and poses are the truth."""
 
+import shutil
 from pathlib import Path
 
 import cv2
@@ -8,18 +9,19 @@ import pytest
 import torch
 
 from pipeline.avatar.body import canonical_to_world
+from pipeline.core.config import Layers, build
 from pipeline.core.errors import UserError
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.geometry.textured import render_textured
 from pipeline.io.gltf import read_glb
-from pipeline.io.image import read_gray, read_rgb, to_float, to_uint8
+from pipeline.io.image import read_gray, read_rgb, to_float, to_uint8, write_gray
 from pipeline.io.npz import load_npz
 from pipeline.metrics.images import body_pixels, on_white, premultiplied_on_white, psnr_db
 from stages.export import STAGE as EXPORT
 from stages.texture import STAGE as TEXTURE
 from tests.avatar.scene import PaintedScene, painted_scene
 from tests.io.test_gltf import Player
-from tests.stages.painted_run import FPS, make_run
+from tests.stages.painted_run import make_run
 from tests.tools.khronos import validator_issues
 
 OPTIONS = {"largest_px": 512, "rounds": 1, "edge_m": 0.01}
@@ -55,7 +57,8 @@ def test_the_texture_stage_makes_its_files_and_no_other(textured: tuple[Path, di
     out, metrics = textured
     assert sorted(path.name for path in out.iterdir()) == sorted(TEXTURE.makes)
     assert metrics["texture_px"] == 512
-    assert all(read_rgb(out / f"{name}.png").shape == (512, 512, 3) for name in ("diffuse", "specular"))
+    assert cv2.imread(str(out / "diffuse.png"), cv2.IMREAD_UNCHANGED).shape == (512, 512, 3)
+    assert cv2.imread(str(out / "specular.png"), cv2.IMREAD_UNCHANGED).shape == (512, 512)
     assert 0.4 < metrics["seen_share"] < 0.95
 
 
@@ -93,7 +96,7 @@ def test_coverage_is_black_between_charts_and_bright_on_the_chest(
 
 def test_plain_paint_is_matte(textured: tuple[Path, dict[str, float]]) -> None:
     assert textured[1]["specular_gain"] < 0.05
-    assert read_rgb(textured[0] / "specular.png").max() <= 20
+    assert read_gray(textured[0] / "specular.png").max() <= 20
 
 
 def test_no_frame_but_training_and_validation_is_read(inputs: dict[str, Path], scene: PaintedScene) -> None:
@@ -124,11 +127,28 @@ def test_without_training_frames_the_remedy_is_named(inputs: dict[str, Path], tm
         TEXTURE.run(inputs | {"frames": only_held_out}, tmp_path, TEXTURE.config(**OPTIONS))
 
 
-def test_the_export_stage_makes_its_files_and_no_other(exported: tuple[Path, dict[str, float]]) -> None:
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"largest_px": 1000}, "largest_px = 1000 .* a power of two"),
+        ({"smallest_px": 96, "largest_px": 128}, "smallest_px = 96 .* a power of two"),
+        ({"smallest_px": 1024, "largest_px": 512}, "largest_px = 512 .* at least smallest_px, which is 1024"),
+    ],
+)
+def test_sides_that_are_no_texture_are_refused(options: dict[str, int], message: str) -> None:
+    layers = Layers()
+    layers.add({"texture": options}, "test.yaml")
+    with pytest.raises(UserError, match=message):
+        build("texture", TEXTURE.config, layers)
+
+
+def test_the_export_stage_makes_its_files_and_no_other(
+    scene: PaintedScene, exported: tuple[Path, dict[str, float]]
+) -> None:
     out, metrics = exported
     assert sorted(path.name for path in out.iterdir()) == sorted(EXPORT.makes)
     assert metrics["glb_bytes"] == (out / "avatar.glb").stat().st_size
-    assert metrics["animation_s"] == pytest.approx(19 / FPS)
+    assert metrics["animation_s"] == pytest.approx(scene.motion.time_s[-1])
 
 
 def test_the_khronos_validator_finds_nothing(exported: tuple[Path, dict[str, float]]) -> None:
@@ -139,7 +159,7 @@ def test_the_avatar_moves_as_filmed_with_the_floor_at_zero(
     scene: PaintedScene, exported: tuple[Path, dict[str, float]]
 ) -> None:
     player = Player(exported[0] / "avatar.glb")
-    posed = player.posed_vertices(HELD_OUT / FPS)
+    posed = player.posed_vertices(scene.motion.time_s[HELD_OUT])
     transforms = canonical_to_world(scene.body, scene.motion)[HELD_OUT : HELD_OUT + 1]
     weights = torch.from_numpy(scene.body.skin_weights)
     world = linear_blend_skinning(torch.from_numpy(scene.body.vertices), weights, transforms)[0].numpy()
@@ -159,3 +179,26 @@ def test_the_pictures_inside_the_glb_are_the_maps(exported: tuple[Path, dict[str
     same = read_rgb(exported[0] / "avatar_diffuse.png") == read_rgb(exported[0].parent / "texture" / "diffuse.png")
     assert same.all()
     assert to_uint8(np.float32([0.5])) == 128
+
+
+def test_highlights_become_a_factor_unless_the_surface_is_unlit(
+    inputs: dict[str, Path], textured: tuple[Path, dict[str, float]], tmp_path: Path
+) -> None:
+    shiny = shutil.copytree(textured[0], tmp_path / "texture")
+    amplitude = np.zeros((512, 512), dtype=np.uint8)
+    amplitude[:, 256:] = 1
+    write_gray(shiny / "specular.png", amplitude)
+    materials = []
+    for name, unlit in (("lit", False), ("unlit", True)):
+        (tmp_path / name).mkdir()
+        EXPORT.run(inputs | {"texture": shiny}, tmp_path / name, EXPORT.config(unlit=unlit))
+        assert validator_issues(tmp_path / name / "avatar.glb") == []
+        document, binary = read_glb(tmp_path / name / "avatar.glb")
+        materials.append((set(document["materials"][0]["extensions"]), len(document["images"])))
+        if not unlit:
+            view = document["bufferViews"][document["images"][1]["bufferView"]]
+            png = np.frombuffer(binary, np.uint8, view["byteLength"], view["byteOffset"])
+            alpha = cv2.imdecode(png, cv2.IMREAD_UNCHANGED)[..., 3]
+            assert not alpha[:, :256].any()
+            assert 10 < np.median(alpha[:, 256:]) < 120  # one level of 255 is a part of what a dielectric adds
+    assert materials == [({"KHR_materials_specular"}, 2), ({"KHR_materials_unlit"}, 1)]
