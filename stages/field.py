@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 
 from pipeline.avatar import selection
 from pipeline.avatar.body import Motion
@@ -16,8 +17,10 @@ from pipeline.avatar.judge import Judge
 from pipeline.avatar.prepare import Picture, spread, start_learning, training_scale
 from pipeline.avatar.train import DivergedError, Learning
 from pipeline.core.cli import main
+from pipeline.core.device import compute_device
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import PROGRESS
+from pipeline.core.measure import MIB
 from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
 from pipeline.geometry.camera import Camera
@@ -43,7 +46,8 @@ def run(inputs: Mapping[str, Path], out: Path, config: FieldConfig) -> Mapping[s
     train = training_positions(capture, inputs["body"])
     train = train[spread(len(train), config.max_frames)]
     pictures = [read_picture(capture, position, camera) for position in track(train, "read frames")]
-    learning = start_learning(body, motion.select(train), camera, pictures, config)
+    device = compute_device(config.device, "field.device")
+    learning = start_learning(body, motion.select(train), camera, pictures, config, device)
     judge = gather_judge(capture, motion, camera, config)
     seconds_per_step = learn(learning, judge, out)
     motion, metrics, renders = judge_poses(learning, judge, motion)
@@ -57,7 +61,15 @@ def run(inputs: Mapping[str, Path], out: Path, config: FieldConfig) -> Mapping[s
         "occupied_cells": int(learning.occupancy.occupied.sum()),
         "train_frames": len(train),
         "parameters": sum(parameter.numel() for parameter in learning.field.parameters()),
+        **graphics_memory(device),
     }
+
+
+def graphics_memory(device: torch.device) -> dict[str, float]:
+    """The most memory that tensors took on a graphics card, MiB; nothing where none was used."""
+    if device.type != "cuda":
+        return {}
+    return {"peak_gpu_mib": torch.cuda.max_memory_allocated(device) / MIB}
 
 
 def read_picture(capture: Capture, position: int, camera: Camera) -> Picture:
@@ -78,9 +90,11 @@ def gather_judge(capture: Capture, motion: Motion, camera: Camera, config: Field
 
 def learn(learning: Learning, judge: Judge, out: Path) -> float:
     """All steps that are still to do, with a checkpoint now and then; returns the median seconds of a step."""
-    checkpoint = out / CHECKPOINT
+    checkpoint, before_s = out / CHECKPOINT, 0.0
     if checkpoint.exists():
-        learning.load_state(load_tensors(checkpoint)[0])
+        tensors, about = load_tensors(checkpoint)
+        learning.load_state(tensors)
+        before_s = float(about["seconds"])
     progress, thin = Progress(out, learning.done), judge.thinned()
     looks = {round(part * learning.config.steps) for part in LOOKS}
     seconds, saved = [], time.monotonic()
@@ -94,11 +108,11 @@ def learn(learning: Learning, judge: Judge, out: Path) -> float:
         seconds.append(time.monotonic() - start)
         if learning.done in looks and judge.truths:
             renders = thin.render(learning, learning.refines_poses)
-            progress.add(learning.done, sum(seconds), *thin.score(renders), *thin.frame_scores(renders))
+            progress.add(learning.done, before_s + sum(seconds), *thin.score(renders), *thin.frame_scores(renders))
             if learning.config.early_stop and progress.has_settled(learning.config.steps / 2):
                 break
         if time.monotonic() - saved > CHECKPOINT_EVERY_S:
-            save_tensors(checkpoint, learning.state())
+            save_tensors(checkpoint, learning.state(), {"seconds": before_s + sum(seconds)})
             saved = time.monotonic()
     progress.finish()
     return float(np.median(seconds)) if seconds else 0.0
@@ -120,11 +134,10 @@ class Progress:
             with self.kept.open(newline="", encoding="utf-8") as file:
                 rows = [tuple(float(value) for value in row) for row in list(csv.reader(file))[1:]]
             self.rows = [row for row in rows if row[0] <= done]
-        self.before_s = self.rows[-1][1] if self.rows else 0.0
 
     def add(self, step: int, seconds: float, *scores_db: float) -> None:
-        """Note the scores after a step and the seconds of learning since this process began with it."""
-        self.rows.append((step, round(self.before_s + seconds, 3), *(round(score, 4) for score in scores_db)))
+        """Note the scores after a step, and the seconds of learning that led there."""
+        self.rows.append((step, round(seconds, 3), *(round(score, 4) for score in scores_db)))
         frames = range(len(self.rows[0]) - len(self.COLUMNS))
         with self.kept.open("w", newline="", encoding="utf-8") as file:
             csv.writer(file).writerows([(*self.COLUMNS, *(f"frame_{frame}_db" for frame in frames)), *self.rows])
@@ -154,9 +167,10 @@ def judge_poses(learning: Learning, judge: Judge, motion: Motion) -> tuple[Motio
     ways = {"fitted": False} | ({"refined": True} if learning.config.pose_refinement else {})
     shown = {name: judge.render(learning, refined) for name, refined in ways.items()}
     scores = {name: judge.score(renders) for name, renders in shown.items()}
-    best = max(scores, key=lambda name: scores[name][0]) if judge.truths else list(ways)[-1]
+    best = max(scores, key=lambda name: scores[name][0]) if judge.truths else "fitted"
     if best == "fitted" and learning.config.pose_refinement:
-        warn("the refined poses did not make validation frames better and were dropped")
+        why = "did not make validation frames better" if judge.truths else "have no validation frames to prove them"
+        warn(f"the refined poses {why} and were dropped")
     metrics = {f"psnr_{name}": score[0] for name, score in scores.items()} if judge.truths else {}
     if judge.truths:
         metrics |= {"psnr": scores[best][0], "psnr_body": scores[best][1]}
@@ -173,7 +187,7 @@ def write_preview(path: Path, renders: list[np.ndarray], judge: Judge) -> None:
 
 STAGE = Stage(
     "field",
-    version=6,
+    version=7,
     needs=("frames", "body"),
     makes=("field.safetensors", "occupancy.npz", "motion.npz"),
     config=FieldConfig,

@@ -1,15 +1,20 @@
-"""The field stage's record of progress; its way from frames to artifacts is walked in tests/test_all.py."""
+"""The field stage's record of progress and its judgement of poses; its whole way is walked in tests/test_all.py."""
 
 import csv
+from dataclasses import dataclass
 from unittest import mock
 
 import numpy as np
 import pytest
 
+from pipeline.avatar.body import Motion
 from pipeline.avatar.field_config import FieldConfig
 from pipeline.avatar.judge import Judge
+from pipeline.avatar.pose import PoseCorrection
 from pipeline.avatar.train import Learning
-from stages.field import Progress, learn
+from pipeline.core.progress import take_warnings
+from pipeline.geometry.camera import Camera
+from stages.field import Progress, judge_poses, learn
 
 
 def rows_of(path):
@@ -23,8 +28,8 @@ def test_progress_goes_on_where_the_checkpoint_is(tmp_path):
     first.add(20, 3.0, 22.0, 16.0)
     # Killed after step 20; the checkpoint is of step 15, so that step 20 is made and scored again.
     second = Progress(tmp_path, done=15)
-    second.add(20, 0.7, 22.5, 16.5)
-    second.add(40, 4.0, 24.0, 18.0)
+    second.add(20, 2.2, 22.5, 16.5)
+    second.add(40, 5.5, 24.0, 18.0)
     second.finish()
     rows = rows_of(tmp_path / "progress.csv")
     assert [float(row["step"]) for row in rows] == [10, 20, 40]
@@ -87,3 +92,75 @@ def test_learning_ends_once_it_has_settled(tmp_path, early_stop, steps):
     # Looks after a half, five and six eighths: two that found nothing new.
     assert learning.done == steps
     assert [float(row["step"]) for row in rows_of(tmp_path / "progress.csv")][-1] == steps
+
+
+FITTED = Motion(np.arange(4), np.arange(4) / 10, np.tile([1.0, 0.0, 0.0, 0.0], (4, 1, 1)), np.zeros((4, 3)))
+REFINED = FITTED.with_pose(FITTED.rotations_wxyz, FITTED.root_translation_m + 0.01)
+
+
+@dataclass(frozen=True)
+class KnownJudge(Judge):
+    """Its renders are darker than the truth by so many levels: in the fitted poses, in the refined ones."""
+
+    levels: tuple[int, int] = (0, 0)
+
+    def render(self, learning: Learning, refined: bool) -> list[np.ndarray]:
+        return [target - np.uint8(self.levels[refined]) for target in self.targets]
+
+
+def judged(levels: tuple[int, int], frames: int = 2, refines: bool = True):
+    """`judge_poses` on grey pictures, and the warnings that came with it."""
+    poses = mock.MagicMock(spec=PoseCorrection)
+    poses.corrected.return_value = REFINED
+    learning = mock.MagicMock(spec=Learning, config=FieldConfig(pose_refinement=refines), poses=poses)
+    truth = np.full((8, 6, 3), 200, np.uint8), np.full((8, 6), 255, np.uint8)
+    judge = KnownJudge(FITTED.select(np.arange(frames)), Camera(9.0, 9.0, 3.0, 4.0, 6, 8), [truth] * frames, levels)
+    take_warnings()
+    return *judge_poses(learning, judge, FITTED), take_warnings()
+
+
+def decibels(levels: int) -> float:
+    return 20 * np.log10(255 / levels)
+
+
+def test_refined_poses_are_kept_where_validation_frames_gain():
+    kept, metrics, shown, warnings = judged((10, 5))
+    assert kept is REFINED
+    assert warnings == []
+    assert metrics == pytest.approx(
+        {
+            "psnr_fitted": decibels(10),
+            "psnr_refined": decibels(5),
+            "psnr": decibels(5),
+            "psnr_body": decibels(5),
+            "poses_kept": 1.0,
+        }
+    )
+    assert [int(picture[0, 0, 0]) for picture in shown] == [195, 195]
+
+
+@pytest.mark.parametrize("levels", [(5, 10), (5, 5)])
+def test_refined_poses_are_dropped_where_validation_frames_do_not_gain(levels):
+    kept, metrics, shown, (warning,) = judged(levels)
+    assert kept is FITTED
+    assert warning == "the refined poses did not make validation frames better and were dropped"
+    assert metrics["psnr"] == metrics["psnr_fitted"] == pytest.approx(decibels(5))
+    assert metrics["psnr_refined"] == pytest.approx(decibels(levels[1]))
+    assert metrics["poses_kept"] == 0.0
+    assert int(shown[0][0, 0, 0]) == 195
+
+
+def test_refined_poses_that_nothing_can_prove_are_dropped():
+    kept, metrics, shown, (warning,) = judged((10, 5), frames=0)
+    assert kept is FITTED
+    assert metrics == {"poses_kept": 0.0}
+    assert shown == []
+    assert "no validation frames" in warning
+
+
+@pytest.mark.parametrize("frames", [0, 2])
+def test_poses_that_were_not_refined_stay_without_a_word(frames):
+    kept, metrics, _, warnings = judged((10, 5), frames, refines=False)
+    assert kept is FITTED
+    assert warnings == []
+    assert "psnr_refined" not in metrics

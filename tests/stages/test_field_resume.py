@@ -1,0 +1,131 @@
+"""The field stage, killed and begun again: the files of an unbroken run, and the seconds that learning took in all."""
+
+import csv
+from pathlib import Path
+from types import SimpleNamespace
+from unittest import mock
+
+import pytest
+import torch
+
+from pipeline.avatar.field_config import FieldConfig
+from pipeline.avatar.judge import Judge
+from pipeline.avatar.train import Learning
+from pipeline.core.manifest import PROGRESS
+from pipeline.io.npz import save_motion
+from stages import field as field_stage
+from stages.field import CHECKPOINT, STAGE, learn
+from tests.avatar.scene import painted_scene
+from tests.stages.painted_run import make_run
+
+TINY = FieldConfig(
+    device="cpu",
+    steps=24,
+    rays=512,
+    frames_per_step=3,
+    levels=3,
+    log2_rows=12,
+    margin_m=0.04,
+    step_fraction=0.02,
+    occupancy_every=4,
+    occupancy_start=4,
+    pose_start=0.2,
+)
+
+
+class Killed(BaseException):
+    """Ends a run as a signal does: no code of the stage sees it."""
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    scene = painted_scene(frames=12, height_px=96)
+    inputs = make_run(tmp_path_factory.mktemp("run"), scene.body, scene.motion, scene.camera, scene.images, scene.masks)
+    save_motion(inputs["body"] / "motion.npz", scene.motion)
+    return inputs
+
+
+@pytest.fixture(scope="module")
+def whole(inputs: dict[str, Path]) -> tuple[Path, dict[str, float]]:
+    """Folder and metrics of a run that nobody disturbs."""
+    out = inputs["body"].parent / "whole"
+    out.mkdir()
+    return out, dict(STAGE.run(inputs, out, TINY))
+
+
+@pytest.fixture(autouse=True)
+def checkpoint_at_every_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(field_stage, "CHECKPOINT_EVERY_S", -1.0)
+
+
+def curve(out: Path) -> list[dict[str, float]]:
+    with (out / PROGRESS).open(newline="", encoding="utf-8") as file:
+        return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+
+
+def killed_in(step: int, real_step):
+    """A step of learning that begins number `step`, from 1, and never ends it."""
+
+    def one(learning):
+        if learning.done == step - 1:
+            raise Killed
+        return real_step(learning)
+
+    return one
+
+
+@pytest.mark.parametrize("step", [7, 24])
+def test_a_killed_stage_ends_with_the_files_of_an_unbroken_one(inputs, whole, tmp_path, monkeypatch, step):
+    """Killed once poses move but before cells are updated; killed after both rebakes, in the last step."""
+    unbroken, expected = whole
+    with monkeypatch.context() as patch:
+        patch.setattr(Learning, "step", killed_in(step, Learning.step))
+        with pytest.raises(Killed):
+            STAGE.run(inputs, tmp_path, TINY)
+    assert (tmp_path / CHECKPOINT).exists()
+    steps_made = []
+    with monkeypatch.context() as patch:
+        real_step = Learning.step
+        patch.setattr(Learning, "step", lambda self: (steps_made.append(self.done), real_step(self)))
+        found = dict(STAGE.run(inputs, tmp_path, TINY))
+    assert steps_made == list(range(step - 1, int(expected["steps"])))
+    for name in STAGE.makes:
+        assert (tmp_path / name).read_bytes() == (unbroken / name).read_bytes(), name
+    timeless = expected.keys() - {"seconds_per_step"}
+    assert {name: found[name] for name in timeless} == {name: expected[name] for name in timeless}
+    assert [row | {"seconds": 0} for row in curve(tmp_path)] == [row | {"seconds": 0} for row in curve(unbroken)]
+
+
+def known_learning(clock: SimpleNamespace, kill_in: int | None = None) -> mock.MagicMock:
+    """A learning of 32 steps that take two seconds each on `clock`."""
+    learning = mock.MagicMock(spec=Learning, done=0, refines_poses=True, config=FieldConfig(steps=32, early_stop=False))
+
+    def step() -> None:
+        if learning.done + 1 == kill_in:
+            raise Killed
+        clock.now_s += 2.0
+        learning.done += 1
+
+    def load(tensors: dict[str, torch.Tensor]) -> None:
+        learning.done = int(tensors["done"])
+
+    learning.step.side_effect, learning.load_state.side_effect = step, load
+    learning.state.side_effect = lambda: {"done": torch.tensor(learning.done)}
+    return learning
+
+
+def test_seconds_go_on_from_the_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Killed in step 11 and again in step 15: looks come after steps 8, 12 and 16, so steps between look and
+    checkpoint count too, and those that are made again count once."""
+    clock = SimpleNamespace(now_s=100.0)
+    monkeypatch.setattr(field_stage, "time", SimpleNamespace(monotonic=lambda: clock.now_s))
+    judge = mock.MagicMock(spec=Judge, truths=[None])
+    judge.thinned.return_value = judge
+    judge.score.return_value, judge.frame_scores.return_value = (30.0, 25.0), [29.0]
+    for kill_in in (11, 15):
+        with pytest.raises(Killed):
+            learn(known_learning(clock, kill_in), judge, tmp_path)
+    learn(known_learning(clock), judge, tmp_path)
+    rows = curve(tmp_path)
+    assert [row["step"] for row in rows] == [1, 2, 4, 8, 12, 16, 20, 24, 28, 32]
+    assert [row["seconds"] for row in rows] == [2 * row["step"] for row in rows]
