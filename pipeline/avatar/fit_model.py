@@ -2,9 +2,8 @@
 
 Letters: n frames, m points, j active joints, p rotation + translation numbers of a frame (3 j + 3), s shape numbers.
 A small rotation is applied in the parent's frame: R_j <- exp(delta_j) R_j; the root moves in the coordinates of
-`fit_place`. With x_k the place that joint k alone would
-carry a point to and w_k its skin weight, turning joint j moves the point by (parent rotation · delta_j) x arm_j, where
-arm_j = sum over k at or below j of w_k (x_k - joint_j).
+`fit_place`. With x_k the place that joint k alone would carry a point to and w_k its skin weight, turning joint j moves
+the point by (parent rotation · delta_j) x arm_j, where arm_j = sum over k at or below j of w_k (x_k - joint_j).
 """
 
 from collections.abc import Mapping, Sequence

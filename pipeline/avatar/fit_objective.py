@@ -120,7 +120,11 @@ class Contour:
 
 @dataclass(frozen=True)
 class Weights:
-    """Standard deviations of the terms; None leaves a term out."""
+    """Standard deviations of the terms, what robust ones are cut off at (in deviations), and which shared numbers move.
+
+    `landmark_m`, `hand_m` and `contour_m` are metres at the person, `direction_m` is on the detector's 3D landmarks,
+    `motion` a factor on `Objective.motion`, `focal_log` of the focal length's logarithm, `centre` in focal lengths.
+    """
 
     landmark_m: float = 0.025
     hand_m: float = 0.060

@@ -8,7 +8,14 @@ import torch
 from pipeline.avatar.body import ParametricBody
 from pipeline.avatar.fit import FitResult
 from pipeline.avatar.fit_camera import LENS_COUNT
-from pipeline.avatar.fit_landmarks import HAND_LANDMARKS, OFFSET_COUNT, POSE_LANDMARKS, landmark_regressor
+from pipeline.avatar.fit_landmarks import (
+    HAND_LANDMARKS,
+    OFFSET_COUNT,
+    PAIRS,
+    POSE_LANDMARKS,
+    landmark_regressor,
+    mirror_permutation,
+)
 from pipeline.avatar.fit_model import ACTIVE_JOINTS, FitModel, linearise, pose_points, pose_skeleton
 from pipeline.avatar.fit_objective import FitState, Observations
 from pipeline.avatar.fit_quality import make_observations
@@ -82,6 +89,19 @@ def act(
         torch.zeros(OFFSET_COUNT, dtype=torch.float64),
         torch.zeros(LENS_COUNT, dtype=torch.float64),
     )
+    return filmed(body, model, state, camera, time_s, noise_m, seed)
+
+
+def filmed(
+    body: ParametricBody,
+    model: FitModel,
+    state: FitState,
+    camera: Camera,
+    time_s: np.ndarray,
+    noise_m: float = 0.0,
+    seed: int = 0,
+) -> Act:
+    """What a detector sees of a motion of the body `model`; noise as in `act`."""
     regressor = landmark_regressor(linearise(body, body.shape_defaults))
     skeleton = pose_skeleton(model, state.rotations, state.root_m)
     world, _ = pose_points(model, skeleton, regressor.points(model, state.offsets_m))
@@ -89,11 +109,18 @@ def act(
     world = world[:, :POSE_LANDMARKS]
     pixels, depth_m = project(world, camera)
     random = np.random.default_rng(seed)
-    noise_px = noise_m * focal_px / float(depth_m.mean())
+    noise_px = noise_m * camera.fx / float(depth_m.mean())
     landmarks_px = pixels.numpy() + noise_px * random.standard_normal(pixels.shape)
     relative = (world - 0.5 * (world[:, 23:24] + world[:, 24:25])).numpy() * [1.0, -1.0, -1.0]
     directions_m = relative + 2 * noise_m * random.standard_normal(relative.shape)
     return Act(model, state, camera, time_s, landmarks_px, directions_m, hands)
+
+
+def take_for_other_side(scene: Act, rows: slice | list[int]) -> None:
+    """In these frames the detector takes the person for one who faces the other way."""
+    order = mirror_permutation(PAIRS)[:POSE_LANDMARKS]
+    scene.landmarks_px[rows] = scene.landmarks_px[rows][:, order]
+    scene.landmarks_world_m[rows] = scene.landmarks_world_m[rows][:, order] * [1.0, 1.0, -1.0]
 
 
 def _hands(points_m: torch.Tensor, camera: Camera) -> Hands:
@@ -120,15 +147,20 @@ def _dance(phase: torch.Tensor, turn_rad: float, wrists_rad: float) -> torch.Ten
     return axis_angle_to_matrix(angles)
 
 
-def fitted_joints_m(result: FitResult, scene: Act) -> torch.Tensor:
-    """World positions of the active joints that a fit found."""
+def fitted_joint_to_world(result: FitResult, scene: Act) -> torch.Tensor:
+    """Where the active joints are that a fit found, and how they are turned: (n, j, 4, 4)."""
     joint_to_world = forward_kinematics(
         quaternion_to_matrix(torch.tensor(result.rotations_wxyz)),
         torch.tensor(result.root_translation_m),
         torch.tensor(result.body.joints_m),
         result.body.parents,
     )
-    return joint_to_world[:, list(scene.model.full_joint), :3, 3].double()
+    return joint_to_world[:, list(scene.model.full_joint)].double()
+
+
+def fitted_joints_m(result: FitResult, scene: Act) -> torch.Tensor:
+    """World positions of the active joints that a fit found."""
+    return fitted_joint_to_world(result, scene)[..., :3, 3]
 
 
 def joint_errors_m(found_m: torch.Tensor, true_m: torch.Tensor) -> tuple[float, float]:

@@ -12,7 +12,7 @@ from pipeline.avatar.fit_given import GivenPoses
 from pipeline.avatar.fit_silhouette import matching_window
 from pipeline.avatar.smpl import SmplBody
 from pipeline.geometry.rotation import axis_angle_to_matrix, quaternion_to_matrix
-from tests.avatar.acting import Act, act, fitted_joints_m, joint_errors_m
+from tests.avatar.acting import Act, act, fitted_joints_m, joint_errors_m, take_for_other_side
 from tests.avatar.smpl_sample import made_up_arrays
 
 ACTIVE = (0, 2)
@@ -64,6 +64,45 @@ def test_joints_that_no_fit_moves_come_back_too(given: GivenPoses) -> None:
     assert torch.allclose(quaternion_to_matrix(torch.from_numpy(whole))[[1, 3], :3], given.rotations, atol=1e-6)
     assert np.array_equal(np.abs(whole[:, 3]), np.abs(still[:, 3]))
     assert (np.einsum("njc,njc->nj", whole[1:], whole[:-1]) > 0).all()
+
+
+@pytest.fixture(scope="module")
+def short() -> tuple[SmplBody, Act, GivenPoses]:
+    """Six frames of a person, and their true poses."""
+    body = SmplBody(made_up_arrays(24))
+    scene = act(body, 6, turn_rad=2.0)
+    rotations = scene.model.rotations_of_all(scene.state.rotations).float()
+    return body, scene, GivenPoses(np.arange(6), scene.state.shape.float(), rotations, scene.state.root_m.float())
+
+
+def of_frames(given: GivenPoses, rows: np.ndarray) -> GivenPoses:
+    return replace(given, rows=rows, rotations=given.rotations[rows], root_m=given.root_m[rows])
+
+
+def test_poses_that_are_all_kept_need_no_landmarks(short: tuple[SmplBody, Act, GivenPoses]) -> None:
+    body, scene, given = short
+    blind = replace(scene, landmarks_px=np.full_like(scene.landmarks_px, np.nan))
+    seen, windows = blind.observations(scene.camera), scene.windows()
+    result = fit_given(body, seen, windows, given, keep=True)
+    assert (fitted_joints_m(result, scene) - scene.joints_m()).abs().max() < 1e-4
+    assert np.isnan(result.landmark_error_px).all()
+    assert result.overlap.min() > 0.97
+    with pytest.raises(ValueError, match="fewer than 3 frames"):
+        fit_given(body, seen, windows, of_frames(given, np.arange(5)), keep=True)
+    with pytest.raises(ValueError, match="fewer than 3 frames"):
+        fit_given(body, seen, windows, given, keep=False)
+
+
+def test_only_frames_that_are_fitted_count_as_mended(short: tuple[SmplBody, Act, GivenPoses]) -> None:
+    """The detector takes left for right in frame 3; a kept pose owes nothing to it."""
+    body, scene, given = short
+    swapped = replace(scene, landmarks_px=scene.landmarks_px.copy(), landmarks_world_m=scene.landmarks_world_m.copy())
+    take_for_other_side(swapped, [3])
+    seen, windows = swapped.observations(scene.camera), scene.windows()
+    for rows, mended in ((np.arange(6), []), (np.array([0, 1, 2, 4, 5]), [3])):
+        result = fit_given(body, seen, windows, of_frames(given, rows), keep=True)
+        assert np.flatnonzero(result.exchanged["whole body"]).tolist() == mended
+        assert result.landmark_error_px.max() < 2.0
 
 
 def errors_mm(scene: Act, body: SmplBody, given: GivenPoses, clothes_px: int, keep: bool) -> tuple[float, float]:

@@ -1,3 +1,5 @@
+from functools import cache
+
 import numpy as np
 import torch
 
@@ -16,6 +18,7 @@ from pipeline.geometry.rotation import axis_angle_to_matrix
 from tests.avatar.acting import act
 
 
+@cache
 def rest_landmarks() -> torch.Tensor:
     body = load_anny()
     model = linearise(body, body.shape_defaults)
