@@ -1,6 +1,5 @@
 """The last stage: held-out frames against renders of the field and of the exported mesh, figures, charts, a page."""
 
-import math
 import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -10,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from pydantic import Field
 from torch import Tensor
 
@@ -23,10 +22,11 @@ from pipeline.core.config import Config as BaseConfig
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import Manifest, read_manifest
 from pipeline.core.measure import environment, peak_rss_mib
-from pipeline.core.progress import track
+from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
 from pipeline.geometry.textured import soften_outline
 from pipeline.io.avatar import FinishedRun, load_finished_run
+from pipeline.io.capture import CONTACT_SHEET, Capture
 from pipeline.io.image import read_rgb, to_uint8, write_rgb
 from pipeline.io.lpips_weights import find_lpips_weights
 from pipeline.io.report_json import build_report, finite, report_text
@@ -34,12 +34,15 @@ from pipeline.io.report_page import FramePictures, PageContent, error_map, rende
 from pipeline.io.sheet import on_white_8bit, picture_sheet
 from pipeline.metrics.health import mesh_health
 from pipeline.metrics.images import (
+    PIXEL_SPREAD_PX,
     body_box,
     body_pixels,
     edge_spread_px,
     frame_scores,
+    missing_blur_px,
     on_white,
     premultiplied_on_white,
+    unscorable,
 )
 
 NEEDS = ("frames", "body", "field", "mesh", "texture", "export")
@@ -51,8 +54,6 @@ PICTURES = (
 )
 CROP_MARGIN_PX = 12
 SPREAD_FRAMES = 16
-PIXEL_SPREAD_PX = math.sqrt(1.0 / 12.0)
-"""Standard deviation of a square pixel: what a sharp outline is blurred by in any picture."""
 
 
 class Config(BaseConfig):
@@ -80,12 +81,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     started = time.monotonic()
     manifests = {name: _manifest(inputs[name]) for name in NEEDS}
     loaded = load_finished_run(inputs)
-    positions = loaded.capture.positions(HELDOUT)
-    if len(positions) == 0:
-        raise UserError(
-            f"{inputs['frames']} holds no frame whose index is divisible by eight, so nothing can be scored: "
-            "film longer, or choose more frames"
-        )
+    positions = scored_positions(loaded.capture)
     spread_px = outline_spread_px(loaded)
     rows, pictures = score(loaded, positions, spread_px, config)
     turntable = draw_turntable(loaded, int(positions[len(positions) // 2]), config)
@@ -118,6 +114,31 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     }
 
 
+def scored_positions(capture: Capture) -> Int[np.ndarray, "k"]:
+    """Positions of the held-out frames that can be scored; a warning names each of the others and says why.
+
+    Raises:
+        UserError: there is no such frame.
+    """
+    positions = capture.positions(HELDOUT)
+    if len(positions) == 0:
+        raise UserError(
+            f"{capture.folder} holds no frame whose index is divisible by eight, so nothing can be scored: "
+            "film longer, or choose more frames"
+        )
+    reasons = [unscorable(to_uint8(capture.mask(position))) for position in positions]
+    for position, reason in zip(positions, reasons, strict=True):
+        if reason is not None:
+            warn(f"held-out frame {capture.frame_index[position]} is not scored: {reason}")
+    scored = positions[[reason is None for reason in reasons]]
+    if len(scored) == 0:
+        raise UserError(
+            f"no held-out frame of {capture.folder} can be scored (frame {capture.frame_index[positions[0]]}: "
+            f"{reasons[0]}); look at {capture.folder / CONTACT_SHEET}, supply masks/, or film closer"
+        )
+    return scored
+
+
 def outline_spread_px(loaded: FinishedRun) -> float:
     """How soft the capture's outlines are: the median over some of the frames that are not scored."""
     others = loaded.capture.positions(TRAIN)
@@ -134,7 +155,7 @@ def score(
     The mesh is drawn with outlines as soft as the capture's (`spread_px`), as the field has learnt them; the row
     `mesh_sharp` is the mesh as square pixels give it.
     """
-    blur_px = math.sqrt(max(0.0, spread_px**2 - PIXEL_SPREAD_PX**2))
+    blur_px = missing_blur_px(spread_px)
 
     def draw_sharp(pose: Float[Tensor, "j 4 4"]) -> Float[np.ndarray, "h w 4"]:
         return loaded.avatar.render(loaded.avatar.posed(pose), loaded.camera, config.samples)
@@ -221,7 +242,7 @@ def _manifest(folder: Path) -> Manifest:
 
 STAGE = Stage(
     name="report",
-    version=3,
+    version=4,
     needs=NEEDS,
     makes=("report.json", "index.html", "turntable.jpg", "heldout.jpg"),
     config=Config,

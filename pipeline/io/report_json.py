@@ -9,19 +9,27 @@ from pipeline.core.errors import UserError
 from pipeline.core.manifest import Manifest
 from pipeline.io.lpips_weights import ABSENT as LPIPS_ABSENT
 from pipeline.metrics.images import mean_scores
+from pipeline.metrics.lpips import SMALLEST_SIDE_PX
 
 PROTOCOL = (
     "{count} frames, those that the video's split.json names or else those whose index in the video is divisible by "
-    "eight, were held out: field, mesh and texture never saw their pixels, and no decision was made on them. Their "
-    "poses come from the body stage, which reads the landmarks and the mask of every frame, and from the field's pose "
-    "corrections, interpolated in time between training frames and held beyond them; no pose was fitted to a held-out "
-    "image. Renders and frames are laid over white by the mask and rounded to 8 bits. Of psnr, ssim and flip (67 "
+    "eight, were held out: field, mesh and texture never saw their pixels, and nothing of them was decided on these. "
+    "Their poses are fitted to landmarks and outline, never to their colours: the body stage finds the pose of every "
+    "frame, and the one shape and camera, from the landmarks and the masks of all frames, held-out ones too; the "
+    "field's corrections of the poses are interpolated in time between training frames and held beyond them. Frames "
+    "are laid over white by the mask that the frames stage found, so that what it leaves out costs nothing, renders by "
+    "their own coverage, both rounded to 8 bits. Of psnr, ssim and flip (67 "
     "pixels a degree, lower is better), _full counts the whole image, _body the pixels of the mask, _box the smallest "
     "box around it; each is the mean over frames. field is the radiance field, mesh the exported mesh with its "
     "diffuse map, unlit, its outline blurred until it is as soft as the masks (masks.edge_spread_px, measured on "
     "frames that are not scored); mesh_sharp is the mesh as square pixels give it."
 )
 UNREFINED = " The rows named unrefined use the body stage's poses alone."
+LPIPS = (
+    "AlexNet, version 0.1, full image on white, colours scaled to [-1, 1] as its authors' code wants them. "
+    "InstantAvatar's evaluation gives it colours in [0, 1], so LPIPS published after that do not compare"
+)
+NO_LPIPS = f"{LPIPS_ABSENT}; frames with a side below {SMALLEST_SIDE_PX} px have none either way"
 POSE_FITTED_ENDING = "_pose_fitted"
 POSE_FITTED = (
     " The rows named pose_fitted are no held-out scores: there the pose of each frame was fitted to that frame's own "
@@ -60,7 +68,7 @@ def build_report(
         "heldout": {name: mean_scores([row[name] for row in frames]) for name in renders}
         | {
             "protocol": protocol,
-            "lpips": "AlexNet, version 0.1, full image on white" if perceptual else LPIPS_ABSENT,
+            "lpips": LPIPS if perceptual else NO_LPIPS,
             "frames": list(frames),
         },
         **{name: dict(section) for name, section in figures.items()},

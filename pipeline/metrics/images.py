@@ -15,12 +15,15 @@ from skimage.measure import perimeter_crofton
 from torch import Tensor
 
 from pipeline.metrics.flip import flip_map
-from pipeline.metrics.lpips import lpips
+from pipeline.metrics.lpips import SMALLEST_SIDE_PX, lpips
 
 SSIM_SIGMA_PX = 1.5
 SSIM_RADIUS_PX = 5  # torchmetrics: int(3.5 sigma + 0.5), so an 11 x 11 window
 _SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2
 _INSIDE = slice(SSIM_RADIUS_PX, -SSIM_RADIUS_PX)
+
+PIXEL_SPREAD_PX = math.sqrt(1.0 / 12.0)
+"""Standard deviation of a square pixel: what a sharp outline is blurred by in any picture."""
 
 
 def on_white(rgb: UInt8[np.ndarray, "h w 3"], alpha: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
@@ -46,6 +49,17 @@ def body_box(body: Bool[np.ndarray, "h w"]) -> tuple[slice, slice]:
     if not len(rows):
         raise ValueError("the mask holds no body pixel")
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+
+
+def unscorable(mask: UInt8[np.ndarray, "h w"]) -> str | None:
+    """Why `frame_scores` refuses a frame with this mask; None when it does not."""
+    body = body_pixels(mask)
+    if not body.any():
+        return "no pixel of its mask reaches one half"
+    height_px, width_px = (part.stop - part.start for part in body_box(body))
+    if min(height_px, width_px) <= 2 * SSIM_RADIUS_PX:
+        return f"the person in it has {width_px} x {height_px} px, less than the window of SSIM"
+    return None if body[_INSIDE, _INSIDE].any() else "the person in it only lines the picture's border"
 
 
 def psnr_db(
@@ -100,11 +114,16 @@ def edge_spread_px(alpha: UInt8[np.ndarray, "h w"]) -> float:
     """How soft a mask's outline is: standard deviation in pixels of the blur that would make it from a step.
 
     Across an edge with that profile, a Gaussian's, alpha (1 - alpha) integrates to spread / sqrt(pi); the length of the
-    outline is Crofton's. A sharp outline seen by square pixels has 0.29; a mask without outline has 0.
+    outline is Crofton's. A sharp outline seen by square pixels has `PIXEL_SPREAD_PX`; a mask without outline has 0.
     """
     opacity = alpha.astype(np.float64) / 255.0
     length_px = perimeter_crofton(alpha >= 128, directions=4)
     return math.sqrt(math.pi) * float((opacity * (1.0 - opacity)).sum()) / length_px if length_px > 0.0 else 0.0
+
+
+def missing_blur_px(spread_px: float) -> float:
+    """Standard deviation of the Gaussian that gives a sharp outline of square pixels this spread (variances add)."""
+    return math.sqrt(max(0.0, spread_px**2 - PIXEL_SPREAD_PX**2))
 
 
 def mask_iou(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"]) -> float:
@@ -129,12 +148,18 @@ def frame_scores(
 
     Returns:
         psnr, ssim (higher is better) and flip (lower) each of the full image, of the body's pixels and of the body's
-        box: psnr_full (dB), psnr_body, ..., flip_box. mask_iou of the two silhouettes. lpips_full (lower) with weights.
+        box: psnr_full (dB), psnr_body, ..., flip_box. mask_iou of the two silhouettes. lpips_full (lower) with weights,
+        for images of 63 px and more.
+
+    Raises:
+        ValueError: see `unscorable`.
     """
     render, target, body = premultiplied_on_white(rgba), on_white(image, mask), body_pixels(mask)
     box = body_box(body)
     flip = flip_map(render, target)
-    perceptual = {} if lpips_weights is None else {"lpips_full": lpips(render, target, lpips_weights)}
+    perceptual: dict[str, float] = {}
+    if lpips_weights is not None and min(mask.shape) >= SMALLEST_SIDE_PX:
+        perceptual["lpips_full"] = lpips(render, target, lpips_weights)
     return {
         "psnr_full": psnr_db(render, target),
         "psnr_body": psnr_db(render, target, body),

@@ -8,7 +8,8 @@ import pytest
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import Manifest
 from pipeline.io.report_json import finite, report_text
-from tests.io.report_sample import STAGES, sample_manifests, sample_report
+from tests.io import report_sample
+from tests.io.report_sample import SCORES, STAGES, sample_manifests, sample_report
 
 
 def test_the_promised_keys_are_there():
@@ -22,6 +23,7 @@ def test_the_promised_keys_are_there():
     assert report["masks"] == {"count": 9}
     assert report["body"] == {"landmark_error_px": 4.5, "silhouette_iou": 0.93}
     assert "divisible by eight" in report["heldout"]["protocol"]
+    assert "fitted to landmarks and outline, never to their colours" in report["heldout"]["protocol"]
 
 
 def test_totals_are_the_sum_of_seconds_and_the_highest_peak():
@@ -42,6 +44,12 @@ def test_the_psnr_of_equal_images_becomes_null():
     assert report["heldout"]["field"]["psnr_full"] is None
     assert json.loads(report_text(report))["heldout"]["frames"][0]["mesh"]["psnr_body"] is None
     assert finite({"a": [math.nan, 1.0, (2, -math.inf)]}) == {"a": [None, 1.0, [2, None]]}
+
+
+def test_lpips_says_what_it_compares_with_or_why_it_is_absent(monkeypatch):
+    assert sample_report()["heldout"]["lpips"].startswith("absent")
+    monkeypatch.setattr(report_sample, "SCORES", (*SCORES, "lpips_full"))
+    assert "do not compare" in sample_report()["heldout"]["lpips"]
 
 
 def test_warnings_name_their_stage():

@@ -1,5 +1,7 @@
 """Mesh health on meshes whose faults are known."""
 
+from itertools import permutations
+
 import numpy as np
 import pytest
 import trimesh
@@ -66,6 +68,51 @@ def test_unused_vertices_are_no_component():
 def test_boxes_that_cut_each_other_are_seen():
     assert self_intersecting_faces(together(box(), box((3.0, 0.0, 0.0)))) == 0
     assert self_intersecting_faces(together(box(), box((0.4, 0.3, 0.2)))) > 4
+
+
+def pierces(ends: np.ndarray, corners: np.ndarray) -> bool:
+    """Whether the straight line between two points goes through a triangle: Cramer's rule by a linear solver."""
+    sides = corners[1:] - corners[0]
+    along, u, v = np.linalg.solve(np.column_stack([ends[0] - ends[1], *sides]), ends[0] - corners[0])
+    return bool(0 < along < 1 and u > 0 and v > 0 and u + v < 1)
+
+
+def slow_cut_faces(mesh: Mesh) -> int:
+    """Faces with an edge that goes through another face, or through which such an edge goes, pair by pair."""
+    cut = set()
+    for one, other in permutations(range(len(mesh.faces)), 2):
+        for ends in mesh.faces[one][[[0, 1], [1, 2], [2, 0]]]:
+            apart = not set(ends) & set(mesh.faces[other])
+            if apart and pierces(mesh.vertices[ends], mesh.vertices[mesh.faces[other]]):
+                cut |= {one, other}
+    return len(cut)
+
+
+def test_cut_faces_are_those_of_a_search_through_all_pairs(rng):
+    """Scattered triangles, and others that hang on a corner of one of them."""
+    corners = rng.random((30, 1, 3)) + 0.15 * rng.normal(size=(30, 3, 3))
+    hanging = corners[:10, :1] + 0.15 * rng.normal(size=(10, 2, 3))
+    faces = np.concatenate([np.arange(90).reshape(30, 3), np.stack([3 * np.arange(10), *_rows(90, 10)], axis=1)])
+    mesh = Mesh(np.concatenate([corners.reshape(-1, 3), hanging.reshape(-1, 3)]), faces.astype(np.int32))
+    expected = slow_cut_faces(mesh)
+    assert 5 < expected < 35
+    assert self_intersecting_faces(mesh) == mesh_health(mesh)["self_intersecting_faces"] == expected
+
+
+def _rows(start: int, count: int) -> np.ndarray:
+    """Numbers of `count` pairs of vertices that follow one another."""
+    return (start + np.arange(2 * count)).reshape(count, 2).T
+
+
+def test_slivers_are_faces_with_an_angle_below_ten_degrees():
+    """Right-angled triangles with a leg of 1 and a known angle beside it, one above the other."""
+    angles_deg = np.array([2.0, 9.9, 10.1, 40.0, 44.0])
+    rise = np.tan(np.radians(angles_deg))
+    vertices = np.array([[[0, 0, k], [1, 0, k], [1, rise[k], k]] for k in range(5)]).reshape(-1, 3)
+    health = mesh_health(Mesh(vertices, np.arange(15, dtype=np.int32).reshape(5, 3)))
+    assert health["sliver_share"] == pytest.approx(2 / 5)
+    assert health["smallest_angle_deg"] == pytest.approx(2.0)
+    assert health["components"] == 5
 
 
 def test_smallest_angle_is_the_law_of_cosines(rng):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from skimage.metrics import structural_similarity
 
+from pipeline.metrics.flip import flip_map
 from pipeline.metrics.images import (
     body_box,
     body_pixels,
@@ -14,11 +15,15 @@ from pipeline.metrics.images import (
     frame_scores,
     mask_iou,
     mean_scores,
+    missing_blur_px,
     on_white,
     premultiplied_on_white,
     psnr_db,
     ssim,
+    unscorable,
 )
+from pipeline.metrics.lpips import lpips
+from tests.metrics.narrow_alexnet import narrow_alexnet
 
 
 @pytest.fixture
@@ -137,6 +142,68 @@ def test_frame_scores_of_a_perfect_render_and_of_a_missing_person(rng):
     assert nobody["flip_full"] < nobody["flip_body"]
     assert scores["ssim_body"] == pytest.approx(1.0)
     assert "lpips_full" not in scores
+    assert frame_scores(perfect, image, mask, narrow_alexnet(rng)) == scores  # 48 x 40 px are too few for LPIPS
+
+
+def test_each_score_of_a_frame_is_the_metric_of_its_name_on_the_pixels_of_its_name(rng):
+    """Softly cut noise whose scores all differ, so that none can stand for another."""
+    rows, columns = np.mgrid[:90, :70]
+    mask, alpha = (np.clip(30.5 - np.hypot((rows - 42) / 1.1, columns - middle), 0, 1) for middle in (36, 39))
+    mask, alpha = np.rint(255 * mask).astype(np.uint8), alpha[..., None].astype(np.float32)
+    image = rng.integers(0, 256, (90, 70, 3)).astype(np.uint8)
+    noisy = np.clip(image / 255 + rng.normal(0, 0.1, image.shape), 0, 1)
+    rgba = np.concatenate([noisy.astype(np.float32) * alpha, alpha], axis=2)
+    weights = narrow_alexnet(rng)
+    render = np.rint(255 * (rgba[..., :3] + (1 - alpha))).astype(np.uint8)
+    target = np.rint(255 - mask[..., None] / 255 * (255.0 - image)).astype(np.uint8)
+    body = mask > 127
+    box = tuple(slice(where.min(), where.max() + 1) for where in np.nonzero(body))
+    differences = flip_map(render, target)
+    expected = {
+        "psnr_full": psnr_db(render, target),
+        "psnr_body": psnr_db(render, target, body),
+        "psnr_box": psnr_db(render[box], target[box]),
+        "ssim_full": ssim(render, target),
+        "ssim_body": ssim(render, target, body),
+        "ssim_box": ssim(render[box], target[box]),
+        "flip_full": differences.mean(),
+        "flip_body": differences[body].mean(),
+        "flip_box": differences[box].mean(),
+        "mask_iou": ((alpha[..., 0] >= 0.5) & body).sum() / ((alpha[..., 0] >= 0.5) | body).sum(),
+        "lpips_full": lpips(render, target, weights),
+    }
+    assert frame_scores(rgba, image, mask, weights) == pytest.approx(expected)
+    assert np.diff(sorted(expected.values())).min() > 1e-3
+
+
+def masks_about_the_smallest() -> list[np.ndarray]:
+    """Nobody, boxes one pixel more or less than SSIM's window, and people who only line the border, or hardly more."""
+    made = [np.zeros((40, 30), dtype=np.uint8)]
+    for height, width in ((10, 20), (11, 11), (20, 10), (12, 13)):
+        made.append(np.zeros_like(made[0]))
+        made[-1][8 : 8 + height, 7 : 7 + width] = 200
+    for thickness in (5, 6):
+        made.append(np.full_like(made[0], 200))
+        made[-1][thickness:, : 30 - thickness] = 0
+    return [*made, np.full_like(made[0], 127)]
+
+
+@pytest.mark.parametrize("mask", masks_about_the_smallest())
+def test_frames_that_scoring_refuses_are_known_beforehand(mask):
+    image, rgba = np.zeros((*mask.shape, 3), dtype=np.uint8), np.zeros((*mask.shape, 4), dtype=np.float32)
+    if unscorable(mask) is None:
+        assert frame_scores(rgba, image, mask)["mask_iou"] == 0.0
+    else:
+        with pytest.raises(ValueError, match="no body pixel|11 px window|no window"):
+            frame_scores(rgba, image, mask)
+
+
+def test_why_a_frame_cannot_be_scored():
+    reasons = [unscorable(mask) for mask in masks_about_the_smallest()]
+    assert [bool(reason) for reason in reasons] == [True, True, False, True, False, True, False, True]
+    assert "one half" in reasons[0]
+    assert "20 x 10 px" in reasons[1]
+    assert "border" in reasons[5]
 
 
 def test_mean_scores():
@@ -153,6 +220,8 @@ def test_edge_spread_is_that_of_the_blur(sigma_px):
     soft = square_pixels if sigma_px == 0.0 else cv2.GaussianBlur(square_pixels, (0, 0), sigma_px)
     spread_px = edge_spread_px(np.rint(255 * soft).astype(np.uint8))
     assert spread_px == pytest.approx(np.hypot(sigma_px, 12**-0.5), rel=0.04)
+    assert missing_blur_px(float(np.hypot(sigma_px, 12**-0.5))) == pytest.approx(sigma_px, abs=1e-6)
+    assert missing_blur_px(0.2) == 0.0  # sharper than square pixels can be: a mask of ones and zeros
 
 
 def test_a_mask_without_outline_has_no_edge_spread():

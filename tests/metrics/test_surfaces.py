@@ -34,13 +34,37 @@ def test_tilted_square_has_the_tilt_as_normal_angle():
     assert scores["normal_angle_deg"] == pytest.approx(10.0, abs=1e-6)
 
 
-def test_missing_half_shows_in_recall_only():
+def test_normal_angles_are_the_mean_of_both_ways():
+    """A floor, and in the truth a wall besides that rises from its edge at 60 degrees: half the truth's area."""
+    floor, slope = square(0.0), np.radians(60.0)
+    across = floor.vertices[:, :1] + 0.5
+    wall = np.concatenate([0.5 + across * np.cos(slope), across * np.sin(slope), floor.vertices[:, 2:]], axis=1)
+    both = Mesh(np.concatenate([floor.vertices, wall]), np.concatenate([floor.faces, floor.faces + 4]))
+    assert surface_scores(floor, both, count=20_000)["normal_angle_deg"] == pytest.approx((0 + 30) / 2, abs=0.3)
+
+
+@pytest.mark.parametrize(("height_m", "f_score"), [(0.0049, 1.0), (0.0051, 0.0)])
+def test_the_threshold_is_five_millimetres(height_m, f_score):
+    assert surface_scores(square(height_m), square(0.0), count=100)["f_score"] == f_score
+
+
+def test_a_missing_half_shows_one_way_only():
+    """From the whole, half the points lie on the rest and half are 0 to 500 mm away from it, evenly."""
     whole = square(0.0)
     half = Mesh(whole.vertices * [0.5, 1.0, 1.0] - [0.25, 0.0, 0.0], whole.faces)
-    scores = surface_scores(half, whole, count=20_000)
-    assert scores["precision"] == 1.0
-    assert scores["recall"] == pytest.approx(0.505, abs=0.01)  # half, and a 5 mm strip beside it
-    assert scores["truth_to_result_mm"] == pytest.approx(125.0, rel=0.03)  # mean of 0 and of 0..500 mm, halved
+    missing, added = (surface_scores(*pair, count=20_000) for pair in ((half, whole), (whole, half)))
+    near = 0.505  # half, and a 5 mm strip beside it
+    for scores, (perfect, partial), (none, far) in (
+        (missing, ("precision", "recall"), ("result_to_truth_mm", "truth_to_result_mm")),
+        (added, ("recall", "precision"), ("truth_to_result_mm", "result_to_truth_mm")),
+    ):
+        assert scores[perfect] == 1.0
+        assert scores[partial] == pytest.approx(near, abs=0.01)
+        assert scores["f_score"] == pytest.approx(2 * near / (1 + near), abs=0.01)
+        assert scores[none] == pytest.approx(0.0, abs=1e-6)
+        assert scores[far] == pytest.approx(125.0, rel=0.03)
+        assert scores["chamfer_mm"] == pytest.approx(62.5, rel=0.03)
+        assert scores["hausdorff95_mm"] == pytest.approx(450.0, abs=8.0)  # a tenth of the far half lies beyond
 
 
 def test_distances_are_those_of_a_brute_force_search(rng):

@@ -12,12 +12,15 @@ import pytest
 
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import digest_files
-from pipeline.io.capture import Capture, load_capture, save_capture
+from pipeline.core.progress import take_warnings
+from pipeline.io.capture import Capture, load_capture, mask_path, save_capture
+from pipeline.io.image import write_gray
 from pipeline.io.lpips_weights import find_lpips_weights
-from stages.report import STAGE, Config, run
+from stages.report import STAGE, Config, run, scored_positions
 from tests.stages.report_run import COLOUR_ERROR, FRAME_INDEX, make_run
 
 CONFIG = Config(samples=3, shown_frames=2, views=4, view_height_px=64, fit_held_out_poses=True, fit_steps=5)
+QUICK = Config(samples=1, shown_frames=1, views=2, view_height_px=64, unrefined=False)
 
 
 @pytest.fixture(scope="module")
@@ -142,6 +145,29 @@ def test_without_held_out_frames_the_reason_is_named(inputs: dict[str, Path], tm
     save_capture(Capture(**fields))
     with pytest.raises(UserError, match="divisible by eight"):
         run(inputs | {"frames": frames}, tmp_path, CONFIG)
+
+
+def test_a_held_out_frame_without_a_person_is_left_out_with_a_warning(inputs: dict[str, Path], tmp_path: Path):
+    """Of three held-out frames one has an empty mask and one a person of 10 px: what no metric can say is not said."""
+    frames = tmp_path / "frames"
+    shutil.copytree(inputs["frames"], frames)
+    blank = np.zeros_like(cv2.imread(str(mask_path(frames, 0)), cv2.IMREAD_GRAYSCALE))
+    write_gray(mask_path(frames, 0), blank)
+    small = blank.copy()
+    small[20:30, 20:40] = 255
+    write_gray(mask_path(frames, 16), small)
+    take_warnings()
+    out = tmp_path / "report"
+    out.mkdir()
+    run(inputs | {"frames": frames}, out, QUICK)
+    assert [row["index"] for row in json.loads((out / "report.json").read_text())["heldout"]["frames"]] == [8]
+    empty, tiny = take_warnings()
+    assert "held-out frame 0 is not scored: no pixel of its mask" in empty
+    assert "held-out frame 16 is not scored: the person in it has 20 x 10 px" in tiny
+    write_gray(mask_path(frames, 8), blank)
+    with pytest.raises(UserError, match=r"no held-out frame of .*frames can be scored \(frame 0: no pixel"):
+        scored_positions(load_capture(frames))
+    assert len(take_warnings()) == 3
 
 
 def test_without_a_manifest_the_command_is_named(inputs: dict[str, Path], tmp_path: Path):
