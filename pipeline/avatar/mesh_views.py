@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
@@ -12,6 +11,7 @@ from torch import Tensor
 from pipeline.avatar.body import Body
 from pipeline.avatar.extract import transfer_skin_weights
 from pipeline.geometry.camera import Camera, project
+from pipeline.geometry.matte import shrink
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.raster import face_adjacency, render_shaded
 from pipeline.geometry.skinning import linear_blend_skinning, top_k_weights
@@ -51,7 +51,7 @@ def crop_view(
 ) -> View:
     """The part of a frame around the mask, reduced until the person is at most ``person_height_px`` high.
 
-    image, mask: in [0, 1]. A frame with an empty mask is kept whole.
+    image, mask: in [0, 1]; colours beyond the mask are lost. A frame with an empty mask is kept whole.
     """
     rows, columns = (np.flatnonzero((mask > 0.5).any(axis=axis)) for axis in (1, 0))
     rows = rows if len(rows) else np.array([0, camera.height - 1])
@@ -62,14 +62,7 @@ def crop_view(
     bottom, right = min(camera.height, rows[-1] + 1 + margin), min(camera.width, columns[-1] + 1 + margin)
     small = camera.cropped(int(left), int(top), int(right - left), int(bottom - top))
     small = small.scaled(min(1.0, person_height_px / tall))
-    parts = [
-        cv2.resize(
-            np.ascontiguousarray(part[top:bottom, left:right]),
-            (small.width, small.height),
-            interpolation=cv2.INTER_AREA,
-        )
-        for part in (image, mask)
-    ]
+    parts = shrink(image[top:bottom, left:right], mask[top:bottom, left:right], (small.width, small.height))
     pixels, alpha = (torch.from_numpy(np.round(255.0 * np.clip(part, 0.0, 1.0)).astype(np.uint8)) for part in parts)
     return View(pixels, alpha, small, canonical_to_world)
 

@@ -1,4 +1,5 @@
-"""Person masks: from a detector's blurred guess to soft edges at the image's own resolution. Pure functions.
+"""Person masks: from a detector's blurred guess to soft edges at the image's own resolution, and the person's own
+colour there. Pure functions.
 
 The letters used here: I colour of a pixel, F and B the colours of person and background around it, alpha the part of
 the pixel that the person covers, so that I = alpha F + (1 - alpha) B. Alphas are float32 in [0, 1].
@@ -9,7 +10,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.geometry.plate import Plate, covered
 
@@ -32,6 +33,9 @@ _PAINTED_SHARE, _PAINTED_LEVELS = 0.95, 2
 # a white hem before a white wall is lost (synthetic captures: IoU median and worst 0.978, 0.945; with it 0.991, 0.959).
 _SURE = 0.97
 _RIM_PX = 1.0
+# Colours at least this far from the soft rim are the person's or the backdrop's alone: lens and codec mix them over a
+# wider strip than alpha tells. Nearer ones are likelier to be those of the rim, see docs/decisions.md.
+_PERSON_CLEAR_PX, _BACKDROP_CLEAR_PX = 1.0, 2.5
 # Level of 255 from which the detector sees a trace of the person.
 _TRACE = 25
 # Parts smaller than this share of the person are specks, holes smaller than this share are noise.
@@ -84,6 +88,44 @@ def clean_alpha(alpha: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     outer, inner = _grown(body, _RIM_PX), ~_grown(~body, _RIM_PX)
     soft = np.where(body, np.maximum(alpha, 0.5), np.minimum(alpha, 0.5))
     return np.where(inner, 1.0, np.where(outer, soft, 0.0)).astype(np.float32)
+
+
+def without_backdrop(rgb: UInt8[np.ndarray, "h w 3"], alpha: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    """The picture in which the person's colour takes the backdrop's share of every soft pixel (alpha from 1 to 254).
+
+    With F' and B', the colours of the nearest pixels surely inside and surely outside, such a pixel becomes
+    I + (1 - alpha) (F' - B'), which is alpha F + (1 - alpha) F' where B' = B: what it shows of the person stays, and no
+    small alpha divides its noise. The rest of the picture stays, and all of it where one side is nowhere sure.
+    """
+    soft = (alpha > 0) & (alpha < 255)
+    if not soft.any():
+        return rgb
+    window = _window(alpha > 0, margin_px=8)
+    sides = [
+        ~_grown(mixed, clear_px)
+        for mixed, clear_px in ((alpha[window] < 255, _PERSON_CLEAR_PX), (alpha[window] > 0, _BACKDROP_CLEAR_PX))
+    ]
+    if not all(side.any() for side in sides):
+        return rgb
+    soft = soft[window]
+    person, backdrop = (rgb[window].reshape(-1, 3)[_nearest(side)[soft]].astype(np.float32) for side in sides)
+    share = 1.0 - alpha[window][soft, None] / np.float32(255.0)
+    result = rgb.copy()
+    result[window][soft] = np.rint(np.clip(rgb[window][soft] + share * (person - backdrop), 0.0, 255.0))
+    return result
+
+
+def shrink(
+    image: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"], size: tuple[int, int]
+) -> tuple[Float[np.ndarray, "h2 w2 3"], Float[np.ndarray, "h2 w2"]]:
+    """Picture and alpha at another size (columns, rows), averaged over areas.
+
+    Colours count as far as the person covers them, so that none of the backdrop comes in; black where he is not.
+    """
+    reduced, premultiplied = (
+        cv2.resize(array, size, interpolation=cv2.INTER_AREA) for array in (alpha, image * alpha[..., None])
+    )
+    return premultiplied / np.maximum(reduced, np.float32(1e-6))[..., None], reduced
 
 
 def with_painted_backdrop(rgb: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
@@ -229,6 +271,16 @@ def _discriminant(
     offset = (direction * background.mean).sum(axis=-1)
     certainty = np.where(np.minimum(person.weight, background.weight) > _LEAST_WEIGHT, certainty, 0.0)
     return direction.astype(np.float32), offset.astype(np.float32), certainty.astype(np.float32)
+
+
+def _nearest(wanted: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "h w"]:
+    """For every pixel the number, row by row, of the nearest wanted one."""
+    _, labels = cv2.distanceTransformWithLabels(
+        (~wanted).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    place = np.zeros(int(labels.max()) + 1, dtype=np.int64)
+    place[labels[wanted]] = np.flatnonzero(wanted)
+    return place[labels]
 
 
 def _largest_parts(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

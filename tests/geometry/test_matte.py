@@ -6,6 +6,8 @@ import pytest
 
 from pipeline.geometry import matte
 
+SIDE_PX = 64
+
 
 def intersection_over_union(first: np.ndarray, second: np.ndarray) -> float:
     return float((first & second).sum() / (first | second).sum())
@@ -153,6 +155,107 @@ def test_shadow_far_from_the_outline_gains_no_area():
     image = composite(alpha)
     image[290:310, 40:100] = (40, 45, 90)
     assert matte.sharpen_mask(image, detector_mask(alpha))[290:310, 40:100].max() == 0
+
+
+def soft_disc(soft_px: float = 1.0) -> np.ndarray:
+    """Alpha of a disc with a soft rim, 0..255."""
+    rows, columns = np.mgrid[:SIDE_PX, :SIDE_PX] + 0.5
+    distance = 20.0 - np.hypot(rows - 32.0, columns - 32.0)
+    return np.rint(255.0 * np.clip(0.5 + distance / (2.0 * soft_px), 0.0, 1.0)).astype(np.uint8)
+
+
+def laid_over(person: tuple, backdrop: tuple, alpha: np.ndarray) -> np.ndarray:
+    share = alpha[..., None] / 255.0
+    return np.rint(share * np.array(person) + (1.0 - share) * np.array(backdrop)).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("person", "backdrop"), [((200, 40, 90), (20, 180, 60)), ((250, 250, 255), (0, 0, 3)), ((9, 0, 4), (255, 255, 255))]
+)
+def test_plain_colours_are_found_again_to_the_level(person: tuple, backdrop: tuple) -> None:
+    alpha = soft_disc()
+    assert ((alpha > 0) & (alpha < 255)).sum() > 100
+    found = matte.without_backdrop(laid_over(person, backdrop, alpha), alpha)
+    np.testing.assert_allclose(found[alpha > 0], np.broadcast_to(person, (int((alpha > 0).sum()), 3)), atol=1)
+
+
+def test_a_person_before_a_striped_wall_loses_most_of_it() -> None:
+    """Shirt and trousers, wall of changing colour, video noise: error of the rim against the person's true colour."""
+    true_alpha = figure()
+    image, alpha = composite(true_alpha), np.rint(255 * true_alpha).astype(np.uint8)
+    rows = np.mgrid[: alpha.shape[0], : alpha.shape[1]][0]
+    person = np.where((rows < 190)[..., None], (190, 60, 50), (40, 45, 90))
+    rim = (alpha > 0) & (alpha < 255)
+    before, after = (
+        np.abs(found.astype(float) - person)[rim].mean() for found in (image, matte.without_backdrop(image, alpha))
+    )
+    assert after < 0.25 * before
+
+
+def test_the_person_as_seen_in_a_soft_pixel_stays() -> None:
+    """A rim of its own colour, half covered: half of what differs from the person further in is still there."""
+    alpha = soft_disc()
+    rim = (alpha > 0) & (alpha < 255)
+    share = alpha[rim, None] / 255.0
+    image = laid_over((100, 100, 100), (0, 200, 0), alpha)
+    image[rim] = np.rint(share * (180, 100, 100) + (1.0 - share) * (0, 200, 0))
+    found = matte.without_backdrop(image, alpha)[rim]
+    np.testing.assert_allclose(found, 100 + share * (80, 0, 0), atol=1)
+
+
+def test_pixels_that_are_not_soft_stay_as_they_are() -> None:
+    image = np.random.default_rng(0).integers(0, 256, (SIDE_PX, SIDE_PX, 3), dtype=np.uint8)
+    alpha = soft_disc()
+    sure = (alpha == 0) | (alpha == 255)
+    found = matte.without_backdrop(image, alpha)
+    np.testing.assert_array_equal(found[sure], image[sure])
+    assert (found[~sure] != image[~sure]).any()
+
+
+@pytest.mark.parametrize(
+    "alpha", [np.where(soft_disc() > 127, 255, 0), soft_disc() * 0, soft_disc() * 0 + 255, soft_disc() * 0 + 99]
+)
+def test_without_a_rim_or_without_one_of_its_sides_nothing_changes(alpha: np.ndarray) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (SIDE_PX, SIDE_PX, 3), dtype=np.uint8)
+    np.testing.assert_array_equal(matte.without_backdrop(image, alpha.astype(np.uint8)), image)
+
+
+def test_a_picture_of_one_colour_stays() -> None:
+    image = np.full((SIDE_PX, SIDE_PX, 3), 77, np.uint8)
+    np.testing.assert_array_equal(matte.without_backdrop(image, soft_disc(3.0)), image)
+
+
+def test_a_strand_too_thin_to_be_sure_takes_the_colours_around_it() -> None:
+    """The nearest sure pixels of each side are asked for, wherever they lie; a hair of two soft pixels has them far."""
+    alpha = soft_disc()
+    alpha[:11, 30:32] = 128
+    image = laid_over((200, 40, 90), (20, 180, 60), alpha)
+    np.testing.assert_allclose(
+        matte.without_backdrop(image, alpha)[:11, 30:32], np.broadcast_to((200, 40, 90), (11, 2, 3)), atol=1
+    )
+
+
+def test_the_picture_given_is_not_written_to() -> None:
+    image = laid_over((200, 40, 90), (20, 180, 60), soft_disc())
+    before = image.copy()
+    matte.without_backdrop(image, soft_disc())
+    np.testing.assert_array_equal(image, before)
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.8, 0.37])
+def test_a_smaller_picture_of_a_person_holds_no_backdrop(factor: float) -> None:
+    """A premultiplied picture shrinks like any other; the straight colours must be those that it then has."""
+    alpha = soft_disc().astype(np.float32) / 255.0
+    image = np.random.default_rng(0).random((SIDE_PX, SIDE_PX, 3), dtype=np.float32)
+    size = (round(factor * SIDE_PX), round(factor * SIDE_PX) - 3)
+    colour, reduced = matte.shrink(image, alpha, size)
+    assert colour.shape == (*size[::-1], 3)
+    np.testing.assert_allclose(
+        colour * reduced[..., None], cv2.resize(image * alpha[..., None], size, interpolation=cv2.INTER_AREA), atol=1e-6
+    )
+    plain, _ = matte.shrink(np.where(alpha[..., None] > 0, np.float32(0.7), image), alpha, size)
+    np.testing.assert_allclose(plain[reduced > 1e-3], 0.7, atol=1e-3)
+    assert 0.1 < (reduced > 1e-3).mean() < 0.5
 
 
 def test_real_video_gets_closer_to_the_green_screen_key(shared_data):
