@@ -50,7 +50,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     mesh = Mesh(arrays["vertices"], arrays["faces"])
     maps = Maps(
         png_bytes(diffuse),
-        specular_png(specular, diffuse, config.roughness) if specular.any() and not config.unlit else None,
+        specular_png(specular, diffuse, config.roughness) if specular.any() else None,
         config.roughness,
         config.unlit,
     )
