@@ -16,6 +16,13 @@ def test_split_rule():
     assert (split == selection.TRAIN).sum() == 18
 
 
+def test_ranges_join_neighbours_among_the_frames():
+    index = np.array([0, 3, 6, 9, 12, 40])
+    assert selection.frame_ranges(index, np.array([1, 0, 1, 1, 1, 0], dtype=bool)) == "0, 6-12"
+    assert selection.frame_ranges(index, np.zeros(6, dtype=bool)) == ""
+    assert selection.frame_ranges(index, np.ones(6, dtype=bool)) == "0-40"
+
+
 def moving_square(n: int, step: int) -> tuple[np.ndarray, np.ndarray]:
     persons = np.zeros((n, 64, 96), bool)
     for i in range(n):
