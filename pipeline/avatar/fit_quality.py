@@ -38,7 +38,7 @@ Most in finished runs: turns 0.013, a self-capture 0.047.
 ROUGH_OVERLAP = 0.85
 """A fit is worth a word whose median overlap is lower. In finished runs: turns 0.93, a skirt 0.87."""
 
-VERDICTS = ("", "sides mended", "doubtful", "unusable")
+VERDICTS = ("", "mended", "doubtful", "unusable")
 """What may be said of a frame, from well to worst."""
 
 

@@ -23,7 +23,7 @@ TILES_A_ROW = 6
 
 LEFT_RGB, RIGHT_RGB, MIDDLE_RGB = (255.0, 150.0, 60.0), (70.0, 150.0, 255.0), (215.0, 215.0, 215.0)
 BODY_OUTLINE_RGB, MASK_OUTLINE_RGB = (255, 235, 0), (0, 255, 255)
-CAPTION_RGB, MARK_RGB = (255, 255, 255), (255, 40, 40)
+MARK_RGB = (255, 40, 40)
 BODY_SHARE = 0.55
 """How much of the drawn body covers the picture."""
 
@@ -68,9 +68,9 @@ def draw_overlay(
     tile, to_tile = _cut(picture.round().astype(np.uint8), covered | (mask > 127))
     _outline(tile, _cut_like(mask > 127, to_tile, tile), MASK_OUTLINE_RGB)
     _outline(tile, _cut_like(covered, to_tile, tile), BODY_OUTLINE_RGB)
-    _write(tile, caption, TILE_ROWS - 8, CAPTION_RGB)
+    words = f"{caption}  {mark}"
+    cv2.putText(tile, words, (8, TILE_ROWS - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
     if mark:
-        _write(tile, mark, TILE_ROWS - 28, MARK_RGB)
         cv2.rectangle(tile, (1, 1), (TILE_COLUMNS - 2, TILE_ROWS - 2), MARK_RGB, 3)
     return tile
 
@@ -106,10 +106,6 @@ def _cut_like(
     area: Bool[np.ndarray, "h w"], to_tile: Float[np.ndarray, "2 3"], tile: UInt8[np.ndarray, "tile_h tile_w 3"]
 ) -> UInt8[np.ndarray, "tile_h tile_w"]:
     return cv2.warpAffine(area.astype(np.uint8), to_tile, tile.shape[1::-1], flags=cv2.INTER_LINEAR)
-
-
-def _write(tile: UInt8[np.ndarray, "tile_h tile_w 3"], words: str, row: int, rgb: tuple[int, int, int]) -> None:
-    cv2.putText(tile, words, (8, row), cv2.FONT_HERSHEY_SIMPLEX, 0.5, rgb, 1, cv2.LINE_AA)
 
 
 def _outline(
