@@ -26,6 +26,9 @@ from pipeline.geometry.camera import Camera
 from pipeline.io.image import to_uint8, write_gray, write_rgb, write_rgba
 from pipeline.io.npz import save_body, save_camera, save_motion
 
+RECIPE_VERSION = 1
+"""Raised whenever the same options give other pictures; the Makefile reads it too."""
+
 _FEET = ("LeftFoot", "LeftToeBase", "RightFoot", "RightToeBase")
 
 
@@ -89,12 +92,15 @@ def portrait_camera(size_px: int, height_m: float, distance_m: float, fill: floa
     return camera, np.array([0.0, -0.52 * height_m, -distance_m])
 
 
-def novel_cameras(camera: Camera, ground_m: np.ndarray, height_m: float, count: int) -> tuple[Camera, ...]:
+def novel_cameras(camera: Camera, standing_m: np.ndarray, height_m: float, count: int) -> tuple[Camera, ...]:
     """Cameras around the person, between the headings of a turn and above or below the capture's own height.
 
     Every one looks at the middle of the body from the capture's distance, +Y up in its image.
+
+    Args:
+        standing_m: world position on the ground where the person stands in the pose that is shown.
     """
-    middle = ground_m + [0.0, 0.5 * height_m, 0.0]
+    middle = standing_m + [0.0, 0.5 * height_m, 0.0]
     distance = float(np.linalg.norm(middle - camera.centre_m()))
     angles = 2.0 * np.pi * (np.arange(count) + 0.37) / max(count, 1)
     rises = np.resize(np.radians([18.0, -6.0, 35.0, 8.0]), count)
@@ -145,6 +151,7 @@ def write_truth(truth: Path, capture: Capture, bare: Body | None, recipe: dict[s
     save_camera(truth / "camera.npz", capture.camera)
     write_rgb(truth / "room.png", to_uint8(capture.room.image))
     facts = {
+        "version": RECIPE_VERSION,
         "fps": capture.fps,
         "samples": capture.samples,
         "ground_m": [float(value) for value in capture.ground_m],

@@ -1,6 +1,7 @@
 """Options that all synthetic captures share, from the command line to a `Capture`."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ LIGHT_HELP = (
     "hard: a strong key light that the person hides from itself"
 )
 LEAST_FRAMES, LEAST_SIZE_PX = 2, 32
+LEAST_FILL, MOST_FILL = 0.05, 0.95
 
 
 def capture_parser(command: str, description: str) -> argparse.ArgumentParser:
@@ -37,11 +39,13 @@ def capture_parser(command: str, description: str) -> argparse.ArgumentParser:
     parser.add_argument("--size", type=int, default=540, help="side of the square image in pixels, even")
     parser.add_argument("--distance", type=float, default=3.6, help="from camera to person, metres")
     parser.add_argument("--fill", type=float, default=0.82, help="share of the image's height that the person takes")
+    parser.add_argument("--focal", type=float, help="focal length in pixels, from which the share then follows")
     parser.add_argument("--light", choices=sorted(LIGHTS), default="studio", help=LIGHT_HELP)
     parser.add_argument("--background", choices=("busy", "plain"), default="busy", help="the room")
     parser.add_argument("--samples", type=int, default=2, help="antialiasing: samples a pixel along each axis")
     parser.add_argument("--novel-views", type=int, default=4, help="held-out cameras to render into truth/")
     parser.add_argument("--novel-poses", type=int, default=4, help="held-out poses to render into truth/")
+    parser.add_argument("--novel-bvh", type=Path, help="motion capture to take them from, evenly spread, on the spot")
     parser.add_argument("--bvh", type=Path, help="motion capture to follow instead of the turn in A-pose")
     parser.add_argument("--start", type=float, default=0.0, help="where in the motion to start, seconds")
     parser.add_argument("--in-place", action="store_true", help="stay on the spot whatever the motion does")
@@ -60,7 +64,7 @@ def check_options(options: argparse.Namespace) -> None:
         ("fps", 0.1, 1000.0),
         ("size", LEAST_SIZE_PX, 4096),
         ("distance", 1.0, 50.0),
-        ("fill", 0.05, 0.95),
+        ("fill", LEAST_FILL, MOST_FILL),
         ("samples", 1, 8),
         ("novel_views", 0, 1000),
         ("novel_poses", 0, 1000),
@@ -76,8 +80,21 @@ def check_options(options: argparse.Namespace) -> None:
 
 
 def stage_scene(options: argparse.Namespace, body: Body) -> tuple[Camera, np.ndarray, Room]:
-    """Camera, ground and room for a person of this height."""
-    camera, ground_m = portrait_camera(options.size, body.height_m(), options.distance, options.fill)
+    """Camera, ground and room for a person of this height.
+
+    Raises:
+        UserError: with this --focal the person would be tiny, or cut off.
+    """
+    fill = options.fill
+    if options.focal is not None:
+        focal_when_full_px = options.size * options.distance / body.height_m()
+        fill = options.focal / focal_when_full_px
+        if not LEAST_FILL <= fill <= MOST_FILL:
+            raise UserError(
+                f"--focal {options.focal} lets the person take {fill:.2f} of the image's height; choose one from "
+                f"{LEAST_FILL * focal_when_full_px:.0f} to {MOST_FILL * focal_when_full_px:.0f}, or another --distance"
+            )
+    camera, ground_m = portrait_camera(options.size, body.height_m(), options.distance, fill)
     room = make_room(camera, ground_m, options.background == "busy", Noise(options.seed))
     return camera, ground_m, Room(to_float(to_uint8(room.image)), room.floor_m)
 
@@ -90,22 +107,36 @@ def choose_motion(options: argparse.Namespace, body: Body, ground_m: np.ndarray)
     return turn_in_a_pose(body, options.frames, options.fps, ground_m, options.seed)
 
 
+def choose_novel_poses(options: argparse.Namespace, body: Body, ground_m: np.ndarray) -> Motion | None:
+    """Poses that the capture does not show: those built in, or some of a BVH file; None when none is asked for."""
+    if not options.novel_poses:
+        return None
+    if not options.novel_bvh:
+        return novel_motion(body, ground_m, options.novel_poses)
+    whole = retarget(read_bvh(options.novel_bvh), body, ground_m, in_place=True)
+    rows = np.linspace(0, len(whole.frame_index) - 1, options.novel_poses).round().astype(int)
+    return replace(whole.select(rows), frame_index=np.arange(len(rows), dtype=np.int32))
+
+
 def assemble(
     options: argparse.Namespace, subject: Subject, motion: Motion, scene: tuple[Camera, np.ndarray, Room]
 ) -> tuple[Capture, Heldout]:
     """The capture, and its held-out questions."""
     camera, ground_m, room = scene
     capture = Capture(subject, motion, camera, LIGHTS[options.light], room, ground_m, options.fps, options.samples)
-    cameras = novel_cameras(camera, ground_m, subject.body.height_m(), options.novel_views)
-    poses = novel_motion(subject.body, ground_m, options.novel_poses) if options.novel_poses else None
-    return capture, Heldout(cameras, poses)
+    # Whoever walks may be metres from the middle of the path in the first frame, which the held-out cameras show.
+    walked_m = motion.root_translation_m[0] - ground_m.astype(np.float32)
+    standing_m = ground_m + walked_m * [1.0, 0.0, 1.0]
+    cameras = novel_cameras(camera, standing_m, subject.body.height_m(), options.novel_views)
+    return capture, Heldout(cameras, choose_novel_poses(options, subject.body, ground_m))
 
 
 def recipe_of(options: argparse.Namespace) -> dict[str, object]:
-    """The options by name, as they go into the truth's recipe; of paths only the motion's name."""
+    """The options by name, as they go into the truth's recipe; of paths only the motions' names."""
     chosen = {
         name: value if isinstance(value, int | float | str) else str(value)
         for name, value in sorted(vars(options).items())
         if value is not None and not isinstance(value, Path)
     }
-    return chosen | {"motion": options.bvh.name if options.bvh else "turn"}
+    novel = {"novel_motion": options.novel_bvh.name} if options.novel_bvh else {}
+    return chosen | novel | {"motion": options.bvh.name if options.bvh else "turn"}

@@ -1,6 +1,6 @@
 """The truth beside a synthetic capture: load it, and check that it explains the video.
 
-python -m data_tools.truth OUT
+python -m data_tools.truth OUT [--meshes FOLDER]
 """
 
 import argparse
@@ -9,6 +9,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -16,11 +17,15 @@ from jaxtyping import UInt8
 from data_tools.backdrop import Room, floor_points
 from data_tools.capture import Capture
 from data_tools.command import run_command
-from data_tools.renderer import Light
+from data_tools.folder import whole_folder
+from data_tools.renderer import Light, pose_vertices
 from data_tools.subject import load_subject
 from pipeline.core.errors import UserError
-from pipeline.io.image import read_gray, read_rgb, to_float
+from pipeline.core.progress import track
+from pipeline.geometry.mesh import Mesh
+from pipeline.io.image import read_gray, read_rgb, to_float, write_rgb
 from pipeline.io.npz import load_camera, load_motion
+from pipeline.io.obj import write_obj
 from pipeline.io.video import open_source, read_frames
 from pipeline.metrics.images import body_pixels, mask_iou, psnr_db
 
@@ -47,13 +52,14 @@ def load_truth(out: Path) -> Capture:
     Raises:
         UserError: there is no truth, or a file of it is missing or damaged.
     """
-    truth = out / "truth"
-    if not (truth / "recipe.json").is_file():
-        raise UserError(f"{truth} holds no truth; make a capture with python -m data_tools.sample {out}")
-    recipe = json.loads((truth / "recipe.json").read_text())
+    truth, recipe = out / "truth", read_recipe(out)
     camera = load_camera(truth / "camera.npz")
-    ground_m = np.array(recipe["ground_m"])
-    light = Light(**{**recipe["light"], "key_from": tuple(recipe["light"]["key_from"])})
+    try:
+        ground_m = np.array(recipe["ground_m"], dtype=np.float64).reshape(3)
+        light = Light(**{**recipe["light"], "key_from": tuple(recipe["light"]["key_from"])})
+        fps, samples = float(recipe["fps"]), int(recipe["samples"])
+    except (KeyError, TypeError, ValueError):
+        raise _damaged_recipe(out) from None
     return Capture(
         subject=load_subject(truth),
         motion=load_motion(truth / "motion.npz"),
@@ -61,9 +67,27 @@ def load_truth(out: Path) -> Capture:
         light=light,
         room=Room(to_float(read_rgb(truth / "room.png")), floor_points(camera, ground_m)),
         ground_m=ground_m,
-        fps=recipe["fps"],
-        samples=recipe["samples"],
+        fps=fps,
+        samples=samples,
     )
+
+
+def read_recipe(out: Path) -> dict[str, Any]:
+    """With which options, by which version a capture was made. UserError where it is absent or damaged."""
+    path = out / "truth" / "recipe.json"
+    if not path.is_file():
+        raise UserError(f"{path.parent} holds no truth; make a capture with python -m data_tools.sample {out}")
+    try:
+        recipe = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError:
+        recipe = None
+    if not isinstance(recipe, dict):
+        raise _damaged_recipe(out)
+    return recipe
+
+
+def _damaged_recipe(out: Path) -> UserError:
+    return UserError(f"{out / 'truth' / 'recipe.json'} is damaged; remove {out} and make the capture again")
 
 
 def true_mask(out: Path, frame: int) -> UInt8[np.ndarray, "h w"]:
@@ -75,9 +99,17 @@ def check(out: Path, every: int = 1) -> Agreement:
     """Render the stored truth again and compare it with the decoded video and the stored masks.
 
     every: look at each `every`-th frame.
+
+    Raises:
+        UserError: a file is missing or damaged, or the video has not as many frames as the truth.
     """
     capture = load_truth(out)
     source = open_source(out / "video")
+    if source.n_frames != len(capture.motion.frame_index):
+        raise UserError(
+            f"{source.path} has {source.n_frames} frames, its truth {len(capture.motion.frame_index)}; "
+            f"remove {out} and make the capture again"
+        )
     scores = []
     longer_side_px = max(capture.camera.width, capture.camera.height)
     for frame in read_frames(source, lambda index: index % every == 0, longer_side_px):
@@ -88,11 +120,35 @@ def check(out: Path, every: int = 1) -> Agreement:
     return Agreement(len(scores), *(float(worst) for worst in np.min(scores, axis=0)))
 
 
+def write_meshes(out: Path, folder: Path) -> int:
+    """Write the clothed person of every frame as `000000.obj`, ... (world, metres, with UV); return their number.
+
+    Raises:
+        UserError: there is no truth, or something at `folder`.
+    """
+    capture = load_truth(out)
+    subject = capture.subject
+    with whole_folder(folder) as part:
+        write_rgb(part / "texture.png", subject.texture)
+        for index, pose in enumerate(track(capture.canonical_to_world, "meshes")):
+            mesh = Mesh(pose_vertices(subject, pose).numpy(), subject.body.faces)
+            normals = mesh.vertex_normals()
+            write_obj(part / f"{index:06d}.obj", mesh, subject.uv, subject.faces_uv, normals, "texture.png", None)
+    return len(capture.canonical_to_world)
+
+
 def _main(argv: Sequence[str]) -> None:
     parser = argparse.ArgumentParser(prog="python -m data_tools.truth", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("out", type=Path, help="folder of a synthetic capture")
     parser.add_argument("--every", type=int, default=8, help="look at each n-th frame (default 8)")
+    parser.add_argument("--meshes", type=Path, help="folder to make: the person of every frame as .obj")
     options = parser.parse_args(argv)
+    if options.every < 1:
+        raise UserError(f"--every {options.every} is too few; give at least 1")
+    if options.meshes:
+        count = write_meshes(options.out, options.meshes)
+        print(f"{count} meshes in {options.meshes}")
+        return
     agreement = check(options.out, options.every)
     print(
         f"{agreement.frames} frames, worst: {agreement.psnr_full_db:.1f} dB in all, "

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from data_tools.capture import novel_cameras, portrait_camera, straight_rgba
+from data_tools.capture import RECIPE_VERSION, novel_cameras, portrait_camera, straight_rgba
 from data_tools.command import run_command
 from data_tools.movie import write_movie
 from data_tools.sample import main
@@ -38,6 +38,7 @@ def test_layout(sample: Path) -> None:
     assert len(load_motion(sample / "truth" / "novel_poses" / "motion.npz").frame_index) == 2
     recipe = json.loads((sample / "truth" / "recipe.json").read_text())
     assert recipe["seed"] == 0
+    assert recipe["version"] == RECIPE_VERSION
     assert recipe["light"]["key"] > 0
     assert not list(sample.parent.glob("*.part"))
 

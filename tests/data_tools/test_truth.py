@@ -11,6 +11,7 @@ import torch
 from data_tools.backdrop import make_room
 from data_tools.capture import Capture
 from data_tools.command import run_command
+from data_tools.movie import write_movie
 from data_tools.noise import Noise
 from data_tools.renderer import pose_vertices
 from data_tools.truth import _main as truth_command
@@ -18,6 +19,7 @@ from data_tools.truth import check, load_truth, true_mask
 from pipeline.core.errors import UserError
 from pipeline.geometry.camera import pixel_rays, project
 from pipeline.io.npz import load_motion, save_motion
+from pipeline.io.video import open_source, read_frames
 from tests.data_tools.shapes import crossings
 
 
@@ -50,6 +52,32 @@ def test_a_wrong_truth_is_caught(sample: Path, tmp_path: Path, capsys: pytest.Ca
 def test_no_truth_is_named(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="holds no truth"):
         load_truth(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "{}", '{"ground_m": [0, 1], "light": {}}', '{"ground_m": [0, 1, 2], "light": {"hue": 1}}']
+)
+def test_a_damaged_recipe_is_named(text: str, sample: Path, tmp_path: Path) -> None:
+    shutil.copytree(sample / "truth", tmp_path / "truth")
+    (tmp_path / "truth" / "recipe.json").write_text(text)
+    with pytest.raises(UserError, match=r"recipe\.json is damaged"):
+        load_truth(tmp_path)
+
+
+def test_a_shortened_video_is_caught(sample: Path, tmp_path: Path) -> None:
+    """What is left of it agrees with the truth."""
+    (tmp_path / "out" / "video").mkdir(parents=True)
+    shutil.copytree(sample / "truth", tmp_path / "out" / "truth")
+    frames = [frame.rgb for frame in read_frames(open_source(sample / "video"), lambda index: index < 5, 200)]
+    write_movie(tmp_path / "out" / "video" / "video.mp4", frames, 6.0)
+    with pytest.raises(UserError, match="has 5 frames, its truth 6"):
+        check(tmp_path / "out", every=4)
+
+
+@pytest.mark.parametrize("every", ["0", "-2"])
+def test_a_step_of_nothing_is_refused(every: str, sample: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(truth_command, [str(sample), "--every", every]) == 2
+    assert capsys.readouterr().err.startswith(f"error: --every {every}")
 
 
 def test_joints_project_into_the_masks(sample: Path, capture: Capture) -> None:
