@@ -15,6 +15,7 @@ from pipeline.core.errors import UserError
 
 _COMPONENT = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTH = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+_HARMLESS = {"KHR_mesh_quantization", "KHR_materials_unlit"}
 _JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 
 
@@ -35,7 +36,7 @@ class Glb:
     """A .glb file: its JSON tree and its binary chunk."""
 
     def __init__(self, path: Path) -> None:
-        """Raises UserError when the file is no binary glTF 2."""
+        """Raises UserError when the file is no binary glTF 2, is damaged, or needs an extension to be read."""
         self.path = path
         data = path.read_bytes() if path.is_file() else b""
         if len(data) < 20 or data[:4] != b"glTF" or struct.unpack_from("<I", data, 4)[0] != 2:
@@ -45,18 +46,33 @@ class Glb:
             length, kind = struct.unpack_from("<II", data, offset)
             chunks[kind] = data[offset + 8 : offset + 8 + length]
             offset += 8 + length
-        self.tree: dict[str, Any] = json.loads(chunks[_JSON_CHUNK])
+        try:
+            self.tree: dict[str, Any] = json.loads(chunks[_JSON_CHUNK])
+            needed = set(self.tree.get("extensionsRequired", ())) - _HARMLESS
+        except (KeyError, ValueError, AttributeError):
+            raise UserError(f"{path} is damaged: its JSON cannot be read; export it again") from None
+        if needed:
+            raise UserError(f"{path} needs {', '.join(sorted(needed))}; export it again without (no compression)")
         self._binary = chunks.get(_BINARY_CHUNK, b"")
 
     def accessor(self, index: int) -> np.ndarray:
-        """Values as stored, one row an element; normalised integers become floats in [-1, 1] or [0, 1]."""
-        accessor = self.tree["accessors"][index]
-        view = self.tree["bufferViews"][accessor["bufferView"]]
-        kind, width = np.dtype(_COMPONENT[accessor["componentType"]]), _WIDTH[accessor["type"]]
-        start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-        stride = view.get("byteStride", kind.itemsize * width)
-        shape, strides = (accessor["count"], width), (stride, kind.itemsize)
-        values: np.ndarray = np.ndarray(shape, kind, self._binary, start, strides)
+        """Values as stored, one row an element; normalised integers become floats in [-1, 1] or [0, 1].
+
+        Raises:
+            UserError: they are stored sparsely, or not in the file.
+        """
+        try:
+            accessor = self.tree["accessors"][index]
+            if "sparse" in accessor:
+                raise UserError(f"{self.path} stores values sparsely; export it again without (no sparse accessors)")
+            view = self.tree["bufferViews"][accessor["bufferView"]]
+            kind, width = np.dtype(_COMPONENT[accessor["componentType"]]), _WIDTH[accessor["type"]]
+            start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+            stride = view.get("byteStride", kind.itemsize * width)
+            shape, strides = (accessor["count"], width), (stride, kind.itemsize)
+            values: np.ndarray = np.ndarray(shape, kind, self._binary, start, strides)
+        except (LookupError, TypeError, ValueError):
+            raise UserError(f"{self.path} is damaged: it lacks the values {index}; export it again") from None
         if accessor.get("normalized"):
             return np.maximum(values.astype(np.float32) / np.iinfo(kind).max, -1.0)
         return values.astype(np.float32 if kind.kind == "f" else np.int64)
@@ -81,7 +97,7 @@ class Glb:
         """
         found = [
             self._primitive(primitive, node["skin"])
-            for node in self.tree["nodes"]
+            for node in self.tree.get("nodes", ())
             if "mesh" in node and "skin" in node
             for primitive in self.tree["meshes"][node["mesh"]]["primitives"]
             if primitive.get("mode", 4) == 4 and "JOINTS_0" in primitive["attributes"]
@@ -96,8 +112,10 @@ class Glb:
         factor = np.asarray(surface.get("baseColorFactor", [1.0] * 4)[:3])
         if "baseColorTexture" not in surface:
             return np.tile(np.rint(255 * factor).astype(np.uint8), (8, 8, 1))
-        source = self.tree["textures"][surface["baseColorTexture"]["index"]]["source"]
-        return np.rint(self._picture(source) * factor).astype(np.uint8)
+        texture = self.tree["textures"][surface["baseColorTexture"]["index"]]
+        if "source" not in texture:
+            raise UserError(f"{self.path} holds a picture that is neither PNG nor JPEG; save it as one of them")
+        return np.rint(self._picture(texture["source"]) * factor).astype(np.uint8)
 
     def _primitive(self, primitive: dict[str, Any], skin: int) -> Primitive:
         names = primitive["attributes"]
@@ -116,7 +134,10 @@ class Glb:
         )
 
     def _picture(self, index: int) -> UInt8[np.ndarray, "h w 3"]:
-        view = self.tree["bufferViews"][self.tree["images"][index]["bufferView"]]
+        image = self.tree["images"][index]
+        if "bufferView" not in image:
+            raise UserError(f"{self.path} keeps its pictures in other files; export it with pictures inside")
+        view = self.tree["bufferViews"][image["bufferView"]]
         start = view.get("byteOffset", 0)
         data = np.frombuffer(io.BytesIO(self._binary[start : start + view["byteLength"]]).getbuffer(), np.uint8)
         pixels = cv2.imdecode(data, cv2.IMREAD_COLOR)

@@ -1,6 +1,10 @@
 """Rigged people from .glb files: a made-up one with known metres and colours, and the real ones."""
 
+import json
+import struct
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -83,6 +87,51 @@ def test_other_files_are_refused(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "person.glb").write_bytes(content)
     with pytest.raises(UserError, match="is no binary glTF 2 file"):
         read_rigged(tmp_path / "person.glb")
+
+
+def changed(path: Path, change: Callable[[dict[str, Any]], object]) -> Path:
+    """Change the JSON of a .glb in place."""
+    data = path.read_bytes()
+    length = struct.unpack_from("<I", data, 12)[0]
+    tree = json.loads(data[20 : 20 + length])
+    change(tree)
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    whole = data[:8] + struct.pack("<I", len(text) + len(data) - length) + struct.pack("<I", len(text)) + data[16:20]
+    path.write_bytes(whole + text + data[20 + length :])
+    return path
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda tree: tree.update(extensionsRequired=["KHR_draco_mesh_compression"]), "needs KHR_draco_mesh_compr"),
+        (lambda tree: tree["accessors"][0].update(sparse={"count": 1}), "stores values sparsely"),
+        (lambda tree: tree["accessors"][0].pop("bufferView"), "lacks the values 0"),
+        (lambda tree: tree["accessors"][0].update(count=10**6), "lacks the values 0"),
+        (lambda tree: tree["accessors"][4].update(componentType=1), "lacks the values 4"),
+        (lambda tree: tree["meshes"][0]["primitives"][0].update(indices=99), "lacks the values 99"),
+        (lambda tree: tree.pop("nodes"), "no skinned triangles"),
+        (lambda tree: tree["textures"][0].pop("source"), "neither PNG nor JPEG"),
+        (lambda tree: tree["images"][0].pop("bufferView"), "in other files"),
+    ],
+)
+def test_what_cannot_be_read_is_named(change: Callable[[dict[str, Any]], object], words: str, tmp_path: Path) -> None:
+    write_made_up_glb(tmp_path / "person.glb")
+    read_rigged(
+        changed(tmp_path / "person.glb", lambda tree: tree.update(extensionsRequired=["KHR_mesh_quantization"]))
+    )
+    with pytest.raises(UserError, match=rf"person\.glb .*{words}"):
+        read_rigged(changed(tmp_path / "person.glb", change))
+
+
+def test_damaged_json_is_named(tmp_path: Path) -> None:
+    write_made_up_glb(tmp_path / "person.glb")
+    whole = (tmp_path / "person.glb").read_bytes()
+    for damaged in (whole[:12] + b"\0" * 8 + whole[20:], whole[:40] + b"#" + whole[41:], whole[:200]):
+        (tmp_path / "person.glb").write_bytes(damaged)
+        with pytest.raises(UserError, match=r"person\.glb is damaged: its JSON"):
+            read_rigged(tmp_path / "person.glb")
 
 
 @pytest.mark.parametrize("name", ["Asian_F_1_Casual", "Black_M_1_Casual"])
