@@ -24,7 +24,7 @@ CAPTURES ?=
 PRESETS ?=
 SEEDS ?=
 
-# Where bench-field writes its figures, and the run of another preset that RUN is compared with.
+# Where bench-field writes its figures, and the runs of another preset that RUN, here also several, is compared with.
 JSON ?=
 BASELINE ?=
 
@@ -32,13 +32,14 @@ TORCH_VERSION := 2.13.0
 GLTF_VALIDATOR_VERSION := 2.0.0-dev.3.10
 SAMPLE_RUN := runs/sample
 SAMPLE := runs/sample-capture
+SAMPLE_MADE := $(SAMPLE)/.done-$(shell sed -n 's/^RECIPE_VERSION = //p' data_tools/capture.py)
 ONE_RUN := $(or $(RUN),$(SAMPLE_RUN))
 RUN_OPTIONS = $(if $(PRESET),--preset $(PRESET)) $(foreach item,$(SET),--set $(item))
 OPTIONS = $(RUN_OPTIONS) $(ARGS)
 STAMP := $(VENV)/.stamp$(if $(EXTRA),-$(EXTRA))
 
 .DEFAULT_GOAL := help
-.PHONY: help all $(STAGES) batch chart compare test test-all check format bench bench-field doctor venv lock configs gltf-validator clean
+.PHONY: help all $(STAGES) batch chart compare test test-all check format bench bench-field bench-body doctor venv lock configs gltf-validator clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z$$()A-Z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST) | sed 's/$$(STAGES)/STAGE    /'
@@ -47,7 +48,7 @@ help:  ## this list
 	@echo "             EXTRA=cuda (a graphics card) or EXTRA=cluster (Snakemake)"
 
 ifeq ($(VIDEO)$(RUN),)
-all: $(STAMP) $(SAMPLE)/.done  ## the whole way; without VIDEO: a generated sample with known truth
+all: $(STAMP) $(SAMPLE_MADE)  ## the whole way; without VIDEO: a generated sample with known truth
 	$(RUN_PYTHON) -m stages --run $(SAMPLE_RUN) --video $(SAMPLE)/video $(OPTIONS)
 else
 all: $(STAMP)
@@ -58,8 +59,9 @@ $(STAGES): $(STAMP)  ## one stage of RUN=runs/name
 	$(RUN_PYTHON) -m stages.$@ "$(ONE_RUN)" $(if $(VIDEO),--video "$(VIDEO)") $(OPTIONS)
 
 batch: $(STAMP)  ## all videos of VIDEOS=folder, with a table; JOBS=n at once, or CLUSTER=local|slurm|kubernetes
+	@test -n "$(VIDEOS)" || { echo "error: no folder of videos: make $@ VIDEOS=folder" >&2; exit 2; }
 ifeq ($(CLUSTER),)
-	$(RUN_PYTHON) -m data_tools.batch $(if $(VIDEOS),"$(VIDEOS)") --runs "$(RUNS)" $(if $(JOBS),--jobs $(JOBS)) $(OPTIONS)
+	$(RUN_PYTHON) -m data_tools.batch "$(VIDEOS)" --runs "$(RUNS)" $(if $(JOBS),--jobs $(JOBS)) $(OPTIONS)
 else
 	@test -x $(VENV)/bin/snakemake || { echo "error: Snakemake is not installed: make venv EXTRA=cluster" >&2; exit 2; }
 	$(VENV)/bin/snakemake --snakefile configs/cluster/Snakefile --profile configs/cluster/$(CLUSTER) \
@@ -70,8 +72,8 @@ endif
 chart: $(STAMP)  ## accuracy against seconds: PRESETS over CAPTURES (all presets, two generated people) with SEEDS
 	$(RUN_PYTHON) -m data_tools.chart $(CAPTURES) $(if $(PRESETS),--presets $(PRESETS)) $(if $(SEEDS),--seeds $(SEEDS)) $(ARGS)
 
-# Made once; a half-made one, which has no .done, is made anew.
-$(SAMPLE)/.done: | $(STAMP)
+# Made once; one that is half-made, which has no .done, or of another version is made anew.
+$(SAMPLE_MADE): | $(STAMP)
 	rm -rf $(SAMPLE)
 	$(RUN_PYTHON) -m data_tools.sample $(SAMPLE)
 	@touch $@
@@ -95,12 +97,15 @@ format: $(STAMP)  ## mend what ruff can mend
 	$(VENV)/bin/ruff check --fix .
 	$(VENV)/bin/ruff format .
 
-bench: $(STAMP)  ## measure the speed of the kernels; the machine should do nothing else
-	$(RUN_PYTHON) -m tests.bench.bench_kernels $(ARGS)
+bench: bench-field  ## bench-field, then the kernels alone; the machine should do nothing else
+	$(RUN_PYTHON) -m tests.bench.bench_kernels $(if $(JSON),--json "$(basename $(JSON))-kernels.json")
 
 bench-field: $(STAMP)  ## each part of a training step beside its floor: RUN=runs/name or a painted body; JSON=file
-	$(RUN_PYTHON) -m tests.bench.bench_field $(if $(RUN),--run "$(RUN)") $(if $(PRESET),--preset $(PRESET)) \
-		$(if $(BASELINE),--baseline "$(BASELINE)") $(if $(JSON),--json "$(JSON)") $(ARGS)
+	$(RUN_PYTHON) -m tests.bench.bench_field $(if $(RUN),--run $(RUN)) $(if $(PRESET),--preset $(PRESET)) \
+		$(if $(BASELINE),--baseline $(BASELINE)) $(if $(JSON),--json "$(JSON)") $(ARGS)
+
+bench-body: $(STAMP)  ## frames and body against the truth of CAPTURES that data_tools made
+	$(RUN_PYTHON) -m tests.bench.bench_body $(CAPTURES) $(ARGS)
 
 doctor:  ## what this machine lacks, and the command that mends it
 	@$(PYTHON) -m pipeline.core.doctor

@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -147,7 +148,21 @@ def test_the_table_escapes_what_it_is_told(tmp_path: Path) -> None:
     assert "a&amp;b" in page
 
 
-def snakemake(toy: Toy, **variables: str) -> subprocess.Popen[str]:
+@pytest.mark.parametrize("cluster", ["", "local"])
+def test_make_asks_for_the_folder(cluster: str, tmp_path: Path) -> None:
+    """An empty name would be the folder in which make runs."""
+    for name in ("requirements.lock", "pyproject.toml", ".venv/.stamp"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    command = ["make", "-f", str(REPOSITORY / "Makefile"), "batch", f"CLUSTER={cluster}"]
+    done = subprocess.run(
+        command, cwd=tmp_path, env=user_environment(), capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 2
+    assert "error: no folder of videos: make batch VIDEOS=folder" in done.stderr
+
+
+def snakemake(toy: Toy, videos: str = "videos", **variables: str) -> subprocess.Popen[str]:
     """Start the workflow on the toy's videos; skips where snakemake is not installed."""
     path = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", "")))
     program = shutil.which("snakemake", path=path)
@@ -155,7 +170,7 @@ def snakemake(toy: Toy, **variables: str) -> subprocess.Popen[str]:
         pytest.skip("snakemake is not installed: make venv EXTRA=cluster")
     folder = REPOSITORY / "configs" / "cluster"
     command = [program, "--snakefile", str(folder / "Snakefile"), "--profile", str(folder / "local"), "--config"]
-    command += ["videos=videos", "runs=runs", "options=--preset quick"]
+    command += [f"videos={videos}", "runs=runs", "options=--preset quick"]
     command += [f"project={toy.folder}", f"python={sys.executable}"]
     environment = user_environment() | {"PYTHONPATH": str(REPOSITORY), **variables}
     return subprocess.Popen(
@@ -163,11 +178,21 @@ def snakemake(toy: Toy, **variables: str) -> subprocess.Popen[str]:
     )
 
 
+def test_the_workflow_asks_for_the_folder(batch: Toy) -> None:
+    process = snakemake(batch, videos="")
+    text, _ = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "no folder of videos" in text
+
+
 def test_the_workflow_survives_a_broken_video_and_a_kill(batch: Toy) -> None:
     killed = snakemake(batch, TOY_SLEEP_S="60")
     parts = [batch.folder / "runs" / name / "learn.part" / "checkpoint.json" for name in GOOD]
+    deadline = time.monotonic() + 300.0
     while not any(part.exists() for part in parts):
         assert killed.poll() is None, killed.communicate()[0]
+        assert time.monotonic() < deadline, f"none of {parts} appeared"
+        time.sleep(0.02)
     killed.kill()
     killed.communicate()
     again = snakemake(batch)
