@@ -17,6 +17,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from data_tools.capture import RECIPE_VERSION
 from data_tools.chart_figure import PANELS, Point, draw_chart, pareto_front, preset_means, save_chart
 from data_tools.chart_trials import (
     FIELD,
@@ -24,14 +25,18 @@ from data_tools.chart_trials import (
     UNTIL_AVATAR,
     Trial,
     compare_with_truth,
+    lacks_comparison,
     point_of,
+    read_trial,
+    refuse_shared_folders,
     run_trial,
     table_row,
     together,
 )
 from data_tools.command import run_command
-from data_tools.runs import CONFIGS, RunState, check_options, log_path, read_run, write_csv
+from data_tools.runs import CONFIGS, RunState, check_options, log_path, write_csv
 from data_tools.sample import main as make_sample
+from data_tools.truth import read_recipe
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track
 
@@ -44,7 +49,8 @@ def main(argv: Sequence[str]) -> None:
     """Run what is missing, then draw.
 
     Raises:
-        UserError: a capture or preset is not there, or some runs are not done (the others are drawn all the same).
+        UserError: a capture or preset is not there, two would share a run, or some runs are not done or not compared
+            with their truth (the others are drawn all the same).
     """
     options = _parse(argv)
     steps = _steps_of(options)
@@ -58,15 +64,11 @@ def main(argv: Sequence[str]) -> None:
         raise UserError(f"{missing[0]} does not exist: give synthetic captures, videos or folders of images")
     combinations = product(options.seeds, captures, options.presets)
     trials = [Trial(capture, preset, seed, options.out, steps.get(preset)) for seed, capture, preset in combinations]
+    refuse_shared_folders(trials)
     visit = _look_at if options.draw else bring_up_to_date
     runs = {trial: visit(trial, trials) for trial in track(trials, "runs")}
     write_results(options.out, runs)
-    bad = [trial.run_dir.name for trial, run in runs.items() if run.verdict != "done"]
-    if bad:
-        raise UserError(
-            f"{len(bad)} of {len(runs)} runs are not done ({', '.join(bad)}): see {options.out}/chart.csv; "
-            "the same command tries them again"
-        )
+    _tell_what_lacks(runs, options.out)
     print(f"{len(runs)} runs: {options.out}/chart.svg, chart.png, chart.csv, anytime.csv")
 
 
@@ -75,17 +77,33 @@ def bring_up_to_date(trial: Trial, others: Sequence[Trial]) -> RunState:
 
     others: what came out the same in their folders is copied, with its seconds.
     """
-    run = read_run(trial.run_dir)
+    run = read_trial(trial)
     if run.verdict != "done":
         tqdm.write(f"{trial.run_dir.name}: started, says what it does in {log_path(trial.run_dir)}", file=sys.stderr)
         run_trial(trial, others)
-        run = read_run(trial.run_dir)
+        run = read_trial(trial)
     if run.verdict == "done":
         compare_with_truth(trial)
-        run = read_run(trial.run_dir)
+        run = read_trial(trial)
     said = f"{trial.run_dir.name}: {run.verdict}, {run.seconds(UNTIL_AVATAR):.0f} s"
     tqdm.write(f"{said}, {run.failure}" if run.verdict == "failed" else said, file=sys.stderr)
     return run
+
+
+def _tell_what_lacks(runs: Mapping[Trial, RunState], out: Path) -> None:
+    """UserError that names the runs which are not done, or not compared with their truth."""
+    done = [trial for trial, run in runs.items() if run.verdict == "done"]
+    lacking = {
+        "not done": [trial for trial in runs if trial not in done],
+        "not compared with their truth": [trial for trial in done if lacks_comparison(trial)],
+    }
+    said = [
+        f"{len(found)} of {len(runs)} runs are {what} ({', '.join(trial.run_dir.name for trial in found)})"
+        for what, found in lacking.items()
+        if found
+    ]
+    if said:
+        raise UserError(f"{', '.join(said)}: see {out}/chart.csv; the same command tries them again")
 
 
 def write_results(out: Path, runs: Mapping[Trial, RunState]) -> None:
@@ -119,14 +137,16 @@ def _fronts(trial: Trial, points: Sequence[Point]) -> str:
 
 
 def _look_at(trial: Trial, others: Sequence[Trial]) -> RunState:
-    return read_run(trial.run_dir)
+    return read_trial(trial)
 
 
 def _make_built_in() -> None:
-    """The generated people's captures, where they are not there yet."""
+    """The generated people's captures, where they are not there yet. UserError where another version made one."""
     for path, seed in BUILT_IN.items():
         if not path.exists():
             make_sample([str(path), "--seed", str(seed)])
+        elif read_recipe(path).get("version") != RECIPE_VERSION:
+            raise UserError(f"{path} is of another version of the program: remove it, and it is made anew")
 
 
 def _steps_of(options: argparse.Namespace) -> dict[str, int]:

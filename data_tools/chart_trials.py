@@ -12,7 +12,7 @@ from typing import Any
 import stages
 from data_tools.chart_figure import Point
 from data_tools.folder import whole_folder
-from data_tools.runs import SCORES, RunState, fresh_stages, log_path, start_run, video_in
+from data_tools.runs import SCORES, RunState, fresh_stages, is_compared, log_path, read_run, start_run, video_in
 from pipeline.core.cli import default_run_dir
 from pipeline.core.errors import UserError
 from pipeline.core.lock import run_lock
@@ -71,6 +71,23 @@ class Trial:
         return update_record(record, self.run_dir, video, self.preset, self.assignments, replace_video=False)
 
 
+def refuse_shared_folders(trials: Iterable[Trial]) -> None:
+    """UserError when two trials would have one run: the second would show the figures of the first."""
+    owners: dict[Path, Trial] = {}
+    for trial in trials:
+        other = owners.setdefault(trial.run_dir, trial)
+        if other != trial:
+            raise UserError(
+                f"{other.preset} on {other.capture} and {trial.preset} on {trial.capture} would share the run "
+                f"{trial.run_dir}: rename one of them, or give each an --out of its own"
+            )
+
+
+def read_trial(trial: Trial) -> RunState:
+    """How far the trial's run came; what the folder holds of another capture or preset does not count."""
+    return read_run(trial.run_dir, trial.record)
+
+
 def run_trial(trial: Trial, others: Iterable[Trial] = ()) -> None:
     """Run what is not fresh; a stage that was cut starts from its beginning.
 
@@ -99,9 +116,14 @@ def share_stages(trial: Trial, others: Iterable[Trial]) -> None:
                     shutil.copytree(other.run_dir / name, part, dirs_exist_ok=True)
 
 
+def lacks_comparison(trial: Trial) -> bool:
+    """Whether the capture has a truth that the trial's report was not compared with, or not wholly, or otherwise."""
+    return (trial.capture / "truth").is_dir() and not is_compared(trial.run_dir / "report")
+
+
 def compare_with_truth(trial: Trial) -> None:
-    """Write `report/truth.json` where the capture has a truth and this report was not compared with it yet."""
-    if not (trial.capture / "truth").is_dir() or (trial.run_dir / "report" / "truth.json").is_file():
+    """Write `report/truth.json` where it lacks; a warning where that fails."""
+    if not lacks_comparison(trial):
         return
     command = [sys.executable, "-m", "data_tools.compare", str(trial.capture), str(trial.run_dir)]
     with log_path(trial.run_dir).open("a", encoding="utf-8") as log:
@@ -139,14 +161,15 @@ def read_progress(field: Path) -> list[tuple[float, float, float]]:
 def table_row(trial: Trial, run: RunState) -> dict[str, Any]:
     """One line of chart.csv.
 
-    steps: of the field's training. resumed: stages whose seconds tell only of the time after an interruption.
+    steps: those of the field's training, which may end early. resumed: stages whose seconds tell only of the time after
+    an interruption.
     """
     environments = [manifest.environment for manifest in run.manifests.values()]
     return {
         "capture": trial.capture_name,
         "preset": trial.preset_name,
         "seed": trial.seed,
-        "steps": run.manifests[FIELD].config.get("steps") if FIELD in run.manifests else None,
+        "steps": run.manifests[FIELD].metrics.get("steps") if FIELD in run.manifests else None,
         "status": run.verdict,
         "field_seconds": round(run.seconds(UNTIL_FIELD), 3),
         "seconds": round(run.seconds(UNTIL_AVATAR), 3),

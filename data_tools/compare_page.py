@@ -18,6 +18,7 @@ from data_tools.compare_avatar import (
     compare_texture,
     load_comparison,
 )
+from data_tools.runs import TRUTH_FILES, TRUTH_VERSION
 from pipeline.core.atomic import atomic_path
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import MANIFEST, digest_file, read_manifest, write_manifest
@@ -58,14 +59,14 @@ def write_comparison(out: Path, run: Path, found: Mapping[str, Mapping[str, floa
     heldout = json.loads((report / "report.json").read_text(encoding="utf-8"))["heldout"]
     document, pictures = avatar_sections(load_comparison(out, run))
     kept = {name: heldout[name] for name in ("field", "mesh")}
-    document = finite({"protocol": PROTOCOL, **found, **document, "images": kept | document["images"]})
-    texts = {
-        "truth.json": json.dumps(document, indent=2, allow_nan=False) + "\n",
-        "truth.html": comparison_page(run.resolve().name, document, pictures),
-    }
-    for name, text in texts.items():
-        (report / name).write_text(text, encoding="utf-8")
-    outputs = manifest.outputs | {name: digest_file(report / name) for name in texts}
+    document = finite(
+        {"version": TRUTH_VERSION, "protocol": PROTOCOL, **found, **document, "images": kept | document["images"]}
+    )
+    page = comparison_page(run.resolve().name, document, pictures)
+    for name, text in zip(TRUTH_FILES, (page, json.dumps(document, indent=2, allow_nan=False) + "\n"), strict=True):
+        with atomic_path(report / name) as path:
+            path.write_text(text, encoding="utf-8")
+    outputs = manifest.outputs | {name: digest_file(report / name) for name in TRUTH_FILES}
     with atomic_path(report / MANIFEST) as path:  # so that --verify knows the two files
         write_manifest(replace(manifest, outputs=outputs), path)
     return document

@@ -16,7 +16,7 @@ from pipeline.core.atomic import atomic_path
 from pipeline.core.config import Config, parse_overrides
 from pipeline.core.errors import UserError
 from pipeline.core.lock import bound_environment
-from pipeline.core.manifest import Manifest, read_manifest
+from pipeline.core.manifest import Manifest, digest_file, read_manifest
 from pipeline.core.record import RunRecord, read_record
 from pipeline.core.runner import FRESH, build_configs, stage_states
 from pipeline.core.stage import Stage
@@ -33,6 +33,10 @@ SCORES = {
     "mesh_psnr_body_db": ("report.json", "heldout", "mesh", "psnr_body"),
     "chamfer_mm": ("truth.json", "mesh", "chamfer_mm"),
 }
+
+TRUTH_FILES = ("truth.html", "truth.json")
+TRUTH_VERSION = 2
+"""Raised whenever what a comparison with the truth finds or means changes, so that it is made again."""
 
 
 @dataclass(frozen=True)
@@ -62,14 +66,17 @@ class RunState:
         return sum((self.manifests[name].seconds for name in names if name in self.manifests), 0.0)
 
 
-def read_run(run_dir: Path) -> RunState:
+def read_run(run_dir: Path, record: RunRecord | None = None) -> RunState:
     """Look at a run; what its folder does not hold is missing.
 
     A damaged record or an unknown option counts as failure of this run, so that the others are still told.
+
+    Args:
+        record: what the run should be of: what was made otherwise is not fresh. The folder's own when None.
     """
     failure = last_failure(log_path(run_dir))
     try:
-        states = _states(run_dir)
+        states = _states(run_dir, record)
     except UserError as error:
         states, failure = dict.fromkeys(stages.STAGES, "missing"), str(error)
     found = {name: read_manifest(run_dir / name) for name, state in states.items() if state == FRESH}
@@ -134,6 +141,15 @@ def read_scores(report: Path) -> dict[str, float]:
     return scores
 
 
+def is_compared(report: Path) -> bool:
+    """Whether a report holds a comparison with the truth of this version, whole: one that was cut short is none."""
+    manifest = read_manifest(report)
+    known = manifest.outputs if manifest else {}
+    if any(not (report / name).is_file() or digest_file(report / name) != known.get(name) for name in TRUTH_FILES):
+        return False
+    return bool(_read_json(report / "truth.json").get("version") == TRUTH_VERSION)
+
+
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
     """A table with a line of headings, whole or not at all."""
     with atomic_path(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
@@ -145,8 +161,8 @@ def cpu_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _states(run_dir: Path) -> dict[str, str]:
-    record = read_record(run_dir)
+def _states(run_dir: Path, record: RunRecord | None) -> dict[str, str]:
+    record = record or read_record(run_dir)
     return stage_states(_load_stages(), _configs(record), run_dir, record)
 
 
@@ -159,4 +175,8 @@ def _load_stages() -> list[Stage]:
 
 
 def _read_json(path: Path) -> Any:
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    """The document; an empty one where it is absent or damaged."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    except ValueError:
+        return {}

@@ -1,16 +1,20 @@
 """A run that found the truth of the sample, in memory, to be spoilt in known ways."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from data_tools.capture import Capture as Recording
 from data_tools.compare_avatar import Comparison
+from data_tools.runs import TRUTH_VERSION
 from data_tools.truth import load_truth
 from pipeline.avatar.body import Motion, canonical_to_world
 from pipeline.avatar.selection import split_of
 from pipeline.avatar.textured import TexturedAvatar, straight_rgba
+from pipeline.core.manifest import MANIFEST, Manifest, digest_files, write_manifest
 from pipeline.geometry.rotation import axis_angle_to_matrix, axis_angle_to_quaternion, quaternion_multiply
 from pipeline.geometry.skinning import forward_kinematics, skinning_transforms, top_k_weights
 from pipeline.io.avatar import FinishedRun
@@ -18,17 +22,18 @@ from pipeline.io.capture import Capture, image_path, mask_path
 from pipeline.io.image import write_gray, write_rgb
 
 
+def compared(report: Path, version: int = TRUTH_VERSION) -> None:
+    """Make a folder look like a report that was compared with the truth by the program of a version."""
+    (report / "truth.html").write_text("a page")
+    (report / "truth.json").write_text(f'{{"version": {version}, "mesh": {{"chamfer_mm": 6.5}}}}')
+    write_manifest(Manifest("report", 1, "", {}, {}, digest_files(report), {}, 1.0, 1.0), report / MANIFEST)
+
+
 def perfect_run(sample: Path, folder: Path) -> Comparison:
     """The true person, texture, poses and camera as if the pipeline had found them; its frames lie in `folder`."""
     truth = load_truth(sample)
-    subject, index = truth.subject, truth.motion.frame_index
-    for path in (image_path(folder, 0), mask_path(folder, 0)):
-        path.parent.mkdir(parents=True)
-    for frame in index.tolist():
-        # Straight colours, so that nothing of the room is in the pixels along the outline.
-        person = straight_rgba(truth.person(frame))
-        write_rgb(image_path(folder, frame), np.ascontiguousarray(person[..., :3]))
-        write_gray(mask_path(folder, frame), np.ascontiguousarray(person[..., 3]))
+    subject = truth.subject
+    _write_frames(truth, folder, straight_rgba)
     indices, weights = top_k_weights(subject.body.skin_weights)
     avatar = TexturedAvatar(
         vertices=torch.from_numpy(subject.body.vertices),
@@ -51,6 +56,25 @@ def perfect_run(sample: Path, folder: Path) -> Comparison:
     )
     coverage = np.ones(subject.texture.shape[:2], dtype=np.float32)
     return Comparison(run, coverage, truth, sample / "truth")
+
+
+def filmed_as(pair: Comparison, folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> Comparison:
+    """The same run, had the frames stage made this (8 bits, straight RGBA) of the person (premultiplied, in [0, 1])."""
+    side_px = _write_frames(pair.truth, folder, change)
+    camera = pair.run.camera.scaled(side_px / pair.run.camera.width)
+    capture = replace(pair.run.capture, folder=folder, width=side_px, height=side_px)
+    return replace(pair, run=replace(pair.run, capture=capture, camera=camera))
+
+
+def _write_frames(truth: Recording, folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> int:
+    """Straight colours, so that nothing of the room is in the pixels along the outline; returns the side in pixels."""
+    for path in (image_path(folder, 0), mask_path(folder, 0)):
+        path.parent.mkdir(parents=True)
+    for frame in truth.motion.frame_index.tolist():
+        person = change(truth.person(frame))
+        write_rgb(image_path(folder, frame), np.ascontiguousarray(person[..., :3]))
+        write_gray(mask_path(folder, frame), np.ascontiguousarray(person[..., 3]))
+    return int(person.shape[0])
 
 
 def _capture(folder: Path, motion: Motion, side_px: int, fps: float) -> Capture:

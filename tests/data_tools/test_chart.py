@@ -2,12 +2,14 @@
 
 import csv
 import shutil
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from data_tools.chart import bring_up_to_date, origin, write_results
+from data_tools.capture import RECIPE_VERSION
+from data_tools.chart import _make_built_in, bring_up_to_date, origin, write_results
 from data_tools.chart import main as chart
 from data_tools.chart_trials import Trial, point_of, read_progress, table_row
 from data_tools.runs import RunState
@@ -15,6 +17,7 @@ from pipeline.core.errors import UserError
 from pipeline.core.manifest import Manifest, read_manifest
 from stages import STAGES
 from tests.core.toy_pipeline import Toy
+from tests.data_tools.finished import compared
 from tests.test_resume import wait_for
 
 SWEEP = ("data_tools.chart", "numbers.mp4", "--presets", "quick", "default", "--out", "runs/chart")
@@ -83,9 +86,9 @@ def test_fewer_steps_are_said_everywhere(tmp_path: Path) -> None:
     assert own.run_dir != fewer.run_dir
     assert set(fewer.assignments) - set(own.assignments) == {"field.steps=600"}
     run = finished(10.0, SCORES)
-    run.manifests["field"].config["steps"] = 600
+    run.manifests["field"].metrics["steps"] = 450.0  # it stopped early
     assert point_of(fewer, run).preset == "ihm, 600 steps"
-    assert table_row(fewer, run)["steps"] == 600
+    assert table_row(fewer, run)["steps"] == 450.0
     write_results(tmp_path, {fewer: run})
     assert "ihm, 600 steps" in (tmp_path / "chart.svg").read_text()
 
@@ -103,12 +106,66 @@ def test_what_is_done_and_compared_is_not_done_again(
     trial = Trial(tmp_path / "ann", "quick", 0, tmp_path)
     for folder in (trial.capture / "truth", trial.run_dir / "report"):
         folder.mkdir(parents=True)
-    monkeypatch.setattr("data_tools.chart.read_run", lambda _: finished(1.0, SCORES))
-    (trial.run_dir / "report" / "truth.json").write_text("{}")
+    monkeypatch.setattr("data_tools.chart_trials.read_run", lambda *_: finished(1.0, SCORES))
+    compared(trial.run_dir / "report")
     assert bring_up_to_date(trial, [trial]).verdict == "done"
     (trial.run_dir / "report" / "truth.json").unlink()
     with pytest.raises(pytest.fail.Exception, match="started"):
         bring_up_to_date(trial, [trial])
+
+
+def test_a_comparison_that_fails_is_no_success(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The chart is drawn, and the command says what it lacks."""
+    (tmp_path / "ann" / "truth").mkdir(parents=True)
+    report = tmp_path / "out" / "ann-default-0" / "report"
+    report.mkdir(parents=True)
+    monkeypatch.setattr("data_tools.chart_trials.read_run", lambda *_: finished(1.0, SCORES))
+    broken = subprocess.CompletedProcess([], 1)
+    monkeypatch.setattr("data_tools.chart_trials.subprocess.run", lambda *_, **__: broken)
+    command = [str(tmp_path / "ann"), "--presets", "default", "--out", str(tmp_path / "out")]
+    with pytest.raises(UserError, match=r"1 of 1 runs are not compared with their truth \(ann-default-0\)"):
+        chart(command)
+    assert (tmp_path / "out" / "chart.svg").is_file()
+    compared(report)
+    chart(command)
+
+
+def test_two_trials_never_share_a_run(tmp_path: Path, nothing_may_start: None) -> None:
+    """Captures and presets go by their last names: two of one name would show one's figures for both."""
+    for name in ("a/me.mp4", "b/me.mp4", "instant.yaml"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("{}")
+    first, second, preset = (str(tmp_path / name) for name in ("a/me.mp4", "b/me.mp4", "instant.yaml"))
+    for captures, presets in (((first, second), ("instant",)), ((first,), ("instant", preset))):
+        with pytest.raises(UserError, match="would share the run .*me-instant-0"):
+            chart([*captures, "--presets", *presets, "--out", str(tmp_path / "out")])
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_run_of_another_capture_is_not_taken(sweep: Toy) -> None:
+    command = ("--presets", "quick", "--out", "runs/chart")
+    assert sweep.call("data_tools.chart", "numbers.mp4", *command).returncode == 0
+    (sweep.folder / "other").mkdir()
+    (sweep.folder / "other" / "numbers.mp4").write_text("7 8 9")
+    assert "not done (numbers-quick-0)" in sweep.refusal("data_tools.chart", "other/numbers.mp4", *command)
+    assert "was made from" in rows(sweep.folder / "runs" / "chart" / "chart.csv")[0]["message"]
+
+
+def test_built_in_captures_are_those_of_this_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[list[str]] = []
+    monkeypatch.setattr("data_tools.chart.BUILT_IN", {tmp_path / "ann": 3})
+    monkeypatch.setattr("data_tools.chart.make_sample", made.append)
+    _make_built_in()
+    assert made == [[str(tmp_path / "ann"), "--seed", "3"]]
+    recipe = tmp_path / "ann" / "truth" / "recipe.json"
+    recipe.parent.mkdir(parents=True)
+    for text in ("{}", f'{{"version": {RECIPE_VERSION + 1}}}'):
+        recipe.write_text(text)
+        with pytest.raises(UserError, match="ann is of another version"):
+            _make_built_in()
+    recipe.write_text(f'{{"version": {RECIPE_VERSION}}}')
+    _make_built_in()
+    assert len(made) == 1
 
 
 def test_drawing_runs_nothing(tmp_path: Path, nothing_may_start: None) -> None:

@@ -12,6 +12,7 @@ import pytest
 from data_tools import compare_page
 from data_tools.compare_avatar import Pair
 from data_tools.compare_page import comparison_page, write_comparison
+from data_tools.runs import is_compared
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import MANIFEST, Manifest, digest_files, find_damage, read_manifest, write_manifest
 
@@ -57,6 +58,25 @@ def test_the_document_holds_all_sections_and_the_report_stays_whole(run: Path, t
     assert manifest.fingerprint == "print"  # still fresh
     write_comparison(tmp_path, run, {})  # again, over itself
     assert find_damage(run / "report") == []
+
+
+def test_a_kill_leaves_no_torn_document_and_is_seen(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Killed while the second comparison is written: the first one's document is whole, and counts no more."""
+    report = run / "report"
+    write_comparison(tmp_path, run, {})
+    assert is_compared(report)
+    first = (report / "truth.json").read_bytes()
+
+    def killed(path: Path) -> None:
+        if path.name.endswith("truth.json"):
+            path.write_text(path.read_text()[:20])
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("pipeline.core.atomic.flush", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_comparison(tmp_path, run, {"masks": {"mask_iou_worst": 0.9}})
+    assert (report / "truth.json").read_bytes() == first
+    assert not is_compared(report)
 
 
 def test_without_a_report_the_command_is_named(run: Path, tmp_path: Path):

@@ -5,9 +5,20 @@ from pathlib import Path
 
 import pytest
 
-from data_tools.runs import RunState, check_options, last_failure, read_run, read_scores, video_in
+from data_tools.runs import (
+    TRUTH_VERSION,
+    RunState,
+    check_options,
+    is_compared,
+    last_failure,
+    read_run,
+    read_scores,
+    video_in,
+)
 from pipeline.core.errors import UserError
+from pipeline.core.manifest import MANIFEST
 from stages import STAGES
+from tests.data_tools.finished import compared
 
 CRASH = "Traceback (most recent call last):\n  File\nValueError: too small\n"
 
@@ -31,6 +42,26 @@ def test_scores_that_are_absent_or_null_are_left_out(tmp_path: Path) -> None:
     heldout = {"field": {"psnr_full": 30.5, "psnr_body": None}, "mesh": {"psnr_full": 28}}
     (tmp_path / "report.json").write_text(json.dumps({"heldout": heldout}))
     assert read_scores(tmp_path) == {"field_psnr_full_db": 30.5, "mesh_psnr_full_db": 28.0}
+
+
+def test_a_damaged_document_counts_as_absent(tmp_path: Path) -> None:
+    for torn in ('{"mesh": {"chamf', "", "\udcff"):
+        (tmp_path / "truth.json").write_bytes(torn.encode("utf-8", "surrogateescape"))
+        assert read_scores(tmp_path) == {}
+
+
+def test_a_comparison_counts_whole_and_of_this_version(tmp_path: Path) -> None:
+    assert not is_compared(tmp_path)
+    compared(tmp_path)
+    assert is_compared(tmp_path)
+    (tmp_path / "truth.json").write_text('{"version": 2, "me')  # a kill in the middle
+    assert not is_compared(tmp_path)
+    for name in ("truth.html", MANIFEST):
+        compared(tmp_path)
+        (tmp_path / name).unlink()
+        assert not is_compared(tmp_path)
+    compared(tmp_path, TRUTH_VERSION - 1)
+    assert not is_compared(tmp_path)
 
 
 def test_an_empty_run_is_unfinished_until_its_log_tells_of_a_failure(tmp_path: Path) -> None:
