@@ -6,7 +6,6 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 
@@ -24,6 +23,7 @@ from pipeline.core.measure import MIB
 from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
 from pipeline.geometry.camera import Camera
+from pipeline.geometry.matte import shrink
 from pipeline.io.capture import Capture, load_capture
 from pipeline.io.checkpoint import load_tensors, save_field, save_occupancy, save_tensors
 from pipeline.io.image import to_uint8, write_rgb
@@ -77,7 +77,7 @@ def read_picture(capture: Capture, position: int, camera: Camera) -> Picture:
     size = (camera.width, camera.height)
     image, mask = capture.image(int(position)), capture.mask(int(position))
     if (capture.width, capture.height) != size:
-        image, mask = (cv2.resize(array, size, interpolation=cv2.INTER_AREA) for array in (image, mask))
+        image, mask = shrink(image, mask, size)
     return to_uint8(image), to_uint8(mask)
 
 
