@@ -124,7 +124,7 @@ def bent(points_px: np.ndarray) -> np.ndarray:
 
 
 def film_through_a_lens(folder, n=17):
-    """A disc of 14 pixels walks away from the centre's left, bent by a lens in pictures, masks and landmarks.
+    """A disc of 14 pixels with a red one of 7 in it walks to the left, bent by a lens in pictures, masks and landmarks.
 
     Returns where a pinhole would show its centre in each frame.
     """
@@ -137,9 +137,12 @@ def film_through_a_lens(folder, n=17):
         ideal_px = ideal_px + seen_px - bent(ideal_px)
     centres_px = np.array([[46.0 - k, 38.0 - 0.5 * k] for k in range(n)])
     for k, centre_px in enumerate(centres_px):
-        inside = np.linalg.norm(ideal_px - centre_px, axis=-1) < 14
-        write_rgb(folder / f"{k}.png", np.where(inside[..., None], np.uint8([200, 150, 90]), np.uint8(30)))
-        write_gray(folder / "masks" / f"{k}.png", np.where(inside, np.uint8(255), np.uint8(0)))
+        away_px = np.linalg.norm(ideal_px - centre_px, axis=-1)
+        picture = np.full((96, 128, 3), 30, np.uint8)
+        picture[away_px < 14, 1:] = 150
+        picture[away_px < 7, 0] = 200
+        write_rgb(folder / f"{k}.png", picture)
+        write_gray(folder / "masks" / f"{k}.png", np.where(away_px < 14, np.uint8(255), np.uint8(0)))
     points_px = bent(centres_px)[:, None].repeat(33, axis=1)
     points_px[3, 13] = np.nan
     save_npz(folder / "landmarks.npz", {"landmarks_px": points_px, "landmarks_world_m": np.zeros((n, 33, 3))})
@@ -157,10 +160,10 @@ def test_picture_mask_and_landmarks_are_undistorted_together(tmp_path, max_side_
     for position, index in enumerate(capture.frame_index):
         expected_px = scale * centres_px[index]
         red = np.clip((255 * capture.image(position)[..., 0] - 30) / 170, 0, 1)
-        for share in (capture.mask(position), red):
+        for share, radius_px in ((capture.mask(position), 14), (red, 7)):
             found_px = np.array([(share * columns).sum(), (share * rows).sum()]) / share.sum()
             np.testing.assert_allclose(found_px, expected_px, atol=0.3 * scale)
-            assert np.sqrt(share.sum() / np.pi) == pytest.approx(14 * scale, rel=0.03)
+            assert np.sqrt(share.sum() / np.pi) == pytest.approx(radius_px * scale, rel=0.03)
         points_px = capture.landmarks_px[position]
         assert np.isnan(points_px).any() == (index == 3)
         np.testing.assert_allclose(points_px[np.isfinite(points_px).all(axis=1)] - expected_px, 0, atol=0.02)
