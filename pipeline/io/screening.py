@@ -18,6 +18,8 @@ _FEET = (29, 30, 31, 32)
 # A shoe reaches this share of the image's height below the joints of heel and toe.
 _SOLE_SHARE = 0.02
 _UNSEEN_ARC_DEG = 120.0
+# Up to this height the person's pixels are of use to the default preset.
+_USEFUL_PERSON_PX = 640.0
 # Pictures on which a camera that moves is looked for, the share of them that must show another scene, and how far from
 # the person the scene begins, as a share of the picture's longer side: shadows and what the mask misses lie nearer.
 _SCENE_PICTURES, _MOST_MOVED, _PERSON_MARGIN = 32, 0.1, 0.03
@@ -76,6 +78,14 @@ def warn_of_gaps(sightings: Sightings, unseen_rad: float, path: Path) -> None:
         warn(
             f"the feet are cut off in {cropped.sum()} frames of {path}; they will be less sharp in the avatar: "
             f"{frame_ranges(sightings.frame_index, cropped)}"
+        )
+    person_px = float(np.median(sightings.persons[sightings.found].any(axis=2).mean(axis=1))) * sightings.height
+    if sightings.scale < 1.0 and person_px < _USEFUL_PERSON_PX:
+        wanted = min(1.0, sightings.scale * _USEFUL_PERSON_PX / person_px)
+        side_px = round(max(sightings.width, sightings.height) * wanted / sightings.scale)
+        warn(
+            f"the person is {person_px / sightings.scale:.0f} px tall in {path} and {person_px:.0f} px in the smaller "
+            f"pictures that are kept; --set frames.max_side_px={side_px} keeps what the avatar can use"
         )
     frame_index, differs = scene_changes(sightings)
     if differs.sum() > _MOST_MOVED * len(differs):

@@ -1,6 +1,6 @@
 """Frames of a video file or of a folder of images, upright, with square pixels, in RGB.
 
-What the container says about rotation, pixel aspect and time stamps is honoured, and what EXIF says for images.
+What the container says about rotation, pixel aspect, colours and times is honoured, and what EXIF says for images.
 A frame keeps its index in the whole recording, however few frames are read.
 """
 
@@ -8,15 +8,17 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 
 import av
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Shaped, UInt8
 
 from pipeline.core.errors import UserError
 from pipeline.core.progress import warn
+from pipeline.io import hdr
 from pipeline.io.image import IMAGE_SUFFIXES, read_rgb
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".3gp", ".wmv", ".gif")
@@ -25,6 +27,8 @@ _IMAGE_FOLDER_NAMES = ("images", "frames", "image", "rgb", "color")
 # Bicubic, with chroma brought to full resolution before the colour matrix: swscale's default repeats each chroma
 # sample over 2 x 2 pixels, which leaves visible blocks along the person's outline (bits of libswscale's SWS_* flags).
 _FULL_CHROMA = 0x4 | 0x2000 | 0x4000 | 0x40000
+# A picture as it comes, 8 bits of sRGB or 16 bits of another curve, and how the first is made of it.
+_Shown = tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -82,7 +86,7 @@ def read_frames(source: Source, is_wanted: Callable[[int], bool], max_side_px: i
     as it goes, with a warning.
     """
     size_px: tuple[int, ...] | None = None
-    for index, time_s, rgb in _images(source, is_wanted) if source.files else _video(source, is_wanted):
+    for index, time_s, (rgb, to_srgb) in _images(source, is_wanted) if source.files else _video(source, is_wanted):
         if size_px is not None and rgb.shape[:2] != size_px:
             name = source.files[index] if source.files else f"frame {index} of {source.path}"
             raise UserError(
@@ -90,7 +94,8 @@ def read_frames(source: Source, is_wanted: Callable[[int], bool], max_side_px: i
                 "all frames must come from one camera at one size: remove or resize the odd ones"
             )
         size_px = rgb.shape[:2]
-        yield Frame(index, time_s, *_shrunk(rgb, max_side_px))
+        shrunk, scale = _shrunk(rgb, max_side_px)
+        yield Frame(index, time_s, to_srgb(shrunk), scale)
 
 
 def picture_size_px(source: Source) -> tuple[int, int]:
@@ -129,13 +134,13 @@ def _open_video(path: Path) -> Source:
     return Source(path, (), n_frames, fps)
 
 
-def _images(source: Source, is_wanted: Callable[[int], bool]) -> Iterator[tuple[int, float, np.ndarray]]:
+def _images(source: Source, is_wanted: Callable[[int], bool]) -> Iterator[tuple[int, float, _Shown]]:
     for index, path in enumerate(source.files):
         if is_wanted(index):
-            yield index, index / source.fps, read_rgb(path)
+            yield index, index / source.fps, (read_rgb(path), np.asarray)
 
 
-def _video(source: Source, is_wanted: Callable[[int], bool]) -> Iterator[tuple[int, float, np.ndarray]]:
+def _video(source: Source, is_wanted: Callable[[int], bool]) -> Iterator[tuple[int, float, _Shown]]:
     start_s: float | None = None
     time_s: float | None = None
     index = -1
@@ -147,7 +152,7 @@ def _video(source: Source, is_wanted: Callable[[int], bool]) -> Iterator[tuple[i
                 time_s = _later(picture.time, time_s, 1.0 / source.fps)
                 start_s = time_s if start_s is None else start_s
                 if is_wanted(index):
-                    yield index, time_s - start_s, _upright_rgb(picture, stream.sample_aspect_ratio)
+                    yield index, time_s - start_s, _upright(picture, stream.sample_aspect_ratio)
         except av.FFmpegError as error:
             warn(f"{source.path} breaks off after {index + 1} frames ({error.strerror}); going on with those")
 
@@ -159,15 +164,19 @@ def _later(stamp_s: float | None, before_s: float | None, step_s: float) -> floa
     return stamp_s if stamp_s is not None and stamp_s > before_s else before_s + step_s
 
 
-def _upright_rgb(picture: av.VideoFrame, aspect: Fraction | None) -> UInt8[np.ndarray, "h w 3"]:
+def _upright(picture: av.VideoFrame, aspect: Fraction | None) -> _Shown:
     """Colour pixels of a decoded picture with square pixels, turned as the container asks."""
-    rgb: np.ndarray = picture.reformat(format="rgb24", interpolation=_FULL_CHROMA).to_ndarray()
+    transfer, primaries = int(picture.color_trc), int(picture.color_primaries)
+    is_hdr = transfer in hdr.TRANSFERS
+    pixels = picture.reformat(format="rgb48le" if is_hdr else "rgb24", interpolation=_FULL_CHROMA)
+    rgb: np.ndarray = pixels.to_ndarray()
     if aspect and aspect != 1:
         rgb = cv2.resize(rgb, (round(rgb.shape[1] * aspect), rgb.shape[0]), interpolation=cv2.INTER_CUBIC)
-    return np.ascontiguousarray(np.rot90(rgb, k=round(picture.rotation / 90) % 4))
+    to_srgb = partial(hdr.to_srgb, transfer=transfer, primaries=primaries) if is_hdr else np.asarray
+    return np.ascontiguousarray(np.rot90(rgb, k=round(picture.rotation / 90) % 4)), to_srgb
 
 
-def _shrunk(rgb: UInt8[np.ndarray, "h w 3"], max_side_px: int) -> tuple[UInt8[np.ndarray, "h2 w2 3"], float]:
+def _shrunk(rgb: Shaped[np.ndarray, "h w 3"], max_side_px: int) -> tuple[Shaped[np.ndarray, "h2 w2 3"], float]:
     """The picture with its longer side at most `max_side_px`, and the factor; area averaging avoids aliasing."""
     scale = min(1.0, max_side_px / max(rgb.shape[:2]))
     if scale == 1.0:

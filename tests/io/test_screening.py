@@ -139,3 +139,19 @@ def test_a_camera_that_moves_is_told(shifts_px, levels, said):
 def test_what_the_run_goes_on_without_is_said(good, name, where, value, unseen_rad, message):
     warn_of_gaps(changed(good, name, where, value), unseen_rad, PATH)
     assert [message in warning for warning in take_warnings()] == [True]
+
+
+def test_a_large_picture_of_a_small_person_is_told(good):
+    """3840 x 2160 was shrunk to 1280 x 720, half of whose height the person fills; 640 px need a side of 2276."""
+    persons = np.zeros((20, 18, 32), bool)
+    persons[:, 4:13, 14:18] = True
+    small = dataclasses.replace(
+        good, persons=persons, grays=np.full((20, 18, 32), 100, np.uint8), width=1280, height=720, scale=1 / 3
+    )
+    warn_of_gaps(small, 0.5, PATH)
+    (message,) = take_warnings()
+    assert "1080 px tall in clip.mp4 and 360 px" in message
+    assert "frames.max_side_px=2276" in message
+    warn_of_gaps(dataclasses.replace(small, scale=1.0), 0.5, PATH)
+    warn_of_gaps(dataclasses.replace(small, width=2560, height=1440), 0.5, PATH)
+    assert take_warnings() == []

@@ -11,6 +11,7 @@ import pytest
 from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
 from pipeline.io import video
+from pipeline.io.hdr import BT_2020, HLG, to_srgb
 from pipeline.io.image import write_rgb
 
 IDENTITY = (0x10000).to_bytes(4, "big") + bytes(12) + (0x10000).to_bytes(4, "big") + bytes(12)
@@ -99,6 +100,33 @@ def test_colours_are_read_with_the_matrix_that_the_file_names(tmp_path, matrix, 
     frames = list(video.read_frames(video.open_source(path), everything, 1000))
     shown = np.array([frame.rgb.mean(axis=(0, 1)) for frame in frames])
     np.testing.assert_allclose(shown, colours, atol=2.5)
+
+
+def test_hdr_is_shown_as_srgb(tmp_path):
+    """HLG with BT.2020's colours, as phones record it: 75 % of the signal is white (BT.2408), 38 % a dark grey."""
+    levels = np.array([[0.75, 0.75, 0.75], [0.38, 0.38, 0.38], [0.6, 0.3, 0.3]])
+    path = tmp_path / "a.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx265", rate=25, options={"crf": "1", "x265-params": "log-level=none"})
+        stream.width, stream.height, stream.pix_fmt = 64, 64, "yuv420p10le"
+        codec = stream.codec_context
+        codec.colorspace, codec.color_primaries, codec.color_trc, codec.color_range = 9, 9, 18, 1
+        for red, green, blue in levels:
+            luma = 0.2627 * red + 0.6780 * green + 0.0593 * blue
+            parts = np.array([luma, (blue - luma) / 1.8814, (red - luma) / 1.4746])
+            coded = np.rint(4 * (np.array([16, 128, 128]) + np.array([219, 224, 224]) * parts))
+            planes = np.repeat(coded, [64 * 64, 32 * 32, 32 * 32]).reshape(96, 64).astype(np.uint16)
+            frame = av.VideoFrame.from_ndarray(planes, format="yuv420p10le")
+            frame.colorspace, frame.color_primaries, frame.color_trc, frame.color_range = 9, 9, 18, 1
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    frames = list(video.read_frames(video.open_source(path), everything, 1000))
+    assert all(frame.rgb.dtype == np.uint8 for frame in frames)
+    shown = np.array([frame.rgb.mean(axis=(0, 1)) for frame in frames])
+    truth = [to_srgb(np.rint(65535 * level).astype(np.uint16)[None, None], HLG, BT_2020)[0, 0] for level in levels]
+    np.testing.assert_allclose(shown, np.array(truth, dtype=float), atol=3)
+    assert shown[0].min() > 250
+    assert shown[1] == pytest.approx([101, 101, 101], abs=3)
 
 
 def test_rotation_in_the_container_is_honoured(tmp_path):

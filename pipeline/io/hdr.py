@@ -1,0 +1,53 @@
+"""High-dynamic-range pictures (ITU-R BT.2100: HLG, which phones record, and PQ) brought to sRGB.
+
+Light is taken as a reference display of 1000 cd/m² would show it. What BT.2408 calls HDR reference white (203 cd/m²)
+becomes white, so that a person is as bright as in an ordinary recording; what shines brighter is cut there.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float, UInt8, UInt16
+
+PQ, HLG = 16, 18
+"""Transfer characteristics as containers number them (ITU-T H.273, table 3)."""
+BT_2020 = 9
+"""Its number among the colour primaries (H.273, table 2)."""
+
+WHITE_NITS, PEAK_NITS, SYSTEM_GAMMA = 203.0, 1000.0, 1.2
+LUMINANCE_2020 = np.array([0.2627, 0.6780, 0.0593], dtype=np.float32)
+TO_BT_709 = np.array(
+    [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]], dtype=np.float32
+)
+"""Linear light of BT.2020's primaries to those of BT.709, which sRGB has (ITU-R BT.2407, section 2)."""
+
+
+def to_srgb(signal: UInt16[np.ndarray, "h w 3"], transfer: int, primaries: int) -> UInt8[np.ndarray, "h w 3"]:
+    """Display a picture. signal: full range of 16 bits. transfer: `HLG` or `PQ`; primaries: H.273's number."""
+    nits = _NITS[transfer](signal)
+    linear = nits / WHITE_NITS
+    if primaries == BT_2020:
+        linear = linear @ TO_BT_709.T
+    linear = np.clip(linear, 0.0, 1.0)
+    coded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** np.float32(1 / 2.4) - 0.055)
+    return np.rint(255.0 * coded).astype(np.uint8)
+
+
+def _hlg_nits(signal: UInt16[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+    """BT.2100 table 5: the inverse of the camera's curve, then the display's, which depends on luminance."""
+    a, b, c = 0.17883277, 0.28466892, 0.55991073
+    level = np.linspace(0.0, 1.0, 1 << 16)
+    scene = np.where(level <= 0.5, level**2 / 3, (np.exp((level - c) / a) + b) / 12).astype(np.float32)[signal]
+    return PEAK_NITS * (scene @ LUMINANCE_2020)[..., None] ** np.float32(SYSTEM_GAMMA - 1) * scene
+
+
+def _pq_nits(signal: UInt16[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+    """BT.2100 table 4."""
+    m1, m2, c1, c2, c3 = 0.1593017578125, 78.84375, 0.8359375, 18.8515625, 18.6875
+    root = np.linspace(0.0, 1.0, 1 << 16) ** (1 / m2)
+    nits = 10000.0 * (np.maximum(root - c1, 0.0) / (c2 - c3 * root)) ** (1 / m1)
+    return nits.astype(np.float32)[signal]
+
+
+_NITS: dict[int, Callable[[np.ndarray], np.ndarray]] = {HLG: _hlg_nits, PQ: _pq_nits}
+TRANSFERS = tuple(_NITS)
