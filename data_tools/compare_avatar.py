@@ -4,10 +4,13 @@ Wherever surfaces are compared they were laid over each other by a similarity (r
 iterated closest points, because one camera cannot tell size from distance; the scale is reported.
 """
 
+from collections import defaultdict
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
@@ -17,7 +20,7 @@ from data_tools.capture import Capture
 from data_tools.renderer import pose_vertices, render_subject
 from data_tools.retarget import carried_rotations, local_rotations
 from data_tools.shadow import seen_from_outside
-from data_tools.truth import load_truth
+from data_tools.truth import load_truth, true_mask
 from pipeline.avatar.body import Body, Motion, canonical_to_world
 from pipeline.avatar.selection import HELDOUT, TRAIN
 from pipeline.core.progress import track
@@ -26,13 +29,14 @@ from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.rotation import quaternion_to_matrix
 from pipeline.geometry.skinning import forward_kinematics
 from pipeline.geometry.surface import closest_on_mesh
-from pipeline.geometry.textured import sample_texture
+from pipeline.geometry.textured import sample_texture, soften_outline
 from pipeline.io.avatar import FinishedRun, load_finished_run
 from pipeline.io.image import read_gray, read_rgba, to_float, to_uint8
 from pipeline.io.npz import load_camera, load_motion
 from pipeline.metrics.alignment import Similarity, align_surfaces
-from pipeline.metrics.images import frame_scores, mean_scores
+from pipeline.metrics.images import frame_scores, mean_scores, missing_blur_px
 from pipeline.metrics.surfaces import sample_surface, surface_scores
+from stages.report import outline_spread_px, scored_positions
 
 SURFACE_FRAMES = 4
 SURFACE_POINTS = 20_000
@@ -178,8 +182,30 @@ def compare_texture(pair: Comparison, seed: int = 0) -> dict[str, float]:
     }
 
 
-def ceiling(pair: Comparison) -> list[dict[str, float]]:
-    """Scores of the held-out frames when the true mesh and texture are drawn in the refined poses by the fitted camera.
+def compare_held_out(pair: Comparison) -> dict[str, dict[str, float]]:
+    """Scores of the held-out frames that only the truth can give, means over frames.
+
+    Returns:
+        ceiling: of `ceiling_pictures`, outlines as soft as those of the report's mesh. field_true_mask,
+        mesh_true_mask, ceiling_true_mask: targets cut out of the video by the true mask, where the report takes the
+        mask that the frames stage found; meshes have sharp outlines, as true masks have.
+    """
+    run = pair.run
+    rows: defaultdict[str, list[dict[str, float]]] = defaultdict(list)
+    blur_px = missing_blur_px(outline_spread_px(run))
+    positions = scored_positions(run.capture)
+    for position, perfect in zip(positions.tolist(), ceiling_pictures(pair, positions), strict=True):
+        image, mask = (to_uint8(part(position)) for part in (run.capture.image, run.capture.mask))
+        rows["ceiling"].append(frame_scores(soften_outline(perfect, blur_px), image, mask))
+        pose, cut = run.refined[position], _true_mask(pair, position)
+        mesh = run.avatar.render(run.avatar.posed(pose), run.camera, SAMPLES)
+        for name, drawn in {"field": run.draw_field(pose), "mesh": mesh, "ceiling": perfect}.items():
+            rows[f"{name}_true_mask"].append(frame_scores(drawn, image, cut))
+    return {name: mean_scores(scores) for name, scores in rows.items()}
+
+
+def ceiling_pictures(pair: Comparison, positions: Int[np.ndarray, "k"]) -> Iterator[Float[np.ndarray, "h w 4"]]:
+    """The true mesh and texture, truly lit, drawn in the refined poses by the fitted camera; outlines are sharp.
 
     What is missing to a perfect picture here is the fault of pose and camera alone. What a perfect reconstruction could
     make good by another shape of the A-pose is not counted: see `absorbed`.
@@ -188,14 +214,10 @@ def ceiling(pair: Comparison) -> list[dict[str, float]]:
     held = replace(subject, body=replace(subject.body, vertices=absorbed(pair)))
     joint = _carriers(subject.body, run.body)
     camera = replace(run.camera, world_to_camera=pair.truth.camera.world_to_camera)
-    rows = []
-    for position in track(run.capture.positions(HELDOUT).tolist(), "ceiling"):
+    for position in track(positions.tolist(), "held-out frames"):
         posed = pose_vertices(held, run.refined[position, joint])
         vertices = _between_worlds(posed, run.camera, pair.truth.camera)
-        drawn = render_subject(held, vertices, camera, pair.truth.light, pair.truth.samples)
-        image, mask = (to_uint8(part(position)) for part in (run.capture.image, run.capture.mask))
-        rows.append(frame_scores(drawn, image, mask))
-    return rows
+        yield render_subject(held, vertices, camera, pair.truth.light, pair.truth.samples)
 
 
 def absorbed(pair: Comparison) -> Float[np.ndarray, "v 3"]:
@@ -279,6 +301,13 @@ def acted(pair: Comparison, motion: Motion) -> list[Mesh]:
 def _aligned_scores(avatar: Mesh, true: Mesh, alignment: Similarity) -> dict[str, float]:
     scores = surface_scores(alignment.moved(avatar), true, SURFACE_POINTS)
     return scores | {"scale_to_truth": alignment.scale}
+
+
+def _true_mask(pair: Comparison, position: int) -> UInt8[np.ndarray, "h w"]:
+    """The person's true coverage of a chosen frame, at the size of the run's images."""
+    capture = pair.run.capture
+    mask = true_mask(pair.folder.parent, int(capture.frame_index[position]))
+    return cv2.resize(mask, (capture.width, capture.height), interpolation=cv2.INTER_AREA)
 
 
 def _drawn(pair: Comparison, surface: Mesh, camera: Camera) -> Float[np.ndarray, "h w 4"]:

@@ -10,8 +10,8 @@ from typing import Any
 from data_tools.compare_avatar import (
     Comparison,
     Pair,
-    ceiling,
     compare_filmed,
+    compare_held_out,
     compare_novel_poses,
     compare_novel_views,
     compare_shape,
@@ -33,9 +33,11 @@ PROTOCOL = (
     "own pose, novel_poses while both rigs do a motion that was never filmed. scale_to_truth is that scale. Joints "
     "are compared root-aligned and absolute, without any other alignment. Pictures: field and mesh are the held-out "
     "rows of the report. ceiling is the true mesh and texture, truly lit, drawn in the refined poses by the fitted "
-    "camera, on the same frames: what is missing there is the fault of pose and camera, after all that another shape "
-    "of the A-pose could make good. Squared error prefers a blur to a sharp print in the wrong place, so a blurred "
-    "avatar may score above it. novel_views and novel_poses are the avatar whose limbs point where the true ones do, "
+    "camera, on the same frames with outlines as soft as the mesh's: what is missing there is the fault of pose and "
+    "camera, after all that another shape of the A-pose could make good. Squared error prefers a blur to a sharp print "
+    "in the wrong place, so a blurred avatar may score above it. Those rows cut the frames out by the mask that the "
+    "pipeline found, so that what it leaves out costs nothing; the rows named true_mask cut them out by the true one, "
+    "meshes with sharp outlines. novel_views and novel_poses are the avatar whose limbs point where the true ones do, "
     "laid over the true surface and seen by the true cameras, unlit while the truth is lit. colour_error and "
     "balanced_colour_error (one gain a channel) are mean absolute differences of 255 on the texels that the video "
     "showed."
@@ -75,7 +77,7 @@ def write_comparison(out: Path, run: Path, found: Mapping[str, Mapping[str, floa
 def avatar_sections(pair: Comparison) -> tuple[dict[str, Any], dict[str, list[Pair]]]:
     """All sections that need a finished avatar, and the pictures of held-out cameras and motions."""
     document: dict[str, Any] = {"mesh": compare_shape(pair), "filmed": compare_filmed(pair)}
-    images = {"ceiling": mean_scores(ceiling(pair))}
+    images = compare_held_out(pair)
     pictures = {}
     if (pair.folder / "novel_poses").is_dir():
         document["novel_poses"], pictures["novel_poses"] = compare_novel_poses(pair)

@@ -52,6 +52,7 @@ def test_the_document_holds_all_sections_and_the_report_stays_whole(run: Path, t
     assert list(document["images"]) == ["field", "mesh", "ceiling", "novel_views"]
     assert document["images"]["novel_views"]["psnr_full"] is None
     assert "iterated closest points" in document["protocol"]
+    assert "rows named true_mask" in document["protocol"]
     assert find_damage(run / "report") == []
     manifest = read_manifest(run / "report")
     assert manifest is not None
