@@ -250,7 +250,7 @@ def overlay(
 
 STAGE = Stage(
     "body",
-    version=8,
+    version=9,
     needs=("frames",),
     makes=(_BODY, _MOTION, _CAMERA, SCORES_NPZ, _OVERLAY),
     config=Config,
