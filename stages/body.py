@@ -10,7 +10,7 @@ from jaxtyping import Bool, UInt8
 from pydantic import Field
 
 from pipeline.avatar.body import Motion, ParametricBody, canonical_to_world, load_anny
-from pipeline.avatar.fit import FitOptions, FitResult, fit_body, fit_given
+from pipeline.avatar.fit import FitOptions, FitResult, TooFewLandmarksError, fit_body, fit_given
 from pipeline.avatar.fit_beside import foreign_frames, lump_doubts, lump_shares
 from pipeline.avatar.fit_given import GivenPoses
 from pipeline.avatar.fit_hands import finger_curls_rad, trusted_hands
@@ -145,10 +145,10 @@ def fit(
             result = fit_body(model, observations, windows, options, finger_curls_rad(model, hands))
         else:
             result = fit_given(model, observations, windows, given, config.supplied_poses == "keep")
-    except ValueError as error:
+    except TooFewLandmarksError as error:
         raise UserError(
-            f"the body cannot be fitted to {frames_dir}: {error}; let the detector find the landmarks "
-            "(remove landmarks.npz from the video folder), or supply `landmarks_world_m` too"
+            f"the body cannot be fitted to {frames_dir}: {error}; film hips and shoulders in view, or, where "
+            "landmarks.npz lies beside the video, complete or remove it"
         ) from error
     refuse_poor_fit(result, capture, config, given is not None)
     return result

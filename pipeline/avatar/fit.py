@@ -54,6 +54,10 @@ OUTLINE_DIRECTION_M = 0.4
 """Standard deviations of a landmark in the image and in 3D once outlines help, which err less and in no fixed way."""
 
 
+class TooFewLandmarksError(ValueError):
+    """The frames do not say enough of the person's place to begin a fit."""
+
+
 WELL_SEEN = 0.5
 """Trust from which a landmark's distance tells how good a fit is."""
 
@@ -178,7 +182,7 @@ def shared_rows(observations: Observations, windows: Sequence[Window | None], co
 
 def _check_landmarks(observations: Observations) -> None:
     if torso_found(observations).sum() < MINIMUM_FRAMES:
-        raise ValueError(f"fewer than {MINIMUM_FRAMES} frames have hips and shoulders in pixels and in 3D")
+        raise TooFewLandmarksError(f"fewer than {MINIMUM_FRAMES} frames have hips and shoulders in pixels and in 3D")
 
 
 def _tools(body: ParametricBody, curls_rad: Float[np.ndarray, "2 4"]) -> _Tools:

@@ -156,7 +156,7 @@ def test_landmarks_without_depth_are_refused_with_a_remedy(tmp_path, scene: Act)
     flat = act(load_anny(), FRAMES)
     flat.landmarks_world_m[:] = np.nan
     write_capture(frames, flat, flat.camera, scene.masks())
-    with pytest.raises(UserError, match="landmarks_world_m"):
+    with pytest.raises(UserError, match="in pixels and in 3D.*landmarks.npz"):
         run({"frames": frames}, out, Config())
 
 

@@ -1,0 +1,92 @@
+"""How well frames and body do on captures with known truth: one line for each capture and what was told of it.
+
+python -m tests.bench.bench_body CAPTURE ... [--runs runs/bench-body]
+
+Each capture is fitted three times: with its true focal length and stature, with its stature alone, and with nothing (a
+picture does not tell how large a person is: what a wrong stature adds is in the joints, not in the avatar's looks).
+"""
+
+import argparse
+import math
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from data_tools.command import run_command
+from data_tools.compare import compare_body, compare_masks, compare_surface
+from data_tools.runs import video_in
+from data_tools.truth import load_truth
+from pipeline.core.errors import UserError
+from pipeline.io.npz import load_body
+from stages import body
+from tests.bench.machine import keep
+
+TOLD = ("focal and stature", "stature", "nothing")
+COLUMNS = {
+    "joints": "joint_error_mm",
+    "scaled": "scaled_joint_error_mm",
+    "absolute": "absolute_joint_error_mm",
+    "focal": "focal_ratio",
+    "surface": "surface_median_mm",
+    "swaps": "swapped_frames",
+    "jitter": "acceleration_error_ratio",
+    "mask": "mask_iou_median",
+    "worst": "mask_iou_worst",
+    "frames s": "frames_seconds",
+    "body s": "body_seconds",
+}
+"""Head of each column, and the figure in it."""
+
+
+def ways(capture: Path) -> Iterator[tuple[str, body.Config]]:
+    """What the body stage is told, in words and as its options; stature only where the truth has a bare body."""
+    camera, bare = load_truth(capture).camera, capture / "truth" / "bare.npz"
+    view_deg = math.degrees(2 * math.atan(0.5 * max(camera.width, camera.height) / camera.fx))
+    height_m = load_body(bare).height_m() if bare.is_file() else None
+    yield TOLD[0], body.Config(field_of_view_deg=view_deg, height_m=height_m)
+    if height_m:
+        yield TOLD[1], body.Config(height_m=height_m)
+    yield TOLD[2], body.Config()
+
+
+def measure(capture: Path, run: Path) -> Iterator[dict[str, str | float]]:
+    """Run both stages on a capture's video; the figures of each way, with the seconds of both stages."""
+    command = [sys.executable, "-m", "stages.frames", str(run), "--video", str(video_in(capture)), "--force"]
+    start = time.monotonic()
+    if subprocess.run(command, check=False).returncode:
+        raise UserError(f"the frames stage failed on {capture}; what it said stands above")
+    frames = {"frames_seconds": time.monotonic() - start} | compare_masks(capture, run / "frames")
+    for told, config in ways(capture):
+        out = run / f"body, {told} told"
+        out.mkdir(parents=True, exist_ok=True)
+        start = time.monotonic()
+        body.run({"frames": run / "frames"}, out, config)
+        seconds = {"body_seconds": time.monotonic() - start}
+        found = compare_body(capture, out) | compare_surface(capture, out)
+        yield {"capture": capture.name, "told": told, **frames, **seconds, **found}
+
+
+def line(figures: Mapping[str, str | float]) -> str:
+    """A row of the table."""
+    values = (figures[name] for name in COLUMNS.values())
+    return f"{figures['capture']:24s} {figures['told']:18s}" + "".join(f"{value:9.3g}" for value in values)
+
+
+def main(argv: Sequence[str]) -> None:
+    """Measure, print, append the rows."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("captures", type=Path, nargs="+", help="captures that data_tools made")
+    parser.add_argument("--runs", type=Path, default=Path("runs/bench-body"), help="where the stages write")
+    options = parser.parse_args(argv)
+    rows = [row for capture in options.captures for row in measure(capture, options.runs / capture.name)]
+    print(f"{'capture':24s} {'told':18s}" + "".join(f"{head:>9s}" for head in COLUMNS))
+    for row in rows:
+        print(line(row))
+        table = keep("body", row)
+    print(f"lengths in mm; rows appended to {table}")
+
+
+if __name__ == "__main__":
+    sys.exit(run_command(main, sys.argv[1:]))
