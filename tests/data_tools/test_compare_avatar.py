@@ -126,25 +126,29 @@ def test_flat_colours_give_the_texture_error_in_closed_form(perfect: Comparison)
     flat = np.array([110.0, 120.0, 130.0], dtype=np.float32) / 255
     left = np.zeros((512, 512), dtype=np.float32)
     left[:, :150] = 1.0
-    found = painted(perfect, np.full((8, 8, 3), 100, dtype=np.uint8), np.tile(flat, (8, 8, 1)))
+    found = painted(perfect, np.full((8, 8, 3), 100, dtype=np.uint8), np.tile(flat, (8, 8, 1)), left)
     share = share_of_surface(perfect, lambda uv: uv[..., 0] < 150 / 512)
-    scores = compare_texture(replace(found, coverage=left))
+    scores = compare_texture(found)
     assert 0.1 < share < 0.45
     assert scores["coverage"] == pytest.approx(share, abs=0.012)
     assert scores["colour_error"] == pytest.approx(20.0, abs=1e-3)
     assert scores["balanced_colour_error"] == pytest.approx(0.0, abs=1e-3)
     greys = np.where(left[..., None] > 0, np.uint8(200), np.uint8(100)).repeat(3, axis=2)
-    two = compare_texture(painted(perfect, greys, np.full((8, 8, 3), 200 / 255, dtype=np.float32)))
+    grey = np.full((8, 8, 3), 200 / 255, dtype=np.float32)
+    two = compare_texture(painted(perfect, greys, grey, perfect.coverage))
     assert two["coverage"] == 1.0
     assert two["colour_error"] == pytest.approx(100 * (1 - share), abs=1.2)
     assert two["balanced_colour_error"] == pytest.approx(100 * share, abs=1.2)  # the gain is right for the larger part
 
 
-def painted(pair: Comparison, truth: np.ndarray, found: np.ndarray) -> Comparison:
-    """The same run with other textures: the true one in 8 bits, the avatar's in [0, 1]."""
+def painted(pair: Comparison, truth: np.ndarray, found: np.ndarray, coverage: np.ndarray) -> Comparison:
+    """The same run with other textures, the true one in 8 bits, the avatar's in [0, 1], and what the video showed."""
     subject = replace(pair.truth.subject, texture=truth)
     avatar = replace(pair.run.avatar, diffuse=torch.from_numpy(found))
-    return replace(pair, truth=replace(pair.truth, subject=subject), run=replace(pair.run, avatar=avatar))
+    truth_painted, run_painted = replace(pair.truth, subject=subject), replace(pair.run, avatar=avatar)
+    made = replace(pair, truth=truth_painted, run=run_painted, coverage=coverage)
+    vars(made).update(rest=pair.rest, alignment=pair.alignment)  # found for the same surfaces already
+    return made
 
 
 def share_of_surface(pair: Comparison, inside: Callable[[np.ndarray], np.ndarray]) -> float:
