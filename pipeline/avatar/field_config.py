@@ -45,6 +45,9 @@ class FieldConfig(Config):
     pixel_jitter: bool = Option(False, description="rays start anywhere in their pixel instead of its centre")
     share_border: float = Option(0.25, ge=0, le=1, description="part of the rays along the mask's border")
     share_outside: float = Option(0.1, ge=0, le=1, description="part of the rays outside the mask")
+    share_error: float = Option(
+        0.6, ge=0, le=1, description="of the rays on the body, the part that is drawn where colours erred most of late"
+    )
     border_px: int = Option(4, ge=1, description="half width of the border, px")
 
     occupancy: Literal["attention", "plain"] = Option(

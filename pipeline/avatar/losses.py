@@ -24,6 +24,18 @@ def hard_surface(alpha: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
     return HARD_OFFSET - torch.log(torch.exp(-alpha.abs()) + torch.exp(-(alpha - 1).abs()))
 
 
+def colour_errors(
+    image: Float[Tensor, "n 3"],
+    alpha: Float[Tensor, "n"],
+    rgba: Float[Tensor, "n 4"],
+    background: Float[Tensor, "n 3"],
+) -> Float[Tensor, "n 3"]:
+    """What is shown less what was filmed, the same background behind both; arguments as in `field_losses`."""
+    mask = rgba[:, 3:]
+    target = rgba[:, :3] * mask + background * (1 - mask)
+    return image + background * (1 - alpha[:, None]) - target
+
+
 def field_losses(
     image: Float[Tensor, "n 3"],
     alpha: Float[Tensor, "n"],
@@ -37,12 +49,9 @@ def field_losses(
     image: premultiplied colour. rgba: straight colour and mask of the pixels. background: laid behind both, random
     for each ray, so that no colour can pass for transparency.
     """
-    mask = rgba[:, 3]
-    target = rgba[:, :3] * mask[:, None] + background * (1 - mask[:, None])
-    shown = image + background * (1 - alpha[:, None])
     losses = {
-        "colour": huber(shown - target, config.huber_delta).mean(),
-        "alpha": config.weight_alpha * huber(alpha - mask, config.huber_delta).mean(),
+        "colour": huber(colour_errors(image, alpha, rgba, background), config.huber_delta).mean(),
+        "alpha": config.weight_alpha * huber(alpha - rgba[:, 3], config.huber_delta).mean(),
         "hard": config.weight_hard * hard_surface(alpha).mean(),
     }
     if len(empty_density_per_m):

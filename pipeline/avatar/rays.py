@@ -5,10 +5,39 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Int, UInt8
+from jaxtyping import Float, Int, UInt8
 
 KINDS = ("body", "border", "outside")
 OUTSIDE_PER_FRAME = 20_000
+TILE_PX = 16
+CANDIDATES = 4
+"""Pixels that are drawn for each that is then chosen by the error around it."""
+MEMORY = 0.8
+"""What is left of a tile's error at each new pixel of it."""
+
+
+class ErrorMap:
+    """Where the learning errs: the mean colour error of late in every tile of every frame."""
+
+    def __init__(self, frames: int, xy_px: Int[np.ndarray, "p 2"]) -> None:
+        """All tiles alike. xy_px: every pixel that will ever be asked for."""
+        columns, rows = xy_px.max(axis=0) // TILE_PX + 1
+        self.error = np.ones((frames, rows, columns), dtype=np.float32)
+
+    def at(self, frame: int, xy_px: Int[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
+        """The error around pixels of a frame."""
+        column, row = xy_px.T // TILE_PX
+        return self.error[frame, row, column]
+
+    def note(self, frame: Int[np.ndarray, "n"], xy_px: Int[np.ndarray, "n 2"], error: Float[np.ndarray, "n"]) -> None:
+        """Take in what pixels (column, row) erred by, not negative."""
+        column, row = xy_px.T // TILE_PX
+        tile = np.ravel_multi_index((frame, row, column), self.error.shape)
+        count, total = np.bincount(tile), np.bincount(tile, error)
+        seen = np.flatnonzero(count)
+        kept = MEMORY ** count[seen]
+        flat = self.error.reshape(-1)
+        flat[seen] = kept * flat[seen] + (1 - kept) * (total[seen] / count[seen])
 
 
 @dataclass(frozen=True)
@@ -29,13 +58,19 @@ class PixelPool:
         return len(self.start)
 
     def draw(
-        self, frames: Int[np.ndarray, "k"], rays: int, shares: tuple[float, float, float], random: np.random.Generator
+        self,
+        frames: Int[np.ndarray, "k"],
+        rays: int,
+        shares: tuple[float, float, float],
+        random: np.random.Generator,
+        errors: ErrorMap | None = None,
+        by_error: float = 0.0,
     ) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
         """Rows of random pixels, about `rays` in all, and the slot (position in `frames`) of each; sorted by slot,
         then place.
 
         shares: parts of the rays on the body, its border and outside; a frame without pixels of a kind draws none of
-        it.
+        it. by_error: part of the rays on the body that goes where `errors` are large.
         """
         rows, slots = [], []
         for slot, frame in enumerate(frames):
@@ -43,7 +78,13 @@ class PixelPool:
             for kind, share in enumerate(shares):
                 first, last = self.start[frame, kind], self.start[frame, kind + 1]
                 count = round(rays * share / len(frames)) if last > first else 0
-                mine.append(random.integers(first, max(last, first + 1), count))
+                chosen = round(by_error * count) if errors and KINDS[kind] == "body" else 0
+                mine.append(random.integers(first, max(last, first + 1), count - chosen))
+                if errors and chosen:
+                    candidates = random.integers(first, last, CANDIDATES * chosen)
+                    weight = errors.at(int(frame), self.xy_px[candidates]).cumsum(dtype=np.float64)
+                    place = np.searchsorted(weight, random.random(chosen) * weight[-1], side="right")
+                    mine.append(candidates[np.minimum(place, len(candidates) - 1)])
             drawn = np.sort(np.concatenate(mine))
             rows.append(drawn)
             slots.append(np.full(len(drawn), slot))

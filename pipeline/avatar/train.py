@@ -12,10 +12,10 @@ from pipeline.avatar.body import Body, Motion
 from pipeline.avatar.field import Field
 from pipeline.avatar.field_config import FieldConfig
 from pipeline.avatar.inverse import Rays, invert_motion
-from pipeline.avatar.losses import field_losses
+from pipeline.avatar.losses import colour_errors, field_losses
 from pipeline.avatar.occupancy import OccupancyUpdate
 from pipeline.avatar.pose import PoseCorrection
-from pipeline.avatar.rays import PixelPool
+from pipeline.avatar.rays import ErrorMap, PixelPool
 from pipeline.avatar.warp import posed_from_world
 from pipeline.geometry.camera import Camera, pixel_rays
 from pipeline.kernels.adam import adam_step_
@@ -51,6 +51,7 @@ class Batch:
 
     frames: Int[Tensor, "k"]
     slot: Int[Tensor, "n"]
+    rows: Int[np.ndarray, "n"]
     origins_m: Float[Tensor, "n 3"]
     directions: Float[Tensor, "n 3"]
     rgba: Float[Tensor, "n 4"]
@@ -76,6 +77,7 @@ class Learning:
         self.step_m = scene.body.height_m() * config.step_fraction
         self.done = 0
         self.bad_steps = 0
+        self.errors = ErrorMap(scene.pool.frames, scene.pool.xy_px)
         self.table_gradient = torch.zeros_like(field.table)
         parameters: dict[str, Tensor] = dict(field.named_parameters())
         parameters |= {"rotation_rad": self.poses.rotation_rad, "shift_m": self.poses.shift_m}
@@ -113,7 +115,7 @@ class Learning:
         config, pool = self.config, self.scene.pool
         frames = np.sort(random.choice(pool.frames, min(config.frames_per_step, pool.frames), replace=False))
         shares = (1 - config.share_border - config.share_outside, config.share_border, config.share_outside)
-        rows, slots = pool.draw(frames, config.rays, shares, random)
+        rows, slots = pool.draw(frames, config.rays, shares, random, self.errors, config.share_error)
         inside = random.random((len(rows), 2), dtype=np.float32) if config.pixel_jitter else np.float32(0.5)
         origins, directions = pixel_rays(self.scene.camera, self._here(pool.xy_px[rows] + inside))
         slot, chosen = self._here(slots), self._here(frames)
@@ -121,6 +123,7 @@ class Learning:
         return Batch(
             frames=chosen,
             slot=slot,
+            rows=rows,
             origins_m=(matrix[:, :3, :3] * origins[:, None]).sum(-1) + matrix[:, :3, 3],
             directions=(matrix[:, :3, :3] * directions[:, None]).sum(-1),
             rgba=self._here(pool.rgba[rows]).float() / 255,
@@ -184,12 +187,20 @@ class Learning:
         finite = bool(torch.isfinite(total))
         self._update_parameters(finite)
         if finite:
+            self._note_errors(batch, image.detach(), alpha.detach())
             self.occupancy.record(samples.canonical_m, light_before(weights, samples.ray_start), weights)
         self.done += 1
         if self.done % config.occupancy_every == 0 and self.done >= config.occupancy_start:
             self.occupancy.update(self.field.density, self.step_m, config.occupancy_threshold, random)
             self._follow_occupancy()
         return {name: float(loss.detach()) for name, loss in losses.items()} | {"samples": float(count)}
+
+    def _note_errors(self, batch: Batch, image: Tensor, alpha: Tensor) -> None:
+        """Remember where colours are wrong, for the rays of later steps."""
+        if self.config.share_error > 0.0:
+            error = colour_errors(image, alpha, batch.rgba, batch.background).abs().mean(1)
+            frame = batch.frames.index_select(0, batch.slot).cpu().numpy()
+            self.errors.note(frame, self.scene.pool.xy_px[batch.rows], error.cpu().numpy())
 
     def _rate(self) -> float:
         """Part of the full learning rate: a short warm-up, then an exponential decay that ends at `final_rate`."""
@@ -227,6 +238,7 @@ class Learning:
         for name, parameter in self.parameters.items():
             tensors[f"parameter.{name}"] = parameter.detach()
             tensors[f"first.{name}"], tensors[f"second.{name}"] = self.moments[name]
+        tensors["pixel_errors"] = torch.from_numpy(self.errors.error)
         return tensors | {f"occupancy.{name}": value for name, value in self.occupancy.state().items()}
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
@@ -240,6 +252,7 @@ class Learning:
                 parameter.copy_(tensors[f"parameter.{name}"])
                 for moment, order in zip(self.moments[name], ("first", "second"), strict=True):
                     moment.copy_(tensors[f"{order}.{name}"])
+        self.errors.error[:] = tensors["pixel_errors"].cpu().numpy()
         prefix = "occupancy."
         kept = {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
         self.occupancy.load_state(kept)

@@ -1,0 +1,80 @@
+"""Rays where colours erred: what is remembered, and what is drawn from it."""
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.avatar.losses import colour_errors
+from pipeline.avatar.rays import MEMORY, TILE_PX, ErrorMap, build_pool
+from tests.avatar.test_train import TRAIN, begin, scene  # noqa: F401 - a fixture
+
+SIDE_PX = 4 * TILE_PX
+
+
+@pytest.fixture
+def pool():
+    """One frame whose mask fills four by four tiles but for a margin."""
+    mask = np.zeros((SIDE_PX, SIDE_PX), np.uint8)
+    mask[8:-8, 8:-8] = 255
+    return build_pool([(np.zeros((SIDE_PX, SIDE_PX, 3), np.uint8), mask)] * 2, border_px=2, seed=0)
+
+
+def test_a_tile_forgets_at_a_fixed_pace_and_others_keep_what_they_know(pool):
+    errors = ErrorMap(2, pool.xy_px)
+    place = np.array([[TILE_PX + 1, 2 * TILE_PX], [TILE_PX + 9, 3 * TILE_PX - 1]], dtype=np.int16)
+    for _ in range(3):
+        errors.note(np.array([1, 1]), place, np.array([0.2, 0.4]))
+    known = 0.3 + (1 - 0.3) * MEMORY**6
+    assert errors.at(1, place).tolist() == pytest.approx([known, known])
+    assert np.count_nonzero(errors.error != 1) == 1
+    assert errors.at(0, place).tolist() == [1, 1]
+
+
+def test_rays_of_the_body_go_where_the_error_is_in_proportion(pool):
+    errors, random = ErrorMap(2, pool.xy_px), np.random.default_rng(0)
+    upper = np.array([0, 1]), np.arange(4)
+    errors.error[0][np.ix_(*upper)] = 3.0
+    draw = (np.array([0, 1]), 16_000, (1.0, 0.0, 0.0), random, errors)
+    for by_error, share in ((1.0, 0.75), (0.5, 0.625), (0.0, 0.5)):
+        rows, slots = pool.draw(*draw, by_error)
+        assert len(rows) == 16_000
+        assert np.all(np.diff(rows) >= 0)
+        is_upper = pool.xy_px[rows, 1] < SIDE_PX // 2
+        assert is_upper[slots == 0].mean() == pytest.approx(share, abs=0.02)
+        assert is_upper[slots == 1].mean() == pytest.approx(0.5, abs=0.02)
+
+
+def test_border_and_outside_keep_their_rays(pool):
+    errors = ErrorMap(2, pool.xy_px)
+    errors.error[:, 0] = 1e6
+    rows, _ = pool.draw(np.array([0]), 1000, (0.4, 0.35, 0.25), np.random.default_rng(0), errors, 1.0)
+    counts = np.histogram(rows, bins=[*pool.start[0]])[0]
+    assert counts.tolist() == [400, 350, 250]
+
+
+def test_a_perfect_picture_errs_nowhere_and_a_hole_by_what_it_hides():
+    rgba = torch.tensor([[0.2, 0.4, 0.6, 1.0], [0.9, 0.1, 0.5, 0.25]])
+    background = torch.tensor([[1.0, 0.0, 0.5], [0.3, 0.3, 0.3]])
+    perfect = rgba[:, :3] * rgba[:, 3:]
+    assert colour_errors(perfect, rgba[:, 3], rgba, background).abs().max() < 1e-7
+    hole = colour_errors(torch.zeros(2, 3), torch.zeros(2), rgba, background)
+    torch.testing.assert_close(hole[0], torch.tensor([0.8, -0.4, -0.1]))
+    torch.testing.assert_close(hole[1], 0.25 * torch.tensor([-0.6, 0.2, -0.2]))
+
+
+def test_a_resumed_run_draws_what_an_unbroken_one_would_have(scene):  # noqa: F811
+    options = {"steps": 12, "share_error": 0.6, "occupancy_start": 4}
+    whole, first = begin(scene, **options), begin(scene, **options)
+    for _ in range(12):
+        whole.step()
+    for _ in range(5):
+        first.step()
+    kept = {name: value.clone() for name, value in first.state().items()}
+    assert float(kept["pixel_errors"].min()) < 0.9
+    assert kept["pixel_errors"].shape[0] == len(TRAIN)
+    second = begin(scene, **options)
+    second.load_state(kept)
+    for _ in range(7):
+        second.step()
+    for name, value in whole.state().items():
+        assert torch.equal(value, second.state()[name]), name
