@@ -88,7 +88,7 @@ class _Calls(TorchDispatchMode):
 
 @contextmanager
 def elsewhere() -> Iterator[_Calls]:
-    """While it lasts, `ELSEWHERE` can be computed on; `count` of what it yields is the number of operations there, views apart."""
+    """While it lasts, `ELSEWHERE` can be computed on; `count` of what it yields counts operations there but views."""
     # Without this, torch.tensor(..., device=ELSEWHERE) asks torch itself for memory there.
     before = torch._C._only_lift_cpu_tensors()
     torch._C._set_only_lift_cpu_tensors(True)
