@@ -9,12 +9,19 @@ import pytest
 from jaxtyping import install_import_hook
 
 from pipeline.core.measure import REPOSITORY
+from pipeline.core.progress import take_warnings
 from tests.core.toy_pipeline import Toy, user_environment
 
 # Before any of these is imported: from here on every annotated shape and dtype in them is checked at each call.
 # The numba kernels are left out, because numba compiles the plain functions.
 CHECKED_PACKAGES = ["pipeline.geometry", "pipeline.avatar", "pipeline.metrics", "pipeline.io"]
 install_import_hook(CHECKED_PACKAGES, "beartype.beartype")
+
+
+@pytest.fixture(autouse=True)
+def only_own_warnings() -> None:
+    """What earlier tests warned of is forgotten: stages gather warnings for the whole process."""
+    take_warnings()
 
 
 @pytest.fixture(scope="session")
