@@ -13,6 +13,7 @@ from pipeline.avatar.occupancy import Occupancy
 from pipeline.avatar.warp import build_skin_grid, posed_from_world, skin_margin_m
 from pipeline.geometry.camera import Camera, pixel_rays, project
 from pipeline.kernels.composite import composite
+from pipeline.kernels.reference.corners import corner_bits
 from pipeline.kernels.warp import SkinGrid
 
 RAYS_AT_ONCE = 1 << 14
@@ -62,8 +63,7 @@ def _pixels_in_box(
     box_m: Float[Tensor, "2 3"], to_posed: Float[Tensor, "4 4"], camera: Camera
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """Rows and columns of the pixels that may see the posed box, in parts."""
-    unit = torch.tensor([[i & 1, i >> 1 & 1, i >> 2 & 1] for i in range(8)], device=box_m.device)
-    corners = (box_m[0] + unit * (box_m[1] - box_m[0]) - to_posed[:3, 3]) @ to_posed[:3, :3]
+    corners = (box_m[0] + corner_bits(box_m.device) * (box_m[1] - box_m[0]) - to_posed[:3, 3]) @ to_posed[:3, :3]
     corners_px, depth_m = project(corners, camera)
     x0, y0, x1, y1 = 0, 0, camera.width, camera.height
     if bool((depth_m > 0.05).all()):

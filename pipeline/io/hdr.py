@@ -5,6 +5,7 @@ becomes white, so that a person is as bright as in an ordinary recording; what s
 """
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
@@ -35,18 +36,29 @@ def to_srgb(signal: UInt16[np.ndarray, "h w 3"], transfer: int, primaries: int) 
 
 def _hlg_nits(signal: UInt16[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
     """BT.2100 table 5: the inverse of the camera's curve, then the display's, which depends on luminance."""
-    a, b, c = 0.17883277, 0.28466892, 0.55991073
-    level = np.linspace(0.0, 1.0, 1 << 16)
-    scene = np.where(level <= 0.5, level**2 / 3, (np.exp((level - c) / a) + b) / 12).astype(np.float32)[signal]
+    scene = _hlg_scene_light()[signal]
     return PEAK_NITS * (scene @ LUMINANCE_2020)[..., None] ** np.float32(SYSTEM_GAMMA - 1) * scene
 
 
 def _pq_nits(signal: UInt16[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-    """BT.2100 table 4."""
+    return _pq_light()[signal]
+
+
+@cache
+def _hlg_scene_light() -> Float[np.ndarray, "65536"]:
+    """Scene light of every signal."""
+    a, b, c = 0.17883277, 0.28466892, 0.55991073
+    level = np.linspace(0.0, 1.0, 1 << 16)
+    return np.where(level <= 0.5, level**2 / 3, (np.exp((level - c) / a) + b) / 12).astype(np.float32)
+
+
+@cache
+def _pq_light() -> Float[np.ndarray, "65536"]:
+    """BT.2100 table 4: cd/m² of every signal."""
     m1, m2, c1, c2, c3 = 0.1593017578125, 78.84375, 0.8359375, 18.8515625, 18.6875
     root = np.linspace(0.0, 1.0, 1 << 16) ** (1 / m2)
     nits = 10000.0 * (np.maximum(root - c1, 0.0) / (c2 - c3 * root)) ** (1 / m1)
-    return nits.astype(np.float32)[signal]
+    return nits.astype(np.float32)
 
 
 _NITS: dict[int, Callable[[np.ndarray], np.ndarray]] = {HLG: _hlg_nits, PQ: _pq_nits}

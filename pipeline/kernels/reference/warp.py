@@ -68,10 +68,9 @@ def newton(
     slot_start: Int[Tensor, "k1"],
     lattice: Lattice,
 ) -> Float[Tensor, "s 3"]:
-    """Same as `pipeline.kernels.warp.newton`.
+    """Same as `pipeline.kernels.warp.newton`: J^-1 (p - A x) is added to x, with J and x of the start.
 
-    To the step, which has no gradient, -J^-1 (A x - A x detached) is added, with J and x of the start: zero in value,
-    with the implicit gradient.
+    Of that only A has a gradient, so the step's own gradient is the implicit one.
     """
     frames, start_m, posed_m = blended.shape[1], start_m.detach(), posed_m.detach()
     slot = torch.repeat_interleave(torch.arange(frames, device=slot_start.device), slot_start.diff())
@@ -86,9 +85,7 @@ def newton(
     determinant, adjugate = _adjugate(jacobian)
     sound = (weight.sum(1) > 1 - 1e-4) & (determinant.abs() > 1e-3)
     inverse = adjugate * (sound / torch.where(sound, determinant, 1.0))[:, None, None]
-    image_m = _carry(matrix, start_m)
-    still_m = image_m.detach()
-    return start_m + (inverse * (posed_m - still_m - (image_m - still_m))[:, None]).sum(-1)
+    return start_m + (inverse * (posed_m - _carry(matrix, start_m))[:, None]).sum(-1)
 
 
 def _jacobian(
@@ -109,7 +106,7 @@ def _jacobian(
 
 
 def _adjugate(matrix: Float[Tensor, "s 3 3"]) -> tuple[Float[Tensor, "s"], Float[Tensor, "s 3 3"]]:
-    """Determinant and adjugate: their quotient is the inverse. A batched solver would take a thousand times as long."""
+    """Determinant and adjugate: their quotient is the inverse, with no solver for each sample."""
     a, b, c = matrix.unbind(1)
     columns = torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)
     return (a * columns[0]).sum(-1), torch.stack(columns, -1)
