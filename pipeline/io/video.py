@@ -126,7 +126,8 @@ def _open_video(path: Path) -> Source:
                 raise UserError(f"{path} has no picture track; give a video file or a folder of images")
             stream = container.streams.video[0]
             fps = float(stream.average_rate or stream.guessed_rate or IMAGE_FOLDER_FPS)
-            n_frames = sum(packet.size > 0 for packet in container.demux(stream))
+            # An edit list (a clip that was cut without encoding it anew) has pictures that are decoded but never shown.
+            n_frames = sum(packet.size > 0 and not packet.is_discard for packet in container.demux(stream))
     except av.FFmpegError as error:
         raise UserError(
             f"{path} is no video that can be read ({error.strerror}); give an .mp4, .mov or .webm file"

@@ -129,6 +129,16 @@ def test_hdr_is_shown_as_srgb(tmp_path):
     assert shown[1] == pytest.approx([101, 101, 101], abs=3)
 
 
+def test_frames_that_an_edit_list_hides_are_not_counted(tmp_path):
+    """As a phone or `ffmpeg -ss` cuts a clip: the pictures back to the last key frame are in the file, before zero."""
+    write_video(tmp_path / "a.mp4", [ramp(20 * k) for k in range(12)], list(range(-4, 8)))
+    source = video.open_source(tmp_path / "a.mp4")
+    frames = list(video.read_frames(source, everything, 1000))
+    assert source.n_frames == len(frames) == 8
+    assert [round(frame.rgb.mean() / 20) for frame in frames] == list(range(4, 12))
+    assert [frame.time_s for frame in frames] == pytest.approx([k / 25 for k in range(8)])
+
+
 def test_rotation_in_the_container_is_honoured(tmp_path):
     """The track header's matrix (0 1; -1 0) sends the picture's right side to the bottom: a clockwise quarter turn."""
     picture = ramp(30)
