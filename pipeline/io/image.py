@@ -1,14 +1,17 @@
 """Images on disk and in memory: uint8, RGB order, row 0 at the top.
 
-OpenCV does the decoding (it honours the EXIF orientation); this is the only file that knows its BGR order.
-PNG bytes depend only on the pixels, so the same pixels give the same file digest.
+OpenCV does the decoding (it honours the EXIF orientation); this is the only file that knows its BGR order. It ignores
+colour profiles, which Pillow reads and LittleCMS applies. PNG bytes depend only on the pixels, so the same pixels give
+the same file digest.
 """
 
+from io import BytesIO
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
+from PIL import Image, ImageCms, UnidentifiedImageError
 
 from pipeline.core.errors import UserError
 
@@ -17,23 +20,30 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".p
 # Level 1 writes a 630 x 630 frame in 8 ms, level 6 in 60 ms for 7 % fewer bytes.
 _PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1)
 _JPEG_OPTIONS = (cv2.IMWRITE_JPEG_QUALITY, 92)
+_SRGB = ImageCms.createProfile("sRGB")
+# What a colour profile is for, and the kind of picture that Pillow then wants.
+_PROFILED = {"RGB": "RGB", "GRAY": "L"}
 
 
 def read_rgb(path: Path) -> UInt8[np.ndarray, "h w 3"]:
-    """Colour image with the EXIF orientation applied; an alpha channel is dropped, 16 bits become 8.
+    """Colour image in sRGB with the EXIF orientation applied; an alpha channel is dropped, 16 bits become 8.
 
-    Raises UserError when the file is missing or is no image.
+    Colours of another space (phones write Display P3, cameras Adobe RGB) are converted if the file has their profile.
+    Raises UserError when the file is missing, is no image, or its profile cannot be used.
     """
-    return cv2.cvtColor(_read(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+    return _in_srgb(cv2.cvtColor(_read(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), path)
 
 
 def read_gray(path: Path) -> UInt8[np.ndarray, "h w"]:
-    """One-channel image; colours become luma. Raises UserError as `read_rgb`."""
+    """One-channel image, as masks are; colours become luma, a profile is ignored. Raises UserError as `read_rgb`."""
     return _read(path, cv2.IMREAD_GRAYSCALE)
 
 
 def read_rgba(path: Path) -> UInt8[np.ndarray, "h w 4"]:
-    """Colour image with straight alpha (255 where the file has none). Raises UserError as `read_rgb`."""
+    """Image as it is stored (no EXIF, no profile) with straight alpha, 255 where the file has none.
+
+    Raises UserError as `read_rgb`.
+    """
     pixels = _read(path, cv2.IMREAD_UNCHANGED)
     if pixels.dtype != np.uint8:
         pixels = cv2.convertScaleAbs(pixels, alpha=255.0 / np.iinfo(pixels.dtype).max)
@@ -83,6 +93,22 @@ def _read(path: Path, flags: int) -> np.ndarray:
     if pixels is None:
         raise UserError(f"image {path} cannot be read (damaged, or no image); replace or remove it")
     return pixels
+
+
+def _in_srgb(rgb: UInt8[np.ndarray, "h w 3"], path: Path) -> UInt8[np.ndarray, "h w 3"]:
+    try:
+        with Image.open(path) as header:
+            profile = header.info.get("icc_profile")
+    except (UnidentifiedImageError, Image.DecompressionBombError):
+        raise UserError(f"image {path} is of a kind or size that is not read; save it as a PNG or JPEG") from None
+    if not profile:
+        return rgb
+    try:
+        space = ImageCms.getOpenProfile(BytesIO(profile)).profile.xcolor_space.strip()
+        pixels = Image.fromarray(rgb).convert(_PROFILED.get(space, "RGB"))
+        return np.array(ImageCms.profileToProfile(pixels, BytesIO(profile), _SRGB, outputMode="RGB"))
+    except ImageCms.PyCMSError as error:
+        raise UserError(f"the colour profile of image {path} cannot be used ({error}); save it again as sRGB") from None
 
 
 def _write(path: Path, pixels: np.ndarray) -> None:
