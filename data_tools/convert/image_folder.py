@@ -5,17 +5,14 @@
                                                  person bright
 
 `camera.json`, `split.json` and `landmarks.npz` in the form of `pipeline.io.supplied` are carried over. A folder that
-has `masks/` already needs no conversion.
+has `masks/`, or pictures with alpha, needs no conversion.
 """
 
 from pathlib import Path
 
-import numpy as np
-from jaxtyping import UInt8
-
 from data_tools.convert.recording import Recording, mask_folder
 from pipeline.core.errors import UserError
-from pipeline.io.image import read_rgba
+from pipeline.io.image import read_alpha
 from pipeline.io.video import open_source
 
 _MASK_FOLDERS = ("masks", "mask", "mattes", "matte", "alpha", "segmentations", "segmentation")
@@ -25,7 +22,7 @@ _READY = ("camera.json", "split.json", "landmarks.npz")
 def is_image_folder(folder: Path) -> bool:
     """True for a folder of pictures with one of the mask folders, or whose first picture is partly transparent."""
     source = open_source(folder)
-    return bool(source.files) and (_find_masks(folder) is not None or bool(_alpha(source.files[0]).min() < 255))
+    return bool(source.files) and (_find_masks(folder) is not None or bool(read_alpha(source.files[0]).min() < 255))
 
 
 def read_image_folder(folder: Path) -> Recording:
@@ -41,14 +38,10 @@ def read_image_folder(folder: Path) -> Recording:
         )
     return Recording(
         source=source,
-        read_mask=mask_folder(masks, source) if masks else lambda index: _alpha(source.files[index]),
+        read_mask=mask_folder(masks, source) if masks else lambda index: read_alpha(source.files[index]),
         ready=tuple(folder / name for name in _READY if (folder / name).is_file()),
     )
 
 
 def _find_masks(folder: Path) -> Path | None:
     return next((folder / name for name in _MASK_FOLDERS if (folder / name).is_dir()), None)
-
-
-def _alpha(path: Path) -> UInt8[np.ndarray, "h w"]:
-    return np.ascontiguousarray(read_rgba(path)[:, :, 3])

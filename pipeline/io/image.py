@@ -54,6 +54,11 @@ def read_rgba(path: Path) -> UInt8[np.ndarray, "h w 4"]:
     return cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGBA)
 
 
+def read_alpha(path: Path) -> UInt8[np.ndarray, "h w"]:
+    """Opacity of an image as it is stored, 255 where the file has none. Raises UserError as `read_rgb`."""
+    return np.ascontiguousarray(read_rgba(path)[:, :, 3])
+
+
 def write_rgb(path: Path, pixels: UInt8[np.ndarray, "h w 3"]) -> None:
     """PNG or JPEG, by suffix. Raises UserError when the file cannot be written (a full disk, a missing folder)."""
     _write(path, cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))

@@ -2,6 +2,7 @@
 
     masks/        one image a frame, named as the images are or else in natural order; 0 to 255, or 0 and 1
     masks.npz     array `masks` (n, h, w);  masks.hdf5: the same, as PeopleSnapshot ships it
+    (none)        the images' own alpha channel, where the first image is partly transparent
     landmarks.npz MediaPipe's 33 points in its order: `landmarks_px` (n, 33, 2) in pixels of the original frames, nan
                   where unknown, optionally `landmarks_visibility` (n, 33), 0 to 1, and `landmarks_world_m` (n, 33, 3),
                   metres about the hips' centre in camera axes, which else the detector gives
@@ -29,7 +30,7 @@ from jaxtyping import Float, Int, UInt8
 from pipeline.avatar.selection import HELDOUT, SPLIT_PERIOD, TRAIN, VALIDATION, VALIDATION_PHASE
 from pipeline.core.errors import UserError
 from pipeline.geometry.camera import UPRIGHT_WORLD_TO_CAMERA, Camera
-from pipeline.io.image import IMAGE_SUFFIXES, read_gray
+from pipeline.io.image import IMAGE_SUFFIXES, read_alpha, read_gray
 from pipeline.io.npz import load_npz
 from pipeline.io.smpl_poses import SMPL_POSES_NPZ, SmplPoses, is_rigid, load_smpl_poses
 from pipeline.io.video import Source, natural_key, picture_size_px
@@ -150,6 +151,8 @@ def _find_masks(path: Path, source: Source) -> tuple[Callable[[int], np.ndarray]
         return _mask_array(arrays["masks"], path / "masks.npz", source), "masks.npz"
     if (path / "masks.hdf5").is_file():
         return _mask_array(_read_hdf5(path / "masks.hdf5"), path / "masks.hdf5", source), "masks.hdf5"
+    if source.files and read_alpha(source.files[0]).min() < 255:
+        return (lambda index: read_alpha(source.files[index])), "the images' alpha channel"
     return None, ""
 
 

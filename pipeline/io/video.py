@@ -23,6 +23,7 @@ from pipeline.io.image import IMAGE_SUFFIXES, read_rgb
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".3gp", ".wmv", ".gif")
 IMAGE_FOLDER_FPS = 30.0
+_PHONE_SUFFIXES = (".heic", ".heif", ".avif")
 _IMAGE_FOLDER_NAMES = ("images", "frames", "image", "rgb", "color")
 # Bicubic, with chroma brought to full resolution before the colour matrix: swscale's default repeats each chroma
 # sample over 2 x 2 pixels, which leaves visible blocks along the person's outline (bits of libswscale's SWS_* flags).
@@ -76,6 +77,8 @@ def open_source(path: Path, image_fps: float = IMAGE_FOLDER_FPS) -> Source:
             return Source(folder, files, len(files), image_fps)
     if not any(path.iterdir()):
         raise UserError(f"folder {path} is empty; put a video or images of the person into it")
+    if any(file.suffix.lower() in _PHONE_SUFFIXES for file in path.iterdir()):
+        raise UserError(f"folder {path} holds HEIC images, which are not read; save them as JPEG, or film a video")
     raise UserError(f"folder {path} holds neither a video nor images; put one of them into it")
 
 

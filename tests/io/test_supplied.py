@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pipeline.core.errors import UserError
-from pipeline.io.image import write_gray, write_rgb
+from pipeline.io.image import write_gray, write_rgb, write_rgba
 from pipeline.io.npz import save_npz
 from pipeline.io.smpl_poses import save_smpl_poses
 from pipeline.io.supplied import SuppliedCamera, find_supplied
@@ -69,6 +69,16 @@ def test_masks_numbered_from_another_start_are_refused(tmp_path, source):
     write_masks(tmp_path, x2=20, x10=30, x11=40)
     with pytest.raises(UserError, match="named as the images are, but none for x1;"):
         find_supplied(tmp_path, source)
+
+
+def test_transparent_images_are_their_own_masks_unless_others_lie_beside(tmp_path):
+    (tmp_path / "images").mkdir()
+    for k, opacity in enumerate((0, 128, 255)):
+        write_rgba(tmp_path / "images" / f"{k}.png", np.full((4, 6, 4), (90, 80, 70, opacity), np.uint8))
+    supplied = find_supplied(tmp_path, open_source(tmp_path))
+    assert (levels_of(supplied), supplied.mask_source) == ([0, 128, 255], "the images' alpha channel")
+    write_masks(tmp_path, m1=10, m2=20, m3=30)
+    assert levels_of(find_supplied(tmp_path, open_source(tmp_path))) == [10, 20, 30]
 
 
 def test_a_folder_of_zeros_and_ones_is_brought_to_255(tmp_path, source):

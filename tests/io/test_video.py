@@ -230,6 +230,7 @@ def test_video_that_breaks_off_goes_on_with_a_warning(tmp_path):
         (lambda path: None, "does not exist"),
         (lambda path: path.mkdir(), "is empty"),
         (lambda path: (path.mkdir(), (path / "a.txt").write_text("x")), "neither a video nor images"),
+        (lambda path: (path.mkdir(), (path / "IMG_1.HEIC").touch()), "HEIC images, .* save them as JPEG"),
         (lambda path: path.write_text("hello"), "is no video"),
         (lambda path: path.write_bytes(b""), "is no video"),
         (lambda path: (path.mkdir(), (path / "a.mp4").touch(), (path / "b.mp4").touch()), "2 videos"),
