@@ -23,7 +23,8 @@ from data_tools.shadow import seen_from_outside
 from data_tools.truth import load_truth, true_mask
 from pipeline.avatar.body import Body, Motion, canonical_to_world
 from pipeline.avatar.selection import HELDOUT, TRAIN
-from pipeline.core.progress import track
+from pipeline.core.errors import UserError
+from pipeline.core.progress import track, warn
 from pipeline.geometry.camera import Camera, world_to_camera_points
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.rotation import quaternion_to_matrix
@@ -34,7 +35,7 @@ from pipeline.io.avatar import FinishedRun, load_finished_run
 from pipeline.io.image import read_gray, read_rgba, to_float, to_uint8
 from pipeline.io.npz import load_camera, load_motion
 from pipeline.metrics.alignment import Similarity, align_surfaces
-from pipeline.metrics.images import frame_scores, mean_scores, missing_blur_px
+from pipeline.metrics.images import frame_scores, mean_scores, missing_blur_px, unscorable
 from pipeline.metrics.surfaces import sample_surface, surface_scores
 from stages.report import outline_spread_px, scored_positions
 
@@ -188,7 +189,11 @@ def compare_held_out(pair: Comparison) -> dict[str, dict[str, float]]:
     Returns:
         ceiling: of `ceiling_pictures`, outlines as soft as those of the report's mesh. field_true_mask,
         mesh_true_mask, ceiling_true_mask: targets cut out of the video by the true mask, where the report takes the
-        mask that the frames stage found; meshes have sharp outlines, as true masks have.
+        mask that the frames stage found; meshes have sharp outlines, as true masks have. A frame whose true mask
+        cannot be scored is left out there, with a warning.
+
+    Raises:
+        UserError: there is no other frame.
     """
     run = pair.run
     rows: defaultdict[str, list[dict[str, float]]] = defaultdict(list)
@@ -198,9 +203,15 @@ def compare_held_out(pair: Comparison) -> dict[str, dict[str, float]]:
         image, mask = (to_uint8(part(position)) for part in (run.capture.image, run.capture.mask))
         rows["ceiling"].append(frame_scores(soften_outline(perfect, blur_px), image, mask))
         pose, cut = run.refined[position], _true_mask(pair, position)
+        if (reason := unscorable(cut)) is not None:
+            frame = run.capture.frame_index[position]
+            warn(f"held-out frame {frame} is not compared within the true mask of {pair.folder}: {reason}")
+            continue
         mesh = run.avatar.render(run.avatar.posed(pose), run.camera, SAMPLES)
         for name, drawn in {"field": run.draw_field(pose), "mesh": mesh, "ceiling": perfect}.items():
             rows[f"{name}_true_mask"].append(frame_scores(drawn, image, cut))
+    if "mesh_true_mask" not in rows:
+        raise UserError(f"no held-out frame can be compared within the true masks of {pair.folder}; is it its truth?")
     return {name: mean_scores(scores) for name, scores in rows.items()}
 
 

@@ -25,9 +25,12 @@ from data_tools.compare_avatar import (
     compare_texture,
     taken_over,
 )
+from data_tools.truth import true_mask
 from pipeline.avatar.body import Body, Motion
 from pipeline.avatar.selection import HELDOUT, TRAIN
 from pipeline.avatar.textured import straight_rgba
+from pipeline.core.errors import UserError
+from pipeline.core.progress import take_warnings
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.textured import soften_outline
 from pipeline.io.image import write_rgba
@@ -249,6 +252,25 @@ def test_what_a_mask_leaves_out_costs_nothing_until_the_true_one_is_asked(perfec
     assert scores["ceiling"]["mask_iou"] == pytest.approx(kept, abs=0.01)  # the found mask blames the truth
     assert scores["ceiling_true_mask"]["mask_iou"] > 0.99
     assert scores["mesh_true_mask"]["mask_iou"] > 0.97
+
+
+def test_a_frame_without_a_true_person_is_left_out_with_a_warning(
+    perfect: Comparison, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of two held-out frames the first is empty in truth: the second alone is scored, until it is empty as well."""
+    split = perfect.run.capture.split.copy()
+    split[:2] = HELDOUT
+    two = replace(perfect, run=replace(perfect.run, capture=replace(perfect.run.capture, split=split)))
+    nothing = np.zeros((perfect.run.camera.height, perfect.run.camera.width, 4), np.float32)
+    monkeypatch.setattr(compare_avatar, "ceiling_pictures", lambda pair, positions: [nothing] * len(positions))
+    monkeypatch.setattr(compare_avatar, "true_mask", lambda out, frame: (frame > 0) * true_mask(out, frame))
+    take_warnings()
+    assert compare_held_out(two)["mesh_true_mask"]["mask_iou"] > 0.98
+    (warning,) = take_warnings()
+    assert "held-out frame 0 is not compared" in warning
+    monkeypatch.setattr(compare_avatar, "true_mask", lambda out, frame: 0 * true_mask(out, frame))
+    with pytest.raises(UserError, match="no held-out frame can be compared"):
+        compare_held_out(two)
 
 
 def test_true_masks_are_brought_to_the_size_of_the_frames(perfect: Comparison, tmp_path: Path) -> None:
