@@ -193,7 +193,9 @@ def _is_smooth(canonical, corners, limit):
             return False
     for a in range(8):
         for bit in range(3):
-            b = a ^ (1 << bit)
+            b = a | (1 << bit)
+            if a == b:
+                continue
             squared = _ZERO
             for axis in range(3):
                 part = canonical[corners[a], axis] - canonical[corners[b], axis]
@@ -232,9 +234,24 @@ def _keep_near(maps, distances, found):
 
 
 @njit(**OPTIONS)
+def _is_known(maps, found, px, py, pz, x, y, z, limit):
+    """True if one of the first `found` inverses puts the posed point p within `limit` metres of x."""
+    for other in range(found):
+        ox, oy, oz = apply_affine(maps[other], px, py, pz)
+        squared = (ox - x) * (ox - x) + (oy - y) * (oy - y) + (oz - z) * (oz - z)
+        if squared <= limit * limit:
+            return True
+    return False
+
+
+@njit(**OPTIONS)
 def _roots_in_cell(canonical, corners, centre, origin, cell, row_of_node, blended, distance, maps):
-    """Distinct inverses at a cell's centre, started from its corners, as affine maps (4, 12); returns their number."""
+    """Distinct inverses at a cell's centre, started from its corners, as affine maps (4, 12); returns their number.
+
+    A corner that an inverse found before explains already would lead there again, and starts none.
+    """
     found = 0
+    half, same = np.float32(0.5) * cell, np.float32(0.1) * cell
     distances = np.empty(4, np.float32)
     inverse_jacobian = np.empty(9, np.float32)
     for corner in range(8):
@@ -243,13 +260,14 @@ def _roots_in_cell(canonical, corners, centre, origin, cell, row_of_node, blende
         if found == maps.shape[0] or np.isnan(x):
             continue
         px, py, pz = centre[0], centre[1], centre[2]
+        right, up, away = corner & 1, (corner >> 1) & 1, corner >> 2
+        cx, cy, cz = px + (half if right else -half), py + (half if up else -half), pz + (half if away else -half)
+        if _is_known(maps, found, cx, cy, cz, x, y, z, same):
+            continue
         converged, x, y, z, _ = _newton(
             px, py, pz, x, y, z, 5, np.float32(2e-4), origin, cell, row_of_node, blended, inverse_jacobian
         )
-        for other in range(found):
-            ox, oy, oz = apply_affine(maps[other], px, py, pz)
-            squared = (ox - x) * (ox - x) + (oy - y) * (oy - y) + (oz - z) * (oz - z)
-            converged &= squared > np.float32(0.01) * cell * cell
+        converged &= not _is_known(maps, found, px, py, pz, x, y, z, same)
         if not converged:
             continue
         for axis in range(3):
