@@ -10,6 +10,7 @@ from torch import Tensor
 from data_tools.shadow import ShadowMap, cast_shadows
 from data_tools.subject import Subject
 from pipeline.geometry.camera import Camera, project
+from pipeline.geometry.colour import linear_light, srgb_of_light
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.geometry.textured import sample_texture
 from pipeline.kernels.raster import rasterize
@@ -131,15 +132,4 @@ def shade(
     irradiance = light.ambient + light.sky * normal[:, 1] + light.key * wrapped
     half = torch.nn.functional.normalize(key_from + to_camera, dim=1)
     gloss = light.shine * lit * (normal * half).sum(1).clamp_min(0.0) ** SHININESS
-    return _to_srgb(_to_linear(albedo) * irradiance[:, None] + gloss[:, None])
-
-
-def _to_linear(srgb: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """IEC 61966-2-1."""
-    return torch.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-
-
-def _to_srgb(linear: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """IEC 61966-2-1, clipped to [0, 1]; inverse of `_to_linear`."""
-    clipped = linear.clamp(0.0, 1.0)
-    return torch.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
+    return srgb_of_light((linear_light(albedo) * irradiance[:, None] + gloss[:, None]).clamp(0.0, 1.0))

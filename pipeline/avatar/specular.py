@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 from pipeline.avatar.bake import BakeConfig, Surface, observe
 from pipeline.avatar.bake_views import View, footprint_m, pixel_trust, seen_depth, vertex_normals
 from pipeline.geometry.atlas import Texels
-from pipeline.metrics.flip import linear_light
+from pipeline.geometry.colour import linear_light
 
 ALTERNATIONS = 8
 RIDGE = 1e-3

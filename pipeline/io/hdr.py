@@ -10,6 +10,8 @@ from functools import cache
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
+from pipeline.geometry.colour import srgb_of_light
+
 PQ, HLG = 16, 18
 """Transfer characteristics as containers number them (ITU-T H.273, table 3)."""
 BT_2020 = 9
@@ -29,9 +31,7 @@ def to_srgb(signal: UInt16[np.ndarray, "h w 3"], transfer: int, primaries: int) 
     linear = nits / WHITE_NITS
     if primaries == BT_2020:
         linear = linear @ TO_BT_709.T
-    linear = np.clip(linear, 0.0, 1.0)
-    coded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** np.float32(1 / 2.4) - 0.055)
-    return np.rint(255.0 * coded).astype(np.uint8)
+    return np.rint(255.0 * srgb_of_light(np.clip(linear, 0.0, 1.0))).astype(np.uint8)
 
 
 def _hlg_nits(signal: UInt16[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:

@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from pipeline.geometry.colour import linear_light
+
 PIXELS_PER_DEGREE = 3840.0 * math.pi / 180.0
 QC, QF, PC, PT = 0.7, 0.5, 0.4, 0.95
 FEATURE_WIDTH_DEG = 0.082
@@ -45,11 +47,6 @@ def flip_map(
         differences.append(np.abs(strengths[0] - strengths[1]))
     feature = (np.maximum(*differences) / math.sqrt(2.0)) ** QF
     return colour ** (1.0 - np.minimum(feature, 1.0))
-
-
-def linear_light(srgb: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-    """Light that sRGB colours (white = 1) stand for (IEC 61966-2-1)."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def _opponent(linear: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:

@@ -1,0 +1,23 @@
+"""The transfer curve of sRGB (IEC 61966-2-1), for arrays and tensors of any shape."""
+
+from typing import TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+_Colours = TypeVar("_Colours", np.ndarray, Tensor)
+
+
+def linear_light(srgb: _Colours) -> _Colours:
+    """Light that sRGB colours stand for; white is 1 in both. Colours may rise above 1."""
+    return _where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def srgb_of_light(linear: _Colours) -> _Colours:
+    """sRGB colours of linear light, which must not be negative: the inverse of `linear_light`."""
+    return _where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def _where(condition: _Colours, then: _Colours, other: _Colours) -> _Colours:
+    return torch.where(condition, then, other) if isinstance(then, Tensor) else np.where(condition, then, other)
