@@ -58,7 +58,7 @@ def start_learning(
     bounds_m = field_bounds_m(body, config.margin_m)
     skin = build_skin_grid(body, skin_margin_m(body, bounds_m))
     pixel_m = body_depth_m(motion, camera) / camera.fy
-    distance_m = cell_distances_m(body, bounds_m, 2 * config.margin_m)
+    distance_m = cell_distances_m(body, bounds_m, config.margin_m)
     near = distance_m < config.margin_m
     frequency = np.zeros(distance_m.shape, dtype=np.float32)
     rows = spread(len(pictures), SUPPORT_FRAMES)

@@ -3,22 +3,23 @@
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
+from scipy.ndimage import binary_fill_holes
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pipeline.avatar.body import Body
 from pipeline.avatar.occupancy import RESOLUTION, cell_centres
 from pipeline.geometry.camera import Camera, project
+from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.geometry.surface import signed_distance_m
-from pipeline.kernels.reference.warp import skin_points
 from pipeline.kernels.warp import SkinGrid
 
 UNSEEN_REACH_M = 0.08
 """Beyond this distance from the body nothing is expected unseen; at half of it, as likely as not."""
 UNSEEN_WEIGHT = 8.0
 """Frames that the expectation counts for where no frame shows a point."""
-DEEPEST_M = 0.3
-"""No point inside a body is farther from its surface."""
+VERTEX_REACH_M = 0.06
+"""No point of a body's surface is farther from the nearest vertex."""
 
 
 def field_bounds_m(body: Body, margin_m: float) -> Float[np.ndarray, "2 3"]:
@@ -28,12 +29,14 @@ def field_bounds_m(body: Body, margin_m: float) -> Float[np.ndarray, "2 3"]:
 
 def cell_distances_m(body: Body, bounds_m: Float[np.ndarray, "2 3"], reach_m: float) -> Float[np.ndarray, "gx gy gz"]:
     """Signed distance of each cell's centre to the canonical body, negative inside; at most `reach_m`."""
-    centres = cell_centres(bounds_m)
-    nearest_m, _ = cKDTree(body.vertices).query(centres, distance_upper_bound=max(reach_m, DEEPEST_M))
-    near = np.isfinite(nearest_m)
-    distance = np.full(len(centres), reach_m, dtype=np.float32)
-    distance[near] = np.minimum(signed_distance_m(centres[near], body.mesh()), reach_m)
-    return distance.reshape(RESOLUTION, RESOLUTION, RESOLUTION)
+    centres, threads = cell_centres(bounds_m), torch.get_num_threads()
+    bound_m = reach_m + VERTEX_REACH_M
+    nearest_m, _ = cKDTree(body.vertices).query(centres, distance_upper_bound=bound_m, workers=threads)
+    # What lies deeper inside the body than that is enclosed by what does not.
+    asked = binary_fill_holes(np.isfinite(nearest_m).reshape(RESOLUTION, RESOLUTION, RESOLUTION))
+    distance = np.full(asked.shape, reach_m, dtype=np.float32)
+    distance[asked] = np.minimum(signed_distance_m(centres[asked.reshape(-1)], body.mesh()), reach_m)
+    return distance
 
 
 def mask_frequency(
@@ -52,9 +55,10 @@ def mask_frequency(
     masks: one a frame, dilated by as much as a point stands for.
     """
     points = torch.from_numpy(centres_m)
+    weights = skin.weights_at(points)
     hits, seen = np.zeros(len(centres_m)), np.zeros(len(centres_m))
     for row, mask in enumerate(masks):
-        posed = skin_points(points, skin.blend(canonical_to_world[row : row + 1])[:, 0], skin.lattice)
+        posed = linear_blend_skinning(points, weights, canonical_to_world[row : row + 1])[0]
         pixels, depth_m = project(posed, camera)
         column, line = (pixels[:, axis].floor().long().numpy() for axis in range(2))
         inside = (depth_m.numpy() > 0) & (column >= 0) & (line >= 0) & (column < mask.shape[1]) & (line < mask.shape[0])

@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -35,7 +36,7 @@ def build_skin_grid(body: Body, margin_m: float, cell_m: float = 0.03) -> SkinGr
     index = np.stack(np.meshgrid(*(np.arange(n) for n in size), indexing="ij"), axis=-1).reshape(-1, 3)
     nodes = (origin + index * np.float32(cell_m)).astype(np.float32)
     tree = cKDTree(body.vertices)
-    near = np.isfinite(tree.query(nodes, distance_upper_bound=reach + 0.02)[0])
+    near = np.isfinite(tree.query(nodes, distance_upper_bound=reach + 0.02, workers=torch.get_num_threads())[0])
     distance = np.full(len(nodes), np.inf, dtype=np.float32)
     distance[near] = signed_distance_m(nodes[near], body.mesh())
     kept = distance < reach
@@ -52,13 +53,13 @@ def skin_margin_m(body: Body, bounds_m: Float[np.ndarray, "2 3"]) -> float:
 
 
 def _smooth_weights(nodes: np.ndarray, tree: cKDTree, skin_weights: np.ndarray, cell_m: float) -> np.ndarray:
-    distance, neighbour = tree.query(nodes, k=NEIGHBOURS)
+    distance, neighbour = tree.query(nodes, k=NEIGHBOURS, workers=torch.get_num_threads())
     width = 0.5 * cell_m + 0.35 * distance[:, :1]
     share = np.exp(-(distance**2 - distance[:, :1] ** 2) / (2 * width**2))
     share = (share / share.sum(1, keepdims=True)).astype(np.float32)
-    weights = np.zeros((len(nodes), skin_weights.shape[1]), dtype=np.float32)
-    for k in range(NEIGHBOURS):
-        weights += share[:, k : k + 1] * skin_weights[neighbour[:, k]]
+    row_start = np.arange(len(nodes) + 1) * NEIGHBOURS
+    smoothing = csr_array((share.ravel(), neighbour.ravel(), row_start), shape=(len(nodes), len(skin_weights)))
+    weights: np.ndarray = smoothing @ skin_weights
     return weights
 
 

@@ -1,8 +1,11 @@
 import numpy as np
 import torch
 
-from pipeline.avatar.support import mask_frequency, starting_shell
+from pipeline.avatar.body import load_anny
+from pipeline.avatar.occupancy import cell_centres
+from pipeline.avatar.support import cell_distances_m, field_bounds_m, mask_frequency, starting_shell
 from pipeline.geometry.camera import Camera
+from pipeline.geometry.surface import signed_distance_m
 from tests.kernels.bar import bar_skin
 
 UPRIGHT = torch.eye(4).expand(1, 2, 4, 4)
@@ -40,6 +43,18 @@ def test_few_sights_of_a_far_point_do_not_outweigh_the_expectation():
     assert frequency_of([[0, 0, 0]], [0.1], masks + blank)[0] == 0.5
     narrow = [np.ones((40, 40), dtype=np.uint8)] * 4
     assert frequency_of([[0.42, 0, 0]], [0.1], narrow)[0] < 0.1
+
+
+def test_every_cell_has_its_distance_to_the_body_up_to_the_reach():
+    anny = load_anny()
+    body = anny.body(anny.shape_defaults)
+    bounds_m, reach_m = field_bounds_m(body, 0.1), 0.02
+    some = np.random.default_rng(0).permutation(64**3)[:20_000]
+    truth_m = signed_distance_m(cell_centres(bounds_m)[some], body.mesh())
+    # The deepest lie farther from all vertices than cells outside that are asked.
+    assert truth_m.min() < -(reach_m + 0.06)
+    found_m = cell_distances_m(body, bounds_m, reach_m).reshape(-1)[some]
+    np.testing.assert_allclose(found_m, np.minimum(truth_m, reach_m), atol=1e-6)
 
 
 def test_the_shell_holds_the_body_and_what_masks_support():
