@@ -4,6 +4,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pipeline.kernels.packing import owner_of_each
+
 
 def composite(
     density_per_m: Float[Tensor, "s"],
@@ -13,7 +15,7 @@ def composite(
 ) -> tuple[Float[Tensor, "n c"], Float[Tensor, "n"], Float[Tensor, "s"]]:
     """Same as `pipeline.kernels.composite.composite`."""
     counts = ray_start.diff()
-    ray = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
+    ray = owner_of_each(counts)
     depth = density_per_m * step_m
     # One sum runs over all rays: in float32 the first rays' depths would swallow the last ones'.
     before = depth.double().cumsum(0) - depth

@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pipeline.kernels.packing import owner_of_each
+
 FRAGMENTS_PER_CHUNK = 1 << 22
 
 
@@ -56,7 +58,7 @@ def _fragments(
 ) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"], Float[Tensor, "n"]]:
     """Covered (face, pixel, 1/z as float32) triples of a chunk of faces."""
     counts = extent.prod(1)
-    face = torch.repeat_interleave(torch.arange(len(faces), device=faces.device), counts)
+    face = owner_of_each(counts)
     order = torch.arange(len(face), device=faces.device) - (counts.cumsum(0) - counts)[face]
     columns = extent[face, 0]
     x, y = first[face, 0] + order % columns, first[face, 1] + order // columns
@@ -136,7 +138,7 @@ def _crossings(
     first = (across.amin(1) - 0.5).clamp(0, lines).ceil().long()
     last = (across.amax(1) - 0.5).clamp(0, lines).ceil().long()
     counts = last - first
-    edge = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
+    edge = owner_of_each(counts)
     line = first[edge] + torch.arange(len(edge), device=edge.device) - (counts.cumsum(0) - counts)[edge]
     start, end = across[edge].unbind(1)
     return edge, line, (line + 0.5 - start) / (end - start)

@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from pipeline.kernels.packing import owner_of_each
+
 Find = Callable[
     [Float[Tensor, "p 3"], Int[Tensor, "p"]],
     tuple[Float[Tensor, "p c 3"], Bool[Tensor, "p c"]],
@@ -31,7 +33,7 @@ def march_with(
     """
     near, far = _near_far(origins_m, directions, boxes_m[frame])
     count = ((far - near) / step_m - jitter).ceil().clamp(min=0).long()
-    ray = torch.repeat_interleave(torch.arange(len(count), device=count.device), count)
+    ray = owner_of_each(count)
     stop = torch.arange(len(ray), device=count.device) - (count.cumsum(0) - count)[ray]
     distance = near[ray] + (stop + jitter[ray]) * step_m
     points, exists = find(origins_m[ray] + distance[:, None] * directions[ray], frame[ray])

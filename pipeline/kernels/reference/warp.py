@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pipeline.kernels.packing import owner_of_each
 from pipeline.kernels.reference.corners import corner_bits, corners_of
 
 Lattice = tuple[Float[Tensor, "3"], float, Int[Tensor, "gx gy gz"]]
@@ -73,7 +74,7 @@ def newton(
     Of that only A has a gradient, so the step's own gradient is the implicit one.
     """
     frames, start_m, posed_m = blended.shape[1], start_m.detach(), posed_m.detach()
-    slot = torch.repeat_interleave(torch.arange(frames, device=slot_start.device), slot_start.diff())
+    slot = owner_of_each(slot_start.diff())
     node, shares = _corners(start_m, lattice)
     exists = node >= 0
     # The matrices of all frames are rows of one table, those of a node one behind the other.
