@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.avatar.body import SCALE
+from pipeline.avatar.fit_limits import JointLimits, hinge_axes, joint_limits, kind_of
 from pipeline.avatar.fit_model import ACTIVE_JOINTS, FitModel
 from pipeline.geometry.rotation import matrix_to_quaternion, quaternion_to_axis_angle
 
@@ -29,9 +30,6 @@ MOTION_LAG = 2
 
 MOTION_SLACK = 2.0
 """People do not move evenly: more is allowed than was seen."""
-
-LIMIT_RAD = 0.06
-"""Softness of a joint limit: going this far beyond costs one standard deviation."""
 
 FREE_RAD = 10.0
 
@@ -56,8 +54,8 @@ BALL_JOINTS = {
     "Foot": (0.375, 0.15, 0.15),
     "ToeBase": (0.12, 0.04, 0.04),
 }
-# (deviation of twist, flexion, sideways; flexion's limits from the straight limb)
-HINGE_JOINTS = {"ForeArm": (0.75, 1.05, 0.05, -0.05, 2.6), "Leg": (0.12, 1.05, 0.05, -0.05, 2.5)}
+# (deviation of twist, flexion, sideways)
+HINGE_JOINTS = {"ForeArm": (0.75, 1.05, 0.05), "Leg": (0.12, 1.05, 0.05)}
 
 SHAPE_DEVIATION = {
     "gender": 0.35,
@@ -106,31 +104,23 @@ def shape_prior(names: Sequence[str], defaults: Float[Tensor, "s"]) -> ShapePrio
 
 @dataclass(frozen=True)
 class JointPrior:
-    """Axes (rows), expected angles with their deviations, and flexion limits of every active joint."""
+    """Axes (rows), expected angles with their deviations, and limits of every active joint."""
 
     axes: Float[Tensor, "j 3 3"]
     mean_rad: Float[Tensor, "j 3"]
     deviation_rad: Float[Tensor, "j 3"]
-    lowest_rad: Float[Tensor, "j 3"]
-    highest_rad: Float[Tensor, "j 3"]
+    limits: JointLimits
 
 
 def joint_prior(model: FitModel) -> JointPrior:
-    """The prior for a skeleton's rest pose: hinge axes and the straight limb follow from its joints."""
-    count = len(ACTIVE_JOINTS)
-    axes = torch.eye(3, dtype=torch.float64).repeat(count, 1, 1)
-    deviation = torch.ones(count, 3, dtype=torch.float64)
-    lowest, highest = torch.full_like(deviation, -FREE_RAD), torch.full_like(deviation, FREE_RAD)
-    for joint, name in enumerate(ACTIVE_JOINTS):
-        kind = name.removeprefix("Left").removeprefix("Right")
-        if kind in BALL_JOINTS:
-            deviation[joint] = torch.tensor(BALL_JOINTS[kind], dtype=torch.float64)
-            continue
-        axes[joint], bent = _hinge_axes(model, joint, kind)
-        twist, flexion, sideways, straight, most = HINGE_JOINTS[kind]
-        deviation[joint] = torch.tensor([twist, flexion, sideways], dtype=torch.float64)
-        lowest[joint, 1], highest[joint, 1] = straight - bent, most - bent
-    return JointPrior(axes, torch.zeros_like(deviation), deviation, lowest, highest)
+    """The prior for a skeleton's rest pose: hinge axes and limits follow from its joints."""
+    axes = torch.eye(3, dtype=torch.float64).repeat(len(ACTIVE_JOINTS), 1, 1)
+    deviation = torch.zeros(len(ACTIVE_JOINTS), 3, dtype=torch.float64)
+    for joint, kind in enumerate(map(kind_of, ACTIVE_JOINTS)):
+        if kind in HINGE_JOINTS:
+            axes[joint], _ = hinge_axes(model, joint)
+        deviation[joint] = torch.tensor({**BALL_JOINTS, **HINGE_JOINTS}[kind], dtype=torch.float64)
+    return JointPrior(axes, torch.zeros_like(deviation), deviation, joint_limits(model))
 
 
 def habitual_prior(prior: JointPrior, rotations: Float[Tensor, "n j 3 3"]) -> JointPrior:
@@ -147,20 +137,6 @@ def habitual_prior(prior: JointPrior, rotations: Float[Tensor, "n j 3 3"]) -> Jo
         mean_rad=torch.where(calm, angle.mean(0), prior.mean_rad),
         deviation_rad=torch.where(calm, spread, prior.deviation_rad),
     )
-
-
-def _hinge_axes(model: FitModel, joint: int, kind: str) -> tuple[Float[Tensor, "3 3"], float]:
-    """Rows (along the bone, flexion axis, sideways) of an elbow or knee, and how far the rest pose bends it (rad)."""
-    parent, child = model.parents[joint], model.parents.index(joint)
-    upper = torch.nn.functional.normalize(model.joints[joint] - model.joints[parent], dim=0)
-    lower = torch.nn.functional.normalize(model.joints[child] - model.joints[joint], dim=0)
-    bend = torch.linalg.cross(upper, lower)
-    if kind == "Leg":  # nearly straight at rest, so its axis is the body's x: a positive angle takes the foot back
-        flexion, bent = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64), float(bend[0])
-    else:
-        flexion, bent = torch.nn.functional.normalize(bend, dim=0), float(torch.asin(bend.norm()))
-    along = torch.nn.functional.normalize(lower - (lower @ flexion) * flexion, dim=0)
-    return torch.stack([along, flexion, torch.linalg.cross(along, flexion)]), bent
 
 
 def rotation_logarithm(rotation: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 3"]:
@@ -191,11 +167,9 @@ def pose_residuals(
     vector = rotation_logarithm(rotations)
     angle = (prior.axes @ vector[..., None]).squeeze(-1)
     by_rotation = prior.axes @ logarithm_jacobian(vector)
-    beyond = (angle - prior.highest_rad).clamp(min=0.0) - (prior.lowest_rad - angle).clamp(min=0.0)
-    outside = (beyond != 0).to(angle.dtype) / LIMIT_RAD
-    residual = torch.cat([(angle - prior.mean_rad) / prior.deviation_rad, beyond / LIMIT_RAD], dim=-1)
-    derivative = torch.cat([by_rotation / prior.deviation_rad[..., None], by_rotation * outside[..., None]], dim=-2)
-    return residual, derivative
+    beyond, beyond_by_rotation = prior.limits.residuals(rotations)
+    residual = torch.cat([(angle - prior.mean_rad) / prior.deviation_rad, beyond], dim=-1)
+    return residual, torch.cat([by_rotation / prior.deviation_rad[..., None], beyond_by_rotation], dim=-2)
 
 
 def interval_factors(time_s: Float[Tensor, "n"]) -> tuple[Float[Tensor, "t"], Float[Tensor, "t"], Float[Tensor, "t"]]:
