@@ -4,10 +4,13 @@ import csv
 import math
 import time
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Int
 
 from pipeline.avatar import selection
 from pipeline.avatar.body import Motion
@@ -24,9 +27,9 @@ from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.matte import shrink
-from pipeline.io.capture import Capture, load_capture
+from pipeline.io.capture import Capture, image_path, load_capture, mask_path
 from pipeline.io.checkpoint import load_tensors, save_field, save_occupancy, save_tensors
-from pipeline.io.image import to_uint8, write_rgb
+from pipeline.io.image import read_gray, read_rgb, to_float, to_uint8, write_rgb
 from pipeline.io.npz import load_body, load_camera, load_motion, save_motion
 from pipeline.io.scores import training_positions
 
@@ -45,7 +48,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: FieldConfig) -> Mapping[s
     camera = camera.scaled(training_scale(body, motion, camera, config.max_person_px))
     train = training_positions(capture, inputs["body"])
     train = train[spread(len(train), config.max_frames)]
-    pictures = [read_picture(capture, position, camera) for position in track(train, "read frames")]
+    pictures = read_pictures(capture, train, camera)
     device = compute_device(config.device, "field.device")
     learning = start_learning(body, motion.select(train), camera, pictures, config, device)
     judge = gather_judge(capture, motion, camera, config)
@@ -72,20 +75,28 @@ def graphics_memory(device: torch.device) -> dict[str, float]:
     return {"peak_gpu_mib": torch.cuda.max_memory_allocated(device) / MIB}
 
 
-def read_picture(capture: Capture, position: int, camera: Camera) -> Picture:
+def read_pictures(capture: Capture, positions: Int[np.ndarray, "k"], camera: Camera) -> list[Picture]:
+    """Image and mask of these frames at the camera's size."""
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        pictures = pool.map(partial(read_picture, capture, camera=camera), positions)
+        return list(track(pictures, "read frames", total=len(positions)))
+
+
+def read_picture(capture: Capture, position: int | np.integer, camera: Camera) -> Picture:
     """Image and mask of a frame at the camera's size, uint8."""
-    size = (camera.width, camera.height)
-    image, mask = capture.image(int(position)), capture.mask(int(position))
-    if (capture.width, capture.height) != size:
-        image, mask = shrink(image, mask, size)
-    return to_uint8(image), to_uint8(mask)
+    index, size = capture.frame_index[position], (camera.width, camera.height)
+    image, mask = read_rgb(image_path(capture.folder, index)), read_gray(mask_path(capture.folder, index))
+    if (capture.width, capture.height) == size:
+        return image, mask
+    small, alpha = shrink(to_float(image), to_float(mask), size)
+    return to_uint8(small), to_uint8(alpha)
 
 
 def gather_judge(capture: Capture, motion: Motion, camera: Camera, config: FieldConfig) -> Judge:
     """Some of the validation frames, evenly spread."""
     chosen = capture.positions(selection.VALIDATION)
     chosen = chosen[spread(len(chosen), config.validation_frames)] if len(chosen) else chosen
-    return Judge(motion.select(chosen), camera, [read_picture(capture, position, camera) for position in chosen])
+    return Judge(motion.select(chosen), camera, read_pictures(capture, chosen, camera))
 
 
 def learn(learning: Learning, judge: Judge, out: Path) -> float:
@@ -107,7 +118,7 @@ def learn(learning: Learning, judge: Judge, out: Path) -> float:
             raise UserError(f"the field does not learn ({error}); lower field.table_rate and try again") from None
         seconds.append(time.monotonic() - start)
         if learning.done in looks and judge.truths:
-            renders = thin.render(learning, learning.refines_poses)
+            renders = thin.render(learning, thin.pose(learning, learning.refines_poses))
             progress.add(learning.done, before_s + sum(seconds), *thin.score(renders), *thin.frame_scores(renders))
             if learning.config.early_stop and progress.has_settled(learning.config.steps / 2):
                 break
@@ -162,20 +173,23 @@ class Progress:
 
 def judge_poses(learning: Learning, judge: Judge, motion: Motion) -> tuple[Motion, dict[str, float], list[np.ndarray]]:
     """Keep the pose corrections only if they make validation frames better, to which they come by interpolation in
-    time.
+    time. Thinned pictures decide (`psnr_fitted`, `psnr_refined`); what is kept is rendered whole (`psnr`, `psnr_body`).
     """
-    ways = {"fitted": False} | ({"refined": True} if learning.config.pose_refinement else {})
-    shown = {name: judge.render(learning, refined) for name, refined in ways.items()}
-    scores = {name: judge.score(renders) for name, renders in shown.items()}
-    best = max(scores, key=lambda name: scores[name][0]) if judge.truths else "fitted"
-    if best == "fitted" and learning.config.pose_refinement:
-        why = "did not make validation frames better" if judge.truths else "have no validation frames to prove them"
-        warn(f"the refined poses {why} and were dropped")
-    metrics = {f"psnr_{name}": score[0] for name, score in scores.items()} if judge.truths else {}
-    if judge.truths:
-        metrics |= {"psnr": scores[best][0], "psnr_body": scores[best][1]}
+    refines = learning.config.pose_refinement
+    if not judge.truths:
+        if refines:
+            warn("the refined poses have no validation frames to prove them and were dropped")
+        return motion, {"poses_kept": 0.0}, []
+    thin, ways = judge.thinned(), {"fitted": False} | ({"refined": True} if refines else {})
+    poses = {name: judge.pose(learning, refined) for name, refined in ways.items()}
+    scores = {f"psnr_{name}": thin.score(thin.render(learning, there))[0] for name, there in poses.items()}
+    best = max(ways, key=lambda name: scores[f"psnr_{name}"])
+    if refines and best == "fitted":
+        warn("the refined poses did not make validation frames better and were dropped")
+    shown = judge.render(learning, poses[best])
+    psnr, psnr_body = judge.score(shown)
     kept = learning.poses.corrected(motion) if ways[best] else motion
-    return kept, metrics | {"poses_kept": float(ways[best])}, shown[best]
+    return kept, scores | {"psnr": psnr, "psnr_body": psnr_body, "poses_kept": float(ways[best])}, shown
 
 
 def write_preview(path: Path, renders: list[np.ndarray], judge: Judge) -> None:
@@ -187,7 +201,7 @@ def write_preview(path: Path, renders: list[np.ndarray], judge: Judge) -> None:
 
 STAGE = Stage(
     "field",
-    version=8,
+    version=9,
     needs=("frames", "body"),
     makes=("field.safetensors", "occupancy.npz", "motion.npz"),
     config=FieldConfig,

@@ -9,7 +9,7 @@ from jaxtyping import UInt8
 
 from pipeline.avatar.body import Motion, canonical_to_world
 from pipeline.avatar.prepare import Picture
-from pipeline.avatar.render import render_field
+from pipeline.avatar.render import Poses, render_pose, undo_poses
 from pipeline.avatar.train import Learning
 from pipeline.geometry.camera import Camera
 from pipeline.metrics.images import body_pixels, on_white, premultiplied_on_white, psnr_db
@@ -38,14 +38,18 @@ class Judge:
         kept = tuple(slice(THINNING // 2, side, THINNING) for side in reversed(whole))
         return Judge(self.motion, camera, [(image[kept], mask[kept]) for image, mask in self.truths])
 
-    def render(self, learning: Learning, refined: bool) -> list[UInt8[np.ndarray, "h w 3"]]:
-        """Pictures on white as the field is now; `refined` poses come by interpolation in time from the learnt ones."""
+    def pose(self, learning: Learning, refined: bool) -> Poses:
+        """The frames' poses, at least one, ready to be rendered; `refined` ones come by interpolation in time from the
+        learnt ones.
+        """
         motion = learning.poses.corrected(self.motion) if refined else self.motion
-        body, grid, skin = learning.scene.body, learning.occupancy.grid(), learning.scene.skin
-        renders = [
-            render_field(learning.field, grid, body, pose, self.camera, skin)
-            for pose in canonical_to_world(body, motion)
-        ]
+        scene = learning.scene
+        return undo_poses(learning.field, scene.body, scene.skin, canonical_to_world(scene.body, motion))
+
+    def render(self, learning: Learning, poses: Poses) -> list[UInt8[np.ndarray, "h w 3"]]:
+        """Pictures on white of all frames as the field is now, in the poses that `pose` gave."""
+        field, grid = learning.field, learning.occupancy.grid()
+        renders = [render_pose(field, grid, poses, row, self.camera) for row in range(len(self.truths))]
         return [premultiplied_on_white(render.numpy()) for render in renders]
 
     def score(self, renders: Sequence[UInt8[np.ndarray, "h w 3"]]) -> tuple[float, float]:

@@ -1,6 +1,7 @@
 """Full images of the canonical field in a pose."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -24,6 +25,30 @@ OPAQUE = 9.0
 """Optical depth behind which a ray ends: an eight-thousandth of the light is left, a thirtieth of a grey level."""
 
 
+@dataclass(frozen=True)
+class Poses:
+    """A body in some poses and the way back from each: what their renders share, whatever the camera.
+
+    to_posed: rigid maps from the world to the posed spaces. canonical_to_posed: the skinning matrices there.
+    """
+
+    skin: SkinGrid
+    to_posed: Float[Tensor, "k 4 4"]
+    canonical_to_posed: Float[Tensor, "k j 4 4"]
+    inverse: Inverse
+    step_m: float
+
+
+def undo_poses(field: Field, body: Body, skin: SkinGrid, canonical_to_world: Float[Tensor, "k j 4 4"]) -> Poses:
+    """Invert the skinning of all poses, at least one, in the field's way, on the field's device."""
+    device = field.bounds_m.device
+    skin, canonical_to_world = skin.to(device), canonical_to_world.float().to(device)
+    to_posed = posed_from_world(canonical_to_world)
+    canonical_to_posed = to_posed[:, None] @ canonical_to_world
+    inverse = invert_motion(field.inverse_skinning, body, skin, canonical_to_posed)
+    return Poses(skin, to_posed, canonical_to_posed, inverse, body.height_m() / STEPS_PER_HEIGHT)
+
+
 def render_field(
     field: Field,
     occupancy: Occupancy,
@@ -37,19 +62,19 @@ def render_field(
     skin: the body's skin grid, from `build_skin_grid`; give it when many images are rendered, it takes a second to
     build.
     """
-    device = field.bounds_m.device
     skin = skin or build_skin_grid(body, skin_margin_m(body, occupancy.bounds_m.cpu().numpy()))
-    skin, occupancy, canonical_to_world = skin.to(device), occupancy.to(device), canonical_to_world.float().to(device)
-    to_posed = posed_from_world(canonical_to_world[None])[0]
-    canonical_to_posed = to_posed @ canonical_to_world
-    inverse = invert_motion(field.inverse_skinning, body, skin, canonical_to_posed[None])
-    step_m = body.height_m() / STEPS_PER_HEIGHT
+    return render_pose(field, occupancy, undo_poses(field, body, skin, canonical_to_world[None]), 0, camera)
+
+
+def render_pose(field: Field, occupancy: Occupancy, poses: Poses, row: int, camera: Camera) -> Float[Tensor, "h w 4"]:
+    """`render_field` of one of some poses whose skinning is inverted already."""
+    occupancy, to_posed = occupancy.to(field.bounds_m.device), poses.to_posed[row]
     image = torch.zeros(camera.height, camera.width, 4)
-    for rows, columns in _pixels_in_box(inverse.boxes_m[0], to_posed, camera):
+    for rows, columns in _pixels_in_box(poses.inverse.boxes_m[row], to_posed, camera):
         pixels_px = torch.stack([columns, rows], dim=-1) + 0.5
         rays = _carry(*pixel_rays(camera, pixels_px), to_posed)
         with torch.no_grad():
-            shaded = _shade(field, occupancy, skin, canonical_to_posed, inverse, rays, step_m)
+            shaded = _shade(field, occupancy, poses, row, rays)
         image[rows.cpu(), columns.cpu()] = shaded.cpu()
     return image
 
@@ -80,16 +105,14 @@ def _pixels_in_box(
 def _shade(
     field: Field,
     occupancy: Occupancy,
-    skin: SkinGrid,
-    canonical_to_posed: Float[Tensor, "j 4 4"],
-    inverse: Inverse,
+    poses: Poses,
+    row: int,
     rays: tuple[Tensor, Tensor],
-    step_m: float,
 ) -> Float[Tensor, "n 4"]:
     origins, directions = rays
-    count, device = len(origins), origins.device
-    frame, jitter = torch.zeros(count, dtype=torch.long, device=device), torch.full((count,), 0.5, device=device)
-    samples = inverse.sample(Rays(origins, directions, frame, jitter), step_m, occupancy, MAX_SAMPLES)
+    count, device, step_m = len(origins), origins.device, poses.step_m
+    frame, jitter = torch.full((count,), row, device=device), torch.full((count,), 0.5, device=device)
+    samples = poses.inverse.sample(Rays(origins, directions, frame, jitter), step_m, occupancy, MAX_SAMPLES)
     ray = torch.repeat_interleave(torch.arange(count, device=device), samples.ray_start.diff())
     waiting, reached = torch.arange(len(ray), device=device), 0
     rank = waiting - samples.ray_start[ray]
@@ -100,8 +123,9 @@ def _shade(
         near = rank[waiting] < reached
         rows, waiting = waiting[near], waiting[~near]
         posed = origins[ray[rows]] + samples.distance_m[rows, None] * directions[ray[rows]]
-        slot, slot_start = torch.tensor([0], device=device), torch.tensor([0, len(rows)], device=device)
-        points = inverse.place(skin, canonical_to_posed[None], slot, samples.canonical_m[rows], posed, slot_start)
+        slot, slot_start = torch.tensor([row], device=device), torch.tensor([0, len(rows)], device=device)
+        matrices, found = poses.canonical_to_posed[row : row + 1], samples.canonical_m[rows]
+        points = poses.inverse.place(poses.skin, matrices, slot, found, posed, slot_start)
         colour[rows], density[rows] = field(points)
         optical_depth.index_add_(0, ray[rows], density[rows] * step_m)
         waiting = waiting[optical_depth[ray[waiting]] < OPAQUE]

@@ -1,9 +1,11 @@
 import numpy as np
 import pytest
 
+from pipeline.avatar.body import canonical_to_world
 from pipeline.avatar.judge import Judge
+from pipeline.avatar.render import render_field
 from pipeline.avatar.train import Learning
-from pipeline.metrics.images import on_white
+from pipeline.metrics.images import on_white, premultiplied_on_white
 from tests.avatar.scene import painted_scene
 from tests.avatar.test_train import begin
 
@@ -30,7 +32,8 @@ def judge(scene) -> Judge:
 
 def test_thinned_pictures_are_pixels_of_the_whole_ones(judge: Judge, learning: Learning):
     thin = judge.thinned()
-    whole, few = judge.render(learning, refined=False)[0], thin.render(learning, refined=False)[0]
+    poses = judge.pose(learning, refined=False)
+    whole, few = judge.render(learning, poses)[0], thin.render(learning, poses)[0]
     sides = few.shape[:2]
     picked = whole[2::5, 2::5][: sides[0], : sides[1]].astype(int)
     assert np.array_equal(thin.truths[0][0], judge.truths[0][0][2::5, 2::5][: sides[0], : sides[1]])
@@ -40,8 +43,19 @@ def test_thinned_pictures_are_pixels_of_the_whole_ones(judge: Judge, learning: L
 
 def test_a_thinned_score_is_that_of_the_pixels_it_keeps(judge: Judge, learning: Learning):
     thin = judge.thinned()
-    kept = [render[2::5, 2::5][: thin.camera.height, : thin.camera.width] for render in judge.render(learning, False)]
-    assert thin.score(thin.render(learning, refined=False)) == pytest.approx(thin.score(kept), abs=0.2)
+    poses = judge.pose(learning, refined=False)
+    kept = [render[2::5, 2::5][: thin.camera.height, : thin.camera.width] for render in judge.render(learning, poses)]
+    assert thin.score(thin.render(learning, poses)) == pytest.approx(thin.score(kept), abs=0.2)
+
+
+def test_frames_share_their_poses_and_not_their_pictures(scene, judge: Judge, learning: Learning):
+    poses, skin = judge.pose(learning, refined=False), learning.scene.skin
+    for row, render in enumerate(judge.render(learning, poses)):
+        alone = Judge(judge.motion.select(np.array([row])), judge.camera, judge.truths[row : row + 1])
+        assert np.array_equal(alone.render(learning, alone.pose(learning, refined=False))[0], render)
+        pose = canonical_to_world(scene.body, judge.motion)[row]
+        drawn = render_field(learning.field, learning.occupancy.grid(), scene.body, pose, scene.camera, skin)
+        assert np.array_equal(premultiplied_on_white(drawn.numpy()), render)
 
 
 def test_the_truth_itself_scores_without_end_and_nothing_scores_nan(judge: Judge):

@@ -88,8 +88,9 @@ def test_validation_frames_are_scored_with_refined_poses(scene, learnt):
     judge = Judge(
         scene.motion.select(np.array([2, 5])), scene.camera, [(scene.images[r], scene.masks[r]) for r in (2, 5)]
     )
-    renders = judge.thinned().render(learning, refined=True)
-    assert all(np.isfinite(score) for score in judge.thinned().frame_scores(renders))
+    thin = judge.thinned()
+    renders = thin.render(learning, thin.pose(learning, refined=True))
+    assert all(np.isfinite(score) for score in thin.frame_scores(renders))
 
 
 def test_a_step_is_few_operations(scene):

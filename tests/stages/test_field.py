@@ -1,7 +1,7 @@
 """The field stage's record of progress and its judgement of poses; its whole way is walked in tests/test_all.py."""
 
 import csv
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from unittest import mock
 
 import numpy as np
@@ -14,7 +14,9 @@ from pipeline.avatar.pose import PoseCorrection
 from pipeline.avatar.train import Learning
 from pipeline.core.progress import take_warnings
 from pipeline.geometry.camera import Camera
-from stages.field import Progress, judge_poses, learn
+from pipeline.io.capture import Capture, image_path, mask_path
+from pipeline.io.image import write_gray, write_rgb
+from stages.field import Progress, judge_poses, learn, read_pictures
 
 
 def rows_of(path):
@@ -100,21 +102,40 @@ REFINED = FITTED.with_pose(FITTED.rotations_wxyz, FITTED.root_translation_m + 0.
 
 @dataclass(frozen=True)
 class KnownJudge(Judge):
-    """Its renders are darker than the truth by so many levels: in the fitted poses, in the refined ones."""
+    """Its renders are darker than the truth by so many levels: in the fitted poses, in the refined ones.
+
+    asked: for each render whether it was of thinned pictures, and whether in refined poses.
+    """
 
     levels: tuple[int, int] = (0, 0)
+    is_thin: bool = False
+    asked: list[tuple[bool, bool]] = field(default_factory=list)
 
-    def render(self, learning: Learning, refined: bool) -> list[np.ndarray]:
-        return [target - np.uint8(self.levels[refined]) for target in self.targets]
+    def thinned(self) -> "KnownJudge":
+        return replace(self, is_thin=True)
+
+    def pose(self, learning: Learning, refined: bool) -> bool:
+        return refined
+
+    def render(self, learning: Learning, poses: bool) -> list[np.ndarray]:
+        self.asked.append((self.is_thin, poses))
+        return [target - np.uint8(self.levels[poses]) for target in self.targets]
+
+
+def known_judge(levels: tuple[int, int], frames: int) -> KnownJudge:
+    truth = np.full((8, 6, 3), 200, np.uint8), np.full((8, 6), 255, np.uint8)
+    return KnownJudge(FITTED.select(np.arange(frames)), Camera(9.0, 9.0, 3.0, 4.0, 6, 8), [truth] * frames, levels)
+
+
+def known_learning(refines: bool) -> Learning:
+    poses = mock.MagicMock(spec=PoseCorrection)
+    poses.corrected.return_value = REFINED
+    return mock.MagicMock(spec=Learning, config=FieldConfig(pose_refinement=refines), poses=poses)
 
 
 def judged(levels: tuple[int, int], frames: int = 2, refines: bool = True):
     """`judge_poses` on grey pictures, and the warnings that came with it."""
-    poses = mock.MagicMock(spec=PoseCorrection)
-    poses.corrected.return_value = REFINED
-    learning = mock.MagicMock(spec=Learning, config=FieldConfig(pose_refinement=refines), poses=poses)
-    truth = np.full((8, 6, 3), 200, np.uint8), np.full((8, 6), 255, np.uint8)
-    judge = KnownJudge(FITTED.select(np.arange(frames)), Camera(9.0, 9.0, 3.0, 4.0, 6, 8), [truth] * frames, levels)
+    learning, judge = known_learning(refines), known_judge(levels, frames)
     take_warnings()
     return *judge_poses(learning, judge, FITTED), take_warnings()
 
@@ -150,6 +171,13 @@ def test_refined_poses_are_dropped_where_validation_frames_do_not_gain(levels):
     assert int(shown[0][0, 0, 0]) == 195
 
 
+@pytest.mark.parametrize(("levels", "is_better"), [((10, 5), True), ((5, 10), False)])
+def test_only_what_is_kept_is_rendered_whole(levels, is_better):
+    judge = known_judge(levels, 2)
+    judge_poses(known_learning(refines=True), judge, FITTED)
+    assert judge.asked == [(True, False), (True, True), (False, is_better)]
+
+
 def test_refined_poses_that_nothing_can_prove_are_dropped():
     kept, metrics, shown, (warning,) = judged((10, 5), frames=0)
     assert kept is FITTED
@@ -164,3 +192,19 @@ def test_poses_that_were_not_refined_stay_without_a_word(frames):
     assert kept is FITTED
     assert warnings == []
     assert "psnr_refined" not in metrics
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+def test_pictures_are_read_in_order_at_the_cameras_size(tmp_path, scale):
+    indices = np.array([30, 10, 20])
+    for index in indices:
+        image_path(tmp_path, index).parent.mkdir(exist_ok=True)
+        mask_path(tmp_path, index).parent.mkdir(exist_ok=True)
+        write_rgb(image_path(tmp_path, index), np.full((8, 6, 3), index, np.uint8))
+        write_gray(mask_path(tmp_path, index), np.full((8, 6), 255, np.uint8))
+    capture = mock.MagicMock(spec=Capture, folder=tmp_path, frame_index=indices, width=6, height=8)
+    camera = Camera(9.0, 9.0, 3.0, 4.0, 6, 8).scaled(scale)
+    pictures = read_pictures(capture, np.array([2, 0, 1]), camera)
+    assert [image.shape for image, _ in pictures] == [(camera.height, camera.width, 3)] * 3
+    assert [int(image[0, 0, 0]) for image, _ in pictures] == [20, 30, 10]
+    assert all((mask == 255).all() for _, mask in pictures)
