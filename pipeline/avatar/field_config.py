@@ -39,7 +39,10 @@ class FieldConfig(Config):
     hull_votes: float = Option(0.9, gt=0, le=1, description="part of the frames whose mask must hold a point of a hull")
 
     margin_m: float = Option(
-        0.10, gt=0, le=0.6, description="how far clothing and hair may stand off the fitted body, m"
+        0.10, gt=0, le=0.6, description="how far clothing and hair may stand off the fitted body at least, m"
+    )
+    widest_margin_m: float = Option(
+        0.5, ge=0, le=0.6, description="the same at most, where the masks reach far beyond the body, m; 0: never wider"
     )
     step_fraction: float = Option(0.01, gt=0, le=0.1, description="ray step, as a part of the body's height")
     pixel_jitter: bool = Option(False, description="rays start anywhere in their pixel instead of its centre")

@@ -14,7 +14,7 @@ from pipeline.avatar.frequency import LAYERS, FrequencyTrunk
 from pipeline.avatar.hull import carve, dense_layout
 from pipeline.avatar.occupancy import OccupancyUpdate, cell_centres
 from pipeline.avatar.rays import build_pool
-from pipeline.avatar.support import cell_distances_m, field_bounds_m, mask_frequency, starting_shell
+from pipeline.avatar.support import cell_distances_m, clothing_margin_m, field_bounds_m, mask_frequency, starting_shell
 from pipeline.avatar.train import Learning, Scene
 from pipeline.avatar.warp import build_skin_grid, skin_margin_m
 from pipeline.core.device import CPU
@@ -55,28 +55,30 @@ def start_learning(
 
     pictures: image and mask of each frame of `motion`, for `camera`.
     """
-    bounds_m = field_bounds_m(body, config.margin_m)
+    rows = spread(len(pictures), SUPPORT_FRAMES)
+    poses, masks = canonical_to_world(body, motion.select(rows)), [pictures[row][1] >= 128 for row in rows]
+    margin_m = clothing_margin_m(body, poses, camera, masks, config.margin_m, config.widest_margin_m)
+    bounds_m = field_bounds_m(body, margin_m)
     skin = build_skin_grid(body, skin_margin_m(body, bounds_m))
     pixel_m = body_depth_m(motion, camera) / camera.fy
-    distance_m = cell_distances_m(body, bounds_m, config.margin_m)
-    near = distance_m < config.margin_m
+    distance_m = cell_distances_m(body, bounds_m, margin_m)
+    near = distance_m < margin_m
     frequency = np.zeros(distance_m.shape, dtype=np.float32)
-    rows = spread(len(pictures), SUPPORT_FRAMES)
     cell_px = 0.5 * float((bounds_m[1] - bounds_m[0]).max()) / distance_m.shape[0] / pixel_m
     frequency[near] = mask_frequency(
         cell_centres(bounds_m)[near.reshape(-1)],
         distance_m[near],
         skin,
-        canonical_to_world(body, motion.select(rows)),
+        poses,
         camera,
-        [dilate(pictures[row][1] >= 128, cell_px) for row in rows],
+        [dilate(mask, cell_px) for mask in masks],
     )
     occupancy = OccupancyUpdate(
-        starting_shell(distance_m, frequency, config.margin_m, config.mask_support),
+        starting_shell(distance_m, frequency, margin_m, config.mask_support),
         distance_m,
         frequency,
         bounds_m,
-        margin_m=config.margin_m,
+        margin_m=margin_m,
         attention=config.occupancy == "attention",
         learning_rate=config.attention_rate,
         decay=config.occupancy_decay,

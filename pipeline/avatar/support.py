@@ -20,11 +20,44 @@ UNSEEN_WEIGHT = 8.0
 """Frames that the expectation counts for where no frame shows a point."""
 VERTEX_REACH_M = 0.06
 """No point of a body's surface is farther from the nearest vertex."""
+REACH_PART = 0.99
+"""Part of a mask's pixels that its clothes explain; the rest may be strands of hair or strokes of a poor mask."""
+MARGIN_PER_REACH = 2.0
+"""Cloth stands farther off the body than off its outline: a leg before or behind the cloth hides the gap."""
+ASKED_EVERY_PX = 4
 
 
 def field_bounds_m(body: Body, margin_m: float) -> Float[np.ndarray, "2 3"]:
     """The body's canonical box, widened on all sides."""
     return np.stack([body.vertices.min(0) - margin_m, body.vertices.max(0) + margin_m]).astype(np.float32)
+
+
+def clothing_margin_m(
+    body: Body,
+    canonical_to_world: Float[Tensor, "k j 4 4"],
+    camera: Camera,
+    masks: list[Bool[np.ndarray, "h w"]],
+    narrowest_m: float,
+    widest_m: float,
+) -> float:
+    """How far from the body clothes may stand, judged by how far the masks reach beyond it; m.
+
+    The reach of a mask is the 99th percentile over its pixels of the distance to the body's nearest vertex in the
+    image, at that vertex's depth. Twice the median over frames counts, so that some poor masks or poses do not; no
+    more than `widest_m`, and never less than `narrowest_m`.
+    """
+    vertices, weights = torch.from_numpy(body.vertices), torch.from_numpy(body.skin_weights)
+    reaches_m = []
+    for pose, mask in zip(canonical_to_world, masks, strict=True):
+        posed = linear_blend_skinning(vertices, weights, pose[None])[0]
+        pixels, depth_m = (of.numpy() for of in project(posed, camera))
+        before = depth_m > 0
+        shown = ASKED_EVERY_PX * np.argwhere(mask[::ASKED_EVERY_PX, ::ASKED_EVERY_PX])[:, ::-1] + 0.5
+        if len(shown) and before.any():
+            distance_px, nearest = cKDTree(pixels[before]).query(shown)
+            reaches_m.append(np.quantile(distance_px * depth_m[before][nearest] / camera.fx, REACH_PART))
+    reach_m = float(np.median(reaches_m)) if reaches_m else 0.0
+    return max(narrowest_m, min(widest_m, MARGIN_PER_REACH * reach_m))
 
 
 def cell_distances_m(body: Body, bounds_m: Float[np.ndarray, "2 3"], reach_m: float) -> Float[np.ndarray, "gx gy gz"]:

@@ -1,13 +1,21 @@
 import numpy as np
+import pytest
 import torch
 
-from pipeline.avatar.body import load_anny
+from pipeline.avatar.body import Body, load_anny
 from pipeline.avatar.occupancy import cell_centres
-from pipeline.avatar.support import cell_distances_m, field_bounds_m, mask_frequency, starting_shell
+from pipeline.avatar.support import (
+    cell_distances_m,
+    clothing_margin_m,
+    field_bounds_m,
+    mask_frequency,
+    starting_shell,
+)
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.surface import signed_distance_m
 from tests.kernels.bar import bar_skin
 
+DISC_M = 0.3
 UPRIGHT = torch.eye(4).expand(1, 2, 4, 4)
 LOOKING_BACK = np.diag([1.0, -1.0, -1.0, 1.0])
 LOOKING_BACK[2, 3] = 2.0
@@ -61,3 +69,36 @@ def test_the_shell_holds_the_body_and_what_masks_support():
     distance = np.array([-0.01, 0.05, 0.05, 0.2])
     frequency = np.array([0.0, 0.7, 0.5, 1.0])
     assert starting_shell(distance, frequency, 0.1, 0.6).tolist() == [True, True, False, False]
+
+
+def margin_of_discs(radii_m, narrowest_m=0.05, widest_m=1.0):
+    """A flat body, a disc of points 2 m before the camera, and a round mask in each frame; a pixel is a centimetre."""
+    grid = np.stack(np.meshgrid(*2 * [np.arange(-DISC_M, DISC_M + 0.01, 0.01)]), axis=-1).reshape(-1, 2)
+    disc = grid[np.linalg.norm(grid, axis=1) <= DISC_M + 1e-6]
+    vertices = np.pad(disc, ((0, 0), (0, 1))).astype(np.float32)
+    nowhere = np.zeros((1, 3), dtype=np.float32)
+    ones = np.ones((len(vertices), 1), dtype=np.float32)
+    body = Body(("Hips",), np.array([-1]), nowhere, vertices, np.array([[0, 1, 2]]), ones, {})
+    camera = Camera(200.0, 200.0, 80.0, 80.0, 160, 160, LOOKING_BACK.astype(np.float32))
+    row, column = np.mgrid[:160, :160] + 0.5
+    from_axis_m = np.hypot(row - 80, column - 80) / 100
+    masks = [from_axis_m < radius for radius in radii_m]
+    return clothing_margin_m(body, UPRIGHT[:, :1].expand(len(masks), 1, 4, 4), camera, masks, narrowest_m, widest_m)
+
+
+def test_the_margin_is_twice_what_masks_reach_beyond_the_body():
+    # 99 % of a disc's area lie within sqrt(0.99) of its radius.
+    for radius in (0.4, 0.5, 0.7):
+        assert margin_of_discs([radius]) == pytest.approx(2 * (np.sqrt(0.99) * radius - DISC_M), abs=0.02)
+
+
+def test_the_margin_stays_within_its_limits():
+    assert margin_of_discs([DISC_M]) == 0.05
+    assert margin_of_discs([0.7], widest_m=0.4) == 0.4
+    assert margin_of_discs([0.7], widest_m=0.0) == 0.05
+
+
+def test_a_few_poor_masks_and_empty_ones_do_not_widen_the_margin():
+    assert margin_of_discs([DISC_M, DISC_M, DISC_M, 0.75, 0.75]) == 0.05
+    assert margin_of_discs([0.5, 0.0, 0.0, 0.0]) == margin_of_discs([0.5])
+    assert margin_of_discs([0.0]) == 0.05
