@@ -160,7 +160,8 @@ def _main(argv: Sequence[str]) -> None:
     options = parser.parse_args(argv)
     found = [stage for stage in ("frames", "body") if (options.run / stage / "manifest.json").is_file()]
     if not found:
-        raise UserError(f"{options.run} holds no finished stage; run python -m stages --video {options.out}/video")
+        command = f"python -m stages --run {options.run} --video {options.out}/video"
+        raise UserError(f"{options.run} holds no finished stage; run {command}")
     sections = {}
     if "frames" in found:
         sections["masks"] = compare_masks(options.out, options.run / "frames")

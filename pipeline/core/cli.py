@@ -116,6 +116,8 @@ def _open_run(run_dir: Path, options: argparse.Namespace, replace_video: bool) -
 
     A command that fails before any stage is finished takes the folder it made away again.
     """
+    if run_dir.is_file():
+        raise UserError(f"{run_dir} is a file, a run is a folder: choose another name with --run")
     is_new = not run_dir.exists()
     record = update_record(read_record(run_dir), run_dir, options.video, options.preset, options.set, replace_video)
     run_dir.mkdir(parents=True, exist_ok=True)

@@ -7,6 +7,7 @@ USER_ERRNO = {
     errno.EDQUOT: "the disk quota is used up: free some space, then run the same command again",
     errno.EACCES: "there is no permission: change the rights, or choose another folder with --run",
     errno.EPERM: "there is no permission: change the rights, or choose another folder with --run",
+    errno.ENOTDIR: "a part of that path is a file: choose another folder with --run",
     errno.EROFS: "the disk is read-only: choose another folder with --run",
 }
 

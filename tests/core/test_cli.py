@@ -114,6 +114,14 @@ def test_a_stage_refuses_options_of_others(toy: Toy) -> None:
     assert "see python -m stages.learn --help" in toy.refusal("stages.learn")
 
 
+def test_a_file_is_no_run(toy: Toy) -> None:
+    (toy.folder / "notes").write_text("in the way")
+    assert "notes is a file, a run is a folder" in toy.refusal("stages", "--run", "notes", "--video", "numbers.txt")
+    below = toy.refusal("stages", "--run", "notes/a", "--video", "numbers.txt")
+    assert "notes/a cannot be written or read, a part of that path is a file" in below
+    assert (toy.folder / "notes").read_text() == "in the way"
+
+
 def test_bad_input_leaves_no_folder(toy: Toy) -> None:
     toy.video.write_text("1 two 3")
     assert "holds two" in toy.refusal("stages", "--run", "runs/a", "--video", "numbers.txt")
