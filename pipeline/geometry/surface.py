@@ -1,9 +1,10 @@
 """Operations on closed surfaces: isosurface, repair, remeshing, conforming subdivision, Laplacian, transfer between
 meshes."""
 
+from typing import Any
+
 import igl
 import numpy as np
-import pymeshlab
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from scipy.sparse import coo_array, csr_array, diags_array
@@ -146,18 +147,22 @@ def remesh(
     the surface farther than this (a tenth of the edge when None), so thin parts keep short edges. Raises
     OpenSurfaceError when the result cannot be repaired.
     """
+    from pymeshlab import PureValue  # here, as in `_meshset`
+
     meshes = _meshset(mesh, selected)
     meshes.meshing_isotropic_explicit_remeshing(
         iterations=iterations,
         selectedonly=selected is not None,
-        targetlen=pymeshlab.PureValue(edge_m),
+        targetlen=PureValue(edge_m),
         checksurfdist=True,
-        maxsurfdist=pymeshlab.PureValue(0.1 * edge_m if tolerance_m is None else tolerance_m),
+        maxsurfdist=PureValue(0.1 * edge_m if tolerance_m is None else tolerance_m),
     )
     return repair(_from_meshset(meshes))
 
 
-def _meshset(mesh: Mesh, selected: Bool[np.ndarray, "f"] | None = None) -> pymeshlab.MeshSet:
+def _meshset(mesh: Mesh, selected: Bool[np.ndarray, "f"] | None = None) -> Any:
+    import pymeshlab  # here, because loading it costs a quarter of a second that few stages need pay
+
     meshes = pymeshlab.MeshSet()
     quality = None if selected is None else selected.astype(np.float64)
     extra = {} if quality is None else {"f_scalar_array": quality}
@@ -167,7 +172,7 @@ def _meshset(mesh: Mesh, selected: Bool[np.ndarray, "f"] | None = None) -> pymes
     return meshes
 
 
-def _from_meshset(meshes: pymeshlab.MeshSet) -> Mesh:
+def _from_meshset(meshes: Any) -> Mesh:
     current = meshes.current_mesh()
     return Mesh(current.vertex_matrix().astype(np.float32), current.face_matrix().astype(np.int32))
 
