@@ -156,7 +156,7 @@ def make_capture(sightings: Sightings, chosen: list[int], out: Path, source: Sou
 
 STAGE = Stage(
     "frames",
-    version=8,
+    version=9,
     needs=("video",),
     makes=(FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, CONTACT_SHEET),
     config=Config,

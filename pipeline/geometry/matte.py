@@ -25,14 +25,20 @@ _COLOUR_NOISE = 1.0 / 255.0
 # How much the detector's word weighs, in the unit of a squared Mahalanobis distance: at its outline, and far from it.
 _PRIOR_AT_EDGE, _PRIOR_CERTAIN = 0.3, 10.0
 _PRIOR_RAMP = 0.2
-# A cloud counts from this mean weight on: one certain pixel in a window of 13 x 13.
-_LEAST_WEIGHT = 1.0 / 169.0
+# A window this many times as wide counts this much besides, for it is all there is deep in a gap between arm and trunk.
+_FAR, _FAR_SHARE = 8, 0.01
+# A cloud counts from this mean weight on: a tenth of the wide window.
+_LEAST_WEIGHT = 1e-3
 # A backdrop is painted when this share of the pixels away from the person is within two levels of one colour.
 _PAINTED_SHARE, _PAINTED_LEVELS = 0.95, 2
 # Where the detector is this sure, a colour belongs to the person even when the first round said otherwise. Without that
 # a white hem before a white wall is lost (synthetic captures: IoU median and worst 0.978, 0.945; with it 0.991, 0.959).
 _SURE = 0.97
-_RIM_PX = 1.0
+# The rim reaches as far to each side as the picture itself is soft there: this many standard deviations of its blur.
+_LEAST_RIM_PX, _RIM_PER_BLUR = 1.0, 2.0
+# Blur is told by blurring again, this much; along this many cells of the outline to each side. A sharp outline looks
+# blurred by this variance (px^2), by the area of a pixel and the gradient's own smoothing.
+_REBLUR_PX, _BLUR_CELLS, _OWN_BLUR = 1.5, 9.0, 0.95
 # Colours at least this far from the soft rim are the person's or the backdrop's alone: lens and codec mix them over a
 # wider strip than alpha tells. Nearer ones are likelier to be those of the rim, see docs/decisions.md.
 _PERSON_CLEAR_PX, _BACKDROP_CLEAR_PX = 1.0, 2.5
@@ -74,18 +80,43 @@ def sharpen_mask(
     for _ in range(2):
         alpha = np.where(reach, np.maximum(_recolour(image, alpha, guess, cell_px), certain), 0.0).astype(np.float32)
     whole = np.zeros(mask.shape, dtype=np.float32)
-    whole[window] = clean_alpha(alpha)
+    rim_px = np.maximum(_RIM_PER_BLUR * outline_blur_px(image, alpha > 0.5, _BLUR_CELLS * cell_px), _LEAST_RIM_PX)
+    whole[window] = clean_alpha(alpha, np.minimum(rim_px, _BAND_CELLS * cell_px))
     return whole
 
 
-def clean_alpha(alpha: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Drop specks and pinholes; 1 inside and 0 outside except in a rim along the outline, where alpha stays soft.
+def outline_blur_px(
+    image: Float[np.ndarray, "h w 3"], body: Bool[np.ndarray, "h w"], window_px: float
+) -> Float[np.ndarray, "h w"]:
+    """How blurred the picture is at the outline near each pixel: standard deviation of a Gaussian, in px.
+
+    An edge of blur s that is blurred again by r keeps s^2 / (s^2 + r^2) of its squared gradient, whatever its contrast
+    (after Zhuo and Sim, "Defocus map estimation from a single image", 2011). Both energies are gathered along the
+    outline in squares of half width `window_px`, so that strong edges speak for weak ones; 0 far from them.
+    """
+    line, side = _grown(outline(body), 1.0).astype(np.float32), 2 * round(window_px) + 1
+    sharp, soft = (
+        cv2.blur(line * _squared_gradient(picture), (side, side))
+        for picture in (image, cv2.GaussianBlur(image, (0, 0), _REBLUR_PX))
+    )
+    excess = np.maximum(sharp - soft, 1e-12)
+    return np.sqrt(np.maximum(_REBLUR_PX**2 * soft / excess - _OWN_BLUR, 0.0)).astype(np.float32)
+
+
+def _squared_gradient(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
+    return sum((cv2.Sobel(image, cv2.CV_32F, *axis) ** 2).sum(axis=2) for axis in ((1, 0), (0, 1)))
+
+
+def clean_alpha(
+    alpha: Float[np.ndarray, "h w"], rim_px: float | Float[np.ndarray, "h w"] = _LEAST_RIM_PX
+) -> Float[np.ndarray, "h w"]:
+    """Drop specks and pinholes; 1 inside and 0 outside except up to `rim_px` from the outline, where alpha stays soft.
 
     Gaps that are larger than noise (between arm and body) stay; parts cut off from the person stay when they are large.
     """
     body = _largest_parts(alpha > 0.5)
     body = ~_without_specks(~body, _HOLE_SHARE * body.sum())
-    outer, inner = _grown(body, _RIM_PX), ~_grown(~body, _RIM_PX)
+    outer, inner = _grown(body, rim_px), ~_grown(~body, rim_px)
     soft = np.where(body, np.maximum(alpha, 0.5), np.minimum(alpha, 0.5))
     return np.where(inner, 1.0, np.where(outer, soft, 0.0)).astype(np.float32)
 
@@ -230,7 +261,8 @@ def _recolour(
 def _gather(
     image: Float[np.ndarray, "h w 3"], weight: Float[np.ndarray, "h w"], small: tuple[int, int], radius: int
 ) -> _Cloud:
-    """Weighted mean and covariance of the colours in a square window around each point of a coarse grid.
+    """Weighted mean and covariance of the colours in a square window around each point of a coarse grid, and a little
+    of those in a wider one.
 
     small: the grid's columns and rows; radius: half of the window, in grid points. Colours are averaged over
     the grid's cells before they are multiplied: texture finer than a cell does not count as spread.
@@ -241,7 +273,11 @@ def _gather(
     colour = weighted / (share[..., None] + 1e-6)
 
     def windowed(values: np.ndarray) -> np.ndarray:
-        return cv2.blur(values, (2 * radius + 1, 2 * radius + 1), borderType=cv2.BORDER_CONSTANT)
+        near, far = (
+            cv2.blur(values, (2 * reach + 1, 2 * reach + 1), borderType=cv2.BORDER_CONSTANT)
+            for reach in (radius, _FAR * radius)
+        )
+        return near + np.float32(_FAR_SHARE) * far
 
     first, second = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
     total = windowed(share)
@@ -300,7 +336,7 @@ def _without_specks(mask: Bool[np.ndarray, "h w"], smallest_area_px: float) -> B
     return keep[labels]
 
 
-def _grown(mask: Bool[np.ndarray, "h w"], radius_px: float) -> Bool[np.ndarray, "h w"]:
+def _grown(mask: Bool[np.ndarray, "h w"], radius_px: float | Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """All pixels within a distance of the mask; by distance transform, which takes no longer for a larger radius."""
     if not mask.any():
         return mask.copy()
