@@ -99,12 +99,14 @@ def outline_blur_px(
         cv2.blur(line * _squared_gradient(picture), (side, side))
         for picture in (image, cv2.GaussianBlur(image, (0, 0), _REBLUR_PX))
     )
-    excess = np.maximum(sharp - soft, 1e-12)
+    excess = np.maximum(sharp - soft, 1e-6)
     return np.sqrt(np.maximum(_REBLUR_PX**2 * soft / excess - _OWN_BLUR, 0.0)).astype(np.float32)
 
 
 def _squared_gradient(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
-    return sum((cv2.Sobel(image, cv2.CV_32F, *axis) ** 2).sum(axis=2) for axis in ((1, 0), (0, 1)))
+    across, down = (cv2.Sobel(image, cv2.CV_32F, *axis) for axis in ((1, 0), (0, 1)))
+    squares = cv2.add(cv2.multiply(across, across), cv2.multiply(down, down))
+    return cv2.transform(squares, np.ones((1, 3), dtype=np.float32))
 
 
 def clean_alpha(

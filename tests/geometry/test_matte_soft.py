@@ -74,11 +74,13 @@ def test_blur_is_measured_whatever_the_contrast(blur_px: float, contrast: float)
     assert found == pytest.approx(blur_px, rel=0.2, abs=0.45)
 
 
-def test_a_picture_of_one_colour_has_no_blur() -> None:
-    image = np.full((64, 64, 3), 0.5, np.float32)
-    body = np.zeros((64, 64), bool)
+def test_there_is_no_blur_without_an_edge_nor_far_from_one() -> None:
+    body = np.zeros((160, 160), bool)
     body[20:40, 20:40] = True
-    assert matte.outline_blur_px(image, body, 12.0).max() == 0.0
+    plain = np.full((160, 160, 3), 0.5, np.float32)
+    assert matte.outline_blur_px(plain, body, 12.0).max() == 0.0
+    edged = matte.outline_blur_px(np.where(body[..., None], np.float32(0.9), plain), body, 12.0)
+    assert edged[60:].max() == edged[:, 60:].max() == 0.0
 
 
 @pytest.mark.parametrize(("kind", "error"), [("1.5", 0.025), ("3", 0.065), ("motion", 0.045)])
