@@ -250,7 +250,7 @@ def overlay(
 
 STAGE = Stage(
     "body",
-    version=9,
+    version=10,
     needs=("frames",),
     makes=(_BODY, _MOTION, _CAMERA, SCORES_NPZ, _OVERLAY),
     config=Config,

@@ -79,7 +79,8 @@ def test_there_is_no_blur_without_an_edge_nor_far_from_one() -> None:
     body[20:40, 20:40] = True
     plain = np.full((160, 160, 3), 0.5, np.float32)
     assert matte.outline_blur_px(plain, body, 12.0).max() == 0.0
-    edged = matte.outline_blur_px(np.where(body[..., None], np.float32(0.9), plain), body, 12.0)
+    soft_wall = cv2.GaussianBlur(np.random.default_rng(0).random((160, 160, 3), dtype=np.float32), (0, 0), 3.0)
+    edged = matte.outline_blur_px(np.where(body[..., None], np.float32(0.9), soft_wall), body, 12.0)
     assert edged[60:].max() == edged[:, 60:].max() == 0.0
 
 
