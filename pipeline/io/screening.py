@@ -4,7 +4,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from pipeline.avatar.person import ANKLES, TORSO, legs_in_image
 from pipeline.avatar.selection import frame_ranges
@@ -17,6 +17,8 @@ _BLACK_LEVEL = 8
 _FEET = (29, 30, 31, 32)
 # A shoe reaches this share of the image's height below the joints of heel and toe.
 _SOLE_SHARE = 0.02
+# Cosine between the spine, from shoulders to hips, and straight down, of somebody who stands.
+_LEAST_UPRIGHT = 0.5
 _UNSEEN_ARC_DEG = 120.0
 # Up to this height the person's pixels are of use to the default preset.
 _USEFUL_PERSON_PX = 640.0
@@ -28,7 +30,7 @@ _SCENE_PICTURES, _MOST_MOVED, _PERSON_MARGIN = 32, 0.1, 0.03
 def refuse_bad_input(sightings: Sightings, path: Path, min_frames: int) -> None:
     """Raise UserError for a recording from which no avatar can come.
 
-    That is one which is black, shows no person, several, one cut off, or one whose pose is not known.
+    That is one which is black, shows no person, several, one cut off or not upright, or one whose pose is not known.
     """
     if sightings.grays.max(axis=(1, 2)).max() < _BLACK_LEVEL:
         raise UserError(f"all frames of {path} are black; give a recording in which the person can be seen")
@@ -47,12 +49,18 @@ def refuse_bad_input(sightings: Sightings, path: Path, min_frames: int) -> None:
             f"a person was found in only {n_found} of {n_looked_at} frames of {path}; {min_frames} are needed"
         )
     known = np.isfinite(sightings.landmarks_px).all(axis=-1) & np.isfinite(sightings.landmarks_world_m).all(axis=-1)
-    n_torso = int((sightings.found & known[:, TORSO].all(axis=1)).sum())
+    is_torso_known = sightings.found & known[:, TORSO].all(axis=1)
+    n_torso = int(is_torso_known.sum())
     if n_torso < min_frames:
         raise UserError(
             f"hips and shoulders are known, in pixels and in 3D, in only {n_torso} of the {n_found} frames of {path} "
             f"that show a person; {min_frames} are needed: film the whole body unoccluded, and where landmarks.npz is "
             "supplied, complete it or remove it"
+        )
+    if not _stands_upright(sightings.landmarks_px[is_torso_known][:, TORSO]):
+        raise UserError(
+            f"the person in {path} lies on the side or stands upside down; turn the recording upright, a video for "
+            "example with ffmpeg -i IN.mp4 -vf transpose=1 OUT.mp4 (a quarter turn clockwise)"
         )
     judged = sightings.found & np.isfinite(sightings.landmarks_px[:, ANKLES, 1]).any(axis=1)
     legs = legs_in_image(sightings.landmarks_px[judged], sightings.landmarks_visibility[judged], sightings.height)
@@ -62,6 +70,13 @@ def refuse_bad_input(sightings: Sightings, path: Path, min_frames: int) -> None:
             f"the person in {path} is cut off above the feet in {np.sum(~legs)} of {len(legs)} frames "
             f"(frame {first} first); film the whole body from head to feet"
         )
+
+
+def _stands_upright(torso_px: Float[np.ndarray, "n 4 2"]) -> bool:
+    """True when the spine points up in at least half of the frames; shoulders come before hips."""
+    spine_px = torso_px[:, 2:].mean(axis=1) - torso_px[:, :2].mean(axis=1)
+    is_fallen = spine_px[:, 1] < _LEAST_UPRIGHT * np.linalg.norm(spine_px, axis=1)
+    return bool(is_fallen.mean() <= 0.5)
 
 
 def warn_of_gaps(sightings: Sightings, unseen_rad: float, path: Path) -> None:

@@ -61,6 +61,8 @@ def test_a_good_recording_passes_without_a_word(good):
         ("landmarks_px", (slice(0, 11), [27, 28], 1), 120.0, "cut off above the feet in 11 of 20 frames"),
         ("landmarks_visibility", (slice(3, 20), [27, 28]), 0.01, "cut off .* in 17 of 20 frames .frame 3 first"),
         ("landmarks_px", (slice(15, 20), 23), np.nan, "known, .* in only 15 of the 20 frames .* landmarks.npz"),
+        ("landmarks_px", (slice(0, 11), [23, 24], 0), 90.0, "lies on the side or stands upside down"),
+        ("landmarks_px", (slice(0, 11), [23, 24], 1), 10.0, "lies on the side or stands upside down"),
         ("landmarks_world_m", (slice(5, 20), 11, 2), np.nan, "known, in pixels and in 3D, in only 5 of the 20"),
     ],
 )
@@ -73,6 +75,8 @@ def test_what_makes_no_avatar_is_refused(good, name, where, value, message):
     ("name", "where", "value"),
     [
         ("n_people", 4, 2),
+        ("landmarks_px", (slice(None), [23, 24]), (65.0, 80.0)),
+        ("landmarks_px", (slice(0, 9), [23, 24], 0), 90.0),
         ("found", slice(17, None), False),
         ("landmarks_px", (slice(0, 9), [27, 28], 1), 120.0),
         ("landmarks_px", (slice(None), 27, 1), 120.0),
