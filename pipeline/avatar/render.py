@@ -14,6 +14,7 @@ from pipeline.avatar.occupancy import Occupancy
 from pipeline.avatar.warp import build_skin_grid, posed_from_world, skin_margin_m
 from pipeline.geometry.camera import Camera, pixel_rays, project
 from pipeline.kernels.composite import composite
+from pipeline.kernels.packing import owner_of_each
 from pipeline.kernels.reference.corners import corner_bits
 from pipeline.kernels.warp import SkinGrid
 
@@ -113,7 +114,7 @@ def _shade(
     count, device, step_m = len(origins), origins.device, poses.step_m
     frame, jitter = torch.full((count,), row, device=device), torch.full((count,), 0.5, device=device)
     samples = poses.inverse.sample(Rays(origins, directions, frame, jitter), step_m, occupancy, MAX_SAMPLES)
-    ray = torch.repeat_interleave(torch.arange(count, device=device), samples.ray_start.diff())
+    ray = owner_of_each(samples.ray_start.diff())
     waiting, reached = torch.arange(len(ray), device=device), 0
     rank = waiting - samples.ray_start[ray]
     colour, density = torch.zeros(len(ray), 3, device=device), torch.zeros(len(ray), device=device)

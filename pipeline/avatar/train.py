@@ -21,13 +21,14 @@ from pipeline.geometry.camera import Camera, pixel_rays
 from pipeline.kernels.adam import adam_step_
 from pipeline.kernels.composite import composite
 from pipeline.kernels.march import Samples
+from pipeline.kernels.packing import owner_of_each
 from pipeline.kernels.visits import light_before
 from pipeline.kernels.warp import SkinGrid
 
 WARM_UP = 20
 MAX_BAD_STEPS = 20
-REBAKES = (0.5, 0.75)
-"""Parts of the training at which the warp grids follow the refined poses."""
+REBAKES = (0.6,)
+"""Parts of the training at which the warp grids follow the refined poses (docs/decisions.md)."""
 MAX_SAMPLES = 160
 """Of a ray; those farther back are dropped."""
 LOOK_EVERYWHERE = 8
@@ -140,8 +141,7 @@ class Learning:
             return samples.canonical_m
         to_world = self.poses.canonical_to_world(batch.frames)
         poses = self.posed_from_world[batch.frames][:, None] @ to_world
-        counts = samples.ray_start.diff()
-        ray = torch.repeat_interleave(torch.arange(len(counts), device=self.device), counts)
+        ray = owner_of_each(samples.ray_start.diff())
         # Rows by index_select: plain indexing takes three times as long for tensors of this size.
         offset = samples.distance_m[:, None] * batch.directions.index_select(0, ray)
         posed = batch.origins_m.index_select(0, ray) + offset

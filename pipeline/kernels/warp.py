@@ -21,6 +21,7 @@ from torch import Tensor
 from pipeline.kernels import warp_cpu
 from pipeline.kernels.blend import SparseWeights, blend
 from pipeline.kernels.dispatch import runs_on_numba
+from pipeline.kernels.packing import owner_of_each
 from pipeline.kernels.reference import warp as reference
 from pipeline.kernels.reference.warp import Lattice
 
@@ -119,7 +120,7 @@ def bake(skin: SkinGrid, canonical_to_posed: Float[Tensor, "j 4 4"]) -> WarpGrid
 class _Newton(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, blended: Tensor, start: Tensor, posed: Tensor, slot_start: Tensor, skin: SkinGrid) -> Tensor:
-        slot = torch.repeat_interleave(torch.arange(blended.shape[1]), slot_start.diff())
+        slot = owner_of_each(slot_start.diff())
         refined, inverse_jacobian = torch.empty_like(start), start.new_empty(len(start), 9)
         grid = (skin.origin_m.numpy(), np.float32(skin.cell_m), skin.row_of_node.numpy())
         arrays = (posed.numpy(), start.numpy(), slot.numpy())

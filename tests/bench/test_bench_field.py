@@ -64,11 +64,11 @@ def test_the_seams_are_as_they_were_afterwards():
 
 
 def test_a_rebake_counts_for_no_part_of_a_step(monkeypatch):
-    """Step 20 of 40 begins with one; by this clock nothing else takes time."""
+    """Step 24 of 40 begins with one; by this clock nothing else takes time."""
     learning, now_s = begin_painted(TINY), [0.0]
     monkeypatch.setattr(Learning, "_bake", lambda _: now_s.append(now_s[-1] + 1000.0))
     clock = Clock(lambda: now_s[-1])
-    learning.done = 20
+    learning.done = 24
     with watched(clock):
         learning.step()
     taken = clock.take()
