@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.avatar.frequency import FrequencyTrunk
-from pipeline.kernels.hashgrid import GridLayout, encode
+from pipeline.kernels.hashgrid import GridLayout, Towards, encode
 
 NO_GRID = GridLayout((), 1, 0)
 
@@ -114,11 +114,11 @@ class Field(torch.nn.Module):
         self.bias = torch.nn.Parameter(torch.zeros(4))
 
     def radiance(
-        self, x_canonical_m: Float[Tensor, "n 3"], table_gradient: Tensor | None = None
+        self, x_canonical_m: Float[Tensor, "n 3"], towards: Towards | None = None
     ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
-        """Colour and density without the cut at the bounds; for training. `table_gradient`: see `encode`."""
+        """Colour and density without the cut at the bounds; for training. `towards`: see `encode`."""
         unit = (x_canonical_m - self.bounds_m[0]) / (self.bounds_m[1] - self.bounds_m[0])
-        features = self.trunk(unit) if self.trunk else encode(unit, self.table, self.layout, table_gradient)
+        features = self.trunk(unit) if self.trunk else encode(unit, self.table, self.layout, towards)
         return _Decode.apply(features, self.hidden, self.output, self.bias)
 
     def forward(self, x_canonical: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:

@@ -30,28 +30,30 @@ def colour_errors(
     rgba: Float[Tensor, "n 4"],
     background: Float[Tensor, "n 3"],
 ) -> Float[Tensor, "n 3"]:
-    """What is shown less what was filmed, the same background behind both; arguments as in `field_losses`."""
+    """What is shown less what was filmed, the same background behind both.
+
+    image: premultiplied colour. rgba: straight colour and mask of the pixels. background: random for each ray, so that
+    no colour can pass for transparency.
+    """
     mask = rgba[:, 3:]
     target = rgba[:, :3] * mask + background * (1 - mask)
     return image + background * (1 - alpha[:, None]) - target
 
 
 def field_losses(
-    image: Float[Tensor, "n 3"],
+    colour_error: Float[Tensor, "n 3"],
     alpha: Float[Tensor, "n"],
+    mask: Float[Tensor, "n"],
     empty_density_per_m: Float[Tensor, "e"],
-    rgba: Float[Tensor, "n 4"],
-    background: Float[Tensor, "n 3"],
     config: FieldConfig,
 ) -> dict[str, Tensor]:
-    """Weighted losses of one batch of rays.
+    """Weighted losses of one batch of rays, means over its rays (`density`: over the points that should be empty).
 
-    image: premultiplied colour. rgba: straight colour and mask of the pixels. background: laid behind both, random
-    for each ray, so that no colour can pass for transparency.
+    colour_error: as `colour_errors` has it.
     """
     losses = {
-        "colour": huber(colour_errors(image, alpha, rgba, background), config.huber_delta).mean(),
-        "alpha": config.weight_alpha * huber(alpha - rgba[:, 3], config.huber_delta).mean(),
+        "colour": huber(colour_error, config.huber_delta).mean(),
+        "alpha": config.weight_alpha * huber(alpha - mask, config.huber_delta).mean(),
         "hard": config.weight_hard * hard_surface(alpha).mean(),
     }
     if len(empty_density_per_m):

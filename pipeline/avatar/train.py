@@ -1,7 +1,10 @@
 """Learning the canonical field from a video: one step, and all that it changes."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -13,17 +16,19 @@ from pipeline.avatar.field import Field
 from pipeline.avatar.field_config import FieldConfig
 from pipeline.avatar.inverse import Rays, invert_motion
 from pipeline.avatar.losses import colour_errors, field_losses
-from pipeline.avatar.occupancy import OccupancyUpdate
+from pipeline.avatar.occupancy import Occupancy, OccupancyUpdate
 from pipeline.avatar.pose import PoseCorrection
 from pipeline.avatar.rays import ErrorMap, PixelPool
 from pipeline.avatar.warp import posed_from_world
 from pipeline.geometry.camera import Camera, pixel_rays
 from pipeline.kernels.adam import adam_step_
 from pipeline.kernels.composite import composite
+from pipeline.kernels.hashgrid import Towards, add_table_gradient_
 from pipeline.kernels.march import Samples
 from pipeline.kernels.packing import owner_of_each
 from pipeline.kernels.visits import light_before
 from pipeline.kernels.warp import SkinGrid
+from pipeline.kernels.workers import Workers
 
 WARM_UP = 20
 MAX_BAD_STEPS = 20
@@ -33,6 +38,8 @@ MAX_SAMPLES = 160
 """Of a ray; those farther back are dropped."""
 LOOK_EVERYWHERE = 8
 """Every so many steps rays stop in unlit cells too, so that these may come to light again."""
+PARTS = 2
+"""On the CPU a step's rays are divided into so many parts, which threads work at, whatever the number of threads."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +66,50 @@ class Batch:
     background: Float[Tensor, "n 3"]
     jitter: Float[Tensor, "n"]
 
+    def parts(self, count: int) -> "list[Batch]":
+        """Cut between frames into `count` parts of about as many frames, or one a frame where these are fewer."""
+        frames = len(self.frames)
+        count = min(count, frames)
+        if count == 1:
+            return [self]
+        slots = [frames * part // count for part in range(count + 1)]
+        rays = torch.searchsorted(self.slot, torch.tensor(slots, device=self.slot.device)).tolist()
+        return [
+            Batch(
+                self.frames[first_slot:last_slot],
+                self.slot[first:last] - first_slot,
+                self.rows[first:last],
+                *(x[first:last] for x in (self.origins_m, self.directions, self.rgba, self.background, self.jitter)),
+            )
+            for (first_slot, last_slot), (first, last) in zip(pairwise(slots), pairwise(rays), strict=True)
+        ]
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What learning comes to for a part of a batch; losses and gradients are its share of the whole batch's.
+
+    gradients: by parameter, without those that have none. towards: what the table's is made of, where that is not
+    among them.
+    """
+
+    samples: Samples
+    weights: Float[Tensor, "s"]
+    light: Float[Tensor, "s"]
+    colour_error: Float[Tensor, "n 3"]
+    losses: dict[str, Tensor]
+    gradients: dict[str, Tensor]
+    towards: Towards
+
+
+def summed(parts: Iterable[dict[str, Tensor]]) -> dict[str, Tensor]:
+    """What several parts say under the same names, added up in their order."""
+    total: dict[str, Tensor] = {}
+    for part in parts:
+        for name, value in part.items():
+            total[name] = total[name] + value if name in total else value
+    return total
+
 
 class DivergedError(ArithmeticError):
     """Many steps in a row had no finite loss."""
@@ -80,6 +131,8 @@ class Learning:
         self.bad_steps = 0
         self.errors = ErrorMap(scene.pool.frames, scene.pool.xy_px)
         self.table_gradient = torch.zeros_like(field.table)
+        self.part_count = PARTS if self.device.type == "cpu" else 1
+        self.workers = Workers(self.part_count)
         parameters: dict[str, Tensor] = dict(field.named_parameters())
         parameters |= {"rotation_rad": self.poses.rotation_rad, "shift_m": self.poses.shift_m}
         self.parameters = parameters
@@ -169,38 +222,70 @@ class Learning:
             self._bake()
         if self.refines_poses and self.skin is self.whole_skin:
             self._follow_occupancy()
-        batch = self._draw(random)
+        batch, empty_m = self._draw(random), self._empty_points(random)
         look_everywhere = self.done % LOOK_EVERYWHERE == 0 or self.done < config.occupancy_start
         grid = self.occupancy.grid() if look_everywhere else self.occupancy.lit_grid()
-        rays = Rays(batch.origins_m, batch.directions, batch.frames[batch.slot], batch.jitter)
-        samples = self.inverse.sample(rays, self.step_m, grid, MAX_SAMPLES)
-        count = len(samples.distance_m)
-        points = torch.cat([self._place(batch, samples), self._empty_points(random)])
-        colour, density = self.field.radiance(points, self.table_gradient)
-        step_m = torch.full((count,), self.step_m, device=self.device)
-        image, alpha, weights = composite(density[:count], colour[:count], step_m, samples.ray_start)
-        losses = field_losses(image, alpha, density[count:], batch.rgba, batch.background, config)
-        total = torch.stack(list(losses.values())).sum()
+        parts = batch.parts(self.part_count)
+        empty = empty_m.tensor_split(len(parts))
+        ray_share = [len(part.rows) / len(batch.rows) for part in parts]
+        empty_share = [len(points) / max(len(empty_m), 1) for points in empty]
+        answers = self.workers.map(partial(self._answer, grid), parts, empty, ray_share, empty_share)
+        losses = summed(answer.losses for answer in answers)
+        total, gradients = torch.stack(list(losses.values())).sum(), [answer.gradients for answer in answers]
         if self.refines_poses:
-            total = total + config.pose_smoothness * self.poses.roughness() + config.pose_size * self.poses.size()
-        total.backward()
+            effort = config.pose_smoothness * self.poses.roughness() + config.pose_size * self.poses.size()
+            gradients.append(self._gradients(effort, ("rotation_rad", "shift_m")))
+            total = total + effort.detach()
         finite = bool(torch.isfinite(total))
-        self._update_parameters(finite)
         if finite:
-            self._note_errors(batch, image.detach(), alpha.detach())
-            self.occupancy.record(samples.canonical_m, light_before(weights, samples.ray_start), weights)
+            for part, answer in zip(parts, answers, strict=True):
+                add_table_gradient_(self.table_gradient, answer.towards, self.field.layout)
+                self._note_errors(part, answer.colour_error)
+                self.occupancy.record(answer.samples.canonical_m, answer.light, answer.weights)
+        self._update_parameters(finite, summed(gradients))
         self.done += 1
         if self.done % config.occupancy_every == 0 and self.done >= config.occupancy_start:
             self.occupancy.update(self.field.density, self.step_m, config.occupancy_threshold, random)
             self._follow_occupancy()
-        return {name: float(loss.detach()) for name, loss in losses.items()} | {"samples": float(count)}
+        samples = sum(len(answer.samples.distance_m) for answer in answers)
+        return {name: float(loss) for name, loss in losses.items()} | {"samples": float(samples)}
 
-    def _note_errors(self, batch: Batch, image: Tensor, alpha: Tensor) -> None:
+    def _answer(
+        self, grid: Occupancy, part: Batch, empty_m: Float[Tensor, "e 3"], ray_share: float, empty_share: float
+    ) -> Answer:
+        """Learn from some rays and points that should be empty. Changes nothing, so threads may do it at once."""
+        rays = Rays(part.origins_m, part.directions, part.frames[part.slot], part.jitter)
+        samples = self.inverse.sample(rays, self.step_m, grid, MAX_SAMPLES)
+        count, towards = len(samples.distance_m), Towards()
+        points = torch.cat([self._place(part, samples), empty_m])
+        colour, density = self.field.radiance(points, towards)
+        step_m = torch.full((count,), self.step_m, device=self.device)
+        image, alpha, weights = composite(density[:count], colour[:count], step_m, samples.ray_start)
+        error = colour_errors(image, alpha, part.rgba, part.background)
+        losses = field_losses(error, alpha, part.rgba[:, 3], density[count:], self.config)
+        losses = {name: (empty_share if name == "density" else ray_share) * loss for name, loss in losses.items()}
+        gradients = self._gradients(torch.stack(list(losses.values())).sum(), tuple(self.parameters))
+        return Answer(
+            samples,
+            weights.detach(),
+            light_before(weights, samples.ray_start),
+            error.detach(),
+            {name: loss.detach() for name, loss in losses.items()},
+            gradients,
+            towards,
+        )
+
+    def _gradients(self, loss: Tensor, names: tuple[str, ...]) -> dict[str, Tensor]:
+        """Of the parameters that the loss depends on and whose gradient autograd is told."""
+        found = torch.autograd.grad(loss, [self.parameters[name] for name in names], allow_unused=True)
+        return {name: gradient for name, gradient in zip(names, found, strict=True) if gradient is not None}
+
+    def _note_errors(self, part: Batch, colour_error: Float[Tensor, "n 3"]) -> None:
         """Remember where colours are wrong, for the rays of later steps."""
         if self.config.share_error > 0.0:
-            error = colour_errors(image, alpha, batch.rgba, batch.background).abs().mean(1)
-            frame = batch.frames.index_select(0, batch.slot).cpu().numpy()
-            self.errors.note(frame, self.scene.pool.xy_px[batch.rows], error.cpu().numpy())
+            frame = part.frames.index_select(0, part.slot).cpu().numpy()
+            error = colour_error.abs().mean(1).cpu().numpy()
+            self.errors.note(frame, self.scene.pool.xy_px[part.rows], error)
 
     def _rate(self) -> float:
         """Part of the full learning rate: a short warm-up, then an exponential decay that ends at `final_rate`."""
@@ -211,25 +296,24 @@ class Learning:
         begun = self.config.pose_start * self.config.steps
         return 0.1 ** ((self.done - begun) / max(self.config.steps - begun, 1))
 
-    def _update_parameters(self, finite: bool) -> None:
+    def _update_parameters(self, finite: bool, gradients: dict[str, Tensor]) -> None:
         self.bad_steps = 0 if finite else self.bad_steps + 1
         if self.bad_steps >= MAX_BAD_STEPS:
             raise DivergedError(f"no finite loss in {MAX_BAD_STEPS} steps up to step {self.done}")
+        if not finite:
+            return
         config = self.config
         rates = {"table": config.table_rate, "rotation_rad": config.pose_rate, "shift_m": config.pose_rate / 3}
-        for name, parameter in self.parameters.items():
-            # The compiled encoding fills a buffer of ours; its plain twin, for other devices, fills autograd's.
-            gradient = self.table_gradient if name == "table" and parameter.grad is None else parameter.grad
-            if gradient is None:
-                continue
-            if not finite:
-                gradient.zero_()
-                continue
+        # The compiled encoding fills a buffer of ours; its plain twin, for other devices, fills autograd's.
+        if "table" in self.parameters and "table" not in gradients:
+            gradients = {"table": self.table_gradient} | gradients
+        for name, gradient in gradients.items():
             is_pose = name in ("rotation_rad", "shift_m")
             begun = math.ceil(config.pose_start * config.steps) if is_pose else 0
             updates = self.done + 1 - begun
             rate = rates.get(name, config.network_rate) * (self._pose_rate() if is_pose else self._rate())
-            adam_step_(parameter, gradient, *self.moments[name], updates, rate, epsilon=1e-15)
+            moments = self.moments[name]
+            adam_step_(self.parameters[name], gradient.contiguous(), *moments, updates, rate, epsilon=1e-15)
 
     def state(self) -> dict[str, Tensor]:
         """Everything that a resumed run needs."""

@@ -75,50 +75,63 @@ class GridLayout:
         return np.array(plan, dtype=np.int64)
 
 
+Towards = list[tuple[Tensor, Tensor]]
+"""Points (n, 3) and what moves their features (n, l*f), of one backward pass after the other."""
+
+
 class _Encode(torch.autograd.Function):
-    """float32 on the CPU. `table_gradient`, if given, takes the table's gradient in autograd's place."""
+    """float32 on the CPU. `towards`, if given, takes what the table's gradient is made of in autograd's place."""
 
     @staticmethod
-    def forward(ctx: Any, points: Tensor, table: Tensor, layout: GridLayout, table_gradient: Tensor | None) -> Tensor:
+    def forward(ctx: Any, points: Tensor, table: Tensor, layout: GridLayout, towards: Towards | None) -> Tensor:
         features = torch.empty(len(points), layout.width)
         arrays = (points.numpy(), table.detach().numpy(), layout.plan, features.numpy())
         hashgrid_cpu.encode(*arrays, layout.lanes)
         ctx.save_for_backward(points, table)
-        ctx.layout, ctx.table_gradient = layout, table_gradient
+        ctx.layout, ctx.towards = layout, towards
         return features
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         points, table = (saved.detach() for saved in ctx.saved_tensors)
-        layout, sums = ctx.layout, ctx.table_gradient
+        layout, towards = ctx.layout, ctx.towards
         moved = torch.from_numpy(hashgrid_cpu.rows_that_are_not_zero(gradient.contiguous().numpy()))
-        towards, places = gradient.index_select(0, moved).numpy(), points.index_select(0, moved)
+        slope, places = gradient.index_select(0, moved), points.index_select(0, moved)
         points_gradient = None
         if ctx.needs_input_grad[0]:
             found = torch.zeros_like(places)
-            hashgrid_cpu.add_points_gradient(
-                places.numpy(), table.numpy(), layout.plan, towards, found.numpy(), layout.lanes
-            )
+            arrays = (places.numpy(), table.numpy(), layout.plan, slope.numpy(), found.numpy())
+            hashgrid_cpu.add_points_gradient(*arrays, layout.lanes)
             points_gradient = torch.zeros_like(points).index_copy_(0, moved, found)
         if not ctx.needs_input_grad[1]:
             return points_gradient, None, None, None
-        target = torch.zeros_like(table) if sums is None else sums
-        hashgrid_cpu.add_table_gradient(places.numpy(), layout.plan, towards, target.numpy(), layout.lanes)
-        return points_gradient, target if sums is None else None, None, None
+        if towards is not None:
+            towards.append((places, slope))
+            return points_gradient, None, None, None
+        table_gradient = torch.zeros_like(table)
+        add_table_gradient_(table_gradient, [(places, slope)], layout)
+        return points_gradient, table_gradient, None, None
 
 
 def encode(
     points_unit: Float[Tensor, "n 3"],
     table: Float[Tensor, "rows f"],
     layout: GridLayout,
-    table_gradient: Float[Tensor, "rows f"] | None = None,
+    towards: Towards | None = None,
 ) -> Float[Tensor, "n width"]:
     """Features of points in the unit box, level after level; differentiable in the points and the table.
 
-    Points outside [0, 1] are read at the nearest point of the box. With `table_gradient` (numba only), backward adds
-    the table's gradient to that buffer and autograd gets none: a training step then neither allocates nor clears a
-    table.
+    Points outside [0, 1] are read at the nearest point of the box. With `towards` (numba only), backward appends there
+    what `add_table_gradient_` needs, and autograd gets no gradient of the table: a training step then neither allocates
+    nor clears a table, and threads that go back at the same time do not write to one.
     """
     if not runs_on_numba(points_unit, table):
         return reference.encode(points_unit, table, layout.plan)
-    return _Encode.apply(points_unit.contiguous(), table, layout, table_gradient)
+    return _Encode.apply(points_unit.contiguous(), table, layout, towards)
+
+
+def add_table_gradient_(table_gradient: Float[Tensor, "rows f"], towards: Towards, layout: GridLayout) -> None:
+    """Add the table's gradient of these backward passes, in their order."""
+    for points, slope in towards:
+        arrays = (points.numpy(), layout.plan, slope.numpy(), table_gradient.numpy())
+        hashgrid_cpu.add_table_gradient(*arrays, layout.lanes)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from pipeline.avatar.field_config import FieldConfig
-from pipeline.avatar.losses import field_losses, hard_surface, huber
+from pipeline.avatar.losses import colour_errors, field_losses, hard_surface, huber
 from pipeline.avatar.rays import build_pool
 
 CONFIG = FieldConfig(huber_delta=0.1, weight_alpha=0.5, weight_hard=0.2, weight_density=0.1)
@@ -28,14 +28,16 @@ def test_hard_surface_is_zero_at_both_ends_and_largest_between():
 def test_perfect_image_costs_nothing():
     rgba = torch.tensor([[0.2, 0.4, 0.6, 1.0], [0.9, 0.1, 0.5, 0.0]])
     solid = rgba[:, :3] * rgba[:, 3:]
-    losses = field_losses(solid, rgba[:, 3], torch.zeros(5), rgba, torch.rand(2, 3), CONFIG)
+    error = colour_errors(solid, rgba[:, 3], rgba, torch.rand(2, 3))
+    losses = field_losses(error, rgba[:, 3], rgba[:, 3], torch.zeros(5), CONFIG)
     for name, value in losses.items():
         assert float(value) == pytest.approx(0, abs=1e-6), name
 
 
 def test_a_hole_in_the_body_costs_whatever_its_colour_and_background():
     rgba = torch.tensor([[1.0, 1.0, 1.0, 1.0]])
-    losses = field_losses(torch.zeros(1, 3), torch.zeros(1), torch.zeros(0), rgba, torch.ones(1, 3), CONFIG)
+    error = colour_errors(torch.zeros(1, 3), torch.zeros(1), rgba, torch.ones(1, 3))
+    losses = field_losses(error, torch.zeros(1), rgba[:, 3], torch.zeros(0), CONFIG)
     assert float(losses["colour"]) == 0
     assert float(losses["alpha"]) == pytest.approx(0.5 * 0.95)
     assert "density" not in losses

@@ -111,6 +111,42 @@ def test_poses_move_once_they_are_refined_and_samples_follow_them(scene):
     assert float((there - still).detach().norm(dim=1).median()) == pytest.approx(0.01 * 3**0.5, rel=0.3)
 
 
+@pytest.mark.parametrize("frames_per_step", [3, 1])
+def test_a_step_in_parts_comes_to_that_of_the_whole(scene, monkeypatch, frames_per_step):
+    options = {"pose_start": 0.0, "occupancy_start": 4, "share_error": 0.6, "frames_per_step": frames_per_step}
+    found = []
+    for count in (1, 2):
+        learning = begin(scene, steps=40, **options)
+        for _ in range(6):
+            learning.step()
+        learning.part_count, gradients = count, {}
+        monkeypatch.setattr(learning, "_update_parameters", lambda _, named, into=gradients: into.update(named))
+        losses = learning.step()
+        gradients["table"] = learning.table_gradient
+        found.append((losses, gradients, learning.occupancy.reached, learning.errors.error))
+    (losses, gradients, reached, errors), (part_losses, part_gradients, part_reached, part_errors) = found
+    assert part_losses == pytest.approx(losses, rel=1e-5)
+    assert set(gradients) == set(part_gradients) == {"table", "hidden", "output", "bias", "rotation_rad", "shift_m"}
+    for name, gradient in gradients.items():
+        # Points that hardly matter get no gradient: which, is told by the mean of their own part.
+        assert (part_gradients[name] - gradient).norm() < 0.01 * gradient.norm(), name
+    assert torch.equal(reached, part_reached)
+    np.testing.assert_allclose(errors, part_errors, rtol=1e-5)
+
+
+def test_the_number_of_threads_changes_no_byte(scene, monkeypatch):
+    states = []
+    for threads in (1, 2):
+        monkeypatch.setattr(torch, "get_num_threads", lambda count=threads: count)
+        learning = begin(scene, steps=40, pose_start=0.25, occupancy_start=8)
+        assert (learning.workers._pool is None) == (threads == 1)
+        for _ in range(16):
+            learning.step()
+        states.append(learning.state())
+    for name, value in states[0].items():
+        assert torch.equal(value, states[1][name]), name
+
+
 def march_of(learning, batch):
     grid = learning.occupancy.grid()
     frames = batch.frames[batch.slot]

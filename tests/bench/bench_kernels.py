@@ -18,7 +18,7 @@ from pipeline.avatar.field import Field, choose_layout
 from pipeline.avatar.field_config import FieldConfig
 from pipeline.kernels.adam import adam_step_
 from pipeline.kernels.composite import composite
-from pipeline.kernels.hashgrid import encode
+from pipeline.kernels.hashgrid import Towards, add_table_gradient_, encode
 from pipeline.kernels.march import WarpSet, march
 from pipeline.kernels.warp import bake, newton
 from tests.bench.machine import keep, median_ms, memory_gb_s, multiply_gflop_s
@@ -44,11 +44,11 @@ def field_parts(config: FieldConfig, repeats: int) -> dict[str, float]:
     layout = choose_layout(BOUNDS, 0.003, config.levels, config.features, config.log2_rows)
     field = Field(BOUNDS, layout, config.hidden_width)
     points, sums = ray_points(random), torch.zeros_like(field.table)
-    features = encode(points, field.table, layout, sums)
+    features = encode(points, field.table, layout)
     towards = torch.randn(features.shape, generator=random)
     low, high = field.bounds_m
     placed = points * (high - low) + low
-    colour, density = field.radiance(placed, sums)
+    colour, density = field.radiance(placed)
     ray_start = torch.arange(0, len(points) + 1, SAMPLES_A_RAY)
     step_m = torch.full((len(points),), 0.004)
 
@@ -58,16 +58,22 @@ def field_parts(config: FieldConfig, repeats: int) -> dict[str, float]:
         (image.sum() + alpha.sum()).backward()
 
     def whole() -> None:
-        rgb, sigma = field.radiance(placed, sums)
+        passed: Towards = []
+        rgb, sigma = field.radiance(placed, passed)
         (rgb.sum() + sigma.sum()).backward()
+        add_table_gradient_(sums, passed, layout)
+
+    def back() -> None:
+        passed: Towards = []
+        encode(points, field.table, layout, passed).backward(towards)
+        add_table_gradient_(sums, passed, layout)
 
     moments = torch.zeros_like(field.table), torch.zeros_like(field.table)
     with torch.no_grad():
-        forward = median_ms(lambda: encode(points, field.table, layout, sums), repeats)
+        forward = median_ms(lambda: encode(points, field.table, layout), repeats)
     return {
         "encode_forward_ms": forward,
-        "encode_backward_ms": median_ms(lambda: encode(points, field.table, layout, sums).backward(towards), repeats)
-        - forward,
+        "encode_backward_ms": median_ms(back, repeats) - forward,
         "field_forward_backward_ms": median_ms(whole, repeats),
         "composite_ms": median_ms(shade, repeats),
         "adam_ms": median_ms(lambda: adam_step_(field.table, sums, *moments, 1, 1e-3), repeats),

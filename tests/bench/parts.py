@@ -1,16 +1,15 @@
 """Where the time of a training step goes: a clock at the seams of stage one, which stays as it is."""
 
 import inspect
+import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial, wraps
 from typing import Any
 from unittest import mock
-
-import torch
 
 from pipeline.avatar import train
 from pipeline.avatar.field import _Decode
@@ -21,6 +20,7 @@ from pipeline.kernels import hashgrid_cpu
 from pipeline.kernels.composite import _Composite
 from pipeline.kernels.hashgrid import _Encode
 from pipeline.kernels.warp import _Newton
+from pipeline.kernels.workers import Workers
 
 OTHER = "other"
 UPDATE = "occupancy_update"
@@ -42,7 +42,7 @@ SEAMS: tuple[tuple[str, Any, str], ...] = (
     ("table_backward", hashgrid_cpu, "add_table_gradient"),
     ("positions_backward", hashgrid_cpu, "add_points_gradient"),
     ("positions_backward", _Newton, "backward"),
-    ("rest_backward", torch.Tensor, "backward"),
+    ("rest_backward", Learning, "_gradients"),
     ("adam", train, "adam_step_"),
     ("occupancy_record", train, "light_before"),
     ("occupancy_record", OccupancyUpdate, "record"),
@@ -51,43 +51,87 @@ SEAMS: tuple[tuple[str, Any, str], ...] = (
 )
 
 
+@dataclass
+class Tally:
+    """What one thread has done: seconds of each part, those that run now, the innermost last, and since when."""
+
+    seconds: dict[str, float] = field(default_factory=partial(defaultdict, float))
+    running: list[str] = field(default_factory=list)
+    since: float = 0.0
+
+
 class Clock:
     """Seconds of each part. A moment counts for the innermost part that runs; only an update of the occupancy keeps the
-    time of the kernels that it calls.
+    time of the kernels that it calls. What threads do at the same time shares the time that this takes.
     """
 
     def __init__(self, now: Callable[[], float] = time.perf_counter) -> None:
-        self._now, self._since = now, 0.0
-        self._running: list[str] = []
-        self._seconds: dict[str, float] = defaultdict(float)
+        self._now, self._of_thread = now, threading.local()
+        self._tally = Tally()
+
+    @property
+    def _tally(self) -> Tally:
+        return self._of_thread.tally
+
+    @_tally.setter
+    def _tally(self, tally: Tally) -> None:
+        self._of_thread.tally = tally
 
     def timed(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
         """The function, its time counted as that of `part`."""
 
         @wraps(function)
         def run(*arguments: Any, **named: Any) -> Any:
-            if self._running and self._running[-1] == UPDATE:
+            if self._tally.running and self._tally.running[-1] == UPDATE:
                 return function(*arguments, **named)
             self._turn()
-            self._running.append(part)
+            self._tally.running.append(part)
             try:
                 return function(*arguments, **named)
             finally:
                 self._turn()
-                self._running.pop()
+                self._tally.running.pop()
+
+        return run
+
+    def shared(self, part: str, map_jobs: Callable[..., Any]) -> Callable[..., Any]:
+        """`Workers.map`, each job begun as `part`. Its whole time is divided as the jobs' own times are."""
+
+        @wraps(map_jobs)
+        def run(workers: Any, function: Callable[..., Any], *arguments: Any) -> Any:
+            tallies: list[Tally] = []
+
+            def job(*of_job: Any) -> Any:
+                outside = getattr(self._of_thread, "tally", None)
+                self._tally = Tally()
+                tallies.append(self._tally)
+                try:
+                    return self.timed(part, function)(*of_job)
+                finally:
+                    self._tally = outside or Tally()
+
+            self._turn()
+            begun = self._tally.since
+            answers = map_jobs(workers, job, *arguments)
+            self._tally.since = self._now()
+            own = sum(sum(tally.seconds.values()) for tally in tallies)
+            for tally in tallies:
+                for name, seconds in tally.seconds.items():
+                    self._tally.seconds[name] += seconds * (self._tally.since - begun) / (own or 1.0)
+            return answers
 
         return run
 
     def take(self) -> dict[str, float]:
-        """Seconds of each part since the last call."""
-        taken, self._seconds = self._seconds, defaultdict(float)
+        """Seconds of each part since the last call, in the thread that steps."""
+        taken, self._tally.seconds = self._tally.seconds, defaultdict(float)
         return taken
 
     def _turn(self) -> None:
-        now = self._now()
-        if self._running:
-            self._seconds[self._running[-1]] += now - self._since
-        self._since = now
+        tally, now = self._tally, self._now()
+        if tally.running:
+            tally.seconds[tally.running[-1]] += now - tally.since
+        tally.since = now
 
 
 @contextmanager
@@ -103,6 +147,7 @@ def watched(clock: Clock) -> Iterator[None]:
         for part, owner, name in SEAMS:
             wrap(owner, name, partial(clock.timed, part))
         wrap(train, "invert_motion", partial(_timed_march, clock))
+        wrap(Workers, "map", partial(clock.shared, OTHER))
         yield
 
 

@@ -1,4 +1,5 @@
 import json
+import threading
 from functools import partial
 
 import numpy as np
@@ -89,6 +90,35 @@ def test_a_clock_counts_each_moment_once():
     clock.timed("occupancy_update", inner)()
     assert clock.take() == {"occupancy_update": 1}
     assert clock.take() == {}
+
+
+def test_what_is_done_at_the_same_time_shares_the_time_that_it_takes():
+    """Two jobs whose own times are 3 and 1 and of which "inner" takes 1 and 1, in a time of 2 by the step's clock."""
+    now, thread_now = [10.0], threading.local()
+    clock = Clock(lambda: getattr(thread_now, "s", now[0]))
+
+    def advance(seconds):
+        thread_now.s += seconds
+
+    inner = clock.timed("inner", lambda: advance(1.0))
+
+    def job(before_s):
+        advance(before_s)
+        inner()
+
+    def map_jobs(_, function, times):
+        threads = [threading.Thread(target=begin, args=(function, seconds)) for seconds in times]
+        for thread in threads:
+            thread.start()
+            thread.join()
+        now[0] += 2.0
+
+    def begin(function, seconds):
+        thread_now.s = 0.0
+        function(seconds)
+
+    clock.timed("step", lambda: clock.shared("outer", map_jobs)(None, job, [2.0, 0.0]))()
+    assert clock.take() == {"step": 0.0, "outer": 2.0 * 2 / 4, "inner": 2.0 * 2 / 4}
 
 
 def test_a_part_that_fails_is_counted_and_left():

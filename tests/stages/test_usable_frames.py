@@ -7,7 +7,8 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from pipeline.io.capture import Capture
+from pipeline.io import capture
+from pipeline.io.capture import image_path
 from pipeline.io.npz import save_motion, save_npz
 from pipeline.io.scores import SCORES_NPZ
 from tests.avatar.scene import painted_scene
@@ -49,13 +50,15 @@ def test_no_stage_learns_from_a_wrecked_frame_or_loses_a_validation_frame(
     after_reading: str,
 ) -> None:
     read: set[int] = set()
-    image, module = Capture.image, import_module(f"stages.{stage}")
+    module = import_module(f"stages.{stage}")
 
-    def noted(capture: Capture, position: int) -> np.ndarray:
-        read.add(int(position))
-        return image(capture, position)
+    def noted(folder: Path, frame_index: int) -> Path:
+        read.add(int(frame_index))
+        return image_path(folder, frame_index)
 
-    monkeypatch.setattr(Capture, "image", noted)
+    for reader in (capture, module):
+        if hasattr(reader, "image_path"):
+            monkeypatch.setattr(reader, "image_path", noted)
     for name in not_needed:
         monkeypatch.setattr(module, name, mock.Mock())
     monkeypatch.setattr(module, after_reading, mock.Mock(side_effect=EnoughRead))
