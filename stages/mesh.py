@@ -159,7 +159,7 @@ def write_results(out: Path, refined: Refined, shade: torch.nn.Module) -> None:
 
 STAGE = Stage(
     "mesh",
-    version=2,
+    version=3,
     needs=("frames", "body", "field"),
     makes=("mesh.npz", "preview.png"),
     config=Config,

@@ -8,6 +8,7 @@ step moves a neighbourhood and no vertex alone (Nicolet et al., "Large steps in 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from pipeline.core.config import Config
 from pipeline.core.progress import track
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import laplacian
+from pipeline.kernels.workers import Workers
 
 
 class RefineConfig(Config):
@@ -125,20 +127,20 @@ def optimise(mesh: Mesh, skin: Skin, task: RefineTask, seed: int, label: str = "
     movement = UniformAdam([coordinates, shift], rates)
     colours: list[Tensor] = [parameter for parameter in task.shade.parameters() if parameter.requires_grad]
     appearance = torch.optim.Adam(colours, lr=config.appearance_rate, betas=(0.9, 0.99), eps=1e-12) if colours else None
-    warm_up = config.appearance_steps if appearance else 0
+    warm_up, workers = config.appearance_steps if appearance else 0, Workers(config.frames_per_step)
     for step in track(range(warm_up + config.steps), label):
         moves = step >= warm_up
         with torch.set_grad_enabled(moves):
             offset = SmoothOffset.apply(coordinates, factor)
             vertices = start + offset + shift
-            loss = _regularisers(vertices, offset, shift, operator, task.edge_m, config)
-        loss = loss + _views_loss(vertices, skin, task, generator)
-        gradients = torch.autograd.grad(loss, ([coordinates, shift] if moves else []) + colours)
+        towards = _views_gradients(vertices, colours, moves, skin, task, generator, workers)
         decay = 0.5 * (1.0 + math.cos(math.pi * step / (warm_up + config.steps)))
         if moves:
-            movement.step(gradients[:2], decay)
+            held = _regularisers(vertices, offset, shift, operator, task.edge_m, config)
+            loss = held + (vertices * towards[0]).sum()
+            movement.step(torch.autograd.grad(loss, [coordinates, shift]), decay)
         if appearance:
-            _step(appearance, colours, gradients[-len(colours) :], config.appearance_rate * decay)
+            _step(appearance, colours, towards[-len(colours) :], config.appearance_rate * decay)
     with torch.no_grad():
         moved = start + SmoothOffset.apply(coordinates, factor) + shift
     return Mesh(moved.numpy(), mesh.faces)
@@ -152,17 +154,34 @@ def _step(optimiser: torch.optim.Adam, parameters: Sequence[Tensor], gradients: 
     optimiser.zero_grad(set_to_none=True)
 
 
-def _views_loss(
-    vertices: Float[Tensor, "v 3"], skin: Skin, task: RefineTask, generator: torch.Generator
-) -> Float[Tensor, ""]:
-    """Mean loss of a few random training views, each before a random background."""
-    config, losses = task.config, []
-    for k in torch.randint(len(task.train), (config.frames_per_step,), generator=generator).tolist():
-        background = torch.rand(3, generator=generator)
-        image, alpha, _ = render_view(vertices, skin, task.train[k], task.shade)
+def _views_gradients(
+    vertices: Float[Tensor, "v 3"],
+    colours: Sequence[Tensor],
+    moves: bool,
+    skin: Skin,
+    task: RefineTask,
+    generator: torch.Generator,
+    workers: Workers,
+) -> list[Tensor]:
+    """Gradients of the mean loss of a few random training views, each before a random background.
+
+    Of the vertices, where these move, and of the colours. Views are looked at by several threads at once; their
+    gradients are added up in order.
+    """
+    config = task.config
+    chosen = torch.randint(len(task.train), (config.frames_per_step,), generator=generator).tolist()
+    backgrounds = [torch.rand(3, generator=generator) for _ in chosen]
+
+    def of_view(k: int, background: Float[Tensor, "3"]) -> Sequence[Tensor]:
+        place = vertices.detach().requires_grad_(moves)
+        image, alpha, _ = render_view(place, skin, task.train[k], task.shade)
         colour, outline = view_losses(image, alpha, task.train[k], background)
-        losses.append(config.colour_weight * colour + config.alpha_weight * outline)
-    return torch.stack(losses).mean()
+        loss = (config.colour_weight * colour + config.alpha_weight * outline) / len(chosen)
+        # A view that shows nothing of the mesh says nothing of its colours.
+        return torch.autograd.grad(loss, ([place] if moves else []) + list(colours), materialize_grads=True)
+
+    views = workers.map(of_view, chosen, backgrounds)
+    return [reduce(torch.add, gradients) for gradients in zip(*views, strict=True)]
 
 
 def _regularisers(
