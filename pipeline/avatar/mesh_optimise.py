@@ -25,7 +25,7 @@ from pipeline.core.config import Config
 from pipeline.core.progress import track
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import laplacian
-from pipeline.kernels.workers import Workers
+from pipeline.kernels.parallel import Parallel
 
 
 class RefineConfig(Config):
@@ -127,13 +127,13 @@ def optimise(mesh: Mesh, skin: Skin, task: RefineTask, seed: int, label: str = "
     movement = UniformAdam([coordinates, shift], rates)
     colours: list[Tensor] = [parameter for parameter in task.shade.parameters() if parameter.requires_grad]
     appearance = torch.optim.Adam(colours, lr=config.appearance_rate, betas=(0.9, 0.99), eps=1e-12) if colours else None
-    warm_up, workers = config.appearance_steps if appearance else 0, Workers(config.frames_per_step)
+    warm_up, threads = config.appearance_steps if appearance else 0, Parallel(config.frames_per_step)
     for step in track(range(warm_up + config.steps), label):
         moves = step >= warm_up
         with torch.set_grad_enabled(moves):
             offset = SmoothOffset.apply(coordinates, factor)
             vertices = start + offset + shift
-        towards = _views_gradients(vertices, colours, moves, skin, task, generator, workers)
+        towards = _views_gradients(vertices, colours, moves, skin, task, generator, threads)
         decay = 0.5 * (1.0 + math.cos(math.pi * step / (warm_up + config.steps)))
         if moves:
             held = _regularisers(vertices, offset, shift, operator, task.edge_m, config)
@@ -161,7 +161,7 @@ def _views_gradients(
     skin: Skin,
     task: RefineTask,
     generator: torch.Generator,
-    workers: Workers,
+    threads: Parallel,
 ) -> list[Tensor]:
     """Gradients of the mean loss of a few random training views, each before a random background.
 
@@ -180,7 +180,7 @@ def _views_gradients(
         # A view that shows nothing of the mesh says nothing of its colours.
         return torch.autograd.grad(loss, ([place] if moves else []) + list(colours), materialize_grads=True)
 
-    views = workers.map(of_view, chosen, backgrounds)
+    views = threads.map(of_view, chosen, backgrounds)
     return [reduce(torch.add, gradients) for gradients in zip(*views, strict=True)]
 
 

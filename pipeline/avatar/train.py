@@ -26,9 +26,9 @@ from pipeline.kernels.composite import composite
 from pipeline.kernels.hashgrid import Towards, add_table_gradient_
 from pipeline.kernels.march import Samples
 from pipeline.kernels.packing import owner_of_each
+from pipeline.kernels.parallel import Parallel
 from pipeline.kernels.visits import light_before
 from pipeline.kernels.warp import SkinGrid
-from pipeline.kernels.workers import Workers
 
 WARM_UP = 20
 MAX_BAD_STEPS = 20
@@ -132,7 +132,7 @@ class Learning:
         self.errors = ErrorMap(scene.pool.frames, scene.pool.xy_px)
         self.table_gradient = torch.zeros_like(field.table)
         self.part_count = PARTS if self.device.type == "cpu" else 1
-        self.workers = Workers(self.part_count)
+        self.threads = Parallel(self.part_count)
         parameters: dict[str, Tensor] = dict(field.named_parameters())
         parameters |= {"rotation_rad": self.poses.rotation_rad, "shift_m": self.poses.shift_m}
         self.parameters = parameters
@@ -229,7 +229,7 @@ class Learning:
         empty = empty_m.tensor_split(len(parts))
         ray_share = [len(part.rows) / len(batch.rows) for part in parts]
         empty_share = [len(points) / max(len(empty_m), 1) for points in empty]
-        answers = self.workers.map(partial(self._answer, grid), parts, empty, ray_share, empty_share)
+        answers = self.threads.map(partial(self._answer, grid), parts, empty, ray_share, empty_share)
         losses = summed(answer.losses for answer in answers)
         total, gradients = torch.stack(list(losses.values())).sum(), [answer.gradients for answer in answers]
         if self.refines_poses:

@@ -139,7 +139,7 @@ def test_the_number_of_threads_changes_no_byte(scene, monkeypatch):
     for threads in (1, 2):
         monkeypatch.setattr(torch, "get_num_threads", lambda count=threads: count)
         learning = begin(scene, steps=40, pose_start=0.25, occupancy_start=8)
-        assert (learning.workers._pool is None) == (threads == 1)
+        assert (learning.threads._pool is None) == (threads == 1)
         for _ in range(16):
             learning.step()
         states.append(learning.state())

@@ -19,8 +19,8 @@ from pipeline.avatar.train import Learning
 from pipeline.kernels import hashgrid_cpu
 from pipeline.kernels.composite import _Composite
 from pipeline.kernels.hashgrid import _Encode
+from pipeline.kernels.parallel import Parallel
 from pipeline.kernels.warp import _Newton
-from pipeline.kernels.workers import Workers
 
 OTHER = "other"
 UPDATE = "occupancy_update"
@@ -95,10 +95,10 @@ class Clock:
         return run
 
     def shared(self, part: str, map_jobs: Callable[..., Any]) -> Callable[..., Any]:
-        """`Workers.map`, each job begun as `part`. Its whole time is divided as the jobs' own times are."""
+        """`Parallel.map`, each job begun as `part`. Its whole time is divided as the jobs' own times are."""
 
         @wraps(map_jobs)
-        def run(workers: Any, function: Callable[..., Any], *arguments: Any) -> Any:
+        def run(threads: Any, function: Callable[..., Any], *arguments: Any) -> Any:
             tallies: list[Tally] = []
 
             def job(*of_job: Any) -> Any:
@@ -112,7 +112,7 @@ class Clock:
 
             self._turn()
             begun = self._tally.since
-            answers = map_jobs(workers, job, *arguments)
+            answers = map_jobs(threads, job, *arguments)
             self._tally.since = self._now()
             own = sum(sum(tally.seconds.values()) for tally in tallies)
             for tally in tallies:
@@ -147,7 +147,7 @@ def watched(clock: Clock) -> Iterator[None]:
         for part, owner, name in SEAMS:
             wrap(owner, name, partial(clock.timed, part))
         wrap(train, "invert_motion", partial(_timed_march, clock))
-        wrap(Workers, "map", partial(clock.shared, OTHER))
+        wrap(Parallel, "map", partial(clock.shared, OTHER))
         yield
 
 

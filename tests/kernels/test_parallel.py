@@ -6,7 +6,7 @@ import numba
 import pytest
 import torch
 
-from pipeline.kernels.workers import Workers
+from pipeline.kernels.parallel import Parallel
 
 
 @pytest.fixture
@@ -35,11 +35,11 @@ def test_answers_come_in_the_jobs_order_whichever_is_done_first(four_threads: No
             second_done.set()
         return f"{number} {word}"
 
-    assert Workers(2).map(job, [0, 1], ["first", "second"]) == ["0 first", "1 second"]
+    assert Parallel(2).map(job, [0, 1], ["first", "second"]) == ["0 first", "1 second"]
 
 
 def test_threads_are_shared_out_and_given_back(four_threads: None) -> None:
-    found = Workers(2).map(whereabouts, range(6))
+    found = Parallel(2).map(whereabouts, range(6))
     assert {there[1:] for there in found} == {(2, 2)}
     assert threading.get_ident() not in {there[0] for there in found}
     assert (torch.get_num_threads(), numba.get_num_threads()) == (4, 4)
@@ -50,7 +50,7 @@ def test_threads_are_given_back_after_a_failure(four_threads: None) -> None:
         raise LookupError(number)
 
     with pytest.raises(LookupError, match="0"):
-        Workers(2).map(fail, range(2))
+        Parallel(2).map(fail, range(2))
     assert torch.get_num_threads() == 4
 
 
@@ -62,4 +62,4 @@ def test_one_after_the_other_where_there_is_one_thread_or_numba_cannot_be_entere
         torch.set_num_threads(1)
     monkeypatch.setattr(numba, "threading_layer", lambda: layer)
     expected = (threading.get_ident(), torch.get_num_threads(), 4)
-    assert Workers(2).map(whereabouts, range(3)) == [expected] * 3
+    assert Parallel(2).map(whereabouts, range(3)) == [expected] * 3

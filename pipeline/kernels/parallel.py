@@ -14,7 +14,7 @@ import torch
 T = TypeVar("T")
 
 
-class Workers:
+class Parallel:
     """At most `count` threads that take jobs at the same time: as many as torch and numba have, one at least.
 
     Where numba's threads cannot be entered from several others (its own "workqueue", used where neither OpenMP nor TBB
@@ -25,7 +25,7 @@ class Workers:
         threads = min(torch.get_num_threads(), numba.get_num_threads())
         at_once = 1 if numba.threading_layer() == "workqueue" else min(count, threads)
         self._share = threads // at_once
-        self._pool = ThreadPoolExecutor(at_once, "worker", self._limit) if at_once > 1 else None
+        self._pool = ThreadPoolExecutor(at_once, initializer=self._limit) if at_once > 1 else None
 
     def map(self, function: Callable[..., T], *arguments: Iterable) -> list[T]:
         """What `function` gives for each of the jobs, in their order; arguments as in `map`."""
