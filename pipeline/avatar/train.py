@@ -67,12 +67,11 @@ class Batch:
     jitter: Float[Tensor, "n"]
 
     def parts(self, count: int) -> "list[Batch]":
-        """Cut between frames into `count` parts of about as many frames, or one a frame where these are fewer."""
-        frames = len(self.frames)
-        count = min(count, frames)
-        if count == 1:
+        """Cut between frames into at most `count` parts of about as many rays; each has some."""
+        if count == 1 or not len(self.slot):
             return [self]
-        slots = [frames * part // count for part in range(count + 1)]
+        middles = self.slot[[len(self.slot) * part // count for part in range(1, count)]].tolist()
+        slots = [0, *sorted({*middles} - {int(self.slot[0])}), len(self.frames)]
         rays = torch.searchsorted(self.slot, torch.tensor(slots, device=self.slot.device)).tolist()
         return [
             Batch(
@@ -227,7 +226,7 @@ class Learning:
         grid = self.occupancy.grid() if look_everywhere else self.occupancy.lit_grid()
         parts = batch.parts(self.part_count)
         empty = empty_m.tensor_split(len(parts))
-        ray_share = [len(part.rows) / len(batch.rows) for part in parts]
+        ray_share = [len(part.rows) / max(len(batch.rows), 1) for part in parts]
         empty_share = [len(points) / max(len(empty_m), 1) for points in empty]
         answers = self.threads.map(partial(self._answer, grid), parts, empty, ray_share, empty_share)
         losses = summed(answer.losses for answer in answers)

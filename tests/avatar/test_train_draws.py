@@ -72,3 +72,37 @@ def test_a_step_draws_anew_and_always_the_same(learning: Learning) -> None:
     for name in ("background", "jitter"):
         assert torch.equal(getattr(first, name), getattr(again, name))
         assert not torch.equal(getattr(first, name), getattr(second, name))
+
+
+@pytest.mark.parametrize(
+    ("slots", "cut"),
+    [
+        ([0, 0, 1, 1, 2, 2, 3, 3], [[0, 1], [2, 3]]),
+        ([0, 0, 1, 1, 2, 2], [[0], [1, 2]]),
+        ([1, 1, 2, 2], [[0, 1], [2]]),
+        ([2, 2, 2], [[0, 1, 2]]),
+        ([0, 3, 3, 3], [[0, 1, 2], [3]]),
+        ([], [[0, 1, 2, 3]]),
+    ],
+)
+def test_a_batch_is_cut_between_frames_and_no_part_is_without_rays(slots: list[int], cut: list[list[int]]) -> None:
+    """Also where frames have no rays, because their masks are empty."""
+    frames, count = sum(len(frames_of) for frames_of in cut), len(slots)
+    numbers = torch.arange(float(3 * count)).view(count, 3)
+    batch = Batch(
+        torch.arange(frames) + 10,
+        torch.tensor(slots, dtype=torch.int64),
+        np.arange(count),
+        numbers,
+        numbers + 1,
+        torch.zeros(count, 4),
+        numbers + 2,
+        numbers[:, 0],
+    )
+    parts = batch.parts(2)
+    assert [part.frames.tolist() for part in parts] == [[10 + frame for frame in frames_of] for frames_of in cut]
+    assert torch.cat([part.frames[part.slot] for part in parts]).tolist() == [10 + slot for slot in slots]
+    assert np.concatenate([part.rows for part in parts]).tolist() == list(range(count))
+    for name in ("origins_m", "directions", "rgba", "background", "jitter"):
+        assert torch.equal(torch.cat([getattr(part, name) for part in parts]), getattr(batch, name)), name
+    assert all(len(part.rows) for part in parts) or not slots
