@@ -127,13 +127,14 @@ def optimise(mesh: Mesh, skin: Skin, task: RefineTask, seed: int, label: str = "
     movement = UniformAdam([coordinates, shift], rates)
     colours: list[Tensor] = [parameter for parameter in task.shade.parameters() if parameter.requires_grad]
     appearance = torch.optim.Adam(colours, lr=config.appearance_rate, betas=(0.9, 0.99), eps=1e-12) if colours else None
-    warm_up, threads = config.appearance_steps if appearance else 0, Parallel(config.frames_per_step)
+    warm_up = config.appearance_steps if appearance else 0
+    threads = Parallel(config.frames_per_step)
     for step in track(range(warm_up + config.steps), label):
         moves = step >= warm_up
         with torch.set_grad_enabled(moves):
             offset = SmoothOffset.apply(coordinates, factor)
             vertices = start + offset + shift
-        towards = _views_gradients(vertices, colours, moves, skin, task, generator, threads)
+        towards = _views_gradients(vertices, colours, skin, task, generator, threads)
         decay = 0.5 * (1.0 + math.cos(math.pi * step / (warm_up + config.steps)))
         if moves:
             held = _regularisers(vertices, offset, shift, operator, task.edge_m, config)
@@ -157,7 +158,6 @@ def _step(optimiser: torch.optim.Adam, parameters: Sequence[Tensor], gradients: 
 def _views_gradients(
     vertices: Float[Tensor, "v 3"],
     colours: Sequence[Tensor],
-    moves: bool,
     skin: Skin,
     task: RefineTask,
     generator: torch.Generator,
@@ -165,7 +165,7 @@ def _views_gradients(
 ) -> list[Tensor]:
     """Gradients of the mean loss of a few random training views, each before a random background.
 
-    Of the vertices, where these move, and of the colours. Views are looked at by several threads at once; their
+    Of the vertices, if these require one, and of the colours. Views are looked at by several threads at once; their
     gradients are added up in order.
     """
     config = task.config
@@ -173,12 +173,13 @@ def _views_gradients(
     backgrounds = [torch.rand(3, generator=generator) for _ in chosen]
 
     def of_view(k: int, background: Float[Tensor, "3"]) -> Sequence[Tensor]:
-        place = vertices.detach().requires_grad_(moves)
+        place = vertices.detach().requires_grad_(vertices.requires_grad)
         image, alpha, _ = render_view(place, skin, task.train[k], task.shade)
         colour, outline = view_losses(image, alpha, task.train[k], background)
         loss = (config.colour_weight * colour + config.alpha_weight * outline) / len(chosen)
         # A view that shows nothing of the mesh says nothing of its colours.
-        return torch.autograd.grad(loss, ([place] if moves else []) + list(colours), materialize_grads=True)
+        wanted = ([place] if place.requires_grad else []) + list(colours)
+        return torch.autograd.grad(loss, wanted, materialize_grads=True)
 
     views = threads.map(of_view, chosen, backgrounds)
     return [reduce(torch.add, gradients) for gradients in zip(*views, strict=True)]

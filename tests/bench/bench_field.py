@@ -6,7 +6,8 @@ What finished runs say of quality is added: see `tests.bench.quality`.
 
 The step is that of the first run's frames and body, or of a painted body. Warm-up steps come first, until poses are
 refined and cells that stay empty have been given up. The occupancy is updated only every few steps: a block holds as
-many steps as it takes until all recurs, and a part's time is the median over blocks of its mean in a block. That median
+many steps as it takes until all recurs, and a part's time is the median over blocks of its mean in a block; parts that
+threads do at the same time share the time that this takes. That median
 passes over the few steps of a training that begin with a rebake of the warp grids: rebake_ms is the time of one, in no
 step. A row is appended to tests/bench/results/<machine>.csv.
 
