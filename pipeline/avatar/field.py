@@ -21,8 +21,8 @@ START_DENSITY_PER_M = 10.0
 none.
 """
 
-DENSITY_GAIN, LIMIT = 1.0, 7.0
-"""density = START · exp(gain · raw), with raw cut at plus and minus the limit."""
+LIMIT = 7.0
+"""density = START · exp(raw), with raw cut at plus and minus the limit."""
 
 ROWS = 8192
 """Points that go through the network at once on the CPU: what lies between its layers stays in the cache."""
@@ -51,7 +51,7 @@ class _Decode(torch.autograd.Function):
             torch.mm(output.T, (part @ hidden).clamp_(min=0).T, out=into)
         raw = raw.T + bias
         colour = torch.sigmoid(raw[:, :3])
-        density = START_DENSITY_PER_M * torch.exp(DENSITY_GAIN * raw[:, 3].clamp(-LIMIT, LIMIT))
+        density = START_DENSITY_PER_M * torch.exp(raw[:, 3].clamp(-LIMIT, LIMIT))
         ctx.save_for_backward(features, hidden, output, colour, density)
         return colour, density
 
@@ -60,7 +60,7 @@ class _Decode(torch.autograd.Function):
         features, hidden, output, colour, density = ctx.saved_tensors
         raw_gradient = torch.empty(len(colour), 4).to(colour)
         torch.mul(colour_gradient, colour * (1 - colour), out=raw_gradient[:, :3])
-        torch.mul(density_gradient, DENSITY_GAIN * density, out=raw_gradient[:, 3])
+        torch.mul(density_gradient, density, out=raw_gradient[:, 3])
         features_gradient = torch.zeros_like(features)
         hidden_gradient, output_gradient = torch.zeros_like(hidden), torch.zeros_like(output)
         size = raw_gradient.abs().amax(1)

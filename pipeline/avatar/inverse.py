@@ -22,7 +22,7 @@ from pipeline.avatar.occupancy import Occupancy, cell_centres
 from pipeline.avatar.warp import bake_motion
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.kernels import broyden
-from pipeline.kernels.march import Samples, march
+from pipeline.kernels.march import Samples, WarpSet, march
 from pipeline.kernels.reference.stops import march_with
 from pipeline.kernels.reference.warp import skin_points
 from pipeline.kernels.warp import SkinGrid, newton
@@ -50,11 +50,13 @@ class Inverse:
     place(skin, canonical_to_posed, frames, canonical_m, posed_m, slot_start): where the poses (b, j, 4, 4) of the rows
     `frames` (b) put samples (s, 3) that were found at `canonical_m`; differentiable in the poses. The samples of frame
     i are slot_start[i] : slot_start[i + 1].
+    warps: the grids that hold the inverse, where it lies in such.
     """
 
     boxes_m: Float[Tensor, "k 2 3"]
     sample: Callable[[Rays, float, Occupancy, int], Samples]
     place: Callable[[SkinGrid, Tensor, Tensor, Tensor, Tensor, Tensor], Tensor]
+    warps: WarpSet | None = None
 
 
 def invert_motion(way: str, body: Body, skin: SkinGrid, canonical_to_posed: Float[Tensor, "k j 4 4"]) -> Inverse:
@@ -76,7 +78,7 @@ def _baked(body: Body, skin: SkinGrid, canonical_to_posed: Float[Tensor, "k j 4 
 
     low = warps.origin_m
     high = low + warps.cell_m * (warps.dims - 1).float()
-    return Inverse(torch.stack([low, high], dim=1), sample, _newton_place)
+    return Inverse(torch.stack([low, high], dim=1), sample, _newton_place, warps)
 
 
 def _broyden(body: Body, skin: SkinGrid, canonical_to_posed: Float[Tensor, "k j 4 4"]) -> Inverse:

@@ -47,7 +47,8 @@ def field_losses(
     empty_density_per_m: Float[Tensor, "e"],
     config: FieldConfig,
 ) -> dict[str, Tensor]:
-    """Weighted losses of one batch of rays, means over its rays (`density`: over the points that should be empty).
+    """Weighted losses of some rays, means over them; `density`: the sum over points that should be empty, as a part of
+    the points that a step asks for.
 
     colour_error: as `colour_errors` has it.
     """
@@ -57,5 +58,6 @@ def field_losses(
         "hard": config.weight_hard * hard_surface(alpha).mean(),
     }
     if len(empty_density_per_m):
-        losses["density"] = config.weight_density * 0.01 * empty_density_per_m.mean()
+        asked = config.empty_points + config.hidden_points
+        losses["density"] = config.weight_density * 0.01 * empty_density_per_m.sum() / asked
     return losses

@@ -118,14 +118,6 @@ class OccupancyUpdate:
         """The cells as they are occupied now; later updates show in it."""
         return Occupancy(self.occupied, self.bounds_m)
 
-    def lit_grid(self) -> Occupancy:
-        """The occupied cells without those that no light reached lately: the inside of a body that has become opaque.
-
-        Training rays need not stop there. A cell that was never visited counts as lit.
-        """
-        dark = (self.reached > 0) & (self.reached < DARK)
-        return Occupancy(self.occupied * ~dark.view(self.shape), self.bounds_m)
-
     def hidden_cells(self) -> Int[Tensor, "h"]:
         """Occupied cells (flat index) outside the body that no light reached lately: nothing says what is there.
 

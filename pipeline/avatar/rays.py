@@ -29,15 +29,23 @@ class ErrorMap:
         column, row = xy_px.T // TILE_PX
         return self.error[frame, row, column]
 
-    def note(self, frame: Int[np.ndarray, "n"], xy_px: Int[np.ndarray, "n 2"], error: Float[np.ndarray, "n"]) -> None:
-        """Take in what pixels (column, row) erred by, not negative."""
+    def note(
+        self,
+        frames: Int[np.ndarray, "k"],
+        slot: Int[np.ndarray, "n"],
+        xy_px: Int[np.ndarray, "n 2"],
+        error: Float[np.ndarray, "n"],
+    ) -> None:
+        """Take in what pixels (column, row) of the frames `frames[slot]`, each named once, erred by, not negative."""
         column, row = xy_px.T // TILE_PX
-        tile = np.ravel_multi_index((frame, row, column), self.error.shape)
+        known = self.error[frames]
+        tile = np.ravel_multi_index((slot, row, column), known.shape)
         count, total = np.bincount(tile), np.bincount(tile, error)
         seen = np.flatnonzero(count)
         kept = MEMORY ** count[seen]
-        flat = self.error.reshape(-1)
+        flat = known.reshape(-1)
         flat[seen] = kept * flat[seen] + (1 - kept) * (total[seen] / count[seen])
+        self.error[frames] = known
 
 
 @dataclass(frozen=True)
@@ -57,38 +65,38 @@ class PixelPool:
         """Number of frames."""
         return len(self.start)
 
+    def sizes(
+        self, frames: Int[np.ndarray, "k"], rays: float, shares: tuple[float, float, float]
+    ) -> Int[np.ndarray, "k kinds"]:
+        """How many pixels of each kind `draw` takes of each frame, when a frame has `rays` in all; none of a kind that
+        a frame is without. shares: parts of the rays on the body, its border and outside.
+        """
+        wanted = np.rint(rays * np.array(shares)).astype(np.int64)
+        return wanted * (np.diff(self.start[frames], axis=1) > 0)
+
     def draw(
         self,
-        frames: Int[np.ndarray, "k"],
-        rays: int,
-        shares: tuple[float, float, float],
+        frame: int,
+        sizes: Int[np.ndarray, "kinds"],
         random: np.random.Generator,
         errors: ErrorMap | None = None,
         by_error: float = 0.0,
-    ) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
-        """Rows of random pixels, about `rays` in all, and the slot (position in `frames`) of each; sorted by slot,
-        then place.
+    ) -> Int[np.ndarray, "n"]:
+        """Rows of random pixels of a frame, so many of each kind, sorted.
 
-        shares: parts of the rays on the body, its border and outside; a frame without pixels of a kind draws none of
-        it. by_error: part of the rays on the body that goes where `errors` are large.
+        by_error: part of the rays on the body that goes where `errors` are large.
         """
-        rows, slots = [], []
-        for slot, frame in enumerate(frames):
-            mine = []
-            for kind, share in enumerate(shares):
-                first, last = self.start[frame, kind], self.start[frame, kind + 1]
-                count = round(rays * share / len(frames)) if last > first else 0
-                chosen = round(by_error * count) if errors and KINDS[kind] == "body" else 0
-                mine.append(random.integers(first, max(last, first + 1), count - chosen))
-                if errors and chosen:
-                    candidates = random.integers(first, last, CANDIDATES * chosen)
-                    weight = errors.at(int(frame), self.xy_px[candidates]).cumsum(dtype=np.float64)
-                    place = np.searchsorted(weight, random.random(chosen) * weight[-1], side="right")
-                    mine.append(candidates[np.minimum(place, len(candidates) - 1)])
-            drawn = np.sort(np.concatenate(mine))
-            rows.append(drawn)
-            slots.append(np.full(len(drawn), slot))
-        return np.concatenate(rows), np.concatenate(slots)
+        mine = []
+        for kind, count in enumerate(sizes.tolist()):
+            first, last = self.start[frame, kind], self.start[frame, kind + 1]
+            chosen = round(by_error * count) if errors and KINDS[kind] == "body" else 0
+            mine.append(random.integers(first, max(last, first + 1), count - chosen))
+            if errors and chosen:
+                candidates = random.integers(first, last, CANDIDATES * chosen)
+                weight = errors.at(frame, self.xy_px[candidates]).cumsum(dtype=np.float64)
+                place = np.searchsorted(weight, random.random(chosen) * weight[-1], side="right")
+                mine.append(candidates[np.minimum(place, len(candidates) - 1)])
+        return np.sort(np.concatenate(mine))
 
 
 def build_pool(

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from jaxtyping import Float
@@ -10,15 +11,19 @@ from torch import Tensor
 from pipeline.avatar.body import Body
 from pipeline.avatar.field import Field
 from pipeline.avatar.inverse import Inverse, Rays, invert_motion
+from pipeline.avatar.look import Placing, ends_with_the_light, look
 from pipeline.avatar.occupancy import Occupancy
 from pipeline.avatar.warp import build_skin_grid, posed_from_world, skin_margin_m
+from pipeline.core.device import CPU
 from pipeline.geometry.camera import Camera, pixel_rays, project
 from pipeline.kernels.composite import composite
+from pipeline.kernels.hashgrid import Towards
 from pipeline.kernels.packing import owner_of_each
+from pipeline.kernels.parallel import Parallel
 from pipeline.kernels.reference.corners import corner_bits
 from pipeline.kernels.warp import SkinGrid
 
-RAYS_AT_ONCE = 1 << 14
+RAYS_AT_ONCE = 1 << 13
 STEPS_PER_HEIGHT, MAX_SAMPLES = 125, 256
 SAMPLES_AT_ONCE = 8
 """Of each ray, near to far, before it is asked whether anything behind them can still be seen."""
@@ -71,13 +76,22 @@ def render_pose(field: Field, occupancy: Occupancy, poses: Poses, row: int, came
     """`render_field` of one of some poses whose skinning is inverted already."""
     occupancy, to_posed = occupancy.to(field.bounds_m.device), poses.to_posed[row]
     image = torch.zeros(camera.height, camera.width, 4)
-    for rows, columns in _pixels_in_box(poses.inverse.boxes_m[row], to_posed, camera):
+
+    def show(rows: Tensor, columns: Tensor) -> None:
         pixels_px = torch.stack([columns, rows], dim=-1) + 0.5
         rays = _carry(*pixel_rays(camera, pixels_px), to_posed)
         with torch.no_grad():
             shaded = _shade(field, occupancy, poses, row, rays)
         image[rows.cpu(), columns.cpu()] = shaded.cpu()
+
+    parts = _pixels_in_box(poses.inverse.boxes_m[row], to_posed, camera)
+    _threads(torch.get_num_threads() if to_posed.device == CPU else 1).map(show, *zip(*parts, strict=True))
     return image
+
+
+@cache
+def _threads(count: int) -> Parallel:
+    return Parallel(count)
 
 
 def _carry(origins: Tensor, directions: Tensor, matrix: Float[Tensor, "4 4"]) -> tuple[Tensor, Tensor]:
@@ -113,6 +127,11 @@ def _shade(
     origins, directions = rays
     count, device, step_m = len(origins), origins.device, poses.step_m
     frame, jitter = torch.full((count,), row, device=device), torch.full((count,), 0.5, device=device)
+    if ends_with_the_light(field, poses.inverse):
+        placing = Placing(poses.skin, frame[:1], poses.canonical_to_posed[row : row + 1])
+        about = (occupancy, Rays(origins, directions, frame, jitter), placing, origins[:0])
+        seen = look(field, poses.inverse, *about, step_m, MAX_SAMPLES, Towards())
+        return torch.cat([seen.image, seen.alpha[:, None]], dim=-1)
     samples = poses.inverse.sample(Rays(origins, directions, frame, jitter), step_m, occupancy, MAX_SAMPLES)
     ray = owner_of_each(samples.ray_start.diff())
     waiting, reached = torch.arange(len(ray), device=device), 0

@@ -1,10 +1,8 @@
 """Learning the canonical field from a video: one step, and all that it changes."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
-from itertools import pairwise
 
 import numpy as np
 import torch
@@ -15,19 +13,17 @@ from pipeline.avatar.body import Body, Motion
 from pipeline.avatar.field import Field
 from pipeline.avatar.field_config import FieldConfig
 from pipeline.avatar.inverse import Rays, invert_motion
+from pipeline.avatar.look import Placing, look
 from pipeline.avatar.losses import colour_errors, field_losses
-from pipeline.avatar.occupancy import Occupancy, OccupancyUpdate
+from pipeline.avatar.occupancy import OccupancyUpdate
 from pipeline.avatar.pose import PoseCorrection
 from pipeline.avatar.rays import ErrorMap, PixelPool
 from pipeline.avatar.warp import posed_from_world
 from pipeline.geometry.camera import Camera, pixel_rays
 from pipeline.kernels.adam import adam_step_
-from pipeline.kernels.composite import composite
 from pipeline.kernels.hashgrid import Towards, add_table_gradient_
-from pipeline.kernels.march import Samples
-from pipeline.kernels.packing import owner_of_each
 from pipeline.kernels.parallel import Parallel
-from pipeline.kernels.visits import light_before
+from pipeline.kernels.trace import Traced
 from pipeline.kernels.warp import SkinGrid
 
 WARM_UP = 20
@@ -36,10 +32,10 @@ REBAKES = (0.6,)
 """Parts of the training at which the warp grids follow the refined poses (docs/decisions.md)."""
 MAX_SAMPLES = 160
 """Of a ray; those farther back are dropped."""
-LOOK_EVERYWHERE = 8
-"""Every so many steps rays stop in unlit cells too, so that these may come to light again."""
 PARTS = 2
-"""On the CPU a step's rays are divided into so many parts, which threads work at, whatever the number of threads."""
+"""On the CPU a step's frames are divided into so many parts, which threads work at, whatever the number of threads."""
+OF_STEP, OF_BOX, OF_HIDDEN, OF_FRAMES = range(4)
+"""Streams of random numbers in a step: what it takes from where is the same however its work is divided."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +51,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Batch:
-    """Rays of one step, in the posed space of their frames, sorted by frame."""
+    """Some rays of a step, in the posed space of their frames, in the order of these."""
 
     frames: Int[Tensor, "k"]
     slot: Int[Tensor, "n"]
@@ -66,35 +62,17 @@ class Batch:
     background: Float[Tensor, "n 3"]
     jitter: Float[Tensor, "n"]
 
-    def parts(self, count: int) -> "list[Batch]":
-        """Cut between frames into at most `count` parts of about as many rays; each has some."""
-        if count == 1 or not len(self.slot):
-            return [self]
-        middles = self.slot[[len(self.slot) * part // count for part in range(1, count)]].tolist()
-        slots = [0, *sorted({*middles} - {int(self.slot[0])}), len(self.frames)]
-        rays = torch.searchsorted(self.slot, torch.tensor(slots, device=self.slot.device)).tolist()
-        return [
-            Batch(
-                self.frames[first_slot:last_slot],
-                self.slot[first:last] - first_slot,
-                self.rows[first:last],
-                *(x[first:last] for x in (self.origins_m, self.directions, self.rgba, self.background, self.jitter)),
-            )
-            for (first_slot, last_slot), (first, last) in zip(pairwise(slots), pairwise(rays), strict=True)
-        ]
-
 
 @dataclass(frozen=True)
 class Answer:
-    """What learning comes to for a part of a batch; losses and gradients are its share of the whole batch's.
+    """What learning comes to for a part of a step; losses and gradients are its share of the whole step's.
 
     gradients: by parameter, without those that have none. towards: what the table's is made of, where that is not
     among them.
     """
 
-    samples: Samples
-    weights: Float[Tensor, "s"]
-    light: Float[Tensor, "s"]
+    batch: Batch
+    seen: Traced
     colour_error: Float[Tensor, "n 3"]
     losses: dict[str, Tensor]
     gradients: dict[str, Tensor]
@@ -130,6 +108,8 @@ class Learning:
         self.bad_steps = 0
         self.errors = ErrorMap(scene.pool.frames, scene.pool.xy_px)
         self.table_gradient = torch.zeros_like(field.table)
+        self.frames_per_step = min(config.frames_per_step, scene.pool.frames)
+        self.shares = (1 - config.share_border - config.share_outside, config.share_border, config.share_outside)
         self.part_count = PARTS if self.device.type == "cpu" else 1
         self.threads = Parallel(self.part_count)
         parameters: dict[str, Tensor] = dict(field.named_parameters())
@@ -161,74 +141,73 @@ class Learning:
         """True once the poses take part in the learning."""
         return self.config.pose_refinement and self.done >= self.config.pose_start * self.config.steps
 
-    def _random(self) -> np.random.Generator:
-        return np.random.Generator(np.random.Philox(key=[self.config.seed, self.done]))
+    def _random(self, stream: int) -> np.random.Generator:
+        return np.random.Generator(np.random.Philox(key=[self.config.seed, self.done], counter=[0, 0, 0, stream]))
 
-    def _draw(self, random: np.random.Generator) -> Batch:
+    def _draw(self, frames: Int[np.ndarray, "k"], sizes: Int[np.ndarray, "k kinds"]) -> Batch:
+        """Rays of some frames, so many of each kind of pixel; those of a frame hang on nothing but frame and step."""
         config, pool = self.config, self.scene.pool
-        frames = np.sort(random.choice(pool.frames, min(config.frames_per_step, pool.frames), replace=False))
-        shares = (1 - config.share_border - config.share_outside, config.share_border, config.share_outside)
-        rows, slots = pool.draw(frames, config.rays, shares, random, self.errors, config.share_error)
-        inside = random.random((len(rows), 2), dtype=np.float32) if config.pixel_jitter else np.float32(0.5)
-        origins, directions = pixel_rays(self.scene.camera, self._here(pool.xy_px[rows] + inside))
-        slot, chosen = self._here(slots), self._here(frames)
+        rows, numbers = [], []
+        for frame, size in zip(frames.tolist(), sizes, strict=True):
+            random = self._random(OF_FRAMES + frame)
+            rows.append(pool.draw(frame, size, random, self.errors, config.share_error))
+            numbers.append(random.random((len(rows[-1]), 6), dtype=np.float32))
+        row, number = np.concatenate(rows), np.concatenate(numbers)
+        inside = number[:, 4:] if config.pixel_jitter else np.float32(0.5)
+        origins, directions = pixel_rays(self.scene.camera, self._here(pool.xy_px[row] + inside))
+        slot, chosen = self._here(np.repeat(np.arange(len(frames)), sizes.sum(1))), self._here(frames)
         matrix = self.posed_from_world[chosen].index_select(0, slot)
         return Batch(
             frames=chosen,
             slot=slot,
-            rows=rows,
+            rows=row,
             origins_m=(matrix[:, :3, :3] * origins[:, None]).sum(-1) + matrix[:, :3, 3],
             directions=(matrix[:, :3, :3] * directions[:, None]).sum(-1),
-            rgba=self._here(pool.rgba[rows]).float() / 255,
-            background=self._here(random.random((len(rows), 3), dtype=np.float32)),
-            jitter=self._here(random.random(len(rows), dtype=np.float32)),
+            rgba=self._here(pool.rgba[row]).float() / 255,
+            background=self._here(number[:, :3]),
+            jitter=self._here(number[:, 3]),
         )
 
     def _here(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(array).to(self.device)
 
-    def _place(self, batch: Batch, samples: Samples) -> Float[Tensor, "s 3"]:
-        """Canonical positions of the samples: as looked up, or exact and differentiable once poses are refined."""
+    def _placing(self, frames: Int[Tensor, "k"]) -> Placing | None:
+        """Where samples lie once poses are refined: wherever these are now."""
         if not self.refines_poses:
-            return samples.canonical_m
-        to_world = self.poses.canonical_to_world(batch.frames)
-        poses = self.posed_from_world[batch.frames][:, None] @ to_world
-        ray = owner_of_each(samples.ray_start.diff())
-        # Rows by index_select: plain indexing takes three times as long for tensors of this size.
-        offset = samples.distance_m[:, None] * batch.directions.index_select(0, ray)
-        posed = batch.origins_m.index_select(0, ray) + offset
-        slots = torch.arange(len(batch.frames) + 1, device=self.device)
-        slot_start = samples.ray_start[torch.searchsorted(batch.slot, slots)]
-        return self.inverse.place(self.skin, poses, batch.frames, samples.canonical_m, posed, slot_start)
+            return None
+        to_world = self.poses.canonical_to_world(frames)
+        return Placing(self.skin, frames, self.posed_from_world[frames][:, None] @ to_world)
 
-    def _empty_points(self, random: np.random.Generator) -> Float[Tensor, "e 3"]:
-        """Random points that should be empty: of the box, in empty cells; and, once rays had time, of hidden cells."""
+    def _points_of_the_box(self) -> Float[Tensor, "e 3"]:
+        """Random points of empty cells."""
         low, high = self.occupancy.bounds_m
-        points = self._here(random.random((self.config.empty_points, 3), dtype=np.float32)) * (high - low) + low
-        empty = points[~self.occupancy.grid().contains(points)]
-        if self.done < self.config.occupancy_start:
-            return empty
-        hidden = self.occupancy.hidden_cells()
-        if not len(hidden):
-            return empty
+        unit = self._random(OF_BOX).random((self.config.empty_points, 3), dtype=np.float32)
+        points = self._here(unit) * (high - low) + low
+        return points[~self.occupancy.grid().contains(points)]
+
+    def _hidden_points(self) -> Float[Tensor, "e 3"]:
+        """Random points of hidden cells, once rays had time to see them."""
+        hidden, random = self.occupancy.hidden_cells(), self._random(OF_HIDDEN)
+        if not len(hidden) or self.done < self.config.occupancy_start:
+            return self.occupancy.bounds_m.new_zeros(0, 3)
         drawn = hidden[self._here(random.integers(0, len(hidden), self.config.hidden_points))]
-        return torch.cat([empty, self.occupancy.points_in(drawn, random)])
+        return self.occupancy.points_in(drawn, random)
 
     def step(self) -> dict[str, float]:
         """One step; returns the losses. Raises DivergedError after many steps without a finite loss."""
-        config, random = self.config, self._random()
+        config, random = self.config, self._random(OF_STEP)
         if self.refines_poses and self.done in {round(part * config.steps) for part in REBAKES}:
             self._bake()
         if self.refines_poses and self.skin is self.whole_skin:
             self._follow_occupancy()
-        batch, empty_m = self._draw(random), self._empty_points(random)
-        look_everywhere = self.done % LOOK_EVERYWHERE == 0 or self.done < config.occupancy_start
-        grid = self.occupancy.grid() if look_everywhere else self.occupancy.lit_grid()
-        parts = batch.parts(self.part_count)
-        empty = empty_m.tensor_split(len(parts))
-        ray_share = [len(part.rows) / max(len(batch.rows), 1) for part in parts]
-        empty_share = [len(points) / max(len(empty_m), 1) for points in empty]
-        answers = self.threads.map(partial(self._answer, grid), parts, empty, ray_share, empty_share)
+        frames = np.sort(random.choice(self.scene.pool.frames, self.frames_per_step, replace=False))
+        sizes = self.scene.pool.sizes(frames, config.rays / len(frames), self.shares)
+        count = min(self.part_count, len(frames))
+        cut = [np.array_split(array, count) for array in (frames, sizes)]
+        points = (self._points_of_the_box, self._hidden_points)
+        should_be_empty = [points[part::count] for part in range(count)]
+        share = [float(part.sum() / max(sizes.sum(), 1)) for part in cut[1]]
+        answers = self.threads.map(self._answer, *cut, should_be_empty, share)
         losses = summed(answer.losses for answer in answers)
         total, gradients = torch.stack(list(losses.values())).sum(), [answer.gradients for answer in answers]
         if self.refines_poses:
@@ -237,54 +216,51 @@ class Learning:
             total = total + effort.detach()
         finite = bool(torch.isfinite(total))
         if finite:
-            for part, answer in zip(parts, answers, strict=True):
+            for answer in answers:
                 add_table_gradient_(self.table_gradient, answer.towards, self.field.layout)
-                self._note_errors(part, answer.colour_error)
-                self.occupancy.record(answer.samples.canonical_m, answer.light, answer.weights)
+                self._note_errors(answer.batch, answer.colour_error)
+                self.occupancy.record(answer.seen.canonical_m, answer.seen.light, answer.seen.weight)
         self._update_parameters(finite, summed(gradients))
         self.done += 1
         if self.done % config.occupancy_every == 0 and self.done >= config.occupancy_start:
             self.occupancy.update(self.field.density, self.step_m, config.occupancy_threshold, random)
             self._follow_occupancy()
-        samples = sum(len(answer.samples.distance_m) for answer in answers)
+        samples = sum(len(answer.seen.light) for answer in answers)
         return {name: float(loss) for name, loss in losses.items()} | {"samples": float(samples)}
 
     def _answer(
-        self, grid: Occupancy, part: Batch, empty_m: Float[Tensor, "e 3"], ray_share: float, empty_share: float
+        self,
+        frames: Int[np.ndarray, "k"],
+        sizes: Int[np.ndarray, "k kinds"],
+        should_be_empty: Sequence[Callable[[], Tensor]],
+        share: float,
     ) -> Answer:
-        """Learn from some rays and points that should be empty. Changes nothing, so threads may do it at once."""
-        rays = Rays(part.origins_m, part.directions, part.frames[part.slot], part.jitter)
-        samples = self.inverse.sample(rays, self.step_m, grid, MAX_SAMPLES)
-        count, towards = len(samples.distance_m), Towards()
-        points = torch.cat([self._place(part, samples), empty_m])
-        colour, density = self.field.radiance(points, towards)
-        step_m = torch.full((count,), self.step_m, device=self.device)
-        image, alpha, weights = composite(density[:count], colour[:count], step_m, samples.ray_start)
-        error = colour_errors(image, alpha, part.rgba, part.background)
-        losses = field_losses(error, alpha, part.rgba[:, 3], density[count:], self.config)
-        losses = {name: (empty_share if name == "density" else ray_share) * loss for name, loss in losses.items()}
+        """Learn from rays of some frames and points that should be empty. Changes nothing, so threads may do it at
+        once. share: that of all rays.
+        """
+        batch, towards = self._draw(frames, sizes), Towards()
+        empty_m = torch.cat([points() for points in should_be_empty] or [self.occupancy.bounds_m[:0]])
+        rays = Rays(batch.origins_m, batch.directions, batch.frames[batch.slot], batch.jitter)
+        about = (self.occupancy.grid(), rays, self._placing(batch.frames), empty_m)
+        seen = look(self.field, self.inverse, *about, self.step_m, MAX_SAMPLES, towards)
+        error = colour_errors(seen.image, seen.alpha, batch.rgba, batch.background)
+        losses = field_losses(error, seen.alpha, batch.rgba[:, 3], seen.density_per_m, self.config)
+        losses = {name: loss if name == "density" else share * loss for name, loss in losses.items()}
         gradients = self._gradients(torch.stack(list(losses.values())).sum(), tuple(self.parameters))
-        return Answer(
-            samples,
-            weights.detach(),
-            light_before(weights, samples.ray_start),
-            error.detach(),
-            {name: loss.detach() for name, loss in losses.items()},
-            gradients,
-            towards,
-        )
+        told = {name: loss.detach() for name, loss in losses.items()}
+        return Answer(batch, seen, error.detach(), told, gradients, towards)
 
     def _gradients(self, loss: Tensor, names: tuple[str, ...]) -> dict[str, Tensor]:
         """Of the parameters that the loss depends on and whose gradient autograd is told."""
         found = torch.autograd.grad(loss, [self.parameters[name] for name in names], allow_unused=True)
         return {name: gradient for name, gradient in zip(names, found, strict=True) if gradient is not None}
 
-    def _note_errors(self, part: Batch, colour_error: Float[Tensor, "n 3"]) -> None:
+    def _note_errors(self, batch: Batch, colour_error: Float[Tensor, "n 3"]) -> None:
         """Remember where colours are wrong, for the rays of later steps."""
         if self.config.share_error > 0.0:
-            frame = part.frames.index_select(0, part.slot).cpu().numpy()
+            frames, slot = batch.frames.cpu().numpy(), batch.slot.cpu().numpy()
             error = colour_error.abs().mean(1).cpu().numpy()
-            self.errors.note(frame, self.scene.pool.xy_px[part.rows], error)
+            self.errors.note(frames, slot, self.scene.pool.xy_px[batch.rows], error)
 
     def _rate(self) -> float:
         """Part of the full learning rate: a short warm-up, then an exponential decay that ends at `final_rate`."""

@@ -57,7 +57,8 @@ def _corners(points, start, stop, level_plan, rows, weights, parts):
 
 
 @njit(**OPTIONS)
-def _encode_block(points, table, plan, level, encoded, start, stop, lanes):
+def encode_block(points, table, plan, level, encoded, start, stop, lanes):
+    """One level's features of at most BLOCK points, start..stop."""
     column = level * len(lanes)
     rows = np.empty((8, BLOCK), np.uint32)
     weights = np.empty((8, BLOCK), np.float32)
@@ -82,7 +83,7 @@ def encode(points, table, plan, encoded, lanes):
     for level in range(plan.shape[0]):
         for block in prange((count + BLOCK - 1) // BLOCK):
             start = block * BLOCK
-            _encode_block(points, table, plan, level, encoded, start, min(start + BLOCK, count), lanes)
+            encode_block(points, table, plan, level, encoded, start, min(start + BLOCK, count), lanes)
 
 
 @njit(**OPTIONS)

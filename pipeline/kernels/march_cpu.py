@@ -8,6 +8,8 @@ from pipeline.kernels.warp_cpu import apply_affine
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
 _ENDLESS_M = np.float32(1e9)
+CANDIDATES = 4
+"""Inverses that a stop has at most."""
 
 
 @njit(**OPTIONS)
@@ -40,6 +42,76 @@ def _interpolate(nodes, first, dims, i, j, k, u, v, w):
     return x, y, z
 
 
+@njit(**OPTIONS)
+def enter(ray, origins, directions, jitter, step, cell, low, dims):
+    """Where a ray enters the box of a warp grid, and how many stops it makes there."""
+    near, far = _ZERO, _ENDLESS_M
+    for axis in range(3):
+        high = low[axis] + cell * np.float32(dims[axis] - 1)
+        near, far = _slab(origins[ray, axis], directions[ray, axis], low[axis], high, near, far)
+    # A ray that no plane ends is no ray (NaN, or a direction of zeros): it would make 1e11 stops.
+    return near, max(0, int(np.ceil((far - near) / step - jitter[ray]))) if far < _ENDLESS_M else 0
+
+
+@njit(**OPTIONS)
+def go_on(
+    ray,
+    near,
+    stop,
+    stops,
+    enough,
+    limit,
+    origins,
+    directions,
+    jitter,
+    step,
+    cell,
+    f,
+    warp_origin,
+    warp_dims,
+    warp_first,
+    warp_nodes,
+    warp_codes,
+    warp_maps,
+    occupied,
+    low,
+    scale,
+    count,
+    found,
+    distance,
+    owner,
+):
+    """Note samples of a ray until there are `enough` of all rays; none once there are `limit`: (samples, next stop)."""
+    ox, oy, oz = origins[ray, 0], origins[ray, 1], origins[ray, 2]
+    dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
+    gx, gy, gz = warp_origin[f, 0], warp_origin[f, 1], warp_origin[f, 2]
+    nx, ny, nz = warp_dims[f, 0], warp_dims[f, 1], warp_dims[f, 2]
+    dims = warp_dims[f]
+    node_first, code_first, map_first = warp_first[f, 0], warp_first[f, 1], warp_first[f, 2]
+    inverse = _ONE / cell
+    while stop < stops and count < enough:
+        t = near + (np.float32(stop) + jitter[ray]) * step
+        stop += 1
+        px, py, pz = (ox + t * dx - gx) * inverse, (oy + t * dy - gy) * inverse, (oz + t * dz - gz) * inverse
+        i, j, k = min(max(int(px), 0), nx - 2), min(max(int(py), 0), ny - 2), min(max(int(pz), 0), nz - 2)
+        code = warp_codes[code_first + (i * (ny - 1) + j) * (nz - 1) + k]
+        if code < 0:
+            continue
+        candidates = 1 if code == 0 else 1 + (code - 1) % CANDIDATES
+        for candidate in range(candidates):
+            if code == 0:
+                u, v, w = px - np.float32(i), py - np.float32(j), pz - np.float32(k)
+                x, y, z = _interpolate(warp_nodes, node_first, dims, i, j, k, u, v, w)
+            else:
+                m = warp_maps[map_first + (code - 1) // CANDIDATES + candidate]
+                x, y, z = apply_affine(m, px * cell + gx, py * cell + gy, pz * cell + gz)
+            if count < limit and _is_occupied(x, y, z, occupied, low, scale):
+                found[count, 0], found[count, 1], found[count, 2] = x, y, z
+                distance[count], owner[count] = t, ray
+                count += 1
+    return count, stop
+
+
 @njit(parallel=True, **OPTIONS)
 def march(
     origins,
@@ -60,52 +132,47 @@ def march(
 ):
     """(canonical points (s, 3), distances (s), ray starts (n + 1) int64): see `pipeline.kernels.march.march`."""
     rays = origins.shape[0]
-    found = np.empty((rays, max_samples, 4), np.float32)
-    counts = np.zeros(rays, np.int64)
+    found, distance = np.empty((rays * max_samples, 3), np.float32), np.empty(rays * max_samples, np.float32)
+    owner, counts = np.empty(rays * max_samples, np.int32), np.zeros(rays, np.int64)
     low, scale = bounds[0], np.empty(3, np.float32)
     for axis in range(3):
         scale[axis] = np.float32(occupied.shape[axis]) / (bounds[1, axis] - bounds[0, axis])
-    inverse = _ONE / cell
     for ray in prange(rays):
-        f = frame[ray]
-        origin, dims = warp_origin[f], warp_dims[f]
-        near, far = _ZERO, _ENDLESS_M
-        for axis in range(3):
-            high = origin[axis] + cell * np.float32(dims[axis] - 1)
-            near, far = _slab(origins[ray, axis], directions[ray, axis], origin[axis], high, near, far)
-        # A ray that no plane ends is no ray (NaN, or a direction of zeros): it would make 1e11 stops.
-        stops = max(0, int(np.ceil((far - near) / step - jitter[ray]))) if far < _ENDLESS_M else 0
-        count = 0
-        for stop in range(stops):
-            t = near + (np.float32(stop) + jitter[ray]) * step
-            px = (origins[ray, 0] + t * directions[ray, 0] - origin[0]) * inverse
-            py = (origins[ray, 1] + t * directions[ray, 1] - origin[1]) * inverse
-            pz = (origins[ray, 2] + t * directions[ray, 2] - origin[2]) * inverse
-            i = min(max(int(px), 0), dims[0] - 2)
-            j = min(max(int(py), 0), dims[1] - 2)
-            k = min(max(int(pz), 0), dims[2] - 2)
-            code = warp_codes[warp_first[f, 1] + (i * (dims[1] - 1) + j) * (dims[2] - 1) + k]
-            if code == -1:
-                continue
-            candidates = 1 if code == 0 else 1 + (code - 1) % 4
-            for candidate in range(candidates):
-                if code == 0:
-                    u, v, w = px - np.float32(i), py - np.float32(j), pz - np.float32(k)
-                    x, y, z = _interpolate(warp_nodes, warp_first[f, 0], dims, i, j, k, u, v, w)
-                else:
-                    m = warp_maps[warp_first[f, 2] + (code - 1) // 4 + candidate]
-                    qx, qy, qz = px * cell + origin[0], py * cell + origin[1], pz * cell + origin[2]
-                    x, y, z = apply_affine(m, qx, qy, qz)
-                if count < max_samples and _is_occupied(x, y, z, occupied, low, scale):
-                    found[ray, count, 0], found[ray, count, 1] = x, y
-                    found[ray, count, 2], found[ray, count, 3] = z, t
-                    count += 1
-        counts[ray] = count
-    return _pack(found, counts)
+        f, first = frame[ray], ray * max_samples
+        near, stops = enter(ray, origins, directions, jitter, step, cell, warp_origin[f], warp_dims[f])
+        last, _ = go_on(
+            ray,
+            near,
+            0,
+            stops,
+            first + max_samples,
+            first + max_samples,
+            origins,
+            directions,
+            jitter,
+            step,
+            cell,
+            f,
+            warp_origin,
+            warp_dims,
+            warp_first,
+            warp_nodes,
+            warp_codes,
+            warp_maps,
+            occupied,
+            low,
+            scale,
+            first,
+            found,
+            distance,
+            owner,
+        )
+        counts[ray] = last - first
+    return _pack(found, distance, counts, max_samples)
 
 
 @njit(parallel=True, **OPTIONS)
-def _pack(found, counts):
+def _pack(found, distances, counts, max_samples):
     rays = counts.shape[0]
     ray_start = np.zeros(rays + 1, np.int64)
     for ray in range(rays):
@@ -113,10 +180,8 @@ def _pack(found, counts):
     points = np.empty((ray_start[rays], 3), np.float32)
     distance = np.empty(ray_start[rays], np.float32)
     for ray in prange(rays):
-        first = ray_start[ray]
         for index in range(counts[ray]):
-            points[first + index, 0] = found[ray, index, 0]
-            points[first + index, 1] = found[ray, index, 1]
-            points[first + index, 2] = found[ray, index, 2]
-            distance[first + index] = found[ray, index, 3]
+            to, of = ray_start[ray] + index, ray * max_samples + index
+            points[to, 0], points[to, 1], points[to, 2] = found[of, 0], found[of, 1], found[of, 2]
+            distance[to] = distances[of]
     return points, distance, ray_start

@@ -8,7 +8,7 @@ from typing import Any
 from numba import config
 from numba.misc.appdirs import AppDirs
 
-OPTIONS: dict[str, Any] = {"cache": True, "error_model": "numpy", "fastmath": {"arcp", "nsz"}}
+OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"arcp", "nsz"}}
 """Arguments of numba's njit. Of fast math only what neither fuses nor reorders sums: what the compiler makes of that
 freedom depends on what it compiles together, so a first run and a later one would differ (docs/decisions.md).
 """

@@ -121,7 +121,7 @@ def _newton(px, py, pz, x, y, z, iterations, tolerance, origin, cell, row_of_nod
     return squared < tolerance * tolerance, x, y, z, squared
 
 
-@njit(nogil=True, **OPTIONS)
+@njit(**OPTIONS)
 def carry_nodes(nodes, blended):
     """Posed positions (m, 3) of the skin grid's nodes, and their box (2, 3)."""
     posed = np.empty((nodes.shape[0], 3), np.float32)
@@ -320,7 +320,7 @@ def _code_cells(canonical, posed_origin, dims, origin, cell, row_of_node, blende
     return codes, table[:used].copy()
 
 
-@njit(nogil=True, **OPTIONS)
+@njit(**OPTIONS)
 def bake(nodes, posed, distance, posed_origin, dims, origin, cell, row_of_node, blended):
     """The warp grid of one frame: see `pipeline.kernels.warp.bake`."""
     row_of = _claim(posed, distance, posed_origin, cell, dims)

@@ -23,7 +23,7 @@ def test_a_tile_forgets_at_a_fixed_pace_and_others_keep_what_they_know(pool):
     errors = ErrorMap(2, pool.xy_px)
     place = np.array([[TILE_PX + 1, 2 * TILE_PX], [TILE_PX + 9, 3 * TILE_PX - 1]], dtype=np.int16)
     for _ in range(3):
-        errors.note(np.array([1, 1]), place, np.array([0.2, 0.4]))
+        errors.note(np.array([1]), np.array([0, 0]), place, np.array([0.2, 0.4]))
     known = 0.3 + (1 - 0.3) * MEMORY**6
     assert errors.at(1, place).tolist() == pytest.approx([known, known])
     assert np.count_nonzero(errors.error != 1) == 1
@@ -34,22 +34,34 @@ def test_rays_of_the_body_go_where_the_error_is_in_proportion(pool):
     errors, random = ErrorMap(2, pool.xy_px), np.random.default_rng(0)
     upper = np.array([0, 1]), np.arange(4)
     errors.error[0][np.ix_(*upper)] = 3.0
-    draw = (np.array([0, 1]), 16_000, (1.0, 0.0, 0.0), random, errors)
     for by_error, share in ((1.0, 0.75), (0.5, 0.625), (0.0, 0.5)):
-        rows, slots = pool.draw(*draw, by_error)
-        assert len(rows) == 16_000
-        assert np.all(np.diff(rows) >= 0)
-        is_upper = pool.xy_px[rows, 1] < SIDE_PX // 2
-        assert is_upper[slots == 0].mean() == pytest.approx(share, abs=0.02)
-        assert is_upper[slots == 1].mean() == pytest.approx(0.5, abs=0.02)
+        for frame, expected in ((0, share), (1, 0.5)):
+            rows = pool.draw(frame, np.array([8000, 0, 0]), random, errors, by_error)
+            assert len(rows) == 8000
+            assert np.all(np.diff(rows) >= 0)
+            assert pool.start[frame, 0] <= rows.min()
+            assert rows.max() < pool.start[frame, 1]
+            is_upper = pool.xy_px[rows, 1] < SIDE_PX // 2
+            assert is_upper.mean() == pytest.approx(expected, abs=0.02)
 
 
 def test_border_and_outside_keep_their_rays(pool):
     errors = ErrorMap(2, pool.xy_px)
     errors.error[:, 0] = 1e6
-    rows, _ = pool.draw(np.array([0]), 1000, (0.4, 0.35, 0.25), np.random.default_rng(0), errors, 1.0)
+    sizes = pool.sizes(np.array([0, 1]), 1000.0, (0.4, 0.35, 0.25))
+    assert sizes.tolist() == [[400, 350, 250]] * 2
+    rows = pool.draw(0, sizes[0], np.random.default_rng(0), errors, 1.0)
     counts = np.histogram(rows, bins=[*pool.start[0]])[0]
     assert counts.tolist() == [400, 350, 250]
+
+
+def test_a_frame_without_a_person_has_rays_outside_alone():
+    empty = np.zeros((SIDE_PX, SIDE_PX), np.uint8)
+    solid = np.pad(np.full((20, 20), 255, np.uint8), 22)
+    pool = build_pool([(np.zeros((64, 64, 3), np.uint8), mask) for mask in (solid, empty)], border_px=2, seed=0)
+    sizes = pool.sizes(np.array([0, 1]), 100.0, (0.5, 0.3, 0.2))
+    assert sizes[0].tolist() == [50, 30, 20]
+    assert sizes[1, :2].tolist() == [0, 0]
 
 
 def test_a_perfect_picture_errs_nowhere_and_a_hole_by_what_it_hides():

@@ -67,11 +67,11 @@ def test_pool_sorts_pixels_into_kinds():
 
 def test_rays_are_shared_out_as_asked():
     pool, _, _ = make_pool()
-    rows, slots = pool.draw(np.array([0, 1, 2]), 900, (0.6, 0.3, 0.1), np.random.default_rng(0))
-    assert np.bincount(slots).tolist() == [300, 0, 300]
-    first = rows[slots == 0]
-    assert (np.diff(first) >= 0).all()
-    kinds = np.searchsorted(pool.start[0], first, side="right") - 1
+    sizes = pool.sizes(np.array([0, 1, 2]), 300.0, (0.6, 0.3, 0.1))
+    assert sizes.tolist() == [[180, 90, 30], [0, 0, 0], [180, 90, 30]]
+    rows = pool.draw(0, sizes[0], np.random.default_rng(0))
+    assert (np.diff(rows) >= 0).all()
+    kinds = np.searchsorted(pool.start[0], rows, side="right") - 1
     assert np.bincount(kinds).tolist() == [180, 90, 30]
-    again, _ = pool.draw(np.array([0, 1, 2]), 900, (0.6, 0.3, 0.1), np.random.default_rng(0))
-    np.testing.assert_array_equal(rows, again)
+    np.testing.assert_array_equal(rows, pool.draw(0, sizes[0], np.random.default_rng(0)))
+    assert len(pool.draw(1, sizes[1], np.random.default_rng(0))) == 0

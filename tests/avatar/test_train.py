@@ -1,13 +1,18 @@
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
 
+from pipeline.avatar import look
 from pipeline.avatar.body import canonical_to_world
 from pipeline.avatar.field_config import FieldConfig
 from pipeline.avatar.inverse import Rays
+from pipeline.avatar.look import _place
 from pipeline.avatar.prepare import spread, start_learning, training_scale
 from pipeline.avatar.render import over_white, render_field
 from pipeline.avatar.train import MAX_SAMPLES, DivergedError
+from pipeline.kernels.trace import trace
 from tests.avatar.scene import painted_scene
 
 TRAIN = np.array([0, 1, 3, 4, 6, 7, 9, 10])
@@ -102,12 +107,13 @@ def test_poses_move_once_they_are_refined_and_samples_follow_them(scene):
         moved.append(not torch.equal(before, learning.poses.shift_m.detach()))
     assert [step for step, there in enumerate(moved) if there] == list(range(10, 20))
     assert 0 < len(learning.skin.nodes_m) < len(learning.scene.skin.nodes_m)
-    batch = learning._draw(np.random.default_rng(0))
-    samples = march_of(learning, batch)
+    batch = draw(learning, 0, 3)
+    rays = Rays(batch.origins_m, batch.directions, batch.frames[batch.slot], batch.jitter)
+    samples = learning.inverse.sample(rays, learning.step_m, learning.occupancy.grid(), MAX_SAMPLES)
     with torch.no_grad():
-        still = learning._place(batch, samples)
+        still = _place(learning.inverse, rays, learning._placing(batch.frames), samples)
         learning.poses.shift_m += 0.01
-        there = learning._place(batch, samples)
+        there = _place(learning.inverse, rays, learning._placing(batch.frames), samples)
     assert float((there - still).detach().norm(dim=1).median()) == pytest.approx(0.01 * 3**0.5, rel=0.3)
 
 
@@ -115,6 +121,8 @@ def test_poses_move_once_they_are_refined_and_samples_follow_them(scene):
 def test_a_step_in_parts_comes_to_that_of_the_whole(scene, monkeypatch, frames_per_step):
     options = {"pose_start": 0.0, "occupancy_start": 4, "share_error": 0.6, "frames_per_step": frames_per_step}
     found = []
+    # Which of the samples with small gradients stand for the others hangs on those before them.
+    monkeypatch.setattr(look, "trace", partial(trace, thinning=0.0))
     for count in (1, 2):
         learning = begin(scene, steps=40, **options)
         for _ in range(6):
@@ -128,8 +136,7 @@ def test_a_step_in_parts_comes_to_that_of_the_whole(scene, monkeypatch, frames_p
     assert part_losses == pytest.approx(losses, rel=1e-5)
     assert set(gradients) == set(part_gradients) == {"table", "hidden", "output", "bias", "rotation_rad", "shift_m"}
     for name, gradient in gradients.items():
-        # Points that hardly matter get no gradient: which, is told by the mean of their own part.
-        assert (part_gradients[name] - gradient).norm() < 0.01 * gradient.norm(), name
+        assert (part_gradients[name] - gradient).norm() < 1e-4 * gradient.norm(), name
     assert torch.equal(reached, part_reached)
     np.testing.assert_allclose(errors, part_errors, rtol=1e-5)
 
@@ -147,11 +154,10 @@ def test_the_number_of_threads_changes_no_byte(scene, monkeypatch):
         assert torch.equal(value, states[1][name]), name
 
 
-def march_of(learning, batch):
-    grid = learning.occupancy.grid()
-    frames = batch.frames[batch.slot]
-    rays = Rays(batch.origins_m, batch.directions, frames, batch.jitter)
-    return learning.inverse.sample(rays, learning.step_m, grid, MAX_SAMPLES)
+def draw(learning, *frames):
+    frames = np.array(frames)
+    sizes = learning.scene.pool.sizes(frames, learning.config.rays / len(frames), learning.shares)
+    return learning._draw(frames, sizes)
 
 
 def test_where_no_light_comes_the_field_becomes_empty(scene):
@@ -160,7 +166,7 @@ def test_where_no_light_comes_the_field_becomes_empty(scene):
         plain.step()
         asked.step()
     cells = plain.occupancy.hidden_cells()
-    assert len(cells) > 20
+    assert len(cells) > 5
     points = plain.occupancy.points_in(cells, np.random.default_rng(0))
     assert float(asked.field.density(points).mean()) < 0.8 * float(plain.field.density(points).mean())
 

@@ -1,5 +1,6 @@
 """What a step of learning draws, and the learning rates at both ends, in closed form."""
 
+from collections.abc import Sequence
 from types import SimpleNamespace
 
 import numpy as np
@@ -52,9 +53,10 @@ def learning() -> Learning:
     return start_learning(scene.body, scene.motion, scene.camera, pictures, config)
 
 
-def drawn(learning: Learning, step: int) -> Batch:
+def drawn(learning: Learning, step: int, frames: Sequence[int] = (0, 2)) -> Batch:
     learning.done = step
-    return learning._draw(learning._random())
+    chosen = np.array(frames)
+    return learning._draw(chosen, learning.scene.pool.sizes(chosen, 300.0, learning.shares))
 
 
 def test_every_ray_has_a_background_of_its_own(learning: Learning) -> None:
@@ -74,35 +76,21 @@ def test_a_step_draws_anew_and_always_the_same(learning: Learning) -> None:
         assert not torch.equal(getattr(first, name), getattr(second, name))
 
 
-@pytest.mark.parametrize(
-    ("slots", "cut"),
-    [
-        ([0, 0, 1, 1, 2, 2, 3, 3], [[0, 1], [2, 3]]),
-        ([0, 0, 1, 1, 2, 2], [[0], [1, 2]]),
-        ([1, 1, 2, 2], [[0, 1], [2]]),
-        ([2, 2, 2], [[0, 1, 2]]),
-        ([0, 3, 3, 3], [[0, 1, 2], [3]]),
-        ([], [[0, 1, 2, 3]]),
-    ],
-)
-def test_a_batch_is_cut_between_frames_and_no_part_is_without_rays(slots: list[int], cut: list[list[int]]) -> None:
-    """Also where frames have no rays, because their masks are empty."""
-    frames, count = sum(len(frames_of) for frames_of in cut), len(slots)
-    numbers = torch.arange(float(3 * count)).view(count, 3)
-    batch = Batch(
-        torch.arange(frames) + 10,
-        torch.tensor(slots, dtype=torch.int64),
-        np.arange(count),
-        numbers,
-        numbers + 1,
-        torch.zeros(count, 4),
-        numbers + 2,
-        numbers[:, 0],
-    )
-    parts = batch.parts(2)
-    assert [part.frames.tolist() for part in parts] == [[10 + frame for frame in frames_of] for frames_of in cut]
-    assert torch.cat([part.frames[part.slot] for part in parts]).tolist() == [10 + slot for slot in slots]
-    assert np.concatenate([part.rows for part in parts]).tolist() == list(range(count))
+def test_a_frame_s_rays_are_the_same_whatever_is_drawn_with_it(learning: Learning) -> None:
+    whole, parts = drawn(learning, 3, (0, 2, 3)), [drawn(learning, 3, frames) for frames in ((0,), (2, 3))]
+    assert torch.cat([part.frames[part.slot] for part in parts]).tolist() == whole.frames[whole.slot].tolist()
+    assert np.concatenate([part.rows for part in parts]).tolist() == whole.rows.tolist()
     for name in ("origins_m", "directions", "rgba", "background", "jitter"):
-        assert torch.equal(torch.cat([getattr(part, name) for part in parts]), getattr(batch, name)), name
-    assert all(len(part.rows) for part in parts) or not slots
+        assert torch.equal(torch.cat([getattr(part, name) for part in parts]), getattr(whole, name)), name
+    assert len({row // 1000 for row in whole.rows.tolist()}) > 3
+
+
+def test_points_that_should_be_empty_are(learning: Learning) -> None:
+    learning.done = learning.config.occupancy_start
+    box, grid = learning._points_of_the_box(), learning.occupancy.grid()
+    assert len(box) > learning.config.empty_points / 2
+    assert not grid.contains(box).any()
+    assert torch.equal(box, learning._points_of_the_box())
+    learning.done -= 1
+    assert not torch.equal(box, learning._points_of_the_box())
+    assert len(learning._hidden_points()) == 0

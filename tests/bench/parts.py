@@ -6,20 +6,20 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial, wraps
 from typing import Any
 from unittest import mock
 
 from pipeline.avatar import train
 from pipeline.avatar.field import _Decode
+from pipeline.avatar.look import Placing
 from pipeline.avatar.occupancy import OccupancyUpdate
 from pipeline.avatar.pose import PoseCorrection
 from pipeline.avatar.train import Learning
-from pipeline.kernels import hashgrid_cpu
-from pipeline.kernels.composite import _Composite
-from pipeline.kernels.hashgrid import _Encode
+from pipeline.kernels import hashgrid_cpu, warp_cpu
 from pipeline.kernels.parallel import Parallel
+from pipeline.kernels.trace import _Trace
 from pipeline.kernels.warp import _Newton
 
 OTHER = "other"
@@ -29,22 +29,22 @@ SEAMS: tuple[tuple[str, Any, str], ...] = (
     (OTHER, Learning, "step"),
     (REBAKE, Learning, "_bake"),
     ("draw", Learning, "_draw"),
-    ("draw", Learning, "_empty_points"),
-    ("place", Learning, "_place"),
-    ("encode_forward", _Encode, "forward"),
-    ("network_forward", _Decode, "forward"),
-    ("composite", _Composite, "forward"),
-    ("composite", _Composite, "backward"),
+    ("draw", Learning, "_points_of_the_box"),
+    ("draw", Learning, "_hidden_points"),
+    ("place", Learning, "_placing"),
+    ("place", Placing, "blended"),
+    ("look", train, "look"),
     ("losses", train, "field_losses"),
     ("losses", PoseCorrection, "roughness"),
     ("losses", PoseCorrection, "size"),
     ("network_backward", _Decode, "backward"),
+    ("network_backward", _Trace, "backward"),
     ("table_backward", hashgrid_cpu, "add_table_gradient"),
     ("positions_backward", hashgrid_cpu, "add_points_gradient"),
     ("positions_backward", _Newton, "backward"),
+    ("positions_backward", warp_cpu, "pose_gradient"),
     ("rest_backward", Learning, "_gradients"),
     ("adam", train, "adam_step_"),
-    ("occupancy_record", train, "light_before"),
     ("occupancy_record", OccupancyUpdate, "record"),
     (UPDATE, OccupancyUpdate, "update"),
     ("skin_cut", Learning, "_follow_occupancy"),
@@ -146,14 +146,5 @@ def watched(clock: Clock) -> Iterator[None]:
 
         for part, owner, name in SEAMS:
             wrap(owner, name, partial(clock.timed, part))
-        wrap(train, "invert_motion", partial(_timed_march, clock))
         wrap(Parallel, "map", partial(clock.shared, OTHER))
         yield
-
-
-def _timed_march(clock: Clock, invert: Callable[..., Any]) -> Callable[..., Any]:
-    def invert_and_watch(*arguments: Any) -> Any:
-        inverse = invert(*arguments)
-        return replace(inverse, sample=clock.timed("march", inverse.sample))
-
-    return invert_and_watch
