@@ -2,7 +2,7 @@
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from pipeline.avatar.body import Body, Motion
@@ -14,6 +14,8 @@ from pipeline.geometry.rotation import (
     quaternion_to_matrix,
 )
 from pipeline.geometry.skinning import forward_kinematics, skinning_transforms
+from pipeline.kernels.dispatch import runs_on_numba
+from pipeline.kernels.kinematics import FittedPoses, Skeleton, skinning_matrices
 
 MAIN_JOINTS = (
     "Hips", "Spine", "Spine1", "Spine2", "Neck", "Head",
@@ -39,6 +41,9 @@ class PoseCorrection:
         self._joints_m = torch.as_tensor(body.joints_m).to(device)
         self._rotations = quaternion_to_matrix(torch.as_tensor(motion.rotations_wxyz)).to(device)
         self._root_m = torch.as_tensor(motion.root_translation_m).to(device)
+        of_joint = torch.full((len(body.joint_names),), -1)
+        of_joint[self.joints.cpu()] = torch.arange(len(joints))
+        self._skeleton = Skeleton(torch.as_tensor(body.joints_m), torch.as_tensor(body.parents).long(), of_joint)
         gaps_s = np.diff(motion.time_s.astype(np.float64)) if frames > 1 else np.zeros(0)
         gaps = np.maximum(gaps_s / max(np.median(gaps_s), 1e-9), 1e-3) if len(gaps_s) else gaps_s
         self._gap = torch.tensor(gaps, dtype=torch.float32, device=device)
@@ -54,6 +59,15 @@ class PoseCorrection:
             self.body.parents,
         )
         return skinning_transforms(posed, self._joints_m)
+
+    def canonical_to_posed(
+        self, rows: Int[Tensor, "k"], posed_from_world: Float[Tensor, "k 4 4"]
+    ) -> Float[Tensor, "k j 4 4"]:
+        """`canonical_to_world`, carried on by a rigid map of each frame."""
+        if not runs_on_numba(self.rotation_rad):
+            return posed_from_world[:, None] @ self.canonical_to_world(rows)
+        fitted = FittedPoses(self._rotations[rows], self._root_m[rows], posed_from_world.contiguous())
+        return skinning_matrices(self.rotation_rad[rows], self.shift_m[rows], self._skeleton, fitted)
 
     def roughness(self) -> Tensor:
         """Mean squared change of the corrections from frame to frame (rad² and, in decimetres, m²)."""

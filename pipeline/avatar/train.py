@@ -175,8 +175,8 @@ class Learning:
         """Where samples lie once poses are refined: wherever these are now."""
         if not self.refines_poses:
             return None
-        to_world = self.poses.canonical_to_world(frames)
-        return Placing(self.skin, frames, self.posed_from_world[frames][:, None] @ to_world)
+        poses = self.poses.canonical_to_posed(frames, self.posed_from_world[frames])
+        return Placing(self.skin, frames, poses)
 
     def _points_of_the_box(self) -> Float[Tensor, "e 3"]:
         """Random points of empty cells."""

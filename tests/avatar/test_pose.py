@@ -52,3 +52,28 @@ def test_roughness_grows_with_jumps_and_shrinks_with_time_between(body, correcti
         correction.shift_m[2] = 0.0
     # The jump now lies between frames 3 and 5, which are twice as far apart as frames 2 and 3.
     assert float(correction.roughness().detach()) == pytest.approx(near / 2, rel=1e-5)
+
+
+@pytest.mark.parametrize("size", [0.0, 3e-3, 0.4, 2.5])
+def test_the_compiled_chain_is_the_plain_one(body, correction, size):
+    """Forward and in gradient, against float64; small corrections are on the series of Rodrigues' factors."""
+    random = torch.Generator().manual_seed(1)
+    rows, motion = torch.tensor([2, 0, 3]), correction.motion
+    shape = correction.rotation_rad.shape
+    with torch.no_grad():
+        correction.rotation_rad.copy_(
+            size * torch.nn.functional.normalize(torch.randn(shape, generator=random), dim=-1)
+        )
+        correction.shift_m.normal_(std=0.05, generator=random)
+    rigid = canonical_to_world(body, motion)[rows, 5].inverse().contiguous()
+    ours = correction.canonical_to_posed(rows, rigid)
+    twin = rigid[:, None] @ correction.canonical_to_world(rows)
+    torch.testing.assert_close(ours, twin, atol=2e-6, rtol=0)
+    weights = torch.randn(ours.shape, generator=random)
+    found, truth = (
+        torch.autograd.grad((matrices * weights).sum(), (correction.rotation_rad, correction.shift_m))
+        for matrices in (ours, twin)
+    )
+    for mine, theirs in zip(found, truth, strict=True):
+        assert not mine[1].any()
+        torch.testing.assert_close(mine, theirs, atol=3e-5 * float(theirs.abs().max()), rtol=0)
