@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from pipeline.avatar import field as field_module
 from pipeline.avatar import look as module
 from pipeline.avatar.inverse import Rays
 from pipeline.avatar.look import look, look_at_all
@@ -55,6 +56,7 @@ def whole(thinning: float = 0.0):
 @pytest.mark.parametrize("exact", [True, False])
 def test_both_ways_come_to_the_same(learning, monkeypatch, exact):
     monkeypatch.setattr(module, "trace", whole())
+    monkeypatch.setattr(field_module, "NEGLIGIBLE", 0.0)
     (ours, towards), (twin, of_twin) = seen(learning, look, exact), seen(learning, look_at_all, exact)
     assert float(twin.alpha.detach().max()) > 0.9
     for name in ("image", "alpha"):
@@ -71,8 +73,8 @@ def test_both_ways_come_to_the_same(learning, monkeypatch, exact):
     assert mine.keys() == theirs.keys()
     assert ("shift_m" in mine) == exact
     for name, gradient in theirs.items():
-        # The twin leaves out points with less than a thousandth of the mean gradient.
-        assert float((mine[name] - gradient).norm()) < 2e-3 * float(gradient.norm()), name
+        # A hidden unit near zero may be on in one and off in the other.
+        assert float((mine[name] - gradient).norm()) < 5e-4 * float(gradient.norm()), name
 
 
 def test_what_lies_in_the_dark_is_not_asked_and_hardly_missed(learning, monkeypatch):
@@ -98,7 +100,9 @@ def test_thinning_keeps_the_gradient_in_the_mean(learning, monkeypatch):
         for name, gradient in truth.items():
             error = float((thinned[name] - gradient).norm()) / float(gradient.norm())
             assert error < {0.3: 0.05, 3.0: 0.5}[thinning], name
-            along = float((thinned[name] * gradient).sum()) / float(gradient.square().sum())
+        # Of many numbers the noise averages out: what is left would be a bias.
+        for name in ("table", "hidden"):
+            along = float((thinned[name] * truth[name]).sum()) / float(truth[name].square().sum())
             assert along == pytest.approx(1.0, abs={0.3: 0.01, 3.0: 0.1}[thinning]), name
     assert taken[3.0] < taken[0.3] < 0.6 * len(seen(learning, look)[0].light)
 

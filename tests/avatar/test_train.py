@@ -1,5 +1,6 @@
 from functools import partial
 
+import numba
 import numpy as np
 import pytest
 import torch
@@ -141,6 +142,7 @@ def test_a_step_in_parts_comes_to_that_of_the_whole(scene, monkeypatch, frames_p
     np.testing.assert_allclose(errors, part_errors, rtol=1e-5)
 
 
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one thread is all there is")
 def test_the_number_of_threads_changes_no_byte(scene, monkeypatch):
     states = []
     for threads in (1, 2):
