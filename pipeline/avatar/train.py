@@ -108,8 +108,13 @@ class Learning:
         self.bad_steps = 0
         self.errors = ErrorMap(scene.pool.frames, scene.pool.xy_px)
         self.table_gradient = torch.zeros_like(field.table)
-        self.frames_per_step = min(config.frames_per_step, scene.pool.frames)
-        self.shares = (1 - config.share_border - config.share_outside, config.share_border, config.share_outside)
+        shares = (1 - config.share_border - config.share_outside, config.share_border, config.share_outside)
+        everything = np.arange(scene.pool.frames)
+        self.frames_with_rays = np.flatnonzero(scene.pool.sizes(everything, float(config.rays), shares).any(axis=1))
+        if not len(self.frames_with_rays):
+            raise ValueError("no frame has a pixel to learn from")
+        self.frames_per_step = min(config.frames_per_step, len(self.frames_with_rays))
+        self.sizes = scene.pool.sizes(everything, config.rays / self.frames_per_step, shares)
         self.part_count = PARTS if self.device.type == "cpu" else 1
         self.threads = Parallel(self.part_count)
         parameters: dict[str, Tensor] = dict(field.named_parameters())
@@ -144,18 +149,18 @@ class Learning:
     def _random(self, stream: int) -> np.random.Generator:
         return np.random.Generator(np.random.Philox(key=[self.config.seed, self.done], counter=[0, 0, 0, stream]))
 
-    def _draw(self, frames: Int[np.ndarray, "k"], sizes: Int[np.ndarray, "k kinds"]) -> Batch:
-        """Rays of some frames, so many of each kind of pixel; those of a frame hang on nothing but frame and step."""
+    def _draw(self, frames: Int[np.ndarray, "k"]) -> Batch:
+        """Rays of some frames; those of a frame hang on nothing but frame and step."""
         config, pool = self.config, self.scene.pool
         rows, numbers = [], []
-        for frame, size in zip(frames.tolist(), sizes, strict=True):
+        for frame in frames.tolist():
             random = self._random(OF_FRAMES + frame)
-            rows.append(pool.draw(frame, size, random, self.errors, config.share_error))
+            rows.append(pool.draw(frame, self.sizes[frame], random, self.errors, config.share_error))
             numbers.append(random.random((len(rows[-1]), 6), dtype=np.float32))
         row, number = np.concatenate(rows), np.concatenate(numbers)
         inside = number[:, 4:] if config.pixel_jitter else np.float32(0.5)
         origins, directions = pixel_rays(self.scene.camera, self._here(pool.xy_px[row] + inside))
-        slot, chosen = self._here(np.repeat(np.arange(len(frames)), sizes.sum(1))), self._here(frames)
+        slot, chosen = self._here(np.repeat(np.arange(len(frames)), self.sizes[frames].sum(1))), self._here(frames)
         matrix = self.posed_from_world[chosen].index_select(0, slot)
         return Batch(
             frames=chosen,
@@ -200,14 +205,12 @@ class Learning:
             self._bake()
         if self.refines_poses and self.skin is self.whole_skin:
             self._follow_occupancy()
-        frames = np.sort(random.choice(self.scene.pool.frames, self.frames_per_step, replace=False))
-        sizes = self.scene.pool.sizes(frames, config.rays / len(frames), self.shares)
-        count = min(self.part_count, len(frames))
-        cut = [np.array_split(array, count) for array in (frames, sizes)]
+        frames = np.sort(random.choice(self.frames_with_rays, self.frames_per_step, replace=False))
+        parts = np.array_split(frames, min(self.part_count, len(frames)))
         points = (self._points_of_the_box, self._hidden_points)
-        should_be_empty = [points[part::count] for part in range(count)]
-        share = [float(part.sum() / max(sizes.sum(), 1)) for part in cut[1]]
-        answers = self.threads.map(self._answer, *cut, should_be_empty, share)
+        should_be_empty = [points[part :: len(parts)] for part in range(len(parts))]
+        share = [float(self.sizes[part].sum() / self.sizes[frames].sum()) for part in parts]
+        answers = self.threads.map(self._answer, parts, should_be_empty, share)
         losses = summed(answer.losses for answer in answers)
         total, gradients = torch.stack(list(losses.values())).sum(), [answer.gradients for answer in answers]
         if self.refines_poses:
@@ -231,14 +234,13 @@ class Learning:
     def _answer(
         self,
         frames: Int[np.ndarray, "k"],
-        sizes: Int[np.ndarray, "k kinds"],
         should_be_empty: Sequence[Callable[[], Tensor]],
         share: float,
     ) -> Answer:
         """Learn from rays of some frames and points that should be empty. Changes nothing, so threads may do it at
         once. share: that of all rays.
         """
-        batch, towards = self._draw(frames, sizes), Towards()
+        batch, towards = self._draw(frames), Towards()
         empty_m = torch.cat([points() for points in should_be_empty] or [self.occupancy.bounds_m[:0]])
         rays = Rays(batch.origins_m, batch.directions, batch.frames[batch.slot], batch.jitter)
         about = (self.occupancy.grid(), rays, self._placing(batch.frames), empty_m)

@@ -157,9 +157,7 @@ def test_the_number_of_threads_changes_no_byte(scene, monkeypatch):
 
 
 def draw(learning, *frames):
-    frames = np.array(frames)
-    sizes = learning.scene.pool.sizes(frames, learning.config.rays / len(frames), learning.shares)
-    return learning._draw(frames, sizes)
+    return learning._draw(np.array(frames))
 
 
 def test_where_no_light_comes_the_field_becomes_empty(scene):

@@ -55,8 +55,7 @@ def learning() -> Learning:
 
 def drawn(learning: Learning, step: int, frames: Sequence[int] = (0, 2)) -> Batch:
     learning.done = step
-    chosen = np.array(frames)
-    return learning._draw(chosen, learning.scene.pool.sizes(chosen, 300.0, learning.shares))
+    return learning._draw(np.array(frames))
 
 
 def test_every_ray_has_a_background_of_its_own(learning: Learning) -> None:
@@ -94,3 +93,16 @@ def test_points_that_should_be_empty_are(learning: Learning) -> None:
     learning.done -= 1
     assert not torch.equal(box, learning._points_of_the_box())
     assert len(learning._hidden_points()) == 0
+
+
+def test_frames_without_a_person_are_passed_over() -> None:
+    scene = painted_scene(4, 64)
+    config = FieldConfig(rays=600, frames_per_step=2, levels=2, log2_rows=10, margin_m=0.03)
+    nothing = np.zeros_like(scene.masks[0])
+    pictures = list(zip(scene.images, [*scene.masks[:1], nothing, nothing, nothing], strict=True))
+    learning = start_learning(scene.body, scene.motion, scene.camera, pictures, config)
+    assert learning.frames_with_rays.tolist() == [0]
+    losses = [learning.step() for _ in range(3)]
+    assert np.isfinite([loss["colour"] for loss in losses]).all()
+    assert learning.bad_steps == 0
+    assert all(loss["samples"] > 0 for loss in losses)
