@@ -59,7 +59,7 @@ class FieldConfig(Config):
     occupancy_every: int = Option(8, ge=1, description="steps between updates of the occupancy grid")
     occupancy_start: int = Option(64, ge=0, description="step of the first update that may empty a cell")
     occupancy_threshold: float = Option(
-        0.01, ge=0, le=1, description="mean opacity of a step above which a cell is occupied"
+        0.03, ge=0, le=1, description="mean opacity of a step above which a cell is occupied"
     )
     occupancy_decay: float = Option(
         0.95, gt=0, lt=1, description="moving average of the occupancy, part kept an update"

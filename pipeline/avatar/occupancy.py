@@ -20,8 +20,10 @@ from pipeline.kernels.visits import record_visits
 
 RESOLUTION = 64
 HIDDEN = 16
-START_AVERAGE = 0.03
-"""Of a cell before it was asked: it stays occupied for some twenty updates in which its density is zero."""
+GRACE = 3.0
+"""The average of a cell before it was asked, in thresholds: with a decay of 0.95 it stays occupied for some twenty
+updates in which its density is zero.
+"""
 FADING = 0.8
 """What is left, an update later, of what the rays saw in a cell."""
 HIDDEN_M = 0.03
@@ -94,6 +96,7 @@ class OccupancyUpdate:
         attention: bool,
         learning_rate: float,
         decay: float,
+        threshold: float,
         seed: int,
         device: torch.device = CPU,
     ) -> None:
@@ -105,9 +108,9 @@ class OccupancyUpdate:
         self.cells = torch.from_numpy(cells).to(device)
         self.centres_m = torch.from_numpy(cell_centres(bounds_m, shell.shape[0])[cells]).to(device)
         self.distance_m, self.frequency = (torch.from_numpy(array).to(device) for array in of_cells)
-        self.average = torch.full((len(cells),), START_AVERAGE, device=device)
+        self.average = torch.full((len(cells),), GRACE * threshold, device=device)
         self.reached, self.gave = torch.zeros(2, shell.size, device=device).unbind()
-        self.decay = decay
+        self.decay, self.threshold = decay, threshold
         self.attention = VoxelAttention(margin_m, seed).to(device) if attention else None
         if self.attention is not None:
             self.optimiser = torch.optim.Adam(self.attention.parameters(), lr=learning_rate)
@@ -139,13 +142,11 @@ class OccupancyUpdate:
         record_visits(points_m, light, weights, self.bounds_m, self.shape, self.reached, self.gave)
 
     @torch.no_grad()
-    def update(
-        self, density_of: Callable[[Tensor], Tensor], step_m: float, threshold: float, random: np.random.Generator
-    ) -> None:
+    def update(self, density_of: Callable[[Tensor], Tensor], step_m: float, random: np.random.Generator) -> None:
         """One update of all cells of the shell.
 
         density_of: canonical points (n, 3) -> density (n); asked at a random point of each cell.
-        step_m: length over which a density becomes an opacity. threshold: average opacity at which a cell is occupied.
+        step_m: length over which a density becomes an opacity.
         """
         device = self.cells.device
         cell_m = (self.bounds_m[1] - self.bounds_m[0]) / torch.tensor(self.shape, device=device)
@@ -157,7 +158,7 @@ class OccupancyUpdate:
         else:
             weight = torch.sigmoid(self._learn(self.attention, density))
             self.average = self.decay * self.average + (1 - self.decay) * weight * opacity
-        kept = self.average > min(threshold, float(self.average.mean()))
+        kept = self.average > min(self.threshold, float(self.average.mean()))
         self.occupied.view(-1)[self.cells] = kept.to(torch.uint8)
         self.reached *= FADING
         self.gave *= FADING

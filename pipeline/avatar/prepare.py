@@ -82,6 +82,7 @@ def start_learning(
         attention=config.occupancy == "attention",
         learning_rate=config.attention_rate,
         decay=config.occupancy_decay,
+        threshold=config.occupancy_threshold,
         seed=config.seed,
         device=device,
     )

@@ -226,7 +226,7 @@ class Learning:
         self._update_parameters(finite, summed(gradients))
         self.done += 1
         if self.done % config.occupancy_every == 0 and self.done >= config.occupancy_start:
-            self.occupancy.update(self.field.density, self.step_m, config.occupancy_threshold, random)
+            self.occupancy.update(self.field.density, self.step_m, random)
             self._follow_occupancy()
         samples = sum(len(answer.seen.light) for answer in answers)
         return {name: float(loss) for name, loss in losses.items()} | {"samples": float(samples)}

@@ -15,7 +15,7 @@ def ball_update(attention, rate=0.03):
     centres = cell_centres(BOUNDS)
     distance = (np.linalg.norm(centres, axis=1) - RADIUS_M).reshape((RESOLUTION,) * 3).astype(np.float32)
     frequency = np.clip(0.9 - 2 * distance, 0, 1).astype(np.float32)
-    return OccupancyUpdate(distance < 0.3, distance, frequency, BOUNDS, 0.3, attention, rate, 0.9, seed=0)
+    return OccupancyUpdate(distance < 0.3, distance, frequency, BOUNDS, 0.3, attention, rate, 0.9, 0.01, seed=0)
 
 
 def ball_density(points):
@@ -36,7 +36,7 @@ def test_cells_without_density_are_emptied(attention):
     start = int(update.occupied.sum())
     for _ in range(40):
         shine(update, random)
-        update.update(ball_density, STEP_M, 0.01, random)
+        update.update(ball_density, STEP_M, random)
     centres = torch.from_numpy(cell_centres(BOUNDS))
     occupied = update.occupied.view(-1) != 0
     inside, outside = centres.norm(dim=1) < 0.45, centres.norm(dim=1) > 0.56
@@ -49,7 +49,7 @@ def test_attention_learns_what_light_showed():
     update, random = ball_update(True), np.random.default_rng(0)
     for _ in range(120):
         shine(update, random)
-        update.update(ball_density, STEP_M, 0.01, random)
+        update.update(ball_density, STEP_M, random)
     density, distance = torch.tensor([200.0, 0.0]), torch.tensor([-0.02, 0.15])
     weight = torch.sigmoid(update.attention(density, distance, torch.tensor([0.9, 0.6])))
     assert float(weight[0]) > 0.7
@@ -63,7 +63,7 @@ def test_attention_trusts_the_density_before_it_has_learnt():
 
 def test_cells_outside_the_shell_stay_empty():
     update = ball_update(False)
-    update.update(lambda points: torch.full((len(points),), 1e3), STEP_M, 0.01, np.random.default_rng(0))
+    update.update(lambda points: torch.full((len(points),), 1e3), STEP_M, np.random.default_rng(0))
     assert int(update.occupied.sum()) == len(update.cells)
 
 
@@ -78,7 +78,7 @@ def test_goes_on_from_its_state_to_the_bit(attention):
         for update in (whole, broken):
             random = np.random.default_rng(seed)
             shine(update, random)
-            update.update(ball_density, STEP_M, 0.01, random)
+            update.update(ball_density, STEP_M, random)
     for name, value in whole.state().items():
         assert torch.equal(value, broken.state()[name]), name
 

@@ -53,7 +53,7 @@ import numpy as np
 
 from data_tools.command import run_command
 from pipeline.avatar.field_config import FieldConfig
-from pipeline.avatar.occupancy import START_AVERAGE
+from pipeline.avatar.occupancy import GRACE
 from pipeline.avatar.prepare import spread, start_learning, training_scale
 from pipeline.avatar.train import REBAKES, Learning
 from pipeline.core.config import build, load_layers
@@ -144,8 +144,7 @@ def period(config: FieldConfig) -> int:
 
 def settled(config: FieldConfig) -> int:
     """Steps until poses are refined and a cell that was never anything but empty is given up; whole periods."""
-    lowest = max(config.occupancy_threshold, 1e-6)
-    updates = max(0, math.ceil(math.log(lowest / START_AVERAGE) / math.log(config.occupancy_decay)))
+    updates = math.ceil(math.log(1 / GRACE) / math.log(config.occupancy_decay))
     emptied = config.occupancy_start + updates * config.occupancy_every
     poses = math.ceil(config.pose_start * config.steps) if config.pose_refinement else 0
     return math.ceil(max(emptied, poses) / period(config)) * period(config)

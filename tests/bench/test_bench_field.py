@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from pipeline.avatar.field_config import FieldConfig
+from pipeline.avatar.occupancy import GRACE
 from pipeline.avatar.train import Learning
 from pipeline.core.errors import UserError
 from pipeline.kernels.hashgrid import _Encode
@@ -157,7 +158,7 @@ def test_warm_up_lasts_until_poses_move_and_cells_are_given_up():
     config = FieldConfig()
     assert period(config) == 8
     updates = (settled(config) - config.occupancy_start) // config.occupancy_every
-    assert 0.03 * config.occupancy_decay**updates <= config.occupancy_threshold
+    assert GRACE * config.occupancy_decay**updates <= 1
     assert settled(config) % 8 == 0
     assert settled(FieldConfig(steps=4000)) == 400
 
