@@ -1,7 +1,7 @@
 """What rays see of a canonical field behind inverse skinning: one operation that goes no farther than the light.
 
 It is what `pipeline.avatar.look.look_at_all`, its plain twin, composes of march, Newton step, hash grid, network and
-compositing. That asks the field for all samples; of these two in three lie behind a surface. Here a ray ends where less
+compositing. That asks the field for all samples; of these three in five lie behind a surface. Here a ray ends where less
 than `LEAST_LIGHT` is left, and what a few rays ask is in the cache while it is worked at.
 
 Letters: n rays, k frames of the batch, s samples, p points, l levels, f features a level, w = l * f, h hidden units.
@@ -23,8 +23,8 @@ from pipeline.kernels.warp import SkinGrid
 LEAST_LIGHT = 1e-3
 """Of a ray's light, below which what is behind is not asked for: a quarter of a grey level."""
 THINNING = 0.3
-"""Samples whose gradient is below this part of the mean one are thinned out. Three in four have nearly none: what that
-adds to the noise of a step's gradient is a ten-thousandth of its square (docs/decisions.md).
+"""Samples whose gradient is below this part of the mean one are thinned out: three in four of those that have any. What
+that adds to the noise of a step's gradient is a ten-thousandth of its square (docs/decisions.md).
 """
 ROOM = 16
 """Samples that a ray has at first room for, on average."""
