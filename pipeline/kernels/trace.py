@@ -1,8 +1,8 @@
 """What rays see of a canonical field behind inverse skinning: one operation that goes no farther than the light.
 
 It is what `pipeline.avatar.look.look_at_all`, its plain twin, composes of march, Newton step, hash grid, network and
-compositing. That asks the field for all samples; of these three in five lie behind a surface. Here a ray ends where less
-than `LEAST_LIGHT` is left, and what a few rays ask is in the cache while it is worked at.
+compositing. That asks the field for all samples, and three in five of these lie behind a surface. Here a ray ends where
+less than `LEAST_LIGHT` is left, and what a few rays ask is in the cache while it is worked at.
 
 Letters: n rays, k frames of the batch, s samples, p points, l levels, f features a level, w = l * f, h hidden units.
 """
