@@ -84,7 +84,13 @@ class VoxelAttention(torch.nn.Module):
 
 
 class OccupancyUpdate:
-    """The state that changes while the field learns: moving average, what rays saw, and the attention network."""
+    """The state that changes while the field learns: moving average, what rays saw, and the attention network.
+
+    cells: flat indices of those that may ever be occupied. empty: of those that are not. hidden: of occupied cells
+    outside the body that no light had reached when they were last updated: nothing says what is there. Between an arm
+    and the torso that it never left, say: unless asked to be empty, such a place keeps the density that it began with
+    and becomes a flap of cloth once the arm is lifted.
+    """
 
     def __init__(
         self,
@@ -106,7 +112,8 @@ class OccupancyUpdate:
         cells = np.flatnonzero(shell)
         of_cells = (array.reshape(-1)[cells].astype(np.float32) for array in (distance_m, frequency))
         self.cells = torch.from_numpy(cells).to(device)
-        self.centres_m = torch.from_numpy(cell_centres(bounds_m, shell.shape[0])[cells]).to(device)
+        self.cell_m = (self.bounds_m[1] - self.bounds_m[0]) / torch.tensor(self.shape, device=device)
+        self.corners_m = torch.from_numpy(cell_centres(bounds_m, shell.shape[0])).to(device) - 0.5 * self.cell_m
         self.distance_m, self.frequency = (torch.from_numpy(array).to(device) for array in of_cells)
         self.average = torch.full((len(cells),), GRACE * threshold, device=device)
         self.reached, self.gave = torch.zeros(2, shell.size, device=device).unbind()
@@ -116,26 +123,29 @@ class OccupancyUpdate:
             self.optimiser = torch.optim.Adam(self.attention.parameters(), lr=learning_rate)
         self.occupied = torch.zeros(shell.shape, dtype=torch.uint8, device=device)
         self.occupied.view(-1)[self.cells] = 1
+        self.empty = torch.nonzero(self.occupied.view(-1) == 0)[:, 0]
+        self.hidden = self.cells[:0]
 
     def grid(self) -> Occupancy:
         """The cells as they are occupied now; later updates show in it."""
         return Occupancy(self.occupied, self.bounds_m)
 
-    def hidden_cells(self) -> Int[Tensor, "h"]:
-        """Occupied cells (flat index) outside the body that no light reached lately: nothing says what is there.
-
-        Between an arm and the torso that it never left, say: unless asked to be empty, such a place keeps the density
-        that it began with and becomes a flap of cloth once the arm is lifted.
+    def should_be_empty(self, of_box: int, of_hidden: int, random: np.random.Generator) -> Float[Tensor, "e 3"]:
+        """Random points where nothing should be: those of `of_box` points of the box that come to lie in empty cells,
+        and `of_hidden` of hidden cells, if there are any.
         """
-        dark = (self.reached[self.cells] < DARK) & (self.occupied.view(-1)[self.cells] != 0)
-        return self.cells[dark & (self.distance_m > HIDDEN_M)]
+        in_empty = round(of_box * len(self.empty) / self.occupied.numel())
+        wanted = ((self.empty, in_empty), (self.hidden, of_hidden if len(self.hidden) else 0))
+        drawn = [cells[self._here(random.integers(0, max(len(cells), 1), count))] for cells, count in wanted]
+        return self.points_in(torch.cat(drawn), random)
 
     def points_in(self, cells: Int[Tensor, "n"], random: np.random.Generator) -> Float[Tensor, "n 3"]:
         """A random point (m) of each cell, given by flat index."""
-        size = torch.tensor(self.shape, device=cells.device)
-        corner = torch.stack(torch.unravel_index(cells, self.shape), dim=-1)
-        inside = torch.from_numpy(random.random((len(cells), 3), dtype=np.float32)).to(cells.device)
-        return self.bounds_m[0] + (corner + inside) / size * (self.bounds_m[1] - self.bounds_m[0])
+        inside = self._here(random.random((len(cells), 3), dtype=np.float32))
+        return self.corners_m.index_select(0, cells) + inside * self.cell_m
+
+    def _here(self, array: np.ndarray) -> Tensor:
+        return torch.from_numpy(array).to(self.cells.device)
 
     def record(self, points_m: Float[Tensor, "s 3"], light: Float[Tensor, "s"], weights: Float[Tensor, "s"]) -> None:
         """Note for each sample's cell how much light reached it and how much of a pixel it gave."""
@@ -148,10 +158,7 @@ class OccupancyUpdate:
         density_of: canonical points (n, 3) -> density (n); asked at a random point of each cell.
         step_m: length over which a density becomes an opacity.
         """
-        device = self.cells.device
-        cell_m = (self.bounds_m[1] - self.bounds_m[0]) / torch.tensor(self.shape, device=device)
-        offset = torch.from_numpy(random.random((len(self.cells), 3), dtype=np.float32)).to(device) - 0.5
-        density = density_of(self.centres_m + offset * cell_m)
+        density = density_of(self.points_in(self.cells, random))
         opacity = -torch.expm1(-density * step_m)
         if self.attention is None:
             self.average = torch.maximum(self.average * self.decay, opacity)
@@ -162,6 +169,9 @@ class OccupancyUpdate:
         self.occupied.view(-1)[self.cells] = kept.to(torch.uint8)
         self.reached *= FADING
         self.gave *= FADING
+        dark = kept & (self.reached[self.cells] < DARK)
+        self.hidden = self.cells[dark & (self.distance_m > HIDDEN_M)]
+        self.empty = torch.nonzero(self.occupied.view(-1) == 0)[:, 0]
 
     def _learn(self, attention: VoxelAttention, density: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
         """One step of the attention network on the cells that light reached lately; returns the logits of all cells."""
@@ -179,6 +189,7 @@ class OccupancyUpdate:
     def state(self) -> dict[str, Tensor]:
         """Everything that a resumed run needs."""
         tensors = {"average": self.average, "reached": self.reached, "gave": self.gave, "occupied": self.occupied}
+        tensors["hidden"] = self.hidden
         if self.attention is None:
             return tensors
         for name, parameter in self.attention.named_parameters():
@@ -189,9 +200,10 @@ class OccupancyUpdate:
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
         """Go on from `state()`."""
-        for name in ("average", "reached", "gave"):
+        for name in ("average", "reached", "gave", "hidden"):
             setattr(self, name, tensors[name].clone().to(self.cells.device))
         self.occupied.copy_(tensors["occupied"])
+        self.empty = torch.nonzero(self.occupied.view(-1) == 0)[:, 0]
         if self.attention is None:
             return
         for name, parameter in self.attention.named_parameters():

@@ -1,17 +1,18 @@
 """The pixels that training draws from: on the body, along its border, and a few outside."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from pipeline.geometry.camera import Camera
+from pipeline.kernels.draw import Eyes, draw_pixels, note_errors, numbers_needed
+
 KINDS = ("body", "border", "outside")
 OUTSIDE_PER_FRAME = 20_000
 TILE_PX = 16
-CANDIDATES = 4
-"""Pixels that are drawn for each that is then chosen by the error around it."""
 MEMORY = 0.8
 """What is left of a tile's error at each new pixel of it."""
 
@@ -21,31 +22,13 @@ class ErrorMap:
 
     def __init__(self, frames: int, xy_px: Int[np.ndarray, "p 2"]) -> None:
         """All tiles alike. xy_px: every pixel that will ever be asked for."""
+        self.xy_px = xy_px
         columns, rows = xy_px.max(axis=0) // TILE_PX + 1
         self.error = np.ones((frames, rows, columns), dtype=np.float32)
 
-    def at(self, frame: int, xy_px: Int[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-        """The error around pixels of a frame."""
-        column, row = xy_px.T // TILE_PX
-        return self.error[frame, row, column]
-
-    def note(
-        self,
-        frames: Int[np.ndarray, "k"],
-        slot: Int[np.ndarray, "n"],
-        xy_px: Int[np.ndarray, "n 2"],
-        error: Float[np.ndarray, "n"],
-    ) -> None:
-        """Take in what pixels (column, row) of the frames `frames[slot]`, each named once, erred by, not negative."""
-        column, row = xy_px.T // TILE_PX
-        known = self.error[frames]
-        tile = np.ravel_multi_index((slot, row, column), known.shape)
-        count, total = np.bincount(tile), np.bincount(tile, error)
-        seen = np.flatnonzero(count)
-        kept = MEMORY ** count[seen]
-        flat = known.reshape(-1)
-        flat[seen] = kept * flat[seen] + (1 - kept) * (total[seen] / count[seen])
-        self.error[frames] = known
+    def note(self, rows: Int[np.ndarray, "n"], frame: Int[np.ndarray, "n"], erred: Float[np.ndarray, "n 3"]) -> None:
+        """Take in what pixels of some frames, those of a frame side by side, erred by in colour."""
+        note_errors(rows, frame, self.xy_px, erred, MEMORY, TILE_PX, self.error)
 
 
 @dataclass(frozen=True)
@@ -76,27 +59,30 @@ class PixelPool:
 
     def draw(
         self,
-        frame: int,
-        sizes: Int[np.ndarray, "kinds"],
-        random: np.random.Generator,
-        errors: ErrorMap | None = None,
+        frames: Int[np.ndarray, "k"],
+        sizes: Int[np.ndarray, "k kinds"],
+        streams: Sequence[np.random.Generator],
+        errors: ErrorMap,
         by_error: float = 0.0,
     ) -> Int[np.ndarray, "n"]:
-        """Rows of random pixels of a frame, so many of each kind, sorted.
+        """Rows of random pixels of some frames, so many of each kind, evenly spread over the pixels of their kind.
 
-        by_error: part of the rays on the body that goes where `errors` are large.
+        streams: of random numbers, one for each frame, so that its pixels hang on it alone. by_error: part of the rays
+        on the body that goes where `errors` are large.
         """
-        mine = []
-        for kind, count in enumerate(sizes.tolist()):
-            first, last = self.start[frame, kind], self.start[frame, kind + 1]
-            chosen = round(by_error * count) if errors and KINDS[kind] == "body" else 0
-            mine.append(random.integers(first, max(last, first + 1), count - chosen))
-            if errors and chosen:
-                candidates = random.integers(first, last, CANDIDATES * chosen)
-                weight = errors.at(frame, self.xy_px[candidates]).cumsum(dtype=np.float64)
-                place = np.searchsorted(weight, random.random(chosen) * weight[-1], side="right")
-                mine.append(candidates[np.minimum(place, len(candidates) - 1)])
-        return np.sort(np.concatenate(mine))
+        chosen = np.zeros_like(sizes)
+        chosen[:, KINDS.index("body")] = np.rint(by_error * sizes[:, KINDS.index("body")])
+        needed = numbers_needed(sizes, chosen).tolist()
+        numbers = np.concatenate([stream.random(count) for stream, count in zip(streams, needed, strict=True)])
+        return draw_pixels(self.start, self.xy_px, frames, sizes, chosen, errors.error, TILE_PX, numbers)
+
+
+def eyes(camera: Camera, posed_from_world: Float[np.ndarray, "frames 4 4"]) -> Eyes:
+    """How the camera sees each frame's posed space."""
+    turn, shift = posed_from_world[:, :3, :3], posed_from_world[:, :3, 3]
+    lens = np.array([[camera.fx, camera.fy], [camera.cx, camera.cy]], np.float32)
+    origin_m, axes = turn @ camera.centre_m() + shift, turn @ camera.world_to_camera[:3, :3].T
+    return Eyes(lens[0], lens[1], origin_m.astype(np.float32), np.ascontiguousarray(axes, np.float32))
 
 
 def build_pool(

@@ -1,7 +1,7 @@
 """Learning the canonical field from a video: one step, and all that it changes."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,13 +14,14 @@ from pipeline.avatar.field import Field
 from pipeline.avatar.field_config import FieldConfig
 from pipeline.avatar.inverse import Rays, invert_motion
 from pipeline.avatar.look import Placing, look
-from pipeline.avatar.losses import colour_errors, field_losses
+from pipeline.avatar.losses import field_losses
 from pipeline.avatar.occupancy import OccupancyUpdate
 from pipeline.avatar.pose import PoseCorrection
-from pipeline.avatar.rays import ErrorMap, PixelPool
+from pipeline.avatar.rays import ErrorMap, PixelPool, eyes
 from pipeline.avatar.warp import posed_from_world
-from pipeline.geometry.camera import Camera, pixel_rays
+from pipeline.geometry.camera import Camera
 from pipeline.kernels.adam import adam_step_
+from pipeline.kernels.draw import pixel_rays
 from pipeline.kernels.hashgrid import Towards, add_table_gradient_
 from pipeline.kernels.parallel import Parallel
 from pipeline.kernels.trace import Traced
@@ -32,9 +33,9 @@ REBAKES = (0.6,)
 """Parts of the training at which the warp grids follow the refined poses (docs/decisions.md)."""
 MAX_SAMPLES = 160
 """Of a ray; those farther back are dropped."""
-PARTS = 2
+PARTS = 4
 """On the CPU a step's frames are divided into so many parts, which threads work at, whatever the number of threads."""
-OF_STEP, OF_BOX, OF_HIDDEN, OF_FRAMES = range(4)
+OF_STEP, OF_POINTS, OF_FRAMES = range(3)
 """Streams of random numbers in a step: what it takes from where is the same however its work is divided."""
 
 
@@ -54,7 +55,7 @@ class Batch:
     """Some rays of a step, in the posed space of their frames, in the order of these."""
 
     frames: Int[Tensor, "k"]
-    slot: Int[Tensor, "n"]
+    frame: Int[Tensor, "n"]
     rows: Int[np.ndarray, "n"]
     origins_m: Float[Tensor, "n 3"]
     directions: Float[Tensor, "n 3"]
@@ -133,6 +134,7 @@ class Learning:
             everything = torch.arange(self.scene.pool.frames, device=self.device)
             canonical_to_world = self.poses.canonical_to_world(everything)
             self.posed_from_world = posed_from_world(canonical_to_world)
+            self.eyes = eyes(self.scene.camera, self.posed_from_world.cpu().numpy())
             poses = self.posed_from_world[:, None] @ canonical_to_world
             self.inverse = invert_motion(self.config.inverse_skinning, self.scene.body, self.scene.skin, poses)
 
@@ -151,24 +153,21 @@ class Learning:
 
     def _draw(self, frames: Int[np.ndarray, "k"]) -> Batch:
         """Rays of some frames; those of a frame hang on nothing but frame and step."""
-        config, pool = self.config, self.scene.pool
-        rows, numbers = [], []
-        for frame in frames.tolist():
-            random = self._random(OF_FRAMES + frame)
-            rows.append(pool.draw(frame, self.sizes[frame], random, self.errors, config.share_error))
-            numbers.append(random.random((len(rows[-1]), 6), dtype=np.float32))
-        row, number = np.concatenate(rows), np.concatenate(numbers)
-        inside = number[:, 4:] if config.pixel_jitter else np.float32(0.5)
-        origins, directions = pixel_rays(self.scene.camera, self._here(pool.xy_px[row] + inside))
-        slot, chosen = self._here(np.repeat(np.arange(len(frames)), self.sizes[frames].sum(1))), self._here(frames)
-        matrix = self.posed_from_world[chosen].index_select(0, slot)
+        config, pool, sizes = self.config, self.scene.pool, self.sizes[frames]
+        streams = [self._random(OF_FRAMES + frame) for frame in frames.tolist()]
+        rows = pool.draw(frames, sizes, streams, self.errors, config.share_error)
+        counts = sizes.sum(axis=1).tolist()
+        number = np.concatenate([s.random((n, 6), dtype=np.float32) for s, n in zip(streams, counts, strict=True)])
+        inside = number[:, 4:] if config.pixel_jitter else np.full((len(rows), 2), 0.5, np.float32)
+        frame = np.repeat(frames, counts)
+        origins, directions, rgba = pixel_rays(rows, frame, pool.xy_px, pool.rgba, inside, self.eyes)
         return Batch(
-            frames=chosen,
-            slot=slot,
-            rows=row,
-            origins_m=(matrix[:, :3, :3] * origins[:, None]).sum(-1) + matrix[:, :3, 3],
-            directions=(matrix[:, :3, :3] * directions[:, None]).sum(-1),
-            rgba=self._here(pool.rgba[row]).float() / 255,
+            frames=self._here(frames),
+            frame=self._here(frame),
+            rows=rows,
+            origins_m=self._here(origins),
+            directions=self._here(directions),
+            rgba=self._here(rgba),
             background=self._here(number[:, :3]),
             jitter=self._here(number[:, 3]),
         )
@@ -183,21 +182,6 @@ class Learning:
         poses = self.poses.canonical_to_posed(frames, self.posed_from_world[frames])
         return Placing(self.skin, frames, poses)
 
-    def _points_of_the_box(self) -> Float[Tensor, "e 3"]:
-        """Random points of empty cells."""
-        low, high = self.occupancy.bounds_m
-        unit = self._random(OF_BOX).random((self.config.empty_points, 3), dtype=np.float32)
-        points = self._here(unit) * (high - low) + low
-        return points[~self.occupancy.grid().contains(points)]
-
-    def _hidden_points(self) -> Float[Tensor, "e 3"]:
-        """Random points of hidden cells, once rays had time to see them."""
-        hidden, random = self.occupancy.hidden_cells(), self._random(OF_HIDDEN)
-        if not len(hidden) or self.done < self.config.occupancy_start:
-            return self.occupancy.bounds_m.new_zeros(0, 3)
-        drawn = hidden[self._here(random.integers(0, len(hidden), self.config.hidden_points))]
-        return self.occupancy.points_in(drawn, random)
-
     def step(self) -> dict[str, float]:
         """One step; returns the losses. Raises DivergedError after many steps without a finite loss."""
         config, random = self.config, self._random(OF_STEP)
@@ -207,10 +191,9 @@ class Learning:
             self._follow_occupancy()
         frames = np.sort(random.choice(self.frames_with_rays, self.frames_per_step, replace=False))
         parts = np.array_split(frames, min(self.part_count, len(frames)))
-        points = (self._points_of_the_box, self._hidden_points)
-        should_be_empty = [points[part :: len(parts)] for part in range(len(parts))]
+        empty_m = self.occupancy.should_be_empty(config.empty_points, config.hidden_points, self._random(OF_POINTS))
         share = [float(self.sizes[part].sum() / self.sizes[frames].sum()) for part in parts]
-        answers = self.threads.map(self._answer, parts, should_be_empty, share)
+        answers = self.threads.map(self._answer, parts, empty_m.tensor_split(len(parts)), share)
         losses = summed(answer.losses for answer in answers)
         total, gradients = torch.stack(list(losses.values())).sum(), [answer.gradients for answer in answers]
         if self.refines_poses:
@@ -231,26 +214,20 @@ class Learning:
         samples = sum(len(answer.seen.light) for answer in answers)
         return {name: float(loss) for name, loss in losses.items()} | {"samples": float(samples)}
 
-    def _answer(
-        self,
-        frames: Int[np.ndarray, "k"],
-        should_be_empty: Sequence[Callable[[], Tensor]],
-        share: float,
-    ) -> Answer:
+    def _answer(self, frames: Int[np.ndarray, "k"], empty_m: Float[Tensor, "e 3"], share: float) -> Answer:
         """Learn from rays of some frames and points that should be empty. Changes nothing, so threads may do it at
         once. share: that of all rays.
         """
         batch, towards = self._draw(frames), Towards()
-        empty_m = torch.cat([points() for points in should_be_empty] or [self.occupancy.bounds_m[:0]])
-        rays = Rays(batch.origins_m, batch.directions, batch.frames[batch.slot], batch.jitter)
+        rays = Rays(batch.origins_m, batch.directions, batch.frame, batch.jitter)
         about = (self.occupancy.grid(), rays, self._placing(batch.frames), empty_m)
         seen = look(self.field, self.inverse, *about, self.step_m, MAX_SAMPLES, towards)
-        error = colour_errors(seen.image, seen.alpha, batch.rgba, batch.background)
-        losses = field_losses(error, seen.alpha, batch.rgba[:, 3], seen.density_per_m, self.config)
+        truth = (batch.rgba, batch.background, seen.density_per_m, self.config)
+        losses, error = field_losses(seen.image, seen.alpha, *truth)
         losses = {name: loss if name == "density" else share * loss for name, loss in losses.items()}
         gradients = self._gradients(torch.stack(list(losses.values())).sum(), tuple(self.parameters))
         told = {name: loss.detach() for name, loss in losses.items()}
-        return Answer(batch, seen, error.detach(), told, gradients, towards)
+        return Answer(batch, seen, error, told, gradients, towards)
 
     def _gradients(self, loss: Tensor, names: tuple[str, ...]) -> dict[str, Tensor]:
         """Of the parameters that the loss depends on and whose gradient autograd is told."""
@@ -260,9 +237,7 @@ class Learning:
     def _note_errors(self, batch: Batch, colour_error: Float[Tensor, "n 3"]) -> None:
         """Remember where colours are wrong, for the rays of later steps."""
         if self.config.share_error > 0.0:
-            frames, slot = batch.frames.cpu().numpy(), batch.slot.cpu().numpy()
-            error = colour_error.abs().mean(1).cpu().numpy()
-            self.errors.note(frames, slot, self.scene.pool.xy_px[batch.rows], error)
+            self.errors.note(batch.rows, batch.frame.cpu().numpy(), colour_error.cpu().numpy())
 
     def _rate(self) -> float:
         """Part of the full learning rate: a short warm-up, then an exponential decay that ends at `final_rate`."""

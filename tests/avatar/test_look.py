@@ -28,7 +28,7 @@ def learning(scene) -> Learning:  # noqa: F811
 
 def seen(learning: Learning, way, exact: bool = True, frames: tuple[int, ...] = (1, 4, 6)) -> tuple[Traced, Towards]:
     batch, towards = draw(learning, *frames), Towards()
-    rays = Rays(batch.origins_m, batch.directions, batch.frames[batch.slot], batch.jitter)
+    rays = Rays(batch.origins_m, batch.directions, batch.frame, batch.jitter)
     placing = learning._placing(batch.frames) if exact else None
     points = torch.tensor([[0.0, 0.9, 0.0], [0.3, 1.2, 0.1], [5.0, 5.0, 5.0]])
     grid = learning.occupancy.grid()

@@ -1,43 +1,28 @@
-import math
-
 import numpy as np
 import pytest
 import torch
 
 from pipeline.avatar.field_config import FieldConfig
-from pipeline.avatar.losses import colour_errors, field_losses, hard_surface, huber
-from pipeline.avatar.rays import build_pool
+from pipeline.avatar.losses import field_losses
+from pipeline.avatar.rays import ErrorMap, build_pool
 
 CONFIG = FieldConfig(huber_delta=0.1, weight_alpha=0.5, weight_hard=0.2, weight_density=0.1)
-
-
-def test_huber_is_square_then_linear():
-    values = huber(torch.tensor([0.0, 0.05, -0.05, 1.0, -3.0]), 0.1)
-    assert values.tolist() == pytest.approx([0, 0.0125, 0.0125, 0.95, 2.95])
-
-
-def test_hard_surface_is_zero_at_both_ends_and_largest_between():
-    alpha = torch.linspace(0, 1, 101)
-    values = hard_surface(alpha)
-    assert float(values[0]) == pytest.approx(0, abs=1e-6)
-    assert float(values[100]) == pytest.approx(0, abs=1e-6)
-    assert int(values.argmax()) == 50
-    assert float(values[50]) == pytest.approx(math.log(1 + math.exp(-1)) - math.log(2 * math.exp(-0.5)), abs=1e-6)
 
 
 def test_perfect_image_costs_nothing():
     rgba = torch.tensor([[0.2, 0.4, 0.6, 1.0], [0.9, 0.1, 0.5, 0.0]])
     solid = rgba[:, :3] * rgba[:, 3:]
-    error = colour_errors(solid, rgba[:, 3], rgba, torch.rand(2, 3))
-    losses = field_losses(error, rgba[:, 3], rgba[:, 3], torch.zeros(5), CONFIG)
+    losses, error = field_losses(solid, rgba[:, 3], rgba, torch.rand(2, 3), torch.zeros(5), CONFIG)
+    assert float(error.abs().max()) < 1e-7
+    assert set(losses) == {"colour", "alpha", "hard", "density"}
     for name, value in losses.items():
         assert float(value) == pytest.approx(0, abs=1e-6), name
 
 
 def test_a_hole_in_the_body_costs_whatever_its_colour_and_background():
     rgba = torch.tensor([[1.0, 1.0, 1.0, 1.0]])
-    error = colour_errors(torch.zeros(1, 3), torch.zeros(1), rgba, torch.ones(1, 3))
-    losses = field_losses(error, torch.zeros(1), rgba[:, 3], torch.zeros(0), CONFIG)
+    nothing = torch.zeros(1, 3), torch.zeros(1)
+    losses, _ = field_losses(*nothing, rgba, torch.ones(1, 3), torch.zeros(0), CONFIG)
     assert float(losses["colour"]) == 0
     assert float(losses["alpha"]) == pytest.approx(0.5 * 0.95)
     assert "density" not in losses
@@ -68,10 +53,14 @@ def test_pool_sorts_pixels_into_kinds():
 def test_rays_are_shared_out_as_asked():
     pool, _, _ = make_pool()
     sizes = pool.sizes(np.array([0, 1, 2]), 300.0, (0.6, 0.3, 0.1))
+
+    def drawn(frame):
+        return pool.draw(np.array([frame]), sizes[[frame]], [np.random.default_rng(0)], ErrorMap(3, pool.xy_px))
+
     assert sizes.tolist() == [[180, 90, 30], [0, 0, 0], [180, 90, 30]]
-    rows = pool.draw(0, sizes[0], np.random.default_rng(0))
+    rows = drawn(0)
     assert (np.diff(rows) >= 0).all()
     kinds = np.searchsorted(pool.start[0], rows, side="right") - 1
     assert np.bincount(kinds).tolist() == [180, 90, 30]
-    np.testing.assert_array_equal(rows, pool.draw(0, sizes[0], np.random.default_rng(0)))
-    assert len(pool.draw(1, sizes[1], np.random.default_rng(0))) == 0
+    np.testing.assert_array_equal(rows, drawn(0))
+    assert len(drawn(1)) == 0

@@ -96,10 +96,16 @@ def test_hidden_cells_are_the_dark_ones_outside_the_body():
     left = centres[:, 0] < 0
     points = centres[left & (radius < 0.8)]
     update.record(points, torch.ones(len(points)), torch.zeros(len(points)))
+    assert len(update.hidden) == 0
+    update.update(lambda points: torch.full((len(points),), 50.0), 0.01, random)
     hidden = torch.zeros(len(centres), dtype=torch.bool)
-    hidden[update.hidden_cells()] = True
+    hidden[update.hidden] = True
     assert hidden[~left & (radius > 0.54) & (radius < 0.78)].all()
     assert not hidden[left | (radius < 0.53) | (radius > 0.8)].any()
-    cells = update.hidden_cells()[:500]
+    cells = update.hidden[:500]
     inside = (update.points_in(cells, random) - centres[cells]).abs() * RESOLUTION / 2
     assert 0.45 < float(inside.max()) <= 0.5 + 1e-5
+    points = update.should_be_empty(0, 300, random)
+    where = ((points + 1) * RESOLUTION / 2).floor().long()
+    assert len(points) == 300
+    assert hidden[(where * torch.tensor([RESOLUTION**2, RESOLUTION, 1])).sum(1)].all()

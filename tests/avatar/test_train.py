@@ -109,7 +109,7 @@ def test_poses_move_once_they_are_refined_and_samples_follow_them(scene):
     assert [step for step, there in enumerate(moved) if there] == list(range(10, 20))
     assert 0 < len(learning.skin.nodes_m) < len(learning.scene.skin.nodes_m)
     batch = draw(learning, 0, 3)
-    rays = Rays(batch.origins_m, batch.directions, batch.frames[batch.slot], batch.jitter)
+    rays = Rays(batch.origins_m, batch.directions, batch.frame, batch.jitter)
     samples = learning.inverse.sample(rays, learning.step_m, learning.occupancy.grid(), MAX_SAMPLES)
     with torch.no_grad():
         still = _place(learning.inverse, rays, learning._placing(batch.frames), samples)
@@ -162,12 +162,18 @@ def draw(learning, *frames):
 
 def test_where_no_light_comes_the_field_becomes_empty(scene):
     plain, asked = (begin(scene, steps=80, pose_refinement=False, hidden_points=count) for count in (0, 256))
+    found = []
     for _ in range(80):
         plain.step()
+        found.append(len(plain.occupancy.hidden))
+        # What lies deep in the body is as dark as what is hidden, and there is more of it.
+        deep = asked.occupancy.cells[asked.occupancy.distance_m < -0.03]
+        asked.occupancy.hidden = deep
         asked.step()
-    cells = plain.occupancy.hidden_cells()
-    assert len(cells) > 5
-    points = plain.occupancy.points_in(cells, np.random.default_rng(0))
+    assert max(found) > 20
+    assert set(found[:23]) == {0}
+    points = plain.occupancy.points_in(deep, np.random.default_rng(0))
+    assert len(points) > 200
     assert float(asked.field.density(points).mean()) < 0.8 * float(plain.field.density(points).mean())
 
 

@@ -77,22 +77,22 @@ def test_a_step_draws_anew_and_always_the_same(learning: Learning) -> None:
 
 def test_a_frame_s_rays_are_the_same_whatever_is_drawn_with_it(learning: Learning) -> None:
     whole, parts = drawn(learning, 3, (0, 2, 3)), [drawn(learning, 3, frames) for frames in ((0,), (2, 3))]
-    assert torch.cat([part.frames[part.slot] for part in parts]).tolist() == whole.frames[whole.slot].tolist()
     assert np.concatenate([part.rows for part in parts]).tolist() == whole.rows.tolist()
-    for name in ("origins_m", "directions", "rgba", "background", "jitter"):
+    for name in ("frame", "origins_m", "directions", "rgba", "background", "jitter"):
         assert torch.equal(torch.cat([getattr(part, name) for part in parts]), getattr(whole, name)), name
     assert len({row // 1000 for row in whole.rows.tolist()}) > 3
 
 
 def test_points_that_should_be_empty_are(learning: Learning) -> None:
-    learning.done = learning.config.occupancy_start
-    box, grid = learning._points_of_the_box(), learning.occupancy.grid()
-    assert len(box) > learning.config.empty_points / 2
-    assert not grid.contains(box).any()
-    assert torch.equal(box, learning._points_of_the_box())
-    learning.done -= 1
-    assert not torch.equal(box, learning._points_of_the_box())
-    assert len(learning._hidden_points()) == 0
+    occupancy, (low, high) = learning.occupancy, learning.occupancy.bounds_m
+    points = occupancy.should_be_empty(2000, 100, np.random.default_rng(0))
+    assert not occupancy.grid().contains(points).any()
+    assert ((points >= low) & (points < high)).all()
+    # No cell is hidden before rays had time to see it; of the box, its empty part alone.
+    assert len(points) == round(2000 * (1 - float(occupancy.occupied.float().mean())))
+    assert torch.equal(points, occupancy.should_be_empty(2000, 100, np.random.default_rng(0)))
+    assert not torch.equal(points, occupancy.should_be_empty(2000, 100, np.random.default_rng(1)))
+    assert len(occupancy.should_be_empty(0, 0, np.random.default_rng(0))) == 0
 
 
 def test_frames_without_a_person_are_passed_over() -> None:

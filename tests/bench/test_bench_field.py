@@ -146,7 +146,9 @@ def test_the_work_of_a_step(learning_and_timing):
     work = least_work(learning, samples=1000)
     assert set(work) == set(PARTS)
     march, newton, grid, network, _ = work["look"]
-    points = 1000 + len(learning._points_of_the_box()) + len(learning._hidden_points())
+    empty = len(learning.occupancy.empty) / learning.occupancy.occupied.numel()
+    hidden = TINY.hidden_points if len(learning.occupancy.hidden) else 0
+    points = 1000 + round(TINY.empty_points * empty) + hidden
     assert grid.rows == pytest.approx(8 * 3 * points)
     assert march.rows == newton.rows == 8000
     assert network.operations == pytest.approx(2 * points * (12 * 32 + 32 * 4))

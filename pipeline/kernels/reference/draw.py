@@ -1,0 +1,64 @@
+"""Plain twin of the draws of a training step: one frame, one kind and one pixel after the other."""
+
+import numpy as np
+
+from pipeline.kernels.draw import CANDIDATES, Eyes
+
+
+def draw_pixels(
+    start: np.ndarray,
+    xy_px: np.ndarray,
+    frames: np.ndarray,
+    sizes: np.ndarray,
+    chosen: np.ndarray,
+    error: np.ndarray,
+    tile_px: int,
+    numbers: np.ndarray,
+) -> np.ndarray:
+    """Same as `pipeline.kernels.draw.draw_pixels`."""
+    left, rows = numbers, [np.zeros(0, np.int64)]
+
+    def stratified(count: int) -> np.ndarray:
+        nonlocal left
+        taken, left = left[:count], left[count:]
+        return (np.arange(count) + taken) / max(count, 1)
+
+    for slot, frame in enumerate(frames):
+        for kind, (count, by_error) in enumerate(zip(sizes[slot], chosen[slot], strict=True)):
+            pixels = np.arange(start[frame, kind], start[frame, kind + 1])
+            rows.append(pixels[(stratified(count - by_error) * len(pixels)).astype(np.int64)])
+            if by_error:
+                candidates = pixels[(stratified(CANDIDATES * by_error) * len(pixels)).astype(np.int64)]
+                x, y = xy_px[candidates].T // tile_px
+                reached = np.cumsum(error[frame, y, x].astype(np.float64).clip(1e-12))
+                place = np.searchsorted(reached, stratified(by_error) * reached[-1], side="right")
+                rows.append(candidates[place.clip(max=len(candidates) - 1)])
+    return np.concatenate(rows)
+
+
+def pixel_rays(
+    rows: np.ndarray, frame: np.ndarray, xy_px: np.ndarray, rgba: np.ndarray, inside_px: np.ndarray, eyes: Eyes
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Same as `pipeline.kernels.draw.pixel_rays`."""
+    plane = (xy_px[rows] + inside_px - eyes.centre_px) / eyes.focal_px
+    in_camera = np.concatenate([plane, np.ones((len(rows), 1))], axis=1)
+    along = (eyes.axes[frame] * in_camera[:, None]).sum(axis=2)
+    return eyes.origin_m[frame], along / np.linalg.norm(in_camera, axis=1, keepdims=True), rgba[rows] / np.float32(255)
+
+
+def note_errors(
+    rows: np.ndarray,
+    frame: np.ndarray,
+    xy_px: np.ndarray,
+    erred: np.ndarray,
+    memory: float,
+    tile_px: int,
+    error: np.ndarray,
+) -> None:
+    """Same as `pipeline.kernels.draw.note_errors`."""
+    x, y = xy_px[rows].T // tile_px
+    tile = np.ravel_multi_index((frame, y, x), error.shape)
+    count, total = np.bincount(tile), np.bincount(tile, np.abs(erred).mean(axis=1))
+    seen = np.flatnonzero(count)
+    kept, known = memory ** count[seen], error.reshape(-1)
+    known[seen] = kept * known[seen] + (1 - kept) * total[seen] / count[seen]
