@@ -202,8 +202,9 @@ class Learning:
             total = total + effort.detach()
         finite = bool(torch.isfinite(total))
         if finite:
+            towards = Towards(part for answer in answers for part in answer.towards)
+            add_table_gradient_(self.table_gradient, towards, self.field.layout)
             for answer in answers:
-                add_table_gradient_(self.table_gradient, answer.towards, self.field.layout)
                 self._note_errors(answer.batch, answer.colour_error)
                 self.occupancy.record(answer.seen.canonical_m, answer.seen.light, answer.seen.weight)
         self._update_parameters(finite, summed(gradients))

@@ -131,7 +131,7 @@ def encode(
 
 
 def add_table_gradient_(table_gradient: Float[Tensor, "rows f"], towards: Towards, layout: GridLayout) -> None:
-    """Add the table's gradient of these backward passes, in their order."""
-    for points, slope in towards:
-        arrays = (points.numpy(), layout.plan, slope.numpy(), table_gradient.numpy())
-        hashgrid_cpu.add_table_gradient(*arrays, layout.lanes)
+    """Add the table's gradient of these backward passes, in their order; threads are woken once for all of them."""
+    if towards:
+        points, slope = (torch.cat(parts).numpy() for parts in zip(*towards, strict=True))
+        hashgrid_cpu.add_table_gradient(points, layout.plan, slope, table_gradient.numpy(), layout.lanes)

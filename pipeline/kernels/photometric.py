@@ -30,11 +30,9 @@ class _RayLosses(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, of_means: Tensor, _of_error: Tensor) -> tuple[Tensor | None, ...]:
         of_image, of_alpha, of_hard = ctx.gradients
-        colour, alpha, hard = (of_means.numpy() / np.float32(len(of_hard))).tolist()
-        total = (
-            np.float32(colour / 3) * of_alpha[:, 0] + np.float32(alpha) * of_alpha[:, 1] + np.float32(hard) * of_hard
-        )
-        return torch.from_numpy(np.float32(colour / 3) * of_image), torch.from_numpy(total), None, None, None
+        colour, alpha, hard = of_means.numpy() / np.array([3 * len(of_hard), len(of_hard), len(of_hard)], np.float32)
+        total = colour * of_alpha[:, 0] + alpha * of_alpha[:, 1] + hard * of_hard
+        return torch.from_numpy(colour * of_image), torch.from_numpy(total), None, None, None
 
 
 def ray_losses(
