@@ -16,7 +16,7 @@ class FieldConfig(Config):
     device: DeviceChoice = Option(
         "auto", description="where the field learns: auto takes a CUDA graphics card where there is one"
     )
-    steps: int = Option(600, ge=0, le=200_000, description="training steps")
+    steps: int = Option(750, ge=0, le=200_000, description="training steps")
     rays: int = Option(4096, ge=64, le=1 << 18, description="rays a step")
     frames_per_step: int = Option(8, ge=1, le=64, description="frames that a step's rays come from")
     max_frames: int = Option(120, ge=2, description="training frames kept, evenly spread; each holds about 3 MB")
@@ -74,7 +74,7 @@ class FieldConfig(Config):
     final_rate: float = Option(
         0.05, gt=0, le=1, description="learning rates at the end, as a part of those at the start"
     )
-    huber_delta: float = Option(0.3, gt=0, description="colour error where the Huber loss turns from square to linear")
+    huber_delta: float = Option(0.1, gt=0, description="colour error where the Huber loss turns from square to linear")
     weight_alpha: float = Option(0.3, ge=0, description="weight of the alpha loss")
     weight_hard: float = Option(0.02, ge=0, description="weight of the hard-surface loss")
     weight_density: float = Option(0.05, ge=0, description="weight of the density loss in empty cells")
