@@ -20,8 +20,8 @@ def field_losses(
     `density` is the sum over points that should be empty, as a part of the points that a step asks for; the rest and
     the arguments are those of `ray_losses`.
     """
-    (colour, alpha_, hard), error = ray_losses(image, alpha, rgba, background, config.huber_delta)
-    losses = {"colour": colour, "alpha": config.weight_alpha * alpha_, "hard": config.weight_hard * hard}
+    (colour, opacity, hard), error = ray_losses(image, alpha, rgba, background, config.huber_delta)
+    losses = {"colour": colour, "alpha": config.weight_alpha * opacity, "hard": config.weight_hard * hard}
     if len(empty_density_per_m):
         asked = config.empty_points + config.hidden_points
         losses["density"] = config.weight_density * 0.01 * empty_density_per_m.sum() / asked

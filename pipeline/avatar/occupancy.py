@@ -86,10 +86,10 @@ class VoxelAttention(torch.nn.Module):
 class OccupancyUpdate:
     """The state that changes while the field learns: moving average, what rays saw, and the attention network.
 
-    cells: flat indices of those that may ever be occupied. empty: of those that are not. hidden: of occupied cells
-    outside the body that no light had reached when they were last updated: nothing says what is there. Between an arm
-    and the torso that it never left, say: unless asked to be empty, such a place keeps the density that it began with
-    and becomes a flap of cloth once the arm is lifted.
+    By flat index, cells: those that may ever be occupied. empty: all of the box that are not occupied now. hidden:
+    occupied cells outside the body that no light had reached when they were last updated: nothing says what is there.
+    Between an arm and the torso that it never left, say: unless asked to be empty, such a place keeps the density that
+    it began with and becomes a flap of cloth once the arm is lifted.
     """
 
     def __init__(
@@ -123,7 +123,7 @@ class OccupancyUpdate:
             self.optimiser = torch.optim.Adam(self.attention.parameters(), lr=learning_rate)
         self.occupied = torch.zeros(shell.shape, dtype=torch.uint8, device=device)
         self.occupied.view(-1)[self.cells] = 1
-        self.empty = torch.nonzero(self.occupied.view(-1) == 0)[:, 0]
+        self.empty = self._not_occupied()
         self.hidden = self.cells[:0]
 
     def grid(self) -> Occupancy:
@@ -143,6 +143,9 @@ class OccupancyUpdate:
         """A random point (m) of each cell, given by flat index."""
         inside = self._here(random.random((len(cells), 3), dtype=np.float32))
         return self.corners_m.index_select(0, cells) + inside * self.cell_m
+
+    def _not_occupied(self) -> Int[Tensor, "e"]:
+        return torch.nonzero(self.occupied.view(-1) == 0)[:, 0]
 
     def _here(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(array).to(self.cells.device)
@@ -171,7 +174,7 @@ class OccupancyUpdate:
         self.gave *= FADING
         dark = kept & (self.reached[self.cells] < DARK)
         self.hidden = self.cells[dark & (self.distance_m > HIDDEN_M)]
-        self.empty = torch.nonzero(self.occupied.view(-1) == 0)[:, 0]
+        self.empty = self._not_occupied()
 
     def _learn(self, attention: VoxelAttention, density: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
         """One step of the attention network on the cells that light reached lately; returns the logits of all cells."""
@@ -203,7 +206,7 @@ class OccupancyUpdate:
         for name in ("average", "reached", "gave", "hidden"):
             setattr(self, name, tensors[name].clone().to(self.cells.device))
         self.occupied.copy_(tensors["occupied"])
-        self.empty = torch.nonzero(self.occupied.view(-1) == 0)[:, 0]
+        self.empty = self._not_occupied()
         if self.attention is None:
             return
         for name, parameter in self.attention.named_parameters():

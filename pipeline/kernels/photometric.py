@@ -23,14 +23,15 @@ class _RayLosses(torch.autograd.Function):
         given = (tensor.detach().numpy() for tensor in (image, alpha, rgba, background))
         filled = (sums.numpy(), error.numpy(), of_image, of_alpha, of_hard)
         photometric_cpu.ray_losses(*given, np.float32(delta), *filled)
-        ctx.gradients = of_image, of_alpha, of_hard
+        counts = torch.tensor([3.0 * rays, rays, rays])
+        ctx.kept = counts, of_image, of_alpha, of_hard
         ctx.mark_non_differentiable(error)
-        return sums / torch.tensor([3.0 * rays, rays, rays]), error
+        return sums / counts, error
 
     @staticmethod
     def backward(ctx: Any, of_means: Tensor, _of_error: Tensor) -> tuple[Tensor | None, ...]:
-        of_image, of_alpha, of_hard = ctx.gradients
-        colour, alpha, hard = of_means.numpy() / np.array([3 * len(of_hard), len(of_hard), len(of_hard)], np.float32)
+        counts, of_image, of_alpha, of_hard = ctx.kept
+        colour, alpha, hard = (of_means / counts).numpy()
         total = colour * of_alpha[:, 0] + alpha * of_alpha[:, 1] + hard * of_hard
         return torch.from_numpy(colour * of_image), torch.from_numpy(total), None, None, None
 

@@ -43,6 +43,8 @@ def test_rays_of_the_body_go_where_the_error_is_in_proportion(pool):
         for frame, expected in ((0, share), (1, 0.5)):
             rows = pool.draw(np.array([frame]), np.array([[8000, 0, 0]]), streams, errors, by_error)
             assert len(rows) == 8000
+            for run in np.split(rows, [8000 - round(8000 * by_error)]):
+                assert np.all(np.diff(run) >= 0)
             assert pool.start[frame, 0] <= rows.min()
             assert rows.max() < pool.start[frame, 1]
             is_upper = pool.xy_px[rows, 1] < SIDE_PX // 2
