@@ -1,10 +1,10 @@
-"""Compiled loop of the Broyden search: a thread takes whole points. Grid arguments as in `warp_cpu`."""
+"""Compiled loop of the Broyden search: a thread takes whole points. Grid arguments as in `newton_cpu`."""
 
 import numpy as np
 from numba import njit, prange
 
+from pipeline.kernels.newton_cpu import invert
 from pipeline.kernels.options import OPTIONS
-from pipeline.kernels.warp_cpu import invert
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
 

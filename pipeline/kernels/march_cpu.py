@@ -3,8 +3,8 @@
 import numpy as np
 from numba import njit, prange
 
+from pipeline.kernels.newton_cpu import apply_affine
 from pipeline.kernels.options import OPTIONS
-from pipeline.kernels.warp_cpu import apply_affine
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
 _ENDLESS_M = np.float32(1e9)

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from pipeline.kernels import hashgrid_cpu, trace_back_cpu, trace_cpu, warp_cpu
+from pipeline.kernels import hashgrid_cpu, newton_cpu, trace_back_cpu, trace_cpu
 from pipeline.kernels.hashgrid import GridLayout, Towards
 from pipeline.kernels.march import WarpSet
 from pipeline.kernels.warp import SkinGrid
@@ -217,7 +217,7 @@ class _Scene:
             mine = rows[:of_rays]
             slot_start = np.searchsorted(self.rays[3][samples.ray[mine]], np.arange(of_blended.shape[1] + 1))
             of_sample = samples.found_m[mine], samples.inverse_jacobian[mine], of_unit / extent_m
-            warp_cpu.pose_gradient(*of_sample, slot_start, *self.skin, of_blended)
+            newton_cpu.pose_gradient(*of_sample, slot_start, *self.skin, of_blended)
         return of_hidden, of_output
 
 

@@ -9,11 +9,13 @@ from numba import njit
 
 from pipeline.kernels.hashgrid_cpu import BLOCK, encode_block
 from pipeline.kernels.march_cpu import CANDIDATES, enter, go_on
+from pipeline.kernels.newton_cpu import newton_step
 from pipeline.kernels.options import OPTIONS
-from pipeline.kernels.warp_cpu import invert, skin
 
-RAYS, AHEAD = 128, 3
-"""Rays that are followed together, and samples that each goes ahead."""
+RAYS, AHEAD, DIM = 128, 3, np.float32(0.5)
+"""Rays that are followed together, and samples that each goes ahead: one by one with less than DIM of its light left,
+where the next may be the last.
+"""
 MOST_AT_ONCE = RAYS * (AHEAD + CANDIDATES)
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
@@ -31,20 +33,14 @@ def _refine(
         x, y, z = found[s, 0], found[s, 1], found[s, 2]
         if len(blended):
             ray, t = owner[s], distance[s]
-            inside, qx, qy, qz, a, b, c, d, e, f, g, h, k = skin(
-                x, y, z, slot[ray], skin_origin, skin_cell, row_of_node, blended
+            px, py, pz = (
+                origins[ray, 0] + t * directions[ray, 0],
+                origins[ray, 1] + t * directions[ray, 1],
+                origins[ray, 2] + t * directions[ray, 2],
             )
-            sound, a, b, c, d, e, f, g, h, k = invert(a, b, c, d, e, f, g, h, k)
-            if inside and sound:
-                rx = origins[ray, 0] + t * directions[ray, 0] - qx
-                ry = origins[ray, 1] + t * directions[ray, 1] - qy
-                rz = origins[ray, 2] + t * directions[ray, 2] - qz
-                x, y, z = x + a * rx + b * ry + c * rz, y + d * rx + e * ry + f * rz, z + g * rx + h * ry + k * rz
-            else:
-                a = b = c = d = e = f = g = h = k = _ZERO
-            inverse_jacobian[s, 0], inverse_jacobian[s, 1], inverse_jacobian[s, 2] = a, b, c
-            inverse_jacobian[s, 3], inverse_jacobian[s, 4], inverse_jacobian[s, 5] = d, e, f
-            inverse_jacobian[s, 6], inverse_jacobian[s, 7], inverse_jacobian[s, 8] = g, h, k
+            x, y, z = newton_step(
+                px, py, pz, x, y, z, slot[ray], skin_origin, skin_cell, row_of_node, blended, inverse_jacobian[s]
+            )
         unit[s, 0], unit[s, 1], unit[s, 2] = (x - low_x) * scale_x, (y - low_y) * scale_y, (z - low_z) * scale_z
 
 
@@ -138,8 +134,9 @@ def trace(
                 return -1
             for place in range(going):
                 ray, noted = on[place], count
+                ahead = AHEAD if light[ray] >= DIM else 1
                 count, stop[ray] = go_on(
-                    ray, near[ray], stop[ray], stops[ray], count + AHEAD, count + left[ray],
+                    ray, near[ray], stop[ray], stops[ray], count + ahead, count + left[ray],
                     origins, directions, jitter, step, cell, frame[ray],
                     warp_origin, warp_dims, warp_first, warp_nodes, warp_codes, warp_maps,
                     occupied, low, scale, count, found, distance, owner,

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from pipeline.kernels import warp_cpu
+from pipeline.kernels import newton_cpu, warp_cpu
 from pipeline.kernels.blend import SparseWeights, blend
 from pipeline.kernels.dispatch import runs_on_numba
 from pipeline.kernels.packing import owner_of_each
@@ -124,7 +124,7 @@ class _Newton(torch.autograd.Function):
         refined, inverse_jacobian = torch.empty_like(start), start.new_empty(len(start), 9)
         grid = (skin.origin_m.numpy(), np.float32(skin.cell_m), skin.row_of_node.numpy())
         arrays = (posed.numpy(), start.numpy(), slot.numpy())
-        warp_cpu.refine(*arrays, *grid, blended.detach().numpy(), refined.numpy(), inverse_jacobian.numpy())
+        newton_cpu.refine(*arrays, *grid, blended.detach().numpy(), refined.numpy(), inverse_jacobian.numpy())
         ctx.save_for_backward(blended, start, inverse_jacobian, slot_start)
         ctx.skin = skin
         return refined
@@ -136,7 +136,7 @@ class _Newton(torch.autograd.Function):
         total = torch.zeros_like(blended)
         grid = (skin.origin_m.numpy(), np.float32(skin.cell_m), skin.row_of_node.numpy())
         arrays = (tensor.numpy() for tensor in (*step, gradient.contiguous(), slot_start))
-        warp_cpu.pose_gradient(*arrays, *grid, total.numpy())
+        newton_cpu.pose_gradient(*arrays, *grid, total.numpy())
         return total, None, None, None, None
 
 

@@ -17,7 +17,7 @@ from pipeline.avatar.look import Placing
 from pipeline.avatar.occupancy import OccupancyUpdate
 from pipeline.avatar.pose import PoseCorrection
 from pipeline.avatar.train import Learning
-from pipeline.kernels import hashgrid_cpu, warp_cpu
+from pipeline.kernels import hashgrid_cpu, newton_cpu
 from pipeline.kernels.parallel import Parallel
 from pipeline.kernels.trace import _Trace
 from pipeline.kernels.warp import _Newton
@@ -41,7 +41,7 @@ SEAMS: tuple[tuple[str, Any, str], ...] = (
     ("table_backward", hashgrid_cpu, "add_table_gradient"),
     ("positions_backward", hashgrid_cpu, "add_points_gradient"),
     ("positions_backward", _Newton, "backward"),
-    ("positions_backward", warp_cpu, "pose_gradient"),
+    ("positions_backward", newton_cpu, "pose_gradient"),
     ("rest_backward", Learning, "_gradients"),
     ("adam", train, "adam_step_"),
     ("occupancy_record", OccupancyUpdate, "record"),
