@@ -16,6 +16,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from data_tools.backdrop import Room, foot_shadow
+from data_tools.ball import Ball
 from data_tools.folder import whole_folder
 from data_tools.movie import write_movie
 from data_tools.renderer import Light, pose_vertices, render_subject
@@ -44,6 +45,7 @@ class Capture:
     ground_m: Float[np.ndarray, "3"]
     fps: float
     samples: int
+    ball: Ball | None = None
 
     @cached_property
     def canonical_to_world(self) -> Float[Tensor, "n j 4 4"]:
@@ -60,8 +62,12 @@ class Capture:
         person = self.person(frame)
         shadow = foot_shadow(self.room, self._feet_m(frame))
         behind = self.room.image * shadow[:, :, None]
-        picture = person[:, :, :3] + (1.0 - person[:, :, 3:]) * behind
-        return to_uint8(picture), to_uint8(person[:, :, 3])
+        picture, coverage = person[:, :, :3] + (1.0 - person[:, :, 3:]) * behind, person[:, :, 3]
+        if self.ball:
+            ball = self.ball.picture(self.camera, frame / self.fps, self.light, self.samples)
+            clear = 1.0 - ball[:, :, 3]
+            picture, coverage = ball[:, :, :3] + clear[:, :, None] * picture, clear * coverage
+        return to_uint8(picture), to_uint8(coverage)
 
     def _feet_m(self, frame: int) -> Float[np.ndarray, "4 3"]:
         """World positions of ankles and balls of the feet."""
@@ -156,6 +162,7 @@ def write_truth(truth: Path, capture: Capture, bare: Body | None, recipe: dict[s
         "samples": capture.samples,
         "ground_m": [float(value) for value in capture.ground_m],
         "light": asdict(capture.light),
+        "ball": capture.ball is not None,
     }
     (truth / "recipe.json").write_text(json.dumps({**recipe, **facts}, indent=2, sort_keys=True) + "\n")
 

@@ -57,11 +57,14 @@ NOVEL_POSES: dict[str, Angles] = {
 """Poses outside the turn: what a held-out motion asks of an avatar."""
 
 
-def turn_in_a_pose(body: Body, frame_count: int, fps: float, ground_m: Float[np.ndarray, "3"], seed: int) -> Motion:
+def turn_in_a_pose(
+    body: Body, frame_count: int, fps: float, ground_m: Float[np.ndarray, "3"], seed: int, arc_deg: float = 360.0
+) -> Motion:
     """One full turn on the spot, with slow arms, breathing and weight that shifts from foot to foot.
 
     Args:
         ground_m: world position between the feet. seed: phases of the sway.
+        arc_deg: below 360, the person turns half of it to one side, then to the other, and back.
 
     The last frame stops one step before the first one's heading, so that headings are spread evenly.
     """
@@ -74,6 +77,8 @@ def turn_in_a_pose(body: Body, frame_count: int, fps: float, ground_m: Float[np.
     _shift_weight(axis_angles, body, time_s)
     turned = np.arange(frame_count) / frame_count
     heading = 2.0 * np.pi * (turned + 0.012 * np.sin(4.0 * np.pi * turned))
+    if arc_deg < 360.0:
+        heading = np.radians(0.5 * arc_deg) * np.sin(heading)
     return _planted(body, axis_angles, heading, ground_m, time_s)
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from data_tools.backdrop import Room, make_room
+from data_tools.ball import Ball
 from data_tools.bvh import read_bvh
 from data_tools.capture import Capture, Heldout, novel_cameras, portrait_camera
 from data_tools.motion import novel_motion, turn_in_a_pose
@@ -47,6 +48,8 @@ def capture_parser(command: str, description: str) -> argparse.ArgumentParser:
     parser.add_argument("--novel-poses", type=int, default=4, help="held-out poses to render into truth/")
     parser.add_argument("--novel-bvh", type=Path, help="motion capture to take them from, evenly spread, on the spot")
     parser.add_argument("--bvh", type=Path, help="motion capture to follow instead of the turn in A-pose")
+    parser.add_argument("--arc", type=float, default=360.0, help="degrees of the turn; below 360: there and back")
+    parser.add_argument("--ball", action="store_true", help="a juggled ball passes before the person")
     parser.add_argument("--start", type=float, default=0.0, help="where in the motion to start, seconds")
     parser.add_argument("--in-place", action="store_true", help="stay on the spot whatever the motion does")
     parser.add_argument("--seed", type=int, default=0, help="person, clothes and sway; same seed, same bytes")
@@ -66,6 +69,7 @@ def check_options(options: argparse.Namespace) -> None:
         ("distance", 1.0, 50.0),
         ("fill", LEAST_FILL, MOST_FILL),
         ("samples", 1, 8),
+        ("arc", 0.0, 360.0),
         ("novel_views", 0, 1000),
         ("novel_poses", 0, 1000),
         ("texture", 64, 8192),
@@ -104,7 +108,7 @@ def choose_motion(options: argparse.Namespace, body: Body, ground_m: np.ndarray)
     if options.bvh:
         whole = retarget(read_bvh(options.bvh), body, ground_m, options.in_place)
         return resampled(whole, options.start, options.frames, options.fps)
-    return turn_in_a_pose(body, options.frames, options.fps, ground_m, options.seed)
+    return turn_in_a_pose(body, options.frames, options.fps, ground_m, options.seed, options.arc)
 
 
 def choose_novel_poses(options: argparse.Namespace, body: Body, ground_m: np.ndarray) -> Motion | None:
@@ -123,7 +127,9 @@ def assemble(
 ) -> tuple[Capture, Heldout]:
     """The capture, and its held-out questions."""
     camera, ground_m, room = scene
-    capture = Capture(subject, motion, camera, LIGHTS[options.light], room, ground_m, options.fps, options.samples)
+    ball = Ball(ground_m, subject.body.height_m()) if options.ball else None
+    light = LIGHTS[options.light]
+    capture = Capture(subject, motion, camera, light, room, ground_m, options.fps, options.samples, ball)
     # Whoever walks may be metres from the middle of the path in the first frame, which the held-out cameras show.
     walked_m = motion.root_translation_m[0] - ground_m.astype(np.float32)
     standing_m = ground_m + walked_m * [1.0, 0.0, 1.0]

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from data_tools.backdrop import Room, floor_points
+from data_tools.ball import Ball
 from data_tools.capture import Capture
 from data_tools.command import run_command
 from data_tools.folder import whole_folder
@@ -60,8 +61,9 @@ def load_truth(out: Path) -> Capture:
         fps, samples = float(recipe["fps"]), int(recipe["samples"])
     except (KeyError, TypeError, ValueError):
         raise _damaged_recipe(out) from None
+    subject = load_subject(truth)
     return Capture(
-        subject=load_subject(truth),
+        subject=subject,
         motion=load_motion(truth / "motion.npz"),
         camera=camera,
         light=light,
@@ -69,6 +71,7 @@ def load_truth(out: Path) -> Capture:
         ground_m=ground_m,
         fps=fps,
         samples=samples,
+        ball=Ball(ground_m, subject.body.height_m()) if recipe.get("ball") else None,
     )
 
 

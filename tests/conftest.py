@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import hypothesis
 import pytest
 from jaxtyping import install_import_hook
 
@@ -16,6 +17,10 @@ from tests.core.toy_pipeline import Toy, user_environment
 # The numba kernels are left out, because numba compiles the plain functions.
 CHECKED_PACKAGES = ["pipeline.geometry", "pipeline.avatar", "pipeline.metrics", "pipeline.io"]
 install_import_hook(CHECKED_PACKAGES, "beartype.beartype")
+
+# A first call loads what numba has compiled: no test is a matter of time.
+hypothesis.settings.register_profile("untimed", deadline=None)
+hypothesis.settings.load_profile("untimed")
 
 
 @pytest.fixture(autouse=True)

@@ -78,3 +78,13 @@ def test_grounding_undoes_a_lift(bare: Body, turn: Motion) -> None:
     lifted = turn.with_pose(turn.rotations_wxyz, turn.root_translation_m + [0.0, 0.7, 0.0])
     back = grounded(bare, lifted, float(GROUND_M[1]))
     assert np.allclose(back.root_translation_m, turn.root_translation_m, atol=1e-5)
+
+
+def test_a_part_of_a_turn_goes_there_and_back(bare: Body) -> None:
+    motion = turn_in_a_pose(bare, 48, 24.0, GROUND_M, seed=0, arc_deg=90.0)
+    w, _, y, _ = motion.rotations_wxyz[:, 0].T
+    heading_deg = np.degrees(2 * np.arctan2(y, w))
+    assert heading_deg.max() == pytest.approx(45, abs=1)
+    assert heading_deg.min() == pytest.approx(-45, abs=1)
+    assert heading_deg[0] == pytest.approx(0, abs=1)
+    assert np.abs(np.diff(heading_deg)).max() < 8

@@ -10,7 +10,7 @@ from data_tools.noise import Noise
 POINTS = np.random.default_rng(5).uniform(-2.0, 2.0, (500, 3)).astype(np.float32)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(seed=st.integers(0, 2**31 - 1))
 def test_a_seed_is_a_field(seed: int) -> None:
     assert np.array_equal(Noise(seed)(POINTS, 0.1), Noise(seed)(POINTS, 0.1))

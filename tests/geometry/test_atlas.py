@@ -102,7 +102,7 @@ def test_texture_size_follows_the_capture(footprint_m: float, expected: int) -> 
         assert 0.5 * footprint_m < texel_m <= footprint_m
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 2**31), st.integers(3, 40), st.integers(3, 40))
 def test_filling_keeps_the_known_and_stays_between_its_extremes(seed: int, height: int, width: int) -> None:
     random = np.random.default_rng(seed)

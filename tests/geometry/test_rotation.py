@@ -16,14 +16,14 @@ def to_scipy(quaternion_wxyz: torch.Tensor) -> Rotation:
     return Rotation.from_quat(quaternion_wxyz.numpy()[:, [1, 2, 3, 0]])
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(vectors)
 def test_exponential_agrees_with_scipy(axis_angle: torch.Tensor) -> None:
     expected = Rotation.from_rotvec(axis_angle.numpy()).as_matrix()
     np.testing.assert_allclose(rot.axis_angle_to_matrix(axis_angle).numpy(), expected, atol=1e-9)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(vectors, vectors)
 def test_product_applies_the_right_factor_first(first: torch.Tensor, second: torch.Tensor) -> None:
     product = rot.quaternion_multiply(rot.axis_angle_to_quaternion(second), rot.axis_angle_to_quaternion(first))
@@ -31,7 +31,7 @@ def test_product_applies_the_right_factor_first(first: torch.Tensor, second: tor
     torch.testing.assert_close(rot.quaternion_to_matrix(product), expected, atol=1e-9, rtol=0)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(vectors)
 def test_matrix_and_quaternion_are_inverse(axis_angle: torch.Tensor) -> None:
     matrix = rot.axis_angle_to_matrix(axis_angle)
@@ -40,7 +40,7 @@ def test_matrix_and_quaternion_are_inverse(axis_angle: torch.Tensor) -> None:
     torch.testing.assert_close(rot.quaternion_to_matrix(quaternion), matrix, atol=1e-9, rtol=0)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(vectors)
 def test_logarithm_undoes_the_exponential(axis_angle: torch.Tensor) -> None:
     quaternion = rot.axis_angle_to_quaternion(axis_angle)
