@@ -201,7 +201,7 @@ def write_preview(path: Path, renders: list[np.ndarray], judge: Judge) -> None:
 
 STAGE = Stage(
     "field",
-    version=13,
+    version=14,
     needs=("frames", "body"),
     makes=("field.safetensors", "occupancy.npz", "motion.npz"),
     config=FieldConfig,

@@ -51,6 +51,12 @@ class FieldConfig(Config):
     share_error: float = Option(
         0.6, ge=0, le=1, description="of the rays on the body, the part that is drawn where colours erred most of late"
     )
+    outlier: float = Option(
+        6.0,
+        gt=0,
+        description="colour error, in medians of its frame's, from which on a pixel is no longer taken for the person; "
+        "its weight falls with the fourth power of the error",
+    )
     border_px: int = Option(4, ge=1, description="half width of the border, px")
 
     occupancy: Literal["attention", "plain"] = Option(
@@ -79,8 +85,8 @@ class FieldConfig(Config):
     weight_hard: float = Option(0.02, ge=0, description="weight of the hard-surface loss")
     weight_density: float = Option(0.05, ge=0, description="weight of the density loss in empty cells")
     empty_points: int = Option(2048, ge=0, description="points a step at which emptiness is asked for")
-    hidden_points: int = Option(
-        512, ge=0, description="points a step at which emptiness is asked for outside the body where no light comes"
+    loose_points: int = Option(
+        512, ge=0, description="points a step at which emptiness is asked for in what may hold something off the body"
     )
 
     pose_refinement: bool = Option(True, description="learn small corrections of the poses")

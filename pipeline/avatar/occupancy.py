@@ -26,10 +26,8 @@ updates in which its density is zero.
 """
 FADING = 0.8
 """What is left, an update later, of what the rays saw in a cell."""
-HIDDEN_M = 0.03
-"""Clothing nearer to the body than this is believed unseen."""
-DARK = 0.02
-"""Light below which a cell counts as unlit; what is behind it gives a pixel at most so much."""
+LOOSE_M = 0.03
+"""Clothing nearer to the body than this needs no evidence."""
 
 
 @dataclass(frozen=True)
@@ -86,10 +84,11 @@ class VoxelAttention(torch.nn.Module):
 class OccupancyUpdate:
     """The state that changes while the field learns: moving average, what rays saw, and the attention network.
 
-    By flat index, cells: those that may ever be occupied. empty: all of the box that are not occupied now. hidden:
-    occupied cells outside the body that no light had reached when they were last updated: nothing says what is there.
-    Between an arm and the torso that it never left, say: unless asked to be empty, such a place keeps the density that
-    it began with and becomes a flap of cloth once the arm is lifted.
+    By flat index, cells: those that may ever be occupied. empty: all of the box that are not occupied now. loose:
+    occupied cells off the body. At random points of both the field is asked to be empty: where pixels need it, loose
+    cloth withstands that. Without it, what no light reaches (between an arm and the torso that it never left) keeps the
+    density that it began with and becomes a flap once the arm is lifted; and what is filmed from one side only lies
+    anywhere along the rays that saw it.
     """
 
     def __init__(
@@ -124,18 +123,18 @@ class OccupancyUpdate:
         self.occupied = torch.zeros(shell.shape, dtype=torch.uint8, device=device)
         self.occupied.view(-1)[self.cells] = 1
         self.empty = self._not_occupied()
-        self.hidden = self.cells[:0]
+        self.loose = self.cells[:0]
 
     def grid(self) -> Occupancy:
         """The cells as they are occupied now; later updates show in it."""
         return Occupancy(self.occupied, self.bounds_m)
 
-    def should_be_empty(self, of_box: int, of_hidden: int, random: np.random.Generator) -> Float[Tensor, "e 3"]:
+    def should_be_empty(self, of_box: int, of_loose: int, random: np.random.Generator) -> Float[Tensor, "e 3"]:
         """Random points where nothing should be: those of `of_box` points of the box that come to lie in empty cells,
-        and `of_hidden` of hidden cells, if there are any.
+        and `of_loose` of loose cells, if there are any.
         """
         in_empty = round(of_box * len(self.empty) / self.occupied.numel())
-        wanted = ((self.empty, in_empty), (self.hidden, of_hidden if len(self.hidden) else 0))
+        wanted = ((self.empty, in_empty), (self.loose, of_loose if len(self.loose) else 0))
         drawn = [cells[self._here(random.integers(0, max(len(cells), 1), count))] for cells, count in wanted]
         return self.points_in(torch.cat(drawn), random)
 
@@ -172,8 +171,7 @@ class OccupancyUpdate:
         self.occupied.view(-1)[self.cells] = kept.to(torch.uint8)
         self.reached *= FADING
         self.gave *= FADING
-        dark = kept & (self.reached[self.cells] < DARK)
-        self.hidden = self.cells[dark & (self.distance_m > HIDDEN_M)]
+        self.loose = self.cells[kept & (self.distance_m > LOOSE_M)]
         self.empty = self._not_occupied()
 
     def _learn(self, attention: VoxelAttention, density: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
@@ -192,7 +190,7 @@ class OccupancyUpdate:
     def state(self) -> dict[str, Tensor]:
         """Everything that a resumed run needs."""
         tensors = {"average": self.average, "reached": self.reached, "gave": self.gave, "occupied": self.occupied}
-        tensors["hidden"] = self.hidden
+        tensors["loose"] = self.loose
         if self.attention is None:
             return tensors
         for name, parameter in self.attention.named_parameters():
@@ -203,7 +201,7 @@ class OccupancyUpdate:
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
         """Go on from `state()`."""
-        for name in ("average", "reached", "gave", "hidden"):
+        for name in ("average", "reached", "gave", "loose"):
             setattr(self, name, tensors[name].clone().to(self.cells.device))
         self.occupied.copy_(tensors["occupied"])
         self.empty = self._not_occupied()

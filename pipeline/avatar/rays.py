@@ -64,17 +64,20 @@ class PixelPool:
         streams: Sequence[np.random.Generator],
         errors: ErrorMap,
         by_error: float = 0.0,
-    ) -> Int[np.ndarray, "n"]:
-        """Rows of random pixels of some frames, so many of each kind, evenly spread over the pixels of their kind.
+        outlier: float = np.inf,
+    ) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+        """Rows of random pixels of some frames, so many of each kind, evenly spread over the pixels of their kind; and
+        the trust in each, in [0, 1].
 
         streams: of random numbers, one for each frame, so that its pixels hang on it alone. by_error: part of the rays
-        on the body that goes where `errors` are large.
+        on the body that goes where `errors` are large. outlier: how large they may be in a frame, in medians, before
+        they tell that something else than the person is seen there.
         """
         chosen = np.zeros_like(sizes)
         chosen[:, KINDS.index("body")] = np.rint(by_error * sizes[:, KINDS.index("body")])
         needed = numbers_needed(sizes, chosen).tolist()
         numbers = np.concatenate([stream.random(count) for stream, count in zip(streams, needed, strict=True)])
-        return draw_pixels(self.start, self.xy_px, frames, sizes, chosen, errors.error, TILE_PX, numbers)
+        return draw_pixels(self.start, self.xy_px, frames, sizes, chosen, errors.error, TILE_PX, outlier, numbers)
 
 
 def eyes(camera: Camera, posed_from_world: Float[np.ndarray, "frames 4 4"]) -> Eyes:

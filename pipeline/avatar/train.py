@@ -62,6 +62,7 @@ class Batch:
     rgba: Float[Tensor, "n 4"]
     background: Float[Tensor, "n 3"]
     jitter: Float[Tensor, "n"]
+    trust: Float[Tensor, "n"]
 
 
 @dataclass(frozen=True)
@@ -155,7 +156,7 @@ class Learning:
         """Rays of some frames; those of a frame hang on nothing but frame and step."""
         config, pool, sizes = self.config, self.scene.pool, self.sizes[frames]
         streams = [self._random(OF_FRAMES + frame) for frame in frames.tolist()]
-        rows = pool.draw(frames, sizes, streams, self.errors, config.share_error)
+        rows, trust = pool.draw(frames, sizes, streams, self.errors, config.share_error, config.outlier)
         counts = sizes.sum(axis=1).tolist()
         number = np.concatenate([s.random((n, 6), dtype=np.float32) for s, n in zip(streams, counts, strict=True)])
         inside = number[:, 4:] if config.pixel_jitter else np.full((len(rows), 2), 0.5, np.float32)
@@ -170,6 +171,8 @@ class Learning:
             rgba=self._here(rgba),
             background=self._here(number[:, :3]),
             jitter=self._here(number[:, 3]),
+            # What lies outside the mask is not the person, however much it errs.
+            trust=self._here(1 - rgba[:, 3] * (1 - trust)),
         )
 
     def _here(self, array: np.ndarray) -> Tensor:
@@ -191,7 +194,7 @@ class Learning:
             self._follow_occupancy()
         frames = np.sort(random.choice(self.frames_with_rays, self.frames_per_step, replace=False))
         parts = np.array_split(frames, min(self.part_count, len(frames)))
-        empty_m = self.occupancy.should_be_empty(config.empty_points, config.hidden_points, self._random(OF_POINTS))
+        empty_m = self.occupancy.should_be_empty(config.empty_points, config.loose_points, self._random(OF_POINTS))
         share = [float(self.sizes[part].sum() / self.sizes[frames].sum()) for part in parts]
         answers = self.threads.map(self._answer, parts, empty_m.tensor_split(len(parts)), share)
         losses = summed(answer.losses for answer in answers)
@@ -223,7 +226,7 @@ class Learning:
         rays = Rays(batch.origins_m, batch.directions, batch.frame, batch.jitter)
         about = (self.occupancy.grid(), rays, self._placing(batch.frames), empty_m)
         seen = look(self.field, self.inverse, *about, self.step_m, MAX_SAMPLES, towards)
-        truth = (batch.rgba, batch.background, seen.density_per_m, self.config)
+        truth = (batch.rgba, batch.background, batch.trust, seen.density_per_m, self.config)
         losses, error = field_losses(seen.image, seen.alpha, *truth)
         losses = {name: loss if name == "density" else share * loss for name, loss in losses.items()}
         gradients = self._gradients(torch.stack(list(losses.values())).sum(), tuple(self.parameters))

@@ -39,18 +39,23 @@ def draw_pixels(
     chosen: Int[np.ndarray, "k q"],
     error: Float[np.ndarray, "frames rows columns"],
     tile_px: int,
+    outlier: float,
     numbers: Float[np.ndarray, "r"],
-) -> Int[np.ndarray, "n"]:
+) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """Rows of pixels, frame by frame and kind by kind: so many as `sizes` says, the kind q of frame f from
-    start[f, q] : start[f, q + 1].
+    start[f, q] : start[f, q + 1]; and the trust in each, in [0, 1].
 
     Stratified: the i-th of m draws comes from the i-th of m equal parts of the list. The last `chosen` of a kind are
     resampled from `CANDIDATES` times as many of these, each as likely as the `error` of its tile (`tile_px` wide) has
     it. numbers: uniform in [0, 1), as many as `numbers_needed` says, in the order of the draws.
+
+    A tile whose error is more than `outlier` medians shows something else than what is learnt: a ball, a passer-by. It
+    is drawn no oftener than one at that limit, and the trust in it is the fourth power of limit over error. The median
+    is that of a frame's plain draws of the first kind; without any, everything is trusted.
     """
-    rows = np.empty(int(sizes.sum()), np.int64)
-    draw_cpu.draw_rows(start, xy_px, frames, sizes, chosen, error, tile_px, numbers, rows)
-    return rows
+    rows, trust = np.empty(int(sizes.sum()), np.int64), np.empty(int(sizes.sum()), np.float32)
+    draw_cpu.draw_rows(start, xy_px, frames, sizes, chosen, error, tile_px, outlier, numbers, rows, trust)
+    return rows, trust
 
 
 def pixel_rays(

@@ -36,26 +36,41 @@ def _choose(candidates, weight, count, numbers, rows):
 
 
 @njit(**OPTIONS)
-def draw_rows(start, xy, frames, sizes, chosen, error, tile, numbers, rows):
-    """Fill `rows`: see `pipeline.kernels.draw.draw_pixels`. numbers: uniform in [0, 1), as many as are used."""
+def _tile_errors(rows, xy, error, tile, errors):
+    """Fill `errors` with those (rows, columns) of the tiles that pixels lie in."""
+    for i in range(len(rows)):
+        errors[i] = max(np.float64(error[xy[rows[i], 1] // tile, xy[rows[i], 0] // tile]), _LEAST)
+
+
+@njit(**OPTIONS)
+def draw_rows(start, xy, frames, sizes, chosen, error, tile, outlier, numbers, rows, trust):
+    """Fill rows and trust: see `pipeline.kernels.draw.draw_pixels`. numbers: uniform in [0, 1), as many as are used."""
     done, used = 0, 0
     for slot in range(len(frames)):
-        frame = frames[slot]
+        frame, begun, limit = frames[slot], done, np.inf
         for kind in range(sizes.shape[1]):
             first, last, by_error = start[frame, kind], start[frame, kind + 1], chosen[slot, kind]
             plain = sizes[slot, kind] - by_error
             _one_of_each_part(first, last, plain, numbers[used:], rows[done:])
+            if kind == 0 and plain > 0:
+                usual = np.empty(plain, np.float64)
+                _tile_errors(rows[done : done + plain], xy, error[frame], tile, usual)
+                limit = outlier * np.median(usual)
             done, used = done + plain, used + plain
             if by_error > 0:
                 candidates = np.empty(CANDIDATES * by_error, np.int64)
                 weight = np.empty(len(candidates), np.float64)
                 _one_of_each_part(first, last, len(candidates), numbers[used:], candidates)
                 used += len(candidates)
+                _tile_errors(candidates, xy, error[frame], tile, weight)
                 for i in range(len(candidates)):
-                    x, y = xy[candidates[i], 0], xy[candidates[i], 1]
-                    weight[i] = max(np.float64(error[frame, y // tile, x // tile]), _LEAST)
+                    weight[i] = min(weight[i], limit)
                 _choose(candidates, weight, by_error, numbers[used:], rows[done:])
                 done, used = done + by_error, used + by_error
+        found = np.empty(done - begun, np.float64)
+        _tile_errors(rows[begun:done], xy, error[frame], tile, found)
+        for i in range(done - begun):
+            trust[begun + i] = min(1.0, limit / found[i]) ** 4
 
 
 @njit(**OPTIONS)

@@ -21,7 +21,7 @@ def _huber(error, delta):
 
 
 @njit(**OPTIONS)
-def ray_losses(image, alpha, rgba, background, delta, sums, error, of_image, of_alpha, of_hard):
+def ray_losses(image, alpha, rgba, background, trust, delta, sums, error, of_image, of_alpha, of_hard):
     """Fill sums (3), error (n, 3) and the gradients of the sums: see `pipeline.kernels.photometric.ray_losses`.
 
     of_image (n, 3) is that of the first sum in the image; of_alpha (n, 2) those of the first and second in alpha;
@@ -29,22 +29,23 @@ def ray_losses(image, alpha, rgba, background, delta, sums, error, of_image, of_
     """
     colours, alphas, hard = 0.0, 0.0, 0.0
     for ray in range(len(alpha)):
-        a, mask = alpha[ray], rgba[ray, 3]
+        a, mask, share = alpha[ray], rgba[ray, 3], trust[ray]
         of_alpha[ray, 0] = _ZERO
         for channel in range(3):
             behind = background[ray, channel]
             wrong = image[ray, channel] + behind * (_ONE - a) - (rgba[ray, channel] * mask + behind * (_ONE - mask))
             error[ray, channel] = wrong
             value, slope = _huber(wrong, delta)
-            colours += value
+            slope *= share
+            colours += share * value
             of_image[ray, channel] = slope
             of_alpha[ray, 0] -= slope * behind
         value, slope = _huber(a - mask, delta)
-        alphas += value
-        of_alpha[ray, 1] = slope
+        alphas += share * value
+        of_alpha[ray, 1] = share * slope
         full, clear = np.exp(-abs(a)), np.exp(-abs(a - _ONE))
-        hard += _HARD_OFFSET - np.log(full + clear)
+        hard += share * (_HARD_OFFSET - np.log(full + clear))
         rising = full if a > _ZERO else -full if a < _ZERO else _ZERO
         falling = clear if a > _ONE else -clear if a < _ONE else _ZERO
-        of_hard[ray] = (rising + falling) / (full + clear)
+        of_hard[ray] = share * (rising + falling) / (full + clear)
     sums[0], sums[1], sums[2] = colours, alphas, hard

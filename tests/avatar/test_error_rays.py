@@ -41,7 +41,7 @@ def test_rays_of_the_body_go_where_the_error_is_in_proportion(pool):
     errors.error[0][np.ix_(*upper)] = 3.0
     for by_error, share in ((1.0, 0.75), (0.5, 0.625), (0.0, 0.5)):
         for frame, expected in ((0, share), (1, 0.5)):
-            rows = pool.draw(np.array([frame]), np.array([[8000, 0, 0]]), streams, errors, by_error)
+            rows, _ = pool.draw(np.array([frame]), np.array([[8000, 0, 0]]), streams, errors, by_error)
             assert len(rows) == 8000
             for run in np.split(rows, [8000 - round(8000 * by_error)]):
                 assert np.all(np.diff(run) >= 0)
@@ -56,7 +56,7 @@ def test_border_and_outside_keep_their_rays(pool):
     errors.error[:, 0] = 1e6
     sizes = pool.sizes(np.array([0, 1]), 1000.0, (0.4, 0.35, 0.25))
     assert sizes.tolist() == [[400, 350, 250]] * 2
-    rows = pool.draw(np.array([0]), sizes[:1], [np.random.default_rng(0)], errors, 1.0)
+    rows, _ = pool.draw(np.array([0]), sizes[:1], [np.random.default_rng(0)], errors, 1.0)
     counts = np.histogram(rows, bins=[*pool.start[0]])[0]
     assert counts.tolist() == [400, 350, 250]
 

@@ -12,7 +12,7 @@ CONFIG = FieldConfig(huber_delta=0.1, weight_alpha=0.5, weight_hard=0.2, weight_
 def test_perfect_image_costs_nothing():
     rgba = torch.tensor([[0.2, 0.4, 0.6, 1.0], [0.9, 0.1, 0.5, 0.0]])
     solid = rgba[:, :3] * rgba[:, 3:]
-    losses, error = field_losses(solid, rgba[:, 3], rgba, torch.rand(2, 3), torch.zeros(5), CONFIG)
+    losses, error = field_losses(solid, rgba[:, 3], rgba, torch.rand(2, 3), torch.ones(2), torch.zeros(5), CONFIG)
     assert float(error.abs().max()) < 1e-7
     assert set(losses) == {"colour", "alpha", "hard", "density"}
     for name, value in losses.items():
@@ -22,7 +22,7 @@ def test_perfect_image_costs_nothing():
 def test_a_hole_in_the_body_costs_whatever_its_colour_and_background():
     rgba = torch.tensor([[1.0, 1.0, 1.0, 1.0]])
     nothing = torch.zeros(1, 3), torch.zeros(1)
-    losses, _ = field_losses(*nothing, rgba, torch.ones(1, 3), torch.zeros(0), CONFIG)
+    losses, _ = field_losses(*nothing, rgba, torch.ones(1, 3), torch.ones(1), torch.zeros(0), CONFIG)
     assert float(losses["colour"]) == 0
     assert float(losses["alpha"]) == pytest.approx(0.5 * 0.95)
     assert "density" not in losses
@@ -55,7 +55,7 @@ def test_rays_are_shared_out_as_asked():
     sizes = pool.sizes(np.array([0, 1, 2]), 300.0, (0.6, 0.3, 0.1))
 
     def drawn(frame):
-        return pool.draw(np.array([frame]), sizes[[frame]], [np.random.default_rng(0)], ErrorMap(3, pool.xy_px))
+        return pool.draw(np.array([frame]), sizes[[frame]], [np.random.default_rng(0)], ErrorMap(3, pool.xy_px))[0]
 
     assert sizes.tolist() == [[180, 90, 30], [0, 0, 0], [180, 90, 30]]
     rows = drawn(0)

@@ -89,23 +89,22 @@ def test_starting_shell_needs_mask_support_outside_the_body_only():
     assert starting_shell(distance, frequency, 0.1, 0.6).tolist() == [True, True, False, False]
 
 
-def test_hidden_cells_are_the_dark_ones_outside_the_body():
+def test_loose_cells_are_the_occupied_ones_off_the_body():
     update, random = ball_update(False), np.random.default_rng(0)
     centres = torch.from_numpy(cell_centres(BOUNDS))
     radius = centres.norm(dim=1)
+    assert len(update.loose) == 0
     left = centres[:, 0] < 0
-    points = centres[left & (radius < 0.8)]
-    update.record(points, torch.ones(len(points)), torch.zeros(len(points)))
-    assert len(update.hidden) == 0
-    update.update(lambda points: torch.full((len(points),), 50.0), 0.01, random)
-    hidden = torch.zeros(len(centres), dtype=torch.bool)
-    hidden[update.hidden] = True
-    assert hidden[~left & (radius > 0.54) & (radius < 0.78)].all()
-    assert not hidden[left | (radius < 0.53) | (radius > 0.8)].any()
-    cells = update.hidden[:500]
+    for _ in range(30):
+        update.update(lambda points: 50.0 * (points[:, 0] < 0).float(), 0.01, random)
+    loose = torch.zeros(len(centres), dtype=torch.bool)
+    loose[update.loose] = True
+    assert loose[left & (centres[:, 0] < -0.05) & (radius > 0.54) & (radius < 0.78)].all()
+    assert not loose[(centres[:, 0] > 0.05) | (radius < 0.53) | (radius > 0.8)].any()
+    cells = update.loose[:500]
     inside = (update.points_in(cells, random) - centres[cells]).abs() * RESOLUTION / 2
     assert 0.45 < float(inside.max()) <= 0.5 + 1e-5
     points = update.should_be_empty(0, 300, random)
     where = ((points + 1) * RESOLUTION / 2).floor().long()
     assert len(points) == 300
-    assert hidden[(where * torch.tensor([RESOLUTION**2, RESOLUTION, 1])).sum(1)].all()
+    assert loose[(where * torch.tensor([RESOLUTION**2, RESOLUTION, 1])).sum(1)].all()

@@ -160,15 +160,15 @@ def draw(learning, *frames):
     return learning._draw(np.array(frames))
 
 
-def test_where_no_light_comes_the_field_becomes_empty(scene):
-    plain, asked = (begin(scene, steps=80, pose_refinement=False, hidden_points=count) for count in (0, 256))
+def test_where_pixels_need_nothing_the_field_becomes_empty(scene):
+    plain, asked = (begin(scene, steps=80, pose_refinement=False, loose_points=count) for count in (0, 256))
     found = []
     for _ in range(80):
         plain.step()
-        found.append(len(plain.occupancy.hidden))
-        # What lies deep in the body is as dark as what is hidden, and there is more of it.
+        found.append(len(plain.occupancy.loose))
+        # Deep in the body no light comes: no pixel says what is there.
         deep = asked.occupancy.cells[asked.occupancy.distance_m < -0.03]
-        asked.occupancy.hidden = deep
+        asked.occupancy.loose = deep
         asked.step()
     assert max(found) > 20
     assert set(found[:23]) == {0}

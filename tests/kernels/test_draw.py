@@ -22,32 +22,36 @@ def some_errors(seed: int) -> np.ndarray:
     return np.random.default_rng(seed).gamma(0.3, size=(2, SIDE // TILE_PX, SIDE // TILE_PX)).astype(np.float32)
 
 
-def drawn(way, frames, sizes, chosen, error, seed=0):
+def drawn(way, frames, sizes, chosen, error, seed=0, outlier=np.inf):
     frames, sizes, chosen = np.array(frames), np.array(sizes), np.array(chosen)
     numbers = np.random.default_rng(seed).random(int(numbers_needed(sizes, chosen).sum()))
-    return way(START, XY_PX, frames, sizes, chosen, error, TILE_PX, numbers)
+    return way(START, XY_PX, frames, sizes, chosen, error, TILE_PX, outlier, numbers)
 
 
 @given(
     st.lists(st.integers(0, 60), min_size=5, max_size=5),
     st.lists(st.integers(0, 60), min_size=5, max_size=5),
     st.integers(0, 99),
+    st.sampled_from([0.5, 3.0, np.inf]),
 )
-def test_the_compiled_draw_matches_its_twin(plain, chosen, seed):
+def test_the_compiled_draw_matches_its_twin(plain, chosen, seed, outlier):
     frames, empty = [0, 1], 3
     by_error = np.insert(np.array(chosen), empty, 0).reshape(2, 3)
     sizes = by_error + np.insert(np.array(plain), empty, 0).reshape(2, 3)
-    ours, twin = (
-        drawn(way, frames, sizes, by_error, some_errors(seed), seed) for way in (draw_pixels, reference.draw_pixels)
+    (ours, trust), (twin, trust_too) = (
+        drawn(way, frames, sizes, by_error, some_errors(seed), seed, outlier)
+        for way in (draw_pixels, reference.draw_pixels)
     )
     assert ours.tolist() == twin.tolist()
+    np.testing.assert_allclose(trust, trust_too, rtol=1e-6)
+    assert outlier < np.inf or (trust == 1).all()
     kinds = np.repeat(np.arange(6), sizes.reshape(-1))
     first, last = START[:, :3].reshape(-1)[kinds], START[:, 1:].reshape(-1)[kinds]
     assert ((ours >= first) & (ours < last)).all()
 
 
 def test_each_draw_has_a_part_of_the_pixels_to_itself():
-    rows = drawn(draw_pixels, [1], [[0, 100, 250]], [[0, 0, 0]], some_errors(0))
+    rows, _ = drawn(draw_pixels, [1], [[0, 100, 250]], [[0, 0, 0]], some_errors(0))
     assert ((rows[:100] - 800) // 3).tolist() == list(range(100))
     assert ((rows[100:] - 1100) // 2).tolist() == list(range(250))
     assert len(set(((rows[:100] - 800) % 3).tolist())) == 3
@@ -58,15 +62,30 @@ def test_chosen_pixels_are_as_many_as_their_error_has_it():
     error[0, :2] = 3.0
     upper = XY_PX[:500, 1] < 2 * TILE_PX
     expected = 3 * upper.sum() / (3 * upper.sum() + (~upper).sum())
-    rows = drawn(draw_pixels, [0], [[4000, 0, 0]], [[4000, 0, 0]], error)
+    rows, _ = drawn(draw_pixels, [0], [[4000, 0, 0]], [[4000, 0, 0]], error)
     assert upper[rows].mean() == pytest.approx(expected, abs=0.01)
     # Within a tile row none is preferred.
     counts = np.bincount(rows[upper[rows]], minlength=500)[:320]
     assert counts.std() < 1.2 * np.sqrt(counts.mean())
     # Where nothing errs, all are alike.
-    rows = drawn(draw_pixels, [0], [[500, 0, 0]], [[500, 0, 0]], np.zeros_like(error))
+    rows, _ = drawn(draw_pixels, [0], [[500, 0, 0]], [[500, 0, 0]], np.zeros_like(error))
     assert len(set(rows.tolist())) > 300
     assert np.histogram(rows, bins=5, range=(0, 500))[0].tolist() == pytest.approx([100] * 5, abs=8)
+
+
+def test_what_errs_far_more_than_the_rest_is_drawn_no_oftener_and_trusted_less():
+    error = np.full((2, SIDE // TILE_PX, SIDE // TILE_PX), 0.1, np.float32)
+    error[0, 0, :2], error[0, 1] = 2.0, 0.3
+    rows, trust = drawn(draw_pixels, [0], [[8000, 0, 40]], [[4000, 0, 0]], error, outlier=4.0)
+    found = error[0, XY_PX[:, 1] // TILE_PX, XY_PX[:, 0] // TILE_PX]
+    # 0.4 is the limit: a twenty-fold error counts as a fourfold one among draws, and a 625th in the losses.
+    np.testing.assert_allclose(trust, np.where(found[rows] > 1, (0.4 / 2.0) ** 4, 1.0), rtol=1e-5)
+    often = np.minimum(found[:500], 0.4)
+    for level in (2.0, 0.3, 0.1):
+        share = (found[rows[4000:8000]] == np.float32(level)).mean()
+        assert share == pytest.approx(often[found[:500] == np.float32(level)].sum() / often.sum(), abs=0.01)
+    # A frame that says nothing of the person says nothing of what is usual.
+    assert (drawn(draw_pixels, [0], [[0, 0, 40]], [[0, 0, 0]], error, outlier=4.0)[1] == 1).all()
 
 
 def test_numbers_are_counted():

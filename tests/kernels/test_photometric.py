@@ -37,14 +37,14 @@ def test_a_perfect_picture_errs_nowhere_and_a_hole_by_what_it_hides():
 def losses_and_gradients(rays, delta, dtype, way):
     """Of a sum in which each of the three counts differently, for rays of all sorts."""
     random = torch.Generator().manual_seed(rays)
-    image, alpha, rgba, background = (
-        torch.rand(shape, generator=random) for shape in ((rays, 3), rays, (rays, 4), (rays, 3))
+    image, alpha, rgba, background, trust = (
+        torch.rand(shape, generator=random) for shape in ((rays, 3), rays, (rays, 4), (rays, 3), rays)
     )
     alpha = 1.4 * alpha - 0.2
     rgba[::3, 3] = (rgba[::3, 3] > 0.5).float()
-    image, alpha, rgba, background = (tensor.to(dtype) for tensor in (image, alpha, rgba, background))
+    image, alpha, rgba, background, trust = (tensor.to(dtype) for tensor in (image, alpha, rgba, background, trust))
     image.requires_grad_(), alpha.requires_grad_()
-    losses, errors = way(image, alpha, rgba, background, delta)
+    losses, errors = way(image, alpha, rgba, background, trust, delta)
     of = torch.autograd.grad((losses * torch.tensor([1.0, 0.3, 0.2], dtype=dtype)).sum(), [image, alpha])
     return losses.detach(), errors, *of
 
@@ -57,6 +57,15 @@ def test_the_compiled_loop_matches_its_twin(rays, delta):
     for mine, theirs in zip(ours, truth, strict=True):
         torch.testing.assert_close(mine.double(), theirs, rtol=2e-5, atol=2e-7)
     assert not ours[1].requires_grad
+
+
+def test_rays_count_by_their_trust():
+    random = torch.Generator().manual_seed(0)
+    image, alpha, rgba, background = (torch.rand(shape, generator=random) for shape in ((4, 3), 4, (4, 4), (4, 3)))
+    trust = torch.tensor([1.0, 0.0, 0.25, 0.0])
+    told, _ = ray_losses(image, alpha, rgba, background, trust, 0.1)
+    each = [ray_losses(image[[i]], alpha[[i]], rgba[[i]], background[[i]], torch.ones(1), 0.1)[0] for i in (0, 2)]
+    torch.testing.assert_close(told, (each[0] + 0.25 * each[1]) / 4)
 
 
 def test_double_precision_takes_the_twin():

@@ -13,10 +13,13 @@ def draw_pixels(
     chosen: np.ndarray,
     error: np.ndarray,
     tile_px: int,
+    outlier: float,
     numbers: np.ndarray,
-) -> np.ndarray:
+) -> tuple[np.ndarray, np.ndarray]:
     """Same as `pipeline.kernels.draw.draw_pixels`."""
-    left, rows = numbers, [np.zeros(0, np.int64)]
+    left = numbers
+    rows: list[np.ndarray] = [np.zeros(0, np.int64)]
+    trust: list[np.ndarray] = [np.zeros(0)]
 
     def stratified(count: int) -> np.ndarray:
         nonlocal left
@@ -24,16 +27,26 @@ def draw_pixels(
         return (np.arange(count) + taken) / max(count, 1)
 
     for slot, frame in enumerate(frames):
+        limit = np.inf
         for kind, (count, by_error) in enumerate(zip(sizes[slot], chosen[slot], strict=True)):
             pixels = np.arange(start[frame, kind], start[frame, kind + 1])
-            rows.append(pixels[(stratified(count - by_error) * len(pixels)).astype(np.int64)])
+            drawn = pixels[(stratified(count - by_error) * len(pixels)).astype(np.int64)]
+            if kind == 0 and len(drawn):
+                limit = outlier * np.median(_tile_errors(drawn, xy_px, error[frame], tile_px))
             if by_error:
                 candidates = pixels[(stratified(CANDIDATES * by_error) * len(pixels)).astype(np.int64)]
-                x, y = xy_px[candidates].T // tile_px
-                reached = np.cumsum(error[frame, y, x].astype(np.float64).clip(1e-12))
+                reached = np.cumsum(np.minimum(_tile_errors(candidates, xy_px, error[frame], tile_px), limit))
                 place = np.searchsorted(reached, stratified(by_error) * reached[-1], side="right")
-                rows.append(candidates[place.clip(max=len(candidates) - 1)])
-    return np.concatenate(rows)
+                drawn = np.concatenate([drawn, candidates[place.clip(max=len(candidates) - 1)]])
+            rows.append(drawn)
+        of_frame = np.concatenate(rows[-len(sizes[slot]) :])
+        trust.append(np.minimum(1.0, limit / _tile_errors(of_frame, xy_px, error[frame], tile_px)) ** 4)
+    return np.concatenate(rows), np.concatenate(trust).astype(np.float32)
+
+
+def _tile_errors(rows: np.ndarray, xy_px: np.ndarray, error: np.ndarray, tile_px: int) -> np.ndarray:
+    x, y = xy_px[rows].T // tile_px
+    return error[y, x].astype(np.float64).clip(1e-12)
 
 
 def pixel_rays(

@@ -28,8 +28,10 @@ def colour_errors(image: Tensor, alpha: Tensor, rgba: Tensor, background: Tensor
     return image + background * (1 - alpha[:, None]) - target
 
 
-def ray_losses(image: Tensor, alpha: Tensor, rgba: Tensor, background: Tensor, delta: float) -> tuple[Tensor, Tensor]:
+def ray_losses(
+    image: Tensor, alpha: Tensor, rgba: Tensor, background: Tensor, trust: Tensor, delta: float
+) -> tuple[Tensor, Tensor]:
     """Same as `pipeline.kernels.photometric.ray_losses`."""
     error = colour_errors(image, alpha, rgba, background)
-    means = huber(error, delta).mean(), huber(alpha - rgba[:, 3], delta).mean(), hard_surface(alpha).mean()
-    return torch.stack(means), error.detach()
+    of_rays = huber(error, delta).mean(1), huber(alpha - rgba[:, 3], delta), hard_surface(alpha)
+    return torch.stack([(trust * loss).mean() for loss in of_rays]), error.detach()
