@@ -85,8 +85,11 @@ class FieldConfig(Config):
     weight_hard: float = Option(0.02, ge=0, description="weight of the hard-surface loss")
     weight_density: float = Option(0.05, ge=0, description="weight of the density loss in empty cells")
     empty_points: int = Option(2048, ge=0, description="points a step at which emptiness is asked for")
-    loose_points: int = Option(
-        512, ge=0, description="points a step at which emptiness is asked for in what may hold something off the body"
+    unproven_points: int = Option(
+        512,
+        ge=0,
+        description="points a step at which emptiness is asked for off the body, where no light comes or only one side "
+        "is ever filmed",
     )
 
     pose_refinement: bool = Option(True, description="learn small corrections of the poses")

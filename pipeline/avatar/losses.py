@@ -24,6 +24,6 @@ def field_losses(
     (colour, opacity, hard), error = ray_losses(image, alpha, rgba, background, trust, config.huber_delta)
     losses = {"colour": colour, "alpha": config.weight_alpha * opacity, "hard": config.weight_hard * hard}
     if len(empty_density_per_m):
-        asked = config.empty_points + config.loose_points
+        asked = config.empty_points + config.unproven_points
         losses["density"] = config.weight_density * 0.01 * empty_density_per_m.sum() / asked
     return losses, error

@@ -28,6 +28,8 @@ FADING = 0.8
 """What is left, an update later, of what the rays saw in a cell."""
 LOOSE_M = 0.03
 """Clothing nearer to the body than this needs no evidence."""
+DARK = 0.02
+"""Light below which a cell counts as unlit; what is behind it gives a pixel at most so much."""
 
 
 @dataclass(frozen=True)
@@ -84,11 +86,11 @@ class VoxelAttention(torch.nn.Module):
 class OccupancyUpdate:
     """The state that changes while the field learns: moving average, what rays saw, and the attention network.
 
-    By flat index, cells: those that may ever be occupied. empty: all of the box that are not occupied now. loose:
-    occupied cells off the body. At random points of both the field is asked to be empty: where pixels need it, loose
-    cloth withstands that. Without it, what no light reaches (between an arm and the torso that it never left) keeps the
-    density that it began with and becomes a flap once the arm is lifted; and what is filmed from one side only lies
-    anywhere along the rays that saw it.
+    By flat index, cells: those that may ever be occupied. empty: all of the box that are not occupied now. unproven:
+    occupied cells off the body of which no frame says whether they hold something: no light had reached them when they
+    were last updated, or only one side of them is ever filmed. They are asked to be empty too. Else what is between an
+    arm and the torso that it never left keeps the density that it began with, and becomes a flap of cloth once the arm
+    is lifted; and what is filmed from the front alone lies anywhere along the rays that saw it.
     """
 
     def __init__(
@@ -96,6 +98,7 @@ class OccupancyUpdate:
         shell: Bool[np.ndarray, "gx gy gz"],
         distance_m: Float[np.ndarray, "gx gy gz"],
         frequency: Float[np.ndarray, "gx gy gz"],
+        one_sided: Bool[np.ndarray, "gx gy gz"],
         bounds_m: Float[np.ndarray, "2 3"],
         margin_m: float,
         attention: bool,
@@ -114,6 +117,7 @@ class OccupancyUpdate:
         self.cell_m = (self.bounds_m[1] - self.bounds_m[0]) / torch.tensor(self.shape, device=device)
         self.corners_m = torch.from_numpy(cell_centres(bounds_m, shell.shape[0])).to(device) - 0.5 * self.cell_m
         self.distance_m, self.frequency = (torch.from_numpy(array).to(device) for array in of_cells)
+        self.one_sided = torch.from_numpy(one_sided.reshape(-1)[cells]).to(device)
         self.average = torch.full((len(cells),), GRACE * threshold, device=device)
         self.reached, self.gave = torch.zeros(2, shell.size, device=device).unbind()
         self.decay, self.threshold = decay, threshold
@@ -123,18 +127,18 @@ class OccupancyUpdate:
         self.occupied = torch.zeros(shell.shape, dtype=torch.uint8, device=device)
         self.occupied.view(-1)[self.cells] = 1
         self.empty = self._not_occupied()
-        self.loose = self.cells[:0]
+        self.unproven = self.cells[:0]
 
     def grid(self) -> Occupancy:
         """The cells as they are occupied now; later updates show in it."""
         return Occupancy(self.occupied, self.bounds_m)
 
-    def should_be_empty(self, of_box: int, of_loose: int, random: np.random.Generator) -> Float[Tensor, "e 3"]:
+    def should_be_empty(self, of_box: int, of_unproven: int, random: np.random.Generator) -> Float[Tensor, "e 3"]:
         """Random points where nothing should be: those of `of_box` points of the box that come to lie in empty cells,
-        and `of_loose` of loose cells, if there are any.
+        and `of_unproven` of unproven cells, if there are any.
         """
         in_empty = round(of_box * len(self.empty) / self.occupied.numel())
-        wanted = ((self.empty, in_empty), (self.loose, of_loose if len(self.loose) else 0))
+        wanted = ((self.empty, in_empty), (self.unproven, of_unproven if len(self.unproven) else 0))
         drawn = [cells[self._here(random.integers(0, max(len(cells), 1), count))] for cells, count in wanted]
         return self.points_in(torch.cat(drawn), random)
 
@@ -171,7 +175,8 @@ class OccupancyUpdate:
         self.occupied.view(-1)[self.cells] = kept.to(torch.uint8)
         self.reached *= FADING
         self.gave *= FADING
-        self.loose = self.cells[kept & (self.distance_m > LOOSE_M)]
+        dark = self.reached[self.cells] < DARK
+        self.unproven = self.cells[kept & (self.distance_m > LOOSE_M) & (dark | self.one_sided)]
         self.empty = self._not_occupied()
 
     def _learn(self, attention: VoxelAttention, density: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
@@ -190,7 +195,7 @@ class OccupancyUpdate:
     def state(self) -> dict[str, Tensor]:
         """Everything that a resumed run needs."""
         tensors = {"average": self.average, "reached": self.reached, "gave": self.gave, "occupied": self.occupied}
-        tensors["loose"] = self.loose
+        tensors["unproven"] = self.unproven
         if self.attention is None:
             return tensors
         for name, parameter in self.attention.named_parameters():
@@ -201,7 +206,7 @@ class OccupancyUpdate:
 
     def load_state(self, tensors: dict[str, Tensor]) -> None:
         """Go on from `state()`."""
-        for name in ("average", "reached", "gave", "loose"):
+        for name in ("average", "reached", "gave", "unproven"):
             setattr(self, name, tensors[name].clone().to(self.cells.device))
         self.occupied.copy_(tensors["occupied"])
         self.empty = self._not_occupied()

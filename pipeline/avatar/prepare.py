@@ -14,7 +14,14 @@ from pipeline.avatar.frequency import LAYERS, FrequencyTrunk
 from pipeline.avatar.hull import carve, dense_layout
 from pipeline.avatar.occupancy import OccupancyUpdate, cell_centres
 from pipeline.avatar.rays import build_pool
-from pipeline.avatar.support import cell_distances_m, clothing_margin_m, field_bounds_m, mask_frequency, starting_shell
+from pipeline.avatar.support import (
+    cell_distances_m,
+    clothing_margin_m,
+    field_bounds_m,
+    filmed_from_one_side,
+    mask_frequency,
+    starting_shell,
+)
 from pipeline.avatar.train import Learning, Scene
 from pipeline.avatar.warp import build_skin_grid, skin_margin_m
 from pipeline.core.device import CPU
@@ -63,10 +70,12 @@ def start_learning(
     pixel_m = body_depth_m(motion, camera) / camera.fy
     distance_m = cell_distances_m(body, bounds_m, margin_m)
     near = distance_m < margin_m
-    frequency = np.zeros(distance_m.shape, dtype=np.float32)
+    frequency, one_sided = np.zeros(near.shape, dtype=np.float32), np.zeros(near.shape, dtype=bool)
+    centres_m = cell_centres(bounds_m)[near.reshape(-1)]
+    one_sided[near] = filmed_from_one_side(centres_m, body.joints_m, skin, poses, camera)
     cell_px = 0.5 * float((bounds_m[1] - bounds_m[0]).max()) / distance_m.shape[0] / pixel_m
     frequency[near] = mask_frequency(
-        cell_centres(bounds_m)[near.reshape(-1)],
+        centres_m,
         distance_m[near],
         skin,
         poses,
@@ -77,6 +86,7 @@ def start_learning(
         starting_shell(distance_m, frequency, margin_m, config.mask_support),
         distance_m,
         frequency,
+        one_sided,
         bounds_m,
         margin_m=margin_m,
         attention=config.occupancy == "attention",

@@ -25,6 +25,8 @@ REACH_PART = 0.99
 MARGIN_PER_REACH = 2.0
 """Cloth stands farther off the body than off its outline: a leg before or behind the cloth hides the gap."""
 ASKED_EVERY_PX = 4
+ONE_SIDED = 0.75
+"""Mean of unit directions, its length, from which on they come from one side: that of an arc of 145 degrees."""
 
 
 def field_bounds_m(body: Body, margin_m: float) -> Float[np.ndarray, "2 3"]:
@@ -100,6 +102,27 @@ def mask_frequency(
     expected = np.clip(1.0 - distance_m / UNSEEN_REACH_M, 0.0, 1.0)
     missing = UNSEEN_WEIGHT * (1.0 - seen / max(len(masks), 1))
     return ((hits + missing * expected) / np.maximum(seen + missing, 1e-6)).astype(np.float32)
+
+
+def filmed_from_one_side(
+    centres_m: Float[np.ndarray, "n 3"],
+    joints_m: Float[np.ndarray, "j 3"],
+    skin: SkinGrid,
+    canonical_to_world: Float[Tensor, "k j 4 4"],
+    camera: Camera,
+) -> Bool[np.ndarray, "n"]:
+    """Whether each canonical point, carried by its skin weights, turns the same side to the camera in all frames.
+
+    How far off the body something is then shows in no frame. Judged by the directions from the joints (canonical
+    positions) to the camera, each in the joint's own space: on real and generated videos their mean had a length of 0.6
+    at most in full turns, of 0.8 and more in films from the front.
+    """
+    canonical_m = torch.from_numpy(joints_m).to(canonical_to_world)
+    turn, shift = canonical_to_world[..., :3, :3], canonical_to_world[..., :3, 3]
+    to_camera = torch.from_numpy(camera.centre_m()).to(canonical_m) - (turn @ canonical_m[:, :, None])[..., 0] - shift
+    in_joint = torch.nn.functional.normalize((turn.transpose(-1, -2) @ to_camera[..., None])[..., 0], dim=-1)
+    alike = in_joint.mean(0).norm(dim=-1)
+    return (skin.weights_at(torch.from_numpy(centres_m)) @ alike > ONE_SIDED).numpy()
 
 
 def starting_shell(

@@ -194,7 +194,7 @@ class Learning:
             self._follow_occupancy()
         frames = np.sort(random.choice(self.frames_with_rays, self.frames_per_step, replace=False))
         parts = np.array_split(frames, min(self.part_count, len(frames)))
-        empty_m = self.occupancy.should_be_empty(config.empty_points, config.loose_points, self._random(OF_POINTS))
+        empty_m = self.occupancy.should_be_empty(config.empty_points, config.unproven_points, self._random(OF_POINTS))
         share = [float(self.sizes[part].sum() / self.sizes[frames].sum()) for part in parts]
         answers = self.threads.map(self._answer, parts, empty_m.tensor_split(len(parts)), share)
         losses = summed(answer.losses for answer in answers)

@@ -11,11 +11,16 @@ RADIUS_M = 0.5
 
 
 def ball_update(attention, rate=0.03):
-    """Cells within 0.8 m of the origin may be occupied; the body is a ball of half a metre."""
+    """Cells within 0.8 m of the origin may be occupied; the body is a ball of half a metre, filmed from one side above
+    half a metre.
+    """
     centres = cell_centres(BOUNDS)
     distance = (np.linalg.norm(centres, axis=1) - RADIUS_M).reshape((RESOLUTION,) * 3).astype(np.float32)
     frequency = np.clip(0.9 - 2 * distance, 0, 1).astype(np.float32)
-    return OccupancyUpdate(distance < 0.3, distance, frequency, BOUNDS, 0.3, attention, rate, 0.9, 0.01, seed=0)
+    one_sided = (centres[:, 1] > RADIUS_M).reshape(distance.shape)
+    return OccupancyUpdate(
+        distance < 0.3, distance, frequency, one_sided, BOUNDS, 0.3, attention, rate, 0.9, 0.01, seed=0
+    )
 
 
 def ball_density(points):
@@ -89,22 +94,27 @@ def test_starting_shell_needs_mask_support_outside_the_body_only():
     assert starting_shell(distance, frequency, 0.1, 0.6).tolist() == [True, True, False, False]
 
 
-def test_loose_cells_are_the_occupied_ones_off_the_body():
+def test_unproven_cells_are_dark_or_filmed_from_one_side_and_off_the_body():
     update, random = ball_update(False), np.random.default_rng(0)
     centres = torch.from_numpy(cell_centres(BOUNDS))
     radius = centres.norm(dim=1)
-    assert len(update.loose) == 0
-    left = centres[:, 0] < 0
-    for _ in range(30):
-        update.update(lambda points: 50.0 * (points[:, 0] < 0).float(), 0.01, random)
-    loose = torch.zeros(len(centres), dtype=torch.bool)
-    loose[update.loose] = True
-    assert loose[left & (centres[:, 0] < -0.05) & (radius > 0.54) & (radius < 0.78)].all()
-    assert not loose[(centres[:, 0] > 0.05) | (radius < 0.53) | (radius > 0.8)].any()
-    cells = update.loose[:500]
+    left, above = centres[:, 0] < 0, centres[:, 1] > RADIUS_M
+    points = centres[left & (radius < 0.8)]
+    update.record(points, torch.ones(len(points)), torch.zeros(len(points)))
+    assert len(update.unproven) == 0
+    update.update(lambda points: torch.full((len(points),), 50.0), 0.01, random)
+    unproven = torch.zeros(len(centres), dtype=torch.bool)
+    unproven[update.unproven] = True
+    assert unproven[(~left | above) & (radius > 0.54) & (radius < 0.78)].all()
+    assert not unproven[(left & ~above) | (radius < 0.53) | (radius > 0.8)].any()
+    cells = update.unproven[:500]
     inside = (update.points_in(cells, random) - centres[cells]).abs() * RESOLUTION / 2
     assert 0.45 < float(inside.max()) <= 0.5 + 1e-5
     points = update.should_be_empty(0, 300, random)
     where = ((points + 1) * RESOLUTION / 2).floor().long()
     assert len(points) == 300
-    assert loose[(where * torch.tensor([RESOLUTION**2, RESOLUTION, 1])).sum(1)].all()
+    assert unproven[(where * torch.tensor([RESOLUTION**2, RESOLUTION, 1])).sum(1)].all()
+    # What has become empty is asked for among the empty cells.
+    for _ in range(60):
+        update.update(lambda points: torch.zeros(len(points)), 0.01, random)
+    assert len(update.unproven) == 0

@@ -8,6 +8,7 @@ from pipeline.avatar.support import (
     cell_distances_m,
     clothing_margin_m,
     field_bounds_m,
+    filmed_from_one_side,
     mask_frequency,
     starting_shell,
 )
@@ -51,6 +52,25 @@ def test_few_sights_of_a_far_point_do_not_outweigh_the_expectation():
     assert frequency_of([[0, 0, 0]], [0.1], masks + blank)[0] == 0.5
     narrow = [np.ones((40, 40), dtype=np.uint8)] * 4
     assert frequency_of([[0.42, 0, 0]], [0.1], narrow)[0] < 0.1
+
+
+@pytest.mark.parametrize(("arc_deg", "one_sided"), [(0, True), (130, True), (160, False), (360, False)])
+def test_a_bone_that_turns_far_enough_is_not_filmed_from_one_side(arc_deg, one_sided):
+    """Over an arc the mean of the directions has the length sin(a/2) / (a/2): 0.75 at 145 degrees."""
+    angle = torch.linspace(-0.5, 0.5, 73)[:-1] * np.radians(arc_deg)
+    turning = torch.eye(4).repeat(len(angle), 1, 1)
+    turning[:, 0, 0], turning[:, 0, 2] = angle.cos(), angle.sin()
+    turning[:, 2, 0], turning[:, 2, 2] = -angle.sin(), angle.cos()
+    matrices = torch.stack([torch.eye(4).repeat(len(angle), 1, 1), turning], dim=1)
+    camera = Camera(100.0, 100.0, 20.0, 20.0, 40, 40, LOOKING_BACK.astype(np.float32))
+    points = np.array([[-0.3, 0, 0], [0.3, 0, 0]], dtype=np.float32)
+    found = filmed_from_one_side(points, np.zeros((2, 3), dtype=np.float32), bar_skin(), matrices, camera)
+    assert found.tolist() == [True, one_sided]
+    # Where the body stands and which way it looks at first means nothing.
+    matrices[:, :, :3, 3] = torch.tensor([0.0, 0.0, -50.0])
+    turned = torch.tensor([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
+    again = filmed_from_one_side(points, np.zeros((2, 3), dtype=np.float32), bar_skin(), matrices @ turned, camera)
+    assert again.tolist() == [True, one_sided]
 
 
 def test_every_cell_has_its_distance_to_the_body_up_to_the_reach():

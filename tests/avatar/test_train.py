@@ -161,14 +161,14 @@ def draw(learning, *frames):
 
 
 def test_where_pixels_need_nothing_the_field_becomes_empty(scene):
-    plain, asked = (begin(scene, steps=80, pose_refinement=False, loose_points=count) for count in (0, 256))
+    plain, asked = (begin(scene, steps=80, pose_refinement=False, unproven_points=count) for count in (0, 256))
     found = []
     for _ in range(80):
         plain.step()
-        found.append(len(plain.occupancy.loose))
+        found.append(len(plain.occupancy.unproven))
         # Deep in the body no light comes: no pixel says what is there.
         deep = asked.occupancy.cells[asked.occupancy.distance_m < -0.03]
-        asked.occupancy.loose = deep
+        asked.occupancy.unproven = deep
         asked.step()
     assert max(found) > 20
     assert set(found[:23]) == {0}

@@ -171,7 +171,7 @@ def least_work(learning: Learning, samples: float) -> dict[str, tuple[Work, ...]
     """The table above, for a step as `learning` stands now: what is done in turn in each part."""
     config, field, occupancy = learning.config, learning.field, learning.occupancy
     n, levels, hidden = config.rays, field.layout.levels, config.hidden_width
-    asked = (config.empty_points, config.loose_points)
+    asked = (config.empty_points, config.unproven_points)
     points = samples + len(occupancy.should_be_empty(*asked, np.random.default_rng(0)))
     width = len(field.hidden)
     moving = float(learning.refines_poses)

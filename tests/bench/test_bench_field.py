@@ -147,8 +147,8 @@ def test_the_work_of_a_step(learning_and_timing):
     assert set(work) == set(PARTS)
     march, newton, grid, network, _ = work["look"]
     empty = len(learning.occupancy.empty) / learning.occupancy.occupied.numel()
-    loose = TINY.loose_points if len(learning.occupancy.loose) else 0
-    points = 1000 + round(TINY.empty_points * empty) + loose
+    unproven = TINY.unproven_points if len(learning.occupancy.unproven) else 0
+    points = 1000 + round(TINY.empty_points * empty) + unproven
     assert grid.rows == pytest.approx(8 * 3 * points)
     assert march.rows == newton.rows == 8000
     assert network.operations == pytest.approx(2 * points * (12 * 32 + 32 * 4))
