@@ -83,9 +83,25 @@ def test_points_far_from_the_body_have_no_answer():
     assert len(found) == 0
 
 
+def skewed(angle_rad):
+    """The bar bent and twisted, in a world that stands askew: no entry of a Jacobian is zero."""
+    matrices = bend(angle_rad)
+    matrices[1] = matrices[1] @ turn([0.6 * angle_rad, 0.0, 0.0])
+    return turn([0.5, -0.7, 0.9]) @ matrices
+
+
+def turn(axis_angle_rad):
+    """A rotation as a matrix (4, 4)."""
+    matrix = torch.eye(4)
+    matrix[:3, :3] = torch.linalg.matrix_exp(
+        torch.linalg.cross(torch.tensor(axis_angle_rad).expand(3, 3), torch.eye(3)).T
+    )
+    return matrix
+
+
 def two_frames():
     skin = bar_skin()
-    blended = skin.blend(torch.stack([bend(0.4), bend(-0.8)]))
+    blended = skin.blend(torch.stack([skewed(0.4), skewed(-0.8)]))
     points = bar_points(60)
     slot_start = torch.tensor([0, 25, 60])
     posed = torch.cat([skin_points(points[a:b], blended[:, f], skin.lattice) for f, a, b in ((0, 0, 25), (1, 25, 60))])
