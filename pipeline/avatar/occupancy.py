@@ -26,8 +26,8 @@ updates in which its density is zero.
 """
 FADING = 0.8
 """What is left, an update later, of what the rays saw in a cell."""
-LOOSE_M = 0.03
-"""Clothing nearer to the body than this needs no evidence."""
+LOOSE_M, CLOSE_M = 0.03, 0.015
+"""Clothing nearer to the body than the first needs no evidence, where one side alone is filmed than the second."""
 DARK = 0.02
 """Light below which a cell counts as unlit; what is behind it gives a pixel at most so much."""
 
@@ -176,7 +176,8 @@ class OccupancyUpdate:
         self.reached *= FADING
         self.gave *= FADING
         dark = self.reached[self.cells] < DARK
-        self.unproven = self.cells[kept & (self.distance_m > LOOSE_M) & (dark | self.one_sided)]
+        believed_m = torch.where(self.one_sided, CLOSE_M, LOOSE_M)
+        self.unproven = self.cells[kept & (dark | self.one_sided) & (self.distance_m > believed_m)]
         self.empty = self._not_occupied()
 
     def _learn(self, attention: VoxelAttention, density: Float[Tensor, "n"]) -> Float[Tensor, "n"]:

@@ -106,7 +106,8 @@ def test_unproven_cells_are_dark_or_filmed_from_one_side_and_off_the_body():
     unproven = torch.zeros(len(centres), dtype=torch.bool)
     unproven[update.unproven] = True
     assert unproven[(~left | above) & (radius > 0.54) & (radius < 0.78)].all()
-    assert not unproven[(left & ~above) | (radius < 0.53) | (radius > 0.8)].any()
+    assert unproven[above & (radius > 0.52) & (radius < 0.78)].all()
+    assert not unproven[(left & ~above) | (~above & (radius < 0.53)) | (radius < 0.51) | (radius > 0.8)].any()
     cells = update.unproven[:500]
     inside = (update.points_in(cells, random) - centres[cells]).abs() * RESOLUTION / 2
     assert 0.45 < float(inside.max()) <= 0.5 + 1e-5
