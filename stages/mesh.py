@@ -1,6 +1,7 @@
 """Stage two: a watertight, manifold mesh of the canonical field, refined against the video."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,7 @@ from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import top_k_weights
+from pipeline.geometry.surface import untangle
 from pipeline.io.capture import Capture, load_capture
 from pipeline.io.checkpoint import load_field, load_occupancy, load_tensors, save_tensors
 from pipeline.io.image import write_rgb
@@ -79,6 +81,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
         start = simplify(first_mesh(density_of, body, judged, config), edge_m)
     task = RefineTask(body, train, validation, SurfaceColour(field), edge_m, config, config.seed)
     refined = refine(start, task, lambda state: save_state(out / CHECKPOINT, state))
+    refined = replace(refined, mesh=untangle(refined.mesh))
     write_results(out, refined, task.shade)
     psnr_db = {"psnr_db_extracted": refined.validation_psnr_db[0], "psnr_db_refined": refined.validation_psnr_db[-1]}
     iou = silhouette_iou(refined.mesh, refined.skin, validation)
@@ -159,7 +162,7 @@ def write_results(out: Path, refined: Refined, shade: torch.nn.Module) -> None:
 
 STAGE = Stage(
     "mesh",
-    version=3,
+    version=4,
     needs=("frames", "body", "field"),
     makes=("mesh.npz", "preview.png"),
     config=Config,

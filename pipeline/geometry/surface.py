@@ -14,6 +14,7 @@ from skimage.measure import marching_cubes
 from pipeline.geometry.mesh import Mesh
 
 REPAIR_ROUNDS = 4
+UNTANGLE_ROUNDS = 20
 
 
 class OpenSurfaceError(ValueError):
@@ -98,9 +99,29 @@ def is_closed_manifold(mesh: Mesh) -> bool:
 
 def self_intersecting_faces(mesh: Mesh) -> int:
     """Number of faces that cut through another face."""
+    return int(_cutting_faces(mesh).sum())
+
+
+def untangle(mesh: Mesh) -> Mesh:
+    """The mesh with the vertices of faces that cut another moved to the mean of their neighbours until none does.
+
+    What still does after `UNTANGLE_ROUNDS` rounds is left. All other vertices stay.
+    """
+    for _ in range(UNTANGLE_ROUNDS):
+        cutting = _cutting_faces(mesh)
+        if not cutting.any():
+            break
+        tangled = np.unique(mesh.faces[cutting])
+        vertices = mesh.vertices.copy()
+        vertices[tangled] -= (laplacian(mesh)[tangled] @ mesh.vertices).astype(vertices.dtype)
+        mesh = Mesh(vertices, mesh.faces)
+    return mesh
+
+
+def _cutting_faces(mesh: Mesh) -> Bool[np.ndarray, "f"]:
     meshes = _meshset(mesh)
     meshes.compute_selection_by_self_intersections_per_face()
-    return int(meshes.current_mesh().selected_face_number())
+    return np.asarray(meshes.current_mesh().face_selection_array(), dtype=bool)
 
 
 def repair(mesh: Mesh) -> Mesh:

@@ -15,12 +15,14 @@ from pipeline.geometry.surface import (
     largest_component,
     remesh,
     repair,
+    self_intersecting_faces,
     signed_distance_m,
     smooth,
     solid_body,
     split_fans,
     subdivide,
     transfer,
+    untangle,
 )
 
 TETRAHEDRON = Mesh(
@@ -130,6 +132,23 @@ def test_repair_closes_holes_and_removes_fins(sphere: Mesh, seed: int) -> None:
     mended = repair(broken)
     assert is_closed_manifold(mended)
     assert volume(mended) == pytest.approx(volume(sphere), rel=0.02)
+
+
+def test_faces_that_cut_another_are_untangled_and_the_rest_stays(sphere: Mesh) -> None:
+    assert self_intersecting_faces(sphere) == 0
+    assert untangle(sphere) is sphere
+    pushed = sphere.vertices.copy()
+    lowest = pushed[:, 1].argmin()
+    pushed[lowest] += [0.0, 1.1, 0.0]  # out through the top
+    tangled = Mesh(pushed, sphere.faces)
+    assert self_intersecting_faces(tangled) > 5
+    mended = untangle(tangled)
+    assert self_intersecting_faces(mended) == 0
+    assert (mended.faces == sphere.faces).all()
+    stayed = (mended.vertices == sphere.vertices).all(axis=1)
+    assert stayed.mean() > 0.9
+    # Whoever neighbours the spike follows it by a sixth of its metre before it is gone.
+    assert np.linalg.norm(mended.vertices - sphere.vertices, axis=1).max() < 0.25
 
 
 def test_what_cannot_be_closed_is_an_error_of_its_own() -> None:
