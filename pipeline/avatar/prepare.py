@@ -72,12 +72,13 @@ def start_learning(
     near = distance_m < margin_m
     frequency, one_sided = np.zeros(near.shape, dtype=np.float32), np.zeros(near.shape, dtype=bool)
     centres_m = cell_centres(bounds_m)[near.reshape(-1)]
-    one_sided[near] = filmed_from_one_side(centres_m, body.joints_m, skin, poses, camera)
+    weights = skin.weights_at(torch.from_numpy(centres_m))
+    one_sided[near] = filmed_from_one_side(body.joints_m, weights, poses, camera)
     cell_px = 0.5 * float((bounds_m[1] - bounds_m[0]).max()) / distance_m.shape[0] / pixel_m
     frequency[near] = mask_frequency(
         centres_m,
         distance_m[near],
-        skin,
+        weights,
         poses,
         camera,
         [dilate(mask, cell_px) for mask in masks],

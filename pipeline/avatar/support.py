@@ -12,7 +12,6 @@ from pipeline.avatar.occupancy import RESOLUTION, cell_centres
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.geometry.surface import signed_distance_m
-from pipeline.kernels.warp import SkinGrid
 
 UNSEEN_REACH_M = 0.08
 """Beyond this distance from the body nothing is expected unseen; at half of it, as likely as not."""
@@ -77,7 +76,7 @@ def cell_distances_m(body: Body, bounds_m: Float[np.ndarray, "2 3"], reach_m: fl
 def mask_frequency(
     centres_m: Float[np.ndarray, "n 3"],
     distance_m: Float[np.ndarray, "n"],
-    skin: SkinGrid,
+    weights: Float[Tensor, "n j"],
     canonical_to_world: Float[Tensor, "k j 4 4"],
     camera: Camera,
     masks: list[UInt8[np.ndarray, "h w"]],
@@ -90,7 +89,6 @@ def mask_frequency(
     masks: one a frame, dilated by as much as a point stands for.
     """
     points = torch.from_numpy(centres_m)
-    weights = skin.weights_at(points)
     hits, seen = np.zeros(len(centres_m)), np.zeros(len(centres_m))
     for row, mask in enumerate(masks):
         posed = linear_blend_skinning(points, weights, canonical_to_world[row : row + 1])[0]
@@ -105,13 +103,12 @@ def mask_frequency(
 
 
 def filmed_from_one_side(
-    centres_m: Float[np.ndarray, "n 3"],
     joints_m: Float[np.ndarray, "j 3"],
-    skin: SkinGrid,
+    weights: Float[Tensor, "n j"],
     canonical_to_world: Float[Tensor, "k j 4 4"],
     camera: Camera,
 ) -> Bool[np.ndarray, "n"]:
-    """Whether each canonical point, carried by its skin weights, turns the same side to the camera in all frames.
+    """Whether each point, carried by its skin weights, turns the same side to the camera in all frames.
 
     How far off the body something is then shows in no frame. Judged by the directions from the joints (canonical
     positions) to the camera, each in the joint's own space: on real and generated videos their mean had a length of 0.6
@@ -122,7 +119,7 @@ def filmed_from_one_side(
     to_camera = torch.from_numpy(camera.centre_m()).to(canonical_m) - (turn @ canonical_m[:, :, None])[..., 0] - shift
     in_joint = torch.nn.functional.normalize((turn.transpose(-1, -2) @ to_camera[..., None])[..., 0], dim=-1)
     alike = in_joint.mean(0).norm(dim=-1)
-    return (skin.weights_at(torch.from_numpy(centres_m)) @ alike > ONE_SIDED).numpy()
+    return (weights @ alike > ONE_SIDED).numpy()
 
 
 def starting_shell(

@@ -107,13 +107,14 @@ def untangle(mesh: Mesh) -> Mesh:
 
     What still does after `UNTANGLE_ROUNDS` rounds is left. All other vertices stay.
     """
+    operator = laplacian(mesh)
     for _ in range(UNTANGLE_ROUNDS):
         cutting = _cutting_faces(mesh)
         if not cutting.any():
             break
         tangled = np.unique(mesh.faces[cutting])
         vertices = mesh.vertices.copy()
-        vertices[tangled] -= (laplacian(mesh)[tangled] @ mesh.vertices).astype(vertices.dtype)
+        vertices[tangled] -= (operator[tangled] @ mesh.vertices).astype(vertices.dtype)
         mesh = Mesh(vertices, mesh.faces)
     return mesh
 

@@ -27,7 +27,8 @@ def frequency_of(points, distances, masks, width=40):
     camera = Camera(100.0, 100.0, width / 2, 20.0, width, 40, LOOKING_BACK.astype(np.float32))
     matrices = UPRIGHT.expand(len(masks), 2, 4, 4)
     points, distances = np.array(points, dtype=np.float32), np.array(distances, dtype=np.float32)
-    return mask_frequency(points, distances, bar_skin(), matrices, camera, masks)
+    weights = bar_skin().weights_at(torch.from_numpy(points))
+    return mask_frequency(points, distances, weights, matrices, camera, masks)
 
 
 def test_counts_the_masks_that_hold_a_point():
@@ -63,13 +64,13 @@ def test_a_bone_that_turns_far_enough_is_not_filmed_from_one_side(arc_deg, one_s
     turning[:, 2, 0], turning[:, 2, 2] = -angle.sin(), angle.cos()
     matrices = torch.stack([torch.eye(4).repeat(len(angle), 1, 1), turning], dim=1)
     camera = Camera(100.0, 100.0, 20.0, 20.0, 40, 40, LOOKING_BACK.astype(np.float32))
-    points = np.array([[-0.3, 0, 0], [0.3, 0, 0]], dtype=np.float32)
-    found = filmed_from_one_side(points, np.zeros((2, 3), dtype=np.float32), bar_skin(), matrices, camera)
+    joints_m, weights = np.zeros((2, 3), np.float32), bar_skin().weights_at(torch.tensor([[-0.3, 0, 0], [0.3, 0, 0]]))
+    found = filmed_from_one_side(joints_m, weights, matrices, camera)
     assert found.tolist() == [True, one_sided]
     # Where the body stands and which way it looks at first means nothing.
     matrices[:, :, :3, 3] = torch.tensor([0.0, 0.0, -50.0])
     turned = torch.tensor([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
-    again = filmed_from_one_side(points, np.zeros((2, 3), dtype=np.float32), bar_skin(), matrices @ turned, camera)
+    again = filmed_from_one_side(joints_m, weights, matrices @ turned, camera)
     assert again.tolist() == [True, one_sided]
 
 
