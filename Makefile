@@ -32,7 +32,7 @@ TORCH_VERSION := 2.13.0
 GLTF_VALIDATOR_VERSION := 2.0.0-dev.3.10
 SAMPLE_RUN := runs/sample
 SAMPLE := runs/sample-capture
-SAMPLE_MADE := $(SAMPLE)/.done-$(shell sed -n 's/^RECIPE_VERSION = //p' data_tools/capture.py)
+SAMPLE_MADE := $(SAMPLE)/.done-$(shell sed -n 's/^RECIPE_VERSION = //p' data_tools/synthetic/scene/capture.py)
 ONE_RUN := $(or $(RUN),$(SAMPLE_RUN))
 RUN_OPTIONS = $(if $(PRESET),--preset $(PRESET)) $(foreach item,$(SET),--set $(item))
 OPTIONS = $(RUN_OPTIONS) $(ARGS)
@@ -61,7 +61,7 @@ $(STAGES): $(STAMP)  ## one stage of RUN=runs/name
 batch: $(STAMP)  ## all videos of VIDEOS=folder, with a table; JOBS=n at once, or CLUSTER=local|slurm|kubernetes
 	@test -n "$(VIDEOS)" || { echo "error: no folder of videos: make $@ VIDEOS=folder" >&2; exit 2; }
 ifeq ($(CLUSTER),)
-	$(RUN_PYTHON) -m data_tools.batch "$(VIDEOS)" --runs "$(RUNS)" $(if $(JOBS),--jobs $(JOBS)) $(OPTIONS)
+	$(RUN_PYTHON) -m data_tools.sweep.batch "$(VIDEOS)" --runs "$(RUNS)" $(if $(JOBS),--jobs $(JOBS)) $(OPTIONS)
 else
 	@test -x $(VENV)/bin/snakemake || { echo "error: Snakemake is not installed: make venv EXTRA=cluster" >&2; exit 2; }
 	$(VENV)/bin/snakemake --snakefile configs/cluster/Snakefile --profile configs/cluster/$(CLUSTER) \
@@ -70,7 +70,7 @@ else
 endif
 
 chart: $(STAMP)  ## accuracy against seconds: PRESETS over CAPTURES (all presets, two generated people) with SEEDS
-	$(RUN_PYTHON) -m data_tools.chart $(CAPTURES) $(if $(PRESETS),--presets $(PRESETS)) $(if $(SEEDS),--seeds $(SEEDS)) $(ARGS)
+	$(RUN_PYTHON) -m data_tools.sweep.chart $(CAPTURES) $(if $(PRESETS),--presets $(PRESETS)) $(if $(SEEDS),--seeds $(SEEDS)) $(ARGS)
 
 # Made once; one that is half-made, which has no .done, or of another version is made anew.
 $(SAMPLE_MADE): | $(STAMP)
@@ -79,7 +79,7 @@ $(SAMPLE_MADE): | $(STAMP)
 	@touch $@
 
 compare: $(STAMP)  ## RUN=runs/name against the truth of TRUTH=capture (the sample's by default): report/truth.html
-	$(RUN_PYTHON) -m data_tools.compare "$(or $(TRUTH),$(SAMPLE))" "$(ONE_RUN)"
+	$(RUN_PYTHON) -m data_tools.evaluate.compare "$(or $(TRUTH),$(SAMPLE))" "$(ONE_RUN)"
 
 test: $(STAMP)  ## the fast tests, with the skip count
 	$(RUN_PYTHON) -m pytest -m "not slow" $(ARGS)
@@ -108,14 +108,14 @@ bench-body: $(STAMP)  ## frames and body against the truth of CAPTURES that data
 	$(RUN_PYTHON) -m tests.bench.bench_body $(CAPTURES) $(ARGS)
 
 doctor:  ## what this machine lacks, and the command that mends it
-	@$(PYTHON) -m pipeline.core.doctor
+	@$(PYTHON) -m scripts.doctor
 
 venv: $(STAMP)  ## install the pinned dependencies into .venv (EXTRA=cuda for a graphics card)
 
 $(STAMP): requirements.lock pyproject.toml
-	@$(PYTHON) -m pipeline.core.doctor
+	@$(PYTHON) -m scripts.doctor
 	@test -x $(RUN_PYTHON) || $(PYTHON) -m venv $(VENV)
-	$(RUN_PYTHON) -m pipeline.core.install requirements.lock $(EXTRA)
+	$(RUN_PYTHON) -m scripts.install requirements.lock $(EXTRA)
 	@touch $@
 
 # The CPU build must be the one that pip sees (TORCH_INDEX=https://download.pytorch.org/whl/cpu where PyPI is all there

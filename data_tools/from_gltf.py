@@ -7,11 +7,18 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from data_tools.capture import write_capture
 from data_tools.command import run_command
 from data_tools.folder import refuse_existing
-from data_tools.options import assemble, capture_parser, check_options, choose_motion, recipe_of, stage_scene
-from data_tools.rigged import read_rigged
+from data_tools.synthetic.rig.rigged import read_rigged
+from data_tools.synthetic.scene.capture import write_capture
+from data_tools.synthetic.scene.options import (
+    assemble,
+    capture_parser,
+    check_options,
+    choose_motion,
+    recipe_of,
+    stage_scene,
+)
 
 
 def main(argv: Sequence[str]) -> None:

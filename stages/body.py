@@ -9,12 +9,9 @@ import torch
 from jaxtyping import Bool, UInt8
 from pydantic import Field
 
-from pipeline.avatar.body import Motion, ParametricBody, canonical_to_world, load_anny
-from pipeline.avatar.fit import FitOptions, FitResult, TooFewLandmarksError, fit_body, fit_given
-from pipeline.avatar.fit_beside import foreign_frames, lump_doubts, lump_shares
-from pipeline.avatar.fit_given import GivenPoses
-from pipeline.avatar.fit_hands import finger_curls_rad, trusted_hands
-from pipeline.avatar.fit_quality import (
+from pipeline.body.body import Motion, ParametricBody, canonical_to_world, load_anny
+from pipeline.body.files import save_body, save_camera, save_motion
+from pipeline.body.fit.diagnostics import (
     VERDICTS,
     doubts,
     frames_to_show,
@@ -25,28 +22,32 @@ from pipeline.avatar.fit_quality import (
     usable_frames,
     verdicts,
 )
-from pipeline.avatar.fit_silhouette import matching_window
-from pipeline.avatar.hands import Hands, no_hands
-from pipeline.avatar.overlay import draw_overlay, overlay_grid, posed_frame
-from pipeline.avatar.selection import TRAIN, frame_ranges
-from pipeline.avatar.smpl import SmplBody
+from pipeline.body.fit.fit import FitOptions, FitResult, TooFewLandmarksError, fit_body, fit_given
+from pipeline.body.fit.foreign_objects import foreign_frames, lump_doubts, lump_shares
+from pipeline.body.fit.hand_observations import finger_curls_rad, trusted_hands
+from pipeline.body.fit.silhouette_icp import matching_window
+from pipeline.body.fit.supplied_poses import GivenPoses
+from pipeline.body.overlay import draw_overlay, overlay_grid, posed_frame
+from pipeline.body.smpl import SmplBody
+from pipeline.body.smpl_file import load_smpl
+from pipeline.capture.capture import Capture, load_capture
+from pipeline.capture.frame_selection import TRAIN, frame_ranges
+from pipeline.capture.hand_detector import Hands, no_hands
+from pipeline.capture.smpl_poses import SMPL_POSES_NPZ
+from pipeline.capture.usable_frames import SCORES_NPZ
 from pipeline.core.cli import main
 from pipeline.core.config import Config as BaseConfig
 from pipeline.core.errors import UserError
 from pipeline.core.progress import warn
 from pipeline.core.stage import Stage
 from pipeline.geometry.camera import Camera
-from pipeline.io.capture import Capture, load_capture
 from pipeline.io.image import to_uint8, write_rgb
-from pipeline.io.npz import save_body, save_camera, save_motion, save_npz
-from pipeline.io.scores import SCORES_NPZ
-from pipeline.io.smpl_model import load_smpl
-from pipeline.io.smpl_poses import SMPL_POSES_NPZ
+from pipeline.io.npz import save_npz
 
 _BODY, _MOTION, _CAMERA, _OVERLAY = "body.npz", "motion.npz", "camera.npz", "overlay.png"
 _OVERLAY_FRAMES = 12
 _GUESS_DEVIATION, _RECORDED_DEVIATION = 0.5, 0.1
-"""Relative deviations of a guessed focal length and of one in the recording's metadata (`pipeline.io.lens`)."""
+"""Relative deviations of a guessed focal length and of one in the metadata (`pipeline.capture.exif_focal`)."""
 
 
 class Config(BaseConfig):

@@ -9,19 +9,20 @@ import torch
 from jaxtyping import Float, UInt8
 from pydantic import Field
 
-from pipeline.avatar.body import Body, Motion, canonical_to_world
+from pipeline.avatar.gltf import Maps, SkinnedMesh, encode_glb, specular_texture, write_glb
+from pipeline.avatar.obj import write_obj
 from pipeline.avatar.placement import hold_ends, move_camera, move_motion, scene_from_world_m
-from pipeline.avatar.specular import dielectric_share
+from pipeline.body.body import Body, Motion, canonical_to_world
+from pipeline.body.files import load_body, load_camera, load_motion
+from pipeline.capture.capture import load_capture
 from pipeline.core.cli import main
 from pipeline.core.config import Config as BaseConfig
 from pipeline.core.stage import Stage
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import dense_weights, linear_blend_skinning
-from pipeline.io.capture import load_capture
-from pipeline.io.gltf import Maps, SkinnedMesh, encode_glb, specular_texture, write_glb
 from pipeline.io.image import png_bytes, read_gray, read_rgb, to_float, to_uint8, write_gray
-from pipeline.io.npz import load_body, load_camera, load_motion, load_npz
-from pipeline.io.obj import write_obj
+from pipeline.io.npz import load_npz
+from pipeline.texture.specular import dielectric_share
 
 DIFFUSE, SPECULAR = "avatar_diffuse.png", "avatar_specular.png"
 

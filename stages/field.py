@@ -12,12 +12,12 @@ import numpy as np
 import torch
 from jaxtyping import Int
 
-from pipeline.avatar import selection
-from pipeline.avatar.body import Motion
-from pipeline.avatar.field_config import FieldConfig
-from pipeline.avatar.judge import Judge
-from pipeline.avatar.prepare import Picture, spread, start_learning, training_scale
-from pipeline.avatar.train import DivergedError, Learning
+from pipeline.body.body import Motion
+from pipeline.body.files import load_body, load_camera, load_motion, save_motion
+from pipeline.capture import frame_selection as selection
+from pipeline.capture.capture import Capture, image_path, load_capture, mask_path
+from pipeline.capture.matting import shrink
+from pipeline.capture.usable_frames import training_positions
 from pipeline.core.cli import main
 from pipeline.core.device import compute_device
 from pipeline.core.errors import UserError
@@ -25,13 +25,14 @@ from pipeline.core.manifest import PROGRESS
 from pipeline.core.measure import MIB
 from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
+from pipeline.field.config import FieldConfig
+from pipeline.field.files import save_field, save_occupancy
+from pipeline.field.setup import Picture, spread, start_learning, training_scale
+from pipeline.field.trainer import DivergedError, Learning
+from pipeline.field.validation import Judge
 from pipeline.geometry.camera import Camera
-from pipeline.geometry.matte import shrink
-from pipeline.io.capture import Capture, image_path, load_capture, mask_path
-from pipeline.io.checkpoint import load_tensors, save_field, save_occupancy, save_tensors
 from pipeline.io.image import read_gray, read_rgb, to_float, to_uint8, write_rgb
-from pipeline.io.npz import load_body, load_camera, load_motion, save_motion
-from pipeline.io.scores import training_positions
+from pipeline.io.tensors import load_tensors, save_tensors
 
 CHECKPOINT, CHECKPOINT_EVERY_S = "checkpoint.safetensors", 15.0
 PREVIEW_FRAMES = 4

@@ -6,20 +6,20 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from pipeline.avatar import selection
+from pipeline.capture import frame_selection as selection
+from pipeline.capture.capture import CONTACT_SHEET, FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, Capture, save_capture
+from pipeline.capture.contact_sheet import contact_sheet
+from pipeline.capture.detection import Sightings, look_at_all, write_frames
+from pipeline.capture.exif_focal import recorded_focal_px
+from pipeline.capture.input_checks import refuse_bad_input, warn_of_gaps
+from pipeline.capture.process_pool import start_workers
+from pipeline.capture.user_files import Supplied, SuppliedSplit, find_supplied
+from pipeline.capture.video import IMAGE_FOLDER_FPS, Source, open_source
 from pipeline.core.cli import main
 from pipeline.core.config import Config as BaseConfig
 from pipeline.core.errors import UserError
 from pipeline.core.stage import Stage
-from pipeline.io.capture import CONTACT_SHEET, FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, Capture, save_capture
-from pipeline.io.contact import contact_sheet
 from pipeline.io.image import write_rgb
-from pipeline.io.lens import recorded_focal_px
-from pipeline.io.screening import refuse_bad_input, warn_of_gaps
-from pipeline.io.sightings import Sightings, look_at_all, write_frames
-from pipeline.io.supplied import Supplied, SuppliedSplit, find_supplied
-from pipeline.io.video import IMAGE_FOLDER_FPS, Source, open_source
-from pipeline.io.workers import start_workers
 
 _COUNTED_FRAMES = 6
 

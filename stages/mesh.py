@@ -10,32 +10,28 @@ from jaxtyping import Float, Int
 from pydantic import Field
 from torch import Tensor
 
-from pipeline.avatar.body import Body, canonical_to_world
-from pipeline.avatar.extract import (
-    ExtractConfig,
-    choose_level,
-    extract_mesh,
-    sample_canonical,
-    simplify,
-)
-from pipeline.avatar.mesh_optimise import RefineConfig, RefineTask
-from pipeline.avatar.mesh_views import View, bind, crop_view, pixel_footprint_m, silhouette_iou, skin_of
-from pipeline.avatar.prepare import spread
-from pipeline.avatar.refine import Refined, refine
-from pipeline.avatar.selection import VALIDATION
 from pipeline.avatar.turntable import turntable_sheet
+from pipeline.body.body import Body, canonical_to_world
+from pipeline.body.files import load_body, load_camera, load_motion
+from pipeline.capture.capture import Capture, load_capture
+from pipeline.capture.frame_selection import VALIDATION
+from pipeline.capture.usable_frames import training_positions
 from pipeline.core.cli import main
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
+from pipeline.field.files import load_field, load_occupancy
+from pipeline.field.setup import spread
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import top_k_weights
 from pipeline.geometry.surface import untangle
-from pipeline.io.capture import Capture, load_capture
-from pipeline.io.checkpoint import load_field, load_occupancy, load_tensors, save_tensors
 from pipeline.io.image import write_rgb
-from pipeline.io.npz import load_body, load_camera, load_motion, save_npz
-from pipeline.io.scores import training_positions
+from pipeline.io.npz import save_npz
+from pipeline.io.tensors import load_tensors, save_tensors
+from pipeline.mesh.isosurface import ExtractConfig, choose_level, extract_mesh, sample_canonical, simplify
+from pipeline.mesh.refinement import Refined, refine
+from pipeline.mesh.vertex_optimisation import RefineConfig, RefineTask
+from pipeline.mesh.views import View, bind, crop_view, pixel_footprint_m, silhouette_iou, skin_of
 from pipeline.metrics.health import mesh_health
 
 CHECKPOINT, APPEARANCE = "checkpoint_round.safetensors", "appearance."

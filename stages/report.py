@@ -13,10 +13,11 @@ from jaxtyping import Float, Int, UInt8
 from pydantic import Field
 from torch import Tensor
 
-from pipeline.avatar.body import canonical_to_world
-from pipeline.avatar.mesh_views import crop_view
+from pipeline.avatar.finished_run import FinishedRun, load_finished_run
 from pipeline.avatar.pose_fit import PERSON_HEIGHT_PX, fit_poses
-from pipeline.avatar.selection import HELDOUT, TRAIN
+from pipeline.body.body import canonical_to_world
+from pipeline.capture.capture import CONTACT_SHEET, Capture
+from pipeline.capture.frame_selection import HELDOUT, TRAIN
 from pipeline.core.cli import main
 from pipeline.core.config import Config as BaseConfig
 from pipeline.core.errors import UserError
@@ -24,14 +25,9 @@ from pipeline.core.manifest import Manifest, read_manifest
 from pipeline.core.measure import environment, peak_rss_mib
 from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
-from pipeline.geometry.textured import soften_outline
-from pipeline.io.avatar import FinishedRun, load_finished_run
-from pipeline.io.capture import CONTACT_SHEET, Capture
+from pipeline.geometry.texture_rendering import soften_outline
 from pipeline.io.image import read_rgb, to_uint8, write_rgb
-from pipeline.io.lpips_weights import find_lpips_weights
-from pipeline.io.report_json import build_report, finite, report_text
-from pipeline.io.report_page import FramePictures, PageContent, error_map, render_page
-from pipeline.io.sheet import on_white_8bit, picture_sheet
+from pipeline.mesh.views import crop_view
 from pipeline.metrics.health import mesh_health
 from pipeline.metrics.images import (
     PIXEL_SPREAD_PX,
@@ -44,6 +40,10 @@ from pipeline.metrics.images import (
     premultiplied_on_white,
     unscorable,
 )
+from pipeline.report.lpips_weights import find_lpips_weights
+from pipeline.report.page import FramePictures, PageContent, error_map, render_page
+from pipeline.report.report_json import build_report, finite, report_text
+from pipeline.report.sheets import on_white_8bit, picture_sheet
 
 NEEDS = ("frames", "body", "field", "mesh", "texture", "export")
 PICTURES = (

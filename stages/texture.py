@@ -9,33 +9,27 @@ import torch
 from jaxtyping import Float, Int
 from pydantic import Field, ValidationInfo, field_validator
 
-from pipeline.avatar import prepare
-from pipeline.avatar.bake import (
-    BakeConfig,
-    Fill,
-    Surface,
-    bake_diffuse,
-    paint,
-    validation_psnr_db,
-)
-from pipeline.avatar.bake_views import View, crop_view, footprint_m, weigh_by_resolution
-from pipeline.avatar.body import Body, canonical_to_world
-from pipeline.avatar.parts import part_of_faces
-from pipeline.avatar.selection import VALIDATION
-from pipeline.avatar.specular import corner_texels, fit_specular, observe_vertices
-from pipeline.avatar.spread import spread, vertex_means
+from pipeline.body.body import Body, canonical_to_world
+from pipeline.body.files import load_body, load_camera, load_motion
+from pipeline.capture.capture import Capture, load_capture
+from pipeline.capture.frame_selection import VALIDATION
+from pipeline.capture.usable_frames import training_positions
 from pipeline.core.cli import main
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
+from pipeline.field import setup as prepare
 from pipeline.geometry.atlas import Atlas, Texels, rasterize_texels, texture_size_px, unwrap
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import dense_weights, linear_blend_skinning
 from pipeline.geometry.surface import laplacian
-from pipeline.io.capture import Capture, load_capture
 from pipeline.io.image import to_uint8, write_gray, write_rgb
-from pipeline.io.npz import load_body, load_camera, load_motion, load_npz, save_npz
-from pipeline.io.scores import training_positions
+from pipeline.io.npz import load_npz, save_npz
+from pipeline.texture.bake import BakeConfig, Fill, Surface, bake_diffuse, paint, validation_psnr_db
+from pipeline.texture.body_parts import part_of_faces
+from pipeline.texture.inpainting import spread, vertex_means
+from pipeline.texture.specular import corner_texels, fit_specular, observe_vertices
+from pipeline.texture.views import View, crop_view, footprint_m, weigh_by_resolution
 
 SPECULAR_SMOOTHING = 8
 

@@ -15,7 +15,10 @@ from tests.core.toy_pipeline import Toy, user_environment
 
 # Before any of these is imported: from here on every annotated shape and dtype in them is checked at each call.
 # The numba kernels are left out, because numba compiles the plain functions.
-CHECKED_PACKAGES = ["pipeline.geometry", "pipeline.avatar", "pipeline.metrics", "pipeline.io"]
+CHECKED_PACKAGES = [
+    f"pipeline.{name}"
+    for name in ("geometry", "io", "capture", "metrics", "body", "texture", "report", "field", "mesh", "avatar")
+]
 install_import_hook(CHECKED_PACKAGES, "beartype.beartype")
 
 # A first call loads what numba has compiled: no test is a matter of time.

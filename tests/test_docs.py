@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.core.doctor import SYSTEM_LIBRARIES
+from scripts.doctor import SYSTEM_LIBRARIES
 from stages import STAGES, load
 
 

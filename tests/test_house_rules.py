@@ -52,7 +52,7 @@ def test_compiled_functions_are_found_in_the_cache(repository: Path) -> None:
     """A compiled closure that calls another one has a new key in numba's cache in every process: seconds each time."""
     closures = [
         f"{path.name}: {inner.name} in {outer.name}"
-        for path in (repository / "pipeline" / "kernels").glob("*_cpu.py")
+        for path in (repository / "pipeline" / "kernels").glob("*/*cpu.py")
         for outer in functions(ast.parse(path.read_text(encoding="utf-8")))
         for inner in functions(outer)
         if inner is not outer

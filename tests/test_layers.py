@@ -38,12 +38,12 @@ def test_the_contracts_hold(repository: Path) -> None:
 @pytest.mark.parametrize(
     ("importer", "imported", "broken"),
     [
-        ("pipeline/kernels/hashing.py", "pipeline.geometry.camera", "Imports point down"),
+        ("pipeline/kernels/common/hashing.py", "pipeline.geometry.camera", "Imports point down"),
         ("pipeline/geometry/camera.py", "pipeline.core.errors", "Imports point down"),
-        ("pipeline/avatar/body.py", "pipeline.io.npz", "Imports point down"),
+        ("pipeline/body/body.py", "pipeline.io.npz", "Imports point down"),
         ("pipeline/io/npz.py", "stages.frames", "Imports point down"),
         ("stages/frames.py", "stages.mesh", "A stage never imports a stage"),
-        ("pipeline/core/errors.py", "pipeline.kernels.hashing", "knows nothing of 3D"),
+        ("pipeline/core/errors.py", "pipeline.kernels.common.hashing", "knows nothing of 3D"),
     ],
 )
 def test_a_planted_import_is_found(copied_house: Path, importer: str, imported: str, broken: str) -> None:

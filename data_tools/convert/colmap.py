@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from pipeline.capture.user_files import SuppliedCamera
 from pipeline.core.errors import UserError
 from pipeline.geometry.rotation import quaternion_to_matrix
-from pipeline.io.supplied import SuppliedCamera
 
 # Model's number in binary files, and where in its parameters fx, fy, cx, cy and the lens distortion begin.
 _MODELS = {

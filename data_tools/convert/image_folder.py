@@ -4,16 +4,16 @@
     masks/, mask/, matte/, ...                   as many masks, named as the pictures are or in the same order, the
                                                  person bright
 
-`camera.json`, `split.json` and `landmarks.npz` in the form of `pipeline.io.supplied` are carried over. A folder that
-has `masks/`, or pictures with alpha, needs no conversion.
+`camera.json`, `split.json` and `landmarks.npz` in the form of `pipeline.capture.user_files` are carried over. A folder
+that has `masks/`, or pictures with alpha, needs no conversion.
 """
 
 from pathlib import Path
 
 from data_tools.convert.recording import Recording, mask_folder
+from pipeline.capture.video import open_source
 from pipeline.core.errors import UserError
 from pipeline.io.image import read_alpha
-from pipeline.io.video import open_source
 
 _MASK_FOLDERS = ("masks", "mask", "mattes", "matte", "alpha", "segmentations", "segmentation")
 _READY = ("camera.json", "split.json", "landmarks.npz")

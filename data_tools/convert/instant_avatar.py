@@ -23,12 +23,12 @@ from jaxtyping import Float, Shaped
 from data_tools.convert.protocol import split_of_subject
 from data_tools.convert.recording import Recording, check_size, mask_folder
 from data_tools.convert.smpl_rows import gender_of, joined, smpl_rows
+from pipeline.capture.smpl_poses import SmplPoses
+from pipeline.capture.user_files import SuppliedCamera
+from pipeline.capture.video import Source, open_source
 from pipeline.core.errors import UserError
 from pipeline.core.progress import warn
 from pipeline.io.npz import load_npz
-from pipeline.io.smpl_poses import SmplPoses
-from pipeline.io.supplied import SuppliedCamera
-from pipeline.io.video import Source, open_source
 
 _CAMERA = "cameras.npz"
 _POSES_OF_SETS = {"train": "poses/anim_nerf_train.npz", "heldout": "poses/anim_nerf_test.npz"}

@@ -23,11 +23,11 @@ from data_tools.convert.colmap import ColmapModel, find_model, read_model
 from data_tools.convert.joblib_pickle import load_joblib
 from data_tools.convert.recording import Recording, check_size, mask_folder
 from data_tools.convert.smpl_rows import smpl_rows
+from pipeline.capture.smpl_poses import SmplPoses
+from pipeline.capture.user_files import SuppliedCamera
+from pipeline.capture.video import Source, open_source
 from pipeline.core.errors import UserError
 from pipeline.io.safe_pickle import load_npy
-from pipeline.io.smpl_poses import SmplPoses
-from pipeline.io.supplied import SuppliedCamera
-from pipeline.io.video import Source, open_source
 
 _POSES = ("smpl_output_optimized.pkl", "smpl_output_romp.pkl")
 _SPLITS = {"train": "train_split.txt", "validation": "val_split.txt", "heldout": "test_split.txt"}

@@ -23,11 +23,11 @@ from jaxtyping import Float, UInt8
 from data_tools.convert.protocol import split_of_subject
 from data_tools.convert.recording import Recording, check_size, mask_levels
 from data_tools.convert.smpl_rows import gender_of, smpl_rows
+from pipeline.capture.smpl_poses import SmplPoses
+from pipeline.capture.user_files import SuppliedCamera
+from pipeline.capture.video import Source, open_source
 from pipeline.core.errors import UserError
 from pipeline.io.safe_pickle import load_pickle
-from pipeline.io.smpl_poses import SmplPoses
-from pipeline.io.supplied import SuppliedCamera
-from pipeline.io.video import Source, open_source
 
 _CAMERA, _MASKS, _POSES = "camera.pkl", "masks.hdf5", "reconstructed_poses.hdf5"
 _CAMERA_SIZES = {"camera_f": 2, "camera_c": 2, "camera_k": 5, "camera_rt": 3, "camera_t": 3, "width": 1, "height": 1}

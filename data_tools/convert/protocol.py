@@ -4,8 +4,8 @@ Only subjects whose two sets share no frame are listed. Its validation frame is 
 named here and the frames stage takes some of the training frames.
 """
 
+from pipeline.capture.video import Source
 from pipeline.core.progress import warn
-from pipeline.io.video import Source
 
 _SETS = {
     "female-3-casual": (range(0, 446, 4), range(446, 648, 4)),

@@ -4,10 +4,10 @@
     TARGET/masks/                  one image a frame, the person bright
     TARGET/camera.json             intrinsics without a pose: the pipeline's world is the camera's
     TARGET/split.json              which frames are used and what for
-    TARGET/smpl_poses.npz          see `pipeline.io.smpl_poses`
+    TARGET/smpl_poses.npz          see `pipeline.capture.smpl_poses`
     TARGET/...                     what the source has in this form already
 
-`pipeline.io.supplied` says how the frames stage reads them.
+`pipeline.capture.user_files` says how the frames stage reads them.
 """
 
 import json
@@ -20,13 +20,13 @@ import numpy as np
 from jaxtyping import Shaped, UInt8
 
 from data_tools.folder import whole_folder
+from pipeline.capture.smpl_poses import SMPL_POSES_NPZ, SmplPoses, save_smpl_poses
+from pipeline.capture.user_files import SuppliedCamera
+from pipeline.capture.video import Source, natural_key, picture_size_px
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track
 from pipeline.io.image import IMAGE_SUFFIXES, read_gray, write_gray
 from pipeline.io.safe_pickle import load_npy
-from pipeline.io.smpl_poses import SMPL_POSES_NPZ, SmplPoses, save_smpl_poses
-from pipeline.io.supplied import SuppliedCamera
-from pipeline.io.video import Source, natural_key, picture_size_px
 
 
 @dataclass(frozen=True)

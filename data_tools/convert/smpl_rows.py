@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
+from pipeline.capture.smpl_poses import N_BETAS, N_BODY_POSE, SmplPoses
 from pipeline.core.errors import UserError
-from pipeline.io.smpl_poses import N_BETAS, N_BODY_POSE, SmplPoses
 
 _WHOLE_POSE = ("thetas", "pose")
 _TRANSLATION = ("transl", "trans")

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.avatar.body import Motion
+from pipeline.body.body import Motion
 from pipeline.geometry.camera import Camera
 
 FLOOR_PERCENTILE = 10.0

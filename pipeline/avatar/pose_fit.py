@@ -12,13 +12,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pipeline.avatar.body import Body, Motion
-from pipeline.avatar.mesh_views import View, view_losses
-from pipeline.avatar.pose import PoseCorrection
-from pipeline.avatar.textured import TexturedAvatar
+from pipeline.avatar.textured_avatar import TexturedAvatar
+from pipeline.body.body import Body, Motion
+from pipeline.body.pose_correction import PoseCorrection
 from pipeline.core.progress import track
-from pipeline.geometry.raster import face_adjacency, render_shaded
-from pipeline.geometry.textured import sample_texture
+from pipeline.geometry.differentiable_raster import face_adjacency, render_shaded
+from pipeline.geometry.texture_rendering import sample_texture
+from pipeline.mesh.views import View, view_losses
 
 PERSON_HEIGHT_PX = 320
 """Height of the person in the pictures that are fitted: poses need no finer ones, and time goes with the pixels."""

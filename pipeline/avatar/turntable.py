@@ -4,10 +4,10 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from pipeline.avatar.mesh_views import Shade
+from pipeline.geometry.differentiable_raster import face_adjacency, render_mesh, render_shaded
 from pipeline.geometry.mesh import Mesh
-from pipeline.geometry.raster import face_adjacency, render_mesh, render_shaded
-from pipeline.geometry.textured import turntable_camera
+from pipeline.geometry.texture_rendering import turntable_camera
+from pipeline.mesh.views import Shade
 
 LIGHT_FROM_CAMERA = np.array([-0.35, 0.45, 0.82])
 

@@ -3,7 +3,7 @@
 Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018, version 0.1 with
 AlexNet: the features after each of its five convolutions, scaled to unit length over channels, their squared
 differences weighted by channel, averaged over the picture and summed over layers. The weights are not part of this
-project; `pipeline.io.lpips_weights` looks for them.
+project; `pipeline.report.lpips_weights` looks for them.
 """
 
 from collections.abc import Mapping

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.avatar.body import Motion
 from pipeline.avatar.placement import hold_ends, scene_from_world_m
+from pipeline.body.body import Motion
 
 
 def motion_at(frames: list[int], places: np.ndarray, time_s: list[float] | None = None) -> Motion:

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.avatar.body import Body, Motion, canonical_to_world
-from pipeline.avatar.mesh_views import View, crop_view
 from pipeline.avatar.pose_fit import fit_poses
-from pipeline.avatar.textured import TexturedAvatar
+from pipeline.avatar.textured_avatar import TexturedAvatar
+from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.rotation import axis_angle_to_quaternion, quaternion_multiply
+from pipeline.mesh.views import View, crop_view
 from pipeline.metrics.images import frame_scores
-from tests.io.avatar_sample import sample_body, sample_motion
+from tests.avatar.avatar_sample import sample_body, sample_motion
 from tests.stages.report_run import make_avatar
 
 CAMERA = Camera(220.0, 220.0, 72.0, 96.0, 144, 192)

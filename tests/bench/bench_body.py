@@ -15,11 +15,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from data_tools.command import run_command
-from data_tools.compare import compare_body, compare_masks, compare_surface
-from data_tools.runs import video_in
-from data_tools.truth import load_truth
+from data_tools.evaluate.compare import compare_body, compare_masks, compare_surface
+from data_tools.evaluate.truth import load_truth
+from data_tools.sweep.runs import video_in
+from pipeline.body.files import load_body
 from pipeline.core.errors import UserError
-from pipeline.io.npz import load_body
 from stages import body
 from tests.bench.machine import keep
 

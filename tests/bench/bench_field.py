@@ -52,21 +52,21 @@ from pathlib import Path
 import numpy as np
 
 from data_tools.command import run_command
-from pipeline.avatar.field_config import FieldConfig
-from pipeline.avatar.occupancy import GRACE
-from pipeline.avatar.prepare import spread, start_learning, training_scale
-from pipeline.avatar.train import REBAKES, Learning
+from pipeline.body.files import load_body, load_camera, load_motion
+from pipeline.capture.capture import load_capture
+from pipeline.capture.usable_frames import training_positions
 from pipeline.core.config import build, load_layers
 from pipeline.core.errors import UserError
 from pipeline.core.progress import warn
-from pipeline.io.capture import load_capture
-from pipeline.io.npz import load_body, load_camera, load_motion
-from pipeline.io.scores import training_positions
+from pipeline.field.config import FieldConfig
+from pipeline.field.occupancy import GRACE
+from pipeline.field.setup import spread, start_learning, training_scale
+from pipeline.field.trainer import REBAKES, Learning
 from stages.field import read_picture
-from tests.avatar.scene import painted_scene
 from tests.bench.machine import circumstances, gather_mrow_s, keep, median_ms, memory_gb_s, multiply_gflop_s
 from tests.bench.parts import OTHER, REBAKE, UPDATE, Clock, watched
 from tests.bench.quality import quality
+from tests.field.scene import painted_scene
 
 PARTS = ("draw", "place", "look", "losses")
 PARTS += (

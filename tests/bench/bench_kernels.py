@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from pipeline.avatar.field import Field, choose_layout
-from pipeline.avatar.field_config import FieldConfig
+from pipeline.field.config import FieldConfig
+from pipeline.field.field import Field, choose_layout
 from pipeline.kernels.adam import adam_step_
 from pipeline.kernels.composite import composite
 from pipeline.kernels.hashgrid import Towards, add_table_gradient_, encode
+from pipeline.kernels.inverse_skinning import bake, newton
 from pipeline.kernels.march import WarpSet, march
-from pipeline.kernels.warp import bake, newton
 from tests.bench.machine import keep, median_ms, memory_gb_s, multiply_gflop_s
 from tests.kernels.bar import CELL_M, bar_skin, bend
 

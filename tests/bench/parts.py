@@ -11,16 +11,16 @@ from functools import partial, wraps
 from typing import Any
 from unittest import mock
 
-from pipeline.avatar import train
-from pipeline.avatar.field import _Decode
-from pipeline.avatar.look import Placing
-from pipeline.avatar.occupancy import OccupancyUpdate
-from pipeline.avatar.pose import PoseCorrection
-from pipeline.avatar.train import Learning
-from pipeline.kernels import hashgrid_cpu, newton_cpu
-from pipeline.kernels.parallel import Parallel
-from pipeline.kernels.trace import _Trace
-from pipeline.kernels.warp import _Newton
+from pipeline.body.pose_correction import PoseCorrection
+from pipeline.field import trainer as train
+from pipeline.field.field import _Decode
+from pipeline.field.occupancy import OccupancyUpdate
+from pipeline.field.trainer import Learning
+from pipeline.field.volume_rendering import Placing
+from pipeline.kernels.common.thread_pool import Parallel
+from pipeline.kernels.hashgrid import cpu as hashgrid_cpu
+from pipeline.kernels.inverse_skinning import _Newton, newton_cpu
+from pipeline.kernels.volume_rendering import _Trace
 
 OTHER = "other"
 UPDATE = "occupancy_update"

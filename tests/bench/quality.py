@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 
-from data_tools.chart_trials import FIELD, read_progress
-from data_tools.runs import read_scores
+from data_tools.sweep.chart_trials import FIELD, read_progress
+from data_tools.sweep.runs import read_scores
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import Manifest, read_manifest
 

@@ -2,8 +2,8 @@ import math
 
 import pytest
 
-from data_tools.truth import load_truth
-from pipeline.io.npz import load_body
+from data_tools.evaluate.truth import load_truth
+from pipeline.body.files import load_body
 from tests.bench.bench_body import COLUMNS, TOLD, line, ways
 
 

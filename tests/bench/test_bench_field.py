@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.avatar.field_config import FieldConfig
-from pipeline.avatar.occupancy import GRACE
-from pipeline.avatar.train import Learning
 from pipeline.core.errors import UserError
+from pipeline.field.config import FieldConfig
+from pipeline.field.occupancy import GRACE
+from pipeline.field.trainer import Learning
 from pipeline.kernels.hashgrid import _Encode
 from tests.bench import bench_field
 from tests.bench.bench_field import PARTS, Peaks, Work, begin_painted, least_work, period, settled, table, time_steps

@@ -8,9 +8,9 @@ from jaxtyping import install_import_hook
 install_import_hook(["data_tools"], "beartype.beartype")
 
 from data_tools.sample import main as make_sample  # noqa: E402 (after the hook, so that shapes are checked)
-from data_tools.subject import Subject, load_subject  # noqa: E402
-from pipeline.avatar.body import Body  # noqa: E402
-from pipeline.io.npz import load_body  # noqa: E402
+from data_tools.synthetic.rig.subject import Subject, load_subject  # noqa: E402
+from pipeline.body.body import Body  # noqa: E402
+from pipeline.body.files import load_body  # noqa: E402
 
 SAMPLE_OPTIONS = [
     *("--frames", "6", "--fps", "6", "--size", "200", "--texture", "512"),

@@ -7,18 +7,18 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from data_tools.capture import Capture as Recording
-from data_tools.compare_avatar import Comparison
-from data_tools.runs import TRUTH_VERSION
-from data_tools.truth import load_truth
-from pipeline.avatar.body import Motion, canonical_to_world
-from pipeline.avatar.selection import split_of
-from pipeline.avatar.textured import TexturedAvatar, straight_rgba
+from data_tools.evaluate.compare_avatar import Comparison
+from data_tools.evaluate.files import TRUTH_VERSION
+from data_tools.evaluate.truth import load_truth
+from data_tools.synthetic.scene.capture import Capture as Recording
+from pipeline.avatar.finished_run import FinishedRun
+from pipeline.avatar.textured_avatar import TexturedAvatar, straight_rgba
+from pipeline.body.body import Motion, canonical_to_world
+from pipeline.capture.capture import Capture, image_path, mask_path
+from pipeline.capture.frame_selection import split_of
 from pipeline.core.manifest import MANIFEST, Manifest, digest_files, write_manifest
 from pipeline.geometry.rotation import axis_angle_to_matrix, axis_angle_to_quaternion, quaternion_multiply
 from pipeline.geometry.skinning import forward_kinematics, skinning_transforms, top_k_weights
-from pipeline.io.avatar import FinishedRun
-from pipeline.io.capture import Capture, image_path, mask_path
 from pipeline.io.image import write_gray, write_rgb
 
 

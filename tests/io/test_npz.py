@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.avatar.body import Motion, load_anny
+from pipeline.body.body import Motion, load_anny
 from pipeline.core.errors import UserError
 from pipeline.geometry.camera import Camera
 from pipeline.io import npz

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from pipeline.kernels.warp import SkinGrid
+from pipeline.kernels.inverse_skinning import SkinGrid
 
 CELL_M = 0.05
 

@@ -3,11 +3,11 @@ import pytest
 import torch
 
 from pipeline.kernels.broyden import CANDIDATES, search
+from pipeline.kernels.inverse_skinning import SkinGrid, bake, newton
+from pipeline.kernels.inverse_skinning.reference import skin_points
 from pipeline.kernels.march import WarpSet
-from pipeline.kernels.reference.warp import skin_points
-from pipeline.kernels.warp import SkinGrid, bake, newton
 from tests.kernels.bar import CELL_M, bar_points, bar_skin, bend
-from tests.kernels.test_warp import look_up
+from tests.kernels.test_inverse_skinning import look_up
 
 
 def run(skin, matrices, posed, frame=None):

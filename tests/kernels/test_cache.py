@@ -13,13 +13,13 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.kernels.options import COMPILED
+from pipeline.kernels.common.numba_options import COMPILED
 
 ROWS_OF_A_POINT = """
 import json
 import numpy as np
 from numba import config
-from pipeline.kernels.hashgrid_cpu import _corners
+from pipeline.kernels.hashgrid.cpu import _corners
 
 point, rows = np.full((1, 3), 0.3, np.float32), np.zeros((8, 1), np.uint32)
 hashed_level = np.array([40, 40, 40, 0, 1 << 20, 0])
@@ -27,7 +27,7 @@ _corners(point, 0, 1, hashed_level, rows, np.zeros((8, 1), np.float32), np.zeros
 found, made = (sum(counts.values()) for counts in (_corners.stats.cache_hits, _corners.stats.cache_misses))
 print(json.dumps({"rows": rows.tolist(), "found": found, "made": made, "vectors": config.SLP_VECTORIZE}))
 """
-WHERE = "from numba import config; import pipeline.kernels.options; print(config.CACHE_DIR)"
+WHERE = "from numba import config; import pipeline.kernels.common.numba_options; print(config.CACHE_DIR)"
 
 
 @pytest.fixture
@@ -57,7 +57,7 @@ def test_a_second_process_compiles_nothing(kernels: Path) -> None:
 
 def test_a_constant_of_another_file_is_not_taken_from_the_cache(kernels: Path) -> None:
     before = json.loads(output(kernels, ROWS_OF_A_POINT))
-    (kernels / "hashing.py").write_text("PRIMES = (2654435769, 805459861)\n")
+    (kernels / "common" / "hashing.py").write_text("PRIMES = (2654435769, 805459861)\n")
     after = json.loads(output(kernels, ROWS_OF_A_POINT))
     assert after["made"] == 1
     assert after["rows"] != before["rows"]
@@ -85,10 +85,11 @@ def test_the_cache_lies_beside_the_sources_or_where_the_user_wants_it(kernels: P
 
 
 def test_compiled_loops_are_made_of_the_files_that_the_cache_watches(repository: Path) -> None:
-    watched = {path.stem for path in COMPILED}
-    for path in (repository / "pipeline" / "kernels").glob("*_cpu.py"):
+    kernels = repository / "pipeline" / "kernels"
+    watched = {".".join(path.relative_to(kernels).with_suffix("").parts) for path in COMPILED}
+    for path in kernels.glob("*/*cpu.py"):
         imports = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
         modules = [node.module or "" for node in imports]
-        ours = {name.rpartition(".")[2] for name in modules if name.startswith("pipeline")}
-        assert ours <= watched, path.name
-        assert path.stem in watched
+        ours = {name.removeprefix("pipeline.kernels.") for name in modules if name.startswith("pipeline")}
+        assert ours <= watched, path
+        assert ".".join(path.relative_to(kernels).with_suffix("").parts) in watched

@@ -3,8 +3,7 @@ import math
 import pytest
 import torch
 
-from pipeline.kernels.composite import composite
-from pipeline.kernels.reference import composite as reference
+from pipeline.kernels.composite import composite, reference
 
 RAY_START = torch.tensor([0, 3, 3, 4, 9, 12])
 

@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.kernels.hashgrid import GridLayout, Towards, add_table_gradient_, encode
-from pipeline.kernels.reference import hashgrid as reference
+from pipeline.kernels.hashgrid import GridLayout, Towards, add_table_gradient_, encode, reference
 
 # One dense level, one that just does not fit, two hashed ones.
 CELLS = ((3, 5, 2), (9, 9, 9), (40, 70, 20), (300, 500, 150))

@@ -5,8 +5,8 @@ import torch
 from torch import Tensor
 
 from pipeline.kernels.interpolate import interpolate
+from pipeline.kernels.interpolate.reference import interpolate_reference
 from pipeline.kernels.raster import rasterize
-from pipeline.kernels.reference.interpolate import interpolate_reference
 
 HEIGHT, WIDTH = 31, 45
 

@@ -3,9 +3,9 @@ import math
 import pytest
 import torch
 
+from pipeline.kernels.inverse_skinning import bake
 from pipeline.kernels.march import WarpSet, march
-from pipeline.kernels.visits import record_visits
-from pipeline.kernels.warp import bake
+from pipeline.kernels.transmittance_stats import record_visits
 from tests.kernels.bar import CELL_M, bar_skin, bend
 
 BOUNDS = torch.tensor([[-0.6, -0.15, -0.15], [0.6, 0.15, 0.15]])

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from pipeline.kernels.hashgrid import GridLayout, encode
+from pipeline.kernels.inverse_skinning import bake, newton
 from pipeline.kernels.march import WarpSet, march
-from pipeline.kernels.shade import shade_texture
-from pipeline.kernels.warp import bake, newton
+from pipeline.kernels.texture_sampling import shade_texture
 from tests.kernels.bar import CELL_M, bar_skin, bend
 
 NAN = float("nan")

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from pipeline.kernels.packing import owner_of_each
+from pipeline.kernels.common.packing import owner_of_each
 
 
 @pytest.mark.parametrize("dtype", [torch.int32, torch.int64])

@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from pipeline.geometry.raster import face_adjacency
+from pipeline.geometry.differentiable_raster import face_adjacency
 from pipeline.kernels.raster import antialias, rasterize
-from pipeline.kernels.reference.raster import rasterize_reference, silhouette_edges
+from pipeline.kernels.raster.reference import rasterize_reference, silhouette_edges
 
 HEIGHT, WIDTH = 37, 53
 

@@ -23,12 +23,12 @@ from pipeline.kernels.broyden import search
 from pipeline.kernels.composite import composite
 from pipeline.kernels.hashgrid import GridLayout, encode
 from pipeline.kernels.interpolate import interpolate
+from pipeline.kernels.inverse_skinning import bake, newton
 from pipeline.kernels.march import WarpSet, march
-from pipeline.kernels.observe import observe_texels
 from pipeline.kernels.raster import rasterize
-from pipeline.kernels.shade import shade_texture
-from pipeline.kernels.visits import light_before
-from pipeline.kernels.warp import bake, newton
+from pipeline.kernels.texel_projection import observe_texels
+from pipeline.kernels.texture_sampling import shade_texture
+from pipeline.kernels.transmittance_stats import light_before
 from tests.kernels.bar import CELL_M, bar_skin, bend
 
 THREADS = (1, 2, 16)

@@ -4,16 +4,17 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.avatar.body import Body, Motion
-from pipeline.avatar.field import Field, choose_layout
-from pipeline.avatar.selection import split_of
+from pipeline.body.body import Body, Motion
+from pipeline.body.files import save_body, save_camera, save_motion
+from pipeline.capture.capture import Capture, image_path, mask_path, save_capture
+from pipeline.capture.frame_selection import split_of
+from pipeline.capture.usable_frames import SCORES_NPZ
+from pipeline.field.field import Field, choose_layout
+from pipeline.field.files import save_field
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.skinning import top_k_weights
-from pipeline.io.capture import Capture, image_path, mask_path, save_capture
-from pipeline.io.checkpoint import save_field
 from pipeline.io.image import write_gray, write_rgb
-from pipeline.io.npz import save_body, save_camera, save_motion, save_npz
-from pipeline.io.scores import SCORES_NPZ
+from pipeline.io.npz import save_npz
 
 FPS = 24.0
 

@@ -7,20 +7,21 @@ import cv2
 import numpy as np
 import torch
 
-from pipeline.avatar.body import Body, Motion, canonical_to_world
-from pipeline.avatar.field import Field, choose_layout
-from pipeline.avatar.occupancy import RESOLUTION, Occupancy
-from pipeline.avatar.selection import split_of
-from pipeline.avatar.textured import TexturedAvatar
+from pipeline.avatar.gltf import encode_glb
+from pipeline.avatar.textured_avatar import TexturedAvatar
+from pipeline.body.body import Body, Motion, canonical_to_world
+from pipeline.body.files import save_body, save_camera, save_motion
+from pipeline.capture.capture import Capture, image_path, mask_path, save_capture
+from pipeline.capture.frame_selection import split_of
 from pipeline.core.manifest import MANIFEST, Manifest, write_manifest
+from pipeline.field.field import Field, choose_layout
+from pipeline.field.files import save_field, save_occupancy
+from pipeline.field.occupancy import RESOLUTION, Occupancy
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.skinning import top_k_weights
-from pipeline.io.capture import Capture, image_path, mask_path, save_capture
-from pipeline.io.checkpoint import save_field, save_occupancy
-from pipeline.io.gltf import encode_glb
 from pipeline.io.image import to_uint8, write_gray, write_rgb
-from pipeline.io.npz import save_body, save_camera, save_motion, save_npz
-from tests.io.avatar_sample import FRAME_RATE, sample_body, sample_maps, sample_motion, sample_skinned_mesh
+from pipeline.io.npz import save_npz
+from tests.avatar.avatar_sample import FRAME_RATE, sample_body, sample_maps, sample_motion, sample_skinned_mesh
 
 FRAME_INDEX = np.array([0, 3, 4, 8, 11, 16], dtype=np.int32)
 CAMERA = Camera(110.0, 110.0, 36.0, 48.0, 72, 96)

@@ -6,17 +6,26 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from pipeline.avatar.body import load_anny
-from pipeline.avatar.overlay import BODY_OUTLINE_RGB, MARK_RGB, MASK_OUTLINE_RGB
+from pipeline.body.body import load_anny
+from pipeline.body.files import load_body, load_camera, load_motion
+from pipeline.body.overlay import BODY_OUTLINE_RGB, MARK_RGB, MASK_OUTLINE_RGB
+from pipeline.capture.capture import (
+    IMAGES_FOLDER,
+    MASKS_FOLDER,
+    Capture,
+    image_path,
+    load_capture,
+    mask_path,
+    save_capture,
+)
 from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
 from pipeline.geometry.camera import Camera
-from pipeline.io.capture import IMAGES_FOLDER, MASKS_FOLDER, Capture, image_path, load_capture, mask_path, save_capture
 from pipeline.io.image import read_rgb, write_gray, write_rgb
-from pipeline.io.npz import load_body, load_camera, load_motion, load_npz
+from pipeline.io.npz import load_npz
 from stages.body import STAGE, Config, refuse_poor_fit, run, starting_camera
-from tests.avatar.acting import Act, act
-from tests.avatar.test_fit_quality import result
+from tests.body.acting import Act, act
+from tests.body.fit.test_diagnostics import result
 
 FRAMES = 8
 

@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.avatar.body import load_anny
-from pipeline.avatar.smpl import SmplBody
+from pipeline.body.body import load_anny
+from pipeline.body.files import load_body, load_motion
+from pipeline.body.smpl import SmplBody
+from pipeline.capture.capture import load_capture
+from pipeline.capture.smpl_poses import SmplPoses, save_smpl_poses
 from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.rotation import quaternion_to_matrix
 from pipeline.geometry.skinning import forward_kinematics
-from pipeline.io.capture import load_capture
-from pipeline.io.npz import load_body, load_motion
-from pipeline.io.smpl_poses import SmplPoses, save_smpl_poses
 from stages.body import STAGE, Config, run, supplied_poses
-from tests.avatar.acting import Act, act
-from tests.avatar.smpl_sample import file_contents, made_up_arrays, smpl_pose_of
+from tests.body.acting import Act, act
+from tests.body.smpl_sample import file_contents, made_up_arrays, smpl_pose_of
 from tests.stages.test_body import FRAMES, write_capture
 
 SPACE = np.array([[0.0, 0.0, 1.0, 0.4], [0.0, -1.0, 0.0, 0.1], [1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 0.0, 1.0]])

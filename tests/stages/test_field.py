@@ -7,14 +7,14 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from pipeline.avatar.body import Motion
-from pipeline.avatar.field_config import FieldConfig
-from pipeline.avatar.judge import Judge
-from pipeline.avatar.pose import PoseCorrection
-from pipeline.avatar.train import Learning
+from pipeline.body.body import Motion
+from pipeline.body.pose_correction import PoseCorrection
+from pipeline.capture.capture import Capture, image_path, mask_path
 from pipeline.core.progress import take_warnings
+from pipeline.field.config import FieldConfig
+from pipeline.field.trainer import Learning
+from pipeline.field.validation import Judge
 from pipeline.geometry.camera import Camera
-from pipeline.io.capture import Capture, image_path, mask_path
 from pipeline.io.image import write_gray, write_rgb
 from stages.field import Progress, judge_poses, learn, read_pictures
 

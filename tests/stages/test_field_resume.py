@@ -8,14 +8,14 @@ from unittest import mock
 import pytest
 import torch
 
-from pipeline.avatar.field_config import FieldConfig
-from pipeline.avatar.judge import Judge
-from pipeline.avatar.train import Learning
+from pipeline.body.files import save_motion
 from pipeline.core.manifest import PROGRESS
-from pipeline.io.npz import save_motion
+from pipeline.field.config import FieldConfig
+from pipeline.field.trainer import Learning
+from pipeline.field.validation import Judge
 from stages import field as field_stage
 from stages.field import CHECKPOINT, STAGE, learn
-from tests.avatar.scene import painted_scene
+from tests.field.scene import painted_scene
 from tests.stages.painted_run import make_run
 
 TINY = FieldConfig(

@@ -6,16 +6,16 @@ import cv2
 import numpy as np
 import pytest
 
-from data_tools.movie import write_movie
+from data_tools.synthetic.scene.movie import write_movie
+from pipeline.capture.capture import load_capture
+from pipeline.capture.smpl_poses import save_smpl_poses
 from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
-from pipeline.io.capture import load_capture
 from pipeline.io.image import write_gray, write_rgb
 from pipeline.io.npz import load_npz, save_npz
-from pipeline.io.smpl_poses import save_smpl_poses
 from stages import frames
-from tests.io.test_lens import tiff, with_exif
-from tests.io.test_smpl_poses import make_poses
+from tests.capture.test_exif_focal import tiff, with_exif
+from tests.capture.test_smpl_poses import make_poses
 
 
 def draw_recording(folder, n=40, repeats=1):

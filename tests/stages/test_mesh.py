@@ -7,18 +7,19 @@ import pytest
 import torch
 from torch import Tensor
 
-from pipeline.avatar.body import Body, Motion
-from pipeline.avatar.mesh_views import View, bind, render_view, skin_of
-from pipeline.avatar.refine import Refined
+from pipeline.body.body import Body, Motion
+from pipeline.body.files import save_body, save_camera, save_motion
+from pipeline.capture.capture import Capture, image_path, mask_path, save_capture
+from pipeline.capture.usable_frames import SCORES_NPZ
 from pipeline.core.errors import UserError
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.rotation import axis_angle_to_quaternion
 from pipeline.geometry.surface import isosurface
-from pipeline.io.capture import Capture, image_path, mask_path, save_capture
 from pipeline.io.image import read_rgb, write_gray, write_rgb
-from pipeline.io.npz import load_npz, save_body, save_camera, save_motion, save_npz
-from pipeline.io.scores import SCORES_NPZ
+from pipeline.io.npz import load_npz, save_npz
+from pipeline.mesh.refinement import Refined
+from pipeline.mesh.views import View, bind, render_view, skin_of
 from stages import mesh as mesh_stage
 from stages.mesh import Config, run
 

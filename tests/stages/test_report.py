@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
+from pipeline.capture.capture import Capture, load_capture, mask_path, save_capture
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import digest_files
 from pipeline.core.progress import take_warnings
-from pipeline.io.capture import Capture, load_capture, mask_path, save_capture
 from pipeline.io.image import write_gray
-from pipeline.io.lpips_weights import find_lpips_weights
+from pipeline.report.lpips_weights import find_lpips_weights
 from stages.report import STAGE, Config, run, scored_positions
 from tests.stages.report_run import COLOUR_ERROR, FRAME_INDEX, make_run
 

@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.avatar.body import canonical_to_world
+from pipeline.avatar.gltf import read_glb
+from pipeline.body.body import canonical_to_world
 from pipeline.core.config import Layers, build
 from pipeline.core.errors import UserError
 from pipeline.geometry.skinning import linear_blend_skinning
-from pipeline.geometry.textured import render_textured
-from pipeline.io.gltf import read_glb
+from pipeline.geometry.texture_rendering import render_textured
 from pipeline.io.image import read_gray, read_rgb, to_float, to_uint8, write_gray
 from pipeline.io.npz import load_npz
 from pipeline.metrics.images import body_pixels, on_white, premultiplied_on_white, psnr_db
 from stages.export import STAGE as EXPORT
 from stages.texture import STAGE as TEXTURE
-from tests.avatar.scene import PaintedScene, painted_scene
-from tests.io.test_gltf import Player
+from tests.avatar.test_gltf import Player
+from tests.field.scene import PaintedScene, painted_scene
 from tests.stages.painted_run import make_run
 from tests.tools.khronos import validator_issues
 

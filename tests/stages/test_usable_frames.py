@@ -7,11 +7,12 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from pipeline.io import capture
-from pipeline.io.capture import image_path
-from pipeline.io.npz import save_motion, save_npz
-from pipeline.io.scores import SCORES_NPZ
-from tests.avatar.scene import painted_scene
+from pipeline.body.files import save_motion
+from pipeline.capture import capture
+from pipeline.capture.capture import image_path
+from pipeline.capture.usable_frames import SCORES_NPZ
+from pipeline.io.npz import save_npz
+from tests.field.scene import painted_scene
 from tests.stages.painted_run import make_run
 
 FRAMES = 14

@@ -6,7 +6,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from data_tools.movie import write_movie
+from data_tools.synthetic.scene.movie import write_movie
 from pipeline.io.image import write_gray, write_rgb
 
 WIDTH, HEIGHT = 16, 12

@@ -7,10 +7,10 @@ import pytest
 
 from data_tools.convert.image_folder import is_image_folder, read_image_folder
 from data_tools.convert.recording import write_recording
+from pipeline.capture.user_files import find_supplied
+from pipeline.capture.video import open_source
 from pipeline.core.errors import UserError
 from pipeline.io.image import read_rgb, write_rgba
-from pipeline.io.supplied import find_supplied
-from pipeline.io.video import open_source
 from tests.data_tools.convert import made_up
 
 

@@ -8,12 +8,12 @@ import pytest
 from data_tools.convert.instant_avatar import is_instant_avatar, read_instant_avatar
 from data_tools.convert.protocol import _SETS
 from data_tools.convert.recording import write_recording
+from pipeline.capture.smpl_poses import load_smpl_poses
+from pipeline.capture.user_files import find_supplied
+from pipeline.capture.video import open_source
 from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
 from pipeline.io.image import read_rgb, write_gray
-from pipeline.io.smpl_poses import load_smpl_poses
-from pipeline.io.supplied import find_supplied
-from pipeline.io.video import open_source
 from tests.data_tools.convert import made_up
 
 SUBJECT = "male-3-casual"

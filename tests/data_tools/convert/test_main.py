@@ -5,8 +5,8 @@ import pytest
 
 from data_tools.command import run_command
 from data_tools.convert.__main__ import main
+from pipeline.capture.capture import load_capture
 from pipeline.core.errors import UserError
-from pipeline.io.capture import load_capture
 from pipeline.io.npz import save_npz
 from stages import frames
 from tests.data_tools.convert import made_up

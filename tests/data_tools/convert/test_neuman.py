@@ -5,11 +5,11 @@ import pytest
 
 from data_tools.convert.neuman import is_neuman, read_neuman
 from data_tools.convert.recording import write_recording
+from pipeline.capture.smpl_poses import load_smpl_poses
+from pipeline.capture.user_files import find_supplied
+from pipeline.capture.video import open_source
 from pipeline.core.errors import UserError
 from pipeline.io.image import write_gray
-from pipeline.io.smpl_poses import load_smpl_poses
-from pipeline.io.supplied import find_supplied
-from pipeline.io.video import open_source
 from tests.data_tools.convert import made_up
 from tests.data_tools.convert.joblib_writer import dump_joblib
 

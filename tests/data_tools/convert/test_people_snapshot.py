@@ -10,11 +10,11 @@ import pytest
 
 from data_tools.convert.people_snapshot import is_people_snapshot, read_people_snapshot
 from data_tools.convert.recording import write_recording
+from pipeline.capture.smpl_poses import load_smpl_poses
+from pipeline.capture.user_files import find_supplied
+from pipeline.capture.video import open_source, read_frames
 from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
-from pipeline.io.smpl_poses import load_smpl_poses
-from pipeline.io.supplied import find_supplied
-from pipeline.io.video import open_source, read_frames
 from tests.data_tools.convert import made_up
 
 

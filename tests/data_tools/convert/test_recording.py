@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from data_tools.convert.recording import mask_folder
-from data_tools.movie import write_movie
+from data_tools.synthetic.scene.movie import write_movie
+from pipeline.capture.video import open_source
 from pipeline.core.errors import UserError
 from pipeline.io.image import write_gray
-from pipeline.io.video import open_source
 from tests.data_tools.convert import made_up
 
 

@@ -1,0 +1,132 @@
+"""`report/truth.json` and `report/truth.html`: all that a comparison with the truth found, on one page."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from data_tools.evaluate.compare_avatar import (
+    Comparison,
+    Pair,
+    compare_filmed,
+    compare_held_out,
+    compare_novel_poses,
+    compare_novel_views,
+    compare_shape,
+    compare_texture,
+    load_comparison,
+)
+from data_tools.evaluate.files import TRUTH_FILES, TRUTH_VERSION
+from pipeline.core.atomic import atomic_path
+from pipeline.core.errors import UserError
+from pipeline.core.manifest import MANIFEST, digest_file, read_manifest, write_manifest
+from pipeline.metrics.images import body_box, body_pixels, mean_scores, on_white, premultiplied_on_white
+from pipeline.report.page import asset, error_map, figure_text, image_tag, table, tile
+from pipeline.report.report_json import finite
+
+PROTOCOL = (
+    "Surfaces are laid over the truth by rotation, shift and one scale, found by iterated closest points in both "
+    "directions, before they are compared (20,000 points a surface, nearest triangle, without faces that cannot be "
+    "seen from outside in the A-pose): mesh in the true rig's A-pose, filmed in some held-out frames, each rig in its "
+    "own pose, novel_poses while both rigs do a motion that was never filmed. scale_to_truth is that scale. Joints "
+    "are compared root-aligned and absolute, without any other alignment. Pictures: field and mesh are the held-out "
+    "rows of the report. ceiling is the true mesh and texture, truly lit, drawn in the refined poses by the fitted "
+    "camera, on the same frames with outlines as soft as the mesh's: what is missing there is the fault of pose and "
+    "camera, after all that another shape of the A-pose could make good. Squared error prefers a blur to a sharp print "
+    "in the wrong place, so a blurred avatar may score above it. Those rows cut the frames out by the mask that the "
+    "pipeline found, so that what it leaves out costs nothing; the rows named true_mask cut them out by the true one, "
+    "meshes with sharp outlines. novel_views and novel_poses are the avatar whose limbs point where the true ones do, "
+    "laid over the true surface and seen by the true cameras, unlit while the truth is lit. colour_error and "
+    "balanced_colour_error (one gain a channel) are mean absolute differences of 255 on the texels that the video "
+    "showed."
+)
+STYLE = ".frame { grid-template-columns: repeat(6, 1fr); }"
+
+
+def write_comparison(out: Path, run: Path, found: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
+    """Compare the finished avatar, write the two files into the run's report, and return the document.
+
+    Args:
+        out: the synthetic capture. found: sections that were measured before (masks, body).
+
+    Raises:
+        UserError: the report is not finished.
+    """
+    report = run / "report"
+    manifest = read_manifest(report)
+    if manifest is None:
+        raise UserError(f"{report} is not finished; run python -m stages --run {run}")
+    heldout = json.loads((report / "report.json").read_text(encoding="utf-8"))["heldout"]
+    document, pictures = avatar_sections(load_comparison(out, run))
+    kept = {name: heldout[name] for name in ("field", "mesh")}
+    document = finite(
+        {"version": TRUTH_VERSION, "protocol": PROTOCOL, **found, **document, "images": kept | document["images"]}
+    )
+    page = comparison_page(run.resolve().name, document, pictures)
+    for name, text in zip(TRUTH_FILES, (page, json.dumps(document, indent=2, allow_nan=False) + "\n"), strict=True):
+        with atomic_path(report / name) as path:
+            path.write_text(text, encoding="utf-8")
+    outputs = manifest.outputs | {name: digest_file(report / name) for name in TRUTH_FILES}
+    with atomic_path(report / MANIFEST) as path:  # so that --verify knows the two files
+        write_manifest(replace(manifest, outputs=outputs), path)
+    return document
+
+
+def avatar_sections(pair: Comparison) -> tuple[dict[str, Any], dict[str, list[Pair]]]:
+    """All sections that need a finished avatar, and the pictures of held-out cameras and motions."""
+    document: dict[str, Any] = {"mesh": compare_shape(pair), "filmed": compare_filmed(pair)}
+    images = compare_held_out(pair)
+    pictures = {}
+    if (pair.folder / "novel_poses").is_dir():
+        document["novel_poses"], pictures["novel_poses"] = compare_novel_poses(pair)
+    if (pair.folder / "novel_views").is_dir():
+        pictures["novel_views"] = compare_novel_views(pair)
+    images |= {name: mean_scores(picture.scores() for picture in row) for name, row in pictures.items()}
+    return document | {"texture": compare_texture(pair), "images": images}, pictures
+
+
+def comparison_page(title: str, document: Mapping[str, Any], pictures: Mapping[str, Sequence[Pair]]) -> str:
+    """The whole HTML text, in the style of the report."""
+    surfaces = {name: document[name] for name in ("mesh", "filmed", "novel_poses") if name in document}
+    tables = [table("Surfaces against truth", surfaces), table("Pictures", document["images"])]
+    tables += [
+        table(name.capitalize(), {"": document[name]}) for name in ("masks", "body", "texture") if name in document
+    ]
+    rows = "".join(_row(name.replace("_", " "), row) for name, row in pictures.items())
+    return (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}: truth</title>'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1"><link rel="icon" href="data:,">'
+        f"<style>{asset('report.css')}{STYLE}</style></head><body><header><h1>{escape(title)} against its truth</h1>"
+        f'<p class="lead">The rest is in <a href="index.html">the report</a>.</p></header><main>'
+        f'<section class="tiles">{"".join(tile(*texts) for texts in _headline(document))}</section>'
+        f'<section><h2>All figures</h2><p class="note">{escape(document["protocol"])}</p>'
+        f'<div class="tables">{"".join(tables)}</div></section><section><h2>Held-out cameras and motions</h2>{rows}'
+        f"</section></main></body></html>\n"
+    )
+
+
+def _headline(document: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """(value, unit, label) of each tile."""
+    mesh, images = document["mesh"], document["images"]
+    return [
+        (figure_text(mesh["chamfer_mm"]), "mm", "Chamfer distance, A-pose"),
+        (figure_text(mesh["f_score"]), "", "F-score at 5 mm"),
+        (figure_text(mesh["normal_angle_deg"]), "°", "normals, mean"),
+        (figure_text(images["mesh"]["psnr_body"]), "dB", "mesh, held out, body pixels"),
+        (figure_text(images["ceiling"]["psnr_body"]), "dB", "true mesh in the fitted poses"),
+    ]
+
+
+def _row(title: str, pictures: Sequence[Pair]) -> str:
+    """Truth, avatar and error of each picture, cropped to the person."""
+    figures = []
+    for number, pair in enumerate(pictures):
+        box = body_box(body_pixels(pair.truth[..., 3]))
+        truth = on_white(pair.truth[..., :3], pair.truth[..., 3])[box]
+        avatar = premultiplied_on_white(pair.avatar)[box]
+        for caption, pixels in (("truth", truth), ("avatar", avatar), ("error", error_map(avatar, truth))):
+            image = image_tag(pixels, f"{title} {number}, {caption}")
+            figures.append(f"<figure>{image}<figcaption>{number}, {caption}</figcaption></figure>")
+    return f'<div class="card frame"><h3>{escape(title.capitalize())}</h3>{"".join(figures)}</div>'

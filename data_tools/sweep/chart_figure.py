@@ -1,0 +1,159 @@
+"""Accuracy against seconds as a figure: a row of panels a capture, a colour a preset, the Pareto front marked."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator
+
+PANEL_INCHES = (4.8, 3.6)
+FOOT_INCHES = 1.1
+INK, FAINT = "#222222", "#888888"
+FEW_TICKS, MANY_TICKS = (1.0, 3.0), (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
+
+Colour = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class Point:
+    """One finished run.
+
+    field_seconds, seconds: from the video until the field, and until the exported avatar.
+    scores: columns of `data_tools.sweep.runs.SCORES`.
+    curve: while the field learnt, seconds since the start and PSNR of validation frames (dB): whole image, body pixels.
+    """
+
+    capture: str
+    preset: str
+    seed: int
+    field_seconds: float
+    seconds: float
+    scores: dict[str, float]
+    curve: list[tuple[float, float, float]] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """What a column shows: the mesh's score, the field's where it has one, and its place in a row of `Point.curve`."""
+
+    title: str
+    mesh: str
+    field: str | None
+    curve: int | None
+    higher_is_better: bool
+
+
+PANELS = (
+    Panel("PSNR, whole image (dB)", "mesh_psnr_full_db", "field_psnr_full_db", 1, True),
+    Panel("PSNR, body pixels (dB)", "mesh_psnr_body_db", "field_psnr_body_db", 2, True),
+    Panel("Chamfer distance to the truth (mm)", "chamfer_mm", None, None, False),
+)
+
+
+def pareto_front(entries: Sequence[tuple[float, float]], higher_is_better: bool) -> list[int]:
+    """Indices of the (seconds, score) that no other beats, from the quickest on.
+
+    One beats another when it is at least as quick and at least as good, and not equal in both.
+    """
+    costs = [(seconds, -score if higher_is_better else score) for seconds, score in entries]
+    beaten = [any(a[0] <= b[0] and a[1] <= b[1] and a != b for a in costs) for b in costs]
+    return sorted((index for index, is_beaten in enumerate(beaten) if not is_beaten), key=costs.__getitem__)
+
+
+def preset_means(points: Iterable[Point], score: str) -> dict[str, tuple[float, float]]:
+    """Mean (seconds, score) over the seeds of each preset; runs without that score are left out."""
+    groups: dict[str, list[tuple[float, float]]] = {}
+    for point in points:
+        if score in point.scores:
+            groups.setdefault(point.preset, []).append((point.seconds, point.scores[score]))
+    means = {preset: np.mean(group, axis=0) for preset, group in groups.items()}
+    return {preset: (float(mean[0]), float(mean[1])) for preset, mean in means.items()}
+
+
+def draw_chart(points: Sequence[Point], origin: str) -> Figure:
+    """The whole figure; a score that no run has is left out. ValueError when there is no score at all.
+
+    origin: a line that says where the figures come from.
+    """
+    captures = list(dict.fromkeys(point.capture for point in points))
+    presets = list(dict.fromkeys(point.preset for point in points))
+    panels = [panel for panel in PANELS if any(panel.mesh in point.scores for point in points)]
+    if not panels:
+        raise ValueError("a chart needs at least one run with a score")
+    colours = {preset: mpl.colormaps["tab10"](number % 10) for number, preset in enumerate(presets)}
+    size = (PANEL_INCHES[0] * len(panels), PANEL_INCHES[1] * len(captures) + FOOT_INCHES)
+    figure = Figure(figsize=size, layout="constrained")
+    grid = figure.subplots(len(captures), len(panels), squeeze=False)
+    for capture, row in zip(captures, grid, strict=True):
+        chosen = [point for point in points if point.capture == capture]
+        for panel, axes in zip(panels, row, strict=True):
+            _draw_runs(axes, panel, chosen, colours)
+            _draw_presets(axes, panel, chosen, colours)
+            _dress(axes, f"{capture}: {panel.title}")
+    keys = [Line2D([], [], color=colour, marker="o", label=preset) for preset, colour in colours.items()]
+    figure.legend(
+        handles=[*keys, *_meanings()], loc="outside lower center", ncols=2 * len(panels), frameon=False, fontsize=9
+    )
+    figure.suptitle(origin, x=0.01, ha="left", fontsize=8, color=FAINT)
+    return figure
+
+
+def save_chart(figure: Figure, folder: Path) -> None:
+    """`chart.svg` and `chart.png`; equal figures give equal bytes."""
+    with mpl.rc_context({"svg.hashsalt": "chart", "svg.fonttype": "none"}):
+        figure.savefig(folder / "chart.svg", metadata={"Date": None})
+    figure.savefig(folder / "chart.png", dpi=130)
+
+
+def _draw_runs(axes: Axes, panel: Panel, points: Sequence[Point], colours: dict[str, Colour]) -> None:
+    """Every run: a dot for the mesh, and before it the field, with the way it took to get there."""
+    for point in points:
+        colour = colours[point.preset]
+        if panel.mesh in point.scores:
+            axes.plot(point.seconds, point.scores[panel.mesh], ".", color=colour, markersize=4)
+        if panel.curve is not None and point.curve:
+            seconds, scores = zip(*((row[0], row[panel.curve]) for row in point.curve), strict=True)
+            axes.plot(seconds, scores, color=colour, linewidth=1, alpha=0.7)
+        if panel.field in point.scores:
+            axes.plot(point.field_seconds, point.scores[panel.field], "D", mec=colour, mfc="white", markersize=5)
+
+
+def _draw_presets(axes: Axes, panel: Panel, points: Sequence[Point], colours: dict[str, Colour]) -> None:
+    """Every preset's mean over seeds with its short name, and which of them no other beats."""
+    means = preset_means(points, panel.mesh)
+    for preset, place in means.items():
+        axes.plot(*place, "o", color=colours[preset], markersize=7)
+        axes.annotate(preset.partition(",")[0], place, (7, 4), textcoords="offset points", fontsize=8, color=INK)
+    places = list(means.values())
+    front = [places[index] for index in pareto_front(places, panel.higher_is_better)]
+    if front:
+        seconds, scores = zip(*front, strict=True)
+        axes.step(seconds, scores, where="post", color=INK, linewidth=1, linestyle=":", zorder=1)
+        axes.plot(seconds, scores, "o", color=INK, markersize=12, fillstyle="none", linestyle="none")
+
+
+def _dress(axes: Axes, title: str) -> None:
+    axes.set_title(title, fontsize=10, loc="left")
+    axes.set_xscale("log")
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda seconds, _: f"{seconds:,.12g}"))
+    axes.xaxis.set_minor_formatter(FuncFormatter(lambda *_: ""))
+    axes.set_xlabel("seconds", fontsize=9, color=FAINT)
+    axes.margins(x=0.15, y=0.12)
+    shortest, longest = axes.get_xlim()
+    axes.xaxis.set_major_locator(LogLocator(subs=FEW_TICKS if longest > 10.0 * shortest else MANY_TICKS))
+    axes.grid(color=FAINT, alpha=0.25)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _meanings() -> list[Line2D]:
+    return [
+        Line2D([], [], color=INK, marker="o", linestyle="none", label="exported mesh, held-out frames"),
+        Line2D([], [], mec=INK, mfc="white", marker="D", linestyle="none", label="field, held-out frames"),
+        Line2D([], [], color=INK, linewidth=1, label="field while it learns, validation frames"),
+        Line2D([], [], color=INK, marker="o", markersize=11, fillstyle="none", linestyle=":", label="Pareto front"),
+    ]

@@ -1,0 +1,136 @@
+"""What the built-in person wears, and where on the body each layer lies."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from data_tools.synthetic.person.anatomy import Anatomy
+
+LAYERS = ("shoes", "trousers", "shirt", "hair")
+"""Offset surfaces, from the skin outwards: a later layer hides an earlier one."""
+
+LEGWEAR = ("trousers", "skirt")
+"""What covers the legs: a layer, or the loose sheet of `data_tools.synthetic.person.skirt` over bare legs."""
+
+TUCKED_M = -0.03
+"""Where a shirt that is tucked into a skirt ends, as `Outfit.shirt_drop_m`."""
+
+Colour = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Outfit:
+    """Cuts in metres and fractions, colours in sRGB [0, 1]."""
+
+    legwear: str
+    sleeve_fraction: float
+    shirt_drop_m: float
+    shirt: Colour
+    stripe: Colour
+    trousers: Colour
+    skirt: Colour
+    check: Colour
+    shoes: Colour
+    hair: Colour
+    iris: Colour
+    skin: Colour
+    print_text: str
+
+
+_SHIRTS: tuple[tuple[Colour, Colour], ...] = (
+    ((0.72, 0.13, 0.14), (0.93, 0.90, 0.84)),
+    ((0.13, 0.33, 0.55), (0.95, 0.80, 0.25)),
+    ((0.88, 0.86, 0.80), (0.15, 0.42, 0.36)),
+    ((0.16, 0.45, 0.30), (0.94, 0.93, 0.88)),
+)
+_TROUSERS: tuple[Colour, ...] = ((0.22, 0.29, 0.42), (0.55, 0.47, 0.35), (0.20, 0.20, 0.22))
+_SKIRTS: tuple[tuple[Colour, Colour], ...] = (
+    ((0.16, 0.36, 0.40), (0.93, 0.76, 0.33)),
+    ((0.52, 0.16, 0.26), (0.92, 0.88, 0.80)),
+    ((0.74, 0.66, 0.50), (0.28, 0.20, 0.34)),
+)
+_SHOES: tuple[Colour, ...] = ((0.16, 0.17, 0.20), (0.50, 0.20, 0.16), (0.30, 0.36, 0.40))
+_HAIR: tuple[Colour, ...] = ((0.17, 0.11, 0.08), (0.07, 0.06, 0.06), (0.42, 0.27, 0.14))
+_IRIS: tuple[Colour, ...] = ((0.30, 0.19, 0.10), (0.25, 0.38, 0.48), (0.28, 0.36, 0.22))
+_SKIN: tuple[Colour, ...] = ((0.86, 0.65, 0.54), (0.72, 0.51, 0.39), (0.52, 0.35, 0.26))
+
+
+def choose_outfit(seed: int, legwear: str = "trousers") -> Outfit:
+    """The wardrobe's entry for a seed; seed 0 is the first of everything. legwear: one of `LEGWEAR`."""
+    digits = np.random.default_rng(seed).integers(0, 1_000_000, 6) if seed else np.zeros(6, dtype=np.int64)
+    shirt, stripe = _SHIRTS[digits[0] % len(_SHIRTS)]
+    skirt, check = _SKIRTS[digits[1] % len(_SKIRTS)]
+    return Outfit(
+        legwear=legwear,
+        sleeve_fraction=0.66,
+        shirt_drop_m=0.07 if legwear == "trousers" else TUCKED_M,
+        shirt=shirt,
+        stripe=stripe,
+        trousers=_TROUSERS[digits[1] % len(_TROUSERS)],
+        skirt=skirt,
+        check=check,
+        shoes=_SHOES[digits[2] % len(_SHOES)],
+        hair=_HAIR[digits[3] % len(_HAIR)],
+        iris=_IRIS[digits[4] % len(_IRIS)],
+        skin=_SKIN[digits[5] % len(_SKIN)],
+        print_text=f"{24 + seed % 70:02d}",
+    )
+
+
+def layer_depths(
+    points_m: Float[np.ndarray, "n 3"], limbs: Float[np.ndarray, "n 2"], anatomy: Anatomy, outfit: Outfit
+) -> Float[np.ndarray, "n 4"]:
+    """How far inside each of `LAYERS` a point of the A-pose surface lies, in metres; negative outside.
+
+    points_m: canonical positions. limbs: weights of (an arm, the head), from `anatomy.limb_weights`.
+    """
+    height = points_m[:, 1]
+    on_arm, on_head = limbs[:, 0] > 0.5, limbs[:, 1] > 0.35
+    foot, hips = anatomy.joints_m["LeftFoot"], anatomy.joints_m["Hips"]
+    trousers = np.minimum(hips[1] + 0.03 - height, height - (foot[1] - 0.025))
+    if outfit.legwear != "trousers":
+        trousers = np.full_like(trousers, -1.0)
+    shirt = np.minimum(below_neckline(points_m, anatomy), height - (hips[1] - outfit.shirt_drop_m))
+    depths = [
+        foot[1] + 0.02 - height,
+        np.where(on_arm, -1.0, trousers),
+        np.where(on_arm, _inside_sleeve(points_m, anatomy, outfit), shirt),
+        np.where(on_head, _inside_hair(points_m, anatomy), -1.0),
+    ]
+    return np.stack(depths, axis=1).astype(np.float32)
+
+
+def below_neckline(points_m: Float[np.ndarray, "n 3"], anatomy: Anatomy) -> Float[np.ndarray, "n"]:
+    """Depth below a crew neck: a plane through the root of the neck that falls towards the front."""
+    normal = np.array([0.0, 1.0, 0.62]) / np.hypot(1.0, 0.62)
+    root = anatomy.joints_m["Neck"] + np.array([0.0, 0.012, 0.0])
+    return _dot(root - points_m, normal)
+
+
+def _inside_sleeve(points_m: Float[np.ndarray, "n 3"], anatomy: Anatomy, outfit: Outfit) -> Float[np.ndarray, "n"]:
+    """Distance along the upper arm to the sleeve's hem."""
+    joints = anatomy.joints_m
+    depth = np.empty(len(points_m))
+    is_left = points_m[:, 0] > joints["Hips"][0]
+    for side, rows in (("Left", is_left), ("Right", ~is_left)):
+        shoulder, elbow = joints[f"{side}Arm"], joints[f"{side}ForeArm"]
+        length = np.linalg.norm(elbow - shoulder)
+        along = _dot(points_m[rows] - shoulder, elbow - shoulder) / length
+        depth[rows] = outfit.sleeve_fraction * length - along
+    return depth
+
+
+def _inside_hair(points_m: Float[np.ndarray, "n 3"], anatomy: Anatomy) -> Float[np.ndarray, "n"]:
+    """A short haircut: high on the forehead, around the ears, down to the nape."""
+    from_skull = points_m - anatomy.skull_m()
+    side = np.abs(from_skull[:, 0])
+    hairline = 0.62 * from_skull[:, 1] - 0.78 * from_skull[:, 2] + 0.024 + 0.12 * np.maximum(side - 0.03, 0.0)
+    nape = points_m[:, 1] - (anatomy.mouth_m[1] + 0.012)
+    beside_ear = np.linalg.norm((points_m[:, None] - anatomy.ears_m) / np.array([2.0, 1.0, 0.72]), axis=2).min(axis=1)
+    return np.minimum(np.minimum(hairline, nape), beside_ear - 0.037)
+
+
+def _dot(points: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n"]:
+    """Inner products, summed in one order: the last bits of a BLAS product depend on the number of threads."""
+    return points[:, 0] * direction[0] + points[:, 1] * direction[1] + points[:, 2] * direction[2]

@@ -1,0 +1,50 @@
+"""A textured, rigged person: the thing that synthetic captures are taken of."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from pipeline.body.body import Body
+from pipeline.body.files import load_body, save_body
+from pipeline.io.image import read_rgb, to_float, write_rgb
+from pipeline.io.npz import load_npz, save_npz
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A clothed surface bound to a skeleton in the canonical A-pose, with its texture.
+
+    `faces_uv` are the corners of `body.faces` in `uv`; UV origin bottom-left, row 0 of the texture at v = 1.
+    """
+
+    body: Body
+    uv: Float[np.ndarray, "t 2"]
+    faces_uv: Int[np.ndarray, "f 3"]
+    texture: UInt8[np.ndarray, "th tw 3"]
+
+    @cached_property
+    def _texture_tensor(self) -> Tensor:
+        return torch.from_numpy(to_float(self.texture))
+
+    def texture_tensor(self) -> Float[Tensor, "th tw 3"]:
+        """sRGB in [0, 1], converted once."""
+        return self._texture_tensor
+
+
+def save_subject(folder: Path, subject: Subject) -> None:
+    """Write `clothed.npz` (a Body), `uv.npz` and `texture.png`."""
+    save_body(folder / "clothed.npz", subject.body)
+    save_npz(folder / "uv.npz", {"uv": subject.uv, "faces_uv": subject.faces_uv})
+    write_rgb(folder / "texture.png", subject.texture)
+
+
+def load_subject(folder: Path) -> Subject:
+    """Inverse of `save_subject`; UserError names a missing file."""
+    layout = load_npz(folder / "uv.npz")
+    body = load_body(folder / "clothed.npz")
+    return Subject(body, layout["uv"], layout["faces_uv"], read_rgb(folder / "texture.png"))

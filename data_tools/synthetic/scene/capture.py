@@ -1,0 +1,193 @@
+"""A synthetic capture: a subject that moves in a room before a fixed camera, and the folder it is written to.
+
+OUT/video/video.mp4            what the pipeline may see
+OUT/truth/...                  what it must never see: see `write_truth`
+"""
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from data_tools.folder import whole_folder
+from data_tools.synthetic.rig.subject import Subject, save_subject
+from data_tools.synthetic.scene.backdrop import Room, foot_shadow
+from data_tools.synthetic.scene.ball import Ball
+from data_tools.synthetic.scene.movie import write_movie
+from data_tools.synthetic.scene.renderer import Light, pose_vertices, render_subject
+from pipeline.body.body import Body, Motion, canonical_to_world
+from pipeline.body.files import save_body, save_camera, save_motion
+from pipeline.core.progress import track
+from pipeline.geometry.camera import Camera
+from pipeline.io.image import to_uint8, write_gray, write_rgb, write_rgba
+
+RECIPE_VERSION = 1
+"""Raised whenever the same options give other pictures; the Makefile reads it too."""
+
+_FEET = ("LeftFoot", "LeftToeBase", "RightFoot", "RightToeBase")
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Everything that determines the pixels of a recording."""
+
+    subject: Subject
+    motion: Motion
+    camera: Camera
+    light: Light
+    room: Room
+    ground_m: Float[np.ndarray, "3"]
+    fps: float
+    samples: int
+    ball: Ball | None = None
+
+    @cached_property
+    def canonical_to_world(self) -> Float[Tensor, "n j 4 4"]:
+        """Skinning matrices of every frame."""
+        return canonical_to_world(self.subject.body, self.motion)
+
+    def person(self, frame: int) -> Float[np.ndarray, "h w 4"]:
+        """The person alone: premultiplied sRGB and coverage, in [0, 1]."""
+        vertices = pose_vertices(self.subject, self.canonical_to_world[frame])
+        return render_subject(self.subject, vertices, self.camera, self.light, self.samples)
+
+    def frame(self, frame: int) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]:
+        """The picture that the camera takes, and the person's coverage in it."""
+        person = self.person(frame)
+        shadow = foot_shadow(self.room, self._feet_m(frame))
+        behind = self.room.image * shadow[:, :, None]
+        picture, coverage = person[:, :, :3] + (1.0 - person[:, :, 3:]) * behind, person[:, :, 3]
+        if self.ball:
+            ball = self.ball.picture(self.camera, frame / self.fps, self.light, self.samples)
+            clear = 1.0 - ball[:, :, 3]
+            picture, coverage = ball[:, :, :3] + clear[:, :, None] * picture, clear * coverage
+        return to_uint8(picture), to_uint8(coverage)
+
+    def _feet_m(self, frame: int) -> Float[np.ndarray, "4 3"]:
+        """World positions of ankles and balls of the feet."""
+        body = self.subject.body
+        feet = [body.joint(name) for name in _FEET]
+        transforms = self.canonical_to_world[frame, feet]
+        joints = torch.from_numpy(body.joints_m[feet])
+        return ((transforms[:, :3, :3] @ joints[:, :, None]).squeeze(-1) + transforms[:, :3, 3]).numpy()
+
+
+@dataclass(frozen=True)
+class Heldout:
+    """Questions whose answers are rendered too: other cameras on the first pose, and other poses."""
+
+    cameras: tuple[Camera, ...]
+    motion: Motion | None
+
+
+def portrait_camera(size_px: int, height_m: float, distance_m: float, fill: float) -> tuple[Camera, np.ndarray]:
+    """A level camera at the world's origin, and the place on the ground where the person stands before it.
+
+    Args:
+        size_px: side of the square image. height_m: of the person. distance_m: from camera to person.
+        fill: share of the image's height that the person takes, in (0, 1).
+    """
+    focal_px = fill * size_px * distance_m / height_m
+    camera = Camera(focal_px, focal_px, size_px / 2, size_px / 2, size_px, size_px)
+    return camera, np.array([0.0, -0.52 * height_m, -distance_m])
+
+
+def novel_cameras(camera: Camera, standing_m: np.ndarray, height_m: float, count: int) -> tuple[Camera, ...]:
+    """Cameras around the person, between the headings of a turn and above or below the capture's own height.
+
+    Every one looks at the middle of the body from the capture's distance, +Y up in its image.
+
+    Args:
+        standing_m: world position on the ground where the person stands in the pose that is shown.
+    """
+    middle = standing_m + [0.0, 0.5 * height_m, 0.0]
+    distance = float(np.linalg.norm(middle - camera.centre_m()))
+    angles = 2.0 * np.pi * (np.arange(count) + 0.37) / max(count, 1)
+    rises = np.resize(np.radians([18.0, -6.0, 35.0, 8.0]), count)
+    return tuple(
+        replace(camera, world_to_camera=_looking_at(middle, distance, angle, rise))
+        for angle, rise in zip(angles, rises, strict=True)
+    )
+
+
+def _looking_at(middle_m: np.ndarray, distance_m: float, angle: float, rise: float) -> Float[np.ndarray, "4 4"]:
+    """world_to_camera of a camera on a sphere around a point; angle 0 stands on +Z, rise is above the horizon."""
+    backward = np.array([np.sin(angle) * np.cos(rise), np.sin(rise), np.cos(angle) * np.cos(rise)])
+    right = np.array([np.cos(angle), 0.0, -np.sin(angle)])
+    world_to_camera = np.eye(4)
+    world_to_camera[:3, :3] = np.stack([right, -np.cross(backward, right), -backward])
+    world_to_camera[:3, 3] = -world_to_camera[:3, :3] @ (middle_m + distance_m * backward)
+    return world_to_camera.astype(np.float32)
+
+
+def write_capture(out: Path, capture: Capture, bare: Body | None, heldout: Heldout, recipe: dict[str, object]) -> None:
+    """Render everything into `out`, which is whole or absent. UserError when it exists already."""
+    with whole_folder(out) as part:
+        for folder in ("video", "truth/masks"):
+            (part / folder).mkdir(parents=True)
+        write_movie(part / "video" / "video.mp4", _frames(capture, part / "truth" / "masks"), capture.fps)
+        write_truth(part / "truth", capture, bare, recipe)
+        write_heldout(part / "truth", capture, heldout)
+
+
+def _frames(capture: Capture, masks: Path) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+    """The pictures in order; the masks are written on the way."""
+    for frame in track(range(len(capture.motion.frame_index)), "rendering"):
+        picture, coverage = capture.frame(frame)
+        write_gray(masks / f"{frame:06d}.png", coverage)
+        yield picture
+
+
+def write_truth(truth: Path, capture: Capture, bare: Body | None, recipe: dict[str, object]) -> None:
+    """Write what determines the pixels.
+
+    `clothed.npz` (Body: canonical clothed surface and skeleton), `uv.npz`, `texture.png`, `bare.npz` (Body beneath the
+    clothes, where there is one), `motion.npz`, `camera.npz`, `room.png`, `recipe.json`; `masks/` is there already.
+    """
+    save_subject(truth, capture.subject)
+    if bare is not None:
+        save_body(truth / "bare.npz", bare)
+    save_motion(truth / "motion.npz", capture.motion)
+    save_camera(truth / "camera.npz", capture.camera)
+    write_rgb(truth / "room.png", to_uint8(capture.room.image))
+    facts = {
+        "version": RECIPE_VERSION,
+        "fps": capture.fps,
+        "samples": capture.samples,
+        "ground_m": [float(value) for value in capture.ground_m],
+        "light": asdict(capture.light),
+        "ball": capture.ball is not None,
+    }
+    (truth / "recipe.json").write_text(json.dumps({**recipe, **facts}, indent=2, sort_keys=True) + "\n")
+
+
+def write_heldout(truth: Path, capture: Capture, heldout: Heldout) -> None:
+    """Write `novel_views/` (the first pose) and `novel_poses/` (the capture's camera) as RGBA, straight alpha."""
+    subject = capture.subject
+    vertices = pose_vertices(subject, capture.canonical_to_world[0])
+    for index, camera in enumerate(heldout.cameras):
+        (truth / "novel_views").mkdir(exist_ok=True)
+        save_camera(truth / "novel_views" / f"{index:06d}.npz", camera)
+        person = render_subject(subject, vertices, camera, capture.light, capture.samples)
+        write_rgba(truth / "novel_views" / f"{index:06d}.png", straight_rgba(person))
+    if heldout.motion is None:
+        return
+    (truth / "novel_poses").mkdir()
+    save_motion(truth / "novel_poses" / "motion.npz", heldout.motion)
+    for index, transforms in enumerate(canonical_to_world(subject.body, heldout.motion)):
+        vertices = pose_vertices(subject, transforms)
+        person = render_subject(subject, vertices, capture.camera, capture.light, capture.samples)
+        write_rgba(truth / "novel_poses" / f"{index:06d}.png", straight_rgba(person))
+
+
+def straight_rgba(person: Float[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w 4"]:
+    """8-bit colours that are no longer multiplied by the coverage; black where it is 0."""
+    coverage = person[:, :, 3:]
+    colours = np.divide(person[:, :, :3], coverage, out=np.zeros_like(person[:, :, :3]), where=coverage > 0)
+    return to_uint8(np.concatenate([colours, coverage], axis=2))

@@ -1,0 +1,161 @@
+"""How synthetic people move: a turn in A-pose with natural sway, and a few poses that the turn never shows."""
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pipeline.body.body import Body, Motion
+from pipeline.geometry.rotation import axis_angle_to_quaternion, quaternion_multiply, quaternion_to_matrix
+from pipeline.geometry.skinning import forward_kinematics
+
+Angles = dict[str, tuple[float, float, float]]
+"""Axis-angle (radians, canonical axes) by joint name; joints that are not named rest."""
+
+_SWAY: dict[str, tuple[tuple[float, float, float], float]] = {
+    "Spine": ((0.016, 0.030, 0.014), 2.9),
+    "Spine1": ((0.014, 0.022, 0.012), 2.3),
+    "Neck": ((0.030, 0.040, 0.015), 3.4),
+    "Head": ((0.025, 0.045, 0.020), 2.6),
+    "LeftArm": ((0.030, 0.035, 0.050), 3.1),
+    "RightArm": ((0.030, 0.035, 0.050), 2.7),
+    "LeftForeArm": ((0.025, 0.045, 0.025), 2.2),
+    "RightForeArm": ((0.025, 0.045, 0.025), 2.5),
+    "LeftHand": ((0.050, 0.020, 0.050), 2.0),
+    "RightHand": ((0.050, 0.020, 0.050), 2.4),
+}
+"""Largest angles (radians about x, y, z) and period (s) of each joint's slow wandering."""
+
+BREATH_PERIOD_S = 3.6
+
+NOVEL_POSES: dict[str, Angles] = {
+    "arms_up": {"LeftArm": (0.0, 0.0, 1.55), "RightArm": (0.0, 0.0, -1.55)},
+    "stride": {
+        "LeftUpLeg": (-0.55, 0.0, 0.0),
+        "LeftLeg": (0.35, 0.0, 0.0),
+        "RightUpLeg": (0.35, 0.0, 0.0),
+        "RightLeg": (0.45, 0.0, 0.0),
+        "LeftArm": (0.45, 0.0, -0.45),
+        "RightArm": (-0.50, 0.0, 0.45),
+    },
+    "squat": {
+        "Spine": (0.35, 0.0, 0.0),
+        "LeftUpLeg": (-1.15, 0.0, 0.0),
+        "RightUpLeg": (-1.15, 0.0, 0.0),
+        "LeftLeg": (1.55, 0.0, 0.0),
+        "RightLeg": (1.55, 0.0, 0.0),
+        "LeftFoot": (-0.40, 0.0, 0.0),
+        "RightFoot": (-0.40, 0.0, 0.0),
+    },
+    "wave": {
+        "RightArm": (0.0, 0.0, -1.0),
+        "RightForeArm": (0.0, 0.0, -0.9),
+        "Head": (0.05, 0.35, 0.0),
+        "LeftArm": (0.0, 0.0, -0.4),
+    },
+}
+"""Poses outside the turn: what a held-out motion asks of an avatar."""
+
+
+def turn_in_a_pose(
+    body: Body, frame_count: int, fps: float, ground_m: Float[np.ndarray, "3"], seed: int, arc_deg: float = 360.0
+) -> Motion:
+    """One full turn on the spot, with slow arms, breathing and weight that shifts from foot to foot.
+
+    Args:
+        ground_m: world position between the feet. seed: phases of the sway.
+        arc_deg: below 360, the person turns half of it to one side, then to the other, and back.
+
+    The last frame stops one step before the first one's heading, so that headings are spread evenly.
+    """
+    time_s = np.arange(frame_count) / fps
+    random = np.random.default_rng([seed, 2])
+    axis_angles = np.zeros((frame_count, len(body.joint_names), 3))
+    for name, (reach, period) in _SWAY.items():
+        _add(axis_angles, body, name, _wandering(time_s, period, random) * reach)
+    _breathe(axis_angles, body, time_s)
+    _shift_weight(axis_angles, body, time_s)
+    turned = np.arange(frame_count) / frame_count
+    heading = 2.0 * np.pi * (turned + 0.012 * np.sin(4.0 * np.pi * turned))
+    if arc_deg < 360.0:
+        heading = np.radians(0.5 * arc_deg) * np.sin(heading)
+    return _planted(body, axis_angles, heading, ground_m, time_s)
+
+
+def novel_motion(body: Body, ground_m: Float[np.ndarray, "3"], count: int) -> Motion:
+    """`count` of the poses in `NOVEL_POSES`, in turn, each seen from another side; one pose a frame."""
+    axis_angles = np.zeros((count, len(body.joint_names), 3))
+    poses = list(NOVEL_POSES.values())
+    for frame in range(count):
+        for name, angles in poses[frame % len(poses)].items():
+            _add(axis_angles[frame : frame + 1], body, name, np.array(angles))
+    heading = np.resize([0.35, -0.70, 0.90, -0.20], count) + 2.1 * (np.arange(count) // len(poses))
+    return _planted(body, axis_angles, heading, ground_m, np.arange(count, dtype=float))
+
+
+def grounded(body: Body, motion: Motion, floor_y_m: float) -> Motion:
+    """The same motion, raised or lowered frame by frame until the lowest foot stands on the floor as in the A-pose."""
+    root = motion.root_translation_m.copy()
+    root[:, 1] += floor_y_m - above_rest_m(body, motion)
+    return motion.with_pose(motion.rotations_wxyz, root)
+
+
+def above_rest_m(body: Body, motion: Motion) -> Float[np.ndarray, "n"]:
+    """Height of the lowest ankle or ball of a foot over its place in the A-pose, which stands on y = 0."""
+    joint_to_world = _joints(body, motion.rotations_wxyz, motion.root_translation_m)
+    feet = [body.joint(side + part) for side in ("Left", "Right") for part in ("Foot", "ToeBase")]
+    return (joint_to_world[:, feet, 1, 3].numpy() - body.joints_m[feet, 1]).min(axis=1)
+
+
+def _wandering(time_s: np.ndarray, period_s: float, random: np.random.Generator) -> Float[np.ndarray, "n 3"]:
+    """Three smooth signals in [-1, 1]: two sines of unrelated periods each."""
+    phase = random.uniform(0.0, 2.0 * np.pi, (2, 3))
+    slow = np.sin(2.0 * np.pi * time_s[:, None] / (1.6 * period_s) + phase[0])
+    return 0.65 * slow + 0.35 * np.sin(2.0 * np.pi * time_s[:, None] / (0.71 * period_s) + phase[1])
+
+
+def _add(axis_angles: Float[np.ndarray, "n j 3"], body: Body, name: str, angles: np.ndarray) -> None:
+    """Turn a joint further, in place; rigs may lack one (a second spine joint, a collar bone)."""
+    if name in body.joint_names:
+        axis_angles[:, body.joint(name)] += angles
+
+
+def _breathe(axis_angles: np.ndarray, body: Body, time_s: np.ndarray) -> None:
+    """The chest rises a little and the shoulders follow."""
+    breath = np.sin(2.0 * np.pi * time_s / BREATH_PERIOD_S)
+    for name, reach in (("Spine2", (-0.014, 0, 0)), ("LeftShoulder", (0, 0, 0.016)), ("RightShoulder", (0, 0, -0.016))):
+        _add(axis_angles, body, name, breath[:, None] * reach)
+
+
+def _shift_weight(axis_angles: np.ndarray, body: Body, time_s: np.ndarray) -> None:
+    """The hips tip from side to side; legs and spine counter it, so that feet stay flat and the head level."""
+    tip = 0.022 * np.sin(2.0 * np.pi * time_s / 2.1)
+    for name, sign in (("Hips", 1.0), ("LeftUpLeg", -1.0), ("RightUpLeg", -1.0), ("Spine", -1.0)):
+        _add(axis_angles, body, name, tip[:, None] * (0.0, 0.0, sign))
+    step = np.maximum(np.sin(2.0 * np.pi * time_s / 1.05), 0.0), np.maximum(-np.sin(2.0 * np.pi * time_s / 1.05), 0.0)
+    for side, lift in zip(("Left", "Right"), step, strict=True):
+        for part, angle in (("UpLeg", -0.07), ("Leg", 0.13), ("Foot", -0.06)):
+            _add(axis_angles, body, side + part, lift[:, None] * (angle, 0.0, 0.0))
+
+
+def _planted(
+    body: Body, axis_angles: np.ndarray, heading: np.ndarray, ground_m: np.ndarray, time_s: np.ndarray
+) -> Motion:
+    """Turn the person by `heading` (radians about +Y) and stand on `ground_m`."""
+    rotations = axis_angle_to_quaternion(torch.from_numpy(axis_angles))
+    turn = torch.zeros(len(heading), 3, dtype=torch.float64)
+    turn[:, 1] = torch.from_numpy(heading)
+    rotations[:, 0] = quaternion_multiply(axis_angle_to_quaternion(turn), rotations[:, 0])
+    root = np.repeat(ground_m[None], len(heading), axis=0) * [1.0, 0.0, 1.0]
+    motion = Motion(
+        frame_index=np.arange(len(heading), dtype=np.int32),
+        time_s=time_s.astype(np.float64),
+        rotations_wxyz=rotations.numpy().astype(np.float32),
+        root_translation_m=root.astype(np.float32),
+    )
+    return grounded(body, motion, float(ground_m[1]))
+
+
+def _joints(body: Body, rotations_wxyz: np.ndarray, root_m: np.ndarray) -> Float[Tensor, "n j 4 4"]:
+    matrices = quaternion_to_matrix(torch.from_numpy(rotations_wxyz))
+    return forward_kinematics(matrices, torch.from_numpy(root_m), torch.from_numpy(body.joints_m), body.parents)

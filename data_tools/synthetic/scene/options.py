@@ -1,0 +1,148 @@
+"""Options that all synthetic captures share, from the command line to a `Capture`."""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from data_tools.synthetic.person.noise import Noise
+from data_tools.synthetic.rig.bvh import read_bvh
+from data_tools.synthetic.rig.retarget import resampled, retarget
+from data_tools.synthetic.rig.subject import Subject
+from data_tools.synthetic.scene.backdrop import Room, make_room
+from data_tools.synthetic.scene.ball import Ball
+from data_tools.synthetic.scene.capture import Capture, Heldout, novel_cameras, portrait_camera
+from data_tools.synthetic.scene.motion import novel_motion, turn_in_a_pose
+from data_tools.synthetic.scene.renderer import LIGHTS
+from pipeline.body.body import Body, Motion
+from pipeline.core.errors import UserError
+from pipeline.geometry.camera import Camera
+from pipeline.io.image import to_float, to_uint8
+
+LIGHT_HELP = (
+    "studio: ambient and key light that shade; flat: the bare texture, shadow-free; shiny: studio with highlights; "
+    "hard: a strong key light that the person hides from itself"
+)
+LEAST_FRAMES, LEAST_SIZE_PX = 2, 32
+LEAST_FILL, MOST_FILL = 0.05, 0.95
+
+
+def capture_parser(command: str, description: str) -> argparse.ArgumentParser:
+    """A parser with the options that all captures share."""
+    parser = argparse.ArgumentParser(
+        prog=f"python -m data_tools.{command}",
+        description=description,
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    parser.add_argument("--frames", type=int, default=96, help="number of frames")
+    parser.add_argument("--fps", type=float, default=24.0, help="frames a second")
+    parser.add_argument("--size", type=int, default=540, help="side of the square image in pixels, even")
+    parser.add_argument("--distance", type=float, default=3.6, help="from camera to person, metres")
+    parser.add_argument("--fill", type=float, default=0.82, help="share of the image's height that the person takes")
+    parser.add_argument("--focal", type=float, help="focal length in pixels, from which the share then follows")
+    parser.add_argument("--light", choices=sorted(LIGHTS), default="studio", help=LIGHT_HELP)
+    parser.add_argument("--background", choices=("busy", "plain"), default="busy", help="the room")
+    parser.add_argument("--samples", type=int, default=2, help="antialiasing: samples a pixel along each axis")
+    parser.add_argument("--novel-views", type=int, default=4, help="held-out cameras to render into truth/")
+    parser.add_argument("--novel-poses", type=int, default=4, help="held-out poses to render into truth/")
+    parser.add_argument("--novel-bvh", type=Path, help="motion capture to take them from, evenly spread, on the spot")
+    parser.add_argument("--bvh", type=Path, help="motion capture to follow instead of the turn in A-pose")
+    parser.add_argument("--arc", type=float, default=360.0, help="degrees of the turn; below 360: there and back")
+    parser.add_argument("--ball", action="store_true", help="a juggled ball passes before the person")
+    parser.add_argument("--start", type=float, default=0.0, help="where in the motion to start, seconds")
+    parser.add_argument("--in-place", action="store_true", help="stay on the spot whatever the motion does")
+    parser.add_argument("--seed", type=int, default=0, help="person, clothes and sway; same seed, same bytes")
+    return parser
+
+
+def check_options(options: argparse.Namespace) -> None:
+    """Refuse numbers that cannot make a capture, before any work.
+
+    Raises:
+        UserError: naming the option and its range.
+    """
+    bounds = (
+        ("frames", LEAST_FRAMES, 100_000),
+        ("fps", 0.1, 1000.0),
+        ("size", LEAST_SIZE_PX, 4096),
+        ("distance", 1.0, 50.0),
+        ("fill", LEAST_FILL, MOST_FILL),
+        ("samples", 1, 8),
+        ("arc", 0.0, 360.0),
+        ("novel_views", 0, 1000),
+        ("novel_poses", 0, 1000),
+        ("texture", 64, 8192),
+        ("seed", 0, 2**31 - 1),
+    )
+    for name, low, high in bounds:
+        value = getattr(options, name, low)
+        if not low <= value <= high:
+            raise UserError(f"--{name.replace('_', '-')} {value} is outside {low} to {high}; choose a value within")
+    if options.size % 2:
+        raise UserError(f"--size {options.size} is odd, which H.264 cannot store; choose {options.size + 1}")
+
+
+def stage_scene(options: argparse.Namespace, body: Body) -> tuple[Camera, np.ndarray, Room]:
+    """Camera, ground and room for a person of this height.
+
+    Raises:
+        UserError: with this --focal the person would be tiny, or cut off.
+    """
+    fill = options.fill
+    if options.focal is not None:
+        focal_when_full_px = options.size * options.distance / body.height_m()
+        fill = options.focal / focal_when_full_px
+        if not LEAST_FILL <= fill <= MOST_FILL:
+            raise UserError(
+                f"--focal {options.focal} lets the person take {fill:.2f} of the image's height; choose one from "
+                f"{LEAST_FILL * focal_when_full_px:.0f} to {MOST_FILL * focal_when_full_px:.0f}, or another --distance"
+            )
+    camera, ground_m = portrait_camera(options.size, body.height_m(), options.distance, fill)
+    room = make_room(camera, ground_m, options.background == "busy", Noise(options.seed))
+    return camera, ground_m, Room(to_float(to_uint8(room.image)), room.floor_m)
+
+
+def choose_motion(options: argparse.Namespace, body: Body, ground_m: np.ndarray) -> Motion:
+    """The turn in A-pose, or the part of a BVH file that is asked for."""
+    if options.bvh:
+        whole = retarget(read_bvh(options.bvh), body, ground_m, options.in_place)
+        return resampled(whole, options.start, options.frames, options.fps)
+    return turn_in_a_pose(body, options.frames, options.fps, ground_m, options.seed, options.arc)
+
+
+def choose_novel_poses(options: argparse.Namespace, body: Body, ground_m: np.ndarray) -> Motion | None:
+    """Poses that the capture does not show: those built in, or some of a BVH file; None when none is asked for."""
+    if not options.novel_poses:
+        return None
+    if not options.novel_bvh:
+        return novel_motion(body, ground_m, options.novel_poses)
+    whole = retarget(read_bvh(options.novel_bvh), body, ground_m, in_place=True)
+    rows = np.linspace(0, len(whole.frame_index) - 1, options.novel_poses).round().astype(int)
+    return replace(whole.select(rows), frame_index=np.arange(len(rows), dtype=np.int32))
+
+
+def assemble(
+    options: argparse.Namespace, subject: Subject, motion: Motion, scene: tuple[Camera, np.ndarray, Room]
+) -> tuple[Capture, Heldout]:
+    """The capture, and its held-out questions."""
+    camera, ground_m, room = scene
+    ball = Ball(ground_m, subject.body.height_m()) if options.ball else None
+    light = LIGHTS[options.light]
+    capture = Capture(subject, motion, camera, light, room, ground_m, options.fps, options.samples, ball)
+    # Whoever walks may be metres from the middle of the path in the first frame, which the held-out cameras show.
+    walked_m = motion.root_translation_m[0] - ground_m.astype(np.float32)
+    standing_m = ground_m + walked_m * [1.0, 0.0, 1.0]
+    cameras = novel_cameras(camera, standing_m, subject.body.height_m(), options.novel_views)
+    return capture, Heldout(cameras, choose_novel_poses(options, subject.body, ground_m))
+
+
+def recipe_of(options: argparse.Namespace) -> dict[str, object]:
+    """The options by name, as they go into the truth's recipe; of paths only the motions' names."""
+    chosen = {
+        name: value if isinstance(value, int | float | str) else str(value)
+        for name, value in sorted(vars(options).items())
+        if value is not None and not isinstance(value, Path)
+    }
+    novel = {"novel_motion": options.novel_bvh.name} if options.novel_bvh else {}
+    return chosen | novel | {"motion": options.bvh.name if options.bvh else "turn"}

@@ -1,0 +1,84 @@
+"""A finished run read back: the recording, the fitted body, the field and the exported mesh, ready to be drawn."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pipeline.avatar.textured_avatar import TexturedAvatar
+from pipeline.body.body import Body, Motion, canonical_to_world
+from pipeline.body.files import load_body, load_camera, load_motion
+from pipeline.capture.capture import Capture, load_capture
+from pipeline.field.files import load_field, load_occupancy
+from pipeline.field.rendering import render_field
+from pipeline.field.skin_grid import build_skin_grid, skin_margin_m
+from pipeline.geometry.camera import Camera
+from pipeline.io.image import read_rgb, to_float
+from pipeline.io.npz import load_npz
+
+Draw = Callable[[Float[Tensor, "j 4 4"]], Float[np.ndarray, "h w 4"]]
+"""Draws one pose, given as skinning matrices: premultiplied colours and alpha in [0, 1]."""
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """What there is to look at when all stages have run.
+
+    motion: of every chosen frame, with the field's pose corrections. refined: its skinning matrices; fitted: those of
+    the body stage alone.
+    """
+
+    capture: Capture
+    camera: Camera
+    body: Body
+    motion: Motion
+    avatar: TexturedAvatar
+    draw_field: Draw
+    refined: Float[Tensor, "n j 4 4"]
+    fitted: Float[Tensor, "n j 4 4"]
+
+
+def load_finished_run(inputs: Mapping[str, Path]) -> FinishedRun:
+    """Read the folders of `frames`, `body`, `field`, `mesh` and `texture`. Raises UserError as the readers do."""
+    body = load_body(inputs["body"] / "body.npz")
+    camera = load_camera(inputs["body"] / "camera.npz")
+    motion = load_motion(inputs["field"] / "motion.npz")
+    return FinishedRun(
+        capture=load_capture(inputs["frames"]),
+        camera=camera,
+        body=body,
+        motion=motion,
+        avatar=load_textured_avatar(inputs["mesh"], inputs["texture"]),
+        draw_field=_field_drawer(inputs["field"], body, camera),
+        refined=canonical_to_world(body, motion),
+        fitted=canonical_to_world(body, load_motion(inputs["body"] / "motion.npz")),
+    )
+
+
+def load_textured_avatar(mesh_dir: Path, texture_dir: Path) -> TexturedAvatar:
+    """The mesh stage's surface and skin with the texture stage's atlas and diffuse map."""
+    mesh, atlas = load_npz(mesh_dir / "mesh.npz"), load_npz(texture_dir / "atlas.npz")
+    return TexturedAvatar(
+        vertices=torch.from_numpy(mesh["vertices"].astype(np.float32)),
+        faces=torch.from_numpy(mesh["faces"].astype(np.int32)),
+        joint_indices=torch.from_numpy(mesh["joint_indices"].astype(np.int64)),
+        joint_weights=torch.from_numpy(mesh["joint_weights"].astype(np.float32)),
+        uv=torch.from_numpy(atlas["uv"].astype(np.float32)),
+        faces_uv=torch.from_numpy(atlas["faces_uv"].astype(np.int32)),
+        diffuse=torch.from_numpy(to_float(read_rgb(texture_dir / "diffuse.png"))),
+    )
+
+
+def _field_drawer(field_dir: Path, body: Body, camera: Camera) -> Draw:
+    field = load_field(field_dir / "field.safetensors")
+    occupancy = load_occupancy(field_dir / "occupancy.npz")
+    skin = build_skin_grid(body, skin_margin_m(body, occupancy.bounds_m.numpy()))
+
+    def draw(canonical_to_world: Float[Tensor, "j 4 4"]) -> Float[np.ndarray, "h w 4"]:
+        return render_field(field, occupancy, body, canonical_to_world, camera, skin).numpy()
+
+    return draw

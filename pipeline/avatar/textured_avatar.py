@@ -1,0 +1,71 @@
+"""The finished avatar as it is exported: a skinned mesh with its atlas and diffuse map, posed and drawn."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from pipeline.geometry.camera import Camera
+from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.skinning import dense_weights, linear_blend_skinning
+from pipeline.geometry.texture_rendering import render_textured, turntable_camera
+
+
+@dataclass(frozen=True)
+class TexturedAvatar:
+    """Canonical A-pose surface (m), four joint influences a vertex, atlas corners of each face, and the diffuse map.
+
+    Colours are sRGB in [0, 1]; UV has its origin bottom-left.
+    """
+
+    vertices: Float[Tensor, "v 3"]
+    faces: Int[Tensor, "f 3"]
+    joint_indices: Int[Tensor, "v 4"]
+    joint_weights: Float[Tensor, "v 4"]
+    uv: Float[Tensor, "t 2"]
+    faces_uv: Int[Tensor, "f 3"]
+    diffuse: Float[Tensor, "th tw 3"]
+
+    def mesh(self) -> Mesh:
+        """The surface alone."""
+        return Mesh(self.vertices.numpy(), self.faces.numpy())
+
+    def posed(self, canonical_to_world: Float[Tensor, "j 4 4"]) -> Float[Tensor, "v 3"]:
+        """Vertices (m, world) in one pose, by the same linear blend skinning that a glTF viewer does."""
+        weights = dense_weights(self.joint_indices, self.joint_weights, len(canonical_to_world))
+        return linear_blend_skinning(self.vertices, weights, canonical_to_world[None])[0]
+
+    def render(self, vertices_world: Float[Tensor, "v 3"], camera: Camera, samples: int) -> Float[np.ndarray, "h w 4"]:
+        """Premultiplied texture colours and coverage in [0, 1], unlit; see `render_textured`."""
+        image = render_textured(vertices_world, self.faces, self.faces_uv, self.uv, self.diffuse, camera, samples)
+        return image.numpy()
+
+    def turntable(
+        self, vertices_world: Float[Tensor, "v 3"], views: int, height_px: int, samples: int
+    ) -> list[UInt8[np.ndarray, "_ _ 4"]]:
+        """Pictures from evenly spread sides, the first from +Z: straight alpha, cropped left and right to the body.
+
+        All have one height and one scale; widths differ.
+        """
+        lowest, highest = vertices_world.numpy().min(axis=0), vertices_world.numpy().max(axis=0)
+        across = math.hypot(highest[0] - lowest[0], highest[2] - lowest[2]) / (highest[1] - lowest[1])
+        pictures = []
+        for number in range(views):
+            angle = 2.0 * math.pi * number / views
+            camera = turntable_camera(lowest, highest, angle, math.ceil(height_px * across), height_px)
+            pictures.append(_cropped_columns(straight_rgba(self.render(vertices_world, camera, samples))))
+        return pictures
+
+
+def straight_rgba(premultiplied: Float[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w 4"]:
+    """8-bit picture with straight alpha from premultiplied colours in [0, 1]; black where nothing is covered."""
+    alpha = premultiplied[..., 3:]
+    colour = premultiplied[..., :3] / np.maximum(alpha, 1e-6)
+    return np.rint(255.0 * np.clip(np.concatenate([colour, alpha], axis=2), 0.0, 1.0)).astype(np.uint8)
+
+
+def _cropped_columns(picture: UInt8[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w2 4"]:
+    columns = np.flatnonzero(picture[..., 3].any(axis=0))
+    return picture[:, columns[0] : columns[-1] + 1] if len(columns) else picture

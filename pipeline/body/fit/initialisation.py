@@ -1,0 +1,132 @@
+"""Where a fit starts: which way the person faces in each frame, and where the person stands."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from pipeline.body.fit.camera_parameters import LENS_COUNT
+from pipeline.body.fit.energy import FitState, Observations
+from pipeline.geometry.rotation import matrix_to_quaternion, quaternion_to_matrix, slerp
+
+TORSO = (11, 12, 23, 24)
+
+
+def torso_rotations(rest_m: Float[Tensor, "l 3"], directions_m: Float[Tensor, "n l 3"]) -> Float[Tensor, "n 3 3"]:
+    """Rotation that carries the rest torso (hips, shoulders) onto each frame's 3D landmarks (Kabsch 1976)."""
+    rows = list(TORSO)
+    rest = rest_m[rows] - rest_m[rows].mean(0)
+    seen = directions_m[:, rows] - directions_m[:, rows].mean(1, keepdim=True)
+    u, _, v = torch.linalg.svd(seen.transpose(1, 2) @ rest)
+    sign = torch.ones(len(seen), 3, dtype=rest.dtype)
+    sign[:, 2] = torch.linalg.det(u @ v)
+    return (u * sign[:, None]) @ v
+
+
+def torso_found(observations: Observations) -> Bool[np.ndarray, "n"]:
+    """Frames whose hips and shoulders are known, and are no point (a failing detector may put all in one place)."""
+    rows = list(TORSO)
+    known = (
+        torch.minimum(observations.confidence[:, rows], observations.direction_confidence[:, rows]).min(1).values > 0
+    )
+    return (known & (torso_size(observations.directions_m) > 1e-3)).numpy()
+
+
+def torso_size(places_m: Float[Tensor, "n l 3"]) -> Float[Tensor, "n"]:
+    """Root mean square distance (m) of hips and shoulders from their middle."""
+    torso = places_m[:, list(TORSO)]
+    return (torso - torso.mean(1, keepdim=True)).square().sum(-1).mean(1).sqrt()
+
+
+def facing_yaw(rotation: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n"]:
+    """Angle (rad) about +Y of the direction a body faces; 0 is +Z, positive towards +X."""
+    return torch.atan2(rotation[:, 0, 2], rotation[:, 2, 2])
+
+
+def initial_state(
+    observations: Observations,
+    rest_m: Float[Tensor, "l 3"],
+    joints_m: Float[Tensor, "j 3"],
+    shape: Float[Tensor, "s"],
+    offset_count: int,
+) -> FitState:
+    """A-pose, turned as the torso is turned and placed where the landmarks project best.
+
+    Frames without landmarks take the rotation and place in between their neighbours'.
+    """
+    found = torso_found(observations)
+    turn = torso_rotations(rest_m, observations.directions_m)
+    turned = (rest_m - joints_m[0]) @ turn.transpose(1, 2)
+    size = torso_size(rest_m[None])[0] / torso_size(observations.directions_m[torch.from_numpy(found)]).median()
+    hips_m = 0.5 * (turned[:, 23] + turned[:, 24])
+    relative = observations.directions_m * size + hips_m[:, None]
+    root = place_by_landmarks(observations, relative)
+    turn, root = _fill_gaps(turn, root, found)
+    rotations = torch.eye(3, dtype=torch.float64).repeat(len(root), len(joints_m), 1, 1)
+    rotations[:, 0] = turn
+    return FitState(
+        rotations,
+        root,
+        shape.double(),
+        torch.zeros(offset_count, dtype=torch.float64),
+        torch.zeros(LENS_COUNT, dtype=torch.float64),
+    )
+
+
+def place_by_landmarks(observations: Observations, relative_m: Float[Tensor, "n l 3"]) -> Float[Tensor, "n 3"]:
+    """World position of the root from pixels of points known relative to it.
+
+    Each pixel gives two equations linear in the unknown place t: fx (X + t_x) - (u - cx) (Z + t_z) = 0, likewise y.
+    """
+    camera = observations.camera
+    pose = torch.as_tensor(camera.world_to_camera, dtype=torch.float64)
+    in_camera = relative_m @ pose[:3, :3].T
+    weight = observations.confidence.sqrt()
+    rows, right = [], []
+    for axis, (focal, centre) in enumerate(((camera.fx, camera.cx), (camera.fy, camera.cy))):
+        offset_px = observations.landmarks_px[..., axis] - centre
+        row = torch.zeros(*offset_px.shape, 3, dtype=torch.float64)
+        row[..., axis], row[..., 2] = focal, -offset_px
+        rows.append(row * weight[..., None])
+        right.append((offset_px * in_camera[..., 2] - focal * in_camera[..., axis]) * weight)
+    matrix, vector = torch.cat(rows, dim=1), torch.cat(right, dim=1)
+    normal = matrix.transpose(1, 2) @ matrix + 1e-6 * torch.eye(3, dtype=torch.float64)
+    root_in_camera = torch.linalg.solve(normal, (matrix * vector[..., None]).sum(1))
+    return (root_in_camera - pose[:3, 3]) @ pose[:3, :3]
+
+
+def _fill_gaps(
+    turn: Float[Tensor, "n 3 3"], root_m: Float[Tensor, "n 3"], found: Bool[np.ndarray, "n"]
+) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3"]]:
+    """Rotation and place of frames that were not found, from the nearest found frames before and after."""
+    known = np.flatnonzero(found)
+    low, high, share = _between(known.astype(np.float64), np.arange(len(found), dtype=np.float64))
+    quaternions = matrix_to_quaternion(turn[known])
+    filled = quaternion_to_matrix(slerp(quaternions[low], quaternions[high], share))
+    return filled, root_m[known][low] * (1 - share) + root_m[known][high] * share
+
+
+def interpolated_state(state: FitState, rows: Int[np.ndarray, "k"], time_s: Float[Tensor, "n"]) -> FitState:
+    """Poses of all n frames from those of some (`rows`), in between by time; outside, the nearest one."""
+    times = time_s.numpy()
+    low, high, share = _between(times[rows], times)
+    quaternions = matrix_to_quaternion(state.rotations)
+    turned = slerp(quaternions[low], quaternions[high], share[:, None].expand(-1, quaternions.shape[1], 1))
+    return replace(
+        state,
+        rotations=quaternion_to_matrix(turned),
+        root_m=state.root_m[low] * (1 - share) + state.root_m[high] * share,
+    )
+
+
+def _between(
+    known: Float[np.ndarray, "k"], wanted: Float[np.ndarray, "n"]
+) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"], Float[Tensor, "n 1"]]:
+    """For each wanted value the known ones below and above it, and how far it lies between them (0 to 1)."""
+    high = np.clip(np.searchsorted(known, wanted), 0, len(known) - 1)
+    low = np.clip(high - 1, 0, None)
+    gap = np.maximum(known[high] - known[low], 1e-9)
+    share = np.where(high == low, 0.0, np.clip((wanted - known[low]) / gap, 0.0, 1.0))
+    return low, high, torch.from_numpy(share)[:, None]

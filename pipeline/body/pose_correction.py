@@ -1,0 +1,98 @@
+"""Small corrections of the fitted poses, learnt with the field and smooth in time."""
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pipeline.body.body import Body, Motion
+from pipeline.core.device import CPU
+from pipeline.geometry.rotation import (
+    axis_angle_to_matrix,
+    axis_angle_to_quaternion,
+    quaternion_multiply,
+    quaternion_to_matrix,
+)
+from pipeline.geometry.skinning import forward_kinematics, skinning_transforms
+from pipeline.kernels.common.dispatch import runs_on_numba
+from pipeline.kernels.kinematics import FittedPoses, Skeleton, skinning_matrices
+
+MAIN_JOINTS = (
+    "Hips", "Spine", "Spine1", "Spine2", "Neck", "Head",
+    "LeftShoulder", "LeftArm", "LeftForeArm", "LeftHand", "RightShoulder", "RightArm", "RightForeArm", "RightHand",
+    "LeftUpLeg", "LeftLeg", "LeftFoot", "RightUpLeg", "RightLeg", "RightFoot",
+)  # fmt: skip
+
+
+class PoseCorrection:
+    """An axis-angle vector for each main joint and a shift of the root, for each training frame, in time order.
+
+    A joint turns by its correction before its fitted local rotation is applied to what hangs on it: R = R_fit ·
+    exp(correction).
+    """
+
+    def __init__(self, body: Body, motion: Motion, device: torch.device = CPU) -> None:
+        self.body, self.motion = body, motion
+        joints = [body.joint(name) for name in MAIN_JOINTS if name in body.joint_names]
+        self.joints = torch.tensor(joints, device=device)
+        frames = len(motion.frame_index)
+        self.rotation_rad = torch.zeros(frames, len(joints), 3, device=device, requires_grad=True)
+        self.shift_m = torch.zeros(frames, 3, device=device, requires_grad=True)
+        self._joints_m = torch.as_tensor(body.joints_m).to(device)
+        self._rotations = quaternion_to_matrix(torch.as_tensor(motion.rotations_wxyz)).to(device)
+        self._root_m = torch.as_tensor(motion.root_translation_m).to(device)
+        of_joint = torch.full((len(body.joint_names),), -1)
+        of_joint[self.joints.cpu()] = torch.arange(len(joints))
+        self._skeleton = Skeleton(torch.as_tensor(body.joints_m), torch.as_tensor(body.parents).long(), of_joint)
+        gaps_s = np.diff(motion.time_s.astype(np.float64)) if frames > 1 else np.zeros(0)
+        gaps = np.maximum(gaps_s / max(np.median(gaps_s), 1e-9), 1e-3) if len(gaps_s) else gaps_s
+        self._gap = torch.tensor(gaps, dtype=torch.float32, device=device)
+
+    def canonical_to_world(self, rows: Tensor) -> Float[Tensor, "k j 4 4"]:
+        """Skinning matrices of some frames, differentiable in the corrections."""
+        rotations = self._rotations[rows]
+        turned = rotations[:, self.joints] @ axis_angle_to_matrix(self.rotation_rad[rows])
+        posed = forward_kinematics(
+            rotations.index_copy(1, self.joints, turned),
+            self._root_m[rows] + self.shift_m[rows],
+            self._joints_m,
+            self.body.parents,
+        )
+        return skinning_transforms(posed, self._joints_m)
+
+    def canonical_to_posed(
+        self, rows: Int[Tensor, "k"], posed_from_world: Float[Tensor, "k 4 4"]
+    ) -> Float[Tensor, "k j 4 4"]:
+        """`canonical_to_world`, carried on by a rigid map of each frame."""
+        if not runs_on_numba(self.rotation_rad):
+            return posed_from_world[:, None] @ self.canonical_to_world(rows)
+        fitted = FittedPoses(self._rotations[rows], self._root_m[rows], posed_from_world.contiguous())
+        return skinning_matrices(self.rotation_rad[rows], self.shift_m[rows], self._skeleton, fitted)
+
+    def roughness(self) -> Tensor:
+        """Mean squared change of the corrections from frame to frame (rad² and, in decimetres, m²)."""
+        if len(self.shift_m) < 2:
+            return self.shift_m.new_zeros(())
+        turn = self.rotation_rad.diff(dim=0).square().sum((1, 2)) / self._gap
+        shift = (10 * self.shift_m.diff(dim=0)).square().sum(1) / self._gap
+        return (turn + shift).mean()
+
+    def size(self) -> Tensor:
+        """Mean squared correction."""
+        return self.rotation_rad.square().sum((1, 2)).mean() + (10 * self.shift_m).square().sum(1).mean()
+
+    def corrected(self, motion: Motion) -> Motion:
+        """Another motion (any frames) with the corrections interpolated to its times, held at the ends."""
+        known, wanted = self.motion.time_s.astype(np.float64), motion.time_s.astype(np.float64)
+        rotation = _interpolate(wanted, known, self.rotation_rad.detach().cpu().numpy().reshape(len(known), -1))
+        shift = _interpolate(wanted, known, self.shift_m.detach().cpu().numpy())
+        quaternions = torch.as_tensor(motion.rotations_wxyz).clone()
+        turn = axis_angle_to_quaternion(torch.from_numpy(rotation.reshape(len(wanted), -1, 3)))
+        joints = self.joints.cpu()
+        quaternions[:, joints] = quaternion_multiply(quaternions[:, joints], turn)
+        return motion.with_pose(quaternions.numpy(), motion.root_translation_m + shift)
+
+
+def _interpolate(wanted: np.ndarray, known: np.ndarray, values: np.ndarray) -> np.ndarray:
+    columns = [np.interp(wanted, known, values[:, column]) for column in range(values.shape[1])]
+    return np.stack(columns, axis=-1).astype(np.float32)

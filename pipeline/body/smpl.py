@@ -1,0 +1,208 @@
+"""SMPL, SMPL-H and SMPL-X behind the interface of the parametric body, from arrays that the user brings.
+
+Loper et al., "SMPL: a skinned multi-person linear model", 2015; Romero et al., "Embodied hands" (SMPL-H), 2017;
+Pavlakos et al., "Expressive body capture" (SMPL-X), 2019. Of a model its shape (betas), joint regressor and skin
+weights are used. Pose blend shapes are left out: an avatar is moved by plain linear blend skinning, as everywhere here.
+
+SMPL rests in a T-pose. The bind pose of this house is an A-pose, so upper arms and forearms are turned until they point
+where the built-in body's do (a bent elbow also tells about which axis it bends), and straight fingers are bent a
+little, in the direction in which a fist closes. That pose is the same for all shapes.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pipeline.body.body import Body, freeze
+from pipeline.geometry.rotation import axis_angle_to_matrix
+from pipeline.geometry.skinning import forward_kinematics, linear_blend_skinning, skinning_transforms
+
+_LIMBS = (
+    *("Hips", "LeftUpLeg", "RightUpLeg", "Spine", "LeftLeg", "RightLeg", "Spine1", "LeftFoot", "RightFoot", "Spine2"),
+    *("LeftToeBase", "RightToeBase", "Neck", "LeftShoulder", "RightShoulder", "Head", "LeftArm", "RightArm"),
+    *("LeftForeArm", "RightForeArm", "LeftHand", "RightHand"),
+)
+_FINGERS = tuple(
+    f"{side}Hand{finger}{joint}"
+    for side in ("Left", "Right")
+    for finger in ("Index", "Middle", "Pinky", "Ring", "Thumb")
+    for joint in (1, 2, 3)
+)
+JOINT_NAMES = {
+    24: (*_LIMBS, "LeftHandMiddle1", "RightHandMiddle1"),
+    52: (*_LIMBS, *_FINGERS),
+    55: (*_LIMBS, "Jaw", "LeftEye", "RightEye", *_FINGERS),
+}
+"""Mixamo's names for the joints of SMPL, SMPL-H and SMPL-X, by how many there are, in the models' order."""
+
+ARM_DIRECTIONS = {"Arm": (0.662, -0.749, 0.024), "ForeArm": (0.515, -0.519, 0.682)}
+"""Where the built-in body's left upper arm and forearm point in the A-pose (unit vectors); mirrored for the right."""
+
+FINGER_BEND_RAD = 0.2
+
+HEAD_PLACES = {
+    "nose": (0.0, 0.468, 0.928),
+    "eye_inner": (0.198, 0.61, 0.822),
+    "eye": (0.297, 0.61, 0.809),
+    "eye_outer": (0.419, 0.61, 0.778),
+    "ear": (0.639, 0.532, 0.556),
+    "mouth": (0.198, 0.319, 0.884),
+}
+"""Landmarks of the face in the box of the head's vertices, as on the built-in body: share of the half width to the
+left, of the height from below, of the depth from behind. They hold for any numbering of the vertices."""
+
+JOINT_PLACES = {
+    "shoulder": (("LeftArm", (-0.012, 0.025, 0.002)),),
+    "elbow": (("LeftForeArm", (-0.012, 0.015, 0.012)),),
+    "wrist": (("LeftHand", (0.0, -0.006, 0.013)),),
+    "pinky": (("LeftHandPinky1", (-0.015, 0.012, 0.01)), ("LeftHand", (0.043, -0.065, 0.056))),
+    "index": (("LeftHandIndex1", (0.0, -0.013, -0.02)), ("LeftHand", (0.03, -0.059, 0.086))),
+    "thumb": (("LeftHandThumb2", (0.03, -0.02, 0.0)), ("LeftHand", (0.007, -0.039, 0.073))),
+    "hip": (("LeftUpLeg", (-0.013, -0.024, 0.028)),),
+    "knee": (("LeftLeg", (0.004, -0.002, -0.002)),),
+    "ankle": (("LeftFoot", (0.001, 0.029, 0.006)),),
+    "heel": (("LeftFoot", (0.0, -0.036, -0.038)),),
+    "foot_index": (("LeftToeBase", (-0.001, 0.006, 0.036)),),
+    "hand_wrist": (("LeftHand", (0.006, -0.006, 0.009)),),
+    "hand_thumb": (("LeftHandThumb2", (-0.002, -0.001, 0.008)), ("LeftHand", (-0.024, -0.02, 0.081))),
+    "hand_index": (("LeftHandIndex1", (-0.004, 0.002, -0.009)), ("LeftHand", (0.027, -0.044, 0.097))),
+    "hand_pinky": (("LeftHandPinky1", (-0.008, 0.004, -0.003)), ("LeftHand", (0.05, -0.072, 0.043))),
+}
+"""The other landmarks: shift (m) from a joint, as on the built-in body; the first joint that the model has counts."""
+
+HIP_HALF_WIDTH_M = 0.100
+"""The detector's hips lie this far from the middle, wherever inside the pelvis a model has its hip joints."""
+
+
+@dataclass(frozen=True)
+class SmplArrays:
+    """What is used of a model file: T-pose, +Y up, facing +Z, metres. b shape directions, one per beta."""
+
+    template_m: Float[np.ndarray, "v 3"]
+    shape_directions_m: Float[np.ndarray, "v 3 b"]
+    joint_regressor: Float[np.ndarray, "j v"]
+    parents: Int[np.ndarray, "j"]
+    skin_weights: Float[np.ndarray, "v j"]
+    faces: Int[np.ndarray, "f 3"]
+
+
+class SmplBody:
+    """An SMPL-like model as a `ParametricBody`; its shape numbers are the betas, unit Gaussian about 0.
+
+    Raises ValueError when it has neither 24, 52 nor 55 joints, or a parent does not come before its child.
+    """
+
+    def __init__(self, arrays: SmplArrays) -> None:
+        count = len(arrays.parents)
+        if count not in JOINT_NAMES:
+            raise ValueError(f"a model with {count} joints is none of SMPL (24), SMPL-H (52), SMPL-X (55)")
+        self.joint_names: tuple[str, ...] = JOINT_NAMES[count]
+        self.shape_names: tuple[str, ...] = tuple(f"beta_{i}" for i in range(arrays.shape_directions_m.shape[2]))
+        self.shape_defaults: Float[Tensor, "p"] = torch.zeros(len(self.shape_names))
+        self.parents: Int[np.ndarray, "j"] = arrays.parents.astype(np.int32)
+        self.faces: Int[np.ndarray, "f 3"] = arrays.faces.astype(np.int32)
+        weights = arrays.skin_weights / arrays.skin_weights.sum(axis=1, keepdims=True)
+        self.skin_weights: Float[np.ndarray, "v j"] = weights.astype(np.float32)
+        self._template, self._directions = _float(arrays.template_m), _float(arrays.shape_directions_m)
+        self._joints = _float(arrays.joint_regressor @ arrays.template_m)
+        self._joint_directions = _float(np.einsum("jv,vcb->jcb", arrays.joint_regressor, arrays.shape_directions_m))
+        self._to_a_pose = a_pose_rotations(self.joint_names, self.parents, self._joints)
+        self.landmark_places_m: Mapping[str, tuple[float, float, float]] = self._landmark_places()
+
+    def rest(self, shape: Float[Tensor, "p"]) -> tuple[Float[Tensor, "v 3"], Float[Tensor, "j 3"]]:
+        """A-pose vertices and joints of some betas, canonical frame, differentiable."""
+        t_pose, t_joints = self._template + self._directions @ shape, self._joints + self._joint_directions @ shape
+        joint_to_world = forward_kinematics(self._to_a_pose[None], t_joints[None, 0], t_joints, self.parents)
+        transforms = skinning_transforms(joint_to_world, t_joints)
+        vertices = linear_blend_skinning(t_pose, torch.from_numpy(self.skin_weights), transforms)[0]
+        joints_m = joint_to_world[0, :, :3, 3]
+        origin = torch.stack([joints_m[0, 0], vertices[:, 1].min(), joints_m[0, 2]])
+        return vertices - origin, joints_m - origin
+
+    def body(self, shape: Float[Tensor, "p"]) -> Body:
+        """Freeze some betas into one person's body."""
+        return freeze(self, shape)
+
+    def local_rotations(self, smpl_rotations: Float[Tensor, "n j 3 3"]) -> Float[Tensor, "n j 3 3"]:
+        """SMPL's local rotations (identity: T-pose) as this house's (identity: A-pose with joints along the axes).
+
+        With Q_j the world rotation of joint j in the A-pose: R_j = Q_parent · theta_j · Q_j^T.
+        """
+        still = torch.zeros(1, 3)
+        bind = forward_kinematics(self._to_a_pose[None], still, self._joints, self.parents)[0, :, :3, :3]
+        above = torch.cat([torch.eye(3)[None], bind[self.parents[1:].tolist()]])
+        return above @ smpl_rotations @ bind.transpose(-1, -2)
+
+    def takes_smpl_poses(self, betas: int) -> bool:
+        """Whether this many betas, and poses, that were fitted with SMPL hold here: SMPL-X has other shapes."""
+        return "Jaw" not in self.joint_names and len(self.shape_names) == betas
+
+    def placed(
+        self,
+        axis_angle: Float[Tensor, "n 24 3"],
+        transl_m: Float[Tensor, "n 3"],
+        betas: Float[Tensor, "n b"],
+        smpl_to_world: Float[Tensor, "n 4 4"],
+    ) -> tuple[Float[Tensor, "n k 3 3"], Float[Tensor, "n 3"]]:
+        """SMPL's poses as this house's: local rotations of the first k joints, and where the root joint is (m).
+
+        SMPL turns about the pelvis where the regressor finds it, then adds `transl_m`. k is 24, or the 22 joints
+        that the other models share with SMPL.
+        """
+        known = len(axis_angle[0]) if len(self.joint_names) == len(axis_angle[0]) else len(_LIMBS)
+        local = torch.eye(3).repeat(len(axis_angle), len(self.joint_names), 1, 1)
+        local[:, :known] = axis_angle_to_matrix(axis_angle[:, :known])
+        rotations = self.local_rotations(local)[:, :known]
+        rotations[:, 0] = smpl_to_world[:, :3, :3] @ rotations[:, 0]
+        pelvis_m = self._joints[0] + betas @ self._joint_directions[0].T + transl_m
+        return rotations, (smpl_to_world[:, :3, :3] @ pelvis_m[..., None]).squeeze(-1) + smpl_to_world[:, :3, 3]
+
+    def _landmark_places(self) -> dict[str, tuple[float, float, float]]:
+        """Where the left and central landmarks lie on the body of the default shape, metres."""
+        vertices, joints_m = (rest.double().numpy() for rest in self.rest(self.shape_defaults))
+        head = vertices[self.skin_weights[:, self.joint_names.index("Head")] > 0.5]
+        low, size = head.min(axis=0), np.ptp(head, axis=0)
+        places = {
+            name: (0.5 * size[0] * across, low[1] + size[1] * up, low[2] + size[2] * forth)
+            for name, (across, up, forth) in HEAD_PLACES.items()
+        }
+        for name, choices in JOINT_PLACES.items():
+            joint, shift = next(choice for choice in choices if choice[0] in self.joint_names)
+            x, y, z = joints_m[self.joint_names.index(joint)] + shift
+            places[name] = (HIP_HALF_WIDTH_M if name == "hip" else x, y, z)
+        return {name: (float(x), float(y), float(z)) for name, (x, y, z) in places.items()}
+
+
+def a_pose_rotations(
+    joint_names: Sequence[str], parents: Int[np.ndarray, "j"], t_joints_m: Float[Tensor, "j 3"]
+) -> Float[Tensor, "j 3 3"]:
+    """Local rotations that take SMPL's T-pose to the A-pose (module docstring)."""
+    local = torch.eye(3).repeat(len(joint_names), 1, 1)
+    for side, sign in (("Left", 1.0), ("Right", -1.0)):
+        mirror, above = torch.tensor([sign, 1.0, 1.0]), torch.eye(3)
+        for name, child in (("Arm", "ForeArm"), ("ForeArm", "Hand")):
+            joint, end = joint_names.index(side + name), joint_names.index(side + child)
+            bone = above @ (t_joints_m[end] - t_joints_m[joint])
+            turned = rotation_between(bone, torch.tensor(ARM_DIRECTIONS[name]) * mirror) @ above
+            local[joint] = above.T @ turned
+            above = turned
+        for joint, name in enumerate(joint_names):
+            if name in _FINGERS and name.startswith(side) and "Thumb" not in name:
+                local[joint] = axis_angle_to_matrix(torch.tensor([0.0, 0.0, -sign * FINGER_BEND_RAD]))
+    return local
+
+
+def rotation_between(start: Float[Tensor, "3"], end: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    """The smallest rotation that turns one direction into another; they must not be opposite."""
+    start, end = (torch.nn.functional.normalize(vector, dim=0) for vector in (start, end))
+    axis = torch.linalg.cross(start, end)
+    sine = axis.norm()
+    return axis_angle_to_matrix(axis / sine.clamp(min=1e-9) * torch.atan2(sine, start @ end))
+
+
+def _float(array: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))

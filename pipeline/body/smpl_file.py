@@ -1,0 +1,116 @@
+"""SMPL, SMPL-H and SMPL-X model files as their owners download them: `.npz`, or `.pkl` read without running anything.
+
+    v_template     (v, 3) T-pose, metres
+    shapedirs      (v, 3, b) what one beta adds to it; the first ten are used
+    J_regressor    (j, v) joints from vertices; dense, or a scipy sparse matrix in a pickle
+    kintree_table  (2, j) parents in the first row
+    weights        (v, j) skin weights
+    f              (t, 3) triangles
+
+In the pickles some arrays are chumpy objects. Those, and scipy's matrices, come back as inert records, of which only
+arrays are taken.
+"""
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.sparse import csc_matrix, csr_matrix
+
+from pipeline.body.smpl import SmplArrays, SmplBody
+from pipeline.core.errors import UserError
+from pipeline.io.safe_pickle import Record, load_pickle
+
+N_BETAS = 10
+"""Shape directions that are used: what all releases have, and what most fits of others give."""
+
+KEYS = ("v_template", "shapedirs", "J_regressor", "kintree_table", "weights", "f")
+_SPARSE = {"csc_matrix": csc_matrix, "csr_matrix": csr_matrix}
+_RECORDS = (
+    "chumpy.ch.Ch",
+    "chumpy.reordering.Select",
+    *(f"scipy.sparse.{module}{name[:3]}.{name}" for module in ("", "_") for name in _SPARSE),
+)
+
+
+def load_smpl(path: Path) -> SmplBody:
+    """The body model in a file.
+
+    Raises:
+        UserError: it is missing, cannot be read, or is no SMPL, SMPL-H or SMPL-X model.
+    """
+    values = _read(path)
+    missing = [key for key in KEYS if key not in values]
+    if missing:
+        raise UserError(f"{path} has no `{missing[0]}`; give an SMPL, SMPL-H or SMPL-X model as .npz or .pkl")
+    try:
+        arrays = _checked({key: plain_array(values[key]) for key in KEYS})
+        return SmplBody(arrays)
+    except (ValueError, TypeError, KeyError) as error:
+        raise UserError(f"{path} is no SMPL, SMPL-H or SMPL-X model ({error}); download it again") from error
+
+
+def plain_array(value: object) -> np.ndarray:
+    """An array out of an array or the record of one: a chumpy variable, its selection, or a sparse matrix.
+
+    Raises ValueError for anything else.
+    """
+    if isinstance(value, np.ndarray) and value.dtype != object:
+        return value
+    if not isinstance(value, Record) or not isinstance(value.state, dict):
+        raise ValueError(f"a {type(value).__name__} in place of an array")
+    kind, state = type(value).__name__, value.state
+    if kind == "Ch":
+        return plain_array(state["x"])
+    if kind == "Select":  # chumpy: some elements of another array, counted along its rows
+        return plain_array(state["a"]).ravel()[plain_array(state["idxs"])].reshape(state["preferred_shape"])
+    return _dense(kind, state)
+
+
+def _dense(kind: str, state: dict[str, Any]) -> Float[np.ndarray, "r c"]:
+    parts = tuple(plain_array(state[name]) for name in ("data", "indices", "indptr"))
+    matrix = _SPARSE[kind](parts, shape=tuple(int(size) for size in state["_shape"]))
+    matrix.check_format(full_check=True)
+    return matrix.toarray()
+
+
+def _read(path: Path) -> dict[str, Any]:
+    if path.suffix == ".pkl":
+        values = load_pickle(path, _RECORDS)
+        if not isinstance(values, dict):
+            raise UserError(f"{path} holds a {type(values).__name__}, no model; give an SMPL model as .npz or .pkl")
+        return values
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {key: archive[key] for key in KEYS if key in archive.files}
+    except (OSError, ValueError, AttributeError, zipfile.BadZipFile) as error:
+        raise UserError(f"{path} cannot be read as .npz or .pkl ({error}); give an SMPL model file") from error
+
+
+def _checked(arrays: dict[str, np.ndarray]) -> SmplArrays:
+    """The arrays with shapes that fit each other; ValueError when they do not."""
+    regressor, template = arrays["J_regressor"], arrays["v_template"]
+    joints, vertices = regressor.shape
+    for name, shape in (("v_template", (vertices, 3)), ("weights", (vertices, joints)), ("kintree_table", (2, joints))):
+        if arrays[name].shape != shape:
+            raise ValueError(f"`{name}` has shape {arrays[name].shape}, needed {shape}")
+    directions = arrays["shapedirs"]
+    if directions.ndim != 3 or directions.shape[:2] != (vertices, 3):
+        raise ValueError(f"`shapedirs` has shape {directions.shape}, needed ({vertices}, 3, betas)")
+    faces = arrays["f"].astype(np.int64)
+    if faces.ndim != 2 or faces.shape[1] != 3 or faces.min() < 0 or faces.max() >= vertices:
+        raise ValueError(f"`f` of shape {faces.shape} are no triangles of {vertices} vertices")
+    parents = arrays["kintree_table"][0].astype(np.int64)
+    parents[0] = -1  # the files have 2^32 - 1
+    if ((parents[1:] < 0) | (parents[1:] >= np.arange(1, joints))).any():
+        raise ValueError("`kintree_table` has a joint before its parent")
+    return SmplArrays(
+        template_m=template.astype(np.float64),
+        shape_directions_m=directions[:, :, :N_BETAS].astype(np.float64),
+        joint_regressor=regressor.astype(np.float64),
+        parents=parents.astype(np.int32),
+        skin_weights=arrays["weights"].astype(np.float64),
+        faces=faces.astype(np.int32),
+    )

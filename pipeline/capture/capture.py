@@ -1,0 +1,156 @@
+"""The artifact of the `frames` stage, and the one reader of it that all later stages use."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from pipeline.capture.hand_detector import Hands
+from pipeline.capture.smpl_poses import SMPL_POSES_NPZ, SmplPoses, load_smpl_poses, save_smpl_poses
+from pipeline.geometry.camera import UPRIGHT_WORLD_TO_CAMERA, Camera
+from pipeline.io.image import read_gray, read_rgb, to_float
+from pipeline.io.npz import load_npz, save_npz
+
+FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, CONTACT_SHEET = "frames.npz", "images", "masks", "contact.jpg"
+_INTRINSICS = ("camera_fx", "camera_fy", "camera_cx", "camera_cy")
+
+
+@dataclass(frozen=True)
+class Capture:
+    """The chosen frames of a recording: n frames, all of one size.
+
+    frame_index: index in the whole recording; time_s: since its first frame.
+    split: 0 train, 1 validation, 2 held out (`pipeline.capture.frame_selection.split_of`, or supplied with the video).
+    landmarks_px: MediaPipe's 33 points, pixel centres at +0.5; nan where unknown. Visibility in [0, 1].
+    landmarks_world_m: metres about the hips' centre in camera axes; nan where unknown.
+    camera: what was supplied with the video, for these images; None when unknown.
+    recorded_focal_px: focal length in these images by the recording's own metadata; None when they say nothing.
+    hands: both hands in every frame; None where they were not looked for.
+    scale: size of these images relative to the recording's. Images are undistorted.
+    smpl_poses: what others fitted to some of these frames; None when nothing was supplied.
+    """
+
+    folder: Path
+    frame_index: Int[np.ndarray, "n"]
+    time_s: Float[np.ndarray, "n"]
+    split: UInt8[np.ndarray, "n"]
+    fps: float
+    width: int
+    height: int
+    landmarks_px: Float[np.ndarray, "n 33 2"]
+    landmarks_visibility: Float[np.ndarray, "n 33"]
+    landmarks_world_m: Float[np.ndarray, "n 33 3"]
+    camera: Camera | None
+    mask_source: str
+    n_video_frames: int
+    scale: float
+    recorded_focal_px: float | None = None
+    hands: Hands | None = None
+    smpl_poses: SmplPoses | None = None
+
+    def __len__(self) -> int:
+        return len(self.frame_index)
+
+    def positions(self, split: int | np.integer) -> Int[np.ndarray, "k"]:
+        """Positions (0..n-1) of the frames of one split."""
+        return np.flatnonzero(self.split == split)
+
+    def image(self, position: int | np.integer) -> Float[np.ndarray, "h w 3"]:
+        """Colours of the frame at this position (not its index in the recording), sRGB in [0, 1]."""
+        return to_float(read_rgb(image_path(self.folder, self.frame_index[position])))
+
+    def mask(self, position: int | np.integer) -> Float[np.ndarray, "h w"]:
+        """Alpha of the person in [0, 1], soft along the outline."""
+        return to_float(read_gray(mask_path(self.folder, self.frame_index[position])))
+
+
+def image_path(folder: Path, frame_index: int | np.integer) -> Path:
+    """Where the picture with this index in the recording lies."""
+    return folder / IMAGES_FOLDER / f"{frame_index:06d}.png"
+
+
+def mask_path(folder: Path, frame_index: int | np.integer) -> Path:
+    """Where its mask lies."""
+    return folder / MASKS_FOLDER / f"{frame_index:06d}.png"
+
+
+def save_capture(capture: Capture) -> None:
+    """Write `frames.npz`, and `smpl_poses.npz` where there are poses, into the capture's folder.
+
+    Images and masks are written beside it as they are made.
+    """
+    camera = capture.camera
+    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy) if camera else (np.nan,) * 4
+    arrays: dict[str, np.ndarray] = {
+        "frame_index": capture.frame_index.astype(np.int32),
+        "time_s": capture.time_s.astype(np.float64),
+        "split": capture.split,
+        "fps": np.array(capture.fps),
+        "width": np.array(capture.width, dtype=np.int32),
+        "height": np.array(capture.height, dtype=np.int32),
+        "landmarks_px": capture.landmarks_px.astype(np.float32),
+        "landmarks_visibility": capture.landmarks_visibility.astype(np.float32),
+        "landmarks_world_m": capture.landmarks_world_m.astype(np.float32),
+        "camera_world_to_camera": camera.world_to_camera if camera else UPRIGHT_WORLD_TO_CAMERA,
+        "mask_source": np.array(capture.mask_source),
+        "n_video_frames": np.array(capture.n_video_frames, dtype=np.int32),
+        "scale": np.array(capture.scale),
+        "recorded_focal_px": np.array(np.nan if capture.recorded_focal_px is None else capture.recorded_focal_px),
+    }
+    for name, value in zip(_INTRINSICS, intrinsics, strict=True):
+        arrays[name] = np.array(value)
+    if capture.hands is not None:
+        arrays |= {f"hands_{name}": value for name, value in vars(capture.hands).items()}
+    save_npz(capture.folder / FRAMES_NPZ, arrays)
+    if capture.smpl_poses is not None:
+        save_smpl_poses(capture.folder / SMPL_POSES_NPZ, capture.smpl_poses)
+
+
+def load_capture(frames_dir: Path) -> Capture:
+    """Read what the `frames` stage made; images and masks are read when they are asked for.
+
+    Raises UserError when the folder holds no readable `frames.npz`.
+    """
+    arrays = load_npz(frames_dir / FRAMES_NPZ)
+    poses_path = frames_dir / SMPL_POSES_NPZ
+    return Capture(
+        folder=frames_dir,
+        frame_index=arrays["frame_index"],
+        time_s=arrays["time_s"],
+        split=arrays["split"],
+        fps=float(arrays["fps"].item()),
+        width=int(arrays["width"].item()),
+        height=int(arrays["height"].item()),
+        landmarks_px=arrays["landmarks_px"],
+        landmarks_visibility=arrays["landmarks_visibility"],
+        landmarks_world_m=arrays["landmarks_world_m"],
+        camera=_camera(arrays),
+        mask_source=str(arrays["mask_source"].item()),
+        n_video_frames=int(arrays["n_video_frames"].item()),
+        scale=float(arrays["scale"].item()),
+        recorded_focal_px=_recorded_focal_px(arrays),
+        hands=_hands(arrays),
+        smpl_poses=load_smpl_poses(poses_path) if poses_path.is_file() else None,
+    )
+
+
+def _recorded_focal_px(arrays: Mapping[str, np.ndarray]) -> float | None:
+    found = float(np.ravel(arrays.get("recorded_focal_px", np.nan))[0])
+    return found if np.isfinite(found) else None
+
+
+def _hands(arrays: Mapping[str, np.ndarray]) -> Hands | None:
+    names = [field.name for field in fields(Hands)]
+    if any(f"hands_{name}" not in arrays for name in names):
+        return None
+    return Hands(*(arrays[f"hands_{name}"] for name in names))
+
+
+def _camera(arrays: Mapping[str, np.ndarray]) -> Camera | None:
+    fx, fy, cx, cy = (float(arrays[name].item()) for name in _INTRINSICS)
+    if not np.isfinite([fx, fy, cx, cy]).all():
+        return None
+    width, height = int(arrays["width"].item()), int(arrays["height"].item())
+    return Camera(fx, fy, cx, cy, width, height, arrays["camera_world_to_camera"])

@@ -1,0 +1,144 @@
+"""Looking at hands: MediaPipe's 21 points of each hand, in the square that the pose's wrist and knuckles ask for.
+
+Zhang et al., "MediaPipe Hands: On-device real-time hand tracking", 2020; the points' order is that of its figure 2. The
+models ship inside the package. A hand that the pose calls hidden, or that is too small, is not looked at.
+"""
+
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from pipeline.capture.person_detector import quiet_stderr
+
+HAND_POINTS = 21
+WRISTS, PINKIES, INDICES = (15, 16), (17, 18), (19, 20)
+"""Of the pose's landmarks, (left, right)."""
+
+LEAST_HAND_PX = 24.0
+HAND_M = 0.18
+"""Hands of this length are looked at when they have at least so many pixels, seen from the side."""
+
+LEAST_VISIBILITY = 0.3
+"""Of the wrist. Below, the hand is behind the body and the model finds the other one."""
+
+_GRAPH = """
+input_stream: "image"
+input_stream: "wrist_and_knuckles"
+input_side_packet: "model_complexity"
+output_stream: "landmarks"
+output_stream: "world_landmarks"
+output_stream: "handedness"
+node { calculator: "ImagePropertiesCalculator" input_stream: "IMAGE_CPU:image" output_stream: "SIZE:image_size" }
+node {
+  calculator: "HandLandmarksFromPoseToRecropRoi"
+  input_stream: "HAND_LANDMARKS_FROM_POSE:wrist_and_knuckles"
+  input_stream: "IMAGE_SIZE:image_size"
+  output_stream: "ROI:guessed_square"
+}
+node {
+  calculator: "HandRecropByRoiCpu"
+  input_stream: "IMAGE:image"
+  input_stream: "ROI:guessed_square"
+  output_stream: "HAND_ROI_FROM_RECROP:square"
+}
+node {
+  calculator: "HandLandmarkCpu"
+  input_side_packet: "MODEL_COMPLEXITY:model_complexity"
+  input_stream: "IMAGE:image"
+  input_stream: "ROI:square"
+  output_stream: "LANDMARKS:landmarks"
+  output_stream: "WORLD_LANDMARKS:world_landmarks"
+  output_stream: "HANDEDNESS:handedness"
+}
+"""
+# The model speaks of mirrored pictures, as a phone shows them to the person before it.
+_MIRRORED_SIDES = ("Right", "Left")
+
+
+@dataclass(frozen=True)
+class Hands:
+    """Both hands (left, right), in any number of images; nan where none was found.
+
+    landmarks_px: pixel centres at +0.5. landmarks_m: metres about the hand's middle, camera axes (x right, y down, z
+    away). own_side: how sure it is, 0 to 1, that the hand is that of this side; 0 where none was found.
+    """
+
+    landmarks_px: Float[np.ndarray, "*n 2 21 2"]
+    landmarks_m: Float[np.ndarray, "*n 2 21 3"]
+    own_side: Float[np.ndarray, "*n 2"]
+
+    def rows(self, rows: Sequence[int]) -> "Hands":
+        """The hands in some of the images."""
+        return Hands(*(values[rows] for values in vars(self).values()))
+
+
+def no_hands(*images: int) -> Hands:
+    """Nothing found in so many images (no number: in one)."""
+    points = (*images, 2, HAND_POINTS)
+    nowhere_px, nowhere_m = (np.full((*points, size), np.nan, dtype=np.float32) for size in (2, 3))
+    return Hands(nowhere_px, nowhere_m, np.zeros((*images, 2), dtype=np.float32))
+
+
+def stack_hands(images: Sequence[Hands]) -> Hands:
+    """Hands that were found in one image each, as one; at least one image."""
+    return Hands(*(np.stack(values) for values in zip(*(vars(hands).values() for hands in images), strict=True)))
+
+
+class HandDetector:
+    """MediaPipe's hand model in its larger size; about 12 ms a hand on one core, whatever the image's size."""
+
+    def __init__(self) -> None:
+        with quiet_stderr():
+            from mediapipe.framework.formats.landmark_pb2 import NormalizedLandmarkList
+            from mediapipe.python.solutions.pose import SolutionBase  # here: takes seconds and writes to stderr
+
+            self._points = NormalizedLandmarkList
+            self._graph = SolutionBase(graph_config=_GRAPH, side_inputs={"model_complexity": 1})
+        self._has_spoken = False
+
+    def look(
+        self,
+        rgb: UInt8[np.ndarray, "h w 3"],
+        pose_px: Float[np.ndarray, "33 2"],
+        visibility: Float[np.ndarray, "33"],
+        pose_world_m: Float[np.ndarray, "33 3"],
+    ) -> Hands:
+        """The hands of the person whose pose is given (as in `person.Detection`)."""
+        hands = no_hands()
+        if HAND_M * pixels_per_metre(pose_px, pose_world_m) < LEAST_HAND_PX:
+            return hands
+        size_px = np.array(rgb.shape[1::-1])
+        for side, mirrored in enumerate(_MIRRORED_SIDES):
+            if visibility[WRISTS[side]] < LEAST_VISIBILITY:
+                continue
+            rows = [group[side] for group in (WRISTS, PINKIES, INDICES)]
+            with nullcontext() if self._has_spoken else quiet_stderr():
+                found = self._process(rgb, pose_px[rows] / size_px, visibility[rows])
+            self._has_spoken = True
+            if found.landmarks is None:
+                continue
+            hands.landmarks_px[side] = size_px * [(p.x, p.y) for p in found.landmarks.landmark]
+            hands.landmarks_m[side] = [(p.x, p.y, p.z) for p in found.world_landmarks.landmark]
+            likely = found.handedness.classification[0]
+            hands.own_side[side] = likely.score if likely.label == mirrored else 1.0 - likely.score
+        return hands
+
+    def _process(self, rgb: UInt8[np.ndarray, "h w 3"], places: np.ndarray, visibility: np.ndarray) -> Any:
+        points = self._points()
+        for (x, y), seen in zip(places.tolist(), visibility.tolist(), strict=True):
+            points.landmark.add(x=x, y=y, visibility=seen)
+        return self._graph.process({"image": rgb, "wrist_and_knuckles": points})
+
+
+def pixels_per_metre(
+    points_px: Float[np.ndarray, "*n p 2"], points_m: Float[np.ndarray, "*n p 3"]
+) -> Float[np.ndarray, "*n"]:
+    """Scale of the image at a person or a hand: spread of its points in pixels over that in metres."""
+    squared_px, squared_m = (
+        np.square(points - points.mean(-2, keepdims=True)).sum((-2, -1)) for points in (points_px, points_m[..., :2])
+    )
+    return np.asarray(np.sqrt(squared_px / np.maximum(squared_m, 1e-12)))

@@ -1,0 +1,303 @@
+"""What lies beside a video and wins: masks, landmarks, a camera over the detector, a split over index modulo eight.
+
+    masks/        one image a frame, named as the images are or else in natural order; 0 to 255, or 0 and 1
+    masks.npz     array `masks` (n, h, w);  masks.hdf5: the same, as PeopleSnapshot ships it
+    (none)        the images' own alpha channel, where the first image is partly transparent
+    landmarks.npz MediaPipe's 33 points in its order: `landmarks_px` (n, 33, 2) in pixels of the original frames, nan
+                  where unknown, optionally `landmarks_visibility` (n, 33), 0 to 1, and `landmarks_world_m` (n, 33, 3),
+                  metres about the hips' centre in camera axes, which else the detector gives
+    camera.json   fx, fy, cx, cy in pixels of the original frames, optionally `width` and `height` of the pictures that
+                  they are for, `distortion` (OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]]) and `world_to_camera` (4 x 4,
+                  row-major, a rotation and a shift in metres; the world is +Y up)
+    split.json    lists of frame indices `train` and `heldout`, optionally `validation` (else every eighth training
+                  frame, from the fifth on); the frames that stand in none are left out
+    smpl_poses.npz  poses that others fitted, of any frames (`pipeline.capture.smpl_poses`); they need their camera
+
+Row i of each array belongs to frame i of the recording, and there are as many rows as frames. The original frames are
+those that a viewer shows: turned upright as the container or EXIF asks, with square pixels, lens distortion still in.
+"""
+
+import json
+import operator
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from pipeline.capture.frame_selection import HELDOUT, SPLIT_PERIOD, TRAIN, VALIDATION, VALIDATION_PHASE
+from pipeline.capture.smpl_poses import SMPL_POSES_NPZ, SmplPoses, is_rigid, load_smpl_poses
+from pipeline.capture.video import Source, natural_key, picture_size_px
+from pipeline.core.errors import UserError
+from pipeline.geometry.camera import UPRIGHT_WORLD_TO_CAMERA, Camera
+from pipeline.io.image import IMAGE_SUFFIXES, read_alpha, read_gray
+from pipeline.io.npz import load_npz
+
+N_LANDMARKS = 33
+# How far from the middle a principal point may lie, as a share of the picture's side, when nothing says what size of
+# picture it is for. That of a calibration for pictures of half the size lies at a quarter.
+_MOST_OFF_CENTRE = 0.2
+# So many masks tell whether a folder holds levels or zeros and ones.
+_MASKS_TRIED = 8
+_SPLITS = {"train": TRAIN, "validation": VALIDATION, "heldout": HELDOUT}
+
+
+@dataclass(frozen=True)
+class SuppliedCamera:
+    """Intrinsics in pixels of the original frames; `world_to_camera` is None where the file does not give it."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+    world_to_camera: Float[np.ndarray, "4 4"] | None = None
+
+    def at(self, scale: float, width: int, height: int) -> Camera:
+        """The camera of undistorted images of this scale and size."""
+        pose = UPRIGHT_WORLD_TO_CAMERA if self.world_to_camera is None else self.world_to_camera
+        fx, fy, cx, cy = (scale * value for value in (self.fx, self.fy, self.cx, self.cy))
+        return Camera(fx, fy, cx, cy, width, height, pose)
+
+    def undistort(self, rgb: UInt8[np.ndarray, "h w c"], scale: float) -> UInt8[np.ndarray, "h w c"]:
+        """The picture as a lens without distortion would show it; `scale` is its size relative to the original."""
+        if not any(self.distortion):
+            return rgb
+        return cv2.undistort(rgb, self._matrix(scale, centre_px=0.0), np.array(self.distortion)).reshape(rgb.shape)
+
+    def undistort_points(self, points_px: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+        """Where points of the original frames lie in the undistorted ones."""
+        if not any(self.distortion):
+            return points_px
+        matrix = self._matrix(1.0, centre_px=0.5)
+        points = cv2.undistortPoints(
+            points_px.reshape(-1, 1, 2).astype(np.float64), matrix, np.array(self.distortion), P=matrix
+        )
+        return points.reshape(points_px.shape)
+
+    def _matrix(self, scale: float, centre_px: float) -> Float[np.ndarray, "3 3"]:
+        """K for a picture of this scale whose first pixel's centre has the coordinate `centre_px` (OpenCV warps: 0)."""
+        shift = centre_px - 0.5
+        fx, fy = self.fx * scale, self.fy * scale
+        return np.array([[fx, 0.0, self.cx * scale + shift], [0.0, fy, self.cy * scale + shift], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class SuppliedLandmarks:
+    """Landmarks for every frame of the recording, in pixels of the original frames; nan where unknown.
+
+    landmarks_world_m: None where the file does not give them.
+    """
+
+    landmarks_px: Float[np.ndarray, "n 33 2"]
+    visibility: Float[np.ndarray, "n 33"]
+    landmarks_world_m: Float[np.ndarray, "n 33 3"] | None
+
+
+@dataclass(frozen=True)
+class SuppliedSplit:
+    """Which frames of the recording are to be used, in rising order, and what for (as `Capture.split`)."""
+
+    frame_index: Int[np.ndarray, "m"]
+    split: UInt8[np.ndarray, "m"]
+
+    def of(self, frame_index: Int[np.ndarray, "n"]) -> UInt8[np.ndarray, "n"]:
+        """What these frames, all of them listed, are for."""
+        return self.split[np.searchsorted(self.frame_index, frame_index)]
+
+
+@dataclass(frozen=True)
+class Supplied:
+    """What was found; None for what was not. `read_mask(index)` gives uint8 [0, 255] at its own size."""
+
+    read_mask: Callable[[int], UInt8[np.ndarray, "h w"]] | None
+    mask_source: str
+    landmarks: SuppliedLandmarks | None
+    camera: SuppliedCamera | None
+    split: SuppliedSplit | None = None
+    smpl_poses: SmplPoses | None = None
+
+
+def find_supplied(path: Path, source: Source) -> Supplied:
+    """Look in the user's folder (nothing is looked for when a video file alone was given).
+
+    Raises UserError when a file that is there does not fit the recording.
+    """
+    if not path.is_dir():
+        return Supplied(None, "", None, None)
+    read_mask, mask_source = _find_masks(path, source)
+    landmarks_path, camera_path, split_path, poses_path = (
+        path / name for name in ("landmarks.npz", "camera.json", "split.json", SMPL_POSES_NPZ)
+    )
+    return Supplied(
+        read_mask,
+        mask_source,
+        _read_landmarks(landmarks_path, source) if landmarks_path.is_file() else None,
+        _read_camera(camera_path, source) if camera_path.is_file() else None,
+        _read_split(split_path, source) if split_path.is_file() else None,
+        _read_smpl_poses(poses_path, source) if poses_path.is_file() else None,
+    )
+
+
+def _find_masks(path: Path, source: Source) -> tuple[Callable[[int], np.ndarray] | None, str]:
+    if (path / "masks").is_dir():
+        return _mask_folder(path / "masks", source), "masks/"
+    if (path / "masks.npz").is_file():
+        arrays = load_npz(path / "masks.npz")
+        if "masks" not in arrays:
+            raise UserError(f"{path / 'masks.npz'} has no array `masks`; store it as (frames, height, width)")
+        return _mask_array(arrays["masks"], path / "masks.npz", source), "masks.npz"
+    if (path / "masks.hdf5").is_file():
+        return _mask_array(_read_hdf5(path / "masks.hdf5"), path / "masks.hdf5", source), "masks.hdf5"
+    if source.files and read_alpha(source.files[0]).min() < 255:
+        return (lambda index: read_alpha(source.files[index])), "the images' alpha channel"
+    return None, ""
+
+
+def _mask_folder(folder: Path, source: Source) -> Callable[[int], np.ndarray]:
+    files = sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES), key=natural_key)
+    by_stem = {p.stem: p for p in files}
+    names = [image.stem for image in source.files]
+    if any(name in by_stem for name in names):
+        if missing := next((name for name in names if name not in by_stem), None):
+            raise UserError(
+                f"{folder} has masks named as the images are, but none for {missing}; add it, or number the masks so "
+                "that none is named as an image"
+            )
+        files = [by_stem[name] for name in names]
+    _check_count(folder, len(files), source)
+    tried = {int(k) for k in np.linspace(0, len(files) - 1, _MASKS_TRIED)}
+    unit = 255 if all(read_gray(files[k]).max() <= 1 for k in sorted(tried)) else 1
+    return lambda index: cv2.convertScaleAbs(read_gray(files[index]), alpha=unit)
+
+
+def _mask_array(masks: np.ndarray, path: Path, source: Source) -> Callable[[int], np.ndarray]:
+    if masks.ndim != 3:
+        raise UserError(f"{path}: the masks have shape {masks.shape}; store them as (frames, height, width)")
+    _check_count(path, len(masks), source)
+    highest = float(masks.max())
+    return lambda index: np.rint(masks[index].astype(np.float32) * (255.0 / max(highest, 1e-6))).astype(np.uint8)
+
+
+def _read_hdf5(path: Path) -> np.ndarray:
+    import h5py  # here, because no other input needs it
+
+    try:
+        with h5py.File(path, "r") as file:
+            return np.asarray(file["masks"])
+    except (OSError, KeyError) as error:
+        raise UserError(
+            f"{path} cannot be read as HDF5 with a data set `masks` ({error}); remove or replace it"
+        ) from None
+
+
+def _read_landmarks(path: Path, source: Source) -> SuppliedLandmarks:
+    arrays = load_npz(path)
+    points = arrays.get("landmarks_px")
+    if points is None or points.ndim != 3 or points.shape[1:] != (N_LANDMARKS, 2):
+        shape = None if points is None else points.shape
+        raise UserError(f"{path}: `landmarks_px` must have shape (frames, {N_LANDMARKS}, 2), found {shape}")
+    _check_count(path, len(points), source)
+    visibility = arrays.get("landmarks_visibility", np.isfinite(points).all(-1))
+    world = arrays.get("landmarks_world_m")
+    if visibility.shape != points.shape[:2] or (world is not None and world.shape != (*points.shape[:2], 3)):
+        raise UserError(
+            f"{path}: `landmarks_visibility` or `landmarks_world_m` does not fit `landmarks_px`; mend its shape"
+        )
+    if (outside := ((visibility < 0) | (visibility > 1)).any(axis=1)).any():
+        raise UserError(
+            f"{path}: `landmarks_visibility` of frame {outside.argmax()} leaves [0, 1]; bring it to that range"
+        )
+    return SuppliedLandmarks(
+        points.astype(np.float32),
+        visibility.astype(np.float32),
+        None if world is None else world.astype(np.float32),
+    )
+
+
+def _read_camera(path: Path, source: Source) -> SuppliedCamera:
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        fx, fy, cx, cy = (float(values[key]) for key in ("fx", "fy", "cx", "cy"))
+        size_px = (int(values["width"]), int(values["height"])) if {"width", "height"} & set(values) else None
+        distortion = tuple(float(value) for value in values.get("distortion") or ())
+        pose = values.get("world_to_camera")
+        world_to_camera = None if pose is None else np.array(pose, dtype=np.float32).reshape(4, 4)
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+        raise UserError(f"{path} is no camera ({error}); it needs numbers fx, fy, cx, cy in pixels") from None
+    if min(fx, fy) <= 0 or not np.isfinite([fx, fy, cx, cy, *distortion]).all():
+        raise UserError(
+            f"{path}: fx and fy must be above 0 pixels and all numbers finite, found fx {fx}, fy {fy}, cx {cx}, "
+            f"cy {cy}, distortion {list(distortion)}; mend them"
+        )
+    if len(distortion) not in (0, 4, 5, 8):
+        raise UserError(f"{path}: distortion needs 4, 5 or 8 numbers (k1 k2 p1 p2 ...), found {len(distortion)}")
+    if world_to_camera is not None and not is_rigid(world_to_camera):
+        raise UserError(
+            f"{path}: `world_to_camera` must be a rotation and a shift in metres, with 0 0 0 1 in its last row; "
+            "divide its scale out, or leave it out"
+        )
+    _check_picture(path, cx, cy, size_px, source)
+    return SuppliedCamera(fx, fy, cx, cy, distortion, world_to_camera)
+
+
+def _check_picture(path: Path, cx: float, cy: float, size_px: tuple[int, int] | None, source: Source) -> None:
+    """UserError for a calibration of pictures of another size: everything would be fitted wrongly without a sign."""
+    width, height = picture_size_px(source)
+    if size_px is not None and size_px != (width, height):
+        raise UserError(
+            f"{path} is for pictures of {size_px[0]}x{size_px[1]}, those of {source.path} are {width}x{height}; "
+            "give the camera of these pictures, or the original pictures"
+        )
+    if size_px is None and max(abs(cx / width - 0.5), abs(cy / height - 0.5)) > _MOST_OFF_CENTRE:
+        raise UserError(
+            f"{path}: cx {cx:g}, cy {cy:g} lie far from the middle of the pictures of {source.path}, which are "
+            f"{width}x{height}; give the camera of these pictures, or, where they were cut out of larger ones, confirm "
+            f'it with "width": {width}, "height": {height} in that file'
+        )
+
+
+def _read_split(path: Path, source: Source) -> SuppliedSplit:
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        lists = {name: [operator.index(value) for value in indices] for name, indices in values.items()}
+    except (ValueError, TypeError, AttributeError) as error:
+        raise UserError(f"{path} is no split ({error}); it needs lists of frame indices, train and heldout") from None
+    if unknown := set(lists) - set(_SPLITS):
+        raise UserError(f"{path}: unknown list {sorted(unknown)[0]}; there are {', '.join(_SPLITS)}")
+    if "validation" not in lists:
+        train = sorted(lists.get("train", []))
+        lists["validation"] = train[VALIDATION_PHASE::SPLIT_PERIOD]
+        lists["train"] = sorted(set(train) - set(lists["validation"]))
+    for name in _SPLITS:
+        if not lists.get(name):
+            raise UserError(f"{path} lists no frame for {name}; list some of each kind, and 5 training ones or more")
+    indices = np.concatenate([lists[name] for name in _SPLITS])
+    if len(np.unique(indices)) != len(indices):
+        raise UserError(f"{path} lists a frame twice; give each frame one use")
+    if indices.min() < 0 or indices.max() >= source.n_frames:
+        raise UserError(f"{path} lists frames up to {indices.max()}, {source.path} has 0 to {source.n_frames - 1}")
+    kinds = np.concatenate([np.full(len(lists[name]), kind, np.uint8) for name, kind in _SPLITS.items()])
+    order = np.argsort(indices)
+    return SuppliedSplit(indices[order], kinds[order])
+
+
+def _read_smpl_poses(path: Path, source: Source) -> SmplPoses:
+    poses = load_smpl_poses(path)
+    if len(poses.frame_index) and not 0 <= poses.frame_index[0] <= poses.frame_index[-1] < source.n_frames:
+        raise UserError(
+            f"{path} has poses of frames {poses.frame_index[0]} to {poses.frame_index[-1]}, {source.path} has 0 to "
+            f"{source.n_frames - 1}; give the recording that belongs to them"
+        )
+    return poses
+
+
+def _check_count(path: Path, count: int, source: Source) -> None:
+    """UserError for too few, and for too many as well: nothing says which frame each belongs to."""
+    if count != source.n_frames:
+        raise UserError(
+            f"{path} has {count} entries for {source.n_frames} frames of {source.path}; "
+            "give one for each frame, or remove it and the detector will be used"
+        )

@@ -1,0 +1,88 @@
+"""Skin weights around the canonical body, and the warp grids of a motion.
+
+The posed space of a frame is the world seen from the moving root: the root's skinning matrix is the identity there,
+so global orientation and translation are factored out and a frame's box is as tight as the body.
+"""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from pipeline.body.body import Body
+from pipeline.core.device import CPU
+from pipeline.geometry.surface import signed_distance_m
+from pipeline.kernels.inverse_skinning import SkinGrid, WarpGrid, bake
+from pipeline.kernels.march import WarpSet
+
+NEIGHBOURS = 24
+
+
+def build_skin_grid(body: Body, margin_m: float, cell_m: float = 0.03) -> SkinGrid:
+    """Skin weights on all nodes within `margin_m` (and two cells) of the canonical surface, inside or outside.
+
+    InstantAvatar gives each voxel the weights of its nearest vertex, which jump where two limbs are equally near.
+    Here they are a Gaussian mean over the nearest vertices, whose width grows with the distance, so that skinning is
+    continuous.
+    """
+    reach = margin_m + 2.5 * cell_m
+    origin = (np.floor((body.vertices.min(0) - reach) / cell_m) * cell_m).astype(np.float32)
+    size = np.ceil((body.vertices.max(0) + reach - origin) / cell_m).astype(np.int64) + 1
+    index = np.stack(np.meshgrid(*(np.arange(n) for n in size), indexing="ij"), axis=-1).reshape(-1, 3)
+    nodes = (origin + index * np.float32(cell_m)).astype(np.float32)
+    tree = cKDTree(body.vertices)
+    near = np.isfinite(tree.query(nodes, distance_upper_bound=reach + 0.02, workers=torch.get_num_threads())[0])
+    distance = np.full(len(nodes), np.inf, dtype=np.float32)
+    distance[near] = signed_distance_m(nodes[near], body.mesh())
+    kept = distance < reach
+    row_of_node = np.where(kept, np.cumsum(kept) - 1, -1).astype(np.int32).reshape(tuple(size))
+    weights = _smooth_weights(nodes[kept], tree, body.skin_weights, cell_m)
+    arrays = (origin, row_of_node, nodes[kept], distance[kept], weights)
+    origin_m, rows, nodes_m, distance_m, weights_of = (torch.from_numpy(array) for array in arrays)
+    return SkinGrid(origin_m, cell_m, rows, nodes_m, distance_m, weights_of)
+
+
+def skin_margin_m(body: Body, bounds_m: Float[np.ndarray, "2 3"]) -> float:
+    """How far a field's box reaches beyond the body: the margin that its skin grid needs."""
+    return float(max((body.vertices.min(0) - bounds_m[0]).max(), (bounds_m[1] - body.vertices.max(0)).max()))
+
+
+def _smooth_weights(nodes: np.ndarray, tree: cKDTree, skin_weights: np.ndarray, cell_m: float) -> np.ndarray:
+    distance, neighbour = tree.query(nodes, k=NEIGHBOURS, workers=torch.get_num_threads())
+    width = 0.5 * cell_m + 0.35 * distance[:, :1]
+    share = np.exp(-(distance**2 - distance[:, :1] ** 2) / (2 * width**2))
+    share = (share / share.sum(1, keepdims=True)).astype(np.float32)
+    row_start = np.arange(len(nodes) + 1) * NEIGHBOURS
+    smoothing = csr_array((share.ravel(), neighbour.ravel(), row_start), shape=(len(nodes), len(skin_weights)))
+    weights: np.ndarray = smoothing @ skin_weights
+    return weights
+
+
+def posed_from_world(canonical_to_world: Float[Tensor, "n j 4 4"]) -> Float[Tensor, "n 4 4"]:
+    """The rigid map from the world into each frame's posed space: the inverse of the root's skinning matrix."""
+    rotation, translation = canonical_to_world[:, 0, :3, :3], canonical_to_world[:, 0, :3, 3]
+    inverse = torch.zeros_like(canonical_to_world[:, 0])
+    inverse[:, :3, :3] = rotation.transpose(1, 2)
+    inverse[:, :3, 3] = -(rotation.transpose(1, 2) @ translation[:, :, None])[:, :, 0]
+    inverse[:, 3, 3] = 1
+    return inverse
+
+
+def bake_motion(skin: SkinGrid, canonical_to_posed: Float[Tensor, "n j 4 4"]) -> WarpSet:
+    """The warp grids of all frames, on the device of the matrices.
+
+    They are baked on the CPU; frames are shared out to as many threads as torch uses.
+    """
+    skin, matrices = skin.to(CPU), canonical_to_posed.cpu()
+
+    def bake_row(row: int) -> WarpGrid:
+        return bake(skin, matrices[row])
+
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        grids: Sequence[WarpGrid] = list(pool.map(bake_row, range(len(matrices))))
+    return WarpSet.of(grids, skin.cell_m).to(canonical_to_posed.device)

@@ -1,0 +1,36 @@
+"""Tensors on disk as safetensors: whole or absent, no pickles, the same bytes for the same tensors."""
+
+import json
+from pathlib import Path
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from pipeline.core.atomic import atomic_path
+from pipeline.core.errors import UserError
+
+# One entry only: the library writes several in an order that changes from run to run.
+DESCRIPTION = "description"
+
+
+def save_tensors(path: Path, tensors: dict[str, Tensor], description: dict | None = None) -> None:
+    """Write tensors and a JSON-like description."""
+    whole = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
+    text = json.dumps(description or {}, sort_keys=True)
+    with atomic_path(path) as unfinished:
+        unfinished.write_bytes(save(whole, {DESCRIPTION: text}))
+
+
+def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict]:
+    """Read tensors and description.
+
+    Raises:
+        UserError: the file is missing, damaged, or no safetensors file.
+    """
+    try:
+        with safe_open(path, framework="pt") as archive:
+            description = json.loads((archive.metadata() or {}).get(DESCRIPTION, "{}"))
+            return {name: archive.get_tensor(name) for name in archive.keys()}, description  # noqa: SIM118
+    except (OSError, SafetensorError, ValueError) as error:
+        raise UserError(f"{path} cannot be read ({error}); run the stage that writes it again") from None

@@ -1,0 +1,40 @@
+"""Adam (Kingma & Ba 2015), in place over one flat float32 tensor, as one pass over memory.
+
+Beside torch's own: the gradient is cleared in the same pass, a gradient that is not finite counts as zero (a NaN never
+reaches a parameter), and moments that have decayed to nothing are set to zero, because denormal numbers made a step
+20 times slower.
+"""
+
+import torch
+from torch import Tensor
+
+from pipeline.kernels.adam import cpu as adam_cpu
+from pipeline.kernels.adam import reference
+from pipeline.kernels.common.dispatch import runs_on_numba
+
+
+def adam_step_(
+    parameter: Tensor,
+    gradient: Tensor,
+    first_moment: Tensor,
+    second_moment: Tensor,
+    step: int,
+    learning_rate: float,
+    betas: tuple[float, float] = (0.9, 0.99),
+    epsilon: float = 1e-15,
+) -> None:
+    """Update `parameter` and both moments; set `gradient` to zero. All four are contiguous and of one shape.
+
+    step: 1 for the first update (bias correction). learning_rate: in units of the parameter.
+    """
+    tensors = (parameter.detach(), gradient, first_moment, second_moment)
+    if any(tensor.shape != parameter.shape or not tensor.is_contiguous() for tensor in tensors):
+        raise ValueError("parameter, gradient and moments must be contiguous and of one shape")
+    rate = learning_rate * (1 - betas[1] ** step) ** 0.5 / (1 - betas[0] ** step)
+    floor = epsilon * (1 - betas[1] ** step) ** 0.5
+    with torch.no_grad():
+        if runs_on_numba(*tensors):
+            flat = [tensor.view(-1).numpy() for tensor in tensors]
+            adam_cpu.update(flat[0], flat[1], flat[2], flat[3], rate, betas[0], betas[1], floor)
+        else:
+            reference.update(*tensors, rate, betas[0], betas[1], floor)

@@ -1,0 +1,42 @@
+"""Compiled loops that blend by sparse weights: the entries of node i are row_start[i] : row_start[i + 1].
+
+Backward, the nodes are shared out in a fixed number of parts whose sums are added in order, whatever the number of
+threads.
+"""
+
+import numpy as np
+from numba import njit, prange
+
+from pipeline.kernels.common.numba_options import OPTIONS
+
+PARTS = 16
+
+
+@njit(**OPTIONS)
+def _add_scaled(scale, values, total):
+    """Slices go to a function of their own: LLVM then knows that they do not overlap."""
+    for column in range(values.shape[0]):
+        total[column] += scale * values[column]
+
+
+@njit(parallel=True, **OPTIONS)
+def blend(row_start, joint, weight, values, blended):
+    """Fill blended (m, c) from values (j, c)."""
+    nodes = blended.shape[0]
+    for part in prange(PARTS):
+        for node in range(part * nodes // PARTS, (part + 1) * nodes // PARTS):
+            blended[node] = np.float32(0)
+            for entry in range(row_start[node], row_start[node + 1]):
+                _add_scaled(weight[entry], values[joint[entry]], blended[node])
+
+
+@njit(parallel=True, **OPTIONS)
+def blend_backward(row_start, joint, weight, joints, blended_gradient):
+    """What each part of the nodes adds to dL/dvalues, (PARTS, j, c), for dL/dblended (m, c)."""
+    nodes, columns = blended_gradient.shape
+    sums = np.zeros((PARTS, joints, columns), np.float32)
+    for part in prange(PARTS):
+        for node in range(part * nodes // PARTS, (part + 1) * nodes // PARTS):
+            for entry in range(row_start[node], row_start[node + 1]):
+                _add_scaled(weight[entry], blended_gradient[node], sums[part, joint[entry]])
+    return sums

@@ -1,0 +1,15 @@
+"""Plain-torch twin of blending: any dtype, any device, gradients by autograd."""
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pipeline.kernels.common.packing import owner_of_each
+
+
+def blend(
+    row_start: Int[Tensor, "m1"], joint: Int[Tensor, "e"], weight: Float[Tensor, "e"], values: Float[Tensor, "j c"]
+) -> Float[Tensor, "m c"]:
+    """Same as `pipeline.kernels.blend.blend`, of the arrays of `SparseWeights`."""
+    node = owner_of_each(row_start.diff())
+    blended = values.new_zeros(len(row_start) - 1, values.shape[1])
+    return blended.index_add(0, node, weight.to(values)[:, None] * values.index_select(0, joint))

@@ -1,0 +1,147 @@
+"""Compiled loop of the Broyden search: a thread takes whole points. Grid arguments as in `newton_cpu`."""
+
+import numpy as np
+from numba import njit, prange
+
+from pipeline.kernels.common.numba_options import OPTIONS
+from pipeline.kernels.inverse_skinning.newton_cpu import invert
+
+_ZERO, _ONE = np.float32(0), np.float32(1)
+
+
+@njit(**OPTIONS)
+def _blend(x, frame, origin, cell, row_of_node, blended, matrix):
+    """Fill the skinning matrix (12) at a canonical point; False outside the grid."""
+    gx, gy, gz = (x[0] - origin[0]) / cell, (x[1] - origin[1]) / cell, (x[2] - origin[2]) / cell
+    i, j, k = int(np.floor(gx)), int(np.floor(gy)), int(np.floor(gz))
+    shape = row_of_node.shape
+    if not (0 <= i < shape[0] - 1 and 0 <= j < shape[1] - 1 and 0 <= k < shape[2] - 1):
+        return False
+    u, v, w = gx - np.float32(i), gy - np.float32(j), gz - np.float32(k)
+    matrix[:] = _ZERO
+    for corner in range(8):
+        a, b, c = corner & 1, (corner >> 1) & 1, corner >> 2
+        row = row_of_node[i + a, j + b, k + c]
+        if row < 0:
+            return False
+        weight = (u if a == 1 else _ONE - u) * (v if b == 1 else _ONE - v) * (w if c == 1 else _ONE - w)
+        for entry in range(12):
+            matrix[entry] += weight * blended[row, frame, entry]
+    return True
+
+
+@njit(**OPTIONS)
+def _miss(matrix, x, target, miss):
+    """A(x) x - p into `miss`; returns its squared length."""
+    squared = _ZERO
+    for axis in range(3):
+        row = 4 * axis
+        value = matrix[row] * x[0] + matrix[row + 1] * x[1] + matrix[row + 2] * x[2] + matrix[row + 3] - target[axis]
+        miss[axis] = value
+        squared += value * value
+    return squared
+
+
+@njit(**OPTIONS)
+def _update(inverse, move, change):
+    """Broyden's good update of the inverse Jacobian; False if it is not possible."""
+    along, ahead = np.empty(3, np.float32), np.empty(3, np.float32)
+    scale = _ZERO
+    for axis in range(3):
+        along[axis] = move[0] * inverse[0, axis] + move[1] * inverse[1, axis] + move[2] * inverse[2, axis]
+        ahead[axis] = inverse[axis, 0] * change[0] + inverse[axis, 1] * change[1] + inverse[axis, 2] * change[2]
+        scale += along[axis] * change[axis]
+    if abs(scale) < np.float32(1e-14):
+        return False
+    for row in range(3):
+        for column in range(3):
+            inverse[row, column] += (move[row] - ahead[row]) * along[column] / scale
+    return True
+
+
+@njit(**OPTIONS)
+def _search(target, x, frame, iterations, converged, diverged, origin, cell, row_of_node, blended, inverse, matrix):
+    """Move `x` to a root of A(x) x = target; True if it got there."""
+    miss, before, move = np.empty(3, np.float32), np.empty(3, np.float32), np.empty(3, np.float32)
+    if not _blend(x, frame, origin, cell, row_of_node, blended, matrix):
+        return False
+    sound, a, b, c, d, e, f, g, h, k = invert(
+        matrix[0], matrix[1], matrix[2], matrix[4], matrix[5], matrix[6], matrix[8], matrix[9], matrix[10]
+    )
+    if not sound:
+        return False
+    inverse[0, 0], inverse[0, 1], inverse[0, 2] = a, b, c
+    inverse[1, 0], inverse[1, 1], inverse[1, 2] = d, e, f
+    inverse[2, 0], inverse[2, 1], inverse[2, 2] = g, h, k
+    squared = _miss(matrix, x, target, miss)
+    for _ in range(iterations):
+        if squared < converged * converged:
+            return True
+        for axis in range(3):
+            before[axis] = miss[axis]
+            move[axis] = -(inverse[axis, 0] * miss[0] + inverse[axis, 1] * miss[1] + inverse[axis, 2] * miss[2])
+            x[axis] += move[axis]
+        if not _blend(x, frame, origin, cell, row_of_node, blended, matrix):
+            return False
+        squared = _miss(matrix, x, target, miss)
+        if squared > diverged * diverged:
+            return False
+        for axis in range(3):
+            before[axis] = miss[axis] - before[axis]
+        if squared >= converged * converged and not _update(inverse, move, before):
+            return False
+    return squared < converged * converged
+
+
+@njit(parallel=True, **OPTIONS)
+def search(
+    posed,
+    frame,
+    posed_to_start,
+    blended,
+    origin,
+    cell,
+    row_of_node,
+    iterations,
+    converged,
+    diverged,
+    same,
+    roots,
+    counts,
+):
+    """Fill roots (n, c, 3) and how many of them (n) each posed point has: see `pipeline.kernels.broyden.search`."""
+    for point in prange(posed.shape[0]):
+        x, matrix, inverse = np.empty(3, np.float32), np.empty(12, np.float32), np.empty((3, 3), np.float32)
+        f, found = frame[point], 0
+        for start in range(posed_to_start.shape[1]):
+            if found == roots.shape[1]:
+                break
+            m = posed_to_start[f, start]
+            for axis in range(3):
+                x[axis] = (
+                    m[4 * axis] * posed[point, 0]
+                    + m[4 * axis + 1] * posed[point, 1]
+                    + m[4 * axis + 2] * posed[point, 2]
+                    + m[4 * axis + 3]
+                )
+            new = _search(
+                posed[point],
+                x,
+                f,
+                iterations,
+                converged,
+                diverged,
+                origin,
+                cell,
+                row_of_node,
+                blended,
+                inverse,
+                matrix,
+            )
+            for other in range(found):
+                ox, oy, oz = x[0] - roots[point, other, 0], x[1] - roots[point, other, 1], x[2] - roots[point, other, 2]
+                new &= ox * ox + oy * oy + oz * oz > same * same
+            if new:
+                roots[point, found, 0], roots[point, found, 1], roots[point, found, 2] = x[0], x[1], x[2]
+                found += 1
+        counts[point] = found

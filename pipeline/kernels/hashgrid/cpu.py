@@ -1,0 +1,186 @@
+"""Compiled loops of the hash grid.
+
+Levels are the outer loop, so that one level's table stays in the cache; in the table's gradient each thread owns whole
+levels: no atomics, and the same sums in the same order whatever the number of threads.
+
+`lanes` is a tuple as long as a level has features: its length is part of its type, hence a constant in the compiled
+code, and the inner loop becomes one vector instruction. (A closure over the number would do so too, but one that calls
+another closure is never found in numba's cache.)
+"""
+
+import numpy as np
+from numba import njit, prange
+
+from pipeline.kernels.common.hashing import PRIMES
+from pipeline.kernels.common.numba_options import OPTIONS
+
+BLOCK = 128
+_PRIME_Y, _PRIME_Z = np.uint32(PRIMES[0]), np.uint32(PRIMES[1])
+
+
+@njit(**OPTIONS)
+def _corners(points, start, stop, level_plan, rows, weights, parts):
+    """Table rows (8, BLOCK), weights (8, BLOCK) and positions in the cell (3, BLOCK) of a block of points."""
+    cells_x, cells_y, cells_z, first = level_plan[0], level_plan[1], level_plan[2], level_plan[3]
+    mask, dense = np.uint32(level_plan[4] - 1), level_plan[5] == 1
+    stride_y, stride_z = np.uint32(cells_x + 1), np.uint32((cells_x + 1) * (cells_y + 1))
+    zero, one = np.float32(0), np.float32(1)
+    for k in range(stop - start):
+        # The zero comes first: the second argument is taken if it is larger, and a NaN, whose row no table has, is not.
+        x = min(max(zero, points[start + k, 0]), one) * np.float32(cells_x)
+        y = min(max(zero, points[start + k, 1]), one) * np.float32(cells_y)
+        z = min(max(zero, points[start + k, 2]), one) * np.float32(cells_z)
+        i = np.uint32(min(np.int32(x), np.int32(cells_x - 1)))
+        j = np.uint32(min(np.int32(y), np.int32(cells_y - 1)))
+        m = np.uint32(min(np.int32(z), np.int32(cells_z - 1)))
+        u, v, w = x - np.float32(i), y - np.float32(j), z - np.float32(m)
+        parts[0, k], parts[1, k], parts[2, k] = u, v, w
+        i1, j1, m1 = i + np.uint32(1), j + np.uint32(1), m + np.uint32(1)
+        if dense:
+            y0, y1, z0, z1 = j * stride_y, j1 * stride_y, m * stride_z, m1 * stride_z
+            rows[0, k], rows[1, k] = i + y0 + z0, i1 + y0 + z0
+            rows[2, k], rows[3, k] = i + y1 + z0, i1 + y1 + z0
+            rows[4, k], rows[5, k] = i + y0 + z1, i1 + y0 + z1
+            rows[6, k], rows[7, k] = i + y1 + z1, i1 + y1 + z1
+        else:
+            y0, y1, z0, z1 = j * _PRIME_Y, j1 * _PRIME_Y, m * _PRIME_Z, m1 * _PRIME_Z
+            rows[0, k], rows[1, k] = (i ^ y0 ^ z0) & mask, (i1 ^ y0 ^ z0) & mask
+            rows[2, k], rows[3, k] = (i ^ y1 ^ z0) & mask, (i1 ^ y1 ^ z0) & mask
+            rows[4, k], rows[5, k] = (i ^ y0 ^ z1) & mask, (i1 ^ y0 ^ z1) & mask
+            rows[6, k], rows[7, k] = (i ^ y1 ^ z1) & mask, (i1 ^ y1 ^ z1) & mask
+        u0, v0, w0 = one - u, one - v, one - w
+        weights[0, k], weights[1, k] = u0 * v0 * w0, u * v0 * w0
+        weights[2, k], weights[3, k] = u0 * v * w0, u * v * w0
+        weights[4, k], weights[5, k] = u0 * v0 * w, u * v0 * w
+        weights[6, k], weights[7, k] = u0 * v * w, u * v * w
+    return first
+
+
+@njit(**OPTIONS)
+def encode_block(points, table, plan, level, encoded, start, stop, lanes):
+    """One level's features of at most BLOCK points, start..stop."""
+    column = level * len(lanes)
+    rows = np.empty((8, BLOCK), np.uint32)
+    weights = np.empty((8, BLOCK), np.float32)
+    parts = np.empty((3, BLOCK), np.float32)
+    first = _corners(points, start, stop, plan[level], rows, weights, parts)
+    values = table[first:]
+    for k in range(stop - start):
+        r0, r1, r2, r3 = rows[0, k], rows[1, k], rows[2, k], rows[3, k]
+        r4, r5, r6, r7 = rows[4, k], rows[5, k], rows[6, k], rows[7, k]
+        w0, w1, w2, w3 = weights[0, k], weights[1, k], weights[2, k], weights[3, k]
+        w4, w5, w6, w7 = weights[4, k], weights[5, k], weights[6, k], weights[7, k]
+        for f in range(len(lanes)):
+            encoded[start + k, column + f] = (
+                (w0 * values[r0, f] + w1 * values[r1, f]) + (w2 * values[r2, f] + w3 * values[r3, f])
+            ) + ((w4 * values[r4, f] + w5 * values[r5, f]) + (w6 * values[r6, f] + w7 * values[r7, f]))
+
+
+@njit(parallel=True, **OPTIONS)
+def encode(points, table, plan, encoded, lanes):
+    """Fill `encoded` (n, l*f) from points (n, 3), table (rows, f) and plan (l, 6)."""
+    count = points.shape[0]
+    for level in range(plan.shape[0]):
+        for block in prange((count + BLOCK - 1) // BLOCK):
+            start = block * BLOCK
+            encode_block(points, table, plan, level, encoded, start, min(start + BLOCK, count), lanes)
+
+
+@njit(**OPTIONS)
+def rows_that_are_not_zero(values):
+    """Indices of the rows (n, c) that hold anything but zeros."""
+    rows = np.empty(values.shape[0], np.int64)
+    count = 0
+    for row in range(values.shape[0]):
+        for column in range(values.shape[1]):
+            if values[row, column] != np.float32(0):
+                rows[count] = row
+                count += 1
+                break
+    return rows[:count]
+
+
+@njit(**OPTIONS)
+def _level_of_turn(turn, levels):
+    """0, 2, 4, ... and then 1, 3, 5, ...: two threads that take half of the turns each get coarse and fine levels."""
+    even = (levels + 1) // 2
+    return 2 * turn if turn < even else 2 * (turn - even) + 1
+
+
+@njit(**OPTIONS)
+def _scatter_block(points, plan, level, gradient, table_gradient, start, stop, rows, weights, parts, lanes):
+    column = level * len(lanes)
+    first = _corners(points, start, stop, plan[level], rows, weights, parts)
+    values = table_gradient[first:]
+    for k in range(stop - start):
+        for corner in range(8):
+            row, weight = rows[corner, k], weights[corner, k]
+            for f in range(len(lanes)):
+                values[row, f] += weight * gradient[start + k, column + f]
+
+
+@njit(parallel=True, **OPTIONS)
+def add_table_gradient(points, plan, gradient, table_gradient, lanes):
+    """Add to `table_gradient` (rows, f) what gradient (n, l*f) means for the table."""
+    count = points.shape[0]
+    levels = plan.shape[0]
+    for turn in prange(levels):
+        level = _level_of_turn(turn, levels)
+        rows = np.empty((8, BLOCK), np.uint32)
+        weights = np.empty((8, BLOCK), np.float32)
+        parts = np.empty((3, BLOCK), np.float32)
+        for block in range((count + BLOCK - 1) // BLOCK):
+            start = block * BLOCK
+            stop = min(start + BLOCK, count)
+            _scatter_block(points, plan, level, gradient, table_gradient, start, stop, rows, weights, parts, lanes)
+
+
+@njit(**OPTIONS)
+def _gather_block(points, table, plan, level, gradient, points_gradient, start, stop, lanes):
+    column = level * len(lanes)
+    rows = np.empty((8, BLOCK), np.uint32)
+    weights = np.empty((8, BLOCK), np.float32)
+    parts = np.empty((3, BLOCK), np.float32)
+    first = _corners(points, start, stop, plan[level], rows, weights, parts)
+    values = table[first:]
+    dots = np.empty(8, np.float32)
+    for k in range(stop - start):
+        for corner in range(8):
+            row, total = rows[corner, k], np.float32(0)
+            for f in range(len(lanes)):
+                total += values[row, f] * gradient[start + k, column + f]
+            dots[corner] = total
+        u, v, w = parts[0, k], parts[1, k], parts[2, k]
+        u0, v0, w0 = np.float32(1) - u, np.float32(1) - v, np.float32(1) - w
+        along_x = (
+            v0 * w0 * (dots[1] - dots[0])
+            + v * w0 * (dots[3] - dots[2])
+            + v0 * w * (dots[5] - dots[4])
+            + v * w * (dots[7] - dots[6])
+        )
+        along_y = (
+            u0 * w0 * (dots[2] - dots[0])
+            + u * w0 * (dots[3] - dots[1])
+            + u0 * w * (dots[6] - dots[4])
+            + u * w * (dots[7] - dots[5])
+        )
+        along_z = (
+            u0 * v0 * (dots[4] - dots[0])
+            + u * v0 * (dots[5] - dots[1])
+            + u0 * v * (dots[6] - dots[2])
+            + u * v * (dots[7] - dots[3])
+        )
+        points_gradient[start + k, 0] += along_x * np.float32(plan[level, 0])
+        points_gradient[start + k, 1] += along_y * np.float32(plan[level, 1])
+        points_gradient[start + k, 2] += along_z * np.float32(plan[level, 2])
+
+
+@njit(parallel=True, **OPTIONS)
+def add_points_gradient(points, table, plan, gradient, points_gradient, lanes):
+    """Add to `points_gradient` (n, 3) what gradient (n, l*f) means for the points."""
+    count = points.shape[0]
+    for level in range(plan.shape[0]):
+        for block in prange((count + BLOCK - 1) // BLOCK):
+            start = block * BLOCK
+            stop = min(start + BLOCK, count)
+            _gather_block(points, table, plan, level, gradient, points_gradient, start, stop, lanes)

@@ -1,0 +1,215 @@
+"""Plain torch rasterisation and silhouette antialiasing: the definition that the fast kernels are tested against.
+
+Letters as in ``pipeline.kernels.raster.cpu``. Order-independent reductions (max of 1/z, then min of the face index)
+keep it deterministic.
+"""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from pipeline.kernels.common.packing import owner_of_each
+
+FRAGMENTS_PER_CHUNK = 1 << 22
+
+
+def signed_areas_px(vertices_px: Float[Tensor, "v 2"], faces: Int[Tensor, "f 3"]) -> Float[Tensor, "f"]:
+    """Twice the signed screen area of every face in px^2; negative for a counter-clockwise outward face seen from
+    outside (y down)."""
+    a, b, c = vertices_px[faces].unbind(1)
+    return _cross(b - a, c - a)
+
+
+def _cross(first: Float[Tensor, "*n 2"], second: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n"]:
+    return first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
+
+
+def weighted_inverse_depth(
+    corners_px: Float[Tensor, "n 3 2"], corners_depth_m: Float[Tensor, "n 3"], points_px: Float[Tensor, "n 2"]
+) -> Float[Tensor, "n 3"]:
+    """q_k = w_k / z_k of each point in its face: q / sum(q) are perspective-correct barycentrics and 1 / sum(q) the
+    depth. Differentiable."""
+    a, b, c = corners_px.unbind(1)
+    edges = torch.stack(
+        [_cross(c - b, points_px - b), _cross(a - c, points_px - c), _cross(b - a, points_px - a)], dim=1
+    )
+    return edges / _cross(b - a, c - a)[:, None] / corners_depth_m
+
+
+def _face_boxes(
+    vertices_px: Float[Tensor, "v 2"], faces: Int[Tensor, "f 3"], drawn: Bool[Tensor, "f"], size_wh: tuple[int, int]
+) -> tuple[Int[Tensor, "f 2"], Int[Tensor, "f 2"]]:
+    """First pixel and extent (columns, rows) of every face, extent 0 where nothing is drawn."""
+    corners = torch.nan_to_num(vertices_px[faces])
+    limit = torch.tensor(size_wh, dtype=corners.dtype, device=corners.device)
+    first = torch.minimum((corners.amin(1) - 0.5).clamp_min(0), limit).ceil().long()
+    last = torch.minimum((corners.amax(1) - 0.5).clamp_min(-1), limit - 1).floor().long()
+    extent = (last - first + 1).clamp_min(0) * drawn[:, None]
+    return first, extent
+
+
+def _fragments(
+    vertices_px: Float[Tensor, "v 2"],
+    depth_m: Float[Tensor, "v"],
+    faces: Int[Tensor, "f 3"],
+    first: Tensor,
+    extent: Tensor,
+    width: int,
+) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"], Float[Tensor, "n"]]:
+    """Covered (face, pixel, 1/z as float32) triples of a chunk of faces."""
+    counts = extent.prod(1)
+    face = owner_of_each(counts)
+    order = torch.arange(len(face), device=faces.device) - (counts.cumsum(0) - counts)[face]
+    columns = extent[face, 0]
+    x, y = first[face, 0] + order % columns, first[face, 1] + order // columns
+    points = torch.stack([x, y], 1).to(torch.float64) + 0.5
+    corner = faces[face]
+    q = weighted_inverse_depth(vertices_px[corner], depth_m[corner], points)
+    inside = (q >= 0).all(1)
+    return face[inside], (y * width + x)[inside], q[inside].sum(1).float()
+
+
+def _chunks(fragments: Int[Tensor, "f"]) -> tuple[Int[Tensor, "_"], ...]:
+    """Face numbers in runs of about FRAGMENTS_PER_CHUNK fragments, so that memory stays bounded."""
+    _, lengths = torch.unique_consecutive(fragments.cumsum(0) // FRAGMENTS_PER_CHUNK, return_counts=True)
+    return torch.split(torch.arange(len(fragments), device=fragments.device), lengths.tolist())
+
+
+def rasterize_reference(
+    vertices_px: Float[Tensor, "v 2"],
+    depth_m: Float[Tensor, "v"],
+    faces: Int[Tensor, "f 3"],
+    height: int,
+    width: int,
+    near_m: float,
+    cull: bool,
+) -> tuple[Int[Tensor, "h w"], Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
+    """``pipeline.kernels.raster.rasterize`` in plain torch on any device, any float type."""
+    dtype, device = vertices_px.dtype, vertices_px.device
+    corners_px, corners_depth, index = vertices_px.double(), depth_m.double(), faces.long()
+    area = signed_areas_px(corners_px, index)
+    drawn = (corners_depth[index] >= near_m).all(1) & (area < 0 if cull else area.abs() > 0)
+    first, extent = _face_boxes(corners_px, index, drawn, (width, height))
+    chunks = _chunks(extent.prod(1))
+    nearest = torch.zeros(height * width, device=device)
+    winner = torch.full((height * width,), len(index), dtype=torch.int64, device=device)
+    for chunk in chunks:
+        _, pixel, inverse = _fragments(corners_px, corners_depth, index[chunk], first[chunk], extent[chunk], width)
+        nearest.scatter_reduce_(0, pixel, inverse, "amax")
+    for chunk in chunks:
+        face, pixel, inverse = _fragments(corners_px, corners_depth, index[chunk], first[chunk], extent[chunk], width)
+        wins = inverse == nearest[pixel]
+        winner.scatter_reduce_(0, pixel[wins], chunk[face[wins]], "amin")
+    covered = torch.nonzero(winner < len(index)).squeeze(1)
+    corner = index[winner[covered]]
+    q = weighted_inverse_depth(
+        corners_px[corner], corners_depth[corner], pixel_centres_px(covered, width, torch.float64)
+    )
+    face_id = torch.where(winner < len(index), winner, -1).to(torch.int32)
+    barycentric = torch.zeros(height * width, 3, dtype=dtype, device=device)
+    depth = torch.full((height * width,), torch.inf, dtype=dtype, device=device)
+    barycentric[covered] = (q / q.sum(1, keepdim=True)).to(dtype)
+    depth[covered] = (1.0 / q.sum(1)).to(dtype)
+    return face_id.view(height, width), barycentric.view(height, width, 3), depth.view(height, width)
+
+
+def pixel_centres_px(pixel: Int[Tensor, "n"], width: int, dtype: torch.dtype) -> Float[Tensor, "n 2"]:
+    """Centres (x + 0.5, y + 0.5) of row-major pixel numbers."""
+    return torch.stack([pixel % width, pixel // width], 1).to(dtype) + 0.5
+
+
+def silhouette_edges(
+    vertices_px: Float[Tensor, "v 2"], faces: Int[Tensor, "f 3"], adjacency: Int[Tensor, "f 3"]
+) -> Int[Tensor, "s 3"]:
+    """(start, end, apex) vertices of every edge with the surface on one side only: no neighbour, or one that faces the
+    other way."""
+    facing = signed_areas_px(vertices_px, faces) < 0
+    folded = facing[:, None] & (adjacency >= 0) & ~facing[adjacency.clamp_min(0)]
+    face, edge = torch.nonzero(folded | (adjacency < 0), as_tuple=True)
+    return torch.stack([faces[face, edge], faces[face, (edge + 1) % 3], faces[face, (edge + 2) % 3]], dim=1)
+
+
+def _crossings(
+    ends_px: Float[Tensor, "s 3 2"], axis: int, lines: int
+) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"], Float[Tensor, "n"]]:
+    """Where edges (start, end, apex) cross the lines of pixel centres along ``axis``: (edge, line, fraction of the way
+    to its end)."""
+    across = ends_px[:, :2, 1 - axis]
+    first = (across.amin(1) - 0.5).clamp(0, lines).ceil().long()
+    last = (across.amax(1) - 0.5).clamp(0, lines).ceil().long()
+    counts = last - first
+    edge = owner_of_each(counts)
+    line = first[edge] + torch.arange(len(edge), device=edge.device) - (counts.cumsum(0) - counts)[edge]
+    start, end = across[edge].unbind(1)
+    return edge, line, (line + 0.5 - start) / (end - start)
+
+
+def _outermost(distance: Float[Tensor, "n"], pair: Int[Tensor, "n"], pair_count: int) -> Bool[Tensor, "n"]:
+    """Of several crossings between the same two pixels the one farthest from the near pixel; the first of equals."""
+    farthest = torch.full((pair_count,), -1.0, dtype=distance.dtype, device=distance.device)
+    farthest.scatter_reduce_(0, pair, distance, "amax")
+    order = torch.arange(len(pair), device=pair.device)
+    first = torch.full((pair_count,), len(pair), device=pair.device)
+    candidate = distance == farthest[pair]
+    first.scatter_reduce_(0, pair[candidate], order[candidate], "amin")
+    return order == first[pair]
+
+
+def _axis_change(
+    flat: Float[Tensor, "n c"],
+    face_id: Int[Tensor, "h w"],
+    depth: Float[Tensor, "h w"],
+    edges: tuple[Float[Tensor, "s 3 2"], Float[Tensor, "s 2"]],
+    axis: int,
+) -> Float[Tensor, "n c"]:
+    """Colour change of every pixel from silhouettes that cut pixel pairs along ``axis`` (0: x, 1: y)."""
+    ends_px, ends_inverse_depth = edges
+    height, width = face_id.shape
+    lines, size, step = (height, width, 1) if axis == 0 else (width, height, width)
+    edge, line, fraction = _crossings(ends_px, axis, lines)
+    start, end, apex = ends_px[edge].unbind(1)
+    position = start[:, axis] + fraction * (end[:, axis] - start[:, axis])
+    inverse = ends_inverse_depth[edge, 0] + fraction.detach() * (
+        ends_inverse_depth[edge, 1] - ends_inverse_depth[edge, 0]
+    )
+    slope = (end - start)[:, 1 - axis] * (-1.0 if axis == 0 else 1.0)
+    # a border is met by row pairs and by column pairs: shares by the square of its normal add up to one border
+    weight = (slope**2 / (end - start).square().sum(1)).detach()
+    outward = torch.where(_cross(end - start, apex - start) * slope > 0, -1, 1)
+    low = (position.detach() - 0.5).clamp(-2, size).floor().long()
+    ok = (low >= 0) & (low < size - 1)
+    low_pixel = (line * width + low if axis == 0 else low * width + line).where(ok, 0)
+    near = low_pixel + (outward < 0) * step
+    far = low_pixel + (outward > 0) * step
+    behind = depth.reshape(-1)
+    ok &= (
+        (behind[near] < behind[far])
+        & (behind[far] * inverse > 1.0)
+        & (face_id.reshape(-1)[near] != face_id.reshape(-1)[far])
+    )
+    near_position = torch.where(outward < 0, low + 1, low).to(position.dtype) + 0.5
+    distance = ((position - near_position) * outward)[ok]
+    near, far, low_pixel = near[ok], far[ok], low_pixel[ok]
+    keep = _outermost(distance.detach(), low_pixel, height * width)
+    share, near, far = distance[keep] - 0.5, near[keep], far[keep]
+    target = torch.where(share.detach() > 0, far, near)
+    share = share * weight[ok][keep]
+    return torch.zeros_like(flat).index_add(0, target, share[:, None] * (flat[near] - flat[far]))
+
+
+def antialias_reference(
+    image: Float[Tensor, "h w c"],
+    face_id: Int[Tensor, "h w"],
+    depth: Float[Tensor, "h w"],
+    vertices_px: Float[Tensor, "v 2"],
+    depth_m: Float[Tensor, "v"],
+    faces: Int[Tensor, "f 3"],
+    adjacency: Int[Tensor, "f 3"],
+) -> Float[Tensor, "h w c"]:
+    """``pipeline.kernels.raster.antialias`` in plain torch."""
+    edges = silhouette_edges(vertices_px.detach(), faces, adjacency)
+    edges = edges[(depth_m.detach()[edges] > 0).all(1)]
+    ends = (vertices_px[edges], 1.0 / depth_m.detach()[edges[:, :2]])
+    flat = image.reshape(-1, image.shape[2])
+    change = [_axis_change(flat, face_id, depth, ends, axis) for axis in (0, 1)]
+    return (flat + change[0] + change[1]).view(image.shape)

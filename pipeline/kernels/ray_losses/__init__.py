@@ -1,0 +1,61 @@
+"""The losses of rays (IHM, Wang et al. 2025, section 2.4) as one operation."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pipeline.kernels.common.dispatch import runs_on_numba
+from pipeline.kernels.ray_losses import cpu as photometric_cpu
+from pipeline.kernels.ray_losses import reference
+
+
+class _RayLosses(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, image: Tensor, alpha: Tensor, rgba: Tensor, background: Tensor, trust: Tensor, delta: float
+    ) -> tuple[Tensor, Tensor]:
+        rays = len(alpha)
+        sums, error, of_image = torch.empty(3), torch.empty(rays, 3), np.empty((rays, 3), np.float32)
+        of_alpha, of_hard = np.empty((rays, 2), np.float32), np.empty(rays, np.float32)
+        given = (tensor.detach().numpy() for tensor in (image, alpha, rgba, background, trust))
+        filled = (sums.numpy(), error.numpy(), of_image, of_alpha, of_hard)
+        photometric_cpu.ray_losses(*given, np.float32(delta), *filled)
+        counts = torch.tensor([3.0 * rays, rays, rays])
+        ctx.kept = counts, of_image, of_alpha, of_hard
+        ctx.mark_non_differentiable(error)
+        return sums / counts, error
+
+    @staticmethod
+    def backward(ctx: Any, of_means: Tensor, _of_error: Tensor) -> tuple[Tensor | None, ...]:
+        counts, of_image, of_alpha, of_hard = ctx.kept
+        colour, alpha, hard = (of_means / counts).numpy()
+        total = colour * of_alpha[:, 0] + alpha * of_alpha[:, 1] + hard * of_hard
+        return torch.from_numpy(colour * of_image), torch.from_numpy(total), None, None, None, None
+
+
+def ray_losses(
+    image: Float[Tensor, "n 3"],
+    alpha: Float[Tensor, "n"],
+    rgba: Float[Tensor, "n 4"],
+    background: Float[Tensor, "n 3"],
+    trust: Float[Tensor, "n"],
+    huber_delta: float,
+) -> tuple[Float[Tensor, "3"], Float[Tensor, "n 3"]]:
+    """Means over rays of three losses times the trust in each ray, differentiable in image and alpha, and the colour
+    errors, which are not.
+
+    The losses: Huber of the colour error, slope one beyond `huber_delta`; the same of alpha - mask; hard surface,
+    zero for an alpha of 0 or 1 (LOLNeRF, Rebain et al. 2022).
+
+    Args:
+        image: premultiplied colour. alpha: what covers the background.
+        rgba: straight colour and mask of the pixels, in [0, 1].
+        background: random for each ray, so that no colour can pass for transparency.
+        trust: in [0, 1], how far the pixel is taken to show what is learnt.
+    """
+    if not runs_on_numba(image, alpha, rgba, background):
+        return reference.ray_losses(image, alpha, rgba, background, trust, huber_delta)
+    return _RayLosses.apply(image, alpha, rgba, background, trust, huber_delta)

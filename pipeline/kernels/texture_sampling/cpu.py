@@ -1,0 +1,49 @@
+"""Textured pixels on the CPU: a row of pixels is one thread's, so nothing depends on thread timing."""
+
+import numpy as np
+from numba import njit, prange
+
+from pipeline.kernels.common.numba_options import OPTIONS
+
+
+@njit(parallel=True, **OPTIONS)
+def shade_texture_cpu(
+    face_id: np.ndarray,
+    barycentric: np.ndarray,
+    faces_uv: np.ndarray,
+    uv: np.ndarray,
+    texture: np.ndarray,
+    samples: int,
+) -> np.ndarray:
+    """See ``pipeline.kernels.texture_sampling.shade_texture``."""
+    height, width = face_id.shape[0] // samples, face_id.shape[1] // samples
+    texture_height, texture_width, channels = texture.shape
+    image = np.zeros((height, width, channels + 1), np.float32)
+    share = np.float32(1.0 / (samples * samples))
+    for row in prange(height):
+        for fine_row in range(row * samples, (row + 1) * samples):
+            for fine_column in range(width * samples):
+                face = face_id[fine_row, fine_column]
+                if face < 0:
+                    continue
+                u, v = np.float32(0.0), np.float32(0.0)
+                for k in range(3):
+                    corner = faces_uv[face, k]
+                    u += barycentric[fine_row, fine_column, k] * uv[corner, 0]
+                    v += barycentric[fine_row, fine_column, k] * uv[corner, 1]
+                # The zero first: a NaN, which is no texel, then becomes zero.
+                x = min(max(np.float32(0.0), u * texture_width - np.float32(0.5)), np.float32(texture_width - 1))
+                y = min(
+                    max(np.float32(0.0), (np.float32(1.0) - v) * texture_height - np.float32(0.5)),
+                    np.float32(texture_height - 1),
+                )
+                left, top = int(x), int(y)
+                right, bottom = min(left + 1, texture_width - 1), min(top + 1, texture_height - 1)
+                across, down = x - np.float32(left), y - np.float32(top)
+                column = fine_column // samples
+                image[row, column, channels] += share
+                for c in range(channels):
+                    upper = texture[top, left, c] + across * (texture[top, right, c] - texture[top, left, c])
+                    lower = texture[bottom, left, c] + across * (texture[bottom, right, c] - texture[bottom, left, c])
+                    image[row, column, c] += share * (upper + down * (lower - upper))
+    return image

@@ -1,0 +1,60 @@
+"""The exported avatar as it is drawn: posed like a glTF viewer poses it, seen whole from all sides."""
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.avatar.textured_avatar import TexturedAvatar, straight_rgba
+from pipeline.body.body import canonical_to_world
+from tests.avatar.avatar_sample import sample_body, sample_motion
+from tests.stages.report_run import CAMERA, make_avatar
+
+
+@pytest.fixture(scope="module")
+def avatar() -> TexturedAvatar:
+    return make_avatar(sample_body())
+
+
+def test_posing_is_the_weighted_sum_of_its_joints(avatar: TexturedAvatar):
+    pose = canonical_to_world(sample_body(), sample_motion(np.array([0, 5])))[1]
+    posed = avatar.posed(pose).numpy()
+    for vertex in (0, 17, len(posed) - 1):
+        point = np.append(avatar.vertices[vertex].numpy(), 1.0)
+        moved = sum(
+            weight * (pose[joint].numpy() @ point)[:3]
+            for joint, weight in zip(
+                avatar.joint_indices[vertex].tolist(), avatar.joint_weights[vertex].tolist(), strict=True
+            )
+        )
+        assert posed[vertex] == pytest.approx(moved, abs=1e-5)
+
+
+def test_a_render_is_premultiplied_and_shows_the_texture(avatar: TexturedAvatar):
+    pose = canonical_to_world(sample_body(), sample_motion(np.array([0, 5])))[0]
+    image = avatar.render(avatar.posed(pose), CAMERA, samples=2)
+    assert image.shape == (CAMERA.height, CAMERA.width, 4)
+    solid = image[..., 3] == 1.0
+    assert solid.sum() > 200
+    assert (image[..., :3] <= image[..., 3:] * 160 / 255 + 1e-4).all()  # the brightest texel is 160
+    assert (image[solid][:, :3] >= 39 / 255).all()  # the darkest is 40
+
+
+def test_turntable_views_have_one_height_and_touch_their_sides(avatar: TexturedAvatar):
+    views = avatar.turntable(avatar.vertices, views=4, height_px=60, samples=2)
+    assert [view.shape[0] for view in views] == [60] * 4
+    for view in views:
+        assert view[:, 0, 3].any()
+        assert view[:, -1, 3].any()
+    front, side = views[0].shape[1], views[1].shape[1]
+    assert front / side == pytest.approx(0.4 / 0.3, rel=0.2)  # the sample is a box of 0.4 m x 0.3 m
+
+
+def test_straight_alpha_undoes_premultiplication():
+    rgba = np.array([[[0.2, 0.1, 0.0, 0.5], [0.0, 0.0, 0.0, 0.0], [1.0, 1.0, 1.0, 1.0]]], dtype=np.float32)
+    assert straight_rgba(rgba).tolist() == [[[102, 51, 0, 128], [0, 0, 0, 0], [255, 255, 255, 255]]]
+
+
+def test_the_surface_alone_keeps_its_triangles(avatar: TexturedAvatar):
+    mesh = avatar.mesh()
+    assert mesh.is_watertight()
+    assert torch.equal(torch.from_numpy(mesh.faces), avatar.faces)

@@ -1,0 +1,292 @@
+"""Limits of joints: angles against closed forms, poses that people can and cannot take, fits that are led astray."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from data_tools.synthetic.rig.bvh import read_bvh
+from data_tools.synthetic.rig.retarget import retarget
+from data_tools.synthetic.scene.motion import NOVEL_POSES
+from pipeline.body.body import load_anny
+from pipeline.body.fit.camera_parameters import LENS_COUNT
+from pipeline.body.fit.energy import FitState, Objective, Observations, Weights
+from pipeline.body.fit.joint_limits import BALLS, LIMIT_RAD, JointLimits, joint_limits, kind_of, swing_twist
+from pipeline.body.fit.landmark_regressor import LANDMARK_COUNT, OFFSET_COUNT, landmark_regressor
+from pipeline.body.fit.levenberg_marquardt import minimise
+from pipeline.body.fit.linear_body import ACTIVE_JOINTS, FitModel, linearise, pose_points, pose_skeleton
+from pipeline.body.fit.priors import joint_prior, shape_prior
+from pipeline.body.smpl import SmplBody
+from pipeline.geometry.camera import Camera, project
+from pipeline.geometry.rotation import axis_angle_to_matrix, matrix_to_quaternion, quaternion_to_matrix
+from tests.body.smpl_sample import made_up_arrays
+
+MIRROR = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+Pose = dict[str, tuple[float, float, float]]
+
+# Degrees about the body's x, y, z, of the left side; the arm rests 48 degrees below the horizontal.
+POSSIBLE: dict[str, Pose] = {
+    "arm straight up": {"LeftArm": (0, 0, 135)},
+    "arm hangs": {"LeftArm": (0, 0, -41)},
+    "arm held back": {"LeftArm": (55, 0, -41)},
+    "arm forward": {"LeftArm": (0, -85, 40)},
+    "thigh at the belly": {"LeftUpLeg": (-125, 0, 0), "LeftLeg": (140, 0, 0)},
+    "thigh held back": {"LeftUpLeg": (30, 0, 0)},
+    "legs astride": {"LeftUpLeg": (0, 0, 45)},
+    "kick to the side": {"LeftUpLeg": (0, 0, 85)},
+    "legs crossed": {"LeftUpLeg": (-20, 0, -25)},
+    "toes turned out": {"LeftUpLeg": (0, 45, 0)},
+    "deep squat": {"LeftUpLeg": (-115, 0, 0), "LeftLeg": (140, 0, 0), "LeftFoot": (-35, 0, 0), "Spine": (30, 0, 0)},
+    "tiptoe": {"LeftFoot": (50, 0, 0), "LeftToeBase": (-60, 0, 0)},
+    "looks over the shoulder": {"Neck": (0, 25, 0), "Head": (0, 55, 0)},
+    "chin on the chest": {"Neck": (40, 0, 0), "Head": (20, 0, 0)},
+    "touches the floor": {"Spine": (35, 0, 0), "Spine1": (25, 0, 0), "Spine2": (20, 0, 0), "LeftUpLeg": (-80, 0, 0)},
+}
+IMPOSSIBLE: dict[str, tuple[str, tuple[float, float, float]]] = {
+    "thigh straight back": ("LeftUpLeg", (90, 0, 0)),
+    "thigh across the other": ("LeftUpLeg", (0, 0, -80)),
+    "foot turned round": ("LeftUpLeg", (0, 130, 0)),
+    "elbow turned round": ("LeftArm", (-150, 0, 0)),
+    "ear below the shoulder": ("Neck", (0, 0, 90)),
+    "head at the nape": ("Head", (-80, 0, 0)),
+    "face to the back": ("Head", (0, 120, 0)),
+    "waist wrung": ("Spine1", (0, 80, 0)),
+    "broken back": ("Spine", (-60, 0, 0)),
+    "collarbone at the ear": ("LeftShoulder", (0, 0, 90)),
+    "shin at the toes": ("LeftFoot", (-90, 0, 0)),
+    "toes aside": ("LeftToeBase", (0, 60, 0)),
+}
+
+
+@pytest.fixture(scope="module")
+def model() -> FitModel:
+    body = load_anny()
+    return linearise(body, body.shape_defaults)
+
+
+@pytest.fixture(scope="module")
+def limits(model: FitModel) -> JointLimits:
+    return joint_limits(model)
+
+
+def posed(pose: Pose, side: str = "Left") -> torch.Tensor:
+    """Rotations of all joints; the right side mirrors the left."""
+    angles = torch.zeros(1, len(ACTIVE_JOINTS), 3, dtype=torch.float64)
+    for name, degrees in pose.items():
+        turn = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
+        angles[0, ACTIVE_JOINTS.index(name.replace("Left", side))] = turn if side == "Left" else turn * MIRROR
+    return axis_angle_to_matrix(angles)
+
+
+def beyond_deg(limits: JointLimits, rotations: torch.Tensor) -> torch.Tensor:
+    """How far joints are beyond their limits: largest of the three angles."""
+    return torch.rad2deg(limits.residuals(rotations)[0].abs().amax(-1) * LIMIT_RAD)
+
+
+@pytest.mark.parametrize("twist", [0.0, -1e-5, 0.7, -2.9])
+@pytest.mark.parametrize("swing", [(0.0, 0.0), (1e-5, 0.0), (-0.9, 0.4), (1.1, 2.4)])
+def test_twist_and_swing_are_found_again(twist: float, swing: tuple[float, float]) -> None:
+    turn = torch.tensor([[0.0, *swing], [twist, 0.0, 0.0]], dtype=torch.float64)
+    rotation = axis_angle_to_matrix(turn[0]) @ axis_angle_to_matrix(turn[1])
+    angles, _ = swing_twist(rotation)
+    assert torch.allclose(angles, turn.sum(0), atol=1e-9)
+    w, x, _, _ = matrix_to_quaternion(rotation)
+    assert torch.allclose(angles[0], 2.0 * torch.atan2(x, w), atol=1e-9)
+
+
+@pytest.mark.parametrize("size", [1e-7, 1e-2, 1.0, 2.7])
+def test_derivative_of_swing_and_twist_agrees_with_differences(size: float) -> None:
+    direction = torch.nn.functional.normalize(torch.tensor([0.4, -0.7, 0.6], dtype=torch.float64), dim=0)
+    rotation = axis_angle_to_matrix(size * direction)
+    columns = [
+        (swing_twist(axis_angle_to_matrix(step) @ rotation)[0] - swing_twist(axis_angle_to_matrix(-step) @ rotation)[0])
+        for step in 1e-5 * torch.eye(3, dtype=torch.float64)
+    ]
+    assert torch.allclose(swing_twist(rotation)[1], torch.stack(columns, dim=1) / 2e-5, atol=1e-6)
+
+
+def test_derivative_of_the_walls_agrees_with_differences(limits: JointLimits) -> None:
+    """In poses most of which are beyond some wall."""
+    generator = torch.Generator().manual_seed(0)
+    angles = 1.2 * torch.randn(6, len(ACTIVE_JOINTS), 3, generator=generator, dtype=torch.float64)
+    step = 1e-6 * torch.randn(angles.shape, generator=generator, dtype=torch.float64)
+    rotations = axis_angle_to_matrix(angles)
+    residual, derivative = limits.residuals(rotations)
+    ahead, behind = (limits.residuals(axis_angle_to_matrix(sign * step) @ rotations)[0] for sign in (1.0, -1.0))
+    assert 0.3 < (residual[:, 1:] != 0).any(-1).double().mean() < 0.95
+    assert torch.allclose((derivative @ step[..., None])[..., 0], 0.5 * (ahead - behind), atol=1e-7)
+
+
+@pytest.mark.parametrize("side", ["Left", "Right"])
+@pytest.mark.parametrize("pose", POSSIBLE)
+def test_what_people_can_do_costs_nothing(limits: JointLimits, pose: str, side: str) -> None:
+    assert beyond_deg(limits, posed(POSSIBLE[pose], side)).max() == 0.0
+
+
+@pytest.mark.parametrize("side", ["Left", "Right"])
+@pytest.mark.parametrize("pose", IMPOSSIBLE)
+def test_what_nobody_can_do_is_beyond_the_wall_of_that_joint(limits: JointLimits, pose: str, side: str) -> None:
+    name, degrees = IMPOSSIBLE[pose]
+    beyond = beyond_deg(limits, posed({name: degrees}, side))[0]
+    joint = ACTIVE_JOINTS.index(name.replace("Left", side))
+    assert beyond[joint] > 10.0
+    assert beyond.sum() == beyond[joint]
+
+
+@pytest.mark.parametrize(("turn_deg", "free"), [(70.0, True), (110.0, False), (-80.0, True), (-110.0, False)])
+@pytest.mark.parametrize("side", ["Left", "Right"])
+def test_wrists_bend_to_the_palm_and_back(model: FitModel, limits: JointLimits, side: str, turn_deg: float, free: bool):
+    """About the line from the knuckle of the index to that of the little finger; both sides bend with their fingers."""
+    wrist, index, little, tip = (
+        model.full_joints[model.full_by_name[f"{side}Hand{part}"]] for part in ("", "Index1", "Pinky1", "Middle3")
+    )
+    axis = torch.nn.functional.normalize(little - index, dim=0) * (1.0 if side == "Left" else -1.0)
+    curl = torch.linalg.cross(0.5 * (index + little) - wrist, tip - 0.5 * (index + little))
+    assert axis @ curl > 0.0
+    rotations = posed({})
+    rotations[0, ACTIVE_JOINTS.index(f"{side}Hand")] = axis_angle_to_matrix(np.deg2rad(turn_deg) * axis)
+    assert (beyond_deg(limits, rotations).max() == 0.0) == free
+
+
+@pytest.mark.parametrize(
+    ("upper", "forearm", "free"),
+    [
+        ((1, 0, 0), (0, 0, 1), True),  # held sideways: the forearm ahead, up, down, and not backward
+        ((1, 0, 0), (0, 1, 0), True),
+        ((1, 0, 0), (0, -1, 0.4), True),
+        ((1, 0, 0), (0, 0, -1), False),
+        ((0, 0, 1), (0, 1, 0), True),  # held forward: up, to the other side, and not outward
+        ((0, 0, 1), (-1, 0, 0), True),
+        ((0, 0, 1), (1, 0, 0), False),
+        ((0, 1, 0), (-1, 0, 0), True),  # a hand over the head, behind the neck, on the other shoulder, behind the back
+        ((0.6, 0.8, -0.1), (-0.8, -0.1, -0.5), True),
+        ((-0.7, -0.1, 0.7), (-0.6, 0.3, -0.5), True),
+        ((0.2, -0.9, -0.4), (-0.9, 0.1, -0.3), True),
+        ((0, -1, 0), (0, 0, -1), False),  # hanging, with the forearm bent backward
+        ((0, 0, -1), (1, 0, 0), False),  # straight back
+        ((-0.8, 0.6, -0.3), (0, 0, 1), False),  # through the head
+    ],
+)
+def test_an_upper_arm_turns_as_far_as_it_can_wherever_it_points(
+    model: FitModel, limits: JointLimits, upper: tuple, forearm: tuple, free: bool
+) -> None:
+    """The left one: x points outward, y up, z ahead; the elbow is bent, so the forearm tells the twist."""
+    arm, elbow, hand = (ACTIVE_JOINTS.index(f"Left{part}") for part in ("Arm", "ForeArm", "Hand"))
+    rest = framed(model.joints[elbow] - model.joints[arm], model.joints[hand] - model.joints[elbow])
+    rotations = posed({})
+    rotations[0, arm] = framed(torch.tensor(upper).double(), torch.tensor(forearm).double()) @ rest.T
+    assert (beyond_deg(limits, rotations).max() == 0.0) == free
+
+
+def framed(upper: torch.Tensor, lower: torch.Tensor) -> torch.Tensor:
+    """Rotation whose columns are the upper arm, the elbow's axis, and their cross product."""
+    bone = torch.nn.functional.normalize(upper, dim=0)
+    axis = torch.nn.functional.normalize(torch.linalg.cross(upper, lower), dim=0)
+    return torch.stack([bone, axis, torch.linalg.cross(bone, axis)], dim=1)
+
+
+@pytest.mark.parametrize("joints", [24, 55])
+def test_smpl_bodies_have_the_same_limits_by_the_same_names(limits: JointLimits, joints: int) -> None:
+    body = SmplBody(made_up_arrays(joints))
+    found, rest = joint_limits(linearise(body, body.shape_defaults)), posed({})
+    assert (found.reach_rad - found.angles(rest)[0].abs() > np.deg2rad(10.0))[0].all()
+    for pose in POSSIBLE.values():
+        assert torch.allclose(found.angles(posed(pose))[0], limits.angles(posed(pose))[0], atol=0.2)
+
+
+def test_both_sides_have_the_same_limits(limits: JointLimits) -> None:
+    generator = torch.Generator().manual_seed(1)
+    for name in ("LeftUpLeg", "LeftArm", "LeftForeArm", "LeftHand", "LeftFoot", "LeftShoulder"):
+        for degrees in (90.0 * torch.randn(20, 3, generator=generator)).tolist():
+            sides = [beyond_deg(limits, posed({name: degrees}, side)).max() for side in ("Left", "Right")]
+            assert sides[0] == pytest.approx(sides[1], abs=1.0)
+
+
+def test_the_novel_poses_of_synthetic_captures_are_possible(limits: JointLimits) -> None:
+    for pose in NOVEL_POSES.values():
+        assert beyond_deg(limits, posed({name: np.rad2deg(turn).tolist() for name, turn in pose.items()})).max() == 0.0
+
+
+@pytest.mark.parametrize("name", ["cmu1_jumping_jacks", "fair1_zombie", "rokoko_jesse_dance"])
+def test_recorded_motions_keep_within_the_limits(limits: JointLimits, shared_data: Path, name: str) -> None:
+    """Jumping jacks, a staggering walk, and a dance with high kicks to the side; elbows and knees apart, whose axes
+    differ from skeleton to skeleton."""
+    model = load_anny()
+    body = model.body(model.shape_defaults)
+    motion = retarget(read_bvh(shared_data / "motions" / f"{name}.bvh"), body, np.zeros(3), in_place=True)
+    everything = quaternion_to_matrix(torch.tensor(motion.rotations_wxyz, dtype=torch.float64))
+    rotations = everything[:, [body.joint(joint) for joint in ACTIVE_JOINTS]]
+    balls = [kind_of(joint) in BALLS for joint in ACTIVE_JOINTS]
+    beyond = beyond_deg(limits, rotations)[:, balls]
+    print(
+        f"{name}: {float((beyond > 0).any(1).double().mean()):.4f} of frames, {float(beyond.max()):.1f} degrees beyond"
+    )
+    assert beyond.max() == 0.0
+
+
+ASTRAY: Pose = {
+    "LeftUpLeg": (95, 0, 0),
+    "LeftArm": (-150, 0, 0),
+    "LeftShoulder": (0, 0, 100),
+    "Head": (0, 140, 0),
+    "LeftHand": (0, 110, 0),
+}
+"""What a detector takes a joint's angles for, in every frame."""
+
+
+@pytest.fixture(scope="module")
+def objective(model: FitModel) -> Objective:
+    """To be given observations; two frames of a detector that is very sure, else the pose prior alone holds a neck."""
+    body, camera = load_anny(), Camera(520.0, 520.0, 128.0, 160.0, 256, 320)
+    nothing = torch.zeros(2, LANDMARK_COUNT, 3, dtype=torch.float64)
+    seen = Observations(
+        torch.tensor([0.0, 0.1], dtype=torch.float64), nothing[..., :2], nothing, *2 * [nothing[..., 0] + 1.0], camera
+    )
+    priors = joint_prior(model), shape_prior(body.shape_names, body.shape_defaults)
+    scale = torch.full((2,), 520.0 / 3.0, dtype=torch.float64)
+    return Objective(
+        model,
+        landmark_regressor(model),
+        *priors,
+        seen,
+        Weights(landmark_m=0.002, direction_m=0.005, free_shape=False),
+        scale,
+    )
+
+
+def fitted(objective: Objective, pose: Pose, with_limits: bool) -> torch.Tensor:
+    """Rotations fitted to the landmarks of a person in a pose, from that pose on."""
+    model, seen = objective.model, objective.observations
+    nothing = [torch.zeros(count, dtype=torch.float64) for count in (OFFSET_COUNT, LENS_COUNT)]
+    root = torch.tensor([[0.0, -0.05, -3.0]], dtype=torch.float64).repeat(2, 1)
+    start = FitState(posed(pose).repeat(2, 1, 1, 1), root, model.shape, *nothing)
+    skeleton = pose_skeleton(model, start.rotations, start.root_m)
+    world, _ = pose_points(model, skeleton, objective.regressor.points(model, start.offsets_m))
+    pixels, _ = project(world, seen.camera)
+    seen = replace(seen, landmarks_px=pixels, directions_m=world - 0.5 * (world[:, 23:24] + world[:, 24:25]))
+    prior = objective.joint_prior
+    if not with_limits:
+        endless = torch.full_like(prior.limits.reach_rad, 10.0)
+        prior = replace(prior, limits=replace(prior.limits, reach_rad=endless))
+    told = replace(objective, observations=seen, joint_prior=prior)
+    return minimise(start, told, told.retract, 12)[0].rotations
+
+
+@pytest.mark.parametrize("name", ASTRAY)
+def test_landmarks_that_would_break_a_joint_are_held(objective: Objective, limits: JointLimits, name: str) -> None:
+    joint = ACTIVE_JOINTS.index(name)
+    broken, held = (
+        float(beyond_deg(limits, fitted(objective, {name: ASTRAY[name]}, with_limits))[:, joint].max())
+        for with_limits in (False, True)
+    )
+    print(f"{name}: {broken:.1f} degrees beyond without limits, {held:.1f} with them")
+    assert broken > 5.0
+    assert held < 0.35 * broken
+
+
+@pytest.mark.parametrize("pose", ["deep squat", "kick to the side", "arm straight up", "looks over the shoulder"])
+def test_an_extreme_pose_that_is_possible_is_found_as_without_limits(objective: Objective, pose: str) -> None:
+    found, free = (fitted(objective, POSSIBLE[pose], with_limits) for with_limits in (True, False))
+    assert torch.allclose(found, free, atol=1e-6)

@@ -1,0 +1,69 @@
+import torch
+
+from pipeline.body.body import load_anny
+from pipeline.body.fit.landmark_regressor import (
+    LANDMARK_COUNT,
+    LANDMARKS,
+    OFFSET_COUNT,
+    PAIRS,
+    landmark_noise,
+    landmark_regressor,
+    mirror_permutation,
+)
+from pipeline.body.fit.linear_body import linearise
+
+
+def test_the_table_names_every_landmark_once() -> None:
+    assert sorted(index for landmark in LANDMARKS for index in landmark.indices) == list(range(LANDMARK_COUNT))
+
+
+def test_landmarks_lie_where_the_table_says_and_mirror_each_other() -> None:
+    body = load_anny()
+    model = linearise(body, body.shape_defaults)
+    rest = landmark_regressor(model).points(model, torch.zeros(OFFSET_COUNT, dtype=torch.float64)).rest[0]
+    for landmark in LANDMARKS:
+        assert torch.allclose(
+            rest[landmark.indices[0]], torch.tensor(body.landmark_places_m[landmark.name]).double(), atol=1e-6
+        )
+    for left, right in PAIRS:
+        assert torch.allclose(rest[left] * torch.tensor([-1.0, 1.0, 1.0]), rest[right], atol=1e-6)
+        assert rest[left, 0] > 0  # the person's left is +X
+
+
+def test_landmarks_follow_the_shape() -> None:
+    body = load_anny()
+    default = linearise(body, body.shape_defaults)
+    shape = body.shape_defaults.clone()
+    shape[body.shape_names.index("lowerleg-length")] = 0.5
+    longer = linearise(body, shape)
+    regressor, offsets = landmark_regressor(default), torch.zeros(OFFSET_COUNT, dtype=torch.float64)
+    shins = []
+    for model in (default, longer):
+        rest = regressor.points(model, offsets).rest[0]
+        shins.append((rest[25] - rest[27]).norm())
+    assert shins[1] > shins[0] + 0.02
+
+
+def test_offsets_move_both_sides_in_mirror_image() -> None:
+    body = load_anny()
+    model = linearise(body, body.shape_defaults)
+    regressor = landmark_regressor(model)
+    offsets = torch.zeros(OFFSET_COUNT, dtype=torch.float64)
+    knee = next(row for row, landmark in enumerate(LANDMARKS) if landmark.name == "knee")
+    offsets[3 * knee : 3 * knee + 3] = torch.tensor([0.01, 0.02, 0.03])
+    moved = regressor.points(model, offsets).rest[0] - regressor.points(model, 0 * offsets).rest[0]
+    assert torch.allclose(moved[25], torch.tensor([0.01, 0.02, 0.03]).double())
+    assert torch.allclose(moved[26], torch.tensor([-0.01, 0.02, 0.03]).double())
+    assert torch.count_nonzero(moved) == 6
+
+
+def test_exchanging_twice_changes_nothing() -> None:
+    order = mirror_permutation(PAIRS)
+    assert [order[index] for index in order] == list(range(LANDMARK_COUNT))
+    assert order[0] == 0
+    assert order[11] == 12
+
+
+def test_noise_is_symmetric() -> None:
+    noise = landmark_noise()
+    assert torch.equal(noise, noise[mirror_permutation(PAIRS)])

@@ -1,0 +1,79 @@
+import numpy as np
+import pytest
+import torch
+
+from pipeline.body.body import canonical_to_world, load_anny
+from pipeline.body.pose_correction import PoseCorrection
+from tests.field.scene import make_motion
+
+
+@pytest.fixture(scope="module")
+def body():
+    anny = load_anny()
+    return anny.body(anny.shape_defaults)
+
+
+@pytest.fixture
+def correction(body):
+    return PoseCorrection(body, make_motion(body, 6).select(np.array([0, 2, 3, 5])))
+
+
+def test_no_correction_is_the_fitted_motion(body, correction):
+    rows = torch.tensor([0, 3])
+    truth = canonical_to_world(body, correction.motion)[rows]
+    torch.testing.assert_close(correction.canonical_to_world(rows), truth, atol=1e-5, rtol=0)
+    assert float(correction.roughness().detach()) == 0
+    assert float(correction.size().detach()) == 0
+
+
+def test_corrected_motion_is_what_was_learnt(body, correction):
+    with torch.no_grad():
+        correction.rotation_rad.normal_(std=0.05)
+        correction.shift_m.normal_(std=0.01)
+    again = canonical_to_world(body, correction.corrected(correction.motion))
+    learnt = correction.canonical_to_world(torch.arange(4)).detach()
+    torch.testing.assert_close(again, learnt, atol=1e-5, rtol=0)
+
+
+def test_frames_between_get_the_mean_of_their_neighbours(body, correction):
+    with torch.no_grad():
+        correction.shift_m[0, 0], correction.shift_m[1, 0] = 0.02, 0.04
+    motion = make_motion(body, 6)
+    shift = correction.corrected(motion).root_translation_m - motion.root_translation_m
+    np.testing.assert_allclose(shift[:3, 0], [0.02, 0.03, 0.04], atol=1e-6)
+    np.testing.assert_allclose(shift[5, 0], 0.0, atol=1e-6)
+
+
+def test_roughness_grows_with_jumps_and_shrinks_with_time_between(body, correction):
+    with torch.no_grad():
+        correction.shift_m[2:] = 0.01
+    near = float(correction.roughness().detach())
+    with torch.no_grad():
+        correction.shift_m[2] = 0.0
+    # The jump now lies between frames 3 and 5, which are twice as far apart as frames 2 and 3.
+    assert float(correction.roughness().detach()) == pytest.approx(near / 2, rel=1e-5)
+
+
+@pytest.mark.parametrize("size", [0.0, 3e-3, 0.4, 2.5])
+def test_the_compiled_chain_is_the_plain_one(body, correction, size):
+    """Forward and in gradient, against float64; small corrections are on the series of Rodrigues' factors."""
+    random = torch.Generator().manual_seed(1)
+    rows, motion = torch.tensor([2, 0, 3]), correction.motion
+    shape = correction.rotation_rad.shape
+    with torch.no_grad():
+        correction.rotation_rad.copy_(
+            size * torch.nn.functional.normalize(torch.randn(shape, generator=random), dim=-1)
+        )
+        correction.shift_m.normal_(std=0.05, generator=random)
+    rigid = canonical_to_world(body, motion)[rows, 5].inverse().contiguous()
+    ours = correction.canonical_to_posed(rows, rigid)
+    twin = rigid[:, None] @ correction.canonical_to_world(rows)
+    torch.testing.assert_close(ours, twin, atol=2e-6, rtol=0)
+    weights = torch.randn(ours.shape, generator=random)
+    found, truth = (
+        torch.autograd.grad((matrices * weights).sum(), (correction.rotation_rad, correction.shift_m))
+        for matrices in (ours, twin)
+    )
+    for mine, theirs in zip(found, truth, strict=True):
+        assert not mine[1].any()
+        torch.testing.assert_close(mine, theirs, atol=3e-5 * float(theirs.abs().max()), rtol=0)

@@ -1,0 +1,230 @@
+"""SMPL-like models: bind pose, shape, landmarks, conversion of poses, and a fit that finds a known person."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.body.body import Motion, ParametricBody, canonical_to_world, load_anny
+from pipeline.body.fit.fit import FitOptions, FitResult, fit_body
+from pipeline.body.fit.landmark_regressor import LANDMARKS
+from pipeline.body.fit.linear_body import ACTIVE_JOINTS, GRIP_RAD, grip_rotations, relaxed_curls
+from pipeline.body.fit.priors import shape_prior
+from pipeline.body.smpl import ARM_DIRECTIONS, FINGER_BEND_RAD, JOINT_NAMES, SmplBody, rotation_between
+from pipeline.geometry.rotation import (
+    axis_angle_to_matrix,
+    matrix_to_quaternion,
+    quaternion_to_axis_angle,
+)
+from pipeline.geometry.skinning import forward_kinematics, linear_blend_skinning, skinning_transforms
+from tests.body.acting import Act, act, fitted_joints_m, joint_errors_m
+from tests.body.smpl_sample import made_up_arrays, smpl_vertices
+
+FRAMES = 16
+BETAS = {"beta_0": 1.0, "beta_1": 1.5, "beta_4": -1.0}
+
+
+@pytest.fixture(scope="module", params=sorted(JOINT_NAMES))
+def model(request: pytest.FixtureRequest) -> SmplBody:
+    return SmplBody(made_up_arrays(request.param))
+
+
+@pytest.fixture(scope="module")
+def smpl() -> SmplBody:
+    return SmplBody(made_up_arrays(24))
+
+
+def test_names_are_those_of_the_built_in_body_and_face(model: SmplBody) -> None:
+    anny = load_anny()
+    assert isinstance(model, ParametricBody)
+    assert set(ACTIVE_JOINTS) <= set(model.joint_names)
+    assert set(model.joint_names) - set(anny.joint_names) <= {"Jaw", "LeftEye", "RightEye"}
+    for name, parent in zip(model.joint_names[1:], model.parents[1:], strict=True):
+        above = model.joint_names[parent]
+        if name in anny.joint_names:
+            assert above == anny.joint_names[anny.parents[anny.joint_names.index(name)]]
+
+
+def test_arms_hang_as_those_of_the_built_in_body() -> None:
+    """The made-up model is the built-in body in a T-pose, so its A-pose must be that body's joints again."""
+    anny, model = load_anny(), SmplBody(made_up_arrays(24))
+    expected = anny.body(anny.shape_defaults)
+    found = model.body(model.shape_defaults)
+    for name in ACTIVE_JOINTS:
+        np.testing.assert_allclose(
+            found.joints_m[found.joint(name)], expected.joints_m[expected.joint(name)], atol=0.005, err_msg=name
+        )
+    assert abs(found.vertices[:, 1].min()) < 1e-5
+    for name, direction in ARM_DIRECTIONS.items():
+        child = {"Arm": "ForeArm", "ForeArm": "Hand"}[name]
+        bone = found.joints_m[found.joint(f"Right{child}")] - found.joints_m[found.joint(f"Right{name}")]
+        assert bone / np.linalg.norm(bone) @ (np.array(direction) * [-1, 1, 1]) > 0.999
+
+
+def test_landmarks_lie_where_they_lie_on_the_built_in_body(model: SmplBody) -> None:
+    expected = load_anny().landmark_places_m
+    assert set(model.landmark_places_m) == {landmark.name for landmark in LANDMARKS}
+    for name, place in expected.items():
+        assert np.linalg.norm(np.subtract(model.landmark_places_m[name], place)) < 0.02, name
+
+
+def test_shape_is_linear_in_the_t_pose_and_differentiable(smpl: SmplBody) -> None:
+    arrays = made_up_arrays(24)
+    betas = torch.linspace(-1.0, 1.0, 10).requires_grad_()
+    vertices, joints = smpl.rest(betas)
+    t_pose = arrays.template_m + arrays.shape_directions_m @ betas.detach().numpy()
+    head = np.flatnonzero(arrays.skin_weights[:, smpl.joint_names.index("Head")] > 0.999)
+    moved = vertices[head].detach().numpy() - t_pose[head]  # above the neck the A-pose is the T-pose, moved as a whole
+    np.testing.assert_allclose(moved, np.broadcast_to(moved[0], moved.shape), atol=1e-5)
+    pelvis = arrays.joint_regressor[0] @ t_pose
+    np.testing.assert_allclose(joints[0, 1].detach().numpy() - pelvis[1], moved[0, 1], atol=1e-5)
+    vertices[:, 1].max().backward()
+    assert betas.grad is not None
+    assert betas.grad[0] > 0.02  # the first made-up beta enlarges
+
+
+def test_fingers_bend_towards_the_palm() -> None:
+    """In SMPL's T-pose the palms face down; a bent finger's tip lies lower along the palm's normal."""
+    body = SmplBody(made_up_arrays(55))
+    grip = quaternion_to_axis_angle(matrix_to_quaternion(grip_rotations(body, relaxed_curls())))
+    for side, sign in (("Left", 1.0), ("Right", -1.0)):
+        index = body.joint_names.index(f"{side}HandMiddle2")
+        hand = body.local_rotations(torch.eye(3).repeat(1, 55, 1, 1))[0, 0]
+        assert torch.allclose(hand, torch.eye(3))
+        assert float(grip[index].norm()) == pytest.approx(GRIP_RAD, abs=1e-6)
+        bind = _bind_rotations(body)[body.joint_names.index(f"{side}Hand")].double()
+        closing = bind @ torch.tensor([0.0, 0.0, -sign], dtype=torch.float64)  # about it a straight finger closes
+        assert grip[index] @ closing > 0.7 * GRIP_RAD
+    assert FINGER_BEND_RAD > 0
+
+
+def test_a_body_without_fingers_has_no_grip(smpl: SmplBody) -> None:
+    assert torch.equal(grip_rotations(smpl, relaxed_curls()), torch.eye(3).double().repeat(24, 1, 1))
+
+
+def _bind_rotations(body: SmplBody) -> torch.Tensor:
+    """World rotations of SMPL's joints in the A-pose: what undoes the local rotations of the T-pose."""
+    t_pose = body.local_rotations(torch.eye(3).repeat(1, len(body.parents), 1, 1))
+    world = forward_kinematics(t_pose, torch.zeros(1, 3), torch.zeros(len(body.parents), 3), body.parents)
+    return world[0, :, :3, :3].transpose(-1, -2)
+
+
+def test_a_pose_of_smpl_is_the_same_pose_here(smpl: SmplBody) -> None:
+    """SMPL's own skinning from the T-pose and ours from the A-pose agree where one joint alone moves the surface."""
+    arrays = made_up_arrays(24)
+    generator = torch.Generator().manual_seed(0)
+    theta = axis_angle_to_matrix(0.4 * torch.randn(1, 24, 3, generator=generator))
+    t_vertices = torch.tensor(arrays.template_m).float()
+    t_joints = torch.tensor(arrays.joint_regressor @ arrays.template_m).float()
+    expected_pose = forward_kinematics(theta, t_joints[None, 0], t_joints, smpl.parents)
+    weights = torch.from_numpy(smpl.skin_weights)
+    expected = linear_blend_skinning(t_vertices, weights, skinning_transforms(expected_pose, t_joints))
+    vertices, joints = smpl.rest(smpl.shape_defaults)
+    pose = forward_kinematics(smpl.local_rotations(theta), t_joints[None, 0], joints, smpl.parents)
+    found = linear_blend_skinning(vertices, weights, skinning_transforms(pose, joints))
+    assert torch.allclose(pose[..., :3, 3], expected_pose[..., :3, 3], atol=1e-5)
+    rigid = weights.max(dim=1).values > 0.999
+    assert rigid.sum() > 300
+    assert torch.allclose(found[0, rigid], expected[0, rigid], atol=1e-4)
+
+
+@pytest.mark.parametrize("count", [24, 52])
+def test_poses_that_others_fitted_stand_where_smpl_puts_them(count: int) -> None:
+    """Shape, translation and a turned space included: every joint lies where SMPL's own formula has it."""
+    arrays, body = made_up_arrays(count), SmplBody(made_up_arrays(count))
+    random = np.random.default_rng(0)
+    pose, transl, betas = (random.normal(0.0, 0.4, (3, *shape)).astype(np.float32) for shape in ((24, 3), (3,), (10,)))
+    pose[:, 22:] = 0.0
+    to_world = np.tile(np.eye(4, dtype=np.float32), (3, 1, 1))
+    to_world[:, :3, :3] = axis_angle_to_matrix(torch.tensor([3.0, 0.2, -0.1])).numpy()
+    to_world[:, :3, 3] = [0.1, -0.2, 4.0]
+    rotations, root_m = body.placed(*map(torch.from_numpy, (pose, transl, betas, to_world)))
+    assert rotations.shape[1] == (24 if count == 24 else 22)
+    for frame in range(3):
+        theta = np.zeros((count, 3))
+        theta[:22] = pose[frame, :22]
+        _, expected = smpl_vertices(arrays, betas[frame], theta, transl[frame])
+        expected = expected @ to_world[frame, :3, :3].T + to_world[frame, :3, 3]
+        joints_m = body.rest(torch.from_numpy(betas[frame]))[1]
+        local = torch.eye(3).repeat(1, count, 1, 1)
+        local[0, : rotations.shape[1]] = rotations[frame]
+        found = forward_kinematics(local, root_m[frame : frame + 1], joints_m, body.parents)[0, :22, :3, 3]
+        np.testing.assert_allclose(found, expected[:22], atol=1e-4)
+
+
+def test_poses_of_the_real_data_set_stand_where_smpl_puts_them(shared_data: Path, smpl: SmplBody) -> None:
+    """InstantAvatar's own file: the surface too, where one joint alone moves it."""
+    with np.load(shared_data / "formats" / "male-3-casual_test.npz") as file:
+        pose = np.concatenate([file["global_orient"], file["body_pose"]], axis=1)[::20].reshape(-1, 24, 3)
+        transl, betas = file["transl"][::20], np.repeat(file["betas"], len(pose), axis=0)
+    here = torch.eye(4).repeat(len(pose), 1, 1)
+    rotations, root_m = smpl.placed(*map(torch.from_numpy, (pose, transl, betas)), here)
+    body = smpl.body(torch.from_numpy(betas[0]))
+    quaternions = matrix_to_quaternion(rotations).numpy()
+    motion = Motion(np.arange(len(pose), dtype=np.int32), np.arange(len(pose)) / 25.0, quaternions, root_m.numpy())
+    weights = torch.from_numpy(body.skin_weights)
+    found = linear_blend_skinning(torch.from_numpy(body.vertices), weights, canonical_to_world(body, motion))
+    rigid = (weights.max(dim=1).values > 0.999).numpy()
+    for frame in range(len(pose)):
+        expected, _ = smpl_vertices(made_up_arrays(24), betas[0], pose[frame], transl[frame])
+        np.testing.assert_allclose(found[frame, rigid], expected[rigid], atol=5e-4)
+
+
+def test_poses_fitted_with_smpl_hold_for_models_with_its_shapes() -> None:
+    assert [SmplBody(made_up_arrays(count)).takes_smpl_poses(10) for count in (24, 52, 55)] == [True, True, False]
+    assert not SmplBody(made_up_arrays(24)).takes_smpl_poses(16)
+
+
+def test_smallest_rotation_between_directions() -> None:
+    x, y = torch.tensor([2.0, 0.0, 0.0]), torch.tensor([0.0, 0.5, 0.0])
+    assert torch.allclose(rotation_between(x, y), axis_angle_to_matrix(torch.tensor([0.0, 0.0, np.pi / 2])), atol=1e-6)
+    assert torch.allclose(rotation_between(x, x), torch.eye(3))
+
+
+def test_betas_have_a_unit_prior(smpl: SmplBody) -> None:
+    prior = shape_prior(smpl.shape_names, smpl.shape_defaults)
+    assert prior.deviation.tolist() == [1.0] * 10
+    assert prior.lowest.tolist() == [-5.0] * 10
+    assert prior.highest.tolist() == [5.0] * 10
+
+
+def test_a_model_with_other_joints_is_refused() -> None:
+    arrays = made_up_arrays(24)
+    with pytest.raises(ValueError, match="23 joints"):
+        SmplBody(
+            replace(
+                arrays,
+                parents=arrays.parents[:23],
+                joint_regressor=arrays.joint_regressor[:23],
+                skin_weights=arrays.skin_weights[:, :23],
+            )
+        )
+
+
+@pytest.fixture(scope="module")
+def fitted(smpl: SmplBody) -> tuple[Act, FitResult]:
+    scene = act(smpl, FRAMES, shape=BETAS, noise_m=0.005)
+    options = FitOptions(scene.model.height_m()[0], focal_deviation=0.0, shared_frames=FRAMES, rounds=4)
+    return scene, fit_body(smpl, scene.observations(scene.camera), scene.windows(), options)
+
+
+def test_the_fit_finds_a_known_pose(fitted: tuple[Act, FitResult]) -> None:
+    scene, result = fitted
+    found = fitted_joints_m(result, scene)
+    aligned, absolute = joint_errors_m(found, scene.joints_m())
+    assert aligned < 0.015
+    assert absolute < 0.030
+    assert np.median(result.overlap) > 0.95
+
+
+def test_the_fit_finds_a_known_shape(fitted: tuple[Act, FitResult], smpl: SmplBody) -> None:
+    """The surface is nearer to the true one than the mean body scaled to its stature would be, and within 1 cm."""
+    scene, result = fitted
+    true = scene.model.vertices.numpy()
+    mean = smpl.body(smpl.shape_defaults).vertices
+    mean = mean * (np.ptp(true[:, 1]) / np.ptp(mean[:, 1]))
+    error = np.linalg.norm(result.body.vertices - true, axis=1).mean()
+    assert error < 0.010
+    assert error < 0.5 * np.linalg.norm(mean - true, axis=1).mean()

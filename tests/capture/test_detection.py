@@ -1,0 +1,180 @@
+"""The two walks through a recording, without the detector: masks and landmarks lie beside the images."""
+
+import numpy as np
+import pytest
+
+from pipeline.capture import detection as sightings
+from pipeline.capture.capture import image_path, mask_path
+from pipeline.capture.detection import _windows, look_at_all, write_frames
+from pipeline.capture.hand_detector import no_hands
+from pipeline.capture.person_detector import Detection
+from pipeline.capture.process_pool import start_workers
+from pipeline.capture.user_files import find_supplied
+from pipeline.capture.video import Frame, open_source
+from pipeline.core.errors import UserError
+from pipeline.io.image import read_gray, read_rgb, write_gray, write_rgb
+from pipeline.io.npz import load_npz, save_npz
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Twelve images of a bar that walks to the right; frame 5 is empty and its landmarks are unknown."""
+    (tmp_path / "in" / "masks").mkdir(parents=True)
+    landmarks = np.zeros((12, 33, 2))
+    for k in range(12):
+        mask = np.zeros((40, 60), np.uint8)
+        if k != 5:
+            mask[5:35, 4 * k : 4 * k + 10] = 255
+        write_rgb(
+            tmp_path / "in" / f"{k}.png", np.where(mask[..., None] > 0, np.uint8(200), np.uint8(k + 10)).repeat(3, 2)
+        )
+        write_gray(tmp_path / "in" / "masks" / f"{k}.png", mask)
+        landmarks[k] = np.nan if k == 5 else (4 * k + 5, 20)
+    world = np.where(np.isnan(landmarks[..., :1]), np.nan, np.ones(3))
+    save_npz(tmp_path / "in" / "landmarks.npz", {"landmarks_px": landmarks, "landmarks_world_m": world})
+    return tmp_path
+
+
+class OneDetector:
+    """In the place of both detectors: the same finding in every frame but those that show nobody."""
+
+    landmarks_px = np.full((33, 2), 7.0, np.float32)
+    landmarks_world_m = np.arange(99, dtype=np.float32).reshape(33, 3)
+
+    def detect(self, rgb):
+        if rgb.max() < 100:
+            return None
+        mask = np.where(rgb[..., 0] > 100, np.uint8(255), np.uint8(0))
+        return Detection(self.landmarks_px, np.full(33, 0.5, np.float32), self.landmarks_world_m, mask)
+
+    def count_people(self, rgb):
+        return 1
+
+    def look(self, rgb, *pose):
+        return no_hands()
+
+
+@pytest.fixture
+def detector(monkeypatch):
+    for name in ("_detector", "_hand_detector"):
+        monkeypatch.setattr(sightings, name, OneDetector)
+    return OneDetector
+
+
+def change_landmarks(folder, **changes):
+    """Rewrite `landmarks.npz`: arrays that are replaced, or left out when None."""
+    path = folder / "in" / "landmarks.npz"
+    save_npz(path, {name: array for name, array in (load_npz(path) | changes).items() if array is not None})
+
+
+def look(folder, stride=1, max_side_px=60):
+    source = open_source(folder / "in")
+    supplied = find_supplied(folder / "in", source)
+    with start_workers(1) as workers:
+        looked_at = range(0, source.n_frames, stride)
+        return source, supplied, look_at_all(source, supplied, looked_at, 2, max_side_px, workers)
+
+
+def test_all_frames_are_seen_and_an_empty_one_is_not_found(folder):
+    _, _, seen = look(folder)
+    np.testing.assert_array_equal(seen.frame_index, np.arange(12))
+    np.testing.assert_array_equal(np.flatnonzero(~seen.found), [5])
+    np.testing.assert_array_equal(seen.landmarks_px[3, 0], [17, 20])
+    assert seen.persons[3].sum() == 300
+    assert (seen.n_people == -1).all()
+    assert (seen.width, seen.height, seen.scale) == (60, 40, 1.0)
+
+
+def test_one_landmark_that_is_unknown_drops_no_frame(folder):
+    points = load_npz(folder / "in" / "landmarks.npz")["landmarks_px"]
+    points[8, 13] = np.nan
+    change_landmarks(folder, landmarks_px=points)
+    _, _, seen = look(folder)
+    np.testing.assert_array_equal(np.flatnonzero(~seen.found), [5])
+    assert np.argwhere(np.isnan(seen.landmarks_px[8]).any(axis=1)).tolist() == [[13]]
+    assert (seen.landmarks_visibility[8] == (np.arange(33) != 13)).all()
+
+
+def test_a_supplied_mask_shows_a_person_whom_the_detector_misses(folder, detector):
+    """Frame 3 is black, so that nothing is detected there, but its mask lies beside it."""
+    (folder / "in" / "landmarks.npz").unlink()
+    write_rgb(folder / "in" / "3.png", np.zeros((40, 60, 3), np.uint8))
+    _, _, seen = look(folder)
+    np.testing.assert_array_equal(np.flatnonzero(~seen.found), [5])
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(seen.landmarks_px).all(axis=(1, 2))), [3, 5])
+    assert seen.persons[3].sum() == 300
+
+
+def test_specks_of_a_mask_show_nobody(folder):
+    speck = np.zeros((40, 60), np.uint8)
+    speck[3:5, 7:9] = 255
+    write_gray(folder / "in" / "masks" / "5.png", speck)
+    _, _, seen = look(folder)
+    np.testing.assert_array_equal(np.flatnonzero(~seen.found), [5])
+
+
+def test_landmarks_without_depth_get_it_from_the_detector(folder, detector):
+    change_landmarks(folder, landmarks_world_m=None)
+    _, _, seen = look(folder)
+    np.testing.assert_array_equal(seen.landmarks_px[3, 0], [17, 20])
+    assert (seen.landmarks_visibility[3] == 1).all()
+    np.testing.assert_array_equal(seen.landmarks_world_m[3], detector.landmarks_world_m)
+    assert np.isnan(seen.landmarks_world_m[5]).all()
+
+
+def test_landmarks_with_depth_need_no_detector(folder, monkeypatch):
+    monkeypatch.setattr(sightings, "_detector", None)
+    _, _, seen = look(folder)
+    assert (seen.landmarks_world_m[3] == 1).all()
+
+
+def test_a_stride_keeps_indices_and_a_smaller_size_scales_landmarks(folder):
+    _, _, seen = look(folder, stride=3, max_side_px=30)
+    np.testing.assert_array_equal(seen.frame_index, [0, 3, 6, 9])
+    np.testing.assert_allclose(seen.time_s, np.array([0, 3, 6, 9]) / 30)
+    np.testing.assert_allclose(seen.landmarks_px[1, 0], [8.5, 10])
+    assert (seen.width, seen.height, seen.scale) == (30, 20, 0.5)
+
+
+def test_chosen_frames_are_written_with_their_masks_as_given(folder):
+    source, supplied, seen = look(folder)
+    out = folder / "out"
+    out.mkdir()
+    with start_workers(1) as workers:
+        write_frames(source, supplied, seen, [0, 4, 11], out, 60, 1.0, workers)
+    assert sorted(path.name for path in (out / "images").iterdir()) == ["000000.png", "000004.png", "000011.png"]
+    for k in (0, 4, 11):
+        np.testing.assert_array_equal(read_rgb(image_path(out, k)), read_rgb(folder / "in" / f"{k}.png"))
+        np.testing.assert_array_equal(read_gray(mask_path(out, k)), read_gray(folder / "in" / "masks" / f"{k}.png"))
+
+
+def test_where_a_mask_is_soft_the_picture_holds_the_persons_colour(folder):
+    mask = read_gray(folder / "in" / "masks" / "4.png")
+    mask[4, 16:26], mask[35, 16:26] = 128, 64
+    image = np.where(mask[..., None] == 128, np.uint8(107), read_rgb(folder / "in" / "4.png"))
+    write_rgb(folder / "in" / "4.png", np.where(mask[..., None] == 64, np.uint8(60), image))
+    write_gray(folder / "in" / "masks" / "4.png", mask)
+    source, supplied, seen = look(folder)
+    out = folder / "out"
+    out.mkdir()
+    with start_workers(1) as workers:
+        write_frames(source, supplied, seen, [4], out, 60, 1.0, workers)
+    written = read_rgb(image_path(out, 4))
+    np.testing.assert_allclose(written[4:36, 16:26], 200, atol=1)
+    np.testing.assert_array_equal(written[[3, 36], 16:26], 14)
+    np.testing.assert_array_equal(read_gray(mask_path(out, 4)), mask)
+
+
+def test_a_mask_of_another_shape_is_named(folder):
+    write_gray(folder / "in" / "masks" / "7.png", np.zeros((60, 40), np.uint8))
+    with pytest.raises(UserError, match="mask of frame 7"):
+        look(folder)
+
+
+def test_windows_hold_each_wanted_frame_with_its_neighbours(folder):
+    _, _, seen = look(folder)
+    frames = [Frame(k, k / 30, np.zeros((1, 1, 3), np.uint8), 1.0) for k in range(12)]
+    windows = [
+        (position, [frame.index for frame in near]) for position, near in _windows(frames, seen, {0, 4, 6, 7, 11})
+    ]
+    assert windows == [(0, [0, 1]), (4, [3, 4]), (6, [6, 7]), (7, [6, 7, 8]), (11, [10, 11])]

@@ -1,0 +1,111 @@
+"""The choice of frames: properties that must hold for any recording, and small cases worked by hand."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.capture import frame_selection as selection
+
+
+def test_split_rule():
+    index = np.arange(24)
+    split = selection.split_of(index)
+    np.testing.assert_array_equal(index[split == selection.HELDOUT], [0, 8, 16])
+    np.testing.assert_array_equal(index[split == selection.VALIDATION], [4, 12, 20])
+    assert (split == selection.TRAIN).sum() == 18
+
+
+def test_ranges_join_neighbours_among_the_frames():
+    index = np.array([0, 3, 6, 9, 12, 40])
+    assert selection.frame_ranges(index, np.array([1, 0, 1, 1, 1, 0], dtype=bool)) == "0, 6-12"
+    assert selection.frame_ranges(index, np.zeros(6, dtype=bool)) == ""
+    assert selection.frame_ranges(index, np.ones(6, dtype=bool)) == "0-40"
+
+
+def moving_square(n: int, step: int) -> tuple[np.ndarray, np.ndarray]:
+    persons = np.zeros((n, 64, 96), bool)
+    for i in range(n):
+        persons[i, 10:50, 5 + step * i : 25 + step * i] = True
+    noise = np.random.default_rng(0).integers(0, 2, persons.shape)
+    return (np.where(persons, 180, 60) + noise).astype(np.uint8), persons
+
+
+def test_noise_is_measured_where_nothing_moves():
+    still = np.random.default_rng(1).normal(100, 4, (9, 64, 96)).astype(np.uint8)
+    expected = 4 * 2 / np.sqrt(np.pi)
+    assert selection.noise_level(still) == pytest.approx(expected, rel=0.1)
+    still[:, :32, :20] = (np.arange(9) * 25)[:, None, None]
+    assert selection.noise_level(still) == pytest.approx(expected, rel=0.15)
+
+
+def test_noise_is_never_below_rounding():
+    assert selection.noise_level(np.zeros((3, 64, 64), np.uint8)) == pytest.approx(1 / 3)
+    assert selection.noise_level(np.zeros((1, 64, 64), np.uint8)) == pytest.approx(1 / 3)
+    assert selection.noise_level(np.zeros((3, 8, 8), np.uint8)) == pytest.approx(1 / 3)
+
+
+def test_repeated_frames_are_dropped_and_motion_is_kept():
+    grays, persons = moving_square(6, step=3)
+    repeat = np.array([0, 0, 1, 2, 2, 2, 3, 4, 5])
+    distinct, way = selection.distinct_frames(grays[repeat], persons[repeat], threshold=3.0)
+    np.testing.assert_array_equal(distinct, [1, 0, 1, 1, 0, 0, 1, 1, 1])
+    assert (np.diff(way) >= 0).all()
+    assert way[1] == way[0] == 0
+    assert way[5] == way[3] < way[6]
+
+
+def test_slow_motion_adds_up_until_a_frame_counts():
+    grays, persons = moving_square(20, step=1)
+    one_step = selection.change(grays[0], grays[1], persons[0] | persons[1])
+    distinct, _ = selection.distinct_frames(grays, persons, threshold=1.5 * one_step)
+    np.testing.assert_array_equal(np.flatnonzero(distinct), np.arange(0, 20, 2))
+
+
+def test_change_without_a_person_is_zero():
+    gray = np.zeros((4, 4), np.uint8)
+    assert selection.change(gray, gray + np.uint8(9), np.zeros((4, 4), bool)) == 0
+
+
+@given(st.integers(20, 300), st.integers(16, 120), st.integers(0, 2**31))
+def test_choice_covers_the_way_and_keeps_the_split(n, max_frames, seed):
+    rng = np.random.default_rng(seed)
+    frame_index = np.sort(rng.choice(4 * n, n, replace=False)).astype(np.int32)
+    way = np.cumsum(rng.exponential(size=n))
+    chosen = selection.choose_frames(frame_index, way, max_frames)
+    split = selection.split_of(frame_index)
+    assert chosen.sum() <= max_frames
+    for kind, quota in (
+        (0, max_frames - 2 * round(max_frames / 8)),
+        (1, round(max_frames / 8)),
+        (2, round(max_frames / 8)),
+    ):
+        members = np.flatnonzero(split == kind)
+        assert chosen[members].sum() == min(len(members), quota)
+        if len(members) and quota > 1:
+            assert chosen[members[[0, -1]]].all()
+
+
+def test_choice_is_even_along_the_way_not_in_time():
+    frame_index = np.arange(800, dtype=np.int32)
+    way = np.concatenate([np.linspace(0, 10, 600), np.linspace(10, 100, 201)[1:]])
+    chosen = way[selection.choose_frames(frame_index, way, 80)]
+    assert (chosen > 10).mean() == pytest.approx(0.9, abs=0.03)
+
+
+@pytest.mark.parametrize("yaw_deg", [0, 45, 90, 180, -90])
+def test_yaw_of_a_turned_torso(yaw_deg):
+    """The left shoulder of a person who faces the camera is at +x; turning its left side away moves it to +z."""
+    yaw = np.radians(yaw_deg)
+    world = np.zeros((1, 33, 3), np.float32)
+    left = np.array([np.cos(yaw), 0, np.sin(yaw)])
+    world[0, 11], world[0, 12] = 0.2 * left - [0, 0.5, 0], -0.2 * left - [0, 0.5, 0]
+    world[0, 23], world[0, 24] = 0.1 * left, -0.1 * left
+    difference = selection.body_yaw_rad(world)[0] - yaw
+    assert np.cos(difference) == pytest.approx(1, abs=1e-6)
+
+
+def test_widest_unseen_arc():
+    assert selection.largest_gap_rad(np.radians([0.0, 90, 200, 350])) == pytest.approx(np.radians(150))
+    assert selection.largest_gap_rad(np.array([1.0])) == pytest.approx(2 * np.pi)
+    assert selection.largest_gap_rad(np.array([np.nan])) == pytest.approx(2 * np.pi)

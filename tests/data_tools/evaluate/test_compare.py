@@ -1,0 +1,128 @@
+"""The comparison with the truth: zero for the truth itself, and the right figure for known errors."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from data_tools.command import run_command
+from data_tools.evaluate.compare import _main as compare_command
+from data_tools.evaluate.compare import acceleration, compare_body, compare_masks, compare_surface, swapped_frames
+from data_tools.evaluate.truth import true_mask
+from pipeline.body.files import load_body, load_camera, load_motion, save_body, save_camera, save_motion
+from pipeline.core.errors import UserError
+from pipeline.io.image import write_gray
+from pipeline.io.npz import save_npz
+
+
+@pytest.fixture
+def run(sample: Path, tmp_path: Path) -> Path:
+    """A run that found the truth, on every second frame."""
+    truth, rows = sample / "truth", np.array([0, 2, 4])
+    (tmp_path / "frames" / "masks").mkdir(parents=True)
+    (tmp_path / "body").mkdir()
+    save_npz(tmp_path / "frames" / "frames.npz", {"frame_index": rows.astype(np.int32)})
+    for index in rows:
+        write_gray(tmp_path / "frames" / "masks" / f"{index:06d}.png", true_mask(sample, int(index)))
+    save_body(tmp_path / "body" / "body.npz", load_body(truth / "bare.npz"))
+    save_motion(tmp_path / "body" / "motion.npz", load_motion(truth / "motion.npz").select(rows))
+    save_camera(tmp_path / "body" / "camera.npz", load_camera(truth / "camera.npz"))
+    save_npz(tmp_path / "body" / "scores.npz", {"silhouette_iou": np.array([0.9, np.nan, 0.8])})
+    return tmp_path
+
+
+def test_the_truth_has_no_error(sample: Path, run: Path) -> None:
+    figures = compare_body(sample, run / "body")
+    assert figures["joint_error_mm"] < 1e-3
+    assert figures["scaled_joint_error_mm"] < 1e-3
+    assert figures["joint_error_px"] < 1e-3
+    assert figures["absolute_joint_error_mm"] < 1e-3
+    assert figures["acceleration_error_ratio"] < 1e-3
+    assert figures["jitter_ratio"] == pytest.approx(1.0, abs=1e-3)
+    assert figures["swapped_frames"] == 0
+    assert figures["silhouette_iou"] == pytest.approx(0.85)
+    assert figures["focal_ratio"] == pytest.approx(1.0)
+    assert figures["scale_ratio"] == pytest.approx(1.0)
+    assert compare_masks(sample, run / "frames") == {"mask_iou_median": 1.0, "mask_iou_worst": 1.0}
+
+
+def test_a_person_of_half_the_size_at_half_the_distance(sample: Path, run: Path) -> None:
+    """The picture is the same, the scale is not: only the error that keeps the fitted scale sees it."""
+    body, motion = load_body(run / "body" / "body.npz"), load_motion(run / "body" / "motion.npz")
+    save_body(run / "body" / "body.npz", replace(body, joints_m=body.joints_m / 2, vertices=body.vertices / 2))
+    save_motion(run / "body" / "motion.npz", motion.with_pose(motion.rotations_wxyz, motion.root_translation_m / 2))
+    figures = compare_body(sample, run / "body")
+    assert figures["joint_error_px"] < 1e-2
+    assert figures["scaled_joint_error_mm"] < 0.1
+    assert figures["joint_error_mm"] > 100.0
+    assert figures["scale_ratio"] == pytest.approx(0.5, abs=1e-4)
+
+
+def test_a_shift_moves_pixels_only(sample: Path, run: Path) -> None:
+    """10 cm sideways: f times 0.1 / depth in the picture, nothing after laying the hips over each other."""
+    motion, camera = load_motion(run / "body" / "motion.npz"), load_camera(run / "body" / "camera.npz")
+    shifted = motion.root_translation_m + np.array([0.1, 0.0, 0.0])
+    save_motion(run / "body" / "motion.npz", motion.with_pose(motion.rotations_wxyz, shifted))
+    figures = compare_body(sample, run / "body")
+    expected_px = camera.fx * 0.1 / -float(motion.root_translation_m[:, 2].mean())
+    assert figures["joint_error_mm"] < 1e-2
+    assert figures["absolute_joint_error_mm"] == pytest.approx(100.0, abs=0.1)
+    assert figures["acceleration_error_ratio"] < 1e-2
+    assert figures["joint_error_px"] == pytest.approx(expected_px, rel=0.05)
+
+
+def test_a_cut_mask_loses_its_share(sample: Path, run: Path) -> None:
+    mask = true_mask(sample, 2)
+    rows = np.flatnonzero((mask > 127).any(axis=1))
+    half = np.where(np.arange(len(mask))[:, None] < rows.mean(), mask, 0).astype(np.uint8)
+    write_gray(run / "frames" / "masks" / "000002.png", half)
+    figures = compare_masks(sample, run / "frames")
+    assert figures["mask_iou_worst"] == pytest.approx((half > 127).sum() / (mask > 127).sum())
+    assert figures["mask_iou_median"] == 1.0
+
+
+def test_the_bare_body_lies_on_itself_and_a_shift_is_taken_out(sample: Path, run: Path) -> None:
+    motion = load_motion(run / "body" / "motion.npz")
+    save_motion(run / "body" / "motion.npz", motion.with_pose(motion.rotations_wxyz, motion.root_translation_m + 0.1))
+    assert compare_surface(sample, run / "body")["surface_median_mm"] < 2.0
+
+
+def test_a_thinner_body_lies_beneath_the_true_one(sample: Path, run: Path) -> None:
+    body = load_body(run / "body" / "body.npz")
+    thin = body.vertices * np.array([1.0, 1.0, 0.8], dtype=np.float32)
+    save_body(run / "body" / "body.npz", replace(body, vertices=thin))
+    assert 5.0 < compare_surface(sample, run / "body")["surface_median_mm"] < 40.0
+
+
+def test_a_frame_with_crossed_knees_is_swapped() -> None:
+    names = ["Hips", "LeftLeg", "RightLeg", "Head"]
+    true = np.array([[0.0, 0, 0], [0.1, -0.5, 0], [-0.1, -0.5, 0], [0, 0.6, 0]])[None].repeat(3, 0)
+    fitted = true + 0.02
+    fitted[1, [1, 2]] = fitted[1, [2, 1]]
+    assert swapped_frames(names, fitted, true).tolist() == [False, True, False]
+
+
+def test_acceleration_of_a_fall_at_uneven_times() -> None:
+    time_s = np.array([0.0, 0.1, 0.15, 0.4, 0.5])
+    places = np.zeros((5, 1, 3))
+    places[:, 0, 1] = -0.5 * 9.81 * time_s**2
+    assert np.allclose(acceleration(places, time_s), [0.0, -9.81, 0.0])
+
+
+def test_the_run_of_another_capture_is_refused(sample: Path, run: Path) -> None:
+    motion = load_motion(run / "body" / "motion.npz")
+    save_motion(run / "body" / "motion.npz", replace(motion, frame_index=motion.frame_index + 100))
+    with pytest.raises(UserError, match="is it its run"):
+        compare_body(sample, run / "body")
+
+
+def test_the_command(sample: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(compare_command, [str(sample), str(run)]) == 2
+    assert "holds no finished stage" in capsys.readouterr().err
+    for stage in ("frames", "body"):
+        (run / stage / "manifest.json").write_text("{}")
+    assert run_command(compare_command, [str(sample), str(run)]) == 0
+    printed = capsys.readouterr().out
+    assert "mask_iou_median" in printed
+    assert "joint_error_mm" in printed

@@ -1,0 +1,343 @@
+"""The comparison of a finished avatar: nothing is found wrong with the truth itself, and known errors are found."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from data_tools.evaluate import compare_avatar
+from data_tools.evaluate.compare_avatar import (
+    Comparison,
+    absorbed,
+    ceiling_pictures,
+    compare_filmed,
+    compare_held_out,
+    compare_novel_poses,
+    compare_novel_views,
+    compare_shape,
+    compare_texture,
+    taken_over,
+)
+from data_tools.evaluate.truth import true_mask
+from pipeline.avatar.textured_avatar import straight_rgba
+from pipeline.body.body import Body, Motion
+from pipeline.body.files import save_motion
+from pipeline.capture.frame_selection import HELDOUT, TRAIN
+from pipeline.core.errors import UserError
+from pipeline.core.progress import take_warnings
+from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.texture_rendering import soften_outline
+from pipeline.io.image import write_rgba
+from pipeline.metrics.alignment import Similarity
+from pipeline.metrics.images import frame_scores, on_white
+from tests.data_tools.finished import (
+    bent_arm,
+    filmed_as,
+    perfect_run,
+    resting_otherwise,
+    seen_from_afar,
+    shrunk,
+    with_motion,
+)
+
+
+@pytest.fixture(scope="module")
+def perfect(sample: Path, tmp_path_factory: pytest.TempPathFactory) -> Comparison:
+    return perfect_run(sample, tmp_path_factory.mktemp("perfect"))
+
+
+@pytest.fixture(scope="module")
+def perfect_ceiling(perfect: Comparison) -> dict[str, float]:
+    return compare_held_out(perfect)["ceiling"]
+
+
+def test_the_truth_has_no_error(perfect: Comparison) -> None:
+    for scores in (compare_shape(perfect), compare_filmed(perfect)):
+        assert scores["chamfer_mm"] < 0.2  # four joints a vertex are kept in the export
+        assert scores["f_score"] > 0.999
+        assert scores["scale_to_truth"] == pytest.approx(1.0, abs=1e-3)
+    texture = compare_texture(perfect)
+    assert texture["coverage"] == 1.0
+    assert texture["colour_error"] < 1.0
+
+
+def test_filmed_poses_are_those_of_held_out_frames(perfect: Comparison) -> None:
+    """A wrong arm counts where it is held out, and nowhere else."""
+    heldout, train = (perfect.run.capture.positions(kind) for kind in (HELDOUT, TRAIN))
+    wrong, trained = (compare_filmed(with_motion(perfect, bent_arm(perfect, rows, 0.3))) for rows in (heldout, train))
+    assert wrong["chamfer_mm"] > 1.0
+    assert trained["chamfer_mm"] < 0.2
+
+
+def test_a_smaller_person_has_the_same_shape(perfect: Comparison) -> None:
+    scores = compare_shape(shrunk(perfect, 0.9))
+    assert scores["chamfer_mm"] < 0.2
+    assert scores["scale_to_truth"] == pytest.approx(1 / 0.9, abs=1e-3)
+
+
+def test_a_motion_that_was_never_filmed(perfect: Comparison) -> None:
+    scores, pictures = compare_novel_poses(perfect)
+    assert scores["chamfer_mm"] < 1.0
+    assert len(pictures) == 2
+    assert min(picture.scores()["mask_iou"] for picture in pictures) > 0.97
+
+
+def test_another_a_pose_is_no_error(perfect: Comparison) -> None:
+    """A rig that rests with a raised arm (as those of other makers do) is compared in the true rig's A-pose.
+
+    Blending twice squeezes the shoulder by some millimetres; left as it rests, the hand is 20 cm away.
+    """
+    other = resting_otherwise(perfect, 0.35)
+    assert compare_shape(other)["chamfer_mm"] < 1.0
+    assert compare_shape(other)["hausdorff95_mm"] < 4.0
+    assert compare_novel_poses(other)[0]["chamfer_mm"] < 1.5
+    assert compare_texture(other)["colour_error"] < 2.0
+
+
+def test_cameras_that_never_filmed(perfect: Comparison) -> None:
+    """The truth is lit and the avatar is not: colours that are made brighter by a fifth cost what that is in dB."""
+    pictures = compare_novel_views(perfect)
+    assert len(pictures) == 2
+    assert min(picture.scores()["mask_iou"] for picture in pictures) > 0.98
+    black = replace(perfect, run=replace(perfect.run, avatar=replace(perfect.run.avatar, diffuse=torch.zeros(4, 4, 3))))
+    dark = compare_novel_views(black)
+    assert dark[0].scores()["psnr_body"] < pictures[0].scores()["psnr_body"] - 3.0
+
+
+def test_a_texture_of_known_error(perfect: Comparison) -> None:
+    """Darker by a fifth, and only its left half seen."""
+    avatar = perfect.run.avatar
+    darker = replace(perfect.run, avatar=replace(avatar, diffuse=0.8 * avatar.diffuse))
+    half = perfect.coverage.copy()
+    half[:, half.shape[1] // 2 :] = 0.0
+    scores = compare_texture(replace(perfect, run=darker, coverage=half))
+    whole = compare_texture(perfect)
+    assert 0.2 < scores["coverage"] < 0.8
+    assert scores["colour_error"] > whole["colour_error"] + 10.0
+    assert scores["balanced_colour_error"] < 1.0
+
+
+def test_flat_colours_give_the_texture_error_in_closed_form(perfect: Comparison) -> None:
+    """A grey person found brighter by 10, 20 and 30 of 255; then a person of two greys found in one of them."""
+    flat = np.array([110.0, 120.0, 130.0], dtype=np.float32) / 255
+    left = np.zeros((512, 512), dtype=np.float32)
+    left[:, :150] = 1.0
+    found = painted(perfect, np.full((8, 8, 3), 100, dtype=np.uint8), np.tile(flat, (8, 8, 1)), left)
+    share = share_of_surface(perfect, lambda uv: uv[..., 0] < 150 / 512)
+    scores = compare_texture(found)
+    assert 0.1 < share < 0.45
+    assert scores["coverage"] == pytest.approx(share, abs=0.012)
+    assert scores["colour_error"] == pytest.approx(20.0, abs=1e-3)
+    assert scores["balanced_colour_error"] == pytest.approx(0.0, abs=1e-3)
+    greys = np.where(left[..., None] > 0, np.uint8(200), np.uint8(100)).repeat(3, axis=2)
+    grey = np.full((8, 8, 3), 200 / 255, dtype=np.float32)
+    two = compare_texture(painted(perfect, greys, grey, perfect.coverage))
+    assert two["coverage"] == 1.0
+    assert two["colour_error"] == pytest.approx(100 * (1 - share), abs=1.2)
+    assert two["balanced_colour_error"] == pytest.approx(100 * share, abs=1.2)  # the gain is right for the larger part
+
+
+def painted(pair: Comparison, truth: np.ndarray, found: np.ndarray, coverage: np.ndarray) -> Comparison:
+    """The same run with other textures, the true one in 8 bits, the avatar's in [0, 1], and what the video showed."""
+    subject = replace(pair.truth.subject, texture=truth)
+    avatar = replace(pair.run.avatar, diffuse=torch.from_numpy(found))
+    truth_painted, run_painted = replace(pair.truth, subject=subject), replace(pair.run, avatar=avatar)
+    made = replace(pair, truth=truth_painted, run=run_painted, coverage=coverage)
+    vars(made).update(rest=pair.rest, alignment=pair.alignment)  # found for the same surfaces already
+    return made
+
+
+def share_of_surface(pair: Comparison, inside: Callable[[np.ndarray], np.ndarray]) -> float:
+    """Share of the A-pose's area whose atlas coordinates are inside something, by 21 points a face."""
+    subject = pair.truth.subject
+    steps = np.array([(i, j) for i in range(6) for j in range(6 - i)])
+    two = (steps + 1 / 3) / 6
+    corners = np.concatenate([1 - two.sum(1, keepdims=True), two], axis=1)
+    a, b, c = (subject.body.vertices[subject.body.faces[:, k]] for k in range(3))
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    covered = inside(np.einsum("pk,fkc->fpc", corners, subject.uv[subject.faces_uv])).mean(1)
+    return float((areas * covered).sum() / areas.sum())
+
+
+LOWERED_RAD = 0.7
+
+
+def test_a_limb_on_the_wrong_joint_is_off_by_what_that_joint_does_not_do(
+    perfect: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An arm that hangs on the collar bone stays where it is when the true one is lowered by `LOWERED_RAD`.
+
+    Expected distances come from points spread densely over both surfaces, which are made here by turning the arm.
+    """
+    monkeypatch.setattr(compare_avatar, "align_surfaces", lambda *_: Similarity(1.0, np.eye(3), np.zeros(3)))
+    body, place = perfect.truth.subject.body, perfect.truth.ground_m
+    shoulder = body.joint("LeftArm")
+    limb = {shoulder}
+    for joint, parent in enumerate(body.parents.tolist()):
+        limb |= {joint} if parent in limb else set()
+    strength = body.skin_weights[:, sorted(limb)].sum(1)
+    turned = (body.vertices - body.joints_m[shoulder]) @ Rotation.from_rotvec([0.0, 0.0, -LOWERED_RAD]).as_matrix().T
+    true = body.vertices + strength[:, None] * (turned + body.joints_m[shoulder] - body.vertices)
+    avatar, hangs = perfect.run.avatar, torch.from_numpy(strength > 0.5)
+    indices, weights = avatar.joint_indices.clone(), avatar.joint_weights.clone()
+    indices[hangs], weights[hangs] = int(body.parents[shoulder]), torch.tensor([1.0, 0.0, 0.0, 0.0])
+    bound = replace(avatar, joint_indices=indices, joint_weights=weights)
+    write_novel_pose(tmp_path, body, shoulder, place)
+    pair = replace(perfect, folder=tmp_path, run=replace(perfect.run, avatar=bound))
+    scores, _ = compare_novel_poses(pair)
+    wrong = np.where(hangs[:, None], body.vertices, true)
+    surfaces = [
+        trimesh.Trimesh(vertices, faces, process=False)
+        for vertices, faces in ((wrong, pair.rest.faces), (true, pair.true_rest.faces))
+    ]
+    dense = [trimesh.sample.sample_surface(surface, 200_000, seed=3)[0] for surface in surfaces]
+    for name, (source, target) in {"result_to_truth_mm": dense, "truth_to_result_mm": dense[::-1]}.items():
+        apart_mm = 1000 * cKDTree(target).query(source[::2])[0]
+        expected = np.where(apart_mm > 4.0, apart_mm, 0.0).mean()  # nearer points lie on both, between the samples
+        assert scores[name] == pytest.approx(expected, rel=0.09)  # 20,000 points scatter by 3 %
+    assert scores["result_to_truth_mm"] > 2 * scores["truth_to_result_mm"] > 10  # one arm in the air, one at the trunk
+
+
+def write_novel_pose(folder: Path, body: Body, joint: int, place: np.ndarray) -> None:
+    """A motion of one frame: the A-pose at a place with one joint turned, and an empty picture of it."""
+    (folder / "novel_poses").mkdir()
+    rotations = np.tile(np.array([1.0, 0.0, 0.0, 0.0], dtype=np.float32), (1, len(body.joint_names), 1))
+    rotations[0, joint] = [np.cos(LOWERED_RAD / 2), 0.0, 0.0, -np.sin(LOWERED_RAD / 2)]
+    root_m = (body.joints_m[:1] + place).astype(np.float32)
+    save_motion(folder / "novel_poses" / "motion.npz", Motion(np.zeros(1, np.int32), np.zeros(1), rotations, root_m))
+    write_rgba(folder / "novel_poses" / "000000.png", np.zeros((200, 200, 4), dtype=np.uint8))
+
+
+def test_true_poses_leave_nothing_to_miss(perfect: Comparison, perfect_ceiling: dict[str, float]) -> None:
+    assert np.abs(absorbed(perfect) - perfect.truth.subject.body.vertices).max() < 1e-3
+    # With the true vertices it is 66 dB; the alignment finds their scale to 0.015 %, a third of a millimetre.
+    assert perfect_ceiling["psnr_body"] > 36.0
+    assert perfect_ceiling["mask_iou"] > 0.99
+
+
+def test_the_ceiling_is_as_soft_as_the_masks(perfect: Comparison, tmp_path: Path) -> None:
+    """Outlines blurred by 1.5 px in all frames: a sharp true mesh misses them, one that is drawn as soft does not."""
+    soft = filmed_as(perfect, tmp_path, lambda person: straight_rgba(soften_outline(person, 1.5)))
+    heldout = soft.run.capture.positions(HELDOUT)
+    (drawn,) = ceiling_pictures(soft, heldout)
+    target = straight_rgba(soften_outline(perfect.truth.person(0), 1.5))
+    sharp = frame_scores(drawn, target[..., :3], target[..., 3])
+    assert compare_held_out(soft)["ceiling"]["psnr_full"] > sharp["psnr_full"] + 6.0
+
+
+def test_what_a_mask_leaves_out_costs_nothing_until_the_true_one_is_asked(perfect: Comparison, tmp_path: Path) -> None:
+    """Masks without legs, and a field that is the person without legs: white where the true target has them."""
+
+    def without_legs(person: np.ndarray) -> np.ndarray:
+        straight = straight_rgba(person)
+        straight[110:, :, 3] = 0
+        return straight
+
+    cut = filmed_as(perfect, tmp_path, without_legs)
+    learnt = perfect.truth.person(0) * (np.arange(200) < 110)[:, None, None]
+    scores = compare_held_out(replace(cut, run=replace(cut.run, draw_field=lambda pose: learnt)))
+    true = straight_rgba(perfect.truth.person(0))
+    legs = (255.0 - on_white(np.ascontiguousarray(true[..., :3]), np.ascontiguousarray(true[..., 3]))[110:]) / 255.0
+    expected_db = -10 * np.log10((legs**2).sum() / (200 * 200 * 3))
+    kept = (true[:110, :, 3] > 127).sum() / (true[..., 3] > 127).sum()
+    assert scores["field_true_mask"]["psnr_full"] == pytest.approx(expected_db, abs=0.02)
+    assert scores["field_true_mask"]["mask_iou"] == pytest.approx(kept, abs=1e-6)
+    assert scores["ceiling"]["mask_iou"] == pytest.approx(kept, abs=0.01)  # the found mask blames the truth
+    assert scores["ceiling_true_mask"]["mask_iou"] > 0.99
+    assert scores["mesh_true_mask"]["mask_iou"] > 0.97
+
+
+def test_a_frame_without_a_true_person_is_left_out_with_a_warning(
+    perfect: Comparison, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of two held-out frames the first is empty in truth: the second alone is scored, until it is empty as well."""
+    split = perfect.run.capture.split.copy()
+    split[:2] = HELDOUT
+    two = replace(perfect, run=replace(perfect.run, capture=replace(perfect.run.capture, split=split)))
+    nothing = np.zeros((perfect.run.camera.height, perfect.run.camera.width, 4), np.float32)
+    monkeypatch.setattr(compare_avatar, "ceiling_pictures", lambda pair, positions: [nothing] * len(positions))
+    monkeypatch.setattr(compare_avatar, "true_mask", lambda out, frame: (frame > 0) * true_mask(out, frame))
+    take_warnings()
+    assert compare_held_out(two)["mesh_true_mask"]["mask_iou"] > 0.98
+    (warning,) = take_warnings()
+    assert "held-out frame 0 is not compared" in warning
+    monkeypatch.setattr(compare_avatar, "true_mask", lambda out, frame: 0 * true_mask(out, frame))
+    with pytest.raises(UserError, match="no held-out frame can be compared"):
+        compare_held_out(two)
+
+
+def test_true_masks_are_brought_to_the_size_of_the_frames(perfect: Comparison, tmp_path: Path) -> None:
+    def halved(person: np.ndarray) -> np.ndarray:
+        return straight_rgba(cv2.resize(person, (100, 100), interpolation=cv2.INTER_AREA))
+
+    half = filmed_as(perfect, tmp_path, halved)
+    learnt = halved(perfect.truth.person(0)) / np.float32(255)
+    scores = compare_held_out(replace(half, run=replace(half.run, draw_field=lambda pose: learnt)))
+    assert scores["field_true_mask"]["mask_iou"] > 0.998
+    assert scores["ceiling_true_mask"]["mask_iou"] > 0.95
+
+
+def test_size_and_distance_are_no_error_of_the_pose(perfect: Comparison, perfect_ceiling: dict[str, float]) -> None:
+    smaller = compare_held_out(shrunk(perfect, 0.9))["ceiling"]
+    assert smaller["psnr_body"] == pytest.approx(perfect_ceiling["psnr_body"], abs=0.5)
+
+
+def test_a_longer_lens_costs_its_perspective_alone(perfect: Comparison) -> None:
+    """A person who is taken for a fifth farther away, by a lens a fifth longer, keeps size, place and shape."""
+    afar = seen_from_afar(perfect, 1.2)
+    apart_m = np.linalg.norm(absorbed(afar) - perfect.truth.subject.body.vertices, axis=1)
+    assert apart_m.max() < 1e-3
+    assert compare_held_out(afar)["ceiling"]["mask_iou"] > 0.97
+
+
+def test_an_arm_that_is_always_off_belongs_to_the_shape(perfect: Comparison, perfect_ceiling: dict[str, float]) -> None:
+    """The same error in all frames can be made good in the A-pose; in the held-out frame alone it cannot."""
+    frames = np.arange(len(perfect.run.motion.frame_index))
+    always, once = (
+        compare_held_out(with_motion(perfect, bent_arm(perfect, rows, 0.15)))["ceiling"]
+        for rows in (frames, frames[:1])
+    )
+    assert always["psnr_body"] > perfect_ceiling["psnr_body"] - 4.0
+    assert once["psnr_body"] < always["psnr_body"] - 4.0
+
+
+def test_a_frame_moves_what_it_sees_across_the_view(perfect: Comparison) -> None:
+    """One training frame 3 cm off: sideways it moves what faces the camera there; in depth it moves hardly anything."""
+    motion, camera, true = perfect.run.motion, perfect.run.camera, perfect.truth.subject.body.vertices
+    frame = int(perfect.run.capture.positions(TRAIN)[0])
+    moved = []
+    for axis in (0, 2):
+        root_m = motion.root_translation_m.copy()
+        root_m[frame] += 0.03 * camera.world_to_camera[axis, :3]
+        wrong = with_motion(perfect, motion.with_pose(motion.rotations_wxyz, root_m))
+        moved.append(np.linalg.norm(absorbed(wrong) - true, axis=1))
+    sideways, deeper = moved
+    posed = Mesh(perfect.run.avatar.posed(perfect.run.refined[frame]).numpy(), perfect.run.avatar.faces.numpy())
+    towards = posed.vertex_normals() @ -camera.world_to_camera[2, :3]
+    assert deeper.mean() < 0.3 * sideways.mean()
+    assert sideways[towards < -0.9].mean() < 0.3 * sideways[towards > 0.9].mean()
+
+
+def test_joints_that_the_fit_lacks_are_carried_by_their_parent(perfect: Comparison) -> None:
+    """A thumb's tip follows the thumb, which never bends here, wherever the hand goes."""
+    body, true = perfect.run.body, perfect.truth.subject.body.vertices
+    names = tuple("Tail" if name == "LeftHandThumb3" else name for name in body.joint_names)
+    lacking = replace(perfect, run=replace(perfect.run, body=replace(body, joint_names=names)))
+    assert np.abs(absorbed(lacking) - true).max() < 1e-3
+
+
+def test_rotations_go_by_name(bare: Body, perfect: Comparison) -> None:
+    """Joints that the actor lacks keep still."""
+    motion = perfect.truth.motion
+    renamed = replace(bare, joint_names=tuple("Tail" if name == "Head" else name for name in bare.joint_names))
+    taken = taken_over(renamed, perfect.truth.subject.body, motion)
+    head, arm = renamed.joint("Tail"), renamed.joint("LeftArm")
+    assert np.allclose(taken.rotations_wxyz[:, head], [1.0, 0.0, 0.0, 0.0], atol=1e-6)
+    assert np.allclose(np.abs(taken.rotations_wxyz[:, arm]), np.abs(motion.rotations_wxyz[:, arm]), atol=1e-5)

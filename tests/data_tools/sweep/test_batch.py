@@ -1,0 +1,235 @@
+"""A folder of videos becomes runs and a table, whatever is broken, killed or started again; on the toy pipeline."""
+
+import csv
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from data_tools.sweep.batch import find_videos, last_change_ns, table_row, text_table, write_table
+from data_tools.sweep.runs import RunState
+from pipeline.core.errors import UserError
+from pipeline.core.manifest import read_manifest
+from pipeline.core.measure import REPOSITORY
+from stages import STAGES
+from tests.core.toy_pipeline import Toy, user_environment
+from tests.test_resume import TOY_STAGES, artifacts, wait_for
+
+GOOD, BROKEN = ("ann", "carl"), "bob"
+OUTCOME = {"ann": "done", "bob": "failed", "carl": "done"}
+
+
+@pytest.fixture
+def batch(toy: Toy) -> Toy:
+    """The toy with three videos, the second of which is broken."""
+    videos = toy.folder / "videos"
+    videos.mkdir()
+    for name, text in ((GOOD[0], "1 2"), (BROKEN, "1 two"), (GOOD[1], "3 4 5")):
+        (videos / f"{name}.mp4").write_text(text)
+    (videos / "notes.txt").write_text("not a video")
+    return toy
+
+
+def rows(toy: Toy) -> dict[str, dict[str, str]]:
+    """The lines of batch.csv by video."""
+    with (toy.folder / "runs" / "batch.csv").open(newline="") as file:
+        return {row["video"]: row for row in csv.DictReader(file)}
+
+
+def test_one_broken_video_stops_no_other(batch: Toy) -> None:
+    sentence = batch.refusal("data_tools.sweep.batch", "videos", "--preset", "quick")
+    assert "1 of 3 videos did not become an avatar (bob)" in sentence
+    table = rows(batch)
+    assert {name: row["status"] for name, row in table.items()} == OUTCOME
+    assert "holds two, which is no number" in table[BROKEN]["message"]
+    assert [table[BROKEN][name] for name in TOY_STAGES] == ["missing", "waits for read", "waits for read"]
+    for name in GOOD:
+        assert [table[name][stage] for stage in TOY_STAGES] == ["fresh"] * 3
+        assert float(table[name]["seconds"]) >= 0
+        assert (batch.folder / "runs" / name / "tell" / "story.txt").is_file()
+    page = (batch.folder / "runs" / "batch.html").read_text()
+    assert "2 of 3 avatars" in page
+    assert "holds two" in page
+
+
+def test_a_mended_video_is_all_that_runs_again(batch: Toy) -> None:
+    batch.call("data_tools.sweep.batch", "videos")
+    before = (batch.folder / "runs" / "ann" / "learn").stat().st_ctime_ns
+    (batch.folder / "videos" / "bob.mp4").write_text("1 2")
+    done = batch.call("data_tools.sweep.batch", "videos")
+    assert done.returncode == 0, done.stderr
+    assert {row["status"] for row in rows(batch).values()} == {"done"}
+    assert (batch.folder / "runs" / "ann" / "learn").stat().st_ctime_ns == before
+
+
+def test_a_killed_batch_takes_its_runs_along_and_goes_on(batch: Toy) -> None:
+    runner = batch.start("data_tools.sweep.batch", "videos", "--jobs", "3", TOY_SLEEP_S="60")
+    for name in GOOD:
+        wait_for(batch.folder / "runs" / name / "learn.part" / "checkpoint.json", runner)
+    runner.kill()
+    runner.communicate()
+    batch.refusal("data_tools.sweep.batch", "videos", "--jobs", "3")
+    for name in GOOD:
+        learnt = read_manifest(batch.folder / "runs" / name / "learn")
+        assert learnt is not None
+        assert (learnt.resumed, learnt.metrics) == (True, {"first_step": 1})
+        undisturbed = batch.call("stages", "--run", "runs/alone", "--video", f"videos/{name}.mp4", "--force")
+        assert undisturbed.returncode == 0
+        runs = batch.folder / "runs"
+        assert artifacts(runs / name, TOY_STAGES) == artifacts(runs / "alone", TOY_STAGES)
+
+
+def test_ctrl_c_stops_all_and_starts_no_other(batch: Toy) -> None:
+    process = batch.start("data_tools.sweep.batch", "videos", TOY_SLEEP_S="30")
+    wait_for(batch.folder / "runs" / "ann" / "learn.part" / "checkpoint.json", process)
+    os.killpg(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=25)
+    assert process.returncode == 130
+    assert err.splitlines()[-1] == "interrupted: run the same command again"
+    assert not (batch.folder / "runs" / "carl").exists()
+
+
+def test_the_table_alone_runs_nothing(batch: Toy) -> None:
+    batch.refusal("data_tools.sweep.batch", "videos", "--table")
+    assert {row["status"] for row in rows(batch).values()} == {"unfinished"}
+    assert not (batch.folder / "runs" / "ann").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("none",), ("none is no folder",)),
+        (("empty",), ("holds no video",)),
+        (("videos", "--preset", "quik"), ("default, quick",)),
+        (("videos", "--set", "lern.steps=3"), ("did you mean learn?",)),
+        (("videos", "--jobs", "0"), ("at least 1",)),
+    ],
+)
+def test_a_mistake_is_one_sentence_before_any_run(batch: Toy, arguments: tuple[str, ...], words: tuple[str]) -> None:
+    (batch.folder / "empty").mkdir()
+    sentence = batch.refusal("data_tools.sweep.batch", *arguments)
+    assert all(word in sentence for word in words), sentence
+    assert not (batch.folder / "runs").exists()
+
+
+def test_videos_are_files_by_suffix_and_folders(tmp_path: Path) -> None:
+    for folder in ("walk", "made/video", ".hidden"):
+        (tmp_path / folder).mkdir(parents=True)
+    for file in ("me.MP4", "me.txt", ".dark.mp4"):
+        (tmp_path / file).touch()
+    found = find_videos(tmp_path)
+    assert found == {"made": tmp_path / "made" / "video", "me": tmp_path / "me.MP4", "walk": tmp_path / "walk"}
+    (tmp_path / "me.mov").touch()
+    with pytest.raises(UserError, match=r"me\.MP4 and me\.mov"):
+        find_videos(tmp_path)
+
+
+def test_a_folders_last_change_is_its_newest_files(tmp_path: Path) -> None:
+    for name, time_s in (("a", 100), ("b", 300), ("c", 200)):
+        (tmp_path / name).touch()
+        os.utime(tmp_path / name, (time_s, time_s))
+    assert last_change_ns(tmp_path) == 300 * 10**9
+    assert last_change_ns(tmp_path / "c") == 200 * 10**9
+
+
+def test_the_table_escapes_what_it_is_told(tmp_path: Path) -> None:
+    broken = RunState(dict.fromkeys(STAGES, "missing"), {}, {"mesh_psnr_full_db": 28.25}, "<b> is no video")
+    row = table_row("a&b", broken)
+    assert row["mesh_psnr_full_db"] == "28.250"
+    assert text_table([row]).splitlines()[-1] == "a&b: <b> is no video"
+    write_table(tmp_path, [row])
+    page = (tmp_path / "batch.html").read_text()
+    assert "&lt;b&gt; is no video" in page
+    assert "a&amp;b" in page
+
+
+@pytest.mark.parametrize("cluster", ["", "local"])
+def test_make_asks_for_the_folder(cluster: str, tmp_path: Path) -> None:
+    """An empty name would be the folder in which make runs."""
+    for name in ("requirements.lock", "pyproject.toml", ".venv/.stamp"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    command = ["make", "-f", str(REPOSITORY / "Makefile"), "batch", f"CLUSTER={cluster}"]
+    done = subprocess.run(
+        command, cwd=tmp_path, env=user_environment(), capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 2
+    assert "error: no folder of videos: make batch VIDEOS=folder" in done.stderr
+
+
+def snakemake(toy: Toy, videos: str = "videos", **variables: str) -> subprocess.Popen[str]:
+    """Start the workflow on the toy's videos; skips where snakemake is not installed."""
+    path = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", "")))
+    program = shutil.which("snakemake", path=path)
+    if program is None:
+        pytest.skip("snakemake is not installed: make venv EXTRA=cluster")
+    folder = REPOSITORY / "configs" / "cluster"
+    command = [program, "--snakefile", str(folder / "Snakefile"), "--profile", str(folder / "local"), "--config"]
+    command += [f"videos={videos}", "runs=runs", "options=--preset quick"]
+    command += [f"project={toy.folder}", f"python={sys.executable}"]
+    environment = user_environment() | {"PYTHONPATH": str(REPOSITORY), **variables}
+    return subprocess.Popen(
+        command, cwd=toy.folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+
+
+def test_the_workflow_asks_for_the_folder(batch: Toy) -> None:
+    process = snakemake(batch, videos="")
+    text, _ = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "no folder of videos" in text
+
+
+def test_the_workflow_survives_a_broken_video_and_a_kill(batch: Toy) -> None:
+    killed = snakemake(batch, TOY_SLEEP_S="60")
+    parts = [batch.folder / "runs" / name / "learn.part" / "checkpoint.json" for name in GOOD]
+    deadline = time.monotonic() + 300.0
+    while not any(part.exists() for part in parts):
+        assert killed.poll() is None, killed.communicate()[0]
+        assert time.monotonic() < deadline, f"none of {parts} appeared"
+        time.sleep(0.02)
+    killed.kill()
+    killed.communicate()
+    again = snakemake(batch)
+    text, _ = again.communicate(timeout=60)
+    assert again.returncode == 1, text
+    stamps = {path.name for path in (batch.folder / "runs").glob("*.done")}
+    assert stamps == {"ann.done", "carl.done"}
+    assert {name: row["status"] for name, row in rows(batch).items()} == OUTCOME
+    resumed = [read_manifest(batch.folder / "runs" / name / "learn") for name in GOOD]
+    assert any(manifest and manifest.resumed for manifest in resumed)
+    (batch.folder / "videos" / "bob.mp4").write_text("1 2")
+    mended = snakemake(batch)
+    text, _ = mended.communicate(timeout=60)
+    assert mended.returncode == 0, text
+    assert {row["status"] for row in rows(batch).values()} == {"done"}
+
+
+@pytest.mark.slow
+def test_three_real_captures_one_of_them_broken(smoke_run: Path, tmp_path: Path) -> None:
+    """A video, a file that is none, and a folder of images, by the real stages; killed once on the way."""
+    videos, runs = tmp_path / "videos", tmp_path / "runs"
+    videos.mkdir()
+    shutil.copy(smoke_run.parent / "capture" / "video" / "video.mp4", videos / "ann.mp4")
+    (videos / "bob.mp4").write_bytes(b"no video at all" * 100)
+    shutil.copytree(smoke_run / "frames" / "images", videos / "carl")
+    command = [sys.executable, "-m", "data_tools.sweep.batch", str(videos), "--runs", str(runs), "--preset", "smoke"]
+    command += ["--set", "field.steps=20", "--set", "mesh.steps=2"]
+    killed = subprocess.Popen(command, cwd=REPOSITORY, env=user_environment())
+    wait_for(runs / "ann" / "body.part", killed)
+    killed.kill()
+    killed.wait()
+    done = subprocess.run(command, cwd=REPOSITORY, env=user_environment(), capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    with (runs / "batch.csv").open(newline="") as file:
+        table = {row["video"]: row for row in csv.DictReader(file)}
+    assert {name: row["status"] for name, row in table.items()} == OUTCOME, done.stdout
+    assert "bob.mp4" in table[BROKEN]["message"]
+    for name in GOOD:
+        assert (runs / name / "export" / "avatar.glb").is_file()
+        assert float(table[name]["mesh_psnr_full_db"]) > 10

@@ -1,0 +1,247 @@
+"""A sweep of presets over captures: it goes on where it was, and its tables say what was measured where."""
+
+import csv
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from data_tools.sweep.chart import _make_built_in, bring_up_to_date, origin, write_results
+from data_tools.sweep.chart import main as chart
+from data_tools.sweep.chart_trials import Trial, point_of, read_progress, table_row
+from data_tools.sweep.runs import RunState
+from data_tools.synthetic.scene.capture import RECIPE_VERSION
+from pipeline.core.errors import UserError
+from pipeline.core.manifest import Manifest, read_manifest
+from stages import STAGES
+from tests.core.toy_pipeline import Toy
+from tests.data_tools.finished import compared
+from tests.test_resume import wait_for
+
+SWEEP = ("data_tools.sweep.chart", "numbers.mp4", "--presets", "quick", "default", "--out", "runs/chart")
+BOTH = "mesh_psnr_full_db chamfer_mm"
+SCORES = {"mesh_psnr_full_db": 28.0, "field_psnr_full_db": 30.0, "chamfer_mm": 6.5}
+
+
+@pytest.fixture
+def sweep(toy: Toy) -> Toy:
+    """The toy with a capture."""
+    shutil.copy(toy.video, toy.folder / "numbers.mp4")
+    return toy
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def finished(seconds: float, scores: dict[str, float], resumed: tuple[str, ...] = ()) -> RunState:
+    """A run in which every stage took as long."""
+    place = {"commit": "abc", "cpu": "Xeon", "cores": 2, "gpu": None}
+    manifests = {
+        name: Manifest(name, 1, "", {}, {}, {}, {}, seconds, 100.0, name in resumed, [], place) for name in STAGES
+    }
+    return RunState(dict.fromkeys(STAGES, "fresh"), manifests, scores, "")
+
+
+def test_a_killed_sweep_goes_on_and_times_the_cut_stage_from_its_start(sweep: Toy) -> None:
+    runner = sweep.start(*SWEEP, TOY_SLEEP_S="3")
+    wait_for(sweep.folder / "runs/chart/numbers-default-0/learn.part/checkpoint.json", runner)
+    runner.kill()
+    runner.communicate()
+    first = sweep.folder / "runs" / "chart" / "numbers-quick-0" / "learn"
+    before = first.stat().st_ctime_ns
+    done = sweep.call(*SWEEP)
+    assert done.returncode == 0, done.stderr
+    assert first.stat().st_ctime_ns == before
+    cut = read_manifest(sweep.folder / "runs" / "chart" / "numbers-default-0" / "learn")
+    assert cut is not None
+    assert (cut.resumed, cut.metrics) == (False, {"first_step": 0})
+    table = rows(sweep.folder / "runs" / "chart" / "chart.csv")
+    assert [(row["preset"], row["seed"], row["status"]) for row in table] == [
+        ("quick", "0", "done"),
+        ("default", "0", "done"),
+    ]
+    assert all(row["commit"] and "cores" in row["machine"] for row in table)
+    assert float(table[0]["seconds"]) > 2.9  # the toy's long step
+    assert not table[1]["resumed"]
+
+
+def test_what_two_runs_have_in_common_is_computed_once(sweep: Toy) -> None:
+    """Both read the same numbers; what they learn differs. A seed or option that reaches a stage keeps it apart."""
+    done = sweep.call(*SWEEP)
+    assert done.returncode == 0, done.stderr
+    quick, default = (sweep.folder / "runs" / "chart" / f"numbers-{preset}-0" for preset in ("quick", "default"))
+    assert (quick / "read" / "manifest.json").read_bytes() == (default / "read" / "manifest.json").read_bytes()
+    assert (quick / "learn" / "manifest.json").read_bytes() != (default / "learn" / "manifest.json").read_bytes()
+    assert not list(default.glob("*.part"))
+    assert "read: cached" in (default.parent / f"{default.name}.log").read_text()
+
+
+def test_fewer_steps_are_said_everywhere(tmp_path: Path) -> None:
+    own, fewer = (Trial(tmp_path / "ann", "ihm", 2, tmp_path, steps) for steps in (None, 600))
+    assert (own.label, fewer.label) == ("ihm", "ihm, 600 steps")
+    assert own.run_dir != fewer.run_dir
+    assert set(fewer.assignments) - set(own.assignments) == {"field.steps=600"}
+    run = finished(10.0, SCORES)
+    run.manifests["field"].metrics["steps"] = 450.0  # it stopped early
+    assert point_of(fewer, run).preset == "ihm, 600 steps"
+    assert table_row(fewer, run)["steps"] == 450.0
+    write_results(tmp_path, {fewer: run})
+    assert "ihm, 600 steps" in (tmp_path / "chart.svg").read_text()
+
+
+@pytest.fixture
+def nothing_may_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run or a comparison that is started is a failure."""
+    for what in ("chart.run_trial", "chart_trials.subprocess.run"):
+        monkeypatch.setattr(f"data_tools.{what}", lambda *_, **__: pytest.fail("started"))
+
+
+def test_what_is_done_and_compared_is_not_done_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, nothing_may_start: None
+) -> None:
+    trial = Trial(tmp_path / "ann", "quick", 0, tmp_path)
+    for folder in (trial.capture / "truth", trial.run_dir / "report"):
+        folder.mkdir(parents=True)
+    monkeypatch.setattr("data_tools.sweep.chart_trials.read_run", lambda *_: finished(1.0, SCORES))
+    compared(trial.run_dir / "report")
+    assert bring_up_to_date(trial, [trial]).verdict == "done"
+    (trial.run_dir / "report" / "truth.json").unlink()
+    with pytest.raises(pytest.fail.Exception, match="started"):
+        bring_up_to_date(trial, [trial])
+
+
+def test_a_comparison_that_fails_is_no_success(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The chart is drawn, and the command says what it lacks."""
+    (tmp_path / "ann" / "truth").mkdir(parents=True)
+    report = tmp_path / "out" / "ann-default-0" / "report"
+    report.mkdir(parents=True)
+    monkeypatch.setattr("data_tools.sweep.chart_trials.read_run", lambda *_: finished(1.0, SCORES))
+    broken = subprocess.CompletedProcess([], 1)
+    monkeypatch.setattr("data_tools.sweep.chart_trials.subprocess.run", lambda *_, **__: broken)
+    command = [str(tmp_path / "ann"), "--presets", "default", "--out", str(tmp_path / "out")]
+    with pytest.raises(UserError, match=r"1 of 1 runs are not compared with their truth \(ann-default-0\)"):
+        chart(command)
+    assert (tmp_path / "out" / "chart.svg").is_file()
+    compared(report)
+    chart(command)
+
+
+def test_two_trials_never_share_a_run(tmp_path: Path, nothing_may_start: None) -> None:
+    """Captures and presets go by their last names: two of one name would show one's figures for both."""
+    for name in ("a/me.mp4", "b/me.mp4", "instant.yaml"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("{}")
+    first, second, preset = (str(tmp_path / name) for name in ("a/me.mp4", "b/me.mp4", "instant.yaml"))
+    for captures, presets in (((first, second), ("instant",)), ((first,), ("instant", preset))):
+        with pytest.raises(UserError, match="would share the run .*me-instant-0"):
+            chart([*captures, "--presets", *presets, "--out", str(tmp_path / "out")])
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_run_of_another_capture_is_not_taken(sweep: Toy) -> None:
+    command = ("--presets", "quick", "--out", "runs/chart")
+    assert sweep.call("data_tools.sweep.chart", "numbers.mp4", *command).returncode == 0
+    (sweep.folder / "other").mkdir()
+    (sweep.folder / "other" / "numbers.mp4").write_text("7 8 9")
+    assert "not done (numbers-quick-0)" in sweep.refusal("data_tools.sweep.chart", "other/numbers.mp4", *command)
+    assert "was made from" in rows(sweep.folder / "runs" / "chart" / "chart.csv")[0]["message"]
+
+
+def test_built_in_captures_are_those_of_this_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[list[str]] = []
+    monkeypatch.setattr("data_tools.sweep.chart.BUILT_IN", {tmp_path / "ann": 3})
+    monkeypatch.setattr("data_tools.sweep.chart.make_sample", made.append)
+    _make_built_in()
+    assert made == [[str(tmp_path / "ann"), "--seed", "3"]]
+    recipe = tmp_path / "ann" / "truth" / "recipe.json"
+    recipe.parent.mkdir(parents=True)
+    for text in ("{}", f'{{"version": {RECIPE_VERSION + 1}}}'):
+        recipe.write_text(text)
+        with pytest.raises(UserError, match="ann is of another version"):
+            _make_built_in()
+    recipe.write_text(f'{{"version": {RECIPE_VERSION}}}')
+    _make_built_in()
+    assert len(made) == 1
+
+
+def test_drawing_runs_nothing(tmp_path: Path, nothing_may_start: None) -> None:
+    (tmp_path / "ann").mkdir()
+    with pytest.raises(UserError, match="1 of 1 runs are not done"):
+        chart([str(tmp_path / "ann"), "--presets", "default", "--out", str(tmp_path / "out"), "--draw"])
+
+
+@pytest.mark.parametrize("entry", ["ihm=600", "default", "default=many", "default=-3"])
+def test_steps_for_no_preset_are_refused(entry: str) -> None:
+    with pytest.raises(UserError, match=r"--steps .*: give PRESET=N with one of default"):
+        chart(["none.mp4", "--presets", "default", "--steps", entry])
+
+
+def test_a_failed_run_stops_no_other(sweep: Toy) -> None:
+    (sweep.folder / "words.mp4").write_text("one two")
+    sentence = sweep.refusal(
+        "data_tools.sweep.chart", "words.mp4", "numbers.mp4", "--presets", "quick", "--out", "chart"
+    )
+    assert "1 of 2 runs are not done (words-quick-0)" in sentence
+    table = rows(sweep.folder / "chart" / "chart.csv")
+    assert [row["status"] for row in table] == ["failed", "done"]
+    assert "no number" in table[0]["message"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [(("none.mp4", "--presets", "quick"), "none.mp4"), (("numbers.mp4", "--presets", "x"), "quick")],
+)
+def test_a_mistake_is_refused_before_any_run(sweep: Toy, arguments: tuple[str, ...], word: str) -> None:
+    assert word in sweep.refusal("data_tools.sweep.chart", *arguments)
+    assert not (sweep.folder / "runs").exists()
+
+
+def test_seconds_are_those_until_field_and_avatar(tmp_path: Path) -> None:
+    trial = Trial(tmp_path / "ann.mp4", "configs/mine.yaml", 3, tmp_path)
+    assert trial.run_dir == tmp_path / "ann.mp4-mine-3"
+    (trial.run_dir / "field").mkdir(parents=True)
+    (trial.run_dir / "field" / "progress.csv").write_text(
+        "step,seconds,validation_psnr_db,validation_psnr_body_db\n50,2.5,20,15\n100,5,22,17.5\n"
+    )
+    point = point_of(trial, finished(10.0, SCORES))
+    assert (point.field_seconds, point.seconds) == (30.0, 60.0)  # the report is not needed for the avatar
+    assert point.curve == [(22.5, 20.0, 15.0), (25.0, 22.0, 17.5)]
+    run = finished(10.0, SCORES, resumed=("field", "mesh"))
+    run.manifests["field"] = replace(run.manifests["field"], peak_rss_mib=250.0)
+    row = table_row(trial, run)
+    assert row["peak_rss_mib"] == 250.0
+    assert (row["resumed"], row["commit"], row["machine"]) == ("field mesh", "abc", "Xeon, 2 cores")
+    assert origin([row, row | {"seed": 4, "status": "failed"}]) == "commit abc; Xeon, 2 cores; seed 3"
+
+
+def test_progress_that_is_absent_or_damaged(tmp_path: Path) -> None:
+    assert read_progress(tmp_path) == []
+    (tmp_path / "progress.csv").write_text("seconds,validation_psnr_db\n1,2\n")
+    with pytest.raises(UserError, match="validation_psnr_body_db"):
+        read_progress(tmp_path)
+
+
+def test_tables_and_chart_of_finished_runs(tmp_path: Path) -> None:
+    """Each capture has fronts of its own; a failure that was made good is no message."""
+    quick, slow, bad = (Trial(tmp_path / "ann", preset, 0, tmp_path) for preset in ("quick", "slow", "bad"))
+    runs = {
+        quick: replace(finished(10.0, SCORES), failure="killed"),
+        slow: finished(20.0, SCORES | {"chamfer_mm": 5.0}),
+        bad: RunState(dict.fromkeys(STAGES, "missing"), {}, {}, "no person"),
+        Trial(tmp_path / "bob", "quick", 0, tmp_path): finished(1.0, SCORES | {"chamfer_mm": 1.0}),
+    }
+    (slow.run_dir / "field").mkdir(parents=True)
+    (slow.run_dir / "field" / "progress.csv").write_text(
+        "step,seconds,validation_psnr_db,validation_psnr_body_db\n9,1,20,15\n"
+    )
+    write_results(tmp_path, runs)
+    table = rows(tmp_path / "chart.csv")
+    assert [row["on_front_of"] for row in table] == [BOTH, "chamfer_mm", "", BOTH]
+    assert [row["message"] for row in table] == ["", "", "no person", ""]
+    assert (tmp_path / "chart.svg").is_file()
+    (curve,) = rows(tmp_path / "anytime.csv")
+    assert list(curve.values()) == ["ann", "slow", "0", "41.0", "20.0", "15.0"]

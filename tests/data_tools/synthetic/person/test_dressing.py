@@ -1,0 +1,119 @@
+"""Clothes lie outside the body, end where they are cut, and leave face and hands alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_tools.synthetic.person.anatomy import EYE, SKIN, measure, surface_kinds
+from data_tools.synthetic.person.outfit import LAYERS, choose_outfit, layer_depths
+from data_tools.synthetic.person.surface import split_at_midpoints, with_midpoints
+from data_tools.synthetic.rig.subject import Subject
+from pipeline.body.body import Body, load_anny
+from pipeline.geometry.mesh import Mesh
+
+
+@pytest.fixture(scope="module")
+def skin(bare: Body) -> np.ndarray:
+    """The bare body's vertices and the midpoints, in the order of the clothed ones."""
+    return with_midpoints(bare.vertices, split_at_midpoints(bare.faces, len(bare.vertices))[0])
+
+
+def dominated_by(subject: Subject, *parts: str) -> np.ndarray:
+    columns = [index for index, name in enumerate(subject.body.joint_names) if name.endswith(parts)]
+    return subject.body.skin_weights[:, columns].sum(axis=1) > 0.95
+
+
+def test_cloth_lies_outside_the_body(subject: Subject, skin: np.ndarray) -> None:
+    """Torso and legs move outwards along the bare body's normals, by 6 cm at most; cloth that spans a hollow's rim
+    may cut off a few millimetres of it."""
+    normals = Mesh(skin, subject.body.faces).vertex_normals()
+    out_m = ((subject.body.vertices - skin) * normals).sum(axis=1)
+    clothed = dominated_by(subject, "Spine", "Spine1") | dominated_by(subject, "UpLeg", "Leg")
+    assert np.percentile(out_m[clothed], 10) > 0.001
+    assert out_m[clothed].min() > -0.008
+    assert out_m[clothed].max() < 0.06
+
+
+def test_hands_and_eyes_stay_bare(subject: Subject, skin: np.ndarray, bare: Body) -> None:
+    moved = np.linalg.norm(subject.body.vertices - skin, axis=1)
+    assert (
+        moved[dominated_by(subject, "Hand", *(f"Hand{f}{k}" for f in ("Index", "Thumb") for k in (1, 2, 3)))].max() == 0
+    )
+    eyes = np.unique(bare.faces[surface_kinds(bare) == EYE])
+    assert moved[eyes].max() == 0
+
+
+def test_the_skeleton_is_the_bare_bodys(subject: Subject, bare: Body) -> None:
+    assert np.array_equal(subject.body.joints_m, bare.joints_m)
+    assert np.allclose(subject.body.skin_weights.sum(axis=1), 1.0, atol=1e-5)
+    assert len(subject.body.faces) == len(subject.faces_uv) == 4 * len(bare.faces)
+
+
+def test_shoes_hide_the_toes_and_stand_flat(subject: Subject) -> None:
+    """The sole is one plane, and the front of a shoe is a convex outline: no gaps between toes."""
+    vertices = subject.body.vertices
+    foot = dominated_by(subject, "LeftFoot", "LeftToeBase") & (vertices[:, 1] < 0.06)
+    sole = np.abs(vertices[foot, 1] - vertices[foot, 1].min()) < 1e-4
+    assert sole.sum() > 50
+    toes = vertices[foot & (vertices[:, 2] > subject.body.joints_m[subject.body.joint("LeftToeBase"), 2])]
+    columns = np.digitize(toes[:, 0], np.linspace(toes[:, 0].min(), toes[:, 0].max(), 9)[1:-1])
+    front = np.array([toes[columns == column, 2].max() for column in range(8)])
+    second_differences = front[2:] - 2 * front[1:-1] + front[:-2]
+    assert second_differences.max() < 0.012
+
+
+def closed_share(faces: np.ndarray) -> float:
+    """Share of edges at which exactly two faces meet."""
+    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    return float((np.unique(edges, axis=0, return_counts=True)[1] == 2).mean())
+
+
+def test_the_surface_is_as_closed_as_the_body(subject: Subject, bare: Body) -> None:
+    skin_only = surface_kinds(bare) == SKIN
+    clothed = closed_share(subject.body.faces[np.repeat(skin_only, 4)])
+    assert clothed >= closed_share(bare.faces[skin_only])
+
+
+def test_layers_are_where_clothes_are(bare: Body) -> None:
+    anatomy, outfit = measure(load_anny(), bare), choose_outfit(0)
+    joints = anatomy.joints_m
+    between = 0.5 * (joints["LeftUpLeg"] + joints["LeftLeg"])
+    points = np.stack(
+        [
+            joints["Spine1"],
+            between,
+            joints["LeftHand"],
+            [0.0, anatomy.crown_y_m, anatomy.skull_m()[2]],
+            joints["LeftToeBase"],
+        ]
+    ).astype(np.float32)
+    limbs = np.array([[0, 0], [0, 0], [1, 0], [0, 1], [0, 0]], dtype=np.float32)
+    inside = layer_depths(points, limbs, anatomy, outfit) > 0
+    names = [tuple(layer for layer, is_in in zip(LAYERS, row, strict=True) if is_in) for row in inside]
+    assert names == [("shirt",), ("trousers",), (), ("hair",), ("shoes",)]
+
+
+def test_a_longer_sleeve_covers_more(bare: Body) -> None:
+    anatomy, outfit = measure(load_anny(), bare), choose_outfit(0)
+    elbow = anatomy.joints_m["LeftForeArm"][None]
+    on_arm = np.array([[1.0, 0.0]], dtype=np.float32)
+    shirt = LAYERS.index("shirt")
+    assert layer_depths(elbow, on_arm, anatomy, outfit)[0, shirt] < 0
+    assert layer_depths(elbow, on_arm, anatomy, replace(outfit, sleeve_fraction=1.3))[0, shirt] > 0
+
+
+def test_anatomy_is_symmetric_and_in_place(bare: Body) -> None:
+    anatomy = measure(load_anny(), bare)
+    assert anatomy.eyes_m[0, 0] > anatomy.mouth_m[0] > anatomy.eyes_m[1, 0]
+    assert anatomy.ears_m[0, 0] > 0.05
+    assert anatomy.ears_m[1, 0] < -0.05
+    assert 0.01 < anatomy.eye_radius_m < 0.02
+    assert anatomy.joints_m["Head"][1] < anatomy.mouth_m[1] < anatomy.eyes_m[:, 1].min() < anatomy.crown_y_m
+    assert np.ptp(anatomy.eyes_m[:, 1]) < 0.002
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_wardrobe_varies(seed: int) -> None:
+    assert choose_outfit(seed) == choose_outfit(seed)
+    assert choose_outfit(seed) != choose_outfit(0)

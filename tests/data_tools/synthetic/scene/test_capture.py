@@ -1,0 +1,123 @@
+"""The command: same seed, same bytes; truth beside, never inside, the video; clear refusals."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from data_tools.command import run_command
+from data_tools.sample import main
+from data_tools.synthetic.rig.subject import Subject
+from data_tools.synthetic.scene.capture import RECIPE_VERSION, novel_cameras, portrait_camera, straight_rgba
+from data_tools.synthetic.scene.movie import write_movie
+from pipeline.body.files import load_camera, load_motion
+from pipeline.capture.video import open_source, read_frames
+from pipeline.geometry.camera import project
+from pipeline.io.image import read_rgba
+from tests.data_tools.conftest import SAMPLE_OPTIONS
+
+
+def bytes_of(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_same_seed_same_bytes(sample: Path, tmp_path: Path) -> None:
+    main([str(tmp_path / "again"), *SAMPLE_OPTIONS])
+    first, second = bytes_of(sample), bytes_of(tmp_path / "again")
+    assert first.keys() == second.keys()
+    assert [name for name in first if first[name] != second[name]] == []
+
+
+def test_layout(sample: Path) -> None:
+    assert [path.name for path in (sample / "video").iterdir()] == ["video.mp4"]
+    assert open_source(sample / "video").n_frames == 6
+    assert len(list((sample / "truth" / "masks").iterdir())) == 6
+    assert len(list((sample / "truth" / "novel_views").glob("*.png"))) == 2
+    assert len(load_motion(sample / "truth" / "novel_poses" / "motion.npz").frame_index) == 2
+    recipe = json.loads((sample / "truth" / "recipe.json").read_text())
+    assert recipe["seed"] == 0
+    assert recipe["version"] == RECIPE_VERSION
+    assert recipe["light"]["key"] > 0
+    assert not list(sample.parent.glob("*.part"))
+
+
+def test_novel_views_look_at_the_person(sample: Path) -> None:
+    """The held-out cameras stand elsewhere, and the whole person is in their pictures."""
+    capture_camera = load_camera(sample / "truth" / "camera.npz")
+    for index in range(2):
+        camera = load_camera(sample / "truth" / "novel_views" / f"{index:06d}.npz")
+        assert np.linalg.norm(camera.centre_m() - capture_camera.centre_m()) > 1.0
+        alpha = read_rgba(sample / "truth" / "novel_views" / f"{index:06d}.png")[:, :, 3]
+        assert (alpha > 127).mean() > 0.04
+        assert not alpha[[0, -1]].any()
+        assert not alpha[:, [0, -1]].any()
+
+
+def test_cameras_are_rigid_and_centred() -> None:
+    camera, ground_m = portrait_camera(540, 1.8, 3.6, 0.8)
+    middle = torch.from_numpy(ground_m + [0.0, 0.9, 0.0])[None].float()
+    for novel in novel_cameras(camera, ground_m, 1.8, 5):
+        rotation = novel.world_to_camera[:3, :3]
+        assert np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
+        assert np.linalg.det(rotation) == pytest.approx(1.0, abs=1e-6)
+        place_px, depth_m = project(middle, novel)
+        assert np.allclose(place_px[0].numpy(), [270.0, 270.0], atol=0.01)
+        assert depth_m[0] == pytest.approx(3.6, rel=0.01)
+        up_px, _ = project(middle + torch.tensor([0.0, 0.1, 0.0]), novel)
+        assert up_px[0, 1] < place_px[0, 1]
+
+
+def test_the_person_fills_the_picture_as_asked() -> None:
+    camera, ground_m = portrait_camera(540, 1.8, 3.6, 0.8)
+    ends = torch.from_numpy(np.stack([ground_m, ground_m + [0.0, 1.8, 0.0]])).float()
+    place_px, _ = project(ends, camera)
+    assert place_px[0, 1] - place_px[1, 1] == pytest.approx(0.8 * 540, abs=0.1)
+
+
+def test_straight_colours_undo_premultiplication() -> None:
+    person = np.array([[[0.2, 0.1, 0.3, 0.5], [0.0, 0.0, 0.0, 0.0], [0.2, 0.4, 0.6, 1.0]]], dtype=np.float32)
+    assert straight_rgba(person).tolist() == [[[102, 51, 153, 128], [0, 0, 0, 0], [51, 102, 153, 255]]]
+
+
+def test_video_keeps_colours(tmp_path: Path) -> None:
+    """Saturated one-pixel stripes survive: no chroma subsampling, no loss beyond the rounding of YUV."""
+    frame = np.zeros((64, 64, 3), dtype=np.uint8)
+    frame[:, ::2] = (200, 30, 30)
+    frame[:, 1::2] = (30, 60, 190)
+    write_movie(tmp_path / "video.mp4", [frame, frame[::-1].copy()], 24.0)
+    decoded = [f.rgb for f in read_frames(open_source(tmp_path / "video.mp4"), lambda index: True, 64)]
+    assert len(decoded) == 2
+    assert np.abs(decoded[0].astype(int) - frame).max() <= 3
+
+
+def test_a_video_needs_a_frame(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="at least one frame"):
+        write_movie(tmp_path / "video.mp4", [], 24.0)
+
+
+def test_nothing_is_overwritten(sample: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = bytes_of(sample)
+    assert run_command(main, [str(sample)]) == 2
+    assert capsys.readouterr().err.startswith(f"error: {sample} exists already")
+    assert bytes_of(sample) == before
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("--frames", "1"), ("--size", "101"), ("--size", "8"), ("--fill", "1.5"), ("--samples", "0"), ("--seed", "-1")],
+)
+def test_bad_options_are_named(option: str, value: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(main, [str(tmp_path / "out"), option, value]) == 2
+    message = capsys.readouterr().err
+    assert message.startswith("error: ")
+    assert option in message
+    assert not (tmp_path / "out").exists()
+
+
+def test_subject_survives_the_disk(subject: Subject) -> None:
+    assert subject.texture.dtype == np.uint8
+    assert subject.faces_uv.max() < len(subject.uv)
+    assert subject.uv.min() >= 0
+    assert subject.uv.max() <= 1

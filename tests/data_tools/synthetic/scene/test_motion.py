@@ -1,0 +1,90 @@
+"""The turn covers all sides, keeps its feet on the ground and sways no more than people do."""
+
+import numpy as np
+import pytest
+import torch
+
+from data_tools.synthetic.scene.motion import NOVEL_POSES, above_rest_m, grounded, novel_motion, turn_in_a_pose
+from pipeline.body.body import Body, Motion, canonical_to_world
+from pipeline.geometry.rotation import quaternion_to_matrix
+
+GROUND_M = np.array([0.3, -0.9, -3.5])
+
+
+@pytest.fixture(scope="module")
+def turn(bare: Body) -> Motion:
+    return turn_in_a_pose(bare, 48, 24.0, GROUND_M, seed=0)
+
+
+def headings(motion: Motion) -> np.ndarray:
+    """Direction in which the hips look, radians around +Y from +Z."""
+    front = quaternion_to_matrix(torch.from_numpy(motion.rotations_wxyz[:, 0]))[:, :, 2].numpy()
+    return np.arctan2(front[:, 0], front[:, 2])
+
+
+def test_one_full_turn_in_even_steps(turn: Motion) -> None:
+    angles = np.unwrap(headings(turn))
+    assert abs(angles[0]) < 0.1  # towards the camera
+    assert angles[-1] - angles[0] == pytest.approx(2 * np.pi * 47 / 48, abs=0.1)
+    steps = np.diff(angles)
+    assert steps.min() > 0.5 * 2 * np.pi / 48
+    assert steps.max() < 1.5 * 2 * np.pi / 48
+
+
+def test_the_lowest_foot_stands_on_the_ground(bare: Body, turn: Motion) -> None:
+    assert np.allclose(above_rest_m(bare, turn), GROUND_M[1], atol=1e-5)
+
+
+def test_the_person_stays_on_the_spot(bare: Body, turn: Motion) -> None:
+    assert np.allclose(turn.root_translation_m[:, [0, 2]], GROUND_M[[0, 2]], atol=1e-5)
+    assert np.ptp(turn.root_translation_m[:, 1]) < 0.03
+
+
+def test_sway_is_natural(bare: Body, turn: Motion) -> None:
+    """No joint but the root leaves the A-pose by more than 9 degrees, none jerks, and arms do move."""
+    rotations = torch.from_numpy(turn.rotations_wxyz[:, 1:]).double()
+    angles = 2.0 * torch.arccos(rotations[..., 0].abs().clamp(max=1.0))
+    assert angles.max() < np.radians(9.0)
+    assert angles[:, bare.joint("LeftArm") - 1].max() > np.radians(1.5)
+    jerk = np.abs(np.diff(turn.rotations_wxyz[:, 1:], axis=0)).max()
+    assert jerk < 0.02
+
+
+def test_seed_decides_the_sway(bare: Body, turn: Motion) -> None:
+    again = turn_in_a_pose(bare, 48, 24.0, GROUND_M, seed=0)
+    other = turn_in_a_pose(bare, 48, 24.0, GROUND_M, seed=1)
+    assert np.array_equal(again.rotations_wxyz, turn.rotations_wxyz)
+    assert not np.allclose(other.rotations_wxyz, turn.rotations_wxyz)
+
+
+def test_novel_poses_lie_outside_the_turn(bare: Body, turn: Motion) -> None:
+    novel = novel_motion(bare, GROUND_M, 5)
+    assert len(novel.frame_index) == 5
+    for pose in novel.rotations_wxyz[:4, 1:]:
+        alike = np.abs((pose * turn.rotations_wxyz[:, 1:]).sum(-1)).min(axis=1)
+        assert alike.max() < np.cos(np.radians(30.0) / 2)
+    assert np.allclose(above_rest_m(bare, novel), GROUND_M[1], atol=1e-5)
+
+
+def test_arms_up_are_up(bare: Body) -> None:
+    index = list(NOVEL_POSES).index("arms_up")
+    transforms = canonical_to_world(bare, novel_motion(bare, GROUND_M, 4))[index]
+    hand, head = bare.joint("LeftHand"), bare.joint("Head")
+    height = [transforms[j, 1, :3] @ torch.from_numpy(bare.joints_m[j]) + transforms[j, 1, 3] for j in (hand, head)]
+    assert height[0] > height[1]
+
+
+def test_grounding_undoes_a_lift(bare: Body, turn: Motion) -> None:
+    lifted = turn.with_pose(turn.rotations_wxyz, turn.root_translation_m + [0.0, 0.7, 0.0])
+    back = grounded(bare, lifted, float(GROUND_M[1]))
+    assert np.allclose(back.root_translation_m, turn.root_translation_m, atol=1e-5)
+
+
+def test_a_part_of_a_turn_goes_there_and_back(bare: Body) -> None:
+    motion = turn_in_a_pose(bare, 48, 24.0, GROUND_M, seed=0, arc_deg=90.0)
+    w, _, y, _ = motion.rotations_wxyz[:, 0].T
+    heading_deg = np.degrees(2 * np.arctan2(y, w))
+    assert heading_deg.max() == pytest.approx(45, abs=1)
+    assert heading_deg.min() == pytest.approx(-45, abs=1)
+    assert heading_deg[0] == pytest.approx(0, abs=1)
+    assert np.abs(np.diff(heading_deg)).max() < 8

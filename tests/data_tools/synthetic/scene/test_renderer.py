@@ -1,0 +1,93 @@
+"""Shading and coverage against closed forms: a lit plane, and a ball whose silhouette is a known disc."""
+
+import numpy as np
+import pytest
+import torch
+
+from data_tools.synthetic.rig.subject import Subject
+from data_tools.synthetic.scene.renderer import FLAT, SHINY, STUDIO, Light, render_subject, shade
+from pipeline.body.body import Body
+from pipeline.geometry.camera import Camera
+from tests.data_tools.synthetic.shapes import sphere
+
+BALL_M, DISTANCE_M = 0.5, 4.0
+CAMERA = Camera(200.0, 200.0, 64.0, 64.0, 128, 128)
+COLOUR = (200, 100, 50)
+
+
+def ball() -> Subject:
+    vertices, faces = sphere(BALL_M, (0.0, 0.0, -DISTANCE_M))
+    weights = np.ones((len(vertices), 1), dtype=np.float32)
+    body = Body(("Hips",), np.array([-1], dtype=np.int32), np.zeros((1, 3), np.float32), vertices, faces, weights, {})
+    texture = np.tile(np.array(COLOUR, dtype=np.uint8), (4, 4, 1))
+    return Subject(body, np.full((len(vertices), 2), 0.5, dtype=np.float32), faces, texture)
+
+
+def render(light: Light, samples: int = 3, camera: Camera = CAMERA) -> np.ndarray:
+    subject = ball()
+    return render_subject(subject, torch.from_numpy(subject.body.vertices), camera, light, samples)
+
+
+def test_coverage_is_the_area_of_the_disc() -> None:
+    """A ball of radius r at distance d subtends asin(r/d); its outline is a disc of radius f tan of that."""
+    radius_px = CAMERA.fx * np.tan(np.arcsin(BALL_M / DISTANCE_M))
+    assert render(FLAT)[:, :, 3].sum() == pytest.approx(np.pi * radius_px**2, rel=0.01)
+
+
+def test_flat_light_shows_the_bare_texture() -> None:
+    image = render(FLAT)
+    inside = image[:, :, 3] == 1.0
+    assert inside.sum() > 1000
+    assert np.allclose(image[inside][:, :3], np.array(COLOUR) / 255.0, atol=1e-3)
+
+
+def test_colours_are_premultiplied() -> None:
+    image = render(FLAT)
+    border = (image[:, :, 3] > 0) & (image[:, :, 3] < 1)
+    assert border.sum() > 100
+    assert np.allclose(image[border][:, :3], image[border][:, 3:] * np.array(COLOUR) / 255.0, atol=1e-3)
+
+
+def test_nothing_outside_the_window() -> None:
+    camera = Camera(200.0, 200.0, -500.0, 64.0, 128, 128)
+    assert not render(STUDIO, camera=camera).any()
+
+
+def test_the_window_does_not_change_the_picture() -> None:
+    """The same ball, seen through a crop of the camera that cuts it, has the same pixels."""
+    whole, cut = render(STUDIO), render(STUDIO, camera=CAMERA.cropped(50, 40, 40, 60))
+    assert np.allclose(whole[40:100, 50:90], cut, atol=2e-2)
+    assert np.abs(whole[40:100, 50:90] - cut).mean() < 1e-4
+
+
+def test_key_light_comes_from_its_side() -> None:
+    image = render(Light(key=0.8, key_from=(1.0, 0.0, 0.0), ambient=0.2, sky=0.0))
+    brightness = image[64, :, :3].sum(axis=1)
+    assert brightness[76] > 1.3 * brightness[52]
+
+
+def lit(normal: tuple[float, float, float], light: Light, albedo: float = 0.5) -> float:
+    to_camera = torch.tensor([[0.0, 0.0, 1.0]])
+    return float(shade(torch.full((1, 3), albedo), torch.tensor([normal]), to_camera, torch.ones(1), light)[0, 0])
+
+
+def test_shade_against_the_formula() -> None:
+    """Mid grey 0.5 is 0.21404 in linear light; facing the key it gets ambient + key of it."""
+    light = Light(key=0.5, key_from=(0.0, 0.0, 1.0), ambient=0.7, sky=0.0)
+    linear = 0.21404 * 1.2
+    assert lit((0.0, 0.0, 1.0), light) == pytest.approx(1.055 * linear ** (1 / 2.4) - 0.055, abs=1e-4)
+    assert lit((0.0, 0.0, -1.0), light) == pytest.approx(1.055 * (0.21404 * 0.7) ** (1 / 2.4) - 0.055, abs=1e-4)
+
+
+def test_sky_is_above() -> None:
+    light = Light(key=0.0, ambient=0.8, sky=0.2)
+    assert lit((0.0, 1.0, 0.0), light) > lit((1.0, 0.0, 0.0), light) > lit((0.0, -1.0, 0.0), light)
+
+
+def test_shine_adds_a_highlight_only_near_the_mirror_direction() -> None:
+    dull = Light(key=SHINY.key, key_from=SHINY.key_from, ambient=SHINY.ambient, sky=SHINY.sky)
+    key = torch.nn.functional.normalize(torch.tensor(SHINY.key_from), dim=0)
+    half = torch.nn.functional.normalize(key + torch.tensor([0.0, 0.0, 1.0]), dim=0)
+    mirror = (float(half[0]), float(half[1]), float(half[2]))
+    assert lit(mirror, SHINY) > lit(mirror, dull) + 0.1
+    assert lit((-1.0, 0.0, 0.0), SHINY) == pytest.approx(lit((-1.0, 0.0, 0.0), dull), abs=1e-6)

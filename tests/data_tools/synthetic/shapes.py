@@ -1,0 +1,37 @@
+"""Small closed meshes with known geometry."""
+
+import numpy as np
+
+from data_tools.synthetic.person.surface import split_at_midpoints, with_midpoints
+
+TETRAHEDRON = (
+    np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], dtype=np.float32),
+    np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]], dtype=np.int32),
+)
+
+
+def octahedron() -> tuple[np.ndarray, np.ndarray]:
+    """Corners on the axes at distance 1, faces counter-clockwise from outside."""
+    vertices = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=np.float32)
+    faces = [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]]
+    return vertices, np.array(faces, dtype=np.int32)
+
+
+def sphere(radius_m: float, centre_m: tuple[float, float, float], rounds: int = 4) -> tuple[np.ndarray, np.ndarray]:
+    """A finely split octahedron blown up to a sphere."""
+    vertices, faces = octahedron()
+    for _ in range(rounds):
+        pairs, faces = split_at_midpoints(faces, len(vertices))
+        vertices = with_midpoints(vertices, pairs)
+        vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
+    return (vertices * radius_m + np.array(centre_m)).astype(np.float32), faces
+
+
+def crossings(origin: np.ndarray, direction: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Distances at which a ray meets triangles (Moeller and Trumbore 1997), by brute force, sorted."""
+    edge_1, edge_2, to_origin = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], origin - corners[:, 0]
+    p, q = np.cross(direction, edge_2), np.cross(to_origin, edge_1)
+    determinant = (edge_1 * p).sum(axis=1)
+    determinant[np.abs(determinant) < 1e-14] = np.nan
+    u, v, t = (to_origin * p).sum(axis=1) / determinant, q @ direction / determinant, (edge_2 * q).sum(1) / determinant
+    return np.sort(t[(u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)])

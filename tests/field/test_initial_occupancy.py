@@ -1,0 +1,125 @@
+import numpy as np
+import pytest
+import torch
+
+from pipeline.body.body import Body, load_anny
+from pipeline.field.initial_occupancy import (
+    cell_distances_m,
+    clothing_margin_m,
+    field_bounds_m,
+    filmed_from_one_side,
+    mask_frequency,
+    starting_shell,
+)
+from pipeline.field.occupancy import cell_centres
+from pipeline.geometry.camera import Camera
+from pipeline.geometry.surface import signed_distance_m
+from tests.kernels.bar import bar_skin
+
+DISC_M = 0.3
+UPRIGHT = torch.eye(4).expand(1, 2, 4, 4)
+LOOKING_BACK = np.diag([1.0, -1.0, -1.0, 1.0])
+LOOKING_BACK[2, 3] = 2.0
+
+
+def frequency_of(points, distances, masks, width=40):
+    """Of points of the unbent bar, before a camera 2 m away for which a decimetre is five pixels."""
+    camera = Camera(100.0, 100.0, width / 2, 20.0, width, 40, LOOKING_BACK.astype(np.float32))
+    matrices = UPRIGHT.expand(len(masks), 2, 4, 4)
+    points, distances = np.array(points, dtype=np.float32), np.array(distances, dtype=np.float32)
+    weights = bar_skin().weights_at(torch.from_numpy(points))
+    return mask_frequency(points, distances, weights, matrices, camera, masks)
+
+
+def test_counts_the_masks_that_hold_a_point():
+    left = np.zeros((40, 40), dtype=np.uint8)
+    left[:, :20] = 1
+    masks = [left, left, left, 1 - left]
+    frequency = frequency_of([[-0.3, 0, 0], [0.3, 0, 0]], [0.1, 0.1], masks)
+    np.testing.assert_allclose(frequency, [0.75, 0.25], atol=1e-6)
+
+
+def test_unseen_points_are_expected_near_the_body_only():
+    masks = [np.ones((40, 20), dtype=np.uint8)] * 8
+    seen, near, far = frequency_of([[0, 0, 0], [0.5, 0, 0], [0.5, 0, 0]], [0.1, 0.0, 0.1], masks, width=20)
+    assert seen == 1
+    assert near == 1
+    assert far == 0
+
+
+def test_few_sights_of_a_far_point_do_not_outweigh_the_expectation():
+    masks = [np.ones((40, 40), dtype=np.uint8)] * 2
+    blank = [np.zeros((40, 40), dtype=np.uint8)] * 2
+    assert frequency_of([[0, 0, 0]], [0.1], masks + blank)[0] == 0.5
+    narrow = [np.ones((40, 40), dtype=np.uint8)] * 4
+    assert frequency_of([[0.42, 0, 0]], [0.1], narrow)[0] < 0.1
+
+
+@pytest.mark.parametrize(("arc_deg", "one_sided"), [(0, True), (130, True), (160, False), (360, False)])
+def test_a_bone_that_turns_far_enough_is_not_filmed_from_one_side(arc_deg, one_sided):
+    """Over an arc the mean of the directions has the length sin(a/2) / (a/2): 0.75 at 145 degrees."""
+    angle = torch.linspace(-0.5, 0.5, 73)[:-1] * np.radians(arc_deg)
+    turning = torch.eye(4).repeat(len(angle), 1, 1)
+    turning[:, 0, 0], turning[:, 0, 2] = angle.cos(), angle.sin()
+    turning[:, 2, 0], turning[:, 2, 2] = -angle.sin(), angle.cos()
+    matrices = torch.stack([torch.eye(4).repeat(len(angle), 1, 1), turning], dim=1)
+    camera = Camera(100.0, 100.0, 20.0, 20.0, 40, 40, LOOKING_BACK.astype(np.float32))
+    joints_m, weights = np.zeros((2, 3), np.float32), bar_skin().weights_at(torch.tensor([[-0.3, 0, 0], [0.3, 0, 0]]))
+    found = filmed_from_one_side(joints_m, weights, matrices, camera)
+    assert found.tolist() == [True, one_sided]
+    # Where the body stands and which way it looks at first means nothing.
+    matrices[:, :, :3, 3] = torch.tensor([0.0, 0.0, -50.0])
+    turned = torch.tensor([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
+    again = filmed_from_one_side(joints_m, weights, matrices @ turned, camera)
+    assert again.tolist() == [True, one_sided]
+
+
+def test_every_cell_has_its_distance_to_the_body_up_to_the_reach():
+    anny = load_anny()
+    body = anny.body(anny.shape_defaults)
+    bounds_m, reach_m = field_bounds_m(body, 0.1), 0.02
+    some = np.random.default_rng(0).permutation(64**3)[:20_000]
+    truth_m = signed_distance_m(cell_centres(bounds_m)[some], body.mesh())
+    # The deepest lie farther from all vertices than cells outside that are asked.
+    assert truth_m.min() < -(reach_m + 0.06)
+    found_m = cell_distances_m(body, bounds_m, reach_m).reshape(-1)[some]
+    np.testing.assert_allclose(found_m, np.minimum(truth_m, reach_m), atol=1e-6)
+
+
+def test_the_shell_holds_the_body_and_what_masks_support():
+    distance = np.array([-0.01, 0.05, 0.05, 0.2])
+    frequency = np.array([0.0, 0.7, 0.5, 1.0])
+    assert starting_shell(distance, frequency, 0.1, 0.6).tolist() == [True, True, False, False]
+
+
+def margin_of_discs(radii_m, narrowest_m=0.05, widest_m=1.0):
+    """A flat body, a disc of points 2 m before the camera, and a round mask in each frame; a pixel is a centimetre."""
+    grid = np.stack(np.meshgrid(*2 * [np.arange(-DISC_M, DISC_M + 0.01, 0.01)]), axis=-1).reshape(-1, 2)
+    disc = grid[np.linalg.norm(grid, axis=1) <= DISC_M + 1e-6]
+    vertices = np.pad(disc, ((0, 0), (0, 1))).astype(np.float32)
+    nowhere = np.zeros((1, 3), dtype=np.float32)
+    ones = np.ones((len(vertices), 1), dtype=np.float32)
+    body = Body(("Hips",), np.array([-1]), nowhere, vertices, np.array([[0, 1, 2]]), ones, {})
+    camera = Camera(200.0, 200.0, 80.0, 80.0, 160, 160, LOOKING_BACK.astype(np.float32))
+    row, column = np.mgrid[:160, :160] + 0.5
+    from_axis_m = np.hypot(row - 80, column - 80) / 100
+    masks = [from_axis_m < radius for radius in radii_m]
+    return clothing_margin_m(body, UPRIGHT[:, :1].expand(len(masks), 1, 4, 4), camera, masks, narrowest_m, widest_m)
+
+
+def test_the_margin_is_twice_what_masks_reach_beyond_the_body():
+    # 99 % of a disc's area lie within sqrt(0.99) of its radius.
+    for radius in (0.4, 0.5, 0.7):
+        assert margin_of_discs([radius]) == pytest.approx(2 * (np.sqrt(0.99) * radius - DISC_M), abs=0.02)
+
+
+def test_the_margin_stays_within_its_limits():
+    assert margin_of_discs([DISC_M]) == 0.05
+    assert margin_of_discs([0.7], widest_m=0.4) == 0.4
+    assert margin_of_discs([0.7], widest_m=0.0) == 0.05
+
+
+def test_a_few_poor_masks_and_empty_ones_do_not_widen_the_margin():
+    assert margin_of_discs([DISC_M, DISC_M, DISC_M, 0.75, 0.75]) == 0.05
+    assert margin_of_discs([0.5, 0.0, 0.0, 0.0]) == margin_of_discs([0.5])
+    assert margin_of_discs([0.0]) == 0.05

@@ -1,0 +1,66 @@
+import numpy as np
+import pytest
+import torch
+
+from pipeline.field.config import FieldConfig
+from pipeline.field.losses import field_losses
+from pipeline.field.pixel_sampler import ErrorMap, build_pool
+
+CONFIG = FieldConfig(huber_delta=0.1, weight_alpha=0.5, weight_hard=0.2, weight_density=0.1)
+
+
+def test_perfect_image_costs_nothing():
+    rgba = torch.tensor([[0.2, 0.4, 0.6, 1.0], [0.9, 0.1, 0.5, 0.0]])
+    solid = rgba[:, :3] * rgba[:, 3:]
+    losses, error = field_losses(solid, rgba[:, 3], rgba, torch.rand(2, 3), torch.ones(2), torch.zeros(5), CONFIG)
+    assert float(error.abs().max()) < 1e-7
+    assert set(losses) == {"colour", "alpha", "hard", "density"}
+    for name, value in losses.items():
+        assert float(value) == pytest.approx(0, abs=1e-6), name
+
+
+def test_a_hole_in_the_body_costs_whatever_its_colour_and_background():
+    rgba = torch.tensor([[1.0, 1.0, 1.0, 1.0]])
+    nothing = torch.zeros(1, 3), torch.zeros(1)
+    losses, _ = field_losses(*nothing, rgba, torch.ones(1, 3), torch.ones(1), torch.zeros(0), CONFIG)
+    assert float(losses["colour"]) == 0
+    assert float(losses["alpha"]) == pytest.approx(0.5 * 0.95)
+    assert "density" not in losses
+
+
+def make_pool():
+    mask = np.zeros((60, 40), np.uint8)
+    mask[10:50, 10:30] = 255
+    image = np.random.default_rng(0).integers(0, 256, (60, 40, 3), dtype=np.uint8)
+    empty = np.zeros_like(mask)
+    return build_pool([(image, mask), (image, empty), (image, mask)], 3, seed=0), image, mask
+
+
+def test_pool_sorts_pixels_into_kinds():
+    pool, image, mask = make_pool()
+    columns, rows = pool.xy_px.T
+    np.testing.assert_array_equal(pool.rgba[:, :3], np.concatenate([image[rows, columns]]))
+    body = slice(pool.start[0, 0], pool.start[0, 1])
+    outside = slice(pool.start[0, 2], pool.start[0, 3])
+    assert (pool.rgba[body, 3] == 255).all()
+    assert (pool.rgba[outside, 3] == 0).all()
+    assert body.stop - body.start == (40 - 6) * (20 - 6)
+    assert (pool.start[1] == pool.start[1, 0]).all()
+    places = pool.xy_px[pool.start[0, 0] : pool.start[0, 3]]
+    assert len(np.unique(places, axis=0)) == len(places)
+
+
+def test_rays_are_shared_out_as_asked():
+    pool, _, _ = make_pool()
+    sizes = pool.sizes(np.array([0, 1, 2]), 300.0, (0.6, 0.3, 0.1))
+
+    def drawn(frame):
+        return pool.draw(np.array([frame]), sizes[[frame]], [np.random.default_rng(0)], ErrorMap(3, pool.xy_px))[0]
+
+    assert sizes.tolist() == [[180, 90, 30], [0, 0, 0], [180, 90, 30]]
+    rows = drawn(0)
+    assert (np.diff(rows) >= 0).all()
+    kinds = np.searchsorted(pool.start[0], rows, side="right") - 1
+    assert np.bincount(kinds).tolist() == [180, 90, 30]
+    np.testing.assert_array_equal(rows, drawn(0))
+    assert len(drawn(1)) == 0

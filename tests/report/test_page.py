@@ -1,0 +1,117 @@
+"""The page is one well-formed file that carries everything it shows and fetches nothing."""
+
+import base64
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.report.embed import split_glb
+from pipeline.report.page import ASSETS, ERROR_RANGE, error_map, figure_text, render_page
+from tests.report.report_sample import sample_page
+
+VOID = {"meta", "link", "img", "input", "br"}
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+
+
+class Outline(HTMLParser):
+    """Checks that tags nest, and keeps attributes and texts."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.attributes: list[tuple[str, dict[str, str | None]]] = []
+        self.texts: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.attributes.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.texts.append(data)
+
+
+@pytest.fixture(scope="module")
+def page() -> str:
+    return render_page(sample_page())
+
+
+@pytest.fixture(scope="module")
+def outline(page: str) -> Outline:
+    parser = Outline()
+    parser.feed(page)
+    assert parser.open == []
+    return parser
+
+
+def test_nothing_is_fetched(outline: Outline):
+    links = [attributes.get(key) for _, attributes in outline.attributes for key in ("src", "href", "srcset")]
+    assert [link for link in links if link]
+    assert all(link.startswith("data:") for link in links if link)
+    assert not re.search(r"url\((?!data:)|@import", (ASSETS / "report.css").read_text())
+
+
+def test_every_picture_has_a_size_and_a_text(outline: Outline):
+    images = [attributes for tag, attributes in outline.attributes if tag == "img"]
+    assert len(images) == 2 * 5 + 4 + 1
+    assert all(image["alt"] and int(image["width"] or 0) > 0 for image in images)
+
+
+def test_what_people_wrote_is_escaped(page: str):
+    assert "<title>run &lt;one&gt;</title>" in page
+    assert "a &lt;processor&gt;" in page
+
+
+def test_the_model_is_carried_whole(page: str):
+    found = re.search(r'id="avatar-glb">([^<]+)</script>', page)
+    assert found
+    document, binary = split_glb(base64.b64decode(found.group(1)))
+    assert document["skins"]
+    assert document["animations"]
+    assert len(binary) == document["buffers"][0]["byteLength"]
+
+
+def test_scripts_cannot_end_early():
+    for name in ("viewer.min.js", "report.js", "report.css"):
+        assert not re.search(r"</(script|style)", (ASSETS / name).read_text(encoding="utf-8"), re.IGNORECASE)
+
+
+def test_frames_without_error_show_a_dash_instead_of_infinity(outline: Outline):
+    texts = " ".join(outline.texts)
+    assert "– dB" in texts
+    assert "inf" not in " ".join(outline.texts[:40])
+
+
+def test_error_maps_are_black_for_equal_and_brightest_from_the_range_on():
+    dark = np.zeros((2, 2, 3), dtype=np.uint8)
+    assert error_map(dark, dark).max() <= 4
+    assert np.array_equal(error_map(dark, dark + np.uint8(ERROR_RANGE)), error_map(dark, dark + np.uint8(255)))
+    assert error_map(dark, dark + np.uint8(ERROR_RANGE)).mean() > 200
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(True, "yes"), (None, "–"), (0.912345, "0.9123"), (12345, "12,345"), (12345.6, "12,346"), (0.0, "0"), ("a", "a")],
+)
+def test_figures_are_short(value: object, text: str):
+    assert figure_text(value) == text
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
+def test_a_browser_shows_the_avatar(page: str, tmp_path: Path):
+    """The viewer marks itself ready only after the model was read and drawn."""
+    file = tmp_path / "index.html"
+    file.write_text(page, encoding="utf-8")
+    options = ["--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    options += ["--virtual-time-budget=20000", "--dump-dom", file.as_uri()]
+    done = subprocess.run([CHROMIUM, *options], capture_output=True, text=True, timeout=120, check=True)
+    assert re.search(r'id="viewer"[^>]*data-ready="true"', done.stdout)
+    assert "Skeleton" in done.stdout

@@ -1,0 +1,65 @@
+"""The document of report.json: the promised keys, sums and means, and nothing that JSON cannot hold."""
+
+import json
+import math
+
+import pytest
+
+from pipeline.core.errors import UserError
+from pipeline.core.manifest import Manifest
+from pipeline.report.report_json import finite, report_text
+from tests.report import report_sample
+from tests.report.report_sample import SCORES, STAGES, sample_manifests, sample_report
+
+
+def test_the_promised_keys_are_there():
+    report = json.loads(report_text(sample_report()))
+    assert list(report["seconds"]) == [*STAGES, "report", "total"]
+    assert list(report["peak_rss_mib"]) == [*STAGES, "report", "total"]
+    for render in ("field", "mesh"):
+        assert {"psnr_full", "psnr_body", "ssim_full"} <= report["heldout"][render].keys()
+    assert {"vertices", "faces", "watertight", "manifold", "components"} <= report["mesh"].keys()
+    assert {"glb_bytes", "texture_px"} <= report["export"].keys()
+    assert report["masks"] == {"count": 9}
+    assert report["body"] == {"landmark_error_px": 4.5, "silhouette_iou": 0.93}
+    assert "divisible by eight" in report["heldout"]["protocol"]
+    assert "fitted to landmarks and outline, never to their colours" in report["heldout"]["protocol"]
+
+
+def test_totals_are_the_sum_of_seconds_and_the_highest_peak():
+    report = sample_report()
+    assert report["seconds"]["total"] == 1 + 2 + 3 + 4 + 5 + 6 + 7
+    assert report["peak_rss_mib"]["total"] == 700.0
+
+
+def test_scores_are_means_over_frames():
+    heldout = sample_report()["heldout"]
+    assert heldout["field"]["psnr_full"] == 25.0
+    assert heldout["mesh"]["ssim_box"] == 24.0
+    assert [row["index"] for row in heldout["frames"]] == [0, 8]
+
+
+def test_the_psnr_of_equal_images_becomes_null():
+    report = sample_report(math.inf)
+    assert report["heldout"]["field"]["psnr_full"] is None
+    assert json.loads(report_text(report))["heldout"]["frames"][0]["mesh"]["psnr_body"] is None
+    assert finite({"a": [math.nan, 1.0, (2, -math.inf)]}) == {"a": [None, 1.0, [2, None]]}
+
+
+def test_lpips_says_what_it_compares_with_or_why_it_is_absent(monkeypatch):
+    assert sample_report()["heldout"]["lpips"].startswith("absent")
+    monkeypatch.setattr(report_sample, "SCORES", (*SCORES, "lpips_full"))
+    assert "do not compare" in sample_report()["heldout"]["lpips"]
+
+
+def test_warnings_name_their_stage():
+    manifests = sample_manifests()
+    manifests["frames"] = Manifest("frames", 1, "", {}, {}, {}, {}, 1.0, 1.0, warnings=["3 frames without a person"])
+    assert sample_report(manifests=manifests)["warnings"] == ["frames: 3 frames without a person"]
+
+
+def test_a_figure_that_the_body_stage_did_not_leave_is_named():
+    manifests = sample_manifests()
+    manifests["body"] = Manifest("body", 1, "", {}, {}, {}, {}, 1.0, 1.0)
+    with pytest.raises(UserError, match="landmark_error_px.*stages.body"):
+        sample_report(manifests=manifests)
