@@ -3,25 +3,25 @@
 import sys
 from collections.abc import Callable, Sequence
 
-from pipeline.core.cli import USER_ERROR
-from pipeline.core.errors import UserError, os_error_sentence
-from pipeline.core.runner import INTERRUPTED
+from pipeline.core.cli import EXIT_USER_ERROR
+from pipeline.core.errors import UserError, format_os_error
+from pipeline.core.runner import EXIT_INTERRUPTED
 
 
-def run_command(work: Callable[[Sequence[str]], None], argv: Sequence[str]) -> int:
+def run_command(command: Callable[[Sequence[str]], None], argv: Sequence[str]) -> int:
     """Run a command with its arguments; return the exit status. Faults of the program stay loud."""
     try:
-        work(argv)
+        command(argv)
     except UserError as error:
-        sentence: str | None = str(error)
+        message: str | None = str(error)
     except OSError as error:
-        sentence = os_error_sentence(error)
-        if sentence is None:
+        message = format_os_error(error)
+        if message is None:
             raise
     except KeyboardInterrupt:
         print("interrupted: run the same command again", file=sys.stderr)
-        return INTERRUPTED
+        return EXIT_INTERRUPTED
     else:
         return 0
-    print(f"error: {sentence}", file=sys.stderr)
-    return USER_ERROR
+    print(f"error: {message}", file=sys.stderr)
+    return EXIT_USER_ERROR

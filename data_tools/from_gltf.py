@@ -8,16 +8,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from data_tools.command import run_command
-from data_tools.folder import refuse_existing
-from data_tools.synthetic.rig.rigged import read_rigged
+from data_tools.folder import require_absent
+from data_tools.synthetic.rig.rigged import read_rigged_person
 from data_tools.synthetic.scene.capture import write_capture
 from data_tools.synthetic.scene.options import (
-    assemble,
+    build_capture,
+    build_motion,
+    build_scene,
     capture_parser,
-    check_options,
-    choose_motion,
-    recipe_of,
-    stage_scene,
+    recipe_from_options,
+    validate_capture_options,
 )
 
 
@@ -27,13 +27,13 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("person", type=Path, help="rigged, textured person (.glb, Mixamo joint names)")
     parser.add_argument("out", type=Path, help="folder to make: OUT/video for the pipeline, OUT/truth beside it")
     options = parser.parse_args(argv)
-    check_options(options)
-    refuse_existing(options.out)
-    subject = read_rigged(options.person)
-    scene = stage_scene(options, subject.body)
-    motion = choose_motion(options, subject.body, scene[1])
-    capture, heldout = assemble(options, subject, motion, scene)
-    recipe = {"source": "gltf", **recipe_of(options), "person": options.person.name}
+    validate_capture_options(options)
+    require_absent(options.out)
+    subject = read_rigged_person(options.person)
+    scene = build_scene(options, subject.body)
+    motion = build_motion(options, subject.body, scene[1])
+    capture, heldout = build_capture(options, subject, motion, scene)
+    recipe = {"source": "gltf", **recipe_from_options(options), "person": options.person.name}
     write_capture(options.out, capture, None, heldout, recipe)
     print(f"{options.out}/video/video.mp4 and its truth in {options.out}/truth")
 

@@ -8,17 +8,17 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from data_tools.command import run_command
-from data_tools.folder import refuse_existing
+from data_tools.folder import require_absent
 from data_tools.synthetic.person.outfit import LEGWEAR
 from data_tools.synthetic.person.person import make_person
 from data_tools.synthetic.scene.capture import write_capture
 from data_tools.synthetic.scene.options import (
-    assemble,
+    build_capture,
+    build_motion,
+    build_scene,
     capture_parser,
-    check_options,
-    choose_motion,
-    recipe_of,
-    stage_scene,
+    recipe_from_options,
+    validate_capture_options,
 )
 
 
@@ -29,13 +29,13 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--texture", type=int, default=2048, help="side of the true texture in pixels")
     parser.add_argument("--legwear", choices=LEGWEAR, default=LEGWEAR[0], help="trousers, or a skirt over bare legs")
     options = parser.parse_args(argv)
-    check_options(options)
-    refuse_existing(options.out)
+    validate_capture_options(options)
+    require_absent(options.out)
     subject, bare = make_person(options.seed, options.texture, options.legwear)
-    scene = stage_scene(options, subject.body)
-    motion = choose_motion(options, subject.body, scene[1])
-    capture, heldout = assemble(options, subject, motion, scene)
-    write_capture(options.out, capture, bare, heldout, {"source": "sample", **recipe_of(options)})
+    scene = build_scene(options, subject.body)
+    motion = build_motion(options, subject.body, scene[1])
+    capture, heldout = build_capture(options, subject, motion, scene)
+    write_capture(options.out, capture, bare, heldout, {"source": "sample", **recipe_from_options(options)})
     print(f"{options.out}/video/video.mp4 and its truth in {options.out}/truth")
 
 

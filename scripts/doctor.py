@@ -11,9 +11,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-PYTHON = (3, 11)
-FREE_DISK_GIB = 6.0
-MEMORY_GIB = 3.0
+REQUIRED_PYTHON = (3, 11)
+MIN_FREE_DISK_GIB = 6.0
+MIN_MEMORY_GIB = 3.0
 GIB = 1024.0**3
 
 # What the wheels load from the system and a bare Debian 12 may lack, beside glibc: the shared library, then its Debian
@@ -43,7 +43,7 @@ def main(arguments: Sequence[str]) -> int:
     if "--packages" in arguments:
         print(" ".join(packages))
         return 0
-    problems = [*python_problems(), *package_problems(packages), *space_problems(Path.cwd())]
+    problems = [*python_problems(), *package_problems(packages), *disk_and_memory_problems(Path.cwd())]
     for problem in problems:
         print(f"missing: {problem}")
     if not problems:
@@ -68,9 +68,9 @@ def is_loadable(library: str) -> bool:
 
 def python_problems() -> list[str]:
     """The interpreter's version, if it is not the one that the dependencies are pinned for."""
-    if sys.version_info[:2] == PYTHON:
+    if sys.version_info[:2] == REQUIRED_PYTHON:
         return []
-    wanted = ".".join(map(str, PYTHON))
+    wanted = ".".join(map(str, REQUIRED_PYTHON))
     return [f"Python {wanted} (this is {sys.version.split()[0]}): make PYTHON=/path/to/python{wanted}"]
 
 
@@ -83,15 +83,15 @@ def package_problems(packages: Sequence[str]) -> list[str]:
     return [f"system packages {', '.join(packages)}: {command}"]
 
 
-def space_problems(folder: Path) -> list[str]:
+def disk_and_memory_problems(folder: Path) -> list[str]:
     """Too little free disk under `folder`, or too little memory."""
     problems = []
     free_gib = shutil.disk_usage(folder).free / GIB
-    if free_gib < FREE_DISK_GIB and not (folder / ".venv").exists():
-        problems.append(f"disk space: {free_gib:.1f} GiB are free at {folder}, {FREE_DISK_GIB:.0f} are needed")
+    if free_gib < MIN_FREE_DISK_GIB and not (folder / ".venv").exists():
+        problems.append(f"disk space: {free_gib:.1f} GiB are free at {folder}, {MIN_FREE_DISK_GIB:.0f} are needed")
     memory_gib = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / GIB
-    if memory_gib < MEMORY_GIB:
-        problems.append(f"memory: {memory_gib:.1f} GiB, {MEMORY_GIB:.0f} are needed: close programs or add swap")
+    if memory_gib < MIN_MEMORY_GIB:
+        problems.append(f"memory: {memory_gib:.1f} GiB, {MIN_MEMORY_GIB:.0f} are needed: close programs or add swap")
     return problems
 
 

@@ -28,11 +28,11 @@ def main(arguments: Sequence[str]) -> int:
     """Install the lock file named first, then the extras named after it; return pip's exit status."""
     lock, extras = Path(arguments[0]), list(arguments[1:])
     pin = torch_pin(lock.read_text(encoding="utf-8"))
-    wants_cuda = "cuda" in extras
-    if wants_cuda and installed_torch().endswith("+cpu"):
+    use_cuda = "cuda" in extras
+    if use_cuda and installed_torch().endswith("+cpu"):
         _pip("uninstall", "--yes", "torch")
     if not installed_torch():
-        _pip("install", *torch_arguments(pin, lock, wants_cuda))
+        _pip("install", *torch_pip_arguments(pin, lock, use_cuda))
     _pip("install", "--requirement", str(lock))
     wanted = [package for extra in extras if extra != "cuda" for package in extra_packages(extra)]
     if wanted:
@@ -48,20 +48,20 @@ def torch_pin(lock_text: str) -> str:
     return found.group(0)
 
 
-def torch_arguments(pin: str, lock: Path, wants_cuda: bool) -> list[str]:
+def torch_pip_arguments(pin: str, lock: Path, use_cuda: bool) -> list[str]:
     """What pip is asked for torch; TORCH_INDEX names another index to add, or is empty for none."""
     index = os.environ.get("TORCH_INDEX")
-    if wants_cuda:
+    if use_cuda:
         return [pin, "--constraint", str(lock), *(["--extra-index-url", index] if index else [])]
-    if index is None and not offers_cpu_build(pin):
-        index = TORCH_CPU_INDEX if answers(TORCH_CPU_INDEX) else None
+    if index is None and not resolves_to_cpu_build(pin):
+        index = TORCH_CPU_INDEX if is_index_reachable(TORCH_CPU_INDEX) else None
         if index is None:
             print(f"note: {TORCH_CPU_INDEX} does not answer: pip takes the build that PyPI has, which may be large")
             return [pin, "--constraint", str(lock)]
     return [pin, "--no-deps", *(["--extra-index-url", index] if index else [])]
 
 
-def offers_cpu_build(pin: str) -> bool:
+def resolves_to_cpu_build(pin: str) -> bool:
     """True when pip, as it is configured here, would already choose a wheel without CUDA."""
     command = [sys.executable, "-m", "pip", "install", "--quiet", "--dry-run", "--no-deps", "--report", "-", pin]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -71,7 +71,7 @@ def offers_cpu_build(pin: str) -> bool:
     return sys.platform != "linux" or any(name.endswith("+cpu") for name in chosen)
 
 
-def answers(index: str) -> bool:
+def is_index_reachable(index: str) -> bool:
     """True when a package index can be reached."""
     try:
         with urllib.request.urlopen(f"{index}/torch/", timeout=PROBE_TIMEOUT_S):

@@ -12,27 +12,27 @@ from pydantic import Field
 from pipeline.body.body import Motion, ParametricBody, canonical_to_world, load_anny
 from pipeline.body.files import save_body, save_camera, save_motion
 from pipeline.body.fit.diagnostics import (
-    VERDICTS,
-    doubts,
-    frames_to_show,
-    known_median,
+    FRAME_RATINGS,
+    finite_median,
+    fit_warnings,
     make_observations,
-    median_overlap,
+    median_silhouette_iou,
+    rate_frames,
+    select_overlay_frames,
     suspicious_frames,
     usable_frames,
-    verdicts,
 )
 from pipeline.body.fit.fit import FitOptions, FitResult, TooFewLandmarksError, fit_body, fit_given
-from pipeline.body.fit.foreign_objects import foreign_frames, lump_doubts, lump_shares
-from pipeline.body.fit.hand_observations import finger_curls_rad, trusted_hands
-from pipeline.body.fit.silhouette_icp import matching_window
-from pipeline.body.fit.supplied_poses import GivenPoses
-from pipeline.body.overlay import draw_overlay, overlay_grid, posed_frame
+from pipeline.body.fit.foreign_objects import foreign_object_warnings, frames_with_foreign_objects, residual_blob_shares
+from pipeline.body.fit.hand_observations import filter_hand_detections, finger_curls_rad
+from pipeline.body.fit.silhouette_icp import crop_mask_window
+from pipeline.body.fit.supplied_poses import SuppliedPoses
+from pipeline.body.overlay import draw_overlay, overlay_grid, pose_vertices
 from pipeline.body.smpl import SmplBody
 from pipeline.body.smpl_file import load_smpl
 from pipeline.capture.capture import Capture, load_capture
-from pipeline.capture.frame_selection import TRAIN, frame_ranges
-from pipeline.capture.hand_detector import Hands, no_hands
+from pipeline.capture.frame_selection import TRAIN, format_frame_ranges
+from pipeline.capture.hand_detector import HandLandmarks, undetected_hands
 from pipeline.capture.smpl_poses import SMPL_POSES_NPZ
 from pipeline.capture.usable_frames import SCORES_NPZ
 from pipeline.core.cli import main
@@ -46,7 +46,7 @@ from pipeline.io.npz import save_npz
 
 _BODY, _MOTION, _CAMERA, _OVERLAY = "body.npz", "motion.npz", "camera.npz", "overlay.png"
 _OVERLAY_FRAMES = 12
-_GUESS_DEVIATION, _RECORDED_DEVIATION = 0.5, 0.1
+_DEFAULT_FOCAL_STD, _EXIF_FOCAL_STD = 0.5, 0.1
 """Relative deviations of a guessed focal length and of one in the metadata (`pipeline.capture.exif_focal`)."""
 
 
@@ -62,10 +62,10 @@ class Config(BaseConfig):
     field_of_view_deg: float | None = Field(
         None, ge=5.0, le=150.0, description="Angle of view along the longer image side, degrees; null: estimated."
     )
-    usual_focal: float = Field(
+    initial_focal_ratio: float = Field(
         1.2, ge=0.3, le=5.0, description="Where the estimate of the focal length starts, times the longer image side."
     )
-    principal_point: float = Field(
+    principal_point_std_ratio: float = Field(
         0.05,
         ge=0.0,
         le=0.3,
@@ -79,10 +79,10 @@ class Config(BaseConfig):
         description="With an SMPL model_file, of smpl_poses.npz beside the video: keep its shape and poses; keep its "
         "shape and start from its poses, which landmarks and outlines refine; or ignore it.",
     )
-    min_overlap: float = Field(
+    min_silhouette_iou: float = Field(
         0.5, ge=0.0, le=1.0, description="A fit is refused whose median overlap with the masks (IoU, 0 to 1) is lower."
     )
-    max_dropped: float = Field(
+    max_dropped_share: float = Field(
         0.3,
         ge=0.0,
         le=0.9,
@@ -95,91 +95,103 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     """Fit the body; write body, motion, camera, a score per frame and the overlay picture."""
     capture = load_capture(inputs["frames"])
     masks = [to_uint8(capture.mask(position)) for position in range(len(capture))]
-    hands = trusted_hands(capture.hands or no_hands(len(capture)), capture.landmarks_px)
+    hands = filter_hand_detections(capture.hands or undetected_hands(len(capture)), capture.landmarks_px)
     result = fit(capture, hands, masks, inputs["frames"], config)
     motion = Motion(capture.frame_index, capture.time_s, result.rotations_wxyz, result.root_translation_m)
-    exchanged = np.stack(list(result.exchanged.values())).any(axis=0)
+    left_right_swapped = np.stack(list(result.left_right_swapped.values())).any(axis=0)
     save_body(out / _BODY, result.body)
     save_motion(out / _MOTION, motion)
     save_camera(out / _CAMERA, result.camera)
-    lumps = lump_shares(result.body, canonical_to_world(result.body, motion), result.camera, masks)
+    blob_shares = residual_blob_shares(result.body, canonical_to_world(result.body, motion), result.camera, masks)
     usable, training = usable_frames(result), capture.split == TRAIN
-    scores = {"silhouette_iou": result.overlap, "landmark_error_px": result.landmark_error_px, "exchanged": exchanged}
-    scores |= {"lump_share": lumps, "usable": usable}
+    scores = {
+        "silhouette_iou": result.silhouette_iou,
+        "landmark_error_px": result.landmark_error_px,
+        "left_right_swapped": left_right_swapped,
+    }
+    scores |= {"residual_blob_share": blob_shares, "usable": usable}
     save_npz(out / SCORES_NPZ, {"frame_index": capture.frame_index, **scores})
-    write_rgb(out / _OVERLAY, overlay(capture, masks, result, motion, foreign_frames(lumps)))
-    for sentence in doubts(result, capture.frame_index, training) + lump_doubts(lumps, capture.frame_index):
-        warn(sentence)
+    write_rgb(out / _OVERLAY, overlay(capture, masks, result, motion, frames_with_foreign_objects(blob_shares)))
+    for message in fit_warnings(result, capture.frame_index, training) + foreign_object_warnings(
+        blob_shares, capture.frame_index
+    ):
+        warn(message)
     return {
-        "silhouette_iou": float(np.nanmedian(result.overlap)),
-        "silhouette_iou_worst": float(np.nanmin(result.overlap)),
-        "landmark_error_px": known_median(result.landmark_error_px),
+        "silhouette_iou": float(np.nanmedian(result.silhouette_iou)),
+        "silhouette_iou_worst": float(np.nanmin(result.silhouette_iou)),
+        "landmark_error_px": finite_median(result.landmark_error_px),
         "focal_px": result.camera.fx,
-        "focal_deviation": result.focal_deviation,
+        "focal_relative_std": result.focal_relative_std,
         "principal_x_px": result.camera.cx,
         "principal_y_px": result.camera.cy,
         "height_m": result.body.height_m(),
-        "height_deviation_m": result.height_deviation_m,
-        "exchanged_frames": int(exchanged.sum()),
-        "hands_used": float((hands.own_side > 0.0).mean()),
+        "height_std_m": result.height_std_m,
+        "left_right_swapped_frames": int(left_right_swapped.sum()),
+        "hands_used": float((hands.handedness_score > 0.0).mean()),
         "suspicious_frames": int(suspicious_frames(result).sum()),
         "dropped_frames": int((training & ~usable).sum()),
-        "foreign_frames": int(foreign_frames(lumps).sum()),
+        "frames_with_foreign_objects": int(frames_with_foreign_objects(blob_shares).sum()),
     }
 
 
 def fit(
-    capture: Capture, hands: Hands, masks: Sequence[UInt8[np.ndarray, "h w"]], frames_dir: Path, config: Config
+    capture: Capture, hands: HandLandmarks, masks: Sequence[UInt8[np.ndarray, "h w"]], frames_dir: Path, config: Config
 ) -> FitResult:
     """Fit and judge; UserError when the landmarks or the result are of no use."""
-    camera, focal_deviation = starting_camera(capture, config)
+    camera, focal_relative_std = initial_camera(capture, config)
     landmarks = capture.landmarks_px, capture.landmarks_visibility, capture.landmarks_world_m
     observations = make_observations(capture.time_s, *landmarks, camera, hands)
     side_px = max(camera.width, camera.height)
-    centre_deviation = config.principal_point * side_px / camera.fx if focal_deviation > 0.0 else 0.0
-    options = FitOptions(config.height_m, focal_deviation, centre_deviation, config.shared_frames, config.rounds)
-    windows = [matching_window(mask) for mask in masks]
+    principal_point_relative_std = (
+        config.principal_point_std_ratio * side_px / camera.fx if focal_relative_std > 0.0 else 0.0
+    )
+    options = FitOptions(
+        config.height_m, focal_relative_std, principal_point_relative_std, config.shared_frames, config.rounds
+    )
+    windows = [crop_mask_window(mask) for mask in masks]
     model = load_anny() if config.model_file is None else load_smpl(Path(config.model_file))
-    given = supplied_poses(capture, model, camera, focal_deviation == 0.0, config)
+    supplied = supplied_poses(capture, model, camera, focal_relative_std == 0.0, config)
     try:
-        if given is None:
+        if supplied is None:
             result = fit_body(model, observations, windows, options, finger_curls_rad(model, hands))
         else:
-            result = fit_given(model, observations, windows, given, config.supplied_poses == "keep")
+            result = fit_given(model, observations, windows, supplied, config.supplied_poses == "keep")
     except TooFewLandmarksError as error:
         raise UserError(
             f"the body cannot be fitted to {frames_dir}: {error}; film hips and shoulders in view, or, where "
             "landmarks.npz lies beside the video, complete or remove it"
         ) from error
-    refuse_poor_fit(result, capture, config, given is not None)
+    check_fit_quality(result, capture, config, supplied is not None)
     return result
 
 
-def refuse_poor_fit(result: FitResult, capture: Capture, config: Config, poses_are_given: bool) -> None:
+def check_fit_quality(result: FitResult, capture: Capture, config: Config, poses_supplied: bool) -> None:
     """UserError when the body fits the person poorly all over, or not at all in too many of the training frames."""
     remedy = (
         f"look at {capture.folder / 'contact.jpg'} for wrong masks or landmarks, film the whole body unoccluded, "
-        f"{'set body.supplied_poses=start, ' if poses_are_given else ''}or"
+        f"{'set body.supplied_poses=start, ' if poses_supplied else ''}or"
     )
-    overlap = median_overlap(result)
-    if overlap < config.min_overlap:
+    silhouette_iou = median_silhouette_iou(result)
+    if silhouette_iou < config.min_silhouette_iou:
         raise UserError(
-            f"the body does not fit the person in {capture.folder}: median overlap with the masks {overlap:.2f}, "
-            f"needed {config.min_overlap:.2f}; {remedy} lower body.min_overlap"
+            f"the body does not fit the person in {capture.folder}: median overlap with the masks "
+            f"{silhouette_iou:.2f}, "
+            f"needed {config.min_silhouette_iou:.2f}; {remedy} lower body.min_silhouette_iou"
         )
-    training, wrecked = capture.split == TRAIN, ~usable_frames(result)
-    dropped = np.count_nonzero(training & wrecked)
-    if dropped > config.max_dropped * np.count_nonzero(training):
+    training, unusable = capture.split == TRAIN, ~usable_frames(result)
+    dropped = np.count_nonzero(training & unusable)
+    if dropped > config.max_dropped_share * np.count_nonzero(training):
         raise UserError(
             f"the body does not fit the person in {dropped} of {np.count_nonzero(training)} training frames of "
-            f"{capture.folder} (frames {frame_ranges(capture.frame_index, wrecked)}); {remedy} leave these frames out "
-            "with split.json, or raise body.max_dropped"
+            f"{capture.folder} (frames {format_frame_ranges(capture.frame_index, unusable)}); {remedy} leave "
+            "these frames out "
+            "with split.json, or raise body.max_dropped_share"
         )
 
 
 def supplied_poses(
     capture: Capture, model: ParametricBody, camera: Camera, focal_is_known: bool, config: Config
-) -> GivenPoses | None:
+) -> SuppliedPoses | None:
     """What others fitted, for this model and in this world; None, with a warning, where that is of no use here.
 
     The shape is the mean over frames: some sources fit one a frame.
@@ -187,7 +199,7 @@ def supplied_poses(
     poses = capture.smpl_poses
     if poses is None or config.supplied_poses == "ignore":
         return None
-    if not isinstance(model, SmplBody) or not model.takes_smpl_poses(poses.betas.shape[1]):
+    if not isinstance(model, SmplBody) or not model.accepts_smpl_poses(poses.betas.shape[1]):
         reason = f"it needs an SMPL or SMPL-H model file ({poses.gender}), --set body.model_file=FILE"
     elif not focal_is_known:
         reason = "the camera that it belongs to is not known; supply camera.json or body.field_of_view_deg"
@@ -197,16 +209,16 @@ def supplied_poses(
         pose = np.concatenate([poses.global_orient, poses.body_pose], axis=1).reshape(-1, 24, 3)
         to_world = np.linalg.inv(camera.world_to_camera.astype(np.float64)) @ poses.smpl_to_camera
         betas = torch.from_numpy(poses.betas)
-        rotations, root_m = model.placed(
+        rotations, root_m = model.convert_smpl_poses(
             torch.from_numpy(pose), torch.from_numpy(poses.transl), betas, torch.from_numpy(to_world).float()
         )
         rows = np.searchsorted(capture.frame_index, poses.frame_index)
-        return GivenPoses(rows, betas.mean(0), rotations, root_m)
+        return SuppliedPoses(rows, betas.mean(0), rotations, root_m)
     warn(f"the supplied {SMPL_POSES_NPZ} is not used: {reason}")
     return None
 
 
-def starting_camera(capture: Capture, config: Config) -> tuple[Camera, float]:
+def initial_camera(capture: Capture, config: Config) -> tuple[Camera, float]:
     """The camera to start from, and the relative deviation of its focal length (0: known).
 
     Supplied, by the options, as the recording's metadata say, or a guess, in this order.
@@ -214,13 +226,13 @@ def starting_camera(capture: Capture, config: Config) -> tuple[Camera, float]:
     if capture.camera is not None:
         return capture.camera, 0.0
     side_px = max(capture.width, capture.height)
-    focal_px, deviation = config.usual_focal * side_px, _GUESS_DEVIATION
+    focal_px, std = config.initial_focal_ratio * side_px, _DEFAULT_FOCAL_STD
     if config.field_of_view_deg is not None:
-        focal_px, deviation = 0.5 * side_px / float(np.tan(np.radians(0.5 * config.field_of_view_deg))), 0.0
-    elif capture.recorded_focal_px is not None:
-        focal_px, deviation = capture.recorded_focal_px, _RECORDED_DEVIATION
+        focal_px, std = 0.5 * side_px / float(np.tan(np.radians(0.5 * config.field_of_view_deg))), 0.0
+    elif capture.metadata_focal_px is not None:
+        focal_px, std = capture.metadata_focal_px, _EXIF_FOCAL_STD
     camera = Camera(focal_px, focal_px, 0.5 * capture.width, 0.5 * capture.height, capture.width, capture.height)
-    return camera, deviation
+    return camera, std
 
 
 def overlay(
@@ -228,21 +240,21 @@ def overlay(
     masks: Sequence[UInt8[np.ndarray, "h w"]],
     result: FitResult,
     motion: Motion,
-    foreign: Bool[np.ndarray, "n"],
+    has_foreign_object: Bool[np.ndarray, "n"],
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Tiles of frames: up to half are the worst of those that a warning may name, marked, the others evenly spread."""
-    verdict = verdicts(result, suspicious_frames(result) | foreign)
-    positions = frames_to_show(verdict, result.overlap, _OVERLAY_FRAMES)
+    rating = rate_frames(result, suspicious_frames(result) | has_foreign_object)
+    positions = select_overlay_frames(rating, result.silhouette_iou, _OVERLAY_FRAMES)
     transforms = canonical_to_world(result.body, motion.select(positions))
     tiles = [
         draw_overlay(
             to_uint8(capture.image(int(position))),
             masks[position],
-            posed_frame(result.body, transforms[tile]),
+            pose_vertices(result.body, transforms[tile]),
             result.body,
             result.camera,
-            f"frame {capture.frame_index[position]}  overlap {result.overlap[position]:.2f}",
-            VERDICTS[verdict[position]],
+            f"frame {capture.frame_index[position]}  overlap {result.silhouette_iou[position]:.2f}",
+            FRAME_RATINGS[rating[position]],
         )
         for tile, position in enumerate(positions)
     ]

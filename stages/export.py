@@ -9,9 +9,14 @@ import torch
 from jaxtyping import Float, UInt8
 from pydantic import Field
 
-from pipeline.avatar.gltf import Maps, SkinnedMesh, encode_glb, specular_texture, write_glb
+from pipeline.avatar.gltf import MaterialMaps, SkinnedMesh, encode_glb, pack_specular_factor, write_glb
 from pipeline.avatar.obj import write_obj
-from pipeline.avatar.placement import hold_ends, move_camera, move_motion, scene_from_world_m
+from pipeline.avatar.placement import (
+    pad_motion_to_video,
+    translate_camera,
+    translate_motion,
+    world_to_scene_translation_m,
+)
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.files import load_body, load_camera, load_motion
 from pipeline.capture.capture import load_capture
@@ -22,7 +27,7 @@ from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import dense_weights, linear_blend_skinning
 from pipeline.io.image import png_bytes, read_gray, read_rgb, to_float, to_uint8, write_gray
 from pipeline.io.npz import load_npz
-from pipeline.texture.specular import dielectric_share
+from pipeline.texture.specular import dielectric_specular_factor
 
 DIFFUSE, SPECULAR = "avatar_diffuse.png", "avatar_specular.png"
 
@@ -49,23 +54,23 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     atlas = load_npz(inputs["texture"] / "atlas.npz")
     diffuse, specular = read_rgb(inputs["texture"] / "diffuse.png"), read_gray(inputs["texture"] / "specular.png")
     mesh = Mesh(arrays["vertices"], arrays["faces"])
-    maps = Maps(
+    maps = MaterialMaps(
         png_bytes(diffuse),
-        specular_png(specular, diffuse, config.roughness) if specular.any() else None,
+        encode_specular_png(specular, diffuse, config.roughness) if specular.any() else None,
         config.roughness,
         config.unlit,
     )
 
     capture, motion = load_capture(inputs["frames"]), load_motion(inputs["field"] / "motion.npz")
-    offset_m = scene_from_world_m(motion, lowest_points_m(arrays, body, motion))
-    clip = hold_ends(move_motion(motion, offset_m), capture.fps, capture.n_video_frames)
+    offset_m = world_to_scene_translation_m(motion, lowest_vertex_y_m(arrays, body, motion))
+    padded_motion = pad_motion_to_video(translate_motion(motion, offset_m), capture.fps, capture.n_video_frames)
     data = encode_glb(
-        skinned_mesh(mesh, arrays, atlas),
+        build_skinned_mesh(mesh, arrays, atlas),
         body,
-        clip,
+        padded_motion,
         maps,
-        move_camera(load_camera(inputs["body"] / "camera.npz"), offset_m),
-        about(config, offset_m, capture.fps),
+        translate_camera(load_camera(inputs["body"] / "camera.npz"), offset_m),
+        asset_extras(config, offset_m, capture.fps),
     )
     write_glb(out / "avatar.glb", data)
     (out / DIFFUSE).write_bytes(maps.diffuse_png)
@@ -75,26 +80,30 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     return {
         "glb_bytes": float(len(data)),
         "texture_px": float(len(diffuse)),
-        "animation_s": float(clip.time_s[-1]),
+        "animation_s": float(padded_motion.time_s[-1]),
         "vertices": float(len(atlas["uv"])),
         "faces": float(len(mesh.faces)),
     }
 
 
-def specular_png(amplitude: UInt8[np.ndarray, "s s"], diffuse: UInt8[np.ndarray, "s s 3"], roughness: float) -> bytes:
+def encode_specular_png(
+    amplitude: UInt8[np.ndarray, "s s"], diffuse: UInt8[np.ndarray, "s s 3"], roughness: float
+) -> bytes:
     """The texture stage's map, in sRGB, as glTF's share of a dielectric's reflection."""
-    share = dielectric_share(to_float(amplitude), to_float(diffuse), roughness)
-    return png_bytes(specular_texture(to_uint8(share)))
+    share = dielectric_specular_factor(to_float(amplitude), to_float(diffuse), roughness)
+    return png_bytes(pack_specular_factor(to_uint8(share)))
 
 
-def skinned_mesh(mesh: Mesh, arrays: Mapping[str, np.ndarray], atlas: Mapping[str, np.ndarray]) -> SkinnedMesh:
+def build_skinned_mesh(mesh: Mesh, arrays: Mapping[str, np.ndarray], atlas: Mapping[str, np.ndarray]) -> SkinnedMesh:
     """The mesh with its vertices repeated along the atlas's seams, which share their position, normal and weights."""
-    of = atlas["vertex_of_uv"]
-    skin = (arrays["joint_indices"][of], arrays["joint_weights"][of])
-    return SkinnedMesh(mesh.vertices[of], mesh.vertex_normals()[of], atlas["uv"], *skin, atlas["faces_uv"])
+    source_vertex = atlas["vertex_of_uv"]
+    skin = (arrays["joint_indices"][source_vertex], arrays["joint_weights"][source_vertex])
+    return SkinnedMesh(
+        mesh.vertices[source_vertex], mesh.vertex_normals()[source_vertex], atlas["uv"], *skin, atlas["faces_uv"]
+    )
 
 
-def lowest_points_m(arrays: Mapping[str, np.ndarray], body: Body, motion: Motion) -> Float[np.ndarray, "n"]:
+def lowest_vertex_y_m(arrays: Mapping[str, np.ndarray], body: Body, motion: Motion) -> Float[np.ndarray, "n"]:
     """Height of the posed mesh's lowest vertex in every frame, world."""
     indices, weights = (torch.from_numpy(arrays[f"joint_{name}"]) for name in ("indices", "weights"))
     dense, vertices = dense_weights(indices, weights, len(body.joint_names)), torch.from_numpy(arrays["vertices"])
@@ -103,12 +112,12 @@ def lowest_points_m(arrays: Mapping[str, np.ndarray], body: Body, motion: Motion
     return torch.cat(lowest).numpy()
 
 
-def about(config: Config, offset_m: Float[np.ndarray, "3"], frame_rate: float) -> dict[str, Any]:
+def asset_extras(config: Config, offset_m: Float[np.ndarray, "3"], frame_rate: float) -> dict[str, Any]:
     """What `asset.extras` says."""
     return {
         "unit": "metre",
         "axes": "+Y up, the rest pose looks along +Z",
-        "scene_from_world_translation_m": [float(value) for value in offset_m],
+        "world_to_scene_translation_m": [float(value) for value in offset_m],
         "world": "the capture camera's frame of reference: +Y up, camera at the origin unless it was supplied",
         "frame_rate_hz": frame_rate,
         "source": "reconstructed from one video",

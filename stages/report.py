@@ -14,7 +14,7 @@ from pydantic import Field
 from torch import Tensor
 
 from pipeline.avatar.finished_run import FinishedRun, load_finished_run
-from pipeline.avatar.pose_fit import PERSON_HEIGHT_PX, fit_poses
+from pipeline.avatar.pose_fit import MAX_PERSON_PX, fit_poses
 from pipeline.body.body import canonical_to_world
 from pipeline.capture.capture import CONTACT_SHEET, Capture
 from pipeline.capture.frame_selection import HELDOUT, TRAIN
@@ -25,55 +25,59 @@ from pipeline.core.manifest import Manifest, read_manifest
 from pipeline.core.measure import environment, peak_rss_mib
 from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
-from pipeline.geometry.texture_rendering import soften_outline
+from pipeline.geometry.texture_rendering import blur_coverage
 from pipeline.io.image import read_rgb, to_uint8, write_rgb
-from pipeline.mesh.views import crop_view
-from pipeline.metrics.health import mesh_health
+from pipeline.mesh.views import crop_posed_view
+from pipeline.metrics.health import mesh_quality_metrics
 from pipeline.metrics.images import (
-    PIXEL_SPREAD_PX,
-    body_box,
-    body_pixels,
-    edge_spread_px,
+    PIXEL_BOX_SIGMA_PX,
+    additional_blur_sigma_px,
+    composite_on_white,
+    composite_premultiplied_on_white,
+    edge_blur_sigma_px,
+    foreground_bounding_box,
+    foreground_mask,
     frame_scores,
-    missing_blur_px,
-    on_white,
-    premultiplied_on_white,
-    unscorable,
+    reason_not_scorable,
 )
 from pipeline.report.lpips_weights import find_lpips_weights
-from pipeline.report.page import FramePictures, PageContent, error_map, render_page
-from pipeline.report.report_json import build_report, finite, report_text
-from pipeline.report.sheets import on_white_8bit, picture_sheet
+from pipeline.report.page import FrameImages, PageContent, error_map, render_page
+from pipeline.report.report_json import build_report, replace_nonfinite, report_to_json
+from pipeline.report.sheets import composite_on_white_uint8, image_grid
 
 NEEDS = ("frames", "body", "field", "mesh", "texture", "export")
-PICTURES = (
+REPORT_IMAGES = (
     ("body", "overlay.png", "Fit of the body, laid over the video"),
     ("frames", "contact.jpg", "Chosen frames and their masks"),
     ("texture", "diffuse.png", "Diffuse map"),
     ("mesh", "preview.png", "Mesh"),
 )
 CROP_MARGIN_PX = 12
-SPREAD_FRAMES = 16
+EDGE_SPREAD_FRAMES = 16
 
 
 class Config(BaseConfig):
     """Options of the report."""
 
-    samples: int = Field(
+    samples_per_pixel_side: int = Field(
         3, ge=1, le=8, description="texture look-ups along each side of a pixel when the mesh is drawn"
     )
-    unrefined: bool = Field(
+    score_unrefined_mesh: bool = Field(
         True, description="score the mesh in the body stage's poses as well, without the field's corrections"
     )
-    unrefined_field: bool = Field(False, description="score the field in those poses too; doubles the report's time")
+    score_unrefined_field: bool = Field(
+        False, description="score the field in those poses too; doubles the report's time"
+    )
     fit_held_out_poses: bool = Field(
         False,
         description="score field and mesh once more, apart, in poses fitted to the held-out images; costs minutes",
     )
-    fit_steps: int = Field(40, ge=1, le=1000, description="optimiser steps of that fit, all held-out frames in each")
-    shown_frames: int = Field(8, ge=1, le=64, description="held-out frames that the page shows; all are scored")
-    views: int = Field(8, ge=2, le=36, description="sides from which the turntable shows the avatar")
-    view_height_px: int = Field(480, ge=64, le=2048, description="height of a turntable picture, px")
+    pose_fit_steps: int = Field(
+        40, ge=1, le=1000, description="optimiser steps of that fit, all held-out frames in each"
+    )
+    max_page_frames: int = Field(8, ge=1, le=64, description="held-out frames that the page shows; all are scored")
+    turntable_views: int = Field(8, ge=2, le=36, description="sides from which the turntable shows the avatar")
+    turntable_height_px: int = Field(480, ge=64, le=2048, description="height of a turntable picture, px")
 
 
 def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, float]:
@@ -82,29 +86,32 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     manifests = {name: _manifest(inputs[name]) for name in NEEDS}
     loaded = load_finished_run(inputs)
     positions = scored_positions(loaded.capture)
-    spread_px = outline_spread_px(loaded)
+    spread_px = median_edge_spread_px(loaded)
     rows, pictures = score(loaded, positions, spread_px, config)
     turntable = draw_turntable(loaded, int(positions[len(positions) // 2]), config)
-    write_rgb(out / "turntable.jpg", picture_sheet([[on_white_8bit(view) for view in views] for _, views in turntable]))
-    write_rgb(out / "heldout.jpg", picture_sheet([_strip(frame) for frame in pictures]))
+    write_rgb(
+        out / "turntable.jpg",
+        image_grid([[composite_on_white_uint8(view) for view in turntable_views] for _, turntable_views in turntable]),
+    )
+    write_rgb(out / "heldout.jpg", image_grid([_comparison_row(frame) for frame in pictures]))
     glb = (inputs["export"] / "avatar.glb").read_bytes()
-    figures: dict[str, Mapping[str, float | int | bool]] = {
-        "mesh": mesh_health(loaded.avatar.mesh()),
+    metric_sections: dict[str, Mapping[str, float | int | bool]] = {
+        "mesh": mesh_quality_metrics(loaded.avatar.mesh()),
         "export": {"glb_bytes": len(glb), "texture_px": len(loaded.avatar.diffuse)},
-        "masks": {"count": len(loaded.capture), "edge_spread_px": spread_px},
+        "masks": {"count": len(loaded.capture), "edge_blur_sigma_px": spread_px},
     }
     cost = (time.monotonic() - started, peak_rss_mib())
-    report = finite(build_report(manifests, rows, figures, environment(), cost))
+    report = replace_nonfinite(build_report(manifests, rows, metric_sections, environment(), cost))
     page = PageContent(
         title=out.resolve().parent.name,
         report=report,
         frames=pictures,
         turntable=turntable,
-        pictures=[(caption, read_rgb(inputs[stage] / name)) for stage, name, caption in PICTURES],
+        pictures=[(caption, read_rgb(inputs[stage] / name)) for stage, name, caption in REPORT_IMAGES],
         glb=glb,
     )
     (out / "index.html").write_text(render_page(page), encoding="utf-8")
-    (out / "report.json").write_text(report_text(report), encoding="utf-8")
+    (out / "report.json").write_text(report_to_json(report), encoding="utf-8")
     heldout = report["heldout"]
     return {
         f"{name}_{score}": heldout[name][score]
@@ -126,7 +133,7 @@ def scored_positions(capture: Capture) -> Int[np.ndarray, "k"]:
             f"{capture.folder} holds no frame whose index is divisible by eight, so nothing can be scored: "
             "film longer, or choose more frames"
         )
-    reasons = [unscorable(to_uint8(capture.mask(position))) for position in positions]
+    reasons = [reason_not_scorable(to_uint8(capture.mask(position))) for position in positions]
     for position, reason in zip(positions, reasons, strict=True):
         if reason is not None:
             warn(f"held-out frame {capture.frame_index[position]} is not scored: {reason}")
@@ -139,68 +146,71 @@ def scored_positions(capture: Capture) -> Int[np.ndarray, "k"]:
     return scored
 
 
-def outline_spread_px(loaded: FinishedRun) -> float:
+def median_edge_spread_px(loaded: FinishedRun) -> float:
     """How soft the capture's outlines are: the median over some of the frames that are not scored."""
     others = loaded.capture.positions(TRAIN)
-    some = others[:: max(1, len(others) // SPREAD_FRAMES)]
-    spreads = [edge_spread_px(to_uint8(loaded.capture.mask(position))) for position in some.tolist()]
-    return float(np.median(spreads)) if spreads else PIXEL_SPREAD_PX
+    some = others[:: max(1, len(others) // EDGE_SPREAD_FRAMES)]
+    spreads = [edge_blur_sigma_px(to_uint8(loaded.capture.mask(position))) for position in some.tolist()]
+    return float(np.median(spreads)) if spreads else PIXEL_BOX_SIGMA_PX
 
 
 def score(
     loaded: FinishedRun, positions: np.ndarray, spread_px: float, config: Config
-) -> tuple[list[dict[str, Any]], list[FramePictures]]:
+) -> tuple[list[dict[str, Any]], list[FrameImages]]:
     """Scores of every held-out frame by render, and the pictures of some of them.
 
     The mesh is drawn with outlines as soft as the capture's (`spread_px`), as the field has learnt them; the row
     `mesh_sharp` is the mesh as square pixels give it.
     """
-    blur_px = missing_blur_px(spread_px)
+    blur_px = additional_blur_sigma_px(spread_px)
 
     def draw_sharp(pose: Float[Tensor, "j 4 4"]) -> Float[np.ndarray, "h w 4"]:
-        return loaded.avatar.render(loaded.avatar.posed(pose), loaded.camera, config.samples)
+        return loaded.avatar.render(loaded.avatar.posed(pose), loaded.camera, config.samples_per_pixel_side)
 
     def draw_mesh(pose: Float[Tensor, "j 4 4"]) -> Float[np.ndarray, "h w 4"]:
-        return soften_outline(draw_sharp(pose), blur_px)
+        return blur_coverage(draw_sharp(pose), blur_px)
 
-    draws = {"field": (loaded.draw_field, loaded.refined), "mesh_sharp": (draw_sharp, loaded.refined)}
-    if config.unrefined:
-        draws["mesh_unrefined"] = (draw_mesh, loaded.fitted)
-    if config.unrefined_field:
-        draws["field_unrefined"] = (loaded.draw_field, loaded.fitted)
+    renderers = {"field": (loaded.field_renderer, loaded.refined), "mesh_sharp": (draw_sharp, loaded.refined)}
+    if config.score_unrefined_mesh:
+        renderers["mesh_unrefined"] = (draw_mesh, loaded.fitted)
+    if config.score_unrefined_field:
+        renderers["field_unrefined"] = (loaded.field_renderer, loaded.fitted)
     if config.fit_held_out_poses:
-        poses_fitted = fit_held_out(loaded, positions, config.fit_steps)
-        draws |= {"field_pose_fitted": (loaded.draw_field, poses_fitted), "mesh_pose_fitted": (draw_mesh, poses_fitted)}
+        poses_fitted = fit_heldout_poses(loaded, positions, config.pose_fit_steps)
+        renderers |= {
+            "field_pose_fitted": (loaded.field_renderer, poses_fitted),
+            "mesh_pose_fitted": (draw_mesh, poses_fitted),
+        }
     weights = find_lpips_weights()
-    shown = set(positions[np.linspace(0, len(positions) - 1, config.shown_frames).round().astype(int)].tolist())
+    shown = set(positions[np.linspace(0, len(positions) - 1, config.max_page_frames).round().astype(int)].tolist())
     rows, pictures = [], []
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         for position in track(positions.tolist(), "held-out frames"):
             image, mask = (to_uint8(part(position)) for part in (loaded.capture.image, loaded.capture.mask))
-            renders = {name: draw(poses[position]) for name, (draw, poses) in draws.items()}
-            softened = soften_outline(renders["mesh_sharp"], blur_px)
+            renders = {name: draw(poses[position]) for name, (draw, poses) in renderers.items()}
+            softened = blur_coverage(renders["mesh_sharp"], blur_px)
             renders = {"field": renders["field"], "mesh": softened} | renders
             index = int(loaded.capture.frame_index[position])
             scores = pool.map(partial(frame_scores, image=image, mask=mask, lpips_weights=weights), renders.values())
             rows.append({"index": index} | dict(zip(renders, scores, strict=True)))
             if position in shown:
-                pictures.append(_pictures(index, image, mask, renders))
+                pictures.append(_frame_images(index, image, mask, renders))
     return rows, pictures
 
 
-def fit_held_out(loaded: FinishedRun, positions: np.ndarray, steps: int) -> Float[Tensor, "n j 4 4"]:
+def fit_heldout_poses(loaded: FinishedRun, positions: np.ndarray, steps: int) -> Float[Tensor, "n j 4 4"]:
     """The refined poses of all frames, those of the held-out ones fitted to their own pictures through the mesh."""
-    views = [
-        crop_view(
+    turntable_views = [
+        crop_posed_view(
             loaded.capture.image(position),
             loaded.capture.mask(position),
             loaded.camera,
             loaded.refined[position],
-            PERSON_HEIGHT_PX,
+            MAX_PERSON_PX,
         )
         for position in positions.tolist()
     ]
-    motion = fit_poses(loaded.avatar, loaded.body, loaded.motion.select(positions), views, steps)
+    motion = fit_poses(loaded.avatar, loaded.body, loaded.motion.select(positions), turntable_views, steps)
     return loaded.refined.index_copy(0, torch.from_numpy(positions), canonical_to_world(loaded.body, motion))
 
 
@@ -214,21 +224,26 @@ def draw_turntable(
         f"As in frame {index}, a held-out one": loaded.avatar.posed(loaded.refined[position]),
     }
     return [
-        (title, loaded.avatar.turntable(vertices, config.views, config.view_height_px, config.samples))
+        (
+            title,
+            loaded.avatar.turntable(
+                vertices, config.turntable_views, config.turntable_height_px, config.samples_per_pixel_side
+            ),
+        )
         for title, vertices in bodies.items()
     ]
 
 
-def _pictures(
+def _frame_images(
     index: int, image: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"], renders: Mapping[str, np.ndarray]
-) -> FramePictures:
-    rows, columns = body_box(body_pixels(mask))
+) -> FrameImages:
+    rows, columns = foreground_bounding_box(foreground_mask(mask))
     crop = tuple(slice(max(0, part.start - CROP_MARGIN_PX), part.stop + CROP_MARGIN_PX) for part in (rows, columns))
-    field, mesh = (premultiplied_on_white(renders[name])[crop] for name in ("field", "mesh"))
-    return FramePictures(index, on_white(image, mask)[crop], field, mesh)
+    field, mesh = (composite_premultiplied_on_white(renders[name])[crop] for name in ("field", "mesh"))
+    return FrameImages(index, composite_on_white(image, mask)[crop], field, mesh)
 
 
-def _strip(frame: FramePictures) -> list[UInt8[np.ndarray, "h w 3"]]:
+def _comparison_row(frame: FrameImages) -> list[UInt8[np.ndarray, "h w 3"]]:
     errors = [error_map(render, frame.video) for render in (frame.field, frame.mesh)]
     return [frame.video, frame.field, frame.mesh, *errors]
 

@@ -9,7 +9,7 @@ import hypothesis
 import pytest
 from jaxtyping import install_import_hook
 
-from pipeline.core.measure import REPOSITORY
+from pipeline.core.measure import REPOSITORY_DIR
 from pipeline.core.progress import take_warnings
 from tests.core.toy_pipeline import Toy, user_environment
 
@@ -35,7 +35,7 @@ def only_own_warnings() -> None:
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """The folder with real captures: `../shared/data`, or where IHM_SHARED_DATA points; skips where there is none."""
-    folder = Path(os.environ.get("IHM_SHARED_DATA", REPOSITORY.parent / "shared" / "data"))
+    folder = Path(os.environ.get("IHM_SHARED_DATA", REPOSITORY_DIR.parent / "shared" / "data"))
     if not folder.is_dir():
         pytest.skip(f"no captures at {folder} (set IHM_SHARED_DATA)")
     return folder
@@ -54,7 +54,7 @@ def cuda() -> str:
 @pytest.fixture(scope="session")
 def repository() -> Path:
     """The root of the checkout."""
-    return REPOSITORY
+    return REPOSITORY_DIR
 
 
 @pytest.fixture
@@ -74,5 +74,5 @@ def smoke_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     make_sample = ["data_tools.sample", str(folder / "capture"), "--frames", "24", "--size", "192"]
     run_all = ["stages", "--run", str(folder / "run"), "--preset", "smoke", "--video", str(video)]
     for command in (make_sample, run_all):
-        subprocess.run([sys.executable, "-m", *command], cwd=REPOSITORY, env=user_environment(), check=True)
+        subprocess.run([sys.executable, "-m", *command], cwd=REPOSITORY_DIR, env=user_environment(), check=True)
     return folder / "run"

@@ -1,6 +1,6 @@
 """A device that is not the CPU, on any machine: tensors that hold real values but keep a graphics card's rules.
 
-A tensor moved to `ELSEWHERE` computes what it would compute on the CPU, and refuses what a tensor on a graphics card
+A tensor moved to `FAKE_DEVICE` computes what it would compute on the CPU, and refuses what a tensor on a graphics card
 refuses: to meet a tensor on the CPU (single numbers apart), and to be handed to numpy or numba. So code that would
 break or fall back on a graphics card breaks here as well. Speed cannot be told so; the number of operations can.
 """
@@ -14,26 +14,26 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
 from torch.utils._pytree import tree_leaves, tree_map
 
-ELSEWHERE = torch.device("lazy")
+FAKE_DEVICE = torch.device("lazy")
 """A device type that no build of torch without its own plugin computes on, and whose gradients need no extra thread."""
 ATEN = torch.ops.aten
-MAY_MIX = (ATEN._to_copy.default, ATEN.copy_.default)
+MIXED_DEVICE_OPERATIONS = (ATEN._to_copy.default, ATEN.copy_.default)
 
 
-class TensorElsewhere(Tensor):
-    """A tensor on the device `ELSEWHERE`; `held` has its values."""
+class FakeDeviceTensor(Tensor):
+    """A tensor on the device `FAKE_DEVICE`; `cpu_tensor` has its values."""
 
-    held: Tensor
+    cpu_tensor: Tensor
     __torch_function__ = torch._C._disabled_torch_function_impl
 
     @staticmethod
-    def __new__(cls, held: Tensor) -> "TensorElsewhere":
+    def __new__(cls, cpu_tensor: Tensor) -> "FakeDeviceTensor":
         """Same shape, strides and type as what it holds."""
-        layout = (held.shape, held.stride(), held.storage_offset())
-        return Tensor._make_wrapper_subclass(cls, *layout, dtype=held.dtype, device=ELSEWHERE)
+        layout = (cpu_tensor.shape, cpu_tensor.stride(), cpu_tensor.storage_offset())
+        return Tensor._make_wrapper_subclass(cls, *layout, dtype=cpu_tensor.dtype, device=FAKE_DEVICE)
 
-    def __init__(self, held: Tensor) -> None:
-        self.held = held
+    def __init__(self, cpu_tensor: Tensor) -> None:
+        self.cpu_tensor = cpu_tensor
 
     @classmethod
     def __torch_dispatch__(cls, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
@@ -46,19 +46,19 @@ class TensorElsewhere(Tensor):
 
 
 def _is_elsewhere(device: Any) -> bool:
-    return device is not None and torch.device(device).type == ELSEWHERE.type
+    return device is not None and torch.device(device).type == FAKE_DEVICE.type
 
 
 def _strip(value: Any) -> Any:
-    if isinstance(value, TensorElsewhere):
-        return value.held
+    if isinstance(value, FakeDeviceTensor):
+        return value.cpu_tensor
     return torch.device("cpu") if isinstance(value, torch.device) else value
 
 
 def _compute(operation: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
-    ours = [isinstance(tensor, TensorElsewhere) for tensor in tensors]
-    if any(ours) and operation not in MAY_MIX:
+    ours = [isinstance(tensor, FakeDeviceTensor) for tensor in tensors]
+    if any(ours) and operation not in MIXED_DEVICE_OPERATIONS:
         for tensor, is_ours in zip(tensors, ours, strict=True):
             if not is_ours and tensor.dim():
                 raise RuntimeError(f"{operation}: {tuple(tensor.shape)} lies on the CPU, other tensors elsewhere")
@@ -68,18 +68,18 @@ def _compute(operation: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         return args[0]
     if not stays:
         return result
-    wrapped = tree_map(lambda x: TensorElsewhere(x) if isinstance(x, Tensor) else x, result)
+    wrapped = tree_map(lambda x: FakeDeviceTensor(x) if isinstance(x, Tensor) else x, result)
     return return_and_correct_aliasing(operation, args, kwargs, wrapped)
 
 
-class _Calls(TorchDispatchMode):
+class _OperationCounter(TorchDispatchMode):
     def __init__(self) -> None:
         super().__init__()
         self.count = 0
 
     def __torch_dispatch__(self, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
-        here = not any(isinstance(leaf, TensorElsewhere) for leaf in tree_leaves((args, kwargs)))
+        here = not any(isinstance(leaf, FakeDeviceTensor) for leaf in tree_leaves((args, kwargs)))
         if here and not _is_elsewhere(kwargs.get("device")):
             return operation(*args, **kwargs)
         self.count += not operation.is_view
@@ -87,13 +87,13 @@ class _Calls(TorchDispatchMode):
 
 
 @contextmanager
-def elsewhere() -> Iterator[_Calls]:
-    """While it lasts, `ELSEWHERE` can be computed on; `count` of what it yields counts operations there but views."""
+def elsewhere() -> Iterator[_OperationCounter]:
+    """While it lasts, `FAKE_DEVICE` can be computed on; `count` of what it yields counts operations there but views."""
     # Without this, torch.tensor(..., device=ELSEWHERE) asks torch itself for memory there.
     before = torch._C._only_lift_cpu_tensors()
     torch._C._set_only_lift_cpu_tensors(True)
     try:
-        with _Calls() as calls:
+        with _OperationCounter() as calls:
             yield calls
     finally:
         torch._C._set_only_lift_cpu_tensors(before)

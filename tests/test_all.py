@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.core.manifest import digest_source, find_damage, read_manifest
-from pipeline.core.measure import REPOSITORY
+from pipeline.core.manifest import digest_video, find_damaged_files, read_manifest
+from pipeline.core.measure import REPOSITORY_DIR
 from pipeline.io.image import read_rgb
 from stages import STAGES, load
 from tests.core.toy_pipeline import user_environment
@@ -28,14 +28,16 @@ def report(smoke_run: Path) -> dict[str, dict[str, float]]:
 def command(*arguments: str) -> str:
     """Standard output of `python -m stages <arguments>`, which must succeed."""
     whole = [sys.executable, "-m", "stages", *arguments]
-    done = subprocess.run(whole, cwd=REPOSITORY, env=user_environment(), capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        whole, cwd=REPOSITORY_DIR, env=user_environment(), capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
 def test_every_stage_left_a_whole_artifact(smoke_run: Path) -> None:
     for name in STAGES:
-        assert find_damage(smoke_run / name) == []
+        assert find_damaged_files(smoke_run / name) == []
         assert all((smoke_run / name / made).exists() for made in load(name).makes)
     assert not list(smoke_run.glob("*.part"))
 
@@ -46,7 +48,7 @@ def test_the_manifests_name_what_they_read(smoke_run: Path) -> None:
         assert manifest is not None
         for need in manifest.inputs:
             source = read_manifest(smoke_run / need) if need != "video" else None
-            digest = source.outputs_digest if source else digest_source(smoke_run.parent / "capture" / "video")
+            digest = source.outputs_digest if source else digest_video(smoke_run.parent / "capture" / "video")
             assert manifest.inputs[need] == digest, f"{name} read another {need} than the one that is there"
 
 
@@ -133,7 +135,7 @@ def test_make_all_runs_a_video(smoke_run: Path, tmp_path: Path) -> None:
     arguments = [f"VIDEO={video}", f"RUN={tmp_path / 'made'}", "PRESET=smoke"]
     done = subprocess.run(
         ["make", "all", *arguments],
-        cwd=REPOSITORY,
+        cwd=REPOSITORY_DIR,
         env=user_environment(),
         capture_output=True,
         text=True,

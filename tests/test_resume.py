@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.core.manifest import digest_json, list_files, read_manifest
-from pipeline.core.measure import REPOSITORY
+from pipeline.core.measure import REPOSITORY_DIR
 from stages import STAGES
 from tests.core.toy_pipeline import Toy, user_environment
 
@@ -82,7 +82,7 @@ def test_a_kill_at_any_moment_does_no_harm(toy: Toy, unbroken: dict[str, str], d
 def real_run(run_dir: Path, video: Path) -> subprocess.Popen[bytes]:
     """Start the real pipeline with the smoke preset, in a process group of its own."""
     command = [sys.executable, "-m", "stages", "--run", str(run_dir), "--video", str(video), "--preset", "smoke"]
-    return subprocess.Popen(command, cwd=REPOSITORY, env=user_environment(), start_new_session=True)
+    return subprocess.Popen(command, cwd=REPOSITORY_DIR, env=user_environment(), start_new_session=True)
 
 
 @pytest.mark.slow
@@ -110,9 +110,9 @@ def test_each_real_stage_survives_a_kill(smoke_run: Path, tmp_path: Path, name: 
     assert digest_json(artifacts(run_dir, STAGES).get("report", "")) != digest_json("")
 
 
-def wait_for(path: Path, runner: subprocess.Popen[str] | subprocess.Popen[bytes], patience_s: float = 300.0) -> None:
+def wait_for(path: Path, runner: subprocess.Popen[str] | subprocess.Popen[bytes], timeout_s: float = 300.0) -> None:
     """Wait until the runner has made a file."""
-    deadline = time.monotonic() + patience_s
+    deadline = time.monotonic() + timeout_s
     while not path.exists():
         assert runner.poll() is None, "the run ended before it could be killed"
         assert time.monotonic() < deadline, f"{path} did not appear"

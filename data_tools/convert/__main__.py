@@ -15,7 +15,7 @@ from data_tools.convert.instant_avatar import is_instant_avatar, read_instant_av
 from data_tools.convert.neuman import is_neuman, read_neuman
 from data_tools.convert.people_snapshot import is_people_snapshot, read_people_snapshot
 from data_tools.convert.recording import Recording, write_recording
-from data_tools.folder import refuse_existing
+from data_tools.folder import require_absent
 from pipeline.core.errors import UserError
 
 
@@ -43,7 +43,7 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("target", type=Path, help="folder to make")
     options = parser.parse_args(argv)
     source, target = options.source, options.target
-    refuse_existing(target)
+    require_absent(target)
     if not source.is_dir():
         raise UserError(f"{source} is no folder; give one subject's folder (a video alone needs no conversion)")
     if target.resolve().is_relative_to(source.resolve()):

@@ -12,12 +12,12 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from pipeline.capture.user_files import SuppliedCamera
+from pipeline.capture.user_files import CameraCalibration
 from pipeline.core.errors import UserError
 from pipeline.geometry.rotation import quaternion_to_matrix
 
 # Model's number in binary files, and where in its parameters fx, fy, cx, cy and the lens distortion begin.
-_MODELS = {
+_CAMERA_MODELS = {
     "SIMPLE_PINHOLE": (0, 3, (0, 0, 1, 2)),
     "PINHOLE": (1, 4, (0, 1, 2, 3)),
     "SIMPLE_RADIAL": (2, 4, (0, 0, 1, 2)),
@@ -31,7 +31,7 @@ _MODELS = {
 class ColmapCamera:
     """One camera of the model, and the size in pixels that it is for."""
 
-    camera: SuppliedCamera
+    camera: CameraCalibration
     width: int
     height: int
 
@@ -41,11 +41,11 @@ class ColmapModel:
     """Cameras by their number; for each picture, by name, its camera's number and world_to_camera (its own unit)."""
 
     cameras: Mapping[int, ColmapCamera]
-    camera_of: Mapping[str, int]
+    camera_id_of: Mapping[str, int]
     world_to_camera: Mapping[str, Float[np.ndarray, "4 4"]]
 
 
-def find_model(folder: Path) -> Path | None:
+def find_colmap_model(folder: Path) -> Path | None:
     """The folder `sparse` or `sparse/0` inside `folder` that holds a model."""
     places = (
         path / f"cameras.{end}" for path in (folder / "sparse", folder / "sparse" / "0") for end in ("txt", "bin")
@@ -53,7 +53,7 @@ def find_model(folder: Path) -> Path | None:
     return next((place.parent for place in places if place.is_file()), None)
 
 
-def read_model(folder: Path) -> ColmapModel:
+def read_colmap_model(folder: Path) -> ColmapModel:
     """Read `cameras` and `images`, `.txt` where both kinds are there.
 
     Raises:
@@ -63,20 +63,20 @@ def read_model(folder: Path) -> ColmapModel:
     ending, cameras_of, images_of = (
         ("txt", _text_cameras, _text_images) if is_text else ("bin", _binary_cameras, _binary_images)
     )
-    cameras, camera_of, world_to_camera = {}, {}, {}
+    cameras, camera_id_of, world_to_camera = {}, {}, {}
     path = folder / f"cameras.{ending}"
     try:
         for number, model, width, height, parameters in cameras_of(path):
             cameras[number] = ColmapCamera(_camera(model, parameters, path), width, height)
         path = folder / f"images.{ending}"
         for name, camera, pose in images_of(path):
-            camera_of[name] = camera
-            world_to_camera[name] = _matrix(pose)
+            camera_id_of[name] = camera
+            world_to_camera[name] = _pose_to_matrix(pose)
     except FileNotFoundError:
         raise UserError(f"{path} does not exist; give the whole COLMAP model") from None
     except (ValueError, IndexError, struct.error) as error:
         raise UserError(f"{path} is no COLMAP file of this kind ({error}); export the model again") from None
-    return ColmapModel(cameras, camera_of, world_to_camera)
+    return ColmapModel(cameras, camera_id_of, world_to_camera)
 
 
 _CameraRow = tuple[int, str, int, int, tuple[float, ...]]
@@ -84,7 +84,7 @@ _ImageRow = tuple[str, int, tuple[float, ...]]
 
 
 def _text_cameras(path: Path) -> Iterator[_CameraRow]:
-    for line in _lines(path):
+    for line in _data_lines(path):
         if line:
             number, model, width, height, *parameters = line.split()
             yield int(number), model, int(width), int(height), tuple(float(value) for value in parameters)
@@ -92,54 +92,55 @@ def _text_cameras(path: Path) -> Iterator[_CameraRow]:
 
 def _text_images(path: Path) -> Iterator[_ImageRow]:
     # Two lines a picture; the second one lists its points and may be empty.
-    for line in _lines(path)[::2]:
+    for line in _data_lines(path)[::2]:
         if line:
             _, *pose, camera, name = line.split(maxsplit=9)
             yield name, int(camera), tuple(float(value) for value in pose)
 
 
-def _lines(path: Path) -> list[str]:
+def _data_lines(path: Path) -> list[str]:
     lines = path.read_text(encoding="utf-8").splitlines()
     return [line.strip() for line in lines if not line.startswith("#")]
 
 
 def _binary_cameras(path: Path) -> Iterator[_CameraRow]:
-    numbers = {number: (model, size) for model, (number, size, _) in _MODELS.items()}
+    numbers = {number: (model, size) for model, (number, size, _) in _CAMERA_MODELS.items()}
     data = path.read_bytes()
-    (count,), at = struct.unpack_from("<Q", data), 8
+    (count,), offset = struct.unpack_from("<Q", data), 8
     for _ in range(count):
-        camera, number, width, height = struct.unpack_from("<iiQQ", data, at)
+        camera, number, width, height = struct.unpack_from("<iiQQ", data, offset)
         model, size = numbers.get(number, (f"number {number}", 0))
-        yield camera, model, width, height, struct.unpack_from(f"<{size}d", data, at + 24)
-        at += 24 + 8 * size
+        yield camera, model, width, height, struct.unpack_from(f"<{size}d", data, offset + 24)
+        offset += 24 + 8 * size
 
 
 def _binary_images(path: Path) -> Iterator[_ImageRow]:
     data = path.read_bytes()
-    (count,), at = struct.unpack_from("<Q", data), 8
+    (count,), offset = struct.unpack_from("<Q", data), 8
     for _ in range(count):
-        _, *pose, camera = struct.unpack_from("<i7di", data, at)
-        end = data.index(b"\0", at + 64)
-        yield data[at + 64 : end].decode("utf-8"), camera, tuple(pose)
+        _, *pose, camera = struct.unpack_from("<i7di", data, offset)
+        end = data.index(b"\0", offset + 64)
+        yield data[offset + 64 : end].decode("utf-8"), camera, tuple(pose)
         (n_points,) = struct.unpack_from("<Q", data, end + 1)
-        at = end + 9 + 24 * n_points
+        offset = end + 9 + 24 * n_points
 
 
-def _camera(model: str, parameters: tuple[float, ...], path: Path) -> SuppliedCamera:
-    if model not in _MODELS:
+def _camera(model: str, parameters: tuple[float, ...], path: Path) -> CameraCalibration:
+    if model not in _CAMERA_MODELS:
         raise UserError(
-            f"{path}: camera model {model} is not read, only {', '.join(_MODELS)}; undistort the pictures with COLMAP"
+            f"{path}: camera model {model} is not read, only {', '.join(_CAMERA_MODELS)}; undistort the pictures "
+            "with COLMAP"
         )
-    _, size, places = _MODELS[model]
+    _, size, places = _CAMERA_MODELS[model]
     if len(parameters) != size:
         raise ValueError(f"{model} has {size} parameters, found {len(parameters)}")
     fx, fy, cx, cy = (parameters[place] for place in places)
-    radial = parameters[max(places) + 1 :]
+    distortion = parameters[max(places) + 1 :]
     # OpenCV wants k1 k2 p1 p2 at least.
-    return SuppliedCamera(fx, fy, cx, cy, radial + (0.0,) * (4 - len(radial)) if any(radial) else ())
+    return CameraCalibration(fx, fy, cx, cy, distortion + (0.0,) * (4 - len(distortion)) if any(distortion) else ())
 
 
-def _matrix(pose: tuple[float, ...]) -> Float[np.ndarray, "4 4"]:
+def _pose_to_matrix(pose: tuple[float, ...]) -> Float[np.ndarray, "4 4"]:
     """world_to_camera of qw qx qy qz tx ty tz."""
     matrix = np.eye(4)
     matrix[:3, :3] = quaternion_to_matrix(torch.tensor(pose[:4], dtype=torch.float64)).numpy()

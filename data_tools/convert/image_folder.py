@@ -10,18 +10,18 @@ that has `masks/`, or pictures with alpha, needs no conversion.
 
 from pathlib import Path
 
-from data_tools.convert.recording import Recording, mask_folder
-from pipeline.capture.video import open_source
+from data_tools.convert.recording import Recording, mask_folder_reader
+from pipeline.capture.video import open_frame_source
 from pipeline.core.errors import UserError
 from pipeline.io.image import read_alpha
 
 _MASK_FOLDERS = ("masks", "mask", "mattes", "matte", "alpha", "segmentations", "segmentation")
-_READY = ("camera.json", "split.json", "landmarks.npz")
+_FILES_TO_COPY = ("camera.json", "split.json", "landmarks.npz")
 
 
 def is_image_folder(folder: Path) -> bool:
     """True for a folder of pictures with one of the mask folders, or whose first picture is partly transparent."""
-    source = open_source(folder)
+    source = open_frame_source(folder)
     return bool(source.files) and (_find_masks(folder) is not None or bool(read_alpha(source.files[0]).min() < 255))
 
 
@@ -31,15 +31,15 @@ def read_image_folder(folder: Path) -> Recording:
     Raises:
         UserError: there are no pictures, no masks, or not as many of both.
     """
-    source, masks = open_source(folder), _find_masks(folder)
+    source, masks = open_frame_source(folder), _find_masks(folder)
     if not is_image_folder(folder):
         raise UserError(
             f"{folder} has no masks beside its pictures and no alpha in them; the pipeline takes it as it is"
         )
     return Recording(
         source=source,
-        read_mask=mask_folder(masks, source) if masks else lambda index: read_alpha(source.files[index]),
-        ready=tuple(folder / name for name in _READY if (folder / name).is_file()),
+        read_mask=mask_folder_reader(masks, source) if masks else lambda index: read_alpha(source.files[index]),
+        files_to_copy=tuple(folder / name for name in _FILES_TO_COPY if (folder / name).is_file()),
     )
 
 

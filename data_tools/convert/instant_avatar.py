@@ -20,19 +20,19 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from data_tools.convert.protocol import split_of_subject
-from data_tools.convert.recording import Recording, check_size, mask_folder
-from data_tools.convert.smpl_rows import gender_of, joined, smpl_rows
+from data_tools.convert.protocol import published_split
+from data_tools.convert.recording import Recording, mask_folder_reader, require_image_size
+from data_tools.convert.smpl_rows import gender_from_name, merge_smpl_poses, smpl_rows
 from pipeline.capture.smpl_poses import SmplPoses
-from pipeline.capture.user_files import SuppliedCamera
-from pipeline.capture.video import Source, open_source
+from pipeline.capture.user_files import CameraCalibration
+from pipeline.capture.video import FrameSource, open_frame_source
 from pipeline.core.errors import UserError
 from pipeline.core.progress import warn
 from pipeline.io.npz import load_npz
 
 _CAMERA = "cameras.npz"
-_POSES_OF_SETS = {"train": "poses/anim_nerf_train.npz", "heldout": "poses/anim_nerf_test.npz"}
-_POSES_OF_ALL = ("poses_optimized.npz", "poses.npz")
+_POSES_BY_SPLIT = {"train": "poses/anim_nerf_train.npz", "heldout": "poses/anim_nerf_test.npz"}
+_POSES_OF_ALL_FRAMES = ("poses_optimized.npz", "poses.npz")
 
 
 def is_instant_avatar(folder: Path) -> bool:
@@ -46,28 +46,28 @@ def read_instant_avatar(folder: Path) -> Recording:
     Raises:
         UserError: a file that is there cannot be read or does not fit the pictures.
     """
-    source = open_source(folder)
+    source = open_frame_source(folder)
     camera, world_to_camera = _read_camera(folder / _CAMERA, source)
     subject = folder.resolve().name
-    split = split_of_subject(subject, source)
+    split = published_split(subject, source)
     return Recording(
         source=source,
-        read_mask=mask_folder(folder / "masks", source) if (folder / "masks").is_dir() else None,
+        read_mask=mask_folder_reader(folder / "masks", source) if (folder / "masks").is_dir() else None,
         camera=camera,
         split=split,
-        poses=_read_poses(folder, split, source.n_frames, world_to_camera, gender_of(subject)),
+        poses=_read_poses(folder, split, source.n_frames, world_to_camera, gender_from_name(subject)),
     )
 
 
-def _read_camera(path: Path, source: Source) -> tuple[SuppliedCamera, Float[np.ndarray, "4 4"]]:
+def _read_camera(path: Path, source: FrameSource) -> tuple[CameraCalibration, Float[np.ndarray, "4 4"]]:
     arrays = load_npz(path)
     for name, shape in (("intrinsic", (3, 3)), ("extrinsic", (4, 4)), ("height", ()), ("width", ())):
         found = arrays[name].shape if name in arrays else None
         if found != shape:
             raise UserError(f"{path}: `{name}` must have shape {shape}, found {found}; give another cameras.npz")
-    check_size(source, int(arrays["width"]), int(arrays["height"]), path)
+    require_image_size(source, int(arrays["width"]), int(arrays["height"]), path)
     matrix = arrays["intrinsic"].astype(np.float64)
-    camera = SuppliedCamera(float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2]))
+    camera = CameraCalibration(float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2]))
     return camera, arrays["extrinsic"].astype(np.float64)
 
 
@@ -84,9 +84,9 @@ def _read_poses(
         arrays: dict[str, Shaped[np.ndarray, "..."]] = load_npz(folder / name)
         return smpl_rows(arrays, np.array(frame_index), world_to_camera, gender, folder / name)
 
-    of_sets = {name: file for name, file in _POSES_OF_SETS.items() if (folder / file).is_file()}
-    if of_sets and split is not None:
-        return joined([rows(file, split[name]) for name, file in of_sets.items()])
-    if of_sets:
+    files_by_split = {name: file for name, file in _POSES_BY_SPLIT.items() if (folder / file).is_file()}
+    if files_by_split and split is not None:
+        return merge_smpl_poses([rows(file, split[name]) for name, file in files_by_split.items()])
+    if files_by_split:
         warn(f"nothing says which frames {folder / 'poses'} is of; its poses are left out")
-    return next((rows(name, range(n_frames)) for name in _POSES_OF_ALL if (folder / name).is_file()), None)
+    return next((rows(name, range(n_frames)) for name in _POSES_OF_ALL_FRAMES if (folder / name).is_file()), None)

@@ -10,36 +10,36 @@ from typing import IO, Any
 
 import numpy as np
 
-from pipeline.io.safe_pickle import Record, RestrictedUnpickler, opened
+from pipeline.io.safe_pickle import OpaqueObject, RestrictedUnpickler, open_pickle
 
 _WRAPPER = "joblib.numpy_pickle.NumpyArrayWrapper"
 
 
 def load_joblib(path: Path) -> Any:
     """Read arrays and plain containers. Raises UserError as `pipeline.io.safe_pickle.load_pickle`."""
-    with opened(path) as file:
+    with open_pickle(path) as file:
         return _JoblibUnpickler(file).load()
 
 
 class _JoblibUnpickler(RestrictedUnpickler):
     def __init__(self, file: IO[bytes]) -> None:
-        super().__init__(file, records=[_WRAPPER])
-        self._raw = file
+        super().__init__(file, opaque_classes=[_WRAPPER])
+        self._stream = file
 
     def load_build(self) -> None:
         """As there; an array's description then gives way to the array."""
         super().load_build()
-        if isinstance(self.stack[-1], Record):
+        if isinstance(self.stack[-1], OpaqueObject):
             self.stack[-1] = self._read_array(self.stack[-1].state)
 
-    def _read_array(self, facts: dict[str, Any]) -> np.ndarray:
-        shape, dtype = facts["shape"], facts["dtype"].dtype
+    def _read_array(self, header: dict[str, Any]) -> np.ndarray:
+        shape, dtype = header["shape"], header["dtype"].dtype
         if dtype.hasobject:
             raise pickle.UnpicklingError("it holds an array of objects")
-        if facts.get("numpy_array_alignment_bytes") is not None:
-            self._raw.read(self._raw.read(1)[0])
+        if header.get("numpy_array_alignment_bytes") is not None:
+            self._stream.read(self._stream.read(1)[0])
         count = int(np.prod([int(side) for side in shape], dtype=object))
-        data = self._raw.read(count * dtype.itemsize)
-        return np.frombuffer(data, dtype, count).reshape(shape, order=facts["order"]).copy()
+        data = self._stream.read(count * dtype.itemsize)
+        return np.frombuffer(data, dtype, count).reshape(shape, order=header["order"]).copy()
 
     dispatch = {**RestrictedUnpickler.dispatch, pickle.BUILD[0]: load_build}

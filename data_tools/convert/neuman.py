@@ -19,13 +19,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from data_tools.convert.colmap import ColmapModel, find_model, read_model
+from data_tools.convert.colmap import ColmapModel, find_colmap_model, read_colmap_model
 from data_tools.convert.joblib_pickle import load_joblib
-from data_tools.convert.recording import Recording, check_size, mask_folder
+from data_tools.convert.recording import Recording, mask_folder_reader, require_image_size
 from data_tools.convert.smpl_rows import smpl_rows
 from pipeline.capture.smpl_poses import SmplPoses
-from pipeline.capture.user_files import SuppliedCamera
-from pipeline.capture.video import Source, open_source
+from pipeline.capture.user_files import CameraCalibration
+from pipeline.capture.video import FrameSource, open_frame_source
 from pipeline.core.errors import UserError
 from pipeline.io.safe_pickle import load_npy
 
@@ -35,7 +35,7 @@ _SPLITS = {"train": "train_split.txt", "validation": "val_split.txt", "heldout":
 
 def is_neuman(folder: Path) -> bool:
     """True for a folder with pictures and a COLMAP model."""
-    return find_model(folder) is not None and (folder / "images").is_dir()
+    return find_colmap_model(folder) is not None and (folder / "images").is_dir()
 
 
 def read_neuman(folder: Path) -> Recording:
@@ -44,49 +44,49 @@ def read_neuman(folder: Path) -> Recording:
     Raises:
         UserError: a file that is there cannot be read or does not fit the pictures.
     """
-    model_folder = find_model(folder)
+    model_folder = find_colmap_model(folder)
     if model_folder is None:
         raise UserError(f"{folder} has no COLMAP model in sparse/; give a scene of NeuMan")
-    source, model = open_source(folder), read_model(model_folder)
+    source, model = open_frame_source(folder), read_colmap_model(model_folder)
     poses_path = next((folder / name for name in _POSES if (folder / name).is_file()), None)
     has_poses = poses_path is not None and (folder / "alignments.npy").is_file()
     return Recording(
         source=source,
         read_mask=_mask_reader(folder / "segmentations", source) if (folder / "segmentations").is_dir() else None,
-        camera=_one_camera(model, source, model_folder),
+        camera=_require_single_camera(model, source, model_folder),
         split=_read_split(folder, source),
         poses=_read_poses(poses_path, folder / "alignments.npy", source, model) if poses_path and has_poses else None,
     )
 
 
-def _one_camera(model: ColmapModel, source: Source, path: Path) -> SuppliedCamera:
-    used = {model.cameras[number] for number in model.camera_of.values() if number in model.cameras}
+def _require_single_camera(model: ColmapModel, source: FrameSource, path: Path) -> CameraCalibration:
+    used = {model.cameras[number] for number in model.camera_id_of.values() if number in model.cameras}
     if len(used) != 1:
         raise UserError(f"{path} has {len(used)} different cameras for its pictures; give a recording of one camera")
     one = used.pop()
-    check_size(source, one.width, one.height, path)
+    require_image_size(source, one.width, one.height, path)
     return one.camera
 
 
-def _mask_reader(folder: Path, source: Source) -> Callable[[int], UInt8[np.ndarray, "h w"]]:
-    around = mask_folder(folder, source)
-    return lambda index: 255 - around(index)
+def _mask_reader(folder: Path, source: FrameSource) -> Callable[[int], UInt8[np.ndarray, "h w"]]:
+    read_background_mask = mask_folder_reader(folder, source)
+    return lambda index: 255 - read_background_mask(index)
 
 
-def _read_split(folder: Path, source: Source) -> dict[str, list[int]] | None:
+def _read_split(folder: Path, source: FrameSource) -> dict[str, list[int]] | None:
     if not all((folder / name).is_file() for name in _SPLITS.values()):
         return None
-    place = {image.name: index for index, image in enumerate(source.files)}
+    frame_of_name = {image.name: index for index, image in enumerate(source.files)}
     split = {}
     for kind, name in _SPLITS.items():
         names = (folder / name).read_text(encoding="utf-8").split()
-        if unknown := next((word for word in names if word not in place), None):
+        if unknown := next((word for word in names if word not in frame_of_name), None):
             raise UserError(f"{folder / name} names {unknown}, which is not in images/; give the pictures it is for")
-        split[kind] = [place[word] for word in names]
+        split[kind] = [frame_of_name[word] for word in names]
     return split
 
 
-def _read_poses(path: Path, alignments_path: Path, source: Source, model: ColmapModel) -> SmplPoses:
+def _read_poses(path: Path, alignments_path: Path, source: FrameSource, model: ColmapModel) -> SmplPoses:
     """The poses of the pictures that have a camera pose and an alignment."""
     people, alignments = load_joblib(path), load_npy(alignments_path)
     aligned = alignments.item() if alignments.shape == () and alignments.dtype == object else None
@@ -103,13 +103,15 @@ def _read_poses(path: Path, alignments_path: Path, source: Source, model: Colmap
         raise UserError(f"{path} has poses of {len(person['pose'])} pictures, not of {source.path}; replace it")
     arrays = {name: np.array([np.reshape(person[name][row], -1) for row in rows]) for name in ("pose", "betas")}
     arrays["transl"] = np.zeros((len(rows), 3))
-    to_camera = np.stack(
-        [_metric(model.world_to_camera[image.name], np.asarray(aligned[image.name])) for _, image in frames]
+    smpl_to_camera = np.stack(
+        [_smpl_to_camera(model.world_to_camera[image.name], np.asarray(aligned[image.name])) for _, image in frames]
     )
-    return smpl_rows(arrays, np.array([index for index, _ in frames]), to_camera, "neutral", path)
+    return smpl_rows(arrays, np.array([index for index, _ in frames]), smpl_to_camera, "neutral", path)
 
 
-def _metric(world_to_camera: Float[np.ndarray, "4 4"], alignment: Float[np.ndarray, "4 3"]) -> Float[np.ndarray, "4 4"]:
+def _smpl_to_camera(
+    world_to_camera: Float[np.ndarray, "4 4"], alignment: Float[np.ndarray, "4 3"]
+) -> Float[np.ndarray, "4 4"]:
     """From SMPL's output to camera axes; divided by the alignment's scale, a rigid motion in SMPL's metres."""
     matrix = np.eye(4)
     matrix[:3] = world_to_camera[:3, :3] @ alignment.T

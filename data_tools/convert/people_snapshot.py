@@ -20,12 +20,12 @@ import h5py
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from data_tools.convert.protocol import split_of_subject
-from data_tools.convert.recording import Recording, check_size, mask_levels
-from data_tools.convert.smpl_rows import gender_of, smpl_rows
+from data_tools.convert.protocol import published_split
+from data_tools.convert.recording import Recording, mask_to_uint8, require_image_size
+from data_tools.convert.smpl_rows import gender_from_name, smpl_rows
 from pipeline.capture.smpl_poses import SmplPoses
-from pipeline.capture.user_files import SuppliedCamera
-from pipeline.capture.video import Source, open_source
+from pipeline.capture.user_files import CameraCalibration
+from pipeline.capture.video import FrameSource, open_frame_source
 from pipeline.core.errors import UserError
 from pipeline.io.safe_pickle import load_pickle
 
@@ -44,22 +44,22 @@ def read_people_snapshot(folder: Path) -> Recording:
     Raises:
         UserError: a file that is there cannot be read or does not fit the video.
     """
-    source = open_source(folder)
+    source = open_frame_source(folder)
     subject, camera, poses, world_to_camera = folder.resolve().name, None, None, np.eye(4)
     if (folder / _CAMERA).is_file():
         camera, world_to_camera = _read_camera(folder / _CAMERA, source)
     if (folder / _POSES).is_file():
-        poses = _read_poses(folder / _POSES, world_to_camera, gender_of(subject))
+        poses = _read_poses(folder / _POSES, world_to_camera, gender_from_name(subject))
     return Recording(
         source=source,
         read_mask=_mask_reader(folder / _MASKS, source) if (folder / _MASKS).is_file() else None,
         camera=camera,
-        split=split_of_subject(subject, source),
+        split=published_split(subject, source),
         poses=poses,
     )
 
 
-def _read_camera(path: Path, source: Source) -> tuple[SuppliedCamera, Float[np.ndarray, "4 4"]]:
+def _read_camera(path: Path, source: FrameSource) -> tuple[CameraCalibration, Float[np.ndarray, "4 4"]]:
     """Intrinsics with distortion, and world_to_camera."""
     stored = load_pickle(path)
     values = {}
@@ -68,15 +68,15 @@ def _read_camera(path: Path, source: Source) -> tuple[SuppliedCamera, Float[np.n
         if number.size != size or not np.issubdtype(number.dtype, np.number):
             raise UserError(f"{path} has no `{name}` of {size} numbers; give PeopleSnapshot's own camera.pkl")
         values[name] = number.astype(np.float64).reshape(-1)
-    check_size(source, int(values["width"][0]), int(values["height"][0]), path)
+    require_image_size(source, int(values["width"][0]), int(values["height"][0]), path)
     world_to_camera = np.eye(4)
     world_to_camera[:3, :3] = cv2.Rodrigues(values["camera_rt"])[0]
     world_to_camera[:3, 3] = values["camera_t"]
     (fx, fy), (cx, cy), distortion = (values[f"camera_{letter}"].tolist() for letter in "fck")
-    return SuppliedCamera(fx, fy, cx, cy, tuple(distortion)), world_to_camera
+    return CameraCalibration(fx, fy, cx, cy, tuple(distortion)), world_to_camera
 
 
-def _mask_reader(path: Path, source: Source) -> Callable[[int], UInt8[np.ndarray, "h w"]]:
+def _mask_reader(path: Path, source: FrameSource) -> Callable[[int], UInt8[np.ndarray, "h w"]]:
     """Reads one mask at a time: all of them together would fill the memory."""
     shape = _read_hdf5(path, "masks", lambda masks: masks.shape)
     if len(shape) != 3 or shape[0] < source.n_frames:
@@ -84,7 +84,7 @@ def _mask_reader(path: Path, source: Source) -> Callable[[int], UInt8[np.ndarray
             f"{path}: `masks` has shape {shape} for the {source.n_frames} frames of {source.path}; "
             "give the (frames, height, width) masks of this video"
         )
-    return lambda index: mask_levels(_read_hdf5(path, "masks", lambda masks: masks[index]), path)
+    return lambda index: mask_to_uint8(_read_hdf5(path, "masks", lambda masks: masks[index]), path)
 
 
 def _read_poses(path: Path, world_to_camera: Float[np.ndarray, "4 4"], gender: str) -> SmplPoses:
@@ -92,10 +92,10 @@ def _read_poses(path: Path, world_to_camera: Float[np.ndarray, "4 4"], gender: s
     return smpl_rows(arrays, np.arange(len(arrays["pose"])), world_to_camera, gender, path)
 
 
-def _read_hdf5(path: Path, name: str, take: Callable[[h5py.Dataset], Any]) -> Any:
-    """What `take` takes from the data set of this name."""
+def _read_hdf5(path: Path, name: str, select: Callable[[h5py.Dataset], Any]) -> Any:
+    """What `select` takes from the data set of this name."""
     try:
         with h5py.File(path, "r") as file:
-            return take(file[name])
+            return select(file[name])
     except (OSError, KeyError) as error:
         raise UserError(f"{path} cannot be read as HDF5 with a data set `{name}` ({error}); replace it") from None

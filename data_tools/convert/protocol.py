@@ -4,10 +4,10 @@ Only subjects whose two sets share no frame are listed. Its validation frame is 
 named here and the frames stage takes some of the training frames.
 """
 
-from pipeline.capture.video import Source
+from pipeline.capture.video import FrameSource
 from pipeline.core.progress import warn
 
-_SETS = {
+_SPLITS = {
     "female-3-casual": (range(0, 446, 4), range(446, 648, 4)),
     "female-4-casual": (range(0, 336, 4), range(335, 524, 4)),
     "female-4-sport": (range(1, 337, 4), range(336, 525, 4)),
@@ -17,12 +17,12 @@ _SETS = {
 }
 
 
-def split_of_subject(subject: str, source: Source) -> dict[str, range] | None:
+def published_split(subject: str, source: FrameSource) -> dict[str, range] | None:
     """The lists of `split.json`; None, with a warning, where the subject is not known or its video is shorter."""
-    if subject not in _SETS:
+    if subject not in _SPLITS:
         warn(f"no split is known for {subject}; the frames stage will hold out every eighth frame")
         return None
-    train, heldout = _SETS[subject]
+    train, heldout = _SPLITS[subject]
     if source.n_frames <= heldout[-1]:
         warn(
             f"{source.path} has {source.n_frames} frames, InstantAvatar's split of {subject} needs {heldout[-1] + 1}; "

@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Shaped, UInt8
 
-from data_tools.folder import whole_folder
+from data_tools.folder import atomic_folder
 from pipeline.capture.smpl_poses import SMPL_POSES_NPZ, SmplPoses, save_smpl_poses
-from pipeline.capture.user_files import SuppliedCamera
-from pipeline.capture.video import Source, natural_key, picture_size_px
+from pipeline.capture.user_files import CameraCalibration
+from pipeline.capture.video import FrameSource, image_size_px, natural_sort_key
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track
 from pipeline.io.image import IMAGE_SUFFIXES, read_gray, write_gray
@@ -37,12 +37,12 @@ class Recording:
     ready: files that have the form of the target already.
     """
 
-    source: Source
+    source: FrameSource
     read_mask: Callable[[int], UInt8[np.ndarray, "h w"]] | None = None
-    camera: SuppliedCamera | None = None
+    camera: CameraCalibration | None = None
     split: Mapping[str, Sequence[int]] | None = None
     poses: SmplPoses | None = None
-    ready: tuple[Path, ...] = ()
+    files_to_copy: tuple[Path, ...] = ()
 
     def summary(self) -> str:
         """What there is, in a few words."""
@@ -52,7 +52,7 @@ class Recording:
             words.append("split (" + ", ".join(f"{len(index)} {name}" for name, index in self.split.items()) + ")")
         if self.poses is not None:
             words.append(f"SMPL poses of {len(self.poses.frame_index)} frames")
-        words += [file.name for file in self.ready]
+        words += [file.name for file in self.files_to_copy]
         return ", ".join(words)
 
 
@@ -68,8 +68,8 @@ def write_recording(recording: Recording, target: Path) -> None:
             f"{source.path} has {source.n_frames} frames, its SMPL poses go to frame {poses.frame_index[-1]}; "
             "give the pictures that belong to them"
         )
-    with whole_folder(target) as part:
-        _copy_pictures(source, part)
+    with atomic_folder(target) as part:
+        _copy_images(source, part)
         if recording.read_mask is not None:
             (part / "masks").mkdir()
             for index in track(range(source.n_frames), "writing masks"):
@@ -81,18 +81,18 @@ def write_recording(recording: Recording, target: Path) -> None:
             _write_json(part / "split.json", {name: [int(k) for k in index] for name, index in recording.split.items()})
         if poses is not None:
             save_smpl_poses(part / SMPL_POSES_NPZ, poses)
-        for file in recording.ready:
+        for file in recording.files_to_copy:
             shutil.copyfile(file, part / file.name)
 
 
-def mask_folder(folder: Path, source: Source) -> Callable[[int], UInt8[np.ndarray, "h w"]]:
+def mask_folder_reader(folder: Path, source: FrameSource) -> Callable[[int], UInt8[np.ndarray, "h w"]]:
     """Reads the masks of a folder, images or `.npy`: those named as the pictures are, or else all in natural order.
 
     Raises:
         UserError: there is not one for each picture.
     """
     found = (path for path in folder.iterdir() if path.suffix.lower() in (".npy", *IMAGE_SUFFIXES))
-    files = sorted(found, key=natural_key)
+    files = sorted(found, key=natural_sort_key)
     by_stem = {path.stem: path for path in files}
     if source.files and all(image.stem in by_stem for image in source.files):
         files = [by_stem[image.stem] for image in source.files]
@@ -101,12 +101,12 @@ def mask_folder(folder: Path, source: Source) -> Callable[[int], UInt8[np.ndarra
 
     def read(index: int) -> UInt8[np.ndarray, "h w"]:
         path = files[index]
-        return mask_levels(load_npy(path) if path.suffix == ".npy" else read_gray(path), path)
+        return mask_to_uint8(load_npy(path) if path.suffix == ".npy" else read_gray(path), path)
 
     return read
 
 
-def mask_levels(mask: Shaped[np.ndarray, "..."], path: Path) -> UInt8[np.ndarray, "h w"]:
+def mask_to_uint8(mask: Shaped[np.ndarray, "..."], path: Path) -> UInt8[np.ndarray, "h w"]:
     """A stored mask as uint8 [0, 255]: what never rises above 1 is a share, everything else is levels already.
 
     Raises:
@@ -118,9 +118,9 @@ def mask_levels(mask: Shaped[np.ndarray, "..."], path: Path) -> UInt8[np.ndarray
     return np.clip(np.rint(values * (255.0 if values.max(initial=0.0) <= 1.0 else 1.0)), 0, 255).astype(np.uint8)
 
 
-def check_size(source: Source, width_px: int, height_px: int, path: Path) -> None:
+def require_image_size(source: FrameSource, width_px: int, height_px: int, path: Path) -> None:
     """Raise UserError when the pictures are not of the size that the camera in `path` was calibrated for."""
-    width, height = picture_size_px(source)
+    width, height = image_size_px(source)
     if (width, height) != (width_px, height_px):
         raise UserError(
             f"{path} is for pictures of {width_px}x{height_px}, those of {source.path} are {width}x{height}; "
@@ -128,7 +128,7 @@ def check_size(source: Source, width_px: int, height_px: int, path: Path) -> Non
         )
 
 
-def _copy_pictures(source: Source, folder: Path) -> None:
+def _copy_images(source: FrameSource, folder: Path) -> None:
     """Contents only: the copies must be writable and new, whatever the originals are."""
     if not source.files:
         shutil.copyfile(source.path, folder / source.path.name)
@@ -138,7 +138,7 @@ def _copy_pictures(source: Source, folder: Path) -> None:
         shutil.copyfile(file, folder / "images" / file.name)
 
 
-def _camera_values(camera: SuppliedCamera) -> dict[str, object]:
+def _camera_values(camera: CameraCalibration) -> dict[str, object]:
     values: dict[str, object] = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
     return values | ({"distortion": list(camera.distortion)} if any(camera.distortion) else {})
 

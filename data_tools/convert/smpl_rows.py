@@ -9,8 +9,8 @@ from jaxtyping import Float, Int, Shaped
 from pipeline.capture.smpl_poses import N_BETAS, N_BODY_POSE, SmplPoses
 from pipeline.core.errors import UserError
 
-_WHOLE_POSE = ("thetas", "pose")
-_TRANSLATION = ("transl", "trans")
+_FULL_POSE_KEYS = ("thetas", "pose")
+_TRANSLATION_KEYS = ("transl", "trans")
 
 
 def smpl_rows(
@@ -32,25 +32,27 @@ def smpl_rows(
         UserError: an array is missing, too short or of another width.
     """
     n = len(frame_index)
-    whole = [arrays[name] for name in _WHOLE_POSE if name in arrays]
+    whole = [arrays[name] for name in _FULL_POSE_KEYS if name in arrays]
     if whole:
-        pose = _rows(whole[0], n, 3 + N_BODY_POSE, "the pose", path)
+        pose = _require_rows(whole[0], n, 3 + N_BODY_POSE, "the pose", path)
     else:
-        orient = _rows(arrays.get("global_orient"), n, 3, "`global_orient`", path)
-        pose = np.concatenate([orient, _rows(arrays.get("body_pose"), n, N_BODY_POSE, "`body_pose`", path)], axis=1)
-    translation = next((arrays[name] for name in _TRANSLATION if name in arrays), None)
+        orient = _require_rows(arrays.get("global_orient"), n, 3, "`global_orient`", path)
+        pose = np.concatenate(
+            [orient, _require_rows(arrays.get("body_pose"), n, N_BODY_POSE, "`body_pose`", path)], axis=1
+        )
+    translation = next((arrays[name] for name in _TRANSLATION_KEYS if name in arrays), None)
     return SmplPoses(
         frame_index=frame_index.astype(np.int32),
         global_orient=pose[:, :3],
         body_pose=pose[:, 3:],
-        transl=_rows(translation, n, 3, "the translation", path),
-        betas=_rows(_for_all(arrays.get("betas"), n), n, N_BETAS, "`betas`", path),
+        transl=_require_rows(translation, n, 3, "the translation", path),
+        betas=_require_rows(_repeat_betas(arrays.get("betas"), n), n, N_BETAS, "`betas`", path),
         smpl_to_camera=np.broadcast_to(smpl_to_camera, (n, 4, 4)).astype(np.float32),
         gender=gender,
     )
 
 
-def joined(parts: Sequence[SmplPoses]) -> SmplPoses:
+def merge_smpl_poses(parts: Sequence[SmplPoses]) -> SmplPoses:
     """Poses of different frames as one table in rising order; all of one gender."""
     index = np.concatenate([part.frame_index for part in parts])
     order = np.argsort(index)
@@ -61,17 +63,17 @@ def joined(parts: Sequence[SmplPoses]) -> SmplPoses:
     return SmplPoses(frame_index=index[order], **rows, gender=parts[0].gender)
 
 
-def gender_of(subject: str) -> str:
+def gender_from_name(subject: str) -> str:
     """What PeopleSnapshot's names of subjects begin with; unknown for other names."""
     return next((gender for gender in ("female", "male", "neutral") if subject.startswith(gender)), "unknown")
 
 
-def _for_all(betas: Shaped[np.ndarray, "..."] | None, n: int) -> Shaped[np.ndarray, "..."] | None:
+def _repeat_betas(betas: Shaped[np.ndarray, "..."] | None, n: int) -> Shaped[np.ndarray, "..."] | None:
     """One shape repeated for every frame; anything else as it is."""
     return np.tile(betas.reshape(1, -1), (n, 1)) if betas is not None and betas.size == N_BETAS else betas
 
 
-def _rows(
+def _require_rows(
     values: Shaped[np.ndarray, "..."] | None, n: int, width: int, name: str, path: Path
 ) -> Float[np.ndarray, "n w"]:
     if values is None or values.ndim != 2 or values.shape[1] != width or len(values) < n:

@@ -17,20 +17,20 @@ from jaxtyping import Bool, Float
 
 from data_tools.command import run_command
 from data_tools.evaluate.compare_page import write_comparison
-from data_tools.evaluate.truth import load_truth, true_mask
+from data_tools.evaluate.truth import load_ground_truth, load_true_mask
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.files import load_body, load_camera, load_motion
 from pipeline.core.errors import UserError
 from pipeline.geometry.camera import project
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning
-from pipeline.geometry.surface import closest_on_mesh
+from pipeline.geometry.surface import closest_points_on_mesh
 from pipeline.io.image import read_gray
 from pipeline.io.npz import load_npz
-from pipeline.metrics.images import body_pixels, mask_iou
-from pipeline.metrics.surfaces import joint_error_m, sample_surface
+from pipeline.metrics.images import foreground_mask, mask_iou
+from pipeline.metrics.surfaces import mpjpe_m, sample_surface
 
-MAIN_JOINTS = (
+CORRECTED_JOINTS = (
     *("Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"),
     *(f"{side}{part}" for side in ("Left", "Right") for part in ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")),
 )
@@ -40,7 +40,10 @@ SURFACE_FRAMES = 8
 def compare_masks(out: Path, frames: Path) -> dict[str, float]:
     """IoU of the masks of the `frames` stage with the true coverage, both cut at one half: median and worst frame."""
     scores = [
-        mask_iou(body_pixels(read_gray(frames / "masks" / f"{index:06d}.png")), body_pixels(true_mask(out, index)))
+        mask_iou(
+            foreground_mask(read_gray(frames / "masks" / f"{index:06d}.png")),
+            foreground_mask(load_true_mask(out, index)),
+        )
         for index in load_npz(frames / "frames.npz")["frame_index"].tolist()
     ]
     return {"mask_iou_median": float(np.median(scores)), "mask_iou_worst": float(np.min(scores))}
@@ -53,62 +56,74 @@ def compare_body(out: Path, body_folder: Path) -> dict[str, float]:
     after the fitted skeleton is scaled to the true distance of neck and hips as well; absolute_joint_error_mm without
     any alignment; joint_error_px in the picture. acceleration_error_ratio: mean error of the joints' accelerations over
     the mean true acceleration; jitter_ratio: mean acceleration over the true one. swapped_frames: see
-    `swapped_frames`. Joints that the true rig lacks are left out.
+    `left_right_swapped_frames`. Joints that the true rig lacks are left out.
 
     Raises:
         UserError: a chosen frame is not in the truth.
     """
-    truth = load_truth(out)
+    truth = load_ground_truth(out)
     body, motion = load_body(body_folder / "body.npz"), load_motion(body_folder / "motion.npz")
     camera = load_camera(body_folder / "camera.npz")
     if motion.frame_index.max() >= len(truth.motion.frame_index):
         raise UserError(f"{body_folder} speaks of frame {motion.frame_index.max()}, {out} has fewer; is it its run?")
-    names = [name for name in MAIN_JOINTS if name in truth.subject.body.joint_names and name in body.joint_names]
+    names = [name for name in CORRECTED_JOINTS if name in truth.subject.body.joint_names and name in body.joint_names]
     fitted = joint_positions(body, motion, names)
     true = joint_positions(truth.subject.body, truth.motion.select(motion.frame_index), names)
-    from_hips, true_from_hips = fitted - fitted[:, :1], true - true[:, :1]
+    root_relative_m, true_root_relative_m = fitted - fitted[:, :1], true - true[:, :1]
     neck = names.index("Neck") if "Neck" in names else names.index("Head")
-    scale = np.linalg.norm(true_from_hips[:, neck], axis=1).mean() / np.linalg.norm(from_hips[:, neck], axis=1).mean()
+    scale = (
+        np.linalg.norm(true_root_relative_m[:, neck], axis=1).mean()
+        / np.linalg.norm(root_relative_m[:, neck], axis=1).mean()
+    )
     fitted_px, true_px = (
-        project(torch.from_numpy(places).float(), seen_by)[0].numpy()
-        for places, seen_by in ((fitted, camera), (true, truth.camera))
+        project(torch.from_numpy(positions).float(), viewing_camera)[0].numpy()
+        for positions, viewing_camera in ((fitted, camera), (true, truth.camera))
     )
     size_ratio = camera.width / truth.camera.width
-    pushed, truly_pushed = (acceleration(places, motion.time_s) for places in (fitted, true))
-    true_size = np.linalg.norm(truly_pushed, axis=2).mean()
+    fitted_acceleration, true_acceleration = (
+        joint_accelerations(positions, motion.time_s) for positions in (fitted, true)
+    )
+    mean_true_acceleration = np.linalg.norm(true_acceleration, axis=2).mean()
     return {
-        "joint_error_mm": 1000.0 * joint_error_m(from_hips, true_from_hips),
-        "scaled_joint_error_mm": 1000.0 * joint_error_m(scale * from_hips, true_from_hips),
-        "absolute_joint_error_mm": 1000.0 * joint_error_m(fitted, true),
+        "joint_error_mm": 1000.0 * mpjpe_m(root_relative_m, true_root_relative_m),
+        "scaled_joint_error_mm": 1000.0 * mpjpe_m(scale * root_relative_m, true_root_relative_m),
+        "absolute_joint_error_mm": 1000.0 * mpjpe_m(fitted, true),
         "joint_error_px": float(np.linalg.norm(fitted_px / size_ratio - true_px, axis=2).mean()),
-        "acceleration_error_ratio": float(np.linalg.norm(pushed - truly_pushed, axis=2).mean() / true_size),
-        "jitter_ratio": float(np.linalg.norm(pushed, axis=2).mean() / true_size),
-        "swapped_frames": float(swapped_frames(names, from_hips, true_from_hips).sum()),
+        "acceleration_error_ratio": float(
+            np.linalg.norm(fitted_acceleration - true_acceleration, axis=2).mean() / mean_true_acceleration
+        ),
+        "jitter_ratio": float(np.linalg.norm(fitted_acceleration, axis=2).mean() / mean_true_acceleration),
+        "left_right_swapped_frames": float(
+            left_right_swapped_frames(names, root_relative_m, true_root_relative_m).sum()
+        ),
         "focal_ratio": camera.fx / size_ratio / truth.camera.fx,
         "scale_ratio": float(1.0 / scale),
         "silhouette_iou": float(np.nanmedian(load_npz(body_folder / "scores.npz")["silhouette_iou"])),
     }
 
 
-def acceleration(places_m: Float[np.ndarray, "n k 3"], time_s: Float[np.ndarray, "n"]) -> Float[np.ndarray, "t k 3"]:
+def joint_accelerations(
+    positions_m: Float[np.ndarray, "n k 3"], time_s: Float[np.ndarray, "n"]
+) -> Float[np.ndarray, "t k 3"]:
     """Second differences over the true intervals (m/s²) at the inner frames."""
     interval = np.diff(time_s)[:, None, None]
-    velocity = np.diff(places_m, axis=0) / interval
+    velocity = np.diff(positions_m, axis=0) / interval
     return np.diff(velocity, axis=0) / (0.5 * (interval[1:] + interval[:-1]))
 
 
-def swapped_frames(
+def left_right_swapped_frames(
     names: Sequence[str], fitted_m: Float[np.ndarray, "n k 3"], true_m: Float[np.ndarray, "n k 3"]
 ) -> Bool[np.ndarray, "n"]:
     """Frames in which a pair of joints (hips, knees, ankles, ...) fits better with left and right exchanged."""
     swapped = np.zeros(len(fitted_m), dtype=bool)
     for left, name in enumerate(names):
         if name.startswith("Left") and name.replace("Left", "Right") in names:
-            pair = [left, names.index(name.replace("Left", "Right"))]
-            kept, exchanged = (
-                np.linalg.norm(fitted_m[:, pair] - true_m[:, order], axis=2).sum(1) for order in (pair, pair[::-1])
+            left_right_joints = [left, names.index(name.replace("Left", "Right"))]
+            unswapped_error_m, swapped_error_m = (
+                np.linalg.norm(fitted_m[:, left_right_joints] - true_m[:, order], axis=2).sum(1)
+                for order in (left_right_joints, left_right_joints[::-1])
             )
-            swapped |= kept > exchanged
+            swapped |= unswapped_error_m > swapped_error_m
     return swapped
 
 
@@ -118,7 +133,7 @@ def compare_surface(out: Path, body_folder: Path, count: int = 2000) -> dict[str
     The true surface is the bare body where there is one, else the clothed person. Middles of the surfaces are laid over
     each other in every frame. Hands and head are left out: fingers and hair differ by design.
     """
-    truth = load_truth(out)
+    truth = load_ground_truth(out)
     bare = out / "truth" / "bare.npz"
     true_body = load_body(bare) if bare.is_file() else truth.subject.body
     body, motion = load_body(body_folder / "body.npz"), load_motion(body_folder / "motion.npz")
@@ -131,7 +146,7 @@ def compare_surface(out: Path, body_folder: Path, count: int = 2000) -> dict[str
         points, faces = sample_surface(mesh, count)
         middle = sample_surface(target, count)[0].mean(0) - points.mean(0)
         points = points[trunk[mesh.faces[faces]].all(1)] + middle
-        distances.append(closest_on_mesh(points, target)[0])
+        distances.append(closest_points_on_mesh(points, target)[0])
     return {"surface_median_mm": 1000.0 * float(np.median(np.concatenate(distances)))}
 
 
@@ -150,8 +165,8 @@ def joint_positions(body: Body, motion: Motion, names: Sequence[str]) -> Float[n
     """World positions of the named joints in every frame, metres."""
     joints = [body.joint(name) for name in names]
     transforms = canonical_to_world(body, motion)[:, joints].double()
-    places = torch.from_numpy(body.joints_m[joints]).double()
-    return ((transforms[..., :3, :3] @ places[:, :, None]).squeeze(-1) + transforms[..., :3, 3]).numpy()
+    positions = torch.from_numpy(body.joints_m[joints]).double()
+    return ((transforms[..., :3, :3] @ positions[:, :, None]).squeeze(-1) + transforms[..., :3, 3]).numpy()
 
 
 def _main(argv: Sequence[str]) -> None:

@@ -9,22 +9,28 @@ from typing import Any
 
 from data_tools.evaluate.compare_avatar import (
     Comparison,
-    Pair,
-    compare_filmed,
-    compare_held_out,
+    ImagePair,
+    compare_heldout_images,
+    compare_heldout_surfaces,
     compare_novel_poses,
     compare_novel_views,
-    compare_shape,
+    compare_rest_surfaces,
     compare_texture,
     load_comparison,
 )
 from data_tools.evaluate.files import TRUTH_FILES, TRUTH_VERSION
 from pipeline.core.atomic import atomic_path
 from pipeline.core.errors import UserError
-from pipeline.core.manifest import MANIFEST, digest_file, read_manifest, write_manifest
-from pipeline.metrics.images import body_box, body_pixels, mean_scores, on_white, premultiplied_on_white
-from pipeline.report.page import asset, error_map, figure_text, image_tag, table, tile
-from pipeline.report.report_json import finite
+from pipeline.core.manifest import MANIFEST_FILE, digest_file, read_manifest, write_manifest
+from pipeline.metrics.images import (
+    composite_on_white,
+    composite_premultiplied_on_white,
+    foreground_bounding_box,
+    foreground_mask,
+    mean_scores,
+)
+from pipeline.report.page import error_map, format_metric, image_tag, metric_table, metric_tile, read_asset
+from pipeline.report.report_json import replace_nonfinite
 
 PROTOCOL = (
     "Surfaces are laid over the truth by rotation, shift and one scale, found by iterated closest points in both "
@@ -60,24 +66,30 @@ def write_comparison(out: Path, run: Path, found: Mapping[str, Mapping[str, floa
         raise UserError(f"{report} is not finished; run python -m stages --run {run}")
     heldout = json.loads((report / "report.json").read_text(encoding="utf-8"))["heldout"]
     document, pictures = avatar_sections(load_comparison(out, run))
-    kept = {name: heldout[name] for name in ("field", "mesh")}
-    document = finite(
-        {"version": TRUTH_VERSION, "protocol": PROTOCOL, **found, **document, "images": kept | document["images"]}
+    report_scores = {name: heldout[name] for name in ("field", "mesh")}
+    document = replace_nonfinite(
+        {
+            "version": TRUTH_VERSION,
+            "protocol": PROTOCOL,
+            **found,
+            **document,
+            "images": report_scores | document["images"],
+        }
     )
     page = comparison_page(run.resolve().name, document, pictures)
     for name, text in zip(TRUTH_FILES, (page, json.dumps(document, indent=2, allow_nan=False) + "\n"), strict=True):
         with atomic_path(report / name) as path:
             path.write_text(text, encoding="utf-8")
     outputs = manifest.outputs | {name: digest_file(report / name) for name in TRUTH_FILES}
-    with atomic_path(report / MANIFEST) as path:  # so that --verify knows the two files
+    with atomic_path(report / MANIFEST_FILE) as path:  # so that --verify knows the two files
         write_manifest(replace(manifest, outputs=outputs), path)
     return document
 
 
-def avatar_sections(pair: Comparison) -> tuple[dict[str, Any], dict[str, list[Pair]]]:
+def avatar_sections(pair: Comparison) -> tuple[dict[str, Any], dict[str, list[ImagePair]]]:
     """All sections that need a finished avatar, and the pictures of held-out cameras and motions."""
-    document: dict[str, Any] = {"mesh": compare_shape(pair), "filmed": compare_filmed(pair)}
-    images = compare_held_out(pair)
+    document: dict[str, Any] = {"mesh": compare_rest_surfaces(pair), "heldout_poses": compare_heldout_surfaces(pair)}
+    images = compare_heldout_images(pair)
     pictures = {}
     if (pair.folder / "novel_poses").is_dir():
         document["novel_poses"], pictures["novel_poses"] = compare_novel_poses(pair)
@@ -87,20 +99,23 @@ def avatar_sections(pair: Comparison) -> tuple[dict[str, Any], dict[str, list[Pa
     return document | {"texture": compare_texture(pair), "images": images}, pictures
 
 
-def comparison_page(title: str, document: Mapping[str, Any], pictures: Mapping[str, Sequence[Pair]]) -> str:
+def comparison_page(title: str, document: Mapping[str, Any], pictures: Mapping[str, Sequence[ImagePair]]) -> str:
     """The whole HTML text, in the style of the report."""
-    surfaces = {name: document[name] for name in ("mesh", "filmed", "novel_poses") if name in document}
-    tables = [table("Surfaces against truth", surfaces), table("Pictures", document["images"])]
+    surfaces = {name: document[name] for name in ("mesh", "heldout_poses", "novel_poses") if name in document}
+    tables = [metric_table("Surfaces against truth", surfaces), metric_table("Pictures", document["images"])]
     tables += [
-        table(name.capitalize(), {"": document[name]}) for name in ("masks", "body", "texture") if name in document
+        metric_table(name.capitalize(), {"": document[name]})
+        for name in ("masks", "body", "texture")
+        if name in document
     ]
     rows = "".join(_row(name.replace("_", " "), row) for name, row in pictures.items())
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}: truth</title>'
         f'<meta name="viewport" content="width=device-width, initial-scale=1"><link rel="icon" href="data:,">'
-        f"<style>{asset('report.css')}{STYLE}</style></head><body><header><h1>{escape(title)} against its truth</h1>"
+        f"<style>{read_asset('report.css')}{STYLE}</style></head><body><header><h1>{escape(title)} against "
+        "its truth</h1>"
         f'<p class="lead">The rest is in <a href="index.html">the report</a>.</p></header><main>'
-        f'<section class="tiles">{"".join(tile(*texts) for texts in _headline(document))}</section>'
+        f'<section class="tiles">{"".join(metric_tile(*texts) for texts in _headline(document))}</section>'
         f'<section><h2>All figures</h2><p class="note">{escape(document["protocol"])}</p>'
         f'<div class="tables">{"".join(tables)}</div></section><section><h2>Held-out cameras and motions</h2>{rows}'
         f"</section></main></body></html>\n"
@@ -111,21 +126,21 @@ def _headline(document: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """(value, unit, label) of each tile."""
     mesh, images = document["mesh"], document["images"]
     return [
-        (figure_text(mesh["chamfer_mm"]), "mm", "Chamfer distance, A-pose"),
-        (figure_text(mesh["f_score"]), "", "F-score at 5 mm"),
-        (figure_text(mesh["normal_angle_deg"]), "°", "normals, mean"),
-        (figure_text(images["mesh"]["psnr_body"]), "dB", "mesh, held out, body pixels"),
-        (figure_text(images["ceiling"]["psnr_body"]), "dB", "true mesh in the fitted poses"),
+        (format_metric(mesh["chamfer_mm"]), "mm", "Chamfer distance, A-pose"),
+        (format_metric(mesh["f_score"]), "", "F-score at 5 mm"),
+        (format_metric(mesh["normal_angle_deg"]), "°", "normals, mean"),
+        (format_metric(images["mesh"]["psnr_body"]), "dB", "mesh, held out, body pixels"),
+        (format_metric(images["upper_bound"]["psnr_body"]), "dB", "true mesh in the fitted poses"),
     ]
 
 
-def _row(title: str, pictures: Sequence[Pair]) -> str:
+def _row(title: str, pictures: Sequence[ImagePair]) -> str:
     """Truth, avatar and error of each picture, cropped to the person."""
     figures = []
     for number, pair in enumerate(pictures):
-        box = body_box(body_pixels(pair.truth[..., 3]))
-        truth = on_white(pair.truth[..., :3], pair.truth[..., 3])[box]
-        avatar = premultiplied_on_white(pair.avatar)[box]
+        box = foreground_bounding_box(foreground_mask(pair.truth[..., 3]))
+        truth = composite_on_white(pair.truth[..., :3], pair.truth[..., 3])[box]
+        avatar = composite_premultiplied_on_white(pair.avatar)[box]
         for caption, pixels in (("truth", truth), ("avatar", avatar), ("error", error_map(avatar, truth))):
             image = image_tag(pixels, f"{title} {number}, {caption}")
             figures.append(f"<figure>{image}<figcaption>{number}, {caption}</figcaption></figure>")

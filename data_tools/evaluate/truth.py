@@ -15,26 +15,26 @@ import numpy as np
 from jaxtyping import UInt8
 
 from data_tools.command import run_command
-from data_tools.folder import whole_folder
+from data_tools.folder import atomic_folder
 from data_tools.synthetic.rig.subject import load_subject
 from data_tools.synthetic.scene.backdrop import Room, floor_points
 from data_tools.synthetic.scene.ball import Ball
-from data_tools.synthetic.scene.capture import Capture
+from data_tools.synthetic.scene.capture import SyntheticCapture
 from data_tools.synthetic.scene.renderer import Light, pose_vertices
 from pipeline.avatar.obj import write_obj
 from pipeline.body.files import load_camera, load_motion
-from pipeline.capture.video import open_source, read_frames
+from pipeline.capture.video import open_frame_source, read_frames
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track
 from pipeline.geometry.mesh import Mesh
 from pipeline.io.image import read_gray, read_rgb, to_float, write_rgb
-from pipeline.metrics.images import body_pixels, mask_iou, psnr_db
+from pipeline.metrics.images import foreground_mask, mask_iou, psnr_db
 
-LEAST_PSNR_DB, LEAST_IOU = 45.0, 0.995
+MIN_PSNR_DB, MIN_IOU = 45.0, 0.995
 
 
 @dataclass(frozen=True)
-class Agreement:
+class GroundTruthCheck:
     """How well the truth explains the video: the worst frame of each figure."""
 
     frames: int
@@ -42,12 +42,12 @@ class Agreement:
     psnr_body_db: float
     mask_iou: float
 
-    def holds(self) -> bool:
+    def passes(self) -> bool:
         """Whether the truth may be trusted."""
-        return min(self.psnr_full_db, self.psnr_body_db) > LEAST_PSNR_DB and self.mask_iou > LEAST_IOU
+        return min(self.psnr_full_db, self.psnr_body_db) > MIN_PSNR_DB and self.mask_iou > MIN_IOU
 
 
-def load_truth(out: Path) -> Capture:
+def load_ground_truth(out: Path) -> SyntheticCapture:
     """The capture that was written to `out`, ready to be rendered again.
 
     Raises:
@@ -57,12 +57,12 @@ def load_truth(out: Path) -> Capture:
     camera = load_camera(truth / "camera.npz")
     try:
         ground_m = np.array(recipe["ground_m"], dtype=np.float64).reshape(3)
-        light = Light(**{**recipe["light"], "key_from": tuple(recipe["light"]["key_from"])})
+        light = Light(**{**recipe["light"], "key_direction": tuple(recipe["light"]["key_direction"])})
         fps, samples = float(recipe["fps"]), int(recipe["samples"])
     except (KeyError, TypeError, ValueError):
-        raise _damaged_recipe(out) from None
+        raise _damaged_recipe_error(out) from None
     subject = load_subject(truth)
-    return Capture(
+    return SyntheticCapture(
         subject=subject,
         motion=load_motion(truth / "motion.npz"),
         camera=camera,
@@ -85,20 +85,20 @@ def read_recipe(out: Path) -> dict[str, Any]:
     except ValueError:
         recipe = None
     if not isinstance(recipe, dict):
-        raise _damaged_recipe(out)
+        raise _damaged_recipe_error(out)
     return recipe
 
 
-def _damaged_recipe(out: Path) -> UserError:
+def _damaged_recipe_error(out: Path) -> UserError:
     return UserError(f"{out / 'truth' / 'recipe.json'} is damaged; remove {out} and make the capture again")
 
 
-def true_mask(out: Path, frame: int) -> UInt8[np.ndarray, "h w"]:
+def load_true_mask(out: Path, frame: int) -> UInt8[np.ndarray, "h w"]:
     """Coverage by the person, 0 to 255, of one frame (by its index in the video)."""
     return read_gray(out / "truth" / "masks" / f"{frame:06d}.png")
 
 
-def check(out: Path, every: int = 1) -> Agreement:
+def verify_ground_truth(out: Path, every: int = 1) -> GroundTruthCheck:
     """Render the stored truth again and compare it with the decoded video and the stored masks.
 
     every: look at each `every`-th frame.
@@ -106,8 +106,8 @@ def check(out: Path, every: int = 1) -> Agreement:
     Raises:
         UserError: a file is missing or damaged, or the video has not as many frames as the truth.
     """
-    capture = load_truth(out)
-    source = open_source(out / "video")
+    capture = load_ground_truth(out)
+    source = open_frame_source(out / "video")
     if source.n_frames != len(capture.motion.frame_index):
         raise UserError(
             f"{source.path} has {source.n_frames} frames, its truth {len(capture.motion.frame_index)}; "
@@ -117,10 +117,10 @@ def check(out: Path, every: int = 1) -> Agreement:
     longer_side_px = max(capture.camera.width, capture.camera.height)
     for frame in read_frames(source, lambda index: index % every == 0, longer_side_px):
         picture, coverage = capture.frame(frame.index)
-        stored = body_pixels(true_mask(out, frame.index))
+        stored = foreground_mask(load_true_mask(out, frame.index))
         full, body = psnr_db(picture, frame.rgb), psnr_db(picture, frame.rgb, stored)
-        scores.append((full, body, mask_iou(body_pixels(coverage), stored)))
-    return Agreement(len(scores), *(float(worst) for worst in np.min(scores, axis=0)))
+        scores.append((full, body, mask_iou(foreground_mask(coverage), stored)))
+    return GroundTruthCheck(len(scores), *(float(worst) for worst in np.min(scores, axis=0)))
 
 
 def write_meshes(out: Path, folder: Path) -> int:
@@ -129,9 +129,9 @@ def write_meshes(out: Path, folder: Path) -> int:
     Raises:
         UserError: there is no truth, or something at `folder`.
     """
-    capture = load_truth(out)
+    capture = load_ground_truth(out)
     subject = capture.subject
-    with whole_folder(folder) as part:
+    with atomic_folder(folder) as part:
         write_rgb(part / "texture.png", subject.texture)
         for index, pose in enumerate(track(capture.canonical_to_world, "meshes")):
             mesh = Mesh(pose_vertices(subject, pose).numpy(), subject.body.faces)
@@ -154,14 +154,14 @@ def _main(argv: Sequence[str]) -> None:
         count = write_meshes(options.out, options.meshes)
         print(f"{count} meshes in {options.meshes}")
         return
-    agreement = check(options.out, options.every)
+    result = verify_ground_truth(options.out, options.every)
     print(
-        f"{agreement.frames} frames, worst: {agreement.psnr_full_db:.1f} dB in all, "
-        f"{agreement.psnr_body_db:.1f} dB on the body, mask IoU {agreement.mask_iou:.4f}"
+        f"{result.frames} frames, worst: {result.psnr_full_db:.1f} dB in all, "
+        f"{result.psnr_body_db:.1f} dB on the body, mask IoU {result.mask_iou:.4f}"
     )
-    if not agreement.holds():
+    if not result.passes():
         raise UserError(
-            f"{options.out} contradicts its truth (wanted {LEAST_PSNR_DB} dB and IoU {LEAST_IOU}); make it again"
+            f"{options.out} contradicts its truth (wanted {MIN_PSNR_DB} dB and IoU {MIN_IOU}); make it again"
         )
 
 

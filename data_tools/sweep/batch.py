@@ -19,14 +19,14 @@ from tqdm import tqdm
 import stages
 from data_tools.command import run_command
 from data_tools.sweep.runs import (
-    SCORES,
+    SCORE_PATHS,
     RunState,
-    check_options,
     cpu_cores,
+    find_video,
     log_path,
     read_run,
     start_run,
-    video_in,
+    validate_run_options,
     write_csv,
 )
 from pipeline.capture.video import VIDEO_SUFFIXES
@@ -62,10 +62,10 @@ def main(argv: Sequence[str]) -> None:
     rows = {name: table_row(name, read_run(options.runs / name)) for name in track(videos, "table")}
     write_table(options.runs, rows.values())
     print(text_table(rows.values()))
-    bad = [name for name, row in rows.items() if row["status"] != "done"]
-    if bad:
+    failed = [name for name, row in rows.items() if row["status"] != "done"]
+    if failed:
         raise UserError(
-            f"{len(bad)} of {len(rows)} videos did not become an avatar ({', '.join(bad)}): "
+            f"{len(failed)} of {len(rows)} videos did not become an avatar ({', '.join(failed)}): "
             f"see {options.runs / 'batch.html'}; the same command tries them again"
         )
 
@@ -87,13 +87,13 @@ def find_videos(folder: Path) -> dict[str, Path]:
         name = default_run_dir(path).name
         if name in videos:
             raise UserError(f"{videos[name].name} and {path.name} in {folder} would share the run {name}: rename one")
-        videos[name] = video_in(path)
+        videos[name] = find_video(path)
     if not videos:
         raise UserError(f"{folder} holds no video and no folder of images: put some into it")
     return videos
 
 
-def last_change_ns(video: Path) -> int:
+def newest_mtime_ns(video: Path) -> int:
     """When a video's content changed last, in nanoseconds since 1970; of a folder, its newest file."""
     files = [video] if video.is_file() else [path for path in video.rglob("*") if path.is_file()]
     return max((path.stat().st_mtime_ns for path in files), default=0)
@@ -101,13 +101,13 @@ def last_change_ns(video: Path) -> int:
 
 def table_row(name: str, run: RunState) -> dict[str, str]:
     """One line of the table: every column as text, empty where there is nothing to tell."""
-    row = {"video": name, "status": run.verdict, **run.states}
+    row = {"video": name, "status": run.status, **run.states}
     for stage in run.states:
         row[f"{stage}_seconds"] = f"{run.seconds([stage]):.1f}" if stage in run.manifests else ""
     row["seconds"] = f"{run.seconds(list(run.states)):.1f}"
-    for column in SCORES:
+    for column in SCORE_PATHS:
         row[column] = f"{run.scores[column]:.3f}" if column in run.scores else ""
-    return row | {"message": "" if run.verdict == "done" else run.failure}
+    return row | {"message": "" if run.status == "done" else run.failure}
 
 
 def text_table(rows: Iterable[Mapping[str, str]]) -> str:
@@ -135,19 +135,19 @@ def write_table(runs: Path, rows: Iterable[Mapping[str, str]]) -> None:
 
 def _run_videos(videos: Mapping[str, Path], options: argparse.Namespace) -> None:
     """`--jobs` at a time, each in a process of its own."""
-    check_options(options.preset or "default", options.set)
+    validate_run_options(options.preset or "default", options.set)
     arguments = ["--preset", options.preset] if options.preset else []
     arguments += [word for assignment in options.set for word in ("--set", assignment)]
     threads = max(1, cpu_cores() // options.jobs) if options.jobs > 1 else None
 
-    def work(name: str) -> str:
+    def run_one_video(name: str) -> str:
         run_dir = options.runs / name
         tqdm.write(f"{name}: started, says what it does in {log_path(run_dir)}", file=sys.stderr)
         start_run(run_dir, ["--video", str(videos[name]), *arguments], threads)
-        return f"{name}: {read_run(run_dir).verdict}"
+        return f"{name}: {read_run(run_dir).status}"
 
     with ThreadPoolExecutor(options.jobs) as pool:
-        futures = [pool.submit(work, name) for name in videos]
+        futures = [pool.submit(run_one_video, name) for name in videos]
         try:
             for future in track(as_completed(futures), "videos", total=len(futures)):
                 tqdm.write(future.result(), file=sys.stderr)
@@ -172,12 +172,12 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
 
 
 def _heading() -> list[str]:
-    return ["video", "status", *stages.STAGES, "seconds", *(name.removesuffix("_db") for name in SCORES)]
+    return ["video", "status", *stages.STAGES, "seconds", *(name.removesuffix("_db") for name in SCORE_PATHS)]
 
 
 def _cells(row: Mapping[str, str]) -> list[str]:
     spent = [row[f"{stage}_seconds"] if row[stage] == FRESH else row[stage].split()[0] for stage in stages.STAGES]
-    return [row["video"], row["status"], *spent, row["seconds"], *(row[score] for score in SCORES)]
+    return [row["video"], row["status"], *spent, row["seconds"], *(row[score] for score in SCORE_PATHS)]
 
 
 def _html_row(row: Mapping[str, str]) -> str:

@@ -20,29 +20,29 @@ from tqdm import tqdm
 from data_tools.command import run_command
 from data_tools.evaluate.truth import read_recipe
 from data_tools.sample import main as make_sample
-from data_tools.sweep.chart_figure import PANELS, Point, draw_chart, pareto_front, preset_means, save_chart
+from data_tools.sweep.chart_figure import PANELS, ChartPoint, draw_chart, pareto_front, preset_means, save_chart
 from data_tools.sweep.chart_trials import (
     FIELD,
     PROGRESS_COLUMNS,
-    UNTIL_AVATAR,
+    STAGES_UNTIL_EXPORT,
     Trial,
+    chart_point,
     compare_with_truth,
-    lacks_comparison,
-    point_of,
+    join_distinct,
+    needs_comparison,
     read_trial,
-    refuse_shared_folders,
+    require_distinct_run_folders,
     run_trial,
     table_row,
-    together,
 )
-from data_tools.sweep.runs import CONFIGS, RunState, check_options, log_path, write_csv
+from data_tools.sweep.runs import CONFIGS, RunState, log_path, validate_run_options, write_csv
 from data_tools.synthetic.scene.capture import RECIPE_VERSION
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track
 
 # The generated people that are taken when no capture is named: where they lie, and the seed that makes them.
-BUILT_IN = {Path("runs/sample-capture"): 0, Path("runs/sample-capture-1"): 1}
-ONLY_FOR_TESTS = "smoke"
+SAMPLE_CAPTURES = {Path("runs/sample-capture"): 0, Path("runs/sample-capture-1"): 1}
+TEST_PRESET = "smoke"
 
 
 def main(argv: Sequence[str]) -> None:
@@ -53,79 +53,82 @@ def main(argv: Sequence[str]) -> None:
             with their truth (the others are drawn all the same).
     """
     options = _parse(argv)
-    steps = _steps_of(options)
+    steps = _parse_steps(options)
     for preset in options.presets:
-        check_options(preset, [f"{FIELD}.steps={steps[preset]}"] if preset in steps else [])
-    captures = options.captures or list(BUILT_IN)
+        validate_run_options(preset, [f"{FIELD}.steps={steps[preset]}"] if preset in steps else [])
+    captures = options.captures or list(SAMPLE_CAPTURES)
     if not options.captures:
-        _make_built_in()
+        _make_sample_captures()
     missing = [str(path) for path in captures if not path.exists()]
     if missing:
         raise UserError(f"{missing[0]} does not exist: give synthetic captures, videos or folders of images")
     combinations = product(options.seeds, captures, options.presets)
     trials = [Trial(capture, preset, seed, options.out, steps.get(preset)) for seed, capture, preset in combinations]
-    refuse_shared_folders(trials)
-    visit = _look_at if options.draw else bring_up_to_date
-    runs = {trial: visit(trial, trials) for trial in track(trials, "runs")}
+    require_distinct_run_folders(trials)
+    process_trial = _read_only if options.draw else run_and_compare
+    runs = {trial: process_trial(trial, trials) for trial in track(trials, "runs")}
     write_results(options.out, runs)
-    _tell_what_lacks(runs, options.out)
+    _raise_if_incomplete(runs, options.out)
     print(f"{len(runs)} runs: {options.out}/chart.svg, chart.png, chart.csv, anytime.csv")
 
 
-def bring_up_to_date(trial: Trial, others: Sequence[Trial]) -> RunState:
+def run_and_compare(trial: Trial, other_trials: Sequence[Trial]) -> RunState:
     """Run and compare what is not done yet. One trial at a time: they are timed, so nothing runs beside them.
 
     others: what came out the same in their folders is copied, with its seconds.
     """
     run = read_trial(trial)
-    if run.verdict != "done":
+    if run.status != "done":
         tqdm.write(f"{trial.run_dir.name}: started, says what it does in {log_path(trial.run_dir)}", file=sys.stderr)
-        run_trial(trial, others)
+        run_trial(trial, other_trials)
         run = read_trial(trial)
-    if run.verdict == "done":
+    if run.status == "done":
         compare_with_truth(trial)
         run = read_trial(trial)
-    said = f"{trial.run_dir.name}: {run.verdict}, {run.seconds(UNTIL_AVATAR):.0f} s"
-    tqdm.write(f"{said}, {run.failure}" if run.verdict == "failed" else said, file=sys.stderr)
+    summary = f"{trial.run_dir.name}: {run.status}, {run.seconds(STAGES_UNTIL_EXPORT):.0f} s"
+    tqdm.write(f"{summary}, {run.failure}" if run.status == "failed" else summary, file=sys.stderr)
     return run
 
 
-def _tell_what_lacks(runs: Mapping[Trial, RunState], out: Path) -> None:
+def _raise_if_incomplete(runs: Mapping[Trial, RunState], out: Path) -> None:
     """UserError that names the runs which are not done, or not compared with their truth."""
-    done = [trial for trial, run in runs.items() if run.verdict == "done"]
-    lacking = {
+    done = [trial for trial, run in runs.items() if run.status == "done"]
+    incomplete = {
         "not done": [trial for trial in runs if trial not in done],
-        "not compared with their truth": [trial for trial in done if lacks_comparison(trial)],
+        "not compared with their truth": [trial for trial in done if needs_comparison(trial)],
     }
-    said = [
+    summary = [
         f"{len(found)} of {len(runs)} runs are {what} ({', '.join(trial.run_dir.name for trial in found)})"
-        for what, found in lacking.items()
+        for what, found in incomplete.items()
         if found
     ]
-    if said:
-        raise UserError(f"{', '.join(said)}: see {out}/chart.csv; the same command tries them again")
+    if summary:
+        raise UserError(f"{', '.join(summary)}: see {out}/chart.csv; the same command tries them again")
 
 
 def write_results(out: Path, runs: Mapping[Trial, RunState]) -> None:
     """Tables of all runs, and the chart of those that are done."""
     out.mkdir(parents=True, exist_ok=True)
-    points = [point_of(trial, run) for trial, run in runs.items() if run.verdict == "done"]
-    rows = [table_row(trial, run) | {"on_front_of": _fronts(trial, points)} for trial, run in runs.items()]
+    points = [chart_point(trial, run) for trial, run in runs.items() if run.status == "done"]
+    rows = [
+        table_row(trial, run) | {"pareto_optimal_in": _pareto_optimal_scores(trial, points)}
+        for trial, run in runs.items()
+    ]
     write_csv(out / "chart.csv", list(rows[0]), [list(row.values()) for row in rows])
     curves = [(point.capture, point.preset, point.seed, *row) for point in points for row in point.curve]
     write_csv(out / "anytime.csv", ("capture", "preset", "seed", *PROGRESS_COLUMNS), curves)
     if any(point.scores for point in points):
-        save_chart(draw_chart(points, origin(rows)), out)
+        save_chart(draw_chart(points, provenance(rows)), out)
 
 
-def origin(rows: Sequence[Mapping[str, Any]]) -> str:
+def provenance(rows: Sequence[Mapping[str, Any]]) -> str:
     """Commit, machine and seeds of the runs that are done."""
     done = [row for row in rows if row["status"] == "done"]
-    commit, machine, seeds = (together(str(row[name]) for row in done) for name in ("commit", "machine", "seed"))
+    commit, machine, seeds = (join_distinct(str(row[name]) for row in done) for name in ("commit", "machine", "seed"))
     return f"commit {commit or 'unknown'}; {machine}; seed {seeds}"
 
 
-def _fronts(trial: Trial, points: Sequence[Point]) -> str:
+def _pareto_optimal_scores(trial: Trial, points: Sequence[ChartPoint]) -> str:
     """The scores on whose Pareto front the trial's preset lies."""
     on = []
     for panel in PANELS:
@@ -136,20 +139,20 @@ def _fronts(trial: Trial, points: Sequence[Point]) -> str:
     return " ".join(on)
 
 
-def _look_at(trial: Trial, others: Sequence[Trial]) -> RunState:
+def _read_only(trial: Trial, other_trials: Sequence[Trial]) -> RunState:
     return read_trial(trial)
 
 
-def _make_built_in() -> None:
+def _make_sample_captures() -> None:
     """The generated people's captures, where they are not there yet. UserError where another version made one."""
-    for path, seed in BUILT_IN.items():
+    for path, seed in SAMPLE_CAPTURES.items():
         if not path.exists():
             make_sample([str(path), "--seed", str(seed)])
         elif read_recipe(path).get("version") != RECIPE_VERSION:
             raise UserError(f"{path} is of another version of the program: remove it, and it is made anew")
 
 
-def _steps_of(options: argparse.Namespace) -> dict[str, int]:
+def _parse_steps(options: argparse.Namespace) -> dict[str, int]:
     """Training steps by preset, of those whose own number is not taken.
 
     Raises:
@@ -168,7 +171,7 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m data_tools.sweep.chart", description=(__doc__ or "").splitlines()[0]
     )
-    presets = sorted(path.stem for path in CONFIGS.glob("*.yaml") if path.stem != ONLY_FOR_TESTS)
+    presets = sorted(path.stem for path in CONFIGS.glob("*.yaml") if path.stem != TEST_PRESET)
     parser.add_argument("captures", nargs="*", type=Path, help="captures, videos or image folders; two people if none")
     parser.add_argument("--presets", nargs="+", default=presets, help="names in configs/ or .yaml files; all if none")
     parser.add_argument("--steps", nargs="+", default=[], help="PRESET=N: so many training steps of its field instead")

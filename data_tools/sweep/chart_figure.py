@@ -12,15 +12,15 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator
 
 PANEL_INCHES = (4.8, 3.6)
-FOOT_INCHES = 1.1
-INK, FAINT = "#222222", "#888888"
+LEGEND_INCHES = 1.1
+TEXT_COLOUR, GRID_COLOUR = "#222222", "#888888"
 FEW_TICKS, MANY_TICKS = (1.0, 3.0), (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
 
 Colour = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
-class Point:
+class ChartPoint:
     """One finished run.
 
     field_seconds, seconds: from the video until the field, and until the exported avatar.
@@ -39,7 +39,9 @@ class Point:
 
 @dataclass(frozen=True)
 class Panel:
-    """What a column shows: the mesh's score, the field's where it has one, and its place in a row of `Point.curve`."""
+    """What a column shows: the mesh's score, the field's where it has one, and its place in a row of
+    `ChartPoint.curve`.
+    """
 
     title: str
     mesh: str
@@ -61,11 +63,11 @@ def pareto_front(entries: Sequence[tuple[float, float]], higher_is_better: bool)
     One beats another when it is at least as quick and at least as good, and not equal in both.
     """
     costs = [(seconds, -score if higher_is_better else score) for seconds, score in entries]
-    beaten = [any(a[0] <= b[0] and a[1] <= b[1] and a != b for a in costs) for b in costs]
-    return sorted((index for index, is_beaten in enumerate(beaten) if not is_beaten), key=costs.__getitem__)
+    is_dominated = [any(a[0] <= b[0] and a[1] <= b[1] and a != b for a in costs) for b in costs]
+    return sorted((index for index, dominated in enumerate(is_dominated) if not dominated), key=costs.__getitem__)
 
 
-def preset_means(points: Iterable[Point], score: str) -> dict[str, tuple[float, float]]:
+def preset_means(points: Iterable[ChartPoint], score: str) -> dict[str, tuple[float, float]]:
     """Mean (seconds, score) over the seeds of each preset; runs without that score are left out."""
     groups: dict[str, list[tuple[float, float]]] = {}
     for point in points:
@@ -75,7 +77,7 @@ def preset_means(points: Iterable[Point], score: str) -> dict[str, tuple[float, 
     return {preset: (float(mean[0]), float(mean[1])) for preset, mean in means.items()}
 
 
-def draw_chart(points: Sequence[Point], origin: str) -> Figure:
+def draw_chart(points: Sequence[ChartPoint], provenance: str) -> Figure:
     """The whole figure; a score that no run has is left out. ValueError when there is no score at all.
 
     origin: a line that says where the figures come from.
@@ -86,7 +88,7 @@ def draw_chart(points: Sequence[Point], origin: str) -> Figure:
     if not panels:
         raise ValueError("a chart needs at least one run with a score")
     colours = {preset: mpl.colormaps["tab10"](number % 10) for number, preset in enumerate(presets)}
-    size = (PANEL_INCHES[0] * len(panels), PANEL_INCHES[1] * len(captures) + FOOT_INCHES)
+    size = (PANEL_INCHES[0] * len(panels), PANEL_INCHES[1] * len(captures) + LEGEND_INCHES)
     figure = Figure(figsize=size, layout="constrained")
     grid = figure.subplots(len(captures), len(panels), squeeze=False)
     for capture, row in zip(captures, grid, strict=True):
@@ -94,12 +96,16 @@ def draw_chart(points: Sequence[Point], origin: str) -> Figure:
         for panel, axes in zip(panels, row, strict=True):
             _draw_runs(axes, panel, chosen, colours)
             _draw_presets(axes, panel, chosen, colours)
-            _dress(axes, f"{capture}: {panel.title}")
+            _style_axes(axes, f"{capture}: {panel.title}")
     keys = [Line2D([], [], color=colour, marker="o", label=preset) for preset, colour in colours.items()]
     figure.legend(
-        handles=[*keys, *_meanings()], loc="outside lower center", ncols=2 * len(panels), frameon=False, fontsize=9
+        handles=[*keys, *_legend_entries()],
+        loc="outside lower center",
+        ncols=2 * len(panels),
+        frameon=False,
+        fontsize=9,
     )
-    figure.suptitle(origin, x=0.01, ha="left", fontsize=8, color=FAINT)
+    figure.suptitle(provenance, x=0.01, ha="left", fontsize=8, color=GRID_COLOUR)
     return figure
 
 
@@ -110,7 +116,7 @@ def save_chart(figure: Figure, folder: Path) -> None:
     figure.savefig(folder / "chart.png", dpi=130)
 
 
-def _draw_runs(axes: Axes, panel: Panel, points: Sequence[Point], colours: dict[str, Colour]) -> None:
+def _draw_runs(axes: Axes, panel: Panel, points: Sequence[ChartPoint], colours: dict[str, Colour]) -> None:
     """Every run: a dot for the mesh, and before it the field, with the way it took to get there."""
     for point in points:
         colour = colours[point.preset]
@@ -123,37 +129,41 @@ def _draw_runs(axes: Axes, panel: Panel, points: Sequence[Point], colours: dict[
             axes.plot(point.field_seconds, point.scores[panel.field], "D", mec=colour, mfc="white", markersize=5)
 
 
-def _draw_presets(axes: Axes, panel: Panel, points: Sequence[Point], colours: dict[str, Colour]) -> None:
+def _draw_presets(axes: Axes, panel: Panel, points: Sequence[ChartPoint], colours: dict[str, Colour]) -> None:
     """Every preset's mean over seeds with its short name, and which of them no other beats."""
     means = preset_means(points, panel.mesh)
     for preset, place in means.items():
         axes.plot(*place, "o", color=colours[preset], markersize=7)
-        axes.annotate(preset.partition(",")[0], place, (7, 4), textcoords="offset points", fontsize=8, color=INK)
+        axes.annotate(
+            preset.partition(",")[0], place, (7, 4), textcoords="offset points", fontsize=8, color=TEXT_COLOUR
+        )
     places = list(means.values())
     front = [places[index] for index in pareto_front(places, panel.higher_is_better)]
     if front:
         seconds, scores = zip(*front, strict=True)
-        axes.step(seconds, scores, where="post", color=INK, linewidth=1, linestyle=":", zorder=1)
-        axes.plot(seconds, scores, "o", color=INK, markersize=12, fillstyle="none", linestyle="none")
+        axes.step(seconds, scores, where="post", color=TEXT_COLOUR, linewidth=1, linestyle=":", zorder=1)
+        axes.plot(seconds, scores, "o", color=TEXT_COLOUR, markersize=12, fillstyle="none", linestyle="none")
 
 
-def _dress(axes: Axes, title: str) -> None:
+def _style_axes(axes: Axes, title: str) -> None:
     axes.set_title(title, fontsize=10, loc="left")
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter(FuncFormatter(lambda seconds, _: f"{seconds:,.12g}"))
     axes.xaxis.set_minor_formatter(FuncFormatter(lambda *_: ""))
-    axes.set_xlabel("seconds", fontsize=9, color=FAINT)
+    axes.set_xlabel("seconds", fontsize=9, color=GRID_COLOUR)
     axes.margins(x=0.15, y=0.12)
     shortest, longest = axes.get_xlim()
     axes.xaxis.set_major_locator(LogLocator(subs=FEW_TICKS if longest > 10.0 * shortest else MANY_TICKS))
-    axes.grid(color=FAINT, alpha=0.25)
+    axes.grid(color=GRID_COLOUR, alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _meanings() -> list[Line2D]:
+def _legend_entries() -> list[Line2D]:
     return [
-        Line2D([], [], color=INK, marker="o", linestyle="none", label="exported mesh, held-out frames"),
-        Line2D([], [], mec=INK, mfc="white", marker="D", linestyle="none", label="field, held-out frames"),
-        Line2D([], [], color=INK, linewidth=1, label="field while it learns, validation frames"),
-        Line2D([], [], color=INK, marker="o", markersize=11, fillstyle="none", linestyle=":", label="Pareto front"),
+        Line2D([], [], color=TEXT_COLOUR, marker="o", linestyle="none", label="exported mesh, held-out frames"),
+        Line2D([], [], mec=TEXT_COLOUR, mfc="white", marker="D", linestyle="none", label="field, held-out frames"),
+        Line2D([], [], color=TEXT_COLOUR, linewidth=1, label="field while it learns, validation frames"),
+        Line2D(
+            [], [], color=TEXT_COLOUR, marker="o", markersize=11, fillstyle="none", linestyle=":", label="Pareto front"
+        ),
     ]

@@ -10,9 +10,18 @@ from pathlib import Path
 from typing import Any
 
 import stages
-from data_tools.folder import whole_folder
-from data_tools.sweep.chart_figure import Point
-from data_tools.sweep.runs import SCORES, RunState, fresh_stages, is_compared, log_path, read_run, start_run, video_in
+from data_tools.folder import atomic_folder
+from data_tools.sweep.chart_figure import ChartPoint
+from data_tools.sweep.runs import (
+    SCORE_PATHS,
+    RunState,
+    find_video,
+    has_current_comparison,
+    log_path,
+    read_run,
+    reusable_stages,
+    start_run,
+)
 from pipeline.core.cli import default_run_dir
 from pipeline.core.errors import UserError
 from pipeline.core.lock import run_lock
@@ -20,9 +29,9 @@ from pipeline.core.progress import warn
 from pipeline.core.record import RunRecord, update_record
 
 FIELD = "field"
-UNTIL_FIELD = ("frames", "body", FIELD)
-BEFORE_FIELD = UNTIL_FIELD[:-1]
-UNTIL_AVATAR = tuple(name for name in stages.STAGES if name != "report")
+STAGES_UNTIL_FIELD = ("frames", "body", FIELD)
+STAGES_BEFORE_FIELD = STAGES_UNTIL_FIELD[:-1]
+STAGES_UNTIL_EXPORT = tuple(name for name in stages.STAGES if name != "report")
 PROGRESS_COLUMNS = ("seconds", "validation_psnr_db", "validation_psnr_body_db")
 
 
@@ -67,15 +76,15 @@ class Trial:
     @property
     def record(self) -> RunRecord:
         """What the run's folder will remember."""
-        record, video = RunRecord(), video_in(self.capture)
+        record, video = RunRecord(), find_video(self.capture)
         return update_record(record, self.run_dir, video, self.preset, self.assignments, replace_video=False)
 
 
-def refuse_shared_folders(trials: Iterable[Trial]) -> None:
+def require_distinct_run_folders(trials: Iterable[Trial]) -> None:
     """UserError when two trials would have one run: the second would show the figures of the first."""
-    owners: dict[Path, Trial] = {}
+    trial_of_folder: dict[Path, Trial] = {}
     for trial in trials:
-        other = owners.setdefault(trial.run_dir, trial)
+        other = trial_of_folder.setdefault(trial.run_dir, trial)
         if other != trial:
             raise UserError(
                 f"{other.preset} on {other.capture} and {trial.preset} on {trial.capture} would share the run "
@@ -88,42 +97,42 @@ def read_trial(trial: Trial) -> RunState:
     return read_run(trial.run_dir, trial.record)
 
 
-def run_trial(trial: Trial, others: Iterable[Trial] = ()) -> None:
+def run_trial(trial: Trial, other_trials: Iterable[Trial] = ()) -> None:
     """Run what is not fresh; a stage that was cut starts from its beginning.
 
-    Gone on with from its checkpoint, it would tell only the seconds after the cut. others: see `share_stages`.
+    Gone on with from its checkpoint, it would tell only the seconds after the cut. others: see `copy_shared_stages`.
     """
     if trial.run_dir.is_dir():
         with run_lock(trial.run_dir):
             for part in trial.run_dir.glob("*.part"):
                 shutil.rmtree(part)
-    share_stages(trial, others)
+    copy_shared_stages(trial, other_trials)
     chosen = [word for assignment in trial.assignments for word in ("--set", assignment)]
-    start_run(trial.run_dir, ["--video", str(video_in(trial.capture)), "--preset", trial.preset, *chosen])
+    start_run(trial.run_dir, ["--video", str(find_video(trial.capture)), "--preset", trial.preset, *chosen])
 
 
-def share_stages(trial: Trial, others: Iterable[Trial]) -> None:
+def copy_shared_stages(trial: Trial, other_trials: Iterable[Trial]) -> None:
     """Copy what would come out the same here from runs of the same capture, stage after stage until one differs.
 
     The copies keep their manifests: their seconds, machine and commit count here as there.
     """
-    for other in others:
+    for other in other_trials:
         if other.capture != trial.capture or other.run_dir == trial.run_dir:
             continue
-        for name in fresh_stages(other.run_dir, trial.record):
+        for name in reusable_stages(other.run_dir, trial.record):
             if not (trial.run_dir / name).exists():
-                with whole_folder(trial.run_dir / name) as part:
+                with atomic_folder(trial.run_dir / name) as part:
                     shutil.copytree(other.run_dir / name, part, dirs_exist_ok=True)
 
 
-def lacks_comparison(trial: Trial) -> bool:
+def needs_comparison(trial: Trial) -> bool:
     """Whether the capture has a truth that the trial's report was not compared with, or not wholly, or otherwise."""
-    return (trial.capture / "truth").is_dir() and not is_compared(trial.run_dir / "report")
+    return (trial.capture / "truth").is_dir() and not has_current_comparison(trial.run_dir / "report")
 
 
 def compare_with_truth(trial: Trial) -> None:
     """Write `report/truth.json` where it lacks; a warning where that fails."""
-    if not lacks_comparison(trial):
+    if not needs_comparison(trial):
         return
     command = [sys.executable, "-m", "data_tools.evaluate.compare", str(trial.capture), str(trial.run_dir)]
     with log_path(trial.run_dir).open("a", encoding="utf-8") as log:
@@ -132,12 +141,12 @@ def compare_with_truth(trial: Trial) -> None:
         warn(f"{trial.run_dir.name} could not be compared with its truth: see {log_path(trial.run_dir)}")
 
 
-def point_of(trial: Trial, run: RunState) -> Point:
+def chart_point(trial: Trial, run: RunState) -> ChartPoint:
     """What the figure needs of a finished run."""
-    before = run.seconds(BEFORE_FIELD)
+    before = run.seconds(STAGES_BEFORE_FIELD)
     curve = [(before + seconds, full, body) for seconds, full, body in read_progress(trial.run_dir / "field")]
-    seconds = (run.seconds(UNTIL_FIELD), run.seconds(UNTIL_AVATAR))
-    return Point(trial.capture_name, trial.label, trial.seed, *seconds, run.scores, curve)
+    seconds = (run.seconds(STAGES_UNTIL_FIELD), run.seconds(STAGES_UNTIL_EXPORT))
+    return ChartPoint(trial.capture_name, trial.label, trial.seed, *seconds, run.scores, curve)
 
 
 def read_progress(field: Path) -> list[tuple[float, float, float]]:
@@ -170,19 +179,19 @@ def table_row(trial: Trial, run: RunState) -> dict[str, Any]:
         "preset": trial.preset_name,
         "seed": trial.seed,
         "steps": run.manifests[FIELD].metrics.get("steps") if FIELD in run.manifests else None,
-        "status": run.verdict,
-        "field_seconds": round(run.seconds(UNTIL_FIELD), 3),
-        "seconds": round(run.seconds(UNTIL_AVATAR), 3),
-        **{score: run.scores.get(score) for score in SCORES},
+        "status": run.status,
+        "field_seconds": round(run.seconds(STAGES_UNTIL_FIELD), 3),
+        "seconds": round(run.seconds(STAGES_UNTIL_EXPORT), 3),
+        **{score: run.scores.get(score) for score in SCORE_PATHS},
         "peak_rss_mib": max((manifest.peak_rss_mib for manifest in run.manifests.values()), default=None),
         "resumed": " ".join(name for name, manifest in run.manifests.items() if manifest.resumed),
-        "commit": together(environment.get("commit") for environment in environments),
-        "machine": together(map(_machine, environments)),
-        "message": "" if run.verdict == "done" else run.failure,
+        "commit": join_distinct(environment.get("commit") for environment in environments),
+        "machine": join_distinct(map(_machine, environments)),
+        "message": "" if run.status == "done" else run.failure,
     }
 
 
-def together(texts: Iterable[str | None]) -> str:
+def join_distinct(texts: Iterable[str | None]) -> str:
     """The different ones among texts, in their order."""
     return "; ".join(dict.fromkeys(text for text in texts if text))
 

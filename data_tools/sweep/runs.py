@@ -16,18 +16,18 @@ from data_tools.evaluate.files import TRUTH_FILES, TRUTH_VERSION
 from pipeline.core.atomic import atomic_path
 from pipeline.core.config import Config, parse_overrides
 from pipeline.core.errors import UserError
-from pipeline.core.lock import bound_environment
+from pipeline.core.lock import die_with_parent_environment
 from pipeline.core.manifest import Manifest, digest_file, read_manifest
 from pipeline.core.record import RunRecord, read_record
 from pipeline.core.runner import FRESH, build_configs, stage_states
 from pipeline.core.stage import Stage
 
 CONFIGS = Path(stages.__file__).resolve().parents[1] / "configs"
-ERROR = "error: "
-CRASH = "Traceback (most recent call last):"
+ERROR_PREFIX = "error: "
+TRACEBACK_HEADER = "Traceback (most recent call last):"
 
 # Column of a table, the document below report/, and where the figure stands in it.
-SCORES = {
+SCORE_PATHS = {
     "field_psnr_full_db": ("report.json", "heldout", "field", "psnr_full"),
     "field_psnr_body_db": ("report.json", "heldout", "field", "psnr_body"),
     "mesh_psnr_full_db": ("report.json", "heldout", "mesh", "psnr_full"),
@@ -42,7 +42,7 @@ class RunState:
 
     states: of every stage in order, the words of `python -m stages --status`.
     manifests: of the fresh stages.
-    scores: the `SCORES` that a fresh report holds.
+    scores: the `SCORE_PATHS` that a fresh report holds.
     failure: the sentence with which the last command ended badly; empty when it did not.
     """
 
@@ -52,7 +52,7 @@ class RunState:
     failure: str
 
     @property
-    def verdict(self) -> str:
+    def status(self) -> str:
         """done, failed, or unfinished."""
         if all(state == FRESH for state in self.states.values()):
             return "done"
@@ -71,7 +71,7 @@ def read_run(run_dir: Path, record: RunRecord | None = None) -> RunState:
     Args:
         record: what the run should be of: what was made otherwise is not fresh. The folder's own when None.
     """
-    failure = last_failure(log_path(run_dir))
+    failure = last_error_message(log_path(run_dir))
     try:
         states = _states(run_dir, record)
     except UserError as error:
@@ -82,18 +82,18 @@ def read_run(run_dir: Path, record: RunRecord | None = None) -> RunState:
     return RunState(states, manifests, read_scores(run_dir / "report") if is_done else {}, failure)
 
 
-def fresh_stages(run_dir: Path, record: RunRecord) -> list[str]:
+def reusable_stages(run_dir: Path, record: RunRecord) -> list[str]:
     """The first stages of a folder, in order, that a run with this record would take over as they are."""
     states = stage_states(_load_stages(), _configs(record), run_dir, record)
     return list(takewhile(lambda name: states[name] == FRESH, states))
 
 
-def video_in(path: Path) -> Path:
+def find_video(path: Path) -> Path:
     """The video of a synthetic capture, which lies beside its truth; any other path is one itself."""
     return path / "video" if (path / "video").is_dir() else path
 
 
-def check_options(preset: str, assignments: Sequence[str]) -> None:
+def validate_run_options(preset: str, assignments: Sequence[str]) -> None:
     """Refuse an unknown preset or option with one UserError, before any run starts."""
     _configs(RunRecord(preset=preset, overrides=parse_overrides(assignments)))
 
@@ -108,7 +108,9 @@ def start_run(run_dir: Path, arguments: Sequence[str], threads: int | None = Non
     limits = {name: str(threads) for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS") if threads is not None}
     command = [sys.executable, "-m", "stages", "--run", str(run_dir), *arguments]
     with log_path(run_dir).open("w", encoding="utf-8") as log:
-        subprocess.run(command, env=limits | bound_environment(), stdout=log, stderr=subprocess.STDOUT, check=False)
+        subprocess.run(
+            command, env=limits | die_with_parent_environment(), stdout=log, stderr=subprocess.STDOUT, check=False
+        )
 
 
 def log_path(run_dir: Path) -> Path:
@@ -116,20 +118,20 @@ def log_path(run_dir: Path) -> Path:
     return run_dir.with_name(f"{run_dir.name}.log")
 
 
-def last_failure(log: Path) -> str:
+def last_error_message(log: Path) -> str:
     """The sentence after `error:`, or the last line of a traceback; empty where the log tells of no failure."""
     lines = log.read_text(encoding="utf-8", errors="replace").splitlines() if log.is_file() else []
-    said = [line.removeprefix(ERROR) for line in lines if line.startswith(ERROR)]
-    if said:
-        return said[-1]
-    return lines[-1] if CRASH in lines else ""
+    error_lines = [line.removeprefix(ERROR_PREFIX) for line in lines if line.startswith(ERROR_PREFIX)]
+    if error_lines:
+        return error_lines[-1]
+    return lines[-1] if TRACEBACK_HEADER in lines else ""
 
 
 def read_scores(report: Path) -> dict[str, float]:
-    """The `SCORES` that stand in a report's folder; what is absent or null is left out."""
-    documents = {name: _read_json(report / name) for name, *_ in SCORES.values()}
+    """The `SCORE_PATHS` that stand in a report's folder; what is absent or null is left out."""
+    documents = {name: _read_json(report / name) for name, *_ in SCORE_PATHS.values()}
     scores = {}
-    for column, (name, *keys) in SCORES.items():
+    for column, (name, *keys) in SCORE_PATHS.items():
         value: Any = documents[name]
         for key in keys:
             value = value.get(key) if isinstance(value, dict) else None
@@ -138,7 +140,7 @@ def read_scores(report: Path) -> dict[str, float]:
     return scores
 
 
-def is_compared(report: Path) -> bool:
+def has_current_comparison(report: Path) -> bool:
     """Whether a report holds a comparison with the truth of this version, whole: one that was cut short is none."""
     manifest = read_manifest(report)
     known = manifest.outputs if manifest else {}

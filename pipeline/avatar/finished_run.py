@@ -20,7 +20,7 @@ from pipeline.geometry.camera import Camera
 from pipeline.io.image import read_rgb, to_float
 from pipeline.io.npz import load_npz
 
-Draw = Callable[[Float[Tensor, "j 4 4"]], Float[np.ndarray, "h w 4"]]
+PoseRenderer = Callable[[Float[Tensor, "j 4 4"]], Float[np.ndarray, "h w 4"]]
 """Draws one pose, given as skinning matrices: premultiplied colours and alpha in [0, 1]."""
 
 
@@ -37,7 +37,7 @@ class FinishedRun:
     body: Body
     motion: Motion
     avatar: TexturedAvatar
-    draw_field: Draw
+    field_renderer: PoseRenderer
     refined: Float[Tensor, "n j 4 4"]
     fitted: Float[Tensor, "n j 4 4"]
 
@@ -53,7 +53,7 @@ def load_finished_run(inputs: Mapping[str, Path]) -> FinishedRun:
         body=body,
         motion=motion,
         avatar=load_textured_avatar(inputs["mesh"], inputs["texture"]),
-        draw_field=_field_drawer(inputs["field"], body, camera),
+        field_renderer=_make_field_renderer(inputs["field"], body, camera),
         refined=canonical_to_world(body, motion),
         fitted=canonical_to_world(body, load_motion(inputs["body"] / "motion.npz")),
     )
@@ -73,12 +73,12 @@ def load_textured_avatar(mesh_dir: Path, texture_dir: Path) -> TexturedAvatar:
     )
 
 
-def _field_drawer(field_dir: Path, body: Body, camera: Camera) -> Draw:
+def _make_field_renderer(field_dir: Path, body: Body, camera: Camera) -> PoseRenderer:
     field = load_field(field_dir / "field.safetensors")
     occupancy = load_occupancy(field_dir / "occupancy.npz")
     skin = build_skin_grid(body, skin_margin_m(body, occupancy.bounds_m.numpy()))
 
-    def draw(canonical_to_world: Float[Tensor, "j 4 4"]) -> Float[np.ndarray, "h w 4"]:
+    def render_pose(canonical_to_world: Float[Tensor, "j 4 4"]) -> Float[np.ndarray, "h w 4"]:
         return render_field(field, occupancy, body, canonical_to_world, camera, skin).numpy()
 
-    return draw
+    return render_pose

@@ -20,12 +20,12 @@ from pipeline.geometry.camera import Camera
 from pipeline.geometry.rotation import continuous_quaternions, matrix_to_quaternion
 
 _FLOAT, _U8, _U16, _U32 = 5126, 5121, 5123, 5125
-_VERTICES, _INDICES = 34962, 34963
-_TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
-_COMPONENTS = {"float32": _FLOAT, "uint8": _U8, "uint16": _U16, "uint32": _U32}
-_STILL_RAD = 1e-4
-_LEAST_LENGTH = 1e-12
-_MOST_JOINTS = 1 << 16
+_ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
+_ACCESSOR_TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
+_COMPONENT_TYPES = {"float32": _FLOAT, "uint8": _U8, "uint16": _U16, "uint32": _U32}
+_MIN_ANIMATED_ANGLE_RAD = 1e-4
+_MIN_NORM = 1e-12
+_MAX_JOINTS = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -44,10 +44,11 @@ class SkinnedMesh:
 
 
 @dataclass(frozen=True)
-class Maps:
+class MaterialMaps:
     """PNG files' bytes and what else describes the surface.
 
-    diffuse_png: RGB, sRGB. specular_png: what `specular_texture` makes, or None for a matte surface. unlit: the diffuse
+    diffuse_png: RGB, sRGB. specular_png: what `pack_specular_factor` makes, or None for a matte surface. unlit: the
+    diffuse
     map is shown as it is, whatever lamps a scene has; there are no highlights then.
     """
 
@@ -58,7 +59,7 @@ class Maps:
 
 
 @dataclass
-class _Document:
+class _GlbBuilder:
     """The JSON part and the binary part while they grow."""
 
     json: dict[str, Any] = field(default_factory=dict)
@@ -79,9 +80,9 @@ class _Document:
         values = np.ascontiguousarray(values)
         accessor: dict[str, Any] = {
             "bufferView": self.add_bytes(values.tobytes(), target),
-            "componentType": _COMPONENTS[values.dtype.name],
+            "componentType": _COMPONENT_TYPES[values.dtype.name],
             "count": len(values),
-            "type": _TYPES[values[0].size],
+            "type": _ACCESSOR_TYPES[values[0].size],
         }
         if bounds:
             rows = values.reshape(len(values), -1)
@@ -101,7 +102,7 @@ def encode_glb(
     mesh: SkinnedMesh,
     body: Body,
     motion: Motion,
-    maps: Maps,
+    maps: MaterialMaps,
     camera: Camera | None = None,
     extras: Mapping[str, Any] | None = None,
 ) -> bytes:
@@ -114,10 +115,10 @@ def encode_glb(
     Raises ValueError when there are more than 65536 joints (indices have 16 bits), no frame, times that do not
     increase, a pose that is not finite, or a quaternion without length.
     """
-    if len(body.joint_names) > _MOST_JOINTS:
-        raise ValueError(f"glTF counts joints in 16 bits: {len(body.joint_names)} are more than {_MOST_JOINTS}")
+    if len(body.joint_names) > _MAX_JOINTS:
+        raise ValueError(f"glTF counts joints in 16 bits: {len(body.joint_names)} are more than {_MAX_JOINTS}")
     _check_motion(motion)
-    document = _Document()
+    document = _GlbBuilder()
     document.json["asset"] = {"version": "2.0", "generator": "instant-human-mesh"}
     if extras:
         document.json["asset"]["extras"] = dict(extras)
@@ -134,7 +135,7 @@ def encode_glb(
     return document.pack()
 
 
-def specular_texture(factor: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 4"]:
+def pack_specular_factor(factor: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 4"]:
     """A picture with the specular factor where KHR_materials_specular reads it: linear, in alpha; the rest is white.
 
     factor: 255 reflects as any dielectric does (4 % seen along the normal), 0 not at all.
@@ -163,8 +164,8 @@ def read_accessor(document: Mapping[str, Any], binary: bytes, index: int) -> np.
     """The values of an accessor as `encode_glb` writes them, one element a row."""
     accessor = document["accessors"][index]
     view = document["bufferViews"][accessor["bufferView"]]
-    name = next(name for name, code in _COMPONENTS.items() if code == accessor["componentType"])
-    width = next(width for width, kind in _TYPES.items() if kind == accessor["type"])
+    name = next(name for name, code in _COMPONENT_TYPES.items() if code == accessor["componentType"])
+    width = next(width for width, kind in _ACCESSOR_TYPES.items() if kind == accessor["type"])
     start = view["byteOffset"]
     values = np.frombuffer(binary[start : start + view["byteLength"]], dtype=name)
     return values.reshape(accessor["count"], width) if width > 1 else values
@@ -177,26 +178,26 @@ def _check_motion(motion: Motion) -> None:
         raise ValueError("an animation needs frames whose times increase")
     if not all(np.isfinite(values).all() for values in (times, motion.rotations_wxyz, motion.root_translation_m)):
         raise ValueError("an animation needs times, rotations and translations that are finite")
-    if np.linalg.norm(motion.rotations_wxyz, axis=-1).min() < _LEAST_LENGTH:
+    if np.linalg.norm(motion.rotations_wxyz, axis=-1).min() < _MIN_NORM:
         raise ValueError("an animation needs quaternions with a length")
 
 
-def _add_primitive(document: _Document, mesh: SkinnedMesh, joint_count: int) -> dict[str, Any]:
+def _add_primitive(document: _GlbBuilder, mesh: SkinnedMesh, joint_count: int) -> dict[str, Any]:
     joints = mesh.joint_indices.astype(np.uint8 if joint_count <= 256 else np.uint16)
     uv = np.stack([mesh.uv[:, 0], 1.0 - mesh.uv[:, 1]], axis=1).astype(np.float32)
     # 65535 restarts a strip in the 16-bit type and may not be used
     faces = mesh.faces.astype(np.uint16 if len(mesh.positions_m) < 65535 else np.uint32)
     attributes = {
-        "POSITION": document.add_array(mesh.positions_m.astype(np.float32), _VERTICES, bounds=True),
-        "NORMAL": document.add_array(_unit_normals(mesh.normals), _VERTICES),
-        "TEXCOORD_0": document.add_array(uv, _VERTICES),
-        "JOINTS_0": document.add_array(joints, _VERTICES),
-        "WEIGHTS_0": document.add_array(_summing_to_one(mesh.joint_weights), _VERTICES),
+        "POSITION": document.add_array(mesh.positions_m.astype(np.float32), _ARRAY_BUFFER, bounds=True),
+        "NORMAL": document.add_array(_unit_normals(mesh.normals), _ARRAY_BUFFER),
+        "TEXCOORD_0": document.add_array(uv, _ARRAY_BUFFER),
+        "JOINTS_0": document.add_array(joints, _ARRAY_BUFFER),
+        "WEIGHTS_0": document.add_array(_normalise_weights(mesh.joint_weights), _ARRAY_BUFFER),
     }
-    return {"attributes": attributes, "indices": document.add_array(faces.reshape(-1), _INDICES)}
+    return {"attributes": attributes, "indices": document.add_array(faces.reshape(-1), _ELEMENT_ARRAY_BUFFER)}
 
 
-def _add_material(document: _Document, maps: Maps) -> int:
+def _add_material(document: _GlbBuilder, maps: MaterialMaps) -> int:
     document.add("samplers", {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071})
     surface = {
         "name": "avatar",
@@ -216,13 +217,13 @@ def _add_material(document: _Document, maps: Maps) -> int:
     return document.add("materials", surface | {"extensions": extensions})
 
 
-def _add_texture(document: _Document, name: str, png: bytes) -> int:
+def _add_texture(document: _GlbBuilder, name: str, png: bytes) -> int:
     view = document.add_bytes(png)
     image = document.add("images", {"name": name, "mimeType": "image/png", "bufferView": view})
     return document.add("textures", {"name": name, "source": image, "sampler": 0})
 
 
-def _add_skeleton(document: _Document, body: Body, first_joint: int) -> None:
+def _add_skeleton(document: _GlbBuilder, body: Body, first_joint: int) -> None:
     """Joints without rotation or scale: their rest is the bind pose, and the inverse bind matrix is a translation."""
     children: list[list[int]] = [[] for _ in body.joint_names]
     for joint, parent in enumerate(body.parents):
@@ -230,7 +231,7 @@ def _add_skeleton(document: _Document, body: Body, first_joint: int) -> None:
             children[parent].append(first_joint + joint)
     for joint, (name, parent) in enumerate(zip(body.joint_names, body.parents, strict=True)):
         origin = body.joints_m[parent] if parent >= 0 else np.zeros(3)
-        node: dict[str, Any] = {"name": name, "translation": _numbers(body.joints_m[joint] - origin)}
+        node: dict[str, Any] = {"name": name, "translation": _float_list(body.joints_m[joint] - origin)}
         document.add("nodes", node | ({"children": children[joint]} if children[joint] else {}))
     inverse_bind = np.tile(np.eye(4, dtype=np.float32), (len(body.joints_m), 1, 1))
     inverse_bind[:, 3, :3] = -body.joints_m  # stored by columns: the translation is the last four numbers
@@ -245,7 +246,7 @@ def _add_skeleton(document: _Document, body: Body, first_joint: int) -> None:
     )
 
 
-def _add_animation(document: _Document, motion: Motion, first_joint: int) -> None:
+def _add_animation(document: _GlbBuilder, motion: Motion, first_joint: int) -> None:
     times = document.add_array(motion.time_s.astype(np.float32), bounds=True)
     samplers: list[dict[str, Any]] = []
     channels: list[dict[str, Any]] = []
@@ -259,12 +260,12 @@ def _add_animation(document: _Document, motion: Motion, first_joint: int) -> Non
     for joint in range(continuous.shape[1]):
         rotations = continuous[:, joint] / np.linalg.norm(continuous[:, joint], axis=1, keepdims=True)
         angle = 2.0 * np.arctan2(np.linalg.norm(rotations[:, 1:], axis=1), np.abs(rotations[:, 0]))
-        if angle.max() > _STILL_RAD:
+        if angle.max() > _MIN_ANIMATED_ANGLE_RAD:
             add_channel(first_joint + joint, "rotation", rotations[:, [1, 2, 3, 0]].astype(np.float32))
     document.add("animations", {"name": "capture", "samplers": samplers, "channels": channels})
 
 
-def _add_camera(document: _Document, camera: Camera) -> int:
+def _add_camera(document: _GlbBuilder, camera: Camera) -> int:
     """The camera as a node; what glTF's symmetric pinhole cannot say (principal point, fx) stays in its extras."""
     axes = np.diag([1.0, -1.0, -1.0])
     rotation = torch.from_numpy(camera.world_to_camera[:3, :3].T.astype(np.float64) @ axes)
@@ -282,8 +283,8 @@ def _add_camera(document: _Document, camera: Camera) -> int:
     node = {
         "name": "capture_camera",
         "camera": index,
-        "translation": _numbers(camera.centre_m()),
-        "rotation": _numbers(wxyz.numpy()[[1, 2, 3, 0]]),
+        "translation": _float_list(camera.centre_m()),
+        "rotation": _float_list(wxyz.numpy()[[1, 2, 3, 0]]),
         "extras": extras,
     }
     return document.add("nodes", node)
@@ -294,10 +295,10 @@ def _unit_normals(normals: np.ndarray) -> np.ndarray:
     normals = normals.astype(np.float64)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     upright = np.array([0.0, 1.0, 0.0])
-    return np.where(length > _LEAST_LENGTH, normals / np.maximum(length, _LEAST_LENGTH), upright).astype(np.float32)
+    return np.where(length > _MIN_NORM, normals / np.maximum(length, _MIN_NORM), upright).astype(np.float32)
 
 
-def _summing_to_one(weights: np.ndarray) -> np.ndarray:
+def _normalise_weights(weights: np.ndarray) -> np.ndarray:
     """Weights whose float32 sum is 1 to the last bit but one: the rounding goes to the largest."""
     weights = (weights.astype(np.float64) / weights.sum(axis=1, keepdims=True, dtype=np.float64)).astype(np.float32)
     rows, largest = np.arange(len(weights)), weights.argmax(axis=1)
@@ -305,5 +306,5 @@ def _summing_to_one(weights: np.ndarray) -> np.ndarray:
     return weights
 
 
-def _numbers(values: np.ndarray) -> list[float]:
+def _float_list(values: np.ndarray) -> list[float]:
     return [float(value) for value in np.asarray(values, dtype=np.float32)]

@@ -25,26 +25,26 @@ def write_obj(
     """
     corners = np.stack([mesh.faces, faces_uv, mesh.faces], axis=2).reshape(len(mesh.faces), 9) + 1
     lines = [f"mtllib {path.with_suffix('.mtl').name}", f"o {MATERIAL}"]
-    lines += _rows("v %.6f %.6f %.6f", mesh.vertices)
-    lines += _rows("vt %.6f %.6f", uv)
-    lines += _rows("vn %.4f %.4f %.4f", normals)
+    lines += _format_rows("v %.6f %.6f %.6f", mesh.vertices)
+    lines += _format_rows("vt %.6f %.6f", uv)
+    lines += _format_rows("vn %.4f %.4f %.4f", normals)
     lines += [f"usemtl {MATERIAL}", "s 1"]
-    lines += _rows("f %d/%d/%d %d/%d/%d %d/%d/%d", corners)
+    lines += _format_rows("f %d/%d/%d %d/%d/%d %d/%d/%d", corners)
     path.write_text("\n".join(lines) + "\n", encoding="ascii")
-    path.with_suffix(".mtl").write_text(_material(diffuse_name, specular_name), encoding="ascii")
+    path.with_suffix(".mtl").write_text(_mtl_text(diffuse_name, specular_name), encoding="ascii")
 
 
-def _rows(form: str, values: np.ndarray) -> list[str]:
-    return [form % tuple(row) for row in values.tolist()]
+def _format_rows(row_format: str, values: np.ndarray) -> list[str]:
+    return [row_format % tuple(row) for row in values.tolist()]
 
 
-def _material(diffuse_name: str, specular_name: str | None) -> str:
-    shine = "1" if specular_name else "0"
+def _mtl_text(diffuse_name: str, specular_name: str | None) -> str:
+    ks = "1" if specular_name else "0"
     lines = [
         f"newmtl {MATERIAL}",
         "Ka 0 0 0",
         "Kd 1 1 1",
-        f"Ks {shine} {shine} {shine}",
+        f"Ks {ks} {ks} {ks}",
         "Ns 20",
         "d 1",
         "illum 2",

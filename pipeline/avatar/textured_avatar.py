@@ -37,35 +37,41 @@ class TexturedAvatar:
         weights = dense_weights(self.joint_indices, self.joint_weights, len(canonical_to_world))
         return linear_blend_skinning(self.vertices, weights, canonical_to_world[None])[0]
 
-    def render(self, vertices_world: Float[Tensor, "v 3"], camera: Camera, samples: int) -> Float[np.ndarray, "h w 4"]:
+    def render(
+        self, vertices_world: Float[Tensor, "v 3"], camera: Camera, supersampling: int
+    ) -> Float[np.ndarray, "h w 4"]:
         """Premultiplied texture colours and coverage in [0, 1], unlit; see `render_textured`."""
-        image = render_textured(vertices_world, self.faces, self.faces_uv, self.uv, self.diffuse, camera, samples)
+        image = render_textured(vertices_world, self.faces, self.faces_uv, self.uv, self.diffuse, camera, supersampling)
         return image.numpy()
 
     def turntable(
-        self, vertices_world: Float[Tensor, "v 3"], views: int, height_px: int, samples: int
+        self, vertices_world: Float[Tensor, "v 3"], views: int, height_px: int, supersampling: int
     ) -> list[UInt8[np.ndarray, "_ _ 4"]]:
         """Pictures from evenly spread sides, the first from +Z: straight alpha, cropped left and right to the body.
 
         All have one height and one scale; widths differ.
         """
-        lowest, highest = vertices_world.numpy().min(axis=0), vertices_world.numpy().max(axis=0)
-        across = math.hypot(highest[0] - lowest[0], highest[2] - lowest[2]) / (highest[1] - lowest[1])
+        box_min_m, box_max_m = vertices_world.numpy().min(axis=0), vertices_world.numpy().max(axis=0)
+        width_to_height = math.hypot(box_max_m[0] - box_min_m[0], box_max_m[2] - box_min_m[2]) / (
+            box_max_m[1] - box_min_m[1]
+        )
         pictures = []
         for number in range(views):
             angle = 2.0 * math.pi * number / views
-            camera = turntable_camera(lowest, highest, angle, math.ceil(height_px * across), height_px)
-            pictures.append(_cropped_columns(straight_rgba(self.render(vertices_world, camera, samples))))
+            camera = turntable_camera(box_min_m, box_max_m, angle, math.ceil(height_px * width_to_height), height_px)
+            pictures.append(
+                _crop_empty_columns(unpremultiply_to_uint8(self.render(vertices_world, camera, supersampling)))
+            )
         return pictures
 
 
-def straight_rgba(premultiplied: Float[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w 4"]:
+def unpremultiply_to_uint8(premultiplied: Float[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w 4"]:
     """8-bit picture with straight alpha from premultiplied colours in [0, 1]; black where nothing is covered."""
     alpha = premultiplied[..., 3:]
     colour = premultiplied[..., :3] / np.maximum(alpha, 1e-6)
     return np.rint(255.0 * np.clip(np.concatenate([colour, alpha], axis=2), 0.0, 1.0)).astype(np.uint8)
 
 
-def _cropped_columns(picture: UInt8[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w2 4"]:
+def _crop_empty_columns(picture: UInt8[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w2 4"]:
     columns = np.flatnonzero(picture[..., 3].any(axis=0))
     return picture[:, columns[0] : columns[-1] + 1] if len(columns) else picture

@@ -4,19 +4,20 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from pipeline.geometry.differentiable_raster import face_adjacency, render_mesh, render_shaded
+from pipeline.geometry.differentiable_raster import face_adjacency, render_attributes, render_shaded
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.texture_rendering import turntable_camera
-from pipeline.mesh.views import Shade
+from pipeline.mesh.views import Shader
 
-LIGHT_FROM_CAMERA = np.array([-0.35, 0.45, 0.82])
+LIGHT_DIRECTION_CAMERA = np.array([-0.35, 0.45, 0.82])
 
 
 @torch.no_grad()
 def turntable_sheet(
-    mesh: Mesh, shade: Shade, views: int = 6, height_px: int = 640, width_px: int = 360
+    mesh: Mesh, shader: Shader, views: int = 6, height_px: int = 640, width_px: int = 360
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Two rows of ``views`` pictures on white, starting from the front and going round: ``shade``'s colours, then a lit
+    """Two rows of ``views`` pictures on white, starting from the front and going round: ``shader``'s colours, then a
+    lit
     grey surface that shows every bump.
     """
     vertices, faces = torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces.astype(np.int64))
@@ -24,19 +25,21 @@ def turntable_sheet(
     rows: tuple[list[torch.Tensor], list[torch.Tensor]] = ([], [])
     for angle in np.arange(views) * (2.0 * np.pi / views):
         camera = turntable_camera(mesh.vertices.min(axis=0), mesh.vertices.max(axis=0), angle, width_px, height_px)
-        image, alpha, _ = render_shaded(vertices, faces, camera, vertices, shade, adjacency)
+        image, alpha, _ = render_shaded(vertices, faces, camera, vertices, shader, adjacency)
         rows[0].append(image + 1.0 - alpha[..., None])
-        grey = _lit(normals, camera.world_to_camera[:3, :3])
-        image, alpha = render_mesh(vertices, faces, camera, grey, adjacency)
+        grey = _lambert_shading(normals, camera.world_to_camera[:3, :3])
+        image, alpha = render_attributes(vertices, faces, camera, grey, adjacency)
         rows[1].append((image + 1.0 - alpha[..., None]).expand(-1, -1, 3))
     sheet = torch.cat([torch.cat(row, dim=1) for row in rows], dim=0)
     return (255.0 * sheet.clamp(0.0, 1.0)).round().to(torch.uint8).numpy()
 
 
-def _lit(normals: Float[np.ndarray, "v 3"], world_to_camera: Float[np.ndarray, "3 3"]) -> Float[torch.Tensor, "v 1"]:
+def _lambert_shading(
+    normals: Float[np.ndarray, "v 3"], world_to_camera: Float[np.ndarray, "3 3"]
+) -> Float[torch.Tensor, "v 1"]:
     """Lambert grey under a light that stands still relative to the camera (its axes: x right, y down, z forward)."""
     right, down, forward = world_to_camera
-    x, y, z = LIGHT_FROM_CAMERA
+    x, y, z = LIGHT_DIRECTION_CAMERA
     light = (x * right - y * down - z * forward).astype(np.float32)
     lit = 0.18 + 0.72 * np.clip(normals @ light, 0.0, 1.0)
     return torch.from_numpy(lit[:, None].astype(np.float32))

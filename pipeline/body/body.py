@@ -167,7 +167,7 @@ ANNY_LANDMARKS_M = {
 class ParametricBody(Protocol):
     """What a body model must offer to be fitted: `AnnyBody` here, `SmplBody` in `smpl.py`.
 
-    Its joints have Mixamo's names, at least `fit_model.ACTIVE_JOINTS`. `landmark_places_m` is where the left and
+    Its joints have Mixamo's names, at least `fit_model.ACTIVE_JOINTS`. `landmark_positions_m` is where the left and
     central landmarks (`fit_landmarks.LANDMARKS`, by name) lie on the A-pose of the default shape.
     """
 
@@ -177,7 +177,7 @@ class ParametricBody(Protocol):
     parents: np.ndarray
     faces: np.ndarray
     skin_weights: np.ndarray
-    landmark_places_m: Mapping[str, tuple[float, float, float]]
+    landmark_positions_m: Mapping[str, tuple[float, float, float]]
 
     def rest(self, shape: Tensor) -> tuple[Tensor, Tensor]:
         """A-pose vertices (v, 3) and joints (j, 3) of a shape, metres."""
@@ -188,7 +188,7 @@ class ParametricBody(Protocol):
         ...
 
 
-def freeze(model: ParametricBody, shape: Float[Tensor, "p"]) -> Body:
+def body_at_shape(model: ParametricBody, shape: Float[Tensor, "p"]) -> Body:
     """One person's body: a model at one shape."""
     with torch.no_grad():
         vertices, joints_m = model.rest(shape)
@@ -223,7 +223,7 @@ class AnnyBody:
         self.parents: Int[np.ndarray, "j"] = np.array(model.bone_parents, dtype=np.int32)
         self.faces: Int[np.ndarray, "f 3"] = model.get_triangular_faces().numpy().astype(np.int32)
         self.skin_weights: Float[np.ndarray, "v j"] = self._dense_weights()
-        self.landmark_places_m: Mapping[str, tuple[float, float, float]] = ANNY_LANDMARKS_M
+        self.landmark_positions_m: Mapping[str, tuple[float, float, float]] = ANNY_LANDMARKS_M
         self.uv: Float[np.ndarray, "t 2"] = model.texture_coordinates.numpy().astype(np.float32)
         self.faces_uv: Int[np.ndarray, "f 3"] = model.face_texture_coordinate_indices.numpy().astype(np.int32)
 
@@ -251,7 +251,7 @@ class AnnyBody:
 
     def body(self, shape: Float[Tensor, "p"]) -> Body:
         """Freeze a shape into one person's body."""
-        return freeze(self, shape)
+        return body_at_shape(self, shape)
 
 
 @lru_cache(maxsize=1)

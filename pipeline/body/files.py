@@ -63,9 +63,9 @@ def load_motion(path: Path) -> Motion:
     """
     arrays = load_npz(path)
     motion = Motion(arrays["frame_index"], arrays["time_s"], arrays["rotations_wxyz"], arrays["root_translation_m"])
-    sound = np.isfinite(motion.rotations_wxyz).all((1, 2)) & np.isfinite(motion.root_translation_m).all(1)
-    if not sound.all():
-        frames = ", ".join(map(str, motion.frame_index[~sound]))
+    is_finite = np.isfinite(motion.rotations_wxyz).all((1, 2)) & np.isfinite(motion.root_translation_m).all(1)
+    if not is_finite.all():
+        frames = ", ".join(map(str, motion.frame_index[~is_finite]))
         raise UserError(f"{path}: the poses of frames {frames} are not finite; run the stage that writes it again")
     return motion
 

@@ -19,12 +19,12 @@ from pipeline.kernels.raster import rasterize
 
 TILE_ROWS = 480
 TILE_COLUMNS = 360
-TILES_A_ROW = 6
+TILES_PER_ROW = 6
 
 LEFT_RGB, RIGHT_RGB, MIDDLE_RGB = (255.0, 150.0, 60.0), (70.0, 150.0, 255.0), (215.0, 215.0, 215.0)
 BODY_OUTLINE_RGB, MASK_OUTLINE_RGB = (255, 235, 0), (0, 255, 255)
-MARK_RGB = (255, 40, 40)
-BODY_SHARE = 0.55
+WARNING_RGB = (255, 40, 40)
+BODY_OPACITY = 0.55
 """How much of the drawn body covers the picture."""
 
 
@@ -35,7 +35,7 @@ def side_colours(body: Body) -> Float[np.ndarray, "f 3"]:
     return np.array([MIDDLE_RGB, LEFT_RGB, RIGHT_RGB])[side]
 
 
-def posed_frame(body: Body, canonical_to_world: Float[Tensor, "j 4 4"]) -> Float[Tensor, "v 3"]:
+def pose_vertices(body: Body, canonical_to_world: Float[Tensor, "j 4 4"]) -> Float[Tensor, "v 3"]:
     """World vertices of the body in one pose."""
     return linear_blend_skinning(
         torch.as_tensor(body.vertices), torch.as_tensor(body.skin_weights), canonical_to_world[None]
@@ -49,7 +49,7 @@ def draw_overlay(
     body: Body,
     camera: Camera,
     caption: str,
-    mark: str = "",
+    warning: str = "",
 ) -> UInt8[np.ndarray, "tile_h tile_w 3"]:
     """One tile: the body shaded over the dimmed frame, its outline yellow, the mask's outline cyan.
 
@@ -60,35 +60,37 @@ def draw_overlay(
     face_id, _, _ = rasterize(vertices_px, depth_m, faces, image.shape[0], image.shape[1])
     seen = face_id.numpy()
     covered = seen >= 0
-    towards = Mesh(vertices_world.numpy(), body.faces).face_normals() @ _view_direction(vertices_world, camera)
-    shade = 0.25 + 0.75 * np.clip(towards, 0.0, 1.0)
+    to_camera = Mesh(vertices_world.numpy(), body.faces).face_normals() @ _view_direction(vertices_world, camera)
+    shade = 0.25 + 0.75 * np.clip(to_camera, 0.0, 1.0)
     colours = side_colours(body) * shade[:, None]
     picture = image.astype(np.float32) * 0.8
-    picture[covered] = (1.0 - BODY_SHARE) * picture[covered] + BODY_SHARE * colours[seen[covered]]
-    tile, to_tile = _cut(picture.round().astype(np.uint8), covered | (mask > 127))
-    _outline(tile, _cut_like(mask > 127, to_tile, tile), MASK_OUTLINE_RGB)
-    _outline(tile, _cut_like(covered, to_tile, tile), BODY_OUTLINE_RGB)
-    words = f"{caption}  {mark}"
-    cv2.putText(tile, words, (8, TILE_ROWS - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
-    if mark:
-        cv2.rectangle(tile, (1, 1), (TILE_COLUMNS - 2, TILE_ROWS - 2), MARK_RGB, 3)
+    picture[covered] = (1.0 - BODY_OPACITY) * picture[covered] + BODY_OPACITY * colours[seen[covered]]
+    tile, to_tile = _crop(picture.round().astype(np.uint8), covered | (mask > 127))
+    _outline(tile, _crop_like(mask > 127, to_tile, tile), MASK_OUTLINE_RGB)
+    _outline(tile, _crop_like(covered, to_tile, tile), BODY_OUTLINE_RGB)
+    label = f"{caption}  {warning}"
+    cv2.putText(tile, label, (8, TILE_ROWS - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
+    if warning:
+        cv2.rectangle(tile, (1, 1), (TILE_COLUMNS - 2, TILE_ROWS - 2), WARNING_RGB, 3)
     return tile
 
 
 def overlay_grid(tiles: Sequence[UInt8[np.ndarray, "tile_h tile_w 3"]]) -> UInt8[np.ndarray, "h w 3"]:
-    """Tiles in rows of `TILES_A_ROW`, the last row filled up with black."""
-    filled = list(tiles) + [np.zeros_like(tiles[0])] * (-len(tiles) % TILES_A_ROW)
-    rows = [np.concatenate(filled[start : start + TILES_A_ROW], axis=1) for start in range(0, len(filled), TILES_A_ROW)]
+    """Tiles in rows of `TILES_PER_ROW`, the last row filled up with black."""
+    filled = list(tiles) + [np.zeros_like(tiles[0])] * (-len(tiles) % TILES_PER_ROW)
+    rows = [
+        np.concatenate(filled[start : start + TILES_PER_ROW], axis=1) for start in range(0, len(filled), TILES_PER_ROW)
+    ]
     return np.concatenate(rows, axis=0)
 
 
 def _view_direction(vertices_world: Float[Tensor, "v 3"], camera: Camera) -> Float[np.ndarray, "3"]:
     """Unit vector from the body's middle to the camera."""
-    towards = camera.centre_m() - vertices_world.mean(0).numpy()
-    return towards / np.linalg.norm(towards)
+    to_camera = camera.centre_m() - vertices_world.mean(0).numpy()
+    return to_camera / np.linalg.norm(to_camera)
 
 
-def _cut(
+def _crop(
     picture: UInt8[np.ndarray, "h w 3"], person: Bool[np.ndarray, "h w"]
 ) -> tuple[UInt8[np.ndarray, "tile_h tile_w 3"], Float[np.ndarray, "2 3"]]:
     """A tile with the person filling it, and the affine map from picture to tile (pixel indices)."""
@@ -102,7 +104,7 @@ def _cut(
     return cv2.warpAffine(picture, to_tile, (TILE_COLUMNS, TILE_ROWS), flags=cv2.INTER_LINEAR), to_tile
 
 
-def _cut_like(
+def _crop_like(
     area: Bool[np.ndarray, "h w"], to_tile: Float[np.ndarray, "2 3"], tile: UInt8[np.ndarray, "tile_h tile_w 3"]
 ) -> UInt8[np.ndarray, "tile_h tile_w"]:
     return cv2.warpAffine(area.astype(np.uint8), to_tile, tile.shape[1::-1], flags=cv2.INTER_LINEAR)

@@ -17,7 +17,7 @@ from pipeline.geometry.skinning import forward_kinematics, skinning_transforms
 from pipeline.kernels.common.dispatch import runs_on_numba
 from pipeline.kernels.kinematics import FittedPoses, Skeleton, skinning_matrices
 
-MAIN_JOINTS = (
+CORRECTED_JOINTS = (
     "Hips", "Spine", "Spine1", "Spine2", "Neck", "Head",
     "LeftShoulder", "LeftArm", "LeftForeArm", "LeftHand", "RightShoulder", "RightArm", "RightForeArm", "RightHand",
     "LeftUpLeg", "LeftLeg", "LeftFoot", "RightUpLeg", "RightLeg", "RightFoot",
@@ -33,7 +33,7 @@ class PoseCorrection:
 
     def __init__(self, body: Body, motion: Motion, device: torch.device = CPU) -> None:
         self.body, self.motion = body, motion
-        joints = [body.joint(name) for name in MAIN_JOINTS if name in body.joint_names]
+        joints = [body.joint(name) for name in CORRECTED_JOINTS if name in body.joint_names]
         self.joints = torch.tensor(joints, device=device)
         frames = len(motion.frame_index)
         self.rotation_rad = torch.zeros(frames, len(joints), 3, device=device, requires_grad=True)
@@ -41,12 +41,14 @@ class PoseCorrection:
         self._joints_m = torch.as_tensor(body.joints_m).to(device)
         self._rotations = quaternion_to_matrix(torch.as_tensor(motion.rotations_wxyz)).to(device)
         self._root_m = torch.as_tensor(motion.root_translation_m).to(device)
-        of_joint = torch.full((len(body.joint_names),), -1)
-        of_joint[self.joints.cpu()] = torch.arange(len(joints))
-        self._skeleton = Skeleton(torch.as_tensor(body.joints_m), torch.as_tensor(body.parents).long(), of_joint)
-        gaps_s = np.diff(motion.time_s.astype(np.float64)) if frames > 1 else np.zeros(0)
-        gaps = np.maximum(gaps_s / max(np.median(gaps_s), 1e-9), 1e-3) if len(gaps_s) else gaps_s
-        self._gap = torch.tensor(gaps, dtype=torch.float32, device=device)
+        correction_row = torch.full((len(body.joint_names),), -1)
+        correction_row[self.joints.cpu()] = torch.arange(len(joints))
+        self._skeleton = Skeleton(torch.as_tensor(body.joints_m), torch.as_tensor(body.parents).long(), correction_row)
+        intervals_s = np.diff(motion.time_s.astype(np.float64)) if frames > 1 else np.zeros(0)
+        relative_intervals = (
+            np.maximum(intervals_s / max(np.median(intervals_s), 1e-9), 1e-3) if len(intervals_s) else intervals_s
+        )
+        self._relative_interval = torch.tensor(relative_intervals, dtype=torch.float32, device=device)
 
     def canonical_to_world(self, rows: Tensor) -> Float[Tensor, "k j 4 4"]:
         """Skinning matrices of some frames, differentiable in the corrections."""
@@ -61,20 +63,20 @@ class PoseCorrection:
         return skinning_transforms(posed, self._joints_m)
 
     def canonical_to_posed(
-        self, rows: Int[Tensor, "k"], posed_from_world: Float[Tensor, "k 4 4"]
+        self, rows: Int[Tensor, "k"], world_to_posed: Float[Tensor, "k 4 4"]
     ) -> Float[Tensor, "k j 4 4"]:
         """`canonical_to_world`, carried on by a rigid map of each frame."""
         if not runs_on_numba(self.rotation_rad):
-            return posed_from_world[:, None] @ self.canonical_to_world(rows)
-        fitted = FittedPoses(self._rotations[rows], self._root_m[rows], posed_from_world.contiguous())
+            return world_to_posed[:, None] @ self.canonical_to_world(rows)
+        fitted = FittedPoses(self._rotations[rows], self._root_m[rows], world_to_posed.contiguous())
         return skinning_matrices(self.rotation_rad[rows], self.shift_m[rows], self._skeleton, fitted)
 
-    def roughness(self) -> Tensor:
+    def temporal_roughness(self) -> Tensor:
         """Mean squared change of the corrections from frame to frame (rad² and, in decimetres, m²)."""
         if len(self.shift_m) < 2:
             return self.shift_m.new_zeros(())
-        turn = self.rotation_rad.diff(dim=0).square().sum((1, 2)) / self._gap
-        shift = (10 * self.shift_m.diff(dim=0)).square().sum(1) / self._gap
+        turn = self.rotation_rad.diff(dim=0).square().sum((1, 2)) / self._relative_interval
+        shift = (10 * self.shift_m.diff(dim=0)).square().sum(1) / self._relative_interval
         return (turn + shift).mean()
 
     def size(self) -> Tensor:

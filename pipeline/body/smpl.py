@@ -17,25 +17,25 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pipeline.body.body import Body, freeze
+from pipeline.body.body import Body, body_at_shape
 from pipeline.geometry.rotation import axis_angle_to_matrix
 from pipeline.geometry.skinning import forward_kinematics, linear_blend_skinning, skinning_transforms
 
-_LIMBS = (
+_BODY_JOINTS = (
     *("Hips", "LeftUpLeg", "RightUpLeg", "Spine", "LeftLeg", "RightLeg", "Spine1", "LeftFoot", "RightFoot", "Spine2"),
     *("LeftToeBase", "RightToeBase", "Neck", "LeftShoulder", "RightShoulder", "Head", "LeftArm", "RightArm"),
     *("LeftForeArm", "RightForeArm", "LeftHand", "RightHand"),
 )
-_FINGERS = tuple(
+_FINGER_JOINTS = tuple(
     f"{side}Hand{finger}{joint}"
     for side in ("Left", "Right")
     for finger in ("Index", "Middle", "Pinky", "Ring", "Thumb")
     for joint in (1, 2, 3)
 )
 JOINT_NAMES = {
-    24: (*_LIMBS, "LeftHandMiddle1", "RightHandMiddle1"),
-    52: (*_LIMBS, *_FINGERS),
-    55: (*_LIMBS, "Jaw", "LeftEye", "RightEye", *_FINGERS),
+    24: (*_BODY_JOINTS, "LeftHandMiddle1", "RightHandMiddle1"),
+    52: (*_BODY_JOINTS, *_FINGER_JOINTS),
+    55: (*_BODY_JOINTS, "Jaw", "LeftEye", "RightEye", *_FINGER_JOINTS),
 }
 """Mixamo's names for the joints of SMPL, SMPL-H and SMPL-X, by how many there are, in the models' order."""
 
@@ -44,7 +44,7 @@ ARM_DIRECTIONS = {"Arm": (0.662, -0.749, 0.024), "ForeArm": (0.515, -0.519, 0.68
 
 FINGER_BEND_RAD = 0.2
 
-HEAD_PLACES = {
+HEAD_LANDMARK_POSITIONS = {
     "nose": (0.0, 0.468, 0.928),
     "eye_inner": (0.198, 0.61, 0.822),
     "eye": (0.297, 0.61, 0.809),
@@ -55,7 +55,7 @@ HEAD_PLACES = {
 """Landmarks of the face in the box of the head's vertices, as on the built-in body: share of the half width to the
 left, of the height from below, of the depth from behind. They hold for any numbering of the vertices."""
 
-JOINT_PLACES = {
+JOINT_LANDMARK_OFFSETS_M = {
     "shoulder": (("LeftArm", (-0.012, 0.025, 0.002)),),
     "elbow": (("LeftForeArm", (-0.012, 0.015, 0.012)),),
     "wrist": (("LeftHand", (0.0, -0.006, 0.013)),),
@@ -111,13 +111,18 @@ class SmplBody:
         self._joints = _float(arrays.joint_regressor @ arrays.template_m)
         self._joint_directions = _float(np.einsum("jv,vcb->jcb", arrays.joint_regressor, arrays.shape_directions_m))
         self._to_a_pose = a_pose_rotations(self.joint_names, self.parents, self._joints)
-        self.landmark_places_m: Mapping[str, tuple[float, float, float]] = self._landmark_places()
+        self.landmark_positions_m: Mapping[str, tuple[float, float, float]] = self._landmark_positions_m()
 
     def rest(self, shape: Float[Tensor, "p"]) -> tuple[Float[Tensor, "v 3"], Float[Tensor, "j 3"]]:
         """A-pose vertices and joints of some betas, canonical frame, differentiable."""
-        t_pose, t_joints = self._template + self._directions @ shape, self._joints + self._joint_directions @ shape
-        joint_to_world = forward_kinematics(self._to_a_pose[None], t_joints[None, 0], t_joints, self.parents)
-        transforms = skinning_transforms(joint_to_world, t_joints)
+        t_pose, t_pose_joints_m = (
+            self._template + self._directions @ shape,
+            self._joints + self._joint_directions @ shape,
+        )
+        joint_to_world = forward_kinematics(
+            self._to_a_pose[None], t_pose_joints_m[None, 0], t_pose_joints_m, self.parents
+        )
+        transforms = skinning_transforms(joint_to_world, t_pose_joints_m)
         vertices = linear_blend_skinning(t_pose, torch.from_numpy(self.skin_weights), transforms)[0]
         joints_m = joint_to_world[0, :, :3, 3]
         origin = torch.stack([joints_m[0, 0], vertices[:, 1].min(), joints_m[0, 2]])
@@ -125,23 +130,23 @@ class SmplBody:
 
     def body(self, shape: Float[Tensor, "p"]) -> Body:
         """Freeze some betas into one person's body."""
-        return freeze(self, shape)
+        return body_at_shape(self, shape)
 
-    def local_rotations(self, smpl_rotations: Float[Tensor, "n j 3 3"]) -> Float[Tensor, "n j 3 3"]:
+    def from_smpl_rotations(self, smpl_rotations: Float[Tensor, "n j 3 3"]) -> Float[Tensor, "n j 3 3"]:
         """SMPL's local rotations (identity: T-pose) as this house's (identity: A-pose with joints along the axes).
 
         With Q_j the world rotation of joint j in the A-pose: R_j = Q_parent · theta_j · Q_j^T.
         """
-        still = torch.zeros(1, 3)
-        bind = forward_kinematics(self._to_a_pose[None], still, self._joints, self.parents)[0, :, :3, :3]
-        above = torch.cat([torch.eye(3)[None], bind[self.parents[1:].tolist()]])
-        return above @ smpl_rotations @ bind.transpose(-1, -2)
+        zero_root_m = torch.zeros(1, 3)
+        bind = forward_kinematics(self._to_a_pose[None], zero_root_m, self._joints, self.parents)[0, :, :3, :3]
+        parent_rotation = torch.cat([torch.eye(3)[None], bind[self.parents[1:].tolist()]])
+        return parent_rotation @ smpl_rotations @ bind.transpose(-1, -2)
 
-    def takes_smpl_poses(self, betas: int) -> bool:
+    def accepts_smpl_poses(self, betas: int) -> bool:
         """Whether this many betas, and poses, that were fitted with SMPL hold here: SMPL-X has other shapes."""
         return "Jaw" not in self.joint_names and len(self.shape_names) == betas
 
-    def placed(
+    def convert_smpl_poses(
         self,
         axis_angle: Float[Tensor, "n 24 3"],
         transl_m: Float[Tensor, "n 3"],
@@ -153,24 +158,24 @@ class SmplBody:
         SMPL turns about the pelvis where the regressor finds it, then adds `transl_m`. k is 24, or the 22 joints
         that the other models share with SMPL.
         """
-        known = len(axis_angle[0]) if len(self.joint_names) == len(axis_angle[0]) else len(_LIMBS)
+        shared_joint_count = len(axis_angle[0]) if len(self.joint_names) == len(axis_angle[0]) else len(_BODY_JOINTS)
         local = torch.eye(3).repeat(len(axis_angle), len(self.joint_names), 1, 1)
-        local[:, :known] = axis_angle_to_matrix(axis_angle[:, :known])
-        rotations = self.local_rotations(local)[:, :known]
+        local[:, :shared_joint_count] = axis_angle_to_matrix(axis_angle[:, :shared_joint_count])
+        rotations = self.from_smpl_rotations(local)[:, :shared_joint_count]
         rotations[:, 0] = smpl_to_world[:, :3, :3] @ rotations[:, 0]
         pelvis_m = self._joints[0] + betas @ self._joint_directions[0].T + transl_m
         return rotations, (smpl_to_world[:, :3, :3] @ pelvis_m[..., None]).squeeze(-1) + smpl_to_world[:, :3, 3]
 
-    def _landmark_places(self) -> dict[str, tuple[float, float, float]]:
+    def _landmark_positions_m(self) -> dict[str, tuple[float, float, float]]:
         """Where the left and central landmarks lie on the body of the default shape, metres."""
         vertices, joints_m = (rest.double().numpy() for rest in self.rest(self.shape_defaults))
         head = vertices[self.skin_weights[:, self.joint_names.index("Head")] > 0.5]
         low, size = head.min(axis=0), np.ptp(head, axis=0)
         places = {
             name: (0.5 * size[0] * across, low[1] + size[1] * up, low[2] + size[2] * forth)
-            for name, (across, up, forth) in HEAD_PLACES.items()
+            for name, (across, up, forth) in HEAD_LANDMARK_POSITIONS.items()
         }
-        for name, choices in JOINT_PLACES.items():
+        for name, choices in JOINT_LANDMARK_OFFSETS_M.items():
             joint, shift = next(choice for choice in choices if choice[0] in self.joint_names)
             x, y, z = joints_m[self.joint_names.index(joint)] + shift
             places[name] = (HIP_HALF_WIDTH_M if name == "hip" else x, y, z)
@@ -178,20 +183,20 @@ class SmplBody:
 
 
 def a_pose_rotations(
-    joint_names: Sequence[str], parents: Int[np.ndarray, "j"], t_joints_m: Float[Tensor, "j 3"]
+    joint_names: Sequence[str], parents: Int[np.ndarray, "j"], t_pose_joints_m: Float[Tensor, "j 3"]
 ) -> Float[Tensor, "j 3 3"]:
     """Local rotations that take SMPL's T-pose to the A-pose (module docstring)."""
     local = torch.eye(3).repeat(len(joint_names), 1, 1)
     for side, sign in (("Left", 1.0), ("Right", -1.0)):
-        mirror, above = torch.tensor([sign, 1.0, 1.0]), torch.eye(3)
+        mirror, parent_rotation = torch.tensor([sign, 1.0, 1.0]), torch.eye(3)
         for name, child in (("Arm", "ForeArm"), ("ForeArm", "Hand")):
             joint, end = joint_names.index(side + name), joint_names.index(side + child)
-            bone = above @ (t_joints_m[end] - t_joints_m[joint])
-            turned = rotation_between(bone, torch.tensor(ARM_DIRECTIONS[name]) * mirror) @ above
-            local[joint] = above.T @ turned
-            above = turned
+            bone = parent_rotation @ (t_pose_joints_m[end] - t_pose_joints_m[joint])
+            turned = rotation_between(bone, torch.tensor(ARM_DIRECTIONS[name]) * mirror) @ parent_rotation
+            local[joint] = parent_rotation.T @ turned
+            parent_rotation = turned
         for joint, name in enumerate(joint_names):
-            if name in _FINGERS and name.startswith(side) and "Thumb" not in name:
+            if name in _FINGER_JOINTS and name.startswith(side) and "Thumb" not in name:
                 local[joint] = axis_angle_to_matrix(torch.tensor([0.0, 0.0, -sign * FINGER_BEND_RAD]))
     return local
 

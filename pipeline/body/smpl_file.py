@@ -21,12 +21,12 @@ from scipy.sparse import csc_matrix, csr_matrix
 
 from pipeline.body.smpl import SmplArrays, SmplBody
 from pipeline.core.errors import UserError
-from pipeline.io.safe_pickle import Record, load_pickle
+from pipeline.io.safe_pickle import OpaqueObject, load_pickle
 
 N_BETAS = 10
 """Shape directions that are used: what all releases have, and what most fits of others give."""
 
-KEYS = ("v_template", "shapedirs", "J_regressor", "kintree_table", "weights", "f")
+REQUIRED_KEYS = ("v_template", "shapedirs", "J_regressor", "kintree_table", "weights", "f")
 _SPARSE = {"csc_matrix": csc_matrix, "csr_matrix": csr_matrix}
 _RECORDS = (
     "chumpy.ch.Ch",
@@ -42,11 +42,11 @@ def load_smpl(path: Path) -> SmplBody:
         UserError: it is missing, cannot be read, or is no SMPL, SMPL-H or SMPL-X model.
     """
     values = _read(path)
-    missing = [key for key in KEYS if key not in values]
+    missing = [key for key in REQUIRED_KEYS if key not in values]
     if missing:
         raise UserError(f"{path} has no `{missing[0]}`; give an SMPL, SMPL-H or SMPL-X model as .npz or .pkl")
     try:
-        arrays = _checked({key: plain_array(values[key]) for key in KEYS})
+        arrays = _validate_arrays({key: plain_array(values[key]) for key in REQUIRED_KEYS})
         return SmplBody(arrays)
     except (ValueError, TypeError, KeyError) as error:
         raise UserError(f"{path} is no SMPL, SMPL-H or SMPL-X model ({error}); download it again") from error
@@ -59,7 +59,7 @@ def plain_array(value: object) -> np.ndarray:
     """
     if isinstance(value, np.ndarray) and value.dtype != object:
         return value
-    if not isinstance(value, Record) or not isinstance(value.state, dict):
+    if not isinstance(value, OpaqueObject) or not isinstance(value.state, dict):
         raise ValueError(f"a {type(value).__name__} in place of an array")
     kind, state = type(value).__name__, value.state
     if kind == "Ch":
@@ -84,12 +84,12 @@ def _read(path: Path) -> dict[str, Any]:
         return values
     try:
         with np.load(path, allow_pickle=False) as archive:
-            return {key: archive[key] for key in KEYS if key in archive.files}
+            return {key: archive[key] for key in REQUIRED_KEYS if key in archive.files}
     except (OSError, ValueError, AttributeError, zipfile.BadZipFile) as error:
         raise UserError(f"{path} cannot be read as .npz or .pkl ({error}); give an SMPL model file") from error
 
 
-def _checked(arrays: dict[str, np.ndarray]) -> SmplArrays:
+def _validate_arrays(arrays: dict[str, np.ndarray]) -> SmplArrays:
     """The arrays with shapes that fit each other; ValueError when they do not."""
     regressor, template = arrays["J_regressor"], arrays["v_template"]
     joints, vertices = regressor.shape

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from pipeline.capture.hand_detector import Hands
+from pipeline.capture.hand_detector import HandLandmarks
 from pipeline.capture.smpl_poses import SMPL_POSES_NPZ, SmplPoses, load_smpl_poses, save_smpl_poses
-from pipeline.geometry.camera import UPRIGHT_WORLD_TO_CAMERA, Camera
+from pipeline.geometry.camera import DEFAULT_WORLD_TO_CAMERA, Camera
 from pipeline.io.image import read_gray, read_rgb, to_float
 from pipeline.io.npz import load_npz, save_npz
 
@@ -22,7 +22,8 @@ class Capture:
     """The chosen frames of a recording: n frames, all of one size.
 
     frame_index: index in the whole recording; time_s: since its first frame.
-    split: 0 train, 1 validation, 2 held out (`pipeline.capture.frame_selection.split_of`, or supplied with the video).
+    split: 0 train, 1 validation, 2 held out (`pipeline.capture.frame_selection.assign_splits`, or supplied with the
+    video).
     landmarks_px: MediaPipe's 33 points, pixel centres at +0.5; nan where unknown. Visibility in [0, 1].
     landmarks_world_m: metres about the hips' centre in camera axes; nan where unknown.
     camera: what was supplied with the video, for these images; None when unknown.
@@ -46,8 +47,8 @@ class Capture:
     mask_source: str
     n_video_frames: int
     scale: float
-    recorded_focal_px: float | None = None
-    hands: Hands | None = None
+    metadata_focal_px: float | None = None
+    hands: HandLandmarks | None = None
     smpl_poses: SmplPoses | None = None
 
     def __len__(self) -> int:
@@ -93,11 +94,11 @@ def save_capture(capture: Capture) -> None:
         "landmarks_px": capture.landmarks_px.astype(np.float32),
         "landmarks_visibility": capture.landmarks_visibility.astype(np.float32),
         "landmarks_world_m": capture.landmarks_world_m.astype(np.float32),
-        "camera_world_to_camera": camera.world_to_camera if camera else UPRIGHT_WORLD_TO_CAMERA,
+        "camera_world_to_camera": camera.world_to_camera if camera else DEFAULT_WORLD_TO_CAMERA,
         "mask_source": np.array(capture.mask_source),
         "n_video_frames": np.array(capture.n_video_frames, dtype=np.int32),
         "scale": np.array(capture.scale),
-        "recorded_focal_px": np.array(np.nan if capture.recorded_focal_px is None else capture.recorded_focal_px),
+        "metadata_focal_px": np.array(np.nan if capture.metadata_focal_px is None else capture.metadata_focal_px),
     }
     for name, value in zip(_INTRINSICS, intrinsics, strict=True):
         arrays[name] = np.array(value)
@@ -130,22 +131,22 @@ def load_capture(frames_dir: Path) -> Capture:
         mask_source=str(arrays["mask_source"].item()),
         n_video_frames=int(arrays["n_video_frames"].item()),
         scale=float(arrays["scale"].item()),
-        recorded_focal_px=_recorded_focal_px(arrays),
+        metadata_focal_px=_metadata_focal_px(arrays),
         hands=_hands(arrays),
         smpl_poses=load_smpl_poses(poses_path) if poses_path.is_file() else None,
     )
 
 
-def _recorded_focal_px(arrays: Mapping[str, np.ndarray]) -> float | None:
-    found = float(np.ravel(arrays.get("recorded_focal_px", np.nan))[0])
+def _metadata_focal_px(arrays: Mapping[str, np.ndarray]) -> float | None:
+    found = float(np.ravel(arrays.get("metadata_focal_px", np.nan))[0])
     return found if np.isfinite(found) else None
 
 
-def _hands(arrays: Mapping[str, np.ndarray]) -> Hands | None:
-    names = [field.name for field in fields(Hands)]
+def _hands(arrays: Mapping[str, np.ndarray]) -> HandLandmarks | None:
+    names = [field.name for field in fields(HandLandmarks)]
     if any(f"hands_{name}" not in arrays for name in names):
         return None
-    return Hands(*(arrays[f"hands_{name}"] for name in names))
+    return HandLandmarks(*(arrays[f"hands_{name}"] for name in names))
 
 
 def _camera(arrays: Mapping[str, np.ndarray]) -> Camera | None:

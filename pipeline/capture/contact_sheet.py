@@ -6,8 +6,8 @@ from jaxtyping import UInt8
 
 from pipeline.capture.capture import Capture
 from pipeline.capture.frame_selection import HELDOUT, VALIDATION
-from pipeline.capture.matting import outline
-from pipeline.capture.person_detector import SKELETON
+from pipeline.capture.matting import inner_boundary
+from pipeline.capture.person_detector import POSE_CONNECTIONS
 from pipeline.io.image import to_uint8
 
 _TILE_HEIGHT_PX, _COLUMNS, _ROWS = 320, 8, 3
@@ -33,9 +33,9 @@ def _tile(capture: Capture, position: int) -> UInt8[np.ndarray, "h w 3"]:
     scale = _TILE_HEIGHT_PX / (bottom - top)
     size = (max(1, round((right - left) * scale)), _TILE_HEIGHT_PX)
     tile = cv2.resize(image[top:bottom, left:right], size, interpolation=cv2.INTER_AREA)
-    tile[outline(cv2.resize(body[top:bottom, left:right].astype(np.uint8), size) > 0)] = _OUTLINE
+    tile[inner_boundary(cv2.resize(body[top:bottom, left:right].astype(np.uint8), size) > 0)] = _OUTLINE
     points = (capture.landmarks_px[position] - (left, top)) * scale
-    for first, second in SKELETON:
+    for first, second in POSE_CONNECTIONS:
         if np.isfinite(points[[first, second]]).all():
             colour = _LEFT if second % 2 else _RIGHT
             ends = [tuple(int(value) for value in np.clip(points[k], -9999, 9999)) for k in (first, second)]

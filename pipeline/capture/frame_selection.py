@@ -12,60 +12,62 @@ SPLIT_PERIOD = 8
 VALIDATION_PHASE = 4
 # Mean absolute difference of two pictures of the same thing when rounding to whole levels is the only noise:
 # E|round(a + e1) - round(a + e2)| with independent uniform dither = 1/3.
-_ROUNDING_NOISE = 1.0 / 3.0
+_QUANTISATION_NOISE = 1.0 / 3.0
 _BLOCK_PX = 16
 
 
-def split_of(frame_index: Int[np.ndarray, "n"]) -> UInt8[np.ndarray, "n"]:
+def assign_splits(frame_index: Int[np.ndarray, "n"]) -> UInt8[np.ndarray, "n"]:
     """HELDOUT for indices divisible by eight, VALIDATION for index = 4 modulo 8, TRAIN for the rest."""
     phase = frame_index % SPLIT_PERIOD
     return np.select([phase == 0, phase == VALIDATION_PHASE], [HELDOUT, VALIDATION], TRAIN).astype(np.uint8)
 
 
-def noise_level(grays: UInt8[np.ndarray, "n h w"]) -> float:
+def estimate_noise_level(gray_thumbnails: UInt8[np.ndarray, "n h w"]) -> float:
     """Mean absolute difference, in levels of 255, between successive pictures where nothing moves.
 
     Each pair's calmest quarter of 16 x 16 blocks counts as still; the median over pairs, at least the rounding noise.
     """
     levels = []
-    for first, second in zip(grays[:-1], grays[1:], strict=True):
+    for first, second in zip(gray_thumbnails[:-1], gray_thumbnails[1:], strict=True):
         difference = np.abs(first.astype(np.float32) - second)
         rows, columns = (side // _BLOCK_PX * _BLOCK_PX for side in difference.shape)
         if rows == 0 or columns == 0:
             continue
         blocks = difference[:rows, :columns].reshape(rows // _BLOCK_PX, _BLOCK_PX, columns // _BLOCK_PX, _BLOCK_PX)
         levels.append(np.percentile(blocks.mean(axis=(1, 3)), 25))
-    return max(_ROUNDING_NOISE, float(np.median(levels)) if levels else 0.0)
+    return max(_QUANTISATION_NOISE, float(np.median(levels)) if levels else 0.0)
 
 
-def change(first: UInt8[np.ndarray, "h w"], second: UInt8[np.ndarray, "h w"], person: Bool[np.ndarray, "h w"]) -> float:
+def mean_absolute_difference(
+    first: UInt8[np.ndarray, "h w"], second: UInt8[np.ndarray, "h w"], person: Bool[np.ndarray, "h w"]
+) -> float:
     """Mean absolute difference of two grey pictures on the person's pixels, in levels of 255."""
     if not person.any():
         return 0.0
     return float(np.abs(first.astype(np.float32) - second)[person].mean())
 
 
-def distinct_frames(
-    grays: UInt8[np.ndarray, "n h w"], persons: Bool[np.ndarray, "n h w"], threshold: float
+def find_distinct_frames(
+    gray_thumbnails: UInt8[np.ndarray, "n h w"], person_masks: Bool[np.ndarray, "n h w"], threshold: float
 ) -> tuple[Bool[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """Which frames differ from the last kept one by more than `threshold`, and how far the person has moved so far.
 
     The way is the sum of the changes between kept frames (levels of 255); a dropped frame has the way of the one that
     was kept before it.
     """
-    keep = np.zeros(len(grays), dtype=bool)
-    way = np.zeros(len(grays), dtype=np.float64)
+    keep = np.zeros(len(gray_thumbnails), dtype=bool)
+    cumulative_motion = np.zeros(len(gray_thumbnails), dtype=np.float64)
     last = 0
-    for i in range(len(grays)):
-        step = change(grays[last], grays[i], persons[last] | persons[i])
+    for i in range(len(gray_thumbnails)):
+        step = mean_absolute_difference(gray_thumbnails[last], gray_thumbnails[i], person_masks[last] | person_masks[i])
         keep[i] = i == 0 or step > threshold
-        way[i] = way[last] + (step if keep[i] else 0.0)
+        cumulative_motion[i] = cumulative_motion[last] + (step if keep[i] else 0.0)
         last = i if keep[i] else last
-    return keep, way
+    return keep, cumulative_motion
 
 
-def choose_frames(
-    frame_index: Int[np.ndarray, "n"], way: Float[np.ndarray, "n"], max_frames: int
+def select_frames_by_motion(
+    frame_index: Int[np.ndarray, "n"], cumulative_motion: Float[np.ndarray, "n"], max_frames: int
 ) -> Bool[np.ndarray, "n"]:
     """At most `max_frames` frames, evenly along the person's way, an eighth each held out and for validation.
 
@@ -73,12 +75,12 @@ def choose_frames(
     spread over the whole way by itself, its first and last frame included.
     """
     chosen = np.zeros(len(frame_index), dtype=bool)
-    split = split_of(frame_index)
+    split = assign_splits(frame_index)
     share = max(1, round(max_frames / SPLIT_PERIOD))
     quotas = {HELDOUT: share, VALIDATION: share, TRAIN: max(1, max_frames - 2 * share)}
     for kind, quota in quotas.items():
         members = np.flatnonzero(split == kind)
-        chosen[members[_evenly(way[members], quota)]] = True
+        chosen[members[_evenly_spaced_indices(cumulative_motion[members], quota)]] = True
     return chosen
 
 
@@ -91,7 +93,7 @@ def body_yaw_rad(landmarks_world_m: Float[np.ndarray, "n 33 3"]) -> Float[np.nda
     return np.arctan2(leftward[:, 2], leftward[:, 0])
 
 
-def largest_gap_rad(yaw_rad: Float[np.ndarray, "n"]) -> float:
+def largest_yaw_gap_rad(yaw_rad: Float[np.ndarray, "n"]) -> float:
     """The widest arc of the circle in which no yaw lies, in (0, 2 pi]."""
     angles = np.sort(np.mod(yaw_rad[np.isfinite(yaw_rad)], 2 * np.pi))
     if len(angles) == 0:
@@ -99,23 +101,23 @@ def largest_gap_rad(yaw_rad: Float[np.ndarray, "n"]) -> float:
     return float(np.diff(np.append(angles, angles[0] + 2 * np.pi)).max())
 
 
-def frame_ranges(frame_index: Int[np.ndarray, "n"], rows: Bool[np.ndarray, "n"]) -> str:
+def format_frame_ranges(frame_index: Int[np.ndarray, "n"], rows: Bool[np.ndarray, "n"]) -> str:
     """Marked frames in words: neighbours among the n frames are joined, "3, 81-96"."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], rows.astype(np.int8), [0]])))
     spans = [(int(frame_index[start]), int(frame_index[end - 1])) for start, end in edges.reshape(-1, 2)]
     return ", ".join(str(first) if first == last else f"{first}-{last}" for first, last in spans)
 
 
-def _evenly(way: Float[np.ndarray, "m"], quota: int) -> Int[np.ndarray, "k"]:
+def _evenly_spaced_indices(cumulative_motion: Float[np.ndarray, "m"], quota: int) -> Int[np.ndarray, "k"]:
     """Positions of `quota` entries of a non-decreasing sequence, as evenly spread over its values as they lie."""
-    if len(way) <= quota:
-        return np.arange(len(way))
+    if len(cumulative_motion) <= quota:
+        return np.arange(len(cumulative_motion))
     if quota == 1:
-        return np.array([len(way) // 2])
+        return np.array([len(cumulative_motion) // 2])
     chosen: list[int] = []
-    for k, target in enumerate(np.linspace(way[0], way[-1], quota)):
+    for k, target in enumerate(np.linspace(cumulative_motion[0], cumulative_motion[-1], quota)):
         first = chosen[-1] + 1 if chosen else 0
-        last = len(way) - quota + k
-        chosen.append(first + int(np.argmin(np.abs(way[first : last + 1] - target))))
-    chosen[-1] = len(way) - 1
+        last = len(cumulative_motion) - quota + k
+        chosen.append(first + int(np.argmin(np.abs(cumulative_motion[first : last + 1] - target))))
+    chosen[-1] = len(cumulative_motion) - 1
     return np.array(chosen)

@@ -12,17 +12,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline.capture.person_detector import quiet_stderr
+from pipeline.capture.person_detector import suppress_stderr
 
-HAND_POINTS = 21
-WRISTS, PINKIES, INDICES = (15, 16), (17, 18), (19, 20)
+N_HAND_LANDMARKS = 21
+WRISTS, PINKIES, INDEX_FINGERS = (15, 16), (17, 18), (19, 20)
 """Of the pose's landmarks, (left, right)."""
 
-LEAST_HAND_PX = 24.0
-HAND_M = 0.18
+MIN_HAND_PX = 24.0
+HAND_LENGTH_M = 0.18
 """Hands of this length are looked at when they have at least so many pixels, seen from the side."""
 
-LEAST_VISIBILITY = 0.3
+MIN_WRIST_VISIBILITY = 0.3
 """Of the wrist. Below, the hand is behind the body and the model finds the other one."""
 
 _GRAPH = """
@@ -56,11 +56,11 @@ node {
 }
 """
 # The model speaks of mirrored pictures, as a phone shows them to the person before it.
-_MIRRORED_SIDES = ("Right", "Left")
+_MIRRORED_LABELS = ("Right", "Left")
 
 
 @dataclass(frozen=True)
-class Hands:
+class HandLandmarks:
     """Both hands (left, right), in any number of images; nan where none was found.
 
     landmarks_px: pixel centres at +0.5. landmarks_m: metres about the hand's middle, camera axes (x right, y down, z
@@ -69,36 +69,38 @@ class Hands:
 
     landmarks_px: Float[np.ndarray, "*n 2 21 2"]
     landmarks_m: Float[np.ndarray, "*n 2 21 3"]
-    own_side: Float[np.ndarray, "*n 2"]
+    handedness_score: Float[np.ndarray, "*n 2"]
 
-    def rows(self, rows: Sequence[int]) -> "Hands":
+    def rows(self, rows: Sequence[int]) -> "HandLandmarks":
         """The hands in some of the images."""
-        return Hands(*(values[rows] for values in vars(self).values()))
+        return HandLandmarks(*(values[rows] for values in vars(self).values()))
 
 
-def no_hands(*images: int) -> Hands:
+def undetected_hands(*images: int) -> HandLandmarks:
     """Nothing found in so many images (no number: in one)."""
-    points = (*images, 2, HAND_POINTS)
+    points = (*images, 2, N_HAND_LANDMARKS)
     nowhere_px, nowhere_m = (np.full((*points, size), np.nan, dtype=np.float32) for size in (2, 3))
-    return Hands(nowhere_px, nowhere_m, np.zeros((*images, 2), dtype=np.float32))
+    return HandLandmarks(nowhere_px, nowhere_m, np.zeros((*images, 2), dtype=np.float32))
 
 
-def stack_hands(images: Sequence[Hands]) -> Hands:
+def stack_hands(images: Sequence[HandLandmarks]) -> HandLandmarks:
     """Hands that were found in one image each, as one; at least one image."""
-    return Hands(*(np.stack(values) for values in zip(*(vars(hands).values() for hands in images), strict=True)))
+    return HandLandmarks(
+        *(np.stack(values) for values in zip(*(vars(hands).values() for hands in images), strict=True))
+    )
 
 
 class HandDetector:
     """MediaPipe's hand model in its larger size; about 12 ms a hand on one core, whatever the image's size."""
 
     def __init__(self) -> None:
-        with quiet_stderr():
+        with suppress_stderr():
             from mediapipe.framework.formats.landmark_pb2 import NormalizedLandmarkList
             from mediapipe.python.solutions.pose import SolutionBase  # here: takes seconds and writes to stderr
 
             self._points = NormalizedLandmarkList
             self._graph = SolutionBase(graph_config=_GRAPH, side_inputs={"model_complexity": 1})
-        self._has_spoken = False
+        self._is_stderr_quiet = False
 
     def look(
         self,
@@ -106,35 +108,37 @@ class HandDetector:
         pose_px: Float[np.ndarray, "33 2"],
         visibility: Float[np.ndarray, "33"],
         pose_world_m: Float[np.ndarray, "33 3"],
-    ) -> Hands:
-        """The hands of the person whose pose is given (as in `person.Detection`)."""
-        hands = no_hands()
-        if HAND_M * pixels_per_metre(pose_px, pose_world_m) < LEAST_HAND_PX:
+    ) -> HandLandmarks:
+        """The hands of the person whose pose is given (as in `person.PersonDetection`)."""
+        hands = undetected_hands()
+        if HAND_LENGTH_M * image_scale_px_per_m(pose_px, pose_world_m) < MIN_HAND_PX:
             return hands
         size_px = np.array(rgb.shape[1::-1])
-        for side, mirrored in enumerate(_MIRRORED_SIDES):
-            if visibility[WRISTS[side]] < LEAST_VISIBILITY:
+        for side, expected_label in enumerate(_MIRRORED_LABELS):
+            if visibility[WRISTS[side]] < MIN_WRIST_VISIBILITY:
                 continue
-            rows = [group[side] for group in (WRISTS, PINKIES, INDICES)]
-            with nullcontext() if self._has_spoken else quiet_stderr():
+            rows = [group[side] for group in (WRISTS, PINKIES, INDEX_FINGERS)]
+            with nullcontext() if self._is_stderr_quiet else suppress_stderr():
                 found = self._process(rgb, pose_px[rows] / size_px, visibility[rows])
-            self._has_spoken = True
+            self._is_stderr_quiet = True
             if found.landmarks is None:
                 continue
             hands.landmarks_px[side] = size_px * [(p.x, p.y) for p in found.landmarks.landmark]
             hands.landmarks_m[side] = [(p.x, p.y, p.z) for p in found.world_landmarks.landmark]
-            likely = found.handedness.classification[0]
-            hands.own_side[side] = likely.score if likely.label == mirrored else 1.0 - likely.score
+            handedness = found.handedness.classification[0]
+            hands.handedness_score[side] = (
+                handedness.score if handedness.label == expected_label else 1.0 - handedness.score
+            )
         return hands
 
-    def _process(self, rgb: UInt8[np.ndarray, "h w 3"], places: np.ndarray, visibility: np.ndarray) -> Any:
+    def _process(self, rgb: UInt8[np.ndarray, "h w 3"], points_normalized: np.ndarray, visibility: np.ndarray) -> Any:
         points = self._points()
-        for (x, y), seen in zip(places.tolist(), visibility.tolist(), strict=True):
+        for (x, y), seen in zip(points_normalized.tolist(), visibility.tolist(), strict=True):
             points.landmark.add(x=x, y=y, visibility=seen)
         return self._graph.process({"image": rgb, "wrist_and_knuckles": points})
 
 
-def pixels_per_metre(
+def image_scale_px_per_m(
     points_px: Float[np.ndarray, "*n p 2"], points_m: Float[np.ndarray, "*n p 3"]
 ) -> Float[np.ndarray, "*n"]:
     """Scale of the image at a person or a hand: spread of its points in pixels over that in metres."""

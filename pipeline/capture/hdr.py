@@ -10,16 +10,16 @@ from functools import cache
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
-from pipeline.geometry.colour import srgb_of_light
+from pipeline.geometry.colour import linear_to_srgb
 
 PQ, HLG = 16, 18
 """Transfer characteristics as containers number them (ITU-T H.273, table 3)."""
 BT_2020 = 9
 """Its number among the colour primaries (H.273, table 2)."""
 
-WHITE_NITS, PEAK_NITS, SYSTEM_GAMMA = 203.0, 1000.0, 1.2
-LUMINANCE_2020 = np.array([0.2627, 0.6780, 0.0593], dtype=np.float32)
-TO_BT_709 = np.array(
+REFERENCE_WHITE_NITS, PEAK_LUMINANCE_NITS, SYSTEM_GAMMA = 203.0, 1000.0, 1.2
+BT_2020_LUMINANCE_WEIGHTS = np.array([0.2627, 0.6780, 0.0593], dtype=np.float32)
+BT_2020_TO_BT_709 = np.array(
     [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]], dtype=np.float32
 )
 """Linear light of BT.2020's primaries to those of BT.709, which sRGB has (ITU-R BT.2407, section 2)."""
@@ -27,25 +27,25 @@ TO_BT_709 = np.array(
 
 def to_srgb(signal: UInt16[np.ndarray, "h w 3"], transfer: int, primaries: int) -> UInt8[np.ndarray, "h w 3"]:
     """Display a picture. signal: full range of 16 bits. transfer: `HLG` or `PQ`; primaries: H.273's number."""
-    nits = _NITS[transfer](signal)
-    linear = nits / WHITE_NITS
+    nits = _EOTF[transfer](signal)
+    linear = nits / REFERENCE_WHITE_NITS
     if primaries == BT_2020:
-        linear = linear @ TO_BT_709.T
-    return np.rint(255.0 * srgb_of_light(np.clip(linear, 0.0, 1.0))).astype(np.uint8)
+        linear = linear @ BT_2020_TO_BT_709.T
+    return np.rint(255.0 * linear_to_srgb(np.clip(linear, 0.0, 1.0))).astype(np.uint8)
 
 
-def _hlg_nits(signal: UInt16[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+def _hlg_eotf(signal: UInt16[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
     """BT.2100 table 5: the inverse of the camera's curve, then the display's, which depends on luminance."""
-    scene = _hlg_scene_light()[signal]
-    return PEAK_NITS * (scene @ LUMINANCE_2020)[..., None] ** np.float32(SYSTEM_GAMMA - 1) * scene
+    scene = _hlg_inverse_oetf_table()[signal]
+    return PEAK_LUMINANCE_NITS * (scene @ BT_2020_LUMINANCE_WEIGHTS)[..., None] ** np.float32(SYSTEM_GAMMA - 1) * scene
 
 
-def _pq_nits(signal: UInt16[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-    return _pq_light()[signal]
+def _pq_eotf(signal: UInt16[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+    return _pq_eotf_table()[signal]
 
 
 @cache
-def _hlg_scene_light() -> Float[np.ndarray, "65536"]:
+def _hlg_inverse_oetf_table() -> Float[np.ndarray, "65536"]:
     """Scene light of every signal."""
     a, b, c = 0.17883277, 0.28466892, 0.55991073
     level = np.linspace(0.0, 1.0, 1 << 16)
@@ -53,7 +53,7 @@ def _hlg_scene_light() -> Float[np.ndarray, "65536"]:
 
 
 @cache
-def _pq_light() -> Float[np.ndarray, "65536"]:
+def _pq_eotf_table() -> Float[np.ndarray, "65536"]:
     """BT.2100 table 4: cd/m² of every signal."""
     m1, m2, c1, c2, c3 = 0.1593017578125, 78.84375, 0.8359375, 18.8515625, 18.6875
     root = np.linspace(0.0, 1.0, 1 << 16) ** (1 / m2)
@@ -61,5 +61,5 @@ def _pq_light() -> Float[np.ndarray, "65536"]:
     return nits.astype(np.float32)
 
 
-_NITS: dict[int, Callable[[np.ndarray], np.ndarray]] = {HLG: _hlg_nits, PQ: _pq_nits}
-TRANSFERS = tuple(_NITS)
+_EOTF: dict[int, Callable[[np.ndarray], np.ndarray]] = {HLG: _hlg_eotf, PQ: _pq_eotf}
+HDR_TRANSFERS = tuple(_EOTF)

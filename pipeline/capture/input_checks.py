@@ -6,50 +6,50 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipeline.capture.background_plate import scene_differs
-from pipeline.capture.detection import Sightings
-from pipeline.capture.frame_selection import frame_ranges
-from pipeline.capture.person_detector import ANKLES, TORSO, legs_in_image
+from pipeline.capture.background_plate import detect_scene_changes
+from pipeline.capture.detection import Detections
+from pipeline.capture.frame_selection import format_frame_ranges
+from pipeline.capture.person_detector import ANKLES, TORSO, is_ankle_visible
 from pipeline.core.errors import UserError
 from pipeline.core.progress import warn
 
-_BLACK_LEVEL = 8
-_FEET = (29, 30, 31, 32)
+_MAX_BLACK_LEVEL = 8
+_FOOT_LANDMARKS = (29, 30, 31, 32)
 # A shoe reaches this share of the image's height below the joints of heel and toe.
-_SOLE_SHARE = 0.02
+_SOLE_HEIGHT_FRACTION = 0.02
 # Cosine between the spine, from shoulders to hips, and straight down, of somebody who stands.
-_LEAST_UPRIGHT = 0.5
-_UNSEEN_ARC_DEG = 120.0
+_MIN_UPRIGHT_COSINE = 0.5
+_MAX_UNSEEN_ARC_DEG = 120.0
 # Up to this height the person's pixels are of use to the default preset.
-_USEFUL_PERSON_PX = 640.0
+_TARGET_PERSON_HEIGHT_PX = 640.0
 # Pictures on which a camera that moves is looked for, the share of them that must show another scene, and how far from
 # the person the scene begins, as a share of the picture's longer side: shadows and what the mask misses lie nearer.
-_SCENE_PICTURES, _MOST_MOVED, _PERSON_MARGIN = 32, 0.1, 0.03
+_N_SCENE_FRAMES, _MAX_MOVED_FRACTION, _PERSON_MARGIN_FRACTION = 32, 0.1, 0.03
 
 
-def refuse_bad_input(sightings: Sightings, path: Path, min_frames: int) -> None:
+def check_input(detections: Detections, path: Path, min_frames: int) -> None:
     """Raise UserError for a recording from which no avatar can come.
 
     That is one which is black, shows no person, several, one cut off or not upright, or one whose pose is not known.
     """
-    if sightings.grays.max(axis=(1, 2)).max() < _BLACK_LEVEL:
+    if detections.gray_thumbnails.max(axis=(1, 2)).max() < _MAX_BLACK_LEVEL:
         raise UserError(f"all frames of {path} are black; give a recording in which the person can be seen")
     # Twice, because one frame may show a picture on a wall or a reflection.
-    crowded = sightings.frame_index[sightings.n_people > 1]
-    if len(crowded) >= 2:
+    multi_person_frames = detections.frame_index[detections.n_people > 1]
+    if len(multi_person_frames) >= 2:
         raise UserError(
-            f"{path} shows several people (for example in frame {crowded[0]}); "
+            f"{path} shows several people (for example in frame {multi_person_frames[0]}); "
             "give a recording of one person alone, or crop it to one"
         )
-    n_found, n_looked_at = int(sightings.found.sum()), len(sightings.found)
+    n_found, n_detection_frames = int(detections.found.sum()), len(detections.found)
     if n_found == 0:
         raise UserError(f"no person was found in {path}; the whole body should be visible and fill half of the height")
     if n_found < min_frames:
         raise UserError(
-            f"a person was found in only {n_found} of {n_looked_at} frames of {path}; {min_frames} are needed"
+            f"a person was found in only {n_found} of {n_detection_frames} frames of {path}; {min_frames} are needed"
         )
-    known = np.isfinite(sightings.landmarks_px).all(axis=-1) & np.isfinite(sightings.landmarks_world_m).all(axis=-1)
-    is_torso_known = sightings.found & known[:, TORSO].all(axis=1)
+    known = np.isfinite(detections.landmarks_px).all(axis=-1) & np.isfinite(detections.landmarks_world_m).all(axis=-1)
+    is_torso_known = detections.found & known[:, TORSO].all(axis=1)
     n_torso = int(is_torso_known.sum())
     if n_torso < min_frames:
         raise UserError(
@@ -57,73 +57,82 @@ def refuse_bad_input(sightings: Sightings, path: Path, min_frames: int) -> None:
             f"that show a person; {min_frames} are needed: film the whole body unoccluded, and where landmarks.npz is "
             "supplied, complete it or remove it"
         )
-    if not _stands_upright(sightings.landmarks_px[is_torso_known][:, TORSO]):
+    if not _is_upright(detections.landmarks_px[is_torso_known][:, TORSO]):
         raise UserError(
             f"the person in {path} lies on the side or stands upside down; turn the recording upright, a video for "
             "example with ffmpeg -i IN.mp4 -vf transpose=1 OUT.mp4 (a quarter turn clockwise)"
         )
-    judged = sightings.found & np.isfinite(sightings.landmarks_px[:, ANKLES, 1]).any(axis=1)
-    legs = legs_in_image(sightings.landmarks_px[judged], sightings.landmarks_visibility[judged], sightings.height)
+    has_ankle_landmarks = detections.found & np.isfinite(detections.landmarks_px[:, ANKLES, 1]).any(axis=1)
+    legs = is_ankle_visible(
+        detections.landmarks_px[has_ankle_landmarks],
+        detections.landmarks_visibility[has_ankle_landmarks],
+        detections.height,
+    )
     if np.sum(~legs) > 0.5 * len(legs):
-        first = sightings.frame_index[judged][~legs][0]
+        first = detections.frame_index[has_ankle_landmarks][~legs][0]
         raise UserError(
             f"the person in {path} is cut off above the feet in {np.sum(~legs)} of {len(legs)} frames "
             f"(frame {first} first); film the whole body from head to feet"
         )
 
 
-def _stands_upright(torso_px: Float[np.ndarray, "n 4 2"]) -> bool:
+def _is_upright(torso_px: Float[np.ndarray, "n 4 2"]) -> bool:
     """True when the spine points up in at least half of the frames; shoulders come before hips."""
     spine_px = torso_px[:, 2:].mean(axis=1) - torso_px[:, :2].mean(axis=1)
-    is_fallen = spine_px[:, 1] < _LEAST_UPRIGHT * np.linalg.norm(spine_px, axis=1)
+    is_fallen = spine_px[:, 1] < _MIN_UPRIGHT_COSINE * np.linalg.norm(spine_px, axis=1)
     return bool(is_fallen.mean() <= 0.5)
 
 
-def warn_of_gaps(sightings: Sightings, unseen_rad: float, path: Path) -> None:
+def warn_about_input(detections: Detections, unseen_arc_rad: float, path: Path) -> None:
     """Say what the run goes on without."""
-    missing = ~sightings.found
+    missing = ~detections.found
     if missing.any():
         warn(
             f"{missing.sum()} of {len(missing)} frames of {path} show no person and are dropped: "
-            f"{frame_ranges(sightings.frame_index, missing)}"
+            f"{format_frame_ranges(detections.frame_index, missing)}"
         )
-    lowest_px = np.fmax.reduce(sightings.landmarks_px[:, _FEET, 1], axis=1)
-    cropped = sightings.found & (lowest_px > (1.0 - _SOLE_SHARE) * sightings.height)
+    lowest_px = np.fmax.reduce(detections.landmarks_px[:, _FOOT_LANDMARKS, 1], axis=1)
+    cropped = detections.found & (lowest_px > (1.0 - _SOLE_HEIGHT_FRACTION) * detections.height)
     if cropped.any():
         warn(
             f"the feet are cut off in {cropped.sum()} frames of {path}; they will be less sharp in the avatar: "
-            f"{frame_ranges(sightings.frame_index, cropped)}"
+            f"{format_frame_ranges(detections.frame_index, cropped)}"
         )
-    person_px = float(np.median(sightings.persons[sightings.found].any(axis=2).mean(axis=1))) * sightings.height
-    if sightings.scale < 1.0 and person_px < _USEFUL_PERSON_PX:
-        wanted = min(1.0, sightings.scale * _USEFUL_PERSON_PX / person_px)
-        side_px = round(max(sightings.width, sightings.height) * wanted / sightings.scale)
+    person_px = float(np.median(detections.person_masks[detections.found].any(axis=2).mean(axis=1))) * detections.height
+    if detections.scale < 1.0 and person_px < _TARGET_PERSON_HEIGHT_PX:
+        target_scale = min(1.0, detections.scale * _TARGET_PERSON_HEIGHT_PX / person_px)
+        side_px = round(max(detections.width, detections.height) * target_scale / detections.scale)
         warn(
-            f"the person is {person_px / sightings.scale:.0f} px tall in {path} and {person_px:.0f} px in the smaller "
+            f"the person is {person_px / detections.scale:.0f} px tall in {path} and {person_px:.0f} px in the smaller "
             f"pictures that are kept; --set frames.max_side_px={side_px} keeps what the avatar can use"
         )
-    frame_index, differs = scene_changes(sightings)
-    if differs.sum() > _MOST_MOVED * len(differs):
+    frame_index, differs = sample_scene_changes(detections)
+    if differs.sum() > _MAX_MOVED_FRACTION * len(differs):
         warn(
-            f"the scene behind the person changes in {path} (frames {frame_ranges(frame_index, differs)}): the camera "
+            f"the scene behind the person changes in {path} (frames {format_frame_ranges(frame_index, differs)}): "
+            "the camera "
             "seems to move, or the light to change, which the avatar takes for motion and colour of the person; film "
             "again with the camera on something firm and its exposure locked"
         )
-    if unseen_rad > np.radians(_UNSEEN_ARC_DEG):
+    if unseen_arc_rad > np.radians(_MAX_UNSEEN_ARC_DEG):
         warn(
-            f"the person in {path} is never seen from {np.degrees(unseen_rad):.0f} degrees of the full turn; "
+            f"the person in {path} is never seen from {np.degrees(unseen_arc_rad):.0f} degrees of the full turn; "
             "that side will be guessed (film a full turn to see it)"
         )
 
 
-def scene_changes(sightings: Sightings) -> tuple[Int[np.ndarray, "k"], Bool[np.ndarray, "k"]]:
+def sample_scene_changes(detections: Detections) -> tuple[Int[np.ndarray, "k"], Bool[np.ndarray, "k"]]:
     """Some of the frames with a person, evenly spread, by their index: which of them show another scene than the rest.
 
     Small grey pictures: a camera that moves by a few of their pixels is seen where the scene has edges.
     """
-    found = np.flatnonzero(sightings.found)
-    taken = found[np.unique(np.linspace(0, len(found) - 1, _SCENE_PICTURES).astype(int))]
-    reach_px = round(_PERSON_MARGIN * max(sightings.grays.shape[1:]))
-    kernel = np.ones((2 * reach_px + 1, 2 * reach_px + 1), np.uint8)
-    near = np.stack([cv2.dilate(person.astype(np.uint8), kernel) > 0 for person in sightings.persons[taken]])
-    return sightings.frame_index[taken], scene_differs(sightings.grays[taken][..., None].repeat(3, axis=-1), near)
+    found = np.flatnonzero(detections.found)
+    sampled = found[np.unique(np.linspace(0, len(found) - 1, _N_SCENE_FRAMES).astype(int))]
+    margin_px = round(_PERSON_MARGIN_FRACTION * max(detections.gray_thumbnails.shape[1:]))
+    kernel = np.ones((2 * margin_px + 1, 2 * margin_px + 1), np.uint8)
+    dilated_masks = np.stack(
+        [cv2.dilate(person.astype(np.uint8), kernel) > 0 for person in detections.person_masks[sampled]]
+    )
+    return detections.frame_index[sampled], detect_scene_changes(
+        detections.gray_thumbnails[sampled][..., None].repeat(3, axis=-1), dilated_masks
+    )

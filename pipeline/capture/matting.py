@@ -12,43 +12,43 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from pipeline.capture.background_plate import Plate, covered
+from pipeline.capture.background_plate import BackgroundPlate, subtract_background
 
 # The detector's mask is a 256-cell grid over a square 1.25 times as high as the person.
-_CELLS_PER_PERSON = 256 / 1.25
+_MASK_CELLS_PER_PERSON_HEIGHT = 256 / 1.25
 # In cells: how far the detector's outline may be wrong, and how far away colours are gathered. Widths of 3 / 6 / 9 / 12
 # cells for the latter give IoU 0.983 / 0.985 / 0.985 / 0.984 on the green-screen capture.
-_BAND_CELLS, _COLOUR_CELLS = 3.0, 6.0
+_UNKNOWN_BAND_CELLS, _COLOUR_WINDOW_CELLS = 3.0, 6.0
 # Standard deviation (of 1) that no colour cloud goes below: rounding. Colours are averaged over cells before they are
 # gathered, so video noise is small there, and a white coat before a white wall needs every level.
 _COLOUR_NOISE = 1.0 / 255.0
 # How much the detector's word weighs, in the unit of a squared Mahalanobis distance: at its outline, and far from it.
-_PRIOR_AT_EDGE, _PRIOR_CERTAIN = 0.3, 10.0
+_PRIOR_WEIGHT_AT_EDGE, _PRIOR_WEIGHT_CERTAIN = 0.3, 10.0
 _PRIOR_RAMP = 0.2
 # A window this many times as wide counts this much besides, for it is all there is deep in a gap between arm and trunk.
-_FAR, _FAR_SHARE = 8, 0.01
+_WIDE_WINDOW_FACTOR, _WIDE_WINDOW_WEIGHT = 8, 0.01
 # A cloud counts from this mean weight on: a tenth of the wide window.
-_LEAST_WEIGHT = 1e-3
+_MIN_SAMPLE_WEIGHT = 1e-3
 # A backdrop is painted when this share of the pixels away from the person is within two levels of one colour.
-_PAINTED_SHARE, _PAINTED_LEVELS = 0.95, 2
+_MIN_UNIFORM_FRACTION, _UNIFORM_TOLERANCE_LEVELS = 0.95, 2
 # Where the detector is this sure, a colour belongs to the person even when the first round said otherwise. Without that
 # a white hem before a white wall is lost (synthetic captures: IoU median and worst 0.978, 0.945; with it 0.991, 0.959).
-_SURE = 0.97
+_CONFIDENT_MASK_VALUE = 0.97
 # The rim reaches as far to each side as the picture itself is soft there: this many standard deviations of its blur.
-_LEAST_RIM_PX, _RIM_PER_BLUR = 1.0, 2.0
+_MIN_RIM_PX, _RIM_PER_BLUR = 1.0, 2.0
 # Blur is told by blurring again, this much; along this many cells of the outline to each side. A sharp outline looks
 # blurred by this variance (px^2), by the area of a pixel and the gradient's own smoothing.
-_REBLUR_PX, _BLUR_CELLS, _OWN_BLUR = 1.5, 9.0, 0.95
+_REBLUR_PX, _BLUR_CELLS, _INTRINSIC_BLUR_VARIANCE_PX2 = 1.5, 9.0, 0.95
 # Colours at least this far from the soft rim are the person's or the backdrop's alone: lens and codec mix them over a
 # wider strip than alpha tells. Nearer ones are likelier to be those of the rim, see docs/decisions.md.
-_PERSON_CLEAR_PX, _BACKDROP_CLEAR_PX = 1.0, 2.5
+_FOREGROUND_MARGIN_PX, _BACKGROUND_MARGIN_PX = 1.0, 2.5
 # Level of 255 from which the detector sees a trace of the person.
-_TRACE = 25
+_MIN_TRACE_LEVEL = 25
 # Parts smaller than this share of the person are specks, holes smaller than this share are noise.
-_SPECK_SHARE, _HOLE_SHARE = 0.05, 2e-4
+_MIN_COMPONENT_FRACTION, _MAX_HOLE_FRACTION = 0.05, 2e-4
 
 
-class _Cloud(NamedTuple):
+class _ColourDistribution(NamedTuple):
     """Colours around each grid point: mean weight, mean and covariance (xx, xy, xz, yy, yz, zz)."""
 
     weight: Float[np.ndarray, "h w"]
@@ -56,8 +56,8 @@ class _Cloud(NamedTuple):
     covariance: Float[np.ndarray, "h w 6"]
 
 
-def sharpen_mask(
-    rgb: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"], plate: Plate | None = None
+def estimate_alpha_matte(
+    rgb: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"], plate: BackgroundPlate | None = None
 ) -> Float[np.ndarray, "h w"]:
     """Alpha with the image's own edges from a soft mask (0..255) that is smooth where the image is sharp.
 
@@ -70,22 +70,31 @@ def sharpen_mask(
     """
     if not (mask > 127).any():
         return np.zeros(mask.shape, dtype=np.float32)
-    window = _window(mask > _TRACE, margin_px=round((_BAND_CELLS + 2 * _COLOUR_CELLS) * _cell_px(mask > 127)) + 2)
+    window = _bounding_slices(
+        mask > _MIN_TRACE_LEVEL,
+        margin_px=round((_UNKNOWN_BAND_CELLS + 2 * _COLOUR_WINDOW_CELLS) * _mask_cell_px(mask > 127)) + 2,
+    )
     image = rgb[window].astype(np.float32) / 255.0
-    guess = mask[window].astype(np.float32) / 255.0
-    cell_px = _cell_px(guess > 0.5)
-    reach = _grown(guess > 0.5, _BAND_CELLS * cell_px)
-    certain = np.zeros_like(reach) if plate is None else covered(rgb[window], plate.window(*window), reach)
-    alpha = guess
+    coarse_alpha = mask[window].astype(np.float32) / 255.0
+    cell_px = _mask_cell_px(coarse_alpha > 0.5)
+    unknown_band = _dilate(coarse_alpha > 0.5, _UNKNOWN_BAND_CELLS * cell_px)
+    definite_foreground = (
+        np.zeros_like(unknown_band)
+        if plate is None
+        else subtract_background(rgb[window], plate.window(*window), unknown_band)
+    )
+    alpha = coarse_alpha
     for _ in range(2):
-        alpha = np.where(reach, np.maximum(_recolour(image, alpha, guess, cell_px), certain), 0.0).astype(np.float32)
-    whole = np.zeros(mask.shape, dtype=np.float32)
-    rim_px = np.maximum(_RIM_PER_BLUR * outline_blur_px(image, alpha > 0.5, _BLUR_CELLS * cell_px), _LEAST_RIM_PX)
-    whole[window] = clean_alpha(alpha, np.minimum(rim_px, _BAND_CELLS * cell_px))
-    return whole
+        alpha = np.where(
+            unknown_band, np.maximum(_update_alpha(image, alpha, coarse_alpha, cell_px), definite_foreground), 0.0
+        ).astype(np.float32)
+    full_alpha = np.zeros(mask.shape, dtype=np.float32)
+    rim_px = np.maximum(_RIM_PER_BLUR * estimate_edge_blur_px(image, alpha > 0.5, _BLUR_CELLS * cell_px), _MIN_RIM_PX)
+    full_alpha[window] = clean_alpha_matte(alpha, np.minimum(rim_px, _UNKNOWN_BAND_CELLS * cell_px))
+    return full_alpha
 
 
-def outline_blur_px(
+def estimate_edge_blur_px(
     image: Float[np.ndarray, "h w 3"], body: Bool[np.ndarray, "h w"], window_px: float
 ) -> Float[np.ndarray, "h w"]:
     """How blurred the picture is at the outline near each pixel: standard deviation of a Gaussian, in px.
@@ -94,13 +103,13 @@ def outline_blur_px(
     (after Zhuo and Sim, "Defocus map estimation from a single image", 2011). Both energies are gathered along the
     outline in squares of half width `window_px`, so that strong edges speak for weak ones; 0 far from them.
     """
-    line, side = _grown(outline(body), 1.0).astype(np.float32), 2 * round(window_px) + 1
+    line, side = _dilate(inner_boundary(body), 1.0).astype(np.float32), 2 * round(window_px) + 1
     sharp, soft = (
         cv2.blur(line * _squared_gradient(picture), (side, side))
         for picture in (image, cv2.GaussianBlur(image, (0, 0), _REBLUR_PX))
     )
     excess = np.maximum(sharp - soft, 1e-6)
-    return np.sqrt(np.maximum(_REBLUR_PX**2 * soft / excess - _OWN_BLUR, 0.0)).astype(np.float32)
+    return np.sqrt(np.maximum(_REBLUR_PX**2 * soft / excess - _INTRINSIC_BLUR_VARIANCE_PX2, 0.0)).astype(np.float32)
 
 
 def _squared_gradient(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
@@ -109,21 +118,23 @@ def _squared_gradient(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h
     return cv2.transform(squares, np.ones((1, 3), dtype=np.float32))
 
 
-def clean_alpha(
-    alpha: Float[np.ndarray, "h w"], rim_px: float | Float[np.ndarray, "h w"] = _LEAST_RIM_PX
+def clean_alpha_matte(
+    alpha: Float[np.ndarray, "h w"], rim_px: float | Float[np.ndarray, "h w"] = _MIN_RIM_PX
 ) -> Float[np.ndarray, "h w"]:
     """Drop specks and pinholes; 1 inside and 0 outside except up to `rim_px` from the outline, where alpha stays soft.
 
     Gaps that are larger than noise (between arm and body) stay; parts cut off from the person stay when they are large.
     """
-    body = _largest_parts(alpha > 0.5)
-    body = ~_without_specks(~body, _HOLE_SHARE * body.sum())
-    outer, inner = _grown(body, rim_px), ~_grown(~body, rim_px)
+    body = _large_components(alpha > 0.5)
+    body = ~_remove_small_components(~body, _MAX_HOLE_FRACTION * body.sum())
+    outer, inner = _dilate(body, rim_px), ~_dilate(~body, rim_px)
     soft = np.where(body, np.maximum(alpha, 0.5), np.minimum(alpha, 0.5))
     return np.where(inner, 1.0, np.where(outer, soft, 0.0)).astype(np.float32)
 
 
-def without_backdrop(rgb: UInt8[np.ndarray, "h w 3"], alpha: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+def decontaminate_colours(
+    rgb: UInt8[np.ndarray, "h w 3"], alpha: UInt8[np.ndarray, "h w"]
+) -> UInt8[np.ndarray, "h w 3"]:
     """The picture in which the person's colour takes the backdrop's share of every soft pixel (alpha from 1 to 254).
 
     With F' and B', the colours of the nearest pixels surely inside and surely outside, such a pixel becomes
@@ -133,22 +144,27 @@ def without_backdrop(rgb: UInt8[np.ndarray, "h w 3"], alpha: UInt8[np.ndarray, "
     soft = (alpha > 0) & (alpha < 255)
     if not soft.any():
         return rgb
-    window = _window(alpha > 0, margin_px=8)
+    window = _bounding_slices(alpha > 0, margin_px=8)
     sides = [
-        ~_grown(mixed, clear_px)
-        for mixed, clear_px in ((alpha[window] < 255, _PERSON_CLEAR_PX), (alpha[window] > 0, _BACKDROP_CLEAR_PX))
+        ~_dilate(mixed, clear_px)
+        for mixed, clear_px in (
+            (alpha[window] < 255, _FOREGROUND_MARGIN_PX),
+            (alpha[window] > 0, _BACKGROUND_MARGIN_PX),
+        )
     ]
     if not all(side.any() for side in sides):
         return rgb
     soft = soft[window]
-    person, backdrop = (rgb[window].reshape(-1, 3)[_nearest(side)[soft]].astype(np.float32) for side in sides)
+    person, backdrop = (
+        rgb[window].reshape(-1, 3)[_nearest_pixel_index(side)[soft]].astype(np.float32) for side in sides
+    )
     share = 1.0 - alpha[window][soft, None] / np.float32(255.0)
     result = rgb.copy()
     result[window][soft] = np.rint(np.clip(rgb[window][soft] + share * (person - backdrop), 0.0, 255.0))
     return result
 
 
-def shrink(
+def resize_premultiplied(
     image: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"], size: tuple[int, int]
 ) -> tuple[Float[np.ndarray, "h2 w2 3"], Float[np.ndarray, "h2 w2"]]:
     """Picture and alpha at another size (columns, rows), averaged over areas.
@@ -161,7 +177,9 @@ def shrink(
     return premultiplied / np.maximum(reduced, np.float32(1e-6))[..., None], reduced
 
 
-def with_painted_backdrop(rgb: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
+def extend_mask_on_uniform_background(
+    rgb: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"]
+) -> UInt8[np.ndarray, "h w"]:
     """The mask with what it misses of a person in front of one painted colour (a recording that is matted already).
 
     Only when nearly all pixels away from the person have that colour exactly, as no camera sees it; then whatever has
@@ -170,23 +188,23 @@ def with_painted_backdrop(rgb: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarra
     body = mask > 127
     if not body.any():
         return mask
-    cell_px = _cell_px(body)
-    near = _grown(body, _BAND_CELLS * cell_px)
-    away = rgb[~_grown(body, 2 * _BAND_CELLS * cell_px)]
+    cell_px = _mask_cell_px(body)
+    near = _dilate(body, _UNKNOWN_BAND_CELLS * cell_px)
+    away = rgb[~_dilate(body, 2 * _UNKNOWN_BAND_CELLS * cell_px)]
     if len(away) == 0:
         return mask
     backdrop = np.median(away, axis=0)
-    painted = (np.abs(rgb.astype(np.int16) - backdrop.astype(np.int16)) <= _PAINTED_LEVELS).all(axis=-1)
-    if painted[~near].mean() < _PAINTED_SHARE:
+    painted = (np.abs(rgb.astype(np.int16) - backdrop.astype(np.int16)) <= _UNIFORM_TOLERANCE_LEVELS).all(axis=-1)
+    if painted[~near].mean() < _MIN_UNIFORM_FRACTION:
         return mask
     support = cv2.morphologyEx((~painted).astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)) > 0
     _, labels = cv2.connectedComponents((support | body).astype(np.uint8), connectivity=8)
     attached = support & np.isin(labels, np.unique(labels[body]))
-    beyond = _grown(attached & ~near, 2 * _BAND_CELLS * cell_px)
+    beyond = _dilate(attached & ~near, 2 * _UNKNOWN_BAND_CELLS * cell_px)
     return np.where(attached & beyond, np.uint8(255), mask)
 
 
-def steady_mask(
+def smooth_mask_temporally(
     images: UInt8[np.ndarray, "t h w 3"], masks: UInt8[np.ndarray, "t h w"], centre: int, noise: float
 ) -> UInt8[np.ndarray, "h w"]:
     """The mask at time `centre`, averaged with those of other times where the image is the same there.
@@ -207,24 +225,24 @@ def steady_mask(
     return np.rint(total / weights).astype(np.uint8)
 
 
-def beyond_doubt_outside(mask: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+def definite_background(mask: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Where even a soft mask's outermost rim, and half a cell around it, shows no person."""
-    seen = mask > _TRACE
-    return ~_grown(seen, 0.5 * _cell_px(seen)) if seen.any() else ~seen
+    seen = mask > _MIN_TRACE_LEVEL
+    return ~_dilate(seen, 0.5 * _mask_cell_px(seen)) if seen.any() else ~seen
 
 
-def outline(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+def inner_boundary(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """The mask's pixels that touch its outside."""
     return mask & (cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
 
 
-def _cell_px(person: Bool[np.ndarray, "h w"]) -> float:
+def _mask_cell_px(person: Bool[np.ndarray, "h w"]) -> float:
     """Size of the detector's grid cell in pixels of this image, at least one."""
     rows = np.flatnonzero(person.any(axis=1))
-    return max(1.0, float(rows[-1] - rows[0] + 1) / _CELLS_PER_PERSON)
+    return max(1.0, float(rows[-1] - rows[0] + 1) / _MASK_CELLS_PER_PERSON_HEIGHT)
 
 
-def _window(mask: Bool[np.ndarray, "h w"], margin_px: int) -> tuple[slice, slice]:
+def _bounding_slices(mask: Bool[np.ndarray, "h w"], margin_px: int) -> tuple[slice, slice]:
     """Rows and columns of the mask's box with a margin, inside the image."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     return (
@@ -233,36 +251,37 @@ def _window(mask: Bool[np.ndarray, "h w"], margin_px: int) -> tuple[slice, slice
     )
 
 
-def _recolour(
+def _update_alpha(
     image: Float[np.ndarray, "h w 3"],
     alpha: Float[np.ndarray, "h w"],
-    guess: Float[np.ndarray, "h w"],
+    coarse_alpha: Float[np.ndarray, "h w"],
     cell_px: float,
 ) -> Float[np.ndarray, "h w"]:
-    """One round of `sharpen_mask`: new alpha from the clouds that the old alpha separates, and the detector's guess.
+    """One round of `estimate_alpha_matte`: new alpha from the clouds that the old alpha separates, and the detector's
+    guess.
 
     The clouds are smooth, so they and the discriminant are found on a grid as coarse as the detector's, then enlarged.
     """
     height, width = alpha.shape
     small = (max(1, round(width / cell_px)), max(1, round(height / cell_px)))
-    radius = round(_COLOUR_CELLS)
-    inside = np.maximum(alpha, guess > _SURE)
-    person = _gather(image, np.clip(2.0 * inside - 1.0, 0.0, 1.0) ** 2, small, radius)
-    background = _gather(image, np.clip(1.0 - 2.0 * alpha, 0.0, 1.0) ** 2, small, 2 * radius)
+    radius = round(_COLOUR_WINDOW_CELLS)
+    inside = np.maximum(alpha, coarse_alpha > _CONFIDENT_MASK_VALUE)
+    person = _local_colour_distribution(image, np.clip(2.0 * inside - 1.0, 0.0, 1.0) ** 2, small, radius)
+    background = _local_colour_distribution(image, np.clip(1.0 - 2.0 * alpha, 0.0, 1.0) ** 2, small, 2 * radius)
     direction, offset, certainty = (
         cv2.resize(field, (width, height), interpolation=cv2.INTER_LINEAR)
-        for field in _discriminant(person, background)
+        for field in _fisher_discriminant(person, background)
     )
     position = cv2.transform(image * direction, np.ones((1, 3), dtype=np.float32)) - offset
-    prior = np.clip((guess - 0.5) / (2.0 * _PRIOR_RAMP) + 0.5, 0.0, 1.0)
-    prior_weight = _PRIOR_AT_EDGE + _PRIOR_CERTAIN * (2.0 * guess - 1.0) ** 2
+    prior = np.clip((coarse_alpha - 0.5) / (2.0 * _PRIOR_RAMP) + 0.5, 0.0, 1.0)
+    prior_weight = _PRIOR_WEIGHT_AT_EDGE + _PRIOR_WEIGHT_CERTAIN * (2.0 * coarse_alpha - 1.0) ** 2
     total = certainty * np.clip(position, -0.2, 1.2) + prior_weight * prior
     return np.clip(total / (certainty + prior_weight), 0.0, 1.0)
 
 
-def _gather(
+def _local_colour_distribution(
     image: Float[np.ndarray, "h w 3"], weight: Float[np.ndarray, "h w"], small: tuple[int, int], radius: int
-) -> _Cloud:
+) -> _ColourDistribution:
     """Weighted mean and covariance of the colours in a square window around each point of a coarse grid, and a little
     of those in a wider one.
 
@@ -274,24 +293,26 @@ def _gather(
     weighted = cv2.resize(image * weight[..., None], small, interpolation=cv2.INTER_AREA)
     colour = weighted / (share[..., None] + 1e-6)
 
-    def windowed(values: np.ndarray) -> np.ndarray:
+    def box_filter(values: np.ndarray) -> np.ndarray:
         near, far = (
-            cv2.blur(values, (2 * reach + 1, 2 * reach + 1), borderType=cv2.BORDER_CONSTANT)
-            for reach in (radius, _FAR * radius)
+            cv2.blur(values, (2 * unknown_band + 1, 2 * unknown_band + 1), borderType=cv2.BORDER_CONSTANT)
+            for unknown_band in (radius, _WIDE_WINDOW_FACTOR * radius)
         )
-        return near + np.float32(_FAR_SHARE) * far
+        return near + np.float32(_WIDE_WINDOW_WEIGHT) * far
 
     first, second = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
-    total = windowed(share)
+    total = box_filter(share)
     scale = (1.0 / (total + 1e-6))[..., None]
-    mean = windowed(weighted) * scale
+    mean = box_filter(weighted) * scale
     products = weighted[..., first] * colour[..., second]
-    square = np.concatenate([windowed(products[..., :3].copy()), windowed(products[..., 3:].copy())], axis=2) * scale
-    return _Cloud(total, mean, square - mean[..., first] * mean[..., second])
+    square = (
+        np.concatenate([box_filter(products[..., :3].copy()), box_filter(products[..., 3:].copy())], axis=2) * scale
+    )
+    return _ColourDistribution(total, mean, square - mean[..., first] * mean[..., second])
 
 
-def _discriminant(
-    person: _Cloud, background: _Cloud
+def _fisher_discriminant(
+    person: _ColourDistribution, background: _ColourDistribution
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
     """Fisher's linear discriminant of two colour clouds, for each grid point: direction, offset, certainty.
 
@@ -300,18 +321,18 @@ def _discriminant(
     clouds (0 where one of them is empty).
     """
     pooled = person.covariance + background.covariance
-    spread = pooled[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(*pooled.shape[:2], 3, 3).astype(np.float64)
-    spread += np.eye(3) * _COLOUR_NOISE**2
+    pooled_scatter = pooled[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(*pooled.shape[:2], 3, 3).astype(np.float64)
+    pooled_scatter += np.eye(3) * _COLOUR_NOISE**2
     difference = (person.mean - background.mean).astype(np.float64)
-    w = np.linalg.solve(spread, difference[..., None])[..., 0]
+    w = np.linalg.solve(pooled_scatter, difference[..., None])[..., 0]
     certainty = (w * difference).sum(axis=-1)
     direction = w / np.maximum(certainty, 1e-6)[..., None]
     offset = (direction * background.mean).sum(axis=-1)
-    certainty = np.where(np.minimum(person.weight, background.weight) > _LEAST_WEIGHT, certainty, 0.0)
+    certainty = np.where(np.minimum(person.weight, background.weight) > _MIN_SAMPLE_WEIGHT, certainty, 0.0)
     return direction.astype(np.float32), offset.astype(np.float32), certainty.astype(np.float32)
 
 
-def _nearest(wanted: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "h w"]:
+def _nearest_pixel_index(wanted: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "h w"]:
     """For every pixel the number, row by row, of the nearest wanted one."""
     _, labels = cv2.distanceTransformWithLabels(
         (~wanted).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
@@ -321,16 +342,16 @@ def _nearest(wanted: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "h w"]:
     return place[labels]
 
 
-def _largest_parts(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+def _large_components(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """The largest connected part and every other that is not small beside it."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     if count == 1:
         return mask
     areas = stats[1:, cv2.CC_STAT_AREA]
-    return np.concatenate([[False], areas >= _SPECK_SHARE * areas.max()])[labels]
+    return np.concatenate([[False], areas >= _MIN_COMPONENT_FRACTION * areas.max()])[labels]
 
 
-def _without_specks(mask: Bool[np.ndarray, "h w"], smallest_area_px: float) -> Bool[np.ndarray, "h w"]:
+def _remove_small_components(mask: Bool[np.ndarray, "h w"], smallest_area_px: float) -> Bool[np.ndarray, "h w"]:
     """The connected parts that have at least this area."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     keep = stats[:, cv2.CC_STAT_AREA] >= smallest_area_px
@@ -338,7 +359,7 @@ def _without_specks(mask: Bool[np.ndarray, "h w"], smallest_area_px: float) -> B
     return keep[labels]
 
 
-def _grown(mask: Bool[np.ndarray, "h w"], radius_px: float | Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+def _dilate(mask: Bool[np.ndarray, "h w"], radius_px: float | Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """All pixels within a distance of the mask; by distance transform, which takes no longer for a larger radius."""
     if not mask.any():
         return mask.copy()

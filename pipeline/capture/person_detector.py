@@ -27,19 +27,19 @@ LANDMARK_NAMES = (
 )  # fmt: skip
 TORSO = (11, 12, 23, 24)
 KNEES, ANKLES = (25, 26), (27, 28)
-SKELETON = (
+POSE_CONNECTIONS = (
     (11, 12), (11, 23), (12, 24), (23, 24), (11, 13), (13, 15), (12, 14), (14, 16), (15, 19), (16, 20),
     (23, 25), (25, 27), (24, 26), (26, 28), (27, 31), (28, 32), (27, 29), (28, 30), (0, 11), (0, 12),
 )  # fmt: skip
 
 # Two detections are two people when their masks share less than this part of the smaller one. On the four test captures
 # with one person the crops' masks share at least 0.5, on the one with three people 0.00.
-_SEPARATE_OVERLAP = 0.2
-_SURE_TORSO_VISIBILITY = 0.9
-_SAME_SIZE = 0.3
+_MAX_OVERLAP_BETWEEN_PEOPLE = 0.2
+_MIN_TORSO_VISIBILITY = 0.9
+_MIN_RELATIVE_AREA = 0.3
 
 # MediaPipe's own graphs smooth the squares over the frames they have seen; these two look at each frame by itself.
-_SQUARE_GRAPH = """
+_ROI_DETECTION_GRAPH = """
 input_stream: "image"
 output_stream: "square"
 node { calculator: "PoseDetectionCpu" input_stream: "IMAGE:image" output_stream: "DETECTIONS:detections" }
@@ -92,17 +92,17 @@ node {
   output_stream: "IMAGE_CPU:mask"
 }
 """
-_MODEL = {"model_complexity": 1, "enable_segmentation": True}
+_LANDMARK_MODEL_OPTIONS = {"model_complexity": 1, "enable_segmentation": True}
 # Looks for a square that holds the person; it grows by 10 to 20 % a look.
-_MOST_LOOKS = 3
+_MAX_ROI_ITERATIONS = 3
 # A square is too small when the landmarks ask for one this much larger, though the mask keeps off its border: a mask
 # that has lost the feet does.
-_MOST_GROWTH = 1.1
-_CELLS_PER_SQUARE = 256
+_MAX_ROI_GROWTH = 1.1
+_BORDER_SAMPLES_PER_SIDE = 256
 
 
 @dataclass(frozen=True)
-class Detection:
+class PersonDetection:
     """One person in one image. Landmarks may lie outside of the image where the model guesses."""
 
     landmarks_px: Float[np.ndarray, "33 2"]
@@ -111,7 +111,7 @@ class Detection:
     mask: UInt8[np.ndarray, "h w"]
 
 
-class _Look(NamedTuple):
+class _RoiEstimate(NamedTuple):
     """What the second model says about a square; `landmarks` are pixels and visibility, squares NormalizedRects."""
 
     landmarks: Float[np.ndarray, "33 3"]
@@ -125,51 +125,51 @@ class PersonDetector:
     """MediaPipe's pose model in its middle size; about 65 ms an image on one core, whatever the image's size."""
 
     def __init__(self) -> None:
-        with quiet_stderr():
+        with suppress_stderr():
             from mediapipe.python.solutions.pose import SolutionBase  # here: takes seconds and writes to stderr
 
-            self._guess_square = SolutionBase(graph_config=_SQUARE_GRAPH)
-            self._in_square = SolutionBase(graph_config=_LANDMARKS_GRAPH, side_inputs=_MODEL)
-            self._guess_square.process(np.zeros((64, 64, 3), dtype=np.uint8))
-        self._has_spoken = False
+            self._roi_graph = SolutionBase(graph_config=_ROI_DETECTION_GRAPH)
+            self._landmark_graph = SolutionBase(graph_config=_LANDMARKS_GRAPH, side_inputs=_LANDMARK_MODEL_OPTIONS)
+            self._roi_graph.process(np.zeros((64, 64, 3), dtype=np.uint8))
+        self._is_stderr_quiet = False
 
-    def detect(self, rgb: UInt8[np.ndarray, "h w 3"]) -> Detection | None:
+    def detect(self, rgb: UInt8[np.ndarray, "h w 3"]) -> PersonDetection | None:
         """The most prominent person, or None.
 
         Landmarks in pixels (centres at +0.5) with visibility in [0, 1]; world landmarks in metres about the hips'
         centre, in camera axes (x right, y down, z away). The mask is soft, 0..255, and smooth at the scale of about
         1/200 of the person's height, where the model's own grid ends.
         """
-        with nullcontext() if self._has_spoken else quiet_stderr():
-            looks = self._looks(rgb)
-        if not looks:
+        with nullcontext() if self._is_stderr_quiet else suppress_stderr():
+            estimates = self._estimate_in_successive_rois(rgb)
+        if not estimates:
             return None
-        self._has_spoken = True
-        points = np.mean([look.landmarks for look in looks], axis=0)
-        world = np.mean([look.landmarks_world_m for look in looks], axis=0)
-        mask = np.mean([look.mask for look in looks], axis=0)
-        return Detection(points[:, :2].copy(), points[:, 2].copy(), world, np.rint(255.0 * mask).astype(np.uint8))
+        self._is_stderr_quiet = True
+        points = np.mean([estimate.landmarks for estimate in estimates], axis=0)
+        world = np.mean([estimate.landmarks_world_m for estimate in estimates], axis=0)
+        mask = np.mean([estimate.mask for estimate in estimates], axis=0)
+        return PersonDetection(points[:, :2].copy(), points[:, 2].copy(), world, np.rint(255.0 * mask).astype(np.uint8))
 
-    def _looks(self, rgb: UInt8[np.ndarray, "h w 3"]) -> list[_Look]:
+    def _estimate_in_successive_rois(self, rgb: UInt8[np.ndarray, "h w 3"]) -> list[_RoiEstimate]:
         """The look in the first square that holds the most prominent person, and the one in the square it asks for."""
-        last, following = None, self._look(rgb, self._guess_square.process(rgb).square)
-        for _ in range(_MOST_LOOKS):
-            if following is None or (last is not None and not is_too_small(last)):
+        previous, current = None, self._estimate_in_roi(rgb, self._roi_graph.process(rgb).square)
+        for _ in range(_MAX_ROI_ITERATIONS):
+            if current is None or (previous is not None and not is_roi_too_small(previous)):
                 break
-            last, following = following, self._look(rgb, following.next_square)
-        return [look for look in (last, following) if look is not None]
+            previous, current = current, self._estimate_in_roi(rgb, current.next_square)
+        return [estimate for estimate in (previous, current) if estimate is not None]
 
-    def _look(self, rgb: UInt8[np.ndarray, "h w 3"], square: Any) -> _Look | None:
+    def _estimate_in_roi(self, rgb: UInt8[np.ndarray, "h w 3"], square: Any) -> _RoiEstimate | None:
         """The second model's word on what is in a square; None without a square or a person in it."""
         if square is None:
             return None
-        found = self._in_square.process({"image": rgb, "square": square})
+        found = self._landmark_graph.process({"image": rgb, "square": square})
         if found.landmarks is None or found.mask is None:
             return None
         size = np.array([rgb.shape[1], rgb.shape[0], 1.0], np.float32)
         points = np.array([(p.x, p.y, p.visibility) for p in found.landmarks.landmark], np.float32) * size
         world = np.array([(p.x, p.y, p.z) for p in found.world_landmarks.landmark], np.float32)
-        return _Look(points, world, np.clip(found.mask, 0.0, 1.0), square, found.next_square)
+        return _RoiEstimate(points, world, np.clip(found.mask, 0.0, 1.0), square, found.next_square)
 
     def count_people(self, rgb: UInt8[np.ndarray, "h w 3"]) -> int:
         """How many people of similar size are in the image.
@@ -180,38 +180,45 @@ class PersonDetector:
         people: list[Bool[np.ndarray, "h w"]] = []
         for left, top, right, bottom in _crops(*rgb.shape[:2]):
             found = self.detect(np.ascontiguousarray(rgb[top:bottom, left:right]))
-            if found is None or found.visibility[list(TORSO)].min() < _SURE_TORSO_VISIBILITY:
+            if found is None or found.visibility[list(TORSO)].min() < _MIN_TORSO_VISIBILITY:
                 continue
             mask = np.zeros(rgb.shape[:2], dtype=bool)
             mask[top:bottom, left:right] = found.mask > 127
-            if all(_overlap(mask, other) < _SEPARATE_OVERLAP for other in people):
+            if all(_overlap_coefficient(mask, other) < _MAX_OVERLAP_BETWEEN_PEOPLE for other in people):
                 people.append(mask)
         largest = max((mask.sum() for mask in people), default=0)
-        return sum(bool(mask.sum() > _SAME_SIZE * largest) for mask in people)
+        return sum(bool(mask.sum() > _MIN_RELATIVE_AREA * largest) for mask in people)
 
 
-def is_too_small(look: _Look) -> bool:
+def is_roi_too_small(estimate: _RoiEstimate) -> bool:
     """True where the square has cut the person: the mask touches its border, or the landmarks ask for a larger one."""
-    return look.next_square.height > _MOST_GROWTH * look.square.height or runs_over(look.mask > 0.5, look.square)
+    return estimate.next_square.height > _MAX_ROI_GROWTH * estimate.square.height or touches_roi_border(
+        estimate.mask > 0.5, estimate.square
+    )
 
 
-def runs_over(person: Bool[np.ndarray, "h w"], square: Any) -> bool:
+def touches_roi_border(person: Bool[np.ndarray, "h w"], square: Any) -> bool:
     """True where the person touches the border of a rotated square inside the image.
 
     square: centre, width and height relative to the image's, rotation in radians (MediaPipe's NormalizedRect).
     """
     size = np.array(person.shape[::-1])
-    along = (np.arange(_CELLS_PER_SQUARE) + 0.5) / _CELLS_PER_SQUARE - 0.5
-    edge = np.full_like(along, along[-1])
-    sides = [np.stack(side, axis=1) for side in ((along, edge), (along, -edge), (edge, along), (-edge, along))]
+    border_offsets = (np.arange(_BORDER_SAMPLES_PER_SIDE) + 0.5) / _BORDER_SAMPLES_PER_SIDE - 0.5
+    edge = np.full_like(border_offsets, border_offsets[-1])
+    sides = [
+        np.stack(side, axis=1)
+        for side in ((border_offsets, edge), (border_offsets, -edge), (edge, border_offsets), (-edge, border_offsets))
+    ]
     cosine, sine = np.cos(square.rotation), np.sin(square.rotation)
-    turned = np.concatenate(sides) * (square.width, square.height) * size @ np.array([[cosine, sine], [-sine, cosine]])
-    pixel = np.floor(turned + size * (square.x_center, square.y_center)).astype(int)
+    rotated_px = (
+        np.concatenate(sides) * (square.width, square.height) * size @ np.array([[cosine, sine], [-sine, cosine]])
+    )
+    pixel = np.floor(rotated_px + size * (square.x_center, square.y_center)).astype(int)
     column, row = pixel[((pixel >= 0) & (pixel < size)).all(axis=1)].T
     return bool(person[row, column].any())
 
 
-def legs_in_image(
+def is_ankle_visible(
     landmarks_px: Float[np.ndarray, "n 33 2"], visibility: Float[np.ndarray, "n 33"], height_px: int
 ) -> Bool[np.ndarray, "n"]:
     """True where an ankle can be seen: inside the image, and at least possibly visible.
@@ -230,23 +237,23 @@ def _crops(height: int, width: int) -> Iterator[tuple[int, int, int, int]]:
         side = int(min(height, width) * share)
         if side == max(height, width):
             continue
-        for top in _starts(height, side):
-            for left in _starts(width, side):
+        for top in _crop_offsets(height, side):
+            for left in _crop_offsets(width, side):
                 yield left, top, left + side, top + side
 
 
-def _starts(length: int, side: int) -> list[int]:
+def _crop_offsets(length: int, side: int) -> list[int]:
     count = int(np.ceil((length - side) / (0.5 * side))) + 1
     return [int(start) for start in np.linspace(0, length - side, count)]
 
 
-def _overlap(first: Bool[np.ndarray, "h w"], second: Bool[np.ndarray, "h w"]) -> float:
+def _overlap_coefficient(first: Bool[np.ndarray, "h w"], second: Bool[np.ndarray, "h w"]) -> float:
     """Shared area over the smaller area."""
     return float((first & second).sum() / max(1, min(first.sum(), second.sum())))
 
 
 @contextmanager
-def quiet_stderr() -> Iterator[None]:
+def suppress_stderr() -> Iterator[None]:
     """Keep the C++ libraries' notes, at loading and at the first person, off the terminal.
 
     They write to the descriptor itself.
@@ -254,12 +261,12 @@ def quiet_stderr() -> Iterator[None]:
     os.environ.setdefault("GLOG_minloglevel", "2")
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
     sys.stderr.flush()
-    kept = os.dup(2)
-    null = os.open(os.devnull, os.O_WRONLY)
+    saved_fd = os.dup(2)
+    devnull_fd = os.open(os.devnull, os.O_WRONLY)
     try:
-        os.dup2(null, 2)
+        os.dup2(devnull_fd, 2)
         yield
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(null)
+        os.dup2(saved_fd, 2)
+        os.close(saved_fd)
+        os.close(devnull_fd)

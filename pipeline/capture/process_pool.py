@@ -12,13 +12,13 @@ from typing import Any, TypeVar
 
 import cv2
 
-from pipeline.core.measure import count_workers
+from pipeline.core.measure import record_worker_peaks
 
 Result = TypeVar("Result")
-_WAITING_PER_WORKER = 3
+_MAX_PENDING_PER_WORKER = 3
 
 
-class Workers:
+class ProcessPool:
     """Runs functions in other processes, or in this one when `executor` is None."""
 
     def __init__(self, executor: ProcessPoolExecutor | None, count: int) -> None:
@@ -31,41 +31,41 @@ class Workers:
             for task in tasks:
                 yield function(*task)
             return
-        waiting: deque[Future[Result]] = deque()
+        pending: deque[Future[Result]] = deque()
         for task in tasks:
-            waiting.append(self._executor.submit(function, *task))
-            if len(waiting) >= _WAITING_PER_WORKER * self._count:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
+            pending.append(self._executor.submit(function, *task))
+            if len(pending) >= _MAX_PENDING_PER_WORKER * self._count:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
 
 
 @contextmanager
-def start_workers(count: int) -> Iterator[Workers]:
+def start_process_pool(count: int) -> Iterator[ProcessPool]:
     """Start `count` processes (none for 1); they end with the block, or when this process is killed.
 
     Processes are started afresh, not forked: the libraries in use keep threads that a fork would cut off.
     """
     if count == 1:
-        yield Workers(None, 1)
+        yield ProcessPool(None, 1)
         return
     context = multiprocessing.get_context("spawn")
-    executor = ProcessPoolExecutor(count, mp_context=context, initializer=_prepare_process)
+    executor = ProcessPoolExecutor(count, mp_context=context, initializer=_initialise_worker)
     try:
-        yield Workers(executor, count)
+        yield ProcessPool(executor, count)
     finally:
-        count_workers(process.pid for process in multiprocessing.active_children() if process.pid is not None)
+        record_worker_peaks(process.pid for process in multiprocessing.active_children() if process.pid is not None)
         executor.shutdown(wait=True, cancel_futures=True)
 
 
-def _prepare_process() -> None:
+def _initialise_worker() -> None:
     """One thread a process, and no life without the parent: a killed parent cannot tell its workers to stop."""
     cv2.setNumThreads(1)
     parent = multiprocessing.parent_process()
     if parent is not None:
-        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+        threading.Thread(target=_exit_with_parent, args=(parent,), daemon=True).start()
 
 
-def _end_with(parent: BaseProcess) -> None:
+def _exit_with_parent(parent: BaseProcess) -> None:
     parent.join()
     os._exit(1)

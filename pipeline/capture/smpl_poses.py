@@ -25,7 +25,7 @@ from pipeline.io.npz import load_npz, save_npz
 
 SMPL_POSES_NPZ = "smpl_poses.npz"
 N_BODY_POSE, N_BETAS = 69, 10
-RIGID = 1e-3
+RIGID_TOLERANCE = 1e-3
 """How far a rotation that somebody supplies may be from one."""
 
 GENDERS = ("male", "female", "neutral", "unknown")
@@ -51,7 +51,7 @@ class SmplPoses:
     smpl_to_camera: Float[np.ndarray, "n 4 4"]
     gender: str
 
-    def of(self, frame_index: Int[np.ndarray, "m"]) -> "SmplPoses":
+    def for_frames(self, frame_index: Int[np.ndarray, "m"]) -> "SmplPoses":
         """The rows of those of these frames that there are."""
         rows = np.flatnonzero(np.isin(self.frame_index, frame_index))
         return replace(self, **{name: getattr(self, name)[rows] for name in _ROW_SHAPES})
@@ -59,12 +59,12 @@ class SmplPoses:
 
 def is_rigid(transforms: Float[np.ndarray, "*n 4 4"]) -> bool:
     """Whether each is a rotation and a shift on column vectors: finite, no scale, no mirror, last row 0 0 0 1."""
-    turn = transforms[..., :3, :3]
+    rotation = transforms[..., :3, :3]
     return bool(
         np.isfinite(transforms).all()
-        and (np.abs(turn @ np.swapaxes(turn, -1, -2) - np.eye(3)) <= RIGID).all()
-        and (np.linalg.det(turn) > 0).all()
-        and (np.abs(transforms[..., 3, :] - np.eye(4)[3]) <= RIGID).all()
+        and (np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3)) <= RIGID_TOLERANCE).all()
+        and (np.linalg.det(rotation) > 0).all()
+        and (np.abs(transforms[..., 3, :] - np.eye(4)[3]) <= RIGID_TOLERANCE).all()
     )
 
 

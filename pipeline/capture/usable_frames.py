@@ -13,7 +13,7 @@ from pipeline.io.npz import load_npz
 SCORES_NPZ = "scores.npz"
 
 
-def training_positions(capture: Capture, body_dir: Path) -> Int[np.ndarray, "k"]:
+def usable_training_positions(capture: Capture, body_dir: Path) -> Int[np.ndarray, "k"]:
     """Positions (0..n-1) of the training frames whose fit is usable: what field, mesh and texture learn from.
 
     Raises UserError when the body stage's folder does not tell which frames are usable.

@@ -29,23 +29,23 @@ from jaxtyping import Float, Int, UInt8
 
 from pipeline.capture.frame_selection import HELDOUT, SPLIT_PERIOD, TRAIN, VALIDATION, VALIDATION_PHASE
 from pipeline.capture.smpl_poses import SMPL_POSES_NPZ, SmplPoses, is_rigid, load_smpl_poses
-from pipeline.capture.video import Source, natural_key, picture_size_px
+from pipeline.capture.video import FrameSource, image_size_px, natural_sort_key
 from pipeline.core.errors import UserError
-from pipeline.geometry.camera import UPRIGHT_WORLD_TO_CAMERA, Camera
+from pipeline.geometry.camera import DEFAULT_WORLD_TO_CAMERA, Camera
 from pipeline.io.image import IMAGE_SUFFIXES, read_alpha, read_gray
 from pipeline.io.npz import load_npz
 
 N_LANDMARKS = 33
 # How far from the middle a principal point may lie, as a share of the picture's side, when nothing says what size of
 # picture it is for. That of a calibration for pictures of half the size lies at a quarter.
-_MOST_OFF_CENTRE = 0.2
+_MAX_PRINCIPAL_POINT_OFFSET = 0.2
 # So many masks tell whether a folder holds levels or zeros and ones.
-_MASKS_TRIED = 8
+_N_MASKS_SAMPLED = 8
 _SPLITS = {"train": TRAIN, "validation": VALIDATION, "heldout": HELDOUT}
 
 
 @dataclass(frozen=True)
-class SuppliedCamera:
+class CameraCalibration:
     """Intrinsics in pixels of the original frames; `world_to_camera` is None where the file does not give it."""
 
     fx: float
@@ -55,9 +55,9 @@ class SuppliedCamera:
     distortion: tuple[float, ...] = ()
     world_to_camera: Float[np.ndarray, "4 4"] | None = None
 
-    def at(self, scale: float, width: int, height: int) -> Camera:
+    def to_camera(self, scale: float, width: int, height: int) -> Camera:
         """The camera of undistorted images of this scale and size."""
-        pose = UPRIGHT_WORLD_TO_CAMERA if self.world_to_camera is None else self.world_to_camera
+        pose = DEFAULT_WORLD_TO_CAMERA if self.world_to_camera is None else self.world_to_camera
         fx, fy, cx, cy = (scale * value for value in (self.fx, self.fy, self.cx, self.cy))
         return Camera(fx, fy, cx, cy, width, height, pose)
 
@@ -65,27 +65,31 @@ class SuppliedCamera:
         """The picture as a lens without distortion would show it; `scale` is its size relative to the original."""
         if not any(self.distortion):
             return rgb
-        return cv2.undistort(rgb, self._matrix(scale, centre_px=0.0), np.array(self.distortion)).reshape(rgb.shape)
+        return cv2.undistort(
+            rgb, self._intrinsic_matrix(scale, first_pixel_centre_px=0.0), np.array(self.distortion)
+        ).reshape(rgb.shape)
 
     def undistort_points(self, points_px: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
         """Where points of the original frames lie in the undistorted ones."""
         if not any(self.distortion):
             return points_px
-        matrix = self._matrix(1.0, centre_px=0.5)
+        matrix = self._intrinsic_matrix(1.0, first_pixel_centre_px=0.5)
         points = cv2.undistortPoints(
             points_px.reshape(-1, 1, 2).astype(np.float64), matrix, np.array(self.distortion), P=matrix
         )
         return points.reshape(points_px.shape)
 
-    def _matrix(self, scale: float, centre_px: float) -> Float[np.ndarray, "3 3"]:
-        """K for a picture of this scale whose first pixel's centre has the coordinate `centre_px` (OpenCV warps: 0)."""
-        shift = centre_px - 0.5
+    def _intrinsic_matrix(self, scale: float, first_pixel_centre_px: float) -> Float[np.ndarray, "3 3"]:
+        """K for a picture of this scale whose first pixel's centre has the coordinate `first_pixel_centre_px` (OpenCV
+        warps: 0).
+        """
+        shift = first_pixel_centre_px - 0.5
         fx, fy = self.fx * scale, self.fy * scale
         return np.array([[fx, 0.0, self.cx * scale + shift], [0.0, fy, self.cy * scale + shift], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True)
-class SuppliedLandmarks:
+class UserLandmarks:
     """Landmarks for every frame of the recording, in pixels of the original frames; nan where unknown.
 
     landmarks_world_m: None where the file does not give them.
@@ -97,41 +101,41 @@ class SuppliedLandmarks:
 
 
 @dataclass(frozen=True)
-class SuppliedSplit:
+class UserSplit:
     """Which frames of the recording are to be used, in rising order, and what for (as `Capture.split`)."""
 
     frame_index: Int[np.ndarray, "m"]
     split: UInt8[np.ndarray, "m"]
 
-    def of(self, frame_index: Int[np.ndarray, "n"]) -> UInt8[np.ndarray, "n"]:
+    def for_frames(self, frame_index: Int[np.ndarray, "n"]) -> UInt8[np.ndarray, "n"]:
         """What these frames, all of them listed, are for."""
         return self.split[np.searchsorted(self.frame_index, frame_index)]
 
 
 @dataclass(frozen=True)
-class Supplied:
+class UserFiles:
     """What was found; None for what was not. `read_mask(index)` gives uint8 [0, 255] at its own size."""
 
     read_mask: Callable[[int], UInt8[np.ndarray, "h w"]] | None
     mask_source: str
-    landmarks: SuppliedLandmarks | None
-    camera: SuppliedCamera | None
-    split: SuppliedSplit | None = None
+    landmarks: UserLandmarks | None
+    camera: CameraCalibration | None
+    split: UserSplit | None = None
     smpl_poses: SmplPoses | None = None
 
 
-def find_supplied(path: Path, source: Source) -> Supplied:
+def load_user_files(path: Path, source: FrameSource) -> UserFiles:
     """Look in the user's folder (nothing is looked for when a video file alone was given).
 
     Raises UserError when a file that is there does not fit the recording.
     """
     if not path.is_dir():
-        return Supplied(None, "", None, None)
+        return UserFiles(None, "", None, None)
     read_mask, mask_source = _find_masks(path, source)
     landmarks_path, camera_path, split_path, poses_path = (
         path / name for name in ("landmarks.npz", "camera.json", "split.json", SMPL_POSES_NPZ)
     )
-    return Supplied(
+    return UserFiles(
         read_mask,
         mask_source,
         _read_landmarks(landmarks_path, source) if landmarks_path.is_file() else None,
@@ -141,23 +145,23 @@ def find_supplied(path: Path, source: Source) -> Supplied:
     )
 
 
-def _find_masks(path: Path, source: Source) -> tuple[Callable[[int], np.ndarray] | None, str]:
+def _find_masks(path: Path, source: FrameSource) -> tuple[Callable[[int], np.ndarray] | None, str]:
     if (path / "masks").is_dir():
-        return _mask_folder(path / "masks", source), "masks/"
+        return _masks_from_folder(path / "masks", source), "masks/"
     if (path / "masks.npz").is_file():
         arrays = load_npz(path / "masks.npz")
         if "masks" not in arrays:
             raise UserError(f"{path / 'masks.npz'} has no array `masks`; store it as (frames, height, width)")
-        return _mask_array(arrays["masks"], path / "masks.npz", source), "masks.npz"
+        return _masks_from_array(arrays["masks"], path / "masks.npz", source), "masks.npz"
     if (path / "masks.hdf5").is_file():
-        return _mask_array(_read_hdf5(path / "masks.hdf5"), path / "masks.hdf5", source), "masks.hdf5"
+        return _masks_from_array(_read_hdf5(path / "masks.hdf5"), path / "masks.hdf5", source), "masks.hdf5"
     if source.files and read_alpha(source.files[0]).min() < 255:
         return (lambda index: read_alpha(source.files[index])), "the images' alpha channel"
     return None, ""
 
 
-def _mask_folder(folder: Path, source: Source) -> Callable[[int], np.ndarray]:
-    files = sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES), key=natural_key)
+def _masks_from_folder(folder: Path, source: FrameSource) -> Callable[[int], np.ndarray]:
+    files = sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES), key=natural_sort_key)
     by_stem = {p.stem: p for p in files}
     names = [image.stem for image in source.files]
     if any(name in by_stem for name in names):
@@ -167,16 +171,16 @@ def _mask_folder(folder: Path, source: Source) -> Callable[[int], np.ndarray]:
                 "that none is named as an image"
             )
         files = [by_stem[name] for name in names]
-    _check_count(folder, len(files), source)
-    tried = {int(k) for k in np.linspace(0, len(files) - 1, _MASKS_TRIED)}
-    unit = 255 if all(read_gray(files[k]).max() <= 1 for k in sorted(tried)) else 1
-    return lambda index: cv2.convertScaleAbs(read_gray(files[index]), alpha=unit)
+    _check_frame_count(folder, len(files), source)
+    sampled = {int(k) for k in np.linspace(0, len(files) - 1, _N_MASKS_SAMPLED)}
+    level_scale = 255 if all(read_gray(files[k]).max() <= 1 for k in sorted(sampled)) else 1
+    return lambda index: cv2.convertScaleAbs(read_gray(files[index]), alpha=level_scale)
 
 
-def _mask_array(masks: np.ndarray, path: Path, source: Source) -> Callable[[int], np.ndarray]:
+def _masks_from_array(masks: np.ndarray, path: Path, source: FrameSource) -> Callable[[int], np.ndarray]:
     if masks.ndim != 3:
         raise UserError(f"{path}: the masks have shape {masks.shape}; store them as (frames, height, width)")
-    _check_count(path, len(masks), source)
+    _check_frame_count(path, len(masks), source)
     highest = float(masks.max())
     return lambda index: np.rint(masks[index].astype(np.float32) * (255.0 / max(highest, 1e-6))).astype(np.uint8)
 
@@ -193,13 +197,13 @@ def _read_hdf5(path: Path) -> np.ndarray:
         ) from None
 
 
-def _read_landmarks(path: Path, source: Source) -> SuppliedLandmarks:
+def _read_landmarks(path: Path, source: FrameSource) -> UserLandmarks:
     arrays = load_npz(path)
     points = arrays.get("landmarks_px")
     if points is None or points.ndim != 3 or points.shape[1:] != (N_LANDMARKS, 2):
         shape = None if points is None else points.shape
         raise UserError(f"{path}: `landmarks_px` must have shape (frames, {N_LANDMARKS}, 2), found {shape}")
-    _check_count(path, len(points), source)
+    _check_frame_count(path, len(points), source)
     visibility = arrays.get("landmarks_visibility", np.isfinite(points).all(-1))
     world = arrays.get("landmarks_world_m")
     if visibility.shape != points.shape[:2] or (world is not None and world.shape != (*points.shape[:2], 3)):
@@ -210,14 +214,14 @@ def _read_landmarks(path: Path, source: Source) -> SuppliedLandmarks:
         raise UserError(
             f"{path}: `landmarks_visibility` of frame {outside.argmax()} leaves [0, 1]; bring it to that range"
         )
-    return SuppliedLandmarks(
+    return UserLandmarks(
         points.astype(np.float32),
         visibility.astype(np.float32),
         None if world is None else world.astype(np.float32),
     )
 
 
-def _read_camera(path: Path, source: Source) -> SuppliedCamera:
+def _read_camera(path: Path, source: FrameSource) -> CameraCalibration:
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
         fx, fy, cx, cy = (float(values[key]) for key in ("fx", "fy", "cx", "cy"))
@@ -239,19 +243,19 @@ def _read_camera(path: Path, source: Source) -> SuppliedCamera:
             f"{path}: `world_to_camera` must be a rotation and a shift in metres, with 0 0 0 1 in its last row; "
             "divide its scale out, or leave it out"
         )
-    _check_picture(path, cx, cy, size_px, source)
-    return SuppliedCamera(fx, fy, cx, cy, distortion, world_to_camera)
+    _check_image_size(path, cx, cy, size_px, source)
+    return CameraCalibration(fx, fy, cx, cy, distortion, world_to_camera)
 
 
-def _check_picture(path: Path, cx: float, cy: float, size_px: tuple[int, int] | None, source: Source) -> None:
+def _check_image_size(path: Path, cx: float, cy: float, size_px: tuple[int, int] | None, source: FrameSource) -> None:
     """UserError for a calibration of pictures of another size: everything would be fitted wrongly without a sign."""
-    width, height = picture_size_px(source)
+    width, height = image_size_px(source)
     if size_px is not None and size_px != (width, height):
         raise UserError(
             f"{path} is for pictures of {size_px[0]}x{size_px[1]}, those of {source.path} are {width}x{height}; "
             "give the camera of these pictures, or the original pictures"
         )
-    if size_px is None and max(abs(cx / width - 0.5), abs(cy / height - 0.5)) > _MOST_OFF_CENTRE:
+    if size_px is None and max(abs(cx / width - 0.5), abs(cy / height - 0.5)) > _MAX_PRINCIPAL_POINT_OFFSET:
         raise UserError(
             f"{path}: cx {cx:g}, cy {cy:g} lie far from the middle of the pictures of {source.path}, which are "
             f"{width}x{height}; give the camera of these pictures, or, where they were cut out of larger ones, confirm "
@@ -259,7 +263,7 @@ def _check_picture(path: Path, cx: float, cy: float, size_px: tuple[int, int] | 
         )
 
 
-def _read_split(path: Path, source: Source) -> SuppliedSplit:
+def _read_split(path: Path, source: FrameSource) -> UserSplit:
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
         lists = {name: [operator.index(value) for value in indices] for name, indices in values.items()}
@@ -281,10 +285,10 @@ def _read_split(path: Path, source: Source) -> SuppliedSplit:
         raise UserError(f"{path} lists frames up to {indices.max()}, {source.path} has 0 to {source.n_frames - 1}")
     kinds = np.concatenate([np.full(len(lists[name]), kind, np.uint8) for name, kind in _SPLITS.items()])
     order = np.argsort(indices)
-    return SuppliedSplit(indices[order], kinds[order])
+    return UserSplit(indices[order], kinds[order])
 
 
-def _read_smpl_poses(path: Path, source: Source) -> SmplPoses:
+def _read_smpl_poses(path: Path, source: FrameSource) -> SmplPoses:
     poses = load_smpl_poses(path)
     if len(poses.frame_index) and not 0 <= poses.frame_index[0] <= poses.frame_index[-1] < source.n_frames:
         raise UserError(
@@ -294,7 +298,7 @@ def _read_smpl_poses(path: Path, source: Source) -> SmplPoses:
     return poses
 
 
-def _check_count(path: Path, count: int, source: Source) -> None:
+def _check_frame_count(path: Path, count: int, source: FrameSource) -> None:
     """UserError for too few, and for too many as well: nothing says which frame each belongs to."""
     if count != source.n_frames:
         raise UserError(

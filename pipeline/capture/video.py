@@ -22,18 +22,18 @@ from pipeline.core.progress import warn
 from pipeline.io.image import IMAGE_SUFFIXES, read_rgb
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".3gp", ".wmv", ".gif")
-IMAGE_FOLDER_FPS = 30.0
-_PHONE_SUFFIXES = (".heic", ".heif", ".avif")
+DEFAULT_IMAGE_FPS = 30.0
+_HEIF_SUFFIXES = (".heic", ".heif", ".avif")
 _IMAGE_FOLDER_NAMES = ("images", "frames", "image", "rgb", "color")
 # Bicubic, with chroma brought to full resolution before the colour matrix: swscale's default repeats each chroma
 # sample over 2 x 2 pixels, which leaves visible blocks along the person's outline (bits of libswscale's SWS_* flags).
-_FULL_CHROMA = 0x4 | 0x2000 | 0x4000 | 0x40000
+_SWS_FLAGS = 0x4 | 0x2000 | 0x4000 | 0x40000
 # A picture as it comes, 8 bits of sRGB or 16 bits of another curve, and how the first is made of it.
-_Shown = tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]
+_DecodedImage = tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]
 
 
 @dataclass(frozen=True)
-class Source:
+class FrameSource:
     """A recording: a video file (then `files` is empty), or images in their natural order."""
 
     path: Path
@@ -52,7 +52,7 @@ class Frame:
     scale: float
 
 
-def open_source(path: Path, image_fps: float = IMAGE_FOLDER_FPS) -> Source:
+def open_frame_source(path: Path, image_fps: float = DEFAULT_IMAGE_FPS) -> FrameSource:
     """Look at a file or folder and say what recording it holds.
 
     A folder may hold images, one video file, or a folder `images`/`frames` with images. Images do not say how many a
@@ -66,7 +66,7 @@ def open_source(path: Path, image_fps: float = IMAGE_FOLDER_FPS) -> Source:
     files = _images_in(path)
     videos = sorted(p for p in path.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES)
     if files:
-        return Source(path, files, len(files), image_fps)
+        return FrameSource(path, files, len(files), image_fps)
     if len(videos) == 1:
         return _open_video(videos[0])
     if videos:
@@ -74,15 +74,15 @@ def open_source(path: Path, image_fps: float = IMAGE_FOLDER_FPS) -> Source:
     for folder in (path / name for name in _IMAGE_FOLDER_NAMES):
         if folder.is_dir() and _images_in(folder):
             files = _images_in(folder)
-            return Source(folder, files, len(files), image_fps)
+            return FrameSource(folder, files, len(files), image_fps)
     if not any(path.iterdir()):
         raise UserError(f"folder {path} is empty; put a video or images of the person into it")
-    if any(file.suffix.lower() in _PHONE_SUFFIXES for file in path.iterdir()):
+    if any(file.suffix.lower() in _HEIF_SUFFIXES for file in path.iterdir()):
         raise UserError(f"folder {path} holds HEIC images, which are not read; save them as JPEG, or film a video")
     raise UserError(f"folder {path} holds neither a video nor images; put one of them into it")
 
 
-def read_frames(source: Source, is_wanted: Callable[[int], bool], max_side_px: int) -> Iterator[Frame]:
+def read_frames(source: FrameSource, is_wanted: Callable[[int], bool], max_side_px: int) -> Iterator[Frame]:
     """Yield the wanted frames in order, none larger than `max_side_px` on its longer side.
 
     Raises UserError for an unreadable image, or images that change their size. A video that breaks off is read as far
@@ -97,11 +97,11 @@ def read_frames(source: Source, is_wanted: Callable[[int], bool], max_side_px: i
                 "all frames must come from one camera at one size: remove or resize the odd ones"
             )
         size_px = rgb.shape[:2]
-        shrunk, scale = _shrunk(rgb, max_side_px)
-        yield Frame(index, time_s, to_srgb(shrunk), scale)
+        downscaled, scale = _downscale(rgb, max_side_px)
+        yield Frame(index, time_s, to_srgb(downscaled), scale)
 
 
-def picture_size_px(source: Source) -> tuple[int, int]:
+def image_size_px(source: FrameSource) -> tuple[int, int]:
     """Width and height of the recording's first picture, upright and with square pixels.
 
     Raises UserError when no picture can be read.
@@ -112,39 +112,39 @@ def picture_size_px(source: Source) -> tuple[int, int]:
     return first.rgb.shape[1], first.rgb.shape[0]
 
 
-def natural_key(path: Path) -> list[tuple[int, str]]:
+def natural_sort_key(path: Path) -> list[tuple[int, str]]:
     """Sort key under which `frame2` comes before `frame10`."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name.lower()) if part]
 
 
 def _images_in(folder: Path) -> tuple[Path, ...]:
     found = (p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
-    return tuple(sorted(found, key=natural_key))
+    return tuple(sorted(found, key=natural_sort_key))
 
 
-def _open_video(path: Path) -> Source:
+def _open_video(path: Path) -> FrameSource:
     try:
         with av.open(str(path)) as container:
             if not container.streams.video:
                 raise UserError(f"{path} has no picture track; give a video file or a folder of images")
             stream = container.streams.video[0]
-            fps = float(stream.average_rate or stream.guessed_rate or IMAGE_FOLDER_FPS)
+            fps = float(stream.average_rate or stream.guessed_rate or DEFAULT_IMAGE_FPS)
             # An edit list (a clip that was cut without encoding it anew) has pictures that are decoded but never shown.
             n_frames = sum(packet.size > 0 and not packet.is_discard for packet in container.demux(stream))
     except av.FFmpegError as error:
         raise UserError(
             f"{path} is no video that can be read ({error.strerror}); give an .mp4, .mov or .webm file"
         ) from None
-    return Source(path, (), n_frames, fps)
+    return FrameSource(path, (), n_frames, fps)
 
 
-def _images(source: Source, is_wanted: Callable[[int], bool]) -> Iterator[tuple[int, float, _Shown]]:
+def _images(source: FrameSource, is_wanted: Callable[[int], bool]) -> Iterator[tuple[int, float, _DecodedImage]]:
     for index, path in enumerate(source.files):
         if is_wanted(index):
             yield index, index / source.fps, (read_rgb(path), np.asarray)
 
 
-def _video(source: Source, is_wanted: Callable[[int], bool]) -> Iterator[tuple[int, float, _Shown]]:
+def _video(source: FrameSource, is_wanted: Callable[[int], bool]) -> Iterator[tuple[int, float, _DecodedImage]]:
     start_s: float | None = None
     time_s: float | None = None
     index = -1
@@ -153,26 +153,26 @@ def _video(source: Source, is_wanted: Callable[[int], bool]) -> Iterator[tuple[i
         stream.thread_type = "AUTO"
         try:
             for index, picture in enumerate(container.decode(stream)):
-                time_s = _later(picture.time, time_s, 1.0 / source.fps)
+                time_s = _monotonic_time_s(picture.time, time_s, 1.0 / source.fps)
                 start_s = time_s if start_s is None else start_s
                 if is_wanted(index):
-                    yield index, time_s - start_s, _upright(picture, stream.sample_aspect_ratio)
+                    yield index, time_s - start_s, _to_upright_rgb(picture, stream.sample_aspect_ratio)
         except av.FFmpegError as error:
             warn(f"{source.path} breaks off after {index + 1} frames ({error.strerror}); going on with those")
 
 
-def _later(stamp_s: float | None, before_s: float | None, step_s: float) -> float:
+def _monotonic_time_s(timestamp_s: float | None, previous_s: float | None, step_s: float) -> float:
     """A frame's time stamp, or one step after the frame before where it is missing or does not lie after that one."""
-    if before_s is None:
-        return stamp_s or 0.0
-    return stamp_s if stamp_s is not None and stamp_s > before_s else before_s + step_s
+    if previous_s is None:
+        return timestamp_s or 0.0
+    return timestamp_s if timestamp_s is not None and timestamp_s > previous_s else previous_s + step_s
 
 
-def _upright(picture: av.VideoFrame, aspect: Fraction | None) -> _Shown:
+def _to_upright_rgb(picture: av.VideoFrame, aspect: Fraction | None) -> _DecodedImage:
     """Colour pixels of a decoded picture with square pixels, turned as the container asks."""
     transfer, primaries = int(picture.color_trc), int(picture.color_primaries)
-    is_hdr = transfer in hdr.TRANSFERS
-    pixels = picture.reformat(format="rgb48le" if is_hdr else "rgb24", interpolation=_FULL_CHROMA)
+    is_hdr = transfer in hdr.HDR_TRANSFERS
+    pixels = picture.reformat(format="rgb48le" if is_hdr else "rgb24", interpolation=_SWS_FLAGS)
     rgb: np.ndarray = pixels.to_ndarray()
     if aspect and aspect != 1:
         rgb = cv2.resize(rgb, (round(rgb.shape[1] * aspect), rgb.shape[0]), interpolation=cv2.INTER_CUBIC)
@@ -180,7 +180,7 @@ def _upright(picture: av.VideoFrame, aspect: Fraction | None) -> _Shown:
     return np.ascontiguousarray(np.rot90(rgb, k=round(picture.rotation / 90) % 4)), to_srgb
 
 
-def _shrunk(rgb: Shaped[np.ndarray, "h w 3"], max_side_px: int) -> tuple[Shaped[np.ndarray, "h2 w2 3"], float]:
+def _downscale(rgb: Shaped[np.ndarray, "h w 3"], max_side_px: int) -> tuple[Shaped[np.ndarray, "h2 w2 3"], float]:
     """The picture with its longer side at most `max_side_px`, and the factor; area averaging avoids aliasing."""
     scale = min(1.0, max_side_px / max(rgb.shape[:2]))
     if scale == 1.0:

@@ -13,16 +13,16 @@ def atomic_path(path: Path) -> Iterator[Path]:
     For checkpoints (`checkpoint*` in a stage's folder) and for small files that are rewritten in place. The temporary
     name keeps the suffix, which many writers look at.
     """
-    unfinished = path.with_name(f"unfinished-{path.name}")
+    temporary_path = path.with_name(f"unfinished-{path.name}")
     try:
-        yield unfinished
-        flush(unfinished)
-        unfinished.replace(path)
+        yield temporary_path
+        fsync_path(temporary_path)
+        temporary_path.replace(path)
     finally:
-        unfinished.unlink(missing_ok=True)
+        temporary_path.unlink(missing_ok=True)
 
 
-def flush(path: Path) -> None:
+def fsync_path(path: Path) -> None:
     """Push a file's content, or a folder's entries, through to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:

@@ -8,14 +8,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NoReturn
 
-from pipeline.core.config import CONFIG_DIR, build, default_yaml, load_layers
-from pipeline.core.errors import UserError, os_error_sentence
+from pipeline.core.config import CONFIG_DIR, build_config, default_yaml, load_layers
+from pipeline.core.errors import UserError, format_os_error
 from pipeline.core.lock import die_with_parent, is_runner_child, run_lock
 from pipeline.core.record import RUN_FILE, RunRecord, read_record, update_record, write_record
-from pipeline.core.runner import INTERRUPTED, StageFailed, build_configs, run_all, status, summary, verify
+from pipeline.core.runner import EXIT_INTERRUPTED, StageFailedError, build_configs, run_all, status, summary, verify
 from pipeline.core.stage import Stage, plan_stage, run_stage
 
-USER_ERROR = 2
+EXIT_USER_ERROR = 2
 
 LoadStage = Callable[[str], Stage]
 
@@ -23,7 +23,7 @@ LoadStage = Callable[[str], Stage]
 def main(stage: Stage, argv: Sequence[str] | None = None, config_dir: Path = CONFIG_DIR) -> int:
     """Run one stage on one run folder; return the exit status."""
     die_with_parent()
-    return _guarded(lambda: _run_one(stage, argv, config_dir))
+    return _run_with_exit_status(lambda: _run_single_stage(stage, argv, config_dir))
 
 
 def main_all(
@@ -31,10 +31,10 @@ def main_all(
 ) -> int:
     """Run, or report on, all stages of one run folder; return the exit status."""
     die_with_parent()
-    return _guarded(lambda: _run_every(names, load, argv, config_dir))
+    return _run_with_exit_status(lambda: _run_pipeline(names, load, argv, config_dir))
 
 
-def _run_one(stage: Stage, argv: Sequence[str] | None, config_dir: Path) -> None:
+def _run_single_stage(stage: Stage, argv: Sequence[str] | None, config_dir: Path) -> None:
     parser = _Parser(prog=f"python -m stages.{stage.name}", description=f"Run the stage {stage.name} alone.")
     parser.add_argument("run", type=Path, help="the run folder, runs/NAME")
     _add_record_options(parser)
@@ -44,7 +44,7 @@ def _run_one(stage: Stage, argv: Sequence[str] | None, config_dir: Path) -> None
         if not assignment.startswith(f"{stage.name}."):
             raise UserError(f"--set {assignment} is not for this stage: write --set {stage.name}.key=value")
     with _open_run(options.run, options, replace_video=options.force) as (record, _):
-        config = build(stage.name, stage.config, load_layers(record.preset, record.overrides, config_dir))
+        config = build_config(stage.name, stage.config, load_layers(record.preset, record.overrides, config_dir))
         plan = plan_stage(stage, config, options.run, record.video_path)
         write_record(record, options.run)
         ran = run_stage(plan, options.force)
@@ -52,8 +52,8 @@ def _run_one(stage: Stage, argv: Sequence[str] | None, config_dir: Path) -> None
         print(f"{plan.folder}: {'done' if ran else 'cached'}")
 
 
-def _run_every(names: Sequence[str], load: LoadStage, argv: Sequence[str] | None, config_dir: Path) -> None:
-    options = _parse_all(names, argv)
+def _run_pipeline(names: Sequence[str], load: LoadStage, argv: Sequence[str] | None, config_dir: Path) -> None:
+    options = _parse_pipeline_arguments(names, argv)
     stages = [load(name) for name in names]
     if options.defaults:
         print(default_yaml({stage.name: stage.config for stage in stages}), end="")
@@ -73,7 +73,7 @@ def _run_every(names: Sequence[str], load: LoadStage, argv: Sequence[str] | None
     print(summary(outcomes, time.monotonic() - start))
 
 
-def _parse_all(names: Sequence[str], argv: Sequence[str] | None) -> argparse.Namespace:
+def _parse_pipeline_arguments(names: Sequence[str], argv: Sequence[str] | None) -> argparse.Namespace:
     parser = _Parser(prog="python -m stages", description=f"Run the whole pipeline: {', '.join(names)}.")
     parser.add_argument("--run", type=Path, help="the run folder (default: runs/NAME after the video)")
     _add_record_options(parser)
@@ -124,7 +124,7 @@ def _open_run(run_dir: Path, options: argparse.Namespace, replace_video: bool) -
     with run_lock(run_dir) as lock_fd:
         try:
             yield record, lock_fd
-        except (UserError, StageFailed, OSError, MemoryError):
+        except (UserError, StageFailedError, OSError, MemoryError):
             if is_new and {path.name for path in run_dir.iterdir()} <= {RUN_FILE, ".lock"}:
                 for path in list(run_dir.iterdir()):
                     path.unlink()
@@ -132,28 +132,28 @@ def _open_run(run_dir: Path, options: argparse.Namespace, replace_video: bool) -
             raise
 
 
-def _guarded(work: Callable[[], None]) -> int:
+def _run_with_exit_status(work: Callable[[], None]) -> int:
     """Run `work`; turn what the user can mend into one sentence and an exit status. Faults of the program stay loud."""
     try:
         work()
     except UserError as error:
-        return _fail(str(error))
-    except StageFailed as failure:
+        return _report_error(str(error))
+    except StageFailedError as failure:
         return failure.code
     except MemoryError:
-        return _fail("there is not enough memory: close other programs, or use --preset instant")
+        return _report_error("there is not enough memory: close other programs, or use --preset instant")
     except OSError as error:
-        sentence = os_error_sentence(error)
+        sentence = format_os_error(error)
         if sentence is None:
             raise
-        return _fail(sentence)
+        return _report_error(sentence)
     except KeyboardInterrupt:
         if not is_runner_child():
             print("interrupted: the same command goes on from here", file=sys.stderr)
-        return INTERRUPTED
+        return EXIT_INTERRUPTED
     return 0
 
 
-def _fail(sentence: str) -> int:
+def _report_error(sentence: str) -> int:
     print(f"error: {sentence}", file=sys.stderr)
-    return USER_ERROR
+    return EXIT_USER_ERROR

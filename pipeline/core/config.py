@@ -18,7 +18,7 @@ from pydantic.fields import FieldInfo
 from pipeline.core.errors import UserError
 
 CONFIG_DIR = Path(__file__).resolve().parents[2] / "configs"
-KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
+TYPE_DESCRIPTIONS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
 YAML_WIDTH = 10_000
 YAML_SCALAR_END = "...\n"
 PRESET_SUFFIXES = (".yaml", ".yml")
@@ -37,7 +37,7 @@ ConfigType = TypeVar("ConfigType", bound=Config)
 
 
 @dataclass
-class Layers:
+class ConfigLayers:
     """The merged values of all sections, and for each dotted key the layer that set it."""
 
     values: dict[str, Any] = field(default_factory=dict)
@@ -56,9 +56,9 @@ class Layers:
         return self.origin.get(key, "the defaults")
 
 
-def load_layers(preset: str, overrides: Mapping[str, Any], config_dir: Path = CONFIG_DIR) -> Layers:
+def load_layers(preset: str, overrides: Mapping[str, Any], config_dir: Path = CONFIG_DIR) -> ConfigLayers:
     """Read default.yaml, the preset (a name in `config_dir`, or a path to a YAML file) and the dotted overrides."""
-    layers = Layers()
+    layers = ConfigLayers()
     default_path = config_dir / "default.yaml"
     if default_path.exists():
         layers.add(_read_sections(default_path), str(default_path))
@@ -93,7 +93,7 @@ def parse_overrides(assignments: Iterable[str]) -> dict[str, Any]:
     return overrides
 
 
-def check_sections(layers: Layers, known: Iterable[str]) -> None:
+def check_sections(layers: ConfigLayers, known: Iterable[str]) -> None:
     """Refuse a section that belongs to no stage."""
     names = list(known)
     for name in layers.values:
@@ -101,13 +101,13 @@ def check_sections(layers: Layers, known: Iterable[str]) -> None:
             raise UserError(_unknown_key(layers.origin_of(name), name, "the configuration", names))
 
 
-def build(section: str, config_type: type[ConfigType], layers: Layers) -> ConfigType:
+def build_config(section: str, config_type: type[ConfigType], layers: ConfigLayers) -> ConfigType:
     """Make the typed config of one section, or raise UserError: key, value, what is allowed, and where it was set."""
     values = layers.values.get(section) or {}
     try:
         return config_type.model_validate(values)
     except ValidationError as error:
-        raise UserError(_explain(section, config_type, error.errors()[0], layers)) from None
+        raise UserError(_format_validation_error(section, config_type, error.errors()[0], layers)) from None
 
 
 def default_yaml(sections: Mapping[str, type[Config]]) -> str:
@@ -159,7 +159,9 @@ def _dotted_keys(values: Mapping[str, Any], prefix: str = "") -> Iterable[str]:
             yield from _dotted_keys(value, f"{prefix}{key}.")
 
 
-def _explain(section: str, config_type: type[Config], error: Mapping[str, Any], layers: Layers) -> str:
+def _format_validation_error(
+    section: str, config_type: type[Config], error: Mapping[str, Any], layers: ConfigLayers
+) -> str:
     """Say in one sentence what pydantic found: origin, key, value, what is allowed."""
     path = [str(part) for part in error["loc"]]
     dotted = ".".join([section, *path])
@@ -171,7 +173,9 @@ def _explain(section: str, config_type: type[Config], error: Mapping[str, Any], 
     if info is None:
         return f"{place}section {dotted} is not allowed: {error['msg']}"
     meaning = f" ({info.description})" if info.description else ""
-    return f"{place}{dotted} = {error['input']!r} is not allowed: it must be {_allowed(info, error)}{meaning}"
+    return (
+        f"{place}{dotted} = {error['input']!r} is not allowed: it must be {_describe_constraints(info, error)}{meaning}"
+    )
 
 
 def _find_field(config_type: type[BaseModel], path: list[str]) -> tuple[type[BaseModel], FieldInfo | None]:
@@ -186,7 +190,7 @@ def _find_field(config_type: type[BaseModel], path: list[str]) -> tuple[type[Bas
     return owner, info
 
 
-def _allowed(info: FieldInfo, error: Mapping[str, Any]) -> str:
+def _describe_constraints(info: FieldInfo, error: Mapping[str, Any]) -> str:
     """What a field takes, in words: its kind and limits; for other kinds, pydantic's own words."""
     words = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
     limits = [
@@ -195,7 +199,7 @@ def _allowed(info: FieldInfo, error: Mapping[str, Any]) -> str:
         for name, word in words.items()
         if getattr(constraint, name, None) is not None
     ]
-    kind = KINDS.get(info.annotation) if isinstance(info.annotation, type) else None
+    kind = TYPE_DESCRIPTIONS.get(info.annotation) if isinstance(info.annotation, type) else None
     if kind is None or error["type"] in ("value_error", "assertion_error"):
         kind = error["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
     return ", ".join([kind, *limits])

@@ -10,7 +10,7 @@ CPU = torch.device("cpu")
 DeviceChoice = Literal["auto", "cpu", "cuda"]
 
 
-def compute_device(choice: DeviceChoice, option: str) -> torch.device:
+def select_device(choice: DeviceChoice, option: str) -> torch.device:
     """The device that a choice means on this machine; `auto` takes a graphics card where torch can use one.
 
     Raises:

@@ -2,7 +2,7 @@
 
 import errno
 
-USER_ERRNO = {
+ERRNO_REMEDIES = {
     errno.ENOSPC: "the disk is full: free some space, then run the same command again",
     errno.EDQUOT: "the disk quota is used up: free some space, then run the same command again",
     errno.EACCES: "there is no permission: change the rights, or choose another folder with --run",
@@ -20,7 +20,7 @@ class UserError(Exception):
     """
 
 
-def os_error_sentence(error: OSError) -> str | None:
+def format_os_error(error: OSError) -> str | None:
     """The sentence for a system error that the user can mend; None for one that is a fault of the program."""
-    remedy = USER_ERRNO.get(error.errno or 0)
+    remedy = ERRNO_REMEDIES.get(error.errno or 0)
     return remedy and f"{error.filename or 'the run folder'} cannot be written or read, {remedy}"

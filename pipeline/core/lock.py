@@ -13,13 +13,13 @@ from pathlib import Path
 from pipeline.core.errors import UserError
 
 LOCK_FD_VARIABLE = "AVATAR_RUN_LOCK_FD"
-PARENT_VARIABLE = "AVATAR_RUN_PARENT"
+PARENT_PID_VARIABLE = "AVATAR_RUN_PARENT"
 # A stage process whose runner was killed needs this long at most to notice and let go.
-PATIENCE_S = 10.0
+LOCK_TIMEOUT_S = 10.0
 
 
 @contextmanager
-def run_lock(run_dir: Path, patience_s: float = PATIENCE_S) -> Iterator[int]:
+def run_lock(run_dir: Path, timeout_s: float = LOCK_TIMEOUT_S) -> Iterator[int]:
     """Hold the run's lock; yield its file descriptor, which a child process may inherit.
 
     Inside a child of the runner the inherited lock is used. UserError when another process holds it.
@@ -30,7 +30,7 @@ def run_lock(run_dir: Path, patience_s: float = PATIENCE_S) -> Iterator[int]:
         yield int(inherited)
         return
     with path.open("a+") as file:
-        _acquire(file.fileno(), path, patience_s)
+        _acquire(file.fileno(), path, timeout_s)
         file.truncate(0)
         file.write(f"{os.getpid()}\n")
         file.flush()
@@ -39,22 +39,24 @@ def run_lock(run_dir: Path, patience_s: float = PATIENCE_S) -> Iterator[int]:
 
 def child_environment(lock_fd: int) -> dict[str, str]:
     """Environment for a stage process that works under this process's lock."""
-    return {**bound_environment(), LOCK_FD_VARIABLE: str(lock_fd)}
+    return {**die_with_parent_environment(), LOCK_FD_VARIABLE: str(lock_fd)}
 
 
-def bound_environment() -> dict[str, str]:
+def die_with_parent_environment() -> dict[str, str]:
     """Environment for a child that ends with this process, if it calls `die_with_parent`."""
-    return {**os.environ, PARENT_VARIABLE: str(os.getpid())}
+    return {**os.environ, PARENT_PID_VARIABLE: str(os.getpid())}
 
 
 def is_runner_child() -> bool:
     """True in a process that was started by the runner, or by a program of many runs."""
-    return PARENT_VARIABLE in os.environ
+    return PARENT_PID_VARIABLE in os.environ
 
 
 def die_with_parent() -> None:
-    """In a process with `bound_environment`: end when its parent ends, even when killed (Linux; elsewhere no-op)."""
-    parent = os.environ.get(PARENT_VARIABLE)
+    """In a process with `die_with_parent_environment`: end when its parent ends, even when killed (Linux; elsewhere
+    no-op).
+    """
+    parent = os.environ.get(PARENT_PID_VARIABLE)
     if not parent or sys.platform != "linux":
         return
     pr_set_pdeathsig = 1
@@ -63,8 +65,8 @@ def die_with_parent() -> None:
         os.kill(os.getpid(), signal.SIGKILL)
 
 
-def _acquire(descriptor: int, path: Path, patience_s: float) -> None:
-    deadline = time.monotonic() + patience_s
+def _acquire(descriptor: int, path: Path, timeout_s: float) -> None:
+    deadline = time.monotonic() + timeout_s
     while True:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

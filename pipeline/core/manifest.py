@@ -9,8 +9,8 @@ from typing import Any
 
 from pipeline.core.errors import UserError
 
-MANIFEST = "manifest.json"
-PROGRESS = "progress.csv"
+MANIFEST_FILE = "manifest.json"
+PROGRESS_FILE = "progress.csv"
 """How a stage's work went, second by second: a result like others, but never the same twice."""
 
 
@@ -34,7 +34,7 @@ class Manifest:
     @property
     def outputs_digest(self) -> str:
         """One digest for all outputs but the record of progress: what a downstream stage's fingerprint depends on."""
-        return digest_json({name: digest for name, digest in self.outputs.items() if name != PROGRESS})
+        return digest_json({name: digest for name, digest in self.outputs.items() if name != PROGRESS_FILE})
 
 
 def write_manifest(manifest: Manifest, path: Path) -> None:
@@ -44,7 +44,7 @@ def write_manifest(manifest: Manifest, path: Path) -> None:
 
 def read_manifest(folder: Path) -> Manifest | None:
     """Read `folder/manifest.json`: None where there is none, UserError where it is damaged."""
-    path = folder / MANIFEST
+    path = folder / MANIFEST_FILE
     try:
         return Manifest(**json.loads(path.read_text(encoding="utf-8")))
     except (FileNotFoundError, NotADirectoryError):
@@ -69,7 +69,7 @@ def digest_file(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def digest_source(path: Path) -> str:
+def digest_video(path: Path) -> str:
     """Digest of the user's video: a file's content, or names and contents of a folder (hidden files left out)."""
     if path.is_file():
         return digest_file(path)
@@ -80,7 +80,7 @@ def digest_source(path: Path) -> str:
 
 def digest_files(folder: Path) -> dict[str, str]:
     """SHA-256 of every file under `folder`, its manifest left out, by sorted relative path."""
-    return {name: digest_file(folder / name) for name in list_files(folder) if name != MANIFEST}
+    return {name: digest_file(folder / name) for name in list_files(folder) if name != MANIFEST_FILE}
 
 
 def list_files(folder: Path) -> list[str]:
@@ -88,11 +88,11 @@ def list_files(folder: Path) -> list[str]:
     return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
 
 
-def find_damage(folder: Path) -> list[str]:
+def find_damaged_files(folder: Path) -> list[str]:
     """Names of the outputs that are missing, changed or strange, against the manifest; empty when all is whole."""
     manifest = read_manifest(folder)
     if manifest is None:
-        return [MANIFEST]
+        return [MANIFEST_FILE]
     found = digest_files(folder)
     return sorted(name for name in found.keys() | manifest.outputs if found.get(name) != manifest.outputs.get(name))
 

@@ -11,16 +11,16 @@ from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any
 
-REPOSITORY = Path(__file__).resolve().parents[2]
+REPOSITORY_DIR = Path(__file__).resolve().parents[2]
 MIB = 1024.0 * 1024.0
 
 
 _worker_peaks_mib: dict[int, float] = {}
 
 
-def count_workers(pids: Iterable[int]) -> None:
+def record_worker_peaks(pids: Iterable[int]) -> None:
     """Add the peaks of these processes to `peak_rss_mib`; call it at the end of their work, while they still live."""
-    _worker_peaks_mib.update({pid: peak for pid in pids if (peak := _high_water_mib(str(pid))) is not None})
+    _worker_peaks_mib.update({pid: peak for pid in pids if (peak := _process_peak_rss_mib(str(pid))) is not None})
 
 
 def peak_rss_mib() -> float:
@@ -30,7 +30,7 @@ def peak_rss_mib() -> float:
     least what the largest finished child had: the system tells that one alone, and outside Linux nothing else.
     """
     # Not getrusage's figure for this process, where there is another: it also counts the parent that started it.
-    own = _high_water_mib("self")
+    own = _process_peak_rss_mib("self")
     together = (_maxrss_mib(resource.RUSAGE_SELF) if own is None else own) + sum(_worker_peaks_mib.values())
     return max(together, _maxrss_mib(resource.RUSAGE_CHILDREN))
 
@@ -55,7 +55,7 @@ def cpu_name() -> str:
     return found.group(1) if found else platform.processor() or platform.machine()
 
 
-def _high_water_mib(process: str) -> float | None:
+def _process_peak_rss_mib(process: str) -> float | None:
     """VmHWM of a process in Linux's /proc; None elsewhere, and when the process is gone."""
     try:
         status = Path(f"/proc/{process}/status").read_text()
@@ -73,7 +73,7 @@ def _maxrss_mib(who: int) -> float:
 def _commit() -> str | None:
     """The checked-out commit, with `+` when files differ from it; None outside a checkout."""
     try:
-        describe = ["git", "-C", str(REPOSITORY), "describe", "--always", "--abbrev=40", "--dirty=+", "--exclude=*"]
+        describe = ["git", "-C", str(REPOSITORY_DIR), "describe", "--always", "--abbrev=40", "--dirty=+", "--exclude=*"]
         done = subprocess.run(describe, capture_output=True, text=True, check=False)
     except FileNotFoundError:
         return None

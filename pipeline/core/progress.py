@@ -28,10 +28,10 @@ def track(iterable: Iterable[Item], label: str, total: int | None = None, initia
     if sys.stderr.isatty():
         yield from tqdm(iterable, desc=label, total=total, initial=initial, leave=False, dynamic_ncols=True)
     else:
-        yield from _logged(iterable, label, total, initial)
+        yield from _track_to_log(iterable, label, total, initial)
 
 
-def _logged(iterable: Iterable[Item], label: str, total: int | None, initial: int) -> Iterator[Item]:
+def _track_to_log(iterable: Iterable[Item], label: str, total: int | None, initial: int) -> Iterator[Item]:
     """Yield the items; print a line when `LOG_INTERVAL_S` have passed since the last one."""
     start = last = time.monotonic()
     for done, item in enumerate(iterable, start=1):
@@ -40,8 +40,8 @@ def _logged(iterable: Iterable[Item], label: str, total: int | None, initial: in
         if now - last >= LOG_INTERVAL_S:
             last = now
             count = f"{initial + done}/{total}" if total else f"{initial + done}"
-            left = f", {(now - start) / done * (total - initial - done):.0f} s left" if total else ""
-            print(f"{label}: {count}{left}", file=sys.stderr, flush=True)
+            remaining_text = f", {(now - start) / done * (total - initial - done):.0f} s left" if total else ""
+            print(f"{label}: {count}{remaining_text}", file=sys.stderr, flush=True)
 
 
 def warn(message: str) -> None:
@@ -52,6 +52,6 @@ def warn(message: str) -> None:
 
 def take_warnings() -> list[str]:
     """Return the warnings since the last call, and forget them."""
-    taken = list(_warnings)
+    messages = list(_warnings)
     _warnings.clear()
-    return taken
+    return messages

@@ -9,7 +9,7 @@ from typing import Any
 from pipeline.core.atomic import atomic_path
 from pipeline.core.config import PRESET_SUFFIXES, parse_overrides
 from pipeline.core.errors import UserError
-from pipeline.core.manifest import digest_source
+from pipeline.core.manifest import digest_video
 
 RUN_FILE = "run.json"
 
@@ -74,6 +74,6 @@ def _checked_video(record: RunRecord, run_dir: Path, video: Path, replace_video:
     known = record.video_path
     if known is None or known == video or replace_video:
         return video
-    if known.exists() and digest_source(known) == digest_source(video):
+    if known.exists() and digest_video(known) == digest_video(video):
         return video
     raise UserError(f"{run_dir} was made from {known}, not {video}: choose another --run, or replace it with --force")

@@ -6,19 +6,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.core.config import Config, build, check_sections, load_layers
+from pipeline.core.config import Config, build_config, check_sections, load_layers
 from pipeline.core.errors import UserError
 from pipeline.core.lock import child_environment
-from pipeline.core.manifest import find_damage, read_manifest
+from pipeline.core.manifest import find_damaged_files, read_manifest
 from pipeline.core.record import RunRecord
-from pipeline.core.stage import Stage, discard_part, plan_stage
+from pipeline.core.stage import Stage, discard_work_dir, plan_stage
 
-INTERRUPTED = 130
+EXIT_INTERRUPTED = 130
 FRESH = "fresh"
 
 
 @dataclass(frozen=True)
-class Outcome:
+class StageOutcome:
     """One line of the summary: `state` is cached or run; seconds and peak memory come from the manifest."""
 
     stage: str
@@ -27,7 +27,7 @@ class Outcome:
     peak_rss_mib: float
 
 
-class StageFailed(Exception):
+class StageFailedError(Exception):
     """A stage's process ended with `code` after it said why."""
 
     def __init__(self, code: int) -> None:
@@ -39,7 +39,7 @@ def build_configs(stages: Sequence[Stage], record: RunRecord, config_dir: Path) 
     """Check the whole configuration before any work: every section known, every value allowed."""
     layers = load_layers(record.preset, record.overrides, config_dir)
     check_sections(layers, [stage.name for stage in stages])
-    return {stage.name: build(stage.name, stage.config, layers) for stage in stages}
+    return {stage.name: build_config(stage.name, stage.config, layers) for stage in stages}
 
 
 def run_all(
@@ -49,7 +49,7 @@ def run_all(
     record: RunRecord,
     lock_fd: int,
     is_forced: Callable[[str], bool],
-) -> list[Outcome]:
+) -> list[StageOutcome]:
     """Bring every stage up to date, in order; what is fresh already is left alone."""
     outcomes = []
     for number, stage in enumerate(stages, start=1):
@@ -57,13 +57,13 @@ def run_all(
         fresh = plan.is_fresh() and not is_forced(stage.name)
         print(f"[{number}/{len(stages)}] {stage.name}{': cached' if fresh else ''}", file=sys.stderr, flush=True)
         if fresh:
-            discard_part(plan)
+            discard_work_dir(plan)
         else:
             _run_in_child(stage.name, run_dir, lock_fd, is_forced(stage.name))
         manifest = read_manifest(plan.folder)
         if manifest is None:
             raise UserError(f"{plan.folder} disappeared while the run went on: run the same command again")
-        outcomes.append(Outcome(stage.name, "cached" if fresh else "run", manifest.seconds, manifest.peak_rss_mib))
+        outcomes.append(StageOutcome(stage.name, "cached" if fresh else "run", manifest.seconds, manifest.peak_rss_mib))
     return outcomes
 
 
@@ -80,13 +80,13 @@ def _run_in_child(name: str, run_dir: Path, lock_fd: int, force: bool) -> None:
             f"stage {name} was killed by signal {-code} (9 is often the system out of memory): "
             f"the same command goes on from here"
         )
-    if code == INTERRUPTED:
+    if code == EXIT_INTERRUPTED:
         raise KeyboardInterrupt
     if code:
-        raise StageFailed(code)
+        raise StageFailedError(code)
 
 
-def summary(outcomes: Sequence[Outcome], wall_s: float) -> str:
+def summary(outcomes: Sequence[StageOutcome], wall_s: float) -> str:
     """The table at the end of a run; cached stages show what they cost when they ran."""
     lines = [f"{'stage':<10} {'state':<7} {'seconds':>9} {'peak MiB':>9}"]
     lines += [f"{o.stage:<10} {o.state:<7} {o.seconds:>9.1f} {o.peak_rss_mib:>9.0f}" for o in outcomes]
@@ -116,22 +116,22 @@ def stage_states(
 
 
 def _state(stage: Stage, config: Config, run_dir: Path, record: RunRecord, states: dict[str, str]) -> str:
-    waits_for = next((need for need in stage.needs if states.get(need, FRESH) != FRESH), None)
-    there = (run_dir / stage.name).exists()
-    if there and not waits_for and plan_stage(stage, config, run_dir, record.video_path).is_fresh():
+    blocking_stage = next((need for need in stage.needs if states.get(need, FRESH) != FRESH), None)
+    folder_exists = (run_dir / stage.name).exists()
+    if folder_exists and not blocking_stage and plan_stage(stage, config, run_dir, record.video_path).is_fresh():
         return FRESH
     if (run_dir / f"{stage.name}.part").exists():
         return "unfinished"
-    if waits_for:
-        return f"waits for {waits_for}"
-    return "stale" if there else "missing"
+    if blocking_stage:
+        return f"waits for {blocking_stage}"
+    return "stale" if folder_exists else "missing"
 
 
 def verify(stages: Sequence[Stage], run_dir: Path) -> str:
     """Digest every finished artifact again; a table when all are whole, else UserError naming the damage."""
     finished = [stage.name for stage in stages if (run_dir / stage.name).exists()]
     for name in finished:
-        damage = find_damage(run_dir / name)
+        damage = find_damaged_files(run_dir / name)
         if damage:
             raise UserError(
                 f"{run_dir / name} is damaged ({', '.join(damage[:5])}): python -m stages --run {run_dir} --from {name}"

@@ -1,6 +1,7 @@
 """A stage: a named function from input folders to an output folder, run whole or not at all.
 
-Work happens in `<stage>.part/`. What a killed run leaves there survives only as `checkpoint*` files, and only for a run
+Work happens in `<stage>.work_dir/`. What a killed run leaves there survives only as `checkpoint*` files, and only for
+a run
 with the same fingerprint; everything else is written anew. A finished folder gets its manifest, is flushed to disk,
 and appears under its name with one rename.
 """
@@ -14,14 +15,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.core.atomic import atomic_path, flush
+from pipeline.core.atomic import atomic_path, fsync_path
 from pipeline.core.config import Config
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import (
-    MANIFEST,
+    MANIFEST_FILE,
     Manifest,
     digest_files,
-    digest_source,
+    digest_video,
     fingerprint,
     read_manifest,
     write_manifest,
@@ -54,7 +55,7 @@ class Stage:
 
 
 @dataclass(frozen=True)
-class Plan:
+class StagePlan:
     """What one stage would do in one run folder: its inputs, its fingerprint, and whether the result is there."""
 
     stage: Stage
@@ -70,7 +71,7 @@ class Plan:
         return self.run_dir / self.stage.name
 
     @property
-    def part(self) -> Path:
+    def work_dir(self) -> Path:
         """Where the work happens."""
         return self.run_dir / f"{self.stage.name}.part"
 
@@ -84,24 +85,24 @@ class Plan:
         )
 
 
-def plan_stage(stage: Stage, config: Config, run_dir: Path, video: Path | None) -> Plan:
+def plan_stage(stage: Stage, config: Config, run_dir: Path, video: Path | None) -> StagePlan:
     """Find a stage's inputs and fingerprint; raise UserError naming the command when an input is missing."""
     inputs, digests = {}, {}
     for need in stage.needs:
         if need == VIDEO:
             if video is None:
                 raise UserError(f"{run_dir} has no video yet: python -m stages --run {run_dir} --video FILE_OR_FOLDER")
-            inputs[need], digests[need] = video, digest_source(video)
+            inputs[need], digests[need] = video, digest_video(video)
             continue
         manifest = read_manifest(run_dir / need)
         if manifest is None:
             raise UserError(f"{stage.name} needs {run_dir / need}, which is missing: python -m stages.{need} {run_dir}")
         inputs[need], digests[need] = run_dir / need, manifest.outputs_digest
     key = fingerprint(stage.name, stage.version, config.model_dump(mode="json"), digests)
-    return Plan(stage, config, run_dir, inputs, digests, key)
+    return StagePlan(stage, config, run_dir, inputs, digests, key)
 
 
-def run_stage(plan: Plan, force: bool = False) -> bool:
+def run_stage(plan: StagePlan, force: bool = False) -> bool:
     """Bring one stage up to date; return True when it ran and False when the result was there already.
 
     Bad input, a full disk or too little memory removes the unfinished folder; a kill or Ctrl-C leaves its checkpoints,
@@ -110,39 +111,39 @@ def run_stage(plan: Plan, force: bool = False) -> bool:
     previous = plan.run_dir / f"{plan.stage.name}.old"
     _remove(previous)
     if plan.is_fresh() and not force:
-        discard_part(plan)
+        discard_work_dir(plan)
         return False
     try:
-        _work(plan, force)
+        _execute(plan, force)
         _publish(plan, previous)
     except (UserError, OSError, MemoryError):
-        discard_part(plan)
+        discard_work_dir(plan)
         raise
     return True
 
 
-def discard_part(plan: Plan) -> None:
+def discard_work_dir(plan: StagePlan) -> None:
     """Remove unfinished work, if there is any."""
-    _remove(plan.part)
+    _remove(plan.work_dir)
 
 
-def _work(plan: Plan, force: bool) -> None:
+def _execute(plan: StagePlan, force: bool) -> None:
     """Fill the .part folder and write its manifest, unless a run killed just before the rename did so."""
-    if not force and _manifest_fingerprint(plan.part) == plan.fingerprint:
+    if not force and _manifest_fingerprint(plan.work_dir) == plan.fingerprint:
         return
-    resumed = _prepare_part(plan, force)
+    resumed = _prepare_work_dir(plan, force)
     take_warnings()
     start = time.monotonic()
-    metrics = plan.stage.run(plan.inputs, plan.part, plan.config)
+    metrics = plan.stage.run(plan.inputs, plan.work_dir, plan.config)
     seconds = time.monotonic() - start
-    _check_makes(plan)
+    _check_outputs(plan)
     manifest = Manifest(
         stage=plan.stage.name,
         version=plan.stage.version,
         fingerprint=plan.fingerprint,
         config=plan.config.model_dump(mode="json"),
         inputs=dict(plan.input_digests),
-        outputs={name: digest for name, digest in digest_files(plan.part).items() if not _is_working_file(name)},
+        outputs={name: digest for name, digest in digest_files(plan.work_dir).items() if not _is_working_file(name)},
         metrics={name: float(value) if math.isfinite(value) else None for name, value in metrics.items()},
         seconds=round(seconds, 3),
         peak_rss_mib=round(peak_rss_mib(), 1),
@@ -150,45 +151,45 @@ def _work(plan: Plan, force: bool) -> None:
         warnings=take_warnings(),
         environment=environment(),
     )
-    _flush_tree(plan.part)
-    with atomic_path(plan.part / MANIFEST) as path:
+    _fsync_tree(plan.work_dir)
+    with atomic_path(plan.work_dir / MANIFEST_FILE) as path:
         write_manifest(manifest, path)
 
 
-def _prepare_part(plan: Plan, force: bool) -> bool:
+def _prepare_work_dir(plan: StagePlan, force: bool) -> bool:
     """Make the .part folder ready; return True when checkpoints of a run with this fingerprint are kept in it."""
-    mark = plan.part / FINGERPRINT
-    same = not force and mark.is_file() and mark.read_text() == plan.fingerprint
-    if not same:
-        _remove(plan.part)
-        plan.part.mkdir(parents=True)
-        mark.write_text(plan.fingerprint)
+    fingerprint_path = plan.work_dir / FINGERPRINT
+    is_same_fingerprint = not force and fingerprint_path.is_file() and fingerprint_path.read_text() == plan.fingerprint
+    if not is_same_fingerprint:
+        _remove(plan.work_dir)
+        plan.work_dir.mkdir(parents=True)
+        fingerprint_path.write_text(plan.fingerprint)
     kept = False
-    for path in plan.part.iterdir():
+    for path in plan.work_dir.iterdir():
         if path.name.startswith(CHECKPOINT_PREFIX):
             kept = True
-        elif path != mark:
+        elif path != fingerprint_path:
             _remove(path)
     return kept
 
 
-def _check_makes(plan: Plan) -> None:
+def _check_outputs(plan: StagePlan) -> None:
     """A stage that does not make what it declares has a fault in its code."""
     for declared in plan.stage.makes:
-        path = plan.part / declared
+        path = plan.work_dir / declared
         if not (any(path.iterdir()) if path.is_dir() else path.is_file() and path.stat().st_size > 0):
             raise RuntimeError(f"stage {plan.stage.name} did not make {declared}")
 
 
-def _publish(plan: Plan, previous: Path) -> None:
+def _publish(plan: StagePlan, previous: Path) -> None:
     """Drop the working files and give the finished folder its name; the result it replaces goes last."""
-    for path in list(plan.part.iterdir()):
+    for path in list(plan.work_dir.iterdir()):
         if _is_working_file(path.name):
             _remove(path)
     if plan.folder.exists():
         plan.folder.rename(previous)
-    plan.part.rename(plan.folder)
-    flush(plan.run_dir)
+    plan.work_dir.rename(plan.folder)
+    fsync_path(plan.run_dir)
     _remove(previous)
 
 
@@ -209,8 +210,8 @@ def _remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def _flush_tree(folder: Path) -> None:
+def _fsync_tree(folder: Path) -> None:
     for directory, _, names in os.walk(folder):
         for name in names:
-            flush(Path(directory, name))
-        flush(Path(directory))
+            fsync_path(Path(directory, name))
+        fsync_path(Path(directory))

@@ -36,22 +36,24 @@ class FieldConfig(Config):
     finest_cell_px: float = Option(2.0, gt=0, description="finest cell of the grid, in pixels at the body's depth")
     hidden_width: int = Option(32, ge=8, le=512, description="width of the hidden layer")
 
-    hull_votes: float = Option(0.9, gt=0, le=1, description="part of the frames whose mask must hold a point of a hull")
+    hull_min_mask_fraction: float = Option(
+        0.9, gt=0, le=1, description="part of the frames whose mask must hold a point of a hull"
+    )
 
-    margin_m: float = Option(
+    min_clothing_offset_m: float = Option(
         0.10, gt=0, le=0.6, description="how far clothing and hair may stand off the fitted body at least, m"
     )
-    widest_margin_m: float = Option(
+    max_clothing_offset_m: float = Option(
         0.5, ge=0, le=0.6, description="the same at most, where the masks reach far beyond the body, m; 0: never wider"
     )
     step_fraction: float = Option(0.01, gt=0, le=0.1, description="ray step, as a part of the body's height")
     pixel_jitter: bool = Option(False, description="rays start anywhere in their pixel instead of its centre")
-    share_border: float = Option(0.25, ge=0, le=1, description="part of the rays along the mask's border")
-    share_outside: float = Option(0.1, ge=0, le=1, description="part of the rays outside the mask")
-    share_error: float = Option(
+    border_sampling_ratio: float = Option(0.25, ge=0, le=1, description="part of the rays along the mask's border")
+    outside_sampling_ratio: float = Option(0.1, ge=0, le=1, description="part of the rays outside the mask")
+    error_sampling_ratio: float = Option(
         0.6, ge=0, le=1, description="of the rays on the body, the part that is drawn where colours erred most of late"
     )
-    outlier: float = Option(
+    outlier_threshold: float = Option(
         6.0,
         gt=0,
         description="colour error, in medians of its frame's, from which on a pixel is no longer taken for the person; "
@@ -62,30 +64,30 @@ class FieldConfig(Config):
     occupancy: Literal["attention", "plain"] = Option(
         "plain", description="how the occupancy grid is updated: by voxel attention (IHM) or by the mean opacity alone"
     )
-    occupancy_every: int = Option(8, ge=1, description="steps between updates of the occupancy grid")
-    occupancy_start: int = Option(64, ge=0, description="step of the first update that may empty a cell")
+    occupancy_update_interval: int = Option(8, ge=1, description="steps between updates of the occupancy grid")
+    occupancy_warmup_steps: int = Option(64, ge=0, description="step of the first update that may empty a cell")
     occupancy_threshold: float = Option(
         0.03, ge=0, le=1, description="mean opacity of a step above which a cell is occupied"
     )
     occupancy_decay: float = Option(
         0.95, gt=0, lt=1, description="moving average of the occupancy, part kept an update"
     )
-    attention_rate: float = Option(3e-3, gt=0, description="learning rate of the voxel attention")
-    mask_support: float = Option(
+    attention_learning_rate: float = Option(3e-3, gt=0, description="learning rate of the voxel attention")
+    initial_min_mask_fraction: float = Option(
         0.6, ge=0, le=1, description="part of the frames whose mask must hold a cell, at the start"
     )
 
-    table_rate: float = Option(1e-1, gt=0, description="learning rate of the hash table")
-    network_rate: float = Option(2e-2, gt=0, description="learning rate of the network")
-    final_rate: float = Option(
+    table_learning_rate: float = Option(1e-1, gt=0, description="learning rate of the hash table")
+    network_learning_rate: float = Option(2e-2, gt=0, description="learning rate of the network")
+    final_learning_rate_ratio: float = Option(
         0.05, gt=0, le=1, description="learning rates at the end, as a part of those at the start"
     )
     huber_delta: float = Option(0.1, gt=0, description="colour error where the Huber loss turns from square to linear")
-    weight_alpha: float = Option(0.3, ge=0, description="weight of the alpha loss")
-    weight_hard: float = Option(0.02, ge=0, description="weight of the hard-surface loss")
-    weight_density: float = Option(0.05, ge=0, description="weight of the density loss in empty cells")
+    alpha_weight: float = Option(0.3, ge=0, description="weight of the alpha loss")
+    hard_surface_weight: float = Option(0.02, ge=0, description="weight of the hard-surface loss")
+    empty_density_weight: float = Option(0.05, ge=0, description="weight of the density loss in empty cells")
     empty_points: int = Option(2048, ge=0, description="points a step at which emptiness is asked for")
-    unproven_points: int = Option(
+    unobserved_points: int = Option(
         512,
         ge=0,
         description="points a step at which emptiness is asked for off the body, where no light comes or only one side "
@@ -93,17 +95,21 @@ class FieldConfig(Config):
     )
 
     pose_refinement: bool = Option(True, description="learn small corrections of the poses")
-    pose_start: float = Option(0.1, ge=0, le=1, description="part of the steps after which poses are refined")
-    pose_rate: float = Option(1e-3, gt=0, description="learning rate of the poses, rad (shifts: a third of it, m)")
-    pose_smoothness: float = Option(0.02, ge=0, description="weight of the change of corrections from frame to frame")
-    pose_size: float = Option(0.002, ge=0, description="weight of the size of corrections")
+    pose_start_fraction: float = Option(0.1, ge=0, le=1, description="part of the steps after which poses are refined")
+    pose_learning_rate: float = Option(
+        1e-3, gt=0, description="learning rate of the poses, rad (shifts: a third of it, m)"
+    )
+    pose_smoothness_weight: float = Option(
+        0.02, ge=0, description="weight of the change of corrections from frame to frame"
+    )
+    pose_l2_weight: float = Option(0.002, ge=0, description="weight of the size of corrections")
     validation_frames: int = Option(4, ge=0, description="validation frames that are rendered to judge the result")
     early_stop: bool = Option(
         True, description="end before all steps are made, once validation frames gain no more than noise"
     )
 
     @model_validator(mode="after")
-    def _leaves_a_rest(self) -> "FieldConfig":
-        if self.share_border + self.share_outside > 1:
+    def _check_sampling_ratios(self) -> "FieldConfig":
+        if self.border_sampling_ratio + self.outside_sampling_ratio > 1:
             raise ValueError("share_border and share_outside are together at most 1")
         return self

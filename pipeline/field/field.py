@@ -11,31 +11,31 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pipeline.field.positional_mlp import FrequencyTrunk
-from pipeline.kernels.hashgrid import GridLayout, Towards, encode
+from pipeline.field.positional_mlp import PositionalMlp
+from pipeline.kernels.hashgrid import FeatureGradients, GridLayout, encode
 
-NO_GRID = GridLayout((), 1, 0)
+EMPTY_GRID_LAYOUT = GridLayout((), 1, 0)
 
-START_DENSITY_PER_M = 10.0
+INITIAL_DENSITY_PER_M = 10.0
 """Before training a torso of 0.2 m is seen as 86 % opaque: enough for a signal, not so much that the inside gets
 none.
 """
 
-LIMIT = 7.0
+MAX_ABS_LOG_DENSITY = 7.0
 """density = START · exp(raw), with raw cut at plus and minus the limit."""
 
-ROWS = 8192
+CPU_CHUNK_POINTS = 8192
 """Points that go through the network at once on the CPU: what lies between its layers stays in the cache."""
 
-QUERY_POINTS = 1 << 18
+QUERY_CHUNK_POINTS = 1 << 18
 
-NEGLIGIBLE = 1e-3
+MIN_RELATIVE_GRADIENT = 1e-3
 """Points whose gradient is below this part of the mean one get none. That is half of them, most behind a surface, and
 together they hold less than a thousandth of the whole.
 """
 
 
-class _Decode(torch.autograd.Function):
+class _RadianceMlp(torch.autograd.Function):
     """relu(features W1) W2 + b, sigmoid for three colours, exp for the density.
 
     Backward computes the hidden layer again rather than store it: that is less than the memory traffic it saves.
@@ -46,39 +46,41 @@ class _Decode(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, features: Tensor, hidden: Tensor, output: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
-        raw, at_once = features.new_empty(4, len(features)), _rows_at_once(features)
-        for part, into in zip(features.split(at_once), raw.split(at_once, dim=1), strict=True):
+        raw, chunk_size = features.new_empty(4, len(features)), _chunk_size(features)
+        for part, into in zip(features.split(chunk_size), raw.split(chunk_size, dim=1), strict=True):
             torch.mm(output.T, (part @ hidden).clamp_(min=0).T, out=into)
         raw = raw.T + bias
         colour = torch.sigmoid(raw[:, :3])
-        density = START_DENSITY_PER_M * torch.exp(raw[:, 3].clamp(-LIMIT, LIMIT))
+        density = INITIAL_DENSITY_PER_M * torch.exp(raw[:, 3].clamp(-MAX_ABS_LOG_DENSITY, MAX_ABS_LOG_DENSITY))
         ctx.save_for_backward(features, hidden, output, colour, density)
         return colour, density
 
     @staticmethod
-    def backward(ctx: Any, colour_gradient: Tensor, density_gradient: Tensor) -> tuple[Tensor, ...]:
+    def backward(ctx: Any, grad_colour: Tensor, grad_density: Tensor) -> tuple[Tensor, ...]:
         features, hidden, output, colour, density = ctx.saved_tensors
-        raw_gradient = torch.empty(len(colour), 4).to(colour)
-        torch.mul(colour_gradient, colour * (1 - colour), out=raw_gradient[:, :3])
-        torch.mul(density_gradient, density, out=raw_gradient[:, 3])
-        features_gradient = torch.zeros_like(features)
-        hidden_gradient, output_gradient = torch.zeros_like(hidden), torch.zeros_like(output)
-        size = raw_gradient.abs().amax(1)
-        for rows in torch.nonzero(size > NEGLIGIBLE * size.mean())[:, 0].split(_rows_at_once(features)):
-            part, towards = features.index_select(0, rows), raw_gradient.index_select(0, rows)
+        grad_raw = torch.empty(len(colour), 4).to(colour)
+        torch.mul(grad_colour, colour * (1 - colour), out=grad_raw[:, :3])
+        torch.mul(grad_density, density, out=grad_raw[:, 3])
+        grad_features = torch.zeros_like(features)
+        grad_hidden, grad_output = torch.zeros_like(hidden), torch.zeros_like(output)
+        gradient_magnitude = grad_raw.abs().amax(1)
+        for rows in torch.nonzero(gradient_magnitude > MIN_RELATIVE_GRADIENT * gradient_magnitude.mean())[:, 0].split(
+            _chunk_size(features)
+        ):
+            part, towards = features.index_select(0, rows), grad_raw.index_select(0, rows)
             activation = (part @ hidden).clamp_(min=0)
-            output_gradient.T.addmm_(towards.T, activation)
-            passed = (towards @ output.T).mul_(activation.sign_())
-            hidden_gradient.addmm_(part.T, passed)
-            features_gradient.index_copy_(0, rows, passed @ hidden.T)
-        return features_gradient, hidden_gradient, output_gradient, raw_gradient.sum(0)
+            grad_output.T.addmm_(towards.T, activation)
+            grad_preactivation = (towards @ output.T).mul_(activation.sign_())
+            grad_hidden.addmm_(part.T, grad_preactivation)
+            grad_features.index_copy_(0, rows, grad_preactivation @ hidden.T)
+        return grad_features, grad_hidden, grad_output, grad_raw.sum(0)
 
 
-def _rows_at_once(features: Tensor) -> int:
-    return ROWS if features.device.type == "cpu" else max(len(features), 1)
+def _chunk_size(features: Tensor) -> int:
+    return CPU_CHUNK_POINTS if features.device.type == "cpu" else max(len(features), 1)
 
 
-class Field(torch.nn.Module):
+class RadianceField(torch.nn.Module):
     """Colour and density of canonical points.
 
     bounds_m: (2, 3) box outside which there is nothing. layout: the hash grid's levels, over that box. trunk: a network
@@ -95,7 +97,7 @@ class Field(torch.nn.Module):
         layout: GridLayout,
         hidden_width: int = 64,
         seed: int = 0,
-        trunk: FrequencyTrunk | None = None,
+        trunk: PositionalMlp | None = None,
         inverse_skinning: str = "baked",
     ) -> None:
         super().__init__()
@@ -114,37 +116,37 @@ class Field(torch.nn.Module):
         self.bias = torch.nn.Parameter(torch.zeros(4))
 
     def radiance(
-        self, x_canonical_m: Float[Tensor, "n 3"], towards: Towards | None = None
+        self, x_canonical_m: Float[Tensor, "n 3"], towards: FeatureGradients | None = None
     ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
         """Colour and density without the cut at the bounds; for training. `towards`: see `encode`."""
         unit = (x_canonical_m - self.bounds_m[0]) / (self.bounds_m[1] - self.bounds_m[0])
         features = self.trunk(unit) if self.trunk else encode(unit, self.table, self.layout, towards)
-        return _Decode.apply(features, self.hidden, self.output, self.bias)
+        return _RadianceMlp.apply(features, self.hidden, self.output, self.bias)
 
-    def forward(self, x_canonical: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+    def forward(self, x_canonical_m: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
         """Colour (n, 3) in [0, 1] and density (n) in 1/m >= 0 of canonical points (m); density is 0 outside the
         bounds.
         """
-        inside = ((x_canonical >= self.bounds_m[0]) & (x_canonical <= self.bounds_m[1])).all(-1)
-        colour, density = self.radiance(x_canonical)
+        inside = ((x_canonical_m >= self.bounds_m[0]) & (x_canonical_m <= self.bounds_m[1])).all(-1)
+        colour, density = self.radiance(x_canonical_m)
         return colour, density * inside
 
-    def density(self, x_canonical: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+    def density(self, x_canonical_m: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Density (1/m) alone, without gradient, in parts that fit into the cache."""
         with torch.no_grad():
-            return torch.cat([self(part)[1] for part in x_canonical.split(QUERY_POINTS)])
+            return torch.cat([self(part)[1] for part in x_canonical_m.split(QUERY_CHUNK_POINTS)])
 
-    def colour(self, x_canonical: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    def colour(self, x_canonical_m: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Colour alone, without gradient, in parts that fit into the cache."""
         with torch.no_grad():
-            return torch.cat([self(part)[0] for part in x_canonical.split(QUERY_POINTS)])
+            return torch.cat([self(part)[0] for part in x_canonical_m.split(QUERY_CHUNK_POINTS)])
 
 
 def _uniform(shape: tuple[int, int], limit: float, random: torch.Generator) -> torch.nn.Parameter:
     return torch.nn.Parameter((2 * torch.rand(shape, generator=random) - 1) * limit)
 
 
-def choose_layout(
+def hash_grid_layout(
     bounds_m: Float[np.ndarray, "2 3"], finest_cell_m: float, levels: int, features: int, log2_rows: int
 ) -> GridLayout:
     """Levels from an eighth of the box's longest side down to the finest cell, in equal ratios.

@@ -13,67 +13,73 @@ from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.geometry.surface import signed_distance_m
 
-UNSEEN_REACH_M = 0.08
+UNSEEN_PRIOR_FALLOFF_M = 0.08
 """Beyond this distance from the body nothing is expected unseen; at half of it, as likely as not."""
-UNSEEN_WEIGHT = 8.0
+UNSEEN_PRIOR_FRAMES = 8.0
 """Frames that the expectation counts for where no frame shows a point."""
-VERTEX_REACH_M = 0.06
+MAX_VERTEX_DISTANCE_M = 0.06
 """No point of a body's surface is farther from the nearest vertex."""
-REACH_PART = 0.99
+MASK_DISTANCE_QUANTILE = 0.99
 """Part of a mask's pixels that its clothes explain; the rest may be strands of hair or strokes of a poor mask."""
-MARGIN_PER_REACH = 2.0
+OFFSET_PER_MASK_DISTANCE = 2.0
 """Cloth stands farther off the body than off its outline: a leg before or behind the cloth hides the gap."""
-ASKED_EVERY_PX = 4
-ONE_SIDED = 0.75
+MASK_STRIDE_PX = 4
+MIN_RESULTANT_LENGTH = 0.75
 """Mean of unit directions, its length, from which on they come from one side: that of an arc of 145 degrees."""
 
 
-def field_bounds_m(body: Body, margin_m: float) -> Float[np.ndarray, "2 3"]:
+def field_bounds_m(body: Body, clothing_offset_m: float) -> Float[np.ndarray, "2 3"]:
     """The body's canonical box, widened on all sides."""
-    return np.stack([body.vertices.min(0) - margin_m, body.vertices.max(0) + margin_m]).astype(np.float32)
+    return np.stack([body.vertices.min(0) - clothing_offset_m, body.vertices.max(0) + clothing_offset_m]).astype(
+        np.float32
+    )
 
 
-def clothing_margin_m(
+def estimate_clothing_offset_m(
     body: Body,
     canonical_to_world: Float[Tensor, "k j 4 4"],
     camera: Camera,
     masks: list[Bool[np.ndarray, "h w"]],
-    narrowest_m: float,
-    widest_m: float,
+    min_offset_m: float,
+    max_offset_m: float,
 ) -> float:
     """How far from the body clothes may stand, judged by how far the masks reach beyond it; m.
 
     The reach of a mask is the 99th percentile over its pixels of the distance to the body's nearest vertex in the
     image, at that vertex's depth. Twice the median over frames counts, so that some poor masks or poses do not; no
-    more than `widest_m`, and never less than `narrowest_m`.
+    more than `max_offset_m`, and never less than `min_offset_m`.
     """
     vertices, weights = torch.from_numpy(body.vertices), torch.from_numpy(body.skin_weights)
-    reaches_m = []
+    mask_distances_m = []
     for pose, mask in zip(canonical_to_world, masks, strict=True):
         posed = linear_blend_skinning(vertices, weights, pose[None])[0]
         pixels, depth_m = (of.numpy() for of in project(posed, camera))
-        before = depth_m > 0
-        shown = ASKED_EVERY_PX * np.argwhere(mask[::ASKED_EVERY_PX, ::ASKED_EVERY_PX])[:, ::-1] + 0.5
-        if len(shown) and before.any():
-            distance_px, nearest = cKDTree(pixels[before]).query(shown)
-            reaches_m.append(np.quantile(distance_px * depth_m[before][nearest] / camera.fx, REACH_PART))
-    reach_m = float(np.median(reaches_m)) if reaches_m else 0.0
-    return max(narrowest_m, min(widest_m, MARGIN_PER_REACH * reach_m))
+        in_front = depth_m > 0
+        mask_px = MASK_STRIDE_PX * np.argwhere(mask[::MASK_STRIDE_PX, ::MASK_STRIDE_PX])[:, ::-1] + 0.5
+        if len(mask_px) and in_front.any():
+            distance_px, nearest = cKDTree(pixels[in_front]).query(mask_px)
+            mask_distances_m.append(
+                np.quantile(distance_px * depth_m[in_front][nearest] / camera.fx, MASK_DISTANCE_QUANTILE)
+            )
+    reach_m = float(np.median(mask_distances_m)) if mask_distances_m else 0.0
+    return max(min_offset_m, min(max_offset_m, OFFSET_PER_MASK_DISTANCE * reach_m))
 
 
-def cell_distances_m(body: Body, bounds_m: Float[np.ndarray, "2 3"], reach_m: float) -> Float[np.ndarray, "gx gy gz"]:
+def cell_signed_distances_m(
+    body: Body, bounds_m: Float[np.ndarray, "2 3"], reach_m: float
+) -> Float[np.ndarray, "gx gy gz"]:
     """Signed distance of each cell's centre to the canonical body, negative inside; at most `reach_m`."""
     centres, threads = cell_centres(bounds_m), torch.get_num_threads()
-    bound_m = reach_m + VERTEX_REACH_M
-    nearest_m, _ = cKDTree(body.vertices).query(centres, distance_upper_bound=bound_m, workers=threads)
+    bound_m = reach_m + MAX_VERTEX_DISTANCE_M
+    vertex_distance_m, _ = cKDTree(body.vertices).query(centres, distance_upper_bound=bound_m, workers=threads)
     # What lies deeper inside the body than that is enclosed by what does not.
-    asked = binary_fill_holes(np.isfinite(nearest_m).reshape(RESOLUTION, RESOLUTION, RESOLUTION))
-    distance = np.full(asked.shape, reach_m, dtype=np.float32)
-    distance[asked] = np.minimum(signed_distance_m(centres[asked.reshape(-1)], body.mesh()), reach_m)
+    needs_query = binary_fill_holes(np.isfinite(vertex_distance_m).reshape(RESOLUTION, RESOLUTION, RESOLUTION))
+    distance = np.full(needs_query.shape, reach_m, dtype=np.float32)
+    distance[needs_query] = np.minimum(signed_distance_m(centres[needs_query.reshape(-1)], body.mesh()), reach_m)
     return distance
 
 
-def mask_frequency(
+def project_mask_fraction(
     centres_m: Float[np.ndarray, "n 3"],
     distance_m: Float[np.ndarray, "n"],
     weights: Float[Tensor, "n j"],
@@ -89,20 +95,26 @@ def mask_frequency(
     masks: one a frame, dilated by as much as a point stands for.
     """
     points = torch.from_numpy(centres_m)
-    hits, seen = np.zeros(len(centres_m)), np.zeros(len(centres_m))
+    mask_sum, in_image_count = np.zeros(len(centres_m)), np.zeros(len(centres_m))
     for row, mask in enumerate(masks):
         posed = linear_blend_skinning(points, weights, canonical_to_world[row : row + 1])[0]
         pixels, depth_m = project(posed, camera)
-        column, line = (pixels[:, axis].floor().long().numpy() for axis in range(2))
-        inside = (depth_m.numpy() > 0) & (column >= 0) & (line >= 0) & (column < mask.shape[1]) & (line < mask.shape[0])
-        seen += inside
-        hits[inside] += mask[line[inside], column[inside]] > 0
-    expected = np.clip(1.0 - distance_m / UNSEEN_REACH_M, 0.0, 1.0)
-    missing = UNSEEN_WEIGHT * (1.0 - seen / max(len(masks), 1))
-    return ((hits + missing * expected) / np.maximum(seen + missing, 1e-6)).astype(np.float32)
+        pixel_column, pixel_row = (pixels[:, axis].floor().long().numpy() for axis in range(2))
+        inside = (
+            (depth_m.numpy() > 0)
+            & (pixel_column >= 0)
+            & (pixel_row >= 0)
+            & (pixel_column < mask.shape[1])
+            & (pixel_row < mask.shape[0])
+        )
+        in_image_count += inside
+        mask_sum[inside] += mask[pixel_row[inside], pixel_column[inside]] > 0
+    prior = np.clip(1.0 - distance_m / UNSEEN_PRIOR_FALLOFF_M, 0.0, 1.0)
+    prior_weight = UNSEEN_PRIOR_FRAMES * (1.0 - in_image_count / max(len(masks), 1))
+    return ((mask_sum + prior_weight * prior) / np.maximum(in_image_count + prior_weight, 1e-6)).astype(np.float32)
 
 
-def filmed_from_one_side(
+def observed_from_one_side(
     joints_m: Float[np.ndarray, "j 3"],
     weights: Float[Tensor, "n j"],
     canonical_to_world: Float[Tensor, "k j 4 4"],
@@ -115,18 +127,22 @@ def filmed_from_one_side(
     at most in full turns, of 0.8 and more in films from the front.
     """
     canonical_m = torch.from_numpy(joints_m).to(canonical_to_world)
-    turn, shift = canonical_to_world[..., :3, :3], canonical_to_world[..., :3, 3]
-    to_camera = torch.from_numpy(camera.centre_m()).to(canonical_m) - (turn @ canonical_m[:, :, None])[..., 0] - shift
-    in_joint = torch.nn.functional.normalize((turn.transpose(-1, -2) @ to_camera[..., None])[..., 0], dim=-1)
-    alike = in_joint.mean(0).norm(dim=-1)
-    return (weights @ alike > ONE_SIDED).numpy()
+    rotation, translation_m = canonical_to_world[..., :3, :3], canonical_to_world[..., :3, 3]
+    to_camera = (
+        torch.from_numpy(camera.centre_m()).to(canonical_m)
+        - (rotation @ canonical_m[:, :, None])[..., 0]
+        - translation_m
+    )
+    in_joint = torch.nn.functional.normalize((rotation.transpose(-1, -2) @ to_camera[..., None])[..., 0], dim=-1)
+    resultant_length = in_joint.mean(0).norm(dim=-1)
+    return (weights @ resultant_length > MIN_RESULTANT_LENGTH).numpy()
 
 
-def starting_shell(
+def initial_occupancy(
     distance_m: Float[np.ndarray, "*grid"],
-    frequency: Float[np.ndarray, "*grid"],
-    margin_m: float,
-    mask_support: float,
+    mask_fraction: Float[np.ndarray, "*grid"],
+    clothing_offset_m: float,
+    initial_min_mask_fraction: float,
 ) -> Bool[np.ndarray, "*grid"]:
     """Cells within the clothing margin that enough masks hold, and all cells inside the body."""
-    return (distance_m < 0) | ((distance_m < margin_m) & (frequency >= mask_support))
+    return (distance_m < 0) | ((distance_m < clothing_offset_m) & (mask_fraction >= initial_min_mask_fraction))

@@ -18,17 +18,25 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pipeline.body.body import Body
-from pipeline.field.occupancy import Occupancy, cell_centres
-from pipeline.field.skin_grid import bake_motion
+from pipeline.field.occupancy import BinaryOccupancy, cell_centres
+from pipeline.field.skin_grid import bake_warp_grids
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.kernels import broyden
-from pipeline.kernels.inverse_skinning import SkinGrid, newton
+from pipeline.kernels.inverse_skinning import SkinGrid, newton_step
 from pipeline.kernels.inverse_skinning.reference import skin_points
-from pipeline.kernels.march import Samples, WarpSet, march
-from pipeline.kernels.march.reference_stops import march_with
+from pipeline.kernels.march import PackedWarpGrids, Samples, march
+from pipeline.kernels.march.reference_stops import march_with_inverse
 
-START_BONES: tuple[str, ...] = ("Hips", "LeftUpLeg", "RightUpLeg", "LeftLeg", "RightLeg", "LeftToeBase", "RightToeBase")
-START_BONES += ("Neck", "Head", "LeftArm", "RightArm", "LeftForeArm", "RightForeArm")
+INITIAL_BONES: tuple[str, ...] = (
+    "Hips",
+    "LeftUpLeg",
+    "RightUpLeg",
+    "LeftLeg",
+    "RightLeg",
+    "LeftToeBase",
+    "RightToeBase",
+)
+INITIAL_BONES += ("Neck", "Head", "LeftArm", "RightArm", "LeftForeArm", "RightForeArm")
 """The thirteen bones from which InstantAvatar's search starts, by the names that they have here."""
 
 
@@ -42,70 +50,83 @@ class Rays(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Inverse:
+class InverseSkinning:
     """Inverse skinning of the frames of a motion.
 
     boxes_m: the posed box of each frame, low and high corner.
-    sample(rays, step_m, occupancy, max_samples): samples in occupied cells; `rays.frame` is a row of `boxes_m`.
+    sample(rays, step_m, occupancy, max_samples): samples in occupied cells; `rays.frame` is a row of `posed_bounds_m`.
     place(skin, canonical_to_posed, frames, canonical_m, posed_m, slot_start): where the poses (b, j, 4, 4) of the rows
     `frames` (b) put samples (s, 3) that were found at `canonical_m`; differentiable in the poses. The samples of frame
     i are slot_start[i] : slot_start[i + 1].
     warps: the grids that hold the inverse, where it lies in such.
     """
 
-    boxes_m: Float[Tensor, "k 2 3"]
-    sample: Callable[[Rays, float, Occupancy, int], Samples]
-    place: Callable[[SkinGrid, Tensor, Tensor, Tensor, Tensor, Tensor], Tensor]
-    warps: WarpSet | None = None
+    posed_bounds_m: Float[Tensor, "k 2 3"]
+    sample_rays: Callable[[Rays, float, BinaryOccupancy, int], Samples]
+    to_canonical: Callable[[SkinGrid, Tensor, Tensor, Tensor, Tensor, Tensor], Tensor]
+    warps: PackedWarpGrids | None = None
 
 
-def invert_motion(way: str, body: Body, skin: SkinGrid, canonical_to_posed: Float[Tensor, "k j 4 4"]) -> Inverse:
+def build_inverse_skinning(
+    method: str, body: Body, skin: SkinGrid, canonical_to_posed: Float[Tensor, "k j 4 4"]
+) -> InverseSkinning:
     """Prepare a way ("baked", "broyden" or "nearest") for the poses of all frames."""
-    return {"baked": _baked, "broyden": _broyden, "nearest": _nearest}[way](body, skin, canonical_to_posed.detach())
+    return {"baked": _baked, "broyden": _broyden, "nearest": _nearest}[method](body, skin, canonical_to_posed.detach())
 
 
-def _newton_place(
-    skin: SkinGrid, canonical_to_posed: Tensor, frames: Tensor, canonical_m: Tensor, posed_m: Tensor, slot_start: Tensor
+def _newton_to_canonical(
+    skin: SkinGrid,
+    canonical_to_posed: Tensor,
+    frames: Tensor,
+    canonical_m: Tensor,
+    posed_m: Tensor,
+    frame_offsets: Tensor,
 ) -> Tensor:
-    return newton(skin.blend(canonical_to_posed), canonical_m, posed_m, slot_start, skin)
+    return newton_step(skin.blend(canonical_to_posed), canonical_m, posed_m, frame_offsets, skin)
 
 
-def _baked(body: Body, skin: SkinGrid, canonical_to_posed: Float[Tensor, "k j 4 4"]) -> Inverse:
-    warps = bake_motion(skin, canonical_to_posed)
+def _baked(body: Body, skin: SkinGrid, canonical_to_posed: Float[Tensor, "k j 4 4"]) -> InverseSkinning:
+    warps = bake_warp_grids(skin, canonical_to_posed)
 
-    def sample(rays: Rays, step_m: float, occupancy: Occupancy, max_samples: int) -> Samples:
+    def sample_rays(rays: Rays, step_m: float, occupancy: BinaryOccupancy, max_samples: int) -> Samples:
         return march(*rays, step_m, warps, occupancy.occupied, occupancy.bounds_m, max_samples)
 
     low = warps.origin_m
     high = low + warps.cell_m * (warps.dims - 1).float()
-    return Inverse(torch.stack([low, high], dim=1), sample, _newton_place, warps)
+    return InverseSkinning(torch.stack([low, high], dim=1), sample_rays, _newton_to_canonical, warps)
 
 
-def _broyden(body: Body, skin: SkinGrid, canonical_to_posed: Float[Tensor, "k j 4 4"]) -> Inverse:
-    bones = [body.joint(name) for name in START_BONES]
-    boxes_m = _boxes_m(_posed_vertices_m(body, canonical_to_posed), skin)
+def _broyden(body: Body, skin: SkinGrid, canonical_to_posed: Float[Tensor, "k j 4 4"]) -> InverseSkinning:
+    bones = [body.joint(name) for name in INITIAL_BONES]
+    posed_bounds_m = _boxes_m(_posed_vertices_m(body, canonical_to_posed), skin)
 
-    def sample(rays: Rays, step_m: float, occupancy: Occupancy, max_samples: int) -> Samples:
+    def sample_rays(rays: Rays, step_m: float, occupancy: BinaryOccupancy, max_samples: int) -> Samples:
         rows, slot = torch.unique(rays.frame, return_inverse=True)
         matrices = canonical_to_posed[rows]
         blended = skin.blend(matrices)
-        trees, reach_m = _posed_cells(occupancy, blended, skin)
+        kd_trees, max_distance_m = _posed_cells(occupancy, blended, skin)
 
-        def find(posed_m: Float[Tensor, "p 3"], slot: Int[Tensor, "p"]) -> tuple[Tensor, Tensor]:
-            near = _nearest_in(trees, posed_m, slot, reach_m) >= 0
+        def find_canonical(posed_m: Float[Tensor, "p 3"], slot: Int[Tensor, "p"]) -> tuple[Tensor, Tensor]:
+            near = _nearest_index(kd_trees, posed_m, slot, max_distance_m) >= 0
             points = posed_m.new_zeros(len(posed_m), broyden.CANDIDATES, 3)
             exists = torch.zeros(points.shape[:2], dtype=torch.bool, device=points.device)
-            points[near], exists[near] = broyden.search(posed_m[near], slot[near], matrices[:, bones], blended, skin)
+            points[near], exists[near] = broyden.find_roots(
+                posed_m[near], slot[near], matrices[:, bones], blended, skin
+            )
             return points, exists
 
         grid = (occupancy.occupied, occupancy.bounds_m)
-        return Samples(*march_with(find, *rays._replace(frame=slot), step_m, boxes_m[rows], *grid, max_samples))
+        return Samples(
+            *march_with_inverse(
+                find_canonical, *rays._replace(frame=slot), step_m, posed_bounds_m[rows], *grid, max_samples
+            )
+        )
 
-    return Inverse(boxes_m, sample, _newton_place)
+    return InverseSkinning(posed_bounds_m, sample_rays, _newton_to_canonical)
 
 
 def _posed_cells(
-    occupancy: Occupancy, blended: Float[Tensor, "m b 12"], skin: SkinGrid
+    occupancy: BinaryOccupancy, blended: Float[Tensor, "m b 12"], skin: SkinGrid
 ) -> tuple[dict[int, cKDTree], float]:
     """The centres of the occupied cells where each frame carries them, and how far from one its cell may reach.
 
@@ -113,45 +134,47 @@ def _posed_cells(
     """
     bounds_m, occupied = occupancy.bounds_m.cpu().numpy(), occupancy.occupied.cpu().numpy()
     centres_m = torch.from_numpy(cell_centres(bounds_m, len(occupied))[occupied.reshape(-1) > 0]).to(blended.device)
-    trees = {
+    kd_trees = {
         slot: cKDTree(skin_points(centres_m, matrix, skin.lattice).cpu().numpy())
         for slot, matrix in enumerate(blended.unbind(1))
     }
     # Half a diagonal would do where skinning does not stretch.
-    return trees, float(np.linalg.norm((bounds_m[1] - bounds_m[0]) / occupied.shape))
+    return kd_trees, float(np.linalg.norm((bounds_m[1] - bounds_m[0]) / occupied.shape))
 
 
-def _nearest(body: Body, skin: SkinGrid, canonical_to_posed: Float[Tensor, "k j 4 4"]) -> Inverse:
+def _nearest(body: Body, skin: SkinGrid, canonical_to_posed: Float[Tensor, "k j 4 4"]) -> InverseSkinning:
     weights = torch.from_numpy(body.skin_weights).to(canonical_to_posed.device)
     vertices_m = _posed_vertices_m(body, canonical_to_posed)
-    boxes_m = _boxes_m(vertices_m, skin)
-    trees = {row: cKDTree(vertices.cpu().numpy()) for row, vertices in enumerate(vertices_m)}
+    posed_bounds_m = _boxes_m(vertices_m, skin)
+    kd_trees = {row: cKDTree(vertices.cpu().numpy()) for row, vertices in enumerate(vertices_m)}
 
-    def undo(matrices: Float[Tensor, "j 4 4"], vertex: Int[Tensor, "p"], posed_m: Float[Tensor, "p 3"]) -> Tensor:
+    def invert_skinning(
+        matrices: Float[Tensor, "j 4 4"], vertex: Int[Tensor, "p"], posed_m: Float[Tensor, "p 3"]
+    ) -> Tensor:
         matrix = (weights[vertex] @ matrices[:, :3].reshape(-1, 12)).view(-1, 3, 4)
         return torch.linalg.solve(matrix[:, :, :3], posed_m - matrix[:, :, 3])
 
-    def find(posed_m: Float[Tensor, "p 3"], frame: Int[Tensor, "p"]) -> tuple[Tensor, Tensor]:
-        vertex = _nearest_in(trees, posed_m, frame, float(skin.distance_m.max()))
+    def find_canonical(posed_m: Float[Tensor, "p 3"], frame: Int[Tensor, "p"]) -> tuple[Tensor, Tensor]:
+        vertex = _nearest_index(kd_trees, posed_m, frame, float(skin.distance_m.max()))
         points = torch.zeros_like(posed_m)
         for row in frame.unique().tolist():
             chosen = (frame == row) & (vertex >= 0)
-            points[chosen] = undo(canonical_to_posed[row], vertex[chosen], posed_m[chosen])
+            points[chosen] = invert_skinning(canonical_to_posed[row], vertex[chosen], posed_m[chosen])
         return points[:, None], (vertex >= 0)[:, None]
 
-    def sample(rays: Rays, step_m: float, occupancy: Occupancy, max_samples: int) -> Samples:
+    def sample_rays(rays: Rays, step_m: float, occupancy: BinaryOccupancy, max_samples: int) -> Samples:
         grid = (occupancy.occupied, occupancy.bounds_m)
-        return Samples(*march_with(find, *rays, step_m, boxes_m, *grid, max_samples))
+        return Samples(*march_with_inverse(find_canonical, *rays, step_m, posed_bounds_m, *grid, max_samples))
 
-    def place(
-        skin: SkinGrid, matrices: Tensor, frames: Tensor, canonical_m: Tensor, posed_m: Tensor, slot_start: Tensor
+    def to_canonical(
+        skin: SkinGrid, matrices: Tensor, frames: Tensor, canonical_m: Tensor, posed_m: Tensor, frame_offsets: Tensor
     ) -> Tensor:
-        sizes = slot_start.diff()
-        vertex = _nearest_in(trees, posed_m, torch.repeat_interleave(frames, sizes), np.inf)
+        sizes = frame_offsets.diff()
+        vertex = _nearest_index(kd_trees, posed_m, torch.repeat_interleave(frames, sizes), np.inf)
         parts = zip(matrices, vertex.split(sizes.tolist()), posed_m.split(sizes.tolist()), strict=True)
-        return torch.cat([undo(*part) for part in parts])
+        return torch.cat([invert_skinning(*part) for part in parts])
 
-    return Inverse(boxes_m, sample, place)
+    return InverseSkinning(posed_bounds_m, sample_rays, to_canonical)
 
 
 def _posed_vertices_m(body: Body, canonical_to_posed: Float[Tensor, "k j 4 4"]) -> Float[Tensor, "k v 3"]:
@@ -162,18 +185,18 @@ def _posed_vertices_m(body: Body, canonical_to_posed: Float[Tensor, "k j 4 4"]) 
 
 def _boxes_m(vertices_m: Float[Tensor, "k v 3"], skin: SkinGrid) -> Float[Tensor, "k 2 3"]:
     """The posed bodies' boxes, widened by as much as the skin grid reaches beyond the body."""
-    reach_m = float(skin.distance_m.max())
-    return torch.stack([vertices_m.amin(1) - reach_m, vertices_m.amax(1) + reach_m], dim=1)
+    max_distance_m = float(skin.distance_m.max())
+    return torch.stack([vertices_m.amin(1) - max_distance_m, vertices_m.amax(1) + max_distance_m], dim=1)
 
 
-def _nearest_in(
-    trees: dict[int, cKDTree], points_m: Float[Tensor, "p 3"], frame: Int[Tensor, "p"], reach_m: float
+def _nearest_index(
+    kd_trees: dict[int, cKDTree], points_m: Float[Tensor, "p 3"], frame: Int[Tensor, "p"], max_distance_m: float
 ) -> Int[Tensor, "p"]:
     """For each point which of its frame's tree points is the nearest; -1 where none is within reach."""
     nearest = torch.full((len(points_m),), -1, device=points_m.device)
     for row in frame.unique().tolist():
         chosen = torch.nonzero(frame == row)[:, 0]
-        at = points_m[chosen].detach().cpu().numpy()
-        _, index = trees[row].query(at, distance_upper_bound=reach_m, workers=torch.get_num_threads())
-        nearest[chosen] = torch.from_numpy(np.where(index < trees[row].n, index, -1)).to(nearest)
+        query_m = points_m[chosen].detach().cpu().numpy()
+        _, index = kd_trees[row].query(query_m, distance_upper_bound=max_distance_m, workers=torch.get_num_threads())
+        nearest[chosen] = torch.from_numpy(np.where(index < kd_trees[row].n, index, -1)).to(nearest)
     return nearest

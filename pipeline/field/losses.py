@@ -12,7 +12,7 @@ def field_losses(
     alpha: Float[Tensor, "n"],
     rgba: Float[Tensor, "n 4"],
     background: Float[Tensor, "n 3"],
-    trust: Float[Tensor, "n"],
+    inlier_weight: Float[Tensor, "n"],
     empty_density_per_m: Float[Tensor, "e"],
     config: FieldConfig,
 ) -> tuple[dict[str, Tensor], Float[Tensor, "n 3"]]:
@@ -21,9 +21,9 @@ def field_losses(
     `density` is the sum over points that should be empty, as a part of the points that a step asks for; the rest and
     the arguments are those of `ray_losses`.
     """
-    (colour, opacity, hard), error = ray_losses(image, alpha, rgba, background, trust, config.huber_delta)
-    losses = {"colour": colour, "alpha": config.weight_alpha * opacity, "hard": config.weight_hard * hard}
+    (colour, opacity, hard), error = ray_losses(image, alpha, rgba, background, inlier_weight, config.huber_delta)
+    losses = {"colour": colour, "alpha": config.alpha_weight * opacity, "hard": config.hard_surface_weight * hard}
     if len(empty_density_per_m):
-        asked = config.empty_points + config.unproven_points
-        losses["density"] = config.weight_density * 0.01 * empty_density_per_m.sum() / asked
+        sample_count = config.empty_points + config.unobserved_points
+        losses["density"] = config.empty_density_weight * 0.01 * empty_density_per_m.sum() / sample_count
     return losses, error

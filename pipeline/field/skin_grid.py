@@ -17,10 +17,10 @@ from torch import Tensor
 from pipeline.body.body import Body
 from pipeline.core.device import CPU
 from pipeline.geometry.surface import signed_distance_m
-from pipeline.kernels.inverse_skinning import SkinGrid, WarpGrid, bake
-from pipeline.kernels.march import WarpSet
+from pipeline.kernels.inverse_skinning import SkinGrid, WarpGrid, bake_warp_grid
+from pipeline.kernels.march import PackedWarpGrids
 
-NEIGHBOURS = 24
+NEIGHBOUR_COUNT = 24
 
 
 def build_skin_grid(body: Body, margin_m: float, cell_m: float = 0.03) -> SkinGrid:
@@ -30,16 +30,18 @@ def build_skin_grid(body: Body, margin_m: float, cell_m: float = 0.03) -> SkinGr
     Here they are a Gaussian mean over the nearest vertices, whose width grows with the distance, so that skinning is
     continuous.
     """
-    reach = margin_m + 2.5 * cell_m
-    origin = (np.floor((body.vertices.min(0) - reach) / cell_m) * cell_m).astype(np.float32)
-    size = np.ceil((body.vertices.max(0) + reach - origin) / cell_m).astype(np.int64) + 1
+    max_distance_m = margin_m + 2.5 * cell_m
+    origin = (np.floor((body.vertices.min(0) - max_distance_m) / cell_m) * cell_m).astype(np.float32)
+    size = np.ceil((body.vertices.max(0) + max_distance_m - origin) / cell_m).astype(np.int64) + 1
     index = np.stack(np.meshgrid(*(np.arange(n) for n in size), indexing="ij"), axis=-1).reshape(-1, 3)
     nodes = (origin + index * np.float32(cell_m)).astype(np.float32)
     tree = cKDTree(body.vertices)
-    near = np.isfinite(tree.query(nodes, distance_upper_bound=reach + 0.02, workers=torch.get_num_threads())[0])
+    near = np.isfinite(
+        tree.query(nodes, distance_upper_bound=max_distance_m + 0.02, workers=torch.get_num_threads())[0]
+    )
     distance = np.full(len(nodes), np.inf, dtype=np.float32)
     distance[near] = signed_distance_m(nodes[near], body.mesh())
-    kept = distance < reach
+    kept = distance < max_distance_m
     row_of_node = np.where(kept, np.cumsum(kept) - 1, -1).astype(np.int32).reshape(tuple(size))
     weights = _smooth_weights(nodes[kept], tree, body.skin_weights, cell_m)
     arrays = (origin, row_of_node, nodes[kept], distance[kept], weights)
@@ -53,17 +55,17 @@ def skin_margin_m(body: Body, bounds_m: Float[np.ndarray, "2 3"]) -> float:
 
 
 def _smooth_weights(nodes: np.ndarray, tree: cKDTree, skin_weights: np.ndarray, cell_m: float) -> np.ndarray:
-    distance, neighbour = tree.query(nodes, k=NEIGHBOURS, workers=torch.get_num_threads())
+    distance, neighbour = tree.query(nodes, k=NEIGHBOUR_COUNT, workers=torch.get_num_threads())
     width = 0.5 * cell_m + 0.35 * distance[:, :1]
     share = np.exp(-(distance**2 - distance[:, :1] ** 2) / (2 * width**2))
     share = (share / share.sum(1, keepdims=True)).astype(np.float32)
-    row_start = np.arange(len(nodes) + 1) * NEIGHBOURS
+    row_start = np.arange(len(nodes) + 1) * NEIGHBOUR_COUNT
     smoothing = csr_array((share.ravel(), neighbour.ravel(), row_start), shape=(len(nodes), len(skin_weights)))
     weights: np.ndarray = smoothing @ skin_weights
     return weights
 
 
-def posed_from_world(canonical_to_world: Float[Tensor, "n j 4 4"]) -> Float[Tensor, "n 4 4"]:
+def world_to_posed(canonical_to_world: Float[Tensor, "n j 4 4"]) -> Float[Tensor, "n 4 4"]:
     """The rigid map from the world into each frame's posed space: the inverse of the root's skinning matrix."""
     rotation, translation = canonical_to_world[:, 0, :3, :3], canonical_to_world[:, 0, :3, 3]
     inverse = torch.zeros_like(canonical_to_world[:, 0])
@@ -73,7 +75,7 @@ def posed_from_world(canonical_to_world: Float[Tensor, "n j 4 4"]) -> Float[Tens
     return inverse
 
 
-def bake_motion(skin: SkinGrid, canonical_to_posed: Float[Tensor, "n j 4 4"]) -> WarpSet:
+def bake_warp_grids(skin: SkinGrid, canonical_to_posed: Float[Tensor, "n j 4 4"]) -> PackedWarpGrids:
     """The warp grids of all frames, on the device of the matrices.
 
     They are baked on the CPU; frames are shared out to as many threads as torch uses.
@@ -81,8 +83,8 @@ def bake_motion(skin: SkinGrid, canonical_to_posed: Float[Tensor, "n j 4 4"]) ->
     skin, matrices = skin.to(CPU), canonical_to_posed.cpu()
 
     def bake_row(row: int) -> WarpGrid:
-        return bake(skin, matrices[row])
+        return bake_warp_grid(skin, matrices[row])
 
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         grids: Sequence[WarpGrid] = list(pool.map(bake_row, range(len(matrices))))
-    return WarpSet.of(grids, skin.cell_m).to(canonical_to_posed.device)
+    return PackedWarpGrids.of(grids, skin.cell_m).to(canonical_to_posed.device)

@@ -1,7 +1,7 @@
 """The cheap end: a visual hull in canonical space (Laurentini 1994, with articulated motion), and nothing learnt.
 
 Every node of a grid is carried into every frame by its skin weights and votes with the mask that it falls on. A dense
-grid of one level holds the result, so that a hull is a `Field` like any other, which all later stages take.
+grid of one level holds the result, so that a hull is a `RadianceField` like any other, which all later stages take.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pipeline.body.body import Body
-from pipeline.field.field import LIMIT, START_DENSITY_PER_M, Field
+from pipeline.field.field import INITIAL_DENSITY_PER_M, MAX_ABS_LOG_DENSITY, RadianceField
 from pipeline.geometry.camera import Camera, project
 from pipeline.kernels.hashgrid import GridLayout
 from pipeline.kernels.inverse_skinning import SkinGrid
@@ -22,7 +22,7 @@ from pipeline.kernels.inverse_skinning.reference import interpolate
 CHANNELS = 4
 SURFACE_DENSITY_PER_M = 32.0
 """Density where just enough masks hold a point: in the middle of the levels that the mesh stage tries."""
-STEEPNESS = 40.0
+LOG_DENSITY_SLOPE = 40.0
 """Of the log density over votes: from a fifth of the surface's density to four times it within 0.07 votes."""
 
 
@@ -42,35 +42,39 @@ def node_positions_m(bounds_m: Float[np.ndarray, "2 3"], layout: GridLayout) -> 
     return np.stack([x, y, z], axis=-1).reshape(-1, 3).astype(np.float32)
 
 
-def carve(
+def carve_visual_hull(
     body: Body,
     skin: SkinGrid,
     canonical_to_world: Float[Tensor, "k j 4 4"],
     camera: Camera,
-    pictures: Sequence[tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]],
+    masked_images: Sequence[tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]],
     bounds_m: Float[np.ndarray, "2 3"],
     layout: GridLayout,
-    least_votes: float,
-) -> Field:
+    min_mask_fraction: float,
+) -> RadianceField:
     """A field from images and masks, one pair a frame.
 
     layout: from `dense_layout`. least_votes: the part of the frames whose masks must hold a point, in (0, 1].
     Beyond the skin grid there is nothing.
     """
     nodes_m = node_positions_m(bounds_m, layout)
-    kept = np.flatnonzero(skin_reaches(nodes_m, skin))
-    votes, colours = _look(nodes_m[kept], body, skin, canonical_to_world, camera, pictures)
+    kept = np.flatnonzero(inside_skin_grid(nodes_m, skin))
+    mask_fraction, colours = _accumulate_votes(nodes_m[kept], body, skin, canonical_to_world, camera, masked_images)
     raw = torch.zeros(len(nodes_m), CHANNELS)
-    raw[:, 3] = -LIMIT
+    raw[:, 3] = -MAX_ABS_LOG_DENSITY
     raw[kept, :3] = torch.logit(torch.from_numpy(colours), eps=1 / 512)
-    density = np.log(SURFACE_DENSITY_PER_M / START_DENSITY_PER_M) + STEEPNESS * (votes - least_votes)
-    raw[kept, 3] = torch.from_numpy(density).clamp(-LIMIT, LIMIT)
-    return raw_field(bounds_m, layout, raw)
+    density = np.log(SURFACE_DENSITY_PER_M / INITIAL_DENSITY_PER_M) + LOG_DENSITY_SLOPE * (
+        mask_fraction - min_mask_fraction
+    )
+    raw[kept, 3] = torch.from_numpy(density).clamp(-MAX_ABS_LOG_DENSITY, MAX_ABS_LOG_DENSITY)
+    return dense_grid_field(bounds_m, layout, raw)
 
 
-def raw_field(bounds_m: Float[np.ndarray, "2 3"], layout: GridLayout, raw: Float[Tensor, "nodes 4"]) -> Field:
+def dense_grid_field(
+    bounds_m: Float[np.ndarray, "2 3"], layout: GridLayout, raw: Float[Tensor, "nodes 4"]
+) -> RadianceField:
     """The field that says what a dense grid holds: x = relu(x) - relu(-x) takes the hidden layer out of the way."""
-    field = Field(bounds_m, layout, hidden_width=2 * CHANNELS)
+    field = RadianceField(bounds_m, layout, hidden_width=2 * CHANNELS)
     with torch.no_grad():
         field.table.copy_(raw)
         field.hidden.copy_(torch.cat([torch.eye(CHANNELS), -torch.eye(CHANNELS)], dim=1))
@@ -79,23 +83,23 @@ def raw_field(bounds_m: Float[np.ndarray, "2 3"], layout: GridLayout, raw: Float
     return field
 
 
-def skin_reaches(points_m: Float[np.ndarray, "n 3"], skin: SkinGrid) -> np.ndarray:
+def inside_skin_grid(points_m: Float[np.ndarray, "n 3"], skin: SkinGrid) -> np.ndarray:
     """True for each point with a node of the skin grid at the low corner of its cell."""
     origin_m, row_of_node = skin.origin_m.numpy(), skin.row_of_node.numpy()
     index = np.floor((points_m - origin_m) / skin.cell_m).astype(np.int64)
     inside = ((index >= 0) & (index < row_of_node.shape)).all(1)
-    reached = np.zeros(len(points_m), dtype=bool)
-    reached[inside] = row_of_node[tuple(index[inside].T)] >= 0
-    return reached
+    inside_grid = np.zeros(len(points_m), dtype=bool)
+    inside_grid[inside] = row_of_node[tuple(index[inside].T)] >= 0
+    return inside_grid
 
 
-def _look(
+def _accumulate_votes(
     points_m: Float[np.ndarray, "n 3"],
     body: Body,
     skin: SkinGrid,
     canonical_to_world: Float[Tensor, "k j 4 4"],
     camera: Camera,
-    pictures: Sequence[tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]],
+    masked_images: Sequence[tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]],
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
     """Part of the frames whose mask holds each point, and the mean colour that it was seen in.
 
@@ -107,22 +111,32 @@ def _look(
     weights = interpolate(points, skin.lattice, skin.weights)
     nearest = cKDTree(body.vertices).query(points_m, workers=torch.get_num_threads())[1]
     normals = torch.from_numpy(body.mesh().vertex_normals()[nearest]).float()
-    hits, seen, light = np.zeros(len(points_m)), np.zeros(len(points_m)), np.full(len(points_m), 1e-6)
+    mask_sum, in_image_count, weight_sum = (
+        np.zeros(len(points_m)),
+        np.zeros(len(points_m)),
+        np.full(len(points_m), 1e-6),
+    )
     colours = np.full((len(points_m), 3), 0.5e-6)
     eye = torch.from_numpy(-camera.world_to_camera[:3, :3].T @ camera.world_to_camera[:3, 3]).float()
-    for matrices, (image, mask) in zip(canonical_to_world, pictures, strict=True):
+    for matrices, (image, mask) in zip(canonical_to_world, masked_images, strict=True):
         matrix = (weights @ matrices[:, :3].reshape(-1, 12)).view(-1, 3, 4)
         posed = (matrix[:, :, :3] @ points[:, :, None])[:, :, 0] + matrix[:, :, 3]
         pixels, depth_m = project(posed, camera)
-        column, line = (pixels[:, axis].floor().long().numpy() for axis in range(2))
-        inside = (depth_m.numpy() > 0) & (column >= 0) & (line >= 0) & (column < camera.width) & (line < camera.height)
-        column, line = column[inside], line[inside]
-        held = mask[line, column] / 255.0
+        pixel_column, pixel_row = (pixels[:, axis].floor().long().numpy() for axis in range(2))
+        inside = (
+            (depth_m.numpy() > 0)
+            & (pixel_column >= 0)
+            & (pixel_row >= 0)
+            & (pixel_column < camera.width)
+            & (pixel_row < camera.height)
+        )
+        pixel_column, pixel_row = pixel_column[inside], pixel_row[inside]
+        mask_value = mask[pixel_row, pixel_column] / 255.0
         facing = (matrix[:, :, :3] @ normals[:, :, None])[:, :, 0] * torch.nn.functional.normalize(eye - posed, dim=1)
-        weight = held * facing.sum(1).clamp(min=0).square().numpy()[inside]
-        seen[inside] += 1
-        hits[inside] += held
-        light[inside] += weight
-        colours[inside] += weight[:, None] * image[line, column] / 255.0
-    votes = hits / np.maximum(seen, 1)
-    return votes.astype(np.float32), (colours / light[:, None]).astype(np.float32)
+        weight = mask_value * facing.sum(1).clamp(min=0).square().numpy()[inside]
+        in_image_count[inside] += 1
+        mask_sum[inside] += mask_value
+        weight_sum[inside] += weight
+        colours[inside] += weight[:, None] * image[pixel_row, pixel_column] / 255.0
+    mask_fraction = mask_sum / np.maximum(in_image_count, 1)
+    return mask_fraction.astype(np.float32), (colours / weight_sum[:, None]).astype(np.float32)

@@ -12,7 +12,7 @@ import xatlas
 from jaxtyping import Bool, Float, Int
 
 from pipeline.geometry.mesh import Mesh
-from pipeline.geometry.surface import smooth
+from pipeline.geometry.surface import smooth_taubin
 from pipeline.kernels.raster import rasterize
 
 # xatlas estimates its scale and overshoots the asked resolution, by up to 38 % in the cases measured: the gutter must
@@ -69,7 +69,9 @@ class Texels:
         return value
 
 
-def texture_size_px(area_m2: float, footprint_m: float, smallest: int, largest: int, utilisation: float = 0.65) -> int:
+def texture_size_px(
+    area_m2: float, pixel_footprint_m: float, min_size_px: int, max_size_px: int, utilisation: float = 0.65
+) -> int:
     """The power of two whose texels are not larger than what one pixel of the capture sees.
 
     area_m2: of the surface; footprint_m: of a pixel on the person; utilisation: share of an atlas that charts cover.
@@ -77,24 +79,25 @@ def texture_size_px(area_m2: float, footprint_m: float, smallest: int, largest: 
     >>> texture_size_px(1.8, 0.0035, 256, 4096)
     512
     """
-    needed = np.sqrt(area_m2 / utilisation) / footprint_m
-    return int(np.clip(2 ** int(np.ceil(np.log2(needed))), smallest, largest))
+    needed = np.sqrt(area_m2 / utilisation) / pixel_footprint_m
+    return int(np.clip(2 ** int(np.ceil(np.log2(needed))), min_size_px, max_size_px))
 
 
-def unwrap(mesh: Mesh, part_of_face: Int[np.ndarray, "f"], size_px: int, padding_px: int) -> Atlas:
+def unwrap(mesh: Mesh, segment_of_face: Int[np.ndarray, "f"], size_px: int, padding_px: int) -> Atlas:
     """Unfold a mesh with xatlas (Young, 2018), every part of it by itself.
 
-    Cutting at `part_of_face` (any labels) first costs charts (120 instead of 66 on a body of 51k faces) and saves time
+    Cutting at `segment_of_face` (any labels) first costs charts (120 instead of 66 on a body of 51k faces) and saves
+    time
     (4 s instead of 19 s): growing charts takes worse than linear time in the faces of a connected piece, and pieces are
     worked on in parallel. The result does not depend on the number of threads. What is unfolded is a smoothed copy: on
     the noise of a reconstructed surface charts end at every dent (756 charts, smoothed 282, on a mesh of 46k faces).
 
     padding_px: least gutter between charts in a texture of `size_px`.
     """
-    atlas, smoothed = xatlas.Atlas(), smooth(mesh, SMOOTHING_STEPS).vertices
+    atlas, smoothed = xatlas.Atlas(), smooth_taubin(mesh, SMOOTHING_STEPS).vertices
     rows_of_part, vertices_of_part = [], []
-    for part in np.unique(part_of_face):
-        rows = np.flatnonzero(part_of_face == part)
+    for part in np.unique(segment_of_face):
+        rows = np.flatnonzero(segment_of_face == part)
         vertices, corners = np.unique(mesh.faces[rows], return_inverse=True)
         atlas.add_mesh(np.ascontiguousarray(smoothed[vertices]), corners.reshape(-1, 3).astype(np.uint32))
         rows_of_part.append(rows)
@@ -133,18 +136,18 @@ def rasterize_texels(atlas: Atlas, size_px: int) -> Texels:
     )
 
 
-def fill_gaps(
-    image: Float[np.ndarray, "h w c"], known: Bool[np.ndarray, "h w"], copied_px: int = 2
+def fill_unknown_texels(
+    image: Float[np.ndarray, "h w c"], known: Bool[np.ndarray, "h w"], dilation_px: int = 2
 ) -> Float[np.ndarray, "h w c"]:
     """Colours for unknown texels, so that neither bilinear look-ups nor mip levels reach a colour that is nowhere.
 
-    The nearest `copied_px` rings take the mean of their known neighbours; the rest is filled by push-pull (Gortler et
+    The nearest `dilation_px` rings take the mean of their known neighbours; the rest is filled by push-pull (Gortler et
     al., "The Lumigraph", 1996): coarser and coarser means of what is known, taken back up where finer levels know
     nothing. All stays 0 when nothing is known.
     """
     colour = np.where(known[..., None], image, 0.0).astype(np.float32)
     weight = known.astype(np.float32)
-    for _ in range(copied_px):
+    for _ in range(dilation_px):
         near_weight = cv2.boxFilter(weight, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
         near = cv2.boxFilter(colour * weight[..., None], -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
         new = (weight == 0) & (near_weight > 0.5)

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-UPRIGHT_WORLD_TO_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32)
+DEFAULT_WORLD_TO_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32)
 """Camera at the world's origin that looks along -Z with +Y up: what is assumed when nothing else is known."""
 
 
@@ -28,9 +28,9 @@ class Camera:
     cy: float
     width: int
     height: int
-    world_to_camera: Float[np.ndarray, "4 4"] = field(default_factory=UPRIGHT_WORLD_TO_CAMERA.copy)
+    world_to_camera: Float[np.ndarray, "4 4"] = field(default_factory=DEFAULT_WORLD_TO_CAMERA.copy)
 
-    def matrix(self) -> Float[np.ndarray, "3 3"]:
+    def intrinsic_matrix(self) -> Float[np.ndarray, "3 3"]:
         """Intrinsic matrix K in pixels."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]], dtype=np.float32)
 
@@ -73,7 +73,7 @@ class Camera:
         return Camera(fx, fy, cx, cy, width, height, np.asarray(arrays["camera_world_to_camera"]))
 
 
-def world_to_camera_points(points_world: Float[Tensor, "*n 3"], camera: Camera) -> Float[Tensor, "*n 3"]:
+def transform_world_to_camera(points_world: Float[Tensor, "*n 3"], camera: Camera) -> Float[Tensor, "*n 3"]:
     """Points in camera axes, metres."""
     pose = torch.as_tensor(camera.world_to_camera, dtype=points_world.dtype, device=points_world.device)
     return points_world @ pose[:3, :3].T + pose[:3, 3]
@@ -84,7 +84,7 @@ def project(points_world: Float[Tensor, "*n 3"], camera: Camera) -> tuple[Float[
 
     Points behind the camera (depth <= 0) get meaningless pixels: mask them by depth.
     """
-    points = world_to_camera_points(points_world, camera)
+    points = transform_world_to_camera(points_world, camera)
     depth_m = points[..., 2]
     x_px = camera.fx * points[..., 0] / depth_m + camera.cx
     y_px = camera.fy * points[..., 1] / depth_m + camera.cy

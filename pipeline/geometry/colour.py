@@ -9,13 +9,13 @@ from torch import Tensor
 _Colours = TypeVar("_Colours", np.ndarray, Tensor)
 
 
-def linear_light(srgb: _Colours) -> _Colours:
+def srgb_to_linear(srgb: _Colours) -> _Colours:
     """Light that sRGB colours stand for; white is 1 in both. Colours may rise above 1."""
     return _where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
-def srgb_of_light(linear: _Colours) -> _Colours:
-    """sRGB colours of linear light, which must not be negative: the inverse of `linear_light`."""
+def linear_to_srgb(linear: _Colours) -> _Colours:
+    """sRGB colours of linear light, which must not be negative: the inverse of `srgb_to_linear`."""
     return _where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 

@@ -34,7 +34,7 @@ def render_shaded(
     faces: Int[Tensor, "f 3"],
     camera: Camera,
     attributes: Float[Tensor, "v c"],
-    shade: Callable[[Float[Tensor, "n c"]], Float[Tensor, "n d"]],
+    shader: Callable[[Float[Tensor, "n c"]], Float[Tensor, "n d"]],
     adjacency: Int[Tensor, "f 3"] | None = None,
 ) -> tuple[Float[Tensor, "h w d"], Float[Tensor, "h w"], Int[Tensor, "h w"]]:
     """(image premultiplied by alpha, alpha in [0, 1], face ids) of a mesh in metres; on white: ``image + 1 - alpha``.
@@ -43,14 +43,14 @@ def render_shaded(
     shading). adjacency: ``face_adjacency(faces)``, to be passed in when the same mesh is rendered many times.
 
     Differentiable in ``vertices_world`` (inside faces through interpolation, at silhouettes through antialiasing), in
-    ``attributes`` and in whatever ``shade`` depends on.
+    ``attributes`` and in whatever ``shader`` depends on.
     """
     vertices_px, depth_m = project(vertices_world, camera)
     face_id, _, depth = rasterize(vertices_px, depth_m, faces, camera.height, camera.width)
     adjacency = face_adjacency(faces) if adjacency is None else adjacency
     covered = torch.nonzero(face_id.reshape(-1) >= 0).squeeze(1)
     face_of = face_id.reshape(-1)[covered]
-    shaded = shade(interpolate(covered, face_of, camera.width, vertices_px, depth_m, faces, attributes))
+    shaded = shader(interpolate(covered, face_of, camera.width, vertices_px, depth_m, faces, attributes))
     with_alpha = torch.cat([shaded, torch.ones_like(shaded[:, :1])], dim=1)
     flat = torch.zeros(face_id.numel(), with_alpha.shape[1], dtype=with_alpha.dtype, device=with_alpha.device)
     image = flat.index_copy(0, covered, with_alpha).view(*face_id.shape, -1)
@@ -58,7 +58,7 @@ def render_shaded(
     return image[..., :-1], image[..., -1], face_id
 
 
-def render_mesh(
+def render_attributes(
     vertices_world: Float[Tensor, "v 3"],
     faces: Int[Tensor, "f 3"],
     camera: Camera,

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-_CROSS = torch.tensor(
+_SKEW_SYMMETRIC_BASIS = torch.tensor(
     [
         [0, 0, 0, 0, 0, -1, 0, 1, 0],
         [0, 0, 1, 0, 0, 0, -1, 0, 0],
@@ -56,7 +56,7 @@ def axis_angle_to_matrix(axis_angle_rad: Float[Tensor, "*n 3"]) -> Float[Tensor,
     angle = safe.sqrt()
     first = torch.where(small, 1 - squared / 6 * (1 - squared / 20), torch.sin(angle) / angle)
     second = torch.where(small, 0.5 - squared / 24 * (1 - squared / 30), (1 - torch.cos(angle)) / safe)
-    cross = (axis_angle_rad @ _CROSS.to(axis_angle_rad)).unflatten(-1, (3, 3))
+    cross = (axis_angle_rad @ _SKEW_SYMMETRIC_BASIS.to(axis_angle_rad)).unflatten(-1, (3, 3))
     return torch.eye(3).to(cross) + first * cross + second * (cross @ cross)
 
 

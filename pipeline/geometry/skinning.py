@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 
-def rigid(rotation: Float[Tensor, "*n 3 3"], translation: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 4 4"]:
+def rigid_transform(rotation: Float[Tensor, "*n 3 3"], translation: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 4 4"]:
     """Homogeneous matrices from rotations and translations (m)."""
     top = torch.cat([rotation, translation[..., None]], dim=-1)
     bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
@@ -38,20 +38,20 @@ def forward_kinematics(
     Raises:
         ValueError: a parent does not come before its child.
     """
-    above = np.array(parents, dtype=np.int64)
-    count, device = len(above), rotations.device
-    wrong = np.flatnonzero((above[1:] < 0) | (above[1:] >= np.arange(1, count))) + 1
+    ancestor = np.array(parents, dtype=np.int64)
+    count, device = len(ancestor), rotations.device
+    wrong = np.flatnonzero((ancestor[1:] < 0) | (ancestor[1:] >= np.arange(1, count))) + 1
     if len(wrong):
-        raise ValueError(f"joint {wrong[0]} has parent {above[wrong[0]]}; parents must come before their children")
-    offset_m = (joints_m[1:] - joints_m[torch.from_numpy(above[1:]).to(device)]).expand(len(rotations), -1, 3)
-    local = rigid(rotations, torch.cat([root_translation_m[:, None], offset_m], dim=1))
+        raise ValueError(f"joint {wrong[0]} has parent {ancestor[wrong[0]]}; parents must come before their children")
+    offset_m = (joints_m[1:] - joints_m[torch.from_numpy(ancestor[1:]).to(device)]).expand(len(rotations), -1, 3)
+    local = rigid_transform(rotations, torch.cat([root_translation_m[:, None], offset_m], dim=1))
     # Row `count` is the world, above the root. Each round joins every chain of joints with the one above it, so chains
     # double in length and a body of sixteen generations takes four rounds.
     world = torch.cat([local, torch.eye(4, dtype=local.dtype, device=device).expand(len(local), 1, 4, 4)], dim=1)
-    above = np.append(np.where(above < 0, count, above), count)
-    while (above < count).any():
-        world = world[:, torch.from_numpy(above).to(device)] @ world
-        above = above[above]
+    ancestor = np.append(np.where(ancestor < 0, count, ancestor), count)
+    while (ancestor < count).any():
+        world = world[:, torch.from_numpy(ancestor).to(device)] @ world
+        ancestor = ancestor[ancestor]
     return world[:, :count]
 
 
@@ -61,7 +61,7 @@ def skinning_transforms(
     """B_j, which carries canonical points that move rigidly with joint j into the world."""
     rotation = joint_to_world[..., :3, :3]
     moved = (rotation @ joints_m[:, :, None]).squeeze(-1)
-    return rigid(rotation, joint_to_world[..., :3, 3] - moved)
+    return rigid_transform(rotation, joint_to_world[..., :3, 3] - moved)
 
 
 def linear_blend_skinning(

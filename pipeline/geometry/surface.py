@@ -14,14 +14,14 @@ from skimage.measure import marching_cubes
 from pipeline.geometry.mesh import Mesh
 
 REPAIR_ROUNDS = 4
-UNTANGLE_ROUNDS = 20
+MAX_INTERSECTION_ROUNDS = 20
 
 
 class OpenSurfaceError(ValueError):
     """A surface has holes that could not be closed; rebuild it with `isosurface` of its solid."""
 
 
-def solid_body(inside: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
+def largest_solid(inside: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
     """The largest 6-connected part of a grid, with the cavities that the outside cannot reach filled."""
     labels, count = ndimage.label(inside)
     if count == 0:
@@ -38,8 +38,8 @@ def isosurface(
 
     origin_m: position of the sample [0, 0, 0]. Raises ValueError when nothing reaches the level.
     """
-    floor = min(float(values.min()), level) - 1.0
-    padded = np.pad(values, 1, constant_values=floor)
+    padding_value = min(float(values.min()), level) - 1.0
+    padded = np.pad(values, 1, constant_values=padding_value)
     if not (padded >= level).any():
         raise ValueError(f"no value of the grid reaches the level {level:g}; the largest is {float(values.max()):g}")
     # a sample exactly on the level makes faces without area, which pinch the surface
@@ -49,7 +49,7 @@ def isosurface(
     return Mesh(vertices_m.astype(np.float32), faces.astype(np.int32))
 
 
-def compact(mesh: Mesh) -> Mesh:
+def remove_unreferenced_vertices(mesh: Mesh) -> Mesh:
     """The mesh without vertices that no face uses; order kept."""
     used, flat = np.unique(mesh.faces, return_inverse=True)
     return Mesh(mesh.vertices[used], flat.reshape(-1, 3).astype(mesh.faces.dtype))
@@ -62,10 +62,10 @@ def largest_component(mesh: Mesh) -> Mesh:
     graph = coo_array((np.ones(len(ends), dtype=bool), ends.T), shape=(vertex_count, vertex_count))
     label = connected_components(graph, directed=False)[1][mesh.faces[:, 0]]
     areas_m2 = np.bincount(label, mesh.face_areas_m2())
-    return compact(Mesh(mesh.vertices, mesh.faces[label == int(np.argmax(areas_m2))]))
+    return remove_unreferenced_vertices(Mesh(mesh.vertices, mesh.faces[label == int(np.argmax(areas_m2))]))
 
 
-def split_fans(mesh: Mesh) -> Mesh:
+def split_nonmanifold_vertices(mesh: Mesh) -> Mesh:
     """Gives every fan of faces around a vertex its own copy of the vertex: no vertex is left where two sheets only
     touch.
 
@@ -94,33 +94,33 @@ def split_fans(mesh: Mesh) -> Mesh:
 
 def is_closed_manifold(mesh: Mesh) -> bool:
     """Watertight with one fan of faces around every vertex in use."""
-    return mesh.is_watertight() and split_fans(mesh) is mesh
+    return mesh.is_watertight() and split_nonmanifold_vertices(mesh) is mesh
 
 
 def self_intersecting_faces(mesh: Mesh) -> int:
     """Number of faces that cut through another face."""
-    return int(_cutting_faces(mesh).sum())
+    return int(_self_intersection_mask(mesh).sum())
 
 
-def untangle(mesh: Mesh) -> Mesh:
+def resolve_self_intersections(mesh: Mesh) -> Mesh:
     """The mesh with the vertices of faces that cut another moved to the mean of their neighbours until none does.
 
-    What still does after `UNTANGLE_ROUNDS` rounds is left. All other vertices stay.
+    What still does after `MAX_INTERSECTION_ROUNDS` rounds is left. All other vertices stay.
     """
     operator = laplacian(mesh)
-    for _ in range(UNTANGLE_ROUNDS):
-        cutting = _cutting_faces(mesh)
-        if not cutting.any():
+    for _ in range(MAX_INTERSECTION_ROUNDS):
+        intersecting = _self_intersection_mask(mesh)
+        if not intersecting.any():
             break
-        tangled = np.unique(mesh.faces[cutting])
+        intersecting_vertices = np.unique(mesh.faces[intersecting])
         vertices = mesh.vertices.copy()
-        vertices[tangled] -= (operator[tangled] @ mesh.vertices).astype(vertices.dtype)
+        vertices[intersecting_vertices] -= (operator[intersecting_vertices] @ mesh.vertices).astype(vertices.dtype)
         mesh = Mesh(vertices, mesh.faces)
     return mesh
 
 
-def _cutting_faces(mesh: Mesh) -> Bool[np.ndarray, "f"]:
-    meshes = _meshset(mesh)
+def _self_intersection_mask(mesh: Mesh) -> Bool[np.ndarray, "f"]:
+    meshes = _to_meshset(mesh)
     meshes.compute_selection_by_self_intersections_per_face()
     return np.asarray(meshes.current_mesh().face_selection_array(), dtype=bool)
 
@@ -131,17 +131,17 @@ def repair(mesh: Mesh) -> Mesh:
     Raises OpenSurfaceError when that does not succeed within a few rounds.
     """
     for _ in range(REPAIR_ROUNDS):
-        mesh = largest_component(split_fans(_without_bad_faces(mesh)))
+        mesh = largest_component(split_nonmanifold_vertices(_remove_invalid_faces(mesh)))
         if is_closed_manifold(mesh):
             return mesh
-        meshes = _meshset(mesh)
+        meshes = _to_meshset(mesh)
         meshes.meshing_re_orient_faces_coherently()
         meshes.meshing_close_holes(maxholesize=len(mesh.faces), selfintersection=False)
         mesh = _from_meshset(meshes)
     raise OpenSurfaceError("a surface could not be closed: its holes border on each other")
 
 
-def _without_bad_faces(mesh: Mesh) -> Mesh:
+def _remove_invalid_faces(mesh: Mesh) -> Mesh:
     """Without faces that repeat a vertex or another face, and without the faces at edges shared by more than two."""
     faces = mesh.faces
     ordered = np.sort(faces, axis=1)
@@ -155,9 +155,9 @@ def _without_bad_faces(mesh: Mesh) -> Mesh:
     return Mesh(mesh.vertices, faces[(uses[edge.ravel()].reshape(-1, 3) <= 2).all(axis=1)])
 
 
-def remesh(
+def remesh_isotropic(
     mesh: Mesh,
-    edge_m: float,
+    target_edge_m: float,
     iterations: int = 5,
     selected: Bool[np.ndarray, "f"] | None = None,
     tolerance_m: float | None = None,
@@ -169,20 +169,20 @@ def remesh(
     the surface farther than this (a tenth of the edge when None), so thin parts keep short edges. Raises
     OpenSurfaceError when the result cannot be repaired.
     """
-    from pymeshlab import PureValue  # here, as in `_meshset`
+    from pymeshlab import PureValue  # here, as in `_to_meshset`
 
-    meshes = _meshset(mesh, selected)
+    meshes = _to_meshset(mesh, selected)
     meshes.meshing_isotropic_explicit_remeshing(
         iterations=iterations,
         selectedonly=selected is not None,
-        targetlen=PureValue(edge_m),
+        targetlen=PureValue(target_edge_m),
         checksurfdist=True,
-        maxsurfdist=PureValue(0.1 * edge_m if tolerance_m is None else tolerance_m),
+        maxsurfdist=PureValue(0.1 * target_edge_m if tolerance_m is None else tolerance_m),
     )
     return repair(_from_meshset(meshes))
 
 
-def _meshset(mesh: Mesh, selected: Bool[np.ndarray, "f"] | None = None) -> Any:
+def _to_meshset(mesh: Mesh, selected: Bool[np.ndarray, "f"] | None = None) -> Any:
     import pymeshlab  # here, because loading it costs a quarter of a second that few stages need pay
 
     meshes = pymeshlab.MeshSet()
@@ -246,18 +246,18 @@ def laplacian(mesh: Mesh) -> csr_array:
     return csr_array(diags_array(np.ones(count)) - diags_array(1.0 / degree) @ adjacency)
 
 
-def smooth(mesh: Mesh, steps: int, shrink: float = 0.5, swell: float = 0.52) -> Mesh:
+def smooth_taubin(mesh: Mesh, steps: int, taubin_lambda: float = 0.5, taubin_nu: float = 0.52) -> Mesh:
     """Taubin's smoothing ("A signal processing approach to fair surface design", 1995): a step moves vertices towards
-    the mean of their neighbours by ``shrink``, then back by ``swell``, so that noise goes and volume stays.
+    the mean of their neighbours by ``taubin_lambda``, then back by ``taubin_nu``, so that noise goes and volume stays.
     """
     operator, vertices = laplacian(mesh), mesh.vertices.astype(np.float64)
     for _ in range(steps):
-        vertices = vertices - shrink * (operator @ vertices)
-        vertices = vertices + swell * (operator @ vertices)
+        vertices = vertices - taubin_lambda * (operator @ vertices)
+        vertices = vertices + taubin_nu * (operator @ vertices)
     return Mesh(vertices.astype(np.float32), mesh.faces)
 
 
-def closest_on_mesh(
+def closest_points_on_mesh(
     points: Float[np.ndarray, "n 3"], mesh: Mesh
 ) -> tuple[Float[np.ndarray, "n"], Int[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
     """Distance (m) of each point to the mesh, the face that is nearest, and the barycentrics of the nearest place on
@@ -272,7 +272,7 @@ def closest_on_mesh(
     return np.sqrt(np.maximum(squared, 0.0)), face.astype(np.int64), barycentric
 
 
-class SurfaceTree:
+class MeshAABBTree:
     """One mesh prepared for many rounds of questions: building the tree costs more than some thousand answers."""
 
     def __init__(self, mesh: Mesh) -> None:
@@ -299,7 +299,7 @@ def transfer(
     points: Float[np.ndarray, "n 3"], mesh: Mesh, attributes: Float[np.ndarray, "v c"]
 ) -> Float[np.ndarray, "n c"]:
     """Vertex attributes of a mesh at the place on it nearest to each point."""
-    _, face, barycentric = closest_on_mesh(points, mesh)
+    _, face, barycentric = closest_points_on_mesh(points, mesh)
     return np.einsum("nk,nkc->nc", barycentric, attributes[mesh.faces[face]]).astype(attributes.dtype)
 
 

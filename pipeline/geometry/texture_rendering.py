@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pipeline.geometry.camera import Camera, project
 from pipeline.kernels.raster import rasterize
-from pipeline.kernels.texture_sampling import shade_texture
+from pipeline.kernels.texture_sampling import supersample_texture
 from pipeline.kernels.texture_sampling.reference import sample_texture_reference
 
 
@@ -31,23 +31,24 @@ def render_textured(
     uv: Float[Tensor, "t 2"],
     texture: Float[Tensor, "th tw c"],
     camera: Camera,
-    samples: int = 3,
+    supersampling: int = 3,
 ) -> Float[Tensor, "h w c+1"]:
     """Texture colours premultiplied by coverage, and the coverage, in [0, 1]; unlit.
 
-    Each pixel is the mean of `samples` x `samples` bilinear look-ups, which antialiases silhouettes, seams and texels.
+    Each pixel is the mean of `supersampling` x `supersampling` bilinear look-ups, which antialiases silhouettes,
+    seams and texels.
 
     Args:
         vertices_world: metres. faces: corners into the vertices. faces_uv: corners of the same faces into `uv`.
     """
-    fine = camera.scaled(float(samples))
+    fine = camera.scaled(float(supersampling))
     vertices_px, depth_m = project(vertices_world, fine)
     face_id, barycentric, _ = rasterize(vertices_px, depth_m, faces, fine.height, fine.width)
-    return shade_texture(face_id, barycentric, faces_uv, uv, texture, samples)
+    return supersample_texture(face_id, barycentric, faces_uv, uv, texture, supersampling)
 
 
-def soften_outline(
-    premultiplied: Float[np.ndarray, "h w channels"], spread_px: float
+def blur_coverage(
+    premultiplied: Float[np.ndarray, "h w channels"], sigma_px: float
 ) -> Float[np.ndarray, "h w channels"]:
     """The picture with the coverage in its last channel blurred, as by a lens and a mask that are not sharp.
 
@@ -57,19 +58,19 @@ def soften_outline(
     Args:
         spread_px: standard deviation of the Gaussian.
     """
-    if spread_px <= 0.0:
+    if sigma_px <= 0.0:
         return premultiplied
-    size = 2 * math.ceil(4.0 * spread_px) + 1
-    blurred = cv2.GaussianBlur(premultiplied, (size, size), spread_px, borderType=cv2.BORDER_REPLICATE)
+    size = 2 * math.ceil(4.0 * sigma_px) + 1
+    blurred = cv2.GaussianBlur(premultiplied, (size, size), sigma_px, borderType=cv2.BORDER_REPLICATE)
     coverage, softened = premultiplied[..., -1:], blurred[..., -1:]
-    carried = blurred[..., :-1] / np.maximum(softened, 1e-6)
+    extrapolated = blurred[..., :-1] / np.maximum(softened, 1e-6)
     own = premultiplied[..., :-1] / np.maximum(coverage, 1e-6)
-    colour = np.where(coverage > 0.5, own, carried)
+    colour = np.where(coverage > 0.5, own, extrapolated)
     return np.concatenate([colour * softened, softened], axis=2)
 
 
 def turntable_camera(
-    lowest_m: Float[np.ndarray, "3"], highest_m: Float[np.ndarray, "3"], angle: float, width: int, height: int
+    box_min_m: Float[np.ndarray, "3"], box_max_m: Float[np.ndarray, "3"], angle: float, width: int, height: int
 ) -> Camera:
     """A camera of long focal length that sees a whole box from all around, level with the box's centre.
 
@@ -78,7 +79,7 @@ def turntable_camera(
         angle: radians around +Y; 0 looks at the front (the camera stands on +Z), pi/2 stands on +X.
         width, height: of the image in pixels.
     """
-    centre, size = 0.5 * (lowest_m + highest_m), highest_m - lowest_m
+    centre, size = 0.5 * (box_min_m + box_max_m), box_max_m - box_min_m
     radius = 0.5 * math.hypot(size[0], size[2])
     distance = 6.0 * max(size[1], 2.0 * radius)
     focal_px = 0.94 * (distance - radius) * min(height / size[1], width / (2.0 * radius))

@@ -22,7 +22,7 @@ _PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1)
 _JPEG_OPTIONS = (cv2.IMWRITE_JPEG_QUALITY, 92)
 _SRGB = ImageCms.createProfile("sRGB")
 # What a colour profile is for, and the kind of picture that Pillow then wants.
-_PROFILED = {"RGB": "RGB", "GRAY": "L"}
+_PILLOW_MODE_OF_SPACE = {"RGB": "RGB", "GRAY": "L"}
 
 
 def read_rgb(path: Path) -> UInt8[np.ndarray, "h w 3"]:
@@ -31,7 +31,7 @@ def read_rgb(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     Colours of another space (phones write Display P3, cameras Adobe RGB) are converted if the file has their profile.
     Raises UserError when the file is missing, is no image, or its profile cannot be used.
     """
-    return _in_srgb(cv2.cvtColor(_read(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), path)
+    return _convert_to_srgb(cv2.cvtColor(_read(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), path)
 
 
 def read_gray(path: Path) -> UInt8[np.ndarray, "h w"]:
@@ -100,7 +100,7 @@ def _read(path: Path, flags: int) -> np.ndarray:
     return pixels
 
 
-def _in_srgb(rgb: UInt8[np.ndarray, "h w 3"], path: Path) -> UInt8[np.ndarray, "h w 3"]:
+def _convert_to_srgb(rgb: UInt8[np.ndarray, "h w 3"], path: Path) -> UInt8[np.ndarray, "h w 3"]:
     try:
         with Image.open(path) as header:
             profile = header.info.get("icc_profile")
@@ -110,7 +110,7 @@ def _in_srgb(rgb: UInt8[np.ndarray, "h w 3"], path: Path) -> UInt8[np.ndarray, "
         return rgb
     try:
         space = ImageCms.getOpenProfile(BytesIO(profile)).profile.xcolor_space.strip()
-        pixels = Image.fromarray(rgb).convert(_PROFILED.get(space, "RGB"))
+        pixels = Image.fromarray(rgb).convert(_PILLOW_MODE_OF_SPACE.get(space, "RGB"))
         return np.array(ImageCms.profileToProfile(pixels, BytesIO(profile), _SRGB, outputMode="RGB"))
     except ImageCms.PyCMSError as error:
         raise UserError(f"the colour profile of image {path} cannot be used ({error}); save it again as sRGB") from None

@@ -2,7 +2,8 @@
 
 A pickle is a program that may call any function it names. Here it may name only those that make numpy arrays and plain
 containers. Those of numpy itself are replaced: they take a type's flags, an array's length and even pointers to objects
-as the pickle gives them. Objects of other packages (chumpy, scipy) are read as `Record`s when the caller asks for it by
+as the pickle gives them. Objects of other packages (chumpy, scipy) are read as `OpaqueObject`s when the caller asks
+for it by
 name, so that the packages are neither needed nor run. Python 2's pickles are read too; their byte strings come back as
 Latin-1 text.
 """
@@ -21,7 +22,7 @@ import numpy as np
 from pipeline.core.errors import UserError
 
 # What damaged bytes can raise on their way through the unpickler and numpy.
-_DAMAGE = (
+_UNPICKLING_ERRORS = (
     pickle.UnpicklingError,
     ArithmeticError,
     AttributeError,
@@ -36,11 +37,11 @@ _DAMAGE = (
 )
 
 
-class RefusedGlobalError(pickle.UnpicklingError):
+class ForbiddenGlobalError(pickle.UnpicklingError):
     """The pickle names something that is not on the allow-list; the message is its dotted name."""
 
 
-class Record:
+class OpaqueObject:
     """An object of another package that was not built: `state` is what it would have been built from."""
 
     state: Any = None
@@ -50,11 +51,11 @@ class Record:
         self.state = state
 
 
-class _Array:
+class _NdarrayPlaceholder:
     """Stands where a pickle names `numpy.ndarray`, which would take any bytes for pointers to objects."""
 
 
-class _Type:
+class _DtypePlaceholder:
     """A numpy type as a pickle describes it: a name and, after BUILD, its parts."""
 
     def __init__(self, name: object, *_: object) -> None:
@@ -86,7 +87,7 @@ def _empty_array(*_: object) -> np.ndarray:
     return np.empty(0)
 
 
-def _array_state(state: Any) -> tuple[Any, ...]:
+def _checked_array_state(state: Any) -> tuple[Any, ...]:
     """What BUILD gives an array: of objects numpy would read on where the shape asks for more than there are."""
     version, shape, kind, is_fortran, content = state
     dtype = kind.dtype
@@ -114,10 +115,10 @@ def _latin1_bytes(text: str, encoding: str) -> bytes:
     return text.encode("latin1")
 
 
-def _empty_record(kind: type, base: type, state: object) -> Record:
+def _reconstruct_opaque_object(kind: type, base: type, state: object) -> OpaqueObject:
     """What `copyreg._reconstructor` does in protocols 0 and 1, for records alone."""
-    if not issubclass(kind, Record) or base is not object or state is not None:
-        raise RefusedGlobalError("copyreg._reconstructor")
+    if not issubclass(kind, OpaqueObject) or base is not object or state is not None:
+        raise ForbiddenGlobalError("copyreg._reconstructor")
     return kind()
 
 
@@ -128,14 +129,14 @@ _NUMPY_BUILDERS: dict[str, Callable[..., Any]] = {
     "numeric._frombuffer": _array_of_bytes,
 }
 
-_ALLOWED: dict[str, Callable[..., Any]] = {
-    "numpy.ndarray": _Array,
-    "numpy.dtype": _Type,
+_ALLOWED_GLOBALS: dict[str, Callable[..., Any]] = {
+    "numpy.ndarray": _NdarrayPlaceholder,
+    "numpy.dtype": _DtypePlaceholder,
     **{f"numpy.{core}.{name}": builder for core in ("core", "_core") for name, builder in _NUMPY_BUILDERS.items()},
     "_codecs.encode": _latin1_bytes,
     "collections.OrderedDict": OrderedDict,
-    "copy_reg._reconstructor": _empty_record,
-    "copyreg._reconstructor": _empty_record,
+    "copy_reg._reconstructor": _reconstruct_opaque_object,
+    "copyreg._reconstructor": _reconstruct_opaque_object,
     **{
         f"{module}.{kind.__name__}": kind
         for module in ("__builtin__", "builtins")
@@ -149,50 +150,52 @@ _PythonUnpickler: Any = pickle._Unpickler
 
 
 class RestrictedUnpickler(_PythonUnpickler):
-    """Reads arrays and plain containers; `records` are dotted names of classes that come back as `Record`s."""
+    """Reads arrays and plain containers; `opaque_classes` are dotted names of classes that come back as
+    `OpaqueObject`s.
+    """
 
-    def __init__(self, file: IO[bytes], records: Iterable[str] = ()) -> None:
+    def __init__(self, file: IO[bytes], opaque_classes: Iterable[str] = ()) -> None:
         super().__init__(file, encoding="latin1")
         # One class a load and name: a pickle may set attributes of classes, which must not outlive it.
-        self._records = {name: type(name.rpartition(".")[2], (Record,), {}) for name in records}
+        self._opaque_classes = {name: type(name.rpartition(".")[2], (OpaqueObject,), {}) for name in opaque_classes}
 
     def find_class(self, module_name: str, global_name: str) -> Any:
         """What the pickle may use under this name. Raises RefusedGlobalError for all else."""
         name = f"{module_name}.{global_name}"
-        found = self._records.get(name) or _ALLOWED.get(name)
+        found = self._opaque_classes.get(name) or _ALLOWED_GLOBALS.get(name)
         if found is None:
-            raise RefusedGlobalError(name)
+            raise ForbiddenGlobalError(name)
         return found
 
     def load_build(self) -> None:
         """As in pickle, for what has a state here: it would set any attribute of anything else."""
         state, instance = self.stack[-1], self.stack[-2]
         if isinstance(instance, np.ndarray):
-            self.stack[-1] = _array_state(state)
-        elif not isinstance(instance, _Type | Record):
+            self.stack[-1] = _checked_array_state(state)
+        elif not isinstance(instance, _DtypePlaceholder | OpaqueObject):
             raise pickle.UnpicklingError(f"it gives a state to {type(instance).__name__}")
         super().load_build()
 
     dispatch = {**_PythonUnpickler.dispatch, pickle.BUILD[0]: load_build}
 
 
-def load_pickle(path: Path, records: Iterable[str] = ()) -> Any:
+def load_pickle(path: Path, opaque_classes: Iterable[str] = ()) -> Any:
     """Read a pickle of numpy arrays and plain containers.
 
     Args:
         path: the file; protocols 0 to 5, of Python 2 or 3.
-        records: dotted names of foreign classes to read as `Record`, for example `chumpy.ch.Ch`.
+        records: dotted names of foreign classes to read as `OpaqueObject`, for example `chumpy.ch.Ch`.
 
     Raises:
         UserError: naming the file and what it asks for beyond that, or that it is damaged or absent.
     """
-    with opened(path) as file:
-        return RestrictedUnpickler(file, records).load()
+    with open_pickle(path) as file:
+        return RestrictedUnpickler(file, opaque_classes).load()
 
 
 def load_npy(path: Path) -> np.ndarray:
     """Read a `.npy` file; what an array of objects holds is read as by `load_pickle`. Raises UserError as it does."""
-    with opened(path) as file:
+    with open_pickle(path) as file:
         is_first_version = np.lib.format.read_magic(file) == (1, 0)
         if is_first_version and np.lib.format.read_array_header_1_0(file)[2].hasobject:
             return np.asarray(RestrictedUnpickler(file).load())
@@ -201,17 +204,17 @@ def load_npy(path: Path) -> np.ndarray:
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[IO[bytes]]:
+def open_pickle(path: Path) -> Iterator[IO[bytes]]:
     """The open file; whatever unpickling from it can raise becomes a UserError that names it."""
     try:
         with path.open("rb") as file:
             yield file
     except FileNotFoundError:
         raise UserError(f"{path} does not exist; give a file of arrays") from None
-    except RefusedGlobalError as refused:
+    except ForbiddenGlobalError as refused:
         raise UserError(
             f"{path} is refused: it asks for `{refused}`, and only numpy arrays and plain containers are read; "
             "store the arrays as .npz"
         ) from None
-    except _DAMAGE as error:
+    except _UNPICKLING_ERRORS as error:
         raise UserError(f"{path} cannot be read as pickled arrays ({error}); fetch or write it again") from None

@@ -16,10 +16,10 @@ DESCRIPTION = "description"
 
 def save_tensors(path: Path, tensors: dict[str, Tensor], description: dict | None = None) -> None:
     """Write tensors and a JSON-like description."""
-    whole = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
+    cpu_tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
     text = json.dumps(description or {}, sort_keys=True)
-    with atomic_path(path) as unfinished:
-        unfinished.write_bytes(save(whole, {DESCRIPTION: text}))
+    with atomic_path(path) as temporary_path:
+        temporary_path.write_bytes(save(cpu_tensors, {DESCRIPTION: text}))
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict]:

@@ -24,11 +24,11 @@ from pipeline.core.config import Config
 from pipeline.core.progress import track
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import laplacian
-from pipeline.kernels.common.thread_pool import Parallel
-from pipeline.mesh.views import Skin, View, render_view, view_losses
+from pipeline.kernels.common.thread_pool import ThreadPool
+from pipeline.mesh.views import PosedView, SkinnedTopology, render_posed_view, view_losses
 
 
-class RefineConfig(Config):
+class RefinementConfig(Config):
     """Options of the refinement."""
 
     rounds: int = Field(
@@ -36,23 +36,23 @@ class RefineConfig(Config):
     )
     steps: int = Field(60, ge=1, le=5000, description="optimiser steps a round")
     frames_per_step: int = Field(3, ge=1, le=16, description="training frames a step looks at")
-    person_height_px: int = Field(
+    max_person_px: int = Field(
         480, ge=64, le=4096, description="images are reduced until the person is at most this high, px"
     )
     learning_rate: float = Field(0.0012, gt=0.0, le=0.1, description="step of the smoothed offsets, m")
     global_learning_rate: float = Field(0.0003, ge=0.0, le=0.1, description="step of the one offset of all vertices, m")
-    appearance_rate: float = Field(
+    appearance_learning_rate: float = Field(
         0.003, ge=0.0, le=0.1, description="learning rate of the field's colours on the mesh's surface; 0 keeps them"
     )
     appearance_steps: int = Field(
         20, ge=0, le=1000, description="steps at the start of a round that change colours only"
     )
-    stiffness: float = Field(
+    smoothing_lambda: float = Field(
         12.0, ge=0.0, le=1000.0, description="lambda of the implicit smoothing of every step; 0 moves vertices alone"
     )
     colour_weight: float = Field(1.0, ge=0.0, description="weight of the Huber colour loss")
-    alpha_weight: float = Field(1.0, ge=0.0, description="weight of the silhouette loss, alpha against mask")
-    smooth_weight: float = Field(
+    silhouette_weight: float = Field(1.0, ge=0.0, description="weight of the silhouette loss, alpha against mask")
+    laplacian_weight: float = Field(
         0.5, ge=0.0, description="weight of the uniform Laplacian of the positions, in units of the edge length"
     )
     offset_weight: float = Field(
@@ -67,14 +67,14 @@ class RefineConfig(Config):
     decimate_percentile: float = Field(
         50.0, ge=0.0, le=95.0, description="faces with less image error than this share are decimated, %"
     )
-    decimate_edge: float = Field(
+    decimated_edge_ratio: float = Field(
         1.4, ge=1.0, le=4.0, description="edge length of decimated regions, in target edge lengths"
     )
     max_faces: int = Field(60000, ge=100, description="no face is split beyond this number of faces")
 
 
 @dataclass(frozen=True)
-class RefineTask:
+class RefinementInputs:
     """What a refinement works with.
 
     train, validation: views to learn from and to judge by. shade: colours in [0, 1] (n, 3) at canonical points (n, 3)
@@ -82,72 +82,84 @@ class RefineTask:
     """
 
     body: Body
-    train: Sequence[View]
-    validation: Sequence[View]
-    shade: torch.nn.Module
-    edge_m: float
-    config: RefineConfig
+    train: Sequence[PosedView]
+    validation: Sequence[PosedView]
+    shader: torch.nn.Module
+    target_edge_m: float
+    config: RefinementConfig
     seed: int = 0
 
 
-class SmoothOffset(torch.autograd.Function):
+class FromDifferential(torch.autograd.Function):
     """D = (I + lambda L)^-1 u, with the same solve for the gradient (the matrix is symmetric)."""
 
     @staticmethod
-    def forward(context: Any, smooth_coordinates: Tensor, factor: SuperLU) -> Tensor:
+    def forward(context: Any, differential_coordinates: Tensor, factorisation: SuperLU) -> Tensor:
         """(v, 3) u -> (v, 3) D."""
-        context.factor = factor
-        return torch.from_numpy(factor.solve(smooth_coordinates.detach().double().numpy())).to(smooth_coordinates)
+        context.factorisation = factorisation
+        return torch.from_numpy(factorisation.solve(differential_coordinates.detach().double().numpy())).to(
+            differential_coordinates
+        )
 
     @staticmethod
     def backward(context: Any, gradient: Tensor) -> tuple[Tensor, None]:
         """dL/dD -> dL/du."""
-        return torch.from_numpy(context.factor.solve(gradient.double().contiguous().numpy())).to(gradient), None
+        return torch.from_numpy(context.factorisation.solve(gradient.double().contiguous().numpy())).to(gradient), None
 
 
-def smoothing_factor(mesh: Mesh, stiffness: float) -> SuperLU:
+def factorise_smoothing_matrix(mesh: Mesh, smoothing_lambda: float) -> SuperLU:
     """Factor of I + stiffness * L with the combinatorial Laplacian L = degree - adjacency."""
     operator = laplacian(mesh)
     degree = np.bincount(mesh.edges().ravel(), minlength=len(mesh.vertices))
-    return splu(csc_array(eye_array(len(mesh.vertices)) + stiffness * (diags_array(degree.astype(float)) @ operator)))
+    return splu(
+        csc_array(eye_array(len(mesh.vertices)) + smoothing_lambda * (diags_array(degree.astype(float)) @ operator))
+    )
 
 
-def optimise(mesh: Mesh, skin: Skin, task: RefineTask, seed: int, label: str = "refine") -> Mesh:
+def optimise_vertices(
+    mesh: Mesh, skin: SkinnedTopology, task: RefinementInputs, seed: int, label: str = "refine"
+) -> Mesh:
     """The mesh with its vertices moved so that it looks like the training views; triangles stay.
 
-    The parameters of ``task.shade`` are changed in place: colours that a volume gives along a ray are not those at one
+    The parameters of ``task.shader`` are changed in place: colours that a volume gives along a ray are not those at one
     surface, and would pull the vertices to wherever they fit by chance.
     """
     config = task.config
     generator = torch.Generator().manual_seed(seed)
     start = torch.from_numpy(mesh.vertices.astype(np.float32))
-    factor, operator = smoothing_factor(mesh, config.stiffness), _to_torch(laplacian(mesh))
-    coordinates, shift = torch.zeros_like(start, requires_grad=True), torch.zeros(3, requires_grad=True)
-    rates = [config.learning_rate * (1.0 + config.stiffness), config.global_learning_rate]
-    movement = UniformAdam([coordinates, shift], rates)
-    colours: list[Tensor] = [parameter for parameter in task.shade.parameters() if parameter.requires_grad]
-    appearance = torch.optim.Adam(colours, lr=config.appearance_rate, betas=(0.9, 0.99), eps=1e-12) if colours else None
-    warm_up = config.appearance_steps if appearance else 0
-    threads = Parallel(config.frames_per_step)
+    factorisation, operator = factorise_smoothing_matrix(mesh, config.smoothing_lambda), _to_torch(laplacian(mesh))
+    coordinates, global_offset = torch.zeros_like(start, requires_grad=True), torch.zeros(3, requires_grad=True)
+    learning_rates = [config.learning_rate * (1.0 + config.smoothing_lambda), config.global_learning_rate]
+    offset_optimiser = AdamUniform([coordinates, global_offset], learning_rates)
+    colours: list[Tensor] = [parameter for parameter in task.shader.parameters() if parameter.requires_grad]
+    appearance_optimiser = (
+        torch.optim.Adam(colours, lr=config.appearance_learning_rate, betas=(0.9, 0.99), eps=1e-12) if colours else None
+    )
+    warm_up = config.appearance_steps if appearance_optimiser else 0
+    threads = ThreadPool(config.frames_per_step)
     for step in track(range(warm_up + config.steps), label):
-        moves = step >= warm_up
-        with torch.set_grad_enabled(moves):
-            offset = SmoothOffset.apply(coordinates, factor)
-            vertices = start + offset + shift
-        towards = _views_gradients(vertices, colours, skin, task, generator, threads)
+        update_vertices = step >= warm_up
+        with torch.set_grad_enabled(update_vertices):
+            offset = FromDifferential.apply(coordinates, factorisation)
+            vertices = start + offset + global_offset
+        view_gradients = _batch_gradients(vertices, colours, skin, task, generator, threads)
         decay = 0.5 * (1.0 + math.cos(math.pi * step / (warm_up + config.steps)))
-        if moves:
-            held = _regularisers(vertices, offset, shift, operator, task.edge_m, config)
-            loss = held + (vertices * towards[0]).sum()
-            movement.step(torch.autograd.grad(loss, [coordinates, shift]), decay)
-        if appearance:
-            _step(appearance, colours, towards[-len(colours) :], config.appearance_rate * decay)
+        if update_vertices:
+            regularisation = _regularisation_loss(vertices, offset, global_offset, operator, task.target_edge_m, config)
+            loss = regularisation + (vertices * view_gradients[0]).sum()
+            offset_optimiser.step(torch.autograd.grad(loss, [coordinates, global_offset]), decay)
+        if appearance_optimiser:
+            _adam_step(
+                appearance_optimiser, colours, view_gradients[-len(colours) :], config.appearance_learning_rate * decay
+            )
     with torch.no_grad():
-        moved = start + SmoothOffset.apply(coordinates, factor) + shift
+        moved = start + FromDifferential.apply(coordinates, factorisation) + global_offset
     return Mesh(moved.numpy(), mesh.faces)
 
 
-def _step(optimiser: torch.optim.Adam, parameters: Sequence[Tensor], gradients: Sequence[Tensor], rate: float) -> None:
+def _adam_step(
+    optimiser: torch.optim.Adam, parameters: Sequence[Tensor], gradients: Sequence[Tensor], rate: float
+) -> None:
     optimiser.param_groups[0]["lr"] = rate
     for parameter, gradient in zip(parameters, gradients, strict=True):
         parameter.grad = gradient
@@ -155,13 +167,13 @@ def _step(optimiser: torch.optim.Adam, parameters: Sequence[Tensor], gradients: 
     optimiser.zero_grad(set_to_none=True)
 
 
-def _views_gradients(
+def _batch_gradients(
     vertices: Float[Tensor, "v 3"],
     colours: Sequence[Tensor],
-    skin: Skin,
-    task: RefineTask,
+    skin: SkinnedTopology,
+    task: RefinementInputs,
     generator: torch.Generator,
-    threads: Parallel,
+    threads: ThreadPool,
 ) -> list[Tensor]:
     """Gradients of the mean loss of a few random training views, each before a random background.
 
@@ -172,57 +184,64 @@ def _views_gradients(
     chosen = torch.randint(len(task.train), (config.frames_per_step,), generator=generator).tolist()
     backgrounds = [torch.rand(3, generator=generator) for _ in chosen]
 
-    def of_view(k: int, background: Float[Tensor, "3"]) -> Sequence[Tensor]:
-        place = vertices.detach().requires_grad_(vertices.requires_grad)
-        image, alpha, _ = render_view(place, skin, task.train[k], task.shade)
-        colour, outline = view_losses(image, alpha, task.train[k], background)
-        loss = (config.colour_weight * colour + config.alpha_weight * outline) / len(chosen)
+    def gradients_of_view(k: int, background: Float[Tensor, "3"]) -> Sequence[Tensor]:
+        leaf_vertices = vertices.detach().requires_grad_(vertices.requires_grad)
+        image, alpha, _ = render_posed_view(leaf_vertices, skin, task.train[k], task.shader)
+        colour_loss, silhouette_loss = view_losses(image, alpha, task.train[k], background)
+        loss = (config.colour_weight * colour_loss + config.silhouette_weight * silhouette_loss) / len(chosen)
         # A view that shows nothing of the mesh says nothing of its colours.
-        wanted = ([place] if place.requires_grad else []) + list(colours)
-        return torch.autograd.grad(loss, wanted, materialize_grads=True)
+        gradient_inputs = ([leaf_vertices] if leaf_vertices.requires_grad else []) + list(colours)
+        return torch.autograd.grad(loss, gradient_inputs, materialize_grads=True)
 
-    views = threads.map(of_view, chosen, backgrounds)
+    views = threads.map(gradients_of_view, chosen, backgrounds)
     return [reduce(torch.add, gradients) for gradients in zip(*views, strict=True)]
 
 
-def _regularisers(
+def _regularisation_loss(
     vertices: Float[Tensor, "v 3"],
     offset: Float[Tensor, "v 3"],
-    shift: Float[Tensor, "3"],
+    global_offset: Float[Tensor, "3"],
     operator: Tensor,
-    edge_m: float,
-    config: RefineConfig,
+    target_edge_m: float,
+    config: RefinementConfig,
 ) -> Float[Tensor, ""]:
     """Uniform Laplacian, vertex offsets and global offset, squared in units of the edge length."""
-    smooth = (torch.sparse.mm(operator, vertices) / edge_m).square().sum(1).mean()
-    drift, common = (offset / edge_m).square().sum(1).mean(), (shift / edge_m).square().sum()
-    return config.smooth_weight * smooth + config.offset_weight * drift + config.global_offset_weight * common
+    laplacian_penalty = (torch.sparse.mm(operator, vertices) / target_edge_m).square().sum(1).mean()
+    offset_penalty, global_offset_penalty = (
+        (offset / target_edge_m).square().sum(1).mean(),
+        (global_offset / target_edge_m).square().sum(),
+    )
+    return (
+        config.laplacian_weight * laplacian_penalty
+        + config.offset_weight * offset_penalty
+        + config.global_offset_weight * global_offset_penalty
+    )
 
 
-class UniformAdam:
+class AdamUniform:
     """Adam whose second moment is one number per tensor, the largest: a step keeps the gradient's shape (Nicolet et
     al., "Large steps in inverse rendering of geometry", 2021, section 4.3).
     """
 
     def __init__(
-        self, parameters: Sequence[Tensor], rates: Sequence[float], betas: tuple[float, float] = (0.9, 0.99)
+        self, parameters: Sequence[Tensor], learning_rates: Sequence[float], betas: tuple[float, float] = (0.9, 0.99)
     ) -> None:
-        self._parameters, self._rates, self._betas = parameters, rates, betas
-        self._means = [torch.zeros_like(parameter) for parameter in parameters]
-        self._largest = [torch.zeros(()) for _ in parameters]
+        self._parameters, self._learning_rates, self._betas = parameters, learning_rates, betas
+        self._first_moments = [torch.zeros_like(parameter) for parameter in parameters]
+        self._second_moments = [torch.zeros(()) for _ in parameters]
         self._count = 0
 
     @torch.no_grad()
-    def step(self, gradients: Sequence[Tensor], rate_factor: float) -> None:
-        """One step against the gradients with the learning rates times ``rate_factor``."""
+    def step(self, gradients: Sequence[Tensor], learning_rate_scale: float) -> None:
+        """One step against the gradients with the learning rates times ``learning_rate_scale``."""
         self._count += 1
         first_beta, second_beta = self._betas
         first_bias, second_bias = 1.0 - first_beta**self._count, 1.0 - second_beta**self._count
         for i, (parameter, gradient) in enumerate(zip(self._parameters, gradients, strict=True)):
-            self._means[i] = torch.lerp(gradient, self._means[i], first_beta)
-            self._largest[i] = torch.lerp(gradient.square().max(), self._largest[i], second_beta)
-            update = self._means[i] / first_bias / ((self._largest[i] / second_bias).sqrt() + 1e-12)
-            parameter -= self._rates[i] * rate_factor * update
+            self._first_moments[i] = torch.lerp(gradient, self._first_moments[i], first_beta)
+            self._second_moments[i] = torch.lerp(gradient.square().max(), self._second_moments[i], second_beta)
+            update = self._first_moments[i] / first_bias / ((self._second_moments[i] / second_bias).sqrt() + 1e-12)
+            parameter -= self._learning_rates[i] * learning_rate_scale * update
 
 
 def _to_torch(matrix: csr_array) -> Tensor:

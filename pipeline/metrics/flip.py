@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline.geometry.colour import linear_light
+from pipeline.geometry.colour import srgb_to_linear
 
 PIXELS_PER_DEGREE = 3840.0 * math.pi / 180.0
 QC, QF, PC, PT = 0.7, 0.5, 0.4, 0.95
@@ -23,24 +23,24 @@ CONTRAST_GAUSSIANS: tuple[tuple[tuple[float, float], ...], ...] = (
 )
 """(a, b) of the Gaussians of each opponent channel's contrast sensitivity: achromatic, red-green, blue-yellow."""
 
-_XYZ_OF_LINEAR = np.array(
+_LINEAR_RGB_TO_XYZ = np.array(
     [
         [10135552 / 24577794, 8788810 / 24577794, 4435075 / 24577794],
         [2613072 / 12288897, 8788810 / 12288897, 887015 / 12288897],
         [1425312 / 73733382, 8788810 / 73733382, 70074185 / 73733382],
     ]
 )
-_WHITE_XYZ = _XYZ_OF_LINEAR.sum(axis=1)
+_WHITE_XYZ = _LINEAR_RGB_TO_XYZ.sum(axis=1)
 
 
 def flip_map(
     render: UInt8[np.ndarray, "h w 3"], image: UInt8[np.ndarray, "h w 3"], pixels_per_degree: float = PIXELS_PER_DEGREE
 ) -> Float[np.ndarray, "h w"]:
     """Perceived error of each pixel in [0, 1], 0 where nothing differs; sRGB pictures, symmetric in the two."""
-    opponent = [_opponent(linear_light(picture / 255.0)) for picture in (render, image)]
-    seen = [_hunt_lab(_blurred(channels, pixels_per_degree)) for channels in opponent]
-    colour = _redistributed(_hyab(*seen) ** QC)
-    brightness = [(channels[..., 0] + 16.0) / 116.0 for channels in opponent]
+    ycxcz = [_linear_rgb_to_ycxcz(srgb_to_linear(picture / 255.0)) for picture in (render, image)]
+    seen = [_hunt_lab(_filter_by_csf(channels, pixels_per_degree)) for channels in ycxcz]
+    colour = _redistribute_errors(_hyab(*seen) ** QC)
+    brightness = [(channels[..., 0] + 16.0) / 116.0 for channels in ycxcz]
     differences = []
     for point in (False, True):
         strengths = [_feature_strength(channel, point, pixels_per_degree) for channel in brightness]
@@ -49,20 +49,20 @@ def flip_map(
     return colour ** (1.0 - np.minimum(feature, 1.0))
 
 
-def _opponent(linear: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+def _linear_rgb_to_ycxcz(linear: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     """Linear RGB to YyCxCz, a linear opponent space."""
-    x, y, z = np.moveaxis(linear @ _XYZ_OF_LINEAR.T / _WHITE_XYZ, -1, 0)
+    x, y, z = np.moveaxis(linear @ _LINEAR_RGB_TO_XYZ.T / _WHITE_XYZ, -1, 0)
     return np.stack([116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)], axis=-1)
 
 
-def _linear_of_opponent(opponent: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-    """Inverse of `_opponent`."""
-    y = (opponent[..., 0] + 16.0) / 116.0
-    xyz = np.stack([y + opponent[..., 1] / 500.0, y, y - opponent[..., 2] / 200.0], axis=-1) * _WHITE_XYZ
-    return xyz @ np.linalg.inv(_XYZ_OF_LINEAR).T
+def _ycxcz_to_linear_rgb(ycxcz: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    """Inverse of `_linear_rgb_to_ycxcz`."""
+    y = (ycxcz[..., 0] + 16.0) / 116.0
+    xyz = np.stack([y + ycxcz[..., 1] / 500.0, y, y - ycxcz[..., 2] / 200.0], axis=-1) * _WHITE_XYZ
+    return xyz @ np.linalg.inv(_LINEAR_RGB_TO_XYZ).T
 
 
-def _blurred(opponent: Float[np.ndarray, "h w 3"], pixels_per_degree: float) -> Float[np.ndarray, "h w 3"]:
+def _filter_by_csf(ycxcz: Float[np.ndarray, "h w 3"], pixels_per_degree: float) -> Float[np.ndarray, "h w 3"]:
     """What the eye resolves, as linear RGB in [0, 1]: each channel through its contrast sensitivity."""
     widest = max(b for gaussians in CONTRAST_GAUSSIANS for _, b in gaussians)
     radius = math.ceil(3.0 * math.sqrt(widest / (2.0 * math.pi**2)) * pixels_per_degree)
@@ -72,16 +72,16 @@ def _blurred(opponent: Float[np.ndarray, "h w 3"], pixels_per_degree: float) -> 
         rows = [np.exp(-(math.pi**2) * squared_deg / b) for _, b in gaussians]
         masses = [a * math.sqrt(math.pi / b) * row.sum() ** 2 for (a, b), row in zip(gaussians, rows, strict=True)]
         parts = [
-            mass / sum(masses) * _filtered(opponent[..., channel], row / row.sum(), row / row.sum())
+            mass / sum(masses) * _filter_separable(ycxcz[..., channel], row / row.sum(), row / row.sum())
             for mass, row in zip(masses, rows, strict=True)
         ]
         channels.append(np.sum(parts, axis=0))
-    return np.clip(_linear_of_opponent(np.stack(channels, axis=-1)), 0.0, 1.0)
+    return np.clip(_ycxcz_to_linear_rgb(np.stack(channels, axis=-1)), 0.0, 1.0)
 
 
 def _hunt_lab(linear: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     """CIELAB whose chroma grows with lightness (Hunt effect)."""
-    ratio = linear @ _XYZ_OF_LINEAR.T / _WHITE_XYZ
+    ratio = linear @ _LINEAR_RGB_TO_XYZ.T / _WHITE_XYZ
     delta = 6.0 / 29.0
     x, y, z = np.moveaxis(np.where(ratio > delta**3, np.cbrt(ratio), ratio / (3.0 * delta**2) + 4.0 / 29.0), -1, 0)
     lightness = 116.0 * y - 16.0
@@ -94,7 +94,7 @@ def _hyab(a: Float[np.ndarray, "*n 3"], b: Float[np.ndarray, "*n 3"]) -> Float[n
     return np.abs(difference[..., 0]) + np.hypot(difference[..., 1], difference[..., 2])
 
 
-def _redistributed(error: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+def _redistribute_errors(error: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     """Errors to [0, 1]: up to PC of the largest possible one (green against blue) fill PT of the range."""
     green, blue = (_hunt_lab(np.array([primary])) for primary in ([0.0, 1.0, 0.0], [0.0, 0.0, 1.0]))
     largest = _hyab(green, blue).item() ** QC
@@ -112,10 +112,10 @@ def _feature_strength(
     along = (offsets**2 / deviation**2 - 1.0) * across if point else -offsets * across
     along = np.where(along > 0.0, along / along[along > 0.0].sum(), -along / along[along < 0.0].sum())
     across /= across.sum()
-    return np.hypot(_filtered(brightness, along, across), _filtered(brightness, across, along))
+    return np.hypot(_filter_separable(brightness, along, across), _filter_separable(brightness, across, along))
 
 
-def _filtered(
+def _filter_separable(
     channel: Float[np.ndarray, "h w"], rows: Float[np.ndarray, "k"], columns: Float[np.ndarray, "k"]
 ) -> Float[np.ndarray, "h w"]:
     """Correlation with the kernel columns x rows (outer product), the border repeated."""

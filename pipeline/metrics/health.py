@@ -6,12 +6,12 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from pipeline.geometry.mesh import Mesh
-from pipeline.geometry.surface import self_intersecting_faces, split_fans
+from pipeline.geometry.surface import self_intersecting_faces, split_nonmanifold_vertices
 
 SLIVER_ANGLE_DEG = 10.0
 
 
-def mesh_health(mesh: Mesh) -> dict[str, float | int | bool]:
+def mesh_quality_metrics(mesh: Mesh) -> dict[str, float | int | bool]:
     """Everything that the report says about a mesh.
 
     Returns:
@@ -19,15 +19,15 @@ def mesh_health(mesh: Mesh) -> dict[str, float | int | bool]:
         sliver_share: share of faces whose smallest angle is below 10 degrees; smallest_angle_deg: over all faces.
         self_intersecting_faces: faces that cut another face.
     """
-    smallest_deg = smallest_angles_deg(mesh)
+    smallest_deg = min_face_angles_deg(mesh)
     return {
         "vertices": len(mesh.vertices),
         "faces": len(mesh.faces),
         "watertight": mesh.is_watertight(),
         "manifold": is_manifold(mesh),
         "components": component_count(mesh),
-        "sliver_share": float(np.mean(smallest_deg < SLIVER_ANGLE_DEG)),
-        "smallest_angle_deg": float(smallest_deg.min()),
+        "sliver_fraction": float(np.mean(smallest_deg < SLIVER_ANGLE_DEG)),
+        "min_angle_deg": float(smallest_deg.min()),
         "self_intersecting_faces": self_intersecting_faces(mesh),
     }
 
@@ -36,7 +36,7 @@ def is_manifold(mesh: Mesh) -> bool:
     """At most two faces meet at each edge, and the faces around each vertex form one fan."""
     if len(mesh.faces) == 0 or int(mesh.edge_face_counts().max()) > 2:
         return False
-    return split_fans(mesh) is mesh
+    return split_nonmanifold_vertices(mesh) is mesh
 
 
 def component_count(mesh: Mesh) -> int:
@@ -48,7 +48,7 @@ def component_count(mesh: Mesh) -> int:
     return int(connected_components(graph, directed=False)[0])
 
 
-def smallest_angles_deg(mesh: Mesh) -> Float[np.ndarray, "f"]:
+def min_face_angles_deg(mesh: Mesh) -> Float[np.ndarray, "f"]:
     """Smallest inner angle of each face; 0 for faces without area."""
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     angles = []

@@ -15,35 +15,35 @@ from skimage.measure import perimeter_crofton
 from torch import Tensor
 
 from pipeline.metrics.flip import flip_map
-from pipeline.metrics.lpips import SMALLEST_SIDE_PX, lpips
+from pipeline.metrics.lpips import MIN_SIDE_PX, lpips
 
 SSIM_SIGMA_PX = 1.5
 SSIM_RADIUS_PX = 5  # torchmetrics: int(3.5 sigma + 0.5), so an 11 x 11 window
 _SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2
-_INSIDE = slice(SSIM_RADIUS_PX, -SSIM_RADIUS_PX)
+_VALID_REGION = slice(SSIM_RADIUS_PX, -SSIM_RADIUS_PX)
 
-PIXEL_SPREAD_PX = math.sqrt(1.0 / 12.0)
+PIXEL_BOX_SIGMA_PX = math.sqrt(1.0 / 12.0)
 """Standard deviation of a square pixel: what a sharp outline is blurred by in any picture."""
 
 
-def on_white(rgb: UInt8[np.ndarray, "h w 3"], alpha: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+def composite_on_white(rgb: UInt8[np.ndarray, "h w 3"], alpha: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
     """The image with its background (straight alpha) replaced by white, rounded to 8 bits."""
     opacity = alpha[..., None].astype(np.float32) / 255.0
     return np.rint(rgb * opacity + 255.0 * (1.0 - opacity)).astype(np.uint8)
 
 
-def premultiplied_on_white(rgba: Float[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w 3"]:
+def composite_premultiplied_on_white(rgba: Float[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w 3"]:
     """A render with premultiplied colours in [0, 1] laid over white, clipped and rounded to 8 bits."""
     colour = rgba[..., :3] + (1.0 - rgba[..., 3:])
     return np.rint(255.0 * np.clip(colour, 0.0, 1.0)).astype(np.uint8)
 
 
-def body_pixels(alpha: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+def foreground_mask(alpha: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Pixels that the mask gives to the person (alpha of one half and more)."""
     return alpha >= 128
 
 
-def body_box(body: Bool[np.ndarray, "h w"]) -> tuple[slice, slice]:
+def foreground_bounding_box(body: Bool[np.ndarray, "h w"]) -> tuple[slice, slice]:
     """Rows and columns of the smallest box around the body; ValueError when there is no body pixel."""
     rows, columns = np.flatnonzero(body.any(axis=1)), np.flatnonzero(body.any(axis=0))
     if not len(rows):
@@ -51,19 +51,21 @@ def body_box(body: Bool[np.ndarray, "h w"]) -> tuple[slice, slice]:
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
 
-def unscorable(mask: UInt8[np.ndarray, "h w"]) -> str | None:
+def reason_not_scorable(mask: UInt8[np.ndarray, "h w"]) -> str | None:
     """Why `frame_scores` refuses a frame with this mask; None when it does not."""
-    body = body_pixels(mask)
+    body = foreground_mask(mask)
     if not body.any():
         return "no pixel of its mask reaches one half"
-    height_px, width_px = (part.stop - part.start for part in body_box(body))
+    height_px, width_px = (part.stop - part.start for part in foreground_bounding_box(body))
     if min(height_px, width_px) <= 2 * SSIM_RADIUS_PX:
         return f"the person in it has {width_px} x {height_px} px, less than the window of SSIM"
-    return None if body[_INSIDE, _INSIDE].any() else "the person in it only lines the picture's border"
+    return None if body[_VALID_REGION, _VALID_REGION].any() else "the person in it only lines the picture's border"
 
 
 def psnr_db(
-    render: UInt8[np.ndarray, "h w 3"], image: UInt8[np.ndarray, "h w 3"], where: Bool[np.ndarray, "h w"] | None = None
+    render: UInt8[np.ndarray, "h w 3"],
+    image: UInt8[np.ndarray, "h w 3"],
+    pixel_mask: Bool[np.ndarray, "h w"] | None = None,
 ) -> float:
     """Peak signal-to-noise ratio, -10 log10(mean squared error on [0, 1]); infinite for equal images.
 
@@ -71,16 +73,18 @@ def psnr_db(
         where: pixels that count; all when None. ValueError when it is empty.
     """
     difference = (render.astype(np.float64) - image) / 255.0
-    if where is not None:
-        if not where.any():
+    if pixel_mask is not None:
+        if not pixel_mask.any():
             raise ValueError("no pixel to compare")
-        difference = difference[where]
+        difference = difference[pixel_mask]
     mean_squared_error = float(np.mean(difference**2))
     return math.inf if mean_squared_error == 0.0 else -10.0 * math.log10(mean_squared_error)
 
 
 def ssim(
-    render: UInt8[np.ndarray, "h w 3"], image: UInt8[np.ndarray, "h w 3"], where: Bool[np.ndarray, "h w"] | None = None
+    render: UInt8[np.ndarray, "h w 3"],
+    image: UInt8[np.ndarray, "h w 3"],
+    pixel_mask: Bool[np.ndarray, "h w"] | None = None,
 ) -> float:
     """Structural similarity (Wang et al. 2004) in [-1, 1], mean over channels and over windows inside the image.
 
@@ -102,28 +106,28 @@ def ssim(
     luminance = (2.0 * mean_x * mean_y + _SSIM_C1) / (mean_x**2 + mean_y**2 + _SSIM_C1)
     structure = (2.0 * covariance + _SSIM_C2) / (variance_x + variance_y + _SSIM_C2)
     similarity = luminance * structure
-    if where is not None:
-        middles = where[_INSIDE, _INSIDE]
+    if pixel_mask is not None:
+        middles = pixel_mask[_VALID_REGION, _VALID_REGION]
         if not middles.any():
             raise ValueError("no window to compare")
         similarity = similarity[middles]
     return float(np.mean(similarity))
 
 
-def edge_spread_px(alpha: UInt8[np.ndarray, "h w"]) -> float:
+def edge_blur_sigma_px(alpha: UInt8[np.ndarray, "h w"]) -> float:
     """How soft a mask's outline is: standard deviation in pixels of the blur that would make it from a step.
 
     Across an edge with that profile, a Gaussian's, alpha (1 - alpha) integrates to spread / sqrt(pi); the length of the
-    outline is Crofton's. A sharp outline seen by square pixels has `PIXEL_SPREAD_PX`; a mask without outline has 0.
+    outline is Crofton's. A sharp outline seen by square pixels has `PIXEL_BOX_SIGMA_PX`; a mask without outline has 0.
     """
     opacity = alpha.astype(np.float64) / 255.0
     length_px = perimeter_crofton(alpha >= 128, directions=4)
     return math.sqrt(math.pi) * float((opacity * (1.0 - opacity)).sum()) / length_px if length_px > 0.0 else 0.0
 
 
-def missing_blur_px(spread_px: float) -> float:
+def additional_blur_sigma_px(edge_sigma_px: float) -> float:
     """Standard deviation of the Gaussian that gives a sharp outline of square pixels this spread (variances add)."""
-    return math.sqrt(max(0.0, spread_px**2 - PIXEL_SPREAD_PX**2))
+    return math.sqrt(max(0.0, edge_sigma_px**2 - PIXEL_BOX_SIGMA_PX**2))
 
 
 def mask_iou(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"]) -> float:
@@ -152,13 +156,17 @@ def frame_scores(
         for images of 63 px and more.
 
     Raises:
-        ValueError: see `unscorable`.
+        ValueError: see `reason_not_scorable`.
     """
-    render, target, body = premultiplied_on_white(rgba), on_white(image, mask), body_pixels(mask)
-    box = body_box(body)
+    render, target, body = (
+        composite_premultiplied_on_white(rgba),
+        composite_on_white(image, mask),
+        foreground_mask(mask),
+    )
+    box = foreground_bounding_box(body)
     flip = flip_map(render, target)
     perceptual: dict[str, float] = {}
-    if lpips_weights is not None and min(mask.shape) >= SMALLEST_SIDE_PX:
+    if lpips_weights is not None and min(mask.shape) >= MIN_SIDE_PX:
         perceptual["lpips_full"] = lpips(render, target, lpips_weights)
     return {
         "psnr_full": psnr_db(render, target),
@@ -188,4 +196,4 @@ def _window_mean(values: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h2 w2
     offsets = np.arange(-SSIM_RADIUS_PX, SSIM_RADIUS_PX + 1)
     window = np.exp(-0.5 * (offsets / SSIM_SIGMA_PX) ** 2)
     window /= window.sum()
-    return cv2.sepFilter2D(values, -1, window, window)[_INSIDE, _INSIDE]
+    return cv2.sepFilter2D(values, -1, window, window)[_VALID_REGION, _VALID_REGION]

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-SMALLEST_SIDE_PX = 63
+MIN_SIDE_PX = 63
 """Below this nothing is left after AlexNet's third shrinking."""
 
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
@@ -33,8 +33,8 @@ def lpips(
     Raises:
         ValueError: a side is shorter than 63 px.
     """
-    if min(image.shape[:2]) < SMALLEST_SIDE_PX:
-        raise ValueError(f"an image of {image.shape[1]} x {image.shape[0]} px is smaller than {SMALLEST_SIDE_PX} px")
+    if min(image.shape[:2]) < MIN_SIDE_PX:
+        raise ValueError(f"an image of {image.shape[1]} x {image.shape[0]} px is smaller than {MIN_SIDE_PX} px")
     total = 0.0
     for layer, (a, b) in enumerate(zip(_features(render, weights), _features(image, weights), strict=True)):
         channel_weights = weights[f"lin{layer}.model.1.weight"].view(-1, 1, 1)
@@ -47,8 +47,8 @@ def _features(picture: UInt8[np.ndarray, "h w 3"], weights: Mapping[str, Tensor]
     shift, scale = (torch.tensor(values).view(3, 1, 1) for values in (_SHIFT, _SCALE))
     values = (torch.from_numpy(picture).permute(2, 0, 1).float() / 127.5 - 1.0 - shift) / scale
     layers = []
-    for name, stride, padding, after_maximum in _CONVOLUTIONS:
-        if after_maximum:
+    for name, stride, padding, pool_first in _CONVOLUTIONS:
+        if pool_first:
             values = torch.nn.functional.max_pool2d(values, 3, 2)
         kernel, bias = weights[f"features.{name}.weight"], weights[f"features.{name}.bias"]
         values = torch.nn.functional.conv2d(values[None], kernel, bias, stride, padding)[0].relu()

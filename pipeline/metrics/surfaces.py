@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.geometry.mesh import Mesh
-from pipeline.geometry.surface import closest_on_mesh
+from pipeline.geometry.surface import closest_points_on_mesh
 
 
 def sample_surface(mesh: Mesh, count: int, seed: int = 0) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
@@ -35,8 +35,8 @@ def surface_scores(
         precision, recall, f_score: shares within the threshold, and their harmonic mean, in [0, 1].
         normal_angle_deg: mean angle between the normals at corresponding points, both ways.
     """
-    forward_m, forward_deg = _one_way(result, truth, count, seed)
-    backward_m, backward_deg = _one_way(truth, result, count, seed + 1)
+    forward_m, forward_deg = _one_sided_distances(result, truth, count, seed)
+    backward_m, backward_deg = _one_sided_distances(truth, result, count, seed + 1)
     precision, recall = float(np.mean(forward_m <= threshold_m)), float(np.mean(backward_m <= threshold_m))
     return {
         "result_to_truth_mm": 1000.0 * float(forward_m.mean()),
@@ -50,16 +50,16 @@ def surface_scores(
     }
 
 
-def joint_error_m(joints_m: Float[np.ndarray, "*n 3"], truth_m: Float[np.ndarray, "*n 3"]) -> float:
+def mpjpe_m(joints_m: Float[np.ndarray, "*n 3"], truth_m: Float[np.ndarray, "*n 3"]) -> float:
     """Mean distance of corresponding joints, without any alignment (MPJPE)."""
     return float(np.linalg.norm(joints_m - truth_m, axis=-1).mean())
 
 
-def _one_way(
+def _one_sided_distances(
     source: Mesh, target: Mesh, count: int, seed: int
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """Distances (m) and normal angles (degrees) of points on `source` to their nearest place on `target`."""
     points, source_faces = sample_surface(source, count, seed)
-    distances_m, target_faces, _ = closest_on_mesh(points, target)
+    distances_m, target_faces, _ = closest_points_on_mesh(points, target)
     cosines = np.sum(source.face_normals()[source_faces] * target.face_normals()[target_faces], axis=1)
     return distances_m, np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))

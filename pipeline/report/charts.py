@@ -19,10 +19,10 @@ def bar_chart(rows: Sequence[tuple[str, float]], unit: str) -> str:
     if any(not math.isfinite(value) or value < 0.0 for _, value in rows):
         raise ValueError(f"bars need finite values of zero and more: {list(rows)}")
     longest = max((value for _, value in rows), default=0.0) or 1.0
-    room = WIDTH - _LABEL - _VALUE
+    plot_width = WIDTH - _LABEL - _VALUE
     parts = []
     for row, (label, value) in enumerate(rows):
-        y, length = row * _ROW, max(room * value / longest, 1.5)
+        y, length = row * _ROW, max(plot_width * value / longest, 1.5)
         parts.append(
             f'<text class="tick" x="{_LABEL - 10}" y="{y + 20}" text-anchor="end">{escape(label)}</text>'
             f'<rect class="bar" x="{_LABEL}" y="{y + 5}" width="{length:.1f}" height="{_ROW - 10}" rx="4"/>'
@@ -43,22 +43,22 @@ def line_chart(series: Mapping[str, Sequence[tuple[float, float]]], x_label: str
     x_ticks = _ticks(min(x for x, _ in points), max(x for x, _ in points))
     y_ticks = _ticks(min(y for _, y in points), max(y for _, y in points))
 
-    def place(x: float, y: float) -> tuple[float, float]:
+    def to_svg_coordinates(x: float, y: float) -> tuple[float, float]:
         across = (x - x_ticks[0]) / (x_ticks[-1] - x_ticks[0])
         up = (y - y_ticks[0]) / (y_ticks[-1] - y_ticks[0])
         return _LEFT + across * (WIDTH - _LEFT - _RIGHT), height - _BOTTOM - up * (height - _TOP - _BOTTOM)
 
     parts = []
     for tick in y_ticks:
-        y = place(x_ticks[0], tick)[1]
+        y = to_svg_coordinates(x_ticks[0], tick)[1]
         parts.append(f'<line class="grid" x1="{_LEFT}" x2="{WIDTH - _RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')
         parts.append(f'<text class="tick" x="{_LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{_short(tick)}</text>')
     for tick in x_ticks:
-        x = place(tick, y_ticks[0])[0]
+        x = to_svg_coordinates(tick, y_ticks[0])[0]
         parts.append(f'<text class="tick" x="{x:.1f}" y="{height - 20}" text-anchor="middle">{_short(tick)}</text>')
     parts.append(f'<text class="tick" x="{WIDTH - _RIGHT}" y="{height - 3}" text-anchor="end">{escape(x_label)}</text>')
     for number, (name, line) in enumerate(series.items()):
-        dots = [place(x, y) for x, y in line if math.isfinite(y)]
+        dots = [to_svg_coordinates(x, y) for x, y in line if math.isfinite(y)]
         path = " ".join(f"{x:.1f},{y:.1f}" for x, y in dots)
         circles = "".join(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3"/>' for x, y in dots)
         title = f"<title>{escape(name)}, {escape(y_label)}</title>"

@@ -14,7 +14,7 @@ JPEG_QUALITY = 88
 _GLB_MAGIC, _JSON_CHUNK, _BIN_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
 
 
-def webp_uri(pixels: UInt8[np.ndarray, "h w c"]) -> str:
+def webp_data_uri(pixels: UInt8[np.ndarray, "h w c"]) -> str:
     """A `data:` URI of an RGB image, or of an RGBA image with straight alpha, as WebP."""
     order = cv2.COLOR_RGBA2BGRA if pixels.shape[2] == 4 else cv2.COLOR_RGB2BGR
     encoded, data = cv2.imencode(".webp", cv2.cvtColor(pixels, order), (cv2.IMWRITE_WEBP_QUALITY, WEBP_QUALITY))
@@ -23,7 +23,7 @@ def webp_uri(pixels: UInt8[np.ndarray, "h w c"]) -> str:
     return f"data:image/webp;base64,{base64.b64encode(data.tobytes()).decode()}"
 
 
-def split_glb(data: bytes) -> tuple[dict[str, Any], bytes]:
+def unpack_glb(data: bytes) -> tuple[dict[str, Any], bytes]:
     """The JSON document and the binary chunk of a GLB (glTF 2.0, section 4.4); ValueError when it is none."""
     if len(data) < 20 or struct.unpack_from("<II", data) != (_GLB_MAGIC, 2):
         raise ValueError("no binary glTF 2.0")
@@ -40,8 +40,8 @@ def split_glb(data: bytes) -> tuple[dict[str, Any], bytes]:
     return document, data[rest + 8 : rest + 8 + binary_length]
 
 
-def join_glb(document: dict[str, Any], binary: bytes) -> bytes:
-    """The inverse of `split_glb`; chunks are padded to four bytes."""
+def pack_glb(document: dict[str, Any], binary: bytes) -> bytes:
+    """The inverse of `unpack_glb`; chunks are padded to four bytes."""
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     binary += b"\0" * (-len(binary) % 4)
@@ -57,43 +57,43 @@ def join_glb(document: dict[str, Any], binary: bytes) -> bytes:
     )
 
 
-def light_glb(data: bytes, max_texture_px: int = 2048) -> bytes:
+def compress_glb_textures(data: bytes, max_texture_px: int = 2048) -> bytes:
     """The same model with its opaque textures as JPEG of at most `max_texture_px` a side.
 
     For showing only: geometry, skin and animation stay bit for bit; textures with alpha stay PNG. A texture is left
     alone where JPEG would not be smaller.
     """
-    document, binary = split_glb(data)
+    document, binary = unpack_glb(data)
     replaced = {}
     for image in document.get("images", []):
         view = document["bufferViews"][image["bufferView"]]
-        original = _view_bytes(view, binary)
-        smaller = _as_jpeg(original, max_texture_px)
+        original = _buffer_view_bytes(view, binary)
+        smaller = _encode_jpeg(original, max_texture_px)
         if smaller is not None and len(smaller) < len(original):
             replaced[image["bufferView"]] = smaller
             image["mimeType"] = "image/jpeg"
     packed = bytearray()
     for number, view in enumerate(document.get("bufferViews", [])):
-        content = replaced.get(number, _view_bytes(view, binary))
+        content = replaced.get(number, _buffer_view_bytes(view, binary))
         packed.extend(b"\0" * (-len(packed) % 4))
         view.update(byteOffset=len(packed), byteLength=len(content))
         packed.extend(content)
     if document.get("buffers"):
         document["buffers"][0]["byteLength"] = len(packed)
-    return join_glb(document, bytes(packed))
+    return pack_glb(document, bytes(packed))
 
 
-def _view_bytes(view: dict[str, Any], binary: bytes) -> bytes:
+def _buffer_view_bytes(view: dict[str, Any], binary: bytes) -> bytes:
     start = view.get("byteOffset", 0)
     return binary[start : start + view["byteLength"]]
 
 
-def _as_jpeg(encoded: bytes, max_texture_px: int) -> bytes | None:
+def _encode_jpeg(encoded: bytes, max_texture_px: int) -> bytes | None:
     """The image as JPEG; None when it has an alpha channel, which JPEG cannot hold."""
     pixels = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None or (pixels.ndim == 3 and pixels.shape[2] == 4):
         return None
-    shrink = max_texture_px / max(pixels.shape[:2])
-    if shrink < 1.0:
-        pixels = cv2.resize(pixels, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    scale = max_texture_px / max(pixels.shape[:2])
+    if scale < 1.0:
+        pixels = cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     return cv2.imencode(".jpg", pixels, (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))[1].tobytes()

@@ -6,22 +6,25 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-ALEXNET = "alexnet-owt-7be5be79.pth"
+ALEXNET_FILE = "alexnet-owt-7be5be79.pth"
 """The file that torchvision keeps in torch's hub folder."""
 
-LAYERS = Path("lpips/weights/v0.1/alex.pth")
+LPIPS_LAYERS_FILE = Path("lpips/weights/v0.1/alex.pth")
 """The file inside the package lpips."""
 
-ABSENT = (
-    f"absent: {ALEXNET} is not in torch's hub folder, or the package lpips with {LAYERS} is not installed; "
+WEIGHTS_MISSING_NOTE = (
+    f"absent: {ALEXNET_FILE} is not in torch's hub folder, or the package lpips with {LPIPS_LAYERS_FILE} "
+    "is not installed; "
     "nothing is downloaded"
 )
 
 
 def find_lpips_weights() -> dict[str, Tensor] | None:
     """AlexNet's features and the five layers' channel weights by name, or None when one of the two files is absent."""
-    backbone = Path(torch.hub.get_dir()) / "checkpoints" / ALEXNET
-    layers = next((Path(folder) / LAYERS for folder in sys.path if (Path(folder) / LAYERS).is_file()), None)
+    backbone = Path(torch.hub.get_dir()) / "checkpoints" / ALEXNET_FILE
+    layers = next(
+        (Path(folder) / LPIPS_LAYERS_FILE for folder in sys.path if (Path(folder) / LPIPS_LAYERS_FILE).is_file()), None
+    )
     if layers is None or not backbone.is_file():
         return None
     found: dict[str, Tensor] = {}

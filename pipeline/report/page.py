@@ -14,18 +14,18 @@ import numpy as np
 from jaxtyping import UInt8
 
 from pipeline.report.charts import bar_chart, legend, line_chart
-from pipeline.report.embed import light_glb, webp_uri
-from pipeline.report.report_json import POSE_FITTED_ENDING
+from pipeline.report.embed import compress_glb_textures, webp_data_uri
+from pipeline.report.report_json import POSE_FITTED_SUFFIX
 
-ASSETS = Path(__file__).parent / "assets"
-ERROR_RANGE = 64
+ASSETS_DIR = Path(__file__).parent / "assets"
+ERROR_MAP_MAX_LEVELS = 64
 """Mean absolute difference, in steps of 255, that the error maps show in their brightest colour."""
 
-MAX_PICTURE_PX = 1600
+MAX_IMAGE_PX = 1600
 
 
 @dataclass(frozen=True)
-class FramePictures:
+class FrameImages:
     """One held-out frame on white, cropped to the person, and its two renders; all of one size."""
 
     index: int
@@ -45,7 +45,7 @@ class PageContent:
 
     title: str
     report: Mapping[str, Any]
-    frames: Sequence[FramePictures]
+    frames: Sequence[FrameImages]
     turntable: Sequence[tuple[str, Sequence[UInt8[np.ndarray, "_ _ 4"]]]]
     pictures: Sequence[tuple[str, UInt8[np.ndarray, "_ _ 3"]]]
     glb: bytes
@@ -54,34 +54,34 @@ class PageContent:
 def render_page(content: PageContent) -> str:
     """The whole HTML text."""
     report = content.report
-    return Template(asset("report.html")).substitute(
+    return Template(read_asset("report.html")).substitute(
         title=escape(content.title),
-        lead=escape(_lead(report)),
-        style=asset("report.css"),
-        tiles="".join(tile(*texts) for texts in _headline(report)),
+        lead=escape(_summary_text(report)),
+        style=read_asset("report.css"),
+        tiles="".join(metric_tile(*texts) for texts in _headline_metrics(report)),
         warnings=_warnings(report["warnings"]),
         turntable="".join(_turntable_row(title, views) for title, views in content.turntable),
         protocol=escape(f"{report['heldout']['protocol']} LPIPS: {report['heldout']['lpips']}.") + _scale_note(),
         frames="".join(_frame_row(frame, report) for frame in content.frames),
         error_charts=_error_charts(report["heldout"]["frames"]),
         cost_charts=_cost_charts(report),
-        pictures="".join(_picture(caption, pixels) for caption, pixels in content.pictures),
+        pictures="".join(_image_figure(caption, pixels) for caption, pixels in content.pictures),
         tables=_tables(report),
         footer=escape(_footer(report["environment"])),
-        glb=base64.b64encode(light_glb(content.glb)).decode(),
-        viewer_script=asset("viewer.min.js"),
-        page_script=asset("report.js"),
+        glb=base64.b64encode(compress_glb_textures(content.glb)).decode(),
+        viewer_script=read_asset("viewer.min.js"),
+        page_script=read_asset("report.js"),
     )
 
 
 def error_map(a: UInt8[np.ndarray, "h w 3"], b: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     """Mean absolute difference of the channels in the magma colours: black is equal, bright is ERROR_RANGE and more."""
     difference = np.abs(a.astype(np.float32) - b).mean(axis=2)
-    steps = np.clip(difference * (255.0 / ERROR_RANGE), 0, 255).astype(np.uint8)
+    steps = np.clip(difference * (255.0 / ERROR_MAP_MAX_LEVELS), 0, 255).astype(np.uint8)
     return cv2.cvtColor(cv2.applyColorMap(steps, cv2.COLORMAP_MAGMA), cv2.COLOR_BGR2RGB)
 
 
-def figure_text(value: object) -> str:
+def format_metric(value: object) -> str:
     """A figure of the report for people: at most four significant digits, yes or no for truth values."""
     if isinstance(value, bool):
         return "yes" if value else "no"
@@ -92,7 +92,7 @@ def figure_text(value: object) -> str:
     return f"{value:,}" if isinstance(value, int) else str(value)
 
 
-def _lead(report: Mapping[str, Any]) -> str:
+def _summary_text(report: Mapping[str, Any]) -> str:
     seconds = report["seconds"]["total"]
     spent = f"{seconds / 60:.1f} minutes" if seconds >= 90 else f"{seconds:.0f} seconds"
     return (
@@ -101,17 +101,17 @@ def _lead(report: Mapping[str, Any]) -> str:
     )
 
 
-def _headline(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+def _headline_metrics(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """(value, unit, label) of each tile."""
     field, mesh, health = report["heldout"]["field"], report["heldout"]["mesh"], report["mesh"]
     whole = "watertight, manifold" if health["watertight"] and health["manifold"] else "not watertight or not manifold"
     return [
-        (_decibel(mesh["psnr_full"]), "dB", "mesh, full held-out image"),
-        (_decibel(mesh["psnr_body"]), "dB", "mesh, body pixels alone"),
-        (_decibel(field["psnr_full"]), "dB", "field, full held-out image"),
-        (_decibel(field["psnr_body"]), "dB", "field, body pixels alone"),
-        (figure_text(mesh["ssim_full"]), "SSIM", "mesh, full held-out image"),
-        (figure_text(report["body"]["silhouette_iou"]), "IoU", "body against the masks"),
+        (_format_db(mesh["psnr_full"]), "dB", "mesh, full held-out image"),
+        (_format_db(mesh["psnr_body"]), "dB", "mesh, body pixels alone"),
+        (_format_db(field["psnr_full"]), "dB", "field, full held-out image"),
+        (_format_db(field["psnr_body"]), "dB", "field, body pixels alone"),
+        (format_metric(mesh["ssim_full"]), "SSIM", "mesh, full held-out image"),
+        (format_metric(report["body"]["silhouette_iou"]), "IoU", "body against the masks"),
         (f"{health['faces']:,}", "faces", whole),
         (f"{report['seconds']['total']:.0f}", "s", "all stages"),
         (f"{max(report['peak_rss_mib'].values()):,.0f}", "MiB", "peak memory"),
@@ -119,11 +119,11 @@ def _headline(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     ]
 
 
-def _decibel(value: float | None) -> str:
+def _format_db(value: float | None) -> str:
     return "–" if value is None else f"{value:.1f}"
 
 
-def tile(value: str, unit: str, label: str) -> str:
+def metric_tile(value: str, unit: str, label: str) -> str:
     """One large figure."""
     return f'<div class="tile"><b>{escape(value)} <small>{escape(unit)}</small></b><span>{escape(label)}</span></div>'
 
@@ -146,10 +146,10 @@ def _turntable_row(title: str, views: Sequence[UInt8[np.ndarray, "_ _ 4"]]) -> s
 
 
 def _scale_note() -> str:
-    return f' Error maps: <i class="scale"></i> 0 to {ERROR_RANGE} of 255 and more, mean over channels.'
+    return f' Error maps: <i class="scale"></i> 0 to {ERROR_MAP_MAX_LEVELS} of 255 and more, mean over channels.'
 
 
-def _frame_row(frame: FramePictures, report: Mapping[str, Any]) -> str:
+def _frame_row(frame: FrameImages, report: Mapping[str, Any]) -> str:
     scores = next(row for row in report["heldout"]["frames"] if row["index"] == frame.index)
     pictures = [
         ("video", "video", frame.video),
@@ -164,7 +164,8 @@ def _frame_row(frame: FramePictures, report: Mapping[str, Any]) -> str:
         for kind, caption, pixels in pictures
     )
     values = "".join(
-        f"<span>{name} {_decibel(scores[name]['psnr_full'])} dB, body {_decibel(scores[name]['psnr_body'])} dB</span>"
+        f"<span>{name} {_format_db(scores[name]['psnr_full'])} dB, body "
+        f"{_format_db(scores[name]['psnr_body'])} dB</span>"
         for name in ("field", "mesh")
     )
     return f'<div class="card frame" data-frame="{frame.index}"><h3>Frame {frame.index} {values}</h3>{figures}</div>'
@@ -190,10 +191,10 @@ def _cost_charts(report: Mapping[str, Any]) -> str:
     return "".join(charts)
 
 
-def _picture(caption: str, pixels: UInt8[np.ndarray, "h w 3"]) -> str:
-    shrink = MAX_PICTURE_PX / max(pixels.shape[:2])
-    if shrink < 1.0:
-        pixels = cv2.resize(pixels, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+def _image_figure(caption: str, pixels: UInt8[np.ndarray, "h w 3"]) -> str:
+    scale = MAX_IMAGE_PX / max(pixels.shape[:2])
+    if scale < 1.0:
+        pixels = cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     return f'<figure class="card">{image_tag(pixels, caption)}<figcaption>{escape(caption)}</figcaption></figure>'
 
 
@@ -201,27 +202,27 @@ def image_tag(pixels: UInt8[np.ndarray, "h w c"], alt: str, kind: str | None = N
     """A picture inside the page."""
     mark = f' data-kind="{kind}"' if kind else ""
     height, width = pixels.shape[:2]
-    return f'<img src="{webp_uri(pixels)}" alt="{escape(alt)}" width="{width}" height="{height}"{mark}>'
+    return f'<img src="{webp_data_uri(pixels)}" alt="{escape(alt)}" width="{width}" height="{height}"{mark}>'
 
 
 def _tables(report: Mapping[str, Any]) -> str:
     renders = {name: scores for name, scores in report["heldout"].items() if isinstance(scores, Mapping)}
-    apart = {name: scores for name, scores in renders.items() if name.endswith(POSE_FITTED_ENDING)}
-    held_out = {name: scores for name, scores in renders.items() if name not in apart}
-    tables = [table("Held-out frames", held_out)]
-    tables += [table("Poses fitted to these frames: not held out", apart)] if apart else []
-    tables += [table(name.capitalize(), {"": report[name]}) for name in ("mesh", "body", "export", "masks")]
+    pose_fitted = {name: scores for name, scores in renders.items() if name.endswith(POSE_FITTED_SUFFIX)}
+    held_out = {name: scores for name, scores in renders.items() if name not in pose_fitted}
+    tables = [metric_table("Held-out frames", held_out)]
+    tables += [metric_table("Poses fitted to these frames: not held out", pose_fitted)] if pose_fitted else []
+    tables += [metric_table(name.capitalize(), {"": report[name]}) for name in ("mesh", "body", "export", "masks")]
     return "".join(tables)
 
 
-def table(title: str, columns: Mapping[str, Mapping[str, object]]) -> str:
+def metric_table(title: str, columns: Mapping[str, Mapping[str, object]]) -> str:
     """A card with a row for each figure of the first column, and a column for each of `columns`; one nameless column
     has no heading."""
     names = next(iter(columns.values()))
     head = "".join(f"<td>{escape(name.replace('_', ' '))}</td>" for name in columns)
     lines = [f"<tr><th></th>{head}</tr>"] if any(columns) else []
     for name in names:
-        cells = "".join(f"<td>{escape(figure_text(column.get(name)))}</td>" for column in columns.values())
+        cells = "".join(f"<td>{escape(format_metric(column.get(name)))}</td>" for column in columns.values())
         lines.append(f"<tr><th>{escape(name)}</th>{cells}</tr>")
     return f'<div class="card"><h3>{escape(title)}</h3><table>{"".join(lines)}</table></div>'
 
@@ -234,6 +235,6 @@ def _footer(environment: Mapping[str, Any]) -> str:
     return " · ".join(parts)
 
 
-def asset(name: str) -> str:
+def read_asset(name: str) -> str:
     """Text of a template, style or script."""
-    return (ASSETS / name).read_text(encoding="utf-8")
+    return (ASSETS_DIR / name).read_text(encoding="utf-8")

@@ -8,13 +8,13 @@ from jaxtyping import UInt8
 GAP_PX = 8
 
 
-def on_white_8bit(picture: UInt8[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w 3"]:
+def composite_on_white_uint8(image: UInt8[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w 3"]:
     """A picture with straight alpha laid over white."""
-    alpha = picture[..., 3:].astype(np.float32) / 255.0
-    return np.rint(picture[..., :3] * alpha + 255.0 * (1.0 - alpha)).astype(np.uint8)
+    alpha = image[..., 3:].astype(np.float32) / 255.0
+    return np.rint(image[..., :3] * alpha + 255.0 * (1.0 - alpha)).astype(np.uint8)
 
 
-def picture_sheet(rows: Sequence[Sequence[UInt8[np.ndarray, "_ _ 3"]]]) -> UInt8[np.ndarray, "h w 3"]:
+def image_grid(rows: Sequence[Sequence[UInt8[np.ndarray, "_ _ 3"]]]) -> UInt8[np.ndarray, "h w 3"]:
     """Rows of pictures of any size on white: each row as high as its highest picture, all pictures at the top of it.
 
     Raises ValueError when there is no picture.
@@ -22,14 +22,14 @@ def picture_sheet(rows: Sequence[Sequence[UInt8[np.ndarray, "_ _ 3"]]]) -> UInt8
     if not any(rows):
         raise ValueError("a sheet needs at least one picture")
     filled = [row for row in rows if row]
-    width = max(sum(picture.shape[1] + GAP_PX for picture in row) for row in filled) + GAP_PX
-    height = sum(max(picture.shape[0] for picture in row) + GAP_PX for row in filled) + GAP_PX
+    width = max(sum(image.shape[1] + GAP_PX for image in row) for row in filled) + GAP_PX
+    height = sum(max(image.shape[0] for image in row) + GAP_PX for row in filled) + GAP_PX
     sheet = np.full((height, width, 3), 255, dtype=np.uint8)
     top = GAP_PX
     for row in filled:
         left = GAP_PX
-        for picture in row:
-            sheet[top : top + picture.shape[0], left : left + picture.shape[1]] = picture
-            left += picture.shape[1] + GAP_PX
-        top += max(picture.shape[0] for picture in row) + GAP_PX
+        for image in row:
+            sheet[top : top + image.shape[0], left : left + image.shape[1]] = image
+            left += image.shape[1] + GAP_PX
+        top += max(image.shape[0] for image in row) + GAP_PX
     return sheet

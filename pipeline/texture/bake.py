@@ -18,18 +18,18 @@ from torch import Tensor
 
 from pipeline.core.config import Config
 from pipeline.core.progress import track
-from pipeline.geometry.atlas import Atlas, Texels, fill_gaps
+from pipeline.geometry.atlas import Atlas, Texels, fill_unknown_texels
 from pipeline.geometry.camera import project
 from pipeline.geometry.texture_rendering import render_textured
-from pipeline.kernels.texel_projection import observe_texels
-from pipeline.metrics.images import body_pixels, on_white, premultiplied_on_white, psnr_db
-from pipeline.texture.views import View, align, footprint_m, pixel_trust, seen_depth
+from pipeline.kernels.texel_projection import project_texels
+from pipeline.metrics.images import composite_on_white, composite_premultiplied_on_white, foreground_mask, psnr_db
+from pipeline.texture.views import BakeView, align_to_render, pixel_confidence, pixel_footprint_m, render_depth
 
-ENOUGH_SHARE = 0.1
+HALF_CONFIDENCE_WEIGHT_RATIO = 0.1
 """A texel with this share of the median sum of weights is half its own, half filled: of the texels below it on a real
 video a tenth hold the backdrop's colour, of the well seen ones a thousandth."""
 
-Fill = Callable[[Float[np.ndarray, "t 3"], Float[np.ndarray, "t"]], Float[np.ndarray, "t 3"]]
+InpaintFunction = Callable[[Float[np.ndarray, "t 3"], Float[np.ndarray, "t"]], Float[np.ndarray, "t 3"]]
 
 
 class BakeConfig(Config):
@@ -38,24 +38,26 @@ class BakeConfig(Config):
     cosine_power: float = Field(
         2.0, ge=0.0, le=16.0, description="weight of a view: the cosine between normal and view to this power"
     )
-    edge_m: float = Field(
+    silhouette_falloff_m: float = Field(
         0.012, gt=0.0, le=0.2, description="trust grows from 0 to 1 over this distance from a silhouette, m"
     )
-    tolerance_m: float = Field(0.01, gt=0.0, le=0.2, description="depth difference up to which a texel is visible, m")
+    depth_tolerance_m: float = Field(
+        0.01, gt=0.0, le=0.2, description="depth difference up to which a texel is visible, m"
+    )
     rounds: int = Field(3, ge=0, le=20, description="rounds of aligning frames and adding their residuals")
-    flow_smoothing_m: float = Field(
+    flow_smoothing_sigma_m: float = Field(
         0.01, ge=0.0, le=0.2, description="standard deviation of the blur of the alignment, m"
     )
-    largest_flow_m: float = Field(
+    max_flow_m: float = Field(
         0.03, ge=0.0, le=0.5, description="frames are moved by at most this much, m; 0 aligns nothing"
     )
-    outlier: float = Field(
+    geman_mcclure_scale: float = Field(
         0.3, gt=0.0, le=2.0, description="residual (sRGB, 0 to 1) at which a pixel counts a quarter of a right one"
     )
 
 
 @dataclass(frozen=True)
-class Surface:
+class TexturedSurface:
     """A mesh with its atlas: what the texture is painted on."""
 
     faces: Int[Tensor, "f 3"]
@@ -64,23 +66,23 @@ class Surface:
     texels: Texels
 
     @staticmethod
-    def of(faces: Int[np.ndarray, "f 3"], atlas: Atlas, texels: Texels) -> "Surface":
+    def from_arrays(faces: Int[np.ndarray, "f 3"], atlas: Atlas, texels: Texels) -> "TexturedSurface":
         """Torch copies of the arrays."""
         tensors = [torch.from_numpy(array) for array in (faces, atlas.faces_uv, atlas.uv)]
-        return Surface(tensors[0], tensors[1], tensors[2], texels)
+        return TexturedSurface(tensors[0], tensors[1], tensors[2], texels)
 
 
 @dataclass
-class Mean:
+class WeightedMean:
     """Weighted mean of colours over frames, summed frame by frame."""
 
     total: Float[Tensor, "t c"]
     weight: Float[Tensor, "t"]
 
     @staticmethod
-    def empty(count: int, channels: int = 3) -> "Mean":
+    def empty(count: int, channels: int = 3) -> "WeightedMean":
         """Nothing seen yet."""
-        return Mean(torch.zeros(count, channels), torch.zeros(count))
+        return WeightedMean(torch.zeros(count, channels), torch.zeros(count))
 
     def add(self, values: Float[Tensor, "t c"], weight: Float[Tensor, "t"]) -> None:
         """One frame's values."""
@@ -93,58 +95,64 @@ class Mean:
 
 
 def observe(
-    view: View,
-    surface: Surface,
+    view: BakeView,
+    surface: TexturedSurface,
     picture: Float[np.ndarray, "h w c"],
-    trust: Float[np.ndarray, "h w"],
+    pixel_weights: Float[np.ndarray, "h w"],
     depth_m: Float[Tensor, "h w"],
     config: BakeConfig,
 ) -> tuple[Float[Tensor, "t c"], Float[Tensor, "t"]]:
     """What a picture over a view says about every texel, and with which weight."""
     vertices_px, vertex_depth_m = project(view.vertices_world, view.camera)
     texels = surface.texels
-    values, seen = observe_texels(
+    values, seen = project_texels(
         vertices_px,
         vertex_depth_m,
-        view.cosine,
+        view.view_cosine,
         surface.faces,
         torch.from_numpy(texels.face),
         torch.from_numpy(texels.barycentric),
         torch.from_numpy(np.ascontiguousarray(picture)),
         depth_m,
-        torch.from_numpy(trust),
-        config.tolerance_m,
+        torch.from_numpy(pixel_weights),
+        config.depth_tolerance_m,
     )
     return values, seen[:, 0] * seen[:, 1] ** config.cosine_power * view.weight
 
 
-def first_texture(views: Iterable[View], surface: Surface, config: BakeConfig) -> Mean:
+def average_views(views: Iterable[BakeView], surface: TexturedSurface, config: BakeConfig) -> WeightedMean:
     """Weighted mean of what all views show, unaligned."""
-    mean = Mean.empty(len(surface.texels.face))
+    mean = WeightedMean.empty(len(surface.texels.face))
     for view in views:
-        depth_m = seen_depth(view, surface.faces)
-        trust = pixel_trust(view.mask, depth_m.numpy(), config.edge_m / footprint_m(view))
-        mean.add(*observe(view, surface, view.image.astype(np.float32) / 255.0, trust, depth_m, config))
+        depth_m = render_depth(view, surface.faces)
+        pixel_weights = pixel_confidence(
+            view.mask, depth_m.numpy(), config.silhouette_falloff_m / pixel_footprint_m(view)
+        )
+        mean.add(*observe(view, surface, view.image.astype(np.float32) / 255.0, pixel_weights, depth_m, config))
     return mean
 
 
-def residual_round(
-    texture: Float[np.ndarray, "s s 3"], views: Iterable[View], surface: Surface, config: BakeConfig
-) -> Mean:
+def average_residuals(
+    texture: Float[np.ndarray, "s s 3"], views: Iterable[BakeView], surface: TexturedSurface, config: BakeConfig
+) -> WeightedMean:
     """Weighted mean of what the aligned views show more than the texture does."""
-    mean = Mean.empty(len(surface.texels.face))
+    mean = WeightedMean.empty(len(surface.texels.face))
     for view in views:
-        rendered, pixel_m = render_view(texture, view, surface), footprint_m(view)
-        moved, moved_mask = align(view, rendered, config.flow_smoothing_m / pixel_m, config.largest_flow_m / pixel_m)
-        depth_m = seen_depth(view, surface.faces)
-        trust = pixel_trust(moved_mask, depth_m.numpy(), config.edge_m / pixel_m)
-        residual = moved - rendered[..., :3] / np.maximum(rendered[..., 3:], 1e-3)
-        trust /= (1.0 + (np.linalg.norm(residual, axis=2) / config.outlier) ** 2) ** 2
-        mean.add(*observe(view, surface, residual, trust, depth_m, config))
+        rendered, pixel_m = render_textured_view(texture, view, surface), pixel_footprint_m(view)
+        warped, warped_mask = align_to_render(
+            view, rendered, config.flow_smoothing_sigma_m / pixel_m, config.max_flow_m / pixel_m
+        )
+        depth_m = render_depth(view, surface.faces)
+        pixel_weights = pixel_confidence(warped_mask, depth_m.numpy(), config.silhouette_falloff_m / pixel_m)
+        residual = warped - rendered[..., :3] / np.maximum(rendered[..., 3:], 1e-3)
+        pixel_weights /= (1.0 + (np.linalg.norm(residual, axis=2) / config.geman_mcclure_scale) ** 2) ** 2
+        mean.add(*observe(view, surface, residual, pixel_weights, depth_m, config))
     return mean
 
 
-def render_view(texture: Float[np.ndarray, "s s 3"], view: View, surface: Surface) -> Float[np.ndarray, "h w 4"]:
+def render_textured_view(
+    texture: Float[np.ndarray, "s s 3"], view: BakeView, surface: TexturedSurface
+) -> Float[np.ndarray, "h w 4"]:
     """The textured mesh in a view's pose: premultiplied colour and alpha."""
     return render_textured(
         view.vertices_world,
@@ -153,45 +161,51 @@ def render_view(texture: Float[np.ndarray, "s s 3"], view: View, surface: Surfac
         surface.uv,
         torch.from_numpy(texture),
         view.camera,
-        samples=2,
+        supersampling=2,
     ).numpy()
 
 
 def bake_diffuse(
-    views: Sequence[View], surface: Surface, fill: Fill, config: BakeConfig
+    views: Sequence[BakeView], surface: TexturedSurface, inpaint: InpaintFunction, config: BakeConfig
 ) -> tuple[Float[np.ndarray, "s s 3"], Float[np.ndarray, "t"]]:
     """The diffuse texture (sRGB, gutters filled), and how well every texel was seen, in [0, 1].
 
     fill: colours for all texels from those of the first mean and how well they were seen, for those that were not.
     """
-    first = first_texture(track(views, "texture: first mean"), surface, config)
-    enough = ENOUGH_SHARE * float(first.weight[first.weight > 0].median()) if bool(first.weight.any()) else 1.0
-    seen = confidence(first.weight, enough)
-    fallback = torch.from_numpy(fill(first.value().numpy(), seen.numpy()))
+    first = average_views(track(views, "texture: first mean"), surface, config)
+    half_confidence_weight = (
+        HALF_CONFIDENCE_WEIGHT_RATIO * float(first.weight[first.weight > 0].median())
+        if bool(first.weight.any())
+        else 1.0
+    )
+    seen = weight_confidence(first.weight, half_confidence_weight)
+    fallback = torch.from_numpy(inpaint(first.value().numpy(), seen.numpy()))
     colour = torch.lerp(fallback, first.value(), seen[:, None])
     for number in range(config.rounds):
-        texture = paint(colour, surface.texels)
+        texture = texels_to_texture(colour, surface.texels)
         label = f"texture: round {number + 1}/{config.rounds}"
-        change = residual_round(texture, track(views, label, total=len(views)), surface, config)
-        sure = confidence(change.weight, enough)[:, None]
-        colour = (colour + sure * change.value()).clamp(0.0, 1.0)
-    return paint(colour, surface.texels), seen.numpy()
+        mean_residual = average_residuals(texture, track(views, label, total=len(views)), surface, config)
+        residual_confidence = weight_confidence(mean_residual.weight, half_confidence_weight)[:, None]
+        colour = (colour + residual_confidence * mean_residual.value()).clamp(0.0, 1.0)
+    return texels_to_texture(colour, surface.texels), seen.numpy()
 
 
-def confidence(weight: Float[Tensor, "t"], enough: float) -> Float[Tensor, "t"]:
-    """How far a sum of weights is to be believed: 0 for none, 1/2 at `enough`, 1 for many."""
-    return weight**2 / (weight**2 + enough**2)
+def weight_confidence(weight: Float[Tensor, "t"], half_confidence_weight: float) -> Float[Tensor, "t"]:
+    """How far a sum of weights is to be believed: 0 for none, 1/2 at `half_confidence_weight`, 1 for many."""
+    return weight**2 / (weight**2 + half_confidence_weight**2)
 
 
-def paint(colour: Float[Tensor, "t c"], texels: Texels) -> Float[np.ndarray, "s s c"]:
+def texels_to_texture(colour: Float[Tensor, "t c"], texels: Texels) -> Float[np.ndarray, "s s c"]:
     """Texel colours (or other values) as a texture with filled gutters."""
-    return fill_gaps(texels.image(colour.numpy()), texels.covered())
+    return fill_unknown_texels(texels.image(colour.numpy()), texels.covered())
 
 
-def validation_psnr_db(texture: Float[np.ndarray, "s s 3"], views: Sequence[View], surface: Surface) -> float:
+def mean_foreground_psnr_db(
+    texture: Float[np.ndarray, "s s 3"], views: Sequence[BakeView], surface: TexturedSurface
+) -> float:
     """Mean over views of the PSNR on the person's pixels, both laid on white; nan without views."""
     values = []
     for view in views:
-        rendered = premultiplied_on_white(render_view(texture, view, surface))
-        values.append(psnr_db(rendered, on_white(view.image, view.mask), body_pixels(view.mask)))
+        rendered = composite_premultiplied_on_white(render_textured_view(texture, view, surface))
+        values.append(psnr_db(rendered, composite_on_white(view.image, view.mask), foreground_mask(view.mask)))
     return float(np.mean(values)) if values else float("nan")

@@ -9,11 +9,11 @@ from pipeline.geometry.atlas import Texels
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import laplacian
 
-STIFFNESS = 0.02
-ANCHOR = 1e-6
+SMOOTHNESS_WEIGHT = 0.02
+REGULARISATION_WEIGHT = 1e-6
 
 
-def vertex_means(
+def average_texels_per_vertex(
     texels: Texels,
     faces: Int[np.ndarray, "f 3"],
     count: int,
@@ -21,13 +21,15 @@ def vertex_means(
     weight: Float[np.ndarray, "t"],
 ) -> tuple[Float[np.ndarray, "v c"], Float[np.ndarray, "v"]]:
     """Weighted mean colour of the texels around each vertex, and their mean weight; 0 where no texel is."""
-    near = texels.barycentric.ravel()
+    corner_weight = texels.barycentric.ravel()
     vertex = faces[texels.face].ravel()
-    weighted = near * np.repeat(weight, 3)
+    weighted = corner_weight * np.repeat(weight, 3)
     total = np.bincount(vertex, weighted, count)
     summed = [np.bincount(vertex, weighted * np.repeat(column, 3), count) for column in colour.T]
     mean = np.stack(summed, axis=1) / np.maximum(total, 1e-12)[:, None]
-    return mean.astype(np.float32), (total / np.maximum(np.bincount(vertex, near, count), 1e-12)).astype(np.float32)
+    return mean.astype(np.float32), (total / np.maximum(np.bincount(vertex, corner_weight, count), 1e-12)).astype(
+        np.float32
+    )
 
 
 def spread(mesh: Mesh, colour: Float[np.ndarray, "v c"], weight: Float[np.ndarray, "v"]) -> Float[np.ndarray, "v c"]:
@@ -36,9 +38,9 @@ def spread(mesh: Mesh, colour: Float[np.ndarray, "v c"], weight: Float[np.ndarra
     Minimises sum w |x - c|^2 + STIFFNESS * sum over edges |x_i - x_j|^2: harmonic where nothing is seen. Pieces of the
     mesh that nobody sees at all get the mean colour.
     """
-    kept = weight.astype(np.float64)
-    mean = (kept @ colour) / max(kept.sum(), 1e-12)
+    data_weight = weight.astype(np.float64)
+    mean = (data_weight @ colour) / max(data_weight.sum(), 1e-12)
     degree = np.bincount(mesh.edges().ravel(), minlength=len(colour)).astype(np.float64)
     operator = diags_array(degree) @ laplacian(mesh)
-    matrix = csc_array(diags_array(kept + ANCHOR) + STIFFNESS * operator)
-    return splu(matrix).solve(kept[:, None] * colour + ANCHOR * mean).astype(np.float32)
+    matrix = csc_array(diags_array(data_weight + REGULARISATION_WEIGHT) + SMOOTHNESS_WEIGHT * operator)
+    return splu(matrix).solve(data_weight[:, None] * colour + REGULARISATION_WEIGHT * mean).astype(np.float32)

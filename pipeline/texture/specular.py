@@ -17,39 +17,39 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.geometry.atlas import Texels
-from pipeline.geometry.colour import linear_light
-from pipeline.texture.bake import BakeConfig, Surface, observe
-from pipeline.texture.views import View, footprint_m, pixel_trust, seen_depth, vertex_normals
+from pipeline.geometry.colour import srgb_to_linear
+from pipeline.texture.bake import BakeConfig, TexturedSurface, observe
+from pipeline.texture.views import BakeView, pixel_confidence, pixel_footprint_m, render_depth, vertex_normals
 
-ALTERNATIONS = 8
-RIDGE = 1e-3
-EDGE_CONTRAST = 0.05
+ALTERNATING_LEAST_SQUARES_ITERATIONS = 8
+RIDGE_WEIGHT = 1e-3
+ALBEDO_CONTRAST_SCALE = 0.05
 TINT_PENALTY = 4.0
 
 
 @dataclass(frozen=True)
-class Observations:
+class VertexObservations:
     """What frames show of vertices, a row an observation: vertex, colour, weight, normal and mirrored view (world)."""
 
     vertex: Int[np.ndarray, "k"]
     colour: Float[np.ndarray, "k 3"]
     weight: Float[np.ndarray, "k"]
     normal: Float[np.ndarray, "k 3"]
-    mirrored: Float[np.ndarray, "k 3"]
+    reflection_direction: Float[np.ndarray, "k 3"]
 
 
 @dataclass(frozen=True)
-class Specular:
+class SpecularFit:
     """amplitude: what a highlight adds to a vertex's colour, sRGB in [0, 1]; 0 everywhere when that explains nothing.
 
     gain: share of the error on unseen frames that the highlights explain beyond shading (negative: they mislead).
     """
 
     amplitude: Float[np.ndarray, "v"]
-    gain: float
+    partial_r2: float
 
 
-def corner_texels(faces: Int[np.ndarray, "f 3"], vertex_count: int) -> Texels:
+def texels_at_vertices(faces: Int[np.ndarray, "f 3"], vertex_count: int) -> Texels:
     """One "texel" a vertex, so that vertices can be observed as texels are; vertices without a face are left out."""
     flat = faces.reshape(-1)
     vertices, first = np.unique(flat, return_index=True)
@@ -58,24 +58,36 @@ def corner_texels(faces: Int[np.ndarray, "f 3"], vertex_count: int) -> Texels:
     return Texels(vertex_count, zeros, vertices.astype(np.int32), (first // 3).astype(np.int32), barycentric)
 
 
-def observe_vertices(views: Iterable[View], surface: Surface, config: BakeConfig) -> Observations:
-    """Colours of all vertices in all views where they can be seen. `surface.texels` must come from `corner_texels`."""
+def observe_vertices(views: Iterable[BakeView], surface: TexturedSurface, config: BakeConfig) -> VertexObservations:
+    """Colours of all vertices in all views where they can be seen. `surface.texels` must come from
+    `texels_at_vertices`.
+    """
     parts = []
     vertices = surface.texels.columns
     for view in views:
-        depth_m = seen_depth(view, surface.faces)
-        trust = pixel_trust(view.mask, depth_m.numpy(), config.edge_m / footprint_m(view))
-        colour, weight = observe(view, surface, view.image.astype(np.float32) / 255.0, trust, depth_m, config)
+        depth_m = render_depth(view, surface.faces)
+        pixel_weights = pixel_confidence(
+            view.mask, depth_m.numpy(), config.silhouette_falloff_m / pixel_footprint_m(view)
+        )
+        colour, weight = observe(view, surface, view.image.astype(np.float32) / 255.0, pixel_weights, depth_m, config)
         seen = (weight > 0).numpy()
         normal = vertex_normals(view.vertices_world, surface.faces).numpy()[vertices[seen]]
         to_camera = view.camera.centre_m() - view.vertices_world.numpy()[vertices[seen]]
         to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
-        mirrored = 2.0 * np.sum(normal * to_camera, axis=1, keepdims=True) * normal - to_camera
-        parts.append((vertices[seen], colour.numpy()[seen], weight.numpy()[seen], normal, mirrored.astype(np.float32)))
-    return Observations(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+        reflection_direction = 2.0 * np.sum(normal * to_camera, axis=1, keepdims=True) * normal - to_camera
+        parts.append(
+            (
+                vertices[seen],
+                colour.numpy()[seen],
+                weight.numpy()[seen],
+                normal,
+                reflection_direction.astype(np.float32),
+            )
+        )
+    return VertexObservations(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
-def harmonics(directions: Float[np.ndarray, "k 3"], degree: int) -> Float[np.ndarray, "k m"]:
+def real_spherical_harmonics(directions: Float[np.ndarray, "k 3"], degree: int) -> Float[np.ndarray, "k m"]:
     """Real spherical harmonics up to a degree (2 or 3) without the constant, not normalised.
 
     (Ramamoorthi and Hanrahan 2001 show that degree 2 holds 99 % of diffuse shading.)
@@ -95,22 +107,26 @@ def harmonics(directions: Float[np.ndarray, "k 3"], degree: int) -> Float[np.nda
     return np.stack(terms, axis=1)
 
 
-class _Centred:
+class _VertexMeans:
     """Observations relative to their vertex's weighted mean over the training frames."""
 
-    def __init__(self, train: Observations, count: int) -> None:
+    def __init__(self, train: VertexObservations, count: int) -> None:
         self.count = count
         self.total = np.maximum(np.bincount(train.vertex, train.weight, count), 1e-9)
         self.mean_colour = self.mean(train, train.colour)
 
-    def mean(self, train: Observations, values: np.ndarray) -> np.ndarray:
+    def mean(self, train: VertexObservations, values: np.ndarray) -> np.ndarray:
         columns = [np.bincount(train.vertex, train.weight * column, self.count) for column in values.T]
         return np.stack(columns, axis=1) / self.total[:, None]
 
 
 def fit_specular(
-    train: Observations, validation: Observations, edges: Int[np.ndarray, "e 2"], count: int, least_gain: float
-) -> Specular:
+    train: VertexObservations,
+    validation: VertexObservations,
+    edges: Int[np.ndarray, "e 2"],
+    count: int,
+    min_partial_r2: float,
+) -> SpecularFit:
     """Shading and highlights from training frames, judged on validation frames.
 
     edges: of the mesh; count: number of vertices. least_gain: share of the validation error that highlights must
@@ -120,40 +136,46 @@ def fit_specular(
     real video the hem of a shirt and a print came out as the brightest highlights. So only changes count that light
     reflected at a surface can make, colourless ones, and only where the paint around is flat.
     """
-    centred = _Centred(train, count)
-    shade_mean = centred.mean(train, harmonics(train.normal, 2))
-    lobe_mean = centred.mean(train, harmonics(train.mirrored, 3))
+    centred = _VertexMeans(train, count)
+    shading_basis_mean = centred.mean(train, real_spherical_harmonics(train.normal, 2))
+    lobe_basis_mean = centred.mean(train, real_spherical_harmonics(train.reflection_direction, 3))
     albedo = centred.mean_colour
-    flat = flatness(albedo, edges)
+    flat = albedo_uniformity(albedo, edges)
     train = replace(train, weight=(train.weight * flat[train.vertex]).astype(np.float32))
     validation = replace(validation, weight=(validation.weight * flat[validation.vertex]).astype(np.float32))
 
-    def terms(seen: Observations) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def terms(seen: VertexObservations) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         residual = seen.colour - albedo[seen.vertex]
-        shade = harmonics(seen.normal, 2) - shade_mean[seen.vertex]
-        lobe = harmonics(seen.mirrored, 3) - lobe_mean[seen.vertex]
-        return residual, shade, lobe
+        shading_basis = real_spherical_harmonics(seen.normal, 2) - shading_basis_mean[seen.vertex]
+        lobe_basis = real_spherical_harmonics(seen.reflection_direction, 3) - lobe_basis_mean[seen.vertex]
+        return residual, shading_basis, lobe_basis
 
-    residual, shade, lobe = terms(train)
+    residual, shading_basis, lobe_basis = terms(train)
     highlights = np.zeros_like(residual)
     strength = np.ones(count)
-    for _ in range(ALTERNATIONS):
-        shading = _solve_shared(shade, albedo[train.vertex], residual - highlights, train.weight)
-        rest = residual - (shade @ shading)[:, None] * albedo[train.vertex]
+    for _ in range(ALTERNATING_LEAST_SQUARES_ITERATIONS):
+        shading_coefficients = _solve_shared_coefficients(
+            shading_basis, albedo[train.vertex], residual - highlights, train.weight
+        )
+        unexplained = residual - (shading_basis @ shading_coefficients)[:, None] * albedo[train.vertex]
         grey = np.repeat(strength[train.vertex, None], 3, axis=1)
-        direction = _solve_shared(lobe, grey, rest, train.weight)
+        lobe_coefficients = _solve_shared_coefficients(lobe_basis, grey, unexplained, train.weight)
         # without a fixed size of L the ridge would pull s down and L would grow in its place, round after round
-        direction /= max(float(np.sqrt(np.average((lobe @ direction) ** 2, weights=train.weight))), 1e-9)
-        height = lobe @ direction
-        strength = _solve_strength(train, height, rest, count)
-        highlights = np.repeat((height * strength[train.vertex])[:, None], 3, axis=1)
-    gain = _gain(terms(validation), validation, albedo, shading, direction, strength)
-    span = np.ptp(np.percentile(harmonics(train.mirrored, 3) @ direction, [1.0, 99.0]))
-    kept = np.clip(strength * span, 0.0, 1.0) if gain >= least_gain else np.zeros(count)
-    return Specular(kept.astype(np.float32), float(gain))
+        lobe_coefficients /= max(
+            float(np.sqrt(np.average((lobe_basis @ lobe_coefficients) ** 2, weights=train.weight))), 1e-9
+        )
+        lobe_value = lobe_basis @ lobe_coefficients
+        strength = _solve_vertex_strengths(train, lobe_value, unexplained, count)
+        highlights = np.repeat((lobe_value * strength[train.vertex])[:, None], 3, axis=1)
+    partial_r2 = _partial_r2(terms(validation), validation, albedo, shading_coefficients, lobe_coefficients, strength)
+    lobe_range = np.ptp(
+        np.percentile(real_spherical_harmonics(train.reflection_direction, 3) @ lobe_coefficients, [1.0, 99.0])
+    )
+    kept = np.clip(strength * lobe_range, 0.0, 1.0) if partial_r2 >= min_partial_r2 else np.zeros(count)
+    return SpecularFit(kept.astype(np.float32), float(partial_r2))
 
 
-def dielectric_share(
+def dielectric_specular_factor(
     amplitude: Float[np.ndarray, "*n"], base: Float[np.ndarray, "*n 3"], roughness: float
 ) -> Float[np.ndarray, "*n"]:
     """How much of a dielectric's reflection shows highlights of this amplitude, in [0, 1]: glTF's specular factor.
@@ -165,49 +187,53 @@ def dielectric_share(
 
     amplitude: on top of `base`, both sRGB in [0, 1]. roughness: glTF's, in [0, 1].
     """
-    added = (linear_light(base + amplitude[..., None]) - linear_light(base)).mean(axis=-1)
+    added = (srgb_to_linear(base + amplitude[..., None]) - srgb_to_linear(base)).mean(axis=-1)
     return np.clip(added * roughness**4 / 0.01, 0.0, 1.0)
 
 
-def flatness(albedo: Float[np.ndarray, "v 3"], edges: Int[np.ndarray, "e 2"]) -> Float[np.ndarray, "v"]:
-    """1 where a vertex has its neighbours' colour, towards 0 where they differ by more than `EDGE_CONTRAST`."""
+def albedo_uniformity(albedo: Float[np.ndarray, "v 3"], edges: Int[np.ndarray, "e 2"]) -> Float[np.ndarray, "v"]:
+    """1 where a vertex has its neighbours' colour, towards 0 where they differ by more than `ALBEDO_CONTRAST_SCALE`."""
     step = np.abs(albedo[edges[:, 0]] - albedo[edges[:, 1]]).max(axis=1)
     largest = np.zeros(len(albedo))
     np.maximum.at(largest, edges.ravel(), np.repeat(step, 2))
-    return 1.0 / (1.0 + (largest / EDGE_CONTRAST) ** 2) ** 2
+    return 1.0 / (1.0 + (largest / ALBEDO_CONTRAST_SCALE) ** 2) ** 2
 
 
-def _solve_shared(
+def _solve_shared_coefficients(
     basis: np.ndarray, scale: np.ndarray, target: np.ndarray, weight: np.ndarray
 ) -> Float[np.ndarray, "m"]:
     """Coefficients x that minimise sum w |scale · (basis x) - target|^2."""
     power = weight * np.sum(scale**2, axis=1)
     matrix = (basis * power[:, None]).T @ basis
     right = basis.T @ (weight * np.sum(scale * target, axis=1))
-    return np.linalg.solve(matrix + RIDGE * np.trace(matrix) / len(matrix) * np.eye(len(matrix)), right)
+    return np.linalg.solve(matrix + RIDGE_WEIGHT * np.trace(matrix) / len(matrix) * np.eye(len(matrix)), right)
 
 
-def _solve_strength(train: Observations, height: np.ndarray, rest: np.ndarray, count: int) -> Float[np.ndarray, "v"]:
+def _solve_vertex_strengths(
+    train: VertexObservations, lobe_value: np.ndarray, unexplained: np.ndarray, count: int
+) -> Float[np.ndarray, "v"]:
     """Each vertex's s >= 0 for given highlights: near 0 where few or weak ones were seen, or coloured ones."""
-    power = np.bincount(train.vertex, train.weight * height**2, count)
-    evidence = np.stack([np.bincount(train.vertex, train.weight * height * c, count) for c in rest.T], axis=1)
+    power = np.bincount(train.vertex, train.weight * lobe_value**2, count)
+    right_hand_side = np.stack(
+        [np.bincount(train.vertex, train.weight * lobe_value * c, count) for c in unexplained.T], axis=1
+    )
     ridge = np.median(power[power > 0]) if np.any(power > 0) else 1.0
-    channels = evidence / (power + ridge)[:, None]
+    channels = right_hand_side / (power + ridge)[:, None]
     grey = np.maximum(channels.mean(axis=1), 0.0)
     tint = np.sum((channels - grey[:, None]) ** 2, axis=1)
     return grey**3 / np.maximum(grey**2 + TINT_PENALTY * tint, 1e-12)
 
 
-def _gain(
+def _partial_r2(
     terms: tuple[np.ndarray, np.ndarray, np.ndarray],
-    seen: Observations,
+    seen: VertexObservations,
     albedo: np.ndarray,
-    shading: np.ndarray,
-    direction: np.ndarray,
+    shading_coefficients: np.ndarray,
+    lobe_coefficients: np.ndarray,
     strength: np.ndarray,
 ) -> float:
-    residual, shade, lobe = terms
-    rest = residual - (shade @ shading)[:, None] * albedo[seen.vertex]
-    left = rest - (lobe @ direction * strength[seen.vertex])[:, None]
-    before = float(np.sum(seen.weight[:, None] * rest**2))
+    residual, shading_basis, lobe_basis = terms
+    unexplained = residual - (shading_basis @ shading_coefficients)[:, None] * albedo[seen.vertex]
+    left = unexplained - (lobe_basis @ lobe_coefficients * strength[seen.vertex])[:, None]
+    before = float(np.sum(seen.weight[:, None] * unexplained**2))
     return 1.0 - float(np.sum(seen.weight[:, None] * left**2)) / before if before > 0 else 0.0

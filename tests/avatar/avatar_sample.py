@@ -5,7 +5,7 @@ import numpy as np
 import torch
 import trimesh
 
-from pipeline.avatar.gltf import Maps, SkinnedMesh
+from pipeline.avatar.gltf import MaterialMaps, SkinnedMesh
 from pipeline.body.body import Body, Motion
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
@@ -51,9 +51,9 @@ def sample_camera() -> Camera:
     return Camera(fx=900.0, fy=910.0, cx=330.0, cy=300.0, width=640, height=600)
 
 
-def sample_maps() -> Maps:
+def sample_maps() -> MaterialMaps:
     random = np.random.default_rng(1)
-    return Maps(_png(random.integers(0, 255, (64, 64, 3))), _png(random.integers(0, 255, (64, 64, 4))))
+    return MaterialMaps(_png(random.integers(0, 255, (64, 64, 3))), _png(random.integers(0, 255, (64, 64, 4))))
 
 
 def _png(pixels: np.ndarray) -> bytes:

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.avatar.gltf import write_glb
 from tests.avatar.test_gltf import FRAMES, Player, encoded
-from tests.tools.blender import blender_finds
+from tests.tools.blender import inspect_in_blender
 
 
 @pytest.mark.slow
@@ -15,7 +15,7 @@ def test_blender_opens_it_upright_and_moving(tmp_path: Path) -> None:
     path = tmp_path / "avatar.glb"
     write_glb(path, encoded())
     seconds = float(FRAMES[4]) / 25.0
-    found = blender_finds(path, tmp_path / "picture.png", seconds)
+    found = inspect_in_blender(path, tmp_path / "picture.png", seconds)
     assert (found["armatures"], found["skinned_meshes"], found["actions"]) == (1, 1, ["capture"])
     assert found["bones"] == 3
     posed = Player(path).posed_vertices(seconds)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation, Slerp
 
-from pipeline.avatar.gltf import Maps, encode_glb, read_accessor, read_glb, specular_texture, write_glb
+from pipeline.avatar.gltf import MaterialMaps, encode_glb, pack_specular_factor, read_accessor, read_glb, write_glb
 from pipeline.body.body import canonical_to_world
 from pipeline.geometry.camera import project
 from pipeline.geometry.skinning import linear_blend_skinning
@@ -158,7 +158,7 @@ def material_of(data: bytes, folder: Path) -> tuple[dict, list[str]]:
 
 
 def test_a_matte_surface_has_no_highlight(tmp_path: Path) -> None:
-    extensions, used = material_of(encoded(maps=Maps(sample_maps().diffuse_png)), tmp_path)
+    extensions, used = material_of(encoded(maps=MaterialMaps(sample_maps().diffuse_png)), tmp_path)
     assert extensions == {"KHR_materials_specular": {"specularFactor": 0.0}}
     assert used == ["KHR_materials_specular"]
 
@@ -177,7 +177,7 @@ def test_an_unlit_surface_has_no_other_shading(tmp_path: Path) -> None:
 
 def test_the_factor_lies_in_alpha_as_it_is() -> None:
     factor = np.random.default_rng(0).integers(0, 256, (5, 7), dtype=np.uint8)
-    png = png_bytes(specular_texture(factor))
+    png = png_bytes(pack_specular_factor(factor))
     pixels = cv2.imdecode(np.frombuffer(png, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(pixels[..., 3], factor)
     assert (pixels[..., :3] == 255).all()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.avatar.placement import hold_ends, scene_from_world_m
+from pipeline.avatar.placement import pad_motion_to_video, world_to_scene_translation_m
 from pipeline.body.body import Motion
 
 
@@ -21,12 +21,12 @@ def test_the_floor_survives_jumps_and_one_wrong_pose() -> None:
     lowest = np.full(100, -1.2)
     lowest[20:80] = -0.9  # sixty frames in the air
     lowest[5] = -2.0
-    offset = scene_from_world_m(motion_at(frames, places), lowest)
+    offset = world_to_scene_translation_m(motion_at(frames, places), lowest)
     np.testing.assert_allclose(offset, [-0.3, 1.2, 5.0], atol=1e-6)
 
 
 def test_the_clip_lasts_as_long_as_the_video() -> None:
-    held = hold_ends(motion_at([4, 6, 9], np.eye(3)), frame_rate=30.0, video_frame_count=21)
+    held = pad_motion_to_video(motion_at([4, 6, 9], np.eye(3)), frame_rate=30.0, video_frame_count=21)
     np.testing.assert_array_equal(held.frame_index, [0, 4, 6, 9, 20])
     np.testing.assert_allclose(held.time_s, held.frame_index / 30.0, rtol=1e-12)
     np.testing.assert_array_equal(held.rotations_wxyz[:, 1, 0], [0, 0, 1, 2, 2])
@@ -35,11 +35,13 @@ def test_the_clip_lasts_as_long_as_the_video() -> None:
 
 def test_frames_keep_the_times_of_a_video_without_a_steady_rate() -> None:
     """Frame 6 came late and frame 9 on time; 11 frames are missing at the end, which 20 frames a second take 0.55 s."""
-    held = hold_ends(motion_at([4, 6, 9], np.eye(3), [0.13, 0.29, 0.36]), frame_rate=20.0, video_frame_count=21)
+    held = pad_motion_to_video(
+        motion_at([4, 6, 9], np.eye(3), [0.13, 0.29, 0.36]), frame_rate=20.0, video_frame_count=21
+    )
     np.testing.assert_allclose(held.time_s, [0.0, 0.13, 0.29, 0.36, 0.91], rtol=1e-12)
 
 
 @pytest.mark.parametrize("frames", [[0, 1, 2], [0, 7, 20]])
 def test_a_clip_that_is_whole_gains_no_key_it_has(frames: list[int]) -> None:
-    held = hold_ends(motion_at(frames, np.eye(3)), frame_rate=30.0, video_frame_count=frames[-1] + 1)
+    held = pad_motion_to_video(motion_at(frames, np.eye(3)), frame_rate=30.0, video_frame_count=frames[-1] + 1)
     np.testing.assert_array_equal(held.frame_index, frames)

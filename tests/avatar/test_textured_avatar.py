@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.avatar.textured_avatar import TexturedAvatar, straight_rgba
+from pipeline.avatar.textured_avatar import TexturedAvatar, unpremultiply_to_uint8
 from pipeline.body.body import canonical_to_world
 from tests.avatar.avatar_sample import sample_body, sample_motion
 from tests.stages.report_run import CAMERA, make_avatar
@@ -31,7 +31,7 @@ def test_posing_is_the_weighted_sum_of_its_joints(avatar: TexturedAvatar):
 
 def test_a_render_is_premultiplied_and_shows_the_texture(avatar: TexturedAvatar):
     pose = canonical_to_world(sample_body(), sample_motion(np.array([0, 5])))[0]
-    image = avatar.render(avatar.posed(pose), CAMERA, samples=2)
+    image = avatar.render(avatar.posed(pose), CAMERA, supersampling=2)
     assert image.shape == (CAMERA.height, CAMERA.width, 4)
     solid = image[..., 3] == 1.0
     assert solid.sum() > 200
@@ -40,7 +40,7 @@ def test_a_render_is_premultiplied_and_shows_the_texture(avatar: TexturedAvatar)
 
 
 def test_turntable_views_have_one_height_and_touch_their_sides(avatar: TexturedAvatar):
-    views = avatar.turntable(avatar.vertices, views=4, height_px=60, samples=2)
+    views = avatar.turntable(avatar.vertices, views=4, height_px=60, supersampling=2)
     assert [view.shape[0] for view in views] == [60] * 4
     for view in views:
         assert view[:, 0, 3].any()
@@ -51,7 +51,7 @@ def test_turntable_views_have_one_height_and_touch_their_sides(avatar: TexturedA
 
 def test_straight_alpha_undoes_premultiplication():
     rgba = np.array([[[0.2, 0.1, 0.0, 0.5], [0.0, 0.0, 0.0, 0.0], [1.0, 1.0, 1.0, 1.0]]], dtype=np.float32)
-    assert straight_rgba(rgba).tolist() == [[[102, 51, 0, 128], [0, 0, 0, 0], [255, 255, 255, 255]]]
+    assert unpremultiply_to_uint8(rgba).tolist() == [[[102, 51, 0, 128], [0, 0, 0, 0], [255, 255, 255, 255]]]
 
 
 def test_the_surface_alone_keeps_its_triangles(avatar: TexturedAvatar):

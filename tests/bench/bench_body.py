@@ -16,21 +16,21 @@ from pathlib import Path
 
 from data_tools.command import run_command
 from data_tools.evaluate.compare import compare_body, compare_masks, compare_surface
-from data_tools.evaluate.truth import load_truth
-from data_tools.sweep.runs import video_in
+from data_tools.evaluate.truth import load_ground_truth
+from data_tools.sweep.runs import find_video
 from pipeline.body.files import load_body
 from pipeline.core.errors import UserError
 from stages import body
-from tests.bench.machine import keep
+from tests.bench.machine import append_result
 
-TOLD = ("focal and stature", "stature", "nothing")
+KNOWN_INPUTS = ("focal and stature", "stature", "nothing")
 COLUMNS = {
     "joints": "joint_error_mm",
     "scaled": "scaled_joint_error_mm",
     "absolute": "absolute_joint_error_mm",
     "focal": "focal_ratio",
     "surface": "surface_median_mm",
-    "swaps": "swapped_frames",
+    "swaps": "left_right_swapped_frames",
     "jitter": "acceleration_error_ratio",
     "mask": "mask_iou_median",
     "worst": "mask_iou_worst",
@@ -40,38 +40,38 @@ COLUMNS = {
 """Head of each column, and the figure in it."""
 
 
-def ways(capture: Path) -> Iterator[tuple[str, body.Config]]:
+def known_input_configs(capture: Path) -> Iterator[tuple[str, body.Config]]:
     """What the body stage is told, in words and as its options; stature only where the truth has a bare body."""
-    camera, bare = load_truth(capture).camera, capture / "truth" / "bare.npz"
+    camera, bare = load_ground_truth(capture).camera, capture / "truth" / "bare.npz"
     view_deg = math.degrees(2 * math.atan(0.5 * max(camera.width, camera.height) / camera.fx))
     height_m = load_body(bare).height_m() if bare.is_file() else None
-    yield TOLD[0], body.Config(field_of_view_deg=view_deg, height_m=height_m)
+    yield KNOWN_INPUTS[0], body.Config(field_of_view_deg=view_deg, height_m=height_m)
     if height_m:
-        yield TOLD[1], body.Config(height_m=height_m)
-    yield TOLD[2], body.Config()
+        yield KNOWN_INPUTS[1], body.Config(height_m=height_m)
+    yield KNOWN_INPUTS[2], body.Config()
 
 
 def measure(capture: Path, run: Path) -> Iterator[dict[str, str | float]]:
     """Run both stages on a capture's video; the figures of each way, with the seconds of both stages."""
-    command = [sys.executable, "-m", "stages.frames", str(run), "--video", str(video_in(capture)), "--force"]
+    command = [sys.executable, "-m", "stages.frames", str(run), "--video", str(find_video(capture)), "--force"]
     start = time.monotonic()
     if subprocess.run(command, check=False).returncode:
         raise UserError(f"the frames stage failed on {capture}; what it said stands above")
     frames = {"frames_seconds": time.monotonic() - start} | compare_masks(capture, run / "frames")
-    for told, config in ways(capture):
-        out = run / f"body, {told} told"
+    for known_inputs, config in known_input_configs(capture):
+        out = run / f"body, {known_inputs} told"
         out.mkdir(parents=True, exist_ok=True)
         start = time.monotonic()
         body.run({"frames": run / "frames"}, out, config)
         seconds = {"body_seconds": time.monotonic() - start}
         found = compare_body(capture, out) | compare_surface(capture, out)
-        yield {"capture": capture.name, "told": told, **frames, **seconds, **found}
+        yield {"capture": capture.name, "known_inputs": known_inputs, **frames, **seconds, **found}
 
 
-def line(figures: Mapping[str, str | float]) -> str:
+def format_row(figures: Mapping[str, str | float]) -> str:
     """A row of the table."""
     values = (figures[name] for name in COLUMNS.values())
-    return f"{figures['capture']:24s} {figures['told']:18s}" + "".join(f"{value:9.3g}" for value in values)
+    return f"{figures['capture']:24s} {figures['known_inputs']:18s}" + "".join(f"{value:9.3g}" for value in values)
 
 
 def main(argv: Sequence[str]) -> None:
@@ -81,10 +81,10 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--runs", type=Path, default=Path("runs/bench-body"), help="where the stages write")
     options = parser.parse_args(argv)
     rows = [row for capture in options.captures for row in measure(capture, options.runs / capture.name)]
-    print(f"{'capture':24s} {'told':18s}" + "".join(f"{head:>9s}" for head in COLUMNS))
+    print(f"{'capture':24s} {'known_inputs':18s}" + "".join(f"{head:>9s}" for head in COLUMNS))
     for row in rows:
-        print(line(row))
-        table = keep("body", row)
+        print(format_row(row))
+        table = append_result("body", row)
     print(f"lengths in mm; rows appended to {table}")
 
 

@@ -54,21 +54,21 @@ import numpy as np
 from data_tools.command import run_command
 from pipeline.body.files import load_body, load_camera, load_motion
 from pipeline.capture.capture import load_capture
-from pipeline.capture.usable_frames import training_positions
-from pipeline.core.config import build, load_layers
+from pipeline.capture.usable_frames import usable_training_positions
+from pipeline.core.config import build_config, load_layers
 from pipeline.core.errors import UserError
 from pipeline.core.progress import warn
 from pipeline.field.config import FieldConfig
-from pipeline.field.occupancy import GRACE
-from pipeline.field.setup import spread, start_learning, training_scale
-from pipeline.field.trainer import REBAKES, Learning
-from stages.field import read_picture
-from tests.bench.machine import circumstances, gather_mrow_s, keep, median_ms, memory_gb_s, multiply_gflop_s
-from tests.bench.parts import OTHER, REBAKE, UPDATE, Clock, watched
+from pipeline.field.occupancy import INITIAL_EMA_RATIO
+from pipeline.field.setup import create_trainer, evenly_spaced, training_scale
+from pipeline.field.trainer import REBAKE_FRACTIONS, Trainer
+from stages.field import read_masked_image
+from tests.bench.machine import append_result, gather_mrow_s, machine_info, median_ms, memory_gb_s, multiply_gflop_s
+from tests.bench.parts import OTHER, REBAKE, UPDATE, PartTimer, timed_parts
 from tests.bench.quality import quality
 from tests.field.scene import painted_scene
 
-PARTS = ("draw", "place", "look", "losses")
+PARTS = ("draw", "place", "render_rays", "losses")
 PARTS += (
     "network_backward",
     "table_backward",
@@ -80,10 +80,10 @@ PARTS += (
     "skin_cut",
     OTHER,
 )
-PAINTED_FRAMES = 32
-BAKES = 3
+SYNTHETIC_FRAMES = 32
+BAKE_REPEATS = 3
 """Times that a rebake is made to be timed."""
-IMAGE_HEIGHTS = 1.25
+IMAGE_HEIGHT_RATIO = 1.25
 """Height of a painted image over that of the person in it, about."""
 
 
@@ -104,7 +104,7 @@ class Work:
     operations: float = 0.0
     rows: float = 0.0
 
-    def least_ms(self, peaks: Peaks) -> float:
+    def lower_bound_ms(self, peaks: Peaks) -> float:
         """The longest of the three times: at best the others hide behind it."""
         seconds = (self.bytes / peaks.memory_gb_s, self.operations / peaks.multiply_gflop_s)
         return max(*(value / 1e6 for value in seconds), self.rows / peaks.gather_mrow_s / 1e3)
@@ -119,67 +119,67 @@ class Timing:
     samples: float
 
 
-def begin_run(run: Path, config: FieldConfig) -> Learning:
+def trainer_from_run(run: Path, config: FieldConfig) -> Trainer:
     """Stage one as it begins in a finished run."""
     capture, camera = load_capture(run / "frames"), load_camera(run / "body" / "camera.npz")
     body, motion = load_body(run / "body" / "body.npz"), load_motion(run / "body" / "motion.npz")
     camera = camera.scaled(training_scale(body, motion, camera, config.max_person_px))
-    chosen = training_positions(capture, run / "body")
-    chosen = chosen[spread(len(chosen), config.max_frames)]
-    pictures = [read_picture(capture, position, camera) for position in chosen]
-    return start_learning(body, motion.select(chosen), camera, pictures, config)
+    chosen = usable_training_positions(capture, run / "body")
+    chosen = chosen[evenly_spaced(len(chosen), config.max_frames)]
+    masked_images = [read_masked_image(capture, position, camera) for position in chosen]
+    return create_trainer(body, motion.select(chosen), camera, masked_images, config)
 
 
-def begin_painted(config: FieldConfig) -> Learning:
+def trainer_from_synthetic_body(config: FieldConfig) -> Trainer:
     """Stage one on a painted body that turns, as tall as the preset lets it be."""
-    scene = painted_scene(min(PAINTED_FRAMES, config.max_frames), round(IMAGE_HEIGHTS * config.max_person_px))
-    pictures = list(zip(scene.images, scene.masks, strict=True))
-    return start_learning(scene.body, scene.motion, scene.camera, pictures, config)
+    scene = painted_scene(min(SYNTHETIC_FRAMES, config.max_frames), round(IMAGE_HEIGHT_RATIO * config.max_person_px))
+    masked_images = list(zip(scene.images, scene.masks, strict=True))
+    return create_trainer(scene.body, scene.motion, scene.camera, masked_images, config)
 
 
-def period(config: FieldConfig) -> int:
+def occupancy_period(config: FieldConfig) -> int:
     """Steps after which all recurs: updates of the occupancy."""
-    return config.occupancy_every
+    return config.occupancy_update_interval
 
 
-def settled(config: FieldConfig) -> int:
+def warm_up_step_count(config: FieldConfig) -> int:
     """Steps until poses are refined and a cell that was never anything but empty is given up; whole periods."""
-    updates = math.ceil(math.log(1 / GRACE) / math.log(config.occupancy_decay))
-    emptied = config.occupancy_start + updates * config.occupancy_every
-    poses = math.ceil(config.pose_start * config.steps) if config.pose_refinement else 0
-    return math.ceil(max(emptied, poses) / period(config)) * period(config)
+    updates = math.ceil(math.log(1 / INITIAL_EMA_RATIO) / math.log(config.occupancy_decay))
+    emptied = config.occupancy_warmup_steps + updates * config.occupancy_update_interval
+    poses = math.ceil(config.pose_start_fraction * config.steps) if config.pose_refinement else 0
+    return math.ceil(max(emptied, poses) / occupancy_period(config)) * occupancy_period(config)
 
 
-def time_steps(learning: Learning, clock: Clock, warm_up: int, steps: int) -> Timing:
-    """Take steps; `learning` was begun while `clock` watched."""
+def time_steps(trainer: Trainer, clock: PartTimer, warm_up: int, steps: int) -> Timing:
+    """Take steps; `trainer` was begun while `clock` watched."""
     for _ in range(warm_up):
-        learning.step()
-    clock.take()
-    length = min(period(learning.config), steps)
-    blocks, whole_s, samples = [], [], []
+        trainer.step()
+    clock.pop_seconds()
+    length = min(occupancy_period(trainer.config), steps)
+    blocks, step_seconds, samples = [], [], []
     for _ in range(max(1, steps // length)):
         start = time.perf_counter()
-        samples += [learning.step()["samples"] for _ in range(length)]
-        whole_s.append((time.perf_counter() - start) / length)
-        taken = clock.take()
+        samples += [trainer.step()["samples"] for _ in range(length)]
+        step_seconds.append((time.perf_counter() - start) / length)
+        taken = clock.pop_seconds()
         blocks.append([1e3 * taken.get(part, 0.0) / length for part in PARTS])
     medians = np.median(np.array(blocks), axis=0).tolist()
-    return Timing(1e3 * float(np.median(whole_s)), dict(zip(PARTS, medians, strict=True)), float(np.mean(samples)))
+    return Timing(1e3 * float(np.median(step_seconds)), dict(zip(PARTS, medians, strict=True)), float(np.mean(samples)))
 
 
-def least_work(learning: Learning, samples: float) -> dict[str, tuple[Work, ...]]:
-    """The table above, for a step as `learning` stands now: what is done in turn in each part."""
-    config, field, occupancy = learning.config, learning.field, learning.occupancy
+def minimum_work(trainer: Trainer, samples: float) -> dict[str, tuple[Work, ...]]:
+    """The table above, for a step as `trainer` stands now: what is done in turn in each part."""
+    config, field, occupancy = trainer.config, trainer.field, trainer.occupancy
     n, levels, hidden = config.rays, field.layout.levels, config.hidden_width
-    asked = (config.empty_points, config.unproven_points)
-    points = samples + len(occupancy.should_be_empty(*asked, np.random.default_rng(0)))
+    asked = (config.empty_points, config.unobserved_points)
+    points = samples + len(occupancy.sample_empty_points(*asked, np.random.default_rng(0)))
     width = len(field.hidden)
-    moving = float(learning.refines_poses)
-    blending = moving * 24.0 * len(learning.skin.sparse_weights.weight) * learning.frames_per_step
+    moving = float(trainer.refines_poses)
+    blending = moving * 24.0 * len(trainer.skin.sparse_weights.weight) * trainer.frames_per_step
     placed = moving * samples
     network = 2.0 * (width * hidden + 4 * hidden)
-    cells = len(occupancy.cells) / config.occupancy_every
-    look = (
+    cells = len(occupancy.cells) / config.occupancy_update_interval
+    render_rays = (
         Work(bytes=16 * samples, rows=8 * samples),
         Work(bytes=40 * placed, rows=8 * placed),
         Work(bytes=(12 + 4 * width) * points, rows=8 * levels * points),
@@ -189,7 +189,7 @@ def least_work(learning: Learning, samples: float) -> dict[str, tuple[Work, ...]
     return {
         "draw": (Work(bytes=84.0 * n),),
         "place": (Work(operations=blending),),
-        "look": look,
+        "render_rays": render_rays,
         "losses": (Work(bytes=44.0 * n),),
         "network_backward": (Work(bytes=(8 * width + 32) * points, operations=2 * network * points),),
         "table_backward": (Work(rows=16 * levels * points),),
@@ -198,25 +198,25 @@ def least_work(learning: Learning, samples: float) -> dict[str, tuple[Work, ...]
         "adam": (Work(bytes=32.0 * sum(parameter.numel() for parameter in field.parameters())),),
         "occupancy_record": (Work(bytes=24 * samples, rows=4 * samples),),
         UPDATE: (Work(bytes=(12 + 4 * width) * cells, operations=network * cells, rows=8 * levels * cells),),
-        "skin_cut": (Work(bytes=8.0 * learning.skin.weights.numel() / config.occupancy_every),),
+        "skin_cut": (Work(bytes=8.0 * trainer.skin.weights.numel() / config.occupancy_update_interval),),
         OTHER: (),
     }
 
 
-def measure(learning: Learning, clock: Clock, warm_up: int, steps: int, repeats: int) -> dict[str, float]:
+def measure(trainer: Trainer, clock: PartTimer, warm_up: int, steps: int, repeats: int) -> dict[str, float]:
     """All figures: the step, its parts, a rebake, the parts' floors, the peaks that the floors come from."""
-    timing = time_steps(learning, clock, warm_up, steps)
-    rows = max(learning.field.layout.rows_per_level, default=1 << 17)
+    timing = time_steps(trainer, clock, warm_up, steps)
+    rows = max(trainer.field.layout.rows_per_level, default=1 << 17)
     peaks = Peaks(
-        memory_gb_s(repeats, 4 * max(learning.field.table.nbytes, 1 << 20)),
+        memory_gb_s(repeats, 4 * max(trainer.field.table.nbytes, 1 << 20)),
         multiply_gflop_s(repeats),
-        gather_mrow_s(rows, learning.field.layout.features, repeats),
+        gather_mrow_s(rows, trainer.field.layout.features, repeats),
     )
-    work = least_work(learning, timing.samples)
-    floors = {part: sum(one.least_ms(peaks) for one in work[part]) for part in PARTS}
+    work = minimum_work(trainer, timing.samples)
+    floors = {part: sum(one.lower_bound_ms(peaks) for one in work[part]) for part in PARTS}
     figures = {"step_ms": timing.step_ms, "floor_ms": sum(floors.values()), "samples": timing.samples}
     figures |= {f"{part}_ms": timing.parts_ms[part] for part in PARTS}
-    figures[f"{REBAKE}_ms"] = median_ms(learning._bake, BAKES)
+    figures[f"{REBAKE}_ms"] = median_ms(trainer._bake_inverse_skinning, BAKE_REPEATS)
     return figures | {f"{part}_floor_ms": floors[part] for part in PARTS} | vars(peaks)
 
 
@@ -226,7 +226,9 @@ def table(figures: dict[str, float]) -> str:
     for name in (*PARTS, "step"):
         spent, least = figures[f"{name}_ms"], figures["floor_ms" if name == "step" else f"{name}_floor_ms"]
         lines.append(f"{name:20s} {spent:8.2f} {least:9.2f} {f'{spent / least:.1f}' if least else '-':>6s}")
-    lines.append(f"{REBAKE:20s} {figures[f'{REBAKE}_ms']:8.2f} each; {len(REBAKES)} in a training, in no step above")
+    lines.append(
+        f"{REBAKE:20s} {figures[f'{REBAKE}_ms']:8.2f} each; {len(REBAKE_FRACTIONS)} in a training, in no step above"
+    )
     return "\n".join(lines)
 
 
@@ -243,18 +245,18 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--repeats", type=int, default=15, help="runs for each peak")
     options = parser.parse_args(argv)
-    config = build("field", FieldConfig, load_layers(options.preset, {}))
+    config = build_config("field", FieldConfig, load_layers(options.preset, {}))
     if config.network != "hashgrid":
         raise UserError(f"preset {options.preset} has no hash grid, whose floors these are; take PRESET=default")
-    gained, reasons = quality(options.run, options.baseline)
-    warm_up = settled(config) if options.warm_up is None else options.warm_up
-    clock = Clock()
-    with watched(clock):
-        learning = begin_run(options.run[0], config) if options.run else begin_painted(config)
-        figures = measure(learning, clock, warm_up, options.steps, options.repeats)
+    quality_figures, reasons = quality(options.run, options.baseline)
+    warm_up = warm_up_step_count(config) if options.warm_up is None else options.warm_up
+    clock = PartTimer()
+    with timed_parts(clock):
+        trainer = trainer_from_run(options.run[0], config) if options.run else trainer_from_synthetic_body(config)
+        figures = measure(trainer, clock, warm_up, options.steps, options.repeats)
     for reason in reasons:
         warn(reason)
-    about = {
+    run_info = {
         "preset": options.preset,
         "seed": config.seed,
         "capture": str(options.run[0]) if options.run else "painted",
@@ -264,8 +266,8 @@ def main(argv: Sequence[str]) -> None:
         "steps": options.steps,
     }
     print(table(figures))
-    print(", ".join(f"{name} {value}" for name, value in (circumstances() | about | gained).items()))
-    results = keep("field", about | figures | gained, options.json)
+    print(", ".join(f"{name} {value}" for name, value in (machine_info() | run_info | quality_figures).items()))
+    results = append_result("field", run_info | figures | quality_figures, options.json)
     print(f"samples a step {figures['samples']:.0f}; row appended to {results}")
 
 

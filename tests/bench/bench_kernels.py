@@ -15,17 +15,17 @@ import numpy as np
 import torch
 
 from pipeline.field.config import FieldConfig
-from pipeline.field.field import Field, choose_layout
+from pipeline.field.field import RadianceField, hash_grid_layout
 from pipeline.kernels.adam import adam_step_
 from pipeline.kernels.composite import composite
-from pipeline.kernels.hashgrid import Towards, add_table_gradient_, encode
-from pipeline.kernels.inverse_skinning import bake, newton
-from pipeline.kernels.march import WarpSet, march
-from tests.bench.machine import keep, median_ms, memory_gb_s, multiply_gflop_s
+from pipeline.kernels.hashgrid import FeatureGradients, add_table_gradient_, encode
+from pipeline.kernels.inverse_skinning import bake_warp_grid, newton_step
+from pipeline.kernels.march import PackedWarpGrids, march
+from tests.bench.machine import append_result, median_ms, memory_gb_s, multiply_gflop_s
 from tests.kernels.bar import CELL_M, bar_skin, bend
 
 BOUNDS = np.array([[-0.8, -0.1, -0.3], [0.8, 1.9, 0.5]], dtype=np.float32)
-RAYS, SAMPLES_A_RAY = 4096, 16
+RAYS, SAMPLES_PER_RAY = 4096, 16
 SEED = 0
 """Of the made-up data."""
 
@@ -34,39 +34,39 @@ def ray_points(random: torch.Generator) -> torch.Tensor:
     """Samples in runs of a few centimetres, as rays near a surface give them, in the unit box."""
     start = torch.rand(RAYS, 1, 3, generator=random) * 0.8 + 0.1
     direction = torch.nn.functional.normalize(torch.randn(RAYS, 1, 3, generator=random), dim=-1)
-    reach = torch.linspace(0, 0.06, SAMPLES_A_RAY)[None, :, None]
+    reach = torch.linspace(0, 0.06, SAMPLES_PER_RAY)[None, :, None]
     return (start + reach * direction).reshape(-1, 3).clamp(0, 1)
 
 
 def field_parts(config: FieldConfig, repeats: int) -> dict[str, float]:
     """Encoding, network, compositing and update, forward and backward."""
     random = torch.Generator().manual_seed(SEED)
-    layout = choose_layout(BOUNDS, 0.003, config.levels, config.features, config.log2_rows)
-    field = Field(BOUNDS, layout, config.hidden_width)
+    layout = hash_grid_layout(BOUNDS, 0.003, config.levels, config.features, config.log2_rows)
+    field = RadianceField(BOUNDS, layout, config.hidden_width)
     points, sums = ray_points(random), torch.zeros_like(field.table)
     features = encode(points, field.table, layout)
-    towards = torch.randn(features.shape, generator=random)
+    grad_output = torch.randn(features.shape, generator=random)
     low, high = field.bounds_m
     placed = points * (high - low) + low
     colour, density = field.radiance(placed)
-    ray_start = torch.arange(0, len(points) + 1, SAMPLES_A_RAY)
+    ray_offsets = torch.arange(0, len(points) + 1, SAMPLES_PER_RAY)
     step_m = torch.full((len(points),), 0.004)
 
     def shade() -> None:
         inputs = (density.detach().requires_grad_(True), colour.detach().requires_grad_(True))
-        image, alpha, _ = composite(*inputs, step_m, ray_start)
+        image, alpha, _ = composite(*inputs, step_m, ray_offsets)
         (image.sum() + alpha.sum()).backward()
 
     def whole() -> None:
-        passed: Towards = []
-        rgb, sigma = field.radiance(placed, passed)
+        feature_gradients: FeatureGradients = []
+        rgb, sigma = field.radiance(placed, feature_gradients)
         (rgb.sum() + sigma.sum()).backward()
-        add_table_gradient_(sums, passed, layout)
+        add_table_gradient_(sums, feature_gradients, layout)
 
     def back() -> None:
-        passed: Towards = []
-        encode(points, field.table, layout, passed).backward(towards)
-        add_table_gradient_(sums, passed, layout)
+        feature_gradients: FeatureGradients = []
+        encode(points, field.table, layout, feature_gradients).backward(grad_output)
+        add_table_gradient_(sums, feature_gradients, layout)
 
     moments = torch.zeros_like(field.table), torch.zeros_like(field.table)
     with torch.no_grad():
@@ -83,7 +83,7 @@ def field_parts(config: FieldConfig, repeats: int) -> dict[str, float]:
 def warp_parts(repeats: int) -> dict[str, float]:
     """Baking a frame, marching and one Newton step with its gradient, on a bending bar."""
     skin, matrices = bar_skin(half_length_m=0.9, half_width_m=0.3), bend(0.6)
-    warps = WarpSet.of([bake(skin, matrices)], CELL_M)
+    warps = PackedWarpGrids.of([bake_warp_grid(skin, matrices)], CELL_M)
     random = torch.Generator().manual_seed(SEED)
     targets = (torch.rand(RAYS, 3, generator=random) - 0.5) * torch.tensor([0.8, 0.2, 0.0])
     origins = torch.tensor([0.0, 0.0, 3.0]).expand(RAYS, 3).contiguous()
@@ -92,19 +92,19 @@ def warp_parts(repeats: int) -> dict[str, float]:
     occupied = torch.ones(64, 64, 64, dtype=torch.uint8)
     rays = (origins, directions, torch.zeros(RAYS, dtype=torch.long), torch.rand(RAYS, generator=random))
 
-    def walk():
-        return march(*rays, 0.2 / SAMPLES_A_RAY, warps, occupied, box)
+    def march_rays():
+        return march(*rays, 0.2 / SAMPLES_PER_RAY, warps, occupied, box)
 
-    samples = walk()
-    ray = torch.repeat_interleave(torch.arange(RAYS), samples.ray_start.diff())
+    samples = march_rays()
+    ray = torch.repeat_interleave(torch.arange(RAYS), samples.ray_offsets.diff())
     posed = origins[ray] + samples.distance_m[:, None] * directions[ray]
     slots = torch.tensor([0, len(ray)])
     blended = skin.blend(matrices[None]).requires_grad_(True)
     return {
-        "bake_frame_ms": median_ms(lambda: bake(skin, matrices), max(3, repeats // 3)),
-        "march_ms": median_ms(walk, repeats),
+        "bake_frame_ms": median_ms(lambda: bake_warp_grid(skin, matrices), max(3, repeats // 3)),
+        "march_ms": median_ms(march_rays, repeats),
         "newton_and_pose_gradient_ms": median_ms(
-            lambda: newton(blended, samples.canonical_m, posed, slots, skin).sum().backward(), repeats
+            lambda: newton_step(blended, samples.canonical_m, posed, slots, skin).sum().backward(), repeats
         ),
         "march_samples": float(len(ray)),
     }
@@ -120,7 +120,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     figures |= field_parts(FieldConfig(), arguments.repeats) | warp_parts(arguments.repeats)
     for name, value in figures.items():
         print(f"{name:32s} {value:10.2f}")
-    print(keep("kernels", {"seed": SEED, "repeats": arguments.repeats} | figures, arguments.json))
+    print(append_result("kernels", {"seed": SEED, "repeats": arguments.repeats} | figures, arguments.json))
 
 
 if __name__ == "__main__":

@@ -51,7 +51,7 @@ def gather_mrow_s(rows: int, features: int, repeats: int) -> float:
     return drawn.numel() / 1e3 / median_ms(lambda: add(drawn, table, mode="sum"), repeats)
 
 
-def circumstances() -> dict[str, str | int]:
+def machine_info() -> dict[str, str | int]:
     """What is measured, on what."""
     return {
         "commit": environment()["commit"] or "unknown",
@@ -62,12 +62,14 @@ def circumstances() -> dict[str, str | int]:
     }
 
 
-def keep(bench: str, figures: Mapping[str, object], json_path: Path | None = None, folder: Path = RESULTS) -> Path:
+def append_result(
+    bench: str, figures: Mapping[str, object], json_path: Path | None = None, folder: Path = RESULTS
+) -> Path:
     """Add a row to the machine's table, which has the columns of all benches; returns the table.
 
     json_path: a file for the same row alone, not rounded.
     """
-    row = {"bench": bench} | circumstances() | figures
+    row = {"bench": bench} | machine_info() | figures
     if json_path:
         json_path.write_text(json.dumps(row, indent=2) + "\n", encoding="utf-8")
     folder.mkdir(exist_ok=True)

@@ -13,45 +13,45 @@ from unittest import mock
 
 from pipeline.body.pose_correction import PoseCorrection
 from pipeline.field import trainer as train
-from pipeline.field.field import _Decode
-from pipeline.field.occupancy import OccupancyUpdate
-from pipeline.field.trainer import Learning
-from pipeline.field.volume_rendering import Placing
-from pipeline.kernels.common.thread_pool import Parallel
+from pipeline.field.field import _RadianceMlp
+from pipeline.field.occupancy import OccupancyGrid
+from pipeline.field.trainer import Trainer
+from pipeline.field.volume_rendering import PoseBatch
+from pipeline.kernels.common.thread_pool import ThreadPool
 from pipeline.kernels.hashgrid import cpu as hashgrid_cpu
-from pipeline.kernels.inverse_skinning import _Newton, newton_cpu
-from pipeline.kernels.volume_rendering import _Trace
+from pipeline.kernels.inverse_skinning import _NewtonStep, newton_cpu
+from pipeline.kernels.volume_rendering import _RenderRays
 
 OTHER = "other"
 UPDATE = "occupancy_update"
 REBAKE = "rebake"
-SEAMS: tuple[tuple[str, Any, str], ...] = (
-    (OTHER, Learning, "step"),
-    (REBAKE, Learning, "_bake"),
-    ("draw", Learning, "_draw"),
-    ("draw", OccupancyUpdate, "should_be_empty"),
-    ("place", Learning, "_placing"),
-    ("place", Placing, "blended"),
-    ("look", train, "look"),
+TIMED_FUNCTIONS: tuple[tuple[str, Any, str], ...] = (
+    (OTHER, Trainer, "step"),
+    (REBAKE, Trainer, "_bake_inverse_skinning"),
+    ("draw", Trainer, "_sample_batch"),
+    ("draw", OccupancyGrid, "sample_empty_points"),
+    ("place", Trainer, "_pose_batch"),
+    ("place", PoseBatch, "blended"),
+    ("render_rays", train, "render_rays"),
     ("losses", train, "field_losses"),
     ("losses", PoseCorrection, "roughness"),
     ("losses", PoseCorrection, "size"),
-    ("network_backward", _Decode, "backward"),
-    ("network_backward", _Trace, "backward"),
+    ("network_backward", _RadianceMlp, "backward"),
+    ("network_backward", _RenderRays, "backward"),
     ("table_backward", hashgrid_cpu, "add_table_gradient"),
     ("positions_backward", hashgrid_cpu, "add_points_gradient"),
-    ("positions_backward", _Newton, "backward"),
-    ("positions_backward", newton_cpu, "pose_gradient"),
-    ("rest_backward", Learning, "_gradients"),
+    ("positions_backward", _NewtonStep, "backward"),
+    ("positions_backward", newton_cpu, "add_pose_gradient"),
+    ("rest_backward", Trainer, "_gradients"),
     ("adam", train, "adam_step_"),
-    ("occupancy_record", OccupancyUpdate, "record"),
-    (UPDATE, OccupancyUpdate, "update"),
-    ("skin_cut", Learning, "_follow_occupancy"),
+    ("occupancy_record", OccupancyGrid, "record_observations"),
+    (UPDATE, OccupancyGrid, "update"),
+    ("skin_cut", Trainer, "_crop_skin_grid"),
 )
 
 
 @dataclass
-class Tally:
+class ThreadTimes:
     """What one thread has done: seconds of each part, those that run now, the innermost last, and since when."""
 
     seconds: dict[str, float] = field(default_factory=partial(defaultdict, float))
@@ -59,91 +59,93 @@ class Tally:
     since: float = 0.0
 
 
-class Clock:
+class PartTimer:
     """Seconds of each part. A moment counts for the innermost part that runs; only an update of the occupancy keeps the
     time of the kernels that it calls. What threads do at the same time shares the time that this takes.
     """
 
     def __init__(self, now: Callable[[], float] = time.perf_counter) -> None:
         self._now, self._of_thread = now, threading.local()
-        self._tally = Tally()
+        self._thread_times = ThreadTimes()
 
     @property
-    def _tally(self) -> Tally:
-        return self._of_thread.tally
+    def _thread_times(self) -> ThreadTimes:
+        return self._of_thread.times
 
-    @_tally.setter
-    def _tally(self, tally: Tally) -> None:
-        self._of_thread.tally = tally
+    @_thread_times.setter
+    def _thread_times(self, times: ThreadTimes) -> None:
+        self._of_thread.times = times
 
     def timed(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
         """The function, its time counted as that of `part`."""
 
         @wraps(function)
         def run(*arguments: Any, **named: Any) -> Any:
-            if self._tally.running and self._tally.running[-1] == UPDATE:
+            if self._thread_times.running and self._thread_times.running[-1] == UPDATE:
                 return function(*arguments, **named)
-            self._turn()
-            self._tally.running.append(part)
+            self._charge_elapsed()
+            self._thread_times.running.append(part)
             try:
                 return function(*arguments, **named)
             finally:
-                self._turn()
-                self._tally.running.pop()
+                self._charge_elapsed()
+                self._thread_times.running.pop()
 
         return run
 
-    def shared(self, part: str, map_jobs: Callable[..., Any]) -> Callable[..., Any]:
-        """`Parallel.map`, each job begun as `part`. Its whole time is divided as the jobs' own times are."""
+    def timed_parallel_map(self, part: str, map_jobs: Callable[..., Any]) -> Callable[..., Any]:
+        """`ThreadPool.map`, each job begun as `part`. Its whole time is divided as the jobs' own times are."""
 
         @wraps(map_jobs)
         def run(threads: Any, function: Callable[..., Any], *arguments: Any) -> Any:
-            tallies: list[Tally] = []
+            thread_times: list[ThreadTimes] = []
 
             def job(*of_job: Any) -> Any:
-                outside = getattr(self._of_thread, "tally", None)
-                self._tally = Tally()
-                tallies.append(self._tally)
+                outside = getattr(self._of_thread, "times", None)
+                self._thread_times = ThreadTimes()
+                thread_times.append(self._thread_times)
                 try:
                     return self.timed(part, function)(*of_job)
                 finally:
-                    self._tally = outside or Tally()
+                    self._thread_times = outside or ThreadTimes()
 
-            self._turn()
-            begun = self._tally.since
+            self._charge_elapsed()
+            start_seconds = self._thread_times.since
             answers = map_jobs(threads, job, *arguments)
-            self._tally.since = self._now()
-            own = sum(sum(tally.seconds.values()) for tally in tallies)
-            for tally in tallies:
-                for name, seconds in tally.seconds.items():
-                    self._tally.seconds[name] += seconds * (self._tally.since - begun) / (own or 1.0)
+            self._thread_times.since = self._now()
+            total_job_seconds = sum(sum(times.seconds.values()) for times in thread_times)
+            for times in thread_times:
+                for name, seconds in times.seconds.items():
+                    self._thread_times.seconds[name] += (
+                        seconds * (self._thread_times.since - start_seconds) / (total_job_seconds or 1.0)
+                    )
             return answers
 
         return run
 
-    def take(self) -> dict[str, float]:
+    def pop_seconds(self) -> dict[str, float]:
         """Seconds of each part since the last call, in the thread that steps."""
-        taken, self._tally.seconds = self._tally.seconds, defaultdict(float)
+        taken, self._thread_times.seconds = self._thread_times.seconds, defaultdict(float)
         return taken
 
-    def _turn(self) -> None:
-        tally, now = self._tally, self._now()
-        if tally.running:
-            tally.seconds[tally.running[-1]] += now - tally.since
-        tally.since = now
+    def _charge_elapsed(self) -> None:
+        times, now = self._thread_times, self._now()
+        if times.running:
+            times.seconds[times.running[-1]] += now - times.since
+        times.since = now
 
 
 @contextmanager
-def watched(clock: Clock) -> Iterator[None]:
-    """While it lasts, `clock` counts the parts of every step of a `Learning` that was begun in it."""
+def timed_parts(clock: PartTimer) -> Iterator[None]:
+    """While it lasts, `clock` counts the parts of every step of a `Trainer` that was begun in it."""
     with ExitStack() as stack:
 
-        def wrap(owner: Any, name: str, change: Callable[[Any], Any]) -> None:
-            is_static = isinstance(inspect.getattr_static(owner, name), staticmethod)
-            changed = change(getattr(owner, name))
-            stack.enter_context(mock.patch.object(owner, name, staticmethod(changed) if is_static else changed))
+        def wrap(target: Any, name: str, change: Callable[[Any], Any]) -> None:
+            is_static = isinstance(inspect.getattr_static(target, name), staticmethod)
+            changed = change(getattr(target, name))
+            stack.enter_context(mock.patch.object(target, name, staticmethod(changed) if is_static else changed))
 
-        for part, owner, name in SEAMS:
-            wrap(owner, name, partial(clock.timed, part))
-        wrap(Parallel, "map", partial(clock.shared, OTHER))
+        for part, target, name in TIMED_FUNCTIONS:
+            wrap(target, name, partial(clock.timed, part))
+        wrap(ThreadPool, "map", partial(clock.timed_parallel_map, OTHER))
         yield

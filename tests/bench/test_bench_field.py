@@ -8,13 +8,23 @@ import torch
 
 from pipeline.core.errors import UserError
 from pipeline.field.config import FieldConfig
-from pipeline.field.occupancy import GRACE
-from pipeline.field.trainer import Learning
+from pipeline.field.occupancy import INITIAL_EMA_RATIO
+from pipeline.field.trainer import Trainer
 from pipeline.kernels.hashgrid import _Encode
 from tests.bench import bench_field
-from tests.bench.bench_field import PARTS, Peaks, Work, begin_painted, least_work, period, settled, table, time_steps
-from tests.bench.machine import circumstances, keep
-from tests.bench.parts import REBAKE, SEAMS, Clock, watched
+from tests.bench.bench_field import (
+    PARTS,
+    Peaks,
+    Work,
+    minimum_work,
+    occupancy_period,
+    table,
+    time_steps,
+    trainer_from_synthetic_body,
+    warm_up_step_count,
+)
+from tests.bench.machine import append_result, machine_info
+from tests.bench.parts import REBAKE, TIMED_FUNCTIONS, PartTimer, timed_parts
 
 TINY = FieldConfig(
     steps=40,
@@ -24,78 +34,78 @@ TINY = FieldConfig(
     max_person_px=64,
     levels=3,
     log2_rows=12,
-    margin_m=0.04,
+    min_clothing_offset_m=0.04,
     step_fraction=0.02,
-    occupancy_every=2,
-    occupancy_start=2,
-    pose_start=0.0,
+    occupancy_update_interval=2,
+    occupancy_warmup_steps=2,
+    pose_start_fraction=0.0,
 )
 
 
 @pytest.fixture(scope="module")
-def learning_and_timing():
-    clock = Clock()
-    with watched(clock):
-        learning = begin_painted(TINY)
-        return learning, time_steps(learning, clock, warm_up=2, steps=2)
+def trainer_and_timing():
+    clock = PartTimer()
+    with timed_parts(clock):
+        trainer = trainer_from_synthetic_body(TINY)
+        return trainer, time_steps(trainer, clock, warm_up=2, steps=2)
 
 
-def test_parts_sum_to_the_step(learning_and_timing):
-    _, timing = learning_and_timing
+def test_parts_sum_to_the_step(trainer_and_timing):
+    _, timing = trainer_and_timing
     assert sum(timing.parts_ms.values()) == pytest.approx(timing.step_ms, rel=0.15)
     assert [part for part, spent_ms in timing.parts_ms.items() if spent_ms <= 0] == []
     assert timing.samples > 0
 
 
-def test_watching_changes_nothing_that_is_learnt(learning_and_timing):
-    watched_one, _ = learning_and_timing
-    plain = begin_painted(TINY)
+def test_timers_do_not_change_training(trainer_and_timing):
+    timed_trainer, _ = trainer_and_timing
+    plain = trainer_from_synthetic_body(TINY)
     for _ in range(4):
         plain.step()
-    assert plain.done == watched_one.done
-    expected = watched_one.state()
+    assert plain.completed_steps == timed_trainer.completed_steps
+    expected = timed_trainer.state()
     for name, tensor in plain.state().items():
         assert torch.equal(tensor, expected[name]), name
 
 
-def test_the_seams_are_as_they_were_afterwards():
-    before = Learning.step, _Encode.forward, _Encode.backward
-    with watched(Clock()):
-        assert Learning.step is not before[0]
-    assert (Learning.step, _Encode.forward, _Encode.backward) == before
+def test_timed_functions_are_restored():
+    before = Trainer.step, _Encode.forward, _Encode.backward
+    with timed_parts(PartTimer()):
+        assert Trainer.step is not before[0]
+    assert (Trainer.step, _Encode.forward, _Encode.backward) == before
 
 
-def test_a_rebake_counts_for_no_part_of_a_step(monkeypatch):
+def test_rebake_time_is_excluded_from_the_step(monkeypatch):
     """Step 24 of 40 begins with one; by this clock nothing else takes time."""
-    learning, now_s = begin_painted(TINY), [0.0]
-    monkeypatch.setattr(Learning, "_bake", lambda _: now_s.append(now_s[-1] + 1000.0))
-    clock = Clock(lambda: now_s[-1])
-    learning.done = 24
-    with watched(clock):
-        learning.step()
-    taken = clock.take()
+    trainer, now_s = trainer_from_synthetic_body(TINY), [0.0]
+    monkeypatch.setattr(Trainer, "_bake_inverse_skinning", lambda _: now_s.append(now_s[-1] + 1000.0))
+    clock = PartTimer(lambda: now_s[-1])
+    trainer.completed_steps = 24
+    with timed_parts(clock):
+        trainer.step()
+    taken = clock.pop_seconds()
     assert taken.pop(REBAKE) == 1000.0
     assert sum(taken.values()) == 0.0
 
 
-def test_every_seam_has_a_part():
-    assert {part for part, *_ in SEAMS} == {*PARTS, REBAKE}
+def test_every_timed_function_has_a_part():
+    assert {part for part, *_ in TIMED_FUNCTIONS} == {*PARTS, REBAKE}
 
 
-def test_a_clock_counts_each_moment_once():
-    clock = Clock(iter(range(100)).__next__)
+def test_nested_parts_are_not_counted_twice():
+    clock = PartTimer(iter(range(100)).__next__)
     inner = clock.timed("inner", lambda: None)
     clock.timed("outer", lambda: (inner(), inner()))()
-    assert clock.take() == {"outer": 3, "inner": 2}
+    assert clock.pop_seconds() == {"outer": 3, "inner": 2}
     clock.timed("occupancy_update", inner)()
-    assert clock.take() == {"occupancy_update": 1}
-    assert clock.take() == {}
+    assert clock.pop_seconds() == {"occupancy_update": 1}
+    assert clock.pop_seconds() == {}
 
 
-def test_what_is_done_at_the_same_time_shares_the_time_that_it_takes():
+def test_parallel_parts_share_the_elapsed_time():
     """Two jobs whose own times are 3 and 1 and of which "inner" takes 1 and 1, in a time of 2 by the step's clock."""
     now, thread_now = [10.0], threading.local()
-    clock = Clock(lambda: getattr(thread_now, "s", now[0]))
+    clock = PartTimer(lambda: getattr(thread_now, "s", now[0]))
 
     def advance(seconds):
         thread_now.s += seconds
@@ -117,12 +127,12 @@ def test_what_is_done_at_the_same_time_shares_the_time_that_it_takes():
         thread_now.s = 0.0
         function(seconds)
 
-    clock.timed("step", lambda: clock.shared("outer", map_jobs)(None, job, [2.0, 0.0]))()
-    assert clock.take() == {"step": 0.0, "outer": 2.0 * 2 / 4, "inner": 2.0 * 2 / 4}
+    clock.timed("step", lambda: clock.timed_parallel_map("outer", map_jobs)(None, job, [2.0, 0.0]))()
+    assert clock.pop_seconds() == {"step": 0.0, "outer": 2.0 * 2 / 4, "inner": 2.0 * 2 / 4}
 
 
-def test_a_part_that_fails_is_counted_and_left():
-    clock = Clock(iter(range(100)).__next__)
+def test_failing_part_is_timed_and_closed():
+    clock = PartTimer(iter(range(100)).__next__)
 
     def fail():
         raise LookupError
@@ -130,44 +140,44 @@ def test_a_part_that_fails_is_counted_and_left():
     with pytest.raises(LookupError):
         clock.timed("outer", clock.timed("inner", fail))()
     clock.timed("after", lambda: None)()
-    assert clock.take() == {"outer": 2, "inner": 1, "after": 1}
+    assert clock.pop_seconds() == {"outer": 2, "inner": 1, "after": 1}
 
 
 def test_the_floor_is_the_longest_of_three_times():
     peaks = Peaks(memory_gb_s=10, multiply_gflop_s=100, gather_mrow_s=1000)
-    assert Work(bytes=1e7).least_ms(peaks) == pytest.approx(1)
-    assert Work(operations=1e8).least_ms(peaks) == pytest.approx(1)
-    assert Work(rows=1e6).least_ms(peaks) == pytest.approx(1)
-    assert Work(bytes=1e7, operations=3e8, rows=2e6).least_ms(peaks) == pytest.approx(3)
+    assert Work(bytes=1e7).lower_bound_ms(peaks) == pytest.approx(1)
+    assert Work(operations=1e8).lower_bound_ms(peaks) == pytest.approx(1)
+    assert Work(rows=1e6).lower_bound_ms(peaks) == pytest.approx(1)
+    assert Work(bytes=1e7, operations=3e8, rows=2e6).lower_bound_ms(peaks) == pytest.approx(3)
 
 
-def test_the_work_of_a_step(learning_and_timing):
-    learning, _ = learning_and_timing
-    work = least_work(learning, samples=1000)
+def test_the_work_of_a_step(trainer_and_timing):
+    trainer, _ = trainer_and_timing
+    work = minimum_work(trainer, samples=1000)
     assert set(work) == set(PARTS)
-    march, newton, grid, network, _ = work["look"]
-    empty = len(learning.occupancy.empty) / learning.occupancy.occupied.numel()
-    unproven = TINY.unproven_points if len(learning.occupancy.unproven) else 0
-    points = 1000 + round(TINY.empty_points * empty) + unproven
+    march, newton, grid, network, _ = work["render_rays"]
+    empty = len(trainer.occupancy.empty) / trainer.occupancy.occupied.numel()
+    unobserved = TINY.unobserved_points if len(trainer.occupancy.unobserved) else 0
+    points = 1000 + round(TINY.empty_points * empty) + unobserved
     assert grid.rows == pytest.approx(8 * 3 * points)
     assert march.rows == newton.rows == 8000
     assert network.operations == pytest.approx(2 * points * (12 * 32 + 32 * 4))
-    assert work["adam"][0].bytes == 32 * (learning.field.table.numel() + 12 * 32 + 32 * 4 + 4)
+    assert work["adam"][0].bytes == 32 * (trainer.field.table.numel() + 12 * 32 + 32 * 4 + 4)
     assert work["positions_backward"][0].rows == pytest.approx(8 * 3 * points + 24 * 1000)
 
 
-def test_warm_up_lasts_until_poses_move_and_cells_are_given_up():
+def test_warm_up_covers_pose_refinement_and_occupancy():
     config = FieldConfig()
-    assert period(config) == 8
-    updates = (settled(config) - config.occupancy_start) // config.occupancy_every
-    assert GRACE * config.occupancy_decay**updates <= 1
-    assert settled(config) % 8 == 0
-    assert settled(FieldConfig(steps=4000)) == 400
+    assert occupancy_period(config) == 8
+    updates = (warm_up_step_count(config) - config.occupancy_warmup_steps) // config.occupancy_update_interval
+    assert INITIAL_EMA_RATIO * config.occupancy_decay**updates <= 1
+    assert warm_up_step_count(config) % 8 == 0
+    assert warm_up_step_count(FieldConfig(steps=4000)) == 400
 
 
 def test_the_command_prints_and_writes(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(bench_field, "keep", partial(keep, folder=tmp_path))
-    monkeypatch.setattr(bench_field, "build", lambda *_: TINY)
+    monkeypatch.setattr(bench_field, "append_result", partial(append_result, folder=tmp_path))
+    monkeypatch.setattr(bench_field, "build_config", lambda *_: TINY)
     monkeypatch.setattr(bench_field, "memory_gb_s", lambda *_: 10.0)
     monkeypatch.setattr(bench_field, "multiply_gflop_s", lambda *_: 100.0)
     path = tmp_path / "out.json"
@@ -176,7 +186,7 @@ def test_the_command_prints_and_writes(tmp_path, monkeypatch, capsys):
     assert figures["step_ms"] > 0
     assert figures["floor_ms"] == pytest.approx(sum(figures[f"{part}_floor_ms"] for part in PARTS))
     assert np.isfinite(figures["samples"])
-    assert figures.items() >= (circumstances() | {"seed": 0, "capture": "painted", "runs": 0}).items()
+    assert figures.items() >= (machine_info() | {"seed": 0, "capture": "painted", "runs": 0}).items()
     assert figures["rebake_ms"] > 0
     assert table(figures) in capsys.readouterr().out
     assert len(list(tmp_path.glob("*.csv"))) == 1

@@ -3,14 +3,14 @@ import json
 
 import torch
 
-from tests.bench.machine import circumstances, gather_mrow_s, keep
+from tests.bench.machine import append_result, gather_mrow_s, machine_info
 
 
 def test_rows_of_all_benches_share_a_table(tmp_path):
     folder = tmp_path / "results"
-    keep("kernels", {"adam_ms": 1.23456}, folder=folder)
-    keep("field", {"step_ms": 20, "preset": "default"}, folder=folder)
-    path = keep("kernels", {"adam_ms": 2.0}, folder=folder)
+    append_result("kernels", {"adam_ms": 1.23456}, folder=folder)
+    append_result("field", {"step_ms": 20, "preset": "default"}, folder=folder)
+    path = append_result("kernels", {"adam_ms": 2.0}, folder=folder)
     with path.open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert [row["bench"] for row in rows] == ["kernels", "field", "kernels"]
@@ -20,18 +20,18 @@ def test_rows_of_all_benches_share_a_table(tmp_path):
 
 
 def test_a_table_of_fewer_columns_is_continued(tmp_path):
-    path = keep("kernels", {}, folder=tmp_path)
+    path = append_result("kernels", {}, folder=tmp_path)
     path.write_text("commit,adam_ms\nabc,3\n")
-    keep("field", {"step_ms": 4}, folder=tmp_path)
+    append_result("field", {"step_ms": 4}, folder=tmp_path)
     with path.open(newline="") as stream:
         first, second = csv.DictReader(stream)
     assert (first["commit"], first["adam_ms"], first["step_ms"]) == ("abc", "3", "")
-    assert (second["commit"], second["adam_ms"], second["step_ms"]) == (circumstances()["commit"], "", "4")
+    assert (second["commit"], second["adam_ms"], second["step_ms"]) == (machine_info()["commit"], "", "4")
 
 
-def test_a_file_of_figures_says_what_was_measured_on_what(tmp_path):
-    keep("kernels", {"adam_ms": 1.23456}, tmp_path / "out.json", tmp_path)
-    assert json.loads((tmp_path / "out.json").read_text()) == {"bench": "kernels", "adam_ms": 1.23456} | circumstances()
+def test_json_file_holds_results_and_machine_info(tmp_path):
+    append_result("kernels", {"adam_ms": 1.23456}, tmp_path / "out.json", tmp_path)
+    assert json.loads((tmp_path / "out.json").read_text()) == {"bench": "kernels", "adam_ms": 1.23456} | machine_info()
 
 
 def test_random_rows_are_counted():

@@ -28,16 +28,16 @@ def finished_run(
     return folder
 
 
-def test_a_tenth_of_a_decibel_below_the_end_is_as_good() -> None:
+def test_speedup_tolerance_is_a_tenth_of_a_decibel() -> None:
     """30.0 dB are reached within 0.1 dB after 25 s, not yet after 20 s: 1000 / 25."""
     assert speedup(QUICK, SLOW) == (40.0, "")
 
 
-def test_a_run_that_falls_again_counts_from_where_it_was_good() -> None:
+def test_speedup_counts_the_first_crossing() -> None:
     assert speedup([(5.0, 30.5, 20.0), (50.0, 20.0, 10.0)], SLOW) == (200.0, "")
 
 
-def test_what_is_never_reached_is_said() -> None:
+def test_unreached_quality_gives_a_reason() -> None:
     factor, reason = speedup(SLOW, QUICK)
     assert factor is None
     assert "never reaches the baseline's 31.00 dB - 0.1 dB: 30.00 dB at best" in reason
@@ -51,7 +51,7 @@ def test_two_runs(tmp_path: Path) -> None:
     assert reasons == []
 
 
-def test_several_seeds_and_videos_count_by_their_medians(tmp_path: Path) -> None:
+def test_several_seeds_and_videos_are_summarised_by_medians(tmp_path: Path) -> None:
     """Pairs by hand: two runs of video x with one baseline, one of video y with two; 40, 20, 8, 16 times as fast."""
 
     def slower(factor: float) -> list[tuple[float, float, float]]:
@@ -74,14 +74,14 @@ def test_several_seeds_and_videos_count_by_their_medians(tmp_path: Path) -> None
     assert figures["psnr_gain_db"] == pytest.approx((0.1 + 0.2) / 2)
 
 
-def test_one_pair_that_cannot_be_told_is_not_left_out(tmp_path: Path) -> None:
+def test_unknown_pair_makes_the_median_unknown(tmp_path: Path) -> None:
     runs = [finished_run(tmp_path / "a", QUICK, 30.5, "x"), finished_run(tmp_path / "b", SLOW[:1], None, "x")]
     figures, reasons = quality(runs, [finished_run(tmp_path / "c", SLOW, 30.5, "x")])
     assert (figures["speedup_to_quality"], figures["psnr_gain_db"]) == (None, None)
     assert any("b and" in reason and "never reaches" in reason for reason in reasons)
 
 
-def test_what_is_not_given_is_null_with_a_reason(tmp_path: Path) -> None:
+def test_missing_inputs_give_null_with_a_reason(tmp_path: Path) -> None:
     run = finished_run(tmp_path / "a", QUICK, None, "x")
     assert quality([], []) == (
         dict.fromkeys(("field_seconds", "speedup_to_quality", "psnr_gain_db")),
@@ -102,7 +102,7 @@ def test_seconds_are_the_median_of_the_runs(tmp_path: Path) -> None:
     assert quality(runs, [])[0]["field_seconds"] == 6
 
 
-def test_runs_of_two_videos_are_refused(tmp_path: Path) -> None:
+def test_runs_of_different_videos_are_rejected(tmp_path: Path) -> None:
     run, other = finished_run(tmp_path / "a", QUICK, 30.0, "x"), finished_run(tmp_path / "b", SLOW, 30.0, "y")
     with pytest.raises(UserError, match="not of the same video"):
         quality([run], [other])

@@ -6,21 +6,21 @@ import numpy as np
 import torch
 
 from pipeline.body.body import ParametricBody
-from pipeline.body.fit.camera_parameters import LENS_COUNT
+from pipeline.body.fit.camera_parameters import INTRINSICS_COUNT
 from pipeline.body.fit.diagnostics import make_observations
 from pipeline.body.fit.energy import FitState, Observations
 from pipeline.body.fit.fit import FitResult
 from pipeline.body.fit.landmark_regressor import (
     HAND_LANDMARKS,
-    OFFSET_COUNT,
-    PAIRS,
-    POSE_LANDMARKS,
+    LANDMARK_OFFSET_COUNT,
+    LEFT_RIGHT_PAIRS,
+    POSE_LANDMARK_COUNT,
     landmark_regressor,
     mirror_permutation,
 )
-from pipeline.body.fit.linear_body import ACTIVE_JOINTS, FitModel, linearise, pose_points, pose_skeleton
-from pipeline.body.fit.silhouette_icp import Window, matching_window, posed_vertices
-from pipeline.capture.hand_detector import HAND_POINTS, Hands
+from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody, linearise_body, pose_points, pose_skeleton
+from pipeline.body.fit.silhouette_icp import MaskWindow, crop_mask_window, posed_vertices
+from pipeline.capture.hand_detector import N_HAND_LANDMARKS, HandLandmarks
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.rotation import axis_angle_to_matrix, quaternion_to_matrix
 from pipeline.geometry.skinning import forward_kinematics
@@ -28,16 +28,16 @@ from pipeline.kernels.raster import rasterize
 
 
 @dataclass(frozen=True)
-class Act:
+class SyntheticRecording:
     """The truth (`state`, `model`, `camera`) and the detector's view of it."""
 
-    model: FitModel
+    model: LinearBody
     state: FitState
     camera: Camera
     time_s: np.ndarray
     landmarks_px: np.ndarray
     landmarks_world_m: np.ndarray
-    hands: Hands
+    hands: HandLandmarks
 
     def observations(self, camera: Camera) -> Observations:
         return make_observations(
@@ -55,11 +55,11 @@ class Act:
             masks.append(np.where(face_id.numpy() >= 0, 255, 0).astype(np.uint8))
         return masks
 
-    def windows(self) -> list[Window | None]:
-        return [matching_window(mask) for mask in self.masks()]
+    def windows(self) -> list[MaskWindow | None]:
+        return [crop_mask_window(mask) for mask in self.masks()]
 
 
-def act(
+def synthetic_recording(
     body: ParametricBody,
     frames: int = 24,
     shape: dict[str, float] | None = None,
@@ -68,7 +68,7 @@ def act(
     turn_rad: float = 2 * np.pi,
     wrists_rad: float = 0.0,
     seed: int = 0,
-) -> Act:
+) -> SyntheticRecording:
     """A person who turns on the spot at 3 m with swinging arms and legs, seen at 256 x 320 pixels, 10 frames a second.
 
     noise_m: standard deviation of landmarks, at the person's depth; hands are seen without noise.
@@ -77,63 +77,63 @@ def act(
     values = body.shape_defaults.clone()
     for name, value in (shape or {}).items():
         values[body.shape_names.index(name)] = value
-    model = linearise(body, values)
+    model = linearise_body(body, values)
     time_s = np.arange(frames) / 10.0
     phase = torch.linspace(0.0, 1.0, frames, dtype=torch.float64)
     camera = Camera(focal_px, focal_px, 128.0, 160.0, 256, 320)
     root = torch.stack([0.1 * torch.sin(6 * phase), 0.02 * torch.cos(9 * phase) - 0.05, -3.0 + 0.2 * phase], dim=1)
     state = FitState(
-        _dance(phase, turn_rad, wrists_rad),
+        _synthetic_rotations(phase, turn_rad, wrists_rad),
         root,
         values.double(),
-        torch.zeros(OFFSET_COUNT, dtype=torch.float64),
-        torch.zeros(LENS_COUNT, dtype=torch.float64),
+        torch.zeros(LANDMARK_OFFSET_COUNT, dtype=torch.float64),
+        torch.zeros(INTRINSICS_COUNT, dtype=torch.float64),
     )
-    return filmed(body, model, state, camera, time_s, noise_m, seed)
+    return simulate_detections(body, model, state, camera, time_s, noise_m, seed)
 
 
-def filmed(
+def simulate_detections(
     body: ParametricBody,
-    model: FitModel,
+    model: LinearBody,
     state: FitState,
     camera: Camera,
     time_s: np.ndarray,
     noise_m: float = 0.0,
     seed: int = 0,
-) -> Act:
-    """What a detector sees of a motion of the body `model`; noise as in `act`."""
-    regressor = landmark_regressor(linearise(body, body.shape_defaults))
+) -> SyntheticRecording:
+    """What a detector sees of a motion of the body `model`; noise as in `synthetic_recording`."""
+    regressor = landmark_regressor(linearise_body(body, body.shape_defaults))
     skeleton = pose_skeleton(model, state.rotations, state.root_m)
-    world, _ = pose_points(model, skeleton, regressor.points(model, state.offsets_m))
-    hands = _hands(world[:, POSE_LANDMARKS:], camera)
-    world = world[:, :POSE_LANDMARKS]
+    world, _ = pose_points(model, skeleton, regressor.points(model, state.landmark_offsets_m))
+    hands = _hands(world[:, POSE_LANDMARK_COUNT:], camera)
+    world = world[:, :POSE_LANDMARK_COUNT]
     pixels, depth_m = project(world, camera)
     random = np.random.default_rng(seed)
     noise_px = noise_m * camera.fx / float(depth_m.mean())
     landmarks_px = pixels.numpy() + noise_px * random.standard_normal(pixels.shape)
     relative = (world - 0.5 * (world[:, 23:24] + world[:, 24:25])).numpy() * [1.0, -1.0, -1.0]
-    directions_m = relative + 2 * noise_m * random.standard_normal(relative.shape)
-    return Act(model, state, camera, time_s, landmarks_px, directions_m, hands)
+    landmarks_3d_m = relative + 2 * noise_m * random.standard_normal(relative.shape)
+    return SyntheticRecording(model, state, camera, time_s, landmarks_px, landmarks_3d_m, hands)
 
 
-def take_for_other_side(scene: Act, rows: slice | list[int]) -> None:
+def swap_left_right(scene: SyntheticRecording, rows: slice | list[int]) -> None:
     """In these frames the detector takes the person for one who faces the other way."""
-    order = mirror_permutation(PAIRS)[:POSE_LANDMARKS]
+    order = mirror_permutation(LEFT_RIGHT_PAIRS)[:POSE_LANDMARK_COUNT]
     scene.landmarks_px[rows] = scene.landmarks_px[rows][:, order]
     scene.landmarks_world_m[rows] = scene.landmarks_world_m[rows][:, order] * [1.0, 1.0, -1.0]
 
 
-def _hands(points_m: torch.Tensor, camera: Camera) -> Hands:
+def _hands(points_m: torch.Tensor, camera: Camera) -> HandLandmarks:
     """Sightings of the points of the hands that a fit looks at; the others, which it ignores, lie on one of them."""
-    copied = np.zeros(HAND_POINTS, dtype=np.int64)
+    copied = np.zeros(N_HAND_LANDMARKS, dtype=np.int64)
     copied[list(HAND_LANDMARKS)] = np.arange(len(HAND_LANDMARKS))
-    places_m = points_m.reshape(len(points_m), -1, 2, 3).transpose(1, 2)[:, :, copied]
-    pixels, _ = project(places_m.flatten(0, 2), camera)
-    in_camera = (places_m - places_m.mean(2, keepdim=True)).numpy() * [1.0, -1.0, -1.0]
-    return Hands(pixels.reshape(*places_m.shape[:3], 2).numpy(), in_camera, np.ones((len(points_m), 2)))
+    positions_m = points_m.reshape(len(points_m), -1, 2, 3).transpose(1, 2)[:, :, copied]
+    pixels, _ = project(positions_m.flatten(0, 2), camera)
+    in_camera = (positions_m - positions_m.mean(2, keepdim=True)).numpy() * [1.0, -1.0, -1.0]
+    return HandLandmarks(pixels.reshape(*positions_m.shape[:3], 2).numpy(), in_camera, np.ones((len(points_m), 2)))
 
 
-def _dance(phase: torch.Tensor, turn_rad: float, wrists_rad: float) -> torch.Tensor:
+def _synthetic_rotations(phase: torch.Tensor, turn_rad: float, wrists_rad: float) -> torch.Tensor:
     angles = torch.zeros(len(phase), len(ACTIVE_JOINTS), 3, dtype=torch.float64)
     swing = torch.sin(10 * phase)
     angles[:, ACTIVE_JOINTS.index("Hips"), 1] = turn_rad * phase
@@ -147,7 +147,7 @@ def _dance(phase: torch.Tensor, turn_rad: float, wrists_rad: float) -> torch.Ten
     return axis_angle_to_matrix(angles)
 
 
-def fitted_joint_to_world(result: FitResult, scene: Act) -> torch.Tensor:
+def fitted_joint_to_world(result: FitResult, scene: SyntheticRecording) -> torch.Tensor:
     """Where the active joints are that a fit found, and how they are turned: (n, j, 4, 4)."""
     joint_to_world = forward_kinematics(
         quaternion_to_matrix(torch.tensor(result.rotations_wxyz)),
@@ -155,10 +155,10 @@ def fitted_joint_to_world(result: FitResult, scene: Act) -> torch.Tensor:
         torch.tensor(result.body.joints_m),
         result.body.parents,
     )
-    return joint_to_world[:, list(scene.model.full_joint)].double()
+    return joint_to_world[:, list(scene.model.full_joint_indices)].double()
 
 
-def fitted_joints_m(result: FitResult, scene: Act) -> torch.Tensor:
+def fitted_joints_m(result: FitResult, scene: SyntheticRecording) -> torch.Tensor:
     """World positions of the active joints that a fit found."""
     return fitted_joint_to_world(result, scene)[..., :3, 3]
 

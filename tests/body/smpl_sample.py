@@ -138,7 +138,7 @@ def smpl_pose_of(body: SmplBody, rotations: torch.Tensor) -> np.ndarray:
 
     The world rotations Q of the A-pose are undone by the local rotations that this house has for SMPL's T-pose.
     """
-    still = body.local_rotations(torch.eye(3).repeat(1, len(body.parents), 1, 1))
+    still = body.from_smpl_rotations(torch.eye(3).repeat(1, len(body.parents), 1, 1))
     t_pose = forward_kinematics(still, torch.zeros(1, 3), torch.zeros(len(body.parents), 3), body.parents)
     bind = t_pose[0, :, :3, :3].transpose(-1, -2)
     above = torch.cat([torch.eye(3)[None], bind[body.parents[1:].tolist()]])

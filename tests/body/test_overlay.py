@@ -5,16 +5,16 @@ from pipeline.body.body import load_anny
 from pipeline.body.fit.silhouette_icp import posed_vertices
 from pipeline.body.overlay import (
     BODY_OUTLINE_RGB,
-    MARK_RGB,
     MASK_OUTLINE_RGB,
     TILE_COLUMNS,
     TILE_ROWS,
-    TILES_A_ROW,
+    TILES_PER_ROW,
+    WARNING_RGB,
     draw_overlay,
     overlay_grid,
     side_colours,
 )
-from tests.body.acting import act
+from tests.body.acting import synthetic_recording
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def tile() -> np.ndarray:
 
 def drawn(mark: str) -> np.ndarray:
     """A person who faces the camera, drawn over grey."""
-    scene = act(load_anny(), 3, turn_rad=0.0)
+    scene = synthetic_recording(load_anny(), 3, turn_rad=0.0)
     image = np.full((scene.camera.height, scene.camera.width, 3), 90, dtype=np.uint8)
     vertices = posed_vertices(scene.model, scene.state)[0]
     body = load_anny().body(load_anny().shape_defaults)
@@ -41,8 +41,8 @@ def test_both_outlines_are_drawn(tile: np.ndarray) -> None:
 
 def test_a_marked_frame_has_a_border_and_a_word(tile: np.ndarray) -> None:
     marked, short = drawn("unusable"), drawn("u")
-    red = (marked == MARK_RGB).all(-1)
-    assert not (tile == MARK_RGB).all(-1).any()
+    red = (marked == WARNING_RGB).all(-1)
+    assert not (tile == WARNING_RGB).all(-1).any()
     assert all(side.all() for side in (red[1, 1:-1], red[-2, 1:-1], red[1:-1, 1], red[1:-1, -2]))
     assert (marked != short).any()
     assert np.array_equal(marked[20:400, 20:-20], tile[20:400, 20:-20])
@@ -64,9 +64,9 @@ def test_every_face_has_a_side_colour() -> None:
 
 
 def test_grid_is_filled_up() -> None:
-    tiles = [np.full((4, 5, 3), shade, dtype=np.uint8) for shade in range(1, TILES_A_ROW + 2)]
+    tiles = [np.full((4, 5, 3), shade, dtype=np.uint8) for shade in range(1, TILES_PER_ROW + 2)]
     grid = overlay_grid(tiles)
-    assert grid.shape == (8, 5 * TILES_A_ROW, 3)
+    assert grid.shape == (8, 5 * TILES_PER_ROW, 3)
     assert grid[0, 0, 0] == 1
-    assert grid[4, 0, 0] == TILES_A_ROW + 1
+    assert grid[4, 0, 0] == TILES_PER_ROW + 1
     assert grid[4:, 5:].max() == 0

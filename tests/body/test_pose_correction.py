@@ -22,7 +22,7 @@ def test_no_correction_is_the_fitted_motion(body, correction):
     rows = torch.tensor([0, 3])
     truth = canonical_to_world(body, correction.motion)[rows]
     torch.testing.assert_close(correction.canonical_to_world(rows), truth, atol=1e-5, rtol=0)
-    assert float(correction.roughness().detach()) == 0
+    assert float(correction.temporal_roughness().detach()) == 0
     assert float(correction.size().detach()) == 0
 
 
@@ -47,11 +47,11 @@ def test_frames_between_get_the_mean_of_their_neighbours(body, correction):
 def test_roughness_grows_with_jumps_and_shrinks_with_time_between(body, correction):
     with torch.no_grad():
         correction.shift_m[2:] = 0.01
-    near = float(correction.roughness().detach())
+    near = float(correction.temporal_roughness().detach())
     with torch.no_grad():
         correction.shift_m[2] = 0.0
     # The jump now lies between frames 3 and 5, which are twice as far apart as frames 2 and 3.
-    assert float(correction.roughness().detach()) == pytest.approx(near / 2, rel=1e-5)
+    assert float(correction.temporal_roughness().detach()) == pytest.approx(near / 2, rel=1e-5)
 
 
 @pytest.mark.parametrize("size", [0.0, 3e-3, 0.4, 2.5])

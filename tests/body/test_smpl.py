@@ -10,7 +10,7 @@ import torch
 from pipeline.body.body import Motion, ParametricBody, canonical_to_world, load_anny
 from pipeline.body.fit.fit import FitOptions, FitResult, fit_body
 from pipeline.body.fit.landmark_regressor import LANDMARKS
-from pipeline.body.fit.linear_body import ACTIVE_JOINTS, GRIP_RAD, grip_rotations, relaxed_curls
+from pipeline.body.fit.linear_body import ACTIVE_JOINTS, RELAXED_CURL_RAD, finger_curl_rotations, relaxed_curls_rad
 from pipeline.body.fit.priors import shape_prior
 from pipeline.body.smpl import ARM_DIRECTIONS, FINGER_BEND_RAD, JOINT_NAMES, SmplBody, rotation_between
 from pipeline.geometry.rotation import (
@@ -19,7 +19,7 @@ from pipeline.geometry.rotation import (
     quaternion_to_axis_angle,
 )
 from pipeline.geometry.skinning import forward_kinematics, linear_blend_skinning, skinning_transforms
-from tests.body.acting import Act, act, fitted_joints_m, joint_errors_m
+from tests.body.acting import SyntheticRecording, fitted_joints_m, joint_errors_m, synthetic_recording
 from tests.body.smpl_sample import made_up_arrays, smpl_vertices
 
 FRAMES = 16
@@ -64,10 +64,10 @@ def test_arms_hang_as_those_of_the_built_in_body() -> None:
 
 
 def test_landmarks_lie_where_they_lie_on_the_built_in_body(model: SmplBody) -> None:
-    expected = load_anny().landmark_places_m
-    assert set(model.landmark_places_m) == {landmark.name for landmark in LANDMARKS}
+    expected = load_anny().landmark_positions_m
+    assert set(model.landmark_positions_m) == {landmark.name for landmark in LANDMARKS}
     for name, place in expected.items():
-        assert np.linalg.norm(np.subtract(model.landmark_places_m[name], place)) < 0.02, name
+        assert np.linalg.norm(np.subtract(model.landmark_positions_m[name], place)) < 0.02, name
 
 
 def test_shape_is_linear_in_the_t_pose_and_differentiable(smpl: SmplBody) -> None:
@@ -88,25 +88,25 @@ def test_shape_is_linear_in_the_t_pose_and_differentiable(smpl: SmplBody) -> Non
 def test_fingers_bend_towards_the_palm() -> None:
     """In SMPL's T-pose the palms face down; a bent finger's tip lies lower along the palm's normal."""
     body = SmplBody(made_up_arrays(55))
-    grip = quaternion_to_axis_angle(matrix_to_quaternion(grip_rotations(body, relaxed_curls())))
+    finger_rotations = quaternion_to_axis_angle(matrix_to_quaternion(finger_curl_rotations(body, relaxed_curls_rad())))
     for side, sign in (("Left", 1.0), ("Right", -1.0)):
         index = body.joint_names.index(f"{side}HandMiddle2")
-        hand = body.local_rotations(torch.eye(3).repeat(1, 55, 1, 1))[0, 0]
+        hand = body.from_smpl_rotations(torch.eye(3).repeat(1, 55, 1, 1))[0, 0]
         assert torch.allclose(hand, torch.eye(3))
-        assert float(grip[index].norm()) == pytest.approx(GRIP_RAD, abs=1e-6)
+        assert float(finger_rotations[index].norm()) == pytest.approx(RELAXED_CURL_RAD, abs=1e-6)
         bind = _bind_rotations(body)[body.joint_names.index(f"{side}Hand")].double()
         closing = bind @ torch.tensor([0.0, 0.0, -sign], dtype=torch.float64)  # about it a straight finger closes
-        assert grip[index] @ closing > 0.7 * GRIP_RAD
+        assert finger_rotations[index] @ closing > 0.7 * RELAXED_CURL_RAD
     assert FINGER_BEND_RAD > 0
 
 
-def test_a_body_without_fingers_has_no_grip(smpl: SmplBody) -> None:
-    assert torch.equal(grip_rotations(smpl, relaxed_curls()), torch.eye(3).double().repeat(24, 1, 1))
+def test_a_body_without_fingers_has_no_finger_rotations(smpl: SmplBody) -> None:
+    assert torch.equal(finger_curl_rotations(smpl, relaxed_curls_rad()), torch.eye(3).double().repeat(24, 1, 1))
 
 
 def _bind_rotations(body: SmplBody) -> torch.Tensor:
     """World rotations of SMPL's joints in the A-pose: what undoes the local rotations of the T-pose."""
-    t_pose = body.local_rotations(torch.eye(3).repeat(1, len(body.parents), 1, 1))
+    t_pose = body.from_smpl_rotations(torch.eye(3).repeat(1, len(body.parents), 1, 1))
     world = forward_kinematics(t_pose, torch.zeros(1, 3), torch.zeros(len(body.parents), 3), body.parents)
     return world[0, :, :3, :3].transpose(-1, -2)
 
@@ -122,7 +122,7 @@ def test_a_pose_of_smpl_is_the_same_pose_here(smpl: SmplBody) -> None:
     weights = torch.from_numpy(smpl.skin_weights)
     expected = linear_blend_skinning(t_vertices, weights, skinning_transforms(expected_pose, t_joints))
     vertices, joints = smpl.rest(smpl.shape_defaults)
-    pose = forward_kinematics(smpl.local_rotations(theta), t_joints[None, 0], joints, smpl.parents)
+    pose = forward_kinematics(smpl.from_smpl_rotations(theta), t_joints[None, 0], joints, smpl.parents)
     found = linear_blend_skinning(vertices, weights, skinning_transforms(pose, joints))
     assert torch.allclose(pose[..., :3, 3], expected_pose[..., :3, 3], atol=1e-5)
     rigid = weights.max(dim=1).values > 0.999
@@ -131,7 +131,7 @@ def test_a_pose_of_smpl_is_the_same_pose_here(smpl: SmplBody) -> None:
 
 
 @pytest.mark.parametrize("count", [24, 52])
-def test_poses_that_others_fitted_stand_where_smpl_puts_them(count: int) -> None:
+def test_converted_smpl_poses_match_smpl(count: int) -> None:
     """Shape, translation and a turned space included: every joint lies where SMPL's own formula has it."""
     arrays, body = made_up_arrays(count), SmplBody(made_up_arrays(count))
     random = np.random.default_rng(0)
@@ -140,7 +140,7 @@ def test_poses_that_others_fitted_stand_where_smpl_puts_them(count: int) -> None
     to_world = np.tile(np.eye(4, dtype=np.float32), (3, 1, 1))
     to_world[:, :3, :3] = axis_angle_to_matrix(torch.tensor([3.0, 0.2, -0.1])).numpy()
     to_world[:, :3, 3] = [0.1, -0.2, 4.0]
-    rotations, root_m = body.placed(*map(torch.from_numpy, (pose, transl, betas, to_world)))
+    rotations, root_m = body.convert_smpl_poses(*map(torch.from_numpy, (pose, transl, betas, to_world)))
     assert rotations.shape[1] == (24 if count == 24 else 22)
     for frame in range(3):
         theta = np.zeros((count, 3))
@@ -154,13 +154,13 @@ def test_poses_that_others_fitted_stand_where_smpl_puts_them(count: int) -> None
         np.testing.assert_allclose(found, expected[:22], atol=1e-4)
 
 
-def test_poses_of_the_real_data_set_stand_where_smpl_puts_them(shared_data: Path, smpl: SmplBody) -> None:
+def test_converted_poses_of_the_real_data_set_match_smpl(shared_data: Path, smpl: SmplBody) -> None:
     """InstantAvatar's own file: the surface too, where one joint alone moves it."""
     with np.load(shared_data / "formats" / "male-3-casual_test.npz") as file:
         pose = np.concatenate([file["global_orient"], file["body_pose"]], axis=1)[::20].reshape(-1, 24, 3)
         transl, betas = file["transl"][::20], np.repeat(file["betas"], len(pose), axis=0)
     here = torch.eye(4).repeat(len(pose), 1, 1)
-    rotations, root_m = smpl.placed(*map(torch.from_numpy, (pose, transl, betas)), here)
+    rotations, root_m = smpl.convert_smpl_poses(*map(torch.from_numpy, (pose, transl, betas)), here)
     body = smpl.body(torch.from_numpy(betas[0]))
     quaternions = matrix_to_quaternion(rotations).numpy()
     motion = Motion(np.arange(len(pose), dtype=np.int32), np.arange(len(pose)) / 25.0, quaternions, root_m.numpy())
@@ -173,8 +173,8 @@ def test_poses_of_the_real_data_set_stand_where_smpl_puts_them(shared_data: Path
 
 
 def test_poses_fitted_with_smpl_hold_for_models_with_its_shapes() -> None:
-    assert [SmplBody(made_up_arrays(count)).takes_smpl_poses(10) for count in (24, 52, 55)] == [True, True, False]
-    assert not SmplBody(made_up_arrays(24)).takes_smpl_poses(16)
+    assert [SmplBody(made_up_arrays(count)).accepts_smpl_poses(10) for count in (24, 52, 55)] == [True, True, False]
+    assert not SmplBody(made_up_arrays(24)).accepts_smpl_poses(16)
 
 
 def test_smallest_rotation_between_directions() -> None:
@@ -185,9 +185,9 @@ def test_smallest_rotation_between_directions() -> None:
 
 def test_betas_have_a_unit_prior(smpl: SmplBody) -> None:
     prior = shape_prior(smpl.shape_names, smpl.shape_defaults)
-    assert prior.deviation.tolist() == [1.0] * 10
-    assert prior.lowest.tolist() == [-5.0] * 10
-    assert prior.highest.tolist() == [5.0] * 10
+    assert prior.std.tolist() == [1.0] * 10
+    assert prior.lower_bound.tolist() == [-5.0] * 10
+    assert prior.upper_bound.tolist() == [5.0] * 10
 
 
 def test_a_model_with_other_joints_is_refused() -> None:
@@ -204,22 +204,22 @@ def test_a_model_with_other_joints_is_refused() -> None:
 
 
 @pytest.fixture(scope="module")
-def fitted(smpl: SmplBody) -> tuple[Act, FitResult]:
-    scene = act(smpl, FRAMES, shape=BETAS, noise_m=0.005)
-    options = FitOptions(scene.model.height_m()[0], focal_deviation=0.0, shared_frames=FRAMES, rounds=4)
+def fitted(smpl: SmplBody) -> tuple[SyntheticRecording, FitResult]:
+    scene = synthetic_recording(smpl, FRAMES, shape=BETAS, noise_m=0.005)
+    options = FitOptions(scene.model.height_m()[0], focal_relative_std=0.0, shared_frames=FRAMES, rounds=4)
     return scene, fit_body(smpl, scene.observations(scene.camera), scene.windows(), options)
 
 
-def test_the_fit_finds_a_known_pose(fitted: tuple[Act, FitResult]) -> None:
+def test_the_fit_finds_a_known_pose(fitted: tuple[SyntheticRecording, FitResult]) -> None:
     scene, result = fitted
     found = fitted_joints_m(result, scene)
     aligned, absolute = joint_errors_m(found, scene.joints_m())
     assert aligned < 0.015
     assert absolute < 0.030
-    assert np.median(result.overlap) > 0.95
+    assert np.median(result.silhouette_iou) > 0.95
 
 
-def test_the_fit_finds_a_known_shape(fitted: tuple[Act, FitResult], smpl: SmplBody) -> None:
+def test_the_fit_finds_a_known_shape(fitted: tuple[SyntheticRecording, FitResult], smpl: SmplBody) -> None:
     """The surface is nearer to the true one than the mean body scaled to its stature would be, and within 1 cm."""
     scene, result = fitted
     true = scene.model.vertices.numpy()

@@ -163,6 +163,8 @@ def test_our_shape_agrees_with_the_smplx_package(tmp_path) -> None:
     from pipeline.geometry.skinning import forward_kinematics
 
     joints = body.rest(betas)[1]
-    ours = forward_kinematics(body.local_rotations(axis_angle_to_matrix(theta)), joints[None, 0], joints, body.parents)
+    ours = forward_kinematics(
+        body.from_smpl_rotations(axis_angle_to_matrix(theta)), joints[None, 0], joints, body.parents
+    )
     found, expected = ours[0, :, :3, 3], output.joints[0, :24]
     assert torch.allclose(found - found[0], expected - expected[0], atol=1e-5)

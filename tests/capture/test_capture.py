@@ -15,7 +15,7 @@ from pipeline.capture.capture import (
     save_capture,
 )
 from pipeline.capture.contact_sheet import contact_sheet
-from pipeline.capture.hand_detector import Hands
+from pipeline.capture.hand_detector import HandLandmarks
 from pipeline.core.errors import UserError
 from pipeline.geometry.camera import Camera
 from pipeline.io.image import write_gray, write_rgb
@@ -50,7 +50,7 @@ def capture(tmp_path) -> Capture:
         mask_source="detector",
         n_video_frames=9,
         scale=0.5,
-        recorded_focal_px=88.0,
+        metadata_focal_px=88.0,
     )
 
 
@@ -65,7 +65,7 @@ def test_round_trip(capture):
 
 
 def test_hands_come_back(capture):
-    hands = Hands(*(np.random.default_rng(1).random(shape).astype(np.float32) for shape in HAND_SHAPES))
+    hands = HandLandmarks(*(np.random.default_rng(1).random(shape).astype(np.float32) for shape in HAND_SHAPES))
     save_capture(dataclasses.replace(capture, hands=hands))
     loaded = load_capture(capture.folder).hands
     assert loaded is not None
@@ -73,7 +73,7 @@ def test_hands_come_back(capture):
         np.testing.assert_array_equal(getattr(loaded, name), values, err_msg=name)
 
 
-def test_supplied_poses_lie_beside(capture):
+def test_supplied_poses_round_trip(capture):
     save_capture(dataclasses.replace(capture, smpl_poses=make_poses()))
     poses = load_capture(capture.folder).smpl_poses
     assert poses is not None
@@ -81,9 +81,9 @@ def test_supplied_poses_lie_beside(capture):
 
 
 def test_unknown_camera_stays_unknown(capture):
-    save_capture(dataclasses.replace(capture, camera=None, recorded_focal_px=None))
+    save_capture(dataclasses.replace(capture, camera=None, metadata_focal_px=None))
     assert load_capture(capture.folder).camera is None
-    assert load_capture(capture.folder).recorded_focal_px is None
+    assert load_capture(capture.folder).metadata_focal_px is None
 
 
 def test_pictures_are_found_by_position(capture):

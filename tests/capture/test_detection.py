@@ -5,12 +5,12 @@ import pytest
 
 from pipeline.capture import detection as sightings
 from pipeline.capture.capture import image_path, mask_path
-from pipeline.capture.detection import _windows, look_at_all, write_frames
-from pipeline.capture.hand_detector import no_hands
-from pipeline.capture.person_detector import Detection
-from pipeline.capture.process_pool import start_workers
-from pipeline.capture.user_files import find_supplied
-from pipeline.capture.video import Frame, open_source
+from pipeline.capture.detection import _temporal_windows, detect_in_frames, write_frames
+from pipeline.capture.hand_detector import undetected_hands
+from pipeline.capture.person_detector import PersonDetection
+from pipeline.capture.process_pool import start_process_pool
+from pipeline.capture.user_files import load_user_files
+from pipeline.capture.video import Frame, open_frame_source
 from pipeline.core.errors import UserError
 from pipeline.io.image import read_gray, read_rgb, write_gray, write_rgb
 from pipeline.io.npz import load_npz, save_npz
@@ -35,7 +35,7 @@ def folder(tmp_path):
     return tmp_path
 
 
-class OneDetector:
+class FakeDetector:
     """In the place of both detectors: the same finding in every frame but those that show nobody."""
 
     landmarks_px = np.full((33, 2), 7.0, np.float32)
@@ -45,20 +45,20 @@ class OneDetector:
         if rgb.max() < 100:
             return None
         mask = np.where(rgb[..., 0] > 100, np.uint8(255), np.uint8(0))
-        return Detection(self.landmarks_px, np.full(33, 0.5, np.float32), self.landmarks_world_m, mask)
+        return PersonDetection(self.landmarks_px, np.full(33, 0.5, np.float32), self.landmarks_world_m, mask)
 
     def count_people(self, rgb):
         return 1
 
     def look(self, rgb, *pose):
-        return no_hands()
+        return undetected_hands()
 
 
 @pytest.fixture
 def detector(monkeypatch):
     for name in ("_detector", "_hand_detector"):
-        monkeypatch.setattr(sightings, name, OneDetector)
-    return OneDetector
+        monkeypatch.setattr(sightings, name, FakeDetector)
+    return FakeDetector
 
 
 def change_landmarks(folder, **changes):
@@ -68,11 +68,11 @@ def change_landmarks(folder, **changes):
 
 
 def look(folder, stride=1, max_side_px=60):
-    source = open_source(folder / "in")
-    supplied = find_supplied(folder / "in", source)
-    with start_workers(1) as workers:
-        looked_at = range(0, source.n_frames, stride)
-        return source, supplied, look_at_all(source, supplied, looked_at, 2, max_side_px, workers)
+    source = open_frame_source(folder / "in")
+    user_files = load_user_files(folder / "in", source)
+    with start_process_pool(1) as workers:
+        frame_indices = range(0, source.n_frames, stride)
+        return source, user_files, detect_in_frames(source, user_files, frame_indices, 2, max_side_px, workers)
 
 
 def test_all_frames_are_seen_and_an_empty_one_is_not_found(folder):
@@ -80,7 +80,7 @@ def test_all_frames_are_seen_and_an_empty_one_is_not_found(folder):
     np.testing.assert_array_equal(seen.frame_index, np.arange(12))
     np.testing.assert_array_equal(np.flatnonzero(~seen.found), [5])
     np.testing.assert_array_equal(seen.landmarks_px[3, 0], [17, 20])
-    assert seen.persons[3].sum() == 300
+    assert seen.person_masks[3].sum() == 300
     assert (seen.n_people == -1).all()
     assert (seen.width, seen.height, seen.scale) == (60, 40, 1.0)
 
@@ -102,7 +102,7 @@ def test_a_supplied_mask_shows_a_person_whom_the_detector_misses(folder, detecto
     _, _, seen = look(folder)
     np.testing.assert_array_equal(np.flatnonzero(~seen.found), [5])
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(seen.landmarks_px).all(axis=(1, 2))), [3, 5])
-    assert seen.persons[3].sum() == 300
+    assert seen.person_masks[3].sum() == 300
 
 
 def test_specks_of_a_mask_show_nobody(folder):
@@ -136,12 +136,12 @@ def test_a_stride_keeps_indices_and_a_smaller_size_scales_landmarks(folder):
     assert (seen.width, seen.height, seen.scale) == (30, 20, 0.5)
 
 
-def test_chosen_frames_are_written_with_their_masks_as_given(folder):
-    source, supplied, seen = look(folder)
+def test_selected_frames_are_written_with_supplied_masks(folder):
+    source, user_files, seen = look(folder)
     out = folder / "out"
     out.mkdir()
-    with start_workers(1) as workers:
-        write_frames(source, supplied, seen, [0, 4, 11], out, 60, 1.0, workers)
+    with start_process_pool(1) as workers:
+        write_frames(source, user_files, seen, [0, 4, 11], out, 60, 1.0, workers)
     assert sorted(path.name for path in (out / "images").iterdir()) == ["000000.png", "000004.png", "000011.png"]
     for k in (0, 4, 11):
         np.testing.assert_array_equal(read_rgb(image_path(out, k)), read_rgb(folder / "in" / f"{k}.png"))
@@ -154,11 +154,11 @@ def test_where_a_mask_is_soft_the_picture_holds_the_persons_colour(folder):
     image = np.where(mask[..., None] == 128, np.uint8(107), read_rgb(folder / "in" / "4.png"))
     write_rgb(folder / "in" / "4.png", np.where(mask[..., None] == 64, np.uint8(60), image))
     write_gray(folder / "in" / "masks" / "4.png", mask)
-    source, supplied, seen = look(folder)
+    source, user_files, seen = look(folder)
     out = folder / "out"
     out.mkdir()
-    with start_workers(1) as workers:
-        write_frames(source, supplied, seen, [4], out, 60, 1.0, workers)
+    with start_process_pool(1) as workers:
+        write_frames(source, user_files, seen, [4], out, 60, 1.0, workers)
     written = read_rgb(image_path(out, 4))
     np.testing.assert_allclose(written[4:36, 16:26], 200, atol=1)
     np.testing.assert_array_equal(written[[3, 36], 16:26], 14)
@@ -175,6 +175,7 @@ def test_windows_hold_each_wanted_frame_with_its_neighbours(folder):
     _, _, seen = look(folder)
     frames = [Frame(k, k / 30, np.zeros((1, 1, 3), np.uint8), 1.0) for k in range(12)]
     windows = [
-        (position, [frame.index for frame in near]) for position, near in _windows(frames, seen, {0, 4, 6, 7, 11})
+        (position, [frame.index for frame in near])
+        for position, near in _temporal_windows(frames, seen, {0, 4, 6, 7, 11})
     ]
     assert windows == [(0, [0, 1]), (4, [3, 4]), (6, [6, 7]), (7, [6, 7, 8]), (11, [10, 11])]

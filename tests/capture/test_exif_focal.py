@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.capture.exif_focal import recorded_focal_px
-from pipeline.capture.video import open_source
+from pipeline.capture.exif_focal import metadata_focal_px
+from pipeline.capture.video import open_frame_source
 
 
 def tiff(order: str, focal_mm: int) -> bytes:
@@ -40,33 +40,33 @@ def write_folder(folder: Path, exif: bytes) -> Path:
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_exif_of_images(tmp_path: Path, order: str) -> None:
     """26 mm on 43.27 mm of film, on a diagonal of 500 pixels."""
-    source = open_source(write_folder(tmp_path / "images", tiff(order, 26)))
-    assert recorded_focal_px(source, 300, 400) == pytest.approx(26 / 43.27 * 500)
-    assert recorded_focal_px(source, 150, 200) == pytest.approx(26 / 43.27 * 250)
+    source = open_frame_source(write_folder(tmp_path / "images", tiff(order, 26)))
+    assert metadata_focal_px(source, 300, 400) == pytest.approx(26 / 43.27 * 500)
+    assert metadata_focal_px(source, 150, 200) == pytest.approx(26 / 43.27 * 250)
 
 
 @pytest.mark.parametrize("exif", [b"", b"II", tiff("<", 26)[:40], tiff("<", 0), b"nonsense" * 9])
-def test_damaged_or_empty_metadata_says_nothing(tmp_path: Path, exif: bytes) -> None:
-    assert recorded_focal_px(open_source(write_folder(tmp_path / "images", exif)), 300, 400) is None
+def test_damaged_or_empty_metadata_gives_none(tmp_path: Path, exif: bytes) -> None:
+    assert metadata_focal_px(open_frame_source(write_folder(tmp_path / "images", exif)), 300, 400) is None
 
 
-def test_pictures_without_metadata_say_nothing(tmp_path: Path) -> None:
+def test_images_without_metadata_give_none(tmp_path: Path) -> None:
     for index in range(2):
         cv2.imwrite(str(tmp_path / f"{index}.png"), np.zeros((40, 30, 3), dtype=np.uint8))
-    assert recorded_focal_px(open_source(tmp_path), 30, 40) is None
+    assert metadata_focal_px(open_frame_source(tmp_path), 30, 40) is None
 
 
-@pytest.mark.parametrize(("said", "expected"), [("26", 26 / 43.27 * 500), ("much", None), (None, None)])
-def test_quicktime_metadata_of_a_video(tmp_path: Path, said: str | None, expected: float | None) -> None:
+@pytest.mark.parametrize(("focal_text", "expected"), [("26", 26 / 43.27 * 500), ("much", None), (None, None)])
+def test_quicktime_metadata_of_a_video(tmp_path: Path, focal_text: str | None, expected: float | None) -> None:
     path = tmp_path / "phone.mov"
     with av.open(str(path), "w", options={"movflags": "use_metadata_tags"}) as container:
-        if said is not None:
-            container.metadata["com.apple.quicktime.camera.focal_length.35mm_equivalent"] = said
+        if focal_text is not None:
+            container.metadata["com.apple.quicktime.camera.focal_length.35mm_equivalent"] = focal_text
         stream = container.add_stream("mpeg4", rate=10)
         stream.width, stream.height = 64, 48
         for _ in range(3):
             picture = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), dtype=np.uint8), format="rgb24")
             container.mux(stream.encode(picture))
         container.mux(stream.encode())
-    found = recorded_focal_px(open_source(path), 300, 400)
+    found = metadata_focal_px(open_frame_source(path), 300, 400)
     assert found == (None if expected is None else pytest.approx(expected))

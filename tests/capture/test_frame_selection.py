@@ -10,7 +10,7 @@ from pipeline.capture import frame_selection as selection
 
 def test_split_rule():
     index = np.arange(24)
-    split = selection.split_of(index)
+    split = selection.assign_splits(index)
     np.testing.assert_array_equal(index[split == selection.HELDOUT], [0, 8, 16])
     np.testing.assert_array_equal(index[split == selection.VALIDATION], [4, 12, 20])
     assert (split == selection.TRAIN).sum() == 18
@@ -18,62 +18,66 @@ def test_split_rule():
 
 def test_ranges_join_neighbours_among_the_frames():
     index = np.array([0, 3, 6, 9, 12, 40])
-    assert selection.frame_ranges(index, np.array([1, 0, 1, 1, 1, 0], dtype=bool)) == "0, 6-12"
-    assert selection.frame_ranges(index, np.zeros(6, dtype=bool)) == ""
-    assert selection.frame_ranges(index, np.ones(6, dtype=bool)) == "0-40"
+    assert selection.format_frame_ranges(index, np.array([1, 0, 1, 1, 1, 0], dtype=bool)) == "0, 6-12"
+    assert selection.format_frame_ranges(index, np.zeros(6, dtype=bool)) == ""
+    assert selection.format_frame_ranges(index, np.ones(6, dtype=bool)) == "0-40"
 
 
 def moving_square(n: int, step: int) -> tuple[np.ndarray, np.ndarray]:
-    persons = np.zeros((n, 64, 96), bool)
+    person_masks = np.zeros((n, 64, 96), bool)
     for i in range(n):
-        persons[i, 10:50, 5 + step * i : 25 + step * i] = True
-    noise = np.random.default_rng(0).integers(0, 2, persons.shape)
-    return (np.where(persons, 180, 60) + noise).astype(np.uint8), persons
+        person_masks[i, 10:50, 5 + step * i : 25 + step * i] = True
+    noise = np.random.default_rng(0).integers(0, 2, person_masks.shape)
+    return (np.where(person_masks, 180, 60) + noise).astype(np.uint8), person_masks
 
 
 def test_noise_is_measured_where_nothing_moves():
     still = np.random.default_rng(1).normal(100, 4, (9, 64, 96)).astype(np.uint8)
     expected = 4 * 2 / np.sqrt(np.pi)
-    assert selection.noise_level(still) == pytest.approx(expected, rel=0.1)
+    assert selection.estimate_noise_level(still) == pytest.approx(expected, rel=0.1)
     still[:, :32, :20] = (np.arange(9) * 25)[:, None, None]
-    assert selection.noise_level(still) == pytest.approx(expected, rel=0.15)
+    assert selection.estimate_noise_level(still) == pytest.approx(expected, rel=0.15)
 
 
 def test_noise_is_never_below_rounding():
-    assert selection.noise_level(np.zeros((3, 64, 64), np.uint8)) == pytest.approx(1 / 3)
-    assert selection.noise_level(np.zeros((1, 64, 64), np.uint8)) == pytest.approx(1 / 3)
-    assert selection.noise_level(np.zeros((3, 8, 8), np.uint8)) == pytest.approx(1 / 3)
+    assert selection.estimate_noise_level(np.zeros((3, 64, 64), np.uint8)) == pytest.approx(1 / 3)
+    assert selection.estimate_noise_level(np.zeros((1, 64, 64), np.uint8)) == pytest.approx(1 / 3)
+    assert selection.estimate_noise_level(np.zeros((3, 8, 8), np.uint8)) == pytest.approx(1 / 3)
 
 
 def test_repeated_frames_are_dropped_and_motion_is_kept():
-    grays, persons = moving_square(6, step=3)
+    gray_thumbnails, person_masks = moving_square(6, step=3)
     repeat = np.array([0, 0, 1, 2, 2, 2, 3, 4, 5])
-    distinct, way = selection.distinct_frames(grays[repeat], persons[repeat], threshold=3.0)
+    distinct, cumulative_motion = selection.find_distinct_frames(
+        gray_thumbnails[repeat], person_masks[repeat], threshold=3.0
+    )
     np.testing.assert_array_equal(distinct, [1, 0, 1, 1, 0, 0, 1, 1, 1])
-    assert (np.diff(way) >= 0).all()
-    assert way[1] == way[0] == 0
-    assert way[5] == way[3] < way[6]
+    assert (np.diff(cumulative_motion) >= 0).all()
+    assert cumulative_motion[1] == cumulative_motion[0] == 0
+    assert cumulative_motion[5] == cumulative_motion[3] < cumulative_motion[6]
 
 
 def test_slow_motion_adds_up_until_a_frame_counts():
-    grays, persons = moving_square(20, step=1)
-    one_step = selection.change(grays[0], grays[1], persons[0] | persons[1])
-    distinct, _ = selection.distinct_frames(grays, persons, threshold=1.5 * one_step)
+    gray_thumbnails, person_masks = moving_square(20, step=1)
+    one_step = selection.mean_absolute_difference(
+        gray_thumbnails[0], gray_thumbnails[1], person_masks[0] | person_masks[1]
+    )
+    distinct, _ = selection.find_distinct_frames(gray_thumbnails, person_masks, threshold=1.5 * one_step)
     np.testing.assert_array_equal(np.flatnonzero(distinct), np.arange(0, 20, 2))
 
 
 def test_change_without_a_person_is_zero():
     gray = np.zeros((4, 4), np.uint8)
-    assert selection.change(gray, gray + np.uint8(9), np.zeros((4, 4), bool)) == 0
+    assert selection.mean_absolute_difference(gray, gray + np.uint8(9), np.zeros((4, 4), bool)) == 0
 
 
 @given(st.integers(20, 300), st.integers(16, 120), st.integers(0, 2**31))
-def test_choice_covers_the_way_and_keeps_the_split(n, max_frames, seed):
+def test_selection_covers_motion_range_and_keeps_split(n, max_frames, seed):
     rng = np.random.default_rng(seed)
     frame_index = np.sort(rng.choice(4 * n, n, replace=False)).astype(np.int32)
-    way = np.cumsum(rng.exponential(size=n))
-    chosen = selection.choose_frames(frame_index, way, max_frames)
-    split = selection.split_of(frame_index)
+    cumulative_motion = np.cumsum(rng.exponential(size=n))
+    chosen = selection.select_frames_by_motion(frame_index, cumulative_motion, max_frames)
+    split = selection.assign_splits(frame_index)
     assert chosen.sum() <= max_frames
     for kind, quota in (
         (0, max_frames - 2 * round(max_frames / 8)),
@@ -86,10 +90,10 @@ def test_choice_covers_the_way_and_keeps_the_split(n, max_frames, seed):
             assert chosen[members[[0, -1]]].all()
 
 
-def test_choice_is_even_along_the_way_not_in_time():
+def test_selection_is_uniform_in_motion_not_in_time():
     frame_index = np.arange(800, dtype=np.int32)
-    way = np.concatenate([np.linspace(0, 10, 600), np.linspace(10, 100, 201)[1:]])
-    chosen = way[selection.choose_frames(frame_index, way, 80)]
+    cumulative_motion = np.concatenate([np.linspace(0, 10, 600), np.linspace(10, 100, 201)[1:]])
+    chosen = cumulative_motion[selection.select_frames_by_motion(frame_index, cumulative_motion, 80)]
     assert (chosen > 10).mean() == pytest.approx(0.9, abs=0.03)
 
 
@@ -106,6 +110,6 @@ def test_yaw_of_a_turned_torso(yaw_deg):
 
 
 def test_widest_unseen_arc():
-    assert selection.largest_gap_rad(np.radians([0.0, 90, 200, 350])) == pytest.approx(np.radians(150))
-    assert selection.largest_gap_rad(np.array([1.0])) == pytest.approx(2 * np.pi)
-    assert selection.largest_gap_rad(np.array([np.nan])) == pytest.approx(2 * np.pi)
+    assert selection.largest_yaw_gap_rad(np.radians([0.0, 90, 200, 350])) == pytest.approx(np.radians(150))
+    assert selection.largest_yaw_gap_rad(np.array([1.0])) == pytest.approx(2 * np.pi)
+    assert selection.largest_yaw_gap_rad(np.array([np.nan])) == pytest.approx(2 * np.pi)

@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipeline.capture.hand_detector import HandDetector, no_hands, pixels_per_metre, stack_hands
-from pipeline.capture.person_detector import LANDMARK_NAMES, Detection, PersonDetector
-from pipeline.capture.video import open_source, read_frames
+from pipeline.capture.hand_detector import HandDetector, image_scale_px_per_m, stack_hands, undetected_hands
+from pipeline.capture.person_detector import LANDMARK_NAMES, PersonDetection, PersonDetector
+from pipeline.capture.video import open_frame_source, read_frames
 
 
 @pytest.fixture(scope="module")
@@ -17,12 +17,12 @@ def detector() -> HandDetector:
 
 @pytest.fixture(scope="module")
 def photograph(shared_data) -> np.ndarray:
-    source = open_source(shared_data / "real" / "dakse" / "video.mp4")
+    source = open_frame_source(shared_data / "real" / "dakse" / "video.mp4")
     return next(read_frames(source, lambda index: index == 185, 2000)).rgb
 
 
 @pytest.fixture(scope="module")
-def person(photograph) -> Detection:
+def person(photograph) -> PersonDetection:
     found = PersonDetector().detect(photograph)
     assert found is not None
     return found
@@ -30,8 +30,8 @@ def person(photograph) -> Detection:
 
 def test_a_hand_seen_from_its_back_is_found_and_the_hidden_one_is_not(detector, photograph, person):
     hands = detector.look(photograph, person.landmarks_px, person.visibility, person.landmarks_world_m)
-    assert hands.own_side[0] > 0.9
-    assert hands.own_side[1] == 0.0  # behind the back
+    assert hands.handedness_score[0] > 0.9
+    assert hands.handedness_score[1] == 0.0  # behind the back
     assert np.isnan(hands.landmarks_px[1]).all()
     wrist_px = person.landmarks_px[LANDMARK_NAMES.index("left_wrist")]
     points_px = hands.landmarks_px[0]
@@ -49,48 +49,48 @@ def test_the_other_hand_is_known_as_such(detector, photograph, person):
     mirrored = np.ascontiguousarray(photograph[:, ::-1])
     pose_px = person.landmarks_px * [-1, 1] + [photograph.shape[1], 0]
     hands = detector.look(mirrored, pose_px.astype(np.float32), person.visibility, person.landmarks_world_m)
-    assert 0.0 < hands.own_side[0] < 0.1
+    assert 0.0 < hands.handedness_score[0] < 0.1
 
 
 def test_a_small_hand_is_not_looked_at(detector, photograph, person):
     small = np.ascontiguousarray(photograph[::4, ::4])
     hands = detector.look(small, person.landmarks_px / 4, person.visibility, person.landmarks_world_m)
-    assert (hands.own_side == 0.0).all()
+    assert (hands.handedness_score == 0.0).all()
 
 
 def test_a_hand_that_the_pose_calls_hidden_is_not_looked_at(detector, photograph, person):
     visibility = person.visibility.copy()
     visibility[LANDMARK_NAMES.index("left_wrist")] = 0.2
     hands = detector.look(photograph, person.landmarks_px, visibility, person.landmarks_world_m)
-    assert hands.own_side[0] == 0.0
+    assert hands.handedness_score[0] == 0.0
 
 
 def test_wrist_pinky_and_index_show_where_a_hand_is(detector, monkeypatch):
     """In this order MediaPipe's graph takes them, as shares of the picture's sides."""
-    told = []
+    process_inputs = []
 
     def process(inputs):
-        told.append([(point.x, point.y) for point in inputs["wrist_and_knuckles"].landmark])
+        process_inputs.append([(point.x, point.y) for point in inputs["wrist_and_knuckles"].landmark])
         return SimpleNamespace(landmarks=None)
 
     monkeypatch.setattr(detector, "_graph", SimpleNamespace(process=process))
     pose_px = np.stack([10.0 * np.arange(33), 300.0 - np.arange(33)], axis=1)
     rgb = np.zeros((300, 400, 3), np.uint8)
     detector.look(rgb, pose_px, np.ones(33), np.random.default_rng(0).normal(size=(33, 3)) * 0.01)
-    for side, points in zip(("left", "right"), told, strict=True):
+    for side, points in zip(("left", "right"), process_inputs, strict=True):
         rows = [LANDMARK_NAMES.index(f"{side}_{name}") for name in ("wrist", "pinky", "index")]
         np.testing.assert_allclose(points, pose_px[rows] / (400, 300), atol=1e-6)
 
 
 def test_hands_are_stacked_and_taken_apart():
-    one, other = no_hands(), no_hands()
-    other.own_side[1] = 0.75
+    one, other = undetected_hands(), undetected_hands()
+    other.handedness_score[1] = 0.75
     both = stack_hands([one, other])
     assert both.landmarks_px.shape == (2, 2, 21, 2)
-    np.testing.assert_array_equal(both.rows([1, 0]).own_side, [[0, 0.75], [0, 0]])
+    np.testing.assert_array_equal(both.rows([1, 0]).handedness_score, [[0, 0.75], [0, 0]])
 
 
 def test_scale_is_independent_of_place():
     points_m = np.random.default_rng(0).normal(size=(5, 9, 3))
     points_px = 250.0 * points_m[..., :2] + np.arange(5)[:, None, None]
-    np.testing.assert_allclose(pixels_per_metre(points_px, points_m), np.full(5, 250.0))
+    np.testing.assert_allclose(image_scale_px_per_m(points_px, points_m), np.full(5, 250.0))

@@ -6,27 +6,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.capture.detection import Sightings
-from pipeline.capture.hand_detector import no_hands
-from pipeline.capture.input_checks import refuse_bad_input, warn_of_gaps
+from pipeline.capture.detection import Detections
+from pipeline.capture.hand_detector import undetected_hands
+from pipeline.capture.input_checks import check_input, warn_about_input
 from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
 
 PATH = Path("clip.mp4")
 
 
-def screened(n: int) -> Sightings:
-    return Sightings(
+def make_detections(n: int) -> Detections:
+    return Detections(
         frame_index=np.arange(n, dtype=np.int32),
         time_s=np.arange(n) / 30,
         found=np.ones(n, bool),
         n_people=np.where(np.arange(n) % 4 == 0, 1, -1).astype(np.int32),
-        grays=np.full((n, 20, 20), 100, np.uint8),
-        persons=np.ones((n, 20, 20), bool),
+        gray_thumbnails=np.full((n, 20, 20), 100, np.uint8),
+        person_masks=np.ones((n, 20, 20), bool),
         landmarks_px=np.full((n, 33, 2), 50, np.float32),
         landmarks_visibility=np.ones((n, 33), np.float32),
         landmarks_world_m=np.zeros((n, 33, 3), np.float32),
-        hands=no_hands(n),
+        hands=undetected_hands(n),
         masks_png=(b"",) * n,
         width=100,
         height=100,
@@ -35,26 +35,26 @@ def screened(n: int) -> Sightings:
 
 
 @pytest.fixture
-def good() -> Sightings:
-    return screened(20)
+def good() -> Detections:
+    return make_detections(20)
 
 
-def changed(good: Sightings, name: str, where, value) -> Sightings:
+def changed(good: Detections, name: str, where, value) -> Detections:
     array = getattr(good, name).copy()
     array[where] = value
     return dataclasses.replace(good, **{name: array})
 
 
-def test_a_good_recording_passes_without_a_word(good):
-    refuse_bad_input(good, PATH, 16)
-    warn_of_gaps(good, 0.5, PATH)
+def test_good_recording_passes_without_warning(good):
+    check_input(good, PATH, 16)
+    warn_about_input(good, 0.5, PATH)
     assert take_warnings() == []
 
 
 @pytest.mark.parametrize(
     ("name", "where", "value", "message"),
     [
-        ("grays", slice(None), 3, "all frames of clip.mp4 are black"),
+        ("gray_thumbnails", slice(None), 3, "all frames of clip.mp4 are black"),
         ("n_people", [4, 8], 3, r"several people \(for example in frame 4\)"),
         ("found", slice(None), False, "no person was found"),
         ("found", slice(5, None), False, "only 5 of 20 frames"),
@@ -66,9 +66,9 @@ def test_a_good_recording_passes_without_a_word(good):
         ("landmarks_world_m", (slice(5, 20), 11, 2), np.nan, "known, in pixels and in 3D, in only 5 of the 20"),
     ],
 )
-def test_what_makes_no_avatar_is_refused(good, name, where, value, message):
+def test_unusable_recording_is_refused(good, name, where, value, message):
     with pytest.raises(UserError, match=message):
-        refuse_bad_input(changed(good, name, where, value), PATH, 16)
+        check_input(changed(good, name, where, value), PATH, 16)
 
 
 @pytest.mark.parametrize(
@@ -83,39 +83,39 @@ def test_what_makes_no_avatar_is_refused(good, name, where, value, message):
         ("landmarks_px", (slice(None), [27, 28]), np.nan),
         ("landmarks_px", (slice(None), slice(25, 33)), np.nan),
         ("landmarks_px", (slice(16, 20), 23), np.nan),
-        ("grays", slice(0, 19), 0),
+        ("gray_thumbnails", slice(0, 19), 0),
     ],
 )
-def test_what_is_bearable_passes(good, name, where, value):
-    refuse_bad_input(changed(good, name, where, value), PATH, 16)
+def test_tolerable_defects_pass(good, name, where, value):
+    check_input(changed(good, name, where, value), PATH, 16)
 
 
 def test_feet_are_cut_off_whatever_is_unknown_of_them(good):
     """The other foot's points are nan in frames 2 and 3; in frame 9, where all are, nothing is known."""
     points = good.landmarks_px.copy()
     points[2:4, 31, 1], points[2:4, 30], points[9, 29:33] = 101.0, np.nan, np.nan
-    warn_of_gaps(dataclasses.replace(good, landmarks_px=points), 0.5, PATH)
+    warn_about_input(dataclasses.replace(good, landmarks_px=points), 0.5, PATH)
     assert [warning.endswith("the avatar: 2-3") for warning in take_warnings()] == [True]
 
 
-def filmed(shifts_px: list[int], levels: list[int]) -> Sightings:
+def make_moving_scene(shifts_px: list[int], levels: list[int]) -> Detections:
     """A person as a bright bar that walks before a wall of patches, which the camera's shift and the light change."""
     wall = np.random.default_rng(0).integers(60, 180, (16, 40), dtype=np.uint8).repeat(8, axis=0).repeat(8, axis=1)
     n = len(shifts_px)
-    persons = np.zeros((n, 128, 320), bool)
+    person_masks = np.zeros((n, 128, 320), bool)
     for k in range(n):
-        persons[k, 20:120, 20 + 10 * k : 60 + 10 * k] = True
+        person_masks[k, 20:120, 20 + 10 * k : 60 + 10 * k] = True
     scenes = np.stack([np.roll(wall, shift, axis=1) + level for shift, level in zip(shifts_px, levels, strict=True)])
     noise = np.random.default_rng(1).integers(-3, 4, scenes.shape)
     # A shadow falls on the wall beside the person, whose mask misses a hem of two pixels.
-    shadows = np.roll(persons, 30, axis=2) & ~persons
-    grays = np.where(persons, 240, np.where(shadows, 0.6 * scenes, scenes) + noise).astype(np.uint8)
-    masks = persons & np.roll(persons, 2, axis=2)
-    return dataclasses.replace(screened(n), grays=grays, persons=masks)
+    shadows = np.roll(person_masks, 30, axis=2) & ~person_masks
+    gray_thumbnails = np.where(person_masks, 240, np.where(shadows, 0.6 * scenes, scenes) + noise).astype(np.uint8)
+    masks = person_masks & np.roll(person_masks, 2, axis=2)
+    return dataclasses.replace(make_detections(n), gray_thumbnails=gray_thumbnails, person_masks=masks)
 
 
 @pytest.mark.parametrize(
-    ("shifts_px", "levels", "said"),
+    ("shifts_px", "levels", "expected_text"),
     [
         ([0] * 20, [0] * 20, None),
         ([0] * 19 + [6], [0] * 20, None),
@@ -125,14 +125,14 @@ def filmed(shifts_px: list[int], levels: list[int]) -> Sightings:
     ],
     ids=["still", "one jolt", "pushed", "in the hand", "brighter"],
 )
-def test_a_camera_that_moves_is_told(shifts_px, levels, said):
-    warn_of_gaps(filmed(shifts_px, levels), 0.5, PATH)
+def test_moving_camera_is_reported(shifts_px, levels, expected_text):
+    warn_about_input(make_moving_scene(shifts_px, levels), 0.5, PATH)
     warnings = take_warnings()
-    assert [said in warning for warning in warnings] == ([True] if said else []), warnings
+    assert [expected_text in warning for warning in warnings] == ([True] if expected_text else []), warnings
 
 
 @pytest.mark.parametrize(
-    ("name", "where", "value", "unseen_rad", "message"),
+    ("name", "where", "value", "unseen_arc_rad", "message"),
     [
         ("found", [2, 3, 9], False, 0.5, "3 of 20 frames of clip.mp4 show no person and are dropped: 2-3, 9"),
         ("landmarks_px", (slice(0, 4), 31, 1), 101.0, 0.5, "feet are cut off in 4 frames of clip.mp4; they will"),
@@ -140,22 +140,27 @@ def test_a_camera_that_moves_is_told(shifts_px, levels, said):
         ("found", [], False, np.pi, "never seen from 180 degrees"),
     ],
 )
-def test_what_the_run_goes_on_without_is_said(good, name, where, value, unseen_rad, message):
-    warn_of_gaps(changed(good, name, where, value), unseen_rad, PATH)
+def test_missing_data_is_reported(good, name, where, value, unseen_arc_rad, message):
+    warn_about_input(changed(good, name, where, value), unseen_arc_rad, PATH)
     assert [message in warning for warning in take_warnings()] == [True]
 
 
-def test_a_large_picture_of_a_small_person_is_told(good):
+def test_small_person_in_large_image_is_reported(good):
     """3840 x 2160 was shrunk to 1280 x 720, half of whose height the person fills; 640 px need a side of 2276."""
-    persons = np.zeros((20, 18, 32), bool)
-    persons[:, 4:13, 14:18] = True
+    person_masks = np.zeros((20, 18, 32), bool)
+    person_masks[:, 4:13, 14:18] = True
     small = dataclasses.replace(
-        good, persons=persons, grays=np.full((20, 18, 32), 100, np.uint8), width=1280, height=720, scale=1 / 3
+        good,
+        person_masks=person_masks,
+        gray_thumbnails=np.full((20, 18, 32), 100, np.uint8),
+        width=1280,
+        height=720,
+        scale=1 / 3,
     )
-    warn_of_gaps(small, 0.5, PATH)
+    warn_about_input(small, 0.5, PATH)
     (message,) = take_warnings()
     assert "1080 px tall in clip.mp4 and 360 px" in message
     assert "frames.max_side_px=2276" in message
-    warn_of_gaps(dataclasses.replace(small, scale=1.0), 0.5, PATH)
-    warn_of_gaps(dataclasses.replace(small, width=2560, height=1440), 0.5, PATH)
+    warn_about_input(dataclasses.replace(small, scale=1.0), 0.5, PATH)
+    warn_about_input(dataclasses.replace(small, width=2560, height=1440), 0.5, PATH)
     assert take_warnings() == []

@@ -50,7 +50,7 @@ def detector_mask(alpha: np.ndarray, cell_px: float = 4.0, shift_px: int = 1) ->
 def test_sharpened_mask_follows_the_image():
     alpha = figure()
     guess = detector_mask(alpha)
-    sharp = matte.sharpen_mask(composite(alpha), guess)
+    sharp = matte.estimate_alpha_matte(composite(alpha), guess)
     before = intersection_over_union(guess > 127, alpha > 0.5)
     after = intersection_over_union(sharp > 0.5, alpha > 0.5)
     assert before < 0.94
@@ -62,25 +62,25 @@ def test_the_gap_between_arm_and_trunk_stays():
     alpha = figure()
     gap = (slice(150, 158), slice(112, 121))
     assert alpha[gap].max() == 0
-    assert matte.sharpen_mask(composite(alpha), detector_mask(alpha))[gap].max() < 0.5
+    assert matte.estimate_alpha_matte(composite(alpha), detector_mask(alpha))[gap].max() < 0.5
 
 
 def test_a_trim_in_the_walls_colour_stays_with_the_person():
     alpha = figure()
     image = np.where(alpha[..., None] > 0.5, np.uint8([190, 40, 40]), np.uint8([200, 205, 200])).astype(np.uint8)
     image[150:153][alpha[150:153] > 0.5] = (212, 214, 210)
-    sharp = matte.sharpen_mask(image, detector_mask(alpha, shift_px=0))
+    sharp = matte.estimate_alpha_matte(image, detector_mask(alpha, shift_px=0))
     assert sharp[150:153, 130:190].min() > 0.5
 
 
 def test_without_a_person_the_mask_is_empty():
-    assert not matte.sharpen_mask(composite(figure()), np.zeros((320, 320), np.uint8)).any()
+    assert not matte.estimate_alpha_matte(composite(figure()), np.zeros((320, 320), np.uint8)).any()
 
 
 def test_person_and_wall_of_one_colour_keep_the_detectors_outline():
     alpha = figure()
     guess = detector_mask(alpha, shift_px=0)
-    sharp = matte.sharpen_mask(np.full((320, 320, 3), 90, np.uint8), guess)
+    sharp = matte.estimate_alpha_matte(np.full((320, 320, 3), 90, np.uint8), guess)
     assert intersection_over_union(sharp > 0.5, guess > 127) > 0.97
 
 
@@ -91,7 +91,7 @@ def test_clean_alpha_drops_specks_and_pinholes_and_keeps_the_rim_soft():
     alpha[150, 150] = 0.0
     alpha[40:60, 40:50] = 0.1
     alpha[230:233, 5:8] = 1.0
-    clean = matte.clean_alpha(alpha)
+    clean = matte.clean_alpha_matte(alpha)
     assert clean[230:233, 5:8].max() == 0
     assert clean[150, 150] == 1
     assert clean[45:55, 44:46].max() == 0
@@ -104,7 +104,7 @@ def test_a_large_part_that_is_cut_off_stays():
     alpha = np.zeros((100, 100), np.float32)
     alpha[5:60, 20:80] = 1.0
     alpha[65:95, 40:60] = 1.0
-    assert matte.clean_alpha(alpha)[80, 50] == 1
+    assert matte.clean_alpha_matte(alpha)[80, 50] == 1
 
 
 def test_flicker_goes_where_the_image_stands_still_and_motion_stays():
@@ -113,15 +113,15 @@ def test_flicker_goes_where_the_image_stands_still_and_motion_stays():
     masks[[0, 2], 10:30, 5:20] = 255
     images[1, 5:35, 35:55] = 200
     masks[1, 8:32, 38:52] = 255
-    steady = matte.steady_mask(images, masks, centre=1, noise=1.0)
-    np.testing.assert_array_equal(steady[12:28, 7:18], 170)
-    np.testing.assert_array_equal(steady[10:30, 40:50], 255)
+    smoothed = matte.smooth_mask_temporally(images, masks, centre=1, noise=1.0)
+    np.testing.assert_array_equal(smoothed[12:28, 7:18], 170)
+    np.testing.assert_array_equal(smoothed[10:30, 40:50], 255)
 
 
 def test_one_mask_alone_is_left_as_it_is():
     mask = detector_mask(figure())
     image = composite(figure())
-    np.testing.assert_array_equal(matte.steady_mask(image[None], mask[None], 0, 1.0), mask)
+    np.testing.assert_array_equal(matte.smooth_mask_temporally(image[None], mask[None], 0, 1.0), mask)
 
 
 def test_what_the_detector_misses_before_a_painted_backdrop_is_added():
@@ -130,16 +130,18 @@ def test_what_the_detector_misses_before_a_painted_backdrop_is_added():
     image[3:7, 3:7] = 90
     guess = detector_mask(alpha, shift_px=0)
     guess[260:] = 0
-    mended = matte.with_painted_backdrop(image, guess)
-    assert intersection_over_union(mended > 127, alpha > 0.5) > 0.95 > intersection_over_union(guess > 127, alpha > 0.5)
-    assert mended[:10, :10].max() == 0
+    extended = matte.extend_mask_on_uniform_background(image, guess)
+    assert (
+        intersection_over_union(extended > 127, alpha > 0.5) > 0.95 > intersection_over_union(guess > 127, alpha > 0.5)
+    )
+    assert extended[:10, :10].max() == 0
 
 
 def test_a_camera_sees_no_painted_backdrop():
     alpha = figure()
     guess = detector_mask(alpha)
     guess[260:] = 0
-    np.testing.assert_array_equal(matte.with_painted_backdrop(composite(alpha), guess), guess)
+    np.testing.assert_array_equal(matte.extend_mask_on_uniform_background(composite(alpha), guess), guess)
 
 
 def test_outline_is_the_border_of_a_square():
@@ -147,24 +149,24 @@ def test_outline_is_the_border_of_a_square():
     mask[2:7, 2:7] = True
     expected = mask.copy()
     expected[3:6, 3:6] = False
-    np.testing.assert_array_equal(matte.outline(mask), expected)
+    np.testing.assert_array_equal(matte.inner_boundary(mask), expected)
 
 
 def test_shadow_far_from_the_outline_gains_no_area():
     alpha = figure()
     image = composite(alpha)
     image[290:310, 40:100] = (40, 45, 90)
-    assert matte.sharpen_mask(image, detector_mask(alpha))[290:310, 40:100].max() == 0
+    assert matte.estimate_alpha_matte(image, detector_mask(alpha))[290:310, 40:100].max() == 0
 
 
-def soft_disc(soft_px: float = 1.0) -> np.ndarray:
+def make_soft_disc(soft_px: float = 1.0) -> np.ndarray:
     """Alpha of a disc with a soft rim, 0..255."""
     rows, columns = np.mgrid[:SIDE_PX, :SIDE_PX] + 0.5
     distance = 20.0 - np.hypot(rows - 32.0, columns - 32.0)
     return np.rint(255.0 * np.clip(0.5 + distance / (2.0 * soft_px), 0.0, 1.0)).astype(np.uint8)
 
 
-def laid_over(person: tuple, backdrop: tuple, alpha: np.ndarray) -> np.ndarray:
+def composite_colours(person: tuple, backdrop: tuple, alpha: np.ndarray) -> np.ndarray:
     share = alpha[..., None] / 255.0
     return np.rint(share * np.array(person) + (1.0 - share) * np.array(backdrop)).astype(np.uint8)
 
@@ -173,9 +175,9 @@ def laid_over(person: tuple, backdrop: tuple, alpha: np.ndarray) -> np.ndarray:
     ("person", "backdrop"), [((200, 40, 90), (20, 180, 60)), ((250, 250, 255), (0, 0, 3)), ((9, 0, 4), (255, 255, 255))]
 )
 def test_plain_colours_are_found_again_to_the_level(person: tuple, backdrop: tuple) -> None:
-    alpha = soft_disc()
+    alpha = make_soft_disc()
     assert ((alpha > 0) & (alpha < 255)).sum() > 100
-    found = matte.without_backdrop(laid_over(person, backdrop, alpha), alpha)
+    found = matte.decontaminate_colours(composite_colours(person, backdrop, alpha), alpha)
     np.testing.assert_allclose(found[alpha > 0], np.broadcast_to(person, (int((alpha > 0).sum()), 3)), atol=1)
 
 
@@ -187,74 +189,79 @@ def test_a_person_before_a_striped_wall_loses_most_of_it() -> None:
     person = np.where((rows < 190)[..., None], (190, 60, 50), (40, 45, 90))
     rim = (alpha > 0) & (alpha < 255)
     before, after = (
-        np.abs(found.astype(float) - person)[rim].mean() for found in (image, matte.without_backdrop(image, alpha))
+        np.abs(found.astype(float) - person)[rim].mean() for found in (image, matte.decontaminate_colours(image, alpha))
     )
     assert after < 0.25 * before
 
 
 def test_the_person_as_seen_in_a_soft_pixel_stays() -> None:
     """A rim of its own colour, half covered: half of what differs from the person further in is still there."""
-    alpha = soft_disc()
+    alpha = make_soft_disc()
     rim = (alpha > 0) & (alpha < 255)
     share = alpha[rim, None] / 255.0
-    image = laid_over((100, 100, 100), (0, 200, 0), alpha)
+    image = composite_colours((100, 100, 100), (0, 200, 0), alpha)
     image[rim] = np.rint(share * (180, 100, 100) + (1.0 - share) * (0, 200, 0))
-    found = matte.without_backdrop(image, alpha)[rim]
+    found = matte.decontaminate_colours(image, alpha)[rim]
     np.testing.assert_allclose(found, 100 + share * (80, 0, 0), atol=1)
 
 
 def test_pixels_that_are_not_soft_stay_as_they_are() -> None:
     image = np.random.default_rng(0).integers(0, 256, (SIDE_PX, SIDE_PX, 3), dtype=np.uint8)
-    alpha = soft_disc()
+    alpha = make_soft_disc()
     sure = (alpha == 0) | (alpha == 255)
-    found = matte.without_backdrop(image, alpha)
+    found = matte.decontaminate_colours(image, alpha)
     np.testing.assert_array_equal(found[sure], image[sure])
     assert (found[~sure] != image[~sure]).any()
 
 
 @pytest.mark.parametrize(
     "alpha",
-    [np.where(soft_disc() > 127, 255, 0), soft_disc() * 0, np.maximum(soft_disc(), 99), np.minimum(soft_disc(), 99)],
+    [
+        np.where(make_soft_disc() > 127, 255, 0),
+        make_soft_disc() * 0,
+        np.maximum(make_soft_disc(), 99),
+        np.minimum(make_soft_disc(), 99),
+    ],
 )
 def test_without_a_rim_or_without_one_of_its_sides_nothing_changes(alpha: np.ndarray) -> None:
     image = np.random.default_rng(0).integers(0, 256, (SIDE_PX, SIDE_PX, 3), dtype=np.uint8)
-    np.testing.assert_array_equal(matte.without_backdrop(image, alpha.astype(np.uint8)), image)
+    np.testing.assert_array_equal(matte.decontaminate_colours(image, alpha.astype(np.uint8)), image)
 
 
 def test_a_picture_of_one_colour_stays() -> None:
     image = np.full((SIDE_PX, SIDE_PX, 3), 77, np.uint8)
-    np.testing.assert_array_equal(matte.without_backdrop(image, soft_disc(3.0)), image)
+    np.testing.assert_array_equal(matte.decontaminate_colours(image, make_soft_disc(3.0)), image)
 
 
 def test_a_strand_too_thin_to_be_sure_takes_the_colours_around_it() -> None:
     """The nearest sure pixels of each side are asked for, wherever they lie; a hair of two soft pixels has them far."""
-    alpha = soft_disc()
+    alpha = make_soft_disc()
     alpha[:11, 30:32] = 128
-    image = laid_over((200, 40, 90), (20, 180, 60), alpha)
+    image = composite_colours((200, 40, 90), (20, 180, 60), alpha)
     np.testing.assert_allclose(
-        matte.without_backdrop(image, alpha)[:11, 30:32], np.broadcast_to((200, 40, 90), (11, 2, 3)), atol=1
+        matte.decontaminate_colours(image, alpha)[:11, 30:32], np.broadcast_to((200, 40, 90), (11, 2, 3)), atol=1
     )
 
 
-def test_the_picture_given_is_not_written_to() -> None:
-    image = laid_over((200, 40, 90), (20, 180, 60), soft_disc())
+def test_input_image_is_not_modified() -> None:
+    image = composite_colours((200, 40, 90), (20, 180, 60), make_soft_disc())
     before = image.copy()
-    matte.without_backdrop(image, soft_disc())
+    matte.decontaminate_colours(image, make_soft_disc())
     np.testing.assert_array_equal(image, before)
 
 
 @pytest.mark.parametrize("factor", [1.0, 0.8, 0.37])
 def test_a_smaller_picture_of_a_person_holds_no_backdrop(factor: float) -> None:
     """A premultiplied picture shrinks like any other; the straight colours must be those that it then has."""
-    alpha = soft_disc().astype(np.float32) / 255.0
+    alpha = make_soft_disc().astype(np.float32) / 255.0
     image = np.random.default_rng(0).random((SIDE_PX, SIDE_PX, 3), dtype=np.float32)
     size = (round(factor * SIDE_PX), round(factor * SIDE_PX) - 3)
-    colour, reduced = matte.shrink(image, alpha, size)
+    colour, reduced = matte.resize_premultiplied(image, alpha, size)
     assert colour.shape == (*size[::-1], 3)
     np.testing.assert_allclose(
         colour * reduced[..., None], cv2.resize(image * alpha[..., None], size, interpolation=cv2.INTER_AREA), atol=1e-6
     )
-    plain, _ = matte.shrink(np.where(alpha[..., None] > 0, np.float32(0.7), image), alpha, size)
+    plain, _ = matte.resize_premultiplied(np.where(alpha[..., None] > 0, np.float32(0.7), image), alpha, size)
     np.testing.assert_allclose(plain[reduced > 1e-3], 0.7, atol=1e-3)
     assert 0.1 < (reduced > 1e-3).mean() < 0.5
 
@@ -262,16 +269,16 @@ def test_a_smaller_picture_of_a_person_holds_no_backdrop(factor: float) -> None:
 def test_real_video_gets_closer_to_the_green_screen_key(shared_data):
     """The key at half of the local green, see docs/decisions.md; three frames of the full turn."""
     from pipeline.capture.person_detector import PersonDetector
-    from pipeline.capture.video import open_source, read_frames
+    from pipeline.capture.video import open_frame_source, read_frames
 
     detector = PersonDetector()
-    source = open_source(shared_data / "real" / "dakse" / "video.mp4")
+    source = open_frame_source(shared_data / "real" / "dakse" / "video.mp4")
     for frame in read_frames(source, {0, 64, 140}.__contains__, 2000):
         found = detector.detect(frame.rgb)
         assert found is not None
         truth = half_key(frame.rgb)
         before = intersection_over_union(found.mask > 127, truth)
-        after = intersection_over_union(matte.sharpen_mask(frame.rgb, found.mask) > 0.5, truth)
+        after = intersection_over_union(matte.estimate_alpha_matte(frame.rgb, found.mask) > 0.5, truth)
         assert after > max(0.98, before + 0.005)
 
 

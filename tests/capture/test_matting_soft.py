@@ -68,8 +68,8 @@ def with_gap(gap_px: int) -> tuple[np.ndarray, tuple[slice, slice]]:
 def test_blur_is_measured_whatever_the_contrast(blur_px: float, contrast: float) -> None:
     true = figure()
     image = 0.1 + contrast * blurred(true, str(blur_px))[..., None].repeat(3, axis=2)
-    line = matte.outline(true > 0.5)
-    found = float(np.median(matte.outline_blur_px(image, true > 0.5, 12.0)[line]))
+    line = matte.inner_boundary(true > 0.5)
+    found = float(np.median(matte.estimate_edge_blur_px(image, true > 0.5, 12.0)[line]))
     print(f"{blur_px} px found as {found:.2f}")
     assert found == pytest.approx(blur_px, rel=0.2, abs=0.45)
 
@@ -78,9 +78,9 @@ def test_there_is_no_blur_without_an_edge_nor_far_from_one() -> None:
     body = np.zeros((160, 160), bool)
     body[20:40, 20:40] = True
     plain = np.full((160, 160, 3), 0.5, np.float32)
-    assert matte.outline_blur_px(plain, body, 12.0).max() == 0.0
+    assert matte.estimate_edge_blur_px(plain, body, 12.0).max() == 0.0
     soft_wall = cv2.GaussianBlur(np.random.default_rng(0).random((160, 160, 3), dtype=np.float32), (0, 0), 3.0)
-    edged = matte.outline_blur_px(np.where(body[..., None], np.float32(0.9), soft_wall), body, 12.0)
+    edged = matte.estimate_edge_blur_px(np.where(body[..., None], np.float32(0.9), soft_wall), body, 12.0)
     assert edged[60:].max() == edged[:, 60:].max() == 0.0
 
 
@@ -89,8 +89,8 @@ def test_alpha_follows_a_blurred_outline(kind: str, error: float) -> None:
     """Mean error within 8 px of the outline, beside that of the thin rim of a sharp picture; as wide as the blur is."""
     true = blurred(figure(), kind)
     image, guess, near = composite(true), detector_mask(true, CELL_PX), near_outline(true, 8.0)
-    found = matte.sharpen_mask(image, guess)
-    off, thin = (float(np.abs(each - true)[near].mean()) for each in (found, matte.clean_alpha(found, 1.0)))
+    found = matte.estimate_alpha_matte(image, guess)
+    off, thin = (float(np.abs(each - true)[near].mean()) for each in (found, matte.clean_alpha_matte(found, 1.0)))
     print(f"{kind}: error {off:.4f}, with a thin rim {thin:.4f}, soft share {soft_share(found, true):.2f}")
     assert off < error
     assert off < 0.6 * thin
@@ -99,7 +99,7 @@ def test_alpha_follows_a_blurred_outline(kind: str, error: float) -> None:
 
 def test_a_sharp_outline_stays_sharp() -> None:
     true = figure()
-    found = matte.sharpen_mask(composite(true), detector_mask(true, CELL_PX))
+    found = matte.estimate_alpha_matte(composite(true), detector_mask(true, CELL_PX))
     assert soft_share(found, true) < 1.4
     assert np.abs(found - true)[near_outline(true, 3.0)].mean() < 0.02
 
@@ -108,7 +108,7 @@ def test_a_sharp_outline_stays_sharp() -> None:
 def test_strands_of_hair_that_the_detector_suspects_stay(width_px: int, error: float, least: float) -> None:
     """Mean error on the strands, share of them that is found (of one pixel a third), and nothing beside them."""
     true, strands = with_strands(width_px, length_px=12)
-    found = matte.sharpen_mask(before_a_busy_wall(true), detector_mask(true, CELL_PX, shift_px=0))
+    found = matte.estimate_alpha_matte(before_a_busy_wall(true), detector_mask(true, CELL_PX, shift_px=0))
     off, share = np.abs(found - true)[strands].mean(), found[strands].sum() / true[strands].sum()
     beside = (cv2.dilate(strands.astype(np.uint8), np.ones((7, 7))) > 0) & ~strands & (true == 0)
     print(f"{width_px} px: error {off:.3f}, {share:.2f} found, {found[beside].mean():.4f} beside")
@@ -123,7 +123,7 @@ def test_a_gap_of_a_few_pixels_stays_open(gap_px: int, wall) -> None:
     """Its two sides are the person, and no wall that is known for sure is near: the wall further off must tell."""
     true, gap = with_gap(gap_px)
     guess = detector_mask(true, CELL_PX, shift_px=0)
-    found = matte.sharpen_mask(wall(true), guess)
+    found = matte.estimate_alpha_matte(wall(true), guess)
     print(f"{gap_px} px: alpha {guess[gap].mean() / 255.0:.2f} -> {found[gap].mean():.3f}")
     assert found[gap].mean() < 0.2
     assert found[110:210, 120:170].min() == 1.0

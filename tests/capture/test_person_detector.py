@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.capture import person_detector as person
-from pipeline.capture.video import open_source, read_frames
+from pipeline.capture.video import open_frame_source, read_frames
 
 
 @pytest.fixture(scope="module")
@@ -16,7 +16,7 @@ def detector() -> person.PersonDetector:
 
 @pytest.fixture(scope="module")
 def photograph(shared_data) -> np.ndarray:
-    source = open_source(shared_data / "real" / "dakse" / "video.mp4")
+    source = open_frame_source(shared_data / "real" / "dakse" / "video.mp4")
     return next(read_frames(source, lambda index: index == 0, 2000)).rgb
 
 
@@ -57,7 +57,7 @@ def test_legs_are_seen_when_one_ankle_is():
     landmarks[1, 27, 1] = 130
     landmarks[2, [27, 28], 1] = 130
     visibility[3, [27, 28]] = 0.02
-    np.testing.assert_array_equal(person.legs_in_image(landmarks, visibility, 100), [True, True, False, False])
+    np.testing.assert_array_equal(person.is_ankle_visible(landmarks, visibility, 100), [True, True, False, False])
 
 
 @pytest.mark.parametrize(("height", "width"), [(100, 100), (90, 160), (160, 90)])
@@ -90,40 +90,40 @@ def square(centre_x_px, centre_y_px, side_px, width_px=200, height_px=100, rotat
 def test_a_person_runs_over_the_square_when_it_touches_the_border(right, over):
     mask = np.zeros((100, 200), bool)
     mask[45:55, 55:right] = True
-    assert person.runs_over(mask, square(60, 50, 20)) == over
+    assert person.touches_roi_border(mask, square(60, 50, 20)) == over
 
 
 def test_a_turned_square_has_turned_borders():
     mask = np.zeros((100, 200), bool)
     mask[48:52, 73:75] = True
-    assert not person.runs_over(mask, square(60, 50, 20))
-    assert person.runs_over(mask, square(60, 50, 20, rotation=np.pi / 4))
+    assert not person.touches_roi_border(mask, square(60, 50, 20))
+    assert person.touches_roi_border(mask, square(60, 50, 20, rotation=np.pi / 4))
 
 
 def test_a_border_outside_of_the_image_is_not_touched():
-    assert not person.runs_over(np.ones((100, 200), bool), square(100, 50, 300))
+    assert not person.touches_roi_border(np.ones((100, 200), bool), square(100, 50, 300))
 
 
-def look(square, next_square, mask):
+def estimate(square, next_square, mask):
     """A look at a square; what it says about landmarks does not matter."""
-    return person._Look(np.zeros((33, 3), np.float32), np.zeros((33, 3), np.float32), mask, square, next_square)
+    return person._RoiEstimate(np.zeros((33, 3), np.float32), np.zeros((33, 3), np.float32), mask, square, next_square)
 
 
 @pytest.mark.parametrize(("next_side", "too_small"), [(21, False), (23, True)])
-def test_a_square_is_too_small_when_a_much_larger_one_is_asked_for(next_side, too_small):
+def test_roi_is_too_small_when_next_roi_is_much_larger(next_side, too_small):
     mask = np.zeros((100, 200), np.float32)
     mask[45:55, 55:65] = 1.0
-    assert person.is_too_small(look(square(60, 50, 20), square(60, 50, next_side), mask)) == too_small
+    assert person.is_roi_too_small(estimate(square(60, 50, 20), square(60, 50, next_side), mask)) == too_small
 
 
 def test_a_square_is_too_small_when_the_person_runs_over_it():
-    assert person.is_too_small(look(square(60, 50, 20), square(60, 50, 20), np.ones((100, 200), np.float32)))
+    assert person.is_roi_too_small(estimate(square(60, 50, 20), square(60, 50, 20), np.ones((100, 200), np.float32)))
 
 
 def with_first_guess(guess):
     """A detector whose first model says what it is told."""
     detector = person.PersonDetector()
-    detector._guess_square = SimpleNamespace(process=lambda _: SimpleNamespace(square=guess))
+    detector._roi_graph = SimpleNamespace(process=lambda _: SimpleNamespace(square=guess))
     return detector
 
 
@@ -131,9 +131,9 @@ def test_a_square_that_cuts_off_the_feet_is_left_for_a_larger_one(photograph):
     """The first model's guess is replaced by one that ends above the ankles."""
     whole = person.PersonDetector().detect(photograph).mask
     detector = with_first_guess(square(315, 270, 430, *photograph.shape[1::-1]))
-    cut = detector._look(photograph, detector._guess_square.process(photograph).square)
-    mended = detector.detect(photograph).mask
-    lowest_px = [np.flatnonzero(mask.any(axis=1))[-1] for mask in (cut.mask > 0.5, mended > 127, whole > 127)]
+    cut = detector._estimate_in_roi(photograph, detector._roi_graph.process(photograph).square)
+    corrected = detector.detect(photograph).mask
+    lowest_px = [np.flatnonzero(mask.any(axis=1))[-1] for mask in (cut.mask > 0.5, corrected > 127, whole > 127)]
     assert lowest_px[0] < lowest_px[2] - 60
     assert abs(lowest_px[1] - lowest_px[2]) < 15
 
@@ -141,15 +141,15 @@ def test_a_square_that_cuts_off_the_feet_is_left_for_a_larger_one(photograph):
 def test_two_looks_are_averaged(photograph):
     guess = square(315, 315, 640, *photograph.shape[1::-1])
     detector = with_first_guess(guess)
-    first = detector._look(photograph, guess)
-    second = detector._look(photograph, first.next_square)
+    first = detector._estimate_in_roi(photograph, guess)
+    second = detector._estimate_in_roi(photograph, first.next_square)
     found = detector.detect(photograph)
     assert np.abs(first.landmarks - second.landmarks).max() > 1.0
     np.testing.assert_allclose(found.landmarks_px, 0.5 * (first.landmarks + second.landmarks)[:, :2], atol=1e-3)
     np.testing.assert_allclose(found.mask, 127.5 * (first.mask + second.mask), atol=0.51)
 
 
-def test_what_was_seen_before_changes_nothing(detector, photograph):
+def test_detection_is_independent_of_previous_frames(detector, photograph):
     """MediaPipe's whole graph smooths its squares in time, even when it is told not to."""
     shrunk = np.full_like(photograph, 128)
     shrunk[100:415, 20:335] = photograph[::2, ::2]

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from pipeline.capture.process_pool import start_workers
+from pipeline.capture.process_pool import start_process_pool
 from pipeline.core.errors import UserError
 from pipeline.core.measure import peak_rss_mib
 
@@ -19,7 +19,7 @@ def refuse(number: int) -> int:
 
 
 def test_results_come_in_order_from_other_processes():
-    with start_workers(2) as workers:
+    with start_process_pool(2) as workers:
         results = list(workers.map(square, ((k,) for k in range(20))))
     assert [value for value, _ in results] == [k * k for k in range(20)]
     assert os.getpid() not in {pid for _, pid in results}
@@ -28,13 +28,13 @@ def test_results_come_in_order_from_other_processes():
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems tell the largest child alone")
 def test_what_workers_held_counts():
     before = peak_rss_mib()
-    with start_workers(2) as workers:
+    with start_process_pool(2) as workers:
         list(workers.map(square, [(3,), (4,)]))
     assert peak_rss_mib() > before + 50  # each worker has loaded numpy and OpenCV
 
 
 def test_one_worker_is_this_process():
-    with start_workers(1) as workers:
+    with start_process_pool(1) as workers:
         assert list(workers.map(square, [(3,)])) == [(9, os.getpid())]
 
 
@@ -46,7 +46,7 @@ def test_tasks_are_drawn_as_they_are_needed():
             drawn.append(k)
             yield (k,)
 
-    with start_workers(2) as workers:
+    with start_process_pool(2) as workers:
         results = workers.map(square, tasks())
         next(results)
         assert len(drawn) < 10
@@ -54,5 +54,5 @@ def test_tasks_are_drawn_as_they_are_needed():
 
 
 def test_an_error_in_a_worker_arrives_as_itself():
-    with start_workers(2) as workers, pytest.raises(UserError, match="number 7"):
+    with start_process_pool(2) as workers, pytest.raises(UserError, match="number 7"):
         list(workers.map(refuse, [(7,)]))

@@ -32,7 +32,7 @@ def test_round_trip(tmp_path):
 
 def test_rows_of_some_frames():
     poses = make_poses(5)
-    some = poses.of(np.array([2, 4, 7, 16, 400]))
+    some = poses.for_frames(np.array([2, 4, 7, 16, 400]))
     np.testing.assert_array_equal(some.frame_index, [4, 16])
     np.testing.assert_array_equal(some.transl, poses.transl[[1, 4]])
     assert some.gender == "female"

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from pipeline.capture.smpl_poses import save_smpl_poses
-from pipeline.capture.user_files import SuppliedCamera, find_supplied
-from pipeline.capture.video import Source, open_source
+from pipeline.capture.user_files import CameraCalibration, load_user_files
+from pipeline.capture.video import FrameSource, open_frame_source
 from pipeline.core.errors import UserError
 from pipeline.io.image import write_gray, write_rgb, write_rgba
 from pipeline.io.npz import save_npz
@@ -19,21 +19,26 @@ HALF_TURN = np.diag([-1.0, 1.0, -1.0, 1.0])
 
 
 @pytest.fixture
-def source(tmp_path) -> Source:
+def source(tmp_path) -> FrameSource:
     """Three pictures, 128 wide and 96 high."""
     for name in ("x1", "x2", "x10"):
         write_rgb(tmp_path / f"{name}.jpg", np.full((96, 128, 3), 90, np.uint8))
-    return open_source(tmp_path)
+    return open_frame_source(tmp_path)
 
 
 def masks() -> np.ndarray:
     return np.arange(3, dtype=np.uint8)[:, None, None] * np.ones((1, 4, 6), np.uint8)
 
 
-def test_nothing_beside_the_video(tmp_path, source):
-    supplied = find_supplied(tmp_path, source)
-    assert (supplied.read_mask, supplied.mask_source, supplied.landmarks, supplied.camera) == (None, "", None, None)
-    assert find_supplied(tmp_path / "video.mp4", source).camera is None
+def test_no_user_files(tmp_path, source):
+    user_files = load_user_files(tmp_path, source)
+    assert (user_files.read_mask, user_files.mask_source, user_files.landmarks, user_files.camera) == (
+        None,
+        "",
+        None,
+        None,
+    )
+    assert load_user_files(tmp_path / "video.mp4", source).camera is None
 
 
 def write_masks(folder, **levels: int) -> None:
@@ -43,78 +48,78 @@ def write_masks(folder, **levels: int) -> None:
         write_gray(folder / "masks" / f"{name}.png", np.full((4, 6), level, np.uint8))
 
 
-def levels_of(supplied) -> list[int]:
-    return [int(supplied.read_mask(index).mean()) for index in range(3)]
+def levels_of(user_files) -> list[int]:
+    return [int(user_files.read_mask(index).mean()) for index in range(3)]
 
 
 def test_mask_folder_by_name(tmp_path, source):
     write_masks(tmp_path, x1=10, x2=20, x10=30, other=99)
-    assert levels_of(find_supplied(tmp_path, source)) == [10, 20, 30]
+    assert levels_of(load_user_files(tmp_path, source)) == [10, 20, 30]
 
 
 def test_mask_folder_by_order(tmp_path, source):
     write_masks(tmp_path, m2=20, m1=10, m10=30)
-    assert levels_of(find_supplied(tmp_path, source)) == [10, 20, 30]
-    assert levels_of(find_supplied(tmp_path, Source(tmp_path, (), 3, 25.0))) == [10, 20, 30]
+    assert levels_of(load_user_files(tmp_path, source)) == [10, 20, 30]
+    assert levels_of(load_user_files(tmp_path, FrameSource(tmp_path, (), 3, 25.0))) == [10, 20, 30]
 
 
-def test_a_mask_too_many_is_refused_where_names_do_not_tell(tmp_path, source):
+def test_extra_mask_is_refused_when_names_do_not_match(tmp_path, source):
     write_masks(tmp_path, m1=10, m2=20, m3=30, m4=40)
     with pytest.raises(UserError, match="masks has 4 entries for 3 frames"):
-        find_supplied(tmp_path, source)
+        load_user_files(tmp_path, source)
 
 
 def test_masks_numbered_from_another_start_are_refused(tmp_path, source):
     """As many as there are images, most of them named as one: in natural order each would belong to another frame."""
     write_masks(tmp_path, x2=20, x10=30, x11=40)
     with pytest.raises(UserError, match="named as the images are, but none for x1;"):
-        find_supplied(tmp_path, source)
+        load_user_files(tmp_path, source)
 
 
-def test_transparent_images_are_their_own_masks_unless_others_lie_beside(tmp_path):
+def test_alpha_channel_is_the_mask_unless_masks_are_supplied(tmp_path):
     (tmp_path / "images").mkdir()
     for k, opacity in enumerate((0, 128, 255)):
         write_rgba(tmp_path / "images" / f"{k}.png", np.full((4, 6, 4), (90, 80, 70, opacity), np.uint8))
-    supplied = find_supplied(tmp_path, open_source(tmp_path))
-    assert (levels_of(supplied), supplied.mask_source) == ([0, 128, 255], "the images' alpha channel")
+    user_files = load_user_files(tmp_path, open_frame_source(tmp_path))
+    assert (levels_of(user_files), user_files.mask_source) == ([0, 128, 255], "the images' alpha channel")
     write_masks(tmp_path, m1=10, m2=20, m3=30)
-    assert levels_of(find_supplied(tmp_path, open_source(tmp_path))) == [10, 20, 30]
+    assert levels_of(load_user_files(tmp_path, open_frame_source(tmp_path))) == [10, 20, 30]
 
 
 def test_a_folder_of_zeros_and_ones_is_brought_to_255(tmp_path, source):
     write_masks(tmp_path, m1=0, m2=1, m3=0)
-    assert levels_of(find_supplied(tmp_path, source)) == [0, 255, 0]
+    assert levels_of(load_user_files(tmp_path, source)) == [0, 255, 0]
 
 
 def test_faint_levels_of_soft_masks_stay_faint(tmp_path, source):
     """One bright mask tells that the folder holds levels, so a mask with nothing but specks of 1 shows nobody."""
     write_masks(tmp_path, m1=1, m2=1, m3=200)
-    assert levels_of(find_supplied(tmp_path, source)) == [1, 1, 200]
+    assert levels_of(load_user_files(tmp_path, source)) == [1, 1, 200]
 
 
 def test_mask_arrays_are_brought_to_255(tmp_path, source):
     save_npz(tmp_path / "masks.npz", {"masks": masks() > 1})
-    assert find_supplied(tmp_path, source).read_mask(2).max() == 255
+    assert load_user_files(tmp_path, source).read_mask(2).max() == 255
     (tmp_path / "masks.npz").unlink()
     with h5py.File(tmp_path / "masks.hdf5", "w") as file:
         file["masks"] = masks() // 2
-    supplied = find_supplied(tmp_path, source)
-    assert supplied.mask_source == "masks.hdf5"
-    assert [int(supplied.read_mask(i).max()) for i in range(3)] == [0, 0, 255]
+    user_files = load_user_files(tmp_path, source)
+    assert user_files.mask_source == "masks.hdf5"
+    assert [int(user_files.read_mask(i).max()) for i in range(3)] == [0, 0, 255]
 
 
 def test_poses_of_frames_that_there_are(tmp_path, source):
     save_smpl_poses(tmp_path / "smpl_poses.npz", make_poses(1))
-    assert find_supplied(tmp_path, source).smpl_poses.gender == "female"
+    assert load_user_files(tmp_path, source).smpl_poses.gender == "female"
     save_smpl_poses(tmp_path / "smpl_poses.npz", make_poses(2))
     with pytest.raises(UserError, match="has poses of frames 0 to 4, .* has 0 to 2"):
-        find_supplied(tmp_path, source)
+        load_user_files(tmp_path, source)
 
 
 def test_landmarks_with_and_without_the_rest(tmp_path, source):
     points = np.random.default_rng(0).uniform(0, 50, (3, 33, 2))
     save_npz(tmp_path / "landmarks.npz", {"landmarks_px": points})
-    landmarks = find_supplied(tmp_path, source).landmarks
+    landmarks = load_user_files(tmp_path, source).landmarks
     np.testing.assert_allclose(landmarks.landmarks_px, points, rtol=1e-6)
     assert (landmarks.visibility == 1).all()
     assert landmarks.landmarks_world_m is None
@@ -124,7 +129,7 @@ def test_landmarks_that_are_unknown_are_not_visible(tmp_path, source):
     points = np.zeros((3, 33, 2))
     points[1, 4] = np.nan
     save_npz(tmp_path / "landmarks.npz", {"landmarks_px": points, "landmarks_world_m": np.ones((3, 33, 3))})
-    landmarks = find_supplied(tmp_path, source).landmarks
+    landmarks = load_user_files(tmp_path, source).landmarks
     assert np.argwhere(landmarks.visibility == 0).tolist() == [[1, 4]]
     assert (landmarks.landmarks_world_m == 1).all()
 
@@ -133,7 +138,7 @@ def test_camera_for_smaller_images(tmp_path, source):
     pose = HALF_TURN.copy()
     pose[2, 3] = 3
     (tmp_path / "camera.json").write_text(json.dumps(CAMERA | {"world_to_camera": pose.tolist()}))
-    camera = find_supplied(tmp_path, source).camera.at(0.5, 64, 48)
+    camera = load_user_files(tmp_path, source).camera.to_camera(0.5, 64, 48)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (250, 255, 32, 24)
     np.testing.assert_array_equal(camera.world_to_camera, pose)
 
@@ -151,31 +156,31 @@ def test_camera_for_smaller_images(tmp_path, source):
 def test_a_pose_that_is_no_rotation_and_shift_is_refused(tmp_path, source, wrong):
     (tmp_path / "camera.json").write_text(json.dumps(CAMERA | {"world_to_camera": wrong.tolist()}))
     with pytest.raises(UserError, match="`world_to_camera` must be a rotation and a shift in metres"):
-        find_supplied(tmp_path, source)
+        load_user_files(tmp_path, source)
 
 
-def test_a_principal_point_far_off_needs_the_size_of_the_picture_beside_it(tmp_path, source):
+def test_off_centre_principal_point_requires_image_size(tmp_path, source):
     """The camera of pictures of half the size has it at a quarter of these; a cropped video may have it there too."""
     (tmp_path / "camera.json").write_text(json.dumps(CAMERA | {"cx": 32.0, "cy": 24.0}))
     with pytest.raises(UserError, match=r'cx 32, cy 24 lie far .* which are 128x96; .* "width": 128, "height": 96'):
-        find_supplied(tmp_path, source)
+        load_user_files(tmp_path, source)
     (tmp_path / "camera.json").write_text(json.dumps(CAMERA | {"cx": 32.0, "cy": 24.0, "width": 128, "height": 96}))
-    assert find_supplied(tmp_path, source).camera.cx == 32
+    assert load_user_files(tmp_path, source).camera.cx == 32
 
 
-def test_a_split_says_what_each_listed_frame_is_for(tmp_path):
-    recording = Source(tmp_path, (), 30, 25.0)
+def test_split_assigns_each_listed_frame(tmp_path):
+    recording = FrameSource(tmp_path, (), 30, 25.0)
     (tmp_path / "split.json").write_text('{"train": [12, 3, 4], "validation": [8], "heldout": [29, 0]}')
-    split = find_supplied(tmp_path, recording).split
+    split = load_user_files(tmp_path, recording).split
     np.testing.assert_array_equal(split.frame_index, [0, 3, 4, 8, 12, 29])
     np.testing.assert_array_equal(split.split, [2, 0, 0, 1, 0, 2])
-    np.testing.assert_array_equal(split.of(np.array([29, 8, 3])), [2, 1, 0])
+    np.testing.assert_array_equal(split.for_frames(np.array([29, 8, 3])), [2, 1, 0])
 
 
 def test_a_split_without_validation_takes_every_eighth_training_frame(tmp_path):
-    recording = Source(tmp_path, (), 60, 25.0)
+    recording = FrameSource(tmp_path, (), 60, 25.0)
     (tmp_path / "split.json").write_text(json.dumps({"train": list(range(0, 40, 2)), "heldout": [41]}))
-    split = find_supplied(tmp_path, recording).split
+    split = load_user_files(tmp_path, recording).split
     np.testing.assert_array_equal(split.frame_index[split.split == 1], [8, 24])
     assert (split.split == 0).sum() == 18
 
@@ -183,10 +188,10 @@ def test_a_split_without_validation_takes_every_eighth_training_frame(tmp_path):
 def test_lens_distortion_is_taken_out_of_pictures_and_points():
     """A bright dot drawn where the distorted lens sees it must land where the ideal pinhole projects it."""
     k1, focal, centre = -0.25, 100.0, 64.0
-    camera = SuppliedCamera(focal, focal, centre, centre, (k1, 0.0, 0.0, 0.0))
+    camera = CameraCalibration(focal, focal, centre, centre, (k1, 0.0, 0.0, 0.0))
     ideal = np.array([0.4, 0.3])
-    bent = ideal * (1 + k1 * (ideal**2).sum())
-    seen_px, expected_px = centre + focal * bent, centre + focal * ideal
+    distorted = ideal * (1 + k1 * (ideal**2).sum())
+    seen_px, expected_px = centre + focal * distorted, centre + focal * ideal
     rows, columns = np.mgrid[:128, :128] + 0.5
     dot = 250 * np.exp(-((columns - seen_px[0]) ** 2 + (rows - seen_px[1]) ** 2) / 8)
     picture = camera.undistort(np.repeat(dot[..., None], 3, axis=2).astype(np.uint8), 1.0)[..., 0].astype(float)
@@ -197,7 +202,7 @@ def test_lens_distortion_is_taken_out_of_pictures_and_points():
 
 def test_without_distortion_nothing_is_resampled():
     picture = np.random.default_rng(0).integers(0, 255, (8, 8, 3), dtype=np.uint8)
-    camera = SuppliedCamera(10.0, 10.0, 4.0, 4.0, (0.0, 0.0, 0.0, 0.0))
+    camera = CameraCalibration(10.0, 10.0, 4.0, 4.0, (0.0, 0.0, 0.0, 0.0))
     assert camera.undistort(picture, 1.0) is picture
     points = np.zeros((2, 2))
     assert camera.undistort_points(points) is points
@@ -233,7 +238,7 @@ def test_without_distortion_nothing_is_resampled():
 def test_a_file_that_does_not_fit_is_named(tmp_path, source, name, content, message):
     (tmp_path / name).write_text(content)
     with pytest.raises(UserError, match=message):
-        find_supplied(tmp_path, source)
+        load_user_files(tmp_path, source)
 
 
 @pytest.mark.parametrize(
@@ -266,4 +271,4 @@ def test_a_file_that_does_not_fit_is_named(tmp_path, source, name, content, mess
 def test_arrays_that_do_not_fit_are_named(tmp_path, source, name, arrays, message):
     save_npz(tmp_path / name, arrays)
     with pytest.raises(UserError, match=message):
-        find_supplied(tmp_path, source)
+        load_user_files(tmp_path, source)

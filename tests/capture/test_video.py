@@ -18,7 +18,7 @@ IDENTITY = (0x10000).to_bytes(4, "big") + bytes(12) + (0x10000).to_bytes(4, "big
 IDENTITY += (0x40000000).to_bytes(4, "big")
 
 
-def everything(index: int) -> bool:
+def select_all(index: int) -> bool:
     return True
 
 
@@ -44,7 +44,7 @@ def ramp(level: int, height: int = 48, width: int = 64) -> np.ndarray:
 
 def test_frames_come_in_order_with_index_and_time(tmp_path):
     write_video(tmp_path / "a.mp4", [ramp(20 * k) for k in range(10)])
-    source = video.open_source(tmp_path / "a.mp4")
+    source = video.open_frame_source(tmp_path / "a.mp4")
     assert (source.n_frames, source.fps, source.files) == (10, 25.0, ())
     frames = list(video.read_frames(source, lambda index: index % 3 == 0, 1000))
     assert [frame.index for frame in frames] == [0, 3, 6, 9]
@@ -55,7 +55,7 @@ def test_frames_come_in_order_with_index_and_time(tmp_path):
 def test_variable_frame_rate_keeps_its_times(tmp_path):
     times = [0, 1, 4, 5, 25]
     write_video(tmp_path / "a.mp4", [ramp(40 * k) for k in range(5)], times)
-    frames = list(video.read_frames(video.open_source(tmp_path / "a.mp4"), everything, 1000))
+    frames = list(video.read_frames(video.open_frame_source(tmp_path / "a.mp4"), select_all, 1000))
     assert [frame.time_s for frame in frames] == pytest.approx([t / 25 for t in times])
 
 
@@ -66,13 +66,13 @@ def test_a_stamp_that_goes_back_counts_one_frame_later(tmp_path):
     at = data.index(b"\x81" + (120).to_bytes(2, "big") + b"\0")
     data[at + 1 : at + 3] = (40).to_bytes(2, "big")
     (tmp_path / "odd.mkv").write_bytes(data)
-    frames = list(video.read_frames(video.open_source(tmp_path / "odd.mkv"), everything, 1000))
+    frames = list(video.read_frames(video.open_frame_source(tmp_path / "odd.mkv"), select_all, 1000))
     assert [frame.time_s for frame in frames] == pytest.approx([k / 25 for k in range(6)])
 
 
 def test_a_video_without_stamps_runs_at_its_rate(tmp_path):
     write_video(tmp_path / "a.h264", [ramp(20 * k) for k in range(6)])
-    frames = list(video.read_frames(video.open_source(tmp_path / "a.h264"), everything, 1000))
+    frames = list(video.read_frames(video.open_frame_source(tmp_path / "a.h264"), select_all, 1000))
     assert [frame.time_s for frame in frames] == pytest.approx([k / 25 for k in range(6)])
 
 
@@ -97,7 +97,7 @@ def test_colours_are_read_with_the_matrix_that_the_file_names(tmp_path, matrix, 
             frame.colorspace, frame.color_range = matrix, 1
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
-    frames = list(video.read_frames(video.open_source(path), everything, 1000))
+    frames = list(video.read_frames(video.open_frame_source(path), select_all, 1000))
     shown = np.array([frame.rgb.mean(axis=(0, 1)) for frame in frames])
     np.testing.assert_allclose(shown, colours, atol=2.5)
 
@@ -120,7 +120,7 @@ def test_hdr_is_shown_as_srgb(tmp_path):
             frame.colorspace, frame.color_primaries, frame.color_trc, frame.color_range = 9, 9, 18, 1
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
-    frames = list(video.read_frames(video.open_source(path), everything, 1000))
+    frames = list(video.read_frames(video.open_frame_source(path), select_all, 1000))
     assert all(frame.rgb.dtype == np.uint8 for frame in frames)
     shown = np.array([frame.rgb.mean(axis=(0, 1)) for frame in frames])
     truth = [to_srgb(np.rint(65535 * level).astype(np.uint16)[None, None], HLG, BT_2020)[0, 0] for level in levels]
@@ -132,8 +132,8 @@ def test_hdr_is_shown_as_srgb(tmp_path):
 def test_frames_that_an_edit_list_hides_are_not_counted(tmp_path):
     """As a phone or `ffmpeg -ss` cuts a clip: the pictures back to the last key frame are in the file, before zero."""
     write_video(tmp_path / "a.mp4", [ramp(20 * k) for k in range(12)], list(range(-4, 8)))
-    source = video.open_source(tmp_path / "a.mp4")
-    frames = list(video.read_frames(source, everything, 1000))
+    source = video.open_frame_source(tmp_path / "a.mp4")
+    frames = list(video.read_frames(source, select_all, 1000))
     assert source.n_frames == len(frames) == 8
     assert [round(frame.rgb.mean() / 20) for frame in frames] == list(range(4, 12))
     assert [frame.time_s for frame in frames] == pytest.approx([k / 25 for k in range(8)])
@@ -150,7 +150,7 @@ def test_rotation_in_the_container_is_honoured(tmp_path):
     turn = bytes(4) + (0x10000).to_bytes(4, "big") + bytes(4) + (0xFFFF0000).to_bytes(4, "big") + bytes(16)
     turn += (0x40000000).to_bytes(4, "big")
     (tmp_path / "turned.mp4").write_bytes(data[:at] + turn + data[at + 36 :])
-    frame = next(video.read_frames(video.open_source(tmp_path / "turned.mp4"), everything, 1000))
+    frame = next(video.read_frames(video.open_frame_source(tmp_path / "turned.mp4"), select_all, 1000))
     assert frame.rgb.shape == (64, 48, 3)
     assert frame.rgb[:28].mean() < 40
     assert frame.rgb[36:].mean() > 210
@@ -158,7 +158,7 @@ def test_rotation_in_the_container_is_honoured(tmp_path):
 
 def test_wide_pixels_are_made_square(tmp_path):
     write_video(tmp_path / "a.mp4", [ramp(90)] * 3, aspect=Fraction(4, 3))
-    frame = next(video.read_frames(video.open_source(tmp_path / "a.mp4"), everything, 1000))
+    frame = next(video.read_frames(video.open_frame_source(tmp_path / "a.mp4"), select_all, 1000))
     assert frame.rgb.shape == (48, 85, 3)
 
 
@@ -168,7 +168,7 @@ def test_chroma_is_interpolated(tmp_path):
     picture = np.where((rows + columns < 64)[..., None], (200, 60, 60), (60, 120, 60)).astype(np.uint8)
     picture = cv2.GaussianBlur(picture, (0, 0), 2)
     write_video(tmp_path / "a.mp4", [picture] * 3)
-    rgb = next(video.read_frames(video.open_source(tmp_path / "a.mp4"), everything, 1000)).rgb.astype(int)
+    rgb = next(video.read_frames(video.open_frame_source(tmp_path / "a.mp4"), select_all, 1000)).rgb.astype(int)
     redness = rgb[..., 0] - rgb[..., 1]
     band = np.abs(rows + columns - 64) < 6
     steps = np.abs(np.diff(redness, axis=1))[band[:, 1:]]
@@ -177,7 +177,7 @@ def test_chroma_is_interpolated(tmp_path):
 
 def test_large_frames_are_shrunk_with_their_factor(tmp_path):
     write_video(tmp_path / "a.mp4", [ramp(90, 100, 200)] * 2)
-    frame = next(video.read_frames(video.open_source(tmp_path / "a.mp4"), everything, 80))
+    frame = next(video.read_frames(video.open_frame_source(tmp_path / "a.mp4"), select_all, 80))
     assert frame.rgb.shape == (40, 80, 3)
     assert frame.scale == pytest.approx(0.4)
 
@@ -186,41 +186,41 @@ def test_image_folder_in_natural_order_at_thirty_a_second(tmp_path):
     for k in (1, 2, 10):
         write_rgb(tmp_path / f"shot{k}.png", ramp(20 * k))
     (tmp_path / "notes.txt").write_text("x")
-    source = video.open_source(tmp_path)
+    source = video.open_frame_source(tmp_path)
     assert [path.name for path in source.files] == ["shot1.png", "shot2.png", "shot10.png"]
-    frames = list(video.read_frames(source, everything, 1000))
+    frames = list(video.read_frames(source, select_all, 1000))
     assert [int(frame.rgb.mean()) for frame in frames] == [20, 40, 200]
     assert [frame.time_s for frame in frames] == pytest.approx([0, 1 / 30, 2 / 30])
-    slow = video.open_source(tmp_path, image_fps=12.5)
+    slow = video.open_frame_source(tmp_path, image_fps=12.5)
     assert slow.fps == 12.5
-    assert [frame.time_s for frame in video.read_frames(slow, everything, 1000)] == pytest.approx([0, 0.08, 0.16])
+    assert [frame.time_s for frame in video.read_frames(slow, select_all, 1000)] == pytest.approx([0, 0.08, 0.16])
 
 
 def test_the_size_of_pictures_is_that_which_a_viewer_shows(tmp_path):
     write_video(tmp_path / "a.mp4", [ramp(90)] * 3, aspect=Fraction(4, 3))
-    assert video.picture_size_px(video.open_source(tmp_path / "a.mp4")) == (85, 48)
+    assert video.image_size_px(video.open_frame_source(tmp_path / "a.mp4")) == (85, 48)
     (tmp_path / "images").mkdir()
     write_rgb(tmp_path / "images" / "0.png", ramp(9, 20, 30))
-    assert video.picture_size_px(video.open_source(tmp_path / "images")) == (30, 20)
+    assert video.image_size_px(video.open_frame_source(tmp_path / "images")) == (30, 20)
 
 
 def test_folder_with_a_video_or_a_folder_of_frames(tmp_path):
     (tmp_path / "v").mkdir()
     write_video(tmp_path / "v" / "clip.mp4", [ramp(9)] * 3)
-    assert video.open_source(tmp_path / "v").path == tmp_path / "v" / "clip.mp4"
+    assert video.open_frame_source(tmp_path / "v").path == tmp_path / "v" / "clip.mp4"
     (tmp_path / "i" / "frames").mkdir(parents=True)
     write_rgb(tmp_path / "i" / "frames" / "0.png", ramp(9))
-    assert video.open_source(tmp_path / "i").path == tmp_path / "i" / "frames"
+    assert video.open_frame_source(tmp_path / "i").path == tmp_path / "i" / "frames"
 
 
-def test_video_that_breaks_off_goes_on_with_a_warning(tmp_path):
+def test_truncated_video_gives_a_warning(tmp_path):
     rng = np.random.default_rng(0)
     pictures = [rng.integers(0, 255, (64, 64, 3), dtype=np.uint8) for _ in range(12)]
     write_video(tmp_path / "a.mkv", pictures)
     data = (tmp_path / "a.mkv").read_bytes()
     (tmp_path / "cut.mkv").write_bytes(data[: len(data) * 2 // 3])
-    source = video.open_source(tmp_path / "cut.mkv")
-    assert 4 <= len(list(video.read_frames(source, everything, 1000))) < 12
+    source = video.open_frame_source(tmp_path / "cut.mkv")
+    assert 4 <= len(list(video.read_frames(source, select_all, 1000))) < 12
     take_warnings()
 
 
@@ -239,7 +239,7 @@ def test_video_that_breaks_off_goes_on_with_a_warning(tmp_path):
 def test_what_is_no_recording_is_refused(tmp_path, make, message):
     make(tmp_path / "in")
     with pytest.raises(UserError, match=message):
-        video.open_source(tmp_path / "in")
+        video.open_frame_source(tmp_path / "in")
 
 
 def test_sound_alone_is_refused(tmp_path):
@@ -249,14 +249,14 @@ def test_sound_alone_is_refused(tmp_path):
         frame.rate = 8000
         container.mux(stream.encode(frame))
     with pytest.raises(UserError, match="no picture track"):
-        video.open_source(tmp_path / "a.wav")
+        video.open_frame_source(tmp_path / "a.wav")
 
 
 def test_unreadable_and_odd_sized_images_are_named(tmp_path):
     write_rgb(tmp_path / "a.png", ramp(9))
     (tmp_path / "b.png").write_bytes(b"nothing")
     with pytest.raises(UserError, match="b.png"):
-        list(video.read_frames(video.open_source(tmp_path), everything, 1000))
+        list(video.read_frames(video.open_frame_source(tmp_path), select_all, 1000))
     write_rgb(tmp_path / "b.png", ramp(9, 20, 20))
     with pytest.raises(UserError, match="b.png is 20x20"):
-        list(video.read_frames(video.open_source(tmp_path), everything, 1000))
+        list(video.read_frames(video.open_frame_source(tmp_path), select_all, 1000))

@@ -79,7 +79,7 @@ def test_verify_finds_a_changed_file(toy: Toy) -> None:
     toy.all("--video", "numbers.txt")
     assert toy.all("--verify").stdout.count("whole") == 3
     (toy.run_dir / "learn" / "trail" / "state.json").write_text("{}")
-    sentence = toy.refusal("stages", "--run", "runs/a", "--verify")
+    sentence = toy.expect_user_error("stages", "--run", "runs/a", "--verify")
     assert "trail/state.json" in sentence
     assert sentence.endswith("python -m stages --run runs/a --from learn")
     assert toy.all("--from", "learn").returncode == 0
@@ -103,37 +103,39 @@ def test_verify_finds_a_changed_file(toy: Toy) -> None:
     ],
 )
 def test_a_mistake_is_one_sentence_and_leaves_nothing(toy: Toy, arguments: Sequence[str], words: Sequence[str]) -> None:
-    sentence = toy.refusal("stages", "--run", "runs/a", *arguments)
+    sentence = toy.expect_user_error("stages", "--run", "runs/a", *arguments)
     assert all(word in sentence for word in words), sentence
     assert not toy.run_dir.exists()
 
 
 def test_a_stage_refuses_options_of_others(toy: Toy) -> None:
-    assert "learn.key=value" in toy.refusal("stages.learn", "runs/a", "--set", "tell.word=x")
-    assert "python -m stages.read runs/a" in toy.refusal("stages.learn", "runs/a")
-    assert "see python -m stages.learn --help" in toy.refusal("stages.learn")
+    assert "learn.key=value" in toy.expect_user_error("stages.learn", "runs/a", "--set", "tell.word=x")
+    assert "python -m stages.read runs/a" in toy.expect_user_error("stages.learn", "runs/a")
+    assert "see python -m stages.learn --help" in toy.expect_user_error("stages.learn")
 
 
 def test_a_file_is_no_run(toy: Toy) -> None:
     (toy.folder / "notes").write_text("in the way")
-    assert "notes is a file, a run is a folder" in toy.refusal("stages", "--run", "notes", "--video", "numbers.txt")
-    below = toy.refusal("stages", "--run", "notes/a", "--video", "numbers.txt")
+    assert "notes is a file, a run is a folder" in toy.expect_user_error(
+        "stages", "--run", "notes", "--video", "numbers.txt"
+    )
+    below = toy.expect_user_error("stages", "--run", "notes/a", "--video", "numbers.txt")
     assert "notes/a cannot be written or read, a part of that path is a file" in below
     assert (toy.folder / "notes").read_text() == "in the way"
 
 
 def test_bad_input_leaves_no_folder(toy: Toy) -> None:
     toy.video.write_text("1 two 3")
-    assert "holds two" in toy.refusal("stages", "--run", "runs/a", "--video", "numbers.txt")
+    assert "holds two" in toy.expect_user_error("stages", "--run", "runs/a", "--video", "numbers.txt")
     assert not toy.run_dir.exists()
-    assert "holds two" in toy.refusal("stages.read", "runs/a", "--video", "numbers.txt")
+    assert "holds two" in toy.expect_user_error("stages.read", "runs/a", "--video", "numbers.txt")
     assert not toy.run_dir.exists()
 
 
 def test_bad_input_leaves_earlier_results(toy: Toy) -> None:
     toy.all("--video", "numbers.txt")
     toy.video.write_text("1 two 3")
-    toy.refusal("stages", "--run", "runs/a")
+    toy.expect_user_error("stages", "--run", "runs/a")
     assert {path.name for path in toy.run_dir.iterdir()} == {"read", "learn", "tell", "run.json", ".lock"}
 
 
@@ -143,7 +145,7 @@ def test_another_video_needs_force(toy: Toy) -> None:
     copy.write_bytes(toy.video.read_bytes())
     other.write_text("4 5 6")
     assert states(toy.all("--video", "copy.txt").stdout) == ["cached"] * 3
-    assert "--force" in toy.refusal("stages", "--run", "runs/a", "--video", "other.txt")
+    assert "--force" in toy.expect_user_error("stages", "--run", "runs/a", "--video", "other.txt")
     assert states(toy.all("--video", "other.txt", "--force").stdout) == ["run"] * 3
 
 
@@ -178,9 +180,9 @@ def test_a_stage_module_is_not_imported_twice(toy: Toy) -> None:
     assert "RuntimeWarning" not in done.stderr
 
 
-def wait_for(path: Path, patience_s: float = 30.0) -> None:
+def wait_for(path: Path, timeout_s: float = 30.0) -> None:
     """Wait until a file is there."""
-    deadline = time.monotonic() + patience_s
+    deadline = time.monotonic() + timeout_s
     while not path.exists():
         assert time.monotonic() < deadline, f"{path} did not appear"
         time.sleep(0.02)
@@ -192,5 +194,5 @@ def test_a_full_disk_is_one_sentence_and_leaves_nothing(toy: Toy) -> None:
     full += "pathlib.Path.write_text = write\n"
     full += "raise SystemExit(read.main(read.STAGE, ['runs/a', '--video', 'numbers.txt'], CONFIG_DIR))"
     (toy.folder / "full.py").write_text(full)
-    assert "the disk is full: free some space" in toy.refusal("full")
+    assert "the disk is full: free some space" in toy.expect_user_error("full")
     assert not toy.run_dir.exists()

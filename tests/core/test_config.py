@@ -9,7 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import Field, field_validator
 
-from pipeline.core.config import Config, Layers, build, check_sections, default_yaml, load_layers, parse_overrides
+from pipeline.core.config import (
+    Config,
+    ConfigLayers,
+    build_config,
+    check_sections,
+    default_yaml,
+    load_layers,
+    parse_overrides,
+)
 from pipeline.core.errors import UserError
 
 
@@ -40,10 +48,10 @@ def config_dir(tmp_path: Path) -> Path:
 
 
 def built(config_dir: Path, preset: str = "default", *assignments: str) -> Options:
-    return build("mesh", Options, load_layers(preset, parse_overrides(assignments), config_dir))
+    return build_config("mesh", Options, load_layers(preset, parse_overrides(assignments), config_dir))
 
 
-def complaint(config_dir: Path, preset: str, *assignments: str) -> str:
+def config_error_message(config_dir: Path, preset: str, *assignments: str) -> str:
     with pytest.raises(UserError) as caught:
         built(config_dir, preset, *assignments)
     return str(caught.value)
@@ -76,16 +84,16 @@ def test_yaml_numbers_without_a_dot_are_numbers(config_dir: Path) -> None:
     ],
 )
 def test_a_bad_value_is_one_sentence(config_dir: Path, assignment: str, words: tuple[str, ...]) -> None:
-    sentence = complaint(config_dir, "default", assignment)
+    sentence = config_error_message(config_dir, "default", assignment)
     assert all(word in sentence for word in words), sentence
     assert "\n" not in sentence
 
 
 def test_a_bad_value_in_a_file_names_the_file(config_dir: Path) -> None:
     (config_dir / "odd.yaml").write_text("mesh:\n  size: 8\n")
-    assert complaint(config_dir, "odd").startswith(str(config_dir / "odd.yaml"))
+    assert config_error_message(config_dir, "odd").startswith(str(config_dir / "odd.yaml"))
     (config_dir / "odd.yaml").write_text("mesh:\n  sice: 8\n")
-    assert complaint(config_dir, "odd").startswith(f"{config_dir / 'odd.yaml'}: mesh.sice")
+    assert config_error_message(config_dir, "odd").startswith(f"{config_dir / 'odd.yaml'}: mesh.sice")
 
 
 def test_a_default_overridden_in_a_file_is_not_blamed_on_it(config_dir: Path) -> None:
@@ -117,7 +125,7 @@ def test_a_preset_may_be_a_path(config_dir: Path) -> None:
 
 
 def test_an_unknown_section_lists_the_known() -> None:
-    layers = Layers()
+    layers = ConfigLayers()
     layers.add({"mehs": {"size": 1}}, "--set mehs.size")
     with pytest.raises(UserError, match=r"did you mean mesh\?.*known keys of the configuration: body, mesh"):
         check_sections(layers, ["body", "mesh"])

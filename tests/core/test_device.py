@@ -1,19 +1,19 @@
 import pytest
 import torch
 
-from pipeline.core.device import CPU, compute_device
+from pipeline.core.device import CPU, select_device
 from pipeline.core.errors import UserError
 
 
 def test_without_a_graphics_card_auto_is_the_cpu_and_cuda_is_refused(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert compute_device("auto", "field.device") == compute_device("cpu", "field.device") == CPU
+    assert select_device("auto", "field.device") == select_device("cpu", "field.device") == CPU
     with pytest.raises(UserError, match=r"field\.device=cuda.*EXTRA=cuda.*field\.device=cpu"):
-        compute_device("cuda", "field.device")
+        select_device("cuda", "field.device")
 
 
 def test_with_a_graphics_card_auto_takes_it_and_cpu_does_not(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
-    assert compute_device("auto", "field.device") == compute_device("cuda", "field.device") == torch.device("cuda:0")
-    assert compute_device("cpu", "field.device") == CPU
+    assert select_device("auto", "field.device") == select_device("cuda", "field.device") == torch.device("cuda:0")
+    assert select_device("cpu", "field.device") == CPU

@@ -9,21 +9,21 @@ from typing import Any
 import pytest
 
 from pipeline.core.errors import UserError
-from pipeline.core.lock import LOCK_FD_VARIABLE, PARENT_VARIABLE, child_environment, is_runner_child, run_lock
-from pipeline.core.measure import REPOSITORY
+from pipeline.core.lock import LOCK_FD_VARIABLE, PARENT_PID_VARIABLE, child_environment, is_runner_child, run_lock
+from pipeline.core.measure import REPOSITORY_DIR
 
 TAKE = "import sys; from pathlib import Path; from pipeline.core.lock import run_lock\n"
-TAKE += "with run_lock(Path(sys.argv[1]), patience_s=0.0): print('taken')"
+TAKE += "with run_lock(Path(sys.argv[1]), timeout_s=0.0): print('taken')"
 
 
 def take(run_dir: Path, **options: Any) -> subprocess.CompletedProcess[str]:
     """Try to take the lock in another process."""
     return subprocess.run(
-        [sys.executable, "-c", TAKE, str(run_dir)], capture_output=True, text=True, cwd=REPOSITORY, **options
+        [sys.executable, "-c", TAKE, str(run_dir)], capture_output=True, text=True, cwd=REPOSITORY_DIR, **options
     )
 
 
-def test_a_second_writer_is_refused_and_told_by_whom(tmp_path: Path) -> None:
+def test_second_writer_is_refused_with_holder_pid(tmp_path: Path) -> None:
     with run_lock(tmp_path), pytest.raises(UserError, match=f"process {os.getpid()}"), run_lock(tmp_path, 0.0):
         pytest.fail("two writers")
 
@@ -52,12 +52,12 @@ def test_an_inherited_lock_of_another_run_does_not_count(tmp_path: Path, monkeyp
 
 def test_a_dead_holder_holds_nothing(tmp_path: Path) -> None:
     killed = TAKE.replace("print('taken')", "import os; os.kill(os.getpid(), 9)")
-    subprocess.run([sys.executable, "-c", killed, str(tmp_path)], check=False, cwd=REPOSITORY)
+    subprocess.run([sys.executable, "-c", killed, str(tmp_path)], check=False, cwd=REPOSITORY_DIR)
     assert take(tmp_path).stdout == "taken\n"
 
 
 def test_a_stage_process_knows_its_runner(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(PARENT_VARIABLE, raising=False)
+    monkeypatch.delenv(PARENT_PID_VARIABLE, raising=False)
     assert not is_runner_child()
-    monkeypatch.setenv(PARENT_VARIABLE, "1")
+    monkeypatch.setenv(PARENT_PID_VARIABLE, "1")
     assert is_runner_child()

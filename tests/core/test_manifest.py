@@ -9,14 +9,14 @@ import pytest
 
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import (
-    MANIFEST,
-    PROGRESS,
+    MANIFEST_FILE,
+    PROGRESS_FILE,
     Manifest,
     digest_file,
     digest_files,
     digest_json,
-    digest_source,
-    find_damage,
+    digest_video,
+    find_damaged_files,
     fingerprint,
     read_manifest,
     write_manifest,
@@ -33,7 +33,7 @@ def finished(folder: Path) -> Manifest:
     manifest = Manifest(
         **BASE, fingerprint="f", outputs=digest_files(folder), metrics={}, seconds=1.0, peak_rss_mib=2.0
     )
-    write_manifest(manifest, folder / MANIFEST)
+    write_manifest(manifest, folder / MANIFEST_FILE)
     return manifest
 
 
@@ -57,23 +57,23 @@ def test_each_part_decides_the_fingerprint(change: dict[str, object]) -> None:
 def test_a_video_file_is_known_by_its_content(tmp_path: Path) -> None:
     (tmp_path / "a.mp4").write_bytes(b"abc")
     (tmp_path / "b.mp4").write_bytes(b"abc")
-    assert digest_source(tmp_path / "a.mp4") == digest_source(tmp_path / "b.mp4")
+    assert digest_video(tmp_path / "a.mp4") == digest_video(tmp_path / "b.mp4")
 
 
 def test_a_video_folder_is_known_by_names_and_contents(tmp_path: Path) -> None:
     (tmp_path / "0.png").write_bytes(b"abc")
-    before = digest_source(tmp_path)
+    before = digest_video(tmp_path)
     (tmp_path / ".DS_Store").write_bytes(b"junk of a file browser")
-    assert digest_source(tmp_path) == before
+    assert digest_video(tmp_path) == before
     (tmp_path / "0.png").rename(tmp_path / "1.png")
-    renamed = digest_source(tmp_path)
+    renamed = digest_video(tmp_path)
     (tmp_path / "1.png").write_bytes(b"abd")
-    assert len({before, renamed, digest_source(tmp_path)}) == 3
+    assert len({before, renamed, digest_video(tmp_path)}) == 3
 
 
 def test_a_missing_video_is_a_sentence(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="--video"):
-        digest_source(tmp_path / "none.mp4")
+        digest_video(tmp_path / "none.mp4")
 
 
 def test_a_manifest_reads_back(tmp_path: Path) -> None:
@@ -85,13 +85,13 @@ def test_a_manifest_reads_back(tmp_path: Path) -> None:
 
 def test_nothing_depends_on_the_record_of_progress(tmp_path: Path) -> None:
     manifest = finished(tmp_path / "mesh")
-    timed = replace(manifest, outputs=manifest.outputs | {PROGRESS: "0" * 64})
+    timed = replace(manifest, outputs=manifest.outputs | {PROGRESS_FILE: "0" * 64})
     assert timed.outputs_digest == manifest.outputs_digest
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"stage": "mesh"}', '{"strange": 1}'])
 def test_a_damaged_manifest_is_a_sentence(tmp_path: Path, text: str) -> None:
-    (tmp_path / MANIFEST).write_text(text)
+    (tmp_path / MANIFEST_FILE).write_text(text)
     with pytest.raises(UserError, match="damaged"):
         read_manifest(tmp_path)
 
@@ -99,17 +99,17 @@ def test_a_damaged_manifest_is_a_sentence(tmp_path: Path, text: str) -> None:
 def test_damage_is_found(tmp_path: Path) -> None:
     folder = tmp_path / "mesh"
     finished(folder)
-    assert find_damage(folder) == []
+    assert find_damaged_files(folder) == []
     (folder / "mesh.npz").write_bytes(b"verticeS")
-    assert find_damage(folder) == ["mesh.npz"]
+    assert find_damaged_files(folder) == ["mesh.npz"]
     (folder / "deep" / "a.png").unlink()
     (folder / "new.txt").write_text("strange")
-    assert find_damage(folder) == ["deep/a.png", "mesh.npz", "new.txt"]
-    (folder / MANIFEST).unlink()
-    assert find_damage(folder) == [MANIFEST]
+    assert find_damaged_files(folder) == ["deep/a.png", "mesh.npz", "new.txt"]
+    (folder / MANIFEST_FILE).unlink()
+    assert find_damaged_files(folder) == [MANIFEST_FILE]
 
 
 def test_a_manifest_is_strict_json(tmp_path: Path) -> None:
     finished(tmp_path / "mesh")
-    values = json.loads((tmp_path / "mesh" / MANIFEST).read_text())
+    values = json.loads((tmp_path / "mesh" / MANIFEST_FILE).read_text())
     assert {"stage", "version", "fingerprint", "config", "inputs", "outputs", "metrics", "seconds"} <= values.keys()

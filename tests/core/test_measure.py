@@ -6,14 +6,14 @@ from types import SimpleNamespace
 
 import pytest
 
-from pipeline.core.measure import REPOSITORY, cpu_name, environment, peak_rss_mib
+from pipeline.core.measure import REPOSITORY_DIR, cpu_name, environment, peak_rss_mib
 
 ALLOCATE = "from pipeline.core.measure import peak_rss_mib; b = bytearray({mib} << 20); del b; print(peak_rss_mib())"
 
 
 def peak_after_allocating(mib: int) -> float:
     done = subprocess.run(
-        [sys.executable, "-c", ALLOCATE.format(mib=mib)], capture_output=True, text=True, check=True, cwd=REPOSITORY
+        [sys.executable, "-c", ALLOCATE.format(mib=mib)], capture_output=True, text=True, check=True, cwd=REPOSITORY_DIR
     )
     return float(done.stdout)
 
@@ -31,14 +31,14 @@ def test_a_childs_peak_does_not_count_its_parents_memory() -> None:
 
 COUNT = """
 import subprocess, sys
-from pipeline.core.measure import count_workers, peak_rss_mib
+from pipeline.core.measure import record_worker_peaks, peak_rss_mib
 held = "b = bytearray(100 << 20); del b; print(flush=True); input()"
 start = [sys.executable, "-c", held]
 workers = [subprocess.Popen(start, stdin=subprocess.PIPE, stdout=subprocess.PIPE) for _ in range(2)]
 before = peak_rss_mib()
 for worker in workers: worker.stdout.readline()
-count_workers([worker.pid for worker in workers] + [2**22 + 1])
-count_workers([workers[0].pid])
+record_worker_peaks([worker.pid for worker in workers] + [2**22 + 1])
+record_worker_peaks([workers[0].pid])
 for worker in workers: worker.communicate(b"x")
 print(peak_rss_mib() - before)
 """
@@ -47,7 +47,7 @@ print(peak_rss_mib() - before)
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems tell the largest child alone")
 def test_workers_count_with_what_they_held() -> None:
     """Two of 100 MiB and an interpreter each, one of them counted twice; a process that is gone adds nothing."""
-    done = subprocess.run([sys.executable, "-c", COUNT], capture_output=True, text=True, check=True, cwd=REPOSITORY)
+    done = subprocess.run([sys.executable, "-c", COUNT], capture_output=True, text=True, check=True, cwd=REPOSITORY_DIR)
     assert 200 < float(done.stdout) < 240
 
 

@@ -31,7 +31,7 @@ def test_a_terminal_gets_a_bar(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     assert "drawing" in capsys.readouterr().err
 
 
-def test_warnings_are_said_and_kept(capsys: pytest.CaptureFixture[str]) -> None:
+def test_warnings_are_printed_and_collected(capsys: pytest.CaptureFixture[str]) -> None:
     progress.take_warnings()
     progress.warn("2 frames are dark and are left out")
     assert "warning: 2 frames are dark and are left out" in capsys.readouterr().err

@@ -11,9 +11,9 @@ import pytest
 from pipeline.core import stage as stage_module
 from pipeline.core.config import Config
 from pipeline.core.errors import UserError
-from pipeline.core.manifest import MANIFEST, read_manifest
+from pipeline.core.manifest import MANIFEST_FILE, read_manifest
 from pipeline.core.progress import warn
-from pipeline.core.stage import Plan, Stage, plan_stage, run_stage
+from pipeline.core.stage import Stage, StagePlan, plan_stage, run_stage
 
 Work = Callable[[Mapping[str, Path], Path, Any], Mapping[str, float]]
 
@@ -27,7 +27,7 @@ def write_number(inputs: Mapping[str, Path], out: Path, config: Options) -> Mapp
     return {"number": config.number, "loss": float("nan")}
 
 
-def plan(tmp_path: Path, work: Work = write_number, number: int = 1, version: int = 1) -> Plan:
+def plan(tmp_path: Path, work: Work = write_number, number: int = 1, version: int = 1) -> StagePlan:
     """The plan of a stage `count` that reads a video and makes number.txt."""
     video = tmp_path / "video.txt"
     if not video.exists():
@@ -44,10 +44,10 @@ def test_a_result_is_made_once(tmp_path: Path) -> None:
     assert run_stage(plan(tmp_path))
     assert not run_stage(plan(tmp_path))
     assert names(tmp_path) == {"count"}
-    assert {path.name for path in (tmp_path / "run" / "count").iterdir()} == {"number.txt", MANIFEST}
+    assert {path.name for path in (tmp_path / "run" / "count").iterdir()} == {"number.txt", MANIFEST_FILE}
 
 
-def test_the_manifest_tells_what_happened(tmp_path: Path) -> None:
+def test_manifest_records_the_run(tmp_path: Path) -> None:
     def work(inputs: Mapping[str, Path], out: Path, config: Options) -> Mapping[str, float]:
         warn("3 frames show nobody and are left out")
         return write_number(inputs, out, config)
@@ -87,7 +87,7 @@ def test_force_runs_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("fault", [UserError("no person"), OSError(errno.ENOSPC, "full"), MemoryError()])
-def test_what_the_user_can_mend_leaves_no_folder(tmp_path: Path, fault: Exception) -> None:
+def test_user_errors_leave_no_folder(tmp_path: Path, fault: Exception) -> None:
     def work(inputs: Mapping[str, Path], out: Path, config: Options) -> Mapping[str, float]:
         (out / "checkpoint.txt").write_text("half")
         raise fault
@@ -143,7 +143,7 @@ def test_checkpoints_of_another_fingerprint_are_dropped(tmp_path: Path, number: 
 
 
 def test_a_kill_just_before_the_rename_costs_no_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def die(plan: Plan, previous: Path) -> None:
+    def die(plan: StagePlan, previous: Path) -> None:
         raise KeyboardInterrupt
 
     def never(inputs: Mapping[str, Path], out: Path, config: Options) -> Mapping[str, float]:
@@ -198,5 +198,5 @@ def test_equal_outputs_upstream_keep_downstream_fresh(tmp_path: Path) -> None:
 
 def test_manifests_hold_no_nan(tmp_path: Path) -> None:
     run_stage(plan(tmp_path))
-    text = (tmp_path / "run" / "count" / MANIFEST).read_text()
+    text = (tmp_path / "run" / "count" / MANIFEST_FILE).read_text()
     json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))

@@ -7,20 +7,20 @@ import subprocess
 import sys
 from pathlib import Path
 
-from pipeline.core.lock import LOCK_FD_VARIABLE, PARENT_VARIABLE
-from pipeline.core.measure import REPOSITORY
+from pipeline.core.lock import LOCK_FD_VARIABLE, PARENT_PID_VARIABLE
+from pipeline.core.measure import REPOSITORY_DIR
 
 
 def user_environment() -> dict[str, str]:
     """This process's environment as a user's shell would have it: not inside a run."""
-    return {key: value for key, value in os.environ.items() if key not in (LOCK_FD_VARIABLE, PARENT_VARIABLE)}
+    return {key: value for key, value in os.environ.items() if key not in (LOCK_FD_VARIABLE, PARENT_PID_VARIABLE)}
 
 
 class Toy:
     """A folder with the toy's `stages` and `configs`, a video of numbers, and the commands."""
 
     def __init__(self, folder: Path) -> None:
-        shutil.copytree(REPOSITORY / "tests" / "core" / "toy", folder, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(REPOSITORY_DIR / "tests" / "core" / "toy", folder, ignore=shutil.ignore_patterns("__pycache__"))
         self.folder = folder
         self.video = folder / "numbers.txt"
         self.video.write_text("1 2 3000\n")
@@ -28,7 +28,7 @@ class Toy:
 
     def start(self, *arguments: str, **variables: str) -> subprocess.Popen[str]:
         """Start `python -m <arguments>` in a process group of its own; the caller waits."""
-        environment = user_environment() | {"PYTHONPATH": str(REPOSITORY), **variables}
+        environment = user_environment() | {"PYTHONPATH": str(REPOSITORY_DIR), **variables}
         command = [sys.executable, "-m", *arguments]
         pipe = subprocess.PIPE
         return subprocess.Popen(
@@ -39,7 +39,7 @@ class Toy:
             stderr=pipe,
             text=True,
             start_new_session=True,
-            preexec_fn=_hear_interrupts,
+            preexec_fn=_restore_sigint_handler,
         )
 
     def call(self, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
@@ -52,7 +52,7 @@ class Toy:
         """Run the whole toy pipeline on runs/a."""
         return self.call("stages", "--run", "runs/a", *arguments, **variables)
 
-    def refusal(self, *arguments: str) -> str:
+    def expect_user_error(self, *arguments: str) -> str:
         """The one sentence with which a command is refused."""
         done = self.call(*arguments)
         assert done.returncode == 2, done
@@ -62,6 +62,6 @@ class Toy:
         return sentence
 
 
-def _hear_interrupts() -> None:
+def _restore_sigint_handler() -> None:
     """A shell's background jobs ignore SIGINT, and so would their children; a user at a terminal is what is tested."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -9,31 +9,31 @@ import torch
 
 from data_tools.evaluate.compare_avatar import Comparison
 from data_tools.evaluate.files import TRUTH_VERSION
-from data_tools.evaluate.truth import load_truth
+from data_tools.evaluate.truth import load_ground_truth
 from data_tools.synthetic.scene.capture import Capture as Recording
 from pipeline.avatar.finished_run import FinishedRun
-from pipeline.avatar.textured_avatar import TexturedAvatar, straight_rgba
+from pipeline.avatar.textured_avatar import TexturedAvatar, unpremultiply_to_uint8
 from pipeline.body.body import Motion, canonical_to_world
 from pipeline.capture.capture import Capture, image_path, mask_path
-from pipeline.capture.frame_selection import split_of
-from pipeline.core.manifest import MANIFEST, Manifest, digest_files, write_manifest
+from pipeline.capture.frame_selection import assign_splits
+from pipeline.core.manifest import MANIFEST_FILE, Manifest, digest_files, write_manifest
 from pipeline.geometry.rotation import axis_angle_to_matrix, axis_angle_to_quaternion, quaternion_multiply
 from pipeline.geometry.skinning import forward_kinematics, skinning_transforms, top_k_weights
 from pipeline.io.image import write_gray, write_rgb
 
 
-def compared(report: Path, version: int = TRUTH_VERSION) -> None:
+def write_fake_comparison(report: Path, version: int = TRUTH_VERSION) -> None:
     """Make a folder look like a report that was compared with the truth by the program of a version."""
     (report / "truth.html").write_text("a page")
     (report / "truth.json").write_text(f'{{"version": {version}, "mesh": {{"chamfer_mm": 6.5}}}}')
-    write_manifest(Manifest("report", 1, "", {}, {}, digest_files(report), {}, 1.0, 1.0), report / MANIFEST)
+    write_manifest(Manifest("report", 1, "", {}, {}, digest_files(report), {}, 1.0, 1.0), report / MANIFEST_FILE)
 
 
-def perfect_run(sample: Path, folder: Path) -> Comparison:
+def ground_truth_run(sample: Path, folder: Path) -> Comparison:
     """The true person, texture, poses and camera as if the pipeline had found them; its frames lie in `folder`."""
-    truth = load_truth(sample)
+    truth = load_ground_truth(sample)
     subject = truth.subject
-    _write_frames(truth, folder, straight_rgba)
+    _write_frames(truth, folder, unpremultiply_to_uint8)
     indices, weights = top_k_weights(subject.body.skin_weights)
     avatar = TexturedAvatar(
         vertices=torch.from_numpy(subject.body.vertices),
@@ -50,7 +50,7 @@ def perfect_run(sample: Path, folder: Path) -> Comparison:
         body=subject.body,
         motion=truth.motion,
         avatar=avatar,
-        draw_field=lambda pose: np.zeros((truth.camera.height, truth.camera.width, 4), dtype=np.float32),
+        field_renderer=lambda pose: np.zeros((truth.camera.height, truth.camera.width, 4), dtype=np.float32),
         refined=canonical_to_world(subject.body, truth.motion),
         fitted=canonical_to_world(subject.body, truth.motion),
     )
@@ -58,12 +58,12 @@ def perfect_run(sample: Path, folder: Path) -> Comparison:
     return Comparison(run, coverage, truth, sample / "truth")
 
 
-def filmed_as(pair: Comparison, folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> Comparison:
+def with_frames(comparison: Comparison, folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> Comparison:
     """The same run, had the frames stage made this (8 bits, straight RGBA) of the person (premultiplied, in [0, 1])."""
-    side_px = _write_frames(pair.truth, folder, change)
-    camera = pair.run.camera.scaled(side_px / pair.run.camera.width)
-    capture = replace(pair.run.capture, folder=folder, width=side_px, height=side_px)
-    return replace(pair, run=replace(pair.run, capture=capture, camera=camera))
+    side_px = _write_frames(comparison.truth, folder, change)
+    camera = comparison.run.camera.scaled(side_px / comparison.run.camera.width)
+    capture = replace(comparison.run.capture, folder=folder, width=side_px, height=side_px)
+    return replace(comparison, run=replace(comparison.run, capture=capture, camera=camera))
 
 
 def _write_frames(truth: Recording, folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> int:
@@ -83,7 +83,7 @@ def _capture(folder: Path, motion: Motion, side_px: int, fps: float) -> Capture:
         folder=folder,
         frame_index=motion.frame_index,
         time_s=motion.time_s,
-        split=split_of(motion.frame_index),
+        split=assign_splits(motion.frame_index),
         fps=fps,
         width=side_px,
         height=side_px,
@@ -97,46 +97,46 @@ def _capture(folder: Path, motion: Motion, side_px: int, fps: float) -> Capture:
     )
 
 
-def with_motion(pair: Comparison, motion: Motion) -> Comparison:
+def with_motion(comparison: Comparison, motion: Motion) -> Comparison:
     """The same run, had it found other poses."""
-    refined = canonical_to_world(pair.run.body, motion)
-    return replace(pair, run=replace(pair.run, motion=motion, refined=refined))
+    refined = canonical_to_world(comparison.run.body, motion)
+    return replace(comparison, run=replace(comparison.run, motion=motion, refined=refined))
 
 
-def shrunk(pair: Comparison, factor: float) -> Comparison:
+def with_scale(comparison: Comparison, factor: float) -> Comparison:
     """The same run, had it taken the person for smaller and nearer."""
-    run = pair.run
+    run = comparison.run
     body = replace(run.body, joints_m=run.body.joints_m * factor, vertices=run.body.vertices * factor)
     avatar = replace(run.avatar, vertices=run.avatar.vertices * factor)
     nearer = run.motion.with_pose(run.motion.rotations_wxyz, run.motion.root_translation_m * factor)
-    return with_motion(replace(pair, run=replace(run, body=body, avatar=avatar)), nearer)
+    return with_motion(replace(comparison, run=replace(run, body=body, avatar=avatar)), nearer)
 
 
-def seen_from_afar(pair: Comparison, factor: float) -> Comparison:
+def with_longer_focal(comparison: Comparison, factor: float) -> Comparison:
     """The same run, had it taken the lens for longer and the person for as much farther away."""
-    camera, motion = pair.run.camera, pair.run.motion
+    camera, motion = comparison.run.camera, comparison.run.motion
     longer = replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
     turn, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
     roots = (motion.root_translation_m @ turn.T + shift) * np.array([1.0, 1.0, factor], np.float32)
     farther = motion.with_pose(motion.rotations_wxyz, (roots - shift) @ turn)
-    return with_motion(replace(pair, run=replace(pair.run, camera=longer)), farther)
+    return with_motion(replace(comparison, run=replace(comparison.run, camera=longer)), farther)
 
 
-def resting_otherwise(pair: Comparison, angle_rad: float) -> Comparison:
+def with_raised_rest_arm(comparison: Comparison, angle_rad: float) -> Comparison:
     """The same run on a rig whose A-pose has the left arm raised by an angle."""
-    body, avatar = pair.run.body, pair.run.avatar
+    body, avatar = comparison.run.body, comparison.run.avatar
     turn = torch.eye(3).repeat(1, len(body.joint_names), 1, 1)
     turn[0, body.joint("LeftArm")] = axis_angle_to_matrix(torch.tensor([0.0, 0.0, angle_rad]))
     joints_m = torch.from_numpy(body.joints_m)
     joint_to_world = forward_kinematics(turn, joints_m[:1], joints_m, body.parents)
     raised = avatar.posed(skinning_transforms(joint_to_world, joints_m)[0])
     rig = replace(body, joints_m=joint_to_world[0, :, :3, 3].numpy(), vertices=raised.numpy())
-    return replace(pair, run=replace(pair.run, body=rig, avatar=replace(avatar, vertices=raised)))
+    return replace(comparison, run=replace(comparison.run, body=rig, avatar=replace(avatar, vertices=raised)))
 
 
-def bent_arm(pair: Comparison, frames: np.ndarray, angle_rad: float) -> Motion:
+def bent_arm(comparison: Comparison, frames: np.ndarray, angle_rad: float) -> Motion:
     """The motion with the left arm raised by an angle in some frames."""
-    motion, joint = pair.run.motion, pair.run.body.joint("LeftArm")
+    motion, joint = comparison.run.motion, comparison.run.body.joint("LeftArm")
     rotations = torch.from_numpy(motion.rotations_wxyz).clone()
     turn = axis_angle_to_quaternion(torch.tensor([0.0, 0.0, angle_rad]))
     rotations[frames, joint] = quaternion_multiply(rotations[frames, joint], turn.expand(len(frames), 4))

@@ -7,7 +7,7 @@ import torch
 
 from pipeline.body.body import Body, Motion, canonical_to_world, load_anny
 from pipeline.geometry.camera import Camera
-from pipeline.geometry.differentiable_raster import render_mesh
+from pipeline.geometry.differentiable_raster import render_attributes
 from pipeline.geometry.rotation import axis_angle_to_quaternion, quaternion_multiply
 from pipeline.geometry.skinning import linear_blend_skinning
 
@@ -58,7 +58,7 @@ def painted_scene(frames: int, height_px: int, seed: int = 0, bend_rad: float = 
     )
     images, masks = [], []
     for vertices in posed:
-        image, alpha = render_mesh(vertices, torch.from_numpy(body.faces), camera, torch.from_numpy(colours))
+        image, alpha = render_attributes(vertices, torch.from_numpy(body.faces), camera, torch.from_numpy(colours))
         straight = image / alpha.clamp(min=1e-3)[..., None]
         images.append((255 * straight.clamp(0, 1)).round().byte().numpy())
         masks.append((255 * alpha.clamp(0, 1)).round().byte().numpy())

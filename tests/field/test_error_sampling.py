@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.field.pixel_sampler import MEMORY, TILE_PX, ErrorMap, build_pool
-from tests.field.test_trainer import TRAIN, begin, scene  # noqa: F401 - a fixture
+from pipeline.field.pixel_sampler import ERROR_DECAY, TILE_PX, ErrorMap, build_pixel_pool
+from tests.field.test_trainer import TRAIN, make_trainer, scene  # noqa: F401 - a fixture
 
 SIDE_PX = 4 * TILE_PX
 
@@ -15,7 +15,7 @@ def pool():
     """One frame whose mask fills four by four tiles but for a margin."""
     mask = np.zeros((SIDE_PX, SIDE_PX), np.uint8)
     mask[8:-8, 8:-8] = 255
-    return build_pool([(np.zeros((SIDE_PX, SIDE_PX, 3), np.uint8), mask)] * 2, border_px=2, seed=0)
+    return build_pixel_pool([(np.zeros((SIDE_PX, SIDE_PX, 3), np.uint8), mask)] * 2, border_px=2, seed=0)
 
 
 def _places(pool):
@@ -26,24 +26,24 @@ def _places(pool):
 
 
 def test_a_tile_forgets_at_a_fixed_pace_and_others_keep_what_they_know(pool):
-    errors = ErrorMap(2, pool.xy_px)
+    error_map = ErrorMap(2, pool.xy_px)
     rows = np.concatenate([pool.start[1, 0] + np.flatnonzero(at) for at in _places(pool)])
     for _ in range(3):
-        errors.note(rows, np.array([1, 1]), np.array([[0.6, 0.0, 0.0], [0.4, -0.4, 0.4]]))
-    known = 0.3 + (1 - 0.3) * MEMORY**6
-    assert errors.error[1, 2, 1] == pytest.approx(known)
-    assert np.count_nonzero(errors.error != 1) == 1
+        error_map.update(rows, np.array([1, 1]), np.array([[0.6, 0.0, 0.0], [0.4, -0.4, 0.4]]))
+    known = 0.3 + (1 - 0.3) * ERROR_DECAY**6
+    assert error_map.error[1, 2, 1] == pytest.approx(known)
+    assert np.count_nonzero(error_map.error != 1) == 1
 
 
 def test_rays_of_the_body_go_where_the_error_is_in_proportion(pool):
-    errors, streams = ErrorMap(2, pool.xy_px), [np.random.default_rng(0)]
+    error_map, rngs = ErrorMap(2, pool.xy_px), [np.random.default_rng(0)]
     upper = np.array([0, 1]), np.arange(4)
-    errors.error[0][np.ix_(*upper)] = 3.0
-    for by_error, share in ((1.0, 0.75), (0.5, 0.625), (0.0, 0.5)):
+    error_map.error[0][np.ix_(*upper)] = 3.0
+    for error_ratio, share in ((1.0, 0.75), (0.5, 0.625), (0.0, 0.5)):
         for frame, expected in ((0, share), (1, 0.5)):
-            rows, _ = pool.draw(np.array([frame]), np.array([[8000, 0, 0]]), streams, errors, by_error)
+            rows, _ = pool.sample_pixels(np.array([frame]), np.array([[8000, 0, 0]]), rngs, error_map, error_ratio)
             assert len(rows) == 8000
-            for run in np.split(rows, [8000 - round(8000 * by_error)]):
+            for run in np.split(rows, [8000 - round(8000 * error_ratio)]):
                 assert np.all(np.diff(run) >= 0)
             assert pool.start[frame, 0] <= rows.min()
             assert rows.max() < pool.start[frame, 1]
@@ -52,11 +52,11 @@ def test_rays_of_the_body_go_where_the_error_is_in_proportion(pool):
 
 
 def test_border_and_outside_keep_their_rays(pool):
-    errors = ErrorMap(2, pool.xy_px)
-    errors.error[:, 0] = 1e6
-    sizes = pool.sizes(np.array([0, 1]), 1000.0, (0.4, 0.35, 0.25))
-    assert sizes.tolist() == [[400, 350, 250]] * 2
-    rows, _ = pool.draw(np.array([0]), sizes[:1], [np.random.default_rng(0)], errors, 1.0)
+    error_map = ErrorMap(2, pool.xy_px)
+    error_map.error[:, 0] = 1e6
+    sample_counts = pool.sample_counts(np.array([0, 1]), 1000.0, (0.4, 0.35, 0.25))
+    assert sample_counts.tolist() == [[400, 350, 250]] * 2
+    rows, _ = pool.sample_pixels(np.array([0]), sample_counts[:1], [np.random.default_rng(0)], error_map, 1.0)
     counts = np.histogram(rows, bins=[*pool.start[0]])[0]
     assert counts.tolist() == [400, 350, 250]
 
@@ -64,15 +64,15 @@ def test_border_and_outside_keep_their_rays(pool):
 def test_a_frame_without_a_person_has_rays_outside_alone():
     empty = np.zeros((SIDE_PX, SIDE_PX), np.uint8)
     solid = np.pad(np.full((20, 20), 255, np.uint8), 22)
-    pool = build_pool([(np.zeros((64, 64, 3), np.uint8), mask) for mask in (solid, empty)], border_px=2, seed=0)
-    sizes = pool.sizes(np.array([0, 1]), 100.0, (0.5, 0.3, 0.2))
-    assert sizes[0].tolist() == [50, 30, 20]
-    assert sizes[1, :2].tolist() == [0, 0]
+    pool = build_pixel_pool([(np.zeros((64, 64, 3), np.uint8), mask) for mask in (solid, empty)], border_px=2, seed=0)
+    sample_counts = pool.sample_counts(np.array([0, 1]), 100.0, (0.5, 0.3, 0.2))
+    assert sample_counts[0].tolist() == [50, 30, 20]
+    assert sample_counts[1, :2].tolist() == [0, 0]
 
 
 def test_a_resumed_run_draws_what_an_unbroken_one_would_have(scene):  # noqa: F811
-    options = {"steps": 12, "share_error": 0.6, "occupancy_start": 4}
-    whole, first = begin(scene, **options), begin(scene, **options)
+    options = {"steps": 12, "error_sampling_ratio": 0.6, "occupancy_warmup_steps": 4}
+    whole, first = make_trainer(scene, **options), make_trainer(scene, **options)
     for _ in range(12):
         whole.step()
     for _ in range(5):
@@ -80,7 +80,7 @@ def test_a_resumed_run_draws_what_an_unbroken_one_would_have(scene):  # noqa: F8
     kept = {name: value.clone() for name, value in first.state().items()}
     assert float(kept["pixel_errors"].min()) < 0.9
     assert kept["pixel_errors"].shape[0] == len(TRAIN)
-    second = begin(scene, **options)
+    second = make_trainer(scene, **options)
     second.load_state(kept)
     for _ in range(7):
         second.step()

@@ -6,16 +6,22 @@ import torch
 
 from pipeline.core.errors import UserError
 from pipeline.field import field as field_module
-from pipeline.field.field import NEGLIGIBLE, START_DENSITY_PER_M, Field, _Decode, choose_layout
+from pipeline.field.field import (
+    INITIAL_DENSITY_PER_M,
+    MIN_RELATIVE_GRADIENT,
+    RadianceField,
+    _RadianceMlp,
+    hash_grid_layout,
+)
 from pipeline.field.files import load_field, load_occupancy, save_field, save_occupancy
-from pipeline.field.occupancy import Occupancy
+from pipeline.field.occupancy import BinaryOccupancy
 from pipeline.io.tensors import load_tensors, save_tensors
 
 BOUNDS = np.array([[-0.5, 0.0, -0.25], [0.5, 2.0, 0.25]], dtype=np.float32)
 
 
 def make_field(seed=0):
-    return Field(BOUNDS, choose_layout(BOUNDS, 0.02, 3, 4, 10), 16, seed)
+    return RadianceField(BOUNDS, hash_grid_layout(BOUNDS, 0.02, 3, 4, 10), 16, seed)
 
 
 def points(count=50):
@@ -28,13 +34,13 @@ def test_decoder_passes_gradcheck():
     shapes = ((7, 6), (6, 5), (5, 4), (4,))
     inputs = [0.5 * torch.randn(shape, generator=random, dtype=torch.float64) for shape in shapes]
     inputs = [tensor.requires_grad_(True) for tensor in inputs]
-    assert torch.autograd.gradcheck(_Decode.apply, inputs)
+    assert torch.autograd.gradcheck(_RadianceMlp.apply, inputs)
 
 
 def test_decoder_keeps_a_gradient_beyond_the_clamp():
     features = torch.ones(1, 1, requires_grad=True)
     output = torch.tensor([[0.0, 0, 0, 50.0]])
-    _, density = _Decode.apply(features, torch.ones(1, 1), output, torch.zeros(4))
+    _, density = _RadianceMlp.apply(features, torch.ones(1, 1), output, torch.zeros(4))
     density.sum().backward()
     assert torch.isfinite(density).all()
     assert float(features.grad) > 0
@@ -49,21 +55,21 @@ def test_points_that_hardly_matter_are_left_out_of_backward():
     for direction in towards:
         direction[:40] *= 1e-5
     gradients = []
-    for share in (0.0, NEGLIGIBLE):
+    for share in (0.0, MIN_RELATIVE_GRADIENT):
         leaves = [tensor.clone().requires_grad_(True) for tensor in inputs]
-        with mock.patch.object(field_module, "NEGLIGIBLE", share):
-            torch.autograd.backward(_Decode.apply(*leaves), towards)
+        with mock.patch.object(field_module, "MIN_RELATIVE_GRADIENT", share):
+            torch.autograd.backward(_RadianceMlp.apply(*leaves), towards)
         gradients.append([leaf.grad for leaf in leaves])
     assert gradients[0][0][:40].any()
     assert not gradients[1][0][:40].any()
     torch.testing.assert_close(gradients[1][0][40:], gradients[0][0][40:])
     for truth, found in zip(gradients[0][1:], gradients[1][1:], strict=True):
-        assert float((found - truth).norm()) < NEGLIGIBLE * float(truth.norm())
+        assert float((found - truth).norm()) < MIN_RELATIVE_GRADIENT * float(truth.norm())
 
 
 def test_starts_as_thin_grey_fog():
     colour, density = make_field().requires_grad_(False)(points())
-    assert float((density - START_DENSITY_PER_M).abs().max()) < 0.1
+    assert float((density - INITIAL_DENSITY_PER_M).abs().max()) < 0.1
     assert float((colour - 0.5).abs().max()) < 0.01
 
 
@@ -80,7 +86,7 @@ def test_same_seed_same_field():
 
 
 def test_layout_ends_at_the_finest_cell():
-    layout = choose_layout(BOUNDS, 0.004, 6, 2, 12)
+    layout = hash_grid_layout(BOUNDS, 0.004, 6, 2, 12)
     finest = np.array([1.0, 2.0, 0.5]) / np.array(layout.cells_per_axis[-1])
     np.testing.assert_allclose(finest, 0.004, rtol=0.02)
     coarsest = np.array([1.0, 2.0, 0.5]) / np.array(layout.cells_per_axis[0])
@@ -102,7 +108,7 @@ def test_field_returns_from_disk(tmp_path):
 def test_occupancy_returns_from_disk(tmp_path):
     occupied = torch.zeros(4, 4, 4, dtype=torch.uint8)
     occupied[1, 2, 3] = 1
-    save_occupancy(tmp_path / "o.npz", Occupancy(occupied, torch.from_numpy(BOUNDS)))
+    save_occupancy(tmp_path / "o.npz", BinaryOccupancy(occupied, torch.from_numpy(BOUNDS)))
     again = load_occupancy(tmp_path / "o.npz")
     assert torch.equal(again.occupied, occupied)
     assert again.contains(torch.tensor([[-0.2, 1.3, 0.2], [0.2, 1.3, 0.2], [9.0, 0, 0]])).tolist() == [

@@ -4,12 +4,12 @@ import torch
 
 from pipeline.body.body import Body, load_anny
 from pipeline.field.initial_occupancy import (
-    cell_distances_m,
-    clothing_margin_m,
+    cell_signed_distances_m,
+    estimate_clothing_offset_m,
     field_bounds_m,
-    filmed_from_one_side,
-    mask_frequency,
-    starting_shell,
+    initial_occupancy,
+    observed_from_one_side,
+    project_mask_fraction,
 )
 from pipeline.field.occupancy import cell_centres
 from pipeline.geometry.camera import Camera
@@ -22,26 +22,26 @@ LOOKING_BACK = np.diag([1.0, -1.0, -1.0, 1.0])
 LOOKING_BACK[2, 3] = 2.0
 
 
-def frequency_of(points, distances, masks, width=40):
+def mask_fraction_of(points, distances, masks, width=40):
     """Of points of the unbent bar, before a camera 2 m away for which a decimetre is five pixels."""
     camera = Camera(100.0, 100.0, width / 2, 20.0, width, 40, LOOKING_BACK.astype(np.float32))
     matrices = UPRIGHT.expand(len(masks), 2, 4, 4)
     points, distances = np.array(points, dtype=np.float32), np.array(distances, dtype=np.float32)
-    weights = bar_skin().weights_at(torch.from_numpy(points))
-    return mask_frequency(points, distances, weights, matrices, camera, masks)
+    weights = bar_skin().interpolate_weights(torch.from_numpy(points))
+    return project_mask_fraction(points, distances, weights, matrices, camera, masks)
 
 
 def test_counts_the_masks_that_hold_a_point():
     left = np.zeros((40, 40), dtype=np.uint8)
     left[:, :20] = 1
     masks = [left, left, left, 1 - left]
-    frequency = frequency_of([[-0.3, 0, 0], [0.3, 0, 0]], [0.1, 0.1], masks)
-    np.testing.assert_allclose(frequency, [0.75, 0.25], atol=1e-6)
+    mask_fraction = mask_fraction_of([[-0.3, 0, 0], [0.3, 0, 0]], [0.1, 0.1], masks)
+    np.testing.assert_allclose(mask_fraction, [0.75, 0.25], atol=1e-6)
 
 
 def test_unseen_points_are_expected_near_the_body_only():
     masks = [np.ones((40, 20), dtype=np.uint8)] * 8
-    seen, near, far = frequency_of([[0, 0, 0], [0.5, 0, 0], [0.5, 0, 0]], [0.1, 0.0, 0.1], masks, width=20)
+    seen, near, far = mask_fraction_of([[0, 0, 0], [0.5, 0, 0], [0.5, 0, 0]], [0.1, 0.0, 0.1], masks, width=20)
     assert seen == 1
     assert near == 1
     assert far == 0
@@ -50,9 +50,9 @@ def test_unseen_points_are_expected_near_the_body_only():
 def test_few_sights_of_a_far_point_do_not_outweigh_the_expectation():
     masks = [np.ones((40, 40), dtype=np.uint8)] * 2
     blank = [np.zeros((40, 40), dtype=np.uint8)] * 2
-    assert frequency_of([[0, 0, 0]], [0.1], masks + blank)[0] == 0.5
+    assert mask_fraction_of([[0, 0, 0]], [0.1], masks + blank)[0] == 0.5
     narrow = [np.ones((40, 40), dtype=np.uint8)] * 4
-    assert frequency_of([[0.42, 0, 0]], [0.1], narrow)[0] < 0.1
+    assert mask_fraction_of([[0.42, 0, 0]], [0.1], narrow)[0] < 0.1
 
 
 @pytest.mark.parametrize(("arc_deg", "one_sided"), [(0, True), (130, True), (160, False), (360, False)])
@@ -64,35 +64,38 @@ def test_a_bone_that_turns_far_enough_is_not_filmed_from_one_side(arc_deg, one_s
     turning[:, 2, 0], turning[:, 2, 2] = -angle.sin(), angle.cos()
     matrices = torch.stack([torch.eye(4).repeat(len(angle), 1, 1), turning], dim=1)
     camera = Camera(100.0, 100.0, 20.0, 20.0, 40, 40, LOOKING_BACK.astype(np.float32))
-    joints_m, weights = np.zeros((2, 3), np.float32), bar_skin().weights_at(torch.tensor([[-0.3, 0, 0], [0.3, 0, 0]]))
-    found = filmed_from_one_side(joints_m, weights, matrices, camera)
+    joints_m, weights = (
+        np.zeros((2, 3), np.float32),
+        bar_skin().interpolate_weights(torch.tensor([[-0.3, 0, 0], [0.3, 0, 0]])),
+    )
+    found = observed_from_one_side(joints_m, weights, matrices, camera)
     assert found.tolist() == [True, one_sided]
     # Where the body stands and which way it looks at first means nothing.
     matrices[:, :, :3, 3] = torch.tensor([0.0, 0.0, -50.0])
     turned = torch.tensor([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
-    again = filmed_from_one_side(joints_m, weights, matrices @ turned, camera)
+    again = observed_from_one_side(joints_m, weights, matrices @ turned, camera)
     assert again.tolist() == [True, one_sided]
 
 
 def test_every_cell_has_its_distance_to_the_body_up_to_the_reach():
     anny = load_anny()
     body = anny.body(anny.shape_defaults)
-    bounds_m, reach_m = field_bounds_m(body, 0.1), 0.02
+    bounds_m, max_distance_m = field_bounds_m(body, 0.1), 0.02
     some = np.random.default_rng(0).permutation(64**3)[:20_000]
     truth_m = signed_distance_m(cell_centres(bounds_m)[some], body.mesh())
     # The deepest lie farther from all vertices than cells outside that are asked.
-    assert truth_m.min() < -(reach_m + 0.06)
-    found_m = cell_distances_m(body, bounds_m, reach_m).reshape(-1)[some]
-    np.testing.assert_allclose(found_m, np.minimum(truth_m, reach_m), atol=1e-6)
+    assert truth_m.min() < -(max_distance_m + 0.06)
+    found_m = cell_signed_distances_m(body, bounds_m, max_distance_m).reshape(-1)[some]
+    np.testing.assert_allclose(found_m, np.minimum(truth_m, max_distance_m), atol=1e-6)
 
 
 def test_the_shell_holds_the_body_and_what_masks_support():
     distance = np.array([-0.01, 0.05, 0.05, 0.2])
-    frequency = np.array([0.0, 0.7, 0.5, 1.0])
-    assert starting_shell(distance, frequency, 0.1, 0.6).tolist() == [True, True, False, False]
+    mask_fraction = np.array([0.0, 0.7, 0.5, 1.0])
+    assert initial_occupancy(distance, mask_fraction, 0.1, 0.6).tolist() == [True, True, False, False]
 
 
-def margin_of_discs(radii_m, narrowest_m=0.05, widest_m=1.0):
+def margin_of_discs(radii_m, min_offset_m=0.05, max_offset_m=1.0):
     """A flat body, a disc of points 2 m before the camera, and a round mask in each frame; a pixel is a centimetre."""
     grid = np.stack(np.meshgrid(*2 * [np.arange(-DISC_M, DISC_M + 0.01, 0.01)]), axis=-1).reshape(-1, 2)
     disc = grid[np.linalg.norm(grid, axis=1) <= DISC_M + 1e-6]
@@ -104,7 +107,9 @@ def margin_of_discs(radii_m, narrowest_m=0.05, widest_m=1.0):
     row, column = np.mgrid[:160, :160] + 0.5
     from_axis_m = np.hypot(row - 80, column - 80) / 100
     masks = [from_axis_m < radius for radius in radii_m]
-    return clothing_margin_m(body, UPRIGHT[:, :1].expand(len(masks), 1, 4, 4), camera, masks, narrowest_m, widest_m)
+    return estimate_clothing_offset_m(
+        body, UPRIGHT[:, :1].expand(len(masks), 1, 4, 4), camera, masks, min_offset_m, max_offset_m
+    )
 
 
 def test_the_margin_is_twice_what_masks_reach_beyond_the_body():
@@ -115,8 +120,8 @@ def test_the_margin_is_twice_what_masks_reach_beyond_the_body():
 
 def test_the_margin_stays_within_its_limits():
     assert margin_of_discs([DISC_M]) == 0.05
-    assert margin_of_discs([0.7], widest_m=0.4) == 0.4
-    assert margin_of_discs([0.7], widest_m=0.0) == 0.05
+    assert margin_of_discs([0.7], max_offset_m=0.4) == 0.4
+    assert margin_of_discs([0.7], max_offset_m=0.0) == 0.05
 
 
 def test_a_few_poor_masks_and_empty_ones_do_not_widen_the_margin():

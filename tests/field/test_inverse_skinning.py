@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from pipeline.body.body import canonical_to_world, load_anny
-from pipeline.field.initial_occupancy import cell_distances_m, field_bounds_m
-from pipeline.field.inverse_skinning import START_BONES, Rays, invert_motion
-from pipeline.field.occupancy import Occupancy
-from pipeline.field.skin_grid import build_skin_grid, posed_from_world
+from pipeline.field.initial_occupancy import cell_signed_distances_m, field_bounds_m
+from pipeline.field.inverse_skinning import INITIAL_BONES, Rays, build_inverse_skinning
+from pipeline.field.occupancy import BinaryOccupancy
+from pipeline.field.skin_grid import build_skin_grid, world_to_posed
 from pipeline.geometry.surface import signed_distance_m
 from pipeline.kernels.inverse_skinning.reference import skin_points
 from tests.field.scene import make_motion
@@ -30,15 +30,15 @@ def skin(body):
 @pytest.fixture(scope="module")
 def poses(body):
     world = canonical_to_world(body, make_motion(body, 3, bend_rad=0.12))
-    return posed_from_world(world)[:, None] @ world
+    return world_to_posed(world)[:, None] @ world
 
 
 @pytest.fixture(scope="module")
 def shell(body):
     """All cells near the body are occupied."""
     bounds_m = field_bounds_m(body, MARGIN_M)
-    near = cell_distances_m(body, bounds_m, 2 * MARGIN_M) < MARGIN_M
-    return Occupancy(torch.from_numpy(near.astype(np.uint8)), torch.from_numpy(bounds_m))
+    near = cell_signed_distances_m(body, bounds_m, 2 * MARGIN_M) < MARGIN_M
+    return BinaryOccupancy(torch.from_numpy(near.astype(np.uint8)), torch.from_numpy(bounds_m))
 
 
 def carried(body, skin, poses, count=3000):
@@ -59,8 +59,8 @@ def samples_at(inverse, posed, frame, occupancy):
     """Samples of rays that make one stop, at the points: the ray starts there and its step is longer than the box."""
     directions = torch.tensor([[0.0, 0.0, 1.0]]).expand(len(posed), 3)
     rays = Rays(posed, directions, frame, torch.zeros(len(posed)))
-    samples = inverse.sample(rays, 99.0, occupancy, 160)
-    return samples, torch.repeat_interleave(torch.arange(len(posed)), samples.ray_start.diff())
+    samples = inverse.sample_rays(rays, 99.0, occupancy, 160)
+    return samples, torch.repeat_interleave(torch.arange(len(posed)), samples.ray_offsets.diff())
 
 
 def nearest_error_m(found, owner, points):
@@ -70,29 +70,31 @@ def nearest_error_m(found, owner, points):
 
 
 def test_thirteen_bones_are_in_the_body(body):
-    assert len(START_BONES) == 13
-    assert set(START_BONES) <= set(body.joint_names)
+    assert len(INITIAL_BONES) == 13
+    assert set(INITIAL_BONES) <= set(body.joint_names)
 
 
-@pytest.mark.parametrize("way", ["baked", "broyden"])
-def test_finds_where_points_came_from_to_a_millimetre(way, body, skin, poses, shell):
+@pytest.mark.parametrize("method", ["baked", "broyden"])
+def test_finds_where_points_came_from_to_a_millimetre(method, body, skin, poses, shell):
     points, frame, posed = carried(body, skin, poses)
     order = frame.argsort(stable=True)
     points, frame, posed = points[order], frame[order], posed[order]
-    inverse = invert_motion(way, body, skin, poses)
+    inverse = build_inverse_skinning(method, body, skin, poses)
     samples, owner = samples_at(inverse, posed, frame, shell)
-    slot_start = torch.searchsorted(frame[owner].contiguous(), torch.arange(len(poses) + 1))
+    frame_offsets = torch.searchsorted(frame[owner].contiguous(), torch.arange(len(poses) + 1))
     frames = torch.arange(len(poses))
-    placed = inverse.place(skin, poses, frames, samples.canonical_m, posed[owner], slot_start)
+    placed = inverse.to_canonical(skin, poses, frames, samples.canonical_m, posed[owner], frame_offsets)
     assert (
-        float((nearest_error_m(placed, owner, points) < 1e-3).float().mean()) > {"baked": 0.97, "broyden": 0.985}[way]
+        float((nearest_error_m(placed, owner, points) < 1e-3).float().mean())
+        > {"baked": 0.97, "broyden": 0.985}[method]
     )
 
 
 def test_broyden_and_the_baked_grid_agree(body, skin, poses, shell):
     _, frame, posed = carried(body, skin, poses, 1500)
     (baked, of_baked), (searched, of_searched) = (
-        samples_at(invert_motion(way, body, skin, poses), posed, frame, shell) for way in ("baked", "broyden")
+        samples_at(build_inverse_skinning(method, body, skin, poses), posed, frame, shell)
+        for method in ("baked", "broyden")
     )
     for one, its, other, others in (
         (baked, of_baked, searched, of_searched),
@@ -110,7 +112,7 @@ def test_broyden_and_the_baked_grid_agree(body, skin, poses, shell):
 def test_nearest_is_exact_on_the_surface_and_rough_beside_joints(body, skin, poses, shell):
     random = np.random.default_rng(2)
     chosen = random.integers(0, len(body.vertices), 1000)
-    inverse = invert_motion("nearest", body, skin, poses)
+    inverse = build_inverse_skinning("nearest", body, skin, poses)
     weights, vertices = torch.from_numpy(body.skin_weights)[chosen], torch.from_numpy(body.vertices)[chosen]
     matrix = torch.einsum("vj,jab->vab", weights, poses[1])
     posed = (matrix[:, :3, :3] @ vertices[:, :, None])[:, :, 0] + matrix[:, :3, 3]
@@ -123,49 +125,49 @@ def test_nearest_is_exact_on_the_surface_and_rough_beside_joints(body, skin, pos
     assert 1e-4 < float(error_m.median()) < 5e-3
 
 
-@pytest.mark.parametrize("way", ["baked", "broyden", "nearest"])
-def test_samples_lie_on_their_rays_and_in_occupied_cells(way, body, skin, poses, shell):
+@pytest.mark.parametrize("method", ["baked", "broyden", "nearest"])
+def test_samples_lie_on_their_rays_and_in_occupied_cells(method, body, skin, poses, shell):
     random = torch.Generator().manual_seed(0)
     origins = torch.randn(150, 3, generator=random) * 0.1 + torch.tensor([0.0, 1.0, 3.0])
-    towards = torch.randn(150, 3, generator=random) * torch.tensor([0.2, 0.5, 0.0]) + torch.tensor([0.0, 1.0, 0.0])
-    directions = torch.nn.functional.normalize(towards - origins, dim=1)
+    grad_output = torch.randn(150, 3, generator=random) * torch.tensor([0.2, 0.5, 0.0]) + torch.tensor([0.0, 1.0, 0.0])
+    directions = torch.nn.functional.normalize(grad_output - origins, dim=1)
     occupied = shell.occupied.clone()
     occupied[:32] = 0
-    occupancy = Occupancy(occupied, shell.bounds_m)
+    occupancy = BinaryOccupancy(occupied, shell.bounds_m)
     rays = Rays(origins, directions, torch.full((150,), 2), torch.rand(150, generator=random))
-    samples = invert_motion(way, body, skin, poses).sample(rays, 0.02, occupancy, 12)
-    counts = samples.ray_start.diff()
+    samples = build_inverse_skinning(method, body, skin, poses).sample_rays(rays, 0.02, occupancy, 12)
+    counts = samples.ray_offsets.diff()
     assert int(counts.max()) == 12
     assert len(samples.canonical_m) > 300
     assert bool(occupancy.contains(samples.canonical_m).all())
-    if way != "nearest":
+    if method != "nearest":
         owner = torch.repeat_interleave(torch.arange(150), counts)
         back = skin_points(samples.canonical_m, skin.blend(poses)[:, 2], skin.lattice)
         on_ray = origins[owner] + samples.distance_m[:, None] * directions[owner]
         assert float((back - on_ray).norm(dim=1).quantile(0.99)) < 0.01
 
 
-@pytest.mark.parametrize("way", ["broyden", "nearest"])
-def test_placing_keeps_the_samples_and_has_the_gradient_of_the_finite_difference(way, body, skin, poses, shell):
+@pytest.mark.parametrize("method", ["broyden", "nearest"])
+def test_placing_keeps_the_samples_and_has_the_gradient_of_the_finite_difference(method, body, skin, poses, shell):
     _, _, posed = carried(body, skin, poses[1:2], 200)
     posed = posed[:30]
-    inverse = invert_motion(way, body, skin, poses)
+    inverse = build_inverse_skinning(method, body, skin, poses)
     samples, owner = samples_at(inverse, posed, torch.ones(30, dtype=torch.long), shell)
     shift = torch.zeros(3, requires_grad=True)
     fixed = (torch.tensor([1]), samples.canonical_m, posed[owner], torch.tensor([0, len(owner)]))
 
-    def place(offset):
+    def to_canonical(offset):
         moved = poses[1:2].clone()
         moved[:, :, :3, 3] += offset
-        return inverse.place(skin, moved, *fixed)
+        return inverse.to_canonical(skin, moved, *fixed)
 
-    placed = place(shift)
+    placed = to_canonical(shift)
     torch.testing.assert_close(placed, samples.canonical_m, atol=2e-5, rtol=0)
     placed.sum().backward()
-    ahead, behind = (place(torch.tensor([0.0, sign * 2e-3, 0.0])).sum() for sign in (1, -1))
+    ahead, behind = (to_canonical(torch.tensor([0.0, sign * 2e-3, 0.0])).sum() for sign in (1, -1))
     assert float(shift.grad[1]) == pytest.approx(float(ahead - behind) / 4e-3, rel=0.02)
 
 
 def test_an_unknown_way_is_refused(body, skin, poses):
     with pytest.raises(KeyError):
-        invert_motion("guessed", body, skin, poses)
+        build_inverse_skinning("guessed", body, skin, poses)

@@ -4,9 +4,9 @@ import torch
 
 from pipeline.field.config import FieldConfig
 from pipeline.field.losses import field_losses
-from pipeline.field.pixel_sampler import ErrorMap, build_pool
+from pipeline.field.pixel_sampler import ErrorMap, build_pixel_pool
 
-CONFIG = FieldConfig(huber_delta=0.1, weight_alpha=0.5, weight_hard=0.2, weight_density=0.1)
+CONFIG = FieldConfig(huber_delta=0.1, alpha_weight=0.5, hard_surface_weight=0.2, empty_density_weight=0.1)
 
 
 def test_perfect_image_costs_nothing():
@@ -33,7 +33,7 @@ def make_pool():
     mask[10:50, 10:30] = 255
     image = np.random.default_rng(0).integers(0, 256, (60, 40, 3), dtype=np.uint8)
     empty = np.zeros_like(mask)
-    return build_pool([(image, mask), (image, empty), (image, mask)], 3, seed=0), image, mask
+    return build_pixel_pool([(image, mask), (image, empty), (image, mask)], 3, seed=0), image, mask
 
 
 def test_pool_sorts_pixels_into_kinds():
@@ -52,12 +52,14 @@ def test_pool_sorts_pixels_into_kinds():
 
 def test_rays_are_shared_out_as_asked():
     pool, _, _ = make_pool()
-    sizes = pool.sizes(np.array([0, 1, 2]), 300.0, (0.6, 0.3, 0.1))
+    sample_counts = pool.sample_counts(np.array([0, 1, 2]), 300.0, (0.6, 0.3, 0.1))
 
     def drawn(frame):
-        return pool.draw(np.array([frame]), sizes[[frame]], [np.random.default_rng(0)], ErrorMap(3, pool.xy_px))[0]
+        return pool.sample_pixels(
+            np.array([frame]), sample_counts[[frame]], [np.random.default_rng(0)], ErrorMap(3, pool.xy_px)
+        )[0]
 
-    assert sizes.tolist() == [[180, 90, 30], [0, 0, 0], [180, 90, 30]]
+    assert sample_counts.tolist() == [[180, 90, 30], [0, 0, 0], [180, 90, 30]]
     rows = drawn(0)
     assert (np.diff(rows) >= 0).all()
     kinds = np.searchsorted(pool.start[0], rows, side="right") - 1

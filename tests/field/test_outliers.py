@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from pipeline.field.config import FieldConfig
-from pipeline.field.setup import start_learning
-from pipeline.field.trainer import Learning
+from pipeline.field.setup import create_trainer
+from pipeline.field.trainer import Trainer
 from tests.field.scene import PaintedScene, painted_scene
 
 SIDE_PX, RADIUS_PX, STEPS = 256, 14, 200
@@ -27,42 +27,42 @@ def ball_of(scene: PaintedScene, frame: int) -> np.ndarray:
     return np.hypot(width - x, height - y) < RADIUS_PX
 
 
-def learnt(scene: PaintedScene, **options) -> Learning:
-    pictures = []
+def learnt(scene: PaintedScene, **options) -> Trainer:
+    masked_images = []
     for frame, (image, mask) in enumerate(zip(scene.images, scene.masks, strict=True)):
         ball = ball_of(scene, frame) & (frame % 2 == 0)
-        pictures.append((np.where(ball[..., None], GREEN, image), np.where(ball, 255, mask).astype(np.uint8)))
+        masked_images.append((np.where(ball[..., None], GREEN, image), np.where(ball, 255, mask).astype(np.uint8)))
     config = FieldConfig(
         rays=1024, frames_per_step=4, steps=STEPS, levels=4, log2_rows=14, pose_refinement=False, **options
     )
-    learning = start_learning(scene.body, scene.motion, scene.camera, pictures, config)
+    trainer = create_trainer(scene.body, scene.motion, scene.camera, masked_images, config)
     for _ in range(STEPS):
-        learning.step()
-    return learning
+        trainer.step()
+    return trainer
 
 
-def green_there(scene: PaintedScene, learning: Learning) -> float:
+def green_there(scene: PaintedScene, trainer: Trainer) -> float:
     """How much greener than the person rays see it where a ball was in the way."""
-    xy, greener = learning.scene.pool.xy_px, []
+    xy, greener = trainer.scene.pool.xy_px, []
     for frame in range(0, len(scene.images), 2):
-        answer = learning._answer(np.array([frame]), torch.zeros(0, 3), 1.0)
-        places = xy[answer.batch.rows]
+        result = trainer._forward_backward(np.array([frame]), torch.zeros(0, 3), 1.0)
+        places = xy[result.batch.rows]
         here = ball_of(scene, frame)[places[:, 1], places[:, 0]]
         truth = scene.images[frame][places[:, 1], places[:, 0]][here] / 255
-        greener.append(answer.seen.image.detach().numpy()[here, 1] - truth[:, 1])
+        greener.append(result.rendered.image.detach().numpy()[here, 1] - truth[:, 1])
     return float(np.concatenate(greener).mean())
 
 
 def test_what_passes_before_the_person_is_not_learnt(scene):
-    careful, trusting = learnt(scene), learnt(scene, outlier=1e6)
+    careful, trusting = learnt(scene), learnt(scene, outlier_threshold=1e6)
     xy, on_ball, beside = careful.scene.pool.xy_px, [], []
     for frame in range(0, len(scene.images), 2):
-        batch = careful._draw(np.array([frame]))
-        ball, trust = ball_of(scene, frame)[xy[batch.rows, 1], xy[batch.rows, 0]], batch.trust.numpy()
-        on_ball.append(trust[ball])
-        beside.append(trust[~ball])
+        batch = careful._sample_batch(np.array([frame]))
+        ball, inlier_weight = ball_of(scene, frame)[xy[batch.rows, 1], xy[batch.rows, 0]], batch.inlier_weight.numpy()
+        on_ball.append(inlier_weight[ball])
+        beside.append(inlier_weight[~ball])
         # What lies outside the mask is believed always, so that nothing is left standing there.
-        assert (trust[batch.rgba[:, 3].numpy() == 0] == 1).all()
+        assert (inlier_weight[batch.rgba[:, 3].numpy() == 0] == 1).all()
     # Tiles are wider than the ball's rim: some of what is beside it shares them.
     assert np.concatenate(on_ball).mean() < 0.5
     assert np.concatenate(beside).mean() > 0.9

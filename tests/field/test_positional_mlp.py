@@ -3,30 +3,30 @@ import math
 import pytest
 import torch
 
-from pipeline.field.positional_mlp import FREQUENCIES, SKIP, FrequencyTrunk
+from pipeline.field.positional_mlp import FREQUENCY_COUNT, SKIP_LAYER, PositionalMlp
 
 
 def encoded_by_hand(point):
     """The point, then sin and cos of pi 2^k (2 x - 1), axis by axis."""
-    octaves = [math.pi * 2**k * (2 * value - 1) for value in point for k in range(FREQUENCIES)]
-    return [*point, *(math.sin(a) for a in octaves), *(math.cos(a) for a in octaves)]
+    phases = [math.pi * 2**k * (2 * value - 1) for value in point for k in range(FREQUENCY_COUNT)]
+    return [*point, *(math.sin(a) for a in phases), *(math.cos(a) for a in phases)]
 
 
 def test_the_encoding_enters_at_the_first_layer_and_before_the_skip():
-    trunk = FrequencyTrunk(SKIP + 1, 16).requires_grad_(False)
+    trunk = PositionalMlp(SKIP_LAYER + 1, 16).requires_grad_(False)
     point = [0.2, 0.55, 0.9]
     encoded = torch.tensor(encoded_by_hand(point))
     features = encoded
     for index, layer in enumerate(trunk.layers):
-        inputs = torch.cat([features, encoded]) if index == SKIP else features
+        inputs = torch.cat([features, encoded]) if index == SKIP_LAYER else features
         features = (layer.weight @ inputs + layer.bias).clamp(min=0)
     torch.testing.assert_close(trunk(torch.tensor([point]))[0], features, atol=1e-3, rtol=1e-3)
-    assert trunk.layers[SKIP].in_features == 16 + 3 + 6 * FREQUENCIES
+    assert trunk.layers[SKIP_LAYER].in_features == 16 + 3 + 6 * FREQUENCY_COUNT
 
 
 def test_same_seed_same_network():
     points = torch.rand(5, 3, generator=torch.Generator().manual_seed(0))
-    one, same, other = (FrequencyTrunk(3, 8, seed)(points) for seed in (1, 1, 2))
+    one, same, other = (PositionalMlp(3, 8, seed)(points) for seed in (1, 1, 2))
     assert torch.equal(one, same)
     assert not torch.equal(one, other)
 
@@ -37,7 +37,7 @@ def test_learns_detail_that_a_plain_network_cannot():
     points = torch.stack([x, torch.full_like(x, 0.5), torch.full_like(x, 0.5)], dim=1)
     stripes = torch.sign(torch.sin(40 * math.pi * x))
     torch.manual_seed(0)
-    trunk, last = FrequencyTrunk(3, 32), torch.nn.Linear(32, 1)
+    trunk, last = PositionalMlp(3, 32), torch.nn.Linear(32, 1)
     optimiser = torch.optim.Adam([*trunk.parameters(), *last.parameters()], lr=3e-3)
     for _ in range(150):
         error = (last(trunk(points))[:, 0] - stripes).square().mean()
@@ -49,4 +49,4 @@ def test_learns_detail_that_a_plain_network_cannot():
 
 @pytest.mark.parametrize("layers", [1, 7])
 def test_width_of_the_features(layers):
-    assert FrequencyTrunk(layers, 24)(torch.rand(2, 3)).shape == (2, 24)
+    assert PositionalMlp(layers, 24)(torch.rand(2, 3)).shape == (2, 24)

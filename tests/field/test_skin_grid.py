@@ -3,10 +3,10 @@ import pytest
 import torch
 
 from pipeline.body.body import canonical_to_world, load_anny
-from pipeline.field.skin_grid import bake_motion, build_skin_grid, posed_from_world, skin_margin_m
+from pipeline.field.skin_grid import bake_warp_grids, build_skin_grid, skin_margin_m, world_to_posed
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.geometry.surface import signed_distance_m
-from pipeline.kernels.inverse_skinning import newton
+from pipeline.kernels.inverse_skinning import newton_step
 from pipeline.kernels.inverse_skinning.reference import skin_points
 from pipeline.kernels.march import march
 from tests.field.scene import make_motion
@@ -48,7 +48,7 @@ def test_neighbouring_points_have_neighbouring_weights(skin):
     inside = skin.nodes_m[skin.distance_m < 0.06].numpy()
     points = torch.from_numpy(inside[random.integers(0, len(inside), 3000)])
     moved = points + 0.001 * torch.nn.functional.normalize(torch.randn(points.shape), dim=-1)
-    change = (skin.weights_at(points) - skin.weights_at(moved)).abs().sum(1)
+    change = (skin.interpolate_weights(points) - skin.interpolate_weights(moved)).abs().sum(1)
     # A jump between limbs, as nearest-vertex weights have it, would be a change of two within a millimetre.
     assert float(change.max()) < 0.35
 
@@ -56,15 +56,15 @@ def test_neighbouring_points_have_neighbouring_weights(skin):
 def test_posed_space_follows_the_root(body):
     motion = make_motion(body, 4)
     matrices = canonical_to_world(body, motion)
-    posed = posed_from_world(matrices) @ matrices[:, 0]
+    posed = world_to_posed(matrices) @ matrices[:, 0]
     torch.testing.assert_close(posed, torch.eye(4).expand(4, 4, 4), atol=1e-5, rtol=0)
 
 
 def test_lookup_and_one_step_undo_skinning(body, skin):
     motion = make_motion(body, 3, bend_rad=0.12)
     world = canonical_to_world(body, motion)
-    posed_matrices = posed_from_world(world)[:, None] @ world
-    warps = bake_motion(skin, posed_matrices)
+    posed_matrices = world_to_posed(world)[:, None] @ world
+    warps = bake_warp_grids(skin, posed_matrices)
     random = np.random.default_rng(1)
     points = skin.nodes_m.numpy()[random.integers(0, len(skin.nodes_m), 4000)]
     points = points + random.uniform(-0.5, 0.5, points.shape).astype(np.float32) * skin.cell_m
@@ -82,24 +82,26 @@ def test_lookup_and_one_step_undo_skinning(body, skin):
         torch.ones(2, 2, 2, dtype=torch.uint8),
         torch.tensor([[-9.0, -9, -9], [9, 9, 9]]),
     )
-    owner = torch.repeat_interleave(torch.arange(count), samples.ray_start.diff())
-    assert float((samples.ray_start.diff() > 0).float().mean()) > 0.995
-    refined = newton(blended, samples.canonical_m, posed[owner], torch.tensor([0, len(owner)]), skin)
+    point_indices = torch.repeat_interleave(torch.arange(count), samples.ray_offsets.diff())
+    assert float((samples.ray_offsets.diff() > 0).float().mean()) > 0.995
+    refined = newton_step(
+        blended, samples.canonical_m, posed[point_indices], torch.tensor([0, len(point_indices)]), skin
+    )
     back = skin_points(refined, blended[:, 0], skin.lattice)
-    assert float((back - posed[owner]).norm(dim=1).quantile(0.99)) < 1e-3
-    error_m = (refined - points[owner]).norm(dim=1)
+    assert float((back - posed[point_indices]).norm(dim=1).quantile(0.99)) < 1e-3
+    error_m = (refined - points[point_indices]).norm(dim=1)
     assert float(error_m.median()) < 1e-4
     assert float((error_m < 1e-3).float().mean()) > 0.97
 
 
 def test_baking_does_not_depend_on_the_number_of_threads(body, skin):
     world = canonical_to_world(body, make_motion(body, 2))
-    matrices = posed_from_world(world)[:, None] @ world
+    matrices = world_to_posed(world)[:, None] @ world
     threads = torch.get_num_threads()
     results = []
     for count in (1, 2):
         torch.set_num_threads(count)
-        results.append(bake_motion(skin, matrices))
+        results.append(bake_warp_grids(skin, matrices))
     torch.set_num_threads(threads)
     for one, two in zip(results[0].tensors(), results[1].tensors(), strict=True):
         assert torch.equal(one.nan_to_num(), two.nan_to_num())

@@ -9,13 +9,19 @@ import torch
 from pipeline.body.body import canonical_to_world
 from pipeline.field.config import FieldConfig
 from pipeline.field.rendering import render_field
-from pipeline.field.setup import start_learning
-from pipeline.field.validation import Judge
-from tests.elsewhere import ELSEWHERE, elsewhere
+from pipeline.field.setup import create_trainer
+from pipeline.field.validation import Validator
+from tests.elsewhere import FAKE_DEVICE, elsewhere
 from tests.field.scene import painted_scene
 from tests.field.test_trainer import TINY, TRAIN
 
-FEW = {"rays": 256, "occupancy_start": 4, "occupancy_every": 4, "pose_start": 0.25, "steps": 24}
+FEW = {
+    "rays": 256,
+    "occupancy_warmup_steps": 4,
+    "occupancy_update_interval": 4,
+    "pose_start_fraction": 0.25,
+    "steps": 24,
+}
 MOST_OPERATIONS = 1000
 """Of a step with poses. Each takes a launch on a graphics card, some five microseconds, whatever its size."""
 
@@ -25,15 +31,15 @@ def scene():
     return painted_scene(12, 110)
 
 
-def begin(scene, device, **options):
+def make_trainer(scene, device, **options):
     config = FieldConfig(**(TINY | FEW | options))
-    pictures = [(scene.images[row], scene.masks[row]) for row in TRAIN]
-    return start_learning(scene.body, scene.motion.select(TRAIN), scene.camera, pictures, config, device)
+    masked_images = [(scene.images[row], scene.masks[row]) for row in TRAIN]
+    return create_trainer(scene.body, scene.motion.select(TRAIN), scene.camera, masked_images, config, device)
 
 
 def learn(scene, device, steps, **options):
-    learning = begin(scene, device, **options)
-    return learning, [learning.step() for _ in range(steps)]
+    trainer = make_trainer(scene, device, **options)
+    return trainer, [trainer.step() for _ in range(steps)]
 
 
 def compare(scene, device, **options):
@@ -55,7 +61,7 @@ def compare(scene, device, **options):
 @pytest.mark.parametrize("options", [{}, {"occupancy": "attention"}, {"inverse_skinning": "nearest"}])
 def test_learns_elsewhere_what_it_learns_here(scene, options):
     with elsewhere():
-        compare(scene, ELSEWHERE, **options)
+        compare(scene, FAKE_DEVICE, **options)
 
 
 @pytest.mark.cuda
@@ -66,55 +72,55 @@ def test_learns_on_a_graphics_card_what_it_learns_here(scene, cuda):
 @pytest.fixture(scope="module", params=["elsewhere", "cuda"])
 def learnt(request, scene):
     """A field that learnt on another device, inside of that device's context."""
-    device = ELSEWHERE if request.param == "elsewhere" else torch.device(request.getfixturevalue("cuda"))
-    with elsewhere() if device == ELSEWHERE else nullcontext() as calls:
+    device = FAKE_DEVICE if request.param == "elsewhere" else torch.device(request.getfixturevalue("cuda"))
+    with elsewhere() if device == FAKE_DEVICE else nullcontext() as calls:
         yield learn(scene, device, 12)[0], calls
 
 
 def test_pictures_and_checkpoints_come_back_to_the_cpu(scene, learnt):
-    learning, _ = learnt
+    trainer, _ = learnt
     pose = canonical_to_world(scene.body, scene.motion.select(np.array([2])))[0]
-    shown = render_field(learning.field, learning.occupancy.grid(), scene.body, pose, scene.camera)
-    state = {name: value.cpu() for name, value in learning.state().items()}
-    again = begin(scene, torch.device("cpu"))
+    shown = render_field(trainer.field, trainer.occupancy.grid(), scene.body, pose, scene.camera)
+    state = {name: value.cpu() for name, value in trainer.state().items()}
+    again = make_trainer(scene, torch.device("cpu"))
     again.load_state(state)
     here = render_field(again.field, again.occupancy.grid(), scene.body, pose, scene.camera)
     assert float(here[..., 3].amax()) > 0.5
     assert float((shown - here).abs().mean()) < 1e-4
-    back = begin(scene, learning.device)
+    back = make_trainer(scene, trainer.device)
     back.load_state(state)
-    assert back.done == learning.done
+    assert back.completed_steps == trainer.completed_steps
 
 
 def test_validation_frames_are_scored_with_refined_poses(scene, learnt):
-    learning, _ = learnt
-    judge = Judge(
+    trainer, _ = learnt
+    validator = Validator(
         scene.motion.select(np.array([2, 5])), scene.camera, [(scene.images[r], scene.masks[r]) for r in (2, 5)]
     )
-    thin = judge.thinned()
-    renders = thin.render(learning, thin.pose(learning, refined=True))
-    assert all(np.isfinite(score) for score in thin.frame_scores(renders))
+    subsampled_validator = validator.subsampled()
+    renders = subsampled_validator.render(trainer, subsampled_validator.pose(trainer, refined=True))
+    assert all(np.isfinite(score) for score in subsampled_validator.psnr_per_frame_db(renders))
 
 
 def test_a_step_is_few_operations(scene):
     with elsewhere() as calls:
-        learning = begin(scene, ELSEWHERE)
+        trainer = make_trainer(scene, FAKE_DEVICE)
         for _ in range(FEW["steps"] - 2):
-            learning.step()
+            trainer.step()
         before = calls.count
-        learning.step()
-        assert learning.refines_poses
+        trainer.step()
+        assert trainer.refines_poses
         assert 100 < calls.count - before < MOST_OPERATIONS
 
 
 def test_elsewhere_keeps_the_rules_of_a_graphics_card():
     with elsewhere():
-        there = torch.arange(6.0).to(ELSEWHERE)
+        there = torch.arange(6.0).to(FAKE_DEVICE)
         with pytest.raises(RuntimeError, match="lies on the CPU"):
             there + torch.ones(6)
         with pytest.raises(RuntimeError, match="numpy"):
             there.numpy()
-        leaf = torch.ones(3, device=ELSEWHERE, requires_grad=True)
+        leaf = torch.ones(3, device=FAKE_DEVICE, requires_grad=True)
         (leaf.square().sum() * 2.0).backward()
         assert leaf.grad.tolist() == [4.0, 4.0, 4.0]
         assert (there[2:4] + 1).cpu().tolist() == [3.0, 4.0]

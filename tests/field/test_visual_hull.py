@@ -3,12 +3,18 @@ import pytest
 import torch
 
 from pipeline.body.body import canonical_to_world
-from pipeline.field.field import START_DENSITY_PER_M
+from pipeline.field.field import INITIAL_DENSITY_PER_M
 from pipeline.field.initial_occupancy import field_bounds_m
-from pipeline.field.occupancy import Occupancy
+from pipeline.field.occupancy import BinaryOccupancy
 from pipeline.field.rendering import over_white, render_field
 from pipeline.field.skin_grid import build_skin_grid
-from pipeline.field.visual_hull import SURFACE_DENSITY_PER_M, carve, dense_layout, node_positions_m, raw_field
+from pipeline.field.visual_hull import (
+    SURFACE_DENSITY_PER_M,
+    carve_visual_hull,
+    dense_grid_field,
+    dense_layout,
+    node_positions_m,
+)
 from tests.field.scene import painted_scene
 
 BOUNDS = np.array([[-0.5, 0.0, -0.25], [0.5, 2.0, 0.25]], dtype=np.float32)
@@ -29,7 +35,7 @@ def skin(scene):
 def hull(scene, skin):
     bounds_m = field_bounds_m(scene.body, MARGIN_M)
     rows = np.array([row for row in range(12) if row != 5])
-    return carve(
+    return carve_visual_hull(
         scene.body,
         skin,
         canonical_to_world(scene.body, scene.motion.select(rows)),
@@ -44,7 +50,7 @@ def hull(scene, skin):
 def test_layout_is_dense_and_as_fine_as_asked_or_as_rows_allow():
     assert dense_layout(BOUNDS, 0.05, 20).cells_per_axis == ((20, 40, 10),)
     layout = dense_layout(BOUNDS, 0.001, 12)
-    assert layout.plan[0, 5] == 1
+    assert layout.level_params[0, 5] == 1
     assert 0.8 * 4096 < layout.rows <= 4096
 
 
@@ -53,12 +59,12 @@ def test_nodes_lie_in_the_order_of_the_rows_and_the_field_says_what_they_hold():
     nodes = torch.from_numpy(node_positions_m(BOUNDS, layout))
     # Linear in space, so that trilinear interpolation is exact everywhere.
     raw = torch.stack([nodes[:, 0], nodes[:, 1] - 1, -4 * nodes[:, 2], 2 * nodes[:, 1] + nodes[:, 0] - 2], dim=1)
-    field = raw_field(BOUNDS, layout, raw).requires_grad_(False)
+    field = dense_grid_field(BOUNDS, layout, raw).requires_grad_(False)
     points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 2.0, 0.5])
     x, y, z = (points + torch.from_numpy(BOUNDS[0])).unbind(1)
     colour, density = field(torch.stack([x, y, z], dim=1))
     torch.testing.assert_close(colour, torch.sigmoid(torch.stack([x, y - 1, -4 * z], dim=1)), atol=1e-5, rtol=0)
-    torch.testing.assert_close(density, START_DENSITY_PER_M * torch.exp(2 * y + x - 2), atol=0, rtol=1e-4)
+    torch.testing.assert_close(density, INITIAL_DENSITY_PER_M * torch.exp(2 * y + x - 2), atol=0, rtol=1e-4)
 
 
 def test_body_is_solid_and_air_is_empty(scene, hull):
@@ -73,7 +79,7 @@ def test_body_is_solid_and_air_is_empty(scene, hull):
 
 def test_shows_a_frame_that_it_was_not_carved_from(scene, skin, hull):
     """A turn leaves no hollow but under arms; colours are means over the frames that face them."""
-    occupancy = Occupancy(torch.ones(64, 64, 64, dtype=torch.uint8), hull.bounds_m)
+    occupancy = BinaryOccupancy(torch.ones(64, 64, 64, dtype=torch.uint8), hull.bounds_m)
     pose = canonical_to_world(scene.body, scene.motion.select(np.array([5])))[0]
     shown = render_field(hull, occupancy, scene.body, pose, scene.camera, skin)
     mask = torch.from_numpy(scene.masks[5]) / 255
@@ -87,13 +93,13 @@ def test_front_and_back_keep_their_colours(scene, skin):
     """One frame from the front, one from behind, painted red and blue: no side takes the other's colour."""
     rows = np.array([0, 6])
     paints = (np.array([255, 0, 0], np.uint8), np.array([0, 0, 255], np.uint8))
-    pictures = [
+    masked_images = [
         (np.zeros_like(scene.images[0]) + paint, scene.masks[row]) for row, paint in zip(rows, paints, strict=True)
     ]
     bounds_m = field_bounds_m(scene.body, MARGIN_M)
     layout = dense_layout(bounds_m, 0.03, 20)
     poses = canonical_to_world(scene.body, scene.motion.select(rows))
-    field = carve(scene.body, skin, poses, scene.camera, pictures, bounds_m, layout, 0.9)
+    field = carve_visual_hull(scene.body, skin, poses, scene.camera, masked_images, bounds_m, layout, 0.9)
     chest, back = (
         scene.body.vertices[
             (np.abs(scene.body.vertices[:, 0]) < 0.1)

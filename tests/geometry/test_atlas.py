@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from pipeline.geometry.atlas import Atlas, fill_gaps, rasterize_texels, texture_size_px, unwrap
+from pipeline.geometry.atlas import Atlas, fill_unknown_texels, rasterize_texels, texture_size_px, unwrap
 from pipeline.geometry.mesh import Mesh
 
 SIZE_PX, PADDING_PX = 256, 4
@@ -93,13 +93,13 @@ def test_image_puts_values_where_covered_says(atlas: Atlas) -> None:
     np.testing.assert_array_equal(image[..., 0] > 0, texels.covered())
 
 
-@pytest.mark.parametrize(("footprint_m", "expected"), [(0.0035, 512), (0.0021, 1024), (1e-5, 2048), (1.0, 256)])
-def test_texture_size_follows_the_capture(footprint_m: float, expected: int) -> None:
-    size = texture_size_px(1.8, footprint_m, smallest=256, largest=2048)
+@pytest.mark.parametrize(("pixel_footprint_m", "expected"), [(0.0035, 512), (0.0021, 1024), (1e-5, 2048), (1.0, 256)])
+def test_texture_size_follows_the_capture(pixel_footprint_m: float, expected: int) -> None:
+    size = texture_size_px(1.8, pixel_footprint_m, min_size_px=256, max_size_px=2048)
     assert size == expected
     if 256 < size < 2048:
         texel_m = np.sqrt(1.8 / 0.65) / size
-        assert 0.5 * footprint_m < texel_m <= footprint_m
+        assert 0.5 * pixel_footprint_m < texel_m <= pixel_footprint_m
 
 
 @settings(max_examples=25)
@@ -109,7 +109,7 @@ def test_filling_keeps_the_known_and_stays_between_its_extremes(seed: int, heigh
     image = random.uniform(0.2, 0.8, (height, width, 3)).astype(np.float32)
     known = random.uniform(size=(height, width)) < 0.2
     known[random.integers(height), random.integers(width)] = True
-    filled = fill_gaps(np.where(known[..., None], image, 7.0).astype(np.float32), known)
+    filled = fill_unknown_texels(np.where(known[..., None], image, 7.0).astype(np.float32), known)
     np.testing.assert_array_equal(filled[known], image[known])
     assert np.all(filled >= image[known].min(axis=0) - 1e-4)
     assert np.all(filled <= image[known].max(axis=0) + 1e-4)
@@ -119,7 +119,7 @@ def test_filling_next_to_a_chart_takes_that_chart_s_colour() -> None:
     image, known = np.zeros((64, 64, 3), dtype=np.float32), np.zeros((64, 64), dtype=bool)
     image[:, :20], image[:, 40:] = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
     known[:, :20] = known[:, 40:] = True
-    filled = fill_gaps(image, known, copied_px=2)
+    filled = fill_unknown_texels(image, known, dilation_px=2)
     np.testing.assert_allclose(filled[:, 20:22], np.broadcast_to([1.0, 0.0, 0.0], (64, 2, 3)), atol=1e-6)
     np.testing.assert_allclose(filled[:, 38:40], np.broadcast_to([0.0, 0.0, 1.0], (64, 2, 3)), atol=1e-6)
     assert 0.2 < filled[32, 30, 0] < 0.8

@@ -4,24 +4,24 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.geometry.colour import linear_light, srgb_of_light
+from pipeline.geometry.colour import linear_to_srgb, srgb_to_linear
 
 
 @pytest.mark.parametrize(
     ("srgb", "light"), [(0.0, 0.0), (0.02, 0.02 / 12.92), (0.5, 0.214041), (0.735357, 0.5), (1, 1)]
 )
 def test_known_points(srgb, light):
-    assert linear_light(np.array([srgb]))[0] == pytest.approx(light, abs=1e-6)
-    assert srgb_of_light(torch.tensor([light]))[0].item() == pytest.approx(srgb, abs=1e-6)
+    assert srgb_to_linear(np.array([srgb]))[0] == pytest.approx(light, abs=1e-6)
+    assert linear_to_srgb(torch.tensor([light]))[0].item() == pytest.approx(srgb, abs=1e-6)
 
 
 def test_both_kinds_agree_and_come_back():
     levels = np.arange(256) / 255.0
-    light = linear_light(levels)
-    np.testing.assert_allclose(linear_light(torch.from_numpy(levels)).numpy(), light, rtol=1e-12)
-    np.testing.assert_allclose(srgb_of_light(light), levels, atol=1e-7)
+    light = srgb_to_linear(levels)
+    np.testing.assert_allclose(srgb_to_linear(torch.from_numpy(levels)).numpy(), light, rtol=1e-12)
+    np.testing.assert_allclose(linear_to_srgb(light), levels, atol=1e-7)
     assert (np.diff(light) > 0).all()
 
 
 def test_the_type_is_kept():
-    assert linear_light(np.ones(2, np.float32)).dtype == srgb_of_light(np.ones(2, np.float32)).dtype == np.float32
+    assert srgb_to_linear(np.ones(2, np.float32)).dtype == linear_to_srgb(np.ones(2, np.float32)).dtype == np.float32

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from pipeline.geometry.camera import Camera
-from pipeline.geometry.differentiable_raster import face_adjacency, render_mesh, render_shaded
+from pipeline.geometry.differentiable_raster import face_adjacency, render_attributes, render_shaded
 
 CAMERA = Camera(60.0, 60.0, 24.0, 20.0, 48, 40)
 
@@ -36,7 +36,7 @@ def test_adjacency_is_mutual_on_a_closed_mesh() -> None:
 def test_area_and_colour_of_a_square() -> None:
     vertices, faces = square(2.0, 0.5)
     colours = torch.full((4, 3), 0.25, dtype=torch.float64)
-    image, alpha = render_mesh(vertices, faces, CAMERA, colours)
+    image, alpha = render_attributes(vertices, faces, CAMERA, colours)
     assert float(alpha.sum()) == pytest.approx(30.0 * 30.0, rel=1e-6)
     torch.testing.assert_close(image, 0.25 * alpha[..., None].expand_as(image))
 
@@ -45,7 +45,7 @@ def test_attributes_follow_the_world_not_the_screen() -> None:
     """World position as attribute on a steep plane: at each pixel it must project back to that pixel."""
     vertices, faces = square(2.0, 0.6)
     vertices[:, 2] -= 1.2 * vertices[:, 0]
-    image, alpha = render_mesh(vertices, faces, CAMERA, vertices)
+    image, alpha = render_attributes(vertices, faces, CAMERA, vertices)
     inside = (alpha == 1.0) & (torch.nn.functional.avg_pool2d(alpha[None, None], 3, 1, 1)[0, 0] == 1.0)
     back_x = 60.0 * image[..., 0] / -image[..., 2] + 24.0
     expected = (torch.arange(48) + 0.5).expand(40, 48).double()
@@ -57,13 +57,13 @@ def test_image_is_linear_in_attributes_and_shading_is_called_once() -> None:
     vertices, faces = square(2.0, 0.5)
     calls = []
 
-    def shade(values: Tensor) -> Tensor:
+    def shader(values: Tensor) -> Tensor:
         calls.append(len(values))
         return 1.0 - values[:, :2]
 
     attributes = torch.rand(4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    shaded, alpha, face_id = render_shaded(vertices, faces, CAMERA, attributes, shade)
-    plain, _ = render_mesh(vertices, faces, CAMERA, attributes)
+    shaded, alpha, face_id = render_shaded(vertices, faces, CAMERA, attributes, shader)
+    plain, _ = render_attributes(vertices, faces, CAMERA, attributes)
     assert calls == [int((face_id >= 0).sum())]
     torch.testing.assert_close(shaded, alpha[..., None] - plain[..., :2])
 
@@ -75,7 +75,7 @@ def test_gradients_inside_faces_equal_finite_differences() -> None:
     colours = torch.rand(4, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
 
     def picture(points: Tensor, values: Tensor) -> Tensor:
-        return render_mesh(points, faces, CAMERA, values)[0][10:30:7, 5:40:9].reshape(-1)
+        return render_attributes(points, faces, CAMERA, values)[0][10:30:7, 5:40:9].reshape(-1)
 
     torch.autograd.gradcheck(picture, (vertices.requires_grad_(), colours.requires_grad_()), eps=1e-7, atol=1e-5)
 
@@ -83,8 +83,8 @@ def test_gradients_inside_faces_equal_finite_differences() -> None:
 def test_float32_and_float64_agree() -> None:
     vertices, faces = square(1.7, 0.43)
     colours = torch.rand(4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
-    double = render_mesh(vertices, faces, CAMERA, colours)
-    single = render_mesh(vertices.float(), faces, CAMERA, colours.float())
+    double = render_attributes(vertices, faces, CAMERA, colours)
+    single = render_attributes(vertices.float(), faces, CAMERA, colours.float())
     for a, b in zip(double, single, strict=True):
         torch.testing.assert_close(a.float(), b, rtol=0, atol=2e-4)
 
@@ -92,11 +92,13 @@ def test_float32_and_float64_agree() -> None:
 def test_a_square_slides_to_where_the_silhouette_says() -> None:
     vertices, faces = square(2.0, 0.4)
     with torch.no_grad():
-        _, target = render_mesh(vertices + torch.tensor([0.09, -0.05, 0.0]), faces, CAMERA, torch.ones(4, 1).double())
+        _, target = render_attributes(
+            vertices + torch.tensor([0.09, -0.05, 0.0]), faces, CAMERA, torch.ones(4, 1).double()
+        )
     shift = torch.zeros(3, dtype=torch.float64, requires_grad=True)
     optimiser = torch.optim.Adam([shift], lr=0.01)
     for _ in range(60):
-        _, alpha = render_mesh(vertices + shift, faces, CAMERA, torch.ones(4, 1).double())
+        _, alpha = render_attributes(vertices + shift, faces, CAMERA, torch.ones(4, 1).double())
         loss = (alpha - target).square().mean()
         optimiser.zero_grad()
         loss.backward()
@@ -106,6 +108,6 @@ def test_a_square_slides_to_where_the_silhouette_says() -> None:
 
 def test_a_mesh_behind_the_camera_is_not_seen() -> None:
     vertices, faces = square(-1.0, 0.4)
-    image, alpha = render_mesh(vertices, faces, CAMERA, torch.ones(4, 3).double())
+    image, alpha = render_attributes(vertices, faces, CAMERA, torch.ones(4, 3).double())
     assert float(alpha.abs().sum()) == 0.0
     assert float(image.abs().sum()) == 0.0

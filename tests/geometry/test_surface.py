@@ -5,24 +5,24 @@ import pytest
 
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import (
+    MeshAABBTree,
     OpenSurfaceError,
-    SurfaceTree,
-    closest_on_mesh,
-    compact,
+    closest_points_on_mesh,
     is_closed_manifold,
     isosurface,
     laplacian,
     largest_component,
-    remesh,
+    largest_solid,
+    remesh_isotropic,
+    remove_unreferenced_vertices,
     repair,
+    resolve_self_intersections,
     self_intersecting_faces,
     signed_distance_m,
-    smooth,
-    solid_body,
-    split_fans,
+    smooth_taubin,
+    split_nonmanifold_vertices,
     subdivide,
     transfer,
-    untangle,
 )
 
 TETRAHEDRON = Mesh(
@@ -49,15 +49,15 @@ def volume(mesh: Mesh) -> float:
     return float(np.einsum("ij,ij", a, np.cross(b, c)) / 6.0)
 
 
-def euler(mesh: Mesh) -> int:
-    return len(compact(mesh).vertices) - len(mesh.edges()) + len(mesh.faces)
+def euler_characteristic(mesh: Mesh) -> int:
+    return len(remove_unreferenced_vertices(mesh).vertices) - len(mesh.edges()) + len(mesh.faces)
 
 
 def moved(mesh: Mesh, shift: tuple[float, float, float]) -> Mesh:
     return Mesh(mesh.vertices + np.array(shift, dtype=np.float32), mesh.faces)
 
 
-def joined(*meshes: Mesh) -> Mesh:
+def concatenate_meshes(*meshes: Mesh) -> Mesh:
     offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])[:-1]
     faces = [mesh.faces + np.int32(offset) for mesh, offset in zip(meshes, offsets, strict=True)]
     return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))
@@ -67,7 +67,7 @@ def test_isosurface_of_a_ball(sphere: Mesh) -> None:
     np.testing.assert_allclose(np.linalg.norm(sphere.vertices, axis=1), 0.5, atol=0.004)
     assert volume(sphere) == pytest.approx(4 / 3 * np.pi * 0.125, rel=0.01)  # positive: faces look outward
     assert is_closed_manifold(sphere)
-    assert euler(sphere) == 2
+    assert euler_characteristic(sphere) == 2
 
 
 def test_isosurface_is_closed_where_the_solid_leaves_the_grid() -> None:
@@ -95,28 +95,28 @@ def test_solid_body_keeps_the_largest_part_and_fills_its_cavity() -> None:
     inside[10, 10, 10] = True
     expected = np.zeros_like(inside)
     expected[1:8, 1:8, 1:8] = True
-    np.testing.assert_array_equal(solid_body(inside), expected)
-    assert not solid_body(np.zeros((2, 2, 2), dtype=bool)).any()
+    np.testing.assert_array_equal(largest_solid(inside), expected)
+    assert not largest_solid(np.zeros((2, 2, 2), dtype=bool)).any()
 
 
 def test_largest_component_is_by_area_and_drops_unused_vertices(sphere: Mesh) -> None:
-    both = joined(TETRAHEDRON, moved(sphere, (5.0, 0.0, 0.0)))
+    both = concatenate_meshes(TETRAHEDRON, moved(sphere, (5.0, 0.0, 0.0)))
     kept = largest_component(both)
     np.testing.assert_allclose(kept.vertices, sphere.vertices + np.array([5.0, 0.0, 0.0]), atol=1e-6)
     assert len(kept.faces) == len(sphere.faces)
 
 
 def test_split_fans_separates_two_bodies_that_touch_in_a_point() -> None:
-    touching = joined(TETRAHEDRON, moved(TETRAHEDRON, (1.0, 0.0, 0.0)))
+    touching = concatenate_meshes(TETRAHEDRON, moved(TETRAHEDRON, (1.0, 0.0, 0.0)))
     faces = np.where(touching.faces == 4, 1, touching.faces)  # the second's corner 0 is the first's corner 1
-    pinched = compact(Mesh(touching.vertices, faces))
+    pinched = remove_unreferenced_vertices(Mesh(touching.vertices, faces))
     assert len(pinched.vertices) == 7
     assert pinched.is_watertight()
     assert not is_closed_manifold(pinched)
-    split = split_fans(pinched)
+    split = split_nonmanifold_vertices(pinched)
     assert len(split.vertices) == 8
     assert is_closed_manifold(split)
-    assert split_fans(split) is split
+    assert split_nonmanifold_vertices(split) is split
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -129,26 +129,26 @@ def test_repair_closes_holes_and_removes_fins(sphere: Mesh, seed: int) -> None:
         np.concatenate([kept, kept[:3], fins.astype(np.int32), [[0, 0, 1]]]).astype(np.int32),
     )
     assert not is_closed_manifold(broken)
-    mended = repair(broken)
-    assert is_closed_manifold(mended)
-    assert volume(mended) == pytest.approx(volume(sphere), rel=0.02)
+    repaired = repair(broken)
+    assert is_closed_manifold(repaired)
+    assert volume(repaired) == pytest.approx(volume(sphere), rel=0.02)
 
 
 def test_faces_that_cut_another_are_untangled_and_the_rest_stays(sphere: Mesh) -> None:
     assert self_intersecting_faces(sphere) == 0
-    assert untangle(sphere) is sphere
+    assert resolve_self_intersections(sphere) is sphere
     pushed = sphere.vertices.copy()
     lowest = pushed[:, 1].argmin()
     pushed[lowest] += [0.0, 1.1, 0.0]  # out through the top
     tangled = Mesh(pushed, sphere.faces)
     assert self_intersecting_faces(tangled) > 5
-    mended = untangle(tangled)
-    assert self_intersecting_faces(mended) == 0
-    assert (mended.faces == sphere.faces).all()
-    stayed = (mended.vertices == sphere.vertices).all(axis=1)
+    repaired = resolve_self_intersections(tangled)
+    assert self_intersecting_faces(repaired) == 0
+    assert (repaired.faces == sphere.faces).all()
+    stayed = (repaired.vertices == sphere.vertices).all(axis=1)
     assert stayed.mean() > 0.9
     # Whoever neighbours the spike follows it by a sixth of its metre before it is gone.
-    assert np.linalg.norm(mended.vertices - sphere.vertices, axis=1).max() < 0.25
+    assert np.linalg.norm(repaired.vertices - sphere.vertices, axis=1).max() < 0.25
 
 
 def test_what_cannot_be_closed_is_an_error_of_its_own() -> None:
@@ -161,7 +161,7 @@ def test_repair_leaves_a_sound_mesh_alone(sphere: Mesh) -> None:
 
 
 def test_remesh_reaches_the_edge_length_and_keeps_the_shape(sphere: Mesh) -> None:
-    coarse = remesh(sphere, 0.09)
+    coarse = remesh_isotropic(sphere, 0.09)
     ends = coarse.vertices[coarse.edges()]
     lengths = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
     assert np.median(lengths) == pytest.approx(0.09, rel=0.2)
@@ -172,7 +172,7 @@ def test_remesh_reaches_the_edge_length_and_keeps_the_shape(sphere: Mesh) -> Non
 
 def test_remesh_of_a_selection_leaves_the_rest_alone(sphere: Mesh) -> None:
     upper = sphere.vertices[sphere.faces][:, :, 1].mean(axis=1) > 0.05
-    result = remesh(sphere, 0.12, selected=upper)
+    result = remesh_isotropic(sphere, 0.12, selected=upper)
     assert is_closed_manifold(result)
     old = {tuple(np.round(v, 5)) for v in sphere.vertices[np.unique(sphere.faces[~upper])]}
     new = {tuple(np.round(v, 5)) for v in result.vertices}
@@ -185,7 +185,7 @@ def test_subdivision_is_conforming(sphere: Mesh, share: float) -> None:
     marked = np.random.default_rng(1).random(len(sphere.faces)) < share
     fine, ends = subdivide(sphere, marked)
     assert is_closed_manifold(fine)
-    assert euler(fine) == euler(sphere)
+    assert euler_characteristic(fine) == euler_characteristic(sphere)
     assert volume(fine) == pytest.approx(volume(sphere), rel=1e-6)
     assert fine.face_areas_m2().sum() == pytest.approx(sphere.face_areas_m2().sum(), rel=1e-6)
     np.testing.assert_array_equal(fine.vertices[: len(sphere.vertices)], sphere.vertices)
@@ -220,20 +220,20 @@ def test_laplacian_rows_vanish_on_constants_and_shrink_the_sphere(sphere: Mesh) 
 def test_smoothing_takes_noise_and_leaves_volume(sphere: Mesh) -> None:
     noise = np.random.default_rng(8).normal(scale=0.01, size=sphere.vertices.shape)
     noisy = Mesh((sphere.vertices + noise).astype(np.float32), sphere.faces)
-    result = smooth(noisy, 10)
+    result = smooth_taubin(noisy, 10)
     assert np.std(np.linalg.norm(result.vertices, axis=1)) < 0.5 * np.std(np.linalg.norm(noisy.vertices, axis=1))
     assert volume(result) == pytest.approx(volume(sphere), rel=0.02)
-    np.testing.assert_array_equal(smooth(noisy, 0).vertices, noisy.vertices)
+    np.testing.assert_array_equal(smooth_taubin(noisy, 0).vertices, noisy.vertices)
 
 
 def test_closest_point_against_brute_force(sphere: Mesh) -> None:
     points = np.random.default_rng(3).normal(size=(50, 3)) * 0.5
-    distance, face, barycentric = closest_on_mesh(points, sphere)
+    distance, face, barycentric = closest_points_on_mesh(points, sphere)
     np.testing.assert_allclose(barycentric.sum(axis=1), 1.0)
     assert barycentric.min() >= 0.0
     nearest = np.einsum("nk,nkc->nc", barycentric, sphere.vertices[sphere.faces[face]])
     np.testing.assert_allclose(np.linalg.norm(nearest - points, axis=1), distance, atol=1e-6)
-    np.testing.assert_allclose(SurfaceTree(sphere).nearest(points), nearest, atol=1e-6)
+    np.testing.assert_allclose(MeshAABBTree(sphere).nearest(points), nearest, atol=1e-6)
     weights = np.random.default_rng(4).dirichlet(np.ones(3), size=200)
     samples = np.einsum("sk,fkc->fsc", weights, sphere.vertices[sphere.faces]).reshape(-1, 3)
     brute = np.sqrt(((points[:, None] - samples[None, ::7]) ** 2).sum(axis=2)).min(axis=1)

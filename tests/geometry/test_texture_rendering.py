@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from pipeline.geometry.camera import Camera, project
-from pipeline.geometry.texture_rendering import render_textured, sample_texture, soften_outline, turntable_camera
+from pipeline.geometry.texture_rendering import blur_coverage, render_textured, sample_texture, turntable_camera
 
 SQUARE = torch.tensor([[-1.0, -1.0, -2.0], [1.0, -1.0, -2.0], [1.0, 1.0, -2.0], [-1.0, 1.0, -2.0]])
 FACES = torch.tensor([[0, 1, 2], [0, 2, 3]], dtype=torch.int32)
@@ -36,14 +36,14 @@ def test_sampling_is_differentiable_in_texture_and_place():
 
 def test_a_square_seen_head_on_shows_its_texture_upright():
     texture = torch.rand(8, 8, 3, generator=torch.Generator().manual_seed(2))
-    image = render_textured(SQUARE, FACES, FACES, UV, texture, square_camera(8), samples=1)
+    image = render_textured(SQUARE, FACES, FACES, UV, texture, square_camera(8), supersampling=1)
     assert torch.allclose(image[..., :3], texture, atol=1e-5)  # one pixel a texel: row 0 is v = 1, the top
     assert torch.equal(image[..., 3], torch.ones(8, 8))
 
 
 def test_samples_average_the_texels_under_a_pixel():
     texture = torch.rand(12, 12, 3, generator=torch.Generator().manual_seed(3))
-    image = render_textured(SQUARE, FACES, FACES, UV, texture, square_camera(4), samples=3)
+    image = render_textured(SQUARE, FACES, FACES, UV, texture, square_camera(4), supersampling=3)
     assert torch.allclose(image[..., :3], texture.view(4, 3, 4, 3, 3).mean(dim=(1, 3)), atol=1e-5)
 
 
@@ -51,7 +51,7 @@ def test_coverage_of_a_cut_pixel_is_its_area():
     shifted = SQUARE + torch.tensor(
         [0.25, 0.0, 0.0]
     )  # 1 px of 8 to the right: half of the 4 px wide image's first column
-    image = render_textured(shifted, FACES, FACES, UV, torch.ones(2, 2, 3), square_camera(4), samples=4)
+    image = render_textured(shifted, FACES, FACES, UV, torch.ones(2, 2, 3), square_camera(4), supersampling=4)
     assert image[:, 0, 3].tolist() == pytest.approx([0.5] * 4)
     assert torch.allclose(image[..., :3], image[..., 3:].expand(-1, -1, 3))  # colours are premultiplied
 
@@ -61,7 +61,9 @@ def test_uv_seams_do_not_blend():
     texture = torch.tensor([[[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
     uv = torch.tensor([[0.25, 0.5], [0.75, 0.5]])
     faces_uv = torch.tensor([[0, 0, 0], [1, 1, 1]], dtype=torch.int32)
-    image = render_textured(SQUARE, FACES, faces_uv, uv, texture, square_camera(6), samples=1)[..., :3].reshape(-1, 3)
+    image = render_textured(SQUARE, FACES, faces_uv, uv, texture, square_camera(6), supersampling=1)[..., :3].reshape(
+        -1, 3
+    )
     assert {tuple(colour) for colour in image.tolist()} == {(1.0, 0.0, 0.0), (0.0, 0.0, 1.0)}
 
 
@@ -92,7 +94,7 @@ def test_a_softened_outline_has_the_blur_and_the_colours_of_the_surface():
     picture = np.zeros((40, 60, 4), dtype=np.float32)
     picture[:, :30] = [0.2, 0.4, 0.6, 1.0]
     picture[20:, :30, 0] = 0.9
-    soft = soften_outline(picture, 1.2)
+    soft = blur_coverage(picture, 1.2)
     step = 0.5 * (1 - np.array([math.erf((x + 0.5 - 30) / (1.2 * 2**0.5)) for x in range(60)]))
     np.testing.assert_allclose(soft[5, :, 3], step, atol=0.02)
     covered = soft[..., 3] > 0.01
@@ -103,4 +105,4 @@ def test_a_softened_outline_has_the_blur_and_the_colours_of_the_surface():
 
 def test_no_blur_changes_nothing():
     picture = np.random.default_rng(0).random((9, 9, 4)).astype(np.float32)
-    assert soften_outline(picture, 0.0) is picture
+    assert blur_coverage(picture, 0.0) is picture

@@ -133,7 +133,7 @@ def test_a_gray_profile_makes_gray_and_levels_of_masks_stay(tmp_path):
 
 
 @pytest.mark.parametrize("profile", [b"junk", icc_profile(DISPLAY_P3, 0, 1.0, space=b"CMYK")])
-def test_a_profile_that_cannot_be_used_is_told(tmp_path, pixels, profile):
+def test_unusable_profile_is_reported(tmp_path, pixels, profile):
     Image.fromarray(pixels).save(tmp_path / "a.png", icc_profile=profile)
     with pytest.raises(UserError, match="colour profile of image .*a.png"):
         image.read_rgb(tmp_path / "a.png")

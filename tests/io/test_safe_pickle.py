@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.core.errors import UserError
 from pipeline.io import safe_pickle
-from pipeline.io.safe_pickle import Record, load_npy, load_pickle
+from pipeline.io.safe_pickle import OpaqueObject, load_npy, load_pickle
 
 
 class Call:
@@ -166,7 +166,7 @@ def made_type(name: str, state: tuple) -> Made:
     ],
 )
 @pytest.mark.parametrize("protocol", [2, 4])
-def test_numpy_is_not_told_lies(tmp_path, content, protocol):
+def test_inconsistent_array_descriptions_are_refused(tmp_path, content, protocol):
     """Each of these makes numpy read where nothing of the pickle lies, or could."""
     with pytest.raises(UserError, match=r"some\.pkl (cannot be read|is refused)"):
         load_pickle(written(tmp_path, content, protocol))
@@ -200,12 +200,12 @@ def test_dotted_names_lead_nowhere(tmp_path):
 
 
 @pytest.mark.parametrize("protocol", [0, 2, 4])
-def test_foreign_objects_are_records_only_when_asked_for(tmp_path, protocol):
+def test_foreign_objects_load_as_opaque_only_when_listed(tmp_path, protocol):
     path = written(tmp_path, {"shape": Foreign()}, protocol)
     with pytest.raises(UserError, match="Foreign|_reconstructor"):
         load_pickle(path)
-    record = load_pickle(path, records=[FOREIGN])["shape"]
-    assert isinstance(record, Record)
+    record = load_pickle(path, opaque_classes=[FOREIGN])["shape"]
+    assert isinstance(record, OpaqueObject)
     np.testing.assert_array_equal(record.state["x"], np.arange(3.0))
 
 
@@ -216,13 +216,13 @@ def test_a_pickle_cannot_change_records_for_the_next_one(tmp_path):
     path.write_bytes(f"c{module}\n{name}\n".encode() + b"(N(S'state'\nI7\ndtb.")
     poisoned = load_pickle_or_none(path)
     assert poisoned is None or poisoned.state == 7
-    assert Record.state is None
-    assert load_pickle(written(tmp_path, Foreign()), records=[FOREIGN]).state["x"].shape == (3,)
+    assert OpaqueObject.state is None
+    assert load_pickle(written(tmp_path, Foreign()), opaque_classes=[FOREIGN]).state["x"].shape == (3,)
 
 
 def load_pickle_or_none(path: Path):
     try:
-        return load_pickle(path, records=[FOREIGN])
+        return load_pickle(path, opaque_classes=[FOREIGN])
     except UserError:
         return None
 
@@ -272,7 +272,7 @@ def test_npy_files_run_nothing(tmp_path):
 
 def test_every_allowed_name_makes_plain_things_only():
     """Whoever adds a name to the list has to think about it here too."""
-    assert sorted({name.rpartition(".")[2] for name in safe_pickle._ALLOWED}) == [
+    assert sorted({name.rpartition(".")[2] for name in safe_pickle._ALLOWED_GLOBALS}) == [
         "OrderedDict", "_frombuffer", "_reconstruct", "_reconstructor", "bytearray", "complex", "dtype", "encode",
         "frozenset", "ndarray", "object", "scalar", "set",
     ]  # fmt: skip

@@ -25,9 +25,9 @@ def bar_skin(half_length_m=0.6, half_width_m=0.15) -> SkinGrid:
 def bend(angle_rad: float, dtype=torch.float32) -> torch.Tensor:
     """Skinning matrices (2, 4, 4): the second bone turns about z at the origin."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
-    turn = torch.eye(4, dtype=dtype)
-    turn[:2, :2] = torch.tensor([[c, -s], [s, c]], dtype=dtype)
-    return torch.stack([torch.eye(4, dtype=dtype), turn])
+    rotation = torch.eye(4, dtype=dtype)
+    rotation[:2, :2] = torch.tensor([[c, -s], [s, c]], dtype=dtype)
+    return torch.stack([torch.eye(4, dtype=dtype), rotation])
 
 
 def bar_points(count: int, seed: int = 0) -> torch.Tensor:

@@ -21,14 +21,14 @@ def run(dtype, steps=7, shape=(37, 3)):
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-6), (torch.float64, 1e-12)])
-def test_makes_the_steps_of_torch(dtype, tolerance):
+def test_steps_equal_torch_adam(dtype, tolerance):
     ours, theirs = run(dtype)
     torch.testing.assert_close(ours, theirs, atol=tolerance, rtol=0)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
-def test_a_gradient_that_is_not_finite_never_reaches_a_parameter(dtype, bad):
+def test_non_finite_gradients_are_ignored(dtype, bad):
     parameter, first, second = torch.ones(4, dtype=dtype), torch.zeros(4, dtype=dtype), torch.zeros(4, dtype=dtype)
     gradient = torch.tensor([1.0, bad, 0.0, -1.0], dtype=dtype)
     adam_step_(parameter, gradient, first, second, 1, 0.1)
@@ -47,6 +47,6 @@ def test_moments_do_not_stay_denormal():
     assert float(second) < 1.2e-30
 
 
-def test_refuses_what_does_not_fit():
+def test_mismatched_tensors_are_rejected():
     with pytest.raises(ValueError, match="contiguous"):
         adam_step_(torch.zeros(3), torch.zeros(4), torch.zeros(3), torch.zeros(3), 1, 0.1)

@@ -2,23 +2,23 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.kernels.broyden import CANDIDATES, search
-from pipeline.kernels.inverse_skinning import SkinGrid, bake, newton
+from pipeline.kernels.broyden import CANDIDATES, find_roots
+from pipeline.kernels.inverse_skinning import SkinGrid, bake_warp_grid, newton_step
 from pipeline.kernels.inverse_skinning.reference import skin_points
-from pipeline.kernels.march import WarpSet
+from pipeline.kernels.march import PackedWarpGrids
 from tests.kernels.bar import CELL_M, bar_points, bar_skin, bend
-from tests.kernels.test_inverse_skinning import look_up
+from tests.kernels.test_inverse_skinning import query_warp_grids
 
 
 def run(skin, matrices, posed, frame=None):
     """Search with all bones as starts; matrices (j, 4, 4) of one frame or (k, j, 4, 4)."""
     matrices = matrices if matrices.dim() == 4 else matrices[None]
     frame = torch.zeros(len(posed), dtype=torch.long) if frame is None else frame
-    return search(posed, frame, matrices, skin.blend(matrices), skin)
+    return find_roots(posed, frame, matrices, skin.blend(matrices), skin)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_single_bone_is_undone_by_its_inverse(dtype):
+def test_single_bone_inverse_is_the_matrix_inverse(dtype):
     bar = bar_skin()
     skin = SkinGrid(bar.origin_m, bar.cell_m, bar.row_of_node, bar.nodes_m, bar.distance_m, bar.weights[:, :1] * 0 + 1)
     matrix = bend(0.8, dtype)[1]
@@ -31,20 +31,20 @@ def test_a_single_bone_is_undone_by_its_inverse(dtype):
 
 
 @pytest.mark.parametrize("angle", [0.5, 1.2])
-def test_undoes_the_bent_bar_and_agrees_with_the_baked_grid(angle):
+def test_roots_agree_with_the_warp_grid_on_a_bent_bar(angle):
     skin, matrices, points = bar_skin(), bend(angle), bar_points(2000)
     blended = skin.blend(matrices[None])
     posed = skin_points(points, blended[:, 0], skin.lattice)
     roots, exists = run(skin, matrices, posed)
     truth = ((roots - points[:, None]).norm(dim=2) < 1e-3) & exists
     assert float(truth.any(1).float().mean()) > 0.995
-    baked, owner = look_up(posed, WarpSet.of([bake(skin, matrices)], CELL_M))
-    refined = newton(blended, baked, posed[owner], torch.tensor([0, len(owner)]), skin)
-    apart_m = (roots[owner] - refined[:, None]).norm(dim=2).masked_fill(~exists[owner], np.inf).amin(1)
+    baked, point_indices = query_warp_grids(posed, PackedWarpGrids.of([bake_warp_grid(skin, matrices)], CELL_M))
+    refined = newton_step(blended, baked, posed[point_indices], torch.tensor([0, len(point_indices)]), skin)
+    apart_m = (roots[point_indices] - refined[:, None]).norm(dim=2).masked_fill(~exists[point_indices], np.inf).amin(1)
     assert float((apart_m < 1e-3).float().mean()) > 0.99
 
 
-def test_every_answer_is_a_root_and_none_comes_twice():
+def test_all_candidates_are_distinct_roots():
     skin, matrices = bar_skin(), bend(np.pi - 0.35)
     points = torch.cat([bar_points(1000), torch.tensor([[-0.4, 0.073, 0.0], [-0.45, 0.081, 0.03]])])
     roots, exists = run(skin, matrices, points)
@@ -70,6 +70,6 @@ def test_matches_its_twin():
     torch.testing.assert_close(ours[0][same].double(), twin[0][same], atol=5e-4, rtol=0)
 
 
-def test_far_points_have_no_answer():
+def test_far_points_have_no_roots():
     far = torch.tensor([[0.0, 0.0, 0.5], [3.0, 0.0, 0.0]])
     assert not run(bar_skin(), bend(0.3), far)[1].any()

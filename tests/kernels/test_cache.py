@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.kernels.common.numba_options import COMPILED
+from pipeline.kernels.common.numba_options import COMPILED_SOURCES
 
-ROWS_OF_A_POINT = """
+HASH_ROWS_SCRIPT = """
 import json
 import numpy as np
 from numba import config
@@ -27,7 +27,7 @@ _corners(point, 0, 1, hashed_level, rows, np.zeros((8, 1), np.float32), np.zeros
 found, made = (sum(counts.values()) for counts in (_corners.stats.cache_hits, _corners.stats.cache_misses))
 print(json.dumps({"rows": rows.tolist(), "found": found, "made": made, "vectors": config.SLP_VECTORIZE}))
 """
-WHERE = "from numba import config; import pipeline.kernels.common.numba_options; print(config.CACHE_DIR)"
+CACHE_FOLDER_SCRIPT = "from numba import config; import pipeline.kernels.common.numba_options; print(config.CACHE_DIR)"
 
 
 @pytest.fixture
@@ -48,45 +48,45 @@ def output(kernels: Path, code: str, **environment: str) -> str:
     return done.stdout.strip()
 
 
-def test_a_second_process_compiles_nothing(kernels: Path) -> None:
-    first, second = (json.loads(output(kernels, ROWS_OF_A_POINT)) for _ in range(2))
+def test_second_process_uses_the_cache(kernels: Path) -> None:
+    first, second = (json.loads(output(kernels, HASH_ROWS_SCRIPT)) for _ in range(2))
     assert (first["found"], first["made"]) == (0, 1)
     assert (second["found"], second["made"]) == (1, 0)
     assert second["rows"] == first["rows"]
 
 
-def test_a_constant_of_another_file_is_not_taken_from_the_cache(kernels: Path) -> None:
-    before = json.loads(output(kernels, ROWS_OF_A_POINT))
+def test_changed_constant_in_another_file_invalidates_the_cache(kernels: Path) -> None:
+    before = json.loads(output(kernels, HASH_ROWS_SCRIPT))
     (kernels / "common" / "hashing.py").write_text("PRIMES = (2654435769, 805459861)\n")
-    after = json.loads(output(kernels, ROWS_OF_A_POINT))
+    after = json.loads(output(kernels, HASH_ROWS_SCRIPT))
     assert after["made"] == 1
     assert after["rows"] != before["rows"]
 
 
 def test_the_order_of_imports_does_not_matter(kernels: Path) -> None:
     """numba reads the environment when it is imported; the kernels' own settings come later then."""
-    late, early = (json.loads(output(kernels, f"import {first}\n{ROWS_OF_A_POINT}")) for first in ("numba", "json"))
+    late, early = (json.loads(output(kernels, f"import {first}\n{HASH_ROWS_SCRIPT}")) for first in ("numba", "json"))
     assert late["vectors"] == early["vectors"] == 1
     assert (early["found"], early["made"]) == (1, 0)
 
 
-def test_loops_without_vector_instructions_are_kept_apart(kernels: Path) -> None:
-    output(kernels, ROWS_OF_A_POINT, NUMBA_SLP_VECTORIZE="0")
-    assert json.loads(output(kernels, ROWS_OF_A_POINT))["made"] == 1
+def test_cache_is_separate_without_slp_vectorisation(kernels: Path) -> None:
+    output(kernels, HASH_ROWS_SCRIPT, NUMBA_SLP_VECTORIZE="0")
+    assert json.loads(output(kernels, HASH_ROWS_SCRIPT))["made"] == 1
 
 
-def test_the_cache_lies_beside_the_sources_or_where_the_user_wants_it(kernels: Path, tmp_path: Path) -> None:
-    beside = Path(output(kernels, WHERE))
-    assert beside.parent == kernels / "__pycache__"
-    wanted = Path(output(kernels, WHERE, NUMBA_CACHE_DIR=str(tmp_path / "wanted")))
-    assert wanted == tmp_path / "wanted" / beside.name
-    read_only = f"import os; os.access = lambda *_: False; {WHERE}"
+def test_cache_folder_is_default_or_user_supplied(kernels: Path, tmp_path: Path) -> None:
+    default_folder = Path(output(kernels, CACHE_FOLDER_SCRIPT))
+    assert default_folder.parent == kernels / "__pycache__"
+    custom_folder = Path(output(kernels, CACHE_FOLDER_SCRIPT, NUMBA_CACHE_DIR=str(tmp_path / "custom_folder")))
+    assert custom_folder == tmp_path / "custom_folder" / default_folder.name
+    read_only = f"import os; os.access = lambda *_: False; {CACHE_FOLDER_SCRIPT}"
     assert Path(output(kernels, read_only, XDG_CACHE_HOME=str(tmp_path))).is_relative_to(tmp_path / "numba")
 
 
-def test_compiled_loops_are_made_of_the_files_that_the_cache_watches(repository: Path) -> None:
+def test_cache_key_covers_all_imported_files(repository: Path) -> None:
     kernels = repository / "pipeline" / "kernels"
-    watched = {".".join(path.relative_to(kernels).with_suffix("").parts) for path in COMPILED}
+    watched = {".".join(path.relative_to(kernels).with_suffix("").parts) for path in COMPILED_SOURCES}
     for path in kernels.glob("*/*cpu.py"):
         imports = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
         modules = [node.module or "" for node in imports]

@@ -16,24 +16,24 @@ def make(dtype=torch.float32, samples=12, channels=3):
     return density, colour, step
 
 
-def by_definition(density, colour, step, first, last):
+def composite_by_definition(density, colour, step, first, last):
     """One ray, sample after sample."""
-    light, image, weights = 1.0, [0.0] * colour.shape[1], []
+    transmittance, image, weights = 1.0, [0.0] * colour.shape[1], []
     for i in range(first, last):
         alpha = 1 - math.exp(-float(density[i]) * float(step[i]))
-        weights.append(light * alpha)
-        image = [old + light * alpha * float(c) for old, c in zip(image, colour[i], strict=True)]
-        light *= 1 - alpha
-    return image, 1 - light, weights
+        weights.append(transmittance * alpha)
+        image = [old + transmittance * alpha * float(c) for old, c in zip(image, colour[i], strict=True)]
+        transmittance *= 1 - alpha
+    return image, 1 - transmittance, weights
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_each_ray_is_the_sum_by_definition(dtype):
+def test_rays_equal_the_compositing_sum(dtype):
     density, colour, step = make(dtype)
     image, alpha, weights = composite(density, colour, step, RAY_START)
     for ray in range(5):
         first, last = int(RAY_START[ray]), int(RAY_START[ray + 1])
-        true_image, true_alpha, true_weights = by_definition(density, colour, step, first, last)
+        true_image, true_alpha, true_weights = composite_by_definition(density, colour, step, first, last)
         assert image[ray].tolist() == pytest.approx(true_image, abs=2e-6)
         assert float(alpha[ray]) == pytest.approx(true_alpha, abs=2e-6)
         assert weights[first:last].tolist() == pytest.approx(true_weights, abs=2e-6)
@@ -49,7 +49,7 @@ def test_uniform_fog_has_its_closed_form():
     assert image[0].tolist() == pytest.approx([0.25 * expected] * 3, abs=1e-5)
 
 
-def test_empty_rays_see_nothing():
+def test_empty_rays_are_transparent():
     density, colour, step = make()
     image, alpha, _ = composite(density, colour, step, RAY_START)
     assert image[1].tolist() == [0, 0, 0]
@@ -78,10 +78,10 @@ def test_twin_passes_gradcheck():
     )
 
 
-def test_twin_in_float32_sees_thin_rays_behind_many_opaque_ones():
+def test_float32_reference_is_accurate_after_many_opaque_rays():
     """On a graphics card the twin runs in float32, over all rays of a step at once."""
     density = torch.cat([torch.full((50_000,), 1e4), torch.tensor([0.3, 0.2, 0.1])])
-    step, colour, ray_start = torch.full_like(density, 0.02), torch.ones(50_003, 1), torch.tensor([0, 50_000, 50_003])
-    _, alpha, weights = reference.composite(density, colour, step, ray_start)
+    step, colour, ray_offsets = torch.full_like(density, 0.02), torch.ones(50_003, 1), torch.tensor([0, 50_000, 50_003])
+    _, alpha, weights = reference.composite(density, colour, step, ray_offsets)
     assert float(alpha[1]) == pytest.approx(1 - math.exp(-0.6 * 0.02), rel=1e-4)
     assert weights[-1].item() == pytest.approx(math.exp(-0.5 * 0.02) * (1 - math.exp(-0.1 * 0.02)), rel=1e-4)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.kernels.hashgrid import GridLayout, Towards, add_table_gradient_, encode, reference
+from pipeline.kernels.hashgrid import FeatureGradients, GridLayout, add_table_gradient_, encode, reference
 
 # One dense level, one that just does not fit, two hashed ones.
 CELLS = ((3, 5, 2), (9, 9, 9), (40, 70, 20), (300, 500, 150))
@@ -31,7 +31,7 @@ def test_layout_counts_rows():
     assert layout.rows_per_level == (72, 512, 512, 512)
     assert layout.rows == 1608
     assert layout.width == 16
-    assert layout.plan[:, 5].tolist() == [1, 0, 0, 0]
+    assert layout.level_params[:, 5].tolist() == [1, 0, 0, 0]
     with pytest.raises(ValueError, match="features"):
         GridLayout(CELLS, 3, 9)
 
@@ -70,10 +70,10 @@ def test_twin_passes_gradcheck():
     random = torch.Generator().manual_seed(1)
     table = torch.randn(layout.rows, 2, generator=random, dtype=torch.float64, requires_grad=True)
     points = (0.05 + 0.9 * torch.rand(6, 3, generator=random, dtype=torch.float64)).requires_grad_(True)
-    assert torch.autograd.gradcheck(lambda p, t: reference.encode(p, t, layout.plan), (points, table))
+    assert torch.autograd.gradcheck(lambda p, t: reference.encode(p, t, layout.level_params), (points, table))
 
 
-def test_points_outside_are_read_at_the_border():
+def test_points_outside_are_clamped():
     layout, _, table = make(4)
     outside = torch.tensor([[-0.5, 0.3, 1.7], [2.0, -1.0, 0.5], [1.0, 1.0, 1.0]])
     torch.testing.assert_close(encode(outside, table, layout), encode(outside.clamp(0, 1), table, layout))
@@ -82,13 +82,13 @@ def test_points_outside_are_read_at_the_border():
     )
 
 
-def test_the_tables_gradient_may_be_added_up_later():
+def test_deferred_table_gradient_equals_autograd():
     layout, points, table = make(4)
     table.requires_grad_(True)
     encode(points, table, layout).square().sum().backward()
     alone = table.grad.clone()
     table.grad = None
-    towards: Towards = []
+    towards: FeatureGradients = []
     for half in points.tensor_split(2):
         encode(half, table, layout, towards).square().sum().backward()
     assert table.grad is None
@@ -98,7 +98,7 @@ def test_the_tables_gradient_may_be_added_up_later():
     torch.testing.assert_close(sums, alone + 1)
 
 
-def test_gradients_repeat_to_the_bit():
+def test_gradients_are_bitwise_deterministic():
     layout, points, table = make(8, points=5000)
     points.requires_grad_(True)
     table.requires_grad_(True)

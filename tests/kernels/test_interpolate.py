@@ -28,12 +28,12 @@ def scene(channels: int, seed: int) -> tuple[Tensor, ...]:
 
 @pytest.mark.parametrize("channels", [1, 3, 6])
 def test_kernel_equals_plain_twin_in_values_and_gradients(channels: int) -> None:
-    covered, face_of, *floats, faces, attributes = scene(channels, seed=channels)
+    covered, face_ids, *floats, faces, attributes = scene(channels, seed=channels)
     upstream = torch.randn(len(covered), channels, generator=torch.Generator().manual_seed(9))
     results = []
     for run in (interpolate, interpolate_reference):
         inputs = [tensor.clone().requires_grad_() for tensor in (*floats, attributes)]
-        values = run(covered, face_of, WIDTH, inputs[0], inputs[1], faces, inputs[2])
+        values = run(covered, face_ids, WIDTH, inputs[0], inputs[1], faces, inputs[2])
         results.append((values.detach(), *torch.autograd.grad((values * upstream).sum(), inputs)))
     assert len(covered) > 1000
     for name, fast, plain in zip(("values", "vertices", "depth", "attributes"), *results, strict=True):
@@ -43,27 +43,27 @@ def test_kernel_equals_plain_twin_in_values_and_gradients(channels: int) -> None
 
 
 def test_twin_gradients_equal_finite_differences() -> None:
-    covered, face_of, vertices_px, depth_m, faces, attributes = scene(2, seed=0)
+    covered, face_ids, vertices_px, depth_m, faces, attributes = scene(2, seed=0)
     some = slice(None, None, 90)
     inputs = [tensor.double().requires_grad_() for tensor in (vertices_px, depth_m, attributes)]
 
     def values(points: Tensor, depth: Tensor, colours: Tensor) -> Tensor:
-        return interpolate(covered[some], face_of[some], WIDTH, points, depth, faces, colours)
+        return interpolate(covered[some], face_ids[some], WIDTH, points, depth, faces, colours)
 
     assert torch.autograd.gradcheck(values, inputs, eps=1e-6, atol=1e-6)
 
 
-def test_gradient_bytes_do_not_depend_on_the_run() -> None:
-    covered, face_of, vertices_px, depth_m, faces, attributes = scene(3, seed=4)
+def test_gradients_are_bitwise_reproducible() -> None:
+    covered, face_ids, vertices_px, depth_m, faces, attributes = scene(3, seed=4)
     gradients = []
     for _ in range(3):
         points = vertices_px.clone().requires_grad_()
-        interpolate(covered, face_of, WIDTH, points, depth_m, faces, attributes).square().sum().backward()
+        interpolate(covered, face_ids, WIDTH, points, depth_m, faces, attributes).square().sum().backward()
         gradients.append(points.grad.numpy().tobytes())
     assert len(set(gradients)) == 1
 
 
-def test_no_pixels_no_values() -> None:
+def test_no_covered_pixels_gives_empty_output() -> None:
     _, _, vertices_px, depth_m, faces, attributes = scene(3, seed=1)
     none = torch.zeros(0, dtype=torch.int64)
     assert interpolate(none, none.int(), WIDTH, vertices_px, depth_m, faces, attributes).shape == (0, 3)

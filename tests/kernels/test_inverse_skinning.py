@@ -2,23 +2,23 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.kernels.inverse_skinning import bake, newton
+from pipeline.kernels.inverse_skinning import bake_warp_grid, newton_step
 from pipeline.kernels.inverse_skinning.reference import interpolate, skin_points
-from pipeline.kernels.march import WarpSet, march
+from pipeline.kernels.march import PackedWarpGrids, march
 from tests.kernels.bar import CELL_M, bar_points, bar_skin, bend
 
 EVERYWHERE = (torch.ones(2, 2, 2, dtype=torch.uint8), torch.tensor([[-9.0, -9, -9], [9, 9, 9]]))
 
 
-def look_up(posed, warps, frame=0):
+def query_warp_grids(posed, warps, frame=0):
     """Canonical candidates of posed points, and the point that each belongs to: rays of a single stop."""
     count = len(posed)
     rays = (posed, torch.tensor([[0.0, 0.0, 1.0]]).expand(count, 3), torch.full((count,), frame))
     samples = march(*rays, torch.zeros(count), 99.0, warps, *EVERYWHERE)
-    return samples.canonical_m, torch.repeat_interleave(torch.arange(count), samples.ray_start.diff())
+    return samples.canonical_m, torch.repeat_interleave(torch.arange(count), samples.ray_offsets.diff())
 
 
-def by_hand(skin, matrices, point):
+def skin_point_by_hand(skin, matrices, point):
     """A(x) x of one point with weights interpolated by hand."""
     origin_m = skin.origin_m.numpy()
     low = np.floor((point - origin_m) / skin.cell_m).astype(int)
@@ -35,62 +35,62 @@ def test_forward_skinning_is_linear_blending_by_hand():
     skin, matrices, points = bar_skin(), bend(0.7), bar_points(20)
     posed = skin_points(points, skin.blend(matrices[None])[:, 0], skin.lattice)
     for point, carried in zip(points.numpy(), posed.numpy(), strict=True):
-        np.testing.assert_allclose(carried, by_hand(skin, matrices, point), atol=1e-6)
+        np.testing.assert_allclose(carried, skin_point_by_hand(skin, matrices, point), atol=1e-6)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.5, 1.2])
-def test_baked_grid_undoes_skinning_to_a_millimetre(angle):
+def test_warp_grid_inverts_skinning_within_a_millimetre(angle):
     skin, matrices, points = bar_skin(), bend(angle), bar_points(3000)
     blended = skin.blend(matrices[None])
     posed = skin_points(points, blended[:, 0], skin.lattice)
-    found, owner = look_up(posed, WarpSet.of([bake(skin, matrices)], CELL_M))
-    assert torch.equal(owner, torch.arange(len(points)))
+    found, point_indices = query_warp_grids(posed, PackedWarpGrids.of([bake_warp_grid(skin, matrices)], CELL_M))
+    assert torch.equal(point_indices, torch.arange(len(points)))
     error_m = (found - points).norm(dim=1)
     # Cells of 5 cm and a joint that bends within 16 cm: a lookup alone is good to millimetres, one step to a tenth.
     assert float(error_m.quantile(0.5)) < 1e-3
-    refined = newton(blended, found, posed, torch.tensor([0, len(found)]), skin)
+    refined = newton_step(blended, found, posed, torch.tensor([0, len(found)]), skin)
     assert float((refined - points).norm(dim=1).quantile(0.99)) < 1e-3
     back = skin_points(refined, blended[:, 0], skin.lattice)
     assert float((back - posed).norm(dim=1).quantile(0.99)) < 1e-3
 
 
-def test_where_the_bar_folds_onto_itself_both_answers_are_found():
+def test_folded_bar_has_both_inverses():
     skin, matrices = bar_skin(), bend(np.pi - 0.35)
     # The second bone, turned by nearly half a turn, comes back over the first; these points are equally deep in both.
     points = torch.tensor([[-0.4, 0.073, 0.0], [-0.45, 0.081, 0.03], [-0.5, 0.09, -0.04]])
-    found, owner = look_up(points, WarpSet.of([bake(skin, matrices)], CELL_M))
+    found, point_indices = query_warp_grids(points, PackedWarpGrids.of([bake_warp_grid(skin, matrices)], CELL_M))
     blended = skin.blend(matrices[None])[:, 0]
     for index in range(len(points)):
-        mine = found[owner == index]
+        mine = found[point_indices == index]
         assert len(mine) == 2
         carried = skin_points(mine, blended, skin.lattice)
         assert float((carried - points[index]).norm(dim=1).max()) < 3e-3
         assert sorted(torch.sign(mine[:, 0]).tolist()) == [-1, 1]
 
 
-def test_of_two_answers_the_one_much_farther_from_the_body_is_dropped():
+def test_inverse_far_from_the_body_is_dropped():
     skin, matrices = bar_skin(), bend(np.pi - 0.35)
     # As above, but deep in one bone and at the rim of the other: where arm and torso meet, a point is of one of them.
     points = torch.tensor([[-0.4, 0.0, 0.0], [-0.4, 0.145, 0.0], [-0.3, 0.02, 0.0]])
-    found, owner = look_up(points, WarpSet.of([bake(skin, matrices)], CELL_M))
-    assert owner.tolist() == [0, 1, 2]
+    found, point_indices = query_warp_grids(points, PackedWarpGrids.of([bake_warp_grid(skin, matrices)], CELL_M))
+    assert point_indices.tolist() == [0, 1, 2]
     assert torch.sign(found[:2, 0]).tolist() == [-1, 1]
 
 
-def test_points_far_from_the_body_have_no_answer():
+def test_points_far_from_the_body_have_no_inverse():
     far = torch.tensor([[0.0, 0.0, 0.5], [3.0, 0.0, 0.0]])
-    found, _ = look_up(far, WarpSet.of([bake(bar_skin(), bend(0.3))], CELL_M))
+    found, _ = query_warp_grids(far, PackedWarpGrids.of([bake_warp_grid(bar_skin(), bend(0.3))], CELL_M))
     assert len(found) == 0
 
 
-def skewed(angle_rad):
+def bent_and_twisted(angle_rad):
     """The bar bent and twisted, in a world that stands askew: no entry of a Jacobian is zero."""
     matrices = bend(angle_rad)
-    matrices[1] = matrices[1] @ turn([0.6 * angle_rad, 0.0, 0.0])
-    return turn([0.5, -0.7, 0.9]) @ matrices
+    matrices[1] = matrices[1] @ rotation_matrix([0.6 * angle_rad, 0.0, 0.0])
+    return rotation_matrix([0.5, -0.7, 0.9]) @ matrices
 
 
-def turn(axis_angle_rad):
+def rotation_matrix(axis_angle_rad):
     """A rotation as a matrix (4, 4)."""
     matrix = torch.eye(4)
     matrix[:3, :3] = torch.linalg.matrix_exp(
@@ -101,23 +101,23 @@ def turn(axis_angle_rad):
 
 def two_frames():
     skin = bar_skin()
-    blended = skin.blend(torch.stack([skewed(0.4), skewed(-0.8)]))
+    blended = skin.blend(torch.stack([bent_and_twisted(0.4), bent_and_twisted(-0.8)]))
     points = bar_points(60)
-    slot_start = torch.tensor([0, 25, 60])
+    frame_offsets = torch.tensor([0, 25, 60])
     posed = torch.cat([skin_points(points[a:b], blended[:, f], skin.lattice) for f, a, b in ((0, 0, 25), (1, 25, 60))])
     random = torch.Generator().manual_seed(9)
     start = points + 0.004 * torch.randn(points.shape, generator=random)
-    return skin, blended, start, posed, slot_start
+    return skin, blended, start, posed, frame_offsets
 
 
-def test_newton_matches_its_twin_in_value_and_gradient():
-    skin, blended, start, posed, slot_start = two_frames()
-    towards = torch.randn(60, 3, generator=torch.Generator().manual_seed(1))
+def test_newton_step_and_gradient_match_reference():
+    skin, blended, start, posed, frame_offsets = two_frames()
+    grad_output = torch.randn(60, 3, generator=torch.Generator().manual_seed(1))
     results = []
     for dtype in (torch.float32, torch.float64):
         leaf = blended.to(dtype).clone().requires_grad_(True)
-        solved = newton(leaf, start.to(dtype), posed.to(dtype), slot_start, skin)
-        (solved * towards.to(dtype)).sum().backward()
+        solved = newton_step(leaf, start.to(dtype), posed.to(dtype), frame_offsets, skin)
+        (solved * grad_output.to(dtype)).sum().backward()
         results.append((solved.detach().double(), leaf.grad.double()))
     torch.testing.assert_close(results[0][0], results[1][0], atol=1e-6, rtol=0)
     torch.testing.assert_close(results[0][1], results[1][1], atol=1e-4, rtol=1e-4)
@@ -127,13 +127,13 @@ def test_pose_gradient_is_the_finite_difference_of_the_solution():
     skin = bar_skin()
     point = bar_points(8, seed=5).double()
     posed = skin_points(point, skin.blend(bend(0.6, torch.float64)[None])[:, 0], skin.lattice)
-    slot_start = torch.tensor([0, 8])
+    frame_offsets = torch.tensor([0, 8])
 
     def solve(angle):
         blended = skin.blend(bend(angle, torch.float64)[None])
         solved = point
         for _ in range(12):
-            solved = newton(blended, solved, posed, slot_start, skin)
+            solved = newton_step(blended, solved, posed, frame_offsets, skin)
         return solved
 
     matrices = bend(0.6, torch.float64)
@@ -141,7 +141,7 @@ def test_pose_gradient_is_the_finite_difference_of_the_solution():
     numeric = (solve(0.6 + 1e-5) - solve(0.6 - 1e-5)) / 2e-5
     for dtype, tolerance in ((torch.float64, 1e-5), (torch.float32, 2e-4)):
         leaf = matrices.to(dtype).requires_grad_(True)
-        solved = newton(skin.blend(leaf[None]), point.to(dtype), posed.to(dtype), slot_start, skin)
+        solved = newton_step(skin.blend(leaf[None]), point.to(dtype), posed.to(dtype), frame_offsets, skin)
         for sample in range(8):
             for axis in range(3):
                 (gradient,) = torch.autograd.grad(solved[sample, axis], leaf, retain_graph=True)
@@ -151,13 +151,13 @@ def test_pose_gradient_is_the_finite_difference_of_the_solution():
 
 def test_weights_outside_the_grid_are_those_of_the_nearest_node():
     skin = bar_skin()
-    weights = skin.weights_at(torch.tensor([[2.0, 0.0, 0.0], [-2.0, 0.0, 0.0], [0.0, 0.0, 0.0]]))
+    weights = skin.interpolate_weights(torch.tensor([[2.0, 0.0, 0.0], [-2.0, 0.0, 0.0], [0.0, 0.0, 0.0]]))
     assert weights[0].tolist() == pytest.approx([0, 1], abs=1e-3)
     assert weights[1].tolist() == pytest.approx([1, 0], abs=1e-3)
     assert weights[2].tolist() == pytest.approx([0.5, 0.5], abs=1e-3)
 
 
-def test_interpolation_leaves_out_missing_nodes():
+def test_interpolation_ignores_missing_nodes():
     rows = torch.arange(8).view(2, 2, 2)
     rows[1, 1, 1] = -1
     values = torch.ones(8, 1, dtype=torch.float64)
@@ -165,12 +165,12 @@ def test_interpolation_leaves_out_missing_nodes():
     assert float(interpolate(inside, (torch.zeros(3), 1.0, rows), values)) == pytest.approx(1.0)
 
 
-def test_a_grid_around_boxes_answers_there_as_the_whole_grid_does():
+def test_cropped_grid_equals_the_full_grid_in_occupied_cells():
     skin = bar_skin()
     bounds = np.array([[-0.63, -0.16, -0.14], [0.62, 0.17, 0.15]], dtype=np.float32)
     occupied = np.zeros((30, 9, 7), dtype=np.uint8)
     occupied[3:5, 4, 2:4] = occupied[20, 6, 5] = 1
-    part = skin.around(torch.from_numpy(occupied), torch.from_numpy(bounds))
+    part = skin.crop_to_occupied(torch.from_numpy(occupied), torch.from_numpy(bounds))
     assert 0 < len(part.nodes_m) < 0.3 * len(skin.nodes_m)
     random = np.random.default_rng(0)
     cells = np.argwhere(occupied)[random.integers(0, occupied.sum(), 200)]
@@ -183,5 +183,5 @@ def test_a_grid_around_boxes_answers_there_as_the_whole_grid_does():
     truth = skin_points(inside, skin.blend(matrices)[:, 0], skin.lattice)
     torch.testing.assert_close(skin_points(inside, part.blend(matrices)[:, 0], part.lattice), truth, atol=0, rtol=0)
     away = torch.tensor([[0.0, 0.1, 0.1]])
-    start = newton(part.blend(matrices), away, away, torch.tensor([0, 1]), part)
+    start = newton_step(part.blend(matrices), away, away, torch.tensor([0, 1]), part)
     assert torch.equal(start, away)

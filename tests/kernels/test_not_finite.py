@@ -4,15 +4,15 @@ import pytest
 import torch
 
 from pipeline.kernels.hashgrid import GridLayout, encode
-from pipeline.kernels.inverse_skinning import bake, newton
-from pipeline.kernels.march import WarpSet, march
-from pipeline.kernels.texture_sampling import shade_texture
+from pipeline.kernels.inverse_skinning import bake_warp_grid, newton_step
+from pipeline.kernels.march import PackedWarpGrids, march
+from pipeline.kernels.texture_sampling import supersample_texture
 from tests.kernels.bar import CELL_M, bar_skin, bend
 
 NAN = float("nan")
 
 
-def test_a_coordinate_that_is_no_number_is_read_at_the_box_s_edge() -> None:
+def test_nan_coordinates_are_clamped_to_the_box() -> None:
     layout = GridLayout(((3, 5, 2), (40, 70, 20)), 2, 9)
     random = torch.Generator().manual_seed(0)
     table, points = torch.randn(layout.rows, 2, generator=random), torch.rand(300, 3, generator=random)
@@ -28,30 +28,30 @@ def test_a_coordinate_that_is_no_number_is_read_at_the_box_s_edge() -> None:
 
 
 @pytest.mark.parametrize("broken", [("origin", NAN), ("direction", NAN), ("direction", 0.0)])
-def test_a_ray_without_an_end_has_no_samples_and_disturbs_no_other(broken: tuple[str, float]) -> None:
+def test_degenerate_ray_has_no_samples(broken: tuple[str, float]) -> None:
     origins, directions = torch.tensor([[0.1, 0.02, 2.0]]).repeat(5, 1), torch.tensor([[0.0, 0.0, -1.0]]).repeat(5, 1)
-    warps = WarpSet.of([bake(bar_skin(), bend(0.3))], CELL_M)
+    warps = PackedWarpGrids.of([bake_warp_grid(bar_skin(), bend(0.3))], CELL_M)
     occupied, box = torch.ones(8, 4, 4, dtype=torch.uint8), torch.tensor([[-0.6, -0.15, -0.15], [0.6, 0.15, 0.15]])
     rest = (torch.zeros(5, dtype=torch.long), torch.full((5,), 0.5), 0.01, warps, occupied, box)
     whole = march(origins, directions, *rest)
     origins[3] = 0.0
     {"origin": origins, "direction": directions}[broken[0]][3] = broken[1]
     samples = march(origins, directions, *rest)
-    counts = whole.ray_start.diff()
+    counts = whole.ray_offsets.diff()
     assert int(counts.min()) > 0
-    assert samples.ray_start.diff().tolist() == [*counts[:3].tolist(), 0, int(counts[4])]
+    assert samples.ray_offsets.diff().tolist() == [*counts[:3].tolist(), 0, int(counts[4])]
     kept = torch.repeat_interleave(torch.arange(5), counts) != 3
     assert torch.equal(samples.canonical_m, whole.canonical_m[kept])
 
 
-def test_a_gradient_that_is_no_number_reaches_no_node_from_outside_the_grid() -> None:
+def test_nan_gradient_outside_the_grid_is_ignored() -> None:
     """The second point lies 1 cm beyond the grid: it has no nodes, and those that its indices name are others'."""
     skin, matrices = bar_skin(), bend(0.4)
     start = torch.tensor([[0.2, 0.03, 0.04], [0.0, 0.16, 0.0]])
     blended = skin.blend(matrices[None]).requires_grad_(True)
 
     def gradient_of(upstream: list[float]) -> torch.Tensor:
-        placed = newton(blended, start, start, torch.tensor([0, 2]), skin)
+        placed = newton_step(blended, start, start, torch.tensor([0, 2]), skin)
         (gradient,) = torch.autograd.grad(placed, blended, torch.tensor(upstream)[:, None].expand(2, 3))
         return gradient
 
@@ -59,8 +59,8 @@ def test_a_gradient_that_is_no_number_reaches_no_node_from_outside_the_grid() ->
     assert float(gradient_of([1.0, NAN]).abs().max()) > 0
 
 
-def test_a_texture_coordinate_that_is_no_number_is_read_at_the_edge() -> None:
+def test_nan_texture_coordinate_is_clamped() -> None:
     face_id, faces_uv = torch.zeros(1, 1, dtype=torch.int32), torch.tensor([[0, 1, 2]], dtype=torch.int32)
     barycentric, texture = torch.tensor([[[1.0, 0.0, 0.0]]]), torch.tensor([[[0.25], [0.5]], [[0.75], [1.0]]])
     uv = torch.tensor([[NAN, NAN], [0.0, 0.0], [0.0, 0.0]])
-    assert shade_texture(face_id, barycentric, faces_uv, uv, texture, 1).tolist() == [[[0.25, 1.0]]]
+    assert supersample_texture(face_id, barycentric, faces_uv, uv, texture, 1).tolist() == [[[0.25, 1.0]]]

@@ -6,10 +6,17 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.field.pixel_sampler import eyes
+from pipeline.field.pixel_sampler import posed_space_cameras
 from pipeline.geometry import camera as cameras
 from pipeline.geometry.camera import Camera
-from pipeline.kernels.pixel_sampling import CANDIDATES, draw_pixels, note_errors, numbers_needed, pixel_rays, reference
+from pipeline.kernels.pixel_sampling import (
+    CANDIDATES_PER_SAMPLE,
+    count_uniforms,
+    generate_pixel_rays,
+    reference,
+    sample_pixels,
+    update_error_map,
+)
 
 TILE_PX, SIDE = 4, 40
 XY_PX = np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE)), axis=-1).reshape(-1, 2).astype(np.int16)
@@ -17,14 +24,14 @@ START = np.array([[0, 500, 501, 800], [800, 800, 1100, 1600]])
 """Two frames of three kinds of pixels: one kind of a single pixel, one of none."""
 
 
-def some_errors(seed: int) -> np.ndarray:
+def random_error_map(seed: int) -> np.ndarray:
     return np.random.default_rng(seed).gamma(0.3, size=(2, SIDE // TILE_PX, SIDE // TILE_PX)).astype(np.float32)
 
 
-def drawn(way, frames, sizes, chosen, error, seed=0, outlier=np.inf):
-    frames, sizes, chosen = np.array(frames), np.array(sizes), np.array(chosen)
-    numbers = np.random.default_rng(seed).random(int(numbers_needed(sizes, chosen).sum()))
-    return way(START, XY_PX, frames, sizes, chosen, error, TILE_PX, outlier, numbers)
+def run_sampler(implementation, frames, sizes, error_sampled_sizes, error, seed=0, outlier_ratio=np.inf):
+    frames, sizes, error_sampled_sizes = np.array(frames), np.array(sizes), np.array(error_sampled_sizes)
+    uniforms = np.random.default_rng(seed).random(int(count_uniforms(sizes, error_sampled_sizes).sum()))
+    return implementation(START, XY_PX, frames, sizes, error_sampled_sizes, error, TILE_PX, outlier_ratio, uniforms)
 
 
 @given(
@@ -33,94 +40,97 @@ def drawn(way, frames, sizes, chosen, error, seed=0, outlier=np.inf):
     st.integers(0, 99),
     st.sampled_from([0.5, 3.0, np.inf]),
 )
-def test_the_compiled_draw_matches_its_twin(plain, chosen, seed, outlier):
+def test_compiled_sampler_matches_reference(uniform, error_sampled_sizes, seed, outlier_ratio):
     frames, empty = [0, 1], 3
-    by_error = np.insert(np.array(chosen), empty, 0).reshape(2, 3)
-    sizes = by_error + np.insert(np.array(plain), empty, 0).reshape(2, 3)
-    (ours, trust), (twin, trust_too) = (
-        drawn(way, frames, sizes, by_error, some_errors(seed), seed, outlier)
-        for way in (draw_pixels, reference.draw_pixels)
+    error_sampled = np.insert(np.array(error_sampled_sizes), empty, 0).reshape(2, 3)
+    sizes = error_sampled + np.insert(np.array(uniform), empty, 0).reshape(2, 3)
+    (ours, confidence), (twin, trust_too) = (
+        run_sampler(implementation, frames, sizes, error_sampled, random_error_map(seed), seed, outlier_ratio)
+        for implementation in (sample_pixels, reference.sample_pixels)
     )
     assert ours.tolist() == twin.tolist()
-    np.testing.assert_allclose(trust, trust_too, rtol=1e-6)
-    assert outlier < np.inf or (trust == 1).all()
+    np.testing.assert_allclose(confidence, trust_too, rtol=1e-6)
+    assert outlier_ratio < np.inf or (confidence == 1).all()
     kinds = np.repeat(np.arange(6), sizes.reshape(-1))
     first, last = START[:, :3].reshape(-1)[kinds], START[:, 1:].reshape(-1)[kinds]
     assert ((ours >= first) & (ours < last)).all()
 
 
-def test_each_draw_has_a_part_of_the_pixels_to_itself():
-    rows, _ = drawn(draw_pixels, [1], [[0, 100, 250]], [[0, 0, 0]], some_errors(0))
+def test_samples_are_stratified():
+    rows, _ = run_sampler(sample_pixels, [1], [[0, 100, 250]], [[0, 0, 0]], random_error_map(0))
     assert ((rows[:100] - 800) // 3).tolist() == list(range(100))
     assert ((rows[100:] - 1100) // 2).tolist() == list(range(250))
     assert len(set(((rows[:100] - 800) % 3).tolist())) == 3
 
 
-def test_chosen_pixels_are_as_many_as_their_error_has_it():
+def test_error_sampling_is_proportional_to_error():
     error = np.full((2, SIDE // TILE_PX, SIDE // TILE_PX), 1.0, np.float32)
     error[0, :2] = 3.0
     upper = XY_PX[:500, 1] < 2 * TILE_PX
     expected = 3 * upper.sum() / (3 * upper.sum() + (~upper).sum())
-    rows, _ = drawn(draw_pixels, [0], [[4000, 0, 0]], [[4000, 0, 0]], error)
+    rows, _ = run_sampler(sample_pixels, [0], [[4000, 0, 0]], [[4000, 0, 0]], error)
     assert upper[rows].mean() == pytest.approx(expected, abs=0.01)
     # Within a tile row none is preferred.
     counts = np.bincount(rows[upper[rows]], minlength=500)[:320]
     assert counts.std() < 1.2 * np.sqrt(counts.mean())
     # Where nothing errs, all are alike.
-    rows, _ = drawn(draw_pixels, [0], [[500, 0, 0]], [[500, 0, 0]], np.zeros_like(error))
+    rows, _ = run_sampler(sample_pixels, [0], [[500, 0, 0]], [[500, 0, 0]], np.zeros_like(error))
     assert len(set(rows.tolist())) > 300
     assert np.histogram(rows, bins=5, range=(0, 500))[0].tolist() == pytest.approx([100] * 5, abs=8)
 
 
-def test_what_errs_far_more_than_the_rest_is_drawn_no_oftener_and_trusted_less():
+def test_outlier_tiles_are_clamped_and_get_low_confidence():
     error = np.full((2, SIDE // TILE_PX, SIDE // TILE_PX), 0.1, np.float32)
     error[0, 0, :2], error[0, 1] = 2.0, 0.3
-    rows, trust = drawn(draw_pixels, [0], [[8000, 0, 40]], [[4000, 0, 0]], error, outlier=4.0)
+    rows, confidence = run_sampler(sample_pixels, [0], [[8000, 0, 40]], [[4000, 0, 0]], error, outlier_ratio=4.0)
     found = error[0, XY_PX[:, 1] // TILE_PX, XY_PX[:, 0] // TILE_PX]
     # 0.4 is the limit: a twenty-fold error counts as a fourfold one among draws, and a 625th in the losses.
-    np.testing.assert_allclose(trust, np.where(found[rows] > 1, (0.4 / 2.0) ** 4, 1.0), rtol=1e-5)
+    np.testing.assert_allclose(confidence, np.where(found[rows] > 1, (0.4 / 2.0) ** 4, 1.0), rtol=1e-5)
     often = np.minimum(found[:500], 0.4)
     for level in (2.0, 0.3, 0.1):
         share = (found[rows[4000:8000]] == np.float32(level)).mean()
         assert share == pytest.approx(often[found[:500] == np.float32(level)].sum() / often.sum(), abs=0.01)
     # A frame that says nothing of the person says nothing of what is usual.
-    assert (drawn(draw_pixels, [0], [[0, 0, 40]], [[0, 0, 0]], error, outlier=4.0)[1] == 1).all()
+    assert (run_sampler(sample_pixels, [0], [[0, 0, 40]], [[0, 0, 0]], error, outlier_ratio=4.0)[1] == 1).all()
 
 
-def test_numbers_are_counted():
-    assert numbers_needed(np.array([[5, 2], [0, 1]]), np.array([[3, 0], [0, 0]])).tolist() == [7 + 3 * CANDIDATES, 1]
+def test_uniform_count():
+    assert count_uniforms(np.array([[5, 2], [0, 1]]), np.array([[3, 0], [0, 0]])).tolist() == [
+        7 + 3 * CANDIDATES_PER_SAMPLE,
+        1,
+    ]
 
 
-def test_rays_are_those_of_the_camera_in_the_space_of_their_frame():
+def test_rays_equal_camera_rays_in_posed_space():
     random = np.random.default_rng(0)
     turn = np.linalg.qr(random.normal(size=(4, 3, 3)))[0]
     turn *= np.linalg.det(turn)[:, None, None]
-    world_to_camera, posed_from_world = np.eye(4, dtype=np.float32), np.tile(np.eye(4, dtype=np.float32), (3, 1, 1))
+    world_to_camera, world_to_posed = np.eye(4, dtype=np.float32), np.tile(np.eye(4, dtype=np.float32), (3, 1, 1))
     world_to_camera[:3] = np.concatenate([turn[3], random.normal(size=(3, 1))], axis=1)
-    posed_from_world[:, :3] = np.concatenate([turn[:3], random.normal(size=(3, 3, 1))], axis=2)
+    world_to_posed[:, :3] = np.concatenate([turn[:3], random.normal(size=(3, 3, 1))], axis=2)
     camera = Camera(300.0, 310.0, 21.0, 18.5, SIDE, SIDE, world_to_camera)
     rows, frame = random.integers(0, 1600, 50), np.sort(random.integers(0, 3, 50))
     inside, rgba = random.random((50, 2), dtype=np.float32), random.integers(0, 256, (1600, 4), dtype=np.uint8)
-    given_ = (rows, frame, XY_PX, rgba, inside, eyes(camera, posed_from_world))
-    origins, directions, shown = pixel_rays(*given_)
-    for ours, twin in zip((origins, directions, shown), reference.pixel_rays(*given_), strict=True):
+    inputs = (rows, frame, XY_PX, rgba, inside, posed_space_cameras(camera, world_to_posed))
+    origins, directions, shown = generate_pixel_rays(*inputs)
+    for ours, twin in zip((origins, directions, shown), reference.generate_pixel_rays(*inputs), strict=True):
         np.testing.assert_allclose(ours, twin, atol=1e-5)
     world = [part.numpy() for part in cameras.pixel_rays(camera, torch.from_numpy(XY_PX[rows] + inside))]
-    matrix = posed_from_world[frame]
+    matrix = world_to_posed[frame]
     np.testing.assert_allclose(origins, (matrix[:, :3, :3] @ world[0][..., None])[..., 0] + matrix[:, :3, 3], atol=1e-5)
     np.testing.assert_allclose(directions, (matrix[:, :3, :3] @ world[1][..., None])[..., 0], atol=1e-6)
     np.testing.assert_allclose(shown, rgba[rows] / 255, atol=1e-7)
 
 
-def test_noted_errors_match_their_twin():
+def test_error_map_update_matches_reference():
     random = np.random.default_rng(3)
     rows, frame = random.integers(0, 1600, 300), np.repeat([1, 0], [180, 120])
-    erred = random.normal(size=(300, 3)).astype(np.float32)
-    ours, twin = some_errors(1), some_errors(1)
-    note_errors(rows, frame, XY_PX, erred, 0.8, TILE_PX, ours)
-    reference.note_errors(rows, frame, XY_PX, erred, 0.8, TILE_PX, twin)
+    colour_error = random.normal(size=(300, 3)).astype(np.float32)
+    ours, twin = random_error_map(1), random_error_map(1)
+    update_error_map(rows, frame, XY_PX, colour_error, 0.8, TILE_PX, ours)
+    reference.update_error_map(rows, frame, XY_PX, colour_error, 0.8, TILE_PX, twin)
     np.testing.assert_allclose(ours, twin, rtol=1e-5)
-    assert (ours != some_errors(1)).mean() > 0.5
+    assert (ours != random_error_map(1)).mean() > 0.5
     before = ours.copy()
-    note_errors(rows[:0], frame[:0], XY_PX, erred[:0], 0.8, TILE_PX, ours)
+    update_error_map(rows[:0], frame[:0], XY_PX, colour_error[:0], 0.8, TILE_PX, ours)
     assert (ours == before).all()

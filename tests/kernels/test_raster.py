@@ -23,7 +23,7 @@ def triangle_soup(count: int, seed: int, size_px: float = 12.0) -> tuple[Tensor,
     return corners.reshape(-1, 2), depth.reshape(-1), torch.arange(3 * count, dtype=torch.int32).view(-1, 3)
 
 
-def slow_truth(vertices_px: Tensor, depth_m: Tensor, faces: Tensor) -> tuple[np.ndarray, np.ndarray]:
+def brute_force_raster(vertices_px: Tensor, depth_m: Tensor, faces: Tensor) -> tuple[np.ndarray, np.ndarray]:
     """Every face against every pixel centre, by solving for the barycentrics; face id and depth."""
     ids, nearest = np.full((HEIGHT, WIDTH), -1), np.full((HEIGHT, WIDTH), np.inf)
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
@@ -40,10 +40,10 @@ def slow_truth(vertices_px: Tensor, depth_m: Tensor, faces: Tensor) -> tuple[np.
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_nearest_face_is_seen_at_every_pixel(seed: int) -> None:
+def test_nearest_face_is_visible_at_every_pixel(seed: int) -> None:
     vertices_px, depth_m, faces = triangle_soup(80, seed)
     face_id, _, depth = rasterize(vertices_px, depth_m, faces, HEIGHT, WIDTH)
-    truth_id, truth_depth = slow_truth(vertices_px, depth_m, faces)
+    truth_id, truth_depth = brute_force_raster(vertices_px, depth_m, faces)
     assert (truth_id >= 0).mean() > 0.2
     np.testing.assert_array_equal(face_id.numpy(), truth_id)
     np.testing.assert_allclose(depth.numpy(), truth_depth, rtol=1e-6)
@@ -102,7 +102,7 @@ def test_a_tiled_square_has_no_cracks_and_ties_go_to_the_lower_face() -> None:
     assert (face_id[inside] >= 0).all()
 
 
-def test_faces_at_the_camera_or_broken_are_dropped() -> None:
+def test_faces_behind_near_plane_or_with_nan_are_dropped() -> None:
     vertices_px = torch.tensor([[0.0, 0.0], [0.0, 90.0], [90.0, 0.0], [torch.nan, 0.0]])
     faces = torch.tensor([[0, 1, 2], [0, 1, 3], [0, 0, 1]])
     for depth in ([1.0, 1.0, 0.001, 1.0], [1.0, -2.0, 1.0, 1.0], [1.0, 1.0, torch.nan, 1.0]):
@@ -120,7 +120,7 @@ def test_far_off_vertices_do_not_overflow() -> None:
     assert (face_id == 0).all()
 
 
-def test_a_missing_vertex_is_an_error_not_a_wild_read() -> None:
+def test_missing_vertex_raises_index_error() -> None:
     with pytest.raises(IndexError, match=r"0\.\.3, the mesh has 3"):
         rasterize(torch.zeros(3, 2), torch.ones(3), torch.tensor([[0, 1, 3]]), 4, 4)
 

@@ -23,7 +23,7 @@ def test_hard_surface_is_zero_at_both_ends_and_largest_between():
     assert float(values[50]) == pytest.approx(math.log(1 + math.exp(-1)) - math.log(2 * math.exp(-0.5)), abs=1e-6)
 
 
-def test_a_perfect_picture_errs_nowhere_and_a_hole_by_what_it_hides():
+def test_colour_errors_of_perfect_and_transparent_images():
     rgba = torch.tensor([[0.2, 0.4, 0.6, 1.0], [0.9, 0.1, 0.5, 0.25]])
     background = torch.tensor([[1.0, 0.0, 0.5], [0.3, 0.3, 0.3]])
     perfect = rgba[:, :3] * rgba[:, 3:]
@@ -33,24 +33,26 @@ def test_a_perfect_picture_errs_nowhere_and_a_hole_by_what_it_hides():
     torch.testing.assert_close(hole[1], 0.25 * torch.tensor([-0.6, 0.2, -0.2]))
 
 
-def losses_and_gradients(rays, delta, dtype, way):
+def losses_and_gradients(rays, delta, dtype, implementation):
     """Of a sum in which each of the three counts differently, for rays of all sorts."""
     random = torch.Generator().manual_seed(rays)
-    image, alpha, rgba, background, trust = (
+    image, alpha, rgba, background, confidence = (
         torch.rand(shape, generator=random) for shape in ((rays, 3), rays, (rays, 4), (rays, 3), rays)
     )
     alpha = 1.4 * alpha - 0.2
     rgba[::3, 3] = (rgba[::3, 3] > 0.5).float()
-    image, alpha, rgba, background, trust = (tensor.to(dtype) for tensor in (image, alpha, rgba, background, trust))
+    image, alpha, rgba, background, confidence = (
+        tensor.to(dtype) for tensor in (image, alpha, rgba, background, confidence)
+    )
     image.requires_grad_(), alpha.requires_grad_()
-    losses, errors = way(image, alpha, rgba, background, trust, delta)
-    of = torch.autograd.grad((losses * torch.tensor([1.0, 0.3, 0.2], dtype=dtype)).sum(), [image, alpha])
-    return losses.detach(), errors, *of
+    losses, errors = implementation(image, alpha, rgba, background, confidence, delta)
+    gradients = torch.autograd.grad((losses * torch.tensor([1.0, 0.3, 0.2], dtype=dtype)).sum(), [image, alpha])
+    return losses.detach(), errors, *gradients
 
 
 @pytest.mark.parametrize("rays", [1, 700])
 @pytest.mark.parametrize("delta", [0.05, 0.3, 1.0])
-def test_the_compiled_loop_matches_its_twin(rays, delta):
+def test_compiled_losses_match_reference(rays, delta):
     ours = losses_and_gradients(rays, delta, torch.float32, ray_losses)
     truth = losses_and_gradients(rays, delta, torch.float64, reference.ray_losses)
     for mine, theirs in zip(ours, truth, strict=True):
@@ -58,16 +60,16 @@ def test_the_compiled_loop_matches_its_twin(rays, delta):
     assert not ours[1].requires_grad
 
 
-def test_rays_count_by_their_trust():
+def test_losses_are_weighted_by_confidence():
     random = torch.Generator().manual_seed(0)
     image, alpha, rgba, background = (torch.rand(shape, generator=random) for shape in ((4, 3), 4, (4, 4), (4, 3)))
-    trust = torch.tensor([1.0, 0.0, 0.25, 0.0])
-    told, _ = ray_losses(image, alpha, rgba, background, trust, 0.1)
+    confidence = torch.tensor([1.0, 0.0, 0.25, 0.0])
+    losses, _ = ray_losses(image, alpha, rgba, background, confidence, 0.1)
     each = [ray_losses(image[[i]], alpha[[i]], rgba[[i]], background[[i]], torch.ones(1), 0.1)[0] for i in (0, 2)]
-    torch.testing.assert_close(told, (each[0] + 0.25 * each[1]) / 4)
+    torch.testing.assert_close(losses, (each[0] + 0.25 * each[1]) / 4)
 
 
-def test_double_precision_takes_the_twin():
+def test_float64_uses_the_reference():
     ours = losses_and_gradients(9, 0.3, torch.float64, ray_losses)
     for mine, theirs in zip(ours, losses_and_gradients(9, 0.3, torch.float64, reference.ray_losses), strict=True):
         assert torch.equal(mine, theirs)

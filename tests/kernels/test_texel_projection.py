@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from pipeline.kernels.raster import rasterize
-from pipeline.kernels.texel_projection import observe_texels
+from pipeline.kernels.texel_projection import project_texels
 
 HEIGHT, WIDTH, FOCAL_PX = 60, 80, 70.0
 
@@ -39,11 +39,11 @@ def observe(
 ):
     vertices_px, depth_m = pinhole(vertices)
     cosine = options.pop("cosine", torch.ones(len(vertices), dtype=vertices.dtype))
-    quality = options.pop("quality", torch.ones(HEIGHT, WIDTH, dtype=vertices.dtype))
-    return observe_texels(vertices_px, depth_m, cosine, faces, *texels, image, depth, quality, **options)
+    pixel_confidence = options.pop("pixel_confidence", torch.ones(HEIGHT, WIDTH, dtype=vertices.dtype))
+    return project_texels(vertices_px, depth_m, cosine, faces, *texels, image, depth, pixel_confidence, **options)
 
 
-def test_a_texel_is_read_where_its_point_projects() -> None:
+def test_texel_is_sampled_at_its_projection() -> None:
     vertices, faces = tilted_square()
     texels = random_texels(500, 2, seed=0)
     values, weights = observe(vertices, faces, texels, pixel_positions(), torch.full((HEIGHT, WIDTH), torch.inf))
@@ -53,7 +53,7 @@ def test_a_texel_is_read_where_its_point_projects() -> None:
     torch.testing.assert_close(values, expected_px, atol=2e-3, rtol=0.0)
 
 
-def test_the_mesh_does_not_hide_itself_but_hides_what_lies_behind() -> None:
+def test_occlusion_without_self_occlusion() -> None:
     front, faces = tilted_square()
     back, _ = tilted_square(offset_m=0.1)
     both, both_faces = torch.cat([front, back]), torch.cat([faces, faces + 4])
@@ -67,7 +67,7 @@ def test_the_mesh_does_not_hide_itself_but_hides_what_lies_behind() -> None:
     assert not seen[(face >= 2) & inner].any()
 
 
-def test_an_occluder_in_any_of_the_four_pixels_hides_the_texel() -> None:
+def test_occluder_in_any_bilinear_pixel_hides_the_texel() -> None:
     vertices, faces = tilted_square()
     texels = (torch.tensor([0], dtype=torch.int32), torch.tensor([[0.4, 0.2, 0.4]]))
     values, _ = observe(vertices, faces, texels, pixel_positions(), torch.full((HEIGHT, WIDTH), torch.inf))
@@ -96,12 +96,12 @@ def test_twins_agree(seed: int) -> None:
     faces = torch.randint(0, 60, (90, 3), generator=generator, dtype=torch.int32)
     vertices_px, depth_m = pinhole(vertices)
     _, _, depth = rasterize(vertices_px, depth_m, faces, HEIGHT, WIDTH)
-    cosine, quality = torch.rand(60, generator=generator), torch.rand(HEIGHT, WIDTH, generator=generator)
+    cosine, pixel_confidence = torch.rand(60, generator=generator), torch.rand(HEIGHT, WIDTH, generator=generator)
     face, barycentric = random_texels(4000, 90, seed)
     image = torch.rand(HEIGHT, WIDTH, 3, generator=generator)
-    inputs = (vertices_px, depth_m, cosine, faces, face, barycentric, image, depth, quality)
-    fast = observe_texels(*inputs, tolerance_m=0.02)
-    exact = observe_texels(*(x.double() if x.is_floating_point() else x for x in inputs), tolerance_m=0.02)
+    inputs = (vertices_px, depth_m, cosine, faces, face, barycentric, image, depth, pixel_confidence)
+    fast = project_texels(*inputs, tolerance_m=0.02)
+    exact = project_texels(*(x.double() if x.is_floating_point() else x for x in inputs), tolerance_m=0.02)
     # float32 may decide the other way within 1e-6 of a threshold: allow a handful of texels, not a value
     same = (fast[1][:, 0] > 0) == (exact[1][:, 0] > 0)
     assert 200 < int((exact[1][:, 0] > 0).sum()) < 3500

@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from pipeline.kernels.raster import rasterize
-from pipeline.kernels.texture_sampling import shade_texture
+from pipeline.kernels.texture_sampling import supersample_texture
 
 
-def seen_faces(samples: int, seed: int) -> tuple[torch.Tensor, ...]:
+def random_raster(samples: int, seed: int) -> tuple[torch.Tensor, ...]:
     """Random triangles before a picture of 24 x 32 pixels, with random uv that also lie outside of [0, 1]."""
     generator = torch.Generator().manual_seed(seed)
     corners = torch.rand(30, 2, generator=generator) * torch.tensor([32.0, 24.0]) * samples
@@ -21,26 +21,30 @@ def seen_faces(samples: int, seed: int) -> tuple[torch.Tensor, ...]:
 
 @pytest.mark.parametrize(("samples", "seed"), [(1, 0), (2, 1), (3, 2)])
 def test_twins_agree(samples: int, seed: int) -> None:
-    face_id, *rest = seen_faces(samples, seed)
-    fast = shade_texture(face_id, *rest, samples)
-    exact = shade_texture(face_id, *(x.double() if x.is_floating_point() else x for x in rest), samples)
+    face_id, *rest = random_raster(samples, seed)
+    fast = supersample_texture(face_id, *rest, samples)
+    exact = supersample_texture(face_id, *(x.double() if x.is_floating_point() else x for x in rest), samples)
     assert 0.2 < float(exact[..., 3].mean()) < 0.99
     # float32 places a look-up to 1e-6 of a texture of 13 texels whose neighbours differ by up to 1
     torch.testing.assert_close(fast, exact.float(), atol=5e-5, rtol=0.0)
 
 
-def test_one_face_over_one_pixel_takes_the_mean_of_four_texels() -> None:
+def test_one_pixel_is_the_mean_of_four_texels() -> None:
     texture = torch.tensor([[[1.0], [0.0]], [[0.0], [0.0]]])
     face_id = torch.tensor([[0, 0], [0, -1]], dtype=torch.int32)
     barycentric = torch.tensor([[[1.0, 0, 0], [0, 1.0, 0]], [[0, 0, 1.0], [0, 0, 0]]])
     uv = torch.tensor([[0.25, 0.75], [0.75, 0.75], [0.25, 0.25]])
-    image = shade_texture(face_id, barycentric, torch.tensor([[0, 1, 2]], dtype=torch.int32), uv, texture, samples=2)
+    image = supersample_texture(
+        face_id, barycentric, torch.tensor([[0, 1, 2]], dtype=torch.int32), uv, texture, samples=2
+    )
     assert image.tolist() == [[[0.25, 0.75]]]
 
 
-def test_the_texture_has_a_gradient_where_it_is_asked_for() -> None:
-    face_id, barycentric, faces_uv, uv, texture = seen_faces(2, 3)
+def test_texture_gradient_when_required() -> None:
+    face_id, barycentric, faces_uv, uv, texture = random_raster(2, 3)
     inputs = (barycentric.double(), faces_uv, uv.double(), texture.double().requires_grad_())
-    assert torch.autograd.gradcheck(lambda t: shade_texture(face_id, *inputs[:3], t, 2).sum(dim=(0, 1)), inputs[3])
+    assert torch.autograd.gradcheck(
+        lambda t: supersample_texture(face_id, *inputs[:3], t, 2).sum(dim=(0, 1)), inputs[3]
+    )
     single = texture.clone().requires_grad_()
-    assert shade_texture(face_id, barycentric, faces_uv, uv, single, 2).requires_grad
+    assert supersample_texture(face_id, barycentric, faces_uv, uv, single, 2).requires_grad

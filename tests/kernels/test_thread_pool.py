@@ -6,26 +6,26 @@ import numba
 import pytest
 import torch
 
-from pipeline.kernels.common.thread_pool import Parallel
+from pipeline.kernels.common.thread_pool import ThreadPool
 
 
 @pytest.fixture
 def four_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     """As if this machine had so many; each thread is told how many it may use, whether or not there are so many."""
-    told = threading.local()
+    thread_counts = threading.local()
     numba.get_num_threads()  # starts its threads, which only then have a kind
     monkeypatch.setattr(numba, "threading_layer", lambda: "omp")
     for module in (numba, torch):
         name = f"{module.__name__}_threads"
-        monkeypatch.setattr(module, "get_num_threads", lambda name=name: getattr(told, name, 4))
-        monkeypatch.setattr(module, "set_num_threads", lambda count, name=name: setattr(told, name, count))
+        monkeypatch.setattr(module, "get_num_threads", lambda name=name: getattr(thread_counts, name, 4))
+        monkeypatch.setattr(module, "set_num_threads", lambda count, name=name: setattr(thread_counts, name, count))
 
 
-def whereabouts(_: int) -> tuple[int, int, int]:
+def thread_state(_: int) -> tuple[int, int, int]:
     return threading.get_ident(), torch.get_num_threads(), numba.get_num_threads()
 
 
-def test_answers_come_in_the_jobs_order_whichever_is_done_first(four_threads: None) -> None:
+def test_results_keep_job_order(four_threads: None) -> None:
     second_done = threading.Event()
 
     def job(number: int, word: str) -> str:
@@ -35,31 +35,31 @@ def test_answers_come_in_the_jobs_order_whichever_is_done_first(four_threads: No
             second_done.set()
         return f"{number} {word}"
 
-    assert Parallel(2).map(job, [0, 1], ["first", "second"]) == ["0 first", "1 second"]
+    assert ThreadPool(2).map(job, [0, 1], ["first", "second"]) == ["0 first", "1 second"]
 
 
-def test_threads_are_shared_out_and_given_back(four_threads: None) -> None:
-    found = Parallel(2).map(whereabouts, range(6))
+def test_threads_are_divided_and_restored(four_threads: None) -> None:
+    found = ThreadPool(2).map(thread_state, range(6))
     assert {there[1:] for there in found} == {(2, 2)}
     assert threading.get_ident() not in {there[0] for there in found}
     assert (torch.get_num_threads(), numba.get_num_threads()) == (4, 4)
 
 
-def test_threads_are_given_back_after_a_failure(four_threads: None) -> None:
+def test_threads_are_restored_after_a_failure(four_threads: None) -> None:
     def fail(number: int) -> None:
         raise LookupError(number)
 
     with pytest.raises(LookupError, match="0"):
-        Parallel(2).map(fail, range(2))
+        ThreadPool(2).map(fail, range(2))
     assert torch.get_num_threads() == 4
 
 
 @pytest.mark.parametrize("layer", ["omp", "workqueue"])
-def test_one_after_the_other_where_there_is_one_thread_or_numba_cannot_be_entered_twice(
+def test_jobs_run_sequentially_without_reentrant_threads(
     four_threads: None, monkeypatch: pytest.MonkeyPatch, layer: str
 ) -> None:
     if layer == "omp":
         torch.set_num_threads(1)
     monkeypatch.setattr(numba, "threading_layer", lambda: layer)
     expected = (threading.get_ident(), torch.get_num_threads(), 4)
-    assert Parallel(2).map(whereabouts, range(3)) == [expected] * 3
+    assert ThreadPool(2).map(thread_state, range(3)) == [expected] * 3

@@ -19,16 +19,16 @@ from torch import Tensor
 
 from pipeline.kernels.adam import adam_step_
 from pipeline.kernels.blend import SparseWeights, blend
-from pipeline.kernels.broyden import search
+from pipeline.kernels.broyden import find_roots
 from pipeline.kernels.composite import composite
 from pipeline.kernels.hashgrid import GridLayout, encode
 from pipeline.kernels.interpolate import interpolate
-from pipeline.kernels.inverse_skinning import bake, newton
-from pipeline.kernels.march import WarpSet, march
+from pipeline.kernels.inverse_skinning import bake_warp_grid, newton_step
+from pipeline.kernels.march import PackedWarpGrids, march
 from pipeline.kernels.raster import rasterize
-from pipeline.kernels.texel_projection import observe_texels
-from pipeline.kernels.texture_sampling import shade_texture
-from pipeline.kernels.transmittance_stats import light_before
+from pipeline.kernels.texel_projection import project_texels
+from pipeline.kernels.texture_sampling import supersample_texture
+from pipeline.kernels.transmittance_stats import transmittance_from_weights
 from tests.kernels.bar import CELL_M, bar_skin, bend
 
 THREADS = (1, 2, 16)
@@ -40,46 +40,46 @@ def seeded() -> torch.Generator:
     return torch.Generator().manual_seed(1)
 
 
-def of_the_hash_grid() -> list[Tensor]:
+def hash_grid_results() -> list[Tensor]:
     cells = ((5, 7, 6), (16, 20, 11), (60, 80, 40), (200, 300, 150), (400, 500, 350))
     layout, random = GridLayout(cells, 4, 12), seeded()
     points = torch.rand(6000, 3, generator=random).requires_grad_(True)
     table = torch.randn(layout.rows, 4, generator=random).requires_grad_(True)
     encoded = encode(points, table, layout)
-    towards = torch.randn(encoded.shape, generator=random)
-    return [encoded, *torch.autograd.grad(encoded, (points, table), towards)]
+    grad_output = torch.randn(encoded.shape, generator=random)
+    return [encoded, *torch.autograd.grad(encoded, (points, table), grad_output)]
 
 
-def of_march_and_warp() -> list[Tensor]:
+def march_and_newton_results() -> list[Tensor]:
     skin, random = bar_skin(), seeded()
     matrices = torch.stack([bend(float(angle)) for angle in torch.linspace(-1.2, 1.2, FRAMES)])
-    warps = WarpSet.of([bake(skin, pose) for pose in matrices], CELL_M)
+    warps = PackedWarpGrids.of([bake_warp_grid(skin, pose) for pose in matrices], CELL_M)
     targets = (torch.rand(RAYS, 3, generator=random) - 0.5) * torch.tensor([1.0, 0.4, 0.2])
     origins = torch.tensor([0.0, 0.0, 2.0]).repeat(RAYS, 1)
     directions = torch.nn.functional.normalize(targets - origins, dim=-1)
     frame, jitter = torch.arange(RAYS) * FRAMES // RAYS, torch.rand(RAYS, generator=random)
     occupied, box = torch.ones(8, 4, 4, dtype=torch.uint8), torch.tensor([[-0.6, -0.15, -0.15], [0.6, 0.15, 0.15]])
     samples = march(origins, directions, frame, jitter, 0.02, warps, occupied, box)
-    ray = torch.repeat_interleave(torch.arange(RAYS), samples.ray_start.diff())
+    ray = torch.repeat_interleave(torch.arange(RAYS), samples.ray_offsets.diff())
     posed = origins[ray] + samples.distance_m[:, None] * directions[ray]
-    slot_start = samples.ray_start[torch.searchsorted(frame, torch.arange(FRAMES + 1))]
+    frame_offsets = samples.ray_offsets[torch.searchsorted(frame, torch.arange(FRAMES + 1))]
     blended = skin.blend(matrices).requires_grad_(True)
-    placed = newton(blended, samples.canonical_m, posed, slot_start, skin)
+    placed = newton_step(blended, samples.canonical_m, posed, frame_offsets, skin)
     (gradient,) = torch.autograd.grad(placed, blended, torch.randn(placed.shape, generator=random))
-    roots, exists = search(posed[:2000], frame[ray[:2000]], matrices, blended.detach(), skin)
-    return [samples.canonical_m, samples.distance_m, samples.ray_start, placed, gradient, roots, exists]
+    roots, exists = find_roots(posed[:2000], frame[ray[:2000]], matrices, blended.detach(), skin)
+    return [samples.canonical_m, samples.distance_m, samples.ray_offsets, placed, gradient, roots, exists]
 
 
-def of_composite() -> list[Tensor]:
-    random, ray_start = seeded(), torch.arange(0, 4 * RAYS + 1, 4)
+def composite_results() -> list[Tensor]:
+    random, ray_offsets = seeded(), torch.arange(0, 4 * RAYS + 1, 4)
     density = (30 * torch.rand(4 * RAYS, generator=random)).requires_grad_(True)
     colour = torch.rand(4 * RAYS, 3, generator=random).requires_grad_(True)
-    image, alpha, weights = composite(density, colour, torch.full((4 * RAYS,), 0.01), ray_start)
+    image, alpha, weights = composite(density, colour, torch.full((4 * RAYS,), 0.01), ray_offsets)
     gradients = torch.autograd.grad(image.square().sum() + alpha.square().sum(), (density, colour))
-    return [image, alpha, weights, light_before(weights, ray_start), *gradients]
+    return [image, alpha, weights, transmittance_from_weights(weights, ray_offsets), *gradients]
 
 
-def of_blend() -> list[Tensor]:
+def blend_results() -> list[Tensor]:
     random = seeded()
     weights = torch.rand(5000, 9, generator=random)
     values = torch.randn(9, 48, generator=random).requires_grad_(True)
@@ -87,14 +87,14 @@ def of_blend() -> list[Tensor]:
     return [blended, *torch.autograd.grad(blended, values, torch.randn(blended.shape, generator=random))]
 
 
-def of_adam() -> list[Tensor]:
+def adam_results() -> list[Tensor]:
     random = seeded()
     parameter, gradient, first, second = (torch.rand(20 << 15, generator=random) for _ in range(4))
     adam_step_(parameter, gradient, first, second, 3, 1e-2)
     return [parameter, first, second]
 
 
-def of_pictures() -> list[Tensor]:
+def raster_results() -> list[Tensor]:
     """A crumpled sheet of triangles that share vertices, seen, interpolated, textured and looked up."""
     random, columns = seeded(), 20
     y, x = torch.meshgrid(torch.linspace(0, HEIGHT, 40), torch.linspace(0, WIDTH, columns), indexing="ij")
@@ -110,20 +110,20 @@ def of_pictures() -> list[Tensor]:
     values = interpolate(covered, face_id.reshape(-1)[covered], WIDTH, vertices_px, depth_m, faces, attributes)
     gradients = torch.autograd.grad(values, leaves, torch.randn(values.shape, generator=random))
     texture = torch.rand(64, 64, 3, generator=random)
-    shaded = shade_texture(face_id, barycentric, faces, torch.rand(len(grid), 2, generator=random), texture, 2)
+    shaded = supersample_texture(face_id, barycentric, faces, torch.rand(len(grid), 2, generator=random), texture, 2)
     texels = torch.randint(0, len(faces), (4000,), generator=random).int(), torch.full((4000, 3), 1 / 3)
     picture, trust = torch.rand(HEIGHT, WIDTH, 3, generator=random), torch.ones(HEIGHT, WIDTH)
     seen = vertices_px.detach(), depth_m.detach(), torch.ones(len(grid)), faces, *texels, picture, depth, trust
-    return [face_id, barycentric, depth, values, *gradients, shaded, *observe_texels(*seen)]
+    return [face_id, barycentric, depth, values, *gradients, shaded, *project_texels(*seen)]
 
 
 KERNELS: tuple[Callable[[], list[Tensor]], ...] = (
-    of_the_hash_grid,
-    of_march_and_warp,
-    of_composite,
-    of_blend,
-    of_adam,
-    of_pictures,
+    hash_grid_results,
+    march_and_newton_results,
+    composite_results,
+    blend_results,
+    adam_results,
+    raster_results,
 )
 
 
@@ -151,7 +151,7 @@ def found(repository: Path) -> dict[str, list[str]]:
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_the_number_of_threads_changes_no_byte(found: dict[str, list[str]], kernel: Callable[[], list[Tensor]]) -> None:
+def test_results_do_not_depend_on_thread_count(found: dict[str, list[str]], kernel: Callable[[], list[Tensor]]) -> None:
     digests_by_threads = found[kernel.__name__]
     assert len(digests_by_threads) == len(THREADS)
     assert len(set(digests_by_threads)) == 1

@@ -6,13 +6,13 @@ import numpy as np
 import torch
 import trimesh
 
-from pipeline.geometry.atlas import Atlas, fill_gaps, rasterize_texels, unwrap
+from pipeline.geometry.atlas import Atlas, fill_unknown_texels, rasterize_texels, unwrap
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.texture_rendering import render_textured
 from pipeline.io.image import to_uint8
-from pipeline.texture.bake import Surface
-from pipeline.texture.views import View, crop_view
+from pipeline.texture.bake import TexturedSurface
+from pipeline.texture.views import BakeView, crop_bake_view
 
 SIZE_PX = 256
 CAMERA = Camera(fx=420.0, fy=420.0, cx=100.0, cy=105.0, width=200, height=210)
@@ -33,7 +33,7 @@ def ball_atlas(mesh: Mesh) -> Atlas:
     return unwrap(mesh, (mesh.vertices[mesh.faces].mean(axis=1)[:, 1] > 0).astype(np.int32), SIZE_PX, padding_px=4)
 
 
-def paint_of(points: np.ndarray) -> np.ndarray:
+def ball_colours(points: np.ndarray) -> np.ndarray:
     """Colours of surface points: smooth waves of about 0.15 m."""
     return (0.5 + 0.35 * np.sin(np.array([17.0, 21.0, 13.0]) * points + np.array([0.3, 1.0, 2.0]))).astype(np.float32)
 
@@ -54,25 +54,25 @@ class PaintedBall:
         self.mesh = ball_mesh()
         self.atlas = ball_atlas(self.mesh)
         self.texels = rasterize_texels(self.atlas, SIZE_PX)
-        self.surface = Surface.of(self.mesh.faces, self.atlas, self.texels)
-        self.truth = paint_of(self.texels.interpolate(self.mesh.faces, self.mesh.vertices))
-        self._fine_truth = unfolded_paint(self.mesh, self.atlas)
+        self.surface = TexturedSurface.from_arrays(self.mesh.faces, self.atlas, self.texels)
+        self.truth = ball_colours(self.texels.interpolate(self.mesh.faces, self.mesh.vertices))
+        self._fine_truth = true_texture(self.mesh, self.atlas)
         angles = 2.0 * math.pi * np.arange(count) / count if angles is None else angles
         random = np.random.default_rng(0)
-        self.views = [self._film(angle, random.normal(size=2) * shift_px) for angle in angles]
+        self.views = [self._render_view(angle, random.normal(size=2) * shift_px) for angle in angles]
 
-    def _film(self, angle: float, shift_px: np.ndarray) -> View:
+    def _render_view(self, angle: float, shift_px: np.ndarray) -> BakeView:
         """A view whose picture is off by `shift_px` from where the camera says, as under a wrong pose."""
         vertices = turned(self.mesh.vertices, angle)
         filmed = Camera(CAMERA.fx, CAMERA.fy, CAMERA.cx + shift_px[0], CAMERA.cy + shift_px[1], 200, 210)
         faces_and_uv = (self.surface.faces, self.surface.faces_uv, self.surface.uv)
-        rgba = render_textured(vertices, *faces_and_uv, self._fine_truth, filmed, samples=4).numpy()
+        rgba = render_textured(vertices, *faces_and_uv, self._fine_truth, filmed, supersampling=4).numpy()
         green = rgba[..., :3] + (1.0 - rgba[..., 3:]) * np.array([0.0, 1.0, 0.0])
-        return crop_view(to_uint8(green), to_uint8(rgba[..., 3]), CAMERA, vertices, self.surface.faces)
+        return crop_bake_view(to_uint8(green), to_uint8(rgba[..., 3]), CAMERA, vertices, self.surface.faces)
 
 
-def unfolded_paint(mesh: Mesh, atlas: Atlas) -> torch.Tensor:
+def true_texture(mesh: Mesh, atlas: Atlas) -> torch.Tensor:
     """The true texture at four times the size, gutters filled by its own neighbours."""
     texels = rasterize_texels(atlas, 4 * SIZE_PX)
-    values = paint_of(texels.interpolate(mesh.faces, mesh.vertices))
-    return torch.from_numpy(fill_gaps(texels.image(values), texels.covered()))
+    values = ball_colours(texels.interpolate(mesh.faces, mesh.vertices))
+    return torch.from_numpy(fill_unknown_texels(texels.image(values), texels.covered()))

@@ -12,16 +12,16 @@ from pipeline.geometry.surface import OpenSurfaceError, is_closed_manifold, isos
 from pipeline.mesh import isosurface as extract_module
 from pipeline.mesh.isosurface import (
     ExtractConfig,
-    choose_level,
     extract_mesh,
-    hand_weights,
-    sample_canonical,
+    hand_skin_weights,
+    indicator_grid,
+    sample_canonical_grid,
+    select_isovalue,
     simplify,
-    solid,
     transfer_skin_weights,
 )
 
-CONFIG = ExtractConfig(voxel_m=0.02, reach_m=0.12, inset_m=0.05)
+CONFIG = ExtractConfig(voxel_size_m=0.02, max_body_distance_m=0.12, solid_core_depth_m=0.05)
 SEGMENTS = {"Hips": (-0.25, 0.05), "RightHand": (0.05, 0.3)}
 RADIUS_M = 0.1
 
@@ -59,7 +59,7 @@ def shell(points: Tensor) -> Tensor:
 
 
 def test_hollow_density_becomes_one_solid_of_its_outer_surface(body: Body) -> None:
-    samples = sample_canonical(shell, body, CONFIG.model_copy(update={"body_hands": False}))
+    samples = sample_canonical_grid(shell, body, CONFIG.model_copy(update={"hands_from_body": False}))
     mesh = extract_mesh(samples, 50.0, CONFIG)
     assert is_closed_manifold(mesh)
     assert len(mesh.vertices) - len(mesh.faces) // 2 == 2  # a sphere's topology: no floater, no inner shell
@@ -67,15 +67,15 @@ def test_hollow_density_becomes_one_solid_of_its_outer_surface(body: Body) -> No
 
 
 def test_where_the_field_saw_nothing_the_body_core_closes_the_surface(body: Body) -> None:
-    config = CONFIG.model_copy(update={"body_hands": False, "voxel_m": 0.01})
-    mesh = extract_mesh(sample_canonical(lambda points: torch.zeros(len(points)), body, config), 50.0, config)
+    config = CONFIG.model_copy(update={"hands_from_body": False, "voxel_size_m": 0.01})
+    mesh = extract_mesh(sample_canonical_grid(lambda points: torch.zeros(len(points)), body, config), 50.0, config)
     assert is_closed_manifold(mesh)
     # the depth is counted in voxels of double size: half of one is 0.01
-    np.testing.assert_allclose(capsule_distance(mesh.vertices), RADIUS_M - CONFIG.inset_m, atol=0.015)
+    np.testing.assert_allclose(capsule_distance(mesh.vertices), RADIUS_M - CONFIG.solid_core_depth_m, atol=0.015)
 
 
 def test_hands_come_from_the_body(body: Body) -> None:
-    samples = sample_canonical(shell, body, CONFIG)
+    samples = sample_canonical_grid(shell, body, CONFIG)
     mesh = extract_mesh(samples, 50.0, CONFIG)
     hand, trunk = (
         capsule_distance(mesh.vertices[part]) for part in (mesh.vertices[:, 0] > 0.2, mesh.vertices[:, 0] < -0.1)
@@ -92,18 +92,22 @@ def test_pits_inside_the_body_are_filled_and_hollows_outside_it_are_not(body: Bo
         bore = (points[:, [0, 2]] - torch.tensor([-0.15, 0.0])).norm(dim=1) < 0.02
         return torch.where((distance < 0.16) & ~bore, 300.0, 0.0).float()
 
-    config = CONFIG.model_copy(update={"body_hands": False, "voxel_m": 0.01, "inset_m": 0.2, "blur_voxels": 0.0})
-    samples = sample_canonical(bored, body, config)
+    config = CONFIG.model_copy(
+        update={"hands_from_body": False, "voxel_size_m": 0.01, "solid_core_depth_m": 0.2, "blur_sigma_voxels": 0.0}
+    )
+    samples = sample_canonical_grid(bored, body, config)
     column = ((np.array([-0.15, 0.5, 0.0]) - samples.origin_m) / 0.01).round().astype(int)
     heights = samples.origin_m[1] + 0.01 * np.arange(samples.density.shape[1]) - 0.5
-    for pit_m, bottom in ((0.04, RADIUS_M), (0.0, 0.0)):
-        value = solid(samples, 50.0, config.model_copy(update={"pit_m": pit_m}))[column[0], :, column[2]]
+    for closing_radius_m, bottom in ((0.04, RADIUS_M), (0.0, 0.0)):
+        value = indicator_grid(samples, 50.0, config.model_copy(update={"closing_radius_m": closing_radius_m}))[
+            column[0], :, column[2]
+        ]
         assert (value[np.abs(heights) < bottom - 0.015] >= 0.5).all()
         assert (value[np.abs(heights) > bottom + 0.015] < 0.5).all()
 
 
 def test_hand_weights_count_every_joint_of_a_hand(body: Body) -> None:
-    weights = hand_weights(body)
+    weights = hand_skin_weights(body)
     assert weights.min() == 0.0
     assert weights.max() == 1.0
 
@@ -115,18 +119,18 @@ def test_samples_hold_density_only_within_reach(body: Body) -> None:
         asked.append(points)
         return torch.full((len(points),), 9.0)
 
-    samples = sample_canonical(everywhere, body, CONFIG)
+    samples = sample_canonical_grid(everywhere, body, CONFIG)
     distance = capsule_distance(torch.cat(asked).numpy()) - RADIUS_M
-    assert distance.max() < CONFIG.reach_m + 0.01
-    assert (samples.density[samples.body_distance_m > CONFIG.reach_m] == 0).all()
-    assert solid(samples, 3.0, CONFIG).max() <= 1.0
+    assert distance.max() < CONFIG.max_body_distance_m + 0.01
+    assert (samples.density[samples.body_distance_m > CONFIG.max_body_distance_m] == 0).all()
+    assert indicator_grid(samples, 3.0, CONFIG).max() <= 1.0
 
 
 def test_distance_is_exact_at_the_hand_and_interpolated_elsewhere(body: Body) -> None:
-    samples = sample_canonical(shell, body, CONFIG)
+    samples = sample_canonical_grid(shell, body, CONFIG)
     index = np.stack(np.meshgrid(*map(np.arange, samples.density.shape), indexing="ij"), axis=-1)
     truth = capsule_distance(index * samples.spacing_m + samples.origin_m) - RADIUS_M
-    hand = (np.abs(truth) < 0.04) & (samples.hand_share > 0)
+    hand = (np.abs(truth) < 0.04) & (samples.hand_weight > 0)
     assert hand.sum() > 1000
     np.testing.assert_allclose(samples.body_distance_m[hand], truth[hand], atol=0.006)
     beyond = (truth > 0.05) & (truth < 0.12)
@@ -138,25 +142,25 @@ def test_the_level_that_scores_best_is_chosen(body: Body) -> None:
         distance = torch.from_numpy(capsule_distance(points.numpy().astype(np.float64))).float()
         return 100.0 * torch.exp((0.12 - distance) / 0.02)
 
-    samples = sample_canonical(ramp, body, CONFIG.model_copy(update={"body_hands": False}))
+    samples = sample_canonical_grid(ramp, body, CONFIG.model_copy(update={"hands_from_body": False}))
 
     def score(mesh: Mesh) -> float:
         return -abs(float(np.median(capsule_distance(mesh.vertices))) - 0.12)
 
-    level, best = choose_level(samples, CONFIG, (1600.0, 400.0, 100.0, 25.0), score)
+    level, best = select_isovalue(samples, CONFIG, (1600.0, 400.0, 100.0, 25.0), score)
     assert level == 100.0
     assert best > -0.01
 
 
 def test_nothing_at_all_is_an_error_of_the_surface(body: Body) -> None:
-    config = CONFIG.model_copy(update={"inset_m": 0.2, "body_hands": False})
-    samples = sample_canonical(lambda points: torch.zeros(len(points)), body, config)
+    config = CONFIG.model_copy(update={"solid_core_depth_m": 0.2, "hands_from_body": False})
+    samples = sample_canonical_grid(lambda points: torch.zeros(len(points)), body, config)
     with pytest.raises(ValueError, match="reaches the level"):
         extract_mesh(samples, 50.0, config)
 
 
 def test_simplify_reaches_the_edge_length(body: Body) -> None:
-    samples = sample_canonical(shell, body, CONFIG)
+    samples = sample_canonical_grid(shell, body, CONFIG)
     fine = extract_mesh(samples, 50.0, CONFIG)
     mesh = simplify(fine, 0.04)
     lengths = np.linalg.norm(np.diff(mesh.vertices[mesh.edges()], axis=1), axis=2)
@@ -164,22 +168,25 @@ def test_simplify_reaches_the_edge_length(body: Body) -> None:
     assert is_closed_manifold(mesh)
 
 
-@pytest.mark.parametrize(("torn", "told"), [("remesh", "stay uneven"), ("repair", "not reduced before remeshing")])
+@pytest.mark.parametrize(
+    ("failing_function", "expected_warning"),
+    [("remesh_isotropic", "stay uneven"), ("repair", "not reduced before remeshing")],
+)
 def test_a_step_of_simplifying_that_tears_the_surface_is_left_out(
-    body: Body, monkeypatch: pytest.MonkeyPatch, torn: str, told: str
+    body: Body, monkeypatch: pytest.MonkeyPatch, failing_function: str, expected_warning: str
 ) -> None:
-    fine = extract_mesh(sample_canonical(shell, body, CONFIG), 50.0, CONFIG)
+    fine = extract_mesh(sample_canonical_grid(shell, body, CONFIG), 50.0, CONFIG)
 
     def tear(*_: object, **__: object) -> Mesh:
         raise OpenSurfaceError("a surface could not be closed: its holes border on each other")
 
-    monkeypatch.setattr(extract_module, torn, tear)
+    monkeypatch.setattr(extract_module, failing_function, tear)
     take_warnings()
     mesh = simplify(fine, 0.05)
     assert is_closed_manifold(mesh)
     assert len(mesh.faces) < len(fine.faces)  # the other step still makes triangles larger
     (warning,) = take_warnings()
-    assert told in warning
+    assert expected_warning in warning
 
 
 def test_weights_of_the_body_itself_are_kept(body: Body) -> None:

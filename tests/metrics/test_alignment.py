@@ -6,10 +6,12 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from pipeline.geometry.mesh import Mesh
-from pipeline.metrics.alignment import Similarity, align_surfaces, similarity_between
+from pipeline.metrics.alignment import SimilarityTransform, align_surfaces_icp, umeyama_similarity
 from pipeline.metrics.surfaces import surface_scores
 
-MOVEMENT = Similarity(1.07, Rotation.from_rotvec([0.1, -0.2, 0.15]).as_matrix(), np.array([0.3, -0.1, 2.0]))
+TRUE_TRANSFORM = SimilarityTransform(
+    1.07, Rotation.from_rotvec([0.1, -0.2, 0.15]).as_matrix(), np.array([0.3, -0.1, 2.0])
+)
 
 
 def cross(subdivisions: int = 3) -> Mesh:
@@ -27,32 +29,32 @@ def cross(subdivisions: int = 3) -> Mesh:
 
 def test_corresponding_points_give_the_movement_back(rng: np.random.Generator):
     points = rng.normal(size=(40, 3))
-    found = similarity_between(points, MOVEMENT(points))
-    assert found.scale == pytest.approx(MOVEMENT.scale)
-    assert found.rotation == pytest.approx(MOVEMENT.rotation)
-    assert found.shift_m == pytest.approx(MOVEMENT.shift_m)
-    mirrored = similarity_between(points, points * [-1.0, 1.0, 1.0])
+    found = umeyama_similarity(points, TRUE_TRANSFORM(points))
+    assert found.scale == pytest.approx(TRUE_TRANSFORM.scale)
+    assert found.rotation == pytest.approx(TRUE_TRANSFORM.rotation)
+    assert found.translation_m == pytest.approx(TRUE_TRANSFORM.translation_m)
+    mirrored = umeyama_similarity(points, points * [-1.0, 1.0, 1.0])
     assert np.linalg.det(mirrored.rotation) == pytest.approx(1.0)  # a mirror image is no movement
 
 
 def test_without_scale_the_size_stays(rng: np.random.Generator):
     points = rng.normal(size=(40, 3))
-    found = similarity_between(points, MOVEMENT(points), with_scale=False)
+    found = umeyama_similarity(points, TRUE_TRANSFORM(points), with_scale=False)
     assert found.scale == 1.0
-    assert found.rotation == pytest.approx(MOVEMENT.rotation)
+    assert found.rotation == pytest.approx(TRUE_TRANSFORM.rotation)
 
 
 def test_there_and_back(rng: np.random.Generator):
     points = rng.normal(size=(5, 3))
-    assert MOVEMENT.inverse()(MOVEMENT(points)) == pytest.approx(points)
+    assert TRUE_TRANSFORM.inverse()(TRUE_TRANSFORM(points)) == pytest.approx(points)
 
 
 def test_a_moved_surface_is_laid_over_itself():
     mesh = cross()
-    found = align_surfaces(mesh, MOVEMENT.moved(cross(2)))  # other triangles, the same surface
-    assert found.scale == pytest.approx(MOVEMENT.scale, abs=2e-3)
-    assert found.rotation == pytest.approx(MOVEMENT.rotation, abs=5e-3)
-    assert surface_scores(found.moved(mesh), MOVEMENT.moved(mesh), count=5000)["chamfer_mm"] < 1.0
+    found = align_surfaces_icp(mesh, TRUE_TRANSFORM.moved(cross(2)))  # other triangles, the same surface
+    assert found.scale == pytest.approx(TRUE_TRANSFORM.scale, abs=2e-3)
+    assert found.rotation == pytest.approx(TRUE_TRANSFORM.rotation, abs=5e-3)
+    assert surface_scores(found.moved(mesh), TRUE_TRANSFORM.moved(mesh), count=5000)["chamfer_mm"] < 1.0
 
 
 def test_a_larger_surface_keeps_its_size_without_scale():
@@ -60,5 +62,5 @@ def test_a_larger_surface_keeps_its_size_without_scale():
     small, large = (trimesh.creation.icosphere(subdivisions=3, radius=radius) for radius in (0.50, 0.52))
     meshes = [Mesh(np.asarray(ball.vertices) + [0, 0, shift], ball.faces) for ball, shift in ((small, 0), (large, 0.1))]
     for with_scale, expected_mm in ((True, 0.0), (False, 20.0)):
-        moved = align_surfaces(*meshes, with_scale=with_scale).moved(meshes[0])
+        moved = align_surfaces_icp(*meshes, with_scale=with_scale).moved(meshes[0])
         assert surface_scores(moved, meshes[1], count=3000)["chamfer_mm"] == pytest.approx(expected_mm, abs=0.5)

@@ -11,8 +11,8 @@ from pipeline.geometry.surface import self_intersecting_faces
 from pipeline.metrics.health import (
     component_count,
     is_manifold,
-    mesh_health,
-    smallest_angles_deg,
+    mesh_quality_metrics,
+    min_face_angles_deg,
 )
 
 
@@ -21,27 +21,27 @@ def box(centre: tuple[float, float, float] = (0.0, 0.0, 0.0), side_m: float = 1.
     return Mesh(np.asarray(made.vertices) + centre, np.asarray(made.faces, dtype=np.int32))
 
 
-def together(a: Mesh, b: Mesh) -> Mesh:
+def concatenate_meshes(a: Mesh, b: Mesh) -> Mesh:
     return Mesh(np.concatenate([a.vertices, b.vertices]), np.concatenate([a.faces, b.faces + len(a.vertices)]))
 
 
 def test_a_box_is_sound():
-    health = mesh_health(box())
+    health = mesh_quality_metrics(box())
     assert health == {
         "vertices": 8,
         "faces": 12,
         "watertight": True,
         "manifold": True,
         "components": 1,
-        "sliver_share": 0.0,
-        "smallest_angle_deg": pytest.approx(45.0),
+        "sliver_fraction": 0.0,
+        "min_angle_deg": pytest.approx(45.0),
         "self_intersecting_faces": 0,
     }
 
 
 def test_a_hole_opens_the_box_but_leaves_it_manifold():
     open_box = Mesh(box().vertices, box().faces[1:])
-    assert not mesh_health(open_box)["watertight"]
+    assert not mesh_quality_metrics(open_box)["watertight"]
     assert is_manifold(open_box)
 
 
@@ -51,7 +51,7 @@ def test_three_faces_on_an_edge_are_not_manifold():
 
 
 def test_two_cones_that_share_a_tip_are_not_manifold_though_every_edge_is():
-    two = together(box(), box((1.0, 1.0, 1.0)))
+    two = concatenate_meshes(box(), box((1.0, 1.0, 1.0)))
     corner = np.argmax(np.all(two.vertices[:8] == 0.5, axis=1))
     twin = 8 + np.argmax(np.all(two.vertices[8:] == 0.5, axis=1))
     pinched = Mesh(two.vertices, np.where(two.faces == twin, corner, two.faces))
@@ -66,8 +66,8 @@ def test_unused_vertices_are_no_component():
 
 
 def test_boxes_that_cut_each_other_are_seen():
-    assert self_intersecting_faces(together(box(), box((3.0, 0.0, 0.0)))) == 0
-    assert self_intersecting_faces(together(box(), box((0.4, 0.3, 0.2)))) > 4
+    assert self_intersecting_faces(concatenate_meshes(box(), box((3.0, 0.0, 0.0)))) == 0
+    assert self_intersecting_faces(concatenate_meshes(box(), box((0.4, 0.3, 0.2)))) > 4
 
 
 def pierces(ends: np.ndarray, corners: np.ndarray) -> bool:
@@ -77,7 +77,7 @@ def pierces(ends: np.ndarray, corners: np.ndarray) -> bool:
     return bool(0 < along < 1 and u > 0 and v > 0 and u + v < 1)
 
 
-def slow_cut_faces(mesh: Mesh) -> int:
+def reference_self_intersections(mesh: Mesh) -> int:
     """Faces with an edge that goes through another face, or through which such an edge goes, pair by pair."""
     cut = set()
     for one, other in permutations(range(len(mesh.faces)), 2):
@@ -94,9 +94,9 @@ def test_cut_faces_are_those_of_a_search_through_all_pairs(rng):
     hanging = corners[:10, :1] + 0.15 * rng.normal(size=(10, 2, 3))
     faces = np.concatenate([np.arange(90).reshape(30, 3), np.stack([3 * np.arange(10), *_rows(90, 10)], axis=1)])
     mesh = Mesh(np.concatenate([corners.reshape(-1, 3), hanging.reshape(-1, 3)]), faces.astype(np.int32))
-    expected = slow_cut_faces(mesh)
+    expected = reference_self_intersections(mesh)
     assert 5 < expected < 35
-    assert self_intersecting_faces(mesh) == mesh_health(mesh)["self_intersecting_faces"] == expected
+    assert self_intersecting_faces(mesh) == mesh_quality_metrics(mesh)["self_intersecting_faces"] == expected
 
 
 def _rows(start: int, count: int) -> np.ndarray:
@@ -109,9 +109,9 @@ def test_slivers_are_faces_with_an_angle_below_ten_degrees():
     angles_deg = np.array([2.0, 9.9, 10.1, 40.0, 44.0])
     rise = np.tan(np.radians(angles_deg))
     vertices = np.array([[[0, 0, k], [1, 0, k], [1, rise[k], k]] for k in range(5)]).reshape(-1, 3)
-    health = mesh_health(Mesh(vertices, np.arange(15, dtype=np.int32).reshape(5, 3)))
-    assert health["sliver_share"] == pytest.approx(2 / 5)
-    assert health["smallest_angle_deg"] == pytest.approx(2.0)
+    health = mesh_quality_metrics(Mesh(vertices, np.arange(15, dtype=np.int32).reshape(5, 3)))
+    assert health["sliver_fraction"] == pytest.approx(2 / 5)
+    assert health["min_angle_deg"] == pytest.approx(2.0)
     assert health["components"] == 5
 
 
@@ -123,6 +123,6 @@ def test_smallest_angle_is_the_law_of_cosines(rng):
         (b * b + c * c - a * a) / (2 * b * c),
         (a * a + c * c - b * b) / (2 * a * c),
     ]
-    assert smallest_angles_deg(mesh)[0] == pytest.approx(np.degrees(np.arccos(cosines)).min())
+    assert min_face_angles_deg(mesh)[0] == pytest.approx(np.degrees(np.arccos(cosines)).min())
     flat = Mesh(np.array([[0, 0, 0], [1.0, 0, 0], [2, 0, 0]]), mesh.faces)
-    assert smallest_angles_deg(flat)[0] == pytest.approx(0.0)
+    assert min_face_angles_deg(flat)[0] == pytest.approx(0.0)

@@ -9,18 +9,18 @@ from skimage.metrics import structural_similarity
 
 from pipeline.metrics.flip import flip_map
 from pipeline.metrics.images import (
-    body_box,
-    body_pixels,
-    edge_spread_px,
+    additional_blur_sigma_px,
+    composite_on_white,
+    composite_premultiplied_on_white,
+    edge_blur_sigma_px,
+    foreground_bounding_box,
+    foreground_mask,
     frame_scores,
     mask_iou,
     mean_scores,
-    missing_blur_px,
-    on_white,
-    premultiplied_on_white,
     psnr_db,
+    reason_not_scorable,
     ssim,
-    unscorable,
 )
 from pipeline.metrics.lpips import lpips
 from tests.metrics.narrow_alexnet import narrow_alexnet
@@ -33,7 +33,7 @@ def pair(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     return noisy, image
 
 
-def slow_ssim(x: np.ndarray, y: np.ndarray) -> float:
+def reference_ssim(x: np.ndarray, y: np.ndarray) -> float:
     """The definition window by window, as torchmetrics documents it (reflect padding there is cropped again)."""
     offsets = np.arange(-5, 6)
     window = np.exp(-(offsets[:, None] ** 2 + offsets[None] ** 2) / (2 * 1.5**2))
@@ -53,7 +53,7 @@ def slow_ssim(x: np.ndarray, y: np.ndarray) -> float:
 
 
 def test_ssim_is_the_definition(pair):
-    assert ssim(*pair) == pytest.approx(slow_ssim(*pair), abs=1e-9)
+    assert ssim(*pair) == pytest.approx(reference_ssim(*pair), abs=1e-9)
 
 
 def test_ssim_is_what_scikit_image_computes(pair):
@@ -102,18 +102,18 @@ def test_compositing_on_white_is_the_same_for_frames_and_for_premultiplied_rende
     alpha = rng.integers(0, 256, (6, 5)).astype(np.uint8)
     opacity = alpha[..., None] / np.float32(255)
     rgba = np.concatenate([rgb / np.float32(255) * opacity, opacity], axis=2).astype(np.float32)
-    difference = premultiplied_on_white(rgba).astype(int) - on_white(rgb, alpha)
+    difference = composite_premultiplied_on_white(rgba).astype(int) - composite_on_white(rgb, alpha)
     assert np.abs(difference).max() <= 1  # two roundings of the same number
-    assert (on_white(rgb, np.zeros_like(alpha)) == 255).all()
-    assert (on_white(rgb, np.full_like(alpha, 255)) == rgb).all()
+    assert (composite_on_white(rgb, np.zeros_like(alpha)) == 255).all()
+    assert (composite_on_white(rgb, np.full_like(alpha, 255)) == rgb).all()
 
 
 def test_body_box_is_tight():
     body = np.zeros((20, 30), dtype=bool)
     body[4, 9] = body[11, 17] = True
-    assert body_box(body) == (slice(4, 12), slice(9, 18))
+    assert foreground_bounding_box(body) == (slice(4, 12), slice(9, 18))
     with pytest.raises(ValueError, match="no body pixel"):
-        body_box(np.zeros((4, 4), dtype=bool))
+        foreground_bounding_box(np.zeros((4, 4), dtype=bool))
 
 
 def test_iou_of_two_overlapping_boxes():
@@ -134,7 +134,7 @@ def test_frame_scores_of_a_perfect_render_and_of_a_missing_person(rng):
     assert scores["mask_iou"] == 1.0
     nobody = frame_scores(np.zeros_like(perfect), image, mask)
     assert nobody["mask_iou"] == 0.0
-    share = body_pixels(mask).mean()  # all error lies on the body, so the full image only dilutes it
+    share = foreground_mask(mask).mean()  # all error lies on the body, so the full image only dilutes it
     assert nobody["psnr_full"] - nobody["psnr_body"] == pytest.approx(-10 * math.log10(share))
     assert nobody["psnr_box"] == pytest.approx(nobody["psnr_body"])
     assert scores["flip_full"] == scores["flip_body"] == 0.0
@@ -191,7 +191,7 @@ def masks_about_the_smallest() -> list[np.ndarray]:
 @pytest.mark.parametrize("mask", masks_about_the_smallest())
 def test_frames_that_scoring_refuses_are_known_beforehand(mask):
     image, rgba = np.zeros((*mask.shape, 3), dtype=np.uint8), np.zeros((*mask.shape, 4), dtype=np.float32)
-    if unscorable(mask) is None:
+    if reason_not_scorable(mask) is None:
         assert frame_scores(rgba, image, mask)["mask_iou"] == 0.0
     else:
         with pytest.raises(ValueError, match="no body pixel|11 px window|no window"):
@@ -199,7 +199,7 @@ def test_frames_that_scoring_refuses_are_known_beforehand(mask):
 
 
 def test_why_a_frame_cannot_be_scored():
-    reasons = [unscorable(mask) for mask in masks_about_the_smallest()]
+    reasons = [reason_not_scorable(mask) for mask in masks_about_the_smallest()]
     assert [bool(reason) for reason in reasons] == [True, True, False, True, False, True, False, True]
     assert "one half" in reasons[0]
     assert "20 x 10 px" in reasons[1]
@@ -218,11 +218,11 @@ def test_edge_spread_is_that_of_the_blur(sigma_px):
     disc = (np.hypot(rows - 149.3, columns - 151.1) < 90.2).astype(np.float32)
     square_pixels = disc.reshape(300, 4, 300, 4).mean((1, 3))
     soft = square_pixels if sigma_px == 0.0 else cv2.GaussianBlur(square_pixels, (0, 0), sigma_px)
-    spread_px = edge_spread_px(np.rint(255 * soft).astype(np.uint8))
-    assert spread_px == pytest.approx(np.hypot(sigma_px, 12**-0.5), rel=0.04)
-    assert missing_blur_px(float(np.hypot(sigma_px, 12**-0.5))) == pytest.approx(sigma_px, abs=1e-6)
-    assert missing_blur_px(0.2) == 0.0  # sharper than square pixels can be: a mask of ones and zeros
+    edge_sigma_px = edge_blur_sigma_px(np.rint(255 * soft).astype(np.uint8))
+    assert edge_sigma_px == pytest.approx(np.hypot(sigma_px, 12**-0.5), rel=0.04)
+    assert additional_blur_sigma_px(float(np.hypot(sigma_px, 12**-0.5))) == pytest.approx(sigma_px, abs=1e-6)
+    assert additional_blur_sigma_px(0.2) == 0.0  # sharper than square pixels can be: a mask of ones and zeros
 
 
 def test_a_mask_without_outline_has_no_edge_spread():
-    assert edge_spread_px(np.zeros((20, 20), dtype=np.uint8)) == 0.0
+    assert edge_blur_sigma_px(np.zeros((20, 20), dtype=np.uint8)) == 0.0

@@ -16,7 +16,7 @@ def weights(rng: np.random.Generator) -> dict[str, torch.Tensor]:
     return narrow_alexnet(rng)
 
 
-def slow_features(picture: np.ndarray, weights: dict[str, torch.Tensor]) -> list[np.ndarray]:
+def reference_features(picture: np.ndarray, weights: dict[str, torch.Tensor]) -> list[np.ndarray]:
     values = np.moveaxis(picture / 255 * 2 - 1, 2, 0)
     values = (values - np.array([-0.030, -0.088, -0.188])[:, None, None]) / np.array([0.458, 0.448, 0.450])[
         :, None, None
@@ -41,7 +41,7 @@ def slow_features(picture: np.ndarray, weights: dict[str, torch.Tensor]) -> list
 def test_it_is_the_definition(rng: np.random.Generator, weights: dict[str, torch.Tensor]):
     a, b = (rng.integers(0, 256, (67, 75, 3)).astype(np.uint8) for _ in range(2))
     expected = 0.0
-    for layer, (x, y) in enumerate(zip(slow_features(a, weights), slow_features(b, weights), strict=True)):
+    for layer, (x, y) in enumerate(zip(reference_features(a, weights), reference_features(b, weights), strict=True)):
         squared = (x - y) ** 2 * weights[f"lin{layer}.model.1.weight"].numpy()[0]
         expected += squared.sum(axis=0).mean()
     assert lpips(a, b, weights) == pytest.approx(expected, rel=1e-4)

@@ -5,8 +5,8 @@ import pytest
 import trimesh
 
 from pipeline.geometry.mesh import Mesh
-from pipeline.geometry.surface import closest_on_mesh
-from pipeline.metrics.surfaces import joint_error_m, sample_surface, surface_scores
+from pipeline.geometry.surface import closest_points_on_mesh
+from pipeline.metrics.surfaces import mpjpe_m, sample_surface, surface_scores
 
 
 def sphere(radius_m: float) -> Mesh:
@@ -70,7 +70,7 @@ def test_a_missing_half_shows_one_way_only():
 def test_distances_are_those_of_a_brute_force_search(rng):
     mesh = Mesh(rng.normal(size=(12, 3)), rng.permutation(12)[:12].reshape(4, 3).astype(np.int32))
     points = rng.normal(size=(20, 3))
-    distances_m, faces, _ = closest_on_mesh(points, mesh)
+    distances_m, faces, _ = closest_points_on_mesh(points, mesh)
     steps = np.linspace(0, 1, 201)
     u, v = np.meshgrid(steps, steps)
     inside = u + v <= 1 + 1e-12
@@ -100,4 +100,4 @@ def test_samples_lie_on_their_faces_and_follow_area():
 
 def test_joint_error_of_a_shift(rng):
     joints_m = rng.normal(size=(4, 7, 3))
-    assert joint_error_m(joints_m + [0.03, 0.0, 0.04], joints_m) == pytest.approx(0.05)
+    assert mpjpe_m(joints_m + [0.03, 0.0, 0.04], joints_m) == pytest.approx(0.05)

@@ -7,8 +7,8 @@ import numpy as np
 
 from pipeline.avatar.gltf import encode_glb
 from pipeline.core.manifest import Manifest
-from pipeline.report.page import FramePictures, PageContent
-from pipeline.report.report_json import build_report, finite
+from pipeline.report.page import FrameImages, PageContent
+from pipeline.report.report_json import build_report, replace_nonfinite
 from tests.avatar.avatar_sample import sample_body, sample_maps, sample_motion, sample_skinned_mesh
 
 STAGES = ("frames", "body", "field", "mesh", "texture", "export")
@@ -34,10 +34,12 @@ def sample_rows(first_psnr: float = 30.0) -> list[dict[str, Any]]:
 
 def sample_report(first_psnr: float = 30.0, manifests: dict[str, Manifest] | None = None) -> dict[str, Any]:
     health = {"vertices": 10, "faces": 16, "watertight": True, "manifold": True, "components": 1}
-    figures = {"mesh": health, "export": {"glb_bytes": 1_234_567, "texture_px": 64}, "masks": {"count": 9}}
+    metric_sections = {"mesh": health, "export": {"glb_bytes": 1_234_567, "texture_px": 64}, "masks": {"count": 9}}
     environment = {"cpu": "a <processor>", "cores": 2, "packages": {"torch": "2"}}
     rows = sample_rows(first_psnr)
-    return finite(build_report(manifests or sample_manifests(), rows, figures, environment, (7.0, 700.0)))
+    return replace_nonfinite(
+        build_report(manifests or sample_manifests(), rows, metric_sections, environment, (7.0, 700.0))
+    )
 
 
 def sample_page() -> PageContent:
@@ -49,7 +51,7 @@ def sample_page() -> PageContent:
     return PageContent(
         title="run <one>",
         report=sample_report(math.inf),
-        frames=[FramePictures(index, video, field, mesh) for index in (0, 8)],
+        frames=[FrameImages(index, video, field, mesh) for index in (0, 8)],
         turntable=[("A-pose", views)],
         pictures=[("Diffuse map", video)],
         glb=encode_glb(sample_skinned_mesh(body)[0], body, motion, sample_maps()),

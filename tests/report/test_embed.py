@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.report.embed import join_glb, light_glb, split_glb, webp_uri
+from pipeline.report.embed import compress_glb_textures, pack_glb, unpack_glb, webp_data_uri
 
 
 def gradient(size: int, channels: int) -> np.ndarray:
@@ -24,19 +24,19 @@ def decoded(uri: str) -> np.ndarray:
 @pytest.mark.parametrize("channels", [3, 4])
 def test_webp_keeps_colours_in_their_channels(channels):
     pixels = gradient(64, channels)
-    back = decoded(webp_uri(pixels))
+    back = decoded(webp_data_uri(pixels))
     code = cv2.COLOR_BGRA2RGBA if channels == 4 else cv2.COLOR_BGR2RGB
     assert np.abs(cv2.cvtColor(back, code).astype(int) - pixels).mean() < 4
 
 
 def test_glb_round_trip_and_refusals():
     document, binary = {"asset": {"version": "2.0"}, "name": "ä"}, bytes(range(7))
-    back, chunk = split_glb(join_glb(document, binary))
+    back, chunk = unpack_glb(pack_glb(document, binary))
     assert back == document
     assert chunk[:7] == binary
     assert len(chunk) % 4 == 0
     with pytest.raises(ValueError, match="no binary glTF"):
-        split_glb(b"PK\x03\x04 this is a zip archive")
+        unpack_glb(b"PK\x03\x04 this is a zip archive")
 
 
 @pytest.fixture
@@ -57,12 +57,12 @@ def textured_glb() -> bytes:
         "bufferViews": views,
         "images": [{"mimeType": "image/png", "bufferView": 1}, {"mimeType": "image/png", "bufferView": 2}],
     }
-    return join_glb(document, binary)
+    return pack_glb(document, binary)
 
 
 def test_light_glb_changes_opaque_textures_alone(textured_glb):
-    before, before_binary = split_glb(textured_glb)
-    after, after_binary = split_glb(light_glb(textured_glb, max_texture_px=32))
+    before, before_binary = unpack_glb(textured_glb)
+    after, after_binary = unpack_glb(compress_glb_textures(textured_glb, max_texture_px=32))
 
     def content(document: dict, binary: bytes, view: int) -> bytes:
         start = document["bufferViews"][view]["byteOffset"]

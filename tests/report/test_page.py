@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.report.embed import split_glb
-from pipeline.report.page import ASSETS, ERROR_RANGE, error_map, figure_text, render_page
+from pipeline.report.embed import unpack_glb
+from pipeline.report.page import ASSETS_DIR, ERROR_MAP_MAX_LEVELS, error_map, format_metric, render_page
 from tests.report.report_sample import sample_page
 
 VOID = {"meta", "link", "img", "input", "br"}
@@ -56,7 +56,7 @@ def test_nothing_is_fetched(outline: Outline):
     links = [attributes.get(key) for _, attributes in outline.attributes for key in ("src", "href", "srcset")]
     assert [link for link in links if link]
     assert all(link.startswith("data:") for link in links if link)
-    assert not re.search(r"url\((?!data:)|@import", (ASSETS / "report.css").read_text())
+    assert not re.search(r"url\((?!data:)|@import", (ASSETS_DIR / "report.css").read_text())
 
 
 def test_every_picture_has_a_size_and_a_text(outline: Outline):
@@ -73,7 +73,7 @@ def test_what_people_wrote_is_escaped(page: str):
 def test_the_model_is_carried_whole(page: str):
     found = re.search(r'id="avatar-glb">([^<]+)</script>', page)
     assert found
-    document, binary = split_glb(base64.b64decode(found.group(1)))
+    document, binary = unpack_glb(base64.b64decode(found.group(1)))
     assert document["skins"]
     assert document["animations"]
     assert len(binary) == document["buffers"][0]["byteLength"]
@@ -81,7 +81,7 @@ def test_the_model_is_carried_whole(page: str):
 
 def test_scripts_cannot_end_early():
     for name in ("viewer.min.js", "report.js", "report.css"):
-        assert not re.search(r"</(script|style)", (ASSETS / name).read_text(encoding="utf-8"), re.IGNORECASE)
+        assert not re.search(r"</(script|style)", (ASSETS_DIR / name).read_text(encoding="utf-8"), re.IGNORECASE)
 
 
 def test_frames_without_error_show_a_dash_instead_of_infinity(outline: Outline):
@@ -93,8 +93,8 @@ def test_frames_without_error_show_a_dash_instead_of_infinity(outline: Outline):
 def test_error_maps_are_black_for_equal_and_brightest_from_the_range_on():
     dark = np.zeros((2, 2, 3), dtype=np.uint8)
     assert error_map(dark, dark).max() <= 4
-    assert np.array_equal(error_map(dark, dark + np.uint8(ERROR_RANGE)), error_map(dark, dark + np.uint8(255)))
-    assert error_map(dark, dark + np.uint8(ERROR_RANGE)).mean() > 200
+    assert np.array_equal(error_map(dark, dark + np.uint8(ERROR_MAP_MAX_LEVELS)), error_map(dark, dark + np.uint8(255)))
+    assert error_map(dark, dark + np.uint8(ERROR_MAP_MAX_LEVELS)).mean() > 200
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_error_maps_are_black_for_equal_and_brightest_from_the_range_on():
     [(True, "yes"), (None, "–"), (0.912345, "0.9123"), (12345, "12,345"), (12345.6, "12,346"), (0.0, "0"), ("a", "a")],
 )
 def test_figures_are_short(value: object, text: str):
-    assert figure_text(value) == text
+    assert format_metric(value) == text
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")

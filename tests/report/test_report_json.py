@@ -7,13 +7,13 @@ import pytest
 
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import Manifest
-from pipeline.report.report_json import finite, report_text
+from pipeline.report.report_json import replace_nonfinite, report_to_json
 from tests.report import report_sample
 from tests.report.report_sample import SCORES, STAGES, sample_manifests, sample_report
 
 
-def test_the_promised_keys_are_there():
-    report = json.loads(report_text(sample_report()))
+def test_contract_keys_are_present():
+    report = json.loads(report_to_json(sample_report()))
     assert list(report["seconds"]) == [*STAGES, "report", "total"]
     assert list(report["peak_rss_mib"]) == [*STAGES, "report", "total"]
     for render in ("field", "mesh"):
@@ -42,11 +42,11 @@ def test_scores_are_means_over_frames():
 def test_the_psnr_of_equal_images_becomes_null():
     report = sample_report(math.inf)
     assert report["heldout"]["field"]["psnr_full"] is None
-    assert json.loads(report_text(report))["heldout"]["frames"][0]["mesh"]["psnr_body"] is None
-    assert finite({"a": [math.nan, 1.0, (2, -math.inf)]}) == {"a": [None, 1.0, [2, None]]}
+    assert json.loads(report_to_json(report))["heldout"]["frames"][0]["mesh"]["psnr_body"] is None
+    assert replace_nonfinite({"a": [math.nan, 1.0, (2, -math.inf)]}) == {"a": [None, 1.0, [2, None]]}
 
 
-def test_lpips_says_what_it_compares_with_or_why_it_is_absent(monkeypatch):
+def test_lpips_note_states_protocol_or_reason_for_absence(monkeypatch):
     assert sample_report()["heldout"]["lpips"].startswith("absent")
     monkeypatch.setattr(report_sample, "SCORES", (*SCORES, "lpips_full"))
     assert "do not compare" in sample_report()["heldout"]["lpips"]

@@ -33,9 +33,9 @@ def test_another_python_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_too_little_space_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "FREE_DISK_GIB", 1e9)
-    monkeypatch.setattr(doctor, "MEMORY_GIB", 1e9)
-    disk, memory = doctor.space_problems(tmp_path)
+    monkeypatch.setattr(doctor, "MIN_FREE_DISK_GIB", 1e9)
+    monkeypatch.setattr(doctor, "MIN_MEMORY_GIB", 1e9)
+    disk, memory = doctor.disk_and_memory_problems(tmp_path)
     assert disk.startswith("disk space")
     assert memory.startswith("memory")
 
@@ -45,7 +45,7 @@ def test_the_doctor_finds_this_machine_ready(capsys: pytest.CaptureFixture[str])
     assert "all is there" in capsys.readouterr().out
 
 
-def test_the_exit_status_tells(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_exit_status_reports_problems(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(doctor, "is_loadable", lambda library: False)
     assert doctor.main([]) == 1
     assert "missing: system packages" in capsys.readouterr().out

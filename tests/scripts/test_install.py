@@ -23,40 +23,40 @@ def test_the_pin_is_read_from_the_lock() -> None:
 
 
 def test_a_local_cpu_build_needs_no_index(lock: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(install, "offers_cpu_build", lambda pin: True)
-    monkeypatch.setattr(install, "answers", lambda index: pytest.fail("no network is needed"))
-    assert install.torch_arguments("torch==2", lock, wants_cuda=False) == ["torch==2", "--no-deps"]
+    monkeypatch.setattr(install, "resolves_to_cpu_build", lambda pin: True)
+    monkeypatch.setattr(install, "is_index_reachable", lambda index: pytest.fail("no network is needed"))
+    assert install.torch_pip_arguments("torch==2", lock, use_cuda=False) == ["torch==2", "--no-deps"]
 
 
 def test_else_the_cpu_index_is_added(lock: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(install, "offers_cpu_build", lambda pin: False)
-    monkeypatch.setattr(install, "answers", lambda index: True)
-    arguments = install.torch_arguments("torch==2", lock, wants_cuda=False)
+    monkeypatch.setattr(install, "resolves_to_cpu_build", lambda pin: False)
+    monkeypatch.setattr(install, "is_index_reachable", lambda index: True)
+    arguments = install.torch_pip_arguments("torch==2", lock, use_cuda=False)
     assert arguments[-2:] == ["--extra-index-url", install.TORCH_CPU_INDEX]
 
 
 def test_without_the_index_pip_is_left_alone(
     lock: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(install, "offers_cpu_build", lambda pin: False)
-    monkeypatch.setattr(install, "answers", lambda index: False)
-    assert "--extra-index-url" not in install.torch_arguments("torch==2", lock, wants_cuda=False)
+    monkeypatch.setattr(install, "resolves_to_cpu_build", lambda pin: False)
+    monkeypatch.setattr(install, "is_index_reachable", lambda index: False)
+    assert "--extra-index-url" not in install.torch_pip_arguments("torch==2", lock, use_cuda=False)
     assert "does not answer" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("wants_cuda", [True, False])
-def test_a_named_index_is_obeyed(lock: Path, monkeypatch: pytest.MonkeyPatch, wants_cuda: bool) -> None:
+@pytest.mark.parametrize("use_cuda", [True, False])
+def test_index_from_environment_is_used(lock: Path, monkeypatch: pytest.MonkeyPatch, use_cuda: bool) -> None:
     monkeypatch.setenv("TORCH_INDEX", "https://mirror.example/whl")
-    arguments = install.torch_arguments("torch==2", lock, wants_cuda)
+    arguments = install.torch_pip_arguments("torch==2", lock, use_cuda)
     assert arguments[-2:] == ["--extra-index-url", "https://mirror.example/whl"]
 
 
 def test_cuda_never_asks_for_the_cpu_index(lock: Path) -> None:
-    assert install.torch_arguments("torch==2", lock, wants_cuda=True) == ["torch==2", "--constraint", str(lock)]
+    assert install.torch_pip_arguments("torch==2", lock, use_cuda=True) == ["torch==2", "--constraint", str(lock)]
 
 
 def test_an_index_that_does_not_answer_is_noticed() -> None:
-    assert not install.answers("http://127.0.0.1:9")
+    assert not install.is_index_reachable("http://127.0.0.1:9")
 
 
 def test_extras_come_from_the_project_file() -> None:

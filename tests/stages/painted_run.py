@@ -7,9 +7,9 @@ import numpy as np
 from pipeline.body.body import Body, Motion
 from pipeline.body.files import save_body, save_camera, save_motion
 from pipeline.capture.capture import Capture, image_path, mask_path, save_capture
-from pipeline.capture.frame_selection import split_of
+from pipeline.capture.frame_selection import assign_splits
 from pipeline.capture.usable_frames import SCORES_NPZ
-from pipeline.field.field import Field, choose_layout
+from pipeline.field.field import RadianceField, hash_grid_layout
 from pipeline.field.files import save_field
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.skinning import top_k_weights
@@ -32,7 +32,7 @@ def make_run(
             folder=inputs["frames"],
             frame_index=motion.frame_index,
             time_s=motion.frame_index / FPS,
-            split=split_of(motion.frame_index),
+            split=assign_splits(motion.frame_index),
             fps=FPS,
             width=camera.width,
             height=camera.height,
@@ -53,7 +53,9 @@ def make_run(
     save_npz(inputs["body"] / SCORES_NPZ, {"usable": np.ones(len(images), dtype=bool)})
     save_motion(inputs["field"] / "motion.npz", motion)
     bounds_m = np.stack([body.vertices.min(axis=0) - 0.1, body.vertices.max(axis=0) + 0.1]).astype(np.float32)
-    save_field(inputs["field"] / "field.safetensors", Field(bounds_m, choose_layout(bounds_m, 0.05, 2, 2, 10)))
+    save_field(
+        inputs["field"] / "field.safetensors", RadianceField(bounds_m, hash_grid_layout(bounds_m, 0.05, 2, 2, 10))
+    )
     indices, weights = top_k_weights(body.skin_weights)
     save_npz(
         inputs["mesh"] / "mesh.npz",

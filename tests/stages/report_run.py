@@ -12,11 +12,11 @@ from pipeline.avatar.textured_avatar import TexturedAvatar
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.files import save_body, save_camera, save_motion
 from pipeline.capture.capture import Capture, image_path, mask_path, save_capture
-from pipeline.capture.frame_selection import split_of
-from pipeline.core.manifest import MANIFEST, Manifest, write_manifest
-from pipeline.field.field import Field, choose_layout
+from pipeline.capture.frame_selection import assign_splits
+from pipeline.core.manifest import MANIFEST_FILE, Manifest, write_manifest
+from pipeline.field.field import RadianceField, hash_grid_layout
 from pipeline.field.files import save_field, save_occupancy
-from pipeline.field.occupancy import RESOLUTION, Occupancy
+from pipeline.field.occupancy import RESOLUTION, BinaryOccupancy
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.skinning import top_k_weights
 from pipeline.io.image import to_uint8, write_gray, write_rgb
@@ -44,7 +44,9 @@ def make_run(folder: Path) -> dict[str, Path]:
     (inputs["export"] / "avatar.glb").write_bytes(glb)
     metrics = {"body": {"landmark_error_px": 3.5, "silhouette_iou": 0.9}}
     for number, (name, path) in enumerate(inputs.items(), start=1):
-        write_manifest(Manifest(name, 1, "", {}, {}, {}, metrics.get(name, {}), number, 50.0 * number), path / MANIFEST)
+        write_manifest(
+            Manifest(name, 1, "", {}, {}, {}, metrics.get(name, {}), number, 50.0 * number), path / MANIFEST_FILE
+        )
     return inputs
 
 
@@ -72,7 +74,7 @@ def _write_frames(folder: Path, avatar: TexturedAvatar, poses: torch.Tensor) -> 
     for path in (image_path(folder, 0).parent, mask_path(folder, 0).parent):
         path.mkdir()
     for index, pose in zip(FRAME_INDEX, poses, strict=True):
-        rgba = avatar.render(avatar.posed(pose), CAMERA, samples=3)
+        rgba = avatar.render(avatar.posed(pose), CAMERA, supersampling=3)
         alpha = rgba[..., 3:]
         brighter = rgba[..., :3] + alpha * (COLOUR_ERROR / 255.0)
         straight = np.where(alpha > 0, brighter / np.maximum(alpha, 1e-6), 0.5)
@@ -82,7 +84,7 @@ def _write_frames(folder: Path, avatar: TexturedAvatar, poses: torch.Tensor) -> 
         folder=folder,
         frame_index=FRAME_INDEX,
         time_s=FRAME_INDEX / FRAME_RATE,
-        split=split_of(FRAME_INDEX),
+        split=assign_splits(FRAME_INDEX),
         fps=FRAME_RATE,
         width=CAMERA.width,
         height=CAMERA.height,
@@ -110,9 +112,12 @@ def _write_body(folder: Path, body: Body, motion: Motion) -> None:
 def _write_field(folder: Path, body: Body, motion: Motion) -> None:
     """An untrained field: grey fog in the body's box."""
     bounds_m = np.stack([body.vertices.min(axis=0) - 0.05, body.vertices.max(axis=0) + 0.05]).astype(np.float32)
-    save_field(folder / "field.safetensors", Field(bounds_m, choose_layout(bounds_m, 0.05, 2, 2, 10), hidden_width=16))
+    save_field(
+        folder / "field.safetensors",
+        RadianceField(bounds_m, hash_grid_layout(bounds_m, 0.05, 2, 2, 10), hidden_width=16),
+    )
     occupied = torch.ones(RESOLUTION, RESOLUTION, RESOLUTION, dtype=torch.uint8)
-    save_occupancy(folder / "occupancy.npz", Occupancy(occupied, torch.from_numpy(bounds_m)))
+    save_occupancy(folder / "occupancy.npz", BinaryOccupancy(occupied, torch.from_numpy(bounds_m)))
     save_motion(folder / "motion.npz", motion)
 
 

@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from pipeline.body.body import load_anny
 from pipeline.body.files import load_body, load_camera, load_motion
-from pipeline.body.overlay import BODY_OUTLINE_RGB, MARK_RGB, MASK_OUTLINE_RGB
+from pipeline.body.overlay import BODY_OUTLINE_RGB, MASK_OUTLINE_RGB, WARNING_RGB
 from pipeline.capture.capture import (
     IMAGES_FOLDER,
     MASKS_FOLDER,
@@ -23,22 +23,22 @@ from pipeline.core.progress import take_warnings
 from pipeline.geometry.camera import Camera
 from pipeline.io.image import read_rgb, write_gray, write_rgb
 from pipeline.io.npz import load_npz
-from stages.body import STAGE, Config, refuse_poor_fit, run, starting_camera
-from tests.body.acting import Act, act
+from stages.body import STAGE, Config, check_fit_quality, initial_camera, run
+from tests.body.acting import SyntheticRecording, synthetic_recording
 from tests.body.fit.test_diagnostics import result
 
 FRAMES = 8
 
 
 @pytest.fixture(scope="module")
-def scene() -> Act:
+def scene() -> SyntheticRecording:
     """Both hands are known for what they are, but one in one frame."""
-    scene = act(load_anny(), FRAMES, turn_rad=2.0, noise_m=0.005)
-    scene.hands.own_side[2, 0] = 0.4
+    scene = synthetic_recording(load_anny(), FRAMES, turn_rad=2.0, noise_m=0.005)
+    scene.hands.handedness_score[2, 0] = 0.4
     return scene
 
 
-def write_capture(folder, scene: Act, camera: Camera | None, masks: list[np.ndarray]) -> None:
+def write_capture(folder, scene: SyntheticRecording, camera: Camera | None, masks: list[np.ndarray]) -> None:
     """What the frames stage would write of a scene: grey pictures, masks, landmarks."""
     for name in (IMAGES_FOLDER, MASKS_FOLDER):
         (folder / name).mkdir(parents=True)
@@ -67,7 +67,7 @@ def write_capture(folder, scene: Act, camera: Camera | None, masks: list[np.ndar
     )
 
 
-def test_stage_writes_body_motion_camera_scores_and_overlay(tmp_path, scene: Act) -> None:
+def test_stage_writes_body_motion_camera_scores_and_overlay(tmp_path, scene: SyntheticRecording) -> None:
     frames, out = tmp_path / "frames", tmp_path / "body"
     out.mkdir()
     write_capture(frames, scene, scene.camera, scene.masks())
@@ -76,7 +76,7 @@ def test_stage_writes_body_motion_camera_scores_and_overlay(tmp_path, scene: Act
     assert metrics["silhouette_iou"] > 0.94
     assert metrics["landmark_error_px"] < 4.0
     assert metrics["focal_px"] == scene.camera.fx
-    assert metrics["exchanged_frames"] == 0
+    assert metrics["left_right_swapped_frames"] == 0
     assert metrics["hands_used"] == 1.0 - 0.5 / FRAMES
     motion, body = load_motion(out / "motion.npz"), load_body(out / "body.npz")
     assert np.array_equal(motion.frame_index, 3 * np.arange(FRAMES))
@@ -87,17 +87,17 @@ def test_stage_writes_body_motion_camera_scores_and_overlay(tmp_path, scene: Act
     scores = load_npz(out / "scores.npz")
     assert scores["silhouette_iou"].shape == (FRAMES,)
     assert metrics["silhouette_iou_worst"] == scores["silhouette_iou"].min()
-    assert scores["lump_share"].max() < 0.005
-    assert metrics["foreign_frames"] == metrics["dropped_frames"] == 0
+    assert scores["residual_blob_share"].max() < 0.005
+    assert metrics["frames_with_foreign_objects"] == metrics["dropped_frames"] == 0
     assert scores["usable"].all()
     tiles = read_rgb(out / "overlay.png")
     mask_px, body_px = ((tiles == colour).all(-1).sum() for colour in (MASK_OUTLINE_RGB, BODY_OUTLINE_RGB))
     assert 0 < mask_px < 0.6 * body_px  # where both agree, the body's outline hides that of the mask
-    assert not (tiles == MARK_RGB).all(-1).any()
+    assert not (tiles == WARNING_RGB).all(-1).any()
     assert take_warnings() == []
 
 
-def test_a_wrecked_frame_is_marked_named_and_dropped(tmp_path, scene: Act) -> None:
+def test_an_unusable_frame_is_marked_reported_and_dropped(tmp_path, scene: SyntheticRecording) -> None:
     frames, out = tmp_path / "frames", tmp_path / "body"
     out.mkdir()
     masks = scene.masks()
@@ -110,7 +110,7 @@ def test_a_wrecked_frame_is_marked_named_and_dropped(tmp_path, scene: Act) -> No
     assert any(
         sentence.startswith("frames 9: the body is not where the person is; 1 frame") for sentence in take_warnings()
     )
-    assert (read_rgb(out / "overlay.png") == MARK_RGB).all(-1).any()
+    assert (read_rgb(out / "overlay.png") == WARNING_RGB).all(-1).any()
 
 
 def capture_of(split: list[int]) -> Capture:
@@ -120,23 +120,30 @@ def capture_of(split: list[int]) -> Capture:
 
 
 def test_a_fit_without_masks_is_refused() -> None:
-    fit = result(overlap=np.full(12, np.nan))
+    fit = result(silhouette_iou=np.full(12, np.nan))
     with pytest.raises(UserError, match="median overlap with the masks 0.00"):
-        refuse_poor_fit(fit, capture_of([0] * 12), Config(), False)
+        check_fit_quality(fit, capture_of([0] * 12), Config(), False)
     with pytest.raises(UserError, match="in 12 of 12 training frames"):
-        refuse_poor_fit(fit, capture_of([0] * 12), Config(min_overlap=0.0), False)
+        check_fit_quality(fit, capture_of([0] * 12), Config(min_silhouette_iou=0.0), False)
 
 
 def test_a_fit_is_refused_where_too_few_frames_are_left_to_learn_from() -> None:
-    overlap = np.where(np.arange(12) < 4, 0.3, 0.9)
-    with pytest.raises(UserError, match=r"in 4 of 12 training frames.*frames 0-6.*split.json.*body.max_dropped"):
-        refuse_poor_fit(result(overlap=overlap), capture_of([0] * 12), Config(), False)
-    refuse_poor_fit(result(overlap=overlap), capture_of([0] * 12), Config(max_dropped=0.34), False)
-    refuse_poor_fit(result(overlap=overlap), capture_of([0, 0, 1, 2] + [0] * 8), Config(), False)
-    refuse_poor_fit(result(overlap=np.maximum(overlap, 0.75)), capture_of([0] * 12), Config(max_dropped=0.0), False)
+    silhouette_iou = np.where(np.arange(12) < 4, 0.3, 0.9)
+    with pytest.raises(UserError, match=r"in 4 of 12 training frames.*frames 0-6.*split.json.*body.max_dropped_share"):
+        check_fit_quality(result(silhouette_iou=silhouette_iou), capture_of([0] * 12), Config(), False)
+    check_fit_quality(
+        result(silhouette_iou=silhouette_iou), capture_of([0] * 12), Config(max_dropped_share=0.34), False
+    )
+    check_fit_quality(result(silhouette_iou=silhouette_iou), capture_of([0, 0, 1, 2] + [0] * 8), Config(), False)
+    check_fit_quality(
+        result(silhouette_iou=np.maximum(silhouette_iou, 0.75)),
+        capture_of([0] * 12),
+        Config(max_dropped_share=0.0),
+        False,
+    )
 
 
-def test_a_thing_beside_the_person_is_told_of(tmp_path, scene: Act) -> None:
+def test_a_foreign_object_is_reported(tmp_path, scene: SyntheticRecording) -> None:
     frames, out = tmp_path / "frames", tmp_path / "body"
     out.mkdir()
     masks = scene.masks()
@@ -145,54 +152,54 @@ def test_a_thing_beside_the_person_is_told_of(tmp_path, scene: Act) -> None:
     write_capture(frames, scene, scene.camera, masks)
     take_warnings()
     metrics = run({"frames": frames}, out, Config(rounds=1))
-    assert metrics["foreign_frames"] == 1
+    assert metrics["frames_with_foreign_objects"] == 1
     assert any(sentence.startswith("frames 9: the mask holds something beside") for sentence in take_warnings())
 
 
-def test_masks_of_something_else_are_refused_with_a_remedy(tmp_path, scene: Act) -> None:
+def test_masks_of_something_else_are_refused_with_a_remedy(tmp_path, scene: SyntheticRecording) -> None:
     frames, out = tmp_path / "frames", tmp_path / "body"
     out.mkdir()
     elsewhere = np.zeros((scene.camera.height, scene.camera.width), dtype=np.uint8)
     elsewhere[280:315, 5:250] = 255
     write_capture(frames, scene, scene.camera, [elsewhere] * FRAMES)
-    with pytest.raises(UserError, match=r"does not fit the person .* body.min_overlap"):
+    with pytest.raises(UserError, match=r"does not fit the person .* body.min_silhouette_iou"):
         run({"frames": frames}, out, Config(rounds=1))
 
 
-def test_landmarks_without_depth_are_refused_with_a_remedy(tmp_path, scene: Act) -> None:
+def test_landmarks_without_depth_are_refused_with_a_remedy(tmp_path, scene: SyntheticRecording) -> None:
     frames, out = tmp_path / "frames", tmp_path / "body"
     out.mkdir()
-    flat = act(load_anny(), FRAMES)
+    flat = synthetic_recording(load_anny(), FRAMES)
     flat.landmarks_world_m[:] = np.nan
     write_capture(frames, flat, flat.camera, scene.masks())
     with pytest.raises(UserError, match="in pixels and in 3D.*landmarks.npz"):
         run({"frames": frames}, out, Config())
 
 
-def test_a_supplied_principal_point_is_kept(tmp_path, scene: Act) -> None:
+def test_a_supplied_principal_point_is_kept(tmp_path, scene: SyntheticRecording) -> None:
     """Also when an angle of view is given: the camera beside the video is the better word."""
     camera = replace(scene.camera, cx=scene.camera.cx + 30.0, cy=scene.camera.cy - 20.0)
     write_capture(tmp_path, scene, camera, [])
-    found, deviation = starting_camera(load_capture(tmp_path), Config(field_of_view_deg=90.0))
-    assert (found.cx, found.cy, deviation) == (camera.cx, camera.cy, 0.0)
+    found, std = initial_camera(load_capture(tmp_path), Config(field_of_view_deg=90.0))
+    assert (found.cx, found.cy, std) == (camera.cx, camera.cy, 0.0)
 
 
-def test_camera_supplied_then_given_then_guessed(tmp_path, scene: Act) -> None:
+def test_camera_priority_supplied_option_metadata_default(tmp_path, scene: SyntheticRecording) -> None:
     for name, camera in (("known", scene.camera), ("unknown", None)):
         write_capture(tmp_path / name, scene, camera, [])
     known, unknown = (load_capture(tmp_path / name) for name in ("known", "unknown"))
-    assert starting_camera(known, Config(field_of_view_deg=90.0)) == (known.camera, 0.0)
-    camera, deviation = starting_camera(unknown, Config(field_of_view_deg=90.0))
-    assert deviation == 0.0
+    assert initial_camera(known, Config(field_of_view_deg=90.0)) == (known.camera, 0.0)
+    camera, std = initial_camera(unknown, Config(field_of_view_deg=90.0))
+    assert std == 0.0
     assert camera.fx == pytest.approx(0.5 * scene.camera.height)
-    camera, deviation = starting_camera(unknown, Config(usual_focal=1.5))
-    assert deviation == 0.5
+    camera, std = initial_camera(unknown, Config(initial_focal_ratio=1.5))
+    assert std == 0.5
     assert camera.fx == pytest.approx(1.5 * scene.camera.height)
-    camera, deviation = starting_camera(replace(unknown, recorded_focal_px=333.0), Config(usual_focal=1.5))
-    assert (camera.fx, deviation) == (333.0, 0.1)
+    camera, std = initial_camera(replace(unknown, metadata_focal_px=333.0), Config(initial_focal_ratio=1.5))
+    assert (camera.fx, std) == (333.0, 0.1)
 
 
-@pytest.mark.parametrize("values", [{"height_m": 30.0}, {"rounds": 0}, {"max_dropped": 1.0}, {"heigth_m": 1.7}])
+@pytest.mark.parametrize("values", [{"height_m": 30.0}, {"rounds": 0}, {"max_dropped_share": 1.0}, {"heigth_m": 1.7}])
 def test_values_out_of_range_and_typos_are_refused(values: dict) -> None:
     with pytest.raises(ValidationError):
         Config(**values)

@@ -19,7 +19,7 @@ from pipeline.geometry.camera import Camera
 from pipeline.geometry.rotation import quaternion_to_matrix
 from pipeline.geometry.skinning import forward_kinematics
 from stages.body import STAGE, Config, run, supplied_poses
-from tests.body.acting import Act, act
+from tests.body.acting import SyntheticRecording, synthetic_recording
 from tests.body.smpl_sample import file_contents, made_up_arrays, smpl_pose_of
 from tests.stages.test_body import FRAMES, write_capture
 
@@ -36,7 +36,7 @@ def model_file(tmp_path):
 
 def test_a_model_file_takes_the_place_of_the_built_in_body(tmp_path, model_file) -> None:
     model = SmplBody(made_up_arrays(24))
-    scene = act(model, FRAMES, shape={"beta_1": 1.0}, turn_rad=2.0, noise_m=0.005)
+    scene = synthetic_recording(model, FRAMES, shape={"beta_1": 1.0}, turn_rad=2.0, noise_m=0.005)
     frames, out = tmp_path / "frames", tmp_path / "body"
     out.mkdir()
     write_capture(frames, scene, scene.camera, scene.masks())
@@ -53,23 +53,25 @@ def test_a_model_file_takes_the_place_of_the_built_in_body(tmp_path, model_file)
 
 def test_a_missing_model_file_is_refused(tmp_path) -> None:
     model = SmplBody(made_up_arrays(24))
-    scene = act(model, FRAMES)
+    scene = synthetic_recording(model, FRAMES)
     write_capture(tmp_path / "frames", scene, scene.camera, scene.masks())
     with pytest.raises(UserError, match="SMPL_MALE.npz"):
         run({"frames": tmp_path / "frames"}, tmp_path, Config(model_file=str(tmp_path / "SMPL_MALE.npz")))
 
 
 @pytest.fixture(scope="module")
-def scene() -> Act:
+def scene() -> SyntheticRecording:
     """A person of known betas, with landmarks that err by 2 cm."""
-    return act(SmplBody(made_up_arrays(24)), FRAMES, shape={"beta_0": 1.0, "beta_1": 1.5}, turn_rad=2.0, noise_m=0.02)
+    return synthetic_recording(
+        SmplBody(made_up_arrays(24)), FRAMES, shape={"beta_0": 1.0, "beta_1": 1.5}, turn_rad=2.0, noise_m=0.02
+    )
 
 
-def true_poses(scene: Act) -> SmplPoses:
+def true_poses(scene: SyntheticRecording) -> SmplPoses:
     """The scene's poses as a data set would give them; `write_capture` says which frames they are of."""
     arrays = made_up_arrays(24)
     betas = scene.state.shape.float().numpy()
-    theta = smpl_pose_of(SmplBody(arrays), scene.model.rotations_of_all(scene.state.rotations))
+    theta = smpl_pose_of(SmplBody(arrays), scene.model.all_joint_rotations(scene.state.rotations))
     world_to_smpl = np.linalg.inv(SPACE) @ scene.camera.world_to_camera
     root = axis_angle_product(world_to_smpl[:3, :3], theta[:, 0])
     pelvis = arrays.joint_regressor[0] @ (arrays.template_m + arrays.shape_directions_m @ betas)
@@ -91,7 +93,7 @@ def axis_angle_product(matrix: np.ndarray, axis_angle: np.ndarray) -> np.ndarray
     return np.stack(turned).astype(np.float32)
 
 
-def errors_m(out: Path, scene: Act) -> np.ndarray:
+def errors_m(out: Path, scene: SyntheticRecording) -> np.ndarray:
     """Mean distance of each frame's joints from the true ones."""
     body, motion = load_body(out / "body.npz"), load_motion(out / "motion.npz")
     joint_to_world = forward_kinematics(
@@ -100,12 +102,12 @@ def errors_m(out: Path, scene: Act) -> np.ndarray:
         torch.tensor(body.joints_m),
         body.parents,
     )
-    found = joint_to_world[:, list(scene.model.full_joint), :3, 3].double()
+    found = joint_to_world[:, list(scene.model.full_joint_indices), :3, 3].double()
     return (found - scene.joints_m()).norm(dim=-1).mean(1).numpy()
 
 
 def fitted(
-    folder: Path, scene: Act, poses: SmplPoses, camera: Camera | None, **options: object
+    folder: Path, scene: SyntheticRecording, poses: SmplPoses, camera: Camera | None, **options: object
 ) -> tuple[Path, dict[str, float]]:
     """Run the stage on a capture with these poses; its folder and figures."""
     frames, out = folder / "frames", folder / "body"
@@ -115,7 +117,7 @@ def fitted(
     return out, dict(run({"frames": frames}, out, Config(rounds=1, **options)))
 
 
-def test_supplied_poses_are_kept(tmp_path, model_file, scene: Act) -> None:
+def test_supplied_poses_are_kept(tmp_path, model_file, scene: SyntheticRecording) -> None:
     """Landmarks 2 cm off change nothing; the shape is that of the file."""
     out, metrics = fitted(tmp_path, scene, true_poses(scene), scene.camera, model_file=str(model_file))
     assert errors_m(out, scene).max() < 1e-4
@@ -124,17 +126,17 @@ def test_supplied_poses_are_kept(tmp_path, model_file, scene: Act) -> None:
     assert take_warnings() == []
 
 
-def test_frames_without_a_supplied_pose_are_fitted(tmp_path, model_file, scene: Act) -> None:
+def test_frames_without_a_supplied_pose_are_fitted(tmp_path, model_file, scene: SyntheticRecording) -> None:
     """The first frame lies before all given poses, the third between two of them."""
     missing = np.isin(np.arange(FRAMES), [0, 2])
-    poses = true_poses(scene).of(3 * np.flatnonzero(~missing))
+    poses = true_poses(scene).for_frames(3 * np.flatnonzero(~missing))
     out, _ = fitted(tmp_path, scene, poses, scene.camera, model_file=str(model_file))
     errors = errors_m(out, scene)
     assert errors[~missing].max() < 1e-4
     assert 1e-4 < errors[missing].max() < 0.06
 
 
-def test_supplied_poses_are_where_the_fit_starts(tmp_path, model_file, scene: Act) -> None:
+def test_supplied_poses_are_where_the_fit_starts(tmp_path, model_file, scene: SyntheticRecording) -> None:
     """Poses that are 5 cm off and bent are drawn to the outlines; the shape stays that of the file."""
     true = true_poses(scene)
     random = np.random.default_rng(0)
@@ -157,14 +159,14 @@ def test_supplied_poses_are_where_the_fit_starts(tmp_path, model_file, scene: Ac
         (24, True, slice(0), "no pose of a chosen frame"),
     ],
 )
-def test_poses_that_cannot_be_used_are_said(
-    tmp_path, scene: Act, joints: int, knows_camera: bool, frames: slice, said: str
+def test_unusable_supplied_poses_are_reported(
+    tmp_path, scene: SyntheticRecording, joints: int, knows_camera: bool, frames: slice, said: str
 ) -> None:
     model = SmplBody(made_up_arrays(joints)) if joints else load_anny()
     write_capture(tmp_path / "frames", scene, scene.camera, [])
     poses = true_poses(scene)
     take_warnings()
-    capture = replace(load_capture(tmp_path / "frames"), smpl_poses=poses.of(poses.frame_index[frames]))
+    capture = replace(load_capture(tmp_path / "frames"), smpl_poses=poses.for_frames(poses.frame_index[frames]))
     assert supplied_poses(capture, model, scene.camera, knows_camera, Config()) is None
     (sentence,) = take_warnings()
     assert "smpl_poses.npz is not used" in sentence
@@ -173,7 +175,7 @@ def test_poses_that_cannot_be_used_are_said(
     assert take_warnings() == []
 
 
-def test_poses_of_a_person_elsewhere_are_refused_with_a_remedy(tmp_path, model_file, scene: Act) -> None:
+def test_poses_of_a_person_elsewhere_are_refused_with_a_remedy(tmp_path, model_file, scene: SyntheticRecording) -> None:
     poses = true_poses(scene)
     elsewhere = replace(poses, transl=poses.transl + np.float32(0.5))
     with pytest.raises(UserError, match=r"does not fit the person .* body.supplied_poses=start, or lower"):

@@ -12,11 +12,11 @@ from pipeline.body.pose_correction import PoseCorrection
 from pipeline.capture.capture import Capture, image_path, mask_path
 from pipeline.core.progress import take_warnings
 from pipeline.field.config import FieldConfig
-from pipeline.field.trainer import Learning
-from pipeline.field.validation import Judge
+from pipeline.field.trainer import Trainer
+from pipeline.field.validation import Validator
 from pipeline.geometry.camera import Camera
 from pipeline.io.image import write_gray, write_rgb
-from stages.field import Progress, judge_poses, learn, read_pictures
+from stages.field import ValidationCurve, read_masked_images, select_poses, train_field
 
 
 def rows_of(path):
@@ -25,11 +25,11 @@ def rows_of(path):
 
 
 def test_progress_goes_on_where_the_checkpoint_is(tmp_path):
-    first = Progress(tmp_path, done=0)
+    first = ValidationCurve(tmp_path, completed_steps=0)
     first.add(10, 1.5, 20.0, 15.0)
     first.add(20, 3.0, 22.0, 16.0)
     # Killed after step 20; the checkpoint is of step 15, so that step 20 is made and scored again.
-    second = Progress(tmp_path, done=15)
+    second = ValidationCurve(tmp_path, completed_steps=15)
     second.add(20, 2.2, 22.5, 16.5)
     second.add(40, 5.5, 24.0, 18.0)
     second.finish()
@@ -41,13 +41,13 @@ def test_progress_goes_on_where_the_checkpoint_is(tmp_path):
 
 
 def test_without_scores_there_is_no_file(tmp_path):
-    Progress(tmp_path, done=0).finish()
+    ValidationCurve(tmp_path, completed_steps=0).finish()
     assert not list(tmp_path.iterdir())
 
 
 def curve(folder, *looks):
     """A record whose looks come every 100 steps; each is the score of every frame."""
-    progress = Progress(folder, done=0)
+    progress = ValidationCurve(folder, completed_steps=0)
     for index, frames in enumerate(looks):
         progress.add(100 * (index + 1), float(index), float(np.mean(frames)), 0.0, *frames)
     return progress
@@ -55,44 +55,44 @@ def curve(folder, *looks):
 
 def test_a_curve_settles_when_two_gains_drown_in_their_noise(tmp_path):
     flat = [30.0, 28.0, 31.0], [30.1, 27.9, 31.0], [30.0, 28.05, 30.95]
-    assert curve(tmp_path, *flat).has_settled(100)
-    assert not curve(tmp_path, *flat).has_settled(200)
-    assert not curve(tmp_path, *flat[:2]).has_settled(0)
+    assert curve(tmp_path, *flat).has_converged(100)
+    assert not curve(tmp_path, *flat).has_converged(200)
+    assert not curve(tmp_path, *flat[:2]).has_converged(0)
     # Small gains, but of every frame; and one large gain among two.
-    assert not curve(tmp_path, *flat[:2], [30.13, 27.94, 31.03]).has_settled(0)
-    assert not curve(tmp_path, [29.0, 27.0, 30.0], *flat[:2]).has_settled(0)
+    assert not curve(tmp_path, *flat[:2], [30.13, 27.94, 31.03]).has_converged(0)
+    assert not curve(tmp_path, [29.0, 27.0, 30.0], *flat[:2]).has_converged(0)
     # A look that found less than the one before counts as no gain.
-    assert curve(tmp_path, *flat[:2], [29.5, 27.5, 30.5]).has_settled(0)
+    assert curve(tmp_path, *flat[:2], [29.5, 27.5, 30.5]).has_converged(0)
     # Noise as of a sample: a tenth of a decibel is less than 0.19 / sqrt(3).
-    assert curve(tmp_path, [30.0, 28.0, 31.0], [30.29, 27.91, 31.1], [30.58, 27.82, 31.2]).has_settled(0)
+    assert curve(tmp_path, [30.0, 28.0, 31.0], [30.29, 27.91, 31.1], [30.58, 27.82, 31.2]).has_converged(0)
     # One frame says nothing of noise.
-    assert not curve(tmp_path, [30.0], [30.0], [30.0]).has_settled(0)
+    assert not curve(tmp_path, [30.0], [30.0], [30.0]).has_converged(0)
 
 
 def test_a_settled_curve_is_known_after_a_restart(tmp_path):
     looks = [30.0, 28.0], [30.1, 27.9], [30.0, 28.05]
     curve(tmp_path, *looks)
-    assert Progress(tmp_path, done=300).has_settled(100)
+    assert ValidationCurve(tmp_path, completed_steps=300).has_converged(100)
     rows = rows_of(tmp_path / "checkpoint_progress.csv")
     assert [float(rows[1][f"frame_{frame}_db"]) for frame in range(2)] == [30.1, 27.9]
 
 
 @pytest.mark.parametrize(("early_stop", "steps"), [(True, 24), (False, 32)])
 def test_learning_ends_once_it_has_settled(tmp_path, early_stop, steps):
-    learning = mock.MagicMock(
-        spec=Learning, done=0, refines_poses=True, config=FieldConfig(steps=32, early_stop=early_stop)
+    trainer = mock.MagicMock(
+        spec=Trainer, completed_steps=0, refines_poses=True, config=FieldConfig(steps=32, early_stop=early_stop)
     )
 
     def step():
-        learning.done += 1
+        trainer.completed_steps += 1
 
-    learning.step.side_effect = step
-    judge = mock.MagicMock(spec=Judge, truths=[None, None])
-    judge.thinned.return_value = judge
-    judge.score.return_value, judge.frame_scores.return_value = (30.0, 25.0), [29.0, 31.0]
-    learn(learning, judge, tmp_path)
+    trainer.step.side_effect = step
+    validator = mock.MagicMock(spec=Validator, ground_truth=[None, None])
+    validator.subsampled.return_value = validator
+    validator.score.return_value, validator.psnr_per_frame_db.return_value = (30.0, 25.0), [29.0, 31.0]
+    train_field(trainer, validator, tmp_path)
     # Looks after a half, five and six eighths: two that found nothing new.
-    assert learning.done == steps
+    assert trainer.completed_steps == steps
     assert [float(row["step"]) for row in rows_of(tmp_path / "progress.csv")][-1] == steps
 
 
@@ -101,43 +101,43 @@ REFINED = FITTED.with_pose(FITTED.rotations_wxyz, FITTED.root_translation_m + 0.
 
 
 @dataclass(frozen=True)
-class KnownJudge(Judge):
+class KnownValidator(Validator):
     """Its renders are darker than the truth by so many levels: in the fitted poses, in the refined ones.
 
     asked: for each render whether it was of thinned pictures, and whether in refined poses.
     """
 
     levels: tuple[int, int] = (0, 0)
-    is_thin: bool = False
+    is_subsampled: bool = False
     asked: list[tuple[bool, bool]] = field(default_factory=list)
 
-    def thinned(self) -> "KnownJudge":
-        return replace(self, is_thin=True)
+    def subsampled(self) -> "KnownValidator":
+        return replace(self, is_subsampled=True)
 
-    def pose(self, learning: Learning, refined: bool) -> bool:
+    def pose(self, trainer: Trainer, refined: bool) -> bool:
         return refined
 
-    def render(self, learning: Learning, poses: bool) -> list[np.ndarray]:
-        self.asked.append((self.is_thin, poses))
+    def render(self, trainer: Trainer, poses: bool) -> list[np.ndarray]:
+        self.asked.append((self.is_subsampled, poses))
         return [target - np.uint8(self.levels[poses]) for target in self.targets]
 
 
-def known_judge(levels: tuple[int, int], frames: int) -> KnownJudge:
+def known_validator(levels: tuple[int, int], frames: int) -> KnownValidator:
     truth = np.full((8, 6, 3), 200, np.uint8), np.full((8, 6), 255, np.uint8)
-    return KnownJudge(FITTED.select(np.arange(frames)), Camera(9.0, 9.0, 3.0, 4.0, 6, 8), [truth] * frames, levels)
+    return KnownValidator(FITTED.select(np.arange(frames)), Camera(9.0, 9.0, 3.0, 4.0, 6, 8), [truth] * frames, levels)
 
 
-def known_learning(refines: bool) -> Learning:
+def known_trainer(refines: bool) -> Trainer:
     poses = mock.MagicMock(spec=PoseCorrection)
     poses.corrected.return_value = REFINED
-    return mock.MagicMock(spec=Learning, config=FieldConfig(pose_refinement=refines), poses=poses)
+    return mock.MagicMock(spec=Trainer, config=FieldConfig(pose_refinement=refines), poses=poses)
 
 
-def judged(levels: tuple[int, int], frames: int = 2, refines: bool = True):
-    """`judge_poses` on grey pictures, and the warnings that came with it."""
-    learning, judge = known_learning(refines), known_judge(levels, frames)
+def selected(levels: tuple[int, int], frames: int = 2, refines: bool = True):
+    """`select_poses` on grey pictures, and the warnings that came with it."""
+    trainer, validator = known_trainer(refines), known_validator(levels, frames)
     take_warnings()
-    return *judge_poses(learning, judge, FITTED), take_warnings()
+    return *select_poses(trainer, validator, FITTED), take_warnings()
 
 
 def decibels(levels: int) -> float:
@@ -145,7 +145,7 @@ def decibels(levels: int) -> float:
 
 
 def test_refined_poses_are_kept_where_validation_frames_gain():
-    kept, metrics, shown, warnings = judged((10, 5))
+    kept, metrics, shown, warnings = selected((10, 5))
     assert kept is REFINED
     assert warnings == []
     assert metrics == pytest.approx(
@@ -162,7 +162,7 @@ def test_refined_poses_are_kept_where_validation_frames_gain():
 
 @pytest.mark.parametrize("levels", [(5, 10), (5, 5)])
 def test_refined_poses_are_dropped_where_validation_frames_do_not_gain(levels):
-    kept, metrics, shown, (warning,) = judged(levels)
+    kept, metrics, shown, (warning,) = selected(levels)
     assert kept is FITTED
     assert warning == "the refined poses did not make validation frames better and were dropped"
     assert metrics["psnr"] == metrics["psnr_fitted"] == pytest.approx(decibels(5))
@@ -173,13 +173,13 @@ def test_refined_poses_are_dropped_where_validation_frames_do_not_gain(levels):
 
 @pytest.mark.parametrize(("levels", "is_better"), [((10, 5), True), ((5, 10), False)])
 def test_only_what_is_kept_is_rendered_whole(levels, is_better):
-    judge = known_judge(levels, 2)
-    judge_poses(known_learning(refines=True), judge, FITTED)
-    assert judge.asked == [(True, False), (True, True), (False, is_better)]
+    validator = known_validator(levels, 2)
+    select_poses(known_trainer(refines=True), validator, FITTED)
+    assert validator.asked == [(True, False), (True, True), (False, is_better)]
 
 
 def test_refined_poses_that_nothing_can_prove_are_dropped():
-    kept, metrics, shown, (warning,) = judged((10, 5), frames=0)
+    kept, metrics, shown, (warning,) = selected((10, 5), frames=0)
     assert kept is FITTED
     assert metrics == {"poses_kept": 0.0}
     assert shown == []
@@ -188,7 +188,7 @@ def test_refined_poses_that_nothing_can_prove_are_dropped():
 
 @pytest.mark.parametrize("frames", [0, 2])
 def test_poses_that_were_not_refined_stay_without_a_word(frames):
-    kept, metrics, _, warnings = judged((10, 5), frames, refines=False)
+    kept, metrics, _, warnings = selected((10, 5), frames, refines=False)
     assert kept is FITTED
     assert warnings == []
     assert "psnr_refined" not in metrics
@@ -204,7 +204,7 @@ def test_pictures_are_read_in_order_at_the_cameras_size(tmp_path, scale):
         write_gray(mask_path(tmp_path, index), np.full((8, 6), 255, np.uint8))
     capture = mock.MagicMock(spec=Capture, folder=tmp_path, frame_index=indices, width=6, height=8)
     camera = Camera(9.0, 9.0, 3.0, 4.0, 6, 8).scaled(scale)
-    pictures = read_pictures(capture, np.array([2, 0, 1]), camera)
-    assert [image.shape for image, _ in pictures] == [(camera.height, camera.width, 3)] * 3
-    assert [int(image[0, 0, 0]) for image, _ in pictures] == [20, 30, 10]
-    assert all((mask == 255).all() for _, mask in pictures)
+    masked_images = read_masked_images(capture, np.array([2, 0, 1]), camera)
+    assert [image.shape for image, _ in masked_images] == [(camera.height, camera.width, 3)] * 3
+    assert [int(image[0, 0, 0]) for image, _ in masked_images] == [20, 30, 10]
+    assert all((mask == 255).all() for _, mask in masked_images)

@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from pipeline.body.files import save_motion
-from pipeline.core.manifest import PROGRESS
+from pipeline.core.manifest import PROGRESS_FILE
 from pipeline.field.config import FieldConfig
-from pipeline.field.trainer import Learning
-from pipeline.field.validation import Judge
+from pipeline.field.trainer import Trainer
+from pipeline.field.validation import Validator
 from stages import field as field_stage
-from stages.field import CHECKPOINT, STAGE, learn
+from stages.field import CHECKPOINT, STAGE, train_field
 from tests.field.scene import painted_scene
 from tests.stages.painted_run import make_run
 
@@ -25,11 +25,11 @@ TINY = FieldConfig(
     frames_per_step=3,
     levels=3,
     log2_rows=12,
-    margin_m=0.04,
+    min_clothing_offset_m=0.04,
     step_fraction=0.02,
-    occupancy_every=4,
-    occupancy_start=4,
-    pose_start=0.2,
+    occupancy_update_interval=4,
+    occupancy_warmup_steps=4,
+    pose_start_fraction=0.2,
 )
 
 
@@ -59,17 +59,17 @@ def checkpoint_at_every_step(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def curve(out: Path) -> list[dict[str, float]]:
-    with (out / PROGRESS).open(newline="", encoding="utf-8") as file:
+    with (out / PROGRESS_FILE).open(newline="", encoding="utf-8") as file:
         return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
 
 
 def killed_in(step: int, real_step):
     """A step of learning that begins number `step`, from 1, and never ends it."""
 
-    def one(learning):
-        if learning.done == step - 1:
+    def one(trainer):
+        if trainer.completed_steps == step - 1:
             raise Killed
-        return real_step(learning)
+        return real_step(trainer)
 
     return one
 
@@ -79,14 +79,14 @@ def test_a_killed_stage_ends_with_the_files_of_an_unbroken_one(inputs, whole, tm
     """Killed once poses move but before cells are updated; killed after both rebakes, in the last step."""
     unbroken, expected = whole
     with monkeypatch.context() as patch:
-        patch.setattr(Learning, "step", killed_in(step, Learning.step))
+        patch.setattr(Trainer, "step", killed_in(step, Trainer.step))
         with pytest.raises(Killed):
             STAGE.run(inputs, tmp_path, TINY)
     assert (tmp_path / CHECKPOINT).exists()
     steps_made = []
     with monkeypatch.context() as patch:
-        real_step = Learning.step
-        patch.setattr(Learning, "step", lambda self: (steps_made.append(self.done), real_step(self)))
+        real_step = Trainer.step
+        patch.setattr(Trainer, "step", lambda self: (steps_made.append(self.completed_steps), real_step(self)))
         found = dict(STAGE.run(inputs, tmp_path, TINY))
     assert steps_made == list(range(step - 1, int(expected["steps"])))
     for name in STAGE.makes:
@@ -96,22 +96,24 @@ def test_a_killed_stage_ends_with_the_files_of_an_unbroken_one(inputs, whole, tm
     assert [row | {"seconds": 0} for row in curve(tmp_path)] == [row | {"seconds": 0} for row in curve(unbroken)]
 
 
-def known_learning(clock: SimpleNamespace, kill_in: int | None = None) -> mock.MagicMock:
+def known_trainer(clock: SimpleNamespace, kill_in: int | None = None) -> mock.MagicMock:
     """A learning of 32 steps that take two seconds each on `clock`."""
-    learning = mock.MagicMock(spec=Learning, done=0, refines_poses=True, config=FieldConfig(steps=32, early_stop=False))
+    trainer = mock.MagicMock(
+        spec=Trainer, completed_steps=0, refines_poses=True, config=FieldConfig(steps=32, early_stop=False)
+    )
 
     def step() -> None:
-        if learning.done + 1 == kill_in:
+        if trainer.completed_steps + 1 == kill_in:
             raise Killed
         clock.now_s += 2.0
-        learning.done += 1
+        trainer.completed_steps += 1
 
     def load(tensors: dict[str, torch.Tensor]) -> None:
-        learning.done = int(tensors["done"])
+        trainer.completed_steps = int(tensors["completed_steps"])
 
-    learning.step.side_effect, learning.load_state.side_effect = step, load
-    learning.state.side_effect = lambda: {"done": torch.tensor(learning.done)}
-    return learning
+    trainer.step.side_effect, trainer.load_state.side_effect = step, load
+    trainer.state.side_effect = lambda: {"completed_steps": torch.tensor(trainer.completed_steps)}
+    return trainer
 
 
 def test_seconds_go_on_from_the_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -119,13 +121,13 @@ def test_seconds_go_on_from_the_checkpoint(tmp_path: Path, monkeypatch: pytest.M
     checkpoint count too, and those that are made again count once."""
     clock = SimpleNamespace(now_s=100.0)
     monkeypatch.setattr(field_stage, "time", SimpleNamespace(monotonic=lambda: clock.now_s))
-    judge = mock.MagicMock(spec=Judge, truths=[None])
-    judge.thinned.return_value = judge
-    judge.score.return_value, judge.frame_scores.return_value = (30.0, 25.0), [29.0]
+    validator = mock.MagicMock(spec=Validator, ground_truth=[None])
+    validator.subsampled.return_value = validator
+    validator.score.return_value, validator.psnr_per_frame_db.return_value = (30.0, 25.0), [29.0]
     for kill_in in (11, 15):
         with pytest.raises(Killed):
-            learn(known_learning(clock, kill_in), judge, tmp_path)
-    learn(known_learning(clock), judge, tmp_path)
+            train_field(known_trainer(clock, kill_in), validator, tmp_path)
+    train_field(known_trainer(clock), validator, tmp_path)
     rows = curve(tmp_path)
     assert [row["step"] for row in rows] == [1, 2, 4, 8, 12, 16, 20, 24, 28, 32]
     assert [row["seconds"] for row in rows] == [2 * row["step"] for row in rows]

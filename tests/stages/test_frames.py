@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from data_tools.synthetic.scene.movie import write_movie
+from data_tools.synthetic.scene.movie import write_video
 from pipeline.capture.capture import load_capture
 from pipeline.capture.smpl_poses import save_smpl_poses
 from pipeline.core.errors import UserError
@@ -117,13 +117,13 @@ def test_large_images_are_stored_smaller_and_the_camera_with_them(tmp_path):
     np.testing.assert_allclose(capture.landmarks_px, 10)
 
 
-def bent(points_px: np.ndarray) -> np.ndarray:
+def distort_points(points_px: np.ndarray) -> np.ndarray:
     """Where a lens with OpenCV's k1 = 0.4 shows what a pinhole would show at these points (pixel centres at +0.5)."""
     ideal = (points_px - (64, 48)) / 80
     return 80 * ideal * (1 + 0.4 * (ideal**2).sum(axis=-1, keepdims=True)) + (64, 48)
 
 
-def film_through_a_lens(folder, n=17):
+def write_distorted_recording(folder, n=17):
     """A disc of 14 pixels with a red one of 7 in it walks to the left, bent by a lens in pictures, masks and landmarks.
 
     Returns where a pinhole would show its centre in each frame.
@@ -134,7 +134,7 @@ def film_through_a_lens(folder, n=17):
     seen_px = np.stack([columns, rows], axis=-1)
     ideal_px = seen_px
     for _ in range(40):
-        ideal_px = ideal_px + seen_px - bent(ideal_px)
+        ideal_px = ideal_px + seen_px - distort_points(ideal_px)
     centres_px = np.array([[46.0 - k, 38.0 - 0.5 * k] for k in range(n)])
     for k, centre_px in enumerate(centres_px):
         away_px = np.linalg.norm(ideal_px - centre_px, axis=-1)
@@ -143,7 +143,7 @@ def film_through_a_lens(folder, n=17):
         picture[away_px < 7, 0] = 200
         write_rgb(folder / f"{k}.png", picture)
         write_gray(folder / "masks" / f"{k}.png", np.where(away_px < 14, np.uint8(255), np.uint8(0)))
-    points_px = bent(centres_px)[:, None].repeat(33, axis=1)
+    points_px = distort_points(centres_px)[:, None].repeat(33, axis=1)
     points_px[3, 13] = np.nan
     save_npz(folder / "landmarks.npz", {"landmarks_px": points_px, "landmarks_world_m": np.zeros((n, 33, 3))})
     return centres_px
@@ -151,11 +151,11 @@ def film_through_a_lens(folder, n=17):
 
 @pytest.mark.parametrize("max_side_px", [128, 64])
 def test_picture_mask_and_landmarks_are_undistorted_together(tmp_path, max_side_px):
-    centres_px = film_through_a_lens(tmp_path / "in")
+    centres_px = write_distorted_recording(tmp_path / "in")
     run(tmp_path / "in", tmp_path / "out", max_side_px=max_side_px)
     capture = load_capture(tmp_path / "out")
     scale = max_side_px / 128
-    assert np.abs(bent(centres_px) - centres_px).max() > 3
+    assert np.abs(distort_points(centres_px) - centres_px).max() > 3
     rows, columns = np.mgrid[: capture.height, : capture.width] + 0.5
     for position, index in enumerate(capture.frame_index):
         expected_px = scale * centres_px[index]
@@ -178,18 +178,18 @@ def test_the_lens_that_the_camera_wrote_reaches_the_capture(tmp_path, max_side_p
     (folder / "0.png").unlink()
     (folder / "0.jpg").write_bytes(with_exif(jpeg, tiff("<", 26)))
     run(folder, tmp_path / "out", max_side_px=max_side_px)
-    assert load_capture(tmp_path / "out").recorded_focal_px == pytest.approx(26 / 43.27 * diagonal_px)
+    assert load_capture(tmp_path / "out").metadata_focal_px == pytest.approx(26 / 43.27 * diagonal_px)
 
 
-def test_images_a_second_can_be_given(tmp_path):
+def test_image_fps_can_be_set(tmp_path):
     run(draw_recording(tmp_path / "in", n=17), tmp_path / "out", fps=12.5)
     capture = load_capture(tmp_path / "out")
     assert capture.fps == 12.5
     np.testing.assert_allclose(capture.time_s, np.arange(17) * 0.08)
 
 
-def test_a_video_says_its_own_frames_a_second(tmp_path):
-    write_movie(tmp_path / "a.mp4", np.zeros((17, 48, 64, 3), np.uint8), 25.0)
+def test_fps_option_is_refused_for_video(tmp_path):
+    write_video(tmp_path / "a.mp4", np.zeros((17, 48, 64, 3), np.uint8), 25.0)
     with pytest.raises(UserError, match="a.mp4 is a video, .* leave frames.fps out"):
         run(tmp_path / "a.mp4", tmp_path / "out", fps=30.0)
 
@@ -247,7 +247,7 @@ def test_a_picture_of_nobody_is_refused(tmp_path):
 
 @pytest.mark.parametrize(("n", "limit", "stride"), [(100, 900, 1), (900, 900, 1), (901, 900, 3), (3000, 900, 5)])
 def test_looking_stride_is_odd_and_enough(n, limit, stride):
-    assert frames.looking_stride(n, limit) == stride
+    assert frames.detection_stride(n, limit) == stride
     assert {index % 8 for index in range(0, 64 * stride, stride)} == set(range(8))
 
 
@@ -257,7 +257,7 @@ def test_looking_stride_is_odd_and_enough(n, limit, stride):
 )
 def test_real_recordings_that_make_no_avatar(shared_data, tmp_path, name, message):
     with pytest.raises(UserError, match=message):
-        run(shared_data / "error" / f"{name}.mp4", tmp_path / "out", max_looked_at=60)
+        run(shared_data / "error" / f"{name}.mp4", tmp_path / "out", max_detection_frames=60)
 
 
 @pytest.mark.slow

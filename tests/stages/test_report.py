@@ -19,8 +19,17 @@ from pipeline.report.lpips_weights import find_lpips_weights
 from stages.report import STAGE, Config, run, scored_positions
 from tests.stages.report_run import COLOUR_ERROR, FRAME_INDEX, make_run
 
-CONFIG = Config(samples=3, shown_frames=2, views=4, view_height_px=64, fit_held_out_poses=True, fit_steps=5)
-QUICK = Config(samples=1, shown_frames=1, views=2, view_height_px=64, unrefined=False)
+CONFIG = Config(
+    samples_per_pixel_side=3,
+    max_page_frames=2,
+    turntable_views=4,
+    turntable_height_px=64,
+    fit_held_out_poses=True,
+    pose_fit_steps=5,
+)
+QUICK = Config(
+    samples_per_pixel_side=1, max_page_frames=1, turntable_views=2, turntable_height_px=64, score_unrefined_mesh=False
+)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +53,7 @@ def report(out: Path) -> dict:
     return json.loads((out / "report.json").read_text())
 
 
-def test_all_promised_files_are_made(out: Path):
+def test_all_declared_files_are_written(out: Path):
     assert {path.name for path in out.iterdir()} == set(STAGE.makes)
 
 
@@ -78,7 +87,7 @@ def test_poses_without_refinement_score_worse(report: dict):
 
 def test_the_mesh_is_drawn_with_the_softness_of_the_masks(report: dict):
     # The painted masks are antialiased by square pixels: nothing is left to soften.
-    assert report["masks"]["edge_spread_px"] == pytest.approx(12**-0.5, abs=0.08)
+    assert report["masks"]["edge_blur_sigma_px"] == pytest.approx(12**-0.5, abs=0.08)
     assert report["heldout"]["mesh_sharp"]["psnr_full"] == pytest.approx(
         report["heldout"]["mesh"]["psnr_full"], abs=0.3
     )
@@ -102,7 +111,7 @@ def test_poses_fitted_to_held_out_images_are_scored_apart(report: dict, out: Pat
     assert "mesh pose fitted" in apart[1]
 
 
-def test_lpips_is_there_or_said_to_be_absent(report: dict):
+def test_lpips_is_present_or_reported_missing(report: dict):
     has_weights = find_lpips_weights() is not None
     assert ("lpips_full" in report["heldout"]["mesh"]) == has_weights
     assert report["heldout"]["lpips"].startswith("AlexNet" if has_weights else "absent")
@@ -126,14 +135,14 @@ def test_figures_of_the_other_stages_are_passed_on(report: dict, inputs: dict[st
 
 def test_the_page_shows_the_chosen_frames(out: Path):
     page = (out / "index.html").read_text()
-    assert page.count('class="card frame"') == CONFIG.shown_frames
-    assert page.count('data-kind="mesh"') == CONFIG.shown_frames
+    assert page.count('class="card frame"') == CONFIG.max_page_frames
+    assert page.count('data-kind="mesh"') == CONFIG.max_page_frames
     assert "<title>small</title>" in page
 
 
 def test_sheets_show_the_avatar(out: Path):
     turntable = cv2.imread(str(out / "turntable.jpg"))
-    assert turntable.shape[0] > 2 * CONFIG.view_height_px
+    assert turntable.shape[0] > 2 * CONFIG.turntable_height_px
     assert (turntable < 200).any(axis=2).mean() > 0.1
     assert cv2.imread(str(out / "heldout.jpg")) is not None
 

@@ -10,13 +10,13 @@ import torch
 
 from pipeline.avatar.gltf import read_glb
 from pipeline.body.body import canonical_to_world
-from pipeline.core.config import Layers, build
+from pipeline.core.config import ConfigLayers, build_config
 from pipeline.core.errors import UserError
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.geometry.texture_rendering import render_textured
 from pipeline.io.image import read_gray, read_rgb, to_float, to_uint8, write_gray
 from pipeline.io.npz import load_npz
-from pipeline.metrics.images import body_pixels, on_white, premultiplied_on_white, psnr_db
+from pipeline.metrics.images import composite_on_white, composite_premultiplied_on_white, foreground_mask, psnr_db
 from stages.export import STAGE as EXPORT
 from stages.texture import STAGE as TEXTURE
 from tests.avatar.test_gltf import Player
@@ -24,7 +24,7 @@ from tests.field.scene import PaintedScene, painted_scene
 from tests.stages.painted_run import make_run
 from tests.tools.khronos import validator_issues
 
-OPTIONS = {"largest_px": 512, "rounds": 1, "edge_m": 0.01}
+OPTIONS = {"max_texture_px": 512, "rounds": 1, "silhouette_falloff_m": 0.01}
 HELD_OUT = 8
 
 
@@ -59,7 +59,7 @@ def test_the_texture_stage_makes_its_files_and_no_other(textured: tuple[Path, di
     assert metrics["texture_px"] == 512
     assert cv2.imread(str(out / "diffuse.png"), cv2.IMREAD_UNCHANGED).shape == (512, 512, 3)
     assert cv2.imread(str(out / "specular.png"), cv2.IMREAD_UNCHANGED).shape == (512, 512)
-    assert 0.4 < metrics["seen_share"] < 0.95
+    assert 0.4 < metrics["observed_texel_fraction"] < 0.95
 
 
 def test_a_held_out_frame_is_foretold(scene: PaintedScene, textured: tuple[Path, dict[str, float]]) -> None:
@@ -76,8 +76,8 @@ def test_a_held_out_frame_is_foretold(scene: PaintedScene, textured: tuple[Path,
 
     def psnr_of(shown: torch.Tensor) -> float:
         rendered = render_textured(posed, faces, faces_uv, uv, shown, scene.camera).numpy()
-        inside = cv2.erode(body_pixels(mask).astype(np.uint8), np.ones((5, 5))) > 0  # limbs are 4 pixels wide here
-        return psnr_db(premultiplied_on_white(rendered), on_white(image, mask), inside)
+        inside = cv2.erode(foreground_mask(mask).astype(np.uint8), np.ones((5, 5))) > 0  # limbs are 4 pixels wide here
+        return psnr_db(composite_premultiplied_on_white(rendered), composite_on_white(image, mask), inside)
 
     mean_colour = torch.from_numpy(image[mask > 200].mean(axis=0) / 255.0).float()
     assert psnr_of(texture) > 6.0 + psnr_of(mean_colour.expand(512, 512, 3))
@@ -95,7 +95,7 @@ def test_coverage_is_black_between_charts_and_bright_on_the_chest(
 
 
 def test_plain_paint_is_matte(textured: tuple[Path, dict[str, float]]) -> None:
-    assert textured[1]["specular_gain"] < 0.05
+    assert textured[1]["specular_partial_r2"] < 0.05
     assert read_gray(textured[0] / "specular.png").max() <= 20
 
 
@@ -130,16 +130,16 @@ def test_without_training_frames_the_remedy_is_named(inputs: dict[str, Path], tm
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"largest_px": 1000}, "largest_px = 1000 .* a power of two"),
-        ({"smallest_px": 96, "largest_px": 128}, "smallest_px = 96 .* a power of two"),
-        ({"smallest_px": 1024, "largest_px": 512}, "largest_px = 512 .* at least smallest_px, which is 1024"),
+        ({"max_texture_px": 1000}, "largest_px = 1000 .* a power of two"),
+        ({"min_texture_px": 96, "max_texture_px": 128}, "smallest_px = 96 .* a power of two"),
+        ({"min_texture_px": 1024, "max_texture_px": 512}, "largest_px = 512 .* at least smallest_px, which is 1024"),
     ],
 )
 def test_sides_that_are_no_texture_are_refused(options: dict[str, int], message: str) -> None:
-    layers = Layers()
+    layers = ConfigLayers()
     layers.add({"texture": options}, "test.yaml")
     with pytest.raises(UserError, match=message):
-        build("texture", TEXTURE.config, layers)
+        build_config("texture", TEXTURE.config, layers)
 
 
 def test_the_export_stage_makes_its_files_and_no_other(
@@ -163,7 +163,7 @@ def test_the_avatar_moves_as_filmed_with_the_floor_at_zero(
     transforms = canonical_to_world(scene.body, scene.motion)[HELD_OUT : HELD_OUT + 1]
     weights = torch.from_numpy(scene.body.skin_weights)
     world = linear_blend_skinning(torch.from_numpy(scene.body.vertices), weights, transforms)[0].numpy()
-    offset_m = np.array(player.json["asset"]["extras"]["scene_from_world_translation_m"])
+    offset_m = np.array(player.json["asset"]["extras"]["world_to_scene_translation_m"])
     atlas = load_npz(exported[0].parent / "texture" / "atlas.npz")
     # four influences instead of all: millimetres, at joints
     assert np.abs(posed - (world + offset_m)[atlas["vertex_of_uv"]]).max() < 0.01

@@ -37,12 +37,12 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 @pytest.mark.parametrize(
     ("stage", "not_needed", "after_reading"),
     [
-        ("field", ["start_learning"], "learn"),
+        ("field", ["create_trainer"], "train_field"),
         ("mesh", ["load_occupancy"], "pixel_footprint_m"),
-        ("texture", [], "make_atlas"),
+        ("texture", [], "build_atlas"),
     ],
 )
-def test_no_stage_learns_from_a_wrecked_frame_or_loses_a_validation_frame(
+def test_no_stage_trains_on_an_unusable_frame_or_loses_a_validation_frame(
     inputs: dict[str, Path],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,

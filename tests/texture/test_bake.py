@@ -5,8 +5,15 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.texture.bake import BakeConfig, bake_diffuse, render_view, validation_psnr_db
-from pipeline.texture.views import View, align, facing_cosine, footprint_m, pixel_trust, weigh_by_resolution
+from pipeline.texture.bake import BakeConfig, bake_diffuse, mean_foreground_psnr_db, render_textured_view
+from pipeline.texture.views import (
+    BakeView,
+    align_to_render,
+    pixel_confidence,
+    pixel_footprint_m,
+    vertex_view_cosine,
+    weight_by_resolution,
+)
 from tests.mesh.painted_ball import CAMERA, DISTANCE_M, PaintedBall
 
 MAGENTA = np.array([1.0, 0.0, 1.0], dtype=np.float32)
@@ -18,7 +25,7 @@ def ball() -> PaintedBall:
 
 
 @pytest.fixture(scope="module")
-def wobbly() -> PaintedBall:
+def misaligned_ball() -> PaintedBall:
     """The pictures lie a few pixels beside where the camera says."""
     return PaintedBall(32, shift_px=2.0)
 
@@ -34,7 +41,7 @@ def magenta(colour: np.ndarray, seen: np.ndarray) -> np.ndarray:
 
 
 def test_the_paint_comes_back_where_it_was_seen(ball: PaintedBall) -> None:
-    colour, seen = baked_colours(ball, rounds=3, largest_flow_m=0.0)
+    colour, seen = baked_colours(ball, rounds=3, max_flow_m=0.0)
     error = np.abs(colour - ball.truth)[seen > 0.98]
     assert (seen > 0.98).mean() > 0.4
     assert np.median(error) < 0.004  # half a step of the 8-bit pictures is 0.002
@@ -42,7 +49,7 @@ def test_the_paint_comes_back_where_it_was_seen(ball: PaintedBall) -> None:
 
 
 def test_rounds_undo_the_blur_of_pixels(ball: PaintedBall) -> None:
-    colours = [baked_colours(ball, rounds=rounds, largest_flow_m=0.0) for rounds in (0, 2)]
+    colours = [baked_colours(ball, rounds=rounds, max_flow_m=0.0) for rounds in (0, 2)]
     before, after = (np.abs(colour - ball.truth)[seen > 0.98].mean() for colour, seen in colours)
     assert after < 0.25 * before
 
@@ -55,10 +62,10 @@ def test_no_backdrop_and_no_occluder_bleeds_in(ball: PaintedBall) -> None:
     assert np.abs(colour - ball.truth)[knobs & (seen > 0.9)].mean() < 0.1
 
 
-def test_alignment_sharpens_what_wrong_poses_blurred(wobbly: PaintedBall) -> None:
+def test_alignment_sharpens_what_wrong_poses_blurred(misaligned_ball: PaintedBall) -> None:
     def contrast(**options: float) -> float:
-        colour, seen = baked_colours(wobbly, **options)
-        return float(np.std(colour[seen > 0.98]) / np.std(wobbly.truth[seen > 0.98]))
+        colour, seen = baked_colours(misaligned_ball, **options)
+        return float(np.std(colour[seen > 0.98]) / np.std(misaligned_ball.truth[seen > 0.98]))
 
     blurred, aligned = contrast(rounds=0), contrast(rounds=3)
     assert blurred < 0.985
@@ -77,10 +84,10 @@ def test_validation_psnr_tells_the_true_texture_from_a_wrong_one(ball: PaintedBa
     grey = np.full((256, 256, 3), 0.5, dtype=np.float32)
     true = ball.texels.image(ball.truth)
     true[~ball.texels.covered()] = 0.5
-    assert validation_psnr_db(true, ball.views[:2], ball.surface) > 10 + validation_psnr_db(
+    assert mean_foreground_psnr_db(true, ball.views[:2], ball.surface) > 10 + mean_foreground_psnr_db(
         grey, ball.views[:2], ball.surface
     )
-    assert np.isnan(validation_psnr_db(true, [], ball.surface))
+    assert np.isnan(mean_foreground_psnr_db(true, [], ball.surface))
 
 
 def test_the_same_views_give_the_same_bytes(ball: PaintedBall) -> None:
@@ -89,21 +96,21 @@ def test_the_same_views_give_the_same_bytes(ball: PaintedBall) -> None:
 
 
 @pytest.mark.parametrize("shift_px", [(2.0, 0.0), (-1.0, 3.0)])
-def test_align_moves_a_picture_onto_the_render(wobbly: PaintedBall, shift_px: tuple[float, float]) -> None:
-    texture = wobbly.texels.image(wobbly.truth)
-    view = wobbly.views[0]
-    rendered = render_view(texture, view, wobbly.surface)
+def test_align_moves_a_picture_onto_the_render(misaligned_ball: PaintedBall, shift_px: tuple[float, float]) -> None:
+    texture = misaligned_ball.texels.image(misaligned_ball.truth)
+    view = misaligned_ball.views[0]
+    rendered = render_textured_view(texture, view, misaligned_ball.surface)
     rows, columns = np.mgrid[: view.mask.shape[0], : view.mask.shape[1]].astype(np.float32)
-    places = (columns - np.float32(shift_px[0]), rows - np.float32(shift_px[1]))
+    sample_positions_px = (columns - np.float32(shift_px[0]), rows - np.float32(shift_px[1]))
     straight = np.clip(255.0 * rendered[..., :3] / np.maximum(rendered[..., 3:], 1e-3), 0, 255).astype(np.uint8)
-    image = cv2.remap(straight, *places, cv2.INTER_LINEAR)
-    mask = cv2.remap((255 * rendered[..., 3]).astype(np.uint8), *places, cv2.INTER_LINEAR)
-    shifted = View(image, mask, view.camera, view.vertices_world, view.cosine)
+    image = cv2.remap(straight, *sample_positions_px, cv2.INTER_LINEAR)
+    mask = cv2.remap((255 * rendered[..., 3]).astype(np.uint8), *sample_positions_px, cv2.INTER_LINEAR)
+    shifted = BakeView(image, mask, view.camera, view.vertices_world, view.view_cosine)
     inside = cv2.erode((rendered[..., 3] > 0.99).astype(np.uint8), np.ones((9, 9))) > 0
     target = straight[inside] / 255.0
-    left = np.abs(align(shifted, rendered, 2.0, 8.0)[0][inside] - target).mean()
+    left = np.abs(align_to_render(shifted, rendered, 2.0, 8.0)[0][inside] - target).mean()
     assert left < 0.25 * np.abs(image[inside] / 255.0 - target).mean()
-    unmoved, same_mask = align(shifted, rendered, 2.0, 0.0)
+    unmoved, same_mask = align_to_render(shifted, rendered, 2.0, 0.0)
     np.testing.assert_array_equal(unmoved, image.astype(np.float32) / 255.0)
     assert same_mask is mask
 
@@ -113,11 +120,11 @@ def test_trust_falls_to_zero_at_silhouettes_and_at_borders_in_depth() -> None:
     depth[5:35, 5:55] = 2.0
     depth[5:35, 30:55] = 1.5  # an arm before the body
     mask = np.where(np.isfinite(depth), 255, 0).astype(np.uint8)
-    trust = pixel_trust(mask, depth, edge_px=4.0)
-    assert trust[20, 15] == trust[20, 45] == 1.0
-    assert not trust[20, 28:32].any()
-    assert not trust[:6].any()
-    assert not pixel_trust(np.full_like(mask, 200), depth, 4.0).any()  # soft everywhere: the person nowhere alone
+    pixel_weights = pixel_confidence(mask, depth, edge_px=4.0)
+    assert pixel_weights[20, 15] == pixel_weights[20, 45] == 1.0
+    assert not pixel_weights[20, 28:32].any()
+    assert not pixel_weights[:6].any()
+    assert not pixel_confidence(np.full_like(mask, 200), depth, 4.0).any()  # soft everywhere: the person nowhere alone
 
 
 def test_cosine_is_one_where_the_ball_faces_the_camera(ball: PaintedBall) -> None:
@@ -125,13 +132,13 @@ def test_cosine_is_one_where_the_ball_faces_the_camera(ball: PaintedBall) -> Non
     centre = view.vertices_world[:642].mean(dim=0)
     outward = torch.nn.functional.normalize(view.vertices_world[:642] - centre, dim=1)
     towards = torch.nn.functional.normalize(-view.vertices_world[:642], dim=1)
-    cosine = facing_cosine(view.vertices_world, ball.surface.faces, CAMERA)[:642]
-    torch.testing.assert_close(cosine, (outward * towards).sum(dim=1), atol=0.02, rtol=0.0)
+    view_cosine = vertex_view_cosine(view.vertices_world, ball.surface.faces, CAMERA)[:642]
+    torch.testing.assert_close(view_cosine, (outward * towards).sum(dim=1), atol=0.02, rtol=0.0)
 
 
 def test_near_frames_weigh_more(ball: PaintedBall) -> None:
     far = ball.views[0]
-    near = View(far.image, far.mask, far.camera, 0.5 * far.vertices_world, far.cosine)
-    assert footprint_m(far) == pytest.approx(DISTANCE_M / CAMERA.fx, rel=0.02)
-    weights = [view.weight for view in weigh_by_resolution([far, far, near])]
+    near = BakeView(far.image, far.mask, far.camera, 0.5 * far.vertices_world, far.view_cosine)
+    assert pixel_footprint_m(far) == pytest.approx(DISTANCE_M / CAMERA.fx, rel=0.02)
+    weights = [view.weight for view in weight_by_resolution([far, far, near])]
     assert weights == pytest.approx([1.0, 1.0, 4.0], rel=1e-4)

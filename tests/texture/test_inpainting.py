@@ -6,7 +6,7 @@ import trimesh
 
 from pipeline.geometry.atlas import Texels, rasterize_texels
 from pipeline.geometry.mesh import Mesh
-from pipeline.texture.inpainting import spread, vertex_means
+from pipeline.texture.inpainting import average_texels_per_vertex, spread
 from tests.mesh.painted_ball import SIZE_PX, ball_atlas, ball_mesh
 
 
@@ -51,7 +51,7 @@ def test_vertices_take_the_colour_of_the_texels_around_them() -> None:
     ramp = (0.5 + 0.3 * mesh.vertices).astype(np.float32)
     colour = texels.interpolate(mesh.faces, ramp)
     halves = (colour[:, 1] > 0.5).astype(np.float32)
-    means, weights = vertex_means(texels, mesh.faces, len(mesh.vertices), colour, halves)
+    means, weights = average_texels_per_vertex(texels, mesh.faces, len(mesh.vertices), colour, halves)
     assert np.all((weights >= 0.0) & (weights <= 1.0 + 1e-6))
     inside = weights > 0.99
     assert inside.sum() > 100

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 
-def blender_finds(glb: Path, picture: Path, seconds: float) -> dict[str, Any]:
+def inspect_in_blender(glb: Path, picture: Path, seconds: float) -> dict[str, Any]:
     """What Blender finds in a .glb at a time of its animation; also renders `picture` for a person to judge.
 
     BLENDER_PYTHON names the Python that can `import bpy` (`python3.11 -m venv DIR && DIR/bin/pip install bpy`).

@@ -11,7 +11,7 @@ import bpy
 from mathutils import Vector
 
 
-def posed_box(mesh):
+def posed_bounding_box(mesh):
     """Lowest and highest corner of the mesh as posed now, in Blender's world (+Z up)."""
     evaluated = mesh.evaluated_get(bpy.context.evaluated_depsgraph_get())
     points = [evaluated.matrix_world @ vertex.co for vertex in evaluated.data.vertices]
@@ -49,7 +49,7 @@ def main(path, picture, seconds):
     objects = list(bpy.data.objects)
     skinned = [o for o in objects if o.type == "MESH" and any(m.type == "ARMATURE" for m in o.modifiers)]
     bpy.context.scene.frame_set(round(seconds * bpy.context.scene.render.fps))
-    low, high = posed_box(skinned[0])
+    low, high = posed_bounding_box(skinned[0])
     render(picture, low, high)
     found = {
         "armatures": sum(o.type == "ARMATURE" for o in objects),

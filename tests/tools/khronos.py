@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-REPOSITORY = Path(__file__).resolve().parents[2]
+REPOSITORY_DIR = Path(__file__).resolve().parents[2]
 WARNING = 1  # severities: 0 error, 1 warning, 2 information, 3 hint
 
 
@@ -19,7 +19,7 @@ def validator_issues(path: Path) -> list[dict[str, Any]]:
     The package is looked for in the repository's node_modules (`make gltf-validator`) and in GLTF_VALIDATOR_MODULES.
     """
     node = shutil.which("node")
-    places = [Path(os.environ.get("GLTF_VALIDATOR_MODULES", "")), REPOSITORY / "node_modules"]
+    places = [Path(os.environ.get("GLTF_VALIDATOR_MODULES", "")), REPOSITORY_DIR / "node_modules"]
     modules = next((place for place in places if (place / "gltf-validator").is_dir()), None)
     if node is None or modules is None:
         pytest.skip("the Khronos validator is not installed: `make gltf-validator` (needs node)")

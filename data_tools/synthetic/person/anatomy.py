@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from data_tools.synthetic.person.surface import face_parts
+from data_tools.synthetic.person.surface import face_components
 from pipeline.body.body import AnnyBody, Body
 
 SKIN, EYE, TONGUE, SKIRT = 0, 1, 2, 3
@@ -33,21 +33,21 @@ class Anatomy:
         return np.array([middle[0], self.eyes_m[:, 1].mean() + 0.02, middle[2]], dtype=np.float32)
 
 
-def surface_kinds(body: Body) -> Int[np.ndarray, "f"]:
+def label_faces(body: Body) -> Int[np.ndarray, "f"]:
     """SKIN, EYE or TONGUE of each face. The eyes are the pair of small parts with equally many faces."""
-    part = face_parts(body.faces, len(body.vertices))
-    sizes = np.bincount(part)
-    kind_of_part = np.full(len(sizes), TONGUE, dtype=np.int32)
-    kind_of_part[0] = SKIN
+    component = face_components(body.faces, len(body.vertices))
+    sizes = np.bincount(component)
+    label_of_component = np.full(len(sizes), TONGUE, dtype=np.int32)
+    label_of_component[0] = SKIN
     smallest = np.flatnonzero(sizes == sizes.min())
-    kind_of_part[smallest] = EYE
-    return kind_of_part[part]
+    label_of_component[smallest] = EYE
+    return label_of_component[component]
 
 
-def measure(model: AnnyBody, body: Body) -> Anatomy:
+def measure_anatomy(model: AnnyBody, body: Body) -> Anatomy:
     """Find the places on one person's body."""
-    kinds = surface_kinds(body)
-    eye_vertices = np.unique(body.faces[kinds == EYE])
+    labels = label_faces(body)
+    eye_vertices = np.unique(body.faces[labels == EYE])
     eye_points = body.vertices[eye_vertices]
     is_left = eye_points[:, 0] > eye_points[:, 0].mean()
     eyes = np.stack([eye_points[is_left], eye_points[~is_left]])
@@ -56,20 +56,20 @@ def measure(model: AnnyBody, body: Body) -> Anatomy:
         joints_m=dict(zip(body.joint_names, body.joints_m, strict=True)),
         eyes_m=centres,
         eye_radius_m=float(np.ptp(eyes[0, :, 1])) / 2,
-        mouth_m=_point_at_uv(model, body, _MOUTH_UV),
-        ears_m=np.stack([_point_at_uv(model, body, uv) for uv in _EAR_UVS]),
+        mouth_m=_vertex_nearest_uv(model, body, _MOUTH_UV),
+        ears_m=np.stack([_vertex_nearest_uv(model, body, uv) for uv in _EAR_UVS]),
         crown_y_m=float(body.vertices[:, 1].max()),
     )
 
 
-def limb_weights(body: Body) -> Float[np.ndarray, "v 2"]:
+def compute_arm_head_weights(body: Body) -> Float[np.ndarray, "v 2"]:
     """How much each vertex belongs to (an arm, the head), each in [0, 1]."""
     is_arm = np.array([name.endswith(_ARM_JOINTS) or "Hand" in name for name in body.joint_names])
     is_head = np.array([name == "Head" for name in body.joint_names])
     return np.stack([body.skin_weights[:, is_arm].sum(axis=1), body.skin_weights[:, is_head].sum(axis=1)], axis=1)
 
 
-def _point_at_uv(model: AnnyBody, body: Body, uv: tuple[float, float]) -> Float[np.ndarray, "3"]:
+def _vertex_nearest_uv(model: AnnyBody, body: Body, uv: tuple[float, float]) -> Float[np.ndarray, "3"]:
     """The vertex nearest to a place in the body's UV layout."""
     nearest = int(((model.uv - np.array(uv)) ** 2).sum(axis=1).argmin())
     face, corner = np.argwhere(model.faces_uv == nearest)[0]

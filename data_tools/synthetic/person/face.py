@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from data_tools.synthetic.person.anatomy import Anatomy
-from data_tools.synthetic.person.noise import Noise
+from data_tools.synthetic.person.noise import ValueNoise
 from data_tools.synthetic.person.outfit import Outfit
 
 IRIS_RADIUS_M = 0.0062
@@ -12,7 +12,7 @@ PUPIL_RADIUS_M = 0.0025
 
 
 def paint_skin(
-    points_m: Float[np.ndarray, "n 3"], anatomy: Anatomy, outfit: Outfit, noise: Noise
+    points_m: Float[np.ndarray, "n 3"], anatomy: Anatomy, outfit: Outfit, noise: ValueNoise
 ) -> Float[np.ndarray, "n 3"]:
     """Mottled skin, warmer at cheeks, nose and ears, with brows, lashes and lips."""
     mottle = noise.fractal(points_m, 0.05) * 0.035 + noise(points_m, 0.004) * 0.02
@@ -22,11 +22,11 @@ def paint_skin(
     cheeks = np.stack([0.5 * (eye + mouth) + [np.sign(eye[0] - mouth[0]) * 0.022, 0.0, -0.01] for eye in eyes])
     for centres, radius_m in ((nose[None], 0.016), (cheeks, 0.026), (anatomy.ears_m, 0.03)):
         for centre in centres:
-            _blend(colours, np.array([0.78, 0.42, 0.38]), 0.28 * _ball(points_m, centre, radius_m))
-    _blend(colours, _darker(outfit.skin, 0.74), 0.5 * _eye_sockets(points_m, anatomy))
-    _blend(colours, _lip_colour(outfit), _lips(points_m, anatomy))
-    _blend(colours, np.asarray(outfit.hair) * 0.9, 0.9 * _brows(points_m, anatomy))
-    _blend(colours, np.array([0.10, 0.07, 0.06]), _lashes(points_m, anatomy))
+            _mix_into(colours, np.array([0.78, 0.42, 0.38]), 0.28 * _gaussian_spot(points_m, centre, radius_m))
+    _mix_into(colours, _scale_colour(outfit.skin, 0.74), 0.5 * _eye_sockets(points_m, anatomy))
+    _mix_into(colours, _lip_colour(outfit), _lips(points_m, anatomy))
+    _mix_into(colours, np.asarray(outfit.hair) * 0.9, 0.9 * _brows(points_m, anatomy))
+    _mix_into(colours, np.array([0.10, 0.07, 0.06]), _lashes(points_m, anatomy))
     return colours
 
 
@@ -35,18 +35,18 @@ def paint_eyes(points_m: Float[np.ndarray, "n 3"], anatomy: Anatomy, outfit: Out
     colours = np.full((len(points_m), 3), 0.90, dtype=np.float32) * np.array([1.0, 0.98, 0.96], dtype=np.float32)
     from_axis = np.min([np.hypot(*(points_m - eye)[:, :2].T) for eye in anatomy.eyes_m], axis=0)
     faces_front = points_m[:, 2] > anatomy.eyes_m[:, 2].mean()
-    _blend(colours, _darker(outfit.iris, 0.45), (faces_front & (from_axis < IRIS_RADIUS_M)).astype(np.float32))
-    _blend(colours, np.asarray(outfit.iris), (faces_front & (from_axis < 0.84 * IRIS_RADIUS_M)).astype(np.float32))
-    _blend(colours, np.full(3, 0.03), (faces_front & (from_axis < PUPIL_RADIUS_M)).astype(np.float32))
+    _mix_into(colours, _scale_colour(outfit.iris, 0.45), (faces_front & (from_axis < IRIS_RADIUS_M)).astype(np.float32))
+    _mix_into(colours, np.asarray(outfit.iris), (faces_front & (from_axis < 0.84 * IRIS_RADIUS_M)).astype(np.float32))
+    _mix_into(colours, np.full(3, 0.03), (faces_front & (from_axis < PUPIL_RADIUS_M)).astype(np.float32))
     return colours
 
 
-def _blend(colours: Float[np.ndarray, "n 3"], ink: np.ndarray, amount: Float[np.ndarray, "n"]) -> None:
+def _mix_into(colours: Float[np.ndarray, "n 3"], ink: np.ndarray, amount: Float[np.ndarray, "n"]) -> None:
     """Mix `ink` into `colours` in place; amount in [0, 1]."""
     colours += amount[:, None].astype(np.float32) * (ink.astype(np.float32) - colours)
 
 
-def _darker(colour: tuple[float, float, float], factor: float) -> np.ndarray:
+def _scale_colour(colour: tuple[float, float, float], factor: float) -> np.ndarray:
     return np.asarray(colour) * factor
 
 
@@ -54,17 +54,17 @@ def _lip_colour(outfit: Outfit) -> np.ndarray:
     return np.asarray(outfit.skin) * np.array([0.84, 0.66, 0.66])
 
 
-def _ball(points: np.ndarray, centre: np.ndarray, radius_m: float) -> Float[np.ndarray, "n"]:
+def _gaussian_spot(points: np.ndarray, centre: np.ndarray, radius_m: float) -> Float[np.ndarray, "n"]:
     """A soft spot, 1 at its centre."""
     return np.exp(-((points - centre) ** 2).sum(axis=1) / radius_m**2)
 
 
-def _step(value: np.ndarray, width: float) -> Float[np.ndarray, "n"]:
+def _linear_step(value: np.ndarray, width: float) -> Float[np.ndarray, "n"]:
     """0 below -width, 1 above +width."""
     return np.clip(0.5 + 0.5 * value / width, 0.0, 1.0)
 
 
-def _beside_eye(points: np.ndarray, anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _eye_coordinates(points: np.ndarray, anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Position seen from the nearer eye: outwards, upwards (m), and whether the point lies in front of its centre."""
     is_left = points[:, 0] > anatomy.eyes_m[:, 0].mean()
     eye = np.where(is_left[:, None], anatomy.eyes_m[0], anatomy.eyes_m[1])
@@ -74,28 +74,28 @@ def _beside_eye(points: np.ndarray, anatomy: Anatomy) -> tuple[np.ndarray, np.nd
 
 def _brows(points: np.ndarray, anatomy: Anatomy) -> Float[np.ndarray, "n"]:
     """An arch over each eye that thins outwards."""
-    outwards, up, in_front = _beside_eye(points, anatomy)
+    outwards, up, in_front = _eye_coordinates(points, anatomy)
     arch = 0.0225 - 5.0 * (outwards - 0.006) ** 2
     half_width = 0.0040 * np.clip((outwards + 0.020) / 0.012, 0, 1) * np.clip((0.032 - outwards) / 0.024, 0, 1)
     inside = np.minimum(half_width - np.abs(up - arch), np.minimum(outwards + 0.017, 0.027 - outwards))
-    return _step(inside, 0.0012) * in_front
+    return _linear_step(inside, 0.0012) * in_front
 
 
 def _lashes(points: np.ndarray, anatomy: Anatomy) -> Float[np.ndarray, "n"]:
     """A dark rim where the lids meet the eyeball."""
-    outwards, up, in_front = _beside_eye(points, anatomy)
+    outwards, up, in_front = _eye_coordinates(points, anatomy)
     depth = np.min([np.linalg.norm(points - eye, axis=1) for eye in anatomy.eyes_m], axis=0)
-    near_ball = _step(anatomy.eye_radius_m + 0.0016 - depth, 0.0007)
+    near_ball = _linear_step(anatomy.eye_radius_m + 0.0016 - depth, 0.0007)
     return near_ball * in_front * np.where(up > 0, 0.85, 0.35)
 
 
 def _eye_sockets(points: np.ndarray, anatomy: Anatomy) -> Float[np.ndarray, "n"]:
-    return np.sum([_ball(points, eye, anatomy.eye_radius_m + 0.006) for eye in anatomy.eyes_m], axis=0)
+    return np.sum([_gaussian_spot(points, eye, anatomy.eye_radius_m + 0.006) for eye in anatomy.eyes_m], axis=0)
 
 
 def _lips(points: np.ndarray, anatomy: Anatomy) -> Float[np.ndarray, "n"]:
     """An almond around the mouth's slit."""
     across, up = (points - anatomy.mouth_m)[:, 0], (points - anatomy.mouth_m)[:, 1]
-    reach = np.sqrt(np.clip(1.0 - (across / 0.0255) ** 2, 0.0, 1.0))
-    inside = np.where(up > 0, 0.0085, 0.0105) * reach - np.abs(up)
-    return _step(inside, 0.0015) * (reach > 0) * (points[:, 2] > anatomy.mouth_m[2] - 0.03)
+    ellipse_profile = np.sqrt(np.clip(1.0 - (across / 0.0255) ** 2, 0.0, 1.0))
+    inside = np.where(up > 0, 0.0085, 0.0105) * ellipse_profile - np.abs(up)
+    return _linear_step(inside, 0.0015) * (ellipse_profile > 0) * (points[:, 2] > anatomy.mouth_m[2] - 0.03)

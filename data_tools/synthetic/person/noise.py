@@ -7,7 +7,7 @@ from scipy.ndimage import map_coordinates
 _LATTICE = 32
 
 
-class Noise:
+class ValueNoise:
     """Periodic value noise on a random lattice (Perlin's "solid texture"); the same seed gives the same field."""
 
     def __init__(self, seed: int) -> None:

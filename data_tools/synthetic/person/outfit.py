@@ -13,8 +13,8 @@ LAYERS = ("shoes", "trousers", "shirt", "hair")
 LEGWEAR = ("trousers", "skirt")
 """What covers the legs: a layer, or the loose sheet of `data_tools.synthetic.person.skirt` over bare legs."""
 
-TUCKED_M = -0.03
-"""Where a shirt that is tucked into a skirt ends, as `Outfit.shirt_drop_m`."""
+TUCKED_SHIRT_BELOW_HIPS_M = -0.03
+"""Where a shirt that is tucked into a skirt ends, as `Outfit.shirt_below_hips_m`."""
 
 Colour = tuple[float, float, float]
 
@@ -25,7 +25,7 @@ class Outfit:
 
     legwear: str
     sleeve_fraction: float
-    shirt_drop_m: float
+    shirt_below_hips_m: float
     shirt: Colour
     stripe: Colour
     trousers: Colour
@@ -58,57 +58,57 @@ _SKIN: tuple[Colour, ...] = ((0.86, 0.65, 0.54), (0.72, 0.51, 0.39), (0.52, 0.35
 
 def choose_outfit(seed: int, legwear: str = "trousers") -> Outfit:
     """The wardrobe's entry for a seed; seed 0 is the first of everything. legwear: one of `LEGWEAR`."""
-    digits = np.random.default_rng(seed).integers(0, 1_000_000, 6) if seed else np.zeros(6, dtype=np.int64)
-    shirt, stripe = _SHIRTS[digits[0] % len(_SHIRTS)]
-    skirt, check = _SKIRTS[digits[1] % len(_SKIRTS)]
+    choice_indices = np.random.default_rng(seed).integers(0, 1_000_000, 6) if seed else np.zeros(6, dtype=np.int64)
+    shirt, stripe = _SHIRTS[choice_indices[0] % len(_SHIRTS)]
+    skirt, check = _SKIRTS[choice_indices[1] % len(_SKIRTS)]
     return Outfit(
         legwear=legwear,
         sleeve_fraction=0.66,
-        shirt_drop_m=0.07 if legwear == "trousers" else TUCKED_M,
+        shirt_below_hips_m=0.07 if legwear == "trousers" else TUCKED_SHIRT_BELOW_HIPS_M,
         shirt=shirt,
         stripe=stripe,
-        trousers=_TROUSERS[digits[1] % len(_TROUSERS)],
+        trousers=_TROUSERS[choice_indices[1] % len(_TROUSERS)],
         skirt=skirt,
         check=check,
-        shoes=_SHOES[digits[2] % len(_SHOES)],
-        hair=_HAIR[digits[3] % len(_HAIR)],
-        iris=_IRIS[digits[4] % len(_IRIS)],
-        skin=_SKIN[digits[5] % len(_SKIN)],
+        shoes=_SHOES[choice_indices[2] % len(_SHOES)],
+        hair=_HAIR[choice_indices[3] % len(_HAIR)],
+        iris=_IRIS[choice_indices[4] % len(_IRIS)],
+        skin=_SKIN[choice_indices[5] % len(_SKIN)],
         print_text=f"{24 + seed % 70:02d}",
     )
 
 
-def layer_depths(
-    points_m: Float[np.ndarray, "n 3"], limbs: Float[np.ndarray, "n 2"], anatomy: Anatomy, outfit: Outfit
+def compute_layer_depths_m(
+    points_m: Float[np.ndarray, "n 3"], arm_head_weights: Float[np.ndarray, "n 2"], anatomy: Anatomy, outfit: Outfit
 ) -> Float[np.ndarray, "n 4"]:
     """How far inside each of `LAYERS` a point of the A-pose surface lies, in metres; negative outside.
 
-    points_m: canonical positions. limbs: weights of (an arm, the head), from `anatomy.limb_weights`.
+    points_m: canonical positions. limbs: weights of (an arm, the head), from `anatomy.compute_arm_head_weights`.
     """
     height = points_m[:, 1]
-    on_arm, on_head = limbs[:, 0] > 0.5, limbs[:, 1] > 0.35
+    on_arm, on_head = arm_head_weights[:, 0] > 0.5, arm_head_weights[:, 1] > 0.35
     foot, hips = anatomy.joints_m["LeftFoot"], anatomy.joints_m["Hips"]
     trousers = np.minimum(hips[1] + 0.03 - height, height - (foot[1] - 0.025))
     if outfit.legwear != "trousers":
         trousers = np.full_like(trousers, -1.0)
-    shirt = np.minimum(below_neckline(points_m, anatomy), height - (hips[1] - outfit.shirt_drop_m))
+    shirt = np.minimum(neckline_depth_m(points_m, anatomy), height - (hips[1] - outfit.shirt_below_hips_m))
     depths = [
         foot[1] + 0.02 - height,
         np.where(on_arm, -1.0, trousers),
-        np.where(on_arm, _inside_sleeve(points_m, anatomy, outfit), shirt),
-        np.where(on_head, _inside_hair(points_m, anatomy), -1.0),
+        np.where(on_arm, _sleeve_depth_m(points_m, anatomy, outfit), shirt),
+        np.where(on_head, _hair_depth_m(points_m, anatomy), -1.0),
     ]
     return np.stack(depths, axis=1).astype(np.float32)
 
 
-def below_neckline(points_m: Float[np.ndarray, "n 3"], anatomy: Anatomy) -> Float[np.ndarray, "n"]:
+def neckline_depth_m(points_m: Float[np.ndarray, "n 3"], anatomy: Anatomy) -> Float[np.ndarray, "n"]:
     """Depth below a crew neck: a plane through the root of the neck that falls towards the front."""
     normal = np.array([0.0, 1.0, 0.62]) / np.hypot(1.0, 0.62)
     root = anatomy.joints_m["Neck"] + np.array([0.0, 0.012, 0.0])
     return _dot(root - points_m, normal)
 
 
-def _inside_sleeve(points_m: Float[np.ndarray, "n 3"], anatomy: Anatomy, outfit: Outfit) -> Float[np.ndarray, "n"]:
+def _sleeve_depth_m(points_m: Float[np.ndarray, "n 3"], anatomy: Anatomy, outfit: Outfit) -> Float[np.ndarray, "n"]:
     """Distance along the upper arm to the sleeve's hem."""
     joints = anatomy.joints_m
     depth = np.empty(len(points_m))
@@ -121,14 +121,16 @@ def _inside_sleeve(points_m: Float[np.ndarray, "n 3"], anatomy: Anatomy, outfit:
     return depth
 
 
-def _inside_hair(points_m: Float[np.ndarray, "n 3"], anatomy: Anatomy) -> Float[np.ndarray, "n"]:
+def _hair_depth_m(points_m: Float[np.ndarray, "n 3"], anatomy: Anatomy) -> Float[np.ndarray, "n"]:
     """A short haircut: high on the forehead, around the ears, down to the nape."""
     from_skull = points_m - anatomy.skull_m()
     side = np.abs(from_skull[:, 0])
     hairline = 0.62 * from_skull[:, 1] - 0.78 * from_skull[:, 2] + 0.024 + 0.12 * np.maximum(side - 0.03, 0.0)
     nape = points_m[:, 1] - (anatomy.mouth_m[1] + 0.012)
-    beside_ear = np.linalg.norm((points_m[:, None] - anatomy.ears_m) / np.array([2.0, 1.0, 0.72]), axis=2).min(axis=1)
-    return np.minimum(np.minimum(hairline, nape), beside_ear - 0.037)
+    ear_distance_m = np.linalg.norm((points_m[:, None] - anatomy.ears_m) / np.array([2.0, 1.0, 0.72]), axis=2).min(
+        axis=1
+    )
+    return np.minimum(np.minimum(hairline, nape), ear_distance_m - 0.037)
 
 
 def _dot(points: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n"]:

@@ -9,10 +9,10 @@ from jaxtyping import Float, Int
 from scipy.ndimage import distance_transform_edt
 
 from data_tools.synthetic.person.anatomy import EYE, SKIRT, TONGUE, Anatomy
-from data_tools.synthetic.person.dressing import Dressed
+from data_tools.synthetic.person.dressing import ClothedSurface
 from data_tools.synthetic.person.face import paint_eyes, paint_skin
-from data_tools.synthetic.person.noise import Noise
-from data_tools.synthetic.person.outfit import LAYERS, Outfit, below_neckline, layer_depths
+from data_tools.synthetic.person.noise import ValueNoise
+from data_tools.synthetic.person.outfit import LAYERS, Outfit, compute_layer_depths_m, neckline_depth_m
 from data_tools.synthetic.person.skirt import waist_and_hem_m
 from pipeline.io.image import to_float
 from pipeline.kernels.raster import rasterize
@@ -29,59 +29,61 @@ class Texels:
     """Surface points behind the covered texels; rows are texels."""
 
     points_m: Float[np.ndarray, "n 3"]
-    limbs: Float[np.ndarray, "n 2"]
-    kinds: Int[np.ndarray, "n"]
+    arm_head_weights: Float[np.ndarray, "n 2"]
+    labels: Int[np.ndarray, "n"]
 
 
 def paint_texture(
-    dressed: Dressed, anatomy: Anatomy, outfit: Outfit, noise: Noise, size_px: int
+    clothed: ClothedSurface, anatomy: Anatomy, outfit: Outfit, noise: ValueNoise, size_px: int
 ) -> Float[np.ndarray, "s s 3"]:
     """sRGB texture of the clothed surface; texels outside all charts repeat the nearest chart's colour."""
-    face_id, barycentric = _chart_map(dressed, size_px)
+    face_id, barycentric = _rasterize_atlas(clothed, size_px)
     covered = face_id >= 0
-    texels = _texels(dressed, face_id[covered], barycentric[covered])
+    texels = _texels(clothed, face_id[covered], barycentric[covered])
     texture = np.zeros((size_px, size_px, 3), dtype=np.float32)
-    texture[covered] = _colours(texels, anatomy, outfit, noise)
+    texture[covered] = _texel_colours(texels, anatomy, outfit, noise)
     rows, columns = distance_transform_edt(~covered, return_distances=False, return_indices=True)
     return texture[rows, columns]
 
 
-def _chart_map(dressed: Dressed, size_px: int) -> tuple[Int[np.ndarray, "s s"], Float[np.ndarray, "s s 3"]]:
+def _rasterize_atlas(
+    clothed: ClothedSurface, size_px: int
+) -> tuple[Int[np.ndarray, "s s"], Float[np.ndarray, "s s 3"]]:
     """Face and barycentrics at every texel centre; row 0 is v = 1."""
-    position_px = torch.from_numpy(dressed.uv * [size_px, -size_px] + [0.0, size_px]).float()
+    position_px = torch.from_numpy(clothed.uv * [size_px, -size_px] + [0.0, size_px]).float()
     face_id, barycentric, _ = rasterize(
-        position_px, torch.ones(len(position_px)), torch.from_numpy(dressed.faces_uv), size_px, size_px
+        position_px, torch.ones(len(position_px)), torch.from_numpy(clothed.faces_uv), size_px, size_px
     )
     return face_id.numpy(), barycentric.numpy()
 
 
-def _texels(dressed: Dressed, faces: Int[np.ndarray, "n"], barycentric: Float[np.ndarray, "n 3"]) -> Texels:
-    corners = dressed.body.faces[faces]
+def _texels(clothed: ClothedSurface, faces: Int[np.ndarray, "n"], barycentric: Float[np.ndarray, "n 3"]) -> Texels:
+    corners = clothed.body.faces[faces]
     blend = barycentric[:, :, None]
     return Texels(
-        points_m=(dressed.drape_m[corners] * blend).sum(axis=1),
-        limbs=(dressed.limbs[corners] * blend).sum(axis=1),
-        kinds=dressed.kinds[faces],
+        points_m=(clothed.drape_m[corners] * blend).sum(axis=1),
+        arm_head_weights=(clothed.arm_head_weights[corners] * blend).sum(axis=1),
+        labels=clothed.labels[faces],
     )
 
 
-def _colours(texels: Texels, anatomy: Anatomy, outfit: Outfit, noise: Noise) -> Float[np.ndarray, "n 3"]:
+def _texel_colours(texels: Texels, anatomy: Anatomy, outfit: Outfit, noise: ValueNoise) -> Float[np.ndarray, "n 3"]:
     """The colour of the outermost layer at each texel."""
-    depths = layer_depths(texels.points_m, texels.limbs, anatomy, outfit)
+    depths = compute_layer_depths_m(texels.points_m, texels.arm_head_weights, anatomy, outfit)
     outermost = np.full(len(depths), SKIN_LAYER)
     for column in range(len(LAYERS)):
         outermost[depths[:, column] > 0] = column
-    outermost[texels.kinds != 0] = SKIN_LAYER
+    outermost[texels.labels != 0] = SKIN_LAYER
     colours = np.empty((len(depths), 3), dtype=np.float32)
     for column, layer in enumerate(LAYERS):
         rows = outermost == column
         colours[rows] = _PAINTERS[layer](texels.points_m[rows], depths[rows, column], anatomy, outfit, noise)
     rows = outermost == SKIN_LAYER
     colours[rows] = paint_skin(texels.points_m[rows], anatomy, outfit, noise)
-    rows = texels.kinds == EYE
+    rows = texels.labels == EYE
     colours[rows] = paint_eyes(texels.points_m[rows], anatomy, outfit)
-    colours[texels.kinds == TONGUE] = (0.55, 0.25, 0.25)
-    rows = texels.kinds == SKIRT
+    colours[texels.labels == TONGUE] = (0.55, 0.25, 0.25)
+    rows = texels.labels == SKIRT
     colours[rows] = _paint_skirt(texels.points_m[rows], anatomy, outfit, noise)
     return np.clip(colours, 0.0, 1.0)
 
@@ -91,14 +93,14 @@ def _shaded(base: tuple[float, float, float], brightness: Float[np.ndarray, "n"]
 
 
 def _paint_shirt(
-    points: np.ndarray, depth: np.ndarray, anatomy: Anatomy, outfit: Outfit, noise: Noise
+    points: np.ndarray, depth: np.ndarray, anatomy: Anatomy, outfit: Outfit, noise: ValueNoise
 ) -> Float[np.ndarray, "n 3"]:
     """Knitted cloth with two stripes at waist and sleeves, a ribbed collar, an emblem in front and a number behind."""
     hips, weave = anatomy.joints_m["Hips"], noise(points, 0.0022) * 0.05 + noise.fractal(points, 0.06) * 0.05
     colours = _shaded(outfit.shirt, 1.0 + weave)
-    above_hem = points[:, 1] - (hips[1] - outfit.shirt_drop_m)
+    above_hem = points[:, 1] - (hips[1] - outfit.shirt_below_hips_m)
     from_hem = np.where(np.abs(points[:, 0]) < anatomy.joints_m["LeftArm"][0], above_hem, depth)
-    below_collar = below_neckline(points, anatomy)
+    below_collar = neckline_depth_m(points, anatomy)
     striped = ((from_hem > 0.045) & (from_hem < 0.062)) | ((from_hem > 0.075) & (from_hem < 0.082))
     colours[striped] = _shaded(outfit.stripe, 1.0 + weave)[striped]
     at_collar = below_collar < 0.016
@@ -106,11 +108,11 @@ def _paint_shirt(
     seam = (np.abs(depth - 0.012) < 0.0012) & (below_collar > 0.05)
     colours[seam] *= 0.72
     for is_front in (True, False):
-        _stamp(colours, points, anatomy, outfit, is_front)
+        _project_print(colours, points, anatomy, outfit, is_front)
     return colours
 
 
-def _stamp(
+def _project_print(
     colours: Float[np.ndarray, "n 3"], points: np.ndarray, anatomy: Anatomy, outfit: Outfit, is_front: bool
 ) -> None:
     """Project the emblem onto the chest, or the number onto the back, along Z; writes into `colours`."""
@@ -135,12 +137,12 @@ def _emblem(outfit: Outfit, size_px: int = 768) -> Float[np.ndarray, "s s 4"]:
     angles = np.pi * (np.arange(10) / 5.0 - 0.5)
     radii = np.where(np.arange(10) % 2 == 0, 215, 88) * unit
     star = np.rint(np.stack([np.cos(angles), np.sin(angles)], 1) * radii[:, None] + centre).astype(np.int32)
-    place = (int(118 * unit), int(706 * unit))
+    text_origin_px = (int(118 * unit), int(706 * unit))
     for canvas, ring, inner, gold in ((art, colour, dark, _rgb(_GOLD)), (alpha, _OPAQUE, _OPAQUE, _OPAQUE)):
         cv2.circle(canvas, centre, int(262 * unit), ring, -1, cv2.LINE_AA)
         cv2.circle(canvas, centre, int(226 * unit), inner, -1, cv2.LINE_AA)
         cv2.fillPoly(canvas, [star], gold, cv2.LINE_AA)
-        cv2.putText(canvas, "NORTH " + outfit.print_text, place, cv2.FONT_HERSHEY_DUPLEX, 2.9 * unit, ring, 9)
+        cv2.putText(canvas, "NORTH " + outfit.print_text, text_origin_px, cv2.FONT_HERSHEY_DUPLEX, 2.9 * unit, ring, 9)
     return to_float(np.dstack([art, alpha]))
 
 
@@ -151,8 +153,8 @@ def _number(outfit: Outfit, size_px: int = 768) -> Float[np.ndarray, "s s 4"]:
     alpha = np.zeros((size_px, size_px), np.uint8)
     scale = 15.0 * size_px / 768
     (width, height), _ = cv2.getTextSize(outfit.print_text, cv2.FONT_HERSHEY_SIMPLEX, scale, 60)
-    place = ((size_px - width) // 2, (size_px + height) // 2)
-    cv2.putText(alpha, outfit.print_text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, _OPAQUE, 60, cv2.LINE_AA)
+    text_origin_px = ((size_px - width) // 2, (size_px + height) // 2)
+    cv2.putText(alpha, outfit.print_text, text_origin_px, cv2.FONT_HERSHEY_SIMPLEX, scale, _OPAQUE, 60, cv2.LINE_AA)
     return to_float(np.dstack([art, alpha]))
 
 
@@ -162,7 +164,7 @@ def _rgb(colour: tuple[float, ...]) -> list[float]:
 
 
 def _paint_trousers(
-    points: np.ndarray, depth: np.ndarray, anatomy: Anatomy, outfit: Outfit, noise: Noise
+    points: np.ndarray, depth: np.ndarray, anatomy: Anatomy, outfit: Outfit, noise: ValueNoise
 ) -> Float[np.ndarray, "n 3"]:
     """Twill with worn thighs, side seams, front pockets and a stitched hem."""
     joints = anatomy.joints_m
@@ -179,34 +181,34 @@ def _paint_trousers(
     return colours
 
 
-def _paint_skirt(points: np.ndarray, anatomy: Anatomy, outfit: Outfit, noise: Noise) -> Float[np.ndarray, "n 3"]:
+def _paint_skirt(points: np.ndarray, anatomy: Anatomy, outfit: Outfit, noise: ValueNoise) -> Float[np.ndarray, "n 3"]:
     """Checked wool: bands around and bands downwards, each half see-through, with two lines above the hem."""
     hips, weave = anatomy.joints_m["Hips"], noise(points, 0.0025) * 0.06 + noise.fractal(points, 0.08) * 0.06
     angle = np.arctan2(points[:, 2] - hips[2], points[:, 0] - hips[0])
     above_hem = points[:, 1] - waist_and_hem_m(anatomy)[1]
     colours = _shaded(outfit.skirt, 1.0 + weave)
     around, down = np.mod(above_hem + 0.02, 0.11) < 0.035, np.mod(angle / (2.0 * np.pi) * 16.0, 1.0) < 0.3
-    thin = (np.abs(np.mod(above_hem, 0.11) - 0.062) < 0.003) | (np.abs(above_hem - 0.012) < 0.004)
+    on_thin_line = (np.abs(np.mod(above_hem, 0.11) - 0.062) < 0.003) | (np.abs(above_hem - 0.012) < 0.004)
     ink = _shaded(outfit.check, 1.0 + weave)
-    share = 0.45 * around + 0.30 * down + 0.5 * thin
+    share = 0.45 * around + 0.30 * down + 0.5 * on_thin_line
     return colours + np.minimum(share, 0.9)[:, None] * (ink - colours)
 
 
 def _paint_shoes(
-    points: np.ndarray, depth: np.ndarray, anatomy: Anatomy, outfit: Outfit, noise: Noise
+    points: np.ndarray, depth: np.ndarray, anatomy: Anatomy, outfit: Outfit, noise: ValueNoise
 ) -> Float[np.ndarray, "n 3"]:
     """Canvas shoes with a light sole and toe cap, and laces."""
     foot, toes = anatomy.joints_m["LeftFoot"], anatomy.joints_m["LeftToeBase"]
     colours = _shaded(outfit.shoes, 1.0 + noise(points, 0.004) * 0.10)
     on_tongue = (points[:, 2] > foot[2] + 0.05) & (points[:, 2] < toes[2] - 0.01) & (points[:, 1] > 0.045)
     laced = on_tongue & (np.abs(np.abs(points[:, 0]) - foot[0]) < 0.022) & (np.mod(points[:, 2], 0.018) < 0.007)
-    light = (points[:, 1] < 0.020) | (points[:, 2] > toes[2] + 0.045) | laced
-    colours[light] = np.array([0.90, 0.89, 0.86]) * (1.0 + noise(points, 0.02)[light, None] * 0.04)
+    is_light_part = (points[:, 1] < 0.020) | (points[:, 2] > toes[2] + 0.045) | laced
+    colours[is_light_part] = np.array([0.90, 0.89, 0.86]) * (1.0 + noise(points, 0.02)[is_light_part, None] * 0.04)
     return colours
 
 
 def _paint_hair(
-    points: np.ndarray, depth: np.ndarray, anatomy: Anatomy, outfit: Outfit, noise: Noise
+    points: np.ndarray, depth: np.ndarray, anatomy: Anatomy, outfit: Outfit, noise: ValueNoise
 ) -> Float[np.ndarray, "n 3"]:
     """Strands that run from the crown down and back."""
     strands = noise(points, (0.0028, 0.03, 0.03)) * 0.34 + noise(points + 5.0, (0.009, 0.05, 0.05)) * 0.28

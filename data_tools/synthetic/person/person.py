@@ -4,16 +4,16 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from data_tools.synthetic.person.anatomy import measure
-from data_tools.synthetic.person.dressing import dress
-from data_tools.synthetic.person.noise import Noise
+from data_tools.synthetic.person.anatomy import measure_anatomy
+from data_tools.synthetic.person.dressing import add_clothing
+from data_tools.synthetic.person.noise import ValueNoise
 from data_tools.synthetic.person.outfit import choose_outfit
 from data_tools.synthetic.person.painting import paint_texture
 from data_tools.synthetic.rig.subject import Subject
 from pipeline.body.body import AnnyBody, Body, load_anny
 from pipeline.io.image import to_uint8
 
-_BUILD = {
+_PHENOTYPES = {
     "gender": (0.12, 0.5),
     "height": (0.40, 0.15),
     "muscle": (0.55, 0.2),
@@ -26,19 +26,19 @@ _BUILD = {
 
 def make_person(seed: int, texture_px: int = 2048, legwear: str = "trousers") -> tuple[Subject, Body]:
     """The person of a seed: dressed and painted, and the bare body beneath. The same seed gives the same arrays."""
-    model, noise, outfit = load_anny(), Noise(seed), choose_outfit(seed, legwear)
+    model, noise, outfit = load_anny(), ValueNoise(seed), choose_outfit(seed, legwear)
     bare = model.body(_shape(model, seed))
-    anatomy = measure(model, bare)
-    dressed = dress(model, bare, anatomy, outfit, noise)
-    texture = to_uint8(paint_texture(dressed, anatomy, outfit, noise, texture_px))
-    return Subject(dressed.body, dressed.uv, dressed.faces_uv, texture), bare
+    anatomy = measure_anatomy(model, bare)
+    clothed = add_clothing(model, bare, anatomy, outfit, noise)
+    texture = to_uint8(paint_texture(clothed, anatomy, outfit, noise, texture_px))
+    return Subject(clothed.body, clothed.uv, clothed.faces_uv, texture), bare
 
 
 def _shape(model: AnnyBody, seed: int) -> Float[Tensor, "p"]:
     """Shape parameters; seed 0 is a man of average build, other seeds spread around him."""
     shape = model.shape_defaults.clone()
     random = np.random.default_rng([seed, 1])
-    for name, (middle, spread) in _BUILD.items():
+    for name, (middle, spread) in _PHENOTYPES.items():
         offset = spread * random.uniform(-1.0, 1.0) if seed else 0.0
         shape[model.shape_names.index(name)] = float(np.clip(middle + offset, 0.0, 1.0))
     return shape

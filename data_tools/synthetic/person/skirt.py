@@ -13,34 +13,34 @@ from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull
 
 from data_tools.synthetic.person.anatomy import Anatomy
-from data_tools.synthetic.person.noise import Noise
-from data_tools.synthetic.person.surface import way_out_m
+from data_tools.synthetic.person.noise import ValueNoise
+from data_tools.synthetic.person.surface import hull_exit_distance_m
 from pipeline.body.body import Body
 
 ROWS, COLUMNS = 40, 192
-PLEATS = 14
+N_PLEATS = 14
 THICKNESS_M = 0.004
 EASE_M = 0.006
 """Between the cloth and what is worn beneath it, at the waist."""
 
-FLARE_M = 0.07
+HEM_FLARE_M = 0.07
 """How much farther out the hem is than cloth that falls straight."""
 
-PLEAT_M = 0.028
+PLEAT_DEPTH_M = 0.028
 """Depth of the pleats at the hem."""
 
-ATLAS_SHARE = 0.25
+ATLAS_HEIGHT_FRACTION = 0.25
 """Share of the texture's height that the sheet takes, at its top."""
 
 _ATLAS_MARGIN = 0.004
-_ARM_WEIGHT = 0.02
-_SLICE_M = 0.03
-_REACH_M = (0.02, 0.06)
+_MAX_ARM_WEIGHT = 0.02
+_SLICE_HALF_HEIGHT_M = 0.03
+_WEIGHT_SIGMA_M = (0.02, 0.06)
 """Over these distances a place of the sheet averages the skin weights of the body, at the waist and at the hem."""
 
 
 @dataclass(frozen=True)
-class Sheet:
+class SkirtMesh:
     """A closed surface with its place in the atlas; rows of `faces_uv` belong to those of `faces`."""
 
     vertices: Float[np.ndarray, "v 3"]
@@ -50,26 +50,26 @@ class Sheet:
     skin_weights: Float[np.ndarray, "v j"]
 
 
-def hang_skirt(body: Body, arms: Float[np.ndarray, "v"], anatomy: Anatomy, noise: Noise) -> Sheet:
+def build_skirt(body: Body, arms: Float[np.ndarray, "v"], anatomy: Anatomy, noise: ValueNoise) -> SkirtMesh:
     """Fit a skirt around a person in the A-pose, over the shirt.
 
     arms: how much each vertex belongs to an arm, in [0, 1]; the skirt passes below hands.
     """
-    fall = np.linspace(0.0, 1.0, ROWS)
-    trunk = arms < _ARM_WEIGHT
-    outside = _outside_m(body.vertices[trunk], fall, anatomy, noise)
-    axis = _axis_m(outside[:, 0, 1], anatomy)[:, None]
-    inwards = axis - outside
-    inside = outside + THICKNESS_M * inwards / np.linalg.norm(inwards, axis=2, keepdims=True)
-    vertices = np.concatenate([outside, inside[::-1]]).reshape(-1, 3).astype(np.float32)
-    shared = _shared_weights(body, trunk, outside, fall)
+    waist_to_hem = np.linspace(0.0, 1.0, ROWS)
+    trunk = arms < _MAX_ARM_WEIGHT
+    outer_surface = _outer_surface_m(body.vertices[trunk], waist_to_hem, anatomy, noise)
+    axis = _axis_m(outer_surface[:, 0, 1], anatomy)[:, None]
+    inwards = axis - outer_surface
+    inside = outer_surface + THICKNESS_M * inwards / np.linalg.norm(inwards, axis=2, keepdims=True)
+    vertices = np.concatenate([outer_surface, inside[::-1]]).reshape(-1, 3).astype(np.float32)
+    shared = _average_skin_weights(body, trunk, outer_surface, waist_to_hem)
     weights = np.concatenate([shared, shared[::-1]]).reshape(-1, shared.shape[2])
     profile, column = np.divmod(np.arange((2 * ROWS + 1) * (COLUMNS + 1)), COLUMNS + 1)
     across = _ATLAS_MARGIN + (1.0 - 2.0 * _ATLAS_MARGIN) * column / COLUMNS
-    height = 1.0 - _ATLAS_MARGIN - (ATLAS_SHARE - 2.0 * _ATLAS_MARGIN) * profile / (2 * ROWS)
+    height = 1.0 - _ATLAS_MARGIN - (ATLAS_HEIGHT_FRACTION - 2.0 * _ATLAS_MARGIN) * profile / (2 * ROWS)
     faces_uv = _quads(2 * ROWS, COLUMNS, lambda row, col: row * (COLUMNS + 1) + col)
     faces = _quads(2 * ROWS, COLUMNS, lambda row, col: row % (2 * ROWS) * COLUMNS + col % COLUMNS)
-    return Sheet(vertices, faces, np.stack([across, height], axis=1).astype(np.float32), faces_uv, weights)
+    return SkirtMesh(vertices, faces, np.stack([across, height], axis=1).astype(np.float32), faces_uv, weights)
 
 
 def waist_and_hem_m(anatomy: Anatomy) -> tuple[float, float]:
@@ -77,21 +77,21 @@ def waist_and_hem_m(anatomy: Anatomy) -> tuple[float, float]:
     return float(anatomy.joints_m["Hips"][1]) + 0.07, float(anatomy.joints_m["LeftLeg"][1]) + 0.05
 
 
-def _outside_m(
-    trunk_m: Float[np.ndarray, "n 3"], fall: Float[np.ndarray, "r"], anatomy: Anatomy, noise: Noise
+def _outer_surface_m(
+    trunk_m: Float[np.ndarray, "n 3"], waist_to_hem: Float[np.ndarray, "r"], anatomy: Anatomy, noise: ValueNoise
 ) -> Float[np.ndarray, "r c 3"]:
     """Places of the outer side: from the waist (fall 0) to the hem (fall 1), round from +X by +Z."""
     top, hem = waist_and_hem_m(anatomy)
-    height = top + (hem - top) * fall
+    height = top + (hem - top) * waist_to_hem
     axis = _axis_m(height, anatomy)
     angle = 2.0 * np.pi * np.arange(COLUMNS) / COLUMNS
     outwards = np.stack([np.cos(angle), np.zeros(COLUMNS), np.sin(angle)], axis=1)
-    body = np.stack([_hull_radius(trunk_m, middle, outwards) for middle in axis])
-    radius = np.maximum.accumulate(body) + EASE_M + FLARE_M * fall[:, None]
-    ring = np.broadcast_to(outwards, (ROWS, COLUMNS, 3)) * 0.3 + np.array([0.0, 0.2, 0.0]) * fall[:, None, None]
-    drift = noise(ring.reshape(-1, 3).astype(np.float32), 0.11, order=3).reshape(ROWS, COLUMNS)
-    pleats = 0.5 + 0.5 * np.cos(PLEATS * angle + 1.2 * drift)
-    radius += fall[:, None] ** 1.3 * (PLEAT_M * pleats + 0.010 * (1.0 + drift))
+    body = np.stack([_hull_radius_m(trunk_m, middle, outwards) for middle in axis])
+    radius = np.maximum.accumulate(body) + EASE_M + HEM_FLARE_M * waist_to_hem[:, None]
+    ring = np.broadcast_to(outwards, (ROWS, COLUMNS, 3)) * 0.3 + np.array([0.0, 0.2, 0.0]) * waist_to_hem[:, None, None]
+    pleat_phase_noise = noise(ring.reshape(-1, 3).astype(np.float32), 0.11, order=3).reshape(ROWS, COLUMNS)
+    pleats = 0.5 + 0.5 * np.cos(N_PLEATS * angle + 1.2 * pleat_phase_noise)
+    radius += waist_to_hem[:, None] ** 1.3 * (PLEAT_DEPTH_M * pleats + 0.010 * (1.0 + pleat_phase_noise))
     return axis[:, None] + radius[:, :, None] * outwards
 
 
@@ -103,37 +103,37 @@ def _axis_m(height_m: Float[np.ndarray, "r"], anatomy: Anatomy) -> Float[np.ndar
     return np.stack([middle_x, height_m, middle_z], axis=1)
 
 
-def _hull_radius(
+def _hull_radius_m(
     points_m: Float[np.ndarray, "n 3"], middle_m: Float[np.ndarray, "3"], outwards: Float[np.ndarray, "c 3"]
 ) -> Float[np.ndarray, "c"]:
     """Where horizontal rays from the middle leave the convex hull of the body near that height."""
-    near = np.abs(points_m[:, 1] - middle_m[1]) < _SLICE_M
+    near = np.abs(points_m[:, 1] - middle_m[1]) < _SLICE_HALF_HEIGHT_M
     hull = ConvexHull(points_m[near][:, [0, 2]] - middle_m[[0, 2]]).equations
-    return way_out_m(np.zeros((1, 2)), outwards[:, [0, 2]], hull)
+    return hull_exit_distance_m(np.zeros((1, 2)), outwards[:, [0, 2]], hull)
 
 
-def _shared_weights(
-    body: Body, trunk: np.ndarray, outside_m: Float[np.ndarray, "r c 3"], fall: Float[np.ndarray, "r"]
+def _average_skin_weights(
+    body: Body, trunk: np.ndarray, outside_m: Float[np.ndarray, "r c 3"], waist_to_hem: Float[np.ndarray, "r"]
 ) -> Float[np.ndarray, "r c j"]:
     """Means of the body's skin weights around each place, the wider the lower: between the legs both count.
 
     What moves a lower leg counts for the thigh: cloth above the knee does not follow the calf.
     """
     joints = [body.joint(name) for name in ("Hips", "Spine", "LeftUpLeg", "RightUpLeg")]
-    carried = body.skin_weights[:, joints].astype(np.float64)
-    carried[:, 0] = 1.0 - carried[:, 1:].sum(axis=1)
+    body_weights = body.skin_weights[:, joints].astype(np.float64)
+    body_weights[:, 0] = 1.0 - body_weights[:, 1:].sum(axis=1)
     for column, side in ((2, "Left"), (3, "Right")):
         lower = body.skin_weights[:, body.joint(f"{side}Leg")]
-        carried[:, [0, column]] += lower[:, None] * [-1.0, 1.0]
+        body_weights[:, [0, column]] += lower[:, None] * [-1.0, 1.0]
     height = outside_m[:, 0, 1]
     near = trunk & (body.vertices[:, 1] > height[-1] - 0.1) & (body.vertices[:, 1] < height[0] + 0.1)
-    places, carried = body.vertices[near].astype(np.float64), carried[near]
+    places, body_weights = body.vertices[near].astype(np.float64), body_weights[near]
     weights = np.zeros((*outside_m.shape[:2], len(body.joint_names)), dtype=np.float32)
-    for row, reach in enumerate(_REACH_M[0] + (_REACH_M[1] - _REACH_M[0]) * fall):
-        square = ((outside_m[row][:, None] - places) ** 2).sum(axis=2)
-        kernel = np.exp(-0.5 * (square - square.min(axis=1, keepdims=True)) / reach**2)
+    for row, sigma_m in enumerate(_WEIGHT_SIGMA_M[0] + (_WEIGHT_SIGMA_M[1] - _WEIGHT_SIGMA_M[0]) * waist_to_hem):
+        squared_distance_m2 = ((outside_m[row][:, None] - places) ** 2).sum(axis=2)
+        kernel = np.exp(-0.5 * (squared_distance_m2 - squared_distance_m2.min(axis=1, keepdims=True)) / sigma_m**2)
         kernel /= kernel.sum(axis=1, keepdims=True)
-        for joint, values in zip(joints, carried.T, strict=True):
+        for joint, values in zip(joints, body_weights.T, strict=True):
             weights[row, :, joint] = (kernel * values).sum(axis=1)
     return weights
 

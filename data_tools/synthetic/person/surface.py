@@ -4,11 +4,11 @@ import numpy as np
 import scipy.sparse as sparse
 from jaxtyping import Float, Int
 
-_PARALLEL = 1e-9
+_PARALLEL_EPS = 1e-9
 """A ray that nears a plane more slowly than this never meets it."""
 
 
-def split_at_midpoints(
+def subdivide_at_midpoints(
     faces: Int[np.ndarray, "f 3"], vertex_count: int
 ) -> tuple[Int[np.ndarray, "m 2"], Int[np.ndarray, "g 3"]]:
     """Cut every triangle into four.
@@ -25,42 +25,44 @@ def split_at_midpoints(
     return pairs, children.transpose(2, 0, 1).reshape(-1, 3)
 
 
-def with_midpoints(values: Float[np.ndarray, "v c"], pairs: Int[np.ndarray, "m 2"]) -> Float[np.ndarray, "w c"]:
+def append_midpoint_values(values: Float[np.ndarray, "v c"], pairs: Int[np.ndarray, "m 2"]) -> Float[np.ndarray, "w c"]:
     """Per-vertex values followed by those of the midpoints."""
     return np.concatenate([values, values[pairs].mean(axis=1, dtype=values.dtype)])
 
 
-def neighbour_mean(faces: Int[np.ndarray, "f 3"], vertex_count: int) -> sparse.csr_matrix:
+def neighbour_averaging_matrix(faces: Int[np.ndarray, "f 3"], vertex_count: int) -> sparse.csr_matrix:
     """Row-stochastic matrix that takes each vertex to the mean of its neighbours (itself where it has none)."""
     pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     pairs = np.concatenate([pairs, pairs[:, ::-1]])
-    links = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(vertex_count, vertex_count)).tocsr()
-    links.data[:] = 1.0
-    alone = np.asarray(links.sum(axis=1)).ravel() == 0
-    links = links + sparse.diags(alone.astype(float))
-    return sparse.diags(1.0 / np.asarray(links.sum(axis=1)).ravel()) @ links
+    adjacency = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(vertex_count, vertex_count)).tocsr()
+    adjacency.data[:] = 1.0
+    is_isolated = np.asarray(adjacency.sum(axis=1)).ravel() == 0
+    adjacency = adjacency + sparse.diags(is_isolated.astype(float))
+    return sparse.diags(1.0 / np.asarray(adjacency.sum(axis=1)).ravel()) @ adjacency
 
 
-def smoothed(vertices: Float[np.ndarray, "v 3"], mean: sparse.csr_matrix, rounds: int) -> Float[np.ndarray, "v 3"]:
+def smooth_laplacian(
+    vertices: Float[np.ndarray, "v 3"], mean: sparse.csr_matrix, iterations: int
+) -> Float[np.ndarray, "v 3"]:
     """Uniform Laplacian smoothing with half steps, which spans hollows as cloth does."""
     result = vertices.astype(np.float64)
-    for _ in range(rounds):
+    for _ in range(iterations):
         result = 0.5 * (result + mean @ result)
     return result.astype(vertices.dtype)
 
 
-def face_parts(faces: Int[np.ndarray, "f 3"], vertex_count: int) -> Int[np.ndarray, "f"]:
+def face_components(faces: Int[np.ndarray, "f 3"], vertex_count: int) -> Int[np.ndarray, "f"]:
     """Connected part of each face, numbered by falling face count."""
     pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
     graph = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(vertex_count, vertex_count))
-    part = sparse.csgraph.connected_components(graph, directed=False)[1][faces[:, 0]]
-    by_size = np.argsort(-np.bincount(part), kind="stable")
+    component = sparse.csgraph.connected_components(graph, directed=False)[1][faces[:, 0]]
+    by_size = np.argsort(-np.bincount(component), kind="stable")
     rank = np.empty_like(by_size)
     rank[by_size] = np.arange(len(by_size))
-    return rank[part].astype(np.int32)
+    return rank[component].astype(np.int32)
 
 
-def way_out_m(
+def hull_exit_distance_m(
     starts_m: Float[np.ndarray, "#n d"],
     directions: Float[np.ndarray, "n d"],
     half_spaces: Float[np.ndarray, "h e"],
@@ -73,5 +75,5 @@ def way_out_m(
     """
     normals, offsets_m = half_spaces[:, :-1].T, half_spaces[:, -1]
     slope = directions @ normals
-    room_m = margin_m - (starts_m @ normals + offsets_m)
-    return np.where(slope > _PARALLEL, room_m / np.maximum(slope, _PARALLEL), np.inf).min(axis=1)
+    plane_distance_m = margin_m - (starts_m @ normals + offsets_m)
+    return np.where(slope > _PARALLEL_EPS, plane_distance_m / np.maximum(slope, _PARALLEL_EPS), np.inf).min(axis=1)

@@ -13,9 +13,9 @@ from jaxtyping import Float, Int, UInt8
 
 from pipeline.core.errors import UserError
 
-_COMPONENT = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_WIDTH = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-_HARMLESS = {"KHR_mesh_quantization", "KHR_materials_unlit"}
+_COMPONENT_DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_N_COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+_SUPPORTED_EXTENSIONS = {"KHR_mesh_quantization", "KHR_materials_unlit"}
 _JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 
 
@@ -32,7 +32,7 @@ class Primitive:
     material: int
 
 
-class Glb:
+class GlbFile:
     """A .glb file: its JSON tree and its binary chunk."""
 
     def __init__(self, path: Path) -> None:
@@ -47,12 +47,12 @@ class Glb:
             chunks[kind] = data[offset + 8 : offset + 8 + length]
             offset += 8 + length
         try:
-            self.tree: dict[str, Any] = json.loads(chunks[_JSON_CHUNK])
-            needed = set(self.tree.get("extensionsRequired", ())) - _HARMLESS
+            self.gltf: dict[str, Any] = json.loads(chunks[_JSON_CHUNK])
+            unsupported = set(self.gltf.get("extensionsRequired", ())) - _SUPPORTED_EXTENSIONS
         except (KeyError, ValueError, AttributeError):
             raise UserError(f"{path} is damaged: its JSON cannot be read; export it again") from None
-        if needed:
-            raise UserError(f"{path} needs {', '.join(sorted(needed))}; export it again without (no compression)")
+        if unsupported:
+            raise UserError(f"{path} needs {', '.join(sorted(unsupported))}; export it again without (no compression)")
         self._binary = chunks.get(_BINARY_CHUNK, b"")
 
     def accessor(self, index: int) -> np.ndarray:
@@ -62,11 +62,11 @@ class Glb:
             UserError: they are stored sparsely, or not in the file.
         """
         try:
-            accessor = self.tree["accessors"][index]
+            accessor = self.gltf["accessors"][index]
             if "sparse" in accessor:
                 raise UserError(f"{self.path} stores values sparsely; export it again without (no sparse accessors)")
-            view = self.tree["bufferViews"][accessor["bufferView"]]
-            kind, width = np.dtype(_COMPONENT[accessor["componentType"]]), _WIDTH[accessor["type"]]
+            view = self.gltf["bufferViews"][accessor["bufferView"]]
+            kind, width = np.dtype(_COMPONENT_DTYPES[accessor["componentType"]]), _N_COMPONENTS[accessor["type"]]
             start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
             stride = view.get("byteStride", kind.itemsize * width)
             shape, strides = (accessor["count"], width), (stride, kind.itemsize)
@@ -79,7 +79,7 @@ class Glb:
 
     def node_to_world(self) -> Float[np.ndarray, "n 4 4"]:
         """Rest-pose matrix of every node."""
-        nodes = self.tree["nodes"]
+        nodes = self.gltf["nodes"]
         world = np.tile(np.eye(4), (len(nodes), 1, 1))
         is_child = {child for node in nodes for child in node.get("children", ())}
         pending = [(index, np.eye(4)) for index in range(len(nodes)) if index not in is_child]
@@ -97,9 +97,9 @@ class Glb:
         """
         found = [
             self._primitive(primitive, node["skin"])
-            for node in self.tree.get("nodes", ())
+            for node in self.gltf.get("nodes", ())
             if "mesh" in node and "skin" in node
-            for primitive in self.tree["meshes"][node["mesh"]]["primitives"]
+            for primitive in self.gltf["meshes"][node["mesh"]]["primitives"]
             if primitive.get("mode", 4) == 4 and "JOINTS_0" in primitive["attributes"]
         ]
         if not found:
@@ -108,14 +108,14 @@ class Glb:
 
     def base_colour(self, material: int) -> UInt8[np.ndarray, "h w 3"]:
         """A material's base colour picture, times its factor; 8 x 8 texels when it has no picture."""
-        surface = self.tree["materials"][material].get("pbrMetallicRoughness", {}) if material >= 0 else {}
+        surface = self.gltf["materials"][material].get("pbrMetallicRoughness", {}) if material >= 0 else {}
         factor = np.asarray(surface.get("baseColorFactor", [1.0] * 4)[:3])
         if "baseColorTexture" not in surface:
             return np.tile(np.rint(255 * factor).astype(np.uint8), (8, 8, 1))
-        texture = self.tree["textures"][surface["baseColorTexture"]["index"]]
+        texture = self.gltf["textures"][surface["baseColorTexture"]["index"]]
         if "source" not in texture:
             raise UserError(f"{self.path} holds a picture that is neither PNG nor JPEG; save it as one of them")
-        return np.rint(self._picture(texture["source"]) * factor).astype(np.uint8)
+        return np.rint(self._decode_image(texture["source"]) * factor).astype(np.uint8)
 
     def _primitive(self, primitive: dict[str, Any], skin: int) -> Primitive:
         names = primitive["attributes"]
@@ -133,11 +133,11 @@ class Glb:
             primitive.get("material", -1),
         )
 
-    def _picture(self, index: int) -> UInt8[np.ndarray, "h w 3"]:
-        image = self.tree["images"][index]
+    def _decode_image(self, index: int) -> UInt8[np.ndarray, "h w 3"]:
+        image = self.gltf["images"][index]
         if "bufferView" not in image:
             raise UserError(f"{self.path} keeps its pictures in other files; export it with pictures inside")
-        view = self.tree["bufferViews"][image["bufferView"]]
+        view = self.gltf["bufferViews"][image["bufferView"]]
         start = view.get("byteOffset", 0)
         data = np.frombuffer(io.BytesIO(self._binary[start : start + view["byteLength"]]).getbuffer(), np.uint8)
         pixels = cv2.imdecode(data, cv2.IMREAD_COLOR)

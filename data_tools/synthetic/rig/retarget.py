@@ -10,14 +10,14 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from data_tools.synthetic.rig.bvh import Recording
+from data_tools.synthetic.rig.bvh import BvhMotion
 from data_tools.synthetic.rig.directions import shortest_arc
-from data_tools.synthetic.scene.motion import above_rest_m
+from data_tools.synthetic.scene.motion import lowest_foot_offset_m
 from pipeline.body.body import Body, Motion
 from pipeline.core.errors import UserError
 from pipeline.geometry.rotation import matrix_to_quaternion
 
-_ALIASES: dict[str, tuple[str, ...]] = {
+_JOINT_ALIASES: dict[str, tuple[str, ...]] = {
     "Spine": ("lowerback", "Chest"),
     "Spine1": ("Chest",),
     "Spine2": ("Chest2", "Spine3"),
@@ -32,7 +32,7 @@ _ALIASES: dict[str, tuple[str, ...]] = {
 }
 """Other names of joints. A name counts only where Mixamo's own name of the limb is absent."""
 
-_CHILD: dict[str, str] = {
+_BONE_CHILD: dict[str, str] = {
     "{side}Arm": "{side}ForeArm",
     "{side}ForeArm": "{side}Hand",
     "{side}UpLeg": "{side}Leg",
@@ -42,10 +42,20 @@ _CHILD: dict[str, str] = {
 """Where a limb's bone ends. Skeletons place spine, collar and foot joints differently, so that the direction of those
 bones means nothing across them: their S is the identity (a hand's that of the forearm)."""
 
-_NEEDED = ("Hips", "Head", "LeftArm", "RightArm", "LeftForeArm", "RightForeArm", "LeftUpLeg", "RightUpLeg", "LeftLeg")
+_REQUIRED_JOINTS = (
+    "Hips",
+    "Head",
+    "LeftArm",
+    "RightArm",
+    "LeftForeArm",
+    "RightForeArm",
+    "LeftUpLeg",
+    "RightUpLeg",
+    "LeftLeg",
+)
 
 
-def retarget(recording: Recording, body: Body, ground_m: Float[np.ndarray, "3"], in_place: bool) -> Motion:
+def retarget(bvh_motion: BvhMotion, body: Body, ground_m: Float[np.ndarray, "3"], in_place: bool) -> Motion:
     """The recorded motion on another body, facing +Z in its first frame.
 
     It stands on the ground in most frames, leaves it in jumps, and is lifted where a foot would sink in.
@@ -56,49 +66,51 @@ def retarget(recording: Recording, body: Body, ground_m: Float[np.ndarray, "3"],
     Raises:
         UserError: the recording lacks a limb.
     """
-    source = matched_joints(recording, body)
-    world, positions = recording.poses(recording.rotations)
-    reference = _reference_pose(recording, body, source, world, positions)
-    motion_to_world = _basis(positions, source).mean(axis=0)
-    motion_to_world = _upright(motion_to_world, _basis(positions[:1], source)[0])
-    rotations = carried_rotations(body, source, world, reference, motion_to_world)
-    local = local_rotations(rotations, body.parents)
-    root = _root_path(recording, body, source, motion_to_world, ground_m, in_place)
+    recorded_joint_of = match_joints(bvh_motion, body)
+    world, positions = bvh_motion.forward_kinematics(bvh_motion.rotations)
+    reference = _reference_pose(bvh_motion, body, recorded_joint_of, world, positions)
+    bvh_to_world = _body_axes(positions, recorded_joint_of).mean(axis=0)
+    bvh_to_world = _bvh_to_world(bvh_to_world, _body_axes(positions[:1], recorded_joint_of)[0])
+    rotations = retarget_rotations(body, recorded_joint_of, world, reference, bvh_to_world)
+    local = local_quaternions(rotations, body.parents)
+    root = _root_trajectory(bvh_motion, body, recorded_joint_of, bvh_to_world, ground_m, in_place)
     count = len(local)
     motion = Motion(
         np.arange(count, dtype=np.int32),
-        np.arange(count) / recording.fps,
+        np.arange(count) / bvh_motion.fps,
         local,
         root.astype(np.float32),
     )
-    lowest_m = above_rest_m(body, motion)
-    standing_m = float(np.percentile(lowest_m, 30.0))
-    root[:, 1] += ground_m[1] - standing_m + np.maximum(standing_m - lowest_m, 0.0)
+    lowest_foot_height_m = lowest_foot_offset_m(body, motion)
+    standing_height_m = float(np.percentile(lowest_foot_height_m, 30.0))
+    root[:, 1] += ground_m[1] - standing_height_m + np.maximum(standing_height_m - lowest_foot_height_m, 0.0)
     return motion.with_pose(motion.rotations_wxyz, root)
 
 
-def matched_joints(recording: Recording, body: Body) -> dict[str, int]:
+def match_joints(bvh_motion: BvhMotion, body: Body) -> dict[str, int]:
     """Recorded joint for each of the body's joints that has one.
 
     Raises:
         UserError: a limb is missing.
     """
-    index_of = {name.split(":")[-1].lower(): joint for joint, name in enumerate(recording.joint_names)}
+    index_of = {name.split(":")[-1].lower(): joint for joint, name in enumerate(bvh_motion.joint_names)}
     found: dict[str, int] = {}
     is_mixamo = "leftupleg" in index_of
-    aliases = {name: other for side in ("Left", "Right", "") for name, other in _sided(_ALIASES, side).items()}
+    aliases = {
+        name: other for side in ("Left", "Right", "") for name, other in _expand_side(_JOINT_ALIASES, side).items()
+    }
     for name in body.joint_names:
         candidates = (name,) if is_mixamo else (*aliases.get(name, ()), *(() if name in aliases else (name,)))
         matches = [index_of[candidate.lower()] for candidate in candidates if candidate.lower() in index_of]
         if matches:
             found[name] = matches[0]
-    missing = [name for name in _NEEDED if name not in found]
+    missing = [name for name in _REQUIRED_JOINTS if name not in found]
     if missing:
         raise UserError(f"the motion has no joint for {missing[0]}; rename its joints to Mixamo's or CMU's names")
     return found
 
 
-def resampled(motion: Motion, start_s: float, frame_count: int, fps: float) -> Motion:
+def resample_motion(motion: Motion, start_s: float, frame_count: int, fps: float) -> Motion:
     """The nearest recorded pose at each of `frame_count` times from `start_s` on.
 
     Raises:
@@ -119,31 +131,39 @@ def resampled(motion: Motion, start_s: float, frame_count: int, fps: float) -> M
     )
 
 
-def _sided(table: dict[str, tuple[str, ...]], side: str) -> dict[str, tuple[str, ...]]:
+def _expand_side(table: dict[str, tuple[str, ...]], side: str) -> dict[str, tuple[str, ...]]:
     """The rows of one side, or those without a side."""
     rows = {name: others for name, others in table.items() if ("{side}" in name) == bool(side)}
     return {name.format(side=side): tuple(o.format(side=side) for o in others) for name, others in rows.items()}
 
 
-def _bones(names: tuple[str, ...], source: dict[str, int]) -> dict[str, str]:
+def _common_bones(names: tuple[str, ...], recorded_joint_of: dict[str, int]) -> dict[str, str]:
     """Child of each joint whose bone both skeletons have."""
     bones = {
-        name.format(side=side): child.format(side=side) for name, child in _CHILD.items() for side in ("Left", "Right")
+        name.format(side=side): child.format(side=side)
+        for name, child in _BONE_CHILD.items()
+        for side in ("Left", "Right")
     }
-    return {n: c for n, c in bones.items() if n in source and c in source and n in names and c in names}
+    return {
+        n: c
+        for n, c in bones.items()
+        if n in recorded_joint_of and c in recorded_joint_of and n in names and c in names
+    }
 
 
-def _basis(positions: Float[np.ndarray, "k j 3"], source: dict[str, int]) -> Float[np.ndarray, "k 3 3"]:
+def _body_axes(positions: Float[np.ndarray, "k j 3"], recorded_joint_of: dict[str, int]) -> Float[np.ndarray, "k 3 3"]:
     """Rows: the person's left, up and front, in the recording's axes."""
-    up = positions[:, source["Head"]] - 0.5 * (positions[:, source["LeftUpLeg"]] + positions[:, source["RightUpLeg"]])
+    up = positions[:, recorded_joint_of["Head"]] - 0.5 * (
+        positions[:, recorded_joint_of["LeftUpLeg"]] + positions[:, recorded_joint_of["RightUpLeg"]]
+    )
     up /= np.linalg.norm(up, axis=1, keepdims=True)
-    left = positions[:, source["LeftUpLeg"]] - positions[:, source["RightUpLeg"]]
+    left = positions[:, recorded_joint_of["LeftUpLeg"]] - positions[:, recorded_joint_of["RightUpLeg"]]
     left -= (left * up).sum(axis=1, keepdims=True) * up
     left /= np.linalg.norm(left, axis=1, keepdims=True)
     return np.stack([left, up, np.cross(left, up)], axis=1)
 
 
-def _upright(mean_basis: Float[np.ndarray, "3 3"], first: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+def _bvh_to_world(mean_basis: Float[np.ndarray, "3 3"], first: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
     """W: the recording's axis that is up on average becomes +Y, the first frame's front +Z."""
     up = np.zeros(3)
     axis = int(np.abs(mean_basis[1]).argmax())
@@ -154,26 +174,29 @@ def _upright(mean_basis: Float[np.ndarray, "3 3"], first: Float[np.ndarray, "3 3
 
 
 def _reference_pose(
-    recording: Recording, body: Body, source: dict[str, int], world: np.ndarray, positions: np.ndarray
+    bvh_motion: BvhMotion, body: Body, recorded_joint_of: dict[str, int], world: np.ndarray, positions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """World rotations (j, 3, 3) and canonical bone directions' positions (j, 3) of the pose most like the A-pose.
 
     Looked at: the file's own rest pose and every tenth frame.
     """
-    rest_world, rest_positions = recording.poses(np.tile(np.eye(3), (1, len(recording.parents), 1, 1)))
-    worlds, places = np.concatenate([rest_world, world[::10]]), np.concatenate([rest_positions, positions[::10]])
-    to_canonical = _basis(places, source)
-    places = np.einsum("kab,kjb->kja", to_canonical, places)
-    likeness = np.zeros(len(places))
-    for name, child in _bones(body.joint_names, source).items():
+    rest_world, rest_positions = bvh_motion.forward_kinematics(np.tile(np.eye(3), (1, len(bvh_motion.parents), 1, 1)))
+    worlds, canonical_positions = (
+        np.concatenate([rest_world, world[::10]]),
+        np.concatenate([rest_positions, positions[::10]]),
+    )
+    to_canonical = _body_axes(canonical_positions, recorded_joint_of)
+    canonical_positions = np.einsum("kab,kjb->kja", to_canonical, canonical_positions)
+    pose_similarity = np.zeros(len(canonical_positions))
+    for name, child in _common_bones(body.joint_names, recorded_joint_of).items():
         bone = body.joints_m[body.joint(child)] - body.joints_m[body.joint(name)]
-        recorded = places[:, source[child]] - places[:, source[name]]
-        likeness += recorded @ bone / np.maximum(np.linalg.norm(recorded, axis=1) * np.linalg.norm(bone), 1e-9)
-    best = int(np.nan_to_num(likeness, nan=-np.inf).argmax())
-    return worlds[best].transpose(0, 2, 1) @ to_canonical[best].T, places[best]
+        recorded = canonical_positions[:, recorded_joint_of[child]] - canonical_positions[:, recorded_joint_of[name]]
+        pose_similarity += recorded @ bone / np.maximum(np.linalg.norm(recorded, axis=1) * np.linalg.norm(bone), 1e-9)
+    best = int(np.nan_to_num(pose_similarity, nan=-np.inf).argmax())
+    return worlds[best].transpose(0, 2, 1) @ to_canonical[best].T, canonical_positions[best]
 
 
-def local_rotations(world: Float[np.ndarray, "n j 3 3"], parents: np.ndarray) -> Float[np.ndarray, "n j 4"]:
+def local_quaternions(world: Float[np.ndarray, "n j 3 3"], parents: np.ndarray) -> Float[np.ndarray, "n j 4"]:
     """Quaternions (wxyz) of joints relative to their parents."""
     local = world.copy()
     for joint, parent in enumerate(parents):
@@ -182,41 +205,48 @@ def local_rotations(world: Float[np.ndarray, "n j 3 3"], parents: np.ndarray) ->
     return matrix_to_quaternion(torch.from_numpy(local)).numpy().astype(np.float32)
 
 
-def carried_rotations(
+def retarget_rotations(
     body: Body,
-    source: dict[str, int],
+    recorded_joint_of: dict[str, int],
     world: Float[np.ndarray, "n s 3 3"],
     reference: tuple[np.ndarray, np.ndarray],
-    motion_to_world: Float[np.ndarray, "3 3"],
+    bvh_to_world: Float[np.ndarray, "3 3"],
 ) -> Float[np.ndarray, "n j 3 3"]:
     """World rotation of each of the body's joints; joints without a recorded one follow their parent.
 
     source: row of `world` for each joint that has one. reference: what undoes the reference pose's rotations, and where
     the recorded joints lie in it, canonical axes.
     """
-    undo, places = reference
-    bones = _bones(body.joint_names, source)
+    inverse_reference, canonical_positions = reference
+    bones = _common_bones(body.joint_names, recorded_joint_of)
     rotations = np.tile(np.eye(3), (len(world), len(body.joint_names), 1, 1))
     arcs = np.tile(np.eye(3), (len(body.joint_names), 1, 1))
     for joint, (name, parent) in enumerate(zip(body.joint_names, body.parents, strict=True)):
         if name in bones:
             bone = body.joints_m[body.joint(bones[name])] - body.joints_m[joint]
-            recorded = places[source[bones[name]]] - places[source[name]]
+            recorded = (
+                canonical_positions[recorded_joint_of[bones[name]]] - canonical_positions[recorded_joint_of[name]]
+            )
             arcs[joint] = shortest_arc(torch.from_numpy(bone).double(), torch.from_numpy(recorded)).numpy()
         elif "Hand" in name:
             arcs[joint] = arcs[parent]
-        if name in source:
-            rotations[:, joint] = motion_to_world @ world[:, source[name]] @ undo[source[name]] @ arcs[joint]
+        if name in recorded_joint_of:
+            rotations[:, joint] = (
+                bvh_to_world
+                @ world[:, recorded_joint_of[name]]
+                @ inverse_reference[recorded_joint_of[name]]
+                @ arcs[joint]
+            )
         else:
             rotations[:, joint] = rotations[:, parent]
     return rotations
 
 
-def _root_path(
-    recording: Recording,
+def _root_trajectory(
+    bvh_motion: BvhMotion,
     body: Body,
-    source: dict[str, int],
-    motion_to_world: Float[np.ndarray, "3 3"],
+    recorded_joint_of: dict[str, int],
+    bvh_to_world: Float[np.ndarray, "3 3"],
     ground_m: Float[np.ndarray, "3"],
     in_place: bool,
 ) -> Float[np.ndarray, "n 3"]:
@@ -226,8 +256,8 @@ def _root_path(
         np.linalg.norm(joints_m[body.joint(f"Left{b}")] - joints_m[body.joint(f"Left{a}")])
         for a, b in (("UpLeg", "Leg"), ("Leg", "Foot"))
     )
-    recorded = sum(np.linalg.norm(recording.offsets[source[f"Left{name}"]]) for name in ("Leg", "Foot"))
-    path = recording.root_positions @ motion_to_world.T * (leg_m / recorded)
-    middle = 0.5 * (path.min(axis=0) + path.max(axis=0))
-    path[:, [0, 2]] += ground_m[[0, 2]] - (path[:, [0, 2]] if in_place else middle[[0, 2]])
-    return path
+    recorded = sum(np.linalg.norm(bvh_motion.offsets[recorded_joint_of[f"Left{name}"]]) for name in ("Leg", "Foot"))
+    trajectory = bvh_motion.root_positions @ bvh_to_world.T * (leg_m / recorded)
+    middle = 0.5 * (trajectory.min(axis=0) + trajectory.max(axis=0))
+    trajectory[:, [0, 2]] += ground_m[[0, 2]] - (trajectory[:, [0, 2]] if in_place else middle[[0, 2]])
+    return trajectory

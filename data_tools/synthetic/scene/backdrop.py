@@ -6,19 +6,19 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from data_tools.synthetic.person.noise import Noise
+from data_tools.synthetic.person.noise import ValueNoise
 from pipeline.geometry.camera import Camera, pixel_rays
 
-WALL_BEHIND_M = 1.7
+WALL_DISTANCE_M = 1.7
 """The wall stands this far behind the person."""
 
 _SAMPLES = 3
 _WALL, _SKIRTING, _PLANKS = (0.74, 0.75, 0.73), (0.90, 0.90, 0.88), (0.58, 0.44, 0.31)
 
-Box = tuple[float, float, float, float]
+WallRectangle = tuple[float, float, float, float]
 """Left, right, bottom, top on the wall, in metres from the point behind the person at floor level."""
 
-_FURNITURE: tuple[tuple[Box, tuple[float, float, float]], ...] = (
+_FURNITURE: tuple[tuple[WallRectangle, tuple[float, float, float]], ...] = (
     ((-1.62, -0.78, 0.0, 2.05), (0.88, 0.86, 0.80)),
     ((-1.54, -0.86, 0.0, 1.98), (0.62, 0.50, 0.38)),
     ((-0.98, -0.93, 0.98, 1.06), (0.30, 0.28, 0.26)),
@@ -40,39 +40,41 @@ class Room:
     floor_m: Float[np.ndarray, "h w 3"]
 
 
-def make_room(camera: Camera, ground_m: Float[np.ndarray, "3"], busy: bool, noise: Noise) -> Room:
+def make_room(camera: Camera, ground_m: Float[np.ndarray, "3"], is_furnished: bool, noise: ValueNoise) -> Room:
     """Picture of the empty room around the place where the person stands.
 
     busy: with a door, a picture, a sofa and a pot on the wall's side; otherwise a bare wall.
     """
-    fine = camera.scaled(float(_SAMPLES))
-    colours = _room_colours(*_hits(fine, ground_m), ground_m, busy, noise)
+    supersampled_camera = camera.scaled(float(_SAMPLES))
+    colours = _room_colours(*_intersect_wall_and_floor(supersampled_camera, ground_m), ground_m, is_furnished, noise)
     shape = (camera.height, _SAMPLES, camera.width, _SAMPLES, 3)
     return Room(colours.reshape(shape).mean(axis=(1, 3)).astype(np.float32), floor_points(camera, ground_m))
 
 
 def floor_points(camera: Camera, ground_m: Float[np.ndarray, "3"]) -> Float[np.ndarray, "h w 3"]:
     """Where each pixel's ray meets the floor; nan where it meets the wall first."""
-    return _hits(camera, ground_m)[1].reshape(camera.height, camera.width, 3)
+    return _intersect_wall_and_floor(camera, ground_m)[1].reshape(camera.height, camera.width, 3)
 
 
-def foot_shadow(room: Room, feet_m: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "h w"]:
+def contact_shadow(room: Room, feet_m: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "h w"]:
     """Factor in (0, 1] by which the feet darken the floor: a soft blot under each place."""
-    light = np.ones(room.floor_m.shape[:2], dtype=np.float32)
+    shadow_factor = np.ones(room.floor_m.shape[:2], dtype=np.float32)
     rows, columns = np.nonzero(~np.isnan(room.floor_m[:, :, 0]))
     points = room.floor_m[rows, columns]
     for foot in feet_m:
         squared = ((points[:, [0, 2]] - foot[[0, 2]]) ** 2).sum(axis=1)
-        light[rows, columns] *= 1.0 - 0.30 * np.exp(-squared / 0.11**2) - 0.10 * np.exp(-squared / 0.35**2)
-    return light
+        shadow_factor[rows, columns] *= 1.0 - 0.30 * np.exp(-squared / 0.11**2) - 0.10 * np.exp(-squared / 0.35**2)
+    return shadow_factor
 
 
-def _hits(camera: Camera, ground_m: np.ndarray) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+def _intersect_wall_and_floor(
+    camera: Camera, ground_m: np.ndarray
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """Where the rays of all pixels meet the wall, and the floor in front of it (nan where they do not)."""
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
     pixels = torch.from_numpy(np.stack([x.ravel(), y.ravel()], axis=1)).float()
     origins, directions = (rays.numpy().astype(np.float64) for rays in pixel_rays(camera, pixels))
-    wall_z = ground_m[2] - WALL_BEHIND_M
+    wall_z = ground_m[2] - WALL_DISTANCE_M
     to_wall = (wall_z - origins[:, 2:]) / np.minimum(directions[:, 2:], -1e-6)
     to_floor = (ground_m[1] - origins[:, 1:2]) / np.minimum(directions[:, 1:2], -1e-6)
     floor = np.where(to_floor < to_wall, origins + to_floor * directions, np.nan)
@@ -80,29 +82,33 @@ def _hits(camera: Camera, ground_m: np.ndarray) -> tuple[Float[np.ndarray, "n 3"
 
 
 def _room_colours(
-    wall_m: Float[np.ndarray, "n 3"], floor_m: Float[np.ndarray, "n 3"], ground_m: np.ndarray, busy: bool, noise: Noise
+    wall_m: Float[np.ndarray, "n 3"],
+    floor_m: Float[np.ndarray, "n 3"],
+    ground_m: np.ndarray,
+    is_furnished: bool,
+    noise: ValueNoise,
 ) -> Float[np.ndarray, "n 3"]:
     on_floor = ~np.isnan(floor_m[:, 0])
-    colours = _wall_colours(wall_m - ground_m, busy, noise)
+    colours = _wall_colours(wall_m - ground_m, is_furnished, noise)
     colours[on_floor] = _floor_colours(floor_m[on_floor] - ground_m, noise)
     return np.clip(colours, 0.0, 1.0)
 
 
-def _wall_colours(place_m: Float[np.ndarray, "n 3"], busy: bool, noise: Noise) -> Float[np.ndarray, "n 3"]:
+def _wall_colours(place_m: Float[np.ndarray, "n 3"], is_furnished: bool, noise: ValueNoise) -> Float[np.ndarray, "n 3"]:
     """Plaster lit from the upper left, above a skirting board."""
     across, up = place_m[:, 0], place_m[:, 1]
     plaster = noise.fractal(place_m.astype(np.float32), 0.5) * 0.02 + noise(place_m.astype(np.float32), 0.01) * 0.008
-    gleam = 1.0 + 0.10 * np.exp(-((across - 0.6) ** 2 + (up - 1.9) ** 2) / 1.6) - 0.05 * np.clip(1.0 - up, 0.0, 1.0)
-    colours = np.asarray(_WALL) * (gleam + plaster)[:, None]
-    colours[up < 0.09] = np.asarray(_SKIRTING) * gleam[up < 0.09, None]
-    for (left, right, bottom, top), colour in _FURNITURE if busy else ():
+    shading = 1.0 + 0.10 * np.exp(-((across - 0.6) ** 2 + (up - 1.9) ** 2) / 1.6) - 0.05 * np.clip(1.0 - up, 0.0, 1.0)
+    colours = np.asarray(_WALL) * (shading + plaster)[:, None]
+    colours[up < 0.09] = np.asarray(_SKIRTING) * shading[up < 0.09, None]
+    for (left, right, bottom, top), colour in _FURNITURE if is_furnished else ():
         inside = (across > left) & (across < right) & (up > bottom) & (up < top)
         grain = noise(place_m[inside].astype(np.float32), (0.02, 0.25, 0.02)) * 0.05
-        colours[inside] = np.asarray(colour) * (gleam[inside] * (1.0 + grain))[:, None]
+        colours[inside] = np.asarray(colour) * (shading[inside] * (1.0 + grain))[:, None]
     return colours
 
 
-def _floor_colours(place_m: Float[np.ndarray, "n 3"], noise: Noise) -> Float[np.ndarray, "n 3"]:
+def _floor_colours(place_m: Float[np.ndarray, "n 3"], noise: ValueNoise) -> Float[np.ndarray, "n 3"]:
     """Boards that run towards the camera, each of its own tone, with dark gaps."""
     board = np.floor(place_m[:, 0] / 0.14)
     tone = 0.07 * np.sin(12.9898 * board) + noise(place_m.astype(np.float32), (0.012, 1.0, 0.30)) * 0.06

@@ -1,7 +1,7 @@
 """A synthetic capture: a subject that moves in a room before a fixed camera, and the folder it is written to.
 
 OUT/video/video.mp4            what the pipeline may see
-OUT/truth/...                  what it must never see: see `write_truth`
+OUT/truth/...                  what it must never see: see `write_ground_truth`
 """
 
 import json
@@ -15,11 +15,11 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from data_tools.folder import whole_folder
+from data_tools.folder import atomic_folder
 from data_tools.synthetic.rig.subject import Subject, save_subject
-from data_tools.synthetic.scene.backdrop import Room, foot_shadow
+from data_tools.synthetic.scene.backdrop import Room, contact_shadow
 from data_tools.synthetic.scene.ball import Ball
-from data_tools.synthetic.scene.movie import write_movie
+from data_tools.synthetic.scene.movie import write_video
 from data_tools.synthetic.scene.renderer import Light, pose_vertices, render_subject
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.files import save_body, save_camera, save_motion
@@ -34,7 +34,7 @@ _FEET = ("LeftFoot", "LeftToeBase", "RightFoot", "RightToeBase")
 
 
 @dataclass(frozen=True)
-class Capture:
+class SyntheticCapture:
     """Everything that determines the pixels of a recording."""
 
     subject: Subject
@@ -60,13 +60,13 @@ class Capture:
     def frame(self, frame: int) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]:
         """The picture that the camera takes, and the person's coverage in it."""
         person = self.person(frame)
-        shadow = foot_shadow(self.room, self._feet_m(frame))
-        behind = self.room.image * shadow[:, :, None]
-        picture, coverage = person[:, :, :3] + (1.0 - person[:, :, 3:]) * behind, person[:, :, 3]
+        shadow = contact_shadow(self.room, self._feet_m(frame))
+        background = self.room.image * shadow[:, :, None]
+        picture, coverage = person[:, :, :3] + (1.0 - person[:, :, 3:]) * background, person[:, :, 3]
         if self.ball:
             ball = self.ball.picture(self.camera, frame / self.fps, self.light, self.samples)
-            clear = 1.0 - ball[:, :, 3]
-            picture, coverage = ball[:, :, :3] + clear[:, :, None] * picture, clear * coverage
+            ball_transparency = 1.0 - ball[:, :, 3]
+            picture, coverage = ball[:, :, :3] + ball_transparency[:, :, None] * picture, ball_transparency * coverage
         return to_uint8(picture), to_uint8(coverage)
 
     def _feet_m(self, frame: int) -> Float[np.ndarray, "4 3"]:
@@ -79,7 +79,7 @@ class Capture:
 
 
 @dataclass(frozen=True)
-class Heldout:
+class HeldOutTargets:
     """Questions whose answers are rendered too: other cameras on the first pose, and other poses."""
 
     cameras: tuple[Camera, ...]
@@ -98,7 +98,7 @@ def portrait_camera(size_px: int, height_m: float, distance_m: float, fill: floa
     return camera, np.array([0.0, -0.52 * height_m, -distance_m])
 
 
-def novel_cameras(camera: Camera, standing_m: np.ndarray, height_m: float, count: int) -> tuple[Camera, ...]:
+def novel_cameras(camera: Camera, person_position_m: np.ndarray, height_m: float, count: int) -> tuple[Camera, ...]:
     """Cameras around the person, between the headings of a turn and above or below the capture's own height.
 
     Every one looks at the middle of the body from the capture's distance, +Y up in its image.
@@ -106,37 +106,47 @@ def novel_cameras(camera: Camera, standing_m: np.ndarray, height_m: float, count
     Args:
         standing_m: world position on the ground where the person stands in the pose that is shown.
     """
-    middle = standing_m + [0.0, 0.5 * height_m, 0.0]
+    middle = person_position_m + [0.0, 0.5 * height_m, 0.0]
     distance = float(np.linalg.norm(middle - camera.centre_m()))
-    angles = 2.0 * np.pi * (np.arange(count) + 0.37) / max(count, 1)
-    rises = np.resize(np.radians([18.0, -6.0, 35.0, 8.0]), count)
+    azimuths_rad = 2.0 * np.pi * (np.arange(count) + 0.37) / max(count, 1)
+    elevations_rad = np.resize(np.radians([18.0, -6.0, 35.0, 8.0]), count)
     return tuple(
-        replace(camera, world_to_camera=_looking_at(middle, distance, angle, rise))
-        for angle, rise in zip(angles, rises, strict=True)
+        replace(camera, world_to_camera=_orbit_world_to_camera(middle, distance, azimuth_rad, elevation_rad))
+        for azimuth_rad, elevation_rad in zip(azimuths_rad, elevations_rad, strict=True)
     )
 
 
-def _looking_at(middle_m: np.ndarray, distance_m: float, angle: float, rise: float) -> Float[np.ndarray, "4 4"]:
+def _orbit_world_to_camera(
+    middle_m: np.ndarray, distance_m: float, azimuth_rad: float, elevation_rad: float
+) -> Float[np.ndarray, "4 4"]:
     """world_to_camera of a camera on a sphere around a point; angle 0 stands on +Z, rise is above the horizon."""
-    backward = np.array([np.sin(angle) * np.cos(rise), np.sin(rise), np.cos(angle) * np.cos(rise)])
-    right = np.array([np.cos(angle), 0.0, -np.sin(angle)])
+    backward = np.array(
+        [
+            np.sin(azimuth_rad) * np.cos(elevation_rad),
+            np.sin(elevation_rad),
+            np.cos(azimuth_rad) * np.cos(elevation_rad),
+        ]
+    )
+    right = np.array([np.cos(azimuth_rad), 0.0, -np.sin(azimuth_rad)])
     world_to_camera = np.eye(4)
     world_to_camera[:3, :3] = np.stack([right, -np.cross(backward, right), -backward])
     world_to_camera[:3, 3] = -world_to_camera[:3, :3] @ (middle_m + distance_m * backward)
     return world_to_camera.astype(np.float32)
 
 
-def write_capture(out: Path, capture: Capture, bare: Body | None, heldout: Heldout, recipe: dict[str, object]) -> None:
+def write_capture(
+    out: Path, capture: SyntheticCapture, bare: Body | None, heldout: HeldOutTargets, recipe: dict[str, object]
+) -> None:
     """Render everything into `out`, which is whole or absent. UserError when it exists already."""
-    with whole_folder(out) as part:
+    with atomic_folder(out) as part:
         for folder in ("video", "truth/masks"):
             (part / folder).mkdir(parents=True)
-        write_movie(part / "video" / "video.mp4", _frames(capture, part / "truth" / "masks"), capture.fps)
-        write_truth(part / "truth", capture, bare, recipe)
+        write_video(part / "video" / "video.mp4", _frames(capture, part / "truth" / "masks"), capture.fps)
+        write_ground_truth(part / "truth", capture, bare, recipe)
         write_heldout(part / "truth", capture, heldout)
 
 
-def _frames(capture: Capture, masks: Path) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+def _frames(capture: SyntheticCapture, masks: Path) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     """The pictures in order; the masks are written on the way."""
     for frame in track(range(len(capture.motion.frame_index)), "rendering"):
         picture, coverage = capture.frame(frame)
@@ -144,7 +154,7 @@ def _frames(capture: Capture, masks: Path) -> Iterator[UInt8[np.ndarray, "h w 3"
         yield picture
 
 
-def write_truth(truth: Path, capture: Capture, bare: Body | None, recipe: dict[str, object]) -> None:
+def write_ground_truth(truth: Path, capture: SyntheticCapture, bare: Body | None, recipe: dict[str, object]) -> None:
     """Write what determines the pixels.
 
     `clothed.npz` (Body: canonical clothed surface and skeleton), `uv.npz`, `texture.png`, `bare.npz` (Body beneath the
@@ -156,7 +166,7 @@ def write_truth(truth: Path, capture: Capture, bare: Body | None, recipe: dict[s
     save_motion(truth / "motion.npz", capture.motion)
     save_camera(truth / "camera.npz", capture.camera)
     write_rgb(truth / "room.png", to_uint8(capture.room.image))
-    facts = {
+    metadata = {
         "version": RECIPE_VERSION,
         "fps": capture.fps,
         "samples": capture.samples,
@@ -164,10 +174,10 @@ def write_truth(truth: Path, capture: Capture, bare: Body | None, recipe: dict[s
         "light": asdict(capture.light),
         "ball": capture.ball is not None,
     }
-    (truth / "recipe.json").write_text(json.dumps({**recipe, **facts}, indent=2, sort_keys=True) + "\n")
+    (truth / "recipe.json").write_text(json.dumps({**recipe, **metadata}, indent=2, sort_keys=True) + "\n")
 
 
-def write_heldout(truth: Path, capture: Capture, heldout: Heldout) -> None:
+def write_heldout(truth: Path, capture: SyntheticCapture, heldout: HeldOutTargets) -> None:
     """Write `novel_views/` (the first pose) and `novel_poses/` (the capture's camera) as RGBA, straight alpha."""
     subject = capture.subject
     vertices = pose_vertices(subject, capture.canonical_to_world[0])
@@ -175,7 +185,7 @@ def write_heldout(truth: Path, capture: Capture, heldout: Heldout) -> None:
         (truth / "novel_views").mkdir(exist_ok=True)
         save_camera(truth / "novel_views" / f"{index:06d}.npz", camera)
         person = render_subject(subject, vertices, camera, capture.light, capture.samples)
-        write_rgba(truth / "novel_views" / f"{index:06d}.png", straight_rgba(person))
+        write_rgba(truth / "novel_views" / f"{index:06d}.png", unpremultiply_to_uint8(person))
     if heldout.motion is None:
         return
     (truth / "novel_poses").mkdir()
@@ -183,10 +193,10 @@ def write_heldout(truth: Path, capture: Capture, heldout: Heldout) -> None:
     for index, transforms in enumerate(canonical_to_world(subject.body, heldout.motion)):
         vertices = pose_vertices(subject, transforms)
         person = render_subject(subject, vertices, capture.camera, capture.light, capture.samples)
-        write_rgba(truth / "novel_poses" / f"{index:06d}.png", straight_rgba(person))
+        write_rgba(truth / "novel_poses" / f"{index:06d}.png", unpremultiply_to_uint8(person))
 
 
-def straight_rgba(person: Float[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w 4"]:
+def unpremultiply_to_uint8(person: Float[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w 4"]:
     """8-bit colours that are no longer multiplied by the coverage; black where it is 0."""
     coverage = person[:, :, 3:]
     colours = np.divide(person[:, :, :3], coverage, out=np.zeros_like(person[:, :, :3]), where=coverage > 0)

@@ -9,7 +9,7 @@ from pipeline.body.body import Body, Motion
 from pipeline.geometry.rotation import axis_angle_to_quaternion, quaternion_multiply, quaternion_to_matrix
 from pipeline.geometry.skinning import forward_kinematics
 
-Angles = dict[str, tuple[float, float, float]]
+JointAngles = dict[str, tuple[float, float, float]]
 """Axis-angle (radians, canonical axes) by joint name; joints that are not named rest."""
 
 _SWAY: dict[str, tuple[tuple[float, float, float], float]] = {
@@ -28,7 +28,7 @@ _SWAY: dict[str, tuple[tuple[float, float, float], float]] = {
 
 BREATH_PERIOD_S = 3.6
 
-NOVEL_POSES: dict[str, Angles] = {
+NOVEL_POSES: dict[str, JointAngles] = {
     "arms_up": {"LeftArm": (0.0, 0.0, 1.55), "RightArm": (0.0, 0.0, -1.55)},
     "stride": {
         "LeftUpLeg": (-0.55, 0.0, 0.0),
@@ -71,15 +71,15 @@ def turn_in_a_pose(
     time_s = np.arange(frame_count) / fps
     random = np.random.default_rng([seed, 2])
     axis_angles = np.zeros((frame_count, len(body.joint_names), 3))
-    for name, (reach, period) in _SWAY.items():
-        _add(axis_angles, body, name, _wandering(time_s, period, random) * reach)
+    for name, (amplitude_rad, period) in _SWAY.items():
+        _add_rotation(axis_angles, body, name, _smooth_random_signals(time_s, period, random) * amplitude_rad)
     _breathe(axis_angles, body, time_s)
     _shift_weight(axis_angles, body, time_s)
-    turned = np.arange(frame_count) / frame_count
-    heading = 2.0 * np.pi * (turned + 0.012 * np.sin(4.0 * np.pi * turned))
+    turn_fraction = np.arange(frame_count) / frame_count
+    heading = 2.0 * np.pi * (turn_fraction + 0.012 * np.sin(4.0 * np.pi * turn_fraction))
     if arc_deg < 360.0:
         heading = np.radians(0.5 * arc_deg) * np.sin(heading)
-    return _planted(body, axis_angles, heading, ground_m, time_s)
+    return _motion_on_ground(body, axis_angles, heading, ground_m, time_s)
 
 
 def novel_motion(body: Body, ground_m: Float[np.ndarray, "3"], count: int) -> Motion:
@@ -88,33 +88,35 @@ def novel_motion(body: Body, ground_m: Float[np.ndarray, "3"], count: int) -> Mo
     poses = list(NOVEL_POSES.values())
     for frame in range(count):
         for name, angles in poses[frame % len(poses)].items():
-            _add(axis_angles[frame : frame + 1], body, name, np.array(angles))
+            _add_rotation(axis_angles[frame : frame + 1], body, name, np.array(angles))
     heading = np.resize([0.35, -0.70, 0.90, -0.20], count) + 2.1 * (np.arange(count) // len(poses))
-    return _planted(body, axis_angles, heading, ground_m, np.arange(count, dtype=float))
+    return _motion_on_ground(body, axis_angles, heading, ground_m, np.arange(count, dtype=float))
 
 
-def grounded(body: Body, motion: Motion, floor_y_m: float) -> Motion:
+def snap_feet_to_floor(body: Body, motion: Motion, floor_y_m: float) -> Motion:
     """The same motion, raised or lowered frame by frame until the lowest foot stands on the floor as in the A-pose."""
     root = motion.root_translation_m.copy()
-    root[:, 1] += floor_y_m - above_rest_m(body, motion)
+    root[:, 1] += floor_y_m - lowest_foot_offset_m(body, motion)
     return motion.with_pose(motion.rotations_wxyz, root)
 
 
-def above_rest_m(body: Body, motion: Motion) -> Float[np.ndarray, "n"]:
+def lowest_foot_offset_m(body: Body, motion: Motion) -> Float[np.ndarray, "n"]:
     """Height of the lowest ankle or ball of a foot over its place in the A-pose, which stands on y = 0."""
-    joint_to_world = _joints(body, motion.rotations_wxyz, motion.root_translation_m)
+    joint_to_world = _joint_to_world(body, motion.rotations_wxyz, motion.root_translation_m)
     feet = [body.joint(side + part) for side in ("Left", "Right") for part in ("Foot", "ToeBase")]
     return (joint_to_world[:, feet, 1, 3].numpy() - body.joints_m[feet, 1]).min(axis=1)
 
 
-def _wandering(time_s: np.ndarray, period_s: float, random: np.random.Generator) -> Float[np.ndarray, "n 3"]:
+def _smooth_random_signals(
+    time_s: np.ndarray, period_s: float, random: np.random.Generator
+) -> Float[np.ndarray, "n 3"]:
     """Three smooth signals in [-1, 1]: two sines of unrelated periods each."""
     phase = random.uniform(0.0, 2.0 * np.pi, (2, 3))
     slow = np.sin(2.0 * np.pi * time_s[:, None] / (1.6 * period_s) + phase[0])
     return 0.65 * slow + 0.35 * np.sin(2.0 * np.pi * time_s[:, None] / (0.71 * period_s) + phase[1])
 
 
-def _add(axis_angles: Float[np.ndarray, "n j 3"], body: Body, name: str, angles: np.ndarray) -> None:
+def _add_rotation(axis_angles: Float[np.ndarray, "n j 3"], body: Body, name: str, angles: np.ndarray) -> None:
     """Turn a joint further, in place; rigs may lack one (a second spine joint, a collar bone)."""
     if name in body.joint_names:
         axis_angles[:, body.joint(name)] += angles
@@ -123,29 +125,33 @@ def _add(axis_angles: Float[np.ndarray, "n j 3"], body: Body, name: str, angles:
 def _breathe(axis_angles: np.ndarray, body: Body, time_s: np.ndarray) -> None:
     """The chest rises a little and the shoulders follow."""
     breath = np.sin(2.0 * np.pi * time_s / BREATH_PERIOD_S)
-    for name, reach in (("Spine2", (-0.014, 0, 0)), ("LeftShoulder", (0, 0, 0.016)), ("RightShoulder", (0, 0, -0.016))):
-        _add(axis_angles, body, name, breath[:, None] * reach)
+    for name, amplitude_rad in (
+        ("Spine2", (-0.014, 0, 0)),
+        ("LeftShoulder", (0, 0, 0.016)),
+        ("RightShoulder", (0, 0, -0.016)),
+    ):
+        _add_rotation(axis_angles, body, name, breath[:, None] * amplitude_rad)
 
 
 def _shift_weight(axis_angles: np.ndarray, body: Body, time_s: np.ndarray) -> None:
     """The hips tip from side to side; legs and spine counter it, so that feet stay flat and the head level."""
-    tip = 0.022 * np.sin(2.0 * np.pi * time_s / 2.1)
+    tilt_rad = 0.022 * np.sin(2.0 * np.pi * time_s / 2.1)
     for name, sign in (("Hips", 1.0), ("LeftUpLeg", -1.0), ("RightUpLeg", -1.0), ("Spine", -1.0)):
-        _add(axis_angles, body, name, tip[:, None] * (0.0, 0.0, sign))
+        _add_rotation(axis_angles, body, name, tilt_rad[:, None] * (0.0, 0.0, sign))
     step = np.maximum(np.sin(2.0 * np.pi * time_s / 1.05), 0.0), np.maximum(-np.sin(2.0 * np.pi * time_s / 1.05), 0.0)
     for side, lift in zip(("Left", "Right"), step, strict=True):
         for part, angle in (("UpLeg", -0.07), ("Leg", 0.13), ("Foot", -0.06)):
-            _add(axis_angles, body, side + part, lift[:, None] * (angle, 0.0, 0.0))
+            _add_rotation(axis_angles, body, side + part, lift[:, None] * (angle, 0.0, 0.0))
 
 
-def _planted(
+def _motion_on_ground(
     body: Body, axis_angles: np.ndarray, heading: np.ndarray, ground_m: np.ndarray, time_s: np.ndarray
 ) -> Motion:
     """Turn the person by `heading` (radians about +Y) and stand on `ground_m`."""
     rotations = axis_angle_to_quaternion(torch.from_numpy(axis_angles))
-    turn = torch.zeros(len(heading), 3, dtype=torch.float64)
-    turn[:, 1] = torch.from_numpy(heading)
-    rotations[:, 0] = quaternion_multiply(axis_angle_to_quaternion(turn), rotations[:, 0])
+    heading_axis_angle = torch.zeros(len(heading), 3, dtype=torch.float64)
+    heading_axis_angle[:, 1] = torch.from_numpy(heading)
+    rotations[:, 0] = quaternion_multiply(axis_angle_to_quaternion(heading_axis_angle), rotations[:, 0])
     root = np.repeat(ground_m[None], len(heading), axis=0) * [1.0, 0.0, 1.0]
     motion = Motion(
         frame_index=np.arange(len(heading), dtype=np.int32),
@@ -153,9 +159,9 @@ def _planted(
         rotations_wxyz=rotations.numpy().astype(np.float32),
         root_translation_m=root.astype(np.float32),
     )
-    return grounded(body, motion, float(ground_m[1]))
+    return snap_feet_to_floor(body, motion, float(ground_m[1]))
 
 
-def _joints(body: Body, rotations_wxyz: np.ndarray, root_m: np.ndarray) -> Float[Tensor, "n j 4 4"]:
+def _joint_to_world(body: Body, rotations_wxyz: np.ndarray, root_m: np.ndarray) -> Float[Tensor, "n j 4 4"]:
     matrices = quaternion_to_matrix(torch.from_numpy(rotations_wxyz))
     return forward_kinematics(matrices, torch.from_numpy(root_m), torch.from_numpy(body.joints_m), body.parents)

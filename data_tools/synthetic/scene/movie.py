@@ -11,16 +11,18 @@ from jaxtyping import UInt8
 # Without loss and with full chroma: 52 dB to the pictures (the rounding of 8-bit YUV) at 61 KB a frame of 540 x 540,
 # where crf 6 leaves 40 dB on the body and 4:2:0 chroma 33 dB. One thread, because x264's bytes depend on their number.
 _PIXEL_FORMAT = "yuv444p"
-_ENCODER = {"crf": "0", "preset": "veryfast", "threads": "1"}
+_X264_OPTIONS = {"crf": "0", "preset": "veryfast", "threads": "1"}
 
 
-def write_movie(path: Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], fps: float) -> None:
+def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], fps: float) -> None:
     """H.264 in MP4; the same frames give the same bytes. ValueError when there is no frame."""
     with av.open(str(path), "w", options={"fflags": "+bitexact", "movflags": "+faststart"}) as container:
         stream = None
         for rgb in frames:
             if stream is None:
-                stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001), options=_ENCODER)
+                stream = container.add_stream(
+                    "libx264", rate=Fraction(fps).limit_denominator(1001), options=_X264_OPTIONS
+                )
                 stream.height, stream.width = rgb.shape[:2]
                 stream.pix_fmt = _PIXEL_FORMAT
                 stream.codec_context.flags |= av.codec.context.Flags.bitexact

@@ -1,4 +1,4 @@
-"""Options that all synthetic captures share, from the command line to a `Capture`."""
+"""Options that all synthetic captures share, from the command line to a `SyntheticCapture`."""
 
 import argparse
 from dataclasses import replace
@@ -6,15 +6,15 @@ from pathlib import Path
 
 import numpy as np
 
-from data_tools.synthetic.person.noise import Noise
+from data_tools.synthetic.person.noise import ValueNoise
 from data_tools.synthetic.rig.bvh import read_bvh
-from data_tools.synthetic.rig.retarget import resampled, retarget
+from data_tools.synthetic.rig.retarget import resample_motion, retarget
 from data_tools.synthetic.rig.subject import Subject
 from data_tools.synthetic.scene.backdrop import Room, make_room
 from data_tools.synthetic.scene.ball import Ball
-from data_tools.synthetic.scene.capture import Capture, Heldout, novel_cameras, portrait_camera
+from data_tools.synthetic.scene.capture import HeldOutTargets, SyntheticCapture, novel_cameras, portrait_camera
 from data_tools.synthetic.scene.motion import novel_motion, turn_in_a_pose
-from data_tools.synthetic.scene.renderer import LIGHTS
+from data_tools.synthetic.scene.renderer import LIGHTING_PRESETS
 from pipeline.body.body import Body, Motion
 from pipeline.core.errors import UserError
 from pipeline.geometry.camera import Camera
@@ -24,8 +24,8 @@ LIGHT_HELP = (
     "studio: ambient and key light that shade; flat: the bare texture, shadow-free; shiny: studio with highlights; "
     "hard: a strong key light that the person hides from itself"
 )
-LEAST_FRAMES, LEAST_SIZE_PX = 2, 32
-LEAST_FILL, MOST_FILL = 0.05, 0.95
+MIN_FRAMES, MIN_SIZE_PX = 2, 32
+MIN_FILL, MAX_FILL = 0.05, 0.95
 
 
 def capture_parser(command: str, description: str) -> argparse.ArgumentParser:
@@ -41,7 +41,7 @@ def capture_parser(command: str, description: str) -> argparse.ArgumentParser:
     parser.add_argument("--distance", type=float, default=3.6, help="from camera to person, metres")
     parser.add_argument("--fill", type=float, default=0.82, help="share of the image's height that the person takes")
     parser.add_argument("--focal", type=float, help="focal length in pixels, from which the share then follows")
-    parser.add_argument("--light", choices=sorted(LIGHTS), default="studio", help=LIGHT_HELP)
+    parser.add_argument("--light", choices=sorted(LIGHTING_PRESETS), default="studio", help=LIGHT_HELP)
     parser.add_argument("--background", choices=("busy", "plain"), default="busy", help="the room")
     parser.add_argument("--samples", type=int, default=2, help="antialiasing: samples a pixel along each axis")
     parser.add_argument("--novel-views", type=int, default=4, help="held-out cameras to render into truth/")
@@ -56,18 +56,18 @@ def capture_parser(command: str, description: str) -> argparse.ArgumentParser:
     return parser
 
 
-def check_options(options: argparse.Namespace) -> None:
+def validate_capture_options(options: argparse.Namespace) -> None:
     """Refuse numbers that cannot make a capture, before any work.
 
     Raises:
         UserError: naming the option and its range.
     """
     bounds = (
-        ("frames", LEAST_FRAMES, 100_000),
+        ("frames", MIN_FRAMES, 100_000),
         ("fps", 0.1, 1000.0),
-        ("size", LEAST_SIZE_PX, 4096),
+        ("size", MIN_SIZE_PX, 4096),
         ("distance", 1.0, 50.0),
-        ("fill", LEAST_FILL, MOST_FILL),
+        ("fill", MIN_FILL, MAX_FILL),
         ("samples", 1, 8),
         ("arc", 0.0, 360.0),
         ("novel_views", 0, 1000),
@@ -83,7 +83,7 @@ def check_options(options: argparse.Namespace) -> None:
         raise UserError(f"--size {options.size} is odd, which H.264 cannot store; choose {options.size + 1}")
 
 
-def stage_scene(options: argparse.Namespace, body: Body) -> tuple[Camera, np.ndarray, Room]:
+def build_scene(options: argparse.Namespace, body: Body) -> tuple[Camera, np.ndarray, Room]:
     """Camera, ground and room for a person of this height.
 
     Raises:
@@ -91,53 +91,54 @@ def stage_scene(options: argparse.Namespace, body: Body) -> tuple[Camera, np.nda
     """
     fill = options.fill
     if options.focal is not None:
-        focal_when_full_px = options.size * options.distance / body.height_m()
-        fill = options.focal / focal_when_full_px
-        if not LEAST_FILL <= fill <= MOST_FILL:
+        focal_at_full_height_px = options.size * options.distance / body.height_m()
+        fill = options.focal / focal_at_full_height_px
+        if not MIN_FILL <= fill <= MAX_FILL:
             raise UserError(
                 f"--focal {options.focal} lets the person take {fill:.2f} of the image's height; choose one from "
-                f"{LEAST_FILL * focal_when_full_px:.0f} to {MOST_FILL * focal_when_full_px:.0f}, or another --distance"
+                f"{MIN_FILL * focal_at_full_height_px:.0f} to {MAX_FILL * focal_at_full_height_px:.0f}, or another "
+                "--distance"
             )
     camera, ground_m = portrait_camera(options.size, body.height_m(), options.distance, fill)
-    room = make_room(camera, ground_m, options.background == "busy", Noise(options.seed))
+    room = make_room(camera, ground_m, options.background == "busy", ValueNoise(options.seed))
     return camera, ground_m, Room(to_float(to_uint8(room.image)), room.floor_m)
 
 
-def choose_motion(options: argparse.Namespace, body: Body, ground_m: np.ndarray) -> Motion:
+def build_motion(options: argparse.Namespace, body: Body, ground_m: np.ndarray) -> Motion:
     """The turn in A-pose, or the part of a BVH file that is asked for."""
     if options.bvh:
-        whole = retarget(read_bvh(options.bvh), body, ground_m, options.in_place)
-        return resampled(whole, options.start, options.frames, options.fps)
+        full_motion = retarget(read_bvh(options.bvh), body, ground_m, options.in_place)
+        return resample_motion(full_motion, options.start, options.frames, options.fps)
     return turn_in_a_pose(body, options.frames, options.fps, ground_m, options.seed, options.arc)
 
 
-def choose_novel_poses(options: argparse.Namespace, body: Body, ground_m: np.ndarray) -> Motion | None:
+def build_novel_poses(options: argparse.Namespace, body: Body, ground_m: np.ndarray) -> Motion | None:
     """Poses that the capture does not show: those built in, or some of a BVH file; None when none is asked for."""
     if not options.novel_poses:
         return None
     if not options.novel_bvh:
         return novel_motion(body, ground_m, options.novel_poses)
-    whole = retarget(read_bvh(options.novel_bvh), body, ground_m, in_place=True)
-    rows = np.linspace(0, len(whole.frame_index) - 1, options.novel_poses).round().astype(int)
-    return replace(whole.select(rows), frame_index=np.arange(len(rows), dtype=np.int32))
+    full_motion = retarget(read_bvh(options.novel_bvh), body, ground_m, in_place=True)
+    rows = np.linspace(0, len(full_motion.frame_index) - 1, options.novel_poses).round().astype(int)
+    return replace(full_motion.select(rows), frame_index=np.arange(len(rows), dtype=np.int32))
 
 
-def assemble(
+def build_capture(
     options: argparse.Namespace, subject: Subject, motion: Motion, scene: tuple[Camera, np.ndarray, Room]
-) -> tuple[Capture, Heldout]:
+) -> tuple[SyntheticCapture, HeldOutTargets]:
     """The capture, and its held-out questions."""
     camera, ground_m, room = scene
     ball = Ball(ground_m, subject.body.height_m()) if options.ball else None
-    light = LIGHTS[options.light]
-    capture = Capture(subject, motion, camera, light, room, ground_m, options.fps, options.samples, ball)
+    light = LIGHTING_PRESETS[options.light]
+    capture = SyntheticCapture(subject, motion, camera, light, room, ground_m, options.fps, options.samples, ball)
     # Whoever walks may be metres from the middle of the path in the first frame, which the held-out cameras show.
-    walked_m = motion.root_translation_m[0] - ground_m.astype(np.float32)
-    standing_m = ground_m + walked_m * [1.0, 0.0, 1.0]
-    cameras = novel_cameras(camera, standing_m, subject.body.height_m(), options.novel_views)
-    return capture, Heldout(cameras, choose_novel_poses(options, subject.body, ground_m))
+    start_offset_m = motion.root_translation_m[0] - ground_m.astype(np.float32)
+    person_position_m = ground_m + start_offset_m * [1.0, 0.0, 1.0]
+    cameras = novel_cameras(camera, person_position_m, subject.body.height_m(), options.novel_views)
+    return capture, HeldOutTargets(cameras, build_novel_poses(options, subject.body, ground_m))
 
 
-def recipe_of(options: argparse.Namespace) -> dict[str, object]:
+def recipe_from_options(options: argparse.Namespace) -> dict[str, object]:
     """The options by name, as they go into the truth's recipe; of paths only the motions' names."""
     chosen = {
         name: value if isinstance(value, int | float | str) else str(value)

@@ -8,9 +8,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from data_tools.synthetic.rig.subject import Subject
-from data_tools.synthetic.scene.shadow import ShadowMap, cast_shadows
+from data_tools.synthetic.scene.shadow import ShadowMap, render_shadow_map
 from pipeline.geometry.camera import Camera, project
-from pipeline.geometry.colour import linear_light, srgb_of_light
+from pipeline.geometry.colour import linear_to_srgb, srgb_to_linear
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.geometry.texture_rendering import sample_texture
 from pipeline.kernels.raster import rasterize
@@ -25,21 +25,21 @@ class Light:
     """
 
     key: float = 0.55
-    key_from: tuple[float, float, float] = (0.45, 0.65, 0.75)
+    key_direction: tuple[float, float, float] = (0.45, 0.65, 0.75)
     ambient: float = 0.62
-    sky: float = 0.10
-    shine: float = 0.0
-    wrap: float = 0.25
+    sky_gradient: float = 0.10
+    specular_strength: float = 0.0
+    diffuse_wrap: float = 0.25
     casts_shadows: bool = False
 
 
 STUDIO = Light()
-FLAT = Light(key=0.0, ambient=1.0, sky=0.0)
-SHINY = Light(shine=0.35)
-HARD = Light(key=0.75, ambient=0.42, wrap=0.0, casts_shadows=True)
-LIGHTS = {"studio": STUDIO, "flat": FLAT, "shiny": SHINY, "hard": HARD}
+FLAT = Light(key=0.0, ambient=1.0, sky_gradient=0.0)
+SHINY = Light(specular_strength=0.35)
+HARD = Light(key=0.75, ambient=0.42, diffuse_wrap=0.0, casts_shadows=True)
+LIGHTING_PRESETS = {"studio": STUDIO, "flat": FLAT, "shiny": SHINY, "hard": HARD}
 
-SHININESS = 24.0
+BLINN_PHONG_EXPONENT = 24.0
 
 
 def pose_vertices(subject: Subject, canonical_to_world: Float[Tensor, "j 4 4"]) -> Float[Tensor, "v 3"]:
@@ -58,20 +58,20 @@ def render_subject(
     ``rgb + (1 - coverage) * background``.
     """
     image = np.zeros((camera.height, camera.width, 4), dtype=np.float32)
-    window = _window(vertices_world, camera)
+    window = _bounding_window_px(vertices_world, camera)
     if window is None:
         return image
     left, top, width, height = window
-    fine = camera.cropped(left, top, width, height).scaled(float(samples))
+    supersampled_camera = camera.cropped(left, top, width, height).scaled(float(samples))
     faces = torch.from_numpy(subject.body.faces)
-    shadows = cast_shadows(vertices_world, faces, light.key_from) if light.casts_shadows else None
-    shaded = _shade_window(subject, vertices_world, fine, light, shadows)
+    shadows = render_shadow_map(vertices_world, faces, light.key_direction) if light.casts_shadows else None
+    shaded = _shade_window(subject, vertices_world, supersampled_camera, light, shadows)
     mean = shaded.reshape(height, samples, width, samples, 4).mean(axis=(1, 3))
     image[top : top + height, left : left + width] = mean
     return image
 
 
-def _window(vertices_world: Float[Tensor, "v 3"], camera: Camera) -> tuple[int, int, int, int] | None:
+def _bounding_window_px(vertices_world: Float[Tensor, "v 3"], camera: Camera) -> tuple[int, int, int, int] | None:
     """Left, top, width and height (px) of the part of the image that the surface can touch; None when it is outside."""
     position_px, _ = project(vertices_world, camera)
     size = torch.tensor([camera.width, camera.height])
@@ -99,8 +99,8 @@ def _shade_window(
     point = (vertices_world[corners] * blend).sum(1)
     to_camera = torch.nn.functional.normalize(torch.from_numpy(camera.centre_m()) - point, dim=1)
     image = np.zeros((camera.height, camera.width, 4), dtype=np.float32)
-    lit = shadows.lit(point, normal) if shadows else torch.ones(len(point))
-    image[seen.numpy(), :3] = shade(albedo, normal, to_camera, lit, light).numpy()
+    visibility = shadows.visibility(point, normal) if shadows else torch.ones(len(point))
+    image[seen.numpy(), :3] = shade(albedo, normal, to_camera, visibility, light).numpy()
     image[seen.numpy(), 3] = 1.0
     return image
 
@@ -119,7 +119,7 @@ def shade(
     albedo: Float[Tensor, "n 3"],
     normal: Float[Tensor, "n 3"],
     to_camera: Float[Tensor, "n 3"],
-    lit: Float[Tensor, "n"],
+    visibility: Float[Tensor, "n"],
     light: Light,
 ) -> Float[Tensor, "n 3"]:
     """sRGB colours under the light: Lambert with a wrapped key light, hemispheric ambient, Blinn-Phong shine.
@@ -127,9 +127,11 @@ def shade(
     All directions are unit vectors in the world; albedo is sRGB, the sum is taken in linear light. lit: share of the
     key light that nothing hides.
     """
-    key_from = torch.nn.functional.normalize(torch.tensor(light.key_from), dim=0)
-    wrapped = lit * ((normal @ key_from + light.wrap) / (1.0 + light.wrap)).clamp_min(0.0)
-    irradiance = light.ambient + light.sky * normal[:, 1] + light.key * wrapped
-    half = torch.nn.functional.normalize(key_from + to_camera, dim=1)
-    gloss = light.shine * lit * (normal * half).sum(1).clamp_min(0.0) ** SHININESS
-    return srgb_of_light((linear_light(albedo) * irradiance[:, None] + gloss[:, None]).clamp(0.0, 1.0))
+    key_direction = torch.nn.functional.normalize(torch.tensor(light.key_direction), dim=0)
+    diffuse = visibility * ((normal @ key_direction + light.diffuse_wrap) / (1.0 + light.diffuse_wrap)).clamp_min(0.0)
+    irradiance = light.ambient + light.sky_gradient * normal[:, 1] + light.key * diffuse
+    half_vector = torch.nn.functional.normalize(key_direction + to_camera, dim=1)
+    specular = (
+        light.specular_strength * visibility * (normal * half_vector).sum(1).clamp_min(0.0) ** BLINN_PHONG_EXPONENT
+    )
+    return linear_to_srgb((srgb_to_linear(albedo) * irradiance[:, None] + specular[:, None]).clamp(0.0, 1.0))

@@ -10,20 +10,20 @@ from torch import Tensor
 from pipeline.body.fit.root_placement import MINIMUM_DEPTH_M
 from pipeline.geometry.camera import Camera
 
-LENS_COUNT = 3
+INTRINSICS_COUNT = 3
 """Numbers of a lens: shift of the principal point to the right and down, and logarithm of the focal length; all over
 the focal length of the given camera.
 """
 
 
-def through_lens(camera: Camera, lens: Float[Tensor, "3"]) -> Camera:
+def apply_intrinsics_delta(camera: Camera, intrinsics_delta: Float[Tensor, "3"]) -> Camera:
     """The given camera with a lens's focal length and principal point."""
-    right, down, focal_log = lens.tolist()
+    right, down, focal_log = intrinsics_delta.tolist()
     fx, fy, scale = camera.fx, camera.fy, math.exp(focal_log)
     return replace(camera, fx=fx * scale, fy=fy * scale, cx=camera.cx + right * fx, cy=camera.cy + down * fy)
 
 
-def project_with_covectors(
+def project_with_jacobian(
     world: Float[Tensor, "n m 3"], camera: Camera
 ) -> tuple[Float[Tensor, "n m 2"], Float[Tensor, "n m 2 3"]]:
     """Pixels and their derivative by the world point (m)."""
@@ -42,11 +42,11 @@ def project_with_covectors(
     return pixels, in_camera @ pose[:3, :3]
 
 
-def pixels_by_lens(
-    pixels: Float[Tensor, "n m 2"], camera: Camera, lens: Float[Tensor, "3"]
+def compute_intrinsics_jacobian(
+    pixels: Float[Tensor, "n m 2"], camera: Camera, intrinsics_delta: Float[Tensor, "3"]
 ) -> Float[Tensor, "n m 2 3"]:
     """Derivative of projections by the lens that the given camera is seen through."""
-    seen = through_lens(camera, lens)
-    by_focal = pixels - pixels.new_tensor([seen.cx, seen.cy])
-    by_shift = torch.diag(pixels.new_tensor([camera.fx, camera.fy]))
-    return torch.cat([by_shift.expand(*pixels.shape, 2), by_focal[..., None]], dim=-1)
+    updated_camera = apply_intrinsics_delta(camera, intrinsics_delta)
+    focal_jacobian = pixels - pixels.new_tensor([updated_camera.cx, updated_camera.cy])
+    principal_point_jacobian = torch.diag(pixels.new_tensor([camera.fx, camera.fy]))
+    return torch.cat([principal_point_jacobian.expand(*pixels.shape, 2), focal_jacobian[..., None]], dim=-1)

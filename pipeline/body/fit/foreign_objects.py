@@ -9,15 +9,15 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from pipeline.body.body import Body
-from pipeline.body.fit.silhouette_icp import draw_in_window, matching_window
-from pipeline.body.overlay import posed_frame
-from pipeline.capture.frame_selection import frame_ranges
+from pipeline.body.fit.silhouette_icp import crop_mask_window, rasterise_in_window
+from pipeline.body.overlay import pose_vertices
+from pipeline.capture.frame_selection import format_frame_ranges
 from pipeline.geometry.camera import Camera
 
-CLOTHING_REACH = 0.03
+CLOTHING_MARGIN_RATIO = 0.03
 """How far from the body a mask is expected to reach, as a share of the person's height in the image."""
 
-MUCH_MORE = 0.01
+MIN_EXCESS_BLOB_SHARE = 0.01
 """A frame is told of when its largest lump exceeds the median frame's by this share of the mask, about a foot.
 
 Most seen without foreign things: a turn 0.0004, a self-capture 0.0035. A juggled ball 0.015 to 0.074; a caption that
@@ -25,42 +25,46 @@ hangs on a foot 0.012, where the skirt's hem alone stays within 0.008.
 """
 
 
-def lump_share(mask: Bool[np.ndarray, "h w"], drawn: Bool[np.ndarray, "h w"], person_px: float) -> float:
+def residual_blob_share(mask: Bool[np.ndarray, "h w"], body_mask: Bool[np.ndarray, "h w"], person_px: float) -> float:
     """Share of the mask that its largest connected part beyond the reach of clothing takes, 0 to 1."""
-    apart_px = cv2.distanceTransform((~drawn).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    beyond = mask & (apart_px > CLOTHING_REACH * person_px)
+    distance_px = cv2.distanceTransform((~body_mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    beyond = mask & (distance_px > CLOTHING_MARGIN_RATIO * person_px)
     _, _, parts, _ = cv2.connectedComponentsWithStats(beyond.astype(np.uint8))
     return float(parts[1:, cv2.CC_STAT_AREA].max(initial=0)) / max(1, int(mask.sum()))
 
 
-def lump_shares(
+def residual_blob_shares(
     body: Body,
     canonical_to_world: Float[Tensor, "n j 4 4"],
     camera: Camera,
     masks: Sequence[UInt8[np.ndarray, "h w"]],
 ) -> Float[np.ndarray, "n"]:
-    """`lump_share` of every frame; nan where the mask is empty."""
+    """`residual_blob_share` of every frame; nan where the mask is empty."""
     faces = torch.as_tensor(body.faces)
     shares = np.full(len(masks), np.nan)
     for frame, mask in enumerate(masks):
-        window = matching_window(mask)
+        window = crop_mask_window(mask)
         if window is not None:
-            drawing = draw_in_window(posed_frame(body, canonical_to_world[frame]), faces, camera, window)
-            shares[frame] = lump_share(window.mask, drawing.face_id >= 0, window.person_px)
+            body_raster = rasterise_in_window(pose_vertices(body, canonical_to_world[frame]), faces, camera, window)
+            shares[frame] = residual_blob_share(window.mask, body_raster.face_id >= 0, window.person_px)
     return shares
 
 
-def foreign_frames(shares: Float[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
+def frames_with_foreign_objects(shares: Float[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
     """Frames whose lump is much larger than is usual in the recording: wide clothes are there all the time."""
-    return np.nan_to_num(shares) > np.nan_to_num(np.nanmedian(shares) if np.isfinite(shares).any() else 0.0) + MUCH_MORE
+    return (
+        np.nan_to_num(shares)
+        > np.nan_to_num(np.nanmedian(shares) if np.isfinite(shares).any() else 0.0) + MIN_EXCESS_BLOB_SHARE
+    )
 
 
-def lump_doubts(shares: Float[np.ndarray, "n"], frame_index: Int[np.ndarray, "n"]) -> list[str]:
-    """A sentence about the frames of `foreign_frames`; empty when there are none."""
-    foreign = foreign_frames(shares)
-    if not foreign.any():
+def foreign_object_warnings(shares: Float[np.ndarray, "n"], frame_index: Int[np.ndarray, "n"]) -> list[str]:
+    """A sentence about the frames of `frames_with_foreign_objects`; empty when there are none."""
+    has_foreign_object = frames_with_foreign_objects(shares)
+    if not has_foreign_object.any():
         return []
     return [
-        f"frames {frame_ranges(frame_index, foreign)}: the mask holds something beside the body (a ball, a bag, a "
+        f"frames {format_frame_ranges(frame_index, has_foreign_object)}: the mask holds something beside the "
+        "body (a ball, a bag, a "
         "caption?), or the pose is wrong; leave them out with split.json, or supply masks/"
     ]

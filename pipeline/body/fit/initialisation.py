@@ -7,47 +7,47 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pipeline.body.fit.camera_parameters import LENS_COUNT
+from pipeline.body.fit.camera_parameters import INTRINSICS_COUNT
 from pipeline.body.fit.energy import FitState, Observations
 from pipeline.geometry.rotation import matrix_to_quaternion, quaternion_to_matrix, slerp
 
-TORSO = (11, 12, 23, 24)
+TORSO_LANDMARKS = (11, 12, 23, 24)
 
 
-def torso_rotations(rest_m: Float[Tensor, "l 3"], directions_m: Float[Tensor, "n l 3"]) -> Float[Tensor, "n 3 3"]:
+def torso_rotations(
+    rest_landmarks_m: Float[Tensor, "l 3"], landmarks_3d_m: Float[Tensor, "n l 3"]
+) -> Float[Tensor, "n 3 3"]:
     """Rotation that carries the rest torso (hips, shoulders) onto each frame's 3D landmarks (Kabsch 1976)."""
-    rows = list(TORSO)
-    rest = rest_m[rows] - rest_m[rows].mean(0)
-    seen = directions_m[:, rows] - directions_m[:, rows].mean(1, keepdim=True)
-    u, _, v = torch.linalg.svd(seen.transpose(1, 2) @ rest)
-    sign = torch.ones(len(seen), 3, dtype=rest.dtype)
+    rows = list(TORSO_LANDMARKS)
+    rest = rest_landmarks_m[rows] - rest_landmarks_m[rows].mean(0)
+    observed = landmarks_3d_m[:, rows] - landmarks_3d_m[:, rows].mean(1, keepdim=True)
+    u, _, v = torch.linalg.svd(observed.transpose(1, 2) @ rest)
+    sign = torch.ones(len(observed), 3, dtype=rest.dtype)
     sign[:, 2] = torch.linalg.det(u @ v)
     return (u * sign[:, None]) @ v
 
 
-def torso_found(observations: Observations) -> Bool[np.ndarray, "n"]:
+def has_torso_landmarks(observations: Observations) -> Bool[np.ndarray, "n"]:
     """Frames whose hips and shoulders are known, and are no point (a failing detector may put all in one place)."""
-    rows = list(TORSO)
-    known = (
-        torch.minimum(observations.confidence[:, rows], observations.direction_confidence[:, rows]).min(1).values > 0
-    )
-    return (known & (torso_size(observations.directions_m) > 1e-3)).numpy()
+    rows = list(TORSO_LANDMARKS)
+    known = torch.minimum(observations.confidence[:, rows], observations.confidence_3d[:, rows]).min(1).values > 0
+    return (known & (torso_radius_m(observations.landmarks_3d_m) > 1e-3)).numpy()
 
 
-def torso_size(places_m: Float[Tensor, "n l 3"]) -> Float[Tensor, "n"]:
+def torso_radius_m(positions_m: Float[Tensor, "n l 3"]) -> Float[Tensor, "n"]:
     """Root mean square distance (m) of hips and shoulders from their middle."""
-    torso = places_m[:, list(TORSO)]
+    torso = positions_m[:, list(TORSO_LANDMARKS)]
     return (torso - torso.mean(1, keepdim=True)).square().sum(-1).mean(1).sqrt()
 
 
-def facing_yaw(rotation: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n"]:
+def facing_yaw_rad(rotation: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n"]:
     """Angle (rad) about +Y of the direction a body faces; 0 is +Z, positive towards +X."""
     return torch.atan2(rotation[:, 0, 2], rotation[:, 2, 2])
 
 
 def initial_state(
     observations: Observations,
-    rest_m: Float[Tensor, "l 3"],
+    rest_landmarks_m: Float[Tensor, "l 3"],
     joints_m: Float[Tensor, "j 3"],
     shape: Float[Tensor, "s"],
     offset_count: int,
@@ -56,26 +56,29 @@ def initial_state(
 
     Frames without landmarks take the rotation and place in between their neighbours'.
     """
-    found = torso_found(observations)
-    turn = torso_rotations(rest_m, observations.directions_m)
-    turned = (rest_m - joints_m[0]) @ turn.transpose(1, 2)
-    size = torso_size(rest_m[None])[0] / torso_size(observations.directions_m[torch.from_numpy(found)]).median()
+    found = has_torso_landmarks(observations)
+    torso_rotation = torso_rotations(rest_landmarks_m, observations.landmarks_3d_m)
+    turned = (rest_landmarks_m - joints_m[0]) @ torso_rotation.transpose(1, 2)
+    size = (
+        torso_radius_m(rest_landmarks_m[None])[0]
+        / torso_radius_m(observations.landmarks_3d_m[torch.from_numpy(found)]).median()
+    )
     hips_m = 0.5 * (turned[:, 23] + turned[:, 24])
-    relative = observations.directions_m * size + hips_m[:, None]
-    root = place_by_landmarks(observations, relative)
-    turn, root = _fill_gaps(turn, root, found)
+    relative = observations.landmarks_3d_m * size + hips_m[:, None]
+    root = solve_root_position(observations, relative)
+    torso_rotation, root = _fill_gaps(torso_rotation, root, found)
     rotations = torch.eye(3, dtype=torch.float64).repeat(len(root), len(joints_m), 1, 1)
-    rotations[:, 0] = turn
+    rotations[:, 0] = torso_rotation
     return FitState(
         rotations,
         root,
         shape.double(),
         torch.zeros(offset_count, dtype=torch.float64),
-        torch.zeros(LENS_COUNT, dtype=torch.float64),
+        torch.zeros(INTRINSICS_COUNT, dtype=torch.float64),
     )
 
 
-def place_by_landmarks(observations: Observations, relative_m: Float[Tensor, "n l 3"]) -> Float[Tensor, "n 3"]:
+def solve_root_position(observations: Observations, relative_m: Float[Tensor, "n l 3"]) -> Float[Tensor, "n 3"]:
     """World position of the root from pixels of points known relative to it.
 
     Each pixel gives two equations linear in the unknown place t: fx (X + t_x) - (u - cx) (Z + t_z) = 0, likewise y.
@@ -98,12 +101,12 @@ def place_by_landmarks(observations: Observations, relative_m: Float[Tensor, "n 
 
 
 def _fill_gaps(
-    turn: Float[Tensor, "n 3 3"], root_m: Float[Tensor, "n 3"], found: Bool[np.ndarray, "n"]
+    torso_rotation: Float[Tensor, "n 3 3"], root_m: Float[Tensor, "n 3"], found: Bool[np.ndarray, "n"]
 ) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3"]]:
     """Rotation and place of frames that were not found, from the nearest found frames before and after."""
     known = np.flatnonzero(found)
-    low, high, share = _between(known.astype(np.float64), np.arange(len(found), dtype=np.float64))
-    quaternions = matrix_to_quaternion(turn[known])
+    low, high, share = _interpolation_weights(known.astype(np.float64), np.arange(len(found), dtype=np.float64))
+    quaternions = matrix_to_quaternion(torso_rotation[known])
     filled = quaternion_to_matrix(slerp(quaternions[low], quaternions[high], share))
     return filled, root_m[known][low] * (1 - share) + root_m[known][high] * share
 
@@ -111,7 +114,7 @@ def _fill_gaps(
 def interpolated_state(state: FitState, rows: Int[np.ndarray, "k"], time_s: Float[Tensor, "n"]) -> FitState:
     """Poses of all n frames from those of some (`rows`), in between by time; outside, the nearest one."""
     times = time_s.numpy()
-    low, high, share = _between(times[rows], times)
+    low, high, share = _interpolation_weights(times[rows], times)
     quaternions = matrix_to_quaternion(state.rotations)
     turned = slerp(quaternions[low], quaternions[high], share[:, None].expand(-1, quaternions.shape[1], 1))
     return replace(
@@ -121,7 +124,7 @@ def interpolated_state(state: FitState, rows: Int[np.ndarray, "k"], time_s: Floa
     )
 
 
-def _between(
+def _interpolation_weights(
     known: Float[np.ndarray, "k"], wanted: Float[np.ndarray, "n"]
 ) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"], Float[Tensor, "n 1"]]:
     """For each wanted value the known ones below and above it, and how far it lies between them (0 to 1)."""

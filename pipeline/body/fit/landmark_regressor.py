@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pipeline.body.fit.linear_body import ACTIVE_JOINTS, FitModel, Points
+from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody, SkinnedPoints
 
-POSE_LANDMARKS = 33
+POSE_LANDMARK_COUNT = 33
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Landmark:
 
     `carrier` is the joint it moves with; `anchor` the joint it is measured from (None: the nearest point of the
     surface; the carrier where a body has no such joint). `noise` scales the detector's usual error. Where it lies is
-    told by each body (`ParametricBody.landmark_places_m`).
+    told by each body (`ParametricBody.landmark_positions_m`).
     """
 
     name: str
@@ -61,15 +61,15 @@ LANDMARK_COUNT = 41
 HAND_LANDMARKS = (0, 2, 5, 17)
 """The points of a hand that follow the pose's landmarks, left and right in turn: those that fingers do not move."""
 
-OFFSET_COUNT = 3 * len(LANDMARKS)
+LANDMARK_OFFSET_COUNT = 3 * len(LANDMARKS)
 """Numbers that shift the landmarks on the body for one video: x, y, z a `Landmark`, mirrored for the right one."""
 
-PAIRS = tuple(landmark.indices for landmark in LANDMARKS if len(landmark.indices) == 2)
+LEFT_RIGHT_PAIRS = tuple(landmark.indices for landmark in LANDMARKS if len(landmark.indices) == 2)
 
-SWAP_GROUPS = {
-    "arms": tuple(pair for pair in PAIRS if 13 <= pair[0] <= 21 or pair[0] >= POSE_LANDMARKS),
-    "legs": tuple(pair for pair in PAIRS if 25 <= pair[0] < POSE_LANDMARKS),
-    "whole body": PAIRS,
+SWAP_PAIR_GROUPS = {
+    "arms": tuple(pair for pair in LEFT_RIGHT_PAIRS if 13 <= pair[0] <= 21 or pair[0] >= POSE_LANDMARK_COUNT),
+    "legs": tuple(pair for pair in LEFT_RIGHT_PAIRS if 25 <= pair[0] < POSE_LANDMARK_COUNT),
+    "whole body": LEFT_RIGHT_PAIRS,
 }
 """Pairs that the detector confuses together."""
 
@@ -82,7 +82,7 @@ def mirror_permutation(pairs: tuple[tuple[int, ...], ...]) -> list[int]:
     return order
 
 
-def landmark_noise() -> Float[Tensor, "l"]:
+def landmark_std_ratio() -> Float[Tensor, "l"]:
     """Each landmark's usual error relative to the detector's typical one."""
     noise = torch.ones(LANDMARK_COUNT, dtype=torch.float64)
     for landmark in LANDMARKS:
@@ -98,45 +98,45 @@ class LandmarkRegressor:
     anchor_vertex: tuple[int | None, ...]
     shift_m: Float[Tensor, "l 3"]
     carrier: Float[Tensor, "l j"]
-    by_offset: Float[Tensor, "l 3 o"]
+    offset_jacobian: Float[Tensor, "l 3 o"]
 
-    def points(self, model: FitModel, offsets_m: Float[Tensor, "o"]) -> Points:
+    def points(self, model: LinearBody, landmark_offsets_m: Float[Tensor, "o"]) -> SkinnedPoints:
         """The landmarks on a rest body; the shape axis is the body's shape followed by the offsets."""
         places, derivatives = [], []
         for joint, vertex in zip(self.anchor_joint, self.anchor_vertex, strict=True):
             if joint is not None:
                 places.append(model.full_joints[joint])
-                derivatives.append(model.full_joints_by_shape[joint])
+                derivatives.append(model.full_joints_shape_jacobian[joint])
             else:
                 places.append(model.vertices[vertex])
-                derivatives.append(model.vertices_by_shape[vertex])
-        rest = torch.stack(places) + self.shift_m + self.by_offset @ offsets_m
-        by_shape = torch.cat([torch.stack(derivatives), self.by_offset], dim=-1)
-        return Points(rest[None], self.carrier[None], by_shape[None])
+                derivatives.append(model.vertices_shape_jacobian[vertex])
+        rest = torch.stack(places) + self.shift_m + self.offset_jacobian @ landmark_offsets_m
+        shape_jacobian = torch.cat([torch.stack(derivatives), self.offset_jacobian], dim=-1)
+        return SkinnedPoints(rest[None], self.carrier[None], shape_jacobian[None])
 
 
-def landmark_regressor(default: FitModel) -> LandmarkRegressor:
+def landmark_regressor(default: LinearBody) -> LandmarkRegressor:
     """Tie a body's landmark places to joints and vertices of its default shape."""
     joints: list[int | None] = [None] * LANDMARK_COUNT
     vertices: list[int | None] = [None] * LANDMARK_COUNT
     shift = torch.zeros(LANDMARK_COUNT, 3, dtype=torch.float64)
     carrier = torch.zeros(LANDMARK_COUNT, len(ACTIVE_JOINTS), dtype=torch.float64)
-    by_offset = torch.zeros(LANDMARK_COUNT, 3, OFFSET_COUNT, dtype=torch.float64)
+    offset_jacobian = torch.zeros(LANDMARK_COUNT, 3, LANDMARK_OFFSET_COUNT, dtype=torch.float64)
     for row, landmark in enumerate(LANDMARKS):
         for side, index in enumerate(landmark.indices):
             mirror = torch.tensor([-1.0 if side else 1.0, 1.0, 1.0], dtype=torch.float64)
-            place = torch.tensor(default.landmark_places_m[landmark.name], dtype=torch.float64) * mirror
+            place = torch.tensor(default.landmark_positions_m[landmark.name], dtype=torch.float64) * mirror
             if landmark.anchor is None:
                 vertices[index] = int((default.vertices - place).norm(dim=1).argmin())
                 anchor = default.vertices[vertices[index]]
             else:
-                carried = default.full_by_name[_on_side(landmark.carrier, side)]
-                joints[index] = default.full_by_name.get(_on_side(landmark.anchor, side), carried)
+                carrier_index = default.joint_index_by_name[_on_side(landmark.carrier, side)]
+                joints[index] = default.joint_index_by_name.get(_on_side(landmark.anchor, side), carrier_index)
                 anchor = default.full_joints[joints[index]]
             shift[index] = place - anchor
             carrier[index, ACTIVE_JOINTS.index(_on_side(landmark.carrier, side))] = 1.0
-            by_offset[index, :, 3 * row : 3 * row + 3] = torch.diag(mirror)
-    return LandmarkRegressor(tuple(joints), tuple(vertices), shift, carrier, by_offset)
+            offset_jacobian[index, :, 3 * row : 3 * row + 3] = torch.diag(mirror)
+    return LandmarkRegressor(tuple(joints), tuple(vertices), shift, carrier, offset_jacobian)
 
 
 def _on_side(name: str, side: int) -> str:

@@ -12,38 +12,43 @@ import torch
 from jaxtyping import Bool, Float, Int
 
 from pipeline.body.fit.energy import Observations
-from pipeline.body.fit.initialisation import facing_yaw, torso_found, torso_rotations
-from pipeline.body.fit.landmark_regressor import PAIRS, POSE_LANDMARKS, SWAP_GROUPS, mirror_permutation
+from pipeline.body.fit.initialisation import facing_yaw_rad, has_torso_landmarks, torso_rotations
+from pipeline.body.fit.landmark_regressor import (
+    LEFT_RIGHT_PAIRS,
+    POSE_LANDMARK_COUNT,
+    SWAP_PAIR_GROUPS,
+    mirror_permutation,
+)
 
-EXCHANGE_COST = 0.25
+SWAP_COST = 0.25
 """What it takes to believe that a frame is exchanged; the costs below are counted against it."""
 
-STEP_S = 0.2
+MIN_INTERVAL_S = 0.2
 """Frames up to this far apart count alike: what changes between them is mostly the detector's noise. In longer gaps
 people move in proportion to the time."""
 
-TURN_COST = 2.0
-TURN_FREE_RAD = 0.35
-"""Radians of turning in a step of `STEP_S` that cost nothing."""
+YAW_CHANGE_COST = 2.0
+FREE_YAW_CHANGE_RAD = 0.35
+"""Radians of turning in a step of `MIN_INTERVAL_S` that cost nothing."""
 
-JUMP_COST = 1.5
-"""For limbs: cost of moving by the size of the torso in a step of `STEP_S`, mean over the limb's landmarks."""
+LANDMARK_JUMP_COST = 1.5
+"""For limbs: cost of moving by the size of the torso in a step of `MIN_INTERVAL_S`, mean over the limb's landmarks."""
 
-SIDE_COST = 1.0
-SIDE_M = 0.15
+WRONG_SIDE_COST = 1.0
+WRONG_SIDE_DISTANCE_M = 0.15
 """For limbs: cost of lying this far on the wrong side of the body (left knee right of the right one)."""
 
-Y_UP = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
-"""From camera axes (y down, z away) to such as `facing_yaw` reads: y up, z towards the viewer."""
+CAMERA_TO_Y_UP = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+"""From camera axes (y down, z away) to such as `facing_yaw_rad` reads: y up, z towards the viewer."""
 
-LIMBS = {
-    "arms": (SWAP_GROUPS["arms"], (13, 14), (11, 12)),
-    "legs": (SWAP_GROUPS["legs"], (25, 26), (23, 24)),
+LIMB_SWAP_PAIRS = {
+    "arms": (SWAP_PAIR_GROUPS["arms"], (13, 14), (11, 12)),
+    "legs": (SWAP_PAIR_GROUPS["legs"], (25, 26), (23, 24)),
 }
 """Pairs that are exchanged together, the pair whose order tells, and the pair of the torso that it is compared with."""
 
 
-def two_label_path(
+def viterbi_two_labels(
     unary: Float[np.ndarray, "n 2"], same: Float[np.ndarray, "k"], other: Float[np.ndarray, "k"]
 ) -> Bool[np.ndarray, "n"]:
     """Cheapest sequence of labels (Viterbi): `unary` costs a frame, `same` and `other` cost keeping or changing the
@@ -62,46 +67,48 @@ def two_label_path(
     return labels
 
 
-def exchanged_bodies(observations: Observations, rest_m: Float[torch.Tensor, "l 3"]) -> Bool[np.ndarray, "n"]:
+def detect_body_swaps(
+    observations: Observations, rest_landmarks_m: Float[torch.Tensor, "l 3"]
+) -> Bool[np.ndarray, "n"]:
     """Frames in which the whole person was taken for one who faces the other way, by the continuity of turning.
 
     Exchanged sides with mirrored depths turn a yaw about the camera's upright axis into pi minus the yaw: a jump in
     front and back views. In a side view the two agree, and nothing tells them apart.
     """
-    rows = np.flatnonzero(torso_found(observations))
+    rows = np.flatnonzero(has_torso_landmarks(observations))
     if len(rows) == 0:
         return np.zeros(len(observations.time_s), dtype=bool)
-    in_camera = _camera_rotation(observations) @ torso_rotations(rest_m, observations.directions_m[rows])
-    yaw_rad = facing_yaw(Y_UP @ in_camera).numpy()
-    free = TURN_FREE_RAD * _steps(observations, rows)
-    same = TURN_COST * np.maximum(np.abs(_wrapped(yaw_rad[1:] - yaw_rad[:-1])) - free, 0.0)
-    other = TURN_COST * np.maximum(np.abs(_wrapped(np.pi - yaw_rad[1:] - yaw_rad[:-1])) - free, 0.0)
-    unary = np.tile([0.0, EXCHANGE_COST], (len(rows), 1))
-    return _spread(two_label_path(unary, same, other), rows, len(observations.time_s))
+    in_camera = _camera_rotation(observations) @ torso_rotations(rest_landmarks_m, observations.landmarks_3d_m[rows])
+    yaw_rad = facing_yaw_rad(CAMERA_TO_Y_UP @ in_camera).numpy()
+    free = FREE_YAW_CHANGE_RAD * _time_steps(observations, rows)
+    same = YAW_CHANGE_COST * np.maximum(np.abs(_wrap_angle(yaw_rad[1:] - yaw_rad[:-1])) - free, 0.0)
+    other = YAW_CHANGE_COST * np.maximum(np.abs(_wrap_angle(np.pi - yaw_rad[1:] - yaw_rad[:-1])) - free, 0.0)
+    unary = np.tile([0.0, SWAP_COST], (len(rows), 1))
+    return _scatter_to_frames(viterbi_two_labels(unary, same, other), rows, len(observations.time_s))
 
 
-def exchanged_limbs(observations: Observations, limb: str) -> Bool[np.ndarray, "n"]:
+def detect_limb_swaps(observations: Observations, limb: str) -> Bool[np.ndarray, "n"]:
     """Frames in which arms or legs are exchanged, by jumps in the image and by the side they lie on."""
-    pairs, telling, torso = LIMBS[limb]
-    rows = np.flatnonzero(torso_found(observations))
+    pairs, order_pair, torso = LIMB_SWAP_PAIRS[limb]
+    rows = np.flatnonzero(has_torso_landmarks(observations))
     if len(rows) == 0:
         return np.zeros(len(observations.time_s), dtype=bool)
     landmarks = observations.landmarks_px[rows].numpy()
-    directions = observations.directions_m[rows].numpy()
+    directions = observations.landmarks_3d_m[rows].numpy()
     torso_px = np.linalg.norm(landmarks[:, [11, 12]].mean(1) - landmarks[:, [23, 24]].mean(1), axis=1)
-    left, right = zip(*(pair for pair in pairs if pair[0] < POSE_LANDMARKS), strict=True)
-    limb_px, exchanged_px = landmarks[:, left + right], landmarks[:, right + left]
-    size = JUMP_COST / np.maximum(np.median(torso_px), 1.0) / _steps(observations, rows)
+    left, right = zip(*(pair for pair in pairs if pair[0] < POSE_LANDMARK_COUNT), strict=True)
+    limb_px, swapped_px = landmarks[:, left + right], landmarks[:, right + left]
+    size = LANDMARK_JUMP_COST / np.maximum(np.median(torso_px), 1.0) / _time_steps(observations, rows)
     same = size * np.linalg.norm(limb_px[1:] - limb_px[:-1], axis=2).mean(1)
-    other = size * np.linalg.norm(limb_px[1:] - exchanged_px[:-1], axis=2).mean(1)
+    other = size * np.linalg.norm(limb_px[1:] - swapped_px[:-1], axis=2).mean(1)
     across = directions[:, torso[0]] - directions[:, torso[1]]
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-6)
-    side = ((directions[:, telling[0]] - directions[:, telling[1]]) * across).sum(1) / SIDE_M
-    unary = SIDE_COST * np.stack([np.clip(-side, 0.0, 1.0), EXCHANGE_COST + np.clip(side, 0.0, 1.0)], axis=1)
-    return _spread(two_label_path(unary, same, other), rows, len(observations.time_s))
+    side = ((directions[:, order_pair[0]] - directions[:, order_pair[1]]) * across).sum(1) / WRONG_SIDE_DISTANCE_M
+    unary = WRONG_SIDE_COST * np.stack([np.clip(-side, 0.0, 1.0), SWAP_COST + np.clip(side, 0.0, 1.0)], axis=1)
+    return _scatter_to_frames(viterbi_two_labels(unary, same, other), rows, len(observations.time_s))
 
 
-def exchange_bodies(observations: Observations, exchanged: Bool[np.ndarray, "n"]) -> Observations:
+def swap_body_left_right(observations: Observations, left_right_swapped: Bool[np.ndarray, "n"]) -> Observations:
     """All left and right landmarks trade places in some frames; their 3D positions are mirrored in depth.
 
     A picture does not tell front from back: the same pixels with left and right exchanged belong to the person seen
@@ -109,33 +116,35 @@ def exchange_bodies(observations: Observations, exchanged: Bool[np.ndarray, "n"]
     """
     to_camera = _camera_rotation(observations)
     mirror = to_camera.T @ torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)) @ to_camera
-    swapped = _exchange(observations, exchanged, PAIRS)
-    directions = swapped.directions_m.clone()
-    directions[torch.from_numpy(exchanged)] @= mirror.T
-    return replace(swapped, directions_m=directions)
+    swapped = _swap_landmarks(observations, left_right_swapped, LEFT_RIGHT_PAIRS)
+    directions = swapped.landmarks_3d_m.clone()
+    directions[torch.from_numpy(left_right_swapped)] @= mirror.T
+    return replace(swapped, landmarks_3d_m=directions)
 
 
-def exchange_limbs(observations: Observations, exchanged: Bool[np.ndarray, "n"], limb: str) -> Observations:
-    """The landmarks of arms or legs trade places in some frames."""
-    return _exchange(observations, exchanged, LIMBS[limb][0])
-
-
-def _exchange(
-    observations: Observations, exchanged: Bool[np.ndarray, "n"], pairs: tuple[tuple[int, ...], ...]
+def swap_limb_left_right(
+    observations: Observations, left_right_swapped: Bool[np.ndarray, "n"], limb: str
 ) -> Observations:
-    order, rows = mirror_permutation(pairs), torch.from_numpy(exchanged)
+    """The landmarks of arms or legs trade places in some frames."""
+    return _swap_landmarks(observations, left_right_swapped, LIMB_SWAP_PAIRS[limb][0])
 
-    def traded(values: torch.Tensor) -> torch.Tensor:
+
+def _swap_landmarks(
+    observations: Observations, left_right_swapped: Bool[np.ndarray, "n"], pairs: tuple[tuple[int, ...], ...]
+) -> Observations:
+    order, rows = mirror_permutation(pairs), torch.from_numpy(left_right_swapped)
+
+    def permute(values: torch.Tensor) -> torch.Tensor:
         result = values.clone()
         result[rows] = values[rows][:, order]
         return result
 
     return replace(
         observations,
-        landmarks_px=traded(observations.landmarks_px),
-        directions_m=traded(observations.directions_m),
-        confidence=traded(observations.confidence),
-        direction_confidence=traded(observations.direction_confidence),
+        landmarks_px=permute(observations.landmarks_px),
+        landmarks_3d_m=permute(observations.landmarks_3d_m),
+        confidence=permute(observations.confidence),
+        confidence_3d=permute(observations.confidence_3d),
     )
 
 
@@ -143,16 +152,16 @@ def _camera_rotation(observations: Observations) -> Float[torch.Tensor, "3 3"]:
     return torch.as_tensor(observations.camera.world_to_camera, dtype=torch.float64)[:3, :3]
 
 
-def _steps(observations: Observations, rows: Int[np.ndarray, "k"]) -> Float[np.ndarray, "t"]:
-    """Time from each of some frames to the next, in steps of `STEP_S`, at least one."""
-    return np.maximum(np.diff(observations.time_s.numpy()[rows]) / STEP_S, 1.0)
+def _time_steps(observations: Observations, rows: Int[np.ndarray, "k"]) -> Float[np.ndarray, "t"]:
+    """Time from each of some frames to the next, in steps of `MIN_INTERVAL_S`, at least one."""
+    return np.maximum(np.diff(observations.time_s.numpy()[rows]) / MIN_INTERVAL_S, 1.0)
 
 
-def _spread(labels: Bool[np.ndarray, "k"], rows: np.ndarray, frames: int) -> Bool[np.ndarray, "n"]:
+def _scatter_to_frames(labels: Bool[np.ndarray, "k"], rows: np.ndarray, frames: int) -> Bool[np.ndarray, "n"]:
     everywhere = np.zeros(frames, dtype=bool)
     everywhere[rows] = labels
     return everywhere
 
 
-def _wrapped(angle_rad: np.ndarray) -> np.ndarray:
+def _wrap_angle(angle_rad: np.ndarray) -> np.ndarray:
     return (angle_rad + np.pi) % (2 * np.pi) - np.pi

@@ -22,51 +22,53 @@ DAMPING_LIMIT = 1e6
 
 @dataclass
 class NormalEquations:
-    """Sums of w J^T J and w J^T r, and the robust cost; float64. `next_frame[t]` couples frames t and t + 1."""
+    """Sums of w J^T J and w J^T r, and the robust cost; float64. `next_frame_coupling[t]` couples frames t and t +
+    1.
+    """
 
     frame: Float[Tensor, "n p p"]
     border: Float[Tensor, "n p g"]
     shared: Float[Tensor, "g g"]
     frame_gradient: Float[Tensor, "n p"]
     shared_gradient: Float[Tensor, "g"]
-    next_frame: Float[Tensor, "n p"]
-    after_next_frame: Float[Tensor, "n p"]
+    next_frame_coupling: Float[Tensor, "n p"]
+    second_next_frame_coupling: Float[Tensor, "n p"]
     cost: float = 0.0
 
     @classmethod
-    def zeros(cls, frames: int, numbers: int, shared: int) -> "NormalEquations":
+    def zeros(cls, frames: int, parameters: int, shared: int) -> "NormalEquations":
         """Nothing known yet."""
 
         def empty(*size: int) -> Tensor:
             return torch.zeros(*size, dtype=torch.float64)
 
         return cls(
-            frame=empty(frames, numbers, numbers),
-            border=empty(frames, numbers, shared),
+            frame=empty(frames, parameters, parameters),
+            border=empty(frames, parameters, shared),
             shared=empty(shared, shared),
-            frame_gradient=empty(frames, numbers),
+            frame_gradient=empty(frames, parameters),
             shared_gradient=empty(shared),
-            next_frame=empty(frames, numbers),
-            after_next_frame=empty(frames, numbers),
+            next_frame_coupling=empty(frames, parameters),
+            second_next_frame_coupling=empty(frames, parameters),
         )
 
     def add(
         self,
-        by_frame: Float[Tensor, "n r p"],
-        by_shared: Float[Tensor, "n r g"],
+        frame_jacobian: Float[Tensor, "n r p"],
+        shared_jacobian: Float[Tensor, "n r g"],
         residual: Float[Tensor, "n r"],
         weight: Float[Tensor, "n r"],
     ) -> None:
         """Accumulate rows that concern one frame each and the shared numbers; the cost is the caller's."""
-        weighted = by_frame * weight[..., None]
-        weighted_shared = (by_shared * weight[..., None]).flatten(0, 1)
-        self.frame += weighted.transpose(1, 2) @ by_frame
-        self.border += weighted.transpose(1, 2) @ by_shared
-        self.shared += weighted_shared.T @ by_shared.flatten(0, 1)
+        weighted = frame_jacobian * weight[..., None]
+        weighted_shared = (shared_jacobian * weight[..., None]).flatten(0, 1)
+        self.frame += weighted.transpose(1, 2) @ frame_jacobian
+        self.border += weighted.transpose(1, 2) @ shared_jacobian
+        self.shared += weighted_shared.T @ shared_jacobian.flatten(0, 1)
         self.frame_gradient += (weighted * residual[..., None]).sum(1)
         self.shared_gradient += weighted_shared.T @ residual.flatten()
 
-    def freeze(self, free: Bool[Tensor, "g"]) -> None:
+    def fix_parameters(self, free: Bool[Tensor, "g"]) -> None:
         """Take shared numbers that are not free out of the system: their step becomes zero."""
         self.border[:, :, ~free] = 0.0
         self.shared[~free] = 0.0
@@ -91,12 +93,12 @@ def _banded_factor(system: NormalEquations, damping: float) -> np.ndarray:
     rows, columns = np.tril_indices(p)
     band[rows - columns, :, columns] = system.frame[:, rows, columns].numpy().T
     band[0] = band[0] * (1.0 + damping) + 1e-9
-    band[p] = system.next_frame.numpy()
-    band[2 * p] = system.after_next_frame.numpy()
+    band[p] = system.next_frame_coupling.numpy()
+    band[2 * p] = system.second_next_frame_coupling.numpy()
     return cholesky_banded(band.reshape(2 * p + 1, n * p), lower=True, check_finite=False)
 
 
-def _shared_schur(
+def _schur_complement(
     system: NormalEquations, factor: np.ndarray, damping: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(matrix of the shared numbers after the frames are eliminated, border solved, frames' gradient solved)."""
@@ -116,7 +118,7 @@ def solve(system: NormalEquations, damping: float) -> tuple[Float[Tensor, "n p"]
     if len(system.shared_gradient) == 0:
         step = -cho_solve_banded((factor, True), system.frame_gradient.flatten().numpy(), check_finite=False)
         return torch.from_numpy(step.reshape(n, p)), system.shared_gradient
-    matrix, solved_border, solved_gradient = _shared_schur(system, factor, damping)
+    matrix, solved_border, solved_gradient = _schur_complement(system, factor, damping)
     border = system.border.reshape(n * p, -1).numpy()
     right = system.shared_gradient.numpy() - border.T @ solved_gradient
     shared_step = -cho_solve(cho_factor(matrix, check_finite=False), right, check_finite=False)
@@ -126,7 +128,7 @@ def solve(system: NormalEquations, damping: float) -> tuple[Float[Tensor, "n p"]
 
 def shared_covariance(system: NormalEquations) -> Float[np.ndarray, "g g"]:
     """Covariance of the shared numbers with the frames' numbers marginalised out, for residuals of unit variance."""
-    matrix, _, _ = _shared_schur(system, _banded_factor(system, 0.0), 0.0)
+    matrix, _, _ = _schur_complement(system, _banded_factor(system, 0.0), 0.0)
     return np.linalg.inv(matrix)
 
 

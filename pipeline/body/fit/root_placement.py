@@ -8,29 +8,29 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pipeline.geometry.camera import Camera, world_to_camera_points
+from pipeline.geometry.camera import Camera, transform_world_to_camera
 
 MINIMUM_DEPTH_M = 0.2
 
 
-def place_of_root(root_m: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n 3"]:
+def world_to_perspective(root_m: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n 3"]:
     """Tangents of the viewing angles and logarithm of the depth (m) of world positions; depth is kept positive."""
-    x, y, depth_m = world_to_camera_points(root_m, camera).unbind(-1)
+    x, y, depth_m = transform_world_to_camera(root_m, camera).unbind(-1)
     depth_m = depth_m.clamp(min=MINIMUM_DEPTH_M)
     return torch.stack([x / depth_m, y / depth_m, depth_m.log()], dim=-1)
 
 
-def root_of_place(place: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n 3"]:
-    """World positions (m); inverse of `place_of_root`."""
-    pose = torch.as_tensor(camera.world_to_camera, dtype=place.dtype)
-    ray = torch.cat([place[:, :2], torch.ones_like(place[:, :1])], dim=-1)
-    return (ray * place[:, 2:].exp() - pose[:3, 3]) @ pose[:3, :3]
+def perspective_to_world(root_perspective: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n 3"]:
+    """World positions (m); inverse of `world_to_perspective`."""
+    pose = torch.as_tensor(camera.world_to_camera, dtype=root_perspective.dtype)
+    ray = torch.cat([root_perspective[:, :2], torch.ones_like(root_perspective[:, :1])], dim=-1)
+    return (ray * root_perspective[:, 2:].exp() - pose[:3, 3]) @ pose[:3, :3]
 
 
-def root_by_place(root_m: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n 3 3"]:
+def root_jacobian(root_m: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n 3 3"]:
     """Derivative of the world position by the place."""
     pose = torch.as_tensor(camera.world_to_camera, dtype=root_m.dtype)
-    in_camera = world_to_camera_points(root_m, camera)
+    in_camera = transform_world_to_camera(root_m, camera)
     depth_m, zero = in_camera[:, 2].clamp(min=MINIMUM_DEPTH_M), torch.zeros(len(root_m), dtype=root_m.dtype)
     sideways = torch.stack([depth_m, zero, zero], dim=-1)
     downward = torch.stack([zero, depth_m, zero], dim=-1)

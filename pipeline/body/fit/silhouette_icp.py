@@ -15,44 +15,44 @@ from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from pipeline.body.fit.camera_parameters import through_lens
+from pipeline.body.fit.camera_parameters import apply_intrinsics_delta
 from pipeline.body.fit.energy import Contour, FitState, Observations
-from pipeline.body.fit.linear_body import ACTIVE_JOINTS, FitModel, pose_skeleton
+from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody, pose_skeleton
 from pipeline.geometry.camera import Camera, project
-from pipeline.geometry.skinning import linear_blend_skinning, rigid
+from pipeline.geometry.skinning import linear_blend_skinning, rigid_transform
 from pipeline.kernels.raster import rasterize
 
-PERSON_ROWS = 240
+PERSON_HEIGHT_PX = 240
 """Height of a person in a matching window, pixels."""
 
-POINTS_PER_SIDE = 120
+PAIRS_PER_DIRECTION = 120
 """Pairs a frame from the body's outline, and as many from the mask's."""
 
-FRAME_SHARE = 40.0
+FRAME_WEIGHT = 40.0
 """What all pairs of a frame weigh together: outline points next to each other err alike."""
 
-REACH = 0.10
+MAX_PAIR_DISTANCE_RATIO = 0.10
 """How far a pair may lie apart, as a share of the person's height."""
 
-CLOTHING_SHARE = 0.5
+CLOTHING_WEIGHT = 0.5
 """Weight of pairs where the mask lies outside the body, as clothes do, against those where the body sticks out."""
 
-BULK_SHARE = 0.05
+HAIR_AND_SHOES_WEIGHT = 0.05
 """The same on head and feet: hair and shoes add to the outline's height, which must not pass for a person who is
 nearer."""
 
-BULKY_JOINTS = ("Head", "LeftFoot", "LeftToeBase", "RightFoot", "RightToeBase")
+HEAD_AND_FOOT_JOINTS = ("Head", "LeftFoot", "LeftToeBase", "RightFoot", "RightToeBase")
 
-DOUBT_FROM, DOUBT_TO = 0.05, 0.15
+FULL_WEIGHT_IOU_DROP, MIN_WEIGHT_IOU_DROP = 0.05, 0.15
 """A frame's outlines count fully while its overlap is this near to the median, and hardly when it is that far below."""
 
-LEAST_TRUST = 0.05
+MIN_MASK_WEIGHT = 0.05
 
 SKIN_CHUNK = 32
 
 
 @dataclass(frozen=True)
-class Window:
+class MaskWindow:
     """One frame's mask in its matching window: signed distance to the outline (window pixels), its unit gradient, and
     the outline's pixels (row, column)."""
 
@@ -66,8 +66,8 @@ class Window:
     person_px: float
 
 
-def matching_window(mask: UInt8[np.ndarray, "h w"]) -> Window | None:
-    """Cut the person out of a mask and shrink it to `PERSON_ROWS`; None when the mask is empty."""
+def crop_mask_window(mask: UInt8[np.ndarray, "h w"]) -> MaskWindow | None:
+    """Cut the person out of a mask and shrink it to `PERSON_HEIGHT_PX`; None when the mask is empty."""
     rows, columns = np.flatnonzero((mask > 127).any(1)), np.flatnonzero((mask > 127).any(0))
     if len(rows) == 0:
         return None
@@ -75,11 +75,13 @@ def matching_window(mask: UInt8[np.ndarray, "h w"]) -> Window | None:
     margin = int(0.2 * person) + 2
     top, bottom = max(int(rows[0]) - margin, 0), min(int(rows[-1]) + margin, mask.shape[0])
     left, right = max(int(columns[0]) - margin, 0), min(int(columns[-1]) + margin, mask.shape[1])
-    scale = min(1.0, PERSON_ROWS / person)
+    scale = min(1.0, PERSON_HEIGHT_PX / person)
     size = (max(1, round((right - left) * scale)), max(1, round((bottom - top) * scale)))
     small = cv2.resize(mask[top:bottom, left:right], size, interpolation=cv2.INTER_AREA) > 127
     distance = signed_distance(small)
-    return Window(left, top, scale, small, distance, outward_normals(distance), outline_pixels(small), person * scale)
+    return MaskWindow(
+        left, top, scale, small, distance, outward_normals(distance), outline_pixels(small), person * scale
+    )
 
 
 def signed_distance(inside: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
@@ -104,34 +106,34 @@ def outward_normals(distance: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h 
     return np.stack([across / length, down / length], axis=-1)
 
 
-def posed_vertices(model: FitModel, state: FitState) -> Float[Tensor, "n v 3"]:
+def posed_vertices(model: LinearBody, state: FitState) -> Float[Tensor, "n v 3"]:
     """World vertices (float32) of the state's body in every frame."""
     posed = model.moved(state.shape)
     skeleton = pose_skeleton(posed, state.rotations, state.root_m)
     moved = (skeleton.rotation @ posed.joints[:, :, None]).squeeze(-1)
-    transforms = rigid(skeleton.rotation, skeleton.position - moved).float()
+    transforms = rigid_transform(skeleton.rotation, skeleton.position - moved).float()
     vertices, weights = posed.vertices.float(), posed.weights.float()
     chunks = [linear_blend_skinning(vertices, weights, part) for part in transforms.split(SKIN_CHUNK)]
     return torch.cat(chunks)
 
 
 @dataclass(frozen=True)
-class Drawing:
+class BodyRaster:
     """The body drawn into a window: which face each pixel shows, and where on it."""
 
     face_id: Int[np.ndarray, "h w"]
     barycentric: Float[np.ndarray, "h w 3"]
 
 
-def draw_in_window(
-    vertices_world: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], camera: Camera, window: Window
-) -> Drawing:
+def rasterise_in_window(
+    vertices_world: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], camera: Camera, window: MaskWindow
+) -> BodyRaster:
     """Rasterise a posed body in a window's pixels."""
     vertices_px, depth_m = project(vertices_world, camera)
     corner = vertices_px.new_tensor([window.left_px, window.top_px])
     height, width = window.mask.shape
     face_id, barycentric, _ = rasterize((vertices_px - corner) * window.scale, depth_m, faces, height, width)
-    return Drawing(face_id.numpy(), barycentric.numpy())
+    return BodyRaster(face_id.numpy(), barycentric.numpy())
 
 
 def intersection_over_union(first: Bool[np.ndarray, "h w"], second: Bool[np.ndarray, "h w"]) -> float:
@@ -141,7 +143,7 @@ def intersection_over_union(first: Bool[np.ndarray, "h w"], second: Bool[np.ndar
 
 
 @dataclass(frozen=True)
-class Pairs:
+class Correspondences:
     """Pairs of one frame, in window pixels (x, y)."""
 
     pixel: Int[np.ndarray, "m 2"]
@@ -150,90 +152,97 @@ class Pairs:
     weight: Float[np.ndarray, "m"]
 
 
-def match_outlines(window: Window, drawn: Bool[np.ndarray, "h w"], bulky: Bool[np.ndarray, "h w"]) -> Pairs:
+def find_correspondences(
+    window: MaskWindow, body_mask: Bool[np.ndarray, "h w"], is_head_or_foot: Bool[np.ndarray, "h w"]
+) -> Correspondences:
     """Pairs between the outline of the drawn body and that of the mask (both kinds of the module's docstring).
 
     bulky: pixels of the body's head and feet.
     """
-    body_outline = outline_pixels(drawn)
+    body_outline = outline_pixels(body_mask)
     if len(body_outline) == 0 or len(window.outline) == 0:
         empty = np.zeros((0, 2))
-        return Pairs(empty.astype(np.int64), empty, empty, np.zeros(0))
-    mask_normal, body_normal = window.normal, outward_normals(signed_distance(drawn))
-    reach = REACH * window.person_px
-    forward = _thinned(body_outline)
+        return Correspondences(empty.astype(np.int64), empty, empty, np.zeros(0))
+    mask_normal, body_normal = window.normal, outward_normals(signed_distance(body_mask))
+    max_distance = MAX_PAIR_DISTANCE_RATIO * window.person_px
+    forward = _subsample(body_outline)
     normal = mask_normal[forward[:, 0], forward[:, 1]]
     gap = window.distance[forward[:, 0], forward[:, 1]] + 0.5
     agree = (normal * body_normal[forward[:, 0], forward[:, 1]]).sum(1) > 0.3
-    first = Pairs(
+    first = Correspondences(
         forward,
         forward[:, ::-1] + 0.5 - gap[:, None] * normal,
         normal,
-        ((np.abs(gap) < reach) & agree) * _slack(gap, bulky[forward[:, 0], forward[:, 1]]),
+        ((np.abs(gap) < max_distance) & agree) * _clothing_weights(gap, is_head_or_foot[forward[:, 0], forward[:, 1]]),
     )
-    backward = _thinned(window.outline)
-    apart, nearest = cKDTree(body_outline).query(backward)
+    backward = _subsample(window.outline)
+    distance_px, nearest = cKDTree(body_outline).query(backward)
     partner = body_outline[nearest]
     normal = mask_normal[backward[:, 0], backward[:, 1]]
     gap = ((partner - backward)[:, ::-1] * normal).sum(1)
     agree = (normal * body_normal[partner[:, 0], partner[:, 1]]).sum(1) > 0.3
-    second = Pairs(
+    second = Correspondences(
         partner,
         backward[:, ::-1] + 0.5,
         normal,
-        ((apart < reach) & agree) * _slack(gap, bulky[partner[:, 0], partner[:, 1]]),
+        ((distance_px < max_distance) & agree) * _clothing_weights(gap, is_head_or_foot[partner[:, 0], partner[:, 1]]),
     )
-    return Pairs(*(np.concatenate(pair) for pair in zip(vars(first).values(), vars(second).values(), strict=True)))
+    return Correspondences(
+        *(np.concatenate(pair) for pair in zip(vars(first).values(), vars(second).values(), strict=True))
+    )
 
 
-def _slack(gap: Float[np.ndarray, "m"], bulky: Bool[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
+def _clothing_weights(gap: Float[np.ndarray, "m"], is_head_or_foot: Bool[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
     """Less weight where the mask lies outside the body (gap < 0): clothes, and even more so hair and shoes."""
-    return np.where(gap < 0, np.where(bulky, BULK_SHARE, CLOTHING_SHARE), 1.0)
+    return np.where(gap < 0, np.where(is_head_or_foot, HAIR_AND_SHOES_WEIGHT, CLOTHING_WEIGHT), 1.0)
 
 
-def _thinned(pixels: Int[np.ndarray, "q 2"]) -> Int[np.ndarray, "m 2"]:
-    """About `POINTS_PER_SIDE` of an outline's pixels, evenly along the scan order."""
-    return pixels[np.linspace(0, len(pixels) - 1, min(POINTS_PER_SIDE, len(pixels))).astype(np.int64)]
+def _subsample(pixels: Int[np.ndarray, "q 2"]) -> Int[np.ndarray, "m 2"]:
+    """About `PAIRS_PER_DIRECTION` of an outline's pixels, evenly along the scan order."""
+    return pixels[np.linspace(0, len(pixels) - 1, min(PAIRS_PER_DIRECTION, len(pixels))).astype(np.int64)]
 
 
-def mask_trust(overlap: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+def mask_weights(silhouette_iou: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     """Share of each frame's outlines that counts: a mask that agrees much less with the body than others is doubtful.
 
     Frames without a mask (nan) get full trust, which multiplies nothing.
     """
-    if np.isnan(overlap).all():
-        return np.ones_like(overlap)
-    behind = np.nanmedian(overlap) - overlap
-    return np.nan_to_num(np.clip((DOUBT_TO - behind) / (DOUBT_TO - DOUBT_FROM), LEAST_TRUST, 1.0), nan=1.0)
+    if np.isnan(silhouette_iou).all():
+        return np.ones_like(silhouette_iou)
+    iou_drop = np.nanmedian(silhouette_iou) - silhouette_iou
+    return np.nan_to_num(
+        np.clip((MIN_WEIGHT_IOU_DROP - iou_drop) / (MIN_WEIGHT_IOU_DROP - FULL_WEIGHT_IOU_DROP), MIN_MASK_WEIGHT, 1.0),
+        nan=1.0,
+    )
 
 
-def match_all(
-    model: FitModel, state: FitState, observations: Observations, windows: Sequence[Window | None]
+def match_silhouettes(
+    model: LinearBody, state: FitState, observations: Observations, windows: Sequence[MaskWindow | None]
 ) -> tuple[Contour, Float[np.ndarray, "n"]]:
     """The contour term for the body as it stands, and each frame's overlap with its mask (nan without a mask)."""
-    camera = through_lens(observations.camera, state.lens)
+    camera = apply_intrinsics_delta(observations.camera, state.intrinsics_delta)
     vertices = posed_vertices(model, state)
-    carried = model.weights[:, [ACTIVE_JOINTS.index(name) for name in BULKY_JOINTS]].sum(1)
-    bulky_faces = (carried > 0.5)[model.faces[:, 0].long()].numpy()
-    size = 2 * POINTS_PER_SIDE
+    carried = model.weights[:, [ACTIVE_JOINTS.index(name) for name in HEAD_AND_FOOT_JOINTS]].sum(1)
+    head_and_foot_faces = (carried > 0.5)[model.faces[:, 0].long()].numpy()
+    size = 2 * PAIRS_PER_DIRECTION
     frames = len(windows)
     corners = torch.zeros(frames, size, 3, dtype=torch.int64)
     barycentric, target = torch.zeros(frames, size, 3).double(), torch.zeros(frames, size, 2).double()
     normal, weight = torch.zeros(frames, size, 2).double(), torch.zeros(frames, size).double()
-    overlap = np.full(frames, np.nan)
+    silhouette_iou = np.full(frames, np.nan)
     for frame, window in enumerate(windows):
         if window is None:
             continue
-        drawing = draw_in_window(vertices[frame], model.faces, camera, window)
-        drawn = drawing.face_id >= 0
-        overlap[frame] = intersection_over_union(drawn, window.mask)
-        pairs = match_outlines(window, drawn, drawn & bulky_faces[drawing.face_id])
+        body_raster = rasterise_in_window(vertices[frame], model.faces, camera, window)
+        body_mask = body_raster.face_id >= 0
+        silhouette_iou[frame] = intersection_over_union(body_mask, window.mask)
+        pairs = find_correspondences(window, body_mask, body_mask & head_and_foot_faces[body_raster.face_id])
         count, used = len(pairs.weight), (pairs.weight > 0).sum()
         rows, columns = pairs.pixel.T
-        corners[frame, :count] = model.faces[drawing.face_id[rows, columns]].long()
-        barycentric[frame, :count] = torch.from_numpy(drawing.barycentric[rows, columns]).double()
+        corners[frame, :count] = model.faces[body_raster.face_id[rows, columns]].long()
+        barycentric[frame, :count] = torch.from_numpy(body_raster.barycentric[rows, columns]).double()
         target[frame, :count] = torch.from_numpy(pairs.target / window.scale + [window.left_px, window.top_px])
         normal[frame, :count] = torch.from_numpy(pairs.normal).double()
-        weight[frame, :count] = torch.from_numpy(pairs.weight * (FRAME_SHARE / max(used, 1)))
-    weight *= torch.from_numpy(mask_trust(overlap))[:, None]
-    return Contour(corners, barycentric, target, normal, weight), overlap
+        weight[frame, :count] = torch.from_numpy(pairs.weight * (FRAME_WEIGHT / max(used, 1)))
+    weight *= torch.from_numpy(mask_weights(silhouette_iou))[:, None]
+    return Contour(corners, barycentric, target, normal, weight), silhouette_iou

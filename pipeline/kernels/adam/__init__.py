@@ -31,10 +31,10 @@ def adam_step_(
     if any(tensor.shape != parameter.shape or not tensor.is_contiguous() for tensor in tensors):
         raise ValueError("parameter, gradient and moments must be contiguous and of one shape")
     rate = learning_rate * (1 - betas[1] ** step) ** 0.5 / (1 - betas[0] ** step)
-    floor = epsilon * (1 - betas[1] ** step) ** 0.5
+    scaled_epsilon = epsilon * (1 - betas[1] ** step) ** 0.5
     with torch.no_grad():
         if runs_on_numba(*tensors):
             flat = [tensor.view(-1).numpy() for tensor in tensors]
-            adam_cpu.update(flat[0], flat[1], flat[2], flat[3], rate, betas[0], betas[1], floor)
+            adam_cpu.update(flat[0], flat[1], flat[2], flat[3], rate, betas[0], betas[1], scaled_epsilon)
         else:
-            reference.update(*tensors, rate, betas[0], betas[1], floor)
+            reference.update(*tensors, rate, betas[0], betas[1], scaled_epsilon)

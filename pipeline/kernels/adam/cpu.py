@@ -3,13 +3,13 @@
 import numpy as np
 from numba import njit, prange
 
-from pipeline.kernels.common.numba_options import OPTIONS
+from pipeline.kernels.common.numba_options import NJIT_OPTIONS
 
 CHUNK = 1 << 15
 
 
-@njit(**OPTIONS)
-def _update_slice(parameter, gradient, first, second, rate, beta1, beta2, floor):
+@njit(**NJIT_OPTIONS)
+def _update_slice(parameter, gradient, first, second, rate, beta1, beta2, scaled_epsilon):
     limit, tiny, zero = np.float32(1e18), np.float32(1e-30), np.float32(0)
     rest1, rest2 = np.float32(1) - beta1, np.float32(1) - beta2
     for i in range(parameter.shape[0]):
@@ -22,19 +22,19 @@ def _update_slice(parameter, gradient, first, second, rate, beta1, beta2, floor)
         first[i] = m
         second[i] = v
         gradient[i] = zero
-        parameter[i] -= rate * m / (np.sqrt(v) + floor)
+        parameter[i] -= rate * m / (np.sqrt(v) + scaled_epsilon)
 
 
-@njit(parallel=True, **OPTIONS)
-def _update(parameter, gradient, first, second, rate, beta1, beta2, floor):
+@njit(parallel=True, **NJIT_OPTIONS)
+def _update(parameter, gradient, first, second, rate, beta1, beta2, scaled_epsilon):
     count = parameter.shape[0]
     for chunk in prange((count + CHUNK - 1) // CHUNK):
         a = chunk * CHUNK
         b = min(a + CHUNK, count)
-        _update_slice(parameter[a:b], gradient[a:b], first[a:b], second[a:b], rate, beta1, beta2, floor)
+        _update_slice(parameter[a:b], gradient[a:b], first[a:b], second[a:b], rate, beta1, beta2, scaled_epsilon)
 
 
-def update(parameter, gradient, first, second, rate, beta1, beta2, floor):
-    """One update of flat float32 arrays; `rate` and `floor` have the bias corrections in them."""
-    scalars = (np.float32(value) for value in (rate, beta1, beta2, floor))
+def update(parameter, gradient, first, second, rate, beta1, beta2, scaled_epsilon):
+    """One update of flat float32 arrays; `rate` and `scaled_epsilon` have the bias corrections in them."""
+    scalars = (np.float32(value) for value in (rate, beta1, beta2, scaled_epsilon))
     _update(parameter, gradient, first, second, *scalars)

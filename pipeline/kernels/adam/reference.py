@@ -12,7 +12,7 @@ def update(
     rate: float,
     beta1: float,
     beta2: float,
-    floor: float,
+    scaled_epsilon: float,
 ) -> None:
     """Same as `pipeline.kernels.adam.cpu.update`, on tensors of one shape."""
     finite = torch.where(gradient.abs() < 1e18, gradient, 0)
@@ -20,5 +20,5 @@ def update(
     second.mul_(beta2).addcmul_(finite, finite, value=1 - beta2)
     first.mul_(first.abs() > 1e-30)
     second.mul_(second > 1e-30)
-    parameter.sub_(rate * first / (second.sqrt() + floor))
+    parameter.sub_(rate * first / (second.sqrt() + scaled_epsilon))
     gradient.zero_()

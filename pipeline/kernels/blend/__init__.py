@@ -17,7 +17,7 @@ from pipeline.kernels.common.dispatch import runs_on_numba
 class SparseWeights(NamedTuple):
     """The weights that are not zero, node after node; those of node i are row_start[i] : row_start[i + 1]."""
 
-    row_start: Int[Tensor, "m1"]
+    row_offsets: Int[Tensor, "m1"]
     joint: Int[Tensor, "e"]
     weight: Float[Tensor, "e"]
 
@@ -25,14 +25,14 @@ class SparseWeights(NamedTuple):
     def of(weights: Float[Tensor, "m j"]) -> "SparseWeights":
         """Without the zeros."""
         node, joint = torch.nonzero(weights, as_tuple=True)
-        row_start = torch.searchsorted(node, torch.arange(len(weights) + 1, device=node.device))
-        return SparseWeights(row_start, joint, weights[node, joint])
+        row_offsets = torch.searchsorted(node, torch.arange(len(weights) + 1, device=node.device))
+        return SparseWeights(row_offsets, joint, weights[node, joint])
 
 
 class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, weights: SparseWeights, values: Tensor) -> Tensor:
-        blended = values.new_empty(len(weights.row_start) - 1, values.shape[1])
+        blended = values.new_empty(len(weights.row_offsets) - 1, values.shape[1])
         arrays = (tensor.detach().numpy() for tensor in (*weights, values, blended))
         blend_cpu.blend(*arrays)
         ctx.weights, ctx.joints = weights, len(values)

@@ -7,36 +7,36 @@ threads.
 import numpy as np
 from numba import njit, prange
 
-from pipeline.kernels.common.numba_options import OPTIONS
+from pipeline.kernels.common.numba_options import NJIT_OPTIONS
 
 PARTS = 16
 
 
-@njit(**OPTIONS)
+@njit(**NJIT_OPTIONS)
 def _add_scaled(scale, values, total):
     """Slices go to a function of their own: LLVM then knows that they do not overlap."""
     for column in range(values.shape[0]):
         total[column] += scale * values[column]
 
 
-@njit(parallel=True, **OPTIONS)
-def blend(row_start, joint, weight, values, blended):
+@njit(parallel=True, **NJIT_OPTIONS)
+def blend(row_offsets, joint, weight, values, blended):
     """Fill blended (m, c) from values (j, c)."""
     nodes = blended.shape[0]
     for part in prange(PARTS):
         for node in range(part * nodes // PARTS, (part + 1) * nodes // PARTS):
             blended[node] = np.float32(0)
-            for entry in range(row_start[node], row_start[node + 1]):
+            for entry in range(row_offsets[node], row_offsets[node + 1]):
                 _add_scaled(weight[entry], values[joint[entry]], blended[node])
 
 
-@njit(parallel=True, **OPTIONS)
-def blend_backward(row_start, joint, weight, joints, blended_gradient):
+@njit(parallel=True, **NJIT_OPTIONS)
+def blend_backward(row_offsets, joint, weight, joints, grad_blended):
     """What each part of the nodes adds to dL/dvalues, (PARTS, j, c), for dL/dblended (m, c)."""
-    nodes, columns = blended_gradient.shape
+    nodes, columns = grad_blended.shape
     sums = np.zeros((PARTS, joints, columns), np.float32)
     for part in prange(PARTS):
         for node in range(part * nodes // PARTS, (part + 1) * nodes // PARTS):
-            for entry in range(row_start[node], row_start[node + 1]):
-                _add_scaled(weight[entry], blended_gradient[node], sums[part, joint[entry]])
+            for entry in range(row_offsets[node], row_offsets[node + 1]):
+                _add_scaled(weight[entry], grad_blended[node], sums[part, joint[entry]])
     return sums

@@ -3,13 +3,13 @@
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pipeline.kernels.common.packing import owner_of_each
+from pipeline.kernels.common.packing import segment_ids_from_counts
 
 
 def blend(
-    row_start: Int[Tensor, "m1"], joint: Int[Tensor, "e"], weight: Float[Tensor, "e"], values: Float[Tensor, "j c"]
+    row_offsets: Int[Tensor, "m1"], joint: Int[Tensor, "e"], weight: Float[Tensor, "e"], values: Float[Tensor, "j c"]
 ) -> Float[Tensor, "m c"]:
     """Same as `pipeline.kernels.blend.blend`, of the arrays of `SparseWeights`."""
-    node = owner_of_each(row_start.diff())
-    blended = values.new_zeros(len(row_start) - 1, values.shape[1])
+    node = segment_ids_from_counts(row_offsets.diff())
+    blended = values.new_zeros(len(row_offsets) - 1, values.shape[1])
     return blended.index_add(0, node, weight.to(values)[:, None] * values.index_select(0, joint))

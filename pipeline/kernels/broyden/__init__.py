@@ -20,12 +20,12 @@ from pipeline.kernels.inverse_skinning import SkinGrid
 ITERATIONS = 10
 CONVERGED_M, DIVERGED_M = 1e-5, 0.1
 """Residuals at which a search has arrived, or is given up (Fast-SNARF's)."""
-SAME_ROOT_M = 1e-3
+DUPLICATE_ROOT_M = 1e-3
 CANDIDATES = 4
 """Roots kept of a point, as many as a cell of the warp grid has."""
 
 
-def search(
+def find_roots(
     posed_m: Float[Tensor, "n 3"],
     frame: Int[Tensor, "n"],
     bone_to_posed: Float[Tensor, "k b 4 4"],
@@ -40,14 +40,14 @@ def search(
         blended: `SkinGrid.blend` of the frames.
     """
     starts = torch.linalg.inv(bone_to_posed.detach())[:, :, :3].reshape(*bone_to_posed.shape[:2], 12).contiguous()
-    limits = (ITERATIONS, CONVERGED_M, DIVERGED_M, SAME_ROOT_M)
+    limits = (ITERATIONS, CONVERGED_M, DIVERGED_M, DUPLICATE_ROOT_M)
     if not runs_on_numba(posed_m, starts, blended):
-        return reference.search(posed_m.detach(), frame, starts, blended.detach(), skin.lattice, limits, CANDIDATES)
+        return reference.find_roots(posed_m.detach(), frame, starts, blended.detach(), skin.lattice, limits, CANDIDATES)
     roots, counts = np.zeros((len(posed_m), CANDIDATES, 3), np.float32), np.zeros(len(posed_m), np.int64)
     points, table = posed_m.detach().contiguous().numpy(), blended.detach().contiguous().numpy()
     origin, cell, rows = skin.origin_m.numpy(), np.float32(skin.cell_m), skin.row_of_node.numpy()
     residuals = [np.float32(limit) for limit in limits[1:]]
-    broyden_cpu.search(
+    broyden_cpu.find_roots(
         points, frame.numpy(), starts.numpy(), table, origin, cell, rows, ITERATIONS, *residuals, roots, counts
     )
     return torch.from_numpy(roots), torch.arange(CANDIDATES) < torch.from_numpy(counts)[:, None]

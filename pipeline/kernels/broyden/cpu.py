@@ -3,13 +3,13 @@
 import numpy as np
 from numba import njit, prange
 
-from pipeline.kernels.common.numba_options import OPTIONS
+from pipeline.kernels.common.numba_options import NJIT_OPTIONS
 from pipeline.kernels.inverse_skinning.newton_cpu import invert
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
-@njit(**OPTIONS)
+@njit(**NJIT_OPTIONS)
 def _blend(x, frame, origin, cell, row_of_node, blended, matrix):
     """Fill the skinning matrix (12) at a canonical point; False outside the grid."""
     gx, gy, gz = (x[0] - origin[0]) / cell, (x[1] - origin[1]) / cell, (x[2] - origin[2]) / cell
@@ -30,71 +30,77 @@ def _blend(x, frame, origin, cell, row_of_node, blended, matrix):
     return True
 
 
-@njit(**OPTIONS)
-def _miss(matrix, x, target, miss):
-    """A(x) x - p into `miss`; returns its squared length."""
+@njit(**NJIT_OPTIONS)
+def _residual(matrix, x, target, residual):
+    """A(x) x - p into `residual`; returns its squared length."""
     squared = _ZERO
     for axis in range(3):
         row = 4 * axis
         value = matrix[row] * x[0] + matrix[row + 1] * x[1] + matrix[row + 2] * x[2] + matrix[row + 3] - target[axis]
-        miss[axis] = value
+        residual[axis] = value
         squared += value * value
     return squared
 
 
-@njit(**OPTIONS)
-def _update(inverse, move, change):
+@njit(**NJIT_OPTIONS)
+def _broyden_update(inverse, delta_x, delta_residual):
     """Broyden's good update of the inverse Jacobian; False if it is not possible."""
     along, ahead = np.empty(3, np.float32), np.empty(3, np.float32)
     scale = _ZERO
     for axis in range(3):
-        along[axis] = move[0] * inverse[0, axis] + move[1] * inverse[1, axis] + move[2] * inverse[2, axis]
-        ahead[axis] = inverse[axis, 0] * change[0] + inverse[axis, 1] * change[1] + inverse[axis, 2] * change[2]
-        scale += along[axis] * change[axis]
+        along[axis] = delta_x[0] * inverse[0, axis] + delta_x[1] * inverse[1, axis] + delta_x[2] * inverse[2, axis]
+        ahead[axis] = (
+            inverse[axis, 0] * delta_residual[0]
+            + inverse[axis, 1] * delta_residual[1]
+            + inverse[axis, 2] * delta_residual[2]
+        )
+        scale += along[axis] * delta_residual[axis]
     if abs(scale) < np.float32(1e-14):
         return False
     for row in range(3):
         for column in range(3):
-            inverse[row, column] += (move[row] - ahead[row]) * along[column] / scale
+            inverse[row, column] += (delta_x[row] - ahead[row]) * along[column] / scale
     return True
 
 
-@njit(**OPTIONS)
-def _search(target, x, frame, iterations, converged, diverged, origin, cell, row_of_node, blended, inverse, matrix):
+@njit(**NJIT_OPTIONS)
+def _find_root(target, x, frame, iterations, converged, diverged, origin, cell, row_of_node, blended, inverse, matrix):
     """Move `x` to a root of A(x) x = target; True if it got there."""
-    miss, before, move = np.empty(3, np.float32), np.empty(3, np.float32), np.empty(3, np.float32)
+    residual, before, delta_x = np.empty(3, np.float32), np.empty(3, np.float32), np.empty(3, np.float32)
     if not _blend(x, frame, origin, cell, row_of_node, blended, matrix):
         return False
-    sound, a, b, c, d, e, f, g, h, k = invert(
+    invertible, a, b, c, d, e, f, g, h, k = invert(
         matrix[0], matrix[1], matrix[2], matrix[4], matrix[5], matrix[6], matrix[8], matrix[9], matrix[10]
     )
-    if not sound:
+    if not invertible:
         return False
     inverse[0, 0], inverse[0, 1], inverse[0, 2] = a, b, c
     inverse[1, 0], inverse[1, 1], inverse[1, 2] = d, e, f
     inverse[2, 0], inverse[2, 1], inverse[2, 2] = g, h, k
-    squared = _miss(matrix, x, target, miss)
+    squared = _residual(matrix, x, target, residual)
     for _ in range(iterations):
         if squared < converged * converged:
             return True
         for axis in range(3):
-            before[axis] = miss[axis]
-            move[axis] = -(inverse[axis, 0] * miss[0] + inverse[axis, 1] * miss[1] + inverse[axis, 2] * miss[2])
-            x[axis] += move[axis]
+            before[axis] = residual[axis]
+            delta_x[axis] = -(
+                inverse[axis, 0] * residual[0] + inverse[axis, 1] * residual[1] + inverse[axis, 2] * residual[2]
+            )
+            x[axis] += delta_x[axis]
         if not _blend(x, frame, origin, cell, row_of_node, blended, matrix):
             return False
-        squared = _miss(matrix, x, target, miss)
+        squared = _residual(matrix, x, target, residual)
         if squared > diverged * diverged:
             return False
         for axis in range(3):
-            before[axis] = miss[axis] - before[axis]
-        if squared >= converged * converged and not _update(inverse, move, before):
+            before[axis] = residual[axis] - before[axis]
+        if squared >= converged * converged and not _broyden_update(inverse, delta_x, before):
             return False
     return squared < converged * converged
 
 
-@njit(parallel=True, **OPTIONS)
-def search(
+@njit(parallel=True, **NJIT_OPTIONS)
+def find_roots(
     posed,
     frame,
     posed_to_start,
@@ -109,7 +115,7 @@ def search(
     roots,
     counts,
 ):
-    """Fill roots (n, c, 3) and how many of them (n) each posed point has: see `pipeline.kernels.broyden.search`."""
+    """Fill roots (n, c, 3) and how many of them (n) each posed point has: see `pipeline.kernels.broyden.find_roots`."""
     for point in prange(posed.shape[0]):
         x, matrix, inverse = np.empty(3, np.float32), np.empty(12, np.float32), np.empty((3, 3), np.float32)
         f, found = frame[point], 0
@@ -124,7 +130,7 @@ def search(
                     + m[4 * axis + 2] * posed[point, 2]
                     + m[4 * axis + 3]
                 )
-            new = _search(
+            new = _find_root(
                 posed[point],
                 x,
                 f,

@@ -7,7 +7,7 @@ from torch import Tensor
 from pipeline.kernels.inverse_skinning.reference import Lattice, gather
 
 
-def search(
+def find_roots(
     posed_m: Float[Tensor, "n 3"],
     frame: Int[Tensor, "n"],
     posed_to_start: Float[Tensor, "k b 12"],
@@ -16,7 +16,7 @@ def search(
     limits: tuple[int, float, float, float],
     candidates: int,
 ) -> tuple[Float[Tensor, "n c 3"], Bool[Tensor, "n c"]]:
-    """Same as `pipeline.kernels.broyden.search`; `limits`: iterations, and metres of arrival, loss and sameness."""
+    """Same as `pipeline.kernels.broyden.find_roots`; `limits`: iterations, and metres of arrival, loss and sameness."""
     roots = posed_m.new_zeros(len(posed_m), candidates, 3)
     exists = torch.zeros(len(posed_m), candidates, dtype=torch.bool, device=posed_m.device)
     for row in range(len(posed_to_start)):
@@ -24,38 +24,38 @@ def search(
         for bone in range(posed_to_start.shape[1]):
             matrix = posed_to_start[row, bone].view(3, 4)
             start = posed_m[chosen] @ matrix[:, :3].T + matrix[:, 3]
-            found, arrived = _descend(start, posed_m[chosen], blended[:, row], lattice, limits)
-            _keep(found, arrived, chosen, roots, exists, same_m=limits[3])
+            found, converged = _iterate(start, posed_m[chosen], blended[:, row], lattice, limits)
+            _append_new_roots(found, converged, chosen, roots, exists, same_m=limits[3])
     return roots, exists
 
 
-def _descend(
+def _iterate(
     x: Tensor, posed: Tensor, blended: Tensor, lattice: Lattice, limits: tuple[int, float, float, float]
 ) -> tuple[Tensor, Tensor]:
     """Where Broyden's method goes from each start (s, 3), and whether that is a root."""
-    iterations, arrived_m, lost_m, _ = limits
+    iterations, converged_m, diverged_m, _ = limits
     matrix, alive = _blend(x, blended, lattice)
     alive &= torch.linalg.det(matrix[:, :, :3]).abs() > 1e-3
     inverse = torch.linalg.inv(
         torch.where(alive[:, None, None], matrix[:, :, :3], torch.eye(3, dtype=x.dtype, device=x.device))
     )
-    miss = _carry(matrix, x) - posed
+    residual = _transform_points(matrix, x) - posed
     for _ in range(iterations):
-        active = alive & (miss.norm(dim=1) >= arrived_m)
-        move = -(inverse @ miss[:, :, None])[:, :, 0] * active[:, None]
-        x = x + move
+        active = alive & (residual.norm(dim=1) >= converged_m)
+        delta_x = -(inverse @ residual[:, :, None])[:, :, 0] * active[:, None]
+        x = x + delta_x
         matrix, inside = _blend(x, blended, lattice)
-        after = torch.where(active[:, None], _carry(matrix, x) - posed, miss)
-        alive &= ~active | (inside & (after.norm(dim=1) <= lost_m))
-        along = (move[:, None] @ inverse)[:, 0]
-        change = after - miss
-        scale = (along * change).sum(1)
-        sound = active & (scale.abs() >= 1e-14)
-        ahead = move - (inverse @ change[:, :, None])[:, :, 0]
-        step = ahead[:, :, None] * along[:, None] / torch.where(sound, scale, torch.ones_like(scale))[:, None, None]
-        inverse = inverse + step * sound[:, None, None]
-        miss = after
-    return x, alive & (miss.norm(dim=1) < arrived_m)
+        after = torch.where(active[:, None], _transform_points(matrix, x) - posed, residual)
+        alive &= ~active | (inside & (after.norm(dim=1) <= diverged_m))
+        along = (delta_x[:, None] @ inverse)[:, 0]
+        delta_residual = after - residual
+        scale = (along * delta_residual).sum(1)
+        updatable = active & (scale.abs() >= 1e-14)
+        ahead = delta_x - (inverse @ delta_residual[:, :, None])[:, :, 0]
+        step = ahead[:, :, None] * along[:, None] / torch.where(updatable, scale, torch.ones_like(scale))[:, None, None]
+        inverse = inverse + step * updatable[:, None, None]
+        residual = after
+    return x, alive & (residual.norm(dim=1) < converged_m)
 
 
 def _blend(x: Tensor, blended: Tensor, lattice: Lattice) -> tuple[Tensor, Tensor]:
@@ -67,14 +67,16 @@ def _blend(x: Tensor, blended: Tensor, lattice: Lattice) -> tuple[Tensor, Tensor
     return matrix.view(-1, 3, 4), inside & (share > 1 - 1e-4)
 
 
-def _carry(matrix: Tensor, x: Tensor) -> Tensor:
+def _transform_points(matrix: Tensor, x: Tensor) -> Tensor:
     return (matrix[:, :, :3] @ x[:, :, None])[:, :, 0] + matrix[:, :, 3]
 
 
-def _keep(found: Tensor, arrived: Tensor, chosen: Tensor, roots: Tensor, exists: Tensor, same_m: float) -> None:
+def _append_new_roots(
+    found: Tensor, converged: Tensor, chosen: Tensor, roots: Tensor, exists: Tensor, same_m: float
+) -> None:
     """Add the roots that are new to the candidates of their points, as long as there is room."""
     known = ((roots[chosen] - found[:, None]).norm(dim=2) <= same_m) & exists[chosen]
     count = exists[chosen].sum(1)
-    new = arrived & ~known.any(1) & (count < exists.shape[1])
+    new = converged & ~known.any(1) & (count < exists.shape[1])
     roots[chosen[new], count[new]] = found[new]
     exists[chosen[new], count[new]] = True

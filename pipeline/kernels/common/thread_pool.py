@@ -14,7 +14,7 @@ import torch
 T = TypeVar("T")
 
 
-class Parallel:
+class ThreadPool:
     """At most `count` threads that take jobs at the same time: as many as torch and numba have, one at least.
 
     Where numba's threads cannot be entered from several others (its own "workqueue", used where neither OpenMP nor TBB
@@ -23,9 +23,9 @@ class Parallel:
 
     def __init__(self, count: int) -> None:
         threads = min(torch.get_num_threads(), numba.get_num_threads())
-        at_once = 1 if numba.threading_layer() == "workqueue" else min(count, threads)
-        self._share = threads // at_once
-        self._pool = ThreadPoolExecutor(at_once, initializer=self._limit) if at_once > 1 else None
+        worker_count = 1 if numba.threading_layer() == "workqueue" else min(count, threads)
+        self._threads_per_worker = threads // worker_count
+        self._pool = ThreadPoolExecutor(worker_count, initializer=self._set_thread_limits) if worker_count > 1 else None
 
     def map(self, function: Callable[..., T], *arguments: Iterable) -> list[T]:
         """What `function` gives for each of the jobs, in their order; arguments as in `map`."""
@@ -33,12 +33,12 @@ class Parallel:
             return list(map(function, *arguments))
         threads = torch.get_num_threads()
         # Here too: MKL has one number of threads for all threads of a process.
-        torch.set_num_threads(self._share)
+        torch.set_num_threads(self._threads_per_worker)
         try:
             return list(self._pool.map(function, *arguments))
         finally:
             torch.set_num_threads(threads)
 
-    def _limit(self) -> None:
-        torch.set_num_threads(self._share)
-        numba.set_num_threads(self._share)
+    def _set_thread_limits(self) -> None:
+        torch.set_num_threads(self._threads_per_worker)
+        numba.set_num_threads(self._threads_per_worker)

@@ -20,37 +20,37 @@ from pipeline.kernels.composite import reference
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, density: Tensor, colour: Tensor, step_m: Tensor, ray_start: Tensor
+        ctx: Any, density: Tensor, colour: Tensor, step_m: Tensor, ray_offsets: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         weights = torch.empty_like(density)
-        image = torch.empty(len(ray_start) - 1, colour.shape[1])
-        alpha = torch.empty(len(ray_start) - 1)
-        composite_cpu.forward(*(array.numpy() for array in (density, colour, step_m, ray_start, weights, image, alpha)))
-        ctx.save_for_backward(density, colour, step_m, ray_start, weights, alpha)
+        image = torch.empty(len(ray_offsets) - 1, colour.shape[1])
+        alpha = torch.empty(len(ray_offsets) - 1)
+        composite_cpu.forward(
+            *(array.numpy() for array in (density, colour, step_m, ray_offsets, weights, image, alpha))
+        )
+        ctx.save_for_backward(density, colour, step_m, ray_offsets, weights, alpha)
         ctx.mark_non_differentiable(weights)
         return image, alpha, weights
 
     @staticmethod
-    def backward(
-        ctx: Any, image_gradient: Tensor, alpha_gradient: Tensor, _weights_gradient: Tensor
-    ) -> tuple[Tensor | None, ...]:
-        density, colour, step_m, ray_start, weights, alpha = ctx.saved_tensors
-        density_gradient, colour_gradient = torch.empty_like(density), torch.empty_like(colour)
+    def backward(ctx: Any, grad_image: Tensor, grad_alpha: Tensor, _grad_weights: Tensor) -> tuple[Tensor | None, ...]:
+        density, colour, step_m, ray_offsets, weights, alpha = ctx.saved_tensors
+        grad_density, grad_colour = torch.empty_like(density), torch.empty_like(colour)
         composite_cpu.backward(
-            *(array.detach().numpy() for array in (density, colour, step_m, ray_start, weights, alpha)),
-            image_gradient.contiguous().numpy(),
-            alpha_gradient.contiguous().numpy(),
-            density_gradient.numpy(),
-            colour_gradient.numpy(),
+            *(array.detach().numpy() for array in (density, colour, step_m, ray_offsets, weights, alpha)),
+            grad_image.contiguous().numpy(),
+            grad_alpha.contiguous().numpy(),
+            grad_density.numpy(),
+            grad_colour.numpy(),
         )
-        return density_gradient, colour_gradient, None, None
+        return grad_density, grad_colour, None, None
 
 
 def composite(
     density_per_m: Float[Tensor, "s"],
     colour: Float[Tensor, "s c"],
     step_m: Float[Tensor, "s"],
-    ray_start: Int[Tensor, "m"],
+    ray_offsets: Int[Tensor, "m"],
 ) -> tuple[Float[Tensor, "n c"], Float[Tensor, "n"], Float[Tensor, "s"]]:
     """Premultiplied colour and alpha of every ray, and the weight of every sample.
 
@@ -67,5 +67,5 @@ def composite(
     ([[0.5], [0.0]], [1.0, 0.0])
     """
     if not runs_on_numba(density_per_m, colour, step_m):
-        return reference.composite(density_per_m, colour, step_m, ray_start)
-    return _Composite.apply(density_per_m.contiguous(), colour.contiguous(), step_m.contiguous(), ray_start)
+        return reference.composite(density_per_m, colour, step_m, ray_offsets)
+    return _Composite.apply(density_per_m.contiguous(), colour.contiguous(), step_m.contiguous(), ray_offsets)

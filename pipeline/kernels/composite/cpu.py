@@ -8,55 +8,55 @@ dims everything behind it and adds to the alpha by the light T_end that is left 
 import numpy as np
 from numba import njit, prange
 
-from pipeline.kernels.common.numba_options import OPTIONS
+from pipeline.kernels.common.numba_options import NJIT_OPTIONS
 
 
-@njit(parallel=True, **OPTIONS)
-def forward(density, colour, step, ray_start, weights, image, alpha):
+@njit(parallel=True, **NJIT_OPTIONS)
+def forward(density, colour, step, ray_offsets, weights, image, alpha):
     """Fill weights (s), image (n, c) and alpha (n)."""
     channels = colour.shape[1]
-    for ray in prange(ray_start.shape[0] - 1):
-        light = np.float32(1)
+    for ray in prange(ray_offsets.shape[0] - 1):
+        transmittance = np.float32(1)
         for channel in range(channels):
             image[ray, channel] = np.float32(0)
-        for i in range(ray_start[ray], ray_start[ray + 1]):
-            passed = np.exp(-density[i] * step[i])
-            weight = light * (np.float32(1) - passed)
+        for i in range(ray_offsets[ray], ray_offsets[ray + 1]):
+            segment_transmittance = np.exp(-density[i] * step[i])
+            weight = transmittance * (np.float32(1) - segment_transmittance)
             weights[i] = weight
             for channel in range(channels):
                 image[ray, channel] += weight * colour[i, channel]
-            light *= passed
-        alpha[ray] = np.float32(1) - light
+            transmittance *= segment_transmittance
+        alpha[ray] = np.float32(1) - transmittance
 
 
-@njit(parallel=True, **OPTIONS)
+@njit(parallel=True, **NJIT_OPTIONS)
 def backward(
     density,
     colour,
     step,
-    ray_start,
+    ray_offsets,
     weights,
     alpha,
-    image_gradient,
-    alpha_gradient,
-    density_gradient,
-    colour_gradient,
+    grad_image,
+    grad_alpha,
+    grad_density,
+    grad_colour,
 ):
     """Fill density_gradient (s) and colour_gradient (s, c)."""
     channels = colour.shape[1]
-    for ray in prange(ray_start.shape[0] - 1):
-        first, last = ray_start[ray], ray_start[ray + 1]
-        behind = np.float32(0)
+    for ray in prange(ray_offsets.shape[0] - 1):
+        first, last = ray_offsets[ray], ray_offsets[ray + 1]
+        suffix_sum = np.float32(0)
         for i in range(first, last):
             for channel in range(channels):
-                behind += weights[i] * image_gradient[ray, channel] * colour[i, channel]
-        light = np.float32(1)
-        left_over = alpha_gradient[ray] * (np.float32(1) - alpha[ray])
+                suffix_sum += weights[i] * grad_image[ray, channel] * colour[i, channel]
+        transmittance = np.float32(1)
+        grad_alpha_term = grad_alpha[ray] * (np.float32(1) - alpha[ray])
         for i in range(first, last):
-            towards = np.float32(0)
+            grad_dot_colour = np.float32(0)
             for channel in range(channels):
-                towards += image_gradient[ray, channel] * colour[i, channel]
-                colour_gradient[i, channel] = weights[i] * image_gradient[ray, channel]
-            behind -= weights[i] * towards
-            light *= np.exp(-density[i] * step[i])
-            density_gradient[i] = step[i] * (light * towards - behind + left_over)
+                grad_dot_colour += grad_image[ray, channel] * colour[i, channel]
+                grad_colour[i, channel] = weights[i] * grad_image[ray, channel]
+            suffix_sum -= weights[i] * grad_dot_colour
+            transmittance *= np.exp(-density[i] * step[i])
+            grad_density[i] = step[i] * (transmittance * grad_dot_colour - suffix_sum + grad_alpha_term)

@@ -20,7 +20,7 @@ from pipeline.kernels.common.dispatch import runs_on_numba
 from pipeline.kernels.hashgrid import cpu as hashgrid_cpu
 from pipeline.kernels.hashgrid import reference
 
-BLOCK_FEATURES = (1, 2, 4, 8)
+SUPPORTED_FEATURE_COUNTS = (1, 2, 4, 8)
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class GridLayout:
     log2_rows: int
 
     def __post_init__(self) -> None:
-        if self.features not in BLOCK_FEATURES:
-            raise ValueError(f"features per level must be one of {BLOCK_FEATURES}, not {self.features}")
+        if self.features not in SUPPORTED_FEATURE_COUNTS:
+            raise ValueError(f"features per level must be one of {SUPPORTED_FEATURE_COUNTS}, not {self.features}")
 
     @property
     def levels(self) -> int:
@@ -66,72 +66,85 @@ class GridLayout:
         return (0,) * self.features
 
     @cached_property
-    def plan(self) -> np.ndarray:
+    def level_params(self) -> np.ndarray:
         """(l, 6) int64 for the kernels: cells x, y, z; first row; rows; 1 if the level is dense."""
-        plan, first = [], 0
+        level_params, first = [], 0
         for (x, y, z), rows in zip(self.cells_per_axis, self.rows_per_level, strict=True):
-            plan.append((x, y, z, first, rows, int((x + 1) * (y + 1) * (z + 1) <= rows)))
+            level_params.append((x, y, z, first, rows, int((x + 1) * (y + 1) * (z + 1) <= rows)))
             first += rows
-        return np.array(plan, dtype=np.int64)
+        return np.array(level_params, dtype=np.int64)
 
 
-Towards = list[tuple[Tensor, Tensor]]
+FeatureGradients = list[tuple[Tensor, Tensor]]
 """Points (n, 3) and what moves their features (n, l*f), of one backward pass after the other."""
 
 
 class _Encode(torch.autograd.Function):
-    """float32 on the CPU. `towards`, if given, takes what the table's gradient is made of in autograd's place."""
+    """float32 on the CPU. `feature_gradients`, if given, takes what the table's gradient is made of in autograd's
+    place.
+    """
 
     @staticmethod
-    def forward(ctx: Any, points: Tensor, table: Tensor, layout: GridLayout, towards: Towards | None) -> Tensor:
+    def forward(
+        ctx: Any, points: Tensor, table: Tensor, layout: GridLayout, feature_gradients: FeatureGradients | None
+    ) -> Tensor:
         features = torch.empty(len(points), layout.width)
-        arrays = (points.numpy(), table.detach().numpy(), layout.plan, features.numpy())
+        arrays = (points.numpy(), table.detach().numpy(), layout.level_params, features.numpy())
         hashgrid_cpu.encode(*arrays, layout.lanes)
         ctx.save_for_backward(points, table)
-        ctx.layout, ctx.towards = layout, towards
+        ctx.layout, ctx.feature_gradients = layout, feature_gradients
         return features
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         points, table = (saved.detach() for saved in ctx.saved_tensors)
-        layout, towards = ctx.layout, ctx.towards
-        moved = torch.from_numpy(hashgrid_cpu.rows_that_are_not_zero(gradient.contiguous().numpy()))
-        slope, places = gradient.index_select(0, moved), points.index_select(0, moved)
-        points_gradient = None
+        layout, feature_gradients = ctx.layout, ctx.feature_gradients
+        nonzero_rows = torch.from_numpy(hashgrid_cpu.find_nonzero_rows(gradient.contiguous().numpy()))
+        grad_features, positions = gradient.index_select(0, nonzero_rows), points.index_select(0, nonzero_rows)
+        grad_points = None
         if ctx.needs_input_grad[0]:
-            found = torch.zeros_like(places)
-            arrays = (places.numpy(), table.numpy(), layout.plan, slope.numpy(), found.numpy())
+            grad_selected = torch.zeros_like(positions)
+            arrays = (
+                positions.numpy(),
+                table.numpy(),
+                layout.level_params,
+                grad_features.numpy(),
+                grad_selected.numpy(),
+            )
             hashgrid_cpu.add_points_gradient(*arrays, layout.lanes)
-            points_gradient = torch.zeros_like(points).index_copy_(0, moved, found)
+            grad_points = torch.zeros_like(points).index_copy_(0, nonzero_rows, grad_selected)
         if not ctx.needs_input_grad[1]:
-            return points_gradient, None, None, None
-        if towards is not None:
-            towards.append((places, slope))
-            return points_gradient, None, None, None
-        table_gradient = torch.zeros_like(table)
-        add_table_gradient_(table_gradient, [(places, slope)], layout)
-        return points_gradient, table_gradient, None, None
+            return grad_points, None, None, None
+        if feature_gradients is not None:
+            feature_gradients.append((positions, grad_features))
+            return grad_points, None, None, None
+        grad_table = torch.zeros_like(table)
+        add_table_gradient_(grad_table, [(positions, grad_features)], layout)
+        return grad_points, grad_table, None, None
 
 
 def encode(
     points_unit: Float[Tensor, "n 3"],
     table: Float[Tensor, "rows f"],
     layout: GridLayout,
-    towards: Towards | None = None,
+    feature_gradients: FeatureGradients | None = None,
 ) -> Float[Tensor, "n width"]:
     """Features of points in the unit box, level after level; differentiable in the points and the table.
 
-    Points outside [0, 1] are read at the nearest point of the box. With `towards` (numba only), backward appends there
+    Points outside [0, 1] are read at the nearest point of the box. With `feature_gradients` (numba only), backward
+    appends there
     what `add_table_gradient_` needs, and autograd gets no gradient of the table: a training step then neither allocates
     nor clears a table, and threads that go back at the same time do not write to one.
     """
     if not runs_on_numba(points_unit, table):
-        return reference.encode(points_unit, table, layout.plan)
-    return _Encode.apply(points_unit.contiguous(), table, layout, towards)
+        return reference.encode(points_unit, table, layout.level_params)
+    return _Encode.apply(points_unit.contiguous(), table, layout, feature_gradients)
 
 
-def add_table_gradient_(table_gradient: Float[Tensor, "rows f"], towards: Towards, layout: GridLayout) -> None:
+def add_table_gradient_(
+    grad_table: Float[Tensor, "rows f"], feature_gradients: FeatureGradients, layout: GridLayout
+) -> None:
     """Add the table's gradient of these backward passes, in their order; threads are woken once for all of them."""
-    if towards:
-        points, slope = (torch.cat(parts).numpy() for parts in zip(*towards, strict=True))
-        hashgrid_cpu.add_table_gradient(points, layout.plan, slope, table_gradient.numpy(), layout.lanes)
+    if feature_gradients:
+        points, grad_features = (torch.cat(parts).numpy() for parts in zip(*feature_gradients, strict=True))
+        hashgrid_cpu.add_table_gradient(points, layout.level_params, grad_features, grad_table.numpy(), layout.lanes)

@@ -12,17 +12,17 @@ import numpy as np
 from numba import njit, prange
 
 from pipeline.kernels.common.hashing import PRIMES
-from pipeline.kernels.common.numba_options import OPTIONS
+from pipeline.kernels.common.numba_options import NJIT_OPTIONS
 
 BLOCK = 128
 _PRIME_Y, _PRIME_Z = np.uint32(PRIMES[0]), np.uint32(PRIMES[1])
 
 
-@njit(**OPTIONS)
-def _corners(points, start, stop, level_plan, rows, weights, parts):
+@njit(**NJIT_OPTIONS)
+def _corners(points, start, stop, params, rows, weights, fractions):
     """Table rows (8, BLOCK), weights (8, BLOCK) and positions in the cell (3, BLOCK) of a block of points."""
-    cells_x, cells_y, cells_z, first = level_plan[0], level_plan[1], level_plan[2], level_plan[3]
-    mask, dense = np.uint32(level_plan[4] - 1), level_plan[5] == 1
+    cells_x, cells_y, cells_z, first = params[0], params[1], params[2], params[3]
+    mask, dense = np.uint32(params[4] - 1), params[5] == 1
     stride_y, stride_z = np.uint32(cells_x + 1), np.uint32((cells_x + 1) * (cells_y + 1))
     zero, one = np.float32(0), np.float32(1)
     for k in range(stop - start):
@@ -34,7 +34,7 @@ def _corners(points, start, stop, level_plan, rows, weights, parts):
         j = np.uint32(min(np.int32(y), np.int32(cells_y - 1)))
         m = np.uint32(min(np.int32(z), np.int32(cells_z - 1)))
         u, v, w = x - np.float32(i), y - np.float32(j), z - np.float32(m)
-        parts[0, k], parts[1, k], parts[2, k] = u, v, w
+        fractions[0, k], fractions[1, k], fractions[2, k] = u, v, w
         i1, j1, m1 = i + np.uint32(1), j + np.uint32(1), m + np.uint32(1)
         if dense:
             y0, y1, z0, z1 = j * stride_y, j1 * stride_y, m * stride_z, m1 * stride_z
@@ -56,14 +56,14 @@ def _corners(points, start, stop, level_plan, rows, weights, parts):
     return first
 
 
-@njit(**OPTIONS)
-def encode_block(points, table, plan, level, encoded, start, stop, lanes):
+@njit(**NJIT_OPTIONS)
+def encode_block(points, table, level_params, level, encoded, start, stop, lanes):
     """One level's features of at most BLOCK points, start..stop."""
     column = level * len(lanes)
     rows = np.empty((8, BLOCK), np.uint32)
     weights = np.empty((8, BLOCK), np.float32)
-    parts = np.empty((3, BLOCK), np.float32)
-    first = _corners(points, start, stop, plan[level], rows, weights, parts)
+    fractions = np.empty((3, BLOCK), np.float32)
+    first = _corners(points, start, stop, level_params[level], rows, weights, fractions)
     values = table[first:]
     for k in range(stop - start):
         r0, r1, r2, r3 = rows[0, k], rows[1, k], rows[2, k], rows[3, k]
@@ -76,18 +76,18 @@ def encode_block(points, table, plan, level, encoded, start, stop, lanes):
             ) + ((w4 * values[r4, f] + w5 * values[r5, f]) + (w6 * values[r6, f] + w7 * values[r7, f]))
 
 
-@njit(parallel=True, **OPTIONS)
-def encode(points, table, plan, encoded, lanes):
+@njit(parallel=True, **NJIT_OPTIONS)
+def encode(points, table, level_params, encoded, lanes):
     """Fill `encoded` (n, l*f) from points (n, 3), table (rows, f) and plan (l, 6)."""
     count = points.shape[0]
-    for level in range(plan.shape[0]):
+    for level in range(level_params.shape[0]):
         for block in prange((count + BLOCK - 1) // BLOCK):
             start = block * BLOCK
-            encode_block(points, table, plan, level, encoded, start, min(start + BLOCK, count), lanes)
+            encode_block(points, table, level_params, level, encoded, start, min(start + BLOCK, count), lanes)
 
 
-@njit(**OPTIONS)
-def rows_that_are_not_zero(values):
+@njit(**NJIT_OPTIONS)
+def find_nonzero_rows(values):
     """Indices of the rows (n, c) that hold anything but zeros."""
     rows = np.empty(values.shape[0], np.int64)
     count = 0
@@ -100,18 +100,20 @@ def rows_that_are_not_zero(values):
     return rows[:count]
 
 
-@njit(**OPTIONS)
-def _level_of_turn(turn, levels):
+@njit(**NJIT_OPTIONS)
+def _interleaved_level(index, levels):
     """0, 2, 4, ... and then 1, 3, 5, ...: two threads that take half of the turns each get coarse and fine levels."""
     even = (levels + 1) // 2
-    return 2 * turn if turn < even else 2 * (turn - even) + 1
+    return 2 * index if index < even else 2 * (index - even) + 1
 
 
-@njit(**OPTIONS)
-def _scatter_block(points, plan, level, gradient, table_gradient, start, stop, rows, weights, parts, lanes):
+@njit(**NJIT_OPTIONS)
+def _scatter_gradient_block(
+    points, level_params, level, gradient, grad_table, start, stop, rows, weights, fractions, lanes
+):
     column = level * len(lanes)
-    first = _corners(points, start, stop, plan[level], rows, weights, parts)
-    values = table_gradient[first:]
+    first = _corners(points, start, stop, level_params[level], rows, weights, fractions)
+    values = grad_table[first:]
     for k in range(stop - start):
         for corner in range(8):
             row, weight = rows[corner, k], weights[corner, k]
@@ -119,29 +121,31 @@ def _scatter_block(points, plan, level, gradient, table_gradient, start, stop, r
                 values[row, f] += weight * gradient[start + k, column + f]
 
 
-@njit(parallel=True, **OPTIONS)
-def add_table_gradient(points, plan, gradient, table_gradient, lanes):
-    """Add to `table_gradient` (rows, f) what gradient (n, l*f) means for the table."""
+@njit(parallel=True, **NJIT_OPTIONS)
+def add_table_gradient(points, level_params, gradient, grad_table, lanes):
+    """Add to `grad_table` (rows, f) what gradient (n, l*f) means for the table."""
     count = points.shape[0]
-    levels = plan.shape[0]
-    for turn in prange(levels):
-        level = _level_of_turn(turn, levels)
+    levels = level_params.shape[0]
+    for index in prange(levels):
+        level = _interleaved_level(index, levels)
         rows = np.empty((8, BLOCK), np.uint32)
         weights = np.empty((8, BLOCK), np.float32)
-        parts = np.empty((3, BLOCK), np.float32)
+        fractions = np.empty((3, BLOCK), np.float32)
         for block in range((count + BLOCK - 1) // BLOCK):
             start = block * BLOCK
             stop = min(start + BLOCK, count)
-            _scatter_block(points, plan, level, gradient, table_gradient, start, stop, rows, weights, parts, lanes)
+            _scatter_gradient_block(
+                points, level_params, level, gradient, grad_table, start, stop, rows, weights, fractions, lanes
+            )
 
 
-@njit(**OPTIONS)
-def _gather_block(points, table, plan, level, gradient, points_gradient, start, stop, lanes):
+@njit(**NJIT_OPTIONS)
+def _point_gradient_block(points, table, level_params, level, gradient, grad_points, start, stop, lanes):
     column = level * len(lanes)
     rows = np.empty((8, BLOCK), np.uint32)
     weights = np.empty((8, BLOCK), np.float32)
-    parts = np.empty((3, BLOCK), np.float32)
-    first = _corners(points, start, stop, plan[level], rows, weights, parts)
+    fractions = np.empty((3, BLOCK), np.float32)
+    first = _corners(points, start, stop, level_params[level], rows, weights, fractions)
     values = table[first:]
     dots = np.empty(8, np.float32)
     for k in range(stop - start):
@@ -150,7 +154,7 @@ def _gather_block(points, table, plan, level, gradient, points_gradient, start, 
             for f in range(len(lanes)):
                 total += values[row, f] * gradient[start + k, column + f]
             dots[corner] = total
-        u, v, w = parts[0, k], parts[1, k], parts[2, k]
+        u, v, w = fractions[0, k], fractions[1, k], fractions[2, k]
         u0, v0, w0 = np.float32(1) - u, np.float32(1) - v, np.float32(1) - w
         along_x = (
             v0 * w0 * (dots[1] - dots[0])
@@ -170,17 +174,17 @@ def _gather_block(points, table, plan, level, gradient, points_gradient, start, 
             + u0 * v * (dots[6] - dots[2])
             + u * v * (dots[7] - dots[3])
         )
-        points_gradient[start + k, 0] += along_x * np.float32(plan[level, 0])
-        points_gradient[start + k, 1] += along_y * np.float32(plan[level, 1])
-        points_gradient[start + k, 2] += along_z * np.float32(plan[level, 2])
+        grad_points[start + k, 0] += along_x * np.float32(level_params[level, 0])
+        grad_points[start + k, 1] += along_y * np.float32(level_params[level, 1])
+        grad_points[start + k, 2] += along_z * np.float32(level_params[level, 2])
 
 
-@njit(parallel=True, **OPTIONS)
-def add_points_gradient(points, table, plan, gradient, points_gradient, lanes):
-    """Add to `points_gradient` (n, 3) what gradient (n, l*f) means for the points."""
+@njit(parallel=True, **NJIT_OPTIONS)
+def add_points_gradient(points, table, level_params, gradient, grad_points, lanes):
+    """Add to `grad_points` (n, 3) what gradient (n, l*f) means for the points."""
     count = points.shape[0]
-    for level in range(plan.shape[0]):
+    for level in range(level_params.shape[0]):
         for block in prange((count + BLOCK - 1) // BLOCK):
             start = block * BLOCK
             stop = min(start + BLOCK, count)
-            _gather_block(points, table, plan, level, gradient, points_gradient, start, stop, lanes)
+            _point_gradient_block(points, table, level_params, level, gradient, grad_points, start, stop, lanes)

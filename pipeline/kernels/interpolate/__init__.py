@@ -13,7 +13,7 @@ from pipeline.kernels.interpolate.reference import interpolate_reference
 
 def interpolate(
     covered: Int[Tensor, "n"],
-    face_of: Int[Tensor, "n"],
+    face_ids: Int[Tensor, "n"],
     width: int,
     vertices_px: Float[Tensor, "v 2"],
     depth_m: Float[Tensor, "v"],
@@ -26,16 +26,16 @@ def interpolate(
     vertices_px: pixel centres at +0.5. depth_m: > 0 at every corner of these faces.
     """
     if not runs_on_numba(vertices_px, depth_m, attributes):
-        return interpolate_reference(covered, face_of, width, vertices_px, depth_m, faces, attributes)
-    return _Interpolate.apply(covered, face_of, width, vertices_px, depth_m, faces, attributes)
+        return interpolate_reference(covered, face_ids, width, vertices_px, depth_m, faces, attributes)
+    return _Interpolate.apply(covered, face_ids, width, vertices_px, depth_m, faces, attributes)
 
 
 class _Interpolate(torch.autograd.Function):
     @staticmethod
-    def forward(context: Any, covered: Tensor, face_of: Tensor, width: int, *tensors: Tensor) -> Tensor:
+    def forward(context: Any, covered: Tensor, face_ids: Tensor, width: int, *tensors: Tensor) -> Tensor:
         context.width = width
-        context.save_for_backward(covered, face_of, *tensors)
-        arrays = [tensor.detach().contiguous().numpy() for tensor in (covered, face_of, *tensors)]
+        context.save_for_backward(covered, face_ids, *tensors)
+        arrays = [tensor.detach().contiguous().numpy() for tensor in (covered, face_ids, *tensors)]
         return torch.from_numpy(interpolate_forward(*arrays[:2], width, *arrays[2:]))
 
     @staticmethod

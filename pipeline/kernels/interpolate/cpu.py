@@ -8,12 +8,12 @@ private copy per block of pixels, added up in block order: the same bytes with a
 import numpy as np
 from numba import njit, prange
 
-from pipeline.kernels.common.numba_options import OPTIONS
+from pipeline.kernels.common.numba_options import NJIT_OPTIONS
 
 BLOCKS = 8
 
 
-@njit(**OPTIONS)
+@njit(**NJIT_OPTIONS)
 def _geometry(
     face: int, pixel: int, width: int, vertices_px: np.ndarray, depth_m: np.ndarray, faces: np.ndarray
 ) -> tuple:
@@ -29,7 +29,7 @@ def _geometry(
     return (i, j, k), (ax, ay, bx, by, cx, cy), area, (q0, q1, q2), q0 + q1 + q2
 
 
-@njit(**OPTIONS)
+@njit(**NJIT_OPTIONS)
 def _fill_pixel(
     pixel: tuple,
     width: int,
@@ -45,10 +45,10 @@ def _fill_pixel(
         out[c] = b0 * attributes[corners[0], c] + b1 * attributes[corners[1], c] + b2 * attributes[corners[2], c]
 
 
-@njit(parallel=True, **OPTIONS)
+@njit(parallel=True, **NJIT_OPTIONS)
 def interpolate_forward(
     covered: np.ndarray,
-    face_of: np.ndarray,
+    face_ids: np.ndarray,
     width: int,
     vertices_px: np.ndarray,
     depth_m: np.ndarray,
@@ -58,11 +58,11 @@ def interpolate_forward(
     """(n, c) attributes at the covered pixels."""
     values = np.empty((len(covered), attributes.shape[1]), np.float32)
     for n in prange(len(covered)):
-        _fill_pixel((covered[n], face_of[n]), width, vertices_px, depth_m, faces, attributes, values[n])
+        _fill_pixel((covered[n], face_ids[n]), width, vertices_px, depth_m, faces, attributes, values[n])
     return values
 
 
-@njit(**OPTIONS)
+@njit(**NJIT_OPTIONS)
 def _add_pixel(
     pixel: tuple,
     width: int,
@@ -102,10 +102,10 @@ def _add_pixel(
     out[k, 1] += f0 * bx - f1 * ax
 
 
-@njit(parallel=True, **OPTIONS)
+@njit(parallel=True, **NJIT_OPTIONS)
 def interpolate_backward(
     covered: np.ndarray,
-    face_of: np.ndarray,
+    face_ids: np.ndarray,
     width: int,
     vertices_px: np.ndarray,
     depth_m: np.ndarray,
@@ -118,7 +118,7 @@ def interpolate_backward(
     parts = np.zeros((BLOCKS, len(vertices_px), size), np.float32)
     for block in prange(BLOCKS):
         for n in range(block * count // BLOCKS, (block + 1) * count // BLOCKS):
-            pixel = (covered[n], face_of[n])
+            pixel = (covered[n], face_ids[n])
             _add_pixel(pixel, width, vertices_px, depth_m, faces, attributes, upstream[n], parts[block])
     total = np.zeros((len(vertices_px), size), np.float32)
     for v in prange(len(vertices_px)):

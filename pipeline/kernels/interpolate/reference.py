@@ -8,7 +8,7 @@ from pipeline.kernels.raster.reference import pixel_centres_px, weighted_inverse
 
 def interpolate_reference(
     covered: Int[Tensor, "n"],
-    face_of: Int[Tensor, "n"],
+    face_ids: Int[Tensor, "n"],
     width: int,
     vertices_px: Float[Tensor, "v 2"],
     depth_m: Float[Tensor, "v"],
@@ -16,7 +16,7 @@ def interpolate_reference(
     attributes: Float[Tensor, "v c"],
 ) -> Float[Tensor, "n c"]:
     """``pipeline.kernels.interpolate.interpolate`` on any device, any float type."""
-    corner = faces.long()[face_of.long()]
+    corner = faces.long()[face_ids.long()]
     centres = pixel_centres_px(covered, width, vertices_px.dtype)
     q = weighted_inverse_depth(vertices_px[corner], depth_m[corner], centres)
     return ((q / q.sum(1, keepdim=True))[..., None] * attributes[corner]).sum(1)

@@ -1,8 +1,9 @@
 """Inverse skinning: from posed points back to the canonical A-pose.
 
-A `SkinGrid` holds skin weights on the nodes near the canonical body. For one frame, `bake` turns its skinning
+A `SkinGrid` holds skin weights on the nodes near the canonical body. For one frame, `bake_warp_grid` turns its skinning
 matrices into a `WarpGrid` that says for each node of a posed grid where it lies in canonical space; a lookup there,
-and at most one Newton step (`newton`), replaces the 13-start Broyden search of SNARF and InstantAvatar (Chen et al.
+and at most one Newton step (`newton_step`), replaces the 13-start Broyden search of SNARF and InstantAvatar (Chen et
+al.
 2021, Jiang et al. 2023). Where limbs come near each other a posed cell has several inverses: it then holds one
 affine map for each.
 
@@ -20,7 +21,7 @@ from torch import Tensor
 
 from pipeline.kernels.blend import SparseWeights, blend
 from pipeline.kernels.common.dispatch import runs_on_numba
-from pipeline.kernels.common.packing import owner_of_each
+from pipeline.kernels.common.packing import segment_ids_from_counts
 from pipeline.kernels.inverse_skinning import cpu as warp_cpu
 from pipeline.kernels.inverse_skinning import newton_cpu, reference
 from pipeline.kernels.inverse_skinning.reference import Lattice
@@ -59,7 +60,7 @@ class SkinGrid:
         """The weights without their zeros: a node hangs on two or three joints."""
         return SparseWeights.of(self.weights)
 
-    def around(self, occupied: UInt8[Tensor, "ox oy oz"], bounds_m: Float[Tensor, "2 3"]) -> "SkinGrid":
+    def crop_to_occupied(self, occupied: UInt8[Tensor, "ox oy oz"], bounds_m: Float[Tensor, "2 3"]) -> "SkinGrid":
         """The same grid without the nodes that no point of an occupied cell is interpolated from.
 
         occupied: not zero for the cells that are meant; they fill the box `bounds_m`. Along each axis a matrix says
@@ -80,7 +81,7 @@ class SkinGrid:
         nodes_m, distance_m, weights = (x.index_select(0, rows) for x in (self.nodes_m, self.distance_m, self.weights))
         return SkinGrid(self.origin_m, self.cell_m, row_of_node, nodes_m, distance_m, weights)
 
-    def weights_at(self, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "n j"]:
+    def interpolate_weights(self, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "n j"]:
         """Skin weights of canonical points; outside the grid, those of the nearest node that exists."""
         return reference.interpolate(points_m, self.lattice, self.weights.to(points_m))
 
@@ -91,17 +92,18 @@ class WarpGrid:
 
     canonical_m: position of each node in canonical space, NaN where unknown (x slowest, z fastest).
     codes: a code a cell: -1 no inverse, 0 one smooth inverse (interpolate), 1 + 4 * first + (count - 1) several
-    inverses: rows first..first + count - 1 of `maps`, which are affine maps (3x4 by rows) from posed to canonical.
+    inverses: rows first..first + count - 1 of `affine_maps`, which are affine maps (3x4 by rows) from posed to
+    canonical.
     """
 
     origin_m: Float[np.ndarray, "3"]
     dims: Int[np.ndarray, "3"]
     canonical_m: Float[np.ndarray, "nodes 3"]
-    codes: Int[np.ndarray, "cells"]
-    maps: Float[np.ndarray, "maps 12"]
+    cell_codes: Int[np.ndarray, "cells"]
+    affine_maps: Float[np.ndarray, "maps 12"]
 
 
-def bake(skin: SkinGrid, canonical_to_posed: Float[Tensor, "j 4 4"]) -> WarpGrid:
+def bake_warp_grid(skin: SkinGrid, canonical_to_posed: Float[Tensor, "j 4 4"]) -> WarpGrid:
     """Invert the skinning of one frame; `skin` is on the CPU. Without the GIL: threads may bake different frames."""
     # A dense product: not more than one thread may enter a parallel loop.
     matrices = canonical_to_posed.detach().float().cpu()[:, :3].flatten(1)
@@ -109,42 +111,48 @@ def bake(skin: SkinGrid, canonical_to_posed: Float[Tensor, "j 4 4"]) -> WarpGrid
     nodes, distance, skin_origin, rows = (
         tensor.numpy() for tensor in (skin.nodes_m, skin.distance_m, skin.origin_m, skin.row_of_node)
     )
-    posed, box = warp_cpu.carry_nodes(nodes, blended)
+    posed, box = warp_cpu.skin_nodes(nodes, blended)
     cell = np.float32(skin.cell_m)
     origin = (np.floor(box[0] / cell) * cell).astype(np.float32)
     dims = (np.ceil((box[1] - origin) / cell) + 1).astype(np.int64)
-    canonical, codes, maps = warp_cpu.bake(nodes, posed, distance, origin, dims, skin_origin, cell, rows, blended)
-    return WarpGrid(origin, dims, canonical, codes, maps)
+    canonical, cell_codes, affine_maps = warp_cpu.bake_warp_grid(
+        nodes, posed, distance, origin, dims, skin_origin, cell, rows, blended
+    )
+    return WarpGrid(origin, dims, canonical, cell_codes, affine_maps)
 
 
-class _Newton(torch.autograd.Function):
+class _NewtonStep(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, blended: Tensor, start: Tensor, posed: Tensor, slot_start: Tensor, skin: SkinGrid) -> Tensor:
-        slot = owner_of_each(slot_start.diff())
+    def forward(
+        ctx: Any, blended: Tensor, start: Tensor, posed: Tensor, frame_offsets: Tensor, skin: SkinGrid
+    ) -> Tensor:
+        batch_index = segment_ids_from_counts(frame_offsets.diff())
         refined, inverse_jacobian = torch.empty_like(start), start.new_empty(len(start), 9)
         grid = (skin.origin_m.numpy(), np.float32(skin.cell_m), skin.row_of_node.numpy())
-        arrays = (posed.numpy(), start.numpy(), slot.numpy())
-        newton_cpu.refine(*arrays, *grid, blended.detach().numpy(), refined.numpy(), inverse_jacobian.numpy())
-        ctx.save_for_backward(blended, start, inverse_jacobian, slot_start)
+        arrays = (posed.numpy(), start.numpy(), batch_index.numpy())
+        newton_cpu.newton_step_batch(
+            *arrays, *grid, blended.detach().numpy(), refined.numpy(), inverse_jacobian.numpy()
+        )
+        ctx.save_for_backward(blended, start, inverse_jacobian, frame_offsets)
         ctx.skin = skin
         return refined
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        blended, *step, slot_start = (tensor.detach() for tensor in ctx.saved_tensors)
+        blended, *step, frame_offsets = (tensor.detach() for tensor in ctx.saved_tensors)
         skin = ctx.skin
         total = torch.zeros_like(blended)
         grid = (skin.origin_m.numpy(), np.float32(skin.cell_m), skin.row_of_node.numpy())
-        arrays = (tensor.numpy() for tensor in (*step, gradient.contiguous(), slot_start))
-        newton_cpu.pose_gradient(*arrays, *grid, total.numpy())
+        arrays = (tensor.numpy() for tensor in (*step, gradient.contiguous(), frame_offsets))
+        newton_cpu.add_pose_gradient(*arrays, *grid, total.numpy())
         return total, None, None, None, None
 
 
-def newton(
+def newton_step(
     blended: Float[Tensor, "m k 12"],
     start_m: Float[Tensor, "s 3"],
     posed_m: Float[Tensor, "s 3"],
-    slot_start: Int[Tensor, "k1"],
+    frame_offsets: Int[Tensor, "k1"],
     skin: SkinGrid,
 ) -> Float[Tensor, "s 3"]:
     """One Newton step towards the canonical points that skinning carries to `posed_m`.
@@ -156,5 +164,5 @@ def newton(
         slot_start: k + 1 offsets; the samples of frame f are slot_start[f] : slot_start[f + 1].
     """
     if not runs_on_numba(blended, start_m, posed_m):
-        return reference.newton(blended, start_m, posed_m, slot_start, skin.lattice)
-    return _Newton.apply(blended.contiguous(), start_m.contiguous(), posed_m.contiguous(), slot_start, skin)
+        return reference.newton_step(blended, start_m, posed_m, frame_offsets, skin.lattice)
+    return _NewtonStep.apply(blended.contiguous(), start_m.contiguous(), posed_m.contiguous(), frame_offsets, skin)

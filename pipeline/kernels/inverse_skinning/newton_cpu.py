@@ -11,13 +11,13 @@ blended (m, k, 12), the rows of A (3, 4) at the nodes that exist, for each of k 
 import numpy as np
 from numba import njit, prange
 
-from pipeline.kernels.common.numba_options import OPTIONS
+from pipeline.kernels.common.numba_options import NJIT_OPTIONS
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
 BLOCK = 256
 
 
-@njit(**OPTIONS)
+@njit(**NJIT_OPTIONS)
 def apply_affine(m, x, y, z):
     """m (12 numbers, a 3 x 4 matrix by rows) times (x, y, z, 1)."""
     return (
@@ -27,8 +27,8 @@ def apply_affine(m, x, y, z):
     )
 
 
-@njit(**OPTIONS)
-def skin(x, y, z, frame, origin, cell, row_of_node, blended):
+@njit(**NJIT_OPTIONS)
+def skin_point(x, y, z, frame, origin, cell, row_of_node, blended):
     """Posed position of a canonical point and the Jacobian, as 13 numbers: inside, position, J by rows."""
     inverse = _ONE / cell
     gx, gy, gz = (x - origin[0]) * inverse, (y - origin[1]) * inverse, (z - origin[2]) * inverse
@@ -71,15 +71,15 @@ def skin(x, y, z, frame, origin, cell, row_of_node, blended):
     return inside, px, py, pz, j00, j01, j02, j10, j11, j12, j20, j21, j22
 
 
-@njit(**OPTIONS)
+@njit(**NJIT_OPTIONS)
 def invert(j00, j01, j02, j10, j11, j12, j20, j21, j22):
     """Inverse of a 3x3 matrix by rows, and whether it is far from singular."""
     c00, c01, c02 = j11 * j22 - j12 * j21, j12 * j20 - j10 * j22, j10 * j21 - j11 * j20
     determinant = j00 * c00 + j01 * c01 + j02 * c02
-    sound = abs(determinant) > np.float32(1e-3)
-    s = _ONE / determinant if sound else _ZERO
+    invertible = abs(determinant) > np.float32(1e-3)
+    s = _ONE / determinant if invertible else _ZERO
     return (
-        sound,
+        invertible,
         s * c00,
         s * (j02 * j21 - j01 * j22),
         s * (j01 * j12 - j02 * j11),
@@ -92,15 +92,15 @@ def invert(j00, j01, j02, j10, j11, j12, j20, j21, j22):
     )
 
 
-@njit(**OPTIONS)
+@njit(**NJIT_OPTIONS)
 def newton_step(px, py, pz, x, y, z, frame, origin, cell, row_of_node, blended, inverse_jacobian):
     """Where one step from (x, y, z) comes nearer to A(x) x = p: the start itself where a step is not possible.
 
     Fills the step's inverse Jacobian (9) by rows, or zeros.
     """
-    inside, qx, qy, qz, a, b, c, d, e, f, g, h, k = skin(x, y, z, frame, origin, cell, row_of_node, blended)
-    sound, a, b, c, d, e, f, g, h, k = invert(a, b, c, d, e, f, g, h, k)
-    if inside and sound:
+    inside, qx, qy, qz, a, b, c, d, e, f, g, h, k = skin_point(x, y, z, frame, origin, cell, row_of_node, blended)
+    invertible, a, b, c, d, e, f, g, h, k = invert(a, b, c, d, e, f, g, h, k)
+    if inside and invertible:
         rx, ry, rz = px - qx, py - qy, pz - qz
         x, y, z = x + a * rx + b * ry + c * rz, y + d * rx + e * ry + f * rz, z + g * rx + h * ry + k * rz
     else:
@@ -111,8 +111,8 @@ def newton_step(px, py, pz, x, y, z, frame, origin, cell, row_of_node, blended, 
     return x, y, z
 
 
-@njit(parallel=True, **OPTIONS)
-def refine(points_posed, start, slot, origin, cell, row_of_node, blended, refined, inverse_jacobian):
+@njit(parallel=True, **NJIT_OPTIONS)
+def newton_step_batch(points_posed, start, batch_index, origin, cell, row_of_node, blended, refined, inverse_jacobian):
     """`newton_step` for each point (s, 3) from its start.
 
     slot (s) says which frame of `blended` a point belongs to. inverse_jacobian (s, 9): that of the step, or zeros.
@@ -122,20 +122,21 @@ def refine(points_posed, start, slot, origin, cell, row_of_node, blended, refine
         for s in range(block * BLOCK, min(block * BLOCK + BLOCK, count)):
             refined[s, 0], refined[s, 1], refined[s, 2] = newton_step(
                 points_posed[s, 0], points_posed[s, 1], points_posed[s, 2], start[s, 0], start[s, 1], start[s, 2],
-                slot[s], origin, cell, row_of_node, blended, inverse_jacobian[s],
+                batch_index[s], origin, cell, row_of_node, blended, inverse_jacobian[s],
             )  # fmt: skip
 
 
-@njit(parallel=True, **OPTIONS)
-def pose_gradient(points, inverse_jacobian, gradient, slot_start, origin, cell, row_of_node, blended_gradient):
+@njit(parallel=True, **NJIT_OPTIONS)
+def add_pose_gradient(points, inverse_jacobian, gradient, frame_offsets, origin, cell, row_of_node, grad_blended):
     """Add dL/dA (m, frames, 12) for dL/dx = gradient, where x solves A(x) x = p: dL/d(A x) = -J^-T dL/dx.
 
-    points (s, 3) and inverse_jacobian (s, 9) are the starts and what `refine` found there; the samples of frame f are
+    points (s, 3) and inverse_jacobian (s, 9) are the starts and what `newton_step_batch` found there; the samples of
+    frame f are
     slot_start[f] : slot_start[f + 1]. A thread owns whole frames.
     """
     inverse = _ONE / cell
-    for frame in prange(slot_start.shape[0] - 1):
-        for s in range(slot_start[frame], slot_start[frame + 1]):
+    for frame in prange(frame_offsets.shape[0] - 1):
+        for s in range(frame_offsets[frame], frame_offsets[frame + 1]):
             gx, gy, gz = gradient[s, 0], gradient[s, 1], gradient[s, 2]
             if gx == _ZERO and gy == _ZERO and gz == _ZERO:
                 continue
@@ -153,7 +154,7 @@ def pose_gradient(points, inverse_jacobian, gradient, slot_start, origin, cell, 
             for corner in range(8):
                 p, q, r = corner & 1, (corner >> 1) & 1, corner >> 2
                 weight = (ui if p == 1 else _ONE - ui) * (uj if q == 1 else _ONE - uj) * (uk if r == 1 else _ONE - uk)
-                target = blended_gradient[row_of_node[i + p, j + q, k + r], frame]
+                target = grad_blended[row_of_node[i + p, j + q, k + r], frame]
                 wx, wy, wz = weight * lx, weight * ly, weight * lz
                 target[0] += wx * x
                 target[1] += wx * y

@@ -22,37 +22,37 @@ from pipeline.kernels.march import reference
 
 
 @dataclass(frozen=True)
-class WarpSet:
+class PackedWarpGrids:
     """The warp grids of several frames, one behind the other, all with the same cell.
 
-    A frame is a row of `origin_m` and `dims`; `first` says where its nodes, cells and maps begin.
+    A frame is a row of `origin_m` and `dims`; `offsets` says where its nodes, cells and maps begin.
     """
 
     cell_m: float
     origin_m: Float[Tensor, "k 3"]
     dims: Int[Tensor, "k 3"]
-    first: Int[Tensor, "k 3"]
+    offsets: Int[Tensor, "k 3"]
     canonical_m: Float[Tensor, "nodes 3"]
-    codes: Int[Tensor, "cells"]
-    maps: Float[Tensor, "maps 12"]
+    cell_codes: Int[Tensor, "cells"]
+    affine_maps: Float[Tensor, "maps 12"]
 
     @staticmethod
-    def of(grids: Sequence[WarpGrid], cell_m: float) -> "WarpSet":
+    def of(grids: Sequence[WarpGrid], cell_m: float) -> "PackedWarpGrids":
         """Lay warp grids one behind the other; `cell_m` is the cell of all of them."""
-        sizes = np.array([(len(g.canonical_m), len(g.codes), len(g.maps)) for g in grids], dtype=np.int64)
-        names = ("canonical_m", "codes", "maps")
+        sizes = np.array([(len(g.canonical_m), len(g.cell_codes), len(g.affine_maps)) for g in grids], dtype=np.int64)
+        names = ("canonical_m", "cell_codes", "affine_maps")
         joined = {name: np.concatenate([getattr(grid, name) for grid in grids]) for name in names}
         joined |= {name: np.stack([getattr(grid, name) for grid in grids]) for name in ("origin_m", "dims")}
-        joined["first"] = np.cumsum(sizes, axis=0) - sizes
-        return WarpSet(cell_m, **{name: torch.from_numpy(array) for name, array in joined.items()})
+        joined["offsets"] = np.cumsum(sizes, axis=0) - sizes
+        return PackedWarpGrids(cell_m, **{name: torch.from_numpy(array) for name, array in joined.items()})
 
-    def to(self, device: torch.device) -> "WarpSet":
+    def to(self, device: torch.device) -> "PackedWarpGrids":
         """The same grids on another device."""
-        return WarpSet(self.cell_m, *(tensor.to(device) for tensor in self.tensors()))
+        return PackedWarpGrids(self.cell_m, *(tensor.to(device) for tensor in self.tensors()))
 
     def tensors(self) -> tuple[Tensor, ...]:
         """In the order that the loops and their twin take."""
-        return self.origin_m, self.dims, self.first, self.canonical_m, self.codes, self.maps
+        return self.origin_m, self.dims, self.offsets, self.canonical_m, self.cell_codes, self.affine_maps
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Samples:
 
     canonical_m: Float[Tensor, "s 3"]
     distance_m: Float[Tensor, "s"]
-    ray_start: Int[Tensor, "m"]
+    ray_offsets: Int[Tensor, "m"]
 
 
 def march(
@@ -70,7 +70,7 @@ def march(
     frame: Int[Tensor, "n"],
     jitter: Float[Tensor, "n"],
     step_m: float,
-    warps: WarpSet,
+    warps: PackedWarpGrids,
     occupied: UInt8[Tensor, "gx gy gz"],
     bounds_m: Float[Tensor, "2 3"],
     max_samples: int = 160,
@@ -103,7 +103,7 @@ def march(
         )
     arrays = (tensor.contiguous().numpy() for tensor in (origins_m, directions, frame, jitter))
     grids = (tensor.numpy() for tensor in (*warps.tensors(), occupied, bounds_m))
-    points, distance, ray_start = march_cpu.march(
+    points, distance, ray_offsets = march_cpu.march(
         *arrays, np.float32(step_m), np.float32(warps.cell_m), *grids, max_samples
     )
-    return Samples(torch.from_numpy(points), torch.from_numpy(distance), torch.from_numpy(ray_start))
+    return Samples(torch.from_numpy(points), torch.from_numpy(distance), torch.from_numpy(ray_offsets))

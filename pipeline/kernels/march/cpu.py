@@ -3,16 +3,16 @@
 import numpy as np
 from numba import njit, prange
 
-from pipeline.kernels.common.numba_options import OPTIONS
+from pipeline.kernels.common.numba_options import NJIT_OPTIONS
 from pipeline.kernels.inverse_skinning.newton_cpu import apply_affine
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
-_ENDLESS_M = np.float32(1e9)
+_MAX_DISTANCE_M = np.float32(1e9)
 CANDIDATES = 4
 """Inverses that a stop has at most."""
 
 
-@njit(**OPTIONS)
+@njit(**NJIT_OPTIONS)
 def _slab(origin, direction, low, high, near, far):
     """Narrow [near, far] to the part of a ray between two planes of one axis."""
     if abs(direction) < np.float32(1e-9):
@@ -21,7 +21,7 @@ def _slab(origin, direction, low, high, near, far):
     return max(near, min(a, b)), min(far, max(a, b))
 
 
-@njit(**OPTIONS)
+@njit(**NJIT_OPTIONS)
 def _is_occupied(x, y, z, occupied, low, scale):
     i = int(np.floor((x - low[0]) * scale[0]))
     j = int(np.floor((y - low[1]) * scale[1]))
@@ -30,7 +30,7 @@ def _is_occupied(x, y, z, occupied, low, scale):
     return inside and occupied[i, j, k] != 0
 
 
-@njit(**OPTIONS)
+@njit(**NJIT_OPTIONS)
 def _interpolate(nodes, first, dims, i, j, k, u, v, w):
     """Trilinear interpolation of the canonical positions at a posed cell's corners."""
     x = y = z = _ZERO
@@ -42,25 +42,25 @@ def _interpolate(nodes, first, dims, i, j, k, u, v, w):
     return x, y, z
 
 
-@njit(**OPTIONS)
-def enter(ray, origins, directions, jitter, step, cell, low, dims):
+@njit(**NJIT_OPTIONS)
+def intersect_box(ray, origins, directions, jitter, step, cell, low, dims):
     """Where a ray enters the box of a warp grid, and how many stops it makes there."""
-    near, far = _ZERO, _ENDLESS_M
+    near, far = _ZERO, _MAX_DISTANCE_M
     for axis in range(3):
         high = low[axis] + cell * np.float32(dims[axis] - 1)
         near, far = _slab(origins[ray, axis], directions[ray, axis], low[axis], high, near, far)
     # A ray that no plane ends is no ray (NaN, or a direction of zeros): it would make 1e11 stops.
-    return near, max(0, int(np.ceil((far - near) / step - jitter[ray]))) if far < _ENDLESS_M else 0
+    return near, max(0, int(np.ceil((far - near) / step - jitter[ray]))) if far < _MAX_DISTANCE_M else 0
 
 
-@njit(**OPTIONS)
-def go_on(
+@njit(**NJIT_OPTIONS)
+def advance_ray(
     ray,
     near,
-    stop,
-    stops,
-    enough,
-    limit,
+    step_index,
+    step_count,
+    target_count,
+    max_count,
     origins,
     directions,
     jitter,
@@ -77,11 +77,13 @@ def go_on(
     low,
     scale,
     count,
-    found,
+    canonical,
     distance,
-    owner,
+    ray_indices,
 ):
-    """Note samples of a ray until there are `enough` of all rays; none once there are `limit`: (samples, next stop)."""
+    """Note samples of a ray until there are `target_count` of all rays; none once there are `max_count`: (samples,
+    next stop).
+    """
     ox, oy, oz = origins[ray, 0], origins[ray, 1], origins[ray, 2]
     dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
     gx, gy, gz = warp_origin[f, 0], warp_origin[f, 1], warp_origin[f, 2]
@@ -89,9 +91,9 @@ def go_on(
     dims = warp_dims[f]
     node_first, code_first, map_first = warp_first[f, 0], warp_first[f, 1], warp_first[f, 2]
     inverse = _ONE / cell
-    while stop < stops and count < enough:
-        t = near + (np.float32(stop) + jitter[ray]) * step
-        stop += 1
+    while step_index < step_count and count < target_count:
+        t = near + (np.float32(step_index) + jitter[ray]) * step
+        step_index += 1
         px, py, pz = (ox + t * dx - gx) * inverse, (oy + t * dy - gy) * inverse, (oz + t * dz - gz) * inverse
         i, j, k = min(max(int(px), 0), nx - 2), min(max(int(py), 0), ny - 2), min(max(int(pz), 0), nz - 2)
         code = warp_codes[code_first + (i * (ny - 1) + j) * (nz - 1) + k]
@@ -105,14 +107,14 @@ def go_on(
             else:
                 m = warp_maps[map_first + (code - 1) // CANDIDATES + candidate]
                 x, y, z = apply_affine(m, px * cell + gx, py * cell + gy, pz * cell + gz)
-            if count < limit and _is_occupied(x, y, z, occupied, low, scale):
-                found[count, 0], found[count, 1], found[count, 2] = x, y, z
-                distance[count], owner[count] = t, ray
+            if count < max_count and _is_occupied(x, y, z, occupied, low, scale):
+                canonical[count, 0], canonical[count, 1], canonical[count, 2] = x, y, z
+                distance[count], ray_indices[count] = t, ray
                 count += 1
-    return count, stop
+    return count, step_index
 
 
-@njit(parallel=True, **OPTIONS)
+@njit(parallel=True, **NJIT_OPTIONS)
 def march(
     origins,
     directions,
@@ -132,19 +134,19 @@ def march(
 ):
     """(canonical points (s, 3), distances (s), ray starts (n + 1) int64): see `pipeline.kernels.march.march`."""
     rays = origins.shape[0]
-    found, distance = np.empty((rays * max_samples, 3), np.float32), np.empty(rays * max_samples, np.float32)
-    owner, counts = np.empty(rays * max_samples, np.int32), np.zeros(rays, np.int64)
+    canonical, distance = np.empty((rays * max_samples, 3), np.float32), np.empty(rays * max_samples, np.float32)
+    ray_indices, counts = np.empty(rays * max_samples, np.int32), np.zeros(rays, np.int64)
     low, scale = bounds[0], np.empty(3, np.float32)
     for axis in range(3):
         scale[axis] = np.float32(occupied.shape[axis]) / (bounds[1, axis] - bounds[0, axis])
     for ray in prange(rays):
         f, first = frame[ray], ray * max_samples
-        near, stops = enter(ray, origins, directions, jitter, step, cell, warp_origin[f], warp_dims[f])
-        last, _ = go_on(
+        near, step_count = intersect_box(ray, origins, directions, jitter, step, cell, warp_origin[f], warp_dims[f])
+        last, _ = advance_ray(
             ray,
             near,
             0,
-            stops,
+            step_count,
             first + max_samples,
             first + max_samples,
             origins,
@@ -163,25 +165,29 @@ def march(
             low,
             scale,
             first,
-            found,
+            canonical,
             distance,
-            owner,
+            ray_indices,
         )
         counts[ray] = last - first
-    return _pack(found, distance, counts, max_samples)
+    return _pack(canonical, distance, counts, max_samples)
 
 
-@njit(parallel=True, **OPTIONS)
-def _pack(found, distances, counts, max_samples):
+@njit(parallel=True, **NJIT_OPTIONS)
+def _pack(canonical, distances, counts, max_samples):
     rays = counts.shape[0]
-    ray_start = np.zeros(rays + 1, np.int64)
+    ray_offsets = np.zeros(rays + 1, np.int64)
     for ray in range(rays):
-        ray_start[ray + 1] = ray_start[ray] + counts[ray]
-    points = np.empty((ray_start[rays], 3), np.float32)
-    distance = np.empty(ray_start[rays], np.float32)
+        ray_offsets[ray + 1] = ray_offsets[ray] + counts[ray]
+    points = np.empty((ray_offsets[rays], 3), np.float32)
+    distance = np.empty(ray_offsets[rays], np.float32)
     for ray in prange(rays):
         for index in range(counts[ray]):
-            to, of = ray_start[ray] + index, ray * max_samples + index
-            points[to, 0], points[to, 1], points[to, 2] = found[of, 0], found[of, 1], found[of, 2]
-            distance[to] = distances[of]
-    return points, distance, ray_start
+            target, source = ray_offsets[ray] + index, ray * max_samples + index
+            points[target, 0], points[target, 1], points[target, 2] = (
+                canonical[source, 0],
+                canonical[source, 1],
+                canonical[source, 2],
+            )
+            distance[target] = distances[source]
+    return points, distance, ray_offsets

@@ -6,33 +6,33 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from pipeline.kernels.common.grid_corners import corners_of
-from pipeline.kernels.march.reference_stops import march_with
+from pipeline.kernels.common.grid_corners import cell_corners
+from pipeline.kernels.march.reference_stops import march_with_inverse
 
 CANDIDATES = 4
 
 
-def _look_up(posed: Tensor, frame: Tensor, cell_m: float, warp: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+def _query_warp_grids(posed: Tensor, frame: Tensor, cell_m: float, warp: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
     """Canonical candidates (p, 4, 3) of posed points (p, 3), and which of the four exist."""
-    origin, dims, first, nodes, codes, maps = warp
+    origin, dims, first, nodes, cell_codes, affine_maps = warp
     dims, first = dims[frame], first[frame]
     scaled = (posed - origin[frame].to(posed)) / cell_m
     low = torch.minimum(scaled.long().clamp(min=0), dims - 2)
     i, j, k = low.unbind(-1)
     cell_index = first[:, 1] + (i * (dims[:, 1] - 1) + j) * (dims[:, 2] - 1) + k
-    code = codes[cell_index.clamp(max=len(codes) - 1)].long()
-    corner, shares = corners_of(scaled, dims - 1)
+    code = cell_codes[cell_index.clamp(max=len(cell_codes) - 1)].long()
+    corner, axis_weights = cell_corners(scaled, dims - 1)
     i, j, k = corner.unbind(-1)
     node = first[:, :1] + (i * dims[:, 1:2] + j) * dims[:, 2:] + k
     # A node that does not exist is NaN; cells with such a corner have other codes.
     around = nodes[node.clamp(max=len(nodes) - 1)].to(posed)
-    smooth = (shares.prod(-1, keepdim=True) * around).sum(1)
+    smooth = (axis_weights.prod(-1, keepdim=True) * around).sum(1)
     points = torch.zeros(len(posed), CANDIDATES, 3, dtype=posed.dtype, device=posed.device)
     candidate = torch.arange(CANDIDATES, device=posed.device)
     exists = (code[:, None] > 0) & ((code[:, None] - 1) % CANDIDATES >= candidate)
-    if len(maps):
+    if len(affine_maps):
         row = first[:, 2:] + (code[:, None].clamp(min=1) - 1) // CANDIDATES + candidate
-        matrix = maps[row.clamp(max=len(maps) - 1)].view(-1, CANDIDATES, 3, 4).to(posed)
+        matrix = affine_maps[row.clamp(max=len(affine_maps) - 1)].view(-1, CANDIDATES, 3, 4).to(posed)
         points = (matrix[..., :3] * posed[:, None, None]).sum(-1) + matrix[..., 3]
     is_smooth = (code == 0)[:, None]
     points[:, 0] = torch.where(is_smooth, smooth, points[:, 0])
@@ -51,8 +51,10 @@ def march(
     bounds_m: Float[Tensor, "2 3"],
     max_samples: int,
 ) -> tuple[Float[Tensor, "s 3"], Float[Tensor, "s"], Int[Tensor, "m"]]:
-    """Same as `pipeline.kernels.march.march`; `warp` is `WarpSet.tensors()`, with cells of `cell_m`."""
+    """Same as `pipeline.kernels.march.march`; `warp` is `PackedWarpGrids.tensors()`, with cells of `cell_m`."""
     low = warp[0].to(origins_m)
     boxes = torch.stack([low, low + cell_m * (warp[1] - 1)], dim=1)
-    find = partial(_look_up, cell_m=cell_m, warp=warp)
-    return march_with(find, origins_m, directions, frame, jitter, step_m, boxes, occupied, bounds_m, max_samples)
+    find_inverses = partial(_query_warp_grids, cell_m=cell_m, warp=warp)
+    return march_with_inverse(
+        find_inverses, origins_m, directions, frame, jitter, step_m, boxes, occupied, bounds_m, max_samples
+    )

@@ -6,17 +6,17 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from pipeline.kernels.common.packing import owner_of_each
+from pipeline.kernels.common.packing import segment_ids_from_counts
 
-Find = Callable[
+FindInverses = Callable[
     [Float[Tensor, "p 3"], Int[Tensor, "p"]],
     tuple[Float[Tensor, "p c 3"], Bool[Tensor, "p c"]],
 ]
 """Posed points (m) and their frames -> canonical candidates (m), and which of them exist."""
 
 
-def march_with(
-    find: Find,
+def march_with_inverse(
+    find_inverses: FindInverses,
     origins_m: Float[Tensor, "n 3"],
     directions: Float[Tensor, "n 3"],
     frame: Int[Tensor, "n"],
@@ -33,21 +33,21 @@ def march_with(
     """
     near, far = _near_far(origins_m, directions, boxes_m[frame])
     count = ((far - near) / step_m - jitter).ceil().clamp(min=0).long()
-    ray = owner_of_each(count)
-    stop = torch.arange(len(ray), device=count.device) - (count.cumsum(0) - count)[ray]
-    distance = near[ray] + (stop + jitter[ray]) * step_m
-    points, exists = find(origins_m[ray] + distance[:, None] * directions[ray], frame[ray])
+    ray = segment_ids_from_counts(count)
+    step_index = torch.arange(len(ray), device=count.device) - (count.cumsum(0) - count)[ray]
+    distance = near[ray] + (step_index + jitter[ray]) * step_m
+    points, exists = find_inverses(origins_m[ray] + distance[:, None] * directions[ray], frame[ray])
     size = torch.tensor(occupied.shape, device=points.device)
     index = ((points - bounds_m[0]) * (size / (bounds_m[1] - bounds_m[0]))).floor()
     inside = exists & (index >= 0).all(-1) & (index < size).all(-1)
     index = torch.where(inside[..., None], index, 0).long()
     kept = inside & (occupied[tuple(index.unbind(-1))] != 0)
-    stop, candidate = torch.nonzero(kept, as_tuple=True)
-    per_ray = torch.bincount(ray[stop], minlength=len(count))
-    rank = torch.arange(len(stop), device=count.device) - (per_ray.cumsum(0) - per_ray)[ray[stop]]
-    stop, candidate = stop[rank < max_samples], candidate[rank < max_samples]
-    ray_start = torch.cat([per_ray.new_zeros(1), per_ray.clamp(max=max_samples).cumsum(0)])
-    return points[stop, candidate], distance[stop], ray_start
+    step_index, candidate = torch.nonzero(kept, as_tuple=True)
+    per_ray = torch.bincount(ray[step_index], minlength=len(count))
+    rank = torch.arange(len(step_index), device=count.device) - (per_ray.cumsum(0) - per_ray)[ray[step_index]]
+    step_index, candidate = step_index[rank < max_samples], candidate[rank < max_samples]
+    ray_offsets = torch.cat([per_ray.new_zeros(1), per_ray.clamp(max=max_samples).cumsum(0)])
+    return points[step_index, candidate], distance[step_index], ray_offsets
 
 
 def _near_far(origins: Tensor, directions: Tensor, boxes: Tensor) -> tuple[Tensor, Tensor]:

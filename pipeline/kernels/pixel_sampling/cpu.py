@@ -7,79 +7,85 @@ order, so that neighbouring rays read the same memory, and no part of a body is 
 import numpy as np
 from numba import njit
 
-from pipeline.kernels.common.numba_options import OPTIONS
+from pipeline.kernels.common.numba_options import NJIT_OPTIONS
 
-CANDIDATES = 4
+CANDIDATES_PER_SAMPLE = 4
 """Pixels that are drawn for each that is then chosen by the error around it."""
-_LEAST = np.float64(1e-12)
+_MIN_ERROR = np.float64(1e-12)
 """Stands for an error of zero, so that of many such no one is preferred."""
 
 
-@njit(**OPTIONS)
-def _one_of_each_part(first, last, count, numbers, rows):
+@njit(**NJIT_OPTIONS)
+def _stratified_indices(first, last, count, uniforms, rows):
     """Fill rows[:count] with one of each n-th of first..last."""
     width = np.float64(last - first) / np.float64(max(count, 1))
     for i in range(count):
-        rows[i] = min(first + np.int64((np.float64(i) + numbers[i]) * width), last - 1)
+        rows[i] = min(first + np.int64((np.float64(i) + uniforms[i]) * width), last - 1)
 
 
-@njit(**OPTIONS)
-def _choose(candidates, weight, count, numbers, rows):
+@njit(**NJIT_OPTIONS)
+def _systematic_resampling(candidates, weight, count, uniforms, rows):
     """Fill rows[:count] with candidates, each as often as its weight has it; weight is made a running sum."""
     for i in range(1, len(candidates)):
         weight[i] += weight[i - 1]
     part, place, end = weight[-1] / np.float64(max(count, 1)), 0, len(candidates) - 1
     for i in range(count):
-        while place < end and weight[place] <= (np.float64(i) + numbers[i]) * part:
+        while place < end and weight[place] <= (np.float64(i) + uniforms[i]) * part:
             place += 1
         rows[i] = candidates[place]
 
 
-@njit(**OPTIONS)
+@njit(**NJIT_OPTIONS)
 def _tile_errors(rows, xy, error, tile, errors):
     """Fill `errors` with those (rows, columns) of the tiles that pixels lie in."""
     for i in range(len(rows)):
-        errors[i] = max(np.float64(error[xy[rows[i], 1] // tile, xy[rows[i], 0] // tile]), _LEAST)
+        errors[i] = max(np.float64(error[xy[rows[i], 1] // tile, xy[rows[i], 0] // tile]), _MIN_ERROR)
 
 
-@njit(**OPTIONS)
-def draw_rows(start, xy, frames, sizes, chosen, error, tile, outlier, numbers, rows, trust):
-    """Fill rows and trust: see `pipeline.kernels.pixel_sampling.draw_pixels`. numbers: uniform in [0, 1)."""
-    done, used = 0, 0
-    for slot in range(len(frames)):
-        frame, begun, limit = frames[slot], done, np.inf
+@njit(**NJIT_OPTIONS)
+def sample_pixels(
+    kind_offsets, xy, frames, sizes, error_sampled_sizes, error, tile, outlier_ratio, uniforms, rows, confidence
+):
+    """Fill rows and trust: see `pipeline.kernels.pixel_sampling.sample_pixels`. numbers: uniform in [0, 1)."""
+    written, consumed = 0, 0
+    for batch_index in range(len(frames)):
+        frame, frame_start, limit = frames[batch_index], written, np.inf
         for kind in range(sizes.shape[1]):
-            first, last, by_error = start[frame, kind], start[frame, kind + 1], chosen[slot, kind]
-            plain = sizes[slot, kind] - by_error
-            _one_of_each_part(first, last, plain, numbers[used:], rows[done:])
-            if kind == 0 and plain > 0:
-                usual = np.empty(plain, np.float64)
-                _tile_errors(rows[done : done + plain], xy, error[frame], tile, usual)
-                limit = outlier * np.median(usual)
-            done, used = done + plain, used + plain
-            if by_error > 0:
-                candidates = np.empty(CANDIDATES * by_error, np.int64)
+            first, last, error_sampled = (
+                kind_offsets[frame, kind],
+                kind_offsets[frame, kind + 1],
+                error_sampled_sizes[batch_index, kind],
+            )
+            uniform_count = sizes[batch_index, kind] - error_sampled
+            _stratified_indices(first, last, uniform_count, uniforms[consumed:], rows[written:])
+            if kind == 0 and uniform_count > 0:
+                uniform_errors = np.empty(uniform_count, np.float64)
+                _tile_errors(rows[written : written + uniform_count], xy, error[frame], tile, uniform_errors)
+                limit = outlier_ratio * np.median(uniform_errors)
+            written, consumed = written + uniform_count, consumed + uniform_count
+            if error_sampled > 0:
+                candidates = np.empty(CANDIDATES_PER_SAMPLE * error_sampled, np.int64)
                 weight = np.empty(len(candidates), np.float64)
-                _one_of_each_part(first, last, len(candidates), numbers[used:], candidates)
-                used += len(candidates)
+                _stratified_indices(first, last, len(candidates), uniforms[consumed:], candidates)
+                consumed += len(candidates)
                 _tile_errors(candidates, xy, error[frame], tile, weight)
                 for i in range(len(candidates)):
                     weight[i] = min(weight[i], limit)
-                _choose(candidates, weight, by_error, numbers[used:], rows[done:])
-                done, used = done + by_error, used + by_error
-        found = np.empty(done - begun, np.float64)
-        _tile_errors(rows[begun:done], xy, error[frame], tile, found)
-        for i in range(done - begun):
-            trust[begun + i] = min(1.0, limit / found[i]) ** 4
+                _systematic_resampling(candidates, weight, error_sampled, uniforms[consumed:], rows[written:])
+                written, consumed = written + error_sampled, consumed + error_sampled
+        sample_errors = np.empty(written - frame_start, np.float64)
+        _tile_errors(rows[frame_start:written], xy, error[frame], tile, sample_errors)
+        for i in range(written - frame_start):
+            confidence[frame_start + i] = min(1.0, limit / sample_errors[i]) ** 4
 
 
-@njit(**OPTIONS)
-def pixel_rays(rows, frame, xy, rgba, inside, focal, centre, origin, axes, origins, directions, colour):
-    """Fill origins, directions, colour: see `pipeline.kernels.pixel_sampling.pixel_rays`."""
+@njit(**NJIT_OPTIONS)
+def generate_pixel_rays(rows, frame, xy, rgba, pixel_offset, focal, centre, origin, axes, origins, directions, colour):
+    """Fill origins, directions, colour: see `pipeline.kernels.pixel_sampling.generate_pixel_rays`."""
     for ray in range(len(rows)):
         row, f = rows[ray], frame[ray]
-        x = (np.float32(xy[row, 0]) + inside[ray, 0] - centre[0]) / focal[0]
-        y = (np.float32(xy[row, 1]) + inside[ray, 1] - centre[1]) / focal[1]
+        x = (np.float32(xy[row, 0]) + pixel_offset[ray, 0] - centre[0]) / focal[0]
+        y = (np.float32(xy[row, 1]) + pixel_offset[ray, 1] - centre[1]) / focal[1]
         scale = np.float32(1) / np.sqrt(x * x + y * y + np.float32(1))
         for axis in range(3):
             along = axes[f, axis, 0] * x + axes[f, axis, 1] * y + axes[f, axis, 2]
@@ -88,20 +94,24 @@ def pixel_rays(rows, frame, xy, rgba, inside, focal, centre, origin, axes, origi
             colour[ray, channel] = np.float32(rgba[row, channel]) / np.float32(255)
 
 
-@njit(**OPTIONS)
-def note_errors(rows, frame, xy, erred, memory, tile, error):
-    """Change `error` in place: see `pipeline.kernels.pixel_sampling.note_errors`."""
+@njit(**NJIT_OPTIONS)
+def update_error_map(rows, frame, xy, colour_error, decay, tile, error):
+    """Change `error` in place: see `pipeline.kernels.pixel_sampling.update_error_map`."""
     total, count = np.zeros(error.shape[1:], np.float64), np.zeros(error.shape[1:], np.int64)
     for ray in range(len(rows)):
         y, x = xy[rows[ray], 1] // tile, xy[rows[ray], 0] // tile
-        total[y, x] += (abs(erred[ray, 0]) + abs(erred[ray, 1]) + abs(erred[ray, 2])) / np.float32(3)
+        total[y, x] += (abs(colour_error[ray, 0]) + abs(colour_error[ray, 1]) + abs(colour_error[ray, 2])) / np.float32(
+            3
+        )
         count[y, x] += 1
         if ray + 1 < len(rows) and frame[ray + 1] == frame[ray]:
             continue
-        known = error[frame[ray]]
+        frame_error = error[frame[ray]]
         for y in range(total.shape[0]):
             for x in range(total.shape[1]):
                 if count[y, x] > 0:
-                    kept = memory ** count[y, x]
-                    known[y, x] = kept * known[y, x] + (1.0 - kept) * total[y, x] / np.float64(count[y, x])
+                    retained = decay ** count[y, x]
+                    frame_error[y, x] = retained * frame_error[y, x] + (1.0 - retained) * total[y, x] / np.float64(
+                        count[y, x]
+                    )
         total[:], count[:] = 0.0, 0

@@ -10,24 +10,24 @@ can fall outside both. NaN must compare false (a face with a NaN corner is dropp
 import numpy as np
 from numba import njit, prange
 
-from pipeline.kernels.common.numba_options import OPTIONS
+from pipeline.kernels.common.numba_options import NJIT_OPTIONS
 
 BAND_ROWS = 16
 
 
-@njit(**OPTIONS)
+@njit(**NJIT_OPTIONS)
 def _first_centre(low: float, size: int) -> int:
     """First pixel index whose centre is at or right of ``low``, within [0, size]."""
     return int(np.ceil(min(max(low - 0.5, 0.0), float(size))))
 
 
-@njit(**OPTIONS)
+@njit(**NJIT_OPTIONS)
 def _last_centre(high: float, size: int) -> int:
     """Last pixel index whose centre is at or left of ``high``, within [-1, size - 1]."""
     return int(np.floor(min(max(high - 0.5, -1.0), float(size - 1))))
 
 
-@njit(parallel=True, **OPTIONS)
+@njit(parallel=True, **NJIT_OPTIONS)
 def face_boxes(
     vertices_px: np.ndarray, depth_m: np.ndarray, faces: np.ndarray, size_wh: tuple, near_m: float, cull: bool
 ) -> np.ndarray:
@@ -54,33 +54,33 @@ def face_boxes(
     return boxes
 
 
-@njit(**OPTIONS)
+@njit(**NJIT_OPTIONS)
 def bin_faces(boxes: np.ndarray, n_bands: int) -> tuple:
     """Faces touching each band of rows in ascending order: (start (n_bands + 1,), face list)."""
-    start = np.zeros(n_bands + 1, np.int64)
+    band_offsets = np.zeros(n_bands + 1, np.int64)
     for f in range(boxes.shape[0]):
         if boxes[f, 0] <= boxes[f, 1] and boxes[f, 2] <= boxes[f, 3]:
             for band in range(boxes[f, 2] // BAND_ROWS, boxes[f, 3] // BAND_ROWS + 1):
-                start[band + 1] += 1
+                band_offsets[band + 1] += 1
     for band in range(n_bands):
-        start[band + 1] += start[band]
-    cursor = start[:-1].copy()
-    listed = np.empty(start[n_bands], np.int32)
+        band_offsets[band + 1] += band_offsets[band]
+    cursor = band_offsets[:-1].copy()
+    face_list = np.empty(band_offsets[n_bands], np.int32)
     for f in range(boxes.shape[0]):
         if boxes[f, 0] <= boxes[f, 1] and boxes[f, 2] <= boxes[f, 3]:
             for band in range(boxes[f, 2] // BAND_ROWS, boxes[f, 3] // BAND_ROWS + 1):
-                listed[cursor[band]] = f
+                face_list[cursor[band]] = f
                 cursor[band] += 1
-    return start, listed
+    return band_offsets, face_list
 
 
-@njit(**OPTIONS)
+@njit(**NJIT_OPTIONS)
 def _edge_plane(ax: float, ay: float, bx: float, by: float, scale: float) -> tuple:
     """(A, B, C) with A x + B y + C = scale * ((b - a) x (p - a))."""
     return -(by - ay) * scale, (bx - ax) * scale, ((by - ay) * ax - (bx - ax) * ay) * scale
 
 
-@njit(**OPTIONS)
+@njit(**NJIT_OPTIONS)
 def _draw_face(
     f: int,
     box: tuple,
@@ -111,28 +111,28 @@ def _draw_face(
                     face_id[y, x] = f
 
 
-@njit(parallel=True, **OPTIONS)
+@njit(parallel=True, **NJIT_OPTIONS)
 def draw_bands(
     vertices_px: np.ndarray,
     depth_m: np.ndarray,
     faces: np.ndarray,
     boxes: np.ndarray,
-    start: np.ndarray,
-    listed: np.ndarray,
+    band_offsets: np.ndarray,
+    face_list: np.ndarray,
     face_id: np.ndarray,
     inverse: np.ndarray,
 ) -> None:
     """Fills ``face_id`` and ``inverse`` depth (h, w), one band of rows per work item."""
     height = face_id.shape[0]
-    for band in prange(start.shape[0] - 1):
+    for band in prange(band_offsets.shape[0] - 1):
         top, bottom = band * BAND_ROWS, min((band + 1) * BAND_ROWS, height) - 1
-        for k in range(start[band], start[band + 1]):
-            f = listed[k]
+        for k in range(band_offsets[band], band_offsets[band + 1]):
+            f = face_list[k]
             box = (boxes[f, 0], boxes[f, 1], max(boxes[f, 2], top), min(boxes[f, 3], bottom))
             _draw_face(f, box, vertices_px, depth_m, faces, face_id, inverse)
 
 
-@njit(parallel=True, **OPTIONS)
+@njit(parallel=True, **NJIT_OPTIONS)
 def resolve(
     vertices_px: np.ndarray,
     depth_m: np.ndarray,
@@ -166,10 +166,10 @@ def rasterize_cpu(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """``pipeline.kernels.raster.rasterize`` on contiguous float32 / int32 arrays."""
     boxes = face_boxes(vertices_px, depth_m, faces, (width, height), near_m, cull)
-    start, listed = bin_faces(boxes, -(-height // BAND_ROWS))
+    band_offsets, face_list = bin_faces(boxes, -(-height // BAND_ROWS))
     face_id = np.full((height, width), -1, np.int32)
     inverse = np.zeros((height, width), np.float32)
-    draw_bands(vertices_px, depth_m, faces, boxes, start, listed, face_id, inverse)
+    draw_bands(vertices_px, depth_m, faces, boxes, band_offsets, face_list, face_id, inverse)
     barycentric = np.zeros((height, width, 3), np.float32)
     depth = np.full((height, width), np.inf, np.float32)
     resolve(vertices_px, depth_m, faces, face_id, barycentric, depth)

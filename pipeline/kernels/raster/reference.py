@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from pipeline.kernels.common.packing import owner_of_each
+from pipeline.kernels.common.packing import segment_ids_from_counts
 
 FRAGMENTS_PER_CHUNK = 1 << 22
 
@@ -58,7 +58,7 @@ def _fragments(
 ) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"], Float[Tensor, "n"]]:
     """Covered (face, pixel, 1/z as float32) triples of a chunk of faces."""
     counts = extent.prod(1)
-    face = owner_of_each(counts)
+    face = segment_ids_from_counts(counts)
     order = torch.arange(len(face), device=faces.device) - (counts.cumsum(0) - counts)[face]
     columns = extent[face, 0]
     x, y = first[face, 0] + order % columns, first[face, 1] + order // columns
@@ -138,7 +138,7 @@ def _crossings(
     first = (across.amin(1) - 0.5).clamp(0, lines).ceil().long()
     last = (across.amax(1) - 0.5).clamp(0, lines).ceil().long()
     counts = last - first
-    edge = owner_of_each(counts)
+    edge = segment_ids_from_counts(counts)
     line = first[edge] + torch.arange(len(edge), device=edge.device) - (counts.cumsum(0) - counts)[edge]
     start, end = across[edge].unbind(1)
     return edge, line, (line + 0.5 - start) / (end - start)
@@ -155,7 +155,7 @@ def _outermost(distance: Float[Tensor, "n"], pair: Int[Tensor, "n"], pair_count:
     return order == first[pair]
 
 
-def _axis_change(
+def _blend_along_axis(
     flat: Float[Tensor, "n c"],
     face_id: Int[Tensor, "h w"],
     depth: Float[Tensor, "h w"],
@@ -177,23 +177,23 @@ def _axis_change(
     weight = (slope**2 / (end - start).square().sum(1)).detach()
     outward = torch.where(_cross(end - start, apex - start) * slope > 0, -1, 1)
     low = (position.detach() - 0.5).clamp(-2, size).floor().long()
-    ok = (low >= 0) & (low < size - 1)
-    low_pixel = (line * width + low if axis == 0 else low * width + line).where(ok, 0)
+    valid = (low >= 0) & (low < size - 1)
+    low_pixel = (line * width + low if axis == 0 else low * width + line).where(valid, 0)
     near = low_pixel + (outward < 0) * step
     far = low_pixel + (outward > 0) * step
     behind = depth.reshape(-1)
-    ok &= (
+    valid &= (
         (behind[near] < behind[far])
         & (behind[far] * inverse > 1.0)
         & (face_id.reshape(-1)[near] != face_id.reshape(-1)[far])
     )
     near_position = torch.where(outward < 0, low + 1, low).to(position.dtype) + 0.5
-    distance = ((position - near_position) * outward)[ok]
-    near, far, low_pixel = near[ok], far[ok], low_pixel[ok]
+    distance = ((position - near_position) * outward)[valid]
+    near, far, low_pixel = near[valid], far[valid], low_pixel[valid]
     keep = _outermost(distance.detach(), low_pixel, height * width)
     share, near, far = distance[keep] - 0.5, near[keep], far[keep]
     target = torch.where(share.detach() > 0, far, near)
-    share = share * weight[ok][keep]
+    share = share * weight[valid][keep]
     return torch.zeros_like(flat).index_add(0, target, share[:, None] * (flat[near] - flat[far]))
 
 
@@ -211,5 +211,5 @@ def antialias_reference(
     edges = edges[(depth_m.detach()[edges] > 0).all(1)]
     ends = (vertices_px[edges], 1.0 / depth_m.detach()[edges[:, :2]])
     flat = image.reshape(-1, image.shape[2])
-    change = [_axis_change(flat, face_id, depth, ends, axis) for axis in (0, 1)]
+    change = [_blend_along_axis(flat, face_id, depth, ends, axis) for axis in (0, 1)]
     return (flat + change[0] + change[1]).view(image.shape)

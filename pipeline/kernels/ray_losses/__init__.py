@@ -15,25 +15,25 @@ from pipeline.kernels.ray_losses import reference
 class _RayLosses(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, image: Tensor, alpha: Tensor, rgba: Tensor, background: Tensor, trust: Tensor, delta: float
+        ctx: Any, image: Tensor, alpha: Tensor, rgba: Tensor, background: Tensor, confidence: Tensor, delta: float
     ) -> tuple[Tensor, Tensor]:
         rays = len(alpha)
-        sums, error, of_image = torch.empty(3), torch.empty(rays, 3), np.empty((rays, 3), np.float32)
-        of_alpha, of_hard = np.empty((rays, 2), np.float32), np.empty(rays, np.float32)
-        given = (tensor.detach().numpy() for tensor in (image, alpha, rgba, background, trust))
-        filled = (sums.numpy(), error.numpy(), of_image, of_alpha, of_hard)
-        photometric_cpu.ray_losses(*given, np.float32(delta), *filled)
+        sums, error, grad_image = torch.empty(3), torch.empty(rays, 3), np.empty((rays, 3), np.float32)
+        grad_alpha, grad_hard = np.empty((rays, 2), np.float32), np.empty(rays, np.float32)
+        inputs = (tensor.detach().numpy() for tensor in (image, alpha, rgba, background, confidence))
+        outputs = (sums.numpy(), error.numpy(), grad_image, grad_alpha, grad_hard)
+        photometric_cpu.ray_losses(*inputs, np.float32(delta), *outputs)
         counts = torch.tensor([3.0 * rays, rays, rays])
-        ctx.kept = counts, of_image, of_alpha, of_hard
+        ctx.kept = counts, grad_image, grad_alpha, grad_hard
         ctx.mark_non_differentiable(error)
         return sums / counts, error
 
     @staticmethod
-    def backward(ctx: Any, of_means: Tensor, _of_error: Tensor) -> tuple[Tensor | None, ...]:
-        counts, of_image, of_alpha, of_hard = ctx.kept
-        colour, alpha, hard = (of_means / counts).numpy()
-        total = colour * of_alpha[:, 0] + alpha * of_alpha[:, 1] + hard * of_hard
-        return torch.from_numpy(colour * of_image), torch.from_numpy(total), None, None, None, None
+    def backward(ctx: Any, grad_means: Tensor, _grad_error: Tensor) -> tuple[Tensor | None, ...]:
+        counts, grad_image, grad_alpha, grad_hard = ctx.kept
+        colour, alpha, hard = (grad_means / counts).numpy()
+        total = colour * grad_alpha[:, 0] + alpha * grad_alpha[:, 1] + hard * grad_hard
+        return torch.from_numpy(colour * grad_image), torch.from_numpy(total), None, None, None, None
 
 
 def ray_losses(
@@ -41,7 +41,7 @@ def ray_losses(
     alpha: Float[Tensor, "n"],
     rgba: Float[Tensor, "n 4"],
     background: Float[Tensor, "n 3"],
-    trust: Float[Tensor, "n"],
+    confidence: Float[Tensor, "n"],
     huber_delta: float,
 ) -> tuple[Float[Tensor, "3"], Float[Tensor, "n 3"]]:
     """Means over rays of three losses times the trust in each ray, differentiable in image and alpha, and the colour
@@ -57,5 +57,5 @@ def ray_losses(
         trust: in [0, 1], how far the pixel is taken to show what is learnt.
     """
     if not runs_on_numba(image, alpha, rgba, background):
-        return reference.ray_losses(image, alpha, rgba, background, trust, huber_delta)
-    return _RayLosses.apply(image, alpha, rgba, background, trust, huber_delta)
+        return reference.ray_losses(image, alpha, rgba, background, confidence, huber_delta)
+    return _RayLosses.apply(image, alpha, rgba, background, confidence, huber_delta)

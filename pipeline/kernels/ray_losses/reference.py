@@ -29,9 +29,9 @@ def colour_errors(image: Tensor, alpha: Tensor, rgba: Tensor, background: Tensor
 
 
 def ray_losses(
-    image: Tensor, alpha: Tensor, rgba: Tensor, background: Tensor, trust: Tensor, delta: float
+    image: Tensor, alpha: Tensor, rgba: Tensor, background: Tensor, confidence: Tensor, delta: float
 ) -> tuple[Tensor, Tensor]:
     """Same as `pipeline.kernels.ray_losses.ray_losses`."""
     error = colour_errors(image, alpha, rgba, background)
-    of_rays = huber(error, delta).mean(1), huber(alpha - rgba[:, 3], delta), hard_surface(alpha)
-    return torch.stack([(trust * loss).mean() for loss in of_rays]), error.detach()
+    per_ray = huber(error, delta).mean(1), huber(alpha - rgba[:, 3], delta), hard_surface(alpha)
+    return torch.stack([(confidence * loss).mean() for loss in per_ray]), error.detach()

@@ -5,11 +5,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pipeline.kernels.common.dispatch import runs_on_numba
-from pipeline.kernels.texel_projection.cpu import observe_texels_cpu
-from pipeline.kernels.texel_projection.reference import observe_texels_reference
+from pipeline.kernels.texel_projection.cpu import project_texels_cpu
+from pipeline.kernels.texel_projection.reference import project_texels_reference
 
 
-def observe_texels(
+def project_texels(
     vertices_px: Float[Tensor, "v 2"],
     depth_m: Float[Tensor, "v"],
     cosine: Float[Tensor, "v"],
@@ -17,10 +17,10 @@ def observe_texels(
     texel_face: Int[Tensor, "t"],
     texel_barycentric: Float[Tensor, "t 3"],
     image: Float[Tensor, "h w c"],
-    seen_depth_m: Float[Tensor, "h w"],
-    quality: Float[Tensor, "h w"],
+    depth_map_m: Float[Tensor, "h w"],
+    pixel_confidence: Float[Tensor, "h w"],
     tolerance_m: float = 0.01,
-    least_cosine: float = 0.1,
+    min_cosine: float = 0.1,
 ) -> tuple[Float[Tensor, "t c"], Float[Tensor, "t 2"]]:
     """Bilinear look-ups of a picture at the places where it shows the texels' surface points.
 
@@ -39,9 +39,9 @@ def observe_texels(
 
     Returns values (0 where invisible) and, per texel, (trust, cosine), both 0 where invisible. Not differentiable.
     """
-    tensors = (vertices_px, depth_m, cosine, texel_barycentric, image, seen_depth_m, quality)
+    tensors = (vertices_px, depth_m, cosine, texel_barycentric, image, depth_map_m, pixel_confidence)
     if not runs_on_numba(*tensors):
-        return observe_texels_reference(
+        return project_texels_reference(
             vertices_px,
             depth_m,
             cosine,
@@ -49,12 +49,12 @@ def observe_texels(
             texel_face,
             texel_barycentric,
             image,
-            seen_depth_m,
-            quality,
+            depth_map_m,
+            pixel_confidence,
             tolerance_m,
-            least_cosine,
+            min_cosine,
         )
     ordered = (vertices_px, depth_m, cosine, faces.int(), texel_face.int(), *tensors[3:])
     arrays = [tensor.detach().contiguous().numpy() for tensor in ordered]
-    values, weights = observe_texels_cpu(*arrays, tolerance_m, least_cosine)
+    values, weights = project_texels_cpu(*arrays, tolerance_m, min_cosine)
     return torch.from_numpy(values), torch.from_numpy(weights)

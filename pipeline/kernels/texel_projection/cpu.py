@@ -7,11 +7,11 @@ its corners' pixels.
 import numpy as np
 from numba import njit, prange
 
-from pipeline.kernels.common.numba_options import OPTIONS
+from pipeline.kernels.common.numba_options import NJIT_OPTIONS
 
 
-@njit(parallel=True, **OPTIONS)
-def observe_texels_cpu(
+@njit(parallel=True, **NJIT_OPTIONS)
+def project_texels_cpu(
     vertices_px: np.ndarray,
     depth_m: np.ndarray,
     cosine: np.ndarray,
@@ -19,23 +19,23 @@ def observe_texels_cpu(
     texel_face: np.ndarray,
     texel_barycentric: np.ndarray,
     image: np.ndarray,
-    seen_depth_m: np.ndarray,
-    quality: np.ndarray,
+    depth_map_m: np.ndarray,
+    pixel_confidence: np.ndarray,
     tolerance_m: float,
-    least_cosine: float,
+    min_cosine: float,
 ) -> tuple:
-    """See ``pipeline.kernels.texel_projection.observe_texels``."""
+    """See ``pipeline.kernels.texel_projection.project_texels``."""
     count, channels = texel_face.shape[0], image.shape[2]
-    height, width = quality.shape
+    height, width = pixel_confidence.shape
     values = np.zeros((count, channels), np.float32)
     weights = np.zeros((count, 2), np.float32)
     for t in prange(count):
         a, b, c = faces[texel_face[t], 0], faces[texel_face[t], 1], faces[texel_face[t], 2]
         wa, wb, wc = texel_barycentric[t, 0], texel_barycentric[t, 1], texel_barycentric[t, 2]
-        facing = wa * cosine[a] + wb * cosine[b] + wc * cosine[c]
+        texel_cosine = wa * cosine[a] + wb * cosine[b] + wc * cosine[c]
         za, zb, zc = wa * depth_m[a], wb * depth_m[b], wc * depth_m[c]
         z = za + zb + zc
-        if not (facing > least_cosine and z > 0.0):
+        if not (texel_cosine > min_cosine and z > 0.0):
             continue
         x = (za * vertices_px[a, 0] + zb * vertices_px[b, 0] + zc * vertices_px[c, 0]) / z - 0.5
         y = (za * vertices_px[a, 1] + zb * vertices_px[b, 1] + zc * vertices_px[c, 1]) / z - 0.5
@@ -43,22 +43,22 @@ def observe_texels_cpu(
             continue
         column, row = int(x), int(y)
         nearest = min(
-            min(seen_depth_m[row, column], seen_depth_m[row, column + 1]),
-            min(seen_depth_m[row + 1, column], seen_depth_m[row + 1, column + 1]),
+            min(depth_map_m[row, column], depth_map_m[row, column + 1]),
+            min(depth_map_m[row + 1, column], depth_map_m[row + 1, column + 1]),
         )
-        if nearest < z - tolerance_m / facing:
+        if nearest < z - tolerance_m / texel_cosine:
             continue
         right, down = np.float32(x - column), np.float32(y - row)
         w00, w01 = (1 - right) * (1 - down), right * (1 - down)
         w10, w11 = (1 - right) * down, right * down
-        trust = (
-            w00 * quality[row, column]
-            + w01 * quality[row, column + 1]
-            + w10 * quality[row + 1, column]
-            + w11 * quality[row + 1, column + 1]
+        confidence = (
+            w00 * pixel_confidence[row, column]
+            + w01 * pixel_confidence[row, column + 1]
+            + w10 * pixel_confidence[row + 1, column]
+            + w11 * pixel_confidence[row + 1, column + 1]
         )
-        weights[t, 0] = trust
-        weights[t, 1] = facing
+        weights[t, 0] = confidence
+        weights[t, 1] = texel_cosine
         for k in range(channels):
             values[t, k] = (
                 w00 * image[row, column, k]

@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 
-def observe_texels_reference(
+def project_texels_reference(
     vertices_px: Float[Tensor, "v 2"],
     depth_m: Float[Tensor, "v"],
     cosine: Float[Tensor, "v"],
@@ -13,20 +13,20 @@ def observe_texels_reference(
     texel_face: Int[Tensor, "t"],
     texel_barycentric: Float[Tensor, "t 3"],
     image: Float[Tensor, "h w c"],
-    seen_depth_m: Float[Tensor, "h w"],
-    quality: Float[Tensor, "h w"],
+    depth_map_m: Float[Tensor, "h w"],
+    pixel_confidence: Float[Tensor, "h w"],
     tolerance_m: float,
-    least_cosine: float,
+    min_cosine: float,
 ) -> tuple[Float[Tensor, "t c"], Float[Tensor, "t 2"]]:
-    """See ``pipeline.kernels.texel_projection.observe_texels``."""
-    height, width = quality.shape
+    """See ``pipeline.kernels.texel_projection.project_texels``."""
+    height, width = pixel_confidence.shape
     corners = faces.long()[texel_face.long()]
-    facing = (texel_barycentric * cosine[corners]).sum(dim=1)
+    texel_cosine = (texel_barycentric * cosine[corners]).sum(dim=1)
     corner_depth = texel_barycentric * depth_m[corners]
     z = corner_depth.sum(dim=1)
     position = (corner_depth[..., None] * vertices_px[corners]).sum(dim=1) / z[:, None] - 0.5
     limit = position.new_tensor([width - 1, height - 1])
-    possible = (facing > least_cosine) & (z > 0) & (position >= 0).all(dim=1) & (position < limit).all(dim=1)
+    possible = (texel_cosine > min_cosine) & (z > 0) & (position >= 0).all(dim=1) & (position < limit).all(dim=1)
 
     position = torch.where(possible[:, None], position, 0.0)
     first = position.floor().long()
@@ -34,9 +34,9 @@ def observe_texels_reference(
     weights = torch.stack([(1 - right) * (1 - down), right * (1 - down), (1 - right) * down, right * down], dim=1)
     rows = torch.clamp(first[:, 1:] + torch.tensor([0, 0, 1, 1], device=first.device), max=height - 1)
     columns = torch.clamp(first[:, :1] + torch.tensor([0, 1, 0, 1], device=first.device), max=width - 1)
-    nearest = seen_depth_m[rows, columns].amin(dim=1)
-    visible = possible & (nearest >= z - tolerance_m / torch.where(possible, facing, 1.0))
+    nearest = depth_map_m[rows, columns].amin(dim=1)
+    visible = possible & (nearest >= z - tolerance_m / torch.where(possible, texel_cosine, 1.0))
     values = (weights[..., None] * image[rows, columns]).sum(dim=1)
-    trust = (weights * quality[rows, columns]).sum(dim=1)
-    observed = torch.stack([trust, facing], dim=1)
-    return torch.where(visible[:, None], values, 0.0), torch.where(visible[:, None], observed, 0.0)
+    confidence = (weights * pixel_confidence[rows, columns]).sum(dim=1)
+    confidence_and_cosine = torch.stack([confidence, texel_cosine], dim=1)
+    return torch.where(visible[:, None], values, 0.0), torch.where(visible[:, None], confidence_and_cosine, 0.0)

@@ -5,11 +5,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pipeline.kernels.common.dispatch import runs_on_numba
-from pipeline.kernels.texture_sampling.cpu import shade_texture_cpu
-from pipeline.kernels.texture_sampling.reference import shade_texture_reference
+from pipeline.kernels.texture_sampling.cpu import supersample_texture_cpu
+from pipeline.kernels.texture_sampling.reference import supersample_texture_reference
 
 
-def shade_texture(
+def supersample_texture(
     face_id: Int[Tensor, "fh fw"],
     barycentric: Float[Tensor, "fh fw 3"],
     faces_uv: Int[Tensor, "f 3"],
@@ -26,6 +26,6 @@ def shade_texture(
     """
     tensors = (barycentric, uv, texture)
     if any(tensor.requires_grad for tensor in tensors) or not runs_on_numba(*tensors):
-        return shade_texture_reference(face_id, barycentric, faces_uv, uv, texture, samples)
+        return supersample_texture_reference(face_id, barycentric, faces_uv, uv, texture, samples)
     ordered = (face_id.int(), barycentric, faces_uv.int(), uv, texture)
-    return torch.from_numpy(shade_texture_cpu(*(tensor.contiguous().numpy() for tensor in ordered), samples))
+    return torch.from_numpy(supersample_texture_cpu(*(tensor.contiguous().numpy() for tensor in ordered), samples))

@@ -3,11 +3,11 @@
 import numpy as np
 from numba import njit, prange
 
-from pipeline.kernels.common.numba_options import OPTIONS
+from pipeline.kernels.common.numba_options import NJIT_OPTIONS
 
 
-@njit(parallel=True, **OPTIONS)
-def shade_texture_cpu(
+@njit(parallel=True, **NJIT_OPTIONS)
+def supersample_texture_cpu(
     face_id: np.ndarray,
     barycentric: np.ndarray,
     faces_uv: np.ndarray,
@@ -15,11 +15,11 @@ def shade_texture_cpu(
     texture: np.ndarray,
     samples: int,
 ) -> np.ndarray:
-    """See ``pipeline.kernels.texture_sampling.shade_texture``."""
+    """See ``pipeline.kernels.texture_sampling.supersample_texture``."""
     height, width = face_id.shape[0] // samples, face_id.shape[1] // samples
     texture_height, texture_width, channels = texture.shape
     image = np.zeros((height, width, channels + 1), np.float32)
-    share = np.float32(1.0 / (samples * samples))
+    sample_weight = np.float32(1.0 / (samples * samples))
     for row in prange(height):
         for fine_row in range(row * samples, (row + 1) * samples):
             for fine_column in range(width * samples):
@@ -41,9 +41,9 @@ def shade_texture_cpu(
                 right, bottom = min(left + 1, texture_width - 1), min(top + 1, texture_height - 1)
                 across, down = x - np.float32(left), y - np.float32(top)
                 column = fine_column // samples
-                image[row, column, channels] += share
+                image[row, column, channels] += sample_weight
                 for c in range(channels):
                     upper = texture[top, left, c] + across * (texture[top, right, c] - texture[top, left, c])
                     lower = texture[bottom, left, c] + across * (texture[bottom, right, c] - texture[bottom, left, c])
-                    image[row, column, c] += share * (upper + down * (lower - upper))
+                    image[row, column, c] += sample_weight * (upper + down * (lower - upper))
     return image

@@ -14,7 +14,7 @@ def sample_texture_reference(texture: Float[Tensor, "th tw c"], uv: Float[Tensor
     return sampled[0, :, 0].T
 
 
-def shade_texture_reference(
+def supersample_texture_reference(
     face_id: Int[Tensor, "fh fw"],
     barycentric: Float[Tensor, "fh fw 3"],
     faces_uv: Int[Tensor, "f 3"],
@@ -22,7 +22,7 @@ def shade_texture_reference(
     texture: Float[Tensor, "th tw c"],
     samples: int,
 ) -> Float[Tensor, "h w c+1"]:
-    """See ``pipeline.kernels.texture_sampling.shade_texture``."""
+    """See ``pipeline.kernels.texture_sampling.supersample_texture``."""
     height, width = face_id.shape[0] // samples, face_id.shape[1] // samples
     seen = face_id >= 0
     corners_uv = uv[faces_uv.long()[face_id[seen].long()]]

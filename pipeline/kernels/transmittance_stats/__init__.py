@@ -9,28 +9,30 @@ from pipeline.kernels.transmittance_stats import cpu as visits_cpu
 from pipeline.kernels.transmittance_stats import reference
 
 
-def record_visits(
+def update_voxel_maxima(
     points_m: Float[Tensor, "s 3"],
-    light: Float[Tensor, "s"],
+    transmittance: Float[Tensor, "s"],
     weight: Float[Tensor, "s"],
     bounds_m: Float[Tensor, "2 3"],
     shape: tuple[int, int, int],
-    reached: Float[Tensor, "cells"],
-    gave: Float[Tensor, "cells"],
+    max_transmittance: Float[Tensor, "cells"],
+    max_weight: Float[Tensor, "cells"],
 ) -> None:
-    """Raise `reached` and `gave` (x slowest) to the largest light and weight of the samples in each cell, in place."""
-    tensors = (points_m, light, weight, bounds_m)
-    if runs_on_numba(*tensors, reached, gave):
+    """Raise `max_transmittance` and `max_weight` (x slowest) to the largest light and weight of the samples in each
+    cell, in place.
+    """
+    tensors = (points_m, transmittance, weight, bounds_m)
+    if runs_on_numba(*tensors, max_transmittance, max_weight):
         arrays = (tensor.detach().numpy() for tensor in tensors)
-        visits_cpu.record(*arrays, shape, reached.numpy(), gave.numpy())
+        visits_cpu.update_voxel_maxima(*arrays, shape, max_transmittance.numpy(), max_weight.numpy())
     else:
-        reference.record(*tensors, shape, reached, gave)
+        reference.update_voxel_maxima(*tensors, shape, max_transmittance, max_weight)
 
 
-def light_before(weight: Float[Tensor, "s"], ray_start: Int[Tensor, "m"]) -> Float[Tensor, "s"]:
+def transmittance_from_weights(weight: Float[Tensor, "s"], ray_offsets: Int[Tensor, "m"]) -> Float[Tensor, "s"]:
     """Light in [0, 1] that reached each sample: what the samples before it on its ray have left."""
     if not runs_on_numba(weight):
-        return reference.light_before(weight.detach(), ray_start)
-    light = torch.empty_like(weight)
-    visits_cpu.light_before(weight.detach().numpy(), ray_start.numpy(), light.numpy())
-    return light
+        return reference.transmittance_from_weights(weight.detach(), ray_offsets)
+    transmittance = torch.empty_like(weight)
+    visits_cpu.transmittance_from_weights(weight.detach().numpy(), ray_offsets.numpy(), transmittance.numpy())
+    return transmittance

@@ -3,22 +3,22 @@
 import numpy as np
 from numba import njit, prange
 
-from pipeline.kernels.common.numba_options import OPTIONS
+from pipeline.kernels.common.numba_options import NJIT_OPTIONS
 
 
-@njit(parallel=True, **OPTIONS)
-def light_before(weight, ray_start, light):
-    """Fill `light`: see `pipeline.kernels.transmittance_stats.light_before`."""
-    for ray in prange(ray_start.shape[0] - 1):
-        left = np.float32(1)
-        for s in range(ray_start[ray], ray_start[ray + 1]):
-            light[s] = max(left, np.float32(0))
-            left -= weight[s]
+@njit(parallel=True, **NJIT_OPTIONS)
+def transmittance_from_weights(weight, ray_offsets, transmittance):
+    """Fill `transmittance`: see `pipeline.kernels.transmittance_stats.transmittance_from_weights`."""
+    for ray in prange(ray_offsets.shape[0] - 1):
+        remaining = np.float32(1)
+        for s in range(ray_offsets[ray], ray_offsets[ray + 1]):
+            transmittance[s] = max(remaining, np.float32(0))
+            remaining -= weight[s]
 
 
-@njit(**OPTIONS)
-def record(points, light, weight, bounds, shape, reached, gave):
-    """See `pipeline.kernels.transmittance_stats.record_visits`."""
+@njit(**NJIT_OPTIONS)
+def update_voxel_maxima(points, transmittance, weight, bounds, shape, max_transmittance, max_weight):
+    """See `pipeline.kernels.transmittance_stats.update_voxel_maxima`."""
     scale_x = np.float32(shape[0]) / (bounds[1, 0] - bounds[0, 0])
     scale_y = np.float32(shape[1]) / (bounds[1, 1] - bounds[0, 1])
     scale_z = np.float32(shape[2]) / (bounds[1, 2] - bounds[0, 2])
@@ -28,5 +28,5 @@ def record(points, light, weight, bounds, shape, reached, gave):
         k = int(np.floor((points[s, 2] - bounds[0, 2]) * scale_z))
         if 0 <= i < shape[0] and 0 <= j < shape[1] and 0 <= k < shape[2]:
             cell = (i * shape[1] + j) * shape[2] + k
-            reached[cell] = max(reached[cell], light[s])
-            gave[cell] = max(gave[cell], weight[s])
+            max_transmittance[cell] = max(max_transmittance[cell], transmittance[s])
+            max_weight[cell] = max(max_weight[cell], weight[s])

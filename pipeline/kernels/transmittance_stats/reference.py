@@ -4,27 +4,27 @@ import torch
 from torch import Tensor
 
 
-def light_before(weight: Tensor, ray_start: Tensor) -> Tensor:
-    """Same as `pipeline.kernels.transmittance_stats.light_before`."""
-    before = weight.double().cumsum(0) - weight
-    first = torch.repeat_interleave(ray_start[:-1], ray_start.diff())
-    return (1 - (before - before[first])).clamp(0, 1).to(weight.dtype)
+def transmittance_from_weights(weight: Tensor, ray_offsets: Tensor) -> Tensor:
+    """Same as `pipeline.kernels.transmittance_stats.transmittance_from_weights`."""
+    weight_before = weight.double().cumsum(0) - weight
+    first = torch.repeat_interleave(ray_offsets[:-1], ray_offsets.diff())
+    return (1 - (weight_before - weight_before[first])).clamp(0, 1).to(weight.dtype)
 
 
-def record(
+def update_voxel_maxima(
     points: Tensor,
-    light: Tensor,
+    transmittance: Tensor,
     weight: Tensor,
     bounds: Tensor,
     shape: tuple[int, int, int],
-    reached: Tensor,
-    gave: Tensor,
+    max_transmittance: Tensor,
+    max_weight: Tensor,
 ) -> None:
-    """Same as `pipeline.kernels.transmittance_stats.record_visits`."""
+    """Same as `pipeline.kernels.transmittance_stats.update_voxel_maxima`."""
     size = torch.tensor(shape, device=points.device)
     index = ((points - bounds[0]) * (size / (bounds[1] - bounds[0]))).floor().long()
     inside = ((index >= 0) & (index < size)).all(-1)
     i, j, k = index[inside].unbind(-1)
     cell = (i * shape[1] + j) * shape[2] + k
-    reached.scatter_reduce_(0, cell, light.detach()[inside], "amax")
-    gave.scatter_reduce_(0, cell, weight.detach()[inside], "amax")
+    max_transmittance.scatter_reduce_(0, cell, transmittance.detach()[inside], "amax")
+    max_weight.scatter_reduce_(0, cell, weight.detach()[inside], "amax")

@@ -3,39 +3,41 @@
 import numpy as np
 from numba import njit
 
-from pipeline.kernels.common.numba_options import OPTIONS
+from pipeline.kernels.common.numba_options import NJIT_OPTIONS
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
-@njit(**OPTIONS)
-def raw_gradients(owner, colour, density, weight, before, step, light, image_gradient, alpha_gradient, raw):
+@njit(**NJIT_OPTIONS)
+def network_output_gradients(
+    ray_indices, colour, density, weight, sample_transmittance, step, final_transmittance, grad_image, grad_alpha, raw
+):
     """Fill dL/d(what the network puts out) of every sample (s, 4) from that of image and alpha; see
     `pipeline.kernels.composite.cpu`.
     """
-    behind = np.zeros(len(light), np.float32)
-    for s in range(len(owner)):
-        ray = owner[s]
-        behind[ray] += weight[s] * (
-            image_gradient[ray, 0] * colour[s, 0]
-            + image_gradient[ray, 1] * colour[s, 1]
-            + image_gradient[ray, 2] * colour[s, 2]
+    suffix_sum = np.zeros(len(final_transmittance), np.float32)
+    for s in range(len(ray_indices)):
+        ray = ray_indices[s]
+        suffix_sum[ray] += weight[s] * (
+            grad_image[ray, 0] * colour[s, 0] + grad_image[ray, 1] * colour[s, 1] + grad_image[ray, 2] * colour[s, 2]
         )
-    for s in range(len(owner)):
-        ray = owner[s]
-        gx, gy, gz = image_gradient[ray, 0], image_gradient[ray, 1], image_gradient[ray, 2]
+    for s in range(len(ray_indices)):
+        ray = ray_indices[s]
+        gx, gy, gz = grad_image[ray, 0], grad_image[ray, 1], grad_image[ray, 2]
         r, g, b = colour[s, 0], colour[s, 1], colour[s, 2]
         towards = gx * r + gy * g + gz * b
-        behind[ray] -= weight[s] * towards
-        left_over = alpha_gradient[ray] * light[ray]
+        suffix_sum[ray] -= weight[s] * towards
+        grad_alpha_term = grad_alpha[ray] * final_transmittance[ray]
         raw[s, 0] = weight[s] * gx * r * (_ONE - r)
         raw[s, 1] = weight[s] * gy * g * (_ONE - g)
         raw[s, 2] = weight[s] * gz * b * (_ONE - b)
-        raw[s, 3] = density[s] * step * ((before[s] - weight[s]) * towards - behind[ray] + left_over)
+        raw[s, 3] = (
+            density[s] * step * ((sample_transmittance[s] - weight[s]) * towards - suffix_sum[ray] + grad_alpha_term)
+        )
 
 
-@njit(**OPTIONS)
-def thin(raw, share):
+@njit(**NJIT_OPTIONS)
+def subsample_gradients(raw, share):
     """Rows of gradients (s, 4) that stand for all, and what they then are: systematic resampling.
 
     Of the rows that are small each is taken with a chance in proportion, and then counts for those that were not.
@@ -46,25 +48,25 @@ def thin(raw, share):
     for s in range(count):
         size[s] = max(max(abs(raw[s, 0]), abs(raw[s, 1])), max(abs(raw[s, 2]), abs(raw[s, 3])))
         total += size[s]
-    enough = share * total / max(count, 1)
+    threshold = share * total / max(count, 1)
     rows, scaled = np.empty(count, np.int64), np.empty((count, 4), np.float32)
-    kept, waited = 0, 0.5
+    kept, accumulated = 0, 0.5
     for s in range(count):
         if not size[s] > _ZERO:
             continue
-        chance = min(1.0, size[s] / enough)
-        waited += chance
-        if waited >= 1.0:
-            waited -= 1.0
+        probability = min(1.0, size[s] / threshold)
+        accumulated += probability
+        if accumulated >= 1.0:
+            accumulated -= 1.0
             rows[kept] = s
             for c in range(4):
-                scaled[kept, c] = raw[s, c] / np.float32(chance)
+                scaled[kept, c] = raw[s, c] / np.float32(probability)
             kept += 1
     return rows[:kept], scaled[:kept]
 
 
-@njit(**OPTIONS)
-def network(rows, raw, features, hidden, output, hidden_gradient, output_gradient, towards):
+@njit(**NJIT_OPTIONS)
+def network(rows, raw, features, hidden, output, grad_hidden_weights, grad_output_weights, towards):
     """Add to the network's gradients; fill dL/d(features) (rows, w)."""
     width, units = hidden.shape
     back = np.ascontiguousarray(hidden.T)
@@ -86,16 +88,16 @@ def network(rows, raw, features, hidden, output, hidden_gradient, output_gradien
         r0, r1, r2, r3 = raw[row, 0], raw[row, 1], raw[row, 2], raw[row, 3]
         for h in range(units):
             value = max(layer[h], _ZERO)
-            output_gradient[h, 0] += value * r0
-            output_gradient[h, 1] += value * r1
-            output_gradient[h, 2] += value * r2
-            output_gradient[h, 3] += value * r3
-            passed = (r0 * output[h, 0] + r1 * output[h, 1]) + (r2 * output[h, 2] + r3 * output[h, 3])
-            layer[h] = passed if value > _ZERO else _ZERO
+            grad_output_weights[h, 0] += value * r0
+            grad_output_weights[h, 1] += value * r1
+            grad_output_weights[h, 2] += value * r2
+            grad_output_weights[h, 3] += value * r3
+            grad_activation = (r0 * output[h, 0] + r1 * output[h, 1]) + (r2 * output[h, 2] + r3 * output[h, 3])
+            layer[h] = grad_activation if value > _ZERO else _ZERO
         for i in range(width):
             value = features[s, i]
             for h in range(units):
-                hidden_gradient[i, h] += value * layer[h]
+                grad_hidden_weights[i, h] += value * layer[h]
         for i in range(width):
             towards[row, i] = _ZERO
         for h in range(units):

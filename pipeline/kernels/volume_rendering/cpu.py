@@ -7,22 +7,23 @@ at stays in the cache; what lies behind a surface is never asked.
 import numpy as np
 from numba import njit
 
-from pipeline.kernels.common.numba_options import OPTIONS
+from pipeline.kernels.common.numba_options import NJIT_OPTIONS
 from pipeline.kernels.hashgrid.cpu import BLOCK, encode_block
 from pipeline.kernels.inverse_skinning.newton_cpu import newton_step
-from pipeline.kernels.march.cpu import CANDIDATES, enter, go_on
+from pipeline.kernels.march.cpu import CANDIDATES, advance_ray, intersect_box
 
-RAYS, AHEAD, DIM = 128, 3, np.float32(0.5)
+RAYS_PER_BLOCK, SAMPLES_PER_PASS, HALF_TRANSMITTANCE = 128, 3, np.float32(0.5)
 """Rays that are followed together, and samples that each goes ahead: one by one with less than DIM of its light left,
 where the next may be the last.
 """
-MOST_AT_ONCE = RAYS * (AHEAD + CANDIDATES)
+MAX_SAMPLES_PER_PASS = RAYS_PER_BLOCK * (SAMPLES_PER_PASS + CANDIDATES)
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
-@njit(**OPTIONS)
-def _refine(
-    first, last, found, distance, owner, origins, directions, slot, skin_origin, skin_cell, row_of_node, blended,
+@njit(**NJIT_OPTIONS)
+def _refine_samples(
+    first, last, canonical, distance, ray_indices, origins, directions, batch_index, skin_origin, skin_cell,
+    row_of_node, blended,
     bounds, unit, inverse_jacobian,
 ):  # fmt: skip
     """One Newton step of samples (`pipeline.kernels.inverse_skinning.newton`), if any; then into the unit box."""
@@ -30,22 +31,24 @@ def _refine(
     scale_x, scale_y = _ONE / (bounds[1, 0] - low_x), _ONE / (bounds[1, 1] - low_y)
     scale_z = _ONE / (bounds[1, 2] - low_z)
     for s in range(first, last):
-        x, y, z = found[s, 0], found[s, 1], found[s, 2]
+        x, y, z = canonical[s, 0], canonical[s, 1], canonical[s, 2]
         if len(blended):
-            ray, t = owner[s], distance[s]
+            ray, t = ray_indices[s], distance[s]
             px, py, pz = (
                 origins[ray, 0] + t * directions[ray, 0],
                 origins[ray, 1] + t * directions[ray, 1],
                 origins[ray, 2] + t * directions[ray, 2],
             )
             x, y, z = newton_step(
-                px, py, pz, x, y, z, slot[ray], skin_origin, skin_cell, row_of_node, blended, inverse_jacobian[s]
+                px, py, pz, x, y, z, batch_index[ray], skin_origin, skin_cell, row_of_node, blended, inverse_jacobian[s]
             )
         unit[s, 0], unit[s, 1], unit[s, 2] = (x - low_x) * scale_x, (y - low_y) * scale_y, (z - low_z) * scale_z
 
 
-@njit(**OPTIONS)
-def _decode(first, last, features, hidden, output, bias, start_density, limit, colour, density, columns, layer, raw):
+@njit(**NJIT_OPTIONS)
+def _decode(
+    first, last, features, hidden, output, bias, initial_density, exponent_limit, colour, density, columns, layer, raw
+):
     """Colour and density of at most BLOCK samples. columns (w, BLOCK), layer (BLOCK), raw (4, BLOCK): scratch."""
     size = last - first
     for i in range(hidden.shape[0]):
@@ -79,83 +82,117 @@ def _decode(first, last, features, hidden, output, bias, start_density, limit, c
         colour[first + s, 0] = _ONE / (_ONE + np.exp(-raw[0, s]))
         colour[first + s, 1] = _ONE / (_ONE + np.exp(-raw[1, s]))
         colour[first + s, 2] = _ONE / (_ONE + np.exp(-raw[2, s]))
-        density[first + s] = start_density * np.exp(min(max(raw[3, s], -limit), limit))
+        density[first + s] = initial_density * np.exp(min(max(raw[3, s], -exponent_limit), exponent_limit))
 
 
-@njit(**OPTIONS)
-def shade(first, last, unit, table, plan, hidden, output, bias, start_density, limit, features, colour, density, lanes):
+@njit(**NJIT_OPTIONS)
+def evaluate_field(
+    first,
+    last,
+    unit,
+    table,
+    level_params,
+    hidden,
+    output,
+    bias,
+    initial_density,
+    exponent_limit,
+    features,
+    colour,
+    density,
+    lanes,
+):
     """Fill features, colour and density of the samples first..last at points of the unit box."""
     columns, layer = np.empty((hidden.shape[0], BLOCK), np.float32), np.empty(BLOCK, np.float32)
     raw = np.empty((4, BLOCK), np.float32)
     for start in range(first, last, BLOCK):
         stop = min(start + BLOCK, last)
-        for level in range(plan.shape[0]):
-            encode_block(unit, table, plan, level, features, start, stop, lanes)
-        _decode(start, stop, features, hidden, output, bias, start_density, limit, colour, density, columns, layer, raw)
+        for level in range(level_params.shape[0]):
+            encode_block(unit, table, level_params, level, features, start, stop, lanes)
+        _decode(
+            start,
+            stop,
+            features,
+            hidden,
+            output,
+            bias,
+            initial_density,
+            exponent_limit,
+            colour,
+            density,
+            columns,
+            layer,
+            raw,
+        )
 
 
-@njit(**OPTIONS)
-def _composite(first, last, owner, density, colour, step, light, weight, before, image):
+@njit(**NJIT_OPTIONS)
+def _composite(first, last, ray_indices, density, colour, step, transmittance, weight, sample_transmittance, image):
     for s in range(first, last):
-        ray = owner[s]
-        passed = np.exp(-density[s] * step)
-        before[s] = light[ray]
-        weight[s] = light[ray] * (_ONE - passed)
+        ray = ray_indices[s]
+        segment_transmittance = np.exp(-density[s] * step)
+        sample_transmittance[s] = transmittance[ray]
+        weight[s] = transmittance[ray] * (_ONE - segment_transmittance)
         for channel in range(3):
             image[ray, channel] += weight[s] * colour[s, channel]
-        light[ray] *= passed
+        transmittance[ray] *= segment_transmittance
 
 
-@njit(**OPTIONS)
+@njit(**NJIT_OPTIONS)
 def trace(
-    origins, directions, frame, slot, jitter, step, most, least_light,
+    origins, directions, frame, batch_index, jitter, step, max_samples, min_transmittance,
     cell, warp_origin, warp_dims, warp_first, warp_nodes, warp_codes, warp_maps, occupied, low, scale,
     skin_origin, skin_cell, row_of_node, blended,
-    bounds, table, plan, hidden, output, bias, start_density, limit, lanes,
-    image, light, room, owner, found, distance, inverse_jacobian, unit, features, colour, density, weight, before,
+    bounds, table, level_params, hidden, output, bias, initial_density, exponent_limit, lanes,
+    image, transmittance, capacity, ray_indices, canonical, distance, inverse_jacobian, unit, features, colour,
+    density, weight, sample_transmittance,
 ):  # fmt: skip
     """The number of samples, -1 if there was no room for them; fills all that follow `lanes`: see
     `pipeline.kernels.volume_rendering.trace`.
     """
     rays, count = len(origins), 0
-    near, stops, stop = np.empty(rays, np.float32), np.empty(rays, np.int64), np.zeros(rays, np.int64)
-    left, on = np.full(rays, most), np.empty(RAYS, np.int64)
-    for block in range(0, rays, RAYS):
-        going = 0
-        for ray in range(block, min(block + RAYS, rays)):
+    near, step_count, stop = np.empty(rays, np.float32), np.empty(rays, np.int64), np.zeros(rays, np.int64)
+    samples_left, active_rays = np.full(rays, max_samples), np.empty(RAYS_PER_BLOCK, np.int64)
+    for block in range(0, rays, RAYS_PER_BLOCK):
+        active_count = 0
+        for ray in range(block, min(block + RAYS_PER_BLOCK, rays)):
             f = frame[ray]
-            near[ray], stops[ray] = enter(ray, origins, directions, jitter, step, cell, warp_origin[f], warp_dims[f])
-            if stops[ray] > 0:
-                on[going] = ray
-                going += 1
-        while going:
+            near[ray], step_count[ray] = intersect_box(
+                ray, origins, directions, jitter, step, cell, warp_origin[f], warp_dims[f]
+            )
+            if step_count[ray] > 0:
+                active_rays[active_count] = ray
+                active_count += 1
+        while active_count:
             first = count
-            if first + MOST_AT_ONCE > room:
+            if first + MAX_SAMPLES_PER_PASS > capacity:
                 return -1
-            for place in range(going):
-                ray, noted = on[place], count
-                ahead = AHEAD if light[ray] >= DIM else 1
-                count, stop[ray] = go_on(
-                    ray, near[ray], stop[ray], stops[ray], count + ahead, count + left[ray],
+            for place in range(active_count):
+                ray, previous_count = active_rays[place], count
+                pass_samples = SAMPLES_PER_PASS if transmittance[ray] >= HALF_TRANSMITTANCE else 1
+                count, stop[ray] = advance_ray(
+                    ray, near[ray], stop[ray], step_count[ray], count + pass_samples, count + samples_left[ray],
                     origins, directions, jitter, step, cell, frame[ray],
                     warp_origin, warp_dims, warp_first, warp_nodes, warp_codes, warp_maps,
-                    occupied, low, scale, count, found, distance, owner,
+                    occupied, low, scale, count, canonical, distance, ray_indices,
                 )  # fmt: skip
-                left[ray] -= count - noted
-            _refine(
-                first, count, found, distance, owner, origins, directions, slot,
+                samples_left[ray] -= count - previous_count
+            _refine_samples(
+                first, count, canonical, distance, ray_indices, origins, directions, batch_index,
                 skin_origin, skin_cell, row_of_node, blended, bounds, unit, inverse_jacobian,
             )  # fmt: skip
-            shade(
-                first, count, unit, table, plan, hidden, output, bias, start_density, limit,
+            evaluate_field(
+                first, count, unit, table, level_params, hidden, output, bias, initial_density, exponent_limit,
                 features, colour, density, lanes,
             )  # fmt: skip
-            _composite(first, count, owner, density, colour, step, light, weight, before, image)
-            lit = 0
-            for place in range(going):
-                ray = on[place]
-                if stop[ray] < stops[ray] and left[ray] > 0 and light[ray] >= least_light:
-                    on[lit] = ray
-                    lit += 1
-            going = lit
+            _composite(
+                first, count, ray_indices, density, colour, step, transmittance, weight, sample_transmittance, image
+            )
+            still_active = 0
+            for place in range(active_count):
+                ray = active_rays[place]
+                if stop[ray] < step_count[ray] and samples_left[ray] > 0 and transmittance[ray] >= min_transmittance:
+                    active_rays[still_active] = ray
+                    still_active += 1
+            active_count = still_active
     return count

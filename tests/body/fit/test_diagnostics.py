@@ -5,21 +5,21 @@ import pytest
 
 from pipeline.body.body import Body, load_anny
 from pipeline.body.fit.diagnostics import (
-    VERDICTS,
-    doubts,
-    frames_to_show,
-    known_median,
+    FRAME_RATINGS,
+    finite_median,
+    fit_warnings,
     make_observations,
-    median_overlap,
+    median_silhouette_iou,
+    rate_frames,
+    select_overlay_frames,
     suspicious_frames,
     usable_frames,
-    verdicts,
 )
 from pipeline.body.fit.fit import FitResult, landmark_errors_px
 from pipeline.body.fit.landmark_regressor import landmark_regressor
-from pipeline.body.fit.linear_body import linearise
+from pipeline.body.fit.linear_body import linearise_body
 from pipeline.geometry.camera import Camera
-from tests.body.acting import act
+from tests.body.acting import synthetic_recording
 
 FRAMES = 12
 ALL = np.ones(FRAMES, dtype=bool)
@@ -39,37 +39,37 @@ def result(**changes: object) -> FitResult:
         "root_translation_m": np.tile(np.float32([0, 0, -2]), (FRAMES, 1)),
         "camera": CAMERA,
         "landmark_error_px": np.full(FRAMES, 2.0),
-        "overlap": np.full(FRAMES, 0.93),
-        "exchanged": {"whole body": np.zeros(FRAMES, dtype=bool), "legs": np.zeros(FRAMES, dtype=bool)},
-        "focal_deviation": 0.1,
-        "height_deviation_m": 0.05,
+        "silhouette_iou": np.full(FRAMES, 0.93),
+        "left_right_swapped": {"whole body": np.zeros(FRAMES, dtype=bool), "legs": np.zeros(FRAMES, dtype=bool)},
+        "focal_relative_std": 0.1,
+        "height_std_m": 0.05,
     }
     return FitResult(**(fields | changes))
 
 
-def test_a_good_fit_raises_no_doubt() -> None:
-    assert doubts(result(), np.arange(FRAMES), ALL) == []
+def test_a_good_fit_gives_no_warning() -> None:
+    assert fit_warnings(result(), np.arange(FRAMES), ALL) == []
     assert usable_frames(result()).all()
 
 
 @pytest.mark.parametrize(
     ("changes", "row", "words"),
     [
-        ({"overlap": 0.75}, 3, "frames 6: the body fits worse"),
+        ({"silhouette_iou": 0.75}, 3, "frames 6: the body fits worse"),
         ({"landmark_error_px": 9.0}, 5, "frames 10: the body fits worse"),
         ({"landmark_error_px": 33.0}, 5, "frames 10: the body fits worse"),
         ({"landmark_error_px": np.nan}, 2, "frames 4: no landmarks"),
     ],
 )
-def test_doubtful_frames_are_named_and_kept(changes: dict[str, float], row: int, words: str) -> None:
-    found = spoilt(changes, row)
+def test_suspicious_frames_are_reported_and_kept(changes: dict[str, float], row: int, words: str) -> None:
+    found = with_outlier(changes, row)
     assert np.flatnonzero(suspicious_frames(found)).tolist() == [row]
     assert usable_frames(found).all()
-    (sentence,) = doubts(found, 2 * np.arange(FRAMES), ALL)
+    (sentence,) = fit_warnings(found, 2 * np.arange(FRAMES), ALL)
     assert sentence.startswith(words)
 
 
-def spoilt(changes: dict[str, float], row: int) -> FitResult:
+def with_outlier(changes: dict[str, float], row: int) -> FitResult:
     """A good fit but for one figure of one frame."""
     name, value = next(iter(changes.items()))
     values = getattr(result(), name).copy()
@@ -78,16 +78,17 @@ def spoilt(changes: dict[str, float], row: int) -> FitResult:
 
 
 @pytest.mark.parametrize(
-    "changes", [{"overlap": 0.72}, {"overlap": 0.0}, {"overlap": np.nan}, {"landmark_error_px": 40.0}]
+    "changes",
+    [{"silhouette_iou": 0.72}, {"silhouette_iou": 0.0}, {"silhouette_iou": np.nan}, {"landmark_error_px": 40.0}],
 )
-def test_a_wrecked_frame_is_unusable_and_told_with_a_remedy(changes: dict[str, float]) -> None:
-    found = spoilt(changes, 3)
+def test_an_unusable_frame_is_reported_with_a_remedy(changes: dict[str, float]) -> None:
+    found = with_outlier(changes, 3)
     assert np.flatnonzero(~usable_frames(found)).tolist() == [3]
     assert suspicious_frames(found)[3]
-    (sentence,) = doubts(found, 2 * np.arange(FRAMES), ALL)
+    (sentence,) = fit_warnings(found, 2 * np.arange(FRAMES), ALL)
     assert sentence.startswith("frames 6: the body is not where the person is; 1 frame dropped from the training;")
     assert "masks/" in sentence
-    (sentence,) = doubts(found, 2 * np.arange(FRAMES), np.arange(FRAMES) != 3)
+    (sentence,) = fit_warnings(found, 2 * np.arange(FRAMES), np.arange(FRAMES) != 3)
     assert "0 frames dropped" in sentence
 
 
@@ -99,55 +100,57 @@ def test_landmarks_are_measured_by_how_large_the_person_is() -> None:
 
 
 def test_without_a_mask_there_is_no_overlap() -> None:
-    overlap = np.full(FRAMES, np.nan)
-    assert median_overlap(result(overlap=overlap)) == 0.0
-    assert not usable_frames(result(overlap=overlap)).any()
-    overlap[:7] = 0.9
-    assert median_overlap(result(overlap=overlap)) == 0.9
-    assert usable_frames(result(overlap=overlap)).tolist() == [True] * 7 + [False] * 5
+    silhouette_iou = np.full(FRAMES, np.nan)
+    assert median_silhouette_iou(result(silhouette_iou=silhouette_iou)) == 0.0
+    assert not usable_frames(result(silhouette_iou=silhouette_iou)).any()
+    silhouette_iou[:7] = 0.9
+    assert median_silhouette_iou(result(silhouette_iou=silhouette_iou)) == 0.9
+    assert usable_frames(result(silhouette_iou=silhouette_iou)).tolist() == [True] * 7 + [False] * 5
 
 
 def test_median_of_what_is_known() -> None:
-    assert known_median(np.array([np.nan, 3.0, 1.0, np.nan, 8.0])) == 3.0
-    assert np.isnan(known_median(np.full(4, np.nan)))
-    assert np.isnan(known_median(np.zeros(0)))
+    assert finite_median(np.array([np.nan, 3.0, 1.0, np.nan, 8.0])) == 3.0
+    assert np.isnan(finite_median(np.full(4, np.nan)))
+    assert np.isnan(finite_median(np.zeros(0)))
 
 
-def test_a_rough_fit_is_told_with_a_remedy() -> None:
-    (sentence,) = doubts(result(overlap=np.full(FRAMES, 0.8)), np.arange(FRAMES), ALL)
+def test_a_rough_fit_is_reported_with_a_remedy() -> None:
+    (sentence,) = fit_warnings(result(silhouette_iou=np.full(FRAMES, 0.8)), np.arange(FRAMES), ALL)
     assert sentence.startswith("the body fits the masks only roughly (median overlap 0.80)")
     assert "camera.json" in sentence
 
 
-def test_the_worst_verdict_holds() -> None:
-    legs, overlap = np.isin(np.arange(FRAMES), [1, 2, 3]), np.full(FRAMES, 0.93)
-    overlap[3] = 0.2
-    verdict = verdicts(result(exchanged={"legs": legs, "arms": ~ALL}, overlap=overlap), np.arange(FRAMES) == 2)
-    assert [VERDICTS[number] for number in verdict[:5]] == ["", "mended", "doubtful", "unusable", ""]
+def test_the_worst_rating_wins() -> None:
+    legs, silhouette_iou = np.isin(np.arange(FRAMES), [1, 2, 3]), np.full(FRAMES, 0.93)
+    silhouette_iou[3] = 0.2
+    rating = rate_frames(
+        result(left_right_swapped={"legs": legs, "arms": ~ALL}, silhouette_iou=silhouette_iou), np.arange(FRAMES) == 2
+    )
+    assert [FRAME_RATINGS[number] for number in rating[:5]] == ["", "corrected", "suspicious", "unusable", ""]
 
 
 def test_frames_to_show_are_even_when_all_is_well() -> None:
     good = np.zeros(9, dtype=np.int64)
-    assert frames_to_show(good, np.ones(9), 5).tolist() == [0, 2, 4, 6, 8]
-    assert frames_to_show(good, np.ones(9), 12).tolist() == list(range(9))
+    assert select_overlay_frames(good, np.ones(9), 5).tolist() == [0, 2, 4, 6, 8]
+    assert select_overlay_frames(good, np.ones(9), 12).tolist() == list(range(9))
 
 
 def test_half_of_the_frames_to_show_are_the_worst() -> None:
-    verdict, overlap = np.zeros(40, dtype=np.int64), np.full(40, 0.9)
-    verdict[20:30], verdict[33] = 2, 3
-    overlap[[24, 27, 33]] = 0.7, np.nan, 0.8
-    shown = frames_to_show(verdict, overlap, 6).tolist()
+    rating, silhouette_iou = np.zeros(40, dtype=np.int64), np.full(40, 0.9)
+    rating[20:30], rating[33] = 2, 3
+    silhouette_iou[[24, 27, 33]] = 0.7, np.nan, 0.8
+    shown = select_overlay_frames(rating, silhouette_iou, 6).tolist()
     assert shown == sorted(set(shown))
     assert {24, 27, 33} <= set(shown)
     assert set(shown) - {24, 27, 33} == {0, 18, 39}
-    one = frames_to_show((np.arange(40) == 33).astype(np.int64), overlap, 6)
+    one = select_overlay_frames((np.arange(40) == 33).astype(np.int64), silhouette_iou, 6)
     assert len(one) == 6
     assert np.diff(one).max() <= 10
 
 
 def test_landmarks_that_are_hardly_seen_tell_an_error_where_there_are_no_better_ones() -> None:
     """Half of the landmarks of the first frame are hardly seen and wrong, all of the second; the third has none."""
-    scene, visibility = act(load_anny(), 3), np.ones((3, 33))
+    scene, visibility = synthetic_recording(load_anny(), 3), np.ones((3, 33))
     shift_px = np.zeros((3, 33, 2))
     shift_px[0, :20], visibility[0, :20] = 90.0, 0.3
     shift_px[1], visibility[1] = [3.0, 4.0], 0.3
@@ -155,20 +158,20 @@ def test_landmarks_that_are_hardly_seen_tell_an_error_where_there_are_no_better_
     seen = make_observations(
         scene.time_s, scene.landmarks_px + shift_px, visibility, scene.landmarks_world_m, scene.camera
     )
-    regressor = landmark_regressor(linearise(load_anny(), load_anny().shape_defaults))
+    regressor = landmark_regressor(linearise_body(load_anny(), load_anny().shape_defaults))
     errors_px = landmark_errors_px(regressor, scene.model, scene.state, seen)
     assert errors_px == pytest.approx([0.0, 5.0, np.nan], abs=1e-3, nan_ok=True)
 
 
-def test_an_unsure_focal_length_is_told_with_a_remedy() -> None:
-    (sentence,) = doubts(result(focal_deviation=0.2), np.arange(FRAMES), ALL)
+def test_an_uncertain_focal_length_is_reported_with_a_remedy() -> None:
+    (sentence,) = fit_warnings(result(focal_relative_std=0.2), np.arange(FRAMES), ALL)
     assert sentence.startswith("focal length 500 px is known to 20 % only")
     assert "camera.json" in sentence
 
 
-def test_exchanged_legs_are_told() -> None:
+def test_swapped_legs_are_reported() -> None:
     legs = np.arange(FRAMES) > 8
-    (sentence,) = doubts(result(exchanged={"legs": legs}), np.arange(FRAMES), ALL)
+    (sentence,) = fit_warnings(result(left_right_swapped={"legs": legs}), np.arange(FRAMES), ALL)
     assert "frames 9-11" in sentence
     assert "left and right legs" in sentence
 
@@ -177,8 +180,8 @@ def test_observations_turn_the_detectors_axes_and_mark_what_is_missing() -> None
     landmarks, world = np.ones((2, 33, 2)), np.tile([0.1, 0.2, 0.3], (2, 33, 1))
     landmarks[0, 5], world[1, 7] = np.nan, np.nan
     seen = make_observations(np.arange(2.0), landmarks, np.ones((2, 33)), world, CAMERA)
-    assert np.allclose(seen.directions_m[0, 0], [0.1, -0.2, -0.3])
+    assert np.allclose(seen.landmarks_3d_m[0, 0], [0.1, -0.2, -0.3])
     assert seen.confidence[0, 5] == 0.0
-    assert seen.direction_confidence[1, 7] == 0.0
+    assert seen.confidence_3d[1, 7] == 0.0
     assert seen.confidence.sum() == 65.0
     assert seen.landmarks_px.isfinite().all()

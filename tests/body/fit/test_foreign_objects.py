@@ -4,12 +4,12 @@ import torch
 
 from pipeline.body.body import load_anny
 from pipeline.body.fit.foreign_objects import (
-    CLOTHING_REACH,
-    MUCH_MORE,
-    foreign_frames,
-    lump_doubts,
-    lump_share,
-    lump_shares,
+    CLOTHING_MARGIN_RATIO,
+    MIN_EXCESS_BLOB_SHARE,
+    foreign_object_warnings,
+    frames_with_foreign_objects,
+    residual_blob_share,
+    residual_blob_shares,
 )
 from pipeline.geometry.camera import Camera, project
 from pipeline.kernels.raster import rasterize
@@ -28,36 +28,36 @@ def blocks(*corners: tuple[int, int, int, int]) -> np.ndarray:
 BODY = (50, 250, 100, 140)
 
 
-def test_clothes_that_stay_close_are_no_lump() -> None:
-    reach = int(CLOTHING_REACH * ROWS)
-    assert lump_share(blocks((50, 250, 100 - reach, 140 + reach)), blocks(BODY), ROWS) == 0.0
-    assert lump_share(blocks((50, 250, 100, 140 + reach + 1)), blocks(BODY), ROWS) > 0.0
-    assert lump_share(blocks((50, 250, 100, 140 + reach)), blocks(BODY), 0.8 * ROWS) > 0.0
-    assert lump_share(blocks(), blocks(BODY), ROWS) == 0.0
+def test_close_clothing_is_no_residual_blob() -> None:
+    reach = int(CLOTHING_MARGIN_RATIO * ROWS)
+    assert residual_blob_share(blocks((50, 250, 100 - reach, 140 + reach)), blocks(BODY), ROWS) == 0.0
+    assert residual_blob_share(blocks((50, 250, 100, 140 + reach + 1)), blocks(BODY), ROWS) > 0.0
+    assert residual_blob_share(blocks((50, 250, 100, 140 + reach)), blocks(BODY), 0.8 * ROWS) > 0.0
+    assert residual_blob_share(blocks(), blocks(BODY), ROWS) == 0.0
 
 
-def test_the_largest_lump_counts_without_what_clothes_may_fill() -> None:
+def test_largest_blob_excludes_the_clothing_margin() -> None:
     """6 px beside the body may be clothes; 34 x 40 px of the large block and 24 x 10 px of the small one may not."""
     mask = blocks(BODY, (100, 140, 140, 180), (200, 210, 70, 100))
-    assert lump_share(mask, blocks(BODY), ROWS) == pytest.approx(34 * 40 / mask.sum())
+    assert residual_blob_share(mask, blocks(BODY), ROWS) == pytest.approx(34 * 40 / mask.sum())
 
 
-def test_only_what_comes_and_goes_is_foreign() -> None:
+def test_only_temporary_blobs_are_foreign_objects() -> None:
     wide_skirt = np.full(9, 0.04)
-    assert not foreign_frames(wide_skirt).any()
-    wide_skirt[[2, 6]] += (0.9 * MUCH_MORE, 1.1 * MUCH_MORE)
+    assert not frames_with_foreign_objects(wide_skirt).any()
+    wide_skirt[[2, 6]] += (0.9 * MIN_EXCESS_BLOB_SHARE, 1.1 * MIN_EXCESS_BLOB_SHARE)
     wide_skirt[4] = np.nan
-    assert np.flatnonzero(foreign_frames(wide_skirt)).tolist() == [6]
-    assert not foreign_frames(np.full(3, np.nan)).any()
-    (sentence,) = lump_doubts(wide_skirt, 3 * np.arange(9))
+    assert np.flatnonzero(frames_with_foreign_objects(wide_skirt)).tolist() == [6]
+    assert not frames_with_foreign_objects(np.full(3, np.nan)).any()
+    (sentence,) = foreign_object_warnings(wide_skirt, 3 * np.arange(9))
     assert sentence == (
         "frames 18: the mask holds something beside the body (a ball, a bag, a caption?), or the pose is wrong; "
         "leave them out with split.json, or supply masks/"
     )
-    assert lump_doubts(wide_skirt[:6], np.arange(6)) == []
+    assert foreign_object_warnings(wide_skirt[:6], np.arange(6)) == []
 
 
-def test_a_ball_at_the_hand_is_seen_in_the_frame_that_has_it() -> None:
+def test_a_ball_at_the_hand_is_detected_in_its_frame() -> None:
     anny = load_anny()
     body = anny.body(anny.shape_defaults)
     world_to_camera = np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32)
@@ -71,10 +71,10 @@ def test_a_ball_at_the_hand_is_seen_in_the_frame_that_has_it() -> None:
     with_ball = alone.copy()
     with_ball[np.hypot(rows - hand_px[1], columns - hand_px[0]) < 20.0] = 255
     here = torch.eye(4).expand(4, len(body.joint_names), 4, 4)
-    shares = lump_shares(body, here, camera, [alone, with_ball, np.zeros_like(alone), alone])
+    shares = residual_blob_shares(body, here, camera, [alone, with_ball, np.zeros_like(alone), alone])
     assert np.isnan(shares).tolist() == [False, False, True, False]
     assert shares[[0, 3]].max() == 0.0
     assert shares[1] == pytest.approx(
-        lump_share(with_ball > 0, alone > 0, np.ptp(np.flatnonzero(alone.any(1))) + 1.0), abs=0.001
+        residual_blob_share(with_ball > 0, alone > 0, np.ptp(np.flatnonzero(alone.any(1))) + 1.0), abs=0.001
     )
-    assert foreign_frames(shares).tolist() == [False, True, False, False]
+    assert frames_with_foreign_objects(shares).tolist() == [False, True, False, False]

@@ -5,62 +5,64 @@ import torch
 
 from pipeline.body.body import load_anny
 from pipeline.body.fit.initialisation import (
-    facing_yaw,
+    facing_yaw_rad,
+    has_torso_landmarks,
     initial_state,
     interpolated_state,
-    place_by_landmarks,
-    torso_found,
+    solve_root_position,
     torso_rotations,
 )
-from pipeline.body.fit.landmark_regressor import OFFSET_COUNT, landmark_regressor
-from pipeline.body.fit.linear_body import linearise, pose_points, pose_skeleton
+from pipeline.body.fit.landmark_regressor import LANDMARK_OFFSET_COUNT, landmark_regressor
+from pipeline.body.fit.linear_body import linearise_body, pose_points, pose_skeleton
 from pipeline.geometry.rotation import axis_angle_to_matrix
-from tests.body.acting import act
+from tests.body.acting import synthetic_recording
 
 
 @cache
-def rest_landmarks() -> torch.Tensor:
+def rest_landmarks_m() -> torch.Tensor:
     body = load_anny()
-    model = linearise(body, body.shape_defaults)
-    return landmark_regressor(model).points(model, torch.zeros(OFFSET_COUNT, dtype=torch.float64)).rest[0]
+    model = linearise_body(body, body.shape_defaults)
+    return landmark_regressor(model).points(model, torch.zeros(LANDMARK_OFFSET_COUNT, dtype=torch.float64)).rest[0]
 
 
 def test_torso_rotation_is_recovered() -> None:
-    rest = rest_landmarks()
+    rest = rest_landmarks_m()
     turn = axis_angle_to_matrix(torch.tensor([[0.1, 2.5, -0.2], [0.0, -1.0, 0.0]], dtype=torch.float64))
     assert torch.allclose(torso_rotations(rest, rest @ turn.transpose(1, 2) * 0.8), turn, atol=1e-9)
 
 
 def test_yaw_is_zero_towards_z_and_positive_towards_x() -> None:
     turn = axis_angle_to_matrix(torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.5, 0.0]], dtype=torch.float64))
-    assert torch.allclose(facing_yaw(turn), torch.tensor([0.0, 0.5], dtype=torch.float64))
+    assert torch.allclose(facing_yaw_rad(turn), torch.tensor([0.0, 0.5], dtype=torch.float64))
     assert (turn[1] @ torch.tensor([0.0, 0.0, 1.0]).double())[0] > 0
 
 
 def test_place_is_exact_without_noise() -> None:
-    scene = act(load_anny(), 5)
+    scene = synthetic_recording(load_anny(), 5)
     model, state = scene.model, scene.state
     regressor = landmark_regressor(model)
-    points = regressor.points(model, state.offsets_m)
+    points = regressor.points(model, state.landmark_offsets_m)
     world, _ = pose_points(model, pose_skeleton(model, state.rotations, state.root_m), points)
-    found = place_by_landmarks(scene.observations(scene.camera), world - state.root_m[:, None])
+    found = solve_root_position(scene.observations(scene.camera), world - state.root_m[:, None])
     assert torch.allclose(found, state.root_m, atol=1e-3)
 
 
 def test_start_is_near_the_truth_and_gaps_are_bridged() -> None:
-    scene = act(load_anny(), 24)
+    scene = synthetic_recording(load_anny(), 24)
     scene.landmarks_px[5:8] = np.nan
     observations = scene.observations(scene.camera)
-    assert not torso_found(observations)[5:8].any()
-    start = initial_state(observations, rest_landmarks(), scene.model.joints, scene.state.shape, OFFSET_COUNT)
+    assert not has_torso_landmarks(observations)[5:8].any()
+    start = initial_state(
+        observations, rest_landmarks_m(), scene.model.joints, scene.state.shape, LANDMARK_OFFSET_COUNT
+    )
     assert (start.root_m - scene.state.root_m).norm(dim=-1).max() < 0.2
     difference = start.rotations[:, 0].transpose(1, 2) @ scene.state.rotations[:, 0]
     angle = torch.arccos(((torch.einsum("nii->n", difference) - 1) / 2).clamp(-1, 1))
     assert angle.max() < 0.3
 
 
-def test_interpolation_keeps_given_frames_and_holds_the_ends() -> None:
-    scene = act(load_anny(), 9)
+def test_interpolation_keeps_key_frames_and_extrapolates_constantly() -> None:
+    scene = synthetic_recording(load_anny(), 9)
     rows = np.array([1, 4, 7])
     filled = interpolated_state(scene.state.rows(rows), rows, torch.tensor(scene.time_s))
     assert torch.allclose(filled.rotations[rows], scene.state.rotations[rows], atol=1e-6)

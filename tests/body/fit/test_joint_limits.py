@@ -11,13 +11,20 @@ from data_tools.synthetic.rig.bvh import read_bvh
 from data_tools.synthetic.rig.retarget import retarget
 from data_tools.synthetic.scene.motion import NOVEL_POSES
 from pipeline.body.body import load_anny
-from pipeline.body.fit.camera_parameters import LENS_COUNT
-from pipeline.body.fit.energy import FitState, Objective, Observations, Weights
-from pipeline.body.fit.joint_limits import BALLS, LIMIT_RAD, JointLimits, joint_limits, kind_of, swing_twist
-from pipeline.body.fit.landmark_regressor import LANDMARK_COUNT, OFFSET_COUNT, landmark_regressor
+from pipeline.body.fit.camera_parameters import INTRINSICS_COUNT
+from pipeline.body.fit.energy import EnergyParameters, FitState, Objective, Observations
+from pipeline.body.fit.joint_limits import (
+    BALL_JOINT_RANGES_DEG,
+    LIMIT_STD_RAD,
+    JointLimits,
+    joint_limits,
+    strip_side,
+    swing_twist,
+)
+from pipeline.body.fit.landmark_regressor import LANDMARK_COUNT, LANDMARK_OFFSET_COUNT, landmark_regressor
 from pipeline.body.fit.levenberg_marquardt import minimise
-from pipeline.body.fit.linear_body import ACTIVE_JOINTS, FitModel, linearise, pose_points, pose_skeleton
-from pipeline.body.fit.priors import joint_prior, shape_prior
+from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody, linearise_body, pose_points, pose_skeleton
+from pipeline.body.fit.priors import pose_prior, shape_prior
 from pipeline.body.smpl import SmplBody
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.rotation import axis_angle_to_matrix, matrix_to_quaternion, quaternion_to_matrix
@@ -61,13 +68,13 @@ IMPOSSIBLE: dict[str, tuple[str, tuple[float, float, float]]] = {
 
 
 @pytest.fixture(scope="module")
-def model() -> FitModel:
+def model() -> LinearBody:
     body = load_anny()
-    return linearise(body, body.shape_defaults)
+    return linearise_body(body, body.shape_defaults)
 
 
 @pytest.fixture(scope="module")
-def limits(model: FitModel) -> JointLimits:
+def limits(model: LinearBody) -> JointLimits:
     return joint_limits(model)
 
 
@@ -80,9 +87,9 @@ def posed(pose: Pose, side: str = "Left") -> torch.Tensor:
     return axis_angle_to_matrix(angles)
 
 
-def beyond_deg(limits: JointLimits, rotations: torch.Tensor) -> torch.Tensor:
+def excess_deg(limits: JointLimits, rotations: torch.Tensor) -> torch.Tensor:
     """How far joints are beyond their limits: largest of the three angles."""
-    return torch.rad2deg(limits.residuals(rotations)[0].abs().amax(-1) * LIMIT_RAD)
+    return torch.rad2deg(limits.residuals(rotations)[0].abs().amax(-1) * LIMIT_STD_RAD)
 
 
 @pytest.mark.parametrize("twist", [0.0, -1e-5, 0.7, -2.9])
@@ -107,7 +114,7 @@ def test_derivative_of_swing_and_twist_agrees_with_differences(size: float) -> N
     assert torch.allclose(swing_twist(rotation)[1], torch.stack(columns, dim=1) / 2e-5, atol=1e-6)
 
 
-def test_derivative_of_the_walls_agrees_with_differences(limits: JointLimits) -> None:
+def test_derivative_of_the_limits_agrees_with_differences(limits: JointLimits) -> None:
     """In poses most of which are beyond some wall."""
     generator = torch.Generator().manual_seed(0)
     angles = 1.2 * torch.randn(6, len(ACTIVE_JOINTS), 3, generator=generator, dtype=torch.float64)
@@ -121,33 +128,36 @@ def test_derivative_of_the_walls_agrees_with_differences(limits: JointLimits) ->
 
 @pytest.mark.parametrize("side", ["Left", "Right"])
 @pytest.mark.parametrize("pose", POSSIBLE)
-def test_what_people_can_do_costs_nothing(limits: JointLimits, pose: str, side: str) -> None:
-    assert beyond_deg(limits, posed(POSSIBLE[pose], side)).max() == 0.0
+def test_feasible_poses_cost_nothing(limits: JointLimits, pose: str, side: str) -> None:
+    assert excess_deg(limits, posed(POSSIBLE[pose], side)).max() == 0.0
 
 
 @pytest.mark.parametrize("side", ["Left", "Right"])
 @pytest.mark.parametrize("pose", IMPOSSIBLE)
-def test_what_nobody_can_do_is_beyond_the_wall_of_that_joint(limits: JointLimits, pose: str, side: str) -> None:
+def test_infeasible_poses_exceed_the_limit_of_their_joint(limits: JointLimits, pose: str, side: str) -> None:
     name, degrees = IMPOSSIBLE[pose]
-    beyond = beyond_deg(limits, posed({name: degrees}, side))[0]
+    excess = excess_deg(limits, posed({name: degrees}, side))[0]
     joint = ACTIVE_JOINTS.index(name.replace("Left", side))
-    assert beyond[joint] > 10.0
-    assert beyond.sum() == beyond[joint]
+    assert excess[joint] > 10.0
+    assert excess.sum() == excess[joint]
 
 
 @pytest.mark.parametrize(("turn_deg", "free"), [(70.0, True), (110.0, False), (-80.0, True), (-110.0, False)])
 @pytest.mark.parametrize("side", ["Left", "Right"])
-def test_wrists_bend_to_the_palm_and_back(model: FitModel, limits: JointLimits, side: str, turn_deg: float, free: bool):
+def test_wrists_bend_to_the_palm_and_back(
+    model: LinearBody, limits: JointLimits, side: str, turn_deg: float, free: bool
+):
     """About the line from the knuckle of the index to that of the little finger; both sides bend with their fingers."""
     wrist, index, little, tip = (
-        model.full_joints[model.full_by_name[f"{side}Hand{part}"]] for part in ("", "Index1", "Pinky1", "Middle3")
+        model.full_joints[model.joint_index_by_name[f"{side}Hand{part}"]]
+        for part in ("", "Index1", "Pinky1", "Middle3")
     )
     axis = torch.nn.functional.normalize(little - index, dim=0) * (1.0 if side == "Left" else -1.0)
     curl = torch.linalg.cross(0.5 * (index + little) - wrist, tip - 0.5 * (index + little))
     assert axis @ curl > 0.0
     rotations = posed({})
     rotations[0, ACTIVE_JOINTS.index(f"{side}Hand")] = axis_angle_to_matrix(np.deg2rad(turn_deg) * axis)
-    assert (beyond_deg(limits, rotations).max() == 0.0) == free
+    assert (excess_deg(limits, rotations).max() == 0.0) == free
 
 
 @pytest.mark.parametrize(
@@ -170,14 +180,14 @@ def test_wrists_bend_to_the_palm_and_back(model: FitModel, limits: JointLimits, 
     ],
 )
 def test_an_upper_arm_turns_as_far_as_it_can_wherever_it_points(
-    model: FitModel, limits: JointLimits, upper: tuple, forearm: tuple, free: bool
+    model: LinearBody, limits: JointLimits, upper: tuple, forearm: tuple, free: bool
 ) -> None:
     """The left one: x points outward, y up, z ahead; the elbow is bent, so the forearm tells the twist."""
     arm, elbow, hand = (ACTIVE_JOINTS.index(f"Left{part}") for part in ("Arm", "ForeArm", "Hand"))
     rest = framed(model.joints[elbow] - model.joints[arm], model.joints[hand] - model.joints[elbow])
     rotations = posed({})
     rotations[0, arm] = framed(torch.tensor(upper).double(), torch.tensor(forearm).double()) @ rest.T
-    assert (beyond_deg(limits, rotations).max() == 0.0) == free
+    assert (excess_deg(limits, rotations).max() == 0.0) == free
 
 
 def framed(upper: torch.Tensor, lower: torch.Tensor) -> torch.Tensor:
@@ -190,8 +200,8 @@ def framed(upper: torch.Tensor, lower: torch.Tensor) -> torch.Tensor:
 @pytest.mark.parametrize("joints", [24, 55])
 def test_smpl_bodies_have_the_same_limits_by_the_same_names(limits: JointLimits, joints: int) -> None:
     body = SmplBody(made_up_arrays(joints))
-    found, rest = joint_limits(linearise(body, body.shape_defaults)), posed({})
-    assert (found.reach_rad - found.angles(rest)[0].abs() > np.deg2rad(10.0))[0].all()
+    found, rest = joint_limits(linearise_body(body, body.shape_defaults)), posed({})
+    assert (found.half_range_rad - found.angles(rest)[0].abs() > np.deg2rad(10.0))[0].all()
     for pose in POSSIBLE.values():
         assert torch.allclose(found.angles(posed(pose))[0], limits.angles(posed(pose))[0], atol=0.2)
 
@@ -200,13 +210,13 @@ def test_both_sides_have_the_same_limits(limits: JointLimits) -> None:
     generator = torch.Generator().manual_seed(1)
     for name in ("LeftUpLeg", "LeftArm", "LeftForeArm", "LeftHand", "LeftFoot", "LeftShoulder"):
         for degrees in (90.0 * torch.randn(20, 3, generator=generator)).tolist():
-            sides = [beyond_deg(limits, posed({name: degrees}, side)).max() for side in ("Left", "Right")]
+            sides = [excess_deg(limits, posed({name: degrees}, side)).max() for side in ("Left", "Right")]
             assert sides[0] == pytest.approx(sides[1], abs=1.0)
 
 
 def test_the_novel_poses_of_synthetic_captures_are_possible(limits: JointLimits) -> None:
     for pose in NOVEL_POSES.values():
-        assert beyond_deg(limits, posed({name: np.rad2deg(turn).tolist() for name, turn in pose.items()})).max() == 0.0
+        assert excess_deg(limits, posed({name: np.rad2deg(turn).tolist() for name, turn in pose.items()})).max() == 0.0
 
 
 @pytest.mark.parametrize("name", ["cmu1_jumping_jacks", "fair1_zombie", "rokoko_jesse_dance"])
@@ -218,15 +228,15 @@ def test_recorded_motions_keep_within_the_limits(limits: JointLimits, shared_dat
     motion = retarget(read_bvh(shared_data / "motions" / f"{name}.bvh"), body, np.zeros(3), in_place=True)
     everything = quaternion_to_matrix(torch.tensor(motion.rotations_wxyz, dtype=torch.float64))
     rotations = everything[:, [body.joint(joint) for joint in ACTIVE_JOINTS]]
-    balls = [kind_of(joint) in BALLS for joint in ACTIVE_JOINTS]
-    beyond = beyond_deg(limits, rotations)[:, balls]
+    balls = [strip_side(joint) in BALL_JOINT_RANGES_DEG for joint in ACTIVE_JOINTS]
+    excess = excess_deg(limits, rotations)[:, balls]
     print(
-        f"{name}: {float((beyond > 0).any(1).double().mean()):.4f} of frames, {float(beyond.max()):.1f} degrees beyond"
+        f"{name}: {float((excess > 0).any(1).double().mean()):.4f} of frames, {float(excess.max()):.1f} degrees beyond"
     )
-    assert beyond.max() == 0.0
+    assert excess.max() == 0.0
 
 
-ASTRAY: Pose = {
+OUT_OF_RANGE: Pose = {
     "LeftUpLeg": (95, 0, 0),
     "LeftArm": (-150, 0, 0),
     "LeftShoulder": (0, 0, 100),
@@ -237,21 +247,21 @@ ASTRAY: Pose = {
 
 
 @pytest.fixture(scope="module")
-def objective(model: FitModel) -> Objective:
+def objective(model: LinearBody) -> Objective:
     """To be given observations; two frames of a detector that is very sure, else the pose prior alone holds a neck."""
     body, camera = load_anny(), Camera(520.0, 520.0, 128.0, 160.0, 256, 320)
     nothing = torch.zeros(2, LANDMARK_COUNT, 3, dtype=torch.float64)
     seen = Observations(
         torch.tensor([0.0, 0.1], dtype=torch.float64), nothing[..., :2], nothing, *2 * [nothing[..., 0] + 1.0], camera
     )
-    priors = joint_prior(model), shape_prior(body.shape_names, body.shape_defaults)
+    priors = pose_prior(model), shape_prior(body.shape_names, body.shape_defaults)
     scale = torch.full((2,), 520.0 / 3.0, dtype=torch.float64)
     return Objective(
         model,
         landmark_regressor(model),
         *priors,
         seen,
-        Weights(landmark_m=0.002, direction_m=0.005, free_shape=False),
+        EnergyParameters(landmark_std_m=0.002, landmark_3d_std_m=0.005, free_shape=False),
         scale,
     )
 
@@ -259,26 +269,26 @@ def objective(model: FitModel) -> Objective:
 def fitted(objective: Objective, pose: Pose, with_limits: bool) -> torch.Tensor:
     """Rotations fitted to the landmarks of a person in a pose, from that pose on."""
     model, seen = objective.model, objective.observations
-    nothing = [torch.zeros(count, dtype=torch.float64) for count in (OFFSET_COUNT, LENS_COUNT)]
+    nothing = [torch.zeros(count, dtype=torch.float64) for count in (LANDMARK_OFFSET_COUNT, INTRINSICS_COUNT)]
     root = torch.tensor([[0.0, -0.05, -3.0]], dtype=torch.float64).repeat(2, 1)
     start = FitState(posed(pose).repeat(2, 1, 1, 1), root, model.shape, *nothing)
     skeleton = pose_skeleton(model, start.rotations, start.root_m)
-    world, _ = pose_points(model, skeleton, objective.regressor.points(model, start.offsets_m))
+    world, _ = pose_points(model, skeleton, objective.regressor.points(model, start.landmark_offsets_m))
     pixels, _ = project(world, seen.camera)
-    seen = replace(seen, landmarks_px=pixels, directions_m=world - 0.5 * (world[:, 23:24] + world[:, 24:25]))
-    prior = objective.joint_prior
+    seen = replace(seen, landmarks_px=pixels, landmarks_3d_m=world - 0.5 * (world[:, 23:24] + world[:, 24:25]))
+    prior = objective.pose_prior
     if not with_limits:
-        endless = torch.full_like(prior.limits.reach_rad, 10.0)
-        prior = replace(prior, limits=replace(prior.limits, reach_rad=endless))
-    told = replace(objective, observations=seen, joint_prior=prior)
+        endless = torch.full_like(prior.limits.half_range_rad, 10.0)
+        prior = replace(prior, limits=replace(prior.limits, half_range_rad=endless))
+    told = replace(objective, observations=seen, pose_prior=prior)
     return minimise(start, told, told.retract, 12)[0].rotations
 
 
-@pytest.mark.parametrize("name", ASTRAY)
-def test_landmarks_that_would_break_a_joint_are_held(objective: Objective, limits: JointLimits, name: str) -> None:
+@pytest.mark.parametrize("name", OUT_OF_RANGE)
+def test_limits_hold_against_infeasible_landmarks(objective: Objective, limits: JointLimits, name: str) -> None:
     joint = ACTIVE_JOINTS.index(name)
     broken, held = (
-        float(beyond_deg(limits, fitted(objective, {name: ASTRAY[name]}, with_limits))[:, joint].max())
+        float(excess_deg(limits, fitted(objective, {name: OUT_OF_RANGE[name]}, with_limits))[:, joint].max())
         for with_limits in (False, True)
     )
     print(f"{name}: {broken:.1f} degrees beyond without limits, {held:.1f} with them")

@@ -3,14 +3,14 @@ import torch
 from pipeline.body.body import load_anny
 from pipeline.body.fit.landmark_regressor import (
     LANDMARK_COUNT,
+    LANDMARK_OFFSET_COUNT,
     LANDMARKS,
-    OFFSET_COUNT,
-    PAIRS,
-    landmark_noise,
+    LEFT_RIGHT_PAIRS,
     landmark_regressor,
+    landmark_std_ratio,
     mirror_permutation,
 )
-from pipeline.body.fit.linear_body import linearise
+from pipeline.body.fit.linear_body import linearise_body
 
 
 def test_the_table_names_every_landmark_once() -> None:
@@ -19,24 +19,24 @@ def test_the_table_names_every_landmark_once() -> None:
 
 def test_landmarks_lie_where_the_table_says_and_mirror_each_other() -> None:
     body = load_anny()
-    model = linearise(body, body.shape_defaults)
-    rest = landmark_regressor(model).points(model, torch.zeros(OFFSET_COUNT, dtype=torch.float64)).rest[0]
+    model = linearise_body(body, body.shape_defaults)
+    rest = landmark_regressor(model).points(model, torch.zeros(LANDMARK_OFFSET_COUNT, dtype=torch.float64)).rest[0]
     for landmark in LANDMARKS:
         assert torch.allclose(
-            rest[landmark.indices[0]], torch.tensor(body.landmark_places_m[landmark.name]).double(), atol=1e-6
+            rest[landmark.indices[0]], torch.tensor(body.landmark_positions_m[landmark.name]).double(), atol=1e-6
         )
-    for left, right in PAIRS:
+    for left, right in LEFT_RIGHT_PAIRS:
         assert torch.allclose(rest[left] * torch.tensor([-1.0, 1.0, 1.0]), rest[right], atol=1e-6)
         assert rest[left, 0] > 0  # the person's left is +X
 
 
 def test_landmarks_follow_the_shape() -> None:
     body = load_anny()
-    default = linearise(body, body.shape_defaults)
+    default = linearise_body(body, body.shape_defaults)
     shape = body.shape_defaults.clone()
     shape[body.shape_names.index("lowerleg-length")] = 0.5
-    longer = linearise(body, shape)
-    regressor, offsets = landmark_regressor(default), torch.zeros(OFFSET_COUNT, dtype=torch.float64)
+    longer = linearise_body(body, shape)
+    regressor, offsets = landmark_regressor(default), torch.zeros(LANDMARK_OFFSET_COUNT, dtype=torch.float64)
     shins = []
     for model in (default, longer):
         rest = regressor.points(model, offsets).rest[0]
@@ -46,9 +46,9 @@ def test_landmarks_follow_the_shape() -> None:
 
 def test_offsets_move_both_sides_in_mirror_image() -> None:
     body = load_anny()
-    model = linearise(body, body.shape_defaults)
+    model = linearise_body(body, body.shape_defaults)
     regressor = landmark_regressor(model)
-    offsets = torch.zeros(OFFSET_COUNT, dtype=torch.float64)
+    offsets = torch.zeros(LANDMARK_OFFSET_COUNT, dtype=torch.float64)
     knee = next(row for row, landmark in enumerate(LANDMARKS) if landmark.name == "knee")
     offsets[3 * knee : 3 * knee + 3] = torch.tensor([0.01, 0.02, 0.03])
     moved = regressor.points(model, offsets).rest[0] - regressor.points(model, 0 * offsets).rest[0]
@@ -58,12 +58,12 @@ def test_offsets_move_both_sides_in_mirror_image() -> None:
 
 
 def test_exchanging_twice_changes_nothing() -> None:
-    order = mirror_permutation(PAIRS)
+    order = mirror_permutation(LEFT_RIGHT_PAIRS)
     assert [order[index] for index in order] == list(range(LANDMARK_COUNT))
     assert order[0] == 0
     assert order[11] == 12
 
 
 def test_noise_is_symmetric() -> None:
-    noise = landmark_noise()
-    assert torch.equal(noise, noise[mirror_permutation(PAIRS)])
+    noise = landmark_std_ratio()
+    assert torch.equal(noise, noise[mirror_permutation(LEFT_RIGHT_PAIRS)])

@@ -6,29 +6,29 @@ import pytest
 import torch
 
 from pipeline.body.body import load_anny
-from pipeline.body.fit.landmark_regressor import POSE_LANDMARKS, mirror_permutation
+from pipeline.body.fit.landmark_regressor import POSE_LANDMARK_COUNT, mirror_permutation
 from pipeline.body.fit.left_right_swaps import (
-    LIMBS,
-    exchange_bodies,
-    exchange_limbs,
-    exchanged_bodies,
-    exchanged_limbs,
-    two_label_path,
+    LIMB_SWAP_PAIRS,
+    detect_body_swaps,
+    detect_limb_swaps,
+    swap_body_left_right,
+    swap_limb_left_right,
+    viterbi_two_labels,
 )
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.rotation import axis_angle_to_matrix
-from tests.body.acting import Act, act, filmed, take_for_other_side
-from tests.body.fit.test_initialisation import rest_landmarks
+from tests.body.acting import SyntheticRecording, simulate_detections, swap_left_right, synthetic_recording
+from tests.body.fit.test_initialisation import rest_landmarks_m
 
 
 @pytest.fixture(scope="module")
-def clean() -> Act:
-    return act(load_anny(), 40, noise_m=0.01)
+def clean() -> SyntheticRecording:
+    return synthetic_recording(load_anny(), 40, noise_m=0.01)
 
 
 @pytest.fixture
-def scene(clean: Act) -> Act:
+def scene(clean: SyntheticRecording) -> SyntheticRecording:
     """A turn whose landmarks may be spoilt."""
     return replace(clean, landmarks_px=clean.landmarks_px.copy(), landmarks_world_m=clean.landmarks_world_m.copy())
 
@@ -42,14 +42,14 @@ def test_path_equals_exhaustive_search() -> None:
         return steps + sum(unary[k, label] for k, label in enumerate(labels))
 
     best = min(itertools.product((0, 1), repeat=7), key=cost)
-    assert two_label_path(unary, same, other).tolist() == [bool(label) for label in best]
+    assert viterbi_two_labels(unary, same, other).tolist() == [bool(label) for label in best]
 
 
-def test_nothing_is_exchanged_in_a_clean_full_turn(scene: Act) -> None:
+def test_no_swap_is_detected_in_a_clean_full_turn(scene: SyntheticRecording) -> None:
     observations = scene.observations(scene.camera)
-    assert not exchanged_bodies(observations, rest_landmarks()).any()
-    for limb in LIMBS:
-        assert not exchanged_limbs(observations, limb).any()
+    assert not detect_body_swaps(observations, rest_landmarks_m()).any()
+    for limb in LIMB_SWAP_PAIRS:
+        assert not detect_limb_swaps(observations, limb).any()
 
 
 def turned(camera: Camera, about_y_rad: float, tilt_rad: float) -> Camera:
@@ -62,69 +62,72 @@ def turned(camera: Camera, about_y_rad: float, tilt_rad: float) -> Camera:
 
 @pytest.mark.parametrize("wrong", [slice(14, 19), slice(23, 27)])
 @pytest.mark.parametrize(("about_y_deg", "tilt_deg"), [(0, 0), (60, 0), (-100, 0), (60, 20)])
-def test_a_body_seen_the_wrong_way_round_is_found_and_mended(
-    scene: Act, wrong: slice, about_y_deg: int, tilt_deg: int
+def test_a_body_swap_is_detected_and_corrected(
+    scene: SyntheticRecording, wrong: slice, about_y_deg: int, tilt_deg: int
 ) -> None:
     """Wherever the camera stands."""
     camera = turned(scene.camera, np.radians(about_y_deg), np.radians(tilt_deg))
     truth = scene.observations(camera)
-    take_for_other_side(scene, wrong)
+    swap_left_right(scene, wrong)
     observations = scene.observations(camera)
-    exchanged = exchanged_bodies(observations, rest_landmarks())
-    assert np.flatnonzero(exchanged).tolist() == list(range(wrong.start, wrong.stop))
-    mended = exchange_bodies(observations, exchanged)
-    assert np.allclose(mended.landmarks_px, truth.landmarks_px)
-    assert np.allclose(mended.directions_m, truth.directions_m)
+    left_right_swapped = detect_body_swaps(observations, rest_landmarks_m())
+    assert np.flatnonzero(left_right_swapped).tolist() == list(range(wrong.start, wrong.stop))
+    corrected = swap_body_left_right(observations, left_right_swapped)
+    assert np.allclose(corrected.landmarks_px, truth.landmarks_px)
+    assert np.allclose(corrected.landmarks_3d_m, truth.landmarks_3d_m)
 
 
-def test_frames_far_apart_in_time_may_turn_far(scene: Act) -> None:
+def test_frames_far_apart_in_time_may_turn_far(scene: SyntheticRecording) -> None:
     """A turn of 3.6 s in eight frames: nothing is mended, though each step is one of 51 degrees."""
-    seen = act(load_anny(), 8).observations(scene.camera)
-    assert not exchanged_bodies(replace(seen, time_s=5 * seen.time_s), rest_landmarks()).any()
+    seen = synthetic_recording(load_anny(), 8).observations(scene.camera)
+    assert not detect_body_swaps(replace(seen, time_s=5 * seen.time_s), rest_landmarks_m()).any()
 
 
 def test_a_short_gap_does_not_hide_a_body_the_wrong_way_round() -> None:
     """At 30 frames a second, seven without a person, and then the last three from the wrong side."""
-    scene = act(load_anny(), 20, turn_rad=0.8)
-    take_for_other_side(scene, slice(17, 20))
+    scene = synthetic_recording(load_anny(), 20, turn_rad=0.8)
+    swap_left_right(scene, slice(17, 20))
     scene.landmarks_px[10:17] = np.nan
     seen = scene.observations(scene.camera)
-    exchanged = exchanged_bodies(replace(seen, time_s=seen.time_s / 3), rest_landmarks())
-    assert np.flatnonzero(exchanged).tolist() == [17, 18, 19]
+    left_right_swapped = detect_body_swaps(replace(seen, time_s=seen.time_s / 3), rest_landmarks_m())
+    assert np.flatnonzero(left_right_swapped).tolist() == [17, 18, 19]
 
 
-@pytest.mark.parametrize(("gap_s", "exchanged"), [(0.1, [4]), (1.0, [])])
-def test_legs_change_places_in_a_second_and_not_in_a_tenth(gap_s: float, exchanged: list[int]) -> None:
+@pytest.mark.parametrize(("gap_s", "left_right_swapped"), [(0.1, [4]), (1.0, [])])
+def test_legs_change_places_in_a_second_and_not_in_a_tenth(gap_s: float, left_right_swapped: list[int]) -> None:
     """A stride seen from the side: four frames of one, then one of the opposite."""
     body = load_anny()
-    scene = act(body, 5)
+    scene = synthetic_recording(body, 5)
     angles = torch.zeros(5, len(ACTIVE_JOINTS), 3, dtype=torch.float64)
     angles[:, 0, 1] = 0.5 * np.pi
     for side, sign in (("Left", 1.0), ("Right", -1.0)):
         angles[:, ACTIVE_JOINTS.index(f"{side}UpLeg"), 0] = 0.45 * sign * torch.tensor([1.0, 1.0, 1.0, 1.0, -1.0])
     state = replace(scene.state, rotations=axis_angle_to_matrix(angles), root_m=scene.state.root_m[:1].repeat(5, 1))
     time_s = np.cumsum([0.0, 0.1, 0.1, 0.1, gap_s])
-    seen = filmed(body, scene.model, state, scene.camera, time_s).observations(scene.camera)
-    assert np.flatnonzero(exchanged_limbs(seen, "legs")).tolist() == exchanged
+    seen = simulate_detections(body, scene.model, state, scene.camera, time_s).observations(scene.camera)
+    assert np.flatnonzero(detect_limb_swaps(seen, "legs")).tolist() == left_right_swapped
 
 
-def test_nothing_is_exchanged_where_nobody_is_seen(scene: Act) -> None:
+def test_no_swap_is_detected_without_a_person(scene: SyntheticRecording) -> None:
     scene.landmarks_px[:] = np.nan
     observations = scene.observations(scene.camera)
-    for exchanged in (exchanged_bodies(observations, rest_landmarks()), exchanged_limbs(observations, "legs")):
-        assert exchanged.tolist() == [False] * 40
+    for left_right_swapped in (
+        detect_body_swaps(observations, rest_landmarks_m()),
+        detect_limb_swaps(observations, "legs"),
+    ):
+        assert left_right_swapped.tolist() == [False] * 40
 
 
-@pytest.mark.parametrize("limb", list(LIMBS))
+@pytest.mark.parametrize("limb", list(LIMB_SWAP_PAIRS))
 @pytest.mark.parametrize("wrong", [slice(0, 4), slice(10, 11), slice(29, 30)])
-def test_exchanged_limbs_are_found_and_mended(scene: Act, limb: str, wrong: slice) -> None:
+def test_limb_swaps_are_detected_and_corrected(scene: SyntheticRecording, limb: str, wrong: slice) -> None:
     """A run at the start, and single frames in side views: 92 and -92 degrees."""
     truth = scene.observations(scene.camera)
-    order = mirror_permutation(LIMBS[limb][0])[:POSE_LANDMARKS]
+    order = mirror_permutation(LIMB_SWAP_PAIRS[limb][0])[:POSE_LANDMARK_COUNT]
     scene.landmarks_px[wrong] = scene.landmarks_px[wrong][:, order]
     scene.landmarks_world_m[wrong] = scene.landmarks_world_m[wrong][:, order]
     observations = scene.observations(scene.camera)
-    exchanged = exchanged_limbs(observations, limb)
-    assert np.flatnonzero(exchanged).tolist() == list(range(wrong.start, wrong.stop))
-    assert not exchanged_bodies(observations, rest_landmarks()).any()
-    assert np.allclose(exchange_limbs(observations, exchanged, limb).landmarks_px, truth.landmarks_px)
+    left_right_swapped = detect_limb_swaps(observations, limb)
+    assert np.flatnonzero(left_right_swapped).tolist() == list(range(wrong.start, wrong.stop))
+    assert not detect_body_swaps(observations, rest_landmarks_m()).any()
+    assert np.allclose(swap_limb_left_right(observations, left_right_swapped, limb).landmarks_px, truth.landmarks_px)

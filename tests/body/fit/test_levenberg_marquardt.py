@@ -18,15 +18,15 @@ def random_system(shared: int = SHARED) -> tuple[NormalEquations, np.ndarray, np
     for _ in range(2):
         by_frame, by_shared = random(FRAMES, 6, NUMBERS), random(FRAMES, 6, shared)
         system.add(by_frame, by_shared, random(FRAMES, 6), random(FRAMES, 6).abs() + 0.1)
-    system.next_frame[:-1] = 0.3
-    system.after_next_frame[:-2] = -0.2
+    system.next_frame_coupling[:-1] = 0.3
+    system.second_next_frame_coupling[:-2] = -0.2
     total = FRAMES * NUMBERS
     dense = np.zeros((total + shared, total + shared))
     for frame in range(FRAMES):
         span = slice(frame * NUMBERS, (frame + 1) * NUMBERS)
         dense[span, span] = system.frame[frame].numpy()
         dense[span, total:] = system.border[frame].numpy()
-        for ahead, coupling in ((1, system.next_frame), (2, system.after_next_frame)):
+        for ahead, coupling in ((1, system.next_frame_coupling), (2, system.second_next_frame_coupling)):
             if frame + ahead < FRAMES:
                 other = slice((frame + ahead) * NUMBERS, (frame + ahead + 1) * NUMBERS)
                 dense[other, span] = dense[span, other] = np.diag(coupling[frame].numpy())
@@ -52,7 +52,7 @@ def test_covariance_is_the_corner_of_the_dense_inverse() -> None:
 
 def test_frozen_numbers_do_not_move() -> None:
     system, _, _ = random_system()
-    system.freeze(torch.tensor([True, False]))
+    system.fix_parameters(torch.tensor([True, False]))
     _, by_shared = solve(system, 0.0)
     assert by_shared[1] == 0.0
     assert by_shared[0] != 0.0

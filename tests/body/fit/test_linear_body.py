@@ -3,16 +3,16 @@ import pytest
 import torch
 
 from pipeline.body.body import load_anny
-from pipeline.body.fit.landmark_regressor import LANDMARK_COUNT, OFFSET_COUNT, landmark_regressor
+from pipeline.body.fit.landmark_regressor import LANDMARK_COUNT, LANDMARK_OFFSET_COUNT, landmark_regressor
 from pipeline.body.fit.linear_body import (
     ACTIVE_JOINTS,
-    FitModel,
-    linearise,
+    LinearBody,
+    linearise_body,
+    pose_jacobian_rows,
     pose_points,
-    pose_rows,
     pose_skeleton,
     reduced_parents,
-    shape_rows,
+    shape_jacobian_rows,
     surface_points,
 )
 from pipeline.geometry.rotation import axis_angle_to_matrix
@@ -22,9 +22,9 @@ FRAMES = 2
 
 
 @pytest.fixture(scope="module")
-def model() -> FitModel:
+def model() -> LinearBody:
     body = load_anny()
-    return linearise(body, body.shape_defaults)
+    return linearise_body(body, body.shape_defaults)
 
 
 def random_pose(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -33,11 +33,11 @@ def random_pose(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     return axis_angle_to_matrix(angles), torch.randn(FRAMES, 3, generator=generator, dtype=torch.float64)
 
 
-def test_posed_points_equal_linear_blend_skinning_of_the_whole_body(model: FitModel) -> None:
+def test_posed_points_equal_linear_blend_skinning_of_the_whole_body(model: LinearBody) -> None:
     """The reduced skeleton moves the surface as the 52 joints do, away from the fingers."""
     body = load_anny()
     rotations, root = random_pose()
-    full = model.rotations_of_all(rotations)
+    full = model.all_joint_rotations(rotations)
     joints = model.full_joints
     vertices, _ = body.rest(body.shape_defaults)
     transforms = skinning_transforms(forward_kinematics(full, root, joints, body.parents), joints)
@@ -51,41 +51,43 @@ def test_posed_points_equal_linear_blend_skinning_of_the_whole_body(model: FitMo
     assert torch.allclose(world, expected[:, whole], atol=1e-6)
 
 
-def test_derivatives_agree_with_differences(model: FitModel) -> None:
+def test_derivatives_agree_with_differences(model: LinearBody) -> None:
     regressor = landmark_regressor(model)
-    offsets = torch.zeros(OFFSET_COUNT, dtype=torch.float64)
+    offsets = torch.zeros(LANDMARK_OFFSET_COUNT, dtype=torch.float64)
     rotations, root = random_pose()
     generator = torch.Generator().manual_seed(1)
-    covector = torch.randn(FRAMES, LANDMARK_COUNT, 3, generator=generator, dtype=torch.float64)
+    point_gradient = torch.randn(FRAMES, LANDMARK_COUNT, 3, generator=generator, dtype=torch.float64)
     points = regressor.points(model, offsets)
     skeleton = pose_skeleton(model, rotations, root)
-    world, arms = pose_points(model, skeleton, points)
+    world, lever_arms = pose_points(model, skeleton, points)
 
     step = 1e-5 * torch.randn(FRAMES, 3 * len(ACTIVE_JOINTS) + 3, generator=generator, dtype=torch.float64)
     turned = axis_angle_to_matrix(step[:, :-3].reshape(FRAMES, -1, 3)) @ rotations
-    by_place = torch.randn(FRAMES, 3, 3, generator=generator, dtype=torch.float64)
-    moved_root = root + (by_place @ step[:, -3:, None])[..., 0]
+    perspective_jacobian = torch.randn(FRAMES, 3, 3, generator=generator, dtype=torch.float64)
+    moved_root = root + (perspective_jacobian @ step[:, -3:, None])[..., 0]
     moved, _ = pose_points(model, pose_skeleton(model, turned, moved_root), points)
-    expected = ((moved - world) * covector).sum(-1)
+    expected = ((moved - world) * point_gradient).sum(-1)
     assert torch.allclose(
-        (pose_rows(skeleton, arms, by_place, covector) @ step[..., None])[..., 0], expected, atol=1e-8
+        (pose_jacobian_rows(skeleton, lever_arms, perspective_jacobian, point_gradient) @ step[..., None])[..., 0],
+        expected,
+        atol=1e-8,
     )
 
     shape_step = 1e-4 * torch.randn(len(model.shape), generator=generator, dtype=torch.float64)
-    offset_step = 1e-4 * torch.randn(OFFSET_COUNT, generator=generator, dtype=torch.float64)
+    offset_step = 1e-4 * torch.randn(LANDMARK_OFFSET_COUNT, generator=generator, dtype=torch.float64)
     other = model.moved(model.shape + shape_step)
     moved, _ = pose_points(other, pose_skeleton(other, rotations, root), regressor.points(other, offset_step))
-    expected = ((moved - world) * covector).sum(-1)
-    found = shape_rows(model, skeleton, points, covector) @ torch.cat([shape_step, offset_step])
+    expected = ((moved - world) * point_gradient).sum(-1)
+    found = shape_jacobian_rows(model, skeleton, points, point_gradient) @ torch.cat([shape_step, offset_step])
     assert torch.allclose(found, expected, atol=1e-8)
 
 
-def test_linear_model_follows_the_body(model: FitModel) -> None:
+def test_linear_model_follows_the_body(model: LinearBody) -> None:
     body = load_anny()
     shape = body.shape_defaults.clone()
     shape[body.shape_names.index("height")] += 0.05
     shape[body.shape_names.index("upperleg-length")] += 0.2
-    exact = linearise(body, shape)
+    exact = linearise_body(body, shape)
     approximate = model.moved(shape.double())
     assert (exact.vertices - approximate.vertices).abs().max() < 2e-3
     assert (exact.vertices - model.vertices).abs().max() > 2e-2
@@ -93,15 +95,15 @@ def test_linear_model_follows_the_body(model: FitModel) -> None:
     assert height + float(gradient @ (shape.double() - model.shape)) == pytest.approx(exact.height_m()[0], abs=2e-3)
 
 
-def test_skin_weights_of_fingers_go_to_the_hand(model: FitModel) -> None:
+def test_skin_weights_of_fingers_go_to_the_hand(model: LinearBody) -> None:
     assert torch.allclose(model.weights.sum(1), torch.ones(len(model.weights), dtype=torch.float64), atol=1e-5)
     tip = int(model.vertices[:, 0].argmax())
     assert model.weights[tip, ACTIVE_JOINTS.index("LeftHand")] > 0.99
 
 
-def test_grip_bends_fingers_alone(model: FitModel) -> None:
+def test_finger_rotations_bend_fingers_only(model: LinearBody) -> None:
     body = load_anny()
-    angle = torch.linalg.matrix_norm(model.grip - torch.eye(3, dtype=torch.float64))
+    angle = torch.linalg.matrix_norm(model.finger_rotations - torch.eye(3, dtype=torch.float64))
     bent = [name for name, bend in zip(body.joint_names, angle, strict=True) if bend > 1e-3]
     assert len(bent) == 24
     assert all("Hand" in name and "Thumb" not in name for name in bent)

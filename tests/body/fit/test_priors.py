@@ -3,31 +3,31 @@ import pytest
 import torch
 
 from pipeline.body.body import load_anny
-from pipeline.body.fit.linear_body import ACTIVE_JOINTS, linearise
+from pipeline.body.fit.linear_body import ACTIVE_JOINTS, linearise_body
 from pipeline.body.fit.priors import (
-    FRAME_S,
-    HABIT_RAD,
-    HABIT_SLACK,
-    LEAST_MOTION,
-    JointPrior,
-    cross_matrix,
-    habitual_prior,
-    joint_prior,
-    logarithm_jacobian,
+    MIN_MOTION_RATIO,
+    MIN_SPREAD_RAD,
+    REFERENCE_INTERVAL_S,
+    SPREAD_FACTOR,
+    PosePrior,
+    adapt_pose_prior,
+    default_motion_std,
+    estimate_motion_std,
+    inverse_left_jacobian_so3,
     motion_residuals,
-    observed_motion,
+    pose_prior,
     pose_residuals,
-    rotation_logarithm,
+    rotation_to_axis_angle,
     shape_prior,
-    usual_motion,
+    skew_symmetric,
 )
 from pipeline.geometry.rotation import axis_angle_to_matrix
 
 
 @pytest.fixture(scope="module")
-def prior() -> JointPrior:
+def prior() -> PosePrior:
     body = load_anny()
-    return joint_prior(linearise(body, body.shape_defaults))
+    return pose_prior(linearise_body(body, body.shape_defaults))
 
 
 def bent(joint: str, axis_angle: torch.Tensor) -> torch.Tensor:
@@ -38,7 +38,7 @@ def bent(joint: str, axis_angle: torch.Tensor) -> torch.Tensor:
 
 def test_cross_matrix_is_the_cross_product() -> None:
     a, b = torch.randn(2, 4, 3, dtype=torch.float64)
-    assert torch.allclose((cross_matrix(a) @ b[..., None])[..., 0], torch.linalg.cross(a, b))
+    assert torch.allclose((skew_symmetric(a) @ b[..., None])[..., 0], torch.linalg.cross(a, b))
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-3, 0.7, 2.5])
@@ -46,13 +46,13 @@ def test_logarithm_jacobian_agrees_with_differences(size: float) -> None:
     vector = size * torch.nn.functional.normalize(torch.tensor([0.3, -0.5, 0.8], dtype=torch.float64), dim=0)
     columns = []
     for axis in torch.eye(3, dtype=torch.float64):
-        forward = rotation_logarithm(axis_angle_to_matrix(1e-5 * axis) @ axis_angle_to_matrix(vector))
-        backward = rotation_logarithm(axis_angle_to_matrix(-1e-5 * axis) @ axis_angle_to_matrix(vector))
+        forward = rotation_to_axis_angle(axis_angle_to_matrix(1e-5 * axis) @ axis_angle_to_matrix(vector))
+        backward = rotation_to_axis_angle(axis_angle_to_matrix(-1e-5 * axis) @ axis_angle_to_matrix(vector))
         columns.append((forward - backward) / 2e-5)
-    assert torch.allclose(logarithm_jacobian(vector), torch.stack(columns, dim=1), atol=1e-5)
+    assert torch.allclose(inverse_left_jacobian_so3(vector), torch.stack(columns, dim=1), atol=1e-5)
 
 
-def test_pose_derivative_agrees_with_differences(prior: JointPrior) -> None:
+def test_pose_derivative_agrees_with_differences(prior: PosePrior) -> None:
     generator = torch.Generator().manual_seed(0)
     angles = 0.5 * torch.randn(2, len(ACTIVE_JOINTS), 3, generator=generator, dtype=torch.float64)
     step = 1e-6 * torch.randn(angles.shape, generator=generator, dtype=torch.float64)
@@ -62,7 +62,7 @@ def test_pose_derivative_agrees_with_differences(prior: JointPrior) -> None:
     assert torch.allclose((derivative @ step[..., None])[..., 0], moved - residual, atol=1e-8)
 
 
-def test_knees_bend_backward_only(prior: JointPrior) -> None:
+def test_knees_bend_backward_only(prior: PosePrior) -> None:
     """A positive turn about +X takes the foot back; the other way is beyond the limit."""
     backward, _ = pose_residuals(prior, bent("LeftLeg", torch.tensor([1.5, 0.0, 0.0])))
     forward, _ = pose_residuals(prior, bent("LeftLeg", torch.tensor([-0.6, 0.0, 0.0])))
@@ -71,10 +71,10 @@ def test_knees_bend_backward_only(prior: JointPrior) -> None:
 
 
 @pytest.mark.parametrize("side", ["Left", "Right"])
-def test_elbows_bend_the_hand_forward_and_stop_when_straight(prior: JointPrior, side: str) -> None:
+def test_elbows_bend_the_hand_forward_and_stop_when_straight(prior: PosePrior, side: str) -> None:
     joint = ACTIVE_JOINTS.index(f"{side}ForeArm")
     body = load_anny()
-    model = linearise(body, body.shape_defaults)
+    model = linearise_body(body, body.shape_defaults)
     flexion = prior.axes[joint, 1]
     hand = model.joints[ACTIVE_JOINTS.index(f"{side}Hand")] - model.joints[joint]
     assert (axis_angle_to_matrix(0.8 * flexion) @ hand - hand)[2] > 0.05
@@ -95,45 +95,47 @@ def test_steady_motion_costs_nothing_at_any_spacing() -> None:
     assert motion_residuals(rotations, root, time_s).abs().max() > 0.03
 
 
-def test_shape_prior_tells_phenotypes_from_local_changes() -> None:
+def test_shape_prior_separates_phenotypes_from_local_changes() -> None:
     prior = shape_prior(("gender", "waist-girth"), torch.tensor([0.5, 0.0]))
-    assert np.allclose(prior.lowest, [0.02, -1.0])
+    assert np.allclose(prior.lower_bound, [0.02, -1.0])
     assert np.allclose(prior.mean, [0.5, 0.0])
 
 
-@pytest.mark.parametrize(("pushed", "expected"), [(0.2, 0.4), (0.0, LEAST_MOTION), (5.0, 1.0)])
-def test_motion_is_told_from_noise(pushed: float, expected: float) -> None:
+@pytest.mark.parametrize(("pushed", "expected"), [(0.2, 0.4), (0.0, MIN_MOTION_RATIO), (5.0, 1.0)])
+def test_motion_is_separated_from_noise(pushed: float, expected: float) -> None:
     """White acceleration of a known size, seen under errors that change from frame to frame."""
     generator = torch.Generator().manual_seed(3)
-    usual = usual_motion(1)
-    acceleration = pushed * usual * torch.randn(4000, 6, generator=generator, dtype=torch.float64)
-    path = acceleration.cumsum(0).cumsum(0) + 0.1 * usual * torch.randn(4000, 6, generator=generator).double()
+    default_std = default_motion_std(1)
+    acceleration = pushed * default_std * torch.randn(4000, 6, generator=generator, dtype=torch.float64)
+    path = acceleration.cumsum(0).cumsum(0) + 0.1 * default_std * torch.randn(4000, 6, generator=generator).double()
     angles = path[:, :3] * torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
     rotations = axis_angle_to_matrix(angles)[:, None]
-    time_s = torch.arange(4000, dtype=torch.float64) * FRAME_S
-    share = observed_motion(rotations, path[:, 3:], time_s) / usual
+    time_s = torch.arange(4000, dtype=torch.float64) * REFERENCE_INTERVAL_S
+    share = estimate_motion_std(rotations, path[:, 3:], time_s) / default_std
     assert share[3:].tolist() == pytest.approx([expected] * 3, rel=0.3)
 
 
-def test_a_short_recording_tells_nothing_about_motion() -> None:
+def test_a_short_recording_uses_the_default_motion_std() -> None:
     time_s = torch.arange(5, dtype=torch.float64)
     still = torch.eye(3, dtype=torch.float64).repeat(5, 2, 1, 1)
-    assert torch.equal(observed_motion(still, torch.zeros(5, 3, dtype=torch.float64), time_s), usual_motion(2))
+    assert torch.equal(
+        estimate_motion_std(still, torch.zeros(5, 3, dtype=torch.float64), time_s), default_motion_std(2)
+    )
 
 
-def test_joints_that_hardly_move_follow_their_mean(prior: JointPrior) -> None:
+def test_joints_that_hardly_move_follow_their_mean(prior: PosePrior) -> None:
     """An arm held up with a little sway is expected there; a leg that swings and the spine keep the general prior."""
     arm, leg, spine = (ACTIVE_JOINTS.index(name) for name in ("LeftArm", "LeftUpLeg", "Spine"))
     phase = torch.linspace(0.0, 6.0, 200, dtype=torch.float64)
     angles = torch.zeros(200, len(ACTIVE_JOINTS), 3, dtype=torch.float64)
     angles[:, arm, 2] = 0.9 + 0.05 * torch.sin(phase)
     angles[:, leg, 0] = 0.5 * torch.sin(phase)
-    habit = habitual_prior(prior, axis_angle_to_matrix(angles))
+    habit = adapt_pose_prior(prior, axis_angle_to_matrix(angles))
     spread = float(angles[:, arm, 2].var(correction=0))
     assert habit.mean_rad[arm, 2] == pytest.approx(float(angles[:, arm, 2].mean()))
-    assert habit.deviation_rad[arm, 2] == pytest.approx(HABIT_SLACK * (spread + HABIT_RAD**2) ** 0.5)
+    assert habit.std_rad[arm, 2] == pytest.approx(SPREAD_FACTOR * (spread + MIN_SPREAD_RAD**2) ** 0.5)
     assert habit.mean_rad[leg, 0] == 0.0
-    assert habit.deviation_rad[leg, 0] == prior.deviation_rad[leg, 0]
-    assert torch.equal(habit.deviation_rad[spine], prior.deviation_rad[spine])
+    assert habit.std_rad[leg, 0] == prior.std_rad[leg, 0]
+    assert torch.equal(habit.std_rad[spine], prior.std_rad[spine])
     residual, _ = pose_residuals(habit, axis_angle_to_matrix(angles))
     assert residual[:, arm, 2].abs().max() < 1.0

@@ -1,6 +1,6 @@
 import torch
 
-from pipeline.body.fit.root_placement import place_of_root, root_by_place, root_of_place
+from pipeline.body.fit.root_placement import perspective_to_world, root_jacobian, world_to_perspective
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.rotation import axis_angle_to_matrix
 
@@ -17,22 +17,25 @@ ROOTS = torch.tensor([[0.1, 0.2, 0.3], [-0.5, 1.0, -0.4]], dtype=torch.float64)
 
 def test_place_and_root_are_inverse() -> None:
     camera = tilted_camera()
-    assert torch.allclose(root_of_place(place_of_root(ROOTS, camera), camera), ROOTS, atol=1e-5)
+    assert torch.allclose(perspective_to_world(world_to_perspective(ROOTS, camera), camera), ROOTS, atol=1e-5)
 
 
 def test_derivative_agrees_with_differences() -> None:
     camera = tilted_camera()
-    place = place_of_root(ROOTS, camera)
+    root_perspective = world_to_perspective(ROOTS, camera)
     for axis in range(3):
         step = torch.zeros(3, dtype=torch.float64)
         step[axis] = 1e-6
-        moved = (root_of_place(place + step, camera) - root_of_place(place - step, camera)) / 2e-6
-        assert torch.allclose(root_by_place(ROOTS, camera)[..., axis], moved, atol=1e-5)
+        moved = (
+            perspective_to_world(root_perspective + step, camera)
+            - perspective_to_world(root_perspective - step, camera)
+        ) / 2e-6
+        assert torch.allclose(root_jacobian(ROOTS, camera)[..., axis], moved, atol=1e-5)
 
 
-def test_a_larger_world_differs_in_depth_alone() -> None:
+def test_scaling_the_world_changes_log_depth_only() -> None:
     camera = Camera(500.0, 500.0, 100.0, 100.0, 200, 200)
     roots = torch.tensor([[0.1, 0.2, -3.0], [0.3, -0.1, -2.5]], dtype=torch.float64)
-    near, far = place_of_root(roots, camera), place_of_root(1.3 * roots, camera)
+    near, far = world_to_perspective(roots, camera), world_to_perspective(1.3 * roots, camera)
     assert torch.allclose(near[:, :2], far[:, :2])
     assert torch.allclose(far[:, 2] - near[:, 2], torch.full((2,), 1.3, dtype=torch.float64).log())

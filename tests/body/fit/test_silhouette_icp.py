@@ -5,18 +5,18 @@ import torch
 
 from pipeline.body.body import load_anny
 from pipeline.body.fit.silhouette_icp import (
+    crop_mask_window,
+    find_correspondences,
     intersection_over_union,
-    mask_trust,
-    match_all,
-    match_outlines,
-    matching_window,
+    mask_weights,
+    match_silhouettes,
     outline_pixels,
     outward_normals,
     posed_vertices,
     signed_distance,
 )
 from pipeline.geometry.skinning import forward_kinematics, linear_blend_skinning, skinning_transforms
-from tests.body.acting import act
+from tests.body.acting import synthetic_recording
 
 
 def disc(radius: float, x: float = 50.0, y: float = 50.0, size: int = 100) -> np.ndarray:
@@ -45,12 +45,12 @@ def test_the_border_of_the_picture_is_no_outline() -> None:
 
 
 def test_pairs_of_a_shifted_disc_point_back() -> None:
-    window = matching_window((disc(30.0) * 255).astype(np.uint8))
+    window = crop_mask_window((disc(30.0) * 255).astype(np.uint8))
     assert window is not None
     shift = np.array([3.0, 0.0])
     middle = (np.array([50.0, 50.0]) - [window.left_px, window.top_px]) * window.scale
-    drawn = disc(30.0 * window.scale, *(middle + shift), size=window.mask.shape[0])[:, : window.mask.shape[1]]
-    pairs = match_outlines(window, drawn, np.zeros_like(drawn))
+    body_mask = disc(30.0 * window.scale, *(middle + shift), size=window.mask.shape[0])[:, : window.mask.shape[1]]
+    pairs = find_correspondences(window, body_mask, np.zeros_like(body_mask))
     used = pairs.weight > 0
     gap = ((pairs.pixel[:, ::-1] + 0.5 - pairs.target) * pairs.normal).sum(1)[used]
     normal = pairs.normal[used]
@@ -61,28 +61,28 @@ def test_pairs_of_a_shifted_disc_point_back() -> None:
 
 def test_a_mask_inside_the_body_pulls_harder_than_one_outside() -> None:
     """Clothes lie outside the body; the body never lies outside its silhouette without cause."""
-    window = matching_window((disc(30.0) * 255).astype(np.uint8))
+    window = crop_mask_window((disc(30.0) * 255).astype(np.uint8))
     assert window is not None
     middle = (np.array([50.0, 50.0]) - [window.left_px, window.top_px]) * window.scale
     weights = []
     for radius in (27.0, 33.0):
-        drawn = disc(radius, *middle, size=window.mask.shape[0])[:, : window.mask.shape[1]]
-        weights.append(match_outlines(window, drawn, np.zeros_like(drawn)).weight.mean())
+        body_mask = disc(radius, *middle, size=window.mask.shape[0])[:, : window.mask.shape[1]]
+        weights.append(find_correspondences(window, body_mask, np.zeros_like(body_mask)).weight.mean())
     assert weights[0] < 0.7 * weights[1]
-    drawn = disc(27.0, *middle, size=window.mask.shape[0])[:, : window.mask.shape[1]]
-    assert match_outlines(window, drawn, drawn).weight.mean() < 0.5 * weights[0]
+    body_mask = disc(27.0, *middle, size=window.mask.shape[0])[:, : window.mask.shape[1]]
+    assert find_correspondences(window, body_mask, body_mask).weight.mean() < 0.5 * weights[0]
 
 
 def test_a_mask_that_agrees_less_than_the_others_counts_less() -> None:
-    trust = mask_trust(np.array([0.93, 0.92, 0.94, 0.83, 0.6, np.nan]))
+    trust = mask_weights(np.array([0.93, 0.92, 0.94, 0.83, 0.6, np.nan]))
     assert trust[[0, 1, 2, 5]].tolist() == [1.0] * 4
     assert 0.3 < trust[3] < 0.8
     assert trust[4] == pytest.approx(0.05)
-    assert mask_trust(np.full(3, np.nan)).tolist() == [1.0] * 3
+    assert mask_weights(np.full(3, np.nan)).tolist() == [1.0] * 3
 
 
 def test_an_empty_mask_has_no_window() -> None:
-    assert matching_window(np.zeros((20, 20), dtype=np.uint8)) is None
+    assert crop_mask_window(np.zeros((20, 20), dtype=np.uint8)) is None
 
 
 @pytest.mark.parametrize(("second", "expected"), [(disc(20.0), 1.0), (disc(20.0, x=10.0, y=90.0), 0.0)])
@@ -91,21 +91,21 @@ def test_overlap_of_discs(second: np.ndarray, expected: float) -> None:
 
 
 def test_the_true_body_covers_its_mask_and_its_pairs_are_satisfied() -> None:
-    scene = act(load_anny(), 3)
+    scene = synthetic_recording(load_anny(), 3)
     windows = [*scene.windows()[:2], None]
-    contour, overlap = match_all(scene.model, scene.state, scene.observations(scene.camera), windows)
-    assert np.nanmin(overlap) > 0.97
-    assert np.isnan(overlap[2])
+    contour, silhouette_iou = match_silhouettes(scene.model, scene.state, scene.observations(scene.camera), windows)
+    assert np.nanmin(silhouette_iou) > 0.97
+    assert np.isnan(silhouette_iou[2])
     assert contour.weight[2].max() == 0.0
     assert contour.weight[:2].sum(1).min() > 20.0
 
 
-def test_what_hair_and_shoes_add_hardly_pulls() -> None:
+def test_hair_and_shoes_have_little_weight() -> None:
     """They make the outline higher than the person, who would come nearer by it."""
     body = load_anny()
-    scene = act(body, 6)
-    windows = [matching_window(cv2.dilate(mask, np.ones((7, 7), np.uint8))) for mask in scene.masks()]
-    contour, _ = match_all(scene.model, scene.state, scene.observations(scene.camera), windows)
+    scene = synthetic_recording(body, 6)
+    windows = [crop_mask_window(cv2.dilate(mask, np.ones((7, 7), np.uint8))) for mask in scene.masks()]
+    contour, _ = match_silhouettes(scene.model, scene.state, scene.observations(scene.camera), windows)
     frozen = body.body(body.shape_defaults)
     carried_by = frozen.skin_weights[contour.corners[..., 0].numpy()]
     weight = contour.weight.numpy()
@@ -120,9 +120,9 @@ def test_what_hair_and_shoes_add_hardly_pulls() -> None:
 
 def test_posed_vertices_equal_whole_body_skinning() -> None:
     body = load_anny()
-    scene = act(body, 2)
+    scene = synthetic_recording(body, 2)
     model, state = scene.model, scene.state
-    full = model.rotations_of_all(state.rotations)
+    full = model.all_joint_rotations(state.rotations)
     transforms = skinning_transforms(
         forward_kinematics(full, state.root_m, model.full_joints, body.parents), model.full_joints
     )

@@ -8,7 +8,7 @@ from pipeline.core.progress import take_warnings
 
 
 @pytest.fixture(autouse=True)
-def no_old_warnings() -> Iterator[None]:
+def clear_warnings() -> Iterator[None]:
     """Forget what was warned of before and in the test."""
     take_warnings()
     yield

@@ -6,7 +6,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from data_tools.synthetic.scene.movie import write_movie
+from data_tools.synthetic.scene.movie import write_video
 from pipeline.io.image import write_gray, write_rgb
 
 WIDTH, HEIGHT = 16, 12
@@ -34,7 +34,7 @@ def numbers(name: str, n: int, seed: int = 2) -> np.ndarray:
 def people_snapshot(folder: Path, n: int = 6) -> dict[str, np.ndarray]:
     """One subject; returns the camera that was written."""
     folder.mkdir(parents=True)
-    write_movie(folder / f"{folder.name}.mp4", pictures(n), 25.0)
+    write_video(folder / f"{folder.name}.mp4", pictures(n), 25.0)
     camera = {
         "camera_f": np.array([30.0, 31.0]),
         "camera_c": np.array([WIDTH / 2, HEIGHT / 2]),
@@ -75,7 +75,7 @@ def poses_of_set(n: int, seed: int) -> dict[str, np.ndarray]:
     return rows | {"betas": numbers("betas", 1, seed)}
 
 
-def images_with(folder: Path, mask_folder: str, n: int = 6) -> None:
+def write_image_folder(folder: Path, mask_folder: str, n: int = 6) -> None:
     """Images with masks of 0 and 255 under the same names."""
     (folder / "images").mkdir(parents=True)
     (folder / mask_folder).mkdir()

@@ -5,7 +5,7 @@ import struct
 import numpy as np
 import pytest
 
-from data_tools.convert.colmap import find_model, read_model
+from data_tools.convert.colmap import find_colmap_model, read_colmap_model
 from pipeline.core.errors import UserError
 
 NUMBERS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "FULL_OPENCV": 6}
@@ -53,13 +53,13 @@ def write_binary(folder, model, parameters):
 def test_cameras_and_poses(tmp_path, write, model):
     parameters, pinhole, distortion = PARAMETERS[model]
     write(tmp_path / "sparse" / "0", model, parameters)
-    assert find_model(tmp_path) == tmp_path / "sparse" / "0"
-    read = read_model(tmp_path / "sparse" / "0")
+    assert find_colmap_model(tmp_path) == tmp_path / "sparse" / "0"
+    read = read_colmap_model(tmp_path / "sparse" / "0")
     one = read.cameras[7]
     assert (one.width, one.height) == (16, 12)
     assert (one.camera.fx, one.camera.fy, one.camera.cx, one.camera.cy) == pinhole
     assert one.camera.distortion == distortion
-    assert read.camera_of == dict.fromkeys(IMAGES, 7)
+    assert read.camera_id_of == dict.fromkeys(IMAGES, 7)
     expected = np.array([[0, 0, 1, 1], [1, 0, 0, 2], [0, 1, 0, 3], [0, 0, 0, 1]])
     np.testing.assert_allclose(read.world_to_camera["a b.png"], expected, atol=1e-12)
     np.testing.assert_allclose(read.world_to_camera["c.png"][:, 3], [0, 0, 5, 1])
@@ -67,7 +67,7 @@ def test_cameras_and_poses(tmp_path, write, model):
 
 def test_a_lens_without_distortion_has_none(tmp_path):
     write_text(tmp_path / "m", "RADIAL", (50, 8, 6, 0, 0))
-    assert read_model(tmp_path / "m").cameras[7].camera.distortion == ()
+    assert read_colmap_model(tmp_path / "m").cameras[7].camera.distortion == ()
 
 
 @pytest.mark.parametrize("write", [write_text, write_binary])
@@ -75,21 +75,21 @@ def test_a_fisheye_is_refused(tmp_path, write, monkeypatch):
     monkeypatch.setitem(NUMBERS, "OPENCV_FISHEYE", 5)
     write(tmp_path / "m", "OPENCV_FISHEYE", (50, 51, 8, 6, 0.1, 0.2, 0.3, 0.4))
     with pytest.raises(UserError, match="camera model (OPENCV_FISHEYE|number 5) is not read"):
-        read_model(tmp_path / "m")
+        read_colmap_model(tmp_path / "m")
 
 
 def test_damage_and_absence_are_named(tmp_path):
-    assert find_model(tmp_path) is None
+    assert find_colmap_model(tmp_path) is None
     write_text(tmp_path / "m", "PINHOLE", (50, 51, 8))
     with pytest.raises(UserError, match="PINHOLE has 4 parameters, found 3"):
-        read_model(tmp_path / "m")
+        read_colmap_model(tmp_path / "m")
     write_text(tmp_path / "n", "PINHOLE", (50, 51, 8, 6))
     (tmp_path / "n" / "images.txt").unlink()
     with pytest.raises(UserError, match=r"images\.txt does not exist"):
-        read_model(tmp_path / "n")
+        read_colmap_model(tmp_path / "n")
     write_binary(tmp_path / "b", "PINHOLE", (50, 51, 8, 6))
     whole = (tmp_path / "b" / "images.bin").read_bytes()
     for length in (4, 40, 75, len(whole) // 2):
         (tmp_path / "b" / "images.bin").write_bytes(whole[:length])
         with pytest.raises(UserError, match=r"images\.bin is no COLMAP file"):
-            read_model(tmp_path / "b")
+            read_colmap_model(tmp_path / "b")

@@ -7,25 +7,25 @@ import pytest
 
 from data_tools.convert.image_folder import is_image_folder, read_image_folder
 from data_tools.convert.recording import write_recording
-from pipeline.capture.user_files import find_supplied
-from pipeline.capture.video import open_source
+from pipeline.capture.user_files import load_user_files
+from pipeline.capture.video import open_frame_source
 from pipeline.core.errors import UserError
 from pipeline.io.image import read_rgb, write_rgba
 from tests.data_tools.convert import made_up
 
 
 def check(target):
-    source = open_source(target)
-    supplied = find_supplied(target, source)
+    source = open_frame_source(target)
+    user_files = load_user_files(target, source)
     for k, (picture, mask) in enumerate(zip(made_up.pictures(6), made_up.masks(6), strict=True)):
         np.testing.assert_array_equal(read_rgb(source.files[k]), picture)
-        np.testing.assert_array_equal(supplied.read_mask(k), 255 * mask)
-    return supplied
+        np.testing.assert_array_equal(user_files.read_mask(k), 255 * mask)
+    return user_files
 
 
 @pytest.mark.parametrize("name", ["masks", "matte"])
 def test_masks_in_a_folder_of_any_usual_name(tmp_path, name):
-    made_up.images_with(tmp_path / "in", name)
+    made_up.write_image_folder(tmp_path / "in", name)
     assert is_image_folder(tmp_path / "in")
     (tmp_path / "in" / "camera.json").write_text(json.dumps({"fx": 9, "fy": 9, "cx": 8, "cy": 6}))
     write_recording(read_image_folder(tmp_path / "in"), tmp_path / "out")
@@ -42,7 +42,7 @@ def test_masks_in_the_alpha_channel(tmp_path):
 
 
 def test_pictures_without_masks_need_no_conversion(tmp_path):
-    made_up.images_with(tmp_path / "in", "other")
+    made_up.write_image_folder(tmp_path / "in", "other")
     assert not is_image_folder(tmp_path / "in")
     with pytest.raises(UserError, match="no masks beside its pictures"):
         read_image_folder(tmp_path / "in")

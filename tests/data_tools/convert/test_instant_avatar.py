@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from data_tools.convert.instant_avatar import is_instant_avatar, read_instant_avatar
-from data_tools.convert.protocol import _SETS
+from data_tools.convert.protocol import _SPLITS
 from data_tools.convert.recording import write_recording
 from pipeline.capture.smpl_poses import load_smpl_poses
-from pipeline.capture.user_files import find_supplied
-from pipeline.capture.video import open_source
+from pipeline.capture.user_files import load_user_files
+from pipeline.capture.video import open_frame_source
 from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
 from pipeline.io.image import read_rgb, write_gray
@@ -38,14 +38,14 @@ def subject(tmp_path_factory):
 def test_round_trip(folder, tmp_path):
     assert is_instant_avatar(folder)
     write_recording(read_instant_avatar(folder), tmp_path / "out")
-    source = open_source(tmp_path / "out")
-    supplied = find_supplied(tmp_path / "out", source)
+    source = open_frame_source(tmp_path / "out")
+    user_files = load_user_files(tmp_path / "out", source)
     for k, (picture, mask) in enumerate(zip(made_up.pictures(6), made_up.masks(6), strict=True)):
         np.testing.assert_array_equal(read_rgb(source.files[k]), picture)
-        np.testing.assert_array_equal(supplied.read_mask(k), 255 * mask)
-    assert (supplied.camera.fx, supplied.camera.fy, supplied.camera.cx, supplied.camera.cy) == (30, 31, 8, 6)
-    assert supplied.camera.distortion == ()
-    assert supplied.split is None
+        np.testing.assert_array_equal(user_files.read_mask(k), 255 * mask)
+    assert (user_files.camera.fx, user_files.camera.fy, user_files.camera.cx, user_files.camera.cy) == (30, 31, 8, 6)
+    assert user_files.camera.distortion == ()
+    assert user_files.split is None
     poses = load_smpl_poses(tmp_path / "out" / "smpl_poses.npz")
     pose = made_up.numbers("pose", 6)
     np.testing.assert_array_equal(np.concatenate([poses.global_orient, poses.body_pose], axis=1), pose)
@@ -60,7 +60,7 @@ def test_a_known_subject_keeps_its_sets_and_their_poses(subject, tmp_path):
     np.savez(tmp_path / SUBJECT / "poses" / "anim_nerf_train.npz", **train)
     np.savez(tmp_path / SUBJECT / "poses" / "anim_nerf_test.npz", **test)
     write_recording(read_instant_avatar(tmp_path / SUBJECT), tmp_path / "out")
-    split = find_supplied(tmp_path / "out", open_source(tmp_path / "out")).split
+    split = load_user_files(tmp_path / "out", open_frame_source(tmp_path / "out")).split
     np.testing.assert_array_equal(split.frame_index, TRAIN + HELDOUT)
     np.testing.assert_array_equal(split.frame_index[split.split == 2], HELDOUT)
     np.testing.assert_array_equal(split.frame_index[split.split == 1], TRAIN[4::8])
@@ -88,9 +88,9 @@ def test_the_real_pose_files_fit_the_split(subject, shared_data, tmp_path):
     assert (poses.transl[:, 2] > 5).all()
 
 
-@pytest.mark.parametrize("name", sorted(_SETS))
+@pytest.mark.parametrize("name", sorted(_SPLITS))
 def test_no_set_shares_a_frame(name):
-    train, heldout = _SETS[name]
+    train, heldout = _SPLITS[name]
     assert not set(train) & set(heldout)
 
 

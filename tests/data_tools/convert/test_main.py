@@ -14,7 +14,7 @@ from tests.data_tools.convert import made_up
 MAKERS = {
     "peoplesnapshot": made_up.people_snapshot,
     "instantavatar": made_up.instant_avatar,
-    "images": lambda folder: made_up.images_with(folder, "mask"),
+    "images": lambda folder: made_up.write_image_folder(folder, "mask"),
 }
 
 
@@ -36,7 +36,7 @@ def test_the_format_is_guessed_and_the_source_is_only_read(tmp_path, capsys, nam
 
 
 def test_errors_are_sentences(tmp_path, capsys):
-    made_up.images_with(tmp_path / "in", "other")
+    made_up.write_image_folder(tmp_path / "in", "other")
     source, target = str(tmp_path / "in"), str(tmp_path / "out")
     for arguments, message in (
         ([source, target], "none of the known formats (peoplesnapshot, instantavatar, neuman, images)"),
@@ -50,7 +50,7 @@ def test_errors_are_sentences(tmp_path, capsys):
 
 
 def test_what_breaks_off_leaves_no_target(tmp_path):
-    made_up.images_with(tmp_path / "in", "masks")
+    made_up.write_image_folder(tmp_path / "in", "masks")
     broken = tmp_path / "in" / "masks" / "00003.png"
     whole = broken.read_bytes()
     broken.write_bytes(b"rubbish")

@@ -6,8 +6,8 @@ import pytest
 from data_tools.convert.neuman import is_neuman, read_neuman
 from data_tools.convert.recording import write_recording
 from pipeline.capture.smpl_poses import load_smpl_poses
-from pipeline.capture.user_files import find_supplied
-from pipeline.capture.video import open_source
+from pipeline.capture.user_files import load_user_files
+from pipeline.capture.video import open_frame_source
 from pipeline.core.errors import UserError
 from pipeline.io.image import write_gray
 from tests.data_tools.convert import made_up
@@ -28,7 +28,7 @@ def camera_pose(k: int) -> tuple[np.ndarray, np.ndarray]:
 def scene(tmp_path):
     """Six pictures, the fifth of them not registered by COLMAP; the world's unit is four metres."""
     folder = tmp_path / "scene"
-    made_up.images_with(folder, "segmentations")
+    made_up.write_image_folder(folder, "segmentations")
     for k, mask in enumerate(made_up.masks(6)):
         write_gray(folder / "segmentations" / f"{k:05d}.png", 255 - 255 * mask)
     (folder / "sparse").mkdir()
@@ -49,12 +49,12 @@ def scene(tmp_path):
 def test_round_trip(scene, tmp_path):
     assert is_neuman(scene)
     write_recording(read_neuman(scene), tmp_path / "out")
-    source = open_source(tmp_path / "out")
-    supplied = find_supplied(tmp_path / "out", source)
+    source = open_frame_source(tmp_path / "out")
+    user_files = load_user_files(tmp_path / "out", source)
     assert source.n_frames == 6
     for k, mask in enumerate(made_up.masks(6)):
-        np.testing.assert_array_equal(supplied.read_mask(k), 255 * mask)
-    camera = supplied.camera
+        np.testing.assert_array_equal(user_files.read_mask(k), 255 * mask)
+    camera = user_files.camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion) == (30.5, 31.5, 8.25, 6.5, ())
     poses = load_smpl_poses(tmp_path / "out" / "smpl_poses.npz")
     registered = [0, 1, 2, 3, 5]
@@ -95,7 +95,7 @@ def test_split_files_name_pictures(scene, tmp_path):
     assert read_neuman(scene).split is None
     (scene / "test_split.txt").write_text("00005.png\n00003.png\n")
     write_recording(read_neuman(scene), tmp_path / "out")
-    split = find_supplied(tmp_path / "out", open_source(tmp_path / "out")).split
+    split = load_user_files(tmp_path / "out", open_frame_source(tmp_path / "out")).split
     np.testing.assert_array_equal(split.split, [0, 1, 0, 2, 0, 2])
     (scene / "test_split.txt").write_text("00099.png\n")
     with pytest.raises(UserError, match="names 00099.png, which is not in images/"):

@@ -11,8 +11,8 @@ import pytest
 from data_tools.convert.people_snapshot import is_people_snapshot, read_people_snapshot
 from data_tools.convert.recording import write_recording
 from pipeline.capture.smpl_poses import load_smpl_poses
-from pipeline.capture.user_files import find_supplied
-from pipeline.capture.video import open_source, read_frames
+from pipeline.capture.user_files import load_user_files
+from pipeline.capture.video import open_frame_source, read_frames
 from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
 from tests.data_tools.convert import made_up
@@ -23,16 +23,16 @@ def test_round_trip(tmp_path):
     camera = made_up.people_snapshot(folder)
     assert is_people_snapshot(folder)
     write_recording(read_people_snapshot(folder), target)
-    source = open_source(target)
+    source = open_frame_source(target)
     read = np.stack([frame.rgb for frame in read_frames(source, lambda _: True, 999)])
     np.testing.assert_allclose(read.astype(int), made_up.pictures(6), atol=3)
-    supplied = find_supplied(target, source)
+    user_files = load_user_files(target, source)
     for k, mask in enumerate(made_up.masks(6)):
-        np.testing.assert_array_equal(supplied.read_mask(k), 255 * mask)
-    assert (supplied.camera.fx, supplied.camera.fy, supplied.camera.cx, supplied.camera.cy) == (30, 31, 8, 6)
-    assert supplied.camera.distortion == tuple(camera["camera_k"])
-    assert supplied.camera.world_to_camera is None
-    assert supplied.split is None
+        np.testing.assert_array_equal(user_files.read_mask(k), 255 * mask)
+    assert (user_files.camera.fx, user_files.camera.fy, user_files.camera.cx, user_files.camera.cy) == (30, 31, 8, 6)
+    assert user_files.camera.distortion == tuple(camera["camera_k"])
+    assert user_files.camera.world_to_camera is None
+    assert user_files.split is None
     assert "no split is known for female-9-casual" in take_warnings()[0]
     poses = load_smpl_poses(target / "smpl_poses.npz")
     np.testing.assert_array_equal(poses.frame_index, np.arange(6))

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from data_tools.convert.recording import mask_folder
-from data_tools.synthetic.scene.movie import write_movie
-from pipeline.capture.video import open_source
+from data_tools.convert.recording import mask_folder_reader
+from data_tools.synthetic.scene.movie import write_video
+from pipeline.capture.video import open_frame_source
 from pipeline.core.errors import UserError
 from pipeline.io.image import write_gray
 from tests.data_tools.convert import made_up
@@ -13,14 +13,14 @@ from tests.data_tools.convert import made_up
 
 def test_masks_of_a_video_lie_in_order(tmp_path):
     """A video's frames have no names that masks could share."""
-    write_movie(tmp_path / "walk.mp4", made_up.pictures(6), 25.0)
+    write_video(tmp_path / "walk.mp4", made_up.pictures(6), 25.0)
     (tmp_path / "masks").mkdir()
     for k, mask in enumerate(made_up.masks(6)):
         write_gray(tmp_path / "masks" / f"{k}.png", 255 * mask)
-    source = open_source(tmp_path / "walk.mp4")
-    read = mask_folder(tmp_path / "masks", source)
+    source = open_frame_source(tmp_path / "walk.mp4")
+    read = mask_folder_reader(tmp_path / "masks", source)
     for k, mask in enumerate(made_up.masks(6)):
         np.testing.assert_array_equal(read(k), 255 * mask)
     (tmp_path / "masks" / "5.png").unlink()
     with pytest.raises(UserError, match="5 masks for 6 pictures"):
-        mask_folder(tmp_path / "masks", source)
+        mask_folder_reader(tmp_path / "masks", source)

@@ -8,8 +8,14 @@ import pytest
 
 from data_tools.command import run_command
 from data_tools.evaluate.compare import _main as compare_command
-from data_tools.evaluate.compare import acceleration, compare_body, compare_masks, compare_surface, swapped_frames
-from data_tools.evaluate.truth import true_mask
+from data_tools.evaluate.compare import (
+    compare_body,
+    compare_masks,
+    compare_surface,
+    joint_accelerations,
+    left_right_swapped_frames,
+)
+from data_tools.evaluate.truth import load_true_mask
 from pipeline.body.files import load_body, load_camera, load_motion, save_body, save_camera, save_motion
 from pipeline.core.errors import UserError
 from pipeline.io.image import write_gray
@@ -24,7 +30,7 @@ def run(sample: Path, tmp_path: Path) -> Path:
     (tmp_path / "body").mkdir()
     save_npz(tmp_path / "frames" / "frames.npz", {"frame_index": rows.astype(np.int32)})
     for index in rows:
-        write_gray(tmp_path / "frames" / "masks" / f"{index:06d}.png", true_mask(sample, int(index)))
+        write_gray(tmp_path / "frames" / "masks" / f"{index:06d}.png", load_true_mask(sample, int(index)))
     save_body(tmp_path / "body" / "body.npz", load_body(truth / "bare.npz"))
     save_motion(tmp_path / "body" / "motion.npz", load_motion(truth / "motion.npz").select(rows))
     save_camera(tmp_path / "body" / "camera.npz", load_camera(truth / "camera.npz"))
@@ -40,7 +46,7 @@ def test_the_truth_has_no_error(sample: Path, run: Path) -> None:
     assert figures["absolute_joint_error_mm"] < 1e-3
     assert figures["acceleration_error_ratio"] < 1e-3
     assert figures["jitter_ratio"] == pytest.approx(1.0, abs=1e-3)
-    assert figures["swapped_frames"] == 0
+    assert figures["left_right_swapped_frames"] == 0
     assert figures["silhouette_iou"] == pytest.approx(0.85)
     assert figures["focal_ratio"] == pytest.approx(1.0)
     assert figures["scale_ratio"] == pytest.approx(1.0)
@@ -73,7 +79,7 @@ def test_a_shift_moves_pixels_only(sample: Path, run: Path) -> None:
 
 
 def test_a_cut_mask_loses_its_share(sample: Path, run: Path) -> None:
-    mask = true_mask(sample, 2)
+    mask = load_true_mask(sample, 2)
     rows = np.flatnonzero((mask > 127).any(axis=1))
     half = np.where(np.arange(len(mask))[:, None] < rows.mean(), mask, 0).astype(np.uint8)
     write_gray(run / "frames" / "masks" / "000002.png", half)
@@ -100,14 +106,14 @@ def test_a_frame_with_crossed_knees_is_swapped() -> None:
     true = np.array([[0.0, 0, 0], [0.1, -0.5, 0], [-0.1, -0.5, 0], [0, 0.6, 0]])[None].repeat(3, 0)
     fitted = true + 0.02
     fitted[1, [1, 2]] = fitted[1, [2, 1]]
-    assert swapped_frames(names, fitted, true).tolist() == [False, True, False]
+    assert left_right_swapped_frames(names, fitted, true).tolist() == [False, True, False]
 
 
 def test_acceleration_of_a_fall_at_uneven_times() -> None:
     time_s = np.array([0.0, 0.1, 0.15, 0.4, 0.5])
     places = np.zeros((5, 1, 3))
     places[:, 0, 1] = -0.5 * 9.81 * time_s**2
-    assert np.allclose(acceleration(places, time_s), [0.0, -9.81, 0.0])
+    assert np.allclose(joint_accelerations(places, time_s), [0.0, -9.81, 0.0])
 
 
 def test_the_run_of_another_capture_is_refused(sample: Path, run: Path) -> None:

@@ -15,51 +15,51 @@ from scipy.spatial.transform import Rotation
 from data_tools.evaluate import compare_avatar
 from data_tools.evaluate.compare_avatar import (
     Comparison,
-    absorbed,
-    ceiling_pictures,
-    compare_filmed,
-    compare_held_out,
+    compare_heldout_images,
+    compare_heldout_surfaces,
     compare_novel_poses,
     compare_novel_views,
-    compare_shape,
+    compare_rest_surfaces,
     compare_texture,
-    taken_over,
+    render_upper_bound,
+    retarget_motion,
+    unpose_true_vertices,
 )
-from data_tools.evaluate.truth import true_mask
-from pipeline.avatar.textured_avatar import straight_rgba
+from data_tools.evaluate.truth import load_true_mask
+from pipeline.avatar.textured_avatar import unpremultiply_to_uint8
 from pipeline.body.body import Body, Motion
 from pipeline.body.files import save_motion
 from pipeline.capture.frame_selection import HELDOUT, TRAIN
 from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
 from pipeline.geometry.mesh import Mesh
-from pipeline.geometry.texture_rendering import soften_outline
+from pipeline.geometry.texture_rendering import blur_coverage
 from pipeline.io.image import write_rgba
-from pipeline.metrics.alignment import Similarity
-from pipeline.metrics.images import frame_scores, on_white
+from pipeline.metrics.alignment import SimilarityTransform
+from pipeline.metrics.images import composite_on_white, frame_scores
 from tests.data_tools.finished import (
     bent_arm,
-    filmed_as,
-    perfect_run,
-    resting_otherwise,
-    seen_from_afar,
-    shrunk,
+    ground_truth_run,
+    with_frames,
+    with_longer_focal,
     with_motion,
+    with_raised_rest_arm,
+    with_scale,
 )
 
 
 @pytest.fixture(scope="module")
 def perfect(sample: Path, tmp_path_factory: pytest.TempPathFactory) -> Comparison:
-    return perfect_run(sample, tmp_path_factory.mktemp("perfect"))
+    return ground_truth_run(sample, tmp_path_factory.mktemp("perfect"))
 
 
 @pytest.fixture(scope="module")
-def perfect_ceiling(perfect: Comparison) -> dict[str, float]:
-    return compare_held_out(perfect)["ceiling"]
+def perfect_upper_bound(perfect: Comparison) -> dict[str, float]:
+    return compare_heldout_images(perfect)["upper_bound"]
 
 
 def test_the_truth_has_no_error(perfect: Comparison) -> None:
-    for scores in (compare_shape(perfect), compare_filmed(perfect)):
+    for scores in (compare_rest_surfaces(perfect), compare_heldout_surfaces(perfect)):
         assert scores["chamfer_mm"] < 0.2  # four joints a vertex are kept in the export
         assert scores["f_score"] > 0.999
         assert scores["scale_to_truth"] == pytest.approx(1.0, abs=1e-3)
@@ -71,13 +71,15 @@ def test_the_truth_has_no_error(perfect: Comparison) -> None:
 def test_filmed_poses_are_those_of_held_out_frames(perfect: Comparison) -> None:
     """A wrong arm counts where it is held out, and nowhere else."""
     heldout, train = (perfect.run.capture.positions(kind) for kind in (HELDOUT, TRAIN))
-    wrong, trained = (compare_filmed(with_motion(perfect, bent_arm(perfect, rows, 0.3))) for rows in (heldout, train))
+    wrong, trained = (
+        compare_heldout_surfaces(with_motion(perfect, bent_arm(perfect, rows, 0.3))) for rows in (heldout, train)
+    )
     assert wrong["chamfer_mm"] > 1.0
     assert trained["chamfer_mm"] < 0.2
 
 
 def test_a_smaller_person_has_the_same_shape(perfect: Comparison) -> None:
-    scores = compare_shape(shrunk(perfect, 0.9))
+    scores = compare_rest_surfaces(with_scale(perfect, 0.9))
     assert scores["chamfer_mm"] < 0.2
     assert scores["scale_to_truth"] == pytest.approx(1 / 0.9, abs=1e-3)
 
@@ -94,9 +96,9 @@ def test_another_a_pose_is_no_error(perfect: Comparison) -> None:
 
     Blending twice squeezes the shoulder by some millimetres; left as it rests, the hand is 20 cm away.
     """
-    other = resting_otherwise(perfect, 0.35)
-    assert compare_shape(other)["chamfer_mm"] < 1.0
-    assert compare_shape(other)["hausdorff95_mm"] < 4.0
+    other = with_raised_rest_arm(perfect, 0.35)
+    assert compare_rest_surfaces(other)["chamfer_mm"] < 1.0
+    assert compare_rest_surfaces(other)["hausdorff95_mm"] < 4.0
     assert compare_novel_poses(other)[0]["chamfer_mm"] < 1.5
     assert compare_texture(other)["colour_error"] < 2.0
 
@@ -129,8 +131,8 @@ def test_flat_colours_give_the_texture_error_in_closed_form(perfect: Comparison)
     flat = np.array([110.0, 120.0, 130.0], dtype=np.float32) / 255
     left = np.zeros((512, 512), dtype=np.float32)
     left[:, :150] = 1.0
-    found = painted(perfect, np.full((8, 8, 3), 100, dtype=np.uint8), np.tile(flat, (8, 8, 1)), left)
-    share = share_of_surface(perfect, lambda uv: uv[..., 0] < 150 / 512)
+    found = with_textures(perfect, np.full((8, 8, 3), 100, dtype=np.uint8), np.tile(flat, (8, 8, 1)), left)
+    share = surface_fraction(perfect, lambda uv: uv[..., 0] < 150 / 512)
     scores = compare_texture(found)
     assert 0.1 < share < 0.45
     assert scores["coverage"] == pytest.approx(share, abs=0.012)
@@ -138,25 +140,27 @@ def test_flat_colours_give_the_texture_error_in_closed_form(perfect: Comparison)
     assert scores["balanced_colour_error"] == pytest.approx(0.0, abs=1e-3)
     greys = np.where(left[..., None] > 0, np.uint8(200), np.uint8(100)).repeat(3, axis=2)
     grey = np.full((8, 8, 3), 200 / 255, dtype=np.float32)
-    two = compare_texture(painted(perfect, greys, grey, perfect.coverage))
+    two = compare_texture(with_textures(perfect, greys, grey, perfect.coverage))
     assert two["coverage"] == 1.0
     assert two["colour_error"] == pytest.approx(100 * (1 - share), abs=1.2)
     assert two["balanced_colour_error"] == pytest.approx(100 * share, abs=1.2)  # the gain is right for the larger part
 
 
-def painted(pair: Comparison, truth: np.ndarray, found: np.ndarray, coverage: np.ndarray) -> Comparison:
+def with_textures(comparison: Comparison, truth: np.ndarray, found: np.ndarray, coverage: np.ndarray) -> Comparison:
     """The same run with other textures, the true one in 8 bits, the avatar's in [0, 1], and what the video showed."""
-    subject = replace(pair.truth.subject, texture=truth)
-    avatar = replace(pair.run.avatar, diffuse=torch.from_numpy(found))
-    truth_painted, run_painted = replace(pair.truth, subject=subject), replace(pair.run, avatar=avatar)
-    made = replace(pair, truth=truth_painted, run=run_painted, coverage=coverage)
-    vars(made).update(rest=pair.rest, alignment=pair.alignment)  # found for the same surfaces already
+    subject = replace(comparison.truth.subject, texture=truth)
+    avatar = replace(comparison.run.avatar, diffuse=torch.from_numpy(found))
+    truth_painted, run_painted = replace(comparison.truth, subject=subject), replace(comparison.run, avatar=avatar)
+    made = replace(comparison, truth=truth_painted, run=run_painted, coverage=coverage)
+    vars(made).update(
+        rest_mesh=comparison.rest_mesh, alignment=comparison.alignment
+    )  # found for the same surfaces already
     return made
 
 
-def share_of_surface(pair: Comparison, inside: Callable[[np.ndarray], np.ndarray]) -> float:
+def surface_fraction(comparison: Comparison, inside: Callable[[np.ndarray], np.ndarray]) -> float:
     """Share of the A-pose's area whose atlas coordinates are inside something, by 21 points a face."""
-    subject = pair.truth.subject
+    subject = comparison.truth.subject
     steps = np.array([(i, j) for i in range(6) for j in range(6 - i)])
     two = (steps + 1 / 3) / 6
     corners = np.concatenate([1 - two.sum(1, keepdims=True), two], axis=1)
@@ -176,7 +180,9 @@ def test_a_limb_on_the_wrong_joint_is_off_by_what_that_joint_does_not_do(
 
     Expected distances come from points spread densely over both surfaces, which are made here by turning the arm.
     """
-    monkeypatch.setattr(compare_avatar, "align_surfaces", lambda *_: Similarity(1.0, np.eye(3), np.zeros(3)))
+    monkeypatch.setattr(
+        compare_avatar, "align_surfaces_icp", lambda *_: SimilarityTransform(1.0, np.eye(3), np.zeros(3))
+    )
     body, place = perfect.truth.subject.body, perfect.truth.ground_m
     shoulder = body.joint("LeftArm")
     limb = {shoulder}
@@ -190,12 +196,12 @@ def test_a_limb_on_the_wrong_joint_is_off_by_what_that_joint_does_not_do(
     indices[hangs], weights[hangs] = int(body.parents[shoulder]), torch.tensor([1.0, 0.0, 0.0, 0.0])
     bound = replace(avatar, joint_indices=indices, joint_weights=weights)
     write_novel_pose(tmp_path, body, shoulder, place)
-    pair = replace(perfect, folder=tmp_path, run=replace(perfect.run, avatar=bound))
-    scores, _ = compare_novel_poses(pair)
+    comparison = replace(perfect, folder=tmp_path, run=replace(perfect.run, avatar=bound))
+    scores, _ = compare_novel_poses(comparison)
     wrong = np.where(hangs[:, None], body.vertices, true)
     surfaces = [
         trimesh.Trimesh(vertices, faces, process=False)
-        for vertices, faces in ((wrong, pair.rest.faces), (true, pair.true_rest.faces))
+        for vertices, faces in ((wrong, comparison.rest_mesh.faces), (true, comparison.true_rest_mesh.faces))
     ]
     dense = [trimesh.sample.sample_surface(surface, 200_000, seed=3)[0] for surface in surfaces]
     for name, (source, target) in {"result_to_truth_mm": dense, "truth_to_result_mm": dense[::-1]}.items():
@@ -215,42 +221,44 @@ def write_novel_pose(folder: Path, body: Body, joint: int, place: np.ndarray) ->
     write_rgba(folder / "novel_poses" / "000000.png", np.zeros((200, 200, 4), dtype=np.uint8))
 
 
-def test_true_poses_leave_nothing_to_miss(perfect: Comparison, perfect_ceiling: dict[str, float]) -> None:
-    assert np.abs(absorbed(perfect) - perfect.truth.subject.body.vertices).max() < 1e-3
+def test_true_poses_leave_nothing_to_miss(perfect: Comparison, perfect_upper_bound: dict[str, float]) -> None:
+    assert np.abs(unpose_true_vertices(perfect) - perfect.truth.subject.body.vertices).max() < 1e-3
     # With the true vertices it is 66 dB; the alignment finds their scale to 0.015 %, a third of a millimetre.
-    assert perfect_ceiling["psnr_body"] > 36.0
-    assert perfect_ceiling["mask_iou"] > 0.99
+    assert perfect_upper_bound["psnr_body"] > 36.0
+    assert perfect_upper_bound["mask_iou"] > 0.99
 
 
 def test_the_ceiling_is_as_soft_as_the_masks(perfect: Comparison, tmp_path: Path) -> None:
     """Outlines blurred by 1.5 px in all frames: a sharp true mesh misses them, one that is drawn as soft does not."""
-    soft = filmed_as(perfect, tmp_path, lambda person: straight_rgba(soften_outline(person, 1.5)))
+    soft = with_frames(perfect, tmp_path, lambda person: unpremultiply_to_uint8(blur_coverage(person, 1.5)))
     heldout = soft.run.capture.positions(HELDOUT)
-    (drawn,) = ceiling_pictures(soft, heldout)
-    target = straight_rgba(soften_outline(perfect.truth.person(0), 1.5))
+    (drawn,) = render_upper_bound(soft, heldout)
+    target = unpremultiply_to_uint8(blur_coverage(perfect.truth.person(0), 1.5))
     sharp = frame_scores(drawn, target[..., :3], target[..., 3])
-    assert compare_held_out(soft)["ceiling"]["psnr_full"] > sharp["psnr_full"] + 6.0
+    assert compare_heldout_images(soft)["upper_bound"]["psnr_full"] > sharp["psnr_full"] + 6.0
 
 
 def test_what_a_mask_leaves_out_costs_nothing_until_the_true_one_is_asked(perfect: Comparison, tmp_path: Path) -> None:
     """Masks without legs, and a field that is the person without legs: white where the true target has them."""
 
     def without_legs(person: np.ndarray) -> np.ndarray:
-        straight = straight_rgba(person)
+        straight = unpremultiply_to_uint8(person)
         straight[110:, :, 3] = 0
         return straight
 
-    cut = filmed_as(perfect, tmp_path, without_legs)
+    cut = with_frames(perfect, tmp_path, without_legs)
     learnt = perfect.truth.person(0) * (np.arange(200) < 110)[:, None, None]
-    scores = compare_held_out(replace(cut, run=replace(cut.run, draw_field=lambda pose: learnt)))
-    true = straight_rgba(perfect.truth.person(0))
-    legs = (255.0 - on_white(np.ascontiguousarray(true[..., :3]), np.ascontiguousarray(true[..., 3]))[110:]) / 255.0
+    scores = compare_heldout_images(replace(cut, run=replace(cut.run, field_renderer=lambda pose: learnt)))
+    true = unpremultiply_to_uint8(perfect.truth.person(0))
+    legs = (
+        255.0 - composite_on_white(np.ascontiguousarray(true[..., :3]), np.ascontiguousarray(true[..., 3]))[110:]
+    ) / 255.0
     expected_db = -10 * np.log10((legs**2).sum() / (200 * 200 * 3))
     kept = (true[:110, :, 3] > 127).sum() / (true[..., 3] > 127).sum()
     assert scores["field_true_mask"]["psnr_full"] == pytest.approx(expected_db, abs=0.02)
     assert scores["field_true_mask"]["mask_iou"] == pytest.approx(kept, abs=1e-6)
-    assert scores["ceiling"]["mask_iou"] == pytest.approx(kept, abs=0.01)  # the found mask blames the truth
-    assert scores["ceiling_true_mask"]["mask_iou"] > 0.99
+    assert scores["upper_bound"]["mask_iou"] == pytest.approx(kept, abs=0.01)  # the found mask blames the truth
+    assert scores["upper_bound_true_mask"]["mask_iou"] > 0.99
     assert scores["mesh_true_mask"]["mask_iou"] > 0.97
 
 
@@ -262,49 +270,51 @@ def test_a_frame_without_a_true_person_is_left_out_with_a_warning(
     split[:2] = HELDOUT
     two = replace(perfect, run=replace(perfect.run, capture=replace(perfect.run.capture, split=split)))
     nothing = np.zeros((perfect.run.camera.height, perfect.run.camera.width, 4), np.float32)
-    monkeypatch.setattr(compare_avatar, "ceiling_pictures", lambda pair, positions: [nothing] * len(positions))
-    monkeypatch.setattr(compare_avatar, "true_mask", lambda out, frame: (frame > 0) * true_mask(out, frame))
+    monkeypatch.setattr(compare_avatar, "render_upper_bound", lambda comparison, positions: [nothing] * len(positions))
+    monkeypatch.setattr(compare_avatar, "load_true_mask", lambda out, frame: (frame > 0) * load_true_mask(out, frame))
     take_warnings()
-    assert compare_held_out(two)["mesh_true_mask"]["mask_iou"] > 0.98
+    assert compare_heldout_images(two)["mesh_true_mask"]["mask_iou"] > 0.98
     (warning,) = take_warnings()
     assert "held-out frame 0 is not compared" in warning
-    monkeypatch.setattr(compare_avatar, "true_mask", lambda out, frame: 0 * true_mask(out, frame))
+    monkeypatch.setattr(compare_avatar, "load_true_mask", lambda out, frame: 0 * load_true_mask(out, frame))
     with pytest.raises(UserError, match="no held-out frame can be compared"):
-        compare_held_out(two)
+        compare_heldout_images(two)
 
 
 def test_true_masks_are_brought_to_the_size_of_the_frames(perfect: Comparison, tmp_path: Path) -> None:
     def halved(person: np.ndarray) -> np.ndarray:
-        return straight_rgba(cv2.resize(person, (100, 100), interpolation=cv2.INTER_AREA))
+        return unpremultiply_to_uint8(cv2.resize(person, (100, 100), interpolation=cv2.INTER_AREA))
 
-    half = filmed_as(perfect, tmp_path, halved)
+    half = with_frames(perfect, tmp_path, halved)
     learnt = halved(perfect.truth.person(0)) / np.float32(255)
-    scores = compare_held_out(replace(half, run=replace(half.run, draw_field=lambda pose: learnt)))
+    scores = compare_heldout_images(replace(half, run=replace(half.run, field_renderer=lambda pose: learnt)))
     assert scores["field_true_mask"]["mask_iou"] > 0.998
-    assert scores["ceiling_true_mask"]["mask_iou"] > 0.95
+    assert scores["upper_bound_true_mask"]["mask_iou"] > 0.95
 
 
-def test_size_and_distance_are_no_error_of_the_pose(perfect: Comparison, perfect_ceiling: dict[str, float]) -> None:
-    smaller = compare_held_out(shrunk(perfect, 0.9))["ceiling"]
-    assert smaller["psnr_body"] == pytest.approx(perfect_ceiling["psnr_body"], abs=0.5)
+def test_size_and_distance_are_no_error_of_the_pose(perfect: Comparison, perfect_upper_bound: dict[str, float]) -> None:
+    smaller = compare_heldout_images(with_scale(perfect, 0.9))["upper_bound"]
+    assert smaller["psnr_body"] == pytest.approx(perfect_upper_bound["psnr_body"], abs=0.5)
 
 
 def test_a_longer_lens_costs_its_perspective_alone(perfect: Comparison) -> None:
     """A person who is taken for a fifth farther away, by a lens a fifth longer, keeps size, place and shape."""
-    afar = seen_from_afar(perfect, 1.2)
-    apart_m = np.linalg.norm(absorbed(afar) - perfect.truth.subject.body.vertices, axis=1)
+    afar = with_longer_focal(perfect, 1.2)
+    apart_m = np.linalg.norm(unpose_true_vertices(afar) - perfect.truth.subject.body.vertices, axis=1)
     assert apart_m.max() < 1e-3
-    assert compare_held_out(afar)["ceiling"]["mask_iou"] > 0.97
+    assert compare_heldout_images(afar)["upper_bound"]["mask_iou"] > 0.97
 
 
-def test_an_arm_that_is_always_off_belongs_to_the_shape(perfect: Comparison, perfect_ceiling: dict[str, float]) -> None:
+def test_an_arm_that_is_always_off_belongs_to_the_shape(
+    perfect: Comparison, perfect_upper_bound: dict[str, float]
+) -> None:
     """The same error in all frames can be made good in the A-pose; in the held-out frame alone it cannot."""
     frames = np.arange(len(perfect.run.motion.frame_index))
     always, once = (
-        compare_held_out(with_motion(perfect, bent_arm(perfect, rows, 0.15)))["ceiling"]
+        compare_heldout_images(with_motion(perfect, bent_arm(perfect, rows, 0.15)))["upper_bound"]
         for rows in (frames, frames[:1])
     )
-    assert always["psnr_body"] > perfect_ceiling["psnr_body"] - 4.0
+    assert always["psnr_body"] > perfect_upper_bound["psnr_body"] - 4.0
     assert once["psnr_body"] < always["psnr_body"] - 4.0
 
 
@@ -317,7 +327,7 @@ def test_a_frame_moves_what_it_sees_across_the_view(perfect: Comparison) -> None
         root_m = motion.root_translation_m.copy()
         root_m[frame] += 0.03 * camera.world_to_camera[axis, :3]
         wrong = with_motion(perfect, motion.with_pose(motion.rotations_wxyz, root_m))
-        moved.append(np.linalg.norm(absorbed(wrong) - true, axis=1))
+        moved.append(np.linalg.norm(unpose_true_vertices(wrong) - true, axis=1))
     sideways, deeper = moved
     posed = Mesh(perfect.run.avatar.posed(perfect.run.refined[frame]).numpy(), perfect.run.avatar.faces.numpy())
     towards = posed.vertex_normals() @ -camera.world_to_camera[2, :3]
@@ -330,14 +340,14 @@ def test_joints_that_the_fit_lacks_are_carried_by_their_parent(perfect: Comparis
     body, true = perfect.run.body, perfect.truth.subject.body.vertices
     names = tuple("Tail" if name == "LeftHandThumb3" else name for name in body.joint_names)
     lacking = replace(perfect, run=replace(perfect.run, body=replace(body, joint_names=names)))
-    assert np.abs(absorbed(lacking) - true).max() < 1e-3
+    assert np.abs(unpose_true_vertices(lacking) - true).max() < 1e-3
 
 
 def test_rotations_go_by_name(bare: Body, perfect: Comparison) -> None:
     """Joints that the actor lacks keep still."""
     motion = perfect.truth.motion
     renamed = replace(bare, joint_names=tuple("Tail" if name == "Head" else name for name in bare.joint_names))
-    taken = taken_over(renamed, perfect.truth.subject.body, motion)
+    taken = retarget_motion(renamed, perfect.truth.subject.body, motion)
     head, arm = renamed.joint("Tail"), renamed.joint("LeftArm")
     assert np.allclose(taken.rotations_wxyz[:, head], [1.0, 0.0, 0.0, 0.0], atol=1e-6)
     assert np.allclose(np.abs(taken.rotations_wxyz[:, arm]), np.abs(motion.rotations_wxyz[:, arm]), atol=1e-5)

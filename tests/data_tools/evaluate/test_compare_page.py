@@ -10,24 +10,33 @@ import numpy as np
 import pytest
 
 from data_tools.evaluate import compare_page
-from data_tools.evaluate.compare_avatar import Pair
+from data_tools.evaluate.compare_avatar import ImagePair
 from data_tools.evaluate.compare_page import comparison_page, write_comparison
-from data_tools.sweep.runs import is_compared
+from data_tools.sweep.runs import has_current_comparison
 from pipeline.core.errors import UserError
-from pipeline.core.manifest import MANIFEST, Manifest, digest_files, find_damage, read_manifest, write_manifest
+from pipeline.core.manifest import (
+    MANIFEST_FILE,
+    Manifest,
+    digest_files,
+    find_damaged_files,
+    read_manifest,
+    write_manifest,
+)
 
 SCORES = {"psnr_full": 30.0, "psnr_body": 20.0}
 SURFACE = {"chamfer_mm": 4.25, "f_score": 0.5, "normal_angle_deg": 12.0}
 
 
-def sections() -> tuple[dict[str, Any], dict[str, list[Pair]]]:
+def sections() -> tuple[dict[str, Any], dict[str, list[ImagePair]]]:
     """What a comparison finds: a grey square that the avatar makes black."""
     truth = np.zeros((40, 30, 4), dtype=np.uint8)
     truth[5:35, 8:22] = [128, 128, 128, 255]
     avatar = (truth / 255.0).astype(np.float32)
     avatar[..., :3] = 0.0
-    images = {"ceiling": SCORES, "novel_views": {"psnr_full": float("inf"), "psnr_body": 10.0}}
-    return {"mesh": SURFACE, "texture": {"coverage": 0.75}, "images": images}, {"novel_views": [Pair(truth, avatar)]}
+    images = {"upper_bound": SCORES, "novel_views": {"psnr_full": float("inf"), "psnr_body": 10.0}}
+    return {"mesh": SURFACE, "texture": {"coverage": 0.75}, "images": images}, {
+        "novel_views": [ImagePair(truth, avatar)]
+    }
 
 
 @pytest.fixture
@@ -38,7 +47,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     heldout = dict.fromkeys(("field", "mesh", "mesh_unrefined"), SCORES)
     (report / "report.json").write_text(json.dumps({"heldout": heldout}))
     manifest = Manifest("report", 1, "print", {}, {}, digest_files(report), {}, 1.0, 1.0)
-    write_manifest(manifest, report / MANIFEST)
+    write_manifest(manifest, report / MANIFEST_FILE)
     monkeypatch.setattr(compare_page, "load_comparison", lambda out, run: None)
     monkeypatch.setattr(compare_page, "avatar_sections", lambda pair: sections())
     return report.parent
@@ -49,23 +58,23 @@ def test_the_document_holds_all_sections_and_the_report_stays_whole(run: Path, t
     document = json.loads((run / "report" / "truth.json").read_text())
     assert document["mesh"]["chamfer_mm"] == 4.25
     assert document["masks"] == {"mask_iou_worst": 0.9}
-    assert list(document["images"]) == ["field", "mesh", "ceiling", "novel_views"]
+    assert list(document["images"]) == ["field", "mesh", "upper_bound", "novel_views"]
     assert document["images"]["novel_views"]["psnr_full"] is None
     assert "iterated closest points" in document["protocol"]
     assert "rows named true_mask" in document["protocol"]
-    assert find_damage(run / "report") == []
+    assert find_damaged_files(run / "report") == []
     manifest = read_manifest(run / "report")
     assert manifest is not None
     assert manifest.fingerprint == "print"  # still fresh
     write_comparison(tmp_path, run, {})  # again, over itself
-    assert find_damage(run / "report") == []
+    assert find_damaged_files(run / "report") == []
 
 
 def test_a_kill_leaves_no_torn_document_and_is_seen(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Killed while the second comparison is written: the first one's document is whole, and counts no more."""
     report = run / "report"
     write_comparison(tmp_path, run, {})
-    assert is_compared(report)
+    assert has_current_comparison(report)
     first = (report / "truth.json").read_bytes()
 
     def killed(path: Path) -> None:
@@ -77,11 +86,11 @@ def test_a_kill_leaves_no_torn_document_and_is_seen(run: Path, tmp_path: Path, m
     with pytest.raises(KeyboardInterrupt):
         write_comparison(tmp_path, run, {"masks": {"mask_iou_worst": 0.9}})
     assert (report / "truth.json").read_bytes() == first
-    assert not is_compared(report)
+    assert not has_current_comparison(report)
 
 
 def test_without_a_report_the_command_is_named(run: Path, tmp_path: Path):
-    (run / "report" / MANIFEST).unlink()
+    (run / "report" / MANIFEST_FILE).unlink()
     with pytest.raises(UserError, match="python -m stages --run"):
         write_comparison(tmp_path, run, {})
 

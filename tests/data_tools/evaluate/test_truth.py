@@ -10,29 +10,29 @@ import torch
 
 from data_tools.command import run_command
 from data_tools.evaluate.truth import _main as truth_command
-from data_tools.evaluate.truth import check, load_truth, true_mask
-from data_tools.synthetic.person.noise import Noise
+from data_tools.evaluate.truth import load_ground_truth, load_true_mask, verify_ground_truth
+from data_tools.synthetic.person.noise import ValueNoise
 from data_tools.synthetic.scene.backdrop import make_room
-from data_tools.synthetic.scene.capture import Capture
-from data_tools.synthetic.scene.movie import write_movie
+from data_tools.synthetic.scene.capture import SyntheticCapture
+from data_tools.synthetic.scene.movie import write_video
 from data_tools.synthetic.scene.renderer import pose_vertices
 from pipeline.body.files import load_motion, save_motion
-from pipeline.capture.video import open_source, read_frames
+from pipeline.capture.video import open_frame_source, read_frames
 from pipeline.core.errors import UserError
 from pipeline.geometry.camera import pixel_rays, project
-from tests.data_tools.synthetic.shapes import crossings
+from tests.data_tools.synthetic.shapes import ray_triangle_distances
 
 
 @pytest.fixture(scope="module")
-def capture(sample: Path) -> Capture:
-    return load_truth(sample)
+def capture(sample: Path) -> SyntheticCapture:
+    return load_ground_truth(sample)
 
 
 def test_the_truth_explains_the_video(sample: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    agreement = check(sample, every=2)
-    assert agreement.frames == 3
-    assert agreement.holds()
-    assert agreement.psnr_body_db > 48.0
+    result = verify_ground_truth(sample, every=2)
+    assert result.frames == 3
+    assert result.passes()
+    assert result.psnr_body_db > 48.0
     assert run_command(truth_command, [str(sample), "--every", "3"]) == 0
     assert "mask IoU 1.0000" in capsys.readouterr().out
 
@@ -44,14 +44,14 @@ def test_a_wrong_truth_is_caught(sample: Path, tmp_path: Path, capsys: pytest.Ca
     motion = load_motion(wrong / "truth" / "motion.npz")
     moved = motion.with_pose(motion.rotations_wxyz, motion.root_translation_m + [0.02, 0.0, 0.0])
     save_motion(wrong / "truth" / "motion.npz", moved)
-    assert not check(wrong, every=3).holds()
+    assert not verify_ground_truth(wrong, every=3).passes()
     assert run_command(truth_command, [str(wrong), "--every", "3"]) == 2
     assert capsys.readouterr().err.startswith("error: ")
 
 
 def test_no_truth_is_named(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="holds no truth"):
-        load_truth(tmp_path)
+        load_ground_truth(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -61,17 +61,17 @@ def test_a_damaged_recipe_is_named(text: str, sample: Path, tmp_path: Path) -> N
     shutil.copytree(sample / "truth", tmp_path / "truth")
     (tmp_path / "truth" / "recipe.json").write_text(text)
     with pytest.raises(UserError, match=r"recipe\.json is damaged"):
-        load_truth(tmp_path)
+        load_ground_truth(tmp_path)
 
 
 def test_a_shortened_video_is_caught(sample: Path, tmp_path: Path) -> None:
     """What is left of it agrees with the truth."""
     (tmp_path / "out" / "video").mkdir(parents=True)
     shutil.copytree(sample / "truth", tmp_path / "out" / "truth")
-    frames = [frame.rgb for frame in read_frames(open_source(sample / "video"), lambda index: index < 5, 200)]
-    write_movie(tmp_path / "out" / "video" / "video.mp4", frames, 6.0)
+    frames = [frame.rgb for frame in read_frames(open_frame_source(sample / "video"), lambda index: index < 5, 200)]
+    write_video(tmp_path / "out" / "video" / "video.mp4", frames, 6.0)
     with pytest.raises(UserError, match="has 5 frames, its truth 6"):
-        check(tmp_path / "out", every=4)
+        verify_ground_truth(tmp_path / "out", every=4)
 
 
 @pytest.mark.parametrize("every", ["0", "-2"])
@@ -80,7 +80,7 @@ def test_a_step_of_nothing_is_refused(every: str, sample: Path, capsys: pytest.C
     assert capsys.readouterr().err.startswith(f"error: --every {every}")
 
 
-def test_joints_project_into_the_masks(sample: Path, capture: Capture) -> None:
+def test_joints_project_into_the_masks(sample: Path, capture: SyntheticCapture) -> None:
     body = capture.subject.body
     names = ("Hips", "Spine1", "Neck", "Head", "LeftForeArm", "RightForeArm", "LeftLeg", "RightLeg", "LeftFoot")
     joints = torch.from_numpy(body.joints_m)[[body.joint(name) for name in names]]
@@ -89,13 +89,13 @@ def test_joints_project_into_the_masks(sample: Path, capture: Capture) -> None:
         world = (transforms[:, :3, :3] @ joints[:, :, None]).squeeze(-1) + transforms[:, :3, 3]
         position_px, _ = project(world, capture.camera)
         column, row = position_px.floor().int().T.numpy()
-        assert (true_mask(sample, frame)[row, column] > 127).all()
+        assert (load_true_mask(sample, frame)[row, column] > 127).all()
 
 
-def test_masks_against_ray_casting(sample: Path, capture: Capture) -> None:
+def test_masks_against_ray_casting(sample: Path, capture: SyntheticCapture) -> None:
     """Rays through pixels that are wholly inside or wholly outside meet the surface, or do not."""
     vertices = pose_vertices(capture.subject, capture.canonical_to_world[2]).double().numpy()
-    mask = true_mask(sample, 2)
+    mask = load_true_mask(sample, 2)
     random = np.random.default_rng(0)
     for value in (0, 255):
         rows, columns = np.nonzero(mask == value)
@@ -104,17 +104,19 @@ def test_masks_against_ray_casting(sample: Path, capture: Capture) -> None:
         pixels = torch.from_numpy(np.stack([columns[chosen], rows[chosen]], axis=1) + 0.5)
         origins, directions = pixel_rays(capture.camera, pixels)
         corners = vertices[capture.subject.body.faces]
-        hits = [len(crossings(origins[0].numpy(), direction, corners)) > 0 for direction in directions.numpy()]
+        hits = [
+            len(ray_triangle_distances(origins[0].numpy(), direction, corners)) > 0 for direction in directions.numpy()
+        ]
         assert hits == [value == 255] * 25
 
 
-def capture_at(capture: Capture, factor: float) -> Capture:
+def capture_at(capture: SyntheticCapture, factor: float) -> SyntheticCapture:
     """The same scene in a finer picture, before the bare wall."""
     camera = capture.camera.scaled(factor)
-    return replace(capture, camera=camera, room=make_room(camera, capture.ground_m, False, Noise(0)))
+    return replace(capture, camera=camera, room=make_room(camera, capture.ground_m, False, ValueNoise(0)))
 
 
-def test_the_detector_finds_the_person(capture: Capture) -> None:
+def test_the_detector_finds_the_person(capture: SyntheticCapture) -> None:
     """The person of the sample is a person to the detector that ships with mediapipe: landmarks and outline."""
     import mediapipe
 

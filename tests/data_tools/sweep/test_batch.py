@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from data_tools.sweep.batch import find_videos, last_change_ns, table_row, text_table, write_table
+from data_tools.sweep.batch import find_videos, newest_mtime_ns, table_row, text_table, write_table
 from data_tools.sweep.runs import RunState
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import read_manifest
-from pipeline.core.measure import REPOSITORY
+from pipeline.core.measure import REPOSITORY_DIR
 from stages import STAGES
 from tests.core.toy_pipeline import Toy, user_environment
 from tests.test_resume import TOY_STAGES, artifacts, wait_for
@@ -42,7 +42,7 @@ def rows(toy: Toy) -> dict[str, dict[str, str]]:
 
 
 def test_one_broken_video_stops_no_other(batch: Toy) -> None:
-    sentence = batch.refusal("data_tools.sweep.batch", "videos", "--preset", "quick")
+    sentence = batch.expect_user_error("data_tools.sweep.batch", "videos", "--preset", "quick")
     assert "1 of 3 videos did not become an avatar (bob)" in sentence
     table = rows(batch)
     assert {name: row["status"] for name, row in table.items()} == OUTCOME
@@ -73,7 +73,7 @@ def test_a_killed_batch_takes_its_runs_along_and_goes_on(batch: Toy) -> None:
         wait_for(batch.folder / "runs" / name / "learn.part" / "checkpoint.json", runner)
     runner.kill()
     runner.communicate()
-    batch.refusal("data_tools.sweep.batch", "videos", "--jobs", "3")
+    batch.expect_user_error("data_tools.sweep.batch", "videos", "--jobs", "3")
     for name in GOOD:
         learnt = read_manifest(batch.folder / "runs" / name / "learn")
         assert learnt is not None
@@ -95,7 +95,7 @@ def test_ctrl_c_stops_all_and_starts_no_other(batch: Toy) -> None:
 
 
 def test_the_table_alone_runs_nothing(batch: Toy) -> None:
-    batch.refusal("data_tools.sweep.batch", "videos", "--table")
+    batch.expect_user_error("data_tools.sweep.batch", "videos", "--table")
     assert {row["status"] for row in rows(batch).values()} == {"unfinished"}
     assert not (batch.folder / "runs" / "ann").exists()
 
@@ -112,7 +112,7 @@ def test_the_table_alone_runs_nothing(batch: Toy) -> None:
 )
 def test_a_mistake_is_one_sentence_before_any_run(batch: Toy, arguments: tuple[str, ...], words: tuple[str]) -> None:
     (batch.folder / "empty").mkdir()
-    sentence = batch.refusal("data_tools.sweep.batch", *arguments)
+    sentence = batch.expect_user_error("data_tools.sweep.batch", *arguments)
     assert all(word in sentence for word in words), sentence
     assert not (batch.folder / "runs").exists()
 
@@ -133,8 +133,8 @@ def test_a_folders_last_change_is_its_newest_files(tmp_path: Path) -> None:
     for name, time_s in (("a", 100), ("b", 300), ("c", 200)):
         (tmp_path / name).touch()
         os.utime(tmp_path / name, (time_s, time_s))
-    assert last_change_ns(tmp_path) == 300 * 10**9
-    assert last_change_ns(tmp_path / "c") == 200 * 10**9
+    assert newest_mtime_ns(tmp_path) == 300 * 10**9
+    assert newest_mtime_ns(tmp_path / "c") == 200 * 10**9
 
 
 def test_the_table_escapes_what_it_is_told(tmp_path: Path) -> None:
@@ -154,7 +154,7 @@ def test_make_asks_for_the_folder(cluster: str, tmp_path: Path) -> None:
     for name in ("requirements.lock", "pyproject.toml", ".venv/.stamp"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
-    command = ["make", "-f", str(REPOSITORY / "Makefile"), "batch", f"CLUSTER={cluster}"]
+    command = ["make", "-f", str(REPOSITORY_DIR / "Makefile"), "batch", f"CLUSTER={cluster}"]
     done = subprocess.run(
         command, cwd=tmp_path, env=user_environment(), capture_output=True, text=True, timeout=60, check=False
     )
@@ -168,11 +168,11 @@ def snakemake(toy: Toy, videos: str = "videos", **variables: str) -> subprocess.
     program = shutil.which("snakemake", path=path)
     if program is None:
         pytest.skip("snakemake is not installed: make venv EXTRA=cluster")
-    folder = REPOSITORY / "configs" / "cluster"
+    folder = REPOSITORY_DIR / "configs" / "cluster"
     command = [program, "--snakefile", str(folder / "Snakefile"), "--profile", str(folder / "local"), "--config"]
     command += [f"videos={videos}", "runs=runs", "options=--preset quick"]
     command += [f"project={toy.folder}", f"python={sys.executable}"]
-    environment = user_environment() | {"PYTHONPATH": str(REPOSITORY), **variables}
+    environment = user_environment() | {"PYTHONPATH": str(REPOSITORY_DIR), **variables}
     return subprocess.Popen(
         command, cwd=toy.folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
@@ -220,11 +220,13 @@ def test_three_real_captures_one_of_them_broken(smoke_run: Path, tmp_path: Path)
     shutil.copytree(smoke_run / "frames" / "images", videos / "carl")
     command = [sys.executable, "-m", "data_tools.sweep.batch", str(videos), "--runs", str(runs), "--preset", "smoke"]
     command += ["--set", "field.steps=20", "--set", "mesh.steps=2"]
-    killed = subprocess.Popen(command, cwd=REPOSITORY, env=user_environment())
+    killed = subprocess.Popen(command, cwd=REPOSITORY_DIR, env=user_environment())
     wait_for(runs / "ann" / "body.part", killed)
     killed.kill()
     killed.wait()
-    done = subprocess.run(command, cwd=REPOSITORY, env=user_environment(), capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, cwd=REPOSITORY_DIR, env=user_environment(), capture_output=True, text=True, check=False
+    )
     assert done.returncode == 2
     with (runs / "batch.csv").open(newline="") as file:
         table = {row["video"]: row for row in csv.DictReader(file)}

@@ -8,16 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from data_tools.sweep.chart import _make_built_in, bring_up_to_date, origin, write_results
+from data_tools.sweep.chart import _make_sample_captures, provenance, run_and_compare, write_results
 from data_tools.sweep.chart import main as chart
-from data_tools.sweep.chart_trials import Trial, point_of, read_progress, table_row
+from data_tools.sweep.chart_trials import Trial, chart_point, read_progress, table_row
 from data_tools.sweep.runs import RunState
 from data_tools.synthetic.scene.capture import RECIPE_VERSION
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import Manifest, read_manifest
 from stages import STAGES
 from tests.core.toy_pipeline import Toy
-from tests.data_tools.finished import compared
+from tests.data_tools.finished import write_fake_comparison
 from tests.test_resume import wait_for
 
 SWEEP = ("data_tools.sweep.chart", "numbers.mp4", "--presets", "quick", "default", "--out", "runs/chart")
@@ -87,31 +87,31 @@ def test_fewer_steps_are_said_everywhere(tmp_path: Path) -> None:
     assert set(fewer.assignments) - set(own.assignments) == {"field.steps=600"}
     run = finished(10.0, SCORES)
     run.manifests["field"].metrics["steps"] = 450.0  # it stopped early
-    assert point_of(fewer, run).preset == "ihm, 600 steps"
+    assert chart_point(fewer, run).preset == "ihm, 600 steps"
     assert table_row(fewer, run)["steps"] == 450.0
     write_results(tmp_path, {fewer: run})
     assert "ihm, 600 steps" in (tmp_path / "chart.svg").read_text()
 
 
 @pytest.fixture
-def nothing_may_start(monkeypatch: pytest.MonkeyPatch) -> None:
+def forbid_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     """A run or a comparison that is started is a failure."""
     for what in ("chart.run_trial", "chart_trials.subprocess.run"):
         monkeypatch.setattr(f"data_tools.{what}", lambda *_, **__: pytest.fail("started"))
 
 
 def test_what_is_done_and_compared_is_not_done_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, nothing_may_start: None
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, forbid_runs: None
 ) -> None:
     trial = Trial(tmp_path / "ann", "quick", 0, tmp_path)
     for folder in (trial.capture / "truth", trial.run_dir / "report"):
         folder.mkdir(parents=True)
     monkeypatch.setattr("data_tools.sweep.chart_trials.read_run", lambda *_: finished(1.0, SCORES))
-    compared(trial.run_dir / "report")
-    assert bring_up_to_date(trial, [trial]).verdict == "done"
+    write_fake_comparison(trial.run_dir / "report")
+    assert run_and_compare(trial, [trial]).status == "done"
     (trial.run_dir / "report" / "truth.json").unlink()
     with pytest.raises(pytest.fail.Exception, match="started"):
-        bring_up_to_date(trial, [trial])
+        run_and_compare(trial, [trial])
 
 
 def test_a_comparison_that_fails_is_no_success(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -126,11 +126,11 @@ def test_a_comparison_that_fails_is_no_success(tmp_path: Path, monkeypatch: pyte
     with pytest.raises(UserError, match=r"1 of 1 runs are not compared with their truth \(ann-default-0\)"):
         chart(command)
     assert (tmp_path / "out" / "chart.svg").is_file()
-    compared(report)
+    write_fake_comparison(report)
     chart(command)
 
 
-def test_two_trials_never_share_a_run(tmp_path: Path, nothing_may_start: None) -> None:
+def test_two_trials_never_share_a_run(tmp_path: Path, forbid_runs: None) -> None:
     """Captures and presets go by their last names: two of one name would show one's figures for both."""
     for name in ("a/me.mp4", "b/me.mp4", "instant.yaml"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
@@ -147,28 +147,30 @@ def test_the_run_of_another_capture_is_not_taken(sweep: Toy) -> None:
     assert sweep.call("data_tools.sweep.chart", "numbers.mp4", *command).returncode == 0
     (sweep.folder / "other").mkdir()
     (sweep.folder / "other" / "numbers.mp4").write_text("7 8 9")
-    assert "not done (numbers-quick-0)" in sweep.refusal("data_tools.sweep.chart", "other/numbers.mp4", *command)
+    assert "not done (numbers-quick-0)" in sweep.expect_user_error(
+        "data_tools.sweep.chart", "other/numbers.mp4", *command
+    )
     assert "was made from" in rows(sweep.folder / "runs" / "chart" / "chart.csv")[0]["message"]
 
 
 def test_built_in_captures_are_those_of_this_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[list[str]] = []
-    monkeypatch.setattr("data_tools.sweep.chart.BUILT_IN", {tmp_path / "ann": 3})
+    monkeypatch.setattr("data_tools.sweep.chart.SAMPLE_CAPTURES", {tmp_path / "ann": 3})
     monkeypatch.setattr("data_tools.sweep.chart.make_sample", made.append)
-    _make_built_in()
+    _make_sample_captures()
     assert made == [[str(tmp_path / "ann"), "--seed", "3"]]
     recipe = tmp_path / "ann" / "truth" / "recipe.json"
     recipe.parent.mkdir(parents=True)
     for text in ("{}", f'{{"version": {RECIPE_VERSION + 1}}}'):
         recipe.write_text(text)
         with pytest.raises(UserError, match="ann is of another version"):
-            _make_built_in()
+            _make_sample_captures()
     recipe.write_text(f'{{"version": {RECIPE_VERSION}}}')
-    _make_built_in()
+    _make_sample_captures()
     assert len(made) == 1
 
 
-def test_drawing_runs_nothing(tmp_path: Path, nothing_may_start: None) -> None:
+def test_drawing_runs_nothing(tmp_path: Path, forbid_runs: None) -> None:
     (tmp_path / "ann").mkdir()
     with pytest.raises(UserError, match="1 of 1 runs are not done"):
         chart([str(tmp_path / "ann"), "--presets", "default", "--out", str(tmp_path / "out"), "--draw"])
@@ -182,7 +184,7 @@ def test_steps_for_no_preset_are_refused(entry: str) -> None:
 
 def test_a_failed_run_stops_no_other(sweep: Toy) -> None:
     (sweep.folder / "words.mp4").write_text("one two")
-    sentence = sweep.refusal(
+    sentence = sweep.expect_user_error(
         "data_tools.sweep.chart", "words.mp4", "numbers.mp4", "--presets", "quick", "--out", "chart"
     )
     assert "1 of 2 runs are not done (words-quick-0)" in sentence
@@ -196,7 +198,7 @@ def test_a_failed_run_stops_no_other(sweep: Toy) -> None:
     [(("none.mp4", "--presets", "quick"), "none.mp4"), (("numbers.mp4", "--presets", "x"), "quick")],
 )
 def test_a_mistake_is_refused_before_any_run(sweep: Toy, arguments: tuple[str, ...], word: str) -> None:
-    assert word in sweep.refusal("data_tools.sweep.chart", *arguments)
+    assert word in sweep.expect_user_error("data_tools.sweep.chart", *arguments)
     assert not (sweep.folder / "runs").exists()
 
 
@@ -207,7 +209,7 @@ def test_seconds_are_those_until_field_and_avatar(tmp_path: Path) -> None:
     (trial.run_dir / "field" / "progress.csv").write_text(
         "step,seconds,validation_psnr_db,validation_psnr_body_db\n50,2.5,20,15\n100,5,22,17.5\n"
     )
-    point = point_of(trial, finished(10.0, SCORES))
+    point = chart_point(trial, finished(10.0, SCORES))
     assert (point.field_seconds, point.seconds) == (30.0, 60.0)  # the report is not needed for the avatar
     assert point.curve == [(22.5, 20.0, 15.0), (25.0, 22.0, 17.5)]
     run = finished(10.0, SCORES, resumed=("field", "mesh"))
@@ -215,7 +217,7 @@ def test_seconds_are_those_until_field_and_avatar(tmp_path: Path) -> None:
     row = table_row(trial, run)
     assert row["peak_rss_mib"] == 250.0
     assert (row["resumed"], row["commit"], row["machine"]) == ("field mesh", "abc", "Xeon, 2 cores")
-    assert origin([row, row | {"seed": 4, "status": "failed"}]) == "commit abc; Xeon, 2 cores; seed 3"
+    assert provenance([row, row | {"seed": 4, "status": "failed"}]) == "commit abc; Xeon, 2 cores; seed 3"
 
 
 def test_progress_that_is_absent_or_damaged(tmp_path: Path) -> None:
@@ -240,7 +242,7 @@ def test_tables_and_chart_of_finished_runs(tmp_path: Path) -> None:
     )
     write_results(tmp_path, runs)
     table = rows(tmp_path / "chart.csv")
-    assert [row["on_front_of"] for row in table] == [BOTH, "chamfer_mm", "", BOTH]
+    assert [row["pareto_optimal_in"] for row in table] == [BOTH, "chamfer_mm", "", BOTH]
     assert [row["message"] for row in table] == ["", "", "no person", ""]
     assert (tmp_path / "chart.svg").is_file()
     (curve,) = rows(tmp_path / "anytime.csv")

@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from data_tools.sweep.chart_figure import PANELS, Point, draw_chart, pareto_front, preset_means, save_chart
+from data_tools.sweep.chart_figure import PANELS, ChartPoint, draw_chart, pareto_front, preset_means, save_chart
 
-QUICK = Point(
+QUICK = ChartPoint(
     "ann", "quick", 0, 10.0, 20.0, {"mesh_psnr_full_db": 24.0, "field_psnr_full_db": 25.0}, [(8.0, 22.0, 18.0)]
 )
-SLOW = Point("ann", "slow", 0, 100.0, 200.0, {"mesh_psnr_full_db": 28.0, "field_psnr_full_db": 30.0})
-WORSE = Point("ann", "worse", 0, 110.0, 210.0, {"mesh_psnr_full_db": 23.0})
+SLOW = ChartPoint("ann", "slow", 0, 100.0, 200.0, {"mesh_psnr_full_db": 28.0, "field_psnr_full_db": 30.0})
+WORSE = ChartPoint("ann", "worse", 0, 110.0, 210.0, {"mesh_psnr_full_db": 23.0})
 
 coarse = st.integers(0, 6).map(float)
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from data_tools.synthetic.person.surface import split_at_midpoints, with_midpoints
+from data_tools.synthetic.person.surface import append_midpoint_values, subdivide_at_midpoints
 
 TETRAHEDRON = (
     np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], dtype=np.float32),
@@ -17,17 +17,19 @@ def octahedron() -> tuple[np.ndarray, np.ndarray]:
     return vertices, np.array(faces, dtype=np.int32)
 
 
-def sphere(radius_m: float, centre_m: tuple[float, float, float], rounds: int = 4) -> tuple[np.ndarray, np.ndarray]:
+def sphere(
+    radius_m: float, centre_m: tuple[float, float, float], subdivisions: int = 4
+) -> tuple[np.ndarray, np.ndarray]:
     """A finely split octahedron blown up to a sphere."""
     vertices, faces = octahedron()
-    for _ in range(rounds):
-        pairs, faces = split_at_midpoints(faces, len(vertices))
-        vertices = with_midpoints(vertices, pairs)
+    for _ in range(subdivisions):
+        pairs, faces = subdivide_at_midpoints(faces, len(vertices))
+        vertices = append_midpoint_values(vertices, pairs)
         vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
     return (vertices * radius_m + np.array(centre_m)).astype(np.float32), faces
 
 
-def crossings(origin: np.ndarray, direction: np.ndarray, corners: np.ndarray) -> np.ndarray:
+def ray_triangle_distances(origin: np.ndarray, direction: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """Distances at which a ray meets triangles (Moeller and Trumbore 1997), by brute force, sorted."""
     edge_1, edge_2, to_origin = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], origin - corners[:, 0]
     p, q = np.cross(direction, edge_2), np.cross(to_origin, edge_1)

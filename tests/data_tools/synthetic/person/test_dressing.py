@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from data_tools.synthetic.person.anatomy import EYE, SKIN, measure, surface_kinds
-from data_tools.synthetic.person.outfit import LAYERS, choose_outfit, layer_depths
-from data_tools.synthetic.person.surface import split_at_midpoints, with_midpoints
+from data_tools.synthetic.person.anatomy import EYE, SKIN, label_faces, measure_anatomy
+from data_tools.synthetic.person.outfit import LAYERS, choose_outfit, compute_layer_depths_m
+from data_tools.synthetic.person.surface import append_midpoint_values, subdivide_at_midpoints
 from data_tools.synthetic.rig.subject import Subject
 from pipeline.body.body import Body, load_anny
 from pipeline.geometry.mesh import Mesh
@@ -16,7 +16,7 @@ from pipeline.geometry.mesh import Mesh
 @pytest.fixture(scope="module")
 def skin(bare: Body) -> np.ndarray:
     """The bare body's vertices and the midpoints, in the order of the clothed ones."""
-    return with_midpoints(bare.vertices, split_at_midpoints(bare.faces, len(bare.vertices))[0])
+    return append_midpoint_values(bare.vertices, subdivide_at_midpoints(bare.faces, len(bare.vertices))[0])
 
 
 def dominated_by(subject: Subject, *parts: str) -> np.ndarray:
@@ -40,7 +40,7 @@ def test_hands_and_eyes_stay_bare(subject: Subject, skin: np.ndarray, bare: Body
     assert (
         moved[dominated_by(subject, "Hand", *(f"Hand{f}{k}" for f in ("Index", "Thumb") for k in (1, 2, 3)))].max() == 0
     )
-    eyes = np.unique(bare.faces[surface_kinds(bare) == EYE])
+    eyes = np.unique(bare.faces[label_faces(bare) == EYE])
     assert moved[eyes].max() == 0
 
 
@@ -63,20 +63,20 @@ def test_shoes_hide_the_toes_and_stand_flat(subject: Subject) -> None:
     assert second_differences.max() < 0.012
 
 
-def closed_share(faces: np.ndarray) -> float:
+def closed_edge_fraction(faces: np.ndarray) -> float:
     """Share of edges at which exactly two faces meet."""
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     return float((np.unique(edges, axis=0, return_counts=True)[1] == 2).mean())
 
 
 def test_the_surface_is_as_closed_as_the_body(subject: Subject, bare: Body) -> None:
-    skin_only = surface_kinds(bare) == SKIN
-    clothed = closed_share(subject.body.faces[np.repeat(skin_only, 4)])
-    assert clothed >= closed_share(bare.faces[skin_only])
+    skin_only = label_faces(bare) == SKIN
+    clothed = closed_edge_fraction(subject.body.faces[np.repeat(skin_only, 4)])
+    assert clothed >= closed_edge_fraction(bare.faces[skin_only])
 
 
 def test_layers_are_where_clothes_are(bare: Body) -> None:
-    anatomy, outfit = measure(load_anny(), bare), choose_outfit(0)
+    anatomy, outfit = measure_anatomy(load_anny(), bare), choose_outfit(0)
     joints = anatomy.joints_m
     between = 0.5 * (joints["LeftUpLeg"] + joints["LeftLeg"])
     points = np.stack(
@@ -88,23 +88,23 @@ def test_layers_are_where_clothes_are(bare: Body) -> None:
             joints["LeftToeBase"],
         ]
     ).astype(np.float32)
-    limbs = np.array([[0, 0], [0, 0], [1, 0], [0, 1], [0, 0]], dtype=np.float32)
-    inside = layer_depths(points, limbs, anatomy, outfit) > 0
+    arm_head_weights = np.array([[0, 0], [0, 0], [1, 0], [0, 1], [0, 0]], dtype=np.float32)
+    inside = compute_layer_depths_m(points, arm_head_weights, anatomy, outfit) > 0
     names = [tuple(layer for layer, is_in in zip(LAYERS, row, strict=True) if is_in) for row in inside]
     assert names == [("shirt",), ("trousers",), (), ("hair",), ("shoes",)]
 
 
 def test_a_longer_sleeve_covers_more(bare: Body) -> None:
-    anatomy, outfit = measure(load_anny(), bare), choose_outfit(0)
+    anatomy, outfit = measure_anatomy(load_anny(), bare), choose_outfit(0)
     elbow = anatomy.joints_m["LeftForeArm"][None]
     on_arm = np.array([[1.0, 0.0]], dtype=np.float32)
     shirt = LAYERS.index("shirt")
-    assert layer_depths(elbow, on_arm, anatomy, outfit)[0, shirt] < 0
-    assert layer_depths(elbow, on_arm, anatomy, replace(outfit, sleeve_fraction=1.3))[0, shirt] > 0
+    assert compute_layer_depths_m(elbow, on_arm, anatomy, outfit)[0, shirt] < 0
+    assert compute_layer_depths_m(elbow, on_arm, anatomy, replace(outfit, sleeve_fraction=1.3))[0, shirt] > 0
 
 
 def test_anatomy_is_symmetric_and_in_place(bare: Body) -> None:
-    anatomy = measure(load_anny(), bare)
+    anatomy = measure_anatomy(load_anny(), bare)
     assert anatomy.eyes_m[0, 0] > anatomy.mouth_m[0] > anatomy.eyes_m[1, 0]
     assert anatomy.ears_m[0, 0] > 0.05
     assert anatomy.ears_m[1, 0] < -0.05

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from data_tools.synthetic.person.noise import Noise
+from data_tools.synthetic.person.noise import ValueNoise
 
 POINTS = np.random.default_rng(5).uniform(-2.0, 2.0, (500, 3)).astype(np.float32)
 
@@ -13,13 +13,13 @@ POINTS = np.random.default_rng(5).uniform(-2.0, 2.0, (500, 3)).astype(np.float32
 @settings(max_examples=10)
 @given(seed=st.integers(0, 2**31 - 1))
 def test_a_seed_is_a_field(seed: int) -> None:
-    assert np.array_equal(Noise(seed)(POINTS, 0.1), Noise(seed)(POINTS, 0.1))
-    assert not np.allclose(Noise(seed)(POINTS, 0.1), Noise(seed + 1)(POINTS, 0.1))
+    assert np.array_equal(ValueNoise(seed)(POINTS, 0.1), ValueNoise(seed)(POINTS, 0.1))
+    assert not np.allclose(ValueNoise(seed)(POINTS, 0.1), ValueNoise(seed + 1)(POINTS, 0.1))
 
 
 @pytest.mark.parametrize("order", [1, 3])
 def test_values_are_bounded_and_centred(order: int) -> None:
-    values = Noise(1)(POINTS, 0.05, order=order)
+    values = ValueNoise(1)(POINTS, 0.05, order=order)
     assert np.abs(values).max() < 1.5
     assert abs(values.mean()) < 0.1
     assert values.std() > 0.2
@@ -27,7 +27,7 @@ def test_values_are_bounded_and_centred(order: int) -> None:
 
 def test_the_field_is_continuous_over_its_period() -> None:
     """32 cells on, across the border of the lattice, the same values return."""
-    noise = Noise(2)
+    noise = ValueNoise(2)
     assert np.allclose(noise(POINTS, 0.1), noise(POINTS + np.float32(3.2), 0.1), atol=1e-3)
     across_border = np.array([[3.2 - 1e-5, 0.3, 0.4], [3.2 + 1e-5, 0.3, 0.4]], dtype=np.float32)
     below, above = noise(across_border, 0.1)
@@ -37,14 +37,14 @@ def test_the_field_is_continuous_over_its_period() -> None:
 def test_linear_between_lattice_points() -> None:
     ends = np.array([[0.1, 0.2, 0.3], [0.2, 0.2, 0.3]], dtype=np.float32)
     middle = ends.mean(axis=0, keepdims=True)
-    noise = Noise(3)
+    noise = ValueNoise(3)
     assert noise(middle, 0.1)[0] == pytest.approx(noise(ends, 0.1).mean(), abs=1e-5)
 
 
 def test_wavelengths_per_axis_stretch_the_field() -> None:
     stretched = POINTS * np.array([1.0, 4.0, 1.0], dtype=np.float32)
-    assert np.allclose(Noise(4)(stretched, (0.1, 0.4, 0.1)), Noise(4)(POINTS, 0.1), atol=1e-4)
+    assert np.allclose(ValueNoise(4)(stretched, (0.1, 0.4, 0.1)), ValueNoise(4)(POINTS, 0.1), atol=1e-4)
 
 
 def test_fractal_stays_bounded() -> None:
-    assert np.abs(Noise(6).fractal(POINTS, 0.3, octaves=4)).max() <= 1.0
+    assert np.abs(ValueNoise(6).fractal(POINTS, 0.3, octaves=4)).max() <= 1.0

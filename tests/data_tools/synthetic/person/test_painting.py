@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from data_tools.synthetic.person.anatomy import measure
+from data_tools.synthetic.person.anatomy import measure_anatomy
 from data_tools.synthetic.person.face import paint_eyes
 from data_tools.synthetic.person.outfit import Outfit, choose_outfit
 from data_tools.synthetic.rig.subject import Subject
@@ -85,7 +85,7 @@ def test_gutters_are_filled(subject: Subject) -> None:
 
 
 def test_the_gaze_is_dark_in_the_middle(bare: Body, outfit: Outfit) -> None:
-    anatomy = measure(load_anny(), bare)
+    anatomy = measure_anatomy(load_anny(), bare)
     axis = anatomy.eyes_m[0] + np.array([0.0, 0.0, anatomy.eye_radius_m])
     offsets = np.array([[0.0, 0, 0], [0.0045, 0, 0], [0.011, 0, 0]])
     pupil, iris, white = paint_eyes((axis + offsets).astype(np.float32), anatomy, outfit)

@@ -5,12 +5,12 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from data_tools.synthetic.person.surface import (
-    face_parts,
-    neighbour_mean,
-    smoothed,
-    split_at_midpoints,
-    way_out_m,
-    with_midpoints,
+    append_midpoint_values,
+    face_components,
+    hull_exit_distance_m,
+    neighbour_averaging_matrix,
+    smooth_laplacian,
+    subdivide_at_midpoints,
 )
 from pipeline.geometry.mesh import Mesh
 from tests.data_tools.synthetic.shapes import TETRAHEDRON, octahedron, sphere
@@ -18,8 +18,8 @@ from tests.data_tools.synthetic.shapes import TETRAHEDRON, octahedron, sphere
 
 def test_midpoint_split_keeps_surface_and_closedness() -> None:
     vertices, faces = octahedron()
-    pairs, finer = split_at_midpoints(faces, len(vertices))
-    mesh = Mesh(with_midpoints(vertices, pairs), finer)
+    pairs, finer = subdivide_at_midpoints(faces, len(vertices))
+    mesh = Mesh(append_midpoint_values(vertices, pairs), finer)
     assert len(pairs) == 12  # one for each edge
     assert len(finer) == 4 * len(faces)
     assert mesh.is_watertight()
@@ -33,27 +33,27 @@ def test_children_of_positions_and_uvs_stay_in_step() -> None:
     to_uv = np.array([[0.3, 0.1], [-0.2, 0.5], [0.4, 0.2]], dtype=np.float32)
     uv = (vertices @ to_uv)[faces].reshape(-1, 2)
     faces_uv = np.arange(12, dtype=np.int32).reshape(4, 3)
-    pairs, finer = split_at_midpoints(faces, len(vertices))
-    uv_pairs, finer_uv = split_at_midpoints(faces_uv, len(uv))
-    corners = with_midpoints(vertices, pairs)[finer]
-    assert np.allclose(with_midpoints(uv, uv_pairs)[finer_uv], corners @ to_uv, atol=1e-6)
+    pairs, finer = subdivide_at_midpoints(faces, len(vertices))
+    uv_pairs, finer_uv = subdivide_at_midpoints(faces_uv, len(uv))
+    corners = append_midpoint_values(vertices, pairs)[finer]
+    assert np.allclose(append_midpoint_values(uv, uv_pairs)[finer_uv], corners @ to_uv, atol=1e-6)
 
 
 def test_neighbour_mean_against_a_loop() -> None:
-    vertices, faces = sphere(1.0, (0.0, 0.0, 0.0), rounds=1)
+    vertices, faces = sphere(1.0, (0.0, 0.0, 0.0), subdivisions=1)
     neighbours: dict[int, set[int]] = {vertex: set() for vertex in range(len(vertices))}
     for a, b, c in faces.tolist():
         neighbours[a] |= {b, c}
         neighbours[b] |= {a, c}
         neighbours[c] |= {a, b}
     slow = np.stack([vertices[sorted(neighbours[v])].mean(axis=0) for v in range(len(vertices))])
-    assert np.allclose(neighbour_mean(faces, len(vertices)) @ vertices, slow, atol=1e-6)
+    assert np.allclose(neighbour_averaging_matrix(faces, len(vertices)) @ vertices, slow, atol=1e-6)
 
 
 def test_a_vertex_without_faces_stays_where_it_is() -> None:
     vertices, faces = TETRAHEDRON
     lonely = np.concatenate([vertices, [[5.0, 6.0, 7.0]]]).astype(np.float32)
-    assert np.allclose(smoothed(lonely, neighbour_mean(faces, 5), 3)[4], [5.0, 6.0, 7.0])
+    assert np.allclose(smooth_laplacian(lonely, neighbour_averaging_matrix(faces, 5), 3)[4], [5.0, 6.0, 7.0])
 
 
 def test_smoothing_calms_a_spike_and_keeps_a_plane() -> None:
@@ -61,11 +61,11 @@ def test_smoothing_calms_a_spike_and_keeps_a_plane() -> None:
     grid = np.stack(np.meshgrid(side, side, [0.0], indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
     cell = (np.arange(6)[:, None] * 7 + np.arange(6)).ravel()
     faces = np.concatenate([np.stack([cell, cell + 7, cell + 8], 1), np.stack([cell, cell + 8, cell + 1], 1)])
-    mean = neighbour_mean(faces.astype(np.int32), len(grid))
-    assert np.allclose(smoothed(grid, mean, 5)[:, 2], 0.0)
+    mean = neighbour_averaging_matrix(faces.astype(np.int32), len(grid))
+    assert np.allclose(smooth_laplacian(grid, mean, 5)[:, 2], 0.0)
     spiked = grid.copy()
     spiked[24, 2] = 1.0
-    calmed = smoothed(spiked, mean, 5)[:, 2]
+    calmed = smooth_laplacian(spiked, mean, 5)[:, 2]
     assert calmed.max() < 0.3
     assert calmed.min() >= 0.0
 
@@ -73,7 +73,7 @@ def test_smoothing_calms_a_spike_and_keeps_a_plane() -> None:
 def test_parts_are_numbered_by_size() -> None:
     vertices, faces = TETRAHEDRON
     both = np.concatenate([faces, octahedron()[1] + len(vertices)])
-    parts = face_parts(both, 10)
+    parts = face_components(both, 10)
     assert parts.tolist() == [1] * 4 + [0] * 8
 
 
@@ -86,7 +86,7 @@ def test_the_way_out_of_a_box(size: int) -> None:
     directions[0] = np.eye(size)[0]  # along four sides of a cube
     for margin in (0.0, 0.25):
         ahead = ((1.0 + margin) * np.sign(directions) - starts) / np.where(directions == 0.0, np.nan, directions)
-        found = way_out_m(starts, directions, ConvexHull(box).equations, margin)
+        found = hull_exit_distance_m(starts, directions, ConvexHull(box).equations, margin)
         np.testing.assert_allclose(found, np.nanmin(ahead, axis=1), rtol=1e-9)
-    middle = way_out_m(np.zeros((1, size)), directions, ConvexHull(box).equations)
+    middle = hull_exit_distance_m(np.zeros((1, size)), directions, ConvexHull(box).equations)
     np.testing.assert_allclose(middle, 1.0 / np.abs(directions).max(axis=1), rtol=1e-9)

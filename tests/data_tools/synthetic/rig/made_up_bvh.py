@@ -6,10 +6,10 @@ import numpy as np
 
 from tests.data_tools.synthetic.rig.made_up_glb import RIG
 
-PLACES = {name: np.array(place) for name, _, place in RIG}
+JOINT_POSITIONS = {name: np.array(place) for name, _, place in RIG}
 
 
-def write_made_up_bvh(path: Path, root_m: np.ndarray, left_arm_deg: np.ndarray, fps: float = 10.0) -> None:
+def write_test_bvh(path: Path, root_m: np.ndarray, left_arm_deg: np.ndarray, fps: float = 10.0) -> None:
     """The T-pose whose hips follow `root_m` (n, 3), the left arm raised by an angle (n) about +Z."""
     lines = ["HIERARCHY", *_joint("Hips", None), "MOTION", f"Frames: {len(root_m)}", f"Frame Time: {1 / fps}"]
     order = [line.split()[1] for line in lines if line.split()[0] in ("ROOT", "JOINT")]
@@ -21,7 +21,7 @@ def write_made_up_bvh(path: Path, root_m: np.ndarray, left_arm_deg: np.ndarray, 
 
 def _joint(name: str, parent: str | None) -> list[str]:
     """The lines of a joint and all below it."""
-    offset = 100.0 * (PLACES[name] - (PLACES[parent] if parent else 0.0))
+    offset = 100.0 * (JOINT_POSITIONS[name] - (JOINT_POSITIONS[parent] if parent else 0.0))
     positions = "" if parent else "Xposition Yposition Zposition "
     lines = [f"{'JOINT' if parent else 'ROOT'} {name}", "{", "OFFSET " + " ".join(map(str, offset))]
     lines.append(f"CHANNELS {3 if parent else 6} {positions}Zrotation Xrotation Yrotation")

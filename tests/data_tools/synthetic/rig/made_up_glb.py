@@ -23,7 +23,7 @@ RIG = [
 ]
 ARMATURE_SCALE = 0.01
 BOX_M = 0.05
-REACH_M = 2.0
+POSITION_RANGE_M = 2.0
 """Positions are stored as fractions of this."""
 
 COLOUR = (30, 120, 210)
@@ -35,11 +35,11 @@ def box_vertices() -> np.ndarray:
     return np.concatenate([np.array(place) + corners for _, _, place in RIG])
 
 
-def write_made_up_glb(path: Path, prefix: str = "", drop: str = "") -> None:
+def write_test_glb(path: Path, prefix: str = "", drop: str = "") -> None:
     """Write the person; `drop` renames that joint, so that it is missing."""
     names = [name for name, _, _ in RIG]
     places = {name: np.array(place) for name, _, place in RIG}
-    stored = np.rint(box_vertices() / REACH_M * 32767).astype("<i2")
+    stored = np.rint(box_vertices() / POSITION_RANGE_M * 32767).astype("<i2")
     padded = np.concatenate([stored, np.zeros((len(stored), 1), "<i2")], axis=1)  # stride 8, as alignment asks
     joints = np.zeros((len(stored), 4), "u1")
     joints[:, 0] = np.repeat(np.arange(len(RIG)), 8)
@@ -51,7 +51,7 @@ def write_made_up_glb(path: Path, prefix: str = "", drop: str = "") -> None:
     faces = (box[None] + 8 * np.arange(len(RIG))[:, None, None]).reshape(-1).astype("<u2")
     bind = np.tile(np.eye(4, dtype="<f4"), (len(RIG), 1, 1))
     for index, name in enumerate(names):
-        bind[index, :3, :3] *= REACH_M / ARMATURE_SCALE
+        bind[index, :3, :3] *= POSITION_RANGE_M / ARMATURE_SCALE
         bind[index, :3, 3] = -places[name] / ARMATURE_SCALE
     picture = cv2.imencode(".png", np.full((4, 4, 3), COLOUR[::-1], np.uint8))[1].tobytes()
     blobs = [padded.tobytes(), joints.tobytes(), weights.tobytes(), uv.tobytes(), faces.tobytes()]
@@ -104,8 +104,8 @@ def _tree(
     }
 
 
-def _write(path: Path, blobs: list[bytes], tree: dict) -> None:
-    text = json.dumps(tree).encode()
+def _write(path: Path, blobs: list[bytes], gltf: dict) -> None:
+    text = json.dumps(gltf).encode()
     text += b" " * (-len(text) % 4)
     binary = b"".join(blob + b"\0" * (-len(blob) % 4) for blob in blobs)
     chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(binary), 0x004E4942) + binary

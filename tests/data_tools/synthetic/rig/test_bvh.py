@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from data_tools.synthetic.rig.bvh import Recording, read_bvh
+from data_tools.synthetic.rig.bvh import BvhMotion, read_bvh
 from pipeline.core.errors import UserError
 
 ARM = """HIERARCHY
@@ -38,38 +38,38 @@ Frame Time: 0.04
 
 
 @pytest.fixture
-def recording(tmp_path: Path) -> Recording:
+def bvh_motion(tmp_path: Path) -> BvhMotion:
     (tmp_path / "arm.bvh").write_text(ARM)
     return read_bvh(tmp_path / "arm.bvh")
 
 
-def test_skeleton(recording: Recording) -> None:
-    assert recording.joint_names == ("Hips", "LeftArm", "LeftHand", "LeftHand_end")
-    assert recording.parents.tolist() == [-1, 0, 1, 2]
-    assert recording.offsets.tolist() == [[0, 1, 0], [2, 0, 0], [0, 3, 0], [0, 0.5, 0]]
-    assert recording.fps == pytest.approx(25.0)
-    assert recording.root_positions.tolist() == [[0, 1, 0], [5, 6, 7]]
+def test_skeleton(bvh_motion: BvhMotion) -> None:
+    assert bvh_motion.joint_names == ("Hips", "LeftArm", "LeftHand", "LeftHand_end")
+    assert bvh_motion.parents.tolist() == [-1, 0, 1, 2]
+    assert bvh_motion.offsets.tolist() == [[0, 1, 0], [2, 0, 0], [0, 3, 0], [0, 0.5, 0]]
+    assert bvh_motion.fps == pytest.approx(25.0)
+    assert bvh_motion.root_positions.tolist() == [[0, 1, 0], [5, 6, 7]]
 
 
-def test_rotations_compose_in_channel_order(recording: Recording) -> None:
+def test_rotations_compose_in_channel_order(bvh_motion: BvhMotion) -> None:
     """Intrinsic Euler angles, as scipy's capital letters mean."""
-    assert np.allclose(recording.rotations[0], np.eye(3))
+    assert np.allclose(bvh_motion.rotations[0], np.eye(3))
     expected = [("ZXY", (10, 20, 30)), ("YXZ", (40, 50, 60)), ("ZXY", (-5, -15, 25))]
     for joint, (order, angles) in enumerate(expected):
         slow = Rotation.from_euler(order, angles, degrees=True).as_matrix()
-        assert np.allclose(recording.rotations[1, joint], slow, atol=1e-12)
+        assert np.allclose(bvh_motion.rotations[1, joint], slow, atol=1e-12)
 
 
-def test_positions_of_the_rest_pose_are_summed_offsets(recording: Recording) -> None:
-    _, positions = recording.poses(recording.rotations[:1])
+def test_positions_of_the_rest_pose_are_summed_offsets(bvh_motion: BvhMotion) -> None:
+    _, positions = bvh_motion.forward_kinematics(bvh_motion.rotations[:1])
     assert np.allclose(positions[0], [[0, 0, 0], [2, 0, 0], [2, 3, 0], [2, 3.5, 0]])
 
 
-def test_bones_keep_their_length_and_turn_with_their_parents(recording: Recording) -> None:
-    world, positions = recording.poses(recording.rotations)
+def test_bones_keep_their_length_and_turn_with_their_parents(bvh_motion: BvhMotion) -> None:
+    world, positions = bvh_motion.forward_kinematics(bvh_motion.rotations)
     lengths = np.linalg.norm(np.diff(positions[1], axis=0), axis=1)
     assert np.allclose(lengths, [2.0, 3.0, 0.5])
-    hips, arm, hand = recording.rotations[1, :3]
+    hips, arm, hand = bvh_motion.rotations[1, :3]
     assert np.allclose(world[1, 2], hips @ arm @ hand)
     assert np.allclose(positions[1, 2] - positions[1, 1], hips @ arm @ [0, 3, 0])
 
@@ -93,7 +93,7 @@ def test_missing_file_is_named(tmp_path: Path) -> None:
     [("cmu1_jumping_jacks", 125, 30.0), ("fair1_zombie", 779, 30.0), ("rokoko_jesse_dance", 1007, 100.0)],
 )
 def test_real_files(name: str, frames: int, fps: float, shared_data: Path) -> None:
-    recording = read_bvh(shared_data / "motions" / f"{name}.bvh")
-    assert len(recording.rotations) == frames
-    assert recording.fps == pytest.approx(fps, rel=1e-3)
-    assert np.allclose(recording.rotations @ recording.rotations.transpose(0, 1, 3, 2), np.eye(3), atol=1e-9)
+    bvh_motion = read_bvh(shared_data / "motions" / f"{name}.bvh")
+    assert len(bvh_motion.rotations) == frames
+    assert bvh_motion.fps == pytest.approx(fps, rel=1e-3)
+    assert np.allclose(bvh_motion.rotations @ bvh_motion.rotations.transpose(0, 1, 3, 2), np.eye(3), atol=1e-9)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from data_tools.synthetic.rig.bvh import Recording, read_bvh
-from data_tools.synthetic.rig.retarget import matched_joints, resampled, retarget
-from data_tools.synthetic.scene.motion import above_rest_m, turn_in_a_pose
+from data_tools.synthetic.rig.bvh import BvhMotion, read_bvh
+from data_tools.synthetic.rig.retarget import match_joints, resample_motion, retarget
+from data_tools.synthetic.scene.motion import lowest_foot_offset_m, turn_in_a_pose
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.core.errors import UserError
 from pipeline.geometry.rotation import quaternion_to_matrix
@@ -18,12 +18,12 @@ GROUND_M = np.array([0.0, -0.9, -3.5])
 LIMBS = (("LeftArm", "LeftForeArm"), ("RightForeArm", "RightHand"), ("LeftUpLeg", "LeftLeg"), ("RightLeg", "RightFoot"))
 
 
-def recorded(body: Body, motion: Motion, fps: float = 24.0) -> Recording:
+def recorded(body: Body, motion: Motion, fps: float = 24.0) -> BvhMotion:
     """A motion of our own body as if a file had held it, in centimetres."""
     offsets = 100.0 * (body.joints_m - body.joints_m[np.maximum(body.parents, 0)]).astype(float)
     rotations = quaternion_to_matrix(torch.from_numpy(motion.rotations_wxyz).double()).numpy()
     positions = 100.0 * motion.root_translation_m.astype(float)
-    return Recording(body.joint_names, body.parents.astype(int), offsets, rotations, positions, fps)
+    return BvhMotion(body.joint_names, body.parents.astype(int), offsets, rotations, positions, fps)
 
 
 def joint_positions(body: Body, motion: Motion) -> np.ndarray:
@@ -60,7 +60,7 @@ def test_the_axes_of_the_file_do_not_matter(bare: Body, turn: Motion) -> None:
     rotations = here.rotations.copy()
     rotations[:, 0] = z_up @ rotations[:, 0]
     there = replace(here, rotations=rotations, root_positions=here.root_positions @ z_up.T)
-    one, other = (retarget(recording, bare, GROUND_M, in_place=False) for recording in (here, there))
+    one, other = (retarget(bvh_motion, bare, GROUND_M, in_place=False) for bvh_motion in (here, there))
     assert np.allclose(joint_positions(bare, one), joint_positions(bare, other), atol=1e-3)
 
 
@@ -69,23 +69,25 @@ def test_other_names_are_understood(bare: Body, turn: Motion) -> None:
     table = {"Arm": "Shoulder", "ForeArm": "Elbow", "Hand": "Wrist", "Shoulder": "Collar"}
     table |= {"UpLeg": "Hip", "Leg": "Knee", "Foot": "Ankle", "ToeBase": "Toe"}
     names = {f"{s}{ours}": f"{s}{theirs}" for s in ("Left", "Right") for ours, theirs in table.items()}
-    recording = recorded(bare, turn)
-    cmu = replace(recording, joint_names=tuple(names.get(name, name) for name in bare.joint_names))
-    source = matched_joints(cmu, bare)
-    assert source["LeftArm"] == bare.joint("LeftArm")
-    assert source["LeftShoulder"] == bare.joint("LeftShoulder")
-    assert source["RightFoot"] == bare.joint("RightFoot")
+    bvh_motion = recorded(bare, turn)
+    cmu = replace(bvh_motion, joint_names=tuple(names.get(name, name) for name in bare.joint_names))
+    recorded_joint_of = match_joints(cmu, bare)
+    assert recorded_joint_of["LeftArm"] == bare.joint("LeftArm")
+    assert recorded_joint_of["LeftShoulder"] == bare.joint("LeftShoulder")
+    assert recorded_joint_of["RightFoot"] == bare.joint("RightFoot")
 
 
 def test_a_missing_limb_is_named(bare: Body, turn: Motion) -> None:
     names = tuple(name.replace("LeftForeArm", "Tail") for name in bare.joint_names)
     with pytest.raises(UserError, match="no joint for LeftForeArm"):
-        matched_joints(replace(recorded(bare, turn), joint_names=names), bare)
+        match_joints(replace(recorded(bare, turn), joint_names=names), bare)
 
 
 def test_in_place_stays_in_place(bare: Body, turn: Motion) -> None:
-    recording = recorded(bare, turn)
-    walking = replace(recording, root_positions=recording.root_positions + np.linspace(0, 300, 24)[:, None] * [0, 0, 1])
+    bvh_motion = recorded(bare, turn)
+    walking = replace(
+        bvh_motion, root_positions=bvh_motion.root_positions + np.linspace(0, 300, 24)[:, None] * [0, 0, 1]
+    )
     root = retarget(walking, bare, GROUND_M, in_place=True).root_translation_m
     assert np.allclose(root[:, [0, 2]], GROUND_M[[0, 2]], atol=1e-5)
     free = retarget(walking, bare, GROUND_M, in_place=False).root_translation_m
@@ -93,29 +95,29 @@ def test_in_place_stays_in_place(bare: Body, turn: Motion) -> None:
 
 
 def test_resampling_takes_the_nearest_pose(turn: Motion) -> None:
-    half = resampled(turn, 0.25, 8, 12.0)
+    half = resample_motion(turn, 0.25, 8, 12.0)
     assert np.array_equal(half.rotations_wxyz, turn.rotations_wxyz[6:22:2])
     assert half.frame_index.tolist() == list(range(8))
     assert np.allclose(half.time_s, np.arange(8) / 12.0)
     with pytest.raises(UserError, match="the motion ends after"):
-        resampled(turn, 0.25, 20, 12.0)
+        resample_motion(turn, 0.25, 20, 12.0)
 
 
 @pytest.mark.parametrize("name", ["cmu1_jumping_jacks", "fair1_zombie", "rokoko_jesse_dance"])
 def test_limbs_point_as_recorded(name: str, bare: Body, shared_data: Path) -> None:
     """Angles between limbs do not depend on any frame: those of the file and of the result agree to a tenth degree."""
-    recording = read_bvh(shared_data / "motions" / f"{name}.bvh")
-    motion = retarget(recording, bare, GROUND_M, in_place=False)
-    source = matched_joints(recording, bare)
-    _, theirs = recording.poses(recording.rotations)
+    bvh_motion = read_bvh(shared_data / "motions" / f"{name}.bvh")
+    motion = retarget(bvh_motion, bare, GROUND_M, in_place=False)
+    recorded_joint_of = match_joints(bvh_motion, bare)
+    _, theirs = bvh_motion.forward_kinematics(bvh_motion.rotations)
     ours = joint_positions(bare, motion)
     for (a, b), (c, d) in zip(LIMBS, LIMBS[1:] + LIMBS[:1], strict=True):
         cosines = [
             (directions(p, at(a), at(b)) * directions(p, at(c), at(d))).sum(axis=1)
-            for p, at in ((ours, bare.joint), (theirs, source.__getitem__))
+            for p, at in ((ours, bare.joint), (theirs, recorded_joint_of.__getitem__))
         ]
         assert np.allclose(*cosines, atol=2e-3)
-    assert above_rest_m(bare, motion).min() > GROUND_M[1] - 1e-4
-    assert np.percentile(above_rest_m(bare, motion), 30) == pytest.approx(GROUND_M[1], abs=1e-3)
+    assert lowest_foot_offset_m(bare, motion).min() > GROUND_M[1] - 1e-4
+    assert np.percentile(lowest_foot_offset_m(bare, motion), 30) == pytest.approx(GROUND_M[1], abs=1e-3)
     first_front = quaternion_to_matrix(torch.from_numpy(motion.rotations_wxyz[:1, 0]))[0, :, 2]
     assert first_front[2] > 0.6

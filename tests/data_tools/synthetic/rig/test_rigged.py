@@ -9,12 +9,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from data_tools.evaluate.truth import check
+from data_tools.evaluate.truth import verify_ground_truth
 from data_tools.from_gltf import main
-from data_tools.synthetic.rig.glb import Glb
-from data_tools.synthetic.rig.rigged import JOINT_NAMES, read_rigged
+from data_tools.synthetic.rig.glb import GlbFile
+from data_tools.synthetic.rig.rigged import JOINT_NAMES, read_rigged_person
 from pipeline.core.errors import UserError
-from tests.data_tools.synthetic.rig.made_up_glb import BOX_M, COLOUR, REACH_M, RIG, box_vertices, write_made_up_glb
+from tests.data_tools.synthetic.rig.made_up_glb import (
+    BOX_M,
+    COLOUR,
+    POSITION_RANGE_M,
+    RIG,
+    box_vertices,
+    write_test_glb,
+)
 
 TINY = ["--frames", "2", "--fps", "2", "--size", "160", "--novel-views", "0", "--novel-poses", "1"]
 
@@ -22,22 +29,22 @@ TINY = ["--frames", "2", "--fps", "2", "--size", "160", "--novel-views", "0", "-
 @pytest.fixture(scope="module", params=["", "mixamorig:"])
 def made_up(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("glb") / "person.glb"
-    write_made_up_glb(path, prefix=request.param)
+    write_test_glb(path, prefix=request.param)
     return path
 
 
 def test_accessors(made_up: Path) -> None:
     """Normalised integers with a stride come out as fractions; the factor tints the picture."""
-    glb = Glb(made_up)
+    glb = GlbFile(made_up)
     primitive = glb.skinned_primitives()[0]
-    assert np.allclose(primitive.positions * REACH_M, box_vertices(), atol=REACH_M / 32767)
+    assert np.allclose(primitive.positions * POSITION_RANGE_M, box_vertices(), atol=POSITION_RANGE_M / 32767)
     assert np.allclose(primitive.weights.sum(axis=1), 1.0)
     assert glb.base_colour(0)[0, 0].tolist() == [COLOUR[0], COLOUR[1] // 2, COLOUR[2]]
 
 
 def test_metres_and_joints(made_up: Path) -> None:
     """Legs and head stay where the T-pose has them, relative to the ground, although the rig is in centimetres."""
-    body = read_rigged(made_up).body
+    body = read_rigged_person(made_up).body
     lowest = min(place[1] for _, _, place in RIG) - BOX_M
     for name, _, place in RIG:
         if name in JOINT_NAMES and "Arm" not in name and "Hand" not in name:
@@ -47,7 +54,7 @@ def test_metres_and_joints(made_up: Path) -> None:
 
 
 def test_parents_come_first_and_surplus_joints_merge(made_up: Path) -> None:
-    body = read_rigged(made_up).body
+    body = read_rigged_person(made_up).body
     assert "HeadEnd" not in body.joint_names
     assert all(parent < joint for joint, parent in enumerate(body.parents))
     names = [name for name, _, _ in RIG]
@@ -59,7 +66,7 @@ def test_parents_come_first_and_surplus_joints_merge(made_up: Path) -> None:
 
 
 def test_arms_are_lowered_and_keep_their_length(made_up: Path) -> None:
-    body = read_rigged(made_up).body
+    body = read_rigged_person(made_up).body
     for side, sign in (("Left", 1.0), ("Right", -1.0)):
         arm, forearm, hand = (body.joints_m[body.joint(f"{side}{part}")] for part in ("Arm", "ForeArm", "Hand"))
         assert np.linalg.norm(forearm - arm) == pytest.approx(0.25, abs=1e-5)
@@ -73,29 +80,29 @@ def test_arms_are_lowered_and_keep_their_length(made_up: Path) -> None:
 
 def test_a_capture_of_it_holds(made_up: Path, tmp_path: Path) -> None:
     main([str(made_up), str(tmp_path / "out"), *TINY])
-    assert check(tmp_path / "out").holds()
+    assert verify_ground_truth(tmp_path / "out").passes()
 
 
 def test_a_rig_without_an_arm_is_refused(tmp_path: Path) -> None:
-    write_made_up_glb(tmp_path / "person.glb", drop="LeftForeArm")
+    write_test_glb(tmp_path / "person.glb", drop="LeftForeArm")
     with pytest.raises(UserError, match="no joint named LeftForeArm"):
-        read_rigged(tmp_path / "person.glb")
+        read_rigged_person(tmp_path / "person.glb")
 
 
 @pytest.mark.parametrize("content", [b"", b"glTF", b"no glTF at all, though long enough to look into"])
 def test_other_files_are_refused(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "person.glb").write_bytes(content)
     with pytest.raises(UserError, match="is no binary glTF 2 file"):
-        read_rigged(tmp_path / "person.glb")
+        read_rigged_person(tmp_path / "person.glb")
 
 
 def changed(path: Path, change: Callable[[dict[str, Any]], object]) -> Path:
     """Change the JSON of a .glb in place."""
     data = path.read_bytes()
     length = struct.unpack_from("<I", data, 12)[0]
-    tree = json.loads(data[20 : 20 + length])
-    change(tree)
-    text = json.dumps(tree).encode()
+    gltf = json.loads(data[20 : 20 + length])
+    change(gltf)
+    text = json.dumps(gltf).encode()
     text += b" " * (-len(text) % 4)
     whole = data[:8] + struct.pack("<I", len(text) + len(data) - length) + struct.pack("<I", len(text)) + data[16:20]
     path.write_bytes(whole + text + data[20 + length :])
@@ -105,38 +112,38 @@ def changed(path: Path, change: Callable[[dict[str, Any]], object]) -> Path:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda tree: tree.update(extensionsRequired=["KHR_draco_mesh_compression"]), "needs KHR_draco_mesh_compr"),
-        (lambda tree: tree["accessors"][0].update(sparse={"count": 1}), "stores values sparsely"),
-        (lambda tree: tree["accessors"][0].pop("bufferView"), "lacks the values 0"),
-        (lambda tree: tree["accessors"][0].update(count=10**6), "lacks the values 0"),
-        (lambda tree: tree["accessors"][4].update(componentType=1), "lacks the values 4"),
-        (lambda tree: tree["meshes"][0]["primitives"][0].update(indices=99), "lacks the values 99"),
-        (lambda tree: tree.pop("nodes"), "no skinned triangles"),
-        (lambda tree: tree["textures"][0].pop("source"), "neither PNG nor JPEG"),
-        (lambda tree: tree["images"][0].pop("bufferView"), "in other files"),
+        (lambda gltf: gltf.update(extensionsRequired=["KHR_draco_mesh_compression"]), "needs KHR_draco_mesh_compr"),
+        (lambda gltf: gltf["accessors"][0].update(sparse={"count": 1}), "stores values sparsely"),
+        (lambda gltf: gltf["accessors"][0].pop("bufferView"), "lacks the values 0"),
+        (lambda gltf: gltf["accessors"][0].update(count=10**6), "lacks the values 0"),
+        (lambda gltf: gltf["accessors"][4].update(componentType=1), "lacks the values 4"),
+        (lambda gltf: gltf["meshes"][0]["primitives"][0].update(indices=99), "lacks the values 99"),
+        (lambda gltf: gltf.pop("nodes"), "no skinned triangles"),
+        (lambda gltf: gltf["textures"][0].pop("source"), "neither PNG nor JPEG"),
+        (lambda gltf: gltf["images"][0].pop("bufferView"), "in other files"),
     ],
 )
 def test_what_cannot_be_read_is_named(change: Callable[[dict[str, Any]], object], words: str, tmp_path: Path) -> None:
-    write_made_up_glb(tmp_path / "person.glb")
-    read_rigged(
-        changed(tmp_path / "person.glb", lambda tree: tree.update(extensionsRequired=["KHR_mesh_quantization"]))
+    write_test_glb(tmp_path / "person.glb")
+    read_rigged_person(
+        changed(tmp_path / "person.glb", lambda gltf: gltf.update(extensionsRequired=["KHR_mesh_quantization"]))
     )
     with pytest.raises(UserError, match=rf"person\.glb .*{words}"):
-        read_rigged(changed(tmp_path / "person.glb", change))
+        read_rigged_person(changed(tmp_path / "person.glb", change))
 
 
 def test_damaged_json_is_named(tmp_path: Path) -> None:
-    write_made_up_glb(tmp_path / "person.glb")
+    write_test_glb(tmp_path / "person.glb")
     whole = (tmp_path / "person.glb").read_bytes()
     for damaged in (whole[:12] + b"\0" * 8 + whole[20:], whole[:40] + b"#" + whole[41:], whole[:200]):
         (tmp_path / "person.glb").write_bytes(damaged)
         with pytest.raises(UserError, match=r"person\.glb is damaged: its JSON"):
-            read_rigged(tmp_path / "person.glb")
+            read_rigged_person(tmp_path / "person.glb")
 
 
 @pytest.mark.parametrize("name", ["Asian_F_1_Casual", "Black_M_1_Casual"])
 def test_real_people_have_human_measures(name: str, shared_data: Path) -> None:
-    subject = read_rigged(shared_data / "subjects" / f"{name}.glb")
+    subject = read_rigged_person(shared_data / "subjects" / f"{name}.glb")
     body = subject.body
     assert set(body.joint_names) == JOINT_NAMES
     assert 1.5 < body.height_m() < 2.0
@@ -156,4 +163,4 @@ def test_a_capture_driven_by_motion_capture_holds(shared_data: Path, tmp_path: P
     person = shared_data / "subjects" / "Black_M_1_Casual.glb"
     motion = shared_data / "motions" / "cmu1_jumping_jacks.bvh"
     main([str(person), str(tmp_path / "out"), *TINY, "--bvh", str(motion), "--in-place", "--fill", "0.6"])
-    assert check(tmp_path / "out").holds()
+    assert verify_ground_truth(tmp_path / "out").passes()

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from data_tools.synthetic.person.noise import Noise
-from data_tools.synthetic.scene.backdrop import WALL_BEHIND_M, Room, foot_shadow, make_room
+from data_tools.synthetic.person.noise import ValueNoise
+from data_tools.synthetic.scene.backdrop import WALL_DISTANCE_M, Room, contact_shadow, make_room
 from pipeline.geometry.camera import Camera, project
 
 CAMERA = Camera(130.0, 130.0, 50.0, 50.0, 100, 100)
@@ -14,14 +14,14 @@ GROUND_M = np.array([0.0, -0.9, -3.0])
 
 @pytest.fixture(scope="module")
 def room() -> Room:
-    return make_room(CAMERA, GROUND_M, True, Noise(0))
+    return make_room(CAMERA, GROUND_M, True, ValueNoise(0))
 
 
 def test_floor_points_project_onto_their_pixels(room: Room) -> None:
     rows, columns = np.nonzero(~np.isnan(room.floor_m[:, :, 0]))
     points = room.floor_m[rows, columns]
     assert np.allclose(points[:, 1], GROUND_M[1], atol=1e-6)
-    assert points[:, 2].min() >= GROUND_M[2] - WALL_BEHIND_M - 1e-6
+    assert points[:, 2].min() >= GROUND_M[2] - WALL_DISTANCE_M - 1e-6
     position_px, depth_m = project(torch.from_numpy(points).float(), CAMERA)
     assert (depth_m > 0).all()
     assert np.allclose(position_px.numpy(), np.stack([columns, rows], axis=1) + 0.5, atol=1e-2)
@@ -29,14 +29,14 @@ def test_floor_points_project_onto_their_pixels(room: Room) -> None:
 
 def test_the_floor_fills_the_lower_part(room: Room) -> None:
     """The corner of wall and floor appears at cy + f h / d."""
-    corner_px = CAMERA.cy + CAMERA.fy * 0.9 / (3.0 + WALL_BEHIND_M)
+    corner_px = CAMERA.cy + CAMERA.fy * 0.9 / (3.0 + WALL_DISTANCE_M)
     is_floor = ~np.isnan(room.floor_m[:, 50, 0])
     assert np.flatnonzero(is_floor)[0] == pytest.approx(corner_px, abs=1.0)
     assert is_floor[int(corner_px) + 2 :].all()
 
 
 def test_shadow_is_darkest_under_the_foot(room: Room) -> None:
-    light = foot_shadow(room, GROUND_M[None])
+    light = contact_shadow(room, GROUND_M[None])
     assert light.min() > 0.5
     assert light.max() == 1.0
     row, column = np.unravel_index(light.argmin(), light.shape)
@@ -45,7 +45,7 @@ def test_shadow_is_darkest_under_the_foot(room: Room) -> None:
 
 
 def test_furniture_stands_on_the_wall_only(room: Room) -> None:
-    plain = make_room(CAMERA, GROUND_M, False, Noise(0))
+    plain = make_room(CAMERA, GROUND_M, False, ValueNoise(0))
     changed = np.abs(plain.image - room.image).max(axis=2) > 1e-6
     assert changed.mean() > 0.05
     assert not changed[~np.isnan(room.floor_m[:, :, 0])].any()

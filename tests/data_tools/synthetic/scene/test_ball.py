@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_tools.evaluate.truth import check, load_truth
+from data_tools.evaluate.truth import load_ground_truth, verify_ground_truth
 from data_tools.sample import main
 from data_tools.synthetic.scene.ball import RADIUS_M, Ball
 from data_tools.synthetic.scene.capture import portrait_camera
@@ -44,9 +44,9 @@ def test_it_stays_before_the_person() -> None:
 def test_a_capture_with_a_ball_and_its_truth(sample: Path, tmp_path: Path) -> None:
     main([str(tmp_path / "ball"), *SAMPLE_OPTIONS, "--ball"])
     assert json.loads((tmp_path / "ball" / "truth" / "recipe.json").read_text())["ball"] is True
-    capture = load_truth(tmp_path / "ball")
-    assert load_truth(sample).ball is None
-    assert check(tmp_path / "ball").holds()
+    capture = load_ground_truth(tmp_path / "ball")
+    assert load_ground_truth(sample).ball is None
+    assert verify_ground_truth(tmp_path / "ball").passes()
     hidden = []
     for frame in range(6):
         mask, whole = (read_gray(out / "truth" / "masks" / f"{frame:06d}.png") for out in (tmp_path / "ball", sample))

@@ -10,29 +10,29 @@ import torch
 from data_tools.command import run_command
 from data_tools.sample import main
 from data_tools.synthetic.rig.subject import Subject
-from data_tools.synthetic.scene.capture import RECIPE_VERSION, novel_cameras, portrait_camera, straight_rgba
-from data_tools.synthetic.scene.movie import write_movie
+from data_tools.synthetic.scene.capture import RECIPE_VERSION, novel_cameras, portrait_camera, unpremultiply_to_uint8
+from data_tools.synthetic.scene.movie import write_video
 from pipeline.body.files import load_camera, load_motion
-from pipeline.capture.video import open_source, read_frames
+from pipeline.capture.video import open_frame_source, read_frames
 from pipeline.geometry.camera import project
 from pipeline.io.image import read_rgba
 from tests.data_tools.conftest import SAMPLE_OPTIONS
 
 
-def bytes_of(folder: Path) -> dict[str, bytes]:
+def read_all_bytes(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
 def test_same_seed_same_bytes(sample: Path, tmp_path: Path) -> None:
     main([str(tmp_path / "again"), *SAMPLE_OPTIONS])
-    first, second = bytes_of(sample), bytes_of(tmp_path / "again")
+    first, second = read_all_bytes(sample), read_all_bytes(tmp_path / "again")
     assert first.keys() == second.keys()
     assert [name for name in first if first[name] != second[name]] == []
 
 
 def test_layout(sample: Path) -> None:
     assert [path.name for path in (sample / "video").iterdir()] == ["video.mp4"]
-    assert open_source(sample / "video").n_frames == 6
+    assert open_frame_source(sample / "video").n_frames == 6
     assert len(list((sample / "truth" / "masks").iterdir())) == 6
     assert len(list((sample / "truth" / "novel_views").glob("*.png"))) == 2
     assert len(load_motion(sample / "truth" / "novel_poses" / "motion.npz").frame_index) == 2
@@ -78,7 +78,7 @@ def test_the_person_fills_the_picture_as_asked() -> None:
 
 def test_straight_colours_undo_premultiplication() -> None:
     person = np.array([[[0.2, 0.1, 0.3, 0.5], [0.0, 0.0, 0.0, 0.0], [0.2, 0.4, 0.6, 1.0]]], dtype=np.float32)
-    assert straight_rgba(person).tolist() == [[[102, 51, 153, 128], [0, 0, 0, 0], [51, 102, 153, 255]]]
+    assert unpremultiply_to_uint8(person).tolist() == [[[102, 51, 153, 128], [0, 0, 0, 0], [51, 102, 153, 255]]]
 
 
 def test_video_keeps_colours(tmp_path: Path) -> None:
@@ -86,22 +86,22 @@ def test_video_keeps_colours(tmp_path: Path) -> None:
     frame = np.zeros((64, 64, 3), dtype=np.uint8)
     frame[:, ::2] = (200, 30, 30)
     frame[:, 1::2] = (30, 60, 190)
-    write_movie(tmp_path / "video.mp4", [frame, frame[::-1].copy()], 24.0)
-    decoded = [f.rgb for f in read_frames(open_source(tmp_path / "video.mp4"), lambda index: True, 64)]
+    write_video(tmp_path / "video.mp4", [frame, frame[::-1].copy()], 24.0)
+    decoded = [f.rgb for f in read_frames(open_frame_source(tmp_path / "video.mp4"), lambda index: True, 64)]
     assert len(decoded) == 2
     assert np.abs(decoded[0].astype(int) - frame).max() <= 3
 
 
 def test_a_video_needs_a_frame(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="at least one frame"):
-        write_movie(tmp_path / "video.mp4", [], 24.0)
+        write_video(tmp_path / "video.mp4", [], 24.0)
 
 
 def test_nothing_is_overwritten(sample: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    before = bytes_of(sample)
+    before = read_all_bytes(sample)
     assert run_command(main, [str(sample)]) == 2
     assert capsys.readouterr().err.startswith(f"error: {sample} exists already")
-    assert bytes_of(sample) == before
+    assert read_all_bytes(sample) == before
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from data_tools.synthetic.scene.motion import NOVEL_POSES, above_rest_m, grounded, novel_motion, turn_in_a_pose
+from data_tools.synthetic.scene.motion import (
+    NOVEL_POSES,
+    lowest_foot_offset_m,
+    novel_motion,
+    snap_feet_to_floor,
+    turn_in_a_pose,
+)
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.geometry.rotation import quaternion_to_matrix
 
@@ -32,7 +38,7 @@ def test_one_full_turn_in_even_steps(turn: Motion) -> None:
 
 
 def test_the_lowest_foot_stands_on_the_ground(bare: Body, turn: Motion) -> None:
-    assert np.allclose(above_rest_m(bare, turn), GROUND_M[1], atol=1e-5)
+    assert np.allclose(lowest_foot_offset_m(bare, turn), GROUND_M[1], atol=1e-5)
 
 
 def test_the_person_stays_on_the_spot(bare: Body, turn: Motion) -> None:
@@ -63,7 +69,7 @@ def test_novel_poses_lie_outside_the_turn(bare: Body, turn: Motion) -> None:
     for pose in novel.rotations_wxyz[:4, 1:]:
         alike = np.abs((pose * turn.rotations_wxyz[:, 1:]).sum(-1)).min(axis=1)
         assert alike.max() < np.cos(np.radians(30.0) / 2)
-    assert np.allclose(above_rest_m(bare, novel), GROUND_M[1], atol=1e-5)
+    assert np.allclose(lowest_foot_offset_m(bare, novel), GROUND_M[1], atol=1e-5)
 
 
 def test_arms_up_are_up(bare: Body) -> None:
@@ -76,7 +82,7 @@ def test_arms_up_are_up(bare: Body) -> None:
 
 def test_grounding_undoes_a_lift(bare: Body, turn: Motion) -> None:
     lifted = turn.with_pose(turn.rotations_wxyz, turn.root_translation_m + [0.0, 0.7, 0.0])
-    back = grounded(bare, lifted, float(GROUND_M[1]))
+    back = snap_feet_to_floor(bare, lifted, float(GROUND_M[1]))
     assert np.allclose(back.root_translation_m, turn.root_translation_m, atol=1e-5)
 
 

@@ -9,14 +9,14 @@ import torch
 
 from data_tools.command import run_command
 from data_tools.evaluate.truth import _main as truth_command
-from data_tools.evaluate.truth import check, load_truth, true_mask
+from data_tools.evaluate.truth import load_ground_truth, load_true_mask, verify_ground_truth
 from data_tools.from_gltf import main
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.files import load_camera, load_motion
 from pipeline.geometry.camera import project
 from pipeline.io.image import read_rgba
-from tests.data_tools.synthetic.rig.made_up_bvh import write_made_up_bvh
-from tests.data_tools.synthetic.rig.made_up_glb import write_made_up_glb
+from tests.data_tools.synthetic.rig.made_up_bvh import write_test_bvh
+from tests.data_tools.synthetic.rig.made_up_glb import write_test_glb
 
 TINY = ["--frames", "2", "--fps", "10", "--size", "160", "--fill", "0.6"]
 HIPS_M = np.array([0.0, 1.0, 0.0])
@@ -24,7 +24,7 @@ HIPS_M = np.array([0.0, 1.0, 0.0])
 
 @pytest.fixture
 def person(tmp_path: Path) -> Path:
-    write_made_up_glb(tmp_path / "person.glb")
+    write_test_glb(tmp_path / "person.glb")
     return tmp_path / "person.glb"
 
 
@@ -39,7 +39,7 @@ def left_arms(body: Body, motion: Motion) -> np.ndarray:
 
 def test_held_out_cameras_look_at_a_walker(person: Path, tmp_path: Path) -> None:
     """In the first frame, which they show, the walker is two metres from the middle of the path."""
-    write_made_up_bvh(tmp_path / "walk.bvh", HIPS_M + np.linspace(0, 4, 21)[:, None] * [1.0, 0.0, 0.0], np.zeros(21))
+    write_test_bvh(tmp_path / "walk.bvh", HIPS_M + np.linspace(0, 4, 21)[:, None] * [1.0, 0.0, 0.0], np.zeros(21))
     main([str(person), str(tmp_path / "out"), *TINY, "--bvh", str(tmp_path / "walk.bvh"), "--novel-views", "3"])
     truth = tmp_path / "out" / "truth"
     assert load_motion(truth / "motion.npz").root_translation_m[0, 0] < -1.5
@@ -54,13 +54,13 @@ def test_held_out_cameras_look_at_a_walker(person: Path, tmp_path: Path) -> None
 
 def test_a_held_out_motion_is_shown_from_its_first_to_its_last_frame(person: Path, tmp_path: Path) -> None:
     """The left arm rises by 80 degrees in 9 frames while the person walks; three of them are asked for."""
-    write_made_up_bvh(
+    write_test_bvh(
         tmp_path / "rise.bvh", HIPS_M + np.linspace(0, 4, 9)[:, None] * [1.0, 0.0, 0.0], np.linspace(-40, 40, 9)
     )
     command = [str(person), str(tmp_path / "out"), *TINY, "--novel-views", "0"]
     main([*command, "--novel-poses", "3", "--novel-bvh", str(tmp_path / "rise.bvh")])
     truth = tmp_path / "out" / "truth"
-    motion, capture = load_motion(truth / "novel_poses" / "motion.npz"), load_truth(tmp_path / "out")
+    motion, capture = load_motion(truth / "novel_poses" / "motion.npz"), load_ground_truth(tmp_path / "out")
     arms = left_arms(capture.subject.body, motion)
     assert np.degrees(np.arccos(arms[0] @ arms[1])) == pytest.approx(40.0, abs=0.5)
     assert np.degrees(np.arccos(arms[0] @ arms[2])) == pytest.approx(80.0, abs=0.5)
@@ -80,16 +80,16 @@ def test_a_given_focal_length_is_kept(person: Path, tmp_path: Path, capsys: pyte
     main([*command, "150"])
     camera = load_camera(tmp_path / "out" / "truth" / "camera.npz")
     assert (camera.fx, camera.fy) == pytest.approx((150.0, 150.0))
-    capture = load_truth(tmp_path / "out")
+    capture = load_ground_truth(tmp_path / "out")
     rows = np.flatnonzero((capture.frame(0)[1] > 127).any(axis=1))
     assert np.ptp(rows) + 1 == pytest.approx(150.0 * capture.subject.body.height_m() / 3.6, abs=5.0)
-    assert check(tmp_path / "out").holds()
+    assert verify_ground_truth(tmp_path / "out").passes()
 
 
 def test_meshes_of_every_frame_span_its_mask(person: Path, tmp_path: Path) -> None:
     """Read back as text and projected, whatever the file's writer thinks of it."""
     main([str(person), str(tmp_path / "out"), *TINY, "--novel-views", "0", "--novel-poses", "0"])
-    capture = load_truth(tmp_path / "out")
+    capture = load_ground_truth(tmp_path / "out")
     assert run_command(truth_command, [str(tmp_path / "out"), "--meshes", str(tmp_path / "meshes")]) == 0
     assert len(list((tmp_path / "meshes").glob("*.obj"))) == 2
     for index in range(2):
@@ -98,6 +98,6 @@ def test_meshes_of_every_frame_span_its_mask(person: Path, tmp_path: Path) -> No
         places = torch.tensor([[float(word) for word in words[1:]] for words in lines if words[0] == "v"])
         assert len([words for words in lines if words[0] == "f"]) == len(capture.subject.body.faces)
         pixels, _ = project(places, capture.camera)
-        rows, columns = np.nonzero(true_mask(tmp_path / "out", index) > 127)
+        rows, columns = np.nonzero(load_true_mask(tmp_path / "out", index) > 127)
         assert np.allclose(pixels.min(0).values, [columns.min(), rows.min()], atol=1.0)
         assert np.allclose(pixels.max(0).values, [columns.max() + 1, rows.max() + 1], atol=1.0)

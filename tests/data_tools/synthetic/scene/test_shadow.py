@@ -8,7 +8,7 @@ import torch
 
 from data_tools.synthetic.rig.subject import Subject
 from data_tools.synthetic.scene.renderer import FLAT, HARD, Light, render_subject, shade
-from data_tools.synthetic.scene.shadow import PIXEL_M, SOFT_PX, cast_shadows, seen_from_outside
+from data_tools.synthetic.scene.shadow import PCF_RADIUS_PX, SHADOW_TEXEL_M, find_exterior_faces, render_shadow_map
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
 from tests.data_tools.synthetic.shapes import sphere
@@ -21,28 +21,28 @@ def test_a_ball_shades_the_ellipse_below_it() -> None:
     """Rays along d through a ball of radius r meet the floor in an ellipse of semi-axes r and r / cos of the slant,
     around the foot point of the ray through the middle."""
     vertices, faces = sphere(BALL_M, (0.0, HEIGHT_M, 0.0))
-    shadows = cast_shadows(torch.from_numpy(vertices), torch.from_numpy(faces), KEY_FROM)
+    shadows = render_shadow_map(torch.from_numpy(vertices), torch.from_numpy(faces), KEY_FROM)
     random = np.random.default_rng(0)
     places = np.zeros((4000, 3), dtype=np.float32)
     places[:, [0, 2]] = random.uniform(-1.0, 1.0, (4000, 2)) - [HEIGHT_M * 0.75, 0.0]
     up = np.tile(np.array([0.0, 1.0, 0.0], dtype=np.float32), (4000, 1))
-    lit = shadows.lit(torch.from_numpy(places), torch.from_numpy(up)).numpy()
+    visibility = shadows.visibility(torch.from_numpy(places), torch.from_numpy(up)).numpy()
     radius = np.hypot((places[:, 0] + HEIGHT_M * 0.75) * 0.8, places[:, 2])
-    soft = 2.0 * PIXEL_M * SOFT_PX + 0.012
-    assert (lit[radius < BALL_M - soft] == 0).all()
-    assert (lit[radius > BALL_M + soft] == 1).all()
+    soft = 2.0 * SHADOW_TEXEL_M * PCF_RADIUS_PX + 0.012
+    assert (visibility[radius < BALL_M - soft] == 0).all()
+    assert (visibility[radius > BALL_M + soft] == 1).all()
     assert (radius < BALL_M - soft).sum() > 100
 
 
 def test_a_ball_shades_its_own_far_half() -> None:
     vertices, faces = sphere(BALL_M, (0.0, HEIGHT_M, 0.0))
     normals = torch.from_numpy((vertices - [0.0, HEIGHT_M, 0.0]) / BALL_M).float()
-    lit = cast_shadows(torch.from_numpy(vertices), torch.from_numpy(faces), KEY_FROM).lit(
+    visibility = render_shadow_map(torch.from_numpy(vertices), torch.from_numpy(faces), KEY_FROM).visibility(
         torch.from_numpy(vertices), normals
     )
     facing = normals @ torch.tensor(KEY_FROM)
-    assert (lit[facing > 0.05] == 1).all()
-    assert (lit[facing < -0.5] == 0).all()
+    assert (visibility[facing > 0.05] == 1).all()
+    assert (visibility[facing < -0.5] == 0).all()
 
 
 def test_the_light_shadows_only_when_asked(subject: Subject) -> None:
@@ -50,7 +50,7 @@ def test_the_light_shadows_only_when_asked(subject: Subject) -> None:
     camera = Camera(200.0, 200.0, 64.0, 64.0, 128, 128, np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32))
     camera.world_to_camera[:3, 3] = [0.0, 0.9, 3.4]
     vertices = torch.from_numpy(subject.body.vertices)
-    light = replace(HARD, key_from=(1.0, 0.3, 0.3))
+    light = replace(HARD, key_direction=(1.0, 0.3, 0.3))
     hard = render_subject(subject, vertices, camera, light, 1)
     open_ = render_subject(subject, vertices, camera, replace(light, casts_shadows=False), 1)
     assert np.array_equal(hard[..., 3], open_[..., 3])
@@ -61,7 +61,7 @@ def test_the_light_shadows_only_when_asked(subject: Subject) -> None:
 
 def test_hidden_places_get_the_ambient_light_alone() -> None:
     grey, up = torch.full((2, 3), 0.5), torch.tensor([[0.0, 0.0, 1.0]] * 2)
-    light = Light(key=0.5, key_from=(0.0, 0.0, 1.0), ambient=0.7, sky=0.0, shine=0.4)
+    light = Light(key=0.5, key_direction=(0.0, 0.0, 1.0), ambient=0.7, sky_gradient=0.0, specular_strength=0.4)
     shaded = shade(grey, up, up, torch.tensor([1.0, 0.0]), light)
     ambient = shade(grey[:1], up[:1], up[:1], torch.ones(1), replace(FLAT, ambient=0.7))
     assert torch.allclose(shaded[1], ambient[0])
@@ -72,11 +72,11 @@ def test_what_lies_inside_is_not_seen() -> None:
     """A ball within a ball is hidden, all of the outer one is seen; through a hole above the upper side is seen."""
     (outer, faces), (inner, _) = (sphere(radius_m, (0.0, 1.0, 0.0)) for radius_m in (0.4, 0.2))
     both = np.concatenate([faces, faces + len(outer)])
-    seen = seen_from_outside(Mesh(np.concatenate([outer, inner]), both))
+    seen = find_exterior_faces(Mesh(np.concatenate([outer, inner]), both))
     assert seen[: len(faces)].all()
     assert not seen[len(faces) :].any()
     open_above = faces[(outer[faces][:, :, 1] < 1.25).all(axis=1)]
-    holed = seen_from_outside(Mesh(np.concatenate([outer, inner]), np.concatenate([open_above, faces + len(outer)])))
+    holed = find_exterior_faces(Mesh(np.concatenate([outer, inner]), np.concatenate([open_above, faces + len(outer)])))
     height_m = inner[faces].mean(axis=1)[:, 1]
     assert holed[len(open_above) :][height_m > 1.15].all()
     assert not holed[len(open_above) :][height_m < 0.85].any()
