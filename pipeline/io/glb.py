@@ -1,0 +1,197 @@
+"""Read binary glTF 2.0 files (.glb) into plain arrays: accessors, node transforms, skinned triangles, embedded images.
+
+trimesh reads the positions, UV and triangles of a .glb, but neither joint indices, joint weights, inverse bind matrices
+nor animations, and it gives no public access to accessors. Skinned files are therefore read here.
+
+Reference: https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html, chapters 3.6 (accessors), 3.7.3 (skins) and
+4.4 (container).
+"""
+
+import json
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from pipeline.core.errors import UserError
+
+_COMPONENT_DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_N_COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+_SUPPORTED_EXTENSIONS = {"KHR_mesh_quantization", "KHR_materials_unlit"}
+_JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
+_TRIANGLES = 4
+_UNTEXTURED_SIDE_PX = 8
+
+
+@dataclass(frozen=True)
+class Primitive:
+    """One skinned triangle list as stored in the file.
+
+    Attributes:
+        positions: in the space of the file's inverse bind matrices.
+        uv: origin top-left, as in glTF; zeros if the file has none.
+        joints: indices into the joint list of `skin`.
+        weights: one row per vertex; rows sum to 1.
+        faces: vertex indices.
+        skin: index into the file's skins.
+        material: index into the file's materials; -1 if the primitive has none.
+    """
+
+    positions: Float[np.ndarray, "v 3"]
+    uv: Float[np.ndarray, "v 2"]
+    joints: Int[np.ndarray, "v 4"]
+    weights: Float[np.ndarray, "v 4"]
+    faces: Int[np.ndarray, "f 3"]
+    skin: int
+    material: int
+
+
+class GlbFile:
+    """A .glb file in memory: `gltf` is its JSON tree; methods read arrays and images from its binary chunk."""
+
+    def __init__(self, path: Path) -> None:
+        """Read the file.
+
+        Raises:
+            UserError: the file is not binary glTF 2, is damaged, or requires an unsupported extension.
+        """
+        self.path = path
+        data = path.read_bytes() if path.is_file() else b""
+        if len(data) < 20 or data[:4] != b"glTF" or struct.unpack_from("<I", data, 4)[0] != 2:
+            raise UserError(f"{path} is no binary glTF 2 file; supply a .glb")
+        chunks, offset = {}, 12
+        while offset + 8 <= len(data):
+            length, kind = struct.unpack_from("<II", data, offset)
+            chunks[kind] = data[offset + 8 : offset + 8 + length]
+            offset += 8 + length
+        try:
+            self.gltf: dict[str, Any] = json.loads(chunks[_JSON_CHUNK])
+            unsupported = set(self.gltf.get("extensionsRequired", ())) - _SUPPORTED_EXTENSIONS
+        except (KeyError, ValueError, AttributeError):
+            raise UserError(f"{path} is damaged: its JSON cannot be read; export it again") from None
+        if unsupported:
+            raise UserError(
+                f"{path} requires the extension {', '.join(sorted(unsupported))}; export it again without compression"
+            )
+        self._binary = chunks.get(_BINARY_CHUNK, b"")
+
+    def accessor(self, index: int) -> np.ndarray:
+        """Return the values of an accessor, shape (count, components).
+
+        Floats are float32, integers int64. Normalised integers become float32 in [-1, 1] or [0, 1].
+
+        Raises:
+            UserError: the accessor is sparse, or the file does not hold its values.
+        """
+        try:
+            accessor = self.gltf["accessors"][index]
+            if "sparse" in accessor:
+                raise UserError(f"{self.path}: accessor {index} is sparse; export the file without sparse accessors")
+            view = self.gltf["bufferViews"][accessor["bufferView"]]
+            kind, width = np.dtype(_COMPONENT_DTYPES[accessor["componentType"]]), _N_COMPONENTS[accessor["type"]]
+            start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+            stride = view.get("byteStride", kind.itemsize * width)
+            shape, strides = (accessor["count"], width), (stride, kind.itemsize)
+            values: np.ndarray = np.ndarray(shape, kind, self._binary, start, strides)
+        except (LookupError, TypeError, ValueError):
+            raise UserError(
+                f"{self.path} is damaged: the values of accessor {index} are missing; export it again"
+            ) from None
+        if accessor.get("normalized"):
+            return np.maximum(values.astype(np.float32) / np.iinfo(kind).max, -1.0)
+        return values.astype(np.float32 if kind.kind == "f" else np.int64)
+
+    def image_bytes(self, index: int) -> bytes:
+        """Return the encoded file (PNG or JPEG) of an embedded image. UserError if the image is an external file."""
+        image = self.gltf["images"][index]
+        if "bufferView" not in image:
+            raise UserError(f"{self.path}: image {index} is an external file; export the .glb with embedded images")
+        view = self.gltf["bufferViews"][image["bufferView"]]
+        start = view.get("byteOffset", 0)
+        return self._binary[start : start + view["byteLength"]]
+
+    def node_to_world(self) -> Float[np.ndarray, "n 4 4"]:
+        """Return the rest-pose matrix of every node."""
+        nodes = self.gltf["nodes"]
+        world = np.tile(np.eye(4), (len(nodes), 1, 1))
+        is_child = {child for node in nodes for child in node.get("children", ())}
+        pending = [(index, np.eye(4)) for index in range(len(nodes)) if index not in is_child]
+        while pending:
+            index, parent_to_world = pending.pop()
+            world[index] = parent_to_world @ _local_matrix(nodes[index])
+            pending += [(child, world[index]) for child in nodes[index].get("children", ())]
+        return world
+
+    def skinned_primitives(self) -> list[Primitive]:
+        """Return all triangle lists of nodes with a skin. UserError if there are none."""
+        found = [
+            self._primitive(primitive, node["skin"])
+            for node in self.gltf.get("nodes", ())
+            if "mesh" in node and "skin" in node
+            for primitive in self.gltf["meshes"][node["mesh"]]["primitives"]
+            if primitive.get("mode", _TRIANGLES) == _TRIANGLES and "JOINTS_0" in primitive["attributes"]
+        ]
+        if not found:
+            raise UserError(f"{self.path} holds no skinned triangles; export the character with its armature")
+        return found
+
+    def base_colour(self, material: int) -> UInt8[np.ndarray, "h w 3"]:
+        """Return the base colour texture of a material times its factor; 8 x 8 texels if it has no texture.
+
+        material: index; -1 means no material (white).
+
+        Raises:
+            UserError: the image is an external file, or neither PNG nor JPEG.
+        """
+        surface = self.gltf["materials"][material].get("pbrMetallicRoughness", {}) if material >= 0 else {}
+        factor = np.asarray(surface.get("baseColorFactor", [1.0] * 4)[:3])
+        if "baseColorTexture" not in surface:
+            return np.tile(np.rint(255 * factor).astype(np.uint8), (_UNTEXTURED_SIDE_PX, _UNTEXTURED_SIDE_PX, 1))
+        texture = self.gltf["textures"][surface["baseColorTexture"]["index"]]
+        if "source" not in texture:
+            raise UserError(f"{self.path} holds an image that is neither PNG nor JPEG; export it as PNG or JPEG")
+        return np.rint(self._decode_image(texture["source"]) * factor).astype(np.uint8)
+
+    def _primitive(self, primitive: dict[str, Any], skin: int) -> Primitive:
+        names = primitive["attributes"]
+        positions = self.accessor(names["POSITION"]).astype(np.float32)
+        indices = self.accessor(primitive["indices"]) if "indices" in primitive else np.arange(len(positions))
+        weights = self.accessor(names["WEIGHTS_0"])
+        uv = self.accessor(names["TEXCOORD_0"]) if "TEXCOORD_0" in names else np.zeros((len(positions), 2), np.float32)
+        return Primitive(
+            positions,
+            uv,
+            self.accessor(names["JOINTS_0"]),
+            weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-9),
+            indices.reshape(-1, 3).astype(np.int32),
+            skin,
+            primitive.get("material", -1),
+        )
+
+    def _decode_image(self, index: int) -> UInt8[np.ndarray, "h w 3"]:
+        pixels = cv2.imdecode(np.frombuffer(self.image_bytes(index), np.uint8), cv2.IMREAD_COLOR)
+        if pixels is None:
+            raise UserError(f"{self.path}: image {index} cannot be decoded; export it as PNG or JPEG")
+        return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
+
+
+def _local_matrix(node: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
+    """Return a node's local matrix, from `matrix` (column-major) or translation, rotation (xyzw) and scale."""
+    if "matrix" in node:
+        return np.array(node["matrix"], dtype=float).reshape(4, 4).T
+    x, y, z, w = node.get("rotation", (0.0, 0.0, 0.0, 1.0))
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation * np.asarray(node.get("scale", (1.0, 1.0, 1.0)))
+    matrix[:3, 3] = node.get("translation", (0.0, 0.0, 0.0))
+    return matrix
