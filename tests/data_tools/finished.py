@@ -10,7 +10,7 @@ import torch
 from data_tools.evaluate.compare_avatar import Comparison
 from data_tools.evaluate.files import TRUTH_VERSION
 from data_tools.evaluate.truth import load_ground_truth
-from data_tools.synthetic.scene.capture import Capture as Recording
+from data_tools.synthetic.scene.capture import SyntheticCapture
 from pipeline.avatar.finished_run import FinishedRun
 from pipeline.avatar.textured_avatar import TexturedAvatar, unpremultiply_to_uint8
 from pipeline.body.body import Motion, canonical_to_world
@@ -66,7 +66,7 @@ def with_frames(comparison: Comparison, folder: Path, change: Callable[[np.ndarr
     return replace(comparison, run=replace(comparison.run, capture=capture, camera=camera))
 
 
-def _write_frames(truth: Recording, folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> int:
+def _write_frames(truth: SyntheticCapture, folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> int:
     """Straight colours, so that nothing of the room is in the pixels along the outline; returns the side in pixels."""
     for path in (image_path(folder, 0), mask_path(folder, 0)):
         path.parent.mkdir(parents=True)

@@ -30,7 +30,7 @@ class Outfit:
     stripe: Colour
     trousers: Colour
     skirt: Colour
-    check: Colour
+    plaid: Colour
     shoes: Colour
     hair: Colour
     iris: Colour
@@ -60,7 +60,7 @@ def choose_outfit(seed: int, legwear: str = "trousers") -> Outfit:
     """The wardrobe's entry for a seed; seed 0 is the first of everything. legwear: one of `LEGWEAR`."""
     choice_indices = np.random.default_rng(seed).integers(0, 1_000_000, 6) if seed else np.zeros(6, dtype=np.int64)
     shirt, stripe = _SHIRTS[choice_indices[0] % len(_SHIRTS)]
-    skirt, check = _SKIRTS[choice_indices[1] % len(_SKIRTS)]
+    skirt, plaid = _SKIRTS[choice_indices[1] % len(_SKIRTS)]
     return Outfit(
         legwear=legwear,
         sleeve_fraction=0.66,
@@ -69,7 +69,7 @@ def choose_outfit(seed: int, legwear: str = "trousers") -> Outfit:
         stripe=stripe,
         trousers=_TROUSERS[choice_indices[1] % len(_TROUSERS)],
         skirt=skirt,
-        check=check,
+        plaid=plaid,
         shoes=_SHOES[choice_indices[2] % len(_SHOES)],
         hair=_HAIR[choice_indices[3] % len(_HAIR)],
         iris=_IRIS[choice_indices[4] % len(_IRIS)],

@@ -189,7 +189,7 @@ def _paint_skirt(points: np.ndarray, anatomy: Anatomy, outfit: Outfit, noise: Va
     colours = _shaded(outfit.skirt, 1.0 + weave)
     around, down = np.mod(above_hem + 0.02, 0.11) < 0.035, np.mod(angle / (2.0 * np.pi) * 16.0, 1.0) < 0.3
     on_thin_line = (np.abs(np.mod(above_hem, 0.11) - 0.062) < 0.003) | (np.abs(above_hem - 0.012) < 0.004)
-    ink = _shaded(outfit.check, 1.0 + weave)
+    ink = _shaded(outfit.plaid, 1.0 + weave)
     share = 0.45 * around + 0.30 * down + 0.5 * on_thin_line
     return colours + np.minimum(share, 0.9)[:, None] * (ink - colours)
 

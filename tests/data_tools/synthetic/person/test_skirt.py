@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_tools.evaluate.truth import check
+from data_tools.evaluate.truth import verify_ground_truth
 from data_tools.sample import main as make_sample
 from data_tools.synthetic.person.anatomy import measure_anatomy
 from data_tools.synthetic.person.outfit import LAYERS, choose_outfit, compute_layer_depths_m
@@ -102,10 +102,10 @@ def test_legs_beneath_are_bare(person: Subject, bare: Body) -> None:
     shin = surface_at(person, knee[0], knee[1] - 0.1, is_front=True)
     assert np.allclose(colour_near(person, shin), outfit.skin, atol=0.12)
     cloth = colour_near(person, surface_at(person, knee[0], knee[1] + 0.2, is_front=True), 0.03)
-    low, high = np.minimum(outfit.skirt, outfit.check), np.maximum(outfit.skirt, outfit.check)
+    low, high = np.minimum(outfit.skirt, outfit.plaid), np.maximum(outfit.skirt, outfit.plaid)
     assert ((low - 0.1 < cloth) & (cloth < high + 0.1)).all()
 
 
 def test_the_truth_with_a_skirt_explains_the_video(capture: Path) -> None:
-    assert check(capture).passes()
+    assert verify_ground_truth(capture).passes()
     assert json.loads((capture / "truth" / "recipe.json").read_text())["legwear"] == "skirt"
