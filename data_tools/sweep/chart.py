@@ -37,6 +37,7 @@ from data_tools.sweep.chart_trials import (
 )
 from data_tools.sweep.runs import CONFIGS, RunState, log_path, validate_run_options, write_csv
 from data_tools.synthetic.scene.capture import RECIPE_VERSION
+from pipeline.core.config import preset_files
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track
 
@@ -171,7 +172,7 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m data_tools.sweep.chart", description=(__doc__ or "").splitlines()[0]
     )
-    presets = sorted(path.stem for path in CONFIGS.glob("*.yaml") if path.stem != TEST_PRESET)
+    presets = [name for name in preset_files(CONFIGS) if name != TEST_PRESET]
     parser.add_argument("captures", nargs="*", type=Path, help="captures, videos or image folders; two people if none")
     parser.add_argument("--presets", nargs="+", default=presets, help="names in configs/ or .yaml files; all if none")
     parser.add_argument("--steps", nargs="+", default=[], help="PRESET=N: so many training steps of its field instead")

@@ -7,7 +7,7 @@ Every value remembers the layer it came from, so that an error can name the plac
 import difflib
 import textwrap
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,6 +18,8 @@ from pydantic.fields import FieldInfo
 from pipeline.core.errors import UserError
 
 CONFIG_DIR = Path(__file__).resolve().parents[2] / "configs"
+BASELINE_PRESETS = Path("data_tools", "baselines")
+"""Folder of the presets that reproduce published methods, relative to the parent folder of the product's presets."""
 TYPE_DESCRIPTIONS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
 YAML_WIDTH = 10_000
 YAML_SCALAR_END = "...\n"
@@ -73,12 +75,18 @@ def load_layers(preset: str, overrides: Mapping[str, Any], config_dir: Path = CO
     return layers
 
 
+def preset_files(config_dir: Path = CONFIG_DIR) -> dict[str, Path]:
+    """Return the file of every preset by name, sorted: those of `config_dir`, then those of published baselines."""
+    folders = (config_dir, config_dir.parent / BASELINE_PRESETS)
+    return {path.stem: path for folder in folders for path in sorted(folder.glob("*.yaml"))}
+
+
 def find_preset(preset: str, config_dir: Path = CONFIG_DIR) -> Path:
     """Return the file of a preset given by name or by path; raise UserError that lists the known names."""
-    path = Path(preset) if preset.endswith(PRESET_SUFFIXES) else config_dir / f"{preset}.yaml"
+    files = preset_files(config_dir)
+    path = Path(preset) if preset.endswith(PRESET_SUFFIXES) else files.get(preset, config_dir / f"{preset}.yaml")
     if not path.is_file() and preset != "default":
-        known = ", ".join(sorted(p.stem for p in config_dir.glob("*.yaml")))
-        raise UserError(f"preset {preset} is not known: use one of {known}, or the path of a .yaml file")
+        raise UserError(f"preset {preset} is not known: use one of {', '.join(files)}, or the path of a .yaml file")
     return path
 
 
@@ -119,6 +127,8 @@ def default_yaml(sections: Mapping[str, type[Config]]) -> str:
         lines += ["", f"{section}:" if config_type.model_fields else f"{section}: {{}}"]
         defaults = config_type().model_dump(mode="json")
         for key, info in config_type.model_fields.items():
+            if is_dataclass(info.annotation):  # settings without options of their own: only presets change them
+                continue
             value = yaml.safe_dump(defaults[key], default_flow_style=True, sort_keys=False, width=YAML_WIDTH)
             lines += textwrap.wrap(info.description or "", 116, initial_indent="  # ", subsequent_indent="  # ")
             lines += [f"  {key}: {value.removesuffix(YAML_SCALAR_END).rstrip()}"]

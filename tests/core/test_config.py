@@ -17,6 +17,7 @@ from pipeline.core.config import (
     default_yaml,
     load_layers,
     parse_overrides,
+    preset_files,
 )
 from pipeline.core.errors import UserError
 
@@ -42,9 +43,11 @@ class Options(Config):
 
 @pytest.fixture
 def config_dir(tmp_path: Path) -> Path:
-    (tmp_path / "default.yaml").write_text("mesh:\n  size: 100\n  name: base\n")
-    (tmp_path / "fine.yaml").write_text("mesh:\n  size: 200\n  inner: {rate: 1e-2}\n")
-    return tmp_path
+    folder = tmp_path / "configs"
+    folder.mkdir()
+    (folder / "default.yaml").write_text("mesh:\n  size: 100\n  name: base\n")
+    (folder / "fine.yaml").write_text("mesh:\n  size: 200\n  inner: {rate: 1e-2}\n")
+    return folder
 
 
 def built(config_dir: Path, preset: str = "default", *assignments: str) -> Options:
@@ -118,6 +121,14 @@ def test_a_broken_assignment_is_named(assignment: str) -> None:
 def test_an_unknown_preset_lists_the_known(config_dir: Path) -> None:
     with pytest.raises(UserError, match="default, fine"):
         load_layers("fien", {}, config_dir)
+
+
+def test_a_preset_may_be_a_baseline(config_dir: Path) -> None:
+    folder = config_dir.parent / "data_tools" / "baselines"
+    folder.mkdir(parents=True)
+    (folder / "paper.yaml").write_text("mesh:\n  size: 50\n")
+    assert built(config_dir, "paper").size == 50
+    assert list(preset_files(config_dir)) == ["default", "fine", "paper"]
 
 
 def test_a_preset_may_be_a_path(config_dir: Path) -> None:

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.core.config import CONFIG_DIR, default_yaml
+from pipeline.core.config import CONFIG_DIR, default_yaml, preset_files
 from pipeline.core.record import RunRecord
 from pipeline.core.runner import build_configs
 from stages import STAGES, load
 
-PRESETS = sorted(path.stem for path in CONFIG_DIR.glob("*.yaml"))
+PRESETS = list(preset_files())
 
 
 def test_the_presets_are_there() -> None:
