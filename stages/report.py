@@ -165,16 +165,19 @@ def score(
     blur_px = additional_blur_sigma_px(spread_px)
 
     def draw_sharp(pose: Float[Tensor, "j 4 4"]) -> Float[np.ndarray, "h w 4"]:
-        return loaded.avatar.render(loaded.avatar.posed(pose), loaded.camera, config.samples_per_pixel_side)
+        return loaded.avatar.render(loaded.avatar.pose_vertices(pose), loaded.camera, config.samples_per_pixel_side)
 
     def draw_mesh(pose: Float[Tensor, "j 4 4"]) -> Float[np.ndarray, "h w 4"]:
         return blur_coverage(draw_sharp(pose), blur_px)
 
-    renderers = {"field": (loaded.field_renderer, loaded.refined), "mesh_sharp": (draw_sharp, loaded.refined)}
+    renderers = {
+        "field": (loaded.field_renderer, loaded.refined_canonical_to_world),
+        "mesh_sharp": (draw_sharp, loaded.refined_canonical_to_world),
+    }
     if config.score_unrefined_mesh:
-        renderers["mesh_unrefined"] = (draw_mesh, loaded.fitted)
+        renderers["mesh_unrefined"] = (draw_mesh, loaded.fitted_canonical_to_world)
     if config.score_unrefined_field:
-        renderers["field_unrefined"] = (loaded.field_renderer, loaded.fitted)
+        renderers["field_unrefined"] = (loaded.field_renderer, loaded.fitted_canonical_to_world)
     if config.fit_held_out_poses:
         poses_fitted = fit_heldout_poses(loaded, positions, config.pose_fit_steps)
         renderers |= {
@@ -205,13 +208,15 @@ def fit_heldout_poses(loaded: FinishedRun, positions: np.ndarray, steps: int) ->
             loaded.capture.image(position),
             loaded.capture.mask(position),
             loaded.camera,
-            loaded.refined[position],
+            loaded.refined_canonical_to_world[position],
             MAX_PERSON_PX,
         )
         for position in positions.tolist()
     ]
     motion = fit_poses(loaded.avatar, loaded.body, loaded.motion.select(positions), turntable_views, steps)
-    return loaded.refined.index_copy(0, torch.from_numpy(positions), canonical_to_world(loaded.body, motion))
+    return loaded.refined_canonical_to_world.index_copy(
+        0, torch.from_numpy(positions), canonical_to_world(loaded.body, motion)
+    )
 
 
 def draw_turntable(
@@ -221,12 +226,14 @@ def draw_turntable(
     index = int(loaded.capture.frame_index[position])
     bodies = {
         "A-pose": loaded.avatar.vertices,
-        f"As in frame {index}, a held-out one": loaded.avatar.posed(loaded.refined[position]),
+        f"As in frame {index}, a held-out one": loaded.avatar.pose_vertices(
+            loaded.refined_canonical_to_world[position]
+        ),
     }
     return [
         (
             title,
-            loaded.avatar.turntable(
+            loaded.avatar.render_turntable(
                 vertices, config.turntable_views, config.turntable_height_px, config.samples_per_pixel_side
             ),
         )

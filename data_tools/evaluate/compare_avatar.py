@@ -101,7 +101,7 @@ class Comparison:
 
     def avatar_surface(self, pose: Float[Tensor, "j 4 4"]) -> Mesh:
         """The avatar in one pose, without what its A-pose hides inside."""
-        return Mesh(self.run.avatar.posed(pose).numpy(), self._avatar_faces)
+        return Mesh(self.run.avatar.pose_vertices(pose).numpy(), self._avatar_faces)
 
 
 def load_comparison(out: Path, run: Path) -> Comparison:
@@ -125,7 +125,7 @@ def compare_heldout_surfaces(comparison: Comparison) -> dict[str, float]:
     frames = comparison.run.capture.frame_index[positions]
     rows = []
     for position, frame in zip(positions, frames, strict=True):
-        avatar = comparison.avatar_surface(comparison.run.refined[position])
+        avatar = comparison.avatar_surface(comparison.run.refined_canonical_to_world[position])
         true = comparison.true_surface(comparison.truth.canonical_to_world[frame])
         rows.append(_aligned_scores(avatar, true, align_surfaces_icp(avatar, true)))
     return mean_scores(rows)
@@ -208,12 +208,12 @@ def compare_heldout_images(comparison: Comparison) -> dict[str, dict[str, float]
     for position, upper_bound_rgba in zip(positions.tolist(), render_upper_bound(comparison, positions), strict=True):
         image, mask = (to_uint8(part(position)) for part in (run.capture.image, run.capture.mask))
         rows["upper_bound"].append(frame_scores(blur_coverage(upper_bound_rgba, blur_px), image, mask))
-        pose, person_mask = run.refined[position], _true_mask(comparison, position)
+        pose, person_mask = run.refined_canonical_to_world[position], _true_mask(comparison, position)
         if (reason := reason_not_scorable(person_mask)) is not None:
             frame = run.capture.frame_index[position]
             warn(f"held-out frame {frame} is not compared within the true mask of {comparison.folder}: {reason}")
             continue
-        mesh = run.avatar.render(run.avatar.posed(pose), run.camera, SAMPLES_PER_AXIS)
+        mesh = run.avatar.render(run.avatar.pose_vertices(pose), run.camera, SAMPLES_PER_AXIS)
         for name, drawn in {"field": run.field_renderer(pose), "mesh": mesh, "upper_bound": upper_bound_rgba}.items():
             rows[f"{name}_true_mask"].append(frame_scores(drawn, image, person_mask))
     if "mesh_true_mask" not in rows:
@@ -234,7 +234,7 @@ def render_upper_bound(comparison: Comparison, positions: Int[np.ndarray, "k"]) 
     joint = _fitted_joint_of(subject.body, run.body)
     camera = replace(run.camera, world_to_camera=comparison.truth.camera.world_to_camera)
     for position in track(positions.tolist(), "held-out frames"):
-        posed = pose_vertices(unposed_subject, run.refined[position, joint])
+        posed = pose_vertices(unposed_subject, run.refined_canonical_to_world[position, joint])
         vertices = _map_between_worlds(posed, run.camera, comparison.truth.camera)
         yield render_subject(unposed_subject, vertices, camera, comparison.truth.light, comparison.truth.samples)
 
@@ -259,7 +259,7 @@ def unpose_true_vertices(comparison: Comparison) -> Float[np.ndarray, "v 3"]:
         true_to_fitted, positions.tolist(), canonical_to_world(body, motion), strict=True
     ):
         there = pose_vertices(truth.subject, (matrix @ pose.double()).float())
-        blended = torch.einsum("vj,jab->vab", weights, run.refined[position, joint])
+        blended = torch.einsum("vj,jab->vab", weights, run.refined_canonical_to_world[position, joint])
         view_cosine = _view_cosine(there, body.faces, run.camera)[:, None, None]
         linear = view_cosine * (blended[:, :3, :3].mT @ seen)
         normal_matrix += linear @ blended[:, :3, :3]

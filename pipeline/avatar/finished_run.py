@@ -38,8 +38,8 @@ class FinishedRun:
     motion: Motion
     avatar: TexturedAvatar
     field_renderer: PoseRenderer
-    refined: Float[Tensor, "n j 4 4"]
-    fitted: Float[Tensor, "n j 4 4"]
+    refined_canonical_to_world: Float[Tensor, "n j 4 4"]
+    fitted_canonical_to_world: Float[Tensor, "n j 4 4"]
 
 
 def load_finished_run(inputs: Mapping[str, Path]) -> FinishedRun:
@@ -54,8 +54,8 @@ def load_finished_run(inputs: Mapping[str, Path]) -> FinishedRun:
         motion=motion,
         avatar=load_textured_avatar(inputs["mesh"], inputs["texture"]),
         field_renderer=_make_field_renderer(inputs["field"], body, camera),
-        refined=canonical_to_world(body, motion),
-        fitted=canonical_to_world(body, load_motion(inputs["body"] / "motion.npz")),
+        refined_canonical_to_world=canonical_to_world(body, motion),
+        fitted_canonical_to_world=canonical_to_world(body, load_motion(inputs["body"] / "motion.npz")),
     )
 
 

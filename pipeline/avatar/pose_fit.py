@@ -83,7 +83,7 @@ class _AvatarRenderer:
         self, canonical_to_world: Float[Tensor, "j 4 4"], view: PosedView
     ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
         """Premultiplied colours and alpha, differentiable in the pose."""
-        corners = self._avatar.posed(canonical_to_world)[self._vertex_of_uv]
+        corners = self._avatar.pose_vertices(canonical_to_world)[self._vertex_of_uv]
         avatar = self._avatar
         image, alpha, _ = render_shaded(
             corners,

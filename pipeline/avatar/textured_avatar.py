@@ -32,7 +32,7 @@ class TexturedAvatar:
         """The surface alone."""
         return Mesh(self.vertices.numpy(), self.faces.numpy())
 
-    def posed(self, canonical_to_world: Float[Tensor, "j 4 4"]) -> Float[Tensor, "v 3"]:
+    def pose_vertices(self, canonical_to_world: Float[Tensor, "j 4 4"]) -> Float[Tensor, "v 3"]:
         """Vertices (m, world) in one pose, by the same linear blend skinning that a glTF viewer does."""
         weights = dense_weights(self.joint_indices, self.joint_weights, len(canonical_to_world))
         return linear_blend_skinning(self.vertices, weights, canonical_to_world[None])[0]
@@ -44,7 +44,7 @@ class TexturedAvatar:
         image = render_textured(vertices_world, self.faces, self.faces_uv, self.uv, self.diffuse, camera, supersampling)
         return image.numpy()
 
-    def turntable(
+    def render_turntable(
         self, vertices_world: Float[Tensor, "v 3"], views: int, height_px: int, supersampling: int
     ) -> list[UInt8[np.ndarray, "_ _ 4"]]:
         """Pictures from evenly spread sides, the first from +Z: straight alpha, cropped left and right to the body.

@@ -38,7 +38,7 @@ def bent() -> Bent:
     body, true = sample_body(), sample_motion(np.array([0, 5]))
     avatar = make_avatar(body)
     poses = canonical_to_world(body, true)
-    pictures = [avatar.render(avatar.posed(pose), CAMERA, supersampling=3) for pose in poses]
+    pictures = [avatar.render(avatar.pose_vertices(pose), CAMERA, supersampling=3) for pose in poses]
     views = [
         crop_posed_view(rgba[..., :3] / np.maximum(rgba[..., 3:], 1e-6), rgba[..., 3], CAMERA, pose, 192)
         for rgba, pose in zip(pictures, poses, strict=True)
@@ -68,7 +68,7 @@ def test_the_picture_is_met(bent: Bent):
     for motion in (bent.moved, bent.fitted):
         for pose, rgba in zip(canonical_to_world(bent.body, motion), bent.pictures, strict=True):
             image = np.rint(255 * rgba[..., :3] / np.maximum(rgba[..., 3:], 1e-6)).clip(0, 255).astype(np.uint8)
-            drawn = bent.avatar.render(bent.avatar.posed(pose), CAMERA, supersampling=3)
+            drawn = bent.avatar.render(bent.avatar.pose_vertices(pose), CAMERA, supersampling=3)
             mask = np.rint(255 * rgba[..., 3]).astype(np.uint8)
             scores.append(frame_scores(drawn, image, mask)["psnr_body"])
     assert min(scores[2:]) > max(scores[:2]) + 6.0

@@ -17,7 +17,7 @@ def avatar() -> TexturedAvatar:
 
 def test_posing_is_the_weighted_sum_of_its_joints(avatar: TexturedAvatar):
     pose = canonical_to_world(sample_body(), sample_motion(np.array([0, 5])))[1]
-    posed = avatar.posed(pose).numpy()
+    posed = avatar.pose_vertices(pose).numpy()
     for vertex in (0, 17, len(posed) - 1):
         point = np.append(avatar.vertices[vertex].numpy(), 1.0)
         moved = sum(
@@ -31,7 +31,7 @@ def test_posing_is_the_weighted_sum_of_its_joints(avatar: TexturedAvatar):
 
 def test_a_render_is_premultiplied_and_shows_the_texture(avatar: TexturedAvatar):
     pose = canonical_to_world(sample_body(), sample_motion(np.array([0, 5])))[0]
-    image = avatar.render(avatar.posed(pose), CAMERA, supersampling=2)
+    image = avatar.render(avatar.pose_vertices(pose), CAMERA, supersampling=2)
     assert image.shape == (CAMERA.height, CAMERA.width, 4)
     solid = image[..., 3] == 1.0
     assert solid.sum() > 200
@@ -40,7 +40,7 @@ def test_a_render_is_premultiplied_and_shows_the_texture(avatar: TexturedAvatar)
 
 
 def test_turntable_views_have_one_height_and_touch_their_sides(avatar: TexturedAvatar):
-    views = avatar.turntable(avatar.vertices, views=4, height_px=60, supersampling=2)
+    views = avatar.render_turntable(avatar.vertices, views=4, height_px=60, supersampling=2)
     assert [view.shape[0] for view in views] == [60] * 4
     for view in views:
         assert view[:, 0, 3].any()

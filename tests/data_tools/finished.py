@@ -51,8 +51,8 @@ def ground_truth_run(sample: Path, folder: Path) -> Comparison:
         motion=truth.motion,
         avatar=avatar,
         field_renderer=lambda pose: np.zeros((truth.camera.height, truth.camera.width, 4), dtype=np.float32),
-        refined=canonical_to_world(subject.body, truth.motion),
-        fitted=canonical_to_world(subject.body, truth.motion),
+        refined_canonical_to_world=canonical_to_world(subject.body, truth.motion),
+        fitted_canonical_to_world=canonical_to_world(subject.body, truth.motion),
     )
     coverage = np.ones(subject.texture.shape[:2], dtype=np.float32)
     return Comparison(run, coverage, truth, sample / "truth")
@@ -100,7 +100,7 @@ def _capture(folder: Path, motion: Motion, side_px: int, fps: float) -> Capture:
 def with_motion(comparison: Comparison, motion: Motion) -> Comparison:
     """The same run, had it found other poses."""
     refined = canonical_to_world(comparison.run.body, motion)
-    return replace(comparison, run=replace(comparison.run, motion=motion, refined=refined))
+    return replace(comparison, run=replace(comparison.run, motion=motion, refined_canonical_to_world=refined))
 
 
 def with_scale(comparison: Comparison, factor: float) -> Comparison:
@@ -129,7 +129,7 @@ def with_raised_rest_arm(comparison: Comparison, angle_rad: float) -> Comparison
     turn[0, body.joint("LeftArm")] = axis_angle_to_matrix(torch.tensor([0.0, 0.0, angle_rad]))
     joints_m = torch.from_numpy(body.joints_m)
     joint_to_world = forward_kinematics(turn, joints_m[:1], joints_m, body.parents)
-    raised = avatar.posed(skinning_transforms(joint_to_world, joints_m)[0])
+    raised = avatar.pose_vertices(skinning_transforms(joint_to_world, joints_m)[0])
     rig = replace(body, joints_m=joint_to_world[0, :, :3, 3].numpy(), vertices=raised.numpy())
     return replace(comparison, run=replace(comparison.run, body=rig, avatar=replace(avatar, vertices=raised)))
 

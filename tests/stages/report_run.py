@@ -74,7 +74,7 @@ def _write_frames(folder: Path, avatar: TexturedAvatar, poses: torch.Tensor) -> 
     for path in (image_path(folder, 0).parent, mask_path(folder, 0).parent):
         path.mkdir()
     for index, pose in zip(FRAME_INDEX, poses, strict=True):
-        rgba = avatar.render(avatar.posed(pose), CAMERA, supersampling=3)
+        rgba = avatar.render(avatar.pose_vertices(pose), CAMERA, supersampling=3)
         alpha = rgba[..., 3:]
         brighter = rgba[..., :3] + alpha * (COLOUR_ERROR / 255.0)
         straight = np.where(alpha > 0, brighter / np.maximum(alpha, 1e-6), 0.5)

@@ -329,7 +329,10 @@ def test_a_frame_moves_what_it_sees_across_the_view(perfect: Comparison) -> None
         wrong = with_motion(perfect, motion.with_pose(motion.rotations_wxyz, root_m))
         moved.append(np.linalg.norm(unpose_true_vertices(wrong) - true, axis=1))
     sideways, deeper = moved
-    posed = Mesh(perfect.run.avatar.posed(perfect.run.refined[frame]).numpy(), perfect.run.avatar.faces.numpy())
+    posed = Mesh(
+        perfect.run.avatar.pose_vertices(perfect.run.refined_canonical_to_world[frame]).numpy(),
+        perfect.run.avatar.faces.numpy(),
+    )
     towards = posed.vertex_normals() @ -camera.world_to_camera[2, :3]
     assert deeper.mean() < 0.3 * sideways.mean()
     assert sideways[towards < -0.9].mean() < 0.3 * sideways[towards > 0.9].mean()
