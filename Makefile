@@ -32,7 +32,7 @@ TORCH_VERSION := 2.13.0
 GLTF_VALIDATOR_VERSION := 2.0.0-dev.3.10
 SAMPLE_RUN := runs/sample
 SAMPLE := runs/sample-capture
-SAMPLE_MADE := $(SAMPLE)/.done-$(shell sed -n 's/^RECIPE_VERSION = //p' data_tools/synthetic/scene/capture.py)
+SAMPLE_MADE := $(SAMPLE)/.done-$(shell sed -n 's/^CAPTURE_VERSION = //p' data_tools/synthetic/scene/capture.py)
 ONE_RUN := $(or $(RUN),$(SAMPLE_RUN))
 RUN_OPTIONS = $(if $(PRESET),--preset $(PRESET)) $(foreach item,$(SET),--set $(item))
 OPTIONS = $(RUN_OPTIONS) $(ARGS)

@@ -1,4 +1,4 @@
-"""Commands of `data_tools`: what the user can mend becomes one sentence and exit status 2."""
+"""Run a command of `data_tools`: errors that the user can fix become one message and exit status 2."""
 
 import sys
 from collections.abc import Callable, Sequence
@@ -9,7 +9,7 @@ from pipeline.core.runner import EXIT_INTERRUPTED
 
 
 def run_command(command: Callable[[Sequence[str]], None], argv: Sequence[str]) -> int:
-    """Run a command with its arguments; return the exit status. Faults of the program stay loud."""
+    """Run a command and return its exit status; unexpected errors propagate."""
     try:
         command(argv)
     except UserError as error:

@@ -1,4 +1,4 @@
-"""Folders that a command makes: whole or absent, and never over something that is there."""
+"""Create output folders atomically, without overwriting."""
 
 import os
 import shutil
@@ -10,16 +10,16 @@ from pipeline.core.errors import UserError
 
 
 def require_absent(out: Path) -> None:
-    """UserError when there is something at `out`: nothing is overwritten."""
+    """Raise UserError if `out` exists."""
     if out.exists():
-        raise UserError(f"{out} exists already; remove it or name another folder")
+        raise UserError(f"{out} already exists; remove it or choose another folder")
 
 
 @contextmanager
 def atomic_folder(out: Path) -> Iterator[Path]:
-    """Yield an empty folder beside `out`, which takes its name when the block ends without an error.
+    """Yield the empty folder `OUT.part`, which is renamed to `out` when the block ends without an error.
 
-    What a killed command left there is removed by the next one. Raises UserError when `out` exists.
+    The remains of a killed command are removed. Raises UserError if `out` exists.
     """
     require_absent(out)
     part = out.with_name(f"{out.name}.part")

@@ -1,4 +1,4 @@
-"""A synthetic capture of any rigged, textured person, who turns in A-pose or follows a motion capture.
+"""Render a synthetic capture of a rigged, textured person (.glb) who turns in A-pose or follows a motion capture.
 
 python -m data_tools.from_gltf PERSON.glb OUT [--bvh MOTION.bvh --start 2.5 --in-place]
 """
@@ -16,16 +16,18 @@ from data_tools.synthetic.scene.options import (
     build_motion,
     build_scene,
     capture_parser,
-    recipe_from_options,
+    settings_from_options,
     validate_capture_options,
 )
 
 
 def main(argv: Sequence[str]) -> None:
-    """Make one capture."""
+    """Render one capture."""
     parser = capture_parser("from_gltf", (__doc__ or "").splitlines()[0])
-    parser.add_argument("person", type=Path, help="rigged, textured person (.glb, Mixamo joint names)")
-    parser.add_argument("out", type=Path, help="folder to make: OUT/video for the pipeline, OUT/truth beside it")
+    parser.add_argument("person", type=Path, help="rigged, textured person: .glb with Mixamo joint names")
+    parser.add_argument(
+        "out", type=Path, help="new folder: OUT/video for the pipeline, OUT/truth with the ground truth"
+    )
     options = parser.parse_args(argv)
     validate_capture_options(options)
     require_absent(options.out)
@@ -33,9 +35,9 @@ def main(argv: Sequence[str]) -> None:
     scene = build_scene(options, subject.body)
     motion = build_motion(options, subject.body, scene[1])
     capture, heldout = build_capture(options, subject, motion, scene)
-    recipe = {"source": "gltf", **recipe_from_options(options), "person": options.person.name}
-    write_capture(options.out, capture, None, heldout, recipe)
-    print(f"{options.out}/video/video.mp4 and its truth in {options.out}/truth")
+    settings = {"source": "gltf", **settings_from_options(options), "person": options.person.name}
+    write_capture(options.out, capture, None, heldout, settings)
+    print(f"{options.out}/video/video.mp4 and its ground truth in {options.out}/truth")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The built-in sample: a clothed person, generated from the embedded body, turns once before a camera.
+"""Render a synthetic capture of a generated clothed person who turns in A-pose or follows a motion capture.
 
 python -m data_tools.sample OUT [--frames 96 --size 540 --seed 0 --legwear skirt --bvh MOTION.bvh ...]
 """
@@ -17,17 +17,19 @@ from data_tools.synthetic.scene.options import (
     build_motion,
     build_scene,
     capture_parser,
-    recipe_from_options,
+    settings_from_options,
     validate_capture_options,
 )
 
 
 def main(argv: Sequence[str]) -> None:
-    """Make one capture."""
+    """Render one capture."""
     parser = capture_parser("sample", (__doc__ or "").splitlines()[0])
-    parser.add_argument("out", type=Path, help="folder to make: OUT/video for the pipeline, OUT/truth beside it")
-    parser.add_argument("--texture", type=int, default=2048, help="side of the true texture in pixels")
-    parser.add_argument("--legwear", choices=LEGWEAR, default=LEGWEAR[0], help="trousers, or a skirt over bare legs")
+    parser.add_argument(
+        "out", type=Path, help="new folder: OUT/video for the pipeline, OUT/truth with the ground truth"
+    )
+    parser.add_argument("--texture", type=int, default=2048, help="side of the texture in pixels")
+    parser.add_argument("--legwear", choices=LEGWEAR, default=LEGWEAR[0], help="clothing of the legs")
     options = parser.parse_args(argv)
     validate_capture_options(options)
     require_absent(options.out)
@@ -35,8 +37,8 @@ def main(argv: Sequence[str]) -> None:
     scene = build_scene(options, subject.body)
     motion = build_motion(options, subject.body, scene[1])
     capture, heldout = build_capture(options, subject, motion, scene)
-    write_capture(options.out, capture, bare, heldout, {"source": "sample", **recipe_from_options(options)})
-    print(f"{options.out}/video/video.mp4 and its truth in {options.out}/truth")
+    write_capture(options.out, capture, bare, heldout, {"source": "sample", **settings_from_options(options)})
+    print(f"{options.out}/video/video.mp4 and its ground truth in {options.out}/truth")
 
 
 if __name__ == "__main__":

@@ -1,1 +1,1 @@
-"""What researchers have on disk becomes a plain video folder: pictures, masks, camera, split, SMPL poses."""
+"""Convert research data sets to video folders of the pipeline: images, masks, camera, split, SMPL poses."""

@@ -1,4 +1,4 @@
-"""Make a plain video folder of what a researcher has on disk.
+"""Convert one subject of a research data set to a video folder of the pipeline.
 
 python -m data_tools.convert [FORMAT] SOURCE TARGET, then make all VIDEO=TARGET
 """
@@ -20,13 +20,13 @@ from pipeline.core.errors import UserError
 
 
 class Format(NamedTuple):
-    """How a folder of a format is recognised and read."""
+    """Functions that recognise and read a folder of one format."""
 
     recognise: Callable[[Path], bool]
     read: Callable[[Path], Recording]
 
 
-# In the order in which they are tried: the last ones fit more folders.
+# In order of detection: the last formats are the most general.
 FORMATS = {
     "peoplesnapshot": Format(is_people_snapshot, read_people_snapshot),
     "instantavatar": Format(is_instant_avatar, read_instant_avatar),
@@ -38,29 +38,31 @@ FORMATS = {
 def main(argv: Sequence[str]) -> None:
     """Convert one folder."""
     parser = argparse.ArgumentParser(prog="python -m data_tools.convert", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("format", nargs="?", help=f"{', '.join(FORMATS)}; guessed when left out")
-    parser.add_argument("source", type=Path, help="folder of one subject; it is only read")
-    parser.add_argument("target", type=Path, help="folder to make")
+    parser.add_argument("format", nargs="?", help=f"{', '.join(FORMATS)}; detected if omitted")
+    parser.add_argument("source", type=Path, help="folder of one subject; read only")
+    parser.add_argument("target", type=Path, help="new video folder")
     options = parser.parse_args(argv)
     source, target = options.source, options.target
     require_absent(target)
     if not source.is_dir():
-        raise UserError(f"{source} is no folder; give one subject's folder (a video alone needs no conversion)")
+        raise UserError(
+            f"{source} is not a folder; name the folder of one subject (a single video needs no conversion)"
+        )
     if target.resolve().is_relative_to(source.resolve()):
-        raise UserError(f"{target} lies in {source}, which is only read; name a folder elsewhere")
-    name = options.format or guess_format(source)
+        raise UserError(f"{target} is inside {source}, which is read only; choose a target outside it")
+    name = options.format or detect_format(source)
     if name not in FORMATS:
-        raise UserError(f"unknown format {name}; there are {', '.join(FORMATS)}")
+        raise UserError(f"unknown format {name}; choose one of {', '.join(FORMATS)}")
     recording = FORMATS[name].read(source)
     write_recording(recording, target)
     print(f"{target} ({name}): {recording.summary()}; next: make all VIDEO={target}")
 
 
-def guess_format(source: Path) -> str:
-    """The first format that recognises the folder. UserError when none does."""
+def detect_format(source: Path) -> str:
+    """Return the first format that recognises the folder. UserError if there is none."""
     name = next((name for name, format_ in FORMATS.items() if format_.recognise(source)), None)
     if name is None:
-        raise UserError(f"{source} has none of the known formats ({', '.join(FORMATS)}); a video alone needs none")
+        raise UserError(f"{source} has none of the formats {', '.join(FORMATS)}; a single video needs no conversion")
     return name
 
 

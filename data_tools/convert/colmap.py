@@ -1,6 +1,6 @@
-"""A COLMAP model's cameras and picture poses, from text or binary files (its points are not read).
+"""Read cameras and image poses of a COLMAP model from text or binary files; 3D points are not read.
 
-https://colmap.github.io/format.html. Pixel centres lie at +0.5, as here.
+Reference: https://colmap.github.io/format.html. Pixel centres are at +0.5, as in this project.
 """
 
 import struct
@@ -16,7 +16,7 @@ from pipeline.capture.user_files import CameraCalibration
 from pipeline.core.errors import UserError
 from pipeline.geometry.rotation import quaternion_to_matrix
 
-# Model's number in binary files, and where in its parameters fx, fy, cx, cy and the lens distortion begin.
+# Model id in binary files, number of parameters, and indices of fx, fy, cx, cy; lens distortion follows them.
 _CAMERA_MODELS = {
     "SIMPLE_PINHOLE": (0, 3, (0, 0, 1, 2)),
     "PINHOLE": (1, 4, (0, 1, 2, 3)),
@@ -29,7 +29,7 @@ _CAMERA_MODELS = {
 
 @dataclass(frozen=True)
 class ColmapCamera:
-    """One camera of the model, and the size in pixels that it is for."""
+    """One camera of the model, with its image size in pixels."""
 
     camera: CameraCalibration
     width: int
@@ -38,7 +38,13 @@ class ColmapCamera:
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """Cameras by their number; for each picture, by name, its camera's number and world_to_camera (its own unit)."""
+    """A model in its own unit of length.
+
+    Attributes:
+        cameras: by camera id.
+        camera_id_of: by image name.
+        world_to_camera: by image name.
+    """
 
     cameras: Mapping[int, ColmapCamera]
     camera_id_of: Mapping[str, int]
@@ -46,18 +52,18 @@ class ColmapModel:
 
 
 def find_colmap_model(folder: Path) -> Path | None:
-    """The folder `sparse` or `sparse/0` inside `folder` that holds a model."""
-    places = (
+    """Return the folder `sparse` or `sparse/0` of `folder` that holds a model; None if there is none."""
+    candidates = (
         path / f"cameras.{end}" for path in (folder / "sparse", folder / "sparse" / "0") for end in ("txt", "bin")
     )
-    return next((place.parent for place in places if place.is_file()), None)
+    return next((candidate.parent for candidate in candidates if candidate.is_file()), None)
 
 
 def read_colmap_model(folder: Path) -> ColmapModel:
-    """Read `cameras` and `images`, `.txt` where both kinds are there.
+    """Read `cameras` and `images`; `.txt` files have precedence over `.bin` files.
 
     Raises:
-        UserError: a file is missing or damaged, or a camera is of a kind that is no pinhole with OpenCV's distortion.
+        UserError: a file is missing or damaged, or a camera is not a pinhole camera with OpenCV distortion.
     """
     is_text = (folder / "cameras.txt").is_file()
     ending, cameras_of, images_of = (
@@ -66,16 +72,16 @@ def read_colmap_model(folder: Path) -> ColmapModel:
     cameras, camera_id_of, world_to_camera = {}, {}, {}
     path = folder / f"cameras.{ending}"
     try:
-        for number, model, width, height, parameters in cameras_of(path):
-            cameras[number] = ColmapCamera(_camera(model, parameters, path), width, height)
+        for camera_id, model, width, height, parameters in cameras_of(path):
+            cameras[camera_id] = ColmapCamera(_camera(model, parameters, path), width, height)
         path = folder / f"images.{ending}"
-        for name, camera, pose in images_of(path):
-            camera_id_of[name] = camera
+        for name, camera_id, pose in images_of(path):
+            camera_id_of[name] = camera_id
             world_to_camera[name] = _pose_to_matrix(pose)
     except FileNotFoundError:
-        raise UserError(f"{path} does not exist; give the whole COLMAP model") from None
+        raise UserError(f"{path} does not exist; supply the complete COLMAP model") from None
     except (ValueError, IndexError, struct.error) as error:
-        raise UserError(f"{path} is no COLMAP file of this kind ({error}); export the model again") from None
+        raise UserError(f"{path} is not a valid COLMAP file ({error}); export the model again") from None
     return ColmapModel(cameras, camera_id_of, world_to_camera)
 
 
@@ -86,16 +92,16 @@ _ImageRow = tuple[str, int, tuple[float, ...]]
 def _text_cameras(path: Path) -> Iterator[_CameraRow]:
     for line in _data_lines(path):
         if line:
-            number, model, width, height, *parameters = line.split()
-            yield int(number), model, int(width), int(height), tuple(float(value) for value in parameters)
+            camera_id, model, width, height, *parameters = line.split()
+            yield int(camera_id), model, int(width), int(height), tuple(float(value) for value in parameters)
 
 
 def _text_images(path: Path) -> Iterator[_ImageRow]:
-    # Two lines a picture; the second one lists its points and may be empty.
+    # Two lines per image; the second lists its points and may be empty.
     for line in _data_lines(path)[::2]:
         if line:
-            _, *pose, camera, name = line.split(maxsplit=9)
-            yield name, int(camera), tuple(float(value) for value in pose)
+            _, *pose, camera_id, name = line.split(maxsplit=9)
+            yield name, int(camera_id), tuple(float(value) for value in pose)
 
 
 def _data_lines(path: Path) -> list[str]:
@@ -104,13 +110,13 @@ def _data_lines(path: Path) -> list[str]:
 
 
 def _binary_cameras(path: Path) -> Iterator[_CameraRow]:
-    numbers = {number: (model, size) for model, (number, size, _) in _CAMERA_MODELS.items()}
+    model_by_id = {model_id: (model, size) for model, (model_id, size, _) in _CAMERA_MODELS.items()}
     data = path.read_bytes()
     (count,), offset = struct.unpack_from("<Q", data), 8
     for _ in range(count):
-        camera, number, width, height = struct.unpack_from("<iiQQ", data, offset)
-        model, size = numbers.get(number, (f"number {number}", 0))
-        yield camera, model, width, height, struct.unpack_from(f"<{size}d", data, offset + 24)
+        camera_id, model_id, width, height = struct.unpack_from("<iiQQ", data, offset)
+        model, size = model_by_id.get(model_id, (f"number {model_id}", 0))
+        yield camera_id, model, width, height, struct.unpack_from(f"<{size}d", data, offset + 24)
         offset += 24 + 8 * size
 
 
@@ -118,9 +124,9 @@ def _binary_images(path: Path) -> Iterator[_ImageRow]:
     data = path.read_bytes()
     (count,), offset = struct.unpack_from("<Q", data), 8
     for _ in range(count):
-        _, *pose, camera = struct.unpack_from("<i7di", data, offset)
+        _, *pose, camera_id = struct.unpack_from("<i7di", data, offset)
         end = data.index(b"\0", offset + 64)
-        yield data[offset + 64 : end].decode("utf-8"), camera, tuple(pose)
+        yield data[offset + 64 : end].decode("utf-8"), camera_id, tuple(pose)
         (n_points,) = struct.unpack_from("<Q", data, end + 1)
         offset = end + 9 + 24 * n_points
 
@@ -128,20 +134,20 @@ def _binary_images(path: Path) -> Iterator[_ImageRow]:
 def _camera(model: str, parameters: tuple[float, ...], path: Path) -> CameraCalibration:
     if model not in _CAMERA_MODELS:
         raise UserError(
-            f"{path}: camera model {model} is not read, only {', '.join(_CAMERA_MODELS)}; undistort the pictures "
+            f"{path}: camera model {model} is not supported, only {', '.join(_CAMERA_MODELS)}; undistort the images "
             "with COLMAP"
         )
-    _, size, places = _CAMERA_MODELS[model]
+    _, size, parameter_indices = _CAMERA_MODELS[model]
     if len(parameters) != size:
         raise ValueError(f"{model} has {size} parameters, found {len(parameters)}")
-    fx, fy, cx, cy = (parameters[place] for place in places)
-    distortion = parameters[max(places) + 1 :]
-    # OpenCV wants k1 k2 p1 p2 at least.
+    fx, fy, cx, cy = (parameters[index] for index in parameter_indices)
+    distortion = parameters[max(parameter_indices) + 1 :]
+    # OpenCV needs at least k1 k2 p1 p2.
     return CameraCalibration(fx, fy, cx, cy, distortion + (0.0,) * (4 - len(distortion)) if any(distortion) else ())
 
 
 def _pose_to_matrix(pose: tuple[float, ...]) -> Float[np.ndarray, "4 4"]:
-    """world_to_camera of qw qx qy qz tx ty tz."""
+    """Convert (qw, qx, qy, qz, tx, ty, tz) to world_to_camera."""
     matrix = np.eye(4)
     matrix[:3, :3] = quaternion_to_matrix(torch.tensor(pose[:4], dtype=torch.float64)).numpy()
     matrix[:3, 3] = pose[4:]

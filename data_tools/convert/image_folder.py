@@ -1,11 +1,11 @@
-"""A folder of pictures whose masks lie in a folder beside them, or in the pictures' own alpha channel.
+"""Read a folder of images with masks in a separate folder, or in the alpha channel.
 
-    images/, frames/, ... or the folder itself   the pictures
-    masks/, mask/, matte/, ...                   as many masks, named as the pictures are or in the same order, the
-                                                 person bright
+    images/, frames/, ... or the folder itself   images
+    masks/, mask/, matte/, ...                   one mask per image, with the same names or in the same order; the
+                                                 person is bright
 
-`camera.json`, `split.json` and `landmarks.npz` in the form of `pipeline.capture.user_files` are carried over. A folder
-that has `masks/`, or pictures with alpha, needs no conversion.
+`camera.json`, `split.json` and `landmarks.npz` in the format of `pipeline.capture.user_files` are copied. A folder with
+`masks/`, or with alpha in its images, needs no conversion.
 """
 
 from pathlib import Path
@@ -20,21 +20,21 @@ _FILES_TO_COPY = ("camera.json", "split.json", "landmarks.npz")
 
 
 def is_image_folder(folder: Path) -> bool:
-    """True for a folder of pictures with one of the mask folders, or whose first picture is partly transparent."""
+    """Return whether a folder of images has a mask folder, or a transparent pixel in its first image."""
     source = open_frame_source(folder)
     return bool(source.files) and (_find_masks(folder) is not None or bool(read_alpha(source.files[0]).min() < 255))
 
 
 def read_image_folder(folder: Path) -> Recording:
-    """Look at the folder; pictures and masks are read later.
+    """Read the structure of the folder; images and masks are read on demand.
 
     Raises:
-        UserError: there are no pictures, no masks, or not as many of both.
+        UserError: images or masks are missing, or their numbers differ.
     """
     source, masks = open_frame_source(folder), _find_masks(folder)
     if not is_image_folder(folder):
         raise UserError(
-            f"{folder} has no masks beside its pictures and no alpha in them; the pipeline takes it as it is"
+            f"{folder} has no mask folder and no alpha channel; it needs no conversion: make all VIDEO={folder}"
         )
     return Recording(
         source=source,

@@ -1,17 +1,17 @@
-"""Folders as InstantAvatar's scripts make them (Jiang et al. 2023), one a subject.
+"""Read a folder of one subject as prepared by InstantAvatar's scripts (Jiang et al., CVPR 2023).
 
-    images/                   undistorted pictures
-    masks/                    as many masks, .npy (0 and 1) or .png
+    images/                   undistorted images
+    masks/                    one mask per image, .npy (0 and 1) or .png
     cameras.npz               intrinsic (3, 3), extrinsic (4, 4) world to camera, height, width
     poses/anim_nerf_train.npz, anim_nerf_test.npz
-                              SMPL poses of the frames of each set (not for all subjects): global_orient, body_pose,
-                              transl for each frame, betas once
+                              SMPL poses of the frames of each split (some subjects): global_orient, body_pose, transl
+                              per frame, betas once
     poses_optimized.npz, poses.npz
                               poses of all frames: thetas (n, 72) or global_orient and body_pose, transl, betas
 
-Masks and poses may be absent. Which frames belong to a set stands in InstantAvatar's configuration, not in the folder:
-`protocol.py` has it. Its rays go through whole pixel numbers; the camera is taken as in `people_snapshot.py`, where it
-comes from.
+Masks and poses are optional. The frames of each split are defined in InstantAvatar's configuration, not in the folder;
+see `protocol.py`. InstantAvatar casts rays through integer pixel coordinates; here the camera is interpreted as in
+`people_snapshot.py`, its origin.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,7 @@ from jaxtyping import Float, Shaped
 
 from data_tools.convert.protocol import published_split
 from data_tools.convert.recording import Recording, mask_folder_reader, require_image_size
-from data_tools.convert.smpl_rows import gender_from_name, merge_smpl_poses, smpl_rows
+from data_tools.convert.smpl_arrays import gender_from_name, merge_smpl_poses, smpl_poses_from_arrays
 from pipeline.capture.smpl_poses import SmplPoses
 from pipeline.capture.user_files import CameraCalibration
 from pipeline.capture.video import FrameSource, open_frame_source
@@ -36,15 +36,15 @@ _POSES_OF_ALL_FRAMES = ("poses_optimized.npz", "poses.npz")
 
 
 def is_instant_avatar(folder: Path) -> bool:
-    """True for a folder with this format's camera and pictures."""
+    """Return whether the folder has the camera file and the image folder of this format."""
     return (folder / _CAMERA).is_file() and (folder / "images").is_dir()
 
 
 def read_instant_avatar(folder: Path) -> Recording:
-    """Look at one subject's folder; pictures and masks are read later.
+    """Read the folder of one subject; images and masks are read on demand.
 
     Raises:
-        UserError: a file that is there cannot be read or does not fit the pictures.
+        UserError: an existing file cannot be read, or does not match the images.
     """
     source = open_frame_source(folder)
     camera, world_to_camera = _read_camera(folder / _CAMERA, source)
@@ -64,7 +64,7 @@ def _read_camera(path: Path, source: FrameSource) -> tuple[CameraCalibration, Fl
     for name, shape in (("intrinsic", (3, 3)), ("extrinsic", (4, 4)), ("height", ()), ("width", ())):
         found = arrays[name].shape if name in arrays else None
         if found != shape:
-            raise UserError(f"{path}: `{name}` must have shape {shape}, found {found}; give another cameras.npz")
+            raise UserError(f"{path}: `{name}` must have shape {shape}, found {found}; supply a valid cameras.npz")
     require_image_size(source, int(arrays["width"]), int(arrays["height"]), path)
     matrix = arrays["intrinsic"].astype(np.float64)
     camera = CameraCalibration(float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2]))
@@ -78,15 +78,15 @@ def _read_poses(
     world_to_camera: Float[np.ndarray, "4 4"],
     gender: str,
 ) -> SmplPoses | None:
-    """The poses of the two sets where it is known which frames they are of, else those of all frames."""
+    """Return the poses of the two splits if their frames are known, else those of all frames."""
 
     def rows(name: str, frame_index: Sequence[int]) -> SmplPoses:
         arrays: dict[str, Shaped[np.ndarray, "..."]] = load_npz(folder / name)
-        return smpl_rows(arrays, np.array(frame_index), world_to_camera, gender, folder / name)
+        return smpl_poses_from_arrays(arrays, np.array(frame_index), world_to_camera, gender, folder / name)
 
     files_by_split = {name: file for name, file in _POSES_BY_SPLIT.items() if (folder / file).is_file()}
     if files_by_split and split is not None:
         return merge_smpl_poses([rows(file, split[name]) for name, file in files_by_split.items()])
     if files_by_split:
-        warn(f"nothing says which frames {folder / 'poses'} is of; its poses are left out")
+        warn(f"the frames of {folder / 'poses'} are unknown: these poses are ignored")
     return next((rows(name, range(n_frames)) for name in _POSES_OF_ALL_FRAMES if (folder / name).is_file()), None)

@@ -1,7 +1,7 @@
-"""Files of joblib's `dump` without compression, read under the rules of `pipeline.io.safe_pickle`.
+"""Read uncompressed files of `joblib.dump`, with the restrictions of `pipeline.io.safe_pickle`.
 
-Such a file is a pickle that stands still after each array: an object with the array's shape, order and type, and then
-the array's bytes, raw (since joblib 1.2 after a byte that counts filling bytes, and these).
+Such a file is a pickle in which each array is an object with shape, order and dtype, followed by the raw bytes of the
+array. Since joblib 1.2 a byte with the number of padding bytes, and the padding, precede the raw bytes.
 """
 
 import pickle
@@ -16,7 +16,7 @@ _WRAPPER = "joblib.numpy_pickle.NumpyArrayWrapper"
 
 
 def load_joblib(path: Path) -> Any:
-    """Read arrays and plain containers. Raises UserError as `pipeline.io.safe_pickle.load_pickle`."""
+    """Read arrays and plain containers. Raises UserError like `pipeline.io.safe_pickle.load_pickle`."""
     with open_pickle(path) as file:
         return _JoblibUnpickler(file).load()
 
@@ -27,7 +27,7 @@ class _JoblibUnpickler(RestrictedUnpickler):
         self._stream = file
 
     def load_build(self) -> None:
-        """As there; an array's description then gives way to the array."""
+        """Build the object, and replace the header of an array by the array."""
         super().load_build()
         if isinstance(self.stack[-1], OpaqueObject):
             self.stack[-1] = self._read_array(self.stack[-1].state)
@@ -35,7 +35,7 @@ class _JoblibUnpickler(RestrictedUnpickler):
     def _read_array(self, header: dict[str, Any]) -> np.ndarray:
         shape, dtype = header["shape"], header["dtype"].dtype
         if dtype.hasobject:
-            raise pickle.UnpicklingError("it holds an array of objects")
+            raise pickle.UnpicklingError("it contains an array of objects")
         if header.get("numpy_array_alignment_bytes") is not None:
             self._stream.read(self._stream.read(1)[0])
         count = int(np.prod([int(side) for side in shape], dtype=object))

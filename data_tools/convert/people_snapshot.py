@@ -1,14 +1,14 @@
-"""PeopleSnapshot as it is distributed (Alldieck et al. 2018), one folder a subject.
+"""Read the folder of one subject of PeopleSnapshot (Alldieck et al., CVPR 2018) as distributed.
 
-    SUBJECT.mp4               the video
+    SUBJECT.mp4               video
     camera.pkl                camera_f, camera_c (pixels), camera_k (OpenCV's five), camera_rt (axis-angle), camera_t,
                               width, height
     masks.hdf5                `masks` (n, h, w), 0 and 1
     reconstructed_poses.hdf5  `pose` (n, 72), `trans` (n, 3), `betas` (10,)
-    keypoints.hdf5            18 OpenPose joints a frame: left to the detector, whose 33 landmarks the body fit reads
+    keypoints.hdf5            18 OpenPose joints per frame; not used, the body fit needs 33 BlazePose landmarks
 
-All but the video may be absent. The principal point is taken as it stands: it is half of the picture, which is the
-centre where pixel centres lie at +0.5.
+Only the video is required. The principal point is used unchanged: it is half of the image size, which is the image
+centre for pixel centres at +0.5.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ from jaxtyping import Float, UInt8
 
 from data_tools.convert.protocol import published_split
 from data_tools.convert.recording import Recording, mask_to_uint8, require_image_size
-from data_tools.convert.smpl_rows import gender_from_name, smpl_rows
+from data_tools.convert.smpl_arrays import gender_from_name, smpl_poses_from_arrays
 from pipeline.capture.smpl_poses import SmplPoses
 from pipeline.capture.user_files import CameraCalibration
 from pipeline.capture.video import FrameSource, open_frame_source
@@ -34,15 +34,15 @@ _CAMERA_SIZES = {"camera_f": 2, "camera_c": 2, "camera_k": 5, "camera_rt": 3, "c
 
 
 def is_people_snapshot(folder: Path) -> bool:
-    """True for a folder with a file that only this format has."""
+    """Return whether the folder has a file that is specific to this format."""
     return any((folder / name).is_file() for name in (_CAMERA, _MASKS, _POSES))
 
 
 def read_people_snapshot(folder: Path) -> Recording:
-    """Look at one subject's folder; pictures and masks are read later.
+    """Read the folder of one subject; images and masks are read on demand.
 
     Raises:
-        UserError: a file that is there cannot be read or does not fit the video.
+        UserError: an existing file cannot be read, or does not match the video.
     """
     source = open_frame_source(folder)
     subject, camera, poses, world_to_camera = folder.resolve().name, None, None, np.eye(4)
@@ -60,13 +60,13 @@ def read_people_snapshot(folder: Path) -> Recording:
 
 
 def _read_camera(path: Path, source: FrameSource) -> tuple[CameraCalibration, Float[np.ndarray, "4 4"]]:
-    """Intrinsics with distortion, and world_to_camera."""
+    """Return intrinsics with distortion, and world_to_camera."""
     stored = load_pickle(path)
     values = {}
     for name, size in _CAMERA_SIZES.items():
         number = np.asarray(stored.get(name) if isinstance(stored, dict) else None)
         if number.size != size or not np.issubdtype(number.dtype, np.number):
-            raise UserError(f"{path} has no `{name}` of {size} numbers; give PeopleSnapshot's own camera.pkl")
+            raise UserError(f"{path} has no `{name}` of {size} numbers; supply the camera.pkl of PeopleSnapshot")
         values[name] = number.astype(np.float64).reshape(-1)
     require_image_size(source, int(values["width"][0]), int(values["height"][0]), path)
     world_to_camera = np.eye(4)
@@ -77,23 +77,23 @@ def _read_camera(path: Path, source: FrameSource) -> tuple[CameraCalibration, Fl
 
 
 def _mask_reader(path: Path, source: FrameSource) -> Callable[[int], UInt8[np.ndarray, "h w"]]:
-    """Reads one mask at a time: all of them together would fill the memory."""
+    """Return a function that reads one mask; all masks together would not fit into memory."""
     shape = _read_hdf5(path, "masks", lambda masks: masks.shape)
     if len(shape) != 3 or shape[0] < source.n_frames:
         raise UserError(
             f"{path}: `masks` has shape {shape} for the {source.n_frames} frames of {source.path}; "
-            "give the (frames, height, width) masks of this video"
+            "supply (frames, height, width) masks of this video"
         )
     return lambda index: mask_to_uint8(_read_hdf5(path, "masks", lambda masks: masks[index]), path)
 
 
 def _read_poses(path: Path, world_to_camera: Float[np.ndarray, "4 4"], gender: str) -> SmplPoses:
     arrays = {name: _read_hdf5(path, name, np.asarray) for name in ("pose", "trans", "betas")}
-    return smpl_rows(arrays, np.arange(len(arrays["pose"])), world_to_camera, gender, path)
+    return smpl_poses_from_arrays(arrays, np.arange(len(arrays["pose"])), world_to_camera, gender, path)
 
 
 def _read_hdf5(path: Path, name: str, select: Callable[[h5py.Dataset], Any]) -> Any:
-    """What `select` takes from the data set of this name."""
+    """Apply `select` to the data set of this name."""
     try:
         with h5py.File(path, "r") as file:
             return select(file[name])

@@ -1,7 +1,7 @@
-"""Which frames of PeopleSnapshot InstantAvatar trains and tests on: first, last and step in its configuration.
+"""Training and test frames of PeopleSnapshot subjects in InstantAvatar's configuration (first, last, step).
 
-Only subjects whose two sets share no frame are listed. Its validation frame is a test frame in each of them, so none is
-named here and the frames stage takes some of the training frames.
+Only subjects with disjoint splits are listed. The validation frame of InstantAvatar is a test frame in each subject, so
+no validation split is defined here and the frames stage selects some of the training frames.
 """
 
 from pipeline.capture.video import FrameSource
@@ -18,14 +18,14 @@ _SPLITS = {
 
 
 def published_split(subject: str, source: FrameSource) -> dict[str, range] | None:
-    """The lists of `split.json`; None, with a warning, where the subject is not known or its video is shorter."""
+    """Return the split of a subject; None, with a warning, if the subject is unknown or its video is too short."""
     if subject not in _SPLITS:
-        warn(f"no split is known for {subject}; the frames stage will hold out every eighth frame")
+        warn(f"no published split for {subject}: the frames stage will hold out every eighth frame")
         return None
     train, heldout = _SPLITS[subject]
     if source.n_frames <= heldout[-1]:
         warn(
-            f"{source.path} has {source.n_frames} frames, InstantAvatar's split of {subject} needs {heldout[-1] + 1}; "
+            f"{source.path} has {source.n_frames} frames, InstantAvatar's split of {subject} needs {heldout[-1] + 1}: "
             "the frames stage will hold out every eighth frame instead"
         )
         return None

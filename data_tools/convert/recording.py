@@ -1,13 +1,13 @@
-"""What every reader hands over, and the folder that is written from it.
+"""The recording that each format reader returns, and the video folder that is written from it.
 
-    TARGET/images/ or one video    the pictures, as they are
-    TARGET/masks/                  one image a frame, the person bright
-    TARGET/camera.json             intrinsics without a pose: the pipeline's world is the camera's
-    TARGET/split.json              which frames are used and what for
+    TARGET/images/ or one video    unchanged copies of the images
+    TARGET/masks/                  one image per frame, the person bright
+    TARGET/camera.json             intrinsics; there is no pose, because the world is the camera frame
+    TARGET/split.json              training, validation and held-out frames
     TARGET/smpl_poses.npz          see `pipeline.capture.smpl_poses`
-    TARGET/...                     what the source has in this form already
+    TARGET/...                     files that the source already has in this format
 
-`pipeline.capture.user_files` says how the frames stage reads them.
+`pipeline.capture.user_files` documents how the frames stage reads them.
 """
 
 import json
@@ -31,10 +31,12 @@ from pipeline.io.safe_pickle import load_npy
 
 @dataclass(frozen=True)
 class Recording:
-    """A recording with what lies beside it; None for what does not.
+    """Images and their annotations; None for an annotation that does not exist.
 
-    read_mask: the mask of a frame by its index, uint8 [0, 255]. split: lists of frame indices, as in `split.json`.
-    ready: files that have the form of the target already.
+    Attributes:
+        read_mask: returns the mask of a frame index, 0 to 255.
+        split: lists of frame indices, as in `split.json`.
+        files_to_copy: files that already have the format of the target.
     """
 
     source: FrameSource
@@ -45,28 +47,28 @@ class Recording:
     files_to_copy: tuple[Path, ...] = ()
 
     def summary(self) -> str:
-        """What there is, in a few words."""
-        words = [f"{self.source.n_frames} frames"]
-        words += ["masks"] * (self.read_mask is not None) + ["camera"] * (self.camera is not None)
+        """Return a one-line description."""
+        parts = [f"{self.source.n_frames} frames"]
+        parts += ["masks"] * (self.read_mask is not None) + ["camera"] * (self.camera is not None)
         if self.split is not None:
-            words.append("split (" + ", ".join(f"{len(index)} {name}" for name, index in self.split.items()) + ")")
+            parts.append("split (" + ", ".join(f"{len(index)} {name}" for name, index in self.split.items()) + ")")
         if self.poses is not None:
-            words.append(f"SMPL poses of {len(self.poses.frame_index)} frames")
-        words += [file.name for file in self.files_to_copy]
-        return ", ".join(words)
+            parts.append(f"SMPL poses of {len(self.poses.frame_index)} frames")
+        parts += [file.name for file in self.files_to_copy]
+        return ", ".join(parts)
 
 
 def write_recording(recording: Recording, target: Path) -> None:
-    """Write the folder, whole or not at all.
+    """Write the video folder atomically.
 
     Raises:
-        UserError: `target` exists, or something in the source cannot be read.
+        UserError: `target` exists, or a file of the source cannot be read.
     """
     source, poses = recording.source, recording.poses
     if poses is not None and len(poses.frame_index) and poses.frame_index[-1] >= source.n_frames:
         raise UserError(
-            f"{source.path} has {source.n_frames} frames, its SMPL poses go to frame {poses.frame_index[-1]}; "
-            "give the pictures that belong to them"
+            f"{source.path} has {source.n_frames} frames, but its SMPL poses extend to frame {poses.frame_index[-1]}; "
+            "supply the matching images"
         )
     with atomic_folder(target) as part:
         _copy_images(source, part)
@@ -86,10 +88,12 @@ def write_recording(recording: Recording, target: Path) -> None:
 
 
 def mask_folder_reader(folder: Path, source: FrameSource) -> Callable[[int], UInt8[np.ndarray, "h w"]]:
-    """Reads the masks of a folder, images or `.npy`: those named as the pictures are, or else all in natural order.
+    """Return a function that reads the mask of a frame index from a folder of images or `.npy` files.
+
+    Masks are matched by the names of the images, or else in natural order.
 
     Raises:
-        UserError: there is not one for each picture.
+        UserError: the number of masks differs from the number of images.
     """
     found = (path for path in folder.iterdir() if path.suffix.lower() in (".npy", *IMAGE_SUFFIXES))
     files = sorted(found, key=natural_sort_key)
@@ -97,7 +101,7 @@ def mask_folder_reader(folder: Path, source: FrameSource) -> Callable[[int], UIn
     if source.files and all(image.stem in by_stem for image in source.files):
         files = [by_stem[image.stem] for image in source.files]
     if len(files) != source.n_frames:
-        raise UserError(f"{folder} has {len(files)} masks for {source.n_frames} pictures; give one for each")
+        raise UserError(f"{folder} has {len(files)} masks for {source.n_frames} images; supply one mask per image")
 
     def read(index: int) -> UInt8[np.ndarray, "h w"]:
         path = files[index]
@@ -107,10 +111,10 @@ def mask_folder_reader(folder: Path, source: FrameSource) -> Callable[[int], UIn
 
 
 def mask_to_uint8(mask: Shaped[np.ndarray, "..."], path: Path) -> UInt8[np.ndarray, "h w"]:
-    """A stored mask as uint8 [0, 255]: what never rises above 1 is a share, everything else is levels already.
+    """Convert a stored mask to uint8; the range is [0, 1] if no value exceeds 1, else [0, 255].
 
     Raises:
-        UserError: the mask is no single picture of numbers.
+        UserError: the mask is not a numeric (height, width) array.
     """
     if mask.ndim != 2 or not np.issubdtype(mask.dtype, np.number) and mask.dtype != bool:
         raise UserError(f"{path}: a mask has shape {mask.shape} and type {mask.dtype}; store (height, width) numbers")
@@ -119,17 +123,17 @@ def mask_to_uint8(mask: Shaped[np.ndarray, "..."], path: Path) -> UInt8[np.ndarr
 
 
 def require_image_size(source: FrameSource, width_px: int, height_px: int, path: Path) -> None:
-    """Raise UserError when the pictures are not of the size that the camera in `path` was calibrated for."""
+    """Raise UserError if the images do not have the size for which the camera in `path` was calibrated."""
     width, height = image_size_px(source)
     if (width, height) != (width_px, height_px):
         raise UserError(
-            f"{path} is for pictures of {width_px}x{height_px}, those of {source.path} are {width}x{height}; "
-            "give the original pictures"
+            f"{path} is calibrated for images of {width_px}x{height_px}, but those of {source.path} are "
+            f"{width}x{height}; supply the original images"
         )
 
 
 def _copy_images(source: FrameSource, folder: Path) -> None:
-    """Contents only: the copies must be writable and new, whatever the originals are."""
+    """Copy contents without permissions and times, so that the copies are writable."""
     if not source.files:
         shutil.copyfile(source.path, folder / source.path.name)
         return

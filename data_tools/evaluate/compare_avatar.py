@@ -175,15 +175,15 @@ def compare_texture(comparison: Comparison, seed: int = 0) -> dict[str, float]:
     true = comparison.truth.subject.body.mesh()
     points, _ = sample_surface(avatar, SURFACE_POINTS, seed)
     uv = _nearest_uv(points, avatar, comparison.run.avatar.uv, comparison.run.avatar.faces_uv.numpy())
-    seen = sample_texture(torch.from_numpy(comparison.coverage)[..., None], uv)[:, 0].numpy() > 0.5
-    avatar_colours = sample_texture(comparison.run.avatar.diffuse, uv[seen]).numpy()
+    observed = sample_texture(torch.from_numpy(comparison.coverage)[..., None], uv)[:, 0].numpy() > 0.5
+    avatar_colours = sample_texture(comparison.run.avatar.diffuse, uv[observed]).numpy()
     subject = comparison.truth.subject
-    places = comparison.alignment(points[seen])
-    there = _nearest_uv(places, true, torch.from_numpy(subject.uv), subject.faces_uv)
-    expected = sample_texture(subject.texture_tensor(), there).numpy()
+    points_true = comparison.alignment(points[observed])
+    uv_true = _nearest_uv(points_true, true, torch.from_numpy(subject.uv), subject.faces_uv)
+    expected = sample_texture(subject.texture_tensor(), uv_true).numpy()
     gain = [_least_absolute_gain(*channels) for channels in zip(avatar_colours.T, expected.T, strict=True)]
     return {
-        "coverage": float(seen.mean()),
+        "coverage": float(observed.mean()),
         "colour_error": 255.0 * float(np.abs(avatar_colours - expected).mean()),
         "balanced_colour_error": 255.0 * float(np.abs(avatar_colours * gain - expected).mean()),
     }
@@ -253,17 +253,17 @@ def unpose_true_vertices(comparison: Comparison) -> Float[np.ndarray, "v 3"]:
     scale = 1.0 / comparison.alignment.scale
     true_to_fitted = _true_to_fitted_world(torch.from_numpy(motion.root_translation_m), scale, truth.camera, run.camera)
     rotation_matrix = torch.from_numpy(run.camera.world_to_camera[:3, :3])
-    seen = rotation_matrix.T @ torch.diag(torch.tensor([1.0, 1.0, DEPTH_WEIGHT])) @ rotation_matrix
+    view_weights = rotation_matrix.T @ torch.diag(torch.tensor([1.0, 1.0, DEPTH_WEIGHT])) @ rotation_matrix
     normal_matrix, normal_rhs = torch.zeros(len(body.vertices), 3, 3), torch.zeros(len(body.vertices), 3)
     for matrix, position, pose in zip(
         true_to_fitted, positions.tolist(), canonical_to_world(body, motion), strict=True
     ):
-        there = pose_vertices(truth.subject, (matrix @ pose.double()).float())
+        true_vertices = pose_vertices(truth.subject, (matrix @ pose.double()).float())
         blended = torch.einsum("vj,jab->vab", weights, run.refined_canonical_to_world[position, joint])
-        view_cosine = _view_cosine(there, body.faces, run.camera)[:, None, None]
-        linear = view_cosine * (blended[:, :3, :3].mT @ seen)
+        view_cosine = _view_cosine(true_vertices, body.faces, run.camera)[:, None, None]
+        linear = view_cosine * (blended[:, :3, :3].mT @ view_weights)
         normal_matrix += linear @ blended[:, :3, :3]
-        normal_rhs += (linear @ (there - blended[:, :3, 3])[..., None]).squeeze(-1)
+        normal_rhs += (linear @ (true_vertices - blended[:, :3, 3])[..., None]).squeeze(-1)
     return torch.linalg.solve(normal_matrix, normal_rhs).numpy()
 
 
@@ -305,9 +305,11 @@ def retarget_motion(body: Body, source_body: Body, motion: Motion) -> Motion:
     """
     recorded_joint_of = {name: source_body.joint(name) for name in body.joint_names if name in source_body.joint_names}
     local = quaternion_to_matrix(torch.from_numpy(motion.rotations_wxyz).double())
-    places = torch.from_numpy(source_body.joints_m).double()
-    world = forward_kinematics(local, torch.from_numpy(motion.root_translation_m).double(), places, source_body.parents)
-    reference = (np.tile(np.eye(3), (len(places), 1, 1)), places.numpy())
+    rest_joints_m = torch.from_numpy(source_body.joints_m).double()
+    world = forward_kinematics(
+        local, torch.from_numpy(motion.root_translation_m).double(), rest_joints_m, source_body.parents
+    )
+    reference = (np.tile(np.eye(3), (len(rest_joints_m), 1, 1)), rest_joints_m.numpy())
     rotations = retarget_rotations(body, recorded_joint_of, world[..., :3, :3].numpy(), reference, np.eye(3))
     return motion.with_pose(local_quaternions(rotations, body.parents), motion.root_translation_m)
 

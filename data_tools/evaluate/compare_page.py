@@ -86,17 +86,20 @@ def write_comparison(out: Path, run: Path, found: Mapping[str, Mapping[str, floa
     return document
 
 
-def avatar_sections(pair: Comparison) -> tuple[dict[str, Any], dict[str, list[ImagePair]]]:
+def avatar_sections(comparison: Comparison) -> tuple[dict[str, Any], dict[str, list[ImagePair]]]:
     """All sections that need a finished avatar, and the pictures of held-out cameras and motions."""
-    document: dict[str, Any] = {"mesh": compare_rest_surfaces(pair), "heldout_poses": compare_heldout_surfaces(pair)}
-    images = compare_heldout_images(pair)
+    document: dict[str, Any] = {
+        "mesh": compare_rest_surfaces(comparison),
+        "heldout_poses": compare_heldout_surfaces(comparison),
+    }
+    images = compare_heldout_images(comparison)
     pictures = {}
-    if (pair.folder / "novel_poses").is_dir():
-        document["novel_poses"], pictures["novel_poses"] = compare_novel_poses(pair)
-    if (pair.folder / "novel_views").is_dir():
-        pictures["novel_views"] = compare_novel_views(pair)
+    if (comparison.folder / "novel_poses").is_dir():
+        document["novel_poses"], pictures["novel_poses"] = compare_novel_poses(comparison)
+    if (comparison.folder / "novel_views").is_dir():
+        pictures["novel_views"] = compare_novel_views(comparison)
     images |= {name: mean_scores(picture.scores() for picture in row) for name, row in pictures.items()}
-    return document | {"texture": compare_texture(pair), "images": images}, pictures
+    return document | {"texture": compare_texture(comparison), "images": images}, pictures
 
 
 def comparison_page(title: str, document: Mapping[str, Any], pictures: Mapping[str, Sequence[ImagePair]]) -> str:
@@ -137,10 +140,10 @@ def _headline(document: Mapping[str, Any]) -> list[tuple[str, str, str]]:
 def _row(title: str, pictures: Sequence[ImagePair]) -> str:
     """Truth, avatar and error of each picture, cropped to the person."""
     figures = []
-    for number, pair in enumerate(pictures):
-        box = foreground_bounding_box(foreground_mask(pair.truth[..., 3]))
-        truth = composite_on_white(pair.truth[..., :3], pair.truth[..., 3])[box]
-        avatar = composite_premultiplied_on_white(pair.avatar)[box]
+    for number, image_pair in enumerate(pictures):
+        box = foreground_bounding_box(foreground_mask(image_pair.truth[..., 3]))
+        truth = composite_on_white(image_pair.truth[..., :3], image_pair.truth[..., 3])[box]
+        avatar = composite_premultiplied_on_white(image_pair.avatar)[box]
         for caption, pixels in (("truth", truth), ("avatar", avatar), ("error", error_map(avatar, truth))):
             image = image_tag(pixels, f"{title} {number}, {caption}")
             figures.append(f"<figure>{image}<figcaption>{number}, {caption}</figcaption></figure>")

@@ -1,4 +1,4 @@
-"""The truth beside a synthetic capture: load it, and check that it explains the video.
+"""Load the ground truth of a synthetic capture, and verify that rendering it reproduces the video.
 
 python -m data_tools.evaluate.truth OUT [--meshes FOLDER]
 """
@@ -6,7 +6,7 @@ python -m data_tools.evaluate.truth OUT [--meshes FOLDER]
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from data_tools.folder import atomic_folder
 from data_tools.synthetic.rig.subject import load_subject
 from data_tools.synthetic.scene.backdrop import Room, floor_points
 from data_tools.synthetic.scene.ball import Ball
-from data_tools.synthetic.scene.capture import SyntheticCapture
+from data_tools.synthetic.scene.capture import CAPTURE_VERSION, SyntheticCapture
 from data_tools.synthetic.scene.renderer import Light, pose_vertices
 from pipeline.avatar.obj import write_obj
 from pipeline.body.files import load_camera, load_motion
@@ -35,7 +35,7 @@ MIN_PSNR_DB, MIN_IOU = 45.0, 0.995
 
 @dataclass(frozen=True)
 class GroundTruthCheck:
-    """How well the truth explains the video: the worst frame of each figure."""
+    """Agreement of the rendered ground truth with the video; each score is that of the worst frame."""
 
     frames: int
     psnr_full_db: float
@@ -43,24 +43,25 @@ class GroundTruthCheck:
     mask_iou: float
 
     def passes(self) -> bool:
-        """Whether the truth may be trusted."""
+        """Return whether all scores are above their thresholds."""
         return min(self.psnr_full_db, self.psnr_body_db) > MIN_PSNR_DB and self.mask_iou > MIN_IOU
 
 
 def load_ground_truth(out: Path) -> SyntheticCapture:
-    """The capture that was written to `out`, ready to be rendered again.
+    """Load the capture in the folder `out`, so that it can be rendered again.
 
     Raises:
-        UserError: there is no truth, or a file of it is missing or damaged.
+        UserError: the ground truth is absent, of another version, or one of its files is missing or damaged.
     """
-    truth, recipe = out / "truth", read_recipe(out)
+    truth, settings = out / "truth", read_capture_settings(out)
+    require_current_version(out, settings)
     camera = load_camera(truth / "camera.npz")
     try:
-        ground_m = np.array(recipe["ground_m"], dtype=np.float64).reshape(3)
-        light = Light(**{**recipe["light"], "key_direction": tuple(recipe["light"]["key_direction"])})
-        fps, samples = float(recipe["fps"]), int(recipe["samples"])
+        ground_m = np.array(settings["ground_m"], dtype=np.float64).reshape(3)
+        light = Light(**{**settings["light"], "key_direction": tuple(settings["light"]["key_direction"])})
+        fps, samples = float(settings["fps"]), int(settings["samples"])
     except (KeyError, TypeError, ValueError):
-        raise _damaged_recipe_error(out) from None
+        raise _damaged_settings_error(out) from None
     subject = load_subject(truth)
     return SyntheticCapture(
         subject=subject,
@@ -71,63 +72,78 @@ def load_ground_truth(out: Path) -> SyntheticCapture:
         ground_m=ground_m,
         fps=fps,
         samples=samples,
-        ball=Ball(ground_m, subject.body.height_m()) if recipe.get("ball") else None,
+        ball=Ball(ground_m, subject.body.height_m()) if settings.get("ball") else None,
     )
 
 
-def read_recipe(out: Path) -> dict[str, Any]:
-    """With which options, by which version a capture was made. UserError where it is absent or damaged."""
-    path = out / "truth" / "recipe.json"
+def read_capture_settings(out: Path) -> dict[str, Any]:
+    """Read the options and the version of a capture. UserError if the file is absent or damaged."""
+    path = out / "truth" / "capture_settings.json"
     if not path.is_file():
-        raise UserError(f"{path.parent} holds no truth; make a capture with python -m data_tools.sample {out}")
+        raise UserError(f"{path.parent} holds no ground truth; make a capture: python -m data_tools.sample {out}")
     try:
-        recipe = json.loads(path.read_text(encoding="utf-8"))
+        settings = json.loads(path.read_text(encoding="utf-8"))
     except ValueError:
-        recipe = None
-    if not isinstance(recipe, dict):
-        raise _damaged_recipe_error(out)
-    return recipe
+        settings = None
+    if not isinstance(settings, dict):
+        raise _damaged_settings_error(out)
+    return settings
 
 
-def _damaged_recipe_error(out: Path) -> UserError:
-    return UserError(f"{out / 'truth' / 'recipe.json'} is damaged; remove {out} and make the capture again")
+def require_current_version(out: Path, settings: Mapping[str, Any]) -> None:
+    """Raise UserError if the capture in `out` was made by another version of the program."""
+    if "version" not in settings:
+        raise _damaged_settings_error(out)
+    if settings["version"] != CAPTURE_VERSION:
+        raise UserError(
+            f"{out} is a capture of version {settings['version']}, this program reads version {CAPTURE_VERSION}; "
+            f"remove {out} and make it again: python -m data_tools.{settings.get('source', 'sample')} with the "
+            f"options in {out / 'truth' / 'capture_settings.json'}"
+        )
 
 
-def load_true_mask(out: Path, frame: int) -> UInt8[np.ndarray, "h w"]:
-    """Coverage by the person, 0 to 255, of one frame (by its index in the video)."""
-    return read_gray(out / "truth" / "masks" / f"{frame:06d}.png")
+def _damaged_settings_error(out: Path) -> UserError:
+    return UserError(
+        f"{out / 'truth' / 'capture_settings.json'} is damaged; remove {out} and make the capture again: "
+        f"python -m data_tools.sample {out}"
+    )
 
 
-def verify_ground_truth(out: Path, every: int = 1) -> GroundTruthCheck:
-    """Render the stored truth again and compare it with the decoded video and the stored masks.
+def load_true_mask(out: Path, frame_index: int) -> UInt8[np.ndarray, "h w"]:
+    """Read the coverage by the person, 0 to 255, of one frame of the video."""
+    return read_gray(out / "truth" / "masks" / f"{frame_index:06d}.png")
 
-    every: look at each `every`-th frame.
+
+def verify_ground_truth(out: Path, frame_stride: int = 1) -> GroundTruthCheck:
+    """Render the ground truth and compare it with the decoded video and the stored masks.
+
+    frame_stride: compare every n-th frame.
 
     Raises:
-        UserError: a file is missing or damaged, or the video has not as many frames as the truth.
+        UserError: a file is missing or damaged, or the numbers of frames differ.
     """
     capture = load_ground_truth(out)
     source = open_frame_source(out / "video")
     if source.n_frames != len(capture.motion.frame_index):
         raise UserError(
-            f"{source.path} has {source.n_frames} frames, its truth {len(capture.motion.frame_index)}; "
+            f"{source.path} has {source.n_frames} frames, its ground truth {len(capture.motion.frame_index)}; "
             f"remove {out} and make the capture again"
         )
     scores = []
     longer_side_px = max(capture.camera.width, capture.camera.height)
-    for frame in read_frames(source, lambda index: index % every == 0, longer_side_px):
-        picture, coverage = capture.frame(frame.index)
+    for frame in read_frames(source, lambda index: index % frame_stride == 0, longer_side_px):
+        image, coverage = capture.render_frame(frame.index)
         stored = foreground_mask(load_true_mask(out, frame.index))
-        full, body = psnr_db(picture, frame.rgb), psnr_db(picture, frame.rgb, stored)
+        full, body = psnr_db(image, frame.rgb), psnr_db(image, frame.rgb, stored)
         scores.append((full, body, mask_iou(foreground_mask(coverage), stored)))
     return GroundTruthCheck(len(scores), *(float(worst) for worst in np.min(scores, axis=0)))
 
 
 def write_meshes(out: Path, folder: Path) -> int:
-    """Write the clothed person of every frame as `000000.obj`, ... (world, metres, with UV); return their number.
+    """Write the clothed person of each frame as `000000.obj`, ... (world, metres, with UV); return their number.
 
     Raises:
-        UserError: there is no truth, or something at `folder`.
+        UserError: there is no ground truth, or `folder` exists.
     """
     capture = load_ground_truth(out)
     subject = capture.subject
@@ -145,23 +161,23 @@ def _main(argv: Sequence[str]) -> None:
         prog="python -m data_tools.evaluate.truth", description=(__doc__ or "").splitlines()[0]
     )
     parser.add_argument("out", type=Path, help="folder of a synthetic capture")
-    parser.add_argument("--every", type=int, default=8, help="look at each n-th frame (default 8)")
-    parser.add_argument("--meshes", type=Path, help="folder to make: the person of every frame as .obj")
+    parser.add_argument("--frame-stride", type=int, default=8, help="compare every n-th frame (default 8)")
+    parser.add_argument("--meshes", type=Path, help="new folder for the person of each frame as .obj")
     options = parser.parse_args(argv)
-    if options.every < 1:
-        raise UserError(f"--every {options.every} is too few; give at least 1")
+    if options.frame_stride < 1:
+        raise UserError(f"--frame-stride {options.frame_stride} is too small; choose at least 1")
     if options.meshes:
         count = write_meshes(options.out, options.meshes)
         print(f"{count} meshes in {options.meshes}")
         return
-    result = verify_ground_truth(options.out, options.every)
+    result = verify_ground_truth(options.out, options.frame_stride)
     print(
-        f"{result.frames} frames, worst: {result.psnr_full_db:.1f} dB in all, "
-        f"{result.psnr_body_db:.1f} dB on the body, mask IoU {result.mask_iou:.4f}"
+        f"{result.frames} frames, worst: {result.psnr_full_db:.1f} dB full image, "
+        f"{result.psnr_body_db:.1f} dB body pixels, mask IoU {result.mask_iou:.4f}"
     )
     if not result.passes():
         raise UserError(
-            f"{options.out} contradicts its truth (wanted {MIN_PSNR_DB} dB and IoU {MIN_IOU}); make it again"
+            f"{options.out} does not match its ground truth (needs {MIN_PSNR_DB} dB and IoU {MIN_IOU}); make it again"
         )
 
 

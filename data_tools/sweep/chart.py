@@ -18,7 +18,7 @@ from typing import Any
 from tqdm import tqdm
 
 from data_tools.command import run_command
-from data_tools.evaluate.truth import read_recipe
+from data_tools.evaluate.truth import read_capture_settings
 from data_tools.sample import main as make_sample
 from data_tools.sweep.chart_figure import PANELS, ChartPoint, draw_chart, pareto_front, preset_means, save_chart
 from data_tools.sweep.chart_trials import (
@@ -36,7 +36,7 @@ from data_tools.sweep.chart_trials import (
     table_row,
 )
 from data_tools.sweep.runs import CONFIGS, RunState, log_path, validate_run_options, write_csv
-from data_tools.synthetic.scene.capture import RECIPE_VERSION
+from data_tools.synthetic.scene.capture import CAPTURE_VERSION
 from pipeline.core.config import preset_files
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track
@@ -133,10 +133,10 @@ def _pareto_optimal_scores(trial: Trial, points: Sequence[ChartPoint]) -> str:
     """The scores on whose Pareto front the trial's preset lies."""
     on = []
     for panel in PANELS:
-        means = preset_means([point for point in points if point.capture == trial.capture_name], panel.mesh)
+        means = preset_means([point for point in points if point.capture == trial.capture_name], panel.mesh_score)
         front = pareto_front(list(means.values()), panel.higher_is_better)
         if trial.label in [list(means)[index] for index in front]:
-            on.append(panel.mesh)
+            on.append(panel.mesh_score)
     return " ".join(on)
 
 
@@ -149,7 +149,7 @@ def _make_sample_captures() -> None:
     for path, seed in SAMPLE_CAPTURES.items():
         if not path.exists():
             make_sample([str(path), "--seed", str(seed)])
-        elif read_recipe(path).get("version") != RECIPE_VERSION:
+        elif read_capture_settings(path).get("version") != CAPTURE_VERSION:
             raise UserError(f"{path} is of another version of the program: remove it, and it is made anew")
 
 

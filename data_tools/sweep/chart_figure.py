@@ -44,9 +44,9 @@ class Panel:
     """
 
     title: str
-    mesh: str
-    field: str | None
-    curve: int | None
+    mesh_score: str
+    field_score: str | None
+    curve_column: int | None
     higher_is_better: bool
 
 
@@ -84,7 +84,7 @@ def draw_chart(points: Sequence[ChartPoint], provenance: str) -> Figure:
     """
     captures = list(dict.fromkeys(point.capture for point in points))
     presets = list(dict.fromkeys(point.preset for point in points))
-    panels = [panel for panel in PANELS if any(panel.mesh in point.scores for point in points)]
+    panels = [panel for panel in PANELS if any(panel.mesh_score in point.scores for point in points)]
     if not panels:
         raise ValueError("a chart needs at least one run with a score")
     colours = {preset: mpl.colormaps["tab10"](number % 10) for number, preset in enumerate(presets)}
@@ -120,18 +120,18 @@ def _draw_runs(axes: Axes, panel: Panel, points: Sequence[ChartPoint], colours: 
     """Every run: a dot for the mesh, and before it the field, with the way it took to get there."""
     for point in points:
         colour = colours[point.preset]
-        if panel.mesh in point.scores:
-            axes.plot(point.seconds, point.scores[panel.mesh], ".", color=colour, markersize=4)
-        if panel.curve is not None and point.curve:
-            seconds, scores = zip(*((row[0], row[panel.curve]) for row in point.curve), strict=True)
+        if panel.mesh_score in point.scores:
+            axes.plot(point.seconds, point.scores[panel.mesh_score], ".", color=colour, markersize=4)
+        if panel.curve_column is not None and point.curve:
+            seconds, scores = zip(*((row[0], row[panel.curve_column]) for row in point.curve), strict=True)
             axes.plot(seconds, scores, color=colour, linewidth=1, alpha=0.7)
-        if panel.field in point.scores:
-            axes.plot(point.field_seconds, point.scores[panel.field], "D", mec=colour, mfc="white", markersize=5)
+        if panel.field_score in point.scores:
+            axes.plot(point.field_seconds, point.scores[panel.field_score], "D", mec=colour, mfc="white", markersize=5)
 
 
 def _draw_presets(axes: Axes, panel: Panel, points: Sequence[ChartPoint], colours: dict[str, Colour]) -> None:
     """Every preset's mean over seeds with its short name, and which of them no other beats."""
-    means = preset_means(points, panel.mesh)
+    means = preset_means(points, panel.mesh_score)
     for preset, place in means.items():
         axes.plot(*place, "o", color=colours[preset], markersize=7)
         axes.annotate(

@@ -29,8 +29,8 @@ def test_what_broke_off_leaves_no_folder_and_does_not_mix_with_the_next(tmp_path
 
 def test_nothing_is_overwritten(tmp_path):
     (tmp_path / "out").write_text("precious")
-    with pytest.raises(UserError, match="exists already"), atomic_folder(tmp_path / "out"):
+    with pytest.raises(UserError, match="already exists"), atomic_folder(tmp_path / "out"):
         pass
-    with pytest.raises(UserError, match="exists already"):
+    with pytest.raises(UserError, match="already exists"):
         require_absent(tmp_path / "out")
     assert (tmp_path / "out").read_text() == "precious"

@@ -20,6 +20,6 @@ def inspect_in_blender(glb: Path, picture: Path, seconds: float) -> dict[str, An
     script = Path(__file__).with_name("blender_import.py")
     command = [python, script, glb, picture, str(seconds)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
-    found = [line for line in done.stdout.splitlines() if line.startswith("FOUND ")]
+    found = [line for line in done.stdout.splitlines() if line.startswith("RESULT ")]
     assert found, done.stderr[-2000:]
-    return json.loads(found[0].removeprefix("FOUND "))
+    return json.loads(found[0].removeprefix("RESULT "))

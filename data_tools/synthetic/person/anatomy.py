@@ -1,4 +1,4 @@
-"""Places on the embedded parametric body that clothes and paint refer to."""
+"""Anatomical landmarks of the parametric body (Anny), to which clothes and textures refer."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from data_tools.synthetic.person.surface import face_components
 from pipeline.body.body import AnnyBody, Body
 
 SKIN, EYE, TONGUE, SKIRT = 0, 1, 2, 3
-"""Kinds of connected part of the dressed surface; the last is no part of the body's."""
+"""Labels of the connected components of the clothed surface; the body itself has no SKIRT."""
 
 _ARM_JOINTS = ("Arm", "ForeArm", "Hand")
 _MOUTH_UV = (0.909, 0.483)
@@ -18,7 +18,7 @@ _EAR_UVS = ((0.850, 0.630), (0.850, 0.340))
 
 @dataclass(frozen=True)
 class Anatomy:
-    """Canonical positions in metres; `left` is the person's left, +X."""
+    """Positions in the canonical frame, metres; the person's left is +X, and pairs are ordered left, right."""
 
     joints_m: dict[str, Float[np.ndarray, "3"]]
     eyes_m: Float[np.ndarray, "2 3"]
@@ -28,13 +28,13 @@ class Anatomy:
     crown_y_m: float
 
     def skull_m(self) -> Float[np.ndarray, "3"]:
-        """Middle of the skull: between the ears, at the height of the brows."""
+        """Return the centre of the skull: midway between the ears, at the height of the brows."""
         middle = self.ears_m.mean(axis=0)
         return np.array([middle[0], self.eyes_m[:, 1].mean() + 0.02, middle[2]], dtype=np.float32)
 
 
 def label_faces(body: Body) -> Int[np.ndarray, "f"]:
-    """SKIN, EYE or TONGUE of each face. The eyes are the pair of small parts with equally many faces."""
+    """Label each face SKIN, EYE or TONGUE; the eyes are the two smallest components, of equal size."""
     component = face_components(body.faces, len(body.vertices))
     sizes = np.bincount(component)
     label_of_component = np.full(len(sizes), TONGUE, dtype=np.int32)
@@ -45,7 +45,7 @@ def label_faces(body: Body) -> Int[np.ndarray, "f"]:
 
 
 def measure_anatomy(model: AnnyBody, body: Body) -> Anatomy:
-    """Find the places on one person's body."""
+    """Measure the landmarks of one body."""
     labels = label_faces(body)
     eye_vertices = np.unique(body.faces[labels == EYE])
     eye_points = body.vertices[eye_vertices]
@@ -63,14 +63,14 @@ def measure_anatomy(model: AnnyBody, body: Body) -> Anatomy:
 
 
 def compute_arm_head_weights(body: Body) -> Float[np.ndarray, "v 2"]:
-    """How much each vertex belongs to (an arm, the head), each in [0, 1]."""
+    """Return the summed skin weight of each vertex on the arms and on the head, in [0, 1]."""
     is_arm = np.array([name.endswith(_ARM_JOINTS) or "Hand" in name for name in body.joint_names])
     is_head = np.array([name == "Head" for name in body.joint_names])
     return np.stack([body.skin_weights[:, is_arm].sum(axis=1), body.skin_weights[:, is_head].sum(axis=1)], axis=1)
 
 
 def _vertex_nearest_uv(model: AnnyBody, body: Body, uv: tuple[float, float]) -> Float[np.ndarray, "3"]:
-    """The vertex nearest to a place in the body's UV layout."""
+    """Return the position of the vertex nearest to a point of the UV layout."""
     nearest = int(((model.uv - np.array(uv)) ** 2).sum(axis=1).argmin())
     face, corner = np.argwhere(model.faces_uv == nearest)[0]
     return body.vertices[body.faces[face, corner]]

@@ -1,9 +1,9 @@
-"""Clothes as offset surfaces: one closed surface that steps outwards at every hem.
+"""Model clothes as offset surfaces of the body.
 
-The body's surface is refined, smoothed where cloth does not follow it (navel, shoulder blades), pushed out along its
-normals by the thickness and the folds of each layer, and keeps the body's skin weights. It is draped twice: the second
-time the cuts are measured on the first drape, where cloth is smooth, so that hems and prints run straight. A skirt is a
-second closed surface around the legs.
+The surface of the body is subdivided, smoothed where cloth does not follow it (navel, shoulder blades), displaced along
+its normals by thickness and folds of each layer, and keeps the skin weights of the body. This is done twice: in the
+second pass, cuts are measured on the smooth surface of the first pass, so that hems and prints are straight. A skirt is
+a second closed surface around the legs.
 """
 
 from dataclasses import dataclass, replace
@@ -28,10 +28,10 @@ from pipeline.body.body import AnnyBody, Body
 from pipeline.geometry.mesh import Mesh
 
 HEM_TRANSITION_M = 0.006
-"""Over this distance a layer rises from nothing to its thickness."""
+"""Width of the transition of a layer from 0 to its thickness."""
 
 TOE_BOX_HEIGHT_M = 0.075
-"""Below this height a shoe is the convex hull of the foot, so that no toes show."""
+"""Below this height a shoe is the convex hull of the foot, which hides the toes."""
 
 SHOE_THICKNESS_M = 0.008
 """Thickness of the shoes' upper."""
@@ -42,9 +42,12 @@ _SMOOTHING_ITERATIONS = {"shoes": 2, "trousers": 24, "shirt": 40, "hair": 6}
 
 @dataclass(frozen=True)
 class ClothedSurface:
-    """The clothed surface and what the painter needs to know about it; rows are vertices.
+    """The clothed surface with the per-vertex and per-face data that texturing needs.
 
-    `drape_m` is the surface that the cuts of `compute_layer_depths_m` were measured on.
+    Attributes:
+        drape_m: vertex positions on which the cuts of `compute_layer_depths_m` were measured.
+        arm_head_weights: skin weights on the arms and on the head.
+        labels: SKIN, EYE, TONGUE or SKIRT of each face.
     """
 
     body: Body
@@ -56,7 +59,7 @@ class ClothedSurface:
 
 
 def add_clothing(model: AnnyBody, body: Body, anatomy: Anatomy, outfit: Outfit, noise: ValueNoise) -> ClothedSurface:
-    """Refine a person's body once and put the outfit on it."""
+    """Subdivide a body once and add the outfit."""
     pairs, faces = subdivide_at_midpoints(body.faces, len(body.vertices))
     uv_pairs, faces_uv = subdivide_at_midpoints(model.faces_uv, len(model.uv))
     bare = append_midpoint_values(body.vertices, pairs)
@@ -83,7 +86,7 @@ def add_clothing(model: AnnyBody, body: Body, anatomy: Anatomy, outfit: Outfit, 
 
 
 def _add_skirt(person: ClothedSurface, anatomy: Anatomy, noise: ValueNoise) -> ClothedSurface:
-    """Add the sheet around the legs; the body's charts make room for its own at the top of the atlas."""
+    """Add the skirt; the UV charts of the body are scaled down to free the top of the atlas."""
     skirt_mesh = build_skirt(person.body, person.arm_head_weights[:, 0], anatomy, noise)
     worn, start, start_uv = person.body, len(person.body.vertices), len(person.uv)
     body = replace(
@@ -110,7 +113,7 @@ def _add_layers(
     anatomy: Anatomy,
     noise: ValueNoise,
 ) -> Float[np.ndarray, "v 3"]:
-    """Put one layer after the other over the surface."""
+    """Displace the surface by all layers in order."""
     vertices = skin_m
     for column, layer in enumerate(LAYERS):
         smooth = smooth_laplacian(vertices, mean, _SMOOTHING_ITERATIONS[layer])
@@ -126,9 +129,9 @@ def _add_layers(
 def _add_toe_boxes(
     bare_m: Float[np.ndarray, "v 3"], mean: sparse.csr_matrix, skin_vertices: np.ndarray, anatomy: Anatomy
 ) -> Float[np.ndarray, "v 3"]:
-    """Wrap the lower part of each foot around its convex hull, which closes the gaps between the toes.
+    """Project the lower part of each foot onto its convex hull, which closes the gaps between the toes.
 
-    Smoothing and projecting in turns spreads the toes' sides, which would lie folded on the hull, over its surface.
+    Alternating smoothing and projection distributes the sides of the toes over the hull instead of folding them.
     """
     vertices = bare_m
     for side in ("Left", "Right"):
@@ -144,7 +147,7 @@ def _add_toe_boxes(
 def _project_onto_hull(
     points: Float[np.ndarray, "n 3"], hull: Float[np.ndarray, "h 4"], toes: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Where rays from the foot's axis through the points leave the hull widened by `SHOE_THICKNESS_M`."""
+    """Intersect rays from the axis of the foot through the points with the hull, offset by `SHOE_THICKNESS_M`."""
     ahead = np.minimum(points[:, 2], toes[2] - 0.03)
     axis = np.stack([np.full(len(points), toes[0]), np.full(len(points), 0.012), ahead], axis=1)
     outwards = points - axis
@@ -157,7 +160,7 @@ def _project_onto_hull(
 def _flatten_soles(
     vertices: Float[np.ndarray, "v 3"], layer_weight: Float[np.ndarray, "v"]
 ) -> Float[np.ndarray, "v 3"]:
-    """Press the lowest 12 mm of the shoes into one plane, so that the person stands."""
+    """Flatten the lowest 12 mm of the shoes into one plane."""
     sole_y = vertices[layer_weight > 0.5, 1].min() + 0.012
     flat = vertices.copy()
     flat[:, 1] = np.where((layer_weight > 0.5) & (flat[:, 1] < sole_y), sole_y - 0.012, flat[:, 1])
@@ -165,12 +168,12 @@ def _flatten_soles(
 
 
 def _shoe_thickness(points: np.ndarray, depth: np.ndarray, anatomy: Anatomy, noise: ValueNoise) -> np.ndarray:
-    """Nothing where the hull already made room for the shoe, its thickness above."""
+    """Return 0 below the toe box, which already has the thickness, and `SHOE_THICKNESS_M` above."""
     return np.where(points[:, 1] < TOE_BOX_HEIGHT_M, 0.0, SHOE_THICKNESS_M)
 
 
 def _trouser_thickness(points: np.ndarray, depth: np.ndarray, anatomy: Anatomy, noise: ValueNoise) -> np.ndarray:
-    """Close at the hip, wide at the hem; folds gather at the knee and above the shoe."""
+    """Return a thickness that grows from hip to hem, with folds at the knee and above the shoe."""
     knee_y, foot_y = anatomy.joints_m["LeftLeg"][1], anatomy.joints_m["LeftFoot"][1]
     hip_to_ankle = np.clip((anatomy.joints_m["Hips"][1] - points[:, 1]) / (anatomy.joints_m["Hips"][1] - foot_y), 0, 1)
     gather = np.exp(-(((points[:, 1] - knee_y) / 0.07) ** 2)) + np.exp(-(((points[:, 1] - foot_y) / 0.10) ** 2))
@@ -179,7 +182,7 @@ def _trouser_thickness(points: np.ndarray, depth: np.ndarray, anatomy: Anatomy, 
 
 
 def _shirt_thickness(points: np.ndarray, depth: np.ndarray, anatomy: Anatomy, noise: ValueNoise) -> np.ndarray:
-    """Rests on the shoulders, hangs loose at waist and sleeves; long folds run downwards."""
+    """Return a thickness that grows from the shoulders to the waist, with long vertical folds."""
     shoulder_y, hips_y = anatomy.joints_m["LeftArm"][1], anatomy.joints_m["Hips"][1]
     looseness = np.clip((shoulder_y - points[:, 1]) / (shoulder_y - hips_y), 0.0, 1.0)
     folds = noise(points, (0.05, 0.16, 0.05), order=3) * (0.001 + 0.006 * looseness)
@@ -189,7 +192,7 @@ def _shirt_thickness(points: np.ndarray, depth: np.ndarray, anatomy: Anatomy, no
 
 
 def _hair_thickness(points: np.ndarray, depth: np.ndarray, anatomy: Anatomy, noise: ValueNoise) -> np.ndarray:
-    """Thin at the hairline, full on the crown, in locks."""
+    """Return a thickness that grows from the hairline to the crown, modulated by locks of hair."""
     fullness = np.clip(depth / 0.05, 0.0, 1.0) ** 0.7
     locks = noise(points, (0.016, 0.03, 0.03), order=3) * 0.004
     return 0.004 + fullness * (0.017 + locks)

@@ -1,4 +1,4 @@
-"""What the built-in person wears, and where on the body each layer lies."""
+"""Outfit of the built-in person, and the regions of the body that each clothing layer covers."""
 
 from dataclasses import dataclass
 
@@ -8,20 +8,27 @@ from jaxtyping import Float
 from data_tools.synthetic.person.anatomy import Anatomy
 
 LAYERS = ("shoes", "trousers", "shirt", "hair")
-"""Offset surfaces, from the skin outwards: a later layer hides an earlier one."""
+"""Offset surfaces from the skin outwards; a later layer occludes an earlier one."""
 
 LEGWEAR = ("trousers", "skirt")
-"""What covers the legs: a layer, or the loose sheet of `data_tools.synthetic.person.skirt` over bare legs."""
+"""Clothing of the legs: a layer, or the separate surface of `data_tools.synthetic.person.skirt`."""
 
 TUCKED_SHIRT_BELOW_HIPS_M = -0.03
-"""Where a shirt that is tucked into a skirt ends, as `Outfit.shirt_below_hips_m`."""
+"""`Outfit.shirt_below_hips_m` of a shirt that is tucked into a skirt."""
 
 Colour = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Outfit:
-    """Cuts in metres and fractions, colours in sRGB [0, 1]."""
+    """Cuts of the clothes, and colours (sRGB in [0, 1]).
+
+    Attributes:
+        legwear: one of `LEGWEAR`.
+        sleeve_fraction: length of the sleeve relative to the upper arm.
+        shirt_below_hips_m: height of the hips above the hem of the shirt.
+        plaid: second colour of the skirt.
+    """
 
     legwear: str
     sleeve_fraction: float
@@ -57,7 +64,7 @@ _SKIN: tuple[Colour, ...] = ((0.86, 0.65, 0.54), (0.72, 0.51, 0.39), (0.52, 0.35
 
 
 def choose_outfit(seed: int, legwear: str = "trousers") -> Outfit:
-    """The wardrobe's entry for a seed; seed 0 is the first of everything. legwear: one of `LEGWEAR`."""
+    """Choose the outfit of a seed; seed 0 takes the first of each colour. legwear: one of `LEGWEAR`."""
     choice_indices = np.random.default_rng(seed).integers(0, 1_000_000, 6) if seed else np.zeros(6, dtype=np.int64)
     shirt, stripe = _SHIRTS[choice_indices[0] % len(_SHIRTS)]
     skirt, plaid = _SKIRTS[choice_indices[1] % len(_SKIRTS)]
@@ -81,9 +88,11 @@ def choose_outfit(seed: int, legwear: str = "trousers") -> Outfit:
 def compute_layer_depths_m(
     points_m: Float[np.ndarray, "n 3"], arm_head_weights: Float[np.ndarray, "n 2"], anatomy: Anatomy, outfit: Outfit
 ) -> Float[np.ndarray, "n 4"]:
-    """How far inside each of `LAYERS` a point of the A-pose surface lies, in metres; negative outside.
+    """Compute the signed distance of surface points to the border of each of `LAYERS`, metres; negative outside.
 
-    points_m: canonical positions. limbs: weights of (an arm, the head), from `anatomy.compute_arm_head_weights`.
+    Args:
+        points_m: canonical positions in the A-pose.
+        arm_head_weights: from `anatomy.compute_arm_head_weights`.
     """
     height = points_m[:, 1]
     on_arm, on_head = arm_head_weights[:, 0] > 0.5, arm_head_weights[:, 1] > 0.35
@@ -102,14 +111,14 @@ def compute_layer_depths_m(
 
 
 def neckline_depth_m(points_m: Float[np.ndarray, "n 3"], anatomy: Anatomy) -> Float[np.ndarray, "n"]:
-    """Depth below a crew neck: a plane through the root of the neck that falls towards the front."""
+    """Return the depth below the neckline: a plane through the root of the neck, lower at the front."""
     normal = np.array([0.0, 1.0, 0.62]) / np.hypot(1.0, 0.62)
     root = anatomy.joints_m["Neck"] + np.array([0.0, 0.012, 0.0])
     return _dot(root - points_m, normal)
 
 
 def _sleeve_depth_m(points_m: Float[np.ndarray, "n 3"], anatomy: Anatomy, outfit: Outfit) -> Float[np.ndarray, "n"]:
-    """Distance along the upper arm to the sleeve's hem."""
+    """Return the distance along the upper arm to the hem of the sleeve."""
     joints = anatomy.joints_m
     depth = np.empty(len(points_m))
     is_left = points_m[:, 0] > joints["Hips"][0]
@@ -122,7 +131,7 @@ def _sleeve_depth_m(points_m: Float[np.ndarray, "n 3"], anatomy: Anatomy, outfit
 
 
 def _hair_depth_m(points_m: Float[np.ndarray, "n 3"], anatomy: Anatomy) -> Float[np.ndarray, "n"]:
-    """A short haircut: high on the forehead, around the ears, down to the nape."""
+    """Return the depth inside the hair region: forehead, around the ears, nape."""
     from_skull = points_m - anatomy.skull_m()
     side = np.abs(from_skull[:, 0])
     hairline = 0.62 * from_skull[:, 1] - 0.78 * from_skull[:, 2] + 0.024 + 0.12 * np.maximum(side - 0.03, 0.0)
@@ -134,5 +143,5 @@ def _hair_depth_m(points_m: Float[np.ndarray, "n 3"], anatomy: Anatomy) -> Float
 
 
 def _dot(points: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n"]:
-    """Inner products, summed in one order: the last bits of a BLAS product depend on the number of threads."""
+    """Return inner products in a fixed summation order; BLAS results depend on the number of threads."""
     return points[:, 0] * direction[0] + points[:, 1] * direction[1] + points[:, 2] * direction[2]

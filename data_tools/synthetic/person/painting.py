@@ -1,4 +1,4 @@
-"""Procedural colours of the dressed person, painted per texel as functions of the canonical position."""
+"""Texture the clothed person procedurally: the colour of each texel is a function of the canonical position."""
 
 from dataclasses import dataclass
 
@@ -26,7 +26,7 @@ _OPAQUE = [255.0]
 
 @dataclass(frozen=True)
 class Texels:
-    """Surface points behind the covered texels; rows are texels."""
+    """Surface points of the covered texels; rows are texels."""
 
     points_m: Float[np.ndarray, "n 3"]
     arm_head_weights: Float[np.ndarray, "n 2"]
@@ -36,7 +36,7 @@ class Texels:
 def paint_texture(
     clothed: ClothedSurface, anatomy: Anatomy, outfit: Outfit, noise: ValueNoise, size_px: int
 ) -> Float[np.ndarray, "s s 3"]:
-    """sRGB texture of the clothed surface; texels outside all charts repeat the nearest chart's colour."""
+    """Render the sRGB texture of the clothed surface; uncovered texels take the nearest covered colour."""
     face_id, barycentric = _rasterize_atlas(clothed, size_px)
     covered = face_id >= 0
     texels = _texels(clothed, face_id[covered], barycentric[covered])
@@ -49,7 +49,7 @@ def paint_texture(
 def _rasterize_atlas(
     clothed: ClothedSurface, size_px: int
 ) -> tuple[Int[np.ndarray, "s s"], Float[np.ndarray, "s s 3"]]:
-    """Face and barycentrics at every texel centre; row 0 is v = 1."""
+    """Return face index (-1 if uncovered) and barycentric coordinates at each texel centre; row 0 is v = 1."""
     position_px = torch.from_numpy(clothed.uv * [size_px, -size_px] + [0.0, size_px]).float()
     face_id, barycentric, _ = rasterize(
         position_px, torch.ones(len(position_px)), torch.from_numpy(clothed.faces_uv), size_px, size_px
@@ -68,7 +68,7 @@ def _texels(clothed: ClothedSurface, faces: Int[np.ndarray, "n"], barycentric: F
 
 
 def _texel_colours(texels: Texels, anatomy: Anatomy, outfit: Outfit, noise: ValueNoise) -> Float[np.ndarray, "n 3"]:
-    """The colour of the outermost layer at each texel."""
+    """Return the colour of the outermost layer at each texel."""
     depths = compute_layer_depths_m(texels.points_m, texels.arm_head_weights, anatomy, outfit)
     outermost = np.full(len(depths), SKIN_LAYER)
     for column in range(len(LAYERS)):
@@ -95,7 +95,7 @@ def _shaded(base: tuple[float, float, float], brightness: Float[np.ndarray, "n"]
 def _paint_shirt(
     points: np.ndarray, depth: np.ndarray, anatomy: Anatomy, outfit: Outfit, noise: ValueNoise
 ) -> Float[np.ndarray, "n 3"]:
-    """Knitted cloth with two stripes at waist and sleeves, a ribbed collar, an emblem in front and a number behind."""
+    """Colour knitted cloth with two stripes, a collar, an emblem on the chest and a number on the back."""
     hips, weave = anatomy.joints_m["Hips"], noise(points, 0.0022) * 0.05 + noise.fractal(points, 0.06) * 0.05
     colours = _shaded(outfit.shirt, 1.0 + weave)
     above_hem = points[:, 1] - (hips[1] - outfit.shirt_below_hips_m)
@@ -115,7 +115,7 @@ def _paint_shirt(
 def _project_print(
     colours: Float[np.ndarray, "n 3"], points: np.ndarray, anatomy: Anatomy, outfit: Outfit, is_front: bool
 ) -> None:
-    """Project the emblem onto the chest, or the number onto the back, along Z; writes into `colours`."""
+    """Project the emblem onto the chest, or the number onto the back, along Z; blend into `colours` in place."""
     chest = 0.5 * (anatomy.joints_m["Spine2"] + anatomy.joints_m["Spine1"])
     middle_z = anatomy.joints_m["LeftArm"][2]
     across = (points[:, 0] - chest[0]) * (1.0 if is_front else -1.0)
@@ -130,7 +130,7 @@ def _project_print(
 
 
 def _emblem(outfit: Outfit, size_px: int = 768) -> Float[np.ndarray, "s s 4"]:
-    """A ring around a five-pointed star, with letters beneath; straight alpha."""
+    """Draw a ring around a five-pointed star with text below; straight RGBA in [0, 1]."""
     colour, dark = _rgb(outfit.stripe), _rgb(tuple(0.35 * c for c in outfit.shirt))
     art, alpha = np.zeros((size_px, size_px, 3), np.uint8), np.zeros((size_px, size_px), np.uint8)
     centre, unit = (size_px // 2, int(0.40 * size_px)), size_px / 768
@@ -147,7 +147,7 @@ def _emblem(outfit: Outfit, size_px: int = 768) -> Float[np.ndarray, "s s 4"]:
 
 
 def _number(outfit: Outfit, size_px: int = 768) -> Float[np.ndarray, "s s 4"]:
-    """The wearer's number in big figures; straight alpha."""
+    """Draw the number in large digits; straight RGBA in [0, 1]."""
     art = np.zeros((size_px, size_px, 3), np.uint8)
     art[:] = _rgb(outfit.stripe)
     alpha = np.zeros((size_px, size_px), np.uint8)
@@ -159,14 +159,14 @@ def _number(outfit: Outfit, size_px: int = 768) -> Float[np.ndarray, "s s 4"]:
 
 
 def _rgb(colour: tuple[float, ...]) -> list[float]:
-    """The colour as OpenCV draws it, 0 to 255."""
+    """Convert a colour from [0, 1] to the range 0 to 255 that OpenCV draws."""
     return [float(round(255 * c)) for c in colour]
 
 
 def _paint_trousers(
     points: np.ndarray, depth: np.ndarray, anatomy: Anatomy, outfit: Outfit, noise: ValueNoise
 ) -> Float[np.ndarray, "n 3"]:
-    """Twill with worn thighs, side seams, front pockets and a stitched hem."""
+    """Colour twill with worn thighs, side seams, front pockets and a stitched hem."""
     joints = anatomy.joints_m
     twill = noise(points, (0.0018, 0.012, 0.0018)) * 0.13 + noise.fractal(points, 0.09) * 0.10
     thigh_y = 0.5 * (joints["LeftUpLeg"][1] + joints["LeftLeg"][1])
@@ -182,7 +182,7 @@ def _paint_trousers(
 
 
 def _paint_skirt(points: np.ndarray, anatomy: Anatomy, outfit: Outfit, noise: ValueNoise) -> Float[np.ndarray, "n 3"]:
-    """Checked wool: bands around and bands downwards, each half see-through, with two lines above the hem."""
+    """Colour plaid wool: translucent horizontal and vertical bands, and two lines above the hem."""
     hips, weave = anatomy.joints_m["Hips"], noise(points, 0.0025) * 0.06 + noise.fractal(points, 0.08) * 0.06
     angle = np.arctan2(points[:, 2] - hips[2], points[:, 0] - hips[0])
     above_hem = points[:, 1] - waist_and_hem_m(anatomy)[1]
@@ -190,14 +190,14 @@ def _paint_skirt(points: np.ndarray, anatomy: Anatomy, outfit: Outfit, noise: Va
     around, down = np.mod(above_hem + 0.02, 0.11) < 0.035, np.mod(angle / (2.0 * np.pi) * 16.0, 1.0) < 0.3
     on_thin_line = (np.abs(np.mod(above_hem, 0.11) - 0.062) < 0.003) | (np.abs(above_hem - 0.012) < 0.004)
     ink = _shaded(outfit.plaid, 1.0 + weave)
-    share = 0.45 * around + 0.30 * down + 0.5 * on_thin_line
-    return colours + np.minimum(share, 0.9)[:, None] * (ink - colours)
+    opacity = 0.45 * around + 0.30 * down + 0.5 * on_thin_line
+    return colours + np.minimum(opacity, 0.9)[:, None] * (ink - colours)
 
 
 def _paint_shoes(
     points: np.ndarray, depth: np.ndarray, anatomy: Anatomy, outfit: Outfit, noise: ValueNoise
 ) -> Float[np.ndarray, "n 3"]:
-    """Canvas shoes with a light sole and toe cap, and laces."""
+    """Colour canvas shoes with light sole, toe cap and laces."""
     foot, toes = anatomy.joints_m["LeftFoot"], anatomy.joints_m["LeftToeBase"]
     colours = _shaded(outfit.shoes, 1.0 + noise(points, 0.004) * 0.10)
     on_tongue = (points[:, 2] > foot[2] + 0.05) & (points[:, 2] < toes[2] - 0.01) & (points[:, 1] > 0.045)
@@ -210,7 +210,7 @@ def _paint_shoes(
 def _paint_hair(
     points: np.ndarray, depth: np.ndarray, anatomy: Anatomy, outfit: Outfit, noise: ValueNoise
 ) -> Float[np.ndarray, "n 3"]:
-    """Strands that run from the crown down and back."""
+    """Colour hair with strands that run down and back from the crown."""
     strands = noise(points, (0.0028, 0.03, 0.03)) * 0.34 + noise(points + 5.0, (0.009, 0.05, 0.05)) * 0.28
     return _shaded(outfit.hair, 1.12 + strands)
 

@@ -1,4 +1,4 @@
-"""The built-in clothed person: an embedded parametric body, a wardrobe and a paint box. Needs no download."""
+"""Generate the built-in clothed person from the parametric body model Anny; no download is needed."""
 
 import numpy as np
 from jaxtyping import Float
@@ -21,11 +21,11 @@ _PHENOTYPES = {
     "proportions": (0.6, 0.2),
     "caucasian": (0.6, 0.0),
 }
-"""Phenotypes of the built-in person and their spread over seeds, each clipped to [0, 1]."""
+"""Mean and half range over seeds of each Anny phenotype; values are clipped to [0, 1]."""
 
 
 def make_person(seed: int, texture_px: int = 2048, legwear: str = "trousers") -> tuple[Subject, Body]:
-    """The person of a seed: dressed and painted, and the bare body beneath. The same seed gives the same arrays."""
+    """Return the clothed, textured person of a seed, and the body without clothes; equal seeds give equal arrays."""
     model, noise, outfit = load_anny(), ValueNoise(seed), choose_outfit(seed, legwear)
     bare = model.body(_shape(model, seed))
     anatomy = measure_anatomy(model, bare)
@@ -35,7 +35,7 @@ def make_person(seed: int, texture_px: int = 2048, legwear: str = "trousers") ->
 
 
 def _shape(model: AnnyBody, seed: int) -> Float[Tensor, "p"]:
-    """Shape parameters; seed 0 is a man of average build, other seeds spread around him."""
+    """Return the shape parameters of a seed; seed 0 has the mean phenotypes, others vary around them."""
     shape = model.shape_defaults.clone()
     random = np.random.default_rng([seed, 1])
     for name, (middle, spread) in _PHENOTYPES.items():

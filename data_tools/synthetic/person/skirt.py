@@ -1,8 +1,8 @@
-"""A skirt: one closed sheet of cloth around both legs, which hangs from the hips and moves with both legs.
+"""Build a skirt: one closed surface around both legs, skinned to hips and thighs.
 
-The sheet is a ring of columns around the body times a profile that runs down outside and up again inside. Every row is
-wide enough for the convex hull of the body at its height, and no narrower than the row above it: cloth spans the gap
-between the legs and falls straight from the widest place.
+The surface is a grid: columns around the body times a profile down the outer side and up the inner side. Each row
+encloses the convex hull of the body at its height and is at least as wide as the row above, so the cloth spans the gap
+between the legs and falls straight from the widest height.
 """
 
 from collections.abc import Callable
@@ -21,27 +21,27 @@ ROWS, COLUMNS = 40, 192
 N_PLEATS = 14
 THICKNESS_M = 0.004
 EASE_M = 0.006
-"""Between the cloth and what is worn beneath it, at the waist."""
+"""Distance between the skirt and the surface below it, at the waist."""
 
 HEM_FLARE_M = 0.07
-"""How much farther out the hem is than cloth that falls straight."""
+"""Additional radius at the hem, compared with cloth that falls straight."""
 
 PLEAT_DEPTH_M = 0.028
 """Depth of the pleats at the hem."""
 
 ATLAS_HEIGHT_FRACTION = 0.25
-"""Share of the texture's height that the sheet takes, at its top."""
+"""Fraction of the texture height, at the top, that the skirt occupies."""
 
 _ATLAS_MARGIN = 0.004
 _MAX_ARM_WEIGHT = 0.02
 _SLICE_HALF_HEIGHT_M = 0.03
 _WEIGHT_SIGMA_M = (0.02, 0.06)
-"""Over these distances a place of the sheet averages the skin weights of the body, at the waist and at the hem."""
+"""Standard deviation of the Gaussian that averages the skin weights of the body, at waist and hem."""
 
 
 @dataclass(frozen=True)
 class SkirtMesh:
-    """A closed surface with its place in the atlas; rows of `faces_uv` belong to those of `faces`."""
+    """A closed surface with UV; rows of `faces_uv` correspond to rows of `faces`."""
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
@@ -50,13 +50,13 @@ class SkirtMesh:
     skin_weights: Float[np.ndarray, "v j"]
 
 
-def build_skirt(body: Body, arms: Float[np.ndarray, "v"], anatomy: Anatomy, noise: ValueNoise) -> SkirtMesh:
-    """Fit a skirt around a person in the A-pose, over the shirt.
+def build_skirt(body: Body, arm_weights: Float[np.ndarray, "v"], anatomy: Anatomy, noise: ValueNoise) -> SkirtMesh:
+    """Fit a skirt around a clothed person in the A-pose.
 
-    arms: how much each vertex belongs to an arm, in [0, 1]; the skirt passes below hands.
+    arm_weights: skin weight of each vertex on the arms, in [0, 1]; vertices on arms are ignored.
     """
     waist_to_hem = np.linspace(0.0, 1.0, ROWS)
-    trunk = arms < _MAX_ARM_WEIGHT
+    trunk = arm_weights < _MAX_ARM_WEIGHT
     outer_surface = _outer_surface_m(body.vertices[trunk], waist_to_hem, anatomy, noise)
     axis = _axis_m(outer_surface[:, 0, 1], anatomy)[:, None]
     inwards = axis - outer_surface
@@ -73,14 +73,14 @@ def build_skirt(body: Body, arms: Float[np.ndarray, "v"], anatomy: Anatomy, nois
 
 
 def waist_and_hem_m(anatomy: Anatomy) -> tuple[float, float]:
-    """Heights between which the skirt hangs: from above the hips to above the knees."""
+    """Return the heights of waist and hem: above the hips, and above the knees."""
     return float(anatomy.joints_m["Hips"][1]) + 0.07, float(anatomy.joints_m["LeftLeg"][1]) + 0.05
 
 
 def _outer_surface_m(
     trunk_m: Float[np.ndarray, "n 3"], waist_to_hem: Float[np.ndarray, "r"], anatomy: Anatomy, noise: ValueNoise
 ) -> Float[np.ndarray, "r c 3"]:
-    """Places of the outer side: from the waist (fall 0) to the hem (fall 1), round from +X by +Z."""
+    """Return positions of the outer side; rows from waist (0) to hem (1), columns from +X towards +Z."""
     top, hem = waist_and_hem_m(anatomy)
     height = top + (hem - top) * waist_to_hem
     axis = _axis_m(height, anatomy)
@@ -96,7 +96,7 @@ def _outer_surface_m(
 
 
 def _axis_m(height_m: Float[np.ndarray, "r"], anatomy: Anatomy) -> Float[np.ndarray, "r 3"]:
-    """Midway between the legs, which runs inside the hull of both at every height."""
+    """Return the points midway between the legs, which are inside the convex hull at each height."""
     leg = np.stack([anatomy.joints_m[name] for name in ("LeftLeg", "LeftUpLeg", "Spine")]).astype(np.float64)
     middle_z = np.interp(height_m, leg[:, 1], leg[:, 2])
     middle_x = np.full(len(height_m), anatomy.joints_m["Hips"][0])
@@ -106,7 +106,7 @@ def _axis_m(height_m: Float[np.ndarray, "r"], anatomy: Anatomy) -> Float[np.ndar
 def _hull_radius_m(
     points_m: Float[np.ndarray, "n 3"], middle_m: Float[np.ndarray, "3"], outwards: Float[np.ndarray, "c 3"]
 ) -> Float[np.ndarray, "c"]:
-    """Where horizontal rays from the middle leave the convex hull of the body near that height."""
+    """Return the distances at which horizontal rays from the middle leave the convex hull near that height."""
     near = np.abs(points_m[:, 1] - middle_m[1]) < _SLICE_HALF_HEIGHT_M
     hull = ConvexHull(points_m[near][:, [0, 2]] - middle_m[[0, 2]]).equations
     return hull_exit_distance_m(np.zeros((1, 2)), outwards[:, [0, 2]], hull)
@@ -115,9 +115,9 @@ def _hull_radius_m(
 def _average_skin_weights(
     body: Body, trunk: np.ndarray, outside_m: Float[np.ndarray, "r c 3"], waist_to_hem: Float[np.ndarray, "r"]
 ) -> Float[np.ndarray, "r c j"]:
-    """Means of the body's skin weights around each place, the wider the lower: between the legs both count.
+    """Average the skin weights of the body around each position, with a larger radius at lower heights.
 
-    What moves a lower leg counts for the thigh: cloth above the knee does not follow the calf.
+    Weights on a lower leg are added to the thigh, because cloth above the knee does not follow the calf.
     """
     joints = [body.joint(name) for name in ("Hips", "Spine", "LeftUpLeg", "RightUpLeg")]
     body_weights = body.skin_weights[:, joints].astype(np.float64)
@@ -127,10 +127,10 @@ def _average_skin_weights(
         body_weights[:, [0, column]] += lower[:, None] * [-1.0, 1.0]
     height = outside_m[:, 0, 1]
     near = trunk & (body.vertices[:, 1] > height[-1] - 0.1) & (body.vertices[:, 1] < height[0] + 0.1)
-    places, body_weights = body.vertices[near].astype(np.float64), body_weights[near]
+    positions_m, body_weights = body.vertices[near].astype(np.float64), body_weights[near]
     weights = np.zeros((*outside_m.shape[:2], len(body.joint_names)), dtype=np.float32)
     for row, sigma_m in enumerate(_WEIGHT_SIGMA_M[0] + (_WEIGHT_SIGMA_M[1] - _WEIGHT_SIGMA_M[0]) * waist_to_hem):
-        squared_distance_m2 = ((outside_m[row][:, None] - places) ** 2).sum(axis=2)
+        squared_distance_m2 = ((outside_m[row][:, None] - positions_m) ** 2).sum(axis=2)
         kernel = np.exp(-0.5 * (squared_distance_m2 - squared_distance_m2.min(axis=1, keepdims=True)) / sigma_m**2)
         kernel /= kernel.sum(axis=1, keepdims=True)
         for joint, values in zip(joints, body_weights.T, strict=True):
@@ -139,7 +139,7 @@ def _average_skin_weights(
 
 
 def _quads(rows: int, columns: int, index: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Int[np.ndarray, "f 3"]:
-    """Two triangles for each cell of a grid, seen from outside counter-clockwise."""
+    """Return two triangles per grid cell, counter-clockwise seen from outside."""
     row, column = np.divmod(np.arange(rows * columns), columns)
     a, b, c, d = index(row, column), index(row, column + 1), index(row + 1, column + 1), index(row + 1, column)
     return np.stack([a, b, c, a, c, d], axis=1).reshape(-1, 3).astype(np.int32)

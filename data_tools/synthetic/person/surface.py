@@ -1,20 +1,21 @@
-"""Mesh operations that dressing a body needs: midpoint subdivision, smoothing, connected parts, convex hulls."""
+"""Mesh operations of the clothing model: midpoint subdivision, smoothing, connected components, convex hulls."""
 
 import numpy as np
 import scipy.sparse as sparse
 from jaxtyping import Float, Int
 
 _PARALLEL_EPS = 1e-9
-"""A ray that nears a plane more slowly than this never meets it."""
+"""Rays with a smaller cosine to the plane normal are treated as parallel to the plane."""
 
 
 def subdivide_at_midpoints(
     faces: Int[np.ndarray, "f 3"], vertex_count: int
 ) -> tuple[Int[np.ndarray, "m 2"], Int[np.ndarray, "g 3"]]:
-    """Cut every triangle into four.
+    """Split each triangle into four.
 
-    Returns the vertex pairs whose midpoints become vertices `vertex_count`, `vertex_count + 1`, ..., and the new faces:
-    the children of face i are rows 4 i .. 4 i + 3, so that faces over positions and faces over UVs stay in step.
+    Returns:
+        Vertex pairs whose midpoints become vertices `vertex_count`, `vertex_count + 1`, ..., and the new faces. The
+        children of face i are rows 4 i to 4 i + 3, so faces over positions and faces over UV stay aligned.
     """
     half_edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     pairs, edge_of = np.unique(half_edges, axis=0, return_inverse=True)
@@ -26,12 +27,12 @@ def subdivide_at_midpoints(
 
 
 def append_midpoint_values(values: Float[np.ndarray, "v c"], pairs: Int[np.ndarray, "m 2"]) -> Float[np.ndarray, "w c"]:
-    """Per-vertex values followed by those of the midpoints."""
+    """Append the values of the midpoints to per-vertex values."""
     return np.concatenate([values, values[pairs].mean(axis=1, dtype=values.dtype)])
 
 
 def neighbour_averaging_matrix(faces: Int[np.ndarray, "f 3"], vertex_count: int) -> sparse.csr_matrix:
-    """Row-stochastic matrix that takes each vertex to the mean of its neighbours (itself where it has none)."""
+    """Return the row-stochastic matrix of uniform neighbour averages; isolated vertices map to themselves."""
     pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     pairs = np.concatenate([pairs, pairs[:, ::-1]])
     adjacency = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(vertex_count, vertex_count)).tocsr()
@@ -44,7 +45,7 @@ def neighbour_averaging_matrix(faces: Int[np.ndarray, "f 3"], vertex_count: int)
 def smooth_laplacian(
     vertices: Float[np.ndarray, "v 3"], mean: sparse.csr_matrix, iterations: int
 ) -> Float[np.ndarray, "v 3"]:
-    """Uniform Laplacian smoothing with half steps, which spans hollows as cloth does."""
+    """Apply uniform Laplacian smoothing with step size 0.5."""
     result = vertices.astype(np.float64)
     for _ in range(iterations):
         result = 0.5 * (result + mean @ result)
@@ -52,7 +53,7 @@ def smooth_laplacian(
 
 
 def face_components(faces: Int[np.ndarray, "f 3"], vertex_count: int) -> Int[np.ndarray, "f"]:
-    """Connected part of each face, numbered by falling face count."""
+    """Return the connected component of each face, numbered by descending face count."""
     pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
     graph = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(vertex_count, vertex_count))
     component = sparse.csgraph.connected_components(graph, directed=False)[1][faces[:, 0]]
@@ -68,10 +69,10 @@ def hull_exit_distance_m(
     half_spaces: Float[np.ndarray, "h e"],
     margin_m: float = 0.0,
 ) -> Float[np.ndarray, "n"]:
-    """How far rays from inside a convex hull run until they leave it, widened by a margin.
+    """Return the distance along rays from inside a convex hull to its surface, offset by a margin.
 
-    A half-space n·x + d <= 0 (a row of `ConvexHull.equations`: unit normal n, offset d) ends the ray a + t u at
-    t = (margin - n·a - d) / (n·u); the smallest positive t is the surface.
+    A half-space n·x + d <= 0 (a row of `ConvexHull.equations`: unit normal n, offset d) bounds the ray a + t u at
+    t = (margin - n·a - d) / (n·u); the smallest positive t is the exit.
     """
     normals, offsets_m = half_spaces[:, :-1].T, half_spaces[:, -1]
     slope = directions @ normals

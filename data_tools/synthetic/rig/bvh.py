@@ -1,4 +1,7 @@
-"""Motion capture in Biovision's BVH text format."""
+"""Read motion capture in the Biovision BVH text format.
+
+Reference: M. Meredith and S. Maddock, "Motion capture file formats explained", 2001.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,10 +15,12 @@ from pipeline.core.errors import UserError
 
 @dataclass(frozen=True)
 class BvhMotion:
-    """A skeleton in the file's own axes and units, and its motion.
+    """A skeleton and its motion, in the axes and units of the file; zero rotations are its rest pose.
 
-    offsets: of each joint from its parent. rotations: local, composed in the file's channel order.
-    root_positions: of joint 0; zero rotations are the file's own rest pose.
+    Attributes:
+        offsets: of each joint from its parent.
+        rotations: local, composed in the channel order of the file.
+        root_positions: of joint 0.
     """
 
     joint_names: tuple[str, ...]
@@ -28,7 +33,7 @@ class BvhMotion:
     def forward_kinematics(
         self, rotations: Float[np.ndarray, "k j 3 3"]
     ) -> tuple[np.ndarray, Float[np.ndarray, "k j 3"]]:
-        """World rotations (k, j, 3, 3) and positions relative to the root (k, j, 3) of local rotations."""
+        """Return world rotations (k, j, 3, 3) and joint positions relative to the root (k, j, 3) of local rotations."""
         world = rotations.copy()
         positions = np.zeros(rotations.shape[:3])
         for joint, parent in enumerate(self.parents):
@@ -39,13 +44,13 @@ class BvhMotion:
 
 
 def read_bvh(path: Path) -> BvhMotion:
-    """Read a whole file.
+    """Read a file.
 
     Raises:
-        UserError: the file is missing or is no complete BVH.
+        UserError: the file is missing, or is not a complete BVH file.
     """
     if not path.is_file():
-        raise UserError(f"motion {path} does not exist; give a .bvh file")
+        raise UserError(f"motion {path} does not exist; choose an existing .bvh file")
     tokens = iter(path.read_text(errors="replace").split())
     try:
         names, parents, offsets, channels = _parse_hierarchy(tokens)
@@ -55,39 +60,39 @@ def read_bvh(path: Path) -> BvhMotion:
         next(tokens), next(tokens)
         frame_time_s = float(next(tokens))
         width = sum(map(len, channels))
-        values = np.array([float(word) for word in tokens])[: count * width].reshape(count, width)
+        values = np.array([float(token) for token in tokens])[: count * width].reshape(count, width)
     except (StopIteration, ValueError) as error:
-        raise UserError(f"motion {path} is no complete BVH file ({error}); give another") from error
+        raise UserError(f"motion {path} is not a complete BVH file ({error}); export it again") from error
     rotations, root_positions = _decode_channels(values, offsets, channels)
     return BvhMotion(tuple(names), np.array(parents), offsets, rotations, root_positions, 1.0 / frame_time_s)
 
 
 def _parse_hierarchy(tokens: Iterator[str]) -> tuple[list[str], list[int], np.ndarray, list[list[str]]]:
-    """Names, parents, offsets and channel names of the joints, in the order of their channels.
+    """Return names, parents, offsets and channel names of the joints, in file order.
 
-    End sites become joints without channels named `<parent>_end`: they tell which way the last bones point.
+    End sites become joints without channels, named `<parent>_end`; they define the direction of the last bones.
     """
     names: list[str] = []
     parents: list[int] = []
     offsets: list[list[float]] = []
     channels: list[list[str]] = []
     open_joints: list[int] = []
-    for word in tokens:
-        if word in ("ROOT", "JOINT", "End"):
+    for token in tokens:
+        if token in ("ROOT", "JOINT", "End"):
             parent = open_joints[-1] if open_joints else -1
             name = next(tokens)
-            names.append(f"{names[parent]}_end" if word == "End" else name)
+            names.append(f"{names[parent]}_end" if token == "End" else name)
             parents.append(parent)
             channels.append([])
-        elif word == "{":
+        elif token == "{":
             open_joints.append(len(names) - 1)
-        elif word == "}":
+        elif token == "}":
             open_joints.pop()
-        elif word == "OFFSET":
+        elif token == "OFFSET":
             offsets.append([float(next(tokens)) for _ in range(3)])
-        elif word == "CHANNELS":
+        elif token == "CHANNELS":
             channels[open_joints[-1]] = [next(tokens) for _ in range(int(next(tokens)))]
-        elif word == "MOTION":
+        elif token == "MOTION":
             break
     if not names or len(offsets) != len(names):
         raise ValueError("no skeleton")
@@ -97,7 +102,7 @@ def _parse_hierarchy(tokens: Iterator[str]) -> tuple[list[str], list[int], np.nd
 def _decode_channels(
     values: Float[np.ndarray, "n c"], offsets: Float[np.ndarray, "j 3"], channels: list[list[str]]
 ) -> tuple[Float[np.ndarray, "n j 3 3"], Float[np.ndarray, "n 3"]]:
-    """Local rotations and root positions; translations of joints other than the root are ignored."""
+    """Return local rotations and root positions; translation channels of other joints are ignored."""
     rotations = np.tile(np.eye(3), (len(values), len(channels), 1, 1))
     root_positions = np.tile(offsets[0], (len(values), 1))
     column = 0
@@ -112,11 +117,11 @@ def _decode_channels(
     return rotations, root_positions
 
 
-def _axis_rotation(axis: int, angle: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3 3"]:
-    """Rotations about a coordinate axis, radians."""
+def _axis_rotation(axis: int, angle_rad: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3 3"]:
+    """Return rotation matrices about a coordinate axis (0, 1, 2)."""
     i, j = (axis + 1) % 3, (axis + 2) % 3
-    matrices = np.tile(np.eye(3), (len(angle), 1, 1))
-    matrices[:, i, i] = matrices[:, j, j] = np.cos(angle)
-    matrices[:, j, i] = np.sin(angle)
-    matrices[:, i, j] = -np.sin(angle)
+    matrices = np.tile(np.eye(3), (len(angle_rad), 1, 1))
+    matrices[:, i, i] = matrices[:, j, j] = np.cos(angle_rad)
+    matrices[:, j, i] = np.sin(angle_rad)
+    matrices[:, i, j] = -np.sin(angle_rad)
     return matrices

@@ -1,4 +1,4 @@
-"""Rotations from directions."""
+"""Compute rotations between directions."""
 
 import torch
 from jaxtyping import Float
@@ -8,7 +8,10 @@ from pipeline.geometry.rotation import axis_angle_to_matrix
 
 
 def shortest_arc(start: Float[Tensor, "*n 3"], end: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
-    """The smallest rotation that takes one direction (any length > 0) to another; any axis will do for opposites."""
+    """Return the smallest rotation from one direction (any length > 0) to another.
+
+    The rotation axis of opposite directions is an arbitrary perpendicular axis.
+    """
     start, end = torch.nn.functional.normalize(start, dim=-1), torch.nn.functional.normalize(end, dim=-1)
     cross = torch.linalg.cross(start, end)
     sine, cosine = cross.norm(dim=-1, keepdim=True), (start * end).sum(-1, keepdim=True)

@@ -1,9 +1,9 @@
-"""Carry a motion capture over to another skeleton: bones point where the recorded ones point.
+"""Retarget motion capture to another skeleton so that bones have the directions of the recorded bones.
 
-Letters: R_j(t) world rotation of a recorded joint, R_j(0) that of the reference pose, A rotation from the recording's
-reference pose to the canonical frame, W rotation from the recording's world to ours, S_j the shortest arc from a bone
-of the A-pose to the recorded bone in the reference pose. The joint's world rotation is W R_j(t) R_j(0)^T A^T S_j.
-As the reference serves the recorded pose that is most like the A-pose, which keeps the twist of the limbs small.
+Notation: R_j(t) world rotation of a recorded joint, R_j(0) that of the reference pose, A rotation from the reference
+pose to the canonical frame, W rotation from the BVH world to the world, S_j the shortest arc from a bone of the A-pose
+to the recorded bone in the reference pose. The world rotation of the joint is W R_j(t) R_j(0)^T A^T S_j. The reference
+is the recorded pose most similar to the A-pose, which keeps the twist of the limbs small.
 """
 
 import numpy as np
@@ -30,7 +30,7 @@ _JOINT_ALIASES: dict[str, tuple[str, ...]] = {
     "{side}Foot": ("{side}Ankle",),
     "{side}ToeBase": ("{side}Toe",),
 }
-"""Other names of joints. A name counts only where Mixamo's own name of the limb is absent."""
+"""Alternative joint names, used only for skeletons without Mixamo names."""
 
 _BONE_CHILD: dict[str, str] = {
     "{side}Arm": "{side}ForeArm",
@@ -39,8 +39,8 @@ _BONE_CHILD: dict[str, str] = {
     "{side}Leg": "{side}Foot",
     **{f"{{side}}Hand{f}{k}": f"{{side}}Hand{f}{k + 1}" for f in ("Index", "Middle", "Ring", "Pinky") for k in (1, 2)},
 }
-"""Where a limb's bone ends. Skeletons place spine, collar and foot joints differently, so that the direction of those
-bones means nothing across them: their S is the identity (a hand's that of the forearm)."""
+"""Child joint at the end of the bone of a limb. Positions of spine, collar and foot joints differ between skeletons, so
+the directions of those bones are not comparable: their S is the identity (S of the forearm for a hand)."""
 
 _REQUIRED_JOINTS = (
     "Hips",
@@ -56,15 +56,16 @@ _REQUIRED_JOINTS = (
 
 
 def retarget(bvh_motion: BvhMotion, body: Body, ground_m: Float[np.ndarray, "3"], in_place: bool) -> Motion:
-    """The recorded motion on another body, facing +Z in its first frame.
+    """Retarget the recorded motion to another body, which faces +Z in the first frame.
 
-    It stands on the ground in most frames, leaves it in jumps, and is lifted where a foot would sink in.
+    The 30th percentile of the lowest foot height is on the ground; frames with a lower foot are raised to the ground.
 
     Args:
-        ground_m: world position under the middle of the path. in_place: drop the motion over the ground.
+        ground_m: world position below the middle of the trajectory.
+        in_place: remove the horizontal root translation.
 
     Raises:
-        UserError: the recording lacks a limb.
+        UserError: the motion lacks a required joint.
     """
     recorded_joint_of = match_joints(bvh_motion, body)
     world, positions = bvh_motion.forward_kinematics(bvh_motion.rotations)
@@ -88,10 +89,10 @@ def retarget(bvh_motion: BvhMotion, body: Body, ground_m: Float[np.ndarray, "3"]
 
 
 def match_joints(bvh_motion: BvhMotion, body: Body) -> dict[str, int]:
-    """Recorded joint for each of the body's joints that has one.
+    """Return the index of the recorded joint by name of the body's joint, for joints that have one.
 
     Raises:
-        UserError: a limb is missing.
+        UserError: a required joint is missing.
     """
     index_of = {name.split(":")[-1].lower(): joint for joint, name in enumerate(bvh_motion.joint_names)}
     found: dict[str, int] = {}
@@ -106,21 +107,21 @@ def match_joints(bvh_motion: BvhMotion, body: Body) -> dict[str, int]:
             found[name] = matches[0]
     missing = [name for name in _REQUIRED_JOINTS if name not in found]
     if missing:
-        raise UserError(f"the motion has no joint for {missing[0]}; rename its joints to Mixamo's or CMU's names")
+        raise UserError(f"the motion has no joint for {missing[0]}; rename its joints to the Mixamo or CMU names")
     return found
 
 
 def resample_motion(motion: Motion, start_s: float, frame_count: int, fps: float) -> Motion:
-    """The nearest recorded pose at each of `frame_count` times from `start_s` on.
+    """Select the nearest recorded pose at each of `frame_count` times from `start_s`.
 
     Raises:
-        UserError: the recording is too short.
+        UserError: the motion is too short.
     """
     rows = np.rint((start_s + np.arange(frame_count) / fps) / (motion.time_s[1] - motion.time_s[0])).astype(int)
     if rows[-1] >= len(motion.time_s):
         raise UserError(
-            f"the motion ends after {motion.time_s[-1]:.2f} s, {frame_count} frames from {start_s} s on need "
-            f"{start_s + (frame_count - 1) / fps:.2f} s; ask for fewer with --frames, or raise --fps"
+            f"the motion ends at {motion.time_s[-1]:.2f} s, but {frame_count} frames from {start_s} s need "
+            f"{start_s + (frame_count - 1) / fps:.2f} s; reduce --frames or increase --fps"
         )
     chosen = motion.select(rows)
     return Motion(
@@ -132,13 +133,13 @@ def resample_motion(motion: Motion, start_s: float, frame_count: int, fps: float
 
 
 def _expand_side(table: dict[str, tuple[str, ...]], side: str) -> dict[str, tuple[str, ...]]:
-    """The rows of one side, or those without a side."""
+    """Return the rows of a table for one side; for the empty side, the rows without a side."""
     rows = {name: others for name, others in table.items() if ("{side}" in name) == bool(side)}
     return {name.format(side=side): tuple(o.format(side=side) for o in others) for name, others in rows.items()}
 
 
 def _common_bones(names: tuple[str, ...], recorded_joint_of: dict[str, int]) -> dict[str, str]:
-    """Child of each joint whose bone both skeletons have."""
+    """Return the child joint of each bone that both skeletons have."""
     bones = {
         name.format(side=side): child.format(side=side)
         for name, child in _BONE_CHILD.items()
@@ -152,7 +153,7 @@ def _common_bones(names: tuple[str, ...], recorded_joint_of: dict[str, int]) -> 
 
 
 def _body_axes(positions: Float[np.ndarray, "k j 3"], recorded_joint_of: dict[str, int]) -> Float[np.ndarray, "k 3 3"]:
-    """Rows: the person's left, up and front, in the recording's axes."""
+    """Return rotations from BVH axes to the axes of the body; rows are left, up and front of the person."""
     up = positions[:, recorded_joint_of["Head"]] - 0.5 * (
         positions[:, recorded_joint_of["LeftUpLeg"]] + positions[:, recorded_joint_of["RightUpLeg"]]
     )
@@ -164,7 +165,7 @@ def _body_axes(positions: Float[np.ndarray, "k j 3"], recorded_joint_of: dict[st
 
 
 def _bvh_to_world(mean_basis: Float[np.ndarray, "3 3"], first: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    """W: the recording's axis that is up on average becomes +Y, the first frame's front +Z."""
+    """Return W: it maps the mean up axis of the recording to +Y and the front of the first frame to +Z."""
     up = np.zeros(3)
     axis = int(np.abs(mean_basis[1]).argmax())
     up[axis] = np.sign(mean_basis[1, axis])
@@ -176,9 +177,9 @@ def _bvh_to_world(mean_basis: Float[np.ndarray, "3 3"], first: Float[np.ndarray,
 def _reference_pose(
     bvh_motion: BvhMotion, body: Body, recorded_joint_of: dict[str, int], world: np.ndarray, positions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """World rotations (j, 3, 3) and canonical bone directions' positions (j, 3) of the pose most like the A-pose.
+    """Return R(0)^T A^T (j, 3, 3) and canonical joint positions (j, 3) of the pose most similar to the A-pose.
 
-    Looked at: the file's own rest pose and every tenth frame.
+    Candidates are the rest pose of the file and every tenth frame.
     """
     rest_world, rest_positions = bvh_motion.forward_kinematics(np.tile(np.eye(3), (1, len(bvh_motion.parents), 1, 1)))
     worlds, canonical_positions = (
@@ -197,7 +198,7 @@ def _reference_pose(
 
 
 def local_quaternions(world: Float[np.ndarray, "n j 3 3"], parents: np.ndarray) -> Float[np.ndarray, "n j 4"]:
-    """Quaternions (wxyz) of joints relative to their parents."""
+    """Return quaternions (wxyz) of joints relative to their parents."""
     local = world.copy()
     for joint, parent in enumerate(parents):
         if parent >= 0:
@@ -212,10 +213,12 @@ def retarget_rotations(
     reference: tuple[np.ndarray, np.ndarray],
     bvh_to_world: Float[np.ndarray, "3 3"],
 ) -> Float[np.ndarray, "n j 3 3"]:
-    """World rotation of each of the body's joints; joints without a recorded one follow their parent.
+    """Return the world rotation of each joint of the body; joints without a recorded joint follow their parent.
 
-    source: row of `world` for each joint that has one. reference: what undoes the reference pose's rotations, and where
-    the recorded joints lie in it, canonical axes.
+    Args:
+        recorded_joint_of: column of `world` by name of the body's joint.
+        world: world rotations of the recorded joints.
+        reference: inverse rotations of the reference pose, and its joint positions in canonical axes.
     """
     inverse_reference, canonical_positions = reference
     bones = _common_bones(body.joint_names, recorded_joint_of)
@@ -250,7 +253,7 @@ def _root_trajectory(
     ground_m: Float[np.ndarray, "3"],
     in_place: bool,
 ) -> Float[np.ndarray, "n 3"]:
-    """Position of the hips in metres, scaled by the length of the legs; its height is settled afterwards."""
+    """Return the hip positions in metres, scaled by the ratio of leg lengths; the caller sets the height."""
     joints_m = body.joints_m
     leg_m = sum(
         np.linalg.norm(joints_m[body.joint(f"Left{b}")] - joints_m[body.joint(f"Left{a}")])

@@ -1,4 +1,4 @@
-"""Any rigged, textured person in a .glb file as a `Subject`: Mixamo's joint names, T-pose lowered to the A-pose."""
+"""Read a rigged, textured person from a .glb file as a `Subject`: Mixamo joint names, T-pose rebound in the A-pose."""
 
 from pathlib import Path
 
@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Float, Int
 
 from data_tools.synthetic.rig.directions import shortest_arc
-from data_tools.synthetic.rig.glb import GlbFile, Primitive
 from data_tools.synthetic.rig.subject import Subject
 from pipeline.body.body import Body
 from pipeline.core.errors import UserError
 from pipeline.geometry.skinning import forward_kinematics, linear_blend_skinning, skinning_transforms
+from pipeline.io.glb import GlbFile, Primitive
 
 _SIDED_JOINTS = ("Shoulder", "Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot", "ToeBase")
 _FINGERS = tuple(f"Hand{finger}{k}" for finger in ("Thumb", "Index", "Middle", "Ring", "Pinky") for k in (1, 2, 3))
@@ -27,7 +27,7 @@ JOINT_NAMES = frozenset(
         *(s + n for s in ("Left", "Right") for n in _SIDED_JOINTS + _FINGERS),
     )
 )
-"""The 52 joints that are kept; the weights of all others go to their nearest kept ancestor."""
+"""The 52 joints that are kept; the weights of other joints are added to their nearest kept ancestor."""
 
 _REQUIRED_JOINTS = frozenset(
     ("Hips", "Spine", "Head", *(s + n for s in ("Left", "Right") for n in _SIDED_JOINTS if n != "Shoulder"))
@@ -36,12 +36,12 @@ _A_POSE_ARM_DIRECTION = (0.66, -0.75, 0.0)
 
 
 def read_rigged_person(path: Path) -> Subject:
-    """Read a person; canonical frame (+Y up, facing +Z, metres, feet on y = 0, A-pose).
+    """Read a person into the canonical frame: +Y up, facing +Z, metres, feet on y = 0, A-pose.
 
-    The inverse bind matrices may carry scale and positions may be normalised integers: skinning is applied first.
+    Inverse bind matrices may contain a scale and positions may be normalised integers, so skinning is applied first.
 
     Raises:
-        UserError: no skin, or a rig without the joints that a person needs.
+        UserError: the file has no skin, or its rig lacks a required joint.
     """
     glb = GlbFile(path)
     primitives = glb.skinned_primitives()
@@ -67,15 +67,17 @@ def read_rigged_person(path: Path) -> Subject:
 
 
 def _select_joints(glb: GlbFile, skin: int) -> tuple[Int[np.ndarray, "n"], list[int], Int[np.ndarray, "j"]]:
-    """Kept joint of every node (its own, or its nearest ancestor's; -1 above the hips), node and parent of each joint.
+    """Return the kept joint of each node, and the node and parent of each joint.
 
-    Joints are numbered from the hips outwards, so that parents come first.
+    The kept joint of a node is its own or that of its nearest ancestor; -1 above the hips. Parents precede children.
     """
     nodes = glb.gltf["nodes"]
     names = [_node_name(glb, node) for node in range(len(nodes))]
     missing = sorted(_REQUIRED_JOINTS - {names[node] for node in glb.gltf["skins"][skin]["joints"]})
     if missing:
-        raise UserError(f"{glb.path} has no joint named {', '.join(missing[:3])}; rename its rig to Mixamo's names")
+        raise UserError(
+            f"{glb.path} has no joint named {', '.join(missing[:3])}; rename its joints to the Mixamo names"
+        )
     kept_joint_of_node = np.full(len(nodes), -1)
     joint_nodes: list[int] = []
     parents: list[int] = []
@@ -92,14 +94,14 @@ def _select_joints(glb: GlbFile, skin: int) -> tuple[Int[np.ndarray, "n"], list[
 
 
 def _node_name(glb: GlbFile, node: int) -> str:
-    """A node's name without its namespace (`mixamorig:Hips` is `Hips`)."""
+    """Return the name of a node without its namespace (`mixamorig:Hips` is `Hips`)."""
     return str(glb.gltf["nodes"][node].get("name", "")).split(":")[-1]
 
 
 def _apply_rest_skinning(
     glb: GlbFile, primitive: Primitive, node_to_world: np.ndarray, kept_joint_of_node: np.ndarray, joint_count: int
 ) -> tuple[Float[np.ndarray, "v 3"], Float[np.ndarray, "v j"]]:
-    """World positions of the rest pose, and weights on the kept joints."""
+    """Return world positions of the rest pose, and skin weights on the kept joints."""
     skin = glb.gltf["skins"][primitive.skin]
     nodes = np.array(skin["joints"])
     if "inverseBindMatrices" in skin:
@@ -121,12 +123,12 @@ def _concatenated_faces(primitives: list[Primitive]) -> Int[np.ndarray, "f 3"]:
 
 
 def _merge_textures(glb: GlbFile, primitives: list[Primitive]) -> tuple[Float[np.ndarray, "v 2"], np.ndarray]:
-    """One texture for all materials (side by side when there are several) and UVs in it, origin bottom-left."""
+    """Return UVs (origin bottom-left) and one texture for all materials, which are placed side by side."""
     materials = sorted({p.material for p in primitives})
     textures = [glb.base_colour(material) for material in materials]
-    height = max(len(picture) for picture in textures)
+    height = max(len(texture) for texture in textures)
     if len(textures) > 1:
-        textures = [cv2.resize(p, (height, height), interpolation=cv2.INTER_CUBIC) for p in textures]
+        textures = [cv2.resize(texture, (height, height), interpolation=cv2.INTER_CUBIC) for texture in textures]
     uv = []
     for primitive in primitives:
         across = (primitive.uv[:, 0] + materials.index(primitive.material)) / len(materials)
@@ -135,7 +137,7 @@ def _merge_textures(glb: GlbFile, primitives: list[Primitive]) -> tuple[Float[np
 
 
 def _rebind_in_a_pose(body: Body) -> Body:
-    """Lower both arms to the A-pose, stand on y = 0 over the origin, and make that the bind pose."""
+    """Lower both arms to the A-pose, place the feet on y = 0 below the hips at the origin, and bind in that pose."""
     rotations = torch.eye(3).repeat(1, len(body.joint_names), 1, 1)
     for side, sign in (("Left", 1.0), ("Right", -1.0)):
         arm, forearm = body.joint(f"{side}Arm"), body.joint(f"{side}ForeArm")

@@ -1,4 +1,4 @@
-"""A textured, rigged person: the thing that synthetic captures are taken of."""
+"""A textured, rigged person, the subject of a synthetic capture, and its files."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,7 +19,10 @@ from pipeline.io.npz import load_npz, save_npz
 class Subject:
     """A clothed surface bound to a skeleton in the canonical A-pose, with its texture.
 
-    `faces_uv` are the corners of `body.faces` in `uv`; UV origin bottom-left, row 0 of the texture at v = 1.
+    Attributes:
+        uv: origin bottom-left; row 0 of the texture is at v = 1.
+        faces_uv: indices into `uv` of the corners of `body.faces`.
+        texture: sRGB.
     """
 
     body: Body
@@ -32,7 +35,7 @@ class Subject:
         return torch.from_numpy(to_float(self.texture))
 
     def texture_tensor(self) -> Float[Tensor, "th tw 3"]:
-        """sRGB in [0, 1], converted once."""
+        """Return the texture as sRGB in [0, 1], converted once."""
         return self._texture_tensor
 
 
@@ -44,7 +47,7 @@ def save_subject(folder: Path, subject: Subject) -> None:
 
 
 def load_subject(folder: Path) -> Subject:
-    """Inverse of `save_subject`; UserError names a missing file."""
+    """Read the files of `save_subject`. UserError if a file is missing."""
     layout = load_npz(folder / "uv.npz")
     body = load_body(folder / "clothed.npz")
     return Subject(body, layout["uv"], layout["faces_uv"], read_rgb(folder / "texture.png"))

@@ -1,4 +1,7 @@
-"""A room for the synthetic camera: a wall and a floor, plain or furnished, and the shadow under the feet."""
+"""Render the room behind the synthetic person: wall, floor, optional furniture, and contact shadows of the feet.
+
+All positions are in metres, in the world (+Y up); `ground_m` is the point on the floor where the person stands.
+"""
 
 from dataclasses import dataclass
 
@@ -10,13 +13,13 @@ from data_tools.synthetic.person.noise import ValueNoise
 from pipeline.geometry.camera import Camera, pixel_rays
 
 WALL_DISTANCE_M = 1.7
-"""The wall stands this far behind the person."""
+"""Distance from the person to the wall behind, along -Z."""
 
-_SAMPLES = 3
+_SAMPLES_PER_AXIS = 3
 _WALL, _SKIRTING, _PLANKS = (0.74, 0.75, 0.73), (0.90, 0.90, 0.88), (0.58, 0.44, 0.31)
 
 WallRectangle = tuple[float, float, float, float]
-"""Left, right, bottom, top on the wall, in metres from the point behind the person at floor level."""
+"""Left, right, bottom, top on the wall in metres; the origin is at floor level behind the person."""
 
 _FURNITURE: tuple[tuple[WallRectangle, tuple[float, float, float]], ...] = (
     ((-1.62, -0.78, 0.0, 2.05), (0.88, 0.86, 0.80)),
@@ -34,30 +37,40 @@ _FURNITURE: tuple[tuple[WallRectangle, tuple[float, float, float]], ...] = (
 
 @dataclass(frozen=True)
 class Room:
-    """What stands still: the picture of the empty room, and where each pixel's ray meets the floor (nan elsewhere)."""
+    """The static background.
+
+    Attributes:
+        image: sRGB in [0, 1] of the empty room.
+        floor_m: world position where the ray of each pixel hits the floor; NaN where it hits the wall.
+    """
 
     image: Float[np.ndarray, "h w 3"]
     floor_m: Float[np.ndarray, "h w 3"]
 
 
 def make_room(camera: Camera, ground_m: Float[np.ndarray, "3"], is_furnished: bool, noise: ValueNoise) -> Room:
-    """Picture of the empty room around the place where the person stands.
+    """Render the empty room.
 
-    busy: with a door, a picture, a sofa and a pot on the wall's side; otherwise a bare wall.
+    Args:
+        is_furnished: draw a door, a framed picture, a sofa and a pot; otherwise the wall is bare.
+        noise: texture of plaster, furniture and floor boards.
     """
-    supersampled_camera = camera.scaled(float(_SAMPLES))
+    supersampled_camera = camera.scaled(float(_SAMPLES_PER_AXIS))
     colours = _room_colours(*_intersect_wall_and_floor(supersampled_camera, ground_m), ground_m, is_furnished, noise)
-    shape = (camera.height, _SAMPLES, camera.width, _SAMPLES, 3)
+    shape = (camera.height, _SAMPLES_PER_AXIS, camera.width, _SAMPLES_PER_AXIS, 3)
     return Room(colours.reshape(shape).mean(axis=(1, 3)).astype(np.float32), floor_points(camera, ground_m))
 
 
 def floor_points(camera: Camera, ground_m: Float[np.ndarray, "3"]) -> Float[np.ndarray, "h w 3"]:
-    """Where each pixel's ray meets the floor; nan where it meets the wall first."""
+    """Intersect the ray of each pixel centre with the floor; NaN where the wall is hit first."""
     return _intersect_wall_and_floor(camera, ground_m)[1].reshape(camera.height, camera.width, 3)
 
 
 def contact_shadow(room: Room, feet_m: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "h w"]:
-    """Factor in (0, 1] by which the feet darken the floor: a soft blot under each place."""
+    """Compute the factor in (0, 1] by which the feet darken each pixel of the floor: two Gaussians under each foot.
+
+    feet_m: world positions; only x and z are used.
+    """
     shadow_factor = np.ones(room.floor_m.shape[:2], dtype=np.float32)
     rows, columns = np.nonzero(~np.isnan(room.floor_m[:, :, 0]))
     points = room.floor_m[rows, columns]
@@ -70,7 +83,7 @@ def contact_shadow(room: Room, feet_m: Float[np.ndarray, "k 3"]) -> Float[np.nda
 def _intersect_wall_and_floor(
     camera: Camera, ground_m: np.ndarray
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Where the rays of all pixels meet the wall, and the floor in front of it (nan where they do not)."""
+    """Intersect the rays of all pixels with the wall, and with the floor in front of it (NaN where the wall is hit)."""
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
     pixels = torch.from_numpy(np.stack([x.ravel(), y.ravel()], axis=1)).float()
     origins, directions = (rays.numpy().astype(np.float64) for rays in pixel_rays(camera, pixels))
@@ -94,23 +107,26 @@ def _room_colours(
     return np.clip(colours, 0.0, 1.0)
 
 
-def _wall_colours(place_m: Float[np.ndarray, "n 3"], is_furnished: bool, noise: ValueNoise) -> Float[np.ndarray, "n 3"]:
-    """Plaster lit from the upper left, above a skirting board."""
-    across, up = place_m[:, 0], place_m[:, 1]
-    plaster = noise.fractal(place_m.astype(np.float32), 0.5) * 0.02 + noise(place_m.astype(np.float32), 0.01) * 0.008
+def _wall_colours(
+    position_m: Float[np.ndarray, "n 3"], is_furnished: bool, noise: ValueNoise
+) -> Float[np.ndarray, "n 3"]:
+    """Colour plaster with a soft highlight, a skirting board and furniture; position_m is relative to `ground_m`."""
+    across, up = position_m[:, 0], position_m[:, 1]
+    points = position_m.astype(np.float32)
+    plaster = noise.fractal(points, 0.5) * 0.02 + noise(points, 0.01) * 0.008
     shading = 1.0 + 0.10 * np.exp(-((across - 0.6) ** 2 + (up - 1.9) ** 2) / 1.6) - 0.05 * np.clip(1.0 - up, 0.0, 1.0)
     colours = np.asarray(_WALL) * (shading + plaster)[:, None]
     colours[up < 0.09] = np.asarray(_SKIRTING) * shading[up < 0.09, None]
     for (left, right, bottom, top), colour in _FURNITURE if is_furnished else ():
         inside = (across > left) & (across < right) & (up > bottom) & (up < top)
-        grain = noise(place_m[inside].astype(np.float32), (0.02, 0.25, 0.02)) * 0.05
+        grain = noise(points[inside], (0.02, 0.25, 0.02)) * 0.05
         colours[inside] = np.asarray(colour) * (shading[inside] * (1.0 + grain))[:, None]
     return colours
 
 
-def _floor_colours(place_m: Float[np.ndarray, "n 3"], noise: ValueNoise) -> Float[np.ndarray, "n 3"]:
-    """Boards that run towards the camera, each of its own tone, with dark gaps."""
-    board = np.floor(place_m[:, 0] / 0.14)
-    tone = 0.07 * np.sin(12.9898 * board) + noise(place_m.astype(np.float32), (0.012, 1.0, 0.30)) * 0.06
-    gap = np.abs(place_m[:, 0] / 0.14 - board - 0.5) > 0.485
+def _floor_colours(position_m: Float[np.ndarray, "n 3"], noise: ValueNoise) -> Float[np.ndarray, "n 3"]:
+    """Colour floor boards along Z, each with its own tone and dark gaps; position_m is relative to `ground_m`."""
+    board = np.floor(position_m[:, 0] / 0.14)
+    tone = 0.07 * np.sin(12.9898 * board) + noise(position_m.astype(np.float32), (0.012, 1.0, 0.30)) * 0.06
+    gap = np.abs(position_m[:, 0] / 0.14 - board - 0.5) > 0.485
     return np.asarray(_PLANKS) * ((1.0 + tone) * np.where(gap, 0.72, 1.0))[:, None]

@@ -1,4 +1,4 @@
-"""A ball that somebody juggles: it passes before the person, elsewhere in each frame."""
+"""A juggled ball that occludes the person at a different position in each frame."""
 
 from dataclasses import dataclass
 
@@ -11,29 +11,29 @@ from pipeline.geometry.camera import Camera, pixel_rays
 
 RADIUS_M = 0.11
 DISTANCE_TO_PERSON_M = 0.45
-"""How far before the person it flies."""
+"""Distance from the person towards the camera, along +Z."""
 MIN_HEIGHT_RATIO, MAX_HEIGHT_RATIO, MAX_SIDEWAYS_RATIO = 0.25, 0.70, 0.13
-"""Its lowest and highest place and how far it strays from the middle, in heights of the person."""
+"""Range of its height above the ground and largest sideways offset, in units of the person's height."""
 BOUNCE_PERIOD_S, SWAY_PERIOD_S = 1.1, 2.7
 LIGHT_ALBEDO, DARK_ALBEDO = 0.92, 0.25
 
 
 @dataclass(frozen=True)
 class Ball:
-    """A ball before a person of this height who stands on `ground_m`, between the person and the world's origin."""
+    """A ball between the camera and a person of this height who stands at `ground_m` (world, metres)."""
 
     ground_m: Float[np.ndarray, "3"]
     height_m: float
 
     def centre_m(self, time_s: float) -> Float[np.ndarray, "3"]:
-        """Where it is: parabolas up and down, a slow sway to the sides."""
+        """Return its centre (world, metres): parabolic bounces and a slow sideways oscillation."""
         phase = 2.0 * ((time_s / BOUNCE_PERIOD_S) % 1.0) - 1.0
         height_ratio = MIN_HEIGHT_RATIO + (MAX_HEIGHT_RATIO - MIN_HEIGHT_RATIO) * (1.0 - phase**2)
         sideways_ratio = MAX_SIDEWAYS_RATIO * np.sin(2.0 * np.pi * time_s / SWAY_PERIOD_S)
         return self.ground_m + [sideways_ratio * self.height_m, height_ratio * self.height_m, DISTANCE_TO_PERSON_M]
 
-    def picture(self, camera: Camera, time_s: float, light: Light, samples: int) -> Float[np.ndarray, "h w 4"]:
-        """Premultiplied sRGB and coverage in [0, 1], each pixel the mean of `samples` x `samples` rays."""
+    def render_rgba(self, camera: Camera, time_s: float, light: Light, samples: int) -> Float[np.ndarray, "h w 4"]:
+        """Render premultiplied sRGB and coverage in [0, 1]; each pixel is the mean of `samples` x `samples` rays."""
         supersampled_camera = camera.scaled(float(samples))
         rows, columns = torch.meshgrid(
             torch.arange(supersampled_camera.height), torch.arange(supersampled_camera.width), indexing="ij"

@@ -1,7 +1,7 @@
-"""A synthetic capture: a subject that moves in a room before a fixed camera, and the folder it is written to.
+"""Render a synthetic capture: a subject that moves in a room in front of a fixed camera, with its ground truth.
 
-OUT/video/video.mp4            what the pipeline may see
-OUT/truth/...                  what it must never see: see `write_ground_truth`
+OUT/video/video.mp4            input of the pipeline
+OUT/truth/...                  ground truth, never read by the pipeline: see `write_ground_truth`
 """
 
 import json
@@ -27,15 +27,20 @@ from pipeline.core.progress import track
 from pipeline.geometry.camera import Camera
 from pipeline.io.image import to_uint8, write_gray, write_rgb, write_rgba
 
-RECIPE_VERSION = 1
-"""Raised whenever the same options give other pictures; the Makefile reads it too."""
+CAPTURE_VERSION = 2
+"""Increased whenever equal options give other images or the format of `truth/` changes; the Makefile reads it."""
 
 _FEET = ("LeftFoot", "LeftToeBase", "RightFoot", "RightToeBase")
 
 
 @dataclass(frozen=True)
 class SyntheticCapture:
-    """Everything that determines the pixels of a recording."""
+    """Everything that determines the pixels of a capture.
+
+    Attributes:
+        ground_m: point on the floor where the person stands (world).
+        samples: antialiasing samples per pixel and axis.
+    """
 
     subject: Subject
     motion: Motion
@@ -49,49 +54,51 @@ class SyntheticCapture:
 
     @cached_property
     def canonical_to_world(self) -> Float[Tensor, "n j 4 4"]:
-        """Skinning matrices of every frame."""
+        """Skinning matrices of all frames."""
         return canonical_to_world(self.subject.body, self.motion)
 
-    def person(self, frame: int) -> Float[np.ndarray, "h w 4"]:
-        """The person alone: premultiplied sRGB and coverage, in [0, 1]."""
-        vertices = pose_vertices(self.subject, self.canonical_to_world[frame])
+    def render_person(self, frame_index: int) -> Float[np.ndarray, "h w 4"]:
+        """Render the person without the room: premultiplied sRGB and coverage, in [0, 1]."""
+        vertices = pose_vertices(self.subject, self.canonical_to_world[frame_index])
         return render_subject(self.subject, vertices, self.camera, self.light, self.samples)
 
-    def frame(self, frame: int) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]:
-        """The picture that the camera takes, and the person's coverage in it."""
-        person = self.person(frame)
-        shadow = contact_shadow(self.room, self._feet_m(frame))
+    def render_frame(self, frame_index: int) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]:
+        """Render the camera image and the coverage by the person, both in 0 to 255."""
+        person = self.render_person(frame_index)
+        shadow = contact_shadow(self.room, self._feet_m(frame_index))
         background = self.room.image * shadow[:, :, None]
-        picture, coverage = person[:, :, :3] + (1.0 - person[:, :, 3:]) * background, person[:, :, 3]
+        image, coverage = person[:, :, :3] + (1.0 - person[:, :, 3:]) * background, person[:, :, 3]
         if self.ball:
-            ball = self.ball.picture(self.camera, frame / self.fps, self.light, self.samples)
+            ball = self.ball.render_rgba(self.camera, frame_index / self.fps, self.light, self.samples)
             ball_transparency = 1.0 - ball[:, :, 3]
-            picture, coverage = ball[:, :, :3] + ball_transparency[:, :, None] * picture, ball_transparency * coverage
-        return to_uint8(picture), to_uint8(coverage)
+            image, coverage = ball[:, :, :3] + ball_transparency[:, :, None] * image, ball_transparency * coverage
+        return to_uint8(image), to_uint8(coverage)
 
-    def _feet_m(self, frame: int) -> Float[np.ndarray, "4 3"]:
-        """World positions of ankles and balls of the feet."""
+    def _feet_m(self, frame_index: int) -> Float[np.ndarray, "4 3"]:
+        """Return the world positions of ankles and balls of the feet."""
         body = self.subject.body
         feet = [body.joint(name) for name in _FEET]
-        transforms = self.canonical_to_world[frame, feet]
+        transforms = self.canonical_to_world[frame_index, feet]
         joints = torch.from_numpy(body.joints_m[feet])
         return ((transforms[:, :3, :3] @ joints[:, :, None]).squeeze(-1) + transforms[:, :3, 3]).numpy()
 
 
 @dataclass(frozen=True)
 class HeldOutTargets:
-    """Questions whose answers are rendered too: other cameras on the first pose, and other poses."""
+    """Views rendered into the ground truth for evaluation: novel cameras on the first pose, and novel poses."""
 
     cameras: tuple[Camera, ...]
     motion: Motion | None
 
 
 def portrait_camera(size_px: int, height_m: float, distance_m: float, fill: float) -> tuple[Camera, np.ndarray]:
-    """A level camera at the world's origin, and the place on the ground where the person stands before it.
+    """Return a horizontal camera at the world origin, and the point on the ground where the person stands.
 
     Args:
-        size_px: side of the square image. height_m: of the person. distance_m: from camera to person.
-        fill: share of the image's height that the person takes, in (0, 1).
+        size_px: side of the square image.
+        height_m: of the person.
+        distance_m: from camera to person.
+        fill: fraction of the image height that the person covers, in (0, 1).
     """
     focal_px = fill * size_px * distance_m / height_m
     camera = Camera(focal_px, focal_px, size_px / 2, size_px / 2, size_px, size_px)
@@ -99,12 +106,12 @@ def portrait_camera(size_px: int, height_m: float, distance_m: float, fill: floa
 
 
 def novel_cameras(camera: Camera, person_position_m: np.ndarray, height_m: float, count: int) -> tuple[Camera, ...]:
-    """Cameras around the person, between the headings of a turn and above or below the capture's own height.
+    """Return orbit cameras around the person at azimuths and elevations that the capture does not contain.
 
-    Every one looks at the middle of the body from the capture's distance, +Y up in its image.
+    Each camera looks at the middle of the body from the distance of the capture's camera; +Y is up in the image.
 
     Args:
-        standing_m: world position on the ground where the person stands in the pose that is shown.
+        person_position_m: point on the ground where the person stands in the rendered pose (world).
     """
     middle = person_position_m + [0.0, 0.5 * height_m, 0.0]
     distance = float(np.linalg.norm(middle - camera.centre_m()))
@@ -119,7 +126,7 @@ def novel_cameras(camera: Camera, person_position_m: np.ndarray, height_m: float
 def _orbit_world_to_camera(
     middle_m: np.ndarray, distance_m: float, azimuth_rad: float, elevation_rad: float
 ) -> Float[np.ndarray, "4 4"]:
-    """world_to_camera of a camera on a sphere around a point; angle 0 stands on +Z, rise is above the horizon."""
+    """Return world_to_camera of an orbit camera; azimuth 0 is on +Z, elevation is above the horizon."""
     backward = np.array(
         [
             np.sin(azimuth_rad) * np.cos(elevation_rad),
@@ -135,30 +142,30 @@ def _orbit_world_to_camera(
 
 
 def write_capture(
-    out: Path, capture: SyntheticCapture, bare: Body | None, heldout: HeldOutTargets, recipe: dict[str, object]
+    out: Path, capture: SyntheticCapture, bare: Body | None, heldout: HeldOutTargets, settings: dict[str, object]
 ) -> None:
-    """Render everything into `out`, which is whole or absent. UserError when it exists already."""
+    """Render the capture into the new folder `out`, atomically. UserError if `out` exists."""
     with atomic_folder(out) as part:
         for folder in ("video", "truth/masks"):
             (part / folder).mkdir(parents=True)
         write_video(part / "video" / "video.mp4", _frames(capture, part / "truth" / "masks"), capture.fps)
-        write_ground_truth(part / "truth", capture, bare, recipe)
+        write_ground_truth(part / "truth", capture, bare, settings)
         write_heldout(part / "truth", capture, heldout)
 
 
 def _frames(capture: SyntheticCapture, masks: Path) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    """The pictures in order; the masks are written on the way."""
-    for frame in track(range(len(capture.motion.frame_index)), "rendering"):
-        picture, coverage = capture.frame(frame)
-        write_gray(masks / f"{frame:06d}.png", coverage)
-        yield picture
+    """Yield the images in order and write the mask of each."""
+    for frame_index in track(range(len(capture.motion.frame_index)), "rendering"):
+        image, coverage = capture.render_frame(frame_index)
+        write_gray(masks / f"{frame_index:06d}.png", coverage)
+        yield image
 
 
-def write_ground_truth(truth: Path, capture: SyntheticCapture, bare: Body | None, recipe: dict[str, object]) -> None:
-    """Write what determines the pixels.
+def write_ground_truth(truth: Path, capture: SyntheticCapture, bare: Body | None, settings: dict[str, object]) -> None:
+    """Write everything that determines the pixels; `masks/` is already written.
 
-    `clothed.npz` (Body: canonical clothed surface and skeleton), `uv.npz`, `texture.png`, `bare.npz` (Body beneath the
-    clothes, where there is one), `motion.npz`, `camera.npz`, `room.png`, `recipe.json`; `masks/` is there already.
+    `clothed.npz` (Body: canonical clothed surface and skeleton), `uv.npz`, `texture.png`, `bare.npz` (Body without
+    clothes, if known), `motion.npz`, `camera.npz`, `room.png`, `capture_settings.json`.
     """
     save_subject(truth, capture.subject)
     if bare is not None:
@@ -167,14 +174,14 @@ def write_ground_truth(truth: Path, capture: SyntheticCapture, bare: Body | None
     save_camera(truth / "camera.npz", capture.camera)
     write_rgb(truth / "room.png", to_uint8(capture.room.image))
     metadata = {
-        "version": RECIPE_VERSION,
+        "version": CAPTURE_VERSION,
         "fps": capture.fps,
         "samples": capture.samples,
         "ground_m": [float(value) for value in capture.ground_m],
         "light": asdict(capture.light),
         "ball": capture.ball is not None,
     }
-    (truth / "recipe.json").write_text(json.dumps({**recipe, **metadata}, indent=2, sort_keys=True) + "\n")
+    (truth / "capture_settings.json").write_text(json.dumps({**settings, **metadata}, indent=2, sort_keys=True) + "\n")
 
 
 def write_heldout(truth: Path, capture: SyntheticCapture, heldout: HeldOutTargets) -> None:
@@ -197,7 +204,7 @@ def write_heldout(truth: Path, capture: SyntheticCapture, heldout: HeldOutTarget
 
 
 def unpremultiply_to_uint8(person: Float[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w 4"]:
-    """8-bit colours that are no longer multiplied by the coverage; black where it is 0."""
+    """Convert premultiplied RGBA in [0, 1] to straight RGBA, 8 bits; colours are 0 where the coverage is 0."""
     coverage = person[:, :, 3:]
     colours = np.divide(person[:, :, :3], coverage, out=np.zeros_like(person[:, :, :3]), where=coverage > 0)
     return to_uint8(np.concatenate([colours, coverage], axis=2))

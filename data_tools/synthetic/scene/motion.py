@@ -1,4 +1,4 @@
-"""How synthetic people move: a turn in A-pose with natural sway, and a few poses that the turn never shows."""
+"""Built-in motions of synthetic people: a turn in A-pose with natural sway, and novel poses for evaluation."""
 
 import numpy as np
 import torch
@@ -10,7 +10,7 @@ from pipeline.geometry.rotation import axis_angle_to_quaternion, quaternion_mult
 from pipeline.geometry.skinning import forward_kinematics
 
 JointAngles = dict[str, tuple[float, float, float]]
-"""Axis-angle (radians, canonical axes) by joint name; joints that are not named rest."""
+"""Axis-angle (radians, canonical axes) by joint name; other joints have the identity rotation."""
 
 _SWAY: dict[str, tuple[tuple[float, float, float], float]] = {
     "Spine": ((0.016, 0.030, 0.014), 2.9),
@@ -24,7 +24,7 @@ _SWAY: dict[str, tuple[tuple[float, float, float], float]] = {
     "LeftHand": ((0.050, 0.020, 0.050), 2.0),
     "RightHand": ((0.050, 0.020, 0.050), 2.4),
 }
-"""Largest angles (radians about x, y, z) and period (s) of each joint's slow wandering."""
+"""Amplitude (radians about x, y, z) and period (s) of the slow oscillation of each joint."""
 
 BREATH_PERIOD_S = 3.6
 
@@ -54,19 +54,20 @@ NOVEL_POSES: dict[str, JointAngles] = {
         "LeftArm": (0.0, 0.0, -0.4),
     },
 }
-"""Poses outside the turn: what a held-out motion asks of an avatar."""
+"""Poses that do not occur in the turn; they test the skinning of an avatar."""
 
 
 def turn_in_a_pose(
     body: Body, frame_count: int, fps: float, ground_m: Float[np.ndarray, "3"], seed: int, arc_deg: float = 360.0
 ) -> Motion:
-    """One full turn on the spot, with slow arms, breathing and weight that shifts from foot to foot.
+    """Generate one full turn on the spot with swaying arms, breathing and weight shift between the feet.
+
+    The last frame is one step before the heading of the first frame, so that headings are evenly spaced.
 
     Args:
-        ground_m: world position between the feet. seed: phases of the sway.
-        arc_deg: below 360, the person turns half of it to one side, then to the other, and back.
-
-    The last frame stops one step before the first one's heading, so that headings are spread evenly.
+        ground_m: world position between the feet, metres.
+        seed: of the phases of the sway.
+        arc_deg: total angle; below 360 the person turns by half of it to each side and back.
     """
     time_s = np.arange(frame_count) / fps
     random = np.random.default_rng([seed, 2])
@@ -83,7 +84,7 @@ def turn_in_a_pose(
 
 
 def novel_motion(body: Body, ground_m: Float[np.ndarray, "3"], count: int) -> Motion:
-    """`count` of the poses in `NOVEL_POSES`, in turn, each seen from another side; one pose a frame."""
+    """Return `count` frames that cycle through `NOVEL_POSES`, each with a different heading."""
     axis_angles = np.zeros((count, len(body.joint_names), 3))
     poses = list(NOVEL_POSES.values())
     for frame in range(count):
@@ -94,14 +95,14 @@ def novel_motion(body: Body, ground_m: Float[np.ndarray, "3"], count: int) -> Mo
 
 
 def snap_feet_to_floor(body: Body, motion: Motion, floor_y_m: float) -> Motion:
-    """The same motion, raised or lowered frame by frame until the lowest foot stands on the floor as in the A-pose."""
+    """Translate each frame vertically so that the lowest foot joint has its A-pose height above the floor."""
     root = motion.root_translation_m.copy()
     root[:, 1] += floor_y_m - lowest_foot_offset_m(body, motion)
     return motion.with_pose(motion.rotations_wxyz, root)
 
 
 def lowest_foot_offset_m(body: Body, motion: Motion) -> Float[np.ndarray, "n"]:
-    """Height of the lowest ankle or ball of a foot over its place in the A-pose, which stands on y = 0."""
+    """Return the height of the lowest foot joint (ankle, ball of the foot) relative to its height in the A-pose."""
     joint_to_world = _joint_to_world(body, motion.rotations_wxyz, motion.root_translation_m)
     feet = [body.joint(side + part) for side in ("Left", "Right") for part in ("Foot", "ToeBase")]
     return (joint_to_world[:, feet, 1, 3].numpy() - body.joints_m[feet, 1]).min(axis=1)
@@ -110,20 +111,20 @@ def lowest_foot_offset_m(body: Body, motion: Motion) -> Float[np.ndarray, "n"]:
 def _smooth_random_signals(
     time_s: np.ndarray, period_s: float, random: np.random.Generator
 ) -> Float[np.ndarray, "n 3"]:
-    """Three smooth signals in [-1, 1]: two sines of unrelated periods each."""
+    """Return three smooth signals in [-1, 1], each the sum of two sines with random phases."""
     phase = random.uniform(0.0, 2.0 * np.pi, (2, 3))
     slow = np.sin(2.0 * np.pi * time_s[:, None] / (1.6 * period_s) + phase[0])
     return 0.65 * slow + 0.35 * np.sin(2.0 * np.pi * time_s[:, None] / (0.71 * period_s) + phase[1])
 
 
 def _add_rotation(axis_angles: Float[np.ndarray, "n j 3"], body: Body, name: str, angles: np.ndarray) -> None:
-    """Turn a joint further, in place; rigs may lack one (a second spine joint, a collar bone)."""
+    """Add axis-angle components to a joint, in place; skip a joint that the rig does not have."""
     if name in body.joint_names:
         axis_angles[:, body.joint(name)] += angles
 
 
 def _breathe(axis_angles: np.ndarray, body: Body, time_s: np.ndarray) -> None:
-    """The chest rises a little and the shoulders follow."""
+    """Add the rotation of chest and shoulders by breathing, in place."""
     breath = np.sin(2.0 * np.pi * time_s / BREATH_PERIOD_S)
     for name, amplitude_rad in (
         ("Spine2", (-0.014, 0, 0)),
@@ -134,7 +135,7 @@ def _breathe(axis_angles: np.ndarray, body: Body, time_s: np.ndarray) -> None:
 
 
 def _shift_weight(axis_angles: np.ndarray, body: Body, time_s: np.ndarray) -> None:
-    """The hips tip from side to side; legs and spine counter it, so that feet stay flat and the head level."""
+    """Add the pelvis tilt of shifting weight, in place; legs and spine compensate it."""
     tilt_rad = 0.022 * np.sin(2.0 * np.pi * time_s / 2.1)
     for name, sign in (("Hips", 1.0), ("LeftUpLeg", -1.0), ("RightUpLeg", -1.0), ("Spine", -1.0)):
         _add_rotation(axis_angles, body, name, tilt_rad[:, None] * (0.0, 0.0, sign))
@@ -147,7 +148,7 @@ def _shift_weight(axis_angles: np.ndarray, body: Body, time_s: np.ndarray) -> No
 def _motion_on_ground(
     body: Body, axis_angles: np.ndarray, heading: np.ndarray, ground_m: np.ndarray, time_s: np.ndarray
 ) -> Motion:
-    """Turn the person by `heading` (radians about +Y) and stand on `ground_m`."""
+    """Rotate the person by `heading` (radians about +Y) and place the feet on the floor at `ground_m`."""
     rotations = axis_angle_to_quaternion(torch.from_numpy(axis_angles))
     heading_axis_angle = torch.zeros(len(heading), 3, dtype=torch.float64)
     heading_axis_angle[:, 1] = torch.from_numpy(heading)

@@ -1,4 +1,4 @@
-"""Writing frames as a video file without visible loss."""
+"""Write frames as a lossless video file."""
 
 from collections.abc import Iterable
 from fractions import Fraction
@@ -8,14 +8,14 @@ import av
 import numpy as np
 from jaxtyping import UInt8
 
-# Without loss and with full chroma: 52 dB to the pictures (the rounding of 8-bit YUV) at 61 KB a frame of 540 x 540,
-# where crf 6 leaves 40 dB on the body and 4:2:0 chroma 33 dB. One thread, because x264's bytes depend on their number.
+# crf 0 with full chroma: 52 dB PSNR to the frames (rounding of 8-bit YUV), 61 KB per frame of 540 x 540. On the body,
+# crf 6 gives 40 dB and 4:2:0 chroma 33 dB. One thread, because the output of x264 depends on the number of threads.
 _PIXEL_FORMAT = "yuv444p"
 _X264_OPTIONS = {"crf": "0", "preset": "veryfast", "threads": "1"}
 
 
 def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], fps: float) -> None:
-    """H.264 in MP4; the same frames give the same bytes. ValueError when there is no frame."""
+    """Write H.264 in MP4; equal frames give equal bytes. ValueError if there is no frame."""
     with av.open(str(path), "w", options={"fflags": "+bitexact", "movflags": "+faststart"}) as container:
         stream = None
         for rgb in frames:

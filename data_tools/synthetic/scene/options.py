@@ -1,4 +1,4 @@
-"""Options that all synthetic captures share, from the command line to a `SyntheticCapture`."""
+"""Command-line options shared by all synthetic captures, and the `SyntheticCapture` that they describe."""
 
 import argparse
 from dataclasses import replace
@@ -21,46 +21,59 @@ from pipeline.geometry.camera import Camera
 from pipeline.io.image import to_float, to_uint8
 
 LIGHT_HELP = (
-    "studio: ambient and key light that shade; flat: the bare texture, shadow-free; shiny: studio with highlights; "
-    "hard: a strong key light that the person hides from itself"
+    "studio: ambient and key light; flat: unlit texture; shiny: studio with specular highlights; "
+    "hard: strong key light with cast shadows"
 )
 MIN_FRAMES, MIN_SIZE_PX = 2, 32
 MIN_FILL, MAX_FILL = 0.05, 0.95
 
 
 def capture_parser(command: str, description: str) -> argparse.ArgumentParser:
-    """A parser with the options that all captures share."""
+    """Return a parser with the options that all captures share."""
     parser = argparse.ArgumentParser(
         prog=f"python -m data_tools.{command}",
         description=description,
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     parser.add_argument("--frames", type=int, default=96, help="number of frames")
-    parser.add_argument("--fps", type=float, default=24.0, help="frames a second")
+    parser.add_argument("--fps", type=float, default=24.0, help="frames per second")
     parser.add_argument("--size", type=int, default=540, help="side of the square image in pixels, even")
-    parser.add_argument("--distance", type=float, default=3.6, help="from camera to person, metres")
-    parser.add_argument("--fill", type=float, default=0.82, help="share of the image's height that the person takes")
-    parser.add_argument("--focal", type=float, help="focal length in pixels, from which the share then follows")
+    parser.add_argument("--distance", type=float, default=3.6, help="distance from camera to person in metres")
+    parser.add_argument("--fill", type=float, default=0.82, help="fraction of the image height that the person covers")
+    parser.add_argument("--focal", type=float, help="focal length in pixels; overrides --fill")
     parser.add_argument("--light", choices=sorted(LIGHTING_PRESETS), default="studio", help=LIGHT_HELP)
-    parser.add_argument("--background", choices=("busy", "plain"), default="busy", help="the room")
-    parser.add_argument("--samples", type=int, default=2, help="antialiasing: samples a pixel along each axis")
-    parser.add_argument("--novel-views", type=int, default=4, help="held-out cameras to render into truth/")
-    parser.add_argument("--novel-poses", type=int, default=4, help="held-out poses to render into truth/")
-    parser.add_argument("--novel-bvh", type=Path, help="motion capture to take them from, evenly spread, on the spot")
-    parser.add_argument("--bvh", type=Path, help="motion capture to follow instead of the turn in A-pose")
-    parser.add_argument("--arc", type=float, default=360.0, help="degrees of the turn; below 360: there and back")
-    parser.add_argument("--ball", action="store_true", help="a juggled ball passes before the person")
-    parser.add_argument("--start", type=float, default=0.0, help="where in the motion to start, seconds")
-    parser.add_argument("--in-place", action="store_true", help="stay on the spot whatever the motion does")
-    parser.add_argument("--seed", type=int, default=0, help="person, clothes and sway; same seed, same bytes")
+    parser.add_argument(
+        "--background", choices=("busy", "plain"), default="busy", help="busy: furnished room; plain: bare wall"
+    )
+    parser.add_argument("--samples", type=int, default=2, help="antialiasing samples per pixel and axis")
+    parser.add_argument("--novel-views", type=int, default=4, help="number of novel cameras to render into truth/")
+    parser.add_argument("--novel-poses", type=int, default=4, help="number of novel poses to render into truth/")
+    parser.add_argument(
+        "--novel-bvh", type=Path, help="BVH file for the novel poses, evenly spaced in time, without root translation"
+    )
+    parser.add_argument("--bvh", type=Path, help="BVH file with the motion, instead of the turn in A-pose")
+    parser.add_argument(
+        "--arc",
+        type=float,
+        default=360.0,
+        help="angle of the turn in degrees; below 360 the person turns to both sides and back",
+    )
+    parser.add_argument("--ball", action="store_true", help="add a juggled ball that occludes the person")
+    parser.add_argument("--start", type=float, default=0.0, help="first time of the BVH motion to use, seconds")
+    parser.add_argument(
+        "--in-place", action="store_true", help="remove the horizontal root translation of the BVH motion"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, help="of body shape, clothes and sway; equal seeds give equal bytes"
+    )
     return parser
 
 
 def validate_capture_options(options: argparse.Namespace) -> None:
-    """Refuse numbers that cannot make a capture, before any work.
+    """Check the ranges of all numeric options.
 
     Raises:
-        UserError: naming the option and its range.
+        UserError: an option is out of range; the message names the option and its range.
     """
     bounds = (
         ("frames", MIN_FRAMES, 100_000),
@@ -78,16 +91,16 @@ def validate_capture_options(options: argparse.Namespace) -> None:
     for name, low, high in bounds:
         value = getattr(options, name, low)
         if not low <= value <= high:
-            raise UserError(f"--{name.replace('_', '-')} {value} is outside {low} to {high}; choose a value within")
+            raise UserError(f"--{name.replace('_', '-')} {value} is out of range; choose a value from {low} to {high}")
     if options.size % 2:
-        raise UserError(f"--size {options.size} is odd, which H.264 cannot store; choose {options.size + 1}")
+        raise UserError(f"--size {options.size} is odd; H.264 needs an even size: choose {options.size + 1}")
 
 
 def build_scene(options: argparse.Namespace, body: Body) -> tuple[Camera, np.ndarray, Room]:
-    """Camera, ground and room for a person of this height.
+    """Return camera, ground position (world, metres) and room for a person of this height.
 
     Raises:
-        UserError: with this --focal the person would be tiny, or cut off.
+        UserError: with this --focal the person would be too small or cropped.
     """
     fill = options.fill
     if options.focal is not None:
@@ -95,7 +108,7 @@ def build_scene(options: argparse.Namespace, body: Body) -> tuple[Camera, np.nda
         fill = options.focal / focal_at_full_height_px
         if not MIN_FILL <= fill <= MAX_FILL:
             raise UserError(
-                f"--focal {options.focal} lets the person take {fill:.2f} of the image's height; choose one from "
+                f"--focal {options.focal} makes the person cover {fill:.2f} of the image height; choose a value from "
                 f"{MIN_FILL * focal_at_full_height_px:.0f} to {MAX_FILL * focal_at_full_height_px:.0f}, or another "
                 "--distance"
             )
@@ -105,7 +118,7 @@ def build_scene(options: argparse.Namespace, body: Body) -> tuple[Camera, np.nda
 
 
 def build_motion(options: argparse.Namespace, body: Body, ground_m: np.ndarray) -> Motion:
-    """The turn in A-pose, or the part of a BVH file that is asked for."""
+    """Return the turn in A-pose, or the selected part of the --bvh file."""
     if options.bvh:
         full_motion = retarget(read_bvh(options.bvh), body, ground_m, options.in_place)
         return resample_motion(full_motion, options.start, options.frames, options.fps)
@@ -113,7 +126,7 @@ def build_motion(options: argparse.Namespace, body: Body, ground_m: np.ndarray) 
 
 
 def build_novel_poses(options: argparse.Namespace, body: Body, ground_m: np.ndarray) -> Motion | None:
-    """Poses that the capture does not show: those built in, or some of a BVH file; None when none is asked for."""
+    """Return the novel poses: built-in, or from the --novel-bvh file; None with --novel-poses 0."""
     if not options.novel_poses:
         return None
     if not options.novel_bvh:
@@ -126,20 +139,20 @@ def build_novel_poses(options: argparse.Namespace, body: Body, ground_m: np.ndar
 def build_capture(
     options: argparse.Namespace, subject: Subject, motion: Motion, scene: tuple[Camera, np.ndarray, Room]
 ) -> tuple[SyntheticCapture, HeldOutTargets]:
-    """The capture, and its held-out questions."""
+    """Return the capture, and the novel views and poses to render for evaluation."""
     camera, ground_m, room = scene
     ball = Ball(ground_m, subject.body.height_m()) if options.ball else None
     light = LIGHTING_PRESETS[options.light]
     capture = SyntheticCapture(subject, motion, camera, light, room, ground_m, options.fps, options.samples, ball)
-    # Whoever walks may be metres from the middle of the path in the first frame, which the held-out cameras show.
+    # The novel cameras show the first frame, in which a walking person may be metres from the middle of the trajectory.
     start_offset_m = motion.root_translation_m[0] - ground_m.astype(np.float32)
     person_position_m = ground_m + start_offset_m * [1.0, 0.0, 1.0]
     cameras = novel_cameras(camera, person_position_m, subject.body.height_m(), options.novel_views)
     return capture, HeldOutTargets(cameras, build_novel_poses(options, subject.body, ground_m))
 
 
-def recipe_from_options(options: argparse.Namespace) -> dict[str, object]:
-    """The options by name, as they go into the truth's recipe; of paths only the motions' names."""
+def settings_from_options(options: argparse.Namespace) -> dict[str, object]:
+    """Return the options by name for `capture_settings.json`; of paths only the file names of the motions."""
     chosen = {
         name: value if isinstance(value, int | float | str) else str(value)
         for name, value in sorted(vars(options).items())

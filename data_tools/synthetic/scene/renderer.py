@@ -1,4 +1,8 @@
-"""Lit, antialiased pictures of a textured skinned surface: what the synthetic camera sees."""
+"""Render a textured skinned surface with lighting and supersampling antialiasing.
+
+Shading: wrapped Lambert diffuse and Blinn-Phong specular of one key light, plus hemispheric ambient light, computed in
+linear colour. The reflection model is Blinn, "Models of light reflection for computer synthesized pictures" (1977).
+"""
 
 from dataclasses import dataclass
 
@@ -18,15 +22,23 @@ from pipeline.kernels.raster import rasterize
 
 @dataclass(frozen=True)
 class Light:
-    """One key light from a fixed direction of the world, and ambient light that is stronger from above.
+    """One directional key light and hemispheric ambient light.
 
-    A key of 0 and an ambient of 1 with no sky shows the bare texture (shadow-free). wrap: how far the key reaches round
-    the terminator (0: Lambert). casts_shadows: the person hides the key from parts of the person.
+    `key_intensity=0, ambient_intensity=1, sky_gradient=0` shows the texture without shading.
+
+    Attributes:
+        key_intensity: irradiance of the key light at normal incidence.
+        key_direction: direction towards the light (world, any length > 0).
+        ambient_intensity: ambient irradiance on vertical surfaces.
+        sky_gradient: change of the ambient irradiance with the y component of the normal.
+        specular_strength: Blinn-Phong coefficient.
+        diffuse_wrap: wrap of the diffuse term around the terminator; 0 is Lambert.
+        casts_shadows: the person casts shadows of the key light on itself.
     """
 
-    key: float = 0.55
+    key_intensity: float = 0.55
     key_direction: tuple[float, float, float] = (0.45, 0.65, 0.75)
-    ambient: float = 0.62
+    ambient_intensity: float = 0.62
     sky_gradient: float = 0.10
     specular_strength: float = 0.0
     diffuse_wrap: float = 0.25
@@ -34,16 +46,16 @@ class Light:
 
 
 STUDIO = Light()
-FLAT = Light(key=0.0, ambient=1.0, sky_gradient=0.0)
+FLAT = Light(key_intensity=0.0, ambient_intensity=1.0, sky_gradient=0.0)
 SHINY = Light(specular_strength=0.35)
-HARD = Light(key=0.75, ambient=0.42, diffuse_wrap=0.0, casts_shadows=True)
+HARD = Light(key_intensity=0.75, ambient_intensity=0.42, diffuse_wrap=0.0, casts_shadows=True)
 LIGHTING_PRESETS = {"studio": STUDIO, "flat": FLAT, "shiny": SHINY, "hard": HARD}
 
 BLINN_PHONG_EXPONENT = 24.0
 
 
 def pose_vertices(subject: Subject, canonical_to_world: Float[Tensor, "j 4 4"]) -> Float[Tensor, "v 3"]:
-    """The clothed surface in one pose, world, metres."""
+    """Return the vertices of the clothed surface in one pose (world, metres)."""
     body = subject.body
     weights = torch.from_numpy(body.skin_weights)
     return linear_blend_skinning(torch.from_numpy(body.vertices), weights, canonical_to_world[None])[0]
@@ -52,9 +64,9 @@ def pose_vertices(subject: Subject, canonical_to_world: Float[Tensor, "j 4 4"]) 
 def render_subject(
     subject: Subject, vertices_world: Float[Tensor, "v 3"], camera: Camera, light: Light, samples: int
 ) -> Float[np.ndarray, "h w 4"]:
-    """sRGB colours premultiplied by coverage, and the coverage, in [0, 1].
+    """Render premultiplied sRGB and coverage, in [0, 1].
 
-    Each pixel is the mean of `samples` x `samples` shaded look-ups at regular places. Composite with
+    Each pixel is the mean of `samples` x `samples` shaded samples on a regular grid. Composite with
     ``rgb + (1 - coverage) * background``.
     """
     image = np.zeros((camera.height, camera.width, 4), dtype=np.float32)
@@ -72,7 +84,7 @@ def render_subject(
 
 
 def _bounding_window_px(vertices_world: Float[Tensor, "v 3"], camera: Camera) -> tuple[int, int, int, int] | None:
-    """Left, top, width and height (px) of the part of the image that the surface can touch; None when it is outside."""
+    """Return left, top, width and height (px) of the projected bounding box, clipped to the image; None if empty."""
     position_px, _ = project(vertices_world, camera)
     size = torch.tensor([camera.width, camera.height])
     low = position_px.amin(0).floor().clamp_min(0).int()
@@ -85,7 +97,7 @@ def _bounding_window_px(vertices_world: Float[Tensor, "v 3"], camera: Camera) ->
 def _shade_window(
     subject: Subject, vertices_world: Float[Tensor, "v 3"], camera: Camera, light: Light, shadows: ShadowMap | None
 ) -> Float[np.ndarray, "h w 4"]:
-    """One shaded look-up a pixel."""
+    """Shade one sample per pixel: premultiplied sRGB and coverage (0 or 1)."""
     faces, faces_uv = torch.from_numpy(subject.body.faces), torch.from_numpy(subject.faces_uv)
     position_px, depth_m = project(vertices_world, camera)
     face_id, barycentric, _ = rasterize(position_px, depth_m, faces, camera.height, camera.width)
@@ -106,7 +118,7 @@ def _shade_window(
 
 
 def _normals(vertices: Float[Tensor, "v 3"], faces: Tensor) -> Float[Tensor, "v 3"]:
-    """Area-weighted vertex normals."""
+    """Return area-weighted unit vertex normals."""
     corners = vertices[faces.long()]
     cross = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals = torch.zeros_like(vertices)
@@ -122,14 +134,16 @@ def shade(
     visibility: Float[Tensor, "n"],
     light: Light,
 ) -> Float[Tensor, "n 3"]:
-    """sRGB colours under the light: Lambert with a wrapped key light, hemispheric ambient, Blinn-Phong shine.
+    """Compute sRGB colours in [0, 1]: wrapped Lambert diffuse, hemispheric ambient and Blinn-Phong specular.
 
-    All directions are unit vectors in the world; albedo is sRGB, the sum is taken in linear light. lit: share of the
-    key light that nothing hides.
+    Args:
+        albedo: sRGB in [0, 1]; the terms are summed in linear colour.
+        normal, to_camera: unit vectors in the world.
+        visibility: fraction of the key light that is not shadowed, in [0, 1].
     """
     key_direction = torch.nn.functional.normalize(torch.tensor(light.key_direction), dim=0)
     diffuse = visibility * ((normal @ key_direction + light.diffuse_wrap) / (1.0 + light.diffuse_wrap)).clamp_min(0.0)
-    irradiance = light.ambient + light.sky_gradient * normal[:, 1] + light.key * diffuse
+    irradiance = light.ambient_intensity + light.sky_gradient * normal[:, 1] + light.key_intensity * diffuse
     half_vector = torch.nn.functional.normalize(key_direction + to_camera, dim=1)
     specular = (
         light.specular_strength * visibility * (normal * half_vector).sum(1).clamp_min(0.0) ** BLINN_PHONG_EXPONENT

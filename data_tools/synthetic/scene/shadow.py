@@ -1,5 +1,8 @@
-"""Cast shadows: a depth picture of the person as a far light sees it (Williams, "Casting curved shadows on curved
-surfaces", 1978), looked up with soft borders (percentage-closer filtering, Reeves et al. 1987)."""
+"""Shadow map of a directional light, with percentage-closer filtering, and a test for exterior faces.
+
+Shadow maps: Williams, "Casting curved shadows on curved surfaces", 1978. Percentage-closer filtering: Reeves, Salesin
+and Cook, "Rendering antialiased shadows with depth maps", 1987. Light coordinates: right, up, away from the light.
+"""
 
 from dataclasses import dataclass
 
@@ -13,26 +16,28 @@ from pipeline.kernels.raster import rasterize
 
 SHADOW_TEXEL_M = 0.003
 PCF_RADIUS_PX = 2
-"""Half width of the square of look-ups around a place: the border of a shadow is as soft as a small lamp's."""
+"""Radius of the square percentage-closer filter, in texels."""
 
 NORMAL_BIAS_M = 0.012
-"""Places are looked up so far off their surface, along its normal: a surface does not shade itself by rounding."""
+"""Offset of query points along their normal, which prevents self-shadowing by rounding (shadow acne)."""
 
 _LIGHT_DISTANCE_M = 1000.0
-"""The light's distance, at which depth is linear in float32 to a tenth of a millimetre."""
+"""Distance of the depth origin; float32 depth then has a resolution of 0.1 mm."""
 
 _N_VIEW_DIRECTIONS = 24
-"""Directions of `find_exterior_faces`, a golden angle apart from top to bottom."""
+"""Directions of `find_exterior_faces`, on a golden-angle (Fibonacci) spiral."""
 
 _MARGIN_PX = 2 * PCF_RADIUS_PX + 1
 
 
 @dataclass(frozen=True)
 class ShadowMap:
-    """Distance of what the light meets first, from a plane `_LIGHT_DISTANCE_M` before the origin; inf where it meets
-    nothing.
+    """Depth of the first surface along the light direction.
 
-    axes: rows are right, up and away from the light. corner: place of the picture's first pixel on right and up.
+    Attributes:
+        world_to_light: rotation; rows are right, up and away from the light.
+        origin_m: right and up coordinates of the first texel.
+        depth: metres from the plane `_LIGHT_DISTANCE_M` in front of the world origin; inf where there is no surface.
     """
 
     world_to_light: Float[Tensor, "3 3"]
@@ -40,7 +45,10 @@ class ShadowMap:
     depth: Float[Tensor, "h w"]
 
     def visibility(self, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-        """Share of the light that reaches each place of a surface, in [0, 1]; world, metres, unit normals."""
+        """Return the fraction of the light that reaches each surface point, in [0, 1].
+
+        points: world, metres. normals: unit vectors.
+        """
         points_light_m = (points + NORMAL_BIAS_M * normals) @ self.world_to_light.T
         cell = ((points_light_m[:, :2] - self.origin_m) / SHADOW_TEXEL_M).floor().long()
         height, width = self.depth.shape
@@ -61,7 +69,10 @@ class ShadowMap:
 def render_shadow_map(
     vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], key_direction: tuple[float, float, float]
 ) -> ShadowMap:
-    """The picture that a light in the direction `key_direction` (world, not along Y) takes of a surface."""
+    """Rasterise the depth of a surface (world, metres) as seen by a directional light.
+
+    key_direction: towards the light, in the world; must not be parallel to Y.
+    """
     away = -torch.nn.functional.normalize(torch.tensor(key_direction), dim=0)
     right = torch.nn.functional.normalize(torch.linalg.cross(away, torch.tensor([0.0, 1.0, 0.0])), dim=0)
     world_to_light = torch.stack([right, torch.linalg.cross(right, away), away])
@@ -74,9 +85,10 @@ def render_shadow_map(
 
 
 def find_exterior_faces(mesh: Mesh) -> Bool[np.ndarray, "f"]:
-    """Whether light from any of `_N_VIEW_DIRECTIONS` directions, spread evenly, reaches the middle of each face.
+    """Return which faces are visible from outside, by shadow maps from `_N_VIEW_DIRECTIONS` uniform directions.
 
-    What none reaches is inside: a mouth, the far side of an eye, a body beneath its clothes.
+    A face is exterior if its centroid is visible from at least one direction. Interior faces are, for example, the
+    mouth cavity, the back of an eyeball, or skin under clothes.
     """
     vertices, faces = torch.from_numpy(mesh.vertices).float(), torch.from_numpy(mesh.faces)
     centroids, normals = vertices[faces.long()].mean(1), torch.from_numpy(mesh.face_normals()).float()

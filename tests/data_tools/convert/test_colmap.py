@@ -74,7 +74,7 @@ def test_a_lens_without_distortion_has_none(tmp_path):
 def test_a_fisheye_is_refused(tmp_path, write, monkeypatch):
     monkeypatch.setitem(NUMBERS, "OPENCV_FISHEYE", 5)
     write(tmp_path / "m", "OPENCV_FISHEYE", (50, 51, 8, 6, 0.1, 0.2, 0.3, 0.4))
-    with pytest.raises(UserError, match="camera model (OPENCV_FISHEYE|number 5) is not read"):
+    with pytest.raises(UserError, match="camera model (OPENCV_FISHEYE|number 5) is not supported"):
         read_colmap_model(tmp_path / "m")
 
 
@@ -91,5 +91,5 @@ def test_damage_and_absence_are_named(tmp_path):
     whole = (tmp_path / "b" / "images.bin").read_bytes()
     for length in (4, 40, 75, len(whole) // 2):
         (tmp_path / "b" / "images.bin").write_bytes(whole[:length])
-        with pytest.raises(UserError, match=r"images\.bin is no COLMAP file"):
+        with pytest.raises(UserError, match=r"images\.bin is not a valid COLMAP file"):
             read_colmap_model(tmp_path / "b")

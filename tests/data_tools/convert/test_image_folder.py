@@ -11,13 +11,13 @@ from pipeline.capture.user_files import load_user_files
 from pipeline.capture.video import open_frame_source
 from pipeline.core.errors import UserError
 from pipeline.io.image import read_rgb, write_rgba
-from tests.data_tools.convert import made_up
+from tests.data_tools.convert import sample_data
 
 
 def check(target):
     source = open_frame_source(target)
     user_files = load_user_files(target, source)
-    for k, (picture, mask) in enumerate(zip(made_up.pictures(6), made_up.masks(6), strict=True)):
+    for k, (picture, mask) in enumerate(zip(sample_data.pictures(6), sample_data.masks(6), strict=True)):
         np.testing.assert_array_equal(read_rgb(source.files[k]), picture)
         np.testing.assert_array_equal(user_files.read_mask(k), 255 * mask)
     return user_files
@@ -25,7 +25,7 @@ def check(target):
 
 @pytest.mark.parametrize("name", ["masks", "matte"])
 def test_masks_in_a_folder_of_any_usual_name(tmp_path, name):
-    made_up.write_image_folder(tmp_path / "in", name)
+    sample_data.write_image_folder(tmp_path / "in", name)
     assert is_image_folder(tmp_path / "in")
     (tmp_path / "in" / "camera.json").write_text(json.dumps({"fx": 9, "fy": 9, "cx": 8, "cy": 6}))
     write_recording(read_image_folder(tmp_path / "in"), tmp_path / "out")
@@ -34,7 +34,7 @@ def test_masks_in_a_folder_of_any_usual_name(tmp_path, name):
 
 def test_masks_in_the_alpha_channel(tmp_path):
     (tmp_path / "in").mkdir()
-    for k, (picture, mask) in enumerate(zip(made_up.pictures(6), made_up.masks(6), strict=True)):
+    for k, (picture, mask) in enumerate(zip(sample_data.pictures(6), sample_data.masks(6), strict=True)):
         write_rgba(tmp_path / "in" / f"{k}.png", np.concatenate([picture, 255 * mask[..., None]], axis=2))
     assert is_image_folder(tmp_path / "in")
     write_recording(read_image_folder(tmp_path / "in"), tmp_path / "out")
@@ -42,7 +42,7 @@ def test_masks_in_the_alpha_channel(tmp_path):
 
 
 def test_pictures_without_masks_need_no_conversion(tmp_path):
-    made_up.write_image_folder(tmp_path / "in", "other")
+    sample_data.write_image_folder(tmp_path / "in", "other")
     assert not is_image_folder(tmp_path / "in")
-    with pytest.raises(UserError, match="no masks beside its pictures"):
+    with pytest.raises(UserError, match="no mask folder and no alpha channel"):
         read_image_folder(tmp_path / "in")

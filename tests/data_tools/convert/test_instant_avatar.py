@@ -14,7 +14,7 @@ from pipeline.capture.video import open_frame_source
 from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
 from pipeline.io.image import read_rgb, write_gray
-from tests.data_tools.convert import made_up
+from tests.data_tools.convert import sample_data
 
 SUBJECT = "male-3-casual"
 TRAIN, HELDOUT = list(range(0, 456, 4)), list(range(456, 676, 4))
@@ -23,7 +23,7 @@ TRAIN, HELDOUT = list(range(0, 456, 4)), list(range(456, 676, 4))
 @pytest.fixture
 def folder(tmp_path):
     """One unknown subject of six frames."""
-    made_up.instant_avatar(tmp_path / "somebody")
+    sample_data.instant_avatar(tmp_path / "somebody")
     return tmp_path / "somebody"
 
 
@@ -31,7 +31,7 @@ def folder(tmp_path):
 def subject(tmp_path_factory):
     """A known subject of 673 frames, just enough for its split, without poses of the sets."""
     folder = tmp_path_factory.mktemp("known") / SUBJECT
-    made_up.instant_avatar(folder, HELDOUT[-1] + 1)
+    sample_data.instant_avatar(folder, HELDOUT[-1] + 1)
     return folder
 
 
@@ -40,22 +40,22 @@ def test_round_trip(folder, tmp_path):
     write_recording(read_instant_avatar(folder), tmp_path / "out")
     source = open_frame_source(tmp_path / "out")
     user_files = load_user_files(tmp_path / "out", source)
-    for k, (picture, mask) in enumerate(zip(made_up.pictures(6), made_up.masks(6), strict=True)):
+    for k, (picture, mask) in enumerate(zip(sample_data.pictures(6), sample_data.masks(6), strict=True)):
         np.testing.assert_array_equal(read_rgb(source.files[k]), picture)
         np.testing.assert_array_equal(user_files.read_mask(k), 255 * mask)
     assert (user_files.camera.fx, user_files.camera.fy, user_files.camera.cx, user_files.camera.cy) == (30, 31, 8, 6)
     assert user_files.camera.distortion == ()
     assert user_files.split is None
     poses = load_smpl_poses(tmp_path / "out" / "smpl_poses.npz")
-    pose = made_up.numbers("pose", 6)
+    pose = sample_data.numbers("pose", 6)
     np.testing.assert_array_equal(np.concatenate([poses.global_orient, poses.body_pose], axis=1), pose)
-    np.testing.assert_array_equal(poses.transl, made_up.numbers("transl", 6))
+    np.testing.assert_array_equal(poses.transl, sample_data.numbers("transl", 6))
     assert poses.gender == "unknown"
     assert (poses.smpl_to_camera[:, 2, 3] == 1).all()
 
 
 def test_a_known_subject_keeps_its_sets_and_their_poses(subject, tmp_path):
-    train, test = made_up.poses_of_set(len(TRAIN), 5), made_up.poses_of_set(len(HELDOUT), 6)
+    train, test = sample_data.poses_of_set(len(TRAIN), 5), sample_data.poses_of_set(len(HELDOUT), 6)
     shutil.copytree(subject, tmp_path / SUBJECT)
     np.savez(tmp_path / SUBJECT / "poses" / "anim_nerf_train.npz", **train)
     np.savez(tmp_path / SUBJECT / "poses" / "anim_nerf_test.npz", **test)
@@ -95,23 +95,23 @@ def test_no_set_shares_a_frame(name):
 
 
 def test_a_shorter_video_of_a_known_subject_gets_no_split(tmp_path):
-    made_up.instant_avatar(tmp_path / SUBJECT)
-    np.savez(tmp_path / SUBJECT / "poses" / "anim_nerf_train.npz", **made_up.poses_of_set(3, 5))
+    sample_data.instant_avatar(tmp_path / SUBJECT)
+    np.savez(tmp_path / SUBJECT / "poses" / "anim_nerf_train.npz", **sample_data.poses_of_set(3, 5))
     recording = read_instant_avatar(tmp_path / SUBJECT)
     assert recording.split is None
     assert len(recording.poses.frame_index) == 6
     warnings = take_warnings()
     assert "needs 673" in warnings[0]
-    assert "its poses are left out" in warnings[1]
+    assert "these poses are ignored" in warnings[1]
 
 
 def test_masks_may_be_images_and_poses_absent(folder):
-    for k, mask in enumerate(made_up.masks(6)):
+    for k, mask in enumerate(sample_data.masks(6)):
         (folder / "masks" / f"mask_{k:04d}.npy").unlink()
         write_gray(folder / "masks" / f"{k}.png", 200 * mask)
     (folder / "poses.npz").unlink()
     recording = read_instant_avatar(folder)
-    np.testing.assert_array_equal(recording.read_mask(3), 200 * made_up.masks(6)[3])
+    np.testing.assert_array_equal(recording.read_mask(3), 200 * sample_data.masks(6)[3])
     assert recording.poses is None
 
 
@@ -123,10 +123,10 @@ def test_what_does_not_fit_is_named(folder):
     with pytest.raises(UserError, match="the translation must have 6 rows of 3 numbers, found None"):
         read_instant_avatar(folder)
     (folder / "masks" / "mask_0003.npy").unlink()
-    with pytest.raises(UserError, match="5 masks for 6 pictures"):
+    with pytest.raises(UserError, match="5 masks for 6 images"):
         read_instant_avatar(folder)
     np.savez(folder / "cameras.npz", intrinsic=np.eye(3), extrinsic=np.eye(4), height=540, width=540)
-    with pytest.raises(UserError, match="for pictures of 540x540, those of .* are 16x12"):
+    with pytest.raises(UserError, match="for images of 540x540, but those of .* are 16x12"):
         read_instant_avatar(folder)
     np.savez(folder / "cameras.npz", intrinsic=np.eye(4))
     with pytest.raises(UserError, match="`intrinsic` must have shape"):

@@ -9,12 +9,12 @@ from pipeline.capture.capture import load_capture
 from pipeline.core.errors import UserError
 from pipeline.io.npz import save_npz
 from stages import frames
-from tests.data_tools.convert import made_up
+from tests.data_tools.convert import sample_data
 
 MAKERS = {
-    "peoplesnapshot": made_up.people_snapshot,
-    "instantavatar": made_up.instant_avatar,
-    "images": lambda folder: made_up.write_image_folder(folder, "mask"),
+    "peoplesnapshot": sample_data.people_snapshot,
+    "instantavatar": sample_data.instant_avatar,
+    "images": lambda folder: sample_data.write_image_folder(folder, "mask"),
 }
 
 
@@ -36,21 +36,21 @@ def test_the_format_is_guessed_and_the_source_is_only_read(tmp_path, capsys, nam
 
 
 def test_errors_are_sentences(tmp_path, capsys):
-    made_up.write_image_folder(tmp_path / "in", "other")
+    sample_data.write_image_folder(tmp_path / "in", "other")
     source, target = str(tmp_path / "in"), str(tmp_path / "out")
     for arguments, message in (
-        ([source, target], "none of the known formats (peoplesnapshot, instantavatar, neuman, images)"),
-        (["nerf", source, target], "unknown format nerf; there are peoplesnapshot"),
-        ([f"{source}/none", target], "is no folder"),
-        ([source, f"{source}/out"], "which is only read"),
-        ([source, source], "exists already"),
+        ([source, target], "none of the formats peoplesnapshot, instantavatar, neuman, images"),
+        (["nerf", source, target], "unknown format nerf; choose one of peoplesnapshot"),
+        ([f"{source}/none", target], "is not a folder"),
+        ([source, f"{source}/out"], "which is read only"),
+        ([source, source], "already exists"),
     ):
         assert run_command(main, arguments) == 2
         assert message in capsys.readouterr().err
 
 
 def test_what_breaks_off_leaves_no_target(tmp_path):
-    made_up.write_image_folder(tmp_path / "in", "masks")
+    sample_data.write_image_folder(tmp_path / "in", "masks")
     broken = tmp_path / "in" / "masks" / "00003.png"
     whole = broken.read_bytes()
     broken.write_bytes(b"rubbish")
@@ -64,7 +64,7 @@ def test_what_breaks_off_leaves_no_target(tmp_path):
 
 def test_the_frames_stage_takes_the_target(tmp_path):
     """With landmarks beside it, so that no detector is needed: the split, masks and camera of the source are used."""
-    made_up.instant_avatar(tmp_path / "in", 20)
+    sample_data.instant_avatar(tmp_path / "in", 20)
     main([str(tmp_path / "in"), str(tmp_path / "out")])
     landmarks = {"landmarks_px": np.full((20, 33, 2), 5.0), "landmarks_world_m": np.zeros((20, 33, 3))}
     save_npz(tmp_path / "out" / "landmarks.npz", landmarks)
@@ -74,4 +74,4 @@ def test_the_frames_stage_takes_the_target(tmp_path):
     capture = load_capture(tmp_path / "run")
     np.testing.assert_array_equal(capture.frame_index[capture.positions(2)], [4, 17])
     assert (capture.camera.fx, capture.mask_source) == (30, "masks/")
-    np.testing.assert_array_equal(capture.mask(2), made_up.masks(20)[2])
+    np.testing.assert_array_equal(capture.mask(2), sample_data.masks(20)[2])

@@ -10,7 +10,7 @@ from pipeline.capture.user_files import load_user_files
 from pipeline.capture.video import open_frame_source
 from pipeline.core.errors import UserError
 from pipeline.io.image import write_gray
-from tests.data_tools.convert import made_up
+from tests.data_tools.convert import sample_data
 from tests.data_tools.convert.joblib_writer import dump_joblib
 
 SCALE = 0.25
@@ -28,8 +28,8 @@ def camera_pose(k: int) -> tuple[np.ndarray, np.ndarray]:
 def scene(tmp_path):
     """Six pictures, the fifth of them not registered by COLMAP; the world's unit is four metres."""
     folder = tmp_path / "scene"
-    made_up.write_image_folder(folder, "segmentations")
-    for k, mask in enumerate(made_up.masks(6)):
+    sample_data.write_image_folder(folder, "segmentations")
+    for k, mask in enumerate(sample_data.masks(6)):
         write_gray(folder / "segmentations" / f"{k:05d}.png", 255 - 255 * mask)
     (folder / "sparse").mkdir()
     (folder / "sparse" / "cameras.txt").write_text("# Camera list\n1 PINHOLE 16 12 30.5 31.5 8.25 6.5\n")
@@ -39,7 +39,7 @@ def scene(tmp_path):
         place = " ".join(map(str, camera_pose(k)[1]))
         lines += [f"{k + 1} {np.cos(half)} 0 0 {np.sin(half)} {place} 1 {k:05d}.png", "1.5 2.5 -1" if k else ""]
     (folder / "sparse" / "images.txt").write_text("\n".join(lines) + "\n")
-    rows = {"pose": list(made_up.numbers("pose", 6)), "betas": made_up.numbers("betas", 6)}
+    rows = {"pose": list(sample_data.numbers("pose", 6)), "betas": sample_data.numbers("betas", 6)}
     dump_joblib({1: rows}, folder / "smpl_output_optimized.pkl")
     alignment = np.concatenate([SCALE * np.eye(3), SCALE * PERSON[None]])
     np.save(folder / "alignments.npy", {f"{k:05d}.png": alignment for k in range(6)}, allow_pickle=True)
@@ -52,16 +52,16 @@ def test_round_trip(scene, tmp_path):
     source = open_frame_source(tmp_path / "out")
     user_files = load_user_files(tmp_path / "out", source)
     assert source.n_frames == 6
-    for k, mask in enumerate(made_up.masks(6)):
+    for k, mask in enumerate(sample_data.masks(6)):
         np.testing.assert_array_equal(user_files.read_mask(k), 255 * mask)
     camera = user_files.camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion) == (30.5, 31.5, 8.25, 6.5, ())
     poses = load_smpl_poses(tmp_path / "out" / "smpl_poses.npz")
     registered = [0, 1, 2, 3, 5]
     np.testing.assert_array_equal(poses.frame_index, registered)
-    pose = made_up.numbers("pose", 6)[registered]
+    pose = sample_data.numbers("pose", 6)[registered]
     np.testing.assert_array_equal(np.concatenate([poses.global_orient, poses.body_pose], axis=1), pose)
-    np.testing.assert_array_equal(poses.betas, made_up.numbers("betas", 6)[registered])
+    np.testing.assert_array_equal(poses.betas, sample_data.numbers("betas", 6)[registered])
     assert poses.gender == "neutral"
     assert (poses.transl == 0).all()
 
@@ -81,10 +81,10 @@ def test_bodies_are_carried_to_the_camera_in_metres(scene):
 def test_romps_poses_when_there_are_no_better_ones(scene):
     (scene / "smpl_output_optimized.pkl").unlink()
     dump_joblib(
-        {1: {"pose": 2 * made_up.numbers("pose", 6), "betas": np.zeros((6, 10))}}, scene / "smpl_output_romp.pkl"
+        {1: {"pose": 2 * sample_data.numbers("pose", 6), "betas": np.zeros((6, 10))}}, scene / "smpl_output_romp.pkl"
     )
     poses = read_neuman(scene).poses
-    np.testing.assert_array_equal(poses.global_orient[1], 2 * made_up.numbers("pose", 6)[1, :3])
+    np.testing.assert_array_equal(poses.global_orient[1], 2 * sample_data.numbers("pose", 6)[1, :3])
     (scene / "alignments.npy").unlink()
     assert read_neuman(scene).poses is None
 
@@ -104,20 +104,22 @@ def test_split_files_name_pictures(scene, tmp_path):
 
 def test_what_does_not_fit_is_named(scene):
     (scene / "segmentations" / "00002.png").unlink()
-    with pytest.raises(UserError, match="5 masks for 6 pictures"):
+    with pytest.raises(UserError, match="5 masks for 6 images"):
         read_neuman(scene)
-    dump_joblib({1: {"pose": made_up.numbers("pose", 3), "betas": np.zeros((3, 10))}}, scene / "smpl_output_romp.pkl")
+    dump_joblib(
+        {1: {"pose": sample_data.numbers("pose", 3), "betas": np.zeros((3, 10))}}, scene / "smpl_output_romp.pkl"
+    )
     (scene / "smpl_output_optimized.pkl").unlink()
     (scene / "segmentations" / "00002.png").write_bytes((scene / "segmentations" / "00001.png").read_bytes())
-    with pytest.raises(UserError, match="has poses of 3 pictures"):
+    with pytest.raises(UserError, match="has poses of 3 images"):
         read_neuman(scene)
     dump_joblib({1: {}, 2: {}}, scene / "smpl_output_romp.pkl")
-    with pytest.raises(UserError, match="does not hold one person's poses"):
+    with pytest.raises(UserError, match="does not hold the poses of one person"):
         read_neuman(scene)
     cameras = scene / "sparse" / "cameras.txt"
     cameras.write_text("1 PINHOLE 32 24 61 63 16.5 13\n")
-    with pytest.raises(UserError, match="for pictures of 32x24, those of .* are 16x12"):
+    with pytest.raises(UserError, match="for images of 32x24, but those of .* are 16x12"):
         read_neuman(scene)
     cameras.write_text("2 PINHOLE 16 12 61 63 16.5 13\n")
-    with pytest.raises(UserError, match="0 different cameras"):
+    with pytest.raises(UserError, match="0 cameras"):
         read_neuman(scene)

@@ -15,46 +15,46 @@ from pipeline.capture.user_files import load_user_files
 from pipeline.capture.video import open_frame_source, read_frames
 from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
-from tests.data_tools.convert import made_up
+from tests.data_tools.convert import sample_data
 
 
 def test_round_trip(tmp_path):
     folder, target = tmp_path / "female-9-casual", tmp_path / "out"
-    camera = made_up.people_snapshot(folder)
+    camera = sample_data.people_snapshot(folder)
     assert is_people_snapshot(folder)
     write_recording(read_people_snapshot(folder), target)
     source = open_frame_source(target)
     read = np.stack([frame.rgb for frame in read_frames(source, lambda _: True, 999)])
-    np.testing.assert_allclose(read.astype(int), made_up.pictures(6), atol=3)
+    np.testing.assert_allclose(read.astype(int), sample_data.pictures(6), atol=3)
     user_files = load_user_files(target, source)
-    for k, mask in enumerate(made_up.masks(6)):
+    for k, mask in enumerate(sample_data.masks(6)):
         np.testing.assert_array_equal(user_files.read_mask(k), 255 * mask)
     assert (user_files.camera.fx, user_files.camera.fy, user_files.camera.cx, user_files.camera.cy) == (30, 31, 8, 6)
     assert user_files.camera.distortion == tuple(camera["camera_k"])
     assert user_files.camera.world_to_camera is None
     assert user_files.split is None
-    assert "no split is known for female-9-casual" in take_warnings()[0]
+    assert "no published split for female-9-casual" in take_warnings()[0]
     poses = load_smpl_poses(target / "smpl_poses.npz")
     np.testing.assert_array_equal(poses.frame_index, np.arange(6))
-    pose = made_up.numbers("pose", 6)
+    pose = sample_data.numbers("pose", 6)
     np.testing.assert_array_equal(np.concatenate([poses.global_orient, poses.body_pose], axis=1), pose)
-    np.testing.assert_array_equal(poses.transl, made_up.numbers("trans", 6))
-    np.testing.assert_array_equal(poses.betas, made_up.numbers("betas", 1).repeat(6, axis=0))
+    np.testing.assert_array_equal(poses.transl, sample_data.numbers("trans", 6))
+    np.testing.assert_array_equal(poses.betas, sample_data.numbers("betas", 1).repeat(6, axis=0))
     assert poses.gender == "female"
     quarter_turn = np.array([[0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 3.0], [0, 0, 0, 1]])
     np.testing.assert_allclose(poses.smpl_to_camera, np.tile(quarter_turn, (6, 1, 1)), atol=1e-6)
 
 
 def test_a_pickle_of_python_2_with_float_scalars(tmp_path):
-    made_up.people_snapshot(tmp_path / "s")
+    sample_data.people_snapshot(tmp_path / "s")
     stored = pickle.loads((tmp_path / "s" / "camera.pkl").read_bytes())
-    stored |= {"width": np.float64(made_up.WIDTH), "height": np.array([made_up.HEIGHT])}
+    stored |= {"width": np.float64(sample_data.WIDTH), "height": np.array([sample_data.HEIGHT])}
     (tmp_path / "s" / "camera.pkl").write_bytes(pickle.dumps(stored, protocol=0))
     assert read_people_snapshot(tmp_path / "s").camera.fx == 30
 
 
 def test_everything_but_the_video_may_be_absent(tmp_path):
-    made_up.people_snapshot(tmp_path / "s")
+    sample_data.people_snapshot(tmp_path / "s")
     for name in ("camera.pkl", "reconstructed_poses.hdf5"):
         (tmp_path / "s" / name).unlink()
     recording = read_people_snapshot(tmp_path / "s")
@@ -65,7 +65,7 @@ def test_everything_but_the_video_may_be_absent(tmp_path):
 
 
 def test_a_malicious_camera_is_refused_and_not_run(tmp_path):
-    made_up.people_snapshot(tmp_path / "s")
+    sample_data.people_snapshot(tmp_path / "s")
 
     class Malice:
         def __reduce__(self):
@@ -82,11 +82,11 @@ def test_a_malicious_camera_is_refused_and_not_run(tmp_path):
     [
         ({"camera_f": np.zeros(3)}, "no `camera_f` of 2 numbers"),
         ({"camera_k": None}, "no `camera_k` of 5 numbers"),
-        ({"width": 1080, "height": 1080}, "for pictures of 1080x1080, those of .* are 16x12"),
+        ({"width": 1080, "height": 1080}, "for images of 1080x1080, but those of .* are 16x12"),
     ],
 )
 def test_a_camera_that_does_not_fit_is_named(tmp_path, change, message):
-    camera = made_up.people_snapshot(tmp_path / "s")
+    camera = sample_data.people_snapshot(tmp_path / "s")
     (tmp_path / "s" / "camera.pkl").write_bytes(pickle.dumps(camera | change))
     with pytest.raises(UserError, match=message):
         read_people_snapshot(tmp_path / "s")
@@ -96,13 +96,13 @@ def test_a_camera_that_does_not_fit_is_named(tmp_path, change, message):
 
 
 def test_masks_and_poses_that_do_not_fit_are_named(tmp_path):
-    made_up.people_snapshot(tmp_path / "s")
+    sample_data.people_snapshot(tmp_path / "s")
     with h5py.File(tmp_path / "s" / "masks.hdf5", "w") as file:
-        file["masks"] = made_up.masks(5)
+        file["masks"] = sample_data.masks(5)
     with pytest.raises(UserError, match=r"masks.hdf5: `masks` has shape \(5, 12, 16\) for the 6 frames"):
         read_people_snapshot(tmp_path / "s")
     with h5py.File(tmp_path / "s" / "masks.hdf5", "w") as file:
-        file["mask"] = made_up.masks(6)
+        file["mask"] = sample_data.masks(6)
     with pytest.raises(UserError, match="data set `masks`"):
         read_people_snapshot(tmp_path / "s")
     (tmp_path / "s" / "masks.hdf5").unlink()
@@ -114,12 +114,12 @@ def test_masks_and_poses_that_do_not_fit_are_named(tmp_path):
 
 
 def test_poses_of_a_longer_video_are_refused(tmp_path):
-    made_up.people_snapshot(tmp_path / "s")
+    sample_data.people_snapshot(tmp_path / "s")
     with h5py.File(tmp_path / "s" / "reconstructed_poses.hdf5", "a") as file:
         for name in ("pose", "trans"):
             del file[name]
-            file[name] = made_up.numbers(name, 9)
-    with pytest.raises(UserError, match="has 6 frames, its SMPL poses go to frame 8"):
+            file[name] = sample_data.numbers(name, 9)
+    with pytest.raises(UserError, match="has 6 frames, but its SMPL poses extend to frame 8"):
         write_recording(read_people_snapshot(tmp_path / "s"), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

@@ -8,19 +8,19 @@ from data_tools.synthetic.scene.movie import write_video
 from pipeline.capture.video import open_frame_source
 from pipeline.core.errors import UserError
 from pipeline.io.image import write_gray
-from tests.data_tools.convert import made_up
+from tests.data_tools.convert import sample_data
 
 
 def test_masks_of_a_video_lie_in_order(tmp_path):
     """A video's frames have no names that masks could share."""
-    write_video(tmp_path / "walk.mp4", made_up.pictures(6), 25.0)
+    write_video(tmp_path / "walk.mp4", sample_data.pictures(6), 25.0)
     (tmp_path / "masks").mkdir()
-    for k, mask in enumerate(made_up.masks(6)):
+    for k, mask in enumerate(sample_data.masks(6)):
         write_gray(tmp_path / "masks" / f"{k}.png", 255 * mask)
     source = open_frame_source(tmp_path / "walk.mp4")
     read = mask_folder_reader(tmp_path / "masks", source)
-    for k, mask in enumerate(made_up.masks(6)):
+    for k, mask in enumerate(sample_data.masks(6)):
         np.testing.assert_array_equal(read(k), 255 * mask)
     (tmp_path / "masks" / "5.png").unlink()
-    with pytest.raises(UserError, match="5 masks for 6 pictures"):
+    with pytest.raises(UserError, match="5 masks for 6 images"):
         mask_folder_reader(tmp_path / "masks", source)

@@ -37,7 +37,7 @@ from pipeline.geometry.texture_rendering import blur_coverage
 from pipeline.io.image import write_rgba
 from pipeline.metrics.alignment import SimilarityTransform
 from pipeline.metrics.images import composite_on_white, frame_scores
-from tests.data_tools.finished import (
+from tests.data_tools.ground_truth_run import (
     bent_arm,
     ground_truth_run,
     with_frames,
@@ -233,7 +233,7 @@ def test_the_ceiling_is_as_soft_as_the_masks(perfect: Comparison, tmp_path: Path
     soft = with_frames(perfect, tmp_path, lambda person: unpremultiply_to_uint8(blur_coverage(person, 1.5)))
     heldout = soft.run.capture.positions(HELDOUT)
     (drawn,) = render_upper_bound(soft, heldout)
-    target = unpremultiply_to_uint8(blur_coverage(perfect.truth.person(0), 1.5))
+    target = unpremultiply_to_uint8(blur_coverage(perfect.truth.render_person(0), 1.5))
     sharp = frame_scores(drawn, target[..., :3], target[..., 3])
     assert compare_heldout_images(soft)["upper_bound"]["psnr_full"] > sharp["psnr_full"] + 6.0
 
@@ -247,9 +247,9 @@ def test_what_a_mask_leaves_out_costs_nothing_until_the_true_one_is_asked(perfec
         return straight
 
     cut = with_frames(perfect, tmp_path, without_legs)
-    learnt = perfect.truth.person(0) * (np.arange(200) < 110)[:, None, None]
+    learnt = perfect.truth.render_person(0) * (np.arange(200) < 110)[:, None, None]
     scores = compare_heldout_images(replace(cut, run=replace(cut.run, field_renderer=lambda pose: learnt)))
-    true = unpremultiply_to_uint8(perfect.truth.person(0))
+    true = unpremultiply_to_uint8(perfect.truth.render_person(0))
     legs = (
         255.0 - composite_on_white(np.ascontiguousarray(true[..., :3]), np.ascontiguousarray(true[..., 3]))[110:]
     ) / 255.0
@@ -286,7 +286,7 @@ def test_true_masks_are_brought_to_the_size_of_the_frames(perfect: Comparison, t
         return unpremultiply_to_uint8(cv2.resize(person, (100, 100), interpolation=cv2.INTER_AREA))
 
     half = with_frames(perfect, tmp_path, halved)
-    learnt = halved(perfect.truth.person(0)) / np.float32(255)
+    learnt = halved(perfect.truth.render_person(0)) / np.float32(255)
     scores = compare_heldout_images(replace(half, run=replace(half.run, field_renderer=lambda pose: learnt)))
     assert scores["field_true_mask"]["mask_iou"] > 0.998
     assert scores["upper_bound_true_mask"]["mask_iou"] > 0.95

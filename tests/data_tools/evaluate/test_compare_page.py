@@ -49,7 +49,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     manifest = Manifest("report", 1, "print", {}, {}, digest_files(report), {}, 1.0, 1.0)
     write_manifest(manifest, report / MANIFEST_FILE)
     monkeypatch.setattr(compare_page, "load_comparison", lambda out, run: None)
-    monkeypatch.setattr(compare_page, "avatar_sections", lambda pair: sections())
+    monkeypatch.setattr(compare_page, "avatar_sections", lambda comparison: sections())
     return report.parent
 
 
@@ -114,10 +114,10 @@ def test_the_page_shows_figures_and_pictures_and_fetches_nothing(run: Path, tmp_
 
 
 def test_a_picture_pair_is_scored_on_white():
-    (pair,) = sections()[1]["novel_views"]
+    (image_pair,) = sections()[1]["novel_views"]
     expected_db = 20 * np.log10(255 / 128)
-    assert pair.scores()["psnr_body"] == pytest.approx(expected_db)
-    same = replace(pair, avatar=(pair.truth / np.float32(255.0)))
+    assert image_pair.scores()["psnr_body"] == pytest.approx(expected_db)
+    same = replace(image_pair, avatar=(image_pair.truth / np.float32(255.0)))
     assert same.scores()["psnr_full"] == np.inf
 
 

@@ -1,5 +1,6 @@
 """The truth explains the video, and would be caught if it did not; it also agrees with independent judges."""
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,7 @@ from data_tools.evaluate.truth import _main as truth_command
 from data_tools.evaluate.truth import load_ground_truth, load_true_mask, verify_ground_truth
 from data_tools.synthetic.person.noise import ValueNoise
 from data_tools.synthetic.scene.backdrop import make_room
-from data_tools.synthetic.scene.capture import SyntheticCapture
+from data_tools.synthetic.scene.capture import CAPTURE_VERSION, SyntheticCapture
 from data_tools.synthetic.scene.movie import write_video
 from data_tools.synthetic.scene.renderer import pose_vertices
 from pipeline.body.files import load_motion, save_motion
@@ -29,11 +30,11 @@ def capture(sample: Path) -> SyntheticCapture:
 
 
 def test_the_truth_explains_the_video(sample: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    result = verify_ground_truth(sample, every=2)
+    result = verify_ground_truth(sample, frame_stride=2)
     assert result.frames == 3
     assert result.passes()
     assert result.psnr_body_db > 48.0
-    assert run_command(truth_command, [str(sample), "--every", "3"]) == 0
+    assert run_command(truth_command, [str(sample), "--frame-stride", "3"]) == 0
     assert "mask IoU 1.0000" in capsys.readouterr().out
 
 
@@ -44,23 +45,37 @@ def test_a_wrong_truth_is_caught(sample: Path, tmp_path: Path, capsys: pytest.Ca
     motion = load_motion(wrong / "truth" / "motion.npz")
     moved = motion.with_pose(motion.rotations_wxyz, motion.root_translation_m + [0.02, 0.0, 0.0])
     save_motion(wrong / "truth" / "motion.npz", moved)
-    assert not verify_ground_truth(wrong, every=3).passes()
-    assert run_command(truth_command, [str(wrong), "--every", "3"]) == 2
+    assert not verify_ground_truth(wrong, frame_stride=3).passes()
+    assert run_command(truth_command, [str(wrong), "--frame-stride", "3"]) == 2
     assert capsys.readouterr().err.startswith("error: ")
 
 
 def test_no_truth_is_named(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="holds no truth"):
+    with pytest.raises(UserError, match="holds no ground truth"):
         load_ground_truth(tmp_path)
 
 
 @pytest.mark.parametrize(
-    "text", ["", "{", "[]", "{}", '{"ground_m": [0, 1], "light": {}}', '{"ground_m": [0, 1, 2], "light": {"hue": 1}}']
+    "text",
+    [
+        *("", "{", "[]", "{}", f'{{"version": {CAPTURE_VERSION}}}'),
+        f'{{"version": {CAPTURE_VERSION}, "ground_m": [0, 1], "light": {{}}}}',
+        f'{{"version": {CAPTURE_VERSION}, "ground_m": [0, 1, 2], "light": {{"hue": 1}}}}',
+    ],
 )
-def test_a_damaged_recipe_is_named(text: str, sample: Path, tmp_path: Path) -> None:
+def test_damaged_capture_settings_are_reported(text: str, sample: Path, tmp_path: Path) -> None:
     shutil.copytree(sample / "truth", tmp_path / "truth")
-    (tmp_path / "truth" / "recipe.json").write_text(text)
-    with pytest.raises(UserError, match=r"recipe\.json is damaged"):
+    (tmp_path / "truth" / "capture_settings.json").write_text(text)
+    with pytest.raises(UserError, match=r"capture_settings\.json is damaged"):
+        load_ground_truth(tmp_path)
+
+
+def test_a_capture_of_another_version_names_the_command(sample: Path, tmp_path: Path) -> None:
+    shutil.copytree(sample / "truth", tmp_path / "truth")
+    path = tmp_path / "truth" / "capture_settings.json"
+    settings = json.loads(path.read_text())
+    path.write_text(json.dumps(settings | {"version": 1}))
+    with pytest.raises(UserError, match=r"is a capture of version 1, .*python -m data_tools\.sample"):
         load_ground_truth(tmp_path)
 
 
@@ -70,14 +85,14 @@ def test_a_shortened_video_is_caught(sample: Path, tmp_path: Path) -> None:
     shutil.copytree(sample / "truth", tmp_path / "out" / "truth")
     frames = [frame.rgb for frame in read_frames(open_frame_source(sample / "video"), lambda index: index < 5, 200)]
     write_video(tmp_path / "out" / "video" / "video.mp4", frames, 6.0)
-    with pytest.raises(UserError, match="has 5 frames, its truth 6"):
-        verify_ground_truth(tmp_path / "out", every=4)
+    with pytest.raises(UserError, match="has 5 frames, its ground truth 6"):
+        verify_ground_truth(tmp_path / "out", frame_stride=4)
 
 
-@pytest.mark.parametrize("every", ["0", "-2"])
-def test_a_step_of_nothing_is_refused(every: str, sample: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_command(truth_command, [str(sample), "--every", every]) == 2
-    assert capsys.readouterr().err.startswith(f"error: --every {every}")
+@pytest.mark.parametrize("frame_stride", ["0", "-2"])
+def test_a_step_of_nothing_is_refused(frame_stride: str, sample: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(truth_command, [str(sample), "--frame-stride", frame_stride]) == 2
+    assert capsys.readouterr().err.startswith(f"error: --frame-stride {frame_stride}")
 
 
 def test_joints_project_into_the_masks(sample: Path, capture: SyntheticCapture) -> None:
@@ -121,7 +136,7 @@ def test_the_detector_finds_the_person(capture: SyntheticCapture) -> None:
     import mediapipe
 
     larger = capture_at(capture, 2.0)
-    picture, coverage = larger.frame(0)
+    picture, coverage = larger.render_frame(0)
     with mediapipe.solutions.pose.Pose(static_image_mode=True, enable_segmentation=True) as detector:
         found = detector.process(picture)
     assert found.pose_landmarks is not None

@@ -12,12 +12,12 @@ from data_tools.sweep.chart import _make_sample_captures, provenance, run_and_co
 from data_tools.sweep.chart import main as chart
 from data_tools.sweep.chart_trials import Trial, chart_point, read_progress, table_row
 from data_tools.sweep.runs import RunState
-from data_tools.synthetic.scene.capture import RECIPE_VERSION
+from data_tools.synthetic.scene.capture import CAPTURE_VERSION
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import Manifest, read_manifest
 from stages import STAGES
 from tests.core.toy_pipeline import Toy
-from tests.data_tools.finished import write_fake_comparison
+from tests.data_tools.ground_truth_run import write_fake_comparison
 from tests.test_resume import wait_for
 
 SWEEP = ("data_tools.sweep.chart", "numbers.mp4", "--presets", "quick", "default", "--out", "runs/chart")
@@ -96,8 +96,8 @@ def test_fewer_steps_are_said_everywhere(tmp_path: Path) -> None:
 @pytest.fixture
 def forbid_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     """A run or a comparison that is started is a failure."""
-    for what in ("chart.run_trial", "chart_trials.subprocess.run"):
-        monkeypatch.setattr(f"data_tools.{what}", lambda *_, **__: pytest.fail("started"))
+    for target in ("chart.run_trial", "chart_trials.subprocess.run"):
+        monkeypatch.setattr(f"data_tools.sweep.{target}", lambda *_, **__: pytest.fail("started"))
 
 
 def test_what_is_done_and_compared_is_not_done_again(
@@ -159,13 +159,13 @@ def test_built_in_captures_are_those_of_this_version(tmp_path: Path, monkeypatch
     monkeypatch.setattr("data_tools.sweep.chart.make_sample", made.append)
     _make_sample_captures()
     assert made == [[str(tmp_path / "ann"), "--seed", "3"]]
-    recipe = tmp_path / "ann" / "truth" / "recipe.json"
-    recipe.parent.mkdir(parents=True)
-    for text in ("{}", f'{{"version": {RECIPE_VERSION + 1}}}'):
-        recipe.write_text(text)
+    settings = tmp_path / "ann" / "truth" / "capture_settings.json"
+    settings.parent.mkdir(parents=True)
+    for text in ("{}", f'{{"version": {CAPTURE_VERSION + 1}}}'):
+        settings.write_text(text)
         with pytest.raises(UserError, match="ann is of another version"):
             _make_sample_captures()
-    recipe.write_text(f'{{"version": {RECIPE_VERSION}}}')
+    settings.write_text(f'{{"version": {CAPTURE_VERSION}}}')
     _make_sample_captures()
     assert len(made) == 1
 

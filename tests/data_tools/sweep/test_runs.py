@@ -18,7 +18,7 @@ from data_tools.sweep.runs import (
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import MANIFEST_FILE
 from stages import STAGES
-from tests.data_tools.finished import write_fake_comparison
+from tests.data_tools.ground_truth_run import write_fake_comparison
 
 TRACEBACK_HEADER = "Traceback (most recent call last):\n  File\nValueError: too small\n"
 

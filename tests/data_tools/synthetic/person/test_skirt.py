@@ -108,4 +108,4 @@ def test_legs_beneath_are_bare(person: Subject, bare: Body) -> None:
 
 def test_the_truth_with_a_skirt_explains_the_video(capture: Path) -> None:
     assert verify_ground_truth(capture).passes()
-    assert json.loads((capture / "truth" / "recipe.json").read_text())["legwear"] == "skirt"
+    assert json.loads((capture / "truth" / "capture_settings.json").read_text())["legwear"] == "skirt"

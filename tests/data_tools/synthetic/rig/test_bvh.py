@@ -79,7 +79,7 @@ def test_bones_keep_their_length_and_turn_with_their_parents(bvh_motion: BvhMoti
 )
 def test_damaged_files_are_named(text: str, tmp_path: Path) -> None:
     (tmp_path / "damaged.bvh").write_text(text)
-    with pytest.raises(UserError, match="damaged.bvh is no complete BVH"):
+    with pytest.raises(UserError, match="damaged.bvh is not a complete BVH"):
         read_bvh(tmp_path / "damaged.bvh")
 
 

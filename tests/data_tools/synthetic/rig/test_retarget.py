@@ -99,7 +99,7 @@ def test_resampling_takes_the_nearest_pose(turn: Motion) -> None:
     assert np.array_equal(half.rotations_wxyz, turn.rotations_wxyz[6:22:2])
     assert half.frame_index.tolist() == list(range(8))
     assert np.allclose(half.time_s, np.arange(8) / 12.0)
-    with pytest.raises(UserError, match="the motion ends after"):
+    with pytest.raises(UserError, match="the motion ends at"):
         resample_motion(turn, 0.25, 20, 12.0)
 
 

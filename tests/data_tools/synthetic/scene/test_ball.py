@@ -19,7 +19,7 @@ def test_a_ball_covers_what_a_sphere_does() -> None:
     camera, ground_m = portrait_camera(240, 1.8, 3.6, 0.8)
     ball = Ball(ground_m, 1.8)
     for time_s in (0.0, 0.4, 1.9):
-        picture, centre = ball.picture(camera, time_s, FLAT, 3), ball.centre_m(time_s)
+        picture, centre = ball.render_rgba(camera, time_s, FLAT, 3), ball.centre_m(time_s)
         # A cone of this half angle: its cut with the image plane is an ellipse of that area.
         distance = np.linalg.norm(centre)
         half, off = np.arcsin(RADIUS_M / distance), np.arccos(-centre[2] / distance)
@@ -43,14 +43,14 @@ def test_it_stays_before_the_person() -> None:
 
 def test_a_capture_with_a_ball_and_its_truth(sample: Path, tmp_path: Path) -> None:
     main([str(tmp_path / "ball"), *SAMPLE_OPTIONS, "--ball"])
-    assert json.loads((tmp_path / "ball" / "truth" / "recipe.json").read_text())["ball"] is True
+    assert json.loads((tmp_path / "ball" / "truth" / "capture_settings.json").read_text())["ball"] is True
     capture = load_ground_truth(tmp_path / "ball")
     assert load_ground_truth(sample).ball is None
     assert verify_ground_truth(tmp_path / "ball").passes()
     hidden = []
     for frame in range(6):
         mask, whole = (read_gray(out / "truth" / "masks" / f"{frame:06d}.png") for out in (tmp_path / "ball", sample))
-        ball = capture.ball.picture(capture.camera, frame / capture.fps, capture.light, capture.samples)[..., 3]
+        ball = capture.ball.render_rgba(capture.camera, frame / capture.fps, capture.light, capture.samples)[..., 3]
         assert ((mask == 0) | (ball < 1)).all()
         assert (mask[ball == 0] == whole[ball == 0]).all()
         hidden.append((whole[ball == 1] > 127).mean())

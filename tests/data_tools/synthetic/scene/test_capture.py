@@ -10,7 +10,7 @@ import torch
 from data_tools.command import run_command
 from data_tools.sample import main
 from data_tools.synthetic.rig.subject import Subject
-from data_tools.synthetic.scene.capture import RECIPE_VERSION, novel_cameras, portrait_camera, unpremultiply_to_uint8
+from data_tools.synthetic.scene.capture import CAPTURE_VERSION, novel_cameras, portrait_camera, unpremultiply_to_uint8
 from data_tools.synthetic.scene.movie import write_video
 from pipeline.body.files import load_camera, load_motion
 from pipeline.capture.video import open_frame_source, read_frames
@@ -36,10 +36,10 @@ def test_layout(sample: Path) -> None:
     assert len(list((sample / "truth" / "masks").iterdir())) == 6
     assert len(list((sample / "truth" / "novel_views").glob("*.png"))) == 2
     assert len(load_motion(sample / "truth" / "novel_poses" / "motion.npz").frame_index) == 2
-    recipe = json.loads((sample / "truth" / "recipe.json").read_text())
-    assert recipe["seed"] == 0
-    assert recipe["version"] == RECIPE_VERSION
-    assert recipe["light"]["key"] > 0
+    settings = json.loads((sample / "truth" / "capture_settings.json").read_text())
+    assert settings["seed"] == 0
+    assert settings["version"] == CAPTURE_VERSION
+    assert settings["light"]["key_intensity"] > 0
     assert not list(sample.parent.glob("*.part"))
 
 
@@ -100,7 +100,7 @@ def test_a_video_needs_a_frame(tmp_path: Path) -> None:
 def test_nothing_is_overwritten(sample: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = read_all_bytes(sample)
     assert run_command(main, [str(sample)]) == 2
-    assert capsys.readouterr().err.startswith(f"error: {sample} exists already")
+    assert capsys.readouterr().err.startswith(f"error: {sample} already exists")
     assert read_all_bytes(sample) == before
 
 

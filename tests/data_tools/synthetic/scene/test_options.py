@@ -15,8 +15,8 @@ from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.files import load_camera, load_motion
 from pipeline.geometry.camera import project
 from pipeline.io.image import read_rgba
-from tests.data_tools.synthetic.rig.made_up_bvh import write_test_bvh
-from tests.data_tools.synthetic.rig.made_up_glb import write_test_glb
+from tests.data_tools.synthetic.rig.bvh_writer import write_test_bvh
+from tests.data_tools.synthetic.rig.glb_writer import write_test_glb
 
 TINY = ["--frames", "2", "--fps", "10", "--size", "160", "--fill", "0.6"]
 HIPS_M = np.array([0.0, 1.0, 0.0])
@@ -69,19 +69,19 @@ def test_a_held_out_motion_is_shown_from_its_first_to_its_last_frame(person: Pat
     pictures = [read_rgba(truth / "novel_poses" / f"{index:06d}.png") for index in range(3)]
     tops = [np.flatnonzero((picture[:, 105:, 3] > 127).any(axis=1))[0] for picture in pictures]
     assert tops[0] > tops[1] > tops[2]
-    assert json.loads((truth / "recipe.json").read_text())["novel_motion"] == "rise.bvh"
+    assert json.loads((truth / "capture_settings.json").read_text())["novel_motion"] == "rise.bvh"
 
 
 def test_a_given_focal_length_is_kept(person: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The person's share of the picture follows: f height / distance."""
     command = [str(person), str(tmp_path / "out"), *TINY, "--novel-poses", "0", "--novel-views", "0", "--focal"]
     assert run_command(main, [*command, "400"]) == 2
-    assert "--focal 400.0 lets the person take 1." in capsys.readouterr().err
+    assert "--focal 400.0 makes the person cover 1." in capsys.readouterr().err
     main([*command, "150"])
     camera = load_camera(tmp_path / "out" / "truth" / "camera.npz")
     assert (camera.fx, camera.fy) == pytest.approx((150.0, 150.0))
     capture = load_ground_truth(tmp_path / "out")
-    rows = np.flatnonzero((capture.frame(0)[1] > 127).any(axis=1))
+    rows = np.flatnonzero((capture.render_frame(0)[1] > 127).any(axis=1))
     assert np.ptp(rows) + 1 == pytest.approx(150.0 * capture.subject.body.height_m() / 3.6, abs=5.0)
     assert verify_ground_truth(tmp_path / "out").passes()
 

@@ -61,7 +61,7 @@ def test_the_window_does_not_change_the_picture() -> None:
 
 
 def test_key_light_comes_from_its_side() -> None:
-    image = render(Light(key=0.8, key_direction=(1.0, 0.0, 0.0), ambient=0.2, sky_gradient=0.0))
+    image = render(Light(key_intensity=0.8, key_direction=(1.0, 0.0, 0.0), ambient_intensity=0.2, sky_gradient=0.0))
     brightness = image[64, :, :3].sum(axis=1)
     assert brightness[76] > 1.3 * brightness[52]
 
@@ -73,20 +73,23 @@ def lit(normal: tuple[float, float, float], light: Light, albedo: float = 0.5) -
 
 def test_shade_against_the_formula() -> None:
     """Mid grey 0.5 is 0.21404 in linear light; facing the key it gets ambient + key of it."""
-    light = Light(key=0.5, key_direction=(0.0, 0.0, 1.0), ambient=0.7, sky_gradient=0.0)
+    light = Light(key_intensity=0.5, key_direction=(0.0, 0.0, 1.0), ambient_intensity=0.7, sky_gradient=0.0)
     linear = 0.21404 * 1.2
     assert lit((0.0, 0.0, 1.0), light) == pytest.approx(1.055 * linear ** (1 / 2.4) - 0.055, abs=1e-4)
     assert lit((0.0, 0.0, -1.0), light) == pytest.approx(1.055 * (0.21404 * 0.7) ** (1 / 2.4) - 0.055, abs=1e-4)
 
 
 def test_sky_is_above() -> None:
-    light = Light(key=0.0, ambient=0.8, sky_gradient=0.2)
+    light = Light(key_intensity=0.0, ambient_intensity=0.8, sky_gradient=0.2)
     assert lit((0.0, 1.0, 0.0), light) > lit((1.0, 0.0, 0.0), light) > lit((0.0, -1.0, 0.0), light)
 
 
 def test_shine_adds_a_highlight_only_near_the_mirror_direction() -> None:
     dull = Light(
-        key=SHINY.key, key_direction=SHINY.key_direction, ambient=SHINY.ambient, sky_gradient=SHINY.sky_gradient
+        key_intensity=SHINY.key_intensity,
+        key_direction=SHINY.key_direction,
+        ambient_intensity=SHINY.ambient_intensity,
+        sky_gradient=SHINY.sky_gradient,
     )
     key = torch.nn.functional.normalize(torch.tensor(SHINY.key_direction), dim=0)
     half = torch.nn.functional.normalize(key + torch.tensor([0.0, 0.0, 1.0]), dim=0)

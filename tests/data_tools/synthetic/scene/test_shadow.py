@@ -61,9 +61,11 @@ def test_the_light_shadows_only_when_asked(subject: Subject) -> None:
 
 def test_hidden_places_get_the_ambient_light_alone() -> None:
     grey, up = torch.full((2, 3), 0.5), torch.tensor([[0.0, 0.0, 1.0]] * 2)
-    light = Light(key=0.5, key_direction=(0.0, 0.0, 1.0), ambient=0.7, sky_gradient=0.0, specular_strength=0.4)
+    light = Light(
+        key_intensity=0.5, key_direction=(0.0, 0.0, 1.0), ambient_intensity=0.7, sky_gradient=0.0, specular_strength=0.4
+    )
     shaded = shade(grey, up, up, torch.tensor([1.0, 0.0]), light)
-    ambient = shade(grey[:1], up[:1], up[:1], torch.ones(1), replace(FLAT, ambient=0.7))
+    ambient = shade(grey[:1], up[:1], up[:1], torch.ones(1), replace(FLAT, ambient_intensity=0.7))
     assert torch.allclose(shaded[1], ambient[0])
     assert float(shaded[0, 0]) == pytest.approx(1.055 * (0.21404 * 1.2 + 0.4) ** (1 / 2.4) - 0.055, abs=1e-4)
 

@@ -1,4 +1,4 @@
-"""SMPL parameters under the names that research code stores them by, as rows of one layout."""
+"""Convert SMPL parameters, stored under the array names of research code, to `SmplPoses`."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,23 +13,23 @@ _FULL_POSE_KEYS = ("thetas", "pose")
 _TRANSLATION_KEYS = ("transl", "trans")
 
 
-def smpl_rows(
+def smpl_poses_from_arrays(
     arrays: Mapping[str, Shaped[np.ndarray, "..."]],
     frame_index: Int[np.ndarray, "n"],
     smpl_to_camera: Float[np.ndarray, "... 4 4"],
     gender: str,
     path: Path,
 ) -> SmplPoses:
-    """Poses of n frames.
+    """Convert the arrays of n frames.
 
     Args:
-        arrays: `thetas` or `pose` (n or more, 72), or `global_orient` (.., 3) and `body_pose` (.., 69); `transl` or
-            `trans` (.., 3); `betas` (10,), (1, 10) or (.., 10). Rows beyond n are left out.
-        smpl_to_camera: one for all, or one a frame.
-        path: named in errors.
+        arrays: `thetas` or `pose` (n or more, 72), or `global_orient` (.., 3) and `body_pose` (.., 69), axis-angle in
+            radians; `transl` or `trans` (.., 3), metres; `betas` (10,), (1, 10) or (.., 10). Rows after n are ignored.
+        smpl_to_camera: one for all frames, or one per frame.
+        path: of the file, for error messages.
 
     Raises:
-        UserError: an array is missing, too short or of another width.
+        UserError: an array is missing, too short or has the wrong width.
     """
     n = len(frame_index)
     whole = [arrays[name] for name in _FULL_POSE_KEYS if name in arrays]
@@ -53,7 +53,7 @@ def smpl_rows(
 
 
 def merge_smpl_poses(parts: Sequence[SmplPoses]) -> SmplPoses:
-    """Poses of different frames as one table in rising order; all of one gender."""
+    """Concatenate poses of different frames in ascending frame order; all must have one gender."""
     index = np.concatenate([part.frame_index for part in parts])
     order = np.argsort(index)
     rows = {
@@ -64,12 +64,12 @@ def merge_smpl_poses(parts: Sequence[SmplPoses]) -> SmplPoses:
 
 
 def gender_from_name(subject: str) -> str:
-    """What PeopleSnapshot's names of subjects begin with; unknown for other names."""
+    """Return the gender prefix of a PeopleSnapshot subject name, or "unknown"."""
     return next((gender for gender in ("female", "male", "neutral") if subject.startswith(gender)), "unknown")
 
 
 def _repeat_betas(betas: Shaped[np.ndarray, "..."] | None, n: int) -> Shaped[np.ndarray, "..."] | None:
-    """One shape repeated for every frame; anything else as it is."""
+    """Repeat a single shape for all frames; return other arrays unchanged."""
     return np.tile(betas.reshape(1, -1), (n, 1)) if betas is not None and betas.size == N_BETAS else betas
 
 
@@ -78,5 +78,7 @@ def _require_rows(
 ) -> Float[np.ndarray, "n w"]:
     if values is None or values.ndim != 2 or values.shape[1] != width or len(values) < n:
         found = None if values is None else values.shape
-        raise UserError(f"{path}: {name} must have {n} rows of {width} numbers, found {found}; give the right file")
+        raise UserError(
+            f"{path}: {name} must have {n} rows of {width} numbers, found {found}; supply the matching file"
+        )
     return values[:n].astype(np.float32)

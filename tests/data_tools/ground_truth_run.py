@@ -71,7 +71,7 @@ def _write_frames(truth: SyntheticCapture, folder: Path, change: Callable[[np.nd
     for path in (image_path(folder, 0), mask_path(folder, 0)):
         path.parent.mkdir(parents=True)
     for frame in truth.motion.frame_index.tolist():
-        person = change(truth.person(frame))
+        person = change(truth.render_person(frame))
         write_rgb(image_path(folder, frame), np.ascontiguousarray(person[..., :3]))
         write_gray(mask_path(folder, frame), np.ascontiguousarray(person[..., 3]))
     return int(person.shape[0])

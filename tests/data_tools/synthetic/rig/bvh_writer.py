@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.data_tools.synthetic.rig.made_up_glb import RIG
+from tests.data_tools.synthetic.rig.glb_writer import RIG
 
 JOINT_POSITIONS = {name: np.array(place) for name, _, place in RIG}
 
