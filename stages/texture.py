@@ -20,6 +20,7 @@ from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
 from pipeline.field import setup as prepare
 from pipeline.geometry.atlas import Atlas, Texels, rasterize_texels, texture_size_px, unwrap
+from pipeline.geometry.camera import pixel_footprint_m
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import dense_weights, linear_blend_skinning
 from pipeline.geometry.surface import laplacian
@@ -36,7 +37,7 @@ from pipeline.texture.bake import (
 from pipeline.texture.body_parts import body_part_of_faces
 from pipeline.texture.inpainting import average_texels_per_vertex, spread
 from pipeline.texture.specular import fit_specular, observe_vertices, texels_at_vertices
-from pipeline.texture.views import BakeView, crop_bake_view, pixel_footprint_m, weight_by_resolution
+from pipeline.texture.views import BakeView, crop_bake_view, weight_by_resolution
 
 SPECULAR_SMOOTHING_STEPS = 8
 
@@ -104,7 +105,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     save_npz(out / "atlas.npz", {"uv": atlas.uv, "faces_uv": atlas.faces_uv, "vertex_of_uv": atlas.vertex_of_uv})
     write_rgb(out / "diffuse.png", to_uint8(diffuse))
     write_gray(out / "specular.png", to_uint8(specular))
-    write_gray(out / "coverage.png", to_uint8(texels.image(seen[:, None])[..., 0]))
+    write_gray(out / "coverage.png", to_uint8(texels.to_texture(seen[:, None])[..., 0]))
     quantised_diffuse = to_uint8(diffuse).astype(np.float32) / 255.0
     return {
         "texture_px": float(size_px),
@@ -150,7 +151,10 @@ def load_views(
 
 def build_atlas(skinned: SkinnedMeshArtifact, body: Body, views: list[BakeView], config: Config) -> tuple[Atlas, int]:
     """The atlas, and the side of its textures from what the capture can resolve."""
-    texel_size_m = float(np.median([pixel_footprint_m(view) for view in views])) / config.texels_per_pixel
+    texel_size_m = (
+        float(np.median([pixel_footprint_m(view.vertices_world, view.camera) for view in views]))
+        / config.texels_per_pixel
+    )
     area_m2 = float(skinned.mesh.face_areas_m2().sum())
     size_px = texture_size_px(area_m2, texel_size_m, config.min_texture_px, config.max_texture_px)
     part = body_part_of_faces(skinned.mesh.faces, skinned.joint_indices, skinned.joint_weights, body.joint_names)

@@ -147,7 +147,7 @@ def compare_novel_poses(comparison: Comparison) -> tuple[dict[str, float], list[
         rows.append(_aligned_scores(avatar, true, alignment))
         expected = read_rgba(comparison.folder / "novel_poses" / f"{index:06d}.png")
         pictures.append(
-            ImagePair(expected, _render_avatar(comparison, alignment.moved(avatar), comparison.truth.camera))
+            ImagePair(expected, _render_avatar(comparison, alignment.transform_mesh(avatar), comparison.truth.camera))
         )
     return mean_scores(rows), pictures
 
@@ -155,7 +155,9 @@ def compare_novel_poses(comparison: Comparison) -> tuple[dict[str, float], list[
 def compare_novel_views(comparison: Comparison) -> list[ImagePair]:
     """Pictures from cameras that never filmed; the avatar in the true pose of the first frame, laid over the truth."""
     avatar = retarget_avatar_meshes(comparison, comparison.truth.motion.select(np.array([0])))[0]
-    surface = align_surfaces_icp(avatar, comparison.true_surface(comparison.truth.canonical_to_world[0])).moved(avatar)
+    surface = align_surfaces_icp(
+        avatar, comparison.true_surface(comparison.truth.canonical_to_world[0])
+    ).transform_mesh(avatar)
     return [
         ImagePair(read_rgba(path.with_suffix(".png")), _render_avatar(comparison, surface, load_camera(path)))
         for path in sorted((comparison.folder / "novel_views").glob("*.npz"))
@@ -322,7 +324,7 @@ def retarget_avatar_meshes(comparison: Comparison, motion: Motion) -> list[Mesh]
 
 
 def _aligned_scores(avatar: Mesh, true: Mesh, alignment: SimilarityTransform) -> dict[str, float]:
-    scores = surface_scores(alignment.moved(avatar), true, SURFACE_POINTS)
+    scores = surface_scores(alignment.transform_mesh(avatar), true, SURFACE_POINTS)
     return scores | {"scale_to_truth": alignment.scale}
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
+from pipeline.geometry.alpha import unpremultiply_to_uint8
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import dense_weights, linear_blend_skinning
@@ -63,13 +64,6 @@ class TexturedAvatar:
                 _crop_empty_columns(unpremultiply_to_uint8(self.render(vertices_world, camera, supersampling)))
             )
         return pictures
-
-
-def unpremultiply_to_uint8(premultiplied: Float[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w 4"]:
-    """8-bit picture with straight alpha from premultiplied colours in [0, 1]; black where nothing is covered."""
-    alpha = premultiplied[..., 3:]
-    colour = premultiplied[..., :3] / np.maximum(alpha, 1e-6)
-    return np.rint(255.0 * np.clip(np.concatenate([colour, alpha], axis=2), 0.0, 1.0)).astype(np.uint8)
 
 
 def _crop_empty_columns(picture: UInt8[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w2 4"]:

@@ -72,7 +72,7 @@ def load_motion(path: Path) -> Motion:
 
 def save_camera(path: Path, camera: Camera) -> None:
     """Write a camera; `load_camera` is the inverse."""
-    save_npz(path, camera.arrays())
+    save_npz(path, camera.to_arrays())
 
 
 def load_camera(path: Path) -> Camera:

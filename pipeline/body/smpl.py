@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pipeline.body.body import Body, body_at_shape
-from pipeline.geometry.rotation import axis_angle_to_matrix
+from pipeline.geometry.rotation import axis_angle_to_matrix, rotation_between
 from pipeline.geometry.skinning import forward_kinematics, linear_blend_skinning, skinning_transforms
 
 _BODY_JOINTS = (
@@ -199,14 +199,6 @@ def a_pose_rotations(
             if name in _FINGER_JOINTS and name.startswith(side) and "Thumb" not in name:
                 local[joint] = axis_angle_to_matrix(torch.tensor([0.0, 0.0, -sign * FINGER_BEND_RAD]))
     return local
-
-
-def rotation_between(start: Float[Tensor, "3"], end: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """The smallest rotation that turns one direction into another; they must not be opposite."""
-    start, end = (torch.nn.functional.normalize(vector, dim=0) for vector in (start, end))
-    axis = torch.linalg.cross(start, end)
-    sine = axis.norm()
-    return axis_angle_to_matrix(axis / sine.clamp(min=1e-9) * torch.atan2(sine, start @ end))
 
 
 def _float(array: np.ndarray) -> Tensor:

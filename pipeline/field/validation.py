@@ -12,7 +12,13 @@ from pipeline.field.rendering import PoseWarps, build_pose_warps, render_pose
 from pipeline.field.setup import MaskedImage
 from pipeline.field.trainer import Trainer
 from pipeline.geometry.camera import Camera
-from pipeline.metrics.images import composite_on_white, composite_premultiplied_on_white, foreground_mask, psnr_db
+from pipeline.metrics.images import (
+    composite_on_white,
+    composite_premultiplied_on_white,
+    foreground_mask,
+    psnr_db,
+    validation_psnr_db,
+)
 
 SUBSAMPLING_STRIDE = 5
 """Odd, so that the centre of a thinned picture's pixel is the centre of a pixel."""
@@ -58,14 +64,8 @@ class Validator:
     def score(self, renders: Sequence[UInt8[np.ndarray, "h w 3"]]) -> tuple[float, float]:
         """Mean decibels of whole images on white, and of body pixels alone; NaN where there is nothing to score."""
         body_masks = [foreground_mask(mask) for _, mask in self.ground_truth]
-        pairs = zip(renders, self.targets, body_masks, strict=True)
-        body = [psnr_db(render, target, where) for render, target, where in pairs if where.any()]
-        return _mean(self.psnr_per_frame_db(renders)), _mean(body)
+        return validation_psnr_db(renders, self.targets), validation_psnr_db(renders, self.targets, body_masks)
 
     def psnr_per_frame_db(self, renders: Sequence[UInt8[np.ndarray, "h w 3"]]) -> list[float]:
         """Decibels of each whole image on white."""
         return [psnr_db(*pair) for pair in zip(renders, self.targets, strict=True)]
-
-
-def _mean(values: list[float]) -> float:
-    return float(np.mean(values)) if values else float("nan")

@@ -1,6 +1,6 @@
-"""Texture atlases: unfolding a mesh, which surface point each texel shows, and filling what no chart covers.
+"""Texture atlases: parametrisation of a mesh, the surface point of each texel, and filling of uncovered texels.
 
-UV has its origin bottom-left; row 0 of a texture is at the top (v = 1); texel centres lie at +0.5.
+The UV origin is bottom-left; row 0 of a texture is at the top (v = 1); texel centres are at +0.5.
 """
 
 from dataclasses import dataclass
@@ -15,17 +15,19 @@ from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import smooth_taubin
 from pipeline.kernels.raster import rasterize
 
-# xatlas estimates its scale and overshoots the asked resolution, by up to 38 % in the cases measured: the gutter must
-# survive being shrunk by as much
 _XATLAS_OVERSHOOT = 1.4
+"""Factor of the padding: xatlas exceeds the requested resolution by up to 38 % (measured), and the atlas is then scaled
+down to that resolution together with its padding."""
+
 SMOOTHING_STEPS = 5
 
 
 @dataclass(frozen=True)
 class Atlas:
-    """An unfolded mesh.
+    """The parametrisation of a mesh.
 
-    uv: positions in [0, 1]; faces_uv: the mesh's faces as corners into `uv`; vertex_of_uv: mesh vertex of each uv.
+    uv: texture coordinates in [0, 1]. faces_uv: corners of the mesh's faces as indices into `uv`. vertex_of_uv: mesh
+    vertex of each texture coordinate.
     """
 
     uv: Float[np.ndarray, "t 2"]
@@ -35,9 +37,10 @@ class Atlas:
 
 @dataclass(frozen=True)
 class Texels:
-    """The texels whose centres lie on the surface.
+    """The texels whose centres are covered by a chart.
 
-    rows, columns: place in the texture; face: mesh face; barycentric: of the texel's centre in that face, sum 1.
+    size_px: side of the texture. rows, columns: position in the texture. face: mesh face of each texel. barycentric:
+    barycentric coordinates of the texel centre in that face, sum 1.
     """
 
     size_px: int
@@ -46,22 +49,22 @@ class Texels:
     face: Int[np.ndarray, "t"]
     barycentric: Float[np.ndarray, "t 3"]
 
-    def covered(self) -> Bool[np.ndarray, "s s"]:
-        """True where a texel's centre lies on the surface."""
-        covered = np.zeros((self.size_px, self.size_px), dtype=bool)
-        covered[self.rows, self.columns] = True
-        return covered
+    def coverage_mask(self) -> Bool[np.ndarray, "s s"]:
+        """Return a texture that is True at the covered texels."""
+        mask = np.zeros((self.size_px, self.size_px), dtype=bool)
+        mask[self.rows, self.columns] = True
+        return mask
 
-    def image(self, values: Float[np.ndarray, "t c"]) -> Float[np.ndarray, "s s c"]:
-        """Values of the texels as a picture, 0 elsewhere."""
-        image = np.zeros((self.size_px, self.size_px, values.shape[1]), dtype=np.float32)
-        image[self.rows, self.columns] = values
-        return image
+    def to_texture(self, values: Float[np.ndarray, "t c"]) -> Float[np.ndarray, "s s c"]:
+        """Return a texture with the values at the covered texels and 0 elsewhere."""
+        texture = np.zeros((self.size_px, self.size_px, values.shape[1]), dtype=np.float32)
+        texture[self.rows, self.columns] = values
+        return texture
 
     def interpolate(
         self, faces: Int[np.ndarray, "f 3"], attributes: Float[np.ndarray, "v c"]
     ) -> Float[np.ndarray, "t c"]:
-        """Vertex attributes at the texels' surface points."""
+        """Interpolate vertex attributes at the surface points of the texels."""
         corners = faces[self.face]
         value = self.barycentric[:, 0, None] * attributes[corners[:, 0]]
         for k in (1, 2):
@@ -72,9 +75,13 @@ class Texels:
 def texture_size_px(
     area_m2: float, pixel_footprint_m: float, min_size_px: int, max_size_px: int, utilisation: float = 0.65
 ) -> int:
-    """The power of two whose texels are not larger than what one pixel of the capture sees.
+    """Return the smallest power of two with texels not larger than the footprint of an image pixel.
 
-    area_m2: of the surface; footprint_m: of a pixel on the person; utilisation: share of an atlas that charts cover.
+    Args:
+        area_m2: area of the surface.
+        pixel_footprint_m: length that one pixel of the capture covers on the surface, m.
+        min_size_px, max_size_px: limits of the result.
+        utilisation: fraction of the atlas that charts cover.
 
     >>> texture_size_px(1.8, 0.0035, 256, 4096)
     512
@@ -84,24 +91,27 @@ def texture_size_px(
 
 
 def unwrap(mesh: Mesh, segment_of_face: Int[np.ndarray, "f"], size_px: int, padding_px: int) -> Atlas:
-    """Unfold a mesh with xatlas (Young, 2018), every part of it by itself.
+    """Parametrise a mesh with xatlas (Young, 2018), each segment separately.
 
-    Cutting at `segment_of_face` (any labels) first costs charts (120 instead of 66 on a body of 51k faces) and saves
-    time
-    (4 s instead of 19 s): growing charts takes worse than linear time in the faces of a connected piece, and pieces are
-    worked on in parallel. The result does not depend on the number of threads. What is unfolded is a smoothed copy: on
-    the noise of a reconstructed surface charts end at every dent (756 charts, smoothed 282, on a mesh of 46k faces).
+    Separate segments give more charts (120 instead of 66 on a body of 51k faces) in less time (4 s instead of 19 s):
+    chart growing takes more than linear time in the number of connected faces, and segments are processed in parallel.
+    The result does not depend on the number of threads. A smoothed copy of the mesh is parametrised, because charts end
+    at the noise of a reconstructed surface (756 charts without smoothing, 282 with, on a mesh of 46k faces).
 
-    padding_px: least gutter between charts in a texture of `size_px`.
+    Args:
+        mesh: the mesh.
+        segment_of_face: label of each face; charts do not cross segments.
+        size_px: side of the texture.
+        padding_px: smallest distance between charts, texels.
     """
     atlas, smoothed = xatlas.Atlas(), smooth_taubin(mesh, SMOOTHING_STEPS).vertices
-    rows_of_part, vertices_of_part = [], []
-    for part in np.unique(segment_of_face):
-        rows = np.flatnonzero(segment_of_face == part)
+    faces_of_segment, vertices_of_segment = [], []
+    for segment in np.unique(segment_of_face):
+        rows = np.flatnonzero(segment_of_face == segment)
         vertices, corners = np.unique(mesh.faces[rows], return_inverse=True)
         atlas.add_mesh(np.ascontiguousarray(smoothed[vertices]), corners.reshape(-1, 3).astype(np.uint32))
-        rows_of_part.append(rows)
-        vertices_of_part.append(vertices)
+        faces_of_segment.append(rows)
+        vertices_of_segment.append(vertices)
     packing = xatlas.PackOptions()
     packing.resolution, packing.bilinear = size_px, True
     packing.padding = int(np.ceil(padding_px * _XATLAS_OVERSHOOT))
@@ -109,17 +119,17 @@ def unwrap(mesh: Mesh, segment_of_face: Int[np.ndarray, "f"], size_px: int, padd
 
     uv, vertex_of_uv, count = [], [], 0
     faces_uv = np.zeros_like(mesh.faces, dtype=np.int32)
-    for part, (rows, vertices) in enumerate(zip(rows_of_part, vertices_of_part, strict=True)):
-        vertex_of_part, corners, part_uv = atlas[part]
+    for segment, (rows, vertices) in enumerate(zip(faces_of_segment, vertices_of_segment, strict=True)):
+        vertex_of_segment, corners, segment_uv = atlas[segment]
         faces_uv[rows] = corners.astype(np.int32) + count
-        uv.append(part_uv)
-        vertex_of_uv.append(vertices[vertex_of_part])
-        count += len(part_uv)
+        uv.append(segment_uv)
+        vertex_of_uv.append(vertices[vertex_of_segment])
+        count += len(segment_uv)
     return Atlas(np.concatenate(uv).astype(np.float32), faces_uv, np.concatenate(vertex_of_uv).astype(np.int32))
 
 
 def rasterize_texels(atlas: Atlas, size_px: int) -> Texels:
-    """Which surface point lies under every texel's centre."""
+    """Return the texels of a texture with the surface point of each."""
     position_px = atlas.uv * np.float32(size_px)
     position_px[:, 1] = size_px - position_px[:, 1]
     ones = torch.ones(len(position_px))
@@ -139,11 +149,16 @@ def rasterize_texels(atlas: Atlas, size_px: int) -> Texels:
 def fill_unknown_texels(
     image: Float[np.ndarray, "h w c"], known: Bool[np.ndarray, "h w"], dilation_px: int = 2
 ) -> Float[np.ndarray, "h w c"]:
-    """Colours for unknown texels, so that neither bilinear look-ups nor mip levels reach a colour that is nowhere.
+    """Fill unknown texels, so that bilinear sampling and mipmaps show no colour of the background at chart borders.
 
-    The nearest `dilation_px` rings take the mean of their known neighbours; the rest is filled by push-pull (Gortler et
-    al., "The Lumigraph", 1996): coarser and coarser means of what is known, taken back up where finer levels know
-    nothing. All stays 0 when nothing is known.
+    The first `dilation_px` rings around known texels take the mean of their known neighbours; the rest is filled by
+    push-pull (Gortler et al., "The Lumigraph", 1996): means over 2 x 2 texels on coarser and coarser levels, then
+    interpolation back to the finer levels where these have no value. If no texel is known, all are 0.
+
+    Args:
+        image: colours; those of unknown texels are ignored.
+        known: texels with a known colour.
+        dilation_px: number of rings that are filled by dilation.
     """
     colour = np.where(known[..., None], image, 0.0).astype(np.float32)
     weight = known.astype(np.float32)

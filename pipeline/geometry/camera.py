@@ -1,7 +1,7 @@
-"""The one pinhole camera of the house.
+"""The pinhole camera: intrinsics, pose, projection and rays.
 
-OpenCV axes: x right, y down, z forward; pixel centres lie at +0.5, so the image spans [0, width] x [0, height].
-`world_to_camera` is a rigid 4x4 matrix that acts on column vectors.
+Camera axes follow OpenCV: x right, y down, z forward. Pixel centres are at +0.5, so the image covers
+[0, width] x [0, height]. `world_to_camera` is a rigid 4x4 matrix that acts on column vectors.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 DEFAULT_WORLD_TO_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32)
-"""Camera at the world's origin that looks along -Z with +Y up: what is assumed when nothing else is known."""
+"""Default pose: the camera is at the world origin and looks along -Z, with +Y up."""
 
 
 @dataclass(frozen=True)
@@ -31,11 +31,11 @@ class Camera:
     world_to_camera: Float[np.ndarray, "4 4"] = field(default_factory=DEFAULT_WORLD_TO_CAMERA.copy)
 
     def intrinsic_matrix(self) -> Float[np.ndarray, "3 3"]:
-        """Intrinsic matrix K in pixels."""
+        """Return the intrinsic matrix K in pixels."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]], dtype=np.float32)
 
     def scaled(self, factor: float) -> Camera:
-        """The same camera for an image resized by `factor`; sides are rounded to whole pixels."""
+        """Return the camera of the image resized by `factor`; the sides are rounded to whole pixels."""
         width, height = max(1, round(self.width * factor)), max(1, round(self.height * factor))
         scale_x, scale_y = width / self.width, height / self.height
         return replace(
@@ -49,16 +49,16 @@ class Camera:
         )
 
     def cropped(self, left_px: int, top_px: int, width_px: int, height_px: int) -> Camera:
-        """The same camera for the window of the image that starts at (left, top)."""
+        """Return the camera of a crop of the image with the upper left corner (left_px, top_px)."""
         return replace(self, cx=self.cx - left_px, cy=self.cy - top_px, width=width_px, height=height_px)
 
     def centre_m(self) -> Float[np.ndarray, "3"]:
-        """Position of the pinhole in the world."""
+        """Return the position of the camera centre in the world, m."""
         rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
         return -rotation.T @ translation
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Flat arrays for an npz; `from_arrays` is the inverse."""
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Return the camera as named arrays for an npz file; `from_arrays` is the inverse."""
         return {
             "camera_intrinsics_px": np.array([self.fx, self.fy, self.cx, self.cy], dtype=np.float64),
             "camera_size_px": np.array([self.width, self.height], dtype=np.int32),
@@ -67,22 +67,22 @@ class Camera:
 
     @staticmethod
     def from_arrays(arrays: Mapping[str, np.ndarray]) -> Camera:
-        """Inverse of `arrays`; other names in the mapping are ignored."""
+        """Build a camera from the result of `to_arrays`; other names in the mapping are ignored."""
         fx, fy, cx, cy = (float(value) for value in arrays["camera_intrinsics_px"])
         width, height = (int(value) for value in arrays["camera_size_px"])
         return Camera(fx, fy, cx, cy, width, height, np.asarray(arrays["camera_world_to_camera"]))
 
 
 def transform_world_to_camera(points_world: Float[Tensor, "*n 3"], camera: Camera) -> Float[Tensor, "*n 3"]:
-    """Points in camera axes, metres."""
+    """Transform world points (m) to camera coordinates (m)."""
     pose = torch.as_tensor(camera.world_to_camera, dtype=points_world.dtype, device=points_world.device)
     return points_world @ pose[:3, :3].T + pose[:3, 3]
 
 
 def project(points_world: Float[Tensor, "*n 3"], camera: Camera) -> tuple[Float[Tensor, "*n 2"], Float[Tensor, "*n"]]:
-    """Pixel positions and depths (m) of world points; differentiable.
+    """Project world points (m) to pixel positions and depths (m); differentiable.
 
-    Points behind the camera (depth <= 0) get meaningless pixels: mask them by depth.
+    The pixel positions of points behind the camera (depth <= 0) are meaningless: mask them by depth.
     """
     points = transform_world_to_camera(points_world, camera)
     depth_m = points[..., 2]
@@ -91,8 +91,14 @@ def project(points_world: Float[Tensor, "*n 3"], camera: Camera) -> tuple[Float[
     return torch.stack([x_px, y_px], dim=-1), depth_m
 
 
+def pixel_footprint_m(vertices_world: Float[Tensor, "v 3"], camera: Camera) -> float:
+    """Return the length (m) that one pixel covers at the median depth of the vertices: median depth / fx."""
+    _, depth_m = project(vertices_world, camera)
+    return float(depth_m.median()) / camera.fx
+
+
 def pixel_rays(camera: Camera, pixels_px: Float[Tensor, "n 2"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Origins (m) and unit directions, in the world, of the rays through pixel positions (centres at +0.5)."""
+    """Return origins (m) and unit directions, in the world, of the rays through pixel positions (centres at +0.5)."""
     pose = torch.as_tensor(camera.world_to_camera, dtype=pixels_px.dtype, device=pixels_px.device)
     in_camera = torch.stack(
         [

@@ -1,5 +1,9 @@
-"""A differentiable picture of a mesh: attributes interpolated with perspective-correct barycentrics, silhouettes
-antialiased."""
+"""Differentiable rendering of a mesh.
+
+Vertex attributes are interpolated with perspective-correct barycentric coordinates; silhouettes are antialiased, which
+gives gradients of the coverage (Laine et al., "Modular Primitives for High-Performance Differentiable Rendering",
+2020).
+"""
 
 from collections.abc import Callable
 
@@ -13,8 +17,11 @@ from pipeline.kernels.raster import antialias, rasterize
 
 
 def face_adjacency(faces: Int[Tensor, "f 3"]) -> Int[Tensor, "f 3"]:
-    """Face across edge k = (corner k, corner k + 1) of every face; -1 at a border and at edges shared by more than two
-    faces."""
+    """Return the neighbour of every face across edge k = (corner k, corner k + 1).
+
+    The neighbour is -1 at a border and at edges with more than two faces. `igl.triangle_triangle_adjacency` is not used
+    because it returns one of the neighbours at edges with more than two faces.
+    """
     faces = faces.long()
     edges = torch.stack([faces, faces.roll(-1, dims=1)], dim=2).view(-1, 2)
     low, high = edges.amin(1), edges.amax(1)
@@ -37,13 +44,22 @@ def render_shaded(
     shader: Callable[[Float[Tensor, "n c"]], Float[Tensor, "n d"]],
     adjacency: Int[Tensor, "f 3"] | None = None,
 ) -> tuple[Float[Tensor, "h w d"], Float[Tensor, "h w"], Int[Tensor, "h w"]]:
-    """(image premultiplied by alpha, alpha in [0, 1], face ids) of a mesh in metres; on white: ``image + 1 - alpha``.
+    """Render a mesh with deferred shading.
 
-    shade: called once with the interpolated attributes of all covered pixels, returns what is seen there (deferred
-    shading). adjacency: ``face_adjacency(faces)``, to be passed in when the same mesh is rendered many times.
+    Differentiable in `vertices_world` (inside faces through interpolation, at silhouettes through antialiasing), in
+    `attributes` and in the parameters of `shader`.
 
-    Differentiable in ``vertices_world`` (inside faces through interpolation, at silhouettes through antialiasing), in
-    ``attributes`` and in whatever ``shader`` depends on.
+    Args:
+        vertices_world: posed vertices, m.
+        faces: corners of each face.
+        camera: the camera.
+        attributes: vertex attributes.
+        shader: called once with the interpolated attributes of all covered pixels; returns their colours.
+        adjacency: `face_adjacency(faces)`, to be passed if the same mesh is rendered several times.
+
+    Returns:
+        The image premultiplied by alpha, alpha in [0, 1], and the face index of each pixel (-1 for none). The image
+        composited on white is `image + 1 - alpha`.
     """
     vertices_px, depth_m = project(vertices_world, camera)
     face_id, _, depth = rasterize(vertices_px, depth_m, faces, camera.height, camera.width)
@@ -52,8 +68,8 @@ def render_shaded(
     face_of = face_id.reshape(-1)[covered]
     shaded = shader(interpolate(covered, face_of, camera.width, vertices_px, depth_m, faces, attributes))
     with_alpha = torch.cat([shaded, torch.ones_like(shaded[:, :1])], dim=1)
-    flat = torch.zeros(face_id.numel(), with_alpha.shape[1], dtype=with_alpha.dtype, device=with_alpha.device)
-    image = flat.index_copy(0, covered, with_alpha).view(*face_id.shape, -1)
+    flat_image = torch.zeros(face_id.numel(), with_alpha.shape[1], dtype=with_alpha.dtype, device=with_alpha.device)
+    image = flat_image.index_copy(0, covered, with_alpha).view(*face_id.shape, -1)
     image = antialias(image, face_id, depth, vertices_px, depth_m, faces, adjacency)
     return image[..., :-1], image[..., -1], face_id
 
@@ -65,7 +81,6 @@ def render_attributes(
     attributes: Float[Tensor, "v c"],
     adjacency: Int[Tensor, "f 3"] | None = None,
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
-    """``render_shaded`` that shows the interpolated attributes themselves: (attribute image premultiplied by alpha,
-    alpha)."""
+    """Render interpolated attributes: the image premultiplied by alpha, and alpha; see `render_shaded`."""
     image, alpha, _ = render_shaded(vertices_world, faces, camera, attributes, lambda values: values, adjacency)
     return image, alpha

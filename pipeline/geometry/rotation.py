@@ -1,4 +1,4 @@
-"""Rotations in torch, batched over leading axes. Quaternions are unit and ordered w, x, y, z."""
+"""Rotations in PyTorch, batched over leading axes. Quaternions are unit quaternions in the order w, x, y, z."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ _SKEW_SYMMETRIC_BASIS = torch.tensor(
         [0, -1, 0, 1, 0, 0, 0, 0, 0],
     ]
 )
-"""What x, y and z give to the rows of a vector's cross product matrix."""
+"""Row k is the flattened derivative of the cross-product matrix of a vector with respect to its component k."""
 
 
 def axis_angle_to_quaternion(axis_angle_rad: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 4"]:
-    """Exponential map; smooth at zero, where it uses the Taylor series of sin(a/2)/a."""
+    """Convert axis-angle vectors (rad) to quaternions (exponential map); differentiable at zero by a Taylor series."""
     squared = (axis_angle_rad**2).sum(-1, keepdim=True)
     small = squared < 1e-8
     angle = torch.where(small, torch.ones_like(squared), squared).sqrt()
@@ -27,7 +27,7 @@ def axis_angle_to_quaternion(axis_angle_rad: Float[Tensor, "*n 3"]) -> Float[Ten
 
 
 def quaternion_to_axis_angle(quaternion_wxyz: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 3"]:
-    """Logarithm with the angle in [0, pi]; inverse of `axis_angle_to_quaternion`."""
+    """Convert quaternions to axis-angle vectors (logarithm map) with angles in [0, pi] rad."""
     quaternion = torch.where(quaternion_wxyz[..., :1] < 0, -quaternion_wxyz, quaternion_wxyz)
     w, xyz = quaternion[..., :1], quaternion[..., 1:]
     squared = (xyz**2).sum(-1, keepdim=True)
@@ -38,7 +38,7 @@ def quaternion_to_axis_angle(quaternion_wxyz: Float[Tensor, "*n 4"]) -> Float[Te
 
 
 def quaternion_to_matrix(quaternion_wxyz: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 3 3"]:
-    """Rotation matrices; the quaternion is normalised first, so that gradients stay on the sphere."""
+    """Convert quaternions to rotation matrices; the quaternions are normalised first."""
     w, x, y, z = torch.nn.functional.normalize(quaternion_wxyz, dim=-1).unbind(-1)
     rows = [
         torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], dim=-1),
@@ -49,7 +49,10 @@ def quaternion_to_matrix(quaternion_wxyz: Float[Tensor, "*n 4"]) -> Float[Tensor
 
 
 def axis_angle_to_matrix(axis_angle_rad: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
-    """Rodrigues' formula, I + sin(a)/a K + (1 - cos(a))/a² K²; near zero with the Taylor series of both factors."""
+    """Convert axis-angle vectors (rad) to matrices by Rodrigues' formula, I + sin(a)/a K + (1 - cos(a))/a² K².
+
+    Near zero both factors are evaluated by their Taylor series.
+    """
     squared = (axis_angle_rad**2).sum(-1)[..., None, None]
     small = squared < 1e-4
     safe = torch.where(small, torch.ones_like(squared), squared)
@@ -61,7 +64,7 @@ def axis_angle_to_matrix(axis_angle_rad: Float[Tensor, "*n 3"]) -> Float[Tensor,
 
 
 def matrix_to_quaternion(matrix: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 4"]:
-    """Unit quaternions with w >= 0 (Shepperd's method: divide by the largest of the four candidates)."""
+    """Convert rotation matrices to quaternions with w >= 0 (Shepperd's method: divide by the largest component)."""
     m = matrix
     trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
     four_squares = torch.stack(
@@ -92,7 +95,7 @@ def matrix_to_quaternion(matrix: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 4
 
 
 def quaternion_multiply(left_wxyz: Float[Tensor, "*n 4"], right_wxyz: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 4"]:
-    """Hamilton product: the rotation that applies `right` first."""
+    """Return the Hamilton product, the rotation that applies `right_wxyz` first."""
     aw, ax, ay, az = left_wxyz.unbind(-1)
     bw, bx, by, bz = right_wxyz.unbind(-1)
     return torch.stack(
@@ -107,28 +110,33 @@ def quaternion_multiply(left_wxyz: Float[Tensor, "*n 4"], right_wxyz: Float[Tens
 
 
 def quaternion_conjugate(quaternion_wxyz: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 4"]:
-    """The inverse rotation of a unit quaternion."""
+    """Return the conjugate, which is the inverse rotation of a unit quaternion."""
     return quaternion_wxyz * quaternion_wxyz.new_tensor([1.0, -1.0, -1.0, -1.0])
 
 
 def slerp(
     start_wxyz: Float[Tensor, "*n 4"], end_wxyz: Float[Tensor, "*n 4"], fraction: Float[Tensor, "*n 1"]
 ) -> Float[Tensor, "*n 4"]:
-    """Spherical interpolation along the shorter arc; `fraction` in [0, 1]."""
+    """Interpolate rotations along the shorter arc (spherical linear interpolation); `fraction` is in [0, 1]."""
     step = quaternion_to_axis_angle(quaternion_multiply(quaternion_conjugate(start_wxyz), end_wxyz))
     return quaternion_multiply(start_wxyz, axis_angle_to_quaternion(step * fraction))
 
 
 def continuous_quaternions(quaternions_wxyz: Float[Tensor, "n *j 4"]) -> Float[Tensor, "n *j 4"]:
-    """The same rotations over time (axis 0) with signs chosen so that neighbours never lie in opposite hemispheres."""
+    """Return the same rotations over time (axis 0) with signs such that consecutive dot products are not negative."""
     dots = (quaternions_wxyz[1:] * quaternions_wxyz[:-1]).sum(-1, keepdim=True)
     flips = torch.where(dots < 0, -torch.ones_like(dots), torch.ones_like(dots)).cumprod(0)
     return torch.cat([quaternions_wxyz[:1], quaternions_wxyz[1:] * flips], dim=0)
 
 
-def six_d_to_matrix(six_d: Float[Tensor, "*n 6"]) -> Float[Tensor, "*n 3 3"]:
-    """Continuous 6D representation (Zhou et al. 2019): Gram-Schmidt on the first two columns."""
-    first = torch.nn.functional.normalize(six_d[..., :3], dim=-1)
-    second = six_d[..., 3:] - (first * six_d[..., 3:]).sum(-1, keepdim=True) * first
-    second = torch.nn.functional.normalize(second, dim=-1)
-    return torch.stack([first, second, torch.linalg.cross(first, second)], dim=-1)
+def rotation_between(start: Float[Tensor, "*n 3"], end: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
+    """Return the smallest rotation that takes the direction `start` to the direction `end`.
+
+    Both may have any length > 0. For opposite directions the axis is an arbitrary one perpendicular to `start`.
+    """
+    start, end = torch.nn.functional.normalize(start, dim=-1), torch.nn.functional.normalize(end, dim=-1)
+    cross = torch.linalg.cross(start, end)
+    sine, cosine = cross.norm(dim=-1, keepdim=True), (start * end).sum(-1, keepdim=True)
+    perpendicular = torch.linalg.cross(start, torch.eye(3, dtype=start.dtype)[start.abs().argmin(-1)])
+    axis = torch.nn.functional.normalize(torch.where(sine > 1e-7, cross, perpendicular), dim=-1)
+    return axis_angle_to_matrix(axis * torch.atan2(sine, cosine))

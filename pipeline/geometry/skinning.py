@@ -1,7 +1,7 @@
-"""Forward kinematics and linear blend skinning, in plain torch.
+"""Forward kinematics and linear blend skinning in PyTorch.
 
-Letters: n frames, j joints, v vertices, k influences. Joints have identity rest orientation, as glTF nodes may have:
-G_j = G_parent · T(joint_j - joint_parent) · R_j, and the skinning matrix is B_j = G_j · T(-joint_j).
+Notation: n frames, j joints, v vertices, k influences. Joints have the identity as rest orientation:
+G_j = G_parent · T(joint_j - joint_parent) · R_j, and the skinning matrix is B_j = G_j · T(-joint_j), as in glTF.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from torch import Tensor
 
 
 def rigid_transform(rotation: Float[Tensor, "*n 3 3"], translation: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 4 4"]:
-    """Homogeneous matrices from rotations and translations (m)."""
+    """Return homogeneous matrices of rotations and translations (m)."""
     top = torch.cat([rotation, translation[..., None]], dim=-1)
     bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
     return torch.cat([top, bottom], dim=-2)
@@ -27,16 +27,16 @@ def forward_kinematics(
     joints_m: Float[Tensor, "j 3"],
     parents: Sequence[int] | Int[np.ndarray, "j"],
 ) -> Float[Tensor, "n j 4 4"]:
-    """World pose of every joint.
+    """Return the pose of every joint in the world.
 
     Args:
         rotations: local to the parent; identity is the bind pose.
         root_translation_m: world position of joint 0.
         joints_m: bind-pose joint positions, canonical frame.
-        parents: index of each joint's parent, which comes before it; -1 for the root, which is joint 0.
+        parents: index of the parent of each joint, smaller than the index of the joint; -1 for the root, joint 0.
 
     Raises:
-        ValueError: a parent does not come before its child.
+        ValueError: a parent has a larger index than its child.
     """
     ancestor = np.array(parents, dtype=np.int64)
     count, device = len(ancestor), rotations.device
@@ -45,8 +45,8 @@ def forward_kinematics(
         raise ValueError(f"joint {wrong[0]} has parent {ancestor[wrong[0]]}; parents must come before their children")
     offset_m = (joints_m[1:] - joints_m[torch.from_numpy(ancestor[1:]).to(device)]).expand(len(rotations), -1, 3)
     local = rigid_transform(rotations, torch.cat([root_translation_m[:, None], offset_m], dim=1))
-    # Row `count` is the world, above the root. Each round joins every chain of joints with the one above it, so chains
-    # double in length and a body of sixteen generations takes four rounds.
+    # Row `count` is the world, the parent of the root. Each iteration composes the transform of every joint with that
+    # of its current ancestor (pointer jumping), so a skeleton of depth 16 takes four iterations.
     world = torch.cat([local, torch.eye(4, dtype=local.dtype, device=device).expand(len(local), 1, 4, 4)], dim=1)
     ancestor = np.append(np.where(ancestor < 0, count, ancestor), count)
     while (ancestor < count).any():
@@ -58,7 +58,7 @@ def forward_kinematics(
 def skinning_transforms(
     joint_to_world: Float[Tensor, "n j 4 4"], joints_m: Float[Tensor, "j 3"]
 ) -> Float[Tensor, "n j 4 4"]:
-    """B_j, which carries canonical points that move rigidly with joint j into the world."""
+    """Return B_j, which transforms canonical points that move rigidly with joint j to the world."""
     rotation = joint_to_world[..., :3, :3]
     moved = (rotation @ joints_m[:, :, None]).squeeze(-1)
     return rigid_transform(rotation, joint_to_world[..., :3, 3] - moved)
@@ -67,7 +67,7 @@ def skinning_transforms(
 def linear_blend_skinning(
     vertices: Float[Tensor, "v 3"], weights: Float[Tensor, "v j"], canonical_to_world: Float[Tensor, "n j 4 4"]
 ) -> Float[Tensor, "n v 3"]:
-    """Posed vertices: x' = (sum_j w_j B_j) x."""
+    """Return the posed vertices x' = (sum_j w_j B_j) x, in m."""
     n_frames, n_joints = canonical_to_world.shape[:2]
     flat = canonical_to_world[:, :, :3].reshape(n_frames, n_joints, 12)
     blended = torch.einsum("vj,njm->nvm", weights, flat).reshape(n_frames, len(vertices), 3, 4)
@@ -75,7 +75,7 @@ def linear_blend_skinning(
 
 
 def dense_weights(indices: Int[Tensor, "v k"], weights: Float[Tensor, "v k"], joint_count: int) -> Float[Tensor, "v j"]:
-    """Scatter sparse influences into one row per vertex."""
+    """Convert sparse influences to one row of weights per vertex."""
     dense = weights.new_zeros(len(weights), joint_count)
     return dense.scatter_add(1, indices.long(), weights)
 
@@ -83,7 +83,10 @@ def dense_weights(indices: Int[Tensor, "v k"], weights: Float[Tensor, "v k"], jo
 def top_k_weights(
     weights: Float[np.ndarray, "v j"], k: int = 4
 ) -> tuple[Int[np.ndarray, "v k"], Float[np.ndarray, "v k"]]:
-    """The k largest influences of each vertex, renormalised to sum 1, largest first; joint 0 where the weight is 0."""
+    """Return the joints and weights of the k largest influences of each vertex, largest first.
+
+    The weights are renormalised to sum 1; influences of weight 0 have joint 0, as glTF requires.
+    """
     indices = np.argsort(-weights, axis=1, kind="stable")[:, :k]
     kept = np.take_along_axis(weights, indices, axis=1)
     kept = kept / kept.sum(axis=1, keepdims=True)

@@ -1,5 +1,4 @@
-"""Operations on closed surfaces: isosurface, repair, remeshing, conforming subdivision, Laplacian, transfer between
-meshes."""
+"""Operations on closed surfaces: isosurface, repair, remeshing, subdivision, smoothing, closest points, distances."""
 
 from typing import Any
 
@@ -13,16 +12,19 @@ from skimage.measure import marching_cubes
 
 from pipeline.geometry.mesh import Mesh
 
-REPAIR_ROUNDS = 4
-MAX_INTERSECTION_ROUNDS = 20
+MAX_REPAIR_ITERATIONS = 4
+MAX_INTERSECTION_ITERATIONS = 20
 
 
 class OpenSurfaceError(ValueError):
-    """A surface has holes that could not be closed; rebuild it with `isosurface` of its solid."""
+    """A surface has holes that `repair` could not close."""
 
 
 def largest_solid(inside: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
-    """The largest 6-connected part of a grid, with the cavities that the outside cannot reach filled."""
+    """Return the largest 6-connected component of a grid with its cavities filled.
+
+    A cavity is an empty region that is not connected to the border of the grid.
+    """
     labels, count = ndimage.label(inside)
     if count == 0:
         return inside
@@ -31,45 +33,51 @@ def largest_solid(inside: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"
 
 
 def isosurface(
-    values: Float[np.ndarray, "x y z"], level: float, origin_m: Float[np.ndarray, "3"], spacing_m: float
+    values: Float[np.ndarray, "x y z"], isovalue: float, origin_m: Float[np.ndarray, "3"], spacing_m: float
 ) -> Mesh:
-    """Marching cubes (Lewiner et al. 2003) of ``values >= level``, closed at the grid's border, outward
-    counter-clockwise.
+    """Extract the surface of `values >= isovalue` by marching cubes (Lewiner et al. 2003).
 
-    origin_m: position of the sample [0, 0, 0]. Raises ValueError when nothing reaches the level.
+    The surface is closed at the border of the grid; faces are counter-clockwise seen from outside.
+
+    Args:
+        values: samples of the scalar field.
+        isovalue: threshold of the field.
+        origin_m: position of sample [0, 0, 0], m.
+        spacing_m: distance of neighbouring samples, m.
+
+    Raises:
+        ValueError: no sample reaches the isovalue.
     """
-    padding_value = min(float(values.min()), level) - 1.0
+    padding_value = min(float(values.min()), isovalue) - 1.0
     padded = np.pad(values, 1, constant_values=padding_value)
-    if not (padded >= level).any():
-        raise ValueError(f"no value of the grid reaches the level {level:g}; the largest is {float(values.max()):g}")
-    # a sample exactly on the level makes faces without area, which pinch the surface
-    padded = np.where(np.abs(padded - level) < 1e-6, level + 1e-6, padded)
-    vertices, faces, _, _ = marching_cubes(padded, level, gradient_direction="ascent", allow_degenerate=False)
+    if not (padded >= isovalue).any():
+        largest = float(values.max())
+        raise ValueError(f"no sample of the grid reaches the isovalue {isovalue:g}; the largest is {largest:g}")
+    # A sample equal to the isovalue gives faces without area, which make vertices non-manifold.
+    padded = np.where(np.abs(padded - isovalue) < 1e-6, isovalue + 1e-6, padded)
+    vertices, faces, _, _ = marching_cubes(padded, isovalue, gradient_direction="ascent", allow_degenerate=False)
     vertices_m = (vertices - 1.0) * spacing_m + np.asarray(origin_m)
     return Mesh(vertices_m.astype(np.float32), faces.astype(np.int32))
 
 
 def remove_unreferenced_vertices(mesh: Mesh) -> Mesh:
-    """The mesh without vertices that no face uses; order kept."""
+    """Return the mesh without the vertices that no face uses; the order of the others is kept."""
     used, flat = np.unique(mesh.faces, return_inverse=True)
     return Mesh(mesh.vertices[used], flat.reshape(-1, 3).astype(mesh.faces.dtype))
 
 
 def largest_component(mesh: Mesh) -> Mesh:
-    """The edge-connected piece with the largest area."""
-    vertex_count = len(mesh.vertices)
-    ends = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]]])
-    graph = coo_array((np.ones(len(ends), dtype=bool), ends.T), shape=(vertex_count, vertex_count))
-    label = connected_components(graph, directed=False)[1][mesh.faces[:, 0]]
-    areas_m2 = np.bincount(label, mesh.face_areas_m2())
-    return remove_unreferenced_vertices(Mesh(mesh.vertices, mesh.faces[label == int(np.argmax(areas_m2))]))
+    """Return the connected component with the largest area."""
+    component = igl.vertex_components(mesh.faces.astype(np.int64))[mesh.faces[:, 0]]
+    areas_m2 = np.bincount(component, mesh.face_areas_m2())
+    return remove_unreferenced_vertices(Mesh(mesh.vertices, mesh.faces[component == int(np.argmax(areas_m2))]))
 
 
 def split_nonmanifold_vertices(mesh: Mesh) -> Mesh:
-    """Gives every fan of faces around a vertex its own copy of the vertex: no vertex is left where two sheets only
-    touch.
+    """Duplicate each non-manifold vertex, so that every fan of faces around it has its own copy.
 
-    Edges must have at most two faces. A mesh whose vertices are manifold comes back unchanged.
+    Edges must have at most two faces. A mesh with manifold vertices is returned unchanged (the same object).
+    `igl.split_nonmanifold` takes twice the time, also changes the winding, and orders the vertices differently.
     """
     count = len(mesh.faces)
     corner = np.arange(3 * count).reshape(count, 3)
@@ -93,22 +101,23 @@ def split_nonmanifold_vertices(mesh: Mesh) -> Mesh:
 
 
 def is_closed_manifold(mesh: Mesh) -> bool:
-    """Watertight with one fan of faces around every vertex in use."""
+    """Return whether the mesh is watertight and has one fan of faces around every vertex in use."""
     return mesh.is_watertight() and split_nonmanifold_vertices(mesh) is mesh
 
 
-def self_intersecting_faces(mesh: Mesh) -> int:
-    """Number of faces that cut through another face."""
+def count_self_intersecting_faces(mesh: Mesh) -> int:
+    """Return the number of faces that intersect another face."""
     return int(_self_intersection_mask(mesh).sum())
 
 
 def resolve_self_intersections(mesh: Mesh) -> Mesh:
-    """The mesh with the vertices of faces that cut another moved to the mean of their neighbours until none does.
+    """Move the vertices of self-intersecting faces to the mean of their neighbours until no face intersects another.
 
-    What still does after `MAX_INTERSECTION_ROUNDS` rounds is left. All other vertices stay.
+    All other vertices stay. Intersections that are left after `MAX_INTERSECTION_ITERATIONS` iterations remain. A mesh
+    without self-intersections is returned unchanged (the same object).
     """
     operator = laplacian(mesh)
-    for _ in range(MAX_INTERSECTION_ROUNDS):
+    for _ in range(MAX_INTERSECTION_ITERATIONS):
         intersecting = _self_intersection_mask(mesh)
         if not intersecting.any():
             break
@@ -126,11 +135,12 @@ def _self_intersection_mask(mesh: Mesh) -> Bool[np.ndarray, "f"]:
 
 
 def repair(mesh: Mesh) -> Mesh:
-    """The largest piece of a mesh made watertight and manifold by removing bad faces and closing the holes.
+    """Make the largest component of a mesh watertight and manifold: remove invalid faces, close the holes.
 
-    Raises OpenSurfaceError when that does not succeed within a few rounds.
+    Raises:
+        OpenSurfaceError: holes remain after `MAX_REPAIR_ITERATIONS` iterations.
     """
-    for _ in range(REPAIR_ROUNDS):
+    for _ in range(MAX_REPAIR_ITERATIONS):
         mesh = largest_component(split_nonmanifold_vertices(_remove_invalid_faces(mesh)))
         if is_closed_manifold(mesh):
             return mesh
@@ -138,11 +148,11 @@ def repair(mesh: Mesh) -> Mesh:
         meshes.meshing_re_orient_faces_coherently()
         meshes.meshing_close_holes(maxholesize=len(mesh.faces), selfintersection=False)
         mesh = _from_meshset(meshes)
-    raise OpenSurfaceError("a surface could not be closed: its holes border on each other")
+    raise OpenSurfaceError(f"a surface still has holes after {MAX_REPAIR_ITERATIONS} repair iterations")
 
 
 def _remove_invalid_faces(mesh: Mesh) -> Mesh:
-    """Without faces that repeat a vertex or another face, and without the faces at edges shared by more than two."""
+    """Remove faces with a repeated vertex, repeated faces, and the faces at edges with more than two faces."""
     faces = mesh.faces
     ordered = np.sort(faces, axis=1)
     distinct = (ordered[:, 0] != ordered[:, 1]) & (ordered[:, 1] != ordered[:, 2])
@@ -162,14 +172,22 @@ def remesh_isotropic(
     selected: Bool[np.ndarray, "f"] | None = None,
     tolerance_m: float | None = None,
 ) -> Mesh:
-    """Isotropic explicit remeshing (Hoppe et al. 1993 as in VCGlib): split, collapse, flip, smooth, project back, in
-    turn.
+    """Remesh to equilateral triangles: isotropic explicit remeshing (Hoppe et al. 1993) of VCGlib.
 
-    edge_m: edge length to reach. selected: only these faces change; their border stays. tolerance_m: no change may move
-    the surface farther than this (a tenth of the edge when None), so thin parts keep short edges. Raises
-    OpenSurfaceError when the result cannot be repaired.
+    Each iteration splits, collapses and flips edges, smooths the vertices and projects them back to the surface.
+
+    Args:
+        mesh: the surface, m.
+        target_edge_m: edge length to reach, m.
+        iterations: number of iterations.
+        selected: only these faces change, and their border stays; all faces if None.
+        tolerance_m: no change moves the surface by more than this distance, m; a tenth of the edge length if None.
+            Thin parts therefore keep short edges.
+
+    Raises:
+        OpenSurfaceError: the result could not be repaired.
     """
-    from pymeshlab import PureValue  # here, as in `_to_meshset`
+    from pymeshlab import PureValue  # imported here for the reason given in `_to_meshset`
 
     meshes = _to_meshset(mesh, selected)
     meshes.meshing_isotropic_explicit_remeshing(
@@ -183,7 +201,7 @@ def remesh_isotropic(
 
 
 def _to_meshset(mesh: Mesh, selected: Bool[np.ndarray, "f"] | None = None) -> Any:
-    import pymeshlab  # here, because loading it costs a quarter of a second that few stages need pay
+    import pymeshlab  # imported here because the import takes 0.25 s and few stages need it
 
     meshes = pymeshlab.MeshSet()
     quality = None if selected is None else selected.astype(np.float64)
@@ -200,12 +218,14 @@ def _from_meshset(meshes: Any) -> Mesh:
 
 
 def subdivide(mesh: Mesh, marked: Bool[np.ndarray, "f"]) -> tuple[Mesh, Int[np.ndarray, "n 2"]]:
-    """Midpoint subdivision of the marked faces; their neighbours are cut so that no vertex hangs on an edge.
+    """Subdivide the marked faces at their edge midpoints, and their neighbours so that the mesh stays conforming.
 
-    A face with all edges split becomes 4 faces, with two 3, with one 2. Watertight and manifold meshes stay so.
+    A face with three split edges becomes 4 faces, with two 3, with one 2. Watertight manifold meshes stay so.
 
-    Returns the finer mesh, whose vertices are the old ones followed by one a split edge, and the two ends of each split
-    edge: any vertex attribute is carried over as ``np.concatenate([a, (a[ends[:, 0]] + a[ends[:, 1]]) / 2])``.
+    Returns:
+        The subdivided mesh, with the old vertices first and then one vertex per split edge; and the two end vertices
+        (n, 2) of each split edge. A vertex attribute `a` of the new mesh is
+        `np.concatenate([a, (a[ends[:, 0]] + a[ends[:, 1]]) / 2])`.
     """
     faces = mesh.faces.astype(np.int64)
     half_edges = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2), axis=2)
@@ -220,9 +240,9 @@ def subdivide(mesh: Mesh, marked: Bool[np.ndarray, "f"]) -> tuple[Mesh, Int[np.n
 
 
 def _split_faces(faces: Int[np.ndarray, "f 3"], middle: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "g 3"]:
-    """Faces cut at the midpoints of their edges k = (corner k, corner k + 1); -1 marks an edge that is not split."""
+    """Split faces at the midpoint vertices of their edges k = (corner k, corner k + 1); -1 marks an unsplit edge."""
     count = (middle >= 0).sum(axis=1)
-    # turn each face so that its split edges come first: the one, or the two around the edge that stays last
+    # Rotate the corners so that the split edges come first; of two split edges the unsplit edge becomes the last.
     turn = np.where(count == 1, np.argmax(middle >= 0, axis=1), np.where(count == 2, np.argmin(middle, axis=1) + 1, 0))
     columns = (np.arange(3) + turn[:, None]) % 3
     corner, middle = np.take_along_axis(faces, columns, axis=1), np.take_along_axis(middle, columns, axis=1)
@@ -236,8 +256,11 @@ def _split_faces(faces: Int[np.ndarray, "f 3"], middle: Int[np.ndarray, "f 3"]) 
 
 
 def laplacian(mesh: Mesh) -> csr_array:
-    """Uniform Laplacian I - D^-1 A, (v, v) float64: applied to positions, each vertex minus the mean of its
-    neighbours."""
+    """Return the uniform Laplacian I - D^-1 A, (v, v) float64.
+
+    Applied to positions, it gives each vertex minus the mean of its neighbours. A is the adjacency matrix, D the
+    diagonal matrix of the degrees.
+    """
     ends = mesh.edges()
     count = len(mesh.vertices)
     both = np.concatenate([ends, ends[:, ::-1]])
@@ -247,8 +270,10 @@ def laplacian(mesh: Mesh) -> csr_array:
 
 
 def smooth_taubin(mesh: Mesh, steps: int, taubin_lambda: float = 0.5, taubin_nu: float = 0.52) -> Mesh:
-    """Taubin's smoothing ("A signal processing approach to fair surface design", 1995): a step moves vertices towards
-    the mean of their neighbours by ``taubin_lambda``, then back by ``taubin_nu``, so that noise goes and volume stays.
+    """Smooth a surface without shrinking it (Taubin, "A signal processing approach to fair surface design", 1995).
+
+    Each step moves the vertices towards the mean of their neighbours by the fraction `taubin_lambda`, then away from it
+    by `taubin_nu`.
     """
     operator, vertices = laplacian(mesh), mesh.vertices.astype(np.float64)
     for _ in range(steps):
@@ -260,8 +285,11 @@ def smooth_taubin(mesh: Mesh, steps: int, taubin_lambda: float = 0.5, taubin_nu:
 def closest_points_on_mesh(
     points: Float[np.ndarray, "n 3"], mesh: Mesh
 ) -> tuple[Float[np.ndarray, "n"], Int[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
-    """Distance (m) of each point to the mesh, the face that is nearest, and the barycentrics of the nearest place on
-    it."""
+    """Return the closest point of a mesh for each query point.
+
+    Returns:
+        Distance (m), index of the closest face, and barycentric coordinates (>= 0, sum 1) of the closest point in it.
+    """
     vertices, faces = mesh.vertices.astype(np.float64), mesh.faces.astype(np.int64)
     squared, face, nearest = igl.point_mesh_squared_distance(
         np.ascontiguousarray(points, dtype=np.float64), vertices, faces
@@ -273,21 +301,28 @@ def closest_points_on_mesh(
 
 
 class MeshAABBTree:
-    """One mesh prepared for many rounds of questions: building the tree costs more than some thousand answers."""
+    """A tree of axis-aligned bounding boxes of one mesh, for repeated closest-point queries.
+
+    Building the tree takes longer than some thousand queries.
+    """
 
     def __init__(self, mesh: Mesh) -> None:
         self._arrays = mesh.vertices.astype(np.float64), mesh.faces.astype(np.int64)
         self._tree = igl.AABB()
         self._tree.init(*self._arrays)
 
-    def nearest(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """The place on the mesh nearest to each point."""
-        nearest: np.ndarray = self._tree.squared_distance(*self._arrays, np.ascontiguousarray(points, np.float64))[2]
-        return nearest
+    def closest_points(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Return the closest point of the mesh for each point, m."""
+        query = np.ascontiguousarray(points, np.float64)
+        closest: np.ndarray = self._tree.squared_distance(*self._arrays, query)[2]
+        return closest
 
 
 def _barycentric(p: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> Float[np.ndarray, "n 3"]:
-    """Barycentrics of points in the planes of triangles; all weight on a corner where the triangle has no area."""
+    """Return barycentric coordinates of points in the planes of triangles.
+
+    A triangle without area gives (1, 0, 0), where `igl.barycentric_coordinates` gives NaN.
+    """
     normal = np.cross(b - a, c - a)
     squared = np.maximum(np.sum(normal**2, axis=1), 1e-30)
     second = np.sum(np.cross(p - a, c - a) * normal, axis=1) / squared
@@ -295,17 +330,11 @@ def _barycentric(p: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> 
     return np.stack([1.0 - second - third, second, third], axis=1)
 
 
-def transfer(
-    points: Float[np.ndarray, "n 3"], mesh: Mesh, attributes: Float[np.ndarray, "v c"]
-) -> Float[np.ndarray, "n c"]:
-    """Vertex attributes of a mesh at the place on it nearest to each point."""
-    _, face, barycentric = closest_points_on_mesh(points, mesh)
-    return np.einsum("nk,nkc->nc", barycentric, attributes[mesh.faces[face]]).astype(attributes.dtype)
-
-
 def signed_distance_m(points: Float[np.ndarray, "n 3"], mesh: Mesh) -> Float[np.ndarray, "n"]:
-    """Distance (m) to a closed mesh, negative inside (generalised winding number above one half; Barill et al.
-    2018)."""
+    """Return the distance (m) to a closed mesh, negative inside.
+
+    A point is inside if its generalised winding number is above one half (Barill et al. 2018).
+    """
     query = np.ascontiguousarray(points, dtype=np.float64)
     vertices, faces = mesh.vertices.astype(np.float64), mesh.faces.astype(np.int64)
     squared, _, _ = igl.point_mesh_squared_distance(query, vertices, faces)

@@ -1,4 +1,4 @@
-"""Pictures of a textured mesh, and the cameras that walk around one."""
+"""Rendering of a textured mesh, and turntable cameras."""
 
 import math
 
@@ -14,9 +14,10 @@ from pipeline.kernels.texture_sampling.reference import sample_texture_reference
 
 
 def sample_texture(texture: Float[Tensor, "th tw c"], uv: Float[Tensor, "n 2"]) -> Float[Tensor, "n c"]:
-    """Bilinear look-up. UV origin bottom-left, row 0 of the texture at the top (v = 1), texel centres at +0.5.
+    """Sample a texture bilinearly; differentiable in both arguments.
 
-    Outside [0, 1] the border texel is repeated. Differentiable in both arguments.
+    The UV origin is bottom-left, row 0 of the texture is at the top (v = 1), texel centres are at +0.5. Outside [0, 1]
+    the border texel is repeated.
 
     >>> sample_texture(torch.tensor([[[1.0], [0.0]]]), torch.tensor([[0.25, 0.5], [0.5, 0.5]])).tolist()
     [[1.0], [0.5]]
@@ -33,13 +34,19 @@ def render_textured(
     camera: Camera,
     supersampling: int = 3,
 ) -> Float[Tensor, "h w c+1"]:
-    """Texture colours premultiplied by coverage, and the coverage, in [0, 1]; unlit.
+    """Render the texture without lighting: colours premultiplied by coverage, then the coverage, all in [0, 1].
 
-    Each pixel is the mean of `supersampling` x `supersampling` bilinear look-ups, which antialiases silhouettes,
-    seams and texels.
+    Each pixel is the mean of `supersampling` x `supersampling` bilinear samples, which antialiases silhouettes, seams
+    and texels.
 
     Args:
-        vertices_world: metres. faces: corners into the vertices. faces_uv: corners of the same faces into `uv`.
+        vertices_world: posed vertices, m.
+        faces: corners of each face, indices into the vertices.
+        faces_uv: corners of the same faces, indices into `uv`.
+        uv: texture coordinates in [0, 1], origin bottom-left.
+        texture: colours in [0, 1], row 0 at the top.
+        camera: the camera.
+        supersampling: samples per pixel along each axis.
     """
     fine = camera.scaled(float(supersampling))
     vertices_px, depth_m = project(vertices_world, fine)
@@ -50,13 +57,14 @@ def render_textured(
 def blur_coverage(
     premultiplied: Float[np.ndarray, "h w channels"], sigma_px: float
 ) -> Float[np.ndarray, "h w channels"]:
-    """The picture with the coverage in its last channel blurred, as by a lens and a mask that are not sharp.
+    """Blur the coverage of a render, which is its last channel, as lens and matting blur the mask of a frame.
 
-    Colours are not blurred where the surface covers a pixel: a texture made from pictures has their blur already. Where
-    it covers none they are carried outward.
+    Colours of covered pixels are not blurred, because a texture baked from images already contains their blur. Colours
+    of uncovered pixels are extrapolated from covered ones.
 
     Args:
-        spread_px: standard deviation of the Gaussian.
+        premultiplied: premultiplied colours and coverage in [0, 1].
+        sigma_px: standard deviation of the Gaussian.
     """
     if sigma_px <= 0.0:
         return premultiplied
@@ -70,22 +78,28 @@ def blur_coverage(
 
 
 def turntable_camera(
-    box_min_m: Float[np.ndarray, "3"], box_max_m: Float[np.ndarray, "3"], angle: float, width: int, height: int
+    box_min_m: Float[np.ndarray, "3"],
+    box_max_m: Float[np.ndarray, "3"],
+    angle_rad: float,
+    width_px: int,
+    height_px: int,
 ) -> Camera:
-    """A camera of long focal length that sees a whole box from all around, level with the box's centre.
+    """Return a camera with a long focal length on a circle around a box, at the height of the centre of the box.
+
+    The whole box is in the image at every angle.
 
     Args:
-        lowest_m, highest_m: corners of the box, world, +Y up.
-        angle: radians around +Y; 0 looks at the front (the camera stands on +Z), pi/2 stands on +X.
-        width, height: of the image in pixels.
+        box_min_m, box_max_m: corners of the box in the world, +Y up, m.
+        angle_rad: angle around +Y; at 0 the camera is on +Z and shows the front, at pi/2 it is on +X.
+        width_px, height_px: size of the image.
     """
     centre, size = 0.5 * (box_min_m + box_max_m), box_max_m - box_min_m
     radius = 0.5 * math.hypot(size[0], size[2])
     distance = 6.0 * max(size[1], 2.0 * radius)
-    focal_px = 0.94 * (distance - radius) * min(height / size[1], width / (2.0 * radius))
-    backward = np.array([math.sin(angle), 0.0, math.cos(angle)])
-    right = np.array([math.cos(angle), 0.0, -math.sin(angle)])
+    focal_px = 0.94 * (distance - radius) * min(height_px / size[1], width_px / (2.0 * radius))
+    backward = np.array([math.sin(angle_rad), 0.0, math.cos(angle_rad)])
+    right = np.array([math.cos(angle_rad), 0.0, -math.sin(angle_rad)])
     world_to_camera = np.eye(4, dtype=np.float32)
     world_to_camera[:3, :3] = np.stack([right, [0.0, -1.0, 0.0], -backward])
     world_to_camera[:3, 3] = -world_to_camera[:3, :3] @ (centre + distance * backward)
-    return Camera(focal_px, focal_px, width / 2.0, height / 2.0, width, height, world_to_camera)
+    return Camera(focal_px, focal_px, width_px / 2.0, height_px / 2.0, width_px, height_px, world_to_camera)

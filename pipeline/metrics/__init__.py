@@ -1,5 +1,6 @@
-"""How good a result is: images against held-out frames, surfaces against truth, a mesh against itself.
+"""Quality metrics: images against held-out frames, surfaces against ground truth, and the quality of one mesh.
 
-Pure functions on arrays. `images` is the protocol of the literature (8-bit, full image on white) and its honest
-companions on the body alone; `surfaces` compares geometry in mm and degrees; `health` looks at one mesh.
+Pure functions on arrays. `images` follows the evaluation protocol of the literature (8-bit images composited on white)
+and adds the same scores on the foreground pixels alone. `surfaces` measures distances in mm and angles in degrees.
+`health` measures the quality of a single mesh.
 """

@@ -1,4 +1,8 @@
-"""Laying one surface over another, so that shape is compared and not place."""
+"""Alignment of one surface to another, so that shapes are compared independently of pose and scale.
+
+References: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 1991;
+Besl and McKay, "A method for registration of 3-D shapes", PAMI 1992 (iterative closest points, ICP).
+"""
 
 from dataclasses import dataclass
 
@@ -10,36 +14,40 @@ from pipeline.geometry.surface import MeshAABBTree
 from pipeline.metrics.surfaces import sample_surface
 
 CONVERGENCE_M = 2e-5
-"""An alignment that moves no point farther than this in a round is finished."""
+"""ICP ends when no coordinate of any sample moves by this distance or more in one iteration."""
 
 
 @dataclass(frozen=True)
 class SimilarityTransform:
-    """x -> scale * rotation @ x + shift_m."""
+    """The transform x -> scale * rotation @ x + translation_m."""
 
     scale: float
     rotation: Float[np.ndarray, "3 3"]
     translation_m: Float[np.ndarray, "3"]
 
     def __call__(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-        """Moved points, float64."""
+        """Transform points (m); the result is float64."""
         return self.scale * points.astype(np.float64) @ self.rotation.T + self.translation_m
 
     def inverse(self) -> "SimilarityTransform":
-        """The way back."""
+        """Return the inverse transform."""
         rotation = self.rotation.T
         return SimilarityTransform(1.0 / self.scale, rotation, -rotation @ self.translation_m / self.scale)
 
-    def moved(self, mesh: Mesh) -> Mesh:
-        """The mesh with its vertices moved."""
+    def transform_mesh(self, mesh: Mesh) -> Mesh:
+        """Return the mesh with transformed vertices (float64)."""
         return Mesh(self(mesh.vertices), mesh.faces)
 
 
 def umeyama_similarity(
     points: Float[np.ndarray, "n 3"], targets: Float[np.ndarray, "n 3"], with_scale: bool = True
 ) -> SimilarityTransform:
-    """The similarity (or, without scale, the rigid motion) that takes points to their targets with the least squared
-    error. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991.
+    """Return the transform of `points` to their corresponding `targets` with the least squared error (Umeyama 1991).
+
+    Args:
+        points: at least three points that do not lie on one line, m.
+        targets: the corresponding positions, m.
+        with_scale: estimate the scale; otherwise the scale is 1 (a rigid transform).
     """
     centroid, target_centroid = points.mean(axis=0), targets.mean(axis=0)
     covariance = (targets - target_centroid).T @ (points - centroid) / len(points)
@@ -52,22 +60,32 @@ def umeyama_similarity(
 
 
 def align_surfaces_icp(
-    source: Mesh, target: Mesh, with_scale: bool = True, rounds: int = 30, count: int = 3000, seed: int = 0
+    source: Mesh, target: Mesh, with_scale: bool = True, max_iterations: int = 30, count: int = 3000, seed: int = 0
 ) -> SimilarityTransform:
-    """What takes `source` onto `target`: iterated closest points, both ways so that shrinking does not pay.
+    """Align `source` to `target` by ICP with correspondences in both directions.
 
-    Starts with the middles (and sizes, with scale) of the two surfaces laid over each other and no rotation: they have
-    to be turned alike within some 30 degrees already. Deterministic in the seed.
+    Correspondences in one direction alone would let the scale shrink. The initial transform aligns the centroids (and
+    the sizes, with scale) without rotation, so the surfaces must already have the same orientation within about 30
+    degrees. The result is deterministic for a given seed.
+
+    Args:
+        source, target: surfaces, m.
+        with_scale: estimate the scale; otherwise the transform is rigid.
+        max_iterations: iterations at most; `CONVERGENCE_M` ends them earlier.
+        count: sample points per surface.
+        seed: seed of the samples.
     """
     points, _ = sample_surface(source, count, seed)
     targets, _ = sample_surface(target, count, seed + 1)
-    start_scale = float(np.sqrt(targets.var(axis=0).sum() / points.var(axis=0).sum())) if with_scale else 1.0
-    similarity = SimilarityTransform(start_scale, np.eye(3), targets.mean(axis=0) - start_scale * points.mean(axis=0))
+    initial_scale = float(np.sqrt(targets.var(axis=0).sum() / points.var(axis=0).sum())) if with_scale else 1.0
+    initial_translation_m = targets.mean(axis=0) - initial_scale * points.mean(axis=0)
+    similarity = SimilarityTransform(initial_scale, np.eye(3), initial_translation_m)
     source_tree, target_tree = MeshAABBTree(source), MeshAABBTree(target)
-    for _ in range(rounds):
+    for _ in range(max_iterations):
         before = similarity(points)
-        sources = np.concatenate([points, source_tree.nearest(similarity.inverse()(targets))])
-        similarity = umeyama_similarity(sources, np.concatenate([target_tree.nearest(before), targets]), with_scale)
+        sources = np.concatenate([points, source_tree.closest_points(similarity.inverse()(targets))])
+        destinations = np.concatenate([target_tree.closest_points(before), targets])
+        similarity = umeyama_similarity(sources, destinations, with_scale)
         if np.abs(similarity(points) - before).max() < CONVERGENCE_M:
             break
     return similarity

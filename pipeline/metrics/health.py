@@ -1,59 +1,59 @@
-"""Is a triangle mesh sound: closed, manifold, in one piece, well shaped, free of self-intersections?"""
+"""Quality of a triangle mesh: closed, manifold, connected, well shaped, without self-intersections."""
 
+import igl
 import numpy as np
 from jaxtyping import Float
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from pipeline.geometry.mesh import Mesh
-from pipeline.geometry.surface import self_intersecting_faces, split_nonmanifold_vertices
+from pipeline.geometry.surface import count_self_intersecting_faces
 
 SLIVER_ANGLE_DEG = 10.0
 
 
 def mesh_quality_metrics(mesh: Mesh) -> dict[str, float | int | bool]:
-    """Everything that the report says about a mesh.
+    """Return the mesh metrics of the report.
 
     Returns:
-        vertices, faces: counts. watertight, manifold: see the functions below. components: pieces joined by edges.
-        sliver_share: share of faces whose smallest angle is below 10 degrees; smallest_angle_deg: over all faces.
-        self_intersecting_faces: faces that cut another face.
+        vertices, faces: counts.
+        watertight: every directed edge has exactly one opposite edge, see `Mesh.is_watertight`.
+        manifold: see `is_manifold`.
+        components: number of connected components, see `component_count`.
+        sliver_fraction: fraction of faces with an angle below 10 degrees, in [0, 1].
+        min_angle_deg: smallest angle of any face.
+        self_intersecting_faces: number of faces that intersect another face.
     """
-    smallest_deg = min_face_angles_deg(mesh)
+    min_angles_deg = min_face_angles_deg(mesh)
     return {
         "vertices": len(mesh.vertices),
         "faces": len(mesh.faces),
         "watertight": mesh.is_watertight(),
         "manifold": is_manifold(mesh),
         "components": component_count(mesh),
-        "sliver_fraction": float(np.mean(smallest_deg < SLIVER_ANGLE_DEG)),
-        "min_angle_deg": float(smallest_deg.min()),
-        "self_intersecting_faces": self_intersecting_faces(mesh),
+        "sliver_fraction": float(np.mean(min_angles_deg < SLIVER_ANGLE_DEG)),
+        "min_angle_deg": float(min_angles_deg.min()),
+        "self_intersecting_faces": count_self_intersecting_faces(mesh),
     }
 
 
 def is_manifold(mesh: Mesh) -> bool:
-    """At most two faces meet at each edge, and the faces around each vertex form one fan."""
-    if len(mesh.faces) == 0 or int(mesh.edge_face_counts().max()) > 2:
+    """Return whether each edge has at most two faces, consistently wound, and each vertex one fan of faces.
+
+    Vertices without faces are ignored; a mesh without faces is not manifold.
+    """
+    if len(mesh.faces) == 0:
         return False
-    return split_nonmanifold_vertices(mesh) is mesh
+    faces = mesh.faces.astype(np.int64)
+    return bool(igl.is_edge_manifold(faces)[0] and igl.is_vertex_manifold(faces)[np.unique(faces)].all())
 
 
 def component_count(mesh: Mesh) -> int:
-    """Pieces that are connected through edges; vertices without faces do not count."""
-    used, flat = np.unique(mesh.faces, return_inverse=True)
-    faces = flat.reshape(-1, 3)
-    pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]]).T
-    graph = coo_array((np.ones(pairs.shape[1], dtype=bool), (pairs[0], pairs[1])), shape=(len(used), len(used)))
-    return int(connected_components(graph, directed=False)[0])
+    """Return the number of pieces that are connected through shared vertices; vertices without faces do not count."""
+    component_of_vertex = igl.vertex_components(mesh.faces.astype(np.int64))
+    return len(np.unique(component_of_vertex[mesh.faces[:, 0]]))
 
 
 def min_face_angles_deg(mesh: Mesh) -> Float[np.ndarray, "f"]:
-    """Smallest inner angle of each face; 0 for faces without area."""
-    corners = mesh.vertices[mesh.faces].astype(np.float64)
-    angles = []
-    for corner in range(3):
-        a = corners[:, (corner + 1) % 3] - corners[:, corner]
-        b = corners[:, (corner + 2) % 3] - corners[:, corner]
-        angles.append(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.sum(a * b, axis=1)))
-    return np.degrees(np.min(angles, axis=0))
+    """Return the smallest interior angle of each face in degrees; 0 for faces without area."""
+    angles_rad = igl.internal_angles(mesh.vertices.astype(np.float64), mesh.faces.astype(np.int64))
+    # Two coincident corners have no defined angles: NaN.
+    return np.degrees(np.nan_to_num(angles_rad, nan=0.0).min(axis=1))

@@ -1,9 +1,9 @@
-"""LPIPS, the distance between two pictures in the features of a trained network.
+"""LPIPS, the distance between two images in the feature space of a trained network.
 
 Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018, version 0.1 with
-AlexNet: the features after each of its five convolutions, scaled to unit length over channels, their squared
-differences weighted by channel, averaged over the picture and summed over layers. The weights are not part of this
-project; `pipeline.report.lpips_weights` looks for them.
+AlexNet: the features after each of the five convolutions are normalised to unit length over channels; their squared
+differences are weighted per channel, averaged over the image and summed over layers. The weights are not part of this
+project; `pipeline.report.lpips_weights` searches for them.
 """
 
 from collections.abc import Mapping
@@ -14,20 +14,21 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 MIN_SIDE_PX = 63
-"""Below this nothing is left after AlexNet's third shrinking."""
+"""Smallest side with which AlexNet's last feature map still has a pixel."""
 
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 _CONVOLUTIONS = (("0", 4, 2, False), ("3", 1, 2, True), ("6", 1, 1, True), ("8", 1, 1, False), ("10", 1, 1, False))
-"""Name, stride, padding of each convolution of AlexNet, and whether a 3 x 3 maximum of stride 2 stands before it."""
+"""Name, stride and padding of each convolution of AlexNet, and whether a 3 x 3 max pooling of stride 2 precedes it."""
 
 
 @torch.no_grad()
 def lpips(
     render: UInt8[np.ndarray, "h w 3"], image: UInt8[np.ndarray, "h w 3"], weights: Mapping[str, Tensor]
 ) -> float:
-    """Distance of two sRGB pictures, 0 for equal ones and about 1 for very different ones.
+    """Return the distance of two sRGB images: 0 for equal images, about 1 for very different ones.
 
     Args:
+        render, image: the two images, both sides at least 63 px.
         weights: `features.N.weight` and `.bias` of torchvision's AlexNet, and `linK.model.1.weight` of the five layers.
 
     Raises:
@@ -42,10 +43,10 @@ def lpips(
     return total
 
 
-def _features(picture: UInt8[np.ndarray, "h w 3"], weights: Mapping[str, Tensor]) -> list[Float[Tensor, "c fh fw"]]:
-    """Rectified outputs of the convolutions, each pixel's channels scaled to unit length."""
+def _features(image: UInt8[np.ndarray, "h w 3"], weights: Mapping[str, Tensor]) -> list[Float[Tensor, "c fh fw"]]:
+    """Return the outputs of each convolution after ReLU, normalised to unit length over the channels of each pixel."""
     shift, scale = (torch.tensor(values).view(3, 1, 1) for values in (_SHIFT, _SCALE))
-    values = (torch.from_numpy(picture).permute(2, 0, 1).float() / 127.5 - 1.0 - shift) / scale
+    values = (torch.from_numpy(image).permute(2, 0, 1).float() / 127.5 - 1.0 - shift) / scale
     layers = []
     for name, stride, padding, pool_first in _CONVOLUTIONS:
         if pool_first:

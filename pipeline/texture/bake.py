@@ -19,11 +19,16 @@ from torch import Tensor
 from pipeline.core.config import Config
 from pipeline.core.progress import track
 from pipeline.geometry.atlas import Atlas, Texels, fill_unknown_texels
-from pipeline.geometry.camera import project
+from pipeline.geometry.camera import pixel_footprint_m, project
 from pipeline.geometry.texture_rendering import render_textured
 from pipeline.kernels.texel_projection import project_texels
-from pipeline.metrics.images import composite_on_white, composite_premultiplied_on_white, foreground_mask, psnr_db
-from pipeline.texture.views import BakeView, align_to_render, pixel_confidence, pixel_footprint_m, render_depth
+from pipeline.metrics.images import (
+    composite_on_white,
+    composite_premultiplied_on_white,
+    foreground_mask,
+    validation_psnr_db,
+)
+from pipeline.texture.views import BakeView, align_to_render, pixel_confidence, render_depth
 
 HALF_CONFIDENCE_WEIGHT_RATIO = 0.1
 """A texel with this share of the median sum of weights is half its own, half filled: of the texels below it on a real
@@ -126,7 +131,9 @@ def average_views(views: Iterable[BakeView], surface: TexturedSurface, config: B
     for view in views:
         depth_m = render_depth(view, surface.faces)
         pixel_weights = pixel_confidence(
-            view.mask, depth_m.numpy(), config.silhouette_falloff_m / pixel_footprint_m(view)
+            view.mask,
+            depth_m.numpy(),
+            config.silhouette_falloff_m / pixel_footprint_m(view.vertices_world, view.camera),
         )
         mean.add(*observe(view, surface, view.image.astype(np.float32) / 255.0, pixel_weights, depth_m, config))
     return mean
@@ -138,7 +145,10 @@ def average_residuals(
     """Weighted mean of what the aligned views show more than the texture does."""
     mean = WeightedMean.empty(len(surface.texels.face))
     for view in views:
-        rendered, pixel_m = render_textured_view(texture, view, surface), pixel_footprint_m(view)
+        rendered, pixel_m = (
+            render_textured_view(texture, view, surface),
+            pixel_footprint_m(view.vertices_world, view.camera),
+        )
         warped, warped_mask = align_to_render(
             view, rendered, config.flow_smoothing_sigma_m / pixel_m, config.max_flow_m / pixel_m
         )
@@ -197,15 +207,13 @@ def weight_confidence(weight: Float[Tensor, "t"], half_confidence_weight: float)
 
 def texels_to_texture(colour: Float[Tensor, "t c"], texels: Texels) -> Float[np.ndarray, "s s c"]:
     """Texel colours (or other values) as a texture with filled gutters."""
-    return fill_unknown_texels(texels.image(colour.numpy()), texels.covered())
+    return fill_unknown_texels(texels.to_texture(colour.numpy()), texels.coverage_mask())
 
 
 def mean_foreground_psnr_db(
     texture: Float[np.ndarray, "s s 3"], views: Sequence[BakeView], surface: TexturedSurface
 ) -> float:
     """Mean over views of the PSNR on the person's pixels, both laid on white; nan without views."""
-    values = []
-    for view in views:
-        rendered = composite_premultiplied_on_white(render_textured_view(texture, view, surface))
-        values.append(psnr_db(rendered, composite_on_white(view.image, view.mask), foreground_mask(view.mask)))
-    return float(np.mean(values)) if values else float("nan")
+    renders = [composite_premultiplied_on_white(render_textured_view(texture, view, surface)) for view in views]
+    targets = [composite_on_white(view.image, view.mask) for view in views]
+    return validation_psnr_db(renders, targets, [foreground_mask(view.mask) for view in views])

@@ -17,9 +17,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.geometry.atlas import Texels
+from pipeline.geometry.camera import pixel_footprint_m
 from pipeline.geometry.colour import srgb_to_linear
+from pipeline.geometry.mesh import area_weighted_vertex_normals
 from pipeline.texture.bake import BakeConfig, TexturedSurface, observe
-from pipeline.texture.views import BakeView, pixel_confidence, pixel_footprint_m, render_depth, vertex_normals
+from pipeline.texture.views import BakeView, pixel_confidence, render_depth
 
 ALTERNATING_LEAST_SQUARES_ITERATIONS = 8
 RIDGE_WEIGHT = 1e-3
@@ -67,11 +69,13 @@ def observe_vertices(views: Iterable[BakeView], surface: TexturedSurface, config
     for view in views:
         depth_m = render_depth(view, surface.faces)
         pixel_weights = pixel_confidence(
-            view.mask, depth_m.numpy(), config.silhouette_falloff_m / pixel_footprint_m(view)
+            view.mask,
+            depth_m.numpy(),
+            config.silhouette_falloff_m / pixel_footprint_m(view.vertices_world, view.camera),
         )
         colour, weight = observe(view, surface, view.image.astype(np.float32) / 255.0, pixel_weights, depth_m, config)
         seen = (weight > 0).numpy()
-        normal = vertex_normals(view.vertices_world, surface.faces).numpy()[vertices[seen]]
+        normal = area_weighted_vertex_normals(view.vertices_world, surface.faces).numpy()[vertices[seen]]
         to_camera = view.camera.centre_m() - view.vertices_world.numpy()[vertices[seen]]
         to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
         reflection_direction = 2.0 * np.sum(normal * to_camera, axis=1, keepdims=True) * normal - to_camera

@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from pipeline.geometry.camera import Camera, project
+from pipeline.geometry.camera import Camera, pixel_footprint_m, project
+from pipeline.geometry.mesh import area_weighted_vertex_normals
 from pipeline.kernels.raster import rasterize
 
 MIN_FOREGROUND_ALPHA = 0.9
@@ -69,26 +70,14 @@ def vertex_view_cosine(
 ) -> Float[Tensor, "v"]:
     """Cosine between each vertex's area-weighted normal and the way to the camera; negative when it looks away."""
     to_camera = torch.from_numpy(camera.centre_m()).to(vertices_world) - vertices_world
-    return (vertex_normals(vertices_world, faces) * torch.nn.functional.normalize(to_camera, dim=1)).sum(dim=1)
-
-
-def vertex_normals(vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"]) -> Float[Tensor, "v 3"]:
-    """Area-weighted unit normals."""
-    corners = vertices[faces.long()]
-    cross = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    summed = torch.zeros_like(vertices).index_add_(0, faces.long().reshape(-1), cross.repeat_interleave(3, dim=0))
-    return torch.nn.functional.normalize(summed, dim=1)
-
-
-def pixel_footprint_m(view: BakeView) -> float:
-    """What one pixel covers on the person, metres: median depth over focal length."""
-    _, depth_m = project(view.vertices_world, view.camera)
-    return float(depth_m.median()) / view.camera.fx
+    return (area_weighted_vertex_normals(vertices_world, faces) * torch.nn.functional.normalize(to_camera, dim=1)).sum(
+        dim=1
+    )
 
 
 def weight_by_resolution(views: Sequence[BakeView]) -> list[BakeView]:
     """The views with the weight that the number of pixels a square metre gives them, 1 for the median."""
-    footprints_m = np.array([pixel_footprint_m(view) for view in views])
+    footprints_m = np.array([pixel_footprint_m(view.vertices_world, view.camera) for view in views])
     weights = (np.median(footprints_m) / footprints_m) ** 2
     return [replace(view, weight=float(weight)) for view, weight in zip(views, weights, strict=True)]
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.avatar.textured_avatar import TexturedAvatar, unpremultiply_to_uint8
+from pipeline.avatar.textured_avatar import TexturedAvatar
 from pipeline.body.body import canonical_to_world
 from tests.avatar.avatar_sample import sample_body, sample_motion
 from tests.stages.report_run import CAMERA, make_avatar
@@ -47,11 +47,6 @@ def test_turntable_views_have_one_height_and_touch_their_sides(avatar: TexturedA
         assert view[:, -1, 3].any()
     front, side = views[0].shape[1], views[1].shape[1]
     assert front / side == pytest.approx(0.4 / 0.3, rel=0.2)  # the sample is a box of 0.4 m x 0.3 m
-
-
-def test_straight_alpha_undoes_premultiplication():
-    rgba = np.array([[[0.2, 0.1, 0.0, 0.5], [0.0, 0.0, 0.0, 0.0], [1.0, 1.0, 1.0, 1.0]]], dtype=np.float32)
-    assert unpremultiply_to_uint8(rgba).tolist() == [[[102, 51, 0, 128], [0, 0, 0, 0], [255, 255, 255, 255]]]
 
 
 def test_the_surface_alone_keeps_its_triangles(avatar: TexturedAvatar):

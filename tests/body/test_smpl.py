@@ -12,7 +12,7 @@ from pipeline.body.fit.fit import FitOptions, FitResult, fit_body
 from pipeline.body.fit.landmark_regressor import LANDMARKS
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS, RELAXED_CURL_RAD, finger_curl_rotations, relaxed_curls_rad
 from pipeline.body.fit.priors import shape_prior
-from pipeline.body.smpl import ARM_DIRECTIONS, FINGER_BEND_RAD, JOINT_NAMES, SmplBody, rotation_between
+from pipeline.body.smpl import ARM_DIRECTIONS, FINGER_BEND_RAD, JOINT_NAMES, SmplBody
 from pipeline.geometry.rotation import (
     axis_angle_to_matrix,
     matrix_to_quaternion,
@@ -175,12 +175,6 @@ def test_converted_poses_of_the_real_data_set_match_smpl(shared_data: Path, smpl
 def test_poses_fitted_with_smpl_hold_for_models_with_its_shapes() -> None:
     assert [SmplBody(made_up_arrays(count)).accepts_smpl_poses(10) for count in (24, 52, 55)] == [True, True, False]
     assert not SmplBody(made_up_arrays(24)).accepts_smpl_poses(16)
-
-
-def test_smallest_rotation_between_directions() -> None:
-    x, y = torch.tensor([2.0, 0.0, 0.0]), torch.tensor([0.0, 0.5, 0.0])
-    assert torch.allclose(rotation_between(x, y), axis_angle_to_matrix(torch.tensor([0.0, 0.0, np.pi / 2])), atol=1e-6)
-    assert torch.allclose(rotation_between(x, x), torch.eye(3))
 
 
 def test_betas_have_a_unit_prior(smpl: SmplBody) -> None:

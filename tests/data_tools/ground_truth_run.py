@@ -12,11 +12,12 @@ from data_tools.evaluate.files import TRUTH_VERSION
 from data_tools.evaluate.truth import load_ground_truth
 from data_tools.synthetic.scene.capture import SyntheticCapture
 from pipeline.avatar.finished_run import FinishedRun
-from pipeline.avatar.textured_avatar import TexturedAvatar, unpremultiply_to_uint8
+from pipeline.avatar.textured_avatar import TexturedAvatar
 from pipeline.body.body import Motion, canonical_to_world
 from pipeline.capture.capture import Capture, image_path, mask_path
 from pipeline.capture.frame_selection import assign_splits
 from pipeline.core.manifest import MANIFEST_FILE, Manifest, digest_files, write_manifest
+from pipeline.geometry.alpha import unpremultiply_to_uint8
 from pipeline.geometry.rotation import axis_angle_to_matrix, axis_angle_to_quaternion, quaternion_multiply
 from pipeline.geometry.skinning import forward_kinematics, skinning_transforms, top_k_weights
 from pipeline.io.image import write_gray, write_rgb

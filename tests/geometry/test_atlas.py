@@ -1,4 +1,4 @@
-"""Atlases: unfolded faces cover the texture once, with a gutter; gaps are filled without inventing colours."""
+"""Atlases: charts cover the texture once with padding between them; gaps are filled with known colours only."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def atlas(ball: Mesh, halves: np.ndarray) -> Atlas:
 
 
 def connected_charts(faces_uv: np.ndarray) -> np.ndarray:
-    """Chart label of every face, by repeated merging of the faces that share a uv corner."""
+    """Chart label of every face: faces that share a uv corner are merged until nothing changes."""
     label = np.arange(faces_uv.max() + 1)
     while True:
         lowest = label[faces_uv].min(axis=1)
@@ -41,34 +41,34 @@ def connected_charts(faces_uv: np.ndarray) -> np.ndarray:
         label = merged
 
 
-def test_unwrap_keeps_every_corner_on_its_vertex(ball: Mesh, atlas: Atlas) -> None:
+def test_every_atlas_corner_refers_to_its_mesh_vertex(ball: Mesh, atlas: Atlas) -> None:
     np.testing.assert_array_equal(atlas.vertex_of_uv[atlas.faces_uv], ball.faces)
     assert atlas.uv.min() >= 0.0
     assert atlas.uv.max() <= 1.0
 
 
-def test_unwrap_gives_the_same_bytes_again(ball: Mesh, halves: np.ndarray, atlas: Atlas) -> None:
+def test_unwrap_is_deterministic(ball: Mesh, halves: np.ndarray, atlas: Atlas) -> None:
     again = unwrap(ball, halves, SIZE_PX, PADDING_PX)
     assert again.uv.tobytes() == atlas.uv.tobytes()
     assert again.faces_uv.tobytes() == atlas.faces_uv.tobytes()
 
 
-def test_no_chart_holds_faces_of_two_parts(halves: np.ndarray, atlas: Atlas) -> None:
+def test_no_chart_contains_faces_of_two_segments(halves: np.ndarray, atlas: Atlas) -> None:
     charts = connected_charts(atlas.faces_uv)
     assert all(len(np.unique(halves[charts == chart])) == 1 for chart in np.unique(charts))
 
 
-def test_charts_keep_their_gutter(atlas: Atlas) -> None:
+def test_charts_keep_their_padding(atlas: Atlas) -> None:
     charts, texels = connected_charts(atlas.faces_uv), rasterize_texels(atlas, SIZE_PX)
-    places = np.stack([texels.rows, texels.columns], axis=1)
+    positions = np.stack([texels.rows, texels.columns], axis=1)
     chart_of_texel = charts[texels.face]
     for chart in np.unique(charts):
-        inside, outside = places[chart_of_texel == chart], places[chart_of_texel != chart]
+        inside, outside = positions[chart_of_texel == chart], positions[chart_of_texel != chart]
         apart, _ = cKDTree(outside).query(inside, p=np.inf)
         assert apart.min() > PADDING_PX - 1
 
 
-def test_texels_show_the_point_that_their_uv_names(ball: Mesh, atlas: Atlas) -> None:
+def test_the_surface_point_of_a_texel_has_the_uv_of_its_centre(ball: Mesh, atlas: Atlas) -> None:
     texels = rasterize_texels(atlas, SIZE_PX)
     np.testing.assert_allclose(texels.barycentric.sum(axis=1), 1.0, atol=1e-5)
     uv = texels.interpolate(atlas.faces_uv, atlas.uv)
@@ -87,14 +87,14 @@ def test_texels_cover_the_surface_evenly(ball: Mesh, atlas: Atlas) -> None:
     assert upper_per_area == pytest.approx(per_area, rel=0.1)
 
 
-def test_image_puts_values_where_covered_says(atlas: Atlas) -> None:
+def test_to_texture_writes_the_texels_of_the_coverage_mask(atlas: Atlas) -> None:
     texels = rasterize_texels(atlas, SIZE_PX)
-    image = texels.image(np.ones((len(texels.face), 1), dtype=np.float32))
-    np.testing.assert_array_equal(image[..., 0] > 0, texels.covered())
+    image = texels.to_texture(np.ones((len(texels.face), 1), dtype=np.float32))
+    np.testing.assert_array_equal(image[..., 0] > 0, texels.coverage_mask())
 
 
 @pytest.mark.parametrize(("pixel_footprint_m", "expected"), [(0.0035, 512), (0.0021, 1024), (1e-5, 2048), (1.0, 256)])
-def test_texture_size_follows_the_capture(pixel_footprint_m: float, expected: int) -> None:
+def test_texture_size_follows_the_pixel_footprint(pixel_footprint_m: float, expected: int) -> None:
     size = texture_size_px(1.8, pixel_footprint_m, min_size_px=256, max_size_px=2048)
     assert size == expected
     if 256 < size < 2048:
@@ -104,7 +104,7 @@ def test_texture_size_follows_the_capture(pixel_footprint_m: float, expected: in
 
 @settings(max_examples=25)
 @given(st.integers(0, 2**31), st.integers(3, 40), st.integers(3, 40))
-def test_filling_keeps_the_known_and_stays_between_its_extremes(seed: int, height: int, width: int) -> None:
+def test_filling_keeps_known_texels_and_their_range(seed: int, height: int, width: int) -> None:
     random = np.random.default_rng(seed)
     image = random.uniform(0.2, 0.8, (height, width, 3)).astype(np.float32)
     known = random.uniform(size=(height, width)) < 0.2
@@ -115,7 +115,7 @@ def test_filling_keeps_the_known_and_stays_between_its_extremes(seed: int, heigh
     assert np.all(filled <= image[known].max(axis=0) + 1e-4)
 
 
-def test_filling_next_to_a_chart_takes_that_chart_s_colour() -> None:
+def test_texels_next_to_a_chart_take_its_colour() -> None:
     image, known = np.zeros((64, 64, 3), dtype=np.float32), np.zeros((64, 64), dtype=bool)
     image[:, :20], image[:, 40:] = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
     known[:, :20] = known[:, 40:] = True

@@ -1,4 +1,4 @@
-"""The camera against OpenCV's own projection and against itself."""
+"""The camera against OpenCV's projection, and its projection against its rays."""
 
 import cv2
 import numpy as np
@@ -38,7 +38,7 @@ def test_a_ray_passes_through_every_point_that_projects_to_its_pixel(camera: Cam
     np.testing.assert_allclose(origins[0].numpy(), camera.centre_m(), atol=1e-6)
 
 
-def test_scaling_and_cropping_move_pixels_as_the_image_does(camera: Camera) -> None:
+def test_scaled_and_cropped_cameras_project_to_the_scaled_and_cropped_image(camera: Camera) -> None:
     points = torch.randn(20, 3, generator=torch.Generator().manual_seed(2)) * 0.5
     pixels_px, _ = project(points, camera)
     torch.testing.assert_close(project(points, camera.scaled(0.5))[0], pixels_px * 0.5, atol=1e-3, rtol=0)
@@ -47,6 +47,8 @@ def test_scaling_and_cropping_move_pixels_as_the_image_does(camera: Camera) -> N
 
 
 def test_arrays_round_trip(camera: Camera) -> None:
-    again = Camera.from_arrays(camera.arrays() | {"camera_distortion": np.zeros(0)})  # files of earlier versions
+    again = Camera.from_arrays(
+        camera.to_arrays() | {"camera_distortion": np.zeros(0)}
+    )  # an extra key of earlier versions
     assert (again.fx, again.fy, again.cx, again.cy, again.width, again.height) == (700, 710, 321, 235, 640, 480)
     np.testing.assert_array_equal(again.world_to_camera, camera.world_to_camera)

@@ -1,4 +1,4 @@
-"""Differentiable rendering: topology, colours of a known plane, gradients against differences, a fit that converges."""
+"""Differentiable rendering: adjacency, known colours, gradients against finite differences, a fit that converges."""
 
 import numpy as np
 import pytest
@@ -12,15 +12,15 @@ CAMERA = Camera(60.0, 60.0, 24.0, 20.0, 48, 40)
 
 
 def square(depth_m: float, half_m: float, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
-    """A square across the camera's view, facing it."""
+    """A square perpendicular to the viewing direction, facing the camera."""
     corners = torch.tensor([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]], dtype=dtype) * half_m
     return torch.cat([corners, torch.full((4, 1), -depth_m, dtype=dtype)], 1), torch.tensor([[0, 1, 2], [0, 2, 3]])
 
 
-def test_adjacency_of_two_triangles_and_of_a_bad_edge() -> None:
+def test_adjacency_of_two_triangles_and_of_an_edge_with_three_faces() -> None:
     assert face_adjacency(torch.tensor([[0, 1, 2], [0, 2, 3]])).tolist() == [[-1, -1, 1], [0, -1, -1]]
     fin = torch.tensor([[0, 1, 2], [1, 0, 3], [0, 1, 4]])
-    assert face_adjacency(fin).tolist() == [[-1] * 3] * 3  # three faces at one edge: no single neighbour
+    assert face_adjacency(fin).tolist() == [[-1] * 3] * 3  # three faces at one edge: the neighbour is not unique
 
 
 def test_adjacency_is_mutual_on_a_closed_mesh() -> None:
@@ -41,8 +41,8 @@ def test_area_and_colour_of_a_square() -> None:
     torch.testing.assert_close(image, 0.25 * alpha[..., None].expand_as(image))
 
 
-def test_attributes_follow_the_world_not_the_screen() -> None:
-    """World position as attribute on a steep plane: at each pixel it must project back to that pixel."""
+def test_interpolation_is_perspective_correct() -> None:
+    """With the world position as attribute on a slanted plane, each pixel's value projects back to that pixel."""
     vertices, faces = square(2.0, 0.6)
     vertices[:, 2] -= 1.2 * vertices[:, 0]
     image, alpha = render_attributes(vertices, faces, CAMERA, vertices)
@@ -53,7 +53,7 @@ def test_attributes_follow_the_world_not_the_screen() -> None:
     torch.testing.assert_close(back_x[inside], expected[inside], rtol=0, atol=1e-9)
 
 
-def test_image_is_linear_in_attributes_and_shading_is_called_once() -> None:
+def test_image_is_linear_in_attributes_and_the_shader_is_called_once() -> None:
     vertices, faces = square(2.0, 0.5)
     calls = []
 
@@ -69,15 +69,15 @@ def test_image_is_linear_in_attributes_and_shading_is_called_once() -> None:
 
 
 def test_gradients_inside_faces_equal_finite_differences() -> None:
-    """Away from borders the picture is smooth in the vertices: autograd through interpolation against differences."""
-    vertices, faces = square(2.0, 3.0)  # fills the picture, no silhouette in it
+    """Inside a face the image is smooth in the vertices: autograd through interpolation against finite differences."""
+    vertices, faces = square(2.0, 3.0)  # covers the whole image: no silhouette in it
     vertices[:, 2] -= 0.3 * vertices[:, 0]
     colours = torch.rand(4, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
 
-    def picture(points: Tensor, values: Tensor) -> Tensor:
+    def sampled_pixels(points: Tensor, values: Tensor) -> Tensor:
         return render_attributes(points, faces, CAMERA, values)[0][10:30:7, 5:40:9].reshape(-1)
 
-    torch.autograd.gradcheck(picture, (vertices.requires_grad_(), colours.requires_grad_()), eps=1e-7, atol=1e-5)
+    torch.autograd.gradcheck(sampled_pixels, (vertices.requires_grad_(), colours.requires_grad_()), eps=1e-7, atol=1e-5)
 
 
 def test_float32_and_float64_agree() -> None:
@@ -89,7 +89,7 @@ def test_float32_and_float64_agree() -> None:
         torch.testing.assert_close(a.float(), b, rtol=0, atol=2e-4)
 
 
-def test_a_square_slides_to_where_the_silhouette_says() -> None:
+def test_gradients_of_the_silhouette_move_a_square_to_its_target() -> None:
     vertices, faces = square(2.0, 0.4)
     with torch.no_grad():
         _, target = render_attributes(
@@ -106,7 +106,7 @@ def test_a_square_slides_to_where_the_silhouette_says() -> None:
     np.testing.assert_allclose(shift.detach().numpy()[:2], [0.09, -0.05], atol=0.01)
 
 
-def test_a_mesh_behind_the_camera_is_not_seen() -> None:
+def test_a_mesh_behind_the_camera_is_not_rendered() -> None:
     vertices, faces = square(-1.0, 0.4)
     image, alpha = render_attributes(vertices, faces, CAMERA, torch.ones(4, 3).double())
     assert float(alpha.abs().sum()) == 0.0

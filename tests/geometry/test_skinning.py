@@ -1,4 +1,4 @@
-"""Kinematics against closed forms and a slow loop."""
+"""Forward kinematics and skinning against closed forms and a loop over vertices and joints."""
 
 import numpy as np
 import pytest
@@ -42,12 +42,12 @@ def test_skinning_agrees_with_a_loop() -> None:
             torch.testing.assert_close(fast[frame, v], slow, atol=1e-5, rtol=0)
 
 
-def test_parents_must_come_first() -> None:
+def test_parents_must_come_before_their_children() -> None:
     with pytest.raises(ValueError, match="parents must come before"):
         skinning.forward_kinematics(torch.eye(3).repeat(1, 3, 1, 1), JOINTS_M[:1], JOINTS_M, [-1, 2, 0])
 
 
-def test_top_k_keeps_the_largest_and_dense_undoes_it() -> None:
+def test_top_k_keeps_the_largest_weights_and_dense_weights_is_its_inverse() -> None:
     weights = np.array([[0.5, 0.3, 0.2, 0.0, 0.0, 0.0], [0.1, 0.1, 0.2, 0.25, 0.3, 0.05]], dtype=np.float32)
     indices, kept = skinning.top_k_weights(weights, k=4)
     np.testing.assert_allclose(kept.sum(1), 1.0, atol=1e-6)

@@ -1,4 +1,4 @@
-"""Closed surfaces: spheres and tori with known distance, area and topology, and meshes broken on purpose."""
+"""Closed surfaces: spheres and boxes with known distance, area and topology, and meshes with known defects."""
 
 import numpy as np
 import pytest
@@ -8,6 +8,7 @@ from pipeline.geometry.surface import (
     MeshAABBTree,
     OpenSurfaceError,
     closest_points_on_mesh,
+    count_self_intersecting_faces,
     is_closed_manifold,
     isosurface,
     laplacian,
@@ -17,12 +18,10 @@ from pipeline.geometry.surface import (
     remove_unreferenced_vertices,
     repair,
     resolve_self_intersections,
-    self_intersecting_faces,
     signed_distance_m,
     smooth_taubin,
     split_nonmanifold_vertices,
     subdivide,
-    transfer,
 )
 
 TETRAHEDRON = Mesh(
@@ -65,7 +64,7 @@ def concatenate_meshes(*meshes: Mesh) -> Mesh:
 
 def test_isosurface_of_a_ball(sphere: Mesh) -> None:
     np.testing.assert_allclose(np.linalg.norm(sphere.vertices, axis=1), 0.5, atol=0.004)
-    assert volume(sphere) == pytest.approx(4 / 3 * np.pi * 0.125, rel=0.01)  # positive: faces look outward
+    assert volume(sphere) == pytest.approx(4 / 3 * np.pi * 0.125, rel=0.01)  # positive volume: the faces point outward
     assert is_closed_manifold(sphere)
     assert euler_characteristic(sphere) == 2
 
@@ -75,7 +74,7 @@ def test_isosurface_is_closed_where_the_solid_leaves_the_grid() -> None:
     assert is_closed_manifold(isosurface(values, 0.0, origin, 0.05))
 
 
-def test_isosurface_with_samples_on_the_level_has_no_pinches() -> None:
+def test_samples_equal_to_the_isovalue_give_no_degenerate_faces() -> None:
     values = np.zeros((6, 6, 6))
     values[2:4, 2:4, 2:4] = 1.0
     mesh = isosurface(values, 1.0, np.zeros(3), 1.0)
@@ -83,12 +82,12 @@ def test_isosurface_with_samples_on_the_level_has_no_pinches() -> None:
     assert (mesh.face_areas_m2() > 0).all()
 
 
-def test_isosurface_of_nothing_names_the_level() -> None:
-    with pytest.raises(ValueError, match=r"reaches the level 2; the largest is 1"):
+def test_isosurface_without_inside_names_the_isovalue() -> None:
+    with pytest.raises(ValueError, match=r"reaches the isovalue 2; the largest is 1"):
         isosurface(np.ones((3, 3, 3)), 2.0, np.zeros(3), 1.0)
 
 
-def test_solid_body_keeps_the_largest_part_and_fills_its_cavity() -> None:
+def test_largest_solid_keeps_the_largest_part_and_fills_its_cavity() -> None:
     inside = np.zeros((12, 12, 12), dtype=bool)
     inside[1:8, 1:8, 1:8] = True
     inside[4, 4, 4] = False
@@ -106,7 +105,7 @@ def test_largest_component_is_by_area_and_drops_unused_vertices(sphere: Mesh) ->
     assert len(kept.faces) == len(sphere.faces)
 
 
-def test_split_fans_separates_two_bodies_that_touch_in_a_point() -> None:
+def test_solids_that_share_one_vertex_are_separated() -> None:
     touching = concatenate_meshes(TETRAHEDRON, moved(TETRAHEDRON, (1.0, 0.0, 0.0)))
     faces = np.where(touching.faces == 4, 1, touching.faces)  # the second's corner 0 is the first's corner 1
     pinched = remove_unreferenced_vertices(Mesh(touching.vertices, faces))
@@ -134,29 +133,29 @@ def test_repair_closes_holes_and_removes_fins(sphere: Mesh, seed: int) -> None:
     assert volume(repaired) == pytest.approx(volume(sphere), rel=0.02)
 
 
-def test_faces_that_cut_another_are_untangled_and_the_rest_stays(sphere: Mesh) -> None:
-    assert self_intersecting_faces(sphere) == 0
+def test_self_intersections_are_resolved_and_the_other_vertices_stay(sphere: Mesh) -> None:
+    assert count_self_intersecting_faces(sphere) == 0
     assert resolve_self_intersections(sphere) is sphere
     pushed = sphere.vertices.copy()
     lowest = pushed[:, 1].argmin()
     pushed[lowest] += [0.0, 1.1, 0.0]  # out through the top
-    tangled = Mesh(pushed, sphere.faces)
-    assert self_intersecting_faces(tangled) > 5
-    repaired = resolve_self_intersections(tangled)
-    assert self_intersecting_faces(repaired) == 0
+    intersecting = Mesh(pushed, sphere.faces)
+    assert count_self_intersecting_faces(intersecting) > 5
+    repaired = resolve_self_intersections(intersecting)
+    assert count_self_intersecting_faces(repaired) == 0
     assert (repaired.faces == sphere.faces).all()
     stayed = (repaired.vertices == sphere.vertices).all(axis=1)
     assert stayed.mean() > 0.9
-    # Whoever neighbours the spike follows it by a sixth of its metre before it is gone.
+    # The neighbours of the displaced vertex move by about a sixth of its displacement of 1.1 m.
     assert np.linalg.norm(repaired.vertices - sphere.vertices, axis=1).max() < 0.25
 
 
-def test_what_cannot_be_closed_is_an_error_of_its_own() -> None:
-    with pytest.raises(OpenSurfaceError, match="could not be closed"):
+def test_a_surface_that_cannot_be_closed_raises_open_surface_error() -> None:
+    with pytest.raises(OpenSurfaceError, match="still has holes after 4 repair iterations"):
         repair(Mesh(TETRAHEDRON.vertices, TETRAHEDRON.faces[:1]))
 
 
-def test_repair_leaves_a_sound_mesh_alone(sphere: Mesh) -> None:
+def test_repair_does_not_change_a_closed_manifold(sphere: Mesh) -> None:
     np.testing.assert_array_equal(repair(sphere).faces, sphere.faces)
 
 
@@ -170,7 +169,7 @@ def test_remesh_reaches_the_edge_length_and_keeps_the_shape(sphere: Mesh) -> Non
     assert len(coarse.faces) < 0.5 * len(sphere.faces)
 
 
-def test_remesh_of_a_selection_leaves_the_rest_alone(sphere: Mesh) -> None:
+def test_remeshing_a_selection_does_not_change_the_other_faces(sphere: Mesh) -> None:
     upper = sphere.vertices[sphere.faces][:, :, 1].mean(axis=1) > 0.05
     result = remesh_isotropic(sphere, 0.12, selected=upper)
     assert is_closed_manifold(result)
@@ -195,7 +194,7 @@ def test_subdivision_is_conforming(sphere: Mesh, share: float) -> None:
 def test_subdivision_counts_of_one_face() -> None:
     marked = np.array([True, False, False, False])
     fine, ends = subdivide(TETRAHEDRON, marked)
-    assert len(fine.faces) == 4 + 3 * 2  # the face in four, each neighbour in two
+    assert len(fine.faces) == 4 + 3 * 2  # the marked face becomes four faces, each neighbour two
     assert {tuple(e) for e in ends.tolist()} == {(0, 1), (0, 2), (1, 2)}
 
 
@@ -206,18 +205,18 @@ def test_subdivided_faces_keep_their_orientation(sphere: Mesh) -> None:
     assert (np.sum(fine.face_normals() * centres, axis=1) > 0).all()
 
 
-def test_laplacian_rows_vanish_on_constants_and_shrink_the_sphere(sphere: Mesh) -> None:
+def test_laplacian_of_a_constant_is_zero_and_a_step_shrinks_the_sphere(sphere: Mesh) -> None:
     operator = laplacian(sphere)
     np.testing.assert_allclose(operator @ np.ones(len(sphere.vertices)), 0.0, atol=1e-12)
     dense = np.zeros(len(sphere.vertices))
     neighbours = np.unique(sphere.faces[(sphere.faces == 7).any(axis=1)])
     dense[neighbours] = 1.0
-    assert (operator @ dense)[7] == pytest.approx(0.0)  # all neighbours are one, as it is itself
+    assert (operator @ dense)[7] == pytest.approx(0.0)  # the vertex and all its neighbours have the value 1
     smoothed = sphere.vertices - 0.5 * (operator @ sphere.vertices)
     assert np.linalg.norm(smoothed, axis=1).mean() < np.linalg.norm(sphere.vertices, axis=1).mean()
 
 
-def test_smoothing_takes_noise_and_leaves_volume(sphere: Mesh) -> None:
+def test_smoothing_removes_noise_and_preserves_volume(sphere: Mesh) -> None:
     noise = np.random.default_rng(8).normal(scale=0.01, size=sphere.vertices.shape)
     noisy = Mesh((sphere.vertices + noise).astype(np.float32), sphere.faces)
     result = smooth_taubin(noisy, 10)
@@ -233,22 +232,12 @@ def test_closest_point_against_brute_force(sphere: Mesh) -> None:
     assert barycentric.min() >= 0.0
     nearest = np.einsum("nk,nkc->nc", barycentric, sphere.vertices[sphere.faces[face]])
     np.testing.assert_allclose(np.linalg.norm(nearest - points, axis=1), distance, atol=1e-6)
-    np.testing.assert_allclose(MeshAABBTree(sphere).nearest(points), nearest, atol=1e-6)
+    np.testing.assert_allclose(MeshAABBTree(sphere).closest_points(points), nearest, atol=1e-6)
     weights = np.random.default_rng(4).dirichlet(np.ones(3), size=200)
     samples = np.einsum("sk,fkc->fsc", weights, sphere.vertices[sphere.faces]).reshape(-1, 3)
     brute = np.sqrt(((points[:, None] - samples[None, ::7]) ** 2).sum(axis=2)).min(axis=1)
     assert (distance <= brute + 1e-6).all()
     assert (brute - distance).max() < 0.02
-
-
-def test_transfer_of_a_linear_function_is_exact_on_a_plane() -> None:
-    plane = Mesh(
-        np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=np.float32), np.array([[0, 1, 2], [0, 2, 3]])
-    )
-    values = plane.vertices[:, :2] @ np.array([[2.0, 0.0], [1.0, -1.0]], dtype=np.float32)
-    points = np.random.default_rng(5).random((20, 3)).astype(np.float32)
-    expected = points[:, :2] @ np.array([[2.0, 0.0], [1.0, -1.0]])
-    np.testing.assert_allclose(transfer(points, plane, values), expected, atol=1e-5)
 
 
 def test_signed_distance_of_a_sphere(sphere: Mesh) -> None:

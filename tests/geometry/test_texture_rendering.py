@@ -1,4 +1,4 @@
-"""Textured renders against closed forms: a known texture on a known square, and cameras on a circle."""
+"""Textured renders of a known square against closed forms, and turntable cameras."""
 
 import math
 
@@ -15,7 +15,7 @@ UV = torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 
 
 def square_camera(size_px: int) -> Camera:
-    """Sees the square of +-1 m at 2 m fill the image exactly."""
+    """A camera whose image the square of 2 x 2 m at 2 m distance covers exactly."""
     return Camera(float(size_px), float(size_px), size_px / 2, size_px / 2, size_px, size_px)
 
 
@@ -28,13 +28,13 @@ def test_texel_centres_give_texels_and_corners_repeat_the_border():
     assert torch.allclose(corners, torch.stack([texture[0, 0], texture[2, 4]]))
 
 
-def test_sampling_is_differentiable_in_texture_and_place():
+def test_sampling_is_differentiable_in_texture_and_position():
     texture = torch.rand(4, 4, 2, dtype=torch.float64, requires_grad=True)
     uv = torch.tensor([[0.31, 0.42], [0.77, 0.58]], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(sample_texture, (texture, uv))
 
 
-def test_a_square_seen_head_on_shows_its_texture_upright():
+def test_a_square_that_faces_the_camera_shows_its_texture_upright():
     texture = torch.rand(8, 8, 3, generator=torch.Generator().manual_seed(2))
     image = render_textured(SQUARE, FACES, FACES, UV, texture, square_camera(8), supersampling=1)
     assert torch.allclose(image[..., :3], texture, atol=1e-5)  # one pixel a texel: row 0 is v = 1, the top
@@ -47,17 +47,16 @@ def test_samples_average_the_texels_under_a_pixel():
     assert torch.allclose(image[..., :3], texture.view(4, 3, 4, 3, 3).mean(dim=(1, 3)), atol=1e-5)
 
 
-def test_coverage_of_a_cut_pixel_is_its_area():
-    shifted = SQUARE + torch.tensor(
-        [0.25, 0.0, 0.0]
-    )  # 1 px of 8 to the right: half of the 4 px wide image's first column
+def test_coverage_of_a_partly_covered_pixel_is_its_covered_area():
+    # 0.25 m is half a pixel of an image with 4 pixels for 2 m.
+    shifted = SQUARE + torch.tensor([0.25, 0.0, 0.0])
     image = render_textured(shifted, FACES, FACES, UV, torch.ones(2, 2, 3), square_camera(4), supersampling=4)
     assert image[:, 0, 3].tolist() == pytest.approx([0.5] * 4)
     assert torch.allclose(image[..., :3], image[..., 3:].expand(-1, -1, 3))  # colours are premultiplied
 
 
 def test_uv_seams_do_not_blend():
-    """Two faces that share an edge in space but not in the atlas keep their own colours."""
+    """Two faces that share an edge in space but not in the atlas do not mix their colours."""
     texture = torch.tensor([[[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
     uv = torch.tensor([[0.25, 0.5], [0.75, 0.5]])
     faces_uv = torch.tensor([[0, 0, 0], [1, 1, 1]], dtype=torch.int32)
@@ -68,7 +67,7 @@ def test_uv_seams_do_not_blend():
 
 
 @pytest.mark.parametrize("angle", [0.0, math.pi / 4, math.pi / 2, math.pi, 4.0])
-def test_turntable_sees_the_whole_box_upright(angle):
+def test_turntable_camera_shows_the_whole_box_upright(angle):
     lowest, highest = np.array([-0.5, 0.0, -0.2]), np.array([0.6, 1.8, 0.3])
     camera = turntable_camera(lowest, highest, angle, 300, 500)
     corners = torch.tensor([[x, y, z] for x in (-0.5, 0.6) for y in (0.0, 1.8) for z in (-0.2, 0.3)]).float()
@@ -78,31 +77,31 @@ def test_turntable_sees_the_whole_box_upright(angle):
     assert (pixels[:, 0] <= 300).all()
     assert (pixels[:, 1] <= 500).all()
     heights = pixels[:, 1]
-    assert heights[corners[:, 1] > 1].max() < heights[corners[:, 1] < 1].min()  # the head is above the feet
+    assert heights[corners[:, 1] > 1].max() < heights[corners[:, 1] < 1].min()  # the top of the box is above its bottom
     rotation = camera.world_to_camera[:3, :3]
     assert np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
     assert np.linalg.det(rotation) == pytest.approx(1.0)
 
 
-def test_turntable_starts_at_the_front_and_goes_to_the_left_hand():
+def test_turntable_starts_at_plus_z_and_continues_to_plus_x():
     lowest, highest = np.zeros(3), np.ones(3)
     assert turntable_camera(lowest, highest, 0.0, 9, 9).centre_m()[2] > 5
     assert turntable_camera(lowest, highest, math.pi / 2, 9, 9).centre_m()[0] > 5
 
 
-def test_a_softened_outline_has_the_blur_and_the_colours_of_the_surface():
-    picture = np.zeros((40, 60, 4), dtype=np.float32)
-    picture[:, :30] = [0.2, 0.4, 0.6, 1.0]
-    picture[20:, :30, 0] = 0.9
-    soft = blur_coverage(picture, 1.2)
+def test_a_blurred_outline_has_the_given_blur_and_the_colours_of_the_surface():
+    image = np.zeros((40, 60, 4), dtype=np.float32)
+    image[:, :30] = [0.2, 0.4, 0.6, 1.0]
+    image[20:, :30, 0] = 0.9
+    soft = blur_coverage(image, 1.2)
     step = 0.5 * (1 - np.array([math.erf((x + 0.5 - 30) / (1.2 * 2**0.5)) for x in range(60)]))
     np.testing.assert_allclose(soft[5, :, 3], step, atol=0.02)
     covered = soft[..., 3] > 0.01
     np.testing.assert_allclose(soft[..., 1][covered] / soft[..., 3][covered], 0.4, atol=1e-4)
-    # The edge between two colours inside the surface is not the outline and stays sharp.
+    # An edge between two colours inside the surface is not part of the outline and stays sharp.
     np.testing.assert_allclose(soft[19:21, 10, 0], [0.2, 0.9], atol=1e-4)
 
 
-def test_no_blur_changes_nothing():
-    picture = np.random.default_rng(0).random((9, 9, 4)).astype(np.float32)
-    assert blur_coverage(picture, 0.0) is picture
+def test_a_blur_of_zero_returns_the_image():
+    image = np.random.default_rng(0).random((9, 9, 4)).astype(np.float32)
+    assert blur_coverage(image, 0.0) is image

@@ -75,4 +75,4 @@ def true_texture(mesh: Mesh, atlas: Atlas) -> torch.Tensor:
     """The true texture at four times the size, gutters filled by its own neighbours."""
     texels = rasterize_texels(atlas, 4 * SIZE_PX)
     values = ball_colours(texels.interpolate(mesh.faces, mesh.vertices))
-    return torch.from_numpy(fill_unknown_texels(texels.image(values), texels.covered()))
+    return torch.from_numpy(fill_unknown_texels(texels.to_texture(values), texels.coverage_mask()))

@@ -1,4 +1,4 @@
-"""One seeded source of random numbers for the metric tests."""
+"""A seeded random number generator for the metric tests."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""AlexNet with few channels and made-up weights, for the tests of LPIPS."""
+"""AlexNet with few channels and random weights, for the tests of LPIPS."""
 
 import numpy as np
 import torch
@@ -9,7 +9,7 @@ KERNELS = (("0", 11, 4, 2), ("3", 5, 1, 2), ("6", 3, 1, 1), ("8", 3, 1, 1), ("10
 
 
 def narrow_alexnet(rng: np.random.Generator) -> dict[str, torch.Tensor]:
-    """Weights under the names that `pipeline.metrics.lpips` wants."""
+    """Random weights with the names that `pipeline.metrics.lpips` reads."""
     made: dict[str, np.ndarray] = {}
     for layer, (name, side, _, _) in enumerate(KERNELS):
         before, after = CHANNELS[layer : layer + 2]

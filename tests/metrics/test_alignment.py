@@ -1,4 +1,4 @@
-"""Alignment finds back the movement that was made."""
+"""Alignment recovers a known similarity transform."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ TRUE_TRANSFORM = SimilarityTransform(
 
 
 def cross(subdivisions: int = 3) -> Mesh:
-    """Three boxes of different sizes: no symmetry that could hide a rotation."""
+    """Three boxes of different sizes, without a symmetry that would make the rotation ambiguous."""
     parts = [
         trimesh.creation.box((0.4, 1.8, 0.3)),
         trimesh.creation.box((1.2, 0.2, 0.2)).apply_translation([0.2, 0.5, 0.0]),
@@ -27,40 +27,42 @@ def cross(subdivisions: int = 3) -> Mesh:
     return Mesh(np.asarray(made.vertices), np.asarray(made.faces, dtype=np.int32))
 
 
-def test_corresponding_points_give_the_movement_back(rng: np.random.Generator):
+def test_umeyama_recovers_the_transform_of_corresponding_points(rng: np.random.Generator):
     points = rng.normal(size=(40, 3))
     found = umeyama_similarity(points, TRUE_TRANSFORM(points))
     assert found.scale == pytest.approx(TRUE_TRANSFORM.scale)
     assert found.rotation == pytest.approx(TRUE_TRANSFORM.rotation)
     assert found.translation_m == pytest.approx(TRUE_TRANSFORM.translation_m)
     mirrored = umeyama_similarity(points, points * [-1.0, 1.0, 1.0])
-    assert np.linalg.det(mirrored.rotation) == pytest.approx(1.0)  # a mirror image is no movement
+    assert np.linalg.det(mirrored.rotation) == pytest.approx(1.0)  # a reflection is not a rotation
 
 
-def test_without_scale_the_size_stays(rng: np.random.Generator):
+def test_without_scale_the_scale_is_one(rng: np.random.Generator):
     points = rng.normal(size=(40, 3))
     found = umeyama_similarity(points, TRUE_TRANSFORM(points), with_scale=False)
     assert found.scale == 1.0
     assert found.rotation == pytest.approx(TRUE_TRANSFORM.rotation)
 
 
-def test_there_and_back(rng: np.random.Generator):
+def test_inverse_inverts(rng: np.random.Generator):
     points = rng.normal(size=(5, 3))
     assert TRUE_TRANSFORM.inverse()(TRUE_TRANSFORM(points)) == pytest.approx(points)
 
 
-def test_a_moved_surface_is_laid_over_itself():
+def test_icp_aligns_a_transformed_surface_with_itself():
     mesh = cross()
-    found = align_surfaces_icp(mesh, TRUE_TRANSFORM.moved(cross(2)))  # other triangles, the same surface
+    found = align_surfaces_icp(mesh, TRUE_TRANSFORM.transform_mesh(cross(2)))  # the same surface with other triangles
     assert found.scale == pytest.approx(TRUE_TRANSFORM.scale, abs=2e-3)
     assert found.rotation == pytest.approx(TRUE_TRANSFORM.rotation, abs=5e-3)
-    assert surface_scores(found.moved(mesh), TRUE_TRANSFORM.moved(mesh), count=5000)["chamfer_mm"] < 1.0
+    assert (
+        surface_scores(found.transform_mesh(mesh), TRUE_TRANSFORM.transform_mesh(mesh), count=5000)["chamfer_mm"] < 1.0
+    )
 
 
-def test_a_larger_surface_keeps_its_size_without_scale():
-    """A sphere in a sphere: with scale nothing is left, without it the difference of the radii."""
+def test_icp_of_spheres_with_and_without_scale():
+    """Two spheres: with scale the distance is zero, without scale it is the difference of the radii."""
     small, large = (trimesh.creation.icosphere(subdivisions=3, radius=radius) for radius in (0.50, 0.52))
     meshes = [Mesh(np.asarray(ball.vertices) + [0, 0, shift], ball.faces) for ball, shift in ((small, 0), (large, 0.1))]
     for with_scale, expected_mm in ((True, 0.0), (False, 20.0)):
-        moved = align_surfaces_icp(*meshes, with_scale=with_scale).moved(meshes[0])
+        moved = align_surfaces_icp(*meshes, with_scale=with_scale).transform_mesh(meshes[0])
         assert surface_scores(moved, meshes[1], count=3000)["chamfer_mm"] == pytest.approx(expected_mm, abs=0.5)

@@ -1,4 +1,4 @@
-"""FLIP against the authors' own program, against the definition with whole kernels, and in closed form."""
+"""FLIP against the authors' program, against the definition with two-dimensional kernels, and in closed form."""
 
 import math
 
@@ -14,7 +14,7 @@ WHITE_XYZ = rgb2xyz(np.ones(3))
 
 @pytest.fixture
 def pair() -> tuple[np.ndarray, np.ndarray]:
-    """A colour pattern, and the same three pixels to the side with a red square."""
+    """A colour pattern, and the same pattern shifted by three pixels with a red square."""
     rows, columns = np.mgrid[0:48, 0:64]
     pattern = np.stack([columns / 63, rows / 47, 0.5 + 0.5 * np.sin(columns / 5.0)], axis=2)
     image = np.rint(255 * pattern).astype(np.uint8)
@@ -28,9 +28,9 @@ def flat(colour: list[int]) -> np.ndarray:
 
 
 def reference_flip(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The paper step by step, colours by scikit-image, filters as whole two-dimensional kernels."""
+    """The equations of the paper, with colour conversions of scikit-image and two-dimensional filter kernels."""
     pixels_per_degree = 0.7 * 3840 / 0.7 * np.pi / 180
-    prepared = [_prepare(picture, pixels_per_degree) for picture in (a, b)]
+    prepared = [_prepare(image, pixels_per_degree) for image in (a, b)]
     (lab_a, edge_a, point_a), (lab_b, edge_b, point_b) = prepared
     green, blue = (_hunt(np.array(colour)) for colour in ([0.0, 1.0, 0.0], [0.0, 0.0, 1.0]))
     error, largest = _hyab(lab_a, lab_b) ** 0.7, _hyab(green, blue) ** 0.7
@@ -41,8 +41,8 @@ def reference_flip(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return colour ** (1 - feature)
 
 
-def _prepare(picture: np.ndarray, pixels_per_degree: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    xyz = rgb2xyz(picture) / WHITE_XYZ
+def _prepare(image: np.ndarray, pixels_per_degree: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    xyz = rgb2xyz(image) / WHITE_XYZ
     opponent = [116 * xyz[..., 1] - 16, 500 * (xyz[..., 0] - xyz[..., 1]), 200 * (xyz[..., 1] - xyz[..., 2])]
     radius = math.ceil(3 * math.sqrt(0.04 / (2 * math.pi**2)) * pixels_per_degree)
     x, y = np.meshgrid(np.arange(-radius, radius + 1), np.arange(-radius, radius + 1))
@@ -66,7 +66,7 @@ def _prepare(picture: np.ndarray, pixels_per_degree: float) -> tuple[np.ndarray,
 
 
 def _linear_to_xyz() -> np.ndarray:
-    """scikit-image takes sRGB; the primaries are the same in linear light."""
+    """scikit-image converts sRGB; the primaries are the same in linear RGB."""
     return np.stack([rgb2xyz(primary) for primary in np.eye(3)], axis=1)
 
 
@@ -79,13 +79,13 @@ def _hyab(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return abs(a - b)[..., 0] + np.linalg.norm((a - b)[..., 1:], axis=-1)
 
 
-def test_it_is_the_definition(pair: tuple[np.ndarray, np.ndarray]):
-    # scikit-image rounds the primaries to six digits, and white is 0.95047 there
+def test_agrees_with_the_definition(pair: tuple[np.ndarray, np.ndarray]):
+    # scikit-image rounds the primaries to six digits, and its white has x = 0.95047
     assert np.allclose(flip_map(*pair), reference_flip(*pair), atol=2e-3)
 
 
-def test_it_is_what_the_authors_program_says(pair: tuple[np.ndarray, np.ndarray]):
-    """Figures of flip-evaluator 1.7 on the same pictures, LDR, its default viewing distance."""
+def test_agrees_with_the_authors_program(pair: tuple[np.ndarray, np.ndarray]):
+    """Values of flip-evaluator 1.7 for the same images: LDR, default viewing distance."""
     differences = flip_map(*pair)
     assert differences.mean() == pytest.approx(0.4373817, abs=1e-5)
     assert differences[15, 35] == pytest.approx(0.9235482, abs=1e-4)
@@ -96,18 +96,20 @@ def test_it_is_what_the_authors_program_says(pair: tuple[np.ndarray, np.ndarray]
 def test_closed_forms():
     assert flip_map(flat([0, 255, 0]), flat([0, 0, 255])) == pytest.approx(1.0)  # the largest possible difference
     largest = float(_hyab(_hunt(np.array([0.0, 1.0, 0.0])), _hunt(np.array([0.0, 0.0, 1.0])))) ** 0.7
-    expected = 0.95 + 0.05 * (100**0.7 - 0.4 * largest) / (0.6 * largest)  # lightness differs by 100, chroma not
+    expected = 0.95 + 0.05 * (100**0.7 - 0.4 * largest) / (0.6 * largest)  # lightness differs by 100, chroma is equal
     assert flip_map(flat([0, 0, 0]), flat([255, 255, 255])) == pytest.approx(expected, abs=1e-4)
 
 
-def test_equal_pictures_differ_nowhere_and_the_order_does_not_matter(pair: tuple[np.ndarray, np.ndarray]):
+def test_equal_images_have_no_error_and_the_metric_is_symmetric(pair: tuple[np.ndarray, np.ndarray]):
     assert flip_map(pair[0], pair[0]).max() == 0.0
     assert np.allclose(flip_map(*pair), flip_map(*pair[::-1]))
 
 
-def test_an_edge_that_moves_is_worse_than_the_same_change_without_edges():
+def test_a_new_edge_is_worse_than_the_same_change_of_the_whole_image():
     image = flat([120, 120, 120])
-    soft, sharp = flat([124, 124, 124]), image.copy()
-    sharp[:, 15] = [124, 124, 124]
-    assert flip_map(sharp, image)[15, 15] > 0.5 * flip_map(soft, image)[15, 15]  # though blurred by the eye
-    assert flip_map(sharp, image)[:, :4].max() < 0.01
+    uniform, edge = flat([124, 124, 124]), image.copy()
+    edge[:, 15] = [124, 124, 124]
+    assert (
+        flip_map(edge, image)[15, 15] > 0.5 * flip_map(uniform, image)[15, 15]
+    )  # although the contrast sensitivity filter blurs it
+    assert flip_map(edge, image)[:, :4].max() < 0.01

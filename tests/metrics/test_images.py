@@ -1,4 +1,4 @@
-"""Image metrics against a slow reference, scikit-image and closed forms."""
+"""Image metrics against a slow reference implementation and closed forms."""
 
 import math
 
@@ -21,6 +21,7 @@ from pipeline.metrics.images import (
     psnr_db,
     reason_not_scorable,
     ssim,
+    validation_psnr_db,
 )
 from pipeline.metrics.lpips import lpips
 from tests.metrics.narrow_alexnet import narrow_alexnet
@@ -34,7 +35,7 @@ def pair(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 
 def reference_ssim(x: np.ndarray, y: np.ndarray) -> float:
-    """The definition window by window, as torchmetrics documents it (reflect padding there is cropped again)."""
+    """The definition, window by window, as documented by torchmetrics (which crops its reflection padding again)."""
     offsets = np.arange(-5, 6)
     window = np.exp(-(offsets[:, None] ** 2 + offsets[None] ** 2) / (2 * 1.5**2))
     window /= window.sum()
@@ -52,11 +53,11 @@ def reference_ssim(x: np.ndarray, y: np.ndarray) -> float:
     return float(np.mean(values))
 
 
-def test_ssim_is_the_definition(pair):
+def test_ssim_agrees_with_the_definition(pair):
     assert ssim(*pair) == pytest.approx(reference_ssim(*pair), abs=1e-9)
 
 
-def test_ssim_is_what_scikit_image_computes(pair):
+def test_ssim_of_all_pixels_is_that_of_scikit_image(pair):
     expected = structural_similarity(
         *pair, channel_axis=2, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=255
     )
@@ -69,14 +70,14 @@ def test_ssim_of_equal_images_is_one_and_small_images_are_refused(pair):
         ssim(pair[0][:10], pair[1][:10])
 
 
-def test_ssim_of_some_pixels_is_the_mean_over_their_windows(pair):
+def test_masked_ssim_is_the_mean_over_the_windows_centred_in_the_mask(pair):
     noisy, image = pair
     where = np.zeros(image.shape[:2], dtype=bool)
     where[12, 9] = where[30, 20] = True
-    alone = [
+    expected = [
         ssim(noisy[r - 5 : r + 6, c - 5 : c + 6], image[r - 5 : r + 6, c - 5 : c + 6]) for r, c in ((12, 9), (30, 20))
     ]
-    assert ssim(noisy, image, where) == pytest.approx(np.mean(alone))
+    assert ssim(noisy, image, where) == pytest.approx(np.mean(expected))
     with pytest.raises(ValueError, match="no window"):
         ssim(noisy, image, np.zeros_like(where))
 
@@ -87,7 +88,7 @@ def test_psnr_of_a_constant_offset_is_closed_form(step):
     assert psnr_db(dark + np.uint8(step), dark) == pytest.approx(20 * math.log10(255 / step))
 
 
-def test_psnr_counts_only_the_chosen_pixels(pair):
+def test_masked_psnr_compares_only_the_pixels_of_the_mask(pair):
     noisy, image = pair
     where = np.zeros(image.shape[:2], dtype=bool)
     where[3:9, 4:20] = True
@@ -97,22 +98,33 @@ def test_psnr_counts_only_the_chosen_pixels(pair):
         psnr_db(noisy, image, np.zeros_like(where))
 
 
-def test_compositing_on_white_is_the_same_for_frames_and_for_premultiplied_renders(rng):
+def test_validation_psnr_is_the_mean_over_frames_in_db(rng):
+    images = [rng.integers(0, 256, (height, 7, 3)).astype(np.uint8) for height in (5, 9)]
+    renders = [image ^ np.uint8(mask) for image, mask in zip(images, (1, 16), strict=True)]
+    expected = [20 * math.log10(255 / step) for step in (1, 16)]
+    assert validation_psnr_db(renders, images) == pytest.approx(np.mean(expected))
+    masks = [np.zeros((5, 7), dtype=bool), np.ones((9, 7), dtype=bool)]
+    assert validation_psnr_db(renders, images, masks) == pytest.approx(expected[1])  # an empty mask is ignored
+    assert math.isnan(validation_psnr_db(renders, images, [mask & False for mask in masks]))
+    assert math.isnan(validation_psnr_db([], []))
+
+
+def test_frames_and_premultiplied_renders_are_composited_alike(rng):
     rgb = rng.integers(0, 256, (6, 5, 3)).astype(np.uint8)
     alpha = rng.integers(0, 256, (6, 5)).astype(np.uint8)
     opacity = alpha[..., None] / np.float32(255)
     rgba = np.concatenate([rgb / np.float32(255) * opacity, opacity], axis=2).astype(np.float32)
     difference = composite_premultiplied_on_white(rgba).astype(int) - composite_on_white(rgb, alpha)
-    assert np.abs(difference).max() <= 1  # two roundings of the same number
+    assert np.abs(difference).max() <= 1  # the same value rounded in two ways
     assert (composite_on_white(rgb, np.zeros_like(alpha)) == 255).all()
     assert (composite_on_white(rgb, np.full_like(alpha, 255)) == rgb).all()
 
 
-def test_body_box_is_tight():
+def test_bounding_box_is_tight():
     body = np.zeros((20, 30), dtype=bool)
     body[4, 9] = body[11, 17] = True
     assert foreground_bounding_box(body) == (slice(4, 12), slice(9, 18))
-    with pytest.raises(ValueError, match="no body pixel"):
+    with pytest.raises(ValueError, match="no foreground pixel"):
         foreground_bounding_box(np.zeros((4, 4), dtype=bool))
 
 
@@ -123,7 +135,7 @@ def test_iou_of_two_overlapping_boxes():
     assert mask_iou(a & False, b & False) == 1.0
 
 
-def test_frame_scores_of_a_perfect_render_and_of_a_missing_person(rng):
+def test_frame_scores_of_a_perfect_and_of_an_empty_render(rng):
     image = rng.integers(0, 200, (48, 40, 3)).astype(np.uint8)
     mask = np.zeros((48, 40), dtype=np.uint8)
     mask[8:40, 10:30] = 255
@@ -132,21 +144,23 @@ def test_frame_scores_of_a_perfect_render_and_of_a_missing_person(rng):
     scores = frame_scores(perfect, image, mask)
     assert scores["psnr_full"] == scores["psnr_body"] == math.inf
     assert scores["mask_iou"] == 1.0
-    nobody = frame_scores(np.zeros_like(perfect), image, mask)
-    assert nobody["mask_iou"] == 0.0
-    share = foreground_mask(mask).mean()  # all error lies on the body, so the full image only dilutes it
-    assert nobody["psnr_full"] - nobody["psnr_body"] == pytest.approx(-10 * math.log10(share))
-    assert nobody["psnr_box"] == pytest.approx(nobody["psnr_body"])
+    empty = frame_scores(np.zeros_like(perfect), image, mask)
+    assert empty["mask_iou"] == 0.0
+    share = foreground_mask(
+        mask
+    ).mean()  # all error is in the foreground, so the full image only divides it by more pixels
+    assert empty["psnr_full"] - empty["psnr_body"] == pytest.approx(-10 * math.log10(share))
+    assert empty["psnr_box"] == pytest.approx(empty["psnr_body"])
     assert scores["flip_full"] == scores["flip_body"] == 0.0
-    assert nobody["flip_body"] == pytest.approx(nobody["flip_box"])
-    assert nobody["flip_full"] < nobody["flip_body"]
+    assert empty["flip_body"] == pytest.approx(empty["flip_box"])
+    assert empty["flip_full"] < empty["flip_body"]
     assert scores["ssim_body"] == pytest.approx(1.0)
     assert "lpips_full" not in scores
     assert frame_scores(perfect, image, mask, narrow_alexnet(rng)) == scores  # 48 x 40 px are too few for LPIPS
 
 
-def test_each_score_of_a_frame_is_the_metric_of_its_name_on_the_pixels_of_its_name(rng):
-    """Softly cut noise whose scores all differ, so that none can stand for another."""
+def test_each_score_is_the_named_metric_on_the_named_pixels(rng):
+    """Noise with a soft mask, whose scores are all different, so that exchanged scores are found."""
     rows, columns = np.mgrid[:90, :70]
     mask, alpha = (np.clip(30.5 - np.hypot((rows - 42) / 1.1, columns - middle), 0, 1) for middle in (36, 39))
     mask, alpha = np.rint(255 * mask).astype(np.uint8), alpha[..., None].astype(np.float32)
@@ -176,8 +190,8 @@ def test_each_score_of_a_frame_is_the_metric_of_its_name_on_the_pixels_of_its_na
     assert np.diff(sorted(expected.values())).min() > 1e-3
 
 
-def masks_about_the_smallest() -> list[np.ndarray]:
-    """Nobody, boxes one pixel more or less than SSIM's window, and people who only line the border, or hardly more."""
+def masks_near_the_size_limit() -> list[np.ndarray]:
+    """Empty, boxes about the size of the SSIM window, and foregrounds along the image border."""
     made = [np.zeros((40, 30), dtype=np.uint8)]
     for height, width in ((10, 20), (11, 11), (20, 10), (12, 13)):
         made.append(np.zeros_like(made[0]))
@@ -188,18 +202,18 @@ def masks_about_the_smallest() -> list[np.ndarray]:
     return [*made, np.full_like(made[0], 127)]
 
 
-@pytest.mark.parametrize("mask", masks_about_the_smallest())
-def test_frames_that_scoring_refuses_are_known_beforehand(mask):
+@pytest.mark.parametrize("mask", masks_near_the_size_limit())
+def test_reason_not_scorable_predicts_the_errors_of_frame_scores(mask):
     image, rgba = np.zeros((*mask.shape, 3), dtype=np.uint8), np.zeros((*mask.shape, 4), dtype=np.float32)
     if reason_not_scorable(mask) is None:
         assert frame_scores(rgba, image, mask)["mask_iou"] == 0.0
     else:
-        with pytest.raises(ValueError, match="no body pixel|11 px window|no window"):
+        with pytest.raises(ValueError, match="no foreground pixel|11 px window|no window"):
             frame_scores(rgba, image, mask)
 
 
-def test_why_a_frame_cannot_be_scored():
-    reasons = [reason_not_scorable(mask) for mask in masks_about_the_smallest()]
+def test_reasons_name_the_problem():
+    reasons = [reason_not_scorable(mask) for mask in masks_near_the_size_limit()]
     assert [bool(reason) for reason in reasons] == [True, True, False, True, False, True, False, True]
     assert "one half" in reasons[0]
     assert "20 x 10 px" in reasons[1]
@@ -208,12 +222,12 @@ def test_why_a_frame_cannot_be_scored():
 
 def test_mean_scores():
     assert mean_scores([{"a": 1.0, "b": 2.0}, {"a": 3.0, "b": 4.0}]) == {"a": 2.0, "b": 3.0}
-    with pytest.raises(ValueError, match="no frame"):
+    with pytest.raises(ValueError, match="no scored frame"):
         mean_scores([])
 
 
 @pytest.mark.parametrize("sigma_px", [0.0, 0.7, 1.5])
-def test_edge_spread_is_that_of_the_blur(sigma_px):
+def test_edge_blur_is_that_of_the_gaussian(sigma_px):
     rows, columns = np.mgrid[:1200, :1200] / 4.0
     disc = (np.hypot(rows - 149.3, columns - 151.1) < 90.2).astype(np.float32)
     square_pixels = disc.reshape(300, 4, 300, 4).mean((1, 3))
@@ -221,8 +235,8 @@ def test_edge_spread_is_that_of_the_blur(sigma_px):
     edge_sigma_px = edge_blur_sigma_px(np.rint(255 * soft).astype(np.uint8))
     assert edge_sigma_px == pytest.approx(np.hypot(sigma_px, 12**-0.5), rel=0.04)
     assert additional_blur_sigma_px(float(np.hypot(sigma_px, 12**-0.5))) == pytest.approx(sigma_px, abs=1e-6)
-    assert additional_blur_sigma_px(0.2) == 0.0  # sharper than square pixels can be: a mask of ones and zeros
+    assert additional_blur_sigma_px(0.2) == 0.0  # a binary mask is sharper than antialiased square pixels
 
 
-def test_a_mask_without_outline_has_no_edge_spread():
+def test_a_mask_without_outline_has_no_edge_blur():
     assert edge_blur_sigma_px(np.zeros((20, 20), dtype=np.uint8)) == 0.0

@@ -1,4 +1,4 @@
-"""LPIPS with made-up weights against the definition written with loops."""
+"""LPIPS with random weights against the definition written with loops."""
 
 import math
 
@@ -16,8 +16,8 @@ def weights(rng: np.random.Generator) -> dict[str, torch.Tensor]:
     return narrow_alexnet(rng)
 
 
-def reference_features(picture: np.ndarray, weights: dict[str, torch.Tensor]) -> list[np.ndarray]:
-    values = np.moveaxis(picture / 255 * 2 - 1, 2, 0)
+def reference_features(image: np.ndarray, weights: dict[str, torch.Tensor]) -> list[np.ndarray]:
+    values = np.moveaxis(image / 255 * 2 - 1, 2, 0)
     values = (values - np.array([-0.030, -0.088, -0.188])[:, None, None]) / np.array([0.458, 0.448, 0.450])[
         :, None, None
     ]
@@ -38,7 +38,7 @@ def reference_features(picture: np.ndarray, weights: dict[str, torch.Tensor]) ->
     return layers
 
 
-def test_it_is_the_definition(rng: np.random.Generator, weights: dict[str, torch.Tensor]):
+def test_agrees_with_the_definition(rng: np.random.Generator, weights: dict[str, torch.Tensor]):
     a, b = (rng.integers(0, 256, (67, 75, 3)).astype(np.uint8) for _ in range(2))
     expected = 0.0
     for layer, (x, y) in enumerate(zip(reference_features(a, weights), reference_features(b, weights), strict=True)):
@@ -48,10 +48,10 @@ def test_it_is_the_definition(rng: np.random.Generator, weights: dict[str, torch
     assert math.isclose(lpips(a, b, weights), lpips(b, a, weights), rel_tol=1e-6)
 
 
-def test_equal_pictures_have_no_distance_and_small_ones_are_refused(
+def test_equal_images_have_no_distance_and_small_images_are_refused(
     rng: np.random.Generator, weights: dict[str, torch.Tensor]
 ):
-    picture = rng.integers(0, 256, (63, 63, 3)).astype(np.uint8)
-    assert lpips(picture, picture, weights) == 0.0
+    image = rng.integers(0, 256, (63, 63, 3)).astype(np.uint8)
+    assert lpips(image, image, weights) == 0.0
     with pytest.raises(ValueError, match="smaller than 63"):
-        lpips(picture[1:], picture[1:], weights)
+        lpips(image[1:], image[1:], weights)

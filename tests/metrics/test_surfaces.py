@@ -20,10 +20,12 @@ def square(height_m: float, tilt_deg: float = 0.0) -> Mesh:
     return Mesh(corners, np.array([[0, 1, 2], [2, 1, 3]], dtype=np.int32))
 
 
-def test_concentric_spheres_are_apart_by_the_difference_of_their_radii():
+def test_distance_of_concentric_spheres_is_the_difference_of_their_radii():
     scores = surface_scores(sphere(0.503), sphere(0.5), count=20_000)
     for name in ("result_to_truth_mm", "truth_to_result_mm", "chamfer_mm", "hausdorff95_mm"):
-        assert scores[name] == pytest.approx(3.0, abs=0.1)  # facets of the icosphere lie 0.2 mm inside at most
+        assert scores[name] == pytest.approx(
+            3.0, abs=0.1
+        )  # the faces of the icosphere are at most 0.2 mm inside the sphere
     assert scores["f_score"] == 1.0
     assert scores["normal_angle_deg"] < 2.0
     assert surface_scores(sphere(0.51), sphere(0.5), count=2_000)["f_score"] == 0.0
@@ -34,8 +36,8 @@ def test_tilted_square_has_the_tilt_as_normal_angle():
     assert scores["normal_angle_deg"] == pytest.approx(10.0, abs=1e-6)
 
 
-def test_normal_angles_are_the_mean_of_both_ways():
-    """A floor, and in the truth a wall besides that rises from its edge at 60 degrees: half the truth's area."""
+def test_normal_angle_is_the_mean_of_both_directions():
+    """The truth has an additional square at 60 degrees to the first, which is half of its area."""
     floor, slope = square(0.0), np.radians(60.0)
     across = floor.vertices[:, :1] + 0.5
     wall = np.concatenate([0.5 + across * np.cos(slope), across * np.sin(slope), floor.vertices[:, 2:]], axis=1)
@@ -48,12 +50,12 @@ def test_the_threshold_is_five_millimetres(height_m, f_score):
     assert surface_scores(square(height_m), square(0.0), count=100)["f_score"] == f_score
 
 
-def test_a_missing_half_shows_one_way_only():
-    """From the whole, half the points lie on the rest and half are 0 to 500 mm away from it, evenly."""
+def test_a_missing_half_changes_the_scores_of_one_direction():
+    """Half of the points of the whole are on the remaining half, the others are 0 to 500 mm away from it, uniformly."""
     whole = square(0.0)
     half = Mesh(whole.vertices * [0.5, 1.0, 1.0] - [0.25, 0.0, 0.0], whole.faces)
     missing, added = (surface_scores(*pair, count=20_000) for pair in ((half, whole), (whole, half)))
-    near = 0.505  # half, and a 5 mm strip beside it
+    near = 0.505  # the half and the 5 mm next to it
     for scores, (perfect, partial), (none, far) in (
         (missing, ("precision", "recall"), ("result_to_truth_mm", "truth_to_result_mm")),
         (added, ("recall", "precision"), ("truth_to_result_mm", "result_to_truth_mm")),
@@ -64,10 +66,10 @@ def test_a_missing_half_shows_one_way_only():
         assert scores[none] == pytest.approx(0.0, abs=1e-6)
         assert scores[far] == pytest.approx(125.0, rel=0.03)
         assert scores["chamfer_mm"] == pytest.approx(62.5, rel=0.03)
-        assert scores["hausdorff95_mm"] == pytest.approx(450.0, abs=8.0)  # a tenth of the far half lies beyond
+        assert scores["hausdorff95_mm"] == pytest.approx(450.0, abs=8.0)  # a tenth of the missing half is farther away
 
 
-def test_distances_are_those_of_a_brute_force_search(rng):
+def test_distances_agree_with_a_brute_force_search(rng):
     mesh = Mesh(rng.normal(size=(12, 3)), rng.permutation(12)[:12].reshape(4, 3).astype(np.int32))
     points = rng.normal(size=(20, 3))
     distances_m, faces, _ = closest_points_on_mesh(points, mesh)
@@ -78,13 +80,13 @@ def test_distances_are_those_of_a_brute_force_search(rng):
     for point, distance_m, face in zip(points, distances_m, faces, strict=True):
         each = []
         for a, b, c in mesh.vertices[mesh.faces]:
-            spots = a + u[:, None] * (b - a) + v[:, None] * (c - a)
-            each.append(np.linalg.norm(spots - point, axis=1).min())
-        assert distance_m == pytest.approx(min(each), abs=0.02)  # the search grid is this coarse
+            samples = a + u[:, None] * (b - a) + v[:, None] * (c - a)
+            each.append(np.linalg.norm(samples - point, axis=1).min())
+        assert distance_m == pytest.approx(min(each), abs=0.02)  # the resolution of the search
         assert each[face] == pytest.approx(min(each), abs=0.02)
 
 
-def test_samples_lie_on_their_faces_and_follow_area():
+def test_samples_are_on_their_faces_and_uniform_by_area():
     big_and_small = Mesh(
         np.array([[0, 0, 0], [3.0, 0, 0], [0, 3, 0], [0, 0, 5], [1, 0, 5], [0, 1, 5]]),
         np.array([[0, 1, 2], [3, 4, 5]], dtype=np.int32),
@@ -92,12 +94,14 @@ def test_samples_lie_on_their_faces_and_follow_area():
     points, faces = sample_surface(big_and_small, 10_000)
     assert np.mean(faces == 0) == pytest.approx(0.9, abs=0.02)
     assert np.allclose(points[:, 2], np.where(faces == 0, 0.0, 5.0))
-    assert np.allclose(points[faces == 0].mean(axis=0), [1.0, 1.0, 0.0], atol=0.05)  # centroid: evenly spread
+    assert np.allclose(
+        points[faces == 0].mean(axis=0), [1.0, 1.0, 0.0], atol=0.05
+    )  # the centroid: uniformly distributed
     assert np.array_equal(points, sample_surface(big_and_small, 10_000)[0])
     with pytest.raises(ValueError, match="no area"):
         sample_surface(Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]], dtype=np.int32)), 10)
 
 
-def test_joint_error_of_a_shift(rng):
+def test_joint_error_of_a_translation(rng):
     joints_m = rng.normal(size=(4, 7, 3))
     assert mpjpe_m(joints_m + [0.03, 0.0, 0.04], joints_m) == pytest.approx(0.05)

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline.geometry.camera import pixel_footprint_m
 from pipeline.texture.bake import BakeConfig, bake_diffuse, mean_foreground_psnr_db, render_textured_view
 from pipeline.texture.views import (
     BakeView,
     align_to_render,
     pixel_confidence,
-    pixel_footprint_m,
     vertex_view_cosine,
     weight_by_resolution,
 )
@@ -82,8 +82,8 @@ def test_what_nobody_sees_keeps_the_fallback() -> None:
 
 def test_validation_psnr_tells_the_true_texture_from_a_wrong_one(ball: PaintedBall) -> None:
     grey = np.full((256, 256, 3), 0.5, dtype=np.float32)
-    true = ball.texels.image(ball.truth)
-    true[~ball.texels.covered()] = 0.5
+    true = ball.texels.to_texture(ball.truth)
+    true[~ball.texels.coverage_mask()] = 0.5
     assert mean_foreground_psnr_db(true, ball.views[:2], ball.surface) > 10 + mean_foreground_psnr_db(
         grey, ball.views[:2], ball.surface
     )
@@ -97,7 +97,7 @@ def test_the_same_views_give_the_same_bytes(ball: PaintedBall) -> None:
 
 @pytest.mark.parametrize("shift_px", [(2.0, 0.0), (-1.0, 3.0)])
 def test_align_moves_a_picture_onto_the_render(misaligned_ball: PaintedBall, shift_px: tuple[float, float]) -> None:
-    texture = misaligned_ball.texels.image(misaligned_ball.truth)
+    texture = misaligned_ball.texels.to_texture(misaligned_ball.truth)
     view = misaligned_ball.views[0]
     rendered = render_textured_view(texture, view, misaligned_ball.surface)
     rows, columns = np.mgrid[: view.mask.shape[0], : view.mask.shape[1]].astype(np.float32)
@@ -139,6 +139,6 @@ def test_cosine_is_one_where_the_ball_faces_the_camera(ball: PaintedBall) -> Non
 def test_near_frames_weigh_more(ball: PaintedBall) -> None:
     far = ball.views[0]
     near = BakeView(far.image, far.mask, far.camera, 0.5 * far.vertices_world, far.view_cosine)
-    assert pixel_footprint_m(far) == pytest.approx(DISTANCE_M / CAMERA.fx, rel=0.02)
+    assert pixel_footprint_m(far.vertices_world, far.camera) == pytest.approx(DISTANCE_M / CAMERA.fx, rel=0.02)
     weights = [view.weight for view in weight_by_resolution([far, far, near])]
     assert weights == pytest.approx([1.0, 1.0, 4.0], rel=1e-4)

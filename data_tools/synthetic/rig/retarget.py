@@ -11,11 +11,10 @@ import torch
 from jaxtyping import Float
 
 from data_tools.synthetic.rig.bvh import BvhMotion
-from data_tools.synthetic.rig.directions import shortest_arc
 from data_tools.synthetic.scene.motion import lowest_foot_offset_m
 from pipeline.body.body import Body, Motion
 from pipeline.core.errors import UserError
-from pipeline.geometry.rotation import matrix_to_quaternion
+from pipeline.geometry.rotation import matrix_to_quaternion, rotation_between
 
 _JOINT_ALIASES: dict[str, tuple[str, ...]] = {
     "Spine": ("lowerback", "Chest"),
@@ -230,7 +229,7 @@ def retarget_rotations(
             recorded = (
                 canonical_positions[recorded_joint_of[bones[name]]] - canonical_positions[recorded_joint_of[name]]
             )
-            arcs[joint] = shortest_arc(torch.from_numpy(bone).double(), torch.from_numpy(recorded)).numpy()
+            arcs[joint] = rotation_between(torch.from_numpy(bone).double(), torch.from_numpy(recorded)).numpy()
         elif "Hand" in name:
             arcs[joint] = arcs[parent]
         if name in recorded_joint_of:

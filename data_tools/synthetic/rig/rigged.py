@@ -7,10 +7,10 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from data_tools.synthetic.rig.directions import shortest_arc
 from data_tools.synthetic.rig.subject import Subject
 from pipeline.body.body import Body
 from pipeline.core.errors import UserError
+from pipeline.geometry.rotation import rotation_between
 from pipeline.geometry.skinning import forward_kinematics, linear_blend_skinning, skinning_transforms
 from pipeline.io.glb import GlbFile, Primitive
 
@@ -142,7 +142,9 @@ def _rebind_in_a_pose(body: Body) -> Body:
     for side, sign in (("Left", 1.0), ("Right", -1.0)):
         arm, forearm = body.joint(f"{side}Arm"), body.joint(f"{side}ForeArm")
         along = torch.from_numpy(body.joints_m[forearm] - body.joints_m[arm])
-        rotations[0, arm] = shortest_arc(along, torch.tensor(_A_POSE_ARM_DIRECTION) * torch.tensor([sign, 1.0, 1.0]))
+        rotations[0, arm] = rotation_between(
+            along, torch.tensor(_A_POSE_ARM_DIRECTION) * torch.tensor([sign, 1.0, 1.0])
+        )
     joints_m = torch.from_numpy(body.joints_m)
     joint_to_world = forward_kinematics(rotations, joints_m[:1], joints_m, body.parents)
     transforms = skinning_transforms(joint_to_world, joints_m)

@@ -24,6 +24,7 @@ from data_tools.synthetic.scene.renderer import Light, pose_vertices, render_sub
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.files import save_body, save_camera, save_motion
 from pipeline.core.progress import track
+from pipeline.geometry.alpha import unpremultiply_to_uint8
 from pipeline.geometry.camera import Camera
 from pipeline.io.image import to_uint8, write_gray, write_rgb, write_rgba
 
@@ -201,10 +202,3 @@ def write_heldout(truth: Path, capture: SyntheticCapture, heldout: HeldOutTarget
         vertices = pose_vertices(subject, transforms)
         person = render_subject(subject, vertices, capture.camera, capture.light, capture.samples)
         write_rgba(truth / "novel_poses" / f"{index:06d}.png", unpremultiply_to_uint8(person))
-
-
-def unpremultiply_to_uint8(person: Float[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w 4"]:
-    """Convert premultiplied RGBA in [0, 1] to straight RGBA, 8 bits; colours are 0 where the coverage is 0."""
-    coverage = person[:, :, 3:]
-    colours = np.divide(person[:, :, :3], coverage, out=np.zeros_like(person[:, :, :3]), where=coverage > 0)
-    return to_uint8(np.concatenate([colours, coverage], axis=2))

@@ -26,12 +26,12 @@ from data_tools.evaluate.compare_avatar import (
     unpose_true_vertices,
 )
 from data_tools.evaluate.truth import load_true_mask
-from pipeline.avatar.textured_avatar import unpremultiply_to_uint8
 from pipeline.body.body import Body, Motion
 from pipeline.body.files import save_motion
 from pipeline.capture.frame_selection import HELDOUT, TRAIN
 from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
+from pipeline.geometry.alpha import unpremultiply_to_uint8
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.texture_rendering import blur_coverage
 from pipeline.io.image import write_rgba

@@ -10,7 +10,7 @@ import torch
 from data_tools.command import run_command
 from data_tools.sample import main
 from data_tools.synthetic.rig.subject import Subject
-from data_tools.synthetic.scene.capture import CAPTURE_VERSION, novel_cameras, portrait_camera, unpremultiply_to_uint8
+from data_tools.synthetic.scene.capture import CAPTURE_VERSION, novel_cameras, portrait_camera
 from data_tools.synthetic.scene.movie import write_video
 from pipeline.body.files import load_camera, load_motion
 from pipeline.capture.video import open_frame_source, read_frames
@@ -74,11 +74,6 @@ def test_the_person_fills_the_picture_as_asked() -> None:
     ends = torch.from_numpy(np.stack([ground_m, ground_m + [0.0, 1.8, 0.0]])).float()
     place_px, _ = project(ends, camera)
     assert place_px[0, 1] - place_px[1, 1] == pytest.approx(0.8 * 540, abs=0.1)
-
-
-def test_straight_colours_undo_premultiplication() -> None:
-    person = np.array([[[0.2, 0.1, 0.3, 0.5], [0.0, 0.0, 0.0, 0.0], [0.2, 0.4, 0.6, 1.0]]], dtype=np.float32)
-    assert unpremultiply_to_uint8(person).tolist() == [[[102, 51, 153, 128], [0, 0, 0, 0], [51, 102, 153, 255]]]
 
 
 def test_video_keeps_colours(tmp_path: Path) -> None:

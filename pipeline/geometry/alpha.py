@@ -1,0 +1,14 @@
+"""Conversion between premultiplied and straight alpha."""
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+
+def unpremultiply_to_uint8(premultiplied: Float[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w 4"]:
+    """Convert premultiplied colours and alpha in [0, 1] to an 8-bit image with straight alpha.
+
+    Pixels with an alpha of 0 are black.
+    """
+    alpha = premultiplied[..., 3:]
+    colour = premultiplied[..., :3] / np.maximum(alpha, 1e-6)
+    return np.rint(255.0 * np.clip(np.concatenate([colour, alpha], axis=2), 0.0, 1.0)).astype(np.uint8)
