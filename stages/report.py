@@ -22,7 +22,7 @@ from pipeline.core.cli import main
 from pipeline.core.config import Config as BaseConfig
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import Manifest, read_manifest
-from pipeline.core.measure import environment, peak_rss_mib
+from pipeline.core.measure import describe_environment, peak_rss_mib
 from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
 from pipeline.geometry.texture_rendering import blur_coverage
@@ -101,7 +101,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
         "masks": {"count": len(loaded.capture), "edge_blur_sigma_px": spread_px},
     }
     cost = (time.monotonic() - started, peak_rss_mib())
-    report = replace_nonfinite(build_report(manifests, rows, metric_sections, environment(), cost))
+    report = replace_nonfinite(build_report(manifests, rows, metric_sections, describe_environment(), cost))
     page = PageContent(
         title=out.resolve().parent.name,
         report=report,

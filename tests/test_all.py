@@ -13,7 +13,7 @@ import pytest
 from pipeline.core.manifest import digest_video, find_damaged_files, read_manifest
 from pipeline.core.measure import REPOSITORY_DIR
 from pipeline.io.image import read_rgb
-from stages import STAGES, load
+from stages import STAGES, load_stage
 from tests.core.toy_pipeline import user_environment
 
 GLB_MAGIC, GLB_VERSION, JSON_CHUNK = 0x46546C67, 2, 0x4E4F534A
@@ -38,7 +38,7 @@ def command(*arguments: str) -> str:
 def test_every_stage_left_a_whole_artifact(smoke_run: Path) -> None:
     for name in STAGES:
         assert find_damaged_files(smoke_run / name) == []
-        assert all((smoke_run / name / made).exists() for made in load(name).makes)
+        assert all((smoke_run / name / made).exists() for made in load_stage(name).makes)
     assert not list(smoke_run.glob("*.part"))
 
 

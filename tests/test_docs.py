@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from scripts.doctor import SYSTEM_LIBRARIES
-from stages import STAGES, load
+from stages import STAGES, load_stage
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def test_files_that_the_readme_names_are_made(readme: str):
     rows = {row[0].strip("`/"): row[1] for row in table_rows(section)[1:]}
     assert list(rows) == list(STAGES)
     for name in STAGES:
-        made = set(load(name).makes)
+        made = set(load_stage(name).makes)
         named = {word.rstrip("/") for word in re.findall(r"`([^`]+)`", rows[name])}
         assert named <= made | {"images", "masks"}, name
 
@@ -76,4 +76,4 @@ def test_options_in_the_readme_are_known(readme: str):
     assert used
     for key in used:
         stage, _, name = key.partition(".")
-        assert name in load(stage).config.model_fields
+        assert name in load_stage(stage).config.model_fields

@@ -1,4 +1,4 @@
-"""kill -9 anywhere, then the same command: it goes on, and ends with the bytes of an unbroken run."""
+"""kill -9 at any time, then the same command: it resumes, and ends with the bytes of an uninterrupted run."""
 
 import os
 import shutil
@@ -15,7 +15,7 @@ from pipeline.core.measure import REPOSITORY_DIR
 from stages import STAGES
 from tests.core.toy_pipeline import Toy, user_environment
 
-TOY_STAGES = ("read", "learn", "tell")
+TOY_STAGES = ("read", "learn", "summarise")
 
 
 def artifacts(run_dir: Path, names: tuple[str, ...]) -> dict[str, str]:
@@ -26,15 +26,15 @@ def artifacts(run_dir: Path, names: tuple[str, ...]) -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def unbroken(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """What the toy pipeline makes when nobody disturbs it."""
+    """What the toy pipeline makes without a kill."""
     toy = Toy(tmp_path_factory.mktemp("toy") / "unbroken")
     assert toy.all("--video", "numbers.txt").returncode == 0
     return artifacts(toy.run_dir, TOY_STAGES)
 
 
 @pytest.mark.parametrize("step", [1, 10, 20])
-def test_a_killed_stage_goes_on_from_its_checkpoint(toy: Toy, unbroken: dict[str, str], step: int) -> None:
-    killed = toy.all("--video", "numbers.txt", TOY_KILL_STEP=str(step))
+def test_a_killed_stage_resumes_from_its_checkpoint(toy: Toy, unbroken: dict[str, str], step: int) -> None:
+    killed = toy.call_all("--video", "numbers.txt", TOY_KILL_STEP=str(step))
     assert killed.returncode == 2
     assert "killed by signal 9" in killed.stderr
     assert not (toy.run_dir / "learn").exists()
@@ -49,7 +49,7 @@ def test_a_killed_stage_goes_on_from_its_checkpoint(toy: Toy, unbroken: dict[str
 
 
 def test_a_changed_option_drops_the_checkpoint(toy: Toy) -> None:
-    toy.all("--video", "numbers.txt", TOY_KILL_STEP="10")
+    toy.call_all("--video", "numbers.txt", TOY_KILL_STEP="10")
     toy.all("--set", "learn.steps=30")
     manifest = read_manifest(toy.run_dir / "learn")
     assert manifest is not None

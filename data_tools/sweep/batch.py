@@ -31,10 +31,10 @@ from data_tools.sweep.runs import (
 )
 from pipeline.capture.video import VIDEO_SUFFIXES
 from pipeline.core.atomic import atomic_path
-from pipeline.core.cli import default_run_dir
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track
-from pipeline.core.runner import FRESH
+from pipeline.core.run_folder import default_run_dir
+from pipeline.core.status import FRESH
 
 PAGE = Template(
     """<!doctype html><html lang="en"><meta charset="utf-8"><title>Batch</title><style>

@@ -17,6 +17,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+import stages
 from data_tools.command import run_command
 from data_tools.evaluate.truth import read_capture_settings
 from data_tools.sample import main as make_sample
@@ -35,7 +36,7 @@ from data_tools.sweep.chart_trials import (
     run_trial,
     table_row,
 )
-from data_tools.sweep.runs import CONFIGS, RunState, log_path, validate_run_options, write_csv
+from data_tools.sweep.runs import RunState, log_path, validate_run_options, write_csv
 from data_tools.synthetic.scene.capture import CAPTURE_VERSION
 from pipeline.core.config import preset_files
 from pipeline.core.errors import UserError
@@ -172,7 +173,7 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m data_tools.sweep.chart", description=(__doc__ or "").splitlines()[0]
     )
-    presets = [name for name in preset_files(CONFIGS) if name != TEST_PRESET]
+    presets = [name for name in preset_files(stages.PIPELINE.config_dir) if name != TEST_PRESET]
     parser.add_argument("captures", nargs="*", type=Path, help="captures, videos or image folders; two people if none")
     parser.add_argument("--presets", nargs="+", default=presets, help="names in configs/ or .yaml files; all if none")
     parser.add_argument("--steps", nargs="+", default=[], help="PRESET=N: so many training steps of its field instead")

@@ -22,11 +22,12 @@ from data_tools.sweep.runs import (
     reusable_stages,
     start_run,
 )
-from pipeline.core.cli import default_run_dir
+from pipeline.core.config import parse_overrides
 from pipeline.core.errors import UserError
 from pipeline.core.lock import run_lock
 from pipeline.core.progress import warn
 from pipeline.core.record import RunRecord, update_record
+from pipeline.core.run_folder import default_run_dir
 
 FIELD = "field"
 STAGES_UNTIL_FIELD = ("frames", "body", FIELD)
@@ -69,7 +70,7 @@ class Trial:
     @property
     def assignments(self) -> list[str]:
         """What differs from the preset, as `section.key=value`."""
-        seeded = [name for name in stages.STAGES if "seed" in stages.load(name).config.model_fields]
+        seeded = [name for name in stages.STAGES if "seed" in stages.load_stage(name).config.model_fields]
         seeds = [f"{name}.seed={self.seed}" for name in seeded]
         return seeds if self.steps is None else [*seeds, f"{FIELD}.steps={self.steps}"]
 
@@ -77,7 +78,8 @@ class Trial:
     def record(self) -> RunRecord:
         """What the run's folder will remember."""
         record, video = RunRecord(), find_video(self.capture)
-        return update_record(record, self.run_dir, video, self.preset, self.assignments, replace_video=False)
+        overrides = parse_overrides(self.assignments)
+        return update_record(record, self.run_dir, video, self.preset, overrides, replace_video=False)
 
 
 def require_distinct_run_folders(trials: Iterable[Trial]) -> None:

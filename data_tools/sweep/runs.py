@@ -14,15 +14,13 @@ from typing import Any
 import stages
 from data_tools.evaluate.files import TRUTH_FILES, TRUTH_VERSION
 from pipeline.core.atomic import atomic_path
-from pipeline.core.config import Config, parse_overrides
+from pipeline.core.config import parse_overrides
 from pipeline.core.errors import UserError
-from pipeline.core.lock import die_with_parent_environment
 from pipeline.core.manifest import Manifest, digest_file, read_manifest
+from pipeline.core.parent import die_with_parent_environment
 from pipeline.core.record import RunRecord, read_record
-from pipeline.core.runner import FRESH, build_configs, stage_states
-from pipeline.core.stage import Stage
+from pipeline.core.status import FRESH, stage_states
 
-CONFIGS = Path(stages.__file__).resolve().parents[1] / "configs"
 ERROR_PREFIX = "error: "
 TRACEBACK_HEADER = "Traceback (most recent call last):"
 
@@ -84,7 +82,7 @@ def read_run(run_dir: Path, record: RunRecord | None = None) -> RunState:
 
 def reusable_stages(run_dir: Path, record: RunRecord) -> list[str]:
     """The first stages of a folder, in order, that a run with this record would take over as they are."""
-    states = stage_states(_load_stages(), _configs(record), run_dir, record)
+    states = stage_states(stages.PIPELINE, run_dir, record)
     return list(takewhile(lambda name: states[name] == FRESH, states))
 
 
@@ -95,7 +93,7 @@ def find_video(path: Path) -> Path:
 
 def validate_run_options(preset: str, assignments: Sequence[str]) -> None:
     """Refuse an unknown preset or option with one UserError, before any run starts."""
-    _configs(RunRecord(preset=preset, overrides=parse_overrides(assignments)))
+    stages.PIPELINE.build_configs(RunRecord(preset=preset, overrides=parse_overrides(assignments)))
 
 
 def start_run(run_dir: Path, arguments: Sequence[str], threads: int | None = None) -> None:
@@ -161,16 +159,7 @@ def cpu_cores() -> int:
 
 
 def _states(run_dir: Path, record: RunRecord | None) -> dict[str, str]:
-    record = record or read_record(run_dir)
-    return stage_states(_load_stages(), _configs(record), run_dir, record)
-
-
-def _configs(record: RunRecord) -> dict[str, Config]:
-    return build_configs(_load_stages(), record, CONFIGS)
-
-
-def _load_stages() -> list[Stage]:
-    return [stages.load(name) for name in stages.STAGES]
+    return stage_states(stages.PIPELINE, run_dir, record or read_record(run_dir))
 
 
 def _read_json(path: Path) -> Any:

@@ -1,1 +1,1 @@
-"""The runner: stages, manifests, strict configuration, locks, progress. Knows nothing of 3D."""
+"""Runner of the stages: manifests, locks, strict configuration, progress. Nothing here depends on 3D."""

@@ -1,6 +1,7 @@
-"""Files that are whole or absent: written beside their place, flushed to disk, then renamed."""
+"""Atomic files: written under a temporary name, flushed to disk, then renamed. A reader sees all of a file or none."""
 
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -8,10 +9,10 @@ from pathlib import Path
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """Yield a temporary path in the same folder; when the block ends without an error it becomes `path`.
+    """Yield a temporary path in the folder of `path`; rename it to `path` when the block ends without an error.
 
-    For checkpoints (`checkpoint*` in a stage's folder) and for small files that are rewritten in place. The temporary
-    name keeps the suffix, which many writers look at.
+    For checkpoints (`checkpoint*` in the folder of a stage) and for small files that are replaced. The temporary name
+    keeps the suffix, from which many writers derive the format.
     """
     temporary_path = path.with_name(f"unfinished-{path.name}")
     try:
@@ -23,8 +24,13 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 
 def fsync_path(path: Path) -> None:
-    """Push a file's content, or a folder's entries, through to the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
+    """Flush the content of a file, or the entries of a folder, to disk."""
+    flags = os.O_RDONLY
+    if sys.platform == "win32":  # where a folder cannot be flushed, and a file needs a writable descriptor
+        if path.is_dir():
+            return
+        flags = os.O_RDWR
+    descriptor = os.open(path, flags)
     try:
         os.fsync(descriptor)
     finally:

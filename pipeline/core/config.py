@@ -1,13 +1,14 @@
-"""Strict configuration: one section a stage, typed beside the stage's code, read from YAML and `--set`.
+"""Strict configuration: one section for each stage, typed beside the code of the stage, read from YAML and `--set`.
 
-Later layers win: `configs/default.yaml`, then the preset's file, then the overrides (`--set mesh.resolution=256`).
-Every value remembers the layer it came from, so that an error can name the place to mend.
+Later layers override earlier ones: `configs/default.yaml`, the file of the preset, the overrides
+(`--set mesh.max_faces=30000`). Each value keeps the layer that set it, so that an error can name the place to correct.
 """
 
 import difflib
 import textwrap
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, is_dataclass
+from importlib import resources
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,17 +18,19 @@ from pydantic.fields import FieldInfo
 
 from pipeline.core.errors import UserError
 
-CONFIG_DIR = Path(__file__).resolve().parents[2] / "configs"
+CONFIG_DIR = Path(str(resources.files("configs")))
 BASELINE_PRESETS = Path("data_tools", "baselines")
 """Folder of the presets that reproduce published methods, relative to the parent folder of the product's presets."""
-TYPE_DESCRIPTIONS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
-YAML_WIDTH = 10_000
-YAML_SCALAR_END = "...\n"
 PRESET_SUFFIXES = (".yaml", ".yml")
+
+_TYPE_DESCRIPTIONS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
+_YAML_WIDTH = 10_000
+_YAML_SCALAR_END = "...\n"
+_HEADING = "# Defaults of all stages. `make configs` writes this file from the code; a test compares the two."
 
 
 class Config(BaseModel):
-    """Base of a stage's options: frozen, unknown keys refused, no NaN or infinity.
+    """Base class of the options of a stage: frozen, without unknown keys, NaN or infinity.
 
     Each field is a `pydantic.Field` with its bounds and a description that names the unit.
     """
@@ -40,26 +43,33 @@ ConfigType = TypeVar("ConfigType", bound=Config)
 
 @dataclass
 class ConfigLayers:
-    """The merged values of all sections, and for each dotted key the layer that set it."""
+    """Merged values by section and key, and the layer that set each dotted key."""
 
     values: dict[str, Any] = field(default_factory=dict)
-    origin: dict[str, str] = field(default_factory=dict)
+    origins: dict[str, str] = field(default_factory=dict)
 
     def add(self, values: Mapping[str, Any], origin: str) -> None:
-        """Lay `values` (a mapping per section) over what is there."""
+        """Override earlier values by `values`, which map each section to its keys."""
         _merge(self.values, values)
-        for key in _dotted_keys(values):
-            self.origin[key] = origin
+        self.origins |= dict.fromkeys(_dotted_keys(values), origin)
 
     def origin_of(self, key: str) -> str:
-        """Name the layer that set `key` (dotted), or an ancestor of it."""
-        while key not in self.origin and "." in key:
+        """Return the name of the layer that set the dotted key or, if none did, the closest key that contains it."""
+        while key not in self.origins and "." in key:
             key = key.rpartition(".")[0]
-        return self.origin.get(key, "the defaults")
+        return self.origins.get(key, "the defaults")
 
 
 def load_layers(preset: str, overrides: Mapping[str, Any], config_dir: Path = CONFIG_DIR) -> ConfigLayers:
-    """Read default.yaml, the preset (a name in `config_dir`, or a path to a YAML file) and the dotted overrides."""
+    """Read default.yaml, the preset and the overrides.
+
+    Args:
+        preset: name of a file in `config_dir`, or path of a YAML file.
+        overrides: values by `section.key`, see `parse_overrides`.
+
+    Raises:
+        UserError: the preset does not exist, or a file is not valid.
+    """
     layers = ConfigLayers()
     default_path = config_dir / "default.yaml"
     if default_path.exists():
@@ -67,11 +77,11 @@ def load_layers(preset: str, overrides: Mapping[str, Any], config_dir: Path = CO
     preset_path = find_preset(preset, config_dir)
     if preset_path != default_path:
         layers.add(_read_sections(preset_path), str(preset_path))
-    for key, value in overrides.items():
-        nested: Any = value
-        for part in reversed(key.split(".")):
+    for dotted_key, value in overrides.items():
+        nested = value
+        for part in reversed(dotted_key.split(".")):
             nested = {part: nested}
-        layers.add(nested, f"--set {key}")
+        layers.add(nested, f"--set {dotted_key}")
     return layers
 
 
@@ -82,63 +92,73 @@ def preset_files(config_dir: Path = CONFIG_DIR) -> dict[str, Path]:
 
 
 def find_preset(preset: str, config_dir: Path = CONFIG_DIR) -> Path:
-    """Return the file of a preset given by name or by path; raise UserError that lists the known names."""
+    """Return the file of a preset, supplied as name or path.
+
+    Raises:
+        UserError: it does not exist; the message lists the known names.
+    """
     files = preset_files(config_dir)
     path = Path(preset) if preset.endswith(PRESET_SUFFIXES) else files.get(preset, config_dir / f"{preset}.yaml")
     if not path.is_file() and preset != "default":
-        raise UserError(f"preset {preset} is not known: use one of {', '.join(files)}, or the path of a .yaml file")
+        raise UserError(f"preset {preset} is unknown: use one of {', '.join(files)}, or the path of a .yaml file")
     return path
 
 
 def parse_overrides(assignments: Iterable[str]) -> dict[str, Any]:
-    """Turn `["mesh.resolution=256"]` into `{"mesh.resolution": 256}`; values are read as YAML."""
+    """Convert `["mesh.max_faces=30000"]` to `{"mesh.max_faces": 30000}`; the values are YAML.
+
+    Raises:
+        UserError: an assignment does not have the form section.key=value.
+    """
     overrides = {}
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
-        if not equals or len(key.split(".")) < 2 or not all(key.split(".")):
-            raise UserError(f"--set {assignment} is not understood: write --set section.key=value")
+        parts = key.split(".")
+        if not equals or len(parts) < 2 or not all(parts):
+            raise UserError(f"--set {assignment} is not valid: write --set section.key=value")
         overrides[key] = _parse_yaml(text, f"--set {assignment}")
     return overrides
 
 
 def check_sections(layers: ConfigLayers, known: Iterable[str]) -> None:
-    """Refuse a section that belongs to no stage."""
+    """Raise UserError for a section that belongs to no stage."""
     names = list(known)
     for name in layers.values:
         if name not in names:
-            raise UserError(_unknown_key(layers.origin_of(name), name, "the configuration", names))
+            raise UserError(_format_unknown_key(layers.origin_of(name), name, "the configuration", names))
 
 
 def build_config(section: str, config_type: type[ConfigType], layers: ConfigLayers) -> ConfigType:
-    """Make the typed config of one section, or raise UserError: key, value, what is allowed, and where it was set."""
-    values = layers.values.get(section) or {}
+    """Build the typed options of one section.
+
+    Raises:
+        UserError: a key or value is not valid; the message names the key, the value, what is allowed, and the layer.
+    """
     try:
-        return config_type.model_validate(values)
+        return config_type.model_validate(layers.values.get(section) or {})
     except ValidationError as error:
         raise UserError(_format_validation_error(section, config_type, error.errors()[0], layers)) from None
 
 
 def default_yaml(sections: Mapping[str, type[Config]]) -> str:
-    """Render the defaults in code as the text of default.yaml, each key under its description."""
-    lines = [
-        "# The defaults of every stage: `make configs` writes this file from the code, a test holds the two equal."
-    ]
+    """Format the defaults in code as the text of default.yaml, each key after its description."""
+    lines = [_HEADING]
     for section, config_type in sections.items():
         lines += ["", f"{section}:" if config_type.model_fields else f"{section}: {{}}"]
         defaults = config_type().model_dump(mode="json")
         for key, info in config_type.model_fields.items():
-            if is_dataclass(info.annotation):  # settings without options of their own: only presets change them
+            if is_dataclass(info.annotation):  # constants of the method, which presets change and users do not
                 continue
-            value = yaml.safe_dump(defaults[key], default_flow_style=True, sort_keys=False, width=YAML_WIDTH)
+            value = yaml.safe_dump(defaults[key], default_flow_style=True, sort_keys=False, width=_YAML_WIDTH)
             lines += textwrap.wrap(info.description or "", 116, initial_indent="  # ", subsequent_indent="  # ")
-            lines += [f"  {key}: {value.removesuffix(YAML_SCALAR_END).rstrip()}"]
+            lines += [f"  {key}: {value.removesuffix(_YAML_SCALAR_END).rstrip()}"]
     return "\n".join(lines) + "\n"
 
 
 def _read_sections(path: Path) -> dict[str, Any]:
     sections = _parse_yaml(path.read_text(encoding="utf-8"), str(path)) or {}
     if not isinstance(sections, dict) or not all(isinstance(s, dict | None) for s in sections.values()):
-        raise UserError(f"{path} is no configuration: it needs sections (stage names) with `key: value` lines inside")
+        raise UserError(f"{path} is not a configuration: write sections (stage names) with `key: value` lines in them")
     return {name: values or {} for name, values in sections.items()}
 
 
@@ -151,18 +171,17 @@ def _parse_yaml(text: str, origin: str) -> Any:
 
 
 def _merge(target: dict[str, Any], values: Mapping[str, Any]) -> None:
+    """Override `target` by `values`, mapping by mapping; `values` stay unchanged."""
     for key, value in values.items():
-        if isinstance(value, Mapping) and isinstance(target.get(key), dict):
+        if isinstance(value, Mapping):
+            inner = target.get(key)
+            target[key] = dict(inner) if isinstance(inner, Mapping) else {}
             _merge(target[key], value)
         else:
-            target[key] = _copied(value)
+            target[key] = value
 
 
-def _copied(value: Any) -> Any:
-    return {key: _copied(inner) for key, inner in value.items()} if isinstance(value, Mapping) else value
-
-
-def _dotted_keys(values: Mapping[str, Any], prefix: str = "") -> Iterable[str]:
+def _dotted_keys(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
     for key, value in values.items():
         yield f"{prefix}{key}"
         if isinstance(value, Mapping):
@@ -172,36 +191,24 @@ def _dotted_keys(values: Mapping[str, Any], prefix: str = "") -> Iterable[str]:
 def _format_validation_error(
     section: str, config_type: type[Config], error: Mapping[str, Any], layers: ConfigLayers
 ) -> str:
-    """Say in one sentence what pydantic found: origin, key, value, what is allowed."""
+    """Describe an error of pydantic in one sentence: layer, key, value, what is allowed."""
     path = [str(part) for part in error["loc"]]
-    dotted = ".".join([section, *path])
-    origin = layers.origin_of(dotted)
-    owner, info = _find_field(config_type, path)
-    if error["type"] == "extra_forbidden":
-        return _unknown_key(origin, dotted, ".".join([section, *path[:-1]]), list(owner.model_fields))
-    place = "" if origin.startswith("--set") else f"{origin}: "
-    if info is None:
-        return f"{place}section {dotted} is not allowed: {error['msg']}"
+    dotted_key = ".".join([section, *path])
+    origin = layers.origin_of(dotted_key)
+    fields = config_type.model_fields
+    if error["type"] == "extra_forbidden" and path[0] not in fields:
+        return _format_unknown_key(origin, dotted_key, section, list(fields))
+    place = _format_place(origin)
+    if not path:
+        return f"{place}section {section} is not valid: {error['msg'].removeprefix('Value error, ')}"
+    info = fields[path[0]]
+    allowed = _describe_constraints(info, error)
     meaning = f" ({info.description})" if info.description else ""
-    return (
-        f"{place}{dotted} = {error['input']!r} is not allowed: it must be {_describe_constraints(info, error)}{meaning}"
-    )
-
-
-def _find_field(config_type: type[BaseModel], path: list[str]) -> tuple[type[BaseModel], FieldInfo | None]:
-    """Walk down nested configs: the innermost model on `path`, and its field if `path` names one."""
-    owner, info = config_type, None
-    for part in path:
-        if info is not None and isinstance(info.annotation, type) and issubclass(info.annotation, BaseModel):
-            owner = info.annotation
-        elif info is not None:
-            break
-        info = owner.model_fields.get(part)
-    return owner, info
+    return f"{place}{dotted_key} = {error['input']!r} is not allowed: it must be {allowed}{meaning}"
 
 
 def _describe_constraints(info: FieldInfo, error: Mapping[str, Any]) -> str:
-    """What a field takes, in words: its kind and limits; for other kinds, pydantic's own words."""
+    """Describe the values that a field allows: type and limits; for other types, the message of pydantic."""
     words = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
     limits = [
         f"{word} {getattr(constraint, name)}"
@@ -209,14 +216,18 @@ def _describe_constraints(info: FieldInfo, error: Mapping[str, Any]) -> str:
         for name, word in words.items()
         if getattr(constraint, name, None) is not None
     ]
-    kind = TYPE_DESCRIPTIONS.get(info.annotation) if isinstance(info.annotation, type) else None
+    kind = _TYPE_DESCRIPTIONS.get(info.annotation) if isinstance(info.annotation, type) else None
     if kind is None or error["type"] in ("value_error", "assertion_error"):
         kind = error["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
     return ", ".join([kind, *limits])
 
 
-def _unknown_key(origin: str, key: str, section: str, known: list[str]) -> str:
+def _format_unknown_key(origin: str, key: str, section: str, known: list[str]) -> str:
     close = difflib.get_close_matches(key.rpartition(".")[2], known, n=1)
     hint = f" (did you mean {close[0]}?)" if close else ""
-    place = "" if origin.startswith("--set") else f"{origin}: "
-    return f"{place}{key} is no known key{hint}; known keys of {section}: {', '.join(known) or 'none'}"
+    return f"{_format_place(origin)}{key} is unknown{hint}; known keys of {section}: {', '.join(known) or 'none'}"
+
+
+def _format_place(origin: str) -> str:
+    """Return the prefix that names a file; an override on the command line is not a place to look for."""
+    return "" if origin.startswith("--set") else f"{origin}: "

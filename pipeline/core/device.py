@@ -1,4 +1,4 @@
-"""Where the heavy arithmetic runs: on the processor or on a CUDA graphics card."""
+"""Choice of the compute device: the CPU or a CUDA GPU."""
 
 from typing import Literal
 
@@ -11,17 +11,21 @@ DeviceChoice = Literal["auto", "cpu", "cuda"]
 
 
 def select_device(choice: DeviceChoice, option: str) -> torch.device:
-    """The device that a choice means on this machine; `auto` takes a graphics card where torch can use one.
+    """Return the device for a value of a `device` option; `auto` selects a CUDA GPU where torch can use one.
+
+    Args:
+        choice: value of the option.
+        option: name of the option with its section, for the message.
 
     Raises:
-        UserError: `cuda` is asked for and torch sees no such card; `option` names the option to change.
+        UserError: the choice is `cuda` and torch finds no CUDA GPU.
     """
     if choice == "cpu" or (choice == "auto" and not torch.cuda.is_available()):
         return CPU
     if not torch.cuda.is_available():
-        reason = "sees no CUDA graphics card" if torch.version.cuda else "was built without CUDA"
+        reason = "finds no CUDA GPU" if torch.version.cuda else "was built without CUDA"
         raise UserError(
-            f"{option}=cuda, but torch {torch.__version__} {reason}; `make venv EXTRA=cuda` installs the CUDA build, "
-            f"{option}=cpu does without"
+            f"{option}=cuda, but torch {torch.__version__} {reason}: install the CUDA build with "
+            f"`make venv EXTRA=cuda`, or set {option}=cpu"
         )
     return torch.device("cuda", torch.cuda.current_device())

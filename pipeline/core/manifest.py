@@ -1,4 +1,4 @@
-"""Manifests: what a finished stage read, wrote and cost. Only `fingerprint` decides whether it is still fresh."""
+"""Manifests: inputs, outputs and cost of a finished stage. Only `fingerprint` decides whether the stage is fresh."""
 
 import hashlib
 import json
@@ -11,12 +11,20 @@ from pipeline.core.errors import UserError
 
 MANIFEST_FILE = "manifest.json"
 PROGRESS_FILE = "progress.csv"
-"""How a stage's work went, second by second: a result like others, but never the same twice."""
+"""Output with the progress of a stage over time. It differs between equal runs, so no fingerprint depends on it."""
 
 
 @dataclass(frozen=True)
 class Manifest:
-    """The record beside a stage's artifacts; `outputs` maps each file's relative path to its SHA-256."""
+    """Record of one finished stage, stored in its folder.
+
+    config: values of the stage's own options.
+    inputs: digest of each input, by name.
+    outputs: SHA-256 of each file, by relative POSIX path.
+    metrics: what the stage measured; None for a value that is not finite.
+    seconds, peak_rss_mib: cost of the run that made it (of its last part if `resumed` from a checkpoint).
+    environment: see `pipeline.core.measure.describe_environment`.
+    """
 
     stage: str
     version: int
@@ -33,7 +41,7 @@ class Manifest:
 
     @property
     def outputs_digest(self) -> str:
-        """One digest for all outputs but the record of progress: what a downstream stage's fingerprint depends on."""
+        """Digest of all outputs except `PROGRESS_FILE`; the fingerprints of later stages depend on it."""
         return digest_json({name: digest for name, digest in self.outputs.items() if name != PROGRESS_FILE})
 
 
@@ -43,53 +51,61 @@ def write_manifest(manifest: Manifest, path: Path) -> None:
 
 
 def read_manifest(folder: Path) -> Manifest | None:
-    """Read `folder/manifest.json`: None where there is none, UserError where it is damaged."""
+    """Read `folder/manifest.json`; return None if it does not exist.
+
+    Raises:
+        UserError: the file is damaged or has the fields of another version.
+    """
     path = folder / MANIFEST_FILE
     try:
         return Manifest(**json.loads(path.read_text(encoding="utf-8")))
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (ValueError, TypeError):
-        raise UserError(f"{path} is damaged or of another version: delete {folder} and run the stage again") from None
+        raise UserError(f"{path} is damaged or from another version: delete {folder} and run the stage again") from None
 
 
 def fingerprint(stage: str, version: int, config: Mapping[str, Any], inputs: Mapping[str, str]) -> str:
-    """Digest of everything that decides a stage's result: name, version, its own config, what it reads."""
+    """Digest everything that determines the result of a stage: name, version, own options, digests of the inputs."""
     return digest_json({"stage": stage, "version": version, "config": config, "inputs": inputs})
 
 
 def digest_json(value: Any) -> str:
-    """SHA-256 of the canonical JSON text of `value`."""
+    """Return the SHA-256 of the canonical JSON text of `value`, in hexadecimal."""
     return hashlib.sha256(json.dumps(value, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 def digest_file(path: Path) -> str:
-    """SHA-256 of a file's content."""
+    """Return the SHA-256 of the content of a file, in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def digest_video(path: Path) -> str:
-    """Digest of the user's video: a file's content, or names and contents of a folder (hidden files left out)."""
+    """Digest the user's video: the content of a file, or names and contents of a folder's files except hidden ones.
+
+    Raises:
+        UserError: the path is neither a file nor a folder.
+    """
     if path.is_file():
         return digest_file(path)
     if not path.is_dir():
-        raise UserError(f"{path} is no file and no folder: give the video with --video")
+        raise UserError(f"{path} is neither a file nor a folder: name the video with --video")
     return digest_json({name: digest_file(path / name) for name in list_files(path) if not _is_hidden(name)})
 
 
 def digest_files(folder: Path) -> dict[str, str]:
-    """SHA-256 of every file under `folder`, its manifest left out, by sorted relative path."""
+    """Return the SHA-256 of every file under `folder` except its manifest, by relative POSIX path, sorted."""
     return {name: digest_file(folder / name) for name in list_files(folder) if name != MANIFEST_FILE}
 
 
 def list_files(folder: Path) -> list[str]:
-    """Relative POSIX paths of all files under `folder`, sorted."""
+    """Return the relative POSIX paths of all files under `folder`, sorted."""
     return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
 
 
 def find_damaged_files(folder: Path) -> list[str]:
-    """Names of the outputs that are missing, changed or strange, against the manifest; empty when all is whole."""
+    """Compare a folder with its manifest: return the paths of missing, changed and unknown files, sorted."""
     manifest = read_manifest(folder)
     if manifest is None:
         return [MANIFEST_FILE]

@@ -1,62 +1,69 @@
-"""What a run cost and where it ran: peak memory, processor, packages, commit. Recorded, never used for freshness."""
+"""Cost and environment of a run: peak memory, processor, packages, commit. Recorded, never used for freshness."""
 
 import os
 import platform
 import re
-import resource
 import subprocess
 import sys
 from collections.abc import Iterable
+from functools import cache
 from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any
 
-REPOSITORY_DIR = Path(__file__).resolve().parents[2]
-MIB = 1024.0 * 1024.0
+if sys.platform != "win32":
+    import resource
 
+REPOSITORY_DIR = Path(__file__).resolve().parents[2]
+"""Root of the checkout; in an installation, the folder that holds the packages."""
+
+MIB = 1024.0 * 1024.0
 
 _worker_peaks_mib: dict[int, float] = {}
 
 
 def record_worker_peaks(pids: Iterable[int]) -> None:
-    """Add the peaks of these processes to `peak_rss_mib`; call it at the end of their work, while they still live."""
-    _worker_peaks_mib.update({pid: peak for pid in pids if (peak := _process_peak_rss_mib(str(pid))) is not None})
+    """Add the peak memory of processes, which must still be running, to `peak_rss_mib`. No effect but on Linux."""
+    _worker_peaks_mib.update({pid: peak for pid in pids if (peak := _linux_peak_rss_mib(str(pid))) is not None})
 
 
 def peak_rss_mib() -> float:
-    """Highest resident memory so far, in MiB: this process's and the peaks of the workers that were counted.
+    """Return the peak resident memory so far, in MiB: of this process plus its recorded worker processes.
 
-    More than was held at once where the peaks did not coincide, and pages that processes share count for each. At
-    least what the largest finished child had: the system tells that one alone, and outside Linux nothing else.
+    An upper bound: the peaks need not coincide, and pages that processes share count for each of them. At least the
+    peak of the largest finished child process, which is all that systems other than Linux report of children;
+    Windows reports none.
     """
-    # Not getrusage's figure for this process, where there is another: it also counts the parent that started it.
-    own = _process_peak_rss_mib("self")
-    together = (_maxrss_mib(resource.RUSAGE_SELF) if own is None else own) + sum(_worker_peaks_mib.values())
-    return max(together, _maxrss_mib(resource.RUSAGE_CHILDREN))
+    if sys.platform == "win32":
+        return _windows_peak_rss_mib()
+    # On Linux not the value of getrusage: it includes the memory of the parent at the time of the fork.
+    own = _linux_peak_rss_mib("self")
+    total = (_maxrss_mib(resource.RUSAGE_SELF) if own is None else own) + sum(_worker_peaks_mib.values())
+    return max(total, _maxrss_mib(resource.RUSAGE_CHILDREN))
 
 
-def environment() -> dict[str, Any]:
-    """Commit, Python, packages, processor, cores and graphics card of this run."""
+def describe_environment() -> dict[str, Any]:
+    """Return commit, Python, packages, processor, cores and GPU of this process, as JSON values."""
     return {
-        "commit": _commit(),
+        "commit": _commit(REPOSITORY_DIR),
         "python": platform.python_version(),
         "platform": platform.platform(),
         "cpu": cpu_name(),
         "cores": os.cpu_count(),
         "gpu": _gpu_name(),
-        "packages": dict(sorted((d.metadata["Name"], d.version) for d in distributions())),
+        "packages": dict(_packages()),
     }
 
 
 def cpu_name() -> str:
-    """The processor's model name."""
+    """Return the model name of the processor, or its architecture where the system does not report the model."""
     cpuinfo = Path("/proc/cpuinfo")
     found = re.search(r"^model name\s*:\s*(.+)$", cpuinfo.read_text(), re.MULTILINE) if cpuinfo.exists() else None
     return found.group(1) if found else platform.processor() or platform.machine()
 
 
-def _process_peak_rss_mib(process: str) -> float | None:
-    """VmHWM of a process in Linux's /proc; None elsewhere, and when the process is gone."""
+def _linux_peak_rss_mib(process: str) -> float | None:
+    """Return VmHWM of a process, see proc_pid_status(5); None on other systems, and when the process has ended."""
     try:
         status = Path(f"/proc/{process}/status").read_text()
     except (FileNotFoundError, ProcessLookupError):
@@ -65,15 +72,45 @@ def _process_peak_rss_mib(process: str) -> float | None:
     return int(found.group(1)) * 1024 / MIB if found else None
 
 
-def _maxrss_mib(who: int) -> float:
-    unit_bytes = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(who).ru_maxrss * unit_bytes / MIB
+if sys.platform == "win32":
+
+    def _windows_peak_rss_mib() -> float:
+        """Return PeakWorkingSetSize of this process (GetProcessMemoryInfo)."""
+        import ctypes
+        from ctypes import wintypes
+
+        class ProcessMemoryCounters(ctypes.Structure):
+            _fields_ = (
+                ("cb", wintypes.DWORD),
+                ("PageFaultCount", wintypes.DWORD),
+                ("PeakWorkingSetSize", ctypes.c_size_t),
+                *((f"unused{number}", ctypes.c_size_t) for number in range(7)),
+            )
+
+        counters = ProcessMemoryCounters(cb=ctypes.sizeof(ProcessMemoryCounters))
+        process = wintypes.HANDLE(ctypes.windll.kernel32.GetCurrentProcess())
+        ctypes.windll.kernel32.K32GetProcessMemoryInfo(process, ctypes.byref(counters), counters.cb)
+        return counters.PeakWorkingSetSize / MIB
+
+else:
+
+    def _maxrss_mib(who: int) -> float:
+        unit_bytes = 1 if sys.platform == "darwin" else 1024
+        return resource.getrusage(who).ru_maxrss * unit_bytes / MIB
 
 
-def _commit() -> str | None:
-    """The checked-out commit, with `+` when files differ from it; None outside a checkout."""
+@cache
+def _packages() -> tuple[tuple[str, str], ...]:
+    return tuple(sorted((d.metadata["Name"], d.version) for d in distributions()))
+
+
+@cache
+def _commit(repository: Path) -> str | None:
+    """Return the checked-out commit, with `+` when files differ from it; None outside a checkout of this project."""
+    if not (repository / ".git").exists():
+        return None
+    describe = ["git", "-C", str(repository), "describe", "--always", "--abbrev=40", "--dirty=+", "--exclude=*"]
     try:
-        describe = ["git", "-C", str(REPOSITORY_DIR), "describe", "--always", "--abbrev=40", "--dirty=+", "--exclude=*"]
         done = subprocess.run(describe, capture_output=True, text=True, check=False)
     except FileNotFoundError:
         return None
@@ -81,9 +118,9 @@ def _commit() -> str | None:
 
 
 def _gpu_name() -> str | None:
-    """The first CUDA device, if the stage that ran has loaded torch; this module does not load it.
+    """Return the name of the first CUDA device if the stage has loaded torch; this module does not load it.
 
-    None also where a card lets nobody in (busy in exclusive mode): its name is not worth the finished work.
+    None also for a GPU that refuses access, for instance in exclusive mode: the finished work is worth more.
     """
     torch = sys.modules.get("torch")
     try:

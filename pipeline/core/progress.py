@@ -1,57 +1,94 @@
-"""Progress on long loops and warnings that a run goes on with; both go to standard error."""
+"""Progress of long loops, and warnings about which the user should know although the run continues.
+
+Both go to standard error. A listener receives the progress as well: the runner uses one to report to its caller.
+"""
 
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sized
-from typing import TypeVar
+from collections.abc import Callable, Iterable, Iterator, Sized
+from contextlib import contextmanager
+from typing import Any, TextIO, TypeVar
 
 from tqdm import tqdm
 
 Item = TypeVar("Item")
+LoopListener = Callable[[str, int, int | None], None]
+"""Called with the label of a loop, its finished items, and their total (None if unknown)."""
 
 LOG_INTERVAL_S = 10.0
+LISTENER_INTERVAL_S = 0.2
 
 _warnings: list[str] = []
+_listeners: list[LoopListener] = []
 
 
 def track(iterable: Iterable[Item], label: str, total: int | None = None, initial: int = 0) -> Iterator[Item]:
-    """Yield the items of `iterable` while showing how far the loop is.
+    """Yield the items of `iterable` and show the progress: a bar on a terminal, a line every 10 s in a log file.
 
-    label: what the loop does, a few words.
-    total: number of items; taken from `len(iterable)` where that exists.
-    initial: items done before this loop, when work goes on from a checkpoint (counted in `total`).
-
-    A terminal sees a bar; a log file sees a line every ten seconds.
+    Args:
+        label: what the loop does, a few words.
+        total: number of items; default `len(iterable)` where it exists.
+        initial: items that were done before this loop, when work resumes from a checkpoint (counted in `total`).
     """
     if total is None and isinstance(iterable, Sized):
         total = initial + len(iterable)
-    if sys.stderr.isatty():
-        yield from tqdm(iterable, desc=label, total=total, initial=initial, leave=False, dynamic_ncols=True)
-    else:
-        yield from _track_to_log(iterable, label, total, initial)
-
-
-def _track_to_log(iterable: Iterable[Item], label: str, total: int | None, initial: int) -> Iterator[Item]:
-    """Yield the items; print a line when `LOG_INTERVAL_S` have passed since the last one."""
-    start = last = time.monotonic()
-    for done, item in enumerate(iterable, start=1):
+    last_report_s = -LISTENER_INTERVAL_S
+    for done, item in enumerate(_progress_bar(iterable, label, total, initial), start=initial + 1):
         yield item
-        now = time.monotonic()
-        if now - last >= LOG_INTERVAL_S:
-            last = now
-            count = f"{initial + done}/{total}" if total else f"{initial + done}"
-            remaining_text = f", {(now - start) / done * (total - initial - done):.0f} s left" if total else ""
-            print(f"{label}: {count}{remaining_text}", file=sys.stderr, flush=True)
+        if _listeners and (done == total or time.monotonic() - last_report_s >= LISTENER_INTERVAL_S):
+            last_report_s = time.monotonic()
+            for listener in _listeners:
+                listener(label, done, total)
 
 
 def warn(message: str) -> None:
-    """Say what the run goes on without; the message also goes into the stage's manifest."""
+    """Print a warning; the manifest of the stage records it as well."""
     _warnings.append(message)
     tqdm.write(f"warning: {message}", file=sys.stderr)
 
 
 def take_warnings() -> list[str]:
-    """Return the warnings since the last call, and forget them."""
+    """Return the warnings since the last call, and clear them."""
     messages = list(_warnings)
     _warnings.clear()
     return messages
+
+
+@contextmanager
+def listen(listener: LoopListener) -> Iterator[None]:
+    """Report the loops of the block to `listener`, at most every `LISTENER_INTERVAL_S` and after the last item."""
+    _listeners.append(listener)
+    try:
+        yield
+    finally:
+        _listeners.remove(listener)
+
+
+class _LogLines:
+    """File for tqdm that writes each state of the bar as a line of its own."""
+
+    def __init__(self, file: TextIO) -> None:
+        self._file = file
+
+    def write(self, text: str) -> None:
+        """Write the text without the characters that move the cursor."""
+        line = text.strip()
+        if line:
+            self._file.write(f"{line}\n")
+
+    def flush(self) -> None:
+        """Flush the log."""
+        self._file.flush()
+
+
+def _progress_bar(iterable: Iterable[Item], label: str, total: int | None, initial: int) -> "tqdm[Item]":
+    if sys.stderr.isatty():
+        style: dict[str, Any] = {"dynamic_ncols": True}
+    else:
+        style = {
+            "file": _LogLines(sys.stderr),
+            "mininterval": LOG_INTERVAL_S,
+            "delay": LOG_INTERVAL_S,
+            "bar_format": "{desc}: {n_fmt}/{total_fmt} [{elapsed}<{remaining}]",
+        }
+    return tqdm(iterable, desc=label, total=total, initial=initial, leave=False, **style)

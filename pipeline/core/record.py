@@ -1,13 +1,13 @@
-"""What a run remembers in `run.json`: its video, preset and overrides, so that any command can go on with it."""
+"""Record of a run in `run.json`: its video, preset and overrides, which later commands reuse."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from pipeline.core.atomic import atomic_path
-from pipeline.core.config import PRESET_SUFFIXES, parse_overrides
+from pipeline.core.config import PRESET_SUFFIXES
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import digest_video
 
@@ -16,7 +16,7 @@ RUN_FILE = "run.json"
 
 @dataclass(frozen=True)
 class RunRecord:
-    """The inputs of a run: an absolute video path (None until given), a preset, dotted overrides."""
+    """Inputs of a run: absolute path of the video (None until it is known), preset, overrides by `section.key`."""
 
     video: str | None = None
     preset: str = "default"
@@ -24,23 +24,27 @@ class RunRecord:
 
     @property
     def video_path(self) -> Path | None:
-        """The video as a path."""
+        """Path of the video, or None."""
         return Path(self.video) if self.video else None
 
 
 def read_record(run_dir: Path) -> RunRecord:
-    """Read the run's record; an empty one where there is none."""
+    """Read the record of a run; return an empty record if there is none.
+
+    Raises:
+        UserError: `run.json` is damaged.
+    """
     path = run_dir / RUN_FILE
     if not path.exists():
         return RunRecord()
     try:
         return RunRecord(**json.loads(path.read_text(encoding="utf-8")))
     except (ValueError, TypeError):
-        raise UserError(f"{path} is damaged: delete it and give --video again") from None
+        raise UserError(f"{path} is damaged: delete it and name the video again with --video") from None
 
 
 def write_record(record: RunRecord, run_dir: Path) -> None:
-    """Write the run's record, whole or not at all."""
+    """Write the record of a run atomically."""
     with atomic_path(run_dir / RUN_FILE) as path:
         path.write_text(json.dumps(asdict(record), indent=2) + "\n", encoding="utf-8")
 
@@ -50,30 +54,36 @@ def update_record(
     run_dir: Path,
     video: Path | None,
     preset: str | None,
-    assignments: Sequence[str],
+    overrides: Mapping[str, Any],
     replace_video: bool,
 ) -> RunRecord:
-    """The record after a command's options: a preset starts its overrides anew, `--set` adds to them.
+    """Apply the options of a command to a record: a new preset clears the earlier overrides, overrides accumulate.
 
-    UserError when the run belongs to another video and `replace_video` is False, or when the video holds the run.
+    Args:
+        video, preset: None keeps the recorded value.
+        overrides: values by `section.key`.
+        replace_video: whether a run may change to a video with other content.
+
+    Raises:
+        UserError: the video does not exist, contains the run folder, or differs from the recorded one.
     """
     if video is not None:
         record = replace(record, video=str(_checked_video(record, run_dir, video, replace_video)))
     if preset is not None:
         is_file = preset.endswith(PRESET_SUFFIXES)
         record = replace(record, preset=str(Path(preset).resolve()) if is_file else preset, overrides={})
-    return replace(record, overrides={**record.overrides, **parse_overrides(assignments)})
+    return replace(record, overrides={**record.overrides, **overrides})
 
 
 def _checked_video(record: RunRecord, run_dir: Path, video: Path, replace_video: bool) -> Path:
     if not video.exists():
-        raise UserError(f"video {video} does not exist: give a video file or a folder of images")
+        raise UserError(f"video {video} does not exist: name a video file or a folder of images")
     video = video.resolve()
     if video.is_dir() and run_dir.resolve().is_relative_to(video):
-        raise UserError(f"run {run_dir} lies inside the video folder, which stays untouched: choose another --run")
+        raise UserError(f"run {run_dir} is inside the video folder, which is never written: choose another --run")
     known = record.video_path
     if known is None or known == video or replace_video:
         return video
     if known.exists() and digest_video(known) == digest_video(video):
         return video
-    raise UserError(f"{run_dir} was made from {known}, not {video}: choose another --run, or replace it with --force")
+    raise UserError(f"{run_dir} belongs to the video {known}, not {video}: choose another --run, or use --force")

@@ -1,139 +1,216 @@
-"""Run all stages in order, each in a process of its own: memory is measured per stage, a crash stays in one."""
+"""Run the stages of a pipeline in order, each in a process of its own.
 
+A process for each stage makes its peak memory measurable, returns its memory, and confines a crash to the stage.
+"""
+
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
-from pipeline.core.config import Config, build_config, check_sections, load_layers
 from pipeline.core.errors import UserError
-from pipeline.core.lock import child_environment
-from pipeline.core.manifest import find_damaged_files, read_manifest
-from pipeline.core.record import RunRecord
-from pipeline.core.stage import Stage, discard_work_dir, plan_stage
+from pipeline.core.events import EVENTS_VARIABLE, parse_event
+from pipeline.core.lock import RunLock
+from pipeline.core.manifest import read_manifest
+from pipeline.core.pipeline import Pipeline
+from pipeline.core.progress import listen
+from pipeline.core.record import write_record
+from pipeline.core.run_folder import RunRequest, StageFailedError, open_run
+from pipeline.core.stage import StagePlan, discard_work_dir, plan_stage, run_stage
 
+EXIT_USER_ERROR = 2
 EXIT_INTERRUPTED = 130
-FRESH = "fresh"
 
 
 @dataclass(frozen=True)
 class StageOutcome:
-    """One line of the summary: `state` is cached or run; seconds and peak memory come from the manifest."""
+    """Result of one stage: whether it ran, and what its manifest says it cost, now or when it ran."""
 
     stage: str
-    state: str
+    state: Literal["cached", "run"]
     seconds: float
     peak_rss_mib: float
 
 
-class StageFailedError(Exception):
-    """A stage's process ended with `code` after it said why."""
+@dataclass(frozen=True)
+class Progress:
+    """Progress of a pipeline.
 
-    def __init__(self, code: int) -> None:
-        super().__init__(f"exit status {code}")
-        self.code = code
+    stage, number, count: name of the current stage, its number from 1, and the number of stages.
+    state: "cached" (the result is fresh), "running" or "done".
+    task, done, total: label of the current loop of the stage, its finished items and their number (None if unknown).
+    """
+
+    stage: str
+    number: int
+    count: int
+    state: Literal["cached", "running", "done"]
+    task: str = ""
+    done: int = 0
+    total: int | None = None
 
 
-def build_configs(stages: Sequence[Stage], record: RunRecord, config_dir: Path) -> dict[str, Config]:
-    """Check the whole configuration before any work: every section known, every value allowed."""
-    layers = load_layers(record.preset, record.overrides, config_dir)
-    check_sections(layers, [stage.name for stage in stages])
-    return {stage.name: build_config(stage.name, stage.config, layers) for stage in stages}
+ProgressCallback = Callable[[Progress], None]
 
 
-def run_all(
-    stages: Sequence[Stage],
-    configs: dict[str, Config],
-    run_dir: Path,
-    record: RunRecord,
-    lock_fd: int,
-    is_forced: Callable[[str], bool],
-) -> list[StageOutcome]:
-    """Bring every stage up to date, in order; what is fresh already is left alone."""
+@dataclass(frozen=True)
+class RunOptions:
+    """How to run a pipeline.
+
+    forced: names of the stages that run even if their result is fresh.
+    isolate: whether each stage runs in a process of its own.
+    progress: called when a stage starts or ends and several times a second while it runs. An exception that it raises
+        stops the run; the next run resumes. None: standard output of the stages is passed on unchanged.
+    """
+
+    forced: Sequence[str] = ()
+    isolate: bool = True
+    progress: ProgressCallback | None = None
+
+
+def run_pipeline(pipeline: Pipeline, request: RunRequest, options: RunOptions) -> list[StageOutcome]:
+    """Bring all stages of a run folder up to date, in order; a stage with a fresh result is skipped.
+
+    Raises:
+        UserError: the request, the configuration or the video is not valid, or a stage refused its input.
+        StageFailedError: the process of a stage failed.
+    """
     outcomes = []
-    for number, stage in enumerate(stages, start=1):
-        plan = plan_stage(stage, configs[stage.name], run_dir, record.video_path)
-        fresh = plan.is_fresh() and not is_forced(stage.name)
-        print(f"[{number}/{len(stages)}] {stage.name}{': cached' if fresh else ''}", file=sys.stderr, flush=True)
-        if fresh:
-            discard_work_dir(plan)
-        else:
-            _run_in_child(stage.name, run_dir, lock_fd, is_forced(stage.name))
-        manifest = read_manifest(plan.folder)
-        if manifest is None:
-            raise UserError(f"{plan.folder} disappeared while the run went on: run the same command again")
-        outcomes.append(StageOutcome(stage.name, "cached" if fresh else "run", manifest.seconds, manifest.peak_rss_mib))
+    with open_run(request) as (record, lock):
+        stages = pipeline.load_stages()
+        configs = pipeline.build_configs(record)
+        write_record(record, request.run_dir)
+        for number, stage in enumerate(stages, start=1):
+            plan = plan_stage(stage, configs[stage.name], request.run_dir, record.video_path)
+            runner = _StageRunner(pipeline, plan, lock, options, number)
+            outcomes.append(runner.run())
     return outcomes
 
 
-def _run_in_child(name: str, run_dir: Path, lock_fd: int, force: bool) -> None:
-    command = [sys.executable, "-m", f"stages.{name}", str(run_dir), *(["--force"] if force else [])]
-    child = subprocess.Popen(command, env=child_environment(lock_fd), pass_fds=(lock_fd,))
-    try:
-        code = child.wait()
-    except KeyboardInterrupt:
-        child.wait()
-        raise
-    if code < 0:
-        raise UserError(
-            f"stage {name} was killed by signal {-code} (9 is often the system out of memory): "
-            f"the same command goes on from here"
+@dataclass(frozen=True)
+class _StageRunner:
+    """One stage in one run."""
+
+    pipeline: Pipeline
+    plan: StagePlan
+    lock: RunLock
+    options: RunOptions
+    number: int
+
+    def run(self) -> StageOutcome:
+        """Bring the stage up to date."""
+        name = self.plan.stage.name
+        is_forced = name in self.options.forced
+        is_fresh = self.plan.is_fresh() and not is_forced
+        count = len(self.pipeline.names)
+        print(f"[{self.number}/{count}] {name}{': cached' if is_fresh else ''}", file=sys.stderr, flush=True)
+        self._report("cached" if is_fresh else "running")
+        if is_fresh:
+            discard_work_dir(self.plan)
+        elif self.options.isolate:
+            self._run_in_child(is_forced)
+        else:
+            self._run_here(is_forced)
+        manifest = read_manifest(self.plan.folder)
+        if manifest is None:
+            raise UserError(f"{self.plan.folder} was removed during the run: run the same command again")
+        if not is_fresh:
+            self._report("done")
+        return StageOutcome(name, "cached" if is_fresh else "run", manifest.seconds, manifest.peak_rss_mib)
+
+    def _report(self, state: Literal["cached", "running", "done"], **loop: Any) -> None:
+        if self.options.progress:
+            count = len(self.pipeline.names)
+            self.options.progress(Progress(self.plan.stage.name, self.number, count, state, **loop))
+
+    def _run_here(self, is_forced: bool) -> None:
+        def report_loop(label: str, done: int, total: int | None) -> None:
+            self._report("running", task=label, done=done, total=total)
+
+        with listen(report_loop) if self.options.progress else nullcontext():
+            run_stage(self.plan, is_forced)
+
+    def _run_in_child(self, is_forced: bool) -> None:
+        """Run the stage by its command; the child imports what this process would import."""
+        name = self.plan.stage.name
+        command = [sys.executable, "-P", "-m", self.pipeline.package, name, str(self.plan.run_dir)]
+        command += ["--force"] if is_forced else []
+        environment = self.lock.child_environment() | {"PYTHONPATH": os.pathsep.join(_import_path())}
+        has_events = self.options.progress is not None
+        if has_events:
+            environment[EVENTS_VARIABLE] = "1"
+        child = subprocess.Popen(
+            command,
+            env=environment,
+            pass_fds=self.lock.passed_descriptors,
+            stdout=subprocess.PIPE if has_events else None,
+            text=True,
+            encoding="utf-8",
         )
-    if code == EXIT_INTERRUPTED:
-        raise KeyboardInterrupt
-    if code:
-        raise StageFailedError(code)
+        try:
+            message = self._forward_output(child)
+            code = child.wait()
+        except KeyboardInterrupt:
+            child.wait()  # Ctrl-C reaches the child as well
+            raise
+        finally:
+            _end(child)
+        self._check_exit_status(code, message)
+
+    def _forward_output(self, child: "subprocess.Popen[str]") -> str:
+        """Report the events of a child and print its other output; return its error message, empty without one."""
+        message = ""
+        for line in child.stdout or ():
+            event = parse_event(line)
+            if event is None:
+                print(line, end="")
+            elif "error" in event:
+                message = event["error"]
+            else:
+                self._report("running", task=event["label"], done=event["done"], total=event["total"])
+        return message
+
+    def _check_exit_status(self, code: int, message: str) -> None:
+        name = self.plan.stage.name
+        if code < 0:
+            raise UserError(
+                f"stage {name} was killed by signal {-code} (9 often means that memory ran out): "
+                "run the same command again to resume"
+            )
+        if code == EXIT_INTERRUPTED:
+            raise KeyboardInterrupt
+        if code == EXIT_USER_ERROR and message:
+            raise UserError(message)
+        if code:
+            raise StageFailedError(name, code)
 
 
-def summary(outcomes: Sequence[StageOutcome], wall_s: float) -> str:
-    """The table at the end of a run; cached stages show what they cost when they ran."""
+def _import_path() -> list[str]:
+    """Return `sys.path` as absolute paths."""
+    return [str(Path(folder).absolute()) for folder in sys.path]
+
+
+def _end(child: "subprocess.Popen[str]") -> None:
+    """Stop a child that is still running and close its output."""
+    if child.poll() is None:
+        child.terminate()
+        child.wait()
+    if child.stdout:
+        child.stdout.close()
+
+
+def format_summary(outcomes: Sequence[StageOutcome], wall_s: float) -> str:
+    """Format the table at the end of a run; a cached stage shows what it cost when it ran.
+
+    Args:
+        wall_s: duration of the command, in seconds.
+    """
     lines = [f"{'stage':<10} {'state':<7} {'seconds':>9} {'peak MiB':>9}"]
     lines += [f"{o.stage:<10} {o.state:<7} {o.seconds:>9.1f} {o.peak_rss_mib:>9.0f}" for o in outcomes]
     seconds, peak_mib = sum(o.seconds for o in outcomes), max((o.peak_rss_mib for o in outcomes), default=0.0)
     lines += [f"{'total':<10} {'':<7} {seconds:>9.1f} {peak_mib:>9.0f}", f"this command took {wall_s:.1f} s"]
     return "\n".join(lines)
-
-
-def status(stages: Sequence[Stage], configs: dict[str, Config], run_dir: Path, record: RunRecord) -> str:
-    """A table of what is there: the state of every stage and what it cost."""
-    lines = []
-    for name, state in stage_states(stages, configs, run_dir, record).items():
-        manifest = read_manifest(run_dir / name)
-        cost = f"{manifest.seconds:>9.1f} s {manifest.peak_rss_mib:>7.0f} MiB" if manifest else ""
-        lines.append(f"{name:<10} {state:<18} {cost}".rstrip())
-    return "\n".join(lines)
-
-
-def stage_states(
-    stages: Sequence[Stage], configs: dict[str, Config], run_dir: Path, record: RunRecord
-) -> dict[str, str]:
-    """Of every stage, in order: fresh, stale, unfinished, missing, or waiting for a stage before it."""
-    states: dict[str, str] = {}
-    for stage in stages:
-        states[stage.name] = _state(stage, configs[stage.name], run_dir, record, states)
-    return states
-
-
-def _state(stage: Stage, config: Config, run_dir: Path, record: RunRecord, states: dict[str, str]) -> str:
-    blocking_stage = next((need for need in stage.needs if states.get(need, FRESH) != FRESH), None)
-    folder_exists = (run_dir / stage.name).exists()
-    if folder_exists and not blocking_stage and plan_stage(stage, config, run_dir, record.video_path).is_fresh():
-        return FRESH
-    if (run_dir / f"{stage.name}.part").exists():
-        return "unfinished"
-    if blocking_stage:
-        return f"waits for {blocking_stage}"
-    return "stale" if folder_exists else "missing"
-
-
-def verify(stages: Sequence[Stage], run_dir: Path) -> str:
-    """Digest every finished artifact again; a table when all are whole, else UserError naming the damage."""
-    finished = [stage.name for stage in stages if (run_dir / stage.name).exists()]
-    for name in finished:
-        damage = find_damaged_files(run_dir / name)
-        if damage:
-            raise UserError(
-                f"{run_dir / name} is damaged ({', '.join(damage[:5])}): python -m stages --run {run_dir} --from {name}"
-            )
-    return "\n".join(f"{name:<10} whole" for name in finished) or f"{run_dir} holds no finished stage"

@@ -1,9 +1,7 @@
-"""A stage: a named function from input folders to an output folder, run whole or not at all.
+"""A stage: a named function from input folders to an output folder, which exists complete or not at all.
 
-Work happens in `<stage>.work_dir/`. What a killed run leaves there survives only as `checkpoint*` files, and only for
-a run
-with the same fingerprint; everything else is written anew. A finished folder gets its manifest, is flushed to disk,
-and appears under its name with one rename.
+The work happens in `<stage>.part/`. After a kill, only `checkpoint*` files remain valid there, and only for a run with
+the same fingerprint. A finished folder gets its manifest, is flushed to disk, and is renamed to `<stage>/`.
 """
 
 import math
@@ -16,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.core.atomic import atomic_path, fsync_path
+from pipeline.core.command import format_command
 from pipeline.core.config import Config
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import (
@@ -27,7 +26,7 @@ from pipeline.core.manifest import (
     read_manifest,
     write_manifest,
 )
-from pipeline.core.measure import environment, peak_rss_mib
+from pipeline.core.measure import describe_environment, peak_rss_mib
 from pipeline.core.progress import take_warnings
 
 VIDEO = "video"
@@ -37,12 +36,12 @@ CHECKPOINT_PREFIX = "checkpoint"
 
 @dataclass(frozen=True)
 class Stage:
-    """One arrow of the pipeline.
+    """One step of the pipeline.
 
-    name: the module, the config section, the folder and the command.
+    name: name of the module, the config section, the folder and the command.
     version: raised when the meaning of the outputs changes.
-    needs: names of the stages it reads, or "video" for the user's file or folder.
-    makes: files and folders that others rely on: they exist, not empty, when it has run. It may make more.
+    needs: names of the stages that it reads, or "video" for the user's file or folder.
+    makes: files and folders on which later stages rely; not empty after a run. Other outputs are allowed.
     run: `run(inputs, out, config) -> metrics`; `inputs` maps each need to its path, `out` is the folder to fill.
     """
 
@@ -56,7 +55,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class StagePlan:
-    """What one stage would do in one run folder: its inputs, its fingerprint, and whether the result is there."""
+    """A stage in one run folder: its inputs with their digests, and the fingerprint of the result."""
 
     stage: Stage
     config: Config
@@ -67,16 +66,16 @@ class StagePlan:
 
     @property
     def folder(self) -> Path:
-        """Where the finished artifacts lie."""
+        """Folder of the finished artifacts."""
         return self.run_dir / self.stage.name
 
     @property
     def work_dir(self) -> Path:
-        """Where the work happens."""
+        """Folder of unfinished work."""
         return self.run_dir / f"{self.stage.name}.part"
 
     def is_fresh(self) -> bool:
-        """True when the folder holds the result of just this fingerprint, with every file in its place."""
+        """Return True if the folder holds the result of this fingerprint and no file is missing."""
         manifest = read_manifest(self.folder)
         return (
             manifest is not None
@@ -86,27 +85,42 @@ class StagePlan:
 
 
 def plan_stage(stage: Stage, config: Config, run_dir: Path, video: Path | None) -> StagePlan:
-    """Find a stage's inputs and fingerprint; raise UserError naming the command when an input is missing."""
+    """Find the inputs of a stage and compute the fingerprint of its result.
+
+    Args:
+        video: the user's file or folder; None if it is not known yet.
+
+    Raises:
+        UserError: an input is missing; the message names the command that makes it.
+    """
     inputs, digests = {}, {}
     for need in stage.needs:
         if need == VIDEO:
             if video is None:
-                raise UserError(f"{run_dir} has no video yet: python -m stages --run {run_dir} --video FILE_OR_FOLDER")
+                command = format_command("--run", run_dir, "--video", "FILE_OR_FOLDER")
+                raise UserError(f"{run_dir} has no video yet: {command}")
             inputs[need], digests[need] = video, digest_video(video)
             continue
         manifest = read_manifest(run_dir / need)
         if manifest is None:
-            raise UserError(f"{stage.name} needs {run_dir / need}, which is missing: python -m stages.{need} {run_dir}")
+            raise UserError(f"{stage.name} needs {run_dir / need}, which is missing: {format_command(need, run_dir)}")
         inputs[need], digests[need] = run_dir / need, manifest.outputs_digest
     key = fingerprint(stage.name, stage.version, config.model_dump(mode="json"), digests)
     return StagePlan(stage, config, run_dir, inputs, digests, key)
 
 
 def run_stage(plan: StagePlan, force: bool = False) -> bool:
-    """Bring one stage up to date; return True when it ran and False when the result was there already.
+    """Run a stage unless its result is fresh; return whether it ran.
 
-    Bad input, a full disk or too little memory removes the unfinished folder; a kill or Ctrl-C leaves its checkpoints,
-    and the next call goes on from them.
+    Bad input, a full disk or too little memory removes the unfinished folder. A kill or Ctrl-C keeps its checkpoints,
+    from which the next call resumes.
+
+    Args:
+        force: run even if the result is fresh, from the beginning.
+
+    Raises:
+        UserError, OSError, MemoryError: from the stage.
+        RuntimeError: the stage did not make a declared output (a fault of its code).
     """
     previous = plan.run_dir / f"{plan.stage.name}.old"
     _remove(previous)
@@ -123,12 +137,12 @@ def run_stage(plan: StagePlan, force: bool = False) -> bool:
 
 
 def discard_work_dir(plan: StagePlan) -> None:
-    """Remove unfinished work, if there is any."""
+    """Remove unfinished work, if it exists."""
     _remove(plan.work_dir)
 
 
 def _execute(plan: StagePlan, force: bool) -> None:
-    """Fill the .part folder and write its manifest, unless a run killed just before the rename did so."""
+    """Fill the work folder and write its manifest, unless a run that was killed just before the rename did so."""
     if not force and _manifest_fingerprint(plan.work_dir) == plan.fingerprint:
         return
     resumed = _prepare_work_dir(plan, force)
@@ -149,7 +163,7 @@ def _execute(plan: StagePlan, force: bool) -> None:
         peak_rss_mib=round(peak_rss_mib(), 1),
         resumed=resumed,
         warnings=take_warnings(),
-        environment=environment(),
+        environment=describe_environment(),
     )
     _fsync_tree(plan.work_dir)
     with atomic_path(plan.work_dir / MANIFEST_FILE) as path:
@@ -157,7 +171,7 @@ def _execute(plan: StagePlan, force: bool) -> None:
 
 
 def _prepare_work_dir(plan: StagePlan, force: bool) -> bool:
-    """Make the .part folder ready; return True when checkpoints of a run with this fingerprint are kept in it."""
+    """Prepare the work folder; return True if it holds checkpoints of a run with the same fingerprint."""
     fingerprint_path = plan.work_dir / FINGERPRINT
     is_same_fingerprint = not force and fingerprint_path.is_file() and fingerprint_path.read_text() == plan.fingerprint
     if not is_same_fingerprint:
@@ -174,7 +188,7 @@ def _prepare_work_dir(plan: StagePlan, force: bool) -> bool:
 
 
 def _check_outputs(plan: StagePlan) -> None:
-    """A stage that does not make what it declares has a fault in its code."""
+    """Raise RuntimeError if a declared output is missing or empty."""
     for declared in plan.stage.makes:
         path = plan.work_dir / declared
         if not (any(path.iterdir()) if path.is_dir() else path.is_file() and path.stat().st_size > 0):
@@ -182,7 +196,7 @@ def _check_outputs(plan: StagePlan) -> None:
 
 
 def _publish(plan: StagePlan, previous: Path) -> None:
-    """Drop the working files and give the finished folder its name; the result it replaces goes last."""
+    """Remove the working files and rename the work folder; the result that it replaces is removed last."""
     for path in list(plan.work_dir.iterdir()):
         if _is_working_file(path.name):
             _remove(path)
@@ -203,7 +217,7 @@ def _manifest_fingerprint(folder: Path) -> str | None:
 
 
 def _remove(path: Path) -> None:
-    """Delete a file or a whole folder, if it is there."""
+    """Delete a file or a folder, if it exists."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:

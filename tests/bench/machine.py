@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numba import get_num_threads
 
-from pipeline.core.measure import cpu_name, environment
+from pipeline.core.measure import cpu_name, describe_environment
 
 RESULTS = Path(__file__).parent / "results"
 CORNERS = 8
@@ -54,7 +54,7 @@ def gather_mrow_s(rows: int, features: int, repeats: int) -> float:
 def machine_info() -> dict[str, str | int]:
     """What is measured, on what."""
     return {
-        "commit": environment()["commit"] or "unknown",
+        "commit": describe_environment()["commit"] or "unknown",
         "machine": platform.node(),
         "cpu": cpu_name(),
         "threads": torch.get_num_threads(),

@@ -1,4 +1,4 @@
-"""A file is whole or absent."""
+"""A file appears complete or not at all."""
 
 from pathlib import Path
 
@@ -32,7 +32,7 @@ def test_a_failure_leaves_the_old_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [target]
 
 
-def test_the_suffix_is_kept_for_writers_that_look_at_it(tmp_path: Path) -> None:
+def test_the_suffix_is_kept_for_the_writer(tmp_path: Path) -> None:
     with atomic_path(tmp_path / "checkpoint.npz") as path:
         np.savez(path, step=3)
     assert np.load(tmp_path / "checkpoint.npz")["step"] == 3

@@ -1,30 +1,36 @@
-"""The commands of the toy pipeline: what is cached, what runs, what is remembered, and how mistakes are answered."""
+"""Commands of the toy pipeline: what is cached, what runs, what is recorded, and how errors are reported."""
 
 import json
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
-from pipeline.core.cli import default_run_dir
+from pipeline.core.cli import main_pipeline
+from pipeline.core.command import COMMAND_VARIABLE
 from pipeline.core.errors import UserError
-from tests.core.toy_pipeline import Toy
+from pipeline.core.measure import REPOSITORY_DIR
+from pipeline.core.run_folder import default_run_dir
+from tests.core.toy.stages import PIPELINE
+from tests.core.toy_pipeline import Toy, user_environment
 
 
 def states(table: str) -> list[str]:
-    """The middle column of the summary or status table."""
-    return [line.split()[1] for line in table.splitlines() if line.split()[0] in ("read", "learn", "tell")]
+    """The second column of the summary or status table."""
+    return [line.split()[1] for line in table.splitlines() if line.split()[0] in ("read", "learn", "summarise")]
 
 
 def test_all_stages_run_and_then_are_cached(toy: Toy) -> None:
-    first = toy.all("--video", "numbers.txt")
+    first = toy.call_all("--video", "numbers.txt")
     assert first.returncode == 0, first.stderr
     assert states(first.stdout) == ["run"] * 3
     assert {"stage", "state", "seconds", "peak", "total"} <= set(first.stdout.split())
-    assert (toy.run_dir / "tell" / "story.txt").read_text().startswith("3 numbers, state ")
+    assert (toy.run_dir / "summarise" / "summary.txt").read_text().startswith("3 numbers, state ")
     assert states(toy.all().stdout) == ["cached"] * 3
     assert states(toy.all("--status").stdout) == ["fresh"] * 3
 
@@ -38,7 +44,7 @@ def test_the_video_is_never_written(toy: Toy) -> None:
 
 def test_a_change_reruns_what_reads_it(toy: Toy) -> None:
     toy.all("--video", "numbers.txt")
-    assert states(toy.all("--set", "tell.word=value").stdout) == ["cached", "cached", "run"]
+    assert states(toy.all("--set", "summarise.word=value").stdout) == ["cached", "cached", "run"]
     assert states(toy.all("--set", "learn.steps=21").stdout) == ["cached", "run", "run"]
 
 
@@ -54,13 +60,13 @@ def test_from_and_force_run_again(toy: Toy) -> None:
     assert states(toy.all("--force").stdout) == ["run"] * 3
 
 
-def test_one_stage_knows_what_the_run_remembers(toy: Toy) -> None:
-    toy.all("--video", "numbers.txt", "--preset", "quick", "--set", "tell.word=value")
+def test_one_stage_uses_the_recorded_options(toy: Toy) -> None:
+    toy.all("--video", "numbers.txt", "--preset", "quick", "--set", "summarise.word=value")
     record = json.loads((toy.run_dir / "run.json").read_text())
-    assert record == {"video": str(toy.video), "preset": "quick", "overrides": {"tell.word": "value"}}
-    for name in ("read", "learn", "tell"):
-        assert toy.call(f"stages.{name}", "runs/a").stdout == f"runs/a/{name}: cached\n"
-    assert toy.call("stages.learn", "runs/a", "--set", "learn.steps=7").stdout == "runs/a/learn: done\n"
+    assert record == {"video": str(toy.video), "preset": "quick", "overrides": {"summarise.word": "value"}}
+    for name in ("read", "learn", "summarise"):
+        assert toy.stages(name, "runs/a").stdout == f"runs/a/{name}: cached\n"
+    assert toy.stages("learn", "runs/a", "--set", "learn.steps=7").stdout == "runs/a/learn: done\n"
     assert states(toy.all("--status").stdout) == ["fresh", "fresh", "stale"]
     toy.all("--preset", "default")
     assert json.loads((toy.run_dir / "run.json").read_text())["overrides"] == {}
@@ -69,15 +75,15 @@ def test_one_stage_knows_what_the_run_remembers(toy: Toy) -> None:
 def test_stages_run_one_by_one_make_the_same(toy: Toy) -> None:
     toy.all("--video", "numbers.txt")
     toy.call("stages.read", "runs/b", "--video", "numbers.txt")
-    toy.call("stages.learn", "runs/b")
-    toy.call("stages.tell", "runs/b")
-    stories = [(toy.folder / "runs" / name / "tell" / "story.txt").read_bytes() for name in "ab"]
-    assert stories[0] == stories[1]
+    toy.call("stages", "learn", "runs/b")
+    toy.stages("summarise", "runs/b")
+    summaries = [(toy.folder / "runs" / name / "summarise" / "summary.txt").read_bytes() for name in "ab"]
+    assert summaries[0] == summaries[1]
 
 
 def test_verify_finds_a_changed_file(toy: Toy) -> None:
     toy.all("--video", "numbers.txt")
-    assert toy.all("--verify").stdout.count("whole") == 3
+    assert toy.all("--verify").stdout.count("intact") == 3
     (toy.run_dir / "learn" / "trail" / "state.json").write_text("{}")
     sentence = toy.expect_user_error("stages", "--run", "runs/a", "--verify")
     assert "trail/state.json" in sentence
@@ -91,7 +97,7 @@ def test_verify_finds_a_changed_file(toy: Toy) -> None:
     [
         (("--set", "learn.steps=0"), ("learn.steps = 0", "at least 1")),
         (("--set", "learn.stepz=3"), ("did you mean steps?", "known keys of learn: steps")),
-        (("--set", "lern.steps=3"), ("did you mean learn?", "read, learn, tell")),
+        (("--set", "lern.steps=3"), ("did you mean learn?", "read, learn, summarise")),
         (("--set", "steps=3"), ("--set section.key=value",)),
         (("--preset", "quik"), ("default, quick",)),
         (("--from", "lern"), ("lern", "'learn'")),
@@ -99,6 +105,7 @@ def test_verify_finds_a_changed_file(toy: Toy) -> None:
         (("--vid", "numbers.txt"), ("--vid", "--help")),
         (("--video", "none.txt"), ("none.txt does not exist",)),
         (("--video", "."), ("inside the video folder",)),
+        (("numbers.txt", "--video", "numbers.txt"), ("two videos",)),
         ((), ("has no video yet", "--video")),
     ],
 )
@@ -109,18 +116,18 @@ def test_a_mistake_is_one_sentence_and_leaves_nothing(toy: Toy, arguments: Seque
 
 
 def test_a_stage_refuses_options_of_others(toy: Toy) -> None:
-    assert "learn.key=value" in toy.expect_user_error("stages.learn", "runs/a", "--set", "tell.word=x")
-    assert "python -m stages.read runs/a" in toy.expect_user_error("stages.learn", "runs/a")
-    assert "see python -m stages.learn --help" in toy.expect_user_error("stages.learn")
+    assert "learn.key=value" in toy.expect_user_error("stages", "learn", "runs/a", "--set", "summarise.word=x")
+    assert "python -m stages read runs/a" in toy.expect_user_error("stages", "learn", "runs/a")
+    assert "see python -m stages learn --help" in toy.expect_user_error("stages.learn")
 
 
 def test_a_file_is_no_run(toy: Toy) -> None:
     (toy.folder / "notes").write_text("in the way")
-    assert "notes is a file, a run is a folder" in toy.expect_user_error(
+    assert "notes is a file, but a run is a folder" in toy.expect_user_error(
         "stages", "--run", "notes", "--video", "numbers.txt"
     )
     below = toy.expect_user_error("stages", "--run", "notes/a", "--video", "numbers.txt")
-    assert "notes/a cannot be written or read, a part of that path is a file" in below
+    assert "notes/a cannot be read or written, a part of this path is a file" in below
     assert (toy.folder / "notes").read_text() == "in the way"
 
 
@@ -128,7 +135,7 @@ def test_bad_input_leaves_no_folder(toy: Toy) -> None:
     toy.video.write_text("1 two 3")
     assert "holds two" in toy.expect_user_error("stages", "--run", "runs/a", "--video", "numbers.txt")
     assert not toy.run_dir.exists()
-    assert "holds two" in toy.expect_user_error("stages.read", "runs/a", "--video", "numbers.txt")
+    assert "holds two" in toy.expect_user_error("stages", "read", "runs/a", "--video", "numbers.txt")
     assert not toy.run_dir.exists()
 
 
@@ -136,7 +143,7 @@ def test_bad_input_leaves_earlier_results(toy: Toy) -> None:
     toy.all("--video", "numbers.txt")
     toy.video.write_text("1 two 3")
     toy.expect_user_error("stages", "--run", "runs/a")
-    assert {path.name for path in toy.run_dir.iterdir()} == {"read", "learn", "tell", "run.json", ".lock"}
+    assert {path.name for path in toy.run_dir.iterdir()} == {"read", "learn", "summarise", "run.json", ".lock"}
 
 
 def test_another_video_needs_force(toy: Toy) -> None:
@@ -149,29 +156,63 @@ def test_another_video_needs_force(toy: Toy) -> None:
     assert states(toy.all("--video", "other.txt", "--force").stdout) == ["run"] * 3
 
 
+def test_a_video_needs_no_option(toy: Toy) -> None:
+    done = toy.stages("numbers.txt")
+    assert done.returncode == 0, done.stderr
+    assert (toy.folder / "runs" / "numbers" / "summarise" / "summary.txt").is_file()
+
+
+def test_messages_name_the_command_in_use(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(COMMAND_VARIABLE, "instant-human-mesh")
+    assert "instant-human-mesh read runs/a" in toy.expect_user_error("stages", "learn", "runs/a")
+    assert "see instant-human-mesh --help" in toy.expect_user_error("stages", "--bla")
+
+
+def test_help_and_version_are_printed(toy: Toy, capsys: pytest.CaptureFixture[str]) -> None:
+    assert toy.stages("--version").stdout == "toy\n"
+    with pytest.raises(SystemExit, match="0"):
+        main_pipeline(PIPELINE, ["--help"])
+    assert "read, learn, summarise" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_folder_of_the_user_does_not_hide_the_stages(toy: Toy) -> None:
+    """The runner imports the stages in its children from where it imported them itself."""
+    elsewhere = toy.folder / "elsewhere"
+    for name in ("pipeline.py", "stages.py"):
+        elsewhere.mkdir(exist_ok=True)
+        (elsewhere / name).write_text("raise ImportError('a file of the user')")
+    code = "import sys; sys.path.remove(''); from stages.__main__ import main_pipeline, PIPELINE\n"
+    code += "raise SystemExit(main_pipeline(PIPELINE, ['../numbers.txt']))"
+    environment = user_environment() | {"PYTHONPATH": os.pathsep.join([str(toy.folder), str(REPOSITORY_DIR)])}
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=elsewhere, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
 def test_the_run_is_named_after_the_video(tmp_path: Path) -> None:
     (tmp_path / "ann").mkdir()
     (tmp_path / "ann" / "video.mp4").touch()
     (tmp_path / "ann" / "walk.mp4").touch()
     named = [default_run_dir(tmp_path / "ann" / name) for name in ("video.mp4", "walk.mp4", "")]
     assert named == [Path("runs/ann"), Path("runs/walk"), Path("runs/ann")]
-    with pytest.raises(UserError, match="--run"):
+    with pytest.raises(UserError, match="python -m stages VIDEO"):
         default_run_dir(None)
 
 
-def test_ctrl_c_is_answered_in_one_line(toy: Toy) -> None:
+def test_ctrl_c_prints_one_line(toy: Toy) -> None:
     process = toy.start("stages", "--run", "runs/a", "--video", "numbers.txt", TOY_SLEEP_S="30")
     wait_for(toy.run_dir / "learn.part" / "checkpoint.json")
     os.killpg(process.pid, signal.SIGINT)
     _, err = process.communicate(timeout=30)
     assert process.returncode == 130
-    assert err.splitlines()[-1] == "interrupted: the same command goes on from here"
+    assert err.splitlines()[-1] == "interrupted: run the same command again to resume"
     assert "Traceback" not in err
     assert states(toy.all().stdout) == ["cached", "run", "run"]
 
 
 def test_the_defaults_print_as_yaml(toy: Toy) -> None:
-    text = toy.call("stages", "--defaults").stdout
+    text = toy.stages("--defaults").stdout
     assert "learn:\n  # steps of the chain\n  steps: 20\n" in text
 
 
@@ -181,7 +222,7 @@ def test_a_stage_module_is_not_imported_twice(toy: Toy) -> None:
 
 
 def wait_for(path: Path, timeout_s: float = 30.0) -> None:
-    """Wait until a file is there."""
+    """Wait until a file exists."""
     deadline = time.monotonic() + timeout_s
     while not path.exists():
         assert time.monotonic() < deadline, f"{path} did not appear"
@@ -189,7 +230,7 @@ def wait_for(path: Path, timeout_s: float = 30.0) -> None:
 
 
 def test_a_full_disk_is_one_sentence_and_leaves_nothing(toy: Toy) -> None:
-    full = "import errno, pathlib, sys, stages.read as read; from stages import CONFIG_DIR\n"
+    full = "import errno, pathlib, stages.read as read; from stages import CONFIG_DIR\n"
     full += "def write(*arguments, **options): raise OSError(errno.ENOSPC, 'full')\n"
     full += "pathlib.Path.write_text = write\n"
     full += "raise SystemExit(read.main(read.STAGE, ['runs/a', '--video', 'numbers.txt'], CONFIG_DIR))"

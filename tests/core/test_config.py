@@ -1,13 +1,13 @@
-"""Strict configuration: layers win in order, and every mistake is one sentence that names its place."""
+"""Strict configuration: order of the layers, and errors that name the place to correct in one sentence."""
 
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from pipeline.core.config import (
     Config,
@@ -22,16 +22,18 @@ from pipeline.core.config import (
 from pipeline.core.errors import UserError
 
 
-class Inner(Config):
-    rate: float = Field(0.1, gt=0, le=1, description="learning rate, per step")
-
-
 class Options(Config):
     size: int = Field(64, ge=16, le=256, description="cells along the longest side")
-    kind: Literal["fast", "fine"] = Field("fast", description="which way")
+    kind: Literal["fast", "fine"] = Field("fast", description="speed or quality")
     name: str = Field("x", description="a name")
     sides_m: tuple[float, float] = Field((1.0, 2.0), description="metres")
-    inner: Inner = Field(Inner(), description="the optimiser")
+    rate: float = Field(0.1, gt=0, le=1, description="learning rate, per step")
+
+    @model_validator(mode="after")
+    def _check_name(self) -> Self:
+        if self.name == "huge" and self.size < 100:
+            raise ValueError("name = huge needs size >= 100")
+        return self
 
     @field_validator("name")
     @classmethod
@@ -46,7 +48,7 @@ def config_dir(tmp_path: Path) -> Path:
     folder = tmp_path / "configs"
     folder.mkdir()
     (folder / "default.yaml").write_text("mesh:\n  size: 100\n  name: base\n")
-    (folder / "fine.yaml").write_text("mesh:\n  size: 200\n  inner: {rate: 1e-2}\n")
+    (folder / "fine.yaml").write_text("mesh:\n  size: 200\n  rate: 1e-2\n")
     return folder
 
 
@@ -62,12 +64,12 @@ def config_error_message(config_dir: Path, preset: str, *assignments: str) -> st
 
 def test_later_layers_win(config_dir: Path) -> None:
     assert built(config_dir).size == 100
-    fine = built(config_dir, "fine", "mesh.kind=fine", "mesh.inner.rate=0.5")
-    assert (fine.size, fine.name, fine.kind, fine.inner.rate) == (200, "base", "fine", 0.5)
+    fine = built(config_dir, "fine", "mesh.kind=fine", "mesh.rate=0.5")
+    assert (fine.size, fine.name, fine.kind, fine.rate) == (200, "base", "fine", 0.5)
 
 
 def test_yaml_numbers_without_a_dot_are_numbers(config_dir: Path) -> None:
-    assert built(config_dir, "fine").inner.rate == 0.01
+    assert built(config_dir, "fine").rate == 0.01
 
 
 @pytest.mark.parametrize(
@@ -78,18 +80,24 @@ def test_yaml_numbers_without_a_dot_are_numbers(config_dir: Path) -> None:
         ("mesh.size=1.5", ("mesh.size = 1.5", "a whole number")),
         ("mesh.kind=slow", ("mesh.kind = 'slow'", "'fast' or 'fine'")),
         ("mesh.name=a b", ("mesh.name = 'a b'", "text without spaces")),
-        ("mesh.inner.rate=.nan", ("mesh.inner.rate = nan", "a number, above 0, at most 1", "per step")),
-        ("mesh.inner.rate=2", ("mesh.inner.rate = 2", "above 0, at most 1")),
+        ("mesh.rate=.nan", ("mesh.rate = nan", "a number, above 0, at most 1", "per step")),
+        ("mesh.rate=2", ("mesh.rate = 2", "above 0, at most 1")),
         ("mesh.sides_m=[1, x]", ("mesh.sides_m.1 = 'x'",)),
-        ("mesh.sizes=8", ("mesh.sizes is no known key", "did you mean size?", "size, kind, name, sides_m, inner")),
-        ("mesh.inner.rat=8", ("mesh.inner.rat is no known key", "known keys of mesh.inner: rate")),
-        ("mesh.inner=8", ("mesh.inner = 8",)),
+        ("mesh.sizes=8", ("mesh.sizes is unknown", "did you mean size?", "size, kind, name, sides_m, rate")),
+        ("mesh.rat=8", ("mesh.rat is unknown", "did you mean rate?")),
+        ("mesh.size.a=8", ("mesh.size = {'a': 8}", "a whole number")),
+        ("mesh.size={a: 8}", ("mesh.size = {'a': 8}", "a whole number")),
     ],
 )
 def test_a_bad_value_is_one_sentence(config_dir: Path, assignment: str, words: tuple[str, ...]) -> None:
     sentence = config_error_message(config_dir, "default", assignment)
     assert all(word in sentence for word in words), sentence
     assert "\n" not in sentence
+
+
+def test_options_that_contradict_each_other_are_named(config_dir: Path) -> None:
+    sentence = config_error_message(config_dir, "default", "mesh.name=huge", "mesh.size=64")
+    assert sentence == "section mesh is not valid: name = huge needs size >= 100"
 
 
 def test_a_bad_value_in_a_file_names_the_file(config_dir: Path) -> None:
@@ -99,7 +107,7 @@ def test_a_bad_value_in_a_file_names_the_file(config_dir: Path) -> None:
     assert config_error_message(config_dir, "odd").startswith(f"{config_dir / 'odd.yaml'}: mesh.sice")
 
 
-def test_a_default_overridden_in_a_file_is_not_blamed_on_it(config_dir: Path) -> None:
+def test_the_layer_of_a_value_is_the_last_that_sets_it(config_dir: Path) -> None:
     layers = load_layers("fine", {"mesh.size": 3}, config_dir)
     assert layers.origin_of("mesh.size") == "--set mesh.size"
     assert layers.origin_of("mesh.name") == str(config_dir / "default.yaml")

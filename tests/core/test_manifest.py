@@ -1,4 +1,4 @@
-"""Manifests and digests: what changes a fingerprint and what does not; damage is found."""
+"""Manifests and digests: what a fingerprint depends on, and how damage is found."""
 
 import hashlib
 import json
@@ -43,8 +43,8 @@ def test_a_digest_is_sha256(tmp_path: Path) -> None:
 
 
 def test_the_fingerprint_ignores_the_order_of_keys() -> None:
-    turned = {**BASE, "config": {"kind": "a", "size": 3}}
-    assert fingerprint(**BASE) == fingerprint(**turned)
+    reordered = {**BASE, "config": {"kind": "a", "size": 3}}
+    assert fingerprint(**BASE) == fingerprint(**reordered)
 
 
 @pytest.mark.parametrize(
@@ -54,16 +54,16 @@ def test_each_part_decides_the_fingerprint(change: dict[str, object]) -> None:
     assert fingerprint(**{**BASE, **change}) != fingerprint(**BASE)
 
 
-def test_a_video_file_is_known_by_its_content(tmp_path: Path) -> None:
+def test_a_video_file_is_identified_by_its_content(tmp_path: Path) -> None:
     (tmp_path / "a.mp4").write_bytes(b"abc")
     (tmp_path / "b.mp4").write_bytes(b"abc")
     assert digest_video(tmp_path / "a.mp4") == digest_video(tmp_path / "b.mp4")
 
 
-def test_a_video_folder_is_known_by_names_and_contents(tmp_path: Path) -> None:
+def test_a_video_folder_is_identified_by_names_and_contents(tmp_path: Path) -> None:
     (tmp_path / "0.png").write_bytes(b"abc")
     before = digest_video(tmp_path)
-    (tmp_path / ".DS_Store").write_bytes(b"junk of a file browser")
+    (tmp_path / ".DS_Store").write_bytes(b"metadata of a file browser")
     assert digest_video(tmp_path) == before
     (tmp_path / "0.png").rename(tmp_path / "1.png")
     renamed = digest_video(tmp_path)
@@ -71,7 +71,7 @@ def test_a_video_folder_is_known_by_names_and_contents(tmp_path: Path) -> None:
     assert len({before, renamed, digest_video(tmp_path)}) == 3
 
 
-def test_a_missing_video_is_a_sentence(tmp_path: Path) -> None:
+def test_a_missing_video_is_a_user_error(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="--video"):
         digest_video(tmp_path / "none.mp4")
 
@@ -89,8 +89,8 @@ def test_nothing_depends_on_the_record_of_progress(tmp_path: Path) -> None:
     assert timed.outputs_digest == manifest.outputs_digest
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"stage": "mesh"}', '{"strange": 1}'])
-def test_a_damaged_manifest_is_a_sentence(tmp_path: Path, text: str) -> None:
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"stage": "mesh"}', '{"unknown": 1}'])
+def test_a_damaged_manifest_is_a_user_error(tmp_path: Path, text: str) -> None:
     (tmp_path / MANIFEST_FILE).write_text(text)
     with pytest.raises(UserError, match="damaged"):
         read_manifest(tmp_path)
@@ -103,7 +103,7 @@ def test_damage_is_found(tmp_path: Path) -> None:
     (folder / "mesh.npz").write_bytes(b"verticeS")
     assert find_damaged_files(folder) == ["mesh.npz"]
     (folder / "deep" / "a.png").unlink()
-    (folder / "new.txt").write_text("strange")
+    (folder / "new.txt").write_text("unknown")
     assert find_damaged_files(folder) == ["deep/a.png", "mesh.npz", "new.txt"]
     (folder / MANIFEST_FILE).unlink()
     assert find_damaged_files(folder) == [MANIFEST_FILE]

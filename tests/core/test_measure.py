@@ -1,4 +1,4 @@
-"""Memory is the process's own peak; the environment is recorded."""
+"""Peak memory of a process and of its workers; description of the environment."""
 
 import subprocess
 import sys
@@ -6,7 +6,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from pipeline.core.measure import REPOSITORY_DIR, cpu_name, environment, peak_rss_mib
+from pipeline.core import measure
+from pipeline.core.measure import REPOSITORY_DIR, cpu_name, describe_environment, peak_rss_mib
 
 ALLOCATE = "from pipeline.core.measure import peak_rss_mib; b = bytearray({mib} << 20); del b; print(peak_rss_mib())"
 
@@ -44,22 +45,28 @@ print(peak_rss_mib() - before)
 """
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems tell the largest child alone")
-def test_workers_count_with_what_they_held() -> None:
-    """Two of 100 MiB and an interpreter each, one of them counted twice; a process that is gone adds nothing."""
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems report the largest child only")
+def test_peaks_of_workers_are_added() -> None:
+    """Two of 100 MiB plus an interpreter, one of them recorded twice; a process that has ended adds nothing."""
     done = subprocess.run([sys.executable, "-c", COUNT], capture_output=True, text=True, check=True, cwd=REPOSITORY_DIR)
     assert 200 < float(done.stdout) < 240
 
 
 def test_the_environment_names_machine_and_packages() -> None:
-    found = environment()
+    found = describe_environment()
     assert found["packages"]["numpy"]
     assert found["cpu"] == cpu_name() != ""
     assert found["cores"] >= 1
 
 
-def test_a_card_that_lets_nobody_in_ends_no_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One in exclusive mode that another process holds is there, and raises as soon as it is asked for its name."""
+def test_the_commit_is_that_of_this_project_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An installation inside the repository of another project has no commit."""
+    monkeypatch.setattr(measure, "REPOSITORY_DIR", REPOSITORY_DIR / "pipeline")
+    assert describe_environment()["commit"] is None
+
+
+def test_a_gpu_that_refuses_access_does_not_fail_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A GPU in exclusive mode that another process uses is available, but raises on any access."""
 
     def refuse(_: int) -> str:
         raise RuntimeError("CUDA error: all CUDA-capable devices are busy or unavailable")
@@ -68,6 +75,6 @@ def test_a_card_that_lets_nobody_in_ends_no_run(monkeypatch: pytest.MonkeyPatch)
         SimpleNamespace(is_available=lambda: True, get_device_name=name) for name in (refuse, lambda _: "Card")
     )
     monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(cuda=busy))
-    assert environment()["gpu"] is None
+    assert describe_environment()["gpu"] is None
     monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(cuda=free))
-    assert environment()["gpu"] == "Card"
+    assert describe_environment()["gpu"] == "Card"

@@ -1,4 +1,4 @@
-"""Progress yields every item and speaks in the form that fits where it is read."""
+"""Progress: all items pass; a terminal shows a bar, a log lines, a listener the counts."""
 
 import pytest
 
@@ -10,14 +10,22 @@ def test_all_items_pass_unchanged() -> None:
     assert list(progress.track(iter("abc"), "spelling")) == ["a", "b", "c"]
 
 
-def test_a_log_gets_lines_with_what_is_left(
+def test_a_log_gets_lines_with_the_remaining_time(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(progress, "LOG_INTERVAL_S", 0.0)
     assert len(list(progress.track(range(2), "fitting", total=5, initial=3))) == 2
-    first, last = capsys.readouterr().err.splitlines()
-    assert first.startswith("fitting: 4/5, ")
-    assert last.startswith("fitting: 5/5, 0 s left")
+    first, *_, last = capsys.readouterr().err.splitlines()
+    assert first.startswith("fitting: 3/5 [")
+    assert last == "fitting: 5/5 [00:00<00:00]"
+
+
+def test_a_listener_gets_the_counts() -> None:
+    calls: list[tuple[str, int, int | None]] = []
+    with progress.listen(lambda *call: calls.append(call)):
+        list(progress.track(range(2), "fitting", total=5, initial=3))
+    list(progress.track(range(2), "fitting"))
+    assert calls == [("fitting", 4, 5), ("fitting", 5, 5)]
 
 
 def test_a_quick_loop_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,4 +1,4 @@
-"""One stage, whole or absent: fresh results stay, unfinished ones vanish, faults of a stage's code are loud."""
+"""One stage: fresh results are kept, unfinished ones removed, faults in the code of a stage are raised."""
 
 import errno
 import json
@@ -52,7 +52,7 @@ def test_manifest_records_the_run(tmp_path: Path) -> None:
         warn("3 frames show nobody and are left out")
         return write_number(inputs, out, config)
 
-    warn("said before this stage")
+    warn("printed before this stage")
     run_stage(plan(tmp_path, work, number=7))
     manifest = read_manifest(tmp_path / "run" / "count")
     assert manifest is not None
@@ -114,7 +114,7 @@ def interrupted(inputs: Mapping[str, Path], out: Path, config: Options) -> Mappi
     raise KeyboardInterrupt
 
 
-def test_checkpoints_of_the_same_fingerprint_are_gone_on_from(tmp_path: Path) -> None:
+def test_checkpoints_of_the_same_fingerprint_are_resumed(tmp_path: Path) -> None:
     seen: list[set[str]] = []
 
     def work(inputs: Mapping[str, Path], out: Path, config: Options) -> Mapping[str, float]:
@@ -180,7 +180,7 @@ def test_more_than_declared_is_kept_and_digested(tmp_path: Path) -> None:
 
 def test_a_missing_input_names_the_command(tmp_path: Path) -> None:
     stage = Stage("paint", 1, ("count",), ("paint.txt",), Options, write_number)
-    with pytest.raises(UserError, match=r"python -m stages\.count"):
+    with pytest.raises(UserError, match=r"python -m stages count"):
         plan_stage(stage, Options(), tmp_path / "run", None)
     with pytest.raises(UserError, match="--video"):
         plan_stage(plan(tmp_path).stage, Options(), tmp_path / "run", None)

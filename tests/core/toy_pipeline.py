@@ -1,23 +1,31 @@
-"""The toy pipeline, run as a user would run the real one: by its commands, in a folder of its own."""
+"""The toy pipeline in a folder of its own, run by its commands: in this process, or in new ones as a user would."""
 
+import io
 import os
 import shutil
 import signal
 import subprocess
 import sys
+from contextlib import chdir, redirect_stderr, redirect_stdout
 from pathlib import Path
 
-from pipeline.core.lock import LOCK_FD_VARIABLE, PARENT_PID_VARIABLE
+from pipeline.core.cli import main_pipeline
+from pipeline.core.events import EVENTS_VARIABLE
+from pipeline.core.lock import LOCK_FD_VARIABLE, LOCK_PATH_VARIABLE
 from pipeline.core.measure import REPOSITORY_DIR
+from pipeline.core.parent import PARENT_PID_VARIABLE
+from tests.core.toy.stages import PIPELINE
+
+RUNNER_VARIABLES = (LOCK_FD_VARIABLE, LOCK_PATH_VARIABLE, PARENT_PID_VARIABLE, EVENTS_VARIABLE)
 
 
 def user_environment() -> dict[str, str]:
-    """This process's environment as a user's shell would have it: not inside a run."""
-    return {key: value for key, value in os.environ.items() if key not in (LOCK_FD_VARIABLE, PARENT_PID_VARIABLE)}
+    """The environment of this process without the variables that the runner sets for its children."""
+    return {key: value for key, value in os.environ.items() if key not in RUNNER_VARIABLES}
 
 
 class Toy:
-    """A folder with the toy's `stages` and `configs`, a video of numbers, and the commands."""
+    """A folder with the `stages` and `configs` of the toy and a video of numbers."""
 
     def __init__(self, folder: Path) -> None:
         shutil.copytree(REPOSITORY_DIR / "tests" / "core" / "toy", folder, ignore=shutil.ignore_patterns("__pycache__"))
@@ -48,13 +56,25 @@ class Toy:
         out, err = process.communicate(timeout=60)
         return subprocess.CompletedProcess(arguments, process.returncode, out, err)
 
-    def all(self, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
-        """Run the whole toy pipeline on runs/a."""
+    def stages(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """Do what `python -m stages <arguments>` does, in this process."""
+        out, err = io.StringIO(), io.StringIO()
+        with chdir(self.folder), redirect_stdout(out), redirect_stderr(err):
+            code = main_pipeline(PIPELINE, arguments, version="toy", isolate=False)
+        return subprocess.CompletedProcess(arguments, code, out.getvalue(), err.getvalue())
+
+    def all(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """Run all toy stages on runs/a in this process."""
+        return self.stages("--run", "runs/a", *arguments)
+
+    def call_all(self, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
+        """Run all toy stages on runs/a by the command, in new processes."""
         return self.call("stages", "--run", "runs/a", *arguments, **variables)
 
     def expect_user_error(self, *arguments: str) -> str:
-        """The one sentence with which a command is refused."""
-        done = self.call(*arguments)
+        """Run `python -m <arguments>`, in this process if it is the pipeline; return the error message."""
+        in_process = arguments[0] == "stages"
+        done = self.stages(*arguments[1:]) if in_process else self.call(*arguments)
         assert done.returncode == 2, done
         assert "Traceback" not in done.stderr
         (sentence,) = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
@@ -63,5 +83,5 @@ class Toy:
 
 
 def _restore_sigint_handler() -> None:
-    """A shell's background jobs ignore SIGINT, and so would their children; a user at a terminal is what is tested."""
+    """Undo that background jobs of a shell, and their children, ignore SIGINT."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)

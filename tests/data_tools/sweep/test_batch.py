@@ -46,12 +46,12 @@ def test_one_broken_video_stops_no_other(batch: Toy) -> None:
     assert "1 of 3 videos did not become an avatar (bob)" in sentence
     table = rows(batch)
     assert {name: row["status"] for name, row in table.items()} == OUTCOME
-    assert "holds two, which is no number" in table[BROKEN]["message"]
+    assert "holds two, which is not a number" in table[BROKEN]["message"]
     assert [table[BROKEN][name] for name in TOY_STAGES] == ["missing", "waits for read", "waits for read"]
     for name in GOOD:
         assert [table[name][stage] for stage in TOY_STAGES] == ["fresh"] * 3
         assert float(table[name]["seconds"]) >= 0
-        assert (batch.folder / "runs" / name / "tell" / "story.txt").is_file()
+        assert (batch.folder / "runs" / name / "summarise" / "summary.txt").is_file()
     page = (batch.folder / "runs" / "batch.html").read_text()
     assert "2 of 3 avatars" in page
     assert "holds two" in page

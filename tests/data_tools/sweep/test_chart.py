@@ -150,7 +150,7 @@ def test_the_run_of_another_capture_is_not_taken(sweep: Toy) -> None:
     assert "not done (numbers-quick-0)" in sweep.expect_user_error(
         "data_tools.sweep.chart", "other/numbers.mp4", *command
     )
-    assert "was made from" in rows(sweep.folder / "runs" / "chart" / "chart.csv")[0]["message"]
+    assert "belongs to the video" in rows(sweep.folder / "runs" / "chart" / "chart.csv")[0]["message"]
 
 
 def test_built_in_captures_are_those_of_this_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -190,7 +190,7 @@ def test_a_failed_run_stops_no_other(sweep: Toy) -> None:
     assert "1 of 2 runs are not done (words-quick-0)" in sentence
     table = rows(sweep.folder / "chart" / "chart.csv")
     assert [row["status"] for row in table] == ["failed", "done"]
-    assert "no number" in table[0]["message"]
+    assert "not a number" in table[0]["message"]
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,8 @@
 """`python -m stages` of the toy pipeline."""
 
-from pipeline.core.cli import main_all
-from stages import CONFIG_DIR, STAGES, load
+from pipeline.core.cli import main_pipeline
+
+from . import PIPELINE
 
 if __name__ == "__main__":
-    raise SystemExit(main_all(STAGES, load, config_dir=CONFIG_DIR))
+    raise SystemExit(main_pipeline(PIPELINE, version="toy"))

@@ -1,4 +1,4 @@
-"""Reads numbers from a text file; complains about words."""
+"""The first toy stage: reads numbers from a text file and refuses words."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,11 +10,12 @@ from pipeline.core.config import Config
 from pipeline.core.errors import UserError
 from pipeline.core.progress import warn
 from pipeline.core.stage import Stage
-from stages import CONFIG_DIR
+
+from . import CONFIG_DIR
 
 
 class ReadConfig(Config):
-    """Options of the toy's first stage."""
+    """Options of the first toy stage."""
 
     modulus: int = Field(1000, ge=2, le=10_000, description="numbers are taken modulo this")
 
@@ -25,7 +26,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: ReadConfig) -> Mapping[st
     words = inputs["video"].read_text().split()
     bad = [word for word in words if not word.isdigit()]
     if bad:
-        raise UserError(f"{inputs['video']} holds {bad[0]}, which is no number: take it out")
+        raise UserError(f"{inputs['video']} holds {bad[0]}, which is not a number: remove it")
     if not words:
         warn("the file is empty")
     (out / "half.txt").unlink()
