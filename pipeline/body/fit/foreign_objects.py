@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from pipeline.body.body import Body
-from pipeline.body.fit.silhouette_icp import crop_mask_window, rasterise_in_window
+from pipeline.body.fit.silhouette_icp import crop_mask_window, distance_px, rasterise_in_window
 from pipeline.body.overlay import pose_vertices
 from pipeline.capture.frame_selection import format_frame_ranges
 from pipeline.geometry.camera import Camera
@@ -27,8 +27,7 @@ hangs on a foot 0.012, where the skirt's hem alone stays within 0.008.
 
 def residual_blob_share(mask: Bool[np.ndarray, "h w"], body_mask: Bool[np.ndarray, "h w"], person_px: float) -> float:
     """Share of the mask that its largest connected part beyond the reach of clothing takes, 0 to 1."""
-    distance_px = cv2.distanceTransform((~body_mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    beyond = mask & (distance_px > CLOTHING_MARGIN_RATIO * person_px)
+    beyond = mask & (distance_px(~body_mask) > CLOTHING_MARGIN_RATIO * person_px)
     _, _, parts, _ = cv2.connectedComponentsWithStats(beyond.astype(np.uint8))
     return float(parts[1:, cv2.CC_STAT_AREA].max(initial=0)) / max(1, int(mask.sum()))
 

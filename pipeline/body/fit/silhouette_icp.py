@@ -86,9 +86,21 @@ def crop_mask_window(mask: UInt8[np.ndarray, "h w"]) -> MaskWindow | None:
 
 def signed_distance(inside: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     """Distance in pixels to the outline between pixel centres: positive outside, -0.5 on the innermost row."""
-    outward = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    inward = cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return np.where(inside, 0.5 - inward, outward - 0.5).astype(np.float32)
+    return np.where(inside, 0.5 - distance_px(inside), distance_px(~inside) - 0.5).astype(np.float32)
+
+
+def distance_px(area: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Euclidean distance in pixels of every pixel in an area to the nearest pixel outside; 0 outside.
+
+    Runs without Intel IPP, which OpenCV uses for small images or a single thread: IPP rounds differently when its
+    output is not aligned to 32 bytes, and malloc aligns to 16.
+    """
+    with_ipp = cv2.ipp.useIPP()
+    cv2.ipp.setUseIPP(False)
+    try:
+        return cv2.distanceTransform(area.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    finally:
+        cv2.ipp.setUseIPP(with_ipp)
 
 
 def outline_pixels(inside: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "q 2"]:
@@ -102,7 +114,8 @@ def outward_normals(distance: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h 
     """Unit gradient (x, y) of a signed distance, smoothed over a few pixels."""
     smooth = cv2.GaussianBlur(distance, (0, 0), 1.5)
     across, down = cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)
-    length = np.maximum(cv2.magnitude(across, down), 1e-6)
+    # cv2.magnitude uses Intel IPP, whose rounding depends on the memory alignment of its output.
+    length = np.maximum(np.sqrt(across * across + down * down), 1e-6)
     return np.stack([across / length, down / length], axis=-1)
 
 

@@ -6,6 +6,7 @@ import torch
 from pipeline.body.body import load_anny
 from pipeline.body.fit.silhouette_icp import (
     crop_mask_window,
+    distance_px,
     find_correspondences,
     intersection_over_union,
     mask_weights,
@@ -36,6 +37,19 @@ def test_normals_of_a_disc_point_outward() -> None:
     normal = outward_normals(signed_distance(disc(30.0)))[outline[:, 0], outline[:, 1]]
     radial = outline[:, ::-1] + 0.5 - 50.0
     assert ((normal * radial).sum(1) / np.linalg.norm(radial, axis=1)).min() > 0.97
+
+
+def test_distances_and_normals_do_not_depend_on_memory_alignment() -> None:
+    """malloc aligns to 16 bytes; arrays that are 32-byte aligned in one process are not in another."""
+    area, kept = disc(30.0), []
+    for turn in range(64):
+        normals = outward_normals(signed_distance(area))
+        kept.append((distance_px(area), distance_px(~area), normals, np.empty(2 * turn)))
+    inner, outer, normals, _ = zip(*kept, strict=True)
+    if len({array.ctypes.data % 32 for array in outer}) == 1:
+        pytest.skip("this platform's malloc gives large arrays one alignment only")
+    for arrays in (inner, outer, normals):
+        assert len({array.tobytes() for array in arrays}) == 1
 
 
 def test_the_border_of_the_picture_is_no_outline() -> None:
