@@ -1,4 +1,4 @@
-"""The last stage: held-out frames against renders of the field and of the exported mesh, figures, charts, a page."""
+"""report: scores of held-out frames, cost of all stages, and a page that shows them."""
 
 import time
 from collections.abc import Mapping
@@ -43,71 +43,65 @@ from pipeline.metrics.images import (
 from pipeline.report.lpips_weights import find_lpips_weights
 from pipeline.report.page import FrameImages, PageContent, error_map, render_page
 from pipeline.report.report_json import build_report, replace_nonfinite, report_to_json
+from pipeline.report.settings import REPORT_SETTINGS, ReportSettings
 from pipeline.report.sheets import composite_on_white_uint8, image_grid
 
 NEEDS = ("frames", "body", "field", "mesh", "texture", "export")
 REPORT_IMAGES = (
-    ("body", "overlay.png", "Fit of the body, laid over the video"),
-    ("frames", "contact.jpg", "Chosen frames and their masks"),
+    ("body", "overlay.png", "Fitted body over the video"),
+    ("frames", "contact.jpg", "Selected frames and their masks"),
     ("texture", "diffuse.png", "Diffuse map"),
     ("mesh", "preview.png", "Mesh"),
 )
-CROP_MARGIN_PX = 12
-EDGE_SPREAD_FRAMES = 16
 
 
 class Config(BaseConfig):
     """Options of the report."""
 
-    samples_per_pixel_side: int = Field(
-        3, ge=1, le=8, description="texture look-ups along each side of a pixel when the mesh is drawn"
-    )
-    score_unrefined_mesh: bool = Field(
-        True, description="score the mesh in the body stage's poses as well, without the field's corrections"
-    )
-    score_unrefined_field: bool = Field(
-        False, description="score the field in those poses too; doubles the report's time"
-    )
     fit_held_out_poses: bool = Field(
         False,
-        description="score field and mesh once more, apart, in poses fitted to the held-out images; costs minutes",
+        description="add scores with poses fitted to the held-out images (InstantAvatar's protocol); takes minutes",
     )
-    pose_fit_steps: int = Field(
-        40, ge=1, le=1000, description="optimiser steps of that fit, all held-out frames in each"
+    score_unrefined_mesh: bool = Field(
+        True, description="score the mesh also with the poses of the body stage, without the field's corrections"
     )
-    max_page_frames: int = Field(8, ge=1, le=64, description="held-out frames that the page shows; all are scored")
-    turntable_views: int = Field(8, ge=2, le=36, description="sides from which the turntable shows the avatar")
-    turntable_height_px: int = Field(480, ge=64, le=2048, description="height of a turntable picture, px")
+    samples_per_pixel_side: int = Field(
+        3, ge=1, le=8, description="texture samples along each side of a pixel when the mesh is rendered"
+    )
+    max_page_frames: int = Field(8, ge=1, le=64, description="held-out frames on the page; all are scored")
+    turntable_views: int = Field(8, ge=2, le=36, description="views of the turntable")
 
 
-def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, float]:
-    """Score held-out frames, measure mesh and files, write report.json, the page and two sheets of pictures."""
+def run(
+    inputs: Mapping[str, Path], out: Path, config: Config, settings: ReportSettings = REPORT_SETTINGS
+) -> Mapping[str, float]:
+    """Score held-out frames, measure mesh and files, and write report.json, the page and two contact sheets."""
     started = time.monotonic()
     manifests = {name: _manifest(inputs[name]) for name in NEEDS}
     loaded = load_finished_run(inputs)
     positions = scored_positions(loaded.capture)
-    spread_px = median_edge_spread_px(loaded)
-    rows, pictures = score(loaded, positions, spread_px, config)
-    turntable = draw_turntable(loaded, int(positions[len(positions) // 2]), config)
+    edge_blur_px = median_edge_blur_px(loaded, settings)
+    rows, frame_images = score_frames(loaded, positions, edge_blur_px, config, settings)
+    turntable = render_turntables(loaded, int(positions[len(positions) // 2]), config, settings)
     write_rgb(
         out / "turntable.jpg",
         image_grid([[composite_on_white_uint8(view) for view in turntable_views] for _, turntable_views in turntable]),
     )
-    write_rgb(out / "heldout.jpg", image_grid([_comparison_row(frame) for frame in pictures]))
+    write_rgb(out / "heldout.jpg", image_grid([_comparison_row(frame) for frame in frame_images]))
     glb = (inputs["export"] / "avatar.glb").read_bytes()
     metric_sections: dict[str, Mapping[str, float | int | bool]] = {
         "mesh": mesh_quality_metrics(loaded.avatar.mesh()),
         "export": {"glb_bytes": len(glb), "texture_px": len(loaded.avatar.diffuse)},
-        "masks": {"count": len(loaded.capture), "edge_blur_sigma_px": spread_px},
+        "masks": {"count": len(loaded.capture), "edge_blur_sigma_px": edge_blur_px},
     }
     cost = (time.monotonic() - started, peak_rss_mib())
     report = replace_nonfinite(build_report(manifests, rows, metric_sections, describe_environment(), cost))
     page = PageContent(
         title=out.resolve().parent.name,
         report=report,
-        frames=pictures,
+        frames=frame_images,
         turntable=turntable,
-        pictures=[(caption, read_rgb(inputs[stage] / name)) for stage, name, caption in REPORT_IMAGES],
+        images=[(caption, read_rgb(inputs[stage] / name)) for stage, name, caption in REPORT_IMAGES],
         glb=glb,
     )
     (out / "index.html").write_text(render_page(page), encoding="utf-8")
@@ -122,16 +116,16 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
 
 
 def scored_positions(capture: Capture) -> Int[np.ndarray, "k"]:
-    """Positions of the held-out frames that can be scored; a warning names each of the others and says why.
+    """Return the positions of the held-out frames that can be scored; warn about each of the others.
 
     Raises:
-        UserError: there is no such frame.
+        UserError: no frame can be scored.
     """
     positions = capture.positions(HELDOUT)
     if len(positions) == 0:
         raise UserError(
-            f"{capture.folder} holds no frame whose index is divisible by eight, so nothing can be scored: "
-            "film longer, or choose more frames"
+            f"{capture.folder} has no held-out frame (no index is divisible by eight), so nothing can be scored: "
+            "record a longer video, raise frames.max_frames, or supply split.json"
         )
     reasons = [reason_not_scorable(to_uint8(capture.mask(position))) for position in positions]
     for position, reason in zip(positions, reasons, strict=True):
@@ -141,69 +135,73 @@ def scored_positions(capture: Capture) -> Int[np.ndarray, "k"]:
     if len(scored) == 0:
         raise UserError(
             f"no held-out frame of {capture.folder} can be scored (frame {capture.frame_index[positions[0]]}: "
-            f"{reasons[0]}); look at {capture.folder / CONTACT_SHEET}, supply masks/, or film closer"
+            f"{reasons[0]}); see {capture.folder / CONTACT_SHEET}, then supply masks/ or film from nearer"
         )
     return scored
 
 
-def median_edge_spread_px(loaded: FinishedRun) -> float:
-    """How soft the capture's outlines are: the median over some of the frames that are not scored."""
+def median_edge_blur_px(loaded: FinishedRun, settings: ReportSettings = REPORT_SETTINGS) -> float:
+    """Return the median blur of the silhouettes (standard deviation, px) over frames that are not scored."""
     others = loaded.capture.positions(TRAIN)
-    some = others[:: max(1, len(others) // EDGE_SPREAD_FRAMES)]
-    spreads = [edge_blur_sigma_px(to_uint8(loaded.capture.mask(position))) for position in some.tolist()]
-    return float(np.median(spreads)) if spreads else PIXEL_BOX_SIGMA_PX
+    subset = others[:: max(1, len(others) // settings.edge_blur_frames)]
+    blurs_px = [edge_blur_sigma_px(to_uint8(loaded.capture.mask(position))) for position in subset.tolist()]
+    return float(np.median(blurs_px)) if blurs_px else PIXEL_BOX_SIGMA_PX
 
 
-def score(
-    loaded: FinishedRun, positions: np.ndarray, spread_px: float, config: Config
+def score_frames(
+    loaded: FinishedRun,
+    positions: np.ndarray,
+    edge_blur_px: float,
+    config: Config,
+    settings: ReportSettings = REPORT_SETTINGS,
 ) -> tuple[list[dict[str, Any]], list[FrameImages]]:
-    """Scores of every held-out frame by render, and the pictures of some of them.
+    """Return the scores of every held-out frame by render, and the images of some of the frames.
 
-    The mesh is drawn with outlines as soft as the capture's (`spread_px`), as the field has learnt them; the row
-    `mesh_sharp` is the mesh as square pixels give it.
+    The silhouette of the render `mesh` is blurred to `edge_blur_px`, the softness of the capture, which the field has
+    learnt; `mesh_sharp` has hard edges.
     """
-    blur_px = additional_blur_sigma_px(spread_px)
+    blur_px = additional_blur_sigma_px(edge_blur_px)
 
-    def draw_sharp(pose: Float[Tensor, "j 4 4"]) -> Float[np.ndarray, "h w 4"]:
+    def render_sharp(pose: Float[Tensor, "j 4 4"]) -> Float[np.ndarray, "h w 4"]:
         return loaded.avatar.render(loaded.avatar.pose_vertices(pose), loaded.camera, config.samples_per_pixel_side)
 
-    def draw_mesh(pose: Float[Tensor, "j 4 4"]) -> Float[np.ndarray, "h w 4"]:
-        return blur_coverage(draw_sharp(pose), blur_px)
+    def render_mesh(pose: Float[Tensor, "j 4 4"]) -> Float[np.ndarray, "h w 4"]:
+        return blur_coverage(render_sharp(pose), blur_px)
 
     renderers = {
         "field": (loaded.field_renderer, loaded.refined_canonical_to_world),
-        "mesh_sharp": (draw_sharp, loaded.refined_canonical_to_world),
+        "mesh_sharp": (render_sharp, loaded.refined_canonical_to_world),
     }
     if config.score_unrefined_mesh:
-        renderers["mesh_unrefined"] = (draw_mesh, loaded.fitted_canonical_to_world)
-    if config.score_unrefined_field:
+        renderers["mesh_unrefined"] = (render_mesh, loaded.fitted_canonical_to_world)
+    if settings.score_unrefined_field:
         renderers["field_unrefined"] = (loaded.field_renderer, loaded.fitted_canonical_to_world)
     if config.fit_held_out_poses:
-        poses_fitted = fit_heldout_poses(loaded, positions, config.pose_fit_steps)
+        poses_fitted = fit_heldout_poses(loaded, positions, settings.pose_fit_steps)
         renderers |= {
             "field_pose_fitted": (loaded.field_renderer, poses_fitted),
-            "mesh_pose_fitted": (draw_mesh, poses_fitted),
+            "mesh_pose_fitted": (render_mesh, poses_fitted),
         }
     weights = find_lpips_weights()
     shown = set(positions[np.linspace(0, len(positions) - 1, config.max_page_frames).round().astype(int)].tolist())
-    rows, pictures = [], []
+    rows, frame_images = [], []
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         for position in track(positions.tolist(), "held-out frames"):
             image, mask = (to_uint8(part(position)) for part in (loaded.capture.image, loaded.capture.mask))
-            renders = {name: draw(poses[position]) for name, (draw, poses) in renderers.items()}
+            renders = {name: render(poses[position]) for name, (render, poses) in renderers.items()}
             softened = blur_coverage(renders["mesh_sharp"], blur_px)
             renders = {"field": renders["field"], "mesh": softened} | renders
             index = int(loaded.capture.frame_index[position])
             scores = pool.map(partial(frame_scores, image=image, mask=mask, lpips_weights=weights), renders.values())
             rows.append({"index": index} | dict(zip(renders, scores, strict=True)))
             if position in shown:
-                pictures.append(_frame_images(index, image, mask, renders))
-    return rows, pictures
+                frame_images.append(_frame_images(index, image, mask, renders, settings.crop_margin_px))
+    return rows, frame_images
 
 
 def fit_heldout_poses(loaded: FinishedRun, positions: np.ndarray, steps: int) -> Float[Tensor, "n j 4 4"]:
-    """The refined poses of all frames, those of the held-out ones fitted to their own pictures through the mesh."""
-    turntable_views = [
+    """Return the refined poses of all frames, those of held-out frames fitted to their own images through the mesh."""
+    views = [
         crop_posed_view(
             loaded.capture.image(position),
             loaded.capture.mask(position),
@@ -213,28 +211,26 @@ def fit_heldout_poses(loaded: FinishedRun, positions: np.ndarray, steps: int) ->
         )
         for position in positions.tolist()
     ]
-    motion = fit_poses(loaded.avatar, loaded.body, loaded.motion.select(positions), turntable_views, steps)
+    motion = fit_poses(loaded.avatar, loaded.body, loaded.motion.select(positions), views, steps)
     return loaded.refined_canonical_to_world.index_copy(
         0, torch.from_numpy(positions), canonical_to_world(loaded.body, motion)
     )
 
 
-def draw_turntable(
-    loaded: FinishedRun, position: int, config: Config
+def render_turntables(
+    loaded: FinishedRun, position: int, config: Config, settings: ReportSettings = REPORT_SETTINGS
 ) -> list[tuple[str, list[UInt8[np.ndarray, "_ _ 4"]]]]:
-    """The avatar from all sides, in its A-pose and as it stood in one frame."""
+    """Render the avatar from all sides, in the A-pose and in the pose of one frame."""
     index = int(loaded.capture.frame_index[position])
     bodies = {
         "A-pose": loaded.avatar.vertices,
-        f"As in frame {index}, a held-out one": loaded.avatar.pose_vertices(
-            loaded.refined_canonical_to_world[position]
-        ),
+        f"Pose of frame {index}, held out": loaded.avatar.pose_vertices(loaded.refined_canonical_to_world[position]),
     }
     return [
         (
             title,
             loaded.avatar.render_turntable(
-                vertices, config.turntable_views, config.turntable_height_px, config.samples_per_pixel_side
+                vertices, config.turntable_views, settings.turntable_height_px, config.samples_per_pixel_side
             ),
         )
         for title, vertices in bodies.items()
@@ -242,10 +238,14 @@ def draw_turntable(
 
 
 def _frame_images(
-    index: int, image: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"], renders: Mapping[str, np.ndarray]
+    index: int,
+    image: UInt8[np.ndarray, "h w 3"],
+    mask: UInt8[np.ndarray, "h w"],
+    renders: Mapping[str, np.ndarray],
+    margin_px: int,
 ) -> FrameImages:
     rows, columns = foreground_bounding_box(foreground_mask(mask))
-    crop = tuple(slice(max(0, part.start - CROP_MARGIN_PX), part.stop + CROP_MARGIN_PX) for part in (rows, columns))
+    crop = tuple(slice(max(0, part.start - margin_px), part.stop + margin_px) for part in (rows, columns))
     field, mesh = (composite_premultiplied_on_white(renders[name])[crop] for name in ("field", "mesh"))
     return FrameImages(index, composite_on_white(image, mask)[crop], field, mesh)
 

@@ -1,4 +1,4 @@
-"""Pictures and models inside one HTML file: data URIs, and a GLB made light enough to be carried along."""
+"""Data for embedding in an HTML file: WebP data URIs, and a GLB with smaller textures."""
 
 import base64
 import json
@@ -15,7 +15,11 @@ _GLB_MAGIC, _JSON_CHUNK, _BIN_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
 
 
 def webp_data_uri(pixels: UInt8[np.ndarray, "h w c"]) -> str:
-    """A `data:` URI of an RGB image, or of an RGBA image with straight alpha, as WebP."""
+    """Return a `data:` URI of an RGB image, or of an RGBA image with straight alpha, as WebP.
+
+    Raises:
+        ValueError: the image cannot be encoded.
+    """
     order = cv2.COLOR_RGBA2BGRA if pixels.shape[2] == 4 else cv2.COLOR_RGB2BGR
     encoded, data = cv2.imencode(".webp", cv2.cvtColor(pixels, order), (cv2.IMWRITE_WEBP_QUALITY, WEBP_QUALITY))
     if not encoded:
@@ -24,7 +28,11 @@ def webp_data_uri(pixels: UInt8[np.ndarray, "h w c"]) -> str:
 
 
 def unpack_glb(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """The JSON document and the binary chunk of a GLB (glTF 2.0, section 4.4); ValueError when it is none."""
+    """Split a GLB into its JSON document and its binary chunk (glTF 2.0, section 4.4).
+
+    Raises:
+        ValueError: the data are no binary glTF 2.0.
+    """
     if len(data) < 20 or struct.unpack_from("<II", data) != (_GLB_MAGIC, 2):
         raise ValueError("no binary glTF 2.0")
     length, kind = struct.unpack_from("<II", data, 12)
@@ -41,7 +49,7 @@ def unpack_glb(data: bytes) -> tuple[dict[str, Any], bytes]:
 
 
 def pack_glb(document: dict[str, Any], binary: bytes) -> bytes:
-    """The inverse of `unpack_glb`; chunks are padded to four bytes."""
+    """Return the bytes of a GLB, the inverse of `unpack_glb`; chunks are padded to four bytes."""
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     binary += b"\0" * (-len(binary) % 4)
@@ -58,10 +66,10 @@ def pack_glb(document: dict[str, Any], binary: bytes) -> bytes:
 
 
 def compress_glb_textures(data: bytes, max_texture_px: int = 2048) -> bytes:
-    """The same model with its opaque textures as JPEG of at most `max_texture_px` a side.
+    """Return the model with its opaque textures as JPEG of at most `max_texture_px` a side.
 
-    For showing only: geometry, skin and animation stay bit for bit; textures with alpha stay PNG. A texture is left
-    alone where JPEG would not be smaller.
+    For display only: geometry, skin and animation keep their bytes; textures with alpha stay PNG. A texture is
+    unchanged if its JPEG is not smaller.
     """
     document, binary = unpack_glb(data)
     replaced = {}
@@ -89,7 +97,7 @@ def _buffer_view_bytes(view: dict[str, Any], binary: bytes) -> bytes:
 
 
 def _encode_jpeg(encoded: bytes, max_texture_px: int) -> bytes | None:
-    """The image as JPEG; None when it has an alpha channel, which JPEG cannot hold."""
+    """Return the image as JPEG; None if it has an alpha channel, which JPEG cannot store."""
     pixels = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None or (pixels.ndim == 3 and pixels.shape[2] == 4):
         return None

@@ -1,4 +1,4 @@
-"""The weights of LPIPS, where other programs have left them on this machine. Nothing is ever downloaded."""
+"""The weights of LPIPS, if another program has installed them on this machine. Nothing is downloaded."""
 
 import sys
 from pathlib import Path
@@ -7,20 +7,19 @@ import torch
 from torch import Tensor
 
 ALEXNET_FILE = "alexnet-owt-7be5be79.pth"
-"""The file that torchvision keeps in torch's hub folder."""
+"""File name of torchvision's AlexNet in torch's hub folder."""
 
 LPIPS_LAYERS_FILE = Path("lpips/weights/v0.1/alex.pth")
-"""The file inside the package lpips."""
+"""Path of the layer weights inside the package lpips."""
 
 WEIGHTS_MISSING_NOTE = (
-    f"absent: {ALEXNET_FILE} is not in torch's hub folder, or the package lpips with {LPIPS_LAYERS_FILE} "
-    "is not installed; "
-    "nothing is downloaded"
+    f"not computed: {ALEXNET_FILE} is not in torch's hub folder, or the package lpips with {LPIPS_LAYERS_FILE} is "
+    "not installed; nothing is downloaded"
 )
 
 
 def find_lpips_weights() -> dict[str, Tensor] | None:
-    """AlexNet's features and the five layers' channel weights by name, or None when one of the two files is absent."""
+    """Return AlexNet's features and the channel weights of the five layers by name; None if a file is missing."""
     backbone = Path(torch.hub.get_dir()) / "checkpoints" / ALEXNET_FILE
     layers = next(
         (Path(folder) / LPIPS_LAYERS_FILE for folder in sys.path if (Path(folder) / LPIPS_LAYERS_FILE).is_file()), None

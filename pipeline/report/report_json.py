@@ -1,4 +1,4 @@
-"""The document of report.json: what all stages cost and how good the result is, for programs and for the page."""
+"""The document of report.json: cost of all stages and quality of the result."""
 
 import json
 import math
@@ -12,28 +12,27 @@ from pipeline.metrics.lpips import MIN_SIDE_PX
 from pipeline.report.lpips_weights import WEIGHTS_MISSING_NOTE as LPIPS_ABSENT
 
 PROTOCOL = (
-    "{count} frames, those that the video's split.json names or else those whose index in the video is divisible by "
-    "eight, were held out: field, mesh and texture never saw their pixels, and nothing of them was decided on these. "
-    "Their poses are fitted to landmarks and outline, never to their colours: the body stage finds the pose of every "
-    "frame, and the one shape and camera, from the landmarks and the masks of all frames, held-out ones too; the "
-    "field's corrections of the poses are interpolated in time between training frames and held beyond them. Frames "
-    "are laid over white by the mask that the frames stage found, so that what it leaves out costs nothing, renders by "
-    "their own coverage, both rounded to 8 bits. Of psnr, ssim and flip (67 "
-    "pixels a degree, lower is better), _full counts the whole image, _body the pixels of the mask, _box the smallest "
-    "box around it; each is the mean over frames. field is the radiance field, mesh the exported mesh with its "
-    "diffuse map, unlit, its outline blurred until it is as soft as the masks (masks.edge_spread_px, measured on "
-    "frames that are not scored); mesh_sharp is the mesh as square pixels give it."
+    "{count} frames were held out: those that the video's split.json lists, or else those whose index in the video is "
+    "divisible by eight. Field, mesh and texture were not trained on their pixels, and no decision used them. Their "
+    "poses are fitted to landmarks and silhouettes, never to colours: the body stage fits every frame, and the common "
+    "shape and camera, to the landmarks and masks of all frames. The field's pose corrections are interpolated in time "
+    "between training frames and constant beyond them. Frames are composited on white with the mask of the frames "
+    "stage, so an error of that mask costs nothing; renders are composited with their own alpha; both are rounded to 8 "
+    "bits. psnr, ssim and flip (67 pixels a degree, lower is better) are means over frames: _full counts the whole "
+    "image, _body the pixels of the mask, _box its bounding box. field is the radiance field; mesh is the exported "
+    "mesh with its diffuse map, unlit, its outline blurred to the softness of the masks (masks.edge_blur_sigma_px, "
+    "measured on frames that are not scored); mesh_sharp is the mesh with hard edges."
 )
-UNREFINED_NOTE = " The rows named unrefined use the body stage's poses alone."
+UNREFINED_NOTE = " Rows named unrefined use the poses of the body stage, without the field's corrections."
 LPIPS_NOTE = (
-    "AlexNet, version 0.1, full image on white, colours scaled to [-1, 1] as its authors' code wants them. "
-    "InstantAvatar's evaluation gives it colours in [0, 1], so LPIPS published after that do not compare"
+    "AlexNet, version 0.1, full image on white, colours scaled to [-1, 1] as in its authors' code. InstantAvatar's "
+    "evaluation passes colours in [0, 1], so LPIPS values published with it do not compare"
 )
-LPIPS_MISSING_NOTE = f"{LPIPS_ABSENT}; frames with a side below {MIN_SIDE_PX} px have none either way"
+LPIPS_MISSING_NOTE = f"{LPIPS_ABSENT}; frames with a side below {MIN_SIDE_PX} px have no LPIPS"
 POSE_FITTED_SUFFIX = "_pose_fitted"
 POSE_FITTED_NOTE = (
-    " The rows named pose_fitted are no held-out scores: there the pose of each frame was fitted to that frame's own "
-    "image and mask through the mesh. They say how much of the error is the pose's."
+    " Rows named pose_fitted are not held-out scores: the pose of each frame was fitted to the image and mask of that "
+    "frame through the mesh. They show which part of the error is an error of the pose."
 )
 
 
@@ -44,16 +43,17 @@ def build_report(
     environment: Mapping[str, Any],
     cost: tuple[float, float],
 ) -> dict[str, Any]:
-    """Everything the report says.
+    """Build the document.
 
     Args:
-        manifests: of the stages before the report, in order.
-        frames: a row a held-out frame, `index` and the scores of each render by name.
-        figures: sections that the report measures: `mesh` (health), `export` (glb_bytes, texture_px), `masks` (count).
-        cost: the report's own seconds and peak memory (MiB) until now.
+        manifests: manifests of the stages before the report, in order.
+        frames: one row for each held-out frame: `index`, and the scores of each render by name.
+        metric_sections: sections measured by the report: `mesh` (quality), `export` (glb_bytes, texture_px), `masks`.
+        environment: machine and versions of this run.
+        cost: seconds and peak memory (MiB) of the report stage so far.
 
     Raises:
-        UserError: the body stage's manifest lacks a figure.
+        UserError: the manifest of the body stage lacks a metric.
     """
     seconds = {name: manifest.seconds for name, manifest in manifests.items()} | {"report": round(cost[0], 3)}
     peaks = {name: manifest.peak_rss_mib for name, manifest in manifests.items()} | {"report": round(cost[1], 1)}
@@ -80,12 +80,12 @@ def build_report(
 
 
 def report_to_json(report: Mapping[str, Any]) -> str:
-    """JSON text of the document; a figure that is not finite (the PSNR of equal images) becomes null."""
+    """Return the document as JSON text; a value that is not finite (the PSNR of equal images) becomes null."""
     return json.dumps(replace_nonfinite(report), indent=2, allow_nan=False) + "\n"
 
 
 def replace_nonfinite(value: Any) -> Any:
-    """The same document with None in place of infinities and NaN."""
+    """Return the document with None in place of infinities and NaN."""
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, Mapping):
@@ -96,7 +96,7 @@ def replace_nonfinite(value: Any) -> Any:
 def _manifest_metric(manifest: Manifest, name: str) -> float | None:
     if name not in manifest.metrics:
         raise UserError(
-            f"the manifest of stage {manifest.stage} has no figure {name}: "
+            f"the manifest of stage {manifest.stage} has no metric {name}: "
             f"run it again with python -m stages.{manifest.stage} RUN --force"
         )
     return manifest.metrics[name]

@@ -53,6 +53,6 @@ def sample_page() -> PageContent:
         report=sample_report(math.inf),
         frames=[FrameImages(index, video, field, mesh) for index in (0, 8)],
         turntable=[("A-pose", views)],
-        pictures=[("Diffuse map", video)],
+        images=[("Diffuse map", video)],
         glb=encode_glb(sample_skinned_mesh(body)[0], body, motion, sample_maps()),
     )

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from pipeline.report.embed import unpack_glb
-from pipeline.report.page import ASSETS_DIR, ERROR_MAP_MAX_LEVELS, error_map, format_metric, render_page
+from pipeline.report.page import ERROR_MAP_MAX_LEVELS, error_map, format_metric, render_page
+from pipeline.report.templates import ASSETS_DIR
 from tests.report.report_sample import sample_page
 
 VOID = {"meta", "link", "img", "input", "br"}

@@ -16,6 +16,7 @@ from pipeline.core.manifest import digest_files
 from pipeline.core.progress import take_warnings
 from pipeline.io.image import write_gray
 from pipeline.report.lpips_weights import find_lpips_weights
+from pipeline.report.settings import ReportSettings
 from stages.report import STAGE, Config, run, scored_positions
 from tests.stages.report_run import COLOUR_ERROR, FRAME_INDEX, make_run
 
@@ -23,13 +24,10 @@ CONFIG = Config(
     samples_per_pixel_side=3,
     max_page_frames=2,
     turntable_views=4,
-    turntable_height_px=64,
     fit_held_out_poses=True,
-    pose_fit_steps=5,
 )
-QUICK = Config(
-    samples_per_pixel_side=1, max_page_frames=1, turntable_views=2, turntable_height_px=64, score_unrefined_mesh=False
-)
+SETTINGS = ReportSettings(turntable_height_px=64, pose_fit_steps=5)
+QUICK = Config(samples_per_pixel_side=1, max_page_frames=1, turntable_views=2, score_unrefined_mesh=False)
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +40,7 @@ def out(inputs: dict[str, Path]) -> Path:
     folder = inputs["frames"].parent / "report.part"
     folder.mkdir()
     before = {name: digest_files(path) for name, path in inputs.items()}
-    metrics = run(inputs, folder, CONFIG)
+    metrics = run(inputs, folder, CONFIG, SETTINGS)
     assert metrics["mesh_psnr_body"] > metrics["field_psnr_body"]
     assert before == {name: digest_files(path) for name, path in inputs.items()}  # inputs are read only
     return folder
@@ -142,7 +140,7 @@ def test_the_page_shows_the_chosen_frames(out: Path):
 
 def test_sheets_show_the_avatar(out: Path):
     turntable = cv2.imread(str(out / "turntable.jpg"))
-    assert turntable.shape[0] > 2 * CONFIG.turntable_height_px
+    assert turntable.shape[0] > 2 * SETTINGS.turntable_height_px
     assert (turntable < 200).any(axis=2).mean() > 0.1
     assert cv2.imread(str(out / "heldout.jpg")) is not None
 
@@ -153,7 +151,7 @@ def test_without_held_out_frames_the_reason_is_named(inputs: dict[str, Path], tm
     fields = load_capture(frames).__dict__ | {"split": np.zeros(len(FRAME_INDEX), dtype=np.uint8)}
     save_capture(Capture(**fields))
     with pytest.raises(UserError, match="divisible by eight"):
-        run(inputs | {"frames": frames}, tmp_path, CONFIG)
+        run(inputs | {"frames": frames}, tmp_path, CONFIG, SETTINGS)
 
 
 def test_a_held_out_frame_without_a_person_is_left_out_with_a_warning(inputs: dict[str, Path], tmp_path: Path):
@@ -168,7 +166,7 @@ def test_a_held_out_frame_without_a_person_is_left_out_with_a_warning(inputs: di
     take_warnings()
     out = tmp_path / "report"
     out.mkdir()
-    run(inputs | {"frames": frames}, out, QUICK)
+    run(inputs | {"frames": frames}, out, QUICK, SETTINGS)
     assert [row["index"] for row in json.loads((out / "report.json").read_text())["heldout"]["frames"]] == [8]
     empty, tiny = take_warnings()
     assert "held-out frame 0 is not scored: no pixel of its mask" in empty
@@ -181,4 +179,4 @@ def test_a_held_out_frame_without_a_person_is_left_out_with_a_warning(inputs: di
 
 def test_without_a_manifest_the_command_is_named(inputs: dict[str, Path], tmp_path: Path):
     with pytest.raises(UserError, match="python -m stages.mesh"):
-        run(inputs | {"mesh": tmp_path / "mesh"}, tmp_path, CONFIG)
+        run(inputs | {"mesh": tmp_path / "mesh"}, tmp_path, CONFIG, SETTINGS)

@@ -1,0 +1,29 @@
+"""Settings of the report that no preset varies; change them from Python with `dataclasses.replace`."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ReportSettings:
+    """Constants of the evaluation.
+
+    score_unrefined_field: score the field also with the poses of the body stage; doubles the time of the report.
+    pose_fit_steps: optimiser steps of the fit to held-out images (docs/decisions/evaluation.md: 40).
+    turntable_height_px: height of a turntable image.
+    edge_blur_frames: frames on which the softness of the masks is measured; none of them is scored.
+    crop_margin_px: margin around the person in images of held-out frames.
+    """
+
+    score_unrefined_field: bool = False
+    pose_fit_steps: int = 40
+    turntable_height_px: int = 480
+    edge_blur_frames: int = 16
+    crop_margin_px: int = 12
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for values that make no report."""
+        if self.pose_fit_steps < 1 or self.turntable_height_px < 64 or self.edge_blur_frames < 1:
+            raise ValueError("pose_fit_steps and edge_blur_frames must be at least 1, turntable_height_px at least 64")
+
+
+REPORT_SETTINGS = ReportSettings()
