@@ -33,10 +33,11 @@ from pipeline.geometry.rotation import quaternion_to_matrix
 from pipeline.geometry.skinning import forward_kinematics
 from pipeline.geometry.surface import closest_points_on_mesh
 from pipeline.geometry.texture_rendering import blur_coverage, sample_texture
-from pipeline.io.image import read_gray, read_rgba, to_float, to_uint8
+from pipeline.io.image import read_rgba, to_float, to_uint8
 from pipeline.metrics.alignment import SimilarityTransform, align_surfaces_icp
 from pipeline.metrics.images import additional_blur_sigma_px, frame_scores, mean_scores, reason_not_scorable
 from pipeline.metrics.surfaces import sample_surface, surface_scores
+from pipeline.texture.files import load_texture
 from stages.report import median_edge_spread_px, scored_positions
 
 SURFACE_FRAMES = 4
@@ -108,7 +109,7 @@ def load_comparison(out: Path, run: Path) -> Comparison:
     """Read a run with a texture and the truth of its capture. UserError as the readers do."""
     return Comparison(
         run=load_finished_run({name: run / name for name in REQUIRED_STAGES}),
-        coverage=to_float(read_gray(run / "texture" / "coverage.png")),
+        coverage=to_float(load_texture(run / "texture").coverage),
         truth=load_ground_truth(out),
         folder=out / "truth",
     )

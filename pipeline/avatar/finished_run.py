@@ -1,4 +1,4 @@
-"""A finished run read back: the recording, the fitted body, the field and the exported mesh, ready to be drawn."""
+"""Load a finished run for evaluation: capture, fitted body, field and textured avatar, ready to render."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -17,19 +17,23 @@ from pipeline.field.files import load_field, load_occupancy
 from pipeline.field.rendering import render_field
 from pipeline.field.skin_grid import build_skin_grid, skin_margin_m
 from pipeline.geometry.camera import Camera
-from pipeline.io.image import read_rgb, to_float
+from pipeline.io.image import to_float
 from pipeline.io.npz import load_npz
+from pipeline.texture.files import load_texture
 
 PoseRenderer = Callable[[Float[Tensor, "j 4 4"]], Float[np.ndarray, "h w 4"]]
-"""Draws one pose, given as skinning matrices: premultiplied colours and alpha in [0, 1]."""
+"""Renders one pose (skinning matrices, canonical to world): premultiplied colours and alpha in [0, 1]."""
 
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """What there is to look at when all stages have run.
+    """The artifacts of all stages up to texture.
 
-    motion: of every chosen frame, with the field's pose corrections. refined: its skinning matrices; fitted: those of
-    the body stage alone.
+    Attributes:
+        motion: of every selected frame, with the pose corrections of the field stage.
+        field_renderer: renders the field with `camera`.
+        refined_canonical_to_world: skinning matrices of `motion`.
+        fitted_canonical_to_world: skinning matrices of the body stage's motion, without these corrections.
     """
 
     capture: Capture
@@ -43,7 +47,13 @@ class FinishedRun:
 
 
 def load_finished_run(inputs: Mapping[str, Path]) -> FinishedRun:
-    """Read the folders of `frames`, `body`, `field`, `mesh` and `texture`. Raises UserError as the readers do."""
+    """Read the artifacts of the frames, body, field, mesh and texture stages.
+
+    inputs: artifact folder of each of these stages, by stage name.
+
+    Raises:
+        UserError: an artifact is missing or cannot be read.
+    """
     body = load_body(inputs["body"] / "body.npz")
     camera = load_camera(inputs["body"] / "camera.npz")
     motion = load_motion(inputs["field"] / "motion.npz")
@@ -60,16 +70,16 @@ def load_finished_run(inputs: Mapping[str, Path]) -> FinishedRun:
 
 
 def load_textured_avatar(mesh_dir: Path, texture_dir: Path) -> TexturedAvatar:
-    """The mesh stage's surface and skin with the texture stage's atlas and diffuse map."""
-    mesh, atlas = load_npz(mesh_dir / "mesh.npz"), load_npz(texture_dir / "atlas.npz")
+    """Combine the skinned mesh of the mesh stage with the atlas and diffuse map of the texture stage."""
+    mesh, texture = load_npz(mesh_dir / "mesh.npz"), load_texture(texture_dir)
     return TexturedAvatar(
         vertices=torch.from_numpy(mesh["vertices"].astype(np.float32)),
         faces=torch.from_numpy(mesh["faces"].astype(np.int32)),
         joint_indices=torch.from_numpy(mesh["joint_indices"].astype(np.int64)),
         joint_weights=torch.from_numpy(mesh["joint_weights"].astype(np.float32)),
-        uv=torch.from_numpy(atlas["uv"].astype(np.float32)),
-        faces_uv=torch.from_numpy(atlas["faces_uv"].astype(np.int32)),
-        diffuse=torch.from_numpy(to_float(read_rgb(texture_dir / "diffuse.png"))),
+        uv=torch.from_numpy(texture.atlas.uv.astype(np.float32)),
+        faces_uv=torch.from_numpy(texture.atlas.faces_uv.astype(np.int32)),
+        diffuse=torch.from_numpy(to_float(texture.diffuse)),
     )
 
 

@@ -1,6 +1,7 @@
-"""A skinned, animated avatar as one binary glTF 2.0 file (https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html).
+"""Encode a skinned, animated avatar as binary glTF 2.0 (https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html).
 
-glTF wants quaternions as xyzw, v pointing down, matrices column by column, cameras that look along -Z with +Y up.
+glTF conventions: quaternions xyzw, v pointing down, column-major matrices, cameras looking along -Z with +Y up.
+trimesh writes neither skins nor animations; `pipeline.io.glb` reads what is written here.
 """
 
 import json
@@ -8,7 +9,6 @@ import math
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,9 +30,15 @@ _MAX_JOINTS = 1 << 16
 
 @dataclass(frozen=True)
 class SkinnedMesh:
-    """One corner list for all attributes, in the bind pose; uv has its origin bottom-left, faces are counter-clockwise.
+    """A mesh in the bind pose with one index per corner: vertices are duplicated along UV seams.
 
-    At most four influences a corner: weights sum to 1, the joint is 0 where the weight is 0.
+    Attributes:
+        positions_m: +Y up.
+        normals: not necessarily of unit length.
+        uv: origin bottom-left.
+        joint_indices: at most four influences per vertex; 0 where the weight is 0.
+        joint_weights: rows sum to 1.
+        faces: counter-clockwise.
     """
 
     positions_m: Float[np.ndarray, "t 3"]
@@ -45,11 +51,13 @@ class SkinnedMesh:
 
 @dataclass(frozen=True)
 class MaterialMaps:
-    """PNG files' bytes and what else describes the surface.
+    """Encoded maps and parameters of the material.
 
-    diffuse_png: RGB, sRGB. specular_png: what `pack_specular_factor` makes, or None for a matte surface. unlit: the
-    diffuse
-    map is shown as it is, whatever lamps a scene has; there are no highlights then.
+    Attributes:
+        diffuse_png: RGB, sRGB.
+        specular_png: result of `pack_specular_factor`; None for a surface without highlights.
+        roughness: in [0, 1].
+        unlit: viewers show the diffuse map without lights; `specular_png` is then ignored.
     """
 
     diffuse_png: bytes
@@ -60,23 +68,25 @@ class MaterialMaps:
 
 @dataclass
 class _GlbBuilder:
-    """The JSON part and the binary part while they grow."""
+    """Accumulates the JSON chunk and the binary chunk of a .glb."""
 
     json: dict[str, Any] = field(default_factory=dict)
     binary: bytearray = field(default_factory=bytearray)
 
     def add(self, kind: str, value: dict[str, Any]) -> int:
+        """Append an object to a top-level array such as "nodes"; return its index."""
         self.json.setdefault(kind, []).append(value)
         return len(self.json[kind]) - 1
 
     def add_bytes(self, data: bytes, target: int | None = None) -> int:
+        """Append a buffer view, aligned to 4 bytes; return its index."""
         self.binary.extend(b"\0" * (-len(self.binary) % 4))
         view = {"buffer": 0, "byteOffset": len(self.binary), "byteLength": len(data)}
         self.binary.extend(data)
         return self.add("bufferViews", view | ({"target": target} if target else {}))
 
     def add_array(self, values: np.ndarray, target: int | None = None, bounds: bool = False) -> int:
-        """An accessor for a scalar or vector array, one element a row."""
+        """Append an accessor, one element per row; `bounds` adds min and max. Return its index."""
         values = np.ascontiguousarray(values)
         accessor: dict[str, Any] = {
             "bufferView": self.add_bytes(values.tobytes(), target),
@@ -89,7 +99,8 @@ class _GlbBuilder:
             accessor |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
         return self.add("accessors", accessor)
 
-    def pack(self) -> bytes:
+    def to_bytes(self) -> bytes:
+        """Return the whole file; the JSON chunk is padded with spaces, the binary chunk with zeros."""
         self.json["buffers"] = [{"byteLength": len(self.binary)}]
         text = json.dumps(self.json, separators=(",", ":"), ensure_ascii=True).encode()
         text += b" " * (-len(text) % 4)
@@ -106,17 +117,22 @@ def encode_glb(
     camera: Camera | None = None,
     extras: Mapping[str, Any] | None = None,
 ) -> bytes:
-    """The bytes of a .glb: one skinned mesh at the scene's root, the body's joints, the motion as animation "capture".
+    """Encode one skinned mesh at the scene root, the body's joints and the motion (animation "capture") as a .glb.
 
-    motion: in the frame of the scene (+Y up, floor at y = 0); key times are its `time_s`, which must increase.
-    camera: becomes a node of the scene, so that the picture that was filmed can be laid under the avatar.
-    extras: what `asset.extras` says about the file.
+    Args:
+        mesh: in the bind pose of `body`.
+        body: joint names, parents and rest positions.
+        motion: in the frame of the scene (+Y up, floor at y = 0); key times are its `time_s`.
+        maps: material.
+        camera: capture camera, written as a node, so that the filmed images can be shown as a background.
+        extras: contents of `asset.extras`.
 
-    Raises ValueError when there are more than 65536 joints (indices have 16 bits), no frame, times that do not
-    increase, a pose that is not finite, or a quaternion without length.
+    Raises:
+        ValueError: more than 65536 joints (indices have 16 bits), no frame, times that do not increase, a value that is
+            not finite, or a zero quaternion.
     """
     if len(body.joint_names) > _MAX_JOINTS:
-        raise ValueError(f"glTF counts joints in 16 bits: {len(body.joint_names)} are more than {_MAX_JOINTS}")
+        raise ValueError(f"glTF joint indices have 16 bits: {len(body.joint_names)} joints exceed {_MAX_JOINTS}")
     _check_motion(motion)
     document = _GlbBuilder()
     document.json["asset"] = {"version": "2.0", "generator": "instant-human-mesh"}
@@ -132,60 +148,32 @@ def encode_glb(
     _add_animation(document, motion, first_joint)
     if camera is not None:
         document.json["scenes"][0]["nodes"].append(_add_camera(document, camera))
-    return document.pack()
+    return document.to_bytes()
 
 
 def pack_specular_factor(factor: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 4"]:
-    """A picture with the specular factor where KHR_materials_specular reads it: linear, in alpha; the rest is white.
+    """Return an RGBA image for KHR_materials_specular: the linear specular factor in alpha, RGB white.
 
-    factor: 255 reflects as any dielectric does (4 % seen along the normal), 0 not at all.
+    factor: 255 reflects like a standard dielectric (4 % at normal incidence), 0 does not reflect.
     """
     return np.concatenate([np.full((*factor.shape, 3), 255, dtype=np.uint8), factor[..., None]], axis=2)
 
 
-def write_glb(path: Path, data: bytes) -> None:
-    """Write the bytes of `encode_glb`."""
-    path.write_bytes(data)
-
-
-def read_glb(path: Path) -> tuple[dict[str, Any], bytes]:
-    """JSON part and binary part of a .glb; ValueError when it is none."""
-    data = path.read_bytes()
-    if len(data) < 20 or data[:4] != b"glTF":
-        raise ValueError(f"{path} is no binary glTF file")
-    (length,) = struct.unpack_from("<I", data, 12)
-    document: dict[str, Any] = json.loads(data[20 : 20 + length])
-    (binary_length,) = struct.unpack_from("<I", data, 20 + length)
-    start = 28 + length
-    return document, data[start : start + binary_length]
-
-
-def read_accessor(document: Mapping[str, Any], binary: bytes, index: int) -> np.ndarray:
-    """The values of an accessor as `encode_glb` writes them, one element a row."""
-    accessor = document["accessors"][index]
-    view = document["bufferViews"][accessor["bufferView"]]
-    name = next(name for name, code in _COMPONENT_TYPES.items() if code == accessor["componentType"])
-    width = next(width for width, kind in _ACCESSOR_TYPES.items() if kind == accessor["type"])
-    start = view["byteOffset"]
-    values = np.frombuffer(binary[start : start + view["byteLength"]], dtype=name)
-    return values.reshape(accessor["count"], width) if width > 1 else values
-
-
 def _check_motion(motion: Motion) -> None:
-    """Raises ValueError for what would play as something else than was filmed."""
-    times = motion.time_s.astype(np.float32)  # as they are stored
+    """Raise ValueError for a motion that a viewer cannot play correctly."""
+    times = motion.time_s.astype(np.float32)  # the stored precision
     if not len(times) or not np.all(np.diff(times) > 0):
-        raise ValueError("an animation needs frames whose times increase")
+        raise ValueError("an animation needs at least one frame, and times that increase")
     if not all(np.isfinite(values).all() for values in (times, motion.rotations_wxyz, motion.root_translation_m)):
-        raise ValueError("an animation needs times, rotations and translations that are finite")
+        raise ValueError("an animation needs finite times, rotations and translations")
     if np.linalg.norm(motion.rotations_wxyz, axis=-1).min() < _MIN_NORM:
-        raise ValueError("an animation needs quaternions with a length")
+        raise ValueError("an animation needs quaternions of non-zero length")
 
 
 def _add_primitive(document: _GlbBuilder, mesh: SkinnedMesh, joint_count: int) -> dict[str, Any]:
     joints = mesh.joint_indices.astype(np.uint8 if joint_count <= 256 else np.uint16)
     uv = np.stack([mesh.uv[:, 0], 1.0 - mesh.uv[:, 1]], axis=1).astype(np.float32)
-    # 65535 restarts a strip in the 16-bit type and may not be used
+    # 65535 is the primitive restart value of 16-bit indices and is not allowed as an index
     faces = mesh.faces.astype(np.uint16 if len(mesh.positions_m) < 65535 else np.uint32)
     attributes = {
         "POSITION": document.add_array(mesh.positions_m.astype(np.float32), _ARRAY_BUFFER, bounds=True),
@@ -208,7 +196,7 @@ def _add_material(document: _GlbBuilder, maps: MaterialMaps) -> int:
         },
     }
     extensions: dict[str, Any] = {"KHR_materials_specular": {"specularFactor": 0.0}}
-    if maps.unlit:  # KHR_materials_specular must not stand beside it
+    if maps.unlit:  # the extension forbids KHR_materials_specular on the same material
         extensions = {"KHR_materials_unlit": {}}
     elif maps.specular_png is not None:
         texture = {"index": _add_texture(document, "specular", maps.specular_png)}
@@ -224,7 +212,7 @@ def _add_texture(document: _GlbBuilder, name: str, png: bytes) -> int:
 
 
 def _add_skeleton(document: _GlbBuilder, body: Body, first_joint: int) -> None:
-    """Joints without rotation or scale: their rest is the bind pose, and the inverse bind matrix is a translation."""
+    """Add joint nodes without rotation or scale: the rest pose is the bind pose, inverse bind is a translation."""
     children: list[list[int]] = [[] for _ in body.joint_names]
     for joint, parent in enumerate(body.parents):
         if parent >= 0:
@@ -234,7 +222,7 @@ def _add_skeleton(document: _GlbBuilder, body: Body, first_joint: int) -> None:
         node: dict[str, Any] = {"name": name, "translation": _float_list(body.joints_m[joint] - origin)}
         document.add("nodes", node | ({"children": children[joint]} if children[joint] else {}))
     inverse_bind = np.tile(np.eye(4, dtype=np.float32), (len(body.joints_m), 1, 1))
-    inverse_bind[:, 3, :3] = -body.joints_m  # stored by columns: the translation is the last four numbers
+    inverse_bind[:, 3, :3] = -body.joints_m  # column-major: the translation is the last row of the array
     document.add(
         "skins",
         {
@@ -266,7 +254,10 @@ def _add_animation(document: _GlbBuilder, motion: Motion, first_joint: int) -> N
 
 
 def _add_camera(document: _GlbBuilder, camera: Camera) -> int:
-    """The camera as a node; what glTF's symmetric pinhole cannot say (principal point, fx) stays in its extras."""
+    """Add the camera as a node.
+
+    glTF cameras have a centred principal point; the full intrinsics are written to the extras of the node.
+    """
     axes = np.diag([1.0, -1.0, -1.0])
     rotation = torch.from_numpy(camera.world_to_camera[:3, :3].T.astype(np.float64) @ axes)
     wxyz = matrix_to_quaternion(rotation[None])[0]
@@ -291,7 +282,7 @@ def _add_camera(document: _GlbBuilder, camera: Camera) -> int:
 
 
 def _unit_normals(normals: np.ndarray) -> np.ndarray:
-    """Rows of length 1 in float32; a normal without length, as of a vertex without area, becomes (0, 1, 0)."""
+    """Return unit rows in float32; a zero normal, as of a vertex without area, becomes (0, 1, 0)."""
     normals = normals.astype(np.float64)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     upright = np.array([0.0, 1.0, 0.0])
@@ -299,7 +290,7 @@ def _unit_normals(normals: np.ndarray) -> np.ndarray:
 
 
 def _normalise_weights(weights: np.ndarray) -> np.ndarray:
-    """Weights whose float32 sum is 1 to the last bit but one: the rounding goes to the largest."""
+    """Return float32 weights whose rows sum to 1 within one unit of precision: the largest takes the rounding error."""
     weights = (weights.astype(np.float64) / weights.sum(axis=1, keepdims=True, dtype=np.float64)).astype(np.float32)
     rows, largest = np.arange(len(weights)), weights.argmax(axis=1)
     weights[rows, largest] += np.float32(1.0) - weights.sum(axis=1, dtype=np.float32)

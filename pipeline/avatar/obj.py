@@ -1,4 +1,8 @@
-"""A textured mesh as Wavefront .obj with its .mtl: what every modelling tool opens, without skeleton or motion."""
+"""Write a textured mesh as Wavefront .obj and .mtl.
+
+trimesh reads these files but is not used to write them: its meshes have one index for position, UV and normal, so its
+.obj would duplicate the vertices along UV seams and open the surface there; it also encodes the maps again.
+"""
 
 from pathlib import Path
 
@@ -19,9 +23,10 @@ def write_obj(
     diffuse_name: str,
     specular_name: str | None,
 ) -> None:
-    """Write `path` (.obj) and the .mtl beside it, which names the maps that lie in the same folder.
+    """Write `path` (.obj) and the .mtl of the same name, which references the maps in the same folder.
 
-    mesh: metres, +Y up. uv: origin bottom-left, which is OBJ's own. normals: unit, one a vertex.
+    mesh: m, +Y up. uv: origin bottom-left, as in OBJ. normals: unit, one per vertex. specular_name: None for a surface
+    without highlights.
     """
     corners = np.stack([mesh.faces, faces_uv, mesh.faces], axis=2).reshape(len(mesh.faces), 9) + 1
     lines = [f"mtllib {path.with_suffix('.mtl').name}", f"o {MATERIAL}"]

@@ -1,4 +1,4 @@
-"""Where an avatar's scene has its origin: on the floor, where the person stood."""
+"""Place the avatar in its scene: origin on the floor, at the median position of the root."""
 
 from dataclasses import replace
 
@@ -12,14 +12,13 @@ FLOOR_PERCENTILE = 10.0
 
 
 def world_to_scene_translation_m(motion: Motion, lowest_vertex_y_m: Float[np.ndarray, "n"]) -> Float[np.ndarray, "3"]:
-    """Translation (m) that carries world points into the scene of the exported file.
+    """Return the translation (m) from the world to the scene of the exported file.
 
-    The floor (y = 0) is where the feet are: the lowest tenth of the frames' lowest points, since a jump lifts some
-    frames and a wrong pose sinks few. x = z = 0 is the middle (median) of the root's places, so that viewers, which
-    look at the rest pose, find the moving person. Nothing is scaled or turned: displacements and the camera's relative
-    place stay.
+    The floor (y = 0) is the `FLOOR_PERCENTILE` of the lowest point per frame: robust to jumps, which raise it, and to
+    single wrong poses, which lower it. x = z = 0 is the median position of the root, so that a viewer that frames the
+    rest pose also shows the moving person. There is no rotation or scale.
 
-    lowest_m: y of the lowest point of the posed surface, a frame, world.
+    lowest_vertex_y_m: height of the lowest vertex of the posed mesh in each frame, world.
     """
     median_root_m = np.median(motion.root_translation_m, axis=0)
     floor_m = np.percentile(lowest_vertex_y_m, FLOOR_PERCENTILE)
@@ -27,24 +26,24 @@ def world_to_scene_translation_m(motion: Motion, lowest_vertex_y_m: Float[np.nda
 
 
 def translate_motion(motion: Motion, offset_m: Float[np.ndarray, "3"]) -> Motion:
-    """The same motion with the world's points shifted by `offset_m`."""
+    """Return the motion in a world translated by `offset_m`."""
     return motion.with_pose(motion.rotations_wxyz, motion.root_translation_m + offset_m)
 
 
 def translate_camera(camera: Camera, offset_m: Float[np.ndarray, "3"]) -> Camera:
-    """The camera that sees the shifted world as it saw the world before."""
+    """Return the camera in a world translated by `offset_m`; its images do not change."""
     world_to_camera = camera.world_to_camera.copy()
     world_to_camera[:3, 3] -= world_to_camera[:3, :3] @ offset_m
     return replace(camera, world_to_camera=world_to_camera)
 
 
 def pad_motion_to_video(motion: Motion, frame_rate: float, video_frame_count: int) -> Motion:
-    """The motion over the whole video: the first and last pose held to the first and last frame of the video.
+    """Extend the motion to the first and last frame of the video by repeating its first and last pose.
 
-    Frames keep their own times, whose steps vary in a phone's video. An added first frame is at 0, an added last one
-    as far behind its neighbour as the frames between them take at the video's mean rate.
+    Existing frames keep their times, whose steps vary in videos of variable frame rate. An added first frame is at 0 s;
+    an added last frame follows at the mean frame rate.
 
-    frame_rate: the video's mean, frames a second.
+    frame_rate: mean of the video, frames per second.
     """
     rows, frames, time_s = np.arange(len(motion.frame_index)), motion.frame_index, motion.time_s
     if frames[0] > 0:

@@ -1,8 +1,8 @@
-"""Poses fitted to pictures through the finished avatar: what a score says once the pose is no longer in question.
+"""Fit poses to images through the textured avatar, to separate pose errors from errors of the avatar.
 
-The avatar stays as it is; a turn of every main joint and a shift of the root are moved by gradient descent through the
-differentiable rasteriser until the textured mesh looks like the frame. Whoever scores a frame after this has fitted the
-pose to the very pixels that are scored, and must say so.
+The avatar is fixed. A rotation of every main joint and a translation of the root are optimised with Adam through the
+differentiable rasteriser, so that the rendered mesh matches the frame. A score after this fit uses poses fitted to the
+scored pixels; reports must state this.
 """
 
 import math
@@ -21,24 +21,26 @@ from pipeline.geometry.texture_rendering import sample_texture
 from pipeline.mesh.views import PosedView, view_losses
 
 MAX_PERSON_PX = 320
-"""Height of the person in the pictures that are fitted: poses need no finer ones, and time goes with the pixels."""
+"""Largest height of the person in the fitted images, px: higher resolution costs time and does not improve poses."""
 
 ROTATION_LEARNING_RATE_RAD, TRANSLATION_LEARNING_RATE_M = 0.008, 0.004
 BACKGROUND = 0.5
 PRIOR_WEIGHT = 0.02
-"""Of the squared corrections: joints that the picture does not show stay where they were."""
+"""Weight of the squared corrections: joints that the image does not constrain keep their pose."""
 
 MAX_TEXTURE_PX = 512
-"""The map is reduced to this side, so that a texel is no smaller than a pixel and colours lead from afar."""
+"""Side to which the diffuse map is downsampled: smooth gradients over larger displacements."""
 
 
 def fit_poses(avatar: TexturedAvatar, body: Body, motion: Motion, views: Sequence[PosedView], steps: int) -> Motion:
-    """The motion with each frame's pose fitted to its view; frames do not influence each other.
+    """Return the motion with the pose of each frame fitted to its view; frames are independent.
 
     Args:
-        motion: where the fit starts, in time order. views: a crop of each of its frames, see `crop_posed_view`; the
-        poses in
-            them are not read. steps: of Adam, its rate falling to zero as a cosine.
+        avatar: is not changed.
+        body: joint hierarchy of the motion.
+        motion: initial poses, in order of time.
+        views: a crop of each frame of `motion`, see `crop_posed_view`; their poses are not read.
+        steps: of Adam; the learning rate falls to zero along a cosine.
     """
     correction = PoseCorrection(body, motion)
     renderer = _AvatarRenderer(avatar)
@@ -63,13 +65,13 @@ def fit_poses(avatar: TexturedAvatar, body: Body, motion: Motion, views: Sequenc
 def _image_loss(
     renderer: "_AvatarRenderer", canonical_to_world: Float[Tensor, "j 4 4"], view: PosedView
 ) -> Float[Tensor, ""]:
-    """Colour before grey, and silhouette."""
+    """Return the colour loss on a grey background plus the silhouette loss."""
     colour_loss, silhouette_loss = view_losses(*renderer(canonical_to_world, view), view, torch.full((3,), BACKGROUND))
     return colour_loss + silhouette_loss
 
 
 class _AvatarRenderer:
-    """The avatar with its map reduced, ready to be rasterised: one vertex a corner of the atlas."""
+    """Renders the avatar with a downsampled map; vertices are duplicated along UV seams."""
 
     def __init__(self, avatar: TexturedAvatar) -> None:
         self._avatar = avatar
@@ -82,7 +84,7 @@ class _AvatarRenderer:
     def __call__(
         self, canonical_to_world: Float[Tensor, "j 4 4"], view: PosedView
     ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
-        """Premultiplied colours and alpha, differentiable in the pose."""
+        """Return premultiplied colours and alpha, differentiable in the pose."""
         corners = self._avatar.pose_vertices(canonical_to_world)[self._vertex_of_uv]
         avatar = self._avatar
         image, alpha, _ = render_shaded(

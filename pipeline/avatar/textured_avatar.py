@@ -1,4 +1,4 @@
-"""The finished avatar as it is exported: a skinned mesh with its atlas and diffuse map, posed and drawn."""
+"""The exported avatar, a skinned mesh with UV atlas and diffuse map: posing and rendering."""
 
 import math
 from dataclasses import dataclass
@@ -16,9 +16,16 @@ from pipeline.geometry.texture_rendering import render_textured, turntable_camer
 
 @dataclass(frozen=True)
 class TexturedAvatar:
-    """Canonical A-pose surface (m), four joint influences a vertex, atlas corners of each face, and the diffuse map.
+    """A skinned mesh in the canonical A-pose with a diffuse texture.
 
-    Colours are sRGB in [0, 1]; UV has its origin bottom-left.
+    Attributes:
+        vertices: m.
+        faces: counter-clockwise.
+        joint_indices: four influences per vertex.
+        joint_weights: rows sum to 1.
+        uv: origin bottom-left.
+        faces_uv: corners of each face, as indices into `uv`.
+        diffuse: sRGB in [0, 1]; row 0 is v = 1.
     """
 
     vertices: Float[Tensor, "v 3"]
@@ -30,27 +37,29 @@ class TexturedAvatar:
     diffuse: Float[Tensor, "th tw 3"]
 
     def mesh(self) -> Mesh:
-        """The surface alone."""
+        """Return the canonical mesh without texture and skin."""
         return Mesh(self.vertices.numpy(), self.faces.numpy())
 
     def pose_vertices(self, canonical_to_world: Float[Tensor, "j 4 4"]) -> Float[Tensor, "v 3"]:
-        """Vertices (m, world) in one pose, by the same linear blend skinning that a glTF viewer does."""
+        """Pose the vertices (m, world) by linear blend skinning, as a glTF viewer does."""
         weights = dense_weights(self.joint_indices, self.joint_weights, len(canonical_to_world))
         return linear_blend_skinning(self.vertices, weights, canonical_to_world[None])[0]
 
     def render(
         self, vertices_world: Float[Tensor, "v 3"], camera: Camera, supersampling: int
     ) -> Float[np.ndarray, "h w 4"]:
-        """Premultiplied texture colours and coverage in [0, 1], unlit; see `render_textured`."""
+        """Render unlit: premultiplied texture colours and coverage, in [0, 1]; see `render_textured`."""
         image = render_textured(vertices_world, self.faces, self.faces_uv, self.uv, self.diffuse, camera, supersampling)
         return image.numpy()
 
     def render_turntable(
         self, vertices_world: Float[Tensor, "v 3"], views: int, height_px: int, supersampling: int
     ) -> list[UInt8[np.ndarray, "_ _ 4"]]:
-        """Pictures from evenly spread sides, the first from +Z: straight alpha, cropped left and right to the body.
+        """Render views at evenly spaced azimuths, the first from +Z.
 
-        All have one height and one scale; widths differ.
+        Images are sRGB with straight alpha, cropped horizontally to the body; they share height and scale.
+
+        views: number of images. height_px: of each image.
         """
         box_min_m, box_max_m = vertices_world.numpy().min(axis=0), vertices_world.numpy().max(axis=0)
         width_to_height = math.hypot(box_max_m[0] - box_min_m[0], box_max_m[2] - box_min_m[2]) / (

@@ -1,4 +1,4 @@
-"""Pictures of a mesh from all sides in its canonical pose: colours above, shape below."""
+"""Render a turntable sheet of a mesh in its canonical pose: colours in the upper row, shaded geometry below."""
 
 import numpy as np
 import torch
@@ -16,9 +16,9 @@ LIGHT_DIRECTION_CAMERA = np.array([-0.35, 0.45, 0.82])
 def turntable_sheet(
     mesh: Mesh, shader: Shader, views: int = 6, height_px: int = 640, width_px: int = 360
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Two rows of ``views`` pictures on white, starting from the front and going round: ``shader``'s colours, then a
-    lit
-    grey surface that shows every bump.
+    """Render two rows of `views` images on white at evenly spaced azimuths, the first from the front.
+
+    The upper row shows the colours of `shader`, the lower row the Lambert-shaded grey surface.
     """
     vertices, faces = torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces.astype(np.int64))
     adjacency, normals = face_adjacency(faces), mesh.vertex_normals()
@@ -37,7 +37,10 @@ def turntable_sheet(
 def _lambert_shading(
     normals: Float[np.ndarray, "v 3"], world_to_camera: Float[np.ndarray, "3 3"]
 ) -> Float[torch.Tensor, "v 1"]:
-    """Lambert grey under a light that stands still relative to the camera (its axes: x right, y down, z forward)."""
+    """Return Lambert shading per vertex, in [0.18, 0.9], under a light fixed to the camera.
+
+    Camera axes: x right, y down, z forward.
+    """
     right, down, forward = world_to_camera
     x, y, z = LIGHT_DIRECTION_CAMERA
     light = (x * right - y * down - z * forward).astype(np.float32)

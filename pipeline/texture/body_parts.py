@@ -1,4 +1,4 @@
-"""Which part of the body a joint belongs to, from its Mixamo name."""
+"""Assign joints and mesh faces to body parts by the Mixamo names of the joints."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -8,9 +8,9 @@ _LIMBS = {"Shoulder": "arm", "ForeArm": "arm", "Arm": "arm", "UpLeg": "leg", "Le
 
 
 def body_part_of_joint(name: str) -> str:
-    """One of `BODY_PARTS`; what is neither head nor limb is torso.
+    """Return the entry of `BODY_PARTS` for a joint name; "torso" for joints of neither head nor limbs.
 
-    >>> part_of_joint("LeftHandIndex1"), part_of_joint("Neck"), part_of_joint("RightToeBase")
+    >>> body_part_of_joint("LeftHandIndex1"), body_part_of_joint("Neck"), body_part_of_joint("RightToeBase")
     ('left hand', 'torso', 'right leg')
     """
     if name.startswith("Head"):
@@ -30,8 +30,11 @@ def body_part_of_faces(
     joint_weights: Float[np.ndarray, "v k"],
     joint_names: tuple[str, ...],
 ) -> Int[np.ndarray, "f"]:
-    """Index into `BODY_PARTS` of every face: the part whose joints weigh most at its corners together."""
-    of_joint = np.array([BODY_PARTS.index(body_part_of_joint(name)) for name in joint_names])
-    share = np.zeros((len(joint_indices), len(BODY_PARTS)))
-    np.add.at(share, (np.arange(len(share))[:, None], of_joint[joint_indices]), joint_weights)
-    return share[faces].sum(axis=1).argmax(axis=1).astype(np.int32)
+    """Return the index into `BODY_PARTS` of every face: the part with the largest summed skin weight at its corners.
+
+    joint_indices: into `joint_names`, k influences per vertex. joint_weights: rows sum to 1.
+    """
+    part_of_joint = np.array([BODY_PARTS.index(body_part_of_joint(name)) for name in joint_names])
+    part_weight = np.zeros((len(joint_indices), len(BODY_PARTS)))
+    np.add.at(part_weight, (np.arange(len(part_weight))[:, None], part_of_joint[joint_indices]), joint_weights)
+    return part_weight[faces].sum(axis=1).argmax(axis=1).astype(np.int32)

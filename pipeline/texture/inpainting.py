@@ -1,4 +1,4 @@
-"""Colours for the parts of a surface that no frame shows: what is seen around them, spread over the surface."""
+"""Inpaint vertex colours that no frame shows: harmonic interpolation of the observed colours over the surface."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -16,27 +16,33 @@ REGULARISATION_WEIGHT = 1e-6
 def average_texels_per_vertex(
     texels: Texels,
     faces: Int[np.ndarray, "f 3"],
-    count: int,
+    vertex_count: int,
     colour: Float[np.ndarray, "t c"],
     weight: Float[np.ndarray, "t"],
 ) -> tuple[Float[np.ndarray, "v c"], Float[np.ndarray, "v"]]:
-    """Weighted mean colour of the texels around each vertex, and their mean weight; 0 where no texel is."""
+    """Return the weighted mean colour of the texels around each vertex, and the mean weight of these texels.
+
+    A texel contributes to the three vertices of its face, in proportion to its barycentric coordinates.
+
+    weight: one per texel, >= 0. Both results are 0 for a vertex without texels.
+    """
     corner_weight = texels.barycentric.ravel()
     vertex = faces[texels.face].ravel()
     weighted = corner_weight * np.repeat(weight, 3)
-    total = np.bincount(vertex, weighted, count)
-    summed = [np.bincount(vertex, weighted * np.repeat(column, 3), count) for column in colour.T]
+    total = np.bincount(vertex, weighted, vertex_count)
+    summed = [np.bincount(vertex, weighted * np.repeat(column, 3), vertex_count) for column in colour.T]
     mean = np.stack(summed, axis=1) / np.maximum(total, 1e-12)[:, None]
-    return mean.astype(np.float32), (total / np.maximum(np.bincount(vertex, corner_weight, count), 1e-12)).astype(
-        np.float32
-    )
+    mean_weight = total / np.maximum(np.bincount(vertex, corner_weight, vertex_count), 1e-12)
+    return mean.astype(np.float32), mean_weight.astype(np.float32)
 
 
-def spread(mesh: Mesh, colour: Float[np.ndarray, "v c"], weight: Float[np.ndarray, "v"]) -> Float[np.ndarray, "v c"]:
-    """The smoothest colours that keep to `colour` where `weight` (in [0, 1]) is near 1.
+def inpaint_vertex_colours(
+    mesh: Mesh, colour: Float[np.ndarray, "v c"], weight: Float[np.ndarray, "v"]
+) -> Float[np.ndarray, "v c"]:
+    """Return the smoothest colours x that keep to `colour` c where `weight` w (in [0, 1]) is near 1.
 
-    Minimises sum w |x - c|^2 + STIFFNESS * sum over edges |x_i - x_j|^2: harmonic where nothing is seen. Pieces of the
-    mesh that nobody sees at all get the mean colour.
+    Minimises sum_i w_i |x_i - c_i|^2 + SMOOTHNESS_WEIGHT * sum over edges |x_i - x_j|^2, so x is harmonic where w = 0.
+    Connected components with w = 0 everywhere get the weighted mean colour.
     """
     data_weight = weight.astype(np.float64)
     mean = (data_weight @ colour) / max(data_weight.sum(), 1e-12)

@@ -1,4 +1,4 @@
-"""A small animated avatar that the exporters' tests share: a box of three joints that bends, turns and walks."""
+"""A small animated avatar for the tests of the exporters: a box with three joints that bends, turns and walks."""
 
 import cv2
 import numpy as np
@@ -27,7 +27,7 @@ def sample_body() -> Body:
 
 
 def sample_motion(frames: np.ndarray) -> Motion:
-    """Turns further than half a circle, so that a naive quaternion track would flip; the head keeps still."""
+    """Turns by more than 180 degrees, so that a naive quaternion track would flip sign; the head does not move."""
     phase = torch.as_tensor(frames / max(frames.max(), 1), dtype=torch.float32)
     zero = torch.zeros_like(phase)
     hips = torch.stack([zero, 6.0 * phase, zero], dim=1)

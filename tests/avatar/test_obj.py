@@ -1,4 +1,4 @@
-"""The .obj, read back by trimesh, and the .mtl beside it."""
+"""The .obj, read by trimesh, and its .mtl."""
 
 from pathlib import Path
 
@@ -25,7 +25,7 @@ def written(folder: Path, mesh: Mesh, specular_name: str | None = None) -> Path:
     return path
 
 
-def test_reading_it_back_gives_the_same_corners(tmp_path: Path, tetrahedron: Mesh) -> None:
+def test_trimesh_reads_the_same_corners(tmp_path: Path, tetrahedron: Mesh) -> None:
     read = trimesh.load(written(tmp_path, tetrahedron), process=False)
     corners = np.asarray(read.vertices)[read.faces]
     np.testing.assert_allclose(corners, tetrahedron.vertices[tetrahedron.faces], atol=1e-6)
@@ -35,7 +35,7 @@ def test_reading_it_back_gives_the_same_corners(tmp_path: Path, tetrahedron: Mes
     )
 
 
-def test_indices_start_at_one_and_name_uv_apart_from_vertices(tmp_path: Path, tetrahedron: Mesh) -> None:
+def test_indices_start_at_one_and_uv_has_its_own(tmp_path: Path, tetrahedron: Mesh) -> None:
     lines = written(tmp_path, tetrahedron).read_text().splitlines()
     faces = [line for line in lines if line.startswith("f ")]
     assert faces[1] == "f 1/2/1 2/5/2 4/3/4"
@@ -43,14 +43,14 @@ def test_indices_start_at_one_and_name_uv_apart_from_vertices(tmp_path: Path, te
     assert sum(line.startswith("vt ") for line in lines) == 5
 
 
-def test_the_material_names_the_maps(tmp_path: Path, tetrahedron: Mesh) -> None:
+def test_the_material_references_the_maps(tmp_path: Path, tetrahedron: Mesh) -> None:
     path = written(tmp_path, tetrahedron, "avatar_specular.png")
     assert path.read_text().startswith("mtllib avatar.mtl\n")
     material = path.with_suffix(".mtl").read_text().splitlines()
     assert {"map_Kd avatar_diffuse.png", "map_Ks avatar_specular.png", "Ks 1 1 1"} <= set(material)
 
 
-def test_a_matte_material_does_not_shine(tmp_path: Path, tetrahedron: Mesh) -> None:
+def test_a_matte_material_has_no_specular_map(tmp_path: Path, tetrahedron: Mesh) -> None:
     material = written(tmp_path, tetrahedron).with_suffix(".mtl").read_text()
     assert "Ks 0 0 0" in material
     assert "map_Ks" not in material

@@ -1,4 +1,4 @@
-"""The exported scene: floor under the feet, origin where the person stood, and the clip as long as the video."""
+"""The exported scene: floor height, origin, and the duration of the animation."""
 
 import numpy as np
 import pytest
@@ -11,11 +11,11 @@ def motion_at(frames: list[int], places: np.ndarray, time_s: list[float] | None 
     index = np.array(frames, dtype=np.int32)
     times = index / 30.0 if time_s is None else np.array(time_s)
     rotations = np.tile(np.array([1.0, 0, 0, 0], dtype=np.float32), (len(frames), 2, 1))
-    rotations[:, 1, 0] = np.arange(len(frames))  # marks which frame a row came from
+    rotations[:, 1, 0] = np.arange(len(frames))  # marks the source frame of a row
     return Motion(index, times, rotations, places.astype(np.float32))
 
 
-def test_the_floor_survives_jumps_and_one_wrong_pose() -> None:
+def test_the_floor_is_robust_to_jumps_and_one_wrong_pose() -> None:
     frames = list(range(100))
     places = np.tile([0.3, 0.0, -5.0], (100, 1))
     lowest = np.full(100, -1.2)
@@ -25,23 +25,23 @@ def test_the_floor_survives_jumps_and_one_wrong_pose() -> None:
     np.testing.assert_allclose(offset, [-0.3, 1.2, 5.0], atol=1e-6)
 
 
-def test_the_clip_lasts_as_long_as_the_video() -> None:
-    held = pad_motion_to_video(motion_at([4, 6, 9], np.eye(3)), frame_rate=30.0, video_frame_count=21)
-    np.testing.assert_array_equal(held.frame_index, [0, 4, 6, 9, 20])
-    np.testing.assert_allclose(held.time_s, held.frame_index / 30.0, rtol=1e-12)
-    np.testing.assert_array_equal(held.rotations_wxyz[:, 1, 0], [0, 0, 1, 2, 2])
-    np.testing.assert_array_equal(held.root_translation_m[[0, -1]], np.eye(3)[[0, 2]])
+def test_the_animation_has_the_duration_of_the_video() -> None:
+    padded = pad_motion_to_video(motion_at([4, 6, 9], np.eye(3)), frame_rate=30.0, video_frame_count=21)
+    np.testing.assert_array_equal(padded.frame_index, [0, 4, 6, 9, 20])
+    np.testing.assert_allclose(padded.time_s, padded.frame_index / 30.0, rtol=1e-12)
+    np.testing.assert_array_equal(padded.rotations_wxyz[:, 1, 0], [0, 0, 1, 2, 2])
+    np.testing.assert_array_equal(padded.root_translation_m[[0, -1]], np.eye(3)[[0, 2]])
 
 
-def test_frames_keep_the_times_of_a_video_without_a_steady_rate() -> None:
-    """Frame 6 came late and frame 9 on time; 11 frames are missing at the end, which 20 frames a second take 0.55 s."""
-    held = pad_motion_to_video(
+def test_frames_keep_the_times_of_a_video_of_variable_frame_rate() -> None:
+    """Frame 6 is late, frame 9 on time; the 11 missing frames at the end take 0.55 s at 20 frames per second."""
+    padded = pad_motion_to_video(
         motion_at([4, 6, 9], np.eye(3), [0.13, 0.29, 0.36]), frame_rate=20.0, video_frame_count=21
     )
-    np.testing.assert_allclose(held.time_s, [0.0, 0.13, 0.29, 0.36, 0.91], rtol=1e-12)
+    np.testing.assert_allclose(padded.time_s, [0.0, 0.13, 0.29, 0.36, 0.91], rtol=1e-12)
 
 
 @pytest.mark.parametrize("frames", [[0, 1, 2], [0, 7, 20]])
-def test_a_clip_that_is_whole_gains_no_key_it_has(frames: list[int]) -> None:
-    held = pad_motion_to_video(motion_at(frames, np.eye(3)), frame_rate=30.0, video_frame_count=frames[-1] + 1)
-    np.testing.assert_array_equal(held.frame_index, frames)
+def test_a_complete_motion_is_not_padded(frames: list[int]) -> None:
+    padded = pad_motion_to_video(motion_at(frames, np.eye(3)), frame_rate=30.0, video_frame_count=frames[-1] + 1)
+    np.testing.assert_array_equal(padded.frame_index, frames)

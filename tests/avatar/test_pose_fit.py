@@ -1,4 +1,4 @@
-"""Poses that were moved away from a picture come back to it; nothing else changes."""
+"""The pose fit recovers poses that were perturbed; other frames and correct poses do not change."""
 
 from dataclasses import dataclass
 
@@ -22,7 +22,7 @@ SHIFT_M = np.array([0.03, -0.02, 0.0], dtype=np.float32)
 
 @dataclass(frozen=True)
 class Bent:
-    """A column of three joints in two poses, pictures of it, and the fit from poses that were moved away."""
+    """A column of three joints in two poses, its images, and the fit from perturbed poses."""
 
     avatar: TexturedAvatar
     body: Body
@@ -55,15 +55,15 @@ def joints_m(bent: Bent, motion: Motion) -> np.ndarray:
     return np.einsum("njab,jb->nja", transforms, points)[..., :3]
 
 
-def test_joints_come_back(bent: Bent):
+def test_joints_return_to_their_positions(bent: Bent):
     before = np.linalg.norm(joints_m(bent, bent.moved) - joints_m(bent, bent.true), axis=2)
     after = np.linalg.norm((joints_m(bent, bent.fitted) - joints_m(bent, bent.true))[..., :2], axis=2)
     assert before.min() > 0.02
-    # across the line of sight, as depth is what a picture tells least; the head ends the chain and shows little
+    # perpendicular to the viewing direction, because depth is poorly observed; without the head, which is small
     assert after[:, :2].max() < 0.006
 
 
-def test_the_picture_is_met(bent: Bent):
+def test_the_render_matches_the_image(bent: Bent):
     scores = []
     for motion in (bent.moved, bent.fitted):
         for pose, rgba in zip(canonical_to_world(bent.body, motion), bent.pictures, strict=True):
@@ -74,13 +74,13 @@ def test_the_picture_is_met(bent: Bent):
     assert min(scores[2:]) > max(scores[:2]) + 6.0
 
 
-def test_frames_do_not_influence_each_other(bent: Bent):
+def test_frames_are_independent(bent: Bent):
     alone = fit_poses(bent.avatar, bent.body, bent.moved.select(np.array([1])), bent.views[1:], steps=60)
     assert alone.rotations_wxyz[0] == pytest.approx(bent.fitted.rotations_wxyz[1], abs=1e-4)
     assert alone.root_translation_m[0] == pytest.approx(bent.fitted.root_translation_m[1], abs=1e-4)
     assert alone.frame_index.tolist() == [bent.true.frame_index[1]]
 
 
-def test_a_pose_that_fits_stays(bent: Bent):
+def test_a_correct_pose_does_not_change(bent: Bent):
     again = fit_poses(bent.avatar, bent.body, bent.true, bent.views, steps=20)
     assert np.abs(again.root_translation_m - bent.true.root_translation_m)[:, :2].max() < 0.003

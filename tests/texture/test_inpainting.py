@@ -1,4 +1,4 @@
-"""Colours spread over a surface: kept where seen, harmonic where not, checked on a sphere with a known solution."""
+"""Inpainted vertex colours on a sphere: kept where observed, harmonic elsewhere (known solution)."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import trimesh
 
 from pipeline.geometry.atlas import Texels, rasterize_texels
 from pipeline.geometry.mesh import Mesh
-from pipeline.texture.inpainting import average_texels_per_vertex, spread
+from pipeline.texture.inpainting import average_texels_per_vertex, inpaint_vertex_colours
 from tests.mesh.painted_ball import SIZE_PX, ball_atlas, ball_mesh
 
 
@@ -16,23 +16,25 @@ def ball() -> Mesh:
     return Mesh(np.array(sphere.vertices, dtype=np.float32), np.array(sphere.faces, dtype=np.int32))
 
 
-def test_what_is_seen_keeps_its_colour(ball: Mesh) -> None:
+def test_observed_vertices_keep_their_colour(ball: Mesh) -> None:
     colour = (0.5 + 0.4 * ball.vertices).astype(np.float32)
-    kept = spread(ball, colour, np.ones(len(colour), dtype=np.float32))
+    kept = inpaint_vertex_colours(ball, colour, np.ones(len(colour), dtype=np.float32))
     np.testing.assert_allclose(kept, colour, atol=0.01)
 
 
-def test_a_hidden_cap_takes_the_mean_of_its_rim(ball: Mesh) -> None:
-    # a harmonic function's value at the middle of a round cap is its mean over the rim
+def test_the_centre_of_an_unobserved_cap_has_the_mean_of_its_rim(ball: Mesh) -> None:
+    # mean value property of harmonic functions
     colour = (0.5 + 0.4 * ball.vertices).astype(np.float32)
     hidden = ball.vertices[:, 1] > 0.8
-    filled = spread(ball, np.where(hidden[:, None], 9.0, colour).astype(np.float32), (~hidden).astype(np.float32))
+    filled = inpaint_vertex_colours(
+        ball, np.where(hidden[:, None], 9.0, colour).astype(np.float32), (~hidden).astype(np.float32)
+    )
     middle = np.argmax(ball.vertices[:, 1])
     np.testing.assert_allclose(filled[middle], [0.5, 0.5 + 0.4 * 0.8, 0.5], atol=0.03)
     assert filled[hidden].max() <= colour[~hidden].max() + 1e-3
 
 
-def test_a_piece_that_nobody_sees_gets_the_mean_colour(ball: Mesh) -> None:
+def test_an_unobserved_component_has_the_mean_colour(ball: Mesh) -> None:
     count = len(ball.vertices)
     two = Mesh(
         np.concatenate([ball.vertices, ball.vertices + [5.0, 0.0, 0.0]]).astype(np.float32),
@@ -40,12 +42,14 @@ def test_a_piece_that_nobody_sees_gets_the_mean_colour(ball: Mesh) -> None:
     )
     colour = np.zeros((2 * count, 3), dtype=np.float32)
     colour[: count // 2], colour[count // 2 : count] = 0.2, 0.6
-    seen = np.concatenate([np.ones(count), np.zeros(count)]).astype(np.float32)
+    weight = np.concatenate([np.ones(count), np.zeros(count)]).astype(np.float32)
     expected = colour[:count].mean(axis=0)
-    np.testing.assert_allclose(spread(two, colour, seen)[count:], np.tile(expected, (count, 1)), atol=1e-4)
+    np.testing.assert_allclose(
+        inpaint_vertex_colours(two, colour, weight)[count:], np.tile(expected, (count, 1)), atol=1e-4
+    )
 
 
-def test_vertices_take_the_colour_of_the_texels_around_them() -> None:
+def test_vertices_have_the_mean_colour_of_the_texels_around_them() -> None:
     mesh = ball_mesh()
     texels: Texels = rasterize_texels(ball_atlas(mesh), SIZE_PX)
     ramp = (0.5 + 0.3 * mesh.vertices).astype(np.float32)

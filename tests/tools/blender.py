@@ -1,4 +1,4 @@
-"""Blender for tests: `bpy` from PyPI in an environment of its own, as it pins its own numpy; skips where it is not."""
+"""Blender for tests: `bpy` from PyPI in a separate environment, because it pins numpy; tests skip without it."""
 
 import json
 import os
@@ -10,7 +10,7 @@ import pytest
 
 
 def inspect_in_blender(glb: Path, picture: Path, seconds: float) -> dict[str, Any]:
-    """What Blender finds in a .glb at a time of its animation; also renders `picture` for a person to judge.
+    """Import a .glb in Blender at a time of its animation and return what was found; also render `picture`.
 
     BLENDER_PYTHON names the Python that can `import bpy` (`python3.11 -m venv DIR && DIR/bin/pip install bpy`).
     """

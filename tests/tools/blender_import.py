@@ -1,7 +1,7 @@
-"""Run by the Python that has Blender (`bpy` from PyPI, in an environment of its own), not by the project's.
+"""Script for a Python with Blender (`bpy` from PyPI, in a separate environment).
 
-python blender_import.py avatar.glb picture.png [seconds]: imports the file, goes to that time, renders a picture and
-prints what it found as JSON.
+python blender_import.py avatar.glb picture.png [seconds]: import the file, seek to that time, render an image and print
+the findings as JSON.
 """
 
 import json
@@ -12,20 +12,20 @@ from mathutils import Vector
 
 
 def posed_bounding_box(mesh):
-    """Lowest and highest corner of the mesh as posed now, in Blender's world (+Z up)."""
+    """Return the minimum and maximum corner of the posed mesh, in Blender's world (+Z up)."""
     evaluated = mesh.evaluated_get(bpy.context.evaluated_depsgraph_get())
     points = [evaluated.matrix_world @ vertex.co for vertex in evaluated.data.vertices]
     return [min(p[k] for p in points) for k in range(3)], [max(p[k] for p in points) for k in range(3)]
 
 
 def render(picture, low, high):
-    """A flat-lit picture from the front, for a person to judge."""
+    """Render an image from the front under uniform light, for visual inspection."""
     centre, height = (
         [(a + b) / 2 for a, b in zip(low, high, strict=True)],
         max(b - a for a, b in zip(low, high, strict=True)),
     )
-    data = bpy.data.cameras.new("preview_camera")
-    camera = bpy.data.objects.new("preview_camera", data)
+    data = bpy.data.cameras.new("inspection")
+    camera = bpy.data.objects.new("inspection", data)
     bpy.context.collection.objects.link(camera)
     camera.location = Vector(centre) + Vector((0.6, -3.0, 0.3)) * height
     camera.rotation_euler = (Vector(centre) - camera.location).to_track_quat("-Z", "Y").to_euler()
@@ -60,7 +60,7 @@ def main(path, picture, seconds):
         "low_m": low,
         "high_m": high,
     }
-    print("RESULT " + json.dumps(found))
+    print("FOUND " + json.dumps(found))
 
 
 main(sys.argv[1], sys.argv[2], float(sys.argv[3]) if len(sys.argv) > 3 else 0.0)

@@ -1,4 +1,4 @@
-"""The Khronos glTF validator (npm package gltf-validator) for tests; they skip, counted, where it is not installed."""
+"""The Khronos glTF validator (npm package gltf-validator) for tests; tests skip if it is not installed."""
 
 import json
 import os
@@ -14,9 +14,9 @@ WARNING = 1  # severities: 0 error, 1 warning, 2 information, 3 hint
 
 
 def validator_issues(path: Path) -> list[dict[str, Any]]:
-    """Errors and warnings that the validator has about a file.
+    """Return the errors and warnings of the validator for a file.
 
-    The package is looked for in the repository's node_modules (`make gltf-validator`) and in GLTF_VALIDATOR_MODULES.
+    The package is searched in GLTF_VALIDATOR_MODULES and in the repository's node_modules (`make gltf-validator`).
     """
     node = shutil.which("node")
     places = [Path(os.environ.get("GLTF_VALIDATOR_MODULES", "")), REPOSITORY_DIR / "node_modules"]

@@ -1,0 +1,116 @@
+"""The export stage on a body with true mesh and poses and a hand-written texture."""
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from pipeline.body.body import canonical_to_world
+from pipeline.geometry.atlas import Atlas
+from pipeline.geometry.skinning import linear_blend_skinning
+from pipeline.io.glb import GlbFile
+from pipeline.io.image import read_rgb, write_gray
+from pipeline.texture.files import TextureArtifact, load_texture, save_texture
+from stages.export import STAGE as EXPORT
+from tests.avatar.test_gltf import Player
+from tests.field.scene import PaintedScene, painted_scene
+from tests.stages.painted_run import make_run
+from tests.tools.khronos import validator_issues
+
+TEXTURE_PX = 64
+FRAME = 8
+
+
+@pytest.fixture(scope="module")
+def scene() -> PaintedScene:
+    return painted_scene(frames=10, height_px=32)
+
+
+@pytest.fixture(scope="module")
+def inputs(scene: PaintedScene, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The stages before export; in the atlas every face is a chart, so all vertices are duplicated."""
+    folder = tmp_path_factory.mktemp("run")
+    inputs = make_run(folder, scene.body, scene.motion, scene.camera, scene.images, scene.masks)
+    random = np.random.default_rng(0)
+    faces = scene.body.faces
+    faces_uv = np.arange(faces.size, dtype=np.int32).reshape(-1, 3)
+    atlas = Atlas(random.uniform(size=(faces.size, 2)).astype(np.float32), faces_uv, faces.reshape(-1).astype(np.int32))
+    diffuse = random.integers(0, 256, (TEXTURE_PX, TEXTURE_PX, 3), dtype=np.uint8)
+    blank = np.zeros((TEXTURE_PX, TEXTURE_PX), dtype=np.uint8)
+    (folder / "texture").mkdir()
+    save_texture(folder / "texture", TextureArtifact(atlas, diffuse, blank, blank))
+    return inputs | {"texture": folder / "texture"}
+
+
+@pytest.fixture(scope="module")
+def exported(inputs: dict[str, Path]) -> tuple[Path, dict[str, float]]:
+    out = inputs["mesh"].parent / "export"
+    out.mkdir()
+    return out, dict(EXPORT.run(inputs, out, EXPORT.config()))
+
+
+def test_the_stage_writes_its_files_and_no_other(scene: PaintedScene, exported: tuple[Path, dict[str, float]]) -> None:
+    out, metrics = exported
+    assert sorted(path.name for path in out.iterdir()) == sorted(EXPORT.makes)
+    assert metrics["glb_bytes"] == (out / "avatar.glb").stat().st_size
+    assert metrics["animation_s"] == pytest.approx(scene.motion.time_s[-1])
+    assert metrics["vertices"] == scene.body.faces.size
+
+
+def test_the_khronos_validator_finds_no_issue(exported: tuple[Path, dict[str, float]]) -> None:
+    assert validator_issues(exported[0] / "avatar.glb") == []
+
+
+def test_the_animation_reproduces_the_motion_on_a_floor_at_zero(
+    scene: PaintedScene, exported: tuple[Path, dict[str, float]]
+) -> None:
+    player = Player(exported[0] / "avatar.glb")
+    posed = player.posed_vertices(scene.motion.time_s[FRAME])
+    transforms = canonical_to_world(scene.body, scene.motion)[FRAME : FRAME + 1]
+    weights = torch.from_numpy(scene.body.skin_weights)
+    world = linear_blend_skinning(torch.from_numpy(scene.body.vertices), weights, transforms)[0].numpy()
+    offset_m = np.array(player.json["asset"]["extras"]["world_to_scene_translation_m"])
+    atlas = load_texture(exported[0].parent / "texture").atlas
+    # four influences per vertex instead of all: millimetres at the joints
+    assert np.abs(posed - (world + offset_m)[atlas.vertex_of_uv]).max() < 0.01
+    assert abs(posed[:, 1].min()) < 0.12
+    assert np.abs(posed.mean(axis=0)[[0, 2]]).max() < 0.15
+
+
+def test_the_glb_embeds_the_maps(exported: tuple[Path, dict[str, float]]) -> None:
+    png = (exported[0] / "avatar_diffuse.png").read_bytes()
+    assert GlbFile(exported[0] / "avatar.glb").image_bytes(0) == png
+    diffuse = load_texture(exported[0].parent / "texture").diffuse
+    np.testing.assert_array_equal(read_rgb(exported[0] / "avatar_diffuse.png"), diffuse)
+
+
+def test_highlights_become_a_specular_factor_unless_the_surface_is_unlit(
+    inputs: dict[str, Path], tmp_path: Path
+) -> None:
+    specular = shutil.copytree(inputs["texture"], tmp_path / "texture")
+    half = TEXTURE_PX // 2
+    amplitude = np.zeros((TEXTURE_PX, TEXTURE_PX), dtype=np.uint8)
+    amplitude[:, half:] = 1
+    write_gray(specular / "specular.png", amplitude)
+    materials = []
+    for name, unlit in (("lit", False), ("unlit", True)):
+        (tmp_path / name).mkdir()
+        EXPORT.run(inputs | {"texture": specular}, tmp_path / name, EXPORT.config(unlit=unlit))
+        glb = GlbFile(tmp_path / name / "avatar.glb")
+        materials.append((set(glb.gltf["materials"][0]["extensions"]), len(glb.gltf["images"])))
+        if not unlit:
+            alpha = cv2.imdecode(np.frombuffer(glb.image_bytes(1), np.uint8), cv2.IMREAD_UNCHANGED)[..., 3]
+            assert not alpha[:, :half].any()
+            assert 10 < np.median(alpha[:, half:]) < 120  # one level of 255 is a fraction of a dielectric's 4 %
+    assert materials == [({"KHR_materials_specular"}, 2), ({"KHR_materials_unlit"}, 1)]
+
+
+@pytest.mark.parametrize("unlit", [False, True])
+def test_the_khronos_validator_accepts_a_specular_map(unlit: bool, inputs: dict[str, Path], tmp_path: Path) -> None:
+    specular = shutil.copytree(inputs["texture"], tmp_path / "texture")
+    write_gray(specular / "specular.png", np.full((TEXTURE_PX, TEXTURE_PX), 9, dtype=np.uint8))
+    EXPORT.run(inputs | {"texture": specular}, tmp_path, EXPORT.config(unlit=unlit))
+    assert validator_issues(tmp_path / "avatar.glb") == []
