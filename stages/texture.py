@@ -189,8 +189,8 @@ def bake_specular(
     texels = texels_at_vertices(mesh.faces, count)
     faces = torch.from_numpy(mesh.faces)
     surface = TexturedSurface(faces, faces, torch.zeros(count, 2), texels)
-    observations = [observe_vertices(views, surface, settings) for views in (train, validation)]
-    fitted = fit_specular(*observations, mesh.edges(), count, settings.specular_min_partial_r2)
+    observed, held_out = (observe_vertices(views, surface, settings) for views in (train, validation))
+    fitted = fit_specular(observed, held_out, mesh.edges(), count, settings.specular_min_partial_r2)
     amplitude, operator = fitted.amplitude.astype(np.float64), laplacian(mesh)
     for _ in range(SPECULAR_SMOOTHING_STEPS):
         amplitude = amplitude - 0.5 * (operator @ amplitude)
