@@ -24,8 +24,8 @@ def render(picture, low, high):
         [(a + b) / 2 for a, b in zip(low, high, strict=True)],
         max(b - a for a, b in zip(low, high, strict=True)),
     )
-    data = bpy.data.cameras.new("inspection")
-    camera = bpy.data.objects.new("inspection", data)
+    data = bpy.data.cameras.new("preview_camera")
+    camera = bpy.data.objects.new("preview_camera", data)
     bpy.context.collection.objects.link(camera)
     camera.location = Vector(centre) + Vector((0.6, -3.0, 0.3)) * height
     camera.rotation_euler = (Vector(centre) - camera.location).to_track_quat("-Z", "Y").to_euler()
@@ -60,7 +60,7 @@ def main(path, picture, seconds):
         "low_m": low,
         "high_m": high,
     }
-    print("FOUND " + json.dumps(found))
+    print("RESULT " + json.dumps(found))
 
 
 main(sys.argv[1], sys.argv[2], float(sys.argv[3]) if len(sys.argv) > 3 else 0.0)
