@@ -65,16 +65,16 @@ class TexturedAvatar:
         width_to_height = math.hypot(box_max_m[0] - box_min_m[0], box_max_m[2] - box_min_m[2]) / (
             box_max_m[1] - box_min_m[1]
         )
-        pictures = []
+        images = []
         for number in range(views):
             angle = 2.0 * math.pi * number / views
             camera = turntable_camera(box_min_m, box_max_m, angle, math.ceil(height_px * width_to_height), height_px)
-            pictures.append(
+            images.append(
                 _crop_empty_columns(unpremultiply_to_uint8(self.render(vertices_world, camera, supersampling)))
             )
-        return pictures
+        return images
 
 
-def _crop_empty_columns(picture: UInt8[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w2 4"]:
-    columns = np.flatnonzero(picture[..., 3].any(axis=0))
-    return picture[:, columns[0] : columns[-1] + 1] if len(columns) else picture
+def _crop_empty_columns(image: UInt8[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w2 4"]:
+    columns = np.flatnonzero(image[..., 3].any(axis=0))
+    return image[:, columns[0] : columns[-1] + 1] if len(columns) else image

@@ -7,21 +7,21 @@ from pipeline.avatar.placement import pad_motion_to_video, world_to_scene_transl
 from pipeline.body.body import Motion
 
 
-def motion_at(frames: list[int], places: np.ndarray, time_s: list[float] | None = None) -> Motion:
+def motion_at(frames: list[int], positions_m: np.ndarray, time_s: list[float] | None = None) -> Motion:
     index = np.array(frames, dtype=np.int32)
     times = index / 30.0 if time_s is None else np.array(time_s)
     rotations = np.tile(np.array([1.0, 0, 0, 0], dtype=np.float32), (len(frames), 2, 1))
     rotations[:, 1, 0] = np.arange(len(frames))  # marks the source frame of a row
-    return Motion(index, times, rotations, places.astype(np.float32))
+    return Motion(index, times, rotations, positions_m.astype(np.float32))
 
 
 def test_the_floor_is_robust_to_jumps_and_one_wrong_pose() -> None:
     frames = list(range(100))
-    places = np.tile([0.3, 0.0, -5.0], (100, 1))
+    positions_m = np.tile([0.3, 0.0, -5.0], (100, 1))
     lowest = np.full(100, -1.2)
     lowest[20:80] = -0.9  # sixty frames in the air
     lowest[5] = -2.0
-    offset = world_to_scene_translation_m(motion_at(frames, places), lowest)
+    offset = world_to_scene_translation_m(motion_at(frames, positions_m), lowest)
     np.testing.assert_allclose(offset, [-0.3, 1.2, 5.0], atol=1e-6)
 
 

@@ -30,7 +30,7 @@ class Bent:
     moved: Motion
     fitted: Motion
     views: list[PosedView]
-    pictures: list[np.ndarray]
+    images: list[np.ndarray]
 
 
 @pytest.fixture(scope="module")
@@ -38,15 +38,15 @@ def bent() -> Bent:
     body, true = sample_body(), sample_motion(np.array([0, 5]))
     avatar = make_avatar(body)
     poses = canonical_to_world(body, true)
-    pictures = [avatar.render(avatar.pose_vertices(pose), CAMERA, supersampling=3) for pose in poses]
+    images = [avatar.render(avatar.pose_vertices(pose), CAMERA, supersampling=3) for pose in poses]
     views = [
         crop_posed_view(rgba[..., :3] / np.maximum(rgba[..., 3:], 1e-6), rgba[..., 3], CAMERA, pose, 192)
-        for rgba, pose in zip(pictures, poses, strict=True)
+        for rgba, pose in zip(images, poses, strict=True)
     ]
     turn = axis_angle_to_quaternion(torch.tensor([[0.0, 0.1, 0.0], [0.0, 0.0, 0.1], [0.0, 0.0, -0.1]]))
     rotations = quaternion_multiply(torch.from_numpy(true.rotations_wxyz), turn.expand(2, 3, 4))
     moved = true.with_pose(rotations.numpy(), true.root_translation_m + SHIFT_M)
-    return Bent(avatar, body, true, moved, fit_poses(avatar, body, moved, views, steps=60), views, pictures)
+    return Bent(avatar, body, true, moved, fit_poses(avatar, body, moved, views, steps=60), views, images)
 
 
 def joints_m(bent: Bent, motion: Motion) -> np.ndarray:
@@ -66,7 +66,7 @@ def test_joints_return_to_their_positions(bent: Bent):
 def test_the_render_matches_the_image(bent: Bent):
     scores = []
     for motion in (bent.moved, bent.fitted):
-        for pose, rgba in zip(canonical_to_world(bent.body, motion), bent.pictures, strict=True):
+        for pose, rgba in zip(canonical_to_world(bent.body, motion), bent.images, strict=True):
             image = np.rint(255 * rgba[..., :3] / np.maximum(rgba[..., 3:], 1e-6)).clip(0, 255).astype(np.uint8)
             drawn = bent.avatar.render(bent.avatar.pose_vertices(pose), CAMERA, supersampling=3)
             mask = np.rint(255 * rgba[..., 3]).astype(np.uint8)

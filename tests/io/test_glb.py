@@ -20,9 +20,9 @@ def textured_box(path: Path) -> Path:
     """A box with UV and a 4 x 4 texture, written by trimesh."""
     box = trimesh.creation.box((0.4, 1.8, 0.3))
     uv = np.random.default_rng(0).uniform(size=(len(box.vertices), 2))
-    picture = Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3))
+    texture = Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3))
     box.visual = trimesh.visual.TextureVisuals(
-        uv=uv, material=trimesh.visual.material.PBRMaterial(baseColorTexture=picture)
+        uv=uv, material=trimesh.visual.material.PBRMaterial(baseColorTexture=texture)
     )
     path.write_bytes(box.export(file_type="glb"))
     return path

@@ -15,7 +15,7 @@ from pipeline.texture.views import (
     vertex_view_cosine,
     weight_by_resolution,
 )
-from tests.mesh.painted_ball import CAMERA, DISTANCE_M, PaintedBall
+from tests.texture.painted_ball import CAMERA, DISTANCE_M, PaintedBall
 
 MAGENTA = np.array([1.0, 0.0, 1.0], dtype=np.float32)
 

@@ -7,7 +7,7 @@ import trimesh
 from pipeline.geometry.atlas import Texels, rasterize_texels
 from pipeline.geometry.mesh import Mesh
 from pipeline.texture.inpainting import average_texels_per_vertex, inpaint_vertex_colours
-from tests.mesh.painted_ball import SIZE_PX, ball_atlas, ball_mesh
+from tests.texture.painted_ball import SIZE_PX, ball_atlas, ball_mesh
 
 
 @pytest.fixture(scope="module")

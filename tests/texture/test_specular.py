@@ -15,7 +15,7 @@ from pipeline.texture.specular import (
     real_spherical_harmonics,
     texels_at_vertices,
 )
-from tests.mesh.painted_ball import PaintedBall, ball_colours
+from tests.texture.painted_ball import PaintedBall, ball_colours
 
 VERTICES, LIGHT = 400, np.array([0.3, 0.6, 0.74])
 
@@ -23,7 +23,7 @@ VERTICES, LIGHT = 400, np.array([0.3, 0.6, 0.74])
 def synthetic_observations(
     frames: int, specular_amplitude: np.ndarray, shade: float, noise: float, seed: int
 ) -> VertexObservations:
-    """Oriented vertices that turn about +Y under one light, visible from +Z; specular_amplitude: RGB per vertex."""
+    """Oriented vertices that turn about +Y under one light, observed from +Z; specular_amplitude: RGB per vertex."""
     base = np.random.default_rng(0)
     normals = base.normal(size=(VERTICES, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)

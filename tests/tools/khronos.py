@@ -19,8 +19,8 @@ def validator_issues(path: Path) -> list[dict[str, Any]]:
     The package is searched in GLTF_VALIDATOR_MODULES and in the repository's node_modules (`make gltf-validator`).
     """
     node = shutil.which("node")
-    places = [Path(os.environ.get("GLTF_VALIDATOR_MODULES", "")), REPOSITORY_DIR / "node_modules"]
-    modules = next((place for place in places if (place / "gltf-validator").is_dir()), None)
+    folders = [Path(os.environ.get("GLTF_VALIDATOR_MODULES", "")), REPOSITORY_DIR / "node_modules"]
+    modules = next((folder for folder in folders if (folder / "gltf-validator").is_dir()), None)
     if node is None or modules is None:
         pytest.skip("the Khronos validator is not installed: `make gltf-validator` (needs node)")
     script = Path(__file__).with_name("validate_gltf.js")

@@ -1,4 +1,4 @@
-"""A turning, painted ball with two knobs (they occlude it), filmed by a still camera: truth for the bake."""
+"""A rotating painted ball with two knobs that occlude it, rendered for a static camera: ground truth for the bake."""
 
 import math
 
@@ -34,12 +34,12 @@ def ball_atlas(mesh: Mesh) -> Atlas:
 
 
 def ball_colours(points: np.ndarray) -> np.ndarray:
-    """Colours of surface points: smooth waves of about 0.15 m."""
+    """Colours of surface points: smooth waves with wavelengths of 0.3 to 0.5 m."""
     return (0.5 + 0.35 * np.sin(np.array([17.0, 21.0, 13.0]) * points + np.array([0.3, 1.0, 2.0]))).astype(np.float32)
 
 
 def turned(vertices: np.ndarray, angle: float) -> torch.Tensor:
-    """World positions: turned around +Y and tilted a little, in front of the camera that looks along -Z."""
+    """World positions: rotated about +Y and slightly about +X, in front of the camera, which looks along -Z."""
     c, s = math.cos(angle), math.sin(angle)
     tilt = 0.35 * math.sin(2.0 * angle)
     turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
@@ -48,7 +48,7 @@ def turned(vertices: np.ndarray, angle: float) -> torch.Tensor:
 
 
 class PaintedBall:
-    """The true texture, and views that show it from `count` sides against a green backdrop."""
+    """The true texture, and views from `count` evenly spaced angles on a green background."""
 
     def __init__(self, count: int, shift_px: float = 0.0, angles: np.ndarray | None = None) -> None:
         self.mesh = ball_mesh()
@@ -62,7 +62,7 @@ class PaintedBall:
         self.views = [self._render_view(angle, random.normal(size=2) * shift_px) for angle in angles]
 
     def _render_view(self, angle: float, shift_px: np.ndarray) -> BakeView:
-        """A view whose picture is off by `shift_px` from where the camera says, as under a wrong pose."""
+        """A view whose image is shifted by `shift_px` against the camera, as under a wrong pose."""
         vertices = turned(self.mesh.vertices, angle)
         filmed = Camera(CAMERA.fx, CAMERA.fy, CAMERA.cx + shift_px[0], CAMERA.cy + shift_px[1], 200, 210)
         faces_and_uv = (self.surface.faces, self.surface.faces_uv, self.surface.uv)
@@ -72,7 +72,7 @@ class PaintedBall:
 
 
 def true_texture(mesh: Mesh, atlas: Atlas) -> torch.Tensor:
-    """The true texture at four times the size, gutters filled by its own neighbours."""
+    """The true texture at four times the size, with filled gutters."""
     texels = rasterize_texels(atlas, 4 * SIZE_PX)
     values = ball_colours(texels.interpolate(mesh.faces, mesh.vertices))
     return torch.from_numpy(fill_unknown_texels(texels.to_texture(values), texels.coverage_mask()))
