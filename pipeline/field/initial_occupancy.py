@@ -1,4 +1,7 @@
-"""Where the masks allow a person to be: the box of the field and the cells that training starts with."""
+"""Bounds of the field and initially occupied cells, from the fitted body and the masks.
+
+Letters: k frames, j joints, n points, g grid cells per axis.
+"""
 
 import numpy as np
 import torch
@@ -14,22 +17,26 @@ from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.geometry.surface import signed_distance_m
 
 UNSEEN_PRIOR_FALLOFF_M = 0.08
-"""Beyond this distance from the body nothing is expected unseen; at half of it, as likely as not."""
+"""Distance from the body, m, at which the prior occupancy of unseen points falls to 0; at half of it, it is 0.5."""
 UNSEEN_PRIOR_FRAMES = 8.0
-"""Frames that the expectation counts for where no frame shows a point."""
+"""Weight of the prior, in frames, where no frame shows a point."""
 MAX_VERTEX_DISTANCE_M = 0.06
-"""No point of a body's surface is farther from the nearest vertex."""
+"""Largest distance of a point of the body surface from the nearest vertex, m."""
 MASK_DISTANCE_QUANTILE = 0.99
-"""Part of a mask's pixels that its clothes explain; the rest may be strands of hair or strokes of a poor mask."""
+"""Quantile of the pixel distances of a mask; pixels above it may be strands of hair or errors of the mask."""
 OFFSET_PER_MASK_DISTANCE = 2.0
-"""Cloth stands farther off the body than off its outline: a leg before or behind the cloth hides the gap."""
+"""Clothing offset relative to the distance from the outline, which a leg before or behind the cloth reduces."""
 MASK_STRIDE_PX = 4
+"""Every fourth row and column of a mask is used."""
 MIN_RESULTANT_LENGTH = 0.75
-"""Mean of unit directions, its length, from which on they come from one side: that of an arc of 145 degrees."""
+"""Length of the mean unit direction above which all directions come from one side: that of an arc of 145 degrees.
+
+On real and generated videos it is at most 0.6 for full turns, and 0.8 or more for captures from the front.
+"""
 
 
 def field_bounds_m(body: Body, clothing_offset_m: float) -> Float[np.ndarray, "2 3"]:
-    """The body's canonical box, widened on all sides."""
+    """Return the bounding box of the canonical body, (low, high), widened by the clothing offset on all sides."""
     return np.stack([body.vertices.min(0) - clothing_offset_m, body.vertices.max(0) + clothing_offset_m]).astype(
         np.float32
     )
@@ -43,17 +50,17 @@ def estimate_clothing_offset_m(
     min_offset_m: float,
     max_offset_m: float,
 ) -> float:
-    """How far from the body clothes may stand, judged by how far the masks reach beyond it; m.
+    """Estimate the largest distance of clothing from the body, m, from the masks.
 
-    The reach of a mask is the 99th percentile over its pixels of the distance to the body's nearest vertex in the
-    image, at that vertex's depth. Twice the median over frames counts, so that some poor masks or poses do not; no
-    more than `max_offset_m`, and never less than `min_offset_m`.
+    The distance of a mask is the 99th percentile over its pixels of the distance to the nearest projected vertex, in
+    metres at the depth of that vertex. The result is twice the median over frames, clamped to
+    [`min_offset_m`, `max_offset_m`]; `min_offset_m` wins if it is larger.
     """
     vertices, weights = torch.from_numpy(body.vertices), torch.from_numpy(body.skin_weights)
     mask_distances_m = []
     for pose, mask in zip(canonical_to_world, masks, strict=True):
         posed = linear_blend_skinning(vertices, weights, pose[None])[0]
-        pixels, depth_m = (of.numpy() for of in project(posed, camera))
+        pixels, depth_m = (tensor.numpy() for tensor in project(posed, camera))
         in_front = depth_m > 0
         mask_px = MASK_STRIDE_PX * np.argwhere(mask[::MASK_STRIDE_PX, ::MASK_STRIDE_PX])[:, ::-1] + 0.5
         if len(mask_px) and in_front.any():
@@ -61,21 +68,23 @@ def estimate_clothing_offset_m(
             mask_distances_m.append(
                 np.quantile(distance_px * depth_m[in_front][nearest] / camera.fx, MASK_DISTANCE_QUANTILE)
             )
-    reach_m = float(np.median(mask_distances_m)) if mask_distances_m else 0.0
-    return max(min_offset_m, min(max_offset_m, OFFSET_PER_MASK_DISTANCE * reach_m))
+    mask_distance_m = float(np.median(mask_distances_m)) if mask_distances_m else 0.0
+    return max(min_offset_m, min(max_offset_m, OFFSET_PER_MASK_DISTANCE * mask_distance_m))
 
 
 def cell_signed_distances_m(
-    body: Body, bounds_m: Float[np.ndarray, "2 3"], reach_m: float
+    body: Body, bounds_m: Float[np.ndarray, "2 3"], max_distance_m: float
 ) -> Float[np.ndarray, "gx gy gz"]:
-    """Signed distance of each cell's centre to the canonical body, negative inside; at most `reach_m`."""
+    """Return the signed distance (m) of each cell centre to the canonical body, negative inside; at most
+    `max_distance_m`.
+    """
     centres, threads = cell_centres(bounds_m), torch.get_num_threads()
-    bound_m = reach_m + MAX_VERTEX_DISTANCE_M
+    bound_m = max_distance_m + MAX_VERTEX_DISTANCE_M
     vertex_distance_m, _ = cKDTree(body.vertices).query(centres, distance_upper_bound=bound_m, workers=threads)
-    # What lies deeper inside the body than that is enclosed by what does not.
+    # Cells deeper inside the body than the bound are enclosed by cells within it.
     needs_query = binary_fill_holes(np.isfinite(vertex_distance_m).reshape(RESOLUTION, RESOLUTION, RESOLUTION))
-    distance = np.full(needs_query.shape, reach_m, dtype=np.float32)
-    distance[needs_query] = np.minimum(signed_distance_m(centres[needs_query.reshape(-1)], body.mesh()), reach_m)
+    distance = np.full(needs_query.shape, max_distance_m, dtype=np.float32)
+    distance[needs_query] = np.minimum(signed_distance_m(centres[needs_query.reshape(-1)], body.mesh()), max_distance_m)
     return distance
 
 
@@ -87,12 +96,12 @@ def project_mask_fraction(
     camera: Camera,
     masks: list[UInt8[np.ndarray, "h w"]],
 ) -> Float[np.ndarray, "n"]:
-    """Part of the frames in which each canonical point, carried by its skin weights, projects into the mask.
+    """Return the fraction of the frames in which each canonical point, posed by its skin weights, is in the mask.
 
-    Frames in which a point lies outside the image do not count. In their place stands, with the weight of a few
-    frames, what one expects unseen: clothing near the body (at `distance_m` from it) and nothing farther off, so that
-    feet which the image cuts off do not grow lumps.
-    masks: one a frame, dilated by as much as a point stands for.
+    Frames in which a point is outside the image do not count. A prior with the weight of a few frames replaces them: 1
+    at the body surface and 0 farther away (`distance_m`), so that feet outside the image do not get spurious density.
+
+    masks: one per frame, non-zero on the person, dilated by the radius that a point represents.
     """
     points = torch.from_numpy(centres_m)
     mask_sum, in_image_count = np.zeros(len(centres_m)), np.zeros(len(centres_m))
@@ -120,11 +129,12 @@ def observed_from_one_side(
     canonical_to_world: Float[Tensor, "k j 4 4"],
     camera: Camera,
 ) -> Bool[np.ndarray, "n"]:
-    """Whether each point, carried by its skin weights, turns the same side to the camera in all frames.
+    """Return for each point, posed by its skin weights, whether the camera sees it from one side in all frames.
 
-    How far off the body something is then shows in no frame. Judged by the directions from the joints (canonical
-    positions) to the camera, each in the joint's own space: on real and generated videos their mean had a length of 0.6
-    at most in full turns, of 0.8 and more in films from the front.
+    No frame then shows its distance from the body. The criterion is the length of the mean direction from a joint to
+    the camera over all frames, in the frame of the joint, blended by the skin weights (`MIN_RESULTANT_LENGTH`).
+
+    joints_m: canonical joint positions.
     """
     canonical_m = torch.from_numpy(joints_m).to(canonical_to_world)
     rotation, translation_m = canonical_to_world[..., :3, :3], canonical_to_world[..., :3, 3]
@@ -144,5 +154,5 @@ def initial_occupancy(
     clothing_offset_m: float,
     initial_min_mask_fraction: float,
 ) -> Bool[np.ndarray, "*grid"]:
-    """Cells within the clothing margin that enough masks hold, and all cells inside the body."""
+    """Return the cells inside the body, and those within the clothing offset that enough masks contain."""
     return (distance_m < 0) | ((distance_m < clothing_offset_m) & (mask_fraction >= initial_min_mask_fraction))

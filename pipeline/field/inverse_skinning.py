@@ -1,10 +1,10 @@
-"""Ways to undo skinning along camera rays; the samples mean what those of `pipeline.kernels.march.march` mean.
+"""Inverse skinning of samples along camera rays, by three methods. Samples follow `pipeline.kernels.march.march`.
 
-- baked: a lookup in warp grids that are inverted once, then one Newton step. The default.
-- broyden: InstantAvatar's search from thirteen bones (Jiang et al. 2023), for every sample anew.
-- nearest: the inverse of the nearest posed vertex's skinning matrix (as in Anim-NeRF, Chen et al. 2021).
+- baked: lookup in warp grids, which are inverted once per pose, then one Newton step. The default.
+- broyden: Broyden's method from thirteen bones for every sample (InstantAvatar, Jiang et al. 2023).
+- nearest: inverse skinning matrix of the nearest posed vertex (Anim-NeRF, Chen et al. 2021).
 
-Letters: k frames of the motion, b frames of a batch, j joints, s samples, n rays, p points.
+Letters: k frames of the motion, b frames of a batch, j joints, m skin grid nodes, s samples, n rays, p points.
 """
 
 from collections.abc import Callable
@@ -28,24 +28,21 @@ from pipeline.kernels.march import PackedWarpGrids, Samples, march
 from pipeline.kernels.march.reference_stops import march_with_inverse
 
 INITIAL_BONES: tuple[str, ...] = (
-    "Hips",
-    "LeftUpLeg",
-    "RightUpLeg",
-    "LeftLeg",
-    "RightLeg",
-    "LeftToeBase",
-    "RightToeBase",
-)
-INITIAL_BONES += ("Neck", "Head", "LeftArm", "RightArm", "LeftForeArm", "RightForeArm")
-"""The thirteen bones from which InstantAvatar's search starts, by the names that they have here."""
+    "Hips", "LeftUpLeg", "RightUpLeg", "LeftLeg", "RightLeg", "LeftToeBase", "RightToeBase",
+    "Neck", "Head", "LeftArm", "RightArm", "LeftForeArm", "RightForeArm",
+)  # fmt: skip
+"""The thirteen bones from which InstantAvatar starts its search, by their names in this pipeline."""
 
 
 class Rays(NamedTuple):
-    """Rays in the posed space of their frames, as `march` takes them."""
+    """Rays in the posed space of their frames, as `march` takes them.
+
+    directions: unit vectors. frame_index: row of the motion. jitter: offset of the samples, as a fraction of a step.
+    """
 
     origins_m: Float[Tensor, "n 3"]
     directions: Float[Tensor, "n 3"]
-    frame: Int[Tensor, "n"]
+    frame_index: Int[Tensor, "n"]
     jitter: Float[Tensor, "n"]
 
 
@@ -53,12 +50,12 @@ class Rays(NamedTuple):
 class InverseSkinning:
     """Inverse skinning of the frames of a motion.
 
-    boxes_m: the posed box of each frame, low and high corner.
-    sample(rays, step_m, occupancy, max_samples): samples in occupied cells; `rays.frame` is a row of `posed_bounds_m`.
-    place(skin, canonical_to_posed, frames, canonical_m, posed_m, slot_start): where the poses (b, j, 4, 4) of the rows
-    `frames` (b) put samples (s, 3) that were found at `canonical_m`; differentiable in the poses. The samples of frame
-    i are slot_start[i] : slot_start[i + 1].
-    warps: the grids that hold the inverse, where it lies in such.
+    posed_bounds_m: bounding box of each frame in its posed space, low and high corner.
+    sample_rays(rays, step_m, occupancy, max_samples): samples in occupied cells.
+    to_canonical(skin, canonical_to_posed, frames, canonical_m, posed_m, frame_offsets): canonical positions (s, 3) of
+    samples at `posed_m` for the poses (b, j, 4, 4) of the rows `frames` (b); `canonical_m` are the positions from
+    `sample_rays`. Samples of frame i are frame_offsets[i] : frame_offsets[i + 1]. Differentiable in the poses.
+    warps: warp grids of the method "baked", None for the others.
     """
 
     posed_bounds_m: Float[Tensor, "k 2 3"]
@@ -70,7 +67,11 @@ class InverseSkinning:
 def build_inverse_skinning(
     method: str, body: Body, skin: SkinGrid, canonical_to_posed: Float[Tensor, "k j 4 4"]
 ) -> InverseSkinning:
-    """Prepare a way ("baked", "broyden" or "nearest") for the poses of all frames."""
+    """Prepare a method ("baked", "broyden" or "nearest") for the poses of all frames.
+
+    Raises:
+        KeyError: the method is unknown.
+    """
     return {"baked": _baked, "broyden": _broyden, "nearest": _nearest}[method](body, skin, canonical_to_posed.detach())
 
 
@@ -98,10 +99,10 @@ def _baked(body: Body, skin: SkinGrid, canonical_to_posed: Float[Tensor, "k j 4 
 
 def _broyden(body: Body, skin: SkinGrid, canonical_to_posed: Float[Tensor, "k j 4 4"]) -> InverseSkinning:
     bones = [body.joint(name) for name in INITIAL_BONES]
-    posed_bounds_m = _boxes_m(_posed_vertices_m(body, canonical_to_posed), skin)
+    posed_bounds_m = _bounds_m(_posed_vertices_m(body, canonical_to_posed), skin)
 
     def sample_rays(rays: Rays, step_m: float, occupancy: BinaryOccupancy, max_samples: int) -> Samples:
-        rows, slot = torch.unique(rays.frame, return_inverse=True)
+        rows, slot = torch.unique(rays.frame_index, return_inverse=True)
         matrices = canonical_to_posed[rows]
         blended = skin.blend(matrices)
         kd_trees, max_distance_m = _posed_cells(occupancy, blended, skin)
@@ -118,7 +119,7 @@ def _broyden(body: Body, skin: SkinGrid, canonical_to_posed: Float[Tensor, "k j 
         grid = (occupancy.occupied, occupancy.bounds_m)
         return Samples(
             *march_with_inverse(
-                find_canonical, *rays._replace(frame=slot), step_m, posed_bounds_m[rows], *grid, max_samples
+                find_canonical, *rays._replace(frame_index=slot), step_m, posed_bounds_m[rows], *grid, max_samples
             )
         )
 
@@ -128,9 +129,9 @@ def _broyden(body: Body, skin: SkinGrid, canonical_to_posed: Float[Tensor, "k j 
 def _posed_cells(
     occupancy: BinaryOccupancy, blended: Float[Tensor, "m b 12"], skin: SkinGrid
 ) -> tuple[dict[int, cKDTree], float]:
-    """The centres of the occupied cells where each frame carries them, and how far from one its cell may reach.
+    """Return a tree of the posed centres of the occupied cells for each frame, and the half-size of a posed cell, m.
 
-    They spare the search all stops in empty space, as a grid in posed space does in InstantAvatar.
+    The search skips ray stops that are not near any of them, as a grid in posed space does in InstantAvatar.
     """
     bounds_m, occupied = occupancy.bounds_m.cpu().numpy(), occupancy.occupied.cpu().numpy()
     centres_m = torch.from_numpy(cell_centres(bounds_m, len(occupied))[occupied.reshape(-1) > 0]).to(blended.device)
@@ -138,14 +139,14 @@ def _posed_cells(
         slot: cKDTree(skin_points(centres_m, matrix, skin.lattice).cpu().numpy())
         for slot, matrix in enumerate(blended.unbind(1))
     }
-    # Half a diagonal would do where skinning does not stretch.
+    # A whole diagonal instead of half of it, because skinning may stretch a cell.
     return kd_trees, float(np.linalg.norm((bounds_m[1] - bounds_m[0]) / occupied.shape))
 
 
 def _nearest(body: Body, skin: SkinGrid, canonical_to_posed: Float[Tensor, "k j 4 4"]) -> InverseSkinning:
     weights = torch.from_numpy(body.skin_weights).to(canonical_to_posed.device)
     vertices_m = _posed_vertices_m(body, canonical_to_posed)
-    posed_bounds_m = _boxes_m(vertices_m, skin)
+    posed_bounds_m = _bounds_m(vertices_m, skin)
     kd_trees = {row: cKDTree(vertices.cpu().numpy()) for row, vertices in enumerate(vertices_m)}
 
     def invert_skinning(
@@ -158,8 +159,8 @@ def _nearest(body: Body, skin: SkinGrid, canonical_to_posed: Float[Tensor, "k j 
         vertex = _nearest_index(kd_trees, posed_m, frame, float(skin.distance_m.max()))
         points = torch.zeros_like(posed_m)
         for row in frame.unique().tolist():
-            chosen = (frame == row) & (vertex >= 0)
-            points[chosen] = invert_skinning(canonical_to_posed[row], vertex[chosen], posed_m[chosen])
+            in_frame = (frame == row) & (vertex >= 0)
+            points[in_frame] = invert_skinning(canonical_to_posed[row], vertex[in_frame], posed_m[in_frame])
         return points[:, None], (vertex >= 0)[:, None]
 
     def sample_rays(rays: Rays, step_m: float, occupancy: BinaryOccupancy, max_samples: int) -> Samples:
@@ -171,8 +172,8 @@ def _nearest(body: Body, skin: SkinGrid, canonical_to_posed: Float[Tensor, "k j 
     ) -> Tensor:
         sizes = frame_offsets.diff()
         vertex = _nearest_index(kd_trees, posed_m, torch.repeat_interleave(frames, sizes), np.inf)
-        parts = zip(matrices, vertex.split(sizes.tolist()), posed_m.split(sizes.tolist()), strict=True)
-        return torch.cat([invert_skinning(*part) for part in parts])
+        of_frames = zip(matrices, vertex.split(sizes.tolist()), posed_m.split(sizes.tolist()), strict=True)
+        return torch.cat([invert_skinning(*of_frame) for of_frame in of_frames])
 
     return InverseSkinning(posed_bounds_m, sample_rays, to_canonical)
 
@@ -183,8 +184,8 @@ def _posed_vertices_m(body: Body, canonical_to_posed: Float[Tensor, "k j 4 4"]) 
     return linear_blend_skinning(vertices, weights, canonical_to_posed)
 
 
-def _boxes_m(vertices_m: Float[Tensor, "k v 3"], skin: SkinGrid) -> Float[Tensor, "k 2 3"]:
-    """The posed bodies' boxes, widened by as much as the skin grid reaches beyond the body."""
+def _bounds_m(vertices_m: Float[Tensor, "k v 3"], skin: SkinGrid) -> Float[Tensor, "k 2 3"]:
+    """Return the boxes of the posed bodies, widened by the margin of the skin grid."""
     max_distance_m = float(skin.distance_m.max())
     return torch.stack([vertices_m.amin(1) - max_distance_m, vertices_m.amax(1) + max_distance_m], dim=1)
 
@@ -192,11 +193,11 @@ def _boxes_m(vertices_m: Float[Tensor, "k v 3"], skin: SkinGrid) -> Float[Tensor
 def _nearest_index(
     kd_trees: dict[int, cKDTree], points_m: Float[Tensor, "p 3"], frame: Int[Tensor, "p"], max_distance_m: float
 ) -> Int[Tensor, "p"]:
-    """For each point which of its frame's tree points is the nearest; -1 where none is within reach."""
+    """Return the nearest tree point of each point's frame; -1 if none is within `max_distance_m`."""
     nearest = torch.full((len(points_m),), -1, device=points_m.device)
     for row in frame.unique().tolist():
-        chosen = torch.nonzero(frame == row)[:, 0]
-        query_m = points_m[chosen].detach().cpu().numpy()
+        in_frame = torch.nonzero(frame == row)[:, 0]
+        query_m = points_m[in_frame].detach().cpu().numpy()
         _, index = kd_trees[row].query(query_m, distance_upper_bound=max_distance_m, workers=torch.get_num_threads())
-        nearest[chosen] = torch.from_numpy(np.where(index < kd_trees[row].n, index, -1)).to(nearest)
+        nearest[in_frame] = torch.from_numpy(np.where(index < kd_trees[row].n, index, -1)).to(nearest)
     return nearest

@@ -1,14 +1,15 @@
-"""Which cells of canonical space may hold something: 64³ voxels, one grid for the whole sequence.
+"""Occupancy grid of canonical space: 64^3 cells, one grid for all frames (Mueller et al. 2022, section 5.2).
 
-IHM (Wang et al. 2025), section 2.2: starts from the A-posed body, and is updated by a moving average of the field's
-density, weighted by voxel attention, a two-layer network on density, distance to the body surface and frequency over
-time. The paper does not say how that network learns. Here it learns from what the training rays saw: a voxel that
-light reached is an example, positive if it gave weight to a pixel, negative if the light went through. Voxels that
-no light reached (the inside of the body) give no example and are judged by what the network learnt from the others.
+The grid starts from the clothed A-pose body (`pipeline.field.initial_occupancy`). During the training the field's
+density at a random point of each cell updates a decaying maximum of the opacity, and cells below a threshold become
+empty. `pipeline.field.baselines.voxel_attention` has the update of IHM (Wang et al. 2025, section 2.2).
+
+Letters: g cells per axis, n points, s samples of rays, e points that should be empty.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,32 +20,31 @@ from pipeline.core.device import CPU
 from pipeline.kernels.transmittance_stats import update_voxel_maxima
 
 RESOLUTION = 64
-ATTENTION_HIDDEN_WIDTH = 16
 INITIAL_EMA_RATIO = 3.0
-"""The average of a cell before it was asked, in thresholds: with a decay of 0.95 it stays occupied for some twenty
-updates in which its density is zero.
+"""Initial opacity of a cell, as a multiple of the threshold: with a decay of 0.95 a cell without density stays occupied
+for about twenty updates.
 """
 OBSERVATION_DECAY = 0.8
-"""What is left, an update later, of what the rays saw in a cell."""
+"""Factor of the recorded transmittances and weights at each update."""
 MIN_UNOBSERVED_DISTANCE_M, MIN_ONE_SIDED_DISTANCE_M = 0.03, 0.015
-"""Clothing nearer to the body than the first needs no evidence, where one side alone is filmed than the second."""
+"""Distance from the body, m, beyond which an unlit cell counts as unobserved, and a cell that is seen from one side."""
 MIN_OBSERVED_TRANSMITTANCE = 0.02
-"""Light below which a cell counts as unlit; what is behind it gives a pixel at most so much."""
+"""Transmittance below which a cell counts as unlit: what is behind it contributes at most this much to a pixel."""
 
 
 @dataclass(frozen=True)
 class BinaryOccupancy:
-    """Occupied cells (not zero) of a grid that fills the box `bounds_m`."""
+    """Occupied cells (not zero) of a grid that fills the axis-aligned box `bounds_m` (low and high corner, m)."""
 
     occupied: UInt8[Tensor, "gx gy gz"]
     bounds_m: Float[Tensor, "2 3"]
 
     def to(self, device: torch.device) -> "BinaryOccupancy":
-        """The same grid on another device."""
+        """Return the same grid on another device."""
         return BinaryOccupancy(self.occupied.to(device), self.bounds_m.to(device))
 
     def contains(self, points_m: Float[Tensor, "n 3"]) -> Tensor:
-        """True for each canonical point in an occupied cell."""
+        """Return (n,) bool: whether each canonical point (m) is in an occupied cell."""
         size = torch.tensor(self.occupied.shape, device=points_m.device)
         index = ((points_m - self.bounds_m[0]) / (self.bounds_m[1] - self.bounds_m[0]) * size).floor().long()
         inside = ((index >= 0) & (index < size)).all(-1)
@@ -52,186 +52,131 @@ class BinaryOccupancy:
         return inside & (self.occupied[tuple(index.unbind(-1))] != 0)
 
 
+class CellData(NamedTuple):
+    """Properties of all cells before the training.
+
+    initially_occupied: cells that may ever be occupied. distance_m: signed distance to the body, negative inside.
+    mask_fraction: fraction of the frames whose mask contains the cell, in [0, 1]. one_sided: cells that the camera sees
+    from one side only. bounds_m: low and high corner of the grid.
+    """
+
+    initially_occupied: Bool[np.ndarray, "gx gy gz"]
+    distance_m: Float[np.ndarray, "gx gy gz"]
+    mask_fraction: Float[np.ndarray, "gx gy gz"]
+    one_sided: Bool[np.ndarray, "gx gy gz"]
+    bounds_m: Float[np.ndarray, "2 3"]
+
+
 def cell_centres(bounds_m: Float[np.ndarray, "2 3"], resolution: int = RESOLUTION) -> Float[np.ndarray, "cells 3"]:
-    """Centres (m) of the cells, x slowest."""
+    """Return the centres (m) of all cells of a cubic grid, x slowest."""
     steps = (np.arange(resolution) + 0.5) / resolution
     unit = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
     return (bounds_m[0] + unit * (bounds_m[1] - bounds_m[0])).astype(np.float32)
 
 
-class VoxelAttention(torch.nn.Module):
-    """(density, distance, frequency) -> weight in [0, 1]; near one before it has learnt anything."""
-
-    def __init__(self, clothing_offset_m: float, seed: int) -> None:
-        super().__init__()
-        self.clothing_offset_m = clothing_offset_m
-        random = torch.Generator().manual_seed(seed)
-        self.first = torch.nn.Linear(3, ATTENTION_HIDDEN_WIDTH)
-        self.second = torch.nn.Linear(ATTENTION_HIDDEN_WIDTH, 1)
-        for weight in (self.first.weight, self.second.weight):
-            weight.data.uniform_(-0.6, 0.6, generator=random)
-        self.first.bias.data.zero_()
-        self.second.bias.data.fill_(2.0)
-
-    def forward(
-        self, density_per_m: Float[Tensor, "n"], distance_m: Float[Tensor, "n"], mask_fraction: Float[Tensor, "n"]
-    ) -> Float[Tensor, "n"]:
-        """Logit of the weight. density >= 0; distance negative inside the body; frequency in [0, 1]."""
-        inputs = torch.stack(
-            [0.5 * torch.log1p(density_per_m) - 1, distance_m / self.clothing_offset_m, 2 * mask_fraction - 1], dim=-1
-        )
-        return self.second(torch.relu(self.first(inputs))).squeeze(-1)
-
-
 class OccupancyGrid:
-    """The state that changes while the field learns: moving average, what rays saw, and the attention network.
+    """State of the grid during the training; opacities are updated by a decaying maximum.
 
-    By flat index, cells: those that may ever be occupied. empty: all of the box that are not occupied now. unproven:
-    occupied cells off the body of which no frame says whether they hold something: no light had reached them when they
-    were last updated, or only one side of them is ever filmed. They are asked to be empty too. Else what is between an
-    arm and the torso that it never left keeps the density that it began with, and becomes a flap of cloth once the arm
-    is lifted; and what is filmed from the front alone lies anywhere along the rays that saw it.
+    Attributes hold flat cell indices (int64): `candidate_cells` may be occupied; `empty_cells` of the box are not
+    occupied now; `unobserved` are occupied cells off the body which no frame confirms: no ray reached them with enough
+    transmittance since the last updates, or all frames see them from one side. The density loss also pulls the density
+    of unobserved cells towards zero. Otherwise cells between an arm and the torso keep their initial density and show
+    when the arm is raised, and in a capture from the front density stays anywhere along the rays.
     """
 
-    def __init__(
-        self,
-        initially_occupied: Bool[np.ndarray, "gx gy gz"],
-        distance_m: Float[np.ndarray, "gx gy gz"],
-        mask_fraction: Float[np.ndarray, "gx gy gz"],
-        one_sided: Bool[np.ndarray, "gx gy gz"],
-        bounds_m: Float[np.ndarray, "2 3"],
-        clothing_offset_m: float,
-        attention: bool,
-        learning_rate: float,
-        decay: float,
-        threshold: float,
-        seed: int,
-        device: torch.device = CPU,
-    ) -> None:
-        self.bounds_m = torch.tensor(bounds_m, dtype=torch.float32, device=device)
-        x, y, z = initially_occupied.shape
+    def __init__(self, cells: CellData, decay: float, threshold: float, device: torch.device = CPU) -> None:
+        self.bounds_m = torch.tensor(cells.bounds_m, dtype=torch.float32, device=device)
+        x, y, z = cells.initially_occupied.shape
         self.shape: tuple[int, int, int] = (x, y, z)
-        cells = np.flatnonzero(initially_occupied)
-        of_cells = (array.reshape(-1)[cells].astype(np.float32) for array in (distance_m, mask_fraction))
-        self.cells = torch.from_numpy(cells).to(device)
-        self.cell_m = (self.bounds_m[1] - self.bounds_m[0]) / torch.tensor(self.shape, device=device)
-        self.cell_origins_m = (
-            torch.from_numpy(cell_centres(bounds_m, initially_occupied.shape[0])).to(device) - 0.5 * self.cell_m
+        candidates = np.flatnonzero(cells.initially_occupied)
+        of_candidates = (
+            array.reshape(-1)[candidates].astype(np.float32) for array in (cells.distance_m, cells.mask_fraction)
         )
-        self.distance_m, self.mask_fraction = (torch.from_numpy(array).to(device) for array in of_cells)
-        self.one_sided = torch.from_numpy(one_sided.reshape(-1)[cells]).to(device)
-        self.opacity_ema = torch.full((len(cells),), INITIAL_EMA_RATIO * threshold, device=device)
-        self.max_transmittance, self.max_weight = torch.zeros(2, initially_occupied.size, device=device).unbind()
+        self.candidate_cells = torch.from_numpy(candidates).to(device)
+        self.cell_m = (self.bounds_m[1] - self.bounds_m[0]) / torch.tensor(self.shape, device=device)
+        self.cell_origins_m = torch.from_numpy(cell_centres(cells.bounds_m, x)).to(device) - 0.5 * self.cell_m
+        self.distance_m, self.mask_fraction = (torch.from_numpy(array).to(device) for array in of_candidates)
+        self.one_sided = torch.from_numpy(cells.one_sided.reshape(-1)[candidates]).to(device)
+        self.opacity_ema = torch.full((len(candidates),), INITIAL_EMA_RATIO * threshold, device=device)
+        maxima = torch.zeros(2, cells.initially_occupied.size, device=device)
+        self.max_transmittance, self.max_weight = maxima.unbind()
         self.decay, self.threshold = decay, threshold
-        self.attention = VoxelAttention(clothing_offset_m, seed).to(device) if attention else None
-        if self.attention is not None:
-            self.optimiser = torch.optim.Adam(self.attention.parameters(), lr=learning_rate)
-        self.occupied = torch.zeros(initially_occupied.shape, dtype=torch.uint8, device=device)
-        self.occupied.view(-1)[self.cells] = 1
-        self.empty = self._empty_cells()
-        self.unobserved = self.cells[:0]
+        self.occupied = torch.zeros(self.shape, dtype=torch.uint8, device=device)
+        self.occupied.view(-1)[self.candidate_cells] = 1
+        self.empty_cells = self._empty_cells()
+        self.unobserved = self.candidate_cells[:0]
 
-    def grid(self) -> BinaryOccupancy:
-        """The cells as they are occupied now; later updates show in it."""
+    def binary(self) -> BinaryOccupancy:
+        """Return the occupied cells, without a copy: later updates change the result."""
         return BinaryOccupancy(self.occupied, self.bounds_m)
 
     def sample_empty_points(
-        self, box_count: int, unobserved_count: int, random: np.random.Generator
+        self, box_count: int, unobserved_count: int, rng: np.random.Generator
     ) -> Float[Tensor, "e 3"]:
-        """Random points where nothing should be: those of `box_count` points of the box that come to lie in empty
-        cells,
-        and `unobserved_count` of unproven cells, if there are any.
+        """Draw random points (m) where the density should be zero.
+
+        They are the part of `box_count` points of the box that falls in empty cells, and `unobserved_count` points of
+        unobserved cells if there are any.
         """
-        in_empty = round(box_count * len(self.empty) / self.occupied.numel())
-        requests = ((self.empty, in_empty), (self.unobserved, unobserved_count if len(self.unobserved) else 0))
-        drawn = [cells[self._to_device(random.integers(0, max(len(cells), 1), count))] for cells, count in requests]
-        return self.sample_in_cells(torch.cat(drawn), random)
+        in_empty = round(box_count * len(self.empty_cells) / self.occupied.numel())
+        requests = ((self.empty_cells, in_empty), (self.unobserved, unobserved_count if len(self.unobserved) else 0))
+        drawn = [cells[self._to_device(rng.integers(0, max(len(cells), 1), count))] for cells, count in requests]
+        return self.sample_in_cells(torch.cat(drawn), rng)
 
-    def sample_in_cells(self, cells: Int[Tensor, "n"], random: np.random.Generator) -> Float[Tensor, "n 3"]:
-        """A random point (m) of each cell, given by flat index."""
-        inside = self._to_device(random.random((len(cells), 3), dtype=np.float32))
+    def sample_in_cells(self, cells: Int[Tensor, "n"], rng: np.random.Generator) -> Float[Tensor, "n 3"]:
+        """Draw a random point (m) in each cell; `cells` are flat indices."""
+        inside = self._to_device(rng.random((len(cells), 3), dtype=np.float32))
         return self.cell_origins_m.index_select(0, cells) + inside * self.cell_m
-
-    def _empty_cells(self) -> Int[Tensor, "e"]:
-        return torch.nonzero(self.occupied.view(-1) == 0)[:, 0]
-
-    def _to_device(self, array: np.ndarray) -> Tensor:
-        return torch.from_numpy(array).to(self.cells.device)
 
     def record_observations(
         self, points_m: Float[Tensor, "s 3"], transmittance: Float[Tensor, "s"], weights: Float[Tensor, "s"]
     ) -> None:
-        """Note for each sample's cell how much light reached it and how much of a pixel it gave."""
+        """Record for each sample's cell the largest transmittance and the largest weight in a pixel."""
         update_voxel_maxima(
             points_m, transmittance, weights, self.bounds_m, self.shape, self.max_transmittance, self.max_weight
         )
 
     @torch.no_grad()
-    def update(self, density_fn: Callable[[Tensor], Tensor], step_m: float, random: np.random.Generator) -> None:
-        """One update of all cells of the shell.
+    def update(self, density_fn: Callable[[Tensor], Tensor], step_m: float, rng: np.random.Generator) -> None:
+        """Update the opacity of all candidate cells from the density at a random point of each.
 
-        density_of: canonical points (n, 3) -> density (n); asked at a random point of each cell.
-        step_m: length over which a density becomes an opacity.
+        density_fn: maps canonical points (n, 3), m, to densities (n,), 1/m.
+        step_m: length over which a density becomes an opacity, m.
         """
-        density = density_fn(self.sample_in_cells(self.cells, random))
-        opacity = -torch.expm1(-density * step_m)
-        if self.attention is None:
-            self.opacity_ema = torch.maximum(self.opacity_ema * self.decay, opacity)
-        else:
-            weight = torch.sigmoid(self._train_attention(self.attention, density))
-            self.opacity_ema = self.decay * self.opacity_ema + (1 - self.decay) * weight * opacity
+        density_per_m = density_fn(self.sample_in_cells(self.candidate_cells, rng))
+        self._update_opacity(density_per_m, -torch.expm1(-density_per_m * step_m))
         kept = self.opacity_ema > min(self.threshold, float(self.opacity_ema.mean()))
-        self.occupied.view(-1)[self.cells] = kept.to(torch.uint8)
+        self.occupied.view(-1)[self.candidate_cells] = kept.to(torch.uint8)
         self.max_transmittance *= OBSERVATION_DECAY
         self.max_weight *= OBSERVATION_DECAY
-        unlit = self.max_transmittance[self.cells] < MIN_OBSERVED_TRANSMITTANCE
+        unlit = self.max_transmittance[self.candidate_cells] < MIN_OBSERVED_TRANSMITTANCE
         min_distance_m = torch.where(self.one_sided, MIN_ONE_SIDED_DISTANCE_M, MIN_UNOBSERVED_DISTANCE_M)
-        self.unobserved = self.cells[kept & (unlit | self.one_sided) & (self.distance_m > min_distance_m)]
-        self.empty = self._empty_cells()
+        self.unobserved = self.candidate_cells[kept & (unlit | self.one_sided) & (self.distance_m > min_distance_m)]
+        self.empty_cells = self._empty_cells()
 
-    def _train_attention(self, attention: VoxelAttention, density: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-        """One step of the attention network on the cells that light reached lately; returns the logits of all cells."""
-        max_transmittance, max_weight = self.max_transmittance[self.cells], self.max_weight[self.cells]
-        seen = (max_transmittance > 0.25).float()
-        target = (max_weight / 0.05).clamp(max=1)
-        with torch.enable_grad():
-            logit = attention(density, self.distance_m, self.mask_fraction)
-            loss = torch.nn.functional.binary_cross_entropy_with_logits(logit, target, seen, reduction="sum")
-            self.optimiser.zero_grad()
-            (loss / seen.sum().clamp(min=1)).backward()
-            self.optimiser.step()
-        return logit.detach()
+    def _update_opacity(self, density_per_m: Float[Tensor, "n"], opacity: Float[Tensor, "n"]) -> None:
+        """Update `opacity_ema` of the candidate cells: a maximum that decays (Instant-NGP)."""
+        self.opacity_ema = torch.maximum(self.opacity_ema * self.decay, opacity)
 
-    def state(self) -> dict[str, Tensor]:
-        """Everything that a resumed run needs."""
-        tensors = {
+    def _empty_cells(self) -> Int[Tensor, "e"]:
+        return torch.nonzero(self.occupied.view(-1) == 0)[:, 0]
+
+    def _to_device(self, array: np.ndarray) -> Tensor:
+        return torch.from_numpy(array).to(self.candidate_cells.device)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return all tensors that a resumed training needs."""
+        return {
             "opacity_ema": self.opacity_ema,
             "max_transmittance": self.max_transmittance,
             "max_weight": self.max_weight,
             "occupied": self.occupied,
+            "unobserved": self.unobserved,
         }
-        tensors["unobserved"] = self.unobserved
-        if self.attention is None:
-            return tensors
-        for name, parameter in self.attention.named_parameters():
-            moments = self.optimiser.state.get(parameter, {})
-            tensors[f"attention.{name}"] = parameter.detach()
-            tensors |= {f"attention.{name}.{key}": value for key, value in moments.items()}
-        return tensors
 
-    def load_state(self, tensors: dict[str, Tensor]) -> None:
-        """Go on from `state()`."""
+    def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
+        """Restore the state that `state_dict` returned."""
         for name in ("opacity_ema", "max_transmittance", "max_weight", "unobserved"):
-            setattr(self, name, tensors[name].clone().to(self.cells.device))
+            setattr(self, name, tensors[name].clone().to(self.candidate_cells.device))
         self.occupied.copy_(tensors["occupied"])
-        self.empty = self._empty_cells()
-        if self.attention is None:
-            return
-        for name, parameter in self.attention.named_parameters():
-            parameter.data.copy_(tensors[f"attention.{name}"])
-            keys = [key for key in ("step", "exp_avg", "exp_avg_sq") if f"attention.{name}.{key}" in tensors]
-            if keys:
-                kept = {key: tensors[f"attention.{name}.{key}"].clone() for key in keys}
-                # The count of steps stays on the CPU, as torch's Adam keeps it.
-                moved = {key: kept[key].to(parameter.device) for key in keys if key != "step"}
-                self.optimiser.state[parameter] = kept | moved
+        self.empty_cells = self._empty_cells()

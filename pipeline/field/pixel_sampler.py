@@ -1,4 +1,7 @@
-"""The pixels that training draws from: on the body, along its border, and a few outside."""
+"""Pool of training pixels in three classes (body, mask border, outside), and sampling from it.
+
+Letters: p pixels of all frames, k frames of a batch, q pixel classes, n sampled pixels.
+"""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -14,30 +17,33 @@ PIXEL_CLASSES = ("body", "border", "outside")
 MAX_OUTSIDE_PIXELS_PER_FRAME = 20_000
 TILE_PX = 16
 ERROR_DECAY = 0.8
-"""What is left of a tile's error at each new pixel of it."""
+"""Factor of a tile's error at each new pixel of it."""
 
 
 class ErrorMap:
-    """Where the learning errs: the mean colour error of late in every tile of every frame."""
+    """Moving average of the colour error in square tiles of every training frame; the source of importance sampling."""
 
     def __init__(self, frames: int, xy_px: Int[np.ndarray, "p 2"]) -> None:
-        """All tiles alike. xy_px: every pixel that will ever be asked for."""
+        """Start with equal errors. xy_px: column and row of every pixel of the pool."""
         self.xy_px = xy_px
         columns, rows = xy_px.max(axis=0) // TILE_PX + 1
         self.error = np.ones((frames, rows, columns), dtype=np.float32)
 
     def update(
-        self, rows: Int[np.ndarray, "n"], frame: Int[np.ndarray, "n"], colour_error: Float[np.ndarray, "n 3"]
+        self,
+        pixel_index: Int[np.ndarray, "n"],
+        frame_index: Int[np.ndarray, "n"],
+        colour_error: Float[np.ndarray, "n 3"],
     ) -> None:
-        """Take in what pixels of some frames, those of a frame side by side, erred by in colour."""
-        update_error_map(rows, frame, self.xy_px, colour_error, ERROR_DECAY, TILE_PX, self.error)
+        """Update the tiles of some pixels, ordered by frame, with their colour errors."""
+        update_error_map(pixel_index, frame_index, self.xy_px, colour_error, ERROR_DECAY, TILE_PX, self.error)
 
 
 @dataclass(frozen=True)
 class PixelPool:
-    """Pixels of all training frames, frame by frame and kind by kind.
+    """Pixels of all training frames, ordered by frame and class.
 
-    xy_px: column and row. rgba: colour and mask, uint8. start: (frames, 4) offsets; the pixels of kind q of frame f are
+    xy_px: column and row. rgba: colour and mask, uint8. start: offsets; the pixels of class q of frame f are
     start[f, q] : start[f, q + 1].
     """
 
@@ -53,9 +59,9 @@ class PixelPool:
     def sample_counts(
         self, frames: Int[np.ndarray, "k"], rays: float, class_ratios: tuple[float, float, float]
     ) -> Int[np.ndarray, "k kinds"]:
-        """How many pixels of each kind `sample_pixels` takes of each frame, when a frame has `rays` in all; none of a
-        kind that
-        a frame is without. shares: parts of the rays on the body, its border and outside.
+        """Return how many pixels of each class a frame with `rays` rays contributes; 0 for classes it does not have.
+
+        class_ratios: fractions of the rays on the body, on its border and outside.
         """
         target_counts = np.rint(rays * np.array(class_ratios)).astype(np.int64)
         return target_counts * (np.diff(self.start[frames], axis=1) > 0)
@@ -69,19 +75,19 @@ class PixelPool:
         error_ratio: float = 0.0,
         outlier_threshold: float = np.inf,
     ) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-        """Rows of random pixels of some frames, so many of each kind, evenly spread over the pixels of their kind; and
-        the trust in each, in [0, 1].
+        """Draw pixels of some frames, stratified over each class; return their rows in the pool and inlier weights.
 
-        streams: of random numbers, one for each frame, so that its pixels hang on it alone. by_error: part of the rays
-        on the body that goes where `error_map` are large. outlier: how large they may be in a frame, in medians, before
-        they tell that something else than the person is seen there.
+        sample_counts: pixels of each frame and class, from `sample_counts`. rngs: one generator for each frame, so that
+        its pixels do not depend on the other frames. error_ratio: fraction of the body pixels that are drawn in
+        proportion to `error_map`. outlier_threshold: error, as a multiple of the frame's median, above which the inlier
+        weight falls below 1. Weights are in [0, 1].
         """
         by_error_counts = np.zeros_like(sample_counts)
         by_error_counts[:, PIXEL_CLASSES.index("body")] = np.rint(
             error_ratio * sample_counts[:, PIXEL_CLASSES.index("body")]
         )
         uniform_counts = count_uniforms(sample_counts, by_error_counts).tolist()
-        uniforms = np.concatenate([stream.random(count) for stream, count in zip(rngs, uniform_counts, strict=True)])
+        uniforms = np.concatenate([rng.random(count) for rng, count in zip(rngs, uniform_counts, strict=True)])
         return sample_pixels(
             self.start,
             self.xy_px,
@@ -96,7 +102,7 @@ class PixelPool:
 
 
 def posed_space_cameras(camera: Camera, world_to_posed: Float[np.ndarray, "frames 4 4"]) -> PosedCameras:
-    """How the camera sees each frame's posed space."""
+    """Transform the camera to the posed space of each frame; `world_to_posed` are rigid transforms."""
     rotation, translation_m = world_to_posed[:, :3, :3], world_to_posed[:, :3, 3]
     intrinsics = np.array([[camera.fx, camera.fy], [camera.cx, camera.cy]], np.float32)
     origin_m, axes = rotation @ camera.centre_m() + translation_m, rotation @ camera.world_to_camera[:3, :3].T
@@ -108,16 +114,15 @@ def posed_space_cameras(camera: Camera, world_to_posed: Float[np.ndarray, "frame
 def build_pixel_pool(
     images: Iterable[tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]], border_px: int, seed: int
 ) -> PixelPool:
-    """Sort the pixels of each (image, mask) into the three kinds.
+    """Classify the pixels of each (image, mask).
 
-    border_px: half width of the band around the mask's edge. Outside pixels come from the body's box, widened by a
-    tenth, and are thinned to a fixed number a frame.
+    border_px: half width of the band around the mask border. Outside pixels come from the bounding box of the mask,
+    widened by a tenth of its height, at most `MAX_OUTSIDE_PIXELS_PER_FRAME` random ones per frame.
     """
     xy, rgba, starts, total = [], [], [], 0
     for index, (image, mask) in enumerate(images):
         start = [total]
-        for row_column in _classify_pixels(mask, border_px, np.random.default_rng((seed, index))):
-            rows, columns = row_column
+        for rows, columns in _classify_pixels(mask, border_px, np.random.default_rng((seed, index))):
             xy.append(np.stack([columns, rows], axis=-1).astype(np.int16))
             rgba.append(np.concatenate([image[rows, columns], mask[rows, columns, None]], axis=-1))
             total += len(rows)
@@ -126,8 +131,8 @@ def build_pixel_pool(
     return PixelPool(np.concatenate(xy), np.concatenate(rgba), np.array(starts, dtype=np.int64))
 
 
-def _classify_pixels(mask: UInt8[np.ndarray, "h w"], border_px: int, random: np.random.Generator) -> list[tuple]:
-    """Rows and columns of the body, border and outside pixels of one mask."""
+def _classify_pixels(mask: UInt8[np.ndarray, "h w"], border_px: int, rng: np.random.Generator) -> list[tuple]:
+    """Return (rows, columns) of the body, border and outside pixels of one mask."""
     solid = (mask >= 128).astype(np.uint8)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * border_px + 1, 2 * border_px + 1))
     outer, inner = cv2.dilate(solid, kernel), cv2.erode(solid, kernel, borderValue=(0,))
@@ -140,5 +145,5 @@ def _classify_pixels(mask: UInt8[np.ndarray, "h w"], border_px: int, random: np.
     outside &= (outer == 0) & (mask == 0)
     outside_index = np.flatnonzero(outside)
     if len(outside_index) > MAX_OUTSIDE_PIXELS_PER_FRAME:
-        outside_index = np.sort(random.choice(outside_index, MAX_OUTSIDE_PIXELS_PER_FRAME, replace=False))
+        outside_index = np.sort(rng.choice(outside_index, MAX_OUTSIDE_PIXELS_PER_FRAME, replace=False))
     return [np.nonzero(solid & ~border), np.nonzero(border), np.unravel_index(outside_index, mask.shape)]

@@ -1,14 +1,19 @@
-"""From a fitted body and the pictures to a field that is ready to learn."""
+"""Set up the training of a field from a fitted body, the camera and the training images."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
 
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.core.device import CPU
+from pipeline.field.baselines.positional_mlp import LAYER_COUNT, PositionalMlp
+from pipeline.field.baselines.visual_hull import carve_visual_hull, dense_layout
+from pipeline.field.baselines.voxel_attention import AttentionOccupancyGrid
 from pipeline.field.config import FieldConfig
 from pipeline.field.field import EMPTY_GRID_LAYOUT, RadianceField, hash_grid_layout
 from pipeline.field.initial_occupancy import (
@@ -19,34 +24,43 @@ from pipeline.field.initial_occupancy import (
     observed_from_one_side,
     project_mask_fraction,
 )
-from pipeline.field.occupancy import OccupancyGrid, cell_centres
+from pipeline.field.occupancy import CellData, OccupancyGrid, cell_centres
 from pipeline.field.pixel_sampler import build_pixel_pool
-from pipeline.field.positional_mlp import LAYER_COUNT, PositionalMlp
 from pipeline.field.skin_grid import build_skin_grid, skin_margin_m
 from pipeline.field.trainer import Trainer, TrainingScene
-from pipeline.field.visual_hull import carve_visual_hull, dense_layout
 from pipeline.geometry.camera import Camera, transform_world_to_camera
+from pipeline.kernels.inverse_skinning import SkinGrid
 
 MASK_FRAMES = 32
-"""Frames that are asked which cells their masks hold."""
+"""Training frames whose masks determine the clothing offset and the initial occupancy."""
 
 MaskedImage = tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]
+"""RGB image and mask of a frame, both in 0..255."""
+
+
+@dataclass(frozen=True)
+class MaskedPoses:
+    """Poses (k, j, 4, 4) of some frames, the camera, and a mask of each frame."""
+
+    canonical_to_world: Float[Tensor, "k j 4 4"]
+    camera: Camera
+    masks: list[Bool[np.ndarray, "h w"]]
 
 
 def median_root_depth_m(motion: Motion, camera: Camera) -> float:
-    """Median depth of the body's root before the camera."""
+    """Return the median depth of the root joint over all frames, m."""
     roots = transform_world_to_camera(torch.as_tensor(motion.root_translation_m), camera)
     return float(roots[:, 2].median())
 
 
 def training_scale(body: Body, motion: Motion, camera: Camera, max_person_px: int) -> float:
-    """Factor by which images shrink so that the standing person is at most `max_person_px` tall; at most 1."""
+    """Return the scale of the images, at most 1, at which the A-pose body is at most `max_person_px` tall."""
     person_px = body.height_m() * camera.fy / median_root_depth_m(motion, camera)
     return min(1.0, max_person_px / person_px)
 
 
 def evenly_spaced(count: int, limit: int) -> np.ndarray:
-    """At most `limit` of the positions 0..count-1, evenly spread."""
+    """Return at most `limit` of the indices 0..count-1, evenly spaced, including both ends."""
     return np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(np.int64))
 
 
@@ -58,51 +72,78 @@ def create_trainer(
     config: FieldConfig,
     device: torch.device = CPU,
 ) -> Trainer:
-    """Choose box, grid levels and starting cells from the data, and set everything up; what learns lies on `device`.
+    """Derive bounds, hash grid levels and initial occupancy from the data, and create the trainer on `device`.
 
-    pictures: image and mask of each frame of `motion`, for `camera`.
+    masked_images: image and mask of each frame of `motion`, at the size of `camera`.
     """
+    settings = config.settings
     rows = evenly_spaced(len(masked_images), MASK_FRAMES)
-    poses, masks = canonical_to_world(body, motion.select(rows)), [masked_images[row][1] >= 128 for row in rows]
+    masks = [masked_images[row][1] >= 128 for row in rows]
+    posed_masks = MaskedPoses(canonical_to_world(body, motion.select(rows)), camera, masks)
     clothing_offset_m = estimate_clothing_offset_m(
-        body, poses, camera, masks, config.min_clothing_offset_m, config.max_clothing_offset_m
+        body,
+        posed_masks.canonical_to_world,
+        camera,
+        masks,
+        settings.min_clothing_offset_m,
+        settings.max_clothing_offset_m,
     )
     bounds_m = field_bounds_m(body, clothing_offset_m)
     skin = build_skin_grid(body, skin_margin_m(body, bounds_m))
     pixel_m = median_root_depth_m(motion, camera) / camera.fy
-    distance_m = cell_signed_distances_m(body, bounds_m, clothing_offset_m)
-    near = distance_m < clothing_offset_m
-    frequency, one_sided = np.zeros(near.shape, dtype=np.float32), np.zeros(near.shape, dtype=bool)
-    centres_m = cell_centres(bounds_m)[near.reshape(-1)]
-    weights = skin.interpolate_weights(torch.from_numpy(centres_m))
-    one_sided[near] = observed_from_one_side(body.joints_m, weights, poses, camera)
-    cell_px = 0.5 * float((bounds_m[1] - bounds_m[0]).max()) / distance_m.shape[0] / pixel_m
-    frequency[near] = project_mask_fraction(
-        centres_m,
-        distance_m[near],
-        weights,
-        poses,
-        camera,
-        [dilate(mask, cell_px) for mask in masks],
+    cells = initial_cells(
+        body, skin, posed_masks, clothing_offset_m, pixel_m, min_mask_fraction=settings.initial_min_mask_fraction
     )
-    occupancy = OccupancyGrid(
-        initial_occupancy(distance_m, frequency, clothing_offset_m, config.initial_min_mask_fraction),
-        distance_m,
-        frequency,
-        one_sided,
-        bounds_m,
-        clothing_offset_m=clothing_offset_m,
-        attention=config.occupancy == "attention",
-        learning_rate=config.attention_learning_rate,
-        decay=config.occupancy_decay,
-        threshold=config.occupancy_threshold,
-        seed=config.seed,
-        device=device,
-    )
-    pool = build_pixel_pool(masked_images, config.border_px, config.seed)
+    occupancy = create_occupancy_grid(cells, clothing_offset_m, config, device)
+    pool = build_pixel_pool(masked_images, settings.border_px, config.seed)
     scene = TrainingScene(body, motion, camera, pool, skin)
     field = initial_field(scene, masked_images, bounds_m, pixel_m, config).to(device)
     return Trainer(scene, field, occupancy, config)
+
+
+def initial_cells(
+    body: Body,
+    skin: SkinGrid,
+    posed_masks: MaskedPoses,
+    clothing_offset_m: float,
+    pixel_m: float,
+    min_mask_fraction: float,
+) -> CellData:
+    """Compute the properties of all occupancy cells from the body and the masks.
+
+    pixel_m: footprint of a pixel at the depth of the body, m. min_mask_fraction: see `initial_occupancy`.
+    """
+    bounds_m = field_bounds_m(body, clothing_offset_m)
+    distance_m = cell_signed_distances_m(body, bounds_m, clothing_offset_m)
+    near = distance_m < clothing_offset_m
+    mask_fraction, one_sided = np.zeros(near.shape, dtype=np.float32), np.zeros(near.shape, dtype=bool)
+    centres_m = cell_centres(bounds_m)[near.reshape(-1)]
+    weights = skin.interpolate_weights(torch.from_numpy(centres_m))
+    poses, camera = posed_masks.canonical_to_world, posed_masks.camera
+    one_sided[near] = observed_from_one_side(body.joints_m, weights, poses, camera)
+    cell_radius_px = 0.5 * float((bounds_m[1] - bounds_m[0]).max()) / distance_m.shape[0] / pixel_m
+    dilated = [dilate(mask, cell_radius_px) for mask in posed_masks.masks]
+    mask_fraction[near] = project_mask_fraction(centres_m, distance_m[near], weights, poses, camera, dilated)
+    occupied = initial_occupancy(distance_m, mask_fraction, clothing_offset_m, min_mask_fraction)
+    return CellData(occupied, distance_m, mask_fraction, one_sided, bounds_m)
+
+
+def create_occupancy_grid(
+    cells: CellData, clothing_offset_m: float, config: FieldConfig, device: torch.device
+) -> OccupancyGrid:
+    """Create the occupancy grid with the update rule of the settings."""
+    settings = config.settings
+    if settings.occupancy == "plain":
+        return OccupancyGrid(cells, settings.occupancy_decay, settings.occupancy_threshold, device)
+    return AttentionOccupancyGrid(
+        cells,
+        settings.occupancy_decay,
+        settings.occupancy_threshold,
+        clothing_offset_m,
+        settings.attention_learning_rate,
+        config.seed,
+        device,
+    )
 
 
 def initial_field(
@@ -112,24 +153,27 @@ def initial_field(
     pixel_m: float,
     config: FieldConfig,
 ) -> RadianceField:
-    """The field as it is before training: thin fog, or a hull carved from the masks. pixel_m: what a pixel covers."""
-    cell_m = pixel_m * config.finest_cell_px
-    if config.network == "hull":
+    """Create the field before training: uniform low density, or a visual hull.
+
+    pixel_m: footprint of a pixel at the depth of the body, m.
+    """
+    settings = config.settings
+    cell_m = pixel_m * settings.finest_cell_px
+    if settings.network == "visual_hull":
         poses = canonical_to_world(scene.body, scene.motion)
-        layout = dense_layout(bounds_m, cell_m, config.log2_rows)
-        return carve_visual_hull(
-            scene.body, scene.skin, poses, scene.camera, masked_images, bounds_m, layout, config.hull_min_mask_fraction
-        )
-    # What Broyden's search finds, the warp grid and one Newton step find too, in a fraction of the time.
-    render_method = "nearest" if config.inverse_skinning == "nearest" else "baked"
-    if config.network == "frequency":
-        trunk = PositionalMlp(LAYER_COUNT - 1, config.hidden_width, config.seed)
-        return RadianceField(bounds_m, EMPTY_GRID_LAYOUT, config.hidden_width, config.seed, trunk, render_method)
-    layout = hash_grid_layout(bounds_m, cell_m, config.levels, config.features, config.log2_rows)
-    return RadianceField(bounds_m, layout, config.hidden_width, config.seed, None, render_method)
+        layout = dense_layout(bounds_m, cell_m, config.log2_hashmap_size)
+        fraction = settings.hull_min_mask_fraction
+        return carve_visual_hull(scene.body, scene.skin, poses, scene.camera, masked_images, bounds_m, layout, fraction)
+    # For renders, warp grids with a Newton step replace Broyden's method: same points in a fraction of the time.
+    render_method = "nearest" if settings.inverse_skinning == "nearest" else "baked"
+    if settings.network == "positional_mlp":
+        trunk = PositionalMlp(LAYER_COUNT - 1, settings.hidden_width, config.seed)
+        return RadianceField(bounds_m, EMPTY_GRID_LAYOUT, settings.hidden_width, config.seed, trunk, render_method)
+    layout = hash_grid_layout(bounds_m, cell_m, settings.levels, settings.features_per_level, config.log2_hashmap_size)
+    return RadianceField(bounds_m, layout, settings.hidden_width, config.seed, None, render_method)
 
 
 def dilate(mask: np.ndarray, radius_px: float) -> UInt8[np.ndarray, "h w"]:
-    """The mask widened by a disc."""
+    """Dilate a mask by a disc of `radius_px`, rounded up."""
     size = 2 * int(np.ceil(radius_px)) + 1
     return cv2.dilate(mask.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))

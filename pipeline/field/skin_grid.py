@@ -1,7 +1,9 @@
 """Skin weights around the canonical body, and the warp grids of a motion.
 
-The posed space of a frame is the world seen from the moving root: the root's skinning matrix is the identity there,
-so global orientation and translation are factored out and a frame's box is as tight as the body.
+The posed space of a frame is the frame of its root joint: the skinning matrix of the root is the identity there. Global
+orientation and translation are factored out, so that the bounding box of a frame is as tight as the body.
+
+Letters: n frames, j joints.
 """
 
 from collections.abc import Sequence
@@ -21,14 +23,15 @@ from pipeline.kernels.inverse_skinning import SkinGrid, WarpGrid, bake_warp_grid
 from pipeline.kernels.march import PackedWarpGrids
 
 NEIGHBOUR_COUNT = 24
+"""Nearest vertices whose skin weights a node averages."""
 
 
 def build_skin_grid(body: Body, margin_m: float, cell_m: float = 0.03) -> SkinGrid:
-    """Skin weights on all nodes within `margin_m` (and two cells) of the canonical surface, inside or outside.
+    """Compute skin weights on all grid nodes within `margin_m` (plus two cells) outside the canonical surface, and
+    inside.
 
-    InstantAvatar gives each voxel the weights of its nearest vertex, which jump where two limbs are equally near.
-    Here they are a Gaussian mean over the nearest vertices, whose width grows with the distance, so that skinning is
-    continuous.
+    InstantAvatar takes the weights of the nearest vertex, which are discontinuous between two limbs. Here they are a
+    Gaussian average over the nearest vertices, whose width grows with the distance, so that skinning is continuous.
     """
     max_distance_m = margin_m + 2.5 * cell_m
     origin = (np.floor((body.vertices.min(0) - max_distance_m) / cell_m) * cell_m).astype(np.float32)
@@ -50,23 +53,25 @@ def build_skin_grid(body: Body, margin_m: float, cell_m: float = 0.03) -> SkinGr
 
 
 def skin_margin_m(body: Body, bounds_m: Float[np.ndarray, "2 3"]) -> float:
-    """How far a field's box reaches beyond the body: the margin that its skin grid needs."""
+    """Return the largest distance, m, by which the bounds of a field exceed those of the body: the margin of its skin
+    grid.
+    """
     return float(max((body.vertices.min(0) - bounds_m[0]).max(), (bounds_m[1] - body.vertices.max(0)).max()))
 
 
 def _smooth_weights(nodes: np.ndarray, tree: cKDTree, skin_weights: np.ndarray, cell_m: float) -> np.ndarray:
     distance, neighbour = tree.query(nodes, k=NEIGHBOUR_COUNT, workers=torch.get_num_threads())
-    width = 0.5 * cell_m + 0.35 * distance[:, :1]
-    share = np.exp(-(distance**2 - distance[:, :1] ** 2) / (2 * width**2))
-    share = (share / share.sum(1, keepdims=True)).astype(np.float32)
+    sigma = 0.5 * cell_m + 0.35 * distance[:, :1]
+    kernel = np.exp(-(distance**2 - distance[:, :1] ** 2) / (2 * sigma**2))
+    kernel = (kernel / kernel.sum(1, keepdims=True)).astype(np.float32)
     row_start = np.arange(len(nodes) + 1) * NEIGHBOUR_COUNT
-    smoothing = csr_array((share.ravel(), neighbour.ravel(), row_start), shape=(len(nodes), len(skin_weights)))
+    smoothing = csr_array((kernel.ravel(), neighbour.ravel(), row_start), shape=(len(nodes), len(skin_weights)))
     weights: np.ndarray = smoothing @ skin_weights
     return weights
 
 
 def world_to_posed(canonical_to_world: Float[Tensor, "n j 4 4"]) -> Float[Tensor, "n 4 4"]:
-    """The rigid map from the world into each frame's posed space: the inverse of the root's skinning matrix."""
+    """Return the rigid transform from world to posed space of each frame: the inverse of the root's skinning matrix."""
     rotation, translation = canonical_to_world[:, 0, :3, :3], canonical_to_world[:, 0, :3, 3]
     inverse = torch.zeros_like(canonical_to_world[:, 0])
     inverse[:, :3, :3] = rotation.transpose(1, 2)
@@ -76,10 +81,7 @@ def world_to_posed(canonical_to_world: Float[Tensor, "n j 4 4"]) -> Float[Tensor
 
 
 def bake_warp_grids(skin: SkinGrid, canonical_to_posed: Float[Tensor, "n j 4 4"]) -> PackedWarpGrids:
-    """The warp grids of all frames, on the device of the matrices.
-
-    They are baked on the CPU; frames are shared out to as many threads as torch uses.
-    """
+    """Bake the warp grids of all frames on the CPU, one frame per thread; return them on the device of the matrices."""
     skin, matrices = skin.to(CPU), canonical_to_posed.cpu()
 
     def bake_row(row: int) -> WarpGrid:

@@ -1,6 +1,5 @@
-"""Learning the canonical field from a video: one step, and all that it changes."""
+"""One step of the training of field, poses and occupancy grid, and the state that it changes."""
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -11,37 +10,34 @@ from torch import Tensor
 
 from pipeline.body.body import Body, Motion
 from pipeline.body.pose_correction import PoseCorrection
+from pipeline.field.baked_inverse_skinning import BakedInverseSkinning
 from pipeline.field.config import FieldConfig
 from pipeline.field.field import RadianceField
-from pipeline.field.inverse_skinning import Rays, build_inverse_skinning
 from pipeline.field.losses import field_losses
 from pipeline.field.occupancy import OccupancyGrid
-from pipeline.field.pixel_sampler import ErrorMap, PixelPool, posed_space_cameras
-from pipeline.field.skin_grid import world_to_posed
-from pipeline.field.volume_rendering import PoseBatch, render_rays
+from pipeline.field.optimiser import POSE_PARAMETERS, FieldOptimiser
+from pipeline.field.pixel_sampler import PixelPool
+from pipeline.field.ray_batches import POINT_STREAM, STEP_STREAM, RayBatch, RaySampler, step_rng
+from pipeline.field.volume_rendering import PosedField, render_rays
 from pipeline.geometry.camera import Camera
-from pipeline.kernels.adam import adam_step_
 from pipeline.kernels.common.thread_pool import ThreadPool
 from pipeline.kernels.hashgrid import FeatureGradients, add_table_gradient_
 from pipeline.kernels.inverse_skinning import SkinGrid
-from pipeline.kernels.pixel_sampling import generate_pixel_rays
 from pipeline.kernels.volume_rendering import RenderOutput
 
-WARMUP_STEPS = 20
-MAX_NONFINITE_STEPS = 20
 REBAKE_FRACTIONS = (0.6,)
-"""Parts of the training at which the warp grids follow the refined poses (docs/decisions.md)."""
+"""Fractions of the steps at which the inverse skinning is baked for the refined poses (docs/decisions.md)."""
 MAX_SAMPLES_PER_RAY = 160
-"""Of a ray; those farther back are dropped."""
+"""Samples farther along the ray are dropped."""
 CPU_BATCH_PARTS = 4
-"""On the CPU a step's frames are divided into so many parts, which threads work at, whatever the number of threads."""
-STEP_STREAM, POINT_STREAM, FRAME_STREAM = range(3)
-"""Streams of random numbers in a step: what it takes from where is the same however its work is divided."""
+"""Parts into which the frames of a step are divided on the CPU. It does not depend on the number of threads, so that
+the order of floating-point sums does not either."""
+OCCUPANCY_PREFIX = "occupancy."
 
 
 @dataclass(frozen=True)
 class TrainingScene:
-    """What is learnt from: one body in motion before one camera, and the pixels that saw it."""
+    """Training data: a body in motion, the camera, and the pixels of all training frames."""
 
     body: Body
     motion: Motion
@@ -51,26 +47,11 @@ class TrainingScene:
 
 
 @dataclass(frozen=True)
-class RayBatch:
-    """Some rays of a step, in the posed space of their frames, in the order of these."""
-
-    frames: Int[Tensor, "k"]
-    frame: Int[Tensor, "n"]
-    rows: Int[np.ndarray, "n"]
-    origins_m: Float[Tensor, "n 3"]
-    directions: Float[Tensor, "n 3"]
-    rgba: Float[Tensor, "n 4"]
-    background: Float[Tensor, "n 3"]
-    jitter: Float[Tensor, "n"]
-    inlier_weight: Float[Tensor, "n"]
-
-
-@dataclass(frozen=True)
 class StepResult:
-    """What learning comes to for a part of a step; losses and gradients are its share of the whole step's.
+    """Losses and gradients of a part of a step; they add up to those of the whole step.
 
-    gradients: by parameter, without those that have none. towards: what the table's is made of, where that is not
-    among them.
+    gradients: by parameter. feature_gradients: contributions to the gradient of the hash table, if autograd does not
+    compute it.
     """
 
     batch: RayBatch
@@ -82,7 +63,7 @@ class StepResult:
 
 
 def sum_by_name(parts: Iterable[dict[str, Tensor]]) -> dict[str, Tensor]:
-    """What several parts say under the same names, added up in their order."""
+    """Add up the tensors of the same name, in the order of the parts."""
     total: dict[str, Tensor] = {}
     for part in parts:
         for name, value in part.items():
@@ -90,16 +71,8 @@ def sum_by_name(parts: Iterable[dict[str, Tensor]]) -> dict[str, Tensor]:
     return total
 
 
-class DivergedError(ArithmeticError):
-    """Many steps in a row had no finite loss."""
-
-
 class Trainer:
-    """The state of stage one: everything that a step changes is here and in `state()`, on the field's device.
-
-    Random numbers come from a generator keyed by (seed, step), so a resumed run draws what an unbroken one would
-    have drawn.
-    """
+    """Training of a field, on the device of the field. `state_dict` holds everything that a step changes."""
 
     def __init__(
         self, scene: TrainingScene, field: RadianceField, occupancy: OccupancyGrid, config: FieldConfig
@@ -107,234 +80,137 @@ class Trainer:
         self.scene, self.field, self.occupancy, self.config = scene, field, occupancy, config
         self.device = field.bounds_m.device
         self.poses = PoseCorrection(scene.body, scene.motion, self.device)
-        self.step_m = scene.body.height_m() * config.step_fraction
+        self.sampler = RaySampler(scene.pool, config, self.device)
+        self.optimiser = FieldOptimiser(field, self.poses, config)
+        self.inverse_skinning = BakedInverseSkinning(
+            scene.body, scene.skin, scene.camera, self.poses, config.settings.inverse_skinning
+        )
+        self.step_m = scene.body.height_m() * config.settings.step_fraction
         self.completed_steps = 0
-        self.nonfinite_steps = 0
-        self.error_map = ErrorMap(scene.pool.frames, scene.pool.xy_px)
-        self.grad_table = torch.zeros_like(field.table)
-        class_ratios = (
-            1 - config.border_sampling_ratio - config.outside_sampling_ratio,
-            config.border_sampling_ratio,
-            config.outside_sampling_ratio,
-        )
-        all_frames = np.arange(scene.pool.frames)
-        self.frames_with_rays = np.flatnonzero(
-            scene.pool.sample_counts(all_frames, float(config.rays), class_ratios).any(axis=1)
-        )
-        if not len(self.frames_with_rays):
-            raise ValueError("no frame has a pixel to learn from")
-        self.frames_per_step = min(config.frames_per_step, len(self.frames_with_rays))
-        self.sample_counts = scene.pool.sample_counts(all_frames, config.rays / self.frames_per_step, class_ratios)
         self.part_count = CPU_BATCH_PARTS if self.device.type == "cpu" else 1
         self.threads = ThreadPool(self.part_count)
-        parameters: dict[str, Tensor] = dict(field.named_parameters())
-        parameters |= {"rotation_rad": self.poses.rotation_rad, "shift_m": self.poses.shift_m}
-        self.parameters = parameters
-        self.moments = {name: (torch.zeros_like(p), torch.zeros_like(p)) for name, p in parameters.items()}
-        self.baked_rotation_rad, self.baked_shift_m = torch.zeros(()), torch.zeros(())
-        self.full_skin_grid = self.skin = scene.skin.to(self.device)
-        self._bake_inverse_skinning()
-
-    def _bake_inverse_skinning(self) -> None:
-        """Invert the skinning of all training frames as they are posed now."""
-        self.baked_rotation_rad = self.poses.rotation_rad.detach().clone()
-        self.baked_shift_m = self.poses.shift_m.detach().clone()
-        with torch.no_grad():
-            all_frames = torch.arange(self.scene.pool.frames, device=self.device)
-            canonical_to_world = self.poses.canonical_to_world(all_frames)
-            self.world_to_posed = world_to_posed(canonical_to_world)
-            self.posed_space_cameras = posed_space_cameras(self.scene.camera, self.world_to_posed.cpu().numpy())
-            poses = self.world_to_posed[:, None] @ canonical_to_world
-            self.inverse = build_inverse_skinning(self.config.inverse_skinning, self.scene.body, self.scene.skin, poses)
-
-    def _crop_skin_grid(self) -> None:
-        """Blend skinning only where samples can lie: a third of the nodes, and of the memory that a step touches."""
-        if self.refines_poses:
-            self.skin = self.full_skin_grid.crop_to_occupied(self.occupancy.occupied, self.occupancy.bounds_m)
 
     @property
     def refines_poses(self) -> bool:
-        """True once the poses take part in the learning."""
-        return (
-            self.config.pose_refinement and self.completed_steps >= self.config.pose_start_fraction * self.config.steps
-        )
-
-    def _rng(self, stream: int) -> np.random.Generator:
-        return np.random.Generator(
-            np.random.Philox(key=[self.config.seed, self.completed_steps], counter=[0, 0, 0, stream])
-        )
-
-    def _sample_batch(self, frames: Int[np.ndarray, "k"]) -> RayBatch:
-        """Rays of some frames; those of a frame hang on nothing but frame and step."""
-        config, pool, sample_counts = self.config, self.scene.pool, self.sample_counts[frames]
-        rngs = [self._rng(FRAME_STREAM + frame) for frame in frames.tolist()]
-        rows, inlier_weight = pool.sample_pixels(
-            frames, sample_counts, rngs, self.error_map, config.error_sampling_ratio, config.outlier_threshold
-        )
-        counts = sample_counts.sum(axis=1).tolist()
-        uniform = np.concatenate([s.random((n, 6), dtype=np.float32) for s, n in zip(rngs, counts, strict=True)])
-        pixel_offset = uniform[:, 4:] if config.pixel_jitter else np.full((len(rows), 2), 0.5, np.float32)
-        frame = np.repeat(frames, counts)
-        origins, directions, rgba = generate_pixel_rays(
-            rows, frame, pool.xy_px, pool.rgba, pixel_offset, self.posed_space_cameras
-        )
-        return RayBatch(
-            frames=self._to_device(frames),
-            frame=self._to_device(frame),
-            rows=rows,
-            origins_m=self._to_device(origins),
-            directions=self._to_device(directions),
-            rgba=self._to_device(rgba),
-            background=self._to_device(uniform[:, :3]),
-            jitter=self._to_device(uniform[:, 3]),
-            # What lies outside the mask is not the person, however much it errs.
-            inlier_weight=self._to_device(1 - rgba[:, 3] * (1 - inlier_weight)),
-        )
-
-    def _to_device(self, array: np.ndarray) -> Tensor:
-        return torch.from_numpy(array).to(self.device)
-
-    def _pose_batch(self, frames: Int[Tensor, "k"]) -> PoseBatch | None:
-        """Where samples lie once poses are refined: wherever these are now."""
-        if not self.refines_poses:
-            return None
-        poses = self.poses.canonical_to_posed(frames, self.world_to_posed[frames])
-        return PoseBatch(self.skin, frames, poses)
+        """Whether the present step refines the poses."""
+        start_step = self.config.settings.pose_start_fraction * self.config.steps
+        return self.config.pose_refinement and self.completed_steps >= start_step
 
     def step(self) -> dict[str, float]:
-        """One step; returns the losses. Raises DivergedError after many steps without a finite loss."""
-        config, random = self.config, self._rng(STEP_STREAM)
-        if self.refines_poses and self.completed_steps in {round(part * config.steps) for part in REBAKE_FRACTIONS}:
-            self._bake_inverse_skinning()
-        if self.refines_poses and self.skin is self.full_skin_grid:
-            self._crop_skin_grid()
-        frames = np.sort(random.choice(self.frames_with_rays, self.frames_per_step, replace=False))
+        """Take one training step; return the losses and the number of samples.
+
+        Raises:
+            DivergedError: many consecutive steps had no finite loss.
+        """
+        settings, rng = self.config.settings, step_rng(self.config.seed, self.completed_steps, STEP_STREAM)
+        self._prepare_pose_refinement()
+        frames = self.sampler.sample_frames(rng)
         parts = np.array_split(frames, min(self.part_count, len(frames)))
         empty_m = self.occupancy.sample_empty_points(
-            config.empty_points, config.unobserved_points, self._rng(POINT_STREAM)
+            settings.empty_points,
+            settings.unobserved_points,
+            step_rng(self.config.seed, self.completed_steps, POINT_STREAM),
         )
-        ray_fraction = [float(self.sample_counts[part].sum() / self.sample_counts[frames].sum()) for part in parts]
-        results = self.threads.map(self._forward_backward, parts, empty_m.tensor_split(len(parts)), ray_fraction)
+        ray_fractions = [self.sampler.ray_fraction(part, frames) for part in parts]
+        results = self.threads.map(self.forward_backward, parts, empty_m.tensor_split(len(parts)), ray_fractions)
         losses = sum_by_name(result.losses for result in results)
         total, gradients = torch.stack(list(losses.values())).sum(), [result.gradients for result in results]
         if self.refines_poses:
-            pose_penalty = (
-                config.pose_smoothness_weight * self.poses.temporal_roughness()
-                + config.pose_l2_weight * self.poses.size()
-            )
-            gradients.append(self._gradients(pose_penalty, ("rotation_rad", "shift_m")))
-            total = total + pose_penalty.detach()
-        finite = bool(torch.isfinite(total))
-        if finite:
-            feature_gradients = FeatureGradients(part for result in results for part in result.feature_gradients)
-            add_table_gradient_(self.grad_table, feature_gradients, self.field.layout)
-            for result in results:
-                self._update_error_map(result.batch, result.colour_error)
-                self.occupancy.record_observations(
-                    result.rendered.canonical_m, result.rendered.transmittance, result.rendered.weight
-                )
-        self._optimiser_step(finite, sum_by_name(gradients))
+            pose_loss = self._pose_loss()
+            gradients.append(self.optimiser.gradients(pose_loss, POSE_PARAMETERS))
+            total = total + pose_loss.detach()
+        is_finite = bool(torch.isfinite(total))
+        if is_finite:
+            self._record_results(results)
+        self.optimiser.step(self.completed_steps, sum_by_name(gradients), is_finite)
         self.completed_steps += 1
-        if (
-            self.completed_steps % config.occupancy_update_interval == 0
-            and self.completed_steps >= config.occupancy_warmup_steps
-        ):
-            self.occupancy.update(self.field.density, self.step_m, random)
-            self._crop_skin_grid()
+        self._update_occupancy(rng)
         samples = sum(len(result.rendered.transmittance) for result in results)
         return {name: float(loss) for name, loss in losses.items()} | {"samples": float(samples)}
 
-    def _forward_backward(
+    def forward_backward(
         self, frames: Int[np.ndarray, "k"], empty_m: Float[Tensor, "e 3"], ray_fraction: float
     ) -> StepResult:
-        """Learn from rays of some frames and points that should be empty. Changes nothing, so threads may do it at
-        once. share: that of all rays.
+        """Compute losses and gradients of rays of some frames and of empty points (m), without changing any state.
+
+        ray_fraction: rays of these frames as a fraction of all rays of the step. Threads may call it concurrently.
         """
-        batch, feature_gradients = self._sample_batch(frames), FeatureGradients()
-        rays = Rays(batch.origins_m, batch.directions, batch.frame, batch.jitter)
-        inputs = (self.occupancy.grid(), rays, self._pose_batch(batch.frames), empty_m)
-        rendered = render_rays(self.field, self.inverse, *inputs, self.step_m, MAX_SAMPLES_PER_RAY, feature_gradients)
-        targets = (batch.rgba, batch.background, batch.inlier_weight, rendered.density_per_m, self.config)
+        batch = self.sampler.sample_rays(frames, self.completed_steps, self.inverse_skinning.cameras)
+        feature_gradients = FeatureGradients()
+        posed_field = PosedField(self.field, self.inverse_skinning.inverse, self.occupancy.binary())
+        pose_batch = self.inverse_skinning.pose_batch(batch.frame_indices) if self.refines_poses else None
+        rendered = render_rays(
+            posed_field, batch.rays, pose_batch, empty_m, self.step_m, MAX_SAMPLES_PER_RAY, feature_gradients
+        )
+        targets = (batch.rgba, batch.background, batch.inlier_weight, rendered.density_per_m, self.config.settings)
         losses, error = field_losses(rendered.image, rendered.alpha, *targets)
         losses = {name: loss if name == "density" else ray_fraction * loss for name, loss in losses.items()}
-        gradients = self._gradients(torch.stack(list(losses.values())).sum(), tuple(self.parameters))
+        gradients = self.optimiser.gradients(torch.stack(list(losses.values())).sum())
         detached = {name: loss.detach() for name, loss in losses.items()}
         return StepResult(batch, rendered, error, detached, gradients, feature_gradients)
 
-    def _gradients(self, loss: Tensor, names: tuple[str, ...]) -> dict[str, Tensor]:
-        """Of the parameters that the loss depends on and whose gradient autograd is told."""
-        gradients = torch.autograd.grad(loss, [self.parameters[name] for name in names], allow_unused=True)
-        return {name: gradient for name, gradient in zip(names, gradients, strict=True) if gradient is not None}
+    def _prepare_pose_refinement(self) -> None:
+        """Bake the inverse skinning for the refined poses if it is time, and crop the skin grid once."""
+        if not self.refines_poses:
+            return
+        if self.completed_steps in {round(fraction * self.config.steps) for fraction in REBAKE_FRACTIONS}:
+            self.inverse_skinning.bake()
+        if not self.inverse_skinning.is_cropped:
+            self.inverse_skinning.crop_skin_grid(self.occupancy.binary())
 
-    def _update_error_map(self, batch: RayBatch, colour_error: Float[Tensor, "n 3"]) -> None:
-        """Remember where colours are wrong, for the rays of later steps."""
-        if self.config.error_sampling_ratio > 0.0:
-            self.error_map.update(batch.rows, batch.frame.cpu().numpy(), colour_error.cpu().numpy())
-
-    def _learning_rate_factor(self) -> float:
-        """Part of the full learning rate: a short warm-up, then an exponential decay that ends at
-        `final_learning_rate_ratio`.
-        """
-        return min(1.0, (self.completed_steps + 1) / WARMUP_STEPS) * self.config.final_learning_rate_ratio ** (
-            self.completed_steps / self.config.steps
+    def _pose_loss(self) -> Tensor:
+        settings = self.config.settings
+        return (
+            settings.pose_smoothness_weight * self.poses.temporal_roughness()
+            + settings.pose_l2_weight * self.poses.size()
         )
 
-    def _pose_learning_rate_factor(self) -> float:
-        """Part of the poses' learning rate: full when they begin to be refined, a tenth at the end."""
-        start_step = self.config.pose_start_fraction * self.config.steps
-        return 0.1 ** ((self.completed_steps - start_step) / max(self.config.steps - start_step, 1))
-
-    def _optimiser_step(self, finite: bool, gradients: dict[str, Tensor]) -> None:
-        self.nonfinite_steps = 0 if finite else self.nonfinite_steps + 1
-        if self.nonfinite_steps >= MAX_NONFINITE_STEPS:
-            raise DivergedError(f"no finite loss in {MAX_NONFINITE_STEPS} steps up to step {self.completed_steps}")
-        if not finite:
-            return
-        config = self.config
-        rates = {
-            "table": config.table_learning_rate,
-            "rotation_rad": config.pose_learning_rate,
-            "shift_m": config.pose_learning_rate / 3,
-        }
-        # The compiled encoding fills a buffer of ours; its plain twin, for other devices, fills autograd's.
-        if "table" in self.parameters and "table" not in gradients:
-            gradients = {"table": self.grad_table} | gradients
-        for name, gradient in gradients.items():
-            is_pose = name in ("rotation_rad", "shift_m")
-            start_step = math.ceil(config.pose_start_fraction * config.steps) if is_pose else 0
-            updates = self.completed_steps + 1 - start_step
-            rate = rates.get(name, config.network_learning_rate) * (
-                self._pose_learning_rate_factor() if is_pose else self._learning_rate_factor()
+    def _record_results(self, results: list[StepResult]) -> None:
+        """Add the hash table gradient, and update the error map and the observations of the occupancy grid."""
+        feature_gradients = FeatureGradients(part for result in results for part in result.feature_gradients)
+        add_table_gradient_(self.optimiser.grad_table, feature_gradients, self.field.layout)
+        for result in results:
+            self.sampler.update_errors(result.batch, result.colour_error)
+            self.occupancy.record_observations(
+                result.rendered.canonical_m, result.rendered.transmittance, result.rendered.weight
             )
-            moments = self.moments[name]
-            adam_step_(self.parameters[name], gradient.contiguous(), *moments, updates, rate, epsilon=1e-15)
 
-    def state(self) -> dict[str, Tensor]:
-        """Everything that a resumed run needs."""
+    def _update_occupancy(self, rng: np.random.Generator) -> None:
+        """Update the occupancy grid every few steps once the warm-up is over."""
+        settings = self.config.settings
+        is_due = self.completed_steps % settings.occupancy_update_interval == 0
+        if is_due and self.completed_steps >= settings.occupancy_warmup_steps:
+            self.occupancy.update(self.field.density, self.step_m, rng)
+            self._crop_skin_grid()
+
+    def _crop_skin_grid(self) -> None:
+        if self.refines_poses:
+            self.inverse_skinning.crop_skin_grid(self.occupancy.binary())
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return all tensors that a resumed training needs."""
         tensors = {
             "completed_steps": torch.tensor(self.completed_steps),
-            "nonfinite_steps": torch.tensor(self.nonfinite_steps),
+            "baked.rotation_rad": self.inverse_skinning.baked_rotation_rad,
+            "baked.shift_m": self.inverse_skinning.baked_shift_m,
+            "pixel_errors": torch.from_numpy(self.sampler.error_map.error),
         }
-        tensors |= {"baked.rotation_rad": self.baked_rotation_rad, "baked.shift_m": self.baked_shift_m}
-        for name, parameter in self.parameters.items():
-            tensors[f"parameter.{name}"] = parameter.detach()
-            tensors[f"first.{name}"], tensors[f"second.{name}"] = self.moments[name]
-        tensors["pixel_errors"] = torch.from_numpy(self.error_map.error)
-        return tensors | {f"occupancy.{name}": value for name, value in self.occupancy.state().items()}
+        occupancy = {f"{OCCUPANCY_PREFIX}{name}": value for name, value in self.occupancy.state_dict().items()}
+        return tensors | self.optimiser.state_dict() | occupancy
 
-    def load_state(self, tensors: dict[str, Tensor]) -> None:
-        """Go on from `state()`; the next step is the one that the other run would have made."""
-        self.completed_steps, self.nonfinite_steps = int(tensors["completed_steps"]), int(tensors["nonfinite_steps"])
+    def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
+        """Restore the state that `state_dict` returned; the next step equals that of the uninterrupted training."""
+        self.completed_steps = int(tensors["completed_steps"])
         with torch.no_grad():
             self.poses.rotation_rad.copy_(tensors["baked.rotation_rad"])
             self.poses.shift_m.copy_(tensors["baked.shift_m"])
-            self._bake_inverse_skinning()
-            for name, parameter in self.parameters.items():
-                parameter.copy_(tensors[f"parameter.{name}"])
-                for moment, order in zip(self.moments[name], ("first", "second"), strict=True):
-                    moment.copy_(tensors[f"{order}.{name}"])
-        self.error_map.error[:] = tensors["pixel_errors"].cpu().numpy()
-        prefix = "occupancy."
-        kept = {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
-        self.occupancy.load_state(kept)
+        self.inverse_skinning.bake()
+        self.optimiser.load_state_dict(tensors)
+        self.sampler.error_map.error[:] = tensors["pixel_errors"].cpu().numpy()
+        occupancy = {
+            name.removeprefix(OCCUPANCY_PREFIX): value
+            for name, value in tensors.items()
+            if name.startswith(OCCUPANCY_PREFIX)
+        }
+        self.occupancy.load_state_dict(occupancy)
         self._crop_skin_grid()

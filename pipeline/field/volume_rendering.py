@@ -1,6 +1,6 @@
-"""What rays see of the canonical field, wherever the poses carry it; differentiable in field and poses.
+"""Volume rendering of the canonical field along rays in posed space; differentiable in field and poses.
 
-Letters: n rays, b frames of a batch, j joints, p points.
+Letters: n rays, k frames of the motion, b frames of a batch, j joints, m nodes of the skin grid, p points, s samples.
 """
 
 from typing import NamedTuple
@@ -22,31 +22,37 @@ from pipeline.kernels.transmittance_stats import transmittance_from_weights
 from pipeline.kernels.volume_rendering import BatchSkinning, RadianceNetwork, RenderOutput, SamplingVolume, trace
 
 
+class PosedField(NamedTuple):
+    """A canonical field, the inverse skinning of the frames in which it is seen, and its occupied cells."""
+
+    field: RadianceField
+    inverse: InverseSkinning
+    occupancy: BinaryOccupancy
+
+    @property
+    def supports_early_termination(self) -> bool:
+        """Whether `render_rays` skips samples behind a surface: hash grid and warp grids on the CPU."""
+        return self.inverse.warps is not None and self.field.trunk is None and runs_on_numba(self.field.table)
+
+
 class PoseBatch(NamedTuple):
-    """Where samples are carried: skin weights, and the skinning matrices of the batch's frames, which are in order."""
+    """Skin weights, and the skinning matrices of the frames of a batch; `frames` is in ascending order."""
 
     skin: SkinGrid
     frames: Int[Tensor, "b"]
     canonical_to_posed: Float[Tensor, "b j 4 4"]
 
     def blended(self) -> Float[Tensor, "m b 12"]:
-        """The matrices at the nodes of the skin grid."""
+        """Blend the matrices at the nodes of the skin grid."""
         return self.skin.blend(self.canonical_to_posed)
 
     def frame_slots(self, rays: Rays) -> Int[Tensor, "n"]:
-        """Which of the frames each ray belongs to."""
-        return torch.searchsorted(self.frames, rays.frame)
-
-
-def uses_early_termination(field: RadianceField, inverse: InverseSkinning) -> bool:
-    """Whether `render_rays` asks only for what light reaches: a hash grid behind warp grids, on the CPU."""
-    return inverse.warps is not None and field.trunk is None and runs_on_numba(field.table)
+        """Return the position in `frames` of each ray's frame."""
+        return torch.searchsorted(self.frames, rays.frame_index)
 
 
 def render_rays(
-    field: RadianceField,
-    inverse: InverseSkinning,
-    occupancy: BinaryOccupancy,
+    posed_field: PosedField,
     rays: Rays,
     pose_batch: PoseBatch | None,
     points_m: Float[Tensor, "p 3"],
@@ -54,17 +60,17 @@ def render_rays(
     max_samples: int,
     feature_gradients: FeatureGradients,
 ) -> RenderOutput:
-    """Colour and alpha of rays, density of some more points, and what the samples saw.
+    """Render colour and alpha of rays, and the density of further canonical points.
 
-    rays: their frames are rows of the motion that `inverse` undoes, in order.
-    placing: None: samples lie where `inverse` found them.
-    towards: takes what the hash table's gradient is made of (`pipeline.kernels.hashgrid.encode`).
+    rays: ordered by frame; frames are rows of the motion of `posed_field.inverse`. pose_batch: present poses, to which
+    a Newton step moves the samples; None keeps the positions that the inverse skinning found. step_m: distance between
+    samples, m. max_samples: per ray. feature_gradients: list that takes the contributions to the gradient of the hash
+    table (`pipeline.kernels.hashgrid.encode`).
     """
+    field, inverse, occupancy = posed_field
     warps = inverse.warps
-    if warps is None or not uses_early_termination(field, inverse):
-        return render_rays_dense(
-            field, inverse, occupancy, rays, pose_batch, points_m, step_m, max_samples, feature_gradients
-        )
+    if warps is None or not posed_field.supports_early_termination:
+        return render_rays_dense(posed_field, rays, pose_batch, points_m, step_m, max_samples, feature_gradients)
     network = (field.hidden, field.output, field.bias)
     return trace(
         *rays,
@@ -81,9 +87,7 @@ def render_rays(
 
 
 def render_rays_dense(
-    field: RadianceField,
-    inverse: InverseSkinning,
-    occupancy: BinaryOccupancy,
+    posed_field: PosedField,
     rays: Rays,
     pose_batch: PoseBatch | None,
     points_m: Float[Tensor, "p 3"],
@@ -91,10 +95,11 @@ def render_rays_dense(
     max_samples: int,
     feature_gradients: FeatureGradients,
 ) -> RenderOutput:
-    """`render_rays` with any inverse, field and device: all samples at once, those behind a surface too."""
+    """`render_rays` for any field, inverse skinning and device; evaluates all samples, also those behind a surface."""
+    field, inverse, occupancy = posed_field
     samples = inverse.sample_rays(rays, step_m, occupancy, max_samples)
     count = len(samples.distance_m)
-    sample_positions_m = _to_canonical(inverse, rays, pose_batch, samples) if pose_batch else samples.canonical_m
+    sample_positions_m = sample_positions(inverse, rays, pose_batch, samples) if pose_batch else samples.canonical_m
     colour, density = field.radiance(torch.cat([sample_positions_m, points_m]), feature_gradients)
     step = torch.full_like(samples.distance_m, step_m)
     image, alpha, weight = composite(density[:count], colour[:count], step, samples.ray_offsets)
@@ -102,12 +107,12 @@ def render_rays_dense(
     return RenderOutput(image, alpha, density[count:], samples.canonical_m, transmittance, weight.detach())
 
 
-def _to_canonical(
+def sample_positions(
     inverse: InverseSkinning, rays: Rays, pose_batch: PoseBatch, samples: Samples
 ) -> Float[Tensor, "s 3"]:
-    """Where the poses carry samples, differentiably."""
+    """Return the canonical positions (m) of samples in the present poses, differentiable in the poses."""
     ray = segment_ids_from_counts(samples.ray_offsets.diff())
-    # Rows by index_select: plain indexing takes three times as long for tensors of this size.
+    # index_select takes a third of the time of plain indexing for tensors of this size.
     offset = samples.distance_m[:, None] * rays.directions.index_select(0, ray)
     posed = rays.origins_m.index_select(0, ray) + offset
     skin, frames, matrices = pose_batch

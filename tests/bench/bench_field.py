@@ -139,14 +139,14 @@ def trainer_from_synthetic_body(config: FieldConfig) -> Trainer:
 
 def occupancy_period(config: FieldConfig) -> int:
     """Steps after which all recurs: updates of the occupancy."""
-    return config.occupancy_update_interval
+    return config.settings.occupancy_update_interval
 
 
 def warm_up_step_count(config: FieldConfig) -> int:
     """Steps until poses are refined and a cell that was never anything but empty is given up; whole periods."""
-    updates = math.ceil(math.log(1 / INITIAL_EMA_RATIO) / math.log(config.occupancy_decay))
-    emptied = config.occupancy_warmup_steps + updates * config.occupancy_update_interval
-    poses = math.ceil(config.pose_start_fraction * config.steps) if config.pose_refinement else 0
+    updates = math.ceil(math.log(1 / INITIAL_EMA_RATIO) / math.log(config.settings.occupancy_decay))
+    emptied = config.settings.occupancy_warmup_steps + updates * config.settings.occupancy_update_interval
+    poses = math.ceil(config.settings.pose_start_fraction * config.steps) if config.pose_refinement else 0
     return math.ceil(max(emptied, poses) / occupancy_period(config)) * occupancy_period(config)
 
 
@@ -170,15 +170,17 @@ def time_steps(trainer: Trainer, clock: PartTimer, warm_up: int, steps: int) -> 
 def minimum_work(trainer: Trainer, samples: float) -> dict[str, tuple[Work, ...]]:
     """The table above, for a step as `trainer` stands now: what is done in turn in each part."""
     config, field, occupancy = trainer.config, trainer.field, trainer.occupancy
-    n, levels, hidden = config.rays, field.layout.levels, config.hidden_width
-    asked = (config.empty_points, config.unobserved_points)
+    n, levels, hidden = config.rays_per_step, field.layout.levels, config.settings.hidden_width
+    asked = (config.settings.empty_points, config.settings.unobserved_points)
     points = samples + len(occupancy.sample_empty_points(*asked, np.random.default_rng(0)))
     width = len(field.hidden)
     moving = float(trainer.refines_poses)
-    blending = moving * 24.0 * len(trainer.skin.sparse_weights.weight) * trainer.frames_per_step
+    blending = (
+        moving * 24.0 * len(trainer.inverse_skinning.skin.sparse_weights.weight) * trainer.sampler.frames_per_step
+    )
     placed = moving * samples
     network = 2.0 * (width * hidden + 4 * hidden)
-    cells = len(occupancy.cells) / config.occupancy_update_interval
+    cells = len(occupancy.candidate_cells) / config.settings.occupancy_update_interval
     render_rays = (
         Work(bytes=16 * samples, rows=8 * samples),
         Work(bytes=40 * placed, rows=8 * placed),
@@ -198,7 +200,9 @@ def minimum_work(trainer: Trainer, samples: float) -> dict[str, tuple[Work, ...]
         "adam": (Work(bytes=32.0 * sum(parameter.numel() for parameter in field.parameters())),),
         "occupancy_record": (Work(bytes=24 * samples, rows=4 * samples),),
         UPDATE: (Work(bytes=(12 + 4 * width) * cells, operations=network * cells, rows=8 * levels * cells),),
-        "skin_cut": (Work(bytes=8.0 * trainer.skin.weights.numel() / config.occupancy_update_interval),),
+        "skin_cut": (
+            Work(bytes=8.0 * trainer.inverse_skinning.skin.weights.numel() / config.settings.occupancy_update_interval),
+        ),
         OTHER: (),
     }
 
@@ -216,7 +220,7 @@ def measure(trainer: Trainer, clock: PartTimer, warm_up: int, steps: int, repeat
     floors = {part: sum(one.lower_bound_ms(peaks) for one in work[part]) for part in PARTS}
     figures = {"step_ms": timing.step_ms, "floor_ms": sum(floors.values()), "samples": timing.samples}
     figures |= {f"{part}_ms": timing.parts_ms[part] for part in PARTS}
-    figures[f"{REBAKE}_ms"] = median_ms(trainer._bake_inverse_skinning, BAKE_REPEATS)
+    figures[f"{REBAKE}_ms"] = median_ms(trainer.inverse_skinning.bake, BAKE_REPEATS)
     return figures | {f"{part}_floor_ms": floors[part] for part in PARTS} | vars(peaks)
 
 
@@ -246,7 +250,7 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--repeats", type=int, default=15, help="runs for each peak")
     options = parser.parse_args(argv)
     config = build_config("field", FieldConfig, load_layers(options.preset, {}))
-    if config.network != "hashgrid":
+    if config.settings.network != "hashgrid":
         raise UserError(f"preset {options.preset} has no hash grid, whose floors these are; take PRESET=default")
     quality_figures, reasons = quality(options.run, options.baseline)
     warm_up = warm_up_step_count(config) if options.warm_up is None else options.warm_up

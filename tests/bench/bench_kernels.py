@@ -41,8 +41,10 @@ def ray_points(random: torch.Generator) -> torch.Tensor:
 def field_parts(config: FieldConfig, repeats: int) -> dict[str, float]:
     """Encoding, network, compositing and update, forward and backward."""
     random = torch.Generator().manual_seed(SEED)
-    layout = hash_grid_layout(BOUNDS, 0.003, config.levels, config.features, config.log2_rows)
-    field = RadianceField(BOUNDS, layout, config.hidden_width)
+    layout = hash_grid_layout(
+        BOUNDS, 0.003, config.settings.levels, config.settings.features_per_level, config.log2_hashmap_size
+    )
+    field = RadianceField(BOUNDS, layout, config.settings.hidden_width)
     points, sums = ray_points(random), torch.zeros_like(field.table)
     features = encode(points, field.table, layout)
     grad_output = torch.randn(features.shape, generator=random)

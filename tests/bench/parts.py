@@ -12,9 +12,13 @@ from typing import Any
 from unittest import mock
 
 from pipeline.body.pose_correction import PoseCorrection
-from pipeline.field import trainer as train
+from pipeline.field import optimiser as optimiser_module
+from pipeline.field import trainer as trainer_module
+from pipeline.field.baked_inverse_skinning import BakedInverseSkinning
 from pipeline.field.field import _RadianceMlp
 from pipeline.field.occupancy import OccupancyGrid
+from pipeline.field.optimiser import FieldOptimiser
+from pipeline.field.ray_batches import RaySampler
 from pipeline.field.trainer import Trainer
 from pipeline.field.volume_rendering import PoseBatch
 from pipeline.kernels.common.thread_pool import ThreadPool
@@ -27,14 +31,14 @@ UPDATE = "occupancy_update"
 REBAKE = "rebake"
 TIMED_FUNCTIONS: tuple[tuple[str, Any, str], ...] = (
     (OTHER, Trainer, "step"),
-    (REBAKE, Trainer, "_bake_inverse_skinning"),
-    ("draw", Trainer, "_sample_batch"),
+    (REBAKE, BakedInverseSkinning, "bake"),
+    ("draw", RaySampler, "sample_rays"),
     ("draw", OccupancyGrid, "sample_empty_points"),
-    ("place", Trainer, "_pose_batch"),
+    ("place", BakedInverseSkinning, "pose_batch"),
     ("place", PoseBatch, "blended"),
-    ("render_rays", train, "render_rays"),
-    ("losses", train, "field_losses"),
-    ("losses", PoseCorrection, "roughness"),
+    ("render_rays", trainer_module, "render_rays"),
+    ("losses", trainer_module, "field_losses"),
+    ("losses", PoseCorrection, "temporal_roughness"),
     ("losses", PoseCorrection, "size"),
     ("network_backward", _RadianceMlp, "backward"),
     ("network_backward", _RenderRays, "backward"),
@@ -42,11 +46,11 @@ TIMED_FUNCTIONS: tuple[tuple[str, Any, str], ...] = (
     ("positions_backward", hashgrid_cpu, "add_points_gradient"),
     ("positions_backward", _NewtonStep, "backward"),
     ("positions_backward", newton_cpu, "add_pose_gradient"),
-    ("rest_backward", Trainer, "_gradients"),
-    ("adam", train, "adam_step_"),
+    ("rest_backward", FieldOptimiser, "gradients"),
+    ("adam", optimiser_module, "adam_step_"),
     ("occupancy_record", OccupancyGrid, "record_observations"),
     (UPDATE, OccupancyGrid, "update"),
-    ("skin_cut", Trainer, "_crop_skin_grid"),
+    ("skin_cut", BakedInverseSkinning, "crop_skin_grid"),
 )
 
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from pipeline.core.errors import UserError
+from pipeline.field.baked_inverse_skinning import BakedInverseSkinning
 from pipeline.field.config import FieldConfig
 from pipeline.field.occupancy import INITIAL_EMA_RATIO
 from pipeline.field.trainer import Trainer
@@ -25,15 +26,16 @@ from tests.bench.bench_field import (
 )
 from tests.bench.machine import append_result, machine_info
 from tests.bench.parts import REBAKE, TIMED_FUNCTIONS, PartTimer, timed_parts
+from tests.field.scene import field_config
 
-TINY = FieldConfig(
+TINY = field_config(
     steps=40,
-    rays=512,
+    rays_per_step=512,
     frames_per_step=2,
     max_frames=3,
     max_person_px=64,
     levels=3,
-    log2_rows=12,
+    log2_hashmap_size=12,
     min_clothing_offset_m=0.04,
     step_fraction=0.02,
     occupancy_update_interval=2,
@@ -63,8 +65,8 @@ def test_timers_do_not_change_training(trainer_and_timing):
     for _ in range(4):
         plain.step()
     assert plain.completed_steps == timed_trainer.completed_steps
-    expected = timed_trainer.state()
-    for name, tensor in plain.state().items():
+    expected = timed_trainer.state_dict()
+    for name, tensor in plain.state_dict().items():
         assert torch.equal(tensor, expected[name]), name
 
 
@@ -78,7 +80,7 @@ def test_timed_functions_are_restored():
 def test_rebake_time_is_excluded_from_the_step(monkeypatch):
     """Step 24 of 40 begins with one; by this clock nothing else takes time."""
     trainer, now_s = trainer_from_synthetic_body(TINY), [0.0]
-    monkeypatch.setattr(Trainer, "_bake_inverse_skinning", lambda _: now_s.append(now_s[-1] + 1000.0))
+    monkeypatch.setattr(BakedInverseSkinning, "bake", lambda _: now_s.append(now_s[-1] + 1000.0))
     clock = PartTimer(lambda: now_s[-1])
     trainer.completed_steps = 24
     with timed_parts(clock):
@@ -156,9 +158,9 @@ def test_the_work_of_a_step(trainer_and_timing):
     work = minimum_work(trainer, samples=1000)
     assert set(work) == set(PARTS)
     march, newton, grid, network, _ = work["render_rays"]
-    empty = len(trainer.occupancy.empty) / trainer.occupancy.occupied.numel()
-    unobserved = TINY.unobserved_points if len(trainer.occupancy.unobserved) else 0
-    points = 1000 + round(TINY.empty_points * empty) + unobserved
+    empty = len(trainer.occupancy.empty_cells) / trainer.occupancy.occupied.numel()
+    unobserved = TINY.settings.unobserved_points if len(trainer.occupancy.unobserved) else 0
+    points = 1000 + round(TINY.settings.empty_points * empty) + unobserved
     assert grid.rows == pytest.approx(8 * 3 * points)
     assert march.rows == newton.rows == 8000
     assert network.operations == pytest.approx(2 * points * (12 * 32 + 32 * 4))
@@ -169,8 +171,10 @@ def test_the_work_of_a_step(trainer_and_timing):
 def test_warm_up_covers_pose_refinement_and_occupancy():
     config = FieldConfig()
     assert occupancy_period(config) == 8
-    updates = (warm_up_step_count(config) - config.occupancy_warmup_steps) // config.occupancy_update_interval
-    assert INITIAL_EMA_RATIO * config.occupancy_decay**updates <= 1
+    updates = (
+        warm_up_step_count(config) - config.settings.occupancy_warmup_steps
+    ) // config.settings.occupancy_update_interval
+    assert INITIAL_EMA_RATIO * config.settings.occupancy_decay**updates <= 1
     assert warm_up_step_count(config) % 8 == 0
     assert warm_up_step_count(FieldConfig(steps=4000)) == 400
 

@@ -1,15 +1,27 @@
-"""A small synthetic scene with known truth: a painted body that turns before a camera."""
+"""A small synthetic scene with ground truth: a painted body that turns in front of a camera; options for tests."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import torch
 
 from pipeline.body.body import Body, Motion, canonical_to_world, load_anny
+from pipeline.field.config import FieldConfig
+from pipeline.field.settings import FieldSettings
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.differentiable_raster import render_attributes
 from pipeline.geometry.rotation import axis_angle_to_quaternion, quaternion_multiply
 from pipeline.geometry.skinning import linear_blend_skinning
+
+SETTING_NAMES = frozenset(setting.name for setting in fields(FieldSettings))
+
+
+def field_config(**values: Any) -> FieldConfig:
+    """Options and settings of the field by one set of names."""
+    settings = {name: value for name, value in values.items() if name in SETTING_NAMES}
+    options = {name: value for name, value in values.items() if name not in SETTING_NAMES}
+    return FieldConfig(**options, settings=FieldSettings(**settings))
 
 
 @dataclass(frozen=True)
@@ -23,9 +35,9 @@ class PaintedScene:
 
 
 def make_motion(body: Body, frames: int, seed: int = 0, bend_rad: float = 0.08) -> Motion:
-    """One full turn, 3 m before the camera, with small random bends of all joints."""
-    random = torch.Generator().manual_seed(seed)
-    bends = axis_angle_to_quaternion(torch.randn(frames, len(body.joint_names), 3, generator=random) * bend_rad)
+    """One full turn, 3 m in front of the camera, with small random rotations of all joints."""
+    rng = torch.Generator().manual_seed(seed)
+    bends = axis_angle_to_quaternion(torch.randn(frames, len(body.joint_names), 3, generator=rng) * bend_rad)
     angle = torch.arange(frames) * (2 * np.pi / frames)
     turn = axis_angle_to_quaternion(torch.stack([torch.zeros(frames), angle, torch.zeros(frames)], dim=-1))
     bends[:, 0] = quaternion_multiply(turn, bends[:, 0])
@@ -35,7 +47,7 @@ def make_motion(body: Body, frames: int, seed: int = 0, bend_rad: float = 0.08) 
 
 
 def paint(vertices: np.ndarray) -> np.ndarray:
-    """Bands and a chequered chest: colours with detail at several scales."""
+    """Vertex colours with detail at several scales: stripes and a checkerboard."""
     x, y, z = vertices.T
     skin = np.array([0.85, 0.65, 0.55]) + 0.1 * np.sin(30 * vertices)
     shirt = np.stack(
@@ -63,3 +75,11 @@ def painted_scene(frames: int, height_px: int, seed: int = 0, bend_rad: float = 
         images.append((255 * straight.clamp(0, 1)).round().byte().numpy())
         masks.append((255 * alpha.clamp(0, 1)).round().byte().numpy())
     return PaintedScene(body, motion, camera, colours, images, masks)
+
+
+def psnr_on_white_db(render: torch.Tensor, image: np.ndarray, mask: np.ndarray) -> float:
+    """PSNR (dB) of a premultiplied render (h, w, 4) against an image and its mask, both on white."""
+    alpha = torch.from_numpy(mask)[..., None] / 255
+    target = torch.from_numpy(image) / 255 * alpha + 1 - alpha
+    on_white = render[..., :3] + (1 - render[..., 3:])
+    return -10 * float((on_white - target).square().mean().log10())

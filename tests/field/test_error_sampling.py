@@ -1,4 +1,4 @@
-"""Rays where colours erred: what is remembered, and what is drawn from it."""
+"""The error map: its update, and importance sampling from it."""
 
 import numpy as np
 import pytest
@@ -12,35 +12,35 @@ SIDE_PX = 4 * TILE_PX
 
 @pytest.fixture
 def pool():
-    """One frame whose mask fills four by four tiles but for a margin."""
+    """Two frames whose mask fills four by four tiles except a margin."""
     mask = np.zeros((SIDE_PX, SIDE_PX), np.uint8)
     mask[8:-8, 8:-8] = 255
     return build_pixel_pool([(np.zeros((SIDE_PX, SIDE_PX, 3), np.uint8), mask)] * 2, border_px=2, seed=0)
 
 
-def _places(pool):
-    """Two pixels of one tile, as masks over the body's pixels of the second frame."""
+def _pixels_of_one_tile(pool):
+    """Two pixels of one tile, as masks over the body pixels of the second frame."""
     body = pool.xy_px[pool.start[1, 0] : pool.start[1, 1]]
     places = (TILE_PX + 1, 2 * TILE_PX), (TILE_PX + 9, 3 * TILE_PX - 1)
     return [(body == np.array(place)).all(axis=1) for place in places]
 
 
-def test_a_tile_forgets_at_a_fixed_pace_and_others_keep_what_they_know(pool):
+def test_the_error_of_a_tile_decays_and_other_tiles_keep_theirs(pool):
     error_map = ErrorMap(2, pool.xy_px)
-    rows = np.concatenate([pool.start[1, 0] + np.flatnonzero(at) for at in _places(pool)])
+    rows = np.concatenate([pool.start[1, 0] + np.flatnonzero(at) for at in _pixels_of_one_tile(pool)])
     for _ in range(3):
         error_map.update(rows, np.array([1, 1]), np.array([[0.6, 0.0, 0.0], [0.4, -0.4, 0.4]]))
-    known = 0.3 + (1 - 0.3) * ERROR_DECAY**6
-    assert error_map.error[1, 2, 1] == pytest.approx(known)
+    expected = 0.3 + (1 - 0.3) * ERROR_DECAY**6
+    assert error_map.error[1, 2, 1] == pytest.approx(expected)
     assert np.count_nonzero(error_map.error != 1) == 1
 
 
-def test_rays_of_the_body_go_where_the_error_is_in_proportion(pool):
+def test_body_pixels_are_sampled_in_proportion_to_the_error(pool):
     error_map, rngs = ErrorMap(2, pool.xy_px), [np.random.default_rng(0)]
     upper = np.array([0, 1]), np.arange(4)
     error_map.error[0][np.ix_(*upper)] = 3.0
-    for error_ratio, share in ((1.0, 0.75), (0.5, 0.625), (0.0, 0.5)):
-        for frame, expected in ((0, share), (1, 0.5)):
+    for error_ratio, upper_fraction in ((1.0, 0.75), (0.5, 0.625), (0.0, 0.5)):
+        for frame, expected in ((0, upper_fraction), (1, 0.5)):
             rows, _ = pool.sample_pixels(np.array([frame]), np.array([[8000, 0, 0]]), rngs, error_map, error_ratio)
             assert len(rows) == 8000
             for run in np.split(rows, [8000 - round(8000 * error_ratio)]):
@@ -51,7 +51,7 @@ def test_rays_of_the_body_go_where_the_error_is_in_proportion(pool):
             assert is_upper.mean() == pytest.approx(expected, abs=0.02)
 
 
-def test_border_and_outside_keep_their_rays(pool):
+def test_the_error_does_not_change_the_rays_of_border_and_outside(pool):
     error_map = ErrorMap(2, pool.xy_px)
     error_map.error[:, 0] = 1e6
     sample_counts = pool.sample_counts(np.array([0, 1]), 1000.0, (0.4, 0.35, 0.25))
@@ -61,7 +61,7 @@ def test_border_and_outside_keep_their_rays(pool):
     assert counts.tolist() == [400, 350, 250]
 
 
-def test_a_frame_without_a_person_has_rays_outside_alone():
+def test_a_frame_without_a_person_has_only_rays_outside():
     empty = np.zeros((SIDE_PX, SIDE_PX), np.uint8)
     solid = np.pad(np.full((20, 20), 255, np.uint8), 22)
     pool = build_pixel_pool([(np.zeros((64, 64, 3), np.uint8), mask) for mask in (solid, empty)], border_px=2, seed=0)
@@ -70,19 +70,19 @@ def test_a_frame_without_a_person_has_rays_outside_alone():
     assert sample_counts[1, :2].tolist() == [0, 0]
 
 
-def test_a_resumed_run_draws_what_an_unbroken_one_would_have(scene):  # noqa: F811
+def test_a_resumed_training_samples_the_same_pixels(scene):  # noqa: F811
     options = {"steps": 12, "error_sampling_ratio": 0.6, "occupancy_warmup_steps": 4}
     whole, first = make_trainer(scene, **options), make_trainer(scene, **options)
     for _ in range(12):
         whole.step()
     for _ in range(5):
         first.step()
-    kept = {name: value.clone() for name, value in first.state().items()}
+    kept = {name: value.clone() for name, value in first.state_dict().items()}
     assert float(kept["pixel_errors"].min()) < 0.9
     assert kept["pixel_errors"].shape[0] == len(TRAIN)
     second = make_trainer(scene, **options)
-    second.load_state(kept)
+    second.load_state_dict(kept)
     for _ in range(7):
         second.step()
-    for name, value in whole.state().items():
-        assert torch.equal(value, second.state()[name]), name
+    for name, value in whole.state_dict().items():
+        assert torch.equal(value, second.state_dict()[name]), name

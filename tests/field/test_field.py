@@ -25,14 +25,14 @@ def make_field(seed=0):
 
 
 def points(count=50):
-    random = torch.Generator().manual_seed(2)
-    return torch.rand(count, 3, generator=random) * torch.tensor([1.0, 2.0, 0.5]) + torch.tensor([-0.5, 0.0, -0.25])
+    rng = torch.Generator().manual_seed(2)
+    return torch.rand(count, 3, generator=rng) * torch.tensor([1.0, 2.0, 0.5]) + torch.tensor([-0.5, 0.0, -0.25])
 
 
 def test_decoder_passes_gradcheck():
-    random = torch.Generator().manual_seed(0)
+    rng = torch.Generator().manual_seed(0)
     shapes = ((7, 6), (6, 5), (5, 4), (4,))
-    inputs = [0.5 * torch.randn(shape, generator=random, dtype=torch.float64) for shape in shapes]
+    inputs = [0.5 * torch.randn(shape, generator=rng, dtype=torch.float64) for shape in shapes]
     inputs = [tensor.requires_grad_(True) for tensor in inputs]
     assert torch.autograd.gradcheck(_RadianceMlp.apply, inputs)
 
@@ -46,19 +46,17 @@ def test_decoder_keeps_a_gradient_beyond_the_clamp():
     assert float(features.grad) > 0
 
 
-def test_points_that_hardly_matter_are_left_out_of_backward():
-    random = torch.Generator().manual_seed(0)
-    inputs = [
-        0.5 * torch.randn(shape, generator=random, dtype=torch.float64) for shape in ((90, 6), (6, 5), (5, 4), (4,))
-    ]
-    towards = [torch.randn(shape, generator=random, dtype=torch.float64) for shape in ((90, 3), (90,))]
-    for direction in towards:
+def test_points_with_small_gradients_are_skipped_in_backward():
+    rng = torch.Generator().manual_seed(0)
+    inputs = [0.5 * torch.randn(shape, generator=rng, dtype=torch.float64) for shape in ((90, 6), (6, 5), (5, 4), (4,))]
+    grad_outputs = [torch.randn(shape, generator=rng, dtype=torch.float64) for shape in ((90, 3), (90,))]
+    for direction in grad_outputs:
         direction[:40] *= 1e-5
     gradients = []
-    for share in (0.0, MIN_RELATIVE_GRADIENT):
+    for fraction in (0.0, MIN_RELATIVE_GRADIENT):
         leaves = [tensor.clone().requires_grad_(True) for tensor in inputs]
-        with mock.patch.object(field_module, "MIN_RELATIVE_GRADIENT", share):
-            torch.autograd.backward(_RadianceMlp.apply(*leaves), towards)
+        with mock.patch.object(field_module, "MIN_RELATIVE_GRADIENT", fraction):
+            torch.autograd.backward(_RadianceMlp.apply(*leaves), grad_outputs)
         gradients.append([leaf.grad for leaf in leaves])
     assert gradients[0][0][:40].any()
     assert not gradients[1][0][:40].any()
@@ -67,20 +65,20 @@ def test_points_that_hardly_matter_are_left_out_of_backward():
         assert float((found - truth).norm()) < MIN_RELATIVE_GRADIENT * float(truth.norm())
 
 
-def test_starts_as_thin_grey_fog():
+def test_initial_field_is_grey_with_the_initial_density():
     colour, density = make_field().requires_grad_(False)(points())
     assert float((density - INITIAL_DENSITY_PER_M).abs().max()) < 0.1
     assert float((colour - 0.5).abs().max()) < 0.01
 
 
-def test_nothing_outside_the_bounds():
+def test_density_is_zero_outside_the_bounds():
     field = make_field()
     outside = torch.tensor([[0.6, 1.0, 0.0], [0.0, -0.1, 0.0], [0.0, 1.0, 0.3]])
     assert field(outside)[1].tolist() == [0, 0, 0]
     assert float(field.density(torch.tensor([[0.0, 1.0, 0.0]]))) > 0
 
 
-def test_same_seed_same_field():
+def test_the_seed_determines_the_field():
     assert torch.equal(make_field(3).table, make_field(3).table)
     assert not torch.equal(make_field(3).table, make_field(4).table)
 
@@ -95,7 +93,7 @@ def test_layout_ends_at_the_finest_cell():
     assert sizes == sorted(sizes)
 
 
-def test_field_returns_from_disk(tmp_path):
+def test_field_round_trip(tmp_path):
     field = make_field(1)
     save_field(tmp_path / "field.safetensors", field)
     again = load_field(tmp_path / "field.safetensors")
@@ -105,7 +103,7 @@ def test_field_returns_from_disk(tmp_path):
     assert (tmp_path / "field.safetensors").read_bytes() == first
 
 
-def test_occupancy_returns_from_disk(tmp_path):
+def test_occupancy_round_trip(tmp_path):
     occupied = torch.zeros(4, 4, 4, dtype=torch.uint8)
     occupied[1, 2, 3] = 1
     save_occupancy(tmp_path / "o.npz", BinaryOccupancy(occupied, torch.from_numpy(BOUNDS)))
@@ -126,5 +124,5 @@ def test_damaged_files_are_a_user_error(tmp_path):
     with pytest.raises(UserError, match="cannot be read"):
         load_field(path)
     save_tensors(path, {"a": torch.zeros(1)}, {"features": 4})
-    with pytest.raises(UserError, match="holds no field"):
+    with pytest.raises(UserError, match="holds no radiance field of this version"):
         load_field(path)

@@ -23,7 +23,7 @@ LOOKING_BACK[2, 3] = 2.0
 
 
 def mask_fraction_of(points, distances, masks, width=40):
-    """Of points of the unbent bar, before a camera 2 m away for which a decimetre is five pixels."""
+    """Mask fraction of points of the straight bar; the camera is 2 m away, and 0.1 m are five pixels."""
     camera = Camera(100.0, 100.0, width / 2, 20.0, width, 40, LOOKING_BACK.astype(np.float32))
     matrices = UPRIGHT.expand(len(masks), 2, 4, 4)
     points, distances = np.array(points, dtype=np.float32), np.array(distances, dtype=np.float32)
@@ -31,7 +31,7 @@ def mask_fraction_of(points, distances, masks, width=40):
     return project_mask_fraction(points, distances, weights, matrices, camera, masks)
 
 
-def test_counts_the_masks_that_hold_a_point():
+def test_mask_fraction_counts_the_masks_that_contain_a_point():
     left = np.zeros((40, 40), dtype=np.uint8)
     left[:, :20] = 1
     masks = [left, left, left, 1 - left]
@@ -39,7 +39,7 @@ def test_counts_the_masks_that_hold_a_point():
     np.testing.assert_allclose(mask_fraction, [0.75, 0.25], atol=1e-6)
 
 
-def test_unseen_points_are_expected_near_the_body_only():
+def test_the_prior_of_unseen_points_is_high_near_the_body_only():
     masks = [np.ones((40, 20), dtype=np.uint8)] * 8
     seen, near, far = mask_fraction_of([[0, 0, 0], [0.5, 0, 0], [0.5, 0, 0]], [0.1, 0.0, 0.1], masks, width=20)
     assert seen == 1
@@ -47,7 +47,7 @@ def test_unseen_points_are_expected_near_the_body_only():
     assert far == 0
 
 
-def test_few_sights_of_a_far_point_do_not_outweigh_the_expectation():
+def test_few_observations_of_a_far_point_do_not_outweigh_the_prior():
     masks = [np.ones((40, 40), dtype=np.uint8)] * 2
     blank = [np.zeros((40, 40), dtype=np.uint8)] * 2
     assert mask_fraction_of([[0, 0, 0]], [0.1], masks + blank)[0] == 0.5
@@ -56,8 +56,8 @@ def test_few_sights_of_a_far_point_do_not_outweigh_the_expectation():
 
 
 @pytest.mark.parametrize(("arc_deg", "one_sided"), [(0, True), (130, True), (160, False), (360, False)])
-def test_a_bone_that_turns_far_enough_is_not_filmed_from_one_side(arc_deg, one_sided):
-    """Over an arc the mean of the directions has the length sin(a/2) / (a/2): 0.75 at 145 degrees."""
+def test_a_bone_that_turns_more_than_145_degrees_is_not_one_sided(arc_deg, one_sided):
+    """The mean direction over an arc a has the length sin(a/2) / (a/2): 0.75 at 145 degrees."""
     angle = torch.linspace(-0.5, 0.5, 73)[:-1] * np.radians(arc_deg)
     turning = torch.eye(4).repeat(len(angle), 1, 1)
     turning[:, 0, 0], turning[:, 0, 2] = angle.cos(), angle.sin()
@@ -70,33 +70,33 @@ def test_a_bone_that_turns_far_enough_is_not_filmed_from_one_side(arc_deg, one_s
     )
     found = observed_from_one_side(joints_m, weights, matrices, camera)
     assert found.tolist() == [True, one_sided]
-    # Where the body stands and which way it looks at first means nothing.
+    # Position and initial orientation of the body do not matter.
     matrices[:, :, :3, 3] = torch.tensor([0.0, 0.0, -50.0])
     turned = torch.tensor([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
     again = observed_from_one_side(joints_m, weights, matrices @ turned, camera)
     assert again.tolist() == [True, one_sided]
 
 
-def test_every_cell_has_its_distance_to_the_body_up_to_the_reach():
+def test_cells_have_their_signed_distance_up_to_the_maximum():
     anny = load_anny()
     body = anny.body(anny.shape_defaults)
     bounds_m, max_distance_m = field_bounds_m(body, 0.1), 0.02
     some = np.random.default_rng(0).permutation(64**3)[:20_000]
     truth_m = signed_distance_m(cell_centres(bounds_m)[some], body.mesh())
-    # The deepest lie farther from all vertices than cells outside that are asked.
+    # The deepest cells are farther from all vertices than the bound of the query.
     assert truth_m.min() < -(max_distance_m + 0.06)
     found_m = cell_signed_distances_m(body, bounds_m, max_distance_m).reshape(-1)[some]
     np.testing.assert_allclose(found_m, np.minimum(truth_m, max_distance_m), atol=1e-6)
 
 
-def test_the_shell_holds_the_body_and_what_masks_support():
+def test_initially_occupied_are_the_body_and_cells_in_enough_masks():
     distance = np.array([-0.01, 0.05, 0.05, 0.2])
     mask_fraction = np.array([0.0, 0.7, 0.5, 1.0])
     assert initial_occupancy(distance, mask_fraction, 0.1, 0.6).tolist() == [True, True, False, False]
 
 
-def margin_of_discs(radii_m, min_offset_m=0.05, max_offset_m=1.0):
-    """A flat body, a disc of points 2 m before the camera, and a round mask in each frame; a pixel is a centimetre."""
+def offset_of_discs(radii_m, min_offset_m=0.05, max_offset_m=1.0):
+    """Clothing offset of a flat body, a disc 2 m from the camera, with a round mask per frame; a pixel is 1 cm."""
     grid = np.stack(np.meshgrid(*2 * [np.arange(-DISC_M, DISC_M + 0.01, 0.01)]), axis=-1).reshape(-1, 2)
     disc = grid[np.linalg.norm(grid, axis=1) <= DISC_M + 1e-6]
     vertices = np.pad(disc, ((0, 0), (0, 1))).astype(np.float32)
@@ -112,19 +112,19 @@ def margin_of_discs(radii_m, min_offset_m=0.05, max_offset_m=1.0):
     )
 
 
-def test_the_margin_is_twice_what_masks_reach_beyond_the_body():
-    # 99 % of a disc's area lie within sqrt(0.99) of its radius.
+def test_the_offset_is_twice_the_distance_of_the_masks():
+    # 99 % of the area of a disc is within sqrt(0.99) of its radius.
     for radius in (0.4, 0.5, 0.7):
-        assert margin_of_discs([radius]) == pytest.approx(2 * (np.sqrt(0.99) * radius - DISC_M), abs=0.02)
+        assert offset_of_discs([radius]) == pytest.approx(2 * (np.sqrt(0.99) * radius - DISC_M), abs=0.02)
 
 
-def test_the_margin_stays_within_its_limits():
-    assert margin_of_discs([DISC_M]) == 0.05
-    assert margin_of_discs([0.7], max_offset_m=0.4) == 0.4
-    assert margin_of_discs([0.7], max_offset_m=0.0) == 0.05
+def test_the_offset_is_clamped():
+    assert offset_of_discs([DISC_M]) == 0.05
+    assert offset_of_discs([0.7], max_offset_m=0.4) == 0.4
+    assert offset_of_discs([0.7], max_offset_m=0.0) == 0.05
 
 
-def test_a_few_poor_masks_and_empty_ones_do_not_widen_the_margin():
-    assert margin_of_discs([DISC_M, DISC_M, DISC_M, 0.75, 0.75]) == 0.05
-    assert margin_of_discs([0.5, 0.0, 0.0, 0.0]) == margin_of_discs([0.5])
-    assert margin_of_discs([0.0]) == 0.05
+def test_a_minority_of_wrong_or_empty_masks_does_not_change_the_offset():
+    assert offset_of_discs([DISC_M, DISC_M, DISC_M, 0.75, 0.75]) == 0.05
+    assert offset_of_discs([0.5, 0.0, 0.0, 0.0]) == offset_of_discs([0.5])
+    assert offset_of_discs([0.0]) == 0.05

@@ -2,27 +2,27 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.field.config import FieldConfig
 from pipeline.field.losses import field_losses
 from pipeline.field.pixel_sampler import ErrorMap, build_pixel_pool
+from pipeline.field.settings import FieldSettings
 
-CONFIG = FieldConfig(huber_delta=0.1, alpha_weight=0.5, hard_surface_weight=0.2, empty_density_weight=0.1)
+SETTINGS = FieldSettings(huber_delta=0.1, alpha_weight=0.5, hard_surface_weight=0.2, empty_density_weight=0.1)
 
 
-def test_perfect_image_costs_nothing():
+def test_a_perfect_image_has_zero_loss():
     rgba = torch.tensor([[0.2, 0.4, 0.6, 1.0], [0.9, 0.1, 0.5, 0.0]])
     solid = rgba[:, :3] * rgba[:, 3:]
-    losses, error = field_losses(solid, rgba[:, 3], rgba, torch.rand(2, 3), torch.ones(2), torch.zeros(5), CONFIG)
+    losses, error = field_losses(solid, rgba[:, 3], rgba, torch.rand(2, 3), torch.ones(2), torch.zeros(5), SETTINGS)
     assert float(error.abs().max()) < 1e-7
     assert set(losses) == {"colour", "alpha", "hard", "density"}
     for name, value in losses.items():
         assert float(value) == pytest.approx(0, abs=1e-6), name
 
 
-def test_a_hole_in_the_body_costs_whatever_its_colour_and_background():
+def test_a_hole_in_the_body_has_an_alpha_loss_for_any_background():
     rgba = torch.tensor([[1.0, 1.0, 1.0, 1.0]])
     nothing = torch.zeros(1, 3), torch.zeros(1)
-    losses, _ = field_losses(*nothing, rgba, torch.ones(1, 3), torch.ones(1), torch.zeros(0), CONFIG)
+    losses, _ = field_losses(*nothing, rgba, torch.ones(1, 3), torch.ones(1), torch.zeros(0), SETTINGS)
     assert float(losses["colour"]) == 0
     assert float(losses["alpha"]) == pytest.approx(0.5 * 0.95)
     assert "density" not in losses
@@ -36,7 +36,7 @@ def make_pool():
     return build_pixel_pool([(image, mask), (image, empty), (image, mask)], 3, seed=0), image, mask
 
 
-def test_pool_sorts_pixels_into_kinds():
+def test_pool_classifies_pixels():
     pool, image, mask = make_pool()
     columns, rows = pool.xy_px.T
     np.testing.assert_array_equal(pool.rgba[:, :3], np.concatenate([image[rows, columns]]))
@@ -50,7 +50,7 @@ def test_pool_sorts_pixels_into_kinds():
     assert len(np.unique(places, axis=0)) == len(places)
 
 
-def test_rays_are_shared_out_as_asked():
+def test_classes_have_the_requested_number_of_rays():
     pool, _, _ = make_pool()
     sample_counts = pool.sample_counts(np.array([0, 1, 2]), 300.0, (0.6, 0.3, 0.1))
 
@@ -62,7 +62,7 @@ def test_rays_are_shared_out_as_asked():
     assert sample_counts.tolist() == [[180, 90, 30], [0, 0, 0], [180, 90, 30]]
     rows = drawn(0)
     assert (np.diff(rows) >= 0).all()
-    kinds = np.searchsorted(pool.start[0], rows, side="right") - 1
-    assert np.bincount(kinds).tolist() == [180, 90, 30]
+    classes = np.searchsorted(pool.start[0], rows, side="right") - 1
+    assert np.bincount(classes).tolist() == [180, 90, 30]
     np.testing.assert_array_equal(rows, drawn(0))
     assert len(drawn(1)) == 0

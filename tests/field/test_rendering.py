@@ -7,6 +7,7 @@ import torch
 from pipeline.body.body import canonical_to_world
 from pipeline.field import rendering as render
 from pipeline.field.trainer import Trainer
+from pipeline.field.volume_rendering import PosedField
 from pipeline.kernels.volume_rendering import MIN_TRANSMITTANCE
 from tests.field.scene import painted_scene
 from tests.field.test_trainer import make_trainer
@@ -17,66 +18,66 @@ def scene():
     return painted_scene(12, 110)
 
 
-def show(trainer: Trainer, scene) -> np.ndarray:
-    """The first frame."""
-    pose, grid = canonical_to_world(scene.body, scene.motion)[0], trainer.occupancy.grid()
+def render_first_frame(trainer: Trainer, scene) -> np.ndarray:
+    """Render the first frame."""
+    pose, grid = canonical_to_world(scene.body, scene.motion)[0], trainer.occupancy.binary()
     return render.render_field(trainer.field, grid, scene.body, pose, scene.camera, trainer.scene.skin).numpy()
 
 
-def draw(trainer: Trainer, scene) -> tuple[np.ndarray, int]:
-    """The first frame in the way that serves any field, and how many points this one was asked for."""
+def render_in_chunks(trainer: Trainer, scene) -> tuple[np.ndarray, int]:
+    """Render the first frame without the compiled kernel; also return the number of evaluated points."""
     with (
-        mock.patch.object(trainer.field, "radiance", wraps=trainer.field.radiance) as asked,
-        mock.patch.object(render, "uses_early_termination", return_value=False),
+        mock.patch.object(trainer.field, "radiance", wraps=trainer.field.radiance) as radiance,
+        mock.patch.object(PosedField, "supports_early_termination", False),
     ):
-        image = show(trainer, scene)
-    return image, sum(len(call.args[0]) for call in asked.call_args_list)
+        image = render_first_frame(trainer, scene)
+    return image, sum(len(call.args[0]) for call in radiance.call_args_list)
 
 
-def test_rays_end_where_nothing_behind_is_seen(scene):
+def test_rays_end_at_the_maximum_optical_depth(scene):
     trainer = make_trainer(scene, steps=10)
     with torch.no_grad():
         trainer.field.bias[3] = 6.0
     with mock.patch.object(render, "SAMPLE_CHUNK_SIZE", 1):
-        early, few = draw(trainer, scene)
+        early, few = render_in_chunks(trainer, scene)
     with mock.patch.object(render, "MAX_OPTICAL_DEPTH", np.inf):
-        whole, all_points = draw(trainer, scene)
+        whole, all_points = render_in_chunks(trainer, scene)
     assert np.abs(early - whole).max() < 2 * np.exp(-render.MAX_OPTICAL_DEPTH)
-    # One sample hides all behind it.
+    # The first sample is opaque.
     assert few == (whole[..., 3] > 0).sum() < all_points
 
 
-def test_rays_go_on_where_something_behind_is_seen(scene):
+def test_rays_continue_behind_transparent_samples(scene):
     trainer = make_trainer(scene, steps=10)
     with torch.no_grad():
         trainer.field.bias[3] = -3.0
-    _, points = draw(trainer, scene)
+    _, points = render_in_chunks(trainer, scene)
     with mock.patch.object(render, "MAX_OPTICAL_DEPTH", np.inf):
-        assert draw(trainer, scene)[1] == points > 0
+        assert render_in_chunks(trainer, scene)[1] == points > 0
 
 
-def test_a_picture_does_not_depend_on_how_many_samples_are_asked_at_once(scene):
+def test_chunk_sizes_do_not_change_the_image(scene):
     trainer = make_trainer(scene, steps=10)
-    image, _ = draw(trainer, scene)
+    image, _ = render_in_chunks(trainer, scene)
     with mock.patch.object(render, "SAMPLE_CHUNK_SIZE", 3), mock.patch.object(render, "RAY_CHUNK_SIZE", 1000):
-        other, _ = draw(trainer, scene)
-    # float32 products of another number of rows
+        other, _ = render_in_chunks(trainer, scene)
+    # float32 matrix products with a different number of rows round differently.
     assert np.abs(image - other).max() < 1e-5
 
 
-def test_both_ways_show_the_same(scene):
+def test_the_compiled_kernel_renders_the_same_image(scene):
     trainer = make_trainer(scene, steps=60)
     for _ in range(60):
         trainer.step()
-    traced, (image, _) = show(trainer, scene), draw(trainer, scene)
+    traced, (image, _) = render_first_frame(trainer, scene), render_in_chunks(trainer, scene)
     assert image[..., 3].max() > 0.9
     assert np.abs(traced - image).max() < 1.1 * MIN_TRANSMITTANCE
 
 
-def test_threads_change_no_byte(scene, monkeypatch):
+def test_the_number_of_threads_does_not_change_a_byte(scene, monkeypatch):
     trainer, found = make_trainer(scene, steps=10), []
     monkeypatch.setattr(render, "RAY_CHUNK_SIZE", 1000)
     for threads in (1, 2):
         monkeypatch.setattr(torch, "get_num_threads", lambda count=threads: count)
-        found.append(show(trainer, scene))
+        found.append(render_first_frame(trainer, scene))
     assert np.array_equal(*found)

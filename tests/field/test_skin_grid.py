@@ -23,7 +23,7 @@ def skin(body):
     return build_skin_grid(body, 0.06)
 
 
-def test_grid_reaches_just_beyond_the_margin(body, skin):
+def test_grid_extends_just_beyond_the_margin(body, skin):
     assert float(skin.distance_m.max()) < 0.06 + 2.5 * skin.cell_m
     assert float(skin.distance_m.min()) < -0.05
     torch.testing.assert_close(skin.weights.sum(1), torch.ones(len(skin.weights)), atol=1e-5, rtol=0)
@@ -31,25 +31,25 @@ def test_grid_reaches_just_beyond_the_margin(body, skin):
     assert skin_margin_m(body, bounds) == pytest.approx(0.06, abs=1e-6)
 
 
-def test_grid_carries_the_surface_as_the_bodys_own_weights_do(body, skin):
+def test_grid_skins_the_surface_like_the_weights_of_the_body(body, skin):
     motion = make_motion(body, 2, bend_rad=0.15)
     matrices = canonical_to_world(body, motion)
     vertices = torch.from_numpy(body.vertices)
     truth = linear_blend_skinning(vertices, torch.from_numpy(body.skin_weights), matrices)[1]
     ours = skin_points(vertices, skin.blend(matrices[1:])[:, 0], skin.lattice)
     error_m = (ours - truth).norm(dim=1)
-    # Weights are smoothed over half a cell: hands, whose bones are as thin as that, differ by millimetres.
+    # Weights are smoothed over half a cell; fingers are as thin as that and differ by millimetres.
     assert float(error_m.median()) < 1e-3
     assert float(error_m.quantile(0.95)) < 6e-3
 
 
-def test_neighbouring_points_have_neighbouring_weights(skin):
-    random = np.random.default_rng(0)
+def test_weights_are_continuous(skin):
+    rng = np.random.default_rng(0)
     inside = skin.nodes_m[skin.distance_m < 0.06].numpy()
-    points = torch.from_numpy(inside[random.integers(0, len(inside), 3000)])
+    points = torch.from_numpy(inside[rng.integers(0, len(inside), 3000)])
     moved = points + 0.001 * torch.nn.functional.normalize(torch.randn(points.shape), dim=-1)
     change = (skin.interpolate_weights(points) - skin.interpolate_weights(moved)).abs().sum(1)
-    # A jump between limbs, as nearest-vertex weights have it, would be a change of two within a millimetre.
+    # Nearest-vertex weights change by 2 within a millimetre between two limbs.
     assert float(change.max()) < 0.35
 
 
@@ -60,14 +60,14 @@ def test_posed_space_follows_the_root(body):
     torch.testing.assert_close(posed, torch.eye(4).expand(4, 4, 4), atol=1e-5, rtol=0)
 
 
-def test_lookup_and_one_step_undo_skinning(body, skin):
+def test_lookup_and_one_newton_step_invert_skinning(body, skin):
     motion = make_motion(body, 3, bend_rad=0.12)
     world = canonical_to_world(body, motion)
     posed_matrices = world_to_posed(world)[:, None] @ world
     warps = bake_warp_grids(skin, posed_matrices)
-    random = np.random.default_rng(1)
-    points = skin.nodes_m.numpy()[random.integers(0, len(skin.nodes_m), 4000)]
-    points = points + random.uniform(-0.5, 0.5, points.shape).astype(np.float32) * skin.cell_m
+    rng = np.random.default_rng(1)
+    points = skin.nodes_m.numpy()[rng.integers(0, len(skin.nodes_m), 4000)]
+    points = points + rng.uniform(-0.5, 0.5, points.shape).astype(np.float32) * skin.cell_m
     points = torch.from_numpy(points[signed_distance_m(points, body.mesh()) < 0.05])
     blended = skin.blend(posed_matrices[2:])
     posed = skin_points(points, blended[:, 0], skin.lattice)

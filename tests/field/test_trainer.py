@@ -1,3 +1,5 @@
+"""The training: convergence, pose refinement, resumption, and independence of threads and parts."""
+
 from functools import partial
 
 import numba
@@ -6,23 +8,22 @@ import pytest
 import torch
 
 from pipeline.body.body import canonical_to_world
-from pipeline.field import volume_rendering as look
-from pipeline.field.config import FieldConfig
-from pipeline.field.inverse_skinning import Rays
-from pipeline.field.rendering import over_white, render_field
+from pipeline.field import volume_rendering
+from pipeline.field.optimiser import DivergedError
+from pipeline.field.rendering import render_field
 from pipeline.field.setup import create_trainer, evenly_spaced, training_scale
-from pipeline.field.trainer import MAX_SAMPLES_PER_RAY, DivergedError
-from pipeline.field.volume_rendering import _to_canonical
+from pipeline.field.trainer import MAX_SAMPLES_PER_RAY
+from pipeline.field.volume_rendering import sample_positions
 from pipeline.kernels.volume_rendering import trace
-from tests.field.scene import painted_scene
+from tests.field.scene import field_config, painted_scene, psnr_on_white_db
 
 TRAIN = np.array([0, 1, 3, 4, 6, 7, 9, 10])
 TINY = {
-    "rays": 768,
+    "rays_per_step": 768,
     "frames_per_step": 3,
     "levels": 4,
-    "features": 4,
-    "log2_rows": 14,
+    "features_per_level": 4,
+    "log2_hashmap_size": 14,
     "hidden_width": 32,
     "finest_cell_px": 1.5,
     "min_clothing_offset_m": 0.04,
@@ -39,39 +40,37 @@ def scene():
 
 
 def make_trainer(scene, **options):
-    config = FieldConfig(**(TINY | options))
+    config = field_config(**(TINY | options))
     masked_images = [(scene.images[row], scene.masks[row]) for row in TRAIN]
     return create_trainer(scene.body, scene.motion.select(TRAIN), scene.camera, masked_images, config)
 
 
-def error_on(scene, trainer, row):
+def psnr_db(scene, trainer, row):
     pose = canonical_to_world(scene.body, scene.motion.select(np.array([row])))[0]
-    grid, skin = trainer.occupancy.grid(), trainer.scene.skin
-    shown = over_white(render_field(trainer.field, grid, scene.body, pose, scene.camera, skin))
-    mask = torch.from_numpy(scene.masks[row])[..., None] / 255
-    truth = torch.from_numpy(scene.images[row]) / 255 * mask + 1 - mask
-    return -10 * float((shown - truth).square().mean().log10())
+    grid, skin = trainer.occupancy.binary(), trainer.scene.skin
+    render = render_field(trainer.field, grid, scene.body, pose, scene.camera, skin)
+    return psnr_on_white_db(render, scene.images[row], scene.masks[row])
 
 
-def test_learns_a_painted_body_and_shows_it_in_a_new_pose(scene):
+def test_learns_a_painted_body_and_renders_it_in_a_new_pose(scene):
     trainer = make_trainer(scene, steps=120, pose_refinement=False)
-    shell = int(trainer.occupancy.occupied.sum())
-    before = error_on(scene, trainer, 2)
+    initially_occupied = int(trainer.occupancy.occupied.sum())
+    before = psnr_db(scene, trainer, 2)
     losses = [trainer.step() for _ in range(120)]
     assert losses[-1]["colour"] < 0.3 * losses[0]["colour"]
-    assert error_on(scene, trainer, 2) > max(22.5, before + 5)
-    assert int(trainer.occupancy.occupied.sum()) < shell
+    assert psnr_db(scene, trainer, 2) > max(22.5, before + 5)
+    assert int(trainer.occupancy.occupied.sum()) < initially_occupied
 
 
 def test_refinement_finds_a_shift_of_the_body(scene):
     wrong = scene.motion.root_translation_m + np.array([0.03, 0, 0], dtype=np.float32)
     moved = scene.motion.with_pose(scene.motion.rotations_wxyz, wrong)
     masked_images = [(scene.images[row], scene.masks[row]) for row in TRAIN]
-    # One frame alone is wrong: the others say where the body is.
+    # Only one frame is wrong; the others determine the position of the body.
     root = scene.motion.root_translation_m.copy()
     root[4] = moved.root_translation_m[4]
     motion = scene.motion.with_pose(scene.motion.rotations_wxyz, root).select(TRAIN)
-    config = FieldConfig(
+    config = field_config(
         **TINY,
         steps=220,
         pose_start_fraction=0.35,
@@ -88,8 +87,8 @@ def test_refinement_finds_a_shift_of_the_body(scene):
 
 
 @pytest.mark.parametrize(("occupancy", "interrupted"), [("attention", 19), ("plain", 19), ("plain", 7)])
-def test_a_resumed_run_ends_with_the_same_bytes(scene, occupancy, interrupted):
-    """Step 7: poses are refined since step 6, and the first update of the cells comes with step 8."""
+def test_a_resumed_training_ends_with_the_same_bytes(scene, occupancy, interrupted):
+    """Step 7: the pose refinement started with step 6, and the first occupancy update follows with step 8."""
     options = {"steps": 30, "pose_start_fraction": 0.2, "occupancy": occupancy, "occupancy_warmup_steps": 8}
     whole = make_trainer(scene, **options)
     for _ in range(30):
@@ -97,36 +96,36 @@ def test_a_resumed_run_ends_with_the_same_bytes(scene, occupancy, interrupted):
     first = make_trainer(scene, **options)
     for _ in range(interrupted):
         first.step()
-    kept = {name: value.clone() for name, value in first.state().items()}
+    kept = {name: value.clone() for name, value in first.state_dict().items()}
     second = make_trainer(scene, **options)
-    second.load_state(kept)
+    second.load_state_dict(kept)
     for _ in range(30 - interrupted):
         second.step()
-    for name, value in whole.state().items():
-        assert torch.equal(value, second.state()[name]), name
+    for name, value in whole.state_dict().items():
+        assert torch.equal(value, second.state_dict()[name]), name
 
 
-def test_poses_move_once_they_are_refined_and_samples_follow_them(scene):
+def test_poses_move_once_they_are_refined_and_samples_follow(scene):
     trainer = make_trainer(scene, steps=40, pose_start_fraction=0.25, occupancy_warmup_steps=8)
     moved = []
     for _ in range(20):
         before = trainer.poses.shift_m.detach().clone()
         trainer.step()
         moved.append(not torch.equal(before, trainer.poses.shift_m.detach()))
-    assert [step for step, there in enumerate(moved) if there] == list(range(10, 20))
-    assert 0 < len(trainer.skin.nodes_m) < len(trainer.scene.skin.nodes_m)
-    batch = draw(trainer, 0, 3)
-    rays = Rays(batch.origins_m, batch.directions, batch.frame, batch.jitter)
-    samples = trainer.inverse.sample_rays(rays, trainer.step_m, trainer.occupancy.grid(), MAX_SAMPLES_PER_RAY)
+    assert [step for step, has_moved in enumerate(moved) if has_moved] == list(range(10, 20))
+    assert 0 < len(trainer.inverse_skinning.skin.nodes_m) < len(trainer.scene.skin.nodes_m)
+    batch, baked = sample_rays(trainer, 0, 3), trainer.inverse_skinning
+    grid = trainer.occupancy.binary()
+    samples = baked.inverse.sample_rays(batch.rays, trainer.step_m, grid, MAX_SAMPLES_PER_RAY)
     with torch.no_grad():
-        still = _to_canonical(trainer.inverse, rays, trainer._pose_batch(batch.frames), samples)
+        before = sample_positions(baked.inverse, batch.rays, baked.pose_batch(batch.frame_indices), samples)
         trainer.poses.shift_m += 0.01
-        there = _to_canonical(trainer.inverse, rays, trainer._pose_batch(batch.frames), samples)
-    assert float((there - still).detach().norm(dim=1).median()) == pytest.approx(0.01 * 3**0.5, rel=0.3)
+        after = sample_positions(baked.inverse, batch.rays, baked.pose_batch(batch.frame_indices), samples)
+    assert float((after - before).detach().norm(dim=1).median()) == pytest.approx(0.01 * 3**0.5, rel=0.3)
 
 
 @pytest.mark.parametrize("frames_per_step", [3, 1])
-def test_a_step_in_parts_comes_to_that_of_the_whole(scene, monkeypatch, frames_per_step):
+def test_parts_of_a_step_add_up_to_the_whole(scene, monkeypatch, frames_per_step):
     options = {
         "pose_start_fraction": 0.0,
         "occupancy_warmup_steps": 4,
@@ -134,27 +133,32 @@ def test_a_step_in_parts_comes_to_that_of_the_whole(scene, monkeypatch, frames_p
         "frames_per_step": frames_per_step,
     }
     found = []
-    # Which of the samples with small gradients stand for the others hangs on those before them.
-    monkeypatch.setattr(look, "trace", partial(trace, subsampling_threshold=0.0))
+    # The subsampling of small gradients depends on the order of the samples.
+    monkeypatch.setattr(volume_rendering, "trace", partial(trace, subsampling_threshold=0.0))
     for count in (1, 2):
         trainer = make_trainer(scene, steps=40, **options)
         for _ in range(6):
             trainer.step()
         trainer.part_count, gradients = count, {}
-        monkeypatch.setattr(trainer, "_optimiser_step", lambda _, named, into=gradients: into.update(named))
+        monkeypatch.setattr(
+            trainer.optimiser, "step", lambda _, by_name, is_finite, into=gradients: into.update(by_name)
+        )
         losses = trainer.step()
-        gradients["table"] = trainer.grad_table
-        found.append((losses, gradients, trainer.occupancy.max_transmittance, trainer.error_map.error))
-    (losses, gradients, max_transmittance, error_map), (part_losses, part_gradients, part_reached, part_errors) = found
+        gradients["table"] = trainer.optimiser.grad_table
+        found.append((losses, gradients, trainer.occupancy.max_transmittance, trainer.sampler.error_map.error))
+    (
+        (losses, gradients, max_transmittance, error_map),
+        (part_losses, part_gradients, part_max_transmittance, part_errors),
+    ) = found
     assert part_losses == pytest.approx(losses, rel=1e-5)
     assert set(gradients) == set(part_gradients) == {"table", "hidden", "output", "bias", "rotation_rad", "shift_m"}
     for name, gradient in gradients.items():
         assert (part_gradients[name] - gradient).norm() < 1e-4 * gradient.norm(), name
-    assert torch.equal(max_transmittance, part_reached)
+    assert torch.equal(max_transmittance, part_max_transmittance)
     np.testing.assert_allclose(error_map, part_errors, rtol=1e-5)
 
 
-@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one thread is all there is")
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="this machine has one thread")
 def test_results_do_not_depend_on_thread_count(scene, monkeypatch):
     states = []
     for threads in (1, 2):
@@ -163,30 +167,32 @@ def test_results_do_not_depend_on_thread_count(scene, monkeypatch):
         assert (trainer.threads._pool is None) == (threads == 1)
         for _ in range(16):
             trainer.step()
-        states.append(trainer.state())
+        states.append(trainer.state_dict())
     for name, value in states[0].items():
         assert torch.equal(value, states[1][name]), name
 
 
-def draw(trainer, *frames):
-    return trainer._sample_batch(np.array(frames))
+def sample_rays(trainer, *frames):
+    return trainer.sampler.sample_rays(np.array(frames), trainer.completed_steps, trainer.inverse_skinning.cameras)
 
 
-def test_where_pixels_need_nothing_the_field_becomes_empty(scene):
-    plain, asked = (make_trainer(scene, steps=80, pose_refinement=False, unobserved_points=count) for count in (0, 256))
+def test_unobserved_cells_lose_their_density(scene):
+    plain, penalised = (
+        make_trainer(scene, steps=80, pose_refinement=False, unobserved_points=count) for count in (0, 256)
+    )
     found = []
     for _ in range(80):
         plain.step()
         found.append(len(plain.occupancy.unobserved))
-        # Deep in the body no light comes: no pixel says what is there.
-        deep = asked.occupancy.cells[asked.occupancy.distance_m < -0.03]
-        asked.occupancy.unobserved = deep
-        asked.step()
+        # No ray reaches cells deep in the body.
+        deep = penalised.occupancy.candidate_cells[penalised.occupancy.distance_m < -0.03]
+        penalised.occupancy.unobserved = deep
+        penalised.step()
     assert max(found) > 20
     assert set(found[:23]) == {0}
     points = plain.occupancy.sample_in_cells(deep, np.random.default_rng(0))
     assert len(points) > 200
-    assert float(asked.field.density(points).mean()) < 0.8 * float(plain.field.density(points).mean())
+    assert float(penalised.field.density(points).mean()) < 0.8 * float(plain.field.density(points).mean())
 
 
 def test_a_nan_never_reaches_a_parameter(scene):
@@ -201,12 +207,12 @@ def test_a_nan_never_reaches_a_parameter(scene):
     assert torch.equal(trainer.field.table.detach(), before)
 
 
-def test_images_shrink_to_the_size_asked_for(scene):
+def test_images_are_downscaled_to_the_height_of_the_person(scene):
     tall_px = scene.body.height_m() * scene.camera.fy / 3.0
     assert training_scale(scene.body, scene.motion, scene.camera, 1000) == 1.0
     assert training_scale(scene.body, scene.motion, scene.camera, round(tall_px / 2)) == pytest.approx(0.5, rel=0.02)
 
 
-def test_spread_keeps_both_ends():
+def test_evenly_spaced_includes_both_ends():
     assert evenly_spaced(10, 4).tolist() == [0, 3, 6, 9]
     assert evenly_spaced(3, 9).tolist() == [0, 1, 2]

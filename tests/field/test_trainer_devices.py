@@ -1,4 +1,4 @@
-"""Stage one on a device that is not the CPU: a graphics card where there is one, else one that keeps its rules."""
+"""Training on another device than the CPU: a CUDA GPU if there is one, and a fake device with the same rules."""
 
 from contextlib import nullcontext
 
@@ -7,23 +7,22 @@ import pytest
 import torch
 
 from pipeline.body.body import canonical_to_world
-from pipeline.field.config import FieldConfig
 from pipeline.field.rendering import render_field
 from pipeline.field.setup import create_trainer
 from pipeline.field.validation import Validator
 from tests.elsewhere import FAKE_DEVICE, elsewhere
-from tests.field.scene import painted_scene
+from tests.field.scene import field_config, painted_scene
 from tests.field.test_trainer import TINY, TRAIN
 
 FEW = {
-    "rays": 256,
+    "rays_per_step": 256,
     "occupancy_warmup_steps": 4,
     "occupancy_update_interval": 4,
     "pose_start_fraction": 0.25,
     "steps": 24,
 }
-MOST_OPERATIONS = 1000
-"""Of a step with poses. Each takes a launch on a graphics card, some five microseconds, whatever its size."""
+MAX_OPERATIONS = 1000
+"""Tensor operations of a step with pose refinement; each is a kernel launch of about 5 microseconds on a GPU."""
 
 
 @pytest.fixture(scope="module")
@@ -32,77 +31,77 @@ def scene():
 
 
 def make_trainer(scene, device, **options):
-    config = FieldConfig(**(TINY | FEW | options))
+    config = field_config(**(TINY | FEW | options))
     masked_images = [(scene.images[row], scene.masks[row]) for row in TRAIN]
     return create_trainer(scene.body, scene.motion.select(TRAIN), scene.camera, masked_images, config, device)
 
 
-def learn(scene, device, steps, **options):
+def train(scene, device, steps, **options):
     trainer = make_trainer(scene, device, **options)
     return trainer, [trainer.step() for _ in range(steps)]
 
 
 def compare(scene, device, **options):
-    """The first steps agree to rounding, later ones in how well they explain the pictures."""
+    """The first steps agree up to rounding, later ones in their colour loss."""
     steps = FEW["steps"]
-    _, here = learn(scene, torch.device("cpu"), steps, **options)
-    there_learning, there = learn(scene, device, steps, **options)
-    # Here rays end with their light, elsewhere all samples are asked for; what lies behind is seen by neither.
-    asked_here, asked_there = here[0].pop("samples"), there[0].pop("samples")
-    assert 0.99 * asked_there < asked_here <= asked_there
-    for name, value in here[0].items():
-        assert there[0][name] == pytest.approx(value, rel=2e-3, abs=1e-6), name
-    assert there[-1]["colour"] == pytest.approx(here[-1]["colour"], rel=0.1)
-    assert there[-1]["colour"] < 0.8 * there[0]["colour"]
-    assert float(there_learning.poses.shift_m.detach().abs().max()) > 0
-    return there_learning
+    _, cpu_losses = train(scene, torch.device("cpu"), steps, **options)
+    other, losses = train(scene, device, steps, **options)
+    # On the CPU rays end at low transmittance; other devices evaluate all samples.
+    cpu_samples, samples = cpu_losses[0].pop("samples"), losses[0].pop("samples")
+    assert 0.99 * samples < cpu_samples <= samples
+    for name, value in cpu_losses[0].items():
+        assert losses[0][name] == pytest.approx(value, rel=2e-3, abs=1e-6), name
+    assert losses[-1]["colour"] == pytest.approx(cpu_losses[-1]["colour"], rel=0.1)
+    assert losses[-1]["colour"] < 0.8 * losses[0]["colour"]
+    assert float(other.poses.shift_m.detach().abs().max()) > 0
+    return other
 
 
 @pytest.mark.parametrize("options", [{}, {"occupancy": "attention"}, {"inverse_skinning": "nearest"}])
-def test_learns_elsewhere_what_it_learns_here(scene, options):
+def test_training_on_another_device_agrees_with_the_cpu(scene, options):
     with elsewhere():
         compare(scene, FAKE_DEVICE, **options)
 
 
 @pytest.mark.cuda
-def test_learns_on_a_graphics_card_what_it_learns_here(scene, cuda):
+def test_training_on_a_gpu_agrees_with_the_cpu(scene, cuda):
     compare(scene, torch.device(cuda))
 
 
 @pytest.fixture(scope="module", params=["elsewhere", "cuda"])
-def learnt(request, scene):
-    """A field that learnt on another device, inside of that device's context."""
+def trained(request, scene):
+    """A trainer on another device, inside the context of that device."""
     device = FAKE_DEVICE if request.param == "elsewhere" else torch.device(request.getfixturevalue("cuda"))
     with elsewhere() if device == FAKE_DEVICE else nullcontext() as calls:
-        yield learn(scene, device, 12)[0], calls
+        yield train(scene, device, 12)[0], calls
 
 
-def test_pictures_and_checkpoints_come_back_to_the_cpu(scene, learnt):
-    trainer, _ = learnt
+def test_renders_and_checkpoints_return_to_the_cpu(scene, trained):
+    trainer, _ = trained
     pose = canonical_to_world(scene.body, scene.motion.select(np.array([2])))[0]
-    shown = render_field(trainer.field, trainer.occupancy.grid(), scene.body, pose, scene.camera)
-    state = {name: value.cpu() for name, value in trainer.state().items()}
+    shown = render_field(trainer.field, trainer.occupancy.binary(), scene.body, pose, scene.camera)
+    state = {name: value.cpu() for name, value in trainer.state_dict().items()}
     again = make_trainer(scene, torch.device("cpu"))
-    again.load_state(state)
-    here = render_field(again.field, again.occupancy.grid(), scene.body, pose, scene.camera)
+    again.load_state_dict(state)
+    here = render_field(again.field, again.occupancy.binary(), scene.body, pose, scene.camera)
     assert float(here[..., 3].amax()) > 0.5
     assert float((shown - here).abs().mean()) < 1e-4
     back = make_trainer(scene, trainer.device)
-    back.load_state(state)
+    back.load_state_dict(state)
     assert back.completed_steps == trainer.completed_steps
 
 
-def test_validation_frames_are_scored_with_refined_poses(scene, learnt):
-    trainer, _ = learnt
+def test_validation_with_refined_poses(scene, trained):
+    trainer, _ = trained
     validator = Validator(
         scene.motion.select(np.array([2, 5])), scene.camera, [(scene.images[r], scene.masks[r]) for r in (2, 5)]
     )
     subsampled_validator = validator.subsampled()
-    renders = subsampled_validator.render(trainer, subsampled_validator.pose(trainer, refined=True))
+    renders = subsampled_validator.render(trainer, subsampled_validator.pose_warps(trainer, refined=True))
     assert all(np.isfinite(score) for score in subsampled_validator.psnr_per_frame_db(renders))
 
 
-def test_a_step_is_few_operations(scene):
+def test_a_step_has_few_operations(scene):
     with elsewhere() as calls:
         trainer = make_trainer(scene, FAKE_DEVICE)
         for _ in range(FEW["steps"] - 2):
@@ -110,10 +109,10 @@ def test_a_step_is_few_operations(scene):
         before = calls.count
         trainer.step()
         assert trainer.refines_poses
-        assert 100 < calls.count - before < MOST_OPERATIONS
+        assert 100 < calls.count - before < MAX_OPERATIONS
 
 
-def test_elsewhere_keeps_the_rules_of_a_graphics_card():
+def test_the_fake_device_has_the_rules_of_a_gpu():
     with elsewhere():
         there = torch.arange(6.0).to(FAKE_DEVICE)
         with pytest.raises(RuntimeError, match="lies on the CPU"):

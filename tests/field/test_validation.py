@@ -30,43 +30,43 @@ def validator(scene) -> Validator:
     return Validator(scene.motion.select(HELD), scene.camera, [(scene.images[row], scene.masks[row]) for row in HELD])
 
 
-def test_thinned_pictures_are_pixels_of_the_whole_ones(validator: Validator, trainer: Trainer):
+def test_subsampled_images_are_pixels_of_the_full_images(validator: Validator, trainer: Trainer):
     subsampled_validator = validator.subsampled()
-    poses = validator.pose(trainer, refined=False)
+    poses = validator.pose_warps(trainer, refined=False)
     whole, few = validator.render(trainer, poses)[0], subsampled_validator.render(trainer, poses)[0]
     sides = few.shape[:2]
     picked = whole[2::5, 2::5][: sides[0], : sides[1]].astype(int)
     assert np.array_equal(
         subsampled_validator.ground_truth[0][0], validator.ground_truth[0][0][2::5, 2::5][: sides[0], : sides[1]]
     )
-    # The same rays but for rounding; a sample that falls to the other side of a cell's wall changes a pixel or two.
+    # The rays differ by rounding; a sample in a neighbouring cell changes a few pixels.
     assert np.quantile(np.abs(few - picked), 0.99) <= 2
 
 
-def test_a_thinned_score_is_that_of_the_pixels_it_keeps(validator: Validator, trainer: Trainer):
+def test_the_subsampled_psnr_is_that_of_the_selected_pixels(validator: Validator, trainer: Trainer):
     subsampled_validator = validator.subsampled()
-    poses = validator.pose(trainer, refined=False)
+    poses = validator.pose_warps(trainer, refined=False)
     kept = [
         render[2::5, 2::5][: subsampled_validator.camera.height, : subsampled_validator.camera.width]
         for render in validator.render(trainer, poses)
     ]
-    assert subsampled_validator.score(subsampled_validator.render(trainer, poses)) == pytest.approx(
-        subsampled_validator.score(kept), abs=0.2
+    assert subsampled_validator.mean_psnr_db(subsampled_validator.render(trainer, poses)) == pytest.approx(
+        subsampled_validator.mean_psnr_db(kept), abs=0.2
     )
 
 
-def test_frames_share_their_poses_and_not_their_pictures(scene, validator: Validator, trainer: Trainer):
-    poses, skin = validator.pose(trainer, refined=False), trainer.scene.skin
+def test_frames_are_rendered_in_their_own_poses(scene, validator: Validator, trainer: Trainer):
+    poses, skin = validator.pose_warps(trainer, refined=False), trainer.scene.skin
     for row, render in enumerate(validator.render(trainer, poses)):
         alone = Validator(
             validator.motion.select(np.array([row])), validator.camera, validator.ground_truth[row : row + 1]
         )
-        assert np.array_equal(alone.render(trainer, alone.pose(trainer, refined=False))[0], render)
+        assert np.array_equal(alone.render(trainer, alone.pose_warps(trainer, refined=False))[0], render)
         pose = canonical_to_world(scene.body, validator.motion)[row]
-        drawn = render_field(trainer.field, trainer.occupancy.grid(), scene.body, pose, scene.camera, skin)
+        drawn = render_field(trainer.field, trainer.occupancy.binary(), scene.body, pose, scene.camera, skin)
         assert np.array_equal(composite_premultiplied_on_white(drawn.numpy()), render)
 
 
-def test_the_truth_itself_scores_without_end_and_nothing_scores_nan(validator: Validator):
-    assert validator.score([composite_on_white(*truth) for truth in validator.ground_truth]) == (np.inf, np.inf)
-    assert all(np.isnan(Validator(validator.motion.select(np.zeros(0, int)), validator.camera, []).score([])))
+def test_psnr_of_the_ground_truth_is_infinite_and_of_no_frames_nan(validator: Validator):
+    assert validator.mean_psnr_db([composite_on_white(*truth) for truth in validator.ground_truth]) == (np.inf, np.inf)
+    assert all(np.isnan(Validator(validator.motion.select(np.zeros(0, int)), validator.camera, []).mean_psnr_db([])))

@@ -1,4 +1,4 @@
-"""The field stage, killed and begun again: the files of an unbroken run, and the seconds that learning took in all."""
+"""Field stage, killed and resumed: it writes the files of an uninterrupted run and reports the total time."""
 
 import csv
 from pathlib import Path
@@ -10,21 +10,20 @@ import torch
 
 from pipeline.body.files import save_motion
 from pipeline.core.manifest import PROGRESS_FILE
-from pipeline.field.config import FieldConfig
 from pipeline.field.trainer import Trainer
 from pipeline.field.validation import Validator
 from stages import field as field_stage
-from stages.field import CHECKPOINT, STAGE, train_field
-from tests.field.scene import painted_scene
+from stages.field import CHECKPOINT_FILE, STAGE, train_field
+from tests.field.scene import field_config, painted_scene
 from tests.stages.painted_run import make_run
 
-TINY = FieldConfig(
+TINY = field_config(
     device="cpu",
     steps=24,
-    rays=512,
+    rays_per_step=512,
     frames_per_step=3,
     levels=3,
-    log2_rows=12,
+    log2_hashmap_size=12,
     min_clothing_offset_m=0.04,
     step_fraction=0.02,
     occupancy_update_interval=4,
@@ -34,7 +33,7 @@ TINY = FieldConfig(
 
 
 class Killed(BaseException):
-    """Ends a run as a signal does: no code of the stage sees it."""
+    """Ends a run like a signal: no code of the stage handles it."""
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +46,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.fixture(scope="module")
 def whole(inputs: dict[str, Path]) -> tuple[Path, dict[str, float]]:
-    """Folder and metrics of a run that nobody disturbs."""
+    """Folder and metrics of an uninterrupted run."""
     out = inputs["body"].parent / "whole"
     out.mkdir()
     return out, dict(STAGE.run(inputs, out, TINY))
@@ -55,7 +54,7 @@ def whole(inputs: dict[str, Path]) -> tuple[Path, dict[str, float]]:
 
 @pytest.fixture(autouse=True)
 def checkpoint_at_every_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(field_stage, "CHECKPOINT_EVERY_S", -1.0)
+    monkeypatch.setattr(field_stage, "CHECKPOINT_INTERVAL_S", -1.0)
 
 
 def curve(out: Path) -> list[dict[str, float]]:
@@ -64,25 +63,25 @@ def curve(out: Path) -> list[dict[str, float]]:
 
 
 def killed_in(step: int, real_step):
-    """A step of learning that begins number `step`, from 1, and never ends it."""
+    """A training step that is killed in step number `step`, counted from 1."""
 
-    def one(trainer):
+    def step_or_die(trainer):
         if trainer.completed_steps == step - 1:
             raise Killed
         return real_step(trainer)
 
-    return one
+    return step_or_die
 
 
 @pytest.mark.parametrize("step", [7, 24])
-def test_a_killed_stage_ends_with_the_files_of_an_unbroken_one(inputs, whole, tmp_path, monkeypatch, step):
-    """Killed once poses move but before cells are updated; killed after both rebakes, in the last step."""
-    unbroken, expected = whole
+def test_a_resumed_stage_writes_the_files_of_an_uninterrupted_one(inputs, whole, tmp_path, monkeypatch, step):
+    """Killed after the pose refinement started and before the occupancy update; killed in the last step."""
+    uninterrupted, expected = whole
     with monkeypatch.context() as patch:
         patch.setattr(Trainer, "step", killed_in(step, Trainer.step))
         with pytest.raises(Killed):
             STAGE.run(inputs, tmp_path, TINY)
-    assert (tmp_path / CHECKPOINT).exists()
+    assert (tmp_path / CHECKPOINT_FILE).exists()
     steps_made = []
     with monkeypatch.context() as patch:
         real_step = Trainer.step
@@ -90,16 +89,16 @@ def test_a_killed_stage_ends_with_the_files_of_an_unbroken_one(inputs, whole, tm
         found = dict(STAGE.run(inputs, tmp_path, TINY))
     assert steps_made == list(range(step - 1, int(expected["steps"])))
     for name in STAGE.makes:
-        assert (tmp_path / name).read_bytes() == (unbroken / name).read_bytes(), name
+        assert (tmp_path / name).read_bytes() == (uninterrupted / name).read_bytes(), name
     timeless = expected.keys() - {"seconds_per_step"}
     assert {name: found[name] for name in timeless} == {name: expected[name] for name in timeless}
-    assert [row | {"seconds": 0} for row in curve(tmp_path)] == [row | {"seconds": 0} for row in curve(unbroken)]
+    assert [row | {"seconds": 0} for row in curve(tmp_path)] == [row | {"seconds": 0} for row in curve(uninterrupted)]
 
 
 def known_trainer(clock: SimpleNamespace, kill_in: int | None = None) -> mock.MagicMock:
-    """A learning of 32 steps that take two seconds each on `clock`."""
+    """A trainer of 32 steps that take two seconds each on `clock`."""
     trainer = mock.MagicMock(
-        spec=Trainer, completed_steps=0, refines_poses=True, config=FieldConfig(steps=32, early_stop=False)
+        spec=Trainer, completed_steps=0, refines_poses=True, config=field_config(steps=32, early_stop=False)
     )
 
     def step() -> None:
@@ -111,19 +110,19 @@ def known_trainer(clock: SimpleNamespace, kill_in: int | None = None) -> mock.Ma
     def load(tensors: dict[str, torch.Tensor]) -> None:
         trainer.completed_steps = int(tensors["completed_steps"])
 
-    trainer.step.side_effect, trainer.load_state.side_effect = step, load
-    trainer.state.side_effect = lambda: {"completed_steps": torch.tensor(trainer.completed_steps)}
+    trainer.step.side_effect, trainer.load_state_dict.side_effect = step, load
+    trainer.state_dict.side_effect = lambda: {"completed_steps": torch.tensor(trainer.completed_steps)}
     return trainer
 
 
-def test_seconds_go_on_from_the_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Killed in step 11 and again in step 15: looks come after steps 8, 12 and 16, so steps between look and
-    checkpoint count too, and those that are made again count once."""
+def test_the_training_time_continues_from_the_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Killed in step 11 and again in step 15; measurements follow steps 8, 12 and 16. Steps between measurement and
+    checkpoint count, and repeated steps count once."""
     clock = SimpleNamespace(now_s=100.0)
     monkeypatch.setattr(field_stage, "time", SimpleNamespace(monotonic=lambda: clock.now_s))
     validator = mock.MagicMock(spec=Validator, ground_truth=[None])
     validator.subsampled.return_value = validator
-    validator.score.return_value, validator.psnr_per_frame_db.return_value = (30.0, 25.0), [29.0]
+    validator.mean_psnr_db.return_value, validator.psnr_per_frame_db.return_value = (30.0, 25.0), [29.0]
     for kill_in in (11, 15):
         with pytest.raises(Killed):
             train_field(known_trainer(clock, kill_in), validator, tmp_path)

@@ -3,19 +3,19 @@ import pytest
 import torch
 
 from pipeline.body.body import canonical_to_world
-from pipeline.field.field import INITIAL_DENSITY_PER_M
-from pipeline.field.initial_occupancy import field_bounds_m
-from pipeline.field.occupancy import BinaryOccupancy
-from pipeline.field.rendering import over_white, render_field
-from pipeline.field.skin_grid import build_skin_grid
-from pipeline.field.visual_hull import (
+from pipeline.field.baselines.visual_hull import (
     SURFACE_DENSITY_PER_M,
     carve_visual_hull,
     dense_grid_field,
     dense_layout,
     node_positions_m,
 )
-from tests.field.scene import painted_scene
+from pipeline.field.field import INITIAL_DENSITY_PER_M
+from pipeline.field.initial_occupancy import field_bounds_m
+from pipeline.field.occupancy import BinaryOccupancy
+from pipeline.field.rendering import render_field
+from pipeline.field.skin_grid import build_skin_grid
+from tests.field.scene import painted_scene, psnr_on_white_db
 
 BOUNDS = np.array([[-0.5, 0.0, -0.25], [0.5, 2.0, 0.25]], dtype=np.float32)
 MARGIN_M = 0.05
@@ -47,14 +47,14 @@ def hull(scene, skin):
     )
 
 
-def test_layout_is_dense_and_as_fine_as_asked_or_as_rows_allow():
+def test_layout_is_dense_and_as_fine_as_requested_or_possible():
     assert dense_layout(BOUNDS, 0.05, 20).cells_per_axis == ((20, 40, 10),)
     layout = dense_layout(BOUNDS, 0.001, 12)
     assert layout.level_params[0, 5] == 1
     assert 0.8 * 4096 < layout.rows <= 4096
 
 
-def test_nodes_lie_in_the_order_of_the_rows_and_the_field_says_what_they_hold():
+def test_the_field_interpolates_the_node_values():
     layout = dense_layout(BOUNDS, 0.1, 20)
     nodes = torch.from_numpy(node_positions_m(BOUNDS, layout))
     # Linear in space, so that trilinear interpolation is exact everywhere.
@@ -77,20 +77,19 @@ def test_body_is_solid_and_air_is_empty(scene, hull):
     assert float(hull.density(beside).max()) < 1.0
 
 
-def test_shows_a_frame_that_it_was_not_carved_from(scene, skin, hull):
-    """A turn leaves no hollow but under arms; colours are means over the frames that face them."""
+def test_renders_a_frame_that_was_not_used(scene, skin, hull):
+    """Full turn: concavities remain under the arms only; colours are means over the frames that face them."""
     occupancy = BinaryOccupancy(torch.ones(64, 64, 64, dtype=torch.uint8), hull.bounds_m)
     pose = canonical_to_world(scene.body, scene.motion.select(np.array([5])))[0]
     shown = render_field(hull, occupancy, scene.body, pose, scene.camera, skin)
     mask = torch.from_numpy(scene.masks[5]) / 255
     covered, true = shown[..., 3] > 0.5, mask > 0.5
     assert float((covered & true).sum() / (covered | true).sum()) > 0.9
-    truth = torch.from_numpy(scene.images[5]) / 255 * mask[..., None] + 1 - mask[..., None]
-    assert -10 * float((over_white(shown) - truth).square().mean().log10()) > 22
+    assert psnr_on_white_db(shown, scene.images[5], scene.masks[5]) > 22
 
 
 def test_front_and_back_keep_their_colours(scene, skin):
-    """One frame from the front, one from behind, painted red and blue: no side takes the other's colour."""
+    """A red frame from the front and a blue frame from the back: each side has its own colour."""
     rows = np.array([0, 6])
     paints = (np.array([255, 0, 0], np.uint8), np.array([0, 0, 255], np.uint8))
     masked_images = [

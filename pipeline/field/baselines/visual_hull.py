@@ -1,7 +1,10 @@
-"""The cheap end: a visual hull in canonical space (Laurentini 1994, with articulated motion), and nothing learnt.
+"""Visual hull of an articulated body in canonical space (Laurentini 1994), without training.
 
-Every node of a grid is carried into every frame by its skin weights and votes with the mask that it falls on. A dense
-grid of one level holds the result, so that a hull is a `RadianceField` like any other, which all later stages take.
+Every node of a grid is posed in every frame by its skin weights and projected into the mask. The fraction of the masks
+that contain it gives its density. A dense grid of one level holds the result, so that a hull is a `RadianceField`,
+which all later stages accept.
+
+Letters: k frames, j joints, n points.
 """
 
 from collections.abc import Sequence
@@ -20,23 +23,26 @@ from pipeline.kernels.inverse_skinning import SkinGrid
 from pipeline.kernels.inverse_skinning.reference import interpolate
 
 CHANNELS = 4
+"""Three colours and the density."""
 SURFACE_DENSITY_PER_M = 32.0
-"""Density where just enough masks hold a point: in the middle of the levels that the mesh stage tries."""
+"""Density where just enough masks contain a point: in the middle of the isovalues that the mesh stage tries."""
 LOG_DENSITY_SLOPE = 40.0
-"""Of the log density over votes: from a fifth of the surface's density to four times it within 0.07 votes."""
+"""Slope of the log density over the mask fraction: the density rises twentyfold within 0.07."""
 
 
-def dense_layout(bounds_m: Float[np.ndarray, "2 3"], cell_m: float, log2_rows: int) -> GridLayout:
-    """One level with a row for each node: cells of `cell_m`, or larger until 2**log2_rows rows are enough."""
+def dense_layout(bounds_m: Float[np.ndarray, "2 3"], cell_m: float, log2_hashmap_size: int) -> GridLayout:
+    """Return a layout of one level with a row per node: cells of `cell_m`, or larger so that 2**log2_hashmap_size rows
+    suffice.
+    """
     sides_m = np.asarray(bounds_m[1] - bounds_m[0], dtype=np.float64)
-    while np.prod(np.ceil(sides_m / cell_m) + 1) > 2**log2_rows:
+    while np.prod(np.ceil(sides_m / cell_m) + 1) > 2**log2_hashmap_size:
         cell_m *= 1.02
     x, y, z = (int(cells) for cells in np.ceil(sides_m / cell_m))
-    return GridLayout(((x, y, z),), CHANNELS, log2_rows)
+    return GridLayout(((x, y, z),), CHANNELS, log2_hashmap_size)
 
 
 def node_positions_m(bounds_m: Float[np.ndarray, "2 3"], layout: GridLayout) -> Float[np.ndarray, "nodes 3"]:
-    """Positions of the nodes of a dense level in the order of its rows (z slowest)."""
+    """Return the positions (m) of the nodes of a dense level, in the order of its rows (z slowest)."""
     axes = [np.linspace(bounds_m[0, axis], bounds_m[1, axis], layout.cells_per_axis[0][axis] + 1) for axis in range(3)]
     z, y, x = np.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
     return np.stack([x, y, z], axis=-1).reshape(-1, 3).astype(np.float32)
@@ -52,28 +58,27 @@ def carve_visual_hull(
     layout: GridLayout,
     min_mask_fraction: float,
 ) -> RadianceField:
-    """A field from images and masks, one pair a frame.
+    """Compute a field from images and masks, one pair per frame; its density is 0 outside the skin grid.
 
-    layout: from `dense_layout`. least_votes: the part of the frames whose masks must hold a point, in (0, 1].
-    Beyond the skin grid there is nothing.
+    layout: from `dense_layout`. min_mask_fraction: fraction of the frames whose mask must contain a point, in (0, 1].
     """
     nodes_m = node_positions_m(bounds_m, layout)
-    kept = np.flatnonzero(inside_skin_grid(nodes_m, skin))
-    mask_fraction, colours = _accumulate_votes(nodes_m[kept], body, skin, canonical_to_world, camera, masked_images)
+    inside = np.flatnonzero(inside_skin_grid(nodes_m, skin))
+    mask_fraction, colours = _accumulate_votes(nodes_m[inside], body, skin, canonical_to_world, camera, masked_images)
     raw = torch.zeros(len(nodes_m), CHANNELS)
     raw[:, 3] = -MAX_ABS_LOG_DENSITY
-    raw[kept, :3] = torch.logit(torch.from_numpy(colours), eps=1 / 512)
+    raw[inside, :3] = torch.logit(torch.from_numpy(colours), eps=1 / 512)
     density = np.log(SURFACE_DENSITY_PER_M / INITIAL_DENSITY_PER_M) + LOG_DENSITY_SLOPE * (
         mask_fraction - min_mask_fraction
     )
-    raw[kept, 3] = torch.from_numpy(density).clamp(-MAX_ABS_LOG_DENSITY, MAX_ABS_LOG_DENSITY)
+    raw[inside, 3] = torch.from_numpy(density).clamp(-MAX_ABS_LOG_DENSITY, MAX_ABS_LOG_DENSITY)
     return dense_grid_field(bounds_m, layout, raw)
 
 
 def dense_grid_field(
     bounds_m: Float[np.ndarray, "2 3"], layout: GridLayout, raw: Float[Tensor, "nodes 4"]
 ) -> RadianceField:
-    """The field that says what a dense grid holds: x = relu(x) - relu(-x) takes the hidden layer out of the way."""
+    """Return a field whose output before the activations is that of a dense grid, by x = relu(x) - relu(-x)."""
     field = RadianceField(bounds_m, layout, hidden_width=2 * CHANNELS)
     with torch.no_grad():
         field.table.copy_(raw)
@@ -84,7 +89,7 @@ def dense_grid_field(
 
 
 def inside_skin_grid(points_m: Float[np.ndarray, "n 3"], skin: SkinGrid) -> np.ndarray:
-    """True for each point with a node of the skin grid at the low corner of its cell."""
+    """Return (n,) bool: whether the skin grid has a node at the low corner of each point's cell."""
     origin_m, row_of_node = skin.origin_m.numpy(), skin.row_of_node.numpy()
     index = np.floor((points_m - origin_m) / skin.cell_m).astype(np.int64)
     inside = ((index >= 0) & (index < row_of_node.shape)).all(1)
@@ -101,11 +106,11 @@ def _accumulate_votes(
     camera: Camera,
     masked_images: Sequence[tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]],
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
-    """Part of the frames whose mask holds each point, and the mean colour that it was seen in.
+    """Return the fraction of the frames whose mask contains each point, and its mean colour, in [0, 1].
 
-    A frame's colour counts by the squared cosine between the view and the body's normal nearest to the point, and not
-    at all from behind: what other limbs hide is taken for seen. Frames in which a point leaves the image do not count;
-    a point that is in none has no votes.
+    The weight of a frame's colour is the squared cosine between the viewing direction and the body normal nearest to
+    the point, and 0 from behind. Occlusion by other limbs is ignored. Frames in which a point is outside the image do
+    not count.
     """
     points = torch.from_numpy(points_m)
     weights = interpolate(points, skin.lattice, skin.weights)
@@ -117,7 +122,7 @@ def _accumulate_votes(
         np.full(len(points_m), 1e-6),
     )
     colours = np.full((len(points_m), 3), 0.5e-6)
-    eye = torch.from_numpy(-camera.world_to_camera[:3, :3].T @ camera.world_to_camera[:3, 3]).float()
+    camera_centre_m = torch.from_numpy(camera.centre_m()).float()
     for matrices, (image, mask) in zip(canonical_to_world, masked_images, strict=True):
         matrix = (weights @ matrices[:, :3].reshape(-1, 12)).view(-1, 3, 4)
         posed = (matrix[:, :, :3] @ points[:, :, None])[:, :, 0] + matrix[:, :, 3]
@@ -132,7 +137,9 @@ def _accumulate_votes(
         )
         pixel_column, pixel_row = pixel_column[inside], pixel_row[inside]
         mask_value = mask[pixel_row, pixel_column] / 255.0
-        facing = (matrix[:, :, :3] @ normals[:, :, None])[:, :, 0] * torch.nn.functional.normalize(eye - posed, dim=1)
+        facing = (matrix[:, :, :3] @ normals[:, :, None])[:, :, 0] * torch.nn.functional.normalize(
+            camera_centre_m - posed, dim=1
+        )
         weight = mask_value * facing.sum(1).clamp(min=0).square().numpy()[inside]
         in_image_count[inside] += 1
         mask_sum[inside] += mask_value

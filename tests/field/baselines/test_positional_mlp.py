@@ -3,11 +3,11 @@ import math
 import pytest
 import torch
 
-from pipeline.field.positional_mlp import FREQUENCY_COUNT, SKIP_LAYER, PositionalMlp
+from pipeline.field.baselines.positional_mlp import FREQUENCY_COUNT, SKIP_LAYER, PositionalMlp
 
 
-def encoded_by_hand(point):
-    """The point, then sin and cos of pi 2^k (2 x - 1), axis by axis."""
+def positional_encoding(point):
+    """Reference: the point, then sin and cos of pi 2^k (2 x - 1), axis by axis."""
     phases = [math.pi * 2**k * (2 * value - 1) for value in point for k in range(FREQUENCY_COUNT)]
     return [*point, *(math.sin(a) for a in phases), *(math.cos(a) for a in phases)]
 
@@ -15,7 +15,7 @@ def encoded_by_hand(point):
 def test_the_encoding_enters_at_the_first_layer_and_before_the_skip():
     trunk = PositionalMlp(SKIP_LAYER + 1, 16).requires_grad_(False)
     point = [0.2, 0.55, 0.9]
-    encoded = torch.tensor(encoded_by_hand(point))
+    encoded = torch.tensor(positional_encoding(point))
     features = encoded
     for index, layer in enumerate(trunk.layers):
         inputs = torch.cat([features, encoded]) if index == SKIP_LAYER else features
@@ -24,15 +24,15 @@ def test_the_encoding_enters_at_the_first_layer_and_before_the_skip():
     assert trunk.layers[SKIP_LAYER].in_features == 16 + 3 + 6 * FREQUENCY_COUNT
 
 
-def test_same_seed_same_network():
+def test_the_seed_determines_the_network():
     points = torch.rand(5, 3, generator=torch.Generator().manual_seed(0))
     one, same, other = (PositionalMlp(3, 8, seed)(points) for seed in (1, 1, 2))
     assert torch.equal(one, same)
     assert not torch.equal(one, other)
 
 
-def test_learns_detail_that_a_plain_network_cannot():
-    """Twenty stripes: the top octaves carry them."""
+def test_fits_high_frequencies():
+    """Twenty stripes, which need the high octaves of the encoding."""
     x = torch.linspace(0, 1, 400)
     points = torch.stack([x, torch.full_like(x, 0.5), torch.full_like(x, 0.5)], dim=1)
     stripes = torch.sign(torch.sin(40 * math.pi * x))

@@ -1,0 +1,51 @@
+"""PSNR of the validation frames over the training time, and the test for convergence."""
+
+import csv
+import math
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.core.manifest import PROGRESS_FILE
+
+MEAN_COLUMNS = ("step", "seconds", "validation_psnr_db", "validation_psnr_body_db")
+
+
+class ValidationCurve:
+    """Table of `MEAN_COLUMNS` and the PSNR of each validation frame (dB), one row per measurement.
+
+    It is kept as a checkpoint file during the training, and becomes `progress.csv` at the end.
+    """
+
+    def __init__(self, out: Path, completed_steps: int) -> None:
+        """Read the rows up to `completed_steps`, the step of the checkpoint that the training resumes from."""
+        self.checkpoint_path, self.output_path = out / f"checkpoint_{PROGRESS_FILE}", out / PROGRESS_FILE
+        self.rows: list[tuple[float, ...]] = []
+        if self.checkpoint_path.exists():
+            with self.checkpoint_path.open(newline="", encoding="utf-8") as file:
+                rows = [tuple(float(value) for value in row) for row in list(csv.reader(file))[1:]]
+            self.rows = [row for row in rows if row[0] <= completed_steps]
+
+    def add(self, step: int, seconds: float, *psnr_db: float) -> None:
+        """Add a row: the training time in seconds; mean PSNR of images, of body pixels; PSNR of each frame."""
+        self.rows.append((step, round(seconds, 3), *(round(value, 4) for value in psnr_db)))
+        frames = range(len(self.rows[0]) - len(MEAN_COLUMNS))
+        with self.checkpoint_path.open("w", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerows([(*MEAN_COLUMNS, *(f"frame_{frame}_db" for frame in frames)), *self.rows])
+
+    def has_converged(self, first_step: float) -> bool:
+        """Return whether neither of the last two gains exceeds its noise; both measurements are after `first_step`.
+
+        The noise is the standard error of the mean gain over frames. Needs three rows and two frames.
+        """
+        late = [row[len(MEAN_COLUMNS) :] for row in self.rows if row[0] >= first_step]
+        if len(late) < 3 or len(late[0]) < 2:
+            return False
+        gains_db = np.diff(np.array(late[-3:]), axis=0)
+        noise_db = gains_db.std(axis=1, ddof=1) / math.sqrt(gains_db.shape[1])
+        return bool((gains_db.mean(axis=1) <= noise_db).all())
+
+    def finish(self) -> None:
+        """Rename the checkpoint file to `progress.csv`, if there are rows."""
+        if self.rows:
+            self.checkpoint_path.replace(self.output_path)
