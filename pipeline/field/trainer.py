@@ -26,7 +26,7 @@ from pipeline.kernels.inverse_skinning import SkinGrid
 from pipeline.kernels.volume_rendering import RenderOutput
 
 REBAKE_FRACTIONS = (0.6,)
-"""Fractions of the steps at which the inverse skinning is baked for the refined poses (docs/decisions.md)."""
+"""Fractions of the steps at which the inverse skinning is baked for the refined poses (docs/decisions/field.md)."""
 MAX_SAMPLES_PER_RAY = 160
 """Samples farther along the ray are dropped."""
 CPU_BATCH_PARTS = 4

@@ -56,24 +56,24 @@ def curve(folder, *measurements):
 
 def test_a_curve_has_converged_after_two_gains_below_the_noise(tmp_path):
     flat = [30.0, 28.0, 31.0], [30.1, 27.9, 31.0], [30.0, 28.05, 30.95]
-    assert curve(tmp_path, *flat).has_converged(100)
-    assert not curve(tmp_path, *flat).has_converged(200)
-    assert not curve(tmp_path, *flat[:2]).has_converged(0)
+    assert curve(tmp_path, *flat).has_converged(100.0)
+    assert not curve(tmp_path, *flat).has_converged(200.0)
+    assert not curve(tmp_path, *flat[:2]).has_converged(0.0)
     # Small gains of every frame; one large gain of two.
-    assert not curve(tmp_path, *flat[:2], [30.13, 27.94, 31.03]).has_converged(0)
-    assert not curve(tmp_path, [29.0, 27.0, 30.0], *flat[:2]).has_converged(0)
+    assert not curve(tmp_path, *flat[:2], [30.13, 27.94, 31.03]).has_converged(0.0)
+    assert not curve(tmp_path, [29.0, 27.0, 30.0], *flat[:2]).has_converged(0.0)
     # A loss is no gain.
-    assert curve(tmp_path, *flat[:2], [29.5, 27.5, 30.5]).has_converged(0)
+    assert curve(tmp_path, *flat[:2], [29.5, 27.5, 30.5]).has_converged(0.0)
     # Standard error of a sample: 0.1 dB is less than 0.19 / sqrt(3).
-    assert curve(tmp_path, [30.0, 28.0, 31.0], [30.29, 27.91, 31.1], [30.58, 27.82, 31.2]).has_converged(0)
+    assert curve(tmp_path, [30.0, 28.0, 31.0], [30.29, 27.91, 31.1], [30.58, 27.82, 31.2]).has_converged(0.0)
     # One frame gives no estimate of the noise.
-    assert not curve(tmp_path, [30.0], [30.0], [30.0]).has_converged(0)
+    assert not curve(tmp_path, [30.0], [30.0], [30.0]).has_converged(0.0)
 
 
 def test_a_restored_curve_has_converged_too(tmp_path):
     measurements = [30.0, 28.0], [30.1, 27.9], [30.0, 28.05]
     curve(tmp_path, *measurements)
-    assert ValidationCurve(tmp_path, completed_steps=300).has_converged(100)
+    assert ValidationCurve(tmp_path, completed_steps=300).has_converged(100.0)
     rows = rows_of(tmp_path / "checkpoint_progress.csv")
     assert [float(rows[1][f"frame_{frame}_db"]) for frame in range(2)] == [30.1, 27.9]
 
