@@ -4,7 +4,7 @@
 constants of the method. From Python, `dataclasses.replace(FieldSettings(), huber_delta=0.05)` changes one. In YAML the
 section `field.settings` changes them; the presets of published baselines (`data_tools/baselines`) use it.
 
-Figures are means over validation frames (whole image / body pixels, PSNR in dB); docs/decisions/field.md has the details.
+Figures are means over validation frames (whole image / body pixels, PSNR in dB), from docs/decisions/field.md.
 """
 
 from dataclasses import dataclass
