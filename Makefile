@@ -78,7 +78,7 @@ $(SAMPLE_MADE): | $(STAMP)
 	$(RUN_PYTHON) -m data_tools.sample $(SAMPLE)
 	@touch $@
 
-compare: $(STAMP)  ## RUN=runs/name against the truth of TRUTH=capture (the sample's by default): report/truth.html
+compare: $(STAMP)  ## RUN=runs/name against the ground truth of TRUTH=capture (default: the sample): compare/truth.html
 	$(RUN_PYTHON) -m data_tools.evaluate.compare "$(or $(TRUTH),$(SAMPLE))" "$(ONE_RUN)"
 
 test: $(STAMP)  ## the fast tests, with the skip count

@@ -22,8 +22,20 @@ def atomic_folder(out: Path) -> Iterator[Path]:
     The remains of a killed command are removed. Raises UserError if `out` exists.
     """
     require_absent(out)
+    with replaced_folder(out) as part:
+        yield part
+
+
+@contextmanager
+def replaced_folder(out: Path) -> Iterator[Path]:
+    """Yield the empty folder `OUT.part`, which replaces `out` when the block ends without an error.
+
+    The remains of a killed command are removed. A kill during the replacement may leave no folder, never a partial one.
+    """
     part = out.with_name(f"{out.name}.part")
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
     yield part
+    if out.exists():
+        shutil.rmtree(out)
     os.rename(part, out)

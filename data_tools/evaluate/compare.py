@@ -1,8 +1,8 @@
-"""A run of the pipeline against the truth of its synthetic capture.
+"""Compare a run of the pipeline with the ground truth of its synthetic capture.
 
 python -m data_tools.evaluate.compare OUT RUN
 
-Prints what can be compared, and writes it into the report of a run that has one: `truth.json`, `truth.html`.
+Prints the scores of the finished stages. If the report is finished, RUN/compare/truth.json and truth.html are written.
 """
 
 import argparse
@@ -11,195 +11,45 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-from jaxtyping import Bool, Float
-
 from data_tools.command import run_command
-from data_tools.evaluate.compare_page import write_comparison
-from data_tools.evaluate.truth import load_ground_truth, load_true_mask
-from pipeline.body.body import Body, Motion, canonical_to_world
-from pipeline.body.files import load_body, load_camera, load_motion
+from data_tools.evaluate.compare_body import compare_body, compare_masks, compare_surface
+from data_tools.evaluate.page import write_comparison
 from pipeline.core.errors import UserError
-from pipeline.geometry.camera import project
-from pipeline.geometry.mesh import Mesh
-from pipeline.geometry.skinning import linear_blend_skinning
-from pipeline.geometry.surface import closest_points_on_mesh
-from pipeline.io.image import read_gray
-from pipeline.io.npz import load_npz
-from pipeline.metrics.images import foreground_mask, mask_iou
-from pipeline.metrics.surfaces import mpjpe_m, sample_surface
-
-CORRECTED_JOINTS = (
-    *("Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"),
-    *(f"{side}{part}" for side in ("Left", "Right") for part in ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")),
-)
-SURFACE_FRAMES = 8
+from pipeline.core.manifest import MANIFEST_FILE
 
 
-def compare_masks(out: Path, frames: Path) -> dict[str, float]:
-    """IoU of the masks of the `frames` stage with the true coverage, both cut at one half: median and worst frame."""
-    scores = [
-        mask_iou(
-            foreground_mask(read_gray(frames / "masks" / f"{index:06d}.png")),
-            foreground_mask(load_true_mask(out, index)),
-        )
-        for index in load_npz(frames / "frames.npz")["frame_index"].tolist()
-    ]
-    return {"mask_iou_median": float(np.median(scores)), "mask_iou_worst": float(np.min(scores))}
-
-
-def compare_body(out: Path, body_folder: Path) -> dict[str, float]:
-    """Joint errors of the `body` stage, mean over frames and joints, and how far focal length and height are off.
-
-    joint_error_mm is measured after the hips are laid over each other, with the fitted scale; scaled_joint_error_mm
-    after the fitted skeleton is scaled to the true distance of neck and hips as well; absolute_joint_error_mm without
-    any alignment; joint_error_px in the picture. acceleration_error_ratio: mean error of the joints' accelerations over
-    the mean true acceleration; jitter_ratio: mean acceleration over the true one. swapped_frames: see
-    `left_right_swapped_frames`. Joints that the true rig lacks are left out.
-
-    Raises:
-        UserError: a chosen frame is not in the truth.
-    """
-    truth = load_ground_truth(out)
-    body, motion = load_body(body_folder / "body.npz"), load_motion(body_folder / "motion.npz")
-    camera = load_camera(body_folder / "camera.npz")
-    if motion.frame_index.max() >= len(truth.motion.frame_index):
-        raise UserError(f"{body_folder} speaks of frame {motion.frame_index.max()}, {out} has fewer; is it its run?")
-    names = [name for name in CORRECTED_JOINTS if name in truth.subject.body.joint_names and name in body.joint_names]
-    fitted = joint_positions(body, motion, names)
-    true = joint_positions(truth.subject.body, truth.motion.select(motion.frame_index), names)
-    root_relative_m, true_root_relative_m = fitted - fitted[:, :1], true - true[:, :1]
-    neck = names.index("Neck") if "Neck" in names else names.index("Head")
-    scale = (
-        np.linalg.norm(true_root_relative_m[:, neck], axis=1).mean()
-        / np.linalg.norm(root_relative_m[:, neck], axis=1).mean()
-    )
-    fitted_px, true_px = (
-        project(torch.from_numpy(positions).float(), viewing_camera)[0].numpy()
-        for positions, viewing_camera in ((fitted, camera), (true, truth.camera))
-    )
-    size_ratio = camera.width / truth.camera.width
-    fitted_acceleration, true_acceleration = (
-        joint_accelerations(positions, motion.time_s) for positions in (fitted, true)
-    )
-    mean_true_acceleration = np.linalg.norm(true_acceleration, axis=2).mean()
-    return {
-        "joint_error_mm": 1000.0 * mpjpe_m(root_relative_m, true_root_relative_m),
-        "scaled_joint_error_mm": 1000.0 * mpjpe_m(scale * root_relative_m, true_root_relative_m),
-        "absolute_joint_error_mm": 1000.0 * mpjpe_m(fitted, true),
-        "joint_error_px": float(np.linalg.norm(fitted_px / size_ratio - true_px, axis=2).mean()),
-        "acceleration_error_ratio": float(
-            np.linalg.norm(fitted_acceleration - true_acceleration, axis=2).mean() / mean_true_acceleration
-        ),
-        "jitter_ratio": float(np.linalg.norm(fitted_acceleration, axis=2).mean() / mean_true_acceleration),
-        "left_right_swapped_frames": float(
-            left_right_swapped_frames(names, root_relative_m, true_root_relative_m).sum()
-        ),
-        "focal_ratio": camera.fx / size_ratio / truth.camera.fx,
-        "scale_ratio": float(1.0 / scale),
-        "silhouette_iou": float(np.nanmedian(load_npz(body_folder / "scores.npz")["silhouette_iou"])),
-    }
-
-
-def joint_accelerations(
-    positions_m: Float[np.ndarray, "n k 3"], time_s: Float[np.ndarray, "n"]
-) -> Float[np.ndarray, "t k 3"]:
-    """Second differences over the true intervals (m/s²) at the inner frames."""
-    interval = np.diff(time_s)[:, None, None]
-    velocity = np.diff(positions_m, axis=0) / interval
-    return np.diff(velocity, axis=0) / (0.5 * (interval[1:] + interval[:-1]))
-
-
-def left_right_swapped_frames(
-    names: Sequence[str], fitted_m: Float[np.ndarray, "n k 3"], true_m: Float[np.ndarray, "n k 3"]
-) -> Bool[np.ndarray, "n"]:
-    """Frames in which a pair of joints (hips, knees, ankles, ...) fits better with left and right exchanged."""
-    swapped = np.zeros(len(fitted_m), dtype=bool)
-    for left, name in enumerate(names):
-        if name.startswith("Left") and name.replace("Left", "Right") in names:
-            left_right_joints = [left, names.index(name.replace("Left", "Right"))]
-            unswapped_error_m, swapped_error_m = (
-                np.linalg.norm(fitted_m[:, left_right_joints] - true_m[:, order], axis=2).sum(1)
-                for order in (left_right_joints, left_right_joints[::-1])
-            )
-            swapped |= unswapped_error_m > swapped_error_m
-    return swapped
-
-
-def compare_surface(out: Path, body_folder: Path, count: int = 2000) -> dict[str, float]:
-    """Distance of the posed fitted body from the true surface beneath it, median over points and 8 frames.
-
-    The true surface is the bare body where there is one, else the clothed person. Middles of the surfaces are laid over
-    each other in every frame. Hands and head are left out: fingers and hair differ by design.
-    """
-    truth = load_ground_truth(out)
-    bare = out / "truth" / "bare.npz"
-    true_body = load_body(bare) if bare.is_file() else truth.subject.body
-    body, motion = load_body(body_folder / "body.npz"), load_motion(body_folder / "motion.npz")
-    rows = np.linspace(0, len(motion.frame_index) - 1, SURFACE_FRAMES).astype(np.int64)
-    fitted = posed_surfaces(body, motion.select(rows))
-    true = posed_surfaces(true_body, truth.motion.select(motion.frame_index[rows]))
-    trunk = ~np.isin(np.array(body.joint_names)[body.skin_weights.argmax(1)], [*_extremities(body.joint_names)])
-    distances = []
-    for mesh, target in zip(fitted, true, strict=True):
-        points, faces = sample_surface(mesh, count)
-        middle = sample_surface(target, count)[0].mean(0) - points.mean(0)
-        points = points[trunk[mesh.faces[faces]].all(1)] + middle
-        distances.append(closest_points_on_mesh(points, target)[0])
-    return {"surface_median_mm": 1000.0 * float(np.median(np.concatenate(distances)))}
-
-
-def posed_surfaces(body: Body, motion: Motion) -> list[Mesh]:
-    """The body's surface in the world in every frame."""
-    vertices, weights = torch.from_numpy(body.vertices), torch.from_numpy(body.skin_weights)
-    posed = linear_blend_skinning(vertices, weights, canonical_to_world(body, motion)).numpy()
-    return [Mesh(frame, body.faces) for frame in posed]
-
-
-def _extremities(names: Sequence[str]) -> list[str]:
-    return [name for name in names if "Hand" in name or name == "Head"]
-
-
-def joint_positions(body: Body, motion: Motion, names: Sequence[str]) -> Float[np.ndarray, "n k 3"]:
-    """World positions of the named joints in every frame, metres."""
-    joints = [body.joint(name) for name in names]
-    transforms = canonical_to_world(body, motion)[:, joints].double()
-    positions = torch.from_numpy(body.joints_m[joints]).double()
-    return ((transforms[..., :3, :3] @ positions[:, :, None]).squeeze(-1) + transforms[..., :3, 3]).numpy()
-
-
-def _main(argv: Sequence[str]) -> None:
+def main(argv: Sequence[str]) -> None:
+    """Compare one run and print the scores."""
     parser = argparse.ArgumentParser(
         prog="python -m data_tools.evaluate.compare", description=(__doc__ or "").splitlines()[0]
     )
     parser.add_argument("out", type=Path, help="folder of the synthetic capture")
     parser.add_argument("run", type=Path, help="run folder of the pipeline on OUT/video")
     options = parser.parse_args(argv)
-    found = [stage for stage in ("frames", "body") if (options.run / stage / "manifest.json").is_file()]
-    if not found:
+    finished = [stage for stage in ("frames", "body", "report") if (options.run / stage / MANIFEST_FILE).is_file()]
+    if not finished:
         command = f"python -m stages --run {options.run} --video {options.out}/video"
-        raise UserError(f"{options.run} holds no finished stage; run {command}")
-    sections = {}
-    if "frames" in found:
+        raise UserError(f"{options.run} has no finished stage; run {command}")
+    sections: dict[str, Any] = {}
+    if "frames" in finished:
         sections["masks"] = compare_masks(options.out, options.run / "frames")
-    if "body" in found:
+    if "body" in finished:
         sections["body"] = compare_body(options.out, options.run / "body")
         sections["body"] |= compare_surface(options.out, options.run / "body")
-    if (options.run / "report" / "manifest.json").is_file():
+    if "report" in finished:
         sections = write_comparison(options.out, options.run, sections)
-    for name, figures in sections.items():
-        _print(name, figures)
+    for name, scores in sections.items():
+        _print_scores(name, scores)
 
 
-def _print(section: str, figures: Any) -> None:
-    """Figures by their path; texts are for the page."""
-    if isinstance(figures, Mapping):
-        for name, value in figures.items():
-            _print(f"{section}.{name}", value)
-    elif isinstance(figures, float):
-        print(f"{section:40}{figures:10.4f}")
+def _print_scores(path: str, scores: Any) -> None:
+    """Print each score with the path of its keys; texts are left out."""
+    if isinstance(scores, Mapping):
+        for name, value in scores.items():
+            _print_scores(f"{path}.{name}", value)
+    elif isinstance(scores, float):
+        print(f"{path:40}{scores:10.4f}")
 
 
 if __name__ == "__main__":
-    raise SystemExit(run_command(_main, sys.argv[1:]))
+    raise SystemExit(run_command(main, sys.argv[1:]))

@@ -1,18 +1,16 @@
-"""Every video of a folder becomes an avatar, and a table tells how: states, seconds and scores.
+"""Run the pipeline on all videos of a folder, and write a table with states, seconds and scores.
 
 python -m data_tools.sweep.batch VIDEOS [--runs runs --preset fine --set mesh.edge_px=2 --jobs 2]
 
-A video that cannot be used never stops the rest. Each is a run folder below `runs`, so the same command goes on after
-an interruption. The table is written as `batch.csv` and `batch.html` into `runs`.
+A failed video does not stop the others. Each video has a run folder in `runs`, so the same command continues after an
+interruption. The table is written to `batch.csv` and `batch.html` in `runs`.
 """
 
 import argparse
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from html import escape
 from pathlib import Path
-from string import Template
 
 from tqdm import tqdm
 
@@ -29,6 +27,7 @@ from data_tools.sweep.runs import (
     validate_run_options,
     write_csv,
 )
+from data_tools.templates import render_template
 from pipeline.capture.video import VIDEO_SUFFIXES
 from pipeline.core.atomic import atomic_path
 from pipeline.core.errors import UserError
@@ -36,24 +35,12 @@ from pipeline.core.progress import track
 from pipeline.core.run_folder import default_run_dir
 from pipeline.core.status import FRESH
 
-PAGE = Template(
-    """<!doctype html><html lang="en"><meta charset="utf-8"><title>Batch</title><style>
-body { font: 14px system-ui, sans-serif; margin: 2rem; color-scheme: light dark; }
-table { border-collapse: collapse; } th, td { padding: .3rem .6rem; text-align: right; border-bottom: 1px solid #8884; }
-td:first-child, td:last-child { text-align: left; } .failed td { color: #c33; } .unfinished td { color: #a60; }
-</style><h1>$summary</h1><p>Stages: seconds where fresh, else the state. PSNR on held-out frames, dB.</p>
-<table><tr>$heading</tr>
-$rows
-</table></html>
-"""
-)
-
 
 def main(argv: Sequence[str]) -> None:
-    """Run all videos, or tell how far they are.
+    """Run all videos, or only write the table.
 
     Raises:
-        UserError: no video is there, two share a name, or some did not become an avatar.
+        UserError: the folder has no video, two videos share a name, or some videos have no avatar.
     """
     options = _parse(argv)
     videos = find_videos(options.videos)
@@ -65,21 +52,21 @@ def main(argv: Sequence[str]) -> None:
     failed = [name for name, row in rows.items() if row["status"] != "done"]
     if failed:
         raise UserError(
-            f"{len(failed)} of {len(rows)} videos did not become an avatar ({', '.join(failed)}): "
-            f"see {options.runs / 'batch.html'}; the same command tries them again"
+            f"{len(failed)} of {len(rows)} videos have no avatar ({', '.join(failed)}): "
+            f"see {options.runs / 'batch.html'}; run the same command to try again"
         )
 
 
 def find_videos(folder: Path) -> dict[str, Path]:
-    """Videos by the name of their run, sorted: files with a video's suffix, and folders of images or captures.
+    """Find videos by the name of their run, sorted: video files, and folders of images or captures.
 
-    What is hidden is left out.
+    Hidden files and folders are ignored.
 
     Raises:
-        UserError: there is none, or two would have one run.
+        UserError: there is no video, or two videos would share a run.
     """
     if not folder.is_dir():
-        raise UserError(f"{folder} is no folder: give one that holds videos or folders of images with VIDEOS=")
+        raise UserError(f"{folder} is not a folder: name a folder of videos or of image folders, VIDEOS=folder")
     videos: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
         if path.name.startswith(".") or not (path.is_dir() or path.suffix.lower() in VIDEO_SUFFIXES):
@@ -89,18 +76,18 @@ def find_videos(folder: Path) -> dict[str, Path]:
             raise UserError(f"{videos[name].name} and {path.name} in {folder} would share the run {name}: rename one")
         videos[name] = find_video(path)
     if not videos:
-        raise UserError(f"{folder} holds no video and no folder of images: put some into it")
+        raise UserError(f"{folder} contains no video and no folder of images: add some")
     return videos
 
 
 def newest_mtime_ns(video: Path) -> int:
-    """When a video's content changed last, in nanoseconds since 1970; of a folder, its newest file."""
+    """Return the modification time of a video, in ns since the epoch; of a folder, that of its newest file."""
     files = [video] if video.is_file() else [path for path in video.rglob("*") if path.is_file()]
     return max((path.stat().st_mtime_ns for path in files), default=0)
 
 
 def table_row(name: str, run: RunState) -> dict[str, str]:
-    """One line of the table: every column as text, empty where there is nothing to tell."""
+    """Return one row of the table: all columns as text, empty if there is no value."""
     row = {"video": name, "status": run.status, **run.states}
     for stage in run.states:
         row[f"{stage}_seconds"] = f"{run.seconds([stage]):.1f}" if stage in run.manifests else ""
@@ -111,7 +98,7 @@ def table_row(name: str, run: RunState) -> dict[str, str]:
 
 
 def text_table(rows: Iterable[Mapping[str, str]]) -> str:
-    """The table for a terminal, what went wrong in lines beneath it."""
+    """Format the table for a terminal, followed by the error messages."""
     rows = list(rows)
     cells = [_heading(), *map(_cells, rows)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
@@ -120,29 +107,32 @@ def text_table(rows: Iterable[Mapping[str, str]]) -> str:
 
 
 def write_table(runs: Path, rows: Iterable[Mapping[str, str]]) -> None:
-    """`batch.csv` and `batch.html` in the folder of the runs."""
+    """Write `batch.csv` and `batch.html` to the folder of the runs."""
     rows = list(rows)
     runs.mkdir(parents=True, exist_ok=True)
     write_csv(runs / "batch.csv", list(rows[0]), [list(row.values()) for row in rows])
     done = sum(row["status"] == "done" for row in rows)
-    heading = "".join(f"<th>{escape(cell)}</th>" for cell in [*_heading(), "message"])
-    page = PAGE.substitute(
-        summary=f"{done} of {len(rows)} avatars", heading=heading, rows="\n".join(map(_html_row, rows))
+    page = render_template(
+        "data_tools.sweep",
+        "batch.html.j2",
+        summary=f"{done} of {len(rows)} avatars",
+        heading=[*_heading(), "message"],
+        rows=[(row["status"], row["video"], _cells(row)[1:], row["message"]) for row in rows],
     )
     with atomic_path(runs / "batch.html") as path:
         path.write_text(page, encoding="utf-8")
 
 
 def _run_videos(videos: Mapping[str, Path], options: argparse.Namespace) -> None:
-    """`--jobs` at a time, each in a process of its own."""
+    """Run `--jobs` videos at a time, each in its own process."""
     validate_run_options(options.preset or "default", options.set)
     arguments = ["--preset", options.preset] if options.preset else []
-    arguments += [word for assignment in options.set for word in ("--set", assignment)]
+    arguments += [argument for assignment in options.set for argument in ("--set", assignment)]
     threads = max(1, cpu_cores() // options.jobs) if options.jobs > 1 else None
 
     def run_one_video(name: str) -> str:
         run_dir = options.runs / name
-        tqdm.write(f"{name}: started, says what it does in {log_path(run_dir)}", file=sys.stderr)
+        tqdm.write(f"{name}: started, log in {log_path(run_dir)}", file=sys.stderr)
         start_run(run_dir, ["--video", str(videos[name]), *arguments], threads)
         return f"{name}: {read_run(run_dir).status}"
 
@@ -159,15 +149,15 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m data_tools.sweep.batch", description=(__doc__ or "").splitlines()[0]
     )
-    parser.add_argument("videos", type=Path, help="folder with videos, or with folders of images")
-    parser.add_argument("--runs", type=Path, default=Path("runs"), help="where the run folders are made")
+    parser.add_argument("videos", type=Path, help="folder of videos, or of image folders")
+    parser.add_argument("--runs", type=Path, default=Path("runs"), help="parent of the run folders")
     parser.add_argument("--preset", help="a name in configs/ or a .yaml file, for all videos")
-    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="an option for all")
-    parser.add_argument("--jobs", type=int, default=1, help="videos at the same time; each may need 2 GiB of memory")
-    parser.add_argument("--table", action="store_true", help="run nothing, only tell how far all are")
+    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="option for all videos")
+    parser.add_argument("--jobs", type=int, default=1, help="number of parallel runs; each may need 2 GiB of memory")
+    parser.add_argument("--table", action="store_true", help="only write the table, run nothing")
     options = parser.parse_args(argv)
     if options.jobs < 1:
-        raise UserError(f"--jobs {options.jobs} is too few: give at least 1")
+        raise UserError(f"--jobs {options.jobs} is too small: choose at least 1")
     return options
 
 
@@ -178,13 +168,6 @@ def _heading() -> list[str]:
 def _cells(row: Mapping[str, str]) -> list[str]:
     spent = [row[f"{stage}_seconds"] if row[stage] == FRESH else row[stage].split()[0] for stage in stages.STAGES]
     return [row["video"], row["status"], *spent, row["seconds"], *(row[score] for score in SCORE_PATHS)]
-
-
-def _html_row(row: Mapping[str, str]) -> str:
-    name, *cells = map(escape, _cells(row))
-    link = f'<a href="{name}/report/index.html">{name}</a>' if row["status"] == "done" else name
-    log = f'{escape(row["message"])} <a href="{name}.log">log</a>' if row["message"] else ""
-    return f'<tr class="{row["status"]}">' + "".join(f"<td>{cell}</td>" for cell in [link, *cells, log]) + "</tr>"
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
-"""Presets over captures: accuracy against seconds, as a chart and as tables.
+"""Run presets on captures, and chart accuracy against run time.
 
 python -m data_tools.sweep.chart [CAPTURE ...] [--presets instant ihm --steps ihm=600 --seeds 0 1 --out runs/chart]
 
-Every combination is a run folder below OUT, so an interrupted sweep goes on where it was; the stage that was cut starts
-from its beginning, because its seconds are what the chart is about. What the first stages of two runs have in common is
-computed once and copied; its seconds count for both. OUT then holds `chart.svg`, `chart.png`,
-`chart.csv` (a line a run) and `anytime.csv` (the field's scores while it learnt).
+Each combination has a run folder in OUT, so the same command continues an interrupted sweep; the interrupted stage
+restarts from its beginning, because its time is measured. Stages with equal inputs and options are computed once and
+copied; their seconds count for each run. Outputs in OUT: `chart.svg`, `chart.png`, `chart.csv` (one row per run) and
+`anytime.csv` (scores of the field during training).
 """
 
 import argparse
@@ -42,17 +42,17 @@ from pipeline.core.config import preset_files
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track
 
-# The generated people that are taken when no capture is named: where they lie, and the seed that makes them.
+# Captures of generated people, used if no capture is named: folder and seed.
 SAMPLE_CAPTURES = {Path("runs/sample-capture"): 0, Path("runs/sample-capture-1"): 1}
 TEST_PRESET = "smoke"
 
 
 def main(argv: Sequence[str]) -> None:
-    """Run what is missing, then draw.
+    """Run what is missing, then write chart and tables.
 
     Raises:
-        UserError: a capture or preset is not there, two would share a run, or some runs are not done or not compared
-            with their truth (the others are drawn all the same).
+        UserError: a capture or preset does not exist, two combinations would share a run, or some runs are unfinished
+            or not compared with their ground truth (the others are in the chart).
     """
     options = _parse(argv)
     steps = _parse_steps(options)
@@ -63,7 +63,7 @@ def main(argv: Sequence[str]) -> None:
         _make_sample_captures()
     missing = [str(path) for path in captures if not path.exists()]
     if missing:
-        raise UserError(f"{missing[0]} does not exist: give synthetic captures, videos or folders of images")
+        raise UserError(f"{missing[0]} does not exist: name synthetic captures, videos or folders of images")
     combinations = product(options.seeds, captures, options.presets)
     trials = [Trial(capture, preset, seed, options.out, steps.get(preset)) for seed, capture, preset in combinations]
     require_distinct_run_folders(trials)
@@ -75,13 +75,13 @@ def main(argv: Sequence[str]) -> None:
 
 
 def run_and_compare(trial: Trial, other_trials: Sequence[Trial]) -> RunState:
-    """Run and compare what is not done yet. One trial at a time: they are timed, so nothing runs beside them.
+    """Run a trial if it is unfinished, and compare it with its ground truth. Trials are timed, so they run one by one.
 
-    others: what came out the same in their folders is copied, with its seconds.
+    other_trials: stages with equal results are copied from their runs, with their seconds.
     """
     run = read_trial(trial)
     if run.status != "done":
-        tqdm.write(f"{trial.run_dir.name}: started, says what it does in {log_path(trial.run_dir)}", file=sys.stderr)
+        tqdm.write(f"{trial.run_dir.name}: started, log in {log_path(trial.run_dir)}", file=sys.stderr)
         run_trial(trial, other_trials)
         run = read_trial(trial)
     if run.status == "done":
@@ -93,23 +93,23 @@ def run_and_compare(trial: Trial, other_trials: Sequence[Trial]) -> RunState:
 
 
 def _raise_if_incomplete(runs: Mapping[Trial, RunState], out: Path) -> None:
-    """UserError that names the runs which are not done, or not compared with their truth."""
+    """Raise UserError with the names of the runs that are unfinished or not compared with their ground truth."""
     done = [trial for trial, run in runs.items() if run.status == "done"]
     incomplete = {
         "not done": [trial for trial in runs if trial not in done],
-        "not compared with their truth": [trial for trial in done if needs_comparison(trial)],
+        "not compared with their ground truth": [trial for trial in done if needs_comparison(trial)],
     }
     summary = [
-        f"{len(found)} of {len(runs)} runs are {what} ({', '.join(trial.run_dir.name for trial in found)})"
-        for what, found in incomplete.items()
+        f"{len(found)} of {len(runs)} runs are {problem} ({', '.join(trial.run_dir.name for trial in found)})"
+        for problem, found in incomplete.items()
         if found
     ]
     if summary:
-        raise UserError(f"{', '.join(summary)}: see {out}/chart.csv; the same command tries them again")
+        raise UserError(f"{', '.join(summary)}: see {out}/chart.csv; run the same command to try again")
 
 
 def write_results(out: Path, runs: Mapping[Trial, RunState]) -> None:
-    """Tables of all runs, and the chart of those that are done."""
+    """Write the tables of all runs, and the chart of the finished ones."""
     out.mkdir(parents=True, exist_ok=True)
     points = [chart_point(trial, run) for trial, run in runs.items() if run.status == "done"]
     rows = [
@@ -124,14 +124,14 @@ def write_results(out: Path, runs: Mapping[Trial, RunState]) -> None:
 
 
 def provenance(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Commit, machine and seeds of the runs that are done."""
+    """Return commit, machine and seeds of the finished runs."""
     done = [row for row in rows if row["status"] == "done"]
     commit, machine, seeds = (join_distinct(str(row[name]) for row in done) for name in ("commit", "machine", "seed"))
     return f"commit {commit or 'unknown'}; {machine}; seed {seeds}"
 
 
 def _pareto_optimal_scores(trial: Trial, points: Sequence[ChartPoint]) -> str:
-    """The scores on whose Pareto front the trial's preset lies."""
+    """Return the scores for which the preset of the trial is Pareto-optimal."""
     on = []
     for panel in PANELS:
         means = preset_means([point for point in points if point.capture == trial.capture_name], panel.mesh_score)
@@ -146,25 +146,25 @@ def _read_only(trial: Trial, other_trials: Sequence[Trial]) -> RunState:
 
 
 def _make_sample_captures() -> None:
-    """The generated people's captures, where they are not there yet. UserError where another version made one."""
+    """Make the captures of generated people that do not exist. UserError if one is of another version."""
     for path, seed in SAMPLE_CAPTURES.items():
         if not path.exists():
             make_sample([str(path), "--seed", str(seed)])
         elif read_capture_settings(path).get("version") != CAPTURE_VERSION:
-            raise UserError(f"{path} is of another version of the program: remove it, and it is made anew")
+            raise UserError(f"{path} was made by another version of the program: remove it and run the same command")
 
 
 def _parse_steps(options: argparse.Namespace) -> dict[str, int]:
-    """Training steps by preset, of those whose own number is not taken.
+    """Return the training steps by preset from --steps.
 
     Raises:
-        UserError: an entry names no chosen preset, or no whole number.
+        UserError: an entry does not name a selected preset, or its number is not an integer.
     """
     steps = {}
     for entry in options.steps:
         preset, _, number = entry.rpartition("=")
         if preset not in options.presets or not number.isdecimal():
-            raise UserError(f"--steps {entry}: give PRESET=N with one of {', '.join(options.presets)}")
+            raise UserError(f"--steps {entry}: write PRESET=N with one of {', '.join(options.presets)}")
         steps[preset] = int(number)
     return steps
 
@@ -174,12 +174,14 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
         prog="python -m data_tools.sweep.chart", description=(__doc__ or "").splitlines()[0]
     )
     presets = [name for name in preset_files(stages.PIPELINE.config_dir) if name != TEST_PRESET]
-    parser.add_argument("captures", nargs="*", type=Path, help="captures, videos or image folders; two people if none")
-    parser.add_argument("--presets", nargs="+", default=presets, help="names in configs/ or .yaml files; all if none")
-    parser.add_argument("--steps", nargs="+", default=[], help="PRESET=N: so many training steps of its field instead")
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0], help="seeds of the stages that draw at random")
-    parser.add_argument("--out", type=Path, default=Path("runs/chart"), help="where runs, tables and chart are made")
-    parser.add_argument("--draw", action="store_true", help="run nothing, draw what is done")
+    parser.add_argument(
+        "captures", nargs="*", type=Path, help="captures, videos or image folders; default: two generated people"
+    )
+    parser.add_argument("--presets", nargs="+", default=presets, help="names in configs/ or .yaml files; default: all")
+    parser.add_argument("--steps", nargs="+", default=[], help="PRESET=N: other number of training steps of the field")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0], help="seeds of the stages that use random numbers")
+    parser.add_argument("--out", type=Path, default=Path("runs/chart"), help="folder of runs, tables and chart")
+    parser.add_argument("--draw", action="store_true", help="run nothing, chart the finished runs")
     return parser.parse_args(argv)
 
 

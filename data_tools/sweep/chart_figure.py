@@ -1,4 +1,4 @@
-"""Accuracy against seconds as a figure: a row of panels a capture, a colour a preset, the Pareto front marked."""
+"""Chart accuracy against run time: one row of panels per capture, one colour per preset, with the Pareto front."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -23,9 +23,11 @@ Colour = tuple[float, float, float, float]
 class ChartPoint:
     """One finished run.
 
-    field_seconds, seconds: from the video until the field, and until the exported avatar.
-    scores: columns of `data_tools.sweep.runs.SCORES`.
-    curve: while the field learnt, seconds since the start and PSNR of validation frames (dB): whole image, body pixels.
+    Attributes:
+        field_seconds: run time up to the trained field.
+        seconds: run time up to the exported avatar.
+        scores: by column of `data_tools.sweep.runs.SCORE_PATHS`.
+        curve: during training: seconds since the start of the run, validation PSNR (dB) of full image and body pixels.
     """
 
     capture: str
@@ -39,9 +41,7 @@ class ChartPoint:
 
 @dataclass(frozen=True)
 class Panel:
-    """What a column shows: the mesh's score, the field's where it has one, and its place in a row of
-    `ChartPoint.curve`.
-    """
+    """A column of panels: score of the mesh, score of the field if any, and its column in `ChartPoint.curve`."""
 
     title: str
     mesh_score: str
@@ -58,9 +58,9 @@ PANELS = (
 
 
 def pareto_front(entries: Sequence[tuple[float, float]], higher_is_better: bool) -> list[int]:
-    """Indices of the (seconds, score) that no other beats, from the quickest on.
+    """Return the indices of the Pareto-optimal (seconds, score) entries, in ascending order of seconds.
 
-    One beats another when it is at least as quick and at least as good, and not equal in both.
+    An entry dominates another if it is at least as fast and at least as good, and not equal in both.
     """
     costs = [(seconds, -score if higher_is_better else score) for seconds, score in entries]
     is_dominated = [any(a[0] <= b[0] and a[1] <= b[1] and a != b for a in costs) for b in costs]
@@ -68,7 +68,7 @@ def pareto_front(entries: Sequence[tuple[float, float]], higher_is_better: bool)
 
 
 def preset_means(points: Iterable[ChartPoint], score: str) -> dict[str, tuple[float, float]]:
-    """Mean (seconds, score) over the seeds of each preset; runs without that score are left out."""
+    """Return the mean (seconds, score) over the seeds of each preset; runs without the score are left out."""
     groups: dict[str, list[tuple[float, float]]] = {}
     for point in points:
         if score in point.scores:
@@ -78,9 +78,9 @@ def preset_means(points: Iterable[ChartPoint], score: str) -> dict[str, tuple[fl
 
 
 def draw_chart(points: Sequence[ChartPoint], provenance: str) -> Figure:
-    """The whole figure; a score that no run has is left out. ValueError when there is no score at all.
+    """Draw the figure; panels without any score are left out. ValueError if no run has a score.
 
-    origin: a line that says where the figures come from.
+    provenance: text above the figure, see `data_tools.sweep.chart.provenance`.
     """
     captures = list(dict.fromkeys(point.capture for point in points))
     presets = list(dict.fromkeys(point.preset for point in points))
@@ -110,14 +110,14 @@ def draw_chart(points: Sequence[ChartPoint], provenance: str) -> Figure:
 
 
 def save_chart(figure: Figure, folder: Path) -> None:
-    """`chart.svg` and `chart.png`; equal figures give equal bytes."""
+    """Write `chart.svg` and `chart.png`; equal figures give equal bytes."""
     with mpl.rc_context({"svg.hashsalt": "chart", "svg.fonttype": "none"}):
         figure.savefig(folder / "chart.svg", metadata={"Date": None})
     figure.savefig(folder / "chart.png", dpi=130)
 
 
 def _draw_runs(axes: Axes, panel: Panel, points: Sequence[ChartPoint], colours: dict[str, Colour]) -> None:
-    """Every run: a dot for the mesh, and before it the field, with the way it took to get there."""
+    """Draw each run: mesh, field, and validation scores during training."""
     for point in points:
         colour = colours[point.preset]
         if panel.mesh_score in point.scores:
@@ -130,15 +130,15 @@ def _draw_runs(axes: Axes, panel: Panel, points: Sequence[ChartPoint], colours: 
 
 
 def _draw_presets(axes: Axes, panel: Panel, points: Sequence[ChartPoint], colours: dict[str, Colour]) -> None:
-    """Every preset's mean over seeds with its short name, and which of them no other beats."""
+    """Draw the mean over seeds of each preset with its name, and the Pareto front."""
     means = preset_means(points, panel.mesh_score)
-    for preset, place in means.items():
-        axes.plot(*place, "o", color=colours[preset], markersize=7)
+    for preset, point in means.items():
+        axes.plot(*point, "o", color=colours[preset], markersize=7)
         axes.annotate(
-            preset.partition(",")[0], place, (7, 4), textcoords="offset points", fontsize=8, color=TEXT_COLOUR
+            preset.partition(",")[0], point, (7, 4), textcoords="offset points", fontsize=8, color=TEXT_COLOUR
         )
-    places = list(means.values())
-    front = [places[index] for index in pareto_front(places, panel.higher_is_better)]
+    mean_points = list(means.values())
+    front = [mean_points[index] for index in pareto_front(mean_points, panel.higher_is_better)]
     if front:
         seconds, scores = zip(*front, strict=True)
         axes.step(seconds, scores, where="post", color=TEXT_COLOUR, linewidth=1, linestyle=":", zorder=1)
@@ -162,7 +162,7 @@ def _legend_entries() -> list[Line2D]:
     return [
         Line2D([], [], color=TEXT_COLOUR, marker="o", linestyle="none", label="exported mesh, held-out frames"),
         Line2D([], [], mec=TEXT_COLOUR, mfc="white", marker="D", linestyle="none", label="field, held-out frames"),
-        Line2D([], [], color=TEXT_COLOUR, linewidth=1, label="field while it learns, validation frames"),
+        Line2D([], [], color=TEXT_COLOUR, linewidth=1, label="field during training, validation frames"),
         Line2D(
             [], [], color=TEXT_COLOUR, marker="o", markersize=11, fillstyle="none", linestyle=":", label="Pareto front"
         ),

@@ -1,4 +1,4 @@
-"""One combination of capture, preset and seed: its run, what it found, and what that cost."""
+"""One combination of capture, preset and seed: its run folder, scores and run times."""
 
 import csv
 import shutil
@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import stages
+from data_tools.evaluate.files import load_comparison_scores
 from data_tools.folder import atomic_folder
 from data_tools.sweep.chart_figure import ChartPoint
 from data_tools.sweep.runs import (
     SCORE_PATHS,
     RunState,
     find_video,
-    has_current_comparison,
     log_path,
     read_run,
     reusable_stages,
@@ -38,7 +38,13 @@ PROGRESS_COLUMNS = ("seconds", "validation_psnr_db", "validation_psnr_body_db")
 
 @dataclass(frozen=True)
 class Trial:
-    """What runs, and below which folder. steps: those of the field where they are not the preset's own."""
+    """One run of a sweep.
+
+    Attributes:
+        preset: name in configs/ or a .yaml file.
+        out: parent of the run folder.
+        steps: training steps of the field; None: those of the preset.
+    """
 
     capture: Path
     preset: str
@@ -48,75 +54,77 @@ class Trial:
 
     @property
     def capture_name(self) -> str:
-        """How tables and the chart call the capture."""
+        """Name of the capture in tables and chart."""
         return default_run_dir(self.capture).name
 
     @property
     def preset_name(self) -> str:
-        """The preset's name, also where a file was given."""
+        """Name of the preset; of a file, its stem."""
         return Path(self.preset).stem
 
     @property
     def label(self) -> str:
-        """How the chart calls the preset."""
+        """Label of the preset in the chart."""
         return self.preset_name if self.steps is None else f"{self.preset_name}, {self.steps} steps"
 
     @property
     def run_dir(self) -> Path:
-        """The folder of the run."""
+        """The run folder."""
         name = f"{self.capture_name}-{self.preset_name}-{self.seed}"
         return self.out / (name if self.steps is None else f"{name}-{self.steps}-steps")
 
     @property
     def assignments(self) -> list[str]:
-        """What differs from the preset, as `section.key=value`."""
+        """Options that differ from the preset, as `section.key=value`."""
         seeded = [name for name in stages.STAGES if "seed" in stages.load_stage(name).config.model_fields]
         seeds = [f"{name}.seed={self.seed}" for name in seeded]
         return seeds if self.steps is None else [*seeds, f"{FIELD}.steps={self.steps}"]
 
     @property
     def record(self) -> RunRecord:
-        """What the run's folder will remember."""
+        """The record that the run folder will contain."""
         record, video = RunRecord(), find_video(self.capture)
         overrides = parse_overrides(self.assignments)
         return update_record(record, self.run_dir, video, self.preset, overrides, replace_video=False)
 
 
 def require_distinct_run_folders(trials: Iterable[Trial]) -> None:
-    """UserError when two trials would have one run: the second would show the figures of the first."""
+    """Raise UserError if two trials have the same run folder."""
     trial_of_folder: dict[Path, Trial] = {}
     for trial in trials:
         other = trial_of_folder.setdefault(trial.run_dir, trial)
         if other != trial:
             raise UserError(
                 f"{other.preset} on {other.capture} and {trial.preset} on {trial.capture} would share the run "
-                f"{trial.run_dir}: rename one of them, or give each an --out of its own"
+                f"{trial.run_dir}: rename one of them, or run them with different --out"
             )
 
 
 def read_trial(trial: Trial) -> RunState:
-    """How far the trial's run came; what the folder holds of another capture or preset does not count."""
+    """Read the state of the run; stages of another capture or preset are not fresh."""
     return read_run(trial.run_dir, trial.record)
 
 
 def run_trial(trial: Trial, other_trials: Iterable[Trial] = ()) -> None:
-    """Run what is not fresh; a stage that was cut starts from its beginning.
+    """Run the stages that are not fresh; an interrupted stage restarts from its beginning.
 
-    Gone on with from its checkpoint, it would tell only the seconds after the cut. others: see `copy_shared_stages`.
+    Resumed from a checkpoint, it would report only the seconds after the interruption.
+
+    other_trials: see `copy_shared_stages`.
     """
     if trial.run_dir.is_dir():
         with run_lock(trial.run_dir):
             for part in trial.run_dir.glob("*.part"):
                 shutil.rmtree(part)
     copy_shared_stages(trial, other_trials)
-    chosen = [word for assignment in trial.assignments for word in ("--set", assignment)]
+    chosen = [argument for assignment in trial.assignments for argument in ("--set", assignment)]
     start_run(trial.run_dir, ["--video", str(find_video(trial.capture)), "--preset", trial.preset, *chosen])
 
 
 def copy_shared_stages(trial: Trial, other_trials: Iterable[Trial]) -> None:
-    """Copy what would come out the same here from runs of the same capture, stage after stage until one differs.
+    """Copy leading stages with equal inputs and options from other runs of the same capture.
 
-    The copies keep their manifests: their seconds, machine and commit count here as there.
+    The copies keep their manifests with seconds, machine and commit.
     """
     for other in other_trials:
         if other.capture != trial.capture or other.run_dir == trial.run_dir:
@@ -128,23 +136,23 @@ def copy_shared_stages(trial: Trial, other_trials: Iterable[Trial]) -> None:
 
 
 def needs_comparison(trial: Trial) -> bool:
-    """Whether the capture has a truth that the trial's report was not compared with, or not wholly, or otherwise."""
-    return (trial.capture / "truth").is_dir() and not has_current_comparison(trial.run_dir / "report")
+    """Return whether the capture has a ground truth and the run has no complete, current comparison with it."""
+    return (trial.capture / "truth").is_dir() and load_comparison_scores(trial.run_dir) is None
 
 
 def compare_with_truth(trial: Trial) -> None:
-    """Write `report/truth.json` where it lacks; a warning where that fails."""
+    """Compare the run with its ground truth if needed; a failure is a warning."""
     if not needs_comparison(trial):
         return
     command = [sys.executable, "-m", "data_tools.evaluate.compare", str(trial.capture), str(trial.run_dir)]
     with log_path(trial.run_dir).open("a", encoding="utf-8") as log:
         done = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, check=False)
     if done.returncode != 0:
-        warn(f"{trial.run_dir.name} could not be compared with its truth: see {log_path(trial.run_dir)}")
+        warn(f"{trial.run_dir.name} was not compared with its ground truth: see {log_path(trial.run_dir)}")
 
 
 def chart_point(trial: Trial, run: RunState) -> ChartPoint:
-    """What the figure needs of a finished run."""
+    """Return the data of the chart from a finished run."""
     before = run.seconds(STAGES_BEFORE_FIELD)
     curve = [(before + seconds, full, body) for seconds, full, body in read_progress(trial.run_dir / "field")]
     seconds = (run.seconds(STAGES_UNTIL_FIELD), run.seconds(STAGES_UNTIL_EXPORT))
@@ -152,10 +160,10 @@ def chart_point(trial: Trial, run: RunState) -> ChartPoint:
 
 
 def read_progress(field: Path) -> list[tuple[float, float, float]]:
-    """Rows of `progress.csv`: seconds of learning, validation PSNR (dB) of whole image and body; empty without it.
+    """Read `progress.csv`: training seconds, validation PSNR (dB) of full image and body pixels; empty if absent.
 
     Raises:
-        UserError: a column is missing or holds no number.
+        UserError: a column is missing or not numeric.
     """
     path = field / "progress.csv"
     if not path.is_file():
@@ -170,10 +178,10 @@ def read_progress(field: Path) -> list[tuple[float, float, float]]:
 
 
 def table_row(trial: Trial, run: RunState) -> dict[str, Any]:
-    """One line of chart.csv.
+    """Return one row of chart.csv.
 
-    steps: those of the field's training, which may end early. resumed: stages whose seconds tell only of the time after
-    an interruption.
+    `steps` are the training steps of the field, which may stop early. The seconds of stages in `resumed` are those
+    after an interruption.
     """
     environments = [manifest.environment for manifest in run.manifests.values()]
     return {
@@ -194,7 +202,7 @@ def table_row(trial: Trial, run: RunState) -> dict[str, Any]:
 
 
 def join_distinct(texts: Iterable[str | None]) -> str:
-    """The different ones among texts, in their order."""
+    """Join the distinct non-empty texts in order."""
     return "; ".join(dict.fromkeys(text for text in texts if text))
 
 

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from data_tools.command import run_command
-from data_tools.evaluate.compare import compare_body, compare_masks, compare_surface
+from data_tools.evaluate.compare_body import compare_body, compare_masks, compare_surface
 from data_tools.evaluate.truth import load_ground_truth
 from data_tools.sweep.runs import find_video
 from pipeline.body.files import load_body

@@ -87,7 +87,7 @@ def _pairs(runs: Sequence[Path], baselines: Sequence[Path]) -> list[tuple[Path, 
 
 
 def _gain_db(run: Path, baseline: Path) -> float | None:
-    ours, theirs = read_scores(run / "report"), read_scores(baseline / "report")
+    ours, theirs = read_scores(run), read_scores(baseline)
     return ours[_HELD_OUT] - theirs[_HELD_OUT] if _HELD_OUT in ours and _HELD_OUT in theirs else None
 
 

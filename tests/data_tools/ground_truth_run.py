@@ -1,4 +1,4 @@
-"""A run that found the truth of the sample, in memory, to be spoilt in known ways."""
+"""Finished runs for tests: the ground truth of the sample as an in-memory run, with known errors."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from data_tools.evaluate.compare_avatar import Comparison
-from data_tools.evaluate.files import TRUTH_VERSION
+from data_tools.evaluate import files
+from data_tools.evaluate.comparison import Comparison
 from data_tools.evaluate.truth import load_ground_truth
 from data_tools.synthetic.scene.capture import SyntheticCapture
 from pipeline.avatar.finished_run import FinishedRun
@@ -23,15 +23,22 @@ from pipeline.geometry.skinning import forward_kinematics, skinning_transforms, 
 from pipeline.io.image import write_gray, write_rgb
 
 
-def write_fake_comparison(report: Path, version: int = TRUTH_VERSION) -> None:
-    """Make a folder look like a report that was compared with the truth by the program of a version."""
-    (report / "truth.html").write_text("a page")
-    (report / "truth.json").write_text(f'{{"version": {version}, "mesh": {{"chamfer_mm": 6.5}}}}')
-    write_manifest(Manifest("report", 1, "", {}, {}, digest_files(report), {}, 1.0, 1.0), report / MANIFEST_FILE)
+def write_fake_report(run_dir: Path, fingerprint: str = "print") -> None:
+    """Write an empty report with a manifest."""
+    report = run_dir / "report"
+    report.mkdir(parents=True, exist_ok=True)
+    manifest = Manifest("report", 1, fingerprint, {}, {}, digest_files(report), {}, 1.0, 1.0)
+    write_manifest(manifest, report / MANIFEST_FILE)
+
+
+def write_fake_comparison(run_dir: Path) -> None:
+    """Write a report, and a complete comparison of it with a Chamfer distance of 6.5 mm."""
+    write_fake_report(run_dir)
+    files.save_comparison(run_dir, {"mesh": {"chamfer_mm": 6.5}}, "a page", "print")
 
 
 def ground_truth_run(sample: Path, folder: Path) -> Comparison:
-    """The true person, texture, poses and camera as if the pipeline had found them; its frames lie in `folder`."""
+    """Return a run with the true person, texture, poses and camera; its frames are written to `folder`."""
     truth = load_ground_truth(sample)
     subject = truth.subject
     _write_frames(truth, folder, unpremultiply_to_uint8)
@@ -60,7 +67,7 @@ def ground_truth_run(sample: Path, folder: Path) -> Comparison:
 
 
 def with_frames(comparison: Comparison, folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> Comparison:
-    """The same run, had the frames stage made this (8 bits, straight RGBA) of the person (premultiplied, in [0, 1])."""
+    """Replace the frames by `change` (8 bits, straight RGBA) of the true person (premultiplied, in [0, 1])."""
     side_px = _write_frames(comparison.truth, folder, change)
     camera = comparison.run.camera.scaled(side_px / comparison.run.camera.width)
     capture = replace(comparison.run.capture, folder=folder, width=side_px, height=side_px)
@@ -68,7 +75,7 @@ def with_frames(comparison: Comparison, folder: Path, change: Callable[[np.ndarr
 
 
 def _write_frames(truth: SyntheticCapture, folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> int:
-    """Straight colours, so that nothing of the room is in the pixels along the outline; returns the side in pixels."""
+    """Write straight colours, so that edge pixels do not contain the room; return the side in pixels."""
     for path in (image_path(folder, 0), mask_path(folder, 0)):
         path.parent.mkdir(parents=True)
     for frame in truth.motion.frame_index.tolist():
@@ -99,13 +106,13 @@ def _capture(folder: Path, motion: Motion, side_px: int, fps: float) -> Capture:
 
 
 def with_motion(comparison: Comparison, motion: Motion) -> Comparison:
-    """The same run, had it found other poses."""
+    """Replace the estimated poses."""
     refined = canonical_to_world(comparison.run.body, motion)
     return replace(comparison, run=replace(comparison.run, motion=motion, refined_canonical_to_world=refined))
 
 
 def with_scale(comparison: Comparison, factor: float) -> Comparison:
-    """The same run, had it taken the person for smaller and nearer."""
+    """Scale the estimated person and its distance."""
     run = comparison.run
     body = replace(run.body, joints_m=run.body.joints_m * factor, vertices=run.body.vertices * factor)
     avatar = replace(run.avatar, vertices=run.avatar.vertices * factor)
@@ -114,7 +121,7 @@ def with_scale(comparison: Comparison, factor: float) -> Comparison:
 
 
 def with_longer_focal(comparison: Comparison, factor: float) -> Comparison:
-    """The same run, had it taken the lens for longer and the person for as much farther away."""
+    """Scale the estimated focal length and the distance of the person."""
     camera, motion = comparison.run.camera, comparison.run.motion
     longer = replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
     turn, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
@@ -124,7 +131,7 @@ def with_longer_focal(comparison: Comparison, factor: float) -> Comparison:
 
 
 def with_raised_rest_arm(comparison: Comparison, angle_rad: float) -> Comparison:
-    """The same run on a rig whose A-pose has the left arm raised by an angle."""
+    """Replace the estimated rig by one whose A-pose has the left arm raised by an angle."""
     body, avatar = comparison.run.body, comparison.run.avatar
     turn = torch.eye(3).repeat(1, len(body.joint_names), 1, 1)
     turn[0, body.joint("LeftArm")] = axis_angle_to_matrix(torch.tensor([0.0, 0.0, angle_rad]))
@@ -136,7 +143,7 @@ def with_raised_rest_arm(comparison: Comparison, angle_rad: float) -> Comparison
 
 
 def bent_arm(comparison: Comparison, frames: np.ndarray, angle_rad: float) -> Motion:
-    """The motion with the left arm raised by an angle in some frames."""
+    """Return the motion with the left arm raised by an angle in some frames."""
     motion, joint = comparison.run.motion, comparison.run.body.joint("LeftArm")
     rotations = torch.from_numpy(motion.rotations_wxyz).clone()
     turn = axis_angle_to_quaternion(torch.tensor([0.0, 0.0, angle_rad]))

@@ -1,4 +1,4 @@
-"""The comparison with the truth: zero for the truth itself, and the right figure for known errors."""
+"""Scores of the frames and body stages: zero error for the ground truth itself, and known errors."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from data_tools.command import run_command
-from data_tools.evaluate.compare import _main as compare_command
-from data_tools.evaluate.compare import (
+from data_tools.evaluate.compare import main as compare_command
+from data_tools.evaluate.compare_body import (
     compare_body,
     compare_masks,
     compare_surface,
@@ -24,7 +24,7 @@ from pipeline.io.npz import save_npz
 
 @pytest.fixture
 def run(sample: Path, tmp_path: Path) -> Path:
-    """A run that found the truth, on every second frame."""
+    """A run with the ground truth as its result, on every second frame."""
     truth, rows = sample / "truth", np.array([0, 2, 4])
     (tmp_path / "frames" / "masks").mkdir(parents=True)
     (tmp_path / "body").mkdir()
@@ -38,7 +38,7 @@ def run(sample: Path, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_the_truth_has_no_error(sample: Path, run: Path) -> None:
+def test_ground_truth_has_no_error(sample: Path, run: Path) -> None:
     figures = compare_body(sample, run / "body")
     assert figures["joint_error_mm"] < 1e-3
     assert figures["scaled_joint_error_mm"] < 1e-3
@@ -53,8 +53,8 @@ def test_the_truth_has_no_error(sample: Path, run: Path) -> None:
     assert compare_masks(sample, run / "frames") == {"mask_iou_median": 1.0, "mask_iou_worst": 1.0}
 
 
-def test_a_person_of_half_the_size_at_half_the_distance(sample: Path, run: Path) -> None:
-    """The picture is the same, the scale is not: only the error that keeps the fitted scale sees it."""
+def test_person_of_half_the_size_at_half_the_distance(sample: Path, run: Path) -> None:
+    """The image is equal, the scale is not: only the error without scale alignment changes."""
     body, motion = load_body(run / "body" / "body.npz"), load_motion(run / "body" / "motion.npz")
     save_body(run / "body" / "body.npz", replace(body, joints_m=body.joints_m / 2, vertices=body.vertices / 2))
     save_motion(run / "body" / "motion.npz", motion.with_pose(motion.rotations_wxyz, motion.root_translation_m / 2))
@@ -65,8 +65,8 @@ def test_a_person_of_half_the_size_at_half_the_distance(sample: Path, run: Path)
     assert figures["scale_ratio"] == pytest.approx(0.5, abs=1e-4)
 
 
-def test_a_shift_moves_pixels_only(sample: Path, run: Path) -> None:
-    """10 cm sideways: f times 0.1 / depth in the picture, nothing after laying the hips over each other."""
+def test_translation_changes_only_the_reprojection_error(sample: Path, run: Path) -> None:
+    """10 cm sideways: f times 0.1 / depth in the image, zero after aligning the hips."""
     motion, camera = load_motion(run / "body" / "motion.npz"), load_camera(run / "body" / "camera.npz")
     shifted = motion.root_translation_m + np.array([0.1, 0.0, 0.0])
     save_motion(run / "body" / "motion.npz", motion.with_pose(motion.rotations_wxyz, shifted))
@@ -78,7 +78,7 @@ def test_a_shift_moves_pixels_only(sample: Path, run: Path) -> None:
     assert figures["joint_error_px"] == pytest.approx(expected_px, rel=0.05)
 
 
-def test_a_cut_mask_loses_its_share(sample: Path, run: Path) -> None:
+def test_iou_of_a_cropped_mask(sample: Path, run: Path) -> None:
     mask = load_true_mask(sample, 2)
     rows = np.flatnonzero((mask > 127).any(axis=1))
     half = np.where(np.arange(len(mask))[:, None] < rows.mean(), mask, 0).astype(np.uint8)
@@ -88,20 +88,20 @@ def test_a_cut_mask_loses_its_share(sample: Path, run: Path) -> None:
     assert figures["mask_iou_median"] == 1.0
 
 
-def test_the_bare_body_lies_on_itself_and_a_shift_is_taken_out(sample: Path, run: Path) -> None:
+def test_surface_distance_of_the_true_body_ignores_translation(sample: Path, run: Path) -> None:
     motion = load_motion(run / "body" / "motion.npz")
     save_motion(run / "body" / "motion.npz", motion.with_pose(motion.rotations_wxyz, motion.root_translation_m + 0.1))
     assert compare_surface(sample, run / "body")["surface_median_mm"] < 2.0
 
 
-def test_a_thinner_body_lies_beneath_the_true_one(sample: Path, run: Path) -> None:
+def test_surface_distance_of_a_thinner_body(sample: Path, run: Path) -> None:
     body = load_body(run / "body" / "body.npz")
     thin = body.vertices * np.array([1.0, 1.0, 0.8], dtype=np.float32)
     save_body(run / "body" / "body.npz", replace(body, vertices=thin))
     assert 5.0 < compare_surface(sample, run / "body")["surface_median_mm"] < 40.0
 
 
-def test_a_frame_with_crossed_knees_is_swapped() -> None:
+def test_frame_with_exchanged_knees_is_left_right_swapped() -> None:
     names = ["Hips", "LeftLeg", "RightLeg", "Head"]
     true = np.array([[0.0, 0, 0], [0.1, -0.5, 0], [-0.1, -0.5, 0], [0, 0.6, 0]])[None].repeat(3, 0)
     fitted = true + 0.02
@@ -109,23 +109,23 @@ def test_a_frame_with_crossed_knees_is_swapped() -> None:
     assert left_right_swapped_frames(names, fitted, true).tolist() == [False, True, False]
 
 
-def test_acceleration_of_a_fall_at_uneven_times() -> None:
+def test_acceleration_of_free_fall_at_non_uniform_times() -> None:
     time_s = np.array([0.0, 0.1, 0.15, 0.4, 0.5])
-    places = np.zeros((5, 1, 3))
-    places[:, 0, 1] = -0.5 * 9.81 * time_s**2
-    assert np.allclose(joint_accelerations(places, time_s), [0.0, -9.81, 0.0])
+    positions_m = np.zeros((5, 1, 3))
+    positions_m[:, 0, 1] = -0.5 * 9.81 * time_s**2
+    assert np.allclose(joint_accelerations(positions_m, time_s), [0.0, -9.81, 0.0])
 
 
-def test_the_run_of_another_capture_is_refused(sample: Path, run: Path) -> None:
+def test_run_of_another_capture_is_an_error(sample: Path, run: Path) -> None:
     motion = load_motion(run / "body" / "motion.npz")
     save_motion(run / "body" / "motion.npz", replace(motion, frame_index=motion.frame_index + 100))
-    with pytest.raises(UserError, match="is it its run"):
+    with pytest.raises(UserError, match="name the capture that this run was made from"):
         compare_body(sample, run / "body")
 
 
-def test_the_command(sample: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_prints_scores_of_finished_stages(sample: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_command(compare_command, [str(sample), str(run)]) == 2
-    assert "holds no finished stage" in capsys.readouterr().err
+    assert "has no finished stage" in capsys.readouterr().err
     for stage in ("frames", "body"):
         (run / stage / "manifest.json").write_text("{}")
     assert run_command(compare_command, [str(sample), str(run)]) == 0

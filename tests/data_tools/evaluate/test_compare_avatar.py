@@ -14,18 +14,16 @@ from scipy.spatial.transform import Rotation
 
 from data_tools.evaluate import compare_avatar
 from data_tools.evaluate.compare_avatar import (
-    Comparison,
     compare_heldout_images,
     compare_heldout_surfaces,
     compare_novel_poses,
     compare_novel_views,
     compare_rest_surfaces,
     compare_texture,
-    render_upper_bound,
-    retarget_motion,
-    unpose_true_vertices,
 )
+from data_tools.evaluate.comparison import Comparison, retarget_motion
 from data_tools.evaluate.truth import load_true_mask
+from data_tools.evaluate.upper_bound import render_upper_bound, unpose_true_vertices
 from pipeline.body.body import Body, Motion
 from pipeline.body.files import save_motion
 from pipeline.capture.frame_selection import HELDOUT, TRAIN
@@ -275,9 +273,9 @@ def test_a_frame_without_a_true_person_is_left_out_with_a_warning(
     take_warnings()
     assert compare_heldout_images(two)["mesh_true_mask"]["mask_iou"] > 0.98
     (warning,) = take_warnings()
-    assert "held-out frame 0 is not compared" in warning
+    assert "held-out frame 0 is not scored" in warning
     monkeypatch.setattr(compare_avatar, "load_true_mask", lambda out, frame: 0 * load_true_mask(out, frame))
-    with pytest.raises(UserError, match="no held-out frame can be compared"):
+    with pytest.raises(UserError, match="no held-out frame can be scored"):
         compare_heldout_images(two)
 
 

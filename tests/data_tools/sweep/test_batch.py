@@ -43,7 +43,7 @@ def rows(toy: Toy) -> dict[str, dict[str, str]]:
 
 def test_one_broken_video_stops_no_other(batch: Toy) -> None:
     sentence = batch.expect_user_error("data_tools.sweep.batch", "videos", "--preset", "quick")
-    assert "1 of 3 videos did not become an avatar (bob)" in sentence
+    assert "1 of 3 videos have no avatar (bob)" in sentence
     table = rows(batch)
     assert {name: row["status"] for name, row in table.items()} == OUTCOME
     assert "holds two, which is not a number" in table[BROKEN]["message"]
@@ -103,11 +103,11 @@ def test_the_table_alone_runs_nothing(batch: Toy) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("none",), ("none is no folder",)),
-        (("empty",), ("holds no video",)),
+        (("none",), ("none is not a folder",)),
+        (("empty",), ("contains no video",)),
         (("videos", "--preset", "quik"), ("default, quick",)),
         (("videos", "--set", "lern.steps=3"), ("did you mean learn?",)),
-        (("videos", "--jobs", "0"), ("at least 1",)),
+        (("videos", "--jobs", "0"), ("choose at least 1",)),
     ],
 )
 def test_a_mistake_is_one_sentence_before_any_run(batch: Toy, arguments: tuple[str, ...], words: tuple[str]) -> None:

@@ -17,7 +17,7 @@ from pipeline.core.errors import UserError
 from pipeline.core.manifest import Manifest, read_manifest
 from stages import STAGES
 from tests.core.toy_pipeline import Toy
-from tests.data_tools.ground_truth_run import write_fake_comparison
+from tests.data_tools.ground_truth_run import write_fake_comparison, write_fake_report
 from tests.test_resume import wait_for
 
 SWEEP = ("data_tools.sweep.chart", "numbers.mp4", "--presets", "quick", "default", "--out", "runs/chart")
@@ -104,12 +104,11 @@ def test_what_is_done_and_compared_is_not_done_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, forbid_runs: None
 ) -> None:
     trial = Trial(tmp_path / "ann", "quick", 0, tmp_path)
-    for folder in (trial.capture / "truth", trial.run_dir / "report"):
-        folder.mkdir(parents=True)
+    (trial.capture / "truth").mkdir(parents=True)
     monkeypatch.setattr("data_tools.sweep.chart_trials.read_run", lambda *_: finished(1.0, SCORES))
-    write_fake_comparison(trial.run_dir / "report")
+    write_fake_comparison(trial.run_dir)
     assert run_and_compare(trial, [trial]).status == "done"
-    (trial.run_dir / "report" / "truth.json").unlink()
+    (trial.run_dir / "compare" / "truth.json").unlink()
     with pytest.raises(pytest.fail.Exception, match="started"):
         run_and_compare(trial, [trial])
 
@@ -117,16 +116,16 @@ def test_what_is_done_and_compared_is_not_done_again(
 def test_a_comparison_that_fails_is_no_success(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The chart is drawn, and the command says what it lacks."""
     (tmp_path / "ann" / "truth").mkdir(parents=True)
-    report = tmp_path / "out" / "ann-default-0" / "report"
-    report.mkdir(parents=True)
+    run_dir = tmp_path / "out" / "ann-default-0"
+    write_fake_report(run_dir)
     monkeypatch.setattr("data_tools.sweep.chart_trials.read_run", lambda *_: finished(1.0, SCORES))
     broken = subprocess.CompletedProcess([], 1)
     monkeypatch.setattr("data_tools.sweep.chart_trials.subprocess.run", lambda *_, **__: broken)
     command = [str(tmp_path / "ann"), "--presets", "default", "--out", str(tmp_path / "out")]
-    with pytest.raises(UserError, match=r"1 of 1 runs are not compared with their truth \(ann-default-0\)"):
+    with pytest.raises(UserError, match=r"1 of 1 runs are not compared with their ground truth \(ann-default-0\)"):
         chart(command)
     assert (tmp_path / "out" / "chart.svg").is_file()
-    write_fake_comparison(report)
+    write_fake_comparison(run_dir)
     chart(command)
 
 
@@ -163,7 +162,7 @@ def test_built_in_captures_are_those_of_this_version(tmp_path: Path, monkeypatch
     settings.parent.mkdir(parents=True)
     for text in ("{}", f'{{"version": {CAPTURE_VERSION + 1}}}'):
         settings.write_text(text)
-        with pytest.raises(UserError, match="ann is of another version"):
+        with pytest.raises(UserError, match="ann was made by another version"):
             _make_sample_captures()
     settings.write_text(f'{{"version": {CAPTURE_VERSION}}}')
     _make_sample_captures()
@@ -178,7 +177,7 @@ def test_drawing_runs_nothing(tmp_path: Path, forbid_runs: None) -> None:
 
 @pytest.mark.parametrize("entry", ["ihm=600", "default", "default=many", "default=-3"])
 def test_steps_for_no_preset_are_refused(entry: str) -> None:
-    with pytest.raises(UserError, match=r"--steps .*: give PRESET=N with one of default"):
+    with pytest.raises(UserError, match=r"--steps .*: write PRESET=N with one of default"):
         chart(["none.mp4", "--presets", "default", "--steps", entry])
 
 

@@ -1,0 +1,130 @@
+"""A finished run and the ground truth of its synthetic capture, as loaded for a comparison."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from data_tools.evaluate.truth import load_ground_truth
+from data_tools.synthetic.rig.retarget import local_quaternions, retarget_rotations
+from data_tools.synthetic.scene.capture import SyntheticCapture
+from data_tools.synthetic.scene.renderer import pose_vertices
+from data_tools.synthetic.scene.shadow import find_exterior_faces
+from pipeline.avatar.finished_run import FinishedRun, load_finished_run
+from pipeline.body.body import Body, Motion, canonical_to_world
+from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.rotation import quaternion_to_matrix
+from pipeline.geometry.skinning import forward_kinematics
+from pipeline.io.image import to_float
+from pipeline.metrics.alignment import SimilarityTransform, align_surfaces_icp
+from pipeline.metrics.images import frame_scores
+from pipeline.texture.files import load_texture
+
+REQUIRED_STAGES = ("frames", "body", "field", "mesh", "texture")
+
+
+@dataclass(frozen=True)
+class ImagePair:
+    """A true image and the render of the avatar from the same camera.
+
+    Attributes:
+        truth: straight RGBA.
+        avatar: premultiplied RGBA in [0, 1].
+    """
+
+    truth: UInt8[np.ndarray, "h w 4"]
+    avatar: Float[np.ndarray, "h w 4"]
+
+    def scores(self) -> dict[str, float]:
+        """Return the scores of `frame_scores`."""
+        return frame_scores(self.avatar, self.truth[..., :3], self.truth[..., 3])
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A finished run and its ground truth.
+
+    Attributes:
+        coverage: of the texture, in [0, 1]; above 0.5 the texel was observed in the video.
+        folder: of the ground truth.
+    """
+
+    run: FinishedRun
+    coverage: Float[np.ndarray, "th tw"]
+    truth: SyntheticCapture
+    folder: Path
+
+    @cached_property
+    def rest_mesh(self) -> Mesh:
+        """The exterior of the avatar in the A-pose of the true rig."""
+        body, joints = self.truth.subject.body, len(self.truth.subject.body.joint_names)
+        identity_wxyz = np.tile(np.array([1.0, 0.0, 0.0, 0.0], dtype=np.float32), (1, joints, 1))
+        motion = Motion(np.zeros(1, np.int32), np.zeros(1), identity_wxyz, body.joints_m[:1])
+        return retarget_avatar_meshes(self, motion)[0]
+
+    @cached_property
+    def alignment(self) -> SimilarityTransform:
+        """The similarity from the avatar to the truth, both in the A-pose of the true rig."""
+        return align_surfaces_icp(self.rest_mesh, self.true_rest_mesh)
+
+    @cached_property
+    def true_rest_mesh(self) -> Mesh:
+        """The exterior of the true person in the A-pose."""
+        return Mesh(self.truth.subject.body.vertices, self._true_faces)
+
+    @cached_property
+    def _true_faces(self) -> Int[np.ndarray, "f 3"]:
+        return self.truth.subject.body.faces[find_exterior_faces(self.truth.subject.body.mesh())]
+
+    @cached_property
+    def _avatar_faces(self) -> Int[np.ndarray, "f 3"]:
+        return self.run.avatar.mesh().faces[find_exterior_faces(self.run.avatar.mesh())]
+
+    def true_surface(self, pose: Float[Tensor, "j 4 4"]) -> Mesh:
+        """Return the true person in one pose, with the faces that are exterior in the A-pose."""
+        return Mesh(pose_vertices(self.truth.subject, pose).numpy(), self._true_faces)
+
+    def avatar_surface(self, pose: Float[Tensor, "j 4 4"]) -> Mesh:
+        """Return the avatar in one pose, with the faces that are exterior in its A-pose."""
+        return Mesh(self.run.avatar.pose_vertices(pose).numpy(), self._avatar_faces)
+
+
+def load_comparison(out: Path, run: Path) -> Comparison:
+    """Read a run and the ground truth of its capture.
+
+    Raises:
+        UserError: a stage up to `texture` is not finished, or the ground truth is missing or damaged.
+    """
+    return Comparison(
+        run=load_finished_run({name: run / name for name in REQUIRED_STAGES}),
+        coverage=to_float(load_texture(run / "texture").coverage),
+        truth=load_ground_truth(out),
+        folder=out / "truth",
+    )
+
+
+def retarget_motion(body: Body, source_body: Body, motion: Motion) -> Motion:
+    """Retarget a motion from one rig to another so that limbs have equal directions, whatever the rest poses are.
+
+    Joints are matched by name; joints that the source rig lacks follow their parent.
+    """
+    recorded_joint_of = {name: source_body.joint(name) for name in body.joint_names if name in source_body.joint_names}
+    local = quaternion_to_matrix(torch.from_numpy(motion.rotations_wxyz).double())
+    rest_joints_m = torch.from_numpy(source_body.joints_m).double()
+    world = forward_kinematics(
+        local, torch.from_numpy(motion.root_translation_m).double(), rest_joints_m, source_body.parents
+    )
+    reference = (np.tile(np.eye(3), (len(rest_joints_m), 1, 1)), rest_joints_m.numpy())
+    rotations = retarget_rotations(body, recorded_joint_of, world[..., :3, :3].numpy(), reference, np.eye(3))
+    return motion.with_pose(local_quaternions(rotations, body.parents), motion.root_translation_m)
+
+
+def retarget_avatar_meshes(comparison: Comparison, motion: Motion) -> list[Mesh]:
+    """Return the avatar in all poses of a true motion; position and scale are not aligned."""
+    body = comparison.run.body
+    poses = canonical_to_world(body, retarget_motion(body, comparison.truth.subject.body, motion))
+    return [comparison.avatar_surface(pose) for pose in poses]
