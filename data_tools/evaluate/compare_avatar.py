@@ -28,7 +28,7 @@ from pipeline.io.image import read_rgba, to_uint8
 from pipeline.metrics.alignment import SimilarityTransform, align_surfaces_icp
 from pipeline.metrics.images import additional_blur_sigma_px, frame_scores, mean_scores, reason_not_scorable
 from pipeline.metrics.surfaces import sample_surface, surface_scores
-from stages.report import median_edge_spread_px, scored_positions
+from stages.report import median_edge_blur_px, scored_positions
 
 SURFACE_FRAMES = 4
 SURFACE_POINTS = 20_000
@@ -127,7 +127,7 @@ def compare_heldout_images(comparison: Comparison) -> dict[str, dict[str, float]
     """
     run = comparison.run
     rows: defaultdict[str, list[dict[str, float]]] = defaultdict(list)
-    blur_px = additional_blur_sigma_px(median_edge_spread_px(run))
+    blur_px = additional_blur_sigma_px(median_edge_blur_px(run))
     positions = scored_positions(run.capture)
     for position, upper_bound_rgba in zip(positions.tolist(), render_upper_bound(comparison, positions), strict=True):
         image, mask = (to_uint8(read(position)) for read in (run.capture.image, run.capture.mask))

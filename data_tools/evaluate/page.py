@@ -130,7 +130,7 @@ def _headline_metrics(document: Mapping[str, Any]) -> list[tuple[str, str, str]]
 
 def _row_images(title: str, image_pairs: Sequence[ImagePair]) -> list[tuple[str, str]]:
     """Return caption and image element of truth, avatar and error map, cropped to the person."""
-    images = []
+    images: list[tuple[str, str]] = []
     for number, image_pair in enumerate(image_pairs):
         box = foreground_bounding_box(foreground_mask(image_pair.truth[..., 3]))
         truth = composite_on_white(image_pair.truth[..., :3], image_pair.truth[..., 3])[box]
