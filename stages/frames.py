@@ -1,4 +1,4 @@
-"""frames: from a recording to the pictures that matter, each with the person's mask and 33 landmarks."""
+"""frames: detect the person in a recording and write selected images with alpha mattes and landmarks."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -27,26 +27,33 @@ _PEOPLE_COUNT_FRAMES = 6
 class Config(BaseConfig):
     """Options of the frames stage."""
 
-    max_frames: int = Field(200, ge=16, le=2000, description="Most frames that are kept (held-out ones included).")
-    min_frames: int = Field(16, ge=5, le=1000, description="Fewest frames with a person that a run goes on with.")
-    max_detection_frames: int = Field(900, ge=16, description="Most frames in which the person is looked for.")
-    max_side_px: int = Field(1280, ge=64, le=8192, description="Longer side of the stored images at most this, pixels.")
+    max_frames: int = Field(
+        200, ge=16, le=2000, description="maximum number of selected frames, held-out frames included"
+    )
+    min_frames: int = Field(16, ge=5, le=1000, description="minimum number of frames with a person")
+    max_detection_frames: int = Field(
+        900, ge=16, description="maximum number of frames in which the person is detected"
+    )
+    max_side_px: int = Field(1280, ge=64, le=8192, description="maximum longer side of the stored images, px")
     duplicate_threshold_noise_ratio: float = Field(
-        3.0, ge=0.0, le=100.0, description="Frames nearer than this to the last kept one are dropped, times the noise."
+        3.0,
+        ge=0.0,
+        le=100.0,
+        description="a frame is dropped if it differs from the last kept one by less than this multiple of the noise",
     )
     fps: float | None = Field(
-        None, gt=0.0, le=1000.0, description="Frames a second of a folder of images; null: 30. A video says its own."
+        None, gt=0.0, le=1000.0, description="frame rate of an image folder, 1/s; null: 30. A video has its own"
     )
-    workers: int = Field(2, ge=1, le=64, description="Processes that look for the person and sharpen masks.")
+    workers: int = Field(2, ge=1, le=64, description="processes for detection and matting")
 
 
 def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, float]:
-    """Find the person in all frames, choose frames, write images, masks, landmarks and a contact sheet."""
+    """Detect the person, select frames, and write images, masks, landmarks and a contact sheet."""
     source = open_frame_source(inputs["video"], config.fps or DEFAULT_IMAGE_FPS)
     if config.fps is not None and not source.files:
-        raise UserError(f"{source.path} is a video, which says its own frames a second; leave frames.fps out")
+        raise UserError(f"{source.path} is a video with a frame rate of its own; remove frames.fps")
     if source.n_frames < config.min_frames:
-        raise UserError(f"{source.path} has {source.n_frames} frames, too few: give at least {config.min_frames}")
+        raise UserError(f"{source.path} has {source.n_frames} frames; at least {config.min_frames} are needed")
     user_files = load_user_files(inputs["video"], source)
     with start_process_pool(config.workers) as workers:
         frame_indices = select_detection_frames(source, user_files, config)
@@ -59,7 +66,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
             chosen, n_duplicates = select_capture_frames(detections, source.path, config, noise)
         else:
             chosen, n_duplicates = select_listed_frames(detections, user_files.split, source.path), 0
-        # Colour noise of a small blurred patch is never below one level, whatever the small grey pictures say.
+        # The colour noise of a blurred patch is at least one level, whatever the grey thumbnails show.
         write_frames(source, user_files, detections, chosen, out, config.max_side_px, max(1.0, noise), workers)
     capture = make_capture(detections, chosen, out, source, user_files)
     save_capture(capture)
@@ -84,10 +91,10 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
 
 
 def select_detection_frames(source: FrameSource, user_files: UserFiles, config: Config) -> Sequence[int]:
-    """Indices of the frames in which the person is looked for: all that a supplied split lists, else evenly spread.
+    """Return the indices of frames for detection: those of a user-supplied split, else evenly spaced.
 
     Raises:
-        UserError: the split lists more frames than may be kept.
+        UserError: the split lists more frames than the option allows.
     """
     if user_files.split is None:
         return range(0, source.n_frames, detection_stride(source.n_frames, config.max_detection_frames))
@@ -101,13 +108,13 @@ def select_detection_frames(source: FrameSource, user_files: UserFiles, config: 
 
 
 def detection_stride(n_frames: int, max_detection_frames: int) -> int:
-    """The smallest odd step that looks at few enough frames; odd, so that every index modulo 8 occurs as often."""
+    """Return the smallest odd stride with few enough frames; odd, so that all indices modulo 8 are equally frequent."""
     stride = -(-n_frames // max_detection_frames)
     return stride + 1 - stride % 2
 
 
 def select_capture_frames(detections: Detections, path: Path, config: Config, noise: float) -> tuple[list[int], int]:
-    """Positions of the frames to keep, and how many were dropped as near-duplicates."""
+    """Return the positions of the selected frames and the number of near-duplicates that were dropped."""
     found = np.flatnonzero(detections.found)
     threshold = config.duplicate_threshold_noise_ratio * noise
     distinct, cumulative_motion = selection.find_distinct_frames(
@@ -127,17 +134,17 @@ def select_capture_frames(detections: Detections, path: Path, config: Config, no
 
 
 def select_listed_frames(detections: Detections, split: UserSplit, path: Path) -> list[int]:
-    """Positions of the frames that a supplied split lists and that show the person."""
+    """Return the positions of the frames of a user-supplied split in which the person was found."""
     kept = np.flatnonzero(detections.found)
     if len(np.unique(split.for_frames(detections.frame_index[kept]))) < 3:
-        raise UserError(f"no person was found in any frame of one kind in split.json of {path}; list other frames")
+        raise UserError(f"split.json of {path}: one of its lists has no frame with a person; list other frames")
     return [int(position) for position in kept]
 
 
 def make_capture(
     detections: Detections, chosen: list[int], out: Path, source: FrameSource, user_files: UserFiles
 ) -> Capture:
-    """Gather what is known about the chosen frames."""
+    """Collect the data of the selected frames."""
     frame_index = detections.frame_index[chosen]
     return Capture(
         folder=out,

@@ -1,4 +1,4 @@
-"""The empty scene behind a person who moves before a fixed camera, and what covers it. Pure functions."""
+"""Background plate of a static camera, and background subtraction. Pure functions."""
 
 from __future__ import annotations
 
@@ -8,37 +8,36 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-# A pixel is known when at least this many pictures show it without the person.
+# Minimum number of images that show a pixel without the person.
 _MIN_OBSERVATIONS = 3
-# Levels of 255 by which a pixel may differ from the plate: video noise and compression.
+# Maximum difference from the plate caused by video noise and compression, levels of 255.
 _MAX_PLATE_DIFFERENCE_LEVELS = 15.0
-# What is nearer to an unchanged pixel than this may be covered in part only: half of the width of a blurred outline.
+# Changed pixels closer than this to an unchanged one may be covered partly: half of the width of a blurred outline.
 _EROSION_RADIUS_PX = 2
-# A shadow leaves at least this share of the light.
+# Minimum ratio of shadowed to unshadowed colour.
 _MIN_SHADOW_RATIO = 0.4
-# When more of the scene away from the person differs, the camera or the light has moved.
+# Above this changed fraction of the background, the camera or the light has moved.
 _MAX_CHANGED_FRACTION = 0.05
 
 
 class BackgroundPlate(NamedTuple):
-    """The scene without the person; `colour` means nothing where it is not `known`."""
+    """The scene without the person. `colour` is undefined where `known` is false."""
 
     colour: UInt8[np.ndarray, "h w 3"]
     known: Bool[np.ndarray, "h w"]
 
     def window(self, rows: slice, columns: slice) -> BackgroundPlate:
-        """A part of it."""
+        """Return a crop of the plate."""
         return BackgroundPlate(self.colour[rows, columns], self.known[rows, columns])
 
 
 def estimate_background_plate(
     images: UInt8[np.ndarray, "t h w 3"], person_masks: Bool[np.ndarray, "t h w"]
 ) -> BackgroundPlate:
-    """The median over time, for each pixel and channel, of the pictures that do not show the person there.
+    """Return the median over time, per pixel and channel, of the images that do not show the person there.
 
-    `person_masks` must be generous; where it misses the person in less than half of the pictures the median forgives
-    it.
-    `images` is overwritten, because it is large.
+    images: overwritten (sorted in place), because the array is large.
+    person_masks: dilated masks; misses are tolerated in less than half of the images.
     """
     images[person_masks] = 255
     images.sort(axis=0)
@@ -51,10 +50,10 @@ def estimate_background_plate(
 def subtract_background(
     rgb: UInt8[np.ndarray, "h w 3"], plate: BackgroundPlate, dilated_person: Bool[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Pixels whose colour, and whose neighbours' colours, neither the plate nor a shadow on it explains.
+    """Return the pixels that neither the plate nor a shadow on it explains, eroded by the width of a blurred outline.
 
-    A shadow scales the plate's colour. Neighbours count so that pixels that the person covers in part are left out.
-    Nothing is covered when the scene away from `dilated_person` has changed as well: the camera has moved.
+    A shadow scales the colour of the plate. Returns no pixel if the scene outside `dilated_person` has changed as well,
+    because then the camera has moved.
     """
     changed = _differs_from_plate(rgb, plate)
     share = _changed_background_fraction(changed, plate, dilated_person)
@@ -69,9 +68,9 @@ def subtract_background(
 def detect_scene_changes(
     images: UInt8[np.ndarray, "t h w 3"], person_masks: Bool[np.ndarray, "t h w"]
 ) -> Bool[np.ndarray, "t"]:
-    """Pictures that show another scene than the rest: there the camera, or the light, has moved.
+    """Return which images show another background than the others: the camera or the light has moved.
 
-    `person_masks` must be generous.
+    person_masks: dilated masks of the person.
     """
     plate = estimate_background_plate(images.copy(), person_masks)
     pairs = zip(images, person_masks, strict=True)
@@ -84,7 +83,7 @@ def detect_scene_changes(
 
 
 def _differs_from_plate(rgb: UInt8[np.ndarray, "h w 3"], plate: BackgroundPlate) -> Bool[np.ndarray, "h w"]:
-    """Pixels whose colour neither the plate nor a shadow on it explains."""
+    """Return the pixels whose colour neither the plate nor a shadow on it explains."""
     image, colour = rgb.astype(np.float32), plate.colour.astype(np.float32)
     ones = np.ones((1, 3), dtype=np.float32)
     shading_ratio = cv2.transform(image * colour, ones) / np.maximum(cv2.transform(colour * colour, ones), 1.0)
@@ -95,6 +94,6 @@ def _differs_from_plate(rgb: UInt8[np.ndarray, "h w 3"], plate: BackgroundPlate)
 def _changed_background_fraction(
     changed: Bool[np.ndarray, "h w"], plate: BackgroundPlate, dilated_person: Bool[np.ndarray, "h w"]
 ) -> float:
-    """How much of the known scene away from the person has changed; nan where none is known."""
+    """Return the changed fraction of the known background away from the person; nan if none is known."""
     away = plate.known & ~dilated_person
     return float(changed[away].mean()) if away.any() else float("nan")

@@ -1,4 +1,4 @@
-"""The artifact of the `frames` stage, and the one reader of it that all later stages use."""
+"""The artifact of the `frames` stage, with the one writer and the one reader that all stages use."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -19,18 +19,17 @@ _INTRINSICS = ("camera_fx", "camera_fy", "camera_cx", "camera_cy")
 
 @dataclass(frozen=True)
 class Capture:
-    """The chosen frames of a recording: n frames, all of one size.
+    """The selected frames of a recording: n frames of one size, undistorted.
 
-    frame_index: index in the whole recording; time_s: since its first frame.
-    split: 0 train, 1 validation, 2 held out (`pipeline.capture.frame_selection.assign_splits`, or supplied with the
-    video).
-    landmarks_px: MediaPipe's 33 points, pixel centres at +0.5; nan where unknown. Visibility in [0, 1].
-    landmarks_world_m: metres about the hips' centre in camera axes; nan where unknown.
-    camera: what was supplied with the video, for these images; None when unknown.
-    recorded_focal_px: focal length in these images by the recording's own metadata; None when they say nothing.
-    hands: both hands in every frame; None where they were not looked for.
-    scale: size of these images relative to the recording's. Images are undistorted.
-    smpl_poses: what others fitted to some of these frames; None when nothing was supplied.
+    frame_index: index in the recording. time_s: since the first frame of the recording.
+    split: 0 train, 1 validation, 2 held out (`pipeline.capture.frame_selection.assign_splits`, or user-supplied).
+    landmarks_px: MediaPipe's 33 landmarks, pixel centres at +0.5; nan where unknown. Visibility in [0, 1].
+    landmarks_world_m: relative to the centre of the hips, in camera axes; nan where unknown.
+    camera: user-supplied camera for these images; None if unknown.
+    scale: size of these images relative to the recording.
+    metadata_focal_px: focal length for these images from the metadata of the recording; None if there is none.
+    hands: landmarks of both hands in every frame; None if they were not detected.
+    smpl_poses: user-supplied SMPL poses of some of these frames; None without.
     """
 
     folder: Path
@@ -55,32 +54,32 @@ class Capture:
         return len(self.frame_index)
 
     def positions(self, split: int | np.integer) -> Int[np.ndarray, "k"]:
-        """Positions (0..n-1) of the frames of one split."""
+        """Return the positions (0..n-1) of the frames of one split."""
         return np.flatnonzero(self.split == split)
 
     def image(self, position: int | np.integer) -> Float[np.ndarray, "h w 3"]:
-        """Colours of the frame at this position (not its index in the recording), sRGB in [0, 1]."""
+        """Read the image at a position (not an index of the recording), sRGB in [0, 1]."""
         return to_float(read_rgb(image_path(self.folder, self.frame_index[position])))
 
     def mask(self, position: int | np.integer) -> Float[np.ndarray, "h w"]:
-        """Alpha of the person in [0, 1], soft along the outline."""
+        """Read the alpha matte of the person at a position, in [0, 1]."""
         return to_float(read_gray(mask_path(self.folder, self.frame_index[position])))
 
 
 def image_path(folder: Path, frame_index: int | np.integer) -> Path:
-    """Where the picture with this index in the recording lies."""
+    """Return the path of an image by its index in the recording."""
     return folder / IMAGES_FOLDER / f"{frame_index:06d}.png"
 
 
 def mask_path(folder: Path, frame_index: int | np.integer) -> Path:
-    """Where its mask lies."""
+    """Return the path of a mask by its index in the recording."""
     return folder / MASKS_FOLDER / f"{frame_index:06d}.png"
 
 
 def save_capture(capture: Capture) -> None:
-    """Write `frames.npz`, and `smpl_poses.npz` where there are poses, into the capture's folder.
+    """Write `frames.npz`, and `smpl_poses.npz` if there are poses, into the folder of the capture.
 
-    Images and masks are written beside it as they are made.
+    Images and masks are written separately, while they are computed.
     """
     camera = capture.camera
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy) if camera else (np.nan,) * 4
@@ -110,9 +109,10 @@ def save_capture(capture: Capture) -> None:
 
 
 def load_capture(frames_dir: Path) -> Capture:
-    """Read what the `frames` stage made; images and masks are read when they are asked for.
+    """Read the artifact of the `frames` stage; images and masks are read on access.
 
-    Raises UserError when the folder holds no readable `frames.npz`.
+    Raises:
+        UserError: the folder holds no readable `frames.npz`.
     """
     arrays = load_npz(frames_dir / FRAMES_NPZ)
     poses_path = frames_dir / SMPL_POSES_NPZ

@@ -1,4 +1,4 @@
-"""One picture that lets a person judge all masks and landmarks at a glance."""
+"""Contact sheet of masks and landmarks, for inspection by eye."""
 
 import cv2
 import numpy as np
@@ -6,8 +6,8 @@ from jaxtyping import UInt8
 
 from pipeline.capture.capture import Capture
 from pipeline.capture.frame_selection import HELDOUT, VALIDATION
+from pipeline.capture.landmarks import POSE_CONNECTIONS
 from pipeline.capture.matting import inner_boundary
-from pipeline.capture.person_detector import POSE_CONNECTIONS
 from pipeline.io.image import to_uint8
 
 _TILE_HEIGHT_PX, _COLUMNS, _ROWS = 320, 8, 3
@@ -16,7 +16,7 @@ _SPLIT_SIGN = {HELDOUT: " held out", VALIDATION: " validation"}
 
 
 def contact_sheet(capture: Capture) -> UInt8[np.ndarray, "h w 3"]:
-    """Up to 24 frames evenly over the capture: outline of the mask, bones (left blue, right orange), frame index."""
+    """Draw up to 24 evenly spaced frames with mask outline, bones (left blue, right orange) and frame index."""
     positions = np.unique(np.linspace(0, len(capture) - 1, _COLUMNS * _ROWS).astype(int))
     tiles = [_tile(capture, int(position)) for position in positions]
     width = max(tile.shape[1] for tile in tiles)
@@ -27,7 +27,7 @@ def contact_sheet(capture: Capture) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def _tile(capture: Capture, position: int) -> UInt8[np.ndarray, "h w 3"]:
-    """One frame, cut to the person and drawn on."""
+    """Crop one frame to the person and draw outline, bones and index on it."""
     image, body = to_uint8(capture.image(position)), capture.mask(position) > 0.5
     top, bottom, left, right = _box(body)
     scale = _TILE_HEIGHT_PX / (bottom - top)
@@ -46,7 +46,7 @@ def _tile(capture: Capture, position: int) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def _box(body: np.ndarray) -> tuple[int, int, int, int]:
-    """Top, bottom, left, right of the person with a margin of 5 % of its height; the whole image without a person."""
+    """Return (top, bottom, left, right) of the person with a 5 % margin; the whole image without a person."""
     if not body.any():
         return 0, body.shape[0], 0, body.shape[1]
     rows, columns = np.flatnonzero(body.any(axis=1)), np.flatnonzero(body.any(axis=0))

@@ -1,4 +1,4 @@
-"""The two walks through a recording: look for the person in every frame, then write the chosen frames with masks."""
+"""Two passes over a recording: detect the person in the frames, then write the selected frames with their masks."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from pipeline.capture.background_plate import BackgroundPlate, estimate_background_plate
 from pipeline.capture.capture import IMAGES_FOLDER, MASKS_FOLDER, image_path, mask_path
 from pipeline.capture.hand_detector import HandDetector, HandLandmarks, stack_hands, undetected_hands
+from pipeline.capture.landmarks import N_LANDMARKS
 from pipeline.capture.matting import (
     decontaminate_colours,
     definite_background,
@@ -22,24 +23,24 @@ from pipeline.capture.matting import (
 )
 from pipeline.capture.person_detector import PersonDetector
 from pipeline.capture.process_pool import ProcessPool
-from pipeline.capture.user_files import N_LANDMARKS, UserFiles
+from pipeline.capture.user_files import UserFiles
 from pipeline.capture.video import Frame, FrameSource, read_frames
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track
 from pipeline.io.image import to_uint8, write_gray, write_rgb
 
-# Longer side of the small grey pictures on which frames are compared.
+# Longer side of the grey thumbnails with which frames are compared.
 _THUMBNAIL_SIDE_PX = 320
-# Mask level of 255 from which a pixel counts as the person there.
+# Minimum mask level of a pixel of the person in a thumbnail.
 _MIN_PERSON_LEVEL = 100
-# A mask shows the person when it has this share of the usual area: specks of a supplied mask are nobody.
+# Minimum mask area relative to the median; smaller masks are specks.
 _MIN_RELATIVE_AREA = 0.1
-# Most pictures that the empty scene is put together from; they are in memory at the same time.
+# Maximum number of images of the background estimate; all are in memory at once.
 _MAX_PLATE_FRAMES = 32
 
 
 class _FrameDetection(NamedTuple):
-    """What one frame shows; `mask_png` is empty where masks are supplied."""
+    """Detections in one frame; `mask_png` is empty if masks are user-supplied."""
 
     gray: UInt8[np.ndarray, "h w"]
     person: Bool[np.ndarray, "h w"]
@@ -51,10 +52,11 @@ class _FrameDetection(NamedTuple):
 
 @dataclass(frozen=True)
 class Detections:
-    """All frames that were looked at, n of them, in order.
+    """Detections in n frames, in order.
 
-    found: the mask shows the person, who may have no landmarks when masks are supplied.
-    grays, persons: small pictures and person masks; masks_png: the detector's soft masks, PNG-encoded to save memory.
+    found: the mask shows the person (without landmarks if masks are user-supplied).
+    gray_thumbnails, person_masks: small images and binary masks.
+    masks_png: soft masks of the detector, PNG-encoded to save memory.
     landmarks and hands as in `Capture`, nan where unknown. n_people: -1 where people were not counted.
     """
 
@@ -82,10 +84,10 @@ def detect_in_frames(
     max_side_px: int,
     workers: ProcessPool,
 ) -> Detections:
-    """Find the person in the frames `frame_indices`; in `n_people_count_frames` of them, evenly spread, count the
-    people.
+    """Detect the person in the frames `frame_indices`, and count people in `n_people_count_frames` of them.
 
-    Raises UserError when the recording yields no frame.
+    Raises:
+        UserError: the recording yields no frame.
     """
     people_count_indices = (
         {frame_indices[int(k)] for k in np.linspace(0, len(frame_indices) - 1, n_people_count_frames)}
@@ -105,25 +107,25 @@ def detect_in_frames(
             yield frame.rgb, mask, needs_landmarks, frame.index in people_count_indices
 
     frame_detections = list(
-        track(workers.map(_detect_in_frame, tasks()), "looking for the person", total=len(frame_indices))
+        track(workers.map(_detect_in_frame, tasks()), "detecting the person", total=len(frame_indices))
     )
     if not frame_detections:
-        raise UserError(f"{source.path} has no frame that can be read; give another video")
+        raise UserError(f"{source.path} has no readable frame; use another video")
     height, width, scale = shape[0]
     landmarks = _landmarks(frame_detections, np.array([index for index, _ in seen]), user_files, scale)
-    person_masks = np.stack([look.person for look in frame_detections])
+    person_masks = np.stack([detection.person for detection in frame_detections])
     return Detections(
         frame_index=np.array([index for index, _ in seen], dtype=np.int32),
         time_s=np.array([time_s for _, time_s in seen]),
         found=_is_person_visible(person_masks),
-        n_people=np.array([look.n_people for look in frame_detections], dtype=np.int32),
-        gray_thumbnails=np.stack([look.gray for look in frame_detections]),
+        n_people=np.array([detection.n_people for detection in frame_detections], dtype=np.int32),
+        gray_thumbnails=np.stack([detection.gray for detection in frame_detections]),
         person_masks=person_masks,
         landmarks_px=landmarks[..., :2],
         landmarks_visibility=np.nan_to_num(landmarks[..., 2]),
         landmarks_world_m=landmarks[..., 3:],
-        hands=stack_hands([look.hands for look in frame_detections]),
-        masks_png=tuple(look.mask_png for look in frame_detections),
+        hands=stack_hands([detection.hands for detection in frame_detections]),
+        masks_png=tuple(detection.mask_png for detection in frame_detections),
         width=width,
         height=height,
         scale=scale,
@@ -140,10 +142,10 @@ def write_frames(
     noise: float,
     workers: ProcessPool,
 ) -> None:
-    """Write the picture and the mask of the sightings at `positions` into `out`.
+    """Write image and mask of the detections at `positions` into `out`.
 
-    A supplied mask is written as it is; the detector's is steadied with its neighbours in time and sharpened. Where the
-    mask is soft the picture holds the person's colour alone.
+    User-supplied masks are written unchanged. Masks of the detector are smoothed over neighbouring frames and refined
+    to alpha mattes. Pixels with partial alpha get the estimated foreground colour.
     """
     plate = (
         None if user_files.read_mask is not None else estimate_background(source, user_files, detections, max_side_px)
@@ -165,14 +167,14 @@ def write_frames(
                 yield images, masks, out, near[centre].index, centre, noise, plate
 
     function = _write_frame if user_files.read_mask is not None else _write_matted_frame
-    for _ in track(workers.map(function, tasks()), "sharpening masks", total=len(wanted)):
+    for _ in track(workers.map(function, tasks()), "refining masks", total=len(wanted)):
         pass
 
 
 def estimate_background(
     source: FrameSource, user_files: UserFiles, detections: Detections, max_side_px: int
 ) -> BackgroundPlate:
-    """The empty scene, from pictures that are spread evenly over the recording; masks must come from the detector."""
+    """Return the background plate from evenly spaced images; masks must come from the detector."""
     found = np.flatnonzero(detections.found)
     sampled = found[np.unique(np.linspace(0, len(found) - 1, _MAX_PLATE_FRAMES).astype(int))]
     is_taken = set(detections.frame_index[sampled].tolist()).__contains__
@@ -185,7 +187,7 @@ def estimate_background(
 def read_undistorted_frames(
     source: FrameSource, user_files: UserFiles, is_wanted: Callable[[int], bool], max_side_px: int
 ) -> Iterator[Frame]:
-    """The recording's frames with the supplied camera's lens distortion taken out."""
+    """Yield the frames of the recording without the lens distortion of the user-supplied camera."""
     for frame in read_frames(source, is_wanted, max_side_px):
         if user_files.camera is None:
             yield frame
@@ -194,7 +196,11 @@ def read_undistorted_frames(
 
 
 def read_user_mask(user_files: UserFiles, frame: Frame) -> UInt8[np.ndarray, "h w"] | None:
-    """The user's mask for a frame at the frame's size, lens distortion taken out; None when none was given."""
+    """Return the user-supplied mask of a frame at the frame's size, undistorted; None if there are none.
+
+    Raises:
+        UserError: the mask has another aspect ratio than the frame.
+    """
     if user_files.read_mask is None:
         return None
     mask = user_files.read_mask(frame.index)
@@ -202,7 +208,7 @@ def read_user_mask(user_files: UserFiles, frame: Frame) -> UInt8[np.ndarray, "h 
     if abs(mask.shape[0] / mask.shape[1] - height / width) > 0.01 * height / width:
         raise UserError(
             f"the mask of frame {frame.index} in {user_files.mask_source} is {mask.shape[1]}x{mask.shape[0]}, "
-            f"the frame is {width}x{height}; give masks of the frames' shape"
+            f"the frame is {width}x{height}; supply masks with the aspect ratio of the frames"
         )
     mask = cv2.resize(mask, (width, height), interpolation=cv2.INTER_AREA)
     return mask if user_files.camera is None else user_files.camera.undistort(mask[..., None], frame.scale)[..., 0]
@@ -210,12 +216,13 @@ def read_user_mask(user_files: UserFiles, frame: Frame) -> UInt8[np.ndarray, "h 
 
 @cache
 def _detector() -> PersonDetector:
-    """One detector a process; loading it takes seconds."""
+    """Return the detector of this process; loading takes seconds."""
     return PersonDetector()
 
 
 @cache
 def _hand_detector() -> HandDetector:
+    """Return the hand detector of this process."""
     return HandDetector()
 
 
@@ -225,7 +232,7 @@ def _detect_in_frame(
     needs_landmarks: bool,
     needs_people_count: bool,
 ) -> _FrameDetection:
-    """Runs in a worker: find the person in one frame."""
+    """Detect the person in one frame (runs in a worker process)."""
     detection = _detector().detect(rgb) if needs_landmarks or mask is None else None
     n_people = _detector().count_people(rgb) if needs_people_count and mask is None else -1
     factor = min(1.0, _THUMBNAIL_SIDE_PX / max(rgb.shape[:2]))
@@ -237,7 +244,9 @@ def _detect_in_frame(
             [detection.landmarks_px, detection.visibility[:, None], detection.landmarks_world_m], axis=1
         )
     if detection is not None and needs_landmarks:
-        hands = _hand_detector().look(rgb, detection.landmarks_px, detection.visibility, detection.landmarks_world_m)
+        hands = _hand_detector().detect_hands(
+            rgb, detection.landmarks_px, detection.visibility, detection.landmarks_world_m
+        )
     if mask is None and detection is not None:
         mask = detection.mask
         mask_png = cv2.imencode(".png", mask, (cv2.IMWRITE_PNG_COMPRESSION, 1))[1].tobytes()
@@ -250,9 +259,11 @@ def _detect_in_frame(
 def _landmarks(
     frame_detections: Sequence[_FrameDetection], frame_index: Int[np.ndarray, "n"], user_files: UserFiles, scale: float
 ) -> Float[np.ndarray, "n 33 6"]:
-    """Pixel position, visibility and world position of all landmarks, as supplied or else detected; nan: unknown."""
+    """Return pixel position, visibility and world position of all landmarks (user-supplied or detected); else nan."""
     missing = np.full((N_LANDMARKS, 6), np.nan, dtype=np.float32)
-    landmarks = np.stack([missing if look.landmarks is None else look.landmarks for look in frame_detections])
+    landmarks = np.stack(
+        [missing if detection.landmarks is None else detection.landmarks for detection in frame_detections]
+    )
     user_landmarks = user_files.landmarks
     if user_landmarks is None:
         return landmarks
@@ -266,14 +277,14 @@ def _landmarks(
 
 
 def _is_person_visible(person_masks: Bool[np.ndarray, "n h w"]) -> Bool[np.ndarray, "n"]:
-    """Whose mask has more than specks, beside the median area of those that have anything."""
+    """Return which masks are larger than specks, relative to the median area of the masks that are not empty."""
     area_px = person_masks.sum(axis=(1, 2))
     median_area_px = np.median(area_px[area_px > 0]) if area_px.any() else 0.0
     return (area_px > 0) & (area_px >= _MIN_RELATIVE_AREA * median_area_px)
 
 
 def _temporal_neighbours(position: int, detections: Detections) -> list[int]:
-    """The position and those beside it, where a person was found."""
+    """Return the position and its neighbours in time in which a person was found."""
     neighbours = range(max(0, position - 1), min(len(detections.found), position + 2))
     return [p for p in neighbours if p == position or detections.found[p]]
 
@@ -281,7 +292,7 @@ def _temporal_neighbours(position: int, detections: Detections) -> list[int]:
 def _temporal_windows(
     frames: Iterable[Frame], detections: Detections, wanted: set[int]
 ) -> Iterator[tuple[int, list[Frame]]]:
-    """For each wanted position, in order: its frame and those of its neighbours, as soon as they have been read."""
+    """Yield each wanted position in order with its frame and the frames of its neighbours, as soon as they are read."""
     buffered: dict[int, Frame] = {}
     pending = sorted(wanted)
     for frame in frames:
@@ -308,7 +319,7 @@ def _write_matted_frame(
     noise: float,
     plate: BackgroundPlate,
 ) -> None:
-    """Runs in a worker: the finished mask of one frame."""
+    """Compute and write the matte of one frame (runs in a worker process)."""
     masks = np.stack([_decode_mask(data) for data in masks_png])
     mask = extend_mask_on_uniform_background(images[centre], smooth_mask_temporally(images, masks, centre, noise))
     alpha = estimate_alpha_matte(images[centre], mask, plate)

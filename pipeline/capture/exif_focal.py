@@ -1,6 +1,6 @@
-"""The focal length that a camera wrote into its files: EXIF of JPEG and TIFF images, QuickTime metadata of videos.
+"""Focal length from metadata: EXIF of JPEG and TIFF images, QuickTime metadata of videos.
 
-Both are given as for 35 mm film. After EXIF 2.3 (tag 0xA405) the two pictures have equal diagonals.
+Both store the 35 mm equivalent. According to EXIF 2.3 (tag 0xA405) images of equal diagonals are compared.
 """
 
 import struct
@@ -20,9 +20,9 @@ _ENTRY_BYTES = 12
 
 
 def metadata_focal_px(source: FrameSource, width_px: int, height_px: int) -> float | None:
-    """Focal length in pixels of pictures of this size, by the recording's own metadata; None where it says nothing.
+    """Return the focal length from the recording's metadata in pixels of images of this size; None if there is none.
 
-    Videos are often cut out of the sensor after the lens was noted (stabilisation), so it is good to about a tenth.
+    Video stabilisation often crops the sensor after the value was stored, so it is accurate to about a tenth.
     """
     focal_35mm_mm = _exif_focal_35mm_mm(source.files[0]) if source.files else _quicktime_focal_35mm_mm(source.path)
     if focal_35mm_mm is None or focal_35mm_mm <= 0.0:
@@ -41,7 +41,7 @@ def _quicktime_focal_35mm_mm(path: Path) -> float | None:
 
 
 def _exif_focal_35mm_mm(path: Path) -> float | None:
-    """Millimetres; None also for damaged metadata, which is no reason to refuse a picture."""
+    """Return millimetres; None also for damaged metadata, which is no reason to refuse an image."""
     with path.open("rb") as file:
         tiff = _tiff_block(file.read(_HEADER_BYTES))
     try:
@@ -55,7 +55,7 @@ def _exif_focal_35mm_mm(path: Path) -> float | None:
 
 
 def _tiff_block(header: bytes) -> bytes:
-    """The TIFF structure of a file's beginning: the whole of a TIFF file, the APP1 segment of a JPEG; else empty."""
+    """Return the TIFF structure of a file: all of a TIFF file, or the APP1 segment of a JPEG; else empty."""
     if not header.startswith(b"\xff\xd8"):
         return header
     offset = 2
@@ -68,7 +68,7 @@ def _tiff_block(header: bytes) -> bytes:
 
 
 def _ifd_entries(tiff: bytes, byte_order: str, offset: int) -> Iterator[tuple[int, int]]:
-    """(tag, value) of a directory's entries that hold one whole number."""
+    """Yield (tag, value) of the directory entries that hold one integer."""
     (count,) = struct.unpack_from(byte_order + "H", tiff, offset)
     for start in range(offset + 2, offset + 2 + _ENTRY_BYTES * count, _ENTRY_BYTES):
         tag, kind, size = struct.unpack_from(byte_order + "HHI", tiff, start)

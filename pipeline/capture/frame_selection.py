@@ -1,31 +1,34 @@
-"""Which frames of a recording are worth keeping. Pure functions on small grey pictures and landmarks.
+"""Selection and splits of frames. Pure functions on grey thumbnails and landmarks.
 
-The split is fixed by a frame's index in the whole recording, so that it does not move when the choice does; a split
-that the user supplies (`pipeline.capture.user_files`) takes the place of both.
+The split depends on the index of a frame in the recording only, so it does not change with the selection. A
+user-supplied split (`pipeline.capture.user_files`) replaces both.
 """
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from pipeline.capture.landmarks import TORSO
+
 TRAIN, VALIDATION, HELDOUT = 0, 1, 2
 SPLIT_PERIOD = 8
 VALIDATION_PHASE = 4
-# Mean absolute difference of two pictures of the same thing when rounding to whole levels is the only noise:
+# Mean absolute difference of two images of the same scene when rounding to integer levels is the only noise:
 # E|round(a + e1) - round(a + e2)| with independent uniform dither = 1/3.
 _QUANTISATION_NOISE = 1.0 / 3.0
 _BLOCK_PX = 16
 
 
 def assign_splits(frame_index: Int[np.ndarray, "n"]) -> UInt8[np.ndarray, "n"]:
-    """HELDOUT for indices divisible by eight, VALIDATION for index = 4 modulo 8, TRAIN for the rest."""
+    """Return HELDOUT for indices divisible by eight, VALIDATION for index = 4 modulo 8, TRAIN for all others."""
     phase = frame_index % SPLIT_PERIOD
     return np.select([phase == 0, phase == VALIDATION_PHASE], [HELDOUT, VALIDATION], TRAIN).astype(np.uint8)
 
 
 def estimate_noise_level(gray_thumbnails: UInt8[np.ndarray, "n h w"]) -> float:
-    """Mean absolute difference, in levels of 255, between successive pictures where nothing moves.
+    """Return the mean absolute difference between successive images where nothing moves, levels of 255.
 
-    Each pair's calmest quarter of 16 x 16 blocks counts as still; the median over pairs, at least the rounding noise.
+    For each pair the calmest quarter of 16 x 16 blocks is static; the result is the median over pairs, at least the
+    rounding noise.
     """
     levels = []
     for first, second in zip(gray_thumbnails[:-1], gray_thumbnails[1:], strict=True):
@@ -41,7 +44,7 @@ def estimate_noise_level(gray_thumbnails: UInt8[np.ndarray, "n h w"]) -> float:
 def mean_absolute_difference(
     first: UInt8[np.ndarray, "h w"], second: UInt8[np.ndarray, "h w"], person: Bool[np.ndarray, "h w"]
 ) -> float:
-    """Mean absolute difference of two grey pictures on the person's pixels, in levels of 255."""
+    """Return the mean absolute difference of two grey images on the pixels of the person, levels of 255."""
     if not person.any():
         return 0.0
     return float(np.abs(first.astype(np.float32) - second)[person].mean())
@@ -50,10 +53,10 @@ def mean_absolute_difference(
 def find_distinct_frames(
     gray_thumbnails: UInt8[np.ndarray, "n h w"], person_masks: Bool[np.ndarray, "n h w"], threshold: float
 ) -> tuple[Bool[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Which frames differ from the last kept one by more than `threshold`, and how far the person has moved so far.
+    """Return which frames differ from the last kept one by more than `threshold`, and the cumulative motion.
 
-    The way is the sum of the changes between kept frames (levels of 255); a dropped frame has the way of the one that
-    was kept before it.
+    Cumulative motion is the sum of differences between kept frames (levels of 255); a dropped frame has the value of
+    the kept frame before it.
     """
     keep = np.zeros(len(gray_thumbnails), dtype=bool)
     cumulative_motion = np.zeros(len(gray_thumbnails), dtype=np.float64)
@@ -69,10 +72,10 @@ def find_distinct_frames(
 def select_frames_by_motion(
     frame_index: Int[np.ndarray, "n"], cumulative_motion: Float[np.ndarray, "n"], max_frames: int
 ) -> Bool[np.ndarray, "n"]:
-    """At most `max_frames` frames, evenly along the person's way, an eighth each held out and for validation.
+    """Select at most `max_frames` frames at equal steps of cumulative motion, an eighth each held out and validation.
 
-    Evenly along the way instead of in time: a slow part of a turn gets no more frames than a fast one. Each split is
-    spread over the whole way by itself, its first and last frame included.
+    Equal steps of motion instead of time: a slow part of a turn gets no more frames than a fast one. Each split covers
+    the whole motion by itself, including its first and last frame.
     """
     chosen = np.zeros(len(frame_index), dtype=bool)
     split = assign_splits(frame_index)
@@ -85,16 +88,17 @@ def select_frames_by_motion(
 
 
 def body_yaw_rad(landmarks_world_m: Float[np.ndarray, "n 33 3"]) -> Float[np.ndarray, "n"]:
-    """Turn of the torso about the vertical: 0 facing the camera, pi / 2 when the person's left side has gone away.
+    """Return the yaw of the torso: 0 facing the camera, pi / 2 with the left side away from the camera.
 
-    From the lines through both shoulders and both hips, in camera axes (x right, y down, z away).
+    It is computed from the lines through shoulders and hips, in camera axes (x right, y down, z forward).
     """
-    leftward = landmarks_world_m[:, 11] - landmarks_world_m[:, 12] + landmarks_world_m[:, 23] - landmarks_world_m[:, 24]
+    left_shoulder, right_shoulder, left_hip, right_hip = (landmarks_world_m[:, index] for index in TORSO)
+    leftward = left_shoulder - right_shoulder + left_hip - right_hip
     return np.arctan2(leftward[:, 2], leftward[:, 0])
 
 
 def largest_yaw_gap_rad(yaw_rad: Float[np.ndarray, "n"]) -> float:
-    """The widest arc of the circle in which no yaw lies, in (0, 2 pi]."""
+    """Return the largest arc of the circle without any yaw, in (0, 2 pi]."""
     angles = np.sort(np.mod(yaw_rad[np.isfinite(yaw_rad)], 2 * np.pi))
     if len(angles) == 0:
         return 2 * np.pi
@@ -102,14 +106,14 @@ def largest_yaw_gap_rad(yaw_rad: Float[np.ndarray, "n"]) -> float:
 
 
 def format_frame_ranges(frame_index: Int[np.ndarray, "n"], rows: Bool[np.ndarray, "n"]) -> str:
-    """Marked frames in words: neighbours among the n frames are joined, "3, 81-96"."""
+    """Format the marked frames; frames that are neighbours among the n frames are joined: "3, 81-96"."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], rows.astype(np.int8), [0]])))
     spans = [(int(frame_index[start]), int(frame_index[end - 1])) for start, end in edges.reshape(-1, 2)]
     return ", ".join(str(first) if first == last else f"{first}-{last}" for first, last in spans)
 
 
 def _evenly_spaced_indices(cumulative_motion: Float[np.ndarray, "m"], quota: int) -> Int[np.ndarray, "k"]:
-    """Positions of `quota` entries of a non-decreasing sequence, as evenly spread over its values as they lie."""
+    """Return `quota` positions in a non-decreasing sequence at which its values are as evenly spaced as possible."""
     if len(cumulative_motion) <= quota:
         return np.arange(len(cumulative_motion))
     if quota == 1:

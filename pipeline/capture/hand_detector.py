@@ -1,7 +1,7 @@
-"""Looking at hands: MediaPipe's 21 points of each hand, in the square that the pose's wrist and knuckles ask for.
+"""Hand landmarks: MediaPipe's 21 points of each hand, in a region of interest from the pose's wrist and knuckles.
 
-Zhang et al., "MediaPipe Hands: On-device real-time hand tracking", 2020; the points' order is that of its figure 2. The
-models ship inside the package. A hand that the pose calls hidden, or that is too small, is not looked at.
+Zhang et al., "MediaPipe Hands: On-device real-time hand tracking", 2020; order of the points as in figure 2. The models
+are part of the package. Hands that are hidden in the pose, or too small, are skipped.
 """
 
 from collections.abc import Sequence
@@ -12,18 +12,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from pipeline.capture.landmarks import INDEX_FINGERS, PINKIES, WRISTS
 from pipeline.capture.person_detector import suppress_stderr
 
 N_HAND_LANDMARKS = 21
-WRISTS, PINKIES, INDEX_FINGERS = (15, 16), (17, 18), (19, 20)
-"""Of the pose's landmarks, (left, right)."""
-
 MIN_HAND_PX = 24.0
 HAND_LENGTH_M = 0.18
-"""Hands of this length are looked at when they have at least so many pixels, seen from the side."""
+"""Hands are detected if a hand of this length, seen from the side, has at least `MIN_HAND_PX` pixels."""
 
 MIN_WRIST_VISIBILITY = 0.3
-"""Of the wrist. Below, the hand is behind the body and the model finds the other one."""
+"""Below this visibility of the wrist the hand is behind the body, and the model would find the other hand."""
 
 _GRAPH = """
 input_stream: "image"
@@ -55,16 +53,17 @@ node {
   output_stream: "HANDEDNESS:handedness"
 }
 """
-# The model speaks of mirrored pictures, as a phone shows them to the person before it.
+# The model assumes mirrored images, as from a front camera.
 _MIRRORED_LABELS = ("Right", "Left")
 
 
 @dataclass(frozen=True)
 class HandLandmarks:
-    """Both hands (left, right), in any number of images; nan where none was found.
+    """Landmarks of both hands (left, right) in any number of images; nan where no hand was found.
 
-    landmarks_px: pixel centres at +0.5. landmarks_m: metres about the hand's middle, camera axes (x right, y down, z
-    away). own_side: how sure it is, 0 to 1, that the hand is that of this side; 0 where none was found.
+    landmarks_px: pixel centres at +0.5.
+    landmarks_m: relative to the centre of the hand, camera axes (x right, y down, z forward).
+    handedness_score: probability in [0, 1] that the hand is of this side; 0 where no hand was found.
     """
 
     landmarks_px: Float[np.ndarray, "*n 2 21 2"]
@@ -72,26 +71,26 @@ class HandLandmarks:
     handedness_score: Float[np.ndarray, "*n 2"]
 
     def rows(self, rows: Sequence[int]) -> "HandLandmarks":
-        """The hands in some of the images."""
+        """Return the hands of some of the images."""
         return HandLandmarks(*(values[rows] for values in vars(self).values()))
 
 
 def undetected_hands(*images: int) -> HandLandmarks:
-    """Nothing found in so many images (no number: in one)."""
+    """Return a result without hands for so many images (without arguments: for one image)."""
     points = (*images, 2, N_HAND_LANDMARKS)
     nowhere_px, nowhere_m = (np.full((*points, size), np.nan, dtype=np.float32) for size in (2, 3))
     return HandLandmarks(nowhere_px, nowhere_m, np.zeros((*images, 2), dtype=np.float32))
 
 
 def stack_hands(images: Sequence[HandLandmarks]) -> HandLandmarks:
-    """Hands that were found in one image each, as one; at least one image."""
+    """Stack the hands of single images; at least one image."""
     return HandLandmarks(
         *(np.stack(values) for values in zip(*(vars(hands).values() for hands in images), strict=True))
     )
 
 
 class HandDetector:
-    """MediaPipe's hand model in its larger size; about 12 ms a hand on one core, whatever the image's size."""
+    """MediaPipe's hand model, complexity 1; about 12 ms per hand on one core for any image size."""
 
     def __init__(self) -> None:
         with suppress_stderr():
@@ -102,14 +101,14 @@ class HandDetector:
             self._graph = SolutionBase(graph_config=_GRAPH, side_inputs={"model_complexity": 1})
         self._is_stderr_quiet = False
 
-    def look(
+    def detect_hands(
         self,
         rgb: UInt8[np.ndarray, "h w 3"],
         pose_px: Float[np.ndarray, "33 2"],
         visibility: Float[np.ndarray, "33"],
         pose_world_m: Float[np.ndarray, "33 3"],
     ) -> HandLandmarks:
-        """The hands of the person whose pose is given (as in `person.PersonDetection`)."""
+        """Detect the hands of the person with this pose (`person_detector.PersonDetection`)."""
         hands = undetected_hands()
         if HAND_LENGTH_M * image_scale_px_per_m(pose_px, pose_world_m) < MIN_HAND_PX:
             return hands
@@ -141,7 +140,7 @@ class HandDetector:
 def image_scale_px_per_m(
     points_px: Float[np.ndarray, "*n p 2"], points_m: Float[np.ndarray, "*n p 3"]
 ) -> Float[np.ndarray, "*n"]:
-    """Scale of the image at a person or a hand: spread of its points in pixels over that in metres."""
+    """Return the image scale at a person or a hand: spread of its points in pixels over their spread in metres."""
     squared_px, squared_m = (
         np.square(points - points.mean(-2, keepdims=True)).sum((-2, -1)) for points in (points_px, points_m[..., :2])
     )

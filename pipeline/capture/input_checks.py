@@ -1,4 +1,4 @@
-"""What a recording must show before any work is spent on it, and what a run goes on without."""
+"""Checks of a recording: conditions that end a run before the expensive stages, and warnings."""
 
 from pathlib import Path
 
@@ -9,41 +9,42 @@ from jaxtyping import Bool, Float, Int
 from pipeline.capture.background_plate import detect_scene_changes
 from pipeline.capture.detection import Detections
 from pipeline.capture.frame_selection import format_frame_ranges
-from pipeline.capture.person_detector import ANKLES, TORSO, is_ankle_visible
+from pipeline.capture.landmarks import ANKLES, FEET, TORSO
+from pipeline.capture.person_detector import is_ankle_visible
 from pipeline.core.errors import UserError
 from pipeline.core.progress import warn
 
 _MAX_BLACK_LEVEL = 8
-_FOOT_LANDMARKS = (29, 30, 31, 32)
-# A shoe reaches this share of the image's height below the joints of heel and toe.
+# Height of a shoe's sole below the landmarks of heel and toe, as a fraction of the image height.
 _SOLE_HEIGHT_FRACTION = 0.02
-# Cosine between the spine, from shoulders to hips, and straight down, of somebody who stands.
+# Minimum cosine between the spine (shoulders to hips) and the image's downward axis of a standing person.
 _MIN_UPRIGHT_COSINE = 0.5
 _MAX_UNSEEN_ARC_DEG = 120.0
-# Up to this height the person's pixels are of use to the default preset.
+# Height of the person up to which the default preset gains from more pixels.
 _TARGET_PERSON_HEIGHT_PX = 640.0
-# Pictures on which a camera that moves is looked for, the share of them that must show another scene, and how far from
-# the person the scene begins, as a share of the picture's longer side: shadows and what the mask misses lie nearer.
+# Detection of a moving camera: number of images, fraction of them that must differ, and margin around the person
+# (fraction of the longer side) that excludes shadows and errors of the mask.
 _N_SCENE_FRAMES, _MAX_MOVED_FRACTION, _PERSON_MARGIN_FRACTION = 32, 0.1, 0.03
 
 
 def check_input(detections: Detections, path: Path, min_frames: int) -> None:
-    """Raise UserError for a recording from which no avatar can come.
+    """Raise UserError for a recording that cannot be reconstructed.
 
-    That is one which is black, shows no person, several, one cut off or not upright, or one whose pose is not known.
+    These are recordings that are black, show no person or several, show a person who is cut off or not upright, or
+    whose pose is unknown.
     """
     if detections.gray_thumbnails.max(axis=(1, 2)).max() < _MAX_BLACK_LEVEL:
-        raise UserError(f"all frames of {path} are black; give a recording in which the person can be seen")
+        raise UserError(f"all frames of {path} are black; use a recording that shows the person")
     # Twice, because one frame may show a picture on a wall or a reflection.
     multi_person_frames = detections.frame_index[detections.n_people > 1]
     if len(multi_person_frames) >= 2:
         raise UserError(
             f"{path} shows several people (for example in frame {multi_person_frames[0]}); "
-            "give a recording of one person alone, or crop it to one"
+            "use a recording of a single person, or crop it to one"
         )
     n_found, n_detection_frames = int(detections.found.sum()), len(detections.found)
     if n_found == 0:
-        raise UserError(f"no person was found in {path}; the whole body should be visible and fill half of the height")
+        raise UserError(f"no person was found in {path}; film the whole body at half of the image height or more")
     if n_found < min_frames:
         raise UserError(
             f"a person was found in only {n_found} of {n_detection_frames} frames of {path}; {min_frames} are needed"
@@ -59,7 +60,7 @@ def check_input(detections: Detections, path: Path, min_frames: int) -> None:
         )
     if not _is_upright(detections.landmarks_px[is_torso_known][:, TORSO]):
         raise UserError(
-            f"the person in {path} lies on the side or stands upside down; turn the recording upright, a video for "
+            f"the person in {path} is not upright (rotated recording); rotate it, for "
             "example with ffmpeg -i IN.mp4 -vf transpose=1 OUT.mp4 (a quarter turn clockwise)"
         )
     has_ankle_landmarks = detections.found & np.isfinite(detections.landmarks_px[:, ANKLES, 1]).any(axis=1)
@@ -77,25 +78,25 @@ def check_input(detections: Detections, path: Path, min_frames: int) -> None:
 
 
 def _is_upright(torso_px: Float[np.ndarray, "n 4 2"]) -> bool:
-    """True when the spine points up in at least half of the frames; shoulders come before hips."""
+    """Return whether the spine is upright in at least half of the frames; shoulders come before hips."""
     spine_px = torso_px[:, 2:].mean(axis=1) - torso_px[:, :2].mean(axis=1)
     is_fallen = spine_px[:, 1] < _MIN_UPRIGHT_COSINE * np.linalg.norm(spine_px, axis=1)
     return bool(is_fallen.mean() <= 0.5)
 
 
 def warn_about_input(detections: Detections, unseen_arc_rad: float, path: Path) -> None:
-    """Say what the run goes on without."""
+    """Warn about properties of the recording that reduce the quality."""
     missing = ~detections.found
     if missing.any():
         warn(
             f"{missing.sum()} of {len(missing)} frames of {path} show no person and are dropped: "
             f"{format_frame_ranges(detections.frame_index, missing)}"
         )
-    lowest_px = np.fmax.reduce(detections.landmarks_px[:, _FOOT_LANDMARKS, 1], axis=1)
+    lowest_px = np.fmax.reduce(detections.landmarks_px[:, FEET, 1], axis=1)
     cropped = detections.found & (lowest_px > (1.0 - _SOLE_HEIGHT_FRACTION) * detections.height)
     if cropped.any():
         warn(
-            f"the feet are cut off in {cropped.sum()} frames of {path}; they will be less sharp in the avatar: "
+            f"the feet are cut off in {cropped.sum()} frames of {path}; the avatar's feet will be less sharp: "
             f"{format_frame_ranges(detections.frame_index, cropped)}"
         )
     person_px = float(np.median(detections.person_masks[detections.found].any(axis=2).mean(axis=1))) * detections.height
@@ -104,27 +105,27 @@ def warn_about_input(detections: Detections, unseen_arc_rad: float, path: Path) 
         side_px = round(max(detections.width, detections.height) * target_scale / detections.scale)
         warn(
             f"the person is {person_px / detections.scale:.0f} px tall in {path} and {person_px:.0f} px in the smaller "
-            f"pictures that are kept; --set frames.max_side_px={side_px} keeps what the avatar can use"
+            f"pictures that are kept; --set frames.max_side_px={side_px} keeps more detail"
         )
     frame_index, differs = sample_scene_changes(detections)
     if differs.sum() > _MAX_MOVED_FRACTION * len(differs):
         warn(
             f"the scene behind the person changes in {path} (frames {format_frame_ranges(frame_index, differs)}): "
-            "the camera "
-            "seems to move, or the light to change, which the avatar takes for motion and colour of the person; film "
-            "again with the camera on something firm and its exposure locked"
+            "the camera or "
+            "the light seems to change, which causes errors of motion and colour; film again with a fixed camera and "
+            "locked exposure"
         )
     if unseen_arc_rad > np.radians(_MAX_UNSEEN_ARC_DEG):
         warn(
             f"the person in {path} is never seen from {np.degrees(unseen_arc_rad):.0f} degrees of the full turn; "
-            "that side will be guessed (film a full turn to see it)"
+            "that side will be guessed; film a full turn"
         )
 
 
 def sample_scene_changes(detections: Detections) -> tuple[Int[np.ndarray, "k"], Bool[np.ndarray, "k"]]:
-    """Some of the frames with a person, evenly spread, by their index: which of them show another scene than the rest.
+    """Return frame indices, evenly spaced over frames with a person, and which of them show another background.
 
-    Small grey pictures: a camera that moves by a few of their pixels is seen where the scene has edges.
+    Detection works on grey thumbnails: a camera shift of a few thumbnail pixels is found where the scene has edges.
     """
     found = np.flatnonzero(detections.found)
     sampled = found[np.unique(np.linspace(0, len(found) - 1, _N_SCENE_FRAMES).astype(int))]

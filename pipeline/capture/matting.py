@@ -1,8 +1,7 @@
-"""Person masks: from a detector's blurred guess to soft edges at the image's own resolution, and the person's own
-colour there. Pure functions.
+"""Alpha mattes of the person from the detector's coarse mask, and colour decontamination. Pure functions.
 
-The letters used here: I colour of a pixel, F and B the colours of person and background around it, alpha the part of
-the pixel that the person covers, so that I = alpha F + (1 - alpha) B. Alphas are float32 in [0, 1].
+Notation: I observed colour of a pixel, F and B colours of foreground (person) and background around it, alpha the
+covered fraction of the pixel: I = alpha F + (1 - alpha) B. Alphas are float32 in [0, 1].
 """
 
 from functools import reduce
@@ -14,42 +13,42 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.capture.background_plate import BackgroundPlate, subtract_background
 
-# The detector's mask is a 256-cell grid over a square 1.25 times as high as the person.
+# The detector's mask has 256 cells on a square of 1.25 times the person's height.
 _MASK_CELLS_PER_PERSON_HEIGHT = 256 / 1.25
-# In cells: how far the detector's outline may be wrong, and how far away colours are gathered. Widths of 3 / 6 / 9 / 12
-# cells for the latter give IoU 0.983 / 0.985 / 0.985 / 0.984 on the green-screen capture.
+# In cells: half width of the unknown band around the detector's outline, and radius of the colour window. Radii of
+# 3 / 6 / 9 / 12 cells give an IoU of 0.983 / 0.985 / 0.985 / 0.984 on the green-screen capture.
 _UNKNOWN_BAND_CELLS, _COLOUR_WINDOW_CELLS = 3.0, 6.0
-# Standard deviation (of 1) that no colour cloud goes below: rounding. Colours are averaged over cells before they are
-# gathered, so video noise is small there, and a white coat before a white wall needs every level.
+# Minimum standard deviation of a colour distribution (of 1): rounding. Colours are averaged over cells first, so video
+# noise is small, and a white coat in front of a white wall needs every level.
 _COLOUR_NOISE = 1.0 / 255.0
-# How much the detector's word weighs, in the unit of a squared Mahalanobis distance: at its outline, and far from it.
+# Weight of the detector's mask, in units of a squared Mahalanobis distance: at its outline, and far from it.
 _PRIOR_WEIGHT_AT_EDGE, _PRIOR_WEIGHT_CERTAIN = 0.3, 10.0
 _PRIOR_RAMP = 0.2
-# A window this many times as wide counts this much besides, for it is all there is deep in a gap between arm and trunk.
+# A wider window (factor) contributes with a small weight; it has the only samples in a gap between arm and torso.
 _WIDE_WINDOW_FACTOR, _WIDE_WINDOW_WEIGHT = 8, 0.01
-# A cloud counts from this mean weight on: a tenth of the wide window.
+# Minimum mean weight of a colour distribution: a tenth of the wide window.
 _MIN_SAMPLE_WEIGHT = 1e-3
-# A backdrop is painted when this share of the pixels away from the person is within two levels of one colour.
+# The background is uniform (synthetic) if this fraction of its pixels is within two levels of one colour.
 _MIN_UNIFORM_FRACTION, _UNIFORM_TOLERANCE_LEVELS = 0.95, 2
-# Where the detector is this sure, a colour belongs to the person even when the first round said otherwise. Without that
-# a white hem before a white wall is lost (synthetic captures: IoU median and worst 0.978, 0.945; with it 0.991, 0.959).
+# Above this mask value a pixel is a foreground sample even if the first iteration rejected it. Without that a white hem
+# in front of a white wall is lost (synthetic captures, IoU median and worst: 0.978, 0.945; with it 0.991, 0.959).
 _CONFIDENT_MASK_VALUE = 0.97
-# The rim reaches as far to each side as the picture itself is soft there: this many standard deviations of its blur.
+# Half width of the soft rim: this many standard deviations of the image's own blur, at least the minimum.
 _MIN_RIM_PX, _RIM_PER_BLUR = 1.0, 2.0
-# Blur is told by blurring again, this much; along this many cells of the outline to each side. A sharp outline looks
-# blurred by this variance (px^2), by the area of a pixel and the gradient's own smoothing.
+# Blur estimation: standard deviation of the second blur, window in cells along the outline, and the apparent variance
+# (px^2) of a sharp edge (area of a pixel and smoothing of the gradient filter).
 _REBLUR_PX, _BLUR_CELLS, _INTRINSIC_BLUR_VARIANCE_PX2 = 1.5, 9.0, 0.95
-# Colours at least this far from the soft rim are the person's or the backdrop's alone: lens and codec mix them over a
-# wider strip than alpha tells. Nearer ones are likelier to be those of the rim, see docs/decisions.md.
+# Distances from the soft rim at which colours are pure foreground or background: lens and codec mix colours over a
+# wider strip than alpha shows (docs/decisions/capture.md).
 _FOREGROUND_MARGIN_PX, _BACKGROUND_MARGIN_PX = 1.0, 2.5
-# Level of 255 from which the detector sees a trace of the person.
+# Minimum mask level with any trace of the person.
 _MIN_TRACE_LEVEL = 25
-# Parts smaller than this share of the person are specks, holes smaller than this share are noise.
+# Components below this fraction of the person's area are specks, holes below the other fraction are noise.
 _MIN_COMPONENT_FRACTION, _MAX_HOLE_FRACTION = 0.05, 2e-4
 
 
 class _ColourDistribution(NamedTuple):
-    """Colours around each grid point: mean weight, mean and covariance (xx, xy, xz, yy, yz, zz)."""
+    """Colour statistics around each grid point: mean weight, mean, covariance (xx, xy, xz, yy, yz, zz)."""
 
     weight: Float[np.ndarray, "h w"]
     mean: Float[np.ndarray, "h w 3"]
@@ -59,14 +58,13 @@ class _ColourDistribution(NamedTuple):
 def estimate_alpha_matte(
     rgb: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"], plate: BackgroundPlate | None = None
 ) -> Float[np.ndarray, "h w"]:
-    """Alpha with the image's own edges from a soft mask (0..255) that is smooth where the image is sharp.
+    """Refine a soft coarse mask (0..255) to an alpha matte with the edges of the image.
 
-    The colours on both sides of the outline are gathered around each pixel (weighted Gaussian clouds); alpha is the
-    position of the pixel's colour between them along Fisher's linear discriminant, where clouds that spread in some
-    direction count less in it. It is then averaged with the mask, each weighted by how sure it is: the colours by the
-    squared distance of the clouds, the mask by its distance from 0.5. Done twice, so that the colours are gathered
-    with the better outline. Only the surroundings of the outline can gain area. What covers the plate there, where one
-    is given, belongs to the person whatever the rest says.
+    Colour distributions of foreground and background are estimated around each pixel in Gaussian windows. Alpha is the
+    position of the pixel's colour between both means along Fisher's linear discriminant. It is averaged with the coarse
+    mask, weighted by certainty: the squared Mahalanobis distance of the distributions, and the distance of the mask
+    from 0.5. Two iterations, so that the distributions use the better outline. Only a band around the outline can be
+    added to the mask. Pixels in the band that differ from `plate` are foreground.
     """
     if not (mask > 127).any():
         return np.zeros(mask.shape, dtype=np.float32)
@@ -97,11 +95,11 @@ def estimate_alpha_matte(
 def estimate_edge_blur_px(
     image: Float[np.ndarray, "h w 3"], body: Bool[np.ndarray, "h w"], window_px: float
 ) -> Float[np.ndarray, "h w"]:
-    """How blurred the picture is at the outline near each pixel: standard deviation of a Gaussian, in px.
+    """Return the blur of the image at the outline near each pixel: standard deviation of a Gaussian, px.
 
-    An edge of blur s that is blurred again by r keeps s^2 / (s^2 + r^2) of its squared gradient, whatever its contrast
-    (after Zhuo and Sim, "Defocus map estimation from a single image", 2011). Both energies are gathered along the
-    outline in squares of half width `window_px`, so that strong edges speak for weak ones; 0 far from them.
+    An edge of blur s that is blurred again by r keeps s^2 / (s^2 + r^2) of its squared gradient, for any contrast (Zhuo
+    and Sim, "Defocus map estimation from a single image", 2011). Both energies are summed along the outline in squares
+    of half width `window_px`, so strong edges dominate; 0 far from the outline.
     """
     line, side = _dilate(inner_boundary(body), 1.0).astype(np.float32), 2 * round(window_px) + 1
     sharp, soft = (
@@ -121,9 +119,10 @@ def _squared_gradient(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h
 def clean_alpha_matte(
     alpha: Float[np.ndarray, "h w"], rim_px: float | Float[np.ndarray, "h w"] = _MIN_RIM_PX
 ) -> Float[np.ndarray, "h w"]:
-    """Drop specks and pinholes; 1 inside and 0 outside except up to `rim_px` from the outline, where alpha stays soft.
+    """Remove specks and pinholes; set 1 inside and 0 outside except within `rim_px` of the outline, where alpha stays
+    soft.
 
-    Gaps that are larger than noise (between arm and body) stay; parts cut off from the person stay when they are large.
+    Gaps larger than noise (between arm and torso) and large separate components stay.
     """
     body = _large_components(alpha > 0.5)
     body = ~_remove_small_components(~body, _MAX_HOLE_FRACTION * body.sum())
@@ -135,11 +134,11 @@ def clean_alpha_matte(
 def decontaminate_colours(
     rgb: UInt8[np.ndarray, "h w 3"], alpha: UInt8[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The picture in which the person's colour takes the backdrop's share of every soft pixel (alpha from 1 to 254).
+    """Replace the background's contribution to pixels of partial alpha (1 to 254) by the foreground colour.
 
-    With F' and B', the colours of the nearest pixels surely inside and surely outside, such a pixel becomes
-    I + (1 - alpha) (F' - B'), which is alpha F + (1 - alpha) F' where B' = B: what it shows of the person stays, and no
-    small alpha divides its noise. The rest of the picture stays, and all of it where one side is nowhere sure.
+    With F' and B', the colours of the nearest pure foreground and background pixels, a pixel becomes I + (1 - alpha)
+    (F' - B'), which is alpha F + (1 - alpha) F' if B' = B; nothing is divided by a small alpha. All other pixels stay,
+    and all pixels if there is no pure foreground or background.
     """
     soft = (alpha > 0) & (alpha < 255)
     if not soft.any():
@@ -167,10 +166,7 @@ def decontaminate_colours(
 def resize_premultiplied(
     image: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"], size: tuple[int, int]
 ) -> tuple[Float[np.ndarray, "h2 w2 3"], Float[np.ndarray, "h2 w2"]]:
-    """Picture and alpha at another size (columns, rows), averaged over areas.
-
-    Colours count as far as the person covers them, so that none of the backdrop comes in; black where he is not.
-    """
+    """Resize image and alpha to (columns, rows) by area averaging of premultiplied colours; black where alpha is 0."""
     reduced, premultiplied = (
         cv2.resize(array, size, interpolation=cv2.INTER_AREA) for array in (alpha, image * alpha[..., None])
     )
@@ -180,10 +176,11 @@ def resize_premultiplied(
 def extend_mask_on_uniform_background(
     rgb: UInt8[np.ndarray, "h w 3"], mask: UInt8[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "h w"]:
-    """The mask with what it misses of a person in front of one painted colour (a recording that is matted already).
+    """Add foreground that the mask misses in front of a uniform synthetic background (a recording that is matted
+    already).
 
-    Only when nearly all pixels away from the person have that colour exactly, as no camera sees it; then whatever has
-    another colour, hangs together with the person and reaches more than the detector's error beyond the mask is added.
+    This applies only if nearly all background pixels have exactly one colour, which no camera records. Pixels of
+    another colour are added if they are connected to the person and farther from the mask than the detector's error.
     """
     body = mask > 127
     if not body.any():
@@ -207,10 +204,10 @@ def extend_mask_on_uniform_background(
 def smooth_mask_temporally(
     images: UInt8[np.ndarray, "t h w 3"], masks: UInt8[np.ndarray, "t h w"], centre: int, noise: float
 ) -> UInt8[np.ndarray, "h w"]:
-    """The mask at time `centre`, averaged with those of other times where the image is the same there.
+    """Average the mask at time `centre` with masks of other times where the image is the same.
 
-    A mask that changes where the image does not is flicker. The weight of another time falls with the squared change of
-    the (slightly blurred) colour in units of `noise` (levels of 255), so that moving limbs are left alone.
+    The weight of another time decreases with the squared change of the slightly blurred colour in units of `noise`
+    (levels of 255), so moving limbs are not smoothed.
     """
     blurred = [cv2.blur(image, (5, 5)) for image in images]
     falloff = np.exp(-((np.arange(256) / (3.0 * noise)) ** 2)).astype(np.float32)
@@ -226,24 +223,24 @@ def smooth_mask_temporally(
 
 
 def definite_background(mask: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Where even a soft mask's outermost rim, and half a cell around it, shows no person."""
+    """Return where even the outermost rim of a soft mask, and half a cell around it, shows no person."""
     seen = mask > _MIN_TRACE_LEVEL
     return ~_dilate(seen, 0.5 * _mask_cell_px(seen)) if seen.any() else ~seen
 
 
 def inner_boundary(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """The mask's pixels that touch its outside."""
+    """Return the pixels of the mask that touch its outside."""
     return mask & (cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
 
 
 def _mask_cell_px(person: Bool[np.ndarray, "h w"]) -> float:
-    """Size of the detector's grid cell in pixels of this image, at least one."""
+    """Return the size of a cell of the detector's mask in pixels of this image, at least one."""
     rows = np.flatnonzero(person.any(axis=1))
     return max(1.0, float(rows[-1] - rows[0] + 1) / _MASK_CELLS_PER_PERSON_HEIGHT)
 
 
 def _bounding_slices(mask: Bool[np.ndarray, "h w"], margin_px: int) -> tuple[slice, slice]:
-    """Rows and columns of the mask's box with a margin, inside the image."""
+    """Return rows and columns of the mask's bounding box with a margin, inside the image."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     return (
         slice(max(0, rows[0] - margin_px), rows[-1] + margin_px + 1),
@@ -257,10 +254,10 @@ def _update_alpha(
     coarse_alpha: Float[np.ndarray, "h w"],
     cell_px: float,
 ) -> Float[np.ndarray, "h w"]:
-    """One round of `estimate_alpha_matte`: new alpha from the clouds that the old alpha separates, and the detector's
-    guess.
+    """Return alpha after one iteration of `estimate_alpha_matte`.
 
-    The clouds are smooth, so they and the discriminant are found on a grid as coarse as the detector's, then enlarged.
+    The colour distributions are smooth, so they and the discriminant are computed on a grid as coarse as the detector's
+    and enlarged.
     """
     height, width = alpha.shape
     small = (max(1, round(width / cell_px)), max(1, round(height / cell_px)))
@@ -282,11 +279,11 @@ def _update_alpha(
 def _local_colour_distribution(
     image: Float[np.ndarray, "h w 3"], weight: Float[np.ndarray, "h w"], small: tuple[int, int], radius: int
 ) -> _ColourDistribution:
-    """Weighted mean and covariance of the colours in a square window around each point of a coarse grid, and a little
-    of those in a wider one.
+    """Return weighted mean and covariance of colours in a window around each point of a coarse grid, plus a wider
+    window.
 
-    small: the grid's columns and rows; radius: half of the window, in grid points. Colours are averaged over
-    the grid's cells before they are multiplied: texture finer than a cell does not count as spread.
+    small: columns and rows of the grid. radius: half of the window in grid points. Colours are averaged over the grid's
+    cells before products are formed: texture finer than a cell does not count as variance.
     """
     weight = weight.astype(np.float32)
     share = cv2.resize(weight, small, interpolation=cv2.INTER_AREA)
@@ -295,8 +292,8 @@ def _local_colour_distribution(
 
     def box_filter(values: np.ndarray) -> np.ndarray:
         near, far = (
-            cv2.blur(values, (2 * unknown_band + 1, 2 * unknown_band + 1), borderType=cv2.BORDER_CONSTANT)
-            for unknown_band in (radius, _WIDE_WINDOW_FACTOR * radius)
+            cv2.blur(values, (2 * half_width + 1, 2 * half_width + 1), borderType=cv2.BORDER_CONSTANT)
+            for half_width in (radius, _WIDE_WINDOW_FACTOR * radius)
         )
         return near + np.float32(_WIDE_WINDOW_WEIGHT) * far
 
@@ -314,11 +311,12 @@ def _local_colour_distribution(
 def _fisher_discriminant(
     person: _ColourDistribution, background: _ColourDistribution
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
-    """Fisher's linear discriminant of two colour clouds, for each grid point: direction, offset, certainty.
+    """Return direction, offset and certainty of Fisher's linear discriminant of two colour distributions per grid
+    point.
 
-    direction . I - offset is 0 for I = B and 1 for I = F. With S the sum of both covariances and d = F - B:
-    w = S^-1 d, direction = w / w.d, offset = direction . B, certainty = w.d, the squared Mahalanobis distance of the
-    clouds (0 where one of them is empty).
+    direction . I - offset is 0 for I = B and 1 for I = F. With S the sum of both covariances and d = F - B: w = S^-1 d,
+    direction = w / w.d, offset = direction . B, certainty = w.d, the squared Mahalanobis distance of the means (0
+    where a distribution is empty).
     """
     pooled = person.covariance + background.covariance
     pooled_scatter = pooled[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(*pooled.shape[:2], 3, 3).astype(np.float64)
@@ -333,7 +331,7 @@ def _fisher_discriminant(
 
 
 def _nearest_pixel_index(wanted: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "h w"]:
-    """For every pixel the number, row by row, of the nearest wanted one."""
+    """Return for every pixel the row-major index of the nearest wanted pixel."""
     _, labels = cv2.distanceTransformWithLabels(
         (~wanted).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
@@ -343,7 +341,7 @@ def _nearest_pixel_index(wanted: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "h 
 
 
 def _large_components(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """The largest connected part and every other that is not small beside it."""
+    """Return the largest component and all others that are not small relative to it."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     if count == 1:
         return mask
@@ -352,7 +350,7 @@ def _large_components(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 
 
 def _remove_small_components(mask: Bool[np.ndarray, "h w"], smallest_area_px: float) -> Bool[np.ndarray, "h w"]:
-    """The connected parts that have at least this area."""
+    """Return the components with at least this area."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     keep = stats[:, cv2.CC_STAT_AREA] >= smallest_area_px
     keep[0] = False
@@ -360,7 +358,9 @@ def _remove_small_components(mask: Bool[np.ndarray, "h w"], smallest_area_px: fl
 
 
 def _dilate(mask: Bool[np.ndarray, "h w"], radius_px: float | Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """All pixels within a distance of the mask; by distance transform, which takes no longer for a larger radius."""
+    """Return all pixels within a distance of the mask; by distance transform, so the cost does not depend on the
+    radius.
+    """
     if not mask.any():
         return mask.copy()
     return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5) <= radius_px

@@ -1,11 +1,12 @@
-"""Finding the person: MediaPipe's 33 pose landmarks and its person mask. Only this file and `hands.py` touch MediaPipe.
+"""Person detection with MediaPipe: 33 pose landmarks and a segmentation mask. Only this file and `hand_detector` use
+it.
 
-Both models ship inside the package, nothing is downloaded. Every frame is looked at on its own (no tracking), so the
-result does not depend on which process saw which frame before.
+Both models are part of the package; nothing is downloaded. Frames are processed independently (no tracking), so the
+result does not depend on which process handled which frame.
 
-The first model guesses a square around the person, the second finds landmarks and mask in it. A square that is guessed
-too small cuts off feet and pushes all landmarks up, so it is left for the one that the landmarks ask for. The last two
-looks are averaged: what the second model makes of a person trembles with the square.
+The first model predicts a square region of interest (ROI) around the person, the second one predicts landmarks and
+mask in it. An ROI that is too small cuts off the feet and shifts all landmarks, so it is replaced by the ROI of the
+landmarks. The last two predictions are averaged, because the second model is sensitive to the ROI.
 """
 
 import os
@@ -18,27 +19,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-LANDMARK_NAMES = (
-    "nose", "left_eye_inner", "left_eye", "left_eye_outer", "right_eye_inner", "right_eye", "right_eye_outer",
-    "left_ear", "right_ear", "mouth_left", "mouth_right", "left_shoulder", "right_shoulder", "left_elbow",
-    "right_elbow", "left_wrist", "right_wrist", "left_pinky", "right_pinky", "left_index", "right_index",
-    "left_thumb", "right_thumb", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle",
-    "left_heel", "right_heel", "left_foot_index", "right_foot_index",
-)  # fmt: skip
-TORSO = (11, 12, 23, 24)
-KNEES, ANKLES = (25, 26), (27, 28)
-POSE_CONNECTIONS = (
-    (11, 12), (11, 23), (12, 24), (23, 24), (11, 13), (13, 15), (12, 14), (14, 16), (15, 19), (16, 20),
-    (23, 25), (25, 27), (24, 26), (26, 28), (27, 31), (28, 32), (27, 29), (28, 30), (0, 11), (0, 12),
-)  # fmt: skip
+from pipeline.capture.landmarks import ANKLES, TORSO
 
-# Two detections are two people when their masks share less than this part of the smaller one. On the four test captures
-# with one person the crops' masks share at least 0.5, on the one with three people 0.00.
+# Two detections are different people if their masks overlap by less than this fraction of the smaller one. Crops of
+# one person overlapped by at least 0.5 in four captures, those of three people by 0.00.
 _MAX_OVERLAP_BETWEEN_PEOPLE = 0.2
 _MIN_TORSO_VISIBILITY = 0.9
 _MIN_RELATIVE_AREA = 0.3
 
-# MediaPipe's own graphs smooth the squares over the frames they have seen; these two look at each frame by itself.
+# MediaPipe's own graphs smooth the ROI over the frames they have processed; these two are stateless.
 _ROI_DETECTION_GRAPH = """
 input_stream: "image"
 output_stream: "square"
@@ -93,17 +82,17 @@ node {
 }
 """
 _LANDMARK_MODEL_OPTIONS = {"model_complexity": 1, "enable_segmentation": True}
-# Looks for a square that holds the person; it grows by 10 to 20 % a look.
+# The ROI grows by 10 to 20 % per iteration.
 _MAX_ROI_ITERATIONS = 3
-# A square is too small when the landmarks ask for one this much larger, though the mask keeps off its border: a mask
-# that has lost the feet does.
+# An ROI is too small if the ROI of the landmarks is larger by this ratio, even if the mask does not touch its border
+# (a mask without feet).
 _MAX_ROI_GROWTH = 1.1
 _BORDER_SAMPLES_PER_SIDE = 256
 
 
 @dataclass(frozen=True)
 class PersonDetection:
-    """One person in one image. Landmarks may lie outside of the image where the model guesses."""
+    """One person in one image. Landmarks may be outside of the image where the model extrapolates."""
 
     landmarks_px: Float[np.ndarray, "33 2"]
     visibility: Float[np.ndarray, "33"]
@@ -112,7 +101,9 @@ class PersonDetection:
 
 
 class _RoiEstimate(NamedTuple):
-    """What the second model says about a square; `landmarks` are pixels and visibility, squares NormalizedRects."""
+    """Prediction of the second model in an ROI. `landmarks`: pixels and visibility. Squares: MediaPipe's
+    NormalizedRect.
+    """
 
     landmarks: Float[np.ndarray, "33 3"]
     landmarks_world_m: Float[np.ndarray, "33 3"]
@@ -122,7 +113,7 @@ class _RoiEstimate(NamedTuple):
 
 
 class PersonDetector:
-    """MediaPipe's pose model in its middle size; about 65 ms an image on one core, whatever the image's size."""
+    """MediaPipe's pose model, complexity 1; about 65 ms per image on one core for any image size."""
 
     def __init__(self) -> None:
         with suppress_stderr():
@@ -134,11 +125,11 @@ class PersonDetector:
         self._is_stderr_quiet = False
 
     def detect(self, rgb: UInt8[np.ndarray, "h w 3"]) -> PersonDetection | None:
-        """The most prominent person, or None.
+        """Return the most prominent person, or None.
 
-        Landmarks in pixels (centres at +0.5) with visibility in [0, 1]; world landmarks in metres about the hips'
-        centre, in camera axes (x right, y down, z away). The mask is soft, 0..255, and smooth at the scale of about
-        1/200 of the person's height, where the model's own grid ends.
+        Landmarks are in pixels (centres at +0.5) with visibility in [0, 1]; world landmarks in metres relative to the
+        centre of the hips, in camera axes (x right, y down, z forward). The mask is soft, 0..255, and smooth at the
+        scale of about 1/200 of the person's height, the resolution of the model.
         """
         with nullcontext() if self._is_stderr_quiet else suppress_stderr():
             estimates = self._estimate_in_successive_rois(rgb)
@@ -151,7 +142,7 @@ class PersonDetector:
         return PersonDetection(points[:, :2].copy(), points[:, 2].copy(), world, np.rint(255.0 * mask).astype(np.uint8))
 
     def _estimate_in_successive_rois(self, rgb: UInt8[np.ndarray, "h w 3"]) -> list[_RoiEstimate]:
-        """The look in the first square that holds the most prominent person, and the one in the square it asks for."""
+        """Return the estimates in the first ROI that contains the person and in the ROI of its landmarks."""
         previous, current = None, self._estimate_in_roi(rgb, self._roi_graph.process(rgb).square)
         for _ in range(_MAX_ROI_ITERATIONS):
             if current is None or (previous is not None and not is_roi_too_small(previous)):
@@ -160,7 +151,7 @@ class PersonDetector:
         return [estimate for estimate in (previous, current) if estimate is not None]
 
     def _estimate_in_roi(self, rgb: UInt8[np.ndarray, "h w 3"], square: Any) -> _RoiEstimate | None:
-        """The second model's word on what is in a square; None without a square or a person in it."""
+        """Return the prediction of the second model in an ROI; None without an ROI or a person."""
         if square is None:
             return None
         found = self._landmark_graph.process({"image": rgb, "square": square})
@@ -172,10 +163,10 @@ class PersonDetector:
         return _RoiEstimate(points, world, np.clip(found.mask, 0.0, 1.0), square, found.next_square)
 
     def count_people(self, rgb: UInt8[np.ndarray, "h w 3"]) -> int:
-        """How many people of similar size are in the image.
+        """Count the people of similar size in the image.
 
-        The model finds one person an image, so it is asked about the whole image and about overlapping square crops;
-        sure detections whose masks do not overlap are different people.
+        The model finds one person per image, so it runs on the whole image and on overlapping square crops; confident
+        detections whose masks do not overlap are different people.
         """
         people: list[Bool[np.ndarray, "h w"]] = []
         for left, top, right, bottom in _crops(*rgb.shape[:2]):
@@ -191,16 +182,16 @@ class PersonDetector:
 
 
 def is_roi_too_small(estimate: _RoiEstimate) -> bool:
-    """True where the square has cut the person: the mask touches its border, or the landmarks ask for a larger one."""
+    """Return whether the ROI cuts the person: the mask touches its border, or the landmarks need a larger one."""
     return estimate.next_square.height > _MAX_ROI_GROWTH * estimate.square.height or touches_roi_border(
         estimate.mask > 0.5, estimate.square
     )
 
 
 def touches_roi_border(person: Bool[np.ndarray, "h w"], square: Any) -> bool:
-    """True where the person touches the border of a rotated square inside the image.
+    """Return whether the person touches the border of a rotated square inside the image.
 
-    square: centre, width and height relative to the image's, rotation in radians (MediaPipe's NormalizedRect).
+    square: centre, width and height relative to the image, rotation in radians (MediaPipe's NormalizedRect).
     """
     size = np.array(person.shape[::-1])
     border_offsets = (np.arange(_BORDER_SAMPLES_PER_SIDE) + 0.5) / _BORDER_SAMPLES_PER_SIDE - 0.5
@@ -221,17 +212,17 @@ def touches_roi_border(person: Bool[np.ndarray, "h w"], square: Any) -> bool:
 def is_ankle_visible(
     landmarks_px: Float[np.ndarray, "n 33 2"], visibility: Float[np.ndarray, "n 33"], height_px: int
 ) -> Bool[np.ndarray, "n"]:
-    """True where an ankle can be seen: inside the image, and at least possibly visible.
+    """Return whether an ankle is inside the image and possibly visible.
 
-    A person cut off at the thigh has ankles guessed below the image with a visibility near 0; a leg hidden behind the
-    other one in a side view still leaves the first.
+    A person cut off at the thigh has ankles predicted below the image with a visibility near 0; a leg hidden behind the
+    other one in a side view leaves the other ankle.
     """
     inside = landmarks_px[:, ANKLES, 1] < height_px
     return (inside & (visibility[:, ANKLES] > 0.1)).any(axis=1)
 
 
 def _crops(height: int, width: int) -> Iterator[tuple[int, int, int, int]]:
-    """The whole image, then half-overlapping squares of the full and of 0.6 of the shorter side."""
+    """Yield the whole image, then half-overlapping squares of 1.0 and 0.6 of the shorter side."""
     yield 0, 0, width, height
     for share in (1.0, 0.6):
         side = int(min(height, width) * share)
@@ -248,16 +239,13 @@ def _crop_offsets(length: int, side: int) -> list[int]:
 
 
 def _overlap_coefficient(first: Bool[np.ndarray, "h w"], second: Bool[np.ndarray, "h w"]) -> float:
-    """Shared area over the smaller area."""
+    """Return the intersection area over the smaller area."""
     return float((first & second).sum() / max(1, min(first.sum(), second.sum())))
 
 
 @contextmanager
 def suppress_stderr() -> Iterator[None]:
-    """Keep the C++ libraries' notes, at loading and at the first person, off the terminal.
-
-    They write to the descriptor itself.
-    """
+    """Suppress the messages of the C++ libraries, which write to the file descriptor itself."""
     os.environ.setdefault("GLOG_minloglevel", "2")
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
     sys.stderr.flush()

@@ -1,4 +1,4 @@
-"""The same function on many pictures in a few processes: results in order, few pictures in memory at once."""
+"""Parallel map over images in worker processes, with results in order and few images in memory."""
 
 import multiprocessing
 import os
@@ -19,14 +19,14 @@ _MAX_PENDING_PER_WORKER = 3
 
 
 class ProcessPool:
-    """Runs functions in other processes, or in this one when `executor` is None."""
+    """Runs functions in worker processes, or in this process if `executor` is None."""
 
     def __init__(self, executor: ProcessPoolExecutor | None, count: int) -> None:
         self._executor = executor
         self._count = count
 
     def map(self, function: Callable[..., Result], tasks: Iterable[tuple[Any, ...]]) -> Iterator[Result]:
-        """Yield `function(*task)` for each task, in the order of the tasks; tasks are drawn as workers get free."""
+        """Yield `function(*task)` for each task in order; tasks are taken from the iterator when a worker is free."""
         if self._executor is None:
             for task in tasks:
                 yield function(*task)
@@ -42,9 +42,9 @@ class ProcessPool:
 
 @contextmanager
 def start_process_pool(count: int) -> Iterator[ProcessPool]:
-    """Start `count` processes (none for 1); they end with the block, or when this process is killed.
+    """Start `count` processes (none for 1) that end with the block, or when this process is killed.
 
-    Processes are started afresh, not forked: the libraries in use keep threads that a fork would cut off.
+    Processes are spawned, not forked: a fork would lose threads of the libraries in use.
     """
     if count == 1:
         yield ProcessPool(None, 1)
@@ -59,7 +59,7 @@ def start_process_pool(count: int) -> Iterator[ProcessPool]:
 
 
 def _initialise_worker() -> None:
-    """One thread a process, and no life without the parent: a killed parent cannot tell its workers to stop."""
+    """Use one thread per process and exit with the parent, because a killed parent cannot stop its workers."""
     cv2.setNumThreads(1)
     parent = multiprocessing.parent_process()
     if parent is not None:

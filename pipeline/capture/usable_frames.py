@@ -1,4 +1,4 @@
-"""`scores.npz` of the body stage: how well the body fits in each frame, and by that the frames to learn from."""
+"""Training frames whose body fit is usable, from `scores.npz` of the body stage."""
 
 from pathlib import Path
 
@@ -14,15 +14,16 @@ SCORES_NPZ = "scores.npz"
 
 
 def usable_training_positions(capture: Capture, body_dir: Path) -> Int[np.ndarray, "k"]:
-    """Positions (0..n-1) of the training frames whose fit is usable: what field, mesh and texture learn from.
+    """Return the positions (0..n-1) of training frames with a usable fit, on which field, mesh and texture are trained.
 
-    Raises UserError when the body stage's folder does not tell which frames are usable.
+    Raises:
+        UserError: the folder of the body stage does not hold this information.
     """
     path = body_dir / SCORES_NPZ
     usable = load_npz(path).get("usable")
     if usable is None or usable.shape != capture.split.shape:
         raise UserError(
-            f"{path} does not tell which of the {len(capture)} frames are usable: an older version made it; "
+            f"{path} does not say which of the {len(capture)} frames are usable (written by an older version); "
             "run `python -m stages.body` again"
         )
     return np.flatnonzero((capture.split == TRAIN) & usable)

@@ -1,20 +1,20 @@
-"""What lies beside a video and wins: masks, landmarks, a camera over the detector, a split over index modulo eight.
+"""User-supplied inputs, which override the detector: masks, landmarks, a camera, a split, SMPL poses.
 
-    masks/        one image a frame, named as the images are or else in natural order; 0 to 255, or 0 and 1
-    masks.npz     array `masks` (n, h, w);  masks.hdf5: the same, as PeopleSnapshot ships it
-    (none)        the images' own alpha channel, where the first image is partly transparent
-    landmarks.npz MediaPipe's 33 points in its order: `landmarks_px` (n, 33, 2) in pixels of the original frames, nan
-                  where unknown, optionally `landmarks_visibility` (n, 33), 0 to 1, and `landmarks_world_m` (n, 33, 3),
-                  metres about the hips' centre in camera axes, which else the detector gives
-    camera.json   fx, fy, cx, cy in pixels of the original frames, optionally `width` and `height` of the pictures that
-                  they are for, `distortion` (OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]]) and `world_to_camera` (4 x 4,
-                  row-major, a rotation and a shift in metres; the world is +Y up)
-    split.json    lists of frame indices `train` and `heldout`, optionally `validation` (else every eighth training
-                  frame, from the fifth on); the frames that stand in none are left out
-    smpl_poses.npz  poses that others fitted, of any frames (`pipeline.capture.smpl_poses`); they need their camera
+    masks/        one image per frame, with the names of the images or in natural order; 0 to 255, or 0 and 1
+    masks.npz     array `masks` (n, h, w);  masks.hdf5: the same, as in PeopleSnapshot
+    (none)        alpha channel of the images, if the first image is partly transparent
+    landmarks.npz MediaPipe's 33 landmarks: `landmarks_px` (n, 33, 2) in pixels of the original frames, nan where
+                  unknown; optional `landmarks_visibility` (n, 33) in [0, 1] and `landmarks_world_m` (n, 33, 3) relative
+                  to the centre of the hips, camera axes (else from the detector)
+    camera.json   fx, fy, cx, cy in pixels of the original frames; optional `width` and `height` of the images of the
+                  calibration, `distortion` (OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]]) and `world_to_camera` (4 x 4,
+                  row-major, rotation and translation in metres; the world is +Y up)
+    split.json    lists of frame indices `train` and `heldout`, optional `validation` (else every eighth training frame
+                  from the fifth on); frames in no list are not used
+    smpl_poses.npz  SMPL poses of any frames (`pipeline.capture.smpl_poses`); they need a camera
 
-Row i of each array belongs to frame i of the recording, and there are as many rows as frames. The original frames are
-those that a viewer shows: turned upright as the container or EXIF asks, with square pixels, lens distortion still in.
+Row i of each array belongs to frame i of the recording; there is one row for each frame. Original frames are upright
+(rotation of the container or EXIF applied), have square pixels, and include lens distortion.
 """
 
 import json
@@ -28,6 +28,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from pipeline.capture.frame_selection import HELDOUT, SPLIT_PERIOD, TRAIN, VALIDATION, VALIDATION_PHASE
+from pipeline.capture.landmarks import N_LANDMARKS
 from pipeline.capture.smpl_poses import SMPL_POSES_NPZ, SmplPoses, is_rigid, load_smpl_poses
 from pipeline.capture.video import FrameSource, image_size_px, natural_sort_key
 from pipeline.core.errors import UserError
@@ -35,9 +36,8 @@ from pipeline.geometry.camera import DEFAULT_WORLD_TO_CAMERA, Camera
 from pipeline.io.image import IMAGE_SUFFIXES, read_alpha, read_gray
 from pipeline.io.npz import load_npz
 
-N_LANDMARKS = 33
-# How far from the middle a principal point may lie, as a share of the picture's side, when nothing says what size of
-# picture it is for. That of a calibration for pictures of half the size lies at a quarter.
+# Maximum distance of a principal point from the centre, as a fraction of the side, if the image size of the calibration
+# is unknown. A calibration for images of half the size is off by a quarter.
 _MAX_PRINCIPAL_POINT_OFFSET = 0.2
 # So many masks tell whether a folder holds levels or zeros and ones.
 _N_MASKS_SAMPLED = 8
@@ -102,19 +102,21 @@ class UserLandmarks:
 
 @dataclass(frozen=True)
 class UserSplit:
-    """Which frames of the recording are to be used, in rising order, and what for (as `Capture.split`)."""
+    """The frames to use, in increasing order, with their split (as `Capture.split`)."""
 
     frame_index: Int[np.ndarray, "m"]
     split: UInt8[np.ndarray, "m"]
 
     def for_frames(self, frame_index: Int[np.ndarray, "n"]) -> UInt8[np.ndarray, "n"]:
-        """What these frames, all of them listed, are for."""
+        """Return the split of these frames; all of them must be listed."""
         return self.split[np.searchsorted(self.frame_index, frame_index)]
 
 
 @dataclass(frozen=True)
 class UserFiles:
-    """What was found; None for what was not. `read_mask(index)` gives uint8 [0, 255] at its own size."""
+    """The inputs that were found; None for the others. `read_mask(index)` returns uint8 [0, 255] at the mask's own
+    size.
+    """
 
     read_mask: Callable[[int], UInt8[np.ndarray, "h w"]] | None
     mask_source: str
@@ -125,9 +127,10 @@ class UserFiles:
 
 
 def load_user_files(path: Path, source: FrameSource) -> UserFiles:
-    """Look in the user's folder (nothing is looked for when a video file alone was given).
+    """Read the user-supplied inputs in the video folder; a video file has none.
 
-    Raises UserError when a file that is there does not fit the recording.
+    Raises:
+        UserError: a file does not fit the recording.
     """
     if not path.is_dir():
         return UserFiles(None, "", None, None)
@@ -167,8 +170,8 @@ def _masks_from_folder(folder: Path, source: FrameSource) -> Callable[[int], np.
     if any(name in by_stem for name in names):
         if missing := next((name for name in names if name not in by_stem), None):
             raise UserError(
-                f"{folder} has masks named as the images are, but none for {missing}; add it, or number the masks so "
-                "that none is named as an image"
+                f"{folder} has masks with the names of images, but none for {missing}; add it, or rename all masks to "
+                "numbers"
             )
         files = [by_stem[name] for name in names]
     _check_frame_count(folder, len(files), source)
@@ -208,12 +211,10 @@ def _read_landmarks(path: Path, source: FrameSource) -> UserLandmarks:
     world = arrays.get("landmarks_world_m")
     if visibility.shape != points.shape[:2] or (world is not None and world.shape != (*points.shape[:2], 3)):
         raise UserError(
-            f"{path}: `landmarks_visibility` or `landmarks_world_m` does not fit `landmarks_px`; mend its shape"
+            f"{path}: `landmarks_visibility` or `landmarks_world_m` does not fit `landmarks_px`; correct its shape"
         )
     if (outside := ((visibility < 0) | (visibility > 1)).any(axis=1)).any():
-        raise UserError(
-            f"{path}: `landmarks_visibility` of frame {outside.argmax()} leaves [0, 1]; bring it to that range"
-        )
+        raise UserError(f"{path}: `landmarks_visibility` of frame {outside.argmax()} is outside [0, 1]; scale it")
     return UserLandmarks(
         points.astype(np.float32),
         visibility.astype(np.float32),
@@ -230,36 +231,36 @@ def _read_camera(path: Path, source: FrameSource) -> CameraCalibration:
         pose = values.get("world_to_camera")
         world_to_camera = None if pose is None else np.array(pose, dtype=np.float32).reshape(4, 4)
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
-        raise UserError(f"{path} is no camera ({error}); it needs numbers fx, fy, cx, cy in pixels") from None
+        raise UserError(f"{path} is not a camera ({error}); it needs numbers fx, fy, cx, cy in pixels") from None
     if min(fx, fy) <= 0 or not np.isfinite([fx, fy, cx, cy, *distortion]).all():
         raise UserError(
             f"{path}: fx and fy must be above 0 pixels and all numbers finite, found fx {fx}, fy {fy}, cx {cx}, "
-            f"cy {cy}, distortion {list(distortion)}; mend them"
+            f"cy {cy}, distortion {list(distortion)}; correct them"
         )
     if len(distortion) not in (0, 4, 5, 8):
         raise UserError(f"{path}: distortion needs 4, 5 or 8 numbers (k1 k2 p1 p2 ...), found {len(distortion)}")
     if world_to_camera is not None and not is_rigid(world_to_camera):
         raise UserError(
-            f"{path}: `world_to_camera` must be a rotation and a shift in metres, with 0 0 0 1 in its last row; "
-            "divide its scale out, or leave it out"
+            f"{path}: `world_to_camera` must be a rotation and a translation in metres, with 0 0 0 1 in its last row; "
+            "divide its scale out, or remove it"
         )
     _check_image_size(path, cx, cy, size_px, source)
     return CameraCalibration(fx, fy, cx, cy, distortion, world_to_camera)
 
 
 def _check_image_size(path: Path, cx: float, cy: float, size_px: tuple[int, int] | None, source: FrameSource) -> None:
-    """UserError for a calibration of pictures of another size: everything would be fitted wrongly without a sign."""
+    """Raise UserError for a calibration of images of another size, which would bias the fit without any other sign."""
     width, height = image_size_px(source)
     if size_px is not None and size_px != (width, height):
         raise UserError(
-            f"{path} is for pictures of {size_px[0]}x{size_px[1]}, those of {source.path} are {width}x{height}; "
-            "give the camera of these pictures, or the original pictures"
+            f"{path} is for images of {size_px[0]}x{size_px[1]}, those of {source.path} are {width}x{height}; "
+            "supply the camera of these images, or the original images"
         )
     if size_px is None and max(abs(cx / width - 0.5), abs(cy / height - 0.5)) > _MAX_PRINCIPAL_POINT_OFFSET:
         raise UserError(
-            f"{path}: cx {cx:g}, cy {cy:g} lie far from the middle of the pictures of {source.path}, which are "
-            f"{width}x{height}; give the camera of these pictures, or, where they were cut out of larger ones, confirm "
-            f'it with "width": {width}, "height": {height} in that file'
+            f"{path}: cx {cx:g}, cy {cy:g} are far from the centre of the images of {source.path}, which are "
+            f"{width}x{height}; supply the camera of these images, or, for cropped images, confirm it with "
+            f'"width": {width}, "height": {height} in that file'
         )
 
 
@@ -268,7 +269,9 @@ def _read_split(path: Path, source: FrameSource) -> UserSplit:
         values = json.loads(path.read_text(encoding="utf-8"))
         lists = {name: [operator.index(value) for value in indices] for name, indices in values.items()}
     except (ValueError, TypeError, AttributeError) as error:
-        raise UserError(f"{path} is no split ({error}); it needs lists of frame indices, train and heldout") from None
+        raise UserError(
+            f"{path} is not a split ({error}); it needs lists of frame indices, train and heldout"
+        ) from None
     if unknown := set(lists) - set(_SPLITS):
         raise UserError(f"{path}: unknown list {sorted(unknown)[0]}; there are {', '.join(_SPLITS)}")
     if "validation" not in lists:
@@ -277,10 +280,10 @@ def _read_split(path: Path, source: FrameSource) -> UserSplit:
         lists["train"] = sorted(set(train) - set(lists["validation"]))
     for name in _SPLITS:
         if not lists.get(name):
-            raise UserError(f"{path} lists no frame for {name}; list some of each kind, and 5 training ones or more")
+            raise UserError(f"{path} lists no frame for {name}; list some for each, and at least 5 training frames")
     indices = np.concatenate([lists[name] for name in _SPLITS])
     if len(np.unique(indices)) != len(indices):
-        raise UserError(f"{path} lists a frame twice; give each frame one use")
+        raise UserError(f"{path} lists a frame twice; remove one of them")
     if indices.min() < 0 or indices.max() >= source.n_frames:
         raise UserError(f"{path} lists frames up to {indices.max()}, {source.path} has 0 to {source.n_frames - 1}")
     kinds = np.concatenate([np.full(len(lists[name]), kind, np.uint8) for name, kind in _SPLITS.items()])
@@ -293,15 +296,15 @@ def _read_smpl_poses(path: Path, source: FrameSource) -> SmplPoses:
     if len(poses.frame_index) and not 0 <= poses.frame_index[0] <= poses.frame_index[-1] < source.n_frames:
         raise UserError(
             f"{path} has poses of frames {poses.frame_index[0]} to {poses.frame_index[-1]}, {source.path} has 0 to "
-            f"{source.n_frames - 1}; give the recording that belongs to them"
+            f"{source.n_frames - 1}; supply the recording of these poses"
         )
     return poses
 
 
 def _check_frame_count(path: Path, count: int, source: FrameSource) -> None:
-    """UserError for too few, and for too many as well: nothing says which frame each belongs to."""
+    """Raise UserError for too few entries, and for too many: their frames are unknown."""
     if count != source.n_frames:
         raise UserError(
             f"{path} has {count} entries for {source.n_frames} frames of {source.path}; "
-            "give one for each frame, or remove it and the detector will be used"
+            "supply one for each frame, or remove it to use the detector"
         )

@@ -1,7 +1,7 @@
-"""Frames of a video file or of a folder of images, upright, with square pixels, in RGB.
+"""Frames of a video file or an image folder as upright RGB images with square pixels.
 
-What the container says about rotation, pixel aspect, colours and times is honoured, and what EXIF says for images.
-A frame keeps its index in the whole recording, however few frames are read.
+Rotation, pixel aspect ratio, colour space and time stamps of the container, and EXIF of images, are applied. A frame
+keeps its index in the recording, whichever frames are read.
 """
 
 import re
@@ -28,13 +28,13 @@ _IMAGE_FOLDER_NAMES = ("images", "frames", "image", "rgb", "color")
 # Bicubic, with chroma brought to full resolution before the colour matrix: swscale's default repeats each chroma
 # sample over 2 x 2 pixels, which leaves visible blocks along the person's outline (bits of libswscale's SWS_* flags).
 _SWS_FLAGS = 0x4 | 0x2000 | 0x4000 | 0x40000
-# A picture as it comes, 8 bits of sRGB or 16 bits of another curve, and how the first is made of it.
+# A decoded image (8-bit sRGB, or 16 bits with another transfer function) and its conversion to 8-bit sRGB.
 _DecodedImage = tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]
 
 
 @dataclass(frozen=True)
 class FrameSource:
-    """A recording: a video file (then `files` is empty), or images in their natural order."""
+    """A recording: a video file (then `files` is empty), or images in natural order."""
 
     path: Path
     files: tuple[Path, ...]
@@ -44,7 +44,7 @@ class FrameSource:
 
 @dataclass(frozen=True)
 class Frame:
-    """One picture of the recording; `scale` is its size relative to the original one (1 or smaller)."""
+    """One image of the recording; `scale` is its size relative to the original (at most 1)."""
 
     index: int
     time_s: float
@@ -53,16 +53,18 @@ class Frame:
 
 
 def open_frame_source(path: Path, image_fps: float = DEFAULT_IMAGE_FPS) -> FrameSource:
-    """Look at a file or folder and say what recording it holds.
+    """Open a video file or a folder.
 
-    A folder may hold images, one video file, or a folder `images`/`frames` with images. Images do not say how many a
-    second there were; `image_fps` does.
-    Raises UserError when there is none, or when the file cannot be read as a video.
+    A folder may hold images, one video file, or a folder `images`/`frames` with images. Images have no frame rate:
+    `image_fps` is used.
+
+    Raises:
+        UserError: there is no recording, or the file cannot be read as a video.
     """
     if path.is_file():
         return _open_video(path)
     if not path.is_dir():
-        raise UserError(f"{path} does not exist; give a video file or a folder of images with VIDEO=")
+        raise UserError(f"{path} does not exist; supply a video file or a folder of images")
     files = _images_in(path)
     videos = sorted(p for p in path.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES)
     if files:
@@ -70,7 +72,7 @@ def open_frame_source(path: Path, image_fps: float = DEFAULT_IMAGE_FPS) -> Frame
     if len(videos) == 1:
         return _open_video(videos[0])
     if videos:
-        raise UserError(f"{path} holds {len(videos)} videos; give one of them, for example VIDEO={videos[0]}")
+        raise UserError(f"{path} holds {len(videos)} videos; choose one of them, for example {videos[0]}")
     for folder in (path / name for name in _IMAGE_FOLDER_NAMES):
         if folder.is_dir() and _images_in(folder):
             files = _images_in(folder)
@@ -83,10 +85,12 @@ def open_frame_source(path: Path, image_fps: float = DEFAULT_IMAGE_FPS) -> Frame
 
 
 def read_frames(source: FrameSource, is_wanted: Callable[[int], bool], max_side_px: int) -> Iterator[Frame]:
-    """Yield the wanted frames in order, none larger than `max_side_px` on its longer side.
+    """Yield the wanted frames in order, reduced to at most `max_side_px` on the longer side.
 
-    Raises UserError for an unreadable image, or images that change their size. A video that breaks off is read as far
-    as it goes, with a warning.
+    A video that is truncated is read as far as possible, with a warning.
+
+    Raises:
+        UserError: an image cannot be read, or the image size changes.
     """
     size_px: tuple[int, ...] | None = None
     for index, time_s, (rgb, to_srgb) in _images(source, is_wanted) if source.files else _video(source, is_wanted):
@@ -102,18 +106,19 @@ def read_frames(source: FrameSource, is_wanted: Callable[[int], bool], max_side_
 
 
 def image_size_px(source: FrameSource) -> tuple[int, int]:
-    """Width and height of the recording's first picture, upright and with square pixels.
+    """Return width and height of the first image, upright and with square pixels.
 
-    Raises UserError when no picture can be read.
+    Raises:
+        UserError: no image can be read.
     """
     first = next(read_frames(source, lambda index: index == 0, max_side_px=1 << 30), None)
     if first is None:
-        raise UserError(f"{source.path} has no picture that can be read; give another recording")
+        raise UserError(f"{source.path} has no readable image; use another recording")
     return first.rgb.shape[1], first.rgb.shape[0]
 
 
 def natural_sort_key(path: Path) -> list[tuple[int, str]]:
-    """Sort key under which `frame2` comes before `frame10`."""
+    """Return a sort key that orders `frame2` before `frame10`."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name.lower()) if part]
 
 
@@ -126,14 +131,14 @@ def _open_video(path: Path) -> FrameSource:
     try:
         with av.open(str(path)) as container:
             if not container.streams.video:
-                raise UserError(f"{path} has no picture track; give a video file or a folder of images")
+                raise UserError(f"{path} has no video track; supply a video file or a folder of images")
             stream = container.streams.video[0]
             fps = float(stream.average_rate or stream.guessed_rate or DEFAULT_IMAGE_FPS)
-            # An edit list (a clip that was cut without encoding it anew) has pictures that are decoded but never shown.
+            # Packets hidden by an edit list (a clip that was trimmed without re-encoding) are decoded but not shown.
             n_frames = sum(packet.size > 0 and not packet.is_discard for packet in container.demux(stream))
     except av.FFmpegError as error:
         raise UserError(
-            f"{path} is no video that can be read ({error.strerror}); give an .mp4, .mov or .webm file"
+            f"{path} cannot be read as a video ({error.strerror}); supply an .mp4, .mov or .webm file"
         ) from None
     return FrameSource(path, (), n_frames, fps)
 
@@ -158,18 +163,18 @@ def _video(source: FrameSource, is_wanted: Callable[[int], bool]) -> Iterator[tu
                 if is_wanted(index):
                     yield index, time_s - start_s, _to_upright_rgb(picture, stream.sample_aspect_ratio)
         except av.FFmpegError as error:
-            warn(f"{source.path} breaks off after {index + 1} frames ({error.strerror}); going on with those")
+            warn(f"{source.path} is truncated after {index + 1} frames ({error.strerror}); these frames are used")
 
 
 def _monotonic_time_s(timestamp_s: float | None, previous_s: float | None, step_s: float) -> float:
-    """A frame's time stamp, or one step after the frame before where it is missing or does not lie after that one."""
+    """Return the time stamp, or one step after the previous frame if it is missing or not increasing."""
     if previous_s is None:
         return timestamp_s or 0.0
     return timestamp_s if timestamp_s is not None and timestamp_s > previous_s else previous_s + step_s
 
 
 def _to_upright_rgb(picture: av.VideoFrame, aspect: Fraction | None) -> _DecodedImage:
-    """Colour pixels of a decoded picture with square pixels, turned as the container asks."""
+    """Return the RGB image of a decoded frame with square pixels, rotated as the container says."""
     transfer, primaries = int(picture.color_trc), int(picture.color_primaries)
     is_hdr = transfer in hdr.HDR_TRANSFERS
     pixels = picture.reformat(format="rgb48le" if is_hdr else "rgb24", interpolation=_SWS_FLAGS)
@@ -181,7 +186,7 @@ def _to_upright_rgb(picture: av.VideoFrame, aspect: Fraction | None) -> _Decoded
 
 
 def _downscale(rgb: Shaped[np.ndarray, "h w 3"], max_side_px: int) -> tuple[Shaped[np.ndarray, "h2 w2 3"], float]:
-    """The picture with its longer side at most `max_side_px`, and the factor; area averaging avoids aliasing."""
+    """Reduce the longer side to at most `max_side_px` by area averaging; return image and factor."""
     scale = min(1.0, max_side_px / max(rgb.shape[:2]))
     if scale == 1.0:
         return rgb, 1.0

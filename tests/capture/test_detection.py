@@ -50,7 +50,7 @@ class FakeDetector:
     def count_people(self, rgb):
         return 1
 
-    def look(self, rgb, *pose):
+    def detect_hands(self, rgb, *pose):
         return undetected_hands()
 
 
@@ -67,7 +67,7 @@ def change_landmarks(folder, **changes):
     save_npz(path, {name: array for name, array in (load_npz(path) | changes).items() if array is not None})
 
 
-def look(folder, stride=1, max_side_px=60):
+def detect_recording(folder, stride=1, max_side_px=60):
     source = open_frame_source(folder / "in")
     user_files = load_user_files(folder / "in", source)
     with start_process_pool(1) as workers:
@@ -76,7 +76,7 @@ def look(folder, stride=1, max_side_px=60):
 
 
 def test_all_frames_are_seen_and_an_empty_one_is_not_found(folder):
-    _, _, seen = look(folder)
+    _, _, seen = detect_recording(folder)
     np.testing.assert_array_equal(seen.frame_index, np.arange(12))
     np.testing.assert_array_equal(np.flatnonzero(~seen.found), [5])
     np.testing.assert_array_equal(seen.landmarks_px[3, 0], [17, 20])
@@ -89,7 +89,7 @@ def test_one_landmark_that_is_unknown_drops_no_frame(folder):
     points = load_npz(folder / "in" / "landmarks.npz")["landmarks_px"]
     points[8, 13] = np.nan
     change_landmarks(folder, landmarks_px=points)
-    _, _, seen = look(folder)
+    _, _, seen = detect_recording(folder)
     np.testing.assert_array_equal(np.flatnonzero(~seen.found), [5])
     assert np.argwhere(np.isnan(seen.landmarks_px[8]).any(axis=1)).tolist() == [[13]]
     assert (seen.landmarks_visibility[8] == (np.arange(33) != 13)).all()
@@ -99,7 +99,7 @@ def test_a_supplied_mask_shows_a_person_whom_the_detector_misses(folder, detecto
     """Frame 3 is black, so that nothing is detected there, but its mask lies beside it."""
     (folder / "in" / "landmarks.npz").unlink()
     write_rgb(folder / "in" / "3.png", np.zeros((40, 60, 3), np.uint8))
-    _, _, seen = look(folder)
+    _, _, seen = detect_recording(folder)
     np.testing.assert_array_equal(np.flatnonzero(~seen.found), [5])
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(seen.landmarks_px).all(axis=(1, 2))), [3, 5])
     assert seen.person_masks[3].sum() == 300
@@ -109,13 +109,13 @@ def test_specks_of_a_mask_show_nobody(folder):
     speck = np.zeros((40, 60), np.uint8)
     speck[3:5, 7:9] = 255
     write_gray(folder / "in" / "masks" / "5.png", speck)
-    _, _, seen = look(folder)
+    _, _, seen = detect_recording(folder)
     np.testing.assert_array_equal(np.flatnonzero(~seen.found), [5])
 
 
 def test_landmarks_without_depth_get_it_from_the_detector(folder, detector):
     change_landmarks(folder, landmarks_world_m=None)
-    _, _, seen = look(folder)
+    _, _, seen = detect_recording(folder)
     np.testing.assert_array_equal(seen.landmarks_px[3, 0], [17, 20])
     assert (seen.landmarks_visibility[3] == 1).all()
     np.testing.assert_array_equal(seen.landmarks_world_m[3], detector.landmarks_world_m)
@@ -124,12 +124,12 @@ def test_landmarks_without_depth_get_it_from_the_detector(folder, detector):
 
 def test_landmarks_with_depth_need_no_detector(folder, monkeypatch):
     monkeypatch.setattr(sightings, "_detector", None)
-    _, _, seen = look(folder)
+    _, _, seen = detect_recording(folder)
     assert (seen.landmarks_world_m[3] == 1).all()
 
 
 def test_a_stride_keeps_indices_and_a_smaller_size_scales_landmarks(folder):
-    _, _, seen = look(folder, stride=3, max_side_px=30)
+    _, _, seen = detect_recording(folder, stride=3, max_side_px=30)
     np.testing.assert_array_equal(seen.frame_index, [0, 3, 6, 9])
     np.testing.assert_allclose(seen.time_s, np.array([0, 3, 6, 9]) / 30)
     np.testing.assert_allclose(seen.landmarks_px[1, 0], [8.5, 10])
@@ -137,7 +137,7 @@ def test_a_stride_keeps_indices_and_a_smaller_size_scales_landmarks(folder):
 
 
 def test_selected_frames_are_written_with_supplied_masks(folder):
-    source, user_files, seen = look(folder)
+    source, user_files, seen = detect_recording(folder)
     out = folder / "out"
     out.mkdir()
     with start_process_pool(1) as workers:
@@ -154,7 +154,7 @@ def test_where_a_mask_is_soft_the_picture_holds_the_persons_colour(folder):
     image = np.where(mask[..., None] == 128, np.uint8(107), read_rgb(folder / "in" / "4.png"))
     write_rgb(folder / "in" / "4.png", np.where(mask[..., None] == 64, np.uint8(60), image))
     write_gray(folder / "in" / "masks" / "4.png", mask)
-    source, user_files, seen = look(folder)
+    source, user_files, seen = detect_recording(folder)
     out = folder / "out"
     out.mkdir()
     with start_process_pool(1) as workers:
@@ -168,11 +168,11 @@ def test_where_a_mask_is_soft_the_picture_holds_the_persons_colour(folder):
 def test_a_mask_of_another_shape_is_named(folder):
     write_gray(folder / "in" / "masks" / "7.png", np.zeros((60, 40), np.uint8))
     with pytest.raises(UserError, match="mask of frame 7"):
-        look(folder)
+        detect_recording(folder)
 
 
 def test_windows_hold_each_wanted_frame_with_its_neighbours(folder):
-    _, _, seen = look(folder)
+    _, _, seen = detect_recording(folder)
     frames = [Frame(k, k / 30, np.zeros((1, 1, 3), np.uint8), 1.0) for k in range(12)]
     windows = [
         (position, [frame.index for frame in near])

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from pipeline.capture.hand_detector import HandDetector, image_scale_px_per_m, stack_hands, undetected_hands
-from pipeline.capture.person_detector import LANDMARK_NAMES, PersonDetection, PersonDetector
+from pipeline.capture.landmarks import LANDMARK_NAMES
+from pipeline.capture.person_detector import PersonDetection, PersonDetector
 from pipeline.capture.video import open_frame_source, read_frames
 
 
@@ -29,7 +30,7 @@ def person(photograph) -> PersonDetection:
 
 
 def test_a_hand_seen_from_its_back_is_found_and_the_hidden_one_is_not(detector, photograph, person):
-    hands = detector.look(photograph, person.landmarks_px, person.visibility, person.landmarks_world_m)
+    hands = detector.detect_hands(photograph, person.landmarks_px, person.visibility, person.landmarks_world_m)
     assert hands.handedness_score[0] > 0.9
     assert hands.handedness_score[1] == 0.0  # behind the back
     assert np.isnan(hands.landmarks_px[1]).all()
@@ -48,20 +49,20 @@ def test_the_other_hand_is_known_as_such(detector, photograph, person):
     """In a mirrored picture the left hand is a right one."""
     mirrored = np.ascontiguousarray(photograph[:, ::-1])
     pose_px = person.landmarks_px * [-1, 1] + [photograph.shape[1], 0]
-    hands = detector.look(mirrored, pose_px.astype(np.float32), person.visibility, person.landmarks_world_m)
+    hands = detector.detect_hands(mirrored, pose_px.astype(np.float32), person.visibility, person.landmarks_world_m)
     assert 0.0 < hands.handedness_score[0] < 0.1
 
 
 def test_a_small_hand_is_not_looked_at(detector, photograph, person):
     small = np.ascontiguousarray(photograph[::4, ::4])
-    hands = detector.look(small, person.landmarks_px / 4, person.visibility, person.landmarks_world_m)
+    hands = detector.detect_hands(small, person.landmarks_px / 4, person.visibility, person.landmarks_world_m)
     assert (hands.handedness_score == 0.0).all()
 
 
 def test_a_hand_that_the_pose_calls_hidden_is_not_looked_at(detector, photograph, person):
     visibility = person.visibility.copy()
     visibility[LANDMARK_NAMES.index("left_wrist")] = 0.2
-    hands = detector.look(photograph, person.landmarks_px, visibility, person.landmarks_world_m)
+    hands = detector.detect_hands(photograph, person.landmarks_px, visibility, person.landmarks_world_m)
     assert hands.handedness_score[0] == 0.0
 
 
@@ -76,7 +77,7 @@ def test_wrist_pinky_and_index_show_where_a_hand_is(detector, monkeypatch):
     monkeypatch.setattr(detector, "_graph", SimpleNamespace(process=process))
     pose_px = np.stack([10.0 * np.arange(33), 300.0 - np.arange(33)], axis=1)
     rgb = np.zeros((300, 400, 3), np.uint8)
-    detector.look(rgb, pose_px, np.ones(33), np.random.default_rng(0).normal(size=(33, 3)) * 0.01)
+    detector.detect_hands(rgb, pose_px, np.ones(33), np.random.default_rng(0).normal(size=(33, 3)) * 0.01)
     for side, points in zip(("left", "right"), process_inputs, strict=True):
         rows = [LANDMARK_NAMES.index(f"{side}_{name}") for name in ("wrist", "pinky", "index")]
         np.testing.assert_allclose(points, pose_px[rows] / (400, 300), atol=1e-6)

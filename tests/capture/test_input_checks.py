@@ -61,8 +61,8 @@ def test_good_recording_passes_without_warning(good):
         ("landmarks_px", (slice(0, 11), [27, 28], 1), 120.0, "cut off above the feet in 11 of 20 frames"),
         ("landmarks_visibility", (slice(3, 20), [27, 28]), 0.01, "cut off .* in 17 of 20 frames .frame 3 first"),
         ("landmarks_px", (slice(15, 20), 23), np.nan, "known, .* in only 15 of the 20 frames .* landmarks.npz"),
-        ("landmarks_px", (slice(0, 11), [23, 24], 0), 90.0, "lies on the side or stands upside down"),
-        ("landmarks_px", (slice(0, 11), [23, 24], 1), 10.0, "lies on the side or stands upside down"),
+        ("landmarks_px", (slice(0, 11), [23, 24], 0), 90.0, "is not upright"),
+        ("landmarks_px", (slice(0, 11), [23, 24], 1), 10.0, "is not upright"),
         ("landmarks_world_m", (slice(5, 20), 11, 2), np.nan, "known, in pixels and in 3D, in only 5 of the 20"),
     ],
 )
@@ -95,7 +95,7 @@ def test_feet_are_cut_off_whatever_is_unknown_of_them(good):
     points = good.landmarks_px.copy()
     points[2:4, 31, 1], points[2:4, 30], points[9, 29:33] = 101.0, np.nan, np.nan
     warn_about_input(dataclasses.replace(good, landmarks_px=points), 0.5, PATH)
-    assert [warning.endswith("the avatar: 2-3") for warning in take_warnings()] == [True]
+    assert [warning.endswith("less sharp: 2-3") for warning in take_warnings()] == [True]
 
 
 def make_moving_scene(shifts_px: list[int], levels: list[int]) -> Detections:

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from pipeline.capture import landmarks
 from pipeline.capture import person_detector as person
 from pipeline.capture.video import open_frame_source, read_frames
 
@@ -21,11 +22,11 @@ def photograph(shared_data) -> np.ndarray:
 
 
 def test_every_landmark_has_a_name():
-    assert len(person.LANDMARK_NAMES) == 33
-    assert [person.LANDMARK_NAMES[k] for k in (*person.KNEES, *person.ANKLES)] == [
+    assert len(landmarks.LANDMARK_NAMES) == 33
+    assert [landmarks.LANDMARK_NAMES[k] for k in (*landmarks.KNEES, *landmarks.ANKLES)] == [
         "left_knee", "right_knee", "left_ankle", "right_ankle"
     ]  # fmt: skip
-    assert {person.LANDMARK_NAMES[k].split("_")[1] for k in person.TORSO} == {"shoulder", "hip"}
+    assert {landmarks.LANDMARK_NAMES[k].split("_")[1] for k in landmarks.TORSO} == {"shoulder", "hip"}
 
 
 def test_nobody_in_an_empty_picture(detector):
@@ -35,13 +36,13 @@ def test_nobody_in_an_empty_picture(detector):
 
 def test_a_person_is_found_where_he_stands(detector, photograph):
     found = detector.detect(photograph)
-    names = dict(zip(person.LANDMARK_NAMES, found.landmarks_px, strict=True))
+    names = dict(zip(landmarks.LANDMARK_NAMES, found.landmarks_px, strict=True))
     assert found.mask.shape == photograph.shape[:2]
     assert 0.12 < (found.mask > 127).mean() < 0.16
     assert names["nose"][1] < names["left_hip"][1] < names["left_ankle"][1] < 630
     assert names["right_wrist"][0] < names["right_shoulder"][0] < names["left_shoulder"][0] < names["left_wrist"][0]
     assert found.visibility.min() > 0.5
-    world = dict(zip(person.LANDMARK_NAMES, found.landmarks_world_m, strict=True))
+    world = dict(zip(landmarks.LANDMARK_NAMES, found.landmarks_world_m, strict=True))
     assert 1.0 < world["left_ankle"][1] - world["nose"][1] < 2.0
 
 

@@ -53,12 +53,12 @@ def test_gender_may_be_left_out(tmp_path):
         ("betas", np.zeros(10), r"`betas` must have shape \(3, 10\)"),
         ("transl", None, "`transl` must have shape .* found None"),
         ("frame_index", None, "`frame_index` must have shape"),
-        ("frame_index", np.array([0, 4, 4]), "does not rise"),
+        ("frame_index", np.array([0, 4, 4]), "does not increase"),
         ("gender", np.array("giant"), "gender is giant"),
-        ("transl", np.full((3, 3), np.nan), "`transl` holds a number that is not finite"),
-        ("smpl_to_camera", np.tile(2 * np.eye(4), (3, 1, 1)), "must be a rotation and a shift"),
-        ("smpl_to_camera", np.tile(np.diag([1.0, -1, 1, 1]), (3, 1, 1)), "must be a rotation and a shift"),
-        ("smpl_to_camera", np.tile(np.diag([1.0, 1, 1, 2]), (3, 1, 1)), "must be a rotation and a shift"),
+        ("transl", np.full((3, 3), np.nan), "`transl` holds a value that is not finite"),
+        ("smpl_to_camera", np.tile(2 * np.eye(4), (3, 1, 1)), "must be a rotation with translation"),
+        ("smpl_to_camera", np.tile(np.diag([1.0, -1, 1, 1]), (3, 1, 1)), "must be a rotation with translation"),
+        ("smpl_to_camera", np.tile(np.diag([1.0, 1, 1, 2]), (3, 1, 1)), "must be a rotation with translation"),
     ],
 )
 def test_what_does_not_fit_is_named(tmp_path, name, value, message):

@@ -72,7 +72,7 @@ def test_extra_mask_is_refused_when_names_do_not_match(tmp_path, source):
 def test_masks_numbered_from_another_start_are_refused(tmp_path, source):
     """As many as there are images, most of them named as one: in natural order each would belong to another frame."""
     write_masks(tmp_path, x2=20, x10=30, x11=40)
-    with pytest.raises(UserError, match="named as the images are, but none for x1;"):
+    with pytest.raises(UserError, match="with the names of images, but none for x1;"):
         load_user_files(tmp_path, source)
 
 
@@ -155,14 +155,14 @@ def test_camera_for_smaller_images(tmp_path, source):
 )
 def test_a_pose_that_is_no_rotation_and_shift_is_refused(tmp_path, source, wrong):
     (tmp_path / "camera.json").write_text(json.dumps(CAMERA | {"world_to_camera": wrong.tolist()}))
-    with pytest.raises(UserError, match="`world_to_camera` must be a rotation and a shift in metres"):
+    with pytest.raises(UserError, match="`world_to_camera` must be a rotation and a translation in metres"):
         load_user_files(tmp_path, source)
 
 
 def test_off_centre_principal_point_requires_image_size(tmp_path, source):
     """The camera of pictures of half the size has it at a quarter of these; a cropped video may have it there too."""
     (tmp_path / "camera.json").write_text(json.dumps(CAMERA | {"cx": 32.0, "cy": 24.0}))
-    with pytest.raises(UserError, match=r'cx 32, cy 24 lie far .* which are 128x96; .* "width": 128, "height": 96'):
+    with pytest.raises(UserError, match=r'cx 32, cy 24 are far .* which are 128x96; .* "width": 128, "height": 96'):
         load_user_files(tmp_path, source)
     (tmp_path / "camera.json").write_text(json.dumps(CAMERA | {"cx": 32.0, "cy": 24.0, "width": 128, "height": 96}))
     assert load_user_files(tmp_path, source).camera.cx == 32
@@ -211,20 +211,20 @@ def test_without_distortion_nothing_is_resampled():
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("camera.json", "{", "is no camera"),
-        ("camera.json", json.dumps({"fx": 1}), "is no camera"),
-        ("camera.json", json.dumps([1, 2]), "is no camera"),
+        ("camera.json", "{", "is not a camera"),
+        ("camera.json", json.dumps({"fx": 1}), "is not a camera"),
+        ("camera.json", json.dumps([1, 2]), "is not a camera"),
         ("camera.json", json.dumps(CAMERA | {"fx": -1}), "above 0"),
         ("camera.json", json.dumps(CAMERA | {"distortion": [0.1]}), "distortion needs"),
-        ("camera.json", json.dumps(CAMERA | {"world_to_camera": [1, 2]}), "is no camera"),
+        ("camera.json", json.dumps(CAMERA | {"world_to_camera": [1, 2]}), "is not a camera"),
         ("camera.json", json.dumps(CAMERA | {"distortion": [0.1, 0.0, np.nan, 0.0]}), "all numbers finite"),
         ("camera.json", json.dumps(CAMERA | {"cx": np.inf}), "all numbers finite"),
-        ("camera.json", json.dumps(CAMERA | {"cx": 300.0}), "lie far from the middle of the pictures"),
-        ("camera.json", json.dumps(CAMERA | {"width": 128}), "is no camera .'height'."),
-        ("camera.json", json.dumps(CAMERA | {"width": 64, "height": 48}), "for pictures of 64x48, those .* are 128x96"),
-        ("split.json", "[0, 1]", "is no split"),
-        ("split.json", '{"train": 3, "heldout": [1]}', "is no split"),
-        ("split.json", '{"train": [0.5], "heldout": [1]}', "is no split"),
+        ("camera.json", json.dumps(CAMERA | {"cx": 300.0}), "are far from the centre of the images"),
+        ("camera.json", json.dumps(CAMERA | {"width": 128}), "is not a camera .'height'."),
+        ("camera.json", json.dumps(CAMERA | {"width": 64, "height": 48}), "for images of 64x48, those .* are 128x96"),
+        ("split.json", "[0, 1]", "is not a split"),
+        ("split.json", '{"train": 3, "heldout": [1]}', "is not a split"),
+        ("split.json", '{"train": [0.5], "heldout": [1]}', "is not a split"),
         ("split.json", '{"train": [0], "test": [1]}', "unknown list test; there are train, validation, heldout"),
         ("split.json", '{"train": [0], "heldout": [1]}', "no frame for validation"),
         ("split.json", '{"train": [0], "validation": [1], "heldout": []}', "no frame for heldout"),
@@ -254,17 +254,17 @@ def test_a_file_that_does_not_fit_is_named(tmp_path, source, name, content, mess
         (
             "landmarks.npz",
             {"landmarks_px": np.zeros((3, 33, 2)), "landmarks_visibility": np.eye(3, 33) * 2},
-            "of frame 0 leaves",
+            "of frame 0 is outside",
         ),
         (
             "landmarks.npz",
             {"landmarks_px": np.zeros((3, 33, 2)), "landmarks_world_m": np.zeros((3, 33, 2))},
-            "mend its shape",
+            "correct its shape",
         ),
         (
             "landmarks.npz",
             {"landmarks_px": np.zeros((3, 33, 2)), "landmarks_visibility": np.zeros(3)},
-            "mend its shape",
+            "correct its shape",
         ),
     ],
 )

@@ -231,8 +231,8 @@ def test_truncated_video_gives_a_warning(tmp_path):
         (lambda path: path.mkdir(), "is empty"),
         (lambda path: (path.mkdir(), (path / "a.txt").write_text("x")), "neither a video nor images"),
         (lambda path: (path.mkdir(), (path / "IMG_1.HEIC").touch()), "HEIC images, .* save them as JPEG"),
-        (lambda path: path.write_text("hello"), "is no video"),
-        (lambda path: path.write_bytes(b""), "is no video"),
+        (lambda path: path.write_text("hello"), "cannot be read as a video"),
+        (lambda path: path.write_bytes(b""), "cannot be read as a video"),
         (lambda path: (path.mkdir(), (path / "a.mp4").touch(), (path / "b.mp4").touch()), "2 videos"),
     ],
 )
@@ -248,7 +248,7 @@ def test_sound_alone_is_refused(tmp_path):
         frame = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), layout="mono")
         frame.rate = 8000
         container.mux(stream.encode(frame))
-    with pytest.raises(UserError, match="no picture track"):
+    with pytest.raises(UserError, match="no video track"):
         video.open_frame_source(tmp_path / "a.wav")
 
 

@@ -105,7 +105,7 @@ def test_a_split_with_more_frames_than_may_be_kept_is_refused(tmp_path):
 def test_a_split_whose_heldout_frames_show_nobody_is_refused(tmp_path):
     folder = write_split(draw_recording(tmp_path / "in", n=40), range(30), [35])
     write_gray(folder / "masks" / "35.png", np.zeros((96, 128), np.uint8))
-    with pytest.raises(UserError, match="no person was found in any frame of one kind"):
+    with pytest.raises(UserError, match="has no frame with a person"):
         run(folder, tmp_path / "out")
 
 
@@ -190,7 +190,7 @@ def test_image_fps_can_be_set(tmp_path):
 
 def test_fps_option_is_refused_for_video(tmp_path):
     write_video(tmp_path / "a.mp4", np.zeros((17, 48, 64, 3), np.uint8), 25.0)
-    with pytest.raises(UserError, match="a.mp4 is a video, .* leave frames.fps out"):
+    with pytest.raises(UserError, match="a.mp4 is a video, .* remove frames.fps"):
         run(tmp_path / "a.mp4", tmp_path / "out", fps=30.0)
 
 
@@ -218,7 +218,7 @@ def test_the_same_recording_gives_the_same_bytes(tmp_path):
 
 
 def test_too_few_frames_are_refused(tmp_path):
-    with pytest.raises(UserError, match="has 9 frames, too few"):
+    with pytest.raises(UserError, match="has 9 frames; at least"):
         run(draw_recording(tmp_path / "in", n=9), tmp_path / "out")
 
 
@@ -246,7 +246,7 @@ def test_a_picture_of_nobody_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(("n", "limit", "stride"), [(100, 900, 1), (900, 900, 1), (901, 900, 3), (3000, 900, 5)])
-def test_looking_stride_is_odd_and_enough(n, limit, stride):
+def test_detection_stride_is_odd_and_sufficient(n, limit, stride):
     assert frames.detection_stride(n, limit) == stride
     assert {index % 8 for index in range(0, 64 * stride, stride)} == set(range(8))
 
@@ -255,7 +255,7 @@ def test_looking_stride_is_odd_and_enough(n, limit, stride):
 @pytest.mark.parametrize(
     ("name", "message"), [("no_feet", "cut off above the feet"), ("several_people", "several people")]
 )
-def test_real_recordings_that_make_no_avatar(shared_data, tmp_path, name, message):
+def test_unusable_real_recordings_are_refused(shared_data, tmp_path, name, message):
     with pytest.raises(UserError, match=message):
         run(shared_data / "error" / f"{name}.mp4", tmp_path / "out", max_detection_frames=60)
 

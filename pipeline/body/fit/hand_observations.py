@@ -12,7 +12,8 @@ from jaxtyping import Float
 from pipeline.body.body import ParametricBody
 from pipeline.body.fit.landmark_regressor import HAND_LANDMARKS
 from pipeline.body.fit.linear_body import FINGERS, relaxed_curls_rad
-from pipeline.capture.hand_detector import N_HAND_LANDMARKS, WRISTS, HandLandmarks, image_scale_px_per_m
+from pipeline.capture.hand_detector import N_HAND_LANDMARKS, HandLandmarks, image_scale_px_per_m
+from pipeline.capture.landmarks import WRISTS
 
 MIN_HANDEDNESS = 0.5
 """A hand that is more likely the other one is not used. Seen edge-on, no model can tell."""
