@@ -39,7 +39,7 @@ OPTIONS = $(RUN_OPTIONS) $(ARGS)
 STAMP := $(VENV)/.stamp$(if $(EXTRA),-$(EXTRA))
 
 .DEFAULT_GOAL := help
-.PHONY: help all $(STAGES) batch chart compare test test-all check format bench bench-field bench-body doctor venv lock configs gltf-validator clean
+.PHONY: help all $(STAGES) batch chart compare figures test test-all check format bench bench-field bench-body doctor venv lock configs gltf-validator clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z$$()A-Z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST) | sed 's/$$(STAGES)/STAGE    /'
@@ -80,6 +80,9 @@ $(SAMPLE_MADE): | $(STAMP)
 
 compare: $(STAMP)  ## RUN=runs/name against the ground truth of TRUTH=capture (default: the sample): compare/truth.html
 	$(RUN_PYTHON) -m data_tools.evaluate.compare "$(or $(TRUTH),$(SAMPLE))" "$(ONE_RUN)"
+
+figures: $(STAMP)  ## measure every table of README and docs on this commit: CAPTURES, PRESETS
+	$(RUN_PYTHON) -m data_tools.sweep.figures $(CAPTURES) $(if $(PRESETS),--presets $(PRESETS)) $(ARGS)
 
 test: $(STAMP)  ## the fast tests, with the skip count
 	$(RUN_PYTHON) -m pytest -m "not slow" $(ARGS)
