@@ -99,7 +99,7 @@ def test_the_field_without_refinement_is_scored_only_on_request(report: dict):
 def test_poses_fitted_to_held_out_images_are_scored_apart(report: dict, out: Path):
     heldout = report["heldout"]
     assert {"field_pose_fitted", "mesh_pose_fitted"} <= heldout.keys()
-    assert "pose_fitted are no held-out scores" in heldout["protocol"]
+    assert "pose_fitted are not held-out scores" in heldout["protocol"]
     # the refined poses of this run are the true ones, so the fit has nothing to find
     assert heldout["mesh_pose_fitted"]["psnr_body"] == pytest.approx(heldout["mesh"]["psnr_body"], abs=1.0)
     held_out, apart = re.findall(
@@ -112,7 +112,7 @@ def test_poses_fitted_to_held_out_images_are_scored_apart(report: dict, out: Pat
 def test_lpips_is_present_or_reported_missing(report: dict):
     has_weights = find_lpips_weights() is not None
     assert ("lpips_full" in report["heldout"]["mesh"]) == has_weights
-    assert report["heldout"]["lpips"].startswith("AlexNet" if has_weights else "absent")
+    assert report["heldout"]["lpips"].startswith("AlexNet" if has_weights else "not computed")
 
 
 def test_an_untrained_field_is_worse_than_the_mesh(report: dict):
