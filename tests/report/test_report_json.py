@@ -47,7 +47,7 @@ def test_the_psnr_of_equal_images_becomes_null():
 
 
 def test_lpips_note_states_protocol_or_reason_for_absence(monkeypatch):
-    assert sample_report()["heldout"]["lpips"].startswith("absent")
+    assert sample_report()["heldout"]["lpips"].startswith("not computed")
     monkeypatch.setattr(report_sample, "SCORES", (*SCORES, "lpips_full"))
     assert "do not compare" in sample_report()["heldout"]["lpips"]
 
