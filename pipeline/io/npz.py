@@ -1,4 +1,4 @@
-"""Arrays on disk: npz without pickles and with the same bytes for the same arrays."""
+"""Arrays as npz files without pickles; equal arrays give equal bytes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
 
 
 def save_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write arrays under their names; `numpy.savez` would stamp the time of day into the archive."""
+    """Write arrays by name. (`numpy.savez` would store the current time in the archive.)"""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for name in sorted(arrays):
             with archive.open(zipfile.ZipInfo(f"{name}.npy", _ZIP_EPOCH), "w", force_zip64=True) as member:
@@ -25,7 +25,7 @@ def load_npz(path: Path) -> dict[str, np.ndarray]:
     """Read all arrays into memory.
 
     Raises:
-        UserError: the file is missing, is no npz, or holds pickled objects.
+        UserError: the file is missing, is not an npz archive, or holds pickled objects.
     """
     try:
         with np.load(path, allow_pickle=False) as archive:

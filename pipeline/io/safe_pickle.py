@@ -1,10 +1,9 @@
-"""Pickles from strangers, read without running anything: arrays and plain containers, everything else is refused.
+"""Restricted reading of untrusted pickles: numpy arrays and plain containers only; nothing is executed.
 
-A pickle is a program that may call any function it names. Here it may name only those that make numpy arrays and plain
-containers. Those of numpy itself are replaced: they take a type's flags, an array's length and even pointers to objects
-as the pickle gives them. Objects of other packages (chumpy, scipy) are read as `OpaqueObject`s when the caller asks
-for it by
-name, so that the packages are neither needed nor run. Python 2's pickles are read too; their byte strings come back as
+A pickle is a program that may call any function it names. Here it may name only the constructors of numpy arrays and
+plain containers. numpy's own constructors are replaced, because they trust type flags, array lengths and even object
+pointers in the pickle. Objects of other packages (chumpy, scipy) are read as `OpaqueObject` if the caller lists their
+classes, so that the packages are neither needed nor executed. Python 2 pickles are supported; their byte strings become
 Latin-1 text.
 """
 
@@ -21,7 +20,7 @@ import numpy as np
 
 from pipeline.core.errors import UserError
 
-# What damaged bytes can raise on their way through the unpickler and numpy.
+# Exceptions of the unpickler and of numpy for damaged data.
 _UNPICKLING_ERRORS = (
     pickle.UnpicklingError,
     ArithmeticError,
@@ -38,38 +37,40 @@ _UNPICKLING_ERRORS = (
 
 
 class ForbiddenGlobalError(pickle.UnpicklingError):
-    """The pickle names something that is not on the allow-list; the message is its dotted name."""
+    """The pickle names a global that is not on the allow-list; the message is its dotted name."""
 
 
 class OpaqueObject:
-    """An object of another package that was not built: `state` is what it would have been built from."""
+    """An object of another package that was not constructed; `state` holds its pickled state."""
 
     state: Any = None
 
     def __setstate__(self, state: object) -> None:
-        """Keep what the pickle hands over."""
+        """Store the pickled state."""
         self.state = state
 
 
 class _NdarrayPlaceholder:
-    """Stands where a pickle names `numpy.ndarray`, which would take any bytes for pointers to objects."""
+    """Replacement of `numpy.ndarray`, whose constructor would accept any bytes as object pointers."""
 
 
 class _DtypePlaceholder:
-    """A numpy type as a pickle describes it: a name and, after BUILD, its parts."""
+    """A numpy dtype as described by a pickle: a name and, after BUILD, its state."""
 
     def __init__(self, name: object, *_: object) -> None:
         if not isinstance(name, str):
-            raise pickle.UnpicklingError("a type of numpy has no name")
+            raise pickle.UnpicklingError("a numpy dtype has no name")
         self.name, self.parts = name, None
 
     def __setstate__(self, state: Any) -> None:
-        """Keep what the pickle hands over."""
+        """Store the pickled state."""
         self.parts = state
 
     @property
     def dtype(self) -> np.dtype:
-        """The type that numpy itself makes of the parts, with its own flags; ValueError where the parts contradict."""
+        """Return the dtype that numpy constructs from the state with its own flags; ValueError if the state is
+        inconsistent.
+        """
         if self.parts is None:
             return np.dtype(self.name)
         _, byte_order, subarray, names, fields, itemsize, *_ = self.parts
@@ -83,12 +84,12 @@ class _DtypePlaceholder:
 
 
 def _empty_array(*_: object) -> np.ndarray:
-    """What `_reconstruct` does; the array gets its content by BUILD."""
+    """Replacement of `_reconstruct`; BUILD fills the array."""
     return np.empty(0)
 
 
 def _checked_array_state(state: Any) -> tuple[Any, ...]:
-    """What BUILD gives an array: of objects numpy would read on where the shape asks for more than there are."""
+    """Check the state of BUILD: for object arrays numpy would read beyond the content if the shape needs more elements."""
     version, shape, kind, is_fortran, content = state
     dtype = kind.dtype
     if dtype.hasobject and len(content) != math.prod(shape):
@@ -97,32 +98,32 @@ def _checked_array_state(state: Any) -> tuple[Any, ...]:
 
 
 def _array_of_bytes(content: Any, kind: Any, shape: Any, order: Any) -> np.ndarray:
-    """What `_frombuffer` does, of bytes alone: no other buffer stays where it is. ValueError for objects."""
+    """Replacement of `_frombuffer` for bytes only (no other buffer is immutable). ValueError for object dtypes."""
     if not isinstance(content, bytes | bytearray):
-        raise pickle.UnpicklingError("an array's content is no bytes")
+        raise pickle.UnpicklingError("the content of an array is not bytes")
     return np.frombuffer(content, kind.dtype).reshape(shape, order=order)
 
 
 def _scalar(kind: Any, content: Any) -> Any:
-    """What `scalar` does; Python 2's bytes are text by now."""
+    """Replacement of `scalar`; bytes of Python 2 have been decoded to text."""
     return _array_of_bytes(content.encode("latin1") if isinstance(content, str) else content, kind, 1, "C")[0]
 
 
 def _latin1_bytes(text: str, encoding: str) -> bytes:
-    """What Python 3 names `_codecs.encode` for in protocol 2: bytes written as text."""
+    """Replacement of `_codecs.encode`, with which Python 3 stores bytes in protocol 2."""
     if encoding not in ("latin1", "latin-1"):
         raise ValueError(f"bytes are stored as {encoding}, not as latin1")
     return text.encode("latin1")
 
 
 def _reconstruct_opaque_object(kind: type, base: type, state: object) -> OpaqueObject:
-    """What `copyreg._reconstructor` does in protocols 0 and 1, for records alone."""
+    """Replacement of `copyreg._reconstructor` of protocols 0 and 1, for opaque objects only."""
     if not issubclass(kind, OpaqueObject) or base is not object or state is not None:
         raise ForbiddenGlobalError("copyreg._reconstructor")
     return kind()
 
 
-# What numpy names when it pickles an array (protocols 0 to 4, and 5) and a scalar; its module moved in numpy 2.
+# Globals in pickles of arrays (protocols 0 to 4, and 5) and scalars; the module was renamed in numpy 2.
 _NUMPY_BUILDERS: dict[str, Callable[..., Any]] = {
     "multiarray._reconstruct": _empty_array,
     "multiarray.scalar": _scalar,
@@ -145,7 +146,7 @@ _ALLOWED_GLOBALS: dict[str, Callable[..., Any]] = {
 }
 
 
-# The unpickler in Python: that in C lets nobody look at what BUILD does. It reads no byte ahead, either.
+# The pure Python unpickler: the C version does not allow to intercept BUILD. It does not read ahead either.
 _PythonUnpickler: Any = pickle._Unpickler
 
 
@@ -156,11 +157,15 @@ class RestrictedUnpickler(_PythonUnpickler):
 
     def __init__(self, file: IO[bytes], opaque_classes: Iterable[str] = ()) -> None:
         super().__init__(file, encoding="latin1")
-        # One class a load and name: a pickle may set attributes of classes, which must not outlive it.
+        # New classes for each load: a pickle may set attributes of classes.
         self._opaque_classes = {name: type(name.rpartition(".")[2], (OpaqueObject,), {}) for name in opaque_classes}
 
     def find_class(self, module_name: str, global_name: str) -> Any:
-        """What the pickle may use under this name. Raises RefusedGlobalError for all else."""
+        """Return the replacement of a global.
+
+        Raises:
+            ForbiddenGlobalError: the global is not allowed.
+        """
         name = f"{module_name}.{global_name}"
         found = self._opaque_classes.get(name) or _ALLOWED_GLOBALS.get(name)
         if found is None:
@@ -168,12 +173,12 @@ class RestrictedUnpickler(_PythonUnpickler):
         return found
 
     def load_build(self) -> None:
-        """As in pickle, for what has a state here: it would set any attribute of anything else."""
+        """Handle BUILD for types with a known state only; otherwise it could set attributes of any object."""
         state, instance = self.stack[-1], self.stack[-2]
         if isinstance(instance, np.ndarray):
             self.stack[-1] = _checked_array_state(state)
         elif not isinstance(instance, _DtypePlaceholder | OpaqueObject):
-            raise pickle.UnpicklingError(f"it gives a state to {type(instance).__name__}")
+            raise pickle.UnpicklingError(f"BUILD on an object of type {type(instance).__name__}")
         super().load_build()
 
     dispatch = {**_PythonUnpickler.dispatch, pickle.BUILD[0]: load_build}
@@ -184,17 +189,17 @@ def load_pickle(path: Path, opaque_classes: Iterable[str] = ()) -> Any:
 
     Args:
         path: the file; protocols 0 to 5, of Python 2 or 3.
-        records: dotted names of foreign classes to read as `OpaqueObject`, for example `chumpy.ch.Ch`.
+        opaque_classes: dotted names of classes to read as `OpaqueObject`, for example `chumpy.ch.Ch`.
 
     Raises:
-        UserError: naming the file and what it asks for beyond that, or that it is damaged or absent.
+        UserError: the file is missing or damaged, or names another global.
     """
     with open_pickle(path) as file:
         return RestrictedUnpickler(file, opaque_classes).load()
 
 
 def load_npy(path: Path) -> np.ndarray:
-    """Read a `.npy` file; what an array of objects holds is read as by `load_pickle`. Raises UserError as it does."""
+    """Read a `.npy` file; object arrays are read as by `load_pickle`. Raises UserError as `load_pickle` does."""
     with open_pickle(path) as file:
         is_first_version = np.lib.format.read_magic(file) == (1, 0)
         if is_first_version and np.lib.format.read_array_header_1_0(file)[2].hasobject:
@@ -205,16 +210,16 @@ def load_npy(path: Path) -> np.ndarray:
 
 @contextmanager
 def open_pickle(path: Path) -> Iterator[IO[bytes]]:
-    """The open file; whatever unpickling from it can raise becomes a UserError that names it."""
+    """Open the file; exceptions of unpickling inside the block become a UserError that names the file."""
     try:
         with path.open("rb") as file:
             yield file
     except FileNotFoundError:
-        raise UserError(f"{path} does not exist; give a file of arrays") from None
+        raise UserError(f"{path} does not exist; supply a file of arrays") from None
     except ForbiddenGlobalError as refused:
         raise UserError(
-            f"{path} is refused: it asks for `{refused}`, and only numpy arrays and plain containers are read; "
+            f"{path} is refused: it contains `{refused}`, but only numpy arrays and plain containers are read; "
             "store the arrays as .npz"
         ) from None
     except _UNPICKLING_ERRORS as error:
-        raise UserError(f"{path} cannot be read as pickled arrays ({error}); fetch or write it again") from None
+        raise UserError(f"{path} cannot be read as pickled arrays ({error}); download or write it again") from None

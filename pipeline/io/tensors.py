@@ -1,4 +1,4 @@
-"""Tensors on disk as safetensors: whole or absent, no pickles, the same bytes for the same tensors."""
+"""Tensors as safetensors files, written atomically, without pickles; equal tensors give equal bytes."""
 
 import json
 from pathlib import Path
@@ -10,12 +10,12 @@ from torch import Tensor
 from pipeline.core.atomic import atomic_path
 from pipeline.core.errors import UserError
 
-# One entry only: the library writes several in an order that changes from run to run.
+# A single metadata entry: the library writes several entries in an order that differs between runs.
 DESCRIPTION = "description"
 
 
 def save_tensors(path: Path, tensors: dict[str, Tensor], description: dict | None = None) -> None:
-    """Write tensors and a JSON-like description."""
+    """Write tensors and a JSON-serialisable description."""
     cpu_tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
     text = json.dumps(description or {}, sort_keys=True)
     with atomic_path(path) as temporary_path:
@@ -26,7 +26,7 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict]:
     """Read tensors and description.
 
     Raises:
-        UserError: the file is missing, damaged, or no safetensors file.
+        UserError: the file is missing, damaged, or not a safetensors file.
     """
     try:
         with safe_open(path, framework="pt") as archive:

@@ -37,7 +37,7 @@ class Malice:
 
 def test_nothing_is_run(tmp_path):
     dump_joblib({1: [np.zeros(3), Malice(tmp_path / "marker")]}, tmp_path / "a.pkl")
-    with pytest.raises(UserError, match=r"a\.pkl is refused: it asks for `.*system`"):
+    with pytest.raises(UserError, match=r"a\.pkl is refused: it contains `.*system`"):
         load_joblib(tmp_path / "a.pkl")
     assert not (tmp_path / "marker").exists()
 
