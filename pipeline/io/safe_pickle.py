@@ -89,7 +89,7 @@ def _empty_array(*_: object) -> np.ndarray:
 
 
 def _checked_array_state(state: Any) -> tuple[Any, ...]:
-    """Check the state of BUILD: numpy would read beyond the content of an object array that is shorter than its shape."""
+    """Check the state of BUILD: numpy would read beyond the content of an object array shorter than its shape."""
     version, shape, kind, is_fortran, content = state
     dtype = kind.dtype
     if dtype.hasobject and len(content) != math.prod(shape):
