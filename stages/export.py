@@ -24,10 +24,9 @@ from pipeline.core.cli import main
 from pipeline.core.config import Config as BaseConfig
 from pipeline.core.stage import Stage
 from pipeline.geometry.atlas import Atlas
-from pipeline.geometry.mesh import Mesh
-from pipeline.geometry.skinning import dense_weights, linear_blend_skinning
+from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.io.image import png_bytes, to_float, to_uint8, write_gray
-from pipeline.io.npz import load_npz
+from pipeline.mesh.files import MeshArtifact, load_mesh
 from pipeline.texture.files import load_texture
 from pipeline.texture.specular import dielectric_specular_factor
 
@@ -57,9 +56,9 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     Raises:
         UserError: an input artifact cannot be read.
     """
-    body, arrays = load_body(inputs["body"] / "body.npz"), load_npz(inputs["mesh"] / "mesh.npz")
+    body, skinned = load_body(inputs["body"] / "body.npz"), load_mesh(inputs["mesh"])
     texture = load_texture(inputs["texture"])
-    mesh, atlas, is_specular = Mesh(arrays["vertices"], arrays["faces"]), texture.atlas, bool(texture.specular.any())
+    mesh, atlas, is_specular = skinned.mesh, texture.atlas, bool(texture.specular.any())
     maps = MaterialMaps(
         png_bytes(texture.diffuse),
         encode_specular_png(texture.specular, texture.diffuse, config.roughness) if is_specular else None,
@@ -67,10 +66,10 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
         config.unlit,
     )
     capture, motion = load_capture(inputs["frames"]), load_motion(inputs["field"] / "motion.npz")
-    offset_m = world_to_scene_translation_m(motion, lowest_vertex_y_m(arrays, body, motion))
+    offset_m = world_to_scene_translation_m(motion, lowest_vertex_y_m(skinned, body, motion))
     padded_motion = pad_motion_to_video(translate_motion(motion, offset_m), capture.fps, capture.n_video_frames)
     glb = encode_glb(
-        build_skinned_mesh(mesh, arrays, atlas),
+        build_skinned_mesh(skinned, atlas),
         body,
         padded_motion,
         maps,
@@ -99,25 +98,24 @@ def encode_specular_png(
     return png_bytes(pack_specular_factor(to_uint8(factor)))
 
 
-def build_skinned_mesh(mesh: Mesh, arrays: Mapping[str, np.ndarray], atlas: Atlas) -> SkinnedMesh:
+def build_skinned_mesh(skinned: MeshArtifact, atlas: Atlas) -> SkinnedMesh:
     """Duplicate the vertices along UV seams; duplicates share position, normal and skin weights."""
-    source_vertex = atlas.vertex_of_uv
+    mesh, source_vertex = skinned.mesh, atlas.vertex_of_uv
     return SkinnedMesh(
         mesh.vertices[source_vertex],
         mesh.vertex_normals()[source_vertex],
         atlas.uv,
-        arrays["joint_indices"][source_vertex],
-        arrays["joint_weights"][source_vertex],
+        skinned.joint_indices[source_vertex],
+        skinned.joint_weights[source_vertex],
         atlas.faces_uv,
     )
 
 
-def lowest_vertex_y_m(arrays: Mapping[str, np.ndarray], body: Body, motion: Motion) -> Float[np.ndarray, "n"]:
+def lowest_vertex_y_m(skinned: MeshArtifact, body: Body, motion: Motion) -> Float[np.ndarray, "n"]:
     """Return the world height (m) of the lowest vertex of the posed mesh in every frame."""
-    indices, weights = (torch.from_numpy(arrays[f"joint_{name}"]) for name in ("indices", "weights"))
-    dense, vertices = dense_weights(indices, weights, len(body.joint_names)), torch.from_numpy(arrays["vertices"])
+    weights, vertices = skinned.dense_skin_weights(len(body.joint_names)), torch.from_numpy(skinned.mesh.vertices)
     batches = canonical_to_world(body, motion).split(POSES_PER_BATCH)
-    lowest = [linear_blend_skinning(vertices, dense, batch)[..., 1].amin(dim=1) for batch in batches]
+    lowest = [linear_blend_skinning(vertices, weights, batch)[..., 1].amin(dim=1) for batch in batches]
     return torch.cat(lowest).numpy()
 
 

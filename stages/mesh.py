@@ -1,13 +1,12 @@
-"""Stage two: a watertight, manifold mesh of the canonical field, refined against the video."""
+"""mesh: a watertight, manifold mesh of the canonical field, refined on the video frames."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from pydantic import Field
+from pydantic import Field, ValidationInfo, field_validator
 from torch import Tensor
 
 from pipeline.avatar.turntable import turntable_sheet
@@ -17,115 +16,160 @@ from pipeline.capture.capture import Capture, load_capture
 from pipeline.capture.frame_selection import VALIDATION
 from pipeline.capture.usable_frames import usable_training_positions
 from pipeline.core.cli import main
+from pipeline.core.config import Config as BaseConfig
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
 from pipeline.field.files import load_field, load_occupancy
 from pipeline.field.setup import evenly_spaced
+from pipeline.geometry.camera import pixel_footprint_m
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import top_k_weights
 from pipeline.geometry.surface import resolve_self_intersections
 from pipeline.io.image import write_rgb
-from pipeline.io.npz import save_npz
-from pipeline.io.tensors import load_tensors, save_tensors
-from pipeline.mesh.isosurface import ExtractConfig, extract_mesh, sample_canonical_grid, select_isovalue, simplify
-from pipeline.mesh.refinement import RefinementState, refine
-from pipeline.mesh.vertex_optimisation import RefinementConfig, RefinementInputs
-from pipeline.mesh.views import (
-    PosedView,
-    build_skinned_topology,
-    crop_posed_view,
-    pixel_footprint_m,
-    silhouette_iou,
-    transfer_skin,
-)
+from pipeline.mesh.files import MeshArtifact, load_checkpoint, save_checkpoint, save_mesh
+from pipeline.mesh.isosurface import extract_mesh, sample_canonical_grid, select_isovalue
+from pipeline.mesh.refinement import RefinementState, refine_mesh
+from pipeline.mesh.remeshing import remesh_to_edge_length
+from pipeline.mesh.settings import MeshSettings
+from pipeline.mesh.skin_transfer import SkinnedTopology, transfer_skin
+from pipeline.mesh.vertex_optimisation import RefinementInputs
+from pipeline.mesh.views import PosedView, crop_posed_view, mesh_psnr_db, silhouette_iou
 from pipeline.metrics.health import mesh_quality_metrics
 
-CHECKPOINT, SHADER_STATE_PREFIX = "checkpoint_round.safetensors", "appearance."
+CHECKPOINT = "checkpoint_round.safetensors"
+DEFAULT_SETTINGS = MeshSettings()
 
 
-class Config(ExtractConfig, RefinementConfig):
-    """Options of the mesh stage."""
+class Config(BaseConfig):
+    """Options of the mesh stage; `pipeline.mesh.settings` has the parameters that no preset varies."""
 
-    seed: int = Field(0, ge=0, description="seed of the order of frames and of the backgrounds behind them")
-    isovalues_per_m: tuple[float, ...] = Field(
-        (8.0, 16.0, 32.0, 64.0, 128.0), min_length=1, description="densities tried as the surface's level, 1/m"
+    rounds: int = Field(3, ge=0, le=10, description="rounds of refinement; 0 keeps the extracted mesh")
+    steps: int = Field(60, ge=1, le=5000, description="optimiser steps per round")
+    max_frames: int = Field(80, ge=1, description="training frames used, evenly spaced over the recording")
+    max_person_px: int = Field(
+        480, ge=64, le=4096, description="frames are downsampled until the person is at most this high, px"
     )
-    isovalue_frames: int = Field(8, ge=1, description="validation frames on which the level is chosen")
-    edge_px: float = Field(3.0, gt=0.5, le=20.0, description="target edge length, in pixels of the images used")
-    min_edge_m: float = Field(0.008, gt=0.001, description="shortest target edge length, m")
-    max_edge_m: float = Field(0.014, gt=0.001, description="longest target edge length, m")
-    max_frames: int = Field(80, ge=1, description="training frames used, evenly spread over the recording")
+    voxel_size_m: float = Field(0.005, gt=0.001, le=0.03, description="spacing of the density samples, m")
+    edge_px: float = Field(3.0, gt=0.5, le=20.0, description="target edge length, in pixels of the downsampled frames")
+    min_edge_m: float = Field(0.008, gt=0.001, description="lower limit of the target edge length, m")
+    max_edge_m: float = Field(0.014, gt=0.001, description="upper limit of the target edge length, m")
+    max_faces: int = Field(60000, ge=100, description="no face is subdivided beyond this number of faces")
+
+    @field_validator("max_edge_m")
+    @classmethod
+    def _at_least_min_edge(cls, max_edge_m: float, checked: ValidationInfo) -> float:
+        min_edge_m = checked.data.get("min_edge_m", max_edge_m)
+        if max_edge_m < min_edge_m:
+            raise ValueError(f"at least min_edge_m, which is {min_edge_m}")
+        return max_edge_m
 
 
-def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, float]:
-    """Extracts, refines and writes `mesh.npz` and `preview.png`."""
+def run(
+    inputs: Mapping[str, Path], out: Path, config: Config, settings: MeshSettings = DEFAULT_SETTINGS
+) -> Mapping[str, float]:
+    """Extract and refine the mesh; write `mesh.npz` and `preview.png`.
+
+    Args:
+        inputs: folders of the stages frames, body and field.
+        out: folder of this stage.
+        config: options of the stage.
+        settings: parameters that only sweeps and ablations vary.
+
+    Returns:
+        The metrics of the manifest. All of them are those of the written mesh, except `initial_validation_psnr_db`.
+    """
     body = load_body(inputs["body"] / "body.npz")
-    field = load_field(inputs["field"] / "field.safetensors").requires_grad_(config.appearance_learning_rate > 0.0)
-    occupancy = load_occupancy(inputs["field"] / "occupancy.npz")
     capture = load_capture(inputs["frames"])
     chosen = usable_training_positions(capture, inputs["body"]), capture.positions(VALIDATION)
     train, validation = (load_views(capture, positions, inputs, body, config) for positions in chosen)
     if not train:
-        raise UserError(f"{inputs['frames']} has no training frames; run `python -m stages.frames` again")
+        raise UserError(f"{inputs['frames']} has no training frames; run python -m stages.frames {out.parent} --force")
     if not validation:
-        warn("there are no validation frames: the level and every round are kept without being judged")
+        warn(f"{inputs['frames']} has no validation frames: the isovalue and the rounds are not validated")
 
-    footprint_m = float(np.median([pixel_footprint_m(view, body.vertices, body.skin_weights) for view in train]))
-    target_edge_m = float(np.clip(config.edge_px * footprint_m, config.min_edge_m, config.max_edge_m))
+    target_edge_m = select_target_edge_m(body, train, config)
+    field = load_field(inputs["field"] / "field.safetensors")
+    field = field.requires_grad_(settings.appearance_learning_rate > 0.0)
+    refinement_inputs = RefinementInputs(
+        body=body,
+        train=train,
+        validation=validation,
+        shader=FieldColourShader(field),
+        target_edge_m=target_edge_m,
+        rounds=config.rounds,
+        steps=config.steps,
+        max_faces=config.max_faces,
+        settings=settings,
+    )
     start: Mesh | RefinementState | None = load_checkpoint(out / CHECKPOINT)
     if start is None:
-        views = validation or train
-        isovalue_views = [views[k] for k in evenly_spaced(len(views), config.isovalue_frames)]
+        occupancy = load_occupancy(inputs["field"] / "occupancy.npz")
 
         def density_fn(points_m: Tensor) -> Tensor:
             return field.density(points_m) * occupancy.contains(points_m)
 
-        start = simplify(extract_initial_mesh(density_fn, body, isovalue_views, config), target_edge_m)
-    task = RefinementInputs(body, train, validation, FieldColourShader(field), target_edge_m, config, config.seed)
-    refined = refine(start, task, lambda state: save_checkpoint(out / CHECKPOINT, state))
-    refined = replace(refined, mesh=resolve_self_intersections(refined.mesh))
-    write_results(out, refined, task.shader)
-    psnr_db = {
-        "initial_validation_psnr_db": refined.validation_psnr_db[0],
-        "refined_validation_psnr_db": refined.validation_psnr_db[-1],
+        extracted = extract_initial_mesh(density_fn, body, validation or train, config.voxel_size_m, settings)
+        start = remesh_to_edge_length(extracted, target_edge_m)
+    state = refine_mesh(start, refinement_inputs, lambda state: save_checkpoint(out / CHECKPOINT, state))
+    shader, skin, psnr_db = refinement_inputs.shader, state.skin, state.validation_psnr_db
+    mesh = resolve_self_intersections(state.mesh)
+    write_results(out, mesh, skin, shader)
+    is_unchanged = mesh is state.mesh
+    return {
+        **{key: float(value) for key, value in mesh_quality_metrics(mesh).items()},
+        "initial_validation_psnr_db": psnr_db[0],
+        "refined_validation_psnr_db": psnr_db[-1] if is_unchanged else mesh_psnr_db(mesh, skin, validation, shader),
+        "silhouette_iou": silhouette_iou(mesh, skin, validation),
+        "target_edge_m": target_edge_m,
+        "accepted_rounds": len(psnr_db) - 1.0,
     }
-    iou = silhouette_iou(refined.mesh, refined.skin, validation)
-    health = {key: float(value) for key, value in mesh_quality_metrics(refined.mesh).items()}
-    kept = len(refined.validation_psnr_db) - 1.0
-    return {**health, **psnr_db, "silhouette_iou": iou, "target_edge_m": target_edge_m, "accepted_rounds": kept}
 
 
 class FieldColourShader(torch.nn.Module):
-    """The field's colours alone; its parameters are refined with the mesh."""
+    """The colours of the field; their parameters are optimised together with the mesh."""
 
     def __init__(self, field: torch.nn.Module) -> None:
         super().__init__()
         self.field = field
 
     def forward(self, points_m: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Colours in [0, 1] at canonical points."""
+        """Return colours in [0, 1] at canonical points."""
         return self.field(points_m)[0]
 
 
+def select_target_edge_m(body: Body, views: Sequence[PosedView], config: Config) -> float:
+    """Return the target edge length (m): `edge_px` pixels of the views, within the limits of the config."""
+    vertices, weights = torch.from_numpy(body.vertices), torch.from_numpy(body.skin_weights)
+    footprints_m = [pixel_footprint_m(view.pose_vertices(vertices, weights), view.camera) for view in views]
+    return float(np.clip(config.edge_px * float(np.median(footprints_m)), config.min_edge_m, config.max_edge_m))
+
+
 def extract_initial_mesh(
-    density_fn: Callable[[Tensor], Tensor], body: Body, isovalue_views: Sequence[PosedView], config: Config
+    density_fn: Callable[[Tensor], Tensor],
+    body: Body,
+    views: Sequence[PosedView],
+    voxel_size_m: float,
+    settings: MeshSettings,
 ) -> Mesh:
-    """The density's surface at the level whose silhouettes fit the judged views best."""
-    samples = sample_canonical_grid(density_fn, body, config)
-    isovalue_per_m, _ = select_isovalue(
-        samples,
-        config,
-        config.isovalues_per_m,
-        lambda mesh: silhouette_iou(mesh, transfer_skin(mesh, body), isovalue_views),
-    )
-    return extract_mesh(samples, isovalue_per_m, config)
+    """Extract the surface of the density at the isovalue with the highest silhouette IoU.
+
+    The IoU is computed on at most `settings.isovalue_frames` of the views.
+    """
+    isovalue_views = [views[k] for k in evenly_spaced(len(views), settings.isovalue_frames)]
+    samples = sample_canonical_grid(density_fn, body, voxel_size_m, settings)
+
+    def score(mesh: Mesh) -> float:
+        return silhouette_iou(mesh, transfer_skin(mesh, body), isovalue_views)
+
+    isovalue_per_m, _ = select_isovalue(samples, settings, score)
+    return extract_mesh(samples, isovalue_per_m, settings)
 
 
 def load_views(
     capture: Capture, positions: Int[np.ndarray, "k"], inputs: Mapping[str, Path], body: Body, config: Config
 ) -> list[PosedView]:
-    """Crops of the frames at these positions, evenly thinned to `max_frames`."""
+    """Load crops of at most `max_frames` of the frames at these positions, evenly spaced."""
     camera = load_camera(inputs["body"] / "camera.npz")
     transforms = canonical_to_world(body, load_motion(inputs["field"] / "motion.npz"))
     subsampled = positions[evenly_spaced(len(positions), config.max_frames)]
@@ -135,49 +179,17 @@ def load_views(
     ]
 
 
-def save_checkpoint(path: Path, state: RefinementState) -> None:
-    """Write a round's result, whole or not at all."""
-    progress = [float(state.rounds_done), float(state.finished), *state.validation_psnr_db]
-    tensors = {
-        "vertices": torch.from_numpy(state.mesh.vertices),
-        "faces": torch.from_numpy(state.mesh.faces),
-        "skin_weights": state.skin.weights,
-        "progress": torch.tensor(progress, dtype=torch.float64),
-    }
-    save_tensors(
-        path, tensors | {f"{SHADER_STATE_PREFIX}{name}": tensor for name, tensor in state.shader_state.items()}
-    )
-
-
-def load_checkpoint(path: Path) -> RefinementState | None:
-    """What `save_checkpoint` wrote, or None when there is nothing."""
-    if not path.exists():
-        return None
-    tensors, _ = load_tensors(path)
-    rounds_done, finished, *psnr_db = tensors["progress"].tolist()
-    shader_state = {
-        name.removeprefix(SHADER_STATE_PREFIX): t for name, t in tensors.items() if name.startswith(SHADER_STATE_PREFIX)
-    }
-    mesh = Mesh(tensors["vertices"].numpy(), tensors["faces"].numpy())
-    skin = build_skinned_topology(mesh, tensors["skin_weights"])
-    return RefinementState(mesh, skin, shader_state, int(rounds_done), tuple(psnr_db), bool(finished))
-
-
-def write_results(out: Path, refined: RefinementState, shader: torch.nn.Module) -> None:
-    """The mesh with its skin and vertex colours, and the contact sheet."""
-    mesh = refined.mesh
-    joint_indices, joint_weights = top_k_weights(refined.skin.weights.numpy())
+def write_results(out: Path, mesh: Mesh, skin: SkinnedTopology, shader: torch.nn.Module) -> None:
+    """Write the mesh with its skin and vertex colours, and the turntable preview."""
     with torch.no_grad():
-        vertex_colors = shader(torch.from_numpy(mesh.vertices)).numpy()
-    arrays = {"vertices": mesh.vertices.astype(np.float32), "faces": mesh.faces.astype(np.int32)}
-    arrays |= {"joint_indices": joint_indices, "joint_weights": joint_weights, "vertex_colors": vertex_colors}
-    save_npz(out / "mesh.npz", arrays)
+        vertex_colours = shader(torch.from_numpy(mesh.vertices)).numpy()
+    save_mesh(out, MeshArtifact(mesh, *top_k_weights(skin.weights.numpy()), vertex_colours))
     write_rgb(out / "preview.png", turntable_sheet(mesh, shader))
 
 
 STAGE = Stage(
     "mesh",
-    version=4,
+    version=5,
     needs=("frames", "body", "field"),
     makes=("mesh.npz", "preview.png"),
     config=Config,

@@ -1,7 +1,6 @@
 """texture stage: unwrap the mesh into a UV atlas and bake diffuse, specular and coverage maps from the video."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,10 +22,10 @@ from pipeline.field.setup import evenly_spaced
 from pipeline.geometry.atlas import Atlas, Texels, rasterize_texels, texture_size_px, unwrap
 from pipeline.geometry.camera import pixel_footprint_m
 from pipeline.geometry.mesh import Mesh
-from pipeline.geometry.skinning import dense_weights, linear_blend_skinning
+from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.geometry.surface import laplacian
 from pipeline.io.image import to_float, to_uint8
-from pipeline.io.npz import load_npz
+from pipeline.mesh.files import MeshArtifact, load_mesh
 from pipeline.texture.bake import (
     InpaintFunction,
     TexturedSurface,
@@ -75,15 +74,6 @@ class Config(BaseConfig):
         return side_px
 
 
-@dataclass(frozen=True)
-class SkinnedMeshArtifact:
-    """The artifact of the mesh stage."""
-
-    mesh: Mesh
-    joint_indices: Int[np.ndarray, "v 4"]
-    joint_weights: Float[np.ndarray, "v 4"]
-
-
 def run(
     inputs: Mapping[str, Path], out: Path, config: Config, settings: TextureSettings = DEFAULT_SETTINGS
 ) -> Mapping[str, float]:
@@ -123,29 +113,19 @@ def run(
     }
 
 
-def load_mesh(folder: Path) -> SkinnedMeshArtifact:
-    """Read `mesh.npz`."""
-    arrays = load_npz(folder / "mesh.npz")
-    return SkinnedMeshArtifact(
-        Mesh(arrays["vertices"], arrays["faces"]), arrays["joint_indices"], arrays["joint_weights"]
-    )
-
-
 def load_views(
     capture: Capture,
     positions: Int[np.ndarray, "k"],
     inputs: Mapping[str, Path],
     body: Body,
-    skinned: SkinnedMeshArtifact,
+    skinned: MeshArtifact,
     max_frames: int,
 ) -> list[BakeView]:
     """Crop at most `max_frames` evenly spaced frames of `positions` to the mesh in the pose of each frame."""
     camera = load_camera(inputs["body"] / "camera.npz")
     transforms = canonical_to_world(body, load_motion(inputs["field"] / "motion.npz"))
     vertices = torch.from_numpy(skinned.mesh.vertices)
-    weights = dense_weights(
-        torch.from_numpy(skinned.joint_indices), torch.from_numpy(skinned.joint_weights), len(body.joint_names)
-    )
+    weights = skinned.dense_skin_weights(len(body.joint_names))
     faces = torch.from_numpy(skinned.mesh.faces)
     subsampled = positions[evenly_spaced(len(positions), max_frames)]
     views = []
@@ -157,7 +137,7 @@ def load_views(
 
 
 def build_atlas(
-    skinned: SkinnedMeshArtifact, body: Body, views: list[BakeView], config: Config, settings: TextureSettings
+    skinned: MeshArtifact, body: Body, views: list[BakeView], config: Config, settings: TextureSettings
 ) -> tuple[Atlas, int]:
     """Unwrap the mesh, and choose the side of the textures (px) from the resolution of the capture."""
     footprints_m = [pixel_footprint_m(view.vertices_world, view.camera) for view in views]

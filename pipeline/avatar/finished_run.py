@@ -18,7 +18,7 @@ from pipeline.field.rendering import render_field
 from pipeline.field.skin_grid import build_skin_grid, skin_margin_m
 from pipeline.geometry.camera import Camera
 from pipeline.io.image import to_float
-from pipeline.io.npz import load_npz
+from pipeline.mesh.files import load_mesh
 from pipeline.texture.files import load_texture
 
 PoseRenderer = Callable[[Float[Tensor, "j 4 4"]], Float[np.ndarray, "h w 4"]]
@@ -71,12 +71,12 @@ def load_finished_run(inputs: Mapping[str, Path]) -> FinishedRun:
 
 def load_textured_avatar(mesh_dir: Path, texture_dir: Path) -> TexturedAvatar:
     """Combine the skinned mesh of the mesh stage with the atlas and diffuse map of the texture stage."""
-    mesh, texture = load_npz(mesh_dir / "mesh.npz"), load_texture(texture_dir)
+    skinned, texture = load_mesh(mesh_dir), load_texture(texture_dir)
     return TexturedAvatar(
-        vertices=torch.from_numpy(mesh["vertices"].astype(np.float32)),
-        faces=torch.from_numpy(mesh["faces"].astype(np.int32)),
-        joint_indices=torch.from_numpy(mesh["joint_indices"].astype(np.int64)),
-        joint_weights=torch.from_numpy(mesh["joint_weights"].astype(np.float32)),
+        vertices=torch.from_numpy(skinned.mesh.vertices.astype(np.float32)),
+        faces=torch.from_numpy(skinned.mesh.faces.astype(np.int32)),
+        joint_indices=torch.from_numpy(skinned.joint_indices.astype(np.int64)),
+        joint_weights=torch.from_numpy(skinned.joint_weights.astype(np.float32)),
         uv=torch.from_numpy(texture.atlas.uv.astype(np.float32)),
         faces_uv=torch.from_numpy(texture.atlas.faces_uv.astype(np.int32)),
         diffuse=torch.from_numpy(to_float(texture.diffuse)),

@@ -1,73 +1,44 @@
-"""From the canonical density to a first closed mesh: what the field saw, the body's core where it saw nothing, the
-body's hands.
+"""Extraction of the initial mesh from the canonical density.
 
-Inside a person no ray ever ends, so a trained density may be hollow, and it is anything at all where no frame looked.
-The solid whose surface is taken is therefore: density above a level, or deeper inside the fitted body than a safe
-inset; never farther from the body than clothes and hair reach; cavities filled.
+No ray ends inside a person, so the density of a trained field may be empty there, and it is arbitrary where no frame
+shows the surface. The solid whose surface is extracted therefore contains all points with a density above an isovalue
+and all points deeper inside the fitted body than a given depth. It contains no point farther outside the body than
+clothing and hair reach; its cavities are filled; hands are those of the fitted body.
 """
 
-from collections.abc import Callable, Sequence
+from __future__ import annotations
+
+from collections.abc import Callable
 from dataclasses import dataclass
 
-import fast_simplification
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
-from pydantic import Field
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
-from scipy.sparse import csr_array
-from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pipeline.body.body import Body
-from pipeline.core.config import Config
-from pipeline.core.progress import warn
 from pipeline.geometry.mesh import Mesh
-from pipeline.geometry.surface import (
-    OpenSurfaceError,
-    closest_points_on_mesh,
-    isosurface,
-    laplacian,
-    largest_solid,
-    remesh_isotropic,
-    repair,
-    signed_distance_m,
-    smooth_taubin,
-)
+from pipeline.geometry.surface import isosurface, largest_solid, repair, signed_distance_m
+from pipeline.mesh.settings import MeshSettings
 
 DENSITY_CHUNK = 1 << 18
 DISTANCE_GRID_STRIDE = 4
 HAND_NARROW_BAND_VOXELS = 4.0
 GRID_SIZE_MULTIPLE = 8
-"""Sample counts less one are multiples of this: every second sample of every second sample ends at the border."""
-DECIMATION_FACE_RATIO = 3.0
-HALF = 0.5
-
-
-class ExtractConfig(Config):
-    """Options of the first mesh."""
-
-    voxel_size_m: float = Field(0.005, gt=0.001, le=0.03, description="spacing of the density samples, m")
-    max_body_distance_m: float = Field(
-        0.12, gt=0.0, le=0.5, description="farthest a surface may lie outside the fitted body, m"
-    )
-    solid_core_depth_m: float = Field(
-        0.025, ge=0.0, le=0.2, description="deeper inside the fitted body than this all is solid, m"
-    )
-    blur_sigma_voxels: float = Field(
-        1.0, ge=0.0, le=4.0, description="Gaussian blur of the solid before its surface is taken, voxels"
-    )
-    closing_radius_m: float = Field(
-        0.03, ge=0.0, le=0.2, description="pits that a ball of this radius cannot enter are filled, inside the body, m"
-    )
-    hands_from_body: bool = Field(True, description="take hands and fingers from the fitted body, not from the field")
+"""Sample counts minus one are multiples of this, so that downsampling by 2 or 4 keeps the last sample of each axis."""
+SURFACE_ISOVALUE = 0.5
+"""Isovalue of the indicator function, which is 1 inside the solid and 0 outside."""
 
 
 @dataclass(frozen=True)
 class CanonicalGrid:
-    """Density (1/m) and signed distance to the body (m) on a regular canonical grid, and how much each sample belongs
-    to a hand."""
+    """Density and signed distance on a regular grid in canonical space.
+
+    origin_m: position of sample [0, 0, 0]. spacing_m: distance of neighbouring samples. density: 1/m. body_distance_m:
+    signed distance to the fitted body, negative inside. hand_weight: skin weight of the hand joints, in [0, 1].
+    """
 
     origin_m: Float[np.ndarray, "3"]
     spacing_m: float
@@ -75,48 +46,110 @@ class CanonicalGrid:
     body_distance_m: Float[np.ndarray, "x y z"]
     hand_weight: Float[np.ndarray, "x y z"]
 
-    def downsampled(self) -> "CanonicalGrid":
-        """Every second sample."""
+    def downsampled(self) -> CanonicalGrid:
+        """Return the grid with every second sample."""
         grids = (grid[::2, ::2, ::2] for grid in (self.density, self.body_distance_m, self.hand_weight))
         return CanonicalGrid(self.origin_m, 2.0 * self.spacing_m, *grids)
 
 
-def sample_canonical_grid(density_fn: Callable[[Tensor], Tensor], body: Body, config: ExtractConfig) -> CanonicalGrid:
-    """Samples the density within reach of the body. density_of: canonical points (n, 3) m -> (n,) 1/m, 0 in empty
-    space."""
-    origin_m = body.vertices.min(axis=0) - config.max_body_distance_m
-    counts = np.ceil((body.vertices.max(axis=0) + config.max_body_distance_m - origin_m) / config.voxel_size_m).astype(
-        int
-    )
+def sample_canonical_grid(
+    density_fn: Callable[[Tensor], Tensor], body: Body, voxel_size_m: float, settings: MeshSettings
+) -> CanonicalGrid:
+    """Sample the density on a grid around the body.
+
+    Args:
+        density_fn: maps canonical points (n, 3) in m to densities (n,) in 1/m, 0 in empty space. It is called only for
+            points closer to the body than `settings.max_body_distance_m`.
+        body: the fitted body in its canonical pose.
+        voxel_size_m: spacing of the samples, m.
+        settings: see `MeshSettings`.
+    """
+    origin_m = body.vertices.min(axis=0) - settings.max_body_distance_m
+    counts = np.ceil((body.vertices.max(axis=0) + settings.max_body_distance_m - origin_m) / voxel_size_m).astype(int)
     counts = GRID_SIZE_MULTIPLE * np.ceil(counts / GRID_SIZE_MULTIPLE).astype(int) + 1
     mesh = body.mesh()
-    distance_m = _signed_distance_grid(mesh, origin_m, counts, config.voxel_size_m)
-    within = np.argwhere(distance_m < config.max_body_distance_m)
-    points = (within * config.voxel_size_m + origin_m).astype(np.float32)
+    distance_m = _signed_distance_grid(mesh, origin_m, counts, voxel_size_m)
+    near_body = np.argwhere(distance_m < settings.max_body_distance_m)
+    points = (near_body * voxel_size_m + origin_m).astype(np.float32)
     density = np.zeros(distance_m.shape, dtype=np.float32)
     chunks = [density_fn(chunk).detach() for chunk in torch.from_numpy(points).split(DENSITY_CHUNK)]
-    density[tuple(within.T)] = torch.cat(chunks).numpy()
+    density[tuple(near_body.T)] = torch.cat(chunks).numpy()
     hand_weight = np.zeros_like(density)
-    if config.hands_from_body:
+    if settings.hands_from_body:
         vertex_hand_weight = hand_skin_weights(body)
-        near_hand = _indices_in_side_boxes(points, body.vertices[vertex_hand_weight > 0.0], config.max_body_distance_m)
+        hand_vertices = body.vertices[vertex_hand_weight > 0.0]
+        near_hand = _indices_in_side_boxes(points, hand_vertices, settings.max_body_distance_m)
         _, nearest = cKDTree(body.vertices).query(points[near_hand])
-        hand_weight[tuple(within[near_hand].T)] = vertex_hand_weight[nearest]
-        edge = np.argwhere((hand_weight > 0.0) & (np.abs(distance_m) < HAND_NARROW_BAND_VOXELS * config.voxel_size_m))
-        distance_m[tuple(edge.T)] = signed_distance_m(edge * config.voxel_size_m + origin_m, mesh)
-    return CanonicalGrid(origin_m.astype(np.float64), config.voxel_size_m, density, distance_m, hand_weight)
+        hand_weight[tuple(near_body[near_hand].T)] = vertex_hand_weight[nearest]
+        narrow_band = np.abs(distance_m) < HAND_NARROW_BAND_VOXELS * voxel_size_m
+        exact = np.argwhere((hand_weight > 0.0) & narrow_band)
+        distance_m[tuple(exact.T)] = signed_distance_m(exact * voxel_size_m + origin_m, mesh)
+    return CanonicalGrid(origin_m.astype(np.float64), voxel_size_m, density, distance_m, hand_weight)
 
 
 def hand_skin_weights(body: Body) -> Float[np.ndarray, "v"]:
-    """Share of each body vertex's skin weight that hands and fingers have, in [0, 1]; fades out over the wrist."""
+    """Return the summed skin weight of the hand and finger joints of each body vertex, in [0, 1]."""
     hands = [i for i, name in enumerate(body.joint_names) if "Hand" in name]
     return body.skin_weights[:, hands].sum(axis=1)
 
 
+def indicator_grid(samples: CanonicalGrid, isovalue_per_m: float, settings: MeshSettings) -> Float[np.ndarray, "x y z"]:
+    """Return a soft indicator function of the solid in [0, 1]; its surface is at `SURFACE_ISOVALUE`.
+
+    Args:
+        samples: the canonical grid.
+        isovalue_per_m: density (1/m) at which the indicator of the density is 0.5.
+        settings: see `MeshSettings`.
+    """
+    density_indicator = samples.density / (samples.density + isovalue_per_m)
+    if settings.blur_sigma_voxels > 0.0:
+        density_indicator = ndimage.gaussian_filter(density_indicator, settings.blur_sigma_voxels, truncate=3.0)
+    ramp_m = 3.0 * samples.spacing_m
+    core = np.clip(SURFACE_ISOVALUE + (_depth_inside_m(samples) - settings.solid_core_depth_m) / ramp_m, 0.0, 1.0)
+    hand = np.clip(SURFACE_ISOVALUE - samples.body_distance_m / ramp_m, 0.0, 1.0)
+    value = np.maximum(density_indicator, core)
+    value = np.maximum(value, _close_concavities(value >= SURFACE_ISOVALUE, samples, settings.closing_radius_m))
+    value += samples.hand_weight * (hand - value)
+    inside = largest_solid(value >= SURFACE_ISOVALUE)
+    # Filled cavities become 1; other components become empty.
+    filled = np.maximum(value, np.where(value < SURFACE_ISOVALUE, 1.0, value))
+    value = np.where(inside, filled, np.minimum(value, SURFACE_ISOVALUE - 1e-3))
+    return value.astype(np.float32)
+
+
+def extract_mesh(samples: CanonicalGrid, isovalue_per_m: float, settings: MeshSettings) -> Mesh:
+    """Extract the watertight surface of the solid by marching cubes, one component, before decimation.
+
+    Raises:
+        ValueError: the solid is empty at this isovalue.
+    """
+    indicator = indicator_grid(samples, isovalue_per_m, settings)
+    return repair(isosurface(indicator, SURFACE_ISOVALUE, samples.origin_m, samples.spacing_m))
+
+
+def select_isovalue(
+    samples: CanonicalGrid, settings: MeshSettings, score: Callable[[Mesh], float]
+) -> tuple[float, float]:
+    """Select the density isovalue (1/m) of `settings.isovalues_per_m` whose surface has the highest score.
+
+    The surfaces are extracted from every second sample.
+
+    Returns:
+        The isovalue and its score.
+    """
+    coarse = samples.downsampled()
+    scores = []
+    for isovalue_per_m in settings.isovalues_per_m:
+        indicator = indicator_grid(coarse, isovalue_per_m, settings)
+        scores.append(score(isosurface(indicator, SURFACE_ISOVALUE, coarse.origin_m, coarse.spacing_m)))
+    best = int(np.argmax(scores))
+    return float(settings.isovalues_per_m[best]), scores[best]
+
+
 def _indices_in_side_boxes(
     points: Float[np.ndarray, "n 3"], targets: Float[np.ndarray, "m 3"], margin_m: float
-) -> np.ndarray:
-    """Numbers of the points that lie within the margin of the left or of the right targets' bounding box."""
+) -> Int[np.ndarray, "k"]:
+    """Return the indices of the points in the padded bounding box of the left (x >= 0) or the right targets."""
     found = np.zeros(len(points), dtype=bool)
     for side in (targets[targets[:, 0] < 0], targets[targets[:, 0] >= 0]):
         if len(side):
@@ -125,9 +158,12 @@ def _indices_in_side_boxes(
 
 
 def _signed_distance_grid(
-    mesh: Mesh, origin_m: Float[np.ndarray, "3"], counts: np.ndarray, spacing_m: float
+    mesh: Mesh, origin_m: Float[np.ndarray, "3"], counts: Int[np.ndarray, "3"], spacing_m: float
 ) -> Float[np.ndarray, "x y z"]:
-    """Signed distance to a mesh, exact at every fourth sample and interpolated between: only hands need it finer."""
+    """Return the signed distance to a mesh, exact at every fourth sample and interpolated between.
+
+    Only the hands need a finer distance, see `sample_canonical_grid`.
+    """
     coarse_axes = [
         origin + spacing_m * np.arange(0, count, DISTANCE_GRID_STRIDE)
         for origin, count in zip(origin_m, counts, strict=True)
@@ -137,25 +173,11 @@ def _signed_distance_grid(
     return _upsample(coarse, tuple(counts.tolist()))
 
 
-def indicator_grid(samples: CanonicalGrid, isovalue_per_m: float, config: ExtractConfig) -> Float[np.ndarray, "x y z"]:
-    """Solidity in [0, 1] whose 0.5 surface is the person. level_per_m: density (1/m) that counts as half solid."""
-    density_indicator = samples.density / (samples.density + isovalue_per_m)
-    if config.blur_sigma_voxels > 0.0:
-        density_indicator = ndimage.gaussian_filter(density_indicator, config.blur_sigma_voxels, truncate=3.0)
-    ramp_m = 3.0 * samples.spacing_m
-    core = np.clip(HALF + (_depth_inside_m(samples) - config.solid_core_depth_m) / ramp_m, 0.0, 1.0)
-    hand = np.clip(HALF - samples.body_distance_m / ramp_m, 0.0, 1.0)
-    value = np.maximum(density_indicator, core)
-    value = np.maximum(value, _close_concavities(value >= HALF, samples, config.closing_radius_m))
-    value += samples.hand_weight * (hand - value)
-    inside = largest_solid(value >= HALF)
-    # what the fill adds becomes solid, what belongs to another component becomes empty
-    value = np.where(inside, np.maximum(value, np.where(value < HALF, 1.0, value)), np.minimum(value, HALF - 1e-3))
-    return value.astype(np.float32)
-
-
 def _depth_inside_m(samples: CanonicalGrid) -> Float[np.ndarray, "x y z"]:
-    """Depth (m) below the body's outer skin, on every second sample: mouth, nostrils and eye sockets count as flesh."""
+    """Return the depth (m) below the surface of the body, computed on every second sample.
+
+    A morphological closing fills the mouth, nostrils and eye sockets first.
+    """
     inside = samples.body_distance_m[::2, ::2, ::2] < 0.0
     closed = largest_solid(ndimage.binary_closing(inside, ndimage.generate_binary_structure(3, 1), iterations=2))
     depth_m = 2.0 * samples.spacing_m * ndimage.gaussian_filter(ndimage.distance_transform_edt(closed), 1.0)
@@ -165,10 +187,10 @@ def _depth_inside_m(samples: CanonicalGrid) -> Float[np.ndarray, "x y z"]:
 def _close_concavities(
     inside: Bool[np.ndarray, "x y z"], samples: CanonicalGrid, radius_m: float
 ) -> Float[np.ndarray, "x y z"]:
-    """Solidity in [0, 1] of what a ball of the radius cannot enter from outside and the fitted body fills.
+    """Return an indicator in [0, 1] of the morphological closing by a ball, restricted to the inside of the body.
 
-    Where a surface moved little against the camera its density has holes; the body says that there is no real one.
-    Counted on every second sample.
+    The density of surfaces that moved little relative to the camera has holes; the fitted body shows that they are no
+    real holes. Computed on every second sample.
     """
     spacing_m = 2.0 * samples.spacing_m
     outside_m = spacing_m * ndimage.distance_transform_edt(~inside[::2, ::2, ::2])
@@ -178,97 +200,6 @@ def _close_concavities(
 
 
 def _upsample(grid: Float[np.ndarray, "a b c"], shape: tuple[int, ...]) -> Float[np.ndarray, "x y z"]:
-    """A grid of every n-th sample, interpolated at all samples (float32)."""
+    """Interpolate a downsampled grid trilinearly at all samples (float32)."""
     source = torch.from_numpy(grid).float()[None, None]
     return torch.nn.functional.interpolate(source, size=shape, mode="trilinear", align_corners=True)[0, 0].numpy()
-
-
-def extract_mesh(samples: CanonicalGrid, isovalue_per_m: float, config: ExtractConfig) -> Mesh:
-    """Watertight marching-cubes surface of the solid, one component, not yet simplified.
-
-    Raises ValueError when the level leaves nothing.
-    """
-    return repair(
-        isosurface(indicator_grid(samples, isovalue_per_m, config), HALF, samples.origin_m, samples.spacing_m)
-    )
-
-
-def select_isovalue(
-    samples: CanonicalGrid, config: ExtractConfig, isovalues_per_m: Sequence[float], score: Callable[[Mesh], float]
-) -> tuple[float, float]:
-    """The density level (1/m) whose surface scores best, and its score; tried on every second sample."""
-    coarse = samples.downsampled()
-    scores = []
-    for level in isovalues_per_m:
-        mesh = isosurface(indicator_grid(coarse, level, config), HALF, coarse.origin_m, coarse.spacing_m)
-        scores.append(score(mesh))
-    best = int(np.argmax(scores))
-    return float(isovalues_per_m[best]), scores[best]
-
-
-def simplify(mesh: Mesh, target_edge_m: float, smoothing: int = 10) -> Mesh:
-    """The surface with well-shaped triangles of about one edge length (m), shorter where it is strongly curved.
-
-    smoothing: steps of Taubin smoothing at the end, which take the density's noise and leave the volume.
-    """
-    dense_face_count = int(mesh.face_areas_m2().sum() / (0.43 * target_edge_m**2) * DECIMATION_FACE_RATIO)
-    if len(mesh.faces) > dense_face_count:
-        mesh = keep_if_repair_fails(
-            lambda: decimate(mesh, dense_face_count), mesh, "its triangles were not reduced before remeshing"
-        )
-    remeshed = keep_if_repair_fails(
-        lambda: remesh_isotropic(mesh, target_edge_m, iterations=6, tolerance_m=0.15 * target_edge_m),
-        mesh,
-        "its triangles stay uneven",
-    )
-    return smooth_taubin(remeshed, smoothing)
-
-
-def decimate(mesh: Mesh, face_count: int) -> Mesh:
-    """The surface with about that many triangles, closed; raises OpenSurfaceError."""
-    vertices, faces = fast_simplification.simplify(mesh.vertices, mesh.faces, target_count=face_count)
-    return repair(Mesh(vertices.astype(np.float32), faces.astype(np.int32)))
-
-
-def keep_if_repair_fails(change: Callable[[], Mesh], before: Mesh, consequence: str) -> Mesh:
-    """The changed surface; the one before, with a warning, where the change tears holes that cannot be closed."""
-    try:
-        return change()
-    except OpenSurfaceError as error:
-        warn(f"{error}; {consequence}")
-        return before
-
-
-def transfer_skin_weights(
-    mesh: Mesh, body: Body, max_body_distance_m: float = 0.08, smoothing: int = 4
-) -> Float[np.ndarray, "v j"]:
-    """Skin weights (v, j), rows summing to 1, for a mesh around the body in the canonical pose.
-
-    A vertex takes the weights of the nearest place on the body if that is within reach and faces the same way (within
-    60 degrees); all others (an arm's inner side that is nearer to the trunk, loose cloth) are filled in harmonically
-    from those over the mesh (after Abdrashitov et al., "Robust Skin Weights Transfer via Weight Inpainting", 2023). A
-    few smoothing steps end it.
-    """
-    body_mesh = body.mesh()
-    distance_m, face, barycentric = closest_points_on_mesh(mesh.vertices, body_mesh)
-    weights = np.einsum("nk,nkj->nj", barycentric, body.skin_weights[body.faces[face]])
-    normals = np.einsum("nk,nkj->nj", barycentric, body_mesh.vertex_normals()[body.faces[face]])
-    matched = (distance_m <= max_body_distance_m) & (np.sum(normals * mesh.vertex_normals(), axis=1) >= HALF)
-    operator = laplacian(mesh)
-    if matched.any() and not matched.all():
-        weights[~matched] = _harmonic_fill(operator, weights, matched)
-    for _ in range(smoothing):
-        weights = weights - HALF * (operator @ weights)
-    weights = np.clip(weights, 0.0, None)
-    return (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
-
-
-def _harmonic_fill(
-    operator: csr_array, values: Float[np.ndarray, "v c"], known: np.ndarray
-) -> Float[np.ndarray, "u c"]:
-    """Values at the unknown vertices that equal the mean of their neighbours, given the known ones."""
-    rows = operator[~known]
-    # a piece without any known vertex would be singular; the tiny pull towards its own values keeps it solvable
-    inner = rows[:, ~known].tocsc()
-    inner.setdiag(inner.diagonal() + 1e-6)
-    return splu(inner).solve(1e-6 * values[~known] - rows[:, known] @ values[known])

@@ -21,7 +21,7 @@ from pipeline.geometry.atlas import Atlas
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.skinning import top_k_weights
 from pipeline.io.image import to_uint8, write_gray, write_rgb
-from pipeline.io.npz import save_npz
+from pipeline.mesh.files import MeshArtifact, save_mesh
 from pipeline.texture.files import TextureArtifact, save_texture
 from tests.avatar.avatar_sample import FRAME_RATE, sample_body, sample_maps, sample_motion, sample_skinned_mesh
 
@@ -124,13 +124,8 @@ def _write_field(folder: Path, body: Body, motion: Motion) -> None:
 
 
 def _write_mesh_and_texture(mesh_dir: Path, texture_dir: Path, avatar: TexturedAvatar) -> None:
-    arrays = {
-        "vertices": avatar.vertices.numpy(),
-        "faces": avatar.faces.numpy(),
-        "joint_indices": avatar.joint_indices.numpy().astype(np.int32),
-        "joint_weights": avatar.joint_weights.numpy(),
-    }
-    save_npz(mesh_dir / "mesh.npz", arrays)
+    indices, weights = avatar.joint_indices.numpy(), avatar.joint_weights.numpy()
+    save_mesh(mesh_dir, MeshArtifact(avatar.mesh(), indices, weights, np.full((len(weights), 3), 0.5)))
     cv2.imwrite(str(mesh_dir / "preview.png"), np.full((20, 30, 3), 60, dtype=np.uint8))
     side_px = len(avatar.diffuse)
     atlas = Atlas(avatar.uv.numpy(), avatar.faces_uv.numpy(), np.arange(len(avatar.uv), dtype=np.int32))

@@ -1,0 +1,95 @@
+"""The files of the mesh stage: the skinned mesh as npz, and the checkpoint of the refinement as safetensors."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pipeline.core.errors import UserError
+from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.skinning import dense_weights
+from pipeline.io.npz import load_npz, save_npz
+from pipeline.io.tensors import load_tensors, save_tensors
+from pipeline.mesh.refinement import RefinementState
+from pipeline.mesh.skin_transfer import build_skinned_topology
+
+MESH_NPZ = "mesh.npz"
+SHADER_STATE_PREFIX = "appearance."
+
+
+@dataclass(frozen=True)
+class MeshArtifact:
+    """The canonical mesh with its skin: the content of mesh.npz.
+
+    mesh: vertices in m (float32) and faces. joint_indices, joint_weights: up to four influences per vertex, the largest
+    first, sum 1. vertex_colours: sRGB in [0, 1].
+    """
+
+    mesh: Mesh
+    joint_indices: Int[np.ndarray, "v k"]
+    joint_weights: Float[np.ndarray, "v k"]
+    vertex_colours: Float[np.ndarray, "v 3"]
+
+    def dense_skin_weights(self, joint_count: int) -> Float[Tensor, "v j"]:
+        """Return one row of skin weights per vertex."""
+        indices, weights = torch.from_numpy(self.joint_indices), torch.from_numpy(self.joint_weights)
+        return dense_weights(indices, weights, joint_count)
+
+
+def save_mesh(folder: Path, artifact: MeshArtifact) -> None:
+    """Write mesh.npz to the folder of the mesh stage; `load_mesh` is the inverse."""
+    arrays = {
+        "vertices": artifact.mesh.vertices.astype(np.float32),
+        "faces": artifact.mesh.faces.astype(np.int32),
+        "joint_indices": artifact.joint_indices.astype(np.int32),
+        "joint_weights": artifact.joint_weights.astype(np.float32),
+        "vertex_colors": artifact.vertex_colours.astype(np.float32),
+    }
+    save_npz(folder / MESH_NPZ, arrays)
+
+
+def load_mesh(folder: Path) -> MeshArtifact:
+    """Read mesh.npz from the folder of the mesh stage.
+
+    Raises:
+        UserError: the file is missing, is no npz, or has not the arrays of a mesh.
+    """
+    arrays = load_npz(folder / MESH_NPZ)
+    try:
+        mesh = Mesh(arrays["vertices"], arrays["faces"])
+        return MeshArtifact(mesh, arrays["joint_indices"], arrays["joint_weights"], arrays["vertex_colors"])
+    except KeyError as error:
+        path = folder / MESH_NPZ
+        raise UserError(f"{path} has no array {error}; run python -m stages.mesh {folder.parent} --force") from None
+
+
+def save_checkpoint(path: Path, state: RefinementState) -> None:
+    """Write the state of the refinement; the file appears complete or not at all."""
+    progress = [float(state.rounds_done), float(state.finished), *state.validation_psnr_db]
+    tensors = {
+        "vertices": torch.from_numpy(state.mesh.vertices),
+        "faces": torch.from_numpy(state.mesh.faces),
+        "skin_weights": state.skin.weights,
+        "progress": torch.tensor(progress, dtype=torch.float64),
+    }
+    shader_state = {f"{SHADER_STATE_PREFIX}{name}": tensor for name, tensor in state.shader_state.items()}
+    save_tensors(path, tensors | shader_state)
+
+
+def load_checkpoint(path: Path) -> RefinementState | None:
+    """Read what `save_checkpoint` wrote; None if there is no file."""
+    if not path.exists():
+        return None
+    tensors, _ = load_tensors(path)
+    rounds_done, finished, *psnr_db = tensors["progress"].tolist()
+    shader_state = {
+        name.removeprefix(SHADER_STATE_PREFIX): tensor
+        for name, tensor in tensors.items()
+        if name.startswith(SHADER_STATE_PREFIX)
+    }
+    mesh = Mesh(tensors["vertices"].numpy(), tensors["faces"].numpy())
+    skin = build_skinned_topology(mesh, tensors["skin_weights"])
+    return RefinementState(mesh, skin, shader_state, int(rounds_done), tuple(psnr_db), bool(finished))

@@ -1,0 +1,105 @@
+"""Remeshing of the canonical mesh: to a target edge length, and adaptively to the image error."""
+
+from collections.abc import Callable
+
+import fast_simplification
+import numpy as np
+from jaxtyping import Bool, Float
+
+from pipeline.core.progress import warn
+from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.surface import OpenSurfaceError, remesh_isotropic, repair, smooth_taubin, subdivide
+from pipeline.mesh.settings import MeshSettings
+
+DECIMATION_FACE_RATIO = 3.0
+"""Ratio of the number of faces after decimation to the number of faces after remeshing."""
+EQUILATERAL_AREA_RATIO = 0.43
+"""Area of an equilateral triangle divided by its squared edge length (0.433)."""
+
+
+def remesh_to_edge_length(mesh: Mesh, target_edge_m: float, smoothing_steps: int = 10) -> Mesh:
+    """Decimate, remesh and smooth a surface to well-shaped triangles with the target edge length.
+
+    Edges are shorter where the surface has a high curvature. If a step leaves holes that cannot be closed, that step is
+    skipped with a warning.
+
+    Args:
+        mesh: a closed surface, m.
+        target_edge_m: edge length to reach, m.
+        smoothing_steps: steps of Taubin smoothing, which removes the noise of the density and preserves the volume.
+    """
+    target_face_area_m2 = EQUILATERAL_AREA_RATIO * target_edge_m**2
+    dense_face_count = int(mesh.face_areas_m2().sum() / target_face_area_m2 * DECIMATION_FACE_RATIO)
+    if len(mesh.faces) > dense_face_count:
+        mesh = keep_if_repair_fails(
+            lambda: decimate(mesh, dense_face_count), mesh, "the mesh is not decimated before remeshing"
+        )
+    remeshed = keep_if_repair_fails(
+        lambda: remesh_isotropic(mesh, target_edge_m, iterations=6, tolerance_m=0.15 * target_edge_m),
+        mesh,
+        "the mesh is not remeshed, so its edge lengths are not uniform",
+    )
+    return smooth_taubin(remeshed, smoothing_steps)
+
+
+def decimate(mesh: Mesh, face_count: int) -> Mesh:
+    """Reduce a surface to about `face_count` faces by quadric edge collapse, and close it.
+
+    Raises:
+        OpenSurfaceError: the result could not be repaired.
+    """
+    vertices, faces = fast_simplification.simplify(mesh.vertices, mesh.faces, target_count=face_count)
+    return repair(Mesh(vertices.astype(np.float32), faces.astype(np.int32)))
+
+
+def keep_if_repair_fails(change: Callable[[], Mesh], before: Mesh, consequence: str) -> Mesh:
+    """Return the result of `change`; if it raises OpenSurfaceError, warn and return the mesh before it."""
+    try:
+        return change()
+    except OpenSurfaceError as error:
+        warn(f"{error}; {consequence}")
+        return before
+
+
+def remesh_adaptively(
+    mesh: Mesh, errors: Float[np.ndarray, "f"], target_edge_m: float, max_faces: int, settings: MeshSettings
+) -> Mesh:
+    """Subdivide the faces with a large image error, decimate and remesh those with a small one (IHM paper, 2.3).
+
+    Args:
+        mesh: a closed surface, m.
+        errors: accumulated image error of each face.
+        target_edge_m: target edge length, m.
+        max_faces: no face is subdivided beyond this number of faces.
+        settings: percentiles of the error, and the edge length of decimated regions.
+
+    Returns:
+        The new mesh; if decimation would leave holes, the faces with a small error stay, with a warning.
+    """
+    low = errors <= np.percentile(errors, settings.decimate_percentile)
+    fine, _ = subdivide(mesh, _faces_to_subdivide(errors, max_faces, settings.subdivide_percentile))
+    # The subdivision keeps these faces, but not their indices: find them by their vertices.
+    keys = {tuple(face) for face in np.sort(mesh.faces[low], axis=1).tolist()}
+    selected = np.array([tuple(face) in keys for face in np.sort(fine.faces, axis=1).tolist()])
+    if not selected.any():
+        return fine
+    decimated_edge_m = settings.decimated_edge_ratio * target_edge_m
+    return keep_if_repair_fails(
+        lambda: remesh_isotropic(fine, decimated_edge_m, iterations=3, selected=selected),
+        fine,
+        "the faces with a small image error are not decimated in this round",
+    )
+
+
+def _faces_to_subdivide(
+    errors: Float[np.ndarray, "f"], max_faces: int, subdivide_percentile: float
+) -> Bool[np.ndarray, "f"]:
+    """Return the faces above the percentile, or those with the largest errors that the face budget allows."""
+    high = errors > np.percentile(errors, subdivide_percentile)
+    face_budget = max(0, max_faces - len(errors)) // 4
+    if high.sum() <= face_budget:
+        return high
+    if face_budget == 0:
+        return np.zeros_like(high)
+    smallest = len(errors) - face_budget
+    return high & (errors >= np.partition(errors, smallest)[smallest])

@@ -1,0 +1,83 @@
+"""Settings of the mesh stage that no preset varies; sweeps and ablations set them from Python."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class MeshSettings:
+    """Parameters of surface extraction and refinement. Figures are in docs/decisions/mesh.md.
+
+    Surface extraction:
+        max_body_distance_m: largest distance of the surface outside the fitted body, m.
+        solid_core_depth_m: points deeper than this inside the fitted body are solid, m.
+        blur_sigma_voxels: standard deviation of the Gaussian blur of the density indicator, voxels.
+        closing_radius_m: concavities inside the body that a ball of this radius cannot enter are filled, m.
+        hands_from_body: take hands and fingers from the fitted body, not from the field.
+        isovalues_per_m: density isovalues to select from, 1/m.
+        isovalue_frames: validation frames on which the isovalue is selected.
+
+    Refinement:
+        frames_per_step: training frames in one optimiser step.
+        learning_rate: step size of the smoothed vertex offsets, m (with 0.003 and lambda 20: 0.12 dB less, 40
+            self-intersections).
+        global_learning_rate: step size of the global offset, m.
+        appearance_learning_rate: learning rate of the field's colours on the surface; 0 keeps them (0.8 dB less).
+        appearance_steps: steps at the start of a round that optimise the colours only.
+        smoothing_lambda: lambda of the implicit smoothing of Nicolet et al.; 0 moves each vertex independently.
+        colour_weight: weight of the Huber colour loss.
+        silhouette_weight: weight of the silhouette loss, alpha against mask.
+        laplacian_weight: weight of the uniform Laplacian of the positions, in units of the edge length (0.02 to 2 give
+            the same PSNR to 0.04 dB).
+        offset_weight: weight of the squared vertex offsets, in units of the edge length.
+        global_offset_weight: weight of the squared global offset, in units of the edge length.
+        subdivide_percentile: faces with an image error above this percentile are subdivided (IHM paper: 95).
+        decimate_percentile: faces with an image error up to this percentile are decimated (IHM paper: 50).
+        decimated_edge_ratio: edge length of decimated regions, in target edge lengths.
+        seed: seed of the frame order and of the random backgrounds.
+
+    Raises:
+        ValueError: a value is out of its range, or two values contradict each other; the message names them.
+    """
+
+    max_body_distance_m: float = 0.12
+    solid_core_depth_m: float = 0.025
+    blur_sigma_voxels: float = 1.0
+    closing_radius_m: float = 0.03
+    hands_from_body: bool = True
+    isovalues_per_m: tuple[float, ...] = (8.0, 16.0, 32.0, 64.0, 128.0)
+    isovalue_frames: int = 8
+
+    frames_per_step: int = 3
+    learning_rate: float = 0.0012
+    global_learning_rate: float = 0.0003
+    appearance_learning_rate: float = 0.003
+    appearance_steps: int = 20
+    smoothing_lambda: float = 12.0
+    colour_weight: float = 1.0
+    silhouette_weight: float = 1.0
+    laplacian_weight: float = 0.5
+    offset_weight: float = 0.002
+    global_offset_weight: float = 0.02
+    subdivide_percentile: float = 95.0
+    decimate_percentile: float = 50.0
+    decimated_edge_ratio: float = 1.4
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range and contradictions."""
+        for name in ("max_body_distance_m", "learning_rate", "isovalue_frames", "frames_per_step"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"MeshSettings.{name} = {getattr(self, name)} is not allowed: it must be above 0")
+        if not self.isovalues_per_m or min(self.isovalues_per_m) <= 0.0:
+            raise ValueError(
+                f"MeshSettings.isovalues_per_m = {self.isovalues_per_m} is not allowed: it must have values above 0"
+            )
+        if not 0.0 <= self.decimate_percentile <= self.subdivide_percentile <= 100.0:
+            raise ValueError(
+                f"MeshSettings.decimate_percentile = {self.decimate_percentile} and subdivide_percentile = "
+                f"{self.subdivide_percentile} contradict each other: 0 <= decimate <= subdivide <= 100 must hold"
+            )
+        if self.decimated_edge_ratio < 1.0:
+            raise ValueError(
+                f"MeshSettings.decimated_edge_ratio = {self.decimated_edge_ratio} is not allowed: it must be at least 1"
+            )

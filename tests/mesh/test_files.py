@@ -1,0 +1,64 @@
+"""The files of the mesh stage: what was written is read back, and a wrong file names itself and the next command."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.core.errors import UserError
+from pipeline.geometry.mesh import Mesh
+from pipeline.io.npz import load_npz, save_npz
+from pipeline.mesh.files import MESH_NPZ, MeshArtifact, load_checkpoint, load_mesh, save_checkpoint, save_mesh
+from pipeline.mesh.refinement import RefinementState
+from pipeline.mesh.skin_transfer import build_skinned_topology
+
+TETRAHEDRON = Mesh(
+    np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], dtype=np.float32),
+    np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], dtype=np.int32),
+)
+ARTIFACT = MeshArtifact(
+    TETRAHEDRON,
+    np.array([[2, 0, 0, 0], [1, 2, 0, 0], [0, 1, 2, 3], [3, 0, 0, 0]], dtype=np.int32),
+    np.array([[1, 0, 0, 0], [0.75, 0.25, 0, 0], [0.4, 0.3, 0.2, 0.1], [1, 0, 0, 0]], dtype=np.float32),
+    np.linspace(0.0, 1.0, 12, dtype=np.float32).reshape(4, 3),
+)
+
+
+def test_a_mesh_is_read_back(tmp_path: Path) -> None:
+    save_mesh(tmp_path, ARTIFACT)
+    loaded = load_mesh(tmp_path)
+    np.testing.assert_array_equal(loaded.mesh.vertices, TETRAHEDRON.vertices)
+    np.testing.assert_array_equal(loaded.mesh.faces, TETRAHEDRON.faces)
+    for name in ("joint_indices", "joint_weights", "vertex_colours"):
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(ARTIFACT, name))
+
+
+def test_dense_weights_have_one_row_per_vertex() -> None:
+    expected = [[0, 0, 1, 0], [0, 0.75, 0.25, 0], [0.4, 0.3, 0.2, 0.1], [0, 0, 0, 1]]
+    torch.testing.assert_close(ARTIFACT.dense_skin_weights(4), torch.tensor(expected))
+
+
+def test_a_file_without_an_array_names_it_and_the_command(tmp_path: Path) -> None:
+    save_mesh(tmp_path, ARTIFACT)
+    arrays = load_npz(tmp_path / MESH_NPZ)
+    save_npz(tmp_path / MESH_NPZ, {name: array for name, array in arrays.items() if name != "joint_weights"})
+    with pytest.raises(UserError, match=r"mesh\.npz has no array 'joint_weights'; run python -m stages\.mesh"):
+        load_mesh(tmp_path)
+
+
+def test_a_checkpoint_is_read_back(tmp_path: Path) -> None:
+    weights = torch.tensor([[1.0, 0.0], [0.5, 0.5], [0.25, 0.75], [0.0, 1.0]])
+    shader_state = {"mean": torch.tensor(0.25)}
+    state = RefinementState(
+        TETRAHEDRON, build_skinned_topology(TETRAHEDRON, weights), shader_state, 2, (20.0, 25.5), True
+    )
+    assert load_checkpoint(tmp_path / "checkpoint.safetensors") is None
+    save_checkpoint(tmp_path / "checkpoint.safetensors", state)
+    loaded = load_checkpoint(tmp_path / "checkpoint.safetensors")
+    assert loaded is not None
+    np.testing.assert_array_equal(loaded.mesh.vertices, TETRAHEDRON.vertices)
+    assert torch.equal(loaded.skin.weights, weights)
+    assert torch.equal(loaded.skin.adjacency, state.skin.adjacency)
+    assert loaded.shader_state == shader_state
+    assert (loaded.rounds_done, loaded.validation_psnr_db, loaded.finished) == (2, (20.0, 25.5), True)

@@ -1,0 +1,86 @@
+"""Remeshing to an edge length and to the image error; steps that would leave holes are skipped with a warning."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.core.progress import take_warnings
+from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.surface import OpenSurfaceError, is_closed_manifold
+from pipeline.mesh import remeshing as remeshing_module
+from pipeline.mesh.isosurface import extract_mesh, sample_canonical_grid
+from pipeline.mesh.remeshing import remesh_adaptively, remesh_to_edge_length
+from tests.mesh import capsule
+from tests.mesh.egg import EDGE_M, SETTINGS
+
+
+@pytest.fixture(scope="module")
+def extracted() -> Mesh:
+    samples = sample_canonical_grid(
+        capsule.shell_density, capsule.capsule_body(), capsule.VOXEL_SIZE_M, capsule.SETTINGS
+    )
+    return extract_mesh(samples, 50.0, capsule.SETTINGS)
+
+
+def raise_open_surface_error(*_: object, **__: object) -> Mesh:
+    raise OpenSurfaceError("a surface still has holes after 4 repair iterations")
+
+
+def test_the_edge_length_is_reached(extracted: Mesh) -> None:
+    mesh = remesh_to_edge_length(extracted, 0.04)
+    lengths = np.linalg.norm(np.diff(mesh.vertices[mesh.edges()], axis=1), axis=2)
+    assert np.median(lengths) == pytest.approx(0.04, rel=0.25)
+    assert is_closed_manifold(mesh)
+
+
+@pytest.mark.parametrize(
+    ("failing_function", "expected_warning"),
+    [("remesh_isotropic", "the mesh is not remeshed"), ("repair", "the mesh is not decimated before remeshing")],
+)
+def test_a_step_that_leaves_holes_is_skipped(
+    extracted: Mesh, monkeypatch: pytest.MonkeyPatch, failing_function: str, expected_warning: str
+) -> None:
+    monkeypatch.setattr(remeshing_module, failing_function, raise_open_surface_error)
+    take_warnings()
+    mesh = remesh_to_edge_length(extracted, 0.05)
+    assert is_closed_manifold(mesh)
+    assert len(mesh.faces) < len(extracted.faces)  # the other step still reduces the number of faces
+    (warning,) = take_warnings()
+    assert expected_warning in warning
+
+
+def test_faces_are_subdivided_where_the_error_is_large(egg: Mesh) -> None:
+    centres = egg.vertices[egg.faces].mean(axis=1)
+    errors = np.exp(8 * centres[:, 1])
+    adapted = remesh_adaptively(egg, errors, EDGE_M, 3000, replace(SETTINGS, subdivide_percentile=90.0))
+    assert is_closed_manifold(adapted)
+
+    def fraction_above(mesh: Mesh) -> float:
+        return float((mesh.vertices[mesh.faces].mean(axis=1)[:, 1] > 0.2).mean())
+
+    assert fraction_above(adapted) > 1.5 * fraction_above(egg)
+    below = adapted.vertices[adapted.faces].mean(axis=1)[:, 1] < -0.05
+    assert below.sum() < (centres[:, 1] < -0.05).sum()
+
+
+def test_a_decimation_that_leaves_holes_is_skipped(egg: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(remeshing_module, "remesh_isotropic", raise_open_surface_error)
+    take_warnings()
+    adapted = remesh_adaptively(egg, np.arange(len(egg.faces), dtype=np.float64), EDGE_M, 3000, SETTINGS)
+    assert is_closed_manifold(adapted)
+    assert len(adapted.faces) > len(egg.faces)  # the faces with a large error are subdivided nevertheless
+    (warning,) = take_warnings()
+    assert "faces with a small image error are not decimated" in warning
+
+
+def test_the_face_limit_stops_the_subdivision(egg: Mesh) -> None:
+    errors = np.arange(len(egg.faces), dtype=np.float64)
+    settings = replace(SETTINGS, decimate_percentile=0.0)
+    assert len(remesh_adaptively(egg, errors, EDGE_M, 100, settings).faces) <= len(egg.faces)
+
+
+def test_the_faces_with_the_largest_errors_fill_the_face_budget(egg: Mesh) -> None:
+    errors = np.arange(len(egg.faces), dtype=np.float64)
+    chosen = remeshing_module._faces_to_subdivide(errors, len(egg.faces) + 8, 50.0)
+    np.testing.assert_array_equal(np.flatnonzero(chosen), [len(errors) - 2, len(errors) - 1])

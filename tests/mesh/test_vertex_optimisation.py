@@ -1,0 +1,71 @@
+"""Optimisation of the vertices of a known mesh: shape, global offset, colours, and the implicit smoothing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.body.body import Body
+from pipeline.geometry.mesh import Mesh
+from pipeline.mesh.skin_transfer import transfer_skin
+from pipeline.mesh.vertex_optimisation import FromDifferential, factorise_smoothing_matrix, optimise_vertices
+from pipeline.mesh.views import mesh_psnr_db
+from tests.mesh.egg import PATTERN, SETTINGS, Pattern, Views, refinement_inputs
+
+
+def mean_normal_distance_m(mesh: Mesh, truth: Mesh) -> float:
+    """Mean distance of corresponding vertices along the normal (same faces)."""
+    return float(np.abs(np.sum((mesh.vertices - truth.vertices) * truth.vertex_normals(), axis=1)).mean())
+
+
+def test_optimisation_recovers_the_shape(egg: Mesh, dented_egg: Mesh, egg_body: Body, egg_views: Views) -> None:
+    skin = transfer_skin(dented_egg, egg_body)
+    result = optimise_vertices(dented_egg, skin, refinement_inputs(egg_body, egg_views, steps=80), seed=0)
+    assert mean_normal_distance_m(result, egg) < 0.4 * mean_normal_distance_m(dented_egg, egg)
+    before_db, after_db = (mesh_psnr_db(mesh, skin, egg_views[1], PATTERN) for mesh in (dented_egg, result))
+    assert after_db - before_db > 4.0
+    np.testing.assert_array_equal(result.faces, dented_egg.faces)
+
+
+def test_the_global_offset_translates_all_vertices(egg: Mesh, egg_body: Body, egg_views: Views) -> None:
+    shift_m = np.array([0.01, -0.015, 0.0], dtype=np.float32)
+    settings = replace(SETTINGS, learning_rate=1e-9, global_learning_rate=0.002)
+    shifted = Mesh(egg.vertices + shift_m, egg.faces)
+    inputs = refinement_inputs(egg_body, egg_views, steps=60, settings=settings)
+    result = optimise_vertices(shifted, transfer_skin(shifted, egg_body), inputs, seed=0)
+    offset_m = result.vertices - shifted.vertices
+    np.testing.assert_allclose(offset_m, np.broadcast_to(offset_m[0], offset_m.shape), atol=1e-5)
+    np.testing.assert_allclose(offset_m[0], -shift_m, atol=0.003)
+
+
+def test_the_first_steps_optimise_only_the_colours(egg: Mesh, egg_body: Body, egg_views: Views) -> None:
+    pale = Pattern(0.1)
+    settings = replace(
+        SETTINGS,
+        appearance_learning_rate=0.05,
+        appearance_steps=40,
+        learning_rate=1e-9,
+        global_learning_rate=0.0,
+    )
+    inputs = refinement_inputs(egg_body, egg_views, steps=1, settings=settings, shader=pale)
+    result = optimise_vertices(egg, transfer_skin(egg, egg_body), inputs, seed=0)
+    assert float(pale.contrast) == pytest.approx(0.4, abs=0.03)
+    np.testing.assert_allclose(result.vertices, egg.vertices, atol=1e-6)
+
+
+def test_smoothed_offsets_solve_their_equation_and_so_do_their_gradients(egg: Mesh) -> None:
+    factorisation = factorise_smoothing_matrix(egg, 5.0)
+    generator = torch.Generator().manual_seed(0)
+    u = torch.rand(len(egg.vertices), 3, generator=generator, dtype=torch.float64, requires_grad=True)
+    offset = FromDifferential.apply(u, factorisation)
+    dense = torch.eye(len(u), dtype=torch.float64)
+    for a, b in egg.edges().tolist():
+        dense[a, a] += 5.0
+        dense[b, b] += 5.0
+        dense[a, b] -= 5.0
+        dense[b, a] -= 5.0
+    torch.testing.assert_close(dense @ offset, u)
+    weights = torch.rand(offset.shape, generator=generator, dtype=torch.float64)
+    (gradient,) = torch.autograd.grad((offset * weights).sum(), u)
+    torch.testing.assert_close(dense @ gradient, weights)
