@@ -1,4 +1,4 @@
-"""One small synthetic person and one small capture for all tests of this folder."""
+"""Session fixtures: one small synthetic person and one small capture."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ SAMPLE_OPTIONS = [
 
 @pytest.fixture(scope="session")
 def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a capture of the built-in person, 6 frames of 200 x 200."""
+    """Folder of a capture of the built-in person, 6 frames of 200 x 200."""
     out = tmp_path_factory.mktemp("captures") / "sample"
     make_sample([str(out), *SAMPLE_OPTIONS])
     return out
@@ -34,5 +34,5 @@ def subject(sample: Path) -> Subject:
 
 @pytest.fixture(scope="session")
 def bare(sample: Path) -> Body:
-    """The body beneath the clothes."""
+    """The body without clothes."""
     return load_body(sample / "truth" / "bare.npz")

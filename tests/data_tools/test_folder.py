@@ -1,4 +1,4 @@
-"""Folders are whole or absent."""
+"""Output folders are created atomically."""
 
 import pytest
 
@@ -6,7 +6,7 @@ from data_tools.folder import atomic_folder, require_absent
 from pipeline.core.errors import UserError
 
 
-def test_a_folder_appears_when_its_work_is_done(tmp_path):
+def test_folder_appears_when_the_block_ends(tmp_path):
     with atomic_folder(tmp_path / "a" / "out") as part:
         (part / "x").write_text("1")
         assert not (tmp_path / "a" / "out").exists()
@@ -14,7 +14,7 @@ def test_a_folder_appears_when_its_work_is_done(tmp_path):
     assert [path.name for path in (tmp_path / "a").iterdir()] == ["out"]
 
 
-def test_what_broke_off_leaves_no_folder_and_does_not_mix_with_the_next(tmp_path):
+def test_failed_block_leaves_no_folder_and_no_remains(tmp_path):
     def half() -> None:
         with atomic_folder(tmp_path / "out") as part:
             (part / "old").write_text("1")
@@ -27,7 +27,7 @@ def test_what_broke_off_leaves_no_folder_and_does_not_mix_with_the_next(tmp_path
         assert not any(part.iterdir())
 
 
-def test_nothing_is_overwritten(tmp_path):
+def test_existing_paths_are_errors(tmp_path):
     (tmp_path / "out").write_text("precious")
     with pytest.raises(UserError, match="already exists"), atomic_folder(tmp_path / "out"):
         pass

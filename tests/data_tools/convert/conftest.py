@@ -1,4 +1,4 @@
-"""Warnings of one test are not seen by the next."""
+"""Clear the warnings before each test."""
 
 from collections.abc import Iterator
 
@@ -9,7 +9,7 @@ from pipeline.core.progress import take_warnings
 
 @pytest.fixture(autouse=True)
 def clear_warnings() -> Iterator[None]:
-    """Forget what was warned of before and in the test."""
+    """Clear the warnings before and after the test."""
     take_warnings()
     yield
     take_warnings()

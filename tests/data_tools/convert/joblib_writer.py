@@ -1,4 +1,4 @@
-"""Writes files as joblib's `dump` does, so that joblib need not be installed (joblib 1.6.0 reads what it writes)."""
+"""Write files like `joblib.dump` without joblib (joblib 1.6.0 reads them)."""
 
 import pickle
 import sys
@@ -12,7 +12,7 @@ ALIGNMENT_BYTES = 16
 
 
 class NumpyArrayWrapper:
-    """Stands in the pickle where an array's bytes follow."""
+    """Header of an array in the pickle; the bytes of the array follow."""
 
     def __init__(self, array: np.ndarray, is_aligned: bool) -> None:
         self.subclass, self.shape, self.dtype, self.allow_mmap = np.ndarray, array.shape, array.dtype, True
@@ -41,7 +41,7 @@ class _Pickler(pickle._Pickler):
 
 
 def dump_joblib(content: object, path: Path, protocol: int = 4, is_aligned: bool = True) -> None:
-    """As `joblib.dump(content, path)`; without alignment as before joblib 1.2."""
+    """Write like `joblib.dump(content, path)`; without alignment, like joblib before 1.2."""
     modules = {"joblib": ModuleType("joblib"), "joblib.numpy_pickle": ModuleType("joblib.numpy_pickle")}
     modules["joblib.numpy_pickle"].NumpyArrayWrapper = NumpyArrayWrapper
     before = {name: sys.modules.get(name) for name in modules}

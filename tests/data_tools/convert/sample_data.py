@@ -1,4 +1,4 @@
-"""Tiny recordings as researchers have them on disk, written with the formats' own tools, not with the readers' code."""
+"""Small recordings in the formats of research data sets, written without the code of the readers."""
 
 import pickle
 from pathlib import Path
@@ -15,24 +15,24 @@ WIDTHS = {"pose": 72, "trans": 3, "transl": 3, "betas": 10, "global_orient": 3, 
 
 
 def pictures(n: int) -> np.ndarray:
-    """Pictures (n, h, w, 3) that differ from each other."""
+    """Return distinct images (n, h, w, 3)."""
     return np.random.default_rng(1).integers(0, 255, (n, HEIGHT, WIDTH, 3), dtype=np.uint8)
 
 
 def masks(n: int) -> np.ndarray:
-    """Masks (n, h, w) of 0 and 1: a bar whose place tells the frame."""
+    """Return masks (n, h, w) of 0 and 1: a bar whose position depends on the frame."""
     columns = np.arange(WIDTH)
     rows = np.stack([(columns >= k % 8) & (columns < k % 8 + 5) for k in range(n)])
     return rows[:, None].repeat(HEIGHT, axis=1).astype(np.uint8)
 
 
 def numbers(name: str, n: int, seed: int = 2) -> np.ndarray:
-    """n rows of the SMPL parameter of this name."""
+    """Return n rows of an SMPL parameter."""
     return np.random.default_rng(seed).normal(scale=SCALES[name], size=(n, WIDTHS[name])).astype(np.float32)
 
 
 def people_snapshot(folder: Path, n: int = 6) -> dict[str, np.ndarray]:
-    """One subject; returns the camera that was written."""
+    """Write one subject and return its camera."""
     folder.mkdir(parents=True)
     write_video(folder / f"{folder.name}.mp4", pictures(n), 25.0)
     camera = {
@@ -55,7 +55,7 @@ def people_snapshot(folder: Path, n: int = 6) -> dict[str, np.ndarray]:
 
 
 def instant_avatar(folder: Path, n: int = 6) -> None:
-    """One subject with poses of all frames; masks as numpy arrays."""
+    """Write one subject with poses of all frames and masks as .npy files."""
     for name in ("images", "masks", "poses"):
         (folder / name).mkdir(parents=True)
     for k, (picture, mask) in enumerate(zip(pictures(n), masks(n), strict=True)):
@@ -70,13 +70,13 @@ def instant_avatar(folder: Path, n: int = 6) -> None:
 
 
 def poses_of_set(n: int, seed: int) -> dict[str, np.ndarray]:
-    """What `anim_nerf_train.npz` holds."""
+    """Return the content of `anim_nerf_train.npz`."""
     rows = {name: numbers(name, n, seed) for name in ("global_orient", "body_pose", "transl")}
     return rows | {"betas": numbers("betas", 1, seed)}
 
 
 def write_image_folder(folder: Path, mask_folder: str, n: int = 6) -> None:
-    """Images with masks of 0 and 255 under the same names."""
+    """Write images, and masks of 0 and 255 with the same names."""
     (folder / "images").mkdir(parents=True)
     (folder / mask_folder).mkdir()
     for k, (picture, mask) in enumerate(zip(pictures(n), masks(n), strict=True)):

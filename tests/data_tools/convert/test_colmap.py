@@ -1,4 +1,4 @@
-"""COLMAP's models: text and binary say the same, and lenses are OpenCV's."""
+"""COLMAP models: equal content of text and binary files, and OpenCV distortion."""
 
 import struct
 
@@ -65,20 +65,20 @@ def test_cameras_and_poses(tmp_path, write, model):
     np.testing.assert_allclose(read.world_to_camera["c.png"][:, 3], [0, 0, 5, 1])
 
 
-def test_a_lens_without_distortion_has_none(tmp_path):
+def test_zero_distortion_is_empty(tmp_path):
     write_text(tmp_path / "m", "RADIAL", (50, 8, 6, 0, 0))
     assert read_colmap_model(tmp_path / "m").cameras[7].camera.distortion == ()
 
 
 @pytest.mark.parametrize("write", [write_text, write_binary])
-def test_a_fisheye_is_refused(tmp_path, write, monkeypatch):
+def test_unsupported_camera_model_is_an_error(tmp_path, write, monkeypatch):
     monkeypatch.setitem(NUMBERS, "OPENCV_FISHEYE", 5)
     write(tmp_path / "m", "OPENCV_FISHEYE", (50, 51, 8, 6, 0.1, 0.2, 0.3, 0.4))
     with pytest.raises(UserError, match="camera model (OPENCV_FISHEYE|number 5) is not supported"):
         read_colmap_model(tmp_path / "m")
 
 
-def test_damage_and_absence_are_named(tmp_path):
+def test_damaged_and_missing_files_are_errors(tmp_path):
     assert find_colmap_model(tmp_path) is None
     write_text(tmp_path / "m", "PINHOLE", (50, 51, 8))
     with pytest.raises(UserError, match="PINHOLE has 4 parameters, found 3"):

@@ -1,4 +1,4 @@
-"""Image folders: masks under other names, or in the pictures' alpha."""
+"""Image folders: mask folders with other names, and masks in the alpha channel."""
 
 import json
 
@@ -24,7 +24,7 @@ def check(target):
 
 
 @pytest.mark.parametrize("name", ["masks", "matte"])
-def test_masks_in_a_folder_of_any_usual_name(tmp_path, name):
+def test_mask_folder_names(tmp_path, name):
     sample_data.write_image_folder(tmp_path / "in", name)
     assert is_image_folder(tmp_path / "in")
     (tmp_path / "in" / "camera.json").write_text(json.dumps({"fx": 9, "fy": 9, "cx": 8, "cy": 6}))
@@ -41,7 +41,7 @@ def test_masks_in_the_alpha_channel(tmp_path):
     check(tmp_path / "out")
 
 
-def test_pictures_without_masks_need_no_conversion(tmp_path):
+def test_images_without_masks_need_no_conversion(tmp_path):
     sample_data.write_image_folder(tmp_path / "in", "other")
     assert not is_image_folder(tmp_path / "in")
     with pytest.raises(UserError, match="no mask folder and no alpha channel"):

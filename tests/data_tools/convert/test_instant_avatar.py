@@ -1,4 +1,4 @@
-"""InstantAvatar's folders: round trips, its sets of frames, and the real pose files."""
+"""InstantAvatar folders: round trips, splits, and the real pose files."""
 
 import shutil
 
@@ -22,14 +22,14 @@ TRAIN, HELDOUT = list(range(0, 456, 4)), list(range(456, 676, 4))
 
 @pytest.fixture
 def folder(tmp_path):
-    """One unknown subject of six frames."""
+    """An unknown subject of six frames."""
     sample_data.instant_avatar(tmp_path / "somebody")
     return tmp_path / "somebody"
 
 
 @pytest.fixture(scope="module")
 def subject(tmp_path_factory):
-    """A known subject of 673 frames, just enough for its split, without poses of the sets."""
+    """A known subject of 673 frames, the minimum for its split, without poses of the splits."""
     folder = tmp_path_factory.mktemp("known") / SUBJECT
     sample_data.instant_avatar(folder, HELDOUT[-1] + 1)
     return folder
@@ -54,7 +54,7 @@ def test_round_trip(folder, tmp_path):
     assert (poses.smpl_to_camera[:, 2, 3] == 1).all()
 
 
-def test_a_known_subject_keeps_its_sets_and_their_poses(subject, tmp_path):
+def test_known_subject_has_its_split_and_poses(subject, tmp_path):
     train, test = sample_data.poses_of_set(len(TRAIN), 5), sample_data.poses_of_set(len(HELDOUT), 6)
     shutil.copytree(subject, tmp_path / SUBJECT)
     np.savez(tmp_path / SUBJECT / "poses" / "anim_nerf_train.npz", **train)
@@ -73,8 +73,8 @@ def test_a_known_subject_keeps_its_sets_and_their_poses(subject, tmp_path):
     assert take_warnings() == []
 
 
-def test_the_real_pose_files_fit_the_split(subject, shared_data, tmp_path):
-    """The table of frames is right about the numbers of poses that InstantAvatar ships."""
+def test_real_pose_files_match_the_split(subject, shared_data, tmp_path):
+    """The lengths of the splits match the numbers of poses in InstantAvatar's files."""
     shutil.copytree(subject, tmp_path / SUBJECT)
     stored = {}
     for name in ("train", "test"):
@@ -89,12 +89,12 @@ def test_the_real_pose_files_fit_the_split(subject, shared_data, tmp_path):
 
 
 @pytest.mark.parametrize("name", sorted(_SPLITS))
-def test_no_set_shares_a_frame(name):
+def test_splits_are_disjoint(name):
     train, heldout = _SPLITS[name]
     assert not set(train) & set(heldout)
 
 
-def test_a_shorter_video_of_a_known_subject_gets_no_split(tmp_path):
+def test_short_video_of_a_known_subject_has_no_split(tmp_path):
     sample_data.instant_avatar(tmp_path / SUBJECT)
     np.savez(tmp_path / SUBJECT / "poses" / "anim_nerf_train.npz", **sample_data.poses_of_set(3, 5))
     recording = read_instant_avatar(tmp_path / SUBJECT)
@@ -105,7 +105,7 @@ def test_a_shorter_video_of_a_known_subject_gets_no_split(tmp_path):
     assert "these poses are ignored" in warnings[1]
 
 
-def test_masks_may_be_images_and_poses_absent(folder):
+def test_image_masks_without_poses(folder):
     for k, mask in enumerate(sample_data.masks(6)):
         (folder / "masks" / f"mask_{k:04d}.npy").unlink()
         write_gray(folder / "masks" / f"{k}.png", 200 * mask)
@@ -115,7 +115,7 @@ def test_masks_may_be_images_and_poses_absent(folder):
     assert recording.poses is None
 
 
-def test_what_does_not_fit_is_named(folder):
+def test_inconsistent_files_are_errors(folder):
     np.savez(folder / "poses.npz", thetas=np.zeros((6, 69)), transl=np.zeros((6, 3)), betas=np.zeros(10))
     with pytest.raises(UserError, match=r"poses.npz: the pose must have 6 rows of 72 numbers, found \(6, 69\)"):
         read_instant_avatar(folder)
@@ -133,7 +133,7 @@ def test_what_does_not_fit_is_named(folder):
         read_instant_avatar(folder)
 
 
-def test_a_mask_of_colours_is_refused(folder):
+def test_colour_mask_is_an_error(folder):
     np.save(folder / "masks" / "mask_0002.npy", np.zeros((4, 4, 3)))
     with pytest.raises(UserError, match=r"mask_0002.npy: a mask has shape \(4, 4, 3\)"):
         read_instant_avatar(folder).read_mask(2)

@@ -1,4 +1,4 @@
-"""joblib's files: arrays of every kind come back, and nothing is run."""
+"""Files of joblib: arrays of all kinds are read, and no code is executed."""
 
 import os
 
@@ -35,14 +35,14 @@ class Malice:
         return os.system, (f"touch {self.marker}",)
 
 
-def test_nothing_is_run(tmp_path):
+def test_code_in_a_pickle_is_not_executed(tmp_path):
     dump_joblib({1: [np.zeros(3), Malice(tmp_path / "marker")]}, tmp_path / "a.pkl")
     with pytest.raises(UserError, match=r"a\.pkl is refused: it contains `.*system`"):
         load_joblib(tmp_path / "a.pkl")
     assert not (tmp_path / "marker").exists()
 
 
-def test_a_file_that_breaks_off_is_named(tmp_path):
+def test_truncated_file_is_an_error(tmp_path):
     dump_joblib(CONTENT, tmp_path / "a.pkl")
     whole = (tmp_path / "a.pkl").read_bytes()
     for length in range(0, len(whole), 37):

@@ -1,4 +1,4 @@
-"""The command: formats are guessed, sources stay as they are, targets are whole or absent."""
+"""The convert command: formats are detected, sources are unchanged, targets are atomic."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def state(folder):
 
 
 @pytest.mark.parametrize("name", sorted(MAKERS))
-def test_the_format_is_guessed_and_the_source_is_only_read(tmp_path, capsys, name):
+def test_format_is_detected_and_the_source_is_unchanged(tmp_path, capsys, name):
     MAKERS[name](tmp_path / "in")
     before = state(tmp_path / "in")
     main([str(tmp_path / "in"), str(tmp_path / "out")])
@@ -35,7 +35,7 @@ def test_the_format_is_guessed_and_the_source_is_only_read(tmp_path, capsys, nam
     }
 
 
-def test_errors_are_sentences(tmp_path, capsys):
+def test_user_errors(tmp_path, capsys):
     sample_data.write_image_folder(tmp_path / "in", "other")
     source, target = str(tmp_path / "in"), str(tmp_path / "out")
     for arguments, message in (
@@ -49,7 +49,7 @@ def test_errors_are_sentences(tmp_path, capsys):
         assert message in capsys.readouterr().err
 
 
-def test_what_breaks_off_leaves_no_target(tmp_path):
+def test_failed_conversion_leaves_no_target(tmp_path):
     sample_data.write_image_folder(tmp_path / "in", "masks")
     broken = tmp_path / "in" / "masks" / "00003.png"
     whole = broken.read_bytes()
@@ -62,8 +62,8 @@ def test_what_breaks_off_leaves_no_target(tmp_path):
     assert not (tmp_path / "out.part").exists()
 
 
-def test_the_frames_stage_takes_the_target(tmp_path):
-    """With landmarks beside it, so that no detector is needed: the split, masks and camera of the source are used."""
+def test_frames_stage_reads_the_target(tmp_path):
+    """Landmarks are supplied, so no detector is needed: split, masks and camera of the source are used."""
     sample_data.instant_avatar(tmp_path / "in", 20)
     main([str(tmp_path / "in"), str(tmp_path / "out")])
     landmarks = {"landmarks_px": np.full((20, 33, 2), 5.0), "landmarks_world_m": np.zeros((20, 33, 3))}

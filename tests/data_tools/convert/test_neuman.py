@@ -1,4 +1,4 @@
-"""NeuMan's scenes: cameras and poses against hand-made truth, masks inverted, splits by name."""
+"""NeuMan scenes: cameras and poses against known values, inverted masks, splits by name."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ PERSON = np.array([0.3, -0.2, 1.5])
 
 
 def camera_pose(k: int) -> tuple[np.ndarray, np.ndarray]:
-    """A camera that turns about +Z by k degrees (rotation and translation, world to camera)."""
+    """Rotation and translation, world to camera, of a camera that rotates about +Z by k degrees."""
     angle = np.radians(k)
     rotation = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
     return rotation, np.array([0.01 * k, 0.0, 0.5])
@@ -26,7 +26,7 @@ def camera_pose(k: int) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture
 def scene(tmp_path):
-    """Six pictures, the fifth of them not registered by COLMAP; the world's unit is four metres."""
+    """Six images, the fifth not registered by COLMAP; the unit of the world is four metres."""
     folder = tmp_path / "scene"
     sample_data.write_image_folder(folder, "segmentations")
     for k, mask in enumerate(sample_data.masks(6)):
@@ -66,8 +66,8 @@ def test_round_trip(scene, tmp_path):
     assert (poses.transl == 0).all()
 
 
-def test_bodies_are_carried_to_the_camera_in_metres(scene):
-    """A point of SMPL's output, through the alignment, COLMAP's pose and back to metres, step by step."""
+def test_smpl_to_camera_is_in_metres(scene):
+    """A point of SMPL's output, mapped step by step through the alignment and the camera pose to metres."""
     poses = read_neuman(scene).poses
     point_m = np.array([0.1, 0.9, -0.05])
     for row, k in enumerate(poses.frame_index):
@@ -78,7 +78,7 @@ def test_bodies_are_carried_to_the_camera_in_metres(scene):
         np.testing.assert_allclose(found[:3], in_camera, atol=1e-5)
 
 
-def test_romps_poses_when_there_are_no_better_ones(scene):
+def test_romp_poses_are_the_fallback(scene):
     (scene / "smpl_output_optimized.pkl").unlink()
     dump_joblib(
         {1: {"pose": 2 * sample_data.numbers("pose", 6), "betas": np.zeros((6, 10))}}, scene / "smpl_output_romp.pkl"
@@ -89,7 +89,7 @@ def test_romps_poses_when_there_are_no_better_ones(scene):
     assert read_neuman(scene).poses is None
 
 
-def test_split_files_name_pictures(scene, tmp_path):
+def test_splits_by_image_name(scene, tmp_path):
     for name, words in (("train", ["00000.png", "00002.png", "00004.png"]), ("val", ["00001.png"])):
         (scene / f"{name}_split.txt").write_text("\n".join(words) + "\n")
     assert read_neuman(scene).split is None
@@ -102,7 +102,7 @@ def test_split_files_name_pictures(scene, tmp_path):
         read_neuman(scene)
 
 
-def test_what_does_not_fit_is_named(scene):
+def test_inconsistent_files_are_errors(scene):
     (scene / "segmentations" / "00002.png").unlink()
     with pytest.raises(UserError, match="5 masks for 6 images"):
         read_neuman(scene)

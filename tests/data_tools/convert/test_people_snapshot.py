@@ -1,4 +1,4 @@
-"""PeopleSnapshot's folders: what goes in comes out, and every file that does not fit is named."""
+"""PeopleSnapshot folders: round trips, and errors that name inconsistent files."""
 
 import os
 import pickle
@@ -53,7 +53,7 @@ def test_a_pickle_of_python_2_with_float_scalars(tmp_path):
     assert read_people_snapshot(tmp_path / "s").camera.fx == 30
 
 
-def test_everything_but_the_video_may_be_absent(tmp_path):
+def test_only_the_video_is_required(tmp_path):
     sample_data.people_snapshot(tmp_path / "s")
     for name in ("camera.pkl", "reconstructed_poses.hdf5"):
         (tmp_path / "s" / name).unlink()
@@ -64,7 +64,7 @@ def test_everything_but_the_video_may_be_absent(tmp_path):
     assert not is_people_snapshot(tmp_path / "s")
 
 
-def test_a_malicious_camera_is_refused_and_not_run(tmp_path):
+def test_code_in_camera_pkl_is_not_executed(tmp_path):
     sample_data.people_snapshot(tmp_path / "s")
 
     class Malice:
@@ -85,7 +85,7 @@ def test_a_malicious_camera_is_refused_and_not_run(tmp_path):
         ({"width": 1080, "height": 1080}, "for images of 1080x1080, but those of .* are 16x12"),
     ],
 )
-def test_a_camera_that_does_not_fit_is_named(tmp_path, change, message):
+def test_invalid_camera_is_an_error(tmp_path, change, message):
     camera = sample_data.people_snapshot(tmp_path / "s")
     (tmp_path / "s" / "camera.pkl").write_bytes(pickle.dumps(camera | change))
     with pytest.raises(UserError, match=message):
@@ -95,7 +95,7 @@ def test_a_camera_that_does_not_fit_is_named(tmp_path, change, message):
         read_people_snapshot(tmp_path / "s")
 
 
-def test_masks_and_poses_that_do_not_fit_are_named(tmp_path):
+def test_invalid_masks_and_poses_are_errors(tmp_path):
     sample_data.people_snapshot(tmp_path / "s")
     with h5py.File(tmp_path / "s" / "masks.hdf5", "w") as file:
         file["masks"] = sample_data.masks(5)
@@ -113,7 +113,7 @@ def test_masks_and_poses_that_do_not_fit_are_named(tmp_path):
         read_people_snapshot(tmp_path / "s")
 
 
-def test_poses_of_a_longer_video_are_refused(tmp_path):
+def test_poses_of_a_longer_video_are_an_error(tmp_path):
     sample_data.people_snapshot(tmp_path / "s")
     with h5py.File(tmp_path / "s" / "reconstructed_poses.hdf5", "a") as file:
         for name in ("pose", "trans"):
@@ -125,7 +125,7 @@ def test_poses_of_a_longer_video_are_refused(tmp_path):
 
 
 def test_the_real_folder(shared_data):
-    """A re-encoded subject, without camera and poses: its masks lie on the person."""
+    """A re-encoded subject without camera and poses: its masks cover the person."""
     recording = read_people_snapshot(shared_data / "real" / "dakse")
     frame = next(read_frames(recording.source, lambda index: index == 100, 999))
     mask = recording.read_mask(100)

@@ -1,4 +1,4 @@
-"""Masks of a recording: by the pictures' names where they have names, else in order."""
+"""Masks of a recording: matched by image name, else in order."""
 
 import numpy as np
 import pytest
@@ -11,8 +11,8 @@ from pipeline.io.image import write_gray
 from tests.data_tools.convert import sample_data
 
 
-def test_masks_of_a_video_lie_in_order(tmp_path):
-    """A video's frames have no names that masks could share."""
+def test_masks_of_a_video_are_in_order(tmp_path):
+    """Frames of a video have no names."""
     write_video(tmp_path / "walk.mp4", sample_data.pictures(6), 25.0)
     (tmp_path / "masks").mkdir()
     for k, mask in enumerate(sample_data.masks(6)):

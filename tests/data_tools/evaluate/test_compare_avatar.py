@@ -1,4 +1,4 @@
-"""The comparison of a finished avatar: nothing is found wrong with the truth itself, and known errors are found."""
+"""Scores of a finished avatar: zero error for the ground truth itself, and known errors."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -56,7 +56,7 @@ def perfect_upper_bound(perfect: Comparison) -> dict[str, float]:
     return compare_heldout_images(perfect)["upper_bound"]
 
 
-def test_the_truth_has_no_error(perfect: Comparison) -> None:
+def test_ground_truth_has_no_error(perfect: Comparison) -> None:
     for scores in (compare_rest_surfaces(perfect), compare_heldout_surfaces(perfect)):
         assert scores["chamfer_mm"] < 0.2  # four joints a vertex are kept in the export
         assert scores["f_score"] > 0.999
@@ -66,8 +66,8 @@ def test_the_truth_has_no_error(perfect: Comparison) -> None:
     assert texture["colour_error"] < 1.0
 
 
-def test_filmed_poses_are_those_of_held_out_frames(perfect: Comparison) -> None:
-    """A wrong arm counts where it is held out, and nowhere else."""
+def test_heldout_surfaces_depend_on_held_out_frames_only(perfect: Comparison) -> None:
+    """A wrong arm pose has an effect in held-out frames only."""
     heldout, train = (perfect.run.capture.positions(kind) for kind in (HELDOUT, TRAIN))
     wrong, trained = (
         compare_heldout_surfaces(with_motion(perfect, bent_arm(perfect, rows, 0.3))) for rows in (heldout, train)
@@ -76,23 +76,24 @@ def test_filmed_poses_are_those_of_held_out_frames(perfect: Comparison) -> None:
     assert trained["chamfer_mm"] < 0.2
 
 
-def test_a_smaller_person_has_the_same_shape(perfect: Comparison) -> None:
+def test_scale_is_aligned(perfect: Comparison) -> None:
     scores = compare_rest_surfaces(with_scale(perfect, 0.9))
     assert scores["chamfer_mm"] < 0.2
     assert scores["scale_to_truth"] == pytest.approx(1 / 0.9, abs=1e-3)
 
 
-def test_a_motion_that_was_never_filmed(perfect: Comparison) -> None:
+def test_novel_poses_of_the_true_rig(perfect: Comparison) -> None:
     scores, pictures = compare_novel_poses(perfect)
     assert scores["chamfer_mm"] < 1.0
     assert len(pictures) == 2
     assert min(picture.scores()["mask_iou"] for picture in pictures) > 0.97
 
 
-def test_another_a_pose_is_no_error(perfect: Comparison) -> None:
-    """A rig that rests with a raised arm (as those of other makers do) is compared in the true rig's A-pose.
+@pytest.mark.slow
+def test_different_rest_pose_is_no_error(perfect: Comparison) -> None:
+    """A rig with a raised arm in its rest pose is compared in the A-pose of the true rig.
 
-    Blending twice squeezes the shoulder by some millimetres; left as it rests, the hand is 20 cm away.
+    Skinning twice shrinks the shoulder by some millimetres; in the rest pose, the hand is 20 cm away.
     """
     other = with_raised_rest_arm(perfect, 0.35)
     assert compare_rest_surfaces(other)["chamfer_mm"] < 1.0
@@ -101,8 +102,8 @@ def test_another_a_pose_is_no_error(perfect: Comparison) -> None:
     assert compare_texture(other)["colour_error"] < 2.0
 
 
-def test_cameras_that_never_filmed(perfect: Comparison) -> None:
-    """The truth is lit and the avatar is not: colours that are made brighter by a fifth cost what that is in dB."""
+def test_novel_views_of_the_true_avatar(perfect: Comparison) -> None:
+    """The truth is lit and the avatar is unlit: masks agree, and a black avatar has a lower PSNR."""
     pictures = compare_novel_views(perfect)
     assert len(pictures) == 2
     assert min(picture.scores()["mask_iou"] for picture in pictures) > 0.98
@@ -111,8 +112,8 @@ def test_cameras_that_never_filmed(perfect: Comparison) -> None:
     assert dark[0].scores()["psnr_body"] < pictures[0].scores()["psnr_body"] - 3.0
 
 
-def test_a_texture_of_known_error(perfect: Comparison) -> None:
-    """Darker by a fifth, and only its left half seen."""
+def test_texture_of_known_error(perfect: Comparison) -> None:
+    """Darker by a fifth, and only the left half is observed."""
     avatar = perfect.run.avatar
     darker = replace(perfect.run, avatar=replace(avatar, diffuse=0.8 * avatar.diffuse))
     half = perfect.coverage.copy()
@@ -125,7 +126,7 @@ def test_a_texture_of_known_error(perfect: Comparison) -> None:
 
 
 def test_flat_colours_give_the_texture_error_in_closed_form(perfect: Comparison) -> None:
-    """A grey person found brighter by 10, 20 and 30 of 255; then a person of two greys found in one of them."""
+    """A grey person estimated brighter by 10, 20 and 30 of 255; then a person of two greys estimated as one grey."""
     flat = np.array([110.0, 120.0, 130.0], dtype=np.float32) / 255
     left = np.zeros((512, 512), dtype=np.float32)
     left[:, :150] = 1.0
@@ -145,7 +146,7 @@ def test_flat_colours_give_the_texture_error_in_closed_form(perfect: Comparison)
 
 
 def with_textures(comparison: Comparison, truth: np.ndarray, found: np.ndarray, coverage: np.ndarray) -> Comparison:
-    """The same run with other textures, the true one in 8 bits, the avatar's in [0, 1], and what the video showed."""
+    """Replace the true texture (8 bits), the texture of the avatar ([0, 1]) and the coverage."""
     subject = replace(comparison.truth.subject, texture=truth)
     avatar = replace(comparison.run.avatar, diffuse=torch.from_numpy(found))
     truth_painted, run_painted = replace(comparison.truth, subject=subject), replace(comparison.run, avatar=avatar)
@@ -157,7 +158,7 @@ def with_textures(comparison: Comparison, truth: np.ndarray, found: np.ndarray, 
 
 
 def surface_fraction(comparison: Comparison, inside: Callable[[np.ndarray], np.ndarray]) -> float:
-    """Share of the A-pose's area whose atlas coordinates are inside something, by 21 points a face."""
+    """Fraction of the A-pose's area whose UV satisfies a predicate, by 21 points per face."""
     subject = comparison.truth.subject
     steps = np.array([(i, j) for i in range(6) for j in range(6 - i)])
     two = (steps + 1 / 3) / 6
@@ -171,12 +172,13 @@ def surface_fraction(comparison: Comparison, inside: Callable[[np.ndarray], np.n
 LOWERED_RAD = 0.7
 
 
-def test_a_limb_on_the_wrong_joint_is_off_by_what_that_joint_does_not_do(
+@pytest.mark.slow
+def test_limb_bound_to_the_wrong_joint_has_the_expected_distance(
     perfect: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An arm that hangs on the collar bone stays where it is when the true one is lowered by `LOWERED_RAD`.
+    """An arm bound to the collar bone does not move when the true arm is lowered by `LOWERED_RAD`.
 
-    Expected distances come from points spread densely over both surfaces, which are made here by turning the arm.
+    Expected distances are between dense point samples of both surfaces, which are posed here by rotating the arm.
     """
     monkeypatch.setattr(
         compare_avatar, "align_surfaces_icp", lambda *_: SimilarityTransform(1.0, np.eye(3), np.zeros(3))
@@ -210,7 +212,7 @@ def test_a_limb_on_the_wrong_joint_is_off_by_what_that_joint_does_not_do(
 
 
 def write_novel_pose(folder: Path, body: Body, joint: int, place: np.ndarray) -> None:
-    """A motion of one frame: the A-pose at a place with one joint turned, and an empty picture of it."""
+    """Write a motion of one frame, the A-pose with one joint rotated, and an empty image of it."""
     (folder / "novel_poses").mkdir()
     rotations = np.tile(np.array([1.0, 0.0, 0.0, 0.0], dtype=np.float32), (1, len(body.joint_names), 1))
     rotations[0, joint] = [np.cos(LOWERED_RAD / 2), 0.0, 0.0, -np.sin(LOWERED_RAD / 2)]
@@ -219,15 +221,15 @@ def write_novel_pose(folder: Path, body: Body, joint: int, place: np.ndarray) ->
     write_rgba(folder / "novel_poses" / "000000.png", np.zeros((200, 200, 4), dtype=np.uint8))
 
 
-def test_true_poses_leave_nothing_to_miss(perfect: Comparison, perfect_upper_bound: dict[str, float]) -> None:
+def test_upper_bound_of_true_poses(perfect: Comparison, perfect_upper_bound: dict[str, float]) -> None:
     assert np.abs(unpose_true_vertices(perfect) - perfect.truth.subject.body.vertices).max() < 1e-3
     # With the true vertices it is 66 dB; the alignment finds their scale to 0.015 %, a third of a millimetre.
     assert perfect_upper_bound["psnr_body"] > 36.0
     assert perfect_upper_bound["mask_iou"] > 0.99
 
 
-def test_the_ceiling_is_as_soft_as_the_masks(perfect: Comparison, tmp_path: Path) -> None:
-    """Outlines blurred by 1.5 px in all frames: a sharp true mesh misses them, one that is drawn as soft does not."""
+def test_upper_bound_has_the_edge_blur_of_the_masks(perfect: Comparison, tmp_path: Path) -> None:
+    """Edges are blurred by 1.5 px in all frames: a sharp upper bound scores lower than one with equal blur."""
     soft = with_frames(perfect, tmp_path, lambda person: unpremultiply_to_uint8(blur_coverage(person, 1.5)))
     heldout = soft.run.capture.positions(HELDOUT)
     (drawn,) = render_upper_bound(soft, heldout)
@@ -236,8 +238,8 @@ def test_the_ceiling_is_as_soft_as_the_masks(perfect: Comparison, tmp_path: Path
     assert compare_heldout_images(soft)["upper_bound"]["psnr_full"] > sharp["psnr_full"] + 6.0
 
 
-def test_what_a_mask_leaves_out_costs_nothing_until_the_true_one_is_asked(perfect: Comparison, tmp_path: Path) -> None:
-    """Masks without legs, and a field that is the person without legs: white where the true target has them."""
+def test_missing_mask_parts_cost_only_in_the_true_mask_scores(perfect: Comparison, tmp_path: Path) -> None:
+    """Masks without legs, and a field without legs: white where the true target has legs."""
 
     def without_legs(person: np.ndarray) -> np.ndarray:
         straight = unpremultiply_to_uint8(person)
@@ -260,10 +262,10 @@ def test_what_a_mask_leaves_out_costs_nothing_until_the_true_one_is_asked(perfec
     assert scores["mesh_true_mask"]["mask_iou"] > 0.97
 
 
-def test_a_frame_without_a_true_person_is_left_out_with_a_warning(
+def test_frame_with_an_empty_true_mask_is_left_out_with_a_warning(
     perfect: Comparison, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of two held-out frames the first is empty in truth: the second alone is scored, until it is empty as well."""
+    """The true mask of the first of two held-out frames is empty: only the second is scored; then both are empty."""
     split = perfect.run.capture.split.copy()
     split[:2] = HELDOUT
     two = replace(perfect, run=replace(perfect.run, capture=replace(perfect.run.capture, split=split)))
@@ -279,7 +281,8 @@ def test_a_frame_without_a_true_person_is_left_out_with_a_warning(
         compare_heldout_images(two)
 
 
-def test_true_masks_are_brought_to_the_size_of_the_frames(perfect: Comparison, tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_true_masks_are_resized_to_the_frames(perfect: Comparison, tmp_path: Path) -> None:
     def halved(person: np.ndarray) -> np.ndarray:
         return unpremultiply_to_uint8(cv2.resize(person, (100, 100), interpolation=cv2.INTER_AREA))
 
@@ -290,23 +293,26 @@ def test_true_masks_are_brought_to_the_size_of_the_frames(perfect: Comparison, t
     assert scores["upper_bound_true_mask"]["mask_iou"] > 0.95
 
 
-def test_size_and_distance_are_no_error_of_the_pose(perfect: Comparison, perfect_upper_bound: dict[str, float]) -> None:
+@pytest.mark.slow
+def test_upper_bound_ignores_scale_and_distance(perfect: Comparison, perfect_upper_bound: dict[str, float]) -> None:
     smaller = compare_heldout_images(with_scale(perfect, 0.9))["upper_bound"]
     assert smaller["psnr_body"] == pytest.approx(perfect_upper_bound["psnr_body"], abs=0.5)
 
 
-def test_a_longer_lens_costs_its_perspective_alone(perfect: Comparison) -> None:
-    """A person who is taken for a fifth farther away, by a lens a fifth longer, keeps size, place and shape."""
+@pytest.mark.slow
+def test_upper_bound_of_a_longer_focal_length(perfect: Comparison) -> None:
+    """A focal length and a distance that are both 1.2 times too large keep size, position and shape in the image."""
     afar = with_longer_focal(perfect, 1.2)
     apart_m = np.linalg.norm(unpose_true_vertices(afar) - perfect.truth.subject.body.vertices, axis=1)
     assert apart_m.max() < 1e-3
     assert compare_heldout_images(afar)["upper_bound"]["mask_iou"] > 0.97
 
 
-def test_an_arm_that_is_always_off_belongs_to_the_shape(
+@pytest.mark.slow
+def test_constant_pose_error_is_compensated_by_the_shape(
     perfect: Comparison, perfect_upper_bound: dict[str, float]
 ) -> None:
-    """The same error in all frames can be made good in the A-pose; in the held-out frame alone it cannot."""
+    """An error in all frames can be compensated by the A-pose; an error in the held-out frame alone cannot."""
     frames = np.arange(len(perfect.run.motion.frame_index))
     always, once = (
         compare_heldout_images(with_motion(perfect, bent_arm(perfect, rows, 0.15)))["upper_bound"]
@@ -316,8 +322,9 @@ def test_an_arm_that_is_always_off_belongs_to_the_shape(
     assert once["psnr_body"] < always["psnr_body"] - 4.0
 
 
-def test_a_frame_moves_what_it_sees_across_the_view(perfect: Comparison) -> None:
-    """One training frame 3 cm off: sideways it moves what faces the camera there; in depth it moves hardly anything."""
+@pytest.mark.slow
+def test_unposed_vertices_ignore_depth_and_back_faces(perfect: Comparison) -> None:
+    """One training frame has an error of 3 cm: a lateral error moves front-facing vertices, depth hardly any."""
     motion, camera, true = perfect.run.motion, perfect.run.camera, perfect.truth.subject.body.vertices
     frame = int(perfect.run.capture.positions(TRAIN)[0])
     moved = []
@@ -336,16 +343,16 @@ def test_a_frame_moves_what_it_sees_across_the_view(perfect: Comparison) -> None
     assert sideways[towards < -0.9].mean() < 0.3 * sideways[towards > 0.9].mean()
 
 
-def test_joints_that_the_fit_lacks_are_carried_by_their_parent(perfect: Comparison) -> None:
-    """A thumb's tip follows the thumb, which never bends here, wherever the hand goes."""
+def test_missing_joints_follow_their_parent(perfect: Comparison) -> None:
+    """The tip of the thumb, whose joint the fit lacks, follows the thumb."""
     body, true = perfect.run.body, perfect.truth.subject.body.vertices
     names = tuple("Tail" if name == "LeftHandThumb3" else name for name in body.joint_names)
     lacking = replace(perfect, run=replace(perfect.run, body=replace(body, joint_names=names)))
     assert np.abs(unpose_true_vertices(lacking) - true).max() < 1e-3
 
 
-def test_rotations_go_by_name(bare: Body, perfect: Comparison) -> None:
-    """Joints that the actor lacks keep still."""
+def test_motion_is_retargeted_by_joint_name(bare: Body, perfect: Comparison) -> None:
+    """Joints that the source rig lacks do not rotate."""
     motion = perfect.truth.motion
     renamed = replace(bare, joint_names=tuple("Tail" if name == "Head" else name for name in bare.joint_names))
     taken = retarget_motion(renamed, perfect.truth.subject.body, motion)

@@ -1,4 +1,4 @@
-"""The truth explains the video, and would be caught if it did not; it also agrees with independent judges."""
+"""The ground truth reproduces the video, errors are detected, and independent methods agree with it."""
 
 import json
 import shutil
@@ -29,7 +29,7 @@ def capture(sample: Path) -> SyntheticCapture:
     return load_ground_truth(sample)
 
 
-def test_the_truth_explains_the_video(sample: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ground_truth_reproduces_the_video(sample: Path, capsys: pytest.CaptureFixture[str]) -> None:
     result = verify_ground_truth(sample, frame_stride=2)
     assert result.frames == 3
     assert result.passes()
@@ -38,8 +38,8 @@ def test_the_truth_explains_the_video(sample: Path, capsys: pytest.CaptureFixtur
     assert "mask IoU 1.0000" in capsys.readouterr().out
 
 
-def test_a_wrong_truth_is_caught(sample: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A motion that is off by two centimetres must not pass."""
+def test_wrong_ground_truth_is_detected(sample: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A motion with an error of two centimetres must not pass."""
     wrong = tmp_path / "wrong"
     shutil.copytree(sample, wrong)
     motion = load_motion(wrong / "truth" / "motion.npz")
@@ -50,7 +50,7 @@ def test_a_wrong_truth_is_caught(sample: Path, tmp_path: Path, capsys: pytest.Ca
     assert capsys.readouterr().err.startswith("error: ")
 
 
-def test_no_truth_is_named(tmp_path: Path) -> None:
+def test_missing_ground_truth_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="holds no ground truth"):
         load_ground_truth(tmp_path)
 
@@ -79,8 +79,8 @@ def test_a_capture_of_another_version_names_the_command(sample: Path, tmp_path: 
         load_ground_truth(tmp_path)
 
 
-def test_a_shortened_video_is_caught(sample: Path, tmp_path: Path) -> None:
-    """What is left of it agrees with the truth."""
+def test_shortened_video_is_detected(sample: Path, tmp_path: Path) -> None:
+    """The remaining frames agree with the ground truth."""
     (tmp_path / "out" / "video").mkdir(parents=True)
     shutil.copytree(sample / "truth", tmp_path / "out" / "truth")
     frames = [frame.rgb for frame in read_frames(open_frame_source(sample / "video"), lambda index: index < 5, 200)]
@@ -90,7 +90,9 @@ def test_a_shortened_video_is_caught(sample: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("frame_stride", ["0", "-2"])
-def test_a_step_of_nothing_is_refused(frame_stride: str, sample: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_frame_stride_below_one_is_an_error(
+    frame_stride: str, sample: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run_command(truth_command, [str(sample), "--frame-stride", frame_stride]) == 2
     assert capsys.readouterr().err.startswith(f"error: --frame-stride {frame_stride}")
 
@@ -108,7 +110,7 @@ def test_joints_project_into_the_masks(sample: Path, capture: SyntheticCapture) 
 
 
 def test_masks_against_ray_casting(sample: Path, capture: SyntheticCapture) -> None:
-    """Rays through pixels that are wholly inside or wholly outside meet the surface, or do not."""
+    """Rays through fully covered pixels hit the surface, rays through uncovered pixels do not."""
     vertices = pose_vertices(capture.subject, capture.canonical_to_world[2]).double().numpy()
     mask = load_true_mask(sample, 2)
     random = np.random.default_rng(0)
@@ -126,13 +128,14 @@ def test_masks_against_ray_casting(sample: Path, capture: SyntheticCapture) -> N
 
 
 def capture_at(capture: SyntheticCapture, factor: float) -> SyntheticCapture:
-    """The same scene in a finer picture, before the bare wall."""
+    """The same scene at a higher resolution, with a bare wall."""
     camera = capture.camera.scaled(factor)
     return replace(capture, camera=camera, room=make_room(camera, capture.ground_m, False, ValueNoise(0)))
 
 
-def test_the_detector_finds_the_person(capture: SyntheticCapture) -> None:
-    """The person of the sample is a person to the detector that ships with mediapipe: landmarks and outline."""
+@pytest.mark.slow
+def test_mediapipe_detects_the_person(capture: SyntheticCapture) -> None:
+    """Landmarks and segmentation of the person by mediapipe agree with the ground truth."""
     import mediapipe
 
     larger = capture_at(capture, 2.0)

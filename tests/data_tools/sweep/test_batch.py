@@ -1,4 +1,4 @@
-"""A folder of videos becomes runs and a table, whatever is broken, killed or started again; on the toy pipeline."""
+"""Batches on the toy pipeline: run folders and table with broken videos, kills and restarts."""
 
 import csv
 import os
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from data_tools.sweep.batch import find_videos, newest_mtime_ns, table_row, text_table, write_table
+from data_tools.sweep.batch import find_videos, main, newest_mtime_ns, table_row, text_table, write_table
 from data_tools.sweep.runs import RunState
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import read_manifest
@@ -26,7 +26,7 @@ OUTCOME = {"ann": "done", "bob": "failed", "carl": "done"}
 
 @pytest.fixture
 def batch(toy: Toy) -> Toy:
-    """The toy with three videos, the second of which is broken."""
+    """The toy pipeline with three videos; the second is broken."""
     videos = toy.folder / "videos"
     videos.mkdir()
     for name, text in ((GOOD[0], "1 2"), (BROKEN, "1 two"), (GOOD[1], "3 4 5")):
@@ -36,14 +36,14 @@ def batch(toy: Toy) -> Toy:
 
 
 def rows(toy: Toy) -> dict[str, dict[str, str]]:
-    """The lines of batch.csv by video."""
+    """Rows of batch.csv by video."""
     with (toy.folder / "runs" / "batch.csv").open(newline="") as file:
         return {row["video"]: row for row in csv.DictReader(file)}
 
 
-def test_one_broken_video_stops_no_other(batch: Toy) -> None:
-    sentence = batch.expect_user_error("data_tools.sweep.batch", "videos", "--preset", "quick")
-    assert "1 of 3 videos have no avatar (bob)" in sentence
+def test_broken_video_does_not_stop_the_others(batch: Toy) -> None:
+    message = batch.expect_user_error("data_tools.sweep.batch", "videos", "--preset", "quick")
+    assert "1 of 3 videos have no avatar (bob)" in message
     table = rows(batch)
     assert {name: row["status"] for name, row in table.items()} == OUTCOME
     assert "holds two, which is not a number" in table[BROKEN]["message"]
@@ -57,7 +57,8 @@ def test_one_broken_video_stops_no_other(batch: Toy) -> None:
     assert "holds two" in page
 
 
-def test_a_mended_video_is_all_that_runs_again(batch: Toy) -> None:
+@pytest.mark.slow
+def test_only_a_repaired_video_runs_again(batch: Toy) -> None:
     batch.call("data_tools.sweep.batch", "videos")
     before = (batch.folder / "runs" / "ann" / "learn").stat().st_ctime_ns
     (batch.folder / "videos" / "bob.mp4").write_text("1 2")
@@ -67,7 +68,8 @@ def test_a_mended_video_is_all_that_runs_again(batch: Toy) -> None:
     assert (batch.folder / "runs" / "ann" / "learn").stat().st_ctime_ns == before
 
 
-def test_a_killed_batch_takes_its_runs_along_and_goes_on(batch: Toy) -> None:
+@pytest.mark.slow
+def test_killed_batch_ends_its_runs_and_resumes(batch: Toy) -> None:
     runner = batch.start("data_tools.sweep.batch", "videos", "--jobs", "3", TOY_SLEEP_S="60")
     for name in GOOD:
         wait_for(batch.folder / "runs" / name / "learn.part" / "checkpoint.json", runner)
@@ -84,7 +86,8 @@ def test_a_killed_batch_takes_its_runs_along_and_goes_on(batch: Toy) -> None:
         assert artifacts(runs / name, TOY_STAGES) == artifacts(runs / "alone", TOY_STAGES)
 
 
-def test_ctrl_c_stops_all_and_starts_no_other(batch: Toy) -> None:
+@pytest.mark.slow
+def test_ctrl_c_stops_all_runs(batch: Toy) -> None:
     process = batch.start("data_tools.sweep.batch", "videos", TOY_SLEEP_S="30")
     wait_for(batch.folder / "runs" / "ann" / "learn.part" / "checkpoint.json", process)
     os.killpg(process.pid, signal.SIGINT)
@@ -94,27 +97,39 @@ def test_ctrl_c_stops_all_and_starts_no_other(batch: Toy) -> None:
     assert not (batch.folder / "runs" / "carl").exists()
 
 
-def test_the_table_alone_runs_nothing(batch: Toy) -> None:
-    batch.expect_user_error("data_tools.sweep.batch", "videos", "--table")
-    assert {row["status"] for row in rows(batch).values()} == {"unfinished"}
-    assert not (batch.folder / "runs" / "ann").exists()
+@pytest.fixture
+def videos(tmp_path: Path) -> Path:
+    """A folder with one video file, which is never read."""
+    (tmp_path / "videos").mkdir()
+    (tmp_path / "videos" / "ann.mp4").touch()
+    return tmp_path / "videos"
+
+
+def test_table_option_runs_nothing(videos: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"1 of 1 videos have no avatar \(ann\)"):
+        main([str(videos), "--runs", str(tmp_path / "runs"), "--table"])
+    with (tmp_path / "runs" / "batch.csv").open(newline="") as file:
+        assert [row["status"] for row in csv.DictReader(file)] == ["unfinished"]
+    assert not (tmp_path / "runs" / "ann").exists()
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "message"),
     [
-        (("none",), ("none is not a folder",)),
-        (("empty",), ("contains no video",)),
-        (("videos", "--preset", "quik"), ("default, quick",)),
-        (("videos", "--set", "lern.steps=3"), ("did you mean learn?",)),
-        (("videos", "--jobs", "0"), ("choose at least 1",)),
+        (("none",), "none is not a folder"),
+        (("empty",), "contains no video"),
+        (("videos", "--preset", "instnt"), "instant"),
+        (("videos", "--set", "fild.steps=3"), r"did you mean field\?"),
+        (("videos", "--jobs", "0"), "choose at least 1"),
     ],
 )
-def test_a_mistake_is_one_sentence_before_any_run(batch: Toy, arguments: tuple[str, ...], words: tuple[str]) -> None:
-    (batch.folder / "empty").mkdir()
-    sentence = batch.expect_user_error("data_tools.sweep.batch", *arguments)
-    assert all(word in sentence for word in words), sentence
-    assert not (batch.folder / "runs").exists()
+def test_user_errors_are_reported_before_any_run(
+    videos: Path, tmp_path: Path, arguments: tuple[str, ...], message: str
+) -> None:
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UserError, match=message):
+        main([str(tmp_path / arguments[0]), "--runs", str(tmp_path / "runs"), *arguments[1:]])
+    assert not (tmp_path / "runs").exists()
 
 
 def test_videos_are_files_by_suffix_and_folders(tmp_path: Path) -> None:
@@ -129,7 +144,7 @@ def test_videos_are_files_by_suffix_and_folders(tmp_path: Path) -> None:
         find_videos(tmp_path)
 
 
-def test_a_folders_last_change_is_its_newest_files(tmp_path: Path) -> None:
+def test_modification_time_of_a_folder(tmp_path: Path) -> None:
     for name, time_s in (("a", 100), ("b", 300), ("c", 200)):
         (tmp_path / name).touch()
         os.utime(tmp_path / name, (time_s, time_s))
@@ -137,7 +152,7 @@ def test_a_folders_last_change_is_its_newest_files(tmp_path: Path) -> None:
     assert newest_mtime_ns(tmp_path / "c") == 200 * 10**9
 
 
-def test_the_table_escapes_what_it_is_told(tmp_path: Path) -> None:
+def test_table_escapes_html(tmp_path: Path) -> None:
     broken = RunState(dict.fromkeys(STAGES, "missing"), {}, {"mesh_psnr_full_db": 28.25}, "<b> is no video")
     row = table_row("a&b", broken)
     assert row["mesh_psnr_full_db"] == "28.250"
@@ -149,8 +164,8 @@ def test_the_table_escapes_what_it_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("cluster", ["", "local"])
-def test_make_asks_for_the_folder(cluster: str, tmp_path: Path) -> None:
-    """An empty name would be the folder in which make runs."""
+def test_make_without_a_folder_is_an_error(cluster: str, tmp_path: Path) -> None:
+    """An empty name would select the current folder."""
     for name in ("requirements.lock", "pyproject.toml", ".venv/.stamp"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
@@ -163,7 +178,7 @@ def test_make_asks_for_the_folder(cluster: str, tmp_path: Path) -> None:
 
 
 def snakemake(toy: Toy, videos: str = "videos", **variables: str) -> subprocess.Popen[str]:
-    """Start the workflow on the toy's videos; skips where snakemake is not installed."""
+    """Start the workflow on the videos of the toy pipeline; skip if snakemake is not installed."""
     path = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", "")))
     program = shutil.which("snakemake", path=path)
     if program is None:
@@ -178,14 +193,16 @@ def snakemake(toy: Toy, videos: str = "videos", **variables: str) -> subprocess.
     )
 
 
-def test_the_workflow_asks_for_the_folder(batch: Toy) -> None:
+@pytest.mark.slow
+def test_workflow_without_a_folder_is_an_error(batch: Toy) -> None:
     process = snakemake(batch, videos="")
     text, _ = process.communicate(timeout=60)
     assert process.returncode == 1
     assert "no folder of videos" in text
 
 
-def test_the_workflow_survives_a_broken_video_and_a_kill(batch: Toy) -> None:
+@pytest.mark.slow
+def test_workflow_with_a_broken_video_and_a_kill(batch: Toy) -> None:
     killed = snakemake(batch, TOY_SLEEP_S="60")
     parts = [batch.folder / "runs" / name / "learn.part" / "checkpoint.json" for name in GOOD]
     deadline = time.monotonic() + 300.0
@@ -211,8 +228,8 @@ def test_the_workflow_survives_a_broken_video_and_a_kill(batch: Toy) -> None:
 
 
 @pytest.mark.slow
-def test_three_real_captures_one_of_them_broken(smoke_run: Path, tmp_path: Path) -> None:
-    """A video, a file that is none, and a folder of images, by the real stages; killed once on the way."""
+def test_three_real_captures_with_a_broken_one(smoke_run: Path, tmp_path: Path) -> None:
+    """A video, an invalid file and a folder of images with the real stages; the batch is killed once."""
     videos, runs = tmp_path / "videos", tmp_path / "runs"
     videos.mkdir()
     shutil.copy(smoke_run.parent / "capture" / "video" / "video.mp4", videos / "ann.mp4")

@@ -1,4 +1,4 @@
-"""A sweep of presets over captures: it goes on where it was, and its tables say what was measured where."""
+"""Sweeps of presets over captures: resuming, shared stages, tables and errors."""
 
 import csv
 import shutil
@@ -27,7 +27,7 @@ SCORES = {"mesh_psnr_full_db": 28.0, "field_psnr_full_db": 30.0, "chamfer_mm": 6
 
 @pytest.fixture
 def sweep(toy: Toy) -> Toy:
-    """The toy with a capture."""
+    """The toy pipeline with a capture."""
     shutil.copy(toy.video, toy.folder / "numbers.mp4")
     return toy
 
@@ -38,7 +38,7 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 
 def finished(seconds: float, scores: dict[str, float], resumed: tuple[str, ...] = ()) -> RunState:
-    """A run in which every stage took as long."""
+    """A finished run in which each stage took `seconds`."""
     place = {"commit": "abc", "cpu": "Xeon", "cores": 2, "gpu": None}
     manifests = {
         name: Manifest(name, 1, "", {}, {}, {}, {}, seconds, 100.0, name in resumed, [], place) for name in STAGES
@@ -46,7 +46,8 @@ def finished(seconds: float, scores: dict[str, float], resumed: tuple[str, ...] 
     return RunState(dict.fromkeys(STAGES, "fresh"), manifests, scores, "")
 
 
-def test_a_killed_sweep_goes_on_and_times_the_cut_stage_from_its_start(sweep: Toy) -> None:
+@pytest.mark.slow
+def test_killed_sweep_resumes_and_restarts_the_interrupted_stage(sweep: Toy) -> None:
     runner = sweep.start(*SWEEP, TOY_SLEEP_S="3")
     wait_for(sweep.folder / "runs/chart/numbers-default-0/learn.part/checkpoint.json", runner)
     runner.kill()
@@ -69,8 +70,9 @@ def test_a_killed_sweep_goes_on_and_times_the_cut_stage_from_its_start(sweep: To
     assert not table[1]["resumed"]
 
 
-def test_what_two_runs_have_in_common_is_computed_once(sweep: Toy) -> None:
-    """Both read the same numbers; what they learn differs. A seed or option that reaches a stage keeps it apart."""
+@pytest.mark.slow
+def test_shared_stages_are_computed_once(sweep: Toy) -> None:
+    """Both presets read the same input and train differently; stages with other options or seeds are not shared."""
     done = sweep.call(*SWEEP)
     assert done.returncode == 0, done.stderr
     quick, default = (sweep.folder / "runs" / "chart" / f"numbers-{preset}-0" for preset in ("quick", "default"))
@@ -80,7 +82,7 @@ def test_what_two_runs_have_in_common_is_computed_once(sweep: Toy) -> None:
     assert "read: cached" in (default.parent / f"{default.name}.log").read_text()
 
 
-def test_fewer_steps_are_said_everywhere(tmp_path: Path) -> None:
+def test_steps_are_in_label_folder_and_table(tmp_path: Path) -> None:
     own, fewer = (Trial(tmp_path / "ann", "ihm", 2, tmp_path, steps) for steps in (None, 600))
     assert (own.label, fewer.label) == ("ihm", "ihm, 600 steps")
     assert own.run_dir != fewer.run_dir
@@ -95,12 +97,12 @@ def test_fewer_steps_are_said_everywhere(tmp_path: Path) -> None:
 
 @pytest.fixture
 def forbid_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A run or a comparison that is started is a failure."""
+    """Fail the test if a run or a comparison is started."""
     for target in ("chart.run_trial", "chart_trials.subprocess.run"):
         monkeypatch.setattr(f"data_tools.sweep.{target}", lambda *_, **__: pytest.fail("started"))
 
 
-def test_what_is_done_and_compared_is_not_done_again(
+def test_finished_and_compared_runs_are_not_repeated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, forbid_runs: None
 ) -> None:
     trial = Trial(tmp_path / "ann", "quick", 0, tmp_path)
@@ -113,8 +115,8 @@ def test_what_is_done_and_compared_is_not_done_again(
         run_and_compare(trial, [trial])
 
 
-def test_a_comparison_that_fails_is_no_success(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The chart is drawn, and the command says what it lacks."""
+def test_failed_comparison_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The chart is written, and the error names the missing comparison."""
     (tmp_path / "ann" / "truth").mkdir(parents=True)
     run_dir = tmp_path / "out" / "ann-default-0"
     write_fake_report(run_dir)
@@ -129,8 +131,8 @@ def test_a_comparison_that_fails_is_no_success(tmp_path: Path, monkeypatch: pyte
     chart(command)
 
 
-def test_two_trials_never_share_a_run(tmp_path: Path, forbid_runs: None) -> None:
-    """Captures and presets go by their last names: two of one name would show one's figures for both."""
+def test_trials_with_equal_run_folders_are_an_error(tmp_path: Path, forbid_runs: None) -> None:
+    """Run folders are named by the stems of capture and preset, so equal stems would share a run."""
     for name in ("a/me.mp4", "b/me.mp4", "instant.yaml"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("{}")
@@ -141,7 +143,8 @@ def test_two_trials_never_share_a_run(tmp_path: Path, forbid_runs: None) -> None
     assert not (tmp_path / "out").exists()
 
 
-def test_the_run_of_another_capture_is_not_taken(sweep: Toy) -> None:
+@pytest.mark.slow
+def test_run_of_another_capture_is_not_used(sweep: Toy) -> None:
     command = ("--presets", "quick", "--out", "runs/chart")
     assert sweep.call("data_tools.sweep.chart", "numbers.mp4", *command).returncode == 0
     (sweep.folder / "other").mkdir()
@@ -152,7 +155,7 @@ def test_the_run_of_another_capture_is_not_taken(sweep: Toy) -> None:
     assert "belongs to the video" in rows(sweep.folder / "runs" / "chart" / "chart.csv")[0]["message"]
 
 
-def test_built_in_captures_are_those_of_this_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sample_captures_of_another_version_are_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[list[str]] = []
     monkeypatch.setattr("data_tools.sweep.chart.SAMPLE_CAPTURES", {tmp_path / "ann": 3})
     monkeypatch.setattr("data_tools.sweep.chart.make_sample", made.append)
@@ -169,39 +172,43 @@ def test_built_in_captures_are_those_of_this_version(tmp_path: Path, monkeypatch
     assert len(made) == 1
 
 
-def test_drawing_runs_nothing(tmp_path: Path, forbid_runs: None) -> None:
+def test_draw_option_runs_nothing(tmp_path: Path, forbid_runs: None) -> None:
     (tmp_path / "ann").mkdir()
     with pytest.raises(UserError, match="1 of 1 runs are not done"):
         chart([str(tmp_path / "ann"), "--presets", "default", "--out", str(tmp_path / "out"), "--draw"])
 
 
 @pytest.mark.parametrize("entry", ["ihm=600", "default", "default=many", "default=-3"])
-def test_steps_for_no_preset_are_refused(entry: str) -> None:
+def test_invalid_steps_are_an_error(entry: str) -> None:
     with pytest.raises(UserError, match=r"--steps .*: write PRESET=N with one of default"):
         chart(["none.mp4", "--presets", "default", "--steps", entry])
 
 
-def test_a_failed_run_stops_no_other(sweep: Toy) -> None:
+def test_failed_run_does_not_stop_the_others(sweep: Toy) -> None:
     (sweep.folder / "words.mp4").write_text("one two")
-    sentence = sweep.expect_user_error(
+    message = sweep.expect_user_error(
         "data_tools.sweep.chart", "words.mp4", "numbers.mp4", "--presets", "quick", "--out", "chart"
     )
-    assert "1 of 2 runs are not done (words-quick-0)" in sentence
+    assert "1 of 2 runs are not done (words-quick-0)" in message
     table = rows(sweep.folder / "chart" / "chart.csv")
     assert [row["status"] for row in table] == ["failed", "done"]
     assert "not a number" in table[0]["message"]
 
 
 @pytest.mark.parametrize(
-    ("arguments", "word"),
-    [(("none.mp4", "--presets", "quick"), "none.mp4"), (("numbers.mp4", "--presets", "x"), "quick")],
+    ("arguments", "message"),
+    [(("none.mp4", "--presets", "instant"), r"none\.mp4 does not exist"), (("ann.mp4", "--presets", "x"), "instant")],
 )
-def test_a_mistake_is_refused_before_any_run(sweep: Toy, arguments: tuple[str, ...], word: str) -> None:
-    assert word in sweep.expect_user_error("data_tools.sweep.chart", *arguments)
-    assert not (sweep.folder / "runs").exists()
+def test_user_errors_are_reported_before_any_run(
+    tmp_path: Path, forbid_runs: None, arguments: tuple[str, ...], message: str
+) -> None:
+    (tmp_path / "ann.mp4").touch()
+    with pytest.raises(UserError, match=message):
+        chart([str(tmp_path / arguments[0]), *arguments[1:], "--out", str(tmp_path / "runs")])
+    assert not (tmp_path / "runs").exists()
 
 
-def test_seconds_are_those_until_field_and_avatar(tmp_path: Path) -> None:
+def test_seconds_until_field_and_avatar(tmp_path: Path) -> None:
     trial = Trial(tmp_path / "ann.mp4", "configs/mine.yaml", 3, tmp_path)
     assert trial.run_dir == tmp_path / "ann.mp4-mine-3"
     (trial.run_dir / "field").mkdir(parents=True)
@@ -219,7 +226,7 @@ def test_seconds_are_those_until_field_and_avatar(tmp_path: Path) -> None:
     assert provenance([row, row | {"seed": 4, "status": "failed"}]) == "commit abc; Xeon, 2 cores; seed 3"
 
 
-def test_progress_that_is_absent_or_damaged(tmp_path: Path) -> None:
+def test_missing_and_damaged_progress(tmp_path: Path) -> None:
     assert read_progress(tmp_path) == []
     (tmp_path / "progress.csv").write_text("seconds,validation_psnr_db\n1,2\n")
     with pytest.raises(UserError, match="validation_psnr_body_db"):
@@ -227,7 +234,7 @@ def test_progress_that_is_absent_or_damaged(tmp_path: Path) -> None:
 
 
 def test_tables_and_chart_of_finished_runs(tmp_path: Path) -> None:
-    """Each capture has fronts of its own; a failure that was made good is no message."""
+    """Each capture has its own Pareto fronts; the failure of a finished run is not in the table."""
     quick, slow, bad = (Trial(tmp_path / "ann", preset, 0, tmp_path) for preset in ("quick", "slow", "bad"))
     runs = {
         quick: replace(finished(10.0, SCORES), failure="killed"),

@@ -1,4 +1,4 @@
-"""The chart: who lies on the front, what stands where, and that the same runs give the same file."""
+"""The chart: Pareto front, positions of the markers, and equal files for equal runs."""
 
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
@@ -20,8 +20,8 @@ coarse = st.integers(0, 6).map(float)
 
 
 @given(st.lists(st.tuples(coarse, coarse), max_size=12), st.booleans())
-def test_the_front_is_what_a_walk_through_time_finds(entries: list[tuple[float, float]], higher: bool) -> None:
-    """Independent way: in order of time, whatever is better than all before it, and its equals."""
+def test_pareto_front_against_a_sorted_scan(entries: list[tuple[float, float]], higher: bool) -> None:
+    """Reference: in order of time, each entry that is better than all before it, and its equals."""
     sign = 1.0 if higher else -1.0
     found: set[tuple[float, float]] = set()
     best = float("-inf")
@@ -34,14 +34,14 @@ def test_the_front_is_what_a_walk_through_time_finds(entries: list[tuple[float, 
     assert {index for index, entry in enumerate(entries) if entry in found} == set(front)
 
 
-def test_seeds_count_as_their_mean() -> None:
+def test_means_over_seeds() -> None:
     again = replace(QUICK, seed=1, seconds=40.0, scores={"mesh_psnr_full_db": 26.0})
     assert preset_means([QUICK, again, SLOW], "mesh_psnr_full_db") == {"quick": (30.0, 25.0), "slow": (200.0, 28.0)}
     assert preset_means([QUICK, again, SLOW], "field_psnr_full_db") == {"quick": (20.0, 25.0), "slow": (200.0, 30.0)}
     assert preset_means([QUICK], "chamfer_mm") == {}
 
 
-def test_panels_without_figures_are_left_out() -> None:
+def test_panels_without_scores_are_left_out() -> None:
     assert len(draw_chart([QUICK, SLOW], "").axes) == 1
     known = replace(SLOW, capture="bob", scores={**SLOW.scores, "chamfer_mm": 5.0})
     figure = draw_chart([QUICK, known], "")
@@ -52,7 +52,7 @@ def test_panels_without_figures_are_left_out() -> None:
         draw_chart([replace(QUICK, scores={})], "")
 
 
-def test_marks_stand_where_the_figures_are() -> None:
+def test_markers_are_at_the_scores() -> None:
     (axes,) = draw_chart([QUICK, SLOW, WORSE], "").axes
     assert axes.get_xscale() == "log"
     lines = [[tuple(map(float, place)) for place in line.get_xydata()] for line in axes.get_lines()]
@@ -63,7 +63,7 @@ def test_marks_stand_where_the_figures_are() -> None:
     assert [[*map(tuple, ring.get_xydata())] for ring in rings] == [[(20.0, 24.0), (200.0, 28.0)]]
 
 
-def test_the_same_runs_give_the_same_files(tmp_path: Path) -> None:
+def test_equal_runs_give_equal_files(tmp_path: Path) -> None:
     texts = []
     for name in ("one", "two"):
         (tmp_path / name).mkdir()

@@ -11,7 +11,7 @@ TETRAHEDRON = (
 
 
 def octahedron() -> tuple[np.ndarray, np.ndarray]:
-    """Corners on the axes at distance 1, faces counter-clockwise from outside."""
+    """Return an octahedron with unit radius; faces are counter-clockwise seen from outside."""
     vertices = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=np.float32)
     faces = [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]]
     return vertices, np.array(faces, dtype=np.int32)
@@ -20,7 +20,7 @@ def octahedron() -> tuple[np.ndarray, np.ndarray]:
 def sphere(
     radius_m: float, centre_m: tuple[float, float, float], subdivisions: int = 4
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A finely split octahedron blown up to a sphere."""
+    """Return a subdivided octahedron projected to a sphere."""
     vertices, faces = octahedron()
     for _ in range(subdivisions):
         pairs, faces = subdivide_at_midpoints(faces, len(vertices))
@@ -30,7 +30,7 @@ def sphere(
 
 
 def ray_triangle_distances(origin: np.ndarray, direction: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Distances at which a ray meets triangles (Moeller and Trumbore 1997), by brute force, sorted."""
+    """Return the sorted distances at which a ray hits triangles (Möller and Trumbore 1997), by brute force."""
     edge_1, edge_2, to_origin = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], origin - corners[:, 0]
     p, q = np.cross(direction, edge_2), np.cross(to_origin, edge_1)
     determinant = (edge_1 * p).sum(axis=1)

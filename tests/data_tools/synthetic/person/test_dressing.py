@@ -1,4 +1,4 @@
-"""Clothes lie outside the body, end where they are cut, and leave face and hands alone."""
+"""Clothes are outside the body, end at their cuts, and do not change face and hands."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ from pipeline.geometry.mesh import Mesh
 
 @pytest.fixture(scope="module")
 def skin(bare: Body) -> np.ndarray:
-    """The bare body's vertices and the midpoints, in the order of the clothed ones."""
+    """Vertices and edge midpoints of the body without clothes, in the order of the clothed ones."""
     return append_midpoint_values(bare.vertices, subdivide_at_midpoints(bare.faces, len(bare.vertices))[0])
 
 
@@ -24,8 +24,8 @@ def dominated_by(subject: Subject, *parts: str) -> np.ndarray:
     return subject.body.skin_weights[:, columns].sum(axis=1) > 0.95
 
 
-def test_cloth_lies_outside_the_body(subject: Subject, skin: np.ndarray) -> None:
-    """Torso and legs move outwards along the bare body's normals, by 6 cm at most; cloth that spans a hollow's rim
+def test_clothes_are_outside_the_body(subject: Subject, skin: np.ndarray) -> None:
+    """Torso and legs move outwards along the normals of the body, by 6 cm at most; cloth that spans a hollow's rim
     may cut off a few millimetres of it."""
     normals = Mesh(skin, subject.body.faces).vertex_normals()
     out_m = ((subject.body.vertices - skin) * normals).sum(axis=1)
@@ -35,7 +35,7 @@ def test_cloth_lies_outside_the_body(subject: Subject, skin: np.ndarray) -> None
     assert out_m[clothed].max() < 0.06
 
 
-def test_hands_and_eyes_stay_bare(subject: Subject, skin: np.ndarray, bare: Body) -> None:
+def test_hands_and_eyes_are_unchanged(subject: Subject, skin: np.ndarray, bare: Body) -> None:
     moved = np.linalg.norm(subject.body.vertices - skin, axis=1)
     assert (
         moved[dominated_by(subject, "Hand", *(f"Hand{f}{k}" for f in ("Index", "Thumb") for k in (1, 2, 3)))].max() == 0
@@ -44,14 +44,14 @@ def test_hands_and_eyes_stay_bare(subject: Subject, skin: np.ndarray, bare: Body
     assert moved[eyes].max() == 0
 
 
-def test_the_skeleton_is_the_bare_bodys(subject: Subject, bare: Body) -> None:
+def test_skeleton_is_unchanged(subject: Subject, bare: Body) -> None:
     assert np.array_equal(subject.body.joints_m, bare.joints_m)
     assert np.allclose(subject.body.skin_weights.sum(axis=1), 1.0, atol=1e-5)
     assert len(subject.body.faces) == len(subject.faces_uv) == 4 * len(bare.faces)
 
 
-def test_shoes_hide_the_toes_and_stand_flat(subject: Subject) -> None:
-    """The sole is one plane, and the front of a shoe is a convex outline: no gaps between toes."""
+def test_shoes_cover_the_toes_and_have_flat_soles(subject: Subject) -> None:
+    """The sole is planar, and the front of a shoe has a convex outline without gaps between toes."""
     vertices = subject.body.vertices
     foot = dominated_by(subject, "LeftFoot", "LeftToeBase") & (vertices[:, 1] < 0.06)
     sole = np.abs(vertices[foot, 1] - vertices[foot, 1].min()) < 1e-4
@@ -64,18 +64,18 @@ def test_shoes_hide_the_toes_and_stand_flat(subject: Subject) -> None:
 
 
 def closed_edge_fraction(faces: np.ndarray) -> float:
-    """Share of edges at which exactly two faces meet."""
+    """Fraction of edges with exactly two faces."""
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     return float((np.unique(edges, axis=0, return_counts=True)[1] == 2).mean())
 
 
-def test_the_surface_is_as_closed_as_the_body(subject: Subject, bare: Body) -> None:
+def test_clothed_surface_is_as_closed_as_the_body(subject: Subject, bare: Body) -> None:
     skin_only = label_faces(bare) == SKIN
     clothed = closed_edge_fraction(subject.body.faces[np.repeat(skin_only, 4)])
     assert clothed >= closed_edge_fraction(bare.faces[skin_only])
 
 
-def test_layers_are_where_clothes_are(bare: Body) -> None:
+def test_layers_cover_their_body_regions(bare: Body) -> None:
     anatomy, outfit = measure_anatomy(load_anny(), bare), choose_outfit(0)
     joints = anatomy.joints_m
     between = 0.5 * (joints["LeftUpLeg"] + joints["LeftLeg"])
@@ -114,6 +114,6 @@ def test_anatomy_is_symmetric_and_in_place(bare: Body) -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_the_wardrobe_varies(seed: int) -> None:
+def test_outfits_vary_with_the_seed(seed: int) -> None:
     assert choose_outfit(seed) == choose_outfit(seed)
     assert choose_outfit(seed) != choose_outfit(0)

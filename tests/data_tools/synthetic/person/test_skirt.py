@@ -1,17 +1,17 @@
-"""The skirt is one closed sheet outside of the clothes, spans the gap between the legs, and follows both of them."""
+"""The skirt is one closed surface outside the other clothes, spans the gap between the legs and follows both legs."""
 
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from data_tools.evaluate.truth import verify_ground_truth
 from data_tools.sample import main as make_sample
 from data_tools.synthetic.person.anatomy import measure_anatomy
 from data_tools.synthetic.person.outfit import LAYERS, choose_outfit, compute_layer_depths_m
 from data_tools.synthetic.person.skirt import COLUMNS, ROWS, THICKNESS_M, waist_and_hem_m
-from data_tools.synthetic.person.surface import face_components
 from data_tools.synthetic.rig.subject import Subject, load_subject
 from pipeline.body.body import Body, load_anny
 from tests.data_tools.synthetic.person.test_painting import colour_near, surface_at
@@ -40,21 +40,19 @@ def corners(person: Subject) -> np.ndarray:
     return person.body.vertices[person.body.faces[-SHEET_FACES:]].astype(np.float64)
 
 
-def test_it_is_one_closed_ring(person: Subject, corners: np.ndarray) -> None:
-    """Two faces at each edge, Euler characteristic 0, and the volume of a sheet: area times thickness."""
-    faces = person.body.faces[-SHEET_FACES:]
-    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    unique, meeting = np.unique(edges, axis=0, return_counts=True)
-    assert (meeting == 2).all()
-    assert len(np.unique(faces)) - len(unique) + len(faces) == 0
-    assert face_components(faces, len(person.body.vertices)).max() == 0
-    volume = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
-    assert volume == pytest.approx(THICKNESS_M * area / 2, rel=0.15)
+def test_skirt_is_one_closed_ring(person: Subject) -> None:
+    """Watertight, Euler characteristic 0, one component, and the volume of a sheet: area times thickness."""
+    skirt = trimesh.Trimesh(person.body.vertices, person.body.faces[-SHEET_FACES:], process=False)
+    skirt.remove_unreferenced_vertices()
+    assert skirt.is_watertight
+    assert skirt.is_winding_consistent
+    assert skirt.euler_number == 0
+    assert skirt.body_count == 1
+    assert skirt.volume == pytest.approx(THICKNESS_M * skirt.area / 2, rel=0.15)
 
 
-def test_it_spans_the_gap_between_the_legs(person: Subject, corners: np.ndarray, bare: Body) -> None:
-    """A line from front to back between the knees meets no leg, but both walls of the skirt, twice."""
+def test_skirt_spans_the_gap_between_the_legs(person: Subject, corners: np.ndarray, bare: Body) -> None:
+    """A line along Z between the knees hits no leg, and both sides of the skirt twice."""
     _, hem = waist_and_hem_m(measure_anatomy(load_anny(), bare))
     start, back = np.array([0.0007, hem + 0.0131, 2.0]), np.array([0.0, 0.0, -1.0])
     assert len(ray_triangle_distances(start, back, corners)) == 4
@@ -68,8 +66,8 @@ def test_it_spans_the_gap_between_the_legs(person: Subject, corners: np.ndarray,
     )
 
 
-def test_what_is_beneath_stays_beneath(person: Subject, corners: np.ndarray, bare: Body) -> None:
-    """Lines outwards from the legs and the shirt inside meet both sides of the sheet."""
+def test_legs_and_shirt_are_inside_the_skirt(person: Subject, corners: np.ndarray, bare: Body) -> None:
+    """Outward rays from the legs and the shirt hit both sides of the skirt."""
     waist, hem = waist_and_hem_m(measure_anatomy(load_anny(), bare))
     vertices = person.body.vertices[: -2 * ROWS * COLUMNS]
     inner = (vertices[:, 1] > hem + 0.01) & (vertices[:, 1] < waist - 0.02) & (np.abs(vertices[:, 0]) < 0.28)
@@ -79,7 +77,7 @@ def test_what_is_beneath_stays_beneath(person: Subject, corners: np.ndarray, bar
         assert len(ray_triangle_distances(place, outwards / np.linalg.norm(outwards), corners)) == 2
 
 
-def test_both_legs_share_it_smoothly(person: Subject) -> None:
+def test_skin_weights_blend_smoothly_between_the_legs(person: Subject) -> None:
     body = person.body
     weights = body.skin_weights[-2 * ROWS * COLUMNS :].reshape(2 * ROWS, COLUMNS, -1)[:ROWS]
     left, right = (weights[:, :, body.joint(f"{side}UpLeg")] for side in ("Left", "Right"))
@@ -94,7 +92,7 @@ def test_both_legs_share_it_smoothly(person: Subject) -> None:
     assert max(np.abs(np.diff(weights, axis=axis)).max() for axis in (0, 1)) < 0.15
 
 
-def test_legs_beneath_are_bare(person: Subject, bare: Body) -> None:
+def test_legs_are_bare(person: Subject, bare: Body) -> None:
     anatomy, outfit = measure_anatomy(load_anny(), bare), choose_outfit(0, "skirt")
     knee = bare.joints_m[bare.joint("LeftLeg")]
     depths = compute_layer_depths_m(knee[None], np.zeros((1, 2), np.float32), anatomy, outfit)
@@ -106,6 +104,6 @@ def test_legs_beneath_are_bare(person: Subject, bare: Body) -> None:
     assert ((low - 0.1 < cloth) & (cloth < high + 0.1)).all()
 
 
-def test_the_truth_with_a_skirt_explains_the_video(capture: Path) -> None:
+def test_ground_truth_with_a_skirt_reproduces_the_video(capture: Path) -> None:
     assert verify_ground_truth(capture).passes()
     assert json.loads((capture / "truth" / "capture_settings.json").read_text())["legwear"] == "skirt"

@@ -16,7 +16,7 @@ from pipeline.geometry.mesh import Mesh
 from tests.data_tools.synthetic.shapes import TETRAHEDRON, octahedron, sphere
 
 
-def test_midpoint_split_keeps_surface_and_closedness() -> None:
+def test_midpoint_subdivision_preserves_area_and_closed_edges() -> None:
     vertices, faces = octahedron()
     pairs, finer = subdivide_at_midpoints(faces, len(vertices))
     mesh = Mesh(append_midpoint_values(vertices, pairs), finer)
@@ -27,8 +27,8 @@ def test_midpoint_split_keeps_surface_and_closedness() -> None:
     assert np.allclose(mesh.face_normals(), np.repeat(Mesh(vertices, faces).face_normals(), 4, axis=0), atol=1e-6)
 
 
-def test_children_of_positions_and_uvs_stay_in_step() -> None:
-    """UVs that are a linear map of the positions stay that map, although their faces are cut along a seam."""
+def test_subdivided_positions_and_uvs_stay_aligned() -> None:
+    """UVs that are a linear map of the positions remain so after subdivision, also along a seam."""
     vertices, faces = TETRAHEDRON
     to_uv = np.array([[0.3, 0.1], [-0.2, 0.5], [0.4, 0.2]], dtype=np.float32)
     uv = (vertices @ to_uv)[faces].reshape(-1, 2)
@@ -50,13 +50,13 @@ def test_neighbour_mean_against_a_loop() -> None:
     assert np.allclose(neighbour_averaging_matrix(faces, len(vertices)) @ vertices, slow, atol=1e-6)
 
 
-def test_a_vertex_without_faces_stays_where_it_is() -> None:
+def test_isolated_vertices_are_not_moved() -> None:
     vertices, faces = TETRAHEDRON
     lonely = np.concatenate([vertices, [[5.0, 6.0, 7.0]]]).astype(np.float32)
     assert np.allclose(smooth_laplacian(lonely, neighbour_averaging_matrix(faces, 5), 3)[4], [5.0, 6.0, 7.0])
 
 
-def test_smoothing_calms_a_spike_and_keeps_a_plane() -> None:
+def test_smoothing_reduces_a_spike_and_keeps_a_plane() -> None:
     side = np.arange(7, dtype=np.float32)
     grid = np.stack(np.meshgrid(side, side, [0.0], indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
     cell = (np.arange(6)[:, None] * 7 + np.arange(6)).ravel()
@@ -70,7 +70,7 @@ def test_smoothing_calms_a_spike_and_keeps_a_plane() -> None:
     assert calmed.min() >= 0.0
 
 
-def test_parts_are_numbered_by_size() -> None:
+def test_components_are_numbered_by_size() -> None:
     vertices, faces = TETRAHEDRON
     both = np.concatenate([faces, octahedron()[1] + len(vertices)])
     parts = face_components(both, 10)
@@ -78,8 +78,8 @@ def test_parts_are_numbered_by_size() -> None:
 
 
 @pytest.mark.parametrize("size", [2, 3])
-def test_the_way_out_of_a_box(size: int) -> None:
-    """A ray leaves a box from -1 to 1 where its first coordinate reaches a side, which the margin moves."""
+def test_exit_distance_from_a_box(size: int) -> None:
+    """A ray leaves the box [-1, 1] where its first coordinate reaches a side, offset by the margin."""
     random = np.random.default_rng(0)
     box = np.stack(np.meshgrid(*[[-1.0, 1.0]] * size), axis=-1).reshape(-1, size)
     starts, directions = random.uniform(-0.9, 0.9, (50, size)), random.normal(size=(50, size))

@@ -1,4 +1,4 @@
-"""A motion capture of the made-up person (`made_up_glb`) as BVH text, in centimetres."""
+"""Write a BVH motion of the person of `glb_writer`, in centimetres."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ JOINT_POSITIONS = {name: np.array(place) for name, _, place in RIG}
 
 
 def write_test_bvh(path: Path, root_m: np.ndarray, left_arm_deg: np.ndarray, fps: float = 10.0) -> None:
-    """The T-pose whose hips follow `root_m` (n, 3), the left arm raised by an angle (n) about +Z."""
+    """Write the T-pose with hips at `root_m` (n, 3) and the left arm raised by an angle (n) about +Z."""
     lines = ["HIERARCHY", *_joint("Hips", None), "MOTION", f"Frames: {len(root_m)}", f"Frame Time: {1 / fps}"]
     order = [line.split()[1] for line in lines if line.split()[0] in ("ROOT", "JOINT")]
     for place, angle in zip(100.0 * root_m, left_arm_deg, strict=True):
@@ -20,7 +20,7 @@ def write_test_bvh(path: Path, root_m: np.ndarray, left_arm_deg: np.ndarray, fps
 
 
 def _joint(name: str, parent: str | None) -> list[str]:
-    """The lines of a joint and all below it."""
+    """Return the lines of a joint and its descendants."""
     offset = 100.0 * (JOINT_POSITIONS[name] - (JOINT_POSITIONS[parent] if parent else 0.0))
     positions = "" if parent else "Xposition Yposition Zposition "
     lines = [f"{'JOINT' if parent else 'ROOT'} {name}", "{", "OFFSET " + " ".join(map(str, offset))]

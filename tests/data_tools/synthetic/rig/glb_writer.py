@@ -24,19 +24,19 @@ RIG = [
 ARMATURE_SCALE = 0.01
 BOX_M = 0.05
 POSITION_RANGE_M = 2.0
-"""Positions are stored as fractions of this."""
+"""Positions are stored as fractions of this range."""
 
 COLOUR = (30, 120, 210)
 
 
 def box_vertices() -> np.ndarray:
-    """The eight corners of a box around each joint, metres, T-pose."""
+    """Return the eight corners of a box around each joint, metres, T-pose."""
     corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij")).reshape(3, -1).T * BOX_M
     return np.concatenate([np.array(place) + corners for _, _, place in RIG])
 
 
 def write_test_glb(path: Path, prefix: str = "", drop: str = "") -> None:
-    """Write the person; `drop` renames that joint, so that it is missing."""
+    """Write the person. drop: name of a joint that is renamed, so that it is missing."""
     names = [name for name, _, _ in RIG]
     places = {name: np.array(place) for name, _, place in RIG}
     stored = np.rint(box_vertices() / POSITION_RANGE_M * 32767).astype("<i2")

@@ -1,4 +1,4 @@
-"""The BVH reader on a made-up file with known rotations, and on damaged ones."""
+"""The BVH reader on a file with known rotations, on damaged and on real files."""
 
 from pathlib import Path
 
@@ -52,7 +52,7 @@ def test_skeleton(bvh_motion: BvhMotion) -> None:
 
 
 def test_rotations_compose_in_channel_order(bvh_motion: BvhMotion) -> None:
-    """Intrinsic Euler angles, as scipy's capital letters mean."""
+    """Intrinsic Euler angles, as capital letters in scipy."""
     assert np.allclose(bvh_motion.rotations[0], np.eye(3))
     expected = [("ZXY", (10, 20, 30)), ("YXZ", (40, 50, 60)), ("ZXY", (-5, -15, 25))]
     for joint, (order, angles) in enumerate(expected):
@@ -65,7 +65,7 @@ def test_positions_of_the_rest_pose_are_summed_offsets(bvh_motion: BvhMotion) ->
     assert np.allclose(positions[0], [[0, 0, 0], [2, 0, 0], [2, 3, 0], [2, 3.5, 0]])
 
 
-def test_bones_keep_their_length_and_turn_with_their_parents(bvh_motion: BvhMotion) -> None:
+def test_bones_keep_their_length_and_rotate_with_their_parents(bvh_motion: BvhMotion) -> None:
     world, positions = bvh_motion.forward_kinematics(bvh_motion.rotations)
     lengths = np.linalg.norm(np.diff(positions[1], axis=0), axis=1)
     assert np.allclose(lengths, [2.0, 3.0, 0.5])
@@ -77,13 +77,13 @@ def test_bones_keep_their_length_and_turn_with_their_parents(bvh_motion: BvhMoti
 @pytest.mark.parametrize(
     "text", ["", "HIERARCHY", ARM.split("MOTION")[0], ARM[: ARM.index("5 6 7") + 10], ARM.replace("30", "thirty")]
 )
-def test_damaged_files_are_named(text: str, tmp_path: Path) -> None:
+def test_damaged_files_are_errors(text: str, tmp_path: Path) -> None:
     (tmp_path / "damaged.bvh").write_text(text)
     with pytest.raises(UserError, match="damaged.bvh is not a complete BVH"):
         read_bvh(tmp_path / "damaged.bvh")
 
 
-def test_missing_file_is_named(tmp_path: Path) -> None:
+def test_missing_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="does not exist"):
         read_bvh(tmp_path / "none.bvh")
 

@@ -1,4 +1,4 @@
-"""Retargeting: onto its own skeleton a motion stays itself; onto another one the limbs point the same way."""
+"""Retargeting: the identity for the same skeleton; equal limb directions for another one."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +19,7 @@ LIMBS = (("LeftArm", "LeftForeArm"), ("RightForeArm", "RightHand"), ("LeftUpLeg"
 
 
 def recorded(body: Body, motion: Motion, fps: float = 24.0) -> BvhMotion:
-    """A motion of our own body as if a file had held it, in centimetres."""
+    """A motion of the generated body as a BVH motion, in centimetres."""
     offsets = 100.0 * (body.joints_m - body.joints_m[np.maximum(body.parents, 0)]).astype(float)
     rotations = quaternion_to_matrix(torch.from_numpy(motion.rotations_wxyz).double()).numpy()
     positions = 100.0 * motion.root_translation_m.astype(float)
@@ -42,8 +42,8 @@ def turn(bare: Body) -> Motion:
     return turn_in_a_pose(bare, 24, 24.0, GROUND_M, seed=3)
 
 
-def test_a_motion_of_our_own_body_comes_back(bare: Body, turn: Motion) -> None:
-    """Up to the heading, which is taken from the first frame, and the axes in which a torso's front is measured."""
+def test_retargeting_to_the_same_body_is_the_identity(bare: Body, turn: Motion) -> None:
+    """Up to the heading, which is that of the first frame, and the measured front of the torso."""
     back = retarget(recorded(bare, turn), bare, GROUND_M, in_place=False)
     before, after = joint_positions(bare, turn), joint_positions(bare, back)
     for start, end in LIMBS:
@@ -53,8 +53,8 @@ def test_a_motion_of_our_own_body_comes_back(bare: Body, turn: Motion) -> None:
     assert np.abs(before - after).max() < 0.05
 
 
-def test_the_axes_of_the_file_do_not_matter(bare: Body, turn: Motion) -> None:
-    """The same recording in a world with Z up, and with another heading, gives the same motion."""
+def test_result_is_independent_of_the_axes_of_the_file(bare: Body, turn: Motion) -> None:
+    """The same recording with Z up and another heading gives the same motion."""
     here = recorded(bare, turn)
     z_up = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     rotations = here.rotations.copy()
@@ -64,8 +64,8 @@ def test_the_axes_of_the_file_do_not_matter(bare: Body, turn: Motion) -> None:
     assert np.allclose(joint_positions(bare, one), joint_positions(bare, other), atol=1e-3)
 
 
-def test_other_names_are_understood(bare: Body, turn: Motion) -> None:
-    """CMU calls the upper arm LeftShoulder and Mixamo the collar bone: the file's own dialect decides."""
+def test_alternative_joint_names(bare: Body, turn: Motion) -> None:
+    """LeftShoulder is the upper arm in CMU files and the collar bone in Mixamo files."""
     table = {"Arm": "Shoulder", "ForeArm": "Elbow", "Hand": "Wrist", "Shoulder": "Collar"}
     table |= {"UpLeg": "Hip", "Leg": "Knee", "Foot": "Ankle", "ToeBase": "Toe"}
     names = {f"{s}{ours}": f"{s}{theirs}" for s in ("Left", "Right") for ours, theirs in table.items()}
@@ -77,13 +77,13 @@ def test_other_names_are_understood(bare: Body, turn: Motion) -> None:
     assert recorded_joint_of["RightFoot"] == bare.joint("RightFoot")
 
 
-def test_a_missing_limb_is_named(bare: Body, turn: Motion) -> None:
+def test_missing_joint_is_an_error(bare: Body, turn: Motion) -> None:
     names = tuple(name.replace("LeftForeArm", "Tail") for name in bare.joint_names)
     with pytest.raises(UserError, match="no joint for LeftForeArm"):
         match_joints(replace(recorded(bare, turn), joint_names=names), bare)
 
 
-def test_in_place_stays_in_place(bare: Body, turn: Motion) -> None:
+def test_in_place_removes_horizontal_translation(bare: Body, turn: Motion) -> None:
     bvh_motion = recorded(bare, turn)
     walking = replace(
         bvh_motion, root_positions=bvh_motion.root_positions + np.linspace(0, 300, 24)[:, None] * [0, 0, 1]
@@ -104,8 +104,8 @@ def test_resampling_takes_the_nearest_pose(turn: Motion) -> None:
 
 
 @pytest.mark.parametrize("name", ["cmu1_jumping_jacks", "fair1_zombie", "rokoko_jesse_dance"])
-def test_limbs_point_as_recorded(name: str, bare: Body, shared_data: Path) -> None:
-    """Angles between limbs do not depend on any frame: those of the file and of the result agree to a tenth degree."""
+def test_limb_directions_match_the_recording(name: str, bare: Body, shared_data: Path) -> None:
+    """Angles between limbs are invariant to the axes: file and result agree to 0.1 degrees."""
     bvh_motion = read_bvh(shared_data / "motions" / f"{name}.bvh")
     motion = retarget(bvh_motion, bare, GROUND_M, in_place=False)
     recorded_joint_of = match_joints(bvh_motion, bare)

@@ -1,4 +1,4 @@
-"""Rigged people from .glb files: a made-up one with known metres and colours, and the real ones."""
+"""Rigged people from .glb files: a small one with known dimensions and colours, and real ones."""
 
 import json
 import struct
@@ -34,7 +34,7 @@ def made_up(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
 
 
 def test_accessors(made_up: Path) -> None:
-    """Normalised integers with a stride come out as fractions; the factor tints the picture."""
+    """Normalised integers with a stride become fractions; the colour factor multiplies the texture."""
     glb = GlbFile(made_up)
     primitive = glb.skinned_primitives()[0]
     assert np.allclose(primitive.positions * POSITION_RANGE_M, box_vertices(), atol=POSITION_RANGE_M / 32767)
@@ -43,7 +43,7 @@ def test_accessors(made_up: Path) -> None:
 
 
 def test_metres_and_joints(made_up: Path) -> None:
-    """Legs and head stay where the T-pose has them, relative to the ground, although the rig is in centimetres."""
+    """Legs and head keep their T-pose positions relative to the ground, although the rig is in centimetres."""
     body = read_rigged_person(made_up).body
     lowest = min(place[1] for _, _, place in RIG) - BOX_M
     for name, _, place in RIG:
@@ -53,7 +53,7 @@ def test_metres_and_joints(made_up: Path) -> None:
     assert body.vertices[:, 1].min() == pytest.approx(0.0, abs=1e-6)
 
 
-def test_parents_come_first_and_surplus_joints_merge(made_up: Path) -> None:
+def test_parents_precede_children_and_other_joints_are_merged(made_up: Path) -> None:
     body = read_rigged_person(made_up).body
     assert "HeadEnd" not in body.joint_names
     assert all(parent < joint for joint, parent in enumerate(body.parents))
@@ -78,19 +78,19 @@ def test_arms_are_lowered_and_keep_their_length(made_up: Path) -> None:
         assert np.allclose(box.mean(axis=0), hand, atol=1e-4)
 
 
-def test_a_capture_of_it_holds(made_up: Path, tmp_path: Path) -> None:
+def test_capture_of_a_small_rig_is_consistent(made_up: Path, tmp_path: Path) -> None:
     main([str(made_up), str(tmp_path / "out"), *TINY])
     assert verify_ground_truth(tmp_path / "out").passes()
 
 
-def test_a_rig_without_an_arm_is_refused(tmp_path: Path) -> None:
+def test_rig_without_an_arm_is_an_error(tmp_path: Path) -> None:
     write_test_glb(tmp_path / "person.glb", drop="LeftForeArm")
     with pytest.raises(UserError, match="no joint named LeftForeArm"):
         read_rigged_person(tmp_path / "person.glb")
 
 
 @pytest.mark.parametrize("content", [b"", b"glTF", b"no glTF at all, though long enough to look into"])
-def test_other_files_are_refused(content: bytes, tmp_path: Path) -> None:
+def test_files_of_other_formats_are_errors(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "person.glb").write_bytes(content)
     with pytest.raises(UserError, match="is no binary glTF 2 file"):
         read_rigged_person(tmp_path / "person.glb")
@@ -126,7 +126,9 @@ def changed(path: Path, change: Callable[[dict[str, Any]], object]) -> Path:
         (lambda gltf: gltf["images"][0].pop("bufferView"), "image 0 is an external file"),
     ],
 )
-def test_what_cannot_be_read_is_named(change: Callable[[dict[str, Any]], object], words: str, tmp_path: Path) -> None:
+def test_unsupported_content_is_an_error(
+    change: Callable[[dict[str, Any]], object], words: str, tmp_path: Path
+) -> None:
     write_test_glb(tmp_path / "person.glb")
     read_rigged_person(
         changed(tmp_path / "person.glb", lambda gltf: gltf.update(extensionsRequired=["KHR_mesh_quantization"]))
@@ -135,7 +137,7 @@ def test_what_cannot_be_read_is_named(change: Callable[[dict[str, Any]], object]
         read_rigged_person(changed(tmp_path / "person.glb", change))
 
 
-def test_damaged_json_is_named(tmp_path: Path) -> None:
+def test_damaged_json_is_an_error(tmp_path: Path) -> None:
     write_test_glb(tmp_path / "person.glb")
     whole = (tmp_path / "person.glb").read_bytes()
     for damaged in (whole[:12] + b"\0" * 8 + whole[20:], whole[:40] + b"#" + whole[41:], whole[:200]):
@@ -145,7 +147,7 @@ def test_damaged_json_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["Asian_F_1_Casual", "Black_M_1_Casual"])
-def test_real_people_have_human_measures(name: str, shared_data: Path) -> None:
+def test_real_people_have_human_dimensions(name: str, shared_data: Path) -> None:
     subject = read_rigged_person(shared_data / "subjects" / f"{name}.glb")
     body = subject.body
     assert set(body.joint_names) == JOINT_NAMES
@@ -162,7 +164,7 @@ def test_real_people_have_human_measures(name: str, shared_data: Path) -> None:
     assert nose[:, 2].max() > body.joints_m[body.joint("Head"), 2] + 0.05  # faces +Z
 
 
-def test_a_capture_driven_by_motion_capture_holds(shared_data: Path, tmp_path: Path) -> None:
+def test_capture_driven_by_motion_capture_is_consistent(shared_data: Path, tmp_path: Path) -> None:
     person = shared_data / "subjects" / "Black_M_1_Casual.glb"
     motion = shared_data / "motions" / "cmu1_jumping_jacks.bvh"
     main([str(person), str(tmp_path / "out"), *TINY, "--bvh", str(motion), "--in-place", "--fill", "0.6"])

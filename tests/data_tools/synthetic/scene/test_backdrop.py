@@ -1,4 +1,4 @@
-"""The room is where it says it is: floor points project back onto their pixels."""
+"""The geometry of the room: floor points project onto their pixels."""
 
 import numpy as np
 import pytest
@@ -27,8 +27,8 @@ def test_floor_points_project_onto_their_pixels(room: Room) -> None:
     assert np.allclose(position_px.numpy(), np.stack([columns, rows], axis=1) + 0.5, atol=1e-2)
 
 
-def test_the_floor_fills_the_lower_part(room: Room) -> None:
-    """The corner of wall and floor appears at cy + f h / d."""
+def test_floor_covers_the_lower_part_of_the_image(room: Room) -> None:
+    """The edge between wall and floor is at row cy + f h / d."""
     corner_px = CAMERA.cy + CAMERA.fy * 0.9 / (3.0 + WALL_DISTANCE_M)
     is_floor = ~np.isnan(room.floor_m[:, 50, 0])
     assert np.flatnonzero(is_floor)[0] == pytest.approx(corner_px, abs=1.0)
@@ -44,7 +44,7 @@ def test_shadow_is_darkest_under_the_foot(room: Room) -> None:
     assert np.allclose([column, row], foot_px[0].numpy() - 0.5, atol=1.5)
 
 
-def test_furniture_stands_on_the_wall_only(room: Room) -> None:
+def test_furniture_is_on_the_wall_only(room: Room) -> None:
     plain = make_room(CAMERA, GROUND_M, False, ValueNoise(0))
     changed = np.abs(plain.image - room.image).max(axis=2) > 1e-6
     assert changed.mean() > 0.05

@@ -1,4 +1,4 @@
-"""A ball before the person: a sphere in closed form, and the capture that it passes through."""
+"""The ball: coverage of a sphere in closed form, and a capture with a ball."""
 
 import json
 from pathlib import Path
@@ -15,7 +15,7 @@ from pipeline.io.image import read_gray
 from tests.data_tools.conftest import SAMPLE_OPTIONS
 
 
-def test_a_ball_covers_what_a_sphere_does() -> None:
+def test_coverage_of_the_ball_in_closed_form() -> None:
     camera, ground_m = portrait_camera(240, 1.8, 3.6, 0.8)
     ball = Ball(ground_m, 1.8)
     for time_s in (0.0, 0.4, 1.9):
@@ -32,7 +32,7 @@ def test_a_ball_covers_what_a_sphere_does() -> None:
         assert (picture[..., :3] <= picture[..., 3:] + 1e-6).all()
 
 
-def test_it_stays_before_the_person() -> None:
+def test_ball_is_in_front_of_the_person() -> None:
     ball = Ball(np.array([0.0, -0.9, -3.0]), 1.8)
     places = np.stack([ball.centre_m(time_s) for time_s in np.linspace(0, 20, 400)])
     assert places[:, 1].min() > -0.9 + RADIUS_M
@@ -41,7 +41,7 @@ def test_it_stays_before_the_person() -> None:
     assert np.ptp(places[:, 1]) > 0.7
 
 
-def test_a_capture_with_a_ball_and_its_truth(sample: Path, tmp_path: Path) -> None:
+def test_capture_with_a_ball_and_its_ground_truth(sample: Path, tmp_path: Path) -> None:
     main([str(tmp_path / "ball"), *SAMPLE_OPTIONS, "--ball"])
     assert json.loads((tmp_path / "ball" / "truth" / "capture_settings.json").read_text())["ball"] is True
     capture = load_ground_truth(tmp_path / "ball")

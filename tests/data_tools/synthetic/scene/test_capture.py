@@ -1,4 +1,4 @@
-"""The command: same seed, same bytes; truth beside, never inside, the video; clear refusals."""
+"""The sample command: equal bytes for equal seeds, layout of the folders, and user errors."""
 
 import json
 from pathlib import Path
@@ -43,8 +43,8 @@ def test_layout(sample: Path) -> None:
     assert not list(sample.parent.glob("*.part"))
 
 
-def test_novel_views_look_at_the_person(sample: Path) -> None:
-    """The held-out cameras stand elsewhere, and the whole person is in their pictures."""
+def test_novel_views_show_the_whole_person(sample: Path) -> None:
+    """The novel cameras are at other positions, and the whole person is in their images."""
     capture_camera = load_camera(sample / "truth" / "camera.npz")
     for index in range(2):
         camera = load_camera(sample / "truth" / "novel_views" / f"{index:06d}.npz")
@@ -69,15 +69,15 @@ def test_cameras_are_rigid_and_centred() -> None:
         assert up_px[0, 1] < place_px[0, 1]
 
 
-def test_the_person_fills_the_picture_as_asked() -> None:
+def test_person_covers_the_requested_image_height() -> None:
     camera, ground_m = portrait_camera(540, 1.8, 3.6, 0.8)
     ends = torch.from_numpy(np.stack([ground_m, ground_m + [0.0, 1.8, 0.0]])).float()
     place_px, _ = project(ends, camera)
     assert place_px[0, 1] - place_px[1, 1] == pytest.approx(0.8 * 540, abs=0.1)
 
 
-def test_video_keeps_colours(tmp_path: Path) -> None:
-    """Saturated one-pixel stripes survive: no chroma subsampling, no loss beyond the rounding of YUV."""
+def test_video_preserves_colours(tmp_path: Path) -> None:
+    """Saturated one-pixel stripes are preserved: no chroma subsampling, only the rounding of YUV."""
     frame = np.zeros((64, 64, 3), dtype=np.uint8)
     frame[:, ::2] = (200, 30, 30)
     frame[:, 1::2] = (30, 60, 190)
@@ -87,12 +87,12 @@ def test_video_keeps_colours(tmp_path: Path) -> None:
     assert np.abs(decoded[0].astype(int) - frame).max() <= 3
 
 
-def test_a_video_needs_a_frame(tmp_path: Path) -> None:
+def test_video_without_frames_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="at least one frame"):
         write_video(tmp_path / "video.mp4", [], 24.0)
 
 
-def test_nothing_is_overwritten(sample: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_existing_folder_is_an_error(sample: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = read_all_bytes(sample)
     assert run_command(main, [str(sample)]) == 2
     assert capsys.readouterr().err.startswith(f"error: {sample} already exists")
@@ -103,7 +103,9 @@ def test_nothing_is_overwritten(sample: Path, capsys: pytest.CaptureFixture[str]
     ("option", "value"),
     [("--frames", "1"), ("--size", "101"), ("--size", "8"), ("--fill", "1.5"), ("--samples", "0"), ("--seed", "-1")],
 )
-def test_bad_options_are_named(option: str, value: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_out_of_range_are_errors(
+    option: str, value: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run_command(main, [str(tmp_path / "out"), option, value]) == 2
     message = capsys.readouterr().err
     assert message.startswith("error: ")
@@ -111,7 +113,7 @@ def test_bad_options_are_named(option: str, value: str, tmp_path: Path, capsys: 
     assert not (tmp_path / "out").exists()
 
 
-def test_subject_survives_the_disk(subject: Subject) -> None:
+def test_subject_round_trip(subject: Subject) -> None:
     assert subject.texture.dtype == np.uint8
     assert subject.faces_uv.max() < len(subject.uv)
     assert subject.uv.min() >= 0

@@ -1,4 +1,4 @@
-"""The turn covers all sides, keeps its feet on the ground and sways no more than people do."""
+"""The turn covers all headings, keeps the feet on the ground and has a natural sway."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def turn(bare: Body) -> Motion:
 
 
 def headings(motion: Motion) -> np.ndarray:
-    """Direction in which the hips look, radians around +Y from +Z."""
+    """Heading of the hips, radians about +Y from +Z."""
     front = quaternion_to_matrix(torch.from_numpy(motion.rotations_wxyz[:, 0]))[:, :, 2].numpy()
     return np.arctan2(front[:, 0], front[:, 2])
 
@@ -37,17 +37,17 @@ def test_one_full_turn_in_even_steps(turn: Motion) -> None:
     assert steps.max() < 1.5 * 2 * np.pi / 48
 
 
-def test_the_lowest_foot_stands_on_the_ground(bare: Body, turn: Motion) -> None:
+def test_lowest_foot_is_on_the_ground(bare: Body, turn: Motion) -> None:
     assert np.allclose(lowest_foot_offset_m(bare, turn), GROUND_M[1], atol=1e-5)
 
 
-def test_the_person_stays_on_the_spot(bare: Body, turn: Motion) -> None:
+def test_person_stays_in_place(bare: Body, turn: Motion) -> None:
     assert np.allclose(turn.root_translation_m[:, [0, 2]], GROUND_M[[0, 2]], atol=1e-5)
     assert np.ptp(turn.root_translation_m[:, 1]) < 0.03
 
 
 def test_sway_is_natural(bare: Body, turn: Motion) -> None:
-    """No joint but the root leaves the A-pose by more than 9 degrees, none jerks, and arms do move."""
+    """Joints except the root stay within 9 degrees of the A-pose and move smoothly; the arms move."""
     rotations = torch.from_numpy(turn.rotations_wxyz[:, 1:]).double()
     angles = 2.0 * torch.arccos(rotations[..., 0].abs().clamp(max=1.0))
     assert angles.max() < np.radians(9.0)
@@ -56,14 +56,14 @@ def test_sway_is_natural(bare: Body, turn: Motion) -> None:
     assert jerk < 0.02
 
 
-def test_seed_decides_the_sway(bare: Body, turn: Motion) -> None:
+def test_sway_depends_on_the_seed(bare: Body, turn: Motion) -> None:
     again = turn_in_a_pose(bare, 48, 24.0, GROUND_M, seed=0)
     other = turn_in_a_pose(bare, 48, 24.0, GROUND_M, seed=1)
     assert np.array_equal(again.rotations_wxyz, turn.rotations_wxyz)
     assert not np.allclose(other.rotations_wxyz, turn.rotations_wxyz)
 
 
-def test_novel_poses_lie_outside_the_turn(bare: Body, turn: Motion) -> None:
+def test_novel_poses_differ_from_the_turn(bare: Body, turn: Motion) -> None:
     novel = novel_motion(bare, GROUND_M, 5)
     assert len(novel.frame_index) == 5
     for pose in novel.rotations_wxyz[:4, 1:]:
@@ -80,13 +80,13 @@ def test_arms_up_are_up(bare: Body) -> None:
     assert height[0] > height[1]
 
 
-def test_grounding_undoes_a_lift(bare: Body, turn: Motion) -> None:
+def test_snap_feet_to_floor_removes_an_offset(bare: Body, turn: Motion) -> None:
     lifted = turn.with_pose(turn.rotations_wxyz, turn.root_translation_m + [0.0, 0.7, 0.0])
     back = snap_feet_to_floor(bare, lifted, float(GROUND_M[1]))
     assert np.allclose(back.root_translation_m, turn.root_translation_m, atol=1e-5)
 
 
-def test_a_part_of_a_turn_goes_there_and_back(bare: Body) -> None:
+def test_partial_turn_goes_to_both_sides_and_back(bare: Body) -> None:
     motion = turn_in_a_pose(bare, 48, 24.0, GROUND_M, seed=0, arc_deg=90.0)
     w, _, y, _ = motion.rotations_wxyz[:, 0].T
     heading_deg = np.degrees(2 * np.arctan2(y, w))

@@ -1,4 +1,4 @@
-"""What a capture's options do: a walker's held-out cameras, a held-out motion, a given focal length."""
+"""Capture options: novel cameras of a walking person, novel poses from BVH, focal length, meshes."""
 
 import json
 from pathlib import Path
@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from data_tools.command import run_command
 from data_tools.evaluate.truth import _main as truth_command
@@ -32,13 +33,13 @@ def left_arms(body: Body, motion: Motion) -> np.ndarray:
     """Unit vectors (n, 3) along the upper arm."""
     joints = [body.joint(name) for name in ("LeftArm", "LeftForeArm")]
     transforms = canonical_to_world(body, motion)[:, joints].numpy()
-    places = np.einsum("njab,jb->nja", transforms[..., :3, :3], body.joints_m[joints]) + transforms[..., :3, 3]
-    bone = places[:, 1] - places[:, 0]
+    positions_m = np.einsum("njab,jb->nja", transforms[..., :3, :3], body.joints_m[joints]) + transforms[..., :3, 3]
+    bone = positions_m[:, 1] - positions_m[:, 0]
     return bone / np.linalg.norm(bone, axis=1, keepdims=True)
 
 
-def test_held_out_cameras_look_at_a_walker(person: Path, tmp_path: Path) -> None:
-    """In the first frame, which they show, the walker is two metres from the middle of the path."""
+def test_novel_cameras_look_at_a_walking_person(person: Path, tmp_path: Path) -> None:
+    """In the first frame, which they show, the person is two metres from the middle of the trajectory."""
     write_test_bvh(tmp_path / "walk.bvh", HIPS_M + np.linspace(0, 4, 21)[:, None] * [1.0, 0.0, 0.0], np.zeros(21))
     main([str(person), str(tmp_path / "out"), *TINY, "--bvh", str(tmp_path / "walk.bvh"), "--novel-views", "3"])
     truth = tmp_path / "out" / "truth"
@@ -52,8 +53,8 @@ def test_held_out_cameras_look_at_a_walker(person: Path, tmp_path: Path) -> None
         assert not alpha[:, [0, -1]].any()
 
 
-def test_a_held_out_motion_is_shown_from_its_first_to_its_last_frame(person: Path, tmp_path: Path) -> None:
-    """The left arm rises by 80 degrees in 9 frames while the person walks; three of them are asked for."""
+def test_novel_poses_span_the_whole_motion(person: Path, tmp_path: Path) -> None:
+    """The left arm rises by 80 degrees in 9 frames while the person walks; three frames are selected."""
     write_test_bvh(
         tmp_path / "rise.bvh", HIPS_M + np.linspace(0, 4, 9)[:, None] * [1.0, 0.0, 0.0], np.linspace(-40, 40, 9)
     )
@@ -72,8 +73,8 @@ def test_a_held_out_motion_is_shown_from_its_first_to_its_last_frame(person: Pat
     assert json.loads((truth / "capture_settings.json").read_text())["novel_motion"] == "rise.bvh"
 
 
-def test_a_given_focal_length_is_kept(person: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The person's share of the picture follows: f height / distance."""
+def test_focal_length_option(person: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The person covers f height / distance pixels."""
     command = [str(person), str(tmp_path / "out"), *TINY, "--novel-poses", "0", "--novel-views", "0", "--focal"]
     assert run_command(main, [*command, "400"]) == 2
     assert "--focal 400.0 makes the person cover 1." in capsys.readouterr().err
@@ -86,18 +87,16 @@ def test_a_given_focal_length_is_kept(person: Path, tmp_path: Path, capsys: pyte
     assert verify_ground_truth(tmp_path / "out").passes()
 
 
-def test_meshes_of_every_frame_span_its_mask(person: Path, tmp_path: Path) -> None:
-    """Read back as text and projected, whatever the file's writer thinks of it."""
+def test_projected_meshes_have_the_extent_of_the_masks(person: Path, tmp_path: Path) -> None:
+    """Meshes are read by trimesh and projected."""
     main([str(person), str(tmp_path / "out"), *TINY, "--novel-views", "0", "--novel-poses", "0"])
     capture = load_ground_truth(tmp_path / "out")
     assert run_command(truth_command, [str(tmp_path / "out"), "--meshes", str(tmp_path / "meshes")]) == 0
     assert len(list((tmp_path / "meshes").glob("*.obj"))) == 2
     for index in range(2):
-        text = (tmp_path / "meshes" / f"{index:06d}.obj").read_text()
-        lines = [line.split() for line in text.splitlines()]
-        places = torch.tensor([[float(word) for word in words[1:]] for words in lines if words[0] == "v"])
-        assert len([words for words in lines if words[0] == "f"]) == len(capture.subject.body.faces)
-        pixels, _ = project(places, capture.camera)
+        mesh = trimesh.load_mesh(tmp_path / "meshes" / f"{index:06d}.obj", process=False)
+        assert len(mesh.faces) == len(capture.subject.body.faces)
+        pixels, _ = project(torch.tensor(mesh.vertices).float(), capture.camera)
         rows, columns = np.nonzero(load_true_mask(tmp_path / "out", index) > 127)
         assert np.allclose(pixels.min(0).values, [columns.min(), rows.min()], atol=1.0)
         assert np.allclose(pixels.max(0).values, [columns.max() + 1, rows.max() + 1], atol=1.0)

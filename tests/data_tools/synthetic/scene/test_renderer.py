@@ -1,4 +1,4 @@
-"""Shading and coverage against closed forms: a lit plane, and a ball whose silhouette is a known disc."""
+"""Shading and coverage against closed forms: single surface points, and a ball whose silhouette is a disc."""
 
 import numpy as np
 import pytest
@@ -29,12 +29,12 @@ def render(light: Light, samples: int = 3, camera: Camera = CAMERA) -> np.ndarra
 
 
 def test_coverage_is_the_area_of_the_disc() -> None:
-    """A ball of radius r at distance d subtends asin(r/d); its outline is a disc of radius f tan of that."""
+    """A ball of radius r at distance d has the silhouette of a disc with radius f tan(asin(r / d))."""
     radius_px = CAMERA.fx * np.tan(np.arcsin(BALL_M / DISTANCE_M))
     assert render(FLAT)[:, :, 3].sum() == pytest.approx(np.pi * radius_px**2, rel=0.01)
 
 
-def test_flat_light_shows_the_bare_texture() -> None:
+def test_flat_light_shows_the_unlit_texture() -> None:
     image = render(FLAT)
     inside = image[:, :, 3] == 1.0
     assert inside.sum() > 1000
@@ -48,13 +48,13 @@ def test_colours_are_premultiplied() -> None:
     assert np.allclose(image[border][:, :3], image[border][:, 3:] * np.array(COLOUR) / 255.0, atol=1e-3)
 
 
-def test_nothing_outside_the_window() -> None:
+def test_subject_outside_the_image_is_not_drawn() -> None:
     camera = Camera(200.0, 200.0, -500.0, 64.0, 128, 128)
     assert not render(STUDIO, camera=camera).any()
 
 
-def test_the_window_does_not_change_the_picture() -> None:
-    """The same ball, seen through a crop of the camera that cuts it, has the same pixels."""
+def test_cropping_does_not_change_the_render() -> None:
+    """A crop of the camera that cuts the ball gives the same pixels."""
     whole, cut = render(STUDIO), render(STUDIO, camera=CAMERA.cropped(50, 40, 40, 60))
     assert np.allclose(whole[40:100, 50:90], cut, atol=2e-2)
     assert np.abs(whole[40:100, 50:90] - cut).mean() < 1e-4
@@ -72,19 +72,19 @@ def lit(normal: tuple[float, float, float], light: Light, albedo: float = 0.5) -
 
 
 def test_shade_against_the_formula() -> None:
-    """Mid grey 0.5 is 0.21404 in linear light; facing the key it gets ambient + key of it."""
+    """sRGB 0.5 is 0.21404 in linear colour; a point that faces the key light gets ambient + key times that."""
     light = Light(key_intensity=0.5, key_direction=(0.0, 0.0, 1.0), ambient_intensity=0.7, sky_gradient=0.0)
     linear = 0.21404 * 1.2
     assert lit((0.0, 0.0, 1.0), light) == pytest.approx(1.055 * linear ** (1 / 2.4) - 0.055, abs=1e-4)
     assert lit((0.0, 0.0, -1.0), light) == pytest.approx(1.055 * (0.21404 * 0.7) ** (1 / 2.4) - 0.055, abs=1e-4)
 
 
-def test_sky_is_above() -> None:
+def test_ambient_light_is_stronger_from_above() -> None:
     light = Light(key_intensity=0.0, ambient_intensity=0.8, sky_gradient=0.2)
     assert lit((0.0, 1.0, 0.0), light) > lit((1.0, 0.0, 0.0), light) > lit((0.0, -1.0, 0.0), light)
 
 
-def test_shine_adds_a_highlight_only_near_the_mirror_direction() -> None:
+def test_specular_highlight_is_near_the_mirror_direction() -> None:
     dull = Light(
         key_intensity=SHINY.key_intensity,
         key_direction=SHINY.key_direction,

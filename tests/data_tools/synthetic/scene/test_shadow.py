@@ -1,4 +1,4 @@
-"""Shadows against closed forms: a ball over a floor darkens the ellipse below it, and half of itself."""
+"""Shadows against closed forms: the shadow of a ball on the floor, and on its own far half."""
 
 from dataclasses import replace
 
@@ -17,8 +17,8 @@ BALL_M, HEIGHT_M = 0.3, 1.0
 KEY_FROM = (0.6, 0.8, 0.0)
 
 
-def test_a_ball_shades_the_ellipse_below_it() -> None:
-    """Rays along d through a ball of radius r meet the floor in an ellipse of semi-axes r and r / cos of the slant,
+def test_shadow_of_a_ball_is_an_ellipse() -> None:
+    """Rays along d through a ball of radius r hit the floor in an ellipse of semi-axes r and r / cos of the slant,
     around the foot point of the ray through the middle."""
     vertices, faces = sphere(BALL_M, (0.0, HEIGHT_M, 0.0))
     shadows = render_shadow_map(torch.from_numpy(vertices), torch.from_numpy(faces), KEY_FROM)
@@ -34,7 +34,7 @@ def test_a_ball_shades_the_ellipse_below_it() -> None:
     assert (radius < BALL_M - soft).sum() > 100
 
 
-def test_a_ball_shades_its_own_far_half() -> None:
+def test_far_half_of_a_ball_is_in_shadow() -> None:
     vertices, faces = sphere(BALL_M, (0.0, HEIGHT_M, 0.0))
     normals = torch.from_numpy((vertices - [0.0, HEIGHT_M, 0.0]) / BALL_M).float()
     visibility = render_shadow_map(torch.from_numpy(vertices), torch.from_numpy(faces), KEY_FROM).visibility(
@@ -45,8 +45,8 @@ def test_a_ball_shades_its_own_far_half() -> None:
     assert (visibility[facing < -0.5] == 0).all()
 
 
-def test_the_light_shadows_only_when_asked(subject: Subject) -> None:
-    """An arm before a light from the side darkens the chest; nothing grows brighter, and the outline stays."""
+def test_shadows_are_cast_only_if_enabled(subject: Subject) -> None:
+    """An arm casts a shadow on the chest; no pixel gets brighter, and the coverage is unchanged."""
     camera = Camera(200.0, 200.0, 64.0, 64.0, 128, 128, np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32))
     camera.world_to_camera[:3, 3] = [0.0, 0.9, 3.4]
     vertices = torch.from_numpy(subject.body.vertices)
@@ -59,7 +59,7 @@ def test_the_light_shadows_only_when_asked(subject: Subject) -> None:
     assert darker.min() >= 0
 
 
-def test_hidden_places_get_the_ambient_light_alone() -> None:
+def test_shadowed_points_get_only_ambient_light() -> None:
     grey, up = torch.full((2, 3), 0.5), torch.tensor([[0.0, 0.0, 1.0]] * 2)
     light = Light(
         key_intensity=0.5, key_direction=(0.0, 0.0, 1.0), ambient_intensity=0.7, sky_gradient=0.0, specular_strength=0.4
@@ -70,8 +70,8 @@ def test_hidden_places_get_the_ambient_light_alone() -> None:
     assert float(shaded[0, 0]) == pytest.approx(1.055 * (0.21404 * 1.2 + 0.4) ** (1 / 2.4) - 0.055, abs=1e-4)
 
 
-def test_what_lies_inside_is_not_seen() -> None:
-    """A ball within a ball is hidden, all of the outer one is seen; through a hole above the upper side is seen."""
+def test_interior_faces_are_not_exterior() -> None:
+    """A ball inside a ball is interior; with a hole in the top of the outer ball, its upper side is exterior."""
     (outer, faces), (inner, _) = (sphere(radius_m, (0.0, 1.0, 0.0)) for radius_m in (0.4, 0.2))
     both = np.concatenate([faces, faces + len(outer)])
     seen = find_exterior_faces(Mesh(np.concatenate([outer, inner]), both))
