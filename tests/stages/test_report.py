@@ -170,7 +170,7 @@ def test_a_held_out_frame_without_a_person_is_left_out_with_a_warning(inputs: di
     assert [row["index"] for row in json.loads((out / "report.json").read_text())["heldout"]["frames"]] == [8]
     empty, tiny = take_warnings()
     assert "held-out frame 0 is not scored: no pixel of its mask" in empty
-    assert "held-out frame 16 is not scored: the person in it has 20 x 10 px" in tiny
+    assert "held-out frame 16 is not scored: the foreground has 20 x 10 px" in tiny
     write_gray(mask_path(frames, 8), blank)
     with pytest.raises(UserError, match=r"no held-out frame of .*frames can be scored \(frame 0: no pixel"):
         scored_positions(load_capture(frames))
