@@ -1,40 +1,39 @@
-"""What all tests share: checked array shapes, the data folder, the graphics card."""
+"""Fixtures of all tests, and the check of annotated array shapes."""
 
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import hypothesis
 import pytest
+from filelock import FileLock
 from jaxtyping import install_import_hook
 
 from pipeline.core.measure import REPOSITORY_DIR
 from pipeline.core.progress import take_warnings
-from tests.core.toy_pipeline import Toy, user_environment
+from tests.core.toy_pipeline import Toy
 
-# Before any of these is imported: from here on every annotated shape and dtype in them is checked at each call.
-# The numba kernels are left out, because numba compiles the plain functions.
+# Must run before any of these packages is imported. Every annotated shape and dtype in them is checked at each call.
+# The numba kernels are left out, because numba compiles plain functions.
 CHECKED_PACKAGES = [
     f"pipeline.{name}"
     for name in ("geometry", "io", "capture", "metrics", "body", "texture", "report", "field", "mesh", "avatar")
 ]
 install_import_hook(CHECKED_PACKAGES, "beartype.beartype")
 
-# A first call loads what numba has compiled: no test is a matter of time.
+# The first call of a function may load or compile kernels, so no example has a deadline.
 hypothesis.settings.register_profile("untimed", deadline=None)
 hypothesis.settings.load_profile("untimed")
 
 
 @pytest.fixture(autouse=True)
 def only_own_warnings() -> None:
-    """What earlier tests warned of is forgotten: stages gather warnings for the whole process."""
+    """Clear the warnings of earlier tests: they are collected for the whole process."""
     take_warnings()
 
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """The folder with real captures: `../shared/data`, or where IHM_SHARED_DATA points; skips where there is none."""
+    """Folder with real captures, `../shared/data` or the value of IHM_SHARED_DATA; skips if it does not exist."""
     folder = Path(os.environ.get("IHM_SHARED_DATA", REPOSITORY_DIR.parent / "shared" / "data"))
     if not folder.is_dir():
         pytest.skip(f"no captures at {folder} (set IHM_SHARED_DATA)")
@@ -43,7 +42,7 @@ def shared_data() -> Path:
 
 @pytest.fixture(scope="session")
 def cuda() -> str:
-    """The name of the graphics card's torch device; skips where there is none. The only place that decides this."""
+    """Name of torch's CUDA device; skips if there is none. No other place decides this."""
     import torch
 
     if not torch.cuda.is_available():
@@ -53,26 +52,35 @@ def cuda() -> str:
 
 @pytest.fixture(scope="session")
 def repository() -> Path:
-    """The root of the checkout."""
+    """Root of the checkout."""
     return REPOSITORY_DIR
 
 
 @pytest.fixture
 def toy(tmp_path: Path) -> Toy:
-    """A three-stage pipeline on numbers with the real runner, in a folder of its own."""
+    """Three-stage pipeline on numbers with the real runner, in a folder of its own."""
     return Toy(tmp_path / "toy")
 
 
 @pytest.fixture(scope="session")
-def smoke_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The whole pipeline, by its commands, on a small generated capture with the smoke preset: the finished run folder.
+def shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Temporary folder that all workers of pytest-xdist share during one run of the tests."""
+    base = tmp_path_factory.getbasetemp()
+    return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
 
-    Beside it lies `capture/`, with the video and its truth.
+
+@pytest.fixture(scope="session")
+def smoke_run(shared_folder: Path) -> Path:
+    """Finished run of all stages on a small generated capture with the smoke preset; tests do not change it.
+
+    `capture/` in the same folder holds the video and its ground truth. The first worker that needs the run makes it.
     """
-    folder = tmp_path_factory.mktemp("smoke")
-    video = folder / "capture" / "video"
-    make_sample = ["data_tools.sample", str(folder / "capture"), "--frames", "24", "--size", "192"]
-    run_all = ["stages", "--run", str(folder / "run"), "--preset", "smoke", "--video", str(video)]
-    for command in (make_sample, run_all):
-        subprocess.run([sys.executable, "-m", *command], cwd=REPOSITORY_DIR, env=user_environment(), check=True)
+    from data_tools.sample import main as make_sample
+    from stages import reconstruct
+
+    folder = shared_folder / "smoke"
+    with FileLock(shared_folder / "smoke.lock"):
+        if not (folder / "run" / "report" / "manifest.json").is_file():
+            make_sample([str(folder / "capture"), "--frames", "24", "--size", "192"])
+            reconstruct(folder / "capture" / "video", folder / "run", preset="smoke", isolate=False)
     return folder / "run"

@@ -1,4 +1,4 @@
-"""The whole way by its commands: a small generated capture becomes a rigged avatar with a report."""
+"""The whole pipeline: a small generated capture becomes a rigged avatar with a report."""
 
 import json
 import re
@@ -35,7 +35,7 @@ def command(*arguments: str) -> str:
     return done.stdout
 
 
-def test_every_stage_left_a_whole_artifact(smoke_run: Path) -> None:
+def test_every_artifact_is_intact(smoke_run: Path) -> None:
     for name in STAGES:
         assert find_damaged_files(smoke_run / name) == []
         assert all((smoke_run / name / made).exists() for made in load_stage(name).makes)
@@ -49,7 +49,7 @@ def test_the_manifests_name_what_they_read(smoke_run: Path) -> None:
         for need in manifest.inputs:
             source = read_manifest(smoke_run / need) if need != "video" else None
             digest = source.outputs_digest if source else digest_video(smoke_run.parent / "capture" / "video")
-            assert manifest.inputs[need] == digest, f"{name} read another {need} than the one that is there"
+            assert manifest.inputs[need] == digest, f"{name} read another {need} than the present one"
 
 
 def test_nothing_is_left_to_do(smoke_run: Path) -> None:
@@ -71,8 +71,8 @@ def test_the_report_keeps_its_contract(report: dict[str, dict[str, float]]) -> N
     assert report["masks"]["count"] > 0
 
 
-def test_the_avatar_is_whole_and_near_the_person(report: dict[str, dict[str, float]]) -> None:
-    """Bounds that even the smoke preset's few steps keep with room to spare."""
+def test_the_avatar_is_watertight_and_close_to_the_person(report: dict[str, dict[str, float]]) -> None:
+    """Bounds that the few steps of the smoke preset keep by a wide margin."""
     assert report["mesh"]["watertight"] is True
     assert report["mesh"]["manifold"] is True
     assert report["mesh"]["components"] == 1
@@ -98,13 +98,13 @@ def test_the_glb_holds_a_skinned_animated_avatar(smoke_run: Path) -> None:
     ].keys()
 
 
-def test_the_page_needs_nothing_from_outside(smoke_run: Path) -> None:
+def test_the_page_loads_no_other_files(smoke_run: Path) -> None:
     page = (smoke_run / "report" / "index.html").read_text(encoding="utf-8")
     loaded = re.findall(r"""(?:src|href)\s*=\s*["'](?!data:|#)([^"']+)["']""", page)
     assert loaded == []
 
 
-def test_the_pictures_show_something(smoke_run: Path) -> None:
+def test_the_images_are_not_blank(smoke_run: Path) -> None:
     for name in ("body/overlay.png", "report/turntable.jpg", "texture/diffuse.png"):
         assert read_rgb(smoke_run / name).std() > 5, f"{name} is blank"
 

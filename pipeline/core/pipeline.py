@@ -37,7 +37,6 @@ class Pipeline:
         Raises:
             UserError: the preset, a section, a key or a value is not valid.
         """
-        stages = self.load_stages()
         layers = load_layers(record.preset, record.overrides, self.config_dir)
         check_sections(layers, self.names)
-        return {stage.name: build_config(stage.name, stage.config, layers) for stage in stages}
+        return {stage.name: build_config(stage.name, stage.config, layers) for stage in self.load_stages()}

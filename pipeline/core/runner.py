@@ -81,10 +81,9 @@ def run_pipeline(pipeline: Pipeline, request: RunRequest, options: RunOptions) -
     """
     outcomes = []
     with open_run(request) as (record, lock):
-        stages = pipeline.load_stages()
         configs = pipeline.build_configs(record)
         write_record(record, request.run_dir)
-        for number, stage in enumerate(stages, start=1):
+        for number, stage in enumerate(pipeline.load_stages(), start=1):
             plan = plan_stage(stage, configs[stage.name], request.run_dir, record.video_path)
             runner = _StageRunner(pipeline, plan, lock, options, number)
             outcomes.append(runner.run())

@@ -1,0 +1,87 @@
+"""Running a pipeline from Python: progress, errors and cancellation, with stages in child processes and in this one."""
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.core.errors import UserError
+from pipeline.core.events import EVENTS_VARIABLE, parse_event, send_event
+from pipeline.core.manifest import read_manifest
+from pipeline.core.pipeline import Pipeline
+from pipeline.core.run_folder import RunRequest, StageFailedError
+from pipeline.core.runner import Progress, RunOptions, StageOutcome, run_pipeline
+from tests.core.toy.stages import PIPELINE
+from tests.core.toy_pipeline import Toy
+
+LEARN_STEPS = 20
+
+
+def run_toy(toy: Toy, isolate: bool, progress: list[Progress]) -> list[StageOutcome]:
+    request = RunRequest(toy.run_dir, toy.video, overrides={"learn.steps": LEARN_STEPS})
+    return run_pipeline(PIPELINE, request, RunOptions(isolate=isolate, progress=progress.append))
+
+
+@pytest.mark.parametrize("isolate", [True, False])
+def test_progress_reports_stages_and_loops(toy: Toy, isolate: bool) -> None:
+    calls: list[Progress] = []
+    outcomes = run_toy(toy, isolate, calls)
+    assert [(outcome.stage, outcome.state) for outcome in outcomes] == [(name, "run") for name in PIPELINE.names]
+    assert calls[0] == Progress("read", 1, 3, "running")
+    assert Progress("learn", 2, 3, "running", "learning", LEARN_STEPS, LEARN_STEPS) in calls
+    assert calls[-1] == Progress("summarise", 3, 3, "done")
+    calls.clear()
+    run_toy(toy, isolate, calls)
+    assert calls == [Progress(name, number, 3, "cached") for number, name in enumerate(PIPELINE.names, start=1)]
+
+
+@pytest.mark.parametrize("isolate", [True, False])
+def test_a_user_error_of_a_stage_is_raised_with_its_message(toy: Toy, isolate: bool) -> None:
+    toy.video.write_text("1 two 3")
+    with pytest.raises(UserError, match=r"numbers\.txt holds two, which is not a number: remove it"):
+        run_toy(toy, isolate, [])
+    assert not toy.run_dir.exists()
+
+
+@pytest.mark.parametrize("isolate", [True, False])
+def test_an_exception_of_the_callback_stops_the_run(toy: Toy, isolate: bool) -> None:
+    """The finished stages stay; the next run resumes."""
+
+    def cancel(progress: Progress) -> None:
+        if progress.stage == "learn":
+            raise TimeoutError("the user has no time")
+
+    request = RunRequest(toy.run_dir, toy.video)
+    with pytest.raises(TimeoutError):
+        run_pipeline(PIPELINE, request, RunOptions(isolate=isolate, progress=cancel))
+    assert read_manifest(toy.run_dir / "read") is not None
+    assert read_manifest(toy.run_dir / "learn") is None
+    assert [outcome.state for outcome in run_toy(toy, isolate, [])] == ["cached", "run", "run"]
+
+
+def test_a_crash_of_a_stage_is_not_a_user_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    package = tmp_path / "crashing"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    (package / "__main__.py").write_text("print('output of a library')\nraise SystemExit(3)\n")
+    (package / "one.py").write_text(
+        "from pipeline.core.config import Config\nfrom pipeline.core.stage import Stage\n"
+        "STAGE = Stage('one', 1, (), (), Config, lambda inputs, out, config: {})\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    pipeline = Pipeline("crashing", ("one",), config_dir=tmp_path)
+    with pytest.raises(StageFailedError, match="stage one ended with exit status 3") as caught:
+        run_pipeline(pipeline, RunRequest(tmp_path / "run"), RunOptions(progress=lambda _: None))
+    assert caught.value.code == 3
+    assert "output of a library" in capfd.readouterr().out
+
+
+def test_events_are_lines_of_their_own(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    send_event(error="nobody listens")
+    assert capsys.readouterr().out == ""
+    monkeypatch.setenv(EVENTS_VARIABLE, "1")
+    send_event(label="a\nb", done=1, total=None)
+    line, rest = capsys.readouterr().out.split("\n")
+    assert (parse_event(line), rest) == ({"label": "a\nb", "done": 1, "total": None}, "")
+    assert parse_event("output of a library") is None
