@@ -1,0 +1,41 @@
+"""Artifacts of the body stage: round trips; poses that are not finite are refused."""
+
+import numpy as np
+import pytest
+
+from pipeline.body.body import Motion, load_anny
+from pipeline.body.files import load_body, load_camera, load_motion, save_body, save_camera, save_motion
+from pipeline.core.errors import UserError
+from pipeline.geometry.camera import Camera
+
+
+def test_body_round_trip(tmp_path) -> None:
+    parametric = load_anny()
+    body = parametric.body(parametric.shape_defaults)
+    save_body(tmp_path / "body.npz", body)
+    again = load_body(tmp_path / "body.npz")
+    assert again.joint_names == body.joint_names
+    assert again.shape == body.shape
+    for name in ("parents", "joints_m", "vertices", "faces", "skin_weights"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(body, name))
+
+
+def test_camera_round_trip(tmp_path) -> None:
+    camera = Camera(1.5, 2.5, 3.0, 4.0, 50, 60)
+    save_camera(tmp_path / "camera.npz", camera)
+    again = load_camera(tmp_path / "camera.npz")
+    assert again.fx == 1.5
+    assert again.height == 60
+
+
+@pytest.mark.parametrize("place", ["rotations_wxyz", "root_translation_m"])
+def test_poses_that_are_not_finite_are_refused_with_their_frames(tmp_path, place) -> None:
+    turns = np.tile(np.float32([1, 0, 0, 0]), (5, 3, 1))
+    motion = Motion(np.arange(10, 60, 10), np.arange(5.0), turns, np.zeros((5, 3), np.float32))
+    save_motion(tmp_path / "motion.npz", motion)
+    np.testing.assert_array_equal(load_motion(tmp_path / "motion.npz").rotations_wxyz, turns)
+    values = getattr(motion, place)
+    values[1, -1], values[4, 0] = np.nan, np.inf
+    save_motion(tmp_path / "motion.npz", motion)
+    with pytest.raises(UserError, match=r"motion.npz: the poses of frames 20, 50 are not finite"):
+        load_motion(tmp_path / "motion.npz")
