@@ -9,7 +9,6 @@ Letters: k frames of the motion, b frames of a batch, j joints, m skin grid node
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -24,7 +23,7 @@ from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.kernels import broyden
 from pipeline.kernels.inverse_skinning import SkinGrid, newton_step
 from pipeline.kernels.inverse_skinning.reference import skin_points
-from pipeline.kernels.march import PackedWarpGrids, Samples, march
+from pipeline.kernels.march import PackedWarpGrids, Rays, Samples, SamplingVolume, march
 from pipeline.kernels.march.reference_stops import march_with_inverse
 
 INITIAL_BONES: tuple[str, ...] = (
@@ -32,18 +31,6 @@ INITIAL_BONES: tuple[str, ...] = (
     "Neck", "Head", "LeftArm", "RightArm", "LeftForeArm", "RightForeArm",
 )  # fmt: skip
 """The thirteen bones from which InstantAvatar starts its search, by their names in this pipeline."""
-
-
-class Rays(NamedTuple):
-    """Rays in the posed space of their frames, as `march` takes them.
-
-    directions: unit vectors. frame_index: row of the motion. jitter: offset of the samples, as a fraction of a step.
-    """
-
-    origins_m: Float[Tensor, "n 3"]
-    directions: Float[Tensor, "n 3"]
-    frame_index: Int[Tensor, "n"]
-    jitter: Float[Tensor, "n"]
 
 
 @dataclass(frozen=True)
@@ -90,7 +77,7 @@ def _baked(body: Body, skin: SkinGrid, canonical_to_posed: Float[Tensor, "k j 4 
     warps = bake_warp_grids(skin, canonical_to_posed)
 
     def sample_rays(rays: Rays, step_m: float, occupancy: BinaryOccupancy, max_samples: int) -> Samples:
-        return march(*rays, step_m, warps, occupancy.occupied, occupancy.bounds_m, max_samples)
+        return march(rays, SamplingVolume(warps, occupancy.occupied, occupancy.bounds_m), step_m, max_samples)
 
     low = warps.origin_m
     high = low + warps.cell_m * (warps.dims - 1).float()
@@ -119,7 +106,7 @@ def _broyden(body: Body, skin: SkinGrid, canonical_to_posed: Float[Tensor, "k j 
         grid = (occupancy.occupied, occupancy.bounds_m)
         return Samples(
             *march_with_inverse(
-                find_canonical, *rays._replace(frame_index=slot), step_m, posed_bounds_m[rows], *grid, max_samples
+                find_canonical, rays._replace(frame_index=slot), step_m, posed_bounds_m[rows], *grid, max_samples
             )
         )
 
@@ -165,7 +152,7 @@ def _nearest(body: Body, skin: SkinGrid, canonical_to_posed: Float[Tensor, "k j 
 
     def sample_rays(rays: Rays, step_m: float, occupancy: BinaryOccupancy, max_samples: int) -> Samples:
         grid = (occupancy.occupied, occupancy.bounds_m)
-        return Samples(*march_with_inverse(find_canonical, *rays, step_m, posed_bounds_m, *grid, max_samples))
+        return Samples(*march_with_inverse(find_canonical, rays, step_m, posed_bounds_m, *grid, max_samples))
 
     def to_canonical(
         skin: SkinGrid, matrices: Tensor, frames: Tensor, canonical_m: Tensor, posed_m: Tensor, frame_offsets: Tensor

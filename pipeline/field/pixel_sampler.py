@@ -11,7 +11,15 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from pipeline.geometry.camera import Camera
-from pipeline.kernels.pixel_sampling import PosedCameras, count_uniforms, sample_pixels, update_error_map
+from pipeline.kernels.pixel_sampling import (
+    PixelLists,
+    PosedCameras,
+    SampleCounts,
+    TileErrors,
+    count_uniforms,
+    sample_pixels,
+    update_error_map,
+)
 
 PIXEL_CLASSES = ("body", "border", "outside")
 MAX_OUTSIDE_PIXELS_PER_FRAME = 20_000
@@ -89,14 +97,9 @@ class PixelPool:
         uniform_counts = count_uniforms(sample_counts, by_error_counts).tolist()
         uniforms = np.concatenate([rng.random(count) for rng, count in zip(rngs, uniform_counts, strict=True)])
         return sample_pixels(
-            self.start,
-            self.xy_px,
-            frames,
-            sample_counts,
-            by_error_counts,
-            error_map.error,
-            TILE_PX,
-            outlier_threshold,
+            PixelLists(self.start, self.xy_px),
+            SampleCounts(frames, sample_counts, by_error_counts),
+            TileErrors(error_map.error, TILE_PX, outlier_threshold),
             uniforms,
         )
 

@@ -89,4 +89,4 @@ def bake_warp_grids(skin: SkinGrid, canonical_to_posed: Float[Tensor, "n j 4 4"]
 
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         grids: Sequence[WarpGrid] = list(pool.map(bake_row, range(len(matrices))))
-    return PackedWarpGrids.of(grids, skin.cell_m).to(canonical_to_posed.device)
+    return PackedWarpGrids.from_grids(grids, skin.cell_m).to(canonical_to_posed.device)

@@ -17,9 +17,15 @@ from pipeline.kernels.common.packing import segment_ids_from_counts
 from pipeline.kernels.composite import composite
 from pipeline.kernels.hashgrid import FeatureGradients
 from pipeline.kernels.inverse_skinning import SkinGrid
-from pipeline.kernels.march import Samples
+from pipeline.kernels.march import Samples, SamplingVolume
 from pipeline.kernels.transmittance_stats import transmittance_from_weights
-from pipeline.kernels.volume_rendering import BatchSkinning, RadianceNetwork, RenderOutput, SamplingVolume, trace
+from pipeline.kernels.volume_rendering import (
+    BatchSkinning,
+    RadianceNetwork,
+    RenderOutput,
+    RenderSettings,
+    render_rays_fused,
+)
 
 
 class PosedField(NamedTuple):
@@ -72,16 +78,15 @@ def render_rays(
     if warps is None or not posed_field.supports_early_termination:
         return render_rays_dense(posed_field, rays, pose_batch, points_m, step_m, max_samples, feature_gradients)
     network = (field.hidden, field.output, field.bias)
-    return trace(
-        *rays,
+    return render_rays_fused(
+        rays,
         SamplingVolume(warps, occupancy.occupied, occupancy.bounds_m),
         RadianceNetwork(
             field.bounds_m, field.table, field.layout, *network, INITIAL_DENSITY_PER_M, MAX_ABS_LOG_DENSITY
         ),
         BatchSkinning(pose_batch.skin, pose_batch.blended(), pose_batch.frame_slots(rays)) if pose_batch else None,
         points_m,
-        step_m,
-        max_samples,
+        RenderSettings(step_m, max_samples),
         feature_gradients,
     )
 

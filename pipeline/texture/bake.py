@@ -21,7 +21,7 @@ from pipeline.core.progress import track
 from pipeline.geometry.atlas import Atlas, Texels, fill_unknown_texels
 from pipeline.geometry.camera import pixel_footprint_m, project
 from pipeline.geometry.texture_rendering import render_textured
-from pipeline.kernels.texel_projection import project_texels
+from pipeline.kernels.texel_projection import ImageView, ProjectedMesh, TexelPoints, project_texels
 from pipeline.metrics.images import (
     composite_on_white,
     composite_premultiplied_on_white,
@@ -101,15 +101,9 @@ def sample_view_at_texels(
     vertices_px, vertex_depth_m = project(view.vertices_world, view.camera)
     texels = surface.texels
     values, weight_and_cosine = project_texels(
-        vertices_px,
-        vertex_depth_m,
-        view.view_cosine,
-        surface.faces,
-        torch.from_numpy(texels.face),
-        torch.from_numpy(texels.barycentric),
-        torch.from_numpy(np.ascontiguousarray(image)),
-        depth_m,
-        torch.from_numpy(pixel_weights),
+        ProjectedMesh(vertices_px, vertex_depth_m, view.view_cosine, surface.faces),
+        TexelPoints(torch.from_numpy(texels.face), torch.from_numpy(texels.barycentric)),
+        ImageView(torch.from_numpy(np.ascontiguousarray(image)), depth_m, torch.from_numpy(pixel_weights)),
         settings.depth_tolerance_m,
     )
     return values, weight_and_cosine[:, 0] * weight_and_cosine[:, 1] ** settings.cosine_power * view.weight

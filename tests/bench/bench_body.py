@@ -1,9 +1,10 @@
-"""How well frames and body do on captures with known truth: one line for each capture and what was told of it.
+"""Accuracy of the stages frames and body on captures with ground truth: one row for each capture and known input.
 
 python -m tests.bench.bench_body CAPTURE ... [--runs runs/bench-body]
 
-Each capture is fitted three times: with its true focal length and stature, with its stature alone, and with nothing (a
-picture does not tell how large a person is: what a wrong stature adds is in the joints, not in the avatar's looks).
+Each capture is fitted three times: with its true focal length and stature, with its stature, and with neither. Images
+of one camera do not determine the size of a person: a wrong stature increases the joint errors but does not change the
+appearance of the avatar.
 """
 
 import argparse
@@ -37,11 +38,11 @@ COLUMNS = {
     "frames s": "frames_seconds",
     "body s": "body_seconds",
 }
-"""Head of each column, and the figure in it."""
+"""Title of each column, and its key in the results."""
 
 
 def known_input_configs(capture: Path) -> Iterator[tuple[str, body.Config]]:
-    """What the body stage is told, in words and as its options; stature only where the truth has a bare body."""
+    """Yield the name of each known input and its options; stature only where the ground truth has a bare body."""
     camera, bare = load_ground_truth(capture).camera, capture / "truth" / "bare.npz"
     view_deg = math.degrees(2 * math.atan(0.5 * max(camera.width, camera.height) / camera.fx))
     height_m = load_body(bare).height_m() if bare.is_file() else None
@@ -52,33 +53,33 @@ def known_input_configs(capture: Path) -> Iterator[tuple[str, body.Config]]:
 
 
 def measure(capture: Path, run: Path) -> Iterator[dict[str, str | float]]:
-    """Run both stages on a capture's video; the figures of each way, with the seconds of both stages."""
+    """Run both stages on the video of a capture; yield the results for each known input, with the seconds of both."""
     command = [sys.executable, "-m", "stages.frames", str(run), "--video", str(find_video(capture)), "--force"]
     start = time.monotonic()
     if subprocess.run(command, check=False).returncode:
-        raise UserError(f"the frames stage failed on {capture}; what it said stands above")
+        raise UserError(f"the frames stage failed on {capture}; its error is printed above")
     frames = {"frames_seconds": time.monotonic() - start} | compare_masks(capture, run / "frames")
     for known_inputs, config in known_input_configs(capture):
-        out = run / f"body, {known_inputs} told"
+        out = run / f"body, known {known_inputs}"
         out.mkdir(parents=True, exist_ok=True)
         start = time.monotonic()
         body.run({"frames": run / "frames"}, out, config)
         seconds = {"body_seconds": time.monotonic() - start}
-        found = compare_body(capture, out) | compare_surface(capture, out)
-        yield {"capture": capture.name, "known_inputs": known_inputs, **frames, **seconds, **found}
+        errors = compare_body(capture, out) | compare_surface(capture, out)
+        yield {"capture": capture.name, "known_inputs": known_inputs, **frames, **seconds, **errors}
 
 
-def format_row(figures: Mapping[str, str | float]) -> str:
-    """A row of the table."""
-    values = (figures[name] for name in COLUMNS.values())
-    return f"{figures['capture']:24s} {figures['known_inputs']:18s}" + "".join(f"{value:9.3g}" for value in values)
+def format_row(results: Mapping[str, str | float]) -> str:
+    """Return a row of the table."""
+    values = (results[name] for name in COLUMNS.values())
+    return f"{results['capture']:24s} {results['known_inputs']:18s}" + "".join(f"{value:9.3g}" for value in values)
 
 
 def main(argv: Sequence[str]) -> None:
-    """Measure, print, append the rows."""
+    """Measure, print the table, append its rows to the results."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("captures", type=Path, nargs="+", help="captures that data_tools made")
-    parser.add_argument("--runs", type=Path, default=Path("runs/bench-body"), help="where the stages write")
+    parser.add_argument("captures", type=Path, nargs="+", help="captures with ground truth, made by data_tools")
+    parser.add_argument("--runs", type=Path, default=Path("runs/bench-body"), help="folder for the runs")
     options = parser.parse_args(argv)
     rows = [row for capture in options.captures for row in measure(capture, options.runs / capture.name)]
     print(f"{'capture':24s} {'known_inputs':18s}" + "".join(f"{head:>9s}" for head in COLUMNS))

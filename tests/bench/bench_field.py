@@ -1,44 +1,43 @@
-"""Where the time of a training step of stage one goes, beside the least that this machine could need for it.
+"""Time of each part of a training step of the field, and a lower bound of that time on this machine.
 
     python -m tests.bench.bench_field [--run runs/x ...] [--baseline runs/y ...] [--preset default] [--json out.json]
 
-What finished runs say of quality is added: see `tests.bench.quality`.
+With finished runs, quality metrics are added: see `tests.bench.quality`.
 
-The step is that of the first run's frames and body, or of a painted body. Warm-up steps come first, until poses are
-refined and cells that stay empty have been given up. The occupancy is updated only every few steps: a block holds as
-many steps as it takes until all recurs, and a part's time is the median over blocks of its mean in a block; parts that
-threads do at the same time share the time that this takes. That median
-passes over the few steps of a training that begin with a rebake of the warp grids: rebake_ms is the time of one, in no
-step. A row is appended to tests/bench/results/<machine>.csv.
+The step uses frames and body of the first run, or a synthetic body. Warm-up steps come first, until poses are refined
+and permanently empty cells are marked empty. The occupancy is updated only every few steps: a block has as many steps
+as its period, and the time of a part is the median over blocks of its mean in a block. Parts that threads run
+concurrently share the elapsed time. The median excludes the few steps that begin with a rebake of the warp grids;
+rebake_ms is the time of one rebake. A row is appended to tests/bench/results/<machine>.csv.
 
-The floor of a part is the longest of three times, each at a rate that is measured in the same run: bytes at the rate of
-a copy as large as the table with its gradient and moments, multiplications and additions at that of a large matrix
-product, rows of tables at that of random rows loaded from a table as large as the largest level. Rows that lie
-together, as those of neighbouring samples do, come faster: a floor made of rows can be undercut. With n rays,
-s samples, p points (the samples, and those that should be empty), l levels of f features, w = l f, h the hidden width,
-and for poses k frames, j joints, m nodes with e skin weights that are not zero:
+The lower bound of a part is the longest of three times, each at a rate that is measured in the same run: bytes at the
+rate of a copy of the size of the table with its gradient and moments; multiplications and additions at the rate of a
+large matrix product; table rows at the rate of random rows of a table of the size of the largest level. Consecutive
+rows, as for neighbouring samples, load faster: a part can be faster than a bound by rows. With n rays, s samples, p
+points (the samples, and points that should be empty), l levels of f features, w = l f, hidden width h, and for poses k
+frames, j joints, m nodes with e nonzero skin weights:
 
-| part | work a step |
+| part | work of a step |
 |---|---|
-| draw | 84 n bytes: pixel and colour read; origin, direction, colour, background, jitter, frame written |
-| place | 24 e k operations (blending) |
-| look: march | 8 s rows of a warp grid, 16 s bytes written |
-| look: Newton | 8 s rows of blended matrices, 40 s bytes |
-| look: hash grid | 8 l p rows, (12 + 4 w) p bytes |
-| look: network | 2 (w h + 4 h) p operations, (4 w + 16) p bytes |
-| look: compositing | 32 s + 24 n bytes |
+| pixel_sampling | 84 n bytes: pixel and colour read; origin, direction, colour, background, jitter, frame written |
+| pose_blending | 24 e k operations (blending) |
+| render_rays: march | 8 s rows of a warp grid, 16 s bytes written |
+| render_rays: Newton | 8 s rows of blended matrices, 40 s bytes |
+| render_rays: hash grid | 8 l p rows, (12 + 4 w) p bytes |
+| render_rays: network | 2 (w h + 4 h) p operations, (4 w + 16) p bytes |
+| render_rays: compositing | 32 s + 24 n bytes |
 | losses | 44 n bytes |
-| network_backward | twice the network's operations in look, (8 w + 32) p bytes |
+| network_backward | twice the network's operations in render_rays, (8 w + 32) p bytes |
 | table_backward | 16 l p rows: each is read and written |
-| positions_backward | 8 l p rows, and for Newton 24 s: a node's matrix is read, its gradient read and written |
+| positions_backward | 8 l p rows, and 24 s for Newton: the matrix of a node is read, its gradient read and written |
 | rest_backward | 32 s + 68 n bytes (losses, compositing), 24 e k operations (blending) |
-| adam | 32 bytes a parameter |
+| adam | 32 bytes for each parameter |
 | occupancy_record | 4 s rows, 24 s bytes |
-| occupancy_update | hash grid and network of one point a cell |
-| skin_cut | 8 m j bytes: the weights near occupied cells, copied |
-| other | none: joining, opacities, sums |
+| occupancy_update | hash grid and network of one point in each cell |
+| skin_grid_crop | 8 m j bytes: the weights near occupied cells, copied |
+| other | none: concatenation, opacities, sums |
 
-What occupancy_update and skin_cut need counts by the part of the steps that make one.
+The work of occupancy_update and skin_grid_crop is divided by the number of steps between two of them.
 """
 
 import argparse
@@ -65,11 +64,14 @@ from pipeline.field.trainer import REBAKE_FRACTIONS, Trainer
 from stages.field import read_masked_image
 from tests.bench.machine import append_result, gather_mrow_s, machine_info, median_ms, memory_gb_s, multiply_gflop_s
 from tests.bench.parts import OTHER, REBAKE, UPDATE, PartTimer, timed_parts
-from tests.bench.quality import quality
+from tests.bench.quality import compare_quality
 from tests.field.scene import painted_scene
 
-PARTS = ("draw", "place", "render_rays", "losses")
-PARTS += (
+PARTS = (
+    "pixel_sampling",
+    "pose_blending",
+    "render_rays",
+    "losses",
     "network_backward",
     "table_backward",
     "positions_backward",
@@ -77,19 +79,19 @@ PARTS += (
     "adam",
     "occupancy_record",
     UPDATE,
-    "skin_cut",
+    "skin_grid_crop",
     OTHER,
 )
 SYNTHETIC_FRAMES = 32
 BAKE_REPEATS = 3
-"""Times that a rebake is made to be timed."""
+"""Number of timed rebakes."""
 IMAGE_HEIGHT_RATIO = 1.25
-"""Height of a painted image over that of the person in it, about."""
+"""Approximate ratio of the height of a synthetic image to the height of the person in it."""
 
 
 @dataclass(frozen=True)
 class Peaks:
-    """Rates of this machine."""
+    """Peak rates of this machine."""
 
     memory_gb_s: float
     multiply_gflop_s: float
@@ -98,21 +100,21 @@ class Peaks:
 
 @dataclass(frozen=True)
 class Work:
-    """What a part cannot do without."""
+    """Minimum work of a part: bytes of memory traffic, arithmetic operations, random table rows."""
 
     bytes: float = 0.0
     operations: float = 0.0
     rows: float = 0.0
 
     def lower_bound_ms(self, peaks: Peaks) -> float:
-        """The longest of the three times: at best the others hide behind it."""
+        """Return the longest of the three times: at best the others overlap with it."""
         seconds = (self.bytes / peaks.memory_gb_s, self.operations / peaks.multiply_gflop_s)
         return max(*(value / 1e6 for value in seconds), self.rows / peaks.gather_mrow_s / 1e3)
 
 
 @dataclass(frozen=True)
 class Timing:
-    """Milliseconds a step, of the whole and of each part, and the mean number of samples."""
+    """Milliseconds of a step and of each of its parts, and the mean number of samples."""
 
     step_ms: float
     parts_ms: dict[str, float]
@@ -120,7 +122,7 @@ class Timing:
 
 
 def trainer_from_run(run: Path, config: FieldConfig) -> Trainer:
-    """Stage one as it begins in a finished run."""
+    """Create the trainer of a finished run, at its first step."""
     capture, camera = load_capture(run / "frames"), load_camera(run / "body" / "camera.npz")
     body, motion = load_body(run / "body" / "body.npz"), load_motion(run / "body" / "motion.npz")
     camera = camera.scaled(training_scale(body, motion, camera, config.max_person_px))
@@ -131,19 +133,19 @@ def trainer_from_run(run: Path, config: FieldConfig) -> Trainer:
 
 
 def trainer_from_synthetic_body(config: FieldConfig) -> Trainer:
-    """Stage one on a painted body that turns, as tall as the preset lets it be."""
+    """Create a trainer on images of a rotating synthetic body, at the maximum height of the preset."""
     scene = painted_scene(min(SYNTHETIC_FRAMES, config.max_frames), round(IMAGE_HEIGHT_RATIO * config.max_person_px))
     masked_images = list(zip(scene.images, scene.masks, strict=True))
     return create_trainer(scene.body, scene.motion, scene.camera, masked_images, config)
 
 
 def occupancy_period(config: FieldConfig) -> int:
-    """Steps after which all recurs: updates of the occupancy."""
+    """Return the number of steps between two updates of the occupancy."""
     return config.settings.occupancy_update_interval
 
 
 def warm_up_step_count(config: FieldConfig) -> int:
-    """Steps until poses are refined and a cell that was never anything but empty is given up; whole periods."""
+    """Return the steps until poses are refined and an always empty cell is marked empty; a multiple of the period."""
     updates = math.ceil(math.log(1 / INITIAL_EMA_RATIO) / math.log(config.settings.occupancy_decay))
     emptied = config.settings.occupancy_warmup_steps + updates * config.settings.occupancy_update_interval
     poses = math.ceil(config.settings.pose_start_fraction * config.steps) if config.pose_refinement else 0
@@ -151,7 +153,7 @@ def warm_up_step_count(config: FieldConfig) -> int:
 
 
 def time_steps(trainer: Trainer, clock: PartTimer, warm_up: int, steps: int) -> Timing:
-    """Take steps; `trainer` was begun while `clock` watched."""
+    """Run and time steps; `trainer` was created within `timed_parts(clock)`."""
     for _ in range(warm_up):
         trainer.step()
     clock.pop_seconds()
@@ -168,39 +170,39 @@ def time_steps(trainer: Trainer, clock: PartTimer, warm_up: int, steps: int) -> 
 
 
 def minimum_work(trainer: Trainer, samples: float) -> dict[str, tuple[Work, ...]]:
-    """The table above, for a step as `trainer` stands now: what is done in turn in each part."""
+    """Return the table above for the current state of `trainer`: the consecutive pieces of work of each part."""
     config, field, occupancy = trainer.config, trainer.field, trainer.occupancy
     n, levels, hidden = config.rays_per_step, field.layout.levels, config.settings.hidden_width
-    asked = (config.settings.empty_points, config.settings.unobserved_points)
-    points = samples + len(occupancy.sample_empty_points(*asked, np.random.default_rng(0)))
+    point_counts = (config.settings.empty_points, config.settings.unobserved_points)
+    points = samples + len(occupancy.sample_empty_points(*point_counts, np.random.default_rng(0)))
     width = len(field.hidden)
-    moving = float(trainer.refines_poses)
+    refines = float(trainer.refines_poses)
     blending = (
-        moving * 24.0 * len(trainer.inverse_skinning.skin.sparse_weights.weight) * trainer.sampler.frames_per_step
+        refines * 24.0 * len(trainer.inverse_skinning.skin.sparse_weights.weight) * trainer.sampler.frames_per_step
     )
-    placed = moving * samples
+    refined = refines * samples
     network = 2.0 * (width * hidden + 4 * hidden)
     cells = len(occupancy.candidate_cells) / config.settings.occupancy_update_interval
     render_rays = (
         Work(bytes=16 * samples, rows=8 * samples),
-        Work(bytes=40 * placed, rows=8 * placed),
+        Work(bytes=40 * refined, rows=8 * refined),
         Work(bytes=(12 + 4 * width) * points, rows=8 * levels * points),
         Work(bytes=(4 * width + 16) * points, operations=network * points),
         Work(bytes=32 * samples + 24 * n),
     )
     return {
-        "draw": (Work(bytes=84.0 * n),),
-        "place": (Work(operations=blending),),
+        "pixel_sampling": (Work(bytes=84.0 * n),),
+        "pose_blending": (Work(operations=blending),),
         "render_rays": render_rays,
         "losses": (Work(bytes=44.0 * n),),
         "network_backward": (Work(bytes=(8 * width + 32) * points, operations=2 * network * points),),
         "table_backward": (Work(rows=16 * levels * points),),
-        "positions_backward": (Work(rows=moving * (8 * levels * points + 24 * samples)),),
+        "positions_backward": (Work(rows=refines * (8 * levels * points + 24 * samples)),),
         "rest_backward": (Work(bytes=32 * samples + 68.0 * n, operations=blending),),
         "adam": (Work(bytes=32.0 * sum(parameter.numel() for parameter in field.parameters())),),
         "occupancy_record": (Work(bytes=24 * samples, rows=4 * samples),),
         UPDATE: (Work(bytes=(12 + 4 * width) * cells, operations=network * cells, rows=8 * levels * cells),),
-        "skin_cut": (
+        "skin_grid_crop": (
             Work(bytes=8.0 * trainer.inverse_skinning.skin.weights.numel() / config.settings.occupancy_update_interval),
         ),
         OTHER: (),
@@ -208,7 +210,7 @@ def minimum_work(trainer: Trainer, samples: float) -> dict[str, tuple[Work, ...]
 
 
 def measure(trainer: Trainer, clock: PartTimer, warm_up: int, steps: int, repeats: int) -> dict[str, float]:
-    """All figures: the step, its parts, a rebake, the parts' floors, the peaks that the floors come from."""
+    """Measure the step, its parts, a rebake and the peak rates; return them with the lower bounds of the parts."""
     timing = time_steps(trainer, clock, warm_up, steps)
     rows = max(trainer.field.layout.rows_per_level, default=1 << 17)
     peaks = Peaks(
@@ -217,62 +219,65 @@ def measure(trainer: Trainer, clock: PartTimer, warm_up: int, steps: int, repeat
         gather_mrow_s(rows, trainer.field.layout.features, repeats),
     )
     work = minimum_work(trainer, timing.samples)
-    floors = {part: sum(one.lower_bound_ms(peaks) for one in work[part]) for part in PARTS}
-    figures = {"step_ms": timing.step_ms, "floor_ms": sum(floors.values()), "samples": timing.samples}
-    figures |= {f"{part}_ms": timing.parts_ms[part] for part in PARTS}
-    figures[f"{REBAKE}_ms"] = median_ms(trainer.inverse_skinning.bake, BAKE_REPEATS)
-    return figures | {f"{part}_floor_ms": floors[part] for part in PARTS} | vars(peaks)
+    bounds = {part: sum(one.lower_bound_ms(peaks) for one in work[part]) for part in PARTS}
+    results = {"step_ms": timing.step_ms, "lower_bound_ms": sum(bounds.values()), "samples": timing.samples}
+    results |= {f"{part}_ms": timing.parts_ms[part] for part in PARTS}
+    results[f"{REBAKE}_ms"] = median_ms(trainer.inverse_skinning.bake, BAKE_REPEATS)
+    return results | {f"{part}_lower_bound_ms": bounds[part] for part in PARTS} | vars(peaks)
 
 
-def table(figures: dict[str, float]) -> str:
-    """Part, ms, floor, ratio; and a rebake."""
-    lines = [f"{'part':20s} {'ms':>8s} {'floor ms':>9s} {'ratio':>6s}"]
+def format_table(results: dict[str, float]) -> str:
+    """Return a table of part, milliseconds, lower bound and ratio, and the time of a rebake."""
+    lines = [f"{'part':20s} {'ms':>8s} {'bound ms':>9s} {'ratio':>6s}"]
     for name in (*PARTS, "step"):
-        spent, least = figures[f"{name}_ms"], figures["floor_ms" if name == "step" else f"{name}_floor_ms"]
-        lines.append(f"{name:20s} {spent:8.2f} {least:9.2f} {f'{spent / least:.1f}' if least else '-':>6s}")
+        measured, bound = (
+            results[f"{name}_ms"],
+            results["lower_bound_ms" if name == "step" else f"{name}_lower_bound_ms"],
+        )
+        lines.append(f"{name:20s} {measured:8.2f} {bound:9.2f} {f'{measured / bound:.1f}' if bound else '-':>6s}")
     lines.append(
-        f"{REBAKE:20s} {figures[f'{REBAKE}_ms']:8.2f} each; {len(REBAKE_FRACTIONS)} in a training, in no step above"
+        f"{REBAKE:20s} {results[f'{REBAKE}_ms']:8.2f} each; {len(REBAKE_FRACTIONS)} in a training, not included above"
     )
     return "\n".join(lines)
 
 
 def main(argv: Sequence[str]) -> None:
-    """Measure, print, write."""
+    """Measure, print the table, append the results."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--run", type=Path, nargs="+", default=[], help="finished runs; without them a painted body")
+    parser.add_argument("--run", type=Path, nargs="+", default=[], help="finished runs; default: a synthetic body")
     parser.add_argument(
         "--baseline", type=Path, nargs="+", default=[], help="finished runs of another preset on the same videos"
     )
-    parser.add_argument("--preset", default="default", help="whose options of the field are taken")
-    parser.add_argument("--warm-up", type=int, help="steps before the first that is measured")
-    parser.add_argument("--steps", type=int, default=80, help="steps that are measured")
-    parser.add_argument("--json", type=Path, help="file for the figures")
-    parser.add_argument("--repeats", type=int, default=15, help="runs for each peak")
+    parser.add_argument("--preset", default="default", help="preset of the field options")
+    parser.add_argument("--warm-up", type=int, help="steps before the measurement")
+    parser.add_argument("--steps", type=int, default=80, help="measured steps")
+    parser.add_argument("--json", type=Path, help="file for the results")
+    parser.add_argument("--repeats", type=int, default=15, help="timed runs for each peak rate")
     options = parser.parse_args(argv)
     config = build_config("field", FieldConfig, load_layers(options.preset, {}))
     if config.settings.network != "hashgrid":
-        raise UserError(f"preset {options.preset} has no hash grid, whose floors these are; take PRESET=default")
-    quality_figures, reasons = quality(options.run, options.baseline)
+        raise UserError(f"preset {options.preset} has no hash grid, which the lower bounds are for; use PRESET=default")
+    quality_metrics, reasons = compare_quality(options.run, options.baseline)
     warm_up = warm_up_step_count(config) if options.warm_up is None else options.warm_up
     clock = PartTimer()
     with timed_parts(clock):
         trainer = trainer_from_run(options.run[0], config) if options.run else trainer_from_synthetic_body(config)
-        figures = measure(trainer, clock, warm_up, options.steps, options.repeats)
+        results = measure(trainer, clock, warm_up, options.steps, options.repeats)
     for reason in reasons:
         warn(reason)
     run_info = {
         "preset": options.preset,
         "seed": config.seed,
-        "capture": str(options.run[0]) if options.run else "painted",
+        "capture": str(options.run[0]) if options.run else "synthetic",
         "runs": len(options.run),
         "baselines": len(options.baseline),
         "warm_up": warm_up,
         "steps": options.steps,
     }
-    print(table(figures))
-    print(", ".join(f"{name} {value}" for name, value in (machine_info() | run_info | quality_figures).items()))
-    results = append_result("field", run_info | figures | quality_figures, options.json)
-    print(f"samples a step {figures['samples']:.0f}; row appended to {results}")
+    print(format_table(results))
+    print(", ".join(f"{name} {value}" for name, value in (machine_info() | run_info | quality_metrics).items()))
+    path = append_result("field", run_info | results | quality_metrics, options.json)
+    print(f"samples a step {results['samples']:.0f}; row appended to {path}")
 
 
 if __name__ == "__main__":

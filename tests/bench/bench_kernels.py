@@ -1,10 +1,9 @@
-"""Milliseconds of the kernels of stage one on made-up data of the default preset's size, and the machine's peaks.
+"""Milliseconds of the kernels of field training on synthetic data of the default preset's size, and machine peaks.
 
     python -m tests.bench.bench_kernels [--json out.json] [--repeats 15]
 
-Medians of warm runs; the machine should do nothing else. A row of figures is appended to
-tests/bench/results/<machine>.csv. A whole step, and the floor of each of its parts, is what `tests.bench.bench_field`
-measures.
+Medians of warm runs, on an otherwise idle machine. A row is appended to tests/bench/results/<machine>.csv.
+`tests.bench.bench_field` measures a complete training step and the lower bound of each of its parts.
 """
 
 import argparse
@@ -20,18 +19,18 @@ from pipeline.kernels.adam import adam_step_
 from pipeline.kernels.composite import composite
 from pipeline.kernels.hashgrid import FeatureGradients, add_table_gradient_, encode
 from pipeline.kernels.inverse_skinning import bake_warp_grid, newton_step
-from pipeline.kernels.march import PackedWarpGrids, march
+from pipeline.kernels.march import PackedWarpGrids, Rays, SamplingVolume, march
 from tests.bench.machine import append_result, median_ms, memory_gb_s, multiply_gflop_s
 from tests.kernels.bar import CELL_M, bar_skin, bend
 
 BOUNDS = np.array([[-0.8, -0.1, -0.3], [0.8, 1.9, 0.5]], dtype=np.float32)
 RAYS, SAMPLES_PER_RAY = 4096, 16
 SEED = 0
-"""Of the made-up data."""
+"""Seed of the synthetic data."""
 
 
 def ray_points(random: torch.Generator) -> torch.Tensor:
-    """Samples in runs of a few centimetres, as rays near a surface give them, in the unit box."""
+    """Return samples along short ray segments in the unit box, as near a surface."""
     start = torch.rand(RAYS, 1, 3, generator=random) * 0.8 + 0.1
     direction = torch.nn.functional.normalize(torch.randn(RAYS, 1, 3, generator=random), dim=-1)
     reach = torch.linspace(0, 0.06, SAMPLES_PER_RAY)[None, :, None]
@@ -39,7 +38,7 @@ def ray_points(random: torch.Generator) -> torch.Tensor:
 
 
 def field_parts(config: FieldConfig, repeats: int) -> dict[str, float]:
-    """Encoding, network, compositing and update, forward and backward."""
+    """Measure encoding, network, compositing and Adam, forward and backward."""
     random = torch.Generator().manual_seed(SEED)
     layout = hash_grid_layout(
         BOUNDS, 0.003, config.settings.levels, config.settings.features_per_level, config.log2_hashmap_size
@@ -83,19 +82,19 @@ def field_parts(config: FieldConfig, repeats: int) -> dict[str, float]:
 
 
 def warp_parts(repeats: int) -> dict[str, float]:
-    """Baking a frame, marching and one Newton step with its gradient, on a bending bar."""
+    """Measure warp-grid baking, ray marching and one Newton step with its gradient, on a bent bar."""
     skin, matrices = bar_skin(half_length_m=0.9, half_width_m=0.3), bend(0.6)
-    warps = PackedWarpGrids.of([bake_warp_grid(skin, matrices)], CELL_M)
+    warps = PackedWarpGrids.from_grids([bake_warp_grid(skin, matrices)], CELL_M)
     random = torch.Generator().manual_seed(SEED)
     targets = (torch.rand(RAYS, 3, generator=random) - 0.5) * torch.tensor([0.8, 0.2, 0.0])
     origins = torch.tensor([0.0, 0.0, 3.0]).expand(RAYS, 3).contiguous()
     directions = torch.nn.functional.normalize(targets - origins, dim=-1)
     box = torch.tensor([[-0.9, -0.3, -0.1], [0.9, 0.3, 0.1]])
     occupied = torch.ones(64, 64, 64, dtype=torch.uint8)
-    rays = (origins, directions, torch.zeros(RAYS, dtype=torch.long), torch.rand(RAYS, generator=random))
+    rays = Rays(origins, directions, torch.zeros(RAYS, dtype=torch.long), torch.rand(RAYS, generator=random))
 
     def march_rays():
-        return march(*rays, 0.2 / SAMPLES_PER_RAY, warps, occupied, box)
+        return march(rays, SamplingVolume(warps, occupied, box), 0.2 / SAMPLES_PER_RAY)
 
     samples = march_rays()
     ray = torch.repeat_interleave(torch.arange(RAYS), samples.ray_offsets.diff())
@@ -113,16 +112,16 @@ def warp_parts(repeats: int) -> dict[str, float]:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Measure, print, write."""
+    """Measure, print the results, append them to the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--json", type=Path, help="file for the figures")
-    parser.add_argument("--repeats", type=int, default=15, help="runs of each part")
+    parser.add_argument("--json", type=Path, help="file for the results")
+    parser.add_argument("--repeats", type=int, default=15, help="timed runs of each kernel")
     arguments = parser.parse_args(argv)
-    figures = {"memory_gb_s": memory_gb_s(arguments.repeats), "multiply_gflop_s": multiply_gflop_s(arguments.repeats)}
-    figures |= field_parts(FieldConfig(), arguments.repeats) | warp_parts(arguments.repeats)
-    for name, value in figures.items():
+    results = {"memory_gb_s": memory_gb_s(arguments.repeats), "multiply_gflop_s": multiply_gflop_s(arguments.repeats)}
+    results |= field_parts(FieldConfig(), arguments.repeats) | warp_parts(arguments.repeats)
+    for name, value in results.items():
         print(f"{name:32s} {value:10.2f}")
-    print(append_result("kernels", {"seed": SEED, "repeats": arguments.repeats} | figures, arguments.json))
+    print(append_result("kernels", {"seed": SEED, "repeats": arguments.repeats} | results, arguments.json))
 
 
 if __name__ == "__main__":

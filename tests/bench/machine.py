@@ -1,4 +1,4 @@
-"""What the benches share: medians, the peaks of this machine, and the table of its figures."""
+"""Shared by the benchmarks: medians, peak rates of this machine, and the table of results."""
 
 import csv
 import json
@@ -16,11 +16,11 @@ from pipeline.core.measure import cpu_name, describe_environment
 
 RESULTS = Path(__file__).parent / "results"
 CORNERS = 8
-"""Rows that are summed at a time: those of a cell's corners."""
+"""Rows that are summed at a time, as for the corners of a grid cell."""
 
 
 def median_ms(run: Callable[[], object], repeats: int) -> float:
-    """Median of warm runs."""
+    """Return the median time of warm runs."""
     run()
     times = []
     for _ in range(repeats):
@@ -31,19 +31,19 @@ def median_ms(run: Callable[[], object], repeats: int) -> float:
 
 
 def memory_gb_s(repeats: int, touched_bytes: int = 1 << 28) -> float:
-    """Bandwidth of a copy; source and target are `touched_bytes` large together, by default too large for caches."""
+    """Measure the bandwidth of a copy; source and target have `touched_bytes` together, by default more than caches."""
     source, target = torch.ones(touched_bytes // 8), torch.empty(touched_bytes // 8)
     return 2 * source.numel() * 4 / 1e6 / median_ms(lambda: target.copy_(source), repeats)
 
 
 def multiply_gflop_s(repeats: int) -> float:
-    """Rate of a large matrix product."""
+    """Measure the rate of a large matrix product."""
     a, b = torch.rand(2048, 2048), torch.rand(2048, 2048)
     return 2 * 2048**3 / 1e6 / median_ms(lambda: a @ b, repeats)
 
 
 def gather_mrow_s(rows: int, features: int, repeats: int) -> float:
-    """Millions of random rows of a table of float32 that are loaded a second, eight at a time and summed."""
+    """Measure the rate of loading random rows of a float32 table, in groups of eight that are summed (Mrow/s)."""
     random = torch.Generator().manual_seed(0)
     table = torch.rand(rows, features, generator=random)
     drawn = torch.randint(rows, (1 << 16, CORNERS), generator=random, dtype=torch.int32)
@@ -52,7 +52,7 @@ def gather_mrow_s(rows: int, features: int, repeats: int) -> float:
 
 
 def machine_info() -> dict[str, str | int]:
-    """What is measured, on what."""
+    """Return commit, machine and numbers of threads."""
     return {
         "commit": describe_environment()["commit"] or "unknown",
         "machine": platform.node(),
@@ -63,13 +63,13 @@ def machine_info() -> dict[str, str | int]:
 
 
 def append_result(
-    bench: str, figures: Mapping[str, object], json_path: Path | None = None, folder: Path = RESULTS
+    bench: str, results: Mapping[str, object], json_path: Path | None = None, folder: Path = RESULTS
 ) -> Path:
-    """Add a row to the machine's table, which has the columns of all benches; returns the table.
+    """Append a row to the machine's table, which has the columns of all benchmarks; return the path of the table.
 
-    json_path: a file for the same row alone, not rounded.
+    json_path: additional file for the same row, not rounded.
     """
-    row = {"bench": bench} | machine_info() | figures
+    row = {"bench": bench} | machine_info() | results
     if json_path:
         json_path.write_text(json.dumps(row, indent=2) + "\n", encoding="utf-8")
     folder.mkdir(exist_ok=True)

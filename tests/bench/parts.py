@@ -1,4 +1,4 @@
-"""Where the time of a training step goes: a clock at the seams of stage one, which stays as it is."""
+"""Timers for the parts of a training step: functions of the field are wrapped while it runs, without changing it."""
 
 import inspect
 import threading
@@ -32,10 +32,10 @@ REBAKE = "rebake"
 TIMED_FUNCTIONS: tuple[tuple[str, Any, str], ...] = (
     (OTHER, Trainer, "step"),
     (REBAKE, BakedInverseSkinning, "bake"),
-    ("draw", RaySampler, "sample_rays"),
-    ("draw", OccupancyGrid, "sample_empty_points"),
-    ("place", BakedInverseSkinning, "pose_batch"),
-    ("place", PoseBatch, "blended"),
+    ("pixel_sampling", RaySampler, "sample_rays"),
+    ("pixel_sampling", OccupancyGrid, "sample_empty_points"),
+    ("pose_blending", BakedInverseSkinning, "pose_batch"),
+    ("pose_blending", PoseBatch, "blended"),
     ("render_rays", trainer_module, "render_rays"),
     ("losses", trainer_module, "field_losses"),
     ("losses", PoseCorrection, "temporal_roughness"),
@@ -50,13 +50,13 @@ TIMED_FUNCTIONS: tuple[tuple[str, Any, str], ...] = (
     ("adam", optimiser_module, "adam_step_"),
     ("occupancy_record", OccupancyGrid, "record_observations"),
     (UPDATE, OccupancyGrid, "update"),
-    ("skin_cut", BakedInverseSkinning, "crop_skin_grid"),
+    ("skin_grid_crop", BakedInverseSkinning, "crop_skin_grid"),
 )
 
 
 @dataclass
 class ThreadTimes:
-    """What one thread has done: seconds of each part, those that run now, the innermost last, and since when."""
+    """Times of one thread: seconds of each part, the running parts (innermost last), and the last time stamp."""
 
     seconds: dict[str, float] = field(default_factory=partial(defaultdict, float))
     running: list[str] = field(default_factory=list)
@@ -64,24 +64,26 @@ class ThreadTimes:
 
 
 class PartTimer:
-    """Seconds of each part. A moment counts for the innermost part that runs; only an update of the occupancy keeps the
-    time of the kernels that it calls. What threads do at the same time shares the time that this takes.
+    """Measures the seconds of each part. Time is charged to the innermost running part.
+
+    Exceptions: an update of the occupancy includes the kernels that it calls; parts that threads run concurrently
+    share the elapsed time.
     """
 
     def __init__(self, now: Callable[[], float] = time.perf_counter) -> None:
-        self._now, self._of_thread = now, threading.local()
+        self._now, self._thread_local = now, threading.local()
         self._thread_times = ThreadTimes()
 
     @property
     def _thread_times(self) -> ThreadTimes:
-        return self._of_thread.times
+        return self._thread_local.times
 
     @_thread_times.setter
     def _thread_times(self, times: ThreadTimes) -> None:
-        self._of_thread.times = times
+        self._thread_local.times = times
 
     def timed(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """The function, its time counted as that of `part`."""
+        """Return the function with its time charged to `part`."""
 
         @wraps(function)
         def run(*arguments: Any, **named: Any) -> Any:
@@ -98,24 +100,24 @@ class PartTimer:
         return run
 
     def timed_parallel_map(self, part: str, map_jobs: Callable[..., Any]) -> Callable[..., Any]:
-        """`ThreadPool.map`, each job begun as `part`. Its whole time is divided as the jobs' own times are."""
+        """Return `ThreadPool.map` with its elapsed time divided in proportion to the times of its jobs."""
 
         @wraps(map_jobs)
         def run(threads: Any, function: Callable[..., Any], *arguments: Any) -> Any:
             thread_times: list[ThreadTimes] = []
 
-            def job(*of_job: Any) -> Any:
-                outside = getattr(self._of_thread, "times", None)
+            def job(*job_arguments: Any) -> Any:
+                outside = getattr(self._thread_local, "times", None)
                 self._thread_times = ThreadTimes()
                 thread_times.append(self._thread_times)
                 try:
-                    return self.timed(part, function)(*of_job)
+                    return self.timed(part, function)(*job_arguments)
                 finally:
                     self._thread_times = outside or ThreadTimes()
 
             self._charge_elapsed()
             start_seconds = self._thread_times.since
-            answers = map_jobs(threads, job, *arguments)
+            results = map_jobs(threads, job, *arguments)
             self._thread_times.since = self._now()
             total_job_seconds = sum(sum(times.seconds.values()) for times in thread_times)
             for times in thread_times:
@@ -123,12 +125,12 @@ class PartTimer:
                     self._thread_times.seconds[name] += (
                         seconds * (self._thread_times.since - start_seconds) / (total_job_seconds or 1.0)
                     )
-            return answers
+            return results
 
         return run
 
     def pop_seconds(self) -> dict[str, float]:
-        """Seconds of each part since the last call, in the thread that steps."""
+        """Return the seconds of each part since the last call, in the calling thread."""
         taken, self._thread_times.seconds = self._thread_times.seconds, defaultdict(float)
         return taken
 
@@ -141,7 +143,7 @@ class PartTimer:
 
 @contextmanager
 def timed_parts(clock: PartTimer) -> Iterator[None]:
-    """While it lasts, `clock` counts the parts of every step of a `Trainer` that was begun in it."""
+    """Within this context `clock` measures the parts of every step of a `Trainer` that is created in it."""
     with ExitStack() as stack:
 
         def wrap(target: Any, name: str, change: Callable[[Any], Any]) -> None:

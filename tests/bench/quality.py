@@ -1,4 +1,4 @@
-"""What finished runs say of quality: seconds of the field, and what it gains over baselines on the same videos."""
+"""Quality of finished runs: seconds of the field stage, speedup and PSNR gain over baselines on the same videos."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,46 +10,48 @@ from pipeline.core.errors import UserError
 from pipeline.core.manifest import Manifest, read_manifest
 
 TOLERANCE_DB = 0.1
-"""A run is as good as a baseline when its validation PSNR (whole image) lies no more than this below it."""
+"""A run reaches the quality of a baseline if its validation PSNR (whole image) is at most this much lower."""
 
-FIGURES = ("field_seconds", "speedup_to_quality", "psnr_gain_db")
+METRICS = ("field_seconds", "speedup_to_quality", "psnr_gain_db")
 _HELD_OUT = "field_psnr_full_db"
 
 Curve = Sequence[tuple[float, float, float]]
-"""Rows of `field/progress.csv`: seconds of learning, validation PSNR (dB) of whole image and body."""
+"""Rows of `field/progress.csv`: seconds of training, validation PSNR (dB) of the whole image and of the body."""
 
 
-def quality(runs: Sequence[Path], baselines: Sequence[Path]) -> tuple[dict[str, float | None], list[str]]:
-    """`FIGURES`, None where they cannot be told, and why they cannot.
+def compare_quality(runs: Sequence[Path], baselines: Sequence[Path]) -> tuple[dict[str, float | None], list[str]]:
+    """Return `METRICS`, None where unknown, and the reasons why they are unknown.
 
-    Several runs, of several seeds or videos, count by their medians: field_seconds over the runs, the others over all
-    pairs of a run and a baseline of the same video. field_seconds: of the run's stage. speedup_to_quality: see
-    `speedup`, of the two `field/progress.csv`. psnr_gain_db: of the field on held-out frames, whole image, run minus
-    baseline, as the two reports have it. What a single pair does not tell is not told.
+    With several runs (seeds or videos) each metric is a median: field_seconds over the runs, the others over all pairs
+    of a run and a baseline of the same video. A metric that is unknown for one pair is unknown.
 
-    Raises:
-        UserError: a field is not finished, or a run has no baseline of its video.
+    field_seconds: duration of the run's field stage. speedup_to_quality: see `speedup`. psnr_gain_db: PSNR of the field
+    on held-out frames, whole image, run minus baseline, from the reports.
+
+    Raises UserError if a field stage is not finished, or a run has no baseline of its video.
     """
-    figures: dict[str, float | None] = dict.fromkeys(FIGURES)
+    metrics: dict[str, float | None] = dict.fromkeys(METRICS)
     if not runs:
-        return figures, ["no RUN is given: its field's seconds, speedup and gain are unknown"]
-    figures["field_seconds"] = median(_finished(run, FIELD).seconds for run in runs)
+        return metrics, ["no RUN: field seconds, speedup and PSNR gain are unknown"]
+    metrics["field_seconds"] = median(_finished(run, FIELD).seconds for run in runs)
     if not baselines:
-        return figures, ["no BASELINE is given: speedup and gain are unknown"]
+        return metrics, ["no BASELINE: speedup and PSNR gain are unknown"]
     pairs = _pairs(runs, baselines)
-    found = [speedup(*(read_progress(run / FIELD) for run in pair)) for pair in pairs]
-    reasons = [f"{run} and {other}: {reason}" for (run, other), (_, reason) in zip(pairs, found, strict=True) if reason]
-    figures["speedup_to_quality"] = _median_of_all([factor for factor, _ in found])
-    figures["psnr_gain_db"] = _median_of_all([_gain_db(*pair) for pair in pairs])
-    if figures["psnr_gain_db"] is None:
-        reasons.append("a report is not finished: the gain on held-out frames is unknown")
-    return figures, reasons
+    speedups = [speedup(*(read_progress(run / FIELD) for run in pair)) for pair in pairs]
+    reasons = [
+        f"{run} and {other}: {reason}" for (run, other), (_, reason) in zip(pairs, speedups, strict=True) if reason
+    ]
+    metrics["speedup_to_quality"] = _median_of_all([factor for factor, _ in speedups])
+    metrics["psnr_gain_db"] = _median_of_all([_gain_db(*pair) for pair in pairs])
+    if metrics["psnr_gain_db"] is None:
+        reasons.append("a report stage is not finished: the PSNR gain on held-out frames is unknown")
+    return metrics, reasons
 
 
 def speedup(curve: Curve, baseline: Curve) -> tuple[float | None, str]:
-    """Seconds of learning of the whole baseline over those until the run's first row that is as good as its last.
+    """Return training seconds of the baseline divided by those of the run until it reaches the baseline's last PSNR.
 
-    None with the reason when there is no such row.
+    None and the reason if the run never reaches it.
     """
     if not curve or not baseline:
         return None, "field/progress.csv is missing: the speedup is unknown"
@@ -72,7 +74,7 @@ def _finished(run: Path, stage: str) -> Manifest:
 
 
 def _pairs(runs: Sequence[Path], baselines: Sequence[Path]) -> list[tuple[Path, Path]]:
-    """Each run with each baseline of its video."""
+    """Return each run with each baseline of its video."""
     for baseline in baselines:
         _finished(baseline, FIELD)
     videos = {baseline: _finished(baseline, "frames").inputs for baseline in baselines}
@@ -80,8 +82,8 @@ def _pairs(runs: Sequence[Path], baselines: Sequence[Path]) -> list[tuple[Path, 
     for run in runs:
         mine = [(run, baseline) for baseline in baselines if videos[baseline] == _finished(run, "frames").inputs]
         if not mine:
-            given = ", ".join(map(str, baselines))
-            raise UserError(f"{run} and {given} are not of the same video: give a BASELINE of each RUN's video")
+            names = ", ".join(map(str, baselines))
+            raise UserError(f"{run} and {names} are not of the same video: pass a BASELINE of each RUN's video")
         pairs += mine
     return pairs
 
@@ -92,6 +94,6 @@ def _gain_db(run: Path, baseline: Path) -> float | None:
 
 
 def _median_of_all(values: Sequence[float | None]) -> float | None:
-    """The median, or None if one is not known: leaving it out would flatter the rest."""
+    """Return the median, or None if a value is unknown: dropping it would bias the result."""
     known = [value for value in values if value is not None]
     return median(known) if len(known) == len(values) else None

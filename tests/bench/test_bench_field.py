@@ -17,9 +17,9 @@ from tests.bench.bench_field import (
     PARTS,
     Peaks,
     Work,
+    format_table,
     minimum_work,
     occupancy_period,
-    table,
     time_steps,
     trainer_from_synthetic_body,
     warm_up_step_count,
@@ -55,7 +55,7 @@ def trainer_and_timing():
 def test_parts_sum_to_the_step(trainer_and_timing):
     _, timing = trainer_and_timing
     assert sum(timing.parts_ms.values()) == pytest.approx(timing.step_ms, rel=0.15)
-    assert [part for part, spent_ms in timing.parts_ms.items() if spent_ms <= 0] == []
+    assert [part for part, part_ms in timing.parts_ms.items() if part_ms <= 0] == []
     assert timing.samples > 0
 
 
@@ -78,7 +78,7 @@ def test_timed_functions_are_restored():
 
 
 def test_rebake_time_is_excluded_from_the_step(monkeypatch):
-    """Step 24 of 40 begins with one; by this clock nothing else takes time."""
+    """Step 24 of 40 begins with a rebake; with this clock nothing else takes time."""
     trainer, now_s = trainer_from_synthetic_body(TINY), [0.0]
     monkeypatch.setattr(BakedInverseSkinning, "bake", lambda _: now_s.append(now_s[-1] + 1000.0))
     clock = PartTimer(lambda: now_s[-1])
@@ -105,7 +105,7 @@ def test_nested_parts_are_not_counted_twice():
 
 
 def test_parallel_parts_share_the_elapsed_time():
-    """Two jobs whose own times are 3 and 1 and of which "inner" takes 1 and 1, in a time of 2 by the step's clock."""
+    """Two jobs with times 3 and 1, of which "inner" takes 1 and 1, within an elapsed time of 2."""
     now, thread_now = [10.0], threading.local()
     clock = PartTimer(lambda: getattr(thread_now, "s", now[0]))
 
@@ -145,7 +145,7 @@ def test_failing_part_is_timed_and_closed():
     assert clock.pop_seconds() == {"outer": 2, "inner": 1, "after": 1}
 
 
-def test_the_floor_is_the_longest_of_three_times():
+def test_lower_bound_is_the_longest_of_three_times():
     peaks = Peaks(memory_gb_s=10, multiply_gflop_s=100, gather_mrow_s=1000)
     assert Work(bytes=1e7).lower_bound_ms(peaks) == pytest.approx(1)
     assert Work(operations=1e8).lower_bound_ms(peaks) == pytest.approx(1)
@@ -153,7 +153,7 @@ def test_the_floor_is_the_longest_of_three_times():
     assert Work(bytes=1e7, operations=3e8, rows=2e6).lower_bound_ms(peaks) == pytest.approx(3)
 
 
-def test_the_work_of_a_step(trainer_and_timing):
+def test_minimum_work_of_a_step(trainer_and_timing):
     trainer, _ = trainer_and_timing
     work = minimum_work(trainer, samples=1000)
     assert set(work) == set(PARTS)
@@ -179,23 +179,23 @@ def test_warm_up_covers_pose_refinement_and_occupancy():
     assert warm_up_step_count(FieldConfig(steps=4000)) == 400
 
 
-def test_the_command_prints_and_writes(tmp_path, monkeypatch, capsys):
+def test_command_prints_and_writes_results(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(bench_field, "append_result", partial(append_result, folder=tmp_path))
     monkeypatch.setattr(bench_field, "build_config", lambda *_: TINY)
     monkeypatch.setattr(bench_field, "memory_gb_s", lambda *_: 10.0)
     monkeypatch.setattr(bench_field, "multiply_gflop_s", lambda *_: 100.0)
     path = tmp_path / "out.json"
     bench_field.main(["--steps", "2", "--warm-up", "0", "--repeats", "1", "--json", str(path)])
-    figures = json.loads(path.read_text())
-    assert figures["step_ms"] > 0
-    assert figures["floor_ms"] == pytest.approx(sum(figures[f"{part}_floor_ms"] for part in PARTS))
-    assert np.isfinite(figures["samples"])
-    assert figures.items() >= (machine_info() | {"seed": 0, "capture": "painted", "runs": 0}).items()
-    assert figures["rebake_ms"] > 0
-    assert table(figures) in capsys.readouterr().out
+    results = json.loads(path.read_text())
+    assert results["step_ms"] > 0
+    assert results["lower_bound_ms"] == pytest.approx(sum(results[f"{part}_lower_bound_ms"] for part in PARTS))
+    assert np.isfinite(results["samples"])
+    assert results.items() >= (machine_info() | {"seed": 0, "capture": "synthetic", "runs": 0}).items()
+    assert results["rebake_ms"] > 0
+    assert format_table(results) in capsys.readouterr().out
     assert len(list(tmp_path.glob("*.csv"))) == 1
 
 
-def test_a_field_without_a_hash_grid_is_refused():
+def test_preset_without_hash_grid_is_rejected():
     with pytest.raises(UserError, match="hash grid"):
         bench_field.main(["--preset", "animnerf"])

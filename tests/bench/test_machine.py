@@ -6,7 +6,7 @@ import torch
 from tests.bench.machine import append_result, gather_mrow_s, machine_info
 
 
-def test_rows_of_all_benches_share_a_table(tmp_path):
+def test_rows_of_all_benchmarks_share_a_table(tmp_path):
     folder = tmp_path / "results"
     append_result("kernels", {"adam_ms": 1.23456}, folder=folder)
     append_result("field", {"step_ms": 20, "preset": "default"}, folder=folder)
@@ -19,7 +19,7 @@ def test_rows_of_all_benches_share_a_table(tmp_path):
     assert rows[0]["threads"] == str(torch.get_num_threads())
 
 
-def test_a_table_of_fewer_columns_is_continued(tmp_path):
+def test_table_with_fewer_columns_is_extended(tmp_path):
     path = append_result("kernels", {}, folder=tmp_path)
     path.write_text("commit,adam_ms\nabc,3\n")
     append_result("field", {"step_ms": 4}, folder=tmp_path)
@@ -34,5 +34,5 @@ def test_json_file_holds_results_and_machine_info(tmp_path):
     assert json.loads((tmp_path / "out.json").read_text()) == {"bench": "kernels", "adam_ms": 1.23456} | machine_info()
 
 
-def test_random_rows_are_counted():
+def test_gather_rate_is_positive():
     assert gather_mrow_s(1 << 10, 4, 1) > 0

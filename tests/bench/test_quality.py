@@ -1,4 +1,4 @@
-"""Closed forms on made-up runs: when a curve reaches another's end, what is gained, and what cannot be told."""
+"""Speedup and PSNR gain of synthetic runs with known values, and unknown values with their reasons."""
 
 import json
 from dataclasses import replace
@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import Manifest, write_manifest
-from tests.bench.quality import quality, speedup
+from tests.bench.quality import compare_quality, speedup
 
 SLOW = [(100.0, 25.0, 18.0), (400.0, 29.0, 21.0), (1000.0, 30.0, 22.0)]
 QUICK = [(10.0, 24.0, 17.0), (20.0, 29.89, 21.9), (25.0, 29.9, 21.9), (40.0, 31.0, 23.0)]
@@ -17,10 +17,10 @@ QUICK = [(10.0, 24.0, 17.0), (20.0, 29.89, 21.9), (25.0, 29.9, 21.9), (40.0, 31.
 def finished_run(
     folder: Path, curve: list[tuple[float, float, float]], held_out_db: float | None, video: str, seconds: float = 45.5
 ) -> Path:
-    place = Manifest("", 1, "", {}, {"video": video}, {}, {}, seconds, 100.0)
+    manifest = Manifest("", 1, "", {}, {"video": video}, {}, {}, seconds, 100.0)
     for stage in ("frames", "field", "report"):
         (folder / stage).mkdir(parents=True)
-        write_manifest(replace(place, stage=stage), folder / stage / "manifest.json")
+        write_manifest(replace(manifest, stage=stage), folder / stage / "manifest.json")
     lines = ["step,seconds,validation_psnr_db,validation_psnr_body_db"]
     lines += [f"{step},{seconds},{full},{body}" for step, (seconds, full, body) in enumerate(curve)]
     (folder / "field" / "progress.csv").write_text("\n".join(lines) + "\n")
@@ -29,7 +29,7 @@ def finished_run(
 
 
 def test_speedup_tolerance_is_a_tenth_of_a_decibel() -> None:
-    """30.0 dB are reached within 0.1 dB after 25 s, not yet after 20 s: 1000 / 25."""
+    """30.0 dB - 0.1 dB is reached after 25 s, not after 20 s: 1000 / 25."""
     assert speedup(QUICK, SLOW) == (40.0, "")
 
 
@@ -46,13 +46,13 @@ def test_unreached_quality_gives_a_reason() -> None:
 
 def test_two_runs(tmp_path: Path) -> None:
     run, baseline = finished_run(tmp_path / "a", QUICK, 30.75, "x"), finished_run(tmp_path / "b", SLOW, 30.5, "x")
-    figures, reasons = quality([run], [baseline])
-    assert figures == {"field_seconds": 45.5, "speedup_to_quality": 40.0, "psnr_gain_db": 0.25}
+    metrics, reasons = compare_quality([run], [baseline])
+    assert metrics == {"field_seconds": 45.5, "speedup_to_quality": 40.0, "psnr_gain_db": 0.25}
     assert reasons == []
 
 
 def test_several_seeds_and_videos_are_summarised_by_medians(tmp_path: Path) -> None:
-    """Pairs by hand: two runs of video x with one baseline, one of video y with two; 40, 20, 8, 16 times as fast."""
+    """Two runs of video x with one baseline, one of video y with two; speedups of the pairs: 40, 20, 8, 16."""
 
     def slower(factor: float) -> list[tuple[float, float, float]]:
         return [(factor * seconds, full, body) for seconds, full, body in QUICK]
@@ -68,43 +68,43 @@ def test_several_seeds_and_videos_are_summarised_by_medians(tmp_path: Path) -> N
         finished_run(tmp_path / "by0", SLOW, 30.5, "y"),
         finished_run(tmp_path / "by1", longer, 30.8, "y"),
     ]
-    figures, reasons = quality(runs, baselines)
+    metrics, reasons = compare_quality(runs, baselines)
     assert reasons == []
-    assert figures["speedup_to_quality"] == pytest.approx((20 + 16) / 2)
-    assert figures["psnr_gain_db"] == pytest.approx((0.1 + 0.2) / 2)
+    assert metrics["speedup_to_quality"] == pytest.approx((20 + 16) / 2)
+    assert metrics["psnr_gain_db"] == pytest.approx((0.1 + 0.2) / 2)
 
 
 def test_unknown_pair_makes_the_median_unknown(tmp_path: Path) -> None:
     runs = [finished_run(tmp_path / "a", QUICK, 30.5, "x"), finished_run(tmp_path / "b", SLOW[:1], None, "x")]
-    figures, reasons = quality(runs, [finished_run(tmp_path / "c", SLOW, 30.5, "x")])
-    assert (figures["speedup_to_quality"], figures["psnr_gain_db"]) == (None, None)
+    metrics, reasons = compare_quality(runs, [finished_run(tmp_path / "c", SLOW, 30.5, "x")])
+    assert (metrics["speedup_to_quality"], metrics["psnr_gain_db"]) == (None, None)
     assert any("b and" in reason and "never reaches" in reason for reason in reasons)
 
 
 def test_missing_inputs_give_null_with_a_reason(tmp_path: Path) -> None:
     run = finished_run(tmp_path / "a", QUICK, None, "x")
-    assert quality([], []) == (
+    assert compare_quality([], []) == (
         dict.fromkeys(("field_seconds", "speedup_to_quality", "psnr_gain_db")),
-        ["no RUN is given: its field's seconds, speedup and gain are unknown"],
+        ["no RUN: field seconds, speedup and PSNR gain are unknown"],
     )
-    figures, (reason,) = quality([run], [])
-    assert (figures["field_seconds"], figures["speedup_to_quality"], figures["psnr_gain_db"]) == (45.5, None, None)
+    metrics, (reason,) = compare_quality([run], [])
+    assert (metrics["field_seconds"], metrics["speedup_to_quality"], metrics["psnr_gain_db"]) == (45.5, None, None)
     assert "no BASELINE" in reason
-    unscored, (reason,) = quality([run], [finished_run(tmp_path / "b", SLOW, 30.5, "x")])
+    unscored, (reason,) = compare_quality([run], [finished_run(tmp_path / "b", SLOW, 30.5, "x")])
     assert unscored["psnr_gain_db"] is None
-    assert "report is not finished" in reason
+    assert "report stage is not finished" in reason
 
 
 def test_seconds_are_the_median_of_the_runs(tmp_path: Path) -> None:
     runs = [
         finished_run(tmp_path / name, QUICK, None, "x", seconds) for name, seconds in (("a", 9), ("b", 5), ("c", 6))
     ]
-    assert quality(runs, [])[0]["field_seconds"] == 6
+    assert compare_quality(runs, [])[0]["field_seconds"] == 6
 
 
 def test_runs_of_different_videos_are_rejected(tmp_path: Path) -> None:
     run, other = finished_run(tmp_path / "a", QUICK, 30.0, "x"), finished_run(tmp_path / "b", SLOW, 30.0, "y")
     with pytest.raises(UserError, match="not of the same video"):
-        quality([run], [other])
+        compare_quality([run], [other])
     with pytest.raises(UserError, match="has no finished field"):
-        quality([tmp_path], [])
+        compare_quality([tmp_path], [])

@@ -8,7 +8,7 @@ from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.geometry.surface import signed_distance_m
 from pipeline.kernels.inverse_skinning import newton_step
 from pipeline.kernels.inverse_skinning.reference import skin_points
-from pipeline.kernels.march import march
+from pipeline.kernels.march import Rays, SamplingVolume, march
 from tests.field.scene import make_motion
 
 
@@ -72,16 +72,10 @@ def test_lookup_and_one_newton_step_invert_skinning(body, skin):
     blended = skin.blend(posed_matrices[2:])
     posed = skin_points(points, blended[:, 0], skin.lattice)
     count = len(points)
-    samples = march(
-        posed,
-        torch.tensor([[0.0, 0.0, 1.0]]).expand(count, 3),
-        torch.full((count,), 2),
-        torch.zeros(count),
-        99.0,
-        warps,
-        torch.ones(2, 2, 2, dtype=torch.uint8),
-        torch.tensor([[-9.0, -9, -9], [9, 9, 9]]),
-    )
+    directions, frame = torch.tensor([[0.0, 0.0, 1.0]]).expand(count, 3), torch.full((count,), 2)
+    box_m = torch.tensor([[-9.0, -9, -9], [9, 9, 9]])
+    volume = SamplingVolume(warps, torch.ones(2, 2, 2, dtype=torch.uint8), box_m)
+    samples = march(Rays(posed, directions, frame, torch.zeros(count)), volume, 99.0)
     point_indices = torch.repeat_interleave(torch.arange(count), samples.ray_offsets.diff())
     assert float((samples.ray_offsets.diff() > 0).float().mean()) > 0.995
     refined = newton_step(

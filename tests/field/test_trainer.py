@@ -14,7 +14,7 @@ from pipeline.field.rendering import render_field
 from pipeline.field.setup import create_trainer, evenly_spaced, training_scale
 from pipeline.field.trainer import MAX_SAMPLES_PER_RAY
 from pipeline.field.volume_rendering import sample_positions
-from pipeline.kernels.volume_rendering import trace
+from pipeline.kernels.volume_rendering import RenderSettings
 from tests.field.scene import field_config, painted_scene, psnr_on_white_db
 
 TRAIN = np.array([0, 1, 3, 4, 6, 7, 9, 10])
@@ -134,7 +134,7 @@ def test_parts_of_a_step_add_up_to_the_whole(scene, monkeypatch, frames_per_step
     }
     found = []
     # The subsampling of small gradients depends on the order of the samples.
-    monkeypatch.setattr(volume_rendering, "trace", partial(trace, subsampling_threshold=0.0))
+    monkeypatch.setattr(volume_rendering, "RenderSettings", partial(RenderSettings, gradient_subsampling_threshold=0.0))
     for count in (1, 2):
         trainer = make_trainer(scene, steps=40, **options)
         for _ in range(6):

@@ -13,7 +13,7 @@ from pipeline.field.inverse_skinning import Rays
 from pipeline.field.trainer import MAX_SAMPLES_PER_RAY, Trainer
 from pipeline.field.volume_rendering import PosedField, render_rays, render_rays_dense
 from pipeline.kernels.hashgrid import FeatureGradients, add_table_gradient_
-from pipeline.kernels.volume_rendering import MIN_TRANSMITTANCE, RenderOutput, trace
+from pipeline.kernels.volume_rendering import MIN_TRANSMITTANCE, RenderOutput, RenderSettings
 from tests.field.test_trainer import make_trainer, sample_rays, scene  # noqa: F401 - a fixture
 
 
@@ -55,14 +55,14 @@ def gradients(trainer: Trainer, found: RenderOutput, feature_gradients: FeatureG
     return {"table": table} | {name: value for name, value in named if value is not None}
 
 
-def complete_trace(subsampling_threshold: float = 0.0):
-    """The kernel without early termination and gradient subsampling."""
-    return partial(trace, min_transmittance=0.0, subsampling_threshold=subsampling_threshold)
+def exact_settings(subsampling_threshold: float = 0.0):
+    """`RenderSettings` without early termination, by default without gradient subsampling."""
+    return partial(RenderSettings, min_transmittance=0.0, gradient_subsampling_threshold=subsampling_threshold)
 
 
 @pytest.mark.parametrize("exact", [True, False])
 def test_the_kernel_without_shortcuts_equals_the_reference(trainer, monkeypatch, exact):
-    monkeypatch.setattr(module, "trace", complete_trace())
+    monkeypatch.setattr(module, "RenderSettings", exact_settings())
     monkeypatch.setattr(field_module, "MIN_RELATIVE_GRADIENT", 0.0)
     (ours, feature_gradients), (twin, reference_feature_gradients) = (
         rendered(trainer, render_rays, exact),
@@ -99,11 +99,11 @@ def test_early_termination_changes_images_by_less_than_its_threshold(trainer, mo
 
 def test_gradient_subsampling_is_unbiased(trainer, monkeypatch):
     """The samples that are kept are weighted for those that are dropped."""
-    monkeypatch.setattr(module, "trace", complete_trace())
+    monkeypatch.setattr(module, "RenderSettings", exact_settings())
     truth = gradients(trainer, *rendered(trainer, render_rays))
     taken = {}
     for subsampling_threshold in (0.3, 3.0):
-        monkeypatch.setattr(module, "trace", complete_trace(subsampling_threshold))
+        monkeypatch.setattr(module, "RenderSettings", exact_settings(subsampling_threshold))
         found, feature_gradients = rendered(trainer, render_rays)
         subsampled = gradients(trainer, found, feature_gradients)
         taken[subsampling_threshold] = len(feature_gradients[0][0])
@@ -118,7 +118,7 @@ def test_gradient_subsampling_is_unbiased(trainer, monkeypatch):
 
 
 def test_the_sample_buffer_grows(trainer, monkeypatch):
-    monkeypatch.setattr(module, "trace", complete_trace())
+    monkeypatch.setattr(module, "RenderSettings", exact_settings())
     large, _ = rendered(trainer, render_rays)
     monkeypatch.setattr("pipeline.kernels.volume_rendering.INITIAL_SAMPLES_PER_RAY", 1)
     small, _ = rendered(trainer, render_rays)

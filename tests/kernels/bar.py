@@ -1,4 +1,4 @@
-"""A bar of two bones along x that bends in its middle: the smallest thing that inverse skinning is hard for."""
+"""Test body: a bar along x with two bones, which bends in the middle."""
 
 import numpy as np
 import torch
@@ -9,7 +9,7 @@ CELL_M = 0.05
 
 
 def bar_skin(half_length_m=0.6, half_width_m=0.15) -> SkinGrid:
-    """Nodes fill the bar's box; the second bone's weight rises smoothly from x = -0.15 m to 0.15 m."""
+    """Skin grid of the bar; the weight of the second bone rises smoothly from x = -0.15 m to 0.15 m."""
     axes = [np.arange(-half, half + 1e-6, CELL_M) for half in (half_length_m, half_width_m, half_width_m)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).astype(np.float32)
     shape = nodes.shape[:3]
@@ -23,7 +23,7 @@ def bar_skin(half_length_m=0.6, half_width_m=0.15) -> SkinGrid:
 
 
 def bend(angle_rad: float, dtype=torch.float32) -> torch.Tensor:
-    """Skinning matrices (2, 4, 4): the second bone turns about z at the origin."""
+    """Skinning matrices (2, 4, 4): the second bone rotates about z at the origin."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     rotation = torch.eye(4, dtype=dtype)
     rotation[:2, :2] = torch.tensor([[c, -s], [s, c]], dtype=dtype)
@@ -31,6 +31,6 @@ def bend(angle_rad: float, dtype=torch.float32) -> torch.Tensor:
 
 
 def bar_points(count: int, seed: int = 0) -> torch.Tensor:
-    """Random canonical points well inside the bar."""
+    """Random canonical points inside the bar."""
     random = torch.Generator().manual_seed(seed)
     return (2 * torch.rand(count, 3, generator=random) - 1) * torch.tensor([0.5, 0.09, 0.09])

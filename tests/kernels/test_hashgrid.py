@@ -4,7 +4,7 @@ import torch
 
 from pipeline.kernels.hashgrid import FeatureGradients, GridLayout, add_table_gradient_, encode, reference
 
-# One dense level, one that just does not fit, two hashed ones.
+# A dense level, a level that has slightly too many nodes to be dense, two hashed levels.
 CELLS = ((3, 5, 2), (9, 9, 9), (40, 70, 20), (300, 500, 150))
 
 
@@ -16,7 +16,7 @@ def make(features, log2_rows=9, points=700):
 
 
 def corner_sum(point, table, cells, rows):
-    """One dense level of one point, by the definition."""
+    """One dense level at one point, by the definition."""
     total = np.zeros(table.shape[1])
     low = np.minimum(np.floor(point * cells), np.array(cells) - 1).astype(int)
     for corner in np.ndindex(2, 2, 2):
@@ -45,27 +45,27 @@ def test_dense_level_is_trilinear_interpolation():
 
 
 @pytest.mark.parametrize("features", [1, 2, 4, 8])
-def test_matches_its_twin_in_double(features):
+def test_compiled_encoding_matches_reference_in_float64(features):
     layout, points, table = make(features)
     table.requires_grad_(True)
     points.requires_grad_(True)
     encoded = encode(points, table, layout)
     random = torch.Generator().manual_seed(0)
-    towards = torch.randn(encoded.shape, generator=random)
-    # Most points of a training step have no gradient and are left out.
-    towards[::3] = 0
-    towards[1::3, :-1] = 0
-    encoded.backward(towards)
+    grad_output = torch.randn(encoded.shape, generator=random)
+    # As in a training step, many points have a zero gradient.
+    grad_output[::3] = 0
+    grad_output[1::3, :-1] = 0
+    encoded.backward(grad_output)
     points64, table64 = points.detach().double().requires_grad_(True), table.detach().double().requires_grad_(True)
     truth = encode(points64, table64, layout)
-    truth.backward(towards.double())
-    # float32 positions times 500 cells round to 3e-5 of a cell.
+    truth.backward(grad_output.double())
+    # float32 positions times 500 cells are rounded to 3e-5 of a cell.
     torch.testing.assert_close(encoded.double(), truth, atol=3e-4, rtol=0)
     torch.testing.assert_close(table.grad.double(), table64.grad, atol=1e-3, rtol=1e-4)
     torch.testing.assert_close(points.grad.double(), points64.grad, atol=0.2, rtol=1e-3)
 
 
-def test_twin_passes_gradcheck():
+def test_reference_passes_gradcheck():
     layout = GridLayout(((3, 2, 2), (7, 6, 5)), 2, 5)
     random = torch.Generator().manual_seed(1)
     table = torch.randn(layout.rows, 2, generator=random, dtype=torch.float64, requires_grad=True)
@@ -88,13 +88,13 @@ def test_deferred_table_gradient_equals_autograd():
     encode(points, table, layout).square().sum().backward()
     alone = table.grad.clone()
     table.grad = None
-    towards: FeatureGradients = []
+    feature_gradients: FeatureGradients = []
     for half in points.tensor_split(2):
-        encode(half, table, layout, towards).square().sum().backward()
+        encode(half, table, layout, feature_gradients).square().sum().backward()
     assert table.grad is None
-    assert len(towards) == 2
+    assert len(feature_gradients) == 2
     sums = torch.ones_like(alone)
-    add_table_gradient_(sums, towards, layout)
+    add_table_gradient_(sums, feature_gradients, layout)
     torch.testing.assert_close(sums, alone + 1)
 
 

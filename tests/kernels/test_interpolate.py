@@ -1,4 +1,4 @@
-"""Interpolation: the fast kernel against its plain twin in values and gradients, the twin against differences."""
+"""Interpolation: compiled loop against reference in values and gradients, reference against finite differences."""
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ HEIGHT, WIDTH = 31, 45
 
 
 def scene(channels: int, seed: int) -> tuple[Tensor, ...]:
-    """A crumpled sheet of triangles that share vertices, at depths of 1 to 2 m, as arguments of `interpolate`."""
+    """A crumpled triangle mesh at depths of 1 to 2 m, as arguments of `interpolate`."""
     generator = torch.Generator().manual_seed(seed)
     y, x = torch.meshgrid(torch.arange(7.0), torch.arange(9.0), indexing="ij")
     grid = torch.stack([x.reshape(-1) * 6.0, y.reshape(-1) * 5.5], dim=1)
@@ -27,7 +27,7 @@ def scene(channels: int, seed: int) -> tuple[Tensor, ...]:
 
 
 @pytest.mark.parametrize("channels", [1, 3, 6])
-def test_kernel_equals_plain_twin_in_values_and_gradients(channels: int) -> None:
+def test_values_and_gradients_match_reference(channels: int) -> None:
     covered, face_ids, *floats, faces, attributes = scene(channels, seed=channels)
     upstream = torch.randn(len(covered), channels, generator=torch.Generator().manual_seed(9))
     results = []
@@ -37,12 +37,12 @@ def test_kernel_equals_plain_twin_in_values_and_gradients(channels: int) -> None
         results.append((values.detach(), *torch.autograd.grad((values * upstream).sum(), inputs)))
     assert len(covered) > 1000
     for name, fast, plain in zip(("values", "vertices", "depth", "attributes"), *results, strict=True):
-        # float32 throughout the twin, float64 inside the kernel: thin faces magnify the twin's rounding
+        # The reference runs in float32, the kernel in float64 inside: thin faces magnify the rounding of the reference.
         scale = float(plain.abs().max())
         torch.testing.assert_close(fast, plain, rtol=1e-3, atol=1e-4 * scale, msg=lambda m, name=name: f"{name}: {m}")
 
 
-def test_twin_gradients_equal_finite_differences() -> None:
+def test_reference_gradients_equal_finite_differences() -> None:
     covered, face_ids, vertices_px, depth_m, faces, attributes = scene(2, seed=0)
     some = slice(None, None, 90)
     inputs = [tensor.double().requires_grad_() for tensor in (vertices_px, depth_m, attributes)]

@@ -4,30 +4,36 @@ import torch
 
 from pipeline.kernels.inverse_skinning import bake_warp_grid, newton_step
 from pipeline.kernels.inverse_skinning.reference import interpolate, skin_points
-from pipeline.kernels.march import PackedWarpGrids, march
+from pipeline.kernels.march import PackedWarpGrids, Rays, SamplingVolume, march
 from tests.kernels.bar import CELL_M, bar_points, bar_skin, bend
 
 EVERYWHERE = (torch.ones(2, 2, 2, dtype=torch.uint8), torch.tensor([[-9.0, -9, -9], [9, 9, 9]]))
 
 
 def query_warp_grids(posed, warps, frame=0):
-    """Canonical candidates of posed points, and the point that each belongs to: rays of a single stop."""
+    """Canonical candidates of posed points, and the point that each belongs to: rays with a single step."""
     count = len(posed)
-    rays = (posed, torch.tensor([[0.0, 0.0, 1.0]]).expand(count, 3), torch.full((count,), frame))
-    samples = march(*rays, torch.zeros(count), 99.0, warps, *EVERYWHERE)
+    directions = torch.tensor([[0.0, 0.0, 1.0]]).expand(count, 3)
+    rays = Rays(posed, directions, torch.full((count,), frame), torch.zeros(count))
+    samples = march(rays, SamplingVolume(warps, *EVERYWHERE), 99.0)
     return samples.canonical_m, torch.repeat_interleave(torch.arange(count), samples.ray_offsets.diff())
 
 
+def bake(skin, matrices):
+    """The warp grid of one frame."""
+    return PackedWarpGrids.from_grids([bake_warp_grid(skin, matrices)], CELL_M)
+
+
 def skin_point_by_hand(skin, matrices, point):
-    """A(x) x of one point with weights interpolated by hand."""
+    """A(x) x of one point, by the definition."""
     origin_m = skin.origin_m.numpy()
     low = np.floor((point - origin_m) / skin.cell_m).astype(int)
     part = (point - origin_m) / skin.cell_m - low
     matrix = np.zeros((4, 4))
     for corner in np.ndindex(2, 2, 2):
-        share = np.prod([p if bit else 1 - p for p, bit in zip(part, corner, strict=True)])
+        corner_weight = np.prod([p if bit else 1 - p for p, bit in zip(part, corner, strict=True)])
         weights = skin.weights[skin.row_of_node[tuple(low + corner)]].numpy()
-        matrix += share * np.einsum("j,jab->ab", weights, matrices.numpy())
+        matrix += corner_weight * np.einsum("j,jab->ab", weights, matrices.numpy())
     return (matrix @ np.append(point, 1))[:3]
 
 
@@ -43,10 +49,10 @@ def test_warp_grid_inverts_skinning_within_a_millimetre(angle):
     skin, matrices, points = bar_skin(), bend(angle), bar_points(3000)
     blended = skin.blend(matrices[None])
     posed = skin_points(points, blended[:, 0], skin.lattice)
-    found, point_indices = query_warp_grids(posed, PackedWarpGrids.of([bake_warp_grid(skin, matrices)], CELL_M))
+    found, point_indices = query_warp_grids(posed, bake(skin, matrices))
     assert torch.equal(point_indices, torch.arange(len(points)))
     error_m = (found - points).norm(dim=1)
-    # Cells of 5 cm and a joint that bends within 16 cm: a lookup alone is good to millimetres, one step to a tenth.
+    # Cells of 5 cm, and a joint that bends over 16 cm: a lookup is accurate to millimetres, one step to 0.1 mm.
     assert float(error_m.quantile(0.5)) < 1e-3
     refined = newton_step(blended, found, posed, torch.tensor([0, len(found)]), skin)
     assert float((refined - points).norm(dim=1).quantile(0.99)) < 1e-3
@@ -56,9 +62,9 @@ def test_warp_grid_inverts_skinning_within_a_millimetre(angle):
 
 def test_folded_bar_has_both_inverses():
     skin, matrices = bar_skin(), bend(np.pi - 0.35)
-    # The second bone, turned by nearly half a turn, comes back over the first; these points are equally deep in both.
+    # The second bone, rotated by almost 180 degrees, overlaps the first; these points are at equal depth in both.
     points = torch.tensor([[-0.4, 0.073, 0.0], [-0.45, 0.081, 0.03], [-0.5, 0.09, -0.04]])
-    found, point_indices = query_warp_grids(points, PackedWarpGrids.of([bake_warp_grid(skin, matrices)], CELL_M))
+    found, point_indices = query_warp_grids(points, bake(skin, matrices))
     blended = skin.blend(matrices[None])[:, 0]
     for index in range(len(points)):
         mine = found[point_indices == index]
@@ -70,28 +76,28 @@ def test_folded_bar_has_both_inverses():
 
 def test_inverse_far_from_the_body_is_dropped():
     skin, matrices = bar_skin(), bend(np.pi - 0.35)
-    # As above, but deep in one bone and at the rim of the other: where arm and torso meet, a point is of one of them.
+    # As above, but deep in one bone and near the surface of the other: a point where an arm overlaps the torso.
     points = torch.tensor([[-0.4, 0.0, 0.0], [-0.4, 0.145, 0.0], [-0.3, 0.02, 0.0]])
-    found, point_indices = query_warp_grids(points, PackedWarpGrids.of([bake_warp_grid(skin, matrices)], CELL_M))
+    found, point_indices = query_warp_grids(points, bake(skin, matrices))
     assert point_indices.tolist() == [0, 1, 2]
     assert torch.sign(found[:2, 0]).tolist() == [-1, 1]
 
 
 def test_points_far_from_the_body_have_no_inverse():
     far = torch.tensor([[0.0, 0.0, 0.5], [3.0, 0.0, 0.0]])
-    found, _ = query_warp_grids(far, PackedWarpGrids.of([bake_warp_grid(bar_skin(), bend(0.3))], CELL_M))
+    found, _ = query_warp_grids(far, bake(bar_skin(), bend(0.3)))
     assert len(found) == 0
 
 
 def bent_and_twisted(angle_rad):
-    """The bar bent and twisted, in a world that stands askew: no entry of a Jacobian is zero."""
+    """The bar bent, twisted and rotated in the world, so that no entry of a Jacobian is zero."""
     matrices = bend(angle_rad)
     matrices[1] = matrices[1] @ rotation_matrix([0.6 * angle_rad, 0.0, 0.0])
     return rotation_matrix([0.5, -0.7, 0.9]) @ matrices
 
 
 def rotation_matrix(axis_angle_rad):
-    """A rotation as a matrix (4, 4)."""
+    """Rotation as a matrix (4, 4)."""
     matrix = torch.eye(4)
     matrix[:3, :3] = torch.linalg.matrix_exp(
         torch.linalg.cross(torch.tensor(axis_angle_rad).expand(3, 3), torch.eye(3)).T

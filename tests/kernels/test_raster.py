@@ -1,4 +1,4 @@
-"""Visibility: closed forms, a per-pixel slow truth, the fast kernel against its plain twin, silhouette gradients."""
+"""Rasterisation: closed forms, a brute-force truth, the compiled loops against the reference, silhouette gradients."""
 
 import math
 
@@ -15,7 +15,7 @@ HEIGHT, WIDTH = 37, 53
 
 
 def triangle_soup(count: int, seed: int, size_px: float = 12.0) -> tuple[Tensor, Tensor, Tensor]:
-    """Random triangles, some partly or wholly outside the picture, at depths of 1 to 3 m."""
+    """Random triangles, some partly or completely outside the image, at depths of 1 to 3 m."""
     generator = torch.Generator().manual_seed(seed)
     centres = torch.rand(count, 1, 2, generator=generator) * torch.tensor([WIDTH + 20.0, HEIGHT + 20.0]) - 10.0
     corners = centres + size_px * (torch.rand(count, 3, 2, generator=generator) - 0.5)
@@ -50,17 +50,17 @@ def test_nearest_face_is_visible_at_every_pixel(seed: int) -> None:
 
 
 @pytest.mark.parametrize("cull", [False, True])
-def test_kernel_equals_plain_twin(cull: bool) -> None:
+def test_compiled_raster_equals_reference(cull: bool) -> None:
     vertices_px, depth_m, faces = triangle_soup(600, seed=7)
     fast = rasterize(vertices_px, depth_m, faces, HEIGHT, WIDTH, cull_backfaces=cull)
     plain = rasterize_reference(vertices_px, depth_m, faces, HEIGHT, WIDTH, 0.01, cull)
     assert torch.equal(fast[0], plain[0])
-    # both compute in float64 and round once
+    # Both compute in float64 and round once.
     torch.testing.assert_close(fast[1], plain[1], rtol=0.0, atol=2e-7)
     torch.testing.assert_close(fast[2], plain[2], rtol=2e-7, atol=0.0)
 
 
-def test_float64_runs_the_plain_twin_with_the_same_result() -> None:
+def test_float64_runs_the_reference_with_the_same_result() -> None:
     vertices_px, depth_m, faces = triangle_soup(50, seed=3)
     double = rasterize(vertices_px.double(), depth_m.double(), faces, HEIGHT, WIDTH)
     assert double[1].dtype == torch.float64
@@ -68,7 +68,7 @@ def test_float64_runs_the_plain_twin_with_the_same_result() -> None:
 
 
 def test_barycentrics_are_perspective_correct() -> None:
-    """A plane z = 2 + x (world) seen at 45 px focal length: the interpolated world x must equal the ray's hit."""
+    """A plane z = 2 + x (world) at 45 px focal length: the interpolated world x equals the intersection of the ray."""
     points = torch.tensor([[-1.0, -2.0, 1.0], [3.0, -2.0, 5.0], [-1.0, 2.0, 1.0], [3.0, 2.0, 5.0]])
     pixels = 45.0 * points[:, :2] / points[:, 2:] + torch.tensor([WIDTH / 2, HEIGHT / 2])
     faces = torch.tensor([[0, 1, 2], [1, 3, 2]])
@@ -82,8 +82,8 @@ def test_barycentrics_are_perspective_correct() -> None:
     torch.testing.assert_close(depth[seen], (2.0 + expected)[seen], rtol=1e-4, atol=1e-4)
 
 
-def test_a_tiled_square_has_no_cracks_and_ties_go_to_the_lower_face() -> None:
-    """Pixel centres lie exactly on edges and corners, then anywhere: every pixel inside belongs to some face."""
+def test_tiled_square_has_no_gaps_and_ties_go_to_the_lower_face() -> None:
+    """Every pixel inside is covered, both with pixel centres exactly on edges and corners and in general position."""
     y, x = torch.meshgrid(torch.arange(6.0), torch.arange(6.0), indexing="ij")
     vertices = torch.stack([x.reshape(-1), y.reshape(-1)], 1) * 4.0 + 0.5
     quads = [[6 * r + c, 6 * r + c + 1, 6 * r + c + 6, 6 * r + c + 7] for r in range(5) for c in range(5)]
@@ -92,12 +92,12 @@ def test_a_tiled_square_has_no_cracks_and_ties_go_to_the_lower_face() -> None:
     assert int(face_id.min()) == 0
     assert face_id[0, 0] == 0
     assert face_id[0, 4] == 0  # corner shared by faces 0, 1 and 2
-    turn = torch.tensor([[math.cos(0.3), -math.sin(0.3)], [math.sin(0.3), math.cos(0.3)]])
+    rotation = torch.tensor([[math.cos(0.3), -math.sin(0.3)], [math.sin(0.3), math.cos(0.3)]])
     centre = torch.tensor([20.7, 18.1])
-    turned = (vertices - 10.5) @ turn.T + centre
-    face_id, _, _ = rasterize(turned, 1.0 + torch.rand(36, generator=torch.Generator().manual_seed(0)), faces, 40, 40)
+    rotated = (vertices - 10.5) @ rotation.T + centre
+    face_id, _, _ = rasterize(rotated, 1.0 + torch.rand(36, generator=torch.Generator().manual_seed(0)), faces, 40, 40)
     pixels = torch.stack(torch.meshgrid(torch.arange(40) + 0.5, torch.arange(40) + 0.5, indexing="xy"), 2)
-    inside = ((pixels - centre) @ turn).abs().amax(2) < 9.9
+    inside = ((pixels - centre) @ rotation).abs().amax(2) < 9.9
     assert inside.sum() > 350
     assert (face_id[inside] >= 0).all()
 
@@ -114,7 +114,7 @@ def test_faces_behind_near_plane_or_with_nan_are_dropped() -> None:
     assert (rasterize(vertices_px, torch.ones(4), faces[:1], HEIGHT, WIDTH)[0] == 0).all()
 
 
-def test_far_off_vertices_do_not_overflow() -> None:
+def test_very_distant_vertices_do_not_overflow() -> None:
     vertices_px = torch.tensor([[-1e12, -1e12], [-1e12, 1e13], [1e13, -1e12]])
     face_id, _, _ = rasterize(vertices_px, torch.ones(3), torch.tensor([[0, 1, 2]]), HEIGHT, WIDTH)
     assert (face_id == 0).all()
@@ -125,7 +125,7 @@ def test_missing_vertex_raises_index_error() -> None:
         rasterize(torch.zeros(3, 2), torch.ones(3), torch.tensor([[0, 1, 3]]), 4, 4)
 
 
-def test_an_empty_mesh_is_an_empty_picture() -> None:
+def test_empty_mesh_gives_an_empty_image() -> None:
     for dtype in (torch.float32, torch.float64):
         empty = torch.zeros(0, 3, dtype=torch.int32)
         face_id, _, _ = rasterize(torch.zeros(0, 2, dtype=dtype), torch.zeros(0, dtype=dtype), empty, 3, 5)
@@ -134,7 +134,7 @@ def test_an_empty_mesh_is_an_empty_picture() -> None:
 
 
 def disc(radius_px: float, count: int = 64) -> tuple[Tensor, Tensor, Tensor]:
-    """A fan around the picture's centre: vertices (float64), depth, faces."""
+    """A triangle fan around the image centre: vertices (float64), depth, faces."""
     angle = torch.arange(count, dtype=torch.float64) * (2 * math.pi / count)
     rim = radius_px * torch.stack([angle.cos(), angle.sin()], 1)
     centre = torch.tensor([WIDTH / 2 + 0.13, HEIGHT / 2 - 0.21], dtype=torch.float64)
@@ -161,7 +161,7 @@ def test_antialiased_coverage_is_near_the_exact_area_of_each_pixel() -> None:
 
 
 def test_silhouette_gradient_is_the_border_length() -> None:
-    """d(area) / d(radius) = perimeter: borders met by rows and by columns must not count twice."""
+    """d(area) / d(radius) = perimeter: a border crossed by rows and by columns is not counted twice."""
     vertices, depth_m, faces = disc(14.3, count=256)
     outward = vertices - vertices[0]
     scale = torch.ones((), dtype=torch.float64, requires_grad=True)
@@ -183,12 +183,12 @@ def test_antialias_gradient_equals_finite_differences() -> None:
     for vertex, axis in ((1, 0), (3, 1), (7, 0)):
         moved = torch.zeros_like(vertices)
         moved[vertex, axis] = step
-        # the share of rows and columns is held fixed by design: its small derivative is missing in the gradient
+        # The weights of rows and columns are constant by design: the gradient lacks their small derivative.
         slope = float(loss(vertices + moved) - loss(vertices - moved)) / (2 * step)
         assert float(points.grad[vertex, axis]) == pytest.approx(slope, rel=0.2, abs=0.3)
 
 
-def test_a_hidden_silhouette_changes_nothing() -> None:
+def test_hidden_silhouette_has_no_effect() -> None:
     near, _, near_faces = disc(15.0)
     far, _, far_faces = disc(8.0)
     vertices, faces = torch.cat([near, far]), torch.cat([near_faces, far_faces + len(near)])
@@ -198,8 +198,8 @@ def test_a_hidden_silhouette_changes_nothing() -> None:
     torch.testing.assert_close(both, alone, rtol=0, atol=1e-12)
 
 
-def test_a_near_part_is_blended_over_a_far_one() -> None:
-    """Colour 1 in front of colour 0: the blend's total is the front disc's area although both pixels are covered."""
+def test_near_part_is_blended_over_far_part() -> None:
+    """Colour 1 in front of colour 0: the blended sum is the area of the front disc."""
     far, _, far_faces = disc(15.0)
     near, _, near_faces = disc(8.0)
     vertices, faces = torch.cat([far, near]), torch.cat([far_faces, near_faces + len(far)])

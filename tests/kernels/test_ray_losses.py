@@ -1,4 +1,4 @@
-"""The losses of rays: closed forms, and the compiled loop against its plain twin in double precision."""
+"""Losses of rays: closed forms, and the compiled loop against the reference in float64."""
 
 import math
 
@@ -34,7 +34,7 @@ def test_colour_errors_of_perfect_and_transparent_images():
 
 
 def losses_and_gradients(rays, delta, dtype, implementation):
-    """Of a sum in which each of the three counts differently, for rays of all sorts."""
+    """Losses, errors, and gradients of a sum with a different weight for each loss."""
     random = torch.Generator().manual_seed(rays)
     image, alpha, rgba, background, confidence = (
         torch.rand(shape, generator=random) for shape in ((rays, 3), rays, (rays, 4), (rays, 3), rays)
@@ -54,8 +54,8 @@ def losses_and_gradients(rays, delta, dtype, implementation):
 @pytest.mark.parametrize("delta", [0.05, 0.3, 1.0])
 def test_compiled_losses_match_reference(rays, delta):
     ours = losses_and_gradients(rays, delta, torch.float32, ray_losses)
-    truth = losses_and_gradients(rays, delta, torch.float64, reference.ray_losses)
-    for mine, theirs in zip(ours, truth, strict=True):
+    expected = losses_and_gradients(rays, delta, torch.float64, reference.ray_losses)
+    for mine, theirs in zip(ours, expected, strict=True):
         torch.testing.assert_close(mine.double(), theirs, rtol=2e-5, atol=2e-7)
     assert not ours[1].requires_grad
 

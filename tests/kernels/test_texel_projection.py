@@ -1,10 +1,10 @@
-"""Projective look-ups of texels: a closed form on a plane, occlusion, and the kernel against its plain twin."""
+"""Projective texturing: a closed form on a plane, occlusion, and the compiled loop against the reference."""
 
 import pytest
 import torch
 
 from pipeline.kernels.raster import rasterize
-from pipeline.kernels.texel_projection import project_texels
+from pipeline.kernels.texel_projection import ImageView, ProjectedMesh, TexelPoints, project_texels
 
 HEIGHT, WIDTH, FOCAL_PX = 60, 80, 70.0
 
@@ -16,7 +16,7 @@ def pinhole(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def tilted_square(offset_m: float = 0.0) -> tuple[torch.Tensor, torch.Tensor]:
-    """A square whose depth runs from 2 m to 3 m, so that perspective matters."""
+    """A square with depths from 2 m to 3 m, so that perspective matters."""
     corners = torch.tensor([[-0.6, -0.6, 2.0], [0.9, -0.6, 3.0], [0.9, 0.6, 3.0], [-0.6, 0.6, 2.0]])
     return corners + torch.tensor([0.0, 0.0, offset_m]), torch.tensor([[0, 1, 2], [0, 2, 3]], dtype=torch.int32)
 
@@ -29,24 +29,29 @@ def random_texels(count: int, face_count: int, seed: int) -> tuple[torch.Tensor,
 
 
 def pixel_positions() -> torch.Tensor:
-    """A picture whose colour is the pixel centre's own position."""
+    """An image whose colour is the position of the pixel centre."""
     y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
     return torch.stack([x, y], dim=2)
 
 
-def observe(
+def project(
     vertices: torch.Tensor, faces: torch.Tensor, texels: tuple, image: torch.Tensor, depth: torch.Tensor, **options
 ):
     vertices_px, depth_m = pinhole(vertices)
     cosine = options.pop("cosine", torch.ones(len(vertices), dtype=vertices.dtype))
     pixel_confidence = options.pop("pixel_confidence", torch.ones(HEIGHT, WIDTH, dtype=vertices.dtype))
-    return project_texels(vertices_px, depth_m, cosine, faces, *texels, image, depth, pixel_confidence, **options)
+    mesh, view = ProjectedMesh(vertices_px, depth_m, cosine, faces), ImageView(image, depth, pixel_confidence)
+    return project_texels(mesh, TexelPoints(*texels), view, **options)
+
+
+def to_double(tensor: torch.Tensor) -> torch.Tensor:
+    return tensor.double() if tensor.is_floating_point() else tensor
 
 
 def test_texel_is_sampled_at_its_projection() -> None:
     vertices, faces = tilted_square()
     texels = random_texels(500, 2, seed=0)
-    values, weights = observe(vertices, faces, texels, pixel_positions(), torch.full((HEIGHT, WIDTH), torch.inf))
+    values, weights = project(vertices, faces, texels, pixel_positions(), torch.full((HEIGHT, WIDTH), torch.inf))
     points = (texels[1][..., None] * vertices[faces.long()[texels[0].long()]]).sum(dim=1)
     expected_px, _ = pinhole(points)
     assert (weights[:, 0] > 0.999).all()
@@ -60,23 +65,23 @@ def test_occlusion_without_self_occlusion() -> None:
     vertices_px, depth_m = pinhole(both)
     _, _, depth = rasterize(vertices_px, depth_m, both_faces, HEIGHT, WIDTH)
     face, barycentric = random_texels(1000, 4, seed=1)
-    _, weights = observe(both, both_faces, (face, barycentric), pixel_positions(), depth, tolerance_m=0.06)
+    _, weights = project(both, both_faces, (face, barycentric), pixel_positions(), depth, tolerance_m=0.06)
     seen = weights[:, 0] > 0
     assert seen[face < 2].all()
-    inner = barycentric.min(dim=1).values > 0.15  # towards the border perspective lets the back one peep out
+    inner = barycentric.min(dim=1).values > 0.15  # the projection of the back square is slightly larger at the border
     assert not seen[(face >= 2) & inner].any()
 
 
 def test_occluder_in_any_bilinear_pixel_hides_the_texel() -> None:
     vertices, faces = tilted_square()
     texels = (torch.tensor([0], dtype=torch.int32), torch.tensor([[0.4, 0.2, 0.4]]))
-    values, _ = observe(vertices, faces, texels, pixel_positions(), torch.full((HEIGHT, WIDTH), torch.inf))
+    values, _ = project(vertices, faces, texels, pixel_positions(), torch.full((HEIGHT, WIDTH), torch.inf))
     column, row = (values[0] - 0.5).floor().long().tolist()
     for down in (-1, 0, 1, 2):
         for right in (-1, 0, 1, 2):
             depth = torch.full((HEIGHT, WIDTH), torch.inf)
             depth[row + down, column + right] = 1.0
-            _, weights = observe(vertices, faces, texels, pixel_positions(), depth)
+            _, weights = project(vertices, faces, texels, pixel_positions(), depth)
             assert bool(weights[0, 0] > 0) == (down not in (0, 1) or right not in (0, 1))
 
 
@@ -84,13 +89,13 @@ def test_oblique_outside_and_behind_texels_are_invisible() -> None:
     vertices, faces = tilted_square()
     texels, far = random_texels(50, 2, seed=2), torch.full((HEIGHT, WIDTH), torch.inf)
     for moved, cosine in [(vertices, 0.05), (vertices + torch.tensor([5.0, 0, 0]), 1.0), (vertices * -1.0, 1.0)]:
-        values, weights = observe(moved, faces, texels, pixel_positions(), far, cosine=torch.full((4,), cosine))
+        values, weights = project(moved, faces, texels, pixel_positions(), far, cosine=torch.full((4,), cosine))
         assert not values.any()
         assert not weights.any()
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_twins_agree(seed: int) -> None:
+def test_compiled_projection_matches_reference(seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
     vertices = torch.rand(60, 3, generator=generator) * torch.tensor([2.4, 1.8, 1.5]) - torch.tensor([1.2, 0.9, -1.5])
     faces = torch.randint(0, 60, (90, 3), generator=generator, dtype=torch.int32)
@@ -99,10 +104,11 @@ def test_twins_agree(seed: int) -> None:
     cosine, pixel_confidence = torch.rand(60, generator=generator), torch.rand(HEIGHT, WIDTH, generator=generator)
     face, barycentric = random_texels(4000, 90, seed)
     image = torch.rand(HEIGHT, WIDTH, 3, generator=generator)
-    inputs = (vertices_px, depth_m, cosine, faces, face, barycentric, image, depth, pixel_confidence)
+    mesh, texels = ProjectedMesh(vertices_px, depth_m, cosine, faces), TexelPoints(face, barycentric)
+    inputs = (mesh, texels, ImageView(image, depth, pixel_confidence))
     fast = project_texels(*inputs, tolerance_m=0.02)
-    exact = project_texels(*(x.double() if x.is_floating_point() else x for x in inputs), tolerance_m=0.02)
-    # float32 may decide the other way within 1e-6 of a threshold: allow a handful of texels, not a value
+    exact = project_texels(*(type(part)(*map(to_double, part)) for part in inputs), tolerance_m=0.02)
+    # Within 1e-6 of a threshold float32 may decide differently: allow a few texels.
     same = (fast[1][:, 0] > 0) == (exact[1][:, 0] > 0)
     assert 200 < int((exact[1][:, 0] > 0).sum()) < 3500
     assert int((~same).sum()) <= 4

@@ -1,4 +1,4 @@
-"""Textured pixels: the kernel against its plain twin, and against texels picked by hand."""
+"""Texture lookups: the compiled loop against the reference, and against known texels."""
 
 import pytest
 import torch
@@ -8,7 +8,7 @@ from pipeline.kernels.texture_sampling import supersample_texture
 
 
 def random_raster(samples: int, seed: int) -> tuple[torch.Tensor, ...]:
-    """Random triangles before a picture of 24 x 32 pixels, with random uv that also lie outside of [0, 1]."""
+    """Random triangles in an image of 24 x 32 pixels, with random uv, some outside [0, 1]."""
     generator = torch.Generator().manual_seed(seed)
     corners = torch.rand(30, 2, generator=generator) * torch.tensor([32.0, 24.0]) * samples
     depth = 1.0 + torch.rand(30, generator=generator)
@@ -20,12 +20,12 @@ def random_raster(samples: int, seed: int) -> tuple[torch.Tensor, ...]:
 
 
 @pytest.mark.parametrize(("samples", "seed"), [(1, 0), (2, 1), (3, 2)])
-def test_twins_agree(samples: int, seed: int) -> None:
+def test_compiled_lookup_matches_reference(samples: int, seed: int) -> None:
     face_id, *rest = random_raster(samples, seed)
     fast = supersample_texture(face_id, *rest, samples)
     exact = supersample_texture(face_id, *(x.double() if x.is_floating_point() else x for x in rest), samples)
     assert 0.2 < float(exact[..., 3].mean()) < 0.99
-    # float32 places a look-up to 1e-6 of a texture of 13 texels whose neighbours differ by up to 1
+    # In float32 a lookup is accurate to 1e-6 of a texture of 13 texels, whose neighbours differ by up to 1.
     torch.testing.assert_close(fast, exact.float(), atol=5e-5, rtol=0.0)
 
 

@@ -1,4 +1,4 @@
-"""Jobs that are done at the same time: in order, with a share of the threads each, or one after the other."""
+"""Concurrent jobs: order of results, threads of each worker, sequential fallback."""
 
 import threading
 
@@ -11,9 +11,9 @@ from pipeline.kernels.common.thread_pool import ThreadPool
 
 @pytest.fixture
 def four_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As if this machine had so many; each thread is told how many it may use, whether or not there are so many."""
+    """Simulate a machine with four threads; the limit of each thread is recorded, not applied."""
     thread_counts = threading.local()
-    numba.get_num_threads()  # starts its threads, which only then have a kind
+    numba.get_num_threads()  # starts the threads, which determines the threading layer
     monkeypatch.setattr(numba, "threading_layer", lambda: "omp")
     for module in (numba, torch):
         name = f"{module.__name__}_threads"
@@ -39,9 +39,9 @@ def test_results_keep_job_order(four_threads: None) -> None:
 
 
 def test_threads_are_divided_and_restored(four_threads: None) -> None:
-    found = ThreadPool(2).map(thread_state, range(6))
-    assert {there[1:] for there in found} == {(2, 2)}
-    assert threading.get_ident() not in {there[0] for there in found}
+    states = ThreadPool(2).map(thread_state, range(6))
+    assert {state[1:] for state in states} == {(2, 2)}
+    assert threading.get_ident() not in {state[0] for state in states}
     assert (torch.get_num_threads(), numba.get_num_threads()) == (4, 4)
 
 

@@ -1,7 +1,7 @@
-"""The same bytes from 1, 2 and 16 threads, of every kernel that has a parallel loop.
+"""Every kernel with a parallel loop gives the same bytes with 1, 2 and 16 threads.
 
-A process has the threads that it begins with and no more, so another process, which begins with 16, does the work.
-Sizes are such that each kernel has more blocks than threads.
+The number of threads of a process is limited at its start, so a separate process with 16 threads does the work. Sizes
+are such that each kernel has more blocks than threads.
 """
 
 import hashlib
@@ -24,9 +24,9 @@ from pipeline.kernels.composite import composite
 from pipeline.kernels.hashgrid import GridLayout, encode
 from pipeline.kernels.interpolate import interpolate
 from pipeline.kernels.inverse_skinning import bake_warp_grid, newton_step
-from pipeline.kernels.march import PackedWarpGrids, march
+from pipeline.kernels.march import PackedWarpGrids, Rays, SamplingVolume, march
 from pipeline.kernels.raster import rasterize
-from pipeline.kernels.texel_projection import project_texels
+from pipeline.kernels.texel_projection import ImageView, ProjectedMesh, TexelPoints, project_texels
 from pipeline.kernels.texture_sampling import supersample_texture
 from pipeline.kernels.transmittance_stats import transmittance_from_weights
 from tests.kernels.bar import CELL_M, bar_skin, bend
@@ -53,21 +53,21 @@ def hash_grid_results() -> list[Tensor]:
 def march_and_newton_results() -> list[Tensor]:
     skin, random = bar_skin(), seeded()
     matrices = torch.stack([bend(float(angle)) for angle in torch.linspace(-1.2, 1.2, FRAMES)])
-    warps = PackedWarpGrids.of([bake_warp_grid(skin, pose) for pose in matrices], CELL_M)
+    warps = PackedWarpGrids.from_grids([bake_warp_grid(skin, pose) for pose in matrices], CELL_M)
     targets = (torch.rand(RAYS, 3, generator=random) - 0.5) * torch.tensor([1.0, 0.4, 0.2])
     origins = torch.tensor([0.0, 0.0, 2.0]).repeat(RAYS, 1)
     directions = torch.nn.functional.normalize(targets - origins, dim=-1)
     frame, jitter = torch.arange(RAYS) * FRAMES // RAYS, torch.rand(RAYS, generator=random)
     occupied, box = torch.ones(8, 4, 4, dtype=torch.uint8), torch.tensor([[-0.6, -0.15, -0.15], [0.6, 0.15, 0.15]])
-    samples = march(origins, directions, frame, jitter, 0.02, warps, occupied, box)
+    samples = march(Rays(origins, directions, frame, jitter), SamplingVolume(warps, occupied, box), 0.02)
     ray = torch.repeat_interleave(torch.arange(RAYS), samples.ray_offsets.diff())
     posed = origins[ray] + samples.distance_m[:, None] * directions[ray]
     frame_offsets = samples.ray_offsets[torch.searchsorted(frame, torch.arange(FRAMES + 1))]
     blended = skin.blend(matrices).requires_grad_(True)
-    placed = newton_step(blended, samples.canonical_m, posed, frame_offsets, skin)
-    (gradient,) = torch.autograd.grad(placed, blended, torch.randn(placed.shape, generator=random))
+    refined = newton_step(blended, samples.canonical_m, posed, frame_offsets, skin)
+    (gradient,) = torch.autograd.grad(refined, blended, torch.randn(refined.shape, generator=random))
     roots, exists = find_roots(posed[:2000], frame[ray[:2000]], matrices, blended.detach(), skin)
-    return [samples.canonical_m, samples.distance_m, samples.ray_offsets, placed, gradient, roots, exists]
+    return [samples.canonical_m, samples.distance_m, samples.ray_offsets, refined, gradient, roots, exists]
 
 
 def composite_results() -> list[Tensor]:
@@ -83,7 +83,7 @@ def blend_results() -> list[Tensor]:
     random = seeded()
     weights = torch.rand(5000, 9, generator=random)
     values = torch.randn(9, 48, generator=random).requires_grad_(True)
-    blended = blend(SparseWeights.of(weights * (weights > 0.6)), values)
+    blended = blend(SparseWeights.from_dense(weights * (weights > 0.6)), values)
     return [blended, *torch.autograd.grad(blended, values, torch.randn(blended.shape, generator=random))]
 
 
@@ -95,7 +95,7 @@ def adam_results() -> list[Tensor]:
 
 
 def raster_results() -> list[Tensor]:
-    """A crumpled sheet of triangles that share vertices, seen, interpolated, textured and looked up."""
+    """A crumpled triangle mesh: rasterised, interpolated, textured and projected."""
     random, columns = seeded(), 20
     y, x = torch.meshgrid(torch.linspace(0, HEIGHT, 40), torch.linspace(0, WIDTH, columns), indexing="ij")
     grid = torch.stack([x.reshape(-1), y.reshape(-1)], dim=1)
@@ -110,11 +110,12 @@ def raster_results() -> list[Tensor]:
     values = interpolate(covered, face_id.reshape(-1)[covered], WIDTH, vertices_px, depth_m, faces, attributes)
     gradients = torch.autograd.grad(values, leaves, torch.randn(values.shape, generator=random))
     texture = torch.rand(64, 64, 3, generator=random)
-    shaded = supersample_texture(face_id, barycentric, faces, torch.rand(len(grid), 2, generator=random), texture, 2)
+    textured = supersample_texture(face_id, barycentric, faces, torch.rand(len(grid), 2, generator=random), texture, 2)
     texels = torch.randint(0, len(faces), (4000,), generator=random).int(), torch.full((4000, 3), 1 / 3)
-    picture, trust = torch.rand(HEIGHT, WIDTH, 3, generator=random), torch.ones(HEIGHT, WIDTH)
-    seen = vertices_px.detach(), depth_m.detach(), torch.ones(len(grid)), faces, *texels, picture, depth, trust
-    return [face_id, barycentric, depth, values, *gradients, shaded, *project_texels(*seen)]
+    image, confidence = torch.rand(HEIGHT, WIDTH, 3, generator=random), torch.ones(HEIGHT, WIDTH)
+    mesh = ProjectedMesh(vertices_px.detach(), depth_m.detach(), torch.ones(len(grid)), faces)
+    projected = project_texels(mesh, TexelPoints(*texels), ImageView(image, depth, confidence))
+    return [face_id, barycentric, depth, values, *gradients, textured, *projected]
 
 
 KERNELS: tuple[Callable[[], list[Tensor]], ...] = (
@@ -128,20 +129,20 @@ KERNELS: tuple[Callable[[], list[Tensor]], ...] = (
 
 
 def digests() -> dict[str, list[str]]:
-    """Of each kernel's results, one for each number of threads."""
-    found: dict[str, list[str]] = {}
+    """Digest of the results of each kernel, for each number of threads."""
+    results: dict[str, list[str]] = {}
     for threads in THREADS:
         numba.set_num_threads(threads)
         for kernel in KERNELS:
             digest = hashlib.sha256()
             for tensor in kernel():
                 digest.update(tensor.detach().contiguous().numpy().tobytes())
-            found.setdefault(kernel.__name__, []).append(digest.hexdigest())
-    return found
+            results.setdefault(kernel.__name__, []).append(digest.hexdigest())
+    return results
 
 
 @pytest.fixture(scope="module")
-def found(repository: Path) -> dict[str, list[str]]:
+def digests_by_kernel(repository: Path) -> dict[str, list[str]]:
     code = "import json; from tests.kernels.test_threads import digests; print(json.dumps(digests()))"
     environment = os.environ | {"NUMBA_NUM_THREADS": str(max(THREADS))}
     command = [sys.executable, "-c", code]
@@ -151,7 +152,9 @@ def found(repository: Path) -> dict[str, list[str]]:
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_results_do_not_depend_on_thread_count(found: dict[str, list[str]], kernel: Callable[[], list[Tensor]]) -> None:
-    digests_by_threads = found[kernel.__name__]
+def test_results_do_not_depend_on_thread_count(
+    digests_by_kernel: dict[str, list[str]], kernel: Callable[[], list[Tensor]]
+) -> None:
+    digests_by_threads = digests_by_kernel[kernel.__name__]
     assert len(digests_by_threads) == len(THREADS)
     assert len(set(digests_by_threads)) == 1

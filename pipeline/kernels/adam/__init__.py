@@ -1,15 +1,14 @@
-"""Adam (Kingma & Ba 2015), in place over one flat float32 tensor, as one pass over memory.
+"""Adam (Kingma & Ba 2015), in place on one contiguous tensor, in one pass over memory.
 
-Beside torch's own: the gradient is cleared in the same pass, a gradient that is not finite counts as zero (a NaN never
-reaches a parameter), and moments that have decayed to nothing are set to zero, because denormal numbers made a step
+Differences from torch.optim.Adam: the gradient is cleared in the same pass; a gradient that is not finite counts as
+zero, so that NaN never reaches a parameter; moments below 1e-30 are set to zero, because denormal numbers made a step
 20 times slower.
 """
 
 import torch
 from torch import Tensor
 
-from pipeline.kernels.adam import cpu as adam_cpu
-from pipeline.kernels.adam import reference
+from pipeline.kernels.adam import cpu, reference
 from pipeline.kernels.common.dispatch import runs_on_numba
 
 
@@ -23,18 +22,24 @@ def adam_step_(
     betas: tuple[float, float] = (0.9, 0.99),
     epsilon: float = 1e-15,
 ) -> None:
-    """Update `parameter` and both moments; set `gradient` to zero. All four are contiguous and of one shape.
+    """Update `parameter` and both moments in place, and set `gradient` to zero.
 
-    step: 1 for the first update (bias correction). learning_rate: in units of the parameter.
+    Args:
+        parameter, gradient, first_moment, second_moment: contiguous, of the same shape.
+        step: 1 for the first update (bias correction).
+        learning_rate: in units of the parameter.
+
+    Raises ValueError if the shapes differ or a tensor is not contiguous.
     """
     tensors = (parameter.detach(), gradient, first_moment, second_moment)
     if any(tensor.shape != parameter.shape or not tensor.is_contiguous() for tensor in tensors):
-        raise ValueError("parameter, gradient and moments must be contiguous and of one shape")
+        shapes = ", ".join(str(tuple(tensor.shape)) for tensor in tensors)
+        raise ValueError(f"parameter, gradient and moments must be contiguous and of one shape, not {shapes}")
     rate = learning_rate * (1 - betas[1] ** step) ** 0.5 / (1 - betas[0] ** step)
     scaled_epsilon = epsilon * (1 - betas[1] ** step) ** 0.5
     with torch.no_grad():
         if runs_on_numba(*tensors):
             flat = [tensor.view(-1).numpy() for tensor in tensors]
-            adam_cpu.update(flat[0], flat[1], flat[2], flat[3], rate, betas[0], betas[1], scaled_epsilon)
+            cpu.update(flat[0], flat[1], flat[2], flat[3], rate, betas[0], betas[1], scaled_epsilon)
         else:
             reference.update(*tensors, rate, betas[0], betas[1], scaled_epsilon)

@@ -1,4 +1,4 @@
-"""Compiled loop of Adam. Slices go to a small function of their own: LLVM then knows that they do not overlap."""
+"""Compiled loop of Adam. Slices are passed to a function of their own, so that LLVM knows that they do not overlap."""
 
 import numpy as np
 from numba import njit, prange
@@ -35,6 +35,6 @@ def _update(parameter, gradient, first, second, rate, beta1, beta2, scaled_epsil
 
 
 def update(parameter, gradient, first, second, rate, beta1, beta2, scaled_epsilon):
-    """One update of flat float32 arrays; `rate` and `scaled_epsilon` have the bias corrections in them."""
+    """Do one update of flat float32 arrays; `rate` and `scaled_epsilon` include the bias corrections."""
     scalars = (np.float32(value) for value in (rate, beta1, beta2, scaled_epsilon))
     _update(parameter, gradient, first, second, *scalars)

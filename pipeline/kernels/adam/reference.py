@@ -1,4 +1,4 @@
-"""Plain-torch twin of Adam: any dtype, any device."""
+"""Plain-torch reference of Adam: any dtype, any device."""
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ def update(
     beta2: float,
     scaled_epsilon: float,
 ) -> None:
-    """Same as `pipeline.kernels.adam.cpu.update`, on tensors of one shape."""
+    """Do `pipeline.kernels.adam.cpu.update`, on tensors of one shape."""
     finite = torch.where(gradient.abs() < 1e18, gradient, 0)
     first.mul_(beta1).add_(finite, alpha=1 - beta1)
     second.mul_(beta2).addcmul_(finite, finite, value=1 - beta2)

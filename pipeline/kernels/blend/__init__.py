@@ -1,6 +1,6 @@
-"""Blending of what joints hold (entries of skinning matrices) at many nodes, by skin weights that are mostly zero.
+"""Linear blending of joint values (entries of skinning matrices) at many nodes, by sparse skin weights.
 
-Letters: m nodes, j joints, c columns, e weights that are not zero.
+Notation: m nodes, j joints, c columns, e nonzero weights.
 """
 
 from typing import Any, NamedTuple
@@ -9,21 +9,20 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pipeline.kernels.blend import cpu as blend_cpu
-from pipeline.kernels.blend import reference
+from pipeline.kernels.blend import cpu, reference
 from pipeline.kernels.common.dispatch import runs_on_numba
 
 
 class SparseWeights(NamedTuple):
-    """The weights that are not zero, node after node; those of node i are row_start[i] : row_start[i + 1]."""
+    """The nonzero weights, node after node (CSR); those of node i are row_offsets[i] : row_offsets[i + 1]."""
 
     row_offsets: Int[Tensor, "m1"]
     joint: Int[Tensor, "e"]
     weight: Float[Tensor, "e"]
 
     @staticmethod
-    def of(weights: Float[Tensor, "m j"]) -> "SparseWeights":
-        """Without the zeros."""
+    def from_dense(weights: Float[Tensor, "m j"]) -> "SparseWeights":
+        """Drop the zeros of a dense matrix."""
         node, joint = torch.nonzero(weights, as_tuple=True)
         row_offsets = torch.searchsorted(node, torch.arange(len(weights) + 1, device=node.device))
         return SparseWeights(row_offsets, joint, weights[node, joint])
@@ -33,22 +32,21 @@ class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, weights: SparseWeights, values: Tensor) -> Tensor:
         blended = values.new_empty(len(weights.row_offsets) - 1, values.shape[1])
-        arrays = (tensor.detach().numpy() for tensor in (*weights, values, blended))
-        blend_cpu.blend(*arrays)
+        cpu.blend(*(tensor.detach().numpy() for tensor in (*weights, values, blended)))
         ctx.weights, ctx.joints = weights, len(values)
         return blended
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[None, Tensor]:
         weights = (tensor.numpy() for tensor in ctx.weights)
-        sums = blend_cpu.blend_backward(*weights, ctx.joints, gradient.contiguous().numpy())
+        sums = cpu.blend_backward(*weights, ctx.joints, gradient.contiguous().numpy())
         return None, torch.from_numpy(sums).sum(0)
 
 
 def blend(weights: SparseWeights, values: Float[Tensor, "j c"]) -> Float[Tensor, "m c"]:
-    """At every node the weighted sum of its joints' values; differentiable in the values.
+    """Return the weighted sum of joint values at every node; differentiable in `values`.
 
-    >>> blend(SparseWeights.of(torch.tensor([[0.25, 0.75]])), torch.tensor([[1.0, 0.0], [2.0, 4.0]])).tolist()
+    >>> blend(SparseWeights.from_dense(torch.tensor([[0.25, 0.75]])), torch.tensor([[1.0, 0.0], [2.0, 4.0]])).tolist()
     [[1.75, 3.0]]
     """
     if not runs_on_numba(weights.weight, values):

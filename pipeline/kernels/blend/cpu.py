@@ -1,7 +1,7 @@
-"""Compiled loops that blend by sparse weights: the entries of node i are row_start[i] : row_start[i + 1].
+"""Compiled loops of blending by sparse weights: the entries of node i are row_offsets[i] : row_offsets[i + 1].
 
-Backward, the nodes are shared out in a fixed number of parts whose sums are added in order, whatever the number of
-threads.
+In the backward pass the nodes are divided into a fixed number of parts, whose sums are added in order, so that the
+result does not depend on the number of threads.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ PARTS = 16
 
 @njit(**NJIT_OPTIONS)
 def _add_scaled(scale, values, total):
-    """Slices go to a function of their own: LLVM then knows that they do not overlap."""
+    """Add scale * values to total. A function of its own, so that LLVM knows that the slices do not overlap."""
     for column in range(values.shape[0]):
         total[column] += scale * values[column]
 
@@ -32,7 +32,7 @@ def blend(row_offsets, joint, weight, values, blended):
 
 @njit(parallel=True, **NJIT_OPTIONS)
 def blend_backward(row_offsets, joint, weight, joints, grad_blended):
-    """What each part of the nodes adds to dL/dvalues, (PARTS, j, c), for dL/dblended (m, c)."""
+    """Return the contribution of each part of the nodes to dL/dvalues (PARTS, j, c), from grad_blended (m, c)."""
     nodes, columns = grad_blended.shape
     sums = np.zeros((PARTS, joints, columns), np.float32)
     for part in prange(PARTS):

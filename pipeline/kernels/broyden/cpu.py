@@ -1,4 +1,6 @@
-"""Compiled loop of the Broyden search: a thread takes whole points. Grid arguments as in `newton_cpu`."""
+"""Compiled loop of the Broyden search: each thread solves whole points."""
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
@@ -9,9 +11,19 @@ from pipeline.kernels.inverse_skinning.newton_cpu import invert
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
+class SearchLimits(NamedTuple):
+    """Iterations; residuals (m) at convergence and divergence; distance (m) below which two roots are the same."""
+
+    iterations: int
+    converged: float
+    diverged: float
+    duplicate: float
+
+
 @njit(**NJIT_OPTIONS)
-def _blend(x, frame, origin, cell, row_of_node, blended, matrix):
-    """Fill the skinning matrix (12) at a canonical point; False outside the grid."""
+def _blend(x, frame, lattice, blended, matrix):
+    """Fill the skinning matrix (12) at a canonical point; return False outside the grid."""
+    origin, cell, row_of_node = lattice
     gx, gy, gz = (x[0] - origin[0]) / cell, (x[1] - origin[1]) / cell, (x[2] - origin[2]) / cell
     i, j, k = int(np.floor(gx)), int(np.floor(gy)), int(np.floor(gz))
     shape = row_of_node.shape
@@ -32,7 +44,7 @@ def _blend(x, frame, origin, cell, row_of_node, blended, matrix):
 
 @njit(**NJIT_OPTIONS)
 def _residual(matrix, x, target, residual):
-    """A(x) x - p into `residual`; returns its squared length."""
+    """Fill `residual` (3) with A(x) x - p; return its squared length."""
     squared = _ZERO
     for axis in range(3):
         row = 4 * axis
@@ -44,7 +56,7 @@ def _residual(matrix, x, target, residual):
 
 @njit(**NJIT_OPTIONS)
 def _broyden_update(inverse, delta_x, delta_residual):
-    """Broyden's good update of the inverse Jacobian; False if it is not possible."""
+    """Do Broyden's good update of the inverse Jacobian in place; return False if it is not possible."""
     along, ahead = np.empty(3, np.float32), np.empty(3, np.float32)
     scale = _ZERO
     for axis in range(3):
@@ -64,13 +76,14 @@ def _broyden_update(inverse, delta_x, delta_residual):
 
 
 @njit(**NJIT_OPTIONS)
-def _find_root(target, x, frame, iterations, converged, diverged, origin, cell, row_of_node, blended, inverse, matrix):
-    """Move `x` to a root of A(x) x = target; True if it got there."""
+def _find_root(target, x, frame, lattice, blended, limits, inverse, matrix):
+    """Move `x` to a root of A(x) x = target; return whether it converged. inverse (3, 3), matrix (12): buffers."""
+    converged, diverged = np.float32(limits.converged), np.float32(limits.diverged)
     residual, before, delta_x = np.empty(3, np.float32), np.empty(3, np.float32), np.empty(3, np.float32)
-    if not _blend(x, frame, origin, cell, row_of_node, blended, matrix):
+    if not _blend(x, frame, lattice, blended, matrix):
         return False
-    invertible, a, b, c, d, e, f, g, h, k = invert(
-        matrix[0], matrix[1], matrix[2], matrix[4], matrix[5], matrix[6], matrix[8], matrix[9], matrix[10]
+    invertible, (a, b, c, d, e, f, g, h, k) = invert(
+        (matrix[0], matrix[1], matrix[2], matrix[4], matrix[5], matrix[6], matrix[8], matrix[9], matrix[10])
     )
     if not invertible:
         return False
@@ -78,7 +91,7 @@ def _find_root(target, x, frame, iterations, converged, diverged, origin, cell, 
     inverse[1, 0], inverse[1, 1], inverse[1, 2] = d, e, f
     inverse[2, 0], inverse[2, 1], inverse[2, 2] = g, h, k
     squared = _residual(matrix, x, target, residual)
-    for _ in range(iterations):
+    for _ in range(limits.iterations):
         if squared < converged * converged:
             return True
         for axis in range(3):
@@ -87,7 +100,7 @@ def _find_root(target, x, frame, iterations, converged, diverged, origin, cell, 
                 inverse[axis, 0] * residual[0] + inverse[axis, 1] * residual[1] + inverse[axis, 2] * residual[2]
             )
             x[axis] += delta_x[axis]
-        if not _blend(x, frame, origin, cell, row_of_node, blended, matrix):
+        if not _blend(x, frame, lattice, blended, matrix):
             return False
         squared = _residual(matrix, x, target, residual)
         if squared > diverged * diverged:
@@ -100,22 +113,12 @@ def _find_root(target, x, frame, iterations, converged, diverged, origin, cell, 
 
 
 @njit(parallel=True, **NJIT_OPTIONS)
-def find_roots(
-    posed,
-    frame,
-    posed_to_start,
-    blended,
-    origin,
-    cell,
-    row_of_node,
-    iterations,
-    converged,
-    diverged,
-    same,
-    roots,
-    counts,
-):
-    """Fill roots (n, c, 3) and how many of them (n) each posed point has: see `pipeline.kernels.broyden.find_roots`."""
+def find_roots(posed, frame, posed_to_start, lattice, blended, limits, roots, counts):
+    """Fill roots (n, c, 3) and their number (n) for each posed point: see `pipeline.kernels.broyden.find_roots`.
+
+    posed_to_start (k, b, 12): inverse matrices of the starting bones. blended (m, k, 12): matrices at the nodes.
+    """
+    duplicate = np.float32(limits.duplicate)
     for point in prange(posed.shape[0]):
         x, matrix, inverse = np.empty(3, np.float32), np.empty(12, np.float32), np.empty((3, 3), np.float32)
         f, found = frame[point], 0
@@ -130,23 +133,10 @@ def find_roots(
                     + m[4 * axis + 2] * posed[point, 2]
                     + m[4 * axis + 3]
                 )
-            new = _find_root(
-                posed[point],
-                x,
-                f,
-                iterations,
-                converged,
-                diverged,
-                origin,
-                cell,
-                row_of_node,
-                blended,
-                inverse,
-                matrix,
-            )
+            new = _find_root(posed[point], x, f, lattice, blended, limits, inverse, matrix)
             for other in range(found):
                 ox, oy, oz = x[0] - roots[point, other, 0], x[1] - roots[point, other, 1], x[2] - roots[point, other, 2]
-                new &= ox * ox + oy * oy + oz * oz > same * same
+                new &= ox * ox + oy * oy + oz * oz > duplicate * duplicate
             if new:
                 roots[point, found, 0], roots[point, found, 1], roots[point, found, 2] = x[0], x[1], x[2]
                 found += 1

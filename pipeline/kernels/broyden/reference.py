@@ -1,9 +1,10 @@
-"""Plain-torch twin of the Broyden search: all points and starts at once, any dtype, any device."""
+"""Plain-torch reference of the Broyden search: all points at once, any dtype, any device."""
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pipeline.kernels.broyden.cpu import SearchLimits
 from pipeline.kernels.inverse_skinning.reference import Lattice, gather
 
 
@@ -13,10 +14,10 @@ def find_roots(
     posed_to_start: Float[Tensor, "k b 12"],
     blended: Float[Tensor, "m k 12"],
     lattice: Lattice,
-    limits: tuple[int, float, float, float],
+    limits: SearchLimits,
     candidates: int,
 ) -> tuple[Float[Tensor, "n c 3"], Bool[Tensor, "n c"]]:
-    """Same as `pipeline.kernels.broyden.find_roots`; `limits`: iterations, and metres of arrival, loss and sameness."""
+    """Do `pipeline.kernels.broyden.find_roots` with inverse bone matrices, up to `candidates` roots."""
     roots = posed_m.new_zeros(len(posed_m), candidates, 3)
     exists = torch.zeros(len(posed_m), candidates, dtype=torch.bool, device=posed_m.device)
     for row in range(len(posed_to_start)):
@@ -25,14 +26,14 @@ def find_roots(
             matrix = posed_to_start[row, bone].view(3, 4)
             start = posed_m[chosen] @ matrix[:, :3].T + matrix[:, 3]
             found, converged = _iterate(start, posed_m[chosen], blended[:, row], lattice, limits)
-            _append_new_roots(found, converged, chosen, roots, exists, same_m=limits[3])
+            _append_new_roots(found, converged, chosen, roots, exists, limits.duplicate)
     return roots, exists
 
 
 def _iterate(
-    x: Tensor, posed: Tensor, blended: Tensor, lattice: Lattice, limits: tuple[int, float, float, float]
+    x: Tensor, posed: Tensor, blended: Tensor, lattice: Lattice, limits: SearchLimits
 ) -> tuple[Tensor, Tensor]:
-    """Where Broyden's method goes from each start (s, 3), and whether that is a root."""
+    """Return the last iterate of Broyden's method from each start (s, 3), and whether it is a root."""
     iterations, converged_m, diverged_m, _ = limits
     matrix, alive = _blend(x, blended, lattice)
     alive &= torch.linalg.det(matrix[:, :, :3]).abs() > 1e-3
@@ -59,12 +60,12 @@ def _iterate(
 
 
 def _blend(x: Tensor, blended: Tensor, lattice: Lattice) -> tuple[Tensor, Tensor]:
-    """Skinning matrices (s, 3, 4) at canonical points, and which of these lie in cells with all their nodes."""
+    """Return the skinning matrices (s, 3, 4) at canonical points, and which are in cells with all their nodes."""
     origin_m, cell_m, row_of_node = lattice
     scaled = (x - origin_m.to(x)) / cell_m
     inside = ((scaled >= 0) & (scaled < torch.tensor(row_of_node.shape, device=x.device) - 1)).all(1)
-    matrix, share = gather(torch.where(inside[:, None], x, torch.zeros_like(x)), lattice, blended)
-    return matrix.view(-1, 3, 4), inside & (share > 1 - 1e-4)
+    matrix, weight_sum = gather(torch.where(inside[:, None], x, torch.zeros_like(x)), lattice, blended)
+    return matrix.view(-1, 3, 4), inside & (weight_sum > 1 - 1e-4)
 
 
 def _transform_points(matrix: Tensor, x: Tensor) -> Tensor:
@@ -72,10 +73,10 @@ def _transform_points(matrix: Tensor, x: Tensor) -> Tensor:
 
 
 def _append_new_roots(
-    found: Tensor, converged: Tensor, chosen: Tensor, roots: Tensor, exists: Tensor, same_m: float
+    found: Tensor, converged: Tensor, chosen: Tensor, roots: Tensor, exists: Tensor, duplicate_m: float
 ) -> None:
-    """Add the roots that are new to the candidates of their points, as long as there is room."""
-    known = ((roots[chosen] - found[:, None]).norm(dim=2) <= same_m) & exists[chosen]
+    """Append new roots to the candidates of their points, up to the maximum number of candidates."""
+    known = ((roots[chosen] - found[:, None]).norm(dim=2) <= duplicate_m) & exists[chosen]
     count = exists[chosen].sum(1)
     new = converged & ~known.any(1) & (count < exists.shape[1])
     roots[chosen[new], count[new]] = found[new]

@@ -1,8 +1,8 @@
-"""One rule decides which twin of a kernel runs: float32 on the CPU takes numba, all else plain torch."""
+"""Choice of the implementation of a kernel: numba for float32 on the CPU, plain torch for everything else."""
 
 from torch import Tensor, float32
 
 
 def runs_on_numba(*tensors: Tensor) -> bool:
-    """True if every tensor is float32 on the CPU, so that its memory can be handed to a compiled loop."""
+    """Return True if every tensor is float32 on the CPU, so that a compiled loop can use its memory."""
     return all(tensor.dtype == float32 and tensor.device.type == "cpu" for tensor in tensors)

@@ -1,4 +1,4 @@
-"""How every loop is compiled, and where what was compiled is kept."""
+"""Compile options of all numba kernels, and the folder of the compilation cache."""
 
 import hashlib
 import os
@@ -9,30 +9,36 @@ from numba import config
 from numba.misc.appdirs import AppDirs
 
 NJIT_OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"arcp", "nsz"}}
-"""Arguments of numba's njit. Of fast math only what neither fuses nor reorders sums: what the compiler makes of that
-freedom depends on what it compiles together, so a first run and a later one would differ (docs/decisions.md).
+"""Arguments of `numba.njit`. The fast-math flags exclude fusing and reordering of sums: how the compiler uses that
+freedom depends on the functions it compiles together, so a first process and a later one, which loads a part from the
+cache, would give different results (docs/decisions.md).
 """
 
-KERNELS = Path(__file__).resolve().parents[1]
-COMPILED_SOURCES = (*sorted(KERNELS.glob("*/*cpu.py")), KERNELS / "common" / "hashing.py", Path(__file__))
-"""Files that compiled loops are made of."""
+KERNELS_FOLDER = Path(__file__).resolve().parents[1]
+COMPILED_SOURCES = (
+    *sorted(KERNELS_FOLDER.glob("*/*cpu.py")),
+    KERNELS_FOLDER / "common" / "hashing.py",
+    Path(__file__),
+)
+"""Source files of all compiled functions and of the constants in them."""
 
 
 def cache_folder() -> Path:
-    """Where numba keeps compiled loops: a folder for each state of `COMPILED_SOURCES` and of the optimiser's switches.
+    """Return numba's cache folder, one for each state of `COMPILED_SOURCES` and of the compiler flags.
 
-    numba itself asks only whether the file of a function has changed, not those of the functions and constants that
-    are compiled into it, nor how they were optimised. The folder lies where NUMBA_CACHE_DIR says, else beside the
-    sources, else, where these are read-only, in the user's cache.
+    numba itself checks only the file of a function for changes, not the files of the functions and constants that are
+    compiled into it, and not the flags. The parent folder is NUMBA_CACHE_DIR; without it `__pycache__` next to the
+    sources, or the user's cache folder where the sources are read-only.
     """
     compiler_flags = f"{config.OPT} {config.LOOP_VECTORIZE} {config.SLP_VECTORIZE}"
     digest = hashlib.sha256(compiler_flags.encode())
     for path in COMPILED_SOURCES:
         digest.update(path.read_bytes())
-    default_folder = KERNELS / "__pycache__" if os.access(KERNELS, os.W_OK) else AppDirs("numba", False).user_cache_dir
+    writable = os.access(KERNELS_FOLDER, os.W_OK)
+    default_folder = KERNELS_FOLDER / "__pycache__" if writable else AppDirs("numba", False).user_cache_dir
     return Path(config.CACHE_DIR or default_folder) / f"kernels-{digest.hexdigest()[:16]}"
 
 
-# Whoever imported numba before this package has it read the environment too early for what the package sets in it.
+# If numba was imported before this package, it read the environment before the package set its variables.
 config.reload_config()
 config.CACHE_DIR = str(cache_folder())

@@ -1,4 +1,4 @@
-"""Things packed one owner after the other: the samples of rays, the pixels of triangles, the entries of rows."""
+"""Packed segments: samples of rays, pixels of triangles, entries of matrix rows, one segment after the other."""
 
 import torch
 from jaxtyping import Int
@@ -6,5 +6,5 @@ from torch import Tensor
 
 
 def segment_ids_from_counts(counts: Int[Tensor, "n"]) -> Int[Tensor, "m"]:
-    """Which of the n owners has each of the m packed things (int64), when owner i has the next `counts[i]` of them."""
+    """Return the segment (int64) of each of the m = sum(counts) packed elements; segment i has `counts[i]` of them."""
     return torch.repeat_interleave(counts.long())

@@ -1,7 +1,7 @@
-"""Threads for work that comes in a few equal parts, each with its share of torch's and numba's threads.
+"""A thread pool for a few jobs of similar size, each with an equal number of the threads of torch and numba.
 
-A training step is some thousand operations that are too small to be shared out among threads one by one: waking a
-thread takes as long as such an operation (docs/decisions.md).
+A training step consists of about a thousand operations that are too small to be divided among threads one by one: to
+wake a thread takes as long as such an operation (docs/decisions.md).
 """
 
 from collections.abc import Callable, Iterable
@@ -15,10 +15,10 @@ T = TypeVar("T")
 
 
 class ThreadPool:
-    """At most `count` threads that take jobs at the same time: as many as torch and numba have, one at least.
+    """At most `count` concurrent workers, at least one, and no more than torch and numba have threads.
 
-    Where numba's threads cannot be entered from several others (its own "workqueue", used where neither OpenMP nor TBB
-    is found), jobs come one after the other.
+    Jobs run sequentially where several threads cannot enter numba's parallel loops at the same time: in its own
+    "workqueue" layer, which it uses if neither OpenMP nor TBB is found.
     """
 
     def __init__(self, count: int) -> None:
@@ -28,11 +28,11 @@ class ThreadPool:
         self._pool = ThreadPoolExecutor(worker_count, initializer=self._set_thread_limits) if worker_count > 1 else None
 
     def map(self, function: Callable[..., T], *arguments: Iterable) -> list[T]:
-        """What `function` gives for each of the jobs, in their order; arguments as in `map`."""
+        """Return the results of `function` for all jobs, in the order of the jobs; `arguments` as in built-in `map`."""
         if self._pool is None:
             return list(map(function, *arguments))
         threads = torch.get_num_threads()
-        # Here too: MKL has one number of threads for all threads of a process.
+        # The calling thread needs the limit too: MKL has one number of threads for the whole process.
         torch.set_num_threads(self._threads_per_worker)
         try:
             return list(self._pool.map(function, *arguments))

@@ -1,9 +1,12 @@
-"""Compiled loops of alpha compositing: a thread takes whole rays, so the sums do not depend on the number of threads.
+"""Compiled loops of alpha compositing: each thread composites whole rays, so that the sums do not depend on the number
+of threads.
 
-Backward, for a loss L with g = dL/d(image), h = dL/d(alpha), T_i the light that reaches sample i:
-dL/d(density_i) = step_i · (T_{i+1} · (g · c_i) - sum_{k>i} w_k (g · c_k) + h · T_end), because more density at i
-dims everything behind it and adds to the alpha by the light T_end that is left over.
+Backward, for a loss L with g = dL/d(image), h = dL/d(alpha), and the transmittance T_i in front of sample i:
+dL/d(density_i) = step_i · (T_{i+1} · (g · c_i) - sum_{k>i} w_k (g · c_k) + h · T_end), because a higher density at i
+attenuates all samples behind it and increases alpha by a part of the final transmittance T_end.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
@@ -11,9 +14,19 @@ from numba import njit, prange
 from pipeline.kernels.common.numba_options import NJIT_OPTIONS
 
 
+class SampleArrays(NamedTuple):
+    """Density (s), colour (s, c) and step (s) of the samples, and the offsets of the rays (n + 1)."""
+
+    density: np.ndarray
+    colour: np.ndarray
+    step: np.ndarray
+    ray_offsets: np.ndarray
+
+
 @njit(parallel=True, **NJIT_OPTIONS)
-def forward(density, colour, step, ray_offsets, weights, image, alpha):
+def forward(samples, weights, image, alpha):
     """Fill weights (s), image (n, c) and alpha (n)."""
+    density, colour, step, ray_offsets = samples
     channels = colour.shape[1]
     for ray in prange(ray_offsets.shape[0] - 1):
         transmittance = np.float32(1)
@@ -30,19 +43,9 @@ def forward(density, colour, step, ray_offsets, weights, image, alpha):
 
 
 @njit(parallel=True, **NJIT_OPTIONS)
-def backward(
-    density,
-    colour,
-    step,
-    ray_offsets,
-    weights,
-    alpha,
-    grad_image,
-    grad_alpha,
-    grad_density,
-    grad_colour,
-):
-    """Fill density_gradient (s) and colour_gradient (s, c)."""
+def backward(samples, weights, alpha, grad_image, grad_alpha, grad_density, grad_colour):
+    """Fill grad_density (s) and grad_colour (s, c)."""
+    density, colour, step, ray_offsets = samples
     channels = colour.shape[1]
     for ray in prange(ray_offsets.shape[0] - 1):
         first, last = ray_offsets[ray], ray_offsets[ray + 1]

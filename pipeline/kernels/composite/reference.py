@@ -1,4 +1,4 @@
-"""Plain-torch twin of alpha compositing: any dtype, any device, gradients by autograd."""
+"""Plain-torch reference of alpha compositing: any dtype, any device, gradients by autograd."""
 
 import torch
 from jaxtyping import Float, Int
@@ -13,11 +13,11 @@ def composite(
     step_m: Float[Tensor, "s"],
     ray_offsets: Int[Tensor, "m"],
 ) -> tuple[Float[Tensor, "n c"], Float[Tensor, "n"], Float[Tensor, "s"]]:
-    """Same as `pipeline.kernels.composite.composite`."""
+    """Do `pipeline.kernels.composite.composite`."""
     counts = ray_offsets.diff()
     ray = segment_ids_from_counts(counts)
     optical_depth = density_per_m * step_m
-    # One sum runs over all rays: in float32 the first rays' depths would swallow the last ones'.
+    # One cumulative sum over all rays: in float32 the depths of the first rays would cancel those of the last rays.
     optical_depth_before = optical_depth.double().cumsum(0) - optical_depth
     ray_optical_depth_before = torch.cat([optical_depth_before, optical_depth_before.new_zeros(1)])[
         ray_offsets[:-1].clamp(max=len(optical_depth_before))

@@ -1,12 +1,14 @@
 """Compiled loops of the hash grid.
 
-Levels are the outer loop, so that one level's table stays in the cache; in the table's gradient each thread owns whole
-levels: no atomics, and the same sums in the same order whatever the number of threads.
+Levels are the outer loop, so that the table of one level stays in the cache. In the gradient of the table each thread
+writes whole levels: no atomics, and the same sums in the same order for any number of threads.
 
-`lanes` is a tuple as long as a level has features: its length is part of its type, hence a constant in the compiled
-code, and the inner loop becomes one vector instruction. (A closure over the number would do so too, but one that calls
-another closure is never found in numba's cache.)
+The length of the tuple `lanes` is the number of features of a level. A tuple's length is part of its type, hence a
+constant in the compiled code, and the inner loop becomes one vector instruction. (A closure over the number would do
+the same, but numba never finds a closure that calls another one in its cache.)
 """
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
@@ -18,15 +20,31 @@ BLOCK = 128
 _PRIME_Y, _PRIME_Z = np.uint32(PRIMES[0]), np.uint32(PRIMES[1])
 
 
+class HashTable(NamedTuple):
+    """Rows of all levels (rows, f), or their gradient, and `GridLayout.level_params` (l, 6)."""
+
+    values: np.ndarray
+    level_params: np.ndarray
+
+
+class CornerBuffers(NamedTuple):
+    """Buffers for a block of points: table rows (8, BLOCK), weights (8, BLOCK), positions in the cell (3, BLOCK)."""
+
+    rows: np.ndarray
+    weights: np.ndarray
+    fractions: np.ndarray
+
+
 @njit(**NJIT_OPTIONS)
-def _corners(points, start, stop, params, rows, weights, fractions):
-    """Table rows (8, BLOCK), weights (8, BLOCK) and positions in the cell (3, BLOCK) of a block of points."""
+def _fill_corners(points, start, stop, params, buffers):
+    """Fill the buffers for the points start..stop of one level; return the first row of the level."""
+    rows, weights, fractions = buffers
     cells_x, cells_y, cells_z, first = params[0], params[1], params[2], params[3]
     mask, dense = np.uint32(params[4] - 1), params[5] == 1
     stride_y, stride_z = np.uint32(cells_x + 1), np.uint32((cells_x + 1) * (cells_y + 1))
     zero, one = np.float32(0), np.float32(1)
     for k in range(stop - start):
-        # The zero comes first: the second argument is taken if it is larger, and a NaN, whose row no table has, is not.
+        # `max` returns its second argument only if that is larger, which NaN is not: NaN becomes zero.
         x = min(max(zero, points[start + k, 0]), one) * np.float32(cells_x)
         y = min(max(zero, points[start + k, 1]), one) * np.float32(cells_y)
         z = min(max(zero, points[start + k, 2]), one) * np.float32(cells_z)
@@ -57,14 +75,14 @@ def _corners(points, start, stop, params, rows, weights, fractions):
 
 
 @njit(**NJIT_OPTIONS)
-def encode_block(points, table, level_params, level, encoded, start, stop, lanes):
-    """One level's features of at most BLOCK points, start..stop."""
+def encode_block(points, table, lanes, level, encoded, start, stop):
+    """Fill the features of one level of the points start..stop, at most BLOCK."""
     column = level * len(lanes)
     rows = np.empty((8, BLOCK), np.uint32)
     weights = np.empty((8, BLOCK), np.float32)
-    fractions = np.empty((3, BLOCK), np.float32)
-    first = _corners(points, start, stop, level_params[level], rows, weights, fractions)
-    values = table[first:]
+    buffers = CornerBuffers(rows, weights, np.empty((3, BLOCK), np.float32))
+    first = _fill_corners(points, start, stop, table.level_params[level], buffers)
+    values = table.values[first:]
     for k in range(stop - start):
         r0, r1, r2, r3 = rows[0, k], rows[1, k], rows[2, k], rows[3, k]
         r4, r5, r6, r7 = rows[4, k], rows[5, k], rows[6, k], rows[7, k]
@@ -77,18 +95,18 @@ def encode_block(points, table, level_params, level, encoded, start, stop, lanes
 
 
 @njit(parallel=True, **NJIT_OPTIONS)
-def encode(points, table, level_params, encoded, lanes):
-    """Fill `encoded` (n, l*f) from points (n, 3), table (rows, f) and plan (l, 6)."""
+def encode(points, table, lanes, encoded):
+    """Fill `encoded` (n, l*f) at points (n, 3) of the unit box."""
     count = points.shape[0]
-    for level in range(level_params.shape[0]):
+    for level in range(table.level_params.shape[0]):
         for block in prange((count + BLOCK - 1) // BLOCK):
             start = block * BLOCK
-            encode_block(points, table, level_params, level, encoded, start, min(start + BLOCK, count), lanes)
+            encode_block(points, table, lanes, level, encoded, start, min(start + BLOCK, count))
 
 
 @njit(**NJIT_OPTIONS)
 def find_nonzero_rows(values):
-    """Indices of the rows (n, c) that hold anything but zeros."""
+    """Return the indices of the rows of `values` (n, c) that are not all zero."""
     rows = np.empty(values.shape[0], np.int64)
     count = 0
     for row in range(values.shape[0]):
@@ -102,18 +120,17 @@ def find_nonzero_rows(values):
 
 @njit(**NJIT_OPTIONS)
 def _interleaved_level(index, levels):
-    """0, 2, 4, ... and then 1, 3, 5, ...: two threads that take half of the turns each get coarse and fine levels."""
+    """Return 0, 2, 4, ..., then 1, 3, 5, ...: each of two threads then gets coarse and fine levels."""
     even = (levels + 1) // 2
     return 2 * index if index < even else 2 * (index - even) + 1
 
 
 @njit(**NJIT_OPTIONS)
-def _scatter_gradient_block(
-    points, level_params, level, gradient, grad_table, start, stop, rows, weights, fractions, lanes
-):
+def _scatter_gradient_block(points, gradient, grad_table, lanes, level, start, stop, buffers):
+    rows, weights, _ = buffers
     column = level * len(lanes)
-    first = _corners(points, start, stop, level_params[level], rows, weights, fractions)
-    values = grad_table[first:]
+    first = _fill_corners(points, start, stop, grad_table.level_params[level], buffers)
+    values = grad_table.values[first:]
     for k in range(stop - start):
         for corner in range(8):
             row, weight = rows[corner, k], weights[corner, k]
@@ -122,31 +139,30 @@ def _scatter_gradient_block(
 
 
 @njit(parallel=True, **NJIT_OPTIONS)
-def add_table_gradient(points, level_params, gradient, grad_table, lanes):
-    """Add to `grad_table` (rows, f) what gradient (n, l*f) means for the table."""
+def add_table_gradient(points, gradient, grad_table, lanes):
+    """Add the gradient of the table to `grad_table` (a `HashTable`), from dL/dfeatures = gradient (n, l*f)."""
     count = points.shape[0]
-    levels = level_params.shape[0]
+    levels = grad_table.level_params.shape[0]
     for index in prange(levels):
         level = _interleaved_level(index, levels)
         rows = np.empty((8, BLOCK), np.uint32)
         weights = np.empty((8, BLOCK), np.float32)
-        fractions = np.empty((3, BLOCK), np.float32)
+        buffers = CornerBuffers(rows, weights, np.empty((3, BLOCK), np.float32))
         for block in range((count + BLOCK - 1) // BLOCK):
             start = block * BLOCK
             stop = min(start + BLOCK, count)
-            _scatter_gradient_block(
-                points, level_params, level, gradient, grad_table, start, stop, rows, weights, fractions, lanes
-            )
+            _scatter_gradient_block(points, gradient, grad_table, lanes, level, start, stop, buffers)
 
 
 @njit(**NJIT_OPTIONS)
-def _point_gradient_block(points, table, level_params, level, gradient, grad_points, start, stop, lanes):
+def _point_gradient_block(points, table, lanes, level, gradient, grad_points, start, stop):
+    level_params = table.level_params
     column = level * len(lanes)
     rows = np.empty((8, BLOCK), np.uint32)
-    weights = np.empty((8, BLOCK), np.float32)
     fractions = np.empty((3, BLOCK), np.float32)
-    first = _corners(points, start, stop, level_params[level], rows, weights, fractions)
-    values = table[first:]
+    buffers = CornerBuffers(rows, np.empty((8, BLOCK), np.float32), fractions)
+    first = _fill_corners(points, start, stop, level_params[level], buffers)
+    values = table.values[first:]
     dots = np.empty(8, np.float32)
     for k in range(stop - start):
         for corner in range(8):
@@ -180,11 +196,11 @@ def _point_gradient_block(points, table, level_params, level, gradient, grad_poi
 
 
 @njit(parallel=True, **NJIT_OPTIONS)
-def add_points_gradient(points, table, level_params, gradient, grad_points, lanes):
-    """Add to `grad_points` (n, 3) what gradient (n, l*f) means for the points."""
+def add_points_gradient(points, table, lanes, gradient, grad_points):
+    """Add dL/dpoints to `grad_points` (n, 3), from dL/dfeatures = gradient (n, l*f)."""
     count = points.shape[0]
-    for level in range(level_params.shape[0]):
+    for level in range(table.level_params.shape[0]):
         for block in prange((count + BLOCK - 1) // BLOCK):
             start = block * BLOCK
             stop = min(start + BLOCK, count)
-            _point_gradient_block(points, table, level_params, level, gradient, grad_points, start, stop, lanes)
+            _point_gradient_block(points, table, lanes, level, gradient, grad_points, start, stop)

@@ -1,4 +1,4 @@
-"""Plain-torch twin of the hash grid: any dtype, any device, gradients by autograd."""
+"""Plain-torch reference of the hash grid: any dtype, any device, gradients by autograd."""
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ LOW_32 = 0xFFFFFFFF
 def encode(
     points_unit: Float[Tensor, "n 3"], table: Float[Tensor, "rows f"], level_params: np.ndarray
 ) -> Float[Tensor, "n width"]:
-    """Same as `pipeline.kernels.hashgrid.encode`, all levels at once; `level_params` is `GridLayout.level_params`."""
+    """Do `pipeline.kernels.hashgrid.encode`, all levels at once; `level_params` is `GridLayout.level_params`."""
     levels = torch.from_numpy(level_params).to(table.device)
     cells, (first, rows, dense) = levels[:, :3], levels[:, 3:, None].unbind(1)
     corner, axis_weights = cell_corners(points_unit.clamp(0, 1)[:, None] * cells, cells)

@@ -1,4 +1,4 @@
-"""Vertex attributes at the pixels where their faces are seen, differentiable."""
+"""Perspective-correct interpolation of vertex attributes at covered pixels, differentiable."""
 
 from typing import Any
 
@@ -20,10 +20,13 @@ def interpolate(
     faces: Int[Tensor, "f 3"],
     attributes: Float[Tensor, "v c"],
 ) -> Float[Tensor, "n c"]:
-    """Perspective-correct attributes at pixel centres. Differentiable in vertices_px, depth_m and attributes.
+    """Interpolate attributes at pixel centres. Differentiable in vertices_px, depth_m and attributes.
 
-    covered: row-major pixel numbers in a picture ``width`` wide. face_of: the face seen at each of them.
-    vertices_px: pixel centres at +0.5. depth_m: > 0 at every corner of these faces.
+    Args:
+        covered: row-major pixel indices in an image of `width` columns.
+        face_ids: face visible at each of these pixels.
+        vertices_px: image position, pixel centres at +0.5.
+        depth_m: > 0 at every corner of the visible faces.
     """
     if not runs_on_numba(vertices_px, depth_m, attributes):
         return interpolate_reference(covered, face_ids, width, vertices_px, depth_m, faces, attributes)

@@ -1,8 +1,8 @@
-"""Perspective-correct interpolation and its gradient on the CPU, one pass over the covered pixels each.
+"""Compiled loops of perspective-correct interpolation and its gradient: one pass over the covered pixels each.
 
-Letters: a, b, c the corners of the pixel's face relative to the pixel centre (px), e_k the edge functions there,
-A their sum, q_k = e_k / (A z_k), S = q_0 + q_1 + q_2, barycentrics b_k = q_k / S. The gradient is summed into one
-private copy per block of pixels, added up in block order: the same bytes with any number of threads.
+Notation: a, b, c corners of the face relative to the pixel centre (px); e_k edge functions at the centre, A their sum;
+q_k = e_k / (A z_k), S = q_0 + q_1 + q_2; barycentrics b_k = q_k / S. The gradient of each block of pixels is summed
+into a private copy, and the copies are added in block order: the result does not depend on the number of threads.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ BLOCKS = 8
 def _geometry(
     face: int, pixel: int, width: int, vertices_px: np.ndarray, depth_m: np.ndarray, faces: np.ndarray
 ) -> tuple:
-    """Corner indices, corners relative to the pixel centre, A, q and S of a pixel in its face."""
+    """Return corner indices, corners relative to the pixel centre, A, q and S of a pixel in its face."""
     i, j, k = faces[face, 0], faces[face, 1], faces[face, 2]
     px, py = pixel % width + 0.5, pixel // width + 0.5
     ax, ay = np.float64(vertices_px[i, 0]) - px, np.float64(vertices_px[i, 1]) - py
@@ -55,7 +55,7 @@ def interpolate_forward(
     faces: np.ndarray,
     attributes: np.ndarray,
 ) -> np.ndarray:
-    """(n, c) attributes at the covered pixels."""
+    """Return the attributes (n, c) at the covered pixels."""
     values = np.empty((len(covered), attributes.shape[1]), np.float32)
     for n in prange(len(covered)):
         _fill_pixel((covered[n], face_ids[n]), width, vertices_px, depth_m, faces, attributes, values[n])
@@ -73,7 +73,7 @@ def _add_pixel(
     upstream: np.ndarray,
     out: np.ndarray,
 ) -> None:
-    """Adds one pixel's gradient to ``out`` (v, 3 + c): d/dx, d/dy, d/dz, d/dattributes."""
+    """Add the gradient of one pixel to `out` (v, 3 + c): d/dx, d/dy, d/dz, d/dattributes."""
     corners, offsets, area, q, total = _geometry(pixel[1], pixel[0], width, vertices_px, depth_m, faces)
     i, j, k = corners
     ax, ay, bx, by, cx, cy = offsets
@@ -92,7 +92,7 @@ def _add_pixel(
     out[i, 2] -= d0 * q[0] / depth_m[i]
     out[j, 2] -= d1 * q[1] / depth_m[j]
     out[k, 2] -= d2 * q[2] / depth_m[k]
-    # sum(d_k q_k) is zero, because barycentrics do not change when all q grow alike: A needs no gradient of its own
+    # sum(d_k q_k) is zero, because barycentrics do not change when all q are scaled: A needs no gradient of its own.
     f0, f1, f2 = d0 / (area * depth_m[i]), d1 / (area * depth_m[j]), d2 / (area * depth_m[k])
     out[i, 0] += -f1 * cy + f2 * by
     out[i, 1] += f1 * cx - f2 * bx
@@ -113,7 +113,7 @@ def interpolate_backward(
     attributes: np.ndarray,
     upstream: np.ndarray,
 ) -> np.ndarray:
-    """(v, 3 + c) gradient by position (px), depth and attributes, given the (n, c) gradient by the values."""
+    """Return the gradient (v, 3 + c) of position (px), depth and attributes; upstream (n, c): that of the values."""
     count, size = len(covered), 3 + attributes.shape[1]
     parts = np.zeros((BLOCKS, len(vertices_px), size), np.float32)
     for block in prange(BLOCKS):

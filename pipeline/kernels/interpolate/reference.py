@@ -1,4 +1,4 @@
-"""Plain torch interpolation: the definition that the fast kernel is tested against."""
+"""Plain-torch reference of interpolation: any dtype, any device, gradients by autograd."""
 
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -15,7 +15,7 @@ def interpolate_reference(
     faces: Int[Tensor, "f 3"],
     attributes: Float[Tensor, "v c"],
 ) -> Float[Tensor, "n c"]:
-    """``pipeline.kernels.interpolate.interpolate`` on any device, any float type."""
+    """Do `pipeline.kernels.interpolate.interpolate`."""
     corner = faces.long()[face_ids.long()]
     centres = pixel_centres_px(covered, width, vertices_px.dtype)
     q = weighted_inverse_depth(vertices_px[corner], depth_m[corner], centres)

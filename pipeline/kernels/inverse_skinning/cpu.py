@@ -1,46 +1,71 @@
-"""Compiled loops that bake the warp grid of a frame, skinning inverted at its nodes. Grid arguments: `newton_cpu`."""
+"""Compiled loops that bake the warp grid of one frame: skinning inverted at the nodes of a posed grid."""
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from pipeline.kernels.common.numba_options import NJIT_OPTIONS
-from pipeline.kernels.inverse_skinning.newton_cpu import apply_affine, invert, skin_point
+from pipeline.kernels.inverse_skinning.newton_cpu import LatticeArrays, apply_affine, invert, skin_point
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
 MAX_EXTRA_DISTANCE_M = np.float32(0.03)
-"""An inverse that much farther from the body than another is not believed: the side of a torso would else become a flap
-below the arm that hung beside it.
+"""Of several inverses, those that are this much farther from the body than the nearest one are dropped: otherwise the
+side of the torso would appear again as a flap below a raised arm that hung next to it in the canonical pose.
 """
 
 
+class SkinArrays(NamedTuple):
+    """A skin grid and the matrices of one frame.
+
+    nodes (m, 3): canonical positions. distance (m): distance to the body. blended (m, 1, 12): skinning matrices.
+    """
+
+    lattice: LatticeArrays
+    nodes: np.ndarray
+    distance: np.ndarray
+    blended: np.ndarray
+
+
+class PosedGrid(NamedTuple):
+    """A grid in posed space, with the cell size of the skin grid: position of the first node (3), node counts (3)."""
+
+    origin: np.ndarray
+    dims: np.ndarray
+
+
 @njit(**NJIT_OPTIONS)
-def _newton(px, py, pz, x, y, z, iterations, tolerance, origin, cell, row_of_node, blended, inverse_jacobian):
-    """Solve A(x) x = p from a start; fills the inverse Jacobian (9). Returns converged, x, y, z, squared residual."""
+def _newton(target, start, iterations, tolerance, lattice, blended, inverse_jacobian):
+    """Solve A(x) x = target by Newton's method; return whether it converged, and x.
+
+    Fills `inverse_jacobian` (9) with that of the last iterate.
+    """
+    x, y, z = start
     squared = np.float32(1e9)
     for iteration in range(iterations + 1):
-        inside, qx, qy, qz, a, b, c, d, e, f, g, h, k = skin_point(x, y, z, 0, origin, cell, row_of_node, blended)
+        inside, (qx, qy, qz), jacobian = skin_point((x, y, z), 0, lattice, blended)
         if not inside:
-            return False, x, y, z, squared
-        invertible, a, b, c, d, e, f, g, h, k = invert(a, b, c, d, e, f, g, h, k)
+            return False, x, y, z
+        invertible, (a, b, c, d, e, f, g, h, k) = invert(jacobian)
         if not invertible:
-            return False, x, y, z, squared
+            return False, x, y, z
         inverse_jacobian[0], inverse_jacobian[1], inverse_jacobian[2] = a, b, c
         inverse_jacobian[3], inverse_jacobian[4], inverse_jacobian[5] = d, e, f
         inverse_jacobian[6], inverse_jacobian[7], inverse_jacobian[8] = g, h, k
-        rx, ry, rz = px - qx, py - qy, pz - qz
+        rx, ry, rz = target[0] - qx, target[1] - qy, target[2] - qz
         squared = rx * rx + ry * ry + rz * rz
         if squared < tolerance * tolerance or iteration == iterations:
             break
         sx, sy, sz = a * rx + b * ry + c * rz, d * rx + e * ry + f * rz, g * rx + h * ry + k * rz
         length = np.sqrt(sx * sx + sy * sy + sz * sz)
-        scale = min(_ONE, np.float32(2) * cell / max(length, np.float32(1e-9)))
+        scale = min(_ONE, np.float32(2) * lattice.cell / max(length, np.float32(1e-9)))
         x, y, z = x + scale * sx, y + scale * sy, z + scale * sz
-    return squared < tolerance * tolerance, x, y, z, squared
+    return squared < tolerance * tolerance, x, y, z
 
 
 @njit(**NJIT_OPTIONS)
 def skin_nodes(nodes, blended):
-    """Posed positions (m, 3) of the skin grid's nodes, and their box (2, 3)."""
+    """Return the posed positions (m, 3) of the nodes (m, 3) of the skin grid, and their bounding box (2, 3)."""
     posed = np.empty((nodes.shape[0], 3), np.float32)
     box = np.empty((2, 3), np.float32)
     box[0], box[1] = np.float32(1e9), np.float32(-1e9)
@@ -55,20 +80,24 @@ def skin_nodes(nodes, blended):
 
 
 @njit(**NJIT_OPTIONS)
-def _choose_start_rows(posed, distance, posed_origin, cell, dims):
-    """For each posed node the skin-grid row to start from: near in space, and of the body part that is nearest."""
+def _choose_start_rows(posed, distance, cell, grid):
+    """Return for each posed node the row of the skin grid to start from, -1 if none is near.
+
+    The chosen row minimises distance to the posed node + distance to the body.
+    """
+    origin, dims = grid
     best = np.full(dims[0] * dims[1] * dims[2], np.float32(1e9))
     start_row = np.full(dims[0] * dims[1] * dims[2], -1, np.int32)
     for row in range(posed.shape[0]):
-        ci = int(np.floor((posed[row, 0] - posed_origin[0]) / cell + np.float32(0.5)))
-        cj = int(np.floor((posed[row, 1] - posed_origin[1]) / cell + np.float32(0.5)))
-        ck = int(np.floor((posed[row, 2] - posed_origin[2]) / cell + np.float32(0.5)))
+        ci = int(np.floor((posed[row, 0] - origin[0]) / cell + np.float32(0.5)))
+        cj = int(np.floor((posed[row, 1] - origin[1]) / cell + np.float32(0.5)))
+        ck = int(np.floor((posed[row, 2] - origin[2]) / cell + np.float32(0.5)))
         for i in range(max(ci - 1, 0), min(ci + 2, dims[0])):
-            dx = posed_origin[0] + np.float32(i) * cell - posed[row, 0]
+            dx = origin[0] + np.float32(i) * cell - posed[row, 0]
             for j in range(max(cj - 1, 0), min(cj + 2, dims[1])):
-                dy = posed_origin[1] + np.float32(j) * cell - posed[row, 1]
+                dy = origin[1] + np.float32(j) * cell - posed[row, 1]
                 for k in range(max(ck - 1, 0), min(ck + 2, dims[2])):
-                    dz = posed_origin[2] + np.float32(k) * cell - posed[row, 2]
+                    dz = origin[2] + np.float32(k) * cell - posed[row, 2]
                     key = distance[row] + np.sqrt(dx * dx + dy * dy + dz * dz)
                     node = (i * dims[1] + j) * dims[2] + k
                     if key < best[node]:
@@ -77,34 +106,35 @@ def _choose_start_rows(posed, distance, posed_origin, cell, dims):
 
 
 @njit(**NJIT_OPTIONS)
-def _solve_nodes(start_row, nodes, posed, posed_origin, dims, origin, cell, row_of_node, blended):
-    """Canonical positions (count, 3) of the posed nodes; NaN where none was found."""
+def _solve_nodes(start_row, posed, skin, grid):
+    """Return the canonical positions (count, 3) of the posed nodes; NaN where no inverse was found."""
+    lattice, nodes, _, blended = skin
+    origin, dims = grid
+    cell = lattice.cell
     canonical = np.full((start_row.shape[0], 3), np.float32(np.nan))
     inverse_jacobian = np.empty(9, np.float32)
     for node in range(start_row.shape[0]):
         row = start_row[node]
         if row < 0:
             continue
-        px = posed_origin[0] + np.float32(node // (dims[1] * dims[2])) * cell
-        py = posed_origin[1] + np.float32(node // dims[2] % dims[1]) * cell
-        pz = posed_origin[2] + np.float32(node % dims[2]) * cell
+        px = origin[0] + np.float32(node // (dims[1] * dims[2])) * cell
+        py = origin[1] + np.float32(node // dims[2] % dims[1]) * cell
+        pz = origin[2] + np.float32(node % dims[2]) * cell
         m = blended[row, 0]
-        invertible, a, b, c, d, e, f, g, h, k = invert(m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10])
+        _, (a, b, c, d, e, f, g, h, k) = invert((m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10]))
         rx, ry, rz = px - posed[row, 0], py - posed[row, 1], pz - posed[row, 2]
         x = nodes[row, 0] + a * rx + b * ry + c * rz
         y = nodes[row, 1] + d * rx + e * ry + f * rz
         z = nodes[row, 2] + g * rx + h * ry + k * rz
-        found, x, y, z, _ = _newton(
-            px, py, pz, x, y, z, 6, np.float32(2e-5), origin, cell, row_of_node, blended, inverse_jacobian
-        )
-        if found:
+        converged, x, y, z = _newton((px, py, pz), (x, y, z), 6, np.float32(2e-5), lattice, blended, inverse_jacobian)
+        if converged:
             canonical[node, 0], canonical[node, 1], canonical[node, 2] = x, y, z
     return canonical
 
 
 @njit(**NJIT_OPTIONS)
 def _is_smooth(canonical, corners, limit):
-    """True if all eight corners have an inverse and no edge of the cell is stretched beyond `limit` metres."""
+    """Return whether all eight corners have an inverse and no edge of the cell is longer than `limit` (m)."""
     for a in range(8):
         if np.isnan(canonical[corners[a], 0]):
             return False
@@ -123,8 +153,9 @@ def _is_smooth(canonical, corners, limit):
 
 
 @njit(**NJIT_OPTIONS)
-def _distance_at(x, y, z, origin, cell, row_of_node, distance):
-    """Distance to the body at a canonical point whose cell has all its nodes."""
+def _distance_at(x, y, z, lattice, distance):
+    """Return the distance to the body at a canonical point whose cell has all eight nodes."""
+    origin, cell, row_of_node = lattice
     gx, gy, gz = (x - origin[0]) / cell, (y - origin[1]) / cell, (z - origin[2]) / cell
     i, j, k = int(np.floor(gx)), int(np.floor(gy)), int(np.floor(gz))
     u, v, w = gx - np.float32(i), gy - np.float32(j), gz - np.float32(k)
@@ -138,7 +169,7 @@ def _distance_at(x, y, z, origin, cell, row_of_node, distance):
 
 @njit(**NJIT_OPTIONS)
 def _drop_far_inverses(affine_maps, distances, found):
-    """Drop the inverses that lie much farther from the body than the nearest one; returns how many are left."""
+    """Drop inverses beyond `MAX_EXTRA_DISTANCE_M`, in place; return the number that remain."""
     nearest = distances[0]
     for root in range(1, found):
         nearest = min(nearest, distances[root])
@@ -151,10 +182,11 @@ def _drop_far_inverses(affine_maps, distances, found):
 
 
 @njit(**NJIT_OPTIONS)
-def _is_duplicate_root(affine_maps, found, px, py, pz, x, y, z, limit):
-    """True if one of the first `found` inverses puts the posed point p within `limit` metres of x."""
+def _is_duplicate_root(affine_maps, found, posed, canonical, limit):
+    """Return whether one of the first `found` inverses maps the posed point to within `limit` (m) of `canonical`."""
+    x, y, z = canonical
     for other in range(found):
-        ox, oy, oz = apply_affine(affine_maps[other], px, py, pz)
+        ox, oy, oz = apply_affine(affine_maps[other], posed[0], posed[1], posed[2])
         squared = (ox - x) * (ox - x) + (oy - y) * (oy - y) + (oz - z) * (oz - z)
         if squared <= limit * limit:
             return True
@@ -162,11 +194,14 @@ def _is_duplicate_root(affine_maps, found, px, py, pz, x, y, z, limit):
 
 
 @njit(**NJIT_OPTIONS)
-def _roots_in_cell(canonical, corners, centre, origin, cell, row_of_node, blended, distance, affine_maps):
-    """Distinct inverses at a cell's centre, started from its corners, as affine maps (4, 12); returns their number.
+def _roots_in_cell(canonical, corners, centre, skin, affine_maps):
+    """Fill `affine_maps` (4, 12) with the distinct inverses at the centre of a posed cell; return their number.
 
-    A corner that an inverse found before explains already would lead there again, and starts none.
+    Newton's method starts from the inverse of each corner. A corner that an earlier root already explains is skipped,
+    because it would converge to that root again.
     """
+    lattice, blended = skin.lattice, skin.blended
+    cell = lattice.cell
     found = 0
     half, same = np.float32(0.5) * cell, np.float32(0.1) * cell
     distances = np.empty(4, np.float32)
@@ -179,12 +214,10 @@ def _roots_in_cell(canonical, corners, centre, origin, cell, row_of_node, blende
         px, py, pz = centre[0], centre[1], centre[2]
         right, up, away = corner & 1, (corner >> 1) & 1, corner >> 2
         cx, cy, cz = px + (half if right else -half), py + (half if up else -half), pz + (half if away else -half)
-        if _is_duplicate_root(affine_maps, found, cx, cy, cz, x, y, z, same):
+        if _is_duplicate_root(affine_maps, found, (cx, cy, cz), (x, y, z), same):
             continue
-        converged, x, y, z, _ = _newton(
-            px, py, pz, x, y, z, 5, np.float32(2e-4), origin, cell, row_of_node, blended, inverse_jacobian
-        )
-        converged &= not _is_duplicate_root(affine_maps, found, px, py, pz, x, y, z, same)
+        converged, x, y, z = _newton((px, py, pz), (x, y, z), 5, np.float32(2e-4), lattice, blended, inverse_jacobian)
+        converged &= not _is_duplicate_root(affine_maps, found, (px, py, pz), (x, y, z), same)
         if not converged:
             continue
         for axis in range(3):
@@ -193,14 +226,16 @@ def _roots_in_cell(canonical, corners, centre, origin, cell, row_of_node, blende
                 affine_maps[found, 4 * axis + column] = inverse_jacobian[3 * axis + column]
                 value -= inverse_jacobian[3 * axis + column] * centre[column]
             affine_maps[found, 4 * axis + 3] = value
-        distances[found] = _distance_at(x, y, z, origin, cell, row_of_node, distance)
+        distances[found] = _distance_at(x, y, z, lattice, skin.distance)
         found += 1
     return _drop_far_inverses(affine_maps, distances, found) if found > 1 else found
 
 
 @njit(**NJIT_OPTIONS)
-def _encode_cells(canonical, posed_origin, dims, origin, cell, row_of_node, blended, distance):
-    """A code per posed cell and the affine maps of the cells without one smooth inverse: see `bake_warp_grid`."""
+def _encode_cells(canonical, skin, grid):
+    """Return the code of each posed cell, and the affine maps of the cells without one smooth inverse (`WarpGrid`)."""
+    origin, dims = grid
+    cell = skin.lattice.cell
     cell_codes = np.full((dims[0] - 1) * (dims[1] - 1) * (dims[2] - 1), -1, np.int32)
     capacity, used = 256, 0
     table = np.empty((capacity, 12), np.float32)
@@ -220,12 +255,10 @@ def _encode_cells(canonical, posed_origin, dims, origin, cell, row_of_node, blen
                 if _is_smooth(canonical, corners, np.float32(2) * cell):
                     cell_codes[code] = 0
                     continue
-                centre[0] = posed_origin[0] + (np.float32(i) + np.float32(0.5)) * cell
-                centre[1] = posed_origin[1] + (np.float32(j) + np.float32(0.5)) * cell
-                centre[2] = posed_origin[2] + (np.float32(k) + np.float32(0.5)) * cell
-                count = _roots_in_cell(
-                    canonical, corners, centre, origin, cell, row_of_node, blended, distance, affine_maps
-                )
+                centre[0] = origin[0] + (np.float32(i) + np.float32(0.5)) * cell
+                centre[1] = origin[1] + (np.float32(j) + np.float32(0.5)) * cell
+                centre[2] = origin[2] + (np.float32(k) + np.float32(0.5)) * cell
+                count = _roots_in_cell(canonical, corners, centre, skin, affine_maps)
                 if count == 0:
                     continue
                 if used + count > capacity:
@@ -240,9 +273,9 @@ def _encode_cells(canonical, posed_origin, dims, origin, cell, row_of_node, blen
 
 
 @njit(**NJIT_OPTIONS)
-def bake_warp_grid(nodes, posed, distance, posed_origin, dims, origin, cell, row_of_node, blended):
-    """The warp grid of one frame: see `pipeline.kernels.inverse_skinning.bake_warp_grid`."""
-    start_row = _choose_start_rows(posed, distance, posed_origin, cell, dims)
-    canonical = _solve_nodes(start_row, nodes, posed, posed_origin, dims, origin, cell, row_of_node, blended)
-    cell_codes, affine_maps = _encode_cells(canonical, posed_origin, dims, origin, cell, row_of_node, blended, distance)
+def bake_warp_grid(posed, skin, grid):
+    """Return canonical positions, cell codes and affine maps of a `WarpGrid`; posed (m, 3): `skin_nodes`' output."""
+    start_row = _choose_start_rows(posed, skin.distance, skin.lattice.cell, grid)
+    canonical = _solve_nodes(start_row, posed, skin, grid)
+    cell_codes, affine_maps = _encode_cells(canonical, skin, grid)
     return canonical, cell_codes, affine_maps

@@ -1,12 +1,14 @@
-"""Compiled loops of skinning through a grid and of one Newton step back, with its gradient.
+"""Compiled loops of grid-based skinning and of one Newton step of its inverse, with the gradient.
 
-Forward, a canonical point x is carried by A(x) = sum_j w_j(x) B_j, whose 12 numbers are interpolated trilinearly
-between the nodes of the skin grid. Inverse, x(p) solves A(x) x = p: Newton's method with the exact Jacobian
-J = A_3x3 + sum_corners (A_corner x) grad(weight_corner)^T.
+Forward: the canonical point x moves to A(x) x with A(x) = sum_j w_j(x) B_j, whose 12 entries are interpolated
+trilinearly between the nodes of the skin grid. Inverse: x(p) solves A(x) x = p by Newton's method with the exact
+Jacobian J = A_3x3 + sum_corners (A_corner x) grad(weight_corner)^T.
 
-Grid arguments, everywhere: origin (3), cell (m), row_of_node (gx, gy, gz) int32 with -1 where the grid has no node,
-blended (m, k, 12), the rows of A (3, 4) at the nodes that exist, for each of k frames.
+Notation: `blended` (m, k, 12) holds the rows of A (3 x 4) at the m nodes that exist, for each of k frames. A 3 x 3
+matrix is a tuple of 9 numbers, row by row.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
@@ -17,9 +19,17 @@ _ZERO, _ONE = np.float32(0), np.float32(1)
 BLOCK = 256
 
 
+class LatticeArrays(NamedTuple):
+    """Node positions of a skin grid: first node (3, m), spacing (m), and row of each node (gx, gy, gz), -1 for none."""
+
+    origin: np.ndarray
+    cell: np.float32
+    row_of_node: np.ndarray
+
+
 @njit(**NJIT_OPTIONS)
 def apply_affine(m, x, y, z):
-    """m (12 numbers, a 3 x 4 matrix by rows) times (x, y, z, 1)."""
+    """Return m (x, y, z, 1) for a 3 x 4 matrix m of 12 numbers, row by row."""
     return (
         m[0] * x + m[1] * y + m[2] * z + m[3],
         m[4] * x + m[5] * y + m[6] * z + m[7],
@@ -28,8 +38,10 @@ def apply_affine(m, x, y, z):
 
 
 @njit(**NJIT_OPTIONS)
-def skin_point(x, y, z, frame, origin, cell, row_of_node, blended):
-    """Posed position of a canonical point and the Jacobian, as 13 numbers: inside, position, J by rows."""
+def skin_point(point, frame, lattice, blended):
+    """Return whether a canonical point is inside the grid, its posed position (3) and the Jacobian J (9)."""
+    x, y, z = point
+    origin, cell, row_of_node = lattice
     inverse = _ONE / cell
     gx, gy, gz = (x - origin[0]) * inverse, (y - origin[1]) * inverse, (z - origin[2]) * inverse
     i, j, k = int(np.floor(gx)), int(np.floor(gy)), int(np.floor(gz))
@@ -53,33 +65,27 @@ def skin_point(x, y, z, frame, origin, cell, row_of_node, blended):
             qx, qy, qz = apply_affine(m, x, y, z)
             weight, along_x, along_y, along_z = wx * wy * wz, dx * wy * wz, wx * dy * wz, wx * wy * dz
             px, py, pz = px + weight * qx, py + weight * qy, pz + weight * qz
-            j00, j01, j02 = (
-                j00 + weight * m[0] + along_x * qx,
-                j01 + weight * m[1] + along_y * qx,
-                j02 + weight * m[2] + along_z * qx,
-            )
-            j10, j11, j12 = (
-                j10 + weight * m[4] + along_x * qy,
-                j11 + weight * m[5] + along_y * qy,
-                j12 + weight * m[6] + along_z * qy,
-            )
-            j20, j21, j22 = (
-                j20 + weight * m[8] + along_x * qz,
-                j21 + weight * m[9] + along_y * qz,
-                j22 + weight * m[10] + along_z * qz,
-            )
-    return inside, px, py, pz, j00, j01, j02, j10, j11, j12, j20, j21, j22
+            j00 = j00 + weight * m[0] + along_x * qx
+            j01 = j01 + weight * m[1] + along_y * qx
+            j02 = j02 + weight * m[2] + along_z * qx
+            j10 = j10 + weight * m[4] + along_x * qy
+            j11 = j11 + weight * m[5] + along_y * qy
+            j12 = j12 + weight * m[6] + along_z * qy
+            j20 = j20 + weight * m[8] + along_x * qz
+            j21 = j21 + weight * m[9] + along_y * qz
+            j22 = j22 + weight * m[10] + along_z * qz
+    return inside, (px, py, pz), (j00, j01, j02, j10, j11, j12, j20, j21, j22)
 
 
 @njit(**NJIT_OPTIONS)
-def invert(j00, j01, j02, j10, j11, j12, j20, j21, j22):
-    """Inverse of a 3x3 matrix by rows, and whether it is far from singular."""
+def invert(matrix):
+    """Return whether a 3 x 3 matrix (9) is invertible (|determinant| > 1e-3), and its inverse (9), zeros if not."""
+    j00, j01, j02, j10, j11, j12, j20, j21, j22 = matrix
     c00, c01, c02 = j11 * j22 - j12 * j21, j12 * j20 - j10 * j22, j10 * j21 - j11 * j20
     determinant = j00 * c00 + j01 * c01 + j02 * c02
     invertible = abs(determinant) > np.float32(1e-3)
     s = _ONE / determinant if invertible else _ZERO
-    return (
-        invertible,
+    inverse = (
         s * c00,
         s * (j02 * j21 - j01 * j22),
         s * (j01 * j12 - j02 * j11),
@@ -90,18 +96,20 @@ def invert(j00, j01, j02, j10, j11, j12, j20, j21, j22):
         s * (j01 * j20 - j00 * j21),
         s * (j00 * j11 - j01 * j10),
     )
+    return invertible, inverse
 
 
 @njit(**NJIT_OPTIONS)
-def newton_step(px, py, pz, x, y, z, frame, origin, cell, row_of_node, blended, inverse_jacobian):
-    """Where one step from (x, y, z) comes nearer to A(x) x = p: the start itself where a step is not possible.
+def newton_step(target, start, frame, lattice, blended, inverse_jacobian):
+    """Return the point after one Newton step from `start` towards A(x) x = target; `start` if no step is possible.
 
-    Fills the step's inverse Jacobian (9) by rows, or zeros.
+    Fills `inverse_jacobian` (9) with that of the step, or with zeros.
     """
-    inside, qx, qy, qz, a, b, c, d, e, f, g, h, k = skin_point(x, y, z, frame, origin, cell, row_of_node, blended)
-    invertible, a, b, c, d, e, f, g, h, k = invert(a, b, c, d, e, f, g, h, k)
+    x, y, z = start
+    inside, (qx, qy, qz), jacobian = skin_point(start, frame, lattice, blended)
+    invertible, (a, b, c, d, e, f, g, h, k) = invert(jacobian)
     if inside and invertible:
-        rx, ry, rz = px - qx, py - qy, pz - qz
+        rx, ry, rz = target[0] - qx, target[1] - qy, target[2] - qz
         x, y, z = x + a * rx + b * ry + c * rz, y + d * rx + e * ry + f * rz, z + g * rx + h * ry + k * rz
     else:
         a = b = c = d = e = f = g = h = k = _ZERO
@@ -112,28 +120,29 @@ def newton_step(px, py, pz, x, y, z, frame, origin, cell, row_of_node, blended, 
 
 
 @njit(parallel=True, **NJIT_OPTIONS)
-def newton_step_batch(points_posed, start, batch_index, origin, cell, row_of_node, blended, refined, inverse_jacobian):
-    """`newton_step` for each point (s, 3) from its start.
+def newton_step_batch(posed, start, batch_index, lattice, blended, refined, inverse_jacobian):
+    """Fill `refined` (s, 3) and `inverse_jacobian` (s, 9): `newton_step` for each posed point (s, 3) from its start.
 
-    slot (s) says which frame of `blended` a point belongs to. inverse_jacobian (s, 9): that of the step, or zeros.
+    batch_index (s): frame of `blended` that each point belongs to.
     """
-    count = points_posed.shape[0]
+    count = posed.shape[0]
     for block in prange((count + BLOCK - 1) // BLOCK):
         for s in range(block * BLOCK, min(block * BLOCK + BLOCK, count)):
+            target, first = (posed[s, 0], posed[s, 1], posed[s, 2]), (start[s, 0], start[s, 1], start[s, 2])
             refined[s, 0], refined[s, 1], refined[s, 2] = newton_step(
-                points_posed[s, 0], points_posed[s, 1], points_posed[s, 2], start[s, 0], start[s, 1], start[s, 2],
-                batch_index[s], origin, cell, row_of_node, blended, inverse_jacobian[s],
-            )  # fmt: skip
+                target, first, batch_index[s], lattice, blended, inverse_jacobian[s]
+            )
 
 
 @njit(parallel=True, **NJIT_OPTIONS)
-def add_pose_gradient(points, inverse_jacobian, gradient, frame_offsets, origin, cell, row_of_node, grad_blended):
-    """Add dL/dA (m, frames, 12) for dL/dx = gradient, where x solves A(x) x = p: dL/d(A x) = -J^-T dL/dx.
+def add_pose_gradient(points, inverse_jacobian, gradient, frame_offsets, lattice, grad_blended):
+    """Add dL/dA to `grad_blended` (m, k, 12) for gradient = dL/dx (s, 3), where x solves A(x) x = p.
 
-    points (s, 3) and inverse_jacobian (s, 9) are the starts and what `newton_step_batch` found there; the samples of
-    frame f are
-    slot_start[f] : slot_start[f + 1]. A thread owns whole frames.
+    Implicit function theorem: dL/d(A x) = -J^-T dL/dx. points (s, 3) and inverse_jacobian (s, 9) are the starts and the
+    output of `newton_step_batch`. The samples of frame f are frame_offsets[f] : frame_offsets[f + 1]; each thread
+    writes whole frames.
     """
+    origin, cell, row_of_node = lattice
     inverse = _ONE / cell
     for frame in prange(frame_offsets.shape[0] - 1):
         for s in range(frame_offsets[frame], frame_offsets[frame + 1]):
@@ -144,7 +153,7 @@ def add_pose_gradient(points, inverse_jacobian, gradient, frame_offsets, origin,
             lx = -(m[0] * gx + m[3] * gy + m[6] * gz)
             ly = -(m[1] * gx + m[4] * gy + m[7] * gz)
             lz = -(m[2] * gx + m[5] * gy + m[8] * gz)
-            # Not `== 0`: a NaN would go on, and a point outside, whose m is zeros, has no nodes to add to.
+            # Not `== 0`, which is false for NaN: a point outside the grid, whose m is zeros, has no nodes.
             if not abs(lx) + abs(ly) + abs(lz) > _ZERO:
                 continue
             x, y, z = points[s, 0], points[s, 1], points[s, 2]

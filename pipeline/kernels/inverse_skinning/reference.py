@@ -1,4 +1,6 @@
-"""Plain-torch twin of inverse skinning: any dtype, any device, gradients by autograd."""
+"""Plain-torch reference of inverse skinning: any dtype, any device, gradients by autograd."""
+
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -7,13 +9,17 @@ from torch import Tensor
 from pipeline.kernels.common.grid_corners import cell_corners, corner_offsets
 from pipeline.kernels.common.packing import segment_ids_from_counts
 
-Lattice = tuple[Float[Tensor, "3"], float, Int[Tensor, "gx gy gz"]]
-"""Where the nodes of a skin grid are: the place of the first (m), their distance (m), and the row of each that exists,
--1 of others."""
+
+class Lattice(NamedTuple):
+    """Node positions of a skin grid: position of the first node, spacing, and row of each node, -1 if it is missing."""
+
+    origin_m: Float[Tensor, "3"]
+    cell_m: float
+    row_of_node: Int[Tensor, "gx gy gz"]
 
 
 def interpolate(points_m: Float[Tensor, "n 3"], lattice: Lattice, values: Float[Tensor, "m c"]) -> Float[Tensor, "n c"]:
-    """Trilinear interpolation of node values; nodes that do not exist have no share in it.
+    """Interpolate node values trilinearly, normalised over the nodes that exist.
 
     Points in cells without any node get the values of the nearest node.
     """
@@ -26,8 +32,8 @@ def interpolate(points_m: Float[Tensor, "n 3"], lattice: Lattice, values: Float[
     exists = row_of_node >= 0
     nodes_m = torch.nonzero(exists).to(points_m) * cell_m + origin_m.to(points_m)
     rows = row_of_node[exists].long()
-    lost = torch.nonzero(~known)[:, 0]
-    for part in lost.split(1024):
+    outside = torch.nonzero(~known)[:, 0]
+    for part in outside.split(1024):
         nearest = torch.cdist(points_m[part].detach(), nodes_m).argmin(1)
         result = result.index_put((part,), values[rows[nearest]])
     return result
@@ -36,7 +42,7 @@ def interpolate(points_m: Float[Tensor, "n 3"], lattice: Lattice, values: Float[
 def gather(
     points_m: Float[Tensor, "n 3"], lattice: Lattice, values: Float[Tensor, "m c"]
 ) -> tuple[Float[Tensor, "n c"], Float[Tensor, "n"]]:
-    """Weighted sum of the eight corners' values, and the sum of the weights of those that exist."""
+    """Return the weighted sum of the values at the eight corners, and the sum of the weights of those that exist."""
     row, axis_weights = _corners(points_m, lattice)
     weight = axis_weights.prod(-1) * (row >= 0)
     picked = values.index_select(0, row.clamp(min=0).view(-1)).view(*row.shape, -1)
@@ -44,7 +50,7 @@ def gather(
 
 
 def _corners(points_m: Float[Tensor, "n 3"], lattice: Lattice) -> tuple[Int[Tensor, "n 8"], Float[Tensor, "n 8 3"]]:
-    """Rows of the nodes around each point, -1 where there is none, and their shares along each axis."""
+    """Return the rows of the nodes around each point, -1 for missing ones, and their weights along each axis."""
     origin_m, cell_m, row_of_node = lattice
     cells = torch.tensor(row_of_node.shape, device=points_m.device) - 1
     corner, axis_weights = cell_corners((points_m - origin_m.to(points_m)) / cell_m, cells, clamp=True)
@@ -54,7 +60,7 @@ def _corners(points_m: Float[Tensor, "n 3"], lattice: Lattice) -> tuple[Int[Tens
 def skin_points(
     points_m: Float[Tensor, "n 3"], blended: Float[Tensor, "m 12"], lattice: Lattice
 ) -> Float[Tensor, "n 3"]:
-    """Canonical points carried into the pose: A(x) x."""
+    """Move canonical points into the pose: A(x) x."""
     return _transform_points(interpolate(points_m, lattice, blended).view(-1, 3, 4), points_m)
 
 
@@ -69,15 +75,15 @@ def newton_step(
     frame_offsets: Int[Tensor, "k1"],
     lattice: Lattice,
 ) -> Float[Tensor, "s 3"]:
-    """Same as `pipeline.kernels.inverse_skinning.newton_step`: J^-1 (p - A x) is added to x, with J and x of the start.
+    """Do `pipeline.kernels.inverse_skinning.newton_step`: x + J^-1 (p - A x), with J and x of the start.
 
-    Of that only A has a gradient, so the step's own gradient is the implicit one.
+    Only A has a gradient, so that the gradient of the step is the implicit one.
     """
     frames, start_m, posed_m = blended.shape[1], start_m.detach(), posed_m.detach()
     batch_index = segment_ids_from_counts(frame_offsets.diff())
     node, axis_weights = _corners(start_m, lattice)
     exists = node >= 0
-    # The matrices of all frames are rows of one table, those of a node one behind the other.
+    # Rows of one table: the matrices of all frames of a node are consecutive.
     row = node.clamp(min=0) * frames + batch_index[:, None]
     corner_matrix = blended.flatten(0, 1).index_select(0, row.view(-1)).view(-1, 8, 3, 4)
     weight = axis_weights.prod(-1) * exists
@@ -96,9 +102,7 @@ def _jacobian(
     exists: Bool[Tensor, "s 8"],
     cell_m: float,
 ) -> Float[Tensor, "s 3 3"]:
-    """What the change of the weights adds to A in the derivative of A(x) x: the corners' images times the gradients of
-    their weights, each the product of the other two shares.
-    """
+    """Return the part of d(A(x) x)/dx due to the change of the weights: corner images times weight gradients."""
     x, y, z = axis_weights.unbind(-1)
     sign = 2 * corner_offsets(points_m.device) - 1
     gradient = torch.stack([y * z, x * z, x * y], -1) * sign * exists[..., None] / cell_m
@@ -107,7 +111,7 @@ def _jacobian(
 
 
 def _adjugate(matrix: Float[Tensor, "s 3 3"]) -> tuple[Float[Tensor, "s"], Float[Tensor, "s 3 3"]]:
-    """Determinant and adjugate: their quotient is the inverse, with no solver for each sample."""
+    """Return determinant and adjugate, whose quotient is the inverse."""
     a, b, c = matrix.unbind(1)
     columns = torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)
     return (a * columns[0]).sum(-1), torch.stack(columns, -1)

@@ -1,34 +1,21 @@
-"""Skinning matrices of corrected poses: some hundred small operations in one.
+"""Skinning matrices of corrected poses: forward kinematics as one operation instead of about a hundred small ones.
 
-Its plain twin is `pipeline.body.pose_correction.PoseCorrection.canonical_to_world`, carried into the posed spaces.
-
-Letters: k frames, j joints, c joints that are corrected.
+Notation: k frames, j joints, c corrected joints.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from pipeline.kernels.kinematics import cpu as kinematics_cpu
+from pipeline.kernels.common.dispatch import runs_on_numba
+from pipeline.kernels.kinematics import cpu, reference
+from pipeline.kernels.kinematics.cpu import PoseArrays, SkeletonArrays
+from pipeline.kernels.kinematics.inputs import FittedPoses, Skeleton
 
-
-class Skeleton(NamedTuple):
-    """Canonical places of the joints, their parents (-1: none; before their children) and rows of corrections (-1)."""
-
-    joints_m: Float[Tensor, "j 3"]
-    parents: Int[Tensor, "j"]
-    correction_row: Int[Tensor, "j"]
-
-
-class FittedPoses(NamedTuple):
-    """Local rotations and the root's place as fitted, and the rigid map into each frame's posed space."""
-
-    rotations: Float[Tensor, "k j 3 3"]
-    root_m: Float[Tensor, "k 3"]
-    world_to_posed: Float[Tensor, "k 4 4"]
+__all__ = ["FittedPoses", "Skeleton", "skinning_matrices"]
 
 
 class _Kinematics(torch.autograd.Function):
@@ -36,23 +23,12 @@ class _Kinematics(torch.autograd.Function):
     def forward(ctx: Any, axis_angles: Tensor, root_shift: Tensor, skeleton: Skeleton, fitted: FittedPoses) -> Tensor:
         local, rotations = (np.empty(fitted.rotations.shape) for _ in range(2))
         matrices = torch.empty(*fitted.rotations.shape[:2], 4, 4)
-        joints, parents, correction_row = (tensor.numpy() for tensor in skeleton)
-        fitted_rotations, root, rigid = (tensor.numpy() for tensor in fitted)
+        skeleton_arrays = SkeletonArrays(*(tensor.numpy() for tensor in skeleton))
+        poses = PoseArrays(*(tensor.numpy() for tensor in fitted))
         corrections = axis_angles.detach().numpy(), root_shift.detach().numpy()
-        kinematics_cpu.forward(
-            *corrections,
-            fitted_rotations,
-            correction_row,
-            root,
-            joints,
-            parents,
-            rigid,
-            local,
-            rotations,
-            matrices.numpy(),
-        )
+        cpu.forward(*corrections, skeleton_arrays, poses, local, rotations, matrices.numpy())
         ctx.save_for_backward(axis_angles)
-        ctx.kept = fitted_rotations, correction_row, joints, parents, rigid, local, rotations
+        ctx.kept = skeleton_arrays, poses, local, rotations
         return matrices
 
     @staticmethod
@@ -60,16 +36,21 @@ class _Kinematics(torch.autograd.Function):
         (axis_angles,) = ctx.saved_tensors
         grad_axis_angles, grad_shift = torch.empty_like(axis_angles), axis_angles.new_empty(len(axis_angles), 3)
         arrays = (gradient.contiguous().numpy(), grad_axis_angles.numpy(), grad_shift.numpy())
-        kinematics_cpu.backward(axis_angles.detach().numpy(), *ctx.kept, *arrays)
+        cpu.backward(axis_angles.detach().numpy(), *ctx.kept, *arrays)
         return grad_axis_angles, grad_shift, None, None
 
 
 def skinning_matrices(
     axis_angles_rad: Float[Tensor, "k c 3"], shift_m: Float[Tensor, "k 3"], skeleton: Skeleton, fitted: FittedPoses
 ) -> Float[Tensor, "k j 4 4"]:
-    """Matrices that carry canonical points into the posed space of each frame; differentiable in the corrections.
+    """Return the matrices that move canonical points into the posed space of each frame.
 
-    float32 on the CPU. A joint turns by its correction (axis times angle) before its fitted rotation; the root moves by
-    `shift_m` in the world.
+    Differentiable in the corrections. Local rotation of a joint: fitted rotation times exp(correction).
+
+    Args:
+        axis_angles_rad: correction of each corrected joint, axis times angle.
+        shift_m: correction of the root position, in world space.
     """
+    if not runs_on_numba(axis_angles_rad, shift_m):
+        return reference.skinning_matrices(axis_angles_rad, shift_m, skeleton, fitted)
     return _Kinematics.apply(axis_angles_rad.contiguous(), shift_m.contiguous(), skeleton, fitted)

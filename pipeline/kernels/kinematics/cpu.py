@@ -1,9 +1,11 @@
 """Compiled loops of forward kinematics with corrected joints.
 
-A joint's local rotation is L = F exp(a): F fitted, a the correction's axis times its angle. Rotations A and places t go
-down from parent q to joint j: A_j = A_q L_j, t_j = t_q + A_q (p_j - p_q), with p the canonical places of the joints.
-Skinning carries x to A_j (x - p_j) + t_j. Sums are in float64: there are few.
+The local rotation of a joint is L = F exp(a), with the fitted rotation F and the correction a (axis times angle).
+Rotations A and positions t follow from parent q to joint j: A_j = A_q L_j, t_j = t_q + A_q (p_j - p_q), with the
+canonical positions p of the joints. Skinning moves x to A_j (x - p_j) + t_j. Sums are in float64.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -11,9 +13,25 @@ from numba import njit
 from pipeline.kernels.common.numba_options import NJIT_OPTIONS
 
 
+class SkeletonArrays(NamedTuple):
+    """See `pipeline.kernels.kinematics.inputs.Skeleton`."""
+
+    joints: np.ndarray
+    parents: np.ndarray
+    correction_row: np.ndarray
+
+
+class PoseArrays(NamedTuple):
+    """See `pipeline.kernels.kinematics.inputs.FittedPoses`."""
+
+    fitted: np.ndarray
+    root: np.ndarray
+    world_to_posed: np.ndarray
+
+
 @njit(**NJIT_OPTIONS)
 def _rodrigues_factors(a):
-    """sin(t)/t, (1 - cos(t))/t² and (t - sin(t))/t³ for the length t of `a`; near zero by their series."""
+    """Return sin(t)/t, (1 - cos(t))/t² and (t - sin(t))/t³ for the length t of `a`; by their series near zero."""
     squared = a[0] * a[0] + a[1] * a[1] + a[2] * a[2]
     if squared < 1e-4:
         return (
@@ -28,7 +46,7 @@ def _rodrigues_factors(a):
 
 @njit(**NJIT_OPTIONS)
 def _axis_angle_to_matrix(a, out):
-    """Rodrigues' formula: I + s K + c K², K the cross product with `a`."""
+    """Fill `out` by Rodrigues' formula: I + s K + c K², where K x = a x x (cross product)."""
     s, c, _ = _rodrigues_factors(a)
     x, y, z = a[0], a[1], a[2]
     out[0, 0], out[0, 1], out[0, 2] = 1 - c * (y * y + z * z), c * x * y - s * z, c * x * z + s * y
@@ -44,13 +62,13 @@ def _multiply_3x3(a, b, out):
 
 
 @njit(**NJIT_OPTIONS)
-def forward(
-    axis_angles, root_shift, fitted, correction_row, root, joints, parents, world_to_posed, local, rotations, matrices
-):
-    """Fill local (k, j, 3, 3), rotations (k, j, 3, 3) and matrices (k, j, 4, 4) in the posed space.
+def forward(axis_angles, root_shift, skeleton, poses, local, rotations, matrices):
+    """Fill local and posed rotations (k, j, 3, 3), and the skinning matrices (k, j, 4, 4) into the posed space.
 
-    turns (k, c, 3), shift (k, 3): corrections; of_joint (j): a joint's row of `axis_angles`, -1 without.
+    axis_angles (k, c, 3) and root_shift (k, 3) are the corrections.
     """
+    joints, parents, correction_row = skeleton
+    fitted, root, world_to_posed = poses
     correction, positions = np.empty((3, 3)), np.empty((len(joints), 3))
     for frame in range(len(fitted)):
         rigid = world_to_posed[frame]
@@ -89,7 +107,7 @@ def forward(
 
 @njit(**NJIT_OPTIONS)
 def _axis_angle_gradient(a, grad_matrix, correction, out):
-    """dL/da for E = exp(a) and dL/dE: J^T v, where v turns with M = dL/dE E^T, and J is the left Jacobian of exp."""
+    """Fill `out` with dL/da = J^T v for E = exp(a): v is the axial vector of dL/dE E^T, J the left Jacobian of exp."""
     m = np.empty((3, 3))
     for row in range(3):
         for column in range(3):
@@ -107,20 +125,10 @@ def _axis_angle_gradient(a, grad_matrix, correction, out):
 
 
 @njit(**NJIT_OPTIONS)
-def backward(
-    axis_angles,
-    fitted,
-    correction_row,
-    joints,
-    parents,
-    world_to_posed,
-    local,
-    rotations,
-    gradient,
-    grad_axis_angles,
-    grad_shift,
-):
-    """Fill turns_gradient (k, c, 3) and shift_gradient (k, 3) for gradient (k, j, 4, 4) = dL/dmatrices."""
+def backward(axis_angles, skeleton, poses, local, rotations, gradient, grad_axis_angles, grad_shift):
+    """Fill grad_axis_angles (k, c, 3) and grad_shift (k, 3) from gradient = dL/dmatrices (k, j, 4, 4)."""
+    joints, parents, correction_row = skeleton
+    fitted, _, world_to_posed = poses
     grad_rotation, grad_position = np.empty((len(joints), 3, 3)), np.empty((len(joints), 3))
     grad_local, grad_correction, correction, parent_rotation = (
         np.empty((3, 3)),

@@ -1,109 +1,45 @@
-"""Ray marching: where along each ray the canonical field has to be asked.
+"""Ray marching: the samples of each ray at which the canonical field is evaluated.
 
-Each ray walks through the posed box of its own frame in steps of constant length in metres; each stop is looked up
-in the frame's warp grid, and kept if its canonical point lies in an occupied cell. What is kept is packed, ray after
-ray.
+Each ray passes through the posed bounding box of its frame in steps of constant length. Each step is looked up in the
+warp grid of the frame and kept if its canonical point is in an occupied cell. The samples are packed, ray after ray.
 
-Letters: n rays, s samples, k frames.
+Notation: n rays, s samples.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from pipeline.kernels.common.dispatch import runs_on_numba
-from pipeline.kernels.inverse_skinning import WarpGrid
-from pipeline.kernels.march import cpu as march_cpu
-from pipeline.kernels.march import reference
+from pipeline.kernels.march import cpu, reference
+from pipeline.kernels.march.cpu import RayArrays
+from pipeline.kernels.march.inputs import PackedWarpGrids, Rays, SamplingVolume
 
-
-@dataclass(frozen=True)
-class PackedWarpGrids:
-    """The warp grids of several frames, one behind the other, all with the same cell.
-
-    A frame is a row of `origin_m` and `dims`; `offsets` says where its nodes, cells and maps begin.
-    """
-
-    cell_m: float
-    origin_m: Float[Tensor, "k 3"]
-    dims: Int[Tensor, "k 3"]
-    offsets: Int[Tensor, "k 3"]
-    canonical_m: Float[Tensor, "nodes 3"]
-    cell_codes: Int[Tensor, "cells"]
-    affine_maps: Float[Tensor, "maps 12"]
-
-    @staticmethod
-    def of(grids: Sequence[WarpGrid], cell_m: float) -> "PackedWarpGrids":
-        """Lay warp grids one behind the other; `cell_m` is the cell of all of them."""
-        sizes = np.array([(len(g.canonical_m), len(g.cell_codes), len(g.affine_maps)) for g in grids], dtype=np.int64)
-        names = ("canonical_m", "cell_codes", "affine_maps")
-        joined = {name: np.concatenate([getattr(grid, name) for grid in grids]) for name in names}
-        joined |= {name: np.stack([getattr(grid, name) for grid in grids]) for name in ("origin_m", "dims")}
-        joined["offsets"] = np.cumsum(sizes, axis=0) - sizes
-        return PackedWarpGrids(cell_m, **{name: torch.from_numpy(array) for name, array in joined.items()})
-
-    def to(self, device: torch.device) -> "PackedWarpGrids":
-        """The same grids on another device."""
-        return PackedWarpGrids(self.cell_m, *(tensor.to(device) for tensor in self.tensors()))
-
-    def tensors(self) -> tuple[Tensor, ...]:
-        """In the order that the loops and their twin take."""
-        return self.origin_m, self.dims, self.offsets, self.canonical_m, self.cell_codes, self.affine_maps
+__all__ = ["PackedWarpGrids", "Rays", "Samples", "SamplingVolume", "march"]
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Packed samples: canonical position, distance along the ray (m), and where each ray's samples begin (n + 1)."""
+    """Packed samples: canonical position, distance along the ray, and first sample of each ray (n + 1 offsets)."""
 
     canonical_m: Float[Tensor, "s 3"]
     distance_m: Float[Tensor, "s"]
     ray_offsets: Int[Tensor, "m"]
 
 
-def march(
-    origins_m: Float[Tensor, "n 3"],
-    directions: Float[Tensor, "n 3"],
-    frame: Int[Tensor, "n"],
-    jitter: Float[Tensor, "n"],
-    step_m: float,
-    warps: PackedWarpGrids,
-    occupied: UInt8[Tensor, "gx gy gz"],
-    bounds_m: Float[Tensor, "2 3"],
-    max_samples: int = 160,
-) -> Samples:
-    """Samples of rays, given in the posed space of their frame, inside occupied cells.
+def march(rays: Rays, volume: SamplingVolume, step_m: float, max_samples: int = 160) -> Samples:
+    """Sample rays in occupied cells.
 
-    Args:
-        directions: unit length.
-        frame: row of `warps` that each ray belongs to, int64.
-        jitter: in [0, 1), the part of a step by which a ray's stops are shifted.
-        occupied: not zero where the canonical field may hold something; the grid fills the box `bounds_m`.
-        max_samples: a ray's samples beyond that number are dropped.
-
-    A stop in a posed cell with several inverses gives a sample for each of them that is occupied, at the same distance.
+    A step in a posed cell with several inverses gives one sample for each inverse that is occupied, all at the same
+    distance. Samples of a ray after the first `max_samples` are dropped.
     """
-    if not runs_on_numba(origins_m, directions, jitter):
-        return Samples(
-            *reference.march(
-                origins_m,
-                directions,
-                frame,
-                jitter,
-                step_m,
-                warps.cell_m,
-                warps.tensors(),
-                occupied,
-                bounds_m,
-                max_samples,
-            )
-        )
-    arrays = (tensor.contiguous().numpy() for tensor in (origins_m, directions, frame, jitter))
-    grids = (tensor.numpy() for tensor in (*warps.tensors(), occupied, bounds_m))
-    points, distance, ray_offsets = march_cpu.march(
-        *arrays, np.float32(step_m), np.float32(warps.cell_m), *grids, max_samples
+    if not runs_on_numba(rays.origins_m, rays.directions, rays.jitter):
+        return Samples(*reference.march(rays, volume, step_m, max_samples))
+    ray_arrays = RayArrays(*(tensor.contiguous().numpy() for tensor in rays))
+    points, distance, ray_offsets = cpu.march(
+        ray_arrays, np.float32(step_m), volume.warps.arrays(), volume.occupancy_arrays(), max_samples
     )
     return Samples(torch.from_numpy(points), torch.from_numpy(distance), torch.from_numpy(ray_offsets))

@@ -1,4 +1,6 @@
-"""Compiled loops of ray marching: a thread takes whole rays, then the rays are packed in order."""
+"""Compiled loops of ray marching: each thread samples whole rays, then the samples are packed in order."""
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
@@ -9,12 +11,58 @@ from pipeline.kernels.inverse_skinning.newton_cpu import apply_affine
 _ZERO, _ONE = np.float32(0), np.float32(1)
 _MAX_DISTANCE_M = np.float32(1e9)
 CANDIDATES = 4
-"""Inverses that a stop has at most."""
+"""Maximum number of inverses of one posed cell."""
+
+
+class RayArrays(NamedTuple):
+    """See `pipeline.kernels.march.inputs.Rays`."""
+
+    origins: np.ndarray
+    directions: np.ndarray
+    frame_index: np.ndarray
+    jitter: np.ndarray
+
+
+class WarpArrays(NamedTuple):
+    """See `pipeline.kernels.march.inputs.PackedWarpGrids`."""
+
+    cell: np.float32
+    origin: np.ndarray
+    dims: np.ndarray
+    offsets: np.ndarray
+    canonical: np.ndarray
+    cell_codes: np.ndarray
+    affine_maps: np.ndarray
+
+
+class OccupancyArrays(NamedTuple):
+    """Occupancy grid (gx, gy, gz) uint8, its low corner (3, m), and the cells per metre along each axis (3)."""
+
+    occupied: np.ndarray
+    low: np.ndarray
+    cells_per_m: np.ndarray
+
+
+class MarchArrays(NamedTuple):
+    """All inputs of ray marching; step in metres."""
+
+    rays: RayArrays
+    step: np.float32
+    warps: WarpArrays
+    occupancy: OccupancyArrays
+
+
+class SampleArrays(NamedTuple):
+    """Output: canonical position (s, 3), distance along the ray (s) and ray (s) of each sample."""
+
+    canonical: np.ndarray
+    distance: np.ndarray
+    ray_indices: np.ndarray
 
 
 @njit(**NJIT_OPTIONS)
 def _slab(origin, direction, low, high, near, far):
-    """Narrow [near, far] to the part of a ray between two planes of one axis."""
+    """Clip the interval [near, far] of a ray to the space between two planes of one axis."""
     if abs(direction) < np.float32(1e-9):
         return (near, far) if low <= origin <= high else (near, near - _ONE)
     a, b = (low - origin) / direction, (high - origin) / direction
@@ -22,17 +70,20 @@ def _slab(origin, direction, low, high, near, far):
 
 
 @njit(**NJIT_OPTIONS)
-def _is_occupied(x, y, z, occupied, low, scale):
-    i = int(np.floor((x - low[0]) * scale[0]))
-    j = int(np.floor((y - low[1]) * scale[1]))
-    k = int(np.floor((z - low[2]) * scale[2]))
+def _is_occupied(x, y, z, occupancy):
+    occupied, low, cells_per_m = occupancy
+    i = int(np.floor((x - low[0]) * cells_per_m[0]))
+    j = int(np.floor((y - low[1]) * cells_per_m[1]))
+    k = int(np.floor((z - low[2]) * cells_per_m[2]))
     inside = 0 <= i < occupied.shape[0] and 0 <= j < occupied.shape[1] and 0 <= k < occupied.shape[2]
     return inside and occupied[i, j, k] != 0
 
 
 @njit(**NJIT_OPTIONS)
-def _interpolate(nodes, first, dims, i, j, k, u, v, w):
-    """Trilinear interpolation of the canonical positions at a posed cell's corners."""
+def _interpolate(nodes, first, dims, cell, fractions):
+    """Interpolate the canonical positions at the corners of a posed cell trilinearly."""
+    i, j, k = cell
+    u, v, w = fractions
     x = y = z = _ZERO
     for corner in range(8):
         a, b, c = corner & 1, (corner >> 1) & 1, corner >> 2
@@ -43,71 +94,54 @@ def _interpolate(nodes, first, dims, i, j, k, u, v, w):
 
 
 @njit(**NJIT_OPTIONS)
-def intersect_box(ray, origins, directions, jitter, step, cell, low, dims):
-    """Where a ray enters the box of a warp grid, and how many stops it makes there."""
+def intersect_box(ray, inputs):
+    """Return the distance at which a ray enters the box of its warp grid, and its number of steps in the box."""
+    rays, step, warps, _ = inputs
+    frame = rays.frame_index[ray]
+    low, dims = warps.origin[frame], warps.dims[frame]
     near, far = _ZERO, _MAX_DISTANCE_M
     for axis in range(3):
-        high = low[axis] + cell * np.float32(dims[axis] - 1)
-        near, far = _slab(origins[ray, axis], directions[ray, axis], low[axis], high, near, far)
-    # A ray that no plane ends is no ray (NaN, or a direction of zeros): it would make 1e11 stops.
-    return near, max(0, int(np.ceil((far - near) / step - jitter[ray]))) if far < _MAX_DISTANCE_M else 0
+        high = low[axis] + warps.cell * np.float32(dims[axis] - 1)
+        near, far = _slab(rays.origins[ray, axis], rays.directions[ray, axis], low[axis], high, near, far)
+    # No plane ends a degenerate ray (NaN, or a zero direction): it would have 1e11 steps.
+    return near, max(0, int(np.ceil((far - near) / step - rays.jitter[ray]))) if far < _MAX_DISTANCE_M else 0
 
 
 @njit(**NJIT_OPTIONS)
-def advance_ray(
-    ray,
-    near,
-    step_index,
-    step_count,
-    target_count,
-    max_count,
-    origins,
-    directions,
-    jitter,
-    step,
-    cell,
-    f,
-    warp_origin,
-    warp_dims,
-    warp_first,
-    warp_nodes,
-    warp_codes,
-    warp_maps,
-    occupied,
-    low,
-    scale,
-    count,
-    canonical,
-    distance,
-    ray_indices,
-):
-    """Note samples of a ray until there are `target_count` of all rays; none once there are `max_count`: (samples,
-    next stop).
+def advance_ray(ray, steps, inputs, samples, count, target_count, max_count):
+    """Append samples of a ray until there are `target_count` samples of all rays, but no more than `max_count`.
+
+    steps: (distance of the box, index of the next step, number of steps). count: number of samples so far.
+    Returns the number of samples and the index of the next step.
     """
-    ox, oy, oz = origins[ray, 0], origins[ray, 1], origins[ray, 2]
-    dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
-    gx, gy, gz = warp_origin[f, 0], warp_origin[f, 1], warp_origin[f, 2]
-    nx, ny, nz = warp_dims[f, 0], warp_dims[f, 1], warp_dims[f, 2]
-    dims = warp_dims[f]
-    node_first, code_first, map_first = warp_first[f, 0], warp_first[f, 1], warp_first[f, 2]
+    near, step_index, step_count = steps
+    rays, step, warps, occupancy = inputs
+    canonical, distance, ray_indices = samples
+    f, jitter, cell, dims = rays.frame_index[ray], rays.jitter[ray], warps.cell, warps.dims[rays.frame_index[ray]]
+    ox, oy, oz = rays.origins[ray, 0], rays.origins[ray, 1], rays.origins[ray, 2]
+    dx, dy, dz = rays.directions[ray, 0], rays.directions[ray, 1], rays.directions[ray, 2]
+    gx, gy, gz = warps.origin[f, 0], warps.origin[f, 1], warps.origin[f, 2]
+    nx, ny, nz = dims[0], dims[1], dims[2]
+    node_first, code_first, map_first = warps.offsets[f, 0], warps.offsets[f, 1], warps.offsets[f, 2]
+    nodes, cell_codes, affine_maps = warps.canonical, warps.cell_codes, warps.affine_maps
     inverse = _ONE / cell
     while step_index < step_count and count < target_count:
-        t = near + (np.float32(step_index) + jitter[ray]) * step
+        t = near + (np.float32(step_index) + jitter) * step
         step_index += 1
         px, py, pz = (ox + t * dx - gx) * inverse, (oy + t * dy - gy) * inverse, (oz + t * dz - gz) * inverse
         i, j, k = min(max(int(px), 0), nx - 2), min(max(int(py), 0), ny - 2), min(max(int(pz), 0), nz - 2)
-        code = warp_codes[code_first + (i * (ny - 1) + j) * (nz - 1) + k]
+        code = cell_codes[code_first + (i * (ny - 1) + j) * (nz - 1) + k]
         if code < 0:
             continue
         candidates = 1 if code == 0 else 1 + (code - 1) % CANDIDATES
         for candidate in range(candidates):
             if code == 0:
                 u, v, w = px - np.float32(i), py - np.float32(j), pz - np.float32(k)
-                x, y, z = _interpolate(warp_nodes, node_first, dims, i, j, k, u, v, w)
+                x, y, z = _interpolate(nodes, node_first, dims, (i, j, k), (u, v, w))
             else:
-                m = warp_maps[map_first + (code - 1) // CANDIDATES + candidate]
+                m = affine_maps[map_first + (code - 1) // CANDIDATES + candidate]
                 x, y, z = apply_affine(m, px * cell + gx, py * cell + gy, pz * cell + gz)
-            if count < max_count and _is_occupied(x, y, z, occupied, low, scale):
+            if count < max_count and _is_occupied(x, y, z, occupancy):
                 canonical[count, 0], canonical[count, 1], canonical[count, 2] = x, y, z
                 distance[count], ray_indices[count] = t, ray
                 count += 1
@@ -115,59 +149,18 @@ def advance_ray(
 
 
 @njit(parallel=True, **NJIT_OPTIONS)
-def march(
-    origins,
-    directions,
-    frame,
-    jitter,
-    step,
-    cell,
-    warp_origin,
-    warp_dims,
-    warp_first,
-    warp_nodes,
-    warp_codes,
-    warp_maps,
-    occupied,
-    bounds,
-    max_samples,
-):
-    """(canonical points (s, 3), distances (s), ray starts (n + 1) int64): see `pipeline.kernels.march.march`."""
-    rays = origins.shape[0]
-    canonical, distance = np.empty((rays * max_samples, 3), np.float32), np.empty(rays * max_samples, np.float32)
-    ray_indices, counts = np.empty(rays * max_samples, np.int32), np.zeros(rays, np.int64)
-    low, scale = bounds[0], np.empty(3, np.float32)
-    for axis in range(3):
-        scale[axis] = np.float32(occupied.shape[axis]) / (bounds[1, axis] - bounds[0, axis])
-    for ray in prange(rays):
-        f, first = frame[ray], ray * max_samples
-        near, step_count = intersect_box(ray, origins, directions, jitter, step, cell, warp_origin[f], warp_dims[f])
+def march(rays, step, warps, occupancy, max_samples):
+    """Return canonical points (s, 3), distances (s) and ray offsets (n + 1) int64."""
+    ray_count = rays.origins.shape[0]
+    capacity = ray_count * max_samples
+    canonical, distance = np.empty((capacity, 3), np.float32), np.empty(capacity, np.float32)
+    samples = SampleArrays(canonical, distance, np.empty(capacity, np.int32))
+    counts = np.zeros(ray_count, np.int64)
+    for ray in prange(ray_count):
+        first, inputs = ray * max_samples, MarchArrays(rays, step, warps, occupancy)
+        near, step_count = intersect_box(ray, inputs)
         last, _ = advance_ray(
-            ray,
-            near,
-            0,
-            step_count,
-            first + max_samples,
-            first + max_samples,
-            origins,
-            directions,
-            jitter,
-            step,
-            cell,
-            f,
-            warp_origin,
-            warp_dims,
-            warp_first,
-            warp_nodes,
-            warp_codes,
-            warp_maps,
-            occupied,
-            low,
-            scale,
-            first,
-            canonical,
-            distance,
-            ray_indices,
+            ray, (near, 0, step_count), inputs, samples, first, first + max_samples, first + max_samples
         )
         counts[ray] = last - first
     return _pack(canonical, distance, counts, max_samples)

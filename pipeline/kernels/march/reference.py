@@ -1,22 +1,23 @@
-"""Plain-torch twin of ray marching through warp grids: any dtype, any device."""
+"""Plain-torch reference of ray marching through warp grids: any dtype, any device."""
 
 from functools import partial
 
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from pipeline.kernels.common.grid_corners import cell_corners
+from pipeline.kernels.march.inputs import PackedWarpGrids, Rays, SamplingVolume
 from pipeline.kernels.march.reference_stops import march_with_inverse
 
 CANDIDATES = 4
 
 
-def _query_warp_grids(posed: Tensor, frame: Tensor, cell_m: float, warp: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-    """Canonical candidates (p, 4, 3) of posed points (p, 3), and which of the four exist."""
-    origin, dims, first, nodes, cell_codes, affine_maps = warp
-    dims, first = dims[frame], first[frame]
-    scaled = (posed - origin[frame].to(posed)) / cell_m
+def _query_warp_grids(posed: Tensor, frame: Tensor, warps: PackedWarpGrids) -> tuple[Tensor, Tensor]:
+    """Return the canonical candidates (p, 4, 3) of posed points (p, 3), and which of the four exist."""
+    nodes, cell_codes, affine_maps = warps.canonical_m, warps.cell_codes, warps.affine_maps
+    dims, first = warps.dims[frame], warps.offsets[frame]
+    scaled = (posed - warps.origin_m[frame].to(posed)) / warps.cell_m
     low = torch.minimum(scaled.long().clamp(min=0), dims - 2)
     i, j, k = low.unbind(-1)
     cell_index = first[:, 1] + (i * (dims[:, 1] - 1) + j) * (dims[:, 2] - 1) + k
@@ -24,7 +25,7 @@ def _query_warp_grids(posed: Tensor, frame: Tensor, cell_m: float, warp: tuple[T
     corner, axis_weights = cell_corners(scaled, dims - 1)
     i, j, k = corner.unbind(-1)
     node = first[:, :1] + (i * dims[:, 1:2] + j) * dims[:, 2:] + k
-    # A node that does not exist is NaN; cells with such a corner have other codes.
+    # Missing nodes are NaN; the code of a cell with such a corner is not 0.
     around = nodes[node.clamp(max=len(nodes) - 1)].to(posed)
     smooth = (axis_weights.prod(-1, keepdim=True) * around).sum(1)
     points = torch.zeros(len(posed), CANDIDATES, 3, dtype=posed.dtype, device=posed.device)
@@ -40,21 +41,11 @@ def _query_warp_grids(posed: Tensor, frame: Tensor, cell_m: float, warp: tuple[T
 
 
 def march(
-    origins_m: Float[Tensor, "n 3"],
-    directions: Float[Tensor, "n 3"],
-    frame: Int[Tensor, "n"],
-    jitter: Float[Tensor, "n"],
-    step_m: float,
-    cell_m: float,
-    warp: tuple[Tensor, ...],
-    occupied: UInt8[Tensor, "gx gy gz"],
-    bounds_m: Float[Tensor, "2 3"],
-    max_samples: int,
+    rays: Rays, volume: SamplingVolume, step_m: float, max_samples: int
 ) -> tuple[Float[Tensor, "s 3"], Float[Tensor, "s"], Int[Tensor, "m"]]:
-    """Same as `pipeline.kernels.march.march`; `warp` is `PackedWarpGrids.tensors()`, with cells of `cell_m`."""
-    low = warp[0].to(origins_m)
-    boxes = torch.stack([low, low + cell_m * (warp[1] - 1)], dim=1)
-    find_inverses = partial(_query_warp_grids, cell_m=cell_m, warp=warp)
-    return march_with_inverse(
-        find_inverses, origins_m, directions, frame, jitter, step_m, boxes, occupied, bounds_m, max_samples
-    )
+    """Do `pipeline.kernels.march.march`; return the fields of `Samples`."""
+    warps = volume.warps
+    low = warps.origin_m.to(rays.origins_m)
+    boxes = torch.stack([low, low + warps.cell_m * (warps.dims - 1)], dim=1)
+    find_inverses = partial(_query_warp_grids, warps=warps)
+    return march_with_inverse(find_inverses, rays, step_m, boxes, volume.occupied, volume.bounds_m, max_samples)

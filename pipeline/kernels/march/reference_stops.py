@@ -1,4 +1,4 @@
-"""Ray marching with any way back to canonical space: plain torch, all stops of all rays at once."""
+"""Ray marching with any inverse skinning: plain torch, all steps of all rays at once."""
 
 from collections.abc import Callable
 
@@ -7,30 +7,30 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from pipeline.kernels.common.packing import segment_ids_from_counts
+from pipeline.kernels.march.inputs import Rays
 
 FindInverses = Callable[
     [Float[Tensor, "p 3"], Int[Tensor, "p"]],
     tuple[Float[Tensor, "p c 3"], Bool[Tensor, "p c"]],
 ]
-"""Posed points (m) and their frames -> canonical candidates (m), and which of them exist."""
+"""Maps posed points (m) and their frames to canonical candidates (m), and to which of the candidates exist."""
 
 
 def march_with_inverse(
     find_inverses: FindInverses,
-    origins_m: Float[Tensor, "n 3"],
-    directions: Float[Tensor, "n 3"],
-    frame: Int[Tensor, "n"],
-    jitter: Float[Tensor, "n"],
+    rays: Rays,
     step_m: float,
     boxes_m: Float[Tensor, "k 2 3"],
     occupied: UInt8[Tensor, "gx gy gz"],
     bounds_m: Float[Tensor, "2 3"],
     max_samples: int,
 ) -> tuple[Float[Tensor, "s 3"], Float[Tensor, "s"], Int[Tensor, "m"]]:
-    """Canonical points, distances along the rays and ray starts, as `pipeline.kernels.march.march` has them.
+    """Sample rays in occupied cells; return the fields of `pipeline.kernels.march.Samples`.
 
-    boxes_m: the posed box (low and high corner) in which the rays of each frame make their stops.
+    boxes_m: posed bounding box (low and high corner) of each frame; the steps of a ray are inside it.
+    occupied, bounds_m, max_samples: see `pipeline.kernels.march`.
     """
+    origins_m, directions, frame, jitter = rays
     near, far = _near_far(origins_m, directions, boxes_m[frame])
     count = ((far - near) / step_m - jitter).ceil().clamp(min=0).long()
     ray = segment_ids_from_counts(count)
@@ -51,7 +51,7 @@ def march_with_inverse(
 
 
 def _near_far(origins: Tensor, directions: Tensor, boxes: Tensor) -> tuple[Tensor, Tensor]:
-    """Distances at which each ray enters and leaves its box."""
+    """Return the distances at which each ray enters and leaves its box."""
     safe = torch.where(directions.abs() < 1e-9, torch.full_like(directions, 1e-9), directions)
     a, b = (boxes[:, 0] - origins) / safe, (boxes[:, 1] - origins) / safe
     return torch.minimum(a, b).amax(-1).clamp(min=0), torch.maximum(a, b).amin(-1)

@@ -1,8 +1,8 @@
-"""Random pixels of some frames and the rays through them; where colours were wrong, for later draws.
+"""Random pixels of some frames, the rays through them, and the error map that later draws use.
 
-All of it stays on the CPU, wherever the field is: a step draws from a pool of pixels too large for a graphics card.
+All of it runs on the CPU, wherever the field is: a step draws from a pool of pixels too large for a graphics card.
 
-Letters: p pixels of all frames, k frames of the batch, q kinds of pixels, n rays.
+Notation: p pixels of all frames, k frames of the batch, q pixel classes, n rays.
 """
 
 from typing import NamedTuple
@@ -10,14 +10,43 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from pipeline.kernels.pixel_sampling import cpu as draw_cpu
+from pipeline.kernels.pixel_sampling import cpu
 
-CANDIDATES_PER_SAMPLE = draw_cpu.CANDIDATES_PER_SAMPLE
+CANDIDATES_PER_SAMPLE = cpu.CANDIDATES_PER_SAMPLE
+
+
+class PixelLists(NamedTuple):
+    """Pixels, frame by frame and class by class: those of class q of frame f are offsets[f, q] : offsets[f, q + 1].
+
+    xy_px: column and row of each pixel.
+    """
+
+    offsets: Int[np.ndarray, "frames q1"]
+    xy_px: Int[np.ndarray, "p 2"]
+
+
+class SampleCounts(NamedTuple):
+    """Number of pixels to draw from each class of each frame, and how many of them by error sampling."""
+
+    frames: Int[np.ndarray, "k"]
+    counts: Int[np.ndarray, "k q"]
+    error_sampled: Int[np.ndarray, "k q"]
+
+
+class TileErrors(NamedTuple):
+    """Mean colour error of each tile of `tile_px` x `tile_px` pixels.
+
+    outlier_ratio: limit of the error, in medians of the frame. A tile above it shows something else than the person.
+    """
+
+    error: Float[np.ndarray, "frames rows columns"]
+    tile_px: int
+    outlier_ratio: float
 
 
 class PosedCameras(NamedTuple):
-    """How frames are seen: focal lengths and image centre in pixels; and for each frame, in its own space, the pinhole
-    and the camera's axes (columns).
+    """Pinhole cameras of the frames: intrinsics, and in the posed space of each frame the camera centre and the camera
+    axes (columns).
     """
 
     focal_px: Float[np.ndarray, "2"]
@@ -26,50 +55,30 @@ class PosedCameras(NamedTuple):
     axes: Float[np.ndarray, "frames 3 3"]
 
 
-def count_uniforms(sizes: Int[np.ndarray, "k q"], error_sampled_sizes: Int[np.ndarray, "k q"]) -> Int[np.ndarray, "k"]:
-    """Random numbers that `sample_pixels` takes for each frame."""
-    return (sizes + CANDIDATES_PER_SAMPLE * error_sampled_sizes).sum(axis=1)
+def count_uniforms(
+    counts: Int[np.ndarray, "k q"], error_sampled_counts: Int[np.ndarray, "k q"]
+) -> Int[np.ndarray, "k"]:
+    """Return the number of uniform random numbers that `sample_pixels` uses for each frame."""
+    return (counts + CANDIDATES_PER_SAMPLE * error_sampled_counts).sum(axis=1)
 
 
 def sample_pixels(
-    kind_offsets: Int[np.ndarray, "frames q+1"],
-    xy_px: Int[np.ndarray, "p 2"],
-    frames: Int[np.ndarray, "k"],
-    sizes: Int[np.ndarray, "k q"],
-    error_sampled_sizes: Int[np.ndarray, "k q"],
-    error: Float[np.ndarray, "frames rows columns"],
-    tile_px: int,
-    outlier_ratio: float,
-    uniforms: Float[np.ndarray, "r"],
+    pixels: PixelLists, samples: SampleCounts, tiles: TileErrors, uniforms: Float[np.ndarray, "r"]
 ) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Rows of pixels, frame by frame and kind by kind: so many as `sizes` says, the kind q of frame f from
-    start[f, q] : start[f, q + 1]; and the trust in each, in [0, 1].
+    """Draw pixels; return their rows in `pixels`, frame by frame and class by class, and their confidence in [0, 1].
 
-    Stratified: the i-th of m draws comes from the i-th of m equal parts of the list. The last `error_sampled_sizes`
-    of a kind are
-    resampled from `CANDIDATES_PER_SAMPLE` times as many of these, each as likely as the `error` of its tile
-    (`tile_px` wide) has
-    it. numbers: uniform in [0, 1), as many as `count_uniforms` says, in the order of the draws.
+    Sampling is stratified: the i-th of m samples comes from the i-th of m equal parts of the list. The last
+    `error_sampled` samples of a class are resampled from `CANDIDATES_PER_SAMPLE` times as many stratified candidates,
+    with probabilities proportional to the error of their tiles.
 
-    A tile whose error is more than `outlier_ratio` medians shows something else than what is learnt: a ball, a
-    passer-by. It
-    is drawn no oftener than one at that limit, and the trust in it is the fourth power of limit over error. The median
-    is that of a frame's plain draws of the first kind; without any, everything is trusted.
+    The error of a tile is clamped to the limit, `outlier_ratio` times the median error of the uniform samples of the
+    frame's first class (no limit without such samples). The confidence is min(1, limit / error) ** 4.
+
+    uniforms: in [0, 1), `count_uniforms` of them, in the order of the samples.
     """
-    rows, confidence = np.empty(int(sizes.sum()), np.int64), np.empty(int(sizes.sum()), np.float32)
-    draw_cpu.sample_pixels(
-        kind_offsets,
-        xy_px,
-        frames,
-        sizes,
-        error_sampled_sizes,
-        error,
-        tile_px,
-        outlier_ratio,
-        uniforms,
-        rows,
-        confidence,
-    )
+    total = int(samples.counts.sum())
+    rows, confidence = np.empty(total, np.int64), np.empty(total, np.float32)
+    cpu.sample_pixels(pixels, samples, tiles, uniforms, rows, confidence)
     return rows, confidence
 
 
@@ -81,14 +90,14 @@ def generate_pixel_rays(
     pixel_offset_px: Float[np.ndarray, "n 2"],
     cameras: PosedCameras,
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n 4"]]:
-    """Origins (m) and unit directions of rays, in the space of their frame, and what their pixels show, in [0, 1].
+    """Return origins (m) and unit directions of rays in the posed space of their frames, and the RGBA of their pixels
+    in [0, 1].
 
-    inside_px: where in the pixel its ray goes, in [0, 1).
+    pixel_offset_px: position of the ray within its pixel, in [0, 1).
     """
-    origins, directions = (np.empty((len(rows), 3), np.float32) for _ in range(2))
-    pixel_rgba = np.empty((len(rows), 4), np.float32)
-    draw_cpu.generate_pixel_rays(rows, frame, xy_px, rgba, pixel_offset_px, *cameras, origins, directions, pixel_rgba)
-    return origins, directions, pixel_rgba
+    rays = cpu.PixelRays(*(np.empty((len(rows), size), np.float32) for size in (3, 3, 4)))
+    cpu.generate_pixel_rays(rows, frame, xy_px, rgba, pixel_offset_px, cameras, rays)
+    return rays.origins, rays.directions, rays.rgba
 
 
 def update_error_map(
@@ -100,7 +109,8 @@ def update_error_map(
     tile_px: int,
     error: Float[np.ndarray, "frames rows columns"],
 ) -> None:
-    """Take into `error`, in place, what pixels erred by, those of a frame side by side: where m are new in a tile, its
-    old error keeps the part memory^m, and their mean absolute error makes up the rest.
+    """Update the error map in place: e = decay^m e + (1 - decay^m) mean|colour_error|, for a tile with m new pixels.
+
+    The pixels of a frame are consecutive.
     """
-    draw_cpu.update_error_map(rows, frame, xy_px, colour_error, decay, tile_px, error)
+    cpu.update_error_map(rows, frame, xy_px, colour_error, decay, tile_px, error)

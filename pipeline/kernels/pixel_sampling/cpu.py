@@ -1,8 +1,10 @@
-"""Compiled loops that draw the pixels of a training step, and the rays through them.
+"""Compiled loops that draw the pixels of a training step, and generate the rays through them.
 
-Draws are stratified: of n draws from a list of pixels, each has an n-th of the list to itself. They come in the list's
-order, so that neighbouring rays read the same memory, and no part of a body is passed over by chance.
+Sampling is stratified: each of n samples comes from its own n-th of a list of pixels. The samples are in the order of
+the list, so that neighbouring rays read the same memory and no part of a body is missed by chance.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -10,14 +12,22 @@ from numba import njit
 from pipeline.kernels.common.numba_options import NJIT_OPTIONS
 
 CANDIDATES_PER_SAMPLE = 4
-"""Pixels that are drawn for each that is then chosen by the error around it."""
+"""Candidates for each pixel that is drawn by error sampling."""
 _MIN_ERROR = np.float64(1e-12)
-"""Stands for an error of zero, so that of many such no one is preferred."""
+"""Lower limit of the error of a tile, so that tiles without error are all equally likely."""
+
+
+class PixelRays(NamedTuple):
+    """Output: origins (n, 3), directions (n, 3) and RGBA (n, 4) of rays."""
+
+    origins: np.ndarray
+    directions: np.ndarray
+    rgba: np.ndarray
 
 
 @njit(**NJIT_OPTIONS)
 def _stratified_indices(first, last, count, uniforms, rows):
-    """Fill rows[:count] with one of each n-th of first..last."""
+    """Fill rows[:count] with one row of each of `count` equal parts of first..last."""
     width = np.float64(last - first) / np.float64(max(count, 1))
     for i in range(count):
         rows[i] = min(first + np.int64((np.float64(i) + uniforms[i]) * width), last - 1)
@@ -25,40 +35,38 @@ def _stratified_indices(first, last, count, uniforms, rows):
 
 @njit(**NJIT_OPTIONS)
 def _systematic_resampling(candidates, weight, count, uniforms, rows):
-    """Fill rows[:count] with candidates, each as often as its weight has it; weight is made a running sum."""
+    """Fill rows[:count] with candidates in proportion to their weights; `weight` becomes its cumulative sum."""
     for i in range(1, len(candidates)):
         weight[i] += weight[i - 1]
-    part, place, end = weight[-1] / np.float64(max(count, 1)), 0, len(candidates) - 1
+    part, index, end = weight[-1] / np.float64(max(count, 1)), 0, len(candidates) - 1
     for i in range(count):
-        while place < end and weight[place] <= (np.float64(i) + uniforms[i]) * part:
-            place += 1
-        rows[i] = candidates[place]
+        while index < end and weight[index] <= (np.float64(i) + uniforms[i]) * part:
+            index += 1
+        rows[i] = candidates[index]
 
 
 @njit(**NJIT_OPTIONS)
 def _tile_errors(rows, xy, error, tile, errors):
-    """Fill `errors` with those (rows, columns) of the tiles that pixels lie in."""
+    """Fill `errors` with the errors of the tiles of pixels; `error` (rows, columns) is that of one frame."""
     for i in range(len(rows)):
         errors[i] = max(np.float64(error[xy[rows[i], 1] // tile, xy[rows[i], 0] // tile]), _MIN_ERROR)
 
 
 @njit(**NJIT_OPTIONS)
-def sample_pixels(
-    kind_offsets, xy, frames, sizes, error_sampled_sizes, error, tile, outlier_ratio, uniforms, rows, confidence
-):
-    """Fill rows and trust: see `pipeline.kernels.pixel_sampling.sample_pixels`. numbers: uniform in [0, 1)."""
+def sample_pixels(pixels, samples, tiles, uniforms, rows, confidence):
+    """Fill rows and confidence: see `pipeline.kernels.pixel_sampling.sample_pixels`."""
+    offsets, xy = pixels
+    frames, sizes, error_sampled_sizes = samples
+    error, tile, outlier_ratio = tiles
     written, consumed = 0, 0
     for batch_index in range(len(frames)):
         frame, frame_start, limit = frames[batch_index], written, np.inf
-        for kind in range(sizes.shape[1]):
-            first, last, error_sampled = (
-                kind_offsets[frame, kind],
-                kind_offsets[frame, kind + 1],
-                error_sampled_sizes[batch_index, kind],
-            )
-            uniform_count = sizes[batch_index, kind] - error_sampled
+        for pixel_class in range(sizes.shape[1]):
+            first, last = offsets[frame, pixel_class], offsets[frame, pixel_class + 1]
+            error_sampled = error_sampled_sizes[batch_index, pixel_class]
+            uniform_count = sizes[batch_index, pixel_class] - error_sampled
             _stratified_indices(first, last, uniform_count, uniforms[consumed:], rows[written:])
-            if kind == 0 and uniform_count > 0:
+            if pixel_class == 0 and uniform_count > 0:
                 uniform_errors = np.empty(uniform_count, np.float64)
                 _tile_errors(rows[written : written + uniform_count], xy, error[frame], tile, uniform_errors)
                 limit = outlier_ratio * np.median(uniform_errors)
@@ -80,8 +88,10 @@ def sample_pixels(
 
 
 @njit(**NJIT_OPTIONS)
-def generate_pixel_rays(rows, frame, xy, rgba, pixel_offset, focal, centre, origin, axes, origins, directions, colour):
-    """Fill origins, directions, colour: see `pipeline.kernels.pixel_sampling.generate_pixel_rays`."""
+def generate_pixel_rays(rows, frame, xy, rgba, pixel_offset, cameras, rays):
+    """Fill `rays`: see `pipeline.kernels.pixel_sampling.generate_pixel_rays`."""
+    focal, centre, origin, axes = cameras
+    origins, directions, colour = rays
     for ray in range(len(rows)):
         row, f = rows[ray], frame[ray]
         x = (np.float32(xy[row, 0]) + pixel_offset[ray, 0] - centre[0]) / focal[0]
@@ -96,7 +106,7 @@ def generate_pixel_rays(rows, frame, xy, rgba, pixel_offset, focal, centre, orig
 
 @njit(**NJIT_OPTIONS)
 def update_error_map(rows, frame, xy, colour_error, decay, tile, error):
-    """Change `error` in place: see `pipeline.kernels.pixel_sampling.update_error_map`."""
+    """Update `error` in place: see `pipeline.kernels.pixel_sampling.update_error_map`."""
     total, count = np.zeros(error.shape[1:], np.float64), np.zeros(error.shape[1:], np.int64)
     for ray in range(len(rows)):
         y, x = xy[rows[ray], 1] // tile, xy[rows[ray], 0] // tile

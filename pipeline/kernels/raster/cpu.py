@@ -1,10 +1,9 @@
-"""Z-buffer rasterisation on the CPU: every thread owns whole bands of rows, so the picture never depends on thread
-timing.
+"""Compiled loops of z-buffer rasterisation. Each thread draws whole bands of rows, so that the result is deterministic.
 
-Letters: a, b, c are the corners of a face in pixels; e is twice the signed area of (corner, corner, pixel centre); w =
-e / area are the screen-space barycentrics; 1/z is linear in them (Blinn, "Hyperbolic interpolation", 1992), hence q_k =
-w_k / z_k and depth = 1 / sum(q). Edge functions are float64: in float32 a pixel centre on an edge shared by two faces
-can fall outside both. NaN must compare false (a face with a NaN corner is dropped), hence no full fastmath.
+Notation: a, b, c corners of a face in pixels; e twice the signed area of (corner, corner, pixel centre); w = e / area
+screen-space barycentrics. 1/z is linear in w (Blinn, "Hyperbolic interpolation", 1992), hence q_k = w_k / z_k and
+depth = 1 / sum(q). Edge functions are float64: in float32 a pixel centre on an edge shared by two faces can be outside
+both. Comparisons with NaN must be false (a face with a NaN corner is dropped), which full fast math does not guarantee.
 """
 
 import numpy as np
@@ -17,13 +16,13 @@ BAND_ROWS = 16
 
 @njit(**NJIT_OPTIONS)
 def _first_centre(low: float, size: int) -> int:
-    """First pixel index whose centre is at or right of ``low``, within [0, size]."""
+    """Return the first pixel index whose centre is at or right of `low`, clamped to [0, size]."""
     return int(np.ceil(min(max(low - 0.5, 0.0), float(size))))
 
 
 @njit(**NJIT_OPTIONS)
 def _last_centre(high: float, size: int) -> int:
-    """Last pixel index whose centre is at or left of ``high``, within [-1, size - 1]."""
+    """Return the last pixel index whose centre is at or left of `high`, clamped to [-1, size - 1]."""
     return int(np.floor(min(max(high - 0.5, -1.0), float(size - 1))))
 
 
@@ -31,8 +30,7 @@ def _last_centre(high: float, size: int) -> int:
 def face_boxes(
     vertices_px: np.ndarray, depth_m: np.ndarray, faces: np.ndarray, size_wh: tuple, near_m: float, cull: bool
 ) -> np.ndarray:
-    """(f, 4) int32 first and last pixel column and row a face can cover; first row > last row means that it covers
-    none."""
+    """Return the first and last column and row (f, 4) int32 that each face can cover; first > last if it is dropped."""
     width, height = size_wh
     boxes = np.empty((faces.shape[0], 4), np.int32)
     for f in prange(faces.shape[0]):
@@ -42,7 +40,7 @@ def face_boxes(
         cx, cy = np.float64(vertices_px[c, 0]), np.float64(vertices_px[c, 1])
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         in_front = depth_m[a] >= near_m and depth_m[b] >= near_m and depth_m[c] >= near_m
-        # image y points down: an outward counter-clockwise face seen from outside has negative area here
+        # Image y points down: a counter-clockwise face seen from outside has a negative area.
         seen = area < 0.0 if cull else abs(area) > 0.0
         if not (in_front and seen):
             boxes[f, 0], boxes[f, 1], boxes[f, 2], boxes[f, 3] = 1, 0, 1, 0
@@ -56,7 +54,7 @@ def face_boxes(
 
 @njit(**NJIT_OPTIONS)
 def bin_faces(boxes: np.ndarray, n_bands: int) -> tuple:
-    """Faces touching each band of rows in ascending order: (start (n_bands + 1,), face list)."""
+    """Return the faces of each band of rows, in ascending order: (offsets (n_bands + 1), face list)."""
     band_offsets = np.zeros(n_bands + 1, np.int64)
     for f in range(boxes.shape[0]):
         if boxes[f, 0] <= boxes[f, 1] and boxes[f, 2] <= boxes[f, 3]:
@@ -76,7 +74,7 @@ def bin_faces(boxes: np.ndarray, n_bands: int) -> tuple:
 
 @njit(**NJIT_OPTIONS)
 def _edge_plane(ax: float, ay: float, bx: float, by: float, scale: float) -> tuple:
-    """(A, B, C) with A x + B y + C = scale * ((b - a) x (p - a))."""
+    """Return (A, B, C) with A x + B y + C = scale * ((b - a) x (p - a))."""
     return -(by - ay) * scale, (bx - ax) * scale, ((by - ay) * ax - (bx - ax) * ay) * scale
 
 
@@ -90,7 +88,7 @@ def _draw_face(
     face_id: np.ndarray,
     inverse: np.ndarray,
 ) -> None:
-    """Draws face ``f`` into the rows and columns of ``box``; a nearer fragment wins, the lower face index on a tie."""
+    """Draw face `f` into the rows and columns of `box`; the nearer fragment wins, the lower face index on a tie."""
     a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
     ax, ay = np.float64(vertices_px[a, 0]), np.float64(vertices_px[a, 1])
     bx, by = np.float64(vertices_px[b, 0]), np.float64(vertices_px[b, 1])
@@ -122,7 +120,7 @@ def draw_bands(
     face_id: np.ndarray,
     inverse: np.ndarray,
 ) -> None:
-    """Fills ``face_id`` and ``inverse`` depth (h, w), one band of rows per work item."""
+    """Fill `face_id` and the inverse depth (h, w), one band of rows for each work item."""
     height = face_id.shape[0]
     for band in prange(band_offsets.shape[0] - 1):
         top, bottom = band * BAND_ROWS, min((band + 1) * BAND_ROWS, height) - 1
@@ -141,7 +139,7 @@ def resolve(
     barycentric: np.ndarray,
     depth: np.ndarray,
 ) -> None:
-    """Perspective-correct barycentrics and depth of the visible face, once per pixel after all faces are drawn."""
+    """Fill perspective-correct barycentrics and depth of the visible face of each pixel."""
     for y in prange(face_id.shape[0]):
         for x in range(face_id.shape[1]):
             f = face_id[y, x]
@@ -164,7 +162,7 @@ def resolve(
 def rasterize_cpu(
     vertices_px: np.ndarray, depth_m: np.ndarray, faces: np.ndarray, height: int, width: int, near_m: float, cull: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """``pipeline.kernels.raster.rasterize`` on contiguous float32 / int32 arrays."""
+    """Do `pipeline.kernels.raster.rasterize` on contiguous float32 and int32 arrays."""
     boxes = face_boxes(vertices_px, depth_m, faces, (width, height), near_m, cull)
     band_offsets, face_list = bin_faces(boxes, -(-height // BAND_ROWS))
     face_id = np.full((height, width), -1, np.int32)

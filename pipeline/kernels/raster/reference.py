@@ -1,7 +1,7 @@
-"""Plain torch rasterisation and silhouette antialiasing: the definition that the fast kernels are tested against.
+"""Plain-torch reference of rasterisation, and silhouette antialiasing.
 
-Letters as in ``pipeline.kernels.raster.cpu``. Order-independent reductions (max of 1/z, then min of the face index)
-keep it deterministic.
+Notation as in `pipeline.kernels.raster.cpu`. The reductions (max of 1/z, then min of the face index) do not depend on
+the order, so that the result is deterministic.
 """
 
 import torch
@@ -14,8 +14,7 @@ FRAGMENTS_PER_CHUNK = 1 << 22
 
 
 def signed_areas_px(vertices_px: Float[Tensor, "v 2"], faces: Int[Tensor, "f 3"]) -> Float[Tensor, "f"]:
-    """Twice the signed screen area of every face in px^2; negative for a counter-clockwise outward face seen from
-    outside (y down)."""
+    """Return twice the signed area of every face (px²): negative for a counter-clockwise face seen from outside."""
     a, b, c = vertices_px[faces].unbind(1)
     return _cross(b - a, c - a)
 
@@ -27,8 +26,10 @@ def _cross(first: Float[Tensor, "*n 2"], second: Float[Tensor, "*n 2"]) -> Float
 def weighted_inverse_depth(
     corners_px: Float[Tensor, "n 3 2"], corners_depth_m: Float[Tensor, "n 3"], points_px: Float[Tensor, "n 2"]
 ) -> Float[Tensor, "n 3"]:
-    """q_k = w_k / z_k of each point in its face: q / sum(q) are perspective-correct barycentrics and 1 / sum(q) the
-    depth. Differentiable."""
+    """Return q_k = w_k / z_k of each point in its face. Differentiable.
+
+    q / sum(q) are the perspective-correct barycentrics, 1 / sum(q) is the depth.
+    """
     a, b, c = corners_px.unbind(1)
     edges = torch.stack(
         [_cross(c - b, points_px - b), _cross(a - c, points_px - c), _cross(b - a, points_px - a)], dim=1
@@ -39,7 +40,7 @@ def weighted_inverse_depth(
 def _face_boxes(
     vertices_px: Float[Tensor, "v 2"], faces: Int[Tensor, "f 3"], drawn: Bool[Tensor, "f"], size_wh: tuple[int, int]
 ) -> tuple[Int[Tensor, "f 2"], Int[Tensor, "f 2"]]:
-    """First pixel and extent (columns, rows) of every face, extent 0 where nothing is drawn."""
+    """Return the first pixel and the extent (columns, rows) of every face; extent 0 if it is not drawn."""
     corners = torch.nan_to_num(vertices_px[faces])
     limit = torch.tensor(size_wh, dtype=corners.dtype, device=corners.device)
     first = torch.minimum((corners.amin(1) - 0.5).clamp_min(0), limit).ceil().long()
@@ -56,7 +57,7 @@ def _fragments(
     extent: Tensor,
     width: int,
 ) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"], Float[Tensor, "n"]]:
-    """Covered (face, pixel, 1/z as float32) triples of a chunk of faces."""
+    """Return the fragments of a chunk of faces: face, pixel, and 1/z as float32."""
     counts = extent.prod(1)
     face = segment_ids_from_counts(counts)
     order = torch.arange(len(face), device=faces.device) - (counts.cumsum(0) - counts)[face]
@@ -70,7 +71,7 @@ def _fragments(
 
 
 def _chunks(fragments: Int[Tensor, "f"]) -> tuple[Int[Tensor, "_"], ...]:
-    """Face numbers in runs of about FRAGMENTS_PER_CHUNK fragments, so that memory stays bounded."""
+    """Split the faces into chunks of about FRAGMENTS_PER_CHUNK fragments, to limit memory."""
     _, lengths = torch.unique_consecutive(fragments.cumsum(0) // FRAGMENTS_PER_CHUNK, return_counts=True)
     return torch.split(torch.arange(len(fragments), device=fragments.device), lengths.tolist())
 
@@ -84,7 +85,7 @@ def rasterize_reference(
     near_m: float,
     cull: bool,
 ) -> tuple[Int[Tensor, "h w"], Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
-    """``pipeline.kernels.raster.rasterize`` in plain torch on any device, any float type."""
+    """Do `pipeline.kernels.raster.rasterize` on any device, with any float type."""
     dtype, device = vertices_px.dtype, vertices_px.device
     corners_px, corners_depth, index = vertices_px.double(), depth_m.double(), faces.long()
     area = signed_areas_px(corners_px, index)
@@ -114,15 +115,14 @@ def rasterize_reference(
 
 
 def pixel_centres_px(pixel: Int[Tensor, "n"], width: int, dtype: torch.dtype) -> Float[Tensor, "n 2"]:
-    """Centres (x + 0.5, y + 0.5) of row-major pixel numbers."""
+    """Return the centres (x + 0.5, y + 0.5) of row-major pixel indices."""
     return torch.stack([pixel % width, pixel // width], 1).to(dtype) + 0.5
 
 
 def silhouette_edges(
     vertices_px: Float[Tensor, "v 2"], faces: Int[Tensor, "f 3"], adjacency: Int[Tensor, "f 3"]
 ) -> Int[Tensor, "s 3"]:
-    """(start, end, apex) vertices of every edge with the surface on one side only: no neighbour, or one that faces the
-    other way."""
+    """Return the vertices (start, end, apex) of every silhouette edge: no neighbour, or one that faces away."""
     facing = signed_areas_px(vertices_px, faces) < 0
     folded = facing[:, None] & (adjacency >= 0) & ~facing[adjacency.clamp_min(0)]
     face, edge = torch.nonzero(folded | (adjacency < 0), as_tuple=True)
@@ -132,8 +132,10 @@ def silhouette_edges(
 def _crossings(
     ends_px: Float[Tensor, "s 3 2"], axis: int, lines: int
 ) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"], Float[Tensor, "n"]]:
-    """Where edges (start, end, apex) cross the lines of pixel centres along ``axis``: (edge, line, fraction of the way
-    to its end)."""
+    """Return the crossings of edges (start, end, apex) with the lines of pixel centres along `axis`.
+
+    A crossing is the edge, the line, and the fraction of the edge from start to end.
+    """
     across = ends_px[:, :2, 1 - axis]
     first = (across.amin(1) - 0.5).clamp(0, lines).ceil().long()
     last = (across.amax(1) - 0.5).clamp(0, lines).ceil().long()
@@ -145,7 +147,7 @@ def _crossings(
 
 
 def _outermost(distance: Float[Tensor, "n"], pair: Int[Tensor, "n"], pair_count: int) -> Bool[Tensor, "n"]:
-    """Of several crossings between the same two pixels the one farthest from the near pixel; the first of equals."""
+    """Select the crossing farthest from the near pixel, of those between the same two pixels; the first of equals."""
     farthest = torch.full((pair_count,), -1.0, dtype=distance.dtype, device=distance.device)
     farthest.scatter_reduce_(0, pair, distance, "amax")
     order = torch.arange(len(pair), device=pair.device)
@@ -162,18 +164,18 @@ def _blend_along_axis(
     edges: tuple[Float[Tensor, "s 3 2"], Float[Tensor, "s 2"]],
     axis: int,
 ) -> Float[Tensor, "n c"]:
-    """Colour change of every pixel from silhouettes that cut pixel pairs along ``axis`` (0: x, 1: y)."""
+    """Return the colour change of every pixel by silhouettes between pairs of pixels along `axis` (0: x, 1: y)."""
     ends_px, ends_inverse_depth = edges
     height, width = face_id.shape
     lines, size, step = (height, width, 1) if axis == 0 else (width, height, width)
-    edge, line, fraction = _crossings(ends_px, axis, lines)
+    edge, line, edge_fraction = _crossings(ends_px, axis, lines)
     start, end, apex = ends_px[edge].unbind(1)
-    position = start[:, axis] + fraction * (end[:, axis] - start[:, axis])
-    inverse = ends_inverse_depth[edge, 0] + fraction.detach() * (
+    position = start[:, axis] + edge_fraction * (end[:, axis] - start[:, axis])
+    inverse = ends_inverse_depth[edge, 0] + edge_fraction.detach() * (
         ends_inverse_depth[edge, 1] - ends_inverse_depth[edge, 0]
     )
     slope = (end - start)[:, 1 - axis] * (-1.0 if axis == 0 else 1.0)
-    # a border is met by row pairs and by column pairs: shares by the square of its normal add up to one border
+    # Row pairs and column pairs both meet a border: weights by the squared normal add up to one border.
     weight = (slope**2 / (end - start).square().sum(1)).detach()
     outward = torch.where(_cross(end - start, apex - start) * slope > 0, -1, 1)
     low = (position.detach() - 0.5).clamp(-2, size).floor().long()
@@ -191,10 +193,10 @@ def _blend_along_axis(
     distance = ((position - near_position) * outward)[valid]
     near, far, low_pixel = near[valid], far[valid], low_pixel[valid]
     keep = _outermost(distance.detach(), low_pixel, height * width)
-    share, near, far = distance[keep] - 0.5, near[keep], far[keep]
-    target = torch.where(share.detach() > 0, far, near)
-    share = share * weight[valid][keep]
-    return torch.zeros_like(flat).index_add(0, target, share[:, None] * (flat[near] - flat[far]))
+    fraction, near, far = distance[keep] - 0.5, near[keep], far[keep]
+    target = torch.where(fraction.detach() > 0, far, near)
+    fraction = fraction * weight[valid][keep]
+    return torch.zeros_like(flat).index_add(0, target, fraction[:, None] * (flat[near] - flat[far]))
 
 
 def antialias_reference(
@@ -206,7 +208,7 @@ def antialias_reference(
     faces: Int[Tensor, "f 3"],
     adjacency: Int[Tensor, "f 3"],
 ) -> Float[Tensor, "h w c"]:
-    """``pipeline.kernels.raster.antialias`` in plain torch."""
+    """Do `pipeline.kernels.raster.antialias` on any device, with any float type."""
     edges = silhouette_edges(vertices_px.detach(), faces, adjacency)
     edges = edges[(depth_m.detach()[edges] > 0).all(1)]
     ends = (vertices_px[edges], 1.0 / depth_m.detach()[edges[:, :2]])

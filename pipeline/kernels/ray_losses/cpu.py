@@ -1,6 +1,7 @@
-"""Compiled loop of the losses of rays, with their gradients: one pass over what some twenty operations would read."""
+"""Compiled loop of the losses of rays and their gradients: one pass over memory instead of about twenty operations."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -11,9 +12,31 @@ _ZERO, _ONE, _HALF = np.float32(0), np.float32(1), np.float32(0.5)
 _HARD_OFFSET = np.float32(math.log(1 + math.exp(-1)))
 
 
+class LossInputs(NamedTuple):
+    """Rendered image (n, 3) and alpha (n); rgba (n, 4) of the pixels; background (n, 3); confidence (n)."""
+
+    image: np.ndarray
+    alpha: np.ndarray
+    rgba: np.ndarray
+    background: np.ndarray
+    confidence: np.ndarray
+
+
+class GradientArrays(NamedTuple):
+    """Gradients of the sums of the losses.
+
+    image (n, 3): of the colour loss. alpha (n, 2): of the colour and the mask loss. hard (n): of the hard surface loss,
+    with respect to alpha.
+    """
+
+    image: np.ndarray
+    alpha: np.ndarray
+    hard: np.ndarray
+
+
 @njit(**NJIT_OPTIONS)
 def _huber(error, delta):
-    """Value and slope."""
+    """Return the value and the slope of the Huber loss, divided by delta."""
     size = abs(error)
     if size < delta:
         return _HALF * error * error / delta, error / delta
@@ -21,12 +44,10 @@ def _huber(error, delta):
 
 
 @njit(**NJIT_OPTIONS)
-def ray_losses(image, alpha, rgba, background, confidence, delta, sums, error, grad_image, grad_alpha, grad_hard):
-    """Fill sums (3), error (n, 3) and the gradients of the sums: see `pipeline.kernels.ray_losses.ray_losses`.
-
-    of_image (n, 3) is that of the first sum in the image; of_alpha (n, 2) those of the first and second in alpha;
-    of_hard (n) that of the third.
-    """
+def ray_losses(inputs, delta, sums, error, gradients):
+    """Fill sums (3), error (n, 3) and the gradients of the sums: see `pipeline.kernels.ray_losses.ray_losses`."""
+    image, alpha, rgba, background, confidence = inputs
+    grad_image, grad_alpha, grad_hard = gradients
     colours, alphas, hard = 0.0, 0.0, 0.0
     for ray in range(len(alpha)):
         a, mask, ray_confidence = alpha[ray], rgba[ray, 3], confidence[ray]

@@ -1,60 +1,39 @@
-"""Depth-tested projective texturing: what one picture says about every texel."""
+"""Depth-tested projective texturing: the colour and the confidence of every texel in one image."""
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.kernels.common.dispatch import runs_on_numba
-from pipeline.kernels.texel_projection.cpu import project_texels_cpu
-from pipeline.kernels.texel_projection.reference import project_texels_reference
+from pipeline.kernels.texel_projection import cpu, reference
+from pipeline.kernels.texel_projection.inputs import ImageView, ProjectedMesh, TexelPoints
+
+__all__ = ["ImageView", "ProjectedMesh", "TexelPoints", "project_texels"]
 
 
 def project_texels(
-    vertices_px: Float[Tensor, "v 2"],
-    depth_m: Float[Tensor, "v"],
-    cosine: Float[Tensor, "v"],
-    faces: Int[Tensor, "f 3"],
-    texel_face: Int[Tensor, "t"],
-    texel_barycentric: Float[Tensor, "t 3"],
-    image: Float[Tensor, "h w c"],
-    depth_map_m: Float[Tensor, "h w"],
-    pixel_confidence: Float[Tensor, "h w"],
-    tolerance_m: float = 0.01,
-    min_cosine: float = 0.1,
+    mesh: ProjectedMesh, texels: TexelPoints, view: ImageView, tolerance_m: float = 0.01, min_cosine: float = 0.1
 ) -> tuple[Float[Tensor, "t c"], Float[Tensor, "t 2"]]:
-    """Bilinear look-ups of a picture at the places where it shows the texels' surface points.
+    """Look up an image bilinearly at the projections of the texels' surface points. Not differentiable.
 
-    A texel is visible when nothing in the 2 x 2 pixels that it is read from lies in front of it by more than the
-    tolerance (Shetty et al., "Holoported Characters", 2024, supplement B, equation 4, one-sided, and over the whole
-    footprint so that no occluder bleeds in).
+    A texel is visible if no surface in the 2 x 2 pixels of the lookup is in front of it by more than the tolerance
+    (Shetty et al., "Holoported Characters", 2024, supplement B, equation 4; here one-sided, and over all four pixels,
+    so that the colour of an occluder never enters).
 
     Args:
-        vertices_px, depth_m: of the posed vertices, as `rasterize` takes them.
-        cosine: between each vertex's normal and the direction to the camera.
-        texel_face, texel_barycentric: surface point of each texel.
-        seen_depth_m: nearest surface in each pixel, inf where there is none.
-        quality: trust in each pixel, [0, 1].
-        tolerance_m: for surfaces that face the camera; grows with 1 / cosine, as the depth within a pixel does.
-        least_cosine: more oblique texels count as invisible.
+        tolerance_m: for surfaces that face the camera; it grows with 1 / cosine, as the depth range of a pixel does.
+        min_cosine: texels with a lower cosine are invisible.
 
-    Returns values (0 where invisible) and, per texel, (trust, cosine), both 0 where invisible. Not differentiable.
+    Returns the values, and for each texel (confidence, cosine); all 0 where the texel is invisible.
     """
-    tensors = (vertices_px, depth_m, cosine, texel_barycentric, image, depth_map_m, pixel_confidence)
-    if not runs_on_numba(*tensors):
-        return project_texels_reference(
-            vertices_px,
-            depth_m,
-            cosine,
-            faces,
-            texel_face,
-            texel_barycentric,
-            image,
-            depth_map_m,
-            pixel_confidence,
-            tolerance_m,
-            min_cosine,
-        )
-    ordered = (vertices_px, depth_m, cosine, faces.int(), texel_face.int(), *tensors[3:])
-    arrays = [tensor.detach().contiguous().numpy() for tensor in ordered]
-    values, weights = project_texels_cpu(*arrays, tolerance_m, min_cosine)
+    if not runs_on_numba(*mesh[:3], texels.barycentric, *view):
+        return reference.project_texels(mesh, texels, view, tolerance_m, min_cosine)
+    values, weights = cpu.project_texels(
+        cpu.MeshArrays(*(tensor.detach().contiguous().numpy() for tensor in (*mesh[:3], mesh.faces.int()))),
+        texels.face.int().contiguous().numpy(),
+        texels.barycentric.detach().contiguous().numpy(),
+        cpu.ViewArrays(*(tensor.detach().contiguous().numpy() for tensor in view)),
+        tolerance_m,
+        min_cosine,
+    )
     return torch.from_numpy(values), torch.from_numpy(weights)

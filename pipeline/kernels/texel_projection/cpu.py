@@ -1,8 +1,10 @@
-"""What one picture says about every texel, on the CPU: a texel is one thread's, so nothing depends on thread timing.
+"""Compiled loop of projective texturing. Each thread writes whole texels, so that the result is deterministic.
 
-Letters: b are barycentrics, z depth; a point of a face lies at pixel sum(b_k z_k p_k) / sum(b_k z_k), where p_k are
-its corners' pixels.
+Notation: b barycentrics, z depth; a point of a face is at pixel sum(b_k z_k p_k) / sum(b_k z_k), where p_k are the
+pixels of its corners.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
@@ -10,21 +12,28 @@ from numba import njit, prange
 from pipeline.kernels.common.numba_options import NJIT_OPTIONS
 
 
+class MeshArrays(NamedTuple):
+    """See `pipeline.kernels.texel_projection.inputs.ProjectedMesh`."""
+
+    vertices_px: np.ndarray
+    depth_m: np.ndarray
+    cosine: np.ndarray
+    faces: np.ndarray
+
+
+class ViewArrays(NamedTuple):
+    """See `pipeline.kernels.texel_projection.inputs.ImageView`."""
+
+    image: np.ndarray
+    depth_map_m: np.ndarray
+    pixel_confidence: np.ndarray
+
+
 @njit(parallel=True, **NJIT_OPTIONS)
-def project_texels_cpu(
-    vertices_px: np.ndarray,
-    depth_m: np.ndarray,
-    cosine: np.ndarray,
-    faces: np.ndarray,
-    texel_face: np.ndarray,
-    texel_barycentric: np.ndarray,
-    image: np.ndarray,
-    depth_map_m: np.ndarray,
-    pixel_confidence: np.ndarray,
-    tolerance_m: float,
-    min_cosine: float,
-) -> tuple:
-    """See ``pipeline.kernels.texel_projection.project_texels``."""
+def project_texels(mesh, texel_face, texel_barycentric, view, tolerance_m, min_cosine):
+    """Return values (t, c) and weights (t, 2): see `pipeline.kernels.texel_projection.project_texels`."""
+    vertices_px, depth_m, cosine, faces = mesh
+    image, depth_map_m, pixel_confidence = view
     count, channels = texel_face.shape[0], image.shape[2]
     height, width = pixel_confidence.shape
     values = np.zeros((count, channels), np.float32)

@@ -1,24 +1,19 @@
-"""Plain-torch twin of ``observe_cpu``."""
+"""Plain-torch reference of projective texturing: any dtype, any device."""
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
+from pipeline.kernels.texel_projection.inputs import ImageView, ProjectedMesh, TexelPoints
 
-def project_texels_reference(
-    vertices_px: Float[Tensor, "v 2"],
-    depth_m: Float[Tensor, "v"],
-    cosine: Float[Tensor, "v"],
-    faces: Int[Tensor, "f 3"],
-    texel_face: Int[Tensor, "t"],
-    texel_barycentric: Float[Tensor, "t 3"],
-    image: Float[Tensor, "h w c"],
-    depth_map_m: Float[Tensor, "h w"],
-    pixel_confidence: Float[Tensor, "h w"],
-    tolerance_m: float,
-    min_cosine: float,
+
+def project_texels(
+    mesh: ProjectedMesh, texels: TexelPoints, view: ImageView, tolerance_m: float, min_cosine: float
 ) -> tuple[Float[Tensor, "t c"], Float[Tensor, "t 2"]]:
-    """See ``pipeline.kernels.texel_projection.project_texels``."""
+    """Do `pipeline.kernels.texel_projection.project_texels`."""
+    vertices_px, depth_m, cosine, faces = mesh
+    texel_face, texel_barycentric = texels
+    image, depth_map_m, pixel_confidence = view
     height, width = pixel_confidence.shape
     corners = faces.long()[texel_face.long()]
     texel_cosine = (texel_barycentric * cosine[corners]).sum(dim=1)

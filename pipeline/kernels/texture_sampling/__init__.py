@@ -1,4 +1,4 @@
-"""The texture's colours at what a rasteriser saw, averaged over the samples of a pixel."""
+"""Texture lookup at rasterised points, averaged over the subsamples of each pixel."""
 
 import torch
 from jaxtyping import Float, Int
@@ -17,12 +17,14 @@ def supersample_texture(
     texture: Float[Tensor, "th tw c"],
     samples: int,
 ) -> Float[Tensor, "h w c+1"]:
-    """Premultiplied colour and coverage of pixels of `samples` x `samples` rasterised points each.
+    """Return the premultiplied colour and the coverage of pixels with `samples` x `samples` rasterised points each.
 
-    face_id (-1 none), barycentric: from ``rasterize`` at `samples` times the size, both sides multiples of `samples`.
-    uv: origin bottom-left, row 0 of the texture at v = 1, texel centres at +0.5, the border repeated outside of [0, 1].
+    Args:
+        face_id: visible face, -1 for none, from `rasterize` at `samples` times the size of the output.
+        barycentric: from the same call.
+        uv: origin bottom-left; row 0 of the texture is at v = 1; texel centres at +0.5; clamped to the border.
 
-    The fast path has no gradient; where one is asked for, the plain twin runs.
+    The compiled loop has no gradient; if an input requires one, the reference runs.
     """
     tensors = (barycentric, uv, texture)
     if any(tensor.requires_grad for tensor in tensors) or not runs_on_numba(*tensors):

@@ -1,4 +1,4 @@
-"""Textured pixels on the CPU: a row of pixels is one thread's, so nothing depends on thread timing."""
+"""Compiled loop of texture lookups. Each thread writes whole rows of pixels, so that the result is deterministic."""
 
 import numpy as np
 from numba import njit, prange
@@ -15,7 +15,7 @@ def supersample_texture_cpu(
     texture: np.ndarray,
     samples: int,
 ) -> np.ndarray:
-    """See ``pipeline.kernels.texture_sampling.supersample_texture``."""
+    """Return the image (h, w, c + 1): see `pipeline.kernels.texture_sampling.supersample_texture`."""
     height, width = face_id.shape[0] // samples, face_id.shape[1] // samples
     texture_height, texture_width, channels = texture.shape
     image = np.zeros((height, width, channels + 1), np.float32)
@@ -31,7 +31,7 @@ def supersample_texture_cpu(
                     corner = faces_uv[face, k]
                     u += barycentric[fine_row, fine_column, k] * uv[corner, 0]
                     v += barycentric[fine_row, fine_column, k] * uv[corner, 1]
-                # The zero first: a NaN, which is no texel, then becomes zero.
+                # `max` returns its second argument only if that is larger, which NaN is not: NaN becomes zero.
                 x = min(max(np.float32(0.0), u * texture_width - np.float32(0.5)), np.float32(texture_width - 1))
                 y = min(
                     max(np.float32(0.0), (np.float32(1.0) - v) * texture_height - np.float32(0.5)),

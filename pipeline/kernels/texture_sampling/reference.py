@@ -1,4 +1,4 @@
-"""Plain-torch twin of ``shade_cpu``; differentiable in the texture and in uv."""
+"""Plain-torch reference of texture lookups; differentiable in the texture and in uv."""
 
 import torch
 from jaxtyping import Float, Int
@@ -6,7 +6,7 @@ from torch import Tensor
 
 
 def sample_texture_reference(texture: Float[Tensor, "th tw c"], uv: Float[Tensor, "n 2"]) -> Float[Tensor, "n c"]:
-    """Bilinear look-up; see ``pipeline.geometry.texture_rendering.sample_texture``."""
+    """Look up a texture bilinearly; see `pipeline.geometry.texture_rendering.sample_texture`."""
     grid = torch.stack([2.0 * uv[:, 0] - 1.0, 1.0 - 2.0 * uv[:, 1]], dim=-1)
     sampled = torch.nn.functional.grid_sample(
         texture.permute(2, 0, 1)[None], grid[None, None], mode="bilinear", padding_mode="border", align_corners=False
@@ -22,7 +22,7 @@ def supersample_texture_reference(
     texture: Float[Tensor, "th tw c"],
     samples: int,
 ) -> Float[Tensor, "h w c+1"]:
-    """See ``pipeline.kernels.texture_sampling.supersample_texture``."""
+    """Do `pipeline.kernels.texture_sampling.supersample_texture`."""
     height, width = face_id.shape[0] // samples, face_id.shape[1] // samples
     seen = face_id >= 0
     corners_uv = uv[faces_uv.long()[face_id[seen].long()]]

@@ -1,12 +1,11 @@
-"""What the training rays saw in each voxel."""
+"""Statistics of training rays for each voxel: the maximum transmittance and the maximum weight of its samples."""
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from pipeline.kernels.common.dispatch import runs_on_numba
-from pipeline.kernels.transmittance_stats import cpu as visits_cpu
-from pipeline.kernels.transmittance_stats import reference
+from pipeline.kernels.transmittance_stats import cpu, reference
 
 
 def update_voxel_maxima(
@@ -18,21 +17,25 @@ def update_voxel_maxima(
     max_transmittance: Float[Tensor, "cells"],
     max_weight: Float[Tensor, "cells"],
 ) -> None:
-    """Raise `max_transmittance` and `max_weight` (x slowest) to the largest light and weight of the samples in each
-    cell, in place.
+    """Update the maximum transmittance and weight of each voxel with those of samples, in place.
+
+    The voxels (x slowest) are a grid of `shape` in the box `bounds_m`. Samples outside the box are ignored.
     """
     tensors = (points_m, transmittance, weight, bounds_m)
     if runs_on_numba(*tensors, max_transmittance, max_weight):
         arrays = (tensor.detach().numpy() for tensor in tensors)
-        visits_cpu.update_voxel_maxima(*arrays, shape, max_transmittance.numpy(), max_weight.numpy())
+        cpu.update_voxel_maxima(*arrays, shape, max_transmittance.numpy(), max_weight.numpy())
     else:
         reference.update_voxel_maxima(*tensors, shape, max_transmittance, max_weight)
 
 
 def transmittance_from_weights(weight: Float[Tensor, "s"], ray_offsets: Int[Tensor, "m"]) -> Float[Tensor, "s"]:
-    """Light in [0, 1] that reached each sample: what the samples before it on its ray have left."""
+    """Return the transmittance in front of each sample, in [0, 1]: 1 minus the weights of the samples before it.
+
+    ray_offsets: n + 1 offsets of the rays, as in `pipeline.kernels.composite`. Not differentiable.
+    """
     if not runs_on_numba(weight):
         return reference.transmittance_from_weights(weight.detach(), ray_offsets)
     transmittance = torch.empty_like(weight)
-    visits_cpu.transmittance_from_weights(weight.detach().numpy(), ray_offsets.numpy(), transmittance.numpy())
+    cpu.transmittance_from_weights(weight.detach().numpy(), ray_offsets.numpy(), transmittance.numpy())
     return transmittance

@@ -1,4 +1,4 @@
-"""Compiled loops that note what rays saw. Voxels are written by one thread, so that there is nothing to race for."""
+"""Compiled loops of the statistics of rays. One thread writes all voxels, so that there is no race."""
 
 import numpy as np
 from numba import njit, prange
@@ -18,7 +18,7 @@ def transmittance_from_weights(weight, ray_offsets, transmittance):
 
 @njit(**NJIT_OPTIONS)
 def update_voxel_maxima(points, transmittance, weight, bounds, shape, max_transmittance, max_weight):
-    """See `pipeline.kernels.transmittance_stats.update_voxel_maxima`."""
+    """Update the maxima: see `pipeline.kernels.transmittance_stats.update_voxel_maxima`."""
     scale_x = np.float32(shape[0]) / (bounds[1, 0] - bounds[0, 0])
     scale_y = np.float32(shape[1]) / (bounds[1, 1] - bounds[0, 1])
     scale_z = np.float32(shape[2]) / (bounds[1, 2] - bounds[0, 2])

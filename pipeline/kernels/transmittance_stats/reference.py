@@ -1,11 +1,11 @@
-"""Plain-torch twin of the voxel records."""
+"""Plain-torch reference of the statistics of rays: any dtype, any device."""
 
 import torch
 from torch import Tensor
 
 
 def transmittance_from_weights(weight: Tensor, ray_offsets: Tensor) -> Tensor:
-    """Same as `pipeline.kernels.transmittance_stats.transmittance_from_weights`."""
+    """Do `pipeline.kernels.transmittance_stats.transmittance_from_weights`."""
     weight_before = weight.double().cumsum(0) - weight
     first = torch.repeat_interleave(ray_offsets[:-1], ray_offsets.diff())
     return (1 - (weight_before - weight_before[first])).clamp(0, 1).to(weight.dtype)
@@ -20,7 +20,7 @@ def update_voxel_maxima(
     max_transmittance: Tensor,
     max_weight: Tensor,
 ) -> None:
-    """Same as `pipeline.kernels.transmittance_stats.update_voxel_maxima`."""
+    """Do `pipeline.kernels.transmittance_stats.update_voxel_maxima`."""
     size = torch.tensor(shape, device=points.device)
     index = ((points - bounds[0]) * (size / (bounds[1] - bounds[0]))).floor().long()
     inside = ((index >= 0) & (index < size)).all(-1)

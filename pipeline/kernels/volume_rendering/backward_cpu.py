@@ -1,4 +1,4 @@
-"""Compiled loops that bring the gradients of traced rays back to network, table and skinning."""
+"""Compiled loops of the backward pass of the fused renderer: gradients of the network and of the features."""
 
 import numpy as np
 from numba import njit
@@ -9,46 +9,46 @@ _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
 @njit(**NJIT_OPTIONS)
-def network_output_gradients(
-    ray_indices, colour, density, weight, sample_transmittance, step, final_transmittance, grad_image, grad_alpha, raw
-):
-    """Fill dL/d(what the network puts out) of every sample (s, 4) from that of image and alpha; see
-    `pipeline.kernels.composite.cpu`.
+def network_output_gradients(samples, count, step, final_transmittance, grad_image, grad_alpha, raw):
+    """Fill dL/d(network output) (s, 4) of the first `count` samples, from the gradients of image and alpha.
+
+    The equations are those of `pipeline.kernels.composite.cpu`.
     """
+    ray_indices, colour, density, weight = samples.ray_indices, samples.colour, samples.density, samples.weight
+    sample_transmittance = samples.transmittance
     suffix_sum = np.zeros(len(final_transmittance), np.float32)
-    for s in range(len(ray_indices)):
+    for s in range(count):
         ray = ray_indices[s]
         suffix_sum[ray] += weight[s] * (
             grad_image[ray, 0] * colour[s, 0] + grad_image[ray, 1] * colour[s, 1] + grad_image[ray, 2] * colour[s, 2]
         )
-    for s in range(len(ray_indices)):
+    for s in range(count):
         ray = ray_indices[s]
         gx, gy, gz = grad_image[ray, 0], grad_image[ray, 1], grad_image[ray, 2]
         r, g, b = colour[s, 0], colour[s, 1], colour[s, 2]
-        towards = gx * r + gy * g + gz * b
-        suffix_sum[ray] -= weight[s] * towards
+        grad_dot_colour = gx * r + gy * g + gz * b
+        suffix_sum[ray] -= weight[s] * grad_dot_colour
         grad_alpha_term = grad_alpha[ray] * final_transmittance[ray]
         raw[s, 0] = weight[s] * gx * r * (_ONE - r)
         raw[s, 1] = weight[s] * gy * g * (_ONE - g)
         raw[s, 2] = weight[s] * gz * b * (_ONE - b)
-        raw[s, 3] = (
-            density[s] * step * ((sample_transmittance[s] - weight[s]) * towards - suffix_sum[ray] + grad_alpha_term)
-        )
+        transmittance_behind = sample_transmittance[s] - weight[s]
+        raw[s, 3] = density[s] * step * (transmittance_behind * grad_dot_colour - suffix_sum[ray] + grad_alpha_term)
 
 
 @njit(**NJIT_OPTIONS)
-def subsample_gradients(raw, share):
-    """Rows of gradients (s, 4) that stand for all, and what they then are: systematic resampling.
+def subsample_gradients(raw, relative_threshold):
+    """Return an unbiased subset of the rows of gradients (s, 4) by systematic resampling, and the rescaled rows.
 
-    Of the rows that are small each is taken with a chance in proportion, and then counts for those that were not.
-    share: of the mean size, above which all are taken.
+    Rows above `relative_threshold` times the mean size are kept. Smaller rows are kept with a probability proportional
+    to their size, and divided by it.
     """
     count, total = len(raw), 0.0
     size = np.empty(count, np.float32)
     for s in range(count):
         size[s] = max(max(abs(raw[s, 0]), abs(raw[s, 1])), max(abs(raw[s, 2]), abs(raw[s, 3])))
         total += size[s]
-    threshold = share * total / max(count, 1)
+    threshold = relative_threshold * total / max(count, 1)
     rows, scaled = np.empty(count, np.int64), np.empty((count, 4), np.float32)
     kept, accumulated = 0, 0.5
     for s in range(count):
@@ -66,8 +66,8 @@ def subsample_gradients(raw, share):
 
 
 @njit(**NJIT_OPTIONS)
-def network(rows, raw, features, hidden, output, grad_hidden_weights, grad_output_weights, towards):
-    """Add to the network's gradients; fill dL/d(features) (rows, w)."""
+def network_gradients(rows, raw, features, hidden, output, grad_hidden_weights, grad_output_weights, grad_features):
+    """Add the gradients of the weights; fill dL/d(features) (rows, w)."""
     width, units = hidden.shape
     back = np.ascontiguousarray(hidden.T)
     layer = np.empty(units, np.float32)
@@ -99,9 +99,9 @@ def network(rows, raw, features, hidden, output, grad_hidden_weights, grad_outpu
             for h in range(units):
                 grad_hidden_weights[i, h] += value * layer[h]
         for i in range(width):
-            towards[row, i] = _ZERO
+            grad_features[row, i] = _ZERO
         for h in range(units):
             value = layer[h]
             if value != _ZERO:
                 for i in range(width):
-                    towards[row, i] += value * back[h, i]
+                    grad_features[row, i] += value * back[h, i]

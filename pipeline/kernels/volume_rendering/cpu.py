@@ -1,55 +1,117 @@
-"""Compiled loop that follows rays until no light is left: march, Newton, hash grid, network, compositing in one.
+"""Compiled loop of the fused renderer: march, Newton step, hash grid, network and compositing.
 
-A few rays go a few samples ahead, these are shaded together, and the rays that have light left go on. What is worked
-at stays in the cache; what lies behind a surface is never asked.
+A block of rays advances a few samples at a time. These samples are evaluated together, and only rays that still have
+transmittance continue. The working set stays in the cache, and samples behind a surface are never evaluated.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from pipeline.kernels.common.numba_options import NJIT_OPTIONS
-from pipeline.kernels.hashgrid.cpu import BLOCK, encode_block
-from pipeline.kernels.inverse_skinning.newton_cpu import newton_step
-from pipeline.kernels.march.cpu import CANDIDATES, advance_ray, intersect_box
+from pipeline.kernels.hashgrid.cpu import BLOCK, HashTable, encode_block
+from pipeline.kernels.inverse_skinning.newton_cpu import LatticeArrays, newton_step
+from pipeline.kernels.march.cpu import CANDIDATES, MarchArrays, SampleArrays, advance_ray, intersect_box
 
-RAYS_PER_BLOCK, SAMPLES_PER_PASS, HALF_TRANSMITTANCE = 128, 3, np.float32(0.5)
-"""Rays that are followed together, and samples that each goes ahead: one by one with less than DIM of its light left,
-where the next may be the last.
-"""
+RAYS_PER_BLOCK = 128
+"""Rays that advance together."""
+SAMPLES_PER_PASS, HALF_TRANSMITTANCE = 3, np.float32(0.5)
+"""Samples that each ray advances at a time; one at a time below this transmittance, where the next may be the last."""
 MAX_SAMPLES_PER_PASS = RAYS_PER_BLOCK * (SAMPLES_PER_PASS + CANDIDATES)
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
+class SkinningArrays(NamedTuple):
+    """Frame of the batch of each ray (n), and the skin grid with its blended matrices (m, k, 12); m = 0: no step."""
+
+    batch_index: np.ndarray
+    lattice: LatticeArrays
+    blended: np.ndarray
+
+
+class NetworkArrays(NamedTuple):
+    """Weights (w, h) and (h, 4), bias (4); density is initial_density * exp(x), with |x| at most `exponent_limit`."""
+
+    hidden: np.ndarray
+    output: np.ndarray
+    bias: np.ndarray
+    initial_density: np.float32
+    exponent_limit: np.float32
+
+
+class FieldArrays(NamedTuple):
+    """The radiance field in the box `bounds` (2, 3); `lanes` as in `pipeline.kernels.hashgrid.cpu`."""
+
+    bounds: np.ndarray
+    table: HashTable
+    lanes: tuple[int, ...]
+    network: NetworkArrays
+
+
+class RenderArrays(NamedTuple):
+    """All inputs of the renderer; `max_samples` for each ray."""
+
+    march: MarchArrays
+    skinning: SkinningArrays
+    field: FieldArrays
+    max_samples: int
+    min_transmittance: np.float32
+
+
+class SampleBuffers(NamedTuple):
+    """Preallocated rows for samples: ray, canonical position, distance, inverse Jacobian (9), position in the unit box,
+    features (w), colour (3), density, weight, and transmittance in front of the sample.
+    """
+
+    ray_indices: np.ndarray
+    canonical: np.ndarray
+    distance: np.ndarray
+    inverse_jacobian: np.ndarray
+    unit: np.ndarray
+    features: np.ndarray
+    colour: np.ndarray
+    density: np.ndarray
+    weight: np.ndarray
+    transmittance: np.ndarray
+
+
+class _DecodeBuffers(NamedTuple):
+    """Features (w, BLOCK), activations (BLOCK) and network outputs (4, BLOCK) of a block of samples."""
+
+    columns: np.ndarray
+    layer: np.ndarray
+    raw: np.ndarray
+
+
 @njit(**NJIT_OPTIONS)
-def _refine_samples(
-    first, last, canonical, distance, ray_indices, origins, directions, batch_index, skin_origin, skin_cell,
-    row_of_node, blended,
-    bounds, unit, inverse_jacobian,
-):  # fmt: skip
-    """One Newton step of samples (`pipeline.kernels.inverse_skinning.newton`), if any; then into the unit box."""
+def _refine_samples(first, last, inputs, samples):
+    """Do one Newton step for the samples first..last, if there is a skin grid; then map them to the unit box."""
+    rays, bounds = inputs.march.rays, inputs.field.bounds
+    batch_index, lattice, blended = inputs.skinning
+    origins, directions, canonical, unit = rays.origins, rays.directions, samples.canonical, samples.unit
     low_x, low_y, low_z = bounds[0, 0], bounds[0, 1], bounds[0, 2]
     scale_x, scale_y = _ONE / (bounds[1, 0] - low_x), _ONE / (bounds[1, 1] - low_y)
     scale_z = _ONE / (bounds[1, 2] - low_z)
     for s in range(first, last):
         x, y, z = canonical[s, 0], canonical[s, 1], canonical[s, 2]
         if len(blended):
-            ray, t = ray_indices[s], distance[s]
-            px, py, pz = (
+            ray, t = samples.ray_indices[s], samples.distance[s]
+            posed = (
                 origins[ray, 0] + t * directions[ray, 0],
                 origins[ray, 1] + t * directions[ray, 1],
                 origins[ray, 2] + t * directions[ray, 2],
             )
-            x, y, z = newton_step(
-                px, py, pz, x, y, z, batch_index[ray], skin_origin, skin_cell, row_of_node, blended, inverse_jacobian[s]
-            )
+            x, y, z = newton_step(posed, (x, y, z), batch_index[ray], lattice, blended, samples.inverse_jacobian[s])
         unit[s, 0], unit[s, 1], unit[s, 2] = (x - low_x) * scale_x, (y - low_y) * scale_y, (z - low_z) * scale_z
 
 
 @njit(**NJIT_OPTIONS)
-def _decode(
-    first, last, features, hidden, output, bias, initial_density, exponent_limit, colour, density, columns, layer, raw
-):
-    """Colour and density of at most BLOCK samples. columns (w, BLOCK), layer (BLOCK), raw (4, BLOCK): scratch."""
+def _decode(first, last, network, samples, buffers):
+    """Fill colour and density of the samples first..last, at most BLOCK, from their features."""
+    hidden, output, bias, initial_density, exponent_limit = network
+    features, colour, density = samples.features, samples.colour, samples.density
+    columns, layer, raw = buffers
     size = last - first
     for i in range(hidden.shape[0]):
         for s in range(size):
@@ -60,7 +122,7 @@ def _decode(
     for h in range(hidden.shape[1]):
         for s in range(size):
             layer[s] = _ZERO
-        # Four at once: the sums are read and written less often. The width is a multiple of four, or the rest follows.
+        # Four inputs at a time, so that the sums are read and written less often; then the remaining inputs.
         whole = hidden.shape[0] // 4 * 4
         for i in range(0, whole, 4):
             w0, w1, w2, w3 = hidden[i, h], hidden[i + 1, h], hidden[i + 2, h], hidden[i + 3, h]
@@ -86,48 +148,23 @@ def _decode(
 
 
 @njit(**NJIT_OPTIONS)
-def evaluate_field(
-    first,
-    last,
-    unit,
-    table,
-    level_params,
-    hidden,
-    output,
-    bias,
-    initial_density,
-    exponent_limit,
-    features,
-    colour,
-    density,
-    lanes,
-):
-    """Fill features, colour and density of the samples first..last at points of the unit box."""
-    columns, layer = np.empty((hidden.shape[0], BLOCK), np.float32), np.empty(BLOCK, np.float32)
-    raw = np.empty((4, BLOCK), np.float32)
+def evaluate_field(first, last, field, samples):
+    """Fill features, colour and density of the samples first..last at their positions in the unit box."""
+    _, table, lanes, network = field
+    columns = np.empty((network.hidden.shape[0], BLOCK), np.float32)
+    buffers = _DecodeBuffers(columns, np.empty(BLOCK, np.float32), np.empty((4, BLOCK), np.float32))
     for start in range(first, last, BLOCK):
         stop = min(start + BLOCK, last)
-        for level in range(level_params.shape[0]):
-            encode_block(unit, table, level_params, level, features, start, stop, lanes)
-        _decode(
-            start,
-            stop,
-            features,
-            hidden,
-            output,
-            bias,
-            initial_density,
-            exponent_limit,
-            colour,
-            density,
-            columns,
-            layer,
-            raw,
-        )
+        for level in range(table.level_params.shape[0]):
+            encode_block(samples.unit, table, lanes, level, samples.features, start, stop)
+        _decode(start, stop, network, samples, buffers)
 
 
 @njit(**NJIT_OPTIONS)
-def _composite(first, last, ray_indices, density, colour, step, transmittance, weight, sample_transmittance, image):
+def _composite(first, last, step, samples, image, transmittance):
+    """Composite the samples first..last onto image (n, 3) and transmittance (n) of their rays."""
+    ray_indices, density, colour, weight = samples.ray_indices, samples.density, samples.colour, samples.weight
+    sample_transmittance = samples.transmittance
     for s in range(first, last):
         ray = ray_indices[s]
         segment_transmittance = np.exp(-density[s] * step)
@@ -139,27 +176,19 @@ def _composite(first, last, ray_indices, density, colour, step, transmittance, w
 
 
 @njit(**NJIT_OPTIONS)
-def trace(
-    origins, directions, frame, batch_index, jitter, step, max_samples, min_transmittance,
-    cell, warp_origin, warp_dims, warp_first, warp_nodes, warp_codes, warp_maps, occupied, low, scale,
-    skin_origin, skin_cell, row_of_node, blended,
-    bounds, table, level_params, hidden, output, bias, initial_density, exponent_limit, lanes,
-    image, transmittance, capacity, ray_indices, canonical, distance, inverse_jacobian, unit, features, colour,
-    density, weight, sample_transmittance,
-):  # fmt: skip
-    """The number of samples, -1 if there was no room for them; fills all that follow `lanes`: see
-    `pipeline.kernels.volume_rendering.trace`.
+def render_rays_fused(inputs, samples, capacity, image, transmittance):
+    """Fill samples, image (n, 3) and final transmittance (n) of rays; image starts at 0, transmittance at 1.
+
+    Returns the number of samples, or -1 if the first `capacity` rows of `samples` are too few.
     """
-    rays, count = len(origins), 0
-    near, step_count, stop = np.empty(rays, np.float32), np.empty(rays, np.int64), np.zeros(rays, np.int64)
-    samples_left, active_rays = np.full(rays, max_samples), np.empty(RAYS_PER_BLOCK, np.int64)
+    rays, count, step = len(transmittance), 0, inputs.march.step
+    marched = SampleArrays(samples.canonical, samples.distance, samples.ray_indices)
+    near, step_count, step_index = np.empty(rays, np.float32), np.empty(rays, np.int64), np.zeros(rays, np.int64)
+    samples_left, active_rays = np.full(rays, inputs.max_samples), np.empty(RAYS_PER_BLOCK, np.int64)
     for block in range(0, rays, RAYS_PER_BLOCK):
         active_count = 0
         for ray in range(block, min(block + RAYS_PER_BLOCK, rays)):
-            f = frame[ray]
-            near[ray], step_count[ray] = intersect_box(
-                ray, origins, directions, jitter, step, cell, warp_origin[f], warp_dims[f]
-            )
+            near[ray], step_count[ray] = intersect_box(ray, inputs.march)
             if step_count[ray] > 0:
                 active_rays[active_count] = ray
                 active_count += 1
@@ -167,31 +196,22 @@ def trace(
             first = count
             if first + MAX_SAMPLES_PER_PASS > capacity:
                 return -1
-            for place in range(active_count):
-                ray, previous_count = active_rays[place], count
+            for index in range(active_count):
+                ray, previous_count = active_rays[index], count
                 pass_samples = SAMPLES_PER_PASS if transmittance[ray] >= HALF_TRANSMITTANCE else 1
-                count, stop[ray] = advance_ray(
-                    ray, near[ray], stop[ray], step_count[ray], count + pass_samples, count + samples_left[ray],
-                    origins, directions, jitter, step, cell, frame[ray],
-                    warp_origin, warp_dims, warp_first, warp_nodes, warp_codes, warp_maps,
-                    occupied, low, scale, count, canonical, distance, ray_indices,
-                )  # fmt: skip
+                steps, max_count = (near[ray], step_index[ray], step_count[ray]), count + samples_left[ray]
+                count, step_index[ray] = advance_ray(
+                    ray, steps, inputs.march, marched, count, count + pass_samples, max_count
+                )
                 samples_left[ray] -= count - previous_count
-            _refine_samples(
-                first, count, canonical, distance, ray_indices, origins, directions, batch_index,
-                skin_origin, skin_cell, row_of_node, blended, bounds, unit, inverse_jacobian,
-            )  # fmt: skip
-            evaluate_field(
-                first, count, unit, table, level_params, hidden, output, bias, initial_density, exponent_limit,
-                features, colour, density, lanes,
-            )  # fmt: skip
-            _composite(
-                first, count, ray_indices, density, colour, step, transmittance, weight, sample_transmittance, image
-            )
+            _refine_samples(first, count, inputs, samples)
+            evaluate_field(first, count, inputs.field, samples)
+            _composite(first, count, step, samples, image, transmittance)
             still_active = 0
-            for place in range(active_count):
-                ray = active_rays[place]
-                if stop[ray] < step_count[ray] and samples_left[ray] > 0 and transmittance[ray] >= min_transmittance:
+            for index in range(active_count):
+                ray = active_rays[index]
+                has_steps = step_index[ray] < step_count[ray] and samples_left[ray] > 0
+                if has_steps and transmittance[ray] >= inputs.min_transmittance:
                     active_rays[still_active] = ray
                     still_active += 1
             active_count = still_active

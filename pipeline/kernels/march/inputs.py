@@ -1,0 +1,85 @@
+"""Inputs of ray marching: rays, warp grids of several frames, and the volume that rays are sampled in.
+
+Notation: n rays, k frames.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from pipeline.kernels.inverse_skinning import WarpGrid
+from pipeline.kernels.march.cpu import OccupancyArrays, WarpArrays
+
+
+class Rays(NamedTuple):
+    """Rays, each in the posed space of its frame.
+
+    directions: unit length. frame_index: row of the warp grids (int64). jitter: offset of the samples of each ray, as a
+    fraction of a step, in [0, 1).
+    """
+
+    origins_m: Float[Tensor, "n 3"]
+    directions: Float[Tensor, "n 3"]
+    frame_index: Int[Tensor, "n"]
+    jitter: Float[Tensor, "n"]
+
+
+@dataclass(frozen=True)
+class PackedWarpGrids:
+    """The warp grids of several frames, concatenated; all have the same cell size.
+
+    Rows of `origin_m` and `dims` are frames; `offsets` holds the first node, cell and affine map of each frame.
+    """
+
+    cell_m: float
+    origin_m: Float[Tensor, "k 3"]
+    dims: Int[Tensor, "k 3"]
+    offsets: Int[Tensor, "k 3"]
+    canonical_m: Float[Tensor, "nodes 3"]
+    cell_codes: Int[Tensor, "cells"]
+    affine_maps: Float[Tensor, "maps 12"]
+
+    @staticmethod
+    def from_grids(grids: Sequence[WarpGrid], cell_m: float) -> "PackedWarpGrids":
+        """Concatenate warp grids, all with cells of `cell_m`."""
+        sizes = np.array([(len(g.canonical_m), len(g.cell_codes), len(g.affine_maps)) for g in grids], dtype=np.int64)
+        names = ("canonical_m", "cell_codes", "affine_maps")
+        joined = {name: np.concatenate([getattr(grid, name) for grid in grids]) for name in names}
+        joined |= {name: np.stack([getattr(grid, name) for grid in grids]) for name in ("origin_m", "dims")}
+        joined["offsets"] = np.cumsum(sizes, axis=0) - sizes
+        return PackedWarpGrids(cell_m, **{name: torch.from_numpy(array) for name, array in joined.items()})
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        """Return all tensors, in the order of the fields."""
+        return self.origin_m, self.dims, self.offsets, self.canonical_m, self.cell_codes, self.affine_maps
+
+    def to(self, device: torch.device) -> "PackedWarpGrids":
+        """Return the grids on another device."""
+        return PackedWarpGrids(self.cell_m, *(tensor.to(device) for tensor in self.tensors()))
+
+    def arrays(self) -> WarpArrays:
+        """Return the grids for the compiled loops; they are on the CPU."""
+        return WarpArrays(np.float32(self.cell_m), *(tensor.contiguous().numpy() for tensor in self.tensors()))
+
+
+@dataclass(frozen=True)
+class SamplingVolume:
+    """The volume that rays are sampled in: inverse skinning of the frames, and the occupied cells of canonical space.
+
+    occupied: nonzero where the field may have density; the grid fills the box `bounds_m` (low and high corner).
+    """
+
+    warps: PackedWarpGrids
+    occupied: UInt8[Tensor, "gx gy gz"]
+    bounds_m: Float[Tensor, "2 3"]
+
+    def occupancy_arrays(self) -> OccupancyArrays:
+        """Return the occupancy grid for the compiled loops; it is on the CPU."""
+        low_m, high_m = self.bounds_m
+        cells_per_m = torch.tensor(self.occupied.shape) / (high_m - low_m)
+        return OccupancyArrays(*(tensor.contiguous().numpy() for tensor in (self.occupied, low_m, cells_per_m)))

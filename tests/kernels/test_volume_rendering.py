@@ -1,0 +1,91 @@
+"""The fused renderer without approximations against the reference, in values and gradients, on a bent bar.
+
+Early termination and gradient subsampling are tested on a trained field in `tests/field/test_volume_rendering.py`.
+"""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from pipeline.kernels.hashgrid import FeatureGradients, GridLayout, add_table_gradient_
+from pipeline.kernels.inverse_skinning import bake_warp_grid
+from pipeline.kernels.march import PackedWarpGrids, Rays, SamplingVolume
+from pipeline.kernels.volume_rendering import (
+    BatchSkinning,
+    RadianceNetwork,
+    RenderSettings,
+    reference,
+    render_rays_fused,
+)
+from tests.kernels.bar import CELL_M, bar_skin, bend
+
+BOUNDS_M = torch.tensor([[-0.65, -0.2, -0.2], [0.65, 0.2, 0.2]])
+EXACT = RenderSettings(0.02, 160, min_transmittance=0.0, gradient_subsampling_threshold=0.0)
+ANGLES = (0.4, -0.7)
+
+
+def make_network(random: torch.Generator) -> RadianceNetwork:
+    layout = GridLayout(((6, 3, 3), (20, 8, 8)), 4, 10)
+    table = 0.5 * torch.randn(layout.rows, 4, generator=random)
+    hidden, output = torch.randn(8, 16, generator=random), torch.randn(16, 4, generator=random)
+    weights = (tensor.requires_grad_() for tensor in (hidden, output, torch.randn(4, generator=random)))
+    return RadianceNetwork(BOUNDS_M, table.requires_grad_(), layout, *weights, 5.0, 4.0)
+
+
+def make_scene():
+    """Rays of two frames, their volume, and a skinning that differs slightly from that of the warp grids."""
+    random, skin = torch.Generator().manual_seed(2), bar_skin()
+    warps = PackedWarpGrids.from_grids([bake_warp_grid(skin, bend(angle)) for angle in ANGLES], CELL_M)
+    origins = torch.tensor([0.0, 0.0, 1.5]) + 0.2 * torch.randn(300, 3, generator=random)
+    targets = (torch.rand(300, 3, generator=random) - 0.5) * torch.tensor([0.9, 0.2, 0.1])
+    frame = torch.arange(300) // 150
+    directions = torch.nn.functional.normalize(targets - origins, dim=-1)
+    rays = Rays(origins, directions, frame, torch.rand(300, generator=random))
+    volume = SamplingVolume(warps, torch.ones(8, 4, 4, dtype=torch.uint8), BOUNDS_M)
+    blended = skin.blend(torch.stack([bend(angle + 0.01) for angle in ANGLES])).requires_grad_()
+    return rays, volume, make_network(random), BatchSkinning(skin, blended, frame)
+
+
+def leaves(network: RadianceNetwork, skinning: BatchSkinning) -> dict[str, torch.Tensor]:
+    named = {name: getattr(network, name) for name in ("hidden", "output", "bias")}
+    return named | {"blended": skinning.blended}
+
+
+@pytest.mark.parametrize("newton", [True, False])
+def test_values_and_gradients_match_reference(newton: bool) -> None:
+    rays, volume, network, skinning = make_scene()
+    points_m = torch.tensor([[0.1, 0.02, 0.0], [-0.3, 0.0, 0.05]])
+    feature_gradients: FeatureGradients = []
+    used = skinning if newton else None
+    fused = render_rays_fused(rays, volume, network, used, points_m, EXACT, feature_gradients)
+    expected = reference.render_rays(rays, volume, network, used, points_m, EXACT)
+    assert float(expected.alpha.detach().max()) > 0.5
+    assert len(fused.weight) == len(expected.weight) > 1000
+    for name in ("image", "alpha", "density_per_m"):
+        torch.testing.assert_close(getattr(fused, name), getattr(expected, name), atol=2e-5, rtol=1e-4)
+    for name in ("transmittance", "weight"):
+        ours, theirs = (getattr(result, name).sort().values for result in (fused, expected))
+        torch.testing.assert_close(ours, theirs, atol=2e-5, rtol=0)
+    random = torch.Generator().manual_seed(3)
+    to_image, to_alpha = torch.randn(300, 3, generator=random), torch.randn(300, generator=random)
+    parameters = {name: leaf for name, leaf in leaves(network, skinning).items() if newton or name != "blended"}
+    gradients = []
+    for result, extra in ((fused, []), (expected, [network.table])):
+        loss = (result.image * to_image).sum() + (result.alpha * to_alpha).sum() + result.density_per_m.sum()
+        gradients.append(torch.autograd.grad(loss, [*parameters.values(), *extra]))
+    grad_table = torch.zeros_like(network.table)
+    add_table_gradient_(grad_table, feature_gradients, network.layout)
+    names = [*parameters, "table"]
+    for name, ours, theirs in zip(names, (*gradients[0], grad_table), gradients[1], strict=True):
+        # A hidden unit near zero may be active in one and not in the other.
+        assert float((ours - theirs).norm()) < 1e-3 * float(theirs.norm()), name
+
+
+def test_max_samples_limits_each_ray() -> None:
+    rays, volume, network, _ = make_scene()
+    settings = replace(EXACT, max_samples=3)
+    fused = render_rays_fused(rays, volume, network, None, torch.zeros(0, 3), settings, [])
+    expected = reference.render_rays(rays, volume, network, None, torch.zeros(0, 3), settings)
+    assert len(fused.weight) == len(expected.weight) <= 3 * len(rays.frame_index)
+    torch.testing.assert_close(fused.image, expected.image, atol=2e-5, rtol=1e-4)
