@@ -51,7 +51,7 @@ class RadianceNetwork:
     """Hash grid and network: raw = relu(features hidden) output + bias.
 
     The colour is sigmoid(raw[:3]). The density (1/m) is initial_density_per_m * exp(raw[3]), with raw[3] clamped to
-    [-exponent_limit, exponent_limit]. The hash grid fills the box `bounds_m`.
+    [-exponent_limit, exponent_limit]; the gradient is not clamped. The hash grid fills the box `bounds_m`.
     """
 
     bounds_m: Float[Tensor, "2 3"]

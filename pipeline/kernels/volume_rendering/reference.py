@@ -51,5 +51,7 @@ def _evaluate(
     low_m, high_m = network.bounds_m
     features = encode((points_m - low_m) / (high_m - low_m), network.table, network.layout)
     raw = torch.relu(features @ network.hidden) @ network.output + network.bias
-    exponent = raw[:, 3].clamp(-network.exponent_limit, network.exponent_limit)
+    # Truncated exponential of Instant-NGP: the exponent is clamped, its gradient is not.
+    clamped = raw[:, 3].clamp(-network.exponent_limit, network.exponent_limit)
+    exponent = raw[:, 3] + (clamped - raw[:, 3]).detach()
     return torch.sigmoid(raw[:, :3]), network.initial_density_per_m * exponent.exp()
