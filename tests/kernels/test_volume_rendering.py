@@ -34,7 +34,7 @@ def make_network(random: torch.Generator) -> RadianceNetwork:
 
 
 def make_scene():
-    """Rays of two frames (one block of 128 rays has both), their volume, and a skinning that differs slightly from that of the warp grids."""
+    """Rays of two frames, both in one block of 128 rays; a skinning slightly different from the warp grids."""
     random, skin = torch.Generator().manual_seed(2), bar_skin()
     warps = PackedWarpGrids.from_grids([bake_warp_grid(skin, bend(angle)) for angle in ANGLES], CELL_M)
     origins = torch.tensor([0.0, 0.0, 1.5]) + 0.2 * torch.randn(300, 3, generator=random)
