@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -28,13 +29,7 @@ def axis_angle_to_quaternion(axis_angle_rad: Float[Tensor, "*n 3"]) -> Float[Ten
 
 def quaternion_to_axis_angle(quaternion_wxyz: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 3"]:
     """Convert quaternions to axis-angle vectors (logarithm map) with angles in [0, pi] rad."""
-    quaternion = torch.where(quaternion_wxyz[..., :1] < 0, -quaternion_wxyz, quaternion_wxyz)
-    w, xyz = quaternion[..., :1], quaternion[..., 1:]
-    squared = (xyz**2).sum(-1, keepdim=True)
-    small = squared < 1e-10
-    sine = torch.where(small, torch.ones_like(squared), squared).sqrt()
-    scale = torch.where(small, 2.0 / w.clamp(min=0.5), 2.0 * torch.atan2(sine, w) / sine)
-    return xyz * scale
+    return roma.unitquat_to_rotvec(quaternion_wxyz[..., [1, 2, 3, 0]])
 
 
 def quaternion_to_matrix(quaternion_wxyz: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 3 3"]:

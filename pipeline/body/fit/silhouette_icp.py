@@ -21,6 +21,7 @@ from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody, pose_skelet
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.skinning import linear_blend_skinning, rigid_transform
 from pipeline.kernels.raster import rasterize
+from pipeline.metrics.images import mask_iou
 
 PERSON_HEIGHT_PX = 240
 """Height of a person in a matching window, pixels."""
@@ -149,12 +150,6 @@ def rasterise_in_window(
     return BodyRaster(face_id.numpy(), barycentric.numpy())
 
 
-def intersection_over_union(first: Bool[np.ndarray, "h w"], second: Bool[np.ndarray, "h w"]) -> float:
-    """Shared area over joint area, 0 to 1; 1 when both are empty."""
-    union = int((first | second).sum())
-    return float((first & second).sum()) / union if union else 1.0
-
-
 @dataclass(frozen=True)
 class Correspondences:
     """Pairs of one frame, in window pixels (x, y)."""
@@ -248,7 +243,7 @@ def match_silhouettes(
             continue
         body_raster = rasterise_in_window(vertices[frame], model.faces, camera, window)
         body_mask = body_raster.face_id >= 0
-        silhouette_iou[frame] = intersection_over_union(body_mask, window.mask)
+        silhouette_iou[frame] = mask_iou(body_mask, window.mask)
         pairs = find_correspondences(window, body_mask, body_mask & head_and_foot_faces[body_raster.face_id])
         count, used = len(pairs.weight), (pairs.weight > 0).sum()
         rows, columns = pairs.pixel.T

@@ -8,7 +8,6 @@ from pipeline.body.fit.silhouette_icp import (
     crop_mask_window,
     distance_px,
     find_correspondences,
-    intersection_over_union,
     mask_weights,
     match_silhouettes,
     outline_pixels,
@@ -17,6 +16,7 @@ from pipeline.body.fit.silhouette_icp import (
     signed_distance,
 )
 from pipeline.geometry.skinning import forward_kinematics, linear_blend_skinning, skinning_transforms
+from pipeline.metrics.images import mask_iou
 from tests.body.acting import synthetic_recording
 
 
@@ -101,7 +101,7 @@ def test_an_empty_mask_has_no_window() -> None:
 
 @pytest.mark.parametrize(("second", "expected"), [(disc(20.0), 1.0), (disc(20.0, x=10.0, y=90.0), 0.0)])
 def test_overlap_of_discs(second: np.ndarray, expected: float) -> None:
-    assert intersection_over_union(disc(20.0), second) == pytest.approx(expected, abs=0.05)
+    assert mask_iou(disc(20.0), second) == pytest.approx(expected, abs=0.05)
 
 
 def test_the_true_body_covers_its_mask_and_its_pairs_are_satisfied() -> None:
