@@ -1,4 +1,4 @@
-"""body: one parametric body, its pose in every frame, and the camera, fitted to landmarks and masks."""
+"""body: fit one parametric body, its pose in every frame and the camera to landmarks and masks."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,7 +10,7 @@ from jaxtyping import Bool, UInt8
 from pydantic import Field
 
 from pipeline.body.body import Motion, ParametricBody, canonical_to_world, load_anny
-from pipeline.body.files import save_body, save_camera, save_motion
+from pipeline.body.files import FrameScores, save_body, save_camera, save_motion, save_scores
 from pipeline.body.fit.diagnostics import (
     FRAME_RATINGS,
     finite_median,
@@ -22,12 +22,14 @@ from pipeline.body.fit.diagnostics import (
     suspicious_frames,
     usable_frames,
 )
-from pipeline.body.fit.fit import FitOptions, FitResult, TooFewLandmarksError, fit_body, fit_given
+from pipeline.body.fit.fit import FitOptions, TooFewLandmarksError, fit_body, fit_supplied_poses
 from pipeline.body.fit.foreign_objects import foreign_object_warnings, frames_with_foreign_objects, residual_blob_shares
 from pipeline.body.fit.hand_observations import filter_hand_detections, finger_curls_rad
+from pipeline.body.fit.result import FitResult
 from pipeline.body.fit.silhouette_icp import crop_mask_window
 from pipeline.body.fit.supplied_poses import SuppliedPoses
-from pipeline.body.overlay import draw_overlay, overlay_grid, pose_vertices
+from pipeline.body.overlay import draw_overlay, pose_vertices, tile_overlays
+from pipeline.body.settings import DEFAULT_SETTINGS, FitSettings
 from pipeline.body.smpl import SmplBody
 from pipeline.body.smpl_file import load_smpl
 from pipeline.capture.capture import Capture, load_capture
@@ -42,61 +44,61 @@ from pipeline.core.progress import warn
 from pipeline.core.stage import Stage
 from pipeline.geometry.camera import Camera
 from pipeline.io.image import to_uint8, write_rgb
-from pipeline.io.npz import save_npz
 
 _BODY, _MOTION, _CAMERA, _OVERLAY = "body.npz", "motion.npz", "camera.npz", "overlay.png"
 _OVERLAY_FRAMES = 12
-_DEFAULT_FOCAL_STD, _EXIF_FOCAL_STD = 0.5, 0.1
-"""Relative deviations of a guessed focal length and of one in the metadata (`pipeline.capture.exif_focal`)."""
 
 
 class Config(BaseConfig):
     """Options of the body stage."""
 
     model_file: str | None = Field(
-        None, description="SMPL, SMPL-H or SMPL-X model to fit, a path to .npz or .pkl; null: the built-in body."
+        None, description="path of an SMPL, SMPL-H or SMPL-X model (.npz or .pkl); null: the built-in body"
     )
     height_m: float | None = Field(
-        None, ge=0.5, le=2.5, description="Stature of the person, metres; null: about 1.70 m, as the pictures suggest."
+        None, ge=0.5, le=2.5, description="stature of the person, m; null: estimated with a prior of 1.70 m"
     )
     field_of_view_deg: float | None = Field(
-        None, ge=5.0, le=150.0, description="Angle of view along the longer image side, degrees; null: estimated."
+        None,
+        ge=5.0,
+        le=150.0,
+        description="field of view along the longer image side, degrees; null: from the metadata, or estimated",
     )
-    initial_focal_ratio: float = Field(
-        1.2, ge=0.3, le=5.0, description="Where the estimate of the focal length starts, times the longer image side."
+    shared_frames: int = Field(48, ge=8, le=500, description="frames used to estimate shape and focal length")
+    rounds: int = Field(
+        8, ge=1, le=50, description="silhouette matching rounds of the estimate of shape and focal length"
     )
-    principal_point_std_ratio: float = Field(
-        0.05,
-        ge=0.0,
-        le=0.3,
-        description="Standard deviation of the principal point about the picture's centre where the camera is not "
-        "known, longer image sides; 0: it is the centre.",
-    )
-    shared_frames: int = Field(48, ge=8, le=500, description="Frames from which shape and focal length are found.")
-    rounds: int = Field(8, ge=1, le=50, description="Rounds of matching outlines to find shape and focal length.")
     supplied_poses: Literal["keep", "start", "ignore"] = Field(
         "keep",
-        description="With an SMPL model_file, of smpl_poses.npz beside the video: keep its shape and poses; keep its "
-        "shape and start from its poses, which landmarks and outlines refine; or ignore it.",
+        description="use of a supplied smpl_poses.npz (needs an SMPL model_file): keep its shape and poses; start: "
+        "keep its shape and refine its poses with landmarks and silhouettes; ignore it",
     )
     min_silhouette_iou: float = Field(
-        0.5, ge=0.0, le=1.0, description="A fit is refused whose median overlap with the masks (IoU, 0 to 1) is lower."
+        0.5, ge=0.0, le=1.0, description="minimum median IoU of body and masks; a worse fit is an error"
     )
     max_dropped_share: float = Field(
         0.3,
         ge=0.0,
         le=0.9,
-        description="A fit is refused that misses the person in a larger share of the training frames; fewer are "
-        "left out of the training.",
+        description="maximum fraction of training frames whose fit is unusable; they are not trained on, more are an "
+        "error",
     )
 
 
-def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, float]:
-    """Fit the body; write body, motion, camera, a score per frame and the overlay picture."""
+def run(
+    inputs: Mapping[str, Path], out: Path, config: Config, settings: FitSettings = DEFAULT_SETTINGS
+) -> Mapping[str, float]:
+    """Fit the body; write body, motion, camera, scores of the frames and the overlay image.
+
+    settings: for sweeps and ablations from Python; the command uses the defaults.
+
+    Raises:
+        UserError: an input cannot be read, or the fit is worse than the options allow.
+    """
     capture = load_capture(inputs["frames"])
     masks = [to_uint8(capture.mask(position)) for position in range(len(capture))]
     hands = filter_hand_detections(capture.hands or undetected_hands(len(capture)), capture.landmarks_px)
-    result = fit(capture, hands, masks, inputs["frames"], config)
+    result = fit_capture(capture, hands, masks, config, settings)
     motion = Motion(capture.frame_index, capture.time_s, result.rotations_wxyz, result.root_translation_m)
     left_right_swapped = np.stack(list(result.left_right_swapped.values())).any(axis=0)
     save_body(out / _BODY, result.body)
@@ -104,14 +106,17 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     save_camera(out / _CAMERA, result.camera)
     blob_shares = residual_blob_shares(result.body, canonical_to_world(result.body, motion), result.camera, masks)
     usable, training = usable_frames(result), capture.split == TRAIN
-    scores = {
-        "silhouette_iou": result.silhouette_iou,
-        "landmark_error_px": result.landmark_error_px,
-        "left_right_swapped": left_right_swapped,
-    }
-    scores |= {"residual_blob_share": blob_shares, "usable": usable}
-    save_npz(out / SCORES_NPZ, {"frame_index": capture.frame_index, **scores})
-    write_rgb(out / _OVERLAY, overlay(capture, masks, result, motion, frames_with_foreign_objects(blob_shares)))
+    scores = FrameScores(
+        frame_index=capture.frame_index,
+        silhouette_iou=result.silhouette_iou,
+        landmark_error_px=result.landmark_error_px,
+        left_right_swapped=left_right_swapped,
+        residual_blob_share=blob_shares,
+        usable=usable,
+    )
+    save_scores(out / SCORES_NPZ, scores)
+    has_foreign_object = frames_with_foreign_objects(blob_shares)
+    write_rgb(out / _OVERLAY, draw_overlay_grid(capture, masks, result, motion, has_foreign_object))
     for message in fit_warnings(result, capture.frame_index, training) + foreign_object_warnings(
         blob_shares, capture.frame_index
     ):
@@ -130,81 +135,94 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
         "hands_used": float((hands.handedness_score > 0.0).mean()),
         "suspicious_frames": int(suspicious_frames(result).sum()),
         "dropped_frames": int((training & ~usable).sum()),
-        "frames_with_foreign_objects": int(frames_with_foreign_objects(blob_shares).sum()),
+        "frames_with_foreign_objects": int(has_foreign_object.sum()),
     }
 
 
-def fit(
-    capture: Capture, hands: HandLandmarks, masks: Sequence[UInt8[np.ndarray, "h w"]], frames_dir: Path, config: Config
+def fit_capture(
+    capture: Capture,
+    hands: HandLandmarks,
+    masks: Sequence[UInt8[np.ndarray, "h w"]],
+    config: Config,
+    settings: FitSettings = DEFAULT_SETTINGS,
 ) -> FitResult:
-    """Fit and judge; UserError when the landmarks or the result are of no use."""
-    camera, focal_relative_std = initial_camera(capture, config)
+    """Fit the body to a capture and check the quality of the fit.
+
+    hands: from `filter_hand_detections`. masks: 0 to 255, one for each frame.
+
+    Raises:
+        UserError: too few landmarks, an unreadable model file, or a fit worse than the options allow.
+    """
+    camera, focal_relative_std = initial_camera(capture, config, settings)
     landmarks = capture.landmarks_px, capture.landmarks_visibility, capture.landmarks_world_m
     observations = make_observations(capture.time_s, *landmarks, camera, hands)
     side_px = max(camera.width, camera.height)
     principal_point_relative_std = (
-        config.principal_point_std_ratio * side_px / camera.fx if focal_relative_std > 0.0 else 0.0
+        settings.principal_point_std_ratio * side_px / camera.fx if focal_relative_std > 0.0 else 0.0
     )
     options = FitOptions(
-        config.height_m, focal_relative_std, principal_point_relative_std, config.shared_frames, config.rounds
+        config.height_m, focal_relative_std, principal_point_relative_std, config.shared_frames, config.rounds, settings
     )
     windows = [crop_mask_window(mask) for mask in masks]
     model = load_anny() if config.model_file is None else load_smpl(Path(config.model_file))
-    supplied = supplied_poses(capture, model, camera, focal_relative_std == 0.0, config)
+    supplied = load_supplied_poses(capture, model, camera, focal_relative_std == 0.0, config)
     try:
         if supplied is None:
             result = fit_body(model, observations, windows, options, finger_curls_rad(model, hands))
         else:
-            result = fit_given(model, observations, windows, supplied, config.supplied_poses == "keep")
+            keep = config.supplied_poses == "keep"
+            result = fit_supplied_poses(model, observations, windows, supplied, keep, settings)
     except TooFewLandmarksError as error:
         raise UserError(
-            f"the body cannot be fitted to {frames_dir}: {error}; film hips and shoulders in view, or, where "
-            "landmarks.npz lies beside the video, complete or remove it"
+            f"the body cannot be fitted to {capture.folder}: {error}; film with hips and shoulders in view, or "
+            "complete or remove a supplied landmarks.npz, and run `python -m stages.frames` again"
         ) from error
     check_fit_quality(result, capture, config, supplied is not None)
     return result
 
 
 def check_fit_quality(result: FitResult, capture: Capture, config: Config, poses_supplied: bool) -> None:
-    """UserError when the body fits the person poorly all over, or not at all in too many of the training frames."""
+    """Check the median silhouette IoU and the fraction of unusable training frames.
+
+    Raises:
+        UserError: one of them is worse than the options allow.
+    """
     remedy = (
-        f"look at {capture.folder / 'contact.jpg'} for wrong masks or landmarks, film the whole body unoccluded, "
+        f"check masks and landmarks in {capture.folder / 'contact.jpg'}, film the whole body unoccluded, "
         f"{'set body.supplied_poses=start, ' if poses_supplied else ''}or"
     )
     silhouette_iou = median_silhouette_iou(result)
     if silhouette_iou < config.min_silhouette_iou:
         raise UserError(
-            f"the body does not fit the person in {capture.folder}: median overlap with the masks "
-            f"{silhouette_iou:.2f}, "
-            f"needed {config.min_silhouette_iou:.2f}; {remedy} lower body.min_silhouette_iou"
+            f"the body does not fit the person in {capture.folder}: median silhouette IoU {silhouette_iou:.2f}, "
+            f"minimum {config.min_silhouette_iou:.2f}; {remedy} lower body.min_silhouette_iou"
         )
     training, unusable = capture.split == TRAIN, ~usable_frames(result)
     dropped = np.count_nonzero(training & unusable)
     if dropped > config.max_dropped_share * np.count_nonzero(training):
         raise UserError(
             f"the body does not fit the person in {dropped} of {np.count_nonzero(training)} training frames of "
-            f"{capture.folder} (frames {format_frame_ranges(capture.frame_index, unusable)}); {remedy} leave "
-            "these frames out "
-            "with split.json, or raise body.max_dropped_share"
+            f"{capture.folder} (frames {format_frame_ranges(capture.frame_index, unusable)}); {remedy} exclude these "
+            "frames with split.json, or raise body.max_dropped_share"
         )
 
 
-def supplied_poses(
+def load_supplied_poses(
     capture: Capture, model: ParametricBody, camera: Camera, focal_is_known: bool, config: Config
 ) -> SuppliedPoses | None:
-    """What others fitted, for this model and in this world; None, with a warning, where that is of no use here.
+    """Return user-supplied poses converted to this model and to world space; None, with a warning, if unusable.
 
-    The shape is the mean over frames: some sources fit one a frame.
+    The shape is the mean over the frames, because some sources fit one shape per frame.
     """
     poses = capture.smpl_poses
     if poses is None or config.supplied_poses == "ignore":
         return None
     if not isinstance(model, SmplBody) or not model.accepts_smpl_poses(poses.betas.shape[1]):
-        reason = f"it needs an SMPL or SMPL-H model file ({poses.gender}), --set body.model_file=FILE"
+        reason = f"it needs an SMPL or SMPL-H model file ({poses.gender}); add --set body.model_file=FILE"
     elif not focal_is_known:
-        reason = "the camera that it belongs to is not known; supply camera.json or body.field_of_view_deg"
+        reason = "its camera is unknown; supply camera.json or body.field_of_view_deg"
     elif len(poses.frame_index) == 0:
-        reason = "it has no pose of a chosen frame"
+        reason = "it has no pose of a selected frame"
     else:
         pose = np.concatenate([poses.global_orient, poses.body_pose], axis=1).reshape(-1, 24, 3)
         to_world = np.linalg.inv(camera.world_to_camera.astype(np.float64)) @ poses.smpl_to_camera
@@ -218,31 +236,31 @@ def supplied_poses(
     return None
 
 
-def initial_camera(capture: Capture, config: Config) -> tuple[Camera, float]:
-    """The camera to start from, and the relative deviation of its focal length (0: known).
+def initial_camera(capture: Capture, config: Config, settings: FitSettings = DEFAULT_SETTINGS) -> tuple[Camera, float]:
+    """Return the initial camera and the relative standard deviation of its focal length (0: known).
 
-    Supplied, by the options, as the recording's metadata say, or a guess, in this order.
+    In this order: the supplied camera, the option, the metadata of the recording, the default.
     """
     if capture.camera is not None:
         return capture.camera, 0.0
     side_px = max(capture.width, capture.height)
-    focal_px, std = config.initial_focal_ratio * side_px, _DEFAULT_FOCAL_STD
+    focal_px, std = settings.initial_focal_ratio * side_px, settings.initial_focal_std
     if config.field_of_view_deg is not None:
         focal_px, std = 0.5 * side_px / float(np.tan(np.radians(0.5 * config.field_of_view_deg))), 0.0
     elif capture.metadata_focal_px is not None:
-        focal_px, std = capture.metadata_focal_px, _EXIF_FOCAL_STD
+        focal_px, std = capture.metadata_focal_px, settings.exif_focal_std
     camera = Camera(focal_px, focal_px, 0.5 * capture.width, 0.5 * capture.height, capture.width, capture.height)
     return camera, std
 
 
-def overlay(
+def draw_overlay_grid(
     capture: Capture,
     masks: Sequence[UInt8[np.ndarray, "h w"]],
     result: FitResult,
     motion: Motion,
     has_foreign_object: Bool[np.ndarray, "n"],
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Tiles of frames: up to half are the worst of those that a warning may name, marked, the others evenly spread."""
+    """Return tiles of at most 12 frames: up to half are those with the worst ratings, the others evenly spaced."""
     rating = rate_frames(result, suspicious_frames(result) | has_foreign_object)
     positions = select_overlay_frames(rating, result.silhouette_iou, _OVERLAY_FRAMES)
     transforms = canonical_to_world(result.body, motion.select(positions))
@@ -253,17 +271,17 @@ def overlay(
             pose_vertices(result.body, transforms[tile]),
             result.body,
             result.camera,
-            f"frame {capture.frame_index[position]}  overlap {result.silhouette_iou[position]:.2f}",
+            f"frame {capture.frame_index[position]}  IoU {result.silhouette_iou[position]:.2f}",
             FRAME_RATINGS[rating[position]],
         )
         for tile, position in enumerate(positions)
     ]
-    return overlay_grid(tiles)
+    return tile_overlays(tiles)
 
 
 STAGE = Stage(
     "body",
-    version=10,
+    version=11,
     needs=("frames",),
     makes=(_BODY, _MOTION, _CAMERA, SCORES_NPZ, _OVERLAY),
     config=Config,

@@ -168,7 +168,7 @@ def select_poses(
     renders = validator.render(trainer, pose_warps[best])
     psnr_db, psnr_body_db = validator.mean_psnr_db(renders)
     metrics |= {"validation_psnr_db": psnr_db, "validation_psnr_body_db": psnr_body_db}
-    selected_motion = trainer.poses.corrected(motion) if candidates[best] else motion
+    selected_motion = trainer.poses.apply(motion) if candidates[best] else motion
     return selected_motion, metrics | {"poses_kept": float(candidates[best])}, renders
 
 

@@ -54,12 +54,12 @@ def fit_poses(avatar: TexturedAvatar, body: Body, motion: Motion, views: Sequenc
     schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: 0.5 * (1.0 + math.cos(math.pi * step / steps)))
     for _ in track(range(steps), "fit of held-out poses"):
         optimiser.zero_grad()
-        (PRIOR_WEIGHT * len(views) * correction.size()).backward()
+        (PRIOR_WEIGHT * len(views) * correction.mean_square_correction()).backward()
         for row, view in enumerate(views):
             _image_loss(renderer, correction.canonical_to_world(torch.tensor([row]))[0], view).backward()
         optimiser.step()
         schedule.step()
-    return correction.corrected(motion)
+    return correction.apply(motion)
 
 
 def _image_loss(

@@ -1,8 +1,10 @@
-"""The parametric body, one person's body, and its motion.
+"""The parametric body model, the body of one person, and its motion.
 
-`ParametricBody` turns shape parameters into an A-pose body. A fit freezes one shape into a `Body`, whose A-pose is the
-bind pose from there on, and a `Motion`, one pose a frame. Joints carry the names that Mixamo, Ready Player Me and
-Unity's humanoid mapping use, and identity rest orientations, so a pose here is a glTF pose.
+`ParametricBody` maps shape parameters to a body in an A-pose. A fit fixes one shape: `Body`, whose A-pose is the bind
+pose, and `Motion`, one pose per frame. Joints have the names of Mixamo, which Ready Player Me and Unity's humanoid
+mapping use as well, and identity rest orientations, so that a pose here is a glTF pose.
+
+Dimensions: v vertices, f faces, j joints, n frames, p shape parameters.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from pipeline.geometry.skinning import forward_kinematics, skinning_transforms
 
 @dataclass(frozen=True)
 class Body:
-    """One person: A-pose surface and skeleton, canonical frame (+Y up, facing +Z, metres, lowest point at y = 0)."""
+    """The body of one person in the A-pose: canonical frame (+Y up, facing +Z, metres, lowest point at y = 0)."""
 
     joint_names: tuple[str, ...]
     parents: Int[np.ndarray, "j"]
@@ -35,21 +37,28 @@ class Body:
     shape: dict[str, float]
 
     def mesh(self) -> Mesh:
-        """The A-pose surface."""
+        """Return the A-pose surface."""
         return Mesh(self.vertices, self.faces)
 
     def joint(self, name: str) -> int:
-        """Index of a joint by name; ValueError when there is none."""
+        """Return the index of a joint.
+
+        Raises:
+            ValueError: there is no joint of this name.
+        """
         return self.joint_names.index(name)
 
     def height_m(self) -> float:
-        """Height of the A-pose, sole to crown."""
+        """Return the height of the A-pose, from sole to crown."""
         return float(np.ptp(self.vertices[:, 1]))
 
 
 @dataclass(frozen=True)
 class Motion:
-    """One pose a frame: local rotations (identity = A-pose) and the world position of the root joint."""
+    """A pose in each frame: local rotations (identity: A-pose) and the world position of the root joint.
+
+    frame_index: in the recording. time_s: since the first frame of the recording.
+    """
 
     frame_index: Int[np.ndarray, "n"]
     time_s: Float[np.ndarray, "n"]
@@ -57,13 +66,13 @@ class Motion:
     root_translation_m: Float[np.ndarray, "n 3"]
 
     def select(self, rows: np.ndarray) -> Motion:
-        """The motion at some rows only (index or mask)."""
+        """Return the motion at selected rows (indices or mask)."""
         return Motion(
             self.frame_index[rows], self.time_s[rows], self.rotations_wxyz[rows], self.root_translation_m[rows]
         )
 
     def with_pose(self, rotations_wxyz: np.ndarray, root_translation_m: np.ndarray) -> Motion:
-        """The same frames in other poses."""
+        """Return the same frames with other poses."""
         return replace(
             self,
             rotations_wxyz=np.asarray(rotations_wxyz, dtype=np.float32),
@@ -72,7 +81,7 @@ class Motion:
 
 
 def canonical_to_world(body: Body, motion: Motion) -> Float[Tensor, "n j 4 4"]:
-    """Skinning matrices of every frame."""
+    """Return the skinning matrices of every frame."""
     joints_m = torch.as_tensor(body.joints_m)
     joint_to_world = forward_kinematics(
         quaternion_to_matrix(torch.as_tensor(motion.rotations_wxyz)),
@@ -98,7 +107,7 @@ PHENOTYPE_DEFAULTS = {
 }
 """Anny's phenotypes, each in [0, 1].
 
-Gender 0 is male; age 2/3 is a young adult (its anchors: 0 baby, 1/3 child, 2/3 young, 1 old).
+Gender 0 is male. Age 2/3 is a young adult (0 baby, 1/3 child, 2/3 young, 1 old).
 """
 
 LOCAL_CHANGES = {
@@ -129,13 +138,13 @@ LOCAL_CHANGES = {
     "foot-size": ("l-foot-scale-incr", "r-foot-scale-incr"),
     "hand-size": ("l-hand-scale-incr", "r-hand-scale-incr"),
 }
-"""Symmetric deviations from the phenotypes, each in [-1, 1] with default 0, and the names that anny has for them."""
+"""Symmetric changes of body parts, each in [-1, 1] with default 0, and their names in Anny."""
 
 SCALE = "scale"
-"""Uniform enlargement: stature alone, where the phenotype `height` changes the proportions too."""
+"""Uniform scale of the body; the phenotype `height` changes the proportions as well."""
 
 SHAPE_DEFAULTS = {**PHENOTYPE_DEFAULTS, **dict.fromkeys(LOCAL_CHANGES, 0.0), SCALE: 1.0}
-"""Every number of a shape with its default."""
+"""Shape parameters with their defaults."""
 
 ANNY_LANDMARKS_M = {
     "nose": (0.000, 1.703, 0.141),
@@ -160,15 +169,16 @@ ANNY_LANDMARKS_M = {
     "hand_index": (0.535, 1.077, 0.284),
     "hand_pinky": (0.559, 1.048, 0.230),
 }
-"""Where the left and central landmarks of `fit_landmarks.LANDMARKS` lie on the A-pose of the default shape."""
+"""Positions of the left and central landmarks (`landmark_regressor.LANDMARKS`) on the A-pose of the default shape."""
 
 
 @runtime_checkable
 class ParametricBody(Protocol):
-    """What a body model must offer to be fitted: `AnnyBody` here, `SmplBody` in `smpl.py`.
+    """Interface of a body model that can be fitted: `AnnyBody`, and `SmplBody` in `pipeline.body.smpl`.
 
-    Its joints have Mixamo's names, at least `fit_model.ACTIVE_JOINTS`. `landmark_positions_m` is where the left and
-    central landmarks (`fit_landmarks.LANDMARKS`, by name) lie on the A-pose of the default shape.
+    joint_names: Mixamo's names, at least `linear_body.ACTIVE_JOINTS`.
+    landmark_positions_m: positions of the left and central landmarks (`landmark_regressor.LANDMARKS`, by name) on the
+        A-pose of the default shape.
     """
 
     shape_names: tuple[str, ...]
@@ -179,19 +189,19 @@ class ParametricBody(Protocol):
     skin_weights: np.ndarray
     landmark_positions_m: Mapping[str, tuple[float, float, float]]
 
-    def rest(self, shape: Tensor) -> tuple[Tensor, Tensor]:
-        """A-pose vertices (v, 3) and joints (j, 3) of a shape, metres."""
+    def rest_pose(self, shape: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the A-pose vertices (v, 3) and joints (j, 3) of a shape, metres."""
         ...
 
-    def body(self, shape: Tensor) -> Body:
-        """The body of one shape, frozen."""
+    def at_shape(self, shape: Tensor) -> Body:
+        """Return the body of one shape."""
         ...
 
 
 def body_at_shape(model: ParametricBody, shape: Float[Tensor, "p"]) -> Body:
-    """One person's body: a model at one shape."""
+    """Return the body of one person: a model at one shape."""
     with torch.no_grad():
-        vertices, joints_m = model.rest(shape)
+        vertices, joints_m = model.rest_pose(shape)
     return Body(
         joint_names=model.joint_names,
         parents=model.parents,
@@ -204,14 +214,14 @@ def body_at_shape(model: ParametricBody, shape: Float[Tensor, "p"]) -> Body:
 
 
 class AnnyBody:
-    """Anny (Apache-2.0 code, CC0 data) behind the interface that the fit needs, with the 52-joint Mixamo rig.
+    """Anny (Apache-2.0 code, CC0 data) with the 52-joint Mixamo rig as a `ParametricBody`.
 
-    Anny's frame is +Z up, facing -Y; here everything is turned to +Y up, facing +Z. Its rest pose is an A-pose.
-    The first construction on a machine builds a cache of up to a minute.
+    Anny's frame (+Z up, facing -Y) is rotated to +Y up, facing +Z. Its rest pose is an A-pose. The first construction
+    on a machine builds a cache, which takes up to a minute.
     """
 
     def __init__(self) -> None:
-        import anny  # here, because loading it costs seconds that `--status` should not pay
+        import anny  # not at the top: the import takes seconds, which `--status` does not need
 
         changes = [name for names in LOCAL_CHANGES.values() for name in names]
         model = anny.Anny(rig="mixamo", phenotypes="all", skinning_method="lbs", local_changes=changes)
@@ -233,8 +243,11 @@ class AnnyBody:
         np.add.at(dense, (np.arange(len(indices))[:, None], indices), self._model.vertex_bone_weights.numpy())
         return dense / dense.sum(axis=1, keepdims=True)
 
-    def rest(self, shape: Float[Tensor, "p"]) -> tuple[Float[Tensor, "v 3"], Float[Tensor, "j 3"]]:
-        """A-pose vertices and joints of a shape (ordered as `shape_names`), canonical frame, differentiable."""
+    def rest_pose(self, shape: Float[Tensor, "p"]) -> tuple[Float[Tensor, "v 3"], Float[Tensor, "j 3"]]:
+        """Return the A-pose vertices and joints of a shape (m, canonical frame), differentiable.
+
+        shape: ordered as `shape_names`.
+        """
         values = {name: shape[i : i + 1] for i, name in enumerate(self.shape_names)}
         coefficients = self._model.get_phenotype_blendshape_coefficients(
             **{name: values[name] for name in PHENOTYPE_DEFAULTS},
@@ -244,17 +257,17 @@ class AnnyBody:
         heads = self._model.template_bone_heads + torch.einsum(
             "k,kjc->jc", coefficients[0], self._model.bone_heads_blendshapes
         )
-        turn = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-        vertices, joints_m = vertices @ turn.T, heads @ turn.T
+        to_y_up = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+        vertices, joints_m = vertices @ to_y_up.T, heads @ to_y_up.T
         origin = torch.stack([joints_m[0, 0], vertices[:, 1].min(), joints_m[0, 2]])
         return (vertices - origin) * values[SCALE], (joints_m - origin) * values[SCALE]
 
-    def body(self, shape: Float[Tensor, "p"]) -> Body:
-        """Freeze a shape into one person's body."""
+    def at_shape(self, shape: Float[Tensor, "p"]) -> Body:
+        """Return the body of one shape."""
         return body_at_shape(self, shape)
 
 
 @lru_cache(maxsize=1)
 def load_anny() -> AnnyBody:
-    """The default parametric body, loaded once a process."""
+    """Return the built-in body model, loaded once per process."""
     return AnnyBody()

@@ -1,8 +1,10 @@
-"""The artifacts of the body stage: body, motion and camera as npz files, one writer and one reader each."""
+"""Artifacts of the body stage: body, motion, camera and frame scores, with one writer and one reader each."""
 
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from pipeline.body.body import Body, Motion
 from pipeline.core.errors import UserError
@@ -11,7 +13,7 @@ from pipeline.io.npz import load_npz, save_npz
 
 
 def save_body(path: Path, body: Body) -> None:
-    """Write one person's body; `load_body` is the inverse."""
+    """Write the body of one person; `load_body` is the inverse."""
     save_npz(
         path,
         {
@@ -28,7 +30,11 @@ def save_body(path: Path, body: Body) -> None:
 
 
 def load_body(path: Path) -> Body:
-    """Read what `save_body` wrote."""
+    """Read a body written by `save_body`.
+
+    Raises:
+        UserError: the file is missing or not a readable npz.
+    """
     arrays = load_npz(path)
     names = [str(name) for name in arrays["shape_names"]]
     return Body(
@@ -56,18 +62,55 @@ def save_motion(path: Path, motion: Motion) -> None:
 
 
 def load_motion(path: Path) -> Motion:
-    """Read what `save_motion` wrote.
+    """Read a motion written by `save_motion`.
 
     Raises:
-        UserError: no readable npz, or a frame whose pose holds a number that is not finite.
+        UserError: the file is missing or not a readable npz, or a pose is not finite.
     """
     arrays = load_npz(path)
     motion = Motion(arrays["frame_index"], arrays["time_s"], arrays["rotations_wxyz"], arrays["root_translation_m"])
     is_finite = np.isfinite(motion.rotations_wxyz).all((1, 2)) & np.isfinite(motion.root_translation_m).all(1)
     if not is_finite.all():
         frames = ", ".join(map(str, motion.frame_index[~is_finite]))
-        raise UserError(f"{path}: the poses of frames {frames} are not finite; run the stage that writes it again")
+        raise UserError(f"{path}: the poses of frames {frames} are not finite; run the stage that wrote it again")
     return motion
+
+
+@dataclass(frozen=True)
+class FrameScores:
+    """Quality of the fit in each frame.
+
+    silhouette_iou: of body and mask, 0 to 1; nan without a mask.
+    landmark_error_px: median reprojection error; nan without landmarks.
+    left_right_swapped: whether swapped landmarks of any body part were corrected.
+    residual_blob_share: fraction of the mask in its largest part away from the body; nan without a mask.
+    usable: whether later stages may train on the frame.
+    """
+
+    frame_index: Int[np.ndarray, "n"]
+    silhouette_iou: Float[np.ndarray, "n"]
+    landmark_error_px: Float[np.ndarray, "n"]
+    left_right_swapped: Bool[np.ndarray, "n"]
+    residual_blob_share: Float[np.ndarray, "n"]
+    usable: Bool[np.ndarray, "n"]
+
+
+def save_scores(path: Path, scores: FrameScores) -> None:
+    """Write the scores of the frames; `load_scores` is the inverse."""
+    save_npz(path, {field.name: getattr(scores, field.name) for field in fields(scores)})
+
+
+def load_scores(path: Path) -> FrameScores:
+    """Read scores written by `save_scores`.
+
+    Raises:
+        UserError: the file is missing or not a readable npz, or an older version wrote it.
+    """
+    arrays = load_npz(path)
+    missing = [field.name for field in fields(FrameScores) if field.name not in arrays]
+    if missing:
+        raise UserError(f"{path} has no `{missing[0]}`: an older version wrote it; run `python -m stages.body` again")
+    return FrameScores(**{field.name: arrays[field.name] for field in fields(FrameScores)})
 
 
 def save_camera(path: Path, camera: Camera) -> None:
@@ -76,5 +119,9 @@ def save_camera(path: Path, camera: Camera) -> None:
 
 
 def load_camera(path: Path) -> Camera:
-    """Read what `save_camera` wrote."""
+    """Read a camera written by `save_camera`.
+
+    Raises:
+        UserError: the file is missing or not a readable npz.
+    """
     return Camera.from_arrays(load_npz(path))

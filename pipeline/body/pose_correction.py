@@ -1,4 +1,4 @@
-"""Small corrections of the fitted poses, learnt with the field and smooth in time."""
+"""Corrections of the fitted poses, optimised jointly with the field and smooth over time."""
 
 import numpy as np
 import torch
@@ -25,10 +25,9 @@ CORRECTED_JOINTS = (
 
 
 class PoseCorrection:
-    """An axis-angle vector for each main joint and a shift of the root, for each training frame, in time order.
+    """An axis-angle vector for each main joint and a translation of the root, for each training frame in time order.
 
-    A joint turns by its correction before its fitted local rotation is applied to what hangs on it: R = R_fit ·
-    exp(correction).
+    The correction of a joint is applied before its fitted local rotation: R = R_fit · exp(correction).
     """
 
     def __init__(self, body: Body, motion: Motion, device: torch.device = CPU) -> None:
@@ -51,7 +50,7 @@ class PoseCorrection:
         self._relative_interval = torch.tensor(relative_intervals, dtype=torch.float32, device=device)
 
     def canonical_to_world(self, rows: Tensor) -> Float[Tensor, "k j 4 4"]:
-        """Skinning matrices of some frames, differentiable in the corrections."""
+        """Return the skinning matrices of selected frames, differentiable in the corrections."""
         rotations = self._rotations[rows]
         turned = rotations[:, self.joints] @ axis_angle_to_matrix(self.rotation_rad[rows])
         posed = forward_kinematics(
@@ -65,26 +64,26 @@ class PoseCorrection:
     def canonical_to_posed(
         self, rows: Int[Tensor, "k"], world_to_posed: Float[Tensor, "k 4 4"]
     ) -> Float[Tensor, "k j 4 4"]:
-        """`canonical_to_world`, carried on by a rigid map of each frame."""
+        """Return `canonical_to_world` followed by a rigid transform of each frame."""
         if not runs_on_numba(self.rotation_rad):
             return world_to_posed[:, None] @ self.canonical_to_world(rows)
         fitted = FittedPoses(self._rotations[rows], self._root_m[rows], world_to_posed.contiguous())
         return skinning_matrices(self.rotation_rad[rows], self.shift_m[rows], self._skeleton, fitted)
 
     def temporal_roughness(self) -> Tensor:
-        """Mean squared change of the corrections from frame to frame (rad² and, in decimetres, m²)."""
+        """Return the mean squared change of the corrections between frames over the interval (rad² and dm²)."""
         if len(self.shift_m) < 2:
             return self.shift_m.new_zeros(())
         turn = self.rotation_rad.diff(dim=0).square().sum((1, 2)) / self._relative_interval
         shift = (10 * self.shift_m.diff(dim=0)).square().sum(1) / self._relative_interval
         return (turn + shift).mean()
 
-    def size(self) -> Tensor:
-        """Mean squared correction."""
+    def mean_square_correction(self) -> Tensor:
+        """Return the mean squared correction (rad² and dm²)."""
         return self.rotation_rad.square().sum((1, 2)).mean() + (10 * self.shift_m).square().sum(1).mean()
 
-    def corrected(self, motion: Motion) -> Motion:
-        """Another motion (any frames) with the corrections interpolated to its times, held at the ends."""
+    def apply(self, motion: Motion) -> Motion:
+        """Return a motion (any frames) with the corrections interpolated to its times; constant outside."""
         known, wanted = self.motion.time_s.astype(np.float64), motion.time_s.astype(np.float64)
         rotation = _interpolate(wanted, known, self.rotation_rad.detach().cpu().numpy().reshape(len(known), -1))
         shift = _interpolate(wanted, known, self.shift_m.detach().cpu().numpy())

@@ -1,12 +1,12 @@
-"""SMPL, SMPL-H and SMPL-X behind the interface of the parametric body, from arrays that the user brings.
+"""SMPL, SMPL-H and SMPL-X as a `ParametricBody`, from user-supplied arrays.
 
 Loper et al., "SMPL: a skinned multi-person linear model", 2015; Romero et al., "Embodied hands" (SMPL-H), 2017;
-Pavlakos et al., "Expressive body capture" (SMPL-X), 2019. Of a model its shape (betas), joint regressor and skin
-weights are used. Pose blend shapes are left out: an avatar is moved by plain linear blend skinning, as everywhere here.
+Pavlakos et al., "Expressive body capture" (SMPL-X), 2019. Shape (betas), joint regressor and skin weights are used.
+Pose blend shapes are not: avatars use plain linear blend skinning, as everywhere in this project.
 
-SMPL rests in a T-pose. The bind pose of this house is an A-pose, so upper arms and forearms are turned until they point
-where the built-in body's do (a bent elbow also tells about which axis it bends), and straight fingers are bent a
-little, in the direction in which a fist closes. That pose is the same for all shapes.
+SMPL rests in a T-pose, the bind pose here is an A-pose. Upper arms and forearms are rotated to the directions of the
+built-in body, and straight fingers are bent slightly in the direction of a fist, which defines their flexion axis. The
+rotations are the same for all shapes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,10 +37,10 @@ JOINT_NAMES = {
     52: (*_BODY_JOINTS, *_FINGER_JOINTS),
     55: (*_BODY_JOINTS, "Jaw", "LeftEye", "RightEye", *_FINGER_JOINTS),
 }
-"""Mixamo's names for the joints of SMPL, SMPL-H and SMPL-X, by how many there are, in the models' order."""
+"""Mixamo's names for the joints of SMPL, SMPL-H and SMPL-X, by the number of joints, in the order of the models."""
 
 ARM_DIRECTIONS = {"Arm": (0.662, -0.749, 0.024), "ForeArm": (0.515, -0.519, 0.682)}
-"""Where the built-in body's left upper arm and forearm point in the A-pose (unit vectors); mirrored for the right."""
+"""Unit vectors of left upper arm and forearm of the built-in body in the A-pose; mirrored for the right."""
 
 FINGER_BEND_RAD = 0.2
 
@@ -52,8 +52,8 @@ HEAD_LANDMARK_POSITIONS = {
     "ear": (0.639, 0.532, 0.556),
     "mouth": (0.198, 0.319, 0.884),
 }
-"""Landmarks of the face in the box of the head's vertices, as on the built-in body: share of the half width to the
-left, of the height from below, of the depth from behind. They hold for any numbering of the vertices."""
+"""Landmarks of the face in the bounding box of the head, as on the built-in body: fraction of the half width to the
+left, of the height from below, of the depth from behind. They do not depend on the order of the vertices."""
 
 JOINT_LANDMARK_OFFSETS_M = {
     "shoulder": (("LeftArm", (-0.012, 0.025, 0.002)),),
@@ -72,15 +72,15 @@ JOINT_LANDMARK_OFFSETS_M = {
     "hand_index": (("LeftHandIndex1", (-0.004, 0.002, -0.009)), ("LeftHand", (0.027, -0.044, 0.097))),
     "hand_pinky": (("LeftHandPinky1", (-0.008, 0.004, -0.003)), ("LeftHand", (0.05, -0.072, 0.043))),
 }
-"""The other landmarks: shift (m) from a joint, as on the built-in body; the first joint that the model has counts."""
+"""The other landmarks: offset (m) from a joint, as on the built-in body; the first joint that the model has is used."""
 
 HIP_HALF_WIDTH_M = 0.100
-"""The detector's hips lie this far from the middle, wherever inside the pelvis a model has its hip joints."""
+"""Distance of the detector's hip landmarks from the sagittal plane, independent of the hip joints of a model."""
 
 
 @dataclass(frozen=True)
 class SmplArrays:
-    """What is used of a model file: T-pose, +Y up, facing +Z, metres. b shape directions, one per beta."""
+    """Arrays of a model file: T-pose, +Y up, facing +Z, metres; b betas."""
 
     template_m: Float[np.ndarray, "v 3"]
     shape_directions_m: Float[np.ndarray, "v 3 b"]
@@ -91,15 +91,16 @@ class SmplArrays:
 
 
 class SmplBody:
-    """An SMPL-like model as a `ParametricBody`; its shape numbers are the betas, unit Gaussian about 0.
+    """An SMPL-like model as a `ParametricBody`; its shape parameters are the betas (unit Gaussian about 0).
 
-    Raises ValueError when it has neither 24, 52 nor 55 joints, or a parent does not come before its child.
+    Raises:
+        ValueError: the model does not have 24, 52 or 55 joints, or a parent does not precede its child.
     """
 
     def __init__(self, arrays: SmplArrays) -> None:
         count = len(arrays.parents)
         if count not in JOINT_NAMES:
-            raise ValueError(f"a model with {count} joints is none of SMPL (24), SMPL-H (52), SMPL-X (55)")
+            raise ValueError(f"{count} joints; SMPL has 24, SMPL-H 52, SMPL-X 55")
         self.joint_names: tuple[str, ...] = JOINT_NAMES[count]
         self.shape_names: tuple[str, ...] = tuple(f"beta_{i}" for i in range(arrays.shape_directions_m.shape[2]))
         self.shape_defaults: Float[Tensor, "p"] = torch.zeros(len(self.shape_names))
@@ -113,8 +114,8 @@ class SmplBody:
         self._to_a_pose = a_pose_rotations(self.joint_names, self.parents, self._joints)
         self.landmark_positions_m: Mapping[str, tuple[float, float, float]] = self._landmark_positions_m()
 
-    def rest(self, shape: Float[Tensor, "p"]) -> tuple[Float[Tensor, "v 3"], Float[Tensor, "j 3"]]:
-        """A-pose vertices and joints of some betas, canonical frame, differentiable."""
+    def rest_pose(self, shape: Float[Tensor, "p"]) -> tuple[Float[Tensor, "v 3"], Float[Tensor, "j 3"]]:
+        """Return the A-pose vertices and joints of a shape (betas), canonical frame, differentiable."""
         t_pose, t_pose_joints_m = (
             self._template + self._directions @ shape,
             self._joints + self._joint_directions @ shape,
@@ -128,12 +129,12 @@ class SmplBody:
         origin = torch.stack([joints_m[0, 0], vertices[:, 1].min(), joints_m[0, 2]])
         return vertices - origin, joints_m - origin
 
-    def body(self, shape: Float[Tensor, "p"]) -> Body:
-        """Freeze some betas into one person's body."""
+    def at_shape(self, shape: Float[Tensor, "p"]) -> Body:
+        """Return the body of one shape (betas)."""
         return body_at_shape(self, shape)
 
     def from_smpl_rotations(self, smpl_rotations: Float[Tensor, "n j 3 3"]) -> Float[Tensor, "n j 3 3"]:
-        """SMPL's local rotations (identity: T-pose) as this house's (identity: A-pose with joints along the axes).
+        """Convert SMPL's local rotations (identity: T-pose) to those of this project (identity: A-pose).
 
         With Q_j the world rotation of joint j in the A-pose: R_j = Q_parent · theta_j · Q_j^T.
         """
@@ -143,7 +144,7 @@ class SmplBody:
         return parent_rotation @ smpl_rotations @ bind.transpose(-1, -2)
 
     def accepts_smpl_poses(self, betas: int) -> bool:
-        """Whether this many betas, and poses, that were fitted with SMPL hold here: SMPL-X has other shapes."""
+        """Return whether poses and this number of betas, fitted with SMPL, are valid here; SMPL-X has other shapes."""
         return "Jaw" not in self.joint_names and len(self.shape_names) == betas
 
     def convert_smpl_poses(
@@ -153,10 +154,10 @@ class SmplBody:
         betas: Float[Tensor, "n b"],
         smpl_to_world: Float[Tensor, "n 4 4"],
     ) -> tuple[Float[Tensor, "n k 3 3"], Float[Tensor, "n 3"]]:
-        """SMPL's poses as this house's: local rotations of the first k joints, and where the root joint is (m).
+        """Convert SMPL poses to local rotations of the first k joints and world positions of the root joint (m).
 
-        SMPL turns about the pelvis where the regressor finds it, then adds `transl_m`. k is 24, or the 22 joints
-        that the other models share with SMPL.
+        SMPL rotates about the pelvis, which it regresses from the shape, then adds `transl_m`. k is 24, or the 22
+        joints that the other models share with SMPL.
         """
         shared_joint_count = len(axis_angle[0]) if len(self.joint_names) == len(axis_angle[0]) else len(_BODY_JOINTS)
         local = torch.eye(3).repeat(len(axis_angle), len(self.joint_names), 1, 1)
@@ -167,34 +168,34 @@ class SmplBody:
         return rotations, (smpl_to_world[:, :3, :3] @ pelvis_m[..., None]).squeeze(-1) + smpl_to_world[:, :3, 3]
 
     def _landmark_positions_m(self) -> dict[str, tuple[float, float, float]]:
-        """Where the left and central landmarks lie on the body of the default shape, metres."""
-        vertices, joints_m = (rest.double().numpy() for rest in self.rest(self.shape_defaults))
+        """Return the positions of the left and central landmarks on the body of the default shape, metres."""
+        vertices, joints_m = (rest.double().numpy() for rest in self.rest_pose(self.shape_defaults))
         head = vertices[self.skin_weights[:, self.joint_names.index("Head")] > 0.5]
         low, size = head.min(axis=0), np.ptp(head, axis=0)
-        places = {
-            name: (0.5 * size[0] * across, low[1] + size[1] * up, low[2] + size[2] * forth)
-            for name, (across, up, forth) in HEAD_LANDMARK_POSITIONS.items()
+        positions_m = {
+            name: (0.5 * size[0] * left, low[1] + size[1] * up, low[2] + size[2] * forward)
+            for name, (left, up, forward) in HEAD_LANDMARK_POSITIONS.items()
         }
         for name, choices in JOINT_LANDMARK_OFFSETS_M.items():
-            joint, shift = next(choice for choice in choices if choice[0] in self.joint_names)
-            x, y, z = joints_m[self.joint_names.index(joint)] + shift
-            places[name] = (HIP_HALF_WIDTH_M if name == "hip" else x, y, z)
-        return {name: (float(x), float(y), float(z)) for name, (x, y, z) in places.items()}
+            joint, offset_m = next(choice for choice in choices if choice[0] in self.joint_names)
+            x, y, z = joints_m[self.joint_names.index(joint)] + offset_m
+            positions_m[name] = (HIP_HALF_WIDTH_M if name == "hip" else x, y, z)
+        return {name: (float(x), float(y), float(z)) for name, (x, y, z) in positions_m.items()}
 
 
 def a_pose_rotations(
     joint_names: Sequence[str], parents: Int[np.ndarray, "j"], t_pose_joints_m: Float[Tensor, "j 3"]
 ) -> Float[Tensor, "j 3 3"]:
-    """Local rotations that take SMPL's T-pose to the A-pose (module docstring)."""
+    """Return the local rotations from SMPL's T-pose to the A-pose (module docstring)."""
     local = torch.eye(3).repeat(len(joint_names), 1, 1)
     for side, sign in (("Left", 1.0), ("Right", -1.0)):
         mirror, parent_rotation = torch.tensor([sign, 1.0, 1.0]), torch.eye(3)
         for name, child in (("Arm", "ForeArm"), ("ForeArm", "Hand")):
             joint, end = joint_names.index(side + name), joint_names.index(side + child)
             bone = parent_rotation @ (t_pose_joints_m[end] - t_pose_joints_m[joint])
-            turned = rotation_between(bone, torch.tensor(ARM_DIRECTIONS[name]) * mirror) @ parent_rotation
-            local[joint] = parent_rotation.T @ turned
-            parent_rotation = turned
+            a_pose = rotation_between(bone, torch.tensor(ARM_DIRECTIONS[name]) * mirror) @ parent_rotation
+            local[joint] = parent_rotation.T @ a_pose
+            parent_rotation = a_pose
         for joint, name in enumerate(joint_names):
             if name in _FINGER_JOINTS and name.startswith(side) and "Thumb" not in name:
                 local[joint] = axis_angle_to_matrix(torch.tensor([0.0, 0.0, -sign * FINGER_BEND_RAD]))

@@ -1,14 +1,13 @@
-"""SMPL, SMPL-H and SMPL-X model files as their owners download them: `.npz`, or `.pkl` read without running anything.
+"""Reader of SMPL, SMPL-H and SMPL-X model files: `.npz`, or `.pkl` read without executing code.
 
     v_template     (v, 3) T-pose, metres
-    shapedirs      (v, 3, b) what one beta adds to it; the first ten are used
+    shapedirs      (v, 3, b) derivative with respect to the betas; the first ten are used
     J_regressor    (j, v) joints from vertices; dense, or a scipy sparse matrix in a pickle
     kintree_table  (2, j) parents in the first row
     weights        (v, j) skin weights
     f              (t, 3) triangles
 
-In the pickles some arrays are chumpy objects. Those, and scipy's matrices, come back as inert records, of which only
-arrays are taken.
+Chumpy objects and scipy matrices in pickles are read as opaque objects, of which only arrays are used.
 """
 
 import zipfile
@@ -24,7 +23,7 @@ from pipeline.core.errors import UserError
 from pipeline.io.safe_pickle import OpaqueObject, load_pickle
 
 N_BETAS = 10
-"""Shape directions that are used: what all releases have, and what most fits of others give."""
+"""Number of betas used: all releases have them, and most supplied fits use them."""
 
 REQUIRED_KEYS = ("v_template", "shapedirs", "J_regressor", "kintree_table", "weights", "f")
 _SPARSE = {"csc_matrix": csc_matrix, "csr_matrix": csr_matrix}
@@ -36,35 +35,36 @@ _RECORDS = (
 
 
 def load_smpl(path: Path) -> SmplBody:
-    """The body model in a file.
+    """Read a body model.
 
     Raises:
-        UserError: it is missing, cannot be read, or is no SMPL, SMPL-H or SMPL-X model.
+        UserError: the file is missing, cannot be read, or is not an SMPL, SMPL-H or SMPL-X model.
     """
     values = _read(path)
     missing = [key for key in REQUIRED_KEYS if key not in values]
     if missing:
-        raise UserError(f"{path} has no `{missing[0]}`; give an SMPL, SMPL-H or SMPL-X model as .npz or .pkl")
+        raise UserError(f"{path} has no `{missing[0]}`; supply an SMPL, SMPL-H or SMPL-X model as .npz or .pkl")
     try:
         arrays = _validate_arrays({key: plain_array(values[key]) for key in REQUIRED_KEYS})
         return SmplBody(arrays)
     except (ValueError, TypeError, KeyError) as error:
-        raise UserError(f"{path} is no SMPL, SMPL-H or SMPL-X model ({error}); download it again") from error
+        raise UserError(f"{path} is not an SMPL, SMPL-H or SMPL-X model ({error}); download it again") from error
 
 
 def plain_array(value: object) -> np.ndarray:
-    """An array out of an array or the record of one: a chumpy variable, its selection, or a sparse matrix.
+    """Return the array in an array, a chumpy variable or selection, or a sparse matrix.
 
-    Raises ValueError for anything else.
+    Raises:
+        ValueError: it is something else.
     """
     if isinstance(value, np.ndarray) and value.dtype != object:
         return value
     if not isinstance(value, OpaqueObject) or not isinstance(value.state, dict):
-        raise ValueError(f"a {type(value).__name__} in place of an array")
+        raise ValueError(f"a {type(value).__name__} instead of an array")
     kind, state = type(value).__name__, value.state
     if kind == "Ch":
         return plain_array(state["x"])
-    if kind == "Select":  # chumpy: some elements of another array, counted along its rows
+    if kind == "Select":  # chumpy: selected elements of another array, indexed in row-major order
         return plain_array(state["a"]).ravel()[plain_array(state["idxs"])].reshape(state["preferred_shape"])
     return _dense(kind, state)
 
@@ -80,32 +80,36 @@ def _read(path: Path) -> dict[str, Any]:
     if path.suffix == ".pkl":
         values = load_pickle(path, _RECORDS)
         if not isinstance(values, dict):
-            raise UserError(f"{path} holds a {type(values).__name__}, no model; give an SMPL model as .npz or .pkl")
+            raise UserError(f"{path} holds a {type(values).__name__}, not a model; supply an SMPL model file")
         return values
     try:
         with np.load(path, allow_pickle=False) as archive:
             return {key: archive[key] for key in REQUIRED_KEYS if key in archive.files}
     except (OSError, ValueError, AttributeError, zipfile.BadZipFile) as error:
-        raise UserError(f"{path} cannot be read as .npz or .pkl ({error}); give an SMPL model file") from error
+        raise UserError(f"{path} cannot be read as .npz or .pkl ({error}); supply an SMPL model file") from error
 
 
 def _validate_arrays(arrays: dict[str, np.ndarray]) -> SmplArrays:
-    """The arrays with shapes that fit each other; ValueError when they do not."""
+    """Return the arrays with checked shapes.
+
+    Raises:
+        ValueError: shapes do not match.
+    """
     regressor, template = arrays["J_regressor"], arrays["v_template"]
     joints, vertices = regressor.shape
     for name, shape in (("v_template", (vertices, 3)), ("weights", (vertices, joints)), ("kintree_table", (2, joints))):
         if arrays[name].shape != shape:
-            raise ValueError(f"`{name}` has shape {arrays[name].shape}, needed {shape}")
+            raise ValueError(f"`{name}` has shape {arrays[name].shape}, expected {shape}")
     directions = arrays["shapedirs"]
     if directions.ndim != 3 or directions.shape[:2] != (vertices, 3):
-        raise ValueError(f"`shapedirs` has shape {directions.shape}, needed ({vertices}, 3, betas)")
+        raise ValueError(f"`shapedirs` has shape {directions.shape}, expected ({vertices}, 3, betas)")
     faces = arrays["f"].astype(np.int64)
     if faces.ndim != 2 or faces.shape[1] != 3 or faces.min() < 0 or faces.max() >= vertices:
-        raise ValueError(f"`f` of shape {faces.shape} are no triangles of {vertices} vertices")
+        raise ValueError(f"`f` of shape {faces.shape} does not hold triangles of {vertices} vertices")
     parents = arrays["kintree_table"][0].astype(np.int64)
     parents[0] = -1  # the files have 2^32 - 1
     if ((parents[1:] < 0) | (parents[1:] >= np.arange(1, joints))).any():
-        raise ValueError("`kintree_table` has a joint before its parent")
+        raise ValueError("a joint in `kintree_table` precedes its parent")
     return SmplArrays(
         template_m=template.astype(np.float64),
         shape_directions_m=directions[:, :, :N_BETAS].astype(np.float64),

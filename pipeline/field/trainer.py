@@ -162,7 +162,7 @@ class Trainer:
         settings = self.config.settings
         return (
             settings.pose_smoothness_weight * self.poses.temporal_roughness()
-            + settings.pose_l2_weight * self.poses.size()
+            + settings.pose_l2_weight * self.poses.mean_square_correction()
         )
 
     def _record_results(self, results: list[StepResult]) -> None:

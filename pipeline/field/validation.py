@@ -52,7 +52,7 @@ class Validator:
 
         refined: add the pose corrections of the training frames, interpolated in time.
         """
-        motion = trainer.poses.corrected(self.motion) if refined else self.motion
+        motion = trainer.poses.apply(self.motion) if refined else self.motion
         scene = trainer.scene
         return build_pose_warps(trainer.field, scene.body, scene.skin, canonical_to_world(scene.body, motion))
 

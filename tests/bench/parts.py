@@ -39,7 +39,7 @@ TIMED_FUNCTIONS: tuple[tuple[str, Any, str], ...] = (
     ("render_rays", trainer_module, "render_rays"),
     ("losses", trainer_module, "field_losses"),
     ("losses", PoseCorrection, "temporal_roughness"),
-    ("losses", PoseCorrection, "size"),
+    ("losses", PoseCorrection, "mean_square_correction"),
     ("network_backward", _RadianceMlp, "backward"),
     ("network_backward", _RenderRays, "backward"),
     ("table_backward", hashgrid_cpu, "add_table_gradient"),

@@ -1,4 +1,4 @@
-"""A person with known shape, motion and camera, and what a detector would see of them."""
+"""Synthetic recordings: a person with known shape, motion and camera, and simulated detections."""
 
 from dataclasses import dataclass
 
@@ -8,8 +8,6 @@ import torch
 from pipeline.body.body import ParametricBody
 from pipeline.body.fit.camera_parameters import INTRINSICS_COUNT
 from pipeline.body.fit.diagnostics import make_observations
-from pipeline.body.fit.energy import FitState, Observations
-from pipeline.body.fit.fit import FitResult
 from pipeline.body.fit.landmark_regressor import (
     HAND_LANDMARKS,
     LANDMARK_OFFSET_COUNT,
@@ -18,8 +16,11 @@ from pipeline.body.fit.landmark_regressor import (
     landmark_regressor,
     mirror_permutation,
 )
-from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody, linearise_body, pose_points, pose_skeleton
+from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody, linearise_body
+from pipeline.body.fit.posed_points import pose_points, pose_skeleton
+from pipeline.body.fit.result import FitResult
 from pipeline.body.fit.silhouette_icp import MaskWindow, crop_mask_window, posed_vertices
+from pipeline.body.fit.state import FitState, Observations
 from pipeline.capture.hand_detector import N_HAND_LANDMARKS, HandLandmarks
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.rotation import axis_angle_to_matrix, quaternion_to_matrix
@@ -29,7 +30,7 @@ from pipeline.kernels.raster import rasterize
 
 @dataclass(frozen=True)
 class SyntheticRecording:
-    """The truth (`state`, `model`, `camera`) and the detector's view of it."""
+    """Ground truth (`state`, `model`, `camera`) and simulated detections."""
 
     model: LinearBody
     state: FitState
@@ -45,7 +46,7 @@ class SyntheticRecording:
         )
 
     def joints_m(self) -> torch.Tensor:
-        return pose_skeleton(self.model, self.state.rotations, self.state.root_m).position
+        return pose_skeleton(self.model, self.state.rotations, self.state.root_m).position_m
 
     def masks(self) -> list[np.ndarray]:
         masks = []
@@ -69,10 +70,10 @@ def synthetic_recording(
     wrists_rad: float = 0.0,
     seed: int = 0,
 ) -> SyntheticRecording:
-    """A person who turns on the spot at 3 m with swinging arms and legs, seen at 256 x 320 pixels, 10 frames a second.
+    """Return a person who turns on the spot at 3 m and swings arms and legs: 256 x 320 pixels, 10 frames per second.
 
-    noise_m: standard deviation of landmarks, at the person's depth; hands are seen without noise.
-    wrists_rad: how far the hands are turned about each axis.
+    noise_m: standard deviation of the landmarks at the depth of the person; hands have no noise.
+    wrists_rad: rotation of the hands about each axis.
     """
     values = body.shape_defaults.clone()
     for name, value in (shape or {}).items():
@@ -101,10 +102,10 @@ def simulate_detections(
     noise_m: float = 0.0,
     seed: int = 0,
 ) -> SyntheticRecording:
-    """What a detector sees of a motion of the body `model`; noise as in `synthetic_recording`."""
+    """Return the detections of a motion of the body `model`; noise as in `synthetic_recording`."""
     regressor = landmark_regressor(linearise_body(body, body.shape_defaults))
     skeleton = pose_skeleton(model, state.rotations, state.root_m)
-    world, _ = pose_points(model, skeleton, regressor.points(model, state.landmark_offsets_m))
+    world = pose_points(model, skeleton, regressor.points(model, state.landmark_offsets_m)).world_m
     hands = _hands(world[:, POSE_LANDMARK_COUNT:], camera)
     world = world[:, :POSE_LANDMARK_COUNT]
     pixels, depth_m = project(world, camera)
@@ -117,14 +118,14 @@ def simulate_detections(
 
 
 def swap_left_right(scene: SyntheticRecording, rows: slice | list[int]) -> None:
-    """In these frames the detector takes the person for one who faces the other way."""
+    """Swap left and right of the landmarks in some frames and mirror their depths, as the detector does."""
     order = mirror_permutation(LEFT_RIGHT_PAIRS)[:POSE_LANDMARK_COUNT]
     scene.landmarks_px[rows] = scene.landmarks_px[rows][:, order]
     scene.landmarks_world_m[rows] = scene.landmarks_world_m[rows][:, order] * [1.0, 1.0, -1.0]
 
 
 def _hands(points_m: torch.Tensor, camera: Camera) -> HandLandmarks:
-    """Sightings of the points of the hands that a fit looks at; the others, which it ignores, lie on one of them."""
+    """Return hand detections; landmarks that the fit ignores are copies of others."""
     copied = np.zeros(N_HAND_LANDMARKS, dtype=np.int64)
     copied[list(HAND_LANDMARKS)] = np.arange(len(HAND_LANDMARKS))
     positions_m = points_m.reshape(len(points_m), -1, 2, 3).transpose(1, 2)[:, :, copied]
@@ -148,7 +149,7 @@ def _synthetic_rotations(phase: torch.Tensor, turn_rad: float, wrists_rad: float
 
 
 def fitted_joint_to_world(result: FitResult, scene: SyntheticRecording) -> torch.Tensor:
-    """Where the active joints are that a fit found, and how they are turned: (n, j, 4, 4)."""
+    """Return the world transforms of the fitted active joints: (n, j, 4, 4)."""
     joint_to_world = forward_kinematics(
         quaternion_to_matrix(torch.tensor(result.rotations_wxyz)),
         torch.tensor(result.root_translation_m),
@@ -159,11 +160,11 @@ def fitted_joint_to_world(result: FitResult, scene: SyntheticRecording) -> torch
 
 
 def fitted_joints_m(result: FitResult, scene: SyntheticRecording) -> torch.Tensor:
-    """World positions of the active joints that a fit found."""
+    """Return the world positions of the fitted active joints."""
     return fitted_joint_to_world(result, scene)[..., :3, 3]
 
 
 def joint_errors_m(found_m: torch.Tensor, true_m: torch.Tensor) -> tuple[float, float]:
-    """Mean distance of joints with the root joint aligned, and as they are."""
+    """Return the mean distance of joints, with the root joint aligned and absolute."""
     aligned = (found_m - found_m[:, :1]) - (true_m - true_m[:, :1])
     return float(aligned.norm(dim=-1).mean()), float((found_m - true_m).norm(dim=-1).mean())

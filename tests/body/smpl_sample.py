@@ -57,7 +57,7 @@ def made_up_arrays(joint_count: int) -> SmplArrays:
 
 def _t_pose(anny: AnnyBody, shape: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
     """The built-in body with its arms stretched out sideways."""
-    vertices, joints = anny.rest(shape)
+    vertices, joints = anny.rest_pose(shape)
     rotations = torch.eye(3).repeat(1, len(joints), 1, 1)
     for side, sign in (("Left", 1.0), ("Right", -1.0)):
         above = torch.eye(3)

@@ -16,7 +16,7 @@ def parametric() -> AnnyBody:
 
 @pytest.fixture(scope="module")
 def body(parametric: AnnyBody) -> Body:
-    return parametric.body(parametric.shape_defaults)
+    return parametric.at_shape(parametric.shape_defaults)
 
 
 def still(body: Body) -> Motion:
@@ -60,7 +60,7 @@ def test_bending_one_knee_moves_that_shin_only(body: Body) -> None:
 
 def test_shape_is_differentiable_and_moves_what_it_names(parametric: AnnyBody) -> None:
     shape = parametric.shape_defaults.clone().requires_grad_()
-    vertices, _ = parametric.rest(shape)
+    vertices, _ = parametric.rest_pose(shape)
     vertices[:, 1].max().backward()
     assert shape.grad is not None
     assert torch.isfinite(shape.grad).all()
@@ -71,13 +71,13 @@ def test_shape_is_differentiable_and_moves_what_it_names(parametric: AnnyBody) -
 def test_a_local_change_moves_the_surface(parametric: AnnyBody, body: Body, name: str) -> None:
     shape = parametric.shape_defaults.clone()
     shape[parametric.shape_names.index(name)] = 1.0
-    assert np.linalg.norm(parametric.body(shape).vertices - body.vertices, axis=1).max() > 0.005
+    assert np.linalg.norm(parametric.at_shape(shape).vertices - body.vertices, axis=1).max() > 0.005
 
 
 def test_scale_enlarges_flesh_and_bones_alike(parametric: AnnyBody, body: Body) -> None:
     shape = parametric.shape_defaults.clone()
     shape[parametric.shape_names.index(SCALE)] = 1.2
-    larger = parametric.body(shape)
+    larger = parametric.at_shape(shape)
     np.testing.assert_allclose(larger.vertices, 1.2 * body.vertices, atol=1e-5)
     np.testing.assert_allclose(larger.joints_m, 1.2 * body.joints_m, atol=1e-5)
 

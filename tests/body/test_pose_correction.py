@@ -10,7 +10,7 @@ from tests.field.scene import make_motion
 @pytest.fixture(scope="module")
 def body():
     anny = load_anny()
-    return anny.body(anny.shape_defaults)
+    return anny.at_shape(anny.shape_defaults)
 
 
 @pytest.fixture
@@ -18,33 +18,33 @@ def correction(body):
     return PoseCorrection(body, make_motion(body, 6).select(np.array([0, 2, 3, 5])))
 
 
-def test_no_correction_is_the_fitted_motion(body, correction):
+def test_zero_correction_keeps_the_fitted_motion(body, correction):
     rows = torch.tensor([0, 3])
     truth = canonical_to_world(body, correction.motion)[rows]
     torch.testing.assert_close(correction.canonical_to_world(rows), truth, atol=1e-5, rtol=0)
     assert float(correction.temporal_roughness().detach()) == 0
-    assert float(correction.size().detach()) == 0
+    assert float(correction.mean_square_correction().detach()) == 0
 
 
-def test_corrected_motion_is_what_was_learnt(body, correction):
+def test_applied_corrections_equal_the_optimised_ones(body, correction):
     with torch.no_grad():
         correction.rotation_rad.normal_(std=0.05)
         correction.shift_m.normal_(std=0.01)
-    again = canonical_to_world(body, correction.corrected(correction.motion))
-    learnt = correction.canonical_to_world(torch.arange(4)).detach()
-    torch.testing.assert_close(again, learnt, atol=1e-5, rtol=0)
+    again = canonical_to_world(body, correction.apply(correction.motion))
+    optimised = correction.canonical_to_world(torch.arange(4)).detach()
+    torch.testing.assert_close(again, optimised, atol=1e-5, rtol=0)
 
 
-def test_frames_between_get_the_mean_of_their_neighbours(body, correction):
+def test_corrections_are_interpolated(body, correction):
     with torch.no_grad():
         correction.shift_m[0, 0], correction.shift_m[1, 0] = 0.02, 0.04
     motion = make_motion(body, 6)
-    shift = correction.corrected(motion).root_translation_m - motion.root_translation_m
+    shift = correction.apply(motion).root_translation_m - motion.root_translation_m
     np.testing.assert_allclose(shift[:3, 0], [0.02, 0.03, 0.04], atol=1e-6)
     np.testing.assert_allclose(shift[5, 0], 0.0, atol=1e-6)
 
 
-def test_roughness_grows_with_jumps_and_shrinks_with_time_between(body, correction):
+def test_roughness_grows_with_jumps_and_falls_with_the_interval(body, correction):
     with torch.no_grad():
         correction.shift_m[2:] = 0.01
     near = float(correction.temporal_roughness().detach())

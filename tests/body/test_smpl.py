@@ -8,10 +8,11 @@ import pytest
 import torch
 
 from pipeline.body.body import Motion, ParametricBody, canonical_to_world, load_anny
-from pipeline.body.fit.fit import FitOptions, FitResult, fit_body
+from pipeline.body.fit.fit import FitOptions, fit_body
 from pipeline.body.fit.landmark_regressor import LANDMARKS
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS, RELAXED_CURL_RAD, finger_curl_rotations, relaxed_curls_rad
 from pipeline.body.fit.priors import shape_prior
+from pipeline.body.fit.result import FitResult
 from pipeline.body.smpl import ARM_DIRECTIONS, FINGER_BEND_RAD, JOINT_NAMES, SmplBody
 from pipeline.geometry.rotation import (
     axis_angle_to_matrix,
@@ -50,8 +51,8 @@ def test_names_are_those_of_the_built_in_body_and_face(model: SmplBody) -> None:
 def test_arms_hang_as_those_of_the_built_in_body() -> None:
     """The made-up model is the built-in body in a T-pose, so its A-pose must be that body's joints again."""
     anny, model = load_anny(), SmplBody(made_up_arrays(24))
-    expected = anny.body(anny.shape_defaults)
-    found = model.body(model.shape_defaults)
+    expected = anny.at_shape(anny.shape_defaults)
+    found = model.at_shape(model.shape_defaults)
     for name in ACTIVE_JOINTS:
         np.testing.assert_allclose(
             found.joints_m[found.joint(name)], expected.joints_m[expected.joint(name)], atol=0.005, err_msg=name
@@ -73,7 +74,7 @@ def test_landmarks_lie_where_they_lie_on_the_built_in_body(model: SmplBody) -> N
 def test_shape_is_linear_in_the_t_pose_and_differentiable(smpl: SmplBody) -> None:
     arrays = made_up_arrays(24)
     betas = torch.linspace(-1.0, 1.0, 10).requires_grad_()
-    vertices, joints = smpl.rest(betas)
+    vertices, joints = smpl.rest_pose(betas)
     t_pose = arrays.template_m + arrays.shape_directions_m @ betas.detach().numpy()
     head = np.flatnonzero(arrays.skin_weights[:, smpl.joint_names.index("Head")] > 0.999)
     moved = vertices[head].detach().numpy() - t_pose[head]  # above the neck the A-pose is the T-pose, moved as a whole
@@ -121,7 +122,7 @@ def test_a_pose_of_smpl_is_the_same_pose_here(smpl: SmplBody) -> None:
     expected_pose = forward_kinematics(theta, t_joints[None, 0], t_joints, smpl.parents)
     weights = torch.from_numpy(smpl.skin_weights)
     expected = linear_blend_skinning(t_vertices, weights, skinning_transforms(expected_pose, t_joints))
-    vertices, joints = smpl.rest(smpl.shape_defaults)
+    vertices, joints = smpl.rest_pose(smpl.shape_defaults)
     pose = forward_kinematics(smpl.from_smpl_rotations(theta), t_joints[None, 0], joints, smpl.parents)
     found = linear_blend_skinning(vertices, weights, skinning_transforms(pose, joints))
     assert torch.allclose(pose[..., :3, 3], expected_pose[..., :3, 3], atol=1e-5)
@@ -147,7 +148,7 @@ def test_converted_smpl_poses_match_smpl(count: int) -> None:
         theta[:22] = pose[frame, :22]
         _, expected = smpl_vertices(arrays, betas[frame], theta, transl[frame])
         expected = expected @ to_world[frame, :3, :3].T + to_world[frame, :3, 3]
-        joints_m = body.rest(torch.from_numpy(betas[frame]))[1]
+        joints_m = body.rest_pose(torch.from_numpy(betas[frame]))[1]
         local = torch.eye(3).repeat(1, count, 1, 1)
         local[0, : rotations.shape[1]] = rotations[frame]
         found = forward_kinematics(local, root_m[frame : frame + 1], joints_m, body.parents)[0, :22, :3, 3]
@@ -161,7 +162,7 @@ def test_converted_poses_of_the_real_data_set_match_smpl(shared_data: Path, smpl
         transl, betas = file["transl"][::20], np.repeat(file["betas"], len(pose), axis=0)
     here = torch.eye(4).repeat(len(pose), 1, 1)
     rotations, root_m = smpl.convert_smpl_poses(*map(torch.from_numpy, (pose, transl, betas)), here)
-    body = smpl.body(torch.from_numpy(betas[0]))
+    body = smpl.at_shape(torch.from_numpy(betas[0]))
     quaternions = matrix_to_quaternion(rotations).numpy()
     motion = Motion(np.arange(len(pose), dtype=np.int32), np.arange(len(pose)) / 25.0, quaternions, root_m.numpy())
     weights = torch.from_numpy(body.skin_weights)
@@ -216,8 +217,8 @@ def test_the_fit_finds_a_known_pose(fitted: tuple[SyntheticRecording, FitResult]
 def test_the_fit_finds_a_known_shape(fitted: tuple[SyntheticRecording, FitResult], smpl: SmplBody) -> None:
     """The surface is nearer to the true one than the mean body scaled to its stature would be, and within 1 cm."""
     scene, result = fitted
-    true = scene.model.vertices.numpy()
-    mean = smpl.body(smpl.shape_defaults).vertices
+    true = scene.model.vertices_m.numpy()
+    mean = smpl.at_shape(smpl.shape_defaults).vertices
     mean = mean * (np.ptp(true[:, 1]) / np.ptp(mean[:, 1]))
     error = np.linalg.norm(result.body.vertices - true, axis=1).mean()
     assert error < 0.010

@@ -44,7 +44,7 @@ def write_pickle(path, contents: dict, protocol: int = 2):
 def assert_same(found: SmplBody, joint_count: int) -> None:
     expected = SmplBody(made_up_arrays(joint_count))
     betas = torch.linspace(-1.0, 1.0, 10)
-    for mine, true in zip(found.rest(betas), expected.rest(betas), strict=True):
+    for mine, true in zip(found.rest_pose(betas), expected.rest_pose(betas), strict=True):
         assert torch.allclose(mine, true, atol=1e-6)
     assert np.array_equal(found.parents, expected.parents)
     assert np.array_equal(found.faces, expected.faces)
@@ -162,7 +162,7 @@ def test_our_shape_agrees_with_the_smplx_package(tmp_path) -> None:
     from pipeline.geometry.rotation import axis_angle_to_matrix
     from pipeline.geometry.skinning import forward_kinematics
 
-    joints = body.rest(betas)[1]
+    joints = body.rest_pose(betas)[1]
     ours = forward_kinematics(
         body.from_smpl_rotations(axis_angle_to_matrix(theta)), joints[None, 0], joints, body.parents
     )

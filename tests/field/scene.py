@@ -60,7 +60,7 @@ def paint(vertices: np.ndarray) -> np.ndarray:
 
 def painted_scene(frames: int, height_px: int, seed: int = 0, bend_rad: float = 0.08) -> PaintedScene:
     anny = load_anny()
-    body = anny.body(anny.shape_defaults)
+    body = anny.at_shape(anny.shape_defaults)
     motion = make_motion(body, frames, seed, bend_rad)
     focal = 1.4 * height_px
     camera = Camera(focal, focal, height_px / 2, height_px / 2, height_px, height_px)

@@ -19,7 +19,7 @@ MARGIN_M = 0.06
 @pytest.fixture(scope="module")
 def body():
     anny = load_anny()
-    return anny.body(anny.shape_defaults)
+    return anny.at_shape(anny.shape_defaults)
 
 
 @pytest.fixture(scope="module")

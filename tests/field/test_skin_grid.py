@@ -15,7 +15,7 @@ from tests.field.scene import make_motion
 @pytest.fixture(scope="module")
 def body():
     anny = load_anny()
-    return anny.body(anny.shape_defaults)
+    return anny.at_shape(anny.shape_defaults)
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,9 @@ import pytest
 from pydantic import ValidationError
 
 from pipeline.body.body import load_anny
-from pipeline.body.files import load_body, load_camera, load_motion
+from pipeline.body.files import load_body, load_camera, load_motion, load_scores
 from pipeline.body.overlay import BODY_OUTLINE_RGB, MASK_OUTLINE_RGB, WARNING_RGB
+from pipeline.body.settings import FitSettings
 from pipeline.capture.capture import (
     IMAGES_FOLDER,
     MASKS_FOLDER,
@@ -22,7 +23,6 @@ from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
 from pipeline.geometry.camera import Camera
 from pipeline.io.image import read_rgb, write_gray, write_rgb
-from pipeline.io.npz import load_npz
 from stages.body import STAGE, Config, check_fit_quality, initial_camera, run
 from tests.body.acting import SyntheticRecording, synthetic_recording
 from tests.body.fit.test_diagnostics import result
@@ -84,12 +84,12 @@ def test_stage_writes_body_motion_camera_scores_and_overlay(tmp_path, scene: Syn
     assert np.abs(motion.root_translation_m - scene.state.root_m.numpy()).max() < 0.05
     assert body.height_m() == pytest.approx(scene.model.height_m()[0], abs=0.03)
     assert load_camera(out / "camera.npz").fx == scene.camera.fx
-    scores = load_npz(out / "scores.npz")
-    assert scores["silhouette_iou"].shape == (FRAMES,)
-    assert metrics["silhouette_iou_worst"] == scores["silhouette_iou"].min()
-    assert scores["residual_blob_share"].max() < 0.005
+    scores = load_scores(out / "scores.npz")
+    assert scores.silhouette_iou.shape == (FRAMES,)
+    assert metrics["silhouette_iou_worst"] == scores.silhouette_iou.min()
+    assert scores.residual_blob_share.max() < 0.005
     assert metrics["frames_with_foreign_objects"] == metrics["dropped_frames"] == 0
-    assert scores["usable"].all()
+    assert scores.usable.all()
     tiles = read_rgb(out / "overlay.png")
     mask_px, body_px = ((tiles == colour).all(-1).sum() for colour in (MASK_OUTLINE_RGB, BODY_OUTLINE_RGB))
     assert 0 < mask_px < 0.6 * body_px  # where both agree, the body's outline hides that of the mask
@@ -106,9 +106,9 @@ def test_an_unusable_frame_is_marked_reported_and_dropped(tmp_path, scene: Synth
     take_warnings()
     metrics = run({"frames": frames}, out, Config(rounds=1))
     assert metrics["dropped_frames"] == 1
-    assert np.flatnonzero(~load_npz(out / "scores.npz")["usable"]).tolist() == [3]
+    assert np.flatnonzero(~load_scores(out / "scores.npz").usable).tolist() == [3]
     assert any(
-        sentence.startswith("frames 9: the body is not where the person is; 1 frame") for sentence in take_warnings()
+        sentence.startswith("frames 9: the body does not match the person; 1 frame") for sentence in take_warnings()
     )
     assert (read_rgb(out / "overlay.png") == WARNING_RGB).all(-1).any()
 
@@ -121,7 +121,7 @@ def capture_of(split: list[int]) -> Capture:
 
 def test_a_fit_without_masks_is_refused() -> None:
     fit = result(silhouette_iou=np.full(12, np.nan))
-    with pytest.raises(UserError, match="median overlap with the masks 0.00"):
+    with pytest.raises(UserError, match="median silhouette IoU 0.00"):
         check_fit_quality(fit, capture_of([0] * 12), Config(), False)
     with pytest.raises(UserError, match="in 12 of 12 training frames"):
         check_fit_quality(fit, capture_of([0] * 12), Config(min_silhouette_iou=0.0), False)
@@ -153,7 +153,7 @@ def test_a_foreign_object_is_reported(tmp_path, scene: SyntheticRecording) -> No
     take_warnings()
     metrics = run({"frames": frames}, out, Config(rounds=1))
     assert metrics["frames_with_foreign_objects"] == 1
-    assert any(sentence.startswith("frames 9: the mask holds something beside") for sentence in take_warnings())
+    assert any(sentence.startswith("frames 9: the mask contains another object") for sentence in take_warnings())
 
 
 def test_masks_of_something_else_are_refused_with_a_remedy(tmp_path, scene: SyntheticRecording) -> None:
@@ -192,10 +192,10 @@ def test_camera_priority_supplied_option_metadata_default(tmp_path, scene: Synth
     camera, std = initial_camera(unknown, Config(field_of_view_deg=90.0))
     assert std == 0.0
     assert camera.fx == pytest.approx(0.5 * scene.camera.height)
-    camera, std = initial_camera(unknown, Config(initial_focal_ratio=1.5))
+    camera, std = initial_camera(unknown, Config(), FitSettings(initial_focal_ratio=1.5))
     assert std == 0.5
     assert camera.fx == pytest.approx(1.5 * scene.camera.height)
-    camera, std = initial_camera(replace(unknown, metadata_focal_px=333.0), Config(initial_focal_ratio=1.5))
+    camera, std = initial_camera(replace(unknown, metadata_focal_px=333.0), Config())
     assert (camera.fx, std) == (333.0, 0.1)
 
 

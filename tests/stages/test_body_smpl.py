@@ -18,7 +18,7 @@ from pipeline.core.progress import take_warnings
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.rotation import quaternion_to_matrix
 from pipeline.geometry.skinning import forward_kinematics
-from stages.body import STAGE, Config, run, supplied_poses
+from stages.body import STAGE, Config, load_supplied_poses, run
 from tests.body.acting import SyntheticRecording, synthetic_recording
 from tests.body.smpl_sample import file_contents, made_up_arrays, smpl_pose_of
 from tests.stages.test_body import FRAMES, write_capture
@@ -153,10 +153,10 @@ def test_supplied_poses_are_where_the_fit_starts(tmp_path, model_file, scene: Sy
 @pytest.mark.parametrize(
     ("joints", "knows_camera", "frames", "said"),
     [
-        (0, True, slice(None), "an SMPL or SMPL-H model file (neutral), --set body.model_file"),
+        (0, True, slice(None), "an SMPL or SMPL-H model file (neutral); add --set body.model_file"),
         (55, True, slice(None), "an SMPL or SMPL-H model file"),
         (24, False, slice(None), "supply camera.json"),
-        (24, True, slice(0), "no pose of a chosen frame"),
+        (24, True, slice(0), "no pose of a selected frame"),
     ],
 )
 def test_unusable_supplied_poses_are_reported(
@@ -167,11 +167,11 @@ def test_unusable_supplied_poses_are_reported(
     poses = true_poses(scene)
     take_warnings()
     capture = replace(load_capture(tmp_path / "frames"), smpl_poses=poses.for_frames(poses.frame_index[frames]))
-    assert supplied_poses(capture, model, scene.camera, knows_camera, Config()) is None
+    assert load_supplied_poses(capture, model, scene.camera, knows_camera, Config()) is None
     (sentence,) = take_warnings()
     assert "smpl_poses.npz is not used" in sentence
     assert said in sentence
-    assert supplied_poses(capture, model, scene.camera, knows_camera, Config(supplied_poses="ignore")) is None
+    assert load_supplied_poses(capture, model, scene.camera, knows_camera, Config(supplied_poses="ignore")) is None
     assert take_warnings() == []
 
 

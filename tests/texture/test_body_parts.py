@@ -28,7 +28,7 @@ def test_part_of_a_joint_name(joint: str, part: str) -> None:
 
 def test_faces_of_each_part_are_at_its_place_on_the_body() -> None:
     anny = load_anny()
-    body = anny.body(anny.shape_defaults)
+    body = anny.at_shape(anny.shape_defaults)
     indices = np.argsort(-body.skin_weights, axis=1)[:, :4]
     weights = np.take_along_axis(body.skin_weights, indices, axis=1)
     part = body_part_of_faces(body.faces, indices.astype(np.int32), weights, body.joint_names)

@@ -27,7 +27,7 @@ _PHENOTYPES = {
 def make_person(seed: int, texture_px: int = 2048, legwear: str = "trousers") -> tuple[Subject, Body]:
     """Return the clothed, textured person of a seed, and the body without clothes; equal seeds give equal arrays."""
     model, noise, outfit = load_anny(), ValueNoise(seed), choose_outfit(seed, legwear)
-    bare = model.body(_shape(model, seed))
+    bare = model.at_shape(_shape(model, seed))
     anatomy = measure_anatomy(model, bare)
     clothed = add_clothing(model, bare, anatomy, outfit, noise)
     texture = to_uint8(paint_texture(clothed, anatomy, outfit, noise, texture_px))

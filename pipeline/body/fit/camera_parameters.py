@@ -1,4 +1,4 @@
-"""The camera as a fit has it: the given one, seen through the lens that is sought."""
+"""Projection through a camera whose intrinsics are estimated, with derivatives."""
 
 import math
 from dataclasses import replace
@@ -11,13 +11,13 @@ from pipeline.body.fit.root_placement import MINIMUM_DEPTH_M
 from pipeline.geometry.camera import Camera
 
 INTRINSICS_COUNT = 3
-"""Numbers of a lens: shift of the principal point to the right and down, and logarithm of the focal length; all over
-the focal length of the given camera.
+"""Entries of an intrinsics delta, relative to the initial camera: shift of the principal point to the right and down in
+focal lengths, and logarithm of the ratio of the focal lengths.
 """
 
 
 def apply_intrinsics_delta(camera: Camera, intrinsics_delta: Float[Tensor, "3"]) -> Camera:
-    """The given camera with a lens's focal length and principal point."""
+    """Return the initial camera with changed focal length and principal point."""
     right, down, focal_log = intrinsics_delta.tolist()
     fx, fy, scale = camera.fx, camera.fy, math.exp(focal_log)
     return replace(camera, fx=fx * scale, fy=fy * scale, cx=camera.cx + right * fx, cy=camera.cy + down * fy)
@@ -26,7 +26,10 @@ def apply_intrinsics_delta(camera: Camera, intrinsics_delta: Float[Tensor, "3"])
 def project_with_jacobian(
     world: Float[Tensor, "n m 3"], camera: Camera
 ) -> tuple[Float[Tensor, "n m 2"], Float[Tensor, "n m 2 3"]]:
-    """Pixels and their derivative by the world point (m)."""
+    """Return pixels and their derivative with respect to the world point (m).
+
+    The depth is clamped to `MINIMUM_DEPTH_M`.
+    """
     pose = torch.as_tensor(camera.world_to_camera, dtype=world.dtype)
     x, y, depth = (world @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
     depth = depth.clamp(min=MINIMUM_DEPTH_M)
@@ -45,7 +48,10 @@ def project_with_jacobian(
 def compute_intrinsics_jacobian(
     pixels: Float[Tensor, "n m 2"], camera: Camera, intrinsics_delta: Float[Tensor, "3"]
 ) -> Float[Tensor, "n m 2 3"]:
-    """Derivative of projections by the lens that the given camera is seen through."""
+    """Return the derivative of pixels with respect to the intrinsics delta.
+
+    pixels: projected with `intrinsics_delta` applied. camera: the initial camera.
+    """
     updated_camera = apply_intrinsics_delta(camera, intrinsics_delta)
     focal_jacobian = pixels - pixels.new_tensor([updated_camera.cx, updated_camera.cy])
     principal_point_jacobian = torch.diag(pixels.new_tensor([camera.fx, camera.fy]))

@@ -1,45 +1,45 @@
-"""What goes into a fit (observations from a detector's arrays), and what to think of the frames that come out of it."""
+"""Observations from detector output, and quality of the fitted frames."""
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
-from pipeline.body.fit.energy import Observations
-from pipeline.body.fit.fit import FitResult
 from pipeline.body.fit.hand_observations import hand_landmarks
+from pipeline.body.fit.result import FitResult
+from pipeline.body.fit.state import Observations
 from pipeline.capture.frame_selection import format_frame_ranges
 from pipeline.capture.hand_detector import HandLandmarks, undetected_hands
 from pipeline.geometry.camera import Camera
 
 MIN_CONFIDENCE = 0.1
-"""Trust in a landmark that the detector calls invisible: it still guesses better than a prior."""
+"""Confidence of a landmark with visibility 0: the detector's guess is still better than the prior."""
 
 SUSPICIOUS_IOU_DROP = 0.10
-"""A frame is doubtful when its overlap lies this far below the median."""
+"""A frame is suspicious if its silhouette IoU is this far below the median."""
 
 UNCERTAIN_FOCAL_STD = 0.15
-"""A focal length is worth a word when it is known no better than this share of it."""
+"""Relative standard deviation of the focal length above which it is reported."""
 
 SUSPICIOUS_ERROR_RATIO = 3.0
-"""A frame is doubtful when its landmark error is this many times the median."""
+"""A frame is suspicious if its landmark error exceeds this multiple of the median."""
 
 UNUSABLE_IOU_DROP = 0.20
-"""A frame is unusable when its overlap lies this far below the median: about what a leg beside its mask costs.
+"""A frame is unusable if its silhouette IoU is this far below the median: about one leg outside the mask.
 
-Worst behind the median in finished runs: turns 0.03, a self-capture 0.11, skirts 0.08; a ball in the mask 0.20.
+Largest drops in finished runs: turns 0.03, a self-capture 0.11, skirts 0.08; a ball in the mask 0.20.
 """
 
 UNUSABLE_ERROR_RATIO = 0.08
-"""A frame is unusable when half of its landmarks lie this far from the body's, as a share of the person's height.
+"""A frame is unusable if its median landmark error exceeds this fraction of the height of the person.
 
-Most in finished runs: turns 0.013, a self-capture 0.047.
+Maxima in finished runs: turns 0.013, a self-capture 0.047.
 """
 
 ROUGH_FIT_IOU = 0.85
-"""A fit is worth a word whose median overlap is lower. In finished runs: turns 0.93, a skirt 0.87."""
+"""Median silhouette IoU below which the fit is reported. In finished runs: turns 0.93, a skirt 0.87."""
 
 FRAME_RATINGS = ("", "corrected", "suspicious", "unusable")
-"""What may be said of a frame, from well to worst."""
+"""Ratings of a frame, from good to worst."""
 
 
 def make_observations(
@@ -50,9 +50,10 @@ def make_observations(
     camera: Camera,
     hands: HandLandmarks | None = None,
 ) -> Observations:
-    """Observations from a detector's output: nan where nothing was found, 3D in camera axes (y down, z away).
+    """Return the observations of a detector's output.
 
-    hands: from `fit_hands.filter_hand_detections`; None where they were not looked for.
+    landmarks_px: nan where nothing was detected. visibility: 0 to 1. landmarks_world_m: camera axes (y down, z away),
+    relative to the hips. hands: from `hand_observations.filter_hand_detections`; None if they were not detected.
     """
     hands_px, hands_m, hands_confidence = hand_landmarks(hands or undetected_hands(len(time_s)), landmarks_world_m)
     landmarks = torch.tensor(np.concatenate([landmarks_px, hands_px], axis=1)).double()
@@ -72,39 +73,38 @@ def make_observations(
 
 
 def suspicious_frames(result: FitResult) -> Bool[np.ndarray, "n"]:
-    """Frames whose overlap or landmark error falls far behind the rest, and frames without landmarks."""
-    near = result.silhouette_iou >= median_silhouette_iou(result) - SUSPICIOUS_IOU_DROP
+    """Return the frames with a much lower IoU or larger landmark error than the others, and those without landmarks."""
+    high_iou = result.silhouette_iou >= median_silhouette_iou(result) - SUSPICIOUS_IOU_DROP
     error = result.landmark_error_px
-    return ~near | np.isnan(error) | (np.nan_to_num(error) > SUSPICIOUS_ERROR_RATIO * finite_median(error))
+    return ~high_iou | np.isnan(error) | (np.nan_to_num(error) > SUSPICIOUS_ERROR_RATIO * finite_median(error))
 
 
 def usable_frames(result: FitResult) -> Bool[np.ndarray, "n"]:
-    """Frames that can be learnt from: False only where the body clearly is not where the person is.
+    """Return the frames that the training may use.
 
-    That is a frame without a mask, or whose overlap or landmarks miss by `UNUSABLE_IOU_DROP` or
-    `UNUSABLE_ERROR_RATIO`. One
-    without landmarks is judged by its overlap.
+    Unusable: frames without a mask, with a low IoU (`UNUSABLE_IOU_DROP`) or large landmark errors
+    (`UNUSABLE_ERROR_RATIO`). Frames without landmarks are rated by their IoU.
     """
-    near = result.silhouette_iou >= median_silhouette_iou(result) - UNUSABLE_IOU_DROP
+    high_iou = result.silhouette_iou >= median_silhouette_iou(result) - UNUSABLE_IOU_DROP
     to_camera = result.camera.world_to_camera
     depth_m = result.root_translation_m @ to_camera[2, :3] + to_camera[2, 3]
     person_px = result.camera.fy * result.body.height_m() / depth_m
-    return near & (np.nan_to_num(result.landmark_error_px) <= UNUSABLE_ERROR_RATIO * person_px)
+    return high_iou & (np.nan_to_num(result.landmark_error_px) <= UNUSABLE_ERROR_RATIO * person_px)
 
 
 def median_silhouette_iou(result: FitResult) -> float:
-    """Median over frames of the overlap with the masks, 0 to 1; a frame without a mask counts as 0."""
+    """Return the median over frames of the IoU with the masks, 0 to 1; a frame without a mask counts as 0."""
     return float(np.median(np.nan_to_num(result.silhouette_iou)))
 
 
 def finite_median(values: Float[np.ndarray, "n"]) -> float:
-    """Median of the finite values; nan without any."""
+    """Return the median of the finite values; nan if there are none."""
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else float("nan")
 
 
 def rate_frames(result: FitResult, suspicious: Bool[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
-    """Position in `FRAME_RATINGS` of the worst that holds of each frame, given which are doubtful."""
+    """Return the index in `FRAME_RATINGS` of the worst rating that applies to each frame."""
     corrected = np.stack(list(result.left_right_swapped.values())).any(axis=0)
     return np.select([~usable_frames(result), suspicious, corrected], [3, 2, 1], 0)
 
@@ -112,8 +112,9 @@ def rate_frames(result: FitResult, suspicious: Bool[np.ndarray, "n"]) -> Int[np.
 def select_overlay_frames(
     rating: Int[np.ndarray, "n"], silhouette_iou: Float[np.ndarray, "n"], count: int
 ) -> Int[np.ndarray, "k"]:
-    """Positions, rising, of at most `count` frames: up to half of them those with the worst verdicts (and there the
-    lowest overlap), the others evenly spread over the rest.
+    """Return ascending positions of at most `count` frames: up to half the worst rated, the others evenly spaced.
+
+    Of equal ratings the lowest IoU comes first.
     """
     worst = np.lexsort((np.nan_to_num(silhouette_iou), -rating))[: min(count // 2, np.count_nonzero(rating))]
     others = np.setdiff1d(np.arange(len(rating)), worst)
@@ -122,48 +123,45 @@ def select_overlay_frames(
 
 
 def fit_warnings(result: FitResult, frame_index: Int[np.ndarray, "n"], training: Bool[np.ndarray, "n"]) -> list[str]:
-    """Sentences about what a person should look at, for example "frames 81-96: ...". Empty when all is well.
+    """Return warnings about the fit, for example "frames 81-96: ..."; empty for a good fit.
 
-    training: frames that later stages learn from, unless they are unusable.
+    training: frames that later stages train on, unless they are unusable.
     """
     warnings = []
     silhouette_iou = median_silhouette_iou(result)
     if silhouette_iou < ROUGH_FIT_IOU:
         warnings.append(
-            f"the body fits the masks only roughly (median overlap {silhouette_iou:.2f}): wide clothes, or wrong "
-            "masks or "
-            "camera; see overlay.png, and supply masks/, camera.json or body.height_m"
+            f"the body fits the masks only roughly (median silhouette IoU {silhouette_iou:.2f}): wide clothes, wrong "
+            "masks or a wrong camera; see overlay.png, and supply masks/, camera.json or body.height_m"
         )
     usable = usable_frames(result)
     if not usable.all():
         dropped = np.count_nonzero(training & ~usable)
         warnings.append(
-            f"frames {format_frame_ranges(frame_index, ~usable)}: the body is not where the person is; {dropped} "
-            f"frame{'' if dropped == 1 else 's'} dropped from the training; see overlay.png, and supply masks/ or "
-            "landmarks.npz that are right there, or film it again"
+            f"frames {format_frame_ranges(frame_index, ~usable)}: the body does not match the person; {dropped} "
+            f"frame{'' if dropped == 1 else 's'} dropped from the training; see overlay.png, and supply correct masks/ "
+            "or landmarks.npz for them, or record them again"
         )
     for body_part, rows in result.left_right_swapped.items():
         if rows.any():
-            limbs = "left and right" if body_part == "whole body" else f"left and right {body_part}"
-            warnings.append(
-                f"frames {format_frame_ranges(frame_index, rows)}: the detector took {limbs} for each other; mended"
-            )
+            sides = "left and right" if body_part == "whole body" else f"left and right {body_part}"
+            warnings.append(f"frames {format_frame_ranges(frame_index, rows)}: the detector swapped {sides}; corrected")
     missing = np.isnan(result.landmark_error_px)
     if missing.any():
         warnings.append(
-            f"frames {format_frame_ranges(frame_index, missing)}: no landmarks; the pose, unless it was supplied, "
-            "follows the "
-            "mask and time"
+            f"frames {format_frame_ranges(frame_index, missing)}: no landmarks; poses that were not supplied are "
+            "fitted to the masks and the neighbouring frames"
         )
     suspicious_rows = suspicious_frames(result) & ~missing & usable
     if suspicious_rows.any():
         warnings.append(
-            f"frames {format_frame_ranges(frame_index, suspicious_rows)}: the body fits worse than elsewhere; see "
-            "overlay.png"
+            f"frames {format_frame_ranges(frame_index, suspicious_rows)}: the body fits worse than in other frames; "
+            "see overlay.png"
         )
     if result.focal_relative_std > UNCERTAIN_FOCAL_STD:
         warnings.append(
-            f"focal length {result.camera.fx:.0f} px is known to {100 * result.focal_relative_std:.0f} % only: supply "
-            "camera.json or body.field_of_view_deg, or film a full turn from nearer"
+            f"focal length {result.camera.fx:.0f} px has a standard deviation of "
+            f"{100 * result.focal_relative_std:.0f} %: supply camera.json or body.field_of_view_deg, or film a full "
+            "turn from a shorter distance"
         )
     return warnings

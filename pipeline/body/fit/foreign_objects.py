@@ -1,4 +1,4 @@
-"""What a mask holds beside the fitted body: a ball, a bag, a caption. Told to the user, who knows what it is."""
+"""Detection of foreign objects in the masks: a ball, a bag, a caption. They are reported; the user decides."""
 
 from collections.abc import Sequence
 
@@ -15,18 +15,21 @@ from pipeline.capture.frame_selection import format_frame_ranges
 from pipeline.geometry.camera import Camera
 
 CLOTHING_MARGIN_RATIO = 0.03
-"""How far from the body a mask is expected to reach, as a share of the person's height in the image."""
+"""Expected distance of the mask outline from the body, over the height of the person in the image."""
 
 MIN_EXCESS_BLOB_SHARE = 0.01
-"""A frame is told of when its largest lump exceeds the median frame's by this share of the mask, about a foot.
+"""A frame is reported if its largest residual blob exceeds the median by this fraction of the mask, about a foot.
 
-Most seen without foreign things: a turn 0.0004, a self-capture 0.0035. A juggled ball 0.015 to 0.074; a caption that
-hangs on a foot 0.012, where the skirt's hem alone stays within 0.008.
+Maxima without foreign objects: turn 0.0004, self-capture 0.0035, hem of a skirt 0.008. A juggled ball: 0.015 to 0.074;
+a caption connected to a foot: 0.012.
 """
 
 
 def residual_blob_share(mask: Bool[np.ndarray, "h w"], body_mask: Bool[np.ndarray, "h w"], person_px: float) -> float:
-    """Share of the mask that its largest connected part beyond the reach of clothing takes, 0 to 1."""
+    """Return the fraction (0 to 1) of the mask in its largest connected part beyond the clothing margin.
+
+    person_px: height of the person.
+    """
     beyond = mask & (distance_px(~body_mask) > CLOTHING_MARGIN_RATIO * person_px)
     _, _, parts, _ = cv2.connectedComponentsWithStats(beyond.astype(np.uint8))
     return float(parts[1:, cv2.CC_STAT_AREA].max(initial=0)) / max(1, int(mask.sum()))
@@ -38,7 +41,7 @@ def residual_blob_shares(
     camera: Camera,
     masks: Sequence[UInt8[np.ndarray, "h w"]],
 ) -> Float[np.ndarray, "n"]:
-    """`residual_blob_share` of every frame; nan where the mask is empty."""
+    """Return `residual_blob_share` of every frame; nan where the mask is empty."""
     faces = torch.as_tensor(body.faces)
     shares = np.full(len(masks), np.nan)
     for frame, mask in enumerate(masks):
@@ -50,7 +53,7 @@ def residual_blob_shares(
 
 
 def frames_with_foreign_objects(shares: Float[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
-    """Frames whose lump is much larger than is usual in the recording: wide clothes are there all the time."""
+    """Return the frames whose residual blob is much larger than the median: wide clothes appear in all frames."""
     return (
         np.nan_to_num(shares)
         > np.nan_to_num(np.nanmedian(shares) if np.isfinite(shares).any() else 0.0) + MIN_EXCESS_BLOB_SHARE
@@ -58,12 +61,11 @@ def frames_with_foreign_objects(shares: Float[np.ndarray, "n"]) -> Bool[np.ndarr
 
 
 def foreign_object_warnings(shares: Float[np.ndarray, "n"], frame_index: Int[np.ndarray, "n"]) -> list[str]:
-    """A sentence about the frames of `frames_with_foreign_objects`; empty when there are none."""
+    """Return a warning about the frames of `frames_with_foreign_objects`; empty if there are none."""
     has_foreign_object = frames_with_foreign_objects(shares)
     if not has_foreign_object.any():
         return []
     return [
-        f"frames {format_frame_ranges(frame_index, has_foreign_object)}: the mask holds something beside the "
-        "body (a ball, a bag, a "
-        "caption?), or the pose is wrong; leave them out with split.json, or supply masks/"
+        f"frames {format_frame_ranges(frame_index, has_foreign_object)}: the mask contains another object (a ball, a "
+        "bag, a caption?), or the pose is wrong; exclude these frames with split.json, or supply masks/"
     ]

@@ -1,7 +1,7 @@
-"""What hands tell a fit: which sightings can be relied on, where knuckles are, how far fingers are bent.
+"""Hand detections of a fit: reliable detections, positions of the knuckles, flexion of the fingers.
 
-Points of a hand are off by 3 to 5 mm, so they say where it is and how the wrist is turned in every frame. The bend of a
-finger in one frame is off by 0.25 rad, so one number a finger is taken from all frames.
+Hand landmarks err by 3 to 5 mm, so they give position and orientation of the hand in every frame. The flexion of a
+finger in one frame errs by 0.25 rad, so one value for each finger is estimated from all frames.
 """
 
 from dataclasses import replace
@@ -16,13 +16,13 @@ from pipeline.capture.hand_detector import N_HAND_LANDMARKS, HandLandmarks, imag
 from pipeline.capture.landmarks import WRISTS
 
 MIN_HANDEDNESS = 0.5
-"""A hand that is more likely the other one is not used. Seen edge-on, no model can tell."""
+"""Minimum handedness score: hands that are more likely the other one are not used."""
 
 MAX_WRIST_DISTANCE_M = 0.05
-"""How far apart the wrists of the pose model and of the hand model may lie."""
+"""Maximum distance between the wrists of the pose model and of the hand model."""
 
 MIN_HAND_FRAMES = 8
-"""Fingers keep their relaxed grip unless their hand was seen in so many frames."""
+"""Minimum number of frames with a hand for estimating the flexion of its fingers; otherwise they are relaxed."""
 
 MAX_CURL_RAD = 1.2
 _KNUCKLES = (5, 9, 13, 17)
@@ -30,9 +30,7 @@ _KNUCKLES = (5, 9, 13, 17)
 
 
 def filter_hand_detections(hands: HandLandmarks, landmarks_px: Float[np.ndarray, "n 33 2"]) -> HandLandmarks:
-    """The hands with `handedness_score` 0 also where a hand is not to be relied on: the other one, or far from the
-    wrist.
-    """
+    """Return the hands with score 0 where the handedness is doubtful or the wrist is far from that of the pose."""
     distance_px = np.linalg.norm(hands.landmarks_px[:, :, 0] - landmarks_px[:, WRISTS], axis=-1)
     near = distance_px < MAX_WRIST_DISTANCE_M * image_scale_px_per_m(hands.landmarks_px, hands.landmarks_m)
     return replace(
@@ -43,8 +41,12 @@ def filter_hand_detections(hands: HandLandmarks, landmarks_px: Float[np.ndarray,
 def hand_landmarks(
     hands: HandLandmarks, pose_world_m: Float[np.ndarray, "n 33 3"]
 ) -> tuple[Float[np.ndarray, "n k 2"], Float[np.ndarray, "n k 3"], Float[np.ndarray, "n k"]]:
-    """Pixels, places about the hips (m, the pose's wrist plus what the hand model says) and trust of the points that
-    follow the pose's landmarks in a fit, in their order."""
+    """Return the hand landmarks used by the fit (`HAND_LANDMARKS`, left and right alternating).
+
+    pose_world_m: pose landmarks relative to the hips.
+
+    Returns pixels, positions relative to the hips (m; wrist of the pose plus offsets of the hand model) and confidence.
+    """
     points_px, points_m = hands.landmarks_px[:, :, HAND_LANDMARKS], hands.landmarks_m[:, :, HAND_LANDMARKS]
     positions_m = pose_world_m[:, WRISTS, None] + points_m - hands.landmarks_m[:, :, :1]
     pixels, places = (
@@ -54,9 +56,9 @@ def hand_landmarks(
 
 
 def finger_curls_rad(body: ParametricBody, hands: HandLandmarks) -> Float[np.ndarray, "2 4"]:
-    """How much further than in the A-pose each finger joint is bent, of left and right `FINGERS`: median over frames.
+    """Return the flexion of the left and right `FINGERS` relative to the A-pose (rad), median over frames.
 
-    A hand that is hardly ever seen, and a body without fingers, keep the relaxed grip.
+    Fingers of a rarely detected hand, and all of a body without fingers, are relaxed.
     """
     curls = relaxed_curls_rad()
     if "LeftHandPinky3" not in body.joint_names:
@@ -70,7 +72,7 @@ def finger_curls_rad(body: ParametricBody, hands: HandLandmarks) -> Float[np.nda
 
 
 def finger_flexion_rad(hand_m: Float[np.ndarray, "*n 21 3"], side: int) -> Float[np.ndarray, "*n 4 3"]:
-    """Angles at the three joints of the four fingers, about the line through the knuckles; positive closes the fist.
+    """Return the angles at the three joints of the four fingers (rad) about the knuckle line; positive closes the fist.
 
     hand_m: 21 points in any rigid frame. side: 0 left, 1 right.
     """
@@ -84,8 +86,11 @@ def finger_flexion_rad(hand_m: Float[np.ndarray, "*n 21 3"], side: int) -> Float
 
 
 def rest_hand_points_m(body: ParametricBody, side: int) -> Float[np.ndarray, "21 3"]:
-    """Where wrist and fingers are in the A-pose of the default shape; nan for the thumb. Last bones go on straight."""
-    joints_m = body.rest(body.shape_defaults)[1].double().numpy()
+    """Return wrist and fingers in the A-pose of the default shape (m); nan for the thumb.
+
+    The last bone of a finger repeats the one before it.
+    """
+    joints_m = body.rest_pose(body.shape_defaults)[1].double().numpy()
     name = ("LeftHand", "RightHand")[side]
     points = np.full((N_HAND_LANDMARKS, 3), np.nan)
     points[0] = joints_m[body.joint_names.index(name)]

@@ -1,4 +1,4 @@
-"""Where a fit starts: which way the person faces in each frame, and where the person stands."""
+"""Initial state of a fit: orientation and position of the root in each frame."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pipeline.body.fit.camera_parameters import INTRINSICS_COUNT
-from pipeline.body.fit.energy import FitState, Observations
+from pipeline.body.fit.state import FitState, Observations
 from pipeline.geometry.rotation import matrix_to_quaternion, quaternion_to_matrix, slerp
 
 TORSO_LANDMARKS = (11, 12, 23, 24)
@@ -17,7 +17,7 @@ TORSO_LANDMARKS = (11, 12, 23, 24)
 def torso_rotations(
     rest_landmarks_m: Float[Tensor, "l 3"], landmarks_3d_m: Float[Tensor, "n l 3"]
 ) -> Float[Tensor, "n 3 3"]:
-    """Rotation that carries the rest torso (hips, shoulders) onto each frame's 3D landmarks (Kabsch 1976)."""
+    """Return the rotations that map the rest torso (hips, shoulders) to the 3D landmarks (Kabsch 1976)."""
     rows = list(TORSO_LANDMARKS)
     rest = rest_landmarks_m[rows] - rest_landmarks_m[rows].mean(0)
     observed = landmarks_3d_m[:, rows] - landmarks_3d_m[:, rows].mean(1, keepdim=True)
@@ -28,20 +28,23 @@ def torso_rotations(
 
 
 def has_torso_landmarks(observations: Observations) -> Bool[np.ndarray, "n"]:
-    """Frames whose hips and shoulders are known, and are no point (a failing detector may put all in one place)."""
+    """Return which frames have hips and shoulders in pixels and in 3D.
+
+    Landmarks that all coincide, as those of a failed detection, do not count.
+    """
     rows = list(TORSO_LANDMARKS)
     known = torch.minimum(observations.confidence[:, rows], observations.confidence_3d[:, rows]).min(1).values > 0
     return (known & (torso_radius_m(observations.landmarks_3d_m) > 1e-3)).numpy()
 
 
 def torso_radius_m(positions_m: Float[Tensor, "n l 3"]) -> Float[Tensor, "n"]:
-    """Root mean square distance (m) of hips and shoulders from their middle."""
+    """Return the root mean square distance (m) of hips and shoulders from their centroid."""
     torso = positions_m[:, list(TORSO_LANDMARKS)]
     return (torso - torso.mean(1, keepdim=True)).square().sum(-1).mean(1).sqrt()
 
 
 def facing_yaw_rad(rotation: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n"]:
-    """Angle (rad) about +Y of the direction a body faces; 0 is +Z, positive towards +X."""
+    """Return the angle (rad) about +Y of the facing direction; 0 is +Z, positive towards +X."""
     return torch.atan2(rotation[:, 0, 2], rotation[:, 2, 2])
 
 
@@ -52,19 +55,21 @@ def initial_state(
     shape: Float[Tensor, "s"],
     offset_count: int,
 ) -> FitState:
-    """A-pose, turned as the torso is turned and placed where the landmarks project best.
+    """Return the A-pose with the orientation of the torso, at the position with the least reprojection error.
 
-    Frames without landmarks take the rotation and place in between their neighbours'.
+    Frames without landmarks are interpolated.
+
+    rest_landmarks_m, joints_m: of the default shape. shape: initial shape.
     """
     found = has_torso_landmarks(observations)
     torso_rotation = torso_rotations(rest_landmarks_m, observations.landmarks_3d_m)
-    turned = (rest_landmarks_m - joints_m[0]) @ torso_rotation.transpose(1, 2)
-    size = (
+    rotated_m = (rest_landmarks_m - joints_m[0]) @ torso_rotation.transpose(1, 2)
+    scale = (
         torso_radius_m(rest_landmarks_m[None])[0]
         / torso_radius_m(observations.landmarks_3d_m[torch.from_numpy(found)]).median()
     )
-    hips_m = 0.5 * (turned[:, 23] + turned[:, 24])
-    relative = observations.landmarks_3d_m * size + hips_m[:, None]
+    hips_m = 0.5 * (rotated_m[:, 23] + rotated_m[:, 24])
+    relative = observations.landmarks_3d_m * scale + hips_m[:, None]
     root = solve_root_position(observations, relative)
     torso_rotation, root = _fill_gaps(torso_rotation, root, found)
     rotations = torch.eye(3, dtype=torch.float64).repeat(len(root), len(joints_m), 1, 1)
@@ -79,9 +84,10 @@ def initial_state(
 
 
 def solve_root_position(observations: Observations, relative_m: Float[Tensor, "n l 3"]) -> Float[Tensor, "n 3"]:
-    """World position of the root from pixels of points known relative to it.
+    """Return the world position of the root (m) from pixels of points with known positions relative to it.
 
-    Each pixel gives two equations linear in the unknown place t: fx (X + t_x) - (u - cx) (Z + t_z) = 0, likewise y.
+    Each pixel gives two linear equations in the unknown position t: fx (X + t_x) - (u - cx) (Z + t_z) = 0, likewise y
+    (direct linear transform).
     """
     camera = observations.camera
     pose = torch.as_tensor(camera.world_to_camera, dtype=torch.float64)
@@ -103,7 +109,7 @@ def solve_root_position(observations: Observations, relative_m: Float[Tensor, "n
 def _fill_gaps(
     torso_rotation: Float[Tensor, "n 3 3"], root_m: Float[Tensor, "n 3"], found: Bool[np.ndarray, "n"]
 ) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3"]]:
-    """Rotation and place of frames that were not found, from the nearest found frames before and after."""
+    """Return rotations and positions with those of missing frames interpolated between the nearest found frames."""
     known = np.flatnonzero(found)
     low, high, share = _interpolation_weights(known.astype(np.float64), np.arange(len(found), dtype=np.float64))
     quaternions = matrix_to_quaternion(torso_rotation[known])
@@ -112,14 +118,14 @@ def _fill_gaps(
 
 
 def interpolated_state(state: FitState, rows: Int[np.ndarray, "k"], time_s: Float[Tensor, "n"]) -> FitState:
-    """Poses of all n frames from those of some (`rows`), in between by time; outside, the nearest one."""
+    """Return the poses of all n frames, interpolated over time from those of `rows`; constant outside."""
     times = time_s.numpy()
     low, high, share = _interpolation_weights(times[rows], times)
     quaternions = matrix_to_quaternion(state.rotations)
-    turned = slerp(quaternions[low], quaternions[high], share[:, None].expand(-1, quaternions.shape[1], 1))
+    interpolated = slerp(quaternions[low], quaternions[high], share[:, None].expand(-1, quaternions.shape[1], 1))
     return replace(
         state,
-        rotations=quaternion_to_matrix(turned),
+        rotations=quaternion_to_matrix(interpolated),
         root_m=state.root_m[low] * (1 - share) + state.root_m[high] * share,
     )
 
@@ -127,7 +133,7 @@ def interpolated_state(state: FitState, rows: Int[np.ndarray, "k"], time_s: Floa
 def _interpolation_weights(
     known: Float[np.ndarray, "k"], wanted: Float[np.ndarray, "n"]
 ) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"], Float[Tensor, "n 1"]]:
-    """For each wanted value the known ones below and above it, and how far it lies between them (0 to 1)."""
+    """Return the known values below and above each wanted value, and its fraction of the way between them (0 to 1)."""
     high = np.clip(np.searchsorted(known, wanted), 0, len(known) - 1)
     low = np.clip(high - 1, 0, None)
     gap = np.maximum(known[high] - known[low], 1e-9)

@@ -1,13 +1,13 @@
-"""How far the joints of a living person go, and what a pose costs beyond that.
+"""Joint limits of living people, and residuals of poses beyond them.
 
-A joint's rotation away from the middle of its range is split into the swing of its bone, whose rotation vector is
+A joint's rotation away from the centre of its range is split into the swing of its bone, whose rotation vector is
 perpendicular to the bone, and the twist about the bone (swing-twist decomposition; Baerlocher and Boulic,
 "Parametrization and range of motion of the ball-and-socket joint", 2001). That gives three angles: twist, flexion,
-sideways. Counted from the middle they have no pole within reach, so each has a range of its own.
+sideways swing. Measured from the centre they have no singularity within the range.
 
 Ranges: American Academy of Orthopaedic Surgeons, "Joint motion: method of measuring and recording", 1965; Boone and
-Azen, "Normal range of motion of joints in male subjects", 1979, found the like. Healthy people differ by 5 to 10
-degrees (standard deviation) and trained ones go further: `LIMIT_MARGIN_DEG` is added at both ends.
+Azen, "Normal range of motion of joints in male subjects", 1979, agree. Healthy people differ by 5 to 10 degrees
+(standard deviation) and trained ones exceed that: `LIMIT_MARGIN_DEG` is added at both ends.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody
 from pipeline.geometry.rotation import axis_angle_to_matrix
 
 LIMIT_STD_RAD = 0.06
-"""Softness of a limit: going this far beyond costs one standard deviation."""
+"""Excess over a limit that counts as one standard deviation."""
 
 LIMIT_MARGIN_DEG = 15.0
 UNLIMITED_DEG = 600.0
@@ -31,79 +31,86 @@ Vector = tuple[float, float, float]
 
 _DOWN, _UP, _LEFT = (0.0, -1.0, 0.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)
 _FLEXION_AXIS = {_DOWN: (-1.0, 0.0, 0.0), _UP: (1.0, 0.0, 0.0), _LEFT: (0.0, -1.0, 0.0)}
-"""About which axis a bone that points there turns forward."""
+"""Axis about which a bone of this direction flexes forward."""
 
 BALL_JOINT_RANGES_DEG: dict[str, tuple[Vector, Range, Range, Range]] = {
-    # each joint of the trunk may take half of the whole range: recordings seldom share it evenly
+    # each joint of the trunk has half of the whole range: recordings seldom distribute it evenly
     "Spine": (_UP, (-22, 22), (-12, 40), (-18, 18)),
     "Spine1": (_UP, (-22, 22), (-12, 40), (-18, 18)),
     "Spine2": (_UP, (-22, 22), (-12, 40), (-18, 18)),
-    # recordings bend the neck alone and turn the head alone
+    # recordings bend only the neck and turn only the head
     "Neck": (_UP, (-30, 30), (-45, 45), (-45, 45)),
     "Head": (_UP, (-60, 60), (-22, 22), (-22, 22)),
     "Shoulder": (_LEFT, (-15, 15), (-15, 15), (-45, 10)),
-    # a hand behind the back is turned further inward than the 70 that are measured with the arm held sideways
+    # a hand behind the back has more inward twist than the 70 measured with the arm held sideways
     "Arm": (_LEFT, (-100, 100), (-45, 135), (-90, 120)),
-    # 45 to the side and in twist when one at a time is measured; a high kick to the side takes more of both
+    # 45 sideways and in twist if measured separately; a high kick to the side exceeds both
     "UpLeg": (_DOWN, (-60, 60), (-30, 120), (-90, 30)),
-    # flexion: 20 without load, 40 in a squat; twist: with the shin, since the knee here hardly turns it
+    # flexion: 20 without load, 40 in a squat; twist: includes the shin, which the knee here hardly twists
     "Foot": (_DOWN, (-40, 40), (-50, 40), (-15, 35)),
     "ToeBase": (_DOWN, (-10, 10), (-45, 70), (-10, 10)),
     "Hand": (_LEFT, (-80, 80), (-70, 80), (-20, 30)),
 }
-"""Where a left joint's bone points at the anatomist's zero, and its ranges of twist, flexion, sideways swing (degrees).
+"""Direction of a left joint's bone in the anatomical neutral position, and ranges of twist, flexion, sideways swing
+(degrees).
 
 Positive is inward, forward (toes up, palm in), and towards the middle or, for arm and hand, down. Zero is the rest
-pose, but for upper arms and thighs, which count from where the table points.
+pose, except for upper arms and thighs, where it is the direction in the table.
 """
 
 HINGE_RANGES_DEG: dict[str, tuple[Range, Range, Range]] = {
     "ForeArm": ((-95, 95), (-3, 149), (-UNLIMITED_DEG, UNLIMITED_DEG)),
     "Leg": ((-UNLIMITED_DEG, UNLIMITED_DEG), (-3, 155), (-UNLIMITED_DEG, UNLIMITED_DEG)),
 }
-"""Elbows and knees, flexion counted from the straight limb (the knee's as in kneeling); without a margin."""
+"""Elbows and knees; flexion from the straight limb, maximum of the knee as in kneeling; without a margin."""
 
 _CHILD_JOINT = {"Arm": "ForeArm", "UpLeg": "Leg"}
 
 
 def swing_twist(rotation: Float[Tensor, "*n 3 3"]) -> tuple[Float[Tensor, "*n 3"], Float[Tensor, "*n 3 3"]]:
-    """Twist about the x axis and swing of it about y and z (rad), R = exp(swing) exp(twist), and their derivative.
+    """Decompose rotations into twist about the x axis and swing about y and z: R = exp(swing) exp(twist).
 
-    The derivative is by delta in exp(delta) R. Twist lies in [-pi, pi]; both are undefined where x is turned round.
+    Returns (twist, swing y, swing z) in rad and their derivative with respect to delta in exp(delta) R. The twist is in
+    [-pi, pi]; both are undefined where x is reversed.
     """
     bone = rotation[..., :, 0]
     cross = torch.linalg.vector_norm(bone[..., 1:], dim=-1)
     angle = torch.atan2(cross, bone[..., 0])
     stretch = torch.where(cross > 1e-6, angle / cross.clamp(min=1e-6), 1.0)[..., None]
     twist = torch.atan2(rotation[..., 2, 1] - rotation[..., 1, 2], rotation[..., 1, 1] + rotation[..., 2, 2])
-    away = stretch * bone[..., 1:]  # where the bone is on the sphere, seen from x: the swing turned back by 90 degrees
-    angles = torch.stack([twist, -away[..., 1], away[..., 0]], dim=-1)
+    tangent = stretch * bone[..., 1:]  # logarithm map of the bone direction at x: the swing rotated by -90 degrees
+    angles = torch.stack([twist, -tangent[..., 1], tangent[..., 0]], dim=-1)
 
     angle = angle[..., None, None].clamp(min=1e-3)
     curve = (1.0 - angle / torch.tan(angle)) / angle**2
-    by_swing = torch.eye(2).to(away) - curve * (away[..., :, None] * away[..., None, :])
-    above = torch.cat([torch.ones_like(twist)[..., None], bone[..., 1:] / (1.0 + bone[..., :1])], dim=-1)
-    return angles, torch.cat([above[..., None, :], torch.cat([-away[..., None], by_swing], dim=-1)], dim=-2)
+    swing_jacobian = torch.eye(2).to(tangent) - curve * (tangent[..., :, None] * tangent[..., None, :])
+    twist_jacobian = torch.cat([torch.ones_like(twist)[..., None], bone[..., 1:] / (1.0 + bone[..., :1])], dim=-1)
+    swing_rows = torch.cat([-tangent[..., None], swing_jacobian], dim=-1)
+    return angles, torch.cat([twist_jacobian[..., None, :], swing_rows], dim=-2)
 
 
 @dataclass(frozen=True)
 class JointLimits:
-    """Of every active joint: the way back from the middle of its range, its axes there (rows: bone, flexion, sideways;
-    coordinates of the parent), and how far each angle may go from there (rad)."""
+    """Limits of every active joint.
+
+    range_centre_to_rest: rotation from the centre of the range to the rest pose.
+    axes: rows (bone, flexion axis, sideways axis) at the centre of the range, in the frame of the parent.
+    half_range_rad: limit of each angle, measured from the centre.
+    """
 
     range_centre_to_rest: Float[Tensor, "j 3 3"]
     axes: Float[Tensor, "j 3 3"]
     half_range_rad: Float[Tensor, "j 3"]
 
     def angles(self, rotations: Float[Tensor, "n j 3 3"]) -> tuple[Float[Tensor, "n j 3"], Float[Tensor, "n j 3 3"]]:
-        """Twist, flexion and sideways swing from the middle (rad), and their derivative by the joint's rotation."""
+        """Return twist, flexion and sideways swing from the centre (rad), and their derivative by the rotation."""
         angles, derivative = swing_twist(
             self.axes @ rotations @ self.range_centre_to_rest @ self.axes.transpose(-1, -2)
         )
         return angles, derivative @ self.axes
 
     def residuals(self, rotations: Float[Tensor, "n j 3 3"]) -> tuple[Float[Tensor, "n j 3"], Float[Tensor, "n j 3 3"]]:
-        """How far each angle is beyond its range, over `LIMIT_STD_RAD` (0 inside), and the derivative of that."""
+        """Return the excess of each angle over `LIMIT_STD_RAD` (0 within the range) and its derivative."""
         angles, derivative = self.angles(rotations)
         excess = angles - torch.minimum(torch.maximum(angles, -self.half_range_rad), self.half_range_rad)
         outside = (excess != 0).to(angles.dtype) / LIMIT_STD_RAD
@@ -111,7 +118,7 @@ class JointLimits:
 
 
 def joint_limits(model: LinearBody) -> JointLimits:
-    """The limits of any body with these joints' names that rests in the A-pose; the root has none."""
+    """Return the limits of a body that rests in the A-pose; the root has none."""
     axes = torch.eye(3, dtype=torch.float64).repeat(len(ACTIVE_JOINTS), 1, 1)
     rest_to_range_centre, half_range_deg = (
         axes.clone(),
@@ -130,26 +137,26 @@ def joint_limits(model: LinearBody) -> JointLimits:
             rest_axes, to_zero, ranges = _ball_joint_frame(model, joint)
         else:
             continue
-        middle = ranges.mean(1).deg2rad()
+        centre_rad = ranges.mean(1).deg2rad()
         half_range_deg[joint] = 0.5 * (ranges[:, 1] - ranges[:, 0])
-        swing = axis_angle_to_matrix(rest_axes[1:].T @ middle[1:])
-        rest_to_range_centre[joint] = swing @ axis_angle_to_matrix(rest_axes[0] * middle[0]) @ to_zero
+        swing = axis_angle_to_matrix(rest_axes[1:].T @ centre_rad[1:])
+        rest_to_range_centre[joint] = swing @ axis_angle_to_matrix(rest_axes[0] * centre_rad[0]) @ to_zero
         axes[joint] = rest_axes @ swing.T
     return JointLimits(rest_to_range_centre.transpose(-1, -2), axes, half_range_deg.deg2rad())
 
 
 def strip_side(name: str) -> str:
-    """A joint's name without its side."""
+    """Return the name of a joint without "Left" or "Right"."""
     return name.removeprefix("Left").removeprefix("Right")
 
 
 def hinge_axes(model: LinearBody, joint: int) -> tuple[Float[Tensor, "3 3"], float]:
-    """Rows (along the bone, flexion axis, sideways) of an elbow or knee, and how far the rest pose bends it (rad)."""
+    """Return the rows (bone, flexion axis, sideways axis) of an elbow or knee and its flexion at rest (rad)."""
     parent, child = model.parents[joint], model.parents.index(joint)
-    upper = normalize(model.joints[joint] - model.joints[parent], dim=0)
-    lower = normalize(model.joints[child] - model.joints[joint], dim=0)
+    upper = normalize(model.joints_m[joint] - model.joints_m[parent], dim=0)
+    lower = normalize(model.joints_m[child] - model.joints_m[joint], dim=0)
     bend = torch.linalg.cross(upper, lower)
-    if strip_side(ACTIVE_JOINTS[joint]) == "Leg":  # nearly straight, so its axis is the body's x: positive bends it
+    if strip_side(ACTIVE_JOINTS[joint]) == "Leg":  # nearly straight, so its flexion axis is the x axis of the body
         flexion, bent = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64), float(bend[0])
     else:
         flexion, bent = normalize(bend, dim=0), float(torch.asin(bend.norm()))
@@ -160,9 +167,9 @@ def hinge_axes(model: LinearBody, joint: int) -> tuple[Float[Tensor, "3 3"], flo
 def _ball_joint_frame(
     model: LinearBody, joint: int
 ) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3 3"], Float[Tensor, "3 2"]]:
-    """Axes at the anatomist's zero, rotation from rest to there, and ranges with their margin (degrees).
+    """Return axes in the anatomical neutral position, the rotation from rest to it, and ranges with margin (degrees).
 
-    The right side mirrors the left: directions along x, and rotations about all axes but the one of flexion.
+    The right side mirrors the left: directions along x, and rotations about all axes except the flexion axis.
     """
     name = ACTIVE_JOINTS[joint]
     joint_type, mirror = strip_side(name), -1.0 if name.startswith("Right") else 1.0
@@ -175,7 +182,7 @@ def _ball_joint_frame(
     to_zero = torch.eye(3, dtype=torch.float64)
     if joint_type in _CHILD_JOINT:
         child = ACTIVE_JOINTS.index(name.replace(joint_type, _CHILD_JOINT[joint_type]))
-        rest = normalize(model.joints[child] - model.joints[joint], dim=0)
+        rest = normalize(model.joints_m[child] - model.joints_m[joint], dim=0)
         across = torch.linalg.cross(rest, bone)
         to_zero = axis_angle_to_matrix(normalize(across, dim=0) * torch.atan2(across.norm(), rest @ bone))
     margin = torch.tensor([-LIMIT_MARGIN_DEG, LIMIT_MARGIN_DEG], dtype=torch.float64)
@@ -186,7 +193,7 @@ def _ball_joint_frame(
 
 
 def _hand_axes(model: LinearBody) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Where the left hand points at rest, and the axis about which it bends towards its palm."""
+    """Return the direction of the left hand at rest, and the axis about which it bends towards its palm."""
     wrist, index, little = (
         torch.tensor(model.landmark_positions_m[name], dtype=torch.float64) for name in ("wrist", "index", "pinky")
     )

@@ -1,7 +1,7 @@
-"""Landmarks as places on the body: where the detector's "left hip" lies on the skeleton.
+"""Positions of the detector's landmarks on the body.
 
-First BlazePose's 33 (Bazarevsky et al., "BlazePose: On-device real-time body pose tracking", 2020, figure 3), then some
-points of each hand, seen by a model of their own (`hands.py`).
+First BlazePose's 33 landmarks (Bazarevsky et al., "BlazePose: On-device real-time body pose tracking", 2020, figure 3),
+then some landmarks of each hand, which another model detects (`pipeline.capture.hand_detector`).
 """
 
 from dataclasses import dataclass
@@ -10,28 +10,30 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody, SkinnedPoints
+from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody
+from pipeline.body.fit.posed_points import SkinnedPoints
 
 POSE_LANDMARK_COUNT = 33
 
 
 @dataclass(frozen=True)
 class Landmark:
-    """One left or central landmark.
+    """A central landmark, or a left one and its mirror image. Its position is in `ParametricBody.landmark_positions_m`.
 
-    `carrier` is the joint it moves with; `anchor` the joint it is measured from (None: the nearest point of the
-    surface; the carrier where a body has no such joint). `noise` scales the detector's usual error. Where it lies is
-    told by each body (`ParametricBody.landmark_positions_m`).
+    indices: of the left and the right landmark.
+    parent_joint: the joint that it moves with.
+    reference_joint: the joint from which its offset is measured; None: the nearest vertex. Bodies without this joint
+        use `parent_joint`.
+    std_ratio: standard deviation of its detection over the typical one.
     """
 
     name: str
     indices: tuple[int, ...]
-    carrier: str
-    anchor: str | None
-    noise: float
+    parent_joint: str
+    reference_joint: str | None
+    std_ratio: float
 
 
-# The right landmark mirrors the left one: x changes sign, "Left" becomes "Right".
 LANDMARKS = (
     Landmark("nose", (0,), "Head", None, 0.8),
     Landmark("eye_inner", (1, 4), "Head", None, 0.8),
@@ -59,10 +61,10 @@ LANDMARKS = (
 LANDMARK_COUNT = 41
 
 HAND_LANDMARKS = (0, 2, 5, 17)
-"""The points of a hand that follow the pose's landmarks, left and right in turn: those that fingers do not move."""
+"""Hand landmarks used after the pose landmarks, left and right alternating: those that finger flexion does not move."""
 
 LANDMARK_OFFSET_COUNT = 3 * len(LANDMARKS)
-"""Numbers that shift the landmarks on the body for one video: x, y, z a `Landmark`, mirrored for the right one."""
+"""Offsets of the landmarks on the body for one recording: x, y, z for each `Landmark`, mirrored for the right one."""
 
 LEFT_RIGHT_PAIRS = tuple(landmark.indices for landmark in LANDMARKS if len(landmark.indices) == 2)
 
@@ -71,11 +73,11 @@ SWAP_PAIR_GROUPS = {
     "legs": tuple(pair for pair in LEFT_RIGHT_PAIRS if 25 <= pair[0] < POSE_LANDMARK_COUNT),
     "whole body": LEFT_RIGHT_PAIRS,
 }
-"""Pairs that the detector confuses together."""
+"""Pairs of landmarks that the detector swaps together."""
 
 
 def mirror_permutation(pairs: tuple[tuple[int, ...], ...]) -> list[int]:
-    """Order of the landmarks with left and right exchanged in the given pairs."""
+    """Return the order of the landmarks with left and right swapped in these pairs."""
     order = list(range(LANDMARK_COUNT))
     for left, right in pairs:
         order[left], order[right] = right, left
@@ -83,60 +85,66 @@ def mirror_permutation(pairs: tuple[tuple[int, ...], ...]) -> list[int]:
 
 
 def landmark_std_ratio() -> Float[Tensor, "l"]:
-    """Each landmark's usual error relative to the detector's typical one."""
-    noise = torch.ones(LANDMARK_COUNT, dtype=torch.float64)
+    """Return the standard deviation of each landmark over the typical one."""
+    std_ratio = torch.ones(LANDMARK_COUNT, dtype=torch.float64)
     for landmark in LANDMARKS:
-        noise[list(landmark.indices)] = landmark.noise
-    return noise
+        std_ratio[list(landmark.indices)] = landmark.std_ratio
+    return std_ratio
 
 
 @dataclass(frozen=True)
 class LandmarkRegressor:
-    """Landmarks as a joint or a vertex each, plus a fixed shift; made once, on the default shape."""
+    """Each landmark as a joint or vertex of the body plus a constant offset.
 
-    anchor_joint: tuple[int | None, ...]
-    anchor_vertex: tuple[int | None, ...]
-    shift_m: Float[Tensor, "l 3"]
-    carrier: Float[Tensor, "l j"]
+    reference_joint, reference_vertex: None where the other one is used.
+    offset_jacobian: derivative of the positions with respect to the landmark offsets.
+    """
+
+    reference_joint: tuple[int | None, ...]
+    reference_vertex: tuple[int | None, ...]
+    offset_m: Float[Tensor, "l 3"]
+    skin_weights: Float[Tensor, "l j"]
     offset_jacobian: Float[Tensor, "l 3 o"]
 
     def points(self, model: LinearBody, landmark_offsets_m: Float[Tensor, "o"]) -> SkinnedPoints:
-        """The landmarks on a rest body; the shape axis is the body's shape followed by the offsets."""
-        places, derivatives = [], []
-        for joint, vertex in zip(self.anchor_joint, self.anchor_vertex, strict=True):
+        """Return the landmarks on a rest body; their shape axis is body shape, then landmark offsets."""
+        positions, derivatives = [], []
+        for joint, vertex in zip(self.reference_joint, self.reference_vertex, strict=True):
             if joint is not None:
-                places.append(model.full_joints[joint])
+                positions.append(model.full_joints_m[joint])
                 derivatives.append(model.full_joints_shape_jacobian[joint])
             else:
-                places.append(model.vertices[vertex])
+                positions.append(model.vertices_m[vertex])
                 derivatives.append(model.vertices_shape_jacobian[vertex])
-        rest = torch.stack(places) + self.shift_m + self.offset_jacobian @ landmark_offsets_m
+        rest = torch.stack(positions) + self.offset_m + self.offset_jacobian @ landmark_offsets_m
         shape_jacobian = torch.cat([torch.stack(derivatives), self.offset_jacobian], dim=-1)
-        return SkinnedPoints(rest[None], self.carrier[None], shape_jacobian[None])
+        return SkinnedPoints(rest[None], self.skin_weights[None], shape_jacobian[None])
 
 
 def landmark_regressor(default: LinearBody) -> LandmarkRegressor:
-    """Tie a body's landmark places to joints and vertices of its default shape."""
+    """Return the regressor of a body, from the landmark positions on its default shape."""
     joints: list[int | None] = [None] * LANDMARK_COUNT
     vertices: list[int | None] = [None] * LANDMARK_COUNT
-    shift = torch.zeros(LANDMARK_COUNT, 3, dtype=torch.float64)
-    carrier = torch.zeros(LANDMARK_COUNT, len(ACTIVE_JOINTS), dtype=torch.float64)
+    offset = torch.zeros(LANDMARK_COUNT, 3, dtype=torch.float64)
+    skin_weights = torch.zeros(LANDMARK_COUNT, len(ACTIVE_JOINTS), dtype=torch.float64)
     offset_jacobian = torch.zeros(LANDMARK_COUNT, 3, LANDMARK_OFFSET_COUNT, dtype=torch.float64)
     for row, landmark in enumerate(LANDMARKS):
         for side, index in enumerate(landmark.indices):
             mirror = torch.tensor([-1.0 if side else 1.0, 1.0, 1.0], dtype=torch.float64)
-            place = torch.tensor(default.landmark_positions_m[landmark.name], dtype=torch.float64) * mirror
-            if landmark.anchor is None:
-                vertices[index] = int((default.vertices - place).norm(dim=1).argmin())
-                anchor = default.vertices[vertices[index]]
+            position = torch.tensor(default.landmark_positions_m[landmark.name], dtype=torch.float64) * mirror
+            parent_joint = _on_side(landmark.parent_joint, side)
+            if landmark.reference_joint is None:
+                vertices[index] = int((default.vertices_m - position).norm(dim=1).argmin())
+                reference = default.vertices_m[vertices[index]]
             else:
-                carrier_index = default.joint_index_by_name[_on_side(landmark.carrier, side)]
-                joints[index] = default.joint_index_by_name.get(_on_side(landmark.anchor, side), carrier_index)
-                anchor = default.full_joints[joints[index]]
-            shift[index] = place - anchor
-            carrier[index, ACTIVE_JOINTS.index(_on_side(landmark.carrier, side))] = 1.0
+                joints[index] = default.joint_index_by_name.get(
+                    _on_side(landmark.reference_joint, side), default.joint_index_by_name[parent_joint]
+                )
+                reference = default.full_joints_m[joints[index]]
+            offset[index] = position - reference
+            skin_weights[index, ACTIVE_JOINTS.index(parent_joint)] = 1.0
             offset_jacobian[index, :, 3 * row : 3 * row + 3] = torch.diag(mirror)
-    return LandmarkRegressor(tuple(joints), tuple(vertices), shift, carrier, offset_jacobian)
+    return LandmarkRegressor(tuple(joints), tuple(vertices), offset, skin_weights, offset_jacobian)
 
 
 def _on_side(name: str, side: int) -> str:

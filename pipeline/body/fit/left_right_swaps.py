@@ -1,17 +1,17 @@
-"""Landmarks whose left and right the detector took for each other, found by what cannot happen in time.
+"""Detection and correction of left-right swaps of the landmark detector.
 
-A person does not turn by half a circle between two frames, and a limb does not jump to where the other one was. Both
-are decided by dynamic programming over two labels a frame (as found, exchanged), so that a whole run of wrong frames is
-seen by its two ends.
+People do not turn by 180 degrees between two frames, and a limb does not jump to the position of the other one. Both
+are decided by dynamic programming over two labels of each frame (as detected, swapped), so that the ends of a run of
+swapped frames reveal all of it.
 """
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
-from pipeline.body.fit.energy import Observations
 from pipeline.body.fit.initialisation import facing_yaw_rad, has_torso_landmarks, torso_rotations
 from pipeline.body.fit.landmark_regressor import (
     LEFT_RIGHT_PAIRS,
@@ -19,40 +19,54 @@ from pipeline.body.fit.landmark_regressor import (
     SWAP_PAIR_GROUPS,
     mirror_permutation,
 )
+from pipeline.body.fit.state import Observations
 
 SWAP_COST = 0.25
-"""What it takes to believe that a frame is exchanged; the costs below are counted against it."""
+"""Cost of labelling a frame as swapped; the costs below are relative to it."""
 
 MIN_INTERVAL_S = 0.2
-"""Frames up to this far apart count alike: what changes between them is mostly the detector's noise. In longer gaps
-people move in proportion to the time."""
+"""Minimum interval that a change is divided by: in shorter ones changes are mostly noise of the detector."""
 
 YAW_CHANGE_COST = 2.0
 FREE_YAW_CHANGE_RAD = 0.35
-"""Radians of turning in a step of `MIN_INTERVAL_S` that cost nothing."""
+"""Costs of a change of yaw: `YAW_CHANGE_COST` for each radian above `FREE_YAW_CHANGE_RAD` in `MIN_INTERVAL_S`."""
 
 LANDMARK_JUMP_COST = 1.5
-"""For limbs: cost of moving by the size of the torso in a step of `MIN_INTERVAL_S`, mean over the limb's landmarks."""
+"""Cost of a limb that moves by the size of the torso in `MIN_INTERVAL_S`, mean over its landmarks."""
 
 WRONG_SIDE_COST = 1.0
 WRONG_SIDE_DISTANCE_M = 0.15
-"""For limbs: cost of lying this far on the wrong side of the body (left knee right of the right one)."""
+"""Cost of a limb at this distance on the wrong side of the body (left knee to the right of the right one)."""
 
 CAMERA_TO_Y_UP = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
-"""From camera axes (y down, z away) to such as `facing_yaw_rad` reads: y up, z towards the viewer."""
+"""From camera axes (y down, z away) to those of `facing_yaw_rad` (y up, z towards the viewer)."""
+
+
+class LimbPairs(NamedTuple):
+    """Left-right pairs of landmark indices of arms or legs.
+
+    swapped: pairs that are swapped together.
+    order_pair: the pair whose order is compared with that of `torso_pair`.
+    """
+
+    swapped: tuple[tuple[int, ...], ...]
+    order_pair: tuple[int, int]
+    torso_pair: tuple[int, int]
+
 
 LIMB_SWAP_PAIRS = {
-    "arms": (SWAP_PAIR_GROUPS["arms"], (13, 14), (11, 12)),
-    "legs": (SWAP_PAIR_GROUPS["legs"], (25, 26), (23, 24)),
+    "arms": LimbPairs(SWAP_PAIR_GROUPS["arms"], (13, 14), (11, 12)),
+    "legs": LimbPairs(SWAP_PAIR_GROUPS["legs"], (25, 26), (23, 24)),
 }
-"""Pairs that are exchanged together, the pair whose order tells, and the pair of the torso that it is compared with."""
 
 
 def viterbi_two_labels(
     unary: Float[np.ndarray, "n 2"], same: Float[np.ndarray, "k"], other: Float[np.ndarray, "k"]
 ) -> Bool[np.ndarray, "n"]:
-    """Cheapest sequence of labels (Viterbi): `unary` costs a frame, `same` and `other` cost keeping or changing the
-    label between neighbours. True where label 1 wins."""
+    """Return the cheapest sequence of two labels (Viterbi); True where it has label 1.
+
+    unary: cost of each label in each frame. same, other: cost of keeping and of changing the label between neighbours.
+    """
     cost = unary[0]
     back = np.zeros(unary.shape, dtype=np.int64)
     for step in range(1, len(unary)):
@@ -70,10 +84,10 @@ def viterbi_two_labels(
 def detect_body_swaps(
     observations: Observations, rest_landmarks_m: Float[torch.Tensor, "l 3"]
 ) -> Bool[np.ndarray, "n"]:
-    """Frames in which the whole person was taken for one who faces the other way, by the continuity of turning.
+    """Return the frames in which the detector swapped left and right of the whole body.
 
-    Exchanged sides with mirrored depths turn a yaw about the camera's upright axis into pi minus the yaw: a jump in
-    front and back views. In a side view the two agree, and nothing tells them apart.
+    A swap with mirrored depth changes a yaw about the vertical axis of the camera into pi minus the yaw: a jump in
+    front and back views. In side views both are equal, so the neighbouring frames decide.
     """
     rows = np.flatnonzero(has_torso_landmarks(observations))
     if len(rows) == 0:
@@ -88,7 +102,7 @@ def detect_body_swaps(
 
 
 def detect_limb_swaps(observations: Observations, limb: str) -> Bool[np.ndarray, "n"]:
-    """Frames in which arms or legs are exchanged, by jumps in the image and by the side they lie on."""
+    """Return the frames in which the detector swapped the arms or the legs, from jumps in the image and wrong sides."""
     pairs, order_pair, torso = LIMB_SWAP_PAIRS[limb]
     rows = np.flatnonzero(has_torso_landmarks(observations))
     if len(rows) == 0:
@@ -109,10 +123,9 @@ def detect_limb_swaps(observations: Observations, limb: str) -> Bool[np.ndarray,
 
 
 def swap_body_left_right(observations: Observations, left_right_swapped: Bool[np.ndarray, "n"]) -> Observations:
-    """All left and right landmarks trade places in some frames; their 3D positions are mirrored in depth.
+    """Swap all left and right landmarks in the selected frames, and mirror their 3D positions in depth.
 
-    A picture does not tell front from back: the same pixels with left and right exchanged belong to the person seen
-    from the other side, whose depths are opposite.
+    With left and right swapped, the same pixels are those of the person seen from behind, with opposite depths.
     """
     to_camera = _camera_rotation(observations)
     mirror = to_camera.T @ torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)) @ to_camera
@@ -125,8 +138,8 @@ def swap_body_left_right(observations: Observations, left_right_swapped: Bool[np
 def swap_limb_left_right(
     observations: Observations, left_right_swapped: Bool[np.ndarray, "n"], limb: str
 ) -> Observations:
-    """The landmarks of arms or legs trade places in some frames."""
-    return _swap_landmarks(observations, left_right_swapped, LIMB_SWAP_PAIRS[limb][0])
+    """Swap the landmarks of arms or legs in the selected frames."""
+    return _swap_landmarks(observations, left_right_swapped, LIMB_SWAP_PAIRS[limb].swapped)
 
 
 def _swap_landmarks(
@@ -153,14 +166,14 @@ def _camera_rotation(observations: Observations) -> Float[torch.Tensor, "3 3"]:
 
 
 def _time_steps(observations: Observations, rows: Int[np.ndarray, "k"]) -> Float[np.ndarray, "t"]:
-    """Time from each of some frames to the next, in steps of `MIN_INTERVAL_S`, at least one."""
+    """Return the interval between successive rows in units of `MIN_INTERVAL_S`, at least 1."""
     return np.maximum(np.diff(observations.time_s.numpy()[rows]) / MIN_INTERVAL_S, 1.0)
 
 
 def _scatter_to_frames(labels: Bool[np.ndarray, "k"], rows: np.ndarray, frames: int) -> Bool[np.ndarray, "n"]:
-    everywhere = np.zeros(frames, dtype=bool)
-    everywhere[rows] = labels
-    return everywhere
+    scattered = np.zeros(frames, dtype=bool)
+    scattered[rows] = labels
+    return scattered
 
 
 def _wrap_angle(angle_rad: np.ndarray) -> np.ndarray:

@@ -1,11 +1,15 @@
-"""Levenberg-Marquardt on all frames at once: a dense block a frame, neighbours in time coupled, few shared numbers.
+"""Levenberg-Marquardt on all frames at once.
 
-Letters: n frames, p numbers a frame, g shared numbers. The normal matrix is banded (a frame's block, and diagonals that
-couple it with the next two frames) with a border for the shared numbers, so a step costs O(n p^3).
+The normal matrix is banded over time (a dense block for each frame, diagonals that couple it with the next two frames)
+and bordered by the shared parameters, so a step costs O(n p^3). Damping after Marquardt, "An algorithm for
+least-squares estimation of nonlinear parameters", 1963.
+
+Dimensions: n frames, p parameters of a frame, g shared parameters, r residuals of a frame.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -22,13 +26,15 @@ DAMPING_LIMIT = 1e6
 
 @dataclass
 class NormalEquations:
-    """Sums of w J^T J and w J^T r, and the robust cost; float64. `next_frame_coupling[t]` couples frames t and t +
-    1.
+    """Sums of w J^T J and w J^T r, and the robust cost; float64.
+
+    border: products of frame and shared parameters.
+    next_frame_coupling, second_next_frame_coupling: row t is the diagonal block that couples frame t with t + 1, t + 2.
     """
 
-    frame: Float[Tensor, "n p p"]
+    frame_hessian: Float[Tensor, "n p p"]
     border: Float[Tensor, "n p g"]
-    shared: Float[Tensor, "g g"]
+    shared_hessian: Float[Tensor, "g g"]
     frame_gradient: Float[Tensor, "n p"]
     shared_gradient: Float[Tensor, "g"]
     next_frame_coupling: Float[Tensor, "n p"]
@@ -36,62 +42,64 @@ class NormalEquations:
     cost: float = 0.0
 
     @classmethod
-    def zeros(cls, frames: int, parameters: int, shared: int) -> "NormalEquations":
-        """Nothing known yet."""
+    def zeros(cls, frame_count: int, parameters_per_frame: int, shared_count: int) -> "NormalEquations":
+        """Return an empty system."""
 
-        def empty(*size: int) -> Tensor:
-            return torch.zeros(*size, dtype=torch.float64)
+        zeros = partial(torch.zeros, dtype=torch.float64)
 
         return cls(
-            frame=empty(frames, parameters, parameters),
-            border=empty(frames, parameters, shared),
-            shared=empty(shared, shared),
-            frame_gradient=empty(frames, parameters),
-            shared_gradient=empty(shared),
-            next_frame_coupling=empty(frames, parameters),
-            second_next_frame_coupling=empty(frames, parameters),
+            frame_hessian=zeros(frame_count, parameters_per_frame, parameters_per_frame),
+            border=zeros(frame_count, parameters_per_frame, shared_count),
+            shared_hessian=zeros(shared_count, shared_count),
+            frame_gradient=zeros(frame_count, parameters_per_frame),
+            shared_gradient=zeros(shared_count),
+            next_frame_coupling=zeros(frame_count, parameters_per_frame),
+            second_next_frame_coupling=zeros(frame_count, parameters_per_frame),
         )
 
-    def add(
+    def accumulate(
         self,
         frame_jacobian: Float[Tensor, "n r p"],
         shared_jacobian: Float[Tensor, "n r g"],
         residual: Float[Tensor, "n r"],
         weight: Float[Tensor, "n r"],
     ) -> None:
-        """Accumulate rows that concern one frame each and the shared numbers; the cost is the caller's."""
+        """Add residuals that depend on the parameters of one frame and the shared ones. Their cost is not added."""
         weighted = frame_jacobian * weight[..., None]
         weighted_shared = (shared_jacobian * weight[..., None]).flatten(0, 1)
-        self.frame += weighted.transpose(1, 2) @ frame_jacobian
+        self.frame_hessian += weighted.transpose(1, 2) @ frame_jacobian
         self.border += weighted.transpose(1, 2) @ shared_jacobian
-        self.shared += weighted_shared.T @ shared_jacobian.flatten(0, 1)
+        self.shared_hessian += weighted_shared.T @ shared_jacobian.flatten(0, 1)
         self.frame_gradient += (weighted * residual[..., None]).sum(1)
         self.shared_gradient += weighted_shared.T @ residual.flatten()
 
     def fix_parameters(self, free: Bool[Tensor, "g"]) -> None:
-        """Take shared numbers that are not free out of the system: their step becomes zero."""
+        """Remove the shared parameters that are not free from the system: their step becomes zero."""
         self.border[:, :, ~free] = 0.0
-        self.shared[~free] = 0.0
-        self.shared[:, ~free] = 0.0
-        self.shared[~free, ~free] = 1.0
+        self.shared_hessian[~free] = 0.0
+        self.shared_hessian[:, ~free] = 0.0
+        self.shared_hessian[~free, ~free] = 1.0
         self.shared_gradient[~free] = 0.0
 
 
 def robust_weights(
     system: NormalEquations, squared: Float[Tensor, "*n"], cutoff: float, share: Float[Tensor, "*n"] | float = 1.0
 ) -> Float[Tensor, "*n"]:
-    """Geman-McClure weights rho'(r) for squared residuals; their cost is added to the system."""
+    """Return the Geman-McClure weights rho'(r) of squared residuals, and add their cost to the system.
+
+    squared: squared residuals in standard deviations. cutoff: in standard deviations. share: factor on the cost.
+    """
     relative = 1.0 + squared / cutoff**2
     system.cost += float((share * squared / relative).sum())
     return relative**-2
 
 
 def _banded_factor(system: NormalEquations, damping: float) -> np.ndarray:
-    """Lower banded Cholesky factor of the frames' part, its diagonal raised by the factor 1 + damping."""
+    """Return the lower banded Cholesky factor of the frames' part, with the diagonal multiplied by 1 + damping."""
     n, p = system.frame_gradient.shape
     band = np.zeros((2 * p + 1, n, p))
     rows, columns = np.tril_indices(p)
-    band[rows - columns, :, columns] = system.frame[:, rows, columns].numpy().T
+    band[rows - columns, :, columns] = system.frame_hessian[:, rows, columns].numpy().T
     band[0] = band[0] * (1.0 + damping) + 1e-9
     band[p] = system.next_frame_coupling.numpy()
     band[2 * p] = system.second_next_frame_coupling.numpy()
@@ -101,18 +109,22 @@ def _banded_factor(system: NormalEquations, damping: float) -> np.ndarray:
 def _schur_complement(
     system: NormalEquations, factor: np.ndarray, damping: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(matrix of the shared numbers after the frames are eliminated, border solved, frames' gradient solved)."""
+    """Eliminate the frames; return the reduced matrix, the solved border and the solved frame gradient."""
     n, p = system.frame_gradient.shape
     border = system.border.reshape(n * p, -1).numpy()
     right = np.concatenate([border, system.frame_gradient.reshape(-1, 1).numpy()], axis=1)
     solved = cho_solve_banded((factor, True), right, check_finite=False)
-    shared = system.shared.numpy().copy()
+    shared = system.shared_hessian.numpy().copy()
     shared[np.diag_indices_from(shared)] *= 1.0 + damping
     return shared - border.T @ solved[:, :-1], solved[:, :-1], solved[:, -1]
 
 
 def solve(system: NormalEquations, damping: float) -> tuple[Float[Tensor, "n p"], Float[Tensor, "g"]]:
-    """The step that lowers the quadratic model: frames' numbers, shared numbers."""
+    """Return the damped step of the frame parameters and of the shared parameters.
+
+    Raises:
+        numpy.linalg.LinAlgError: the damped normal matrix is not positive definite.
+    """
     n, p = system.frame_gradient.shape
     factor = _banded_factor(system, damping)
     if len(system.shared_gradient) == 0:
@@ -127,7 +139,7 @@ def solve(system: NormalEquations, damping: float) -> tuple[Float[Tensor, "n p"]
 
 
 def shared_covariance(system: NormalEquations) -> Float[np.ndarray, "g g"]:
-    """Covariance of the shared numbers with the frames' numbers marginalised out, for residuals of unit variance."""
+    """Return the covariance of the shared parameters, marginalised over the frames, for residuals of unit variance."""
     matrix, _, _ = _schur_complement(system, _banded_factor(system, 0.0), 0.0)
     return np.linalg.inv(matrix)
 
@@ -142,10 +154,10 @@ def minimise(
     iterations: int,
     tolerance: float = 1e-3,
 ) -> tuple[State, NormalEquations]:
-    """Levenberg-Marquardt; ends when a step lowers the cost by less than `tolerance` of it.
+    """Minimise an energy until a step lowers its cost by less than `tolerance`, relative to the cost.
 
-    evaluate: the normal equations at a state. retract: the state moved by (frames' step, shared step).
-    Returns the best state and its normal equations.
+    evaluate: returns the normal equations at a state. retract: returns the state after (frame step, shared step).
+    Returns the state with the lowest cost and its normal equations.
     """
     system, damping = evaluate(state), DAMPING_START
     for _ in range(iterations):

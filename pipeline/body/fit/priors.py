@@ -1,7 +1,9 @@
-"""What is known before any picture: how joints bend, how people move, how tall and how shaped they are.
+"""Priors on pose, motion and shape.
 
-Residuals are in standard deviations. Angles are rotation vectors of the local rotation, resolved along each joint's own
-axes (rows of `PosePrior.axes`): for hinges (twist along the bone, flexion, sideways), else the body's x, y, z.
+Residuals are in standard deviations. Angles are rotation vectors of the local rotation in the axes of each joint (rows
+of `PosePrior.axes`): (twist about the bone, flexion, sideways) for hinges, x, y, z of the body for others.
+
+Dimensions: n frames, j active joints, p = 3 j + 3 parameters of a frame, t = n - 2 inner frames, s shape parameters.
 """
 
 from collections.abc import Sequence
@@ -17,29 +19,29 @@ from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody
 from pipeline.geometry.rotation import matrix_to_quaternion, quaternion_to_axis_angle
 
 REFERENCE_INTERVAL_S = 1.0 / 30.0
-"""Interval that the motion prior's deviations are given for."""
+"""Frame interval to which the standard deviations of the motion prior refer."""
 
 MOTION_STD_RAD, MOTION_ROOT_STD = 0.03, 0.003
-"""How much joints turn faster and the root moves faster (`fit_place`) from frame to frame, for the fastest people."""
+"""Change of the velocity of joints (rad per frame) and root (perspective coordinates) between frames, for the fastest
+people."""
 
 MIN_MOTION_RATIO = 0.15
-"""The calmest that a joint is believed to be, as a share of that."""
+"""Lower bound of an estimated standard deviation, relative to the ones above."""
 
 MOTION_LAG = 2
-"""Frames over which a motion is told from noise."""
+"""Larger of the two frame intervals whose comparison separates motion from noise."""
 
 MOTION_STD_FACTOR = 2.0
-"""People do not move evenly: more is allowed than was seen."""
+"""Factor on the estimated standard deviation, because motion is not uniform over time."""
 
 UNCONSTRAINED_RAD = 10.0
 
 LOOSE_STD_RAD, STATIC_SPREAD_RAD = 0.25, 0.25
-"""Axes with at least this deviation, whose angles in a recording spread less than that, follow its mean pose."""
+"""Axes with at least the first standard deviation, whose spread in a recording is below the second, are tied to its
+mean pose."""
 
 MIN_SPREAD_RAD, SPREAD_FACTOR = 0.02, 3.0
-"""The least that any joint moves, and how much more than the spread seen is allowed."""
-
-# (deviation about the three axes, rad), symmetric about the A-pose
+"""Lower bound of the spread of an angle, and factor on it."""
 BALL_JOINT_STD_RAD = {
     "Hips": (UNCONSTRAINED_RAD, UNCONSTRAINED_RAD, UNCONSTRAINED_RAD),
     "Spine": (0.15, 0.10, 0.10),
@@ -54,8 +56,9 @@ BALL_JOINT_STD_RAD = {
     "Foot": (0.375, 0.15, 0.15),
     "ToeBase": (0.12, 0.04, 0.04),
 }
-# (deviation of twist, flexion, sideways)
+"""Standard deviations about x, y, z of the body, relative to the A-pose."""
 HINGE_JOINT_STD_RAD = {"ForeArm": (0.75, 1.05, 0.05), "Leg": (0.12, 1.05, 0.05)}
+"""Standard deviations of twist, flexion, sideways."""
 
 PHENOTYPE_STD = {
     "gender": 0.35,
@@ -71,10 +74,10 @@ PHENOTYPE_STD = {
     "caucasian": 0.15,
 }
 LOCAL_CHANGE_STD = 0.3
-"""For shape numbers that are no phenotypes: local changes about 0."""
+"""Standard deviation of shape parameters that are no phenotypes: local changes about 0."""
 
 BETA_STD = 1.0
-"""For the betas of SMPL, which are principal components scaled to unit variance."""
+"""Standard deviation of SMPL betas, which are principal components scaled to unit variance."""
 
 BETA_RANGE = (-5.0, 5.0)
 PHENOTYPE_RANGE = (0.02, 0.98)
@@ -85,7 +88,7 @@ SCALE_RANGE = (0.6, 1.4)
 
 @dataclass(frozen=True)
 class ShapePrior:
-    """Expected shape, its standard deviation and its allowed range."""
+    """Mean, standard deviation and range of the shape parameters."""
 
     mean: Float[Tensor, "s"]
     std: Float[Tensor, "s"]
@@ -94,7 +97,7 @@ class ShapePrior:
 
 
 def shape_prior(names: Sequence[str], defaults: Float[Tensor, "s"]) -> ShapePrior:
-    """The prior for a body's shape numbers, by their names; unknown names count as local changes."""
+    """Return the prior of a body's shape parameters by their names; unknown names count as local changes."""
     known = {name: (std, *PHENOTYPE_RANGE) for name, std in PHENOTYPE_STD.items()}
     known[SCALE] = (SCALE_STD, *SCALE_RANGE)
     known.update({name: (BETA_STD, *BETA_RANGE) for name in names if name.startswith("beta_")})
@@ -104,7 +107,7 @@ def shape_prior(names: Sequence[str], defaults: Float[Tensor, "s"]) -> ShapePrio
 
 @dataclass(frozen=True)
 class PosePrior:
-    """Axes (rows), expected angles with their deviations, and limits of every active joint."""
+    """Axes (rows), mean angles with standard deviations, and limits of every active joint."""
 
     axes: Float[Tensor, "j 3 3"]
     mean_rad: Float[Tensor, "j 3"]
@@ -113,7 +116,7 @@ class PosePrior:
 
 
 def pose_prior(model: LinearBody) -> PosePrior:
-    """The prior for a skeleton's rest pose: hinge axes and limits follow from its joints."""
+    """Return the prior of a body; hinge axes and limits depend on its rest pose."""
     axes = torch.eye(3, dtype=torch.float64).repeat(len(ACTIVE_JOINTS), 1, 1)
     std = torch.zeros(len(ACTIVE_JOINTS), 3, dtype=torch.float64)
     for joint, joint_type in enumerate(map(strip_side, ACTIVE_JOINTS)):
@@ -124,10 +127,10 @@ def pose_prior(model: LinearBody) -> PosePrior:
 
 
 def adapt_pose_prior(prior: PosePrior, rotations: Float[Tensor, "n j 3 3"]) -> PosePrior:
-    """The prior with the joints that a recording hardly moves held near their mean over its n frames.
+    """Return the prior with joints that hardly move in a recording tied to their mean over its n frames.
 
-    A person who turns in one pose is seen from all sides: each side tells what is depth from the others. Only axes
-    that the prior leaves loose take part, and only while they spread less than `STATIC_SPREAD_RAD`.
+    A person who turns in one pose is seen from all sides, which determines the depth of the joints. Only axes with a
+    loose prior and a spread below `STATIC_SPREAD_RAD` are changed.
     """
     angle = (prior.axes @ rotation_to_axis_angle(rotations)[..., None]).squeeze(-1)
     spread = SPREAD_FACTOR * (angle.var(0, correction=0) + MIN_SPREAD_RAD**2).sqrt()
@@ -140,12 +143,12 @@ def adapt_pose_prior(prior: PosePrior, rotations: Float[Tensor, "n j 3 3"]) -> P
 
 
 def rotation_to_axis_angle(rotation: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 3"]:
-    """Rotation vector (rad) of a rotation matrix."""
+    """Return the rotation vector (rad) of a rotation matrix."""
     return quaternion_to_axis_angle(matrix_to_quaternion(rotation))
 
 
 def skew_symmetric(vector: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
-    """[v]x, so that [v]x u = v x u."""
+    """Return [v]x, so that [v]x u = v x u."""
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
     rows = [torch.stack([zero, -z, y], -1), torch.stack([z, zero, -x], -1), torch.stack([-y, x, zero], -1)]
@@ -153,7 +156,7 @@ def skew_symmetric(vector: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
 
 
 def inverse_left_jacobian_so3(vector: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
-    """Derivative of log(exp(delta) exp(vector)) by delta at 0: the inverse left Jacobian of SO(3)."""
+    """Return the inverse left Jacobian of SO(3): the derivative of log(exp(delta) exp(vector)) by delta at 0."""
     angle = vector.norm(dim=-1)[..., None, None].clamp(min=1e-4, max=3.1)
     bracket = skew_symmetric(vector)
     curve = 1.0 / angle**2 - (1.0 + torch.cos(angle)) / (2.0 * angle * torch.sin(angle))
@@ -163,7 +166,7 @@ def inverse_left_jacobian_so3(vector: Float[Tensor, "*n 3"]) -> Float[Tensor, "*
 def pose_residuals(
     prior: PosePrior, rotations: Float[Tensor, "n j 3 3"]
 ) -> tuple[Float[Tensor, "n j 6"], Float[Tensor, "n j 6 3"]]:
-    """Deviations from the expected pose and excess over joint limits, and their derivative by the joint's rotation."""
+    """Return deviations from the mean pose and excess over joint limits, and their derivative by the rotation."""
     vector = rotation_to_axis_angle(rotations)
     angle = (prior.axes @ vector[..., None]).squeeze(-1)
     rotation_jacobian = prior.axes @ inverse_left_jacobian_so3(vector)
@@ -175,10 +178,10 @@ def pose_residuals(
 def acceleration_factors(
     time_s: Float[Tensor, "n"],
 ) -> tuple[Float[Tensor, "t"], Float[Tensor, "t"], Float[Tensor, "t"]]:
-    """For each inner frame: factors on the step before it, the step after it, and on the whole residual.
+    """Return for each inner frame the factors on the step before it, on the step after it, and on the residual.
 
-    Velocities are taken over the true intervals; a change of velocity is allowed in proportion to the root of the time
-    it took (white acceleration), so that dropped frames loosen the coupling.
+    Velocities use the actual frame intervals. The change of velocity grows with the square root of the interval (white
+    noise acceleration), so that dropped frames loosen the coupling.
     """
     interval = torch.diff(time_s).clamp(min=1e-4) / REFERENCE_INTERVAL_S
     before, after = 1.0 / interval[:-1], 1.0 / interval[1:]
@@ -188,7 +191,7 @@ def acceleration_factors(
 def motion_residuals(
     rotations: Float[Tensor, "n j 3 3"], root_perspective: Float[Tensor, "n 3"], time_s: Float[Tensor, "n"]
 ) -> Float[Tensor, "t p"]:
-    """Change of velocity at each inner frame: joint rotations (rad a frame), then `fit_place`.
+    """Return the change of velocity at each inner frame: joint rotations (rad per frame), then perspective coordinates.
 
     To first order its derivative by the rotation steps of frames t - 1, t, t + 1 is (before, -before - after, after).
     """
@@ -199,7 +202,7 @@ def motion_residuals(
 
 
 def default_motion_std(joints: int) -> Float[Tensor, "p"]:
-    """Standard deviations of `motion_residuals` when nothing is known about the motion."""
+    """Return the standard deviations of `motion_residuals` for an unknown motion."""
     std = torch.full((3 * joints + 3,), MOTION_STD_RAD, dtype=torch.float64)
     std[-3:] = MOTION_ROOT_STD
     return std
@@ -208,12 +211,12 @@ def default_motion_std(joints: int) -> Float[Tensor, "p"]:
 def estimate_motion_std(
     rotations: Float[Tensor, "n j 3 3"], root_perspective: Float[Tensor, "n 3"], time_s: Float[Tensor, "n"]
 ) -> Float[Tensor, "p"]:
-    """Standard deviations of `motion_residuals` for the person in this recording, one a joint, from its fitted poses.
+    """Return the standard deviations of `motion_residuals`, one for each joint, estimated from the fitted poses.
 
-    Errors that change from frame to frame look like motion, but do not add up. With k times the interval, the squared
-    residual of white acceleration of variance s^2 under white noise is s^2 + noise / k^3; from k = 1 and
-    `MOTION_LAG` follows s^2. `MOTION_STD_FACTOR` times s is allowed, at least `MIN_MOTION_RATIO` of
-    `default_motion_std`, at most all.
+    Errors that change between frames resemble motion but do not accumulate. At k times the interval, the squared
+    residual of white noise acceleration of variance s^2 with white noise is s^2 + noise / k^3; k = 1 and
+    k = `MOTION_LAG` give s^2.
+    The result is `MOTION_STD_FACTOR` times s, clamped to [`MIN_MOTION_RATIO`, 1] times `default_motion_std`.
     """
     default_std = default_motion_std(rotations.shape[1])
     if len(time_s) < 4 * MOTION_LAG:

@@ -1,7 +1,7 @@
-"""Where the root is, in numbers that do not know the size of the world: (x / z, y / z, log z) in camera axes.
+"""Position of the root in perspective coordinates: (x / z, y / z, log z) in camera axes, z in metres.
 
-A picture does not tell a small person nearby from a tall one far away. In these coordinates a smooth motion is as
-smooth in either world, so that no term of the fit makes the world shrink.
+An image does not determine whether a person is small and near or tall and far. In these coordinates a motion is equally
+smooth at either scale, so that no term of the fit shrinks the world.
 """
 
 import torch
@@ -14,21 +14,21 @@ MINIMUM_DEPTH_M = 0.2
 
 
 def world_to_perspective(root_m: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n 3"]:
-    """Tangents of the viewing angles and logarithm of the depth (m) of world positions; depth is kept positive."""
+    """Return perspective coordinates of world positions; the depth is clamped to `MINIMUM_DEPTH_M`."""
     x, y, depth_m = transform_world_to_camera(root_m, camera).unbind(-1)
     depth_m = depth_m.clamp(min=MINIMUM_DEPTH_M)
     return torch.stack([x / depth_m, y / depth_m, depth_m.log()], dim=-1)
 
 
 def perspective_to_world(root_perspective: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n 3"]:
-    """World positions (m); inverse of `world_to_perspective`."""
+    """Return world positions (m); inverse of `world_to_perspective`."""
     pose = torch.as_tensor(camera.world_to_camera, dtype=root_perspective.dtype)
     ray = torch.cat([root_perspective[:, :2], torch.ones_like(root_perspective[:, :1])], dim=-1)
     return (ray * root_perspective[:, 2:].exp() - pose[:3, 3]) @ pose[:3, :3]
 
 
 def root_jacobian(root_m: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n 3 3"]:
-    """Derivative of the world position by the place."""
+    """Return the derivative of the world position with respect to the perspective coordinates."""
     pose = torch.as_tensor(camera.world_to_camera, dtype=root_m.dtype)
     in_camera = transform_world_to_camera(root_m, camera)
     depth_m, zero = in_camera[:, 2].clamp(min=MINIMUM_DEPTH_M), torch.zeros(len(root_m), dtype=root_m.dtype)

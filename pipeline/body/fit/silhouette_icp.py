@@ -1,8 +1,8 @@
-"""Silhouette terms: points on the body's outline paired with points on the mask's outline (iterated closest points).
+"""Silhouette correspondences: iterative closest points (ICP) between the outlines of the body and of the mask.
 
-The body is drawn into the same small window as the mask, so that both outlines carry the same half-pixel error and it
-cancels. Two kinds of pairs: every point of the body's outline belongs on the mask's outline, and every point of the
-mask's outline wants the body's nearest outline with a similar normal. Outlines inside the body have no pair.
+The body is rasterised into the same small window as the mask, so that both outlines have the same half-pixel error,
+which cancels. Every point of the body outline is matched with the mask outline, and every point of the mask outline
+with the nearest body outline of similar normal. Outlines inside the body are not matched.
 """
 
 from collections.abc import Sequence
@@ -16,36 +16,38 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pipeline.body.fit.camera_parameters import apply_intrinsics_delta
-from pipeline.body.fit.energy import Contour, FitState, Observations
-from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody, pose_skeleton
+from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody
+from pipeline.body.fit.posed_points import pose_skeleton
+from pipeline.body.fit.state import FitState, Observations
+from pipeline.body.fit.terms import Contour
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.skinning import linear_blend_skinning, rigid_transform
 from pipeline.kernels.raster import rasterize
 from pipeline.metrics.images import mask_iou
 
 PERSON_HEIGHT_PX = 240
-"""Height of a person in a matching window, pixels."""
+"""Height of a person in a matching window."""
 
 PAIRS_PER_DIRECTION = 120
-"""Pairs a frame from the body's outline, and as many from the mask's."""
+"""Pairs in a frame from the body outline, and as many from the mask outline."""
 
 FRAME_WEIGHT = 40.0
-"""What all pairs of a frame weigh together: outline points next to each other err alike."""
+"""Sum of the weights of all pairs in a frame: errors of adjacent outline points are correlated."""
 
 MAX_PAIR_DISTANCE_RATIO = 0.10
-"""How far a pair may lie apart, as a share of the person's height."""
+"""Maximum distance of a pair, over the height of the person."""
 
 CLOTHING_WEIGHT = 0.5
-"""Weight of pairs where the mask lies outside the body, as clothes do, against those where the body sticks out."""
+"""Weight of pairs with the mask outside the body, as with clothes, relative to pairs with the body outside the mask."""
 
 HAIR_AND_SHOES_WEIGHT = 0.05
-"""The same on head and feet: hair and shoes add to the outline's height, which must not pass for a person who is
-nearer."""
+"""The same on head and feet: hair and shoes make the silhouette taller, which would move the person to the camera."""
 
 HEAD_AND_FOOT_JOINTS = ("Head", "LeftFoot", "LeftToeBase", "RightFoot", "RightToeBase")
 
 FULL_WEIGHT_IOU_DROP, MIN_WEIGHT_IOU_DROP = 0.05, 0.15
-"""A frame's outlines count fully while its overlap is this near to the median, and hardly when it is that far below."""
+"""Differences of a frame's IoU below the median: up to the first its pairs have full weight, from the second
+`MIN_MASK_WEIGHT`."""
 
 MIN_MASK_WEIGHT = 0.05
 
@@ -54,8 +56,12 @@ SKIN_CHUNK = 32
 
 @dataclass(frozen=True)
 class MaskWindow:
-    """One frame's mask in its matching window: signed distance to the outline (window pixels), its unit gradient, and
-    the outline's pixels (row, column)."""
+    """Mask of one frame in its matching window.
+
+    left_px, top_px: corner of the window in the image. scale: window pixels per image pixel.
+    distance: signed distance to the outline (window pixels, positive outside); normal: its unit gradient (x, y).
+    outline: pixels (row, column) of the outline. person_px: height of the person in window pixels.
+    """
 
     left_px: int
     top_px: int
@@ -68,7 +74,10 @@ class MaskWindow:
 
 
 def crop_mask_window(mask: UInt8[np.ndarray, "h w"]) -> MaskWindow | None:
-    """Cut the person out of a mask and shrink it to `PERSON_HEIGHT_PX`; None when the mask is empty."""
+    """Crop a mask to the person and downscale it to `PERSON_HEIGHT_PX`; None if the mask is empty.
+
+    mask: 0 to 255; the person is above 127.
+    """
     rows, columns = np.flatnonzero((mask > 127).any(1)), np.flatnonzero((mask > 127).any(0))
     if len(rows) == 0:
         return None
@@ -86,15 +95,15 @@ def crop_mask_window(mask: UInt8[np.ndarray, "h w"]) -> MaskWindow | None:
 
 
 def signed_distance(inside: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Distance in pixels to the outline between pixel centres: positive outside, -0.5 on the innermost row."""
+    """Return the distance to the outline between pixel centres (px): positive outside, -0.5 in boundary pixels."""
     return np.where(inside, 0.5 - distance_px(inside), distance_px(~inside) - 0.5).astype(np.float32)
 
 
 def distance_px(area: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Euclidean distance in pixels of every pixel in an area to the nearest pixel outside; 0 outside.
+    """Return the Euclidean distance in pixels from every pixel inside to the nearest pixel outside; 0 outside.
 
-    Runs without Intel IPP, which OpenCV uses for small images or a single thread: IPP rounds differently when its
-    output is not aligned to 32 bytes, and malloc aligns to 16.
+    Runs without Intel IPP, which OpenCV uses for small images or a single thread: IPP rounds differently if its output
+    is not aligned to 32 bytes, and malloc aligns to 16.
     """
     with_ipp = cv2.ipp.useIPP()
     cv2.ipp.setUseIPP(False)
@@ -105,14 +114,14 @@ def distance_px(area: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
 
 
 def outline_pixels(inside: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "q 2"]:
-    """(row, column) of inside pixels with an outside neighbour; the picture's border is no outline."""
+    """Return (row, column) of the inside pixels with an outside neighbour; the image border is no outline."""
     padded = np.pad(inside, 1, mode="edge")
     surrounded = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
     return np.argwhere(inside & ~surrounded)
 
 
 def outward_normals(distance: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 2"]:
-    """Unit gradient (x, y) of a signed distance, smoothed over a few pixels."""
+    """Return the smoothed unit gradient (x, y) of a signed distance."""
     smooth = cv2.GaussianBlur(distance, (0, 0), 1.5)
     across, down = cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)
     # cv2.magnitude uses Intel IPP, whose rounding depends on the memory alignment of its output.
@@ -121,19 +130,19 @@ def outward_normals(distance: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h 
 
 
 def posed_vertices(model: LinearBody, state: FitState) -> Float[Tensor, "n v 3"]:
-    """World vertices (float32) of the state's body in every frame."""
-    posed = model.moved(state.shape)
+    """Return the world vertices (m, float32) of the body in every frame."""
+    posed = model.at_shape(state.shape)
     skeleton = pose_skeleton(posed, state.rotations, state.root_m)
-    moved = (skeleton.rotation @ posed.joints[:, :, None]).squeeze(-1)
-    transforms = rigid_transform(skeleton.rotation, skeleton.position - moved).float()
-    vertices, weights = posed.vertices.float(), posed.weights.float()
+    rotated_joints_m = (skeleton.rotation @ posed.joints_m[:, :, None]).squeeze(-1)
+    transforms = rigid_transform(skeleton.rotation, skeleton.position_m - rotated_joints_m).float()
+    vertices, weights = posed.vertices_m.float(), posed.skin_weights.float()
     chunks = [linear_blend_skinning(vertices, weights, part) for part in transforms.split(SKIN_CHUNK)]
     return torch.cat(chunks)
 
 
 @dataclass(frozen=True)
 class BodyRaster:
-    """The body drawn into a window: which face each pixel shows, and where on it."""
+    """The body rasterised in a window: face of each pixel (-1: none) and barycentric coordinates."""
 
     face_id: Int[np.ndarray, "h w"]
     barycentric: Float[np.ndarray, "h w 3"]
@@ -142,7 +151,10 @@ class BodyRaster:
 def rasterise_in_window(
     vertices_world: Float[Tensor, "v 3"], faces: Int[Tensor, "f 3"], camera: Camera, window: MaskWindow
 ) -> BodyRaster:
-    """Rasterise a posed body in a window's pixels."""
+    """Rasterise a posed body in the pixels of a window.
+
+    vertices_world: metres.
+    """
     vertices_px, depth_m = project(vertices_world, camera)
     corner = vertices_px.new_tensor([window.left_px, window.top_px])
     height, width = window.mask.shape
@@ -152,7 +164,7 @@ def rasterise_in_window(
 
 @dataclass(frozen=True)
 class Correspondences:
-    """Pairs of one frame, in window pixels (x, y)."""
+    """Pairs of one frame, in window pixels (x, y); `pixel` is (row, column)."""
 
     pixel: Int[np.ndarray, "m 2"]
     target: Float[np.ndarray, "m 2"]
@@ -163,9 +175,9 @@ class Correspondences:
 def find_correspondences(
     window: MaskWindow, body_mask: Bool[np.ndarray, "h w"], is_head_or_foot: Bool[np.ndarray, "h w"]
 ) -> Correspondences:
-    """Pairs between the outline of the drawn body and that of the mask (both kinds of the module's docstring).
+    """Match the outline of the rasterised body with that of the mask, in both directions (module docstring).
 
-    bulky: pixels of the body's head and feet.
+    is_head_or_foot: pixels of the head and the feet of the body.
     """
     body_outline = outline_pixels(body_mask)
     if len(body_outline) == 0 or len(window.outline) == 0:
@@ -173,27 +185,29 @@ def find_correspondences(
         return Correspondences(empty.astype(np.int64), empty, empty, np.zeros(0))
     mask_normal, body_normal = window.normal, outward_normals(signed_distance(body_mask))
     max_distance = MAX_PAIR_DISTANCE_RATIO * window.person_px
-    forward = _subsample(body_outline)
-    normal = mask_normal[forward[:, 0], forward[:, 1]]
-    gap = window.distance[forward[:, 0], forward[:, 1]] + 0.5
-    agree = (normal * body_normal[forward[:, 0], forward[:, 1]]).sum(1) > 0.3
+    from_body = _subsample(body_outline)
+    normal = mask_normal[from_body[:, 0], from_body[:, 1]]
+    gap = window.distance[from_body[:, 0], from_body[:, 1]] + 0.5
+    agree = (normal * body_normal[from_body[:, 0], from_body[:, 1]]).sum(1) > 0.3
+    is_bulky = is_head_or_foot[from_body[:, 0], from_body[:, 1]]
     first = Correspondences(
-        forward,
-        forward[:, ::-1] + 0.5 - gap[:, None] * normal,
+        from_body,
+        from_body[:, ::-1] + 0.5 - gap[:, None] * normal,
         normal,
-        ((np.abs(gap) < max_distance) & agree) * _clothing_weights(gap, is_head_or_foot[forward[:, 0], forward[:, 1]]),
+        ((np.abs(gap) < max_distance) & agree) * _clothing_weights(gap, is_bulky),
     )
-    backward = _subsample(window.outline)
-    distance_px, nearest = cKDTree(body_outline).query(backward)
+    from_mask = _subsample(window.outline)
+    distance_px, nearest = cKDTree(body_outline).query(from_mask)
     partner = body_outline[nearest]
-    normal = mask_normal[backward[:, 0], backward[:, 1]]
-    gap = ((partner - backward)[:, ::-1] * normal).sum(1)
+    normal = mask_normal[from_mask[:, 0], from_mask[:, 1]]
+    gap = ((partner - from_mask)[:, ::-1] * normal).sum(1)
     agree = (normal * body_normal[partner[:, 0], partner[:, 1]]).sum(1) > 0.3
+    is_bulky = is_head_or_foot[partner[:, 0], partner[:, 1]]
     second = Correspondences(
         partner,
-        backward[:, ::-1] + 0.5,
+        from_mask[:, ::-1] + 0.5,
         normal,
-        ((distance_px < max_distance) & agree) * _clothing_weights(gap, is_head_or_foot[partner[:, 0], partner[:, 1]]),
+        ((distance_px < max_distance) & agree) * _clothing_weights(gap, is_bulky),
     )
     return Correspondences(
         *(np.concatenate(pair) for pair in zip(vars(first).values(), vars(second).values(), strict=True))
@@ -201,19 +215,19 @@ def find_correspondences(
 
 
 def _clothing_weights(gap: Float[np.ndarray, "m"], is_head_or_foot: Bool[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
-    """Less weight where the mask lies outside the body (gap < 0): clothes, and even more so hair and shoes."""
+    """Return the weights of pairs; smaller where the mask is outside the body (gap < 0)."""
     return np.where(gap < 0, np.where(is_head_or_foot, HAIR_AND_SHOES_WEIGHT, CLOTHING_WEIGHT), 1.0)
 
 
 def _subsample(pixels: Int[np.ndarray, "q 2"]) -> Int[np.ndarray, "m 2"]:
-    """About `PAIRS_PER_DIRECTION` of an outline's pixels, evenly along the scan order."""
+    """Return about `PAIRS_PER_DIRECTION` pixels of an outline, evenly spaced in scan order."""
     return pixels[np.linspace(0, len(pixels) - 1, min(PAIRS_PER_DIRECTION, len(pixels))).astype(np.int64)]
 
 
 def mask_weights(silhouette_iou: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """Share of each frame's outlines that counts: a mask that agrees much less with the body than others is doubtful.
+    """Return the weight of each frame's pairs (0 to 1): small if its IoU is far below the median.
 
-    Frames without a mask (nan) get full trust, which multiplies nothing.
+    Frames without a mask (nan) have weight 1; they have no pairs.
     """
     if np.isnan(silhouette_iou).all():
         return np.ones_like(silhouette_iou)
@@ -227,11 +241,14 @@ def mask_weights(silhouette_iou: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n
 def match_silhouettes(
     model: LinearBody, state: FitState, observations: Observations, windows: Sequence[MaskWindow | None]
 ) -> tuple[Contour, Float[np.ndarray, "n"]]:
-    """The contour term for the body as it stands, and each frame's overlap with its mask (nan without a mask)."""
+    """Return the silhouette pairs of the current body, and each frame's IoU with its mask (nan without a mask).
+
+    windows: masks of the frames (`crop_mask_window`); None without a mask.
+    """
     camera = apply_intrinsics_delta(observations.camera, state.intrinsics_delta)
     vertices = posed_vertices(model, state)
-    carried = model.weights[:, [ACTIVE_JOINTS.index(name) for name in HEAD_AND_FOOT_JOINTS]].sum(1)
-    head_and_foot_faces = (carried > 0.5)[model.faces[:, 0].long()].numpy()
+    head_and_foot_weight = model.skin_weights[:, [ACTIVE_JOINTS.index(name) for name in HEAD_AND_FOOT_JOINTS]].sum(1)
+    head_and_foot_faces = (head_and_foot_weight > 0.5)[model.faces[:, 0].long()].numpy()
     size = 2 * PAIRS_PER_DIRECTION
     frames = len(windows)
     corners = torch.zeros(frames, size, 3, dtype=torch.int64)

@@ -26,20 +26,20 @@ def test_intrinsics_delta_is_relative_to_the_focal_length() -> None:
     assert (camera.width, camera.height) == (256, 200)
 
 
-def test_pixels_are_those_of_the_camera() -> None:
+def test_projection_equals_that_of_the_camera() -> None:
     camera = apply_intrinsics_delta(CAMERA, INTRINSICS_DELTA)
     pixels, _ = project_with_jacobian(points(), camera)
     torch.testing.assert_close(pixels.view(-1, 2), project(points().view(-1, 3), camera)[0])
 
 
-def test_a_point_behind_the_camera_is_taken_as_just_before_it() -> None:
+def test_depth_behind_the_camera_is_clamped() -> None:
     behind = torch.tensor([[[0.02, 0.0, 1.0]]], dtype=torch.float64)
     pixels, pixel_jacobian = project_with_jacobian(behind, CAMERA)
     assert pixels[0, 0].tolist() == pytest.approx([300.0 * 0.02 / MINIMUM_DEPTH_M + 140.0, 90.0])
     assert pixel_jacobian.isfinite().all()
 
 
-def test_derivatives_are_differences() -> None:
+def test_jacobians_agree_with_differences() -> None:
     def pixels(world: torch.Tensor, intrinsics_delta: torch.Tensor) -> torch.Tensor:
         return project_with_jacobian(world, apply_intrinsics_delta(CAMERA, intrinsics_delta))[0]
 

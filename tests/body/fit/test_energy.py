@@ -5,32 +5,31 @@ import torch
 
 from pipeline.body.body import load_anny
 from pipeline.body.fit.camera_parameters import INTRINSICS_COUNT
-from pipeline.body.fit.energy import (
+from pipeline.body.fit.energy import EnergyParameters, Objective, compute_px_per_m
+from pipeline.body.fit.initialisation import solve_root_position
+from pipeline.body.fit.landmark_regressor import LANDMARK_COUNT, LANDMARK_OFFSET_COUNT, landmark_regressor
+from pipeline.body.fit.linear_body import ACTIVE_JOINTS, linearise_body
+from pipeline.body.fit.posed_points import pose_skeleton
+from pipeline.body.fit.priors import pose_prior, shape_prior
+from pipeline.body.fit.silhouette_icp import match_silhouettes
+from pipeline.body.fit.state import FitState
+from pipeline.body.fit.terms import (
     MAX_DEPTH_SCALE_RATIO,
     MIN_DEPTH_SCALE_RATIO,
-    EnergyParameters,
-    FitState,
-    Objective,
-    compute_px_per_m,
     face_landmark_confidence,
     fit_3d_landmark_scale,
 )
-from pipeline.body.fit.initialisation import solve_root_position
-from pipeline.body.fit.landmark_regressor import LANDMARK_COUNT, LANDMARK_OFFSET_COUNT, landmark_regressor
-from pipeline.body.fit.linear_body import ACTIVE_JOINTS, linearise_body, pose_skeleton
-from pipeline.body.fit.priors import pose_prior, shape_prior
-from pipeline.body.fit.silhouette_icp import match_silhouettes
 from pipeline.geometry.rotation import axis_angle_to_matrix
 from tests.body.acting import synthetic_recording
 
 FRAMES = 4
 NUMBERS = 3 * len(ACTIVE_JOINTS) + 3
-# Without motion, whose derivative is of first order in the turn between frames, the gradient is exact.
-EXACT = EnergyParameters(free_landmark_offsets=True, free_focal=True, free_principal_point=True, motion=1e5)
+# The Jacobian of the motion term is a first-order approximation, so its weight is negligible here.
+EXACT = EnergyParameters(free_landmark_offsets=True, free_focal=True, free_principal_point=True, motion_std_factor=1e5)
 
 
-def build(weights: EnergyParameters, outlines: bool = True) -> tuple[Objective, FitState]:
-    """An objective near, not at, its minimum."""
+def build(parameters: EnergyParameters, outlines: bool = True) -> tuple[Objective, FitState]:
+    """Return an objective and a state near its minimum."""
     body = load_anny()
     scene = synthetic_recording(body, FRAMES, turn_rad=0.6, noise_m=0.02)
     model = linearise_body(body, body.shape_defaults)
@@ -39,66 +38,68 @@ def build(weights: EnergyParameters, outlines: bool = True) -> tuple[Objective, 
     shared = 0.01 * torch.randn(
         len(model.shape) + LANDMARK_OFFSET_COUNT + INTRINSICS_COUNT, generator=generator, dtype=torch.float64
     )
-    state = scene.state.moved(step, shared, scene.camera)
+    state = scene.state.retract(step, shared, scene.camera)
     observations = scene.observations(scene.camera)
     contour = match_silhouettes(model, state, observations, scene.windows())[0] if outlines else None
     scale = compute_px_per_m(state, scene.camera)
     priors = pose_prior(model), shape_prior(body.shape_names, body.shape_defaults)
-    return Objective(model, landmark_regressor(model), *priors, observations, weights, scale, contour), state
+    return Objective(model, landmark_regressor(model), *priors, observations, parameters, scale, contour), state
 
 
 @pytest.mark.parametrize(
-    "weights",
+    "parameters",
     [
         EXACT,
         replace(EXACT, free_shape=False, free_landmark_offsets=False, free_focal=False, free_principal_point=False),
     ],
 )
-def test_gradient_agrees_with_differences_of_the_cost(weights: EnergyParameters) -> None:
-    objective, state = build(weights)
+def test_gradient_agrees_with_differences_of_the_cost(parameters: EnergyParameters) -> None:
+    objective, state = build(parameters)
     system = objective(state)
     generator = torch.Generator().manual_seed(6)
-    by_frame = torch.randn(FRAMES, NUMBERS, generator=generator, dtype=torch.float64)
+    frame_step = torch.randn(FRAMES, NUMBERS, generator=generator, dtype=torch.float64)
     camera = objective.observations.camera
-    by_shared = 0.1 * torch.randn(len(system.shared_gradient), generator=generator, dtype=torch.float64)
-    ahead = objective(state.moved(1e-6 * by_frame, 1e-6 * by_shared, camera)).cost
-    behind = objective(state.moved(-1e-6 * by_frame, -1e-6 * by_shared, camera)).cost
-    slope = 2.0 * float((system.frame_gradient * by_frame).sum() + system.shared_gradient @ by_shared)
-    # the surface's derivative by shape is that of the nearest corner, hence the tolerance
+    shared_step = 0.1 * torch.randn(len(system.shared_gradient), generator=generator, dtype=torch.float64)
+    ahead = objective(state.retract(1e-6 * frame_step, 1e-6 * shared_step, camera)).cost
+    behind = objective(state.retract(-1e-6 * frame_step, -1e-6 * shared_step, camera)).cost
+    slope = 2.0 * float((system.frame_gradient * frame_step).sum() + system.shared_gradient @ shared_step)
+    # the shape derivative of a surface point is that of the nearest vertex, hence the tolerance
     assert (ahead - behind) / 2e-6 == pytest.approx(slope, rel=5e-3)
 
 
-def test_a_picture_cut_off_centre_costs_the_same() -> None:
-    """A window of the picture, with the principal point moved along, says the same about every unknown."""
+def test_cropping_does_not_change_the_energy() -> None:
+    """Cost and gradients of a cropped image, with the principal point shifted accordingly, stay the same."""
     left_px, top_px = 21, 10
     objective, state = build(EXACT)
-    seen, contour = objective.observations, objective.contour
+    observations, contour = objective.observations, objective.contour
     assert contour is not None
-    corner = seen.landmarks_px.new_tensor([left_px, top_px])
-    camera = seen.camera.cropped(left_px, top_px, 230, 300)
-    cut = replace(
+    corner = observations.landmarks_px.new_tensor([left_px, top_px])
+    camera = observations.camera.cropped(left_px, top_px, 230, 300)
+    cropped = replace(
         objective,
-        observations=replace(seen, camera=camera, landmarks_px=seen.landmarks_px - corner),
+        observations=replace(observations, camera=camera, landmarks_px=observations.landmarks_px - corner),
         contour=replace(contour, target_px=contour.target_px - corner),
     )
-    whole, part = objective(state), cut(state)
-    assert part.cost == pytest.approx(whole.cost, rel=1e-9)
-    assert torch.allclose(part.frame_gradient, whole.frame_gradient)
-    assert torch.allclose(part.shared_gradient, whole.shared_gradient)
-    start, cut_start = (solve_root_position(each.observations, seen.landmarks_3d_m) for each in (objective, cut))
-    assert torch.allclose(cut_start, start)
+    full_system, cropped_system = objective(state), cropped(state)
+    assert cropped_system.cost == pytest.approx(full_system.cost, rel=1e-9)
+    assert torch.allclose(cropped_system.frame_gradient, full_system.frame_gradient)
+    assert torch.allclose(cropped_system.shared_gradient, full_system.shared_gradient)
+    start, cropped_start = (
+        solve_root_position(each.observations, observations.landmarks_3d_m) for each in (objective, cropped)
+    )
+    assert torch.allclose(cropped_start, start)
 
 
-def test_the_prior_pulls_the_principal_point_to_the_middle() -> None:
-    weights = EnergyParameters(
+def test_principal_point_prior_is_centred() -> None:
+    parameters = EnergyParameters(
         landmark_std_m=1e4,
         hand_std_m=1e4,
         landmark_3d_std_m=1e4,
-        motion=1e4,
+        motion_std_factor=1e4,
         free_principal_point=True,
         principal_point_std=0.02,
     )
-    objective, state = build(weights, outlines=False)
+    objective, state = build(parameters, outlines=False)
     costs = [
         objective(replace(state, intrinsics_delta=torch.tensor([*shift, 0.0], dtype=torch.float64))).cost
         for shift in ((0.0, 0.0), (0.02, 0.0), (0.0, -0.04))
@@ -107,28 +108,28 @@ def test_the_prior_pulls_the_principal_point_to_the_middle() -> None:
     assert costs[2] - costs[0] == pytest.approx(4.0, rel=1e-3)
 
 
-def test_gradient_of_motion_is_right_for_small_turns() -> None:
+def test_motion_gradient_is_correct_for_small_rotations() -> None:
     objective, state = build(
         EnergyParameters(landmark_std_m=1e3, landmark_3d_std_m=1e3, free_shape=False), outlines=False
     )
     system = objective(state)
     generator = torch.Generator().manual_seed(7)
-    by_frame = torch.randn(FRAMES, NUMBERS, generator=generator, dtype=torch.float64)
+    frame_step = torch.randn(FRAMES, NUMBERS, generator=generator, dtype=torch.float64)
     camera = objective.observations.camera
     nothing = torch.zeros(0, dtype=torch.float64)
-    ahead, behind = (objective(state.moved(sign * 1e-6 * by_frame, nothing, camera)).cost for sign in (1.0, -1.0))
-    slope = 2.0 * float((system.frame_gradient * by_frame).sum())
+    ahead, behind = (objective(state.retract(sign * 1e-6 * frame_step, nothing, camera)).cost for sign in (1.0, -1.0))
+    slope = 2.0 * float((system.frame_gradient * frame_step).sum())
     assert (ahead - behind) / 2e-6 == pytest.approx(slope, rel=0.05)
 
 
-def test_the_truth_costs_less_than_its_neighbourhood() -> None:
-    objective, wrong = build(EnergyParameters(motion=1e5), outlines=False)
+def test_the_true_state_has_a_lower_cost() -> None:
+    objective, wrong = build(EnergyParameters(motion_std_factor=1e5), outlines=False)
     scene = synthetic_recording(load_anny(), FRAMES, turn_rad=0.6)
     objective = replace(objective, observations=scene.observations(scene.camera))
     assert objective(scene.state).cost < 0.5 * objective(wrong).cost
 
 
-def test_faces_seen_from_behind_are_not_trusted() -> None:
+def test_face_landmarks_seen_from_behind_have_low_confidence() -> None:
     body = load_anny()
     scene = synthetic_recording(body, 3)
     turned = torch.tensor([0.0, torch.pi / 2, torch.pi], dtype=torch.float64)
@@ -146,8 +147,8 @@ def test_faces_seen_from_behind_are_not_trusted() -> None:
 @pytest.mark.parametrize(
     ("flatness", "found"), [(0.6, 0.6), (0.1, MIN_DEPTH_SCALE_RATIO), (3.0, MAX_DEPTH_SCALE_RATIO)]
 )
-def test_depths_have_a_scale_of_their_own(flatness: float, found: float) -> None:
-    """A detector that makes people smaller, flatter, and puts one landmark in a wrong place."""
+def test_depth_scale_is_estimated_separately(flatness: float, found: float) -> None:
+    """The detector scales people down, flattens them, and misplaces one landmark."""
     generator = torch.Generator().manual_seed(8)
     relative = 0.4 * torch.randn(5, 33, 3, generator=generator, dtype=torch.float64)
     directions = relative * torch.tensor([0.8, 0.8, 0.8 * flatness], dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""The whole fit on people whose truth is known."""
+"""The whole fit on synthetic recordings with known ground truth."""
 
 from dataclasses import replace
 
@@ -7,10 +7,11 @@ import pytest
 import torch
 
 from pipeline.body.body import Motion, canonical_to_world, load_anny
-from pipeline.body.fit.energy import FACE_LANDMARK_COUNT
-from pipeline.body.fit.fit import FitOptions, FitResult, fit_body
+from pipeline.body.fit.fit import FitOptions, fit_body
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS
+from pipeline.body.fit.result import FitResult
 from pipeline.body.fit.silhouette_icp import rasterise_in_window
+from pipeline.body.fit.terms import FACE_LANDMARK_COUNT
 from pipeline.body.overlay import pose_vertices
 from pipeline.geometry.rotation import axis_angle_to_matrix
 from tests.body.acting import (
@@ -32,12 +33,12 @@ def options(scene: SyntheticRecording, focal_relative_std: float = 0.0, rounds: 
 
 
 JUMP = 7
-"""The frame in which the left wrist is seen some 40 cm from where it is."""
+"""The frame in which the detection of the left wrist is off by about 40 cm."""
 
 
 @pytest.fixture(scope="module")
 def corrupted_fit() -> tuple[SyntheticRecording, FitResult]:
-    """A full turn with noise, three frames seen the wrong way round, one unseen and one landmark that jumps."""
+    """Return the fit of a noisy full turn: three frames swapped, one without landmarks, one landmark that jumps."""
     scene = synthetic_recording(load_anny(), FRAMES, shape=SHAPE, noise_m=0.008)
     swap_left_right(scene, slice(10, 13))
     scene.landmarks_px[4] = np.nan
@@ -46,7 +47,7 @@ def corrupted_fit() -> tuple[SyntheticRecording, FitResult]:
     return scene, fit_body(load_anny(), scene.observations(scene.camera), scene.windows(), options(scene))
 
 
-def test_joints_are_found_with_known_focal_length(corrupted_fit: tuple[SyntheticRecording, FitResult]) -> None:
+def test_joints_are_accurate_with_known_focal_length(corrupted_fit: tuple[SyntheticRecording, FitResult]) -> None:
     scene, result = corrupted_fit
     aligned, absolute = joint_errors_m(fitted_joints_m(result, scene), scene.joints_m())
     assert aligned < 0.015
@@ -96,12 +97,12 @@ def test_the_body_stays_inside_its_mask(corrupted_fit: tuple[SyntheticRecording,
 
 
 def test_fast_arm_motion_is_tracked() -> None:
-    """By 0.8 rad, 2.5 times a second, filmed at 30 a second: smoothness must not freeze them, nor lag behind."""
+    """Arms swing by 0.8 rad at 2.5 Hz, recorded at 30 frames per second; the motion prior must not damp them."""
     time_s = np.arange(18) / 30.0
     angles = torch.zeros(len(time_s), 3, dtype=torch.float64)
     angles[:, 2] = 0.8 * torch.sin(2 * torch.pi * 2.5 * torch.tensor(time_s))
     turns = {f"{side}Arm": axis_angle_to_matrix(sign * angles) for side, sign in (("Left", 1.0), ("Right", -1.0))}
-    scene = acting_differently(turns, time_s, turn_rad=0.6)
+    scene = recording_with_rotations(turns, time_s, turn_rad=0.6)
     result = fit_body(load_anny(), scene.observations(scene.camera), scene.windows(), options(scene, rounds=1))
     hands = [ACTIVE_JOINTS.index(f"{side}Hand") for side in ("Left", "Right")]
     found, true = (joints[:, hands, 1] for joints in (fitted_joints_m(result, scene), scene.joints_m()))
@@ -111,11 +112,11 @@ def test_fast_arm_motion_is_tracked() -> None:
 
 
 def test_face_landmarks_on_the_back_of_a_head_are_ignored() -> None:
-    """A person with the back turned (126 to 206 degrees); the detector guesses a face that looks at the camera."""
+    """The person is seen from behind (126 to 206 degrees); the detector invents a face towards the camera."""
     away = torch.linspace(2.2, 3.6, 8, dtype=torch.float64)
     hips = axis_angle_to_matrix(torch.stack([torch.zeros(8), away, torch.zeros(8)], dim=1).double())
     straight = torch.eye(3, dtype=torch.float64).repeat(8, 1, 1)
-    scene = acting_differently({"Hips": hips, "Head": straight}, np.arange(8) / 10.0)
+    scene = recording_with_rotations({"Hips": hips, "Head": straight}, np.arange(8) / 10.0)
     turn_faces_to_camera(scene)
     result = fit_body(load_anny(), scene.observations(scene.camera), scene.windows(), options(scene, rounds=1))
     head = fitted_joint_to_world(result, scene)[:, ACTIVE_JOINTS.index("Head"), :3, :3]
@@ -124,8 +125,10 @@ def test_face_landmarks_on_the_back_of_a_head_are_ignored() -> None:
     assert error.max() < 10.0
 
 
-def acting_differently(turns: dict[str, torch.Tensor], time_s: np.ndarray, turn_rad: float = 0.0) -> SyntheticRecording:
-    """The usual person, with other rotations of some joints."""
+def recording_with_rotations(
+    turns: dict[str, torch.Tensor], time_s: np.ndarray, turn_rad: float = 0.0
+) -> SyntheticRecording:
+    """Return the synthetic recording with other rotations of some joints."""
     body = load_anny()
     scene = synthetic_recording(body, len(time_s), turn_rad=turn_rad)
     rotations = scene.state.rotations.clone()
@@ -136,7 +139,7 @@ def acting_differently(turns: dict[str, torch.Tensor], time_s: np.ndarray, turn_
 
 
 def turn_faces_to_camera(scene: SyntheticRecording) -> None:
-    """Turn the landmarks of each face about the upright axis between the ears until the nose points at the camera."""
+    """Rotate the face landmarks about the vertical axis between the ears until the nose points at the camera."""
     face_m = scene.landmarks_world_m[:, :FACE_LANDMARK_COUNT]
     middle_m = face_m[:, 7:9].mean(1, keepdims=True)
     x, y, z = np.moveaxis(face_m - middle_m, -1, 0)

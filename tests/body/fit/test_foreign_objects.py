@@ -15,7 +15,7 @@ from pipeline.geometry.camera import Camera, project
 from pipeline.kernels.raster import rasterize
 
 ROWS = 200.0
-"""Height of the body in the test pictures."""
+"""Height of the body in the test images, pixels."""
 
 
 def blocks(*corners: tuple[int, int, int, int]) -> np.ndarray:
@@ -29,15 +29,15 @@ BODY = (50, 250, 100, 140)
 
 
 def test_close_clothing_is_no_residual_blob() -> None:
-    reach = int(CLOTHING_MARGIN_RATIO * ROWS)
-    assert residual_blob_share(blocks((50, 250, 100 - reach, 140 + reach)), blocks(BODY), ROWS) == 0.0
-    assert residual_blob_share(blocks((50, 250, 100, 140 + reach + 1)), blocks(BODY), ROWS) > 0.0
-    assert residual_blob_share(blocks((50, 250, 100, 140 + reach)), blocks(BODY), 0.8 * ROWS) > 0.0
+    margin_px = int(CLOTHING_MARGIN_RATIO * ROWS)
+    assert residual_blob_share(blocks((50, 250, 100 - margin_px, 140 + margin_px)), blocks(BODY), ROWS) == 0.0
+    assert residual_blob_share(blocks((50, 250, 100, 140 + margin_px + 1)), blocks(BODY), ROWS) > 0.0
+    assert residual_blob_share(blocks((50, 250, 100, 140 + margin_px)), blocks(BODY), 0.8 * ROWS) > 0.0
     assert residual_blob_share(blocks(), blocks(BODY), ROWS) == 0.0
 
 
 def test_largest_blob_excludes_the_clothing_margin() -> None:
-    """6 px beside the body may be clothes; 34 x 40 px of the large block and 24 x 10 px of the small one may not."""
+    """Within 6 px of the body is clothing; 34 x 40 px of the large block and 24 x 10 px of the small one remain."""
     mask = blocks(BODY, (100, 140, 140, 180), (200, 210, 70, 100))
     assert residual_blob_share(mask, blocks(BODY), ROWS) == pytest.approx(34 * 40 / mask.sum())
 
@@ -49,17 +49,17 @@ def test_only_temporary_blobs_are_foreign_objects() -> None:
     wide_skirt[4] = np.nan
     assert np.flatnonzero(frames_with_foreign_objects(wide_skirt)).tolist() == [6]
     assert not frames_with_foreign_objects(np.full(3, np.nan)).any()
-    (sentence,) = foreign_object_warnings(wide_skirt, 3 * np.arange(9))
-    assert sentence == (
-        "frames 18: the mask holds something beside the body (a ball, a bag, a caption?), or the pose is wrong; "
-        "leave them out with split.json, or supply masks/"
+    (warning,) = foreign_object_warnings(wide_skirt, 3 * np.arange(9))
+    assert warning == (
+        "frames 18: the mask contains another object (a ball, a bag, a caption?), or the pose is wrong; "
+        "exclude these frames with split.json, or supply masks/"
     )
     assert foreign_object_warnings(wide_skirt[:6], np.arange(6)) == []
 
 
 def test_a_ball_at_the_hand_is_detected_in_its_frame() -> None:
     anny = load_anny()
-    body = anny.body(anny.shape_defaults)
+    body = anny.at_shape(anny.shape_defaults)
     world_to_camera = np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32)
     world_to_camera[:3, 3] = (0.0, 0.85, 3.0)
     camera = Camera(300.0, 300.0, 150.0, 150.0, 300, 300, world_to_camera)
@@ -70,8 +70,8 @@ def test_a_ball_at_the_hand_is_detected_in_its_frame() -> None:
     rows, columns = np.mgrid[:300, :300] + 0.5
     with_ball = alone.copy()
     with_ball[np.hypot(rows - hand_px[1], columns - hand_px[0]) < 20.0] = 255
-    here = torch.eye(4).expand(4, len(body.joint_names), 4, 4)
-    shares = residual_blob_shares(body, here, camera, [alone, with_ball, np.zeros_like(alone), alone])
+    identity = torch.eye(4).expand(4, len(body.joint_names), 4, 4)
+    shares = residual_blob_shares(body, identity, camera, [alone, with_ball, np.zeros_like(alone), alone])
     assert np.isnan(shares).tolist() == [False, False, True, False]
     assert shares[[0, 3]].max() == 0.0
     assert shares[1] == pytest.approx(

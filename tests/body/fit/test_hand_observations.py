@@ -1,4 +1,4 @@
-"""Hands made by forward kinematics of the body, whose bends are known, and sightings that are wrong in known ways."""
+"""Hand observations: hands from forward kinematics with known flexion, and detections with known errors."""
 
 from dataclasses import replace
 
@@ -9,7 +9,6 @@ import torch
 from pipeline.body.body import AnnyBody, load_anny
 from pipeline.body.fit.diagnostics import make_observations
 from pipeline.body.fit.energy import EnergyParameters, Objective, compute_px_per_m
-from pipeline.body.fit.fit import HAND_STD_M
 from pipeline.body.fit.hand_observations import (
     MAX_CURL_RAD,
     MAX_WRIST_DISTANCE_M,
@@ -28,11 +27,11 @@ from pipeline.body.fit.linear_body import (
     RELAXED_CURL_RAD,
     finger_curl_rotations,
     linearise_body,
-    pose_points,
-    pose_skeleton,
     relaxed_curls_rad,
 )
+from pipeline.body.fit.posed_points import pose_points, pose_skeleton
 from pipeline.body.fit.priors import pose_prior, shape_prior
+from pipeline.body.settings import FitSettings
 from pipeline.body.smpl import SmplBody
 from pipeline.capture.hand_detector import N_HAND_LANDMARKS, HandLandmarks, undetected_hands
 from pipeline.geometry.camera import project
@@ -46,9 +45,9 @@ CURLS = np.array([[0.1, 0.3, 0.5, 0.7], [0.6, 0.4, 0.2, 0.0]])
 
 
 def posed_hand_m(body: AnnyBody, curls_rad: np.ndarray, side: int) -> np.ndarray:
-    """21 points of a hand with bent fingers, which end as far beyond their last joint as that from the one before."""
+    """Return 21 points of a hand with bent fingers; the last bone of a finger repeats the one before it."""
     finger_rotations = finger_curl_rotations(body, curls_rad)
-    _, joints = body.rest(body.shape_defaults)
+    _, joints = body.rest_pose(body.shape_defaults)
     joint_to_world = forward_kinematics(finger_rotations.float()[None], joints[None, 0], joints, body.parents)[
         0
     ].double()
@@ -64,7 +63,7 @@ def posed_hand_m(body: AnnyBody, curls_rad: np.ndarray, side: int) -> np.ndarray
 
 
 def seen(body: AnnyBody, curls_rad: np.ndarray, frames: int, noise_m: float = 0.0) -> HandLandmarks:
-    """Both hands, turned another way in every frame, as a detector would see them 250 px a metre large."""
+    """Return detections of both hands at 250 px per metre, with another orientation in every frame."""
     random = np.random.default_rng(0)
     turns = axis_angle_to_matrix(torch.from_numpy(random.normal(size=(frames, 3)))).numpy()
     points = np.stack([posed_hand_m(body, curls_rad, side) for side in range(2)])
@@ -74,22 +73,22 @@ def seen(body: AnnyBody, curls_rad: np.ndarray, frames: int, noise_m: float = 0.
 
 
 def pose_px(hands: HandLandmarks) -> np.ndarray:
-    """A pose whose wrists are those of the hands."""
+    """Return pose landmarks with the wrists of the hands."""
     landmarks_px = np.zeros((len(hands.handedness_score), 33, 2))
     landmarks_px[:, [15, 16]] = hands.landmarks_px[:, :, 0]
     return landmarks_px
 
 
-def test_curls_are_found_from_hands_that_turn() -> None:
+def test_finger_curls_are_estimated_from_rotating_hands() -> None:
     body = load_anny()
     hands = seen(body, CURLS, 40, noise_m=0.001)
-    hands.landmarks_m[:6] = hands.landmarks_m[:6, :, ::-1]  # a few looks go wild
-    trusted = filter_hand_detections(hands, pose_px(hands))
-    assert (trusted.handedness_score == 0.9).all()
-    np.testing.assert_allclose(finger_curls_rad(body, trusted), CURLS, atol=0.06)
+    hands.landmarks_m[:6] = hands.landmarks_m[:6, :, ::-1]  # outliers
+    reliable = filter_hand_detections(hands, pose_px(hands))
+    assert (reliable.handedness_score == 0.9).all()
+    np.testing.assert_allclose(finger_curls_rad(body, reliable), CURLS, atol=0.06)
 
 
-def test_a_straight_chain_has_no_bend_and_a_fist_has_positive_ones() -> None:
+def test_straight_fingers_have_zero_flexion_and_a_fist_positive() -> None:
     body = load_anny()
     for side in range(2):
         rest, fist = rest_hand_points_m(body, side), posed_hand_m(body, np.full((2, 4), 1.0), side)
@@ -99,7 +98,7 @@ def test_a_straight_chain_has_no_bend_and_a_fist_has_positive_ones() -> None:
 
 @pytest.mark.parametrize("frame_count", [0, MIN_HAND_FRAMES - 1])
 def test_a_rarely_detected_hand_keeps_the_relaxed_curl(frame_count: int) -> None:
-    """Whatever is seen of the other one."""
+    """The curl of one hand does not depend on the detections of the other."""
     body = load_anny()
     hands = seen(body, CURLS, FRAMES)
     hands.handedness_score[MIN_HAND_FRAMES:, 0] = 0.0
@@ -109,10 +108,10 @@ def test_a_rarely_detected_hand_keeps_the_relaxed_curl(frame_count: int) -> None
     np.testing.assert_array_equal(right, np.full(4, RELAXED_CURL_RAD))
 
 
-@pytest.mark.parametrize(("made_rad", "found_rad"), [(-0.6, 0.0), (1.7, MAX_CURL_RAD)])
-def test_fingers_bend_no_further_than_fingers_do(made_rad: float, found_rad: float) -> None:
+@pytest.mark.parametrize(("true_rad", "found_rad"), [(-0.6, 0.0), (1.7, MAX_CURL_RAD)])
+def test_finger_curls_are_clamped(true_rad: float, found_rad: float) -> None:
     body = load_anny()
-    hands = seen(body, np.full((2, 4), made_rad), MIN_HAND_FRAMES)
+    hands = seen(body, np.full((2, 4), true_rad), MIN_HAND_FRAMES)
     np.testing.assert_array_equal(finger_curls_rad(body, hands), np.full((2, 4), found_rad))
 
 
@@ -122,7 +121,7 @@ def test_a_body_without_fingers_has_the_relaxed_curl() -> None:
     np.testing.assert_array_equal(finger_curls_rad(body, hands), relaxed_curls_rad())
 
 
-def test_hands_of_the_other_side_or_away_from_the_wrist_are_not_trusted() -> None:
+def test_hands_of_the_other_side_or_away_from_the_wrist_are_not_reliable() -> None:
     hands = seen(load_anny(), CURLS, 4)
     hands.handedness_score[1, 0] = 0.4
     landmarks_px = pose_px(hands)
@@ -162,11 +161,11 @@ def test_points_of_hands_turn_the_wrists() -> None:
         seen = make_observations(
             scene.time_s, scene.landmarks_px, visibility, scene.landmarks_world_m, scene.camera, hands
         )
-        weights = EnergyParameters(free_shape=False, hand_std_m=HAND_STD_M)
+        weights = EnergyParameters(free_shape=False, hand_std_m=FitSettings.fitted_hand_std_m)
         objective = Objective(scene.model, regressor, *priors, seen, weights, compute_px_per_m(start, scene.camera))
         state, _ = minimise(start, objective, objective.retract, 12)
         skeleton = pose_skeleton(scene.model, state.rotations, state.root_m)
-        points, _ = pose_points(scene.model, skeleton, regressor.points(scene.model, state.landmark_offsets_m))
+        points = pose_points(scene.model, skeleton, regressor.points(scene.model, state.landmark_offsets_m)).world_m
         found_px = project(points[:, POSE_LANDMARK_COUNT:].flatten(0, 1), scene.camera)[0].reshape(3, -1, 2, 2)
         true_px = scene.hands.landmarks_px[:, :, list(HAND_LANDMARKS)].swapaxes(1, 2)
         errors_px.append(float(np.linalg.norm(found_px.numpy() - true_px, axis=-1).max()))

@@ -1,4 +1,4 @@
-"""Limits of joints: angles against closed forms, poses that people can and cannot take, fits that are led astray."""
+"""Joint limits: angles against closed forms, feasible and infeasible poses, fits to infeasible landmarks."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +12,7 @@ from data_tools.synthetic.rig.retarget import retarget
 from data_tools.synthetic.scene.motion import NOVEL_POSES
 from pipeline.body.body import load_anny
 from pipeline.body.fit.camera_parameters import INTRINSICS_COUNT
-from pipeline.body.fit.energy import EnergyParameters, FitState, Objective, Observations
+from pipeline.body.fit.energy import EnergyParameters, Objective
 from pipeline.body.fit.joint_limits import (
     BALL_JOINT_RANGES_DEG,
     LIMIT_STD_RAD,
@@ -23,8 +23,10 @@ from pipeline.body.fit.joint_limits import (
 )
 from pipeline.body.fit.landmark_regressor import LANDMARK_COUNT, LANDMARK_OFFSET_COUNT, landmark_regressor
 from pipeline.body.fit.levenberg_marquardt import minimise
-from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody, linearise_body, pose_points, pose_skeleton
+from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody, linearise_body
+from pipeline.body.fit.posed_points import pose_points, pose_skeleton
 from pipeline.body.fit.priors import pose_prior, shape_prior
+from pipeline.body.fit.state import FitState, Observations
 from pipeline.body.smpl import SmplBody
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.rotation import axis_angle_to_matrix, matrix_to_quaternion, quaternion_to_matrix
@@ -34,7 +36,7 @@ MIRROR = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
 Pose = dict[str, tuple[float, float, float]]
 
 # Degrees about the body's x, y, z, of the left side; the arm rests 48 degrees below the horizontal.
-POSSIBLE: dict[str, Pose] = {
+FEASIBLE: dict[str, Pose] = {
     "arm straight up": {"LeftArm": (0, 0, 135)},
     "arm hangs": {"LeftArm": (0, 0, -41)},
     "arm held back": {"LeftArm": (55, 0, -41)},
@@ -51,7 +53,7 @@ POSSIBLE: dict[str, Pose] = {
     "chin on the chest": {"Neck": (40, 0, 0), "Head": (20, 0, 0)},
     "touches the floor": {"Spine": (35, 0, 0), "Spine1": (25, 0, 0), "Spine2": (20, 0, 0), "LeftUpLeg": (-80, 0, 0)},
 }
-IMPOSSIBLE: dict[str, tuple[str, tuple[float, float, float]]] = {
+INFEASIBLE: dict[str, tuple[str, tuple[float, float, float]]] = {
     "thigh straight back": ("LeftUpLeg", (90, 0, 0)),
     "thigh across the other": ("LeftUpLeg", (0, 0, -80)),
     "foot turned round": ("LeftUpLeg", (0, 130, 0)),
@@ -79,7 +81,7 @@ def limits(model: LinearBody) -> JointLimits:
 
 
 def posed(pose: Pose, side: str = "Left") -> torch.Tensor:
-    """Rotations of all joints; the right side mirrors the left."""
+    """Return the rotations of all joints; the right side mirrors the left."""
     angles = torch.zeros(1, len(ACTIVE_JOINTS), 3, dtype=torch.float64)
     for name, degrees in pose.items():
         turn = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
@@ -88,13 +90,13 @@ def posed(pose: Pose, side: str = "Left") -> torch.Tensor:
 
 
 def excess_deg(limits: JointLimits, rotations: torch.Tensor) -> torch.Tensor:
-    """How far joints are beyond their limits: largest of the three angles."""
+    """Return the excess of each joint over its limits, largest of the three angles."""
     return torch.rad2deg(limits.residuals(rotations)[0].abs().amax(-1) * LIMIT_STD_RAD)
 
 
 @pytest.mark.parametrize("twist", [0.0, -1e-5, 0.7, -2.9])
 @pytest.mark.parametrize("swing", [(0.0, 0.0), (1e-5, 0.0), (-0.9, 0.4), (1.1, 2.4)])
-def test_twist_and_swing_are_found_again(twist: float, swing: tuple[float, float]) -> None:
+def test_twist_and_swing_are_recovered(twist: float, swing: tuple[float, float]) -> None:
     turn = torch.tensor([[0.0, *swing], [twist, 0.0, 0.0]], dtype=torch.float64)
     rotation = axis_angle_to_matrix(turn[0]) @ axis_angle_to_matrix(turn[1])
     angles, _ = swing_twist(rotation)
@@ -115,7 +117,7 @@ def test_derivative_of_swing_and_twist_agrees_with_differences(size: float) -> N
 
 
 def test_derivative_of_the_limits_agrees_with_differences(limits: JointLimits) -> None:
-    """In poses most of which are beyond some wall."""
+    """In random poses, most of which exceed some limit."""
     generator = torch.Generator().manual_seed(0)
     angles = 1.2 * torch.randn(6, len(ACTIVE_JOINTS), 3, generator=generator, dtype=torch.float64)
     step = 1e-6 * torch.randn(angles.shape, generator=generator, dtype=torch.float64)
@@ -127,15 +129,15 @@ def test_derivative_of_the_limits_agrees_with_differences(limits: JointLimits) -
 
 
 @pytest.mark.parametrize("side", ["Left", "Right"])
-@pytest.mark.parametrize("pose", POSSIBLE)
-def test_feasible_poses_cost_nothing(limits: JointLimits, pose: str, side: str) -> None:
-    assert excess_deg(limits, posed(POSSIBLE[pose], side)).max() == 0.0
+@pytest.mark.parametrize("pose", FEASIBLE)
+def test_feasible_poses_cost_zeros(limits: JointLimits, pose: str, side: str) -> None:
+    assert excess_deg(limits, posed(FEASIBLE[pose], side)).max() == 0.0
 
 
 @pytest.mark.parametrize("side", ["Left", "Right"])
-@pytest.mark.parametrize("pose", IMPOSSIBLE)
+@pytest.mark.parametrize("pose", INFEASIBLE)
 def test_infeasible_poses_exceed_the_limit_of_their_joint(limits: JointLimits, pose: str, side: str) -> None:
-    name, degrees = IMPOSSIBLE[pose]
+    name, degrees = INFEASIBLE[pose]
     excess = excess_deg(limits, posed({name: degrees}, side))[0]
     joint = ACTIVE_JOINTS.index(name.replace("Left", side))
     assert excess[joint] > 10.0
@@ -144,12 +146,10 @@ def test_infeasible_poses_exceed_the_limit_of_their_joint(limits: JointLimits, p
 
 @pytest.mark.parametrize(("turn_deg", "free"), [(70.0, True), (110.0, False), (-80.0, True), (-110.0, False)])
 @pytest.mark.parametrize("side", ["Left", "Right"])
-def test_wrists_bend_to_the_palm_and_back(
-    model: LinearBody, limits: JointLimits, side: str, turn_deg: float, free: bool
-):
-    """About the line from the knuckle of the index to that of the little finger; both sides bend with their fingers."""
+def test_wrists_flex_and_extend(model: LinearBody, limits: JointLimits, side: str, turn_deg: float, free: bool):
+    """About the line from the knuckle of the index to that of the little finger; flexion is that of the fingers."""
     wrist, index, little, tip = (
-        model.full_joints[model.joint_index_by_name[f"{side}Hand{part}"]]
+        model.full_joints_m[model.joint_index_by_name[f"{side}Hand{part}"]]
         for part in ("", "Index1", "Pinky1", "Middle3")
     )
     axis = torch.nn.functional.normalize(little - index, dim=0) * (1.0 if side == "Left" else -1.0)
@@ -163,11 +163,11 @@ def test_wrists_bend_to_the_palm_and_back(
 @pytest.mark.parametrize(
     ("upper", "forearm", "free"),
     [
-        ((1, 0, 0), (0, 0, 1), True),  # held sideways: the forearm ahead, up, down, and not backward
+        ((1, 0, 0), (0, 0, 1), True),  # held sideways: forearm forward, up, down, not backward
         ((1, 0, 0), (0, 1, 0), True),
         ((1, 0, 0), (0, -1, 0.4), True),
         ((1, 0, 0), (0, 0, -1), False),
-        ((0, 0, 1), (0, 1, 0), True),  # held forward: up, to the other side, and not outward
+        ((0, 0, 1), (0, 1, 0), True),  # held forward: up, across, not outward
         ((0, 0, 1), (-1, 0, 0), True),
         ((0, 0, 1), (1, 0, 0), False),
         ((0, 1, 0), (-1, 0, 0), True),  # a hand over the head, behind the neck, on the other shoulder, behind the back
@@ -179,30 +179,30 @@ def test_wrists_bend_to_the_palm_and_back(
         ((-0.8, 0.6, -0.3), (0, 0, 1), False),  # through the head
     ],
 )
-def test_an_upper_arm_turns_as_far_as_it_can_wherever_it_points(
+def test_upper_arm_limits_hold_in_all_directions(
     model: LinearBody, limits: JointLimits, upper: tuple, forearm: tuple, free: bool
 ) -> None:
-    """The left one: x points outward, y up, z ahead; the elbow is bent, so the forearm tells the twist."""
+    """Left arm: x outward, y up, z forward; the elbow is bent, so the direction of the forearm gives the twist."""
     arm, elbow, hand = (ACTIVE_JOINTS.index(f"Left{part}") for part in ("Arm", "ForeArm", "Hand"))
-    rest = framed(model.joints[elbow] - model.joints[arm], model.joints[hand] - model.joints[elbow])
+    rest = bone_frame(model.joints_m[elbow] - model.joints_m[arm], model.joints_m[hand] - model.joints_m[elbow])
     rotations = posed({})
-    rotations[0, arm] = framed(torch.tensor(upper).double(), torch.tensor(forearm).double()) @ rest.T
+    rotations[0, arm] = bone_frame(torch.tensor(upper).double(), torch.tensor(forearm).double()) @ rest.T
     assert (excess_deg(limits, rotations).max() == 0.0) == free
 
 
-def framed(upper: torch.Tensor, lower: torch.Tensor) -> torch.Tensor:
-    """Rotation whose columns are the upper arm, the elbow's axis, and their cross product."""
+def bone_frame(upper: torch.Tensor, lower: torch.Tensor) -> torch.Tensor:
+    """Return the rotation with the columns upper arm, elbow axis, and their cross product."""
     bone = torch.nn.functional.normalize(upper, dim=0)
     axis = torch.nn.functional.normalize(torch.linalg.cross(upper, lower), dim=0)
     return torch.stack([bone, axis, torch.linalg.cross(bone, axis)], dim=1)
 
 
 @pytest.mark.parametrize("joints", [24, 55])
-def test_smpl_bodies_have_the_same_limits_by_the_same_names(limits: JointLimits, joints: int) -> None:
+def test_smpl_bodies_have_the_same_limits(limits: JointLimits, joints: int) -> None:
     body = SmplBody(made_up_arrays(joints))
     found, rest = joint_limits(linearise_body(body, body.shape_defaults)), posed({})
     assert (found.half_range_rad - found.angles(rest)[0].abs() > np.deg2rad(10.0))[0].all()
-    for pose in POSSIBLE.values():
+    for pose in FEASIBLE.values():
         assert torch.allclose(found.angles(posed(pose))[0], limits.angles(posed(pose))[0], atol=0.2)
 
 
@@ -214,17 +214,17 @@ def test_both_sides_have_the_same_limits(limits: JointLimits) -> None:
             assert sides[0] == pytest.approx(sides[1], abs=1.0)
 
 
-def test_the_novel_poses_of_synthetic_captures_are_possible(limits: JointLimits) -> None:
+def test_novel_poses_of_synthetic_captures_are_feasible(limits: JointLimits) -> None:
     for pose in NOVEL_POSES.values():
         assert excess_deg(limits, posed({name: np.rad2deg(turn).tolist() for name, turn in pose.items()})).max() == 0.0
 
 
 @pytest.mark.parametrize("name", ["cmu1_jumping_jacks", "fair1_zombie", "rokoko_jesse_dance"])
-def test_recorded_motions_keep_within_the_limits(limits: JointLimits, shared_data: Path, name: str) -> None:
-    """Jumping jacks, a staggering walk, and a dance with high kicks to the side; elbows and knees apart, whose axes
-    differ from skeleton to skeleton."""
+def test_recorded_motions_stay_within_the_limits(limits: JointLimits, shared_data: Path, name: str) -> None:
+    """Jumping jacks, a staggering walk, and a dance with high kicks to the side. Without elbows and knees, whose axes
+    differ between skeletons."""
     model = load_anny()
-    body = model.body(model.shape_defaults)
+    body = model.at_shape(model.shape_defaults)
     motion = retarget(read_bvh(shared_data / "motions" / f"{name}.bvh"), body, np.zeros(3), in_place=True)
     everything = quaternion_to_matrix(torch.tensor(motion.rotations_wxyz, dtype=torch.float64))
     rotations = everything[:, [body.joint(joint) for joint in ACTIVE_JOINTS]]
@@ -243,16 +243,16 @@ OUT_OF_RANGE: Pose = {
     "Head": (0, 140, 0),
     "LeftHand": (0, 110, 0),
 }
-"""What a detector takes a joint's angles for, in every frame."""
+"""Infeasible angles of joints as detected in every frame, degrees."""
 
 
 @pytest.fixture(scope="module")
 def objective(model: LinearBody) -> Objective:
-    """To be given observations; two frames of a detector that is very sure, else the pose prior alone holds a neck."""
+    """Return an objective of two frames without observations; landmarks outweigh the pose prior."""
     body, camera = load_anny(), Camera(520.0, 520.0, 128.0, 160.0, 256, 320)
-    nothing = torch.zeros(2, LANDMARK_COUNT, 3, dtype=torch.float64)
+    zeros = torch.zeros(2, LANDMARK_COUNT, 3, dtype=torch.float64)
     seen = Observations(
-        torch.tensor([0.0, 0.1], dtype=torch.float64), nothing[..., :2], nothing, *2 * [nothing[..., 0] + 1.0], camera
+        torch.tensor([0.0, 0.1], dtype=torch.float64), zeros[..., :2], zeros, *2 * [zeros[..., 0] + 1.0], camera
     )
     priors = pose_prior(model), shape_prior(body.shape_names, body.shape_defaults)
     scale = torch.full((2,), 520.0 / 3.0, dtype=torch.float64)
@@ -267,21 +267,21 @@ def objective(model: LinearBody) -> Objective:
 
 
 def fitted(objective: Objective, pose: Pose, with_limits: bool) -> torch.Tensor:
-    """Rotations fitted to the landmarks of a person in a pose, from that pose on."""
+    """Return the rotations fitted to the landmarks of a pose, with that pose as the initial state."""
     model, seen = objective.model, objective.observations
-    nothing = [torch.zeros(count, dtype=torch.float64) for count in (LANDMARK_OFFSET_COUNT, INTRINSICS_COUNT)]
+    zeros = [torch.zeros(count, dtype=torch.float64) for count in (LANDMARK_OFFSET_COUNT, INTRINSICS_COUNT)]
     root = torch.tensor([[0.0, -0.05, -3.0]], dtype=torch.float64).repeat(2, 1)
-    start = FitState(posed(pose).repeat(2, 1, 1, 1), root, model.shape, *nothing)
+    start = FitState(posed(pose).repeat(2, 1, 1, 1), root, model.shape, *zeros)
     skeleton = pose_skeleton(model, start.rotations, start.root_m)
-    world, _ = pose_points(model, skeleton, objective.regressor.points(model, start.landmark_offsets_m))
+    world = pose_points(model, skeleton, objective.regressor.points(model, start.landmark_offsets_m)).world_m
     pixels, _ = project(world, seen.camera)
     seen = replace(seen, landmarks_px=pixels, landmarks_3d_m=world - 0.5 * (world[:, 23:24] + world[:, 24:25]))
     prior = objective.pose_prior
     if not with_limits:
-        endless = torch.full_like(prior.limits.half_range_rad, 10.0)
-        prior = replace(prior, limits=replace(prior.limits, half_range_rad=endless))
-    told = replace(objective, observations=seen, pose_prior=prior)
-    return minimise(start, told, told.retract, 12)[0].rotations
+        unlimited = torch.full_like(prior.limits.half_range_rad, 10.0)
+        prior = replace(prior, limits=replace(prior.limits, half_range_rad=unlimited))
+    objective_of_pose = replace(objective, observations=seen, pose_prior=prior)
+    return minimise(start, objective_of_pose, objective_of_pose.retract, 12)[0].rotations
 
 
 @pytest.mark.parametrize("name", OUT_OF_RANGE)
@@ -297,6 +297,6 @@ def test_limits_hold_against_infeasible_landmarks(objective: Objective, limits: 
 
 
 @pytest.mark.parametrize("pose", ["deep squat", "kick to the side", "arm straight up", "looks over the shoulder"])
-def test_an_extreme_pose_that_is_possible_is_found_as_without_limits(objective: Objective, pose: str) -> None:
-    found, free = (fitted(objective, POSSIBLE[pose], with_limits) for with_limits in (True, False))
+def test_limits_do_not_change_extreme_feasible_poses(objective: Objective, pose: str) -> None:
+    found, free = (fitted(objective, FEASIBLE[pose], with_limits) for with_limits in (True, False))
     assert torch.allclose(found, free, atol=1e-6)

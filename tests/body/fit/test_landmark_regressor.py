@@ -17,10 +17,10 @@ def test_the_table_names_every_landmark_once() -> None:
     assert sorted(index for landmark in LANDMARKS for index in landmark.indices) == list(range(LANDMARK_COUNT))
 
 
-def test_landmarks_lie_where_the_table_says_and_mirror_each_other() -> None:
+def test_landmarks_have_their_tabulated_positions_and_are_symmetric() -> None:
     body = load_anny()
     model = linearise_body(body, body.shape_defaults)
-    rest = landmark_regressor(model).points(model, torch.zeros(LANDMARK_OFFSET_COUNT, dtype=torch.float64)).rest[0]
+    rest = landmark_regressor(model).points(model, torch.zeros(LANDMARK_OFFSET_COUNT, dtype=torch.float64)).rest_m[0]
     for landmark in LANDMARKS:
         assert torch.allclose(
             rest[landmark.indices[0]], torch.tensor(body.landmark_positions_m[landmark.name]).double(), atol=1e-6
@@ -39,31 +39,31 @@ def test_landmarks_follow_the_shape() -> None:
     regressor, offsets = landmark_regressor(default), torch.zeros(LANDMARK_OFFSET_COUNT, dtype=torch.float64)
     shins = []
     for model in (default, longer):
-        rest = regressor.points(model, offsets).rest[0]
+        rest = regressor.points(model, offsets).rest_m[0]
         shins.append((rest[25] - rest[27]).norm())
     assert shins[1] > shins[0] + 0.02
 
 
-def test_offsets_move_both_sides_in_mirror_image() -> None:
+def test_offsets_are_mirrored() -> None:
     body = load_anny()
     model = linearise_body(body, body.shape_defaults)
     regressor = landmark_regressor(model)
     offsets = torch.zeros(LANDMARK_OFFSET_COUNT, dtype=torch.float64)
     knee = next(row for row, landmark in enumerate(LANDMARKS) if landmark.name == "knee")
     offsets[3 * knee : 3 * knee + 3] = torch.tensor([0.01, 0.02, 0.03])
-    moved = regressor.points(model, offsets).rest[0] - regressor.points(model, 0 * offsets).rest[0]
+    moved = regressor.points(model, offsets).rest_m[0] - regressor.points(model, 0 * offsets).rest_m[0]
     assert torch.allclose(moved[25], torch.tensor([0.01, 0.02, 0.03]).double())
     assert torch.allclose(moved[26], torch.tensor([-0.01, 0.02, 0.03]).double())
     assert torch.count_nonzero(moved) == 6
 
 
-def test_exchanging_twice_changes_nothing() -> None:
+def test_swapping_twice_is_the_identity() -> None:
     order = mirror_permutation(LEFT_RIGHT_PAIRS)
     assert [order[index] for index in order] == list(range(LANDMARK_COUNT))
     assert order[0] == 0
     assert order[11] == 12
 
 
-def test_noise_is_symmetric() -> None:
-    noise = landmark_std_ratio()
-    assert torch.equal(noise, noise[mirror_permutation(LEFT_RIGHT_PAIRS)])
+def test_standard_deviations_are_symmetric() -> None:
+    std_ratio = landmark_std_ratio()
+    assert torch.equal(std_ratio, std_ratio[mirror_permutation(LEFT_RIGHT_PAIRS)])

@@ -29,11 +29,11 @@ def clean() -> SyntheticRecording:
 
 @pytest.fixture
 def scene(clean: SyntheticRecording) -> SyntheticRecording:
-    """A turn whose landmarks may be spoilt."""
+    """Return a full turn whose landmarks a test may change."""
     return replace(clean, landmarks_px=clean.landmarks_px.copy(), landmarks_world_m=clean.landmarks_world_m.copy())
 
 
-def test_path_equals_exhaustive_search() -> None:
+def test_viterbi_path_equals_exhaustive_search() -> None:
     random = np.random.default_rng(0)
     unary, same, other = random.random((7, 2)), random.random(6), random.random(6)
 
@@ -53,7 +53,7 @@ def test_no_swap_is_detected_in_a_clean_full_turn(scene: SyntheticRecording) -> 
 
 
 def turned(camera: Camera, about_y_rad: float, tilt_rad: float) -> Camera:
-    """The camera turned about the world's +Y, then tilted: the picture stays, the world turns."""
+    """Return the camera with the world rotated about +Y, then tilted; the image stays the same."""
     rotation = camera.world_to_camera.copy()
     for axis in ([0.0, about_y_rad, 0.0], [tilt_rad, 0.0, 0.0]):
         rotation[:3, :3] = rotation[:3, :3] @ axis_angle_to_matrix(torch.tensor([axis]))[0].numpy()
@@ -65,7 +65,7 @@ def turned(camera: Camera, about_y_rad: float, tilt_rad: float) -> Camera:
 def test_a_body_swap_is_detected_and_corrected(
     scene: SyntheticRecording, wrong: slice, about_y_deg: int, tilt_deg: int
 ) -> None:
-    """Wherever the camera stands."""
+    """The detection does not depend on the orientation of the camera."""
     camera = turned(scene.camera, np.radians(about_y_deg), np.radians(tilt_deg))
     truth = scene.observations(camera)
     swap_left_right(scene, wrong)
@@ -77,25 +77,25 @@ def test_a_body_swap_is_detected_and_corrected(
     assert np.allclose(corrected.landmarks_3d_m, truth.landmarks_3d_m)
 
 
-def test_frames_far_apart_in_time_may_turn_far(scene: SyntheticRecording) -> None:
-    """A turn of 3.6 s in eight frames: nothing is mended, though each step is one of 51 degrees."""
-    seen = synthetic_recording(load_anny(), 8).observations(scene.camera)
-    assert not detect_body_swaps(replace(seen, time_s=5 * seen.time_s), rest_landmarks_m()).any()
+def test_large_yaw_changes_over_long_intervals_are_no_swaps(scene: SyntheticRecording) -> None:
+    """A turn of 3.6 s in eight frames, 51 degrees between frames."""
+    observations = synthetic_recording(load_anny(), 8).observations(scene.camera)
+    assert not detect_body_swaps(replace(observations, time_s=5 * observations.time_s), rest_landmarks_m()).any()
 
 
-def test_a_short_gap_does_not_hide_a_body_the_wrong_way_round() -> None:
-    """At 30 frames a second, seven without a person, and then the last three from the wrong side."""
+def test_a_body_swap_after_a_short_gap_is_detected() -> None:
+    """At 30 frames per second: seven frames without a person, then three swapped ones."""
     scene = synthetic_recording(load_anny(), 20, turn_rad=0.8)
     swap_left_right(scene, slice(17, 20))
     scene.landmarks_px[10:17] = np.nan
-    seen = scene.observations(scene.camera)
-    left_right_swapped = detect_body_swaps(replace(seen, time_s=seen.time_s / 3), rest_landmarks_m())
+    observations = scene.observations(scene.camera)
+    left_right_swapped = detect_body_swaps(replace(observations, time_s=observations.time_s / 3), rest_landmarks_m())
     assert np.flatnonzero(left_right_swapped).tolist() == [17, 18, 19]
 
 
 @pytest.mark.parametrize(("gap_s", "left_right_swapped"), [(0.1, [4]), (1.0, [])])
-def test_legs_change_places_in_a_second_and_not_in_a_tenth(gap_s: float, left_right_swapped: list[int]) -> None:
-    """A stride seen from the side: four frames of one, then one of the opposite."""
+def test_legs_cross_within_a_second_but_not_within_a_tenth(gap_s: float, left_right_swapped: list[int]) -> None:
+    """A stride seen from the side: four frames, then one frame of the opposite stride."""
     body = load_anny()
     scene = synthetic_recording(body, 5)
     angles = torch.zeros(5, len(ACTIVE_JOINTS), 3, dtype=torch.float64)
@@ -104,8 +104,8 @@ def test_legs_change_places_in_a_second_and_not_in_a_tenth(gap_s: float, left_ri
         angles[:, ACTIVE_JOINTS.index(f"{side}UpLeg"), 0] = 0.45 * sign * torch.tensor([1.0, 1.0, 1.0, 1.0, -1.0])
     state = replace(scene.state, rotations=axis_angle_to_matrix(angles), root_m=scene.state.root_m[:1].repeat(5, 1))
     time_s = np.cumsum([0.0, 0.1, 0.1, 0.1, gap_s])
-    seen = simulate_detections(body, scene.model, state, scene.camera, time_s).observations(scene.camera)
-    assert np.flatnonzero(detect_limb_swaps(seen, "legs")).tolist() == left_right_swapped
+    observations = simulate_detections(body, scene.model, state, scene.camera, time_s).observations(scene.camera)
+    assert np.flatnonzero(detect_limb_swaps(observations, "legs")).tolist() == left_right_swapped
 
 
 def test_no_swap_is_detected_without_a_person(scene: SyntheticRecording) -> None:
@@ -121,9 +121,9 @@ def test_no_swap_is_detected_without_a_person(scene: SyntheticRecording) -> None
 @pytest.mark.parametrize("limb", list(LIMB_SWAP_PAIRS))
 @pytest.mark.parametrize("wrong", [slice(0, 4), slice(10, 11), slice(29, 30)])
 def test_limb_swaps_are_detected_and_corrected(scene: SyntheticRecording, limb: str, wrong: slice) -> None:
-    """A run at the start, and single frames in side views: 92 and -92 degrees."""
+    """Several frames at the start, and single frames in side views (92 and -92 degrees)."""
     truth = scene.observations(scene.camera)
-    order = mirror_permutation(LIMB_SWAP_PAIRS[limb][0])[:POSE_LANDMARK_COUNT]
+    order = mirror_permutation(LIMB_SWAP_PAIRS[limb].swapped)[:POSE_LANDMARK_COUNT]
     scene.landmarks_px[wrong] = scene.landmarks_px[wrong][:, order]
     scene.landmarks_world_m[wrong] = scene.landmarks_world_m[wrong][:, order]
     observations = scene.observations(scene.camera)

@@ -4,14 +4,11 @@ import torch
 
 from pipeline.body.body import load_anny
 from pipeline.body.fit.landmark_regressor import LANDMARK_COUNT, LANDMARK_OFFSET_COUNT, landmark_regressor
-from pipeline.body.fit.linear_body import (
-    ACTIVE_JOINTS,
-    LinearBody,
-    linearise_body,
+from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody, linearise_body, reduced_parents
+from pipeline.body.fit.posed_points import (
     pose_jacobian_rows,
     pose_points,
     pose_skeleton,
-    reduced_parents,
     shape_jacobian_rows,
     surface_points,
 )
@@ -34,21 +31,23 @@ def random_pose(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def test_posed_points_equal_linear_blend_skinning_of_the_whole_body(model: LinearBody) -> None:
-    """The reduced skeleton moves the surface as the 52 joints do, away from the fingers."""
+    """Away from the fingers the reduced skeleton moves the surface as the 52 joints do."""
     body = load_anny()
     rotations, root = random_pose()
     full = model.all_joint_rotations(rotations)
-    joints = model.full_joints
-    vertices, _ = body.rest(body.shape_defaults)
+    joints = model.full_joints_m
+    vertices, _ = body.rest_pose(body.shape_defaults)
     transforms = skinning_transforms(forward_kinematics(full, root, joints, body.parents), joints)
     weights = torch.as_tensor(body.skin_weights).double()
     expected = linear_blend_skinning(vertices.double(), weights, transforms)
     fingers = [j for j, name in enumerate(body.joint_names) if "Hand" in name and not name.endswith("Hand")]
-    whole = torch.nonzero(weights[:, fingers].sum(1) == 0).squeeze(1)[::97]
-    corners = whole[None, :, None].expand(FRAMES, -1, 3)
+    without_fingers = torch.nonzero(weights[:, fingers].sum(1) == 0).squeeze(1)[::97]
+    corners = without_fingers[None, :, None].expand(FRAMES, -1, 3)
     barycentric = torch.full(corners.shape, 1 / 3, dtype=torch.float64)
-    world, _ = pose_points(model, pose_skeleton(model, rotations, root), surface_points(model, corners, barycentric))
-    assert torch.allclose(world, expected[:, whole], atol=1e-6)
+    world = pose_points(
+        model, pose_skeleton(model, rotations, root), surface_points(model, corners, barycentric)
+    ).world_m
+    assert torch.allclose(world, expected[:, without_fingers], atol=1e-6)
 
 
 def test_derivatives_agree_with_differences(model: LinearBody) -> None:
@@ -59,13 +58,14 @@ def test_derivatives_agree_with_differences(model: LinearBody) -> None:
     point_gradient = torch.randn(FRAMES, LANDMARK_COUNT, 3, generator=generator, dtype=torch.float64)
     points = regressor.points(model, offsets)
     skeleton = pose_skeleton(model, rotations, root)
-    world, lever_arms = pose_points(model, skeleton, points)
+    posed = pose_points(model, skeleton, points)
+    world, lever_arms = posed.world_m, posed.lever_arms_m
 
     step = 1e-5 * torch.randn(FRAMES, 3 * len(ACTIVE_JOINTS) + 3, generator=generator, dtype=torch.float64)
     turned = axis_angle_to_matrix(step[:, :-3].reshape(FRAMES, -1, 3)) @ rotations
     perspective_jacobian = torch.randn(FRAMES, 3, 3, generator=generator, dtype=torch.float64)
     moved_root = root + (perspective_jacobian @ step[:, -3:, None])[..., 0]
-    moved, _ = pose_points(model, pose_skeleton(model, turned, moved_root), points)
+    moved = pose_points(model, pose_skeleton(model, turned, moved_root), points).world_m
     expected = ((moved - world) * point_gradient).sum(-1)
     assert torch.allclose(
         (pose_jacobian_rows(skeleton, lever_arms, perspective_jacobian, point_gradient) @ step[..., None])[..., 0],
@@ -75,30 +75,32 @@ def test_derivatives_agree_with_differences(model: LinearBody) -> None:
 
     shape_step = 1e-4 * torch.randn(len(model.shape), generator=generator, dtype=torch.float64)
     offset_step = 1e-4 * torch.randn(LANDMARK_OFFSET_COUNT, generator=generator, dtype=torch.float64)
-    other = model.moved(model.shape + shape_step)
-    moved, _ = pose_points(other, pose_skeleton(other, rotations, root), regressor.points(other, offset_step))
+    other = model.at_shape(model.shape + shape_step)
+    moved = pose_points(other, pose_skeleton(other, rotations, root), regressor.points(other, offset_step)).world_m
     expected = ((moved - world) * point_gradient).sum(-1)
     found = shape_jacobian_rows(model, skeleton, points, point_gradient) @ torch.cat([shape_step, offset_step])
     assert torch.allclose(found, expected, atol=1e-8)
 
 
-def test_linear_model_follows_the_body(model: LinearBody) -> None:
+def test_linear_body_approximates_the_body(model: LinearBody) -> None:
     body = load_anny()
     shape = body.shape_defaults.clone()
     shape[body.shape_names.index("height")] += 0.05
     shape[body.shape_names.index("upperleg-length")] += 0.2
     exact = linearise_body(body, shape)
-    approximate = model.moved(shape.double())
-    assert (exact.vertices - approximate.vertices).abs().max() < 2e-3
-    assert (exact.vertices - model.vertices).abs().max() > 2e-2
+    approximate = model.at_shape(shape.double())
+    assert (exact.vertices_m - approximate.vertices_m).abs().max() < 2e-3
+    assert (exact.vertices_m - model.vertices_m).abs().max() > 2e-2
     height, gradient = model.height_m()
     assert height + float(gradient @ (shape.double() - model.shape)) == pytest.approx(exact.height_m()[0], abs=2e-3)
 
 
-def test_skin_weights_of_fingers_go_to_the_hand(model: LinearBody) -> None:
-    assert torch.allclose(model.weights.sum(1), torch.ones(len(model.weights), dtype=torch.float64), atol=1e-5)
-    tip = int(model.vertices[:, 0].argmax())
-    assert model.weights[tip, ACTIVE_JOINTS.index("LeftHand")] > 0.99
+def test_skin_weights_of_fingers_are_merged_into_the_hand(model: LinearBody) -> None:
+    assert torch.allclose(
+        model.skin_weights.sum(1), torch.ones(len(model.skin_weights), dtype=torch.float64), atol=1e-5
+    )
+    tip = int(model.vertices_m[:, 0].argmax())
+    assert model.skin_weights[tip, ACTIVE_JOINTS.index("LeftHand")] > 0.99
 
 
 def test_finger_rotations_bend_fingers_only(model: LinearBody) -> None:
@@ -109,6 +111,6 @@ def test_finger_rotations_bend_fingers_only(model: LinearBody) -> None:
     assert all("Hand" in name and "Thumb" not in name for name in bent)
 
 
-def test_reduced_parents_skip_what_is_left_out() -> None:
+def test_reduced_parents_skip_inactive_joints() -> None:
     parents = np.array([-1, 0, 1, 2, 1])
     assert reduced_parents(parents, [0, 2, 3, 4]) == (-1, 0, 1, 0)

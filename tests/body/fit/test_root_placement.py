@@ -15,7 +15,7 @@ def tilted_camera() -> Camera:
 ROOTS = torch.tensor([[0.1, 0.2, 0.3], [-0.5, 1.0, -0.4]], dtype=torch.float64)
 
 
-def test_place_and_root_are_inverse() -> None:
+def test_perspective_coordinates_are_invertible() -> None:
     camera = tilted_camera()
     assert torch.allclose(perspective_to_world(world_to_perspective(ROOTS, camera), camera), ROOTS, atol=1e-5)
 

@@ -40,7 +40,7 @@ def test_normals_of_a_disc_point_outward() -> None:
 
 
 def test_distances_and_normals_do_not_depend_on_memory_alignment() -> None:
-    """malloc aligns to 16 bytes; arrays that are 32-byte aligned in one process are not in another."""
+    """malloc aligns to 16 bytes, so an array may be 32-byte aligned in one process and not in another."""
     area, kept = disc(30.0), []
     for turn in range(64):
         normals = outward_normals(signed_distance(area))
@@ -52,13 +52,13 @@ def test_distances_and_normals_do_not_depend_on_memory_alignment() -> None:
         assert len({array.tobytes() for array in arrays}) == 1
 
 
-def test_the_border_of_the_picture_is_no_outline() -> None:
+def test_the_image_border_is_no_outline() -> None:
     inside = np.zeros((10, 10), dtype=bool)
     inside[4:] = True
     assert np.array_equal(np.unique(outline_pixels(inside)[:, 0]), [4])
 
 
-def test_pairs_of_a_shifted_disc_point_back() -> None:
+def test_pairs_of_a_shifted_disc_recover_the_shift() -> None:
     window = crop_mask_window((disc(30.0) * 255).astype(np.uint8))
     assert window is not None
     shift = np.array([3.0, 0.0])
@@ -73,8 +73,8 @@ def test_pairs_of_a_shifted_disc_point_back() -> None:
     assert np.allclose(found, shift, atol=0.4)
 
 
-def test_a_mask_inside_the_body_pulls_harder_than_one_outside() -> None:
-    """Clothes lie outside the body; the body never lies outside its silhouette without cause."""
+def test_pairs_inside_the_mask_weigh_less_than_outside() -> None:
+    """Clothes extend the mask beyond the body; the body itself never extends beyond the mask."""
     window = crop_mask_window((disc(30.0) * 255).astype(np.uint8))
     assert window is not None
     middle = (np.array([50.0, 50.0]) - [window.left_px, window.top_px]) * window.scale
@@ -87,11 +87,11 @@ def test_a_mask_inside_the_body_pulls_harder_than_one_outside() -> None:
     assert find_correspondences(window, body_mask, body_mask).weight.mean() < 0.5 * weights[0]
 
 
-def test_a_mask_that_agrees_less_than_the_others_counts_less() -> None:
-    trust = mask_weights(np.array([0.93, 0.92, 0.94, 0.83, 0.6, np.nan]))
-    assert trust[[0, 1, 2, 5]].tolist() == [1.0] * 4
-    assert 0.3 < trust[3] < 0.8
-    assert trust[4] == pytest.approx(0.05)
+def test_masks_with_low_iou_have_low_weight() -> None:
+    weights = mask_weights(np.array([0.93, 0.92, 0.94, 0.83, 0.6, np.nan]))
+    assert weights[[0, 1, 2, 5]].tolist() == [1.0] * 4
+    assert 0.3 < weights[3] < 0.8
+    assert weights[4] == pytest.approx(0.05)
     assert mask_weights(np.full(3, np.nan)).tolist() == [1.0] * 3
 
 
@@ -104,7 +104,7 @@ def test_overlap_of_discs(second: np.ndarray, expected: float) -> None:
     assert mask_iou(disc(20.0), second) == pytest.approx(expected, abs=0.05)
 
 
-def test_the_true_body_covers_its_mask_and_its_pairs_are_satisfied() -> None:
+def test_the_true_body_matches_its_mask() -> None:
     scene = synthetic_recording(load_anny(), 3)
     windows = [*scene.windows()[:2], None]
     contour, silhouette_iou = match_silhouettes(scene.model, scene.state, scene.observations(scene.camera), windows)
@@ -115,16 +115,16 @@ def test_the_true_body_covers_its_mask_and_its_pairs_are_satisfied() -> None:
 
 
 def test_hair_and_shoes_have_little_weight() -> None:
-    """They make the outline higher than the person, who would come nearer by it."""
+    """They make the silhouette taller than the body, which would move the person towards the camera."""
     body = load_anny()
     scene = synthetic_recording(body, 6)
     windows = [crop_mask_window(cv2.dilate(mask, np.ones((7, 7), np.uint8))) for mask in scene.masks()]
     contour, _ = match_silhouettes(scene.model, scene.state, scene.observations(scene.camera), windows)
-    frozen = body.body(body.shape_defaults)
-    carried_by = frozen.skin_weights[contour.corners[..., 0].numpy()]
+    default_body = body.at_shape(body.shape_defaults)
+    skin_weights = default_body.skin_weights[contour.corners[..., 0].numpy()]
     weight = contour.weight.numpy()
-    head = carried_by[..., frozen.joint_names.index("Head")]
-    feet = carried_by[..., [row for row, name in enumerate(frozen.joint_names) if "Foot" in name]].sum(-1)
+    head = skin_weights[..., default_body.joint_names.index("Head")]
+    feet = skin_weights[..., [row for row, name in enumerate(default_body.joint_names) if "Foot" in name]].sum(-1)
     elsewhere = (head + feet < 0.1) & (weight > 0)
     for end in (head, feet):
         at_end = (end > 0.5) & (weight > 0)
@@ -138,11 +138,11 @@ def test_posed_vertices_equal_whole_body_skinning() -> None:
     model, state = scene.model, scene.state
     full = model.all_joint_rotations(state.rotations)
     transforms = skinning_transforms(
-        forward_kinematics(full, state.root_m, model.full_joints, body.parents), model.full_joints
+        forward_kinematics(full, state.root_m, model.full_joints_m, body.parents), model.full_joints_m
     )
-    frozen = body.body(body.shape_defaults)
+    default_body = body.at_shape(body.shape_defaults)
     expected = linear_blend_skinning(
-        torch.as_tensor(frozen.vertices).double(), torch.as_tensor(frozen.skin_weights).double(), transforms
+        torch.as_tensor(default_body.vertices).double(), torch.as_tensor(default_body.skin_weights).double(), transforms
     )
     # hands differ by millimetres where a vertex follows fingers and palm at once
     assert (posed_vertices(model, state) - expected).norm(dim=-1).max() < 0.01

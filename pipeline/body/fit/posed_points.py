@@ -1,0 +1,135 @@
+"""Points on the posed linear body and their derivatives.
+
+A small rotation delta_j of joint j is applied in the frame of its parent: R_j <- exp(delta_j) R_j. Let x_k be the
+position to which joint k alone would carry a point, and w_k its skin weight. Then the rotation of joint j moves the
+point by (parent rotation · delta_j) x arm_j with the lever arm arm_j = sum over k = j and its descendants of
+w_k (x_k - joint_j). The root moves in perspective coordinates (`pipeline.body.fit.root_placement`).
+
+Dimensions: n frames, m points, j active joints, p = 3 j + 3 parameters of a frame, s shape parameters.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pipeline.body.fit.linear_body import LinearBody
+from pipeline.geometry.skinning import forward_kinematics
+
+
+@dataclass(frozen=True)
+class PosedSkeleton:
+    """World rotations of the active joints, those of their parents, and world positions (m)."""
+
+    rotation: Float[Tensor, "n j 3 3"]
+    parent_rotation: Float[Tensor, "n j 3 3"]
+    position_m: Float[Tensor, "n j 3"]
+
+
+def pose_skeleton(
+    model: LinearBody, rotations: Float[Tensor, "n j 3 3"], root_m: Float[Tensor, "n 3"]
+) -> PosedSkeleton:
+    """Return the forward kinematics of the active joints.
+
+    rotations: local rotations; identity is the A-pose. root_m: world position of the root joint.
+    """
+    joint_to_world = forward_kinematics(rotations, root_m, model.joints_m, model.parents)
+    rotation = joint_to_world[..., :3, :3]
+    identity = torch.eye(3, dtype=rotation.dtype).expand(len(rotations), 1, 3, 3)
+    return PosedSkeleton(
+        rotation,
+        torch.cat([identity, rotation[:, list(model.parents[1:])]], dim=1),
+        joint_to_world[..., :3, 3],
+    )
+
+
+@dataclass(frozen=True)
+class SkinnedPoints:
+    """Points of the rest body: position (m), skin weights, derivative with respect to the shape.
+
+    The leading axis has length 1 if the points are the same in every frame.
+    """
+
+    rest_m: Float[Tensor, "#n m 3"]
+    skin_weights: Float[Tensor, "#n m j"]
+    shape_jacobian: Float[Tensor, "#n m 3 s"]
+
+
+@dataclass(frozen=True)
+class PosedPoints:
+    """Points of the body in world space.
+
+    lever_arms_m: about every joint (module docstring).
+    """
+
+    rest: SkinnedPoints
+    world_m: Float[Tensor, "n m 3"]
+    lever_arms_m: Float[Tensor, "n m j 3"]
+
+
+def surface_points(
+    model: LinearBody, corners: Int[Tensor, "n m 3"], barycentric: Float[Tensor, "n m 3"]
+) -> SkinnedPoints:
+    """Return points on faces of the rest body.
+
+    corners: vertex indices. The derivative with respect to the shape is approximated by that of the nearest corner.
+    """
+    share = barycentric[..., None]
+    nearest = corners.gather(2, barycentric.argmax(dim=2, keepdim=True)).squeeze(2)
+    return SkinnedPoints(
+        (model.vertices_m[corners] * share).sum(2),
+        (model.skin_weights[corners] * share).sum(2),
+        model.vertices_shape_jacobian[nearest],
+    )
+
+
+def pose_points(model: LinearBody, skeleton: PosedSkeleton, points: SkinnedPoints) -> PosedPoints:
+    """Return points in world space with their lever arms."""
+    offsets = points.rest_m[:, :, None] - model.joints_m
+    carried = torch.einsum("njab,nmjb->nmja", skeleton.rotation, offsets.expand(len(skeleton.rotation), -1, -1, -1))
+    weighted = points.skin_weights[..., None] * (carried + skeleton.position_m[:, None])
+    world = weighted.sum(2)
+    below = torch.einsum("jk,nmkc->nmjc", model.is_descendant, weighted)
+    weight_below = (points.skin_weights @ model.is_descendant.T)[..., None]
+    return PosedPoints(points, world, below - weight_below * skeleton.position_m[:, None])
+
+
+def pose_jacobian_rows(
+    skeleton: PosedSkeleton,
+    lever_arms_m: Float[Tensor, "n m j 3"],
+    root_jacobian: Float[Tensor, "n 3 3"],
+    point_gradient: Float[Tensor, "n m 3"],
+) -> Float[Tensor, "n m p"]:
+    """Return the derivative of point_gradient · point with respect to the 3 j joint rotations (rad) and the root (3).
+
+    root_jacobian: derivative of the world position of the root with respect to its parameters.
+    """
+    torque = torch.linalg.cross(lever_arms_m, point_gradient[:, :, None].expand_as(lever_arms_m))
+    rotation_jacobian = torch.einsum("njba,nmjb->nmja", skeleton.parent_rotation, torque)
+    return torch.cat([rotation_jacobian.flatten(2), point_gradient @ root_jacobian], dim=2)
+
+
+def shape_jacobian_rows(
+    model: LinearBody, skeleton: PosedSkeleton, points: SkinnedPoints, point_gradient: Float[Tensor, "n m 3"]
+) -> Float[Tensor, "n m s"]:
+    """Return the derivative of point_gradient · point with respect to the shape, through the surface and the skeleton.
+
+    Columns of `points.shape_jacobian` beyond the shape of the body (landmark offsets) do not move the skeleton.
+    """
+    joints_shape_jacobian = model.joints_shape_jacobian
+    joint_motion = [torch.zeros(len(skeleton.rotation), *joints_shape_jacobian.shape[1:], dtype=torch.float64)]
+    for joint, parent in list(enumerate(model.parents))[1:]:
+        step = joints_shape_jacobian[joint] - joints_shape_jacobian[parent]
+        joint_motion.append(joint_motion[parent] + skeleton.rotation[:, parent] @ step)
+    relative_joint_motion = torch.stack(joint_motion, dim=1) - skeleton.rotation @ joints_shape_jacobian
+    rest_gradient = torch.einsum(
+        "nmj,njab,nma->nmb",
+        points.skin_weights.expand(*point_gradient.shape[:2], -1),
+        skeleton.rotation,
+        point_gradient,
+    )
+    rows = (rest_gradient[..., None] * points.shape_jacobian).sum(2)
+    skeleton_gradient = torch.einsum("nma,njas->nmjs", point_gradient, relative_joint_motion)
+    rows[..., : relative_joint_motion.shape[-1]] += (points.skin_weights[..., None] * skeleton_gradient).sum(2)
+    return rows

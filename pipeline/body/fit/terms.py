@@ -1,0 +1,374 @@
+"""Energy terms of the fit. Each adds its Gauss-Newton approximation to the normal equations.
+
+Residuals are divided by their standard deviations. Distances in the image are measured in metres at the depth of the
+person, so that the weights hold for any resolution. Robust terms use the Geman-McClure function
+rho(r) = r^2 / (1 + r^2 / c^2) (Barron, "A general and adaptive robust loss function", 2019); c is the cutoff.
+
+Dimensions: n frames, l landmarks, m points of a frame, g shared parameters.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from pipeline.body.fit.camera_parameters import (
+    INTRINSICS_COUNT,
+    apply_intrinsics_delta,
+    compute_intrinsics_jacobian,
+    project_with_jacobian,
+)
+from pipeline.body.fit.ground_contact import CONTACT_CUTOFF, CONTACT_STD_M, Contact
+from pipeline.body.fit.landmark_regressor import LANDMARK_COUNT, LANDMARK_OFFSET_COUNT, landmark_std_ratio
+from pipeline.body.fit.levenberg_marquardt import NormalEquations, robust_weights
+from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody
+from pipeline.body.fit.posed_points import (
+    PosedPoints,
+    PosedSkeleton,
+    pose_jacobian_rows,
+    pose_points,
+    shape_jacobian_rows,
+    surface_points,
+)
+from pipeline.body.fit.priors import (
+    PosePrior,
+    ShapePrior,
+    acceleration_factors,
+    default_motion_std,
+    motion_residuals,
+    pose_residuals,
+)
+from pipeline.body.fit.root_placement import root_jacobian, world_to_perspective
+from pipeline.body.fit.state import FitState, Observations
+from pipeline.geometry.camera import Camera
+
+FACE_LANDMARK_COUNT = 11
+LEFT_HIP, RIGHT_HIP = 23, 24
+SCALE_ITERATIONS = 3
+DEPTH_STD_RATIO = 2.0
+"""Standard deviation of a detected landmark along the depth axis, relative to the one across."""
+MIN_DEPTH_SCALE_RATIO, MAX_DEPTH_SCALE_RATIO = 0.4, 1.2
+"""Range of the detector's depth scale, relative to its scale across."""
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """A state and what several terms derive from it.
+
+    model: the linear body at the shape of the state.
+    landmarks: the landmarks on the posed body.
+    has_shared: whether the normal equations have shared parameters.
+    """
+
+    state: FitState
+    camera: Camera
+    model: LinearBody
+    skeleton: PosedSkeleton
+    landmarks: PosedPoints
+    has_shared: bool
+
+    def projection(
+        self, points: PosedPoints
+    ) -> tuple[Float[Tensor, "n m 2"], Float[Tensor, "n m 2 3"], Float[Tensor, "n m 2 3"]]:
+        """Return pixels and their derivatives with respect to the world point (m) and the intrinsics delta."""
+        delta = self.state.intrinsics_delta
+        pixels, pixel_jacobian = project_with_jacobian(points.world_m, apply_intrinsics_delta(self.camera, delta))
+        return pixels, pixel_jacobian, compute_intrinsics_jacobian(pixels, self.camera, delta)
+
+    def pose_jacobian(
+        self, points: PosedPoints, root_jacobian: Float[Tensor, "n 3 3"], point_gradient: Float[Tensor, "n m 3"]
+    ) -> Float[Tensor, "n m p"]:
+        """Return the derivative of point_gradient · point with respect to the pose parameters."""
+        return pose_jacobian_rows(self.skeleton, points.lever_arms_m, root_jacobian, point_gradient)
+
+    def shared_jacobian(
+        self,
+        points: PosedPoints,
+        point_gradient: Float[Tensor, "n m 3"],
+        intrinsics_jacobian: Float[Tensor, "n m 3"],
+    ) -> Float[Tensor, "n m g"]:
+        """Return the derivative of point_gradient · point with respect to shape, landmark offsets and intrinsics.
+
+        It has no columns if there are no shared parameters.
+        """
+        if not self.has_shared:
+            return point_gradient[..., :0]
+        shape_jacobian = shape_jacobian_rows(self.model, self.skeleton, points.rest, point_gradient)
+        missing = len(self.model.shape) + LANDMARK_OFFSET_COUNT - shape_jacobian.shape[-1]
+        offsets = shape_jacobian.new_zeros(*shape_jacobian.shape[:2], missing)
+        return torch.cat([shape_jacobian, offsets, intrinsics_jacobian], dim=-1)
+
+
+@runtime_checkable
+class EnergyTerm(Protocol):
+    """A part of the energy."""
+
+    def add_to(self, system: NormalEquations, at: Linearisation) -> None:
+        """Add cost, gradient and Gauss-Newton Hessian at a state."""
+        ...
+
+
+@dataclass(frozen=True)
+class LandmarkTerm:
+    """Reprojection errors of the landmarks, robust.
+
+    std_m: standard deviation of each landmark, metres at the depth of the person.
+    px_per_m: image scale at the person in each frame, constant during a minimisation.
+    """
+
+    observations: Observations
+    std_m: Float[Tensor, "l"]
+    px_per_m: Float[Tensor, "n"]
+    cutoff: float
+
+    def add_to(self, system: NormalEquations, at: Linearisation) -> None:
+        """Add cost, gradient and Gauss-Newton Hessian at a state."""
+        pixels, pixel_jacobian, intrinsics_jacobian = at.projection(at.landmarks)
+        confidence = self.observations.confidence * face_landmark_confidence(at.skeleton, at.camera)
+        inverse_std = confidence.sqrt() / (self.std_m * self.px_per_m[:, None])
+        residual = (pixels - self.observations.landmarks_px) * inverse_std[..., None]
+        weight = robust_weights(system, residual.square().sum(-1), self.cutoff)
+        perspective_jacobian = root_jacobian(at.state.root_m, at.camera)
+        for axis in range(2):
+            point_gradient = pixel_jacobian[:, :, axis] * inverse_std[..., None]
+            system.accumulate(
+                at.pose_jacobian(at.landmarks, perspective_jacobian, point_gradient),
+                at.shared_jacobian(
+                    at.landmarks, point_gradient, intrinsics_jacobian[:, :, axis] * inverse_std[..., None]
+                ),
+                residual[..., axis],
+                weight,
+            )
+
+
+@dataclass(frozen=True)
+class Landmark3dTerm:
+    """Errors of the 3D landmarks relative to the middle of the hips, in camera axes, robust.
+
+    The scale of the detector is unknown and has its own factor along the depth axis (`fit_3d_landmark_scale`).
+    std_m: standard deviation across the view; the one along the depth is `DEPTH_STD_RATIO` times larger.
+    """
+
+    observations: Observations
+    std_m: float
+    cutoff: float
+
+    def add_to(self, system: NormalEquations, at: Linearisation) -> None:
+        """Add cost, gradient and Gauss-Newton Hessian at a state."""
+        world_m = at.landmarks.world_m
+        facing = face_landmark_confidence(at.skeleton, at.camera)
+        confidence = self.observations.confidence_3d * facing / landmark_std_ratio().square()
+        to_camera = torch.as_tensor(at.camera.world_to_camera, dtype=world_m.dtype)[:3, :3]
+        relative_m = (world_m - _hip_midpoint(world_m)) @ to_camera.T
+        detected_m = self.observations.landmarks_3d_m @ to_camera.T
+        inverse_std = confidence.sqrt()[..., None] / (self.std_m * world_m.new_tensor([1.0, 1.0, DEPTH_STD_RATIO]))
+        scale = fit_3d_landmark_scale(relative_m, detected_m, inverse_std, self.cutoff)
+        residual = (scale * relative_m - detected_m) * inverse_std
+        weight = robust_weights(system, residual.square().sum(-1), self.cutoff)
+        no_root = torch.zeros(len(world_m), 3, 3, dtype=torch.float64)  # a root translation moves hips and landmarks
+        no_intrinsics = world_m.new_zeros(*world_m.shape[:2], INTRINSICS_COUNT)
+        for axis in range(3):
+            point_gradient = (scale[axis] * to_camera[axis]).expand_as(world_m)
+            rows = at.pose_jacobian(at.landmarks, no_root, point_gradient)
+            shared = at.shared_jacobian(at.landmarks, point_gradient, no_intrinsics)
+            system.accumulate(
+                (rows - _hip_midpoint(rows)) * inverse_std[..., axis, None],
+                (shared - _hip_midpoint(shared)) * inverse_std[..., axis, None],
+                residual[..., axis],
+                weight,
+            )
+
+
+@dataclass(frozen=True)
+class Contour:
+    """Point-to-line constraints in the image: normal · (projection - target) = 0.
+
+    corners, barycentric: points on faces of the body, as vertex indices and barycentric coordinates.
+    weight: 0 for padding.
+    """
+
+    corners: Int[Tensor, "n m 3"]
+    barycentric: Float[Tensor, "n m 3"]
+    target_px: Float[Tensor, "n m 2"]
+    normal: Float[Tensor, "n m 2"]
+    weight: Float[Tensor, "n m"]
+
+
+@dataclass(frozen=True)
+class SilhouetteTerm:
+    """Distances of silhouette points from the mask outline, robust.
+
+    std_m: standard deviation, metres at the depth of the person. px_per_m: as in `LandmarkTerm`.
+    """
+
+    contour: Contour
+    std_m: float
+    px_per_m: Float[Tensor, "n"]
+    cutoff: float
+
+    def add_to(self, system: NormalEquations, at: Linearisation) -> None:
+        """Add cost, gradient and Gauss-Newton Hessian at a state."""
+        contour = self.contour
+        points = pose_points(at.model, at.skeleton, surface_points(at.model, contour.corners, contour.barycentric))
+        pixels, pixel_jacobian, intrinsics_jacobian = at.projection(points)
+        inverse_std = 1.0 / (self.px_per_m[:, None] * self.std_m)
+        residual = ((pixels - contour.target_px) * contour.normal).sum(-1) * inverse_std
+        weight = contour.weight * robust_weights(system, residual.square(), self.cutoff, contour.weight)
+        normal, inverse_std = contour.normal[..., None], inverse_std[..., None]
+        point_gradient = (pixel_jacobian * normal).sum(2) * inverse_std
+        shared = at.shared_jacobian(points, point_gradient, (intrinsics_jacobian * normal).sum(2) * inverse_std)
+        rows = at.pose_jacobian(points, root_jacobian(at.state.root_m, at.camera), point_gradient)
+        system.accumulate(rows, shared, residual, weight)
+
+
+@dataclass(frozen=True)
+class ContactTerm:
+    """Distances of standing soles from the floor and from where they stand, robust. Needs fixed shared parameters."""
+
+    contact: Contact
+
+    def add_to(self, system: NormalEquations, at: Linearisation) -> None:
+        """Add cost, gradient and Gauss-Newton Hessian at a state."""
+        contact = self.contact
+        points = pose_points(at.model, at.skeleton, contact.points)
+        perspective_jacobian = root_jacobian(at.state.root_m, at.camera)
+        residual = (points.world_m @ contact.axes.T - contact.target_m) / CONTACT_STD_M
+        weight = contact.weight * robust_weights(system, residual.square(), CONTACT_CUTOFF, contact.weight)
+        for axis, direction in enumerate(contact.axes):
+            point_gradient = (direction / CONTACT_STD_M).expand_as(points.world_m)
+            rows = at.pose_jacobian(points, perspective_jacobian, point_gradient)
+            system.accumulate(rows, point_gradient[..., :0], residual[..., axis], weight[..., axis])
+
+
+@dataclass(frozen=True)
+class PosePriorTerm:
+    """Deviations of the joint angles from the pose prior and from the joint limits."""
+
+    prior: PosePrior
+
+    def add_to(self, system: NormalEquations, at: Linearisation) -> None:
+        """Add cost, gradient and Gauss-Newton Hessian at a state."""
+        residual, jacobian = pose_residuals(self.prior, at.state.rotations)
+        system.cost += float(residual.square().sum())
+        gradient = (jacobian.transpose(-1, -2) @ residual[..., None]).squeeze(-1)
+        system.frame_gradient[:, :-3] += gradient.flatten(1)
+        blocks = jacobian.transpose(-1, -2) @ jacobian
+        for joint in range(blocks.shape[1]):
+            span = slice(3 * joint, 3 * joint + 3)
+            system.frame_hessian[:, span, span] += blocks[:, joint]
+
+
+@dataclass(frozen=True)
+class MotionTerm:
+    """Changes of velocity between successive frames, robust.
+
+    std: standard deviations of `motion_residuals`; None: `default_motion_std`. std_factor multiplies them.
+    """
+
+    time_s: Float[Tensor, "n"]
+    std: Float[Tensor, "p"] | None
+    std_factor: float
+    cutoff: float
+
+    def add_to(self, system: NormalEquations, at: Linearisation) -> None:
+        """Add cost, gradient and Gauss-Newton Hessian at a state; nothing if there are fewer than three frames."""
+        state = at.state
+        if len(state.root_m) < 3:
+            return
+        root_perspective = world_to_perspective(state.root_m, at.camera)
+        residual = motion_residuals(state.rotations, root_perspective, self.time_s)
+        std = default_motion_std(state.rotations.shape[1]) if self.std is None else self.std
+        residual = residual / (self.std_factor * std)
+        weight = robust_weights(system, residual.square(), self.cutoff)
+        before, after, scale = (factor[:, None] for factor in acceleration_factors(self.time_s))
+        factors = (before * scale / std, -(before + after) * scale / std, after * scale / std)
+        diagonal = torch.diagonal(system.frame_hessian, dim1=1, dim2=2)
+        inner = len(residual)
+        for shift, factor in enumerate(factors):
+            diagonal[shift : shift + inner] += weight * factor**2
+            system.frame_gradient[shift : shift + inner] += weight * factor * residual
+        system.next_frame_coupling[:inner] += weight * factors[0] * factors[1]
+        system.next_frame_coupling[1 : inner + 1] += weight * factors[1] * factors[2]
+        system.second_next_frame_coupling[:inner] += weight * factors[0] * factors[2]
+
+
+@dataclass(frozen=True)
+class SharedPriorTerm:
+    """Priors on shape, stature, landmark offsets and intrinsics.
+
+    intrinsics_std: of the intrinsics delta (principal point in focal lengths, logarithm of the focal length).
+    """
+
+    shape_prior: ShapePrior
+    landmark_offset_std_m: float
+    intrinsics_std: tuple[float, float, float]
+    height_m: float
+    height_std_m: float
+
+    def add_to(self, system: NormalEquations, at: Linearisation) -> None:
+        """Add cost, gradient and Gauss-Newton Hessian at a state; nothing if there are no shared parameters."""
+        if not at.has_shared:
+            return
+        state, shape_count = at.state, len(at.state.shape)
+        std = torch.cat(
+            [
+                self.shape_prior.std,
+                torch.full((LANDMARK_OFFSET_COUNT,), self.landmark_offset_std_m, dtype=torch.float64),
+                torch.tensor(self.intrinsics_std, dtype=torch.float64),
+            ]
+        )
+        value = torch.cat([state.shape - self.shape_prior.mean, state.landmark_offsets_m, state.intrinsics_delta]) / std
+        system.cost += float(value.square().sum())
+        system.shared_hessian += torch.diag(std**-2)
+        system.shared_gradient += value / std
+        height_m, gradient = at.model.height_m()
+        gradient = gradient / self.height_std_m
+        residual = (height_m - self.height_m) / self.height_std_m
+        system.cost += residual**2
+        system.shared_hessian[:shape_count, :shape_count] += torch.outer(gradient, gradient)
+        system.shared_gradient[:shape_count] += gradient * residual
+
+
+def face_landmark_confidence(skeleton: PosedSkeleton, camera: Camera) -> Float[Tensor, "n l"]:
+    """Return factors in [0.05, 1] on the confidence of the landmarks: small for face landmarks seen from behind.
+
+    The detector invents a face on the back of a head.
+    """
+    head = ACTIVE_JOINTS.index("Head")
+    to_camera = torch.nn.functional.normalize(
+        torch.as_tensor(camera.centre_m(), dtype=torch.float64) - skeleton.position_m[:, head], dim=-1
+    )
+    cosine = (skeleton.rotation[:, head, :, 2] * to_camera).sum(-1)
+    factor = torch.ones(len(cosine), LANDMARK_COUNT, dtype=torch.float64)
+    factor[:, :FACE_LANDMARK_COUNT] = (0.5 + 2.0 * cosine).clamp(0.05, 1.0)[:, None]
+    return factor
+
+
+def fit_3d_landmark_scale(
+    relative_m: Float[Tensor, "n l 3"],
+    landmarks_3d_m: Float[Tensor, "n l 3"],
+    inverse_std: Float[Tensor, "n l 3"],
+    cutoff: float,
+) -> Float[Tensor, "3"]:
+    """Return the factors (x, y, depth) that map the landmarks of the body to the detected ones with least robust cost.
+
+    x and y have the same factor; the depth has its own because the detector flattens people. The factors minimise the
+    cost, so its derivative with respect to them is zero and the Jacobians may take them as constant.
+
+    relative_m, landmarks_3d_m: relative to the middle of the hips, camera axes.
+    """
+    weight, scale = inverse_std.square(), relative_m.new_ones(3)
+    for _ in range(SCALE_ITERATIONS):
+        numerator, denominator = ((weight * relative_m * other).sum((0, 1)) for other in (landmarks_3d_m, relative_m))
+        across = numerator[:2].sum() / denominator[:2].sum()
+        depth = (numerator[2] / denominator[2]).clamp(MIN_DEPTH_SCALE_RATIO * across, MAX_DEPTH_SCALE_RATIO * across)
+        scale = torch.stack([across, across, depth])
+        squared = ((scale * relative_m - landmarks_3d_m) * inverse_std).square().sum(-1)
+        weight = inverse_std.square() * ((1.0 + squared / cutoff**2) ** -2)[..., None]
+    return scale
+
+
+def _hip_midpoint(values: Float[Tensor, "n l c"]) -> Float[Tensor, "n 1 c"]:
+    return 0.5 * (values[:, LEFT_HIP] + values[:, RIGHT_HIP])[:, None]
