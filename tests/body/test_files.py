@@ -4,14 +4,25 @@ import numpy as np
 import pytest
 
 from pipeline.body.body import Motion, load_anny
-from pipeline.body.files import load_body, load_camera, load_motion, save_body, save_camera, save_motion
+from pipeline.body.files import (
+    FrameScores,
+    load_body,
+    load_camera,
+    load_motion,
+    load_scores,
+    save_body,
+    save_camera,
+    save_motion,
+    save_scores,
+)
 from pipeline.core.errors import UserError
 from pipeline.geometry.camera import Camera
+from pipeline.io.npz import save_npz
 
 
 def test_body_round_trip(tmp_path) -> None:
     parametric = load_anny()
-    body = parametric.body(parametric.shape_defaults)
+    body = parametric.at_shape(parametric.shape_defaults)
     save_body(tmp_path / "body.npz", body)
     again = load_body(tmp_path / "body.npz")
     assert again.joint_names == body.joint_names
@@ -39,3 +50,19 @@ def test_poses_that_are_not_finite_are_refused_with_their_frames(tmp_path, place
     save_motion(tmp_path / "motion.npz", motion)
     with pytest.raises(UserError, match=r"motion.npz: the poses of frames 20, 50 are not finite"):
         load_motion(tmp_path / "motion.npz")
+
+
+def test_scores_round_trip(tmp_path) -> None:
+    values = np.array([0.5, np.nan])
+    flags = np.array([True, False])
+    scores = FrameScores(np.array([3, 6]), values, values + 1.0, flags, values + 2.0, ~flags)
+    save_scores(tmp_path / "scores.npz", scores)
+    again = load_scores(tmp_path / "scores.npz")
+    for name, array in vars(scores).items():
+        np.testing.assert_array_equal(getattr(again, name), array)
+
+
+def test_scores_of_an_older_version_are_refused(tmp_path) -> None:
+    save_npz(tmp_path / "scores.npz", {"frame_index": np.arange(2), "silhouette_iou": np.ones(2)})
+    with pytest.raises(UserError, match="scores.npz has no `landmark_error_px`.* run `python -m stages.body` again"):
+        load_scores(tmp_path / "scores.npz")
