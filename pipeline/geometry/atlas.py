@@ -1,11 +1,10 @@
-"""Texture atlases: parametrisation of a mesh, the surface point of each texel, and filling of uncovered texels.
+"""Texture atlases: parametrisation of a mesh and the surface point of each texel.
 
 The UV origin is bottom-left; row 0 of a texture is at the top (v = 1); texel centres are at +0.5.
 """
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 import xatlas
@@ -144,46 +143,3 @@ def rasterize_texels(atlas: Atlas, size_px: int) -> Texels:
         face_id.numpy()[rows, columns],
         barycentric.numpy()[rows, columns],
     )
-
-
-def fill_unknown_texels(
-    image: Float[np.ndarray, "h w c"], known: Bool[np.ndarray, "h w"], dilation_px: int = 2
-) -> Float[np.ndarray, "h w c"]:
-    """Fill unknown texels, so that bilinear sampling and mipmaps show no colour of the background at chart borders.
-
-    The first `dilation_px` rings around known texels take the mean of their known neighbours; the rest is filled by
-    push-pull (Gortler et al., "The Lumigraph", 1996): means over 2 x 2 texels on coarser and coarser levels, then
-    interpolation back to the finer levels where these have no value. If no texel is known, all are 0.
-
-    Args:
-        image: colours; those of unknown texels are ignored.
-        known: texels with a known colour.
-        dilation_px: number of rings that are filled by dilation.
-    """
-    colour = np.where(known[..., None], image, 0.0).astype(np.float32)
-    weight = known.astype(np.float32)
-    for _ in range(dilation_px):
-        near_weight = cv2.boxFilter(weight, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
-        near = cv2.boxFilter(colour * weight[..., None], -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
-        new = (weight == 0) & (near_weight > 0.5)
-        colour[new] = near.reshape(colour.shape)[new] / near_weight[new][:, None]
-        weight[new] = 1.0
-    return _push_pull(colour, weight)
-
-
-def _push_pull(colour: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    height, width = weight.shape
-    if weight.size == 1 or weight.min() > 0:
-        return colour
-    even = ((0, height % 2), (0, width % 2))
-    summed = _sum_2x2(np.pad(colour * weight[..., None], (*even, (0, 0))))
-    count = _sum_2x2(np.pad(weight, even)[..., None])
-    coarse = _push_pull(summed / np.maximum(count, 1e-8), np.minimum(count[..., 0], 1.0))
-    finer = cv2.resize(coarse, (2 * coarse.shape[1], 2 * coarse.shape[0]), interpolation=cv2.INTER_LINEAR)
-    finer = finer.reshape(2 * coarse.shape[0], 2 * coarse.shape[1], -1)[:height, :width]
-    return np.where(weight[..., None] > 0, colour, finer).astype(np.float32)
-
-
-def _sum_2x2(values: np.ndarray) -> np.ndarray:
-    height, width, channels = values.shape
-    return values.reshape(height // 2, 2, width // 2, 2, channels).sum(axis=(1, 3))

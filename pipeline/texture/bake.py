@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pipeline.core.progress import track
-from pipeline.geometry.atlas import Atlas, Texels, fill_unknown_texels
+from pipeline.geometry.atlas import Atlas, Texels
 from pipeline.geometry.camera import pixel_footprint_m, project
 from pipeline.geometry.texture_rendering import render_textured
 from pipeline.kernels.texel_projection import ImageView, ProjectedMesh, TexelPoints, project_texels
@@ -28,6 +28,7 @@ from pipeline.metrics.images import (
     foreground_mask,
     validation_psnr_db,
 )
+from pipeline.texture.edge_padding import fill_unknown_texels
 from pipeline.texture.settings import TextureSettings
 from pipeline.texture.views import BakeView, align_to_render, pixel_confidence, render_depth
 

@@ -1,13 +1,11 @@
-"""Atlases: charts cover the texture once with padding between them; gaps are filled with known colours only."""
+"""Atlases: charts cover the texture once with padding between them."""
 
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from pipeline.geometry.atlas import Atlas, fill_unknown_texels, rasterize_texels, texture_size_px, unwrap
+from pipeline.geometry.atlas import Atlas, rasterize_texels, texture_size_px, unwrap
 from pipeline.geometry.mesh import Mesh
 
 SIZE_PX, PADDING_PX = 256, 4
@@ -100,26 +98,3 @@ def test_texture_size_follows_the_pixel_footprint(pixel_footprint_m: float, expe
     if 256 < size < 2048:
         texel_m = np.sqrt(1.8 / 0.65) / size
         assert 0.5 * pixel_footprint_m < texel_m <= pixel_footprint_m
-
-
-@settings(max_examples=25)
-@given(st.integers(0, 2**31), st.integers(3, 40), st.integers(3, 40))
-def test_filling_keeps_known_texels_and_their_range(seed: int, height: int, width: int) -> None:
-    random = np.random.default_rng(seed)
-    image = random.uniform(0.2, 0.8, (height, width, 3)).astype(np.float32)
-    known = random.uniform(size=(height, width)) < 0.2
-    known[random.integers(height), random.integers(width)] = True
-    filled = fill_unknown_texels(np.where(known[..., None], image, 7.0).astype(np.float32), known)
-    np.testing.assert_array_equal(filled[known], image[known])
-    assert np.all(filled >= image[known].min(axis=0) - 1e-4)
-    assert np.all(filled <= image[known].max(axis=0) + 1e-4)
-
-
-def test_texels_next_to_a_chart_take_its_colour() -> None:
-    image, known = np.zeros((64, 64, 3), dtype=np.float32), np.zeros((64, 64), dtype=bool)
-    image[:, :20], image[:, 40:] = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
-    known[:, :20] = known[:, 40:] = True
-    filled = fill_unknown_texels(image, known, dilation_px=2)
-    np.testing.assert_allclose(filled[:, 20:22], np.broadcast_to([1.0, 0.0, 0.0], (64, 2, 3)), atol=1e-6)
-    np.testing.assert_allclose(filled[:, 38:40], np.broadcast_to([0.0, 0.0, 1.0], (64, 2, 3)), atol=1e-6)
-    assert 0.2 < filled[32, 30, 0] < 0.8

@@ -6,12 +6,13 @@ import numpy as np
 import torch
 import trimesh
 
-from pipeline.geometry.atlas import Atlas, fill_unknown_texels, rasterize_texels, unwrap
+from pipeline.geometry.atlas import Atlas, rasterize_texels, unwrap
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.texture_rendering import render_textured
 from pipeline.io.image import to_uint8
 from pipeline.texture.bake import TexturedSurface
+from pipeline.texture.edge_padding import fill_unknown_texels
 from pipeline.texture.views import BakeView, crop_bake_view
 
 SIZE_PX = 256
