@@ -1,12 +1,13 @@
 """export stage: write the avatar as a skinned, animated .glb and as a textured .obj."""
 
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float32
 from pydantic import Field
 
 from pipeline.avatar.gltf import MaterialMaps, SkinnedMesh, encode_glb, pack_specular_factor
@@ -25,12 +26,12 @@ from pipeline.core.config import Config as BaseConfig
 from pipeline.core.stage import Stage
 from pipeline.geometry.atlas import Atlas
 from pipeline.geometry.skinning import linear_blend_skinning
-from pipeline.io.image import png_bytes, to_float, to_uint8, write_gray
+from pipeline.io.image import png_bytes, to_uint8
 from pipeline.mesh.files import MeshArtifact, load_mesh
-from pipeline.texture.files import load_texture
+from pipeline.texture.files import DIFFUSE, SPECULAR, load_texture, map_files
 from pipeline.texture.specular import dielectric_specular_factor
 
-DIFFUSE, SPECULAR = "avatar_diffuse.png", "avatar_specular.png"
+OBJ_MAPS = tuple(f"avatar_{name}" for name in (DIFFUSE, SPECULAR))
 POSES_PER_BATCH = 8
 
 
@@ -60,7 +61,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     texture = load_texture(inputs["texture"])
     mesh, atlas, is_specular = skinned.mesh, texture.atlas, bool(texture.specular.any())
     maps = MaterialMaps(
-        png_bytes(texture.diffuse),
+        png_bytes(to_uint8(texture.diffuse)),
         encode_specular_png(texture.specular, texture.diffuse, config.roughness) if is_specular else None,
         config.roughness,
         config.unlit,
@@ -77,9 +78,8 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
         asset_extras(config, offset_m, capture.fps),
     )
     (out / "avatar.glb").write_bytes(glb)
-    (out / DIFFUSE).write_bytes(maps.diffuse_png)
-    write_gray(out / SPECULAR, texture.specular)
-    map_names = (DIFFUSE, SPECULAR if is_specular else None)
+    diffuse_name, specular_name = (copy_map(inputs["texture"], name, out) for name in (DIFFUSE, SPECULAR))
+    map_names = (diffuse_name, specular_name if is_specular else None)
     write_obj(out / "avatar.obj", mesh, atlas.uv, atlas.faces_uv, mesh.vertex_normals(), *map_names)
     return {
         "glb_bytes": float(len(glb)),
@@ -90,11 +90,22 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     }
 
 
+def copy_map(texture_dir: Path, name: str, out: Path) -> str:
+    """Copy the files of a map for the .obj; return the name of the one with the highest precision.
+
+    The .glb embeds 8 bits: glTF allows 16-bit PNG, but no GPU has a 16-bit sRGB format, so viewers reduce it.
+    """
+    paths = map_files(texture_dir, name)
+    for path in paths:
+        shutil.copyfile(path, out / f"avatar_{path.name}")
+    return f"avatar_{paths[-1].name}"
+
+
 def encode_specular_png(
-    amplitude: UInt8[np.ndarray, "s s"], diffuse: UInt8[np.ndarray, "s s 3"], roughness: float
+    amplitude: Float32[np.ndarray, "s s"], diffuse: Float32[np.ndarray, "s s 3"], roughness: float
 ) -> bytes:
     """Convert the texture stage's specular map (sRGB) to a PNG with glTF's specular factor."""
-    factor = dielectric_specular_factor(to_float(amplitude), to_float(diffuse), roughness)
+    factor = dielectric_specular_factor(amplitude, diffuse, roughness)
     return png_bytes(pack_specular_factor(to_uint8(factor)))
 
 
@@ -136,7 +147,7 @@ STAGE = Stage(
     "export",
     version=3,
     needs=("frames", "body", "field", "mesh", "texture"),
-    makes=("avatar.glb", "avatar.obj", "avatar.mtl", DIFFUSE, SPECULAR),
+    makes=("avatar.glb", "avatar.obj", "avatar.mtl", *OBJ_MAPS),
     config=Config,
     run=run,
 )

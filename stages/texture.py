@@ -34,7 +34,7 @@ from pipeline.texture.bake import (
     texels_to_texture,
 )
 from pipeline.texture.body_parts import body_part_of_faces
-from pipeline.texture.files import ATLAS, COVERAGE, DIFFUSE, SPECULAR, TextureArtifact, save_texture
+from pipeline.texture.files import ATLAS, COVERAGE, DIFFUSE, SPECULAR, TextureArtifact, TextureFormat, save_texture
 from pipeline.texture.inpainting import average_texels_per_vertex, inpaint_vertex_colours
 from pipeline.texture.settings import DEFAULT_SETTINGS, TextureSettings
 from pipeline.texture.specular import fit_specular, observe_vertices, texels_at_vertices
@@ -53,6 +53,10 @@ class Config(BaseConfig):
         ge=64,
         le=8192,
         description="largest side of the texture, px, a power of two",
+    )
+    format: TextureFormat = Field(
+        "png8",
+        description="files of the maps: png8, png16, or exr (8-bit .png and half floats in .exr)",
     )
     max_frames: int = Field(
         100, ge=1, description="largest number of training frames, evenly spaced over the recording"
@@ -99,16 +103,16 @@ def run(
     specular = torch.from_numpy(texels.interpolate(skinned.mesh.faces, amplitude[:, None]))
     artifact = TextureArtifact(
         atlas,
-        diffuse=to_uint8(diffuse),
-        specular=to_uint8(texels_to_texture(specular, texels)[..., 0]),
+        diffuse=diffuse,
+        specular=np.ascontiguousarray(texels_to_texture(specular, texels)[..., 0]),
         coverage=to_uint8(texels.to_texture(texel_confidence[:, None])[..., 0]),
     )
-    save_texture(out, artifact)
+    save_texture(out, artifact, config.format)
     return {
         "texture_px": float(size_px),
         "observed_texel_fraction": float((texel_confidence > 0.5).mean()),
         "atlas_utilisation": float(len(texels.face) / size_px**2),
-        "validation_psnr_body_db": mean_foreground_psnr_db(to_float(artifact.diffuse), validation, surface),
+        "validation_psnr_body_db": mean_foreground_psnr_db(to_float(to_uint8(diffuse)), validation, surface),
         "specular_partial_r2": partial_r2,
     }
 

@@ -17,7 +17,6 @@ from pipeline.field.files import load_field, load_occupancy
 from pipeline.field.rendering import render_field
 from pipeline.field.skin_grid import build_skin_grid, skin_margin_m
 from pipeline.geometry.camera import Camera
-from pipeline.io.image import to_float
 from pipeline.mesh.files import load_mesh
 from pipeline.texture.files import load_texture
 
@@ -79,7 +78,7 @@ def load_textured_avatar(mesh_dir: Path, texture_dir: Path) -> TexturedAvatar:
         joint_weights=torch.from_numpy(skinned.joint_weights.astype(np.float32)),
         uv=torch.from_numpy(texture.atlas.uv.astype(np.float32)),
         faces_uv=torch.from_numpy(texture.atlas.faces_uv.astype(np.int32)),
-        diffuse=torch.from_numpy(to_float(texture.diffuse)),
+        diffuse=torch.from_numpy(texture.diffuse),
     )
 
 

@@ -2,16 +2,18 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float32, UInt8
 
 from pipeline.core.errors import UserError
 from pipeline.geometry.atlas import Atlas
-from pipeline.io.image import read_gray, read_rgb, write_gray, write_rgb
+from pipeline.io.image import read_gray, read_rgb_float, to_uint8, to_uint16, write_gray, write_rgb
 from pipeline.io.npz import load_npz, save_npz
 
 ATLAS, DIFFUSE, SPECULAR, COVERAGE = "atlas.npz", "diffuse.png", "specular.png", "coverage.png"
+TextureFormat = Literal["png8", "png16", "exr"]
 
 
 @dataclass(frozen=True)
@@ -20,28 +22,40 @@ class TextureArtifact:
 
     Attributes:
         atlas: UV layout of the mesh.
-        diffuse: sRGB, 0 to 255, gutters filled.
-        specular: what a highlight adds to the diffuse colour, sRGB, 0 to 255; all 0 for a matte surface.
+        diffuse: sRGB in [0, 1], gutters filled.
+        specular: what a highlight adds to the diffuse colour, sRGB in [0, 1]; all 0 for a matte surface.
         coverage: confidence that the video shows the texel, 0 to 255; 0 outside the charts.
     """
 
     atlas: Atlas
-    diffuse: UInt8[np.ndarray, "s s 3"]
-    specular: UInt8[np.ndarray, "s s"]
+    diffuse: Float32[np.ndarray, "s s 3"]
+    specular: Float32[np.ndarray, "s s"]
     coverage: UInt8[np.ndarray, "s s"]
 
 
-def save_texture(folder: Path, texture: TextureArtifact) -> None:
-    """Write the atlas and the maps into `folder`; `load_texture` is the inverse."""
+def save_texture(folder: Path, texture: TextureArtifact, texture_format: TextureFormat = "png8") -> None:
+    """Write the atlas and the maps into `folder`; `load_texture` is the inverse up to the precision of the format.
+
+    Maps are PNG with 8 bits per channel, or 16 for "png16". "exr" adds OpenEXR files with linear half floats.
+    """
     atlas = texture.atlas
     save_npz(folder / ATLAS, {"uv": atlas.uv, "faces_uv": atlas.faces_uv, "vertex_of_uv": atlas.vertex_of_uv})
-    write_rgb(folder / DIFFUSE, texture.diffuse)
-    write_gray(folder / SPECULAR, texture.specular)
+    for name, values in ((DIFFUSE, texture.diffuse), (SPECULAR, texture.specular)):
+        write = write_rgb if values.ndim == 3 else write_gray
+        write(folder / name, to_uint16(values) if texture_format == "png16" else to_uint8(values))
+        if texture_format == "exr":
+            write((folder / name).with_suffix(".exr"), values)
     write_gray(folder / COVERAGE, texture.coverage)
 
 
+def map_files(folder: Path, name: str) -> list[Path]:
+    """Return the files of a map (`DIFFUSE` or `SPECULAR`); the last one has the highest precision."""
+    exr = (folder / name).with_suffix(".exr")
+    return [folder / name, *([exr] if exr.is_file() else [])]
+
+
 def load_texture(folder: Path) -> TextureArtifact:
-    """Read what `save_texture` wrote.
+    """Read the artifact, maps in their highest precision.
 
     Raises:
         UserError: a file is missing or unreadable, or the atlas lacks an array.
@@ -51,6 +65,6 @@ def load_texture(folder: Path) -> TextureArtifact:
         atlas = Atlas(arrays["uv"], arrays["faces_uv"], arrays["vertex_of_uv"])
     except KeyError as error:
         raise UserError(f"{folder / ATLAS} lacks the array {error}; run `python -m stages.texture` again") from None
-    return TextureArtifact(
-        atlas, read_rgb(folder / DIFFUSE), read_gray(folder / SPECULAR), read_gray(folder / COVERAGE)
-    )
+    diffuse = read_rgb_float(map_files(folder, DIFFUSE)[-1])
+    specular = read_rgb_float(map_files(folder, SPECULAR)[-1])[..., 0]
+    return TextureArtifact(atlas, diffuse, np.ascontiguousarray(specular), read_gray(folder / COVERAGE))

@@ -1,6 +1,7 @@
 """The export stage on a body with true mesh and poses and a hand-written texture."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,8 +13,8 @@ from pipeline.body.body import canonical_to_world
 from pipeline.geometry.atlas import Atlas
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.io.glb import GlbFile
-from pipeline.io.image import read_rgb, write_gray
-from pipeline.texture.files import TextureArtifact, load_texture, save_texture
+from pipeline.io.image import read_rgb, to_float, write_gray
+from pipeline.texture.files import TextureArtifact, TextureFormat, load_texture, save_texture
 from stages.export import STAGE as EXPORT
 from tests.avatar.test_gltf import Player
 from tests.field.scene import PaintedScene, painted_scene
@@ -38,10 +39,10 @@ def inputs(scene: PaintedScene, tmp_path_factory: pytest.TempPathFactory) -> dic
     faces = scene.body.faces
     faces_uv = np.arange(faces.size, dtype=np.int32).reshape(-1, 3)
     atlas = Atlas(random.uniform(size=(faces.size, 2)).astype(np.float32), faces_uv, faces.reshape(-1).astype(np.int32))
-    diffuse = random.integers(0, 256, (TEXTURE_PX, TEXTURE_PX, 3), dtype=np.uint8)
+    diffuse = to_float(random.integers(0, 256, (TEXTURE_PX, TEXTURE_PX, 3), dtype=np.uint8))
     blank = np.zeros((TEXTURE_PX, TEXTURE_PX), dtype=np.uint8)
     (folder / "texture").mkdir()
-    save_texture(folder / "texture", TextureArtifact(atlas, diffuse, blank, blank))
+    save_texture(folder / "texture", TextureArtifact(atlas, diffuse, to_float(blank), blank))
     return inputs | {"texture": folder / "texture"}
 
 
@@ -82,9 +83,32 @@ def test_the_animation_reproduces_the_motion_on_a_floor_at_zero(
 
 def test_the_glb_embeds_the_maps(exported: tuple[Path, dict[str, float]]) -> None:
     png = (exported[0] / "avatar_diffuse.png").read_bytes()
-    assert GlbFile(exported[0] / "avatar.glb").image_bytes(0) == png
-    diffuse = load_texture(exported[0].parent / "texture").diffuse
-    np.testing.assert_array_equal(read_rgb(exported[0] / "avatar_diffuse.png"), diffuse)
+    assert png == (exported[0].parent / "texture" / "diffuse.png").read_bytes()
+    embedded = GlbFile(exported[0] / "avatar.glb").base_colour(0)
+    np.testing.assert_array_equal(embedded, read_rgb(exported[0] / "avatar_diffuse.png"))
+
+
+@pytest.mark.parametrize(("texture_format", "suffix"), [("png16", ".png"), ("exr", ".exr")])
+def test_the_obj_refers_to_the_deepest_maps_and_the_glb_embeds_eight_bits(
+    inputs: dict[str, Path], tmp_path: Path, texture_format: TextureFormat, suffix: str
+) -> None:
+    texture, out = tmp_path / "texture", tmp_path / "export"
+    texture.mkdir()
+    out.mkdir()
+    artifact = load_texture(inputs["texture"])
+    amplitude = np.zeros((TEXTURE_PX, TEXTURE_PX), dtype=np.float32)
+    amplitude[:, TEXTURE_PX // 2 :] = 0.01
+    diffuse = np.random.default_rng(1).uniform(size=(TEXTURE_PX, TEXTURE_PX, 3)).astype(np.float32)
+    save_texture(texture, replace(artifact, diffuse=diffuse, specular=amplitude), texture_format)
+    EXPORT.run(inputs | {"texture": texture}, out, EXPORT.config())
+    material = (out / "avatar.mtl").read_text().splitlines()
+    assert {f"map_Kd avatar_diffuse{suffix}", f"map_Ks avatar_specular{suffix}"} <= set(material)
+    for name in ("diffuse", "specular"):
+        assert (out / f"avatar_{name}{suffix}").read_bytes() == (texture / f"{name}{suffix}").read_bytes()
+    assert validator_issues(out / "avatar.glb") == []
+    embedded = cv2.imdecode(np.frombuffer(GlbFile(out / "avatar.glb").image_bytes(0), np.uint8), cv2.IMREAD_UNCHANGED)
+    assert embedded.dtype == np.uint8
+    np.testing.assert_allclose(embedded[..., ::-1] / 255.0, diffuse, atol=0.0023)
 
 
 def test_highlights_become_a_specular_factor_unless_the_surface_is_unlit(

@@ -1,14 +1,27 @@
 """The artifact of the texture stage: round trip and errors."""
 
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from pipeline.core.errors import UserError
 from pipeline.geometry.atlas import Atlas
+from pipeline.io.image import to_float
 from pipeline.io.npz import load_npz, save_npz
-from pipeline.texture.files import ATLAS, COVERAGE, DIFFUSE, SPECULAR, TextureArtifact, load_texture, save_texture
+from pipeline.texture.files import (
+    ATLAS,
+    COVERAGE,
+    DIFFUSE,
+    SPECULAR,
+    TextureArtifact,
+    TextureFormat,
+    load_texture,
+    map_files,
+    save_texture,
+)
 
 
 @pytest.fixture
@@ -20,7 +33,7 @@ def artifact() -> TextureArtifact:
         np.array([0, 1, 2, 3, 0], dtype=np.int32),
     )
     diffuse, gray = (random.integers(0, 256, shape, dtype=np.uint8) for shape in ((8, 8, 3), (2, 8, 8)))
-    return TextureArtifact(atlas, diffuse, gray[0], gray[1])
+    return TextureArtifact(atlas, to_float(diffuse), to_float(gray[0]), gray[1])
 
 
 def test_reading_inverts_writing(artifact: TextureArtifact, tmp_path: Path) -> None:
@@ -31,6 +44,29 @@ def test_reading_inverts_writing(artifact: TextureArtifact, tmp_path: Path) -> N
         np.testing.assert_array_equal(getattr(read.atlas, name), getattr(artifact.atlas, name))
     for name in ("diffuse", "specular", "coverage"):
         np.testing.assert_array_equal(getattr(read, name), getattr(artifact, name))
+
+
+@pytest.mark.parametrize(
+    ("texture_format", "names", "tolerance"),
+    [
+        ("png8", ["diffuse.png"], 0.5 / 255),
+        ("png16", ["diffuse.png"], 0.5 / 65535),
+        ("exr", ["diffuse.png", "diffuse.exr"], 3e-4),
+    ],
+)
+def test_each_format_keeps_its_precision(
+    artifact: TextureArtifact, tmp_path: Path, texture_format: TextureFormat, names: list[str], tolerance: float
+) -> None:
+    values = np.random.default_rng(0).uniform(size=(8, 8, 3)).astype(np.float32)
+    deep = replace(artifact, diffuse=values, specular=np.ascontiguousarray(values[..., 0]))
+    save_texture(tmp_path, deep, texture_format)
+    assert [path.name for path in map_files(tmp_path, DIFFUSE)] == names
+    read = load_texture(tmp_path)
+    for name in ("diffuse", "specular"):
+        np.testing.assert_allclose(getattr(read, name), getattr(deep, name), atol=1.001 * tolerance)
+        assert np.abs(getattr(read, name) - getattr(deep, name)).max() > 0.2 * tolerance
+    depth = np.uint16 if texture_format == "png16" else np.uint8
+    assert cv2.imread(str(tmp_path / DIFFUSE), cv2.IMREAD_UNCHANGED).dtype == depth
 
 
 @pytest.mark.parametrize("name", [ATLAS, DIFFUSE, SPECULAR, COVERAGE])
