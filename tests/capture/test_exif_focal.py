@@ -7,6 +7,7 @@ import av
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from pipeline.capture.exif_focal import metadata_focal_px
 from pipeline.capture.video import open_frame_source
@@ -45,9 +46,23 @@ def test_exif_of_images(tmp_path: Path, order: str) -> None:
     assert metadata_focal_px(source, 150, 200) == pytest.approx(26 / 43.27 * 250)
 
 
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
+def test_exif_that_pillow_writes(tmp_path: Path, suffix: str) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 1
+    exif.get_ifd(0x8769)[0xA405] = 26
+    Image.new("RGB", (30, 40)).save(tmp_path / f"0{suffix}", exif=exif)
+    assert metadata_focal_px(open_frame_source(tmp_path), 300, 400) == pytest.approx(26 / 43.27 * 500)
+
+
 @pytest.mark.parametrize("exif", [b"", b"II", tiff("<", 26)[:40], tiff("<", 0), b"nonsense" * 9])
 def test_damaged_or_empty_metadata_gives_none(tmp_path: Path, exif: bytes) -> None:
     assert metadata_focal_px(open_frame_source(write_folder(tmp_path / "images", exif)), 300, 400) is None
+
+
+def test_files_that_are_not_images_give_none(tmp_path: Path) -> None:
+    (tmp_path / "0.jpg").write_bytes(b"nonsense" * 9)
+    assert metadata_focal_px(open_frame_source(tmp_path), 300, 400) is None
 
 
 def test_images_without_metadata_give_none(tmp_path: Path) -> None:
