@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import UInt8
 from markupsafe import Markup
 
+from pipeline.io.image import resize
 from pipeline.report.charts import bar_chart, legend, line_chart
 from pipeline.report.embed import compress_glb_textures, webp_data_uri
 from pipeline.report.report_json import POSE_FITTED_SUFFIX
@@ -206,7 +207,8 @@ def _shrunk(pixels: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "_ _ 3"]:
     scale = MAX_IMAGE_PX / max(pixels.shape[:2])
     if scale >= 1.0:
         return pixels
-    return cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    height, width = pixels.shape[:2]
+    return resize(pixels, round(width * scale), round(height * scale))
 
 
 def _tables(report: Mapping[str, Any]) -> list[Markup]:

@@ -4,6 +4,7 @@ import base64
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -64,6 +65,14 @@ def test_every_picture_has_a_size_and_a_text(outline: Outline):
     images = [attributes for tag, attributes in outline.attributes if tag == "img"]
     assert len(images) == 2 * 5 + 4 + 1
     assert all(image["alt"] and int(image["width"] or 0) > 0 for image in images)
+
+
+def test_large_pictures_are_shrunk_in_proportion():
+    large = np.full((40, 2 * MAX_PICTURE_PX, 3), 90, np.uint8)
+    parser = Outline()
+    parser.feed(render_page(replace(sample_page(), pictures=[("Mesh", large)])))
+    sizes = [(attributes["width"], attributes["height"]) for tag, attributes in parser.attributes if tag == "img"]
+    assert (str(MAX_PICTURE_PX), "20") in sizes
 
 
 def test_what_people_wrote_is_escaped(page: str):
