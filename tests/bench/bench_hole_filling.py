@@ -16,7 +16,7 @@ from pipeline.geometry.atlas import Atlas, Texels, rasterize_texels
 from pipeline.geometry.mesh import Mesh
 from pipeline.io.image import push_pull, read_gray, read_rgb_float, to_float
 from pipeline.io.npz import load_npz
-from pipeline.texture.inpainting import spread, vertex_means
+from pipeline.texture.inpainting import average_texels_per_vertex, inpaint_vertex_colours
 
 HOLES = ((0.01, 300), (0.02, 120), (0.05, 25), (0.10, 6))
 """Radius in metres and number of balls."""
@@ -58,7 +58,8 @@ def score(
     left, held = np.where(hidden, 0.0, seen).astype(np.float32), hidden & (seen > OBSERVED)
     started = time.process_time()
     over_mesh = texels.interpolate(
-        mesh.faces, spread(mesh, *vertex_means(texels, mesh.faces, len(mesh.vertices), colour, left))
+        mesh.faces,
+        inpaint_vertex_colours(mesh, *average_texels_per_vertex(texels, mesh.faces, len(mesh.vertices), colour, left)),
     )
     between = time.process_time()
     known: Bool[np.ndarray, "s s"] = texels.image(left[:, None])[..., 0] > OBSERVED

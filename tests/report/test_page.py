@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from pipeline.report.embed import unpack_glb
-from pipeline.report.page import ERROR_MAP_MAX_LEVELS, error_map, format_metric, render_page
+from pipeline.report.page import ERROR_MAP_MAX_LEVELS, MAX_IMAGE_PX, error_map, format_metric, render_page
 from pipeline.report.templates import ASSETS_DIR
 from tests.report.report_sample import sample_page
 
@@ -67,12 +67,12 @@ def test_every_picture_has_a_size_and_a_text(outline: Outline):
     assert all(image["alt"] and int(image["width"] or 0) > 0 for image in images)
 
 
-def test_large_pictures_are_shrunk_in_proportion():
-    large = np.full((40, 2 * MAX_PICTURE_PX, 3), 90, np.uint8)
+def test_large_images_are_shrunk_in_proportion():
+    large = np.full((40, 2 * MAX_IMAGE_PX, 3), 90, np.uint8)
     parser = Outline()
-    parser.feed(render_page(replace(sample_page(), pictures=[("Mesh", large)])))
+    parser.feed(render_page(replace(sample_page(), images=[("Mesh", large)])))
     sizes = [(attributes["width"], attributes["height"]) for tag, attributes in parser.attributes if tag == "img"]
-    assert (str(MAX_PICTURE_PX), "20") in sizes
+    assert (str(MAX_IMAGE_PX), "20") in sizes
 
 
 def test_what_people_wrote_is_escaped(page: str):
