@@ -62,7 +62,7 @@ def score(
         inpaint_vertex_colours(mesh, *average_texels_per_vertex(texels, mesh.faces, len(mesh.vertices), colour, left)),
     )
     between = time.process_time()
-    known: Bool[np.ndarray, "s s"] = texels.image(left[:, None])[..., 0] > OBSERVED
+    known: Bool[np.ndarray, "s s"] = texels.to_texture(left[:, None])[..., 0] > OBSERVED
     in_texture = push_pull(texture, known)[texels.rows, texels.columns]
     ended = time.process_time()
     psnrs_db = (-10.0 * np.log10(np.mean((filled - colour)[held] ** 2)) for filled in (over_mesh, in_texture))

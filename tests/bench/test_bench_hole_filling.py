@@ -18,14 +18,14 @@ def test_both_methods_fill_holes_of_a_smooth_texture(tmp_path: Path, capsys: pyt
     mesh = Mesh(sphere.vertices.astype(np.float32), sphere.faces.astype(np.int32))
     atlas = unwrap(mesh, np.zeros(len(mesh.faces), dtype=np.int32), 256, 4)
     texels = rasterize_texels(atlas, 256)
-    colour = texels.image(texels.interpolate(mesh.faces, mesh.vertices) + np.float32(0.5))
+    colour = texels.to_texture(texels.interpolate(mesh.faces, mesh.vertices) + np.float32(0.5))
     for name in ("mesh", "texture"):
         (tmp_path / name).mkdir()
     save_npz(tmp_path / "mesh" / "mesh.npz", {"vertices": mesh.vertices, "faces": mesh.faces})
     layout = {"uv": atlas.uv, "faces_uv": atlas.faces_uv, "vertex_of_uv": atlas.vertex_of_uv}
     save_npz(tmp_path / "texture" / "atlas.npz", layout)
     write_rgb(tmp_path / "texture" / "diffuse.png", to_uint8(colour))
-    write_gray(tmp_path / "texture" / "coverage.png", to_uint8(texels.covered().astype(np.float32)))
+    write_gray(tmp_path / "texture" / "coverage.png", to_uint8(texels.coverage_mask().astype(np.float32)))
     main([str(tmp_path)])
     rows = np.array([line.split()[1:] for line in capsys.readouterr().out.splitlines()[1:]], dtype=float)
     np.testing.assert_allclose(rows[:, 0], [radius_m for radius_m, _ in HOLES])
