@@ -3,8 +3,10 @@
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 
@@ -31,14 +33,14 @@ def is_pure_python(pin: str) -> bool:
     return "Root-Is-Purelib: true" in text
 
 
-def find_missing(pins: list[str], python: str, platforms: tuple[str, ...], folder: Path) -> set[str]:
+def find_missing(pins: list[str], python: str, platforms: tuple[str, ...], folder: str) -> set[str]:
     """Names of the packages for which pip finds no wheel of the pinned version; downloads those that exist."""
     missing = set()
     while pins:
         command = [sys.executable, "-m", "pip", "install", "--dry-run", "--ignore-installed", "--no-deps", "--quiet"]
         command += ["--only-binary=:all:", "--python-version", python, "--implementation", "cp"]
         command += [word for platform in platforms for word in ("--platform", platform)]
-        command += ["--target", str(folder / "target"), "--cache-dir", str(folder / "cache"), *pins]
+        command += ["--target", f"{folder}/target", "--cache-dir", f"{folder}/cache", *pins]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode == 0:
             break
@@ -50,21 +52,24 @@ def find_missing(pins: list[str], python: str, platforms: tuple[str, ...], folde
 
 
 @pytest.fixture
-def network() -> None:
+def downloads() -> Iterator[str]:
+    """Folder for about a gigabyte of downloads, removed after the test; skips without a package index."""
     if not is_index_reachable(INDEX):
         pytest.skip("no package index is reachable")
+    with TemporaryDirectory() as folder:
+        yield folder
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("target", TARGETS)
-def test_every_compiled_pin_has_a_wheel(network: None, repository: Path, tmp_path: Path, target: str) -> None:
+def test_every_compiled_pin_has_a_wheel(downloads: str, repository: Path, target: str) -> None:
     python, platforms = TARGETS[target]
     text = (repository / "requirements.lock").read_text(encoding="utf-8")
     compiled = [pin for pin in re.findall(r"^\S+==\S+$", text, re.MULTILINE) if not is_pure_python(pin)]
     assert "numpy" in {pin.partition("==")[0] for pin in compiled}
-    assert find_missing(compiled, python, platforms, tmp_path) == MISSING.get(target, set())
+    assert find_missing(compiled, python, platforms, downloads) == MISSING.get(target, set())
 
 
 @pytest.mark.slow
-def test_a_version_without_a_wheel_is_noticed(network: None, tmp_path: Path) -> None:
-    assert find_missing(["numpy==1.26.4", "PyYAML==6.0.3"], "3.13", ("win_amd64",), tmp_path) == {"numpy"}
+def test_a_version_without_a_wheel_is_noticed(downloads: str) -> None:
+    assert find_missing(["numpy==1.26.4", "PyYAML==6.0.3"], "3.13", ("win_amd64",), downloads) == {"numpy"}
