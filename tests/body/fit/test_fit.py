@@ -178,6 +178,7 @@ def test_unknown_focal_length_is_estimated() -> None:
     assert aligned < 0.025
 
 
+@pytest.mark.slow
 def test_principal_point_of_an_off_centre_crop_is_estimated() -> None:
     """A fifth of the width is missing on the left; the camera to start from has its point in the middle."""
     scene = synthetic_recording(load_anny(), FRAMES, shape=SHAPE, noise_m=0.004)
