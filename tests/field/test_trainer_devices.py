@@ -9,7 +9,7 @@ import torch
 from pipeline.body.body import canonical_to_world
 from pipeline.field.rendering import render_field
 from pipeline.field.validation import Validator
-from tests.elsewhere import FAKE_DEVICE, elsewhere
+from tests.fake_device import FAKE_DEVICE, fake_device
 from tests.field.scene import make_trainer
 
 FEW = {
@@ -53,7 +53,7 @@ def compare(scene, device, **options):
     ],
 )
 def test_training_on_another_device_agrees_with_the_cpu(scene, options):
-    with elsewhere():
+    with fake_device():
         compare(scene, FAKE_DEVICE, **options)
 
 
@@ -62,11 +62,11 @@ def test_training_on_a_gpu_agrees_with_the_cpu(scene, cuda):
     compare(scene, torch.device(cuda))
 
 
-@pytest.fixture(scope="module", params=["elsewhere", "cuda"])
+@pytest.fixture(scope="module", params=["fake", "cuda"])
 def trained(request, scene):
     """A trainer on another device, inside the context of that device."""
-    device = FAKE_DEVICE if request.param == "elsewhere" else torch.device(request.getfixturevalue("cuda"))
-    with elsewhere() if device == FAKE_DEVICE else nullcontext() as calls:
+    device = FAKE_DEVICE if request.param == "fake" else torch.device(request.getfixturevalue("cuda"))
+    with fake_device() if device == FAKE_DEVICE else nullcontext() as calls:
         yield train(scene, device, 12)[0], calls
 
 
@@ -97,7 +97,7 @@ def test_validation_with_refined_poses(scene, trained):
 
 
 def test_a_step_has_few_operations(scene):
-    with elsewhere() as calls:
+    with fake_device() as calls:
         trainer = make_trainer(scene, FAKE_DEVICE, **FEW)
         for _ in range(FEW["steps"] - 2):
             trainer.step()
@@ -108,9 +108,9 @@ def test_a_step_has_few_operations(scene):
 
 
 def test_the_fake_device_has_the_rules_of_a_gpu():
-    with elsewhere():
+    with fake_device():
         there = torch.arange(6.0).to(FAKE_DEVICE)
-        with pytest.raises(RuntimeError, match="lies on the CPU"):
+        with pytest.raises(RuntimeError, match="is on the CPU"):
             there + torch.ones(6)
         with pytest.raises(RuntimeError, match="numpy"):
             there.numpy()
