@@ -1,11 +1,11 @@
-# make help says what there is.
+# make help lists the targets.
 
-PYTHON ?= $(shell command -v python3.11 || command -v python3)
+PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || command -v python3)
 VENV := .venv
 RUN_PYTHON := $(VENV)/bin/python
 STAGES := frames body field mesh texture export report
 
-# What a run is made of; all may be left out.
+# Inputs of a run; all are optional.
 VIDEO ?=
 RUN ?=
 PRESET ?=
@@ -13,26 +13,30 @@ SET ?=
 EXTRA ?=
 ARGS ?=
 
-# Many videos.
+# Inputs of a batch.
 VIDEOS ?=
 RUNS ?= runs
 JOBS ?=
 CLUSTER ?=
 
-# What the chart compares; all may be left out.
+# Inputs of the chart; all are optional.
 CAPTURES ?=
 PRESETS ?=
 SEEDS ?=
 
-# Where bench-field writes its figures, and the runs of another preset that RUN, here also several, is compared with.
+# bench-field: file for its figures, and runs of another preset for comparison (RUN may then name several runs).
 JSON ?=
 BASELINE ?=
+
+# Tests: worker processes, each with one thread of OpenMP. TEST_JOBS=0 runs them in one process with all threads.
+TEST_JOBS ?= 2
+PYTEST := $(if $(filter 0,$(TEST_JOBS)),,OMP_NUM_THREADS=1) $(RUN_PYTHON) -m pytest -n $(TEST_JOBS)
 
 TORCH_VERSION := 2.13.0
 GLTF_VALIDATOR_VERSION := 2.0.0-dev.3.10
 SAMPLE_RUN := runs/sample
 SAMPLE := runs/sample-capture
-SAMPLE_MADE := $(SAMPLE)/.done-$(shell sed -n 's/^CAPTURE_VERSION = //p' data_tools/synthetic/scene/capture.py)
+SAMPLE_DONE := $(SAMPLE)/.done-$(shell sed -n 's/^CAPTURE_VERSION = //p' data_tools/synthetic/scene/capture.py)
 ONE_RUN := $(or $(RUN),$(SAMPLE_RUN))
 RUN_OPTIONS = $(if $(PRESET),--preset $(PRESET)) $(foreach item,$(SET),--set $(item))
 OPTIONS = $(RUN_OPTIONS) $(ARGS)
@@ -41,24 +45,24 @@ STAMP := $(VENV)/.stamp$(if $(EXTRA),-$(EXTRA))
 .DEFAULT_GOAL := help
 .PHONY: help all $(STAGES) batch chart compare figures test test-all check format bench bench-field bench-body doctor venv lock configs gltf-validator clean
 
-help:  ## this list
+help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z$$()A-Z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST) | sed 's/$$(STAGES)/STAGE    /'
 	@echo "  STAGE is one of: $(STAGES)"
 	@echo "  variables: VIDEO=file-or-folder RUN=runs/name PRESET=instant|default|fine SET='mesh.key=value'"
-	@echo "             EXTRA=cuda (a graphics card) or EXTRA=cluster (Snakemake)"
+	@echo "             EXTRA=cuda (an NVIDIA GPU) or EXTRA=cluster (Snakemake)"
 
 ifeq ($(VIDEO)$(RUN),)
-all: $(STAMP) $(SAMPLE_MADE)  ## the whole way; without VIDEO: a generated sample with known truth
+all: $(STAMP) $(SAMPLE_DONE)  ## run all stages; without VIDEO: on a generated sample with known ground truth
 	$(RUN_PYTHON) -m stages --run $(SAMPLE_RUN) --video $(SAMPLE)/video $(OPTIONS)
 else
 all: $(STAMP)
 	$(RUN_PYTHON) -m stages $(if $(RUN),--run "$(RUN)") $(if $(VIDEO),--video "$(VIDEO)") $(OPTIONS)
 endif
 
-$(STAGES): $(STAMP)  ## one stage of RUN=runs/name
+$(STAGES): $(STAMP)  ## run one stage of RUN=runs/name
 	$(RUN_PYTHON) -m stages.$@ "$(ONE_RUN)" $(if $(VIDEO),--video "$(VIDEO)") $(OPTIONS)
 
-batch: $(STAMP)  ## all videos of VIDEOS=folder, with a table; JOBS=n at once, or CLUSTER=local|slurm|kubernetes
+batch: $(STAMP)  ## run all videos of VIDEOS=folder, JOBS=n at a time, or with CLUSTER=local|slurm|kubernetes
 	@test -n "$(VIDEOS)" || { echo "error: no folder of videos: make $@ VIDEOS=folder" >&2; exit 2; }
 ifeq ($(CLUSTER),)
 	$(RUN_PYTHON) -m data_tools.sweep.batch "$(VIDEOS)" --runs "$(RUNS)" $(if $(JOBS),--jobs $(JOBS)) $(OPTIONS)
@@ -69,51 +73,51 @@ else
 		python="$(CURDIR)/$(RUN_PYTHON)" options="$(RUN_OPTIONS)"
 endif
 
-chart: $(STAMP)  ## accuracy against seconds: PRESETS over CAPTURES (all presets, two generated people) with SEEDS
+chart: $(STAMP)  ## plot accuracy against time of PRESETS on CAPTURES with SEEDS (default: all presets, two generated people)
 	$(RUN_PYTHON) -m data_tools.sweep.chart $(CAPTURES) $(if $(PRESETS),--presets $(PRESETS)) $(if $(SEEDS),--seeds $(SEEDS)) $(ARGS)
 
-# Made once; one that is half-made, which has no .done, or of another version is made anew.
-$(SAMPLE_MADE): | $(STAMP)
+# Made once; a sample that is incomplete (without .done) or of another version is made again.
+$(SAMPLE_DONE): | $(STAMP)
 	rm -rf $(SAMPLE)
 	$(RUN_PYTHON) -m data_tools.sample $(SAMPLE)
 	@touch $@
 
-compare: $(STAMP)  ## RUN=runs/name against the ground truth of TRUTH=capture (default: the sample): compare/truth.html
+compare: $(STAMP)  ## compare RUN=runs/name with the ground truth of TRUTH=capture (default: the sample): compare/truth.html
 	$(RUN_PYTHON) -m data_tools.evaluate.compare "$(or $(TRUTH),$(SAMPLE))" "$(ONE_RUN)"
 
 figures: $(STAMP)  ## measure every table of README and docs on this commit: CAPTURES, PRESETS
 	$(RUN_PYTHON) -m data_tools.sweep.figures $(CAPTURES) $(if $(PRESETS),--presets $(PRESETS)) $(ARGS)
 
-test: $(STAMP)  ## the fast tests, with the skip count
-	$(RUN_PYTHON) -m pytest -m "not slow" $(ARGS)
+test: $(STAMP)  ## run the fast tests in TEST_JOBS=2 processes
+	$(PYTEST) -m "not slow" $(ARGS)
 
-test-all: $(STAMP)  ## all tests, the slow ones too
-	$(RUN_PYTHON) -m pytest $(ARGS)
+test-all: $(STAMP)  ## run all tests
+	$(PYTEST) $(ARGS)
 
-check: $(STAMP)  ## lint, format, types, import layers
+check: $(STAMP)  ## check lint, format, types and import rules
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
 	$(VENV)/bin/lint-imports
 
-format: $(STAMP)  ## mend what ruff can mend
+format: $(STAMP)  ## apply the fixes of ruff
 	$(VENV)/bin/ruff check --fix .
 	$(VENV)/bin/ruff format .
 
-bench: bench-field  ## bench-field, then the kernels alone; the machine should do nothing else
+bench: bench-field  ## bench-field, then the kernels alone; run nothing else at the same time
 	$(RUN_PYTHON) -m tests.bench.bench_kernels $(if $(JSON),--json "$(basename $(JSON))-kernels.json")
 
-bench-field: $(STAMP)  ## each part of a training step beside its floor: RUN=runs/name or a painted body; JSON=file
+bench-field: $(STAMP)  ## time each part of a training step: RUN=runs/name or a painted body; JSON=file
 	$(RUN_PYTHON) -m tests.bench.bench_field $(if $(RUN),--run $(RUN)) $(if $(PRESET),--preset $(PRESET)) \
 		$(if $(BASELINE),--baseline $(BASELINE)) $(if $(JSON),--json "$(JSON)") $(ARGS)
 
-bench-body: $(STAMP)  ## frames and body against the truth of CAPTURES that data_tools made
+bench-body: $(STAMP)  ## compare frames and body with the ground truth of synthetic CAPTURES
 	$(RUN_PYTHON) -m tests.bench.bench_body $(CAPTURES) $(ARGS)
 
-doctor:  ## what this machine lacks, and the command that mends it
+doctor:  ## check the requirements of this machine
 	@$(PYTHON) -m scripts.doctor
 
-venv: $(STAMP)  ## install the pinned dependencies into .venv (EXTRA=cuda for a graphics card)
+venv: $(STAMP)  ## install the pinned dependencies into .venv (EXTRA=cuda for an NVIDIA GPU)
 
 $(STAMP): requirements.lock pyproject.toml
 	@$(PYTHON) -m scripts.doctor
@@ -121,12 +125,12 @@ $(STAMP): requirements.lock pyproject.toml
 	$(RUN_PYTHON) -m scripts.install requirements.lock $(EXTRA)
 	@touch $@
 
-# The CPU build must be the one that pip sees (TORCH_INDEX=https://download.pytorch.org/whl/cpu where PyPI is all there
-# is): the CUDA build would fill the lock file with its own packages.
-lock:  ## resolve pyproject.toml anew into requirements.lock
+# pip must find the CPU build of torch (TORCH_INDEX=https://download.pytorch.org/whl/cpu unless another index offers it):
+# the CUDA build would add its own packages to the lock file.
+lock:  ## write requirements.lock from pyproject.toml
 	$(PYTHON) -m venv --clear build/lock
 	build/lock/bin/python -m pip install --quiet $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) torch==$(TORCH_VERSION) ".[dev]"
-	echo "# Written by make lock: the full resolution of pyproject.toml with its dev extra." > build/requirements.lock
+	echo "# Written by make lock: full resolution of pyproject.toml with its dev extra." > build/requirements.lock
 	build/lock/bin/python -m pip freeze --exclude instant-human-mesh | sed 's/+cpu$$//' >> build/requirements.lock
 	mv build/requirements.lock requirements.lock
 
@@ -139,6 +143,6 @@ gltf-validator: node_modules/gltf-validator  ## install the Khronos validator fo
 node_modules/gltf-validator:
 	npm install --no-save --no-audit --no-fund --loglevel=error gltf-validator@$(GLTF_VALIDATOR_VERSION)
 
-clean:  ## remove caches and builds; runs/ and .venv stay
+clean:  ## remove caches and builds, not runs/ and .venv
 	rm -rf build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find . -path ./$(VENV) -prune -o -name __pycache__ -type d -print0 | xargs -0 rm -rf

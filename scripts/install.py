@@ -1,10 +1,10 @@
-"""Fill the virtual environment from `requirements.lock`: the CPU build of torch, or the CUDA one on request.
+"""Install `requirements.lock` into the virtual environment, with the CPU build of torch or, on request, the CUDA build.
 
-Runs on the bare interpreter (standard library only): `python -m scripts.install requirements.lock [EXTRA ...]`.
+Uses the standard library only: `python -m scripts.install requirements.lock [EXTRA ...]`.
 
-PyPI's Linux wheel of torch is the CUDA build and pulls in gigabytes. The small CPU build has the same version with the
-suffix `+cpu`, which pip prefers wherever it finds it: in a local folder (`PIP_FIND_LINKS`) or on PyTorch's own index.
-So torch goes first, with that index added when it answers, and everything else follows from PyPI.
+The Linux wheel of torch on PyPI is the CUDA build, several gigabytes with its dependencies. The CPU build has the same
+version with the suffix `+cpu`; pip prefers it if a local folder (`PIP_FIND_LINKS`) or an index offers it. Therefore
+torch is installed first, with PyTorch's own index if it is reachable, and everything else from PyPI.
 """
 
 import json
@@ -25,7 +25,7 @@ PROJECT_FILE = Path(__file__).resolve().parents[1] / "pyproject.toml"
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Install the lock file named first, then the extras named after it; return pip's exit status."""
+    """Install a lock file (first argument) and extras of pyproject.toml (further arguments); return the exit status."""
     lock, extras = Path(arguments[0]), list(arguments[1:])
     pin = torch_pin(lock.read_text(encoding="utf-8"))
     use_cuda = "cuda" in extras
@@ -41,28 +41,28 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def torch_pin(lock_text: str) -> str:
-    """The `torch==X.Y.Z` line of a lock file."""
+    """Return the line `torch==X.Y.Z` of a lock file."""
     found = re.search(r"^torch==\S+$", lock_text, re.MULTILINE)
     if not found:
-        raise SystemExit("error: the lock file has no torch==... line: write it anew with `make lock`")
+        raise SystemExit("error: the lock file has no line torch==VERSION: write it again with `make lock`")
     return found.group(0)
 
 
 def torch_pip_arguments(pin: str, lock: Path, use_cuda: bool) -> list[str]:
-    """What pip is asked for torch; TORCH_INDEX names another index to add, or is empty for none."""
+    """Return the arguments of `pip install` for torch; TORCH_INDEX names another index, or is empty for none."""
     index = os.environ.get("TORCH_INDEX")
     if use_cuda:
         return [pin, "--constraint", str(lock), *(["--extra-index-url", index] if index else [])]
     if index is None and not resolves_to_cpu_build(pin):
         index = TORCH_CPU_INDEX if is_index_reachable(TORCH_CPU_INDEX) else None
         if index is None:
-            print(f"note: {TORCH_CPU_INDEX} does not answer: pip takes the build that PyPI has, which may be large")
+            print(f"note: {TORCH_CPU_INDEX} is not reachable: pip installs the build of PyPI, which may be large")
             return [pin, "--constraint", str(lock)]
     return [pin, "--no-deps", *(["--extra-index-url", index] if index else [])]
 
 
 def resolves_to_cpu_build(pin: str) -> bool:
-    """True when pip, as it is configured here, would already choose a wheel without CUDA."""
+    """Return True if pip, as it is configured here, would choose a wheel without CUDA."""
     command = [sys.executable, "-m", "pip", "install", "--quiet", "--dry-run", "--no-deps", "--report", "-", pin]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
@@ -72,7 +72,7 @@ def resolves_to_cpu_build(pin: str) -> bool:
 
 
 def is_index_reachable(index: str) -> bool:
-    """True when a package index can be reached."""
+    """Return True if a package index is reachable."""
     try:
         with urllib.request.urlopen(f"{index}/torch/", timeout=PROBE_TIMEOUT_S):
             return True
@@ -81,7 +81,7 @@ def is_index_reachable(index: str) -> bool:
 
 
 def installed_torch() -> str:
-    """Version of the installed torch, empty when there is none."""
+    """Return the version of the installed torch, empty if there is none."""
     try:
         return version("torch")
     except PackageNotFoundError:
@@ -89,10 +89,10 @@ def installed_torch() -> str:
 
 
 def extra_packages(extra: str) -> list[str]:
-    """The packages that pyproject.toml lists under an extra."""
+    """Return the packages of an extra of pyproject.toml."""
     extras = tomllib.loads(PROJECT_FILE.read_text(encoding="utf-8"))["project"]["optional-dependencies"]
     if extra not in extras:
-        raise SystemExit(f"error: EXTRA={extra} is not known: use one of {', '.join(extras)}")
+        raise SystemExit(f"error: EXTRA={extra} is unknown: use one of {', '.join(extras)}")
     packages: list[str] = extras[extra]
     return packages
 
@@ -100,7 +100,7 @@ def extra_packages(extra: str) -> list[str]:
 def _pip(*arguments: str) -> None:
     done = subprocess.run([sys.executable, "-m", "pip", *arguments, "--disable-pip-version-check"], check=False)
     if done.returncode != 0:
-        raise SystemExit(f"error: pip {arguments[0]} failed, see above: mend it and run the same command again")
+        raise SystemExit(f"error: pip {arguments[0]} failed, see above: correct it and run the same command again")
 
 
 if __name__ == "__main__":

@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.core.cli import main_pipeline
 from pipeline.core.manifest import digest_video, find_damaged_files, read_manifest
 from pipeline.core.measure import REPOSITORY_DIR
 from pipeline.io.image import read_rgb
-from stages import STAGES, load_stage
+from stages import PIPELINE, STAGES, load_stage
 from tests.core.toy_pipeline import user_environment
 
 GLB_MAGIC, GLB_VERSION, JSON_CHUNK = 0x46546C67, 2, 0x4E4F534A
@@ -52,8 +53,9 @@ def test_the_manifests_name_what_they_read(smoke_run: Path) -> None:
             assert manifest.inputs[need] == digest, f"{name} read another {need} than the present one"
 
 
-def test_nothing_is_left_to_do(smoke_run: Path) -> None:
-    lines = command("--run", str(smoke_run), "--status").splitlines()
+def test_all_stages_are_fresh(smoke_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main_pipeline(PIPELINE, ["--run", str(smoke_run), "--status"]) == 0
+    lines = capsys.readouterr().out.splitlines()
     assert [line.split()[:2] for line in lines] == [[name, "fresh"] for name in STAGES]
 
 

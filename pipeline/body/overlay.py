@@ -60,9 +60,9 @@ def draw_overlay(
     to_camera = Mesh(vertices_world.numpy(), body.faces).face_normals() @ _view_direction(vertices_world, camera)
     shade = 0.25 + 0.75 * np.clip(to_camera, 0.0, 1.0)
     colours = side_colours(body) * shade[:, None]
-    picture = image.astype(np.float32) * 0.8
-    picture[covered] = (1.0 - BODY_OPACITY) * picture[covered] + BODY_OPACITY * colours[visible_face[covered]]
-    tile, to_tile = _crop(picture.round().astype(np.uint8), covered | (mask > 127))
+    shaded = image.astype(np.float32) * 0.8
+    shaded[covered] = (1.0 - BODY_OPACITY) * shaded[covered] + BODY_OPACITY * colours[visible_face[covered]]
+    tile, to_tile = _crop(shaded.round().astype(np.uint8), covered | (mask > 127))
     _outline(tile, _crop_like(mask > 127, to_tile, tile), MASK_OUTLINE_RGB)
     _outline(tile, _crop_like(covered, to_tile, tile), BODY_OUTLINE_RGB)
     label = f"{caption}  {warning}"
@@ -88,17 +88,17 @@ def _view_direction(vertices_world: Float[Tensor, "v 3"], camera: Camera) -> Flo
 
 
 def _crop(
-    picture: UInt8[np.ndarray, "h w 3"], person: Bool[np.ndarray, "h w"]
+    image: UInt8[np.ndarray, "h w 3"], person: Bool[np.ndarray, "h w"]
 ) -> tuple[UInt8[np.ndarray, "tile_h tile_w 3"], Float[np.ndarray, "2 3"]]:
     """Return a tile filled by the person, and the affine map from image to tile (pixel indices)."""
     rows, columns = np.flatnonzero(person.any(1)), np.flatnonzero(person.any(0))
     if len(rows) == 0:
-        rows, columns = np.array([0, picture.shape[0] - 1]), np.array([0, picture.shape[1] - 1])
+        rows, columns = np.array([0, image.shape[0] - 1]), np.array([0, image.shape[1] - 1])
     scale = 0.92 * min(TILE_ROWS / (rows[-1] - rows[0] + 1), TILE_COLUMNS / (columns[-1] - columns[0] + 1))
     centre = 0.5 * np.array([columns[0] + columns[-1], rows[0] + rows[-1]])
     shift = 0.5 * np.array([TILE_COLUMNS, TILE_ROWS]) - scale * centre
     to_tile = np.array([[scale, 0.0, shift[0]], [0.0, scale, shift[1]]])
-    return cv2.warpAffine(picture, to_tile, (TILE_COLUMNS, TILE_ROWS), flags=cv2.INTER_LINEAR), to_tile
+    return cv2.warpAffine(image, to_tile, (TILE_COLUMNS, TILE_ROWS), flags=cv2.INTER_LINEAR), to_tile
 
 
 def _crop_like(

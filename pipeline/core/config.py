@@ -1,4 +1,4 @@
-"""Strict configuration: one section for each stage, typed beside the code of the stage, read from YAML and `--set`.
+"""Strict configuration: one section for each stage, typed in the code of the stage, read from YAML and `--set`.
 
 Later layers override earlier ones: `configs/default.yaml`, the file of the preset, the overrides
 (`--set mesh.max_faces=30000`). Each value keeps the layer that set it, so that an error can name the place to correct.

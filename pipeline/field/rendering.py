@@ -33,7 +33,7 @@ SAMPLE_CHUNK_SIZE = 8
 MAX_OPTICAL_DEPTH = 9.0
 """Optical depth at which a ray ends: the transmittance is 1/8000, a thirtieth of a grey level."""
 MIN_DEPTH_M = 0.05
-"""A box with a corner nearer to the camera is not projected; its image is the whole picture."""
+"""If a corner of the box is nearer to the camera than this, m, all pixels are rendered."""
 
 
 @dataclass(frozen=True)

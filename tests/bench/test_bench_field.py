@@ -179,6 +179,7 @@ def test_warm_up_covers_pose_refinement_and_occupancy():
     assert warm_up_step_count(FieldConfig(steps=4000)) == 400
 
 
+@pytest.mark.slow
 def test_command_prints_and_writes_results(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(bench_field, "append_result", partial(append_result, folder=tmp_path))
     monkeypatch.setattr(bench_field, "build_config", lambda *_: TINY)

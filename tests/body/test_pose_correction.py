@@ -50,13 +50,13 @@ def test_roughness_grows_with_jumps_and_falls_with_the_interval(body, correction
     near = float(correction.temporal_roughness().detach())
     with torch.no_grad():
         correction.shift_m[2] = 0.0
-    # The jump now lies between frames 3 and 5, which are twice as far apart as frames 2 and 3.
+    # The jump is now between frames 3 and 5, which are twice as far apart as frames 2 and 3.
     assert float(correction.temporal_roughness().detach()) == pytest.approx(near / 2, rel=1e-5)
 
 
 @pytest.mark.parametrize("size", [0.0, 3e-3, 0.4, 2.5])
-def test_the_compiled_chain_is_the_plain_one(body, correction, size):
-    """Forward and in gradient, against float64; small corrections are on the series of Rodrigues' factors."""
+def test_compiled_kinematics_equals_the_reference(body, correction, size):
+    """Values and gradients, against float64; small corrections use the series of Rodrigues' factors."""
     random = torch.Generator().manual_seed(1)
     rows, motion = torch.tensor([2, 0, 3]), correction.motion
     shape = correction.rotation_rad.shape

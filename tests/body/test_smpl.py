@@ -1,4 +1,4 @@
-"""SMPL-like models: bind pose, shape, landmarks, conversion of poses, and a fit that finds a known person."""
+"""SMPL-like models: bind pose, shape, landmarks, conversion of poses, and the fit of a known person."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +21,7 @@ from pipeline.geometry.rotation import (
 )
 from pipeline.geometry.skinning import forward_kinematics, linear_blend_skinning, skinning_transforms
 from tests.body.acting import SyntheticRecording, fitted_joints_m, joint_errors_m, synthetic_recording
-from tests.body.smpl_sample import made_up_arrays, smpl_vertices
+from tests.body.smpl_sample import sample_arrays, smpl_vertices
 
 FRAMES = 16
 BETAS = {"beta_0": 1.0, "beta_1": 1.5, "beta_4": -1.0}
@@ -29,15 +29,15 @@ BETAS = {"beta_0": 1.0, "beta_1": 1.5, "beta_4": -1.0}
 
 @pytest.fixture(scope="module", params=sorted(JOINT_NAMES))
 def model(request: pytest.FixtureRequest) -> SmplBody:
-    return SmplBody(made_up_arrays(request.param))
+    return SmplBody(sample_arrays(request.param))
 
 
 @pytest.fixture(scope="module")
 def smpl() -> SmplBody:
-    return SmplBody(made_up_arrays(24))
+    return SmplBody(sample_arrays(24))
 
 
-def test_names_are_those_of_the_built_in_body_and_face(model: SmplBody) -> None:
+def test_joint_names_are_those_of_the_built_in_body_and_face(model: SmplBody) -> None:
     anny = load_anny()
     assert isinstance(model, ParametricBody)
     assert set(ACTIVE_JOINTS) <= set(model.joint_names)
@@ -48,9 +48,9 @@ def test_names_are_those_of_the_built_in_body_and_face(model: SmplBody) -> None:
             assert above == anny.joint_names[anny.parents[anny.joint_names.index(name)]]
 
 
-def test_arms_hang_as_those_of_the_built_in_body() -> None:
-    """The made-up model is the built-in body in a T-pose, so its A-pose must be that body's joints again."""
-    anny, model = load_anny(), SmplBody(made_up_arrays(24))
+def test_arm_directions_equal_those_of_the_built_in_body() -> None:
+    """The sample model is the built-in body in a T-pose, so its A-pose must have the joints of that body."""
+    anny, model = load_anny(), SmplBody(sample_arrays(24))
     expected = anny.at_shape(anny.shape_defaults)
     found = model.at_shape(model.shape_defaults)
     for name in ACTIVE_JOINTS:
@@ -64,7 +64,7 @@ def test_arms_hang_as_those_of_the_built_in_body() -> None:
         assert bone / np.linalg.norm(bone) @ (np.array(direction) * [-1, 1, 1]) > 0.999
 
 
-def test_landmarks_lie_where_they_lie_on_the_built_in_body(model: SmplBody) -> None:
+def test_landmark_positions_equal_those_of_the_built_in_body(model: SmplBody) -> None:
     expected = load_anny().landmark_positions_m
     assert set(model.landmark_positions_m) == {landmark.name for landmark in LANDMARKS}
     for name, place in expected.items():
@@ -72,23 +72,23 @@ def test_landmarks_lie_where_they_lie_on_the_built_in_body(model: SmplBody) -> N
 
 
 def test_shape_is_linear_in_the_t_pose_and_differentiable(smpl: SmplBody) -> None:
-    arrays = made_up_arrays(24)
+    arrays = sample_arrays(24)
     betas = torch.linspace(-1.0, 1.0, 10).requires_grad_()
     vertices, joints = smpl.rest_pose(betas)
     t_pose = arrays.template_m + arrays.shape_directions_m @ betas.detach().numpy()
     head = np.flatnonzero(arrays.skin_weights[:, smpl.joint_names.index("Head")] > 0.999)
-    moved = vertices[head].detach().numpy() - t_pose[head]  # above the neck the A-pose is the T-pose, moved as a whole
+    moved = vertices[head].detach().numpy() - t_pose[head]  # above the neck the A-pose is the translated T-pose
     np.testing.assert_allclose(moved, np.broadcast_to(moved[0], moved.shape), atol=1e-5)
     pelvis = arrays.joint_regressor[0] @ t_pose
     np.testing.assert_allclose(joints[0, 1].detach().numpy() - pelvis[1], moved[0, 1], atol=1e-5)
     vertices[:, 1].max().backward()
     assert betas.grad is not None
-    assert betas.grad[0] > 0.02  # the first made-up beta enlarges
+    assert betas.grad[0] > 0.02  # the first beta of the sample enlarges
 
 
 def test_fingers_bend_towards_the_palm() -> None:
-    """In SMPL's T-pose the palms face down; a bent finger's tip lies lower along the palm's normal."""
-    body = SmplBody(made_up_arrays(55))
+    """In SMPL's T-pose the palms face down; the tip of a bent finger is lower along the normal of the palm."""
+    body = SmplBody(sample_arrays(55))
     finger_rotations = quaternion_to_axis_angle(matrix_to_quaternion(finger_curl_rotations(body, relaxed_curls_rad())))
     for side, sign in (("Left", 1.0), ("Right", -1.0)):
         index = body.joint_names.index(f"{side}HandMiddle2")
@@ -96,7 +96,7 @@ def test_fingers_bend_towards_the_palm() -> None:
         assert torch.allclose(hand, torch.eye(3))
         assert float(finger_rotations[index].norm()) == pytest.approx(RELAXED_CURL_RAD, abs=1e-6)
         bind = _bind_rotations(body)[body.joint_names.index(f"{side}Hand")].double()
-        closing = bind @ torch.tensor([0.0, 0.0, -sign], dtype=torch.float64)  # about it a straight finger closes
+        closing = bind @ torch.tensor([0.0, 0.0, -sign], dtype=torch.float64)  # flexion axis of a straight finger
         assert finger_rotations[index] @ closing > 0.7 * RELAXED_CURL_RAD
     assert FINGER_BEND_RAD > 0
 
@@ -106,15 +106,15 @@ def test_a_body_without_fingers_has_no_finger_rotations(smpl: SmplBody) -> None:
 
 
 def _bind_rotations(body: SmplBody) -> torch.Tensor:
-    """World rotations of SMPL's joints in the A-pose: what undoes the local rotations of the T-pose."""
+    """Return the world rotations of SMPL's joints in the A-pose, the inverse of those of the T-pose."""
     t_pose = body.from_smpl_rotations(torch.eye(3).repeat(1, len(body.parents), 1, 1))
     world = forward_kinematics(t_pose, torch.zeros(1, 3), torch.zeros(len(body.parents), 3), body.parents)
     return world[0, :, :3, :3].transpose(-1, -2)
 
 
-def test_a_pose_of_smpl_is_the_same_pose_here(smpl: SmplBody) -> None:
-    """SMPL's own skinning from the T-pose and ours from the A-pose agree where one joint alone moves the surface."""
-    arrays = made_up_arrays(24)
+def test_smpl_rotations_give_the_same_pose(smpl: SmplBody) -> None:
+    """SMPL's skinning from the T-pose and ours from the A-pose agree where the surface follows one joint."""
+    arrays = sample_arrays(24)
     generator = torch.Generator().manual_seed(0)
     theta = axis_angle_to_matrix(0.4 * torch.randn(1, 24, 3, generator=generator))
     t_vertices = torch.tensor(arrays.template_m).float()
@@ -133,8 +133,8 @@ def test_a_pose_of_smpl_is_the_same_pose_here(smpl: SmplBody) -> None:
 
 @pytest.mark.parametrize("count", [24, 52])
 def test_converted_smpl_poses_match_smpl(count: int) -> None:
-    """Shape, translation and a turned space included: every joint lies where SMPL's own formula has it."""
-    arrays, body = made_up_arrays(count), SmplBody(made_up_arrays(count))
+    """Every joint is where SMPL's formula has it, with shape, translation and a rotated world."""
+    arrays, body = sample_arrays(count), SmplBody(sample_arrays(count))
     random = np.random.default_rng(0)
     pose, transl, betas = (random.normal(0.0, 0.4, (3, *shape)).astype(np.float32) for shape in ((24, 3), (3,), (10,)))
     pose[:, 22:] = 0.0
@@ -156,12 +156,12 @@ def test_converted_smpl_poses_match_smpl(count: int) -> None:
 
 
 def test_converted_poses_of_the_real_data_set_match_smpl(shared_data: Path, smpl: SmplBody) -> None:
-    """InstantAvatar's own file: the surface too, where one joint alone moves it."""
+    """InstantAvatar's file: the surface matches where it follows one joint."""
     with np.load(shared_data / "formats" / "male-3-casual_test.npz") as file:
         pose = np.concatenate([file["global_orient"], file["body_pose"]], axis=1)[::20].reshape(-1, 24, 3)
         transl, betas = file["transl"][::20], np.repeat(file["betas"], len(pose), axis=0)
-    here = torch.eye(4).repeat(len(pose), 1, 1)
-    rotations, root_m = smpl.convert_smpl_poses(*map(torch.from_numpy, (pose, transl, betas)), here)
+    identity = torch.eye(4).repeat(len(pose), 1, 1)
+    rotations, root_m = smpl.convert_smpl_poses(*map(torch.from_numpy, (pose, transl, betas)), identity)
     body = smpl.at_shape(torch.from_numpy(betas[0]))
     quaternions = matrix_to_quaternion(rotations).numpy()
     motion = Motion(np.arange(len(pose), dtype=np.int32), np.arange(len(pose)) / 25.0, quaternions, root_m.numpy())
@@ -169,13 +169,13 @@ def test_converted_poses_of_the_real_data_set_match_smpl(shared_data: Path, smpl
     found = linear_blend_skinning(torch.from_numpy(body.vertices), weights, canonical_to_world(body, motion))
     rigid = (weights.max(dim=1).values > 0.999).numpy()
     for frame in range(len(pose)):
-        expected, _ = smpl_vertices(made_up_arrays(24), betas[0], pose[frame], transl[frame])
+        expected, _ = smpl_vertices(sample_arrays(24), betas[0], pose[frame], transl[frame])
         np.testing.assert_allclose(found[frame, rigid], expected[rigid], atol=5e-4)
 
 
-def test_poses_fitted_with_smpl_hold_for_models_with_its_shapes() -> None:
-    assert [SmplBody(made_up_arrays(count)).accepts_smpl_poses(10) for count in (24, 52, 55)] == [True, True, False]
-    assert not SmplBody(made_up_arrays(24)).accepts_smpl_poses(16)
+def test_smpl_poses_are_accepted_by_models_with_the_same_shapes() -> None:
+    assert [SmplBody(sample_arrays(count)).accepts_smpl_poses(10) for count in (24, 52, 55)] == [True, True, False]
+    assert not SmplBody(sample_arrays(24)).accepts_smpl_poses(16)
 
 
 def test_betas_have_a_unit_prior(smpl: SmplBody) -> None:
@@ -186,7 +186,7 @@ def test_betas_have_a_unit_prior(smpl: SmplBody) -> None:
 
 
 def test_a_model_with_other_joints_is_refused() -> None:
-    arrays = made_up_arrays(24)
+    arrays = sample_arrays(24)
     with pytest.raises(ValueError, match="23 joints"):
         SmplBody(
             replace(
@@ -205,7 +205,7 @@ def fitted(smpl: SmplBody) -> tuple[SyntheticRecording, FitResult]:
     return scene, fit_body(smpl, scene.observations(scene.camera), scene.windows(), options)
 
 
-def test_the_fit_finds_a_known_pose(fitted: tuple[SyntheticRecording, FitResult]) -> None:
+def test_a_known_pose_is_fitted(fitted: tuple[SyntheticRecording, FitResult]) -> None:
     scene, result = fitted
     found = fitted_joints_m(result, scene)
     aligned, absolute = joint_errors_m(found, scene.joints_m())
@@ -214,8 +214,8 @@ def test_the_fit_finds_a_known_pose(fitted: tuple[SyntheticRecording, FitResult]
     assert np.median(result.silhouette_iou) > 0.95
 
 
-def test_the_fit_finds_a_known_shape(fitted: tuple[SyntheticRecording, FitResult], smpl: SmplBody) -> None:
-    """The surface is nearer to the true one than the mean body scaled to its stature would be, and within 1 cm."""
+def test_a_known_shape_is_fitted(fitted: tuple[SyntheticRecording, FitResult], smpl: SmplBody) -> None:
+    """The surface is within 1 cm, and closer than the mean body scaled to the true stature."""
     scene, result = fitted
     true = scene.model.vertices_m.numpy()
     mean = smpl.at_shape(smpl.shape_defaults).vertices

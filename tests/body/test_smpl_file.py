@@ -1,4 +1,4 @@
-"""Model files: npz and pickles as they are downloaded give the same body; everything else is refused with a reason."""
+"""Model files: npz and pickles of the releases give the same body; other files are refused with a reason."""
 
 import pickle
 import sys
@@ -12,11 +12,11 @@ from scipy.sparse import csc_matrix, csr_matrix
 from pipeline.body.smpl import SmplBody
 from pipeline.body.smpl_file import load_smpl, plain_array
 from pipeline.core.errors import UserError
-from tests.body.smpl_sample import file_contents, made_up_arrays
+from tests.body.smpl_sample import file_contents, sample_arrays
 
 
 class Chumpy:
-    """Classes that pickle under chumpy's names, as long as the block lasts; the package itself is never there."""
+    """Classes that pickle under chumpy's names until monkeypatch is undone; the package is not installed."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(sys.modules, "chumpy", types.ModuleType("chumpy"))
@@ -42,7 +42,7 @@ def write_pickle(path, contents: dict, protocol: int = 2):
 
 
 def assert_same(found: SmplBody, joint_count: int) -> None:
-    expected = SmplBody(made_up_arrays(joint_count))
+    expected = SmplBody(sample_arrays(joint_count))
     betas = torch.linspace(-1.0, 1.0, 10)
     for mine, true in zip(found.rest_pose(betas), expected.rest_pose(betas), strict=True):
         assert torch.allclose(mine, true, atol=1e-6)
@@ -53,15 +53,15 @@ def assert_same(found: SmplBody, joint_count: int) -> None:
 @pytest.mark.parametrize("joint_count", [24, 52, 55])
 def test_npz_gives_the_model(tmp_path, joint_count: int) -> None:
     path = tmp_path / "model.npz"
-    extra = {"part2num": np.array({"head": 1}, dtype=object)}  # SMPL-X files hold pickled objects, which nobody needs
-    np.savez(path, **file_contents(made_up_arrays(joint_count)), **extra)
+    extra = {"part2num": np.array({"head": 1}, dtype=object)}  # SMPL-X files hold pickled objects, which are not used
+    np.savez(path, **file_contents(sample_arrays(joint_count)), **extra)
     assert_same(load_smpl(path), joint_count)
 
 
 @pytest.mark.parametrize("matrix", [csc_matrix, csr_matrix])
 @pytest.mark.parametrize("protocol", [0, 2, 4])
 def test_pickle_with_sparse_regressor_and_chumpy_gives_the_model(tmp_path, monkeypatch, matrix, protocol: int) -> None:
-    contents = file_contents(made_up_arrays(24))
+    contents = file_contents(sample_arrays(24))
     chumpy = Chumpy(monkeypatch)
     shapedirs = contents["shapedirs"]
     order = np.random.default_rng(0).permutation(shapedirs.size)
@@ -79,9 +79,9 @@ def test_pickle_with_sparse_regressor_and_chumpy_gives_the_model(tmp_path, monke
     assert_same(load_smpl(path), 24)
 
 
-def test_old_names_of_scipy_are_known(tmp_path) -> None:
-    """Python 2's scipy kept its matrices in `scipy.sparse.csc`; today's name differs by an underscore."""
-    contents = file_contents(made_up_arrays(24))
+def test_old_module_names_of_scipy_are_read(tmp_path) -> None:
+    """Scipy for Python 2 had its matrices in `scipy.sparse.csc`, now `scipy.sparse._csc`."""
+    contents = file_contents(sample_arrays(24))
     path = write_pickle(tmp_path / "model.pkl", contents | {"J_regressor": csc_matrix(contents["J_regressor"])})
     new = path.read_bytes()
     old = new.replace(b"cscipy.sparse._csc\n", b"cscipy.sparse.csc\n")
@@ -90,8 +90,8 @@ def test_old_names_of_scipy_are_known(tmp_path) -> None:
     assert_same(load_smpl(path), 24)
 
 
-def test_surplus_shape_directions_are_left_out(tmp_path) -> None:
-    contents = file_contents(made_up_arrays(55))
+def test_only_the_first_ten_shape_directions_are_used(tmp_path) -> None:
+    contents = file_contents(sample_arrays(55))
     more = np.concatenate([contents["shapedirs"], np.ones((*contents["shapedirs"].shape[:2], 30))], axis=2)
     np.savez(tmp_path / "model.npz", **(contents | {"shapedirs": more}))
     assert_same(load_smpl(tmp_path / "model.npz"), 55)
@@ -104,13 +104,13 @@ def test_surplus_shape_directions_are_left_out(tmp_path) -> None:
         ("weights", np.ones((3, 24)), r"`weights` has shape \(3, 24\)"),
         ("v_template", np.ones((5, 3)), r"`v_template` has shape \(5, 3\)"),
         ("shapedirs", np.ones((5, 3, 10)), "`shapedirs` has shape"),
-        ("f", np.full((4, 3), 10**6, dtype=np.uint32), "no triangles"),
+        ("f", np.full((4, 3), 10**6, dtype=np.uint32), "does not hold triangles"),
         ("kintree_table", np.zeros((2, 23), dtype=np.uint32), "`kintree_table` has shape"),
-        ("kintree_table", np.full((2, 24), 23, dtype=np.uint32), "before its parent"),
+        ("kintree_table", np.full((2, 24), 23, dtype=np.uint32), "precedes its parent"),
     ],
 )
-def test_what_is_no_model_is_refused_by_name(tmp_path, key: str, value, reason: str) -> None:
-    contents = file_contents(made_up_arrays(24))
+def test_invalid_arrays_are_refused_by_name(tmp_path, key: str, value, reason: str) -> None:
+    contents = file_contents(sample_arrays(24))
     del contents[key]
     path = tmp_path / "model.npz"
     np.savez(path, **contents, **({} if value is None else {key: value}))
@@ -130,23 +130,23 @@ def test_a_missing_file_a_text_and_a_list_are_refused(tmp_path) -> None:
 
 
 def test_damaged_sparse_matrices_and_other_objects_are_refused(tmp_path) -> None:
-    contents = file_contents(made_up_arrays(24))
+    contents = file_contents(sample_arrays(24))
     broken = csc_matrix(contents["J_regressor"])
     broken.indices[:] = 10**6  # would write outside of the matrix
     for value in (broken, [1, 2, 3]):
         path = write_pickle(tmp_path / "model.pkl", contents | {"J_regressor": value})
-        with pytest.raises(UserError, match=r"model.pkl is no SMPL"):
+        with pytest.raises(UserError, match=r"model.pkl is not an SMPL"):
             load_smpl(path)
-    with pytest.raises(ValueError, match="dict in place of an array"):
+    with pytest.raises(ValueError, match="dict instead of an array"):
         plain_array({})
 
 
-def test_our_shape_agrees_with_the_smplx_package(tmp_path) -> None:
-    """Where that package is installed (its licence is its own): joints of the T-pose for the same betas."""
+def test_shapes_agree_with_the_smplx_package(tmp_path) -> None:
+    """Compare the T-pose joints for the same betas; only where smplx is installed (non-commercial licence)."""
     smplx = pytest.importorskip("smplx")
     from smplx.utils import Struct
 
-    contents = file_contents(made_up_arrays(24))
+    contents = file_contents(sample_arrays(24))
     data = Struct(**contents, posedirs=np.zeros((*contents["v_template"].shape, 207)))
     few = dict.fromkeys(("nose", "reye", "leye", "rear", "lear"), 0)
     feet = dict.fromkeys(("LBigToe", "LSmallToe", "LHeel", "RBigToe", "RSmallToe", "RHeel"), 0)

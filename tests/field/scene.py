@@ -7,13 +7,34 @@ import numpy as np
 import torch
 
 from pipeline.body.body import Body, Motion, canonical_to_world, load_anny
+from pipeline.core.device import CPU
 from pipeline.field.config import FieldConfig
+from pipeline.field.ray_batches import RayBatch
 from pipeline.field.settings import FieldSettings
+from pipeline.field.setup import create_trainer
+from pipeline.field.trainer import Trainer
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.differentiable_raster import render_attributes
 from pipeline.geometry.rotation import axis_angle_to_quaternion, quaternion_multiply
 from pipeline.geometry.skinning import linear_blend_skinning
 
+TRAIN = np.array([0, 1, 3, 4, 6, 7, 9, 10])
+"""Frames of the scene that tests train on."""
+TINY = {
+    "rays_per_step": 768,
+    "frames_per_step": 3,
+    "levels": 4,
+    "features_per_level": 4,
+    "log2_hashmap_size": 14,
+    "hidden_width": 32,
+    "finest_cell_px": 1.5,
+    "min_clothing_offset_m": 0.04,
+    "step_fraction": 0.012,
+    "occupancy_warmup_steps": 24,
+    "occupancy_decay": 0.7,
+    "border_px": 2,
+}
+"""Options and settings of a training of seconds."""
 SETTING_NAMES = frozenset(setting.name for setting in fields(FieldSettings))
 
 
@@ -83,3 +104,15 @@ def psnr_on_white_db(render: torch.Tensor, image: np.ndarray, mask: np.ndarray) 
     target = torch.from_numpy(image) / 255 * alpha + 1 - alpha
     on_white = render[..., :3] + (1 - render[..., 3:])
     return -10 * float((on_white - target).square().mean().log10())
+
+
+def make_trainer(scene: PaintedScene, device: torch.device = CPU, **options: Any) -> Trainer:
+    """A trainer with the options `TINY` on the frames `TRAIN`."""
+    config = field_config(**(TINY | options))
+    masked_images = [(scene.images[row], scene.masks[row]) for row in TRAIN]
+    return create_trainer(scene.body, scene.motion.select(TRAIN), scene.camera, masked_images, config, device)
+
+
+def sample_rays(trainer: Trainer, *frames: int) -> RayBatch:
+    """The rays of some frames in the present step."""
+    return trainer.sampler.sample_rays(np.array(frames), trainer.completed_steps, trainer.inverse_skinning.cameras)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from pipeline.field.pixel_sampler import ERROR_DECAY, TILE_PX, ErrorMap, build_pixel_pool
-from tests.field.test_trainer import TRAIN, make_trainer, scene  # noqa: F401 - a fixture
+from tests.field.scene import TRAIN, make_trainer
 
 SIDE_PX = 4 * TILE_PX
 
@@ -70,7 +70,7 @@ def test_a_frame_without_a_person_has_only_rays_outside():
     assert sample_counts[1, :2].tolist() == [0, 0]
 
 
-def test_a_resumed_training_samples_the_same_pixels(scene):  # noqa: F811
+def test_a_resumed_training_samples_the_same_pixels(scene):
     options = {"steps": 12, "error_sampling_ratio": 0.6, "occupancy_warmup_steps": 4}
     whole, first = make_trainer(scene, **options), make_trainer(scene, **options)
     for _ in range(12):

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.body.body import Body, load_anny
+from pipeline.body.body import Body
 from pipeline.field.initial_occupancy import (
     cell_signed_distances_m,
     estimate_clothing_offset_m,
@@ -77,9 +77,7 @@ def test_a_bone_that_turns_more_than_145_degrees_is_not_one_sided(arc_deg, one_s
     assert again.tolist() == [True, one_sided]
 
 
-def test_cells_have_their_signed_distance_up_to_the_maximum():
-    anny = load_anny()
-    body = anny.at_shape(anny.shape_defaults)
+def test_cells_have_their_signed_distance_up_to_the_maximum(body):
     bounds_m, max_distance_m = field_bounds_m(body, 0.1), 0.02
     some = np.random.default_rng(0).permutation(64**3)[:20_000]
     truth_m = signed_distance_m(cell_centres(bounds_m)[some], body.mesh())

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.body.body import canonical_to_world, load_anny
+from pipeline.body.body import canonical_to_world
 from pipeline.field.initial_occupancy import cell_signed_distances_m, field_bounds_m
 from pipeline.field.inverse_skinning import INITIAL_BONES, Rays, build_inverse_skinning
 from pipeline.field.occupancy import BinaryOccupancy
@@ -14,12 +14,6 @@ from pipeline.kernels.inverse_skinning.reference import skin_points
 from tests.field.scene import make_motion
 
 MARGIN_M = 0.06
-
-
-@pytest.fixture(scope="module")
-def body():
-    anny = load_anny()
-    return anny.at_shape(anny.shape_defaults)
 
 
 @pytest.fixture(scope="module")

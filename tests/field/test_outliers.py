@@ -6,8 +6,7 @@ import torch
 
 from pipeline.field.setup import create_trainer
 from pipeline.field.trainer import Trainer
-from tests.field.scene import PaintedScene, field_config, painted_scene
-from tests.field.test_trainer import sample_rays
+from tests.field.scene import PaintedScene, field_config, painted_scene, sample_rays
 
 SIDE_PX, RADIUS_PX, STEPS = 256, 14, 200
 GREEN = np.array([40, 250, 60], np.uint8)
@@ -59,6 +58,7 @@ def green_excess(scene: PaintedScene, trainer: Trainer) -> float:
     return float(np.concatenate(greener).mean())
 
 
+@pytest.mark.slow
 def test_a_foreign_object_is_not_learnt(scene):
     robust, plain = train(scene), train(scene, outlier_threshold=1e6)
     xy, on_ball, off_ball = robust.scene.pool.xy_px, [], []

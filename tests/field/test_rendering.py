@@ -1,7 +1,6 @@
 from unittest import mock
 
 import numpy as np
-import pytest
 import torch
 
 from pipeline.body.body import canonical_to_world
@@ -9,13 +8,7 @@ from pipeline.field import rendering as render
 from pipeline.field.trainer import Trainer
 from pipeline.field.volume_rendering import PosedField
 from pipeline.kernels.volume_rendering import MIN_TRANSMITTANCE
-from tests.field.scene import painted_scene
-from tests.field.test_trainer import make_trainer
-
-
-@pytest.fixture(scope="module")
-def scene():
-    return painted_scene(12, 110)
+from tests.field.scene import make_trainer
 
 
 def render_first_frame(trainer: Trainer, scene) -> np.ndarray:
@@ -65,11 +58,8 @@ def test_chunk_sizes_do_not_change_the_image(scene):
     assert np.abs(image - other).max() < 1e-5
 
 
-def test_the_compiled_kernel_renders_the_same_image(scene):
-    trainer = make_trainer(scene, steps=60)
-    for _ in range(60):
-        trainer.step()
-    traced, (image, _) = render_first_frame(trainer, scene), render_in_chunks(trainer, scene)
+def test_the_compiled_kernel_renders_the_same_image(scene, trained):
+    traced, (image, _) = render_first_frame(trained, scene), render_in_chunks(trained, scene)
     assert image[..., 3].max() > 0.9
     assert np.abs(traced - image).max() < 1.1 * MIN_TRANSMITTANCE
 

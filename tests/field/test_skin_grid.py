@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.body.body import canonical_to_world, load_anny
+from pipeline.body.body import canonical_to_world
 from pipeline.field.skin_grid import bake_warp_grids, build_skin_grid, skin_margin_m, world_to_posed
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.geometry.surface import signed_distance_m
@@ -10,12 +10,6 @@ from pipeline.kernels.inverse_skinning import newton_step
 from pipeline.kernels.inverse_skinning.reference import skin_points
 from pipeline.kernels.march import Rays, SamplingVolume, march
 from tests.field.scene import make_motion
-
-
-@pytest.fixture(scope="module")
-def body():
-    anny = load_anny()
-    return anny.at_shape(anny.shape_defaults)
 
 
 @pytest.fixture(scope="module")

@@ -15,34 +15,7 @@ from pipeline.field.setup import create_trainer, evenly_spaced, training_scale
 from pipeline.field.trainer import MAX_SAMPLES_PER_RAY
 from pipeline.field.volume_rendering import sample_positions
 from pipeline.kernels.volume_rendering import RenderSettings
-from tests.field.scene import field_config, painted_scene, psnr_on_white_db
-
-TRAIN = np.array([0, 1, 3, 4, 6, 7, 9, 10])
-TINY = {
-    "rays_per_step": 768,
-    "frames_per_step": 3,
-    "levels": 4,
-    "features_per_level": 4,
-    "log2_hashmap_size": 14,
-    "hidden_width": 32,
-    "finest_cell_px": 1.5,
-    "min_clothing_offset_m": 0.04,
-    "step_fraction": 0.012,
-    "occupancy_warmup_steps": 24,
-    "occupancy_decay": 0.7,
-    "border_px": 2,
-}
-
-
-@pytest.fixture(scope="module")
-def scene():
-    return painted_scene(12, 110)
-
-
-def make_trainer(scene, **options):
-    config = field_config(**(TINY | options))
-    masked_images = [(scene.images[row], scene.masks[row]) for row in TRAIN]
-    return create_trainer(scene.body, scene.motion.select(TRAIN), scene.camera, masked_images, config)
+from tests.field.scene import TINY, TRAIN, field_config, make_trainer, psnr_on_white_db, sample_rays
 
 
 def psnr_db(scene, trainer, row):
@@ -170,10 +143,6 @@ def test_results_do_not_depend_on_thread_count(scene, monkeypatch):
         states.append(trainer.state_dict())
     for name, value in states[0].items():
         assert torch.equal(value, states[1][name]), name
-
-
-def sample_rays(trainer, *frames):
-    return trainer.sampler.sample_rays(np.array(frames), trainer.completed_steps, trainer.inverse_skinning.cameras)
 
 
 def test_unobserved_cells_lose_their_density(scene):

@@ -8,11 +8,9 @@ import torch
 
 from pipeline.body.body import canonical_to_world
 from pipeline.field.rendering import render_field
-from pipeline.field.setup import create_trainer
 from pipeline.field.validation import Validator
-from tests.elsewhere import FAKE_DEVICE, elsewhere
-from tests.field.scene import field_config, painted_scene
-from tests.field.test_trainer import TINY, TRAIN
+from tests.fake_device import FAKE_DEVICE, fake_device
+from tests.field.scene import make_trainer
 
 FEW = {
     "rays_per_step": 256,
@@ -25,19 +23,8 @@ MAX_OPERATIONS = 1000
 """Tensor operations of a step with pose refinement; each is a kernel launch of about 5 microseconds on a GPU."""
 
 
-@pytest.fixture(scope="module")
-def scene():
-    return painted_scene(12, 110)
-
-
-def make_trainer(scene, device, **options):
-    config = field_config(**(TINY | FEW | options))
-    masked_images = [(scene.images[row], scene.masks[row]) for row in TRAIN]
-    return create_trainer(scene.body, scene.motion.select(TRAIN), scene.camera, masked_images, config, device)
-
-
 def train(scene, device, steps, **options):
-    trainer = make_trainer(scene, device, **options)
+    trainer = make_trainer(scene, device, **(FEW | options))
     return trainer, [trainer.step() for _ in range(steps)]
 
 
@@ -57,9 +44,16 @@ def compare(scene, device, **options):
     return other
 
 
-@pytest.mark.parametrize("options", [{}, {"occupancy": "attention"}, {"inverse_skinning": "nearest"}])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        pytest.param({"occupancy": "attention"}, marks=pytest.mark.slow),
+        pytest.param({"inverse_skinning": "nearest"}, marks=pytest.mark.slow),
+    ],
+)
 def test_training_on_another_device_agrees_with_the_cpu(scene, options):
-    with elsewhere():
+    with fake_device():
         compare(scene, FAKE_DEVICE, **options)
 
 
@@ -68,25 +62,26 @@ def test_training_on_a_gpu_agrees_with_the_cpu(scene, cuda):
     compare(scene, torch.device(cuda))
 
 
-@pytest.fixture(scope="module", params=["elsewhere", "cuda"])
+@pytest.fixture(scope="module", params=["fake", "cuda"])
 def trained(request, scene):
     """A trainer on another device, inside the context of that device."""
-    device = FAKE_DEVICE if request.param == "elsewhere" else torch.device(request.getfixturevalue("cuda"))
-    with elsewhere() if device == FAKE_DEVICE else nullcontext() as calls:
+    device = FAKE_DEVICE if request.param == "fake" else torch.device(request.getfixturevalue("cuda"))
+    with fake_device() if device == FAKE_DEVICE else nullcontext() as calls:
         yield train(scene, device, 12)[0], calls
 
 
+@pytest.mark.slow
 def test_renders_and_checkpoints_return_to_the_cpu(scene, trained):
     trainer, _ = trained
     pose = canonical_to_world(scene.body, scene.motion.select(np.array([2])))[0]
     shown = render_field(trainer.field, trainer.occupancy.binary(), scene.body, pose, scene.camera)
     state = {name: value.cpu() for name, value in trainer.state_dict().items()}
-    again = make_trainer(scene, torch.device("cpu"))
+    again = make_trainer(scene, **FEW)
     again.load_state_dict(state)
     here = render_field(again.field, again.occupancy.binary(), scene.body, pose, scene.camera)
     assert float(here[..., 3].amax()) > 0.5
     assert float((shown - here).abs().mean()) < 1e-4
-    back = make_trainer(scene, trainer.device)
+    back = make_trainer(scene, trainer.device, **FEW)
     back.load_state_dict(state)
     assert back.completed_steps == trainer.completed_steps
 
@@ -102,8 +97,8 @@ def test_validation_with_refined_poses(scene, trained):
 
 
 def test_a_step_has_few_operations(scene):
-    with elsewhere() as calls:
-        trainer = make_trainer(scene, FAKE_DEVICE)
+    with fake_device() as calls:
+        trainer = make_trainer(scene, FAKE_DEVICE, **FEW)
         for _ in range(FEW["steps"] - 2):
             trainer.step()
         before = calls.count
@@ -113,9 +108,9 @@ def test_a_step_has_few_operations(scene):
 
 
 def test_the_fake_device_has_the_rules_of_a_gpu():
-    with elsewhere():
+    with fake_device():
         there = torch.arange(6.0).to(FAKE_DEVICE)
-        with pytest.raises(RuntimeError, match="lies on the CPU"):
+        with pytest.raises(RuntimeError, match="is on the CPU"):
             there + torch.ones(6)
         with pytest.raises(RuntimeError, match="numpy"):
             there.numpy()

@@ -14,11 +14,11 @@ from pipeline.field.trainer import MAX_SAMPLES_PER_RAY, Trainer
 from pipeline.field.volume_rendering import PosedField, render_rays, render_rays_dense
 from pipeline.kernels.hashgrid import FeatureGradients, add_table_gradient_
 from pipeline.kernels.volume_rendering import MIN_TRANSMITTANCE, RenderOutput, RenderSettings
-from tests.field.test_trainer import make_trainer, sample_rays, scene  # noqa: F401 - a fixture
+from tests.field.scene import make_trainer, sample_rays
 
 
 @pytest.fixture(scope="module")
-def trainer(scene) -> Trainer:  # noqa: F811
+def trainer(scene) -> Trainer:
     """A half-trained field: some cells are opaque, and poses have moved since the last bake."""
     trainer = make_trainer(scene, steps=160, pose_start_fraction=0.1, occupancy_warmup_steps=8)
     for _ in range(120):

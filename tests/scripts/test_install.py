@@ -1,4 +1,4 @@
-"""Which torch is asked of pip: the CPU build wherever it can be had, the CUDA one only on request."""
+"""Choice of the torch build: the CPU build wherever it is available, the CUDA build on request."""
 
 from pathlib import Path
 
@@ -41,7 +41,7 @@ def test_without_the_index_pip_is_left_alone(
     monkeypatch.setattr(install, "resolves_to_cpu_build", lambda pin: False)
     monkeypatch.setattr(install, "is_index_reachable", lambda index: False)
     assert "--extra-index-url" not in install.torch_pip_arguments("torch==2", lock, use_cuda=False)
-    assert "does not answer" in capsys.readouterr().out
+    assert "is not reachable" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("use_cuda", [True, False])
@@ -51,11 +51,11 @@ def test_index_from_environment_is_used(lock: Path, monkeypatch: pytest.MonkeyPa
     assert arguments[-2:] == ["--extra-index-url", "https://mirror.example/whl"]
 
 
-def test_cuda_never_asks_for_the_cpu_index(lock: Path) -> None:
+def test_cuda_never_uses_the_cpu_index(lock: Path) -> None:
     assert install.torch_pip_arguments("torch==2", lock, use_cuda=True) == ["torch==2", "--constraint", str(lock)]
 
 
-def test_an_index_that_does_not_answer_is_noticed() -> None:
+def test_an_unreachable_index_is_noticed() -> None:
     assert not install.is_index_reachable("http://127.0.0.1:9")
 
 

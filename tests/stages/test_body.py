@@ -32,14 +32,14 @@ FRAMES = 8
 
 @pytest.fixture(scope="module")
 def scene() -> SyntheticRecording:
-    """Both hands are known for what they are, but one in one frame."""
+    """Return a recording in which all hands but one have a high handedness score."""
     scene = synthetic_recording(load_anny(), FRAMES, turn_rad=2.0, noise_m=0.005)
     scene.hands.handedness_score[2, 0] = 0.4
     return scene
 
 
 def write_capture(folder, scene: SyntheticRecording, camera: Camera | None, masks: list[np.ndarray]) -> None:
-    """What the frames stage would write of a scene: grey pictures, masks, landmarks."""
+    """Write the artifact of the frames stage: grey images, masks, landmarks."""
     for name in (IMAGES_FOLDER, MASKS_FOLDER):
         (folder / name).mkdir(parents=True)
     index = 3 * np.arange(FRAMES, dtype=np.int32)
@@ -108,13 +108,13 @@ def test_an_unusable_frame_is_marked_reported_and_dropped(tmp_path, scene: Synth
     assert metrics["dropped_frames"] == 1
     assert np.flatnonzero(~load_scores(out / "scores.npz").usable).tolist() == [3]
     assert any(
-        sentence.startswith("frames 9: the body does not match the person; 1 frame") for sentence in take_warnings()
+        warning.startswith("frames 9: the body does not match the person; 1 frame") for warning in take_warnings()
     )
     assert (read_rgb(out / "overlay.png") == WARNING_RGB).all(-1).any()
 
 
 def capture_of(split: list[int]) -> Capture:
-    """The little that is asked of a capture whose fit is judged."""
+    """Return a capture with the attributes that the quality check uses."""
     index = 2 * np.arange(len(split))
     return mock.MagicMock(spec=Capture, folder=Path("frames"), split=np.array(split), frame_index=index)
 
@@ -127,7 +127,7 @@ def test_a_fit_without_masks_is_refused() -> None:
         check_fit_quality(fit, capture_of([0] * 12), Config(min_silhouette_iou=0.0), False)
 
 
-def test_a_fit_is_refused_where_too_few_frames_are_left_to_learn_from() -> None:
+def test_a_fit_with_too_many_unusable_frames_is_refused() -> None:
     silhouette_iou = np.where(np.arange(12) < 4, 0.3, 0.9)
     with pytest.raises(UserError, match=r"in 4 of 12 training frames.*frames 0-6.*split.json.*body.max_dropped_share"):
         check_fit_quality(result(silhouette_iou=silhouette_iou), capture_of([0] * 12), Config(), False)
@@ -153,15 +153,15 @@ def test_a_foreign_object_is_reported(tmp_path, scene: SyntheticRecording) -> No
     take_warnings()
     metrics = run({"frames": frames}, out, Config(rounds=1))
     assert metrics["frames_with_foreign_objects"] == 1
-    assert any(sentence.startswith("frames 9: the mask contains another object") for sentence in take_warnings())
+    assert any(warning.startswith("frames 9: the mask contains another object") for warning in take_warnings())
 
 
-def test_masks_of_something_else_are_refused_with_a_remedy(tmp_path, scene: SyntheticRecording) -> None:
+def test_masks_of_another_object_are_refused_with_a_remedy(tmp_path, scene: SyntheticRecording) -> None:
     frames, out = tmp_path / "frames", tmp_path / "body"
     out.mkdir()
-    elsewhere = np.zeros((scene.camera.height, scene.camera.width), dtype=np.uint8)
-    elsewhere[280:315, 5:250] = 255
-    write_capture(frames, scene, scene.camera, [elsewhere] * FRAMES)
+    wrong_mask = np.zeros((scene.camera.height, scene.camera.width), dtype=np.uint8)
+    wrong_mask[280:315, 5:250] = 255
+    write_capture(frames, scene, scene.camera, [wrong_mask] * FRAMES)
     with pytest.raises(UserError, match=r"does not fit the person .* body.min_silhouette_iou"):
         run({"frames": frames}, out, Config(rounds=1))
 
@@ -177,7 +177,7 @@ def test_landmarks_without_depth_are_refused_with_a_remedy(tmp_path, scene: Synt
 
 
 def test_a_supplied_principal_point_is_kept(tmp_path, scene: SyntheticRecording) -> None:
-    """Also when an angle of view is given: the camera beside the video is the better word."""
+    """A supplied camera overrides the option of the field of view."""
     camera = replace(scene.camera, cx=scene.camera.cx + 30.0, cy=scene.camera.cy - 20.0)
     write_capture(tmp_path, scene, camera, [])
     found, std = initial_camera(load_capture(tmp_path), Config(field_of_view_deg=90.0))

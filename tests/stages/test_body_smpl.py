@@ -1,4 +1,4 @@
-"""Stage `body` with a model file of the user's: the same artifacts, with the model's joints."""
+"""Stage `body` with a user-supplied model file: the same artifacts with the joints of the model."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -20,22 +20,22 @@ from pipeline.geometry.rotation import quaternion_to_matrix
 from pipeline.geometry.skinning import forward_kinematics
 from stages.body import STAGE, Config, load_supplied_poses, run
 from tests.body.acting import SyntheticRecording, synthetic_recording
-from tests.body.smpl_sample import file_contents, made_up_arrays, smpl_pose_of
+from tests.body.smpl_sample import file_contents, sample_arrays, smpl_pose_of
 from tests.stages.test_body import FRAMES, write_capture
 
 SPACE = np.array([[0.0, 0.0, 1.0, 0.4], [0.0, -1.0, 0.0, 0.1], [1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 0.0, 1.0]])
-"""Some space that poses may be given in, to camera axes."""
+"""From the space of the supplied poses to camera axes."""
 
 
 @pytest.fixture
 def model_file(tmp_path):
     path = tmp_path / "SMPL_NEUTRAL.npz"
-    np.savez(path, **file_contents(made_up_arrays(24)))
+    np.savez(path, **file_contents(sample_arrays(24)))
     return path
 
 
-def test_a_model_file_takes_the_place_of_the_built_in_body(tmp_path, model_file) -> None:
-    model = SmplBody(made_up_arrays(24))
+def test_a_model_file_replaces_the_built_in_body(tmp_path, model_file) -> None:
+    model = SmplBody(sample_arrays(24))
     scene = synthetic_recording(model, FRAMES, shape={"beta_1": 1.0}, turn_rad=2.0, noise_m=0.005)
     frames, out = tmp_path / "frames", tmp_path / "body"
     out.mkdir()
@@ -52,7 +52,7 @@ def test_a_model_file_takes_the_place_of_the_built_in_body(tmp_path, model_file)
 
 
 def test_a_missing_model_file_is_refused(tmp_path) -> None:
-    model = SmplBody(made_up_arrays(24))
+    model = SmplBody(sample_arrays(24))
     scene = synthetic_recording(model, FRAMES)
     write_capture(tmp_path / "frames", scene, scene.camera, scene.masks())
     with pytest.raises(UserError, match="SMPL_MALE.npz"):
@@ -61,15 +61,15 @@ def test_a_missing_model_file_is_refused(tmp_path) -> None:
 
 @pytest.fixture(scope="module")
 def scene() -> SyntheticRecording:
-    """A person of known betas, with landmarks that err by 2 cm."""
+    """Return a person with known betas and landmark errors of 2 cm."""
     return synthetic_recording(
-        SmplBody(made_up_arrays(24)), FRAMES, shape={"beta_0": 1.0, "beta_1": 1.5}, turn_rad=2.0, noise_m=0.02
+        SmplBody(sample_arrays(24)), FRAMES, shape={"beta_0": 1.0, "beta_1": 1.5}, turn_rad=2.0, noise_m=0.02
     )
 
 
 def true_poses(scene: SyntheticRecording) -> SmplPoses:
-    """The scene's poses as a data set would give them; `write_capture` says which frames they are of."""
-    arrays = made_up_arrays(24)
+    """Return the poses of the scene in SMPL's format, for the frames of `write_capture`."""
+    arrays = sample_arrays(24)
     betas = scene.state.shape.float().numpy()
     theta = smpl_pose_of(SmplBody(arrays), scene.model.all_joint_rotations(scene.state.rotations))
     world_to_smpl = np.linalg.inv(SPACE) @ scene.camera.world_to_camera
@@ -88,13 +88,13 @@ def true_poses(scene: SyntheticRecording) -> SmplPoses:
 
 
 def axis_angle_product(matrix: np.ndarray, axis_angle: np.ndarray) -> np.ndarray:
-    """matrix @ exp(axis_angle), as axis-angle."""
+    """Return matrix @ exp(axis_angle) as axis-angle."""
     turned = [cv2.Rodrigues(matrix @ cv2.Rodrigues(vector.astype(np.float64))[0])[0][:, 0] for vector in axis_angle]
     return np.stack(turned).astype(np.float32)
 
 
 def errors_m(out: Path, scene: SyntheticRecording) -> np.ndarray:
-    """Mean distance of each frame's joints from the true ones."""
+    """Return the mean joint error of each frame."""
     body, motion = load_body(out / "body.npz"), load_motion(out / "motion.npz")
     joint_to_world = forward_kinematics(
         quaternion_to_matrix(torch.tensor(motion.rotations_wxyz)),
@@ -109,7 +109,7 @@ def errors_m(out: Path, scene: SyntheticRecording) -> np.ndarray:
 def fitted(
     folder: Path, scene: SyntheticRecording, poses: SmplPoses, camera: Camera | None, **options: object
 ) -> tuple[Path, dict[str, float]]:
-    """Run the stage on a capture with these poses; its folder and figures."""
+    """Run the stage on a capture with these poses; return its folder and metrics."""
     frames, out = folder / "frames", folder / "body"
     out.mkdir()
     write_capture(frames, scene, camera, scene.masks())
@@ -118,7 +118,7 @@ def fitted(
 
 
 def test_supplied_poses_are_kept(tmp_path, model_file, scene: SyntheticRecording) -> None:
-    """Landmarks 2 cm off change nothing; the shape is that of the file."""
+    """Landmark errors of 2 cm have no effect; the shape is that of the file."""
     out, metrics = fitted(tmp_path, scene, true_poses(scene), scene.camera, model_file=str(model_file))
     assert errors_m(out, scene).max() < 1e-4
     assert metrics["silhouette_iou"] > 0.98
@@ -127,7 +127,7 @@ def test_supplied_poses_are_kept(tmp_path, model_file, scene: SyntheticRecording
 
 
 def test_frames_without_a_supplied_pose_are_fitted(tmp_path, model_file, scene: SyntheticRecording) -> None:
-    """The first frame lies before all given poses, the third between two of them."""
+    """The first frame is before all supplied poses, the third between two of them."""
     missing = np.isin(np.arange(FRAMES), [0, 2])
     poses = true_poses(scene).for_frames(3 * np.flatnonzero(~missing))
     out, _ = fitted(tmp_path, scene, poses, scene.camera, model_file=str(model_file))
@@ -136,8 +136,8 @@ def test_frames_without_a_supplied_pose_are_fitted(tmp_path, model_file, scene: 
     assert 1e-4 < errors[missing].max() < 0.06
 
 
-def test_supplied_poses_are_where_the_fit_starts(tmp_path, model_file, scene: SyntheticRecording) -> None:
-    """Poses that are 5 cm off and bent are drawn to the outlines; the shape stays that of the file."""
+def test_supplied_poses_are_refined(tmp_path, model_file, scene: SyntheticRecording) -> None:
+    """Poses with errors of 5 cm and bent joints are refined; the shape is that of the file."""
     true = true_poses(scene)
     random = np.random.default_rng(0)
     bent = true.body_pose + random.normal(0.0, 0.05, true.body_pose.shape).astype(np.float32)
@@ -151,7 +151,7 @@ def test_supplied_poses_are_where_the_fit_starts(tmp_path, model_file, scene: Sy
 
 
 @pytest.mark.parametrize(
-    ("joints", "knows_camera", "frames", "said"),
+    ("joints", "knows_camera", "frames", "expected"),
     [
         (0, True, slice(None), "an SMPL or SMPL-H model file (neutral); add --set body.model_file"),
         (55, True, slice(None), "an SMPL or SMPL-H model file"),
@@ -160,23 +160,23 @@ def test_supplied_poses_are_where_the_fit_starts(tmp_path, model_file, scene: Sy
     ],
 )
 def test_unusable_supplied_poses_are_reported(
-    tmp_path, scene: SyntheticRecording, joints: int, knows_camera: bool, frames: slice, said: str
+    tmp_path, scene: SyntheticRecording, joints: int, knows_camera: bool, frames: slice, expected: str
 ) -> None:
-    model = SmplBody(made_up_arrays(joints)) if joints else load_anny()
+    model = SmplBody(sample_arrays(joints)) if joints else load_anny()
     write_capture(tmp_path / "frames", scene, scene.camera, [])
     poses = true_poses(scene)
     take_warnings()
     capture = replace(load_capture(tmp_path / "frames"), smpl_poses=poses.for_frames(poses.frame_index[frames]))
     assert load_supplied_poses(capture, model, scene.camera, knows_camera, Config()) is None
-    (sentence,) = take_warnings()
-    assert "smpl_poses.npz is not used" in sentence
-    assert said in sentence
+    (warning,) = take_warnings()
+    assert "smpl_poses.npz is not used" in warning
+    assert expected in warning
     assert load_supplied_poses(capture, model, scene.camera, knows_camera, Config(supplied_poses="ignore")) is None
     assert take_warnings() == []
 
 
-def test_poses_of_a_person_elsewhere_are_refused_with_a_remedy(tmp_path, model_file, scene: SyntheticRecording) -> None:
+def test_misplaced_poses_are_refused_with_a_remedy(tmp_path, model_file, scene: SyntheticRecording) -> None:
     poses = true_poses(scene)
-    elsewhere = replace(poses, transl=poses.transl + np.float32(0.5))
+    misplaced = replace(poses, transl=poses.transl + np.float32(0.5))
     with pytest.raises(UserError, match=r"does not fit the person .* body.supplied_poses=start, or lower"):
-        fitted(tmp_path, scene, elsewhere, scene.camera, model_file=str(model_file))
+        fitted(tmp_path, scene, misplaced, scene.camera, model_file=str(model_file))

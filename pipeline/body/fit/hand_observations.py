@@ -64,10 +64,10 @@ def finger_curls_rad(body: ParametricBody, hands: HandLandmarks) -> Float[np.nda
     if "LeftHandPinky3" not in body.joint_names:
         return curls
     for side in range(2):
-        seen = hands.landmarks_m[hands.handedness_score[:, side] > 0.0, side]
-        if len(seen) >= MIN_HAND_FRAMES:
-            beyond = finger_flexion_rad(seen, side) - finger_flexion_rad(rest_hand_points_m(body, side), side)
-            curls[side] = np.median(beyond.mean(-1), axis=0).clip(0.0, MAX_CURL_RAD)
+        detected = hands.landmarks_m[hands.handedness_score[:, side] > 0.0, side]
+        if len(detected) >= MIN_HAND_FRAMES:
+            curl_rad = finger_flexion_rad(detected, side) - finger_flexion_rad(rest_hand_points_m(body, side), side)
+            curls[side] = np.median(curl_rad.mean(-1), axis=0).clip(0.0, MAX_CURL_RAD)
     return curls
 
 

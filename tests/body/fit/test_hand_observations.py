@@ -38,7 +38,7 @@ from pipeline.geometry.camera import project
 from pipeline.geometry.rotation import axis_angle_to_matrix
 from pipeline.geometry.skinning import forward_kinematics
 from tests.body.acting import synthetic_recording
-from tests.body.smpl_sample import made_up_arrays
+from tests.body.smpl_sample import sample_arrays
 
 FRAMES = 12
 CURLS = np.array([[0.1, 0.3, 0.5, 0.7], [0.6, 0.4, 0.2, 0.0]])
@@ -62,7 +62,7 @@ def posed_hand_m(body: AnnyBody, curls_rad: np.ndarray, side: int) -> np.ndarray
     return points
 
 
-def seen(body: AnnyBody, curls_rad: np.ndarray, frames: int, noise_m: float = 0.0) -> HandLandmarks:
+def simulate_hands(body: AnnyBody, curls_rad: np.ndarray, frames: int, noise_m: float = 0.0) -> HandLandmarks:
     """Return detections of both hands at 250 px per metre, with another orientation in every frame."""
     random = np.random.default_rng(0)
     turns = axis_angle_to_matrix(torch.from_numpy(random.normal(size=(frames, 3)))).numpy()
@@ -81,7 +81,7 @@ def pose_px(hands: HandLandmarks) -> np.ndarray:
 
 def test_finger_curls_are_estimated_from_rotating_hands() -> None:
     body = load_anny()
-    hands = seen(body, CURLS, 40, noise_m=0.001)
+    hands = simulate_hands(body, CURLS, 40, noise_m=0.001)
     hands.landmarks_m[:6] = hands.landmarks_m[:6, :, ::-1]  # outliers
     reliable = filter_hand_detections(hands, pose_px(hands))
     assert (reliable.handedness_score == 0.9).all()
@@ -100,7 +100,7 @@ def test_straight_fingers_have_zero_flexion_and_a_fist_positive() -> None:
 def test_a_rarely_detected_hand_keeps_the_relaxed_curl(frame_count: int) -> None:
     """The curl of one hand does not depend on the detections of the other."""
     body = load_anny()
-    hands = seen(body, CURLS, FRAMES)
+    hands = simulate_hands(body, CURLS, FRAMES)
     hands.handedness_score[MIN_HAND_FRAMES:, 0] = 0.0
     hands.handedness_score[frame_count:, 1] = 0.0
     left, right = finger_curls_rad(body, hands)
@@ -111,18 +111,18 @@ def test_a_rarely_detected_hand_keeps_the_relaxed_curl(frame_count: int) -> None
 @pytest.mark.parametrize(("true_rad", "found_rad"), [(-0.6, 0.0), (1.7, MAX_CURL_RAD)])
 def test_finger_curls_are_clamped(true_rad: float, found_rad: float) -> None:
     body = load_anny()
-    hands = seen(body, np.full((2, 4), true_rad), MIN_HAND_FRAMES)
+    hands = simulate_hands(body, np.full((2, 4), true_rad), MIN_HAND_FRAMES)
     np.testing.assert_array_equal(finger_curls_rad(body, hands), np.full((2, 4), found_rad))
 
 
 def test_a_body_without_fingers_has_the_relaxed_curl() -> None:
-    hands = seen(load_anny(), CURLS, FRAMES)
-    body = SmplBody(made_up_arrays(24))
+    hands = simulate_hands(load_anny(), CURLS, FRAMES)
+    body = SmplBody(sample_arrays(24))
     np.testing.assert_array_equal(finger_curls_rad(body, hands), relaxed_curls_rad())
 
 
 def test_hands_of_the_other_side_or_away_from_the_wrist_are_not_reliable() -> None:
-    hands = seen(load_anny(), CURLS, 4)
+    hands = simulate_hands(load_anny(), CURLS, 4)
     hands.handedness_score[1, 0] = 0.4
     landmarks_px = pose_px(hands)
     landmarks_px[2, 16, 0] += 250.0 * 1.1 * MAX_WRIST_DISTANCE_M
@@ -132,8 +132,8 @@ def test_hands_of_the_other_side_or_away_from_the_wrist_are_not_reliable() -> No
     assert (filter_hand_detections(undetected_hands(4), landmarks_px).handedness_score == 0.0).all()
 
 
-def test_points_are_in_the_order_of_the_fits_landmarks() -> None:
-    hands = seen(load_anny(), CURLS, 3)
+def test_hand_landmarks_are_in_the_order_of_the_fit() -> None:
+    hands = simulate_hands(load_anny(), CURLS, 3)
     world = np.random.default_rng(0).normal(size=(3, 33, 3))
     hands.handedness_score[:, 0] = 0.7
     pixels, places, weights = hand_landmarks(hands, world)
@@ -146,8 +146,8 @@ def test_points_are_in_the_order_of_the_fits_landmarks() -> None:
         np.testing.assert_allclose(places[:, place] - world[:, 15 + side], from_wrist, atol=1e-12)
 
 
-def test_points_of_hands_turn_the_wrists() -> None:
-    """Wrists start straight; the pose's landmarks hardly see knuckles, the hands' points do."""
+def test_hand_landmarks_determine_the_wrist_rotation() -> None:
+    """The wrists start straight; pose landmarks of the knuckles have low confidence, hand landmarks do not."""
     body, rows = load_anny(), [ACTIVE_JOINTS.index(name) for name in ("LeftHand", "RightHand")]
     scene = synthetic_recording(body, 3, turn_rad=0.5, wrists_rad=0.3)
     start = replace(scene.state, rotations=scene.state.rotations.clone())
@@ -158,11 +158,13 @@ def test_points_of_hands_turn_the_wrists() -> None:
     regressor = landmark_regressor(linearise_body(body, body.shape_defaults))
     errors_px = []
     for hands in (None, scene.hands):
-        seen = make_observations(
+        observations = make_observations(
             scene.time_s, scene.landmarks_px, visibility, scene.landmarks_world_m, scene.camera, hands
         )
         weights = EnergyParameters(free_shape=False, hand_std_m=FitSettings.fitted_hand_std_m)
-        objective = Objective(scene.model, regressor, *priors, seen, weights, compute_px_per_m(start, scene.camera))
+        objective = Objective(
+            scene.model, regressor, *priors, observations, weights, compute_px_per_m(start, scene.camera)
+        )
         state, _ = minimise(start, objective, objective.retract, 12)
         skeleton = pose_skeleton(scene.model, state.rotations, state.root_m)
         points = pose_points(scene.model, skeleton, regressor.points(scene.model, state.landmark_offsets_m)).world_m

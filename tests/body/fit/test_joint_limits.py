@@ -30,7 +30,7 @@ from pipeline.body.fit.state import FitState, Observations
 from pipeline.body.smpl import SmplBody
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.rotation import axis_angle_to_matrix, matrix_to_quaternion, quaternion_to_matrix
-from tests.body.smpl_sample import made_up_arrays
+from tests.body.smpl_sample import sample_arrays
 
 MIRROR = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
 Pose = dict[str, tuple[float, float, float]]
@@ -199,7 +199,7 @@ def bone_frame(upper: torch.Tensor, lower: torch.Tensor) -> torch.Tensor:
 
 @pytest.mark.parametrize("joints", [24, 55])
 def test_smpl_bodies_have_the_same_limits(limits: JointLimits, joints: int) -> None:
-    body = SmplBody(made_up_arrays(joints))
+    body = SmplBody(sample_arrays(joints))
     found, rest = joint_limits(linearise_body(body, body.shape_defaults)), posed({})
     assert (found.half_range_rad - found.angles(rest)[0].abs() > np.deg2rad(10.0))[0].all()
     for pose in FEASIBLE.values():
@@ -251,7 +251,7 @@ def objective(model: LinearBody) -> Objective:
     """Return an objective of two frames without observations; landmarks outweigh the pose prior."""
     body, camera = load_anny(), Camera(520.0, 520.0, 128.0, 160.0, 256, 320)
     zeros = torch.zeros(2, LANDMARK_COUNT, 3, dtype=torch.float64)
-    seen = Observations(
+    observations = Observations(
         torch.tensor([0.0, 0.1], dtype=torch.float64), zeros[..., :2], zeros, *2 * [zeros[..., 0] + 1.0], camera
     )
     priors = pose_prior(model), shape_prior(body.shape_names, body.shape_defaults)
@@ -260,7 +260,7 @@ def objective(model: LinearBody) -> Objective:
         model,
         landmark_regressor(model),
         *priors,
-        seen,
+        observations,
         EnergyParameters(landmark_std_m=0.002, landmark_3d_std_m=0.005, free_shape=False),
         scale,
     )
@@ -268,19 +268,21 @@ def objective(model: LinearBody) -> Objective:
 
 def fitted(objective: Objective, pose: Pose, with_limits: bool) -> torch.Tensor:
     """Return the rotations fitted to the landmarks of a pose, with that pose as the initial state."""
-    model, seen = objective.model, objective.observations
+    model, observations = objective.model, objective.observations
     zeros = [torch.zeros(count, dtype=torch.float64) for count in (LANDMARK_OFFSET_COUNT, INTRINSICS_COUNT)]
     root = torch.tensor([[0.0, -0.05, -3.0]], dtype=torch.float64).repeat(2, 1)
     start = FitState(posed(pose).repeat(2, 1, 1, 1), root, model.shape, *zeros)
     skeleton = pose_skeleton(model, start.rotations, start.root_m)
     world = pose_points(model, skeleton, objective.regressor.points(model, start.landmark_offsets_m)).world_m
-    pixels, _ = project(world, seen.camera)
-    seen = replace(seen, landmarks_px=pixels, landmarks_3d_m=world - 0.5 * (world[:, 23:24] + world[:, 24:25]))
+    pixels, _ = project(world, observations.camera)
+    observations = replace(
+        observations, landmarks_px=pixels, landmarks_3d_m=world - 0.5 * (world[:, 23:24] + world[:, 24:25])
+    )
     prior = objective.pose_prior
     if not with_limits:
         unlimited = torch.full_like(prior.limits.half_range_rad, 10.0)
         prior = replace(prior, limits=replace(prior.limits, half_range_rad=unlimited))
-    objective_of_pose = replace(objective, observations=seen, pose_prior=prior)
+    objective_of_pose = replace(objective, observations=observations, pose_prior=prior)
     return minimise(start, objective_of_pose, objective_of_pose.retract, 12)[0].rotations
 
 

@@ -62,8 +62,8 @@ def test_pose_derivative_agrees_with_differences(prior: PosePrior) -> None:
     assert torch.allclose((derivative @ step[..., None])[..., 0], moved - residual, atol=1e-8)
 
 
-def test_knees_bend_backward_only(prior: PosePrior) -> None:
-    """A positive turn about +X takes the foot back; the other way is beyond the limit."""
+def test_knees_flex_backward_only(prior: PosePrior) -> None:
+    """A positive rotation about +X moves the foot backward; a negative one exceeds the limit."""
     backward, _ = pose_residuals(prior, bent("LeftLeg", torch.tensor([1.5, 0.0, 0.0])))
     forward, _ = pose_residuals(prior, bent("LeftLeg", torch.tensor([-0.6, 0.0, 0.0])))
     assert backward[0, :, 3:].abs().max() == 0.0
@@ -71,7 +71,7 @@ def test_knees_bend_backward_only(prior: PosePrior) -> None:
 
 
 @pytest.mark.parametrize("side", ["Left", "Right"])
-def test_elbows_bend_the_hand_forward_and_stop_when_straight(prior: PosePrior, side: str) -> None:
+def test_elbows_flex_forward_only(prior: PosePrior, side: str) -> None:
     joint = ACTIVE_JOINTS.index(f"{side}ForeArm")
     body = load_anny()
     model = linearise_body(body, body.shape_defaults)
@@ -84,7 +84,7 @@ def test_elbows_bend_the_hand_forward_and_stop_when_straight(prior: PosePrior, s
     assert breaking[0, joint, 3:].abs().max() > 3.0
 
 
-def test_steady_motion_costs_nothing_at_any_spacing() -> None:
+def test_uniform_motion_has_zero_residual_at_any_interval() -> None:
     time_s = torch.tensor([0.0, 0.1, 0.13, 0.4, 0.5], dtype=torch.float64)
     turn = torch.tensor([0.2, 1.5, -0.4], dtype=torch.float64)
     rotations = axis_angle_to_matrix((time_s[:, None] * turn)[:, None].expand(-1, 3, -1))
@@ -103,7 +103,7 @@ def test_shape_prior_separates_phenotypes_from_local_changes() -> None:
 
 @pytest.mark.parametrize(("pushed", "expected"), [(0.2, 0.4), (0.0, MIN_MOTION_RATIO), (5.0, 1.0)])
 def test_motion_is_separated_from_noise(pushed: float, expected: float) -> None:
-    """White acceleration of a known size, seen under errors that change from frame to frame."""
+    """White noise acceleration of known variance, observed with independent errors in each frame."""
     generator = torch.Generator().manual_seed(3)
     default_std = default_motion_std(1)
     acceleration = pushed * default_std * torch.randn(4000, 6, generator=generator, dtype=torch.float64)

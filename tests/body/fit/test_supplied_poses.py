@@ -13,7 +13,7 @@ from pipeline.body.fit.supplied_poses import SuppliedPoses
 from pipeline.body.smpl import SmplBody
 from pipeline.geometry.rotation import axis_angle_to_matrix, quaternion_to_matrix
 from tests.body.acting import SyntheticRecording, fitted_joints_m, joint_errors_m, swap_left_right, synthetic_recording
-from tests.body.smpl_sample import made_up_arrays
+from tests.body.smpl_sample import sample_arrays
 
 ACTIVE = (0, 2)
 
@@ -71,7 +71,7 @@ def test_inactive_joints_are_restored(supplied: SuppliedPoses) -> None:
 @pytest.fixture(scope="module")
 def short() -> tuple[SmplBody, SyntheticRecording, SuppliedPoses]:
     """Return six frames of a person with their true poses."""
-    body = SmplBody(made_up_arrays(24))
+    body = SmplBody(sample_arrays(24))
     scene = synthetic_recording(body, 6, turn_rad=2.0)
     rotations = scene.model.all_joint_rotations(scene.state.rotations).float()
     return body, scene, SuppliedPoses(np.arange(6), scene.state.shape.float(), rotations, scene.state.root_m.float())
@@ -122,7 +122,7 @@ def errors_mm(
 @pytest.mark.slow
 def test_poses_with_three_degrees_error_are_better_kept_with_loose_clothing() -> None:
     """Independent errors in every frame: 3 degrees of each joint, 1 cm of the root; clothing of 0 or 17 mm."""
-    body = SmplBody(made_up_arrays(24))
+    body = SmplBody(sample_arrays(24))
     scene = synthetic_recording(body, 24, shape={"beta_0": 1.0, "beta_1": 1.5, "beta_4": -1.0}, noise_m=0.02)
     generator = torch.Generator().manual_seed(0)
     true = scene.model.all_joint_rotations(scene.state.rotations).float()

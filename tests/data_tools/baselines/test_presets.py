@@ -77,6 +77,7 @@ def test_presets_have_the_constants_of_the_papers(preset, constants):
     assert found == constants
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("preset", "render_method", "gain_db"),
     [("instantavatar", "baked", 1.5), ("animnerf", "nearest", 0.5), ("ihm", "baked", 1.5)],

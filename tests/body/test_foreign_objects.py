@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from pipeline.body.body import load_anny
-from pipeline.body.fit.foreign_objects import (
+from pipeline.body.foreign_objects import (
     CLOTHING_MARGIN_RATIO,
     MIN_EXCESS_BLOB_SHARE,
     foreign_object_warnings,
