@@ -55,9 +55,9 @@ def test_make_targets_in_the_readme_exist(readme: str, repository: Path):
     assert used <= targets
 
 
-def test_files_that_the_readme_names_are_made(readme: str):
-    section = readme.partition("## What flows")[2].partition("\n## ")[0]
-    rows = {row[0].strip("`/"): row[1] for row in table_rows(section)[1:]}
+def test_files_of_the_stages_are_those_that_the_documents_name(repository: Path):
+    text = (repository / "docs/how-it-works.md").read_text(encoding="utf-8")
+    rows = {row[0].strip("`/"): row[1] for row in table_rows(text)[1:]}
     assert list(rows) == list(STAGES)
     for name in STAGES:
         made = set(load_stage(name).makes)
@@ -65,10 +65,23 @@ def test_files_that_the_readme_names_are_made(readme: str):
         assert named <= made | {"images", "masks"}, name
 
 
+def test_the_readme_is_short(readme: str):
+    assert len(readme.split()) < 1000
+
+
 def test_local_links_lead_somewhere(readme: str, repository: Path):
-    paths = re.findall(r"`((?:pipeline|stages|docs|configs)/[\w./-]+)`", readme)
-    paths += [link for link in re.findall(r"\]\(([^)]+)\)", readme) if not link.startswith("http")]
-    assert [path for path in paths if not (repository / path).exists()] == []
+    texts = [(repository, readme)]
+    texts += [(path.parent, path.read_text(encoding="utf-8")) for path in (repository / "docs").rglob("*.md")]
+    missing = []
+    for folder, text in texts:
+        missing += [
+            path
+            for path in re.findall(r"`((?:pipeline|stages|docs|configs|data_tools|scripts)/[\w./-]+)`", text)
+            if not (repository / path).exists()
+        ]
+        links = [link for link in re.findall(r"\]\(([^)#]+)\)", text) if not link.startswith("http")]
+        missing += [link for link in links if not (folder / link).exists()]
+    assert missing == []
 
 
 def test_options_in_the_readme_are_known(readme: str):

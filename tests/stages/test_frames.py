@@ -190,7 +190,7 @@ def test_image_fps_can_be_set(tmp_path):
 
 def test_fps_option_is_refused_for_video(tmp_path):
     write_video(tmp_path / "a.mp4", np.zeros((17, 48, 64, 3), np.uint8), 25.0)
-    with pytest.raises(UserError, match="a.mp4 is a video, .* remove frames.fps"):
+    with pytest.raises(UserError, match="a.mp4 is a video with a frame rate .* remove frames.fps"):
         run(tmp_path / "a.mp4", tmp_path / "out", fps=30.0)
 
 
