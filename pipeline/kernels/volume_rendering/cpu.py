@@ -89,20 +89,22 @@ def _refine_samples(first, last, inputs, samples):
     """Do one Newton step for the samples first..last, if there is a skin grid; then map them to the unit box."""
     rays, bounds = inputs.march.rays, inputs.field.bounds
     batch_index, lattice, blended = inputs.skinning
-    origins, directions, canonical, unit = rays.origins, rays.directions, samples.canonical, samples.unit
+    # Arrays are taken out of their tuples before the loop: in the loop this would count references for each sample.
+    origins, directions, ray_indices, distance = rays.origins, rays.directions, samples.ray_indices, samples.distance
+    canonical, unit, inverse_jacobian = samples.canonical, samples.unit, samples.inverse_jacobian
     low_x, low_y, low_z = bounds[0, 0], bounds[0, 1], bounds[0, 2]
     scale_x, scale_y = _ONE / (bounds[1, 0] - low_x), _ONE / (bounds[1, 1] - low_y)
     scale_z = _ONE / (bounds[1, 2] - low_z)
     for s in range(first, last):
         x, y, z = canonical[s, 0], canonical[s, 1], canonical[s, 2]
         if len(blended):
-            ray, t = samples.ray_indices[s], samples.distance[s]
+            ray, t = ray_indices[s], distance[s]
             posed = (
                 origins[ray, 0] + t * directions[ray, 0],
                 origins[ray, 1] + t * directions[ray, 1],
                 origins[ray, 2] + t * directions[ray, 2],
             )
-            x, y, z = newton_step(posed, (x, y, z), batch_index[ray], lattice, blended, samples.inverse_jacobian[s])
+            x, y, z = newton_step(posed, (x, y, z), batch_index[ray], lattice, blended, inverse_jacobian[s])
         unit[s, 0], unit[s, 1], unit[s, 2] = (x - low_x) * scale_x, (y - low_y) * scale_y, (z - low_z) * scale_z
 
 
@@ -151,12 +153,13 @@ def _decode(first, last, network, samples, buffers):
 def evaluate_field(first, last, field, samples):
     """Fill features, colour and density of the samples first..last at their positions in the unit box."""
     _, table, lanes, network = field
+    unit, features, levels = samples.unit, samples.features, table.level_params.shape[0]
     columns = np.empty((network.hidden.shape[0], BLOCK), np.float32)
     buffers = _DecodeBuffers(columns, np.empty(BLOCK, np.float32), np.empty((4, BLOCK), np.float32))
     for start in range(first, last, BLOCK):
         stop = min(start + BLOCK, last)
-        for level in range(table.level_params.shape[0]):
-            encode_block(samples.unit, table, lanes, level, samples.features, start, stop)
+        for level in range(levels):
+            encode_block(unit, table, lanes, level, features, start, stop)
         _decode(start, stop, network, samples, buffers)
 
 
@@ -181,14 +184,14 @@ def render_rays_fused(inputs, samples, capacity, image, transmittance):
 
     Returns the number of samples, or -1 if the first `capacity` rows of `samples` are too few.
     """
-    rays, count, step = len(transmittance), 0, inputs.march.step
+    rays, count, march, field = len(transmittance), 0, inputs.march, inputs.field
     marched = SampleArrays(samples.canonical, samples.distance, samples.ray_indices)
     near, step_count, step_index = np.empty(rays, np.float32), np.empty(rays, np.int64), np.zeros(rays, np.int64)
     samples_left, active_rays = np.full(rays, inputs.max_samples), np.empty(RAYS_PER_BLOCK, np.int64)
     for block in range(0, rays, RAYS_PER_BLOCK):
         active_count = 0
         for ray in range(block, min(block + RAYS_PER_BLOCK, rays)):
-            near[ray], step_count[ray] = intersect_box(ray, inputs.march)
+            near[ray], step_count[ray] = intersect_box(ray, march)
             if step_count[ray] > 0:
                 active_rays[active_count] = ray
                 active_count += 1
@@ -201,12 +204,12 @@ def render_rays_fused(inputs, samples, capacity, image, transmittance):
                 pass_samples = SAMPLES_PER_PASS if transmittance[ray] >= HALF_TRANSMITTANCE else 1
                 steps, max_count = (near[ray], step_index[ray], step_count[ray]), count + samples_left[ray]
                 count, step_index[ray] = advance_ray(
-                    ray, steps, inputs.march, marched, count, count + pass_samples, max_count
+                    ray, steps, march, marched, count, count + pass_samples, max_count
                 )
                 samples_left[ray] -= count - previous_count
             _refine_samples(first, count, inputs, samples)
-            evaluate_field(first, count, inputs.field, samples)
-            _composite(first, count, step, samples, image, transmittance)
+            evaluate_field(first, count, field, samples)
+            _composite(first, count, march.step, samples, image, transmittance)
             still_active = 0
             for index in range(active_count):
                 ray = active_rays[index]
