@@ -37,6 +37,8 @@ def kernels(repository: Path, tmp_path: Path) -> Path:
     copy = tmp_path / "code" / "pipeline" / "kernels"
     shutil.copytree(repository / "pipeline" / "kernels", copy, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(repository / "pipeline" / "__init__.py", copy.parent)
+    # The compiled loops need numba alone; without the public operation a process starts without torch.
+    (copy / "hashgrid" / "__init__.py").write_text("")
     return copy
 
 

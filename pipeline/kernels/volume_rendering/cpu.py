@@ -203,9 +203,7 @@ def render_rays_fused(inputs, samples, capacity, image, transmittance):
                 ray, previous_count = active_rays[index], count
                 pass_samples = SAMPLES_PER_PASS if transmittance[ray] >= HALF_TRANSMITTANCE else 1
                 steps, max_count = (near[ray], step_index[ray], step_count[ray]), count + samples_left[ray]
-                count, step_index[ray] = advance_ray(
-                    ray, steps, march, marched, count, count + pass_samples, max_count
-                )
+                count, step_index[ray] = advance_ray(ray, steps, march, marched, count, count + pass_samples, max_count)
                 samples_left[ray] -= count - previous_count
             _refine_samples(first, count, inputs, samples)
             evaluate_field(first, count, field, samples)
