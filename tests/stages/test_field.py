@@ -130,7 +130,7 @@ def known_validator(levels: tuple[int, int], frames: int) -> KnownValidator:
 
 def known_trainer(refines: bool) -> Trainer:
     poses = mock.MagicMock(spec=PoseCorrection)
-    poses.corrected.return_value = REFINED
+    poses.apply.return_value = REFINED
     return mock.MagicMock(spec=Trainer, config=FieldConfig(pose_refinement=refines), poses=poses)
 
 
