@@ -59,7 +59,14 @@ def test_refinement_finds_a_shift_of_the_body(scene):
     assert float(shift[[0, 1, 2, 4, 5], 0].abs().max()) < 0.009
 
 
-@pytest.mark.parametrize(("occupancy", "interrupted"), [("attention", 19), ("plain", 19), ("plain", 7)])
+@pytest.mark.parametrize(
+    ("occupancy", "interrupted"),
+    [
+        pytest.param("attention", 19, marks=pytest.mark.slow),
+        pytest.param("plain", 19, marks=pytest.mark.slow),
+        ("plain", 7),
+    ],
+)
 def test_a_resumed_training_ends_with_the_same_bytes(scene, occupancy, interrupted):
     """Step 7: the pose refinement started with step 6, and the first occupancy update follows with step 8."""
     options = {"steps": 30, "pose_start_fraction": 0.2, "occupancy": occupancy, "occupancy_warmup_steps": 8}

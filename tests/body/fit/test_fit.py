@@ -96,6 +96,7 @@ def test_the_body_stays_inside_its_mask(corrupted_fit: tuple[SyntheticRecording,
     assert max(spill) < 0.03
 
 
+@pytest.mark.slow
 def test_fast_arm_motion_is_tracked() -> None:
     """Arms swing by 0.8 rad at 2.5 Hz, recorded at 30 frames per second; the motion prior must not damp them."""
     time_s = np.arange(18) / 30.0
@@ -168,6 +169,7 @@ def test_quaternions_are_unit_and_continuous(corrupted_fit: tuple[SyntheticRecor
     assert ((result.rotations_wxyz[1:] * result.rotations_wxyz[:-1]).sum(-1) >= 0).all()
 
 
+@pytest.mark.slow
 def test_unknown_focal_length_is_estimated() -> None:
     scene = synthetic_recording(load_anny(), FRAMES, shape=SHAPE, noise_m=0.004)
     start = replace(scene.camera, fx=384.0, fy=384.0)

@@ -66,6 +66,7 @@ def test_ground_truth_has_no_error(perfect: Comparison) -> None:
     assert texture["colour_error"] < 1.0
 
 
+@pytest.mark.slow
 def test_heldout_surfaces_depend_on_held_out_frames_only(perfect: Comparison) -> None:
     """A wrong arm pose has an effect in held-out frames only."""
     heldout, train = (perfect.run.capture.positions(kind) for kind in (HELDOUT, TRAIN))
