@@ -18,7 +18,7 @@ from pipeline.core.run_folder import RunRequest, default_run_dir
 from pipeline.core.runner import Progress, ProgressCallback, RunOptions, StageOutcome, run_pipeline
 from pipeline.core.stage import Stage
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 STAGES = ("frames", "body", "field", "mesh", "texture", "export", "report")
 PIPELINE = Pipeline(__name__, STAGES)
