@@ -1,5 +1,7 @@
 """npz files: round trips, equal bytes for equal arrays, refused pickles."""
 
+import zipfile
+
 import numpy as np
 import pytest
 
@@ -12,6 +14,8 @@ def test_same_arrays_give_the_same_bytes_and_come_back(tmp_path) -> None:
     npz.save_npz(tmp_path / "one.npz", arrays)
     npz.save_npz(tmp_path / "two.npz", dict(reversed(arrays.items())))
     assert (tmp_path / "one.npz").read_bytes() == (tmp_path / "two.npz").read_bytes()
+    with zipfile.ZipFile(tmp_path / "one.npz") as archive:
+        assert {info.date_time for info in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}  # no time of writing
     again = npz.load_npz(tmp_path / "one.npz")
     np.testing.assert_array_equal(again["b"], arrays["b"])
     assert again["a"].tolist() == ["x", "yy"]
