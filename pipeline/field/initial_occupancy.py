@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pipeline.body.body import Body
 from pipeline.field.occupancy import RESOLUTION, cell_centres
-from pipeline.geometry.camera import Camera, project
+from pipeline.geometry.camera import Camera, project, project_to_pixels
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.geometry.surface import signed_distance_m
 
@@ -107,15 +107,7 @@ def project_mask_fraction(
     mask_sum, in_image_count = np.zeros(len(centres_m)), np.zeros(len(centres_m))
     for row, mask in enumerate(masks):
         posed = linear_blend_skinning(points, weights, canonical_to_world[row : row + 1])[0]
-        pixels, depth_m = project(posed, camera)
-        pixel_column, pixel_row = (pixels[:, axis].floor().long().numpy() for axis in range(2))
-        inside = (
-            (depth_m.numpy() > 0)
-            & (pixel_column >= 0)
-            & (pixel_row >= 0)
-            & (pixel_column < mask.shape[1])
-            & (pixel_row < mask.shape[0])
-        )
+        pixel_row, pixel_column, inside = project_to_pixels(posed, camera)
         in_image_count += inside
         mask_sum[inside] += mask[pixel_row[inside], pixel_column[inside]] > 0
     prior = np.clip(1.0 - distance_m / UNSEEN_PRIOR_FALLOFF_M, 0.0, 1.0)

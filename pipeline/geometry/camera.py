@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 DEFAULT_WORLD_TO_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32)
@@ -89,6 +89,19 @@ def project(points_world: Float[Tensor, "*n 3"], camera: Camera) -> tuple[Float[
     x_px = camera.fx * points[..., 0] / depth_m + camera.cx
     y_px = camera.fy * points[..., 1] / depth_m + camera.cy
     return torch.stack([x_px, y_px], dim=-1), depth_m
+
+
+def project_to_pixels(
+    points_world: Float[Tensor, "n 3"], camera: Camera
+) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
+    """Return row and column of the pixel that contains each projected point, and whether the image shows the point.
+
+    The third array is false for points behind the camera or outside the image; their rows and columns are meaningless.
+    """
+    position_px, depth_m = project(points_world, camera)
+    column, row = (position_px[:, axis].floor().long().numpy() for axis in range(2))
+    in_image = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    return row, column, (depth_m.numpy() > 0) & in_image
 
 
 def pixel_footprint_m(vertices_world: Float[Tensor, "v 3"], camera: Camera) -> float:

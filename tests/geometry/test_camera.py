@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.geometry.camera import Camera, pixel_rays, project
+from pipeline.geometry.camera import Camera, pixel_rays, project, project_to_pixels
 from pipeline.geometry.rotation import axis_angle_to_matrix
 
 
@@ -36,6 +36,16 @@ def test_a_ray_passes_through_every_point_that_projects_to_its_pixel(camera: Cam
     along = ((points - origins) * directions).sum(-1, keepdim=True)
     torch.testing.assert_close(origins + along * directions, points, atol=2e-5, rtol=0)
     np.testing.assert_allclose(origins[0].numpy(), camera.centre_m(), atol=1e-6)
+
+
+def test_points_fall_into_the_pixels_of_their_rays_and_only_those_in_the_image_count(camera: Camera) -> None:
+    corners_px = torch.tensor([[0.5, 0.5], [639.5, 0.5], [0.5, 479.5], [639.5, 479.5]])
+    outside_px = torch.tensor([[-0.5, 9.5], [640.5, 9.5], [9.5, -0.5], [9.5, 480.5]])
+    origins, directions = pixel_rays(camera, torch.cat([corners_px, outside_px]))
+    row, column, in_image = project_to_pixels(origins + 2.0 * directions, camera)
+    assert in_image.tolist() == [True] * 4 + [False] * 4
+    assert list(zip(column[:4].tolist(), row[:4].tolist(), strict=True)) == [(0, 0), (639, 0), (0, 479), (639, 479)]
+    assert not project_to_pixels(origins - 2.0 * directions, camera)[2].any()
 
 
 def test_scaled_and_cropped_cameras_project_to_the_scaled_and_cropped_image(camera: Camera) -> None:

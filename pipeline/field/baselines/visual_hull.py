@@ -17,7 +17,7 @@ from torch import Tensor
 
 from pipeline.body.body import Body
 from pipeline.field.field import INITIAL_DENSITY_PER_M, MAX_ABS_LOG_DENSITY, RadianceField
-from pipeline.geometry.camera import Camera, project
+from pipeline.geometry.camera import Camera, project_to_pixels
 from pipeline.kernels.hashgrid import GridLayout
 from pipeline.kernels.inverse_skinning import SkinGrid
 from pipeline.kernels.inverse_skinning.reference import interpolate
@@ -126,15 +126,7 @@ def _accumulate_votes(
     for matrices, (image, mask) in zip(canonical_to_world, masked_images, strict=True):
         matrix = (weights @ matrices[:, :3].reshape(-1, 12)).view(-1, 3, 4)
         posed = (matrix[:, :, :3] @ points[:, :, None])[:, :, 0] + matrix[:, :, 3]
-        pixels, depth_m = project(posed, camera)
-        pixel_column, pixel_row = (pixels[:, axis].floor().long().numpy() for axis in range(2))
-        inside = (
-            (depth_m.numpy() > 0)
-            & (pixel_column >= 0)
-            & (pixel_row >= 0)
-            & (pixel_column < camera.width)
-            & (pixel_row < camera.height)
-        )
+        pixel_row, pixel_column, inside = project_to_pixels(posed, camera)
         pixel_column, pixel_row = pixel_column[inside], pixel_row[inside]
         mask_value = mask[pixel_row, pixel_column] / 255.0
         facing = (matrix[:, :, :3] @ normals[:, :, None])[:, :, 0] * torch.nn.functional.normalize(
