@@ -60,6 +60,8 @@ def test_ground_truth_has_no_error(perfect: Comparison) -> None:
     for scores in (compare_rest_surfaces(perfect), compare_heldout_surfaces(perfect)):
         assert scores["chamfer_mm"] < 0.2  # four joints a vertex are kept in the export
         assert scores["f_score"] > 0.999
+        assert scores["normal_angle_deg"] < 1.0
+        assert scores["far_area_share"] == 0.0
         assert scores["scale_to_truth"] == pytest.approx(1.0, abs=1e-3)
     texture = compare_texture(perfect)
     assert texture["coverage"] == 1.0
@@ -81,6 +83,31 @@ def test_scale_is_aligned(perfect: Comparison) -> None:
     scores = compare_rest_surfaces(with_scale(perfect, 0.9))
     assert scores["chamfer_mm"] < 0.2
     assert scores["scale_to_truth"] == pytest.approx(1 / 0.9, abs=1e-3)
+
+
+def test_without_alignment_a_smaller_person_is_wrong(perfect: Comparison) -> None:
+    """A person of nine tenths on the same floor: each point is moved by a tenth of its distance from the origin."""
+    true = perfect.true_rest_mesh
+    scores = compare_rest_surfaces(with_scale(perfect, 0.9))
+    assert scores["stature_mm"] == pytest.approx(0.9 * scores["true_stature_mm"], abs=2.0)
+    assert scores["true_stature_mm"] == pytest.approx(1000 * np.ptp(true.vertices[:, 1]), abs=0.1)
+    smaller = trimesh.Trimesh(0.9 * true.vertices, true.faces, process=False)
+    same = trimesh.Trimesh(true.vertices, true.faces, process=False)
+    dense = [trimesh.sample.sample_surface(surface, 100_000, seed=3)[0] for surface in (smaller, same)]
+    expected_mm = 500 * sum(cKDTree(target).query(source[::5])[0].mean() for source, target in (dense, dense[::-1]))
+    assert scores["chamfer_unaligned_mm"] == pytest.approx(expected_mm, rel=0.08)
+    assert compare_rest_surfaces(perfect)["chamfer_unaligned_mm"] < 0.2
+
+
+def test_without_alignment_a_wrong_distance_is_an_error(perfect: Comparison) -> None:
+    """The person 5 cm too far away in all frames: aligned there is no error, unaligned up to 5 cm."""
+    motion = perfect.run.motion
+    farther = motion.with_pose(motion.rotations_wxyz, motion.root_translation_m + np.array([0, 0, -0.05], np.float32))
+    scores = compare_heldout_surfaces(with_motion(perfect, farther))
+    assert scores["chamfer_mm"] < 0.2
+    assert 5.0 < scores["chamfer_unaligned_mm"] < 50.0
+    assert compare_heldout_surfaces(perfect)["chamfer_unaligned_mm"] < 0.2
+    assert compare_novel_poses(perfect)[0]["chamfer_unaligned_mm"] < 1.0
 
 
 def test_novel_poses_of_the_true_rig(perfect: Comparison) -> None:
