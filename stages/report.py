@@ -104,7 +104,9 @@ def run(
         "masks": {"count": len(loaded.capture), "edge_blur_sigma_px": edge_blur_px},
     }
     cost = (time.monotonic() - started, peak_rss_mib())
-    report = replace_nonfinite(build_report(manifests, rows, metric_sections, describe_environment(), cost))
+    report = replace_nonfinite(
+        build_report(manifests, rows, metric_sections, describe_environment(), cost, loaded.capture.split_rule)
+    )
     page = PageContent(
         title=out.resolve().parent.name,
         report=report,
@@ -133,7 +135,7 @@ def scored_positions(capture: Capture) -> Int[np.ndarray, "k"]:
     positions = capture.positions(HELDOUT)
     if len(positions) == 0:
         raise UserError(
-            f"{capture.folder} has no held-out frame (no index is divisible by eight), so nothing can be scored: "
+            f"{capture.folder} has no held-out frame ({capture.split_rule}), so nothing can be scored: "
             "record a longer video, raise frames.max_frames, or supply split.json"
         )
     reasons = [reason_not_scorable(to_uint8(capture.mask(position))) for position in positions]
