@@ -52,6 +52,21 @@ def compare_rest_surfaces(comparison: Comparison) -> dict[str, float]:
     )
 
 
+def compare_labelled_surfaces(comparison: Comparison) -> dict[str, dict[str, float]]:
+    """Score each labelled part of the truth in its A-pose, see `SurfaceCorrespondence.label_scores`.
+
+    Parts that are invisible from outside are left out; a capture without labels has no parts.
+    """
+    labels = comparison.true_labels
+    if labels is None:
+        return {}
+    rows = {
+        name: comparison.rest_correspondence.label_scores(labels.of_face, label)
+        for label, name in enumerate(labels.names)
+    }
+    return {name: scores for name, scores in rows.items() if scores is not None}
+
+
 def compare_heldout_surfaces(comparison: Comparison) -> dict[str, float]:
     """Score the surface in some held-out frames: the avatar in the refined pose, the truth in the true pose.
 

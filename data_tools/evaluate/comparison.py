@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from data_tools.evaluate.truth import load_ground_truth
+from data_tools.synthetic.rig.labels import FaceLabels
 from data_tools.synthetic.rig.retarget import local_quaternions, retarget_rotations
 from data_tools.synthetic.scene.capture import SyntheticCapture
 from data_tools.synthetic.scene.motion import snap_feet_to_floor
@@ -100,8 +101,18 @@ class Comparison:
         return Mesh(self.truth.subject.body.vertices, self._true_faces)
 
     @cached_property
+    def true_labels(self) -> FaceLabels | None:
+        """The labels of the faces of `true_rest_mesh`; None if the capture has none."""
+        labels = self.truth.subject.labels
+        return None if labels is None else labels.select(self._true_exterior)
+
+    @cached_property
+    def _true_exterior(self) -> Bool[np.ndarray, "f"]:
+        return find_exterior_faces(self.truth.subject.body.mesh())
+
+    @cached_property
     def _true_faces(self) -> Int[np.ndarray, "f 3"]:
-        return self.truth.subject.body.faces[find_exterior_faces(self.truth.subject.body.mesh())]
+        return self.truth.subject.body.faces[self._true_exterior]
 
     @cached_property
     def _avatar_faces(self) -> Int[np.ndarray, "f 3"]:

@@ -8,6 +8,7 @@ from typing import Any
 from data_tools.evaluate.compare_avatar import (
     compare_heldout_images,
     compare_heldout_surfaces,
+    compare_labelled_surfaces,
     compare_novel_poses,
     compare_novel_views,
     compare_rest_surfaces,
@@ -38,8 +39,9 @@ PROTOCOL = (
     "than 30 mm from the truth. chamfer_unaligned_mm: without alignment and scale, see stature_mm. mesh: A-pose of the "
     "true rig, unaligned standing on the same floor; heldout_poses: held-out frames, each rig in its own pose, "
     "unaligned where its camera sees it; novel_poses: both rigs in poses that the video does not contain, unaligned "
-    "with the hips in the same place. Joints: compared after aligning the root, "
-    "and without alignment. Images: field and mesh are the held-out scores of the report. upper_bound is the true "
+    "with the hips in the same place. surface_by_label: the A-pose, on the faces of one garment or body part of the "
+    "truth and the points of the avatar nearest to them; area_share of the truth. Joints: after aligning the root, and "
+    "without alignment. Images: field and mesh are the held-out scores of the report. upper_bound is the true "
     "mesh and texture with true lighting, rendered in the refined poses by the estimated camera on the same frames,"
     " with the same edge blur as the mesh: its error is the error of poses and camera that no other A-pose shape "
     "can compensate. Squared error prefers a blurred texture to a sharp one at the wrong position, so a blurred "
@@ -87,6 +89,8 @@ def avatar_sections(comparison: Comparison) -> tuple[dict[str, Any], dict[str, l
         "mesh": compare_rest_surfaces(comparison),
         "heldout_poses": compare_heldout_surfaces(comparison),
     }
+    if parts := compare_labelled_surfaces(comparison):
+        document["surface_by_label"] = parts
     images = compare_heldout_images(comparison)
     image_pairs = {}
     if (comparison.folder / "novel_poses").is_dir():
@@ -100,7 +104,10 @@ def avatar_sections(comparison: Comparison) -> tuple[dict[str, Any], dict[str, l
 def comparison_page(title: str, document: Mapping[str, Any], image_pairs: Mapping[str, Sequence[ImagePair]]) -> str:
     """Render the HTML page, in the style of the report."""
     surfaces = {name: document[name] for name in ("mesh", "heldout_poses", "novel_poses") if name in document}
-    tables = [metric_table("Surfaces", surfaces), metric_table("Images", document["images"])]
+    tables = [metric_table("Surfaces", surfaces)]
+    if "surface_by_label" in document:
+        tables.append(metric_table("Surface of each part, A-pose", document["surface_by_label"]))
+    tables.append(metric_table("Images", document["images"]))
     tables += [
         metric_table(name.capitalize(), {"": document[name]})
         for name in ("masks", "body", "texture")

@@ -16,6 +16,7 @@ from data_tools.evaluate import compare_avatar
 from data_tools.evaluate.compare_avatar import (
     compare_heldout_images,
     compare_heldout_surfaces,
+    compare_labelled_surfaces,
     compare_novel_poses,
     compare_novel_views,
     compare_rest_surfaces,
@@ -83,6 +84,28 @@ def test_scale_is_aligned(perfect: Comparison) -> None:
     scores = compare_rest_surfaces(with_scale(perfect, 0.9))
     assert scores["chamfer_mm"] < 0.2
     assert scores["scale_to_truth"] == pytest.approx(1 / 0.9, abs=1e-3)
+
+
+def test_a_wrong_part_is_found_by_its_label(perfect: Comparison) -> None:
+    """The hair of the avatar stands out by 6 mm: its label shows that, the shoes' does not."""
+    subject = perfect.truth.subject
+    labels = subject.labels
+    assert labels is not None
+    hair = np.unique(subject.body.faces[labels.of_face == labels.names.index("hair")])
+    vertices = subject.body.vertices.copy()
+    vertices[hair] += 0.006 * subject.body.mesh().vertex_normals()[hair]
+    avatar = replace(perfect.run.avatar, vertices=torch.from_numpy(vertices))
+    scores = compare_labelled_surfaces(replace(perfect, run=replace(perfect.run, avatar=avatar)))
+    right = compare_labelled_surfaces(perfect)
+    assert scores["hair"]["chamfer_mm"] == pytest.approx(6.0, abs=1.2)
+    assert scores["shoes"]["chamfer_mm"] < 1.0  # the hair shifts the alignment a little
+    assert max(part["chamfer_mm"] for part in right.values()) < 0.3
+    assert sum(part["area_share"] for part in right.values()) == pytest.approx(1.0)
+
+
+def test_a_capture_without_labels_has_no_parts(perfect: Comparison) -> None:
+    older = replace(perfect, truth=replace(perfect.truth, subject=replace(perfect.truth.subject, labels=None)))
+    assert compare_labelled_surfaces(older) == {}
 
 
 def test_without_alignment_a_smaller_person_is_wrong(perfect: Comparison) -> None:
