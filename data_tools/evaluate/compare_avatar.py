@@ -14,8 +14,10 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from data_tools.evaluate.comparison import SURFACE_POINTS, Comparison, ImagePair, retarget_avatar_meshes
+from data_tools.evaluate.static_texture import render_static, static_brightness
 from data_tools.evaluate.truth import load_true_mask
 from data_tools.evaluate.upper_bound import map_between_worlds, render_upper_bound
+from data_tools.synthetic.scene.renderer import pose_vertices
 from pipeline.body.body import canonical_to_world
 from pipeline.body.files import load_camera, load_motion
 from pipeline.capture.frame_selection import HELDOUT
@@ -120,6 +122,34 @@ def compare_novel_views(comparison: Comparison) -> list[ImagePair]:
         ImagePair(read_rgba(path.with_suffix(".png")), _render_avatar(comparison, surface, load_camera(path)))
         for path in sorted((comparison.folder / "novel_views").glob("*.npz"))
     ]
+
+
+def compare_ceiling(comparison: Comparison) -> dict[str, dict[str, float]]:
+    """Score the ceiling of novel views and poses: the true mesh with its best static texture.
+
+    Returns:
+        novel_views_ceiling, novel_poses_ceiling: scores as those of the avatar, for what the capture contains.
+    """
+    truth, folder = comparison.truth, comparison.folder
+    brightness = static_brightness(comparison)
+    targets = {
+        "novel_views": [(path, truth.canonical_to_world[0]) for path in sorted(folder.glob("novel_views/*.npz"))]
+    }
+    if (folder / "novel_poses").is_dir():
+        poses = canonical_to_world(truth.subject.body, load_motion(folder / "novel_poses" / "motion.npz"))
+        targets["novel_poses"] = [(folder / "novel_poses" / f"{index:06d}", pose) for index, pose in enumerate(poses)]
+    scores = {}
+    for name, views in targets.items():
+        pairs = []
+        for path, pose in views:
+            camera = load_camera(path) if path.suffix else truth.camera
+            drawn = render_static(
+                truth.subject, pose_vertices(truth.subject, pose), brightness, camera, SAMPLES_PER_AXIS
+            )
+            pairs.append(ImagePair(read_rgba(path.with_suffix(".png")), drawn))
+        if pairs:
+            scores[f"{name}_ceiling"] = mean_scores(pair.scores() for pair in pairs)
+    return scores
 
 
 def compare_texture(comparison: Comparison, seed: int = 0) -> dict[str, float]:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from data_tools.evaluate.compare_avatar import (
+    compare_ceiling,
     compare_heldout_images,
     compare_heldout_surfaces,
     compare_labelled_surfaces,
@@ -16,6 +17,7 @@ from data_tools.evaluate.compare_avatar import (
 )
 from data_tools.evaluate.comparison import Comparison, ImagePair, load_comparison
 from data_tools.evaluate.files import TRUTH_VERSION, save_comparison
+from data_tools.synthetic.scene.renderer import FLAT
 from data_tools.templates import render_template
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import read_manifest
@@ -48,8 +50,13 @@ PROTOCOL = (
     "avatar may score higher. These columns use the masks of the frames stage, so parts that are missing in a mask "
     "cost nothing; the columns true_mask use the true masks, and meshes with sharp edges. novel_views and "
     "novel_poses: the avatar in the true poses, aligned to the true surface and rendered by the true cameras; the "
-    "avatar is unlit, the truth is lit. colour_error and balanced_colour_error (after one gain per channel) are "
-    "mean absolute differences, of 255, on the observed texels."
+    "avatar is unlit. Their columns ceiling are the true mesh in the same poses with its best static texture: the true "
+    "one times the mean brightness of each vertex in the training frames. colour_error and balanced_colour_error "
+    "(after one gain per channel) are mean absolute differences, of 255, on the observed texels."
+)
+LIT_NOTE = (
+    "not flat: the novel views and poses of this capture are lit, the avatar is not, so their image scores hold the "
+    "light against it; judge them on a capture made with --light flat"
 )
 
 
@@ -98,6 +105,8 @@ def avatar_sections(comparison: Comparison) -> tuple[dict[str, Any], dict[str, l
     if (comparison.folder / "novel_views").is_dir():
         image_pairs["novel_views"] = compare_novel_views(comparison)
     images |= {name: mean_scores(image_pair.scores() for image_pair in row) for name, row in image_pairs.items()}
+    images |= compare_ceiling(comparison)
+    document["light"] = "flat" if comparison.truth.light == FLAT else LIT_NOTE
     return document | {"texture": compare_texture(comparison), "images": images}, image_pairs
 
 
@@ -118,7 +127,7 @@ def comparison_page(title: str, document: Mapping[str, Any], image_pairs: Mappin
         "comparison.html.j2",
         title=title,
         style=read_asset("report.css"),
-        protocol=document["protocol"],
+        protocol=f"{document['protocol']} Light of the capture: {document['light']}.",
         tiles=[metric_tile(*texts) for texts in _headline_metrics(document)],
         tables=tables,
         image_rows=[
