@@ -14,21 +14,16 @@ from scipy.spatial.transform import Rotation
 
 from data_tools.evaluate import compare_avatar
 from data_tools.evaluate.compare_avatar import (
-    compare_ceiling,
     compare_heldout_images,
     compare_heldout_surfaces,
-    compare_labelled_surfaces,
     compare_novel_poses,
     compare_novel_views,
     compare_rest_surfaces,
     compare_texture,
 )
 from data_tools.evaluate.comparison import Comparison, retarget_motion
-from data_tools.evaluate.static_texture import static_brightness
 from data_tools.evaluate.truth import load_true_mask
 from data_tools.evaluate.upper_bound import render_upper_bound, unpose_true_vertices
-from data_tools.sample import main as make_sample
-from data_tools.synthetic.scene.renderer import Light, pose_vertices
 from pipeline.body.body import Body, Motion
 from pipeline.body.files import save_motion
 from pipeline.capture.frame_selection import HELDOUT, TRAIN
@@ -40,21 +35,14 @@ from pipeline.geometry.texture_rendering import blur_coverage
 from pipeline.io.image import write_rgba
 from pipeline.metrics.alignment import SimilarityTransform
 from pipeline.metrics.images import composite_on_white, frame_scores
-from tests.data_tools.conftest import SAMPLE_OPTIONS
 from tests.data_tools.ground_truth_run import (
     bent_arm,
-    ground_truth_run,
     with_frames,
     with_longer_focal,
     with_motion,
     with_raised_rest_arm,
     with_scale,
 )
-
-
-@pytest.fixture(scope="module")
-def perfect(sample: Path, tmp_path_factory: pytest.TempPathFactory) -> Comparison:
-    return ground_truth_run(sample, tmp_path_factory.mktemp("perfect"))
 
 
 @pytest.fixture(scope="module")
@@ -91,53 +79,6 @@ def test_scale_is_aligned(perfect: Comparison) -> None:
     assert scores["scale_to_truth"] == pytest.approx(1 / 0.9, abs=1e-3)
 
 
-def test_a_wrong_part_is_found_by_its_label(perfect: Comparison) -> None:
-    """The hair of the avatar stands out by 6 mm: its label shows that, the shoes' does not."""
-    subject = perfect.truth.subject
-    labels = subject.labels
-    assert labels is not None
-    hair = np.unique(subject.body.faces[labels.of_face == labels.names.index("hair")])
-    vertices = subject.body.vertices.copy()
-    vertices[hair] += 0.006 * subject.body.mesh().vertex_normals()[hair]
-    avatar = replace(perfect.run.avatar, vertices=torch.from_numpy(vertices))
-    scores = compare_labelled_surfaces(replace(perfect, run=replace(perfect.run, avatar=avatar)))
-    right = compare_labelled_surfaces(perfect)
-    assert scores["hair"]["chamfer_mm"] == pytest.approx(6.0, abs=1.2)
-    assert scores["shoes"]["chamfer_mm"] < 1.0  # the hair shifts the alignment a little
-    assert max(part["chamfer_mm"] for part in right.values()) < 0.3
-    assert sum(part["area_share"] for part in right.values()) == pytest.approx(1.0)
-
-
-def test_a_capture_without_labels_has_no_parts(perfect: Comparison) -> None:
-    older = replace(perfect, truth=replace(perfect.truth, subject=replace(perfect.truth.subject, labels=None)))
-    assert compare_labelled_surfaces(older) == {}
-
-
-def test_without_alignment_a_smaller_person_is_wrong(perfect: Comparison) -> None:
-    """A person of nine tenths on the same floor: each point is moved by a tenth of its distance from the origin."""
-    true = perfect.true_rest_mesh
-    scores = compare_rest_surfaces(with_scale(perfect, 0.9))
-    assert scores["stature_mm"] == pytest.approx(0.9 * scores["true_stature_mm"], abs=2.0)
-    assert scores["true_stature_mm"] == pytest.approx(1000 * np.ptp(true.vertices[:, 1]), abs=0.1)
-    smaller = trimesh.Trimesh(0.9 * true.vertices, true.faces, process=False)
-    same = trimesh.Trimesh(true.vertices, true.faces, process=False)
-    dense = [trimesh.sample.sample_surface(surface, 100_000, seed=3)[0] for surface in (smaller, same)]
-    expected_mm = 500 * sum(cKDTree(target).query(source[::5])[0].mean() for source, target in (dense, dense[::-1]))
-    assert scores["chamfer_unaligned_mm"] == pytest.approx(expected_mm, rel=0.08)
-    assert compare_rest_surfaces(perfect)["chamfer_unaligned_mm"] < 0.2
-
-
-def test_without_alignment_a_wrong_distance_is_an_error(perfect: Comparison) -> None:
-    """The person 5 cm too far away in all frames: aligned there is no error, unaligned up to 5 cm."""
-    motion = perfect.run.motion
-    farther = motion.with_pose(motion.rotations_wxyz, motion.root_translation_m + np.array([0, 0, -0.05], np.float32))
-    scores = compare_heldout_surfaces(with_motion(perfect, farther))
-    assert scores["chamfer_mm"] < 0.2
-    assert 5.0 < scores["chamfer_unaligned_mm"] < 50.0
-    assert compare_heldout_surfaces(perfect)["chamfer_unaligned_mm"] < 0.2
-    assert compare_novel_poses(perfect)[0]["chamfer_unaligned_mm"] < 1.0
-
-
 def test_novel_poses_of_the_true_rig(perfect: Comparison) -> None:
     scores, pictures = compare_novel_poses(perfect)
     assert scores["chamfer_mm"] < 1.0
@@ -166,52 +107,6 @@ def test_novel_views_of_the_true_avatar(perfect: Comparison) -> None:
     black = replace(perfect, run=replace(perfect.run, avatar=replace(perfect.run.avatar, diffuse=torch.zeros(4, 4, 3))))
     dark = compare_novel_views(black)
     assert dark[0].scores()["psnr_body"] < pictures[0].scores()["psnr_body"] - 3.0
-
-
-def test_ceiling_under_flat_light_is_the_truth(flat: Comparison, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The true texture is static: with as many samples as the truth only rounding differs."""
-    monkeypatch.setattr(compare_avatar, "SAMPLES_PER_AXIS", flat.truth.samples)
-    assert torch.allclose(static_brightness(flat), torch.ones(1), atol=1e-5)
-    ceiling = compare_ceiling(flat)
-    assert set(ceiling) == {"novel_views_ceiling", "novel_poses_ceiling"}
-    for scores in ceiling.values():
-        assert scores["psnr_body"] > 45.0
-        assert scores["mask_iou"] > 0.999
-
-
-@pytest.fixture(scope="module")
-def flat(tmp_path_factory: pytest.TempPathFactory) -> Comparison:
-    """The true person as a run, in a capture with the options of `sample` and flat light."""
-    out = tmp_path_factory.mktemp("captures") / "flat"
-    make_sample([str(out), *SAMPLE_OPTIONS, "--light", "flat"])
-    return ground_truth_run(out, tmp_path_factory.mktemp("flat"))
-
-
-def test_light_lowers_the_ceiling(perfect: Comparison) -> None:
-    """In views all around, a texture with the mean light is better than the bare texture of the perfect avatar."""
-    ceiling = compare_ceiling(perfect)
-    bare = np.mean([pair.scores()["psnr_body"] for pair in compare_novel_views(perfect)])
-    assert bare + 0.5 < ceiling["novel_views_ceiling"]["psnr_body"] < 35.0
-    assert ceiling["novel_poses_ceiling"]["psnr_body"] < 35.0
-
-
-def test_brightness_is_the_mean_over_training_frames(perfect: Comparison) -> None:
-    """In a room lit from above: the mean of the shades of mid grey, weighted by the view."""
-    frames = perfect.run.capture.frame_index[perfect.run.capture.positions(TRAIN)]
-    light = Light(key_intensity=0.0, ambient_intensity=0.7, sky_gradient=0.2)
-    truth = replace(perfect.truth, light=light)
-    found = static_brightness(replace(perfect, truth=truth)).numpy()
-    numerator = denominator = 0.0
-    for frame in frames.tolist():
-        vertices = pose_vertices(truth.subject, truth.canonical_to_world[frame]).double().numpy()
-        normals = Mesh(vertices, truth.subject.body.faces).vertex_normals()
-        towards = truth.camera.centre_m() - vertices
-        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-        weight = np.maximum((normals * towards).sum(1), 1e-3)
-        linear = ((0.5 + 0.055) / 1.055) ** 2.4 * (0.7 + 0.2 * normals[:, 1])
-        numerator = numerator + weight * (1.055 * linear ** (1 / 2.4) - 0.055) / 0.5
-        denominator = denominator + weight
-    assert np.allclose(found, numerator / denominator, atol=2e-3)
 
 
 def test_texture_of_known_error(perfect: Comparison) -> None:
