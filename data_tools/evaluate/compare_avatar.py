@@ -18,15 +18,17 @@ from data_tools.evaluate.static_texture import render_static, static_brightness
 from data_tools.evaluate.truth import load_true_mask
 from data_tools.evaluate.upper_bound import map_between_worlds, render_upper_bound
 from data_tools.synthetic.scene.renderer import pose_vertices
+from pipeline.avatar.clay import render_clay_views
 from pipeline.body.body import canonical_to_world
 from pipeline.body.files import load_camera, load_motion
 from pipeline.capture.frame_selection import HELDOUT
 from pipeline.core.errors import UserError
 from pipeline.core.progress import warn
+from pipeline.geometry.alpha import premultiply_to_float
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import closest_points_on_mesh
-from pipeline.geometry.texture_rendering import blur_coverage, sample_texture
+from pipeline.geometry.texture_rendering import blur_coverage, sample_texture, turntable_cameras
 from pipeline.io.image import read_rgba, to_uint8
 from pipeline.metrics.alignment import SimilarityTransform, align_surfaces_icp
 from pipeline.metrics.images import additional_blur_sigma_px, frame_scores, mean_scores, reason_not_scorable
@@ -35,6 +37,7 @@ from stages.report import median_edge_blur_px, scored_positions
 
 SURFACE_FRAMES = 4
 SAMPLES_PER_AXIS = 3
+CLAY_VIEWS, CLAY_HEIGHT_PX = 8, 480
 
 
 def compare_rest_surfaces(comparison: Comparison) -> dict[str, float]:
@@ -150,6 +153,19 @@ def compare_ceiling(comparison: Comparison) -> dict[str, dict[str, float]]:
         if pairs:
             scores[f"{name}_ceiling"] = mean_scores(pair.scores() for pair in pairs)
     return scores
+
+
+def compare_clay(comparison: Comparison) -> list[ImagePair]:
+    """Render truth and avatar in clay, in the A-pose of the true rig and aligned, from `CLAY_VIEWS` sides."""
+    true, avatar = comparison.true_rest_mesh, comparison.alignment.transform_mesh(comparison.rest_mesh)
+    corners = true.vertices[true.faces].reshape(-1, 3)
+    cameras = turntable_cameras(corners.min(axis=0), corners.max(axis=0), CLAY_VIEWS, CLAY_HEIGHT_PX)
+    return [
+        ImagePair(truth, premultiply_to_float(drawn))
+        for truth, drawn in zip(
+            render_clay_views(true, cameras).smooth, render_clay_views(avatar, cameras).smooth, strict=True
+        )
+    ]
 
 
 def compare_texture(comparison: Comparison, seed: int = 0) -> dict[str, float]:

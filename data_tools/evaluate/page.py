@@ -7,6 +7,7 @@ from typing import Any
 
 from data_tools.evaluate.compare_avatar import (
     compare_ceiling,
+    compare_clay,
     compare_heldout_images,
     compare_heldout_surfaces,
     compare_labelled_surfaces,
@@ -91,7 +92,7 @@ def write_comparison(out: Path, run_dir: Path, measured: Mapping[str, Mapping[st
 
 
 def avatar_sections(comparison: Comparison) -> tuple[dict[str, Any], dict[str, list[ImagePair]]]:
-    """Compute all sections that need a finished avatar, and the image pairs of novel views and poses."""
+    """Compute all sections that need a finished avatar, and the image pairs of novel views, novel poses and clay."""
     document: dict[str, Any] = {
         "mesh": compare_rest_surfaces(comparison),
         "heldout_poses": compare_heldout_surfaces(comparison),
@@ -106,6 +107,7 @@ def avatar_sections(comparison: Comparison) -> tuple[dict[str, Any], dict[str, l
         image_pairs["novel_views"] = compare_novel_views(comparison)
     images |= {name: mean_scores(image_pair.scores() for image_pair in row) for name, row in image_pairs.items()}
     images |= compare_ceiling(comparison)
+    image_pairs["clay"] = compare_clay(comparison)
     document["light"] = "flat" if comparison.truth.light == FLAT else LIT_NOTE
     return document | {"texture": compare_texture(comparison), "images": images}, image_pairs
 

@@ -41,7 +41,7 @@ Views = list[UInt8[np.ndarray, "_ _ 4"]]
 
 @dataclass(frozen=True)
 class ClayViews:
-    """Views at evenly spaced azimuths, the first from +Z: sRGB with straight alpha, cropped horizontally to the body.
+    """Views of one mesh: sRGB with straight alpha.
 
     Attributes:
         smooth: clay with interpolated vertex normals, as a viewer shows the exported mesh.
@@ -53,9 +53,15 @@ class ClayViews:
     flat: Views
     normals: Views
 
+    def cropped(self) -> "ClayViews":
+        """Return the views without the empty columns left and right of the body."""
+        return ClayViews(
+            *([crop_empty_columns(view) for view in row] for row in (self.smooth, self.flat, self.normals))
+        )
+
 
 def render_clay(mesh: Mesh, views: int, height_px: int) -> ClayViews:
-    """Render the whole body in clay and as normal map; cameras as in `TexturedAvatar.render_turntable`.
+    """Render the whole body in clay and as normal map; cameras and cropping as in `TexturedAvatar.render_turntable`.
 
     Args:
         mesh: m, +Y up.
@@ -63,7 +69,7 @@ def render_clay(mesh: Mesh, views: int, height_px: int) -> ClayViews:
         height_px: height of each image.
     """
     box_m = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    return _render_views(mesh, turntable_cameras(*box_m, views, height_px))
+    return render_clay_views(mesh, turntable_cameras(*box_m, views, height_px)).cropped()
 
 
 def render_clay_head(mesh: Mesh, views: int, height_px: int) -> Views:
@@ -73,7 +79,7 @@ def render_clay_head(mesh: Mesh, views: int, height_px: int) -> Views:
     head = mesh.vertices[mesh.vertices[:, 1] > neck_m]
     box_m = np.minimum(head.min(axis=0), [np.inf, neck_m, np.inf]), head.max(axis=0)
     cameras = turntable_cameras(*box_m, views, height_px)
-    return _render_views(mesh, cameras).smooth
+    return render_clay_views(mesh, cameras).cropped().smooth
 
 
 def shade_clay(normals: Float[Tensor, "n 3"], world_to_camera: Float[np.ndarray, "4 4"]) -> Float[Tensor, "n"]:
@@ -84,7 +90,8 @@ def shade_clay(normals: Float[Tensor, "n 3"], world_to_camera: Float[np.ndarray,
     return linear_to_srgb((ALBEDO * irradiance).clamp(0.0, 1.0))
 
 
-def _render_views(mesh: Mesh, cameras: Sequence[Camera]) -> ClayViews:
+def render_clay_views(mesh: Mesh, cameras: Sequence[Camera]) -> ClayViews:
+    """Render one view of a mesh (m, world, +Y up) for each camera, of the size of its image."""
     vertices, faces = torch.from_numpy(mesh.vertices).float(), torch.from_numpy(mesh.faces)
     vertex_normals, face_normals = (
         torch.from_numpy(normals).float() for normals in (mesh.vertex_normals(), mesh.face_normals())
@@ -102,5 +109,5 @@ def _render_views(mesh: Mesh, cameras: Sequence[Camera]) -> ClayViews:
             samples = np.zeros((fine.height, fine.width, 4), dtype=np.float32)
             samples[seen.numpy()] = torch.cat([colours.expand(-1, 3), torch.ones(len(face), 1)], dim=1).numpy()
             pixels = cv2.resize(samples, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-            views.append(crop_empty_columns(unpremultiply_to_uint8(pixels)))
+            views.append(unpremultiply_to_uint8(pixels))
     return made

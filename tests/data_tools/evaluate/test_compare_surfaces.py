@@ -9,6 +9,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from data_tools.evaluate.compare_avatar import (
+    compare_clay,
     compare_heldout_surfaces,
     compare_labelled_surfaces,
     compare_novel_poses,
@@ -33,6 +34,23 @@ def test_a_wrong_part_is_found_by_its_label(perfect: Comparison) -> None:
     assert scores["shoes"]["chamfer_mm"] < 1.0  # the hair shifts the alignment a little
     assert max(part["chamfer_mm"] for part in right.values()) < 0.3
     assert sum(part["area_share"] for part in right.values()) == pytest.approx(1.0)
+
+
+def test_clay_shows_where_the_shape_is_wrong(perfect: Comparison) -> None:
+    """Truth and avatar are equal in clay; a dent in the chest of the avatar is seen from the front only."""
+    body = perfect.truth.subject.body
+    for pair in compare_clay(perfect):
+        assert pair.scores()["psnr_body"] > 30.0
+    at_height = np.abs(body.vertices[:, 1] - body.joints_m[body.joint("Spine2")][1]) < 0.02
+    chest_m = body.vertices[at_height][body.vertices[at_height, 2].argmax()]
+    near = np.exp(-(((body.vertices - chest_m) / 0.08) ** 2).sum(axis=1))
+    dented = body.vertices - 0.03 * near[:, None].astype(np.float32) * np.array([0, 0, 1], np.float32)
+    avatar = replace(perfect.run.avatar, vertices=torch.from_numpy(dented))
+    wrong = [
+        pair.scores()["psnr_body"] for pair in compare_clay(replace(perfect, run=replace(perfect.run, avatar=avatar)))
+    ]
+    assert len(wrong) == 8
+    assert wrong[0] < wrong[4] - 1.0
 
 
 def test_a_capture_without_labels_has_no_parts(perfect: Comparison) -> None:
