@@ -9,7 +9,7 @@ from pathlib import Path
 
 from data_tools.command import run_command
 from data_tools.folder import require_absent
-from data_tools.synthetic.person.outfit import LEGWEAR
+from data_tools.synthetic.person.outfit import HEM_FLARE_M, LEGWEAR
 from data_tools.synthetic.person.person import make_person
 from data_tools.synthetic.scene.capture import write_capture
 from data_tools.synthetic.scene.options import (
@@ -20,6 +20,7 @@ from data_tools.synthetic.scene.options import (
     settings_from_options,
     validate_capture_options,
 )
+from pipeline.core.errors import UserError
 
 
 def main(argv: Sequence[str]) -> None:
@@ -30,10 +31,16 @@ def main(argv: Sequence[str]) -> None:
     )
     parser.add_argument("--texture", type=int, default=2048, help="side of the texture in pixels")
     parser.add_argument("--legwear", choices=LEGWEAR, default=LEGWEAR[0], help="clothing of the legs")
+    parser.add_argument(
+        "--flare-m", type=float, help="widening of the skirt from waist to hem in metres; 0.07 if absent"
+    )
     options = parser.parse_args(argv)
     validate_capture_options(options)
+    if options.flare_m is not None and options.legwear != "skirt":
+        raise UserError("--flare-m widens a skirt; add --legwear skirt")
     require_absent(options.out)
-    subject, bare = make_person(options.seed, options.texture, options.legwear)
+    flare_m = HEM_FLARE_M if options.flare_m is None else options.flare_m
+    subject, bare = make_person(options.seed, options.texture, options.legwear, flare_m)
     scene = build_scene(options, subject.body)
     motion = build_motion(options, subject.body, scene[1])
     capture, heldout = build_capture(options, subject, motion, scene)

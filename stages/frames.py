@@ -1,15 +1,19 @@
 """frames: detect the person in a recording and write selected images with alpha mattes and landmarks."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+from jaxtyping import UInt8
 from pydantic import Field
 
 from pipeline.capture import frame_selection as selection
 from pipeline.capture.capture import CONTACT_SHEET, FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, Capture, save_capture
 from pipeline.capture.contact_sheet import contact_sheet
 from pipeline.capture.detection import Detections, detect_in_frames, write_frames
+from pipeline.capture.disjoint_split import assign_disjoint_splits
 from pipeline.capture.exif_focal import metadata_focal_px
 from pipeline.capture.input_checks import check_input, warn_about_input
 from pipeline.capture.process_pool import start_process_pool
@@ -27,6 +31,10 @@ _PEOPLE_COUNT_FRAMES = 6
 class Config(BaseConfig):
     """Options of the frames stage."""
 
+    split: Literal["interleaved", "disjoint"] = Field(
+        "interleaved",
+        description="held-out frames: interleaved: every eighth; disjoint: the last turn or quarter, to judge a run",
+    )
     max_frames: int = Field(
         200, ge=16, le=2000, description="maximum number of selected frames, held-out frames included"
     )
@@ -55,6 +63,8 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     if source.n_frames < config.min_frames:
         raise UserError(f"{source.path} has {source.n_frames} frames; at least {config.min_frames} are needed")
     user_files = load_user_files(inputs["video"], source)
+    if user_files.split is not None and config.split == "disjoint":
+        raise UserError(f"{inputs['video']} has a split.json, which frames.split=disjoint would ignore; remove one")
     with start_process_pool(config.workers) as workers:
         frame_indices = select_detection_frames(source, user_files, config)
         detections = detect_in_frames(
@@ -63,12 +73,13 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
         check_input(detections, source.path, config.min_frames)
         noise = selection.estimate_noise_level(detections.gray_thumbnails)
         if user_files.split is None:
-            chosen, n_duplicates = select_capture_frames(detections, source.path, config, noise)
+            selected = select_capture_frames(detections, source.path, config, noise)
         else:
-            chosen, n_duplicates = select_listed_frames(detections, user_files.split, source.path), 0
+            selected = select_listed_frames(detections, user_files.split, source.path)
+        chosen = selected.positions
         # The colour noise of a blurred patch is at least one level, whatever the grey thumbnails show.
         write_frames(source, user_files, detections, chosen, out, config.max_side_px, max(1.0, noise), workers)
-    capture = make_capture(detections, chosen, out, source, user_files)
+    capture = make_capture(detections, selected, out, source, user_files)
     save_capture(capture)
     write_rgb(out / CONTACT_SHEET, contact_sheet(capture))
     unseen_arc_rad = selection.largest_yaw_gap_rad(selection.body_yaw_rad(capture.landmarks_world_m))
@@ -81,11 +92,12 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
         "frames_heldout": len(capture.positions(selection.HELDOUT)),
         "video_frames": source.n_frames,
         "dropped_no_person": int((~detections.found).sum()),
-        "dropped_duplicates": n_duplicates,
+        "dropped_duplicates": selected.n_duplicates,
         "noise_levels": noise,
         "landmark_visibility": float(capture.landmarks_visibility.mean()),
         "hands_found": float((detections.hands.handedness_score[chosen] > 0.0).mean()),
         "unseen_arc_deg": float(np.degrees(unseen_arc_rad)),
+        "turns": selected.turns,
         "scale": detections.scale,
     }
 
@@ -113,46 +125,73 @@ def detection_stride(n_frames: int, max_detection_frames: int) -> int:
     return stride + 1 - stride % 2
 
 
-def select_capture_frames(detections: Detections, path: Path, config: Config, noise: float) -> tuple[list[int], int]:
-    """Return the positions of the selected frames and the number of near-duplicates that were dropped."""
+@dataclass(frozen=True)
+class FrameChoice:
+    """The selected frames.
+
+    positions: in the detections, increasing.
+    split: of each of them.
+    split_rule: in words, `Capture.split_rule`.
+    turns: of the person in the whole recording, nan where a user-supplied split makes them irrelevant.
+    n_duplicates: near-duplicates that were dropped.
+    """
+
+    positions: list[int]
+    split: UInt8[np.ndarray, "k"]
+    split_rule: str
+    turns: float
+    n_duplicates: int
+
+
+def select_capture_frames(detections: Detections, path: Path, config: Config, noise: float) -> FrameChoice:
+    """Select frames by motion and split them.
+
+    Raises:
+        UserError: too few frames are left for learning, validation or judgement.
+    """
     found = np.flatnonzero(detections.found)
     threshold = config.duplicate_threshold_noise_ratio * noise
     distinct, cumulative_motion = selection.find_distinct_frames(
         detections.gray_thumbnails[found], detections.person_masks[found], threshold
     )
     kept = found[distinct]
-    chosen = kept[
-        selection.select_frames_by_motion(detections.frame_index[kept], cumulative_motion[distinct], config.max_frames)
-    ]
-    n_splits = len(np.unique(selection.assign_splits(detections.frame_index[chosen])))
-    if len(chosen) < config.min_frames or n_splits < 3:
+    yaw_rad = selection.body_yaw_rad(detections.landmarks_world_m[kept])
+    disjoint = assign_disjoint_splits(detections.frame_index[kept], yaw_rad)
+    if config.split == "disjoint":
+        split, rule = disjoint.split, f"disjoint: {disjoint.held_out_part} held out"
+    else:
+        split, rule = selection.assign_splits(detections.frame_index[kept]), selection.INTERLEAVED_RULE
+    chosen = selection.select_frames_by_motion(split, cumulative_motion[distinct], config.max_frames)
+    if chosen.sum() < config.min_frames or len(np.unique(split[chosen])) < 3:
+        advice = " use --set frames.split=interleaved," if config.split == "disjoint" else ""
         raise UserError(
-            f"{path} has only {len(chosen)} frames in which the person has moved, {config.min_frames} are needed; "
-            "film a slow full turn, or lower frames.duplicate_threshold_noise_ratio"
+            f"{path} has only {chosen.sum()} frames in which the person has moved, {config.min_frames} are needed;"
+            f"{advice} film a slow full turn, or lower frames.duplicate_threshold_noise_ratio"
         )
-    return [int(position) for position in chosen], int((~distinct).sum())
+    return FrameChoice(kept[chosen].tolist(), split[chosen], rule, disjoint.turns, int((~distinct).sum()))
 
 
-def select_listed_frames(detections: Detections, split: UserSplit, path: Path) -> list[int]:
-    """Return the positions of the frames of a user-supplied split in which the person was found."""
+def select_listed_frames(detections: Detections, split: UserSplit, path: Path) -> FrameChoice:
+    """Return the frames of a user-supplied split in which the person was found."""
     kept = np.flatnonzero(detections.found)
-    if len(np.unique(split.for_frames(detections.frame_index[kept]))) < 3:
+    kinds = split.for_frames(detections.frame_index[kept])
+    if len(np.unique(kinds)) < 3:
         raise UserError(f"split.json of {path}: one of its lists has no frame with a person; list other frames")
-    return [int(position) for position in kept]
+    return FrameChoice(kept.tolist(), kinds, "split.json", float("nan"), 0)
 
 
 def make_capture(
-    detections: Detections, chosen: list[int], out: Path, source: FrameSource, user_files: UserFiles
+    detections: Detections, selected: FrameChoice, out: Path, source: FrameSource, user_files: UserFiles
 ) -> Capture:
     """Collect the data of the selected frames."""
+    chosen = selected.positions
     frame_index = detections.frame_index[chosen]
     return Capture(
         folder=out,
         frame_index=frame_index,
         time_s=detections.time_s[chosen],
-        split=selection.assign_splits(frame_index)
-        if user_files.split is None
-        else user_files.split.for_frames(frame_index),
+        split=selected.split,
+        split_rule=selected.split_rule,
         fps=source.fps,
         width=detections.width,
         height=detections.height,
@@ -173,7 +212,7 @@ def make_capture(
 
 STAGE = Stage(
     "frames",
-    version=9,
+    version=10,
     needs=("video",),
     makes=(FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, CONTACT_SHEET),
     config=Config,

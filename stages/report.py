@@ -13,6 +13,7 @@ from jaxtyping import Float, Int, UInt8
 from pydantic import Field
 from torch import Tensor
 
+from pipeline.avatar.clay import render_clay, render_clay_head
 from pipeline.avatar.finished_run import FinishedRun, load_finished_run
 from pipeline.avatar.pose_fit import MAX_PERSON_PX, fit_poses
 from pipeline.body.body import canonical_to_world
@@ -25,6 +26,7 @@ from pipeline.core.manifest import Manifest, read_manifest
 from pipeline.core.measure import describe_environment, peak_rss_mib
 from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
+from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.texture_rendering import blur_coverage
 from pipeline.io.image import read_rgb, to_uint8, write_rgb
 from pipeline.mesh.views import crop_posed_view
@@ -55,6 +57,10 @@ REPORT_IMAGES = (
 )
 
 
+Turntable = tuple[str, list[UInt8[np.ndarray, "_ _ 4"]]]
+"""Title of a row, and its views from all sides."""
+
+
 class Config(BaseConfig):
     """Options of the report."""
 
@@ -75,18 +81,21 @@ class Config(BaseConfig):
 def run(
     inputs: Mapping[str, Path], out: Path, config: Config, settings: ReportSettings = REPORT_SETTINGS
 ) -> Mapping[str, float]:
-    """Score held-out frames, measure mesh and files, and write report.json, the page and two contact sheets."""
+    """Score held-out frames, measure mesh and files, and write report.json, the page and three sheets."""
     started = time.monotonic()
     manifests = {name: _manifest(inputs[name]) for name in NEEDS}
     loaded = load_finished_run(inputs)
     positions = scored_positions(loaded.capture)
     edge_blur_px = median_edge_blur_px(loaded, settings)
     rows, frame_images = score_frames(loaded, positions, edge_blur_px, config, settings)
-    turntable = render_turntables(loaded, int(positions[len(positions) // 2]), config, settings)
+    middle = int(positions[len(positions) // 2])
+    turntable = render_turntables(loaded, middle, config, settings)
     write_rgb(
         out / "turntable.jpg",
         image_grid([[composite_on_white_uint8(view) for view in turntable_views] for _, turntable_views in turntable]),
     )
+    clay, clay_posed = render_clay_turntables(loaded, middle, config, settings)
+    write_rgb(out / "clay.jpg", image_grid([[composite_on_white_uint8(view) for view in views] for _, views in clay]))
     write_rgb(out / "heldout.jpg", image_grid([_comparison_row(frame) for frame in frame_images]))
     glb = (inputs["export"] / "avatar.glb").read_bytes()
     metric_sections: dict[str, Mapping[str, float | int | bool]] = {
@@ -95,12 +104,14 @@ def run(
         "masks": {"count": len(loaded.capture), "edge_blur_sigma_px": edge_blur_px},
     }
     cost = (time.monotonic() - started, peak_rss_mib())
-    report = replace_nonfinite(build_report(manifests, rows, metric_sections, describe_environment(), cost))
+    report = replace_nonfinite(
+        build_report(manifests, rows, metric_sections, describe_environment(), cost, loaded.capture.split_rule)
+    )
     page = PageContent(
         title=out.resolve().parent.name,
         report=report,
         frames=frame_images,
-        turntable=turntable,
+        turntable=[turntable[0], *clay, turntable[1], clay_posed],
         images=[(caption, read_rgb(inputs[stage] / name)) for stage, name, caption in REPORT_IMAGES],
         glb=glb,
     )
@@ -124,7 +135,7 @@ def scored_positions(capture: Capture) -> Int[np.ndarray, "k"]:
     positions = capture.positions(HELDOUT)
     if len(positions) == 0:
         raise UserError(
-            f"{capture.folder} has no held-out frame (no index is divisible by eight), so nothing can be scored: "
+            f"{capture.folder} has no held-out frame ({capture.split_rule}), so nothing can be scored: "
             "record a longer video, raise frames.max_frames, or supply split.json"
         )
     reasons = [reason_not_scorable(to_uint8(capture.mask(position))) for position in positions]
@@ -219,12 +230,11 @@ def fit_heldout_poses(loaded: FinishedRun, positions: np.ndarray, steps: int) ->
 
 def render_turntables(
     loaded: FinishedRun, position: int, config: Config, settings: ReportSettings = REPORT_SETTINGS
-) -> list[tuple[str, list[UInt8[np.ndarray, "_ _ 4"]]]]:
+) -> list[Turntable]:
     """Render the avatar from all sides, in the A-pose and in the pose of one frame."""
-    index = int(loaded.capture.frame_index[position])
     bodies = {
         "A-pose": loaded.avatar.vertices,
-        f"Pose of frame {index}, held out": loaded.avatar.pose_vertices(loaded.refined_canonical_to_world[position]),
+        _pose_title(loaded, position): loaded.avatar.pose_vertices(loaded.refined_canonical_to_world[position]),
     }
     return [
         (
@@ -235,6 +245,27 @@ def render_turntables(
         )
         for title, vertices in bodies.items()
     ]
+
+
+def render_clay_turntables(
+    loaded: FinishedRun, position: int, config: Config, settings: ReportSettings = REPORT_SETTINGS
+) -> tuple[list[Turntable], Turntable]:
+    """Render the shape without texture: rows of the A-pose for the clay sheet, and clay in the pose of one frame."""
+    mesh, views, height_px = loaded.avatar.mesh(), config.turntable_views, settings.turntable_height_px
+    posed = loaded.avatar.pose_vertices(loaded.refined_canonical_to_world[position]).numpy()
+    canonical = render_clay(mesh, views, height_px)
+    rows = [
+        ("A-pose, clay", canonical.smooth),
+        ("A-pose, clay, flat shading: the triangles", canonical.flat),
+        ("A-pose, canonical normals: red to the person's left, green up, blue to the front", canonical.normals),
+        ("Head, clay", render_clay_head(mesh, views, settings.clay_head_height_px)),
+    ]
+    in_pose = render_clay(Mesh(posed, mesh.faces), views, height_px).smooth
+    return rows, (f"{_pose_title(loaded, position)}, clay", in_pose)
+
+
+def _pose_title(loaded: FinishedRun, position: int) -> str:
+    return f"Pose of frame {int(loaded.capture.frame_index[position])}, held out"
 
 
 def _frame_images(
@@ -264,9 +295,9 @@ def _manifest(folder: Path) -> Manifest:
 
 STAGE = Stage(
     name="report",
-    version=4,
+    version=5,
     needs=NEEDS,
-    makes=("report.json", "index.html", "turntable.jpg", "heldout.jpg"),
+    makes=("report.json", "index.html", "turntable.jpg", "clay.jpg", "heldout.jpg"),
     config=Config,
     run=run,
 )

@@ -40,6 +40,8 @@ def main(argv: Sequence[str]) -> None:
         sections = write_comparison(options.out, options.run, sections)
     for name, scores in sections.items():
         _print_scores(name, scores)
+    if sections.get("light", "flat") != "flat":
+        print(f"light: {sections['light']}")
 
 
 def _print_scores(path: str, scores: Any) -> None:

@@ -1,7 +1,8 @@
 """Score a finished avatar against the ground truth of its synthetic capture: surface, skinning, texture and renders.
 
 Surfaces are aligned by a similarity transform (rotation, translation, one scale) from iterated closest points before
-they are compared, because one camera cannot determine absolute scale; the scale is reported.
+they are compared, because one camera cannot determine absolute scale; the scale is reported, and the Chamfer distance
+without any alignment beside it.
 """
 
 from collections import defaultdict
@@ -12,48 +13,88 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from data_tools.evaluate.comparison import Comparison, ImagePair, retarget_avatar_meshes
+from data_tools.evaluate.comparison import SURFACE_POINTS, Comparison, ImagePair, retarget_avatar_meshes
+from data_tools.evaluate.static_texture import render_static, static_brightness
 from data_tools.evaluate.truth import load_true_mask
-from data_tools.evaluate.upper_bound import render_upper_bound
+from data_tools.evaluate.upper_bound import map_between_worlds, render_upper_bound
+from data_tools.synthetic.scene.renderer import pose_vertices
+from pipeline.avatar.clay import render_clay_views
 from pipeline.body.body import canonical_to_world
 from pipeline.body.files import load_camera, load_motion
 from pipeline.capture.frame_selection import HELDOUT
 from pipeline.core.errors import UserError
 from pipeline.core.progress import warn
+from pipeline.geometry.alpha import premultiply_to_float
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import closest_points_on_mesh
-from pipeline.geometry.texture_rendering import blur_coverage, sample_texture
+from pipeline.geometry.texture_rendering import blur_coverage, sample_texture, turntable_cameras
 from pipeline.io.image import read_rgba, to_uint8
 from pipeline.metrics.alignment import SimilarityTransform, align_surfaces_icp
 from pipeline.metrics.images import additional_blur_sigma_px, frame_scores, mean_scores, reason_not_scorable
-from pipeline.metrics.surfaces import sample_surface, surface_scores
+from pipeline.metrics.surfaces import chamfer_distance_mm, sample_surface, surface_scores
 from stages.report import median_edge_blur_px, scored_positions
 
 SURFACE_FRAMES = 4
-SURFACE_POINTS = 20_000
 SAMPLES_PER_AXIS = 3
+CLAY_VIEWS, CLAY_HEIGHT_PX = 8, 480
 
 
 def compare_rest_surfaces(comparison: Comparison) -> dict[str, float]:
-    """Score the surface of the avatar in the A-pose of the true rig."""
-    return _aligned_scores(comparison.rest_mesh, comparison.true_rest_mesh, comparison.alignment)
+    """Score the surface of the avatar in the A-pose of the true rig.
+
+    Unaligned, both stand on the same floor with the hips above the same point. stature_mm, true_stature_mm: heights of
+    both in this pose.
+    """
+    avatar, true = comparison.standing_mesh, comparison.true_rest_mesh
+    return (
+        comparison.rest_correspondence.scores()
+        | {
+            "scale_to_truth": comparison.alignment.scale,
+            "chamfer_unaligned_mm": chamfer_distance_mm(avatar, true, SURFACE_POINTS),
+        }
+        | {"stature_mm": _stature_mm(avatar), "true_stature_mm": _stature_mm(true)}
+    )
+
+
+def compare_labelled_surfaces(comparison: Comparison) -> dict[str, dict[str, float]]:
+    """Score each labelled part of the truth in its A-pose, see `SurfaceCorrespondence.label_scores`.
+
+    Parts that are invisible from outside are left out; a capture without labels has no parts.
+    """
+    labels = comparison.true_labels
+    if labels is None:
+        return {}
+    rows = {
+        name: comparison.rest_correspondence.label_scores(labels.of_face, label)
+        for label, name in enumerate(labels.names)
+    }
+    return {name: scores for name, scores in rows.items() if scores is not None}
 
 
 def compare_heldout_surfaces(comparison: Comparison) -> dict[str, float]:
-    """Score the surface in some held-out frames: the avatar in the refined pose, the truth in the true pose."""
+    """Score the surface in some held-out frames: the avatar in the refined pose, the truth in the true pose.
+
+    Unaligned, both are where their own camera sees them.
+    """
     positions = _evenly_spaced(comparison.run.capture.positions(HELDOUT))
     frames = comparison.run.capture.frame_index[positions]
     rows = []
     for position, frame in zip(positions, frames, strict=True):
         avatar = comparison.avatar_surface(comparison.run.refined_canonical_to_world[position])
         true = comparison.true_surface(comparison.truth.canonical_to_world[frame])
-        rows.append(_aligned_scores(avatar, true, align_surfaces_icp(avatar, true)))
+        seen = map_between_worlds(torch.from_numpy(avatar.vertices), comparison.run.camera, comparison.truth.camera)
+        unaligned_mm = chamfer_distance_mm(Mesh(seen.numpy(), avatar.faces), true, SURFACE_POINTS)
+        scores = _aligned_scores(avatar, true, align_surfaces_icp(avatar, true))
+        rows.append(scores | {"chamfer_unaligned_mm": unaligned_mm})
     return mean_scores(rows)
 
 
 def compare_novel_poses(comparison: Comparison) -> tuple[dict[str, float], list[ImagePair]]:
-    """Score skinning: surfaces and images of both rigs in poses that the video does not contain."""
+    """Score skinning: surfaces and images of both rigs in poses that the video does not contain.
+
+    Unaligned, the hips of both are in the same place.
+    """
     motion = load_motion(comparison.folder / "novel_poses" / "motion.npz")
     rows, image_pairs = [], []
     for index, (pose, avatar) in enumerate(
@@ -65,7 +106,8 @@ def compare_novel_poses(comparison: Comparison) -> tuple[dict[str, float], list[
     ):
         true = comparison.true_surface(pose)
         alignment = align_surfaces_icp(avatar, true)
-        rows.append(_aligned_scores(avatar, true, alignment))
+        unaligned_mm = chamfer_distance_mm(avatar, true, SURFACE_POINTS)
+        rows.append(_aligned_scores(avatar, true, alignment) | {"chamfer_unaligned_mm": unaligned_mm})
         expected = read_rgba(comparison.folder / "novel_poses" / f"{index:06d}.png")
         image_pairs.append(
             ImagePair(expected, _render_avatar(comparison, alignment.transform_mesh(avatar), comparison.truth.camera))
@@ -82,6 +124,47 @@ def compare_novel_views(comparison: Comparison) -> list[ImagePair]:
     return [
         ImagePair(read_rgba(path.with_suffix(".png")), _render_avatar(comparison, surface, load_camera(path)))
         for path in sorted((comparison.folder / "novel_views").glob("*.npz"))
+    ]
+
+
+def compare_ceiling(comparison: Comparison) -> dict[str, dict[str, float]]:
+    """Score the ceiling of novel views and poses: the true mesh with its best static texture.
+
+    Returns:
+        novel_views_ceiling, novel_poses_ceiling: scores as those of the avatar, for what the capture contains.
+    """
+    truth, folder = comparison.truth, comparison.folder
+    brightness = static_brightness(comparison)
+    targets = {
+        "novel_views": [(path, truth.canonical_to_world[0]) for path in sorted(folder.glob("novel_views/*.npz"))]
+    }
+    if (folder / "novel_poses").is_dir():
+        poses = canonical_to_world(truth.subject.body, load_motion(folder / "novel_poses" / "motion.npz"))
+        targets["novel_poses"] = [(folder / "novel_poses" / f"{index:06d}", pose) for index, pose in enumerate(poses)]
+    scores = {}
+    for name, views in targets.items():
+        pairs = []
+        for path, pose in views:
+            camera = load_camera(path) if path.suffix else truth.camera
+            drawn = render_static(
+                truth.subject, pose_vertices(truth.subject, pose), brightness, camera, SAMPLES_PER_AXIS
+            )
+            pairs.append(ImagePair(read_rgba(path.with_suffix(".png")), drawn))
+        if pairs:
+            scores[f"{name}_ceiling"] = mean_scores(pair.scores() for pair in pairs)
+    return scores
+
+
+def compare_clay(comparison: Comparison) -> list[ImagePair]:
+    """Render truth and avatar in clay, in the A-pose of the true rig and aligned, from `CLAY_VIEWS` sides."""
+    true, avatar = comparison.true_rest_mesh, comparison.alignment.transform_mesh(comparison.rest_mesh)
+    corners = true.vertices[true.faces].reshape(-1, 3)
+    cameras = turntable_cameras(corners.min(axis=0), corners.max(axis=0), CLAY_VIEWS, CLAY_HEIGHT_PX)
+    return [
+        ImagePair(truth, premultiply_to_float(drawn))
+        for truth, drawn in zip(
+            render_clay_views(true, cameras).smooth, render_clay_views(avatar, cameras).smooth, strict=True
+        )
     ]
 
 
@@ -146,6 +229,10 @@ def compare_heldout_images(comparison: Comparison) -> dict[str, dict[str, float]
             "name the capture that this run was made from"
         )
     return {name: mean_scores(scores) for name, scores in rows.items()}
+
+
+def _stature_mm(mesh: Mesh) -> float:
+    return 1000.0 * float(np.ptp(mesh.vertices[mesh.faces, 1]))
 
 
 def _aligned_scores(avatar: Mesh, true: Mesh, alignment: SimilarityTransform) -> dict[str, float]:

@@ -6,12 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from data_tools.evaluate.truth import load_ground_truth
+from data_tools.synthetic.rig.labels import FaceLabels
 from data_tools.synthetic.rig.retarget import local_quaternions, retarget_rotations
 from data_tools.synthetic.scene.capture import SyntheticCapture
+from data_tools.synthetic.scene.motion import snap_feet_to_floor
 from data_tools.synthetic.scene.renderer import pose_vertices
 from data_tools.synthetic.scene.shadow import find_exterior_faces
 from pipeline.avatar.finished_run import FinishedRun, load_finished_run
@@ -22,7 +24,11 @@ from pipeline.geometry.skinning import forward_kinematics
 from pipeline.io.image import to_float
 from pipeline.metrics.alignment import SimilarityTransform, align_surfaces_icp
 from pipeline.metrics.images import frame_scores
+from pipeline.metrics.surfaces import SurfaceCorrespondence, surface_correspondence
 from pipeline.texture.files import load_texture
+
+SURFACE_POINTS = 20_000
+"""Sample points per surface."""
 
 REQUIRED_STAGES = ("frames", "body", "field", "mesh", "texture")
 
@@ -60,11 +66,29 @@ class Comparison:
 
     @cached_property
     def rest_mesh(self) -> Mesh:
-        """The exterior of the avatar in the A-pose of the true rig."""
+        """The exterior of the avatar in the A-pose of the true rig, with the hips where the true hips are."""
+        return self.avatar_surface(canonical_to_world(self.run.body, self._rest_motion)[0])
+
+    @cached_property
+    def standing_mesh(self) -> Mesh:
+        """The exterior of the avatar in the A-pose of the true rig, with its feet on y = 0."""
+        standing = snap_feet_to_floor(self.run.body, self._rest_motion, 0.0)
+        return self.avatar_surface(canonical_to_world(self.run.body, standing)[0])
+
+    @cached_property
+    def rest_correspondence(self) -> SurfaceCorrespondence:
+        """Corresponding points of `rest_mesh`, aligned, and `true_rest_mesh`."""
+        return surface_correspondence(
+            self.alignment.transform_mesh(self.rest_mesh), self.true_rest_mesh, SURFACE_POINTS
+        )
+
+    @cached_property
+    def _rest_motion(self) -> Motion:
+        """The A-pose of the true rig, retargeted to the rig of the avatar: one frame."""
         body, joints = self.truth.subject.body, len(self.truth.subject.body.joint_names)
         identity_wxyz = np.tile(np.array([1.0, 0.0, 0.0, 0.0], dtype=np.float32), (1, joints, 1))
         motion = Motion(np.zeros(1, np.int32), np.zeros(1), identity_wxyz, body.joints_m[:1])
-        return retarget_avatar_meshes(self, motion)[0]
+        return retarget_motion(self.run.body, body, motion)
 
     @cached_property
     def alignment(self) -> SimilarityTransform:
@@ -77,8 +101,18 @@ class Comparison:
         return Mesh(self.truth.subject.body.vertices, self._true_faces)
 
     @cached_property
+    def true_labels(self) -> FaceLabels | None:
+        """The labels of the faces of `true_rest_mesh`; None if the capture has none."""
+        labels = self.truth.subject.labels
+        return None if labels is None else labels.select(self._true_exterior)
+
+    @cached_property
+    def _true_exterior(self) -> Bool[np.ndarray, "f"]:
+        return find_exterior_faces(self.truth.subject.body.mesh())
+
+    @cached_property
     def _true_faces(self) -> Int[np.ndarray, "f 3"]:
-        return self.truth.subject.body.faces[find_exterior_faces(self.truth.subject.body.mesh())]
+        return self.truth.subject.body.faces[self._true_exterior]
 
     @cached_property
     def _avatar_faces(self) -> Int[np.ndarray, "f 3"]:

@@ -6,8 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from data_tools.evaluate.compare_avatar import (
+    compare_ceiling,
+    compare_clay,
     compare_heldout_images,
     compare_heldout_surfaces,
+    compare_labelled_surfaces,
     compare_novel_poses,
     compare_novel_views,
     compare_rest_surfaces,
@@ -15,6 +18,7 @@ from data_tools.evaluate.compare_avatar import (
 )
 from data_tools.evaluate.comparison import Comparison, ImagePair, load_comparison
 from data_tools.evaluate.files import TRUTH_VERSION, save_comparison
+from data_tools.synthetic.scene.renderer import FLAT
 from data_tools.templates import render_template
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import read_manifest
@@ -33,17 +37,27 @@ PROTOCOL = (
     "Surfaces: before a comparison, the surface of the avatar is aligned to the true surface by rotation, "
     "translation and one scale (scale_to_truth), from iterated closest points in both directions. Distances are "
     "from 20,000 points per surface to the nearest triangle of the other, without faces that are invisible from "
-    "outside in the A-pose. mesh: A-pose of the true rig; heldout_poses: held-out frames, each rig in its own pose;"
-    " novel_poses: both rigs in poses that the video does not contain. Joints: compared after aligning the root, "
-    "and without alignment. Images: field and mesh are the held-out scores of the report. upper_bound is the true "
+    "outside in the A-pose. normal_angle_deg: angle to the nearest face within 30 mm whose normal is less than 90 "
+    "degrees away, mean of both directions; 90 where there is none. far_area_share: share of the avatar's area farther "
+    "than 30 mm from the truth. chamfer_unaligned_mm: without alignment and scale, see stature_mm. mesh: A-pose of the "
+    "true rig, unaligned standing on the same floor; heldout_poses: held-out frames, each rig in its own pose, "
+    "unaligned where its camera sees it; novel_poses: both rigs in poses that the video does not contain, unaligned "
+    "with the hips in the same place. surface_by_label: the A-pose, on the faces of one garment or body part of the "
+    "truth and the points of the avatar nearest to them; area_share of the truth. Joints: after aligning the root, and "
+    "without alignment. Images: field and mesh are the held-out scores of the report. upper_bound is the true "
     "mesh and texture with true lighting, rendered in the refined poses by the estimated camera on the same frames,"
     " with the same edge blur as the mesh: its error is the error of poses and camera that no other A-pose shape "
     "can compensate. Squared error prefers a blurred texture to a sharp one at the wrong position, so a blurred "
     "avatar may score higher. These columns use the masks of the frames stage, so parts that are missing in a mask "
     "cost nothing; the columns true_mask use the true masks, and meshes with sharp edges. novel_views and "
     "novel_poses: the avatar in the true poses, aligned to the true surface and rendered by the true cameras; the "
-    "avatar is unlit, the truth is lit. colour_error and balanced_colour_error (after one gain per channel) are "
-    "mean absolute differences, of 255, on the observed texels."
+    "avatar is unlit. Their columns ceiling are the true mesh in the same poses with its best static texture: the true "
+    "one times the mean brightness of each vertex in the training frames. colour_error and balanced_colour_error "
+    "(after one gain per channel) are mean absolute differences, of 255, on the observed texels."
+)
+LIT_NOTE = (
+    "not flat: the novel views and poses of this capture are lit, the avatar is not, so their image scores hold the "
+    "light against it; judge them on a capture made with --light flat"
 )
 
 
@@ -78,11 +92,13 @@ def write_comparison(out: Path, run_dir: Path, measured: Mapping[str, Mapping[st
 
 
 def avatar_sections(comparison: Comparison) -> tuple[dict[str, Any], dict[str, list[ImagePair]]]:
-    """Compute all sections that need a finished avatar, and the image pairs of novel views and poses."""
+    """Compute all sections that need a finished avatar, and the image pairs of novel views, novel poses and clay."""
     document: dict[str, Any] = {
         "mesh": compare_rest_surfaces(comparison),
         "heldout_poses": compare_heldout_surfaces(comparison),
     }
+    if parts := compare_labelled_surfaces(comparison):
+        document["surface_by_label"] = parts
     images = compare_heldout_images(comparison)
     image_pairs = {}
     if (comparison.folder / "novel_poses").is_dir():
@@ -90,13 +106,19 @@ def avatar_sections(comparison: Comparison) -> tuple[dict[str, Any], dict[str, l
     if (comparison.folder / "novel_views").is_dir():
         image_pairs["novel_views"] = compare_novel_views(comparison)
     images |= {name: mean_scores(image_pair.scores() for image_pair in row) for name, row in image_pairs.items()}
+    images |= compare_ceiling(comparison)
+    image_pairs["clay"] = compare_clay(comparison)
+    document["light"] = "flat" if comparison.truth.light == FLAT else LIT_NOTE
     return document | {"texture": compare_texture(comparison), "images": images}, image_pairs
 
 
 def comparison_page(title: str, document: Mapping[str, Any], image_pairs: Mapping[str, Sequence[ImagePair]]) -> str:
     """Render the HTML page, in the style of the report."""
     surfaces = {name: document[name] for name in ("mesh", "heldout_poses", "novel_poses") if name in document}
-    tables = [metric_table("Surfaces", surfaces), metric_table("Images", document["images"])]
+    tables = [metric_table("Surfaces", surfaces)]
+    if "surface_by_label" in document:
+        tables.append(metric_table("Surface of each part, A-pose", document["surface_by_label"]))
+    tables.append(metric_table("Images", document["images"]))
     tables += [
         metric_table(name.capitalize(), {"": document[name]})
         for name in ("masks", "body", "texture")
@@ -107,7 +129,7 @@ def comparison_page(title: str, document: Mapping[str, Any], image_pairs: Mappin
         "comparison.html.j2",
         title=title,
         style=read_asset("report.css"),
-        protocol=document["protocol"],
+        protocol=f"{document['protocol']} Light of the capture: {document['light']}.",
         tiles=[metric_tile(*texts) for texts in _headline_metrics(document)],
         tables=tables,
         image_rows=[

@@ -42,7 +42,7 @@ def render_upper_bound(comparison: Comparison, positions: Int[np.ndarray, "k"]) 
     camera = replace(run.camera, world_to_camera=comparison.truth.camera.world_to_camera)
     for position in track(positions.tolist(), "held-out frames"):
         posed = pose_vertices(unposed_subject, run.refined_canonical_to_world[position, joint])
-        vertices = _map_between_worlds(posed, run.camera, comparison.truth.camera)
+        vertices = map_between_worlds(posed, run.camera, comparison.truth.camera)
         yield render_subject(unposed_subject, vertices, camera, comparison.truth.light, comparison.truth.samples)
 
 
@@ -111,7 +111,7 @@ def _true_to_fitted_world(
     return matrices
 
 
-def _map_between_worlds(vertices: Float[Tensor, "v 3"], camera: Camera, target: Camera) -> Float[Tensor, "v 3"]:
+def map_between_worlds(vertices: Float[Tensor, "v 3"], camera: Camera, target: Camera) -> Float[Tensor, "v 3"]:
     """Transform points from the world of one camera to that of another, with equal camera coordinates."""
     matrix = torch.from_numpy(np.linalg.inv(target.world_to_camera) @ camera.world_to_camera).to(vertices)
     return vertices @ matrix[:3, :3].T + matrix[:3, 3]

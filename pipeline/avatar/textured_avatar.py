@@ -1,17 +1,16 @@
 """The exported avatar, a skinned mesh with UV atlas and diffuse map: posing and rendering."""
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from pipeline.geometry.alpha import unpremultiply_to_uint8
+from pipeline.geometry.alpha import crop_empty_columns, unpremultiply_to_uint8
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import dense_weights, linear_blend_skinning
-from pipeline.geometry.texture_rendering import render_textured, turntable_camera
+from pipeline.geometry.texture_rendering import render_textured, turntable_cameras
 
 
 @dataclass(frozen=True)
@@ -61,20 +60,8 @@ class TexturedAvatar:
 
         views: number of images. height_px: of each image.
         """
-        box_min_m, box_max_m = vertices_world.numpy().min(axis=0), vertices_world.numpy().max(axis=0)
-        width_to_height = math.hypot(box_max_m[0] - box_min_m[0], box_max_m[2] - box_min_m[2]) / (
-            box_max_m[1] - box_min_m[1]
-        )
-        images = []
-        for number in range(views):
-            angle = 2.0 * math.pi * number / views
-            camera = turntable_camera(box_min_m, box_max_m, angle, math.ceil(height_px * width_to_height), height_px)
-            images.append(
-                _crop_empty_columns(unpremultiply_to_uint8(self.render(vertices_world, camera, supersampling)))
-            )
-        return images
-
-
-def _crop_empty_columns(image: UInt8[np.ndarray, "h w 4"]) -> UInt8[np.ndarray, "h w2 4"]:
-    columns = np.flatnonzero(image[..., 3].any(axis=0))
-    return image[:, columns[0] : columns[-1] + 1] if len(columns) else image
+        box_m = vertices_world.numpy().min(axis=0), vertices_world.numpy().max(axis=0)
+        return [
+            crop_empty_columns(unpremultiply_to_uint8(self.render(vertices_world, camera, supersampling)))
+            for camera in turntable_cameras(*box_m, views, height_px)
+        ]

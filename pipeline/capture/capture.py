@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from pipeline.capture.frame_selection import INTERLEAVED_RULE
 from pipeline.capture.hand_detector import HandLandmarks
 from pipeline.capture.smpl_poses import SMPL_POSES_NPZ, SmplPoses, load_smpl_poses, save_smpl_poses
 from pipeline.geometry.camera import DEFAULT_WORLD_TO_CAMERA, Camera
@@ -22,7 +23,9 @@ class Capture:
     """The selected frames of a recording: n frames of one size, undistorted.
 
     frame_index: index in the recording. time_s: since the first frame of the recording.
-    split: 0 train, 1 validation, 2 held out (`pipeline.capture.frame_selection.assign_splits`, or user-supplied).
+    split: 0 train, 1 validation, 2 held out (`pipeline.capture.frame_selection.assign_splits`,
+        `pipeline.capture.disjoint_split`, or user-supplied).
+    split_rule: how they were split, in words.
     landmarks_px: MediaPipe's 33 landmarks, pixel centres at +0.5; nan where unknown. Visibility in [0, 1].
     landmarks_world_m: relative to the centre of the hips, in camera axes; nan where unknown.
     camera: user-supplied camera for these images; None if unknown.
@@ -49,6 +52,7 @@ class Capture:
     metadata_focal_px: float | None = None
     hands: HandLandmarks | None = None
     smpl_poses: SmplPoses | None = None
+    split_rule: str = INTERLEAVED_RULE
 
     def __len__(self) -> int:
         return len(self.frame_index)
@@ -87,6 +91,7 @@ def save_capture(capture: Capture) -> None:
         "frame_index": capture.frame_index.astype(np.int32),
         "time_s": capture.time_s.astype(np.float64),
         "split": capture.split,
+        "split_rule": np.array(capture.split_rule),
         "fps": np.array(capture.fps),
         "width": np.array(capture.width, dtype=np.int32),
         "height": np.array(capture.height, dtype=np.int32),
@@ -134,6 +139,7 @@ def load_capture(frames_dir: Path) -> Capture:
         metadata_focal_px=_metadata_focal_px(arrays),
         hands=_hands(arrays),
         smpl_poses=load_smpl_poses(poses_path) if poses_path.is_file() else None,
+        split_rule=str(arrays["split_rule"].item()) if "split_rule" in arrays else INTERLEAVED_RULE,
     )
 
 

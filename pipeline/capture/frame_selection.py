@@ -1,7 +1,8 @@
 """Selection and splits of frames. Pure functions on grey thumbnails and landmarks.
 
-The split depends on the index of a frame in the recording only, so it does not change with the selection. A
-user-supplied split (`pipeline.capture.user_files`) replaces both.
+The interleaved split depends on the index of a frame in the recording only, so it does not change with the selection;
+`pipeline.capture.disjoint_split` holds out the end of the recording. A user-supplied split
+(`pipeline.capture.user_files`) replaces split and selection.
 """
 
 import numpy as np
@@ -10,6 +11,10 @@ from jaxtyping import Bool, Float, Int, UInt8
 from pipeline.capture.landmarks import TORSO
 
 TRAIN, VALIDATION, HELDOUT = 0, 1, 2
+UNUSED = 3
+"""Frames that are in no split; they are not selected."""
+
+INTERLEAVED_RULE = "interleaved: frames with an index divisible by eight held out"
 SPLIT_PERIOD = 8
 VALIDATION_PHASE = 4
 # Mean absolute difference of two images of the same scene when rounding to integer levels is the only noise:
@@ -70,15 +75,14 @@ def find_distinct_frames(
 
 
 def select_frames_by_motion(
-    frame_index: Int[np.ndarray, "n"], cumulative_motion: Float[np.ndarray, "n"], max_frames: int
+    split: UInt8[np.ndarray, "n"], cumulative_motion: Float[np.ndarray, "n"], max_frames: int
 ) -> Bool[np.ndarray, "n"]:
     """Select at most `max_frames` frames at equal steps of cumulative motion, an eighth each held out and validation.
 
     Equal steps of motion instead of time: a slow part of a turn gets no more frames than a fast one. Each split covers
-    the whole motion by itself, including its first and last frame.
+    its whole motion by itself, including its first and last frame. UNUSED frames are not selected.
     """
-    chosen = np.zeros(len(frame_index), dtype=bool)
-    split = assign_splits(frame_index)
+    chosen = np.zeros(len(split), dtype=bool)
     share = max(1, round(max_frames / SPLIT_PERIOD))
     quotas = {HELDOUT: share, VALIDATION: share, TRAIN: max(1, max_frames - 2 * share)}
     for kind, quota in quotas.items():

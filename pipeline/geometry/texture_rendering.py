@@ -103,3 +103,19 @@ def turntable_camera(
     world_to_camera[:3, :3] = np.stack([right, [0.0, -1.0, 0.0], -backward])
     world_to_camera[:3, 3] = -world_to_camera[:3, :3] @ (centre + distance * backward)
     return Camera(focal_px, focal_px, width_px / 2.0, height_px / 2.0, width_px, height_px, world_to_camera)
+
+
+def turntable_cameras(
+    box_min_m: Float[np.ndarray, "3"], box_max_m: Float[np.ndarray, "3"], views: int, height_px: int
+) -> list[Camera]:
+    """Return cameras at evenly spaced azimuths, the first on +Z; the images are wide enough for the box at every angle.
+
+    Args:
+        box_min_m, box_max_m: corners of the box in the world, +Y up, m.
+        views: number of cameras.
+        height_px: height of the images.
+    """
+    size = box_max_m - box_min_m
+    width_px = math.ceil(height_px * (math.hypot(size[0], size[2]) / size[1]))
+    angles_rad = (2.0 * math.pi * number / views for number in range(views))
+    return [turntable_camera(box_min_m, box_max_m, angle_rad, width_px, height_px) for angle_rad in angles_rad]

@@ -12,8 +12,8 @@ from pipeline.metrics.lpips import MIN_SIDE_PX
 from pipeline.report.lpips_weights import WEIGHTS_MISSING_NOTE as LPIPS_ABSENT
 
 PROTOCOL = (
-    "{count} frames were held out: those that the video's split.json lists, or else those whose index in the video is "
-    "divisible by eight. Field, mesh and texture were not trained on their pixels, and no decision used them. Their "
+    "{count} frames were held out; split: {split_rule}. Scores of interleaved and disjoint frames do not compare. "
+    "Field, mesh and texture were not trained on their pixels, and no decision used them. Their "
     "poses are fitted to landmarks and silhouettes, never to colours: the body stage fits every frame, and the common "
     "shape and camera, to the landmarks and masks of all frames. The field's pose corrections are interpolated in time "
     "between training frames and constant beyond them. Frames are composited on white with the mask of the frames "
@@ -42,6 +42,7 @@ def build_report(
     metric_sections: Mapping[str, Mapping[str, float | int | bool]],
     environment: Mapping[str, Any],
     cost: tuple[float, float],
+    split_rule: str,
 ) -> dict[str, Any]:
     """Build the document.
 
@@ -51,6 +52,7 @@ def build_report(
         metric_sections: sections measured by the report: `mesh` (quality), `export` (glb_bytes, texture_px), `masks`.
         environment: machine and versions of this run.
         cost: seconds and peak memory (MiB) of the report stage so far.
+        split_rule: `Capture.split_rule`.
 
     Raises:
         UserError: the manifest of the body stage lacks a metric.
@@ -58,7 +60,7 @@ def build_report(
     seconds = {name: manifest.seconds for name, manifest in manifests.items()} | {"report": round(cost[0], 3)}
     peaks = {name: manifest.peak_rss_mib for name, manifest in manifests.items()} | {"report": round(cost[1], 1)}
     renders = [name for name in frames[0] if name != "index"]
-    protocol = PROTOCOL.format(count=len(frames))
+    protocol = PROTOCOL.format(count=len(frames), split_rule=split_rule)
     protocol += UNREFINED_NOTE * any(name.endswith("_unrefined") for name in renders)
     protocol += POSE_FITTED_NOTE * any(name.endswith(POSE_FITTED_SUFFIX) for name in renders)
     has_lpips = "lpips_full" in frames[0][renders[0]]
@@ -67,6 +69,7 @@ def build_report(
         "peak_rss_mib": peaks | {"total": max(peaks.values())},
         "heldout": {name: mean_scores([row[name] for row in frames]) for name in renders}
         | {
+            "split": split_rule,
             "protocol": protocol,
             "lpips": LPIPS_NOTE if has_lpips else LPIPS_MISSING_NOTE,
             "frames": list(frames),

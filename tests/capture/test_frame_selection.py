@@ -76,8 +76,8 @@ def test_selection_covers_motion_range_and_keeps_split(n, max_frames, seed):
     rng = np.random.default_rng(seed)
     frame_index = np.sort(rng.choice(4 * n, n, replace=False)).astype(np.int32)
     cumulative_motion = np.cumsum(rng.exponential(size=n))
-    chosen = selection.select_frames_by_motion(frame_index, cumulative_motion, max_frames)
     split = selection.assign_splits(frame_index)
+    chosen = selection.select_frames_by_motion(split, cumulative_motion, max_frames)
     assert chosen.sum() <= max_frames
     for kind, quota in (
         (0, max_frames - 2 * round(max_frames / 8)),
@@ -91,9 +91,9 @@ def test_selection_covers_motion_range_and_keeps_split(n, max_frames, seed):
 
 
 def test_selection_is_uniform_in_motion_not_in_time():
-    frame_index = np.arange(800, dtype=np.int32)
+    split = selection.assign_splits(np.arange(800, dtype=np.int32))
     cumulative_motion = np.concatenate([np.linspace(0, 10, 600), np.linspace(10, 100, 201)[1:]])
-    chosen = cumulative_motion[selection.select_frames_by_motion(frame_index, cumulative_motion, 80)]
+    chosen = cumulative_motion[selection.select_frames_by_motion(split, cumulative_motion, 80)]
     assert (chosen > 10).mean() == pytest.approx(0.9, abs=0.03)
 
 

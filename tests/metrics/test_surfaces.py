@@ -6,7 +6,15 @@ import trimesh
 
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import closest_points_on_mesh
-from pipeline.metrics.surfaces import mpjpe_m, sample_surface, surface_scores
+from pipeline.metrics.agreeing_faces import nearest_agreeing_faces
+from pipeline.metrics.surfaces import (
+    NORMAL_REACH_M,
+    chamfer_distance_mm,
+    mpjpe_m,
+    sample_surface,
+    surface_correspondence,
+    surface_scores,
+)
 
 
 def sphere(radius_m: float) -> Mesh:
@@ -32,7 +40,8 @@ def test_distance_of_concentric_spheres_is_the_difference_of_their_radii():
 
 
 def test_tilted_square_has_the_tilt_as_normal_angle():
-    scores = surface_scores(square(0.0, tilt_deg=10.0), square(0.0), count=5_000)
+    tilted, level = (Mesh(0.2 * made.vertices, made.faces) for made in (square(0.0, tilt_deg=10.0), square(0.0)))
+    scores = surface_scores(tilted, level, count=5_000)  # at most 18 mm apart
     assert scores["normal_angle_deg"] == pytest.approx(10.0, abs=1e-6)
 
 
@@ -42,7 +51,84 @@ def test_normal_angle_is_the_mean_of_both_directions():
     across = floor.vertices[:, :1] + 0.5
     wall = np.concatenate([0.5 + across * np.cos(slope), across * np.sin(slope), floor.vertices[:, 2:]], axis=1)
     both = Mesh(np.concatenate([floor.vertices, wall]), np.concatenate([floor.faces, floor.faces + 4]))
-    assert surface_scores(floor, both, count=20_000)["normal_angle_deg"] == pytest.approx((0 + 30) / 2, abs=0.3)
+    near = NORMAL_REACH_M / np.sin(slope)  # share of the wall within reach of the floor; the rest counts as 90 degrees
+    expected_deg = (0 + (near * 60 + (1 - near) * 90) / 2) / 2
+    assert surface_scores(floor, both, count=20_000)["normal_angle_deg"] == pytest.approx(expected_deg, abs=0.3)
+
+
+@pytest.mark.parametrize(("lining_m", "outer_m"), [(0.001, 0.004), (-0.001, -0.004)])
+def test_a_lining_that_faces_inwards_has_no_normal_angle(lining_m, outer_m):
+    """The nearest surface is the lining of a thin shell, whose normal points the other way; the shell itself agrees."""
+    lining, outer = square(lining_m), square(outer_m, tilt_deg=5.0)
+    shell = Mesh(
+        np.concatenate([lining.vertices, outer.vertices]), np.concatenate([lining.faces[:, ::-1], outer.faces + 4])
+    )
+    points, _ = sample_surface(square(0.0), 2000)
+    normals = np.tile([0.0, 1.0, 0.0], (len(points), 1)) * np.sign(square(0.0).face_normals()[0, 1])
+    distances_m, faces = nearest_agreeing_faces(points, normals, shell, NORMAL_REACH_M)
+    heights_m = np.abs(outer_m + np.tan(np.radians(5.0)) * points[:, 0]) * np.cos(np.radians(5.0))
+    reached = heights_m < NORMAL_REACH_M - 1e-6
+    assert set(faces[reached].tolist()) == {2, 3}
+    assert set(faces[heights_m > NORMAL_REACH_M + 1e-6].tolist()) == {-1}
+    inner = reached & (np.abs(points[:, 0]) < 0.45)
+    assert np.allclose(distances_m[inner], heights_m[inner], atol=1e-9)
+
+
+def test_without_an_agreeing_face_the_angle_is_a_right_angle():
+    flipped = Mesh(square(0.001).vertices, square(0.001).faces[:, ::-1])
+    assert surface_scores(square(0.0), flipped, count=500)["normal_angle_deg"] == 90.0
+    assert surface_scores(square(0.0), square(0.031), count=500)["normal_angle_deg"] == 90.0
+    assert surface_scores(square(0.0), square(0.029), count=500)["normal_angle_deg"] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_agreeing_faces_equal_a_brute_force_search(rng):
+    """Random triangles of sizes from 1 mm to 0.3 m; each pair of point and triangle by trimesh."""
+    count = 300
+    size_m = 10.0 ** rng.uniform(-3, -0.5, (count, 1, 1))
+    corners = rng.uniform(-0.1, 0.1, (count, 1, 3)) + size_m * rng.normal(size=(count, 3, 3))
+    mesh = Mesh(corners.reshape(-1, 3), np.arange(3 * count, dtype=np.int32).reshape(-1, 3))
+    points, normals = rng.uniform(-0.12, 0.12, (700, 3)), rng.normal(size=(700, 3))
+    distances_m, faces = nearest_agreeing_faces(points, normals, mesh, 0.03)
+    pairs = np.repeat(points, count, axis=0)
+    closest = trimesh.triangles.closest_point(np.tile(corners, (len(points), 1, 1)), pairs)
+    apart_m = np.linalg.norm(closest - pairs, axis=1).reshape(len(points), count)
+    apart_m[(normals @ mesh.face_normals().T <= 0) | (apart_m > 0.03)] = np.inf
+    assert 0.02 < np.isinf(apart_m.min(axis=1)).mean() < 0.98
+    assert np.allclose(distances_m, apart_m.min(axis=1), atol=1e-9)
+    assert np.array_equal(faces >= 0, np.isfinite(distances_m))
+    found = faces >= 0
+    assert np.allclose(apart_m[found, faces[found]], distances_m[found], atol=1e-9)
+
+
+def test_far_area_is_the_share_of_the_result(rng):
+    """A quarter of the result's area is 4 cm away; area that is missing in the result does not count."""
+    near, far = square(0.0), square(0.04)
+    far = Mesh(far.vertices * [np.sqrt(1 / 3), 1.0, np.sqrt(1 / 3)], far.faces)
+    both = Mesh(np.concatenate([near.vertices, far.vertices]), np.concatenate([near.faces, near.faces + 4]))
+    assert surface_scores(both, near, count=20_000)["far_area_share"] == pytest.approx(0.25, abs=0.01)
+    assert surface_scores(near, both, count=2_000)["far_area_share"] == 0.0
+
+
+def test_chamfer_alone_equals_that_of_all_scores():
+    result, truth = square(0.01, tilt_deg=3.0), square(0.0)
+    assert chamfer_distance_mm(result, truth, 500, 3) == surface_scores(result, truth, 500, seed=3)["chamfer_mm"]
+
+
+def test_scores_of_a_label_are_those_of_its_part():
+    """Two squares side by side, 3 and 7 mm below the result."""
+    first, second = square(-0.003), square(-0.007)
+    second = Mesh(second.vertices + [2.0, 0.0, 0.0], second.faces)
+    truth = Mesh(np.concatenate([first.vertices, second.vertices]), np.concatenate([first.faces, first.faces + 4]))
+    result = Mesh(truth.vertices * [1.0, 0.0, 1.0], truth.faces)
+    found = surface_correspondence(result, truth, 4000)
+    labels = np.array([5, 5, 9, 9])
+    assert found.label_scores(labels, 5)["chamfer_mm"] == pytest.approx(3.0, abs=1e-6)
+    assert found.label_scores(labels, 9)["chamfer_mm"] == pytest.approx(7.0, abs=1e-6)
+    assert found.label_scores(labels, 9)["area_share"] == pytest.approx(0.5, abs=0.03)
+    assert found.label_scores(labels, 7) is None
+    missing = surface_correspondence(Mesh(result.vertices, result.faces[:2]), truth, 4000)
+    assert missing.label_scores(labels, 9)["chamfer_mm"] > 1000.0
+    assert missing.label_scores(labels, 9)["normal_angle_deg"] == 90.0
 
 
 @pytest.mark.parametrize(("height_m", "f_score"), [(0.0049, 1.0), (0.0051, 0.0)])

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.avatar.gltf import encode_glb
+from pipeline.capture.frame_selection import INTERLEAVED_RULE
 from pipeline.core.manifest import Manifest
 from pipeline.report.page import FrameImages, PageContent
 from pipeline.report.report_json import build_report, replace_nonfinite
@@ -38,7 +39,9 @@ def sample_report(first_psnr: float = 30.0, manifests: dict[str, Manifest] | Non
     environment = {"cpu": "a <processor>", "cores": 2, "packages": {"torch": "2"}}
     rows = sample_rows(first_psnr)
     return replace_nonfinite(
-        build_report(manifests or sample_manifests(), rows, metric_sections, environment, (7.0, 700.0))
+        build_report(
+            manifests or sample_manifests(), rows, metric_sections, environment, (7.0, 700.0), INTERLEAVED_RULE
+        )
     )
 
 

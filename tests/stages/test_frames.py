@@ -18,7 +18,7 @@ from tests.capture.test_exif_focal import tiff, with_exif
 from tests.capture.test_smpl_poses import make_poses
 
 
-def draw_recording(folder, n=40, repeats=1):
+def draw_recording(folder, n=40, repeats=1, turns=1):
     """A block that walks, each picture `repeats` times, with masks, landmarks that turn around, and a camera."""
     (folder / "masks").mkdir(parents=True)
     rng = np.random.default_rng(0)
@@ -26,7 +26,7 @@ def draw_recording(folder, n=40, repeats=1):
     world = np.zeros((n, 33, 3))
     for k in range(n):
         place = k // repeats
-        yaw = 2 * np.pi * k / n
+        yaw = 2 * np.pi * turns * k / n
         world[k, [11, 23]] = 0.2 * np.array([np.cos(yaw), 0, np.sin(yaw)])
         mask = np.zeros((96, 128), np.uint8)
         mask[20:80, place : place + 40] = 255
@@ -72,6 +72,49 @@ def test_duplicates_are_dropped_and_the_rest_is_thinned_out(tmp_path):
     assert capture.frame_index[-1] == 78
 
 
+def test_the_last_of_several_turns_is_held_out(tmp_path):
+    """72 frames of three turns: frames 48 to 71 are judged, 45 to 47 are in no split, all before are learnt from."""
+    metrics = run(draw_recording(tmp_path / "in", n=72, turns=3), tmp_path / "out", split="disjoint")
+    capture = load_capture(tmp_path / "out")
+    assert metrics["turns"] == pytest.approx(3 * 71 / 72, abs=0.02)
+    heldout, validation, train = (capture.frame_index[capture.positions(kind)] for kind in (2, 1, 0))
+    assert heldout.min() == pytest.approx(48, abs=1)
+    assert heldout.max() == 71
+    assert max(train.max(), validation.max()) == pytest.approx(heldout.min() - 4, abs=1)
+    assert (validation % 8 == 4).all()
+    assert 0 in train  # held out in the interleaved split
+    assert capture.split_rule == "disjoint: the last of 3 turns held out"
+
+
+def test_the_last_quarter_of_a_single_turn_is_held_out(tmp_path):
+    run(draw_recording(tmp_path / "in", n=40), tmp_path / "out", split="disjoint")
+    capture = load_capture(tmp_path / "out")
+    np.testing.assert_array_equal(capture.frame_index[capture.positions(2)], range(30, 40))
+    assert capture.frame_index[capture.split != 2].max() == 27  # two frames of guard
+    assert capture.split_rule == "disjoint: the last quarter held out"
+
+
+def test_disjoint_frames_do_not_cost_training_frames(tmp_path):
+    """Of equal numbers of frames, the same eighths are held out and used for validation."""
+    folder = draw_recording(tmp_path / "in", n=80, turns=2)
+    counts = []
+    for split in ("interleaved", "disjoint"):
+        metrics = run(folder, tmp_path / split, split=split, max_frames=32)
+        counts.append([metrics[f"frames_{kind}"] for kind in ("train", "validation", "heldout")])
+    assert counts == [[24, 4, 4], [24, 4, 4]]
+
+
+def test_a_disjoint_split_of_a_short_recording_is_refused_with_advice(tmp_path):
+    with pytest.raises(UserError, match=r"only 14 frames .* 16 are needed; use --set frames.split=interleaved, film"):
+        run(draw_recording(tmp_path / "in", n=16), tmp_path / "out", split="disjoint")
+
+
+def test_a_supplied_split_and_a_disjoint_one_exclude_each_other(tmp_path):
+    folder = write_split(draw_recording(tmp_path / "in", n=40), range(20), [35])
+    with pytest.raises(UserError, match=r"has a split.json, which frames.split=disjoint would ignore; remove one"):
+        run(folder, tmp_path / "out", split="disjoint")
+
+
 def write_split(folder, train, heldout):
     (folder / "split.json").write_text(json.dumps({"train": list(train), "heldout": list(heldout)}))
     return folder
@@ -85,6 +128,7 @@ def test_a_supplied_split_is_kept_frame_by_frame(tmp_path):
     np.testing.assert_array_equal(capture.frame_index, [*range(3, 24), *range(30, 40, 3)])
     np.testing.assert_array_equal(capture.frame_index[capture.positions(2)], range(30, 40, 3))
     np.testing.assert_array_equal(capture.frame_index[capture.positions(1)], [7, 15, 23])
+    assert capture.split_rule == "split.json"
     assert (metrics["frames_train"], metrics["frames_validation"], metrics["frames_heldout"]) == (18, 3, 4)
     assert metrics["dropped_duplicates"] == 0
 

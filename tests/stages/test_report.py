@@ -26,7 +26,7 @@ CONFIG = Config(
     turntable_views=4,
     fit_held_out_poses=True,
 )
-SETTINGS = ReportSettings(turntable_height_px=64, pose_fit_steps=5)
+SETTINGS = ReportSettings(turntable_height_px=64, clay_head_height_px=64, pose_fit_steps=5)
 QUICK = Config(samples_per_pixel_side=1, max_page_frames=1, turntable_views=2, score_unrefined_mesh=False)
 
 
@@ -143,6 +143,16 @@ def test_sheets_show_the_avatar(out: Path):
     assert turntable.shape[0] > 2 * SETTINGS.turntable_height_px
     assert (turntable < 200).any(axis=2).mean() > 0.1
     assert cv2.imread(str(out / "heldout.jpg")) is not None
+    clay = cv2.imread(str(out / "clay.jpg"))
+    assert clay.shape[0] > 4 * SETTINGS.turntable_height_px  # smooth, flat, normals, head
+    smooth = clay[: SETTINGS.turntable_height_px].astype(int)
+    assert np.abs(smooth - smooth.mean(axis=2, keepdims=True)).max() < 12  # grey, but for the compression
+    page = (out / "index.html").read_text()
+    titles = re.findall(r'class="card turntable"><h3>([^<]*)</h3>', page)
+    assert [title.split(":")[0] for title in titles] == [
+        *("A-pose", "A-pose, clay", "A-pose, clay, flat shading", "A-pose, canonical normals", "Head, clay"),
+        *("Pose of frame 8, held out", "Pose of frame 8, held out, clay"),
+    ]
 
 
 def test_without_held_out_frames_the_reason_is_named(inputs: dict[str, Path], tmp_path: Path):

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sparse
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from scipy.spatial import ConvexHull
 
 from data_tools.synthetic.person.anatomy import SKIN, SKIRT, Anatomy, compute_arm_head_weights, label_faces
@@ -24,6 +24,7 @@ from data_tools.synthetic.person.surface import (
     smooth_laplacian,
     subdivide_at_midpoints,
 )
+from data_tools.synthetic.rig.labels import body_part_names
 from pipeline.body.body import AnnyBody, Body
 from pipeline.geometry.mesh import Mesh
 
@@ -82,12 +83,22 @@ def add_clothing(model: AnnyBody, body: Body, anatomy: Anatomy, outfit: Outfit, 
     clothed = ClothedSurface(
         clothed_body, append_midpoint_values(model.uv, uv_pairs), faces_uv, drape, arm_head_weights, labels
     )
-    return _add_skirt(clothed, anatomy, noise) if outfit.legwear == "skirt" else clothed
+    return _add_skirt(clothed, anatomy, noise, outfit.hem_flare_m) if outfit.legwear == "skirt" else clothed
 
 
-def _add_skirt(person: ClothedSurface, anatomy: Anatomy, noise: ValueNoise) -> ClothedSurface:
+def surface_names(person: ClothedSurface, anatomy: Anatomy, outfit: Outfit) -> Shaped[np.ndarray, "f"]:
+    """Return for each face the garment that covers it (`LAYERS`, skirt), or the body part whose skin it is."""
+    names = body_part_names(person.body)
+    depths_m = compute_layer_depths_m(person.drape_m, person.arm_head_weights, anatomy, outfit)[person.body.faces]
+    for column, layer in enumerate(LAYERS):
+        names[(depths_m[:, :, column].mean(axis=1) > 0.0) & (person.labels == SKIN)] = layer
+    names[person.labels == SKIRT] = "skirt"
+    return names
+
+
+def _add_skirt(person: ClothedSurface, anatomy: Anatomy, noise: ValueNoise, hem_flare_m: float) -> ClothedSurface:
     """Add the skirt; the UV charts of the body are scaled down to free the top of the atlas."""
-    skirt_mesh = build_skirt(person.body, person.arm_head_weights[:, 0], anatomy, noise)
+    skirt_mesh = build_skirt(person.body, person.arm_head_weights[:, 0], anatomy, noise, hem_flare_m)
     worn, start, start_uv = person.body, len(person.body.vertices), len(person.uv)
     body = replace(
         worn,

@@ -16,6 +16,9 @@ LEGWEAR = ("trousers", "skirt")
 TUCKED_SHIRT_BELOW_HIPS_M = -0.03
 """`Outfit.shirt_below_hips_m` of a shirt that is tucked into a skirt."""
 
+HEM_FLARE_M = 0.07
+"""Default of `Outfit.hem_flare_m`."""
+
 Colour = tuple[float, float, float]
 
 
@@ -28,6 +31,7 @@ class Outfit:
         sleeve_fraction: length of the sleeve relative to the upper arm.
         shirt_below_hips_m: height of the hips above the hem of the shirt.
         plaid: second colour of the skirt.
+        hem_flare_m: additional radius of the skirt at the hem, compared with cloth that falls straight.
     """
 
     legwear: str
@@ -43,6 +47,7 @@ class Outfit:
     iris: Colour
     skin: Colour
     print_text: str
+    hem_flare_m: float = HEM_FLARE_M
 
 
 _SHIRTS: tuple[tuple[Colour, Colour], ...] = (

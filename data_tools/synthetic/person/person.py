@@ -1,14 +1,17 @@
 """Generate the built-in clothed person from the parametric body model Anny; no download is needed."""
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
 from data_tools.synthetic.person.anatomy import measure_anatomy
-from data_tools.synthetic.person.dressing import add_clothing
+from data_tools.synthetic.person.dressing import add_clothing, surface_names
 from data_tools.synthetic.person.noise import ValueNoise
-from data_tools.synthetic.person.outfit import choose_outfit
+from data_tools.synthetic.person.outfit import HEM_FLARE_M, choose_outfit
 from data_tools.synthetic.person.painting import paint_texture
+from data_tools.synthetic.rig.labels import labels_from_names
 from data_tools.synthetic.rig.subject import Subject
 from pipeline.body.body import AnnyBody, Body, load_anny
 from pipeline.io.image import to_uint8
@@ -24,14 +27,21 @@ _PHENOTYPES = {
 """Mean and half range over seeds of each Anny phenotype; values are clipped to [0, 1]."""
 
 
-def make_person(seed: int, texture_px: int = 2048, legwear: str = "trousers") -> tuple[Subject, Body]:
-    """Return the clothed, textured person of a seed, and the body without clothes; equal seeds give equal arrays."""
-    model, noise, outfit = load_anny(), ValueNoise(seed), choose_outfit(seed, legwear)
+def make_person(
+    seed: int, texture_px: int = 2048, legwear: str = "trousers", hem_flare_m: float = HEM_FLARE_M
+) -> tuple[Subject, Body]:
+    """Return the clothed, textured person of a seed, and the body without clothes; equal seeds give equal arrays.
+
+    texture_px: side of the texture. legwear, hem_flare_m: see `Outfit`.
+    """
+    model, noise = load_anny(), ValueNoise(seed)
+    outfit = replace(choose_outfit(seed, legwear), hem_flare_m=hem_flare_m)
     bare = model.at_shape(_shape(model, seed))
     anatomy = measure_anatomy(model, bare)
     clothed = add_clothing(model, bare, anatomy, outfit, noise)
     texture = to_uint8(paint_texture(clothed, anatomy, outfit, noise, texture_px))
-    return Subject(clothed.body, clothed.uv, clothed.faces_uv, texture), bare
+    labels = labels_from_names(surface_names(clothed, anatomy, outfit))
+    return Subject(clothed.body, clothed.uv, clothed.faces_uv, texture, labels), bare
 
 
 def _shape(model: AnnyBody, seed: int) -> Float[Tensor, "p"]:

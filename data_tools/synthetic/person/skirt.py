@@ -23,9 +23,6 @@ THICKNESS_M = 0.004
 EASE_M = 0.006
 """Distance between the skirt and the surface below it, at the waist."""
 
-HEM_FLARE_M = 0.07
-"""Additional radius at the hem, compared with cloth that falls straight."""
-
 PLEAT_DEPTH_M = 0.028
 """Depth of the pleats at the hem."""
 
@@ -50,14 +47,17 @@ class SkirtMesh:
     skin_weights: Float[np.ndarray, "v j"]
 
 
-def build_skirt(body: Body, arm_weights: Float[np.ndarray, "v"], anatomy: Anatomy, noise: ValueNoise) -> SkirtMesh:
+def build_skirt(
+    body: Body, arm_weights: Float[np.ndarray, "v"], anatomy: Anatomy, noise: ValueNoise, hem_flare_m: float
+) -> SkirtMesh:
     """Fit a skirt around a clothed person in the A-pose.
 
-    arm_weights: skin weight of each vertex on the arms, in [0, 1]; vertices on arms are ignored.
+    arm_weights: skin weight of each vertex on the arms, in [0, 1]; vertices on arms are ignored. hem_flare_m: see
+    `Outfit`.
     """
     waist_to_hem = np.linspace(0.0, 1.0, ROWS)
     trunk = arm_weights < _MAX_ARM_WEIGHT
-    outer_surface = _outer_surface_m(body.vertices[trunk], waist_to_hem, anatomy, noise)
+    outer_surface = _outer_surface_m(body.vertices[trunk], waist_to_hem, anatomy, noise, hem_flare_m)
     axis = _axis_m(outer_surface[:, 0, 1], anatomy)[:, None]
     inwards = axis - outer_surface
     inside = outer_surface + THICKNESS_M * inwards / np.linalg.norm(inwards, axis=2, keepdims=True)
@@ -78,7 +78,11 @@ def waist_and_hem_m(anatomy: Anatomy) -> tuple[float, float]:
 
 
 def _outer_surface_m(
-    trunk_m: Float[np.ndarray, "n 3"], waist_to_hem: Float[np.ndarray, "r"], anatomy: Anatomy, noise: ValueNoise
+    trunk_m: Float[np.ndarray, "n 3"],
+    waist_to_hem: Float[np.ndarray, "r"],
+    anatomy: Anatomy,
+    noise: ValueNoise,
+    hem_flare_m: float,
 ) -> Float[np.ndarray, "r c 3"]:
     """Return positions of the outer side; rows from waist (0) to hem (1), columns from +X towards +Z."""
     top, hem = waist_and_hem_m(anatomy)
@@ -87,7 +91,7 @@ def _outer_surface_m(
     angle = 2.0 * np.pi * np.arange(COLUMNS) / COLUMNS
     outwards = np.stack([np.cos(angle), np.zeros(COLUMNS), np.sin(angle)], axis=1)
     body = np.stack([_hull_radius_m(trunk_m, middle, outwards) for middle in axis])
-    radius = np.maximum.accumulate(body) + EASE_M + HEM_FLARE_M * waist_to_hem[:, None]
+    radius = np.maximum.accumulate(body) + EASE_M + hem_flare_m * waist_to_hem[:, None]
     ring = np.broadcast_to(outwards, (ROWS, COLUMNS, 3)) * 0.3 + np.array([0.0, 0.2, 0.0]) * waist_to_hem[:, None, None]
     pleat_phase_noise = noise(ring.reshape(-1, 3).astype(np.float32), 0.11, order=3).reshape(ROWS, COLUMNS)
     pleats = 0.5 + 0.5 * np.cos(N_PLEATS * angle + 1.2 * pleat_phase_noise)

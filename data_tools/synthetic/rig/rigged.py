@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
+from data_tools.synthetic.rig.labels import body_part_names, labels_from_names
 from data_tools.synthetic.rig.subject import Subject
 from pipeline.body.body import Body
 from pipeline.core.errors import UserError
@@ -63,7 +64,8 @@ def read_rigged_person(path: Path) -> Subject:
         skin_weights=np.concatenate(weights).astype(np.float32),
         shape={},
     )
-    return Subject(_rebind_in_a_pose(body), uv, faces.copy(), texture)
+    labels = labels_from_names(body_part_names(body))
+    return Subject(_rebind_in_a_pose(body), uv, faces.copy(), texture, labels)
 
 
 def _select_joints(glb: GlbFile, skin: int) -> tuple[Int[np.ndarray, "n"], list[int], Int[np.ndarray, "j"]]:

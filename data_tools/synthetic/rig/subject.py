@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
+from data_tools.synthetic.rig.labels import FaceLabels, load_labels, save_labels
 from pipeline.body.body import Body
 from pipeline.body.files import load_body, save_body
 from pipeline.io.image import read_rgb, to_float, write_rgb
@@ -23,12 +24,14 @@ class Subject:
         uv: origin bottom-left; row 0 of the texture is at v = 1.
         faces_uv: indices into `uv` of the corners of `body.faces`.
         texture: sRGB.
+        labels: of the faces; None if unknown.
     """
 
     body: Body
     uv: Float[np.ndarray, "t 2"]
     faces_uv: Int[np.ndarray, "f 3"]
     texture: UInt8[np.ndarray, "th tw 3"]
+    labels: FaceLabels | None = None
 
     @cached_property
     def _texture_tensor(self) -> Tensor:
@@ -40,14 +43,17 @@ class Subject:
 
 
 def save_subject(folder: Path, subject: Subject) -> None:
-    """Write `clothed.npz` (a Body), `uv.npz` and `texture.png`."""
+    """Write `clothed.npz` (a Body), `uv.npz`, `texture.png`, and `labels.npz` if the labels are known."""
     save_body(folder / "clothed.npz", subject.body)
     save_npz(folder / "uv.npz", {"uv": subject.uv, "faces_uv": subject.faces_uv})
     write_rgb(folder / "texture.png", subject.texture)
+    if subject.labels is not None:
+        save_labels(folder, subject.labels)
 
 
 def load_subject(folder: Path) -> Subject:
-    """Read the files of `save_subject`. UserError if a file is missing."""
+    """Read the files of `save_subject`. UserError if a file other than `labels.npz` is missing."""
     layout = load_npz(folder / "uv.npz")
     body = load_body(folder / "clothed.npz")
-    return Subject(body, layout["uv"], layout["faces_uv"], read_rgb(folder / "texture.png"))
+    texture, labels = read_rgb(folder / "texture.png"), load_labels(folder)
+    return Subject(body, layout["uv"], layout["faces_uv"], texture, labels)

@@ -165,8 +165,9 @@ def _frames(capture: SyntheticCapture, masks: Path) -> Iterator[UInt8[np.ndarray
 def write_ground_truth(truth: Path, capture: SyntheticCapture, bare: Body | None, settings: dict[str, object]) -> None:
     """Write everything that determines the pixels; `masks/` is already written.
 
-    `clothed.npz` (Body: canonical clothed surface and skeleton), `uv.npz`, `texture.png`, `bare.npz` (Body without
-    clothes, if known), `motion.npz`, `camera.npz`, `room.png`, `capture_settings.json`.
+    `clothed.npz` (Body: canonical clothed surface and skeleton), `uv.npz`, `texture.png`, `labels.npz` (garment or body
+    part of each face, if known), `bare.npz` (Body without clothes, if known), `motion.npz`, `camera.npz`, `room.png`,
+    `capture_settings.json`.
     """
     save_subject(truth, capture.subject)
     if bare is not None:

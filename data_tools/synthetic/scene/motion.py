@@ -26,6 +26,25 @@ _SWAY: dict[str, tuple[tuple[float, float, float], float]] = {
 }
 """Amplitude (radians about x, y, z) and period (s) of the slow oscillation of each joint."""
 
+_POSTURE: dict[str, tuple[tuple[float, float, float], float]] = {
+    "LeftArm": ((0.10, 0.05, 0.21), 1.0),
+    "RightArm": ((0.10, 0.05, 0.21), 1.2),
+    "LeftForeArm": ((0.05, 0.12, 0.08), 0.9),
+    "RightForeArm": ((0.05, 0.12, 0.08), 1.1),
+    "Neck": ((0.05, 0.11, 0.02), 0.8),
+    "Head": ((0.07, 0.18, 0.03), 0.9),
+    "Spine1": ((0.05, 0.05, 0.03), 1.3),
+    "LeftUpLeg": ((0.04, 0.03, 0.05), 1.5),
+    "RightUpLeg": ((0.04, 0.03, 0.05), 1.3),
+}
+"""Amplitude (radians about x, y, z) and period (turns) of the posture that changes over several turns.
+
+The slow part of each signal has 1.6 times the period, so no two turns are equal.
+"""
+
+_HIP_SHIFT_RAD, _HIP_SHIFT_TURNS = 0.05, 1.6
+"""Pelvis tilt of standing on one leg and then on the other, and its period in turns."""
+
 BREATH_PERIOD_S = 3.6
 
 NOVEL_POSES: dict[str, JointAngles] = {
@@ -58,9 +77,15 @@ NOVEL_POSES: dict[str, JointAngles] = {
 
 
 def turn_in_a_pose(
-    body: Body, frame_count: int, fps: float, ground_m: Float[np.ndarray, "3"], seed: int, arc_deg: float = 360.0
+    body: Body,
+    frame_count: int,
+    fps: float,
+    ground_m: Float[np.ndarray, "3"],
+    seed: int,
+    arc_deg: float = 360.0,
+    turns: int = 1,
 ) -> Motion:
-    """Generate one full turn on the spot with swaying arms, breathing and weight shift between the feet.
+    """Generate full turns on the spot with swaying arms, breathing and weight shift between the feet.
 
     The last frame is one step before the heading of the first frame, so that headings are evenly spaced.
 
@@ -68,6 +93,8 @@ def turn_in_a_pose(
         ground_m: world position between the feet, metres.
         seed: of the phases of the sway.
         arc_deg: total angle; below 360 the person turns by half of it to each side and back.
+        turns: number of full turns; with more than one the posture (arms, head, weight, legs) changes smoothly within
+            and between them, by up to about 15 degrees.
     """
     time_s = np.arange(frame_count) / fps
     random = np.random.default_rng([seed, 2])
@@ -77,6 +104,9 @@ def turn_in_a_pose(
     _breathe(axis_angles, body, time_s)
     _shift_weight(axis_angles, body, time_s)
     turn_fraction = np.arange(frame_count) / frame_count
+    if turns > 1:
+        _change_posture(axis_angles, body, turns * turn_fraction, random)
+        turn_fraction = turns * turn_fraction
     heading = 2.0 * np.pi * (turn_fraction + 0.012 * np.sin(4.0 * np.pi * turn_fraction))
     if arc_deg < 360.0:
         heading = np.radians(0.5 * arc_deg) * np.sin(heading)
@@ -134,11 +164,22 @@ def _breathe(axis_angles: np.ndarray, body: Body, time_s: np.ndarray) -> None:
         _add_rotation(axis_angles, body, name, breath[:, None] * amplitude_rad)
 
 
-def _shift_weight(axis_angles: np.ndarray, body: Body, time_s: np.ndarray) -> None:
-    """Add the pelvis tilt of shifting weight, in place; legs and spine compensate it."""
-    tilt_rad = 0.022 * np.sin(2.0 * np.pi * time_s / 2.1)
+def _change_posture(axis_angles: np.ndarray, body: Body, turned: np.ndarray, random: np.random.Generator) -> None:
+    """Add the slow change of posture over several turns, in place; `turned` is the number of turns at each frame."""
+    for name, (amplitude_rad, period_turns) in _POSTURE.items():
+        _add_rotation(axis_angles, body, name, _smooth_random_signals(turned, period_turns, random) * amplitude_rad)
+    _tilt_pelvis(axis_angles, body, _HIP_SHIFT_RAD * np.sin(2.0 * np.pi * turned / _HIP_SHIFT_TURNS))
+
+
+def _tilt_pelvis(axis_angles: np.ndarray, body: Body, tilt_rad: np.ndarray) -> None:
+    """Tilt the pelvis to the side, in place; legs and spine compensate it."""
     for name, sign in (("Hips", 1.0), ("LeftUpLeg", -1.0), ("RightUpLeg", -1.0), ("Spine", -1.0)):
         _add_rotation(axis_angles, body, name, tilt_rad[:, None] * (0.0, 0.0, sign))
+
+
+def _shift_weight(axis_angles: np.ndarray, body: Body, time_s: np.ndarray) -> None:
+    """Add the pelvis tilt of shifting weight, in place; legs and spine compensate it."""
+    _tilt_pelvis(axis_angles, body, 0.022 * np.sin(2.0 * np.pi * time_s / 2.1))
     step = np.maximum(np.sin(2.0 * np.pi * time_s / 1.05), 0.0), np.maximum(-np.sin(2.0 * np.pi * time_s / 1.05), 0.0)
     for side, lift in zip(("Left", "Right"), step, strict=True):
         for part, angle in (("UpLeg", -0.07), ("Leg", 0.13), ("Foot", -0.06)):

@@ -58,6 +58,7 @@ def capture_parser(command: str, description: str) -> argparse.ArgumentParser:
         default=360.0,
         help="angle of the turn in degrees; below 360 the person turns to both sides and back",
     )
+    parser.add_argument("--turns", type=int, help="full turns in the frames, each in another posture; 1 if absent")
     parser.add_argument("--ball", action="store_true", help="add a juggled ball that occludes the person")
     parser.add_argument("--start", type=float, default=0.0, help="first time of the BVH motion to use, seconds")
     parser.add_argument(
@@ -83,6 +84,8 @@ def validate_capture_options(options: argparse.Namespace) -> None:
         ("fill", MIN_FILL, MAX_FILL),
         ("samples", 1, 8),
         ("arc", 0.0, 360.0),
+        ("turns", 1, 20),
+        ("flare_m", 0.0, 0.6),
         ("novel_views", 0, 1000),
         ("novel_poses", 0, 1000),
         ("texture", 64, 8192),
@@ -90,8 +93,10 @@ def validate_capture_options(options: argparse.Namespace) -> None:
     )
     for name, low, high in bounds:
         value = getattr(options, name, low)
-        if not low <= value <= high:
+        if value is not None and not low <= value <= high:
             raise UserError(f"--{name.replace('_', '-')} {value} is out of range; choose a value from {low} to {high}")
+    if options.turns is not None and (options.bvh or options.arc < 360.0):
+        raise UserError("--turns is for the full turn in A-pose; remove it, or --bvh and --arc")
     if options.size % 2:
         raise UserError(f"--size {options.size} is odd; H.264 needs an even size: choose {options.size + 1}")
 
@@ -122,7 +127,7 @@ def build_motion(options: argparse.Namespace, body: Body, ground_m: np.ndarray) 
     if options.bvh:
         full_motion = retarget(read_bvh(options.bvh), body, ground_m, options.in_place)
         return resample_motion(full_motion, options.start, options.frames, options.fps)
-    return turn_in_a_pose(body, options.frames, options.fps, ground_m, options.seed, options.arc)
+    return turn_in_a_pose(body, options.frames, options.fps, ground_m, options.seed, options.arc, options.turns or 1)
 
 
 def build_novel_poses(options: argparse.Namespace, body: Body, ground_m: np.ndarray) -> Motion | None:

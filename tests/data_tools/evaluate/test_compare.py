@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from data_tools.command import run_command
+from data_tools.evaluate import compare
 from data_tools.evaluate.compare import main as compare_command
 from data_tools.evaluate.compare_body import (
     compare_body,
@@ -15,6 +16,7 @@ from data_tools.evaluate.compare_body import (
     joint_accelerations,
     left_right_swapped_frames,
 )
+from data_tools.evaluate.page import LIT_NOTE
 from data_tools.evaluate.truth import load_true_mask
 from pipeline.body.files import load_body, load_camera, load_motion, save_body, save_camera, save_motion
 from pipeline.core.errors import UserError
@@ -132,3 +134,14 @@ def test_command_prints_scores_of_finished_stages(sample: Path, run: Path, capsy
     printed = capsys.readouterr().out
     assert "mask_iou_median" in printed
     assert "joint_error_mm" in printed
+
+
+@pytest.mark.parametrize(("light", "is_said"), [("flat", False), (LIT_NOTE, True)])
+def test_command_says_where_the_light_is_not_flat(
+    light: str, is_said: bool, run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (run / "report").mkdir()
+    (run / "report" / "manifest.json").write_text("{}")
+    monkeypatch.setattr(compare, "write_comparison", lambda out, run_dir, measured: {"light": light})
+    assert run_command(compare_command, ["capture", str(run)]) == 0
+    assert ("--light flat" in capsys.readouterr().out) == is_said

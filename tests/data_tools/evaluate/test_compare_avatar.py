@@ -37,18 +37,12 @@ from pipeline.metrics.alignment import SimilarityTransform
 from pipeline.metrics.images import composite_on_white, frame_scores
 from tests.data_tools.ground_truth_run import (
     bent_arm,
-    ground_truth_run,
     with_frames,
     with_longer_focal,
     with_motion,
     with_raised_rest_arm,
     with_scale,
 )
-
-
-@pytest.fixture(scope="module")
-def perfect(sample: Path, tmp_path_factory: pytest.TempPathFactory) -> Comparison:
-    return ground_truth_run(sample, tmp_path_factory.mktemp("perfect"))
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +54,8 @@ def test_ground_truth_has_no_error(perfect: Comparison) -> None:
     for scores in (compare_rest_surfaces(perfect), compare_heldout_surfaces(perfect)):
         assert scores["chamfer_mm"] < 0.2  # four joints a vertex are kept in the export
         assert scores["f_score"] > 0.999
+        assert scores["normal_angle_deg"] < 1.0
+        assert scores["far_area_share"] == 0.0
         assert scores["scale_to_truth"] == pytest.approx(1.0, abs=1e-3)
     texture = compare_texture(perfect)
     assert texture["coverage"] == 1.0

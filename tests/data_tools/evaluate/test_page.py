@@ -32,7 +32,7 @@ def sections() -> tuple[dict[str, Any], dict[str, list[ImagePair]]]:
     avatar = (truth / 255.0).astype(np.float32)
     avatar[..., :3] = 0.0
     images = {"upper_bound": SCORES, "novel_views": {"psnr_full": float("inf"), "psnr_body": 10.0}}
-    return {"mesh": SURFACE, "texture": {"coverage": 0.75}, "images": images}, {
+    return {"mesh": SURFACE, "light": "flat", "texture": {"coverage": 0.75}, "images": images}, {
         "novel_views": [ImagePair(truth, avatar)]
     }
 

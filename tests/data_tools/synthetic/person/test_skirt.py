@@ -11,6 +11,7 @@ from data_tools.evaluate.truth import verify_ground_truth
 from data_tools.sample import main as make_sample
 from data_tools.synthetic.person.anatomy import measure_anatomy
 from data_tools.synthetic.person.outfit import LAYERS, choose_outfit, compute_layer_depths_m
+from data_tools.synthetic.person.person import make_person
 from data_tools.synthetic.person.skirt import COLUMNS, ROWS, THICKNESS_M, waist_and_hem_m
 from data_tools.synthetic.rig.subject import Subject, load_subject
 from pipeline.body.body import Body, load_anny
@@ -49,6 +50,34 @@ def test_skirt_is_one_closed_ring(person: Subject) -> None:
     assert skirt.euler_number == 0
     assert skirt.body_count == 1
     assert skirt.volume == pytest.approx(THICKNESS_M * skirt.area / 2, rel=0.15)
+
+
+def test_flare_widens_the_hem_only() -> None:
+    """The waist keeps its width; the mean radius of the hem grows by the difference of the flares."""
+    rings = []
+    for hem_flare_m in (0.07, 0.24):
+        made, _ = make_person(0, 64, "skirt", hem_flare_m)
+        outside = made.body.vertices[-2 * ROWS * COLUMNS : -ROWS * COLUMNS].reshape(ROWS, COLUMNS, 3)
+        centre = outside.mean(axis=1, keepdims=True)
+        rings.append(np.linalg.norm((outside - centre)[..., [0, 2]], axis=2).mean(axis=1))
+    assert rings[1][0] == pytest.approx(rings[0][0], abs=1e-4)
+    assert rings[1][-1] - rings[0][-1] == pytest.approx(0.17, abs=0.01)
+
+
+def test_labels_name_garments_and_body_parts(person: Subject) -> None:
+    labels = person.labels
+    assert labels is not None
+    assert {"arms", "hair", "hands", "head", "legs", "shirt", "shoes", "skirt"} <= set(labels.names)
+    assert "trousers" not in labels.names
+    name_of_face = np.array(labels.names)[labels.of_face]
+    assert (name_of_face[-SHEET_FACES:] == "skirt").all()
+    assert not (name_of_face[:-SHEET_FACES] == "skirt").any()
+    height_m = person.body.vertices[person.body.faces].mean(axis=1)[:, 1]
+    stature_m = person.body.height_m()
+    middle = {name: height_m[name_of_face == name].mean() / stature_m for name in labels.names}
+    assert middle["shoes"] < 0.06 < middle["legs"] < 0.5 < middle["shirt"] < 0.85 < middle["head"] < middle["hair"]
+    hands = person.body.vertices[person.body.faces[name_of_face == "hands"]].mean(axis=1)
+    assert np.abs(hands[:, 0]).min() > 0.3
 
 
 def test_skirt_spans_the_gap_between_the_legs(person: Subject, corners: np.ndarray, bare: Body) -> None:

@@ -78,6 +78,20 @@ def test_arms_are_lowered_and_keep_their_length(made_up: Path) -> None:
         assert np.allclose(box.mean(axis=0), hand, atol=1e-4)
 
 
+def test_faces_are_labelled_by_body_part(made_up: Path) -> None:
+    """Each face has the part of the joint with the largest weight at its corners."""
+    subject = read_rigged_person(made_up)
+    body, labels = subject.body, subject.labels
+    assert labels is not None
+    name_of_face = np.array(labels.names)[labels.of_face]
+    joint = body.skin_weights[body.faces].sum(axis=1).argmax(axis=1)
+    expected = {"Head": "head", "LeftFoot": "feet", "Hips": "trunk", "RightForeArm": "arms", "LeftLeg": "legs"}
+    assert set(expected.values()) | {"hands"} >= set(labels.names)
+    for name, part in expected.items():
+        found = set(name_of_face[joint == body.joint(name)].tolist())
+        assert found == {part}
+
+
 def test_capture_of_a_small_rig_is_consistent(made_up: Path, tmp_path: Path) -> None:
     main([str(made_up), str(tmp_path / "out"), *TINY])
     assert verify_ground_truth(tmp_path / "out").passes()

@@ -101,7 +101,16 @@ def test_existing_folder_is_an_error(sample: Path, capsys: pytest.CaptureFixture
 
 @pytest.mark.parametrize(
     ("option", "value"),
-    [("--frames", "1"), ("--size", "101"), ("--size", "8"), ("--fill", "1.5"), ("--samples", "0"), ("--seed", "-1")],
+    [
+        ("--frames", "1"),
+        ("--size", "101"),
+        ("--size", "8"),
+        ("--fill", "1.5"),
+        ("--samples", "0"),
+        ("--seed", "-1"),
+        ("--turns", "0"),
+        ("--flare-m", "0.7"),
+    ],
 )
 def test_options_out_of_range_are_errors(
     option: str, value: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -110,6 +119,22 @@ def test_options_out_of_range_are_errors(
     message = capsys.readouterr().err
     assert message.startswith("error: ")
     assert option in message
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "advice"),
+    [
+        (["--turns", "2", "--arc", "90"], "remove it, or --bvh and --arc"),
+        (["--turns", "2", "--bvh", "walk.bvh"], "remove it, or --bvh and --arc"),
+        (["--flare-m", "0.2"], "add --legwear skirt"),
+    ],
+)
+def test_options_that_would_have_no_effect_are_errors(
+    options: list[str], advice: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_command(main, [str(tmp_path / "out"), *options]) == 2
+    assert advice in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

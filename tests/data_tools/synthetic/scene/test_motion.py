@@ -56,6 +56,30 @@ def test_sway_is_natural(bare: Body, turn: Motion) -> None:
     assert jerk < 0.02
 
 
+@pytest.mark.parametrize("turns", [2, 3])
+def test_several_turns_in_postures_that_differ(bare: Body, turns: int) -> None:
+    """Arms rise and fall by more than ten degrees, also from one turn to the next, without jumps."""
+    motion = turn_in_a_pose(bare, 48 * turns, 24.0, GROUND_M, seed=0, turns=turns)
+    angles = np.unwrap(headings(motion))
+    assert angles[-1] - angles[0] == pytest.approx(2 * np.pi * turns, abs=0.3)
+    rotations = torch.from_numpy(motion.rotations_wxyz).double()
+    angle = 2.0 * torch.arccos(rotations[..., 0].abs().clamp(max=1.0))
+    assert angle[:, 1:].max() < np.radians(25.0)
+    for name in ("LeftArm", "RightArm", "Head"):
+        joint = bare.joint(name)
+        assert angle[:, joint].max() > np.radians(9.0)
+        first, second = rotations[:48, joint], rotations[48:96, joint]
+        between = 2.0 * torch.arccos((first * second).sum(1).abs().clamp(max=1.0))
+        assert between.max() > np.radians(6.0)
+    assert np.abs(np.diff(motion.rotations_wxyz[:, 1:], axis=0)).max() < 0.03
+    assert np.allclose(lowest_foot_offset_m(bare, motion), GROUND_M[1], atol=1e-5)
+
+
+def test_one_turn_is_the_default(bare: Body, turn: Motion) -> None:
+    one = turn_in_a_pose(bare, 48, 24.0, GROUND_M, seed=0, turns=1)
+    assert np.array_equal(one.rotations_wxyz, turn.rotations_wxyz)
+
+
 def test_sway_depends_on_the_seed(bare: Body, turn: Motion) -> None:
     again = turn_in_a_pose(bare, 48, 24.0, GROUND_M, seed=0)
     other = turn_in_a_pose(bare, 48, 24.0, GROUND_M, seed=1)
