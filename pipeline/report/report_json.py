@@ -16,7 +16,7 @@ PROTOCOL = (
     "divisible by eight. Field, mesh and texture were not trained on their pixels, and no decision used them. Their "
     "poses are fitted to landmarks and silhouettes, never to colours: the body stage fits every frame, and the common "
     "shape and camera, to the landmarks and masks of all frames. The field's pose corrections are interpolated in time "
-    "between training frames and constant beyond them. Frames are composited on white with the mask of the frames "
+    "between training frames and fade to zero away from them. Frames are composited on white with the mask of the frames "
     "stage, so an error of that mask costs nothing; renders are composited with their own alpha; both are rounded to 8 "
     "bits. psnr, ssim and flip (67 pixels a degree, lower is better) are means over frames: _full counts the whole "
     "image, _body the pixels of the mask, _box its bounding box. field is the radiance field; mesh is the exported "
