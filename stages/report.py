@@ -264,7 +264,7 @@ def _manifest(folder: Path) -> Manifest:
 
 STAGE = Stage(
     name="report",
-    version=4,
+    version=5,
     needs=NEEDS,
     makes=("report.json", "index.html", "turntable.jpg", "heldout.jpg"),
     config=Config,
