@@ -13,7 +13,6 @@ from torch import Tensor
 from pipeline.avatar.turntable import turntable_sheet
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.files import load_body, load_camera, load_motion, load_observations, save_motion
-from pipeline.body.fit.refit import refit_poses, select_poses
 from pipeline.body.fit.silhouette_icp import crop_mask_window
 from pipeline.capture.capture import Capture, load_capture
 from pipeline.capture.frame_selection import VALIDATION
@@ -32,7 +31,8 @@ from pipeline.geometry.surface import resolve_self_intersections
 from pipeline.io.image import to_uint8, write_rgb
 from pipeline.mesh.files import MeshArtifact, load_checkpoint, save_checkpoint, save_mesh
 from pipeline.mesh.isosurface import extract_mesh, sample_canonical_grid, select_isovalue
-from pipeline.mesh.pose_selection import is_better_motion, is_far_from, score_motion
+from pipeline.mesh.pose_refit import refit_poses, select_poses
+from pipeline.mesh.pose_selection import is_far_from, score_motion
 from pipeline.mesh.refinement import RefinementState, refine_mesh
 from pipeline.mesh.remeshing import remesh_to_edge_length
 from pipeline.mesh.settings import MeshSettings
@@ -198,8 +198,8 @@ def refit_motion(
     """Fit the frames that are not trained on to landmarks and masks through the mesh; return motion and metrics.
 
     Training frames keep the poses of the field stage. Frames near them keep the interpolated corrections, with a
-    warning, if the validation views prefer these (`is_better_motion`); frames far from them, which have no corrections,
-    keep their pose if the outline does not fit better.
+    warning, unless the validation views prefer the new poses (`MotionScores.is_better_than`). Frames far from them have
+    no corrections; they keep their poses unless the outlines of these frames fit better.
 
     validation: views of evenly spaced validation frames, from `load_views`.
     """
@@ -222,12 +222,12 @@ def refit_motion(
         score_motion(mesh, skin, shader, validation, canonical_to_world(body, poses.select(positions)))
         for poses in (motion, refitted.motion)
     ]
-    use_near = is_better_motion(scores[1], scores[0])
+    use_near = scores[1].is_better_than(scores[0])
     if not use_near:
-        warn("frames near training frames keep the interpolated corrections: poses refitted through the mesh are worse")
+        warn("frames next to training frames keep interpolated poses: validation frames prefer them to a second fit")
     return select_poses(np.where(is_far, use_far, use_near), refitted.motion, motion), {
         **{f"{name}_motion_silhouette_iou": score.silhouette_iou for name, score in zip(MOTIONS, scores, strict=True)},
-        **{f"{name}_motion_psnr_db": score.mean_psnr_db() for name, score in zip(MOTIONS, scores, strict=True)},
+        **{f"{name}_motion_psnr_db": score.psnr_db for name, score in zip(MOTIONS, scores, strict=True)},
         "refitted_frames": float(((is_far & use_far) | (~is_far & use_near) & ~is_trained).sum()),
     }
 

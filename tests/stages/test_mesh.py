@@ -12,7 +12,6 @@ from torch import Tensor
 
 from pipeline.body.body import Body, Motion
 from pipeline.body.files import load_motion, save_body, save_camera, save_motion
-from pipeline.body.fit.refit import RefittedPoses
 from pipeline.capture.capture import Capture, image_path, mask_path, save_capture
 from pipeline.capture.usable_frames import SCORES_NPZ
 from pipeline.core.errors import UserError
@@ -24,6 +23,7 @@ from pipeline.geometry.surface import isosurface
 from pipeline.io.image import read_rgb, write_gray, write_rgb
 from pipeline.io.npz import load_npz, save_npz
 from pipeline.mesh.files import load_mesh
+from pipeline.mesh.pose_refit import RefittedPoses
 from pipeline.mesh.settings import MeshSettings
 from pipeline.mesh.skin_transfer import build_skinned_topology, transfer_skin
 from pipeline.mesh.views import PosedView, render_posed_view
@@ -104,7 +104,7 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
 
 
 def refit_to(change: Callable[[Motion], Motion], iou_gain: float) -> Callable[..., RefittedPoses]:
-    """A second fit with a known result; a capsule has no joints to fit. tests/body/fit/test_refit.py fits a person."""
+    """A second fit with a known result; a capsule has no joints to fit. tests/mesh/test_pose_refit.py fits a person."""
 
     def refit(surface: Body, motion: Motion, is_fixed: np.ndarray, *_: object) -> RefittedPoses:
         assert len(surface.vertices) == len(surface.skin_weights)

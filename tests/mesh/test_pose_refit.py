@@ -9,13 +9,13 @@ import torch
 from pipeline.body.body import Body, Motion, canonical_to_world, load_anny
 from pipeline.body.fit.landmark_regressor import LANDMARK_OFFSET_COUNT, landmark_regressor
 from pipeline.body.fit.linear_body import linearise_body
-from pipeline.body.fit.refit import refit_poses, select_poses, surface_model
 from pipeline.body.fit.silhouette_icp import MaskWindow, crop_mask_window
 from pipeline.geometry.camera import project
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.rotation import axis_angle_to_quaternion, matrix_to_quaternion, quaternion_multiply
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.kernels.raster import rasterize
+from pipeline.mesh.pose_refit import refit_poses, select_poses, surface_model
 from tests.body.acting import SyntheticRecording, synthetic_recording
 
 FRAMES = 12
