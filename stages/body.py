@@ -10,7 +10,14 @@ from jaxtyping import Bool, UInt8
 from pydantic import Field
 
 from pipeline.body.body import Motion, ParametricBody, canonical_to_world, load_anny
-from pipeline.body.files import FrameScores, save_body, save_camera, save_motion, save_scores
+from pipeline.body.files import (
+    FrameScores,
+    save_body,
+    save_camera,
+    save_motion,
+    save_observations,
+    save_scores,
+)
 from pipeline.body.fit.diagnostics import (
     FRAME_RATINGS,
     finite_median,
@@ -46,6 +53,7 @@ from pipeline.geometry.camera import Camera
 from pipeline.io.image import to_uint8, write_rgb
 
 _BODY, _MOTION, _CAMERA, _OVERLAY = "body.npz", "motion.npz", "camera.npz", "overlay.png"
+_OBSERVATIONS = "observations.npz"
 _OVERLAY_FRAMES = 12
 
 
@@ -104,6 +112,7 @@ def run(
     save_body(out / _BODY, result.body)
     save_motion(out / _MOTION, motion)
     save_camera(out / _CAMERA, result.camera)
+    save_observations(out / _OBSERVATIONS, result.observations, result.landmarks_m)
     blob_shares = residual_blob_shares(result.body, canonical_to_world(result.body, motion), result.camera, masks)
     usable, training = usable_frames(result), capture.split == TRAIN
     scores = FrameScores(
@@ -281,9 +290,9 @@ def draw_overlay_grid(
 
 STAGE = Stage(
     "body",
-    version=11,
+    version=12,
     needs=("frames",),
-    makes=(_BODY, _MOTION, _CAMERA, SCORES_NPZ, _OVERLAY),
+    makes=(_BODY, _MOTION, _CAMERA, _OBSERVATIONS, SCORES_NPZ, _OVERLAY),
     config=Config,
     run=run,
 )

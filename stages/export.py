@@ -66,7 +66,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
         config.roughness,
         config.unlit,
     )
-    capture, motion = load_capture(inputs["frames"]), load_motion(inputs["field"] / "motion.npz")
+    capture, motion = load_capture(inputs["frames"]), load_motion(inputs["mesh"] / "motion.npz")
     offset_m = world_to_scene_translation_m(motion, lowest_vertex_y_m(skinned, body, motion))
     padded_motion = pad_motion_to_video(translate_motion(motion, offset_m), capture.fps, capture.n_video_frames)
     glb = encode_glb(
@@ -145,8 +145,8 @@ def asset_extras(config: Config, offset_m: Float[np.ndarray, "3"], frame_rate_hz
 
 STAGE = Stage(
     "export",
-    version=3,
-    needs=("frames", "body", "field", "mesh", "texture"),
+    version=4,
+    needs=("frames", "body", "mesh", "texture"),
     makes=("avatar.glb", "avatar.obj", "avatar.mtl", *OBJ_MAPS),
     config=Config,
     run=run,

@@ -35,6 +35,8 @@ from pipeline.io.image import read_gray, read_rgb, to_float, to_uint8, write_rgb
 
 CHECKPOINT_INTERVAL_S = 15.0
 PREVIEW_FRAMES = 4
+PSNR_DECIMALS = 2
+"""Decimals (dB) to which the PSNR of fitted and of refined poses are compared."""
 VALIDATION_FRACTIONS = (1 / 32, 1 / 16, 1 / 8, 1 / 4, 3 / 8, 1 / 2, 5 / 8, 3 / 4, 7 / 8, 1)
 """Fractions of the steps after which the validation PSNR is measured."""
 
@@ -144,9 +146,10 @@ def train_field(trainer: Trainer, validator: Validator, out: Path) -> float:
 def select_poses(
     trainer: Trainer, validator: Validator, motion: Motion
 ) -> tuple[Motion, dict[str, float], list[np.ndarray]]:
-    """Keep the pose corrections only if they raise the validation PSNR; return motion, metrics and renders.
+    """Drop the pose corrections if they lower the validation PSNR; return motion, metrics and renders.
 
-    The corrections are interpolated in time to the validation frames. Subsampled images decide
+    The corrections are interpolated in time to the validation frames. Far from the training frames they are zero there,
+    and the PSNR is equal; then they are kept, because the field was trained with them. Subsampled images decide
     (`validation_psnr_fitted_db`, `validation_psnr_refined_db`); the selected poses are rendered in full
     (`validation_psnr_db`, `validation_psnr_body_db`).
     """
@@ -162,9 +165,9 @@ def select_poses(
         f"validation_psnr_{name}_db": subsampled_validator.mean_psnr_db(subsampled_validator.render(trainer, poses))[0]
         for name, poses in pose_warps.items()
     }
-    best = max(candidates, key=lambda name: metrics[f"validation_psnr_{name}_db"])
+    best = max(reversed(candidates), key=lambda name: round(metrics[f"validation_psnr_{name}_db"], PSNR_DECIMALS))
     if refines and best == "fitted":
-        warn("the refined poses were dropped, because they did not raise the PSNR of the validation frames")
+        warn("the refined poses were dropped, because they lower the PSNR of the validation frames")
     renders = validator.render(trainer, pose_warps[best])
     psnr_db, psnr_body_db = validator.mean_psnr_db(renders)
     metrics |= {"validation_psnr_db": psnr_db, "validation_psnr_body_db": psnr_body_db}
@@ -181,7 +184,7 @@ def write_preview(path: Path, renders: list[np.ndarray], validator: Validator) -
 
 STAGE = Stage(
     "field",
-    version=15,
+    version=16,
     needs=("frames", "body"),
     makes=("field.safetensors", "occupancy.npz", "motion.npz"),
     config=FieldConfig,

@@ -1,6 +1,7 @@
-"""mesh: a watertight, manifold mesh of the canonical field, refined on the video frames."""
+"""mesh: a watertight, manifold mesh of the canonical field, refined on the video frames; poses fitted through it."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,9 @@ from pydantic import Field, ValidationInfo, field_validator
 from torch import Tensor
 
 from pipeline.avatar.turntable import turntable_sheet
-from pipeline.body.body import Body, canonical_to_world
-from pipeline.body.files import load_body, load_camera, load_motion
+from pipeline.body.body import Body, Motion, canonical_to_world
+from pipeline.body.files import load_body, load_camera, load_motion, load_observations, save_motion
+from pipeline.body.fit.silhouette_icp import crop_mask_window
 from pipeline.capture.capture import Capture, load_capture
 from pipeline.capture.frame_selection import VALIDATION
 from pipeline.capture.usable_frames import usable_training_positions
@@ -26,9 +28,11 @@ from pipeline.geometry.camera import pixel_footprint_m
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import top_k_weights
 from pipeline.geometry.surface import resolve_self_intersections
-from pipeline.io.image import write_rgb
+from pipeline.io.image import to_uint8, write_rgb
 from pipeline.mesh.files import MeshArtifact, load_checkpoint, save_checkpoint, save_mesh
 from pipeline.mesh.isosurface import extract_mesh, sample_canonical_grid, select_isovalue
+from pipeline.mesh.pose_refit import refit_poses, select_poses
+from pipeline.mesh.pose_selection import is_far_from, score_motion
 from pipeline.mesh.refinement import RefinementState, refine_mesh
 from pipeline.mesh.remeshing import remesh_to_edge_length
 from pipeline.mesh.settings import MeshSettings
@@ -39,6 +43,7 @@ from pipeline.metrics.health import mesh_quality_metrics
 
 CHECKPOINT = "checkpoint_round.safetensors"
 DEFAULT_SETTINGS = MeshSettings()
+MOTIONS = ("field", "refitted")
 
 
 class Config(BaseConfig):
@@ -68,7 +73,7 @@ class Config(BaseConfig):
 def run(
     inputs: Mapping[str, Path], out: Path, config: Config, settings: MeshSettings = DEFAULT_SETTINGS
 ) -> Mapping[str, float]:
-    """Extract and refine the mesh; write `mesh.npz` and `preview.png`.
+    """Extract and refine the mesh, and refit the motion through it; write `mesh.npz`, `motion.npz` and `preview.png`.
 
     Args:
         inputs: folders of the stages frames, body and field.
@@ -77,7 +82,8 @@ def run(
         settings: parameters that only sweeps and ablations vary.
 
     Returns:
-        The metrics of the manifest. All of them are those of the written mesh, except `initial_validation_psnr_db`.
+        The metrics of the manifest. Those of the mesh are of the written one in the poses of the field stage, except
+        `initial_validation_psnr_db`.
     """
     body = load_body(inputs["body"] / "body.npz")
     capture = load_capture(inputs["frames"])
@@ -115,6 +121,8 @@ def run(
     shader, skin, psnr_db = refinement_inputs.shader, state.skin, state.validation_psnr_db
     mesh = resolve_self_intersections(state.mesh)
     write_results(out, mesh, skin, shader)
+    motion, motion_metrics = refit_motion(capture, inputs, body, (mesh, skin, shader), validation)
+    save_motion(out / "motion.npz", motion)
     is_unchanged = mesh is state.mesh
     return {
         **{key: float(value) for key, value in mesh_quality_metrics(mesh).items()},
@@ -123,6 +131,7 @@ def run(
         "silhouette_iou": silhouette_iou(mesh, skin, validation),
         "target_edge_m": target_edge_m,
         "accepted_rounds": len(psnr_db) - 1.0,
+        **motion_metrics,
     }
 
 
@@ -179,6 +188,50 @@ def load_views(
     ]
 
 
+def refit_motion(
+    capture: Capture,
+    inputs: Mapping[str, Path],
+    body: Body,
+    shaded_mesh: tuple[Mesh, SkinnedTopology, torch.nn.Module],
+    validation: Sequence[PosedView],
+) -> tuple[Motion, dict[str, float]]:
+    """Fit the frames that are not trained on to landmarks and masks through the mesh; return motion and metrics.
+
+    Training frames keep the poses of the field stage. Frames near them keep the interpolated corrections, with a
+    warning, unless the validation views prefer the new poses (`MotionScores.is_better_than`). Frames far from them have
+    no corrections; they keep their poses unless the outlines of these frames fit better.
+
+    validation: views of evenly spaced validation frames, from `load_views`.
+    """
+    mesh, skin, shader = shaded_mesh
+    motion = load_motion(inputs["field"] / "motion.npz")
+    is_trained = np.zeros(len(capture), dtype=bool)
+    is_trained[usable_training_positions(capture, inputs["body"])] = True
+    masks = (None if is_trained[k] else to_uint8(capture.mask(k)) for k in range(len(capture)))
+    windows = [None if mask is None else crop_mask_window(mask) for mask in masks]
+    camera = load_camera(inputs["body"] / "camera.npz")
+    landmarks = load_observations(inputs["body"] / "observations.npz", motion.time_s, camera)
+    surface = replace(body, vertices=mesh.vertices, faces=mesh.faces, skin_weights=skin.weights.numpy())
+    refitted = refit_poses(surface, motion, is_trained, landmarks, windows)
+    is_far = is_far_from(motion.time_s, motion.time_s[is_trained])
+    iou_gain = np.nan_to_num(refitted.iou_after - refitted.iou_before)
+    use_far = bool(is_far.any() and iou_gain[is_far].mean() > 0.0)
+    positions = capture.positions(VALIDATION)
+    positions = positions[evenly_spaced(len(positions), len(validation))]
+    scores = [
+        score_motion(mesh, skin, shader, validation, canonical_to_world(body, poses.select(positions)))
+        for poses in (motion, refitted.motion)
+    ]
+    use_near = scores[1].is_better_than(scores[0])
+    if not use_near:
+        warn("frames next to training frames keep interpolated poses: validation frames prefer them to a second fit")
+    return select_poses(np.where(is_far, use_far, use_near), refitted.motion, motion), {
+        **{f"{name}_motion_silhouette_iou": score.silhouette_iou for name, score in zip(MOTIONS, scores, strict=True)},
+        **{f"{name}_motion_psnr_db": score.psnr_db for name, score in zip(MOTIONS, scores, strict=True)},
+        "refitted_frames": float(((is_far & use_far) | (~is_far & use_near) & ~is_trained).sum()),
+    }
+
+
 def write_results(out: Path, mesh: Mesh, skin: SkinnedTopology, shader: torch.nn.Module) -> None:
     """Write the mesh with its skin and vertex colours, and the turntable preview."""
     with torch.no_grad():
@@ -189,9 +242,9 @@ def write_results(out: Path, mesh: Mesh, skin: SkinnedTopology, shader: torch.nn
 
 STAGE = Stage(
     "mesh",
-    version=5,
+    version=6,
     needs=("frames", "body", "field"),
-    makes=("mesh.npz", "preview.png"),
+    makes=("mesh.npz", "motion.npz", "preview.png"),
     config=Config,
     run=run,
 )

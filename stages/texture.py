@@ -127,7 +127,7 @@ def load_views(
 ) -> list[BakeView]:
     """Crop at most `max_frames` evenly spaced frames of `positions` to the mesh in the pose of each frame."""
     camera = load_camera(inputs["body"] / "camera.npz")
-    transforms = canonical_to_world(body, load_motion(inputs["field"] / "motion.npz"))
+    transforms = canonical_to_world(body, load_motion(inputs["mesh"] / "motion.npz"))
     vertices = torch.from_numpy(skinned.mesh.vertices)
     weights = skinned.dense_skin_weights(len(body.joint_names))
     faces = torch.from_numpy(skinned.mesh.faces)
@@ -183,8 +183,8 @@ def bake_specular(
 
 STAGE = Stage(
     "texture",
-    version=4,
-    needs=("frames", "body", "field", "mesh"),
+    version=5,
+    needs=("frames", "body", "mesh"),
     makes=(ATLAS, DIFFUSE, SPECULAR, COVERAGE),
     config=Config,
     run=run,

@@ -29,10 +29,11 @@ class FinishedRun:
     """The artifacts of all stages up to texture.
 
     Attributes:
-        motion: of every selected frame, with the pose corrections of the field stage.
+        motion: of every selected frame; training frames have the corrections of the field stage, the others were
+            refitted through the mesh.
         field_renderer: renders the field with `camera`.
         refined_canonical_to_world: skinning matrices of `motion`.
-        fitted_canonical_to_world: skinning matrices of the body stage's motion, without these corrections.
+        fitted_canonical_to_world: skinning matrices of the body stage's motion.
     """
 
     capture: Capture
@@ -55,7 +56,7 @@ def load_finished_run(inputs: Mapping[str, Path]) -> FinishedRun:
     """
     body = load_body(inputs["body"] / "body.npz")
     camera = load_camera(inputs["body"] / "camera.npz")
-    motion = load_motion(inputs["field"] / "motion.npz")
+    motion = load_motion(inputs["mesh"] / "motion.npz")
     return FinishedRun(
         capture=load_capture(inputs["frames"]),
         camera=camera,

@@ -1,8 +1,13 @@
-"""Corrections of the fitted poses, optimised jointly with the field and smooth over time."""
+"""Corrections of the fitted poses, optimised jointly with the field and smooth over time.
+
+Corrections mend the errors of the fit in single frames, which are correlated over a quarter of a second and have zero
+mean. Between training frames they are therefore interpolated as a stationary process of this correlation time, and far
+from training frames they are zero.
+"""
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float32, Int
 from torch import Tensor
 
 from pipeline.body.body import Body, Motion
@@ -22,6 +27,9 @@ CORRECTED_JOINTS = (
     "LeftShoulder", "LeftArm", "LeftForeArm", "LeftHand", "RightShoulder", "RightArm", "RightForeArm", "RightHand",
     "LeftUpLeg", "LeftLeg", "LeftFoot", "RightUpLeg", "RightLeg", "RightFoot",
 )  # fmt: skip
+
+TYPICAL_CORRELATION_TIME_S = 0.25
+"""Correlation time of learnt corrections (docs/decisions/field.md)."""
 
 
 class PoseCorrection:
@@ -83,17 +91,55 @@ class PoseCorrection:
         return self.rotation_rad.square().sum((1, 2)).mean() + (10 * self.shift_m).square().sum(1).mean()
 
     def apply(self, motion: Motion) -> Motion:
-        """Return a motion (any frames) with the corrections interpolated to its times; constant outside."""
-        known, wanted = self.motion.time_s.astype(np.float64), motion.time_s.astype(np.float64)
-        rotation = _interpolate(wanted, known, self.rotation_rad.detach().cpu().numpy().reshape(len(known), -1))
-        shift = _interpolate(wanted, known, self.shift_m.detach().cpu().numpy())
+        """Return a motion (any frames) with the corrections interpolated to its times (`interpolate_corrections`)."""
+        known_s, wanted_s = self.motion.time_s.astype(np.float64), motion.time_s.astype(np.float64)
+        rotation_rad = self.rotation_rad.detach().cpu().numpy().reshape(len(known_s), -1)
+        rotation = interpolate_corrections(wanted_s, known_s, rotation_rad)
+        shift = interpolate_corrections(wanted_s, known_s, self.shift_m.detach().cpu().numpy())
         quaternions = torch.as_tensor(motion.rotations_wxyz).clone()
-        turn = axis_angle_to_quaternion(torch.from_numpy(rotation.reshape(len(wanted), -1, 3)))
+        turn = axis_angle_to_quaternion(torch.from_numpy(rotation.reshape(len(wanted_s), -1, 3)))
         joints = self.joints.cpu()
         quaternions[:, joints] = quaternion_multiply(quaternions[:, joints], turn)
         return motion.with_pose(quaternions.numpy(), motion.root_translation_m + shift)
 
 
-def _interpolate(wanted: np.ndarray, known: np.ndarray, values: np.ndarray) -> np.ndarray:
-    columns = [np.interp(wanted, known, values[:, column]) for column in range(values.shape[1])]
-    return np.stack(columns, axis=-1).astype(np.float32)
+def interpolate_corrections(
+    wanted_s: Float[np.ndarray, "m"], known_s: Float[np.ndarray, "n"], corrections: Float[np.ndarray, "n c"]
+) -> Float32[np.ndarray, "m c"]:
+    """Return corrections at any times from those at known times.
+
+    They are the means of a Gaussian process of zero mean with the covariance exp(-interval / correlation time), given
+    the known values (kriging). The process is Markovian, so only the two neighbours in time count: the interpolation
+    is linear over gaps that are much shorter than the correlation time, and falls to zero in longer ones and outside.
+
+    known_s: increasing, at least one.
+    """
+    correlation_s = correlation_time_s(known_s, corrections)
+    time_s = np.concatenate([[-np.inf], known_s, [np.inf]])
+    values = np.pad(corrections.astype(np.float64), ((1, 1), (0, 0)))
+    after = np.clip(np.searchsorted(time_s, wanted_s, side="right"), 1, len(time_s) - 1)
+    since = (wanted_s - time_s[after - 1]) / correlation_s
+    until = (time_s[after] - wanted_s) / correlation_s
+    # sinh(until) / sinh(since + until) and its mirror image, without overflow.
+    norm = -np.expm1(-2.0 * (since + until))
+    before_weight = np.exp(-since) * -np.expm1(-2.0 * until) / norm
+    after_weight = np.exp(-until) * -np.expm1(-2.0 * since) / norm
+    interpolated = before_weight[:, None] * values[after - 1] + after_weight[:, None] * values[after]
+    return interpolated.astype(np.float32)
+
+
+def correlation_time_s(time_s: Float[np.ndarray, "n"], corrections: Float[np.ndarray, "n c"]) -> float:
+    """Estimate the time (s) over which the correlation of corrections falls to 1 / e, from successive frames.
+
+    Pairs of frames more than twice the median interval apart are not used. The result is at least a tenth of the mean
+    interval of the pairs, and at most ten times: a longer correlation cannot be told from a constant. One frame alone
+    has `TYPICAL_CORRELATION_TIME_S`.
+    """
+    if len(time_s) < 2:
+        return TYPICAL_CORRELATION_TIME_S
+    interval_s = np.diff(time_s)
+    near = interval_s <= 2.0 * np.median(interval_s)
+    first, second = corrections[:-1][near], corrections[1:][near]
+    power = np.sqrt(np.square(first).sum() * np.square(second).sum())
+    correlation = (first * second).sum() / power if power > 0.0 else 0.0
+    return float(interval_s[near].mean() / -np.log(np.clip(correlation, np.exp(-10.0), np.exp(-0.1))))

@@ -3,7 +3,12 @@ import pytest
 import torch
 
 from pipeline.body.body import canonical_to_world, load_anny
-from pipeline.body.pose_correction import PoseCorrection
+from pipeline.body.pose_correction import (
+    TYPICAL_CORRELATION_TIME_S,
+    PoseCorrection,
+    correlation_time_s,
+    interpolate_corrections,
+)
 from tests.field.scene import make_motion
 
 
@@ -35,13 +40,56 @@ def test_applied_corrections_equal_the_optimised_ones(body, correction):
     torch.testing.assert_close(again, optimised, atol=1e-5, rtol=0)
 
 
-def test_corrections_are_interpolated(body, correction):
+def test_corrections_reach_the_frames_between_and_no_others(body, correction):
+    """Frames 0, 2, 3, 5 are learnt from; the correlation of successive corrections gives the correlation time."""
     with torch.no_grad():
-        correction.shift_m[0, 0], correction.shift_m[1, 0] = 0.02, 0.04
-    motion = make_motion(body, 6)
+        correction.shift_m[:, 0] = torch.tensor([0.02, 0.04, 0.01, 0.02])
+    motion = make_motion(body, 40)
     shift = correction.apply(motion).root_translation_m - motion.root_translation_m
-    np.testing.assert_allclose(shift[:3, 0], [0.02, 0.03, 0.04], atol=1e-6)
-    np.testing.assert_allclose(shift[5, 0], 0.0, atol=1e-6)
+    correlation = (0.02 * 0.04 + 0.04 * 0.01 + 0.01 * 0.02) / (0.02**2 + 0.04**2 + 0.01**2)
+    decay = correlation ** (1 / np.mean([2, 1, 2]))
+    np.testing.assert_allclose(shift[[0, 2, 3, 5], 0], [0.02, 0.04, 0.01, 0.02], atol=1e-6)
+    np.testing.assert_allclose(shift[1, 0], 0.06 * decay / (1 + decay**2), atol=1e-6)
+    np.testing.assert_allclose(shift[5:10, 0], 0.02 * decay ** np.arange(5), atol=1e-6)
+    assert abs(shift[30:]).max() < 1e-3
+    np.testing.assert_allclose(shift[:, 1:], 0.0, atol=1e-7)
+
+
+def test_interpolated_corrections_are_the_kriging_mean():
+    """Independent truth: the dense solution of Gaussian process regression."""
+    random = np.random.default_rng(0)
+    known_s = np.cumsum(random.uniform(0.02, 0.2, 12))
+    wanted_s = np.sort(np.concatenate([known_s[[0, 5, -1]], random.uniform(-1.0, known_s[-1] + 1.0, 40)]))
+    corrections = random.normal(size=(12, 4))
+    scale_s = correlation_time_s(known_s, corrections)
+    covariance = np.exp(-abs(known_s[:, None] - known_s) / scale_s)
+    truth = np.exp(-abs(wanted_s[:, None] - known_s) / scale_s) @ np.linalg.solve(covariance, corrections)
+    np.testing.assert_allclose(interpolate_corrections(wanted_s, known_s, corrections), truth, atol=1e-6)
+
+
+def test_corrections_of_a_short_gap_are_interpolated_linearly():
+    known_s, corrections = np.array([0.0, 0.04, 0.08, 0.12]), np.array([[1.0], [1.1], [1.2], [1.3]])
+    found = interpolate_corrections(np.array([0.01, 0.06]), known_s, corrections)
+    np.testing.assert_allclose(found[:, 0], [1.025, 1.15], atol=0.005)
+
+
+@pytest.mark.parametrize("true_s", [0.1, 0.3])
+def test_correlation_time_of_a_known_process(true_s):
+    """Ornstein-Uhlenbeck processes at uneven times; every eighth frame is missing."""
+    random, time_s = np.random.default_rng(1), np.delete(np.arange(400) / 25, np.arange(0, 400, 8))
+    decay = np.exp(-np.diff(time_s) / true_s)[:, None]
+    values = [random.normal(size=60)]
+    for factor in decay:
+        values.append(factor * values[-1] + np.sqrt(1 - factor**2) * random.normal(size=60))
+    assert correlation_time_s(time_s, np.stack(values)) == pytest.approx(true_s, rel=0.05)
+
+
+def test_correlation_time_without_evidence():
+    time_s = np.arange(4) / 25
+    assert correlation_time_s(time_s[:1], np.ones((1, 3))) == TYPICAL_CORRELATION_TIME_S
+    assert correlation_time_s(time_s, np.zeros((4, 3))) == pytest.approx(0.004)
+    assert correlation_time_s(time_s, np.ones((4, 3))) == pytest.approx(0.4)
+    assert np.isfinite(interpolate_corrections(np.linspace(-9, 9, 50), time_s, np.zeros((4, 3)))).all()
 
 
 def test_roughness_grows_with_jumps_and_falls_with_the_interval(body, correction):

@@ -52,7 +52,8 @@ def make_run(
     save_body(inputs["body"] / "body.npz", body)
     save_camera(inputs["body"] / "camera.npz", camera)
     save_npz(inputs["body"] / SCORES_NPZ, {"usable": np.ones(len(images), dtype=bool)})
-    save_motion(inputs["field"] / "motion.npz", motion)
+    for stage in ("field", "mesh"):
+        save_motion(inputs[stage] / "motion.npz", motion)
     bounds_m = np.stack([body.vertices.min(axis=0) - 0.1, body.vertices.max(axis=0) + 0.1]).astype(np.float32)
     save_field(
         inputs["field"] / "field.safetensors", RadianceField(bounds_m, hash_grid_layout(bounds_m, 0.05, 2, 2, 10))

@@ -41,7 +41,7 @@ def make_run(folder: Path) -> dict[str, Path]:
     _write_frames(inputs["frames"], avatar, canonical_to_world(body, motion))
     _write_body(inputs["body"], body, motion)
     _write_field(inputs["field"], body, motion)
-    _write_mesh_and_texture(inputs["mesh"], inputs["texture"], avatar)
+    _write_mesh_and_texture(inputs["mesh"], inputs["texture"], avatar, motion)
     glb = encode_glb(sample_skinned_mesh(body)[0], body, motion, sample_maps())
     (inputs["export"] / "avatar.glb").write_bytes(glb)
     metrics = {"body": {"landmark_error_px": 3.5, "silhouette_iou": 0.9}}
@@ -123,8 +123,9 @@ def _write_field(folder: Path, body: Body, motion: Motion) -> None:
     save_motion(folder / "motion.npz", motion)
 
 
-def _write_mesh_and_texture(mesh_dir: Path, texture_dir: Path, avatar: TexturedAvatar) -> None:
+def _write_mesh_and_texture(mesh_dir: Path, texture_dir: Path, avatar: TexturedAvatar, motion: Motion) -> None:
     indices, weights = avatar.joint_indices.numpy(), avatar.joint_weights.numpy()
+    save_motion(mesh_dir / "motion.npz", motion)
     save_mesh(mesh_dir, MeshArtifact(avatar.mesh(), indices, weights, np.full((len(weights), 3), 0.5)))
     cv2.imwrite(str(mesh_dir / "preview.png"), np.full((20, 30, 3), 60, dtype=np.uint8))
     side_px = len(avatar.diffuse)

@@ -161,11 +161,19 @@ def test_refined_poses_are_kept_if_the_psnr_rises():
     assert [int(image[0, 0, 0]) for image in renders] == [195, 195]
 
 
-@pytest.mark.parametrize("levels", [(5, 10), (5, 5)])
-def test_refined_poses_are_dropped_if_the_psnr_does_not_rise(levels):
+def test_refined_poses_are_kept_if_validation_frames_cannot_tell():
+    """Far from the training frames corrections are zero: both renders are equal."""
+    kept, metrics, _, warnings = selected((5, 5))
+    assert kept is REFINED
+    assert warnings == []
+    assert metrics["poses_kept"] == 1.0
+
+
+def test_refined_poses_are_dropped_if_they_lower_the_psnr():
+    levels = (5, 10)
     kept, metrics, renders, (warning,) = selected(levels)
     assert kept is FITTED
-    assert warning == "the refined poses were dropped, because they did not raise the PSNR of the validation frames"
+    assert warning == "the refined poses were dropped, because they lower the PSNR of the validation frames"
     assert metrics["validation_psnr_db"] == metrics["validation_psnr_fitted_db"] == pytest.approx(decibels(5))
     assert metrics["validation_psnr_refined_db"] == pytest.approx(decibels(levels[1]))
     assert metrics["poses_kept"] == 0.0

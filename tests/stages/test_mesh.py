@@ -1,5 +1,6 @@
 """The mesh stage on a small capture rendered from a known solid: its files, its metrics, and resuming."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,10 +11,11 @@ from pydantic import ValidationError
 from torch import Tensor
 
 from pipeline.body.body import Body, Motion
-from pipeline.body.files import save_body, save_camera, save_motion
+from pipeline.body.files import load_motion, save_body, save_camera, save_motion
 from pipeline.capture.capture import Capture, image_path, mask_path, save_capture
 from pipeline.capture.usable_frames import SCORES_NPZ
 from pipeline.core.errors import UserError
+from pipeline.core.progress import take_warnings
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.rotation import axis_angle_to_quaternion
@@ -21,6 +23,7 @@ from pipeline.geometry.surface import isosurface
 from pipeline.io.image import read_rgb, write_gray, write_rgb
 from pipeline.io.npz import load_npz, save_npz
 from pipeline.mesh.files import load_mesh
+from pipeline.mesh.pose_refit import RefittedPoses
 from pipeline.mesh.settings import MeshSettings
 from pipeline.mesh.skin_transfer import build_skinned_topology, transfer_skin
 from pipeline.mesh.views import PosedView, render_posed_view
@@ -78,6 +81,8 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
     """Folders of the preceding stages: a body that turns around once, and frames of the thicker capsule."""
     monkeypatch.setattr(mesh_stage, "load_field", lambda path: CapsuleField())
     monkeypatch.setattr(mesh_stage, "load_occupancy", lambda path: FullOccupancy())
+    monkeypatch.setattr(mesh_stage, "load_observations", lambda *_: (None, None))
+    monkeypatch.setattr(mesh_stage, "refit_poses", refit_to(lambda motion: motion, 0.0))
     folders = {name: tmp_path / name for name in ("frames", "body", "field")}
     for folder in (*folders.values(), folders["frames"] / "images", folders["frames"] / "masks"):
         folder.mkdir()
@@ -96,6 +101,22 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
     save_capture(capture_in(folders["frames"]))
     render_frames(folders["frames"], thick, body, motion)
     return folders
+
+
+def refit_to(change: Callable[[Motion], Motion], iou_gain: float) -> Callable[..., RefittedPoses]:
+    """A second fit with a known result; a capsule has no joints to fit. tests/mesh/test_pose_refit.py fits a person."""
+
+    def refit(surface: Body, motion: Motion, is_fixed: np.ndarray, *_: object) -> RefittedPoses:
+        assert len(surface.vertices) == len(surface.skin_weights)
+        return RefittedPoses(change(motion), np.zeros(len(is_fixed)), np.full(len(is_fixed), iou_gain))
+
+    return refit
+
+
+def shifted(motion: Motion, rows: Sequence[int], shift_m: float) -> Motion:
+    root_m = motion.root_translation_m.copy()
+    root_m[list(rows), 0] += shift_m
+    return motion.with_pose(motion.rotations_wxyz, root_m)
 
 
 def capture_in(folder: Path) -> Capture:
@@ -164,6 +185,42 @@ def test_a_run_killed_after_a_round_resumes_to_the_same_bytes(
     monkeypatch.setattr(mesh_stage, "sample_canonical_grid", None)  # the extraction must not run again
     assert run(inputs, killed, CONFIG, SETTINGS) == metrics
     assert (whole / "mesh.npz").read_bytes() == (killed / "mesh.npz").read_bytes()
+
+
+@pytest.mark.parametrize(("shift_m", "kept_m"), [(-0.05, 0.0), (0.05, 0.05)])
+def test_validation_frames_decide_on_the_refitted_motion(
+    inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shift_m: float, kept_m: float
+) -> None:
+    """Frames 0, 4, 8 are 5 cm off; the second fit moves them to the truth, or farther away."""
+    path, free = inputs["field"] / "motion.npz", (0, 4, 8)
+    truth = load_motion(path)
+    save_motion(path, shifted(truth, free, 0.05))
+    monkeypatch.setattr(mesh_stage, "refit_poses", refit_to(lambda motion: shifted(motion, free, shift_m), 0.0))
+    take_warnings()
+    metrics = run(inputs, tmp_path, CONFIG.model_copy(update={"rounds": 0}), SETTINGS)
+    np.testing.assert_array_equal(
+        load_motion(tmp_path / "motion.npz").root_translation_m, shifted(truth, free, kept_m).root_translation_m
+    )
+    assert metrics["refitted_frames"] == (3.0 if kept_m == 0.0 else 0.0)
+    assert len(take_warnings()) == (0 if kept_m == 0.0 else 1)
+
+
+@pytest.mark.parametrize(("iou_gain", "moved_m"), [(0.01, 0.5), (-0.01, 0.0)])
+def test_frames_far_from_training_frames_follow_their_own_outline(
+    inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, iou_gain: float, moved_m: float
+) -> None:
+    """Frame 8 and later are held out; from 9 s on nothing is learnt. Validation frame 4 rejects the second fit."""
+    arrays = load_npz(inputs["frames"] / "frames.npz")
+    split = np.where(np.arange(FRAMES) < 8, arrays["split"], 2).astype(np.uint8)
+    np.savez(inputs["frames"] / "frames.npz", **(arrays | {"split": split}))
+    motion = load_motion(inputs["field"] / "motion.npz")
+    late = replace(motion, time_s=motion.time_s + 9.0 * (np.arange(FRAMES) >= 9))
+    save_motion(inputs["field"] / "motion.npz", late)
+    everywhere = range(FRAMES)
+    monkeypatch.setattr(mesh_stage, "refit_poses", refit_to(lambda old: shifted(old, everywhere, 0.5), iou_gain))
+    run(inputs, tmp_path, CONFIG.model_copy(update={"rounds": 0}), SETTINGS)
+    moved = load_motion(tmp_path / "motion.npz").root_translation_m - motion.root_translation_m
+    np.testing.assert_allclose(moved[:, 0], np.where(np.arange(FRAMES) >= 9, moved_m, 0.0), atol=1e-6)
 
 
 def test_the_exported_skin_weights_are_those_of_the_refinement(tmp_path: Path) -> None:

@@ -94,9 +94,9 @@ def landmark_std_ratio() -> Float[Tensor, "l"]:
 
 @dataclass(frozen=True)
 class LandmarkRegressor:
-    """Each landmark as a joint or vertex of the body plus a constant offset.
+    """Each landmark as a joint or vertex of the body, or the canonical origin, plus a constant offset.
 
-    reference_joint, reference_vertex: None where the other one is used.
+    reference_joint, reference_vertex: None where the other one, or the origin, is used.
     offset_jacobian: derivative of the positions with respect to the landmark offsets.
     """
 
@@ -113,9 +113,12 @@ class LandmarkRegressor:
             if joint is not None:
                 positions.append(model.full_joints_m[joint])
                 derivatives.append(model.full_joints_shape_jacobian[joint])
-            else:
+            elif vertex is not None:
                 positions.append(model.vertices_m[vertex])
                 derivatives.append(model.vertices_shape_jacobian[vertex])
+            else:
+                positions.append(self.offset_m.new_zeros(3))
+                derivatives.append(self.offset_m.new_zeros(3, len(model.shape)))
         rest = torch.stack(positions) + self.offset_m + self.offset_jacobian @ landmark_offsets_m
         shape_jacobian = torch.cat([torch.stack(derivatives), self.offset_jacobian], dim=-1)
         return SkinnedPoints(rest[None], self.skin_weights[None], shape_jacobian[None])
@@ -145,6 +148,16 @@ def landmark_regressor(default: LinearBody) -> LandmarkRegressor:
             skin_weights[index, ACTIVE_JOINTS.index(parent_joint)] = 1.0
             offset_jacobian[index, :, 3 * row : 3 * row + 3] = torch.diag(mirror)
     return LandmarkRegressor(tuple(joints), tuple(vertices), offset, skin_weights, offset_jacobian)
+
+
+def fixed_landmarks(positions_m: Float[Tensor, "l 3"]) -> LandmarkRegressor:
+    """Return the regressor of a body of fixed shape from the positions of the landmarks on its A-pose."""
+    skin_weights = torch.zeros(LANDMARK_COUNT, len(ACTIVE_JOINTS), dtype=torch.float64)
+    for landmark in LANDMARKS:
+        for side, index in enumerate(landmark.indices):
+            skin_weights[index, ACTIVE_JOINTS.index(_on_side(landmark.parent_joint, side))] = 1.0
+    no_offsets = torch.zeros(LANDMARK_COUNT, 3, LANDMARK_OFFSET_COUNT, dtype=torch.float64)
+    return LandmarkRegressor((None,) * LANDMARK_COUNT, (None,) * LANDMARK_COUNT, positions_m, skin_weights, no_offsets)
 
 
 def _on_side(name: str, side: int) -> str:

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pipeline.body.body import ParametricBody
+from pipeline.body.body import Body, ParametricBody
 from pipeline.geometry.rotation import axis_angle_to_matrix
 from pipeline.geometry.skinning import forward_kinematics, linear_blend_skinning, skinning_transforms
 
@@ -139,7 +139,7 @@ def descendant_matrix(parents: Sequence[int]) -> Float[Tensor, "j j"]:
     return is_descendant
 
 
-def merge_skin_weights(body: ParametricBody, active: Sequence[int]) -> Float[Tensor, "v j"]:
+def merge_skin_weights(body: ParametricBody | Body, active: Sequence[int]) -> Float[Tensor, "v j"]:
     """Return skin weights of the active joints; the weights of other joints go to the nearest active ancestor."""
     active_index = {joint: index for index, joint in enumerate(active)}
     merged = torch.zeros(len(body.skin_weights), len(active), dtype=torch.float64)

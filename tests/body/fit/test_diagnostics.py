@@ -2,6 +2,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+import torch
 
 from pipeline.body.body import Body, load_anny
 from pipeline.body.fit.diagnostics import (
@@ -41,6 +42,8 @@ def result(**changes: object) -> FitResult:
         "landmark_error_px": np.full(FRAMES, 2.0),
         "silhouette_iou": np.full(FRAMES, 0.93),
         "left_right_swapped": {"whole body": np.zeros(FRAMES, dtype=bool), "legs": np.zeros(FRAMES, dtype=bool)},
+        "observations": synthetic_recording(load_anny(), frames=FRAMES).observations(CAMERA),
+        "landmarks_m": torch.zeros(41, 3),
         "focal_relative_std": 0.1,
         "height_std_m": 0.05,
     }
