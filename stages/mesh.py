@@ -1,6 +1,6 @@
 """mesh: a watertight, manifold mesh of the canonical field, refined on the video frames; poses fitted through it."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,8 +29,9 @@ from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import top_k_weights
 from pipeline.geometry.surface import resolve_self_intersections
 from pipeline.io.image import to_uint8, write_rgb
+from pipeline.mesh.face_reduction import reduce_faces
 from pipeline.mesh.files import MeshArtifact, load_checkpoint, save_checkpoint, save_mesh
-from pipeline.mesh.isosurface import extract_mesh, sample_canonical_grid, select_isovalue
+from pipeline.mesh.isosurface import CanonicalGrid, extract_mesh, sample_canonical_grid, select_isovalue
 from pipeline.mesh.pose_refit import refit_poses, select_poses
 from pipeline.mesh.pose_selection import is_far_from, score_motion
 from pipeline.mesh.refinement import RefinementState, refine_mesh
@@ -44,6 +45,8 @@ from pipeline.metrics.health import mesh_quality_metrics
 CHECKPOINT = "checkpoint_round.safetensors"
 DEFAULT_SETTINGS = MeshSettings()
 MOTIONS = ("field", "refitted")
+JUDGED_FRAMES = 12
+"""Training frames on which the reduction of faces is judged if there are no validation frames."""
 
 
 class Config(BaseConfig):
@@ -113,17 +116,21 @@ def run(
         occupancy = load_occupancy(inputs["field"] / "occupancy.npz")
 
         def density_fn(points_m: Tensor) -> Tensor:
-            return field.density(points_m) * occupancy.contains(points_m)
+            occupied, density = occupancy.contains(points_m), torch.zeros(len(points_m))
+            density[occupied] = field.density(points_m[occupied])
+            return density
 
-        extracted = extract_initial_mesh(density_fn, body, validation or train, config.voxel_size_m, settings)
+        samples = sample_canonical_grid(density_fn, occupancy.occupied_bounds_m(), body, config.voxel_size_m, settings)
+        extracted = extract_initial_mesh(samples, body, validation or train, settings)
         start = remesh_to_edge_length(extracted, target_edge_m)
     state = refine_mesh(start, refinement_inputs, lambda state: save_checkpoint(out / CHECKPOINT, state))
-    shader, skin, psnr_db = refinement_inputs.shader, state.skin, state.validation_psnr_db
-    mesh = resolve_self_intersections(state.mesh)
+    shader, psnr_db = refinement_inputs.shader, state.validation_psnr_db
+    mesh = finish_mesh(state.mesh, refinement_inputs, config)
+    is_unchanged = mesh is state.mesh
+    skin = state.skin if is_unchanged else transfer_skin(mesh, body)
     write_results(out, mesh, skin, shader)
     motion, motion_metrics = refit_motion(capture, inputs, body, (mesh, skin, shader), validation)
     save_motion(out / "motion.npz", motion)
-    is_unchanged = mesh is state.mesh
     return {
         **{key: float(value) for key, value in mesh_quality_metrics(mesh).items()},
         "initial_validation_psnr_db": psnr_db[0],
@@ -133,6 +140,18 @@ def run(
         "accepted_rounds": len(psnr_db) - 1.0,
         **motion_metrics,
     }
+
+
+def finish_mesh(mesh: Mesh, inputs: RefinementInputs, config: Config) -> Mesh:
+    """Reduce the faces of the refined mesh, judged on validation views (else on training views); untangle it."""
+    views = inputs.validation or [inputs.train[k] for k in evenly_spaced(len(inputs.train), JUDGED_FRAMES)]
+
+    def psnr_db(trial: Mesh) -> float:
+        return mesh_psnr_db(trial, transfer_skin(trial, inputs.body), views, inputs.shader)
+
+    tolerance_m = inputs.settings.reduction_tolerance_px * inputs.target_edge_m / config.edge_px
+    reduced = reduce_faces(mesh, inputs.target_edge_m, tolerance_m, psnr_db, inputs.settings)
+    return resolve_self_intersections(reduced)
 
 
 class FieldColourShader(torch.nn.Module):
@@ -155,18 +174,13 @@ def select_target_edge_m(body: Body, views: Sequence[PosedView], config: Config)
 
 
 def extract_initial_mesh(
-    density_fn: Callable[[Tensor], Tensor],
-    body: Body,
-    views: Sequence[PosedView],
-    voxel_size_m: float,
-    settings: MeshSettings,
+    samples: CanonicalGrid, body: Body, views: Sequence[PosedView], settings: MeshSettings
 ) -> Mesh:
     """Extract the surface of the density at the isovalue with the highest silhouette IoU.
 
     The IoU is computed on at most `settings.isovalue_frames` of the views.
     """
     isovalue_views = [views[k] for k in evenly_spaced(len(views), settings.isovalue_frames)]
-    samples = sample_canonical_grid(density_fn, body, voxel_size_m, settings)
 
     def score(mesh: Mesh) -> float:
         return silhouette_iou(mesh, transfer_skin(mesh, body), isovalue_views)
@@ -242,7 +256,7 @@ def write_results(out: Path, mesh: Mesh, skin: SkinnedTopology, shader: torch.nn
 
 STAGE = Stage(
     "mesh",
-    version=6,
+    version=7,
     needs=("frames", "body", "field"),
     makes=("mesh.npz", "motion.npz", "preview.png"),
     config=Config,

@@ -43,6 +43,15 @@ class BinaryOccupancy:
         """Return the same grid on another device."""
         return BinaryOccupancy(self.occupied.to(device), self.bounds_m.to(device))
 
+    def occupied_bounds_m(self) -> Float[np.ndarray, "2 3"]:
+        """Return the low and high corner of the box around all occupied cells, m; of the grid if there are none."""
+        cells = torch.nonzero(self.occupied)
+        if not len(cells):
+            return self.bounds_m.cpu().numpy()
+        cell_m = (self.bounds_m[1] - self.bounds_m[0]) / torch.tensor(self.occupied.shape, device=cells.device)
+        corners = torch.stack([cells.amin(0), cells.amax(0) + 1])
+        return (self.bounds_m[0] + corners * cell_m).cpu().numpy()
+
     def contains(self, points_m: Float[Tensor, "n 3"]) -> Tensor:
         """Return (n,) bool: whether each canonical point (m) is in an occupied cell."""
         size = torch.tensor(self.occupied.shape, device=points_m.device)

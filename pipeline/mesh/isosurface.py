@@ -2,8 +2,8 @@
 
 No ray ends inside a person, so the density of a trained field may be empty there, and it is arbitrary where no frame
 shows the surface. The solid whose surface is extracted therefore contains all points with a density above an isovalue
-and all points deeper inside the fitted body than a given depth. It contains no point farther outside the body than
-clothing and hair reach; its cavities are filled; hands are those of the fitted body.
+and all points deeper inside the fitted body than a given depth. Its cavities are filled; hands are those of the fitted
+body.
 """
 
 from __future__ import annotations
@@ -23,7 +23,10 @@ from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import isosurface, largest_solid, repair, signed_distance_m
 from pipeline.mesh.settings import MeshSettings
 
-DENSITY_CHUNK = 1 << 18
+BODY_PADDING_VOXELS = 4
+"""Samples around the body where the box of the density ends nearer to it."""
+HAND_REACH_M = 0.12
+"""Density up to this distance from the body belongs to a hand where a hand is nearest, m."""
 DISTANCE_GRID_STRIDE = 4
 HAND_NARROW_BAND_VOXELS = 4.0
 GRID_SIZE_MULTIPLE = 8
@@ -53,38 +56,58 @@ class CanonicalGrid:
 
 
 def sample_canonical_grid(
-    density_fn: Callable[[Tensor], Tensor], body: Body, voxel_size_m: float, settings: MeshSettings
+    density_fn: Callable[[Tensor], Tensor],
+    bounds_m: Float[np.ndarray, "2 3"],
+    body: Body,
+    voxel_size_m: float,
+    settings: MeshSettings,
 ) -> CanonicalGrid:
-    """Sample the density on a grid around the body.
+    """Sample the density on a grid that covers the body and everything around it that has density.
 
     Args:
-        density_fn: maps canonical points (n, 3) in m to densities (n,) in 1/m, 0 in empty space. It is called only for
-            points closer to the body than `settings.max_body_distance_m`.
+        density_fn: maps canonical points (n, 3) in m to densities (n,) in 1/m, 0 in empty space.
+        bounds_m: low and high corner of a box that holds all density, m: cloth and hair as far as the field has them.
         body: the fitted body in its canonical pose.
         voxel_size_m: spacing of the samples, m.
         settings: see `MeshSettings`.
     """
-    origin_m = body.vertices.min(axis=0) - settings.max_body_distance_m
-    counts = np.ceil((body.vertices.max(axis=0) + settings.max_body_distance_m - origin_m) / voxel_size_m).astype(int)
+    padding_m = BODY_PADDING_VOXELS * voxel_size_m
+    origin_m = np.minimum(bounds_m[0], body.vertices.min(axis=0) - padding_m).astype(np.float64)
+    counts = np.ceil((np.maximum(bounds_m[1], body.vertices.max(axis=0) + padding_m) - origin_m) / voxel_size_m)
     counts = GRID_SIZE_MULTIPLE * np.ceil(counts / GRID_SIZE_MULTIPLE).astype(int) + 1
     mesh = body.mesh()
     distance_m = _signed_distance_grid(mesh, origin_m, counts, voxel_size_m)
-    near_body = np.argwhere(distance_m < settings.max_body_distance_m)
-    points = (near_body * voxel_size_m + origin_m).astype(np.float32)
-    density = np.zeros(distance_m.shape, dtype=np.float32)
-    chunks = [density_fn(chunk).detach() for chunk in torch.from_numpy(points).split(DENSITY_CHUNK)]
-    density[tuple(near_body.T)] = torch.cat(chunks).numpy()
+    density = _density_grid(density_fn, origin_m, distance_m.shape, voxel_size_m)
     hand_weight = np.zeros_like(density)
     if settings.hands_from_body:
         vertex_hand_weight = hand_skin_weights(body)
-        hand_vertices = body.vertices[vertex_hand_weight > 0.0]
-        near_hand = _indices_in_side_boxes(points, hand_vertices, settings.max_body_distance_m)
-        _, nearest = cKDTree(body.vertices).query(points[near_hand])
-        hand_weight[tuple(near_body[near_hand].T)] = vertex_hand_weight[nearest]
+        near_hand = _indices_in_side_boxes(
+            origin_m, voxel_size_m, distance_m.shape, body.vertices[vertex_hand_weight > 0.0], HAND_REACH_M
+        )
+        near_hand = near_hand[distance_m[tuple(near_hand.T)] < HAND_REACH_M]
+        _, nearest = cKDTree(body.vertices).query(near_hand * voxel_size_m + origin_m)
+        hand_weight[tuple(near_hand.T)] = vertex_hand_weight[nearest]
         narrow_band = np.abs(distance_m) < HAND_NARROW_BAND_VOXELS * voxel_size_m
         exact = np.argwhere((hand_weight > 0.0) & narrow_band)
         distance_m[tuple(exact.T)] = signed_distance_m(exact * voxel_size_m + origin_m, mesh)
-    return CanonicalGrid(origin_m.astype(np.float64), voxel_size_m, density, distance_m, hand_weight)
+    return CanonicalGrid(origin_m, voxel_size_m, density, distance_m, hand_weight)
+
+
+def _density_grid(
+    density_fn: Callable[[Tensor], Tensor],
+    origin_m: Float[np.ndarray, "3"],
+    shape: tuple[int, ...],
+    spacing_m: float,
+) -> Float[np.ndarray, "x y z"]:
+    """Return the density at all samples, slab by slab, so that a wide box needs little memory."""
+    density = np.empty(shape, dtype=np.float32)
+    y, z = (origin_m[axis] + spacing_m * np.arange(shape[axis]) for axis in (1, 2))
+    slab = np.stack(np.broadcast_arrays(origin_m[0], y[:, None], z[None, :]), axis=-1).reshape(-1, 3)
+    points = torch.from_numpy(slab.astype(np.float32))
+    for row in range(shape[0]):
+        points[:, 0] = float(origin_m[0] + spacing_m * row)
+        density[row] = density_fn(points).detach().numpy().reshape(shape[1:])
+    return density
 
 
 def hand_skin_weights(body: Body) -> Float[np.ndarray, "v"]:
@@ -147,14 +170,20 @@ def select_isovalue(
 
 
 def _indices_in_side_boxes(
-    points: Float[np.ndarray, "n 3"], targets: Float[np.ndarray, "m 3"], margin_m: float
-) -> Int[np.ndarray, "k"]:
-    """Return the indices of the points in the padded bounding box of the left (x >= 0) or the right targets."""
-    found = np.zeros(len(points), dtype=bool)
+    origin_m: Float[np.ndarray, "3"],
+    spacing_m: float,
+    shape: tuple[int, ...],
+    targets: Float[np.ndarray, "m 3"],
+    margin_m: float,
+) -> Int[np.ndarray, "k 3"]:
+    """Return the indices of the samples in the padded bounding box of the left (x >= 0) or the right targets."""
+    found = np.zeros(shape, dtype=bool)
     for side in (targets[targets[:, 0] < 0], targets[targets[:, 0] >= 0]):
         if len(side):
-            found |= ((points > side.min(axis=0) - margin_m) & (points < side.max(axis=0) + margin_m)).all(axis=1)
-    return np.flatnonzero(found)
+            low = np.maximum(np.ceil((side.min(axis=0) - margin_m - origin_m) / spacing_m).astype(int), 0)
+            high = np.floor((side.max(axis=0) + margin_m - origin_m) / spacing_m).astype(int) + 1
+            found[tuple(map(slice, low, high))] = True
+    return np.argwhere(found)
 
 
 def _signed_distance_grid(

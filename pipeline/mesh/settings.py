@@ -8,7 +8,6 @@ class MeshSettings:
     """Parameters of surface extraction and refinement. Figures are in docs/decisions/mesh.md.
 
     Surface extraction:
-        max_body_distance_m: largest distance of the surface outside the fitted body, m.
         solid_core_depth_m: points deeper than this inside the fitted body are solid, m.
         blur_sigma_voxels: standard deviation of the Gaussian blur of the density indicator, voxels.
         closing_radius_m: concavities inside the body that a ball of this radius cannot enter are filled, m.
@@ -35,11 +34,15 @@ class MeshSettings:
         decimated_edge_ratio: edge length of decimated regions, in target edge lengths.
         seed: seed of the frame order and of the random backgrounds.
 
+    Reduction of faces:
+        max_reduction_loss_db: validation PSNR that the reduction may cost, dB.
+        reduction_edge_ratio: ratio of the edge lengths of successive trials.
+        reduction_tolerance_px: largest distance from the refined surface, in pixels of the downsampled frames.
+
     Raises:
         ValueError: a value is out of its range, or two values contradict each other; the message names them.
     """
 
-    max_body_distance_m: float = 0.12
     solid_core_depth_m: float = 0.025
     blur_sigma_voxels: float = 1.0
     closing_radius_m: float = 0.03
@@ -63,9 +66,13 @@ class MeshSettings:
     decimated_edge_ratio: float = 1.4
     seed: int = 0
 
+    max_reduction_loss_db: float = 0.05
+    reduction_edge_ratio: float = 1.2
+    reduction_tolerance_px: float = 0.25
+
     def __post_init__(self) -> None:
         """Refuse values out of range and contradictions."""
-        for name in ("max_body_distance_m", "learning_rate", "isovalue_frames", "frames_per_step"):
+        for name in ("learning_rate", "isovalue_frames", "frames_per_step"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"MeshSettings.{name} = {getattr(self, name)} is not allowed: it must be above 0")
         if not self.isovalues_per_m or min(self.isovalues_per_m) <= 0.0:

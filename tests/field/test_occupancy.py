@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from pipeline.field.initial_occupancy import initial_occupancy
-from pipeline.field.occupancy import RESOLUTION, cell_centres
+from pipeline.field.occupancy import RESOLUTION, BinaryOccupancy, cell_centres
 from tests.field.occupancy_ball import BOUNDS, RADIUS_M, STEP_M, ball_density, ball_grid, record_rays
 
 
@@ -77,3 +77,13 @@ def test_unobserved_cells_are_unlit_or_one_sided_and_off_the_body():
     for _ in range(60):
         grid.update(lambda points: torch.zeros(len(points)), 0.01, rng)
     assert len(grid.unobserved) == 0
+
+
+def test_the_occupied_bounds_are_the_corners_of_the_outermost_occupied_cells() -> None:
+    occupied = torch.zeros(8, 4, 2, dtype=torch.uint8)
+    bounds_m = torch.tensor([[-1.0, 0.0, 2.0], [1.0, 2.0, 3.0]])
+    np.testing.assert_allclose(BinaryOccupancy(occupied, bounds_m).occupied_bounds_m(), bounds_m)
+    occupied[2, 1, 0] = occupied[5, 1, 0] = 1
+    np.testing.assert_allclose(
+        BinaryOccupancy(occupied, bounds_m).occupied_bounds_m(), [[-0.5, 0.5, 2.0], [0.5, 1.0, 2.5]]
+    )

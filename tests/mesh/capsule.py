@@ -9,7 +9,9 @@ from pipeline.geometry.surface import isosurface
 from pipeline.mesh.settings import MeshSettings
 
 VOXEL_SIZE_M = 0.02
-SETTINGS = MeshSettings(max_body_distance_m=0.12, solid_core_depth_m=0.05)
+SETTINGS = MeshSettings(solid_core_depth_m=0.05)
+BOUNDS_M = np.array([[-0.5, 0.25, -0.25], [0.55, 0.75, 0.25]])
+"""A box that holds the densities of this file."""
 RADIUS_M = 0.1
 
 

@@ -17,7 +17,7 @@ from pipeline.mesh.isosurface import (
     sample_canonical_grid,
     select_isovalue,
 )
-from tests.mesh.capsule import RADIUS_M, SETTINGS, VOXEL_SIZE_M, capsule_body, capsule_distance, shell_density
+from tests.mesh.capsule import BOUNDS_M, RADIUS_M, SETTINGS, VOXEL_SIZE_M, capsule_body, capsule_distance, shell_density
 
 WITHOUT_HANDS = replace(SETTINGS, hands_from_body=False)
 
@@ -28,7 +28,7 @@ def body() -> Body:
 
 
 def test_a_hollow_density_gives_one_solid_with_its_outer_surface(body: Body) -> None:
-    samples = sample_canonical_grid(shell_density, body, VOXEL_SIZE_M, WITHOUT_HANDS)
+    samples = sample_canonical_grid(shell_density, BOUNDS_M, body, VOXEL_SIZE_M, WITHOUT_HANDS)
     mesh = extract_mesh(samples, 50.0, SETTINGS)
     assert is_closed_manifold(mesh)
     assert len(mesh.vertices) - len(mesh.faces) // 2 == 2  # genus 0: no floater, no inner surface
@@ -36,7 +36,7 @@ def test_a_hollow_density_gives_one_solid_with_its_outer_surface(body: Body) -> 
 
 
 def test_without_density_the_surface_is_that_of_the_body_core(body: Body) -> None:
-    samples = sample_canonical_grid(lambda points: torch.zeros(len(points)), body, 0.01, WITHOUT_HANDS)
+    samples = sample_canonical_grid(lambda points: torch.zeros(len(points)), BOUNDS_M, body, 0.01, WITHOUT_HANDS)
     mesh = extract_mesh(samples, 50.0, WITHOUT_HANDS)
     assert is_closed_manifold(mesh)
     # The depth is computed on samples 0.02 m apart, with an error of half that distance.
@@ -44,7 +44,7 @@ def test_without_density_the_surface_is_that_of_the_body_core(body: Body) -> Non
 
 
 def test_hands_are_those_of_the_body(body: Body) -> None:
-    samples = sample_canonical_grid(shell_density, body, VOXEL_SIZE_M, SETTINGS)
+    samples = sample_canonical_grid(shell_density, BOUNDS_M, body, VOXEL_SIZE_M, SETTINGS)
     mesh = extract_mesh(samples, 50.0, SETTINGS)
     hand, trunk = (
         capsule_distance(mesh.vertices[part]) for part in (mesh.vertices[:, 0] > 0.2, mesh.vertices[:, 0] < -0.1)
@@ -62,7 +62,7 @@ def test_concavities_are_filled_inside_the_body_only(body: Body) -> None:
         return torch.where((distance < 0.16) & ~hole, 300.0, 0.0).float()
 
     settings = replace(WITHOUT_HANDS, solid_core_depth_m=0.2, blur_sigma_voxels=0.0)
-    samples = sample_canonical_grid(density_with_hole, body, 0.01, settings)
+    samples = sample_canonical_grid(density_with_hole, BOUNDS_M, body, 0.01, settings)
     column = ((np.array([-0.15, 0.5, 0.0]) - samples.origin_m) / 0.01).round().astype(int)
     heights = samples.origin_m[1] + 0.01 * np.arange(samples.density.shape[1]) - 0.5
     for closing_radius_m, filled_to in ((0.04, RADIUS_M), (0.0, 0.0)):
@@ -78,22 +78,28 @@ def test_hand_weights_sum_over_every_joint_of_a_hand(body: Body) -> None:
     assert weights.max() == 1.0
 
 
-def test_the_density_is_sampled_only_near_the_body(body: Body) -> None:
-    sampled = []
+def test_cloth_far_from_the_body_is_part_of_the_surface(body: Body) -> None:
+    """A skirt stands off the body by 35 cm; the grid reaches as far as the density does."""
 
-    def constant_density(points: Tensor) -> Tensor:
-        sampled.append(points)
-        return torch.full((len(points),), 9.0)
+    def density(points: Tensor) -> Tensor:
+        distance = torch.from_numpy(capsule_distance(points.numpy().astype(np.float64)))
+        return torch.where(distance < RADIUS_M + 0.35, 300.0, 0.0).float()
 
-    samples = sample_canonical_grid(constant_density, body, VOXEL_SIZE_M, SETTINGS)
-    distance = capsule_distance(torch.cat(sampled).numpy()) - RADIUS_M
-    assert distance.max() < SETTINGS.max_body_distance_m + 0.01
-    assert (samples.density[samples.body_distance_m > SETTINGS.max_body_distance_m] == 0).all()
-    assert indicator_grid(samples, 3.0, SETTINGS).max() <= 1.0
+    bounds_m = np.array([[-0.8, 0.0, -0.5], [0.8, 1.0, 0.5]])
+    mesh = extract_mesh(sample_canonical_grid(density, bounds_m, body, VOXEL_SIZE_M, WITHOUT_HANDS), 50.0, SETTINGS)
+    np.testing.assert_allclose(capsule_distance(mesh.vertices), RADIUS_M + 0.35, atol=0.02)
+
+
+def test_the_grid_covers_the_body_where_there_is_no_density(body: Body) -> None:
+    nowhere_m = np.array([[0.0, 0.5, 0.0], [0.02, 0.52, 0.02]])
+    samples = sample_canonical_grid(lambda points: torch.zeros(len(points)), nowhere_m, body, VOXEL_SIZE_M, SETTINGS)
+    last_m = samples.origin_m + samples.spacing_m * (np.array(samples.density.shape) - 1)
+    assert (samples.origin_m < body.vertices.min(axis=0)).all()
+    assert (last_m > body.vertices.max(axis=0)).all()
 
 
 def test_distance_is_exact_at_the_hand_and_interpolated_elsewhere(body: Body) -> None:
-    samples = sample_canonical_grid(shell_density, body, VOXEL_SIZE_M, SETTINGS)
+    samples = sample_canonical_grid(shell_density, BOUNDS_M, body, VOXEL_SIZE_M, SETTINGS)
     index = np.stack(np.meshgrid(*map(np.arange, samples.density.shape), indexing="ij"), axis=-1)
     truth = capsule_distance(index * samples.spacing_m + samples.origin_m) - RADIUS_M
     hand = (np.abs(truth) < 0.04) & (samples.hand_weight > 0)
@@ -108,7 +114,7 @@ def test_the_isovalue_with_the_highest_score_is_selected(body: Body) -> None:
         distance = torch.from_numpy(capsule_distance(points.numpy().astype(np.float64))).float()
         return 100.0 * torch.exp((0.12 - distance) / 0.02)
 
-    samples = sample_canonical_grid(ramp, body, VOXEL_SIZE_M, WITHOUT_HANDS)
+    samples = sample_canonical_grid(ramp, BOUNDS_M, body, VOXEL_SIZE_M, WITHOUT_HANDS)
 
     def score(mesh: Mesh) -> float:
         return -abs(float(np.median(capsule_distance(mesh.vertices))) - 0.12)
@@ -121,6 +127,6 @@ def test_the_isovalue_with_the_highest_score_is_selected(body: Body) -> None:
 
 def test_an_empty_solid_is_an_error(body: Body) -> None:
     settings = replace(WITHOUT_HANDS, solid_core_depth_m=0.2)
-    samples = sample_canonical_grid(lambda points: torch.zeros(len(points)), body, VOXEL_SIZE_M, settings)
+    samples = sample_canonical_grid(lambda points: torch.zeros(len(points)), BOUNDS_M, body, VOXEL_SIZE_M, settings)
     with pytest.raises(ValueError, match="reaches the isovalue"):
         extract_mesh(samples, 50.0, settings)

@@ -18,7 +18,7 @@ from tests.mesh.egg import EDGE_M, SETTINGS
 @pytest.fixture(scope="module")
 def extracted() -> Mesh:
     samples = sample_canonical_grid(
-        capsule.shell_density, capsule.capsule_body(), capsule.VOXEL_SIZE_M, capsule.SETTINGS
+        capsule.shell_density, capsule.BOUNDS_M, capsule.capsule_body(), capsule.VOXEL_SIZE_M, capsule.SETTINGS
     )
     return extract_mesh(samples, 50.0, capsule.SETTINGS)
 

@@ -40,7 +40,7 @@ CONFIG = Config(
     max_edge_m=0.04,
     max_person_px=80,
 )
-SETTINGS = MeshSettings(max_body_distance_m=0.1, solid_core_depth_m=0.06)
+SETTINGS = MeshSettings(solid_core_depth_m=0.06)
 
 
 def capsule(points: np.ndarray, radius: float) -> np.ndarray:
@@ -72,6 +72,9 @@ class CapsuleField(torch.nn.Module):
 
 
 class FullOccupancy:
+    def occupied_bounds_m(self) -> np.ndarray:
+        return np.array([[-0.35, -0.15, -0.35], [0.35, 0.95, 0.35]])
+
     def contains(self, points: Tensor) -> Tensor:
         return torch.ones(len(points), dtype=torch.bool)
 

@@ -1,0 +1,43 @@
+"""Reduction of faces: as far as the images allow, close to the surface, and closed."""
+
+import numpy as np
+
+from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.surface import closest_points_on_mesh, is_closed_manifold, isosurface
+from pipeline.mesh.face_reduction import reduce_faces
+from pipeline.mesh.settings import MeshSettings
+
+RADIUS_M, SPACING_M = 0.1, 0.01
+
+
+def sphere() -> Mesh:
+    axis = np.arange(-0.13, 0.1301, SPACING_M)
+    distance = np.linalg.norm(np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1), axis=-1)
+    return isosurface(RADIUS_M - distance, 0.0, np.full(3, axis[0]), SPACING_M)
+
+
+def test_faces_are_removed_while_the_loss_is_small() -> None:
+    mesh = sphere()
+    # One dB for each thousand faces that are missing.
+    psnr_db, settings = lambda trial: len(trial.faces) / 1000.0, MeshSettings(max_reduction_loss_db=2.5)
+    reduced = reduce_faces(mesh, SPACING_M, 0.01, psnr_db, settings)
+    assert len(mesh.faces) - 2500 <= len(reduced.faces) < len(mesh.faces) - 1000
+    assert is_closed_manifold(reduced)
+
+
+def test_no_vertex_leaves_the_tolerance_even_where_images_would_allow_it() -> None:
+    mesh = sphere()
+    reduced = reduce_faces(mesh, SPACING_M, 0.002, lambda trial: 30.0, MeshSettings())
+    assert len(reduced.faces) < 0.7 * len(mesh.faces)
+    distance_m, _, _ = closest_points_on_mesh(reduced.vertices, mesh)
+    assert distance_m.max() < 0.0025
+    centres = reduced.vertices[reduced.faces].mean(axis=1)
+    assert np.abs(np.linalg.norm(centres, axis=1) - RADIUS_M).max() < 0.005
+
+
+def test_a_mesh_that_needs_its_faces_stays() -> None:
+    mesh = sphere()
+    assert (
+        reduce_faces(mesh, SPACING_M, 0.01, lambda trial: -abs(len(trial.faces) - len(mesh.faces)), MeshSettings())
+        is mesh
+    )
