@@ -161,7 +161,13 @@ def fit_capture(
         settings.principal_point_std_ratio * side_px / camera.fx if focal_relative_std > 0.0 else 0.0
     )
     options = FitOptions(
-        config.height_m, focal_relative_std, principal_point_relative_std, config.shared_frames, config.rounds, settings
+        config.height_m,
+        focal_relative_std,
+        principal_point_relative_std,
+        config.shared_frames,
+        config.rounds,
+        capture.camera_pose_is_known,
+        settings,
     )
     windows = [crop_mask_window(mask) for mask in masks]
     model = load_anny() if config.model_file is None else load_smpl(Path(config.model_file))
@@ -171,7 +177,9 @@ def fit_capture(
             result = fit_body(model, observations, windows, options, finger_curls_rad(model, hands))
         else:
             keep = config.supplied_poses == "keep"
-            result = fit_supplied_poses(model, observations, windows, supplied, keep, settings)
+            result = fit_supplied_poses(
+                model, observations, windows, supplied, keep, capture.camera_pose_is_known, settings
+            )
     except TooFewLandmarksError as error:
         raise UserError(
             f"the body cannot be fitted to {capture.folder}: {error}; film with hips and shoulders in view, or "
@@ -281,7 +289,7 @@ def draw_overlay_grid(
 
 STAGE = Stage(
     "body",
-    version=11,
+    version=12,
     needs=("frames",),
     makes=(_BODY, _MOTION, _CAMERA, SCORES_NPZ, _OVERLAY),
     config=Config,

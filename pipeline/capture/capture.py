@@ -30,6 +30,7 @@ class Capture:
     metadata_focal_px: focal length for these images from the metadata of the recording; None if there is none.
     hands: landmarks of both hands in every frame; None if they were not detected.
     smpl_poses: user-supplied SMPL poses of some of these frames; None without.
+    camera_pose_is_known: whether the user supplied the pose of the camera, in a world whose +Y is up.
     """
 
     folder: Path
@@ -49,6 +50,7 @@ class Capture:
     metadata_focal_px: float | None = None
     hands: HandLandmarks | None = None
     smpl_poses: SmplPoses | None = None
+    camera_pose_is_known: bool = False
 
     def __len__(self) -> int:
         return len(self.frame_index)
@@ -94,6 +96,7 @@ def save_capture(capture: Capture) -> None:
         "landmarks_visibility": capture.landmarks_visibility.astype(np.float32),
         "landmarks_world_m": capture.landmarks_world_m.astype(np.float32),
         "camera_world_to_camera": camera.world_to_camera if camera else DEFAULT_WORLD_TO_CAMERA,
+        "camera_pose_is_known": np.array(capture.camera_pose_is_known),
         "mask_source": np.array(capture.mask_source),
         "n_video_frames": np.array(capture.n_video_frames, dtype=np.int32),
         "scale": np.array(capture.scale),
@@ -134,6 +137,7 @@ def load_capture(frames_dir: Path) -> Capture:
         metadata_focal_px=_metadata_focal_px(arrays),
         hands=_hands(arrays),
         smpl_poses=load_smpl_poses(poses_path) if poses_path.is_file() else None,
+        camera_pose_is_known=bool(np.ravel(arrays.get("camera_pose_is_known", False))[0]),
     )
 
 

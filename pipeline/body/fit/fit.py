@@ -16,6 +16,7 @@ from torch import Tensor
 from pipeline.body.body import ParametricBody
 from pipeline.body.fit.camera_parameters import apply_intrinsics_delta
 from pipeline.body.fit.energy import EnergyParameters, Objective, compute_px_per_m
+from pipeline.body.fit.gravity import align_with_gravity, initial_evidence, level_evidence, turn_observations
 from pipeline.body.fit.ground_contact import Contact, estimate_floor_contact
 from pipeline.body.fit.initialisation import has_torso_landmarks, initial_state, interpolated_state
 from pipeline.body.fit.landmark_regressor import LandmarkRegressor, landmark_regressor
@@ -62,6 +63,7 @@ class FitOptions:
         fixes it.
     shared_frames: number of frames for the shared parameters.
     rounds: matchings of the silhouettes for the shared parameters.
+    vertical_is_known: whether +Y of the camera's world is up; otherwise the vertical is estimated.
     """
 
     height_m: float | None = None
@@ -69,6 +71,7 @@ class FitOptions:
     principal_point_relative_std: float = 0.0
     shared_frames: int = 48
     rounds: int = 8
+    vertical_is_known: bool = False
     settings: FitSettings = DEFAULT_SETTINGS
 
 
@@ -98,7 +101,7 @@ def fit_body(
 ) -> FitResult:
     """Fit a body to landmarks and masks.
 
-    observations: their camera is the initial one.
+    observations: their camera is the initial one, level unless the vertical is known.
     windows: from `silhouette_icp.crop_mask_window`.
     curls_rad: from `hand_observations.finger_curls_rad`; None: relaxed fingers.
 
@@ -111,6 +114,9 @@ def fit_body(
     no_offsets = torch.zeros(offset_count, dtype=torch.float64)
     rest_landmarks_m = context.regressor.points(context.default, no_offsets).rest_m[0]
     observations, left_right_swapped = _correct_left_right_swaps(observations, rest_landmarks_m)
+    evidence = None if options.vertical_is_known else initial_evidence(observations, options.settings)
+    if evidence is not None:
+        observations = turn_observations(observations, evidence.up(), rest_landmarks_m)
     start = initial_state(
         observations, rest_landmarks_m, context.default.joints_m, body.shape_defaults.double(), offset_count
     )
@@ -120,6 +126,8 @@ def fit_body(
     )
     state = interpolated_state(state, chosen, observations.time_s)
     state, model, silhouette_iou = _fit_poses(context, observations, windows, state, parameters)
+    if evidence is not None:
+        state, observations = align_with_gravity(model, state, observations, evidence, options.settings)
     focal_relative_std, height_std_m = _posterior_stds(model, system)
     stature_std_m = options.settings.stature_spread_m if options.height_m is None else 0.0
     return replace(
@@ -135,12 +143,15 @@ def fit_supplied_poses(
     windows: Sequence[MaskWindow | None],
     supplied: SuppliedPoses,
     keep: bool,
+    vertical_is_known: bool,
     settings: FitSettings = DEFAULT_SETTINGS,
 ) -> FitResult:
     """Use user-supplied shape and poses; interpolate and fit the poses of the other frames.
 
     observations: their camera is that of the supplied poses.
-    keep: whether the supplied poses stay unchanged; otherwise all poses are refined with landmarks and silhouettes.
+    keep: whether the supplied poses stay unchanged relative to the camera; otherwise all poses are refined with
+        landmarks and silhouettes.
+    vertical_is_known: as in `FitOptions`.
 
     Raises:
         TooFewLandmarksError: as `fit_body`, if any frame is fitted.
@@ -162,8 +173,17 @@ def fit_supplied_poses(
     if keep:
         state = supplied.overwrite_poses(state, model.full_joint_indices)
     _, silhouette_iou = match_silhouettes(model, state, observations, windows)
+    roots = state.rotations[:, 0]
+    if not vertical_is_known:
+        state, observations = align_with_gravity(model, state, observations, level_evidence(settings), settings)
     result = _result(context, model, state, observations, silhouette_iou, left_right_swapped)
-    return replace(result, rotations_wxyz=supplied.overwrite_all_rotations(result.rotations_wxyz)) if keep else result
+    if not keep:
+        return result
+    turned = replace(supplied, rotations=supplied.rotations.clone())
+    turned.rotations[:, 0] = (state.rotations[:, 0] @ roots.transpose(1, 2))[
+        supplied.rows
+    ].float() @ supplied.rotations[:, 0]
+    return replace(result, rotations_wxyz=turned.overwrite_all_rotations(result.rotations_wxyz))
 
 
 def select_shared_frames(
