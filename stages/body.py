@@ -23,6 +23,7 @@ from pipeline.body.fit.diagnostics import (
     usable_frames,
 )
 from pipeline.body.fit.fit import FitOptions, TooFewLandmarksError, fit_body, fit_supplied_poses
+from pipeline.body.fit.gravity import camera_tilt_deg
 from pipeline.body.fit.hand_observations import filter_hand_detections, finger_curls_rad
 from pipeline.body.fit.result import FitResult
 from pipeline.body.fit.silhouette_icp import crop_mask_window
@@ -121,6 +122,7 @@ def run(
         blob_shares, capture.frame_index
     ):
         warn(message)
+    pitch_deg, roll_deg = camera_tilt_deg(result.camera)
     return {
         "silhouette_iou": float(np.nanmedian(result.silhouette_iou)),
         "silhouette_iou_worst": float(np.nanmin(result.silhouette_iou)),
@@ -129,6 +131,9 @@ def run(
         "focal_relative_std": result.focal_relative_std,
         "principal_x_px": result.camera.cx,
         "principal_y_px": result.camera.cy,
+        "camera_pitch_deg": pitch_deg,
+        "camera_roll_deg": roll_deg,
+        "lean_deg": result.lean_deg,
         "height_m": result.body.height_m(),
         "height_std_m": result.height_std_m,
         "left_right_swapped_frames": int(left_right_swapped.sum()),
@@ -177,9 +182,7 @@ def fit_capture(
             result = fit_body(model, observations, windows, options, finger_curls_rad(model, hands))
         else:
             keep = config.supplied_poses == "keep"
-            result = fit_supplied_poses(
-                model, observations, windows, supplied, keep, capture.camera_pose_is_known, settings
-            )
+            result = fit_supplied_poses(model, observations, windows, supplied, keep, settings)
     except TooFewLandmarksError as error:
         raise UserError(
             f"the body cannot be fitted to {capture.folder}: {error}; film with hips and shoulders in view, or "

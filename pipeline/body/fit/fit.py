@@ -16,7 +16,7 @@ from torch import Tensor
 from pipeline.body.body import ParametricBody
 from pipeline.body.fit.camera_parameters import apply_intrinsics_delta
 from pipeline.body.fit.energy import EnergyParameters, Objective, compute_px_per_m
-from pipeline.body.fit.gravity import align_with_gravity, initial_evidence, level_evidence, turn_observations
+from pipeline.body.fit.gravity import align_with_gravity, axis_evidence, lean_deg, turn_observations
 from pipeline.body.fit.ground_contact import Contact, estimate_floor_contact
 from pipeline.body.fit.initialisation import has_torso_landmarks, initial_state, interpolated_state
 from pipeline.body.fit.landmark_regressor import LandmarkRegressor, landmark_regressor
@@ -42,6 +42,7 @@ from pipeline.body.fit.root_placement import world_to_perspective
 from pipeline.body.fit.silhouette_icp import MaskWindow, match_silhouettes
 from pipeline.body.fit.state import FitState, Observations
 from pipeline.body.fit.supplied_poses import SuppliedPoses
+from pipeline.body.fit.turn_axis import estimate_turn_axis
 from pipeline.body.settings import DEFAULT_SETTINGS, FitSettings
 from pipeline.core.progress import track
 from pipeline.geometry.rotation import continuous_quaternions, matrix_to_quaternion
@@ -71,7 +72,7 @@ class FitOptions:
     principal_point_relative_std: float = 0.0
     shared_frames: int = 48
     rounds: int = 8
-    vertical_is_known: bool = False
+    vertical_is_known: bool = True
     settings: FitSettings = DEFAULT_SETTINGS
 
 
@@ -114,9 +115,13 @@ def fit_body(
     no_offsets = torch.zeros(offset_count, dtype=torch.float64)
     rest_landmarks_m = context.regressor.points(context.default, no_offsets).rest_m[0]
     observations, left_right_swapped = _correct_left_right_swaps(observations, rest_landmarks_m)
-    evidence = None if options.vertical_is_known else initial_evidence(observations, options.settings)
-    if evidence is not None:
-        observations = turn_observations(observations, evidence.up(), rest_landmarks_m)
+    evidence = None
+    if not options.vertical_is_known:
+        axis = estimate_turn_axis(observations, options.focal_relative_std)
+        evidence = axis_evidence(axis, options.settings)
+        observations = turn_observations(observations, evidence.up(), axis, rest_landmarks_m)
+        if axis is not None and options.focal_relative_std > 0.0:
+            options = replace(options, focal_relative_std=axis.focal_log_std)
     start = initial_state(
         observations, rest_landmarks_m, context.default.joints_m, body.shape_defaults.double(), offset_count
     )
@@ -143,15 +148,12 @@ def fit_supplied_poses(
     windows: Sequence[MaskWindow | None],
     supplied: SuppliedPoses,
     keep: bool,
-    vertical_is_known: bool,
     settings: FitSettings = DEFAULT_SETTINGS,
 ) -> FitResult:
     """Use user-supplied shape and poses; interpolate and fit the poses of the other frames.
 
-    observations: their camera is that of the supplied poses.
-    keep: whether the supplied poses stay unchanged relative to the camera; otherwise all poses are refined with
-        landmarks and silhouettes.
-    vertical_is_known: as in `FitOptions`.
+    observations: their camera is that of the supplied poses, whose world is kept.
+    keep: whether the supplied poses stay unchanged; otherwise all poses are refined with landmarks and silhouettes.
 
     Raises:
         TooFewLandmarksError: as `fit_body`, if any frame is fitted.
@@ -173,17 +175,8 @@ def fit_supplied_poses(
     if keep:
         state = supplied.overwrite_poses(state, model.full_joint_indices)
     _, silhouette_iou = match_silhouettes(model, state, observations, windows)
-    roots = state.rotations[:, 0]
-    if not vertical_is_known:
-        state, observations = align_with_gravity(model, state, observations, level_evidence(settings), settings)
     result = _result(context, model, state, observations, silhouette_iou, left_right_swapped)
-    if not keep:
-        return result
-    turned = replace(supplied, rotations=supplied.rotations.clone())
-    turned.rotations[:, 0] = (state.rotations[:, 0] @ roots.transpose(1, 2))[
-        supplied.rows
-    ].float() @ supplied.rotations[:, 0]
-    return replace(result, rotations_wxyz=turned.overwrite_all_rotations(result.rotations_wxyz))
+    return replace(result, rotations_wxyz=supplied.overwrite_all_rotations(result.rotations_wxyz)) if keep else result
 
 
 def select_shared_frames(
@@ -382,6 +375,7 @@ def _result(
         left_right_swapped=left_right_swapped,
         focal_relative_std=0.0,
         height_std_m=0.0,
+        lean_deg=lean_deg(model, state),
     )
 
 

@@ -20,7 +20,7 @@ from pipeline.body.fit.initialisation import facing_yaw_rad, has_torso_landmarks
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody
 from pipeline.body.fit.posed_points import PosedSkeleton, pose_points, pose_skeleton
 from pipeline.body.fit.state import FitState, Observations
-from pipeline.body.fit.turn_axis import MAX_YAW_RESULTANT, estimate_turn_axis, yaw_resultant
+from pipeline.body.fit.turn_axis import MAX_YAW_RESULTANT, TurnAxis, yaw_resultant
 from pipeline.body.settings import FitSettings
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.rotation import rotation_between
@@ -60,27 +60,39 @@ def level_evidence(settings: FitSettings) -> TiltEvidence:
     return TiltEvidence.from_std(none, none + np.radians(settings.camera_tilt_std_deg))
 
 
-def initial_evidence(observations: Observations, settings: FitSettings) -> TiltEvidence:
-    """Return what is known of the vertical before the fit, in the world of a level camera."""
-    evidence, axis = level_evidence(settings), estimate_turn_axis(observations)
+def axis_evidence(axis: TurnAxis | None, settings: FitSettings) -> TiltEvidence:
+    """Return what is known of the vertical before the fit, in the world of a level camera.
+
+    axis: None if there is no turn.
+    """
+    evidence = level_evidence(settings)
     if axis is None:
         return evidence
     return evidence + TiltEvidence.from_std(torch.from_numpy(axis.tilt_rad), torch.from_numpy(axis.std_rad))
 
 
 def turn_observations(
-    observations: Observations, up: Float[Tensor, "3"], rest_landmarks_m: Float[Tensor, "l 3"]
+    observations: Observations,
+    up: Float[Tensor, "3"],
+    axis: TurnAxis | None,
+    rest_landmarks_m: Float[Tensor, "l 3"],
 ) -> Observations:
     """Return the observations in the world in which `up` is +Y; on a turn, with 3D landmarks whose torso is upright.
 
-    The detector reports a part of the tilt of the camera only, and the fit would start from there.
+    The detector reports a part of the tilt of the camera only, and the fit would start from there. The camera gets the
+    focal length at which the turn was seen.
+
+    axis: None if there is no turn.
     """
     to_vertical = rotation_between(up, _y_axis())
     directions = observations.landmarks_3d_m @ to_vertical.T
-    rotation = torso_rotations(rest_landmarks_m, directions[has_torso_landmarks(observations)])
-    if yaw_resultant(facing_yaw_rad(rotation).numpy()) <= MAX_YAW_RESULTANT:
+    camera = observations.camera
+    if axis is not None:
+        rotation = torso_rotations(rest_landmarks_m, directions[has_torso_landmarks(observations)])
         directions = directions @ rotation_between(rotation[:, :, 1].mean(0), _y_axis()).T
-    camera = turn_camera(observations.camera, to_vertical, torch.zeros(3, dtype=torch.float64))
+        zoom = float(np.exp(axis.focal_log))
+        camera = replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom)
+    camera = turn_camera(camera, to_vertical, torch.zeros(3, dtype=torch.float64))
     return replace(observations, landmarks_3d_m=directions, camera=camera)
 
 
@@ -127,6 +139,12 @@ def body_axes(skeleton: PosedSkeleton) -> Float[Tensor, "n 3"]:
     position_m = skeleton.position_m
     axis = position_m[:, neck] - 0.5 * (position_m[:, left] + position_m[:, right])
     return torch.nn.functional.normalize(axis, dim=-1)
+
+
+def lean_deg(model: LinearBody, state: FitState) -> float:
+    """Return the angle between +Y and the mean axis of the body."""
+    mean = body_axes(pose_skeleton(model, state.rotations, state.root_m)).mean(0)
+    return float(torch.rad2deg(torch.atan2(mean[[0, 2]].norm(), mean[1])))
 
 
 def mean_lean_rad(axes: Float[Tensor, "n 3"], yaw_rad: Float[Tensor, "n"]) -> Float[Tensor, "2"]:

@@ -25,6 +25,7 @@ class FitResult:
     landmark_error_px, silhouette_iou: of each frame; nan without landmarks or mask.
     left_right_swapped: by body part, the frames whose landmarks were swapped.
     focal_relative_std, height_std_m: standard deviations from the curvature of the energy.
+    lean_deg: angle between +Y and the mean axis of the trunk (mid-hips to neck); over a full turn 0 for upright people.
     """
 
     body: Body
@@ -36,6 +37,7 @@ class FitResult:
     left_right_swapped: dict[str, Bool[np.ndarray, "n"]]
     focal_relative_std: float
     height_std_m: float
+    lean_deg: float
 
 
 def landmark_errors_px(

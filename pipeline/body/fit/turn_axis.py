@@ -48,10 +48,13 @@ class TurnAxis:
 
     tilt_rad: slope of the axis to the right and towards a level camera: the axis is (right, 1, towards), normalised.
     std_rad: of each.
+    focal_log, focal_log_std: logarithm of the focal length over the camera's, and its standard deviation.
     """
 
     tilt_rad: Float[np.ndarray, "2"]
     std_rad: Float[np.ndarray, "2"]
+    focal_log: float
+    focal_log_std: float
 
 
 @dataclass(frozen=True)
@@ -67,11 +70,12 @@ class _Problem:
     start_body: Float[np.ndarray, "m 3"]
     start_yaw_rad: Float[np.ndarray, "k"]
     height: float
+    focal_log_std: float
 
     def unpack(
         self, unknowns: Float[np.ndarray, "u"]
-    ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "k"], Float[np.ndarray, "k 2"], Float[np.ndarray, "3"]]:
-        """Return the body, the yaw, the place on the floor of each frame, and (height of the body, two tilts)."""
+    ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "k"], Float[np.ndarray, "k 2"], Float[np.ndarray, "4"]]:
+        """Return the body, yaw and place on the floor of each frame, and (middle height, two tilts, focal_log)."""
         frames, points = self.rays.shape[:2]
         body, yaw, place, rest = np.split(unknowns, np.cumsum([3 * points, frames, 2 * frames]))
         return body.reshape(points, 3), yaw, place.reshape(frames, 2), rest
@@ -80,11 +84,11 @@ class _Problem:
         """Return the unknowns of the body of the detector on a level turn."""
         place = np.zeros(2 * len(self.rays))
         middle = float(np.average(self.rays[..., 1], weights=self.weight[..., 0])) - self.start_body[:, 1].mean()
-        return np.concatenate([self.start_body.ravel(), self.start_yaw_rad, place, [middle, 0.0, 0.0]])
+        return np.concatenate([self.start_body.ravel(), self.start_yaw_rad, place, [middle, 0.0, 0.0, 0.0]])
 
     def reprojection(self, unknowns: Float[np.ndarray, "u"]) -> Float[np.ndarray, "k m 2"]:
         """Return the distances of the projected body from the rays, over the height of the landmarks."""
-        body, yaw, place, (middle, right, towards) = self.unpack(unknowns)
+        body, yaw, place, (middle, right, towards, focal_log) = self.unpack(unknowns)
         sine, cosine = np.sin(yaw)[:, None], np.cos(yaw)[:, None]
         turned = np.stack(
             [
@@ -95,16 +99,18 @@ class _Problem:
             axis=-1,
         )
         seen = turned @ axis_rotation(right, towards).T + [0.0, middle, -1.0]
-        return (seen[..., :2] / -seen[..., 2:] - self.rays) / self.height
+        return (np.exp(focal_log) * seen[..., :2] / -seen[..., 2:] - self.rays) / self.height
 
     def residuals(self, unknowns: Float[np.ndarray, "u"]) -> Float[np.ndarray, "r"]:
-        """Return all residuals in standard deviations; the last ones fix what an image does not show."""
+        """Return all residuals in standard deviations; the gauge fixes what an image does not show."""
         body, yaw, place, _ = self.unpack(unknowns)
         asymmetry = (body[::2] * [-1.0, 1.0, 1.0] - body[1::2]) / (self.height * SYMMETRY_STD_RATIO)
         offset = body[:, :2].mean(0) - self.start_body[:, :2].mean(0)
         gauge = [*offset, *place.mean(0), yaw.mean() - self.start_yaw_rad.mean()]
         pixels = self.weight * self.reprojection(unknowns) / LANDMARK_STD_RATIO
-        return np.concatenate([pixels.ravel(), asymmetry.ravel(), np.array(gauge) / 1e-3])
+        return np.concatenate(
+            [pixels.ravel(), asymmetry.ravel(), np.array(gauge) / 1e-3, unknowns[-1:] / self.focal_log_std]
+        )
 
 
 def axis_rotation(right: float, towards: float) -> Float[np.ndarray, "3 3"]:
@@ -115,10 +121,11 @@ def axis_rotation(right: float, towards: float) -> Float[np.ndarray, "3 3"]:
     return np.stack([across, up, np.cross(across, up)], axis=1)
 
 
-def estimate_turn_axis(observations: Observations) -> TurnAxis | None:
+def estimate_turn_axis(observations: Observations, focal_log_std: float) -> TurnAxis | None:
     """Return the axis of the turn of a person; None if there is no turn, or too few or contradicting landmarks.
 
     observations: with corrected left and right, in the world of a level camera.
+    focal_log_std: standard deviation of the logarithm of its focal length; 0 for a known one.
     """
     rows = _complete_frames(observations)
     if len(rows) < MIN_FRAMES:
@@ -128,13 +135,14 @@ def estimate_turn_axis(observations: Observations) -> TurnAxis | None:
     yaw_rad = np.unwrap(np.arctan2(-left[:, 2], left[:, 0]))
     if yaw_resultant(yaw_rad) > MAX_YAW_RESULTANT:
         return None
-    problem = _make_problem(observations, rows, yaw_rad)
+    problem = _make_problem(observations, rows, yaw_rad, max(focal_log_std, 1e-3))
     found = least_squares(problem.residuals, problem.start(), loss="soft_l1", max_nfev=MAX_EVALUATIONS)
     residual = np.linalg.norm(problem.reprojection(found.x), axis=-1)
     if np.median(residual) > MAX_RESIDUAL_RATIO:
         return None
     covariance = np.linalg.pinv(found.jac.T @ found.jac)
-    return TurnAxis(found.x[-2:], STD_FACTOR * np.sqrt(np.diag(covariance)[-2:]))
+    std = STD_FACTOR * np.sqrt(np.diag(covariance)[-3:])
+    return TurnAxis(found.x[-3:-1], std[:2], float(found.x[-1]), float(std[2]))
 
 
 def yaw_resultant(yaw_rad: Float[np.ndarray, "k"]) -> float:
@@ -150,7 +158,9 @@ def _complete_frames(observations: Observations) -> Int[np.ndarray, "k"]:
     return complete[np.unique(np.linspace(0, len(complete) - 1, min(MAX_FRAMES, len(complete))).astype(np.int64))]
 
 
-def _make_problem(observations: Observations, rows: Int[np.ndarray, "k"], yaw_rad: Float[np.ndarray, "k"]) -> _Problem:
+def _make_problem(
+    observations: Observations, rows: Int[np.ndarray, "k"], yaw_rad: Float[np.ndarray, "k"], focal_log_std: float
+) -> _Problem:
     camera, chosen = observations.camera, list(AXIS_LANDMARKS)
     pixels = observations.landmarks_px[rows][:, chosen].numpy()
     rays = (pixels - [camera.cx, camera.cy]) / [camera.fx, -camera.fy]
@@ -159,4 +169,4 @@ def _make_problem(observations: Observations, rows: Int[np.ndarray, "k"], yaw_ra
     body = np.median(np.stack([cosine * x - sine * z, y, sine * x + cosine * z], axis=-1), axis=0)
     height = float(np.median(np.ptp(rays[..., 1], axis=1)))
     weight = observations.confidence[rows][:, chosen].numpy()[..., None]
-    return _Problem(rays, weight, body * height / np.ptp(body[:, 1]), yaw_rad, height)
+    return _Problem(rays, weight, body * height / np.ptp(body[:, 1]), yaw_rad, height, focal_log_std)

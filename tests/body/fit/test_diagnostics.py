@@ -43,6 +43,7 @@ def result(**changes: object) -> FitResult:
         "left_right_swapped": {"whole body": np.zeros(FRAMES, dtype=bool), "legs": np.zeros(FRAMES, dtype=bool)},
         "focal_relative_std": 0.1,
         "height_std_m": 0.05,
+        "lean_deg": 0.5,
     }
     return FitResult(**(fields | changes))
 
