@@ -4,6 +4,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
+import torch
 from pydantic import ValidationError
 
 from pipeline.body.body import load_anny
@@ -21,7 +22,7 @@ from pipeline.capture.capture import (
 )
 from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
-from pipeline.geometry.camera import Camera
+from pipeline.geometry.camera import Camera, transform_world_to_camera
 from pipeline.io.image import read_rgb, write_gray, write_rgb
 from stages.body import STAGE, Config, check_fit_quality, initial_camera, run
 from tests.body.acting import SyntheticRecording, synthetic_recording
@@ -81,7 +82,13 @@ def test_stage_writes_body_motion_camera_scores_and_overlay(tmp_path, scene: Syn
     motion, body = load_motion(out / "motion.npz"), load_body(out / "body.npz")
     assert np.array_equal(motion.frame_index, 3 * np.arange(FRAMES))
     assert np.array_equal(motion.time_s, scene.time_s)
-    assert np.abs(motion.root_translation_m - scene.state.root_m.numpy()).max() < 0.05
+    # Without a supplied pose of the camera the floor is y = 0: only positions in the camera's axes are comparable.
+    camera = load_camera(out / "camera.npz")
+    root_m = transform_world_to_camera(torch.from_numpy(motion.root_translation_m).double(), camera)
+    assert (root_m - transform_world_to_camera(scene.state.root_m, scene.camera)).abs().max() < 0.05
+    assert metrics["camera_pitch_deg"] == pytest.approx(0.0, abs=3.0)
+    assert metrics["camera_roll_deg"] == pytest.approx(0.0, abs=3.0)
+    assert 0.7 < motion.root_translation_m[:, 1].mean() < 1.2
     assert body.height_m() == pytest.approx(scene.model.height_m()[0], abs=0.03)
     assert load_camera(out / "camera.npz").fx == scene.camera.fx
     scores = load_scores(out / "scores.npz")

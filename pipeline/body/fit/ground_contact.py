@@ -31,8 +31,9 @@ PLANE_TILT_STD_RAD, SOLE_HEIGHT_STD_M = 0.1, 0.1
 """Standard deviations of the tilt of the plane from the y axis of the world, and of the height of a sole, whose errors
 are correlated in time."""
 
-FLOOR_TILT_STD_RAD = 0.035
-"""Standard deviation of the tilt of a floor of any extent: errors of depth and of the soles' shape are common."""
+FLOOR_TILT_STD_RAD, COMMON_HEIGHT_STD_M = 0.035, 0.05
+"""Standard deviations of the tilt of a floor of any extent, and of the height over the root mean square extent of the
+soles. More frames do not lower them: who stands with a leaning fit has soles on a leaning plane in all of them."""
 
 PLANE_ITERATIONS = 4
 MIN_STANDING_SHARE = 0.2
@@ -119,7 +120,8 @@ def floor_tilt_information(positions_m: Float[Tensor, "n 4 3"], weight: Float[Te
     """Return the information (1 / rad²) that weighted points of a plane give on its slope along x and z."""
     centroid = (weight[..., None] * positions_m).sum((0, 1)) / weight.sum()
     horizontal = (positions_m - centroid)[..., [0, 2]].reshape(-1, 2)
-    information = horizontal.T @ (horizontal * weight.reshape(-1, 1)) / SOLE_HEIGHT_STD_M**2
+    scatter = horizontal.T @ (horizontal * weight.reshape(-1, 1)) / weight.sum()
+    information = scatter / COMMON_HEIGHT_STD_M**2
     identity = torch.eye(2, dtype=positions_m.dtype)
     return torch.linalg.solve(identity + FLOOR_TILT_STD_RAD**2 * information, information)
 

@@ -127,7 +127,7 @@ def test_a_person_who_stands_still_is_no_evidence() -> None:
     evidence = axis_evidence(estimate_turn_axis(observations, 0.0), SETTINGS)
     assert torch.equal(evidence.up(), torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
     _, aligned = align_with_gravity(scene.model, state, observations, evidence, SETTINGS)
-    assert camera_tilt_deg(aligned.camera) == pytest.approx((0.0, 0.0), abs=1.0)
+    assert camera_tilt_deg(aligned.camera) == pytest.approx((0.0, 0.0), abs=1.5)
 
 
 def test_observations_of_a_turn_become_upright() -> None:
