@@ -51,6 +51,7 @@ def capture(tmp_path) -> Capture:
         n_video_frames=9,
         scale=0.5,
         metadata_focal_px=88.0,
+        camera_pose_is_known=True,
     )
 
 

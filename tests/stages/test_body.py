@@ -9,6 +9,7 @@ from pydantic import ValidationError
 
 from pipeline.body.body import load_anny
 from pipeline.body.files import load_body, load_camera, load_motion, load_scores
+from pipeline.body.fit.fit import TooFewLandmarksError
 from pipeline.body.overlay import BODY_OUTLINE_RGB, MASK_OUTLINE_RGB, WARNING_RGB
 from pipeline.body.settings import FitSettings
 from pipeline.capture.capture import (
@@ -24,7 +25,7 @@ from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
 from pipeline.geometry.camera import Camera, transform_world_to_camera
 from pipeline.io.image import read_rgb, write_gray, write_rgb
-from stages.body import STAGE, Config, check_fit_quality, initial_camera, run
+from stages.body import STAGE, Config, check_fit_quality, fit_capture, initial_camera, run
 from tests.body.acting import SyntheticRecording, synthetic_recording
 from tests.body.fit.test_diagnostics import result
 
@@ -102,6 +103,19 @@ def test_stage_writes_body_motion_camera_scores_and_overlay(tmp_path, scene: Syn
     assert 0 < mask_px < 0.6 * body_px  # where both agree, the body's outline hides that of the mask
     assert not (tiles == WARNING_RGB).all(-1).any()
     assert take_warnings() == []
+
+
+@pytest.mark.parametrize("is_known", [True, False])
+def test_the_vertical_is_estimated_unless_the_camera_pose_is_supplied(
+    tmp_path, scene: SyntheticRecording, is_known: bool
+) -> None:
+    masks = scene.masks()
+    write_capture(tmp_path / "frames", scene, scene.camera, masks)
+    capture = replace(load_capture(tmp_path / "frames"), camera_pose_is_known=is_known)
+    stop = mock.patch("stages.body.fit_body", side_effect=TooFewLandmarksError("stop"))
+    with stop as fit, pytest.raises(UserError, match="stop"):
+        fit_capture(capture, scene.hands, masks, Config())
+    assert fit.call_args.args[3].vertical_is_known is is_known
 
 
 def test_an_unusable_frame_is_marked_reported_and_dropped(tmp_path, scene: SyntheticRecording) -> None:

@@ -38,8 +38,7 @@ MAX_RESIDUAL_RATIO = 0.03
 whose limbs swing is no rigid body."""
 
 STD_FACTOR = 2.0
-"""True over formal standard deviation: errors of neighbouring frames are alike. Three turns: errors of 1 to 2 degrees at
-formal deviations of 0.5."""
+"""True over formal standard deviation: errors of neighbouring frames are alike (1 to 2 degrees on three turns)."""
 
 
 @dataclass(frozen=True)
