@@ -121,7 +121,11 @@ def fit_body(
         evidence = axis_evidence(axis, options.settings)
         observations = turn_observations(observations, evidence.up(), axis, rest_landmarks_m)
         if axis is not None and options.focal_relative_std > 0.0:
-            options = replace(options, focal_relative_std=axis.focal_log_std)
+            # The deviation of the principal point is in focal lengths.
+            principal_point_std = options.principal_point_relative_std * float(np.exp(-axis.focal_log))
+            options = replace(
+                options, focal_relative_std=axis.focal_log_std, principal_point_relative_std=principal_point_std
+            )
     start = initial_state(
         observations, rest_landmarks_m, context.default.joints_m, body.shape_defaults.double(), offset_count
     )
