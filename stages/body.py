@@ -23,11 +23,11 @@ from pipeline.body.fit.diagnostics import (
     usable_frames,
 )
 from pipeline.body.fit.fit import FitOptions, TooFewLandmarksError, fit_body, fit_supplied_poses
-from pipeline.body.fit.gravity import camera_tilt_deg
 from pipeline.body.fit.hand_observations import filter_hand_detections, finger_curls_rad
 from pipeline.body.fit.result import FitResult
 from pipeline.body.fit.silhouette_icp import crop_mask_window
 from pipeline.body.fit.supplied_poses import SuppliedPoses
+from pipeline.body.fit.vertical.gravity import camera_tilt_deg
 from pipeline.body.foreign_objects import foreign_object_warnings, frames_with_foreign_objects, residual_blob_shares
 from pipeline.body.overlay import draw_overlay, pose_vertices, tile_overlays
 from pipeline.body.settings import DEFAULT_SETTINGS, FitSettings

@@ -12,7 +12,7 @@ from data_tools.evaluate.truth import load_ground_truth, load_true_mask
 from data_tools.synthetic.scene.capture import SyntheticCapture
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.files import load_body, load_camera, load_motion
-from pipeline.body.fit.gravity import camera_tilt_deg
+from pipeline.body.fit.vertical.gravity import camera_tilt_deg
 from pipeline.core.errors import UserError
 from pipeline.geometry.camera import Camera, project, transform_world_to_camera
 from pipeline.geometry.mesh import Mesh

@@ -37,7 +37,7 @@ from pipeline.geometry.camera import Camera
 
 VERTICAL_PRINCIPAL_POINT_RATIO = 0.2
 """Standard deviation of the principal point down the image over the one across it. A pitch of the camera shows the same
-picture to first order, and is estimated from more (`pipeline.body.fit.gravity`)."""
+picture to first order, and is estimated from more (`pipeline.body.fit.vertical.gravity`)."""
 
 
 @dataclass(frozen=True)

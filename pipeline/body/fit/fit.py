@@ -16,7 +16,6 @@ from torch import Tensor
 from pipeline.body.body import ParametricBody
 from pipeline.body.fit.camera_parameters import apply_intrinsics_delta
 from pipeline.body.fit.energy import EnergyParameters, Objective, compute_px_per_m
-from pipeline.body.fit.gravity import align_with_gravity, axis_evidence, lean_deg, turn_observations
 from pipeline.body.fit.ground_contact import Contact, estimate_floor_contact
 from pipeline.body.fit.initialisation import has_torso_landmarks, initial_state, interpolated_state
 from pipeline.body.fit.landmark_regressor import LandmarkRegressor, landmark_regressor
@@ -42,7 +41,8 @@ from pipeline.body.fit.root_placement import world_to_perspective
 from pipeline.body.fit.silhouette_icp import MaskWindow, match_silhouettes
 from pipeline.body.fit.state import FitState, Observations
 from pipeline.body.fit.supplied_poses import SuppliedPoses
-from pipeline.body.fit.turn_axis import estimate_turn_axis
+from pipeline.body.fit.vertical.gravity import align_with_gravity, axis_evidence, lean_deg, turn_observations
+from pipeline.body.fit.vertical.turn_axis import estimate_turn_axis
 from pipeline.body.settings import DEFAULT_SETTINGS, FitSettings
 from pipeline.core.progress import track
 from pipeline.geometry.rotation import continuous_quaternions, matrix_to_quaternion

@@ -103,7 +103,7 @@ def fit_plane(
 ) -> tuple[Float[Tensor, "3"], Float[Tensor, ""]]:
     """Return unit normal and offset (m) of the plane through weighted points: normal · x = offset.
 
-    A prior keeps the normal near the y axis, the estimated vertical (`pipeline.body.fit.gravity`).
+    A prior keeps the normal near the y axis, the estimated vertical (`pipeline.body.fit.vertical.gravity`).
     """
     total = weight.sum()
     centroid = (weight[..., None] * positions_m).sum((0, 1)) / total

@@ -8,7 +8,7 @@ import torch
 
 from pipeline.body.body import load_anny
 from pipeline.body.fit.state import Observations
-from pipeline.body.fit.turn_axis import axis_rotation, estimate_turn_axis, yaw_resultant
+from pipeline.body.fit.vertical.turn_axis import axis_rotation, estimate_turn_axis, yaw_resultant
 from pipeline.geometry.camera import Camera
 from tests.body.acting import synthetic_recording
 

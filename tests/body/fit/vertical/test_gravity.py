@@ -7,7 +7,10 @@ import pytest
 import torch
 
 from pipeline.body.body import load_anny
-from pipeline.body.fit.gravity import (
+from pipeline.body.fit.ground_contact import FLOOR_TILT_STD_RAD, floor_tilt_information, sole_points
+from pipeline.body.fit.landmark_regressor import landmark_regressor
+from pipeline.body.fit.posed_points import pose_points, pose_skeleton
+from pipeline.body.fit.vertical.gravity import (
     TiltEvidence,
     align_with_gravity,
     axis_evidence,
@@ -18,10 +21,7 @@ from pipeline.body.fit.gravity import (
     turn_observations,
     turn_state,
 )
-from pipeline.body.fit.ground_contact import FLOOR_TILT_STD_RAD, floor_tilt_information, sole_points
-from pipeline.body.fit.landmark_regressor import landmark_regressor
-from pipeline.body.fit.posed_points import pose_points, pose_skeleton
-from pipeline.body.fit.turn_axis import TurnAxis, estimate_turn_axis
+from pipeline.body.fit.vertical.turn_axis import TurnAxis, estimate_turn_axis
 from pipeline.body.settings import FitSettings
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.rotation import axis_angle_to_matrix

@@ -1,7 +1,7 @@
 """The vertical of a recording: the world of a fit is turned until +Y is up, and its floor is y = 0.
 
 Evidence of the tilt of the vertical, each with a standard deviation: a camera is held nearly level, the axis of a turn
-in the images (`pipeline.body.fit.turn_axis`), the floor through the standing soles, and the axis of the body over a
+in the images (module `turn_axis`), the floor through the standing soles, and the axis of the body over a
 turn. Where there is no turn and nobody walks, the camera stays level. A tilt is the slope (x, z) of the vertical in a
 world whose y axis is nearly vertical: the vertical is (x, 1, z), normalised.
 
@@ -20,7 +20,7 @@ from pipeline.body.fit.initialisation import facing_yaw_rad, has_torso_landmarks
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody
 from pipeline.body.fit.posed_points import PosedSkeleton, pose_points, pose_skeleton
 from pipeline.body.fit.state import FitState, Observations
-from pipeline.body.fit.turn_axis import MAX_YAW_RESULTANT, TurnAxis, yaw_resultant
+from pipeline.body.fit.vertical.turn_axis import MAX_YAW_RESULTANT, TurnAxis, yaw_resultant
 from pipeline.body.settings import FitSettings
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.rotation import rotation_between
