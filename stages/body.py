@@ -34,6 +34,7 @@ from pipeline.body.fit.hand_observations import filter_hand_detections, finger_c
 from pipeline.body.fit.result import FitResult
 from pipeline.body.fit.silhouette_icp import crop_mask_window
 from pipeline.body.fit.supplied_poses import SuppliedPoses
+from pipeline.body.fit.vertical.gravity import camera_tilt_deg
 from pipeline.body.foreign_objects import foreign_object_warnings, frames_with_foreign_objects, residual_blob_shares
 from pipeline.body.overlay import draw_overlay, pose_vertices, tile_overlays
 from pipeline.body.settings import DEFAULT_SETTINGS, FitSettings
@@ -130,6 +131,7 @@ def run(
         blob_shares, capture.frame_index
     ):
         warn(message)
+    pitch_deg, roll_deg = camera_tilt_deg(result.camera)
     return {
         "silhouette_iou": float(np.nanmedian(result.silhouette_iou)),
         "silhouette_iou_worst": float(np.nanmin(result.silhouette_iou)),
@@ -138,6 +140,9 @@ def run(
         "focal_relative_std": result.focal_relative_std,
         "principal_x_px": result.camera.cx,
         "principal_y_px": result.camera.cy,
+        "camera_pitch_deg": pitch_deg,
+        "camera_roll_deg": roll_deg,
+        "lean_deg": result.lean_deg,
         "height_m": result.body.height_m(),
         "height_std_m": result.height_std_m,
         "left_right_swapped_frames": int(left_right_swapped.sum()),
@@ -170,7 +175,13 @@ def fit_capture(
         settings.principal_point_std_ratio * side_px / camera.fx if focal_relative_std > 0.0 else 0.0
     )
     options = FitOptions(
-        config.height_m, focal_relative_std, principal_point_relative_std, config.shared_frames, config.rounds, settings
+        config.height_m,
+        focal_relative_std,
+        principal_point_relative_std,
+        config.shared_frames,
+        config.rounds,
+        capture.camera_pose_is_known,
+        settings,
     )
     windows = [crop_mask_window(mask) for mask in masks]
     model = load_anny() if config.model_file is None else load_smpl(Path(config.model_file))
@@ -290,7 +301,7 @@ def draw_overlay_grid(
 
 STAGE = Stage(
     "body",
-    version=12,
+    version=13,
     needs=("frames",),
     makes=(_BODY, _MOTION, _CAMERA, _OBSERVATIONS, SCORES_NPZ, _OVERLAY),
     config=Config,

@@ -207,12 +207,13 @@ def make_capture(
         metadata_focal_px=metadata_focal_px(source, detections.width, detections.height),
         hands=detections.hands.rows(chosen),
         smpl_poses=None if user_files.smpl_poses is None else user_files.smpl_poses.for_frames(frame_index),
+        camera_pose_is_known=user_files.camera is not None and user_files.camera.world_to_camera is not None,
     )
 
 
 STAGE = Stage(
     "frames",
-    version=10,
+    version=11,
     needs=("video",),
     makes=(FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, CONTACT_SHEET),
     config=Config,

@@ -1,6 +1,7 @@
 """Score the frames and body stages of a run against the ground truth of its synthetic capture."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +9,12 @@ import torch
 from jaxtyping import Bool, Float
 
 from data_tools.evaluate.truth import load_ground_truth, load_true_mask
+from data_tools.synthetic.scene.capture import SyntheticCapture
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.files import load_body, load_camera, load_motion
+from pipeline.body.fit.vertical.gravity import camera_tilt_deg
 from pipeline.core.errors import UserError
-from pipeline.geometry.camera import project
+from pipeline.geometry.camera import Camera, project, transform_world_to_camera
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.geometry.surface import closest_points_on_mesh
@@ -24,6 +27,7 @@ CORRECTED_JOINTS = (
     *("Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"),
     *(f"{side}{part}" for side in ("Left", "Right") for part in ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")),
 )
+TRUNK_JOINTS = ("LeftUpLeg", "RightUpLeg", "Neck")
 SURFACE_FRAMES = 8
 
 
@@ -42,6 +46,8 @@ def compare_masks(out: Path, frames: Path) -> dict[str, float]:
 def compare_body(out: Path, body_folder: Path) -> dict[str, float]:
     """Score the body stage; errors are means over frames and joints. Joints that the true rig lacks are left out.
 
+    Joint errors are in camera axes, so that they do not contain errors of the vertical.
+
     Returns:
         joint_error_mm: MPJPE after aligning the hips.
         scaled_joint_error_mm: MPJPE after aligning the hips and scaling to the true distance of neck and hips.
@@ -52,6 +58,9 @@ def compare_body(out: Path, body_folder: Path) -> dict[str, float]:
         left_right_swapped_frames: number of frames, see `left_right_swapped_frames`.
         focal_ratio, scale_ratio: estimated over true focal length and body size.
         silhouette_iou: median over frames, as reported by the stage.
+        lean_median_deg, lean_worst_deg: over frames, angle between the fitted and the true axis of the trunk in the
+            world, see `trunk_axes`; absent if the true rig lacks hip joints or neck.
+        camera_pitch_error_deg, camera_roll_error_deg: estimated minus true.
 
     Raises:
         UserError: a frame of the run is not in the ground truth.
@@ -65,8 +74,11 @@ def compare_body(out: Path, body_folder: Path) -> dict[str, float]:
             "name the capture that this run was made from"
         )
     names = [name for name in CORRECTED_JOINTS if name in truth.subject.body.joint_names and name in body.joint_names]
-    fitted = joint_positions(body, motion, names)
-    true = joint_positions(truth.subject.body, truth.motion.select(motion.frame_index), names)
+    true_body, true_motion = truth.subject.body, truth.motion.select(motion.frame_index)
+    fitted, true = (
+        transform_world_to_camera(torch.from_numpy(joint_positions(rig, poses, names)), viewing_camera).numpy()
+        for rig, poses, viewing_camera in ((body, motion, camera), (true_body, true_motion, truth.camera))
+    )
     root_relative_m, true_root_relative_m = fitted - fitted[:, :1], true - true[:, :1]
     neck = names.index("Neck") if "Neck" in names else names.index("Head")
     scale = (
@@ -74,7 +86,7 @@ def compare_body(out: Path, body_folder: Path) -> dict[str, float]:
         / np.linalg.norm(root_relative_m[:, neck], axis=1).mean()
     )
     fitted_px, true_px = (
-        project(torch.from_numpy(positions).float(), viewing_camera)[0].numpy()
+        project(torch.from_numpy(positions).float(), replace(viewing_camera, world_to_camera=np.eye(4)))[0].numpy()
         for positions, viewing_camera in ((fitted, camera), (true, truth.camera))
     )
     size_ratio = camera.width / truth.camera.width
@@ -97,7 +109,44 @@ def compare_body(out: Path, body_folder: Path) -> dict[str, float]:
         "focal_ratio": camera.fx / size_ratio / truth.camera.fx,
         "scale_ratio": float(1.0 / scale),
         "silhouette_iou": float(np.nanmedian(load_npz(body_folder / "scores.npz")["silhouette_iou"])),
+        **_vertical_errors(body, motion, camera, truth),
     }
+
+
+def _vertical_errors(body: Body, motion: Motion, camera: Camera, truth: SyntheticCapture) -> dict[str, float]:
+    """Return the errors of the lean of the trunk and of pitch and roll of the camera; see `compare_body`."""
+    pitch_deg, roll_deg = (
+        fitted - true for fitted, true in zip(camera_tilt_deg(camera), camera_tilt_deg(truth.camera), strict=True)
+    )
+    errors = {"camera_pitch_error_deg": pitch_deg, "camera_roll_error_deg": roll_deg}
+    if not set(TRUNK_JOINTS) <= set(truth.subject.body.joint_names):
+        return errors
+    fitted_axis = trunk_axes(body, motion, truth.subject.body)
+    true_axis = trunk_axes(truth.subject.body, truth.motion.select(motion.frame_index), truth.subject.body)
+    lean_deg = np.degrees(np.arccos(np.clip((fitted_axis * true_axis).sum(1), -1.0, 1.0)))
+    return {"lean_median_deg": float(np.median(lean_deg)), "lean_worst_deg": float(lean_deg.max()), **errors}
+
+
+def trunk_axes(body: Body, motion: Motion, reference: Body) -> Float[np.ndarray, "n 3"]:
+    """Return unit vectors from the middle of the hip joints to the base of the neck, in the world.
+
+    Rigs place these joints differently inside the body: the difference of the slopes of body and `reference` in the
+    rest pose, about the axis through the hip joints, is removed.
+    """
+    left, right, neck = np.moveaxis(joint_positions(body, motion, TRUNK_JOINTS), 1, 0)
+    axis, across = neck - 0.5 * (left + right), left - right
+    forward = np.cross(across, axis)
+    forward *= np.linalg.norm(axis, axis=1, keepdims=True) / np.linalg.norm(forward, axis=1, keepdims=True)
+    angle_rad = rest_slope_rad(reference) - rest_slope_rad(body)
+    turned = np.cos(angle_rad) * axis + np.sin(angle_rad) * forward
+    return turned / np.linalg.norm(turned, axis=1, keepdims=True)
+
+
+def rest_slope_rad(body: Body) -> float:
+    """Return the angle by which the axis of the trunk leans forward in the rest pose."""
+    left, right, neck = body.joints_m[[body.joint(name) for name in TRUNK_JOINTS]].astype(np.float64)
+    axis = neck - 0.5 * (left + right)
+    return float(np.arctan2(axis[2], axis[1]))
 
 
 def joint_accelerations(

@@ -38,6 +38,9 @@ class FitSettings:
         mean_stature_m, mean_stature_std_m: prior of the stature if it is not known. A loose prior let it sink to
             1.56 m.
         known_stature_std_m: standard deviation of a known stature.
+        camera_tilt_std_deg: standard deviation of pitch and roll of a camera about level, before anything is seen.
+            Cameras look down by up to 15 degrees, and a turn determines the vertical to 1.5 degrees.
+        body_axis_std_deg: standard deviation of the mean axis of the body over a turn from the vertical.
         stature_spread_m: standard deviation of the stature of adults, reported as the uncertainty of an unknown one.
     """
 
@@ -64,6 +67,8 @@ class FitSettings:
     mean_stature_std_m: float = 0.02
     known_stature_std_m: float = 0.005
     stature_spread_m: float = 0.09
+    camera_tilt_std_deg: float = 10.0
+    body_axis_std_deg: float = 1.0
 
     def __post_init__(self) -> None:
         for field in fields(self):

@@ -33,6 +33,7 @@ class Capture:
     metadata_focal_px: focal length for these images from the metadata of the recording; None if there is none.
     hands: landmarks of both hands in every frame; None if they were not detected.
     smpl_poses: user-supplied SMPL poses of some of these frames; None without.
+    camera_pose_is_known: whether the user supplied the pose of the camera, in a world whose +Y is up.
     """
 
     folder: Path
@@ -53,6 +54,7 @@ class Capture:
     hands: HandLandmarks | None = None
     smpl_poses: SmplPoses | None = None
     split_rule: str = INTERLEAVED_RULE
+    camera_pose_is_known: bool = False
 
     def __len__(self) -> int:
         return len(self.frame_index)
@@ -99,6 +101,7 @@ def save_capture(capture: Capture) -> None:
         "landmarks_visibility": capture.landmarks_visibility.astype(np.float32),
         "landmarks_world_m": capture.landmarks_world_m.astype(np.float32),
         "camera_world_to_camera": camera.world_to_camera if camera else DEFAULT_WORLD_TO_CAMERA,
+        "camera_pose_is_known": np.array(capture.camera_pose_is_known),
         "mask_source": np.array(capture.mask_source),
         "n_video_frames": np.array(capture.n_video_frames, dtype=np.int32),
         "scale": np.array(capture.scale),
@@ -140,6 +143,7 @@ def load_capture(frames_dir: Path) -> Capture:
         hands=_hands(arrays),
         smpl_poses=load_smpl_poses(poses_path) if poses_path.is_file() else None,
         split_rule=str(arrays["split_rule"].item()) if "split_rule" in arrays else INTERLEAVED_RULE,
+        camera_pose_is_known=bool(np.ravel(arrays.get("camera_pose_is_known", False))[0]),
     )
 
 

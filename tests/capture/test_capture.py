@@ -52,6 +52,7 @@ def capture(tmp_path) -> Capture:
         scale=0.5,
         metadata_focal_px=88.0,
         split_rule="split.json",
+        camera_pose_is_known=True,
     )
 
 

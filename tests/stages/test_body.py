@@ -4,10 +4,12 @@ from unittest import mock
 
 import numpy as np
 import pytest
+import torch
 from pydantic import ValidationError
 
 from pipeline.body.body import load_anny
 from pipeline.body.files import load_body, load_camera, load_motion, load_scores
+from pipeline.body.fit.fit import TooFewLandmarksError
 from pipeline.body.overlay import BODY_OUTLINE_RGB, MASK_OUTLINE_RGB, WARNING_RGB
 from pipeline.body.settings import FitSettings
 from pipeline.capture.capture import (
@@ -21,9 +23,9 @@ from pipeline.capture.capture import (
 )
 from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
-from pipeline.geometry.camera import Camera
+from pipeline.geometry.camera import Camera, transform_world_to_camera
 from pipeline.io.image import read_rgb, write_gray, write_rgb
-from stages.body import STAGE, Config, check_fit_quality, initial_camera, run
+from stages.body import STAGE, Config, check_fit_quality, fit_capture, initial_camera, run
 from tests.body.acting import SyntheticRecording, synthetic_recording
 from tests.body.fit.test_diagnostics import result
 
@@ -81,7 +83,13 @@ def test_stage_writes_body_motion_camera_scores_and_overlay(tmp_path, scene: Syn
     motion, body = load_motion(out / "motion.npz"), load_body(out / "body.npz")
     assert np.array_equal(motion.frame_index, 3 * np.arange(FRAMES))
     assert np.array_equal(motion.time_s, scene.time_s)
-    assert np.abs(motion.root_translation_m - scene.state.root_m.numpy()).max() < 0.05
+    # Without a supplied pose of the camera the floor is y = 0: only positions in the camera's axes are comparable.
+    camera = load_camera(out / "camera.npz")
+    root_m = transform_world_to_camera(torch.from_numpy(motion.root_translation_m).double(), camera)
+    assert (root_m - transform_world_to_camera(scene.state.root_m, scene.camera)).abs().max() < 0.05
+    assert metrics["camera_pitch_deg"] == pytest.approx(0.0, abs=3.0)
+    assert metrics["camera_roll_deg"] == pytest.approx(0.0, abs=3.0)
+    assert 0.7 < motion.root_translation_m[:, 1].mean() < 1.2
     assert body.height_m() == pytest.approx(scene.model.height_m()[0], abs=0.03)
     assert load_camera(out / "camera.npz").fx == scene.camera.fx
     scores = load_scores(out / "scores.npz")
@@ -95,6 +103,19 @@ def test_stage_writes_body_motion_camera_scores_and_overlay(tmp_path, scene: Syn
     assert 0 < mask_px < 0.6 * body_px  # where both agree, the body's outline hides that of the mask
     assert not (tiles == WARNING_RGB).all(-1).any()
     assert take_warnings() == []
+
+
+@pytest.mark.parametrize("is_known", [True, False])
+def test_the_vertical_is_estimated_unless_the_camera_pose_is_supplied(
+    tmp_path, scene: SyntheticRecording, is_known: bool
+) -> None:
+    masks = scene.masks()
+    write_capture(tmp_path / "frames", scene, scene.camera, masks)
+    capture = replace(load_capture(tmp_path / "frames"), camera_pose_is_known=is_known)
+    stop = mock.patch("stages.body.fit_body", side_effect=TooFewLandmarksError("stop"))
+    with stop as fit, pytest.raises(UserError, match="stop"):
+        fit_capture(capture, scene.hands, masks, Config())
+    assert fit.call_args.args[3].vertical_is_known is is_known
 
 
 def test_an_unusable_frame_is_marked_reported_and_dropped(tmp_path, scene: SyntheticRecording) -> None:

@@ -92,18 +92,32 @@ class HeldOutTargets:
     motion: Motion | None
 
 
-def portrait_camera(size_px: int, height_m: float, distance_m: float, fill: float) -> tuple[Camera, np.ndarray]:
-    """Return a horizontal camera at the world origin, and the point on the ground where the person stands.
+def portrait_camera(
+    size_px: int, height_m: float, distance_m: float, fill: float, pitch_deg: float = 0.0, roll_deg: float = 0.0
+) -> tuple[Camera, np.ndarray]:
+    """Return a camera, and the point on the ground where the person stands (world).
+
+    A level camera is at the world origin. A pitched one is moved on a circle about the point at the middle of its
+    image, so that the person stays in view.
 
     Args:
         size_px: side of the square image.
         height_m: of the person.
         distance_m: from camera to person.
-        fill: fraction of the image height that the person covers, in (0, 1).
+        fill: fraction of the image height that the person covers, in (0, 1); approximate for a pitched camera.
+        pitch_deg: angle of the optical axis above the horizon.
+        roll_deg: angle of the camera about its optical axis, clockwise as seen from behind it.
     """
     focal_px = fill * size_px * distance_m / height_m
     camera = Camera(focal_px, focal_px, size_px / 2, size_px / 2, size_px, size_px)
-    return camera, np.array([0.0, -0.52 * height_m, -distance_m])
+    ground_m = np.array([0.0, -0.52 * height_m, -distance_m])
+    if pitch_deg == roll_deg == 0.0:
+        return camera, ground_m
+    pitched = _orbit_world_to_camera(np.array([0.0, 0.0, -distance_m]), distance_m, 0.0, np.radians(-pitch_deg))
+    cosine, sine = np.cos(np.radians(roll_deg)), np.sin(np.radians(roll_deg))
+    rolled = np.eye(4)
+    rolled[:2, :2] = [[cosine, sine], [-sine, cosine]]
+    return replace(camera, world_to_camera=(rolled @ pitched).astype(np.float32)), ground_m
 
 
 def novel_cameras(camera: Camera, person_position_m: np.ndarray, height_m: float, count: int) -> tuple[Camera, ...]:

@@ -6,7 +6,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.body.body import Body, Motion
-from pipeline.geometry.rotation import axis_angle_to_quaternion, quaternion_multiply, quaternion_to_matrix
+from pipeline.geometry.rotation import (
+    axis_angle_to_quaternion,
+    quaternion_conjugate,
+    quaternion_multiply,
+    quaternion_to_matrix,
+)
 from pipeline.geometry.skinning import forward_kinematics
 
 JointAngles = dict[str, tuple[float, float, float]]
@@ -122,6 +127,23 @@ def novel_motion(body: Body, ground_m: Float[np.ndarray, "3"], count: int) -> Mo
             _add_rotation(axis_angles[frame : frame + 1], body, name, np.array(angles))
     heading = np.resize([0.35, -0.70, 0.90, -0.20], count) + 2.1 * (np.arange(count) // len(poses))
     return _motion_on_ground(body, axis_angles, heading, ground_m, np.arange(count, dtype=float))
+
+
+def bend_at_hips(body: Body, motion: Motion, bend_deg: float) -> Motion:
+    """Bend the trunk forward about the axis through both hip joints; the legs keep their positions and rotations.
+
+    The bend is constant in the frame of the body. Positive angles bend forward.
+    """
+    hips, legs = body.joint("Hips"), [body.joint("LeftUpLeg"), body.joint("RightUpLeg")]
+    bend = axis_angle_to_quaternion(torch.tensor([np.radians(bend_deg), 0.0, 0.0], dtype=torch.float64))
+    rotations = torch.from_numpy(motion.rotations_wxyz).double()
+    hips_rotation = quaternion_to_matrix(rotations[:, hips])
+    centre_m = torch.from_numpy(body.joints_m[legs].mean(0) - body.joints_m[hips]).double()
+    shift_m = hips_rotation @ (centre_m - quaternion_to_matrix(bend) @ centre_m)
+    rotations[:, hips] = quaternion_multiply(rotations[:, hips], bend.expand(len(rotations), 4))
+    unbend = quaternion_conjugate(bend).expand(len(rotations), len(legs), 4)
+    rotations[:, legs] = quaternion_multiply(unbend, rotations[:, legs])
+    return motion.with_pose(rotations.float().numpy(), (motion.root_translation_m + shift_m.numpy()).astype(np.float32))
 
 
 def snap_feet_to_floor(body: Body, motion: Motion, floor_y_m: float) -> Motion:

@@ -13,7 +13,7 @@ from data_tools.synthetic.rig.subject import Subject
 from data_tools.synthetic.scene.backdrop import Room, make_room
 from data_tools.synthetic.scene.ball import Ball
 from data_tools.synthetic.scene.capture import HeldOutTargets, SyntheticCapture, novel_cameras, portrait_camera
-from data_tools.synthetic.scene.motion import novel_motion, turn_in_a_pose
+from data_tools.synthetic.scene.motion import bend_at_hips, novel_motion, turn_in_a_pose
 from data_tools.synthetic.scene.renderer import LIGHTING_PRESETS
 from pipeline.body.body import Body, Motion
 from pipeline.core.errors import UserError
@@ -26,6 +26,7 @@ LIGHT_HELP = (
 )
 MIN_FRAMES, MIN_SIZE_PX = 2, 32
 MIN_FILL, MAX_FILL = 0.05, 0.95
+MIN_CAMERA_HEIGHT_M = 0.05
 
 
 def capture_parser(command: str, description: str) -> argparse.ArgumentParser:
@@ -41,6 +42,18 @@ def capture_parser(command: str, description: str) -> argparse.ArgumentParser:
     parser.add_argument("--distance", type=float, default=3.6, help="distance from camera to person in metres")
     parser.add_argument("--fill", type=float, default=0.82, help="fraction of the image height that the person covers")
     parser.add_argument("--focal", type=float, help="focal length in pixels; overrides --fill")
+    parser.add_argument(
+        "--pitch-deg", type=float, default=0.0, help="angle of the optical axis above the horizon, degrees"
+    )
+    parser.add_argument(
+        "--roll-deg", type=float, default=0.0, help="clockwise roll of the camera about its optical axis, degrees"
+    )
+    parser.add_argument(
+        "--lean-deg",
+        type=float,
+        default=0.0,
+        help="forward bend of the person at the hips in all frames, degrees; the legs stay as they are",
+    )
     parser.add_argument("--light", choices=sorted(LIGHTING_PRESETS), default="studio", help=LIGHT_HELP)
     parser.add_argument(
         "--background", choices=("busy", "plain"), default="busy", help="busy: furnished room; plain: bare wall"
@@ -82,6 +95,9 @@ def validate_capture_options(options: argparse.Namespace) -> None:
         ("size", MIN_SIZE_PX, 4096),
         ("distance", 1.0, 50.0),
         ("fill", MIN_FILL, MAX_FILL),
+        ("pitch_deg", -45.0, 45.0),
+        ("roll_deg", -45.0, 45.0),
+        ("lean_deg", -30.0, 60.0),
         ("samples", 1, 8),
         ("arc", 0.0, 360.0),
         ("turns", 1, 20),
@@ -105,7 +121,8 @@ def build_scene(options: argparse.Namespace, body: Body) -> tuple[Camera, np.nda
     """Return camera, ground position (world, metres) and room for a person of this height.
 
     Raises:
-        UserError: with this --focal the person would be too small or cropped.
+        UserError: with this --focal the person would be too small or cropped, or with this --pitch-deg the camera would
+            be below the floor.
     """
     fill = options.fill
     if options.focal is not None:
@@ -117,17 +134,27 @@ def build_scene(options: argparse.Namespace, body: Body) -> tuple[Camera, np.nda
                 f"{MIN_FILL * focal_at_full_height_px:.0f} to {MAX_FILL * focal_at_full_height_px:.0f}, or another "
                 "--distance"
             )
-    camera, ground_m = portrait_camera(options.size, body.height_m(), options.distance, fill)
+    camera, ground_m = portrait_camera(
+        options.size, body.height_m(), options.distance, fill, options.pitch_deg, options.roll_deg
+    )
+    if camera.centre_m()[1] < ground_m[1] + MIN_CAMERA_HEIGHT_M:
+        raise UserError(
+            f"--pitch-deg {options.pitch_deg} puts the camera at --distance {options.distance} below the floor; choose "
+            "a smaller pitch or distance"
+        )
     room = make_room(camera, ground_m, options.background == "busy", ValueNoise(options.seed))
     return camera, ground_m, Room(to_float(to_uint8(room.image)), room.floor_m)
 
 
 def build_motion(options: argparse.Namespace, body: Body, ground_m: np.ndarray) -> Motion:
-    """Return the turn in A-pose, or the selected part of the --bvh file."""
+    """Return the turn in A-pose, or the selected part of the --bvh file, bent by --lean-deg."""
     if options.bvh:
         full_motion = retarget(read_bvh(options.bvh), body, ground_m, options.in_place)
-        return resample_motion(full_motion, options.start, options.frames, options.fps)
-    return turn_in_a_pose(body, options.frames, options.fps, ground_m, options.seed, options.arc, options.turns or 1)
+        motion = resample_motion(full_motion, options.start, options.frames, options.fps)
+    else:
+        turns = options.turns or 1
+        motion = turn_in_a_pose(body, options.frames, options.fps, ground_m, options.seed, options.arc, turns)
+    return bend_at_hips(body, motion, options.lean_deg) if options.lean_deg else motion
 
 
 def build_novel_poses(options: argparse.Namespace, body: Body, ground_m: np.ndarray) -> Motion | None:

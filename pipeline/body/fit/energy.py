@@ -35,6 +35,10 @@ from pipeline.body.fit.terms import (
 from pipeline.body.settings import FitSettings
 from pipeline.geometry.camera import Camera
 
+VERTICAL_PRINCIPAL_POINT_RATIO = 0.2
+"""Standard deviation of the principal point down the image over the one across it. A pitch of the camera shows the same
+picture to first order, and is estimated from more (`pipeline.body.fit.vertical.gravity`)."""
+
 
 @dataclass(frozen=True)
 class EnergyParameters:
@@ -48,7 +52,7 @@ class EnergyParameters:
     motion_std_factor: factor on `Objective.motion_std`.
     height_m, height_std_m: prior of the stature.
     log_focal_std: of the logarithm of the focal length.
-    principal_point_std: in focal lengths.
+    principal_point_std: across the image, in focal lengths.
     """
 
     landmark_std_m: float = FitSettings.landmark_std_m
@@ -151,7 +155,7 @@ class Objective:
             SharedPriorTerm(
                 self.shape_prior,
                 parameters.landmark_offset_std_m,
-                (centre_std, centre_std, parameters.log_focal_std),
+                (centre_std, VERTICAL_PRINCIPAL_POINT_RATIO * centre_std, parameters.log_focal_std),
                 parameters.height_m,
                 parameters.height_std_m,
             ),

@@ -41,6 +41,8 @@ from pipeline.body.fit.root_placement import world_to_perspective
 from pipeline.body.fit.silhouette_icp import MaskWindow, match_silhouettes
 from pipeline.body.fit.state import FitState, Observations
 from pipeline.body.fit.supplied_poses import SuppliedPoses
+from pipeline.body.fit.vertical.gravity import align_with_gravity, axis_evidence, lean_deg, turn_observations
+from pipeline.body.fit.vertical.turn_axis import estimate_turn_axis
 from pipeline.body.settings import DEFAULT_SETTINGS, FitSettings
 from pipeline.core.progress import track
 from pipeline.geometry.rotation import continuous_quaternions, matrix_to_quaternion
@@ -62,6 +64,7 @@ class FitOptions:
         fixes it.
     shared_frames: number of frames for the shared parameters.
     rounds: matchings of the silhouettes for the shared parameters.
+    vertical_is_known: whether +Y of the camera's world is up; otherwise the vertical is estimated.
     """
 
     height_m: float | None = None
@@ -69,6 +72,7 @@ class FitOptions:
     principal_point_relative_std: float = 0.0
     shared_frames: int = 48
     rounds: int = 8
+    vertical_is_known: bool = True
     settings: FitSettings = DEFAULT_SETTINGS
 
 
@@ -98,7 +102,7 @@ def fit_body(
 ) -> FitResult:
     """Fit a body to landmarks and masks.
 
-    observations: their camera is the initial one.
+    observations: their camera is the initial one, level unless the vertical is known.
     windows: from `silhouette_icp.crop_mask_window`.
     curls_rad: from `hand_observations.finger_curls_rad`; None: relaxed fingers.
 
@@ -111,6 +115,17 @@ def fit_body(
     no_offsets = torch.zeros(offset_count, dtype=torch.float64)
     rest_landmarks_m = context.regressor.points(context.default, no_offsets).rest_m[0]
     observations, left_right_swapped = _correct_left_right_swaps(observations, rest_landmarks_m)
+    evidence = None
+    if not options.vertical_is_known:
+        axis = estimate_turn_axis(observations, options.focal_relative_std)
+        evidence = axis_evidence(axis, options.settings)
+        observations = turn_observations(observations, evidence.up(), axis, rest_landmarks_m)
+        if axis is not None and options.focal_relative_std > 0.0:
+            # The deviation of the principal point is in focal lengths.
+            principal_point_std = options.principal_point_relative_std * float(np.exp(-axis.focal_log))
+            options = replace(
+                options, focal_relative_std=axis.focal_log_std, principal_point_relative_std=principal_point_std
+            )
     start = initial_state(
         observations, rest_landmarks_m, context.default.joints_m, body.shape_defaults.double(), offset_count
     )
@@ -120,6 +135,8 @@ def fit_body(
     )
     state = interpolated_state(state, chosen, observations.time_s)
     state, model, silhouette_iou = _fit_poses(context, observations, windows, state, parameters)
+    if evidence is not None:
+        state, observations = align_with_gravity(model, state, observations, evidence, options.settings)
     focal_relative_std, height_std_m = _posterior_stds(model, system)
     stature_std_m = options.settings.stature_spread_m if options.height_m is None else 0.0
     return replace(
@@ -139,7 +156,7 @@ def fit_supplied_poses(
 ) -> FitResult:
     """Use user-supplied shape and poses; interpolate and fit the poses of the other frames.
 
-    observations: their camera is that of the supplied poses.
+    observations: their camera is that of the supplied poses, whose world is kept.
     keep: whether the supplied poses stay unchanged; otherwise all poses are refined with landmarks and silhouettes.
 
     Raises:
@@ -364,6 +381,7 @@ def _result(
         landmarks_m=context.regressor.points(model, state.landmark_offsets_m).rest_m[0],
         focal_relative_std=0.0,
         height_std_m=0.0,
+        lean_deg=lean_deg(model, state),
     )
 
 

@@ -28,8 +28,12 @@ STATIONARY_SPEED_M_S, MOVING_SPEED_M_S = 0.10, 0.25
 SPEED_WINDOW_S = 0.4
 
 PLANE_TILT_STD_RAD, SOLE_HEIGHT_STD_M = 0.1, 0.1
-"""Standard deviations of the tilt of the plane relative to the camera, and of the height of a sole, whose errors are
-correlated in time."""
+"""Standard deviations of the tilt of the plane from the y axis of the world, and of the height of a sole, whose errors
+are correlated in time."""
+
+FLOOR_TILT_STD_RAD, COMMON_HEIGHT_STD_M = 0.035, 0.05
+"""Standard deviations of the tilt of a floor of any extent, and of the height over the root mean square extent of the
+soles. More frames do not lower them: who stands with a leaning fit has soles on a leaning plane in all of them."""
 
 PLANE_ITERATIONS = 4
 MIN_STANDING_SHARE = 0.2
@@ -99,7 +103,7 @@ def fit_plane(
 ) -> tuple[Float[Tensor, "3"], Float[Tensor, ""]]:
     """Return unit normal and offset (m) of the plane through weighted points: normal · x = offset.
 
-    A prior keeps the normal near the y axis, the vertical of the camera.
+    A prior keeps the normal near the y axis, the estimated vertical (`pipeline.body.fit.vertical.gravity`).
     """
     total = weight.sum()
     centroid = (weight[..., None] * positions_m).sum((0, 1)) / total
@@ -110,6 +114,16 @@ def fit_plane(
     slope = torch.linalg.solve(matrix, weighted[:, [0, 2]].T @ offset[:, 1])
     normal = torch.nn.functional.normalize(torch.stack([-slope[0], torch.ones_like(total), -slope[1]]), dim=0)
     return normal, normal @ centroid
+
+
+def floor_tilt_information(positions_m: Float[Tensor, "n 4 3"], weight: Float[Tensor, "n 4"]) -> Float[Tensor, "2 2"]:
+    """Return the information (1 / rad²) that weighted points of a plane give on its slope along x and z."""
+    centroid = (weight[..., None] * positions_m).sum((0, 1)) / weight.sum()
+    horizontal = (positions_m - centroid)[..., [0, 2]].reshape(-1, 2)
+    scatter = horizontal.T @ (horizontal * weight.reshape(-1, 1)) / weight.sum()
+    information = scatter / COMMON_HEIGHT_STD_M**2
+    identity = torch.eye(2, dtype=positions_m.dtype)
+    return torch.linalg.solve(identity + FLOOR_TILT_STD_RAD**2 * information, information)
 
 
 def compute_speed_m_s(positions_m: Float[Tensor, "n 4 3"], time_s: Float[Tensor, "n"]) -> Float[Tensor, "n 4"]:

@@ -28,6 +28,7 @@ class FitResult:
     observations: the landmarks that the poses were fitted to, left-right swaps corrected.
     landmarks_m: their places on the A-pose of the body with the fitted finger curl, canonical frame.
     focal_relative_std, height_std_m: standard deviations from the curvature of the energy.
+    lean_deg: angle between +Y and the mean axis of the trunk (mid-hips to neck); over a full turn 0 for upright people.
     """
 
     body: Body
@@ -41,6 +42,7 @@ class FitResult:
     landmarks_m: Float[Tensor, "l 3"]
     focal_relative_std: float
     height_std_m: float
+    lean_deg: float
 
 
 def landmark_errors_px(

@@ -46,6 +46,7 @@ def result(**changes: object) -> FitResult:
         "landmarks_m": torch.zeros(41, 3),
         "focal_relative_std": 0.1,
         "height_std_m": 0.05,
+        "lean_deg": 0.5,
     }
     return FitResult(**(fields | changes))
 

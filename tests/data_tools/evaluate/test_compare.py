@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from data_tools.command import run_command
 from data_tools.evaluate import compare
@@ -15,11 +16,14 @@ from data_tools.evaluate.compare_body import (
     compare_surface,
     joint_accelerations,
     left_right_swapped_frames,
+    rest_slope_rad,
+    trunk_axes,
 )
 from data_tools.evaluate.page import LIT_NOTE
 from data_tools.evaluate.truth import load_true_mask
 from pipeline.body.files import load_body, load_camera, load_motion, save_body, save_camera, save_motion
 from pipeline.core.errors import UserError
+from pipeline.geometry.rotation import axis_angle_to_quaternion, quaternion_multiply, quaternion_to_matrix
 from pipeline.io.image import write_gray
 from pipeline.io.npz import save_npz
 
@@ -52,6 +56,9 @@ def test_ground_truth_has_no_error(sample: Path, run: Path) -> None:
     assert figures["silhouette_iou"] == pytest.approx(0.85)
     assert figures["focal_ratio"] == pytest.approx(1.0)
     assert figures["scale_ratio"] == pytest.approx(1.0)
+    assert figures["lean_worst_deg"] < 0.1
+    assert figures["camera_pitch_error_deg"] == pytest.approx(0.0, abs=1e-4)
+    assert figures["camera_roll_error_deg"] == pytest.approx(0.0, abs=1e-4)
     assert compare_masks(sample, run / "frames") == {"mask_iou_median": 1.0, "mask_iou_worst": 1.0}
 
 
@@ -65,6 +72,37 @@ def test_person_of_half_the_size_at_half_the_distance(sample: Path, run: Path) -
     assert figures["scaled_joint_error_mm"] < 0.1
     assert figures["joint_error_mm"] > 100.0
     assert figures["scale_ratio"] == pytest.approx(0.5, abs=1e-4)
+
+
+def test_tilt_of_the_world_changes_lean_and_camera_but_no_joint(sample: Path, run: Path) -> None:
+    """The run took a camera that looks down by 6 degrees as level: person and camera are turned together."""
+    motion, camera = load_motion(run / "body" / "motion.npz"), load_camera(run / "body" / "camera.npz")
+    tilt = axis_angle_to_quaternion(torch.tensor([np.radians(6.0), 0.0, 0.0], dtype=torch.float32))
+    matrix = quaternion_to_matrix(tilt).numpy()
+    rotations = torch.from_numpy(motion.rotations_wxyz).clone()
+    rotations[:, 0] = quaternion_multiply(tilt.expand(len(rotations), 4), rotations[:, 0])
+    save_motion(run / "body" / "motion.npz", motion.with_pose(rotations.numpy(), motion.root_translation_m @ matrix.T))
+    world_to_camera = camera.world_to_camera.copy()
+    world_to_camera[:3, :3] = world_to_camera[:3, :3] @ matrix.T
+    save_camera(run / "body" / "camera.npz", replace(camera, world_to_camera=world_to_camera))
+    figures = compare_body(sample, run / "body")
+    assert figures["absolute_joint_error_mm"] < 0.01
+    assert figures["joint_error_px"] < 1e-2
+    assert figures["lean_median_deg"] == pytest.approx(6.0, abs=0.2)
+    assert figures["camera_pitch_error_deg"] == pytest.approx(6.0, abs=0.01)
+    assert figures["camera_roll_error_deg"] == pytest.approx(0.0, abs=0.01)
+
+
+def test_rest_pose_of_another_rig_does_not_count_as_lean(sample: Path, run: Path) -> None:
+    """The neck joint of the run's rig is 5 cm farther forward in every pose: a slope of the axis, no lean."""
+    body = load_body(run / "body" / "body.npz")
+    joints_m = body.joints_m.copy()
+    joints_m[body.joint("Neck"), 2] += 0.05
+    other = replace(body, joints_m=joints_m)
+    motion, truth = load_motion(run / "body" / "motion.npz"), load_body(sample / "truth" / "bare.npz")
+    fitted, true = trunk_axes(other, motion, truth), trunk_axes(truth, motion, truth)
+    assert np.degrees(rest_slope_rad(other) - rest_slope_rad(truth)) > 4.0
+    assert np.degrees(np.arccos(np.clip((fitted * true).sum(1), -1.0, 1.0))).max() < 0.7
 
 
 def test_translation_changes_only_the_reprojection_error(sample: Path, run: Path) -> None:

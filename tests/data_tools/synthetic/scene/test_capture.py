@@ -14,7 +14,7 @@ from data_tools.synthetic.scene.capture import CAPTURE_VERSION, novel_cameras, p
 from data_tools.synthetic.scene.movie import write_video
 from pipeline.body.files import load_camera, load_motion
 from pipeline.capture.video import open_frame_source, read_frames
-from pipeline.geometry.camera import project
+from pipeline.geometry.camera import DEFAULT_WORLD_TO_CAMERA, project
 from pipeline.io.image import read_rgba
 from tests.data_tools.conftest import SAMPLE_OPTIONS
 
@@ -67,6 +67,31 @@ def test_cameras_are_rigid_and_centred() -> None:
         assert depth_m[0] == pytest.approx(3.6, rel=0.01)
         up_px, _ = project(middle + torch.tensor([0.0, 0.1, 0.0]), novel)
         assert up_px[0, 1] < place_px[0, 1]
+
+
+@pytest.mark.parametrize(("pitch_deg", "roll_deg"), [(-15.0, 5.0), (10.0, -3.0), (0.0, 5.0)])
+def test_pitch_and_roll_turn_the_optical_axis_and_the_vertical(pitch_deg: float, roll_deg: float) -> None:
+    """The axis is pitched above the horizon; the vertical in the image is turned against the camera's roll."""
+    camera, ground_m = portrait_camera(540, 1.8, 3.6, 0.6, pitch_deg, roll_deg)
+    optical_axis = camera.world_to_camera[2, :3]
+    assert optical_axis[1] == pytest.approx(np.sin(np.radians(pitch_deg)), abs=1e-6)
+    assert optical_axis[0] == pytest.approx(0.0, abs=1e-6)
+    middle = np.array([0.0, 0.0, -3.6])
+    ends = torch.from_numpy(np.stack([middle, middle + [0.0, 0.01, 0.0]])).float()
+    place_px, depth_m = project(ends, camera)
+    assert np.allclose(place_px[0].numpy(), [270.0, 270.0], atol=1e-3)
+    assert depth_m[0] == pytest.approx(3.6, rel=1e-6)
+    right, down = (place_px[1] - place_px[0]).tolist()
+    # A camera that is rolled clockwise shows the world turned counterclockwise: the top moves to the left.
+    assert np.degrees(np.arctan2(-right, -down)) == pytest.approx(roll_deg, abs=0.1)
+    assert ground_m.tolist() == pytest.approx([0.0, -0.52 * 1.8, -3.6])
+
+
+def test_level_camera_is_the_default_pose() -> None:
+    camera, _ = portrait_camera(540, 1.8, 3.6, 0.8, 0.0, 0.0)
+    assert np.array_equal(camera.world_to_camera, DEFAULT_WORLD_TO_CAMERA)
+    nearly_level, _ = portrait_camera(540, 1.8, 3.6, 0.8, 1e-6, 0.0)
+    assert np.allclose(nearly_level.world_to_camera, DEFAULT_WORLD_TO_CAMERA, atol=1e-6)
 
 
 def test_person_covers_the_requested_image_height() -> None:

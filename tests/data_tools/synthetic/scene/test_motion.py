@@ -6,6 +6,7 @@ import torch
 
 from data_tools.synthetic.scene.motion import (
     NOVEL_POSES,
+    bend_at_hips,
     lowest_foot_offset_m,
     novel_motion,
     snap_feet_to_floor,
@@ -118,3 +119,30 @@ def test_partial_turn_goes_to_both_sides_and_back(bare: Body) -> None:
     assert heading_deg.min() == pytest.approx(-45, abs=1)
     assert heading_deg[0] == pytest.approx(0, abs=1)
     assert np.abs(np.diff(heading_deg)).max() < 8
+
+
+def joints_m(body: Body, motion: Motion, names: list[str]) -> np.ndarray:
+    """World positions (n, k, 3)."""
+    joints = [body.joint(name) for name in names]
+    transforms = canonical_to_world(body, motion)[:, joints].numpy()
+    return np.einsum("njab,jb->nja", transforms[..., :3, :3], body.joints_m[joints]) + transforms[..., :3, 3]
+
+
+def test_bend_turns_the_trunk_forward_and_keeps_the_legs(bare: Body, turn: Motion) -> None:
+    """In every frame the trunk turns by the angle about the axis through the hip joints; hips, knees and feet stay."""
+    legs = [side + part for side in ("Left", "Right") for part in ("UpLeg", "Leg", "Foot", "ToeBase")]
+    bent = bend_at_hips(bare, turn, 5.0)
+    before, after = joints_m(bare, turn, legs), joints_m(bare, bent, legs)
+    assert np.allclose(before, after, atol=2e-3)
+    ends = ["LeftUpLeg", "RightUpLeg", "Neck"]
+    upright, leaning = (joints_m(bare, motion, ends) for motion in (turn, bent))
+    across = upright[:, 0] - upright[:, 1]
+    axes = [trunk[:, 2] - trunk[:, :2].mean(1) for trunk in (upright, leaning)]
+    sagittal = [
+        axis - across * (axis * across).sum(1, keepdims=True) / (across**2).sum(1, keepdims=True) for axis in axes
+    ]
+    lengths = np.linalg.norm(sagittal[0], axis=1) * np.linalg.norm(sagittal[1], axis=1)
+    cosine = (sagittal[0] * sagittal[1]).sum(1) / lengths
+    assert np.degrees(np.arccos(cosine)) == pytest.approx(5.0, abs=0.1)
+    front = quaternion_to_matrix(torch.from_numpy(turn.rotations_wxyz[:, 0]))[:, :, 2].numpy()
+    assert ((axes[1] - axes[0]) * front).sum(1).min() > 0

@@ -100,3 +100,24 @@ def test_projected_meshes_have_the_extent_of_the_masks(person: Path, tmp_path: P
         rows, columns = np.nonzero(load_true_mask(tmp_path / "out", index) > 127)
         assert np.allclose(pixels.min(0).values, [columns.min(), rows.min()], atol=1.0)
         assert np.allclose(pixels.max(0).values, [columns.max() + 1, rows.max() + 1], atol=1.0)
+
+
+def test_pitched_capture_of_a_person_who_leans(person: Path, tmp_path: Path) -> None:
+    """The room surrounds the person, the stored truth reproduces the video, and the camera is the requested one."""
+    out = tmp_path / "out"
+    turned = ["--pitch-deg", "-15", "--roll-deg", "5", "--lean-deg", "5", "--novel-views", "0", "--novel-poses", "0"]
+    main([str(person), str(out), *TINY, *turned])
+    assert verify_ground_truth(out, frame_stride=1).passes()
+    capture = load_ground_truth(out)
+    assert np.degrees(np.arcsin(capture.camera.world_to_camera[2, 1])) == pytest.approx(-15.0, abs=1e-4)
+    assert np.isfinite(capture.room.image).all()
+    assert np.isfinite(capture.room.floor_m[-1]).all()  # the camera looks down on the floor
+    mask = load_true_mask(out, 0) > 127
+    assert not mask[[0, -1]].any()
+    assert mask.sum() > 500
+
+
+def test_camera_below_the_floor_is_an_error(person: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(main, [str(person), str(tmp_path / "out"), *TINY, "--pitch-deg", "30"]) == 2
+    assert "--pitch-deg 30" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
