@@ -30,6 +30,7 @@ from pipeline.geometry.skinning import top_k_weights
 from pipeline.geometry.surface import resolve_self_intersections
 from pipeline.io.image import to_uint8, write_rgb
 from pipeline.mesh.face_reduction import reduce_faces
+from pipeline.mesh.fairing import fair_surface
 from pipeline.mesh.files import MeshArtifact, load_checkpoint, save_checkpoint, save_mesh
 from pipeline.mesh.isosurface import CanonicalGrid, extract_mesh, sample_canonical_grid, select_isovalue
 from pipeline.mesh.pose_refit import refit_poses, select_poses
@@ -122,10 +123,10 @@ def run(
 
         samples = sample_canonical_grid(density_fn, occupancy.occupied_bounds_m(), body, config.voxel_size_m, settings)
         extracted = extract_initial_mesh(samples, body, validation or train, settings)
-        start = remesh_to_edge_length(extracted, target_edge_m)
+        start = remesh_to_edge_length(extracted, target_edge_m, body)
     state = refine_mesh(start, refinement_inputs, lambda state: save_checkpoint(out / CHECKPOINT, state))
     shader, psnr_db = refinement_inputs.shader, state.validation_psnr_db
-    mesh = finish_mesh(state.mesh, refinement_inputs, config)
+    mesh = finish_mesh(state.mesh, refinement_inputs)
     is_unchanged = mesh is state.mesh
     skin = state.skin if is_unchanged else transfer_skin(mesh, body)
     write_results(out, mesh, skin, shader)
@@ -142,16 +143,14 @@ def run(
     }
 
 
-def finish_mesh(mesh: Mesh, inputs: RefinementInputs, config: Config) -> Mesh:
+def finish_mesh(mesh: Mesh, inputs: RefinementInputs) -> Mesh:
     """Reduce the faces of the refined mesh, judged on validation views (else on training views); untangle it."""
     views = inputs.validation or [inputs.train[k] for k in evenly_spaced(len(inputs.train), JUDGED_FRAMES)]
 
     def psnr_db(trial: Mesh) -> float:
         return mesh_psnr_db(trial, transfer_skin(trial, inputs.body), views, inputs.shader)
 
-    tolerance_m = inputs.settings.reduction_tolerance_px * inputs.target_edge_m / config.edge_px
-    reduced = reduce_faces(mesh, inputs.target_edge_m, tolerance_m, psnr_db, inputs.settings)
-    return resolve_self_intersections(reduced)
+    return resolve_self_intersections(reduce_faces(mesh, psnr_db, inputs.settings))
 
 
 class FieldColourShader(torch.nn.Module):
@@ -186,7 +185,7 @@ def extract_initial_mesh(
         return silhouette_iou(mesh, transfer_skin(mesh, body), isovalue_views)
 
     isovalue_per_m, _ = select_isovalue(samples, settings, score)
-    return extract_mesh(samples, isovalue_per_m, settings)
+    return fair_surface(extract_mesh(samples, isovalue_per_m, settings), samples, body, settings)
 
 
 def load_views(
@@ -256,7 +255,7 @@ def write_results(out: Path, mesh: Mesh, skin: SkinnedTopology, shader: torch.nn
 
 STAGE = Stage(
     "mesh",
-    version=7,
+    version=8,
     needs=("frames", "body", "field"),
     makes=("mesh.npz", "motion.npz", "preview.png"),
     config=Config,

@@ -76,7 +76,7 @@ def sample_canonical_grid(
     counts = np.ceil((np.maximum(bounds_m[1], body.vertices.max(axis=0) + padding_m) - origin_m) / voxel_size_m)
     counts = GRID_SIZE_MULTIPLE * np.ceil(counts / GRID_SIZE_MULTIPLE).astype(int) + 1
     mesh = body.mesh()
-    distance_m = _signed_distance_grid(mesh, origin_m, counts, voxel_size_m)
+    distance_m = signed_distance_grid(mesh, origin_m, counts, voxel_size_m)
     density = _density_grid(density_fn, origin_m, distance_m.shape, voxel_size_m)
     hand_weight = np.zeros_like(density)
     if settings.hands_from_body:
@@ -186,7 +186,7 @@ def _indices_in_side_boxes(
     return np.argwhere(found)
 
 
-def _signed_distance_grid(
+def signed_distance_grid(
     mesh: Mesh, origin_m: Float[np.ndarray, "3"], counts: Int[np.ndarray, "3"], spacing_m: float
 ) -> Float[np.ndarray, "x y z"]:
     """Return the signed distance to a mesh, exact at every fourth sample and interpolated between.
@@ -199,7 +199,7 @@ def _signed_distance_grid(
     ]
     coarse_points = np.stack(np.meshgrid(*coarse_axes, indexing="ij"), axis=-1)
     coarse = signed_distance_m(coarse_points.reshape(-1, 3), mesh).reshape(coarse_points.shape[:3])
-    return _upsample(coarse, tuple(counts.tolist()))
+    return upsample(coarse, tuple(counts.tolist()))
 
 
 def _depth_inside_m(samples: CanonicalGrid) -> Float[np.ndarray, "x y z"]:
@@ -210,7 +210,7 @@ def _depth_inside_m(samples: CanonicalGrid) -> Float[np.ndarray, "x y z"]:
     inside = samples.body_distance_m[::2, ::2, ::2] < 0.0
     closed = largest_solid(ndimage.binary_closing(inside, ndimage.generate_binary_structure(3, 1), iterations=2))
     depth_m = 2.0 * samples.spacing_m * ndimage.gaussian_filter(ndimage.distance_transform_edt(closed), 1.0)
-    return _upsample(depth_m, samples.density.shape)
+    return upsample(depth_m, samples.density.shape)
 
 
 def _close_concavities(
@@ -225,10 +225,10 @@ def _close_concavities(
     outside_m = spacing_m * ndimage.distance_transform_edt(~inside[::2, ::2, ::2])
     closed = spacing_m * ndimage.distance_transform_edt(outside_m <= radius_m) > radius_m
     filled = closed & (samples.body_distance_m[::2, ::2, ::2] < 0.0)
-    return _upsample(ndimage.gaussian_filter(filled.astype(np.float64), 0.7), samples.density.shape)
+    return upsample(ndimage.gaussian_filter(filled.astype(np.float64), 0.7), samples.density.shape)
 
 
-def _upsample(grid: Float[np.ndarray, "a b c"], shape: tuple[int, ...]) -> Float[np.ndarray, "x y z"]:
+def upsample(grid: Float[np.ndarray, "a b c"], shape: tuple[int, ...]) -> Float[np.ndarray, "x y z"]:
     """Interpolate a downsampled grid trilinearly at all samples (float32)."""
     source = torch.from_numpy(grid).float()[None, None]
     return torch.nn.functional.interpolate(source, size=shape, mode="trilinear", align_corners=True)[0, 0].numpy()

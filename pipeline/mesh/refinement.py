@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 from pipeline.geometry.mesh import Mesh
-from pipeline.mesh.remeshing import remesh_adaptively
+from pipeline.mesh.remeshing import detailed_faces, remesh_adaptively
 from pipeline.mesh.skin_transfer import SkinnedTopology, transfer_skin
 from pipeline.mesh.vertex_optimisation import RefinementInputs, optimise_vertices
 from pipeline.mesh.views import accumulate_face_errors, mesh_psnr_db
@@ -74,7 +74,8 @@ def _run_round(state: RefinementState, inputs: RefinementInputs) -> RefinementSt
     inputs.shader.load_state_dict(state.shader_state)
     if state.rounds_done > 0:
         errors = accumulate_face_errors(mesh, skin, inputs.train, inputs.shader)
-        mesh = remesh_adaptively(mesh, errors, inputs.target_edge_m, inputs.max_faces, inputs.settings)
+        detailed = detailed_faces(mesh, inputs.body)
+        mesh = remesh_adaptively(mesh, errors, detailed, inputs.target_edge_m, inputs.max_faces, inputs.settings)
         skin = transfer_skin(mesh, inputs.body)
     seed = inputs.settings.seed + 1000 * rounds_done
     mesh = optimise_vertices(mesh, skin, inputs, seed, f"mesh round {rounds_done}")

@@ -6,27 +6,31 @@ import fast_simplification
 import numpy as np
 from jaxtyping import Bool, Float
 
+from pipeline.body.body import Body
 from pipeline.core.progress import warn
 from pipeline.geometry.mesh import Mesh
-from pipeline.geometry.surface import OpenSurfaceError, remesh_isotropic, repair, smooth_taubin, subdivide
+from pipeline.geometry.surface import OpenSurfaceError, closest_points_on_mesh, remesh_isotropic, repair, subdivide
+from pipeline.mesh.isosurface import hand_skin_weights
 from pipeline.mesh.settings import MeshSettings
 
 DECIMATION_FACE_RATIO = 3.0
 """Ratio of the number of faces after decimation to the number of faces after remeshing."""
+DETAIL_EDGE_RATIO = 0.5
+"""Edge length at face and hands, in target edge lengths: fingers and lips are thinner than cloth is smooth."""
 EQUILATERAL_AREA_RATIO = 0.43
 """Area of an equilateral triangle divided by its squared edge length (0.433)."""
 
 
-def remesh_to_edge_length(mesh: Mesh, target_edge_m: float, smoothing_steps: int = 10) -> Mesh:
-    """Decimate, remesh and smooth a surface to well-shaped triangles with the target edge length.
+def remesh_to_edge_length(mesh: Mesh, target_edge_m: float, body: Body) -> Mesh:
+    """Decimate and remesh a surface to well-shaped triangles with the target edge length, half of it at face and hands.
 
     Edges are shorter where the surface has a high curvature. If a step leaves holes that cannot be closed, that step is
     skipped with a warning.
 
     Args:
-        mesh: a closed surface, m.
+        mesh: a closed, smooth surface, m.
         target_edge_m: edge length to reach, m.
-        smoothing_steps: steps of Taubin smoothing, which removes the noise of the density and preserves the volume.
+        body: the fitted body in the pose of the mesh; it tells where face and hands are.
     """
     target_face_area_m2 = EQUILATERAL_AREA_RATIO * target_edge_m**2
     dense_face_count = int(mesh.face_areas_m2().sum() / target_face_area_m2 * DECIMATION_FACE_RATIO)
@@ -34,12 +38,32 @@ def remesh_to_edge_length(mesh: Mesh, target_edge_m: float, smoothing_steps: int
         mesh = keep_if_repair_fails(
             lambda: decimate(mesh, dense_face_count), mesh, "the mesh is not decimated before remeshing"
         )
-    remeshed = keep_if_repair_fails(
-        lambda: remesh_isotropic(mesh, target_edge_m, iterations=6, tolerance_m=0.15 * target_edge_m),
+    return keep_if_repair_fails(
+        lambda: _remesh_in_two_sizes(mesh, target_edge_m, body),
         mesh,
         "the mesh is not remeshed, so its edge lengths are not uniform",
     )
-    return smooth_taubin(remeshed, smoothing_steps)
+
+
+def _remesh_in_two_sizes(mesh: Mesh, target_edge_m: float, body: Body) -> Mesh:
+    for detailed, edge_m in ((False, target_edge_m), (True, DETAIL_EDGE_RATIO * target_edge_m)):
+        selected = detailed_faces(mesh, body) == detailed
+        if selected.any():
+            part = None if selected.all() else selected
+            mesh = remesh_isotropic(mesh, edge_m, iterations=6, selected=part, tolerance_m=0.15 * edge_m)
+    return mesh
+
+
+def detailed_faces(mesh: Mesh, body: Body) -> Bool[np.ndarray, "f"]:
+    """Return the faces whose nearest point of the body is on a hand or on the front half of the head."""
+    _, nearest, _ = closest_points_on_mesh(mesh.vertices[mesh.faces].mean(axis=1), body.mesh())
+    vertex = body.faces[nearest, 0]
+    detailed = hand_skin_weights(body) > 0.5
+    if "Head" in body.joint_names:
+        on_head = body.skin_weights[:, body.joint("Head")] > 0.5
+        depth_m = body.vertices[:, 2]
+        detailed |= on_head & (depth_m > 0.5 * (depth_m[on_head].min() + depth_m[on_head].max()))
+    return detailed[vertex]
 
 
 def decimate(mesh: Mesh, face_count: int) -> Mesh:
@@ -62,13 +86,19 @@ def keep_if_repair_fails(change: Callable[[], Mesh], before: Mesh, consequence: 
 
 
 def remesh_adaptively(
-    mesh: Mesh, errors: Float[np.ndarray, "f"], target_edge_m: float, max_faces: int, settings: MeshSettings
+    mesh: Mesh,
+    errors: Float[np.ndarray, "f"],
+    detailed: Bool[np.ndarray, "f"],
+    target_edge_m: float,
+    max_faces: int,
+    settings: MeshSettings,
 ) -> Mesh:
     """Subdivide the faces with a large image error, decimate and remesh those with a small one (IHM paper, 2.3).
 
     Args:
         mesh: a closed surface, m.
         errors: accumulated image error of each face.
+        detailed: faces that are not decimated, from `detailed_faces`.
         target_edge_m: target edge length, m.
         max_faces: no face is subdivided beyond this number of faces.
         settings: percentiles of the error, and the edge length of decimated regions.
@@ -76,7 +106,7 @@ def remesh_adaptively(
     Returns:
         The new mesh; if decimation would leave holes, the faces with a small error stay, with a warning.
     """
-    low = errors <= np.percentile(errors, settings.decimate_percentile)
+    low = (errors <= np.percentile(errors, settings.decimate_percentile)) & ~detailed
     fine, _ = subdivide(mesh, _faces_to_subdivide(errors, max_faces, settings.subdivide_percentile))
     # The subdivision keeps these faces, but not their indices: find them by their vertices.
     keys = {tuple(face) for face in np.sort(mesh.faces[low], axis=1).tolist()}

@@ -12,6 +12,7 @@ class MeshSettings:
         blur_sigma_voxels: standard deviation of the Gaussian blur of the density indicator, voxels.
         closing_radius_m: concavities inside the body that a ball of this radius cannot enter are filled, m.
         hands_from_body: take hands and fingers from the fitted body, not from the field.
+        fairing_ratio: standard deviation of the smoothing of the offset from the body, in local thicknesses; 0: none.
         isovalues_per_m: density isovalues to select from, 1/m.
         isovalue_frames: validation frames on which the isovalue is selected.
 
@@ -25,8 +26,7 @@ class MeshSettings:
         smoothing_lambda: lambda of the implicit smoothing of Nicolet et al.; 0 moves each vertex independently.
         colour_weight: weight of the Huber colour loss.
         silhouette_weight: weight of the silhouette loss, alpha against mask.
-        laplacian_weight: weight of the uniform Laplacian of the positions, in units of the edge length (0.02 to 2 give
-            the same PSNR to 0.04 dB).
+        laplacian_weight: weight of the uniform Laplacian of the vertex offsets, in units of the edge length.
         offset_weight: weight of the squared vertex offsets, in units of the edge length.
         global_offset_weight: weight of the squared global offset, in units of the edge length.
         subdivide_percentile: faces with an image error above this percentile are subdivided (IHM paper: 95).
@@ -36,8 +36,7 @@ class MeshSettings:
 
     Reduction of faces:
         max_reduction_loss_db: validation PSNR that the reduction may cost, dB.
-        reduction_edge_ratio: ratio of the edge lengths of successive trials.
-        reduction_tolerance_px: largest distance from the refined surface, in pixels of the downsampled frames.
+        reduction_ratio: ratio of the numbers of faces of successive trials.
 
     Raises:
         ValueError: a value is out of its range, or two values contradict each other; the message names them.
@@ -47,6 +46,7 @@ class MeshSettings:
     blur_sigma_voxels: float = 1.0
     closing_radius_m: float = 0.03
     hands_from_body: bool = True
+    fairing_ratio: float = 0.2
     isovalues_per_m: tuple[float, ...] = (8.0, 16.0, 32.0, 64.0, 128.0)
     isovalue_frames: int = 8
 
@@ -67,8 +67,7 @@ class MeshSettings:
     seed: int = 0
 
     max_reduction_loss_db: float = 0.05
-    reduction_edge_ratio: float = 1.2
-    reduction_tolerance_px: float = 0.25
+    reduction_ratio: float = 0.8
 
     def __post_init__(self) -> None:
         """Refuse values out of range and contradictions."""

@@ -111,7 +111,7 @@ def optimise_vertices(
         view_gradients = _batch_gradients(vertices, colours, skin, inputs, generator, threads)
         decay = 0.5 * (1.0 + math.cos(math.pi * step / (warm_up + inputs.steps)))
         if update_vertices:
-            regularisation = _regularisation_loss(vertices, offset, global_offset, operator, inputs)
+            regularisation = _regularisation_loss(offset, global_offset, operator, inputs)
             loss = regularisation + (vertices * view_gradients[0]).sum()
             offset_optimiser.step(torch.autograd.grad(loss, [coordinates, global_offset]), decay)
         if appearance_optimiser:
@@ -162,15 +162,17 @@ def _batch_gradients(
 
 
 def _regularisation_loss(
-    vertices: Float[Tensor, "v 3"],
     offset: Float[Tensor, "v 3"],
     global_offset: Float[Tensor, "3"],
     operator: Tensor,
     inputs: RefinementInputs,
 ) -> Float[Tensor, ""]:
-    """Return the weighted sum of squared Laplacian, vertex offsets and global offset, in units of the edge length."""
+    """Return the weighted sum of squared Laplacian of the offsets, offsets and global offset, in edge lengths.
+
+    The Laplacian is that of the offsets, not of the positions, so that curved details of the initial mesh stay.
+    """
     target_edge_m, settings = inputs.target_edge_m, inputs.settings
-    laplacian_penalty = (torch.sparse.mm(operator, vertices) / target_edge_m).square().sum(1).mean()
+    laplacian_penalty = (torch.sparse.mm(operator, offset) / target_edge_m).square().sum(1).mean()
     offset_penalty, global_offset_penalty = (
         (offset / target_edge_m).square().sum(1).mean(),
         (global_offset / target_edge_m).square().sum(),

@@ -28,9 +28,11 @@ def raise_open_surface_error(*_: object, **__: object) -> Mesh:
 
 
 def test_the_edge_length_is_reached(extracted: Mesh) -> None:
-    mesh = remesh_to_edge_length(extracted, 0.04)
-    lengths = np.linalg.norm(np.diff(mesh.vertices[mesh.edges()], axis=1), axis=2)
-    assert np.median(lengths) == pytest.approx(0.04, rel=0.25)
+    mesh = remesh_to_edge_length(extracted, 0.04, capsule.capsule_body())
+    edges = mesh.vertices[mesh.edges()]
+    lengths, x_m = np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1), edges[..., 0].mean(axis=1)
+    assert np.median(lengths[x_m < -0.05]) == pytest.approx(0.04, rel=0.25)
+    assert np.median(lengths[x_m > 0.2]) == pytest.approx(0.02, rel=0.25)  # the hand
     assert is_closed_manifold(mesh)
 
 
@@ -43,17 +45,30 @@ def test_a_step_that_leaves_holes_is_skipped(
 ) -> None:
     monkeypatch.setattr(remeshing_module, failing_function, raise_open_surface_error)
     take_warnings()
-    mesh = remesh_to_edge_length(extracted, 0.05)
+    mesh = remesh_to_edge_length(extracted, 0.05, capsule.capsule_body())
     assert is_closed_manifold(mesh)
     assert len(mesh.faces) < len(extracted.faces)  # the other step still reduces the number of faces
     (warning,) = take_warnings()
     assert expected_warning in warning
 
 
+def no_detail(mesh: Mesh) -> np.ndarray:
+    return np.zeros(len(mesh.faces), dtype=bool)
+
+
+def test_detailed_faces_are_not_decimated(egg: Mesh) -> None:
+    detailed = egg.vertices[egg.faces].mean(axis=1)[:, 1] > 0.1
+    settings = replace(SETTINGS, subdivide_percentile=100.0, decimate_percentile=100.0)
+    adapted = remesh_adaptively(egg, np.zeros(len(egg.faces)), detailed, EDGE_M, 3000, settings)
+    after = adapted.vertices[adapted.faces].mean(axis=1)[:, 1] > 0.1
+    assert after.sum() == pytest.approx(detailed.sum(), rel=0.05)
+    assert (~after).sum() < 0.8 * (~detailed).sum()
+
+
 def test_faces_are_subdivided_where_the_error_is_large(egg: Mesh) -> None:
     centres = egg.vertices[egg.faces].mean(axis=1)
     errors = np.exp(8 * centres[:, 1])
-    adapted = remesh_adaptively(egg, errors, EDGE_M, 3000, replace(SETTINGS, subdivide_percentile=90.0))
+    adapted = remesh_adaptively(egg, errors, no_detail(egg), EDGE_M, 3000, replace(SETTINGS, subdivide_percentile=90.0))
     assert is_closed_manifold(adapted)
 
     def fraction_above(mesh: Mesh) -> float:
@@ -67,7 +82,9 @@ def test_faces_are_subdivided_where_the_error_is_large(egg: Mesh) -> None:
 def test_a_decimation_that_leaves_holes_is_skipped(egg: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(remeshing_module, "remesh_isotropic", raise_open_surface_error)
     take_warnings()
-    adapted = remesh_adaptively(egg, np.arange(len(egg.faces), dtype=np.float64), EDGE_M, 3000, SETTINGS)
+    adapted = remesh_adaptively(
+        egg, np.arange(len(egg.faces), dtype=np.float64), no_detail(egg), EDGE_M, 3000, SETTINGS
+    )
     assert is_closed_manifold(adapted)
     assert len(adapted.faces) > len(egg.faces)  # the faces with a large error are subdivided nevertheless
     (warning,) = take_warnings()
@@ -77,7 +94,7 @@ def test_a_decimation_that_leaves_holes_is_skipped(egg: Mesh, monkeypatch: pytes
 def test_the_face_limit_stops_the_subdivision(egg: Mesh) -> None:
     errors = np.arange(len(egg.faces), dtype=np.float64)
     settings = replace(SETTINGS, decimate_percentile=0.0)
-    assert len(remesh_adaptively(egg, errors, EDGE_M, 100, settings).faces) <= len(egg.faces)
+    assert len(remesh_adaptively(egg, errors, no_detail(egg), EDGE_M, 100, settings).faces) <= len(egg.faces)
 
 
 def test_the_faces_with_the_largest_errors_fill_the_face_budget(egg: Mesh) -> None:

@@ -1,0 +1,119 @@
+"""Fairing of the extracted surface: a smooth offset from the fitted body.
+
+The density determines the depth of a surface without texture to a few millimetres only, so that the extracted surface
+has bumps. Cloth that lies on a body varies over lengths in proportion to the thickness of the part it covers. The
+offset, the signed distance to the extracted surface less that to the body, is therefore smoothed by a Gaussian whose
+standard deviation is a fraction of the local thickness, and added to the signed distance to the body again. What the
+body model knows (fingers, nose, lips) keeps its detail, and convex parts do not shrink as they would if the surface
+itself were smoothed. Local thickness: Hildebrand and Ruegsegger, "A new method for the model-independent assessment of
+thickness in three-dimensional images", 1997.
+
+Grids with half the resolution of the canonical grid are called coarse.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+
+from pipeline.body.body import Body
+from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.surface import isosurface, repair, signed_distance_m
+from pipeline.mesh.isosurface import CanonicalGrid, signed_distance_grid, upsample
+from pipeline.mesh.settings import MeshSettings
+
+SIGMAS_M = (0.0, 0.005, 0.01, 0.02, 0.03)
+"""Standard deviations of the smoothed offsets that are blended."""
+RADII_M = (0.01, 0.02, 0.03, 0.04, 0.06, 0.08, 0.10, 0.12)
+"""Radii of the balls that measure the local thickness."""
+EXACT_BAND_M = 0.045
+"""Distance from the extracted surface within which the offset is exact; interpolated farther away, where it has little
+weight."""
+DETAIL_BAND_M = 0.012
+"""Distance from the result within which the details of head and hands are evaluated."""
+CLOSE_OFFSET_M, LOOSE_OFFSET_M = 0.02, 0.06
+"""Below the first distance from the body its own detail shows, beyond the second none does: its distance has creases
+between the legs, which a skirt has not."""
+LOOSE_SIGMA_M = 0.03
+"""Smoothing of the distance to the body where cloth is loose."""
+
+
+def fair_surface(mesh: Mesh, samples: CanonicalGrid, body: Body, settings: MeshSettings) -> Mesh:
+    """Return the surface with a smoothed offset from the body, closed and dense as from marching cubes.
+
+    Args:
+        mesh: the extracted surface, closed, m.
+        samples: the grid from which it was extracted.
+        body: the fitted body in its canonical pose.
+        settings: `fairing_ratio` is the standard deviation over the local thickness; 0 returns the mesh as it is.
+
+    Raises:
+        OpenSurfaceError: the result could not be repaired.
+    """
+    if settings.fairing_ratio <= 0.0:
+        return mesh
+    coarse = samples.downsampled()
+    counts = np.array(coarse.density.shape)
+    surface_m = signed_distance_grid(mesh, coarse.origin_m, counts, coarse.spacing_m)
+    near = np.abs(surface_m) < EXACT_BAND_M
+    points = np.argwhere(near) * coarse.spacing_m + coarse.origin_m
+    surface_m[near] = signed_distance_m(points, mesh)
+    body_m = coarse.body_distance_m.copy()
+    body_m[near] = signed_distance_m(points, body.mesh())
+    reference_m = _without_creases(body_m, coarse.spacing_m)
+    sigma_m = settings.fairing_ratio * local_thickness_m(body_m < 0.0, coarse.spacing_m)
+    offset_m = smooth_with_local_sigma(surface_m - reference_m, sigma_m, coarse.spacing_m)
+    shape = samples.density.shape
+    fine_offset_m = upsample(offset_m, shape) * (1.0 - samples.hand_weight)
+    value_m = upsample(reference_m, shape) + fine_offset_m
+    detailed = np.argwhere((np.abs(value_m) < DETAIL_BAND_M) & _has_detail(samples, body))
+    detail_m = signed_distance_m(detailed * samples.spacing_m + samples.origin_m, body.mesh())
+    value_m[tuple(detailed.T)] = detail_m + fine_offset_m[tuple(detailed.T)]
+    return repair(isosurface(-value_m, 0.0, samples.origin_m, samples.spacing_m))
+
+
+def local_thickness_m(inside: Bool[np.ndarray, "x y z"], spacing_m: float) -> Float[np.ndarray, "x y z"]:
+    """Return the radius of the largest of the balls `RADII_M` that fits into the solid and contains a sample, m.
+
+    Samples outside have the value of the nearest one inside, and the result is smoothed by one sample.
+    """
+    depth_m = spacing_m * ndimage.distance_transform_edt(inside)
+    thickness_m = np.full(inside.shape, RADII_M[0])
+    for radius_m in RADII_M[1:]:
+        centres = depth_m >= radius_m
+        if not centres.any():
+            break
+        thickness_m[spacing_m * ndimage.distance_transform_edt(~centres) <= radius_m] = radius_m
+    nearest = ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)
+    return ndimage.gaussian_filter(thickness_m[tuple(nearest)], 1.0)
+
+
+def smooth_with_local_sigma(
+    values: Float[np.ndarray, "x y z"], sigma_m: Float[np.ndarray, "x y z"], spacing_m: float
+) -> Float[np.ndarray, "x y z"]:
+    """Smooth a grid by a Gaussian whose standard deviation varies from sample to sample, at most the last `SIGMAS_M`.
+
+    Each sample interpolates linearly between the results of the two nearest standard deviations.
+    """
+    result = np.zeros_like(values)
+    for row, level_m in enumerate(SIGMAS_M):
+        rising = (sigma_m - SIGMAS_M[row - 1]) / (level_m - SIGMAS_M[row - 1]) if row > 0 else np.inf
+        falling = (SIGMAS_M[row + 1] - sigma_m) / (SIGMAS_M[row + 1] - level_m) if row + 1 < len(SIGMAS_M) else np.inf
+        share = np.clip(np.minimum(rising, falling), 0.0, 1.0)
+        smoothed = ndimage.gaussian_filter(values, level_m / spacing_m, truncate=3.0) if level_m else values
+        result += share * smoothed
+    return result
+
+
+def _without_creases(body_m: Float[np.ndarray, "x y z"], spacing_m: float) -> Float[np.ndarray, "x y z"]:
+    """Return the distance to the body, smoothed where cloth would be loose."""
+    loose = np.clip((body_m - CLOSE_OFFSET_M) / (LOOSE_OFFSET_M - CLOSE_OFFSET_M), 0.0, 1.0)
+    return body_m + loose * (ndimage.gaussian_filter(body_m, LOOSE_SIGMA_M / spacing_m, truncate=3.0) - body_m)
+
+
+def _has_detail(samples: CanonicalGrid, body: Body) -> Bool[np.ndarray, "x y z"]:
+    """Return the samples at hands and head, where the body has details finer than the coarse grid."""
+    detailed = samples.hand_weight > 0.0
+    if "Head" in body.joint_names:
+        head_m = body.joints_m[body.joint("Head"), 1]
+        detailed[:, max(0, int((head_m - samples.origin_m[1]) / samples.spacing_m)) :] = True
+    return detailed

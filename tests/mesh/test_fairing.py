@@ -1,0 +1,78 @@
+"""Fairing: bumps go, the offset and the details of the body stay, and the smoothing follows the thickness."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy import ndimage
+from torch import Tensor
+
+from pipeline.body.body import Body
+from pipeline.geometry.surface import is_closed_manifold
+from pipeline.mesh.fairing import fair_surface, local_thickness_m, smooth_with_local_sigma
+from pipeline.mesh.isosurface import extract_mesh, sample_canonical_grid
+from tests.mesh.capsule import BOUNDS_M, RADIUS_M, SETTINGS, capsule_body, capsule_distance
+
+SPACING_M, CLOTH_M, BUMP_M = 0.01, 0.03, 0.006
+WITHOUT_HANDS = replace(SETTINGS, hands_from_body=False, solid_core_depth_m=0.09)
+
+
+@pytest.fixture(scope="module")
+def body() -> Body:
+    return capsule_body()
+
+
+def bumpy_cloth(points: Tensor) -> Tensor:
+    """Density of cloth 3 cm off the capsule with bumps of 6 mm, 5 cm long."""
+    array = points.numpy().astype(np.float64)
+    waves = np.sin(array * (2.0 * np.pi / 0.05)).prod(axis=1)
+    depth_m = RADIUS_M + CLOTH_M + BUMP_M * waves - capsule_distance(array)
+    return torch.from_numpy(100.0 * np.exp(np.clip(depth_m / 0.004, -20.0, 20.0))).float()
+
+
+def test_bumps_go_and_the_offset_of_the_cloth_stays(body: Body) -> None:
+    samples = sample_canonical_grid(bumpy_cloth, BOUNDS_M, body, SPACING_M, WITHOUT_HANDS)
+    settings = replace(WITHOUT_HANDS, blur_sigma_voxels=0.0)
+    rough = extract_mesh(samples, 100.0, settings)
+    fair = fair_surface(rough, samples, body, settings)
+    assert is_closed_manifold(fair)
+    deviation_m = [capsule_distance(mesh.vertices) - RADIUS_M - CLOTH_M for mesh in (rough, fair)]
+    assert deviation_m[0].std() > 0.0015
+    assert deviation_m[1].std() < 0.5 * deviation_m[0].std()
+    assert abs(deviation_m[1].mean()) < 0.001  # smoothing the surface itself would shrink it
+
+
+def test_without_fairing_the_mesh_is_returned_as_it_is(body: Body) -> None:
+    samples = sample_canonical_grid(bumpy_cloth, BOUNDS_M, body, 0.02, WITHOUT_HANDS)
+    mesh = extract_mesh(samples, 100.0, WITHOUT_HANDS)
+    assert fair_surface(mesh, samples, body, replace(WITHOUT_HANDS, fairing_ratio=0.0)) is mesh
+
+
+def test_local_thickness_is_the_radius_of_the_part(body: Body) -> None:
+    """A ball of 9 cm with an arm of 2.5 cm."""
+    axis = np.arange(-0.15, 0.4501, SPACING_M)
+    x, y, z = np.meshgrid(axis, axis[axis < 0.15], axis[axis < 0.15], indexing="ij")
+    inside = (x**2 + y**2 + z**2 < 0.09**2) | ((np.hypot(y, z) < 0.025) & (x > 0.0) & (x < 0.4))
+    thickness_m = local_thickness_m(inside, SPACING_M)
+    middle = len(axis[axis < 0.15]) // 2
+    ball, arm = (thickness_m[np.argmin(np.abs(axis - along)), middle, middle] for along in (0.0, 0.3))
+    assert ball == pytest.approx(0.08, abs=0.005)
+    assert arm == pytest.approx(0.02, abs=0.005)
+
+
+def test_smoothing_with_one_sigma_is_a_gaussian_filter() -> None:
+    values = np.random.default_rng(0).normal(size=(24, 24, 24))
+    for sigma_m in (0.0, 0.01, 0.03):
+        expected = ndimage.gaussian_filter(values, sigma_m / SPACING_M, truncate=3.0) if sigma_m else values
+        result = smooth_with_local_sigma(values, np.full(values.shape, sigma_m), SPACING_M)
+        np.testing.assert_allclose(result, expected, atol=1e-12)
+    largest = smooth_with_local_sigma(values, np.full(values.shape, 0.5), SPACING_M)
+    np.testing.assert_allclose(largest, ndimage.gaussian_filter(values, 3.0, truncate=3.0), atol=1e-12)
+
+
+def test_hands_keep_the_shape_of_the_body(body: Body) -> None:
+    samples = sample_canonical_grid(bumpy_cloth, BOUNDS_M, body, SPACING_M, SETTINGS)
+    fair = fair_surface(extract_mesh(samples, 100.0, SETTINGS), samples, body, SETTINGS)
+    hand = fair.vertices[:, 0] > 0.2
+    np.testing.assert_allclose(capsule_distance(fair.vertices[hand]), RADIUS_M, atol=0.004)
