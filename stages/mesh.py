@@ -36,7 +36,7 @@ from pipeline.mesh.isosurface import CanonicalGrid, extract_mesh, sample_canonic
 from pipeline.mesh.pose_refit import refit_poses, select_poses
 from pipeline.mesh.pose_selection import is_far_from, score_motion
 from pipeline.mesh.refinement import RefinementState, refine_mesh
-from pipeline.mesh.remeshing import remesh_to_edge_length
+from pipeline.mesh.remeshing import detailed_faces, remesh_to_edge_length
 from pipeline.mesh.settings import MeshSettings
 from pipeline.mesh.skin_transfer import SkinnedTopology, transfer_skin
 from pipeline.mesh.vertex_optimisation import RefinementInputs
@@ -150,7 +150,8 @@ def finish_mesh(mesh: Mesh, inputs: RefinementInputs) -> Mesh:
     def psnr_db(trial: Mesh) -> float:
         return mesh_psnr_db(trial, transfer_skin(trial, inputs.body), views, inputs.shader)
 
-    return resolve_self_intersections(reduce_faces(mesh, psnr_db, inputs.settings))
+    detailed = detailed_faces(mesh, inputs.body)
+    return resolve_self_intersections(reduce_faces(mesh, detailed, psnr_db, inputs.settings))
 
 
 class FieldColourShader(torch.nn.Module):
@@ -255,7 +256,7 @@ def write_results(out: Path, mesh: Mesh, skin: SkinnedTopology, shader: torch.nn
 
 STAGE = Stage(
     "mesh",
-    version=8,
+    version=9,
     needs=("frames", "body", "field"),
     makes=("mesh.npz", "motion.npz", "preview.png"),
     config=Config,

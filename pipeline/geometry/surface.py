@@ -200,21 +200,22 @@ def remesh_isotropic(
     return repair(_from_meshset(meshes))
 
 
-def collapse_edges(mesh: Mesh, face_count: int, shape_weight: float = 0.6) -> Mesh:
-    """Reduce a closed surface to about `face_count` faces by edge collapses with the smallest quadric error (VCGlib).
+def collapse_edges(mesh: Mesh, selected: Bool[np.ndarray, "f"], face_count: int, shape_weight: float = 0.6) -> Mesh:
+    """Reduce a part of a closed surface by edge collapses with the smallest quadric error (VCGlib).
 
     Args:
         mesh: the surface, m.
-        face_count: number of faces to reach.
+        selected: the part; the other faces stay.
+        face_count: number of its faces to reach.
         shape_weight: weight of well-shaped triangles, in [0, 1]. `fast_simplification` has none: at equal faces its
             normals are half a degree worse.
 
     Raises:
         OpenSurfaceError: the result could not be repaired.
     """
-    meshes = _to_meshset(mesh)
+    meshes = _to_meshset(mesh, selected)
     meshes.meshing_decimation_quadric_edge_collapse(
-        targetfacenum=face_count, qualitythr=shape_weight, preservenormal=True, planarquadric=True
+        targetfacenum=face_count, qualitythr=shape_weight, preservenormal=True, planarquadric=True, selected=True
     )
     return repair(_from_meshset(meshes))
 

@@ -7,6 +7,9 @@ of the mesh is measurably worse.
 
 from collections.abc import Callable
 
+import numpy as np
+from jaxtyping import Bool
+
 from pipeline.core.progress import track
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import OpenSurfaceError, collapse_edges
@@ -15,7 +18,9 @@ from pipeline.mesh.settings import MeshSettings
 MAX_TRIALS = 10
 
 
-def reduce_faces(mesh: Mesh, psnr_db: Callable[[Mesh], float], settings: MeshSettings) -> Mesh:
+def reduce_faces(
+    mesh: Mesh, detailed: Bool[np.ndarray, "f"], psnr_db: Callable[[Mesh], float], settings: MeshSettings
+) -> Mesh:
     """Remove as many faces as cost at most `settings.max_reduction_loss_db`.
 
     Each trial multiplies the number of faces by `settings.reduction_ratio`; the first that costs more, has no fewer
@@ -23,13 +28,16 @@ def reduce_faces(mesh: Mesh, psnr_db: Callable[[Mesh], float], settings: MeshSet
 
     Args:
         mesh: a closed surface, m; returned as it is (the same object) if the first trial fails.
+        detailed: faces that stay (`pipeline.mesh.remeshing.detailed_faces`): views of the whole person hardly show
+            what they are needed for.
         psnr_db: PSNR of renders of a mesh, dB.
         settings: see `MeshSettings`.
     """
     lowest_psnr_db, best = psnr_db(mesh) - settings.max_reduction_loss_db, mesh
     for trial in track(range(1, MAX_TRIALS + 1), "reduce faces"):
         try:
-            reduced = collapse_edges(mesh, int(len(mesh.faces) * settings.reduction_ratio**trial))
+            count = int(np.count_nonzero(~detailed) * settings.reduction_ratio**trial)
+            reduced = collapse_edges(mesh, ~detailed, count)
         except OpenSurfaceError:
             break
         if psnr_db(reduced) < lowest_psnr_db or len(reduced.faces) >= len(best.faces):

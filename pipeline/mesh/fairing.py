@@ -3,10 +3,12 @@
 The density determines the depth of a surface without texture to a few millimetres only, so that the extracted surface
 has bumps. Cloth that lies on a body varies over lengths in proportion to the thickness of the part it covers. The
 offset, the signed distance to the extracted surface less that to the body, is therefore smoothed by a Gaussian whose
-standard deviation is a fraction of the local thickness, and added to the signed distance to the body again. What the
-body model knows (fingers, nose, lips) keeps its detail, and convex parts do not shrink as they would if the surface
-itself were smoothed. Local thickness: Hildebrand and Ruegsegger, "A new method for the model-independent assessment of
-thickness in three-dimensional images", 1997.
+standard deviation is a fraction of the local thickness, and added to the signed distance to the body again. Hands and
+head keep the details of the body model (fingers, nose, lips); elsewhere the body is smoothed in the same way first,
+because cloth does not show them. Convex parts do not shrink as they would if the surface itself were smoothed.
+
+Local thickness: Hildebrand and Ruegsegger, "A new method for the model-independent assessment of thickness in
+three-dimensional images", 1997.
 
 Grids with half the resolution of the canonical grid are called coarse.
 """
@@ -31,8 +33,8 @@ weight."""
 DETAIL_BAND_M = 0.012
 """Distance from the result within which the details of head and hands are evaluated."""
 CLOSE_OFFSET_M, LOOSE_OFFSET_M = 0.02, 0.06
-"""Below the first distance from the body its own detail shows, beyond the second none does: its distance has creases
-between the legs, which a skirt has not."""
+"""Below the first distance from the body the offset is from the body itself, beyond the second from a smoothed one: the
+distance to the body has creases between the legs, which a skirt has not."""
 LOOSE_SIGMA_M = 0.03
 """Smoothing of the distance to the body where cloth is loose."""
 
@@ -59,13 +61,15 @@ def fair_surface(mesh: Mesh, samples: CanonicalGrid, body: Body, settings: MeshS
     surface_m[near] = signed_distance_m(points, mesh)
     body_m = coarse.body_distance_m.copy()
     body_m[near] = signed_distance_m(points, body.mesh())
-    reference_m = _without_creases(body_m, coarse.spacing_m)
     sigma_m = settings.fairing_ratio * local_thickness_m(body_m < 0.0, coarse.spacing_m)
+    has_detail = _has_detail(samples, body)
+    clothed_m = _without_creases(smooth_with_local_sigma(body_m, sigma_m, coarse.spacing_m), coarse.spacing_m)
+    reference_m = np.where(has_detail[::2, ::2, ::2], body_m, clothed_m)
     offset_m = smooth_with_local_sigma(surface_m - reference_m, sigma_m, coarse.spacing_m)
     shape = samples.density.shape
     fine_offset_m = upsample(offset_m, shape) * (1.0 - samples.hand_weight)
     value_m = upsample(reference_m, shape) + fine_offset_m
-    detailed = np.argwhere((np.abs(value_m) < DETAIL_BAND_M) & _has_detail(samples, body))
+    detailed = np.argwhere((np.abs(value_m) < DETAIL_BAND_M) & has_detail)
     detail_m = signed_distance_m(detailed * samples.spacing_m + samples.origin_m, body.mesh())
     value_m[tuple(detailed.T)] = detail_m + fine_offset_m[tuple(detailed.T)]
     return repair(isosurface(-value_m, 0.0, samples.origin_m, samples.spacing_m))

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.sparse import csc_array, csr_array, diags_array, eye_array
+from scipy.sparse import coo_array, csc_array, csr_array, diags_array, eye_array
 from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
@@ -27,6 +27,9 @@ from pipeline.kernels.common.thread_pool import ThreadPool
 from pipeline.mesh.settings import MeshSettings
 from pipeline.mesh.skin_transfer import SkinnedTopology
 from pipeline.mesh.views import PosedView, render_posed_view, view_losses
+
+MAX_EDGE_WEIGHT = 16.0
+"""Largest weight of an edge in the smoothing of the gradients: that of a quarter of the median length."""
 
 
 @dataclass(frozen=True)
@@ -68,12 +71,18 @@ class FromDifferential(torch.autograd.Function):
 
 
 def factorise_smoothing_matrix(mesh: Mesh, smoothing_lambda: float) -> SuperLU:
-    """Factorise I + lambda L with the combinatorial Laplacian L = degree - adjacency."""
-    operator = laplacian(mesh)
-    degree = np.bincount(mesh.edges().ravel(), minlength=len(mesh.vertices))
-    return splu(
-        csc_array(eye_array(len(mesh.vertices)) + smoothing_lambda * (diags_array(degree.astype(float)) @ operator))
-    )
+    """Factorise I + lambda L with the combinatorial Laplacian L = degree - adjacency.
+
+    An edge has the weight (median length / length)^2, at most `MAX_EDGE_WEIGHT`, so that the smoothing reaches equally
+    far, in metres, where the edges are short.
+    """
+    ends, count = mesh.edges(), len(mesh.vertices)
+    length_m = np.linalg.norm(mesh.vertices[ends[:, 0]] - mesh.vertices[ends[:, 1]], axis=1).astype(np.float64)
+    weight = np.minimum((np.median(length_m) / np.maximum(length_m, 1e-9)) ** 2, MAX_EDGE_WEIGHT)
+    both = np.concatenate([ends, ends[:, ::-1]])
+    adjacency = coo_array((np.concatenate([weight, weight]), both.T), shape=(count, count)).tocsr()
+    combinatorial = diags_array(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency
+    return splu(csc_array(eye_array(count) + smoothing_lambda * combinatorial))
 
 
 def optimise_vertices(

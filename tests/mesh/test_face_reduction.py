@@ -16,18 +16,31 @@ def sphere() -> Mesh:
     return isosurface(RADIUS_M - distance, 0.0, np.full(3, axis[0]), SPACING_M)
 
 
+def no_detail(mesh: Mesh) -> np.ndarray:
+    return np.zeros(len(mesh.faces), dtype=bool)
+
+
+def test_detailed_faces_stay() -> None:
+    mesh = sphere()
+    detailed = mesh.vertices[mesh.faces].mean(axis=1)[:, 1] > 0.0
+    reduced = reduce_faces(mesh, detailed, lambda trial: 30.0, MeshSettings())
+    above = reduced.vertices[reduced.faces].mean(axis=1)[:, 1] > 0.0
+    assert above.sum() >= 0.97 * detailed.sum()
+    assert (~above).sum() < 0.3 * (~detailed).sum()
+
+
 def test_faces_are_removed_while_the_loss_is_small() -> None:
     mesh = sphere()
     # One dB for each thousand faces that are missing.
     psnr_db, settings = lambda trial: len(trial.faces) / 1000.0, MeshSettings(max_reduction_loss_db=2.5)
-    reduced = reduce_faces(mesh, psnr_db, settings)
+    reduced = reduce_faces(mesh, no_detail(mesh), psnr_db, settings)
     assert len(mesh.faces) - 2500 <= len(reduced.faces) < len(mesh.faces) - 1000
     assert is_closed_manifold(reduced)
 
 
 def test_the_surface_stays_where_it_was() -> None:
     mesh = sphere()
-    reduced = reduce_faces(mesh, lambda trial: 30.0, MeshSettings())
+    reduced = reduce_faces(mesh, no_detail(mesh), lambda trial: 30.0, MeshSettings())
     assert len(reduced.faces) < 0.2 * len(mesh.faces)
     distance_m, _, _ = closest_points_on_mesh(mesh.vertices, reduced)
     assert distance_m.max() < 0.002
@@ -39,4 +52,4 @@ def test_the_surface_stays_where_it_was() -> None:
 def test_a_mesh_that_needs_its_faces_stays() -> None:
     mesh = sphere()
     count = len(mesh.faces)
-    assert reduce_faces(mesh, lambda trial: -abs(len(trial.faces) - count), MeshSettings()) is mesh
+    assert reduce_faces(mesh, no_detail(mesh), lambda trial: -abs(len(trial.faces) - count), MeshSettings()) is mesh
