@@ -32,6 +32,8 @@ EXACT_BAND_M = 0.045
 weight."""
 DETAIL_BAND_M = 0.012
 """Distance from the result within which the details of head and hands are evaluated."""
+DETAIL_BLEND_M, MIN_DETAIL = 0.015, 0.01
+"""Width of the transition from the body to the smoothed body, and the share below which the former is ignored."""
 CLOSE_OFFSET_M, LOOSE_OFFSET_M = 0.02, 0.06
 """Below the first distance from the body the offset is from the body itself, beyond the second from a smoothed one: the
 distance to the body has creases between the legs, which a skirt has not."""
@@ -62,23 +64,26 @@ def fair_surface(mesh: Mesh, samples: CanonicalGrid, body: Body, settings: MeshS
     body_m = coarse.body_distance_m.copy()
     body_m[near] = signed_distance_m(points, body.mesh())
     sigma_m = settings.fairing_ratio * local_thickness_m(body_m < 0.0, coarse.spacing_m)
-    has_detail = _has_detail(samples, body)
+    sigma_m[_head_mask(coarse, body, front_only=True)] = SIGMAS_M[-1]
+    sigma_m = ndimage.gaussian_filter(sigma_m, 1.0)
     clothed_m = _without_creases(smooth_with_local_sigma(body_m, sigma_m, coarse.spacing_m), coarse.spacing_m)
-    reference_m = np.where(has_detail[::2, ::2, ::2], body_m, clothed_m)
+    has_detail = (coarse.hand_weight > 0.0) | _head_mask(coarse, body, front_only=False)
+    detail = ndimage.gaussian_filter(has_detail.astype(np.float64), DETAIL_BLEND_M / coarse.spacing_m)
+    reference_m = clothed_m + detail * (body_m - clothed_m)
     offset_m = smooth_with_local_sigma(surface_m - reference_m, sigma_m, coarse.spacing_m)
     shape = samples.density.shape
-    fine_offset_m = upsample(offset_m, shape) * (1.0 - samples.hand_weight)
-    value_m = upsample(reference_m, shape) + fine_offset_m
-    detailed = np.argwhere((np.abs(value_m) < DETAIL_BAND_M) & has_detail)
-    detail_m = signed_distance_m(detailed * samples.spacing_m + samples.origin_m, body.mesh())
-    value_m[tuple(detailed.T)] = detail_m + fine_offset_m[tuple(detailed.T)]
+    value_m = upsample(reference_m, shape) + upsample(offset_m, shape) * (1.0 - samples.hand_weight)
+    fine_detail = upsample(detail, shape)
+    near_detail = (np.abs(value_m) < DETAIL_BAND_M) & (fine_detail > MIN_DETAIL)
+    exact_m = signed_distance_m(np.argwhere(near_detail) * samples.spacing_m + samples.origin_m, body.mesh())
+    value_m[near_detail] += fine_detail[near_detail] * (exact_m - upsample(body_m, shape)[near_detail])
     return repair(isosurface(-value_m, 0.0, samples.origin_m, samples.spacing_m))
 
 
 def local_thickness_m(inside: Bool[np.ndarray, "x y z"], spacing_m: float) -> Float[np.ndarray, "x y z"]:
     """Return the radius of the largest of the balls `RADII_M` that fits into the solid and contains a sample, m.
 
-    Samples outside have the value of the nearest one inside, and the result is smoothed by one sample.
+    Samples outside have the value of the nearest one inside.
     """
     depth_m = spacing_m * ndimage.distance_transform_edt(inside)
     thickness_m = np.full(inside.shape, RADII_M[0])
@@ -88,7 +93,7 @@ def local_thickness_m(inside: Bool[np.ndarray, "x y z"], spacing_m: float) -> Fl
             break
         thickness_m[spacing_m * ndimage.distance_transform_edt(~centres) <= radius_m] = radius_m
     nearest = ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)
-    return ndimage.gaussian_filter(thickness_m[tuple(nearest)], 1.0)
+    return thickness_m[tuple(nearest)]
 
 
 def smooth_with_local_sigma(
@@ -114,10 +119,20 @@ def _without_creases(body_m: Float[np.ndarray, "x y z"], spacing_m: float) -> Fl
     return body_m + loose * (ndimage.gaussian_filter(body_m, LOOSE_SIGMA_M / spacing_m, truncate=3.0) - body_m)
 
 
-def _has_detail(samples: CanonicalGrid, body: Body) -> Bool[np.ndarray, "x y z"]:
-    """Return the samples at hands and head, where the body has details finer than the coarse grid."""
-    detailed = samples.hand_weight > 0.0
+def _head_mask(samples: CanonicalGrid, body: Body, front_only: bool) -> Bool[np.ndarray, "x y z"]:
+    """Return the samples at the head, or at its front half, the face.
+
+    The dark and bright parts of a face look like dents and bumps to the density, and its shape is much alike from
+    person to person: there the offset is smoothed as far as anywhere.
+    """
+    mask = np.zeros(samples.density.shape, dtype=bool)
     if "Head" in body.joint_names:
-        head_m = body.joints_m[body.joint("Head"), 1]
-        detailed[:, max(0, int((head_m - samples.origin_m[1]) / samples.spacing_m)) :] = True
-    return detailed
+        head = body.vertices[body.skin_weights[:, body.joint("Head")] > 0.5]
+        low_m = head.min(axis=0)
+        middle_m = 0.5 * (low_m + head.max(axis=0)) if front_only else np.full(3, -np.inf)
+        y, z = (
+            max(0.0, np.ceil((position_m - samples.origin_m[axis]) / samples.spacing_m))
+            for axis, position_m in ((1, low_m[1]), (2, middle_m[2]))
+        )
+        mask[:, int(y) :, int(z) :] = True
+    return mask

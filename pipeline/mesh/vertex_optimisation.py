@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.sparse import coo_array, csc_array, csr_array, diags_array, eye_array
 from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
@@ -24,12 +24,16 @@ from pipeline.core.progress import track
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import laplacian
 from pipeline.kernels.common.thread_pool import ThreadPool
+from pipeline.mesh.remeshing import detailed_faces
 from pipeline.mesh.settings import MeshSettings
 from pipeline.mesh.skin_transfer import SkinnedTopology
 from pipeline.mesh.views import PosedView, render_posed_view, view_losses
 
 MAX_EDGE_WEIGHT = 16.0
 """Largest weight of an edge in the smoothing of the gradients: that of a quarter of the median length."""
+STIFFNESS = 20.0
+"""Weight of edges of face and hands, which move almost as a whole: their details are the body model's, and dark brows
+or lips would become grooves."""
 
 
 @dataclass(frozen=True)
@@ -70,15 +74,18 @@ class FromDifferential(torch.autograd.Function):
         return torch.from_numpy(context.factorisation.solve(gradient.double().contiguous().numpy())).to(gradient), None
 
 
-def factorise_smoothing_matrix(mesh: Mesh, smoothing_lambda: float) -> SuperLU:
+def factorise_smoothing_matrix(mesh: Mesh, stiff: Bool[np.ndarray, "f"], smoothing_lambda: float) -> SuperLU:
     """Factorise I + lambda L with the combinatorial Laplacian L = degree - adjacency.
 
     An edge has the weight (median length / length)^2, at most `MAX_EDGE_WEIGHT`, so that the smoothing reaches equally
-    far, in metres, where the edges are short.
+    far, in metres, where the edges are short. Edges of stiff faces weigh `STIFFNESS` times as much.
     """
     ends, count = mesh.edges(), len(mesh.vertices)
+    stiff_vertex = np.zeros(count, dtype=bool)
+    stiff_vertex[mesh.faces[stiff]] = True
     length_m = np.linalg.norm(mesh.vertices[ends[:, 0]] - mesh.vertices[ends[:, 1]], axis=1).astype(np.float64)
     weight = np.minimum((np.median(length_m) / np.maximum(length_m, 1e-9)) ** 2, MAX_EDGE_WEIGHT)
+    weight[stiff_vertex[ends].all(axis=1)] *= STIFFNESS
     both = np.concatenate([ends, ends[:, ::-1]])
     adjacency = coo_array((np.concatenate([weight, weight]), both.T), shape=(count, count)).tocsr()
     combinatorial = diags_array(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency
@@ -103,7 +110,11 @@ def optimise_vertices(
     settings = inputs.settings
     generator = torch.Generator().manual_seed(seed)
     start = torch.from_numpy(mesh.vertices.astype(np.float32))
-    factorisation, operator = factorise_smoothing_matrix(mesh, settings.smoothing_lambda), _to_torch(laplacian(mesh))
+    stiff = detailed_faces(mesh, inputs.body)
+    factorisation, operator = (
+        factorise_smoothing_matrix(mesh, stiff, settings.smoothing_lambda),
+        _to_torch(laplacian(mesh)),
+    )
     coordinates, global_offset = torch.zeros_like(start, requires_grad=True), torch.zeros(3, requires_grad=True)
     learning_rates = [settings.learning_rate * (1.0 + settings.smoothing_lambda), settings.global_learning_rate]
     offset_optimiser = AdamUniform([coordinates, global_offset], learning_rates)
