@@ -98,13 +98,16 @@ def _true_to_fitted_world(
     """Return the transforms from the true to the fitted world that preserve the image of the person.
 
     In the fitted world the person may be smaller and nearer: each transform scales the person about its root and moves
-    the root to the depth at which the person has the same size in the image.
+    the root to the depth at which the person has the same size in the image, on the ray of its pixel.
     """
-    roots = transform_world_to_camera(roots_m.double(), camera)
-    depth = scale * fitted.fx / fitted.width * camera.width / camera.fx
+    roots, ratio = transform_world_to_camera(roots_m.double(), camera), fitted.width / camera.width
+    depth_m = scale * fitted.fx / (ratio * camera.fx) * roots[:, 2:]
+    pixels_px = ratio * (roots[:, :2] / roots[:, 2:] * torch.tensor([camera.fx, camera.fy], dtype=torch.float64))
+    pixels_px += torch.tensor([ratio * camera.cx - fitted.cx, ratio * camera.cy - fitted.cy], dtype=torch.float64)
+    in_camera = torch.cat([pixels_px / torch.tensor([fitted.fx, fitted.fy]) * depth_m, depth_m], dim=1)
     moved = torch.linalg.inv(torch.from_numpy(fitted.world_to_camera).double())
     rotation_matrix = moved[:3, :3] @ torch.from_numpy(camera.world_to_camera).double()[:3, :3]
-    targets = (roots * torch.tensor([scale, scale, depth])) @ moved[:3, :3].T + moved[:3, 3]
+    targets = in_camera @ moved[:3, :3].T + moved[:3, 3]
     matrices = torch.eye(4, dtype=torch.float64).repeat(len(roots_m), 1, 1)
     matrices[:, :3, :3] = scale * rotation_matrix
     matrices[:, :3, 3] = targets - scale * roots_m.double() @ rotation_matrix.T
