@@ -256,7 +256,7 @@ def write_results(out: Path, mesh: Mesh, skin: SkinnedTopology, shader: torch.nn
 
 STAGE = Stage(
     "mesh",
-    version=10,
+    version=11,
     needs=("frames", "body", "field"),
     makes=("mesh.npz", "motion.npz", "preview.png"),
     config=Config,

@@ -55,15 +55,23 @@ def _remesh_in_two_sizes(mesh: Mesh, target_edge_m: float, body: Body) -> Mesh:
 
 
 def detailed_faces(mesh: Mesh, body: Body) -> Bool[np.ndarray, "f"]:
-    """Return the faces whose nearest point of the body is on a hand or on the front half of the head."""
+    """Return the mesh faces at the hands and at the face of the person."""
+    return _near_vertices(mesh, body, hand_skin_weights(body) > 0.5) | face_of_person(mesh, body)
+
+
+def face_of_person(mesh: Mesh, body: Body) -> Bool[np.ndarray, "f"]:
+    """Return the mesh faces at the front half of the head; none if the body has no joint of this name."""
+    if "Head" not in body.joint_names:
+        return np.zeros(len(mesh.faces), dtype=bool)
+    on_head, depth_m = body.skin_weights[:, body.joint("Head")] > 0.5, body.vertices[:, 2]
+    middle_m = 0.5 * (depth_m[on_head].min() + depth_m[on_head].max())
+    return _near_vertices(mesh, body, on_head & (depth_m > middle_m))
+
+
+def _near_vertices(mesh: Mesh, body: Body, chosen: Bool[np.ndarray, "v"]) -> Bool[np.ndarray, "f"]:
+    """Return the mesh faces whose nearest point of the body is on one of its chosen vertices."""
     _, nearest, _ = closest_points_on_mesh(mesh.vertices[mesh.faces].mean(axis=1), body.mesh())
-    vertex = body.faces[nearest, 0]
-    detailed = hand_skin_weights(body) > 0.5
-    if "Head" in body.joint_names:
-        on_head = body.skin_weights[:, body.joint("Head")] > 0.5
-        depth_m = body.vertices[:, 2]
-        detailed |= on_head & (depth_m > 0.5 * (depth_m[on_head].min() + depth_m[on_head].max()))
-    return detailed[vertex]
+    return chosen[body.faces[nearest, 0]]
 
 
 def decimate(mesh: Mesh, face_count: int) -> Mesh:

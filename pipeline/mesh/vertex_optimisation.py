@@ -24,16 +24,16 @@ from pipeline.core.progress import track
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import laplacian
 from pipeline.kernels.common.thread_pool import ThreadPool
-from pipeline.mesh.remeshing import detailed_faces
+from pipeline.mesh.remeshing import face_of_person
 from pipeline.mesh.settings import MeshSettings
 from pipeline.mesh.skin_transfer import SkinnedTopology
 from pipeline.mesh.views import PosedView, render_posed_view, view_losses
 
 MAX_EDGE_WEIGHT = 16.0
 """Largest weight of an edge in the smoothing of the gradients: that of a quarter of the median length."""
-STIFFNESS = 20.0
-"""Weight of edges of face and hands, which move almost as a whole: their details are the body model's, and dark brows
-or lips would become grooves."""
+STIFFNESS = 6.0
+"""Weight of edges of the face, which moves almost as a whole: its details are the body model's, and dark brows or lips
+would become grooves."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ def optimise_vertices(
     settings = inputs.settings
     generator = torch.Generator().manual_seed(seed)
     start = torch.from_numpy(mesh.vertices.astype(np.float32))
-    stiff = detailed_faces(mesh, inputs.body)
+    stiff = face_of_person(mesh, inputs.body)
     factorisation, operator = (
         factorise_smoothing_matrix(mesh, stiff, settings.smoothing_lambda),
         _to_torch(laplacian(mesh)),
