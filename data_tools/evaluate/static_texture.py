@@ -15,6 +15,7 @@ from data_tools.synthetic.rig.subject import Subject
 from data_tools.synthetic.scene.renderer import pose_vertices, shade
 from data_tools.synthetic.scene.shadow import render_shadow_map
 from pipeline.capture.frame_selection import TRAIN
+from pipeline.field.setup import evenly_spaced
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.mesh import area_weighted_vertex_normals
 from pipeline.geometry.texture_rendering import sample_texture
@@ -34,7 +35,7 @@ def static_brightness(comparison: Comparison) -> Float[Tensor, "v"]:
     """
     truth, light, capture = comparison.truth, comparison.truth.light, comparison.run.capture
     positions = capture.positions(TRAIN)
-    chosen = positions[np.unique(np.linspace(0, len(positions) - 1, MAX_FRAMES).round().astype(int))]
+    chosen = positions[evenly_spaced(len(positions), MAX_FRAMES)]
     faces = torch.from_numpy(truth.subject.body.faces)
     summed, weight = (torch.zeros(len(truth.subject.body.vertices)) for _ in range(2))
     for frame in capture.frame_index[chosen].tolist():

@@ -275,18 +275,22 @@ def _split_faces(faces: Int[np.ndarray, "f 3"], middle: Int[np.ndarray, "f 3"]) 
     return np.concatenate(parts)
 
 
+def adjacency(mesh: Mesh, edge_weights: Float[np.ndarray, "e"]) -> csr_array:
+    """Return the symmetric adjacency matrix (v, v) with a weight for each edge of `mesh.edges()`, float64."""
+    ends, count = mesh.edges(), len(mesh.vertices)
+    both = np.concatenate([ends, ends[:, ::-1]])
+    return coo_array((np.concatenate([edge_weights, edge_weights]), both.T), shape=(count, count)).tocsr()
+
+
 def laplacian(mesh: Mesh) -> csr_array:
     """Return the uniform Laplacian I - D^-1 A, (v, v) float64.
 
     Applied to positions, it gives each vertex minus the mean of its neighbours. A is the adjacency matrix, D the
     diagonal matrix of the degrees.
     """
-    ends = mesh.edges()
-    count = len(mesh.vertices)
-    both = np.concatenate([ends, ends[:, ::-1]])
-    adjacency = coo_array((np.ones(len(both)), both.T), shape=(count, count)).tocsr()
-    degree = np.maximum(adjacency.sum(axis=1), 1.0)
-    return csr_array(diags_array(np.ones(count)) - diags_array(1.0 / degree) @ adjacency)
+    neighbours = adjacency(mesh, np.ones(len(mesh.edges())))
+    degree = np.maximum(neighbours.sum(axis=1), 1.0)
+    return csr_array(diags_array(np.ones(len(mesh.vertices))) - diags_array(1.0 / degree) @ neighbours)
 
 
 def smooth_taubin(mesh: Mesh, steps: int, taubin_lambda: float = 0.5, taubin_nu: float = 0.52) -> Mesh:

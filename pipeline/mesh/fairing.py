@@ -20,7 +20,13 @@ from scipy import ndimage
 from pipeline.body.body import Body
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import isosurface, repair, signed_distance_m
-from pipeline.mesh.isosurface import CanonicalGrid, signed_distance_grid, upsample
+from pipeline.mesh.isosurface import (
+    CanonicalGrid,
+    head_middle_m,
+    head_vertices,
+    signed_distance_grid,
+    upsample,
+)
 from pipeline.mesh.settings import MeshSettings
 
 SIGMAS_M = (0.0, 0.005, 0.01, 0.02, 0.03)
@@ -126,13 +132,13 @@ def _head_mask(samples: CanonicalGrid, body: Body, front_only: bool) -> Bool[np.
     person to person: there the offset is smoothed as far as anywhere.
     """
     mask = np.zeros(samples.density.shape, dtype=bool)
-    if "Head" in body.joint_names:
-        head = body.vertices[body.skin_weights[:, body.joint("Head")] > 0.5]
-        low_m = head.min(axis=0)
-        middle_m = 0.5 * (low_m + head.max(axis=0)) if front_only else np.full(3, -np.inf)
+    head = head_vertices(body)
+    if head.any():
+        low_m = body.vertices[head, 1].min()
+        back_m = head_middle_m(body)[2] if front_only else -np.inf
         y, z = (
             max(0.0, np.ceil((position_m - samples.origin_m[axis]) / samples.spacing_m))
-            for axis, position_m in ((1, low_m[1]), (2, middle_m[2]))
+            for axis, position_m in ((1, low_m), (2, back_m))
         )
         mask[:, int(y) :, int(z) :] = True
     return mask

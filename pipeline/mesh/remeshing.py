@@ -10,7 +10,7 @@ from pipeline.body.body import Body
 from pipeline.core.progress import warn
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import OpenSurfaceError, closest_points_on_mesh, remesh_isotropic, repair, subdivide
-from pipeline.mesh.isosurface import hand_skin_weights
+from pipeline.mesh.isosurface import hand_skin_weights, head_middle_m, head_vertices
 from pipeline.mesh.settings import MeshSettings
 
 DECIMATION_FACE_RATIO = 3.0
@@ -61,11 +61,10 @@ def detailed_faces(mesh: Mesh, body: Body) -> Bool[np.ndarray, "f"]:
 
 def face_of_person(mesh: Mesh, body: Body) -> Bool[np.ndarray, "f"]:
     """Return the mesh faces at the front half of the head; none if the body has no joint of this name."""
-    if "Head" not in body.joint_names:
+    head = head_vertices(body)
+    if not head.any():
         return np.zeros(len(mesh.faces), dtype=bool)
-    on_head, depth_m = body.skin_weights[:, body.joint("Head")] > 0.5, body.vertices[:, 2]
-    middle_m = 0.5 * (depth_m[on_head].min() + depth_m[on_head].max())
-    return _near_vertices(mesh, body, on_head & (depth_m > middle_m))
+    return _near_vertices(mesh, body, head & (body.vertices[:, 2] > head_middle_m(body)[2]))
 
 
 def _near_vertices(mesh: Mesh, body: Body, chosen: Bool[np.ndarray, "v"]) -> Bool[np.ndarray, "f"]:

@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from scipy.sparse import coo_array, csc_array, csr_array, diags_array, eye_array
+from scipy.sparse import csc_array, csr_array, diags_array, eye_array
 from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
 from pipeline.body.body import Body
 from pipeline.core.progress import track
 from pipeline.geometry.mesh import Mesh
-from pipeline.geometry.surface import laplacian
+from pipeline.geometry.surface import adjacency, laplacian
 from pipeline.kernels.common.thread_pool import ThreadPool
 from pipeline.mesh.remeshing import face_of_person
 from pipeline.mesh.settings import MeshSettings
@@ -86,9 +86,8 @@ def factorise_smoothing_matrix(mesh: Mesh, stiff: Bool[np.ndarray, "f"], smoothi
     length_m = np.linalg.norm(mesh.vertices[ends[:, 0]] - mesh.vertices[ends[:, 1]], axis=1).astype(np.float64)
     weight = np.minimum((np.median(length_m) / np.maximum(length_m, 1e-9)) ** 2, MAX_EDGE_WEIGHT)
     weight[stiff_vertex[ends].all(axis=1)] *= STIFFNESS
-    both = np.concatenate([ends, ends[:, ::-1]])
-    adjacency = coo_array((np.concatenate([weight, weight]), both.T), shape=(count, count)).tocsr()
-    combinatorial = diags_array(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency
+    weighted = adjacency(mesh, weight)
+    combinatorial = diags_array(np.asarray(weighted.sum(axis=1)).ravel()) - weighted
     return splu(csc_array(eye_array(count) + smoothing_lambda * combinatorial))
 
 

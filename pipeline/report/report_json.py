@@ -18,7 +18,7 @@ PROTOCOL = (
     "shape and camera, to the landmarks and masks of all frames; the mesh stage fits frames that are not trained on "
     "once more, to the same landmarks and, through the outline of the mesh, to that of the mask, tied by the motion "
     "prior to the training frames next to them, whose poses are learnt with the field. Where validation frames reject "
-    "this fit (stages.mesh.motion_refitted 0), the field's pose corrections are interpolated in time between training "
+    "this fit (stages.mesh.refitted_frames 0), the field's pose corrections are interpolated in time between training "
     "frames and fade to zero away from them. Frames are composited on white with the mask of the frames "
     "stage, so an error of that mask costs nothing; renders are composited with their own alpha; both are rounded to 8 "
     "bits. psnr, ssim and flip (67 pixels a degree, lower is better) are means over frames: _full counts the whole "
