@@ -13,13 +13,13 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from data_tools.evaluate.comparison import SURFACE_POINTS, Comparison, ImagePair, retarget_avatar_meshes
+from data_tools.evaluate.comparison import SURFACE_POINTS, Comparison, ImagePair, retarget_motion
 from data_tools.evaluate.static_texture import render_static, static_brightness
 from data_tools.evaluate.truth import load_true_mask
 from data_tools.evaluate.upper_bound import map_between_worlds, render_upper_bound
 from data_tools.synthetic.scene.renderer import pose_vertices
 from pipeline.avatar.clay import render_clay_views
-from pipeline.body.body import canonical_to_world
+from pipeline.body.body import Motion, canonical_to_world
 from pipeline.body.files import load_camera, load_motion
 from pipeline.capture.frame_selection import HELDOUT
 from pipeline.core.errors import UserError
@@ -57,6 +57,12 @@ def compare_rest_surfaces(comparison: Comparison) -> dict[str, float]:
     )
 
 
+def compare_matched_surfaces(comparison: Comparison) -> dict[str, float]:
+    """Score the surface of the avatar in the A-pose of the true rig, with the rigs' joints matched."""
+    avatar, true = comparison.matched_rest_mesh, comparison.true_rest_mesh
+    return _aligned_scores(avatar, true, align_surfaces_icp(avatar, true))
+
+
 def compare_labelled_surfaces(comparison: Comparison) -> dict[str, dict[str, float]]:
     """Score each labelled part of the truth in its A-pose, see `SurfaceCorrespondence.label_scores`.
 
@@ -90,34 +96,49 @@ def compare_heldout_surfaces(comparison: Comparison) -> dict[str, float]:
     return mean_scores(rows)
 
 
-def compare_novel_poses(comparison: Comparison) -> tuple[dict[str, float], list[ImagePair]]:
+def compare_novel_poses(comparison: Comparison) -> tuple[dict[str, dict[str, float]], list[ImagePair]]:
     """Score skinning: surfaces and images of both rigs in poses that the video does not contain.
 
-    Unaligned, the hips of both are in the same place.
+    Returns:
+        novel_poses: scores of the surfaces whose limbs have equal directions; unaligned, the hips of both are in the
+        same place. novel_poses_matched: the same with the rigs' joints matched.
+        Image pairs with the rigs' joints matched.
     """
     motion = load_motion(comparison.folder / "novel_poses" / "motion.npz")
-    rows, image_pairs = [], []
-    for index, (pose, avatar) in enumerate(
-        zip(
-            canonical_to_world(comparison.truth.subject.body, motion),
-            retarget_avatar_meshes(comparison, motion),
-            strict=True,
+    body, true_body = comparison.run.body, comparison.truth.subject.body
+    true_surfaces = [comparison.true_surface(pose) for pose in canonical_to_world(true_body, motion)]
+
+    def surfaces(avatar_motion: Motion) -> list[Mesh]:
+        return [comparison.avatar_surface(pose) for pose in canonical_to_world(body, avatar_motion)]
+
+    def scores(avatars: list[Mesh], alignments: list[SimilarityTransform]) -> dict[str, float]:
+        return mean_scores(
+            _aligned_scores(avatar, true, alignment)
+            | {"chamfer_unaligned_mm": chamfer_distance_mm(avatar, true, SURFACE_POINTS)}
+            for avatar, true, alignment in zip(avatars, true_surfaces, alignments, strict=True)
         )
-    ):
-        true = comparison.true_surface(pose)
-        alignment = align_surfaces_icp(avatar, true)
-        unaligned_mm = chamfer_distance_mm(avatar, true, SURFACE_POINTS)
-        rows.append(_aligned_scores(avatar, true, alignment) | {"chamfer_unaligned_mm": unaligned_mm})
-        expected = read_rgba(comparison.folder / "novel_poses" / f"{index:06d}.png")
-        image_pairs.append(
-            ImagePair(expected, _render_avatar(comparison, alignment.transform_mesh(avatar), comparison.truth.camera))
+
+    retargeted, matched = surfaces(retarget_motion(body, true_body, motion)), surfaces(comparison.match_motion(motion))
+    retargeted_to_truth, matched_to_truth = (
+        list(map(align_surfaces_icp, avatars, true_surfaces)) for avatars in (retargeted, matched)
+    )
+    image_pairs = [
+        ImagePair(
+            read_rgba(comparison.folder / "novel_poses" / f"{index:06d}.png"),
+            _render_avatar(comparison, alignment.transform_mesh(avatar), comparison.truth.camera),
         )
-    return mean_scores(rows), image_pairs
+        for index, (avatar, alignment) in enumerate(zip(matched, matched_to_truth, strict=True))
+    ]
+    return {
+        "novel_poses": scores(retargeted, retargeted_to_truth),
+        "novel_poses_matched": scores(matched, matched_to_truth),
+    }, image_pairs
 
 
 def compare_novel_views(comparison: Comparison) -> list[ImagePair]:
-    """Render novel views: the avatar in the true pose of the first frame, aligned to the truth."""
-    avatar = retarget_avatar_meshes(comparison, comparison.truth.motion.select(np.array([0])))[0]
+    """Render novel views: the avatar in the true pose of the first frame, joints matched, aligned to the truth."""
+    motion = comparison.match_motion(comparison.truth.motion.select(np.array([0])))
+    avatar = comparison.avatar_surface(canonical_to_world(comparison.run.body, motion)[0])
     surface = align_surfaces_icp(
         avatar, comparison.true_surface(comparison.truth.canonical_to_world[0])
     ).transform_mesh(avatar)

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from data_tools.evaluate.rig_offsets import joint_rotations_in_camera, mean_rotation_offsets, rotate_joints
 from data_tools.evaluate.truth import load_ground_truth
 from data_tools.synthetic.rig.labels import FaceLabels
 from data_tools.synthetic.rig.retarget import local_quaternions, retarget_rotations
@@ -83,12 +84,37 @@ class Comparison:
         )
 
     @cached_property
+    def matched_rest_mesh(self) -> Mesh:
+        """The exterior of the avatar in the A-pose of the true rig, see `match_motion`."""
+        return self.avatar_surface(canonical_to_world(self.run.body, self.match_motion(self._true_rest_motion))[0])
+
+    @cached_property
     def _rest_motion(self) -> Motion:
         """The A-pose of the true rig, retargeted to the rig of the avatar: one frame."""
+        return retarget_motion(self.run.body, self.truth.subject.body, self._true_rest_motion)
+
+    @cached_property
+    def _true_rest_motion(self) -> Motion:
+        """The A-pose of the true rig: one frame."""
         body, joints = self.truth.subject.body, len(self.truth.subject.body.joint_names)
         identity_wxyz = np.tile(np.array([1.0, 0.0, 0.0, 0.0], dtype=np.float32), (1, joints, 1))
-        motion = Motion(np.zeros(1, np.int32), np.zeros(1), identity_wxyz, body.joints_m[:1])
-        return retarget_motion(self.run.body, body, motion)
+        return Motion(np.zeros(1, np.int32), np.zeros(1), identity_wxyz, body.joints_m[:1])
+
+    @cached_property
+    def joint_offsets(self) -> Float[Tensor, "j 3 3"]:
+        """Mean rotation over the frames of the run from the retargeted true motion to the motion of the avatar."""
+        run, truth = self.run, self.truth
+        true_motion = truth.motion.select(np.searchsorted(truth.motion.frame_index, run.motion.frame_index))
+        retargeted = retarget_motion(run.body, truth.subject.body, true_motion)
+        return mean_rotation_offsets(
+            joint_rotations_in_camera(run.body, run.motion, run.camera),
+            joint_rotations_in_camera(run.body, retargeted, truth.camera),
+        )
+
+    def match_motion(self, motion: Motion) -> Motion:
+        """Retarget a motion of the true rig such that both rigs agree as they do, on average, in the video."""
+        body = self.run.body
+        return rotate_joints(body, retarget_motion(body, self.truth.subject.body, motion), self.joint_offsets)
 
     @cached_property
     def alignment(self) -> SimilarityTransform:
@@ -155,10 +181,3 @@ def retarget_motion(body: Body, source_body: Body, motion: Motion) -> Motion:
     reference = (np.tile(np.eye(3), (len(rest_joints_m), 1, 1)), rest_joints_m.numpy())
     rotations = retarget_rotations(body, recorded_joint_of, world[..., :3, :3].numpy(), reference, np.eye(3))
     return motion.with_pose(local_quaternions(rotations, body.parents), motion.root_translation_m)
-
-
-def retarget_avatar_meshes(comparison: Comparison, motion: Motion) -> list[Mesh]:
-    """Return the avatar in all poses of a true motion; position and scale are not aligned."""
-    body = comparison.run.body
-    poses = canonical_to_world(body, retarget_motion(body, comparison.truth.subject.body, motion))
-    return [comparison.avatar_surface(pose) for pose in poses]

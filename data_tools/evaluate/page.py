@@ -11,6 +11,7 @@ from data_tools.evaluate.compare_avatar import (
     compare_heldout_images,
     compare_heldout_surfaces,
     compare_labelled_surfaces,
+    compare_matched_surfaces,
     compare_novel_poses,
     compare_novel_views,
     compare_rest_surfaces,
@@ -42,7 +43,11 @@ PROTOCOL = (
     "than 30 mm from the truth. chamfer_unaligned_mm: without alignment and scale, see stature_mm. mesh: A-pose of the "
     "true rig, unaligned standing on the same floor; heldout_poses: held-out frames, each rig in its own pose, "
     "unaligned where its camera sees it; novel_poses: both rigs in poses that the video does not contain, unaligned "
-    "with the hips in the same place. surface_by_label: the A-pose, on the faces of one garment or body part of the "
+    "with the hips in the same place. In mesh and novel_poses the limbs of both rigs have equal directions; rigs that "
+    "place hips, shoulders or ankles differently then differ although their surfaces do not. In mesh_matched and "
+    "novel_poses_matched, and in the images of novel views and poses, the rotation of each joint is corrected by the "
+    "mean rotation between the two rigs over the frames of the video. "
+    "surface_by_label: the A-pose, on the faces of one garment or body part of the "
     "truth and the points of the avatar nearest to them; area_share of the truth. Joints: after aligning the root, and "
     "without alignment. Images: field and mesh are the held-out scores of the report. upper_bound is the true "
     "mesh and texture with true lighting, rendered in the refined poses by the estimated camera on the same frames,"
@@ -55,6 +60,7 @@ PROTOCOL = (
     "one times the mean brightness of each vertex in the training frames. colour_error and balanced_colour_error "
     "(after one gain per channel) are mean absolute differences, of 255, on the observed texels."
 )
+SURFACES = ("mesh", "mesh_matched", "heldout_poses", "novel_poses", "novel_poses_matched")
 LIT_NOTE = (
     "not flat: the novel views and poses of this capture are lit, the avatar is not, so their image scores hold the "
     "light against it; judge them on a capture made with --light flat"
@@ -95,6 +101,7 @@ def avatar_sections(comparison: Comparison) -> tuple[dict[str, Any], dict[str, l
     """Compute all sections that need a finished avatar, and the image pairs of novel views, novel poses and clay."""
     document: dict[str, Any] = {
         "mesh": compare_rest_surfaces(comparison),
+        "mesh_matched": compare_matched_surfaces(comparison),
         "heldout_poses": compare_heldout_surfaces(comparison),
     }
     if parts := compare_labelled_surfaces(comparison):
@@ -102,7 +109,8 @@ def avatar_sections(comparison: Comparison) -> tuple[dict[str, Any], dict[str, l
     images = compare_heldout_images(comparison)
     image_pairs = {}
     if (comparison.folder / "novel_poses").is_dir():
-        document["novel_poses"], image_pairs["novel_poses"] = compare_novel_poses(comparison)
+        surfaces, image_pairs["novel_poses"] = compare_novel_poses(comparison)
+        document |= surfaces
     if (comparison.folder / "novel_views").is_dir():
         image_pairs["novel_views"] = compare_novel_views(comparison)
     images |= {name: mean_scores(image_pair.scores() for image_pair in row) for name, row in image_pairs.items()}
@@ -114,7 +122,7 @@ def avatar_sections(comparison: Comparison) -> tuple[dict[str, Any], dict[str, l
 
 def comparison_page(title: str, document: Mapping[str, Any], image_pairs: Mapping[str, Sequence[ImagePair]]) -> str:
     """Render the HTML page, in the style of the report."""
-    surfaces = {name: document[name] for name in ("mesh", "heldout_poses", "novel_poses") if name in document}
+    surfaces = {name: document[name] for name in SURFACES if name in document}
     tables = [metric_table("Surfaces", surfaces)]
     if "surface_by_label" in document:
         tables.append(metric_table("Surface of each part, A-pose", document["surface_by_label"]))

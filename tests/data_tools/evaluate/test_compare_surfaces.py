@@ -80,4 +80,4 @@ def test_without_alignment_a_wrong_distance_is_an_error(perfect: Comparison) -> 
     assert scores["chamfer_mm"] < 0.2
     assert 5.0 < scores["chamfer_unaligned_mm"] < 50.0
     assert compare_heldout_surfaces(perfect)["chamfer_unaligned_mm"] < 0.2
-    assert compare_novel_poses(perfect)[0]["chamfer_unaligned_mm"] < 1.0
+    assert compare_novel_poses(perfect)[0]["novel_poses"]["chamfer_unaligned_mm"] < 1.0
