@@ -4,7 +4,7 @@ python -m data_tools.sweep.ablate [CAPTURE ...] [--rows uniform error-driven --s
 
 Frames, body and field are made once for each capture and seed; each row runs the stages from the mesh on, with links to
 them, so the same command continues an interrupted sweep. A seed is that of the field and of the mesh stage. Outputs in
-OUT: `ablation.csv` (one line per run), `ablation.md` (tables for the documents) and `ablation.html` (with clay renders).
+OUT: `ablation.csv` (one line per run), `ablation.md` (tables for the documents) and `ablation.html` (with clay).
 """
 
 import argparse

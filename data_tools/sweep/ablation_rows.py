@@ -12,9 +12,9 @@ FIELD_VIEWS = 40
 FACES, FACES_BEFORE_REDUCTION = "faces", "faces_before_reduction"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Row:
-    """One variant of the mesh stage.
+    """One variant of the mesh stage. Rows are compared by identity, because mappings have no hash.
 
     Attributes:
         name: in command, tables and names of run folders.
