@@ -82,7 +82,10 @@ def capture_tables(results: Results) -> list[Table]:
         for row in _row_names(chosen):
             figures = [result.figures for trial, result in chosen.items() if trial.row.name == row]
             rows.append([f"`{row}`", *(format_spread(_values(figures, column), column) for column in COLUMNS)])
-        title = f"{name}: mean ± standard deviation, seeds {', '.join(map(str, seeds))}"
+        spread = (
+            f"mean ± standard deviation, seeds {', '.join(map(str, seeds))}" if len(seeds) > 1 else f"seed {seeds[0]}"
+        )
+        title = f"{name}, {spread}"
         tables.append((title, ["row", *(column.heading for column in COLUMNS)], rows))
     return tables
 

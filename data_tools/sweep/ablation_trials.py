@@ -160,7 +160,7 @@ def link_folder(source: Path, link: Path) -> None:
 
 
 def make_stage(run_dir: Path, name: str) -> None:
-    """Run a stage in a process of its own, unless its result is fresh; its output is added to the log of the run.
+    """Run a stage in a process of its own, unless its result is fresh; its output replaces the log of the run.
 
     Raises:
         UserError: the stage failed; the message is that of the stage.

@@ -27,7 +27,7 @@ from pipeline.mesh.views import PosedView
 AZIMUTH_STEP_RAD = np.pi * (3.0 - np.sqrt(5.0))
 """Golden angle: any number of successive azimuths is spread over the circle."""
 ELEVATIONS_RAD = tuple(np.radians((15.0, -15.0, 35.0)))
-"""Elevations of successive cameras above the filming camera: none is zero, and none shows the soles of the feet."""
+"""Elevations of successive cameras above the filming camera; none is zero, so that no camera is one that filmed."""
 BODY_MARGIN_RATIO = 0.12
 """Margin of the image around the fitted body, which has no hair or clothes; a fraction of its height in the image."""
 
