@@ -24,6 +24,9 @@ CAPTURES ?=
 PRESETS ?=
 SEEDS ?=
 
+# Inputs of the ablation besides CAPTURES and SEEDS; optional.
+ROWS ?=
+
 # bench-field: file for its figures, and runs of another preset for comparison (RUN may then name several runs).
 JSON ?=
 BASELINE ?=
@@ -43,7 +46,7 @@ OPTIONS = $(RUN_OPTIONS) $(ARGS)
 STAMP := $(VENV)/.stamp$(if $(EXTRA),-$(EXTRA))
 
 .DEFAULT_GOAL := help
-.PHONY: help all $(STAGES) batch chart compare figures test test-all check format bench bench-field bench-body doctor venv lock configs gltf-validator clean
+.PHONY: help all $(STAGES) batch chart ablate compare figures test test-all check format bench bench-field bench-body doctor venv lock configs gltf-validator clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z$$()A-Z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST) | sed 's/$$(STAGES)/STAGE    /'
@@ -75,6 +78,9 @@ endif
 
 chart: $(STAMP)  ## plot accuracy against time of PRESETS on CAPTURES with SEEDS (default: all presets, two generated people)
 	$(RUN_PYTHON) -m data_tools.sweep.chart $(CAPTURES) $(if $(PRESETS),--presets $(PRESETS)) $(if $(SEEDS),--seeds $(SEEDS)) $(ARGS)
+
+ablate: $(STAMP)  ## remove, replace or add one part of the mesh stage: ROWS, CAPTURES, SEEDS (default: all, the sample, 0 1 2)
+	$(RUN_PYTHON) -m data_tools.sweep.ablate $(CAPTURES) $(if $(ROWS),--rows $(ROWS)) $(if $(SEEDS),--seeds $(SEEDS)) $(ARGS)
 
 # Made once; a sample that is incomplete (without .done) or of another version is made again.
 $(SAMPLE_DONE): | $(STAMP)

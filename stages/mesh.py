@@ -31,6 +31,7 @@ from pipeline.geometry.surface import resolve_self_intersections
 from pipeline.io.image import to_uint8, write_rgb
 from pipeline.mesh.face_reduction import reduce_faces
 from pipeline.mesh.fairing import fair_surface
+from pipeline.mesh.field_views import render_field_views
 from pipeline.mesh.files import MeshArtifact, load_checkpoint, save_checkpoint, save_mesh
 from pipeline.mesh.isosurface import CanonicalGrid, extract_mesh, sample_canonical_grid, select_isovalue
 from pipeline.mesh.pose_refit import refit_poses, select_poses
@@ -99,7 +100,12 @@ def run(
         warn(f"{inputs['frames']} has no validation frames: the isovalue and the rounds are not validated")
 
     target_edge_m = select_target_edge_m(body, train, config)
-    field = load_field(inputs["field"] / "field.safetensors")
+    field, occupancy = (
+        load_field(inputs["field"] / "field.safetensors"),
+        load_occupancy(inputs["field"] / "occupancy.npz"),
+    )
+    if settings.field_views:
+        train += render_field_views(field, occupancy, body, train, settings.field_views)
     field = field.requires_grad_(settings.appearance_learning_rate > 0.0)
     refinement_inputs = RefinementInputs(
         body=body,
@@ -114,7 +120,6 @@ def run(
     )
     start: Mesh | RefinementState | None = load_checkpoint(out / CHECKPOINT)
     if start is None:
-        occupancy = load_occupancy(inputs["field"] / "occupancy.npz")
 
         def density_fn(points_m: Tensor) -> Tensor:
             occupied, density = occupancy.contains(points_m), torch.zeros(len(points_m))
@@ -139,6 +144,7 @@ def run(
         "silhouette_iou": silhouette_iou(mesh, skin, validation),
         "target_edge_m": target_edge_m,
         "accepted_rounds": len(psnr_db) - 1.0,
+        "faces_before_reduction": float(len(state.mesh.faces)),
         **motion_metrics,
     }
 

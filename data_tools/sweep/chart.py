@@ -85,7 +85,7 @@ def run_and_compare(trial: Trial, other_trials: Sequence[Trial]) -> RunState:
         run_trial(trial, other_trials)
         run = read_trial(trial)
     if run.status == "done":
-        compare_with_truth(trial)
+        compare_with_truth(trial.capture, trial.run_dir)
         run = read_trial(trial)
     summary = f"{trial.run_dir.name}: {run.status}, {run.seconds(STAGES_UNTIL_EXPORT):.0f} s"
     tqdm.write(f"{summary}, {run.failure}" if run.status == "failed" else summary, file=sys.stderr)
@@ -97,7 +97,9 @@ def _raise_if_incomplete(runs: Mapping[Trial, RunState], out: Path) -> None:
     done = [trial for trial, run in runs.items() if run.status == "done"]
     incomplete = {
         "not done": [trial for trial in runs if trial not in done],
-        "not compared with their ground truth": [trial for trial in done if needs_comparison(trial)],
+        "not compared with their ground truth": [
+            trial for trial in done if needs_comparison(trial.capture, trial.run_dir)
+        ],
     }
     summary = [
         f"{len(found)} of {len(runs)} runs are {problem} ({', '.join(trial.run_dir.name for trial in found)})"

@@ -135,20 +135,20 @@ def copy_shared_stages(trial: Trial, other_trials: Iterable[Trial]) -> None:
                     shutil.copytree(other.run_dir / name, part, dirs_exist_ok=True)
 
 
-def needs_comparison(trial: Trial) -> bool:
+def needs_comparison(capture: Path, run_dir: Path) -> bool:
     """Return whether the capture has a ground truth and the run has no complete, current comparison with it."""
-    return (trial.capture / "truth").is_dir() and load_comparison_scores(trial.run_dir) is None
+    return (capture / "truth").is_dir() and load_comparison_scores(run_dir) is None
 
 
-def compare_with_truth(trial: Trial) -> None:
+def compare_with_truth(capture: Path, run_dir: Path) -> None:
     """Compare the run with its ground truth if needed; a failure is a warning."""
-    if not needs_comparison(trial):
+    if not needs_comparison(capture, run_dir):
         return
-    command = [sys.executable, "-m", "data_tools.evaluate.compare", str(trial.capture), str(trial.run_dir)]
-    with log_path(trial.run_dir).open("a", encoding="utf-8") as log:
+    command = [sys.executable, "-m", "data_tools.evaluate.compare", str(capture), str(run_dir)]
+    with log_path(run_dir).open("a", encoding="utf-8") as log:
         done = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, check=False)
     if done.returncode != 0:
-        warn(f"{trial.run_dir.name} was not compared with its ground truth: see {log_path(trial.run_dir)}")
+        warn(f"{run_dir.name} was not compared with its ground truth: see {log_path(run_dir)}")
 
 
 def chart_point(trial: Trial, run: RunState) -> ChartPoint:
@@ -196,7 +196,7 @@ def table_row(trial: Trial, run: RunState) -> dict[str, Any]:
         "peak_rss_mib": max((manifest.peak_rss_mib for manifest in run.manifests.values()), default=None),
         "resumed": " ".join(name for name, manifest in run.manifests.items() if manifest.resumed),
         "commit": join_distinct(environment.get("commit") for environment in environments),
-        "machine": join_distinct(map(_machine, environments)),
+        "machine": join_distinct(map(describe_machine, environments)),
         "message": "" if run.status == "done" else run.failure,
     }
 
@@ -206,6 +206,7 @@ def join_distinct(texts: Iterable[str | None]) -> str:
     return "; ".join(dict.fromkeys(text for text in texts if text))
 
 
-def _machine(environment: dict[str, Any]) -> str:
+def describe_machine(environment: dict[str, Any]) -> str:
+    """Return processor, cores and GPU of the environment of a manifest."""
     parts = [environment.get("cpu"), f"{environment.get('cores')} cores", environment.get("gpu")]
     return ", ".join(part for part in parts if part)

@@ -13,6 +13,7 @@ from jaxtyping import Bool
 from pipeline.core.progress import track
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import OpenSurfaceError, collapse_edges
+from pipeline.mesh.remeshing import keep_if_repair_fails
 from pipeline.mesh.settings import MeshSettings
 
 MAX_TRIALS = 10
@@ -24,15 +25,19 @@ def reduce_faces(
     """Remove as many faces as cost at most `settings.max_reduction_loss_db`.
 
     Each trial multiplies the number of faces by `settings.reduction_ratio`; the first that costs more, has no fewer
-    faces or leaves holes ends the search.
+    faces or leaves holes ends the search. With `settings.final_faces` there is one trial, to this number of faces,
+    which may cost anything.
 
     Args:
-        mesh: a closed surface, m; returned as it is (the same object) if the first trial fails.
+        mesh: a closed surface, m; returned as it is (the same object) if the first trial fails, or if it has no more
+            than `settings.final_faces`.
         detailed: faces that stay (`pipeline.mesh.remeshing.detailed_faces`): views of the whole person hardly show
             what they are needed for.
         psnr_db: PSNR of renders of a mesh, dB.
         settings: see `MeshSettings`.
     """
+    if settings.final_faces:
+        return _reduce_to(mesh, detailed, settings.final_faces)
     lowest_psnr_db, best = psnr_db(mesh) - settings.max_reduction_loss_db, mesh
     for trial in track(range(1, MAX_TRIALS + 1), "reduce faces"):
         try:
@@ -44,3 +49,13 @@ def reduce_faces(
             break
         best = reduced
     return best
+
+
+def _reduce_to(mesh: Mesh, detailed: Bool[np.ndarray, "f"], face_count: int) -> Mesh:
+    if len(mesh.faces) <= face_count:
+        return mesh
+    return keep_if_repair_fails(
+        lambda: collapse_edges(mesh, ~detailed, max(0, face_count - int(np.count_nonzero(detailed)))),
+        mesh,
+        f"the mesh keeps its {len(mesh.faces)} faces",
+    )

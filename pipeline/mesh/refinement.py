@@ -2,9 +2,9 @@
 
 Each round after the first starts with adaptive remeshing: faces with an accumulated image error above an upper
 percentile are subdivided, those below a lower percentile are decimated; the vertex offsets start from zero (IHM paper,
-section 2.3). A round that lowers the validation PSNR is discarded and ends the refinement. Skin weights are transferred
-from the body after remeshing and stay with the vertices during optimisation, so that each round is scored with the
-weights that are exported.
+section 2.3). `MeshSettings.remeshing` has alternatives for ablations. A round that lowers the validation PSNR is
+discarded and ends the refinement. Skin weights are transferred from the body after remeshing and stay with the vertices
+during optimisation, so that each round is scored with the weights that are exported.
 """
 
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 from pipeline.geometry.mesh import Mesh
-from pipeline.mesh.remeshing import detailed_faces, remesh_adaptively
+from pipeline.mesh.remeshing import detailed_faces, remesh_adaptively, remesh_uniformly
 from pipeline.mesh.skin_transfer import SkinnedTopology, transfer_skin
 from pipeline.mesh.vertex_optimisation import RefinementInputs, optimise_vertices
 from pipeline.mesh.views import accumulate_face_errors, mesh_psnr_db
@@ -59,6 +59,8 @@ def refine_mesh(
 
 
 def _initial_state(mesh: Mesh, inputs: RefinementInputs) -> RefinementState:
+    if inputs.settings.remeshing == "uniform":
+        mesh = remesh_uniformly(mesh, detailed_faces(mesh, inputs.body), inputs.settings.remeshed_faces)
     skin = transfer_skin(mesh, inputs.body)
     psnr_db = mesh_psnr_db(mesh, skin, inputs.validation, inputs.shader)
     return RefinementState(mesh, skin, _shader_state(inputs), 0, (psnr_db,), inputs.rounds == 0)
@@ -73,9 +75,7 @@ def _run_round(state: RefinementState, inputs: RefinementInputs) -> RefinementSt
     mesh, skin, rounds_done = state.mesh, state.skin, state.rounds_done + 1
     inputs.shader.load_state_dict(state.shader_state)
     if state.rounds_done > 0:
-        errors = accumulate_face_errors(mesh, skin, inputs.train, inputs.shader)
-        detailed = detailed_faces(mesh, inputs.body)
-        mesh = remesh_adaptively(mesh, errors, detailed, inputs.target_edge_m, inputs.max_faces, inputs.settings)
+        mesh = _remesh(mesh, skin, inputs)
         skin = transfer_skin(mesh, inputs.body)
     seed = inputs.settings.seed + 1000 * rounds_done
     mesh = optimise_vertices(mesh, skin, inputs, seed, f"mesh round {rounds_done}")
@@ -84,3 +84,14 @@ def _run_round(state: RefinementState, inputs: RefinementInputs) -> RefinementSt
         return replace(state, rounds_done=rounds_done, finished=True)
     accepted = (*state.validation_psnr_db, psnr_db)
     return RefinementState(mesh, skin, _shader_state(inputs), rounds_done, accepted, rounds_done == inputs.rounds)
+
+
+def _remesh(mesh: Mesh, skin: SkinnedTopology, inputs: RefinementInputs) -> Mesh:
+    settings = inputs.settings
+    if settings.remeshing == "none":
+        return mesh
+    detailed = detailed_faces(mesh, inputs.body)
+    if settings.remeshing == "uniform":
+        return remesh_uniformly(mesh, detailed, settings.remeshed_faces)
+    errors = accumulate_face_errors(mesh, skin, inputs.train, inputs.shader)
+    return remesh_adaptively(mesh, errors, detailed, inputs.target_edge_m, inputs.max_faces, settings)

@@ -1,6 +1,7 @@
 """Remeshing of the canonical mesh: to a target edge length, and adaptively to the image error."""
 
 from collections.abc import Callable
+from functools import partial
 
 import fast_simplification
 import numpy as np
@@ -19,6 +20,8 @@ DETAIL_EDGE_RATIO = 0.5
 """Edge length at face and hands, in target edge lengths: fingers and lips are thinner than cloth is smooth."""
 EQUILATERAL_AREA_RATIO = 0.43
 """Area of an equilateral triangle divided by its squared edge length (0.433)."""
+MAX_FACE_EXCESS, MAX_UNIFORM_TRIALS = 0.02, 6
+"""Share by which uniform remeshing may exceed the number of faces, and the number of edge lengths that it tries."""
 
 
 def remesh_to_edge_length(mesh: Mesh, target_edge_m: float, body: Body) -> Mesh:
@@ -126,6 +129,36 @@ def remesh_adaptively(
         fine,
         "the faces with a small image error are not decimated in this round",
     )
+
+
+def remesh_uniformly(mesh: Mesh, detailed: Bool[np.ndarray, "f"], face_count: int) -> Mesh:
+    """Remesh to a uniform edge length that gives `face_count` faces, at most `MAX_FACE_EXCESS` more.
+
+    Edges are shorter where longer ones would move the surface by more than a tenth of their length.
+
+    Args:
+        mesh: a closed surface, m.
+        detailed: faces that stay as they are, from `detailed_faces`.
+        face_count: number of faces to reach, the detailed ones included.
+
+    Returns:
+        The new mesh; if no tried edge length gives the number of faces, that with the nearest number.
+    """
+    kept, aim = np.count_nonzero(detailed), (1.0 + 0.5 * MAX_FACE_EXCESS) * face_count
+    wanted = max(1.0, aim - kept)
+    edge_m = float(np.sqrt(mesh.face_areas_m2()[~detailed].sum() / (EQUILATERAL_AREA_RATIO * wanted)))
+    trials: list[Mesh] = []
+    for _ in range(MAX_UNIFORM_TRIALS):
+        trial = keep_if_repair_fails(
+            partial(remesh_isotropic, mesh, edge_m, iterations=3, selected=~detailed),
+            mesh,
+            "the mesh is not remeshed to a uniform edge length",
+        )
+        trials.append(trial)
+        if trial is mesh or face_count <= len(trial.faces) <= (1.0 + MAX_FACE_EXCESS) * face_count:
+            return trial
+        edge_m *= float(np.sqrt(max(1, len(trial.faces) - kept) / wanted))
+    return min(trials, key=lambda trial: abs(len(trial.faces) - aim))
 
 
 def _faces_to_subdivide(

@@ -1,6 +1,9 @@
 """Settings of the mesh stage that no preset varies; sweeps and ablations set them from Python."""
 
 from dataclasses import dataclass
+from typing import Literal
+
+Remeshing = Literal["error", "uniform", "none"]
 
 
 @dataclass(frozen=True)
@@ -32,11 +35,17 @@ class MeshSettings:
         subdivide_percentile: faces with an image error above this percentile are subdivided (IHM paper: 95).
         decimate_percentile: faces with an image error up to this percentile are decimated (IHM paper: 50).
         decimated_edge_ratio: edge length of decimated regions, in target edge lengths.
+        remeshing: before each round after the first; by the image error of the faces, to a uniform edge length (then
+            before the first round too), or none.
+        remeshed_faces: number of faces after uniform remeshing; unused otherwise.
+        field_views: renders of the field from other cameras that are added to the training views (IHM paper: only
+            renders); 0: none.
         seed: seed of the frame order and of the random backgrounds.
 
     Reduction of faces:
         max_reduction_loss_db: validation PSNR that the reduction may cost, dB.
         reduction_ratio: ratio of the numbers of faces of successive trials.
+        final_faces: number of faces to reach, whatever it costs; 0: as few as `max_reduction_loss_db` allows.
 
     Raises:
         ValueError: a value is out of its range, or two values contradict each other; the message names them.
@@ -64,16 +73,23 @@ class MeshSettings:
     subdivide_percentile: float = 95.0
     decimate_percentile: float = 50.0
     decimated_edge_ratio: float = 1.4
+    remeshing: Remeshing = "error"
+    remeshed_faces: int = 0
+    field_views: int = 0
     seed: int = 0
 
     max_reduction_loss_db: float = 0.05
     reduction_ratio: float = 0.8
+    final_faces: int = 0
 
     def __post_init__(self) -> None:
         """Refuse values out of range and contradictions."""
         for name in ("learning_rate", "isovalue_frames", "frames_per_step"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"MeshSettings.{name} = {getattr(self, name)} is not allowed: it must be above 0")
+        for name in ("field_views", "final_faces"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"MeshSettings.{name} = {getattr(self, name)} is not allowed: it must be at least 0")
         if not self.isovalues_per_m or min(self.isovalues_per_m) <= 0.0:
             raise ValueError(
                 f"MeshSettings.isovalues_per_m = {self.isovalues_per_m} is not allowed: it must have values above 0"
@@ -86,4 +102,9 @@ class MeshSettings:
         if self.decimated_edge_ratio < 1.0:
             raise ValueError(
                 f"MeshSettings.decimated_edge_ratio = {self.decimated_edge_ratio} is not allowed: it must be at least 1"
+            )
+        if (self.remeshing == "uniform") != (self.remeshed_faces > 0):
+            raise ValueError(
+                f"MeshSettings.remeshing = {self.remeshing} and remeshed_faces = {self.remeshed_faces} contradict each "
+                "other: remeshed_faces must be above 0 for uniform remeshing, and 0 otherwise"
             )

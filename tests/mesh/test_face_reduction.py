@@ -53,3 +53,13 @@ def test_a_mesh_that_needs_its_faces_stays() -> None:
     mesh = sphere()
     count = len(mesh.faces)
     assert reduce_faces(mesh, no_detail(mesh), lambda trial: -abs(len(trial.faces) - count), MeshSettings()) is mesh
+
+
+def test_a_number_of_final_faces_is_reached_at_any_loss() -> None:
+    mesh = sphere()
+    settings, wanted = MeshSettings(final_faces=len(mesh.faces) // 3), len(mesh.faces) // 3
+    reduced = reduce_faces(mesh, no_detail(mesh), lambda trial: float(len(trial.faces)), settings)
+    assert abs(len(reduced.faces) - wanted) <= 2
+    assert is_closed_manifold(reduced)
+    settings = MeshSettings(final_faces=len(mesh.faces))
+    assert reduce_faces(mesh, no_detail(mesh), lambda trial: 30.0, settings) is mesh

@@ -107,3 +107,25 @@ def test_without_validation_views_every_round_is_accepted(dented_egg: Mesh, egg_
     result = refine_mesh(dented_egg, refinement_inputs(egg_body, (egg_views[0], []), steps=2))
     assert result.rounds_done == 2
     assert np.isnan(result.validation_psnr_db).tolist() == [True, True, True]
+
+
+def test_rounds_without_remeshing_keep_the_faces(dented_egg: Mesh, egg_body: Body, egg_views: Views) -> None:
+    settings = replace(SETTINGS, remeshing="none")
+    result = refine_mesh(dented_egg, refinement_inputs(egg_body, egg_views, steps=10, settings=settings))
+    assert len(result.validation_psnr_db) == 3
+    np.testing.assert_array_equal(result.mesh.faces, dented_egg.faces)
+    assert not np.array_equal(result.mesh.vertices, dented_egg.vertices)
+
+
+def test_uniform_rounds_have_the_number_of_faces_even_if_none_is_kept(
+    dented_egg: Mesh, egg_body: Body, egg_views: Views, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The image error is not evaluated: no colour of the views has an influence on the faces."""
+    monkeypatch.setattr(refinement_module, "accumulate_face_errors", lambda *_: pytest.fail("error was evaluated"))
+    wanted = len(dented_egg.faces) // 2
+    settings = replace(SETTINGS, remeshing="uniform", remeshed_faces=wanted)
+    for steps, rounds in ((10, 2), (1, 0)):
+        inputs = refinement_inputs(egg_body, egg_views, steps=steps, rounds=rounds, settings=settings)
+        result = refine_mesh(dented_egg, inputs)
+        assert wanted <= len(result.mesh.faces) <= 1.02 * wanted
+        assert is_closed_manifold(result.mesh)

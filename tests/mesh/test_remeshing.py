@@ -7,10 +7,10 @@ import pytest
 
 from pipeline.core.progress import take_warnings
 from pipeline.geometry.mesh import Mesh
-from pipeline.geometry.surface import OpenSurfaceError, is_closed_manifold
+from pipeline.geometry.surface import OpenSurfaceError, is_closed_manifold, subdivide
 from pipeline.mesh import remeshing as remeshing_module
 from pipeline.mesh.isosurface import extract_mesh, sample_canonical_grid
-from pipeline.mesh.remeshing import remesh_adaptively, remesh_to_edge_length
+from pipeline.mesh.remeshing import remesh_adaptively, remesh_to_edge_length, remesh_uniformly
 from tests.mesh import capsule
 from tests.mesh.egg import EDGE_M, SETTINGS
 
@@ -101,3 +101,36 @@ def test_the_faces_with_the_largest_errors_fill_the_face_budget(egg: Mesh) -> No
     errors = np.arange(len(egg.faces), dtype=np.float64)
     chosen = remeshing_module._faces_to_subdivide(errors, len(egg.faces) + 8, 50.0)
     np.testing.assert_array_equal(np.flatnonzero(chosen), [len(errors) - 2, len(errors) - 1])
+
+
+@pytest.mark.parametrize("ratio", [0.5, 2.0])
+def test_uniform_remeshing_reaches_the_number_of_faces_with_equal_edges(egg: Mesh, ratio: float) -> None:
+    fine_half = egg.vertices[egg.faces].mean(axis=1)[:, 1] > 0.0
+    uneven = subdivide(egg, fine_half)[0]
+    wanted = int(ratio * len(egg.faces))
+    mesh = remesh_uniformly(uneven, no_detail(uneven), wanted)
+    assert is_closed_manifold(mesh)
+    assert wanted <= len(mesh.faces) <= 1.02 * wanted
+
+    def area_ratio(mesh: Mesh) -> float:
+        """Median area of the faces below over that of the faces above, which are finer in the input."""
+        above = mesh.vertices[mesh.faces].mean(axis=1)[:, 1] > 0.0
+        return float(np.median(mesh.face_areas_m2()[~above]) / np.median(mesh.face_areas_m2()[above]))
+
+    assert area_ratio(uneven) > 3.0
+    assert area_ratio(mesh) == pytest.approx(1.0, abs=0.25)
+
+
+def test_uniform_remeshing_keeps_detailed_faces(egg: Mesh) -> None:
+    detailed = egg.vertices[egg.faces].mean(axis=1)[:, 1] > 0.1
+    mesh = remesh_uniformly(egg, detailed, 2 * len(egg.faces))
+    kept = {tuple(np.sort(np.round(face, 6).ravel())) for face in egg.vertices[egg.faces[detailed]]}
+    found = {tuple(np.sort(np.round(face, 6).ravel())) for face in mesh.vertices[mesh.faces]}
+    assert kept <= found
+
+
+def test_uniform_remeshing_that_leaves_holes_is_skipped(egg: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(remeshing_module, "remesh_isotropic", raise_open_surface_error)
+    take_warnings()
+    assert remesh_uniformly(egg, no_detail(egg), 100) is egg
+    assert len(take_warnings()) == 1

@@ -13,6 +13,9 @@ from pipeline.mesh.settings import MeshSettings
         ({"isovalues_per_m": (8.0, -1.0)}, "isovalues_per_m"),
         ({"decimate_percentile": 96.0}, "decimate_percentile = 96.0 and subdivide_percentile = 95.0 contradict"),
         ({"decimated_edge_ratio": 0.5}, "decimated_edge_ratio = 0.5 is not allowed"),
+        ({"remeshing": "uniform"}, "remeshing = uniform and remeshed_faces = 0 contradict"),
+        ({"remeshed_faces": 500}, "remeshing = error and remeshed_faces = 500 contradict"),
+        ({"final_faces": -1}, "final_faces = -1 is not allowed"),
     ],
 )
 def test_values_out_of_range_and_contradictions_are_refused(changes: dict[str, object], message: str) -> None:

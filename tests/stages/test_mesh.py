@@ -26,6 +26,7 @@ from pipeline.mesh.files import load_mesh
 from pipeline.mesh.pose_refit import RefittedPoses
 from pipeline.mesh.settings import MeshSettings
 from pipeline.mesh.skin_transfer import build_skinned_topology, transfer_skin
+from pipeline.mesh.vertex_optimisation import RefinementInputs
 from pipeline.mesh.views import PosedView, render_posed_view
 from stages import mesh as mesh_stage
 from stages.mesh import Config, run
@@ -188,6 +189,35 @@ def test_a_run_killed_after_a_round_resumes_to_the_same_bytes(
     monkeypatch.setattr(mesh_stage, "sample_canonical_grid", None)  # the extraction must not run again
     assert run(inputs, killed, CONFIG, SETTINGS) == metrics
     assert (whole / "mesh.npz").read_bytes() == (killed / "mesh.npz").read_bytes()
+
+
+def test_renders_of_the_field_are_training_views_only(
+    inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nine of the twelve frames are learnt from; the renders join them and never the validation views."""
+    seen: list[tuple[int, int]] = []
+    refine = mesh_stage.refine_mesh
+
+    def count_views(start: object, refinement_inputs: RefinementInputs, on_round_end: object) -> object:
+        seen.append((len(refinement_inputs.train), len(refinement_inputs.validation)))
+        return refine(start, refinement_inputs, on_round_end)
+
+    monkeypatch.setattr(mesh_stage, "refine_mesh", count_views)
+    monkeypatch.setattr(mesh_stage, "render_field_views", lambda field, _, body, views, count: list(views[:count]))
+    config = CONFIG.model_copy(update={"rounds": 0})
+    for name, count in (("without", 0), ("with", 4)):
+        (tmp_path / name).mkdir()
+        run(inputs, tmp_path / name, config, replace(SETTINGS, field_views=count))
+    assert seen == [(9, 1), (13, 1)]
+
+
+def test_the_number_of_final_faces_is_reached(inputs: dict[str, Path], tmp_path: Path) -> None:
+    config = CONFIG.model_copy(update={"rounds": 0})
+    for name, settings in (("free", SETTINGS), ("fixed", replace(SETTINGS, final_faces=300))):
+        (tmp_path / name).mkdir()
+        metrics = run(inputs, tmp_path / name, config, settings)
+        assert metrics["faces_before_reduction"] > 400
+    assert metrics["faces"] == pytest.approx(300, abs=2)
 
 
 @pytest.mark.parametrize(("shift_m", "kept_m"), [(-0.05, 0.0), (0.05, 0.05)])
