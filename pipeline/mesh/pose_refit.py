@@ -6,7 +6,7 @@ those of the first fit; no colours are used.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -27,9 +27,9 @@ from pipeline.body.fit.linear_body import (
     merge_skin_weights,
     reduced_parents,
 )
+from pipeline.body.fit.posture import Posture, tie_to_posture
 from pipeline.body.fit.priors import (
     ShapePrior,
-    adapt_pose_prior,
     estimate_motion_std,
     pose_prior,
 )
@@ -119,12 +119,13 @@ def refit_poses(
     )
     match = partial(match_silhouettes, model, observations=observations, windows=windows, is_clothed=True)
     contour, iou_before = match(state)
+    posture: Posture | None = None
     for _ in track(range(settings.pose_rounds), "poses through the mesh"):
         root_perspective = world_to_perspective(state.root_m, observations.camera)
         objective = Objective(
             model=model,
             regressor=fixed_landmarks(landmarks_m),
-            pose_prior=adapt_pose_prior(prior, state.rotations),
+            pose_prior=prior,
             shape_prior=ShapePrior(*[model.shape] * 4),
             observations=observations,
             parameters=_energy_parameters(settings),
@@ -136,6 +137,8 @@ def refit_poses(
             ),
             free_frames=torch.from_numpy(~is_fixed),
         )
+        posture = posture or objective.estimate_posture(state)
+        objective = replace(objective, pose_prior=tie_to_posture(prior, posture, observations.time_s))
         state, _ = minimise(state, objective, objective.retract, settings.silhouette_steps)
         contour, iou_after = match(state)
     rotations[:, active] = state.rotations
@@ -156,6 +159,7 @@ def _energy_parameters(settings: FitSettings) -> EnergyParameters:
     return EnergyParameters(
         landmark_std_m=settings.silhouette_landmark_std_m,
         hand_std_m=settings.fitted_hand_std_m,
+        single_landmark_std_m=settings.landmark_std_m,
         landmark_cutoff=settings.landmark_cutoff,
         landmark_3d_std_m=settings.silhouette_landmark_3d_std_m,
         contour_std_m=settings.avatar_contour_std_m,

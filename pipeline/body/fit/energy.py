@@ -17,6 +17,7 @@ from pipeline.body.fit.landmark_regressor import (
 from pipeline.body.fit.levenberg_marquardt import NormalEquations
 from pipeline.body.fit.linear_body import LinearBody
 from pipeline.body.fit.posed_points import pose_points, pose_skeleton
+from pipeline.body.fit.posture import Posture, estimate_posture
 from pipeline.body.fit.priors import PosePrior, ShapePrior
 from pipeline.body.fit.root_placement import world_to_perspective
 from pipeline.body.fit.state import FitState, Observations
@@ -47,6 +48,8 @@ class EnergyParameters:
     Standard deviations in metres are measured at the depth of the person; cutoffs are in standard deviations.
 
     landmark_std_m, hand_std_m: of pose and hand landmarks in the image.
+    single_landmark_std_m: of one pose landmark by itself, for what a frame shows (`Objective.image_hessian`); with
+    silhouettes `landmark_std_m` is larger, because the errors of landmarks are correlated.
     landmark_3d_std_m: of the detected 3D landmarks across the view.
     contour_std_m: of the silhouette.
     motion_std_factor: factor on `Objective.motion_std`.
@@ -57,6 +60,7 @@ class EnergyParameters:
 
     landmark_std_m: float = FitSettings.landmark_std_m
     hand_std_m: float = FitSettings.hand_std_m
+    single_landmark_std_m: float = FitSettings.landmark_std_m
     landmark_cutoff: float = FitSettings.landmark_cutoff
     landmark_3d_std_m: float = FitSettings.landmark_3d_std_m
     contour_std_m: float = FitSettings.contour_std_m
@@ -120,6 +124,20 @@ class Objective:
             system.fix_frames(self.free_frames)
         return system
 
+    def image_hessian(self, state: FitState) -> Float[Tensor, "n p p"]:
+        """Return the Gauss-Newton Hessian of landmarks, silhouettes and pose prior by the pose of each frame."""
+        frame_count, joint_count = state.rotations.shape[:2]
+        system = NormalEquations.zeros(frame_count, 3 * joint_count + 3, 0)
+        linearisation = replace(self._linearise(state), has_shared=False)
+        parameters = replace(self.parameters, landmark_std_m=self.parameters.single_landmark_std_m)
+        for term in (*self._image_terms(parameters), PosePriorTerm(self.pose_prior)):
+            term.add_to(system, linearisation)
+        return system.frame_hessian
+
+    def estimate_posture(self, state: FitState) -> Posture:
+        """Return the posture of a state that was fitted with the pose prior of this objective."""
+        return estimate_posture(self.pose_prior, state.rotations, self.observations.time_s, self.image_hessian(state))
+
     def retract(self, state: FitState, frame_step: Tensor, shared_step: Tensor) -> FitState:
         """Return the state after a step, with its shape clamped to the range of the shape prior."""
         updated = state.retract(frame_step, shared_step, self.observations.camera)
@@ -134,15 +152,7 @@ class Objective:
 
     def _terms(self) -> list[EnergyTerm]:
         """Return the terms in the order in which they are summed."""
-        parameters, cutoff = self.parameters, self.parameters.landmark_cutoff
-        terms: list[EnergyTerm] = [
-            LandmarkTerm(self.observations, parameters.landmark_stds_m(), self.px_per_m, cutoff),
-            Landmark3dTerm(self.observations, parameters.landmark_3d_std_m, cutoff),
-        ]
-        if self.contour is not None:
-            terms.append(
-                SilhouetteTerm(self.contour, parameters.contour_std_m, self.px_per_m, parameters.contour_cutoff)
-            )
+        parameters, terms = self.parameters, self._image_terms(self.parameters)
         if self.contact is not None:
             terms.append(ContactTerm(self.contact))
         centre_std = parameters.principal_point_std
@@ -160,6 +170,18 @@ class Objective:
                 parameters.height_std_m,
             ),
         ]
+
+    def _image_terms(self, parameters: EnergyParameters) -> list[EnergyTerm]:
+        cutoff = parameters.landmark_cutoff
+        terms: list[EnergyTerm] = [
+            LandmarkTerm(self.observations, parameters.landmark_stds_m(), self.px_per_m, cutoff),
+            Landmark3dTerm(self.observations, parameters.landmark_3d_std_m, cutoff),
+        ]
+        if self.contour is not None:
+            terms.append(
+                SilhouetteTerm(self.contour, parameters.contour_std_m, self.px_per_m, parameters.contour_cutoff)
+            )
+        return terms
 
     def _free_shared_mask(self, shape_count: int) -> Bool[Tensor, "g"]:
         parameters = self.parameters

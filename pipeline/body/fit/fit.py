@@ -28,10 +28,10 @@ from pipeline.body.fit.left_right_swaps import (
 )
 from pipeline.body.fit.levenberg_marquardt import NormalEquations, minimise, shared_covariance
 from pipeline.body.fit.linear_body import LinearBody, linearise_body, relaxed_curls_rad
+from pipeline.body.fit.posture import Posture, tie_to_posture, unknown_posture
 from pipeline.body.fit.priors import (
     PosePrior,
     ShapePrior,
-    adapt_pose_prior,
     estimate_motion_std,
     pose_prior,
     shape_prior,
@@ -48,6 +48,8 @@ from pipeline.core.progress import track
 from pipeline.geometry.rotation import continuous_quaternions, matrix_to_quaternion
 
 MIN_FRAMES = 3
+POSTURE_ROUND = 3
+"""Number of matchings of the silhouettes before the posture of the recording is estimated."""
 
 
 class TooFewLandmarksError(ValueError):
@@ -93,6 +95,15 @@ class _FitContext:
         return linearise_body(self.body, shape, self.curls_rad)
 
 
+@dataclass(frozen=True)
+class _Recording:
+    """What the poses so far tell of the recording: posture, `Objective.motion_std` and contacts with the floor."""
+
+    posture: Posture
+    motion_std: Float[Tensor, "p"] | None = None
+    contact: Contact | None = None
+
+
 def fit_body(
     body: ParametricBody,
     observations: Observations,
@@ -130,11 +141,11 @@ def fit_body(
         observations, rest_landmarks_m, context.default.joints_m, body.shape_defaults.double(), offset_count
     )
     chosen = select_shared_frames(observations, windows, options.shared_frames)
-    state, parameters, system = _fit_shared(
+    state, parameters, system, posture = _fit_shared(
         context, observations.select(chosen), [windows[row] for row in chosen], start.select(chosen), options
     )
     state = interpolated_state(state, chosen, observations.time_s)
-    state, model, silhouette_iou = _fit_poses(context, observations, windows, state, parameters)
+    state, model, silhouette_iou = _fit_poses(context, observations, windows, state, parameters, posture)
     if evidence is not None:
         state, observations = align_with_gravity(model, state, observations, evidence, options.settings)
     focal_relative_std, height_std_m = _posterior_stds(model, system)
@@ -175,7 +186,8 @@ def fit_supplied_poses(
     left_right_swapped = {sides: rows & to_fit for sides, rows in left_right_swapped.items()}
     if to_fit.any():
         parameters = _with_silhouettes(_energy_parameters(settings), settings)
-        state, _, _ = _fit_poses(context, observations, windows, state, parameters)
+        posture = unknown_posture(context.pose_prior)
+        state, _, _ = _fit_poses(context, observations, windows, state, parameters, posture)
     if keep:
         state = supplied.overwrite_poses(state, model.full_joint_indices)
     _, silhouette_iou = match_silhouettes(model, state, observations, windows)
@@ -216,6 +228,7 @@ def _energy_parameters(settings: FitSettings) -> EnergyParameters:
     return EnergyParameters(
         landmark_std_m=settings.landmark_std_m,
         hand_std_m=settings.hand_std_m,
+        single_landmark_std_m=settings.landmark_std_m,
         landmark_cutoff=settings.landmark_cutoff,
         landmark_3d_std_m=settings.landmark_3d_std_m,
         contour_std_m=settings.contour_std_m,
@@ -254,8 +267,8 @@ def _fit_shared(
     windows: Sequence[MaskWindow | None],
     state: FitState,
     options: FitOptions,
-) -> tuple[FitState, EnergyParameters, NormalEquations]:
-    """Fit the shared parameters and the poses of these frames; return the last normal equations as well."""
+) -> tuple[FitState, EnergyParameters, NormalEquations, Posture]:
+    """Fit the shared parameters and the poses of these frames; return last normal equations and posture as well."""
     settings = options.settings
     parameters = _energy_parameters(settings)
     if options.height_m is not None:
@@ -271,10 +284,15 @@ def _fit_shared(
     model = context.linearise(state.shape)
     state, system = _fit_landmarks(context, model, observations, parameters, state, settings.landmark_steps)
     parameters = _with_silhouettes(parameters, settings)
-    for _ in track(range(options.rounds), "shape and focal length"):
+    posture = unknown_posture(context.pose_prior)
+    for number in track(range(options.rounds), "shape and focal length"):
         model = context.linearise(state.shape)
-        state, system = _silhouette_round(context, model, observations, windows, parameters, state)
-    return state, parameters, system
+        state, system, objective = _silhouette_round(
+            context, model, observations, windows, parameters, state, _Recording(posture)
+        )
+        if number + 1 == POSTURE_ROUND:
+            posture = objective.estimate_posture(state)
+    return state, parameters, system, posture
 
 
 def _fit_poses(
@@ -283,8 +301,12 @@ def _fit_poses(
     windows: Sequence[MaskWindow | None],
     state: FitState,
     parameters: EnergyParameters,
+    posture: Posture,
 ) -> tuple[FitState, LinearBody, Float[np.ndarray, "n"]]:
-    """Fit the poses of all frames with the shared parameters fixed; return each frame's silhouette IoU as well."""
+    """Fit the poses of all frames with the shared parameters fixed; return each frame's silhouette IoU as well.
+
+    posture: of the recording, as far as it is known.
+    """
     settings = context.settings
     parameters = replace(
         parameters,
@@ -299,14 +321,17 @@ def _fit_poses(
         parameters, landmark_std_m=settings.landmark_std_m, landmark_3d_std_m=settings.landmark_3d_std_m
     )
     state, _ = _fit_landmarks(context, model, observations, landmarks_only, state, settings.silhouette_steps)
-    motion_std = None
+    recording = _Recording(posture)
     for _ in track(range(settings.pose_rounds), "poses"):
         contact = estimate_floor_contact(
             model, state.rotations, state.root_m, observations.confidence, observations.time_s
         )
-        state, _ = _silhouette_round(context, model, observations, windows, parameters, state, motion_std, contact)
+        state, _, _ = _silhouette_round(
+            context, model, observations, windows, parameters, state, replace(recording, contact=contact)
+        )
         root_perspective = world_to_perspective(state.root_m, observations.camera)
         motion_std = estimate_motion_std(state.rotations, root_perspective, observations.time_s)
+        recording = _Recording(posture, motion_std)
     _, silhouette_iou = match_silhouettes(model, state, observations, windows)
     return state, model, silhouette_iou
 
@@ -318,24 +343,23 @@ def _silhouette_round(
     windows: Sequence[MaskWindow | None],
     parameters: EnergyParameters,
     state: FitState,
-    motion_std: Float[Tensor, "p"] | None = None,
-    contact: Contact | None = None,
-) -> tuple[FitState, NormalEquations]:
-    """Match the silhouettes of the current body, then minimise the energy."""
+    recording: _Recording,
+) -> tuple[FitState, NormalEquations, Objective]:
+    """Match the silhouettes of the current body, then minimise the energy; return the objective as well."""
     contour, _ = match_silhouettes(model, state, observations, windows)
     objective = Objective(
         model,
         context.regressor,
-        adapt_pose_prior(context.pose_prior, state.rotations),
+        tie_to_posture(context.pose_prior, recording.posture, observations.time_s),
         context.shape_prior,
         observations,
         parameters,
         compute_px_per_m(state, observations.camera),
         contour,
-        motion_std,
-        contact,
+        recording.motion_std,
+        recording.contact,
     )
-    return minimise(state, objective, objective.retract, context.settings.silhouette_steps)
+    return *minimise(state, objective, objective.retract, context.settings.silhouette_steps), objective
 
 
 def _fit_landmarks(

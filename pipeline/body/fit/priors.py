@@ -7,7 +7,7 @@ Dimensions: n frames, j active joints, p = 3 j + 3 parameters of a frame, t = n 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -36,12 +36,6 @@ MOTION_STD_FACTOR = 2.0
 
 UNCONSTRAINED_RAD = 10.0
 
-LOOSE_STD_RAD, STATIC_SPREAD_RAD = 0.25, 0.25
-"""Axes with at least the first standard deviation, whose spread in a recording is below the second, are tied to its
-mean pose."""
-
-MIN_SPREAD_RAD, SPREAD_FACTOR = 0.02, 3.0
-"""Lower bound of the spread of an angle, and factor on it."""
 BALL_JOINT_STD_RAD = {
     "Hips": (UNCONSTRAINED_RAD, UNCONSTRAINED_RAD, UNCONSTRAINED_RAD),
     "Spine": (0.15, 0.10, 0.10),
@@ -107,12 +101,17 @@ def shape_prior(names: Sequence[str], defaults: Float[Tensor, "s"]) -> ShapePrio
 
 @dataclass(frozen=True)
 class PosePrior:
-    """Axes (rows), mean angles with standard deviations, and limits of every active joint."""
+    """Axes (rows), mean angles with standard deviations, and limits of every active joint; tilt of the hips.
+
+    tilt_mean, tilt_std: of `tilt_of_hips`.
+    """
 
     axes: Float[Tensor, "j 3 3"]
     mean_rad: Float[Tensor, "j 3"]
     std_rad: Float[Tensor, "j 3"]
     limits: JointLimits
+    tilt_mean: Float[Tensor, "2"]
+    tilt_std: Float[Tensor, "2"]
 
 
 def pose_prior(model: LinearBody) -> PosePrior:
@@ -123,23 +122,19 @@ def pose_prior(model: LinearBody) -> PosePrior:
         if joint_type in HINGE_JOINT_STD_RAD:
             axes[joint], _ = hinge_axes(model, joint)
         std[joint] = torch.tensor({**BALL_JOINT_STD_RAD, **HINGE_JOINT_STD_RAD}[joint_type], dtype=torch.float64)
-    return PosePrior(axes, torch.zeros_like(std), std, joint_limits(model))
+    no_tilt = torch.zeros(2, dtype=torch.float64)
+    return PosePrior(axes, torch.zeros_like(std), std, joint_limits(model), no_tilt, no_tilt + UNCONSTRAINED_RAD)
 
 
-def adapt_pose_prior(prior: PosePrior, rotations: Float[Tensor, "n j 3 3"]) -> PosePrior:
-    """Return the prior with joints that hardly move in a recording tied to their mean over its n frames.
+def tilt_of_hips(rotation: Float[Tensor, "n 3 3"]) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 3"]]:
+    """Return where +Y of the world points in the axes of the hips, and its derivative by the rotation.
 
-    A person who turns in one pose is seen from all sides, which determines the depth of the joints. Only axes with a
-    loose prior and a spread below `STATIC_SPREAD_RAD` are changed.
+    The components are (to the person's left, to the front): about the angle, in rad, by which the hips tilt to the
+    right and backwards, whatever way they face.
     """
-    angle = (prior.axes @ rotation_to_axis_angle(rotations)[..., None]).squeeze(-1)
-    spread = SPREAD_FACTOR * (angle.var(0, correction=0) + MIN_SPREAD_RAD**2).sqrt()
-    is_static = (prior.std_rad >= LOOSE_STD_RAD) & (prior.std_rad < UNCONSTRAINED_RAD) & (spread < STATIC_SPREAD_RAD)
-    return replace(
-        prior,
-        mean_rad=torch.where(is_static, angle.mean(0), prior.mean_rad),
-        std_rad=torch.where(is_static, spread, prior.std_rad),
-    )
+    up = rotation.new_tensor([0.0, 1.0, 0.0])
+    in_hips = rotation.transpose(-1, -2)
+    return (in_hips @ up)[:, ::2], (in_hips @ skew_symmetric(up))[:, ::2]
 
 
 def rotation_to_axis_angle(rotation: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 3"]:

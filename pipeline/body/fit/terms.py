@@ -39,6 +39,7 @@ from pipeline.body.fit.priors import (
     default_motion_std,
     motion_residuals,
     pose_residuals,
+    tilt_of_hips,
 )
 from pipeline.body.fit.root_placement import root_jacobian, world_to_perspective
 from pipeline.body.fit.state import FitState, Observations
@@ -244,7 +245,7 @@ class ContactTerm:
 
 @dataclass(frozen=True)
 class PosePriorTerm:
-    """Deviations of the joint angles from the pose prior and from the joint limits."""
+    """Deviations of joint angles and of the tilt of the hips from the pose prior; excess over the joint limits."""
 
     prior: PosePrior
 
@@ -258,6 +259,12 @@ class PosePriorTerm:
         for joint in range(blocks.shape[1]):
             span = slice(3 * joint, 3 * joint + 3)
             system.frame_hessian[:, span, span] += blocks[:, joint]
+        tilt, tilt_jacobian = tilt_of_hips(at.state.rotations[:, 0])
+        tilt_residual = (tilt - self.prior.tilt_mean) / self.prior.tilt_std
+        tilt_jacobian = tilt_jacobian / self.prior.tilt_std[:, None]
+        system.cost += float(tilt_residual.square().sum())
+        system.frame_gradient[:, :3] += (tilt_jacobian.transpose(-1, -2) @ tilt_residual[..., None]).squeeze(-1)
+        system.frame_hessian[:, :3, :3] += tilt_jacobian.transpose(-1, -2) @ tilt_jacobian
 
 
 @dataclass(frozen=True)

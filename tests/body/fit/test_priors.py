@@ -6,11 +6,8 @@ from pipeline.body.body import load_anny
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS, linearise_body
 from pipeline.body.fit.priors import (
     MIN_MOTION_RATIO,
-    MIN_SPREAD_RAD,
     REFERENCE_INTERVAL_S,
-    SPREAD_FACTOR,
     PosePrior,
-    adapt_pose_prior,
     default_motion_std,
     estimate_motion_std,
     inverse_left_jacobian_so3,
@@ -121,21 +118,3 @@ def test_a_short_recording_uses_the_default_motion_std() -> None:
     assert torch.equal(
         estimate_motion_std(still, torch.zeros(5, 3, dtype=torch.float64), time_s), default_motion_std(2)
     )
-
-
-def test_static_joints_are_tied_to_their_mean(prior: PosePrior) -> None:
-    """An arm with little motion is tied to its mean; a swinging leg and the spine keep the general prior."""
-    arm, leg, spine = (ACTIVE_JOINTS.index(name) for name in ("LeftArm", "LeftUpLeg", "Spine"))
-    phase = torch.linspace(0.0, 6.0, 200, dtype=torch.float64)
-    angles = torch.zeros(200, len(ACTIVE_JOINTS), 3, dtype=torch.float64)
-    angles[:, arm, 2] = 0.9 + 0.05 * torch.sin(phase)
-    angles[:, leg, 0] = 0.5 * torch.sin(phase)
-    adapted = adapt_pose_prior(prior, axis_angle_to_matrix(angles))
-    spread = float(angles[:, arm, 2].var(correction=0))
-    assert adapted.mean_rad[arm, 2] == pytest.approx(float(angles[:, arm, 2].mean()))
-    assert adapted.std_rad[arm, 2] == pytest.approx(SPREAD_FACTOR * (spread + MIN_SPREAD_RAD**2) ** 0.5)
-    assert adapted.mean_rad[leg, 0] == 0.0
-    assert adapted.std_rad[leg, 0] == prior.std_rad[leg, 0]
-    assert torch.equal(adapted.std_rad[spine], prior.std_rad[spine])
-    residual, _ = pose_residuals(adapted, axis_angle_to_matrix(angles))
-    assert residual[:, arm, 2].abs().max() < 1.0

@@ -1,0 +1,95 @@
+"""Posture of a recording, against values of known mean and spread."""
+
+import pytest
+import torch
+
+from pipeline.body.body import load_anny
+from pipeline.body.fit.linear_body import ACTIVE_JOINTS, linearise_body
+from pipeline.body.fit.posture import (
+    MIN_SPREAD_RAD,
+    estimate_posture,
+    frames_per_posture,
+    most_likely_posture,
+    tie_to_posture,
+)
+from pipeline.body.fit.priors import PosePrior, pose_prior, tilt_of_hips
+from pipeline.geometry.rotation import axis_angle_to_matrix
+
+FRAMES = 400
+TIME_S = torch.arange(FRAMES, dtype=torch.float64) / 10.0
+ARM = ACTIVE_JOINTS.index("LeftArm")
+
+
+@pytest.fixture(scope="module")
+def prior() -> PosePrior:
+    body = load_anny()
+    return pose_prior(linearise_body(body, body.shape_defaults))
+
+
+def noise(*shape: int, seed: int) -> torch.Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("spread_rad", [0.05, 0.2, 0.6])
+def test_spread_is_separated_from_errors(spread_rad: float) -> None:
+    """Values of known spread about 0.4, observed with errors of 0.02 in every fifth frame and of 0.5 in the others."""
+    std = torch.where(torch.arange(FRAMES) % 5 == 0, 0.02, 0.5).double()[:, None]
+    value = 0.4 + spread_rad * noise(FRAMES, 1, seed=0) + std * noise(FRAMES, 1, seed=1)
+    posture = most_likely_posture(value, std**2)
+    assert float(posture.mean_rad) == pytest.approx(0.4, abs=3.0 * spread_rad / (FRAMES / 5) ** 0.5)
+    assert float(posture.spread_rad) == pytest.approx(spread_rad, rel=0.3)
+
+
+def test_errors_alone_have_no_spread() -> None:
+    std = torch.full((FRAMES, 1), 0.3, dtype=torch.float64)
+    posture = most_likely_posture(0.4 + 0.1 * noise(FRAMES, 1, seed=2), std**2)
+    assert float(posture.mean_rad) == pytest.approx(0.4, abs=0.02)
+    assert float(posture.spread_rad) == pytest.approx(MIN_SPREAD_RAD)
+
+
+def posture_of(prior: PosePrior, angles: torch.Tensor, std_rad: torch.Tensor) -> PosePrior:
+    """Return the prior of a recording with these angles, whose image leaves these standard deviations."""
+    hessian = torch.diag_embed(std_rad**-2)
+    posture = estimate_posture(prior, axis_angle_to_matrix(angles), TIME_S, hessian)
+    return tie_to_posture(prior, posture, TIME_S)
+
+
+def test_frames_that_show_an_angle_decide_its_mean(prior: PosePrior) -> None:
+    """An arm looks swung by 0.5 rad in frames that hardly show it, and is at 0.1 in those that do."""
+    joints, shows = len(ACTIVE_JOINTS), torch.arange(FRAMES) % 4 == 0
+    angles = torch.zeros(FRAMES, joints, 3, dtype=torch.float64)
+    angles[:, ARM, 0] = torch.where(shows, 0.1, 0.5).double() + 0.01 * noise(FRAMES, seed=3)
+    std = torch.full((FRAMES, 3 * joints + 3), 0.02, dtype=torch.float64)
+    std[~shows, 3 * ARM] = 3.0
+    tied = posture_of(prior, angles, std)
+    assert float(tied.mean_rad[ARM, 0]) == pytest.approx(0.1, abs=0.01)
+    assert float(tied.std_rad[ARM, 0]) == pytest.approx(MIN_SPREAD_RAD * frames_per_posture(TIME_S) ** 0.5)
+
+
+def test_a_dancer_is_not_tied(prior: PosePrior) -> None:
+    angles = torch.zeros(FRAMES, len(ACTIVE_JOINTS), 3, dtype=torch.float64)
+    angles[:, ARM] = 0.6 * noise(FRAMES, 3, seed=4)
+    tied = posture_of(prior, angles, torch.full((FRAMES, 3 * len(ACTIVE_JOINTS) + 3), 0.05).double())
+    assert torch.equal(tied.std_rad[ARM], prior.std_rad[ARM])
+    assert torch.equal(tied.mean_rad[ARM], prior.mean_rad[ARM])
+
+
+def test_frames_of_half_a_second_count_once() -> None:
+    """A posture ties ten frames a second as much as fifty."""
+    assert frames_per_posture(torch.arange(100) / 10.0) == pytest.approx(5.0)
+    assert frames_per_posture(torch.arange(100) / 50.0) == pytest.approx(25.0)
+    assert frames_per_posture(torch.arange(100).double()) == 1.0
+    assert frames_per_posture(torch.zeros(1)) == 1.0
+
+
+def test_tilt_of_the_hips_whatever_way_they_face() -> None:
+    """Whoever leans forwards by 0.2 rad and turns has a constant tilt; the derivative is that of finite differences."""
+    yaw = torch.linspace(0.0, 6.0, 50, dtype=torch.float64)
+    turn = axis_angle_to_matrix(torch.stack([0.0 * yaw, yaw, 0.0 * yaw], dim=-1))
+    lean = axis_angle_to_matrix(torch.tensor([0.2, 0.0, 0.0], dtype=torch.float64))
+    tilt, jacobian = tilt_of_hips(turn @ lean)
+    expected = torch.tensor([0.0, -torch.sin(torch.tensor(0.2))], dtype=torch.float64).expand(50, 2)
+    torch.testing.assert_close(tilt, expected)
+    step = 1e-6 * noise(3, seed=5)
+    moved, _ = tilt_of_hips(axis_angle_to_matrix(step) @ turn @ lean)
+    torch.testing.assert_close((moved - tilt) / 1e-6, (jacobian @ step[:, None])[..., 0] / 1e-6, atol=1e-5, rtol=1e-4)
