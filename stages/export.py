@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from jaxtyping import Float, Float32
 from pydantic import Field
 
 from pipeline.avatar.gltf import MaterialMaps, SkinnedMesh, encode_glb, pack_specular_factor
+from pipeline.avatar.idle import idle_motion
 from pipeline.avatar.obj import write_obj
 from pipeline.avatar.placement import (
     pad_motion_to_video,
@@ -18,6 +20,8 @@ from pipeline.avatar.placement import (
     translate_motion,
     world_to_scene_translation_m,
 )
+from pipeline.avatar.rig import RestPose, Rig, build_rig
+from pipeline.avatar.rig_names import RigName
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.files import load_body, load_camera, load_motion
 from pipeline.capture.capture import load_capture
@@ -25,6 +29,7 @@ from pipeline.core.cli import main
 from pipeline.core.config import Config as BaseConfig
 from pipeline.core.stage import Stage
 from pipeline.geometry.atlas import Atlas
+from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.io.image import png_bytes, to_uint8
 from pipeline.mesh.files import MeshArtifact, load_mesh
@@ -45,6 +50,12 @@ class Config(BaseConfig):
         False,
         description="mark the .glb's material as unlit: viewers show the diffuse map without lights or highlights",
     )
+    rig: RigName = Field(
+        "plain",
+        description="names and axes of the joints, those of clips that play by name: mixamo, unity (Humanoid), unreal, "
+        "vrm; plain: as mixamo without the prefix mixamorig:, as in Ready Player Me",
+    )
+    rest_pose: RestPose = Field("a", description="pose of the .glb without animation, and of the .obj: a or t (T-pose)")
     licence_note: str = Field(
         "Made from a video of a person: ask that person before you share it.",
         description="text written to the .glb as asset.extras.licence_note",
@@ -59,7 +70,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     """
     body, skinned = load_body(inputs["body"] / "body.npz"), load_mesh(inputs["mesh"])
     texture = load_texture(inputs["texture"])
-    mesh, atlas, is_specular = skinned.mesh, texture.atlas, bool(texture.specular.any())
+    atlas, is_specular = texture.atlas, bool(texture.specular.any())
     maps = MaterialMaps(
         png_bytes(to_uint8(texture.diffuse)),
         encode_specular_png(texture.specular, texture.diffuse, config.roughness) if is_specular else None,
@@ -69,10 +80,13 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     capture, motion = load_capture(inputs["frames"]), load_motion(inputs["mesh"] / "motion.npz")
     offset_m = world_to_scene_translation_m(motion, lowest_vertex_y_m(skinned, body, motion))
     padded_motion = pad_motion_to_video(translate_motion(motion, offset_m), capture.fps, capture.n_video_frames)
+    rig = build_rig(body, config.rig, config.rest_pose)
+    skinned = to_rest_pose(skinned, rig)
+    mesh = skinned.mesh
     glb = encode_glb(
         build_skinned_mesh(skinned, atlas),
-        body,
-        padded_motion,
+        rig,
+        {"capture": padded_motion, "idle": idle_motion(body)},
         maps,
         translate_camera(load_camera(inputs["body"] / "camera.npz"), offset_m),
         asset_extras(config, offset_m, capture.fps),
@@ -122,6 +136,13 @@ def build_skinned_mesh(skinned: MeshArtifact, atlas: Atlas) -> SkinnedMesh:
     )
 
 
+def to_rest_pose(skinned: MeshArtifact, rig: Rig) -> MeshArtifact:
+    """Return the mesh in the rest pose of a rig."""
+    mesh = skinned.mesh
+    weights = skinned.dense_skin_weights(len(rig.joint_names)).numpy()
+    return replace(skinned, mesh=Mesh(rig.rest_positions(mesh.vertices, weights), mesh.faces))
+
+
 def lowest_vertex_y_m(skinned: MeshArtifact, body: Body, motion: Motion) -> Float[np.ndarray, "n"]:
     """Return the world height (m) of the lowest vertex of the posed mesh in every frame."""
     weights, vertices = skinned.dense_skin_weights(len(body.joint_names)), torch.from_numpy(skinned.mesh.vertices)
@@ -145,7 +166,7 @@ def asset_extras(config: Config, offset_m: Float[np.ndarray, "3"], frame_rate_hz
 
 STAGE = Stage(
     "export",
-    version=4,
+    version=5,
     needs=("frames", "body", "mesh", "texture"),
     makes=("avatar.glb", "avatar.obj", "avatar.mtl", *OBJ_MAPS),
     config=Config,

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from data_tools.synthetic.rig.bvh import read_bvh
-from data_tools.synthetic.rig.retarget import retarget
 from data_tools.synthetic.scene.motion import NOVEL_POSES
+from pipeline.avatar.retarget import retarget
 from pipeline.body.body import load_anny
 from pipeline.body.fit.camera_parameters import INTRINSICS_COUNT
 from pipeline.body.fit.energy import EnergyParameters, Objective
@@ -30,6 +29,7 @@ from pipeline.body.fit.state import FitState, Observations
 from pipeline.body.smpl import SmplBody
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.rotation import axis_angle_to_matrix, matrix_to_quaternion, quaternion_to_matrix
+from pipeline.io.bvh import read_bvh
 from tests.body.smpl_sample import sample_arrays
 
 MIRROR = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)

@@ -1,45 +1,38 @@
 """Retarget motion capture to another skeleton so that bones have the directions of the recorded bones.
 
 Notation: R_j(t) world rotation of a recorded joint, R_j(0) that of the reference pose, A rotation from the reference
-pose to the canonical frame, W rotation from the BVH world to the world, S_j the shortest arc from a bone of the A-pose
-to the recorded bone in the reference pose. The world rotation of the joint is W R_j(t) R_j(0)^T A^T S_j. The reference
-is the recorded pose most similar to the A-pose, which keeps the twist of the limbs small.
+pose to the canonical frame, W rotation from the BVH world to the world, S_j the rotation from the A-pose of a bone to
+the recorded bone in the reference pose. The world rotation of the joint is W R_j(t) R_j(0)^T A^T S_j. The axes, rolls
+and rest pose of the recorded skeleton cancel. The reference is the rest pose of the file if its limbs are as in an
+A-pose or T-pose, else the recorded pose most similar to the A-pose; in both, palms face the body or the floor, which
+determines the twist of the arms.
 """
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from data_tools.synthetic.rig.bvh import BvhMotion
-from data_tools.synthetic.scene.motion import lowest_foot_offset_m
+from pipeline.avatar.feet import find_contacts, lowest_foot_offset_m
+from pipeline.avatar.rig_names import match_names
 from pipeline.body.body import Body, Motion
+from pipeline.body.fit.ground_contact import SOLE_JOINTS
 from pipeline.core.errors import UserError
-from pipeline.geometry.rotation import matrix_to_quaternion, rotation_between
+from pipeline.geometry.rotation import rotation_between
+from pipeline.geometry.skinning import local_quaternions
+from pipeline.io.bvh import BvhMotion
 
-_JOINT_ALIASES: dict[str, tuple[str, ...]] = {
-    "Spine": ("lowerback", "Chest"),
-    "Spine1": ("Chest",),
-    "Spine2": ("Chest2", "Spine3"),
-    "{side}Shoulder": ("{side}Collar",),
-    "{side}Arm": ("{side}Shoulder",),
-    "{side}ForeArm": ("{side}Elbow",),
-    "{side}Hand": ("{side}Wrist",),
-    "{side}UpLeg": ("{side}Hip", "{side}Thigh"),
-    "{side}Leg": ("{side}Knee", "{side}Shin"),
-    "{side}Foot": ("{side}Ankle",),
-    "{side}ToeBase": ("{side}Toe",),
-}
-"""Alternative joint names, used only for skeletons without Mixamo names."""
-
-_BONE_CHILD: dict[str, str] = {
+_LIMBS = {
     "{side}Arm": "{side}ForeArm",
     "{side}ForeArm": "{side}Hand",
     "{side}UpLeg": "{side}Leg",
     "{side}Leg": "{side}Foot",
-    **{f"{{side}}Hand{f}{k}": f"{{side}}Hand{f}{k + 1}" for f in ("Index", "Middle", "Ring", "Pinky") for k in (1, 2)},
 }
-"""Child joint at the end of the bone of a limb. Positions of spine, collar and foot joints differ between skeletons, so
-the directions of those bones are not comparable: their S is the identity (S of the forearm for a hand)."""
+_FINGERS = {
+    f"{{side}}Hand{f}{k}": f"{{side}}Hand{f}{k + 1}" for f in ("Index", "Middle", "Ring", "Pinky") for k in (1, 2)
+}
+_BONE_CHILD = {**_LIMBS, "{side}Hand": "{side}HandMiddle1", **_FINGERS}
+"""Child joint at the end of a bone. Positions of spine, collar and foot joints differ between skeletons, so the
+directions of those bones are not comparable: their S is the identity (S of the parent for joints of hands)."""
 
 _REQUIRED_JOINTS = (
     "Hips",
@@ -51,13 +44,22 @@ _REQUIRED_JOINTS = (
     "LeftUpLeg",
     "RightUpLeg",
     "LeftLeg",
+    "RightLeg",
+    "LeftFoot",
+    "RightFoot",
 )
+_MIN_REST_SIMILARITY = 0.7
+"""Mean cosine between limbs of the file's rest pose and of the A-pose above which the rest pose is the reference; a
+T-pose has 0.8."""
+
+_FRONT = (0.0, 0.0, 1.0)
 
 
 def retarget(bvh_motion: BvhMotion, body: Body, ground_m: Float[np.ndarray, "3"], in_place: bool) -> Motion:
     """Retarget the recorded motion to another body, which faces +Z in the first frame.
 
-    The 30th percentile of the lowest foot height is on the ground; frames with a lower foot are raised to the ground.
+    Distances are scaled by the ratio of the leg lengths. The 30th percentile of the lowest foot height is on the
+    ground; frames with a lower foot are raised to the ground.
 
     Args:
         ground_m: world position below the middle of the trajectory.
@@ -87,26 +89,37 @@ def retarget(bvh_motion: BvhMotion, body: Body, ground_m: Float[np.ndarray, "3"]
     return motion.with_pose(motion.rotations_wxyz, root)
 
 
+def recorded_contacts(bvh_motion: BvhMotion, body: Body) -> Bool[np.ndarray, "n 4"]:
+    """Return where each sole of the recorded person stands; see `find_contacts`. A missing toe stands with its ankle.
+
+    Raises:
+        UserError: the motion lacks a required joint.
+    """
+    recorded_joint_of = match_joints(bvh_motion, body)
+    _, positions = bvh_motion.forward_kinematics(bvh_motion.rotations)
+    axes = _body_axes(positions, recorded_joint_of)
+    to_world = _bvh_to_world(axes.mean(axis=0), axes[0]) * _scale_to_m(bvh_motion, body, recorded_joint_of)
+    soles = [
+        recorded_joint_of.get(name, recorded_joint_of[name[: name.index("t") + 1] + "Foot"]) for name in SOLE_JOINTS
+    ]
+    soles_m = (positions[:, soles] + bvh_motion.root_positions[:, None]) @ to_world.T
+    return find_contacts(soles_m, np.arange(len(soles_m)) / bvh_motion.fps)
+
+
 def match_joints(bvh_motion: BvhMotion, body: Body) -> dict[str, int]:
     """Return the index of the recorded joint by name of the body's joint, for joints that have one.
 
     Raises:
         UserError: a required joint is missing.
     """
-    index_of = {name.split(":")[-1].lower(): joint for joint, name in enumerate(bvh_motion.joint_names)}
-    found: dict[str, int] = {}
-    is_mixamo = "leftupleg" in index_of
-    aliases = {
-        name: other for side in ("Left", "Right", "") for name, other in _expand_side(_JOINT_ALIASES, side).items()
-    }
-    for name in body.joint_names:
-        candidates = (name,) if is_mixamo else (*aliases.get(name, ()), *(() if name in aliases else (name,)))
-        matches = [index_of[candidate.lower()] for candidate in candidates if candidate.lower() in index_of]
-        if matches:
-            found[name] = matches[0]
+    matched = match_names(bvh_motion.joint_names)
+    found = {name: matched[name] for name in body.joint_names if name in matched}
     missing = [name for name in _REQUIRED_JOINTS if name not in found]
     if missing:
-        raise UserError(f"the motion has no joint for {missing[0]}; rename its joints to the Mixamo or CMU names")
+        raise UserError(
+            f"the motion has no joint for {missing[0]}; rename its joints to the names of Mixamo, CMU, Unity, VRM or "
+            "Unreal"
+        )
     return found
 
 
@@ -131,18 +144,10 @@ def resample_motion(motion: Motion, start_s: float, frame_count: int, fps: float
     )
 
 
-def _expand_side(table: dict[str, tuple[str, ...]], side: str) -> dict[str, tuple[str, ...]]:
-    """Return the rows of a table for one side; for the empty side, the rows without a side."""
-    rows = {name: others for name, others in table.items() if ("{side}" in name) == bool(side)}
-    return {name.format(side=side): tuple(o.format(side=side) for o in others) for name, others in rows.items()}
-
-
-def _common_bones(names: tuple[str, ...], recorded_joint_of: dict[str, int]) -> dict[str, str]:
-    """Return the child joint of each bone that both skeletons have."""
+def _common_bones(table: dict[str, str], names: tuple[str, ...], recorded_joint_of: dict[str, int]) -> dict[str, str]:
+    """Return the child joint of each bone of a table that both skeletons have."""
     bones = {
-        name.format(side=side): child.format(side=side)
-        for name, child in _BONE_CHILD.items()
-        for side in ("Left", "Right")
+        name.format(side=side): child.format(side=side) for name, child in table.items() for side in ("Left", "Right")
     }
     return {
         n: c
@@ -176,7 +181,7 @@ def _bvh_to_world(mean_basis: Float[np.ndarray, "3 3"], first: Float[np.ndarray,
 def _reference_pose(
     bvh_motion: BvhMotion, body: Body, recorded_joint_of: dict[str, int], world: np.ndarray, positions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return R(0)^T A^T (j, 3, 3) and canonical joint positions (j, 3) of the pose most similar to the A-pose.
+    """Return R(0)^T A^T (j, 3, 3) and canonical joint positions (j, 3) of the reference pose.
 
     Candidates are the rest pose of the file and every tenth frame.
     """
@@ -187,22 +192,15 @@ def _reference_pose(
     )
     to_canonical = _body_axes(canonical_positions, recorded_joint_of)
     canonical_positions = np.einsum("kab,kjb->kja", to_canonical, canonical_positions)
-    pose_similarity = np.zeros(len(canonical_positions))
-    for name, child in _common_bones(body.joint_names, recorded_joint_of).items():
+    limbs = _common_bones(_LIMBS, body.joint_names, recorded_joint_of)
+    cosines = np.zeros(len(canonical_positions))
+    for name, child in limbs.items():
         bone = body.joints_m[body.joint(child)] - body.joints_m[body.joint(name)]
         recorded = canonical_positions[:, recorded_joint_of[child]] - canonical_positions[:, recorded_joint_of[name]]
-        pose_similarity += recorded @ bone / np.maximum(np.linalg.norm(recorded, axis=1) * np.linalg.norm(bone), 1e-9)
-    best = int(np.nan_to_num(pose_similarity, nan=-np.inf).argmax())
+        cosines += recorded @ bone / np.maximum(np.linalg.norm(recorded, axis=1) * np.linalg.norm(bone), 1e-9)
+    similarity = np.nan_to_num(cosines / len(limbs), nan=-np.inf)
+    best = 0 if similarity[0] > _MIN_REST_SIMILARITY else int(similarity.argmax())
     return worlds[best].transpose(0, 2, 1) @ to_canonical[best].T, canonical_positions[best]
-
-
-def local_quaternions(world: Float[np.ndarray, "n j 3 3"], parents: np.ndarray) -> Float[np.ndarray, "n j 4"]:
-    """Return quaternions (wxyz) of joints relative to their parents."""
-    local = world.copy()
-    for joint, parent in enumerate(parents):
-        if parent >= 0:
-            local[:, joint] = world[:, parent].transpose(0, 2, 1) @ world[:, joint]
-    return matrix_to_quaternion(torch.from_numpy(local)).numpy().astype(np.float32)
 
 
 def retarget_rotations(
@@ -220,28 +218,65 @@ def retarget_rotations(
         reference: inverse rotations of the reference pose, and its joint positions in canonical axes.
     """
     inverse_reference, canonical_positions = reference
-    bones = _common_bones(body.joint_names, recorded_joint_of)
+    bones = _common_bones(_BONE_CHILD, body.joint_names, recorded_joint_of)
     rotations = np.tile(np.eye(3), (len(world), len(body.joint_names), 1, 1))
-    arcs = np.tile(np.eye(3), (len(body.joint_names), 1, 1))
+    from_a_pose = np.tile(np.eye(3), (len(body.joint_names), 1, 1))
     for joint, (name, parent) in enumerate(zip(body.joint_names, body.parents, strict=True)):
+        if "Hand" in name:
+            from_a_pose[joint] = from_a_pose[parent]
         if name in bones:
-            bone = body.joints_m[body.joint(bones[name])] - body.joints_m[joint]
+            bone = (body.joints_m[body.joint(bones[name])] - body.joints_m[joint]).astype(np.float64)
             recorded = (
                 canonical_positions[recorded_joint_of[bones[name]]] - canonical_positions[recorded_joint_of[name]]
             )
-            arcs[joint] = rotation_between(torch.from_numpy(bone).double(), torch.from_numpy(recorded)).numpy()
-        elif "Hand" in name:
-            arcs[joint] = arcs[parent]
+            from_a_pose[joint] = _bone_rotation(name, bone, recorded, from_a_pose[joint])
         if name in recorded_joint_of:
             rotations[:, joint] = (
                 bvh_to_world
                 @ world[:, recorded_joint_of[name]]
                 @ inverse_reference[recorded_joint_of[name]]
-                @ arcs[joint]
+                @ from_a_pose[joint]
             )
         else:
             rotations[:, joint] = rotations[:, parent]
     return rotations
+
+
+def _bone_rotation(
+    name: str, bone: Float[np.ndarray, "3"], recorded: Float[np.ndarray, "3"], start: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "3 3"]:
+    """Return the rotation from a bone of the A-pose to a recorded one, which continues `start`.
+
+    Arms and hands also take the inner side of the elbow to the inner side: perpendicular to the bone and to the front,
+    which is the axis of the elbow and the normal of the palm in an A-pose and a T-pose. Others take the shortest arc.
+    """
+    if name.endswith(("Arm", "Hand")):
+        frames = [_arm_axes(direction) for direction in (bone, recorded)]
+        if frames[0] is not None and frames[1] is not None:
+            return frames[1] @ frames[0].T
+    arc = rotation_between(torch.from_numpy(start @ bone), torch.from_numpy(recorded))
+    return arc.numpy() @ start
+
+
+def _arm_axes(bone: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"] | None:
+    """Return an orthonormal frame of an arm's bone; None for one that points to the front or back."""
+    along = bone / np.linalg.norm(bone)
+    inner = np.cross(along, _FRONT)
+    length = float(np.linalg.norm(inner))
+    if length < 0.5:
+        return None
+    return np.stack([along, inner / length, np.cross(along, inner / length)], axis=1)
+
+
+def _scale_to_m(bvh_motion: BvhMotion, body: Body, recorded_joint_of: dict[str, int]) -> float:
+    """Return the ratio of the lengths of the left leg."""
+    _, rest = bvh_motion.forward_kinematics(np.tile(np.eye(3), (1, len(bvh_motion.parents), 1, 1)))
+    bones = (("LeftUpLeg", "LeftLeg"), ("LeftLeg", "LeftFoot"))
+    leg_m = sum(np.linalg.norm(body.joints_m[body.joint(b)] - body.joints_m[body.joint(a)]) for a, b in bones)
+    recorded = sum(np.linalg.norm(rest[0, recorded_joint_of[b]] - rest[0, recorded_joint_of[a]]) for a, b in bones)
+    if recorded <= 0.0:
+        raise UserError("the motion has legs of zero length; export its skeleton with offsets")
+    return float(leg_m / recorded)
 
 
 def _root_trajectory(
@@ -253,13 +288,7 @@ def _root_trajectory(
     in_place: bool,
 ) -> Float[np.ndarray, "n 3"]:
     """Return the hip positions in metres, scaled by the ratio of leg lengths; the caller sets the height."""
-    joints_m = body.joints_m
-    leg_m = sum(
-        np.linalg.norm(joints_m[body.joint(f"Left{b}")] - joints_m[body.joint(f"Left{a}")])
-        for a, b in (("UpLeg", "Leg"), ("Leg", "Foot"))
-    )
-    recorded = sum(np.linalg.norm(bvh_motion.offsets[recorded_joint_of[f"Left{name}"]]) for name in ("Leg", "Foot"))
-    trajectory = bvh_motion.root_positions @ bvh_to_world.T * (leg_m / recorded)
+    trajectory = bvh_motion.root_positions @ bvh_to_world.T * _scale_to_m(bvh_motion, body, recorded_joint_of)
     middle = 0.5 * (trajectory.min(axis=0) + trajectory.max(axis=0))
     trajectory[:, [0, 2]] += ground_m[[0, 2]] - (trajectory[:, [0, 2]] if in_place else middle[[0, 2]])
     return trajectory

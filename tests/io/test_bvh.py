@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from data_tools.synthetic.rig.bvh import BvhMotion, read_bvh
 from pipeline.core.errors import UserError
+from pipeline.io.bvh import BvhMotion, read_bvh
 
 ARM = """HIERARCHY
 ROOT Hips

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from data_tools.synthetic.rig.bvh import BvhMotion, read_bvh
-from data_tools.synthetic.rig.retarget import match_joints, resample_motion, retarget
-from data_tools.synthetic.scene.motion import lowest_foot_offset_m, turn_in_a_pose
+from data_tools.synthetic.scene.motion import turn_in_a_pose
+from pipeline.avatar.feet import lowest_foot_offset_m
+from pipeline.avatar.retarget import match_joints, resample_motion, retarget
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.core.errors import UserError
 from pipeline.geometry.rotation import quaternion_to_matrix
+from pipeline.io.bvh import BvhMotion, read_bvh
 
 GROUND_M = np.array([0.0, -0.9, -3.5])
 LIMBS = (("LeftArm", "LeftForeArm"), ("RightForeArm", "RightHand"), ("LeftUpLeg", "LeftLeg"), ("RightLeg", "RightFoot"))
