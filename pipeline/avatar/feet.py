@@ -1,6 +1,7 @@
-"""Feet on the floor: where they stand in a motion, and legs that hold them there.
+"""Feet on the floor: where they stand in a motion, and hips and legs that hold them there.
 
-Planting keeps the rotation of the feet and the trunk. The hips sink where a leg would have to be longer than it is.
+The hips follow the standing feet, so that legs turn little; legs bend for what remains, as where both feet stand. The
+rotation of feet and trunk does not change. The hips sink where a leg would have to be longer than it is.
 
 Notation: n frames; 4 soles: left ankle and ball of the foot, right ankle and ball (`SOLE_JOINTS`).
 """
@@ -15,8 +16,8 @@ from pipeline.body.fit.ground_contact import SOLE_JOINTS, compute_speed_m_s
 from pipeline.geometry.rotation import rotation_between
 from pipeline.geometry.skinning import local_quaternions
 
-CONTACT_HEIGHT_M, CONTACT_SPEED_M_S = 0.04, 0.25
-"""Height above its lowest (5th percentile) and speed below which a sole stands."""
+CONTACT_HEIGHT_M, CONTACT_SPEED_M_S = 0.04, 0.15
+"""Height above the lowest (5th percentile of the lower one of both sides) and speed below which a sole stands."""
 
 MIN_CONTACT_S = 0.1
 """Shorter contacts are ignored, shorter gaps between contacts are closed."""
@@ -24,7 +25,17 @@ MIN_CONTACT_S = 0.1
 MAX_LEG_STRETCH = 0.999
 """Longest distance of hip and ankle, as a fraction of the length of the leg."""
 
-_SINK_SMOOTHING_S = 0.1
+_SMOOTHING_S = 0.06
+"""Standard deviation of the smoothing of heights and of the shares of both feet in the shift of the hips."""
+
+_STRAIGHT_SINE = 0.05
+"""Sine of the angle between thigh and leg below which the plane of the knee is taken from the axes of the thigh."""
+
+_FADE_S = 0.5
+"""Time in which a correction fades after and before a contact; between contacts that follow sooner it is blended."""
+
+_MIN_SHARE = 1e-3
+_SIDES = ("Left", "Right")
 
 
 def joint_positions_m(body: Body, motion: Motion) -> Float[np.ndarray, "n j 3"]:
@@ -54,7 +65,8 @@ def snap_feet_to_floor(body: Body, motion: Motion, floor_y_m: float) -> Motion:
 def find_contacts(soles_m: Float[np.ndarray, "n 4 3"], time_s: Float[np.ndarray, "n"]) -> Bool[np.ndarray, "n 4"]:
     """Return where each sole stands: it is low and slow."""
     speed_m_s = compute_speed_m_s(torch.from_numpy(soles_m), torch.from_numpy(time_s)).numpy()
-    height_m = soles_m[..., 1] - np.percentile(soles_m[..., 1], 5.0, axis=0)
+    lower_side_m = soles_m[..., 1].reshape(-1, 2, 2).min(axis=1)
+    height_m = soles_m[..., 1] - np.tile(np.percentile(lower_side_m, 5.0, axis=0), 2)
     contact = (speed_m_s < CONTACT_SPEED_M_S) & (height_m < CONTACT_HEIGHT_M)
     for sole in range(contact.shape[1]):
         for is_contact in (False, True):
@@ -69,7 +81,7 @@ def plant_feet(body: Body, motion: Motion, contact: Bool[np.ndarray, "n 4"], flo
     """Return the motion with legs bent so that soles stay where they stand, at their A-pose height above the floor.
 
     While the ball of a foot stands it is held, otherwise the ankle. Each stands at its mean position; a sole that
-    follows without a gap stands where it then is. Between contacts the correction changes smoothly.
+    follows without a gap stands where it then is. Before and after contacts the correction fades.
 
     Args:
         contact: result of `find_contacts`, for the same frames.
@@ -80,19 +92,27 @@ def plant_feet(body: Body, motion: Motion, contact: Bool[np.ndarray, "n 4"], flo
     """
     positions = joint_positions_m(body, motion)
     world = canonical_to_world(body, motion)[..., :3, :3].numpy().astype(np.float64)
-    shift_m = {}
-    for side, columns in (("Left", contact[:, :2]), ("Right", contact[:, 2:])):
-        soles = [body.joint(f"{side}Foot"), body.joint(f"{side}ToeBase")]
-        standing_m = floor_y_m + body.joints_m[soles, 1]
-        shift_m[side] = _foot_shift_m(positions[:, soles], columns, standing_m, motion.time_s)
-    sink_m = _sink_m(body, positions, shift_m, contact, motion.time_s)
-    root_m = motion.root_translation_m.astype(np.float64)
-    root_m[:, 1] -= sink_m
-    positions[:, :, 1] -= sink_m[:, None]
-    for side, shift in shift_m.items():
-        shift[:, 1] += sink_m
-        _move_ankle(body, side, positions, world, shift)
-    return motion.with_pose(local_quaternions(world, body.parents), root_m)
+    sigma = _SMOOTHING_S / (float(np.median(np.diff(motion.time_s))) if len(motion.time_s) > 1 else 1.0)
+    soles = np.array([body.joint(name) for name in SOLE_JOINTS]).reshape(2, 2)
+    standing_m = floor_y_m + body.joints_m[soles, 1]
+    is_held = contact.reshape(-1, 2, 2)
+    shift_m = np.stack(
+        [_foot_shift_m(positions[:, soles[k]], is_held[:, k], standing_m[k], motion.time_s) for k in range(2)]
+    )
+    shift_m[..., 1] = gaussian_filter1d(shift_m[..., 1], sigma, axis=1)
+    share = gaussian_filter1d(is_held.any(axis=2).astype(float), sigma, axis=0).T[..., None] + _MIN_SHARE
+    hips_shift_m = (share * shift_m).sum(axis=0) / share.sum(axis=0)
+    shift_m -= hips_shift_m
+    positions += hips_shift_m[:, None]
+    for side in range(2):
+        below_m = (standing_m[side] - positions[:, soles[side], 1]).max(axis=1)
+        shift_m[side, :, 1] = np.maximum(shift_m[side, :, 1], below_m)
+    sink_m = _sink_m(body, positions, shift_m, is_held.any(axis=2), sigma)
+    positions[..., 1] -= sink_m[:, None]
+    shift_m[..., 1] += sink_m
+    for side, name in enumerate(_SIDES):
+        _move_ankle(body, name, positions, world, shift_m[side])
+    return motion.with_pose(local_quaternions(world, body.parents), positions[:, 0])
 
 
 def _foot_shift_m(
@@ -115,15 +135,15 @@ def _foot_shift_m(
             target_m = track_m[0] + shift_m[first - 1]
         target_m[1] = standing_m[sole]
         shift_m[first:end] = target_m - track_m
-    if not known.any():
-        return shift_m
     for first, end in _runs(~known):
-        before, after = max(first - 1, 0), min(end, len(held) - 1)
-        before, after = (before if first > 0 else after), (after if end < len(held) else before)
-        duration_s = max(time_s[after] - time_s[before], 1e-9)
-        fraction = np.clip((time_s[first:end] - time_s[before]) / duration_s, 0.0, 1.0)[:, None]
-        smooth = fraction**2 * (3.0 - 2.0 * fraction)
-        shift_m[first:end] = (1.0 - smooth) * shift_m[before] + smooth * shift_m[after]
+        for edge, time_from_edge_s in (
+            (first - 1, time_s[first:end] - time_s[max(first - 1, 0)]),
+            (end, time_s[min(end, len(time_s) - 1)] - time_s[first:end]),
+        ):
+            if 0 <= edge < len(held):
+                fade_s = min(_FADE_S, time_s[min(end, len(time_s) - 1)] - time_s[max(first - 1, 0)])
+                left = np.clip(1.0 - time_from_edge_s / fade_s, 0.0, 1.0)[:, None]
+                shift_m[first:end] += left**2 * (3.0 - 2.0 * left) * shift_m[edge]
     return shift_m
 
 
@@ -135,21 +155,19 @@ def _leg_joints(body: Body, side: str) -> tuple[int, int, int]:
 def _sink_m(
     body: Body,
     positions_m: Float[np.ndarray, "n j 3"],
-    shift_m: dict[str, Float[np.ndarray, "n 3"]],
-    contact: Bool[np.ndarray, "n 4"],
-    time_s: Float[np.ndarray, "n"],
+    shift_m: Float[np.ndarray, "2 n 3"],
+    is_held: Bool[np.ndarray, "n 2"],
+    sigma: float,
 ) -> Float[np.ndarray, "n"]:
-    """Return how far the hips must sink so that the legs reach the held feet, smooth in time."""
+    """Return how far the hips must sink so that the legs reach the held feet, smoothed over `sigma` frames."""
     sink_m = np.zeros(len(positions_m))
-    for column, (side, shift) in zip((0, 2), shift_m.items(), strict=True):
-        hip, knee, ankle = _leg_joints(body, side)
+    for side, name in enumerate(_SIDES):
+        hip, knee, ankle = _leg_joints(body, name)
         reach_m = MAX_LEG_STRETCH * sum(_length(positions_m, a, b) for a, b in ((hip, knee), (knee, ankle)))
-        leg_m = positions_m[:, ankle] + shift - positions_m[:, hip]
+        leg_m = positions_m[:, ankle] + shift_m[side] - positions_m[:, hip]
         horizontal = np.linalg.norm(leg_m[:, [0, 2]], axis=1)
         needed = -leg_m[:, 1] - np.sqrt(np.maximum(reach_m**2 - horizontal**2, 0.0))
-        sink_m = np.maximum(sink_m, np.where(contact[:, column : column + 2].any(axis=1), needed, 0.0))
-    frame_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0
-    sigma = _SINK_SMOOTHING_S / frame_s
+        sink_m = np.maximum(sink_m, np.where(is_held[:, side], needed, 0.0))
     return gaussian_filter1d(maximum_filter1d(sink_m, 2 * int(np.ceil(2.0 * sigma)) + 1), sigma, truncate=2.0)
 
 
@@ -164,7 +182,10 @@ def _move_ankle(
     world: Float[np.ndarray, "n j 3 3"],
     shift_m: Float[np.ndarray, "n 3"],
 ) -> None:
-    """Turn thigh and shin, in place, so that the ankle moves by `shift_m`; the knee stays in its plane."""
+    """Turn thigh and shin, in place, so that the ankle moves by `shift_m`.
+
+    The knee stays in its plane; that of a straight leg is perpendicular to the lateral axis of the thigh.
+    """
     hip, knee, ankle = _leg_joints(body, side)
     thigh_m, shin_m = positions_m[:, knee] - positions_m[:, hip], positions_m[:, ankle] - positions_m[:, knee]
     leg_m = thigh_m + shin_m + shift_m
@@ -173,8 +194,13 @@ def _move_ankle(
     along = leg_m / distance
     reach = np.clip(distance, np.abs(a - b) / MAX_LEG_STRETCH, MAX_LEG_STRETCH * (a + b))
     reach = np.where(np.linalg.norm(shift_m, axis=1, keepdims=True) < 1e-9, distance, reach)
-    hinge = world[:, hip, :, 0] - (world[:, hip, :, 0] * along).sum(axis=1, keepdims=True) * along
-    front = np.cross(along, hinge / np.linalg.norm(hinge, axis=1, keepdims=True))
+    to_new_leg = rotation_between(torch.from_numpy(thigh_m + shin_m), torch.from_numpy(leg_m)).numpy()
+    turned_thigh = (to_new_leg @ (thigh_m / a)[..., None])[..., 0]
+    bend = turned_thigh - (turned_thigh * along).sum(axis=1, keepdims=True) * along
+    hinge_front = np.cross(along, (to_new_leg @ world[:, hip, :, :1])[..., 0])
+    straightness = np.clip(1.0 - np.linalg.norm(bend, axis=1, keepdims=True) / _STRAIGHT_SINE, 0.0, 1.0)
+    front = bend + _STRAIGHT_SINE * straightness * hinge_front
+    front /= np.linalg.norm(front, axis=1, keepdims=True)
     cosine = np.clip((a**2 + reach**2 - b**2) / (2.0 * a * reach), -1.0, 1.0)
     new_thigh = a * (cosine * along + np.sqrt(1.0 - cosine**2) * front)
     for joint, old, new in ((hip, thigh_m, new_thigh), (knee, shin_m, reach * along - new_thigh)):

@@ -3,9 +3,9 @@
 Notation: R_j(t) world rotation of a recorded joint, R_j(0) that of the reference pose, A rotation from the reference
 pose to the canonical frame, W rotation from the BVH world to the world, S_j the rotation from the A-pose of a bone to
 the recorded bone in the reference pose. The world rotation of the joint is W R_j(t) R_j(0)^T A^T S_j. The axes, rolls
-and rest pose of the recorded skeleton cancel. The reference is the rest pose of the file if its limbs are as in an
-A-pose or T-pose, else the recorded pose most similar to the A-pose; in both, palms face the body or the floor, which
-determines the twist of the arms.
+and rest pose of the recorded skeleton cancel. The reference is the pose most similar to the A-pose, of the rest pose of
+the file and the recorded poses; in an A-pose and a T-pose palms face the body or the floor, which determines the twist
+of the arms.
 """
 
 import numpy as np
@@ -48,9 +48,12 @@ _REQUIRED_JOINTS = (
     "LeftFoot",
     "RightFoot",
 )
-_MIN_REST_SIMILARITY = 0.7
-"""Mean cosine between limbs of the file's rest pose and of the A-pose above which the rest pose is the reference; a
-T-pose has 0.8."""
+_REST_BONUS = 0.1
+"""Added to the mean cosine between limbs and those of the A-pose for the rest pose of the file, in which arms are not
+twisted; a T-pose has a cosine of 0.8."""
+
+_MIN_FLAT_FRAMES = 5
+"""Frames in which ankle and ball of a foot stand, for an estimate of the pitch of the foot's bones."""
 
 _FRONT = (0.0, 0.0, 1.0)
 
@@ -74,6 +77,7 @@ def retarget(bvh_motion: BvhMotion, body: Body, ground_m: Float[np.ndarray, "3"]
     bvh_to_world = _body_axes(positions, recorded_joint_of).mean(axis=0)
     bvh_to_world = _bvh_to_world(bvh_to_world, _body_axes(positions[:1], recorded_joint_of)[0])
     rotations = retarget_rotations(body, recorded_joint_of, world, reference, bvh_to_world)
+    _flatten_standing_feet(body, rotations, recorded_contacts(bvh_motion, body))
     local = local_quaternions(rotations, body.parents)
     root = _root_trajectory(bvh_motion, body, recorded_joint_of, bvh_to_world, ground_m, in_place)
     count = len(local)
@@ -199,7 +203,8 @@ def _reference_pose(
         recorded = canonical_positions[:, recorded_joint_of[child]] - canonical_positions[:, recorded_joint_of[name]]
         cosines += recorded @ bone / np.maximum(np.linalg.norm(recorded, axis=1) * np.linalg.norm(bone), 1e-9)
     similarity = np.nan_to_num(cosines / len(limbs), nan=-np.inf)
-    best = 0 if similarity[0] > _MIN_REST_SIMILARITY else int(similarity.argmax())
+    similarity[0] += _REST_BONUS
+    best = int(similarity.argmax())
     return worlds[best].transpose(0, 2, 1) @ to_canonical[best].T, canonical_positions[best]
 
 
@@ -266,6 +271,24 @@ def _arm_axes(bone: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"] | None:
     if length < 0.5:
         return None
     return np.stack([along, inner / length, np.cross(along, inner / length)], axis=1)
+
+
+def _flatten_standing_feet(
+    body: Body, rotations: Float[np.ndarray, "n j 3 3"], contact: Bool[np.ndarray, "n 4"]
+) -> None:
+    """Turn feet and toes so that they are flat on average where they stand, in place, by a constant in their own axes.
+
+    The pitch of the bones of a foot differs between skeletons, and feet need not be flat in the reference pose.
+    """
+    up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    for side, columns in (("Left", contact[:, :2]), ("Right", contact[:, 2:])):
+        stands = columns.all(axis=1)
+        if stands.sum() < _MIN_FLAT_FRAMES:
+            continue
+        for name in (f"{side}Foot", f"{side}ToeBase"):
+            joint = body.joint(name)
+            floor_normal = torch.from_numpy(rotations[stands, joint, 1].mean(axis=0))
+            rotations[:, joint] = rotations[:, joint] @ rotation_between(up, floor_normal).numpy()
 
 
 def _scale_to_m(bvh_motion: BvhMotion, body: Body, recorded_joint_of: dict[str, int]) -> float:
