@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +29,12 @@ from pipeline.core.cli import main
 from pipeline.core.config import Config as BaseConfig
 from pipeline.core.stage import Stage
 from pipeline.geometry.atlas import Atlas
+from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.io.image import png_bytes, to_uint8
 from pipeline.mesh.files import MeshArtifact, load_mesh
-from pipeline.texture.files import DIFFUSE, SPECULAR, load_texture, map_files
+from pipeline.texture.files import DIFFUSE, SPECULAR, TextureArtifact, load_texture, map_files
 from pipeline.texture.specular import dielectric_specular_factor
 
 OBJ_MAPS = tuple(f"avatar_{name}" for name in (DIFFUSE, SPECULAR))
@@ -62,46 +63,89 @@ class Config(BaseConfig):
     )
 
 
+@dataclass(frozen=True)
+class Scene:
+    """What the exported files show.
+
+    Attributes:
+        body: in the A-pose.
+        skinned: the mesh in the A-pose.
+        rig: names, axes and rest pose of the joints.
+        texture: atlas and maps.
+        motion: of the video, on a floor at y = 0, with the duration of the video.
+        fps: frame rate of the video.
+        camera: of the capture, in the same scene.
+        extras: contents of `asset.extras`.
+    """
+
+    body: Body
+    skinned: MeshArtifact
+    rig: Rig
+    texture: TextureArtifact
+    motion: Motion
+    fps: float
+    camera: Camera
+    extras: dict[str, Any]
+
+
 def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, float]:
     """Write `avatar.glb`, and `avatar.obj` with its `.mtl` and maps.
 
     Raises:
         UserError: an input artifact cannot be read.
     """
+    scene = load_scene(inputs, config)
+    glb = encode_scene(scene, config, {"capture": scene.motion, "idle": idle_motion(scene.body)})
+    (out / "avatar.glb").write_bytes(glb)
+    write_scene_obj(inputs["texture"], out, scene.texture, to_rest_pose(scene.skinned, scene.rig).mesh)
+    return {
+        "glb_bytes": float(len(glb)),
+        "texture_px": float(len(scene.texture.diffuse)),
+        "animation_s": float(scene.motion.time_s[-1]),
+        "vertices": float(len(scene.texture.atlas.uv)),
+        "faces": float(len(scene.skinned.mesh.faces)),
+    }
+
+
+def load_scene(inputs: Mapping[str, Path], config: Config) -> Scene:
+    """Read the artifacts of the stages in `STAGE.needs`, and place person and camera on the floor.
+
+    Raises:
+        UserError: an input artifact cannot be read.
+    """
     body, skinned = load_body(inputs["body"] / "body.npz"), load_mesh(inputs["mesh"])
-    texture = load_texture(inputs["texture"])
-    atlas, is_specular = texture.atlas, bool(texture.specular.any())
+    capture, motion = load_capture(inputs["frames"]), load_motion(inputs["mesh"] / "motion.npz")
+    offset_m = world_to_scene_translation_m(motion, lowest_vertex_y_m(skinned, body, motion))
+    return Scene(
+        body=body,
+        skinned=skinned,
+        rig=build_rig(body, config.rig, config.rest_pose),
+        texture=load_texture(inputs["texture"]),
+        motion=pad_motion_to_video(translate_motion(motion, offset_m), capture.fps, capture.n_video_frames),
+        fps=capture.fps,
+        camera=translate_camera(load_camera(inputs["body"] / "camera.npz"), offset_m),
+        extras=asset_extras(config, offset_m, capture.fps),
+    )
+
+
+def encode_scene(scene: Scene, config: Config, clips: Mapping[str, Motion]) -> bytes:
+    """Return the .glb with the clips as animations."""
+    texture = scene.texture
     maps = MaterialMaps(
         png_bytes(to_uint8(texture.diffuse)),
-        encode_specular_png(texture.specular, texture.diffuse, config.roughness) if is_specular else None,
+        encode_specular_png(texture.specular, texture.diffuse, config.roughness) if texture.specular.any() else None,
         config.roughness,
         config.unlit,
     )
-    capture, motion = load_capture(inputs["frames"]), load_motion(inputs["mesh"] / "motion.npz")
-    offset_m = world_to_scene_translation_m(motion, lowest_vertex_y_m(skinned, body, motion))
-    padded_motion = pad_motion_to_video(translate_motion(motion, offset_m), capture.fps, capture.n_video_frames)
-    rig = build_rig(body, config.rig, config.rest_pose)
-    skinned = to_rest_pose(skinned, rig)
-    mesh = skinned.mesh
-    glb = encode_glb(
-        build_skinned_mesh(skinned, atlas),
-        rig,
-        {"capture": padded_motion, "idle": idle_motion(body)},
-        maps,
-        translate_camera(load_camera(inputs["body"] / "camera.npz"), offset_m),
-        asset_extras(config, offset_m, capture.fps),
-    )
-    (out / "avatar.glb").write_bytes(glb)
-    diffuse_name, specular_name = (copy_map(inputs["texture"], name, out) for name in (DIFFUSE, SPECULAR))
-    map_names = (diffuse_name, specular_name if is_specular else None)
-    write_obj(out / "avatar.obj", mesh, atlas.uv, atlas.faces_uv, mesh.vertex_normals(), *map_names)
-    return {
-        "glb_bytes": float(len(glb)),
-        "texture_px": float(len(texture.diffuse)),
-        "animation_s": float(padded_motion.time_s[-1]),
-        "vertices": float(len(atlas.uv)),
-        "faces": float(len(mesh.faces)),
-    }
+    mesh = build_skinned_mesh(to_rest_pose(scene.skinned, scene.rig), texture.atlas)
+    return encode_glb(mesh, scene.rig, clips, maps, scene.camera, scene.extras)
+
+
+def write_scene_obj(texture_dir: Path, out: Path, texture: TextureArtifact, mesh: Mesh) -> None:
+    """Write `avatar.obj`, `avatar.mtl` and the maps for any pose of the mesh."""
+    diffuse_name, specular_name = (copy_map(texture_dir, name, out) for name in (DIFFUSE, SPECULAR))
+    map_names = (diffuse_name, specular_name if texture.specular.any() else None)
+    write_obj(out / "avatar.obj", mesh, texture.atlas.uv, texture.atlas.faces_uv, mesh.vertex_normals(), *map_names)
 
 
 def copy_map(texture_dir: Path, name: str, out: Path) -> str:

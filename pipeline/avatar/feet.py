@@ -78,10 +78,11 @@ def find_contacts(soles_m: Float[np.ndarray, "n 4 3"], time_s: Float[np.ndarray,
 
 
 def plant_feet(body: Body, motion: Motion, contact: Bool[np.ndarray, "n 4"], floor_y_m: float) -> Motion:
-    """Return the motion with legs bent so that soles stay where they stand, at their A-pose height above the floor.
+    """Return the motion with soles that do not slide where they stand, and no sole below the floor.
 
     While the ball of a foot stands it is held, otherwise the ankle. Each stands at its mean position; a sole that
-    follows without a gap stands where it then is. Before and after contacts the correction fades.
+    follows without a gap stands where it then is. Heights are corrected by the hips alone. Before and after contacts
+    the correction fades.
 
     Args:
         contact: result of `find_contacts`, for the same frames.
@@ -103,6 +104,7 @@ def plant_feet(body: Body, motion: Motion, contact: Bool[np.ndarray, "n 4"], flo
     share = gaussian_filter1d(is_held.any(axis=2).astype(float), sigma, axis=0).T[..., None] + _MIN_SHARE
     hips_shift_m = (share * shift_m).sum(axis=0) / share.sum(axis=0)
     shift_m -= hips_shift_m
+    shift_m[..., 1] = 0.0  # a leg that is almost straight bends by ten degrees for a centimetre
     positions += hips_shift_m[:, None]
     for side in range(2):
         below_m = (standing_m[side] - positions[:, soles[side], 1]).max(axis=1)

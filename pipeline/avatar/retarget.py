@@ -3,9 +3,9 @@
 Notation: R_j(t) world rotation of a recorded joint, R_j(0) that of the reference pose, A rotation from the reference
 pose to the canonical frame, W rotation from the BVH world to the world, S_j the rotation from the A-pose of a bone to
 the recorded bone in the reference pose. The world rotation of the joint is W R_j(t) R_j(0)^T A^T S_j. The axes, rolls
-and rest pose of the recorded skeleton cancel. The reference is the pose most similar to the A-pose, of the rest pose of
-the file and the recorded poses; in an A-pose and a T-pose palms face the body or the floor, which determines the twist
-of the arms.
+and rest pose of the recorded skeleton cancel. The reference is the rest pose of the file if that is a T-pose, else the
+pose most similar to the A-pose, of the rest pose and the recorded poses. In an A-pose and a T-pose palms face the body
+or the floor, which determines the twist of the arms.
 """
 
 import numpy as np
@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 
 from pipeline.avatar.feet import find_contacts, lowest_foot_offset_m
+from pipeline.avatar.rig import build_rig
 from pipeline.avatar.rig_names import match_names
 from pipeline.body.body import Body, Motion
 from pipeline.body.fit.ground_contact import SOLE_JOINTS
@@ -48,9 +49,8 @@ _REQUIRED_JOINTS = (
     "LeftFoot",
     "RightFoot",
 )
-_REST_BONUS = 0.1
-"""Added to the mean cosine between limbs and those of the A-pose for the rest pose of the file, in which arms are not
-twisted; a T-pose has a cosine of 0.8."""
+_T_POSE_COSINE = 0.97
+"""Mean cosine between the limbs of the file's rest pose and of a T-pose above which the rest pose is a T-pose."""
 
 _MIN_FLAT_FRAMES = 5
 """Frames in which ankle and ball of a foot stand, for an estimate of the pitch of the foot's bones."""
@@ -196,16 +196,27 @@ def _reference_pose(
     )
     to_canonical = _body_axes(canonical_positions, recorded_joint_of)
     canonical_positions = np.einsum("kab,kjb->kja", to_canonical, canonical_positions)
-    limbs = _common_bones(_LIMBS, body.joint_names, recorded_joint_of)
-    cosines = np.zeros(len(canonical_positions))
-    for name, child in limbs.items():
-        bone = body.joints_m[body.joint(child)] - body.joints_m[body.joint(name)]
-        recorded = canonical_positions[:, recorded_joint_of[child]] - canonical_positions[:, recorded_joint_of[name]]
-        cosines += recorded @ bone / np.maximum(np.linalg.norm(recorded, axis=1) * np.linalg.norm(bone), 1e-9)
-    similarity = np.nan_to_num(cosines / len(limbs), nan=-np.inf)
-    similarity[0] += _REST_BONUS
-    best = int(similarity.argmax())
+    t_pose_m = build_rig(body, rest_pose="t").rest_matrices()[:, :3, 3]
+    similarity = _limb_similarity(canonical_positions, recorded_joint_of, body, body.joints_m)
+    rest_is_t_pose = _limb_similarity(canonical_positions[:1], recorded_joint_of, body, t_pose_m)[0] > _T_POSE_COSINE
+    best = 0 if rest_is_t_pose else int(similarity.argmax())
     return worlds[best].transpose(0, 2, 1) @ to_canonical[best].T, canonical_positions[best]
+
+
+def _limb_similarity(
+    positions: Float[np.ndarray, "k s 3"],
+    recorded_joint_of: dict[str, int],
+    body: Body,
+    joints_m: Float[np.ndarray, "j 3"],
+) -> Float[np.ndarray, "k"]:
+    """Return the mean cosine between the limbs of recorded poses and of a pose of the body; -inf without lengths."""
+    limbs = _common_bones(_LIMBS, body.joint_names, recorded_joint_of)
+    cosines = np.zeros(len(positions))
+    for name, child in limbs.items():
+        bone = joints_m[body.joint(child)] - joints_m[body.joint(name)]
+        recorded = positions[:, recorded_joint_of[child]] - positions[:, recorded_joint_of[name]]
+        cosines += recorded @ bone / np.maximum(np.linalg.norm(recorded, axis=1) * np.linalg.norm(bone), 1e-9)
+    return np.nan_to_num(cosines / len(limbs), nan=-np.inf)
 
 
 def retarget_rotations(

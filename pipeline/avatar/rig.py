@@ -49,7 +49,7 @@ _MIXAMO_AXES = {
     "hand": _Axes("y", _OUT, "z", _DOWN),
     "thumb": _Axes("y", _THUMB, "z", _DOWN),
     "leg": _Axes("y", _DOWN, "z", _FRONT),
-    "foot": _Axes("y", (0.0, -0.5, 0.866), "z", _UP),
+    "foot": _Axes("y", (0.0, -0.545, 0.838), "z", _UP),
     "toe": _Axes("y", _FRONT, "z", _UP),
 }
 _UNREAL_AXES = {
@@ -103,13 +103,17 @@ class Rig:
         local[1:] = np.linalg.inv(world[self.body.parents[1:]]) @ world[1:]
         return local
 
-    def local_rotations_wxyz(self, motion: Motion) -> Float[np.ndarray, "n j 4"]:
-        """Return the rotation of every joint relative to its parent, in the joints' axes; not that of the rest pose."""
+    def world_rotations(self, motion: Motion) -> Float[np.ndarray, "n j 3 3"]:
+        """Return the rotation of every joint's rigid part from the A-pose to the world."""
         local = quaternion_to_matrix(torch.from_numpy(motion.rotations_wxyz.astype(np.float64)))
         root_m, joints_m = (
             torch.from_numpy(values.astype(np.float64)) for values in (motion.root_translation_m, self.body.joints_m)
         )
-        world = forward_kinematics(local, root_m, joints_m, self.body.parents)[..., :3, :3].numpy()
+        return forward_kinematics(local, root_m, joints_m, self.body.parents)[..., :3, :3].numpy()
+
+    def local_rotations_wxyz(self, motion: Motion) -> Float[np.ndarray, "n j 4"]:
+        """Return the rotation of every joint relative to its parent, in the joints' axes; not that of the rest pose."""
+        world = self.world_rotations(motion)
         return local_quaternions(world @ self.axes, self.body.parents)
 
     def rest_positions(
