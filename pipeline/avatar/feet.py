@@ -134,7 +134,7 @@ def _foot_shift_m(
         track_m = soles_m[first:end, sole]
         target_m = track_m.mean(axis=0)
         if first > 0 and held[first - 1] >= 0:
-            target_m = track_m[0] + shift_m[first - 1]
+            target_m = soles_m[first - 1, sole] + shift_m[first - 1]
         target_m[1] = standing_m[sole]
         shift_m[first:end] = target_m - track_m
     for first, end in _runs(~known):

@@ -97,3 +97,13 @@ def test_raised_and_fast_soles_do_not_stand() -> None:
     assert not contact[35:55, 2:].any()
     assert contact[70:85, 2].all()
     assert not contact[65:85, 3].any()
+
+
+def test_the_correction_does_not_jump_from_the_ankle_to_the_ball(bare: Body) -> None:
+    motion = standing(bare)
+    root_m = motion.root_translation_m + np.linspace(0, 0.06, 30)[:, None].astype(np.float32) * [0, 0, 1]
+    contact = np.zeros((30, 4), bool)
+    contact[:15, [0, 2]] = contact[15:, [1, 3]] = True
+    planted = plant_feet(bare, motion.with_pose(motion.rotations_wxyz, root_m), contact, 0.0)
+    steps_m = np.diff(sole_positions_m(bare, planted)[..., [0, 2]], axis=0)
+    assert np.linalg.norm(steps_m, axis=2).max() < 1e-3

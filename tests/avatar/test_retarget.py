@@ -15,7 +15,7 @@ from pipeline.avatar.retarget import match_joints, recorded_contacts, resample_m
 from pipeline.avatar.rig import build_rig
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.core.errors import UserError
-from pipeline.geometry.rotation import quaternion_to_matrix
+from pipeline.geometry.rotation import axis_angle_to_quaternion, quaternion_to_matrix
 from pipeline.io.bvh import BvhMotion, read_bvh, write_bvh
 from tests.avatar.test_feet import slides_m
 
@@ -244,3 +244,17 @@ def test_planted_clips_do_not_slide_and_keep_the_arms(name: str, bare: Body, sha
     others = [joint for joint, name in enumerate(bare.joint_names) if not name.endswith("Leg")]
     assert turned_deg[:, others].max() < 0.1
     assert np.median(turned_deg) < 0.1
+
+
+def test_standing_feet_are_flat_whatever_they_are_in_the_reference_pose(bare: Body) -> None:
+    """Only the first frame is an A-pose, and in it the feet point down; then arms are raised and feet stand."""
+    frames = 40
+    angles = np.zeros((frames, len(bare.joint_names), 3))
+    angles[0, [bare.joint("LeftFoot"), bare.joint("RightFoot")], 0] = 0.5
+    angles[1:, bare.joint("LeftArm"), 2], angles[1:, bare.joint("RightArm"), 2] = 1.2, -1.2
+    rotations = axis_angle_to_quaternion(torch.from_numpy(angles)).numpy().astype(np.float32)
+    root_m = np.repeat(bare.joints_m[:1], frames, axis=0)
+    still = Motion(np.arange(frames, dtype=np.int32), np.arange(frames) / 30.0, rotations, root_m)
+    motion = retarget(in_another_rig(recorded(bare, still, 30.0), bare, seed=2), bare, np.zeros(3), in_place=False)
+    soles = canonical_to_world(bare, motion)[1:, [bare.joint("LeftFoot"), bare.joint("RightToeBase")], :3, 1]
+    assert soles[..., 1].min() > np.cos(np.radians(1.5))

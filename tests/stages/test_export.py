@@ -138,3 +138,25 @@ def test_the_khronos_validator_accepts_a_specular_map(unlit: bool, inputs: dict[
     write_gray(specular / "specular.png", np.full((TEXTURE_PX, TEXTURE_PX), 9, dtype=np.uint8))
     EXPORT.run(inputs | {"texture": specular}, tmp_path, EXPORT.config(unlit=unlit))
     assert validator_issues(tmp_path / "avatar.glb") == []
+
+
+def test_the_t_pose_is_that_of_both_files_and_the_clips_are_the_same(
+    scene: PaintedScene, inputs: dict[str, Path], exported: tuple[Path, dict[str, float]], tmp_path: Path
+) -> None:
+    EXPORT.run(inputs, tmp_path, EXPORT.config(rest_pose="t", rig="unreal"))
+    player, other = Player(tmp_path / "avatar.glb"), Player(exported[0] / "avatar.glb")
+    positions = player.array(player.json["meshes"][0]["primitives"][0]["attributes"]["POSITION"])
+    lines = (tmp_path / "avatar.obj").read_text().splitlines()
+    obj = np.array([line.split()[1:] for line in lines if line.startswith("v ")], dtype=float)
+    atlas = load_texture(inputs["texture"]).atlas
+    np.testing.assert_allclose(positions, obj[atlas.vertex_of_uv], atol=2e-6)
+    assert np.ptp(positions[:, 0]) > np.ptp(scene.body.vertices[:, 0]) + 0.3
+    assert [animation["name"] for animation in player.json["animations"]] == ["capture", "idle"]
+    assert validator_issues(tmp_path / "avatar.glb") == []
+    time_s = scene.motion.time_s[FRAME]
+    for one, two in (("pelvis", "Hips"), ("hand_l", "LeftHand"), ("foot_r", "RightFoot")):
+        places = [
+            file.global_matrix([node.get("name") for node in file.json["nodes"]].index(name), time_s)[:3, 3]
+            for file, name in ((player, one), (other, two))
+        ]
+        np.testing.assert_allclose(*places, atol=2e-5)
