@@ -3,9 +3,9 @@
 Notation: R_j(t) world rotation of a recorded joint, R_j(0) that of the reference pose, A rotation from the reference
 pose to the canonical frame, W rotation from the BVH world to the world, S_j the rotation from the A-pose of a bone to
 the recorded bone in the reference pose. The world rotation of the joint is W R_j(t) R_j(0)^T A^T S_j. The axes, rolls
-and rest pose of the recorded skeleton cancel. The reference is the rest pose of the file if that is a T-pose, else the
-pose most similar to the A-pose, of the rest pose and the recorded poses. In an A-pose and a T-pose palms face the body
-or the floor, which determines the twist of the arms.
+and rest pose of the recorded skeleton cancel. The reference is the pose most similar to the A-pose, of the rest pose of
+the file and the recorded poses; for arms and hands, it is the rest pose if that is a T-pose. In an A-pose and a T-pose
+palms face the body or the floor, which determines the twist of the arms.
 """
 
 import numpy as np
@@ -196,27 +196,32 @@ def _reference_pose(
     )
     to_canonical = _body_axes(canonical_positions, recorded_joint_of)
     canonical_positions = np.einsum("kab,kjb->kja", to_canonical, canonical_positions)
+    bones = _common_bones(_BONE_CHILD, body.joint_names, recorded_joint_of)
+    best = int(_mean_cosine(canonical_positions, recorded_joint_of, bones, body, body.joints_m).argmax())
+    inverse, reference_positions = worlds[best].transpose(0, 2, 1) @ to_canonical[best].T, canonical_positions[best]
+    limbs = _common_bones(_LIMBS, body.joint_names, recorded_joint_of)
     t_pose_m = build_rig(body, rest_pose="t").rest_matrices()[:, :3, 3]
-    similarity = _limb_similarity(canonical_positions, recorded_joint_of, body, body.joints_m)
-    rest_is_t_pose = _limb_similarity(canonical_positions[:1], recorded_joint_of, body, t_pose_m)[0] > _T_POSE_COSINE
-    best = 0 if rest_is_t_pose else int(similarity.argmax())
-    return worlds[best].transpose(0, 2, 1) @ to_canonical[best].T, canonical_positions[best]
+    if _mean_cosine(canonical_positions[:1], recorded_joint_of, limbs, body, t_pose_m)[0] > _T_POSE_COSINE:
+        arms = [joint for name, joint in recorded_joint_of.items() if "Arm" in name or "Hand" in name]
+        inverse[arms] = (worlds[0].transpose(0, 2, 1) @ to_canonical[0].T)[arms]
+        reference_positions[arms] = canonical_positions[0, arms]
+    return inverse, reference_positions
 
 
-def _limb_similarity(
+def _mean_cosine(
     positions: Float[np.ndarray, "k s 3"],
     recorded_joint_of: dict[str, int],
+    bones: dict[str, str],
     body: Body,
     joints_m: Float[np.ndarray, "j 3"],
 ) -> Float[np.ndarray, "k"]:
-    """Return the mean cosine between the limbs of recorded poses and of a pose of the body; -inf without lengths."""
-    limbs = _common_bones(_LIMBS, body.joint_names, recorded_joint_of)
+    """Return the mean cosine between bones of recorded poses and of a pose of the body; -inf without lengths."""
     cosines = np.zeros(len(positions))
-    for name, child in limbs.items():
+    for name, child in bones.items():
         bone = joints_m[body.joint(child)] - joints_m[body.joint(name)]
         recorded = positions[:, recorded_joint_of[child]] - positions[:, recorded_joint_of[name]]
         cosines += recorded @ bone / np.maximum(np.linalg.norm(recorded, axis=1) * np.linalg.norm(bone), 1e-9)
-    return np.nan_to_num(cosines / len(limbs), nan=-np.inf)
+    return np.nan_to_num(cosines / len(bones), nan=-np.inf)
 
 
 def retarget_rotations(
