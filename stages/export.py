@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float, Float32
-from pydantic import Field
+from pydantic import Field, field_validator
 
+from pipeline.avatar.formats import ExportFormat, FormatRequest, missing_package, write_formats
 from pipeline.avatar.gltf import MaterialMaps, SkinnedMesh, encode_glb, pack_specular_factor
 from pipeline.avatar.obj import write_obj
 from pipeline.avatar.placement import (
@@ -18,6 +19,7 @@ from pipeline.avatar.placement import (
     translate_motion,
     world_to_scene_translation_m,
 )
+from pipeline.avatar.vrm import VrmMeta
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.files import load_body, load_camera, load_motion
 from pipeline.capture.capture import load_capture
@@ -49,10 +51,31 @@ class Config(BaseConfig):
         "Made from a video of a person: ask that person before you share it.",
         description="text written to the .glb as asset.extras.licence_note",
     )
+    formats: tuple[ExportFormat, ...] = Field(
+        (),
+        description="further files: vrm (VRM 1.0), vrm0 (VRM 0.x), lod (levels of detail), usdz, web (compressed .glb)",
+    )
+    author: str = Field("unknown", min_length=1, description="author in the .vrm files")
+    licence_url: str = Field(
+        "", description="address of the licence in the .vrm files; without it only the author may use them"
+    )
+
+    @field_validator("formats", mode="before")
+    @classmethod
+    def _split_names(cls, formats: object) -> object:
+        return formats.replace(" ", "").split(",") if isinstance(formats, str) else formats
+
+    @field_validator("formats")
+    @classmethod
+    def _check_packages(cls, formats: tuple[ExportFormat, ...]) -> tuple[ExportFormat, ...]:
+        missing = missing_package(formats)
+        if missing:
+            raise ValueError(missing)
+        return formats
 
 
 def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, float]:
-    """Write `avatar.glb`, and `avatar.obj` with its `.mtl` and maps.
+    """Write `avatar.glb`, `avatar.obj` with its `.mtl` and maps, and the files of `config.formats`.
 
     Raises:
         UserError: an input artifact cannot be read.
@@ -78,6 +101,8 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
         asset_extras(config, offset_m, capture.fps),
     )
     (out / "avatar.glb").write_bytes(glb)
+    meta = VrmMeta("avatar", config.author, config.licence_url)
+    write_formats(out / "avatar.glb", FormatRequest(config.formats, body.joint_names, meta))
     diffuse_name, specular_name = (copy_map(inputs["texture"], name, out) for name in (DIFFUSE, SPECULAR))
     map_names = (diffuse_name, specular_name if is_specular else None)
     write_obj(out / "avatar.obj", mesh, atlas.uv, atlas.faces_uv, mesh.vertex_normals(), *map_names)

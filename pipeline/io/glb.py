@@ -33,6 +33,7 @@ class Primitive:
 
     Attributes:
         positions: in the space of the file's inverse bind matrices.
+        normals: of unit length; zeros if the file has none.
         uv: origin top-left, as in glTF; zeros if the file has none.
         joints: indices into the joint list of `skin`.
         weights: one row per vertex; rows sum to 1.
@@ -42,6 +43,7 @@ class Primitive:
     """
 
     positions: Float[np.ndarray, "v 3"]
+    normals: Float[np.ndarray, "v 3"]
     uv: Float[np.ndarray, "v 2"]
     joints: Int[np.ndarray, "v 4"]
     weights: Float[np.ndarray, "v 4"]
@@ -51,7 +53,7 @@ class Primitive:
 
 
 class GlbFile:
-    """A .glb file in memory: `gltf` is its JSON tree; methods read arrays and images from its binary chunk."""
+    """A .glb file in memory: `gltf` is its JSON tree, `binary` the chunk from which methods read arrays and images."""
 
     def __init__(self, path: Path) -> None:
         """Read the file.
@@ -77,12 +79,10 @@ class GlbFile:
             raise UserError(
                 f"{path} requires the extension {', '.join(sorted(unsupported))}; export it again without compression"
             )
-        self._binary = chunks.get(_BINARY_CHUNK, b"")
+        self.binary = chunks.get(_BINARY_CHUNK, b"")
 
-    def accessor(self, index: int) -> np.ndarray:
-        """Return the values of an accessor, shape (count, components).
-
-        Floats are float32, integers int64. Normalised integers become float32 in [-1, 1] or [0, 1].
+    def stored_array(self, index: int) -> np.ndarray:
+        """Return the values of an accessor as they are stored, shape (count, components), without conversion.
 
         Raises:
             UserError: the accessor is sparse, or the file does not hold its values.
@@ -96,12 +96,23 @@ class GlbFile:
             start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
             stride = view.get("byteStride", kind.itemsize * width)
             shape, strides = (accessor["count"], width), (stride, kind.itemsize)
-            values: np.ndarray = np.ndarray(shape, kind, self._binary, start, strides)
+            return np.ndarray(shape, kind, self.binary, start, strides)
         except (LookupError, TypeError, ValueError):
             raise UserError(
                 f"{self.path} is damaged: the values of accessor {index} are missing; export it again"
             ) from None
-        if accessor.get("normalized"):
+
+    def accessor(self, index: int) -> np.ndarray:
+        """Return the values of an accessor, shape (count, components).
+
+        Floats are float32, integers int64. Normalised integers become float32 in [-1, 1] or [0, 1].
+
+        Raises:
+            UserError: the accessor is sparse, or the file does not hold its values.
+        """
+        values = self.stored_array(index)
+        kind = values.dtype
+        if self.gltf["accessors"][index].get("normalized"):
             return np.maximum(values.astype(np.float32) / np.iinfo(kind).max, -1.0)
         return values.astype(np.float32 if kind.kind == "f" else np.int64)
 
@@ -112,7 +123,14 @@ class GlbFile:
             raise UserError(f"{self.path}: image {index} is an external file; export the .glb with embedded images")
         view = self.gltf["bufferViews"][image["bufferView"]]
         start = view.get("byteOffset", 0)
-        return self._binary[start : start + view["byteLength"]]
+        return self.binary[start : start + view["byteLength"]]
+
+    def image_pixels(self, index: int) -> UInt8[np.ndarray, "h w c"]:
+        """Return an embedded image with the channels of its file (RGB or RGBA). UserError as `image_bytes`."""
+        pixels = cv2.imdecode(np.frombuffer(self.image_bytes(index), np.uint8), cv2.IMREAD_UNCHANGED)
+        if pixels is None or pixels.ndim != 3 or pixels.dtype != np.uint8:
+            raise UserError(f"{self.path}: image {index} has not 8-bit colours; export it as PNG or JPEG")
+        return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
 
     def node_to_world(self) -> Float[np.ndarray, "n 4 4"]:
         """Return the rest-pose matrix of every node."""
@@ -162,8 +180,10 @@ class GlbFile:
         indices = self.accessor(primitive["indices"]) if "indices" in primitive else np.arange(len(positions))
         weights = self.accessor(names["WEIGHTS_0"])
         uv = self.accessor(names["TEXCOORD_0"]) if "TEXCOORD_0" in names else np.zeros((len(positions), 2), np.float32)
+        normals = self.accessor(names["NORMAL"]).astype(np.float32) if "NORMAL" in names else np.zeros_like(positions)
         return Primitive(
             positions,
+            normals,
             uv,
             self.accessor(names["JOINTS_0"]),
             weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-9),
