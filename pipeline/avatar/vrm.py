@@ -108,7 +108,7 @@ def encode_vrm0(file: GlbFile, joint_names: Sequence[str], meta: VrmMeta) -> byt
     annotations = [{"mesh": mesh, "firstPersonFlag": "Auto"} for mesh in range(len(document.json["meshes"]))]
     first_person = {
         "firstPersonBone": rest.nodes[rest.joint_names.index("Head")],
-        "firstPersonBoneOffset": {"x": x, "y": y, "z": z},
+        "firstPersonBoneOffset": {"x": x, "y": y, "z": -z},  # in Unity's axes, whose z is that of glTF negated
         "meshAnnotations": annotations,
         "lookAtTypeName": "Bone",
     }

@@ -71,7 +71,7 @@ def encode_webp(pixels: UInt8[np.ndarray, "h w c"]) -> bytes:
     least_db = MIN_SPECULAR_PSNR_DB if is_specular else MIN_COLOUR_PSNR_DB
     for quality in _WEBP_QUALITIES:
         encoded = io.BytesIO()
-        image.save(encoded, "WEBP", quality=quality, alpha_quality=quality, method=6)
+        image.save(encoded, "WEBP", quality=quality, alpha_quality=quality, method=4)
         decoded = np.asarray(Image.open(encoded).convert(image.mode))[..., channels].astype(np.float32)
         error = float(np.mean((decoded - pixels[..., channels]) ** 2))
         if error <= 255.0**2 * 10.0 ** (-least_db / 10.0):
