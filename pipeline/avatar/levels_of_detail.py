@@ -1,7 +1,7 @@
 """Levels of detail: the avatar with fewer triangles and smaller textures, with the same skeleton, skin and clips.
 
-Each level is a whole file of its own. The extension MSFT_lod would put all levels into one file, but of the common
-importers only Babylon.js reads it; three.js, glTFast, Unreal and Blender show the finest level or all at once.
+Each level is a whole file of its own. The extension MSFT_lod would put all levels into one file, but the loaders of
+three.js, glTFast and Blender do not read it.
 """
 
 from typing import Any

@@ -32,6 +32,21 @@ _ROOT, _SKELETON, _ANIMATION, _MESH, _MATERIAL = (
 
 
 @dataclass(frozen=True)
+class _Joints:
+    """The joints of a skin in USD's order, parents before children.
+
+    Attributes:
+        nodes: of the joints.
+        parents: index in this order of each joint's parent; -1 for roots.
+        skin_index: index in the skin of each joint.
+    """
+
+    nodes: list[int]
+    parents: list[int]
+    skin_index: list[int]
+
+
+@dataclass(frozen=True)
 class _Clip:
     """Local transforms of the skin's joints: times (s), translations (m), unit quaternions (glTF's order xyzw)."""
 
@@ -63,8 +78,9 @@ def write_usdz(path: Path, file: GlbFile) -> None:
         root = UsdSkel.Root.Define(stage, _ROOT)
         Usd.ModelAPI(root.GetPrim()).SetKind("component")
         stage.SetDefaultPrim(root.GetPrim())
-        _define_skeleton(stage, file, primitive.skin)
-        _define_mesh(stage, primitive)
+        joints = _ordered_joints(file, primitive.skin)
+        _define_skeleton(stage, file, primitive.skin, joints)
+        _define_mesh(stage, primitive, joints)
         _define_material(stage, file, primitive, Path(folder))
         extent = UsdGeom.Boundable.ComputeExtentFromPlugins(root, Usd.TimeCode(stage.GetStartTimeCode()))
         root.GetExtentAttr().Set(extent)
@@ -75,23 +91,23 @@ def write_usdz(path: Path, file: GlbFile) -> None:
                 package.AddFile(str(member), member.name)
 
 
-def _define_skeleton(stage: Any, file: GlbFile, skin_index: int) -> None:
+def _define_skeleton(stage: Any, file: GlbFile, skin: int, joints: _Joints) -> None:
     from pxr import Gf, Usd, UsdSkel, Vt
 
-    skin, joints = file.gltf["skins"][skin_index], _joint_paths(file, skin_index)
-    inverse_bind = file.accessor(skin["inverseBindMatrices"]).reshape(-1, 4, 4).astype(np.float64)
+    names, matrices = _joint_paths(file, joints), file.accessor(file.gltf["skins"][skin]["inverseBindMatrices"])
+    inverse_bind = matrices.reshape(-1, 4, 4).astype(np.float64)[joints.skin_index]
     bind = np.linalg.inv(inverse_bind)  # column-major in glTF is what USD's row vectors need
-    rest = _joint_local_matrices(file, skin_index).transpose(0, 2, 1)
+    rest = _joint_local_matrices(file, joints).transpose(0, 2, 1)
     skeleton = UsdSkel.Skeleton.Define(stage, _SKELETON)
-    skeleton.CreateJointsAttr(joints)
+    skeleton.CreateJointsAttr(names)
     skeleton.CreateBindTransformsAttr(Vt.Matrix4dArray.FromNumpy(np.ascontiguousarray(bind)))
     skeleton.CreateRestTransformsAttr(Vt.Matrix4dArray.FromNumpy(np.ascontiguousarray(rest)))
     if not file.gltf.get("animations"):
         return
-    clip = _sample_clip(file, skin_index)
+    clip = _sample_clip(file, joints)
     animation = UsdSkel.Animation.Define(stage, _ANIMATION)
-    animation.CreateJointsAttr(joints)
-    animation.CreateScalesAttr(Vt.Vec3hArray(len(joints), Gf.Vec3h(1.0)))
+    animation.CreateJointsAttr(names)
+    animation.CreateScalesAttr(Vt.Vec3hArray(len(names), Gf.Vec3h(1.0)))
     translations, rotations = animation.CreateTranslationsAttr(), animation.CreateRotationsAttr()
     for row, time_s in enumerate(clip.time_s.tolist()):
         code = Usd.TimeCode(time_s * TIME_CODES_PER_SECOND)
@@ -104,7 +120,7 @@ def _define_skeleton(stage: Any, file: GlbFile, skin_index: int) -> None:
     binding.CreateAnimationSourceRel().SetTargets([animation.GetPath()])
 
 
-def _define_mesh(stage: Any, primitive: Primitive) -> None:
+def _define_mesh(stage: Any, primitive: Primitive, joints: _Joints) -> None:
     from pxr import Gf, Sdf, UsdGeom, UsdSkel, Vt
 
     mesh = UsdGeom.Mesh.Define(stage, _MESH)
@@ -121,8 +137,8 @@ def _define_mesh(stage: Any, primitive: Primitive) -> None:
     )
     coordinates.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(uv, dtype=np.float32)))
     binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
-    influences = primitive.joints.shape[1]
-    indices = Vt.IntArray.FromNumpy(primitive.joints.astype(np.int32).reshape(-1))
+    influences, position_of = primitive.joints.shape[1], np.argsort(joints.skin_index)
+    indices = Vt.IntArray.FromNumpy(position_of[primitive.joints].astype(np.int32).reshape(-1))
     binding.CreateJointIndicesPrimvar(constant=False, elementSize=influences).Set(indices)
     weights = Vt.FloatArray.FromNumpy(primitive.weights.astype(np.float32).reshape(-1))
     binding.CreateJointWeightsPrimvar(constant=False, elementSize=influences).Set(weights)
@@ -163,38 +179,37 @@ def _define_material(stage: Any, file: GlbFile, primitive: Primitive, folder: Pa
     UsdShade.MaterialBindingAPI.Apply(stage.GetPrimAtPath(_MESH)).Bind(material)
 
 
-def _joint_parents(file: GlbFile, skin_index: int) -> list[int]:
-    """Return the joint (not the node) that is the parent of each joint of the skin; -1 for roots."""
-    joint_of_node = {node: joint for joint, node in enumerate(file.gltf["skins"][skin_index]["joints"])}
-    parents = [-1] * len(joint_of_node)
-    for node, joint in joint_of_node.items():
-        for child in file.gltf["nodes"][node].get("children", ()):
-            if child in joint_of_node:
-                parents[joint_of_node[child]] = joint
-    return parents
+def _ordered_joints(file: GlbFile, skin: int) -> _Joints:
+    skin_joints, nodes = file.gltf["skins"][skin]["joints"], file.gltf["nodes"]
+    parent_of = {child: node for node in skin_joints for child in nodes[node].get("children", ())}
+
+    def depth(node: int) -> int:
+        return 1 + depth(parent_of[node]) if node in parent_of else 0
+
+    ordered = sorted(skin_joints, key=depth)
+    parents = [ordered.index(parent_of[node]) if node in parent_of else -1 for node in ordered]
+    return _Joints(ordered, parents, [skin_joints.index(node) for node in ordered])
 
 
-def _joint_paths(file: GlbFile, skin_index: int) -> list[str]:
-    """Return USD's names of the joints, for instance "Hips/Spine"; parents come before their children in the skin."""
+def _joint_paths(file: GlbFile, joints: _Joints) -> list[str]:
+    """Return USD's names of the joints, for instance "Hips/Spine"."""
     from pxr import Tf
 
     paths: list[str] = []
-    nodes = file.gltf["skins"][skin_index]["joints"]
-    for node, parent in zip(nodes, _joint_parents(file, skin_index), strict=True):
+    for node, parent in zip(joints.nodes, joints.parents, strict=True):
         name = Tf.MakeValidIdentifier(file.gltf["nodes"][node]["name"])
         paths.append(f"{paths[parent]}/{name}" if parent >= 0 else name)
     return paths
 
 
-def _joint_local_matrices(file: GlbFile, skin_index: int) -> Float[np.ndarray, "j 4 4"]:
-    world = file.node_to_world()[file.gltf["skins"][skin_index]["joints"]]
-    parents = _joint_parents(file, skin_index)
-    return np.stack([np.linalg.inv(world[p]) @ world[j] if p >= 0 else world[j] for j, p in enumerate(parents)])
+def _joint_local_matrices(file: GlbFile, joints: _Joints) -> Float[np.ndarray, "j 4 4"]:
+    world = file.node_to_world()[joints.nodes]
+    return np.stack([np.linalg.inv(world[p]) @ world[j] if p >= 0 else world[j] for j, p in enumerate(joints.parents)])
 
 
-def _sample_clip(file: GlbFile, skin_index: int) -> _Clip:
+def _sample_clip(file: GlbFile, joints: _Joints) -> _Clip:
     """Sample the first animation at all its key times; joints without keys keep their rest transform."""
-    animation, nodes = file.gltf["animations"][0], file.gltf["skins"][skin_index]["joints"]
+    animation, nodes = file.gltf["animations"][0], joints.nodes
     samplers = animation["samplers"]
     time_s = np.unique(np.concatenate([file.accessor(sampler["input"])[:, 0] for sampler in samplers]))
     rest = [file.gltf["nodes"][node] for node in nodes]

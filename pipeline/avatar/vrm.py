@@ -59,7 +59,8 @@ def encode_vrm1(file: GlbFile, joint_names: Sequence[str], meta: VrmMeta) -> byt
 
     Args:
         file: one skinned mesh, facing +Z, +Y up.
-        joint_names: Mixamo's names of the skin's joints, in its order; the nodes may have others.
+        joint_names: Mixamo's names of the skin's joints, in its order; the nodes may have others. A joint that follows
+            them in the skin, a root above the hips, stays at the origin.
         meta: name and licence.
 
     Raises:
@@ -153,10 +154,11 @@ def _rest_pose(file: GlbFile, joint_names: Sequence[str]) -> _RestPose:
     parents = np.full(len(joints_m), -1)
     for node, joint in joint_of_node.items():
         parents[[joint_of_node[child] for child in nodes[node].get("children", ()) if child in joint_of_node]] = joint
-    transforms = t_pose_transforms(joint_names, parents, joints_m)
+    names = (*joint_names, *(nodes[node]["name"] for node in skin["joints"][len(joint_names) :]))
+    transforms = t_pose_transforms(names, parents, joints_m)
     lowest_m = min(_posed(file, primitive, transforms)[:, 1].min() for primitive in _primitives(file))
-    transforms[:, 1, 3] -= lowest_m
-    return _RestPose(skin["joints"], tuple(joint_names), parents, joints_m, transforms)
+    transforms[: len(joint_names), 1, 3] -= lowest_m
+    return _RestPose(skin["joints"], names, parents, joints_m, transforms)
 
 
 def _rest_joints_m(rest: _RestPose) -> Float[np.ndarray, "j 3"]:

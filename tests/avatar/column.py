@@ -7,6 +7,7 @@ import numpy as np
 from pipeline.avatar.gltf import SkinnedMesh, encode_glb
 from pipeline.geometry.skinning import top_k_weights
 from pipeline.io.glb import GlbFile
+from pipeline.io.glb_writer import GlbWriter
 from tests.avatar.avatar_sample import sample_body, sample_camera, sample_maps, sample_motion
 
 AROUND, ALONG = 96, 120
@@ -29,6 +30,25 @@ def column_mesh() -> SkinnedMesh:
     pad = ((0, 0), (0, 4 - indices.shape[1]))
     uv = np.stack([u, v], axis=1).astype(np.float32)
     return SkinnedMesh(positions, normals, uv, np.pad(indices, pad), np.pad(weights, pad), faces)
+
+
+def add_root_joint(file: GlbFile) -> GlbFile:
+    """Add a joint without weights above the first one, last in the skin, as rigs for Unreal have it."""
+    document = GlbWriter.from_file(file)
+    (skin,) = document.json["skins"]
+    matrices = file.accessor(skin["inverseBindMatrices"])
+    document.replace_array(
+        skin["inverseBindMatrices"], np.concatenate([matrices, np.eye(4, dtype=np.float32).reshape(1, 16)])
+    )
+    first = skin["joints"][0]
+    document.json["nodes"].append(document.json["nodes"][-1])  # the camera stays last
+    root = len(document.json["nodes"]) - 2
+    document.json["nodes"][root] = {"name": "root", "children": [first]}
+    skin["joints"].append(root)
+    document.json["scenes"][0]["nodes"] = [0, root, root + 1]
+    path = file.path.with_name("rooted.glb")
+    path.write_bytes(document.to_bytes())
+    return GlbFile(path)
 
 
 def column_glb(folder: Path) -> GlbFile:

@@ -9,7 +9,7 @@ import pytest
 from pipeline.avatar.usdz import TIME_CODES_PER_SECOND, write_usdz
 from pipeline.io.glb import GlbFile
 from pipeline.io.glb_writer import GlbWriter
-from tests.avatar.column import FRAMES, column_glb
+from tests.avatar.column import FRAMES, add_root_joint, column_glb
 from tests.avatar.test_gltf import Player
 
 pytest.importorskip("pxr", reason="usd-core is not installed: make venv EXTRA=usdz")
@@ -86,6 +86,17 @@ def test_usd_finds_no_fault(path: Path) -> None:
 def test_the_same_avatar_gives_the_same_bytes(glb: GlbFile, path: Path, tmp_path: Path) -> None:
     write_usdz(tmp_path / "again.usdz", glb)
     assert (tmp_path / "again.usdz").read_bytes() == path.read_bytes()
+
+
+def test_a_root_joint_that_comes_last_in_the_skin_is_first_in_usd(glb: GlbFile, tmp_path: Path) -> None:
+    rooted = add_root_joint(glb)
+    write_usdz(tmp_path / "rooted.usdz", rooted)
+    stage = Usd.Stage.Open(str(tmp_path / "rooted.usdz"))
+    joints = UsdSkel.Skeleton(stage.GetPrimAtPath("/Avatar/Skeleton")).GetJointsAttr().Get()
+    assert list(joints) == ["root", "root/Hips", "root/Hips/Spine", "root/Hips/Spine/Head"]
+    time_s = float(FRAMES[3]) / 25.0
+    posed = skinned_points(stage, time_s * TIME_CODES_PER_SECOND)
+    np.testing.assert_allclose(posed, Player(glb.path).posed_vertices(time_s), atol=2e-6)
 
 
 def test_without_a_clip_it_is_the_rest_pose(glb: GlbFile, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from pipeline.avatar.vrm import VrmMeta, encode_vrm0, encode_vrm1
 from pipeline.avatar.vrm_bones import human_bones
 from pipeline.io.glb import GlbFile
 from tests.avatar.anny_avatar import anny_body, anny_glb
+from tests.avatar.column import add_root_joint
 from tests.avatar.test_gltf import Player
 from tests.tools.khronos import validator_issues
 
@@ -189,6 +190,16 @@ def test_the_gaze_starts_between_the_eyes(files: dict[str, GlbFile]) -> None:
 def test_a_skeleton_that_is_no_humanoid_is_refused() -> None:
     with pytest.raises(ValueError, match="leftHand"):
         human_bones([name for name in anny_body().joint_names if name != "LeftHand"], "1.0")
+
+
+def test_a_root_joint_above_the_hips_changes_nothing(files: dict[str, GlbFile], tmp_path: Path) -> None:
+    rooted = add_root_joint(files["glb"])
+    for version, encode in (("1.0", encode_vrm1), ("0.x", encode_vrm0)):
+        (tmp_path / "rooted.vrm").write_bytes(encode(rooted, anny_body().joint_names, META))
+        posed, expected = RestPlayer(tmp_path / "rooted.vrm"), RestPlayer(files[version].path)
+        assert bone_nodes(GlbFile(tmp_path / "rooted.vrm")) == bone_nodes(files[version])
+        np.testing.assert_allclose(posed.posed_vertices(0.0), expected.posed_vertices(0.0), atol=1e-6)
+        np.testing.assert_array_equal(posed.joint_m("root"), 0.0)
 
 
 def test_the_khronos_validator_finds_no_issue(files: dict[str, GlbFile]) -> None:

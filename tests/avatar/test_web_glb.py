@@ -54,8 +54,9 @@ def smooth_image(channels: int, side_px: int = 256) -> np.ndarray:
 
 
 def specular_image() -> np.ndarray:
-    pixels = smooth_image(4)
-    pixels[..., :3] = 255
+    """White with a noisy alpha channel, of which the lowest qualities are not accurate enough."""
+    pixels = np.full((256, 256, 4), 255, dtype=np.uint8)
+    pixels[..., 3] = np.clip(np.random.default_rng(3).normal(90, 40, (256, 256)), 0, 255)
     return pixels
 
 
@@ -118,7 +119,7 @@ def test_it_is_much_smaller_and_valid(files: tuple[GlbFile, WebGlb], tmp_path: P
     full, web = files
     data = encode_web_glb(full)
     (tmp_path / "web.glb").write_bytes(data)
-    assert len(data) < 0.3 * full.path.stat().st_size
+    assert len(data) < 0.5 * full.path.stat().st_size
     assert validator_issues(tmp_path / "web.glb") == []
     required = ["KHR_draco_mesh_compression", "EXT_texture_webp"]
     assert web.gltf["extensionsRequired"] == required
