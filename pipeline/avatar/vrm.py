@@ -188,6 +188,9 @@ def _bake_mesh(file: GlbFile, document: GlbWriter, transforms: Float[np.ndarray,
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         document.replace_array(attributes["POSITION"], positions_m.astype(np.float32))
         document.replace_array(attributes["NORMAL"], normals.astype(np.float32))
+        for index in (index for target in primitive.get("targets", ()) for index in target.values()):
+            moved = np.einsum("vab,vb->va", bind_to_rest[:, :3, :3], file.accessor(index))
+            document.replace_array(index, moved.astype(np.float32))
 
 
 def _posed(file: GlbFile, primitive: dict[str, Any], transforms: Float[np.ndarray, "j 4 4"]) -> np.ndarray:

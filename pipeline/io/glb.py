@@ -84,19 +84,23 @@ class GlbFile:
     def stored_array(self, index: int) -> np.ndarray:
         """Return the values of an accessor as they are stored, shape (count, components), without conversion.
 
+        A sparse accessor without a buffer view is 0 where it has no values.
+
         Raises:
-            UserError: the accessor is sparse, or the file does not hold its values.
+            UserError: the file does not hold its values.
         """
         try:
             accessor = self.gltf["accessors"][index]
-            if "sparse" in accessor:
-                raise UserError(f"{self.path}: accessor {index} is sparse; export the file without sparse accessors")
-            view = self.gltf["bufferViews"][accessor["bufferView"]]
-            kind, width = np.dtype(_COMPONENT_DTYPES[accessor["componentType"]]), _N_COMPONENTS[accessor["type"]]
-            start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-            stride = view.get("byteStride", kind.itemsize * width)
-            shape, strides = (accessor["count"], width), (stride, kind.itemsize)
-            return np.ndarray(shape, kind, self.binary, start, strides)
+            count, width = accessor["count"], _N_COMPONENTS[accessor["type"]]
+            if "sparse" not in accessor:
+                return self._view_array(accessor, accessor["componentType"], count, width)
+            sparse, dtype = accessor["sparse"], _COMPONENT_DTYPES[accessor["componentType"]]
+            values: np.ndarray = np.zeros((count, width), dtype)
+            if "bufferView" in accessor:
+                values[:] = self._view_array(accessor, accessor["componentType"], count, width)
+            rows = self._view_array(sparse["indices"], sparse["indices"]["componentType"], sparse["count"], 1)[:, 0]
+            values[rows] = self._view_array(sparse["values"], accessor["componentType"], sparse["count"], width)
+            return values
         except (LookupError, TypeError, ValueError):
             raise UserError(
                 f"{self.path} is damaged: the values of accessor {index} are missing; export it again"
@@ -108,7 +112,7 @@ class GlbFile:
         Floats are float32, integers int64. Normalised integers become float32 in [-1, 1] or [0, 1].
 
         Raises:
-            UserError: the accessor is sparse, or the file does not hold its values.
+            UserError: the file does not hold its values.
         """
         values = self.stored_array(index)
         kind = values.dtype
@@ -173,6 +177,13 @@ class GlbFile:
         if "source" not in texture:
             raise UserError(f"{self.path} holds an image that is neither PNG nor JPEG; export it as PNG or JPEG")
         return np.rint(self._decode_image(texture["source"]) * factor).astype(np.uint8)
+
+    def _view_array(self, owner: dict[str, Any], component_type: int, count: int, width: int) -> np.ndarray:
+        """Return the rows in the buffer view of an accessor or of a part of a sparse one."""
+        view, kind = self.gltf["bufferViews"][owner["bufferView"]], np.dtype(_COMPONENT_DTYPES[component_type])
+        start = view.get("byteOffset", 0) + owner.get("byteOffset", 0)
+        stride = view.get("byteStride", kind.itemsize * width)
+        return np.ndarray((count, width), kind, self.binary, start, (stride, kind.itemsize))
 
     def _primitive(self, primitive: dict[str, Any], skin: int) -> Primitive:
         names = primitive["attributes"]

@@ -59,15 +59,31 @@ class GlbWriter:
             accessor |= _bounds(values)
         return self.add("accessors", accessor)
 
+    def add_sparse_array(self, values: Shaped[np.ndarray, "n *c"], bounds: bool = False) -> int:
+        """Append an accessor that stores only the rows that are not 0; return its index. `bounds` as in `add_array`."""
+        rows = np.flatnonzero(values.any(axis=tuple(range(1, values.ndim))))
+        rows = (rows if len(rows) else np.zeros(1)).astype(np.uint16 if len(values) <= 65536 else np.uint32)
+        indices = {"bufferView": self.add_bytes(rows.tobytes()), "componentType": _COMPONENT_TYPES[rows.dtype.name]}
+        stored = {"bufferView": self.add_bytes(np.ascontiguousarray(values[rows]).tobytes())}
+        accessor = {
+            "componentType": _COMPONENT_TYPES[values.dtype.name],
+            "count": len(values),
+            "type": _ACCESSOR_TYPES[values[0].size],
+            "sparse": {"count": len(rows), "indices": indices, "values": stored},
+        }
+        return self.add("accessors", accessor | (_bounds(values) if bounds else {}))
+
     def replace_array(self, index: int, values: Shaped[np.ndarray, "n *c"]) -> None:
-        """Give an accessor other values: index, target, and whether it has min and max, stay.
+        """Give an accessor other values: index, target, and whether it is sparse or has min and max, stay.
 
         values: in the file's component type or another one that its use allows; rows of 4 bytes or a multiple for
         vertex attributes.
         """
         old = self.json["accessors"][index]
         target = self.json["bufferViews"][old["bufferView"]].get("target") if "bufferView" in old else None
-        new = self.json["accessors"].pop(self.add_array(values, target, "min" in old))
+        bounds = "min" in old
+        added = self.add_sparse_array(values, bounds) if "sparse" in old else self.add_array(values, target, bounds)
+        new = self.json["accessors"].pop(added)
         kept = {key: old[key] for key in ("name", "normalized") if key in old}
         self.json["accessors"][index] = new | kept
 

@@ -70,18 +70,22 @@ def test_skeleton_clip_and_camera_are_the_same(files: list[GlbFile]) -> None:
             np.testing.assert_array_equal(mine, its)
 
 
-def test_morphs_move_the_same_vertices(tmp_path: Path) -> None:
+@pytest.mark.parametrize("sparse", [False, True])
+def test_morphs_move_the_same_vertices(tmp_path: Path, sparse: bool) -> None:
     full = column_glb(tmp_path)
     document = GlbWriter.from_file(full)
     primitive = document.json["meshes"][0]["primitives"][0]
     positions = full.accessor(primitive["attributes"]["POSITION"])
-    primitive["targets"] = [{"POSITION": document.add_array(0.1 * positions[:, ::-1], bounds=True)}]
+    add = document.add_sparse_array if sparse else document.add_array
+    primitive["targets"] = [{"POSITION": add(0.1 * positions[:, ::-1], bounds=True)}]
     (tmp_path / "morph.glb").write_bytes(document.to_bytes())
     (tmp_path / "level.glb").write_bytes(encode_level(GlbFile(tmp_path / "morph.glb"), 0.5, 1))
     level = GlbFile(tmp_path / "level.glb")
     (reduced,) = level.gltf["meshes"][0]["primitives"]
     expected = 0.1 * level.accessor(reduced["attributes"]["POSITION"])[:, ::-1]
     np.testing.assert_array_equal(level.accessor(reduced["targets"][0]["POSITION"]), expected)
+    assert ("sparse" in level.gltf["accessors"][reduced["targets"][0]["POSITION"]]) == sparse
+    assert validator_issues(level.path) == []
 
 
 def test_the_khronos_validator_finds_no_issue(files: list[GlbFile]) -> None:

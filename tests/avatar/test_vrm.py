@@ -9,6 +9,7 @@ import pytest
 from pipeline.avatar.vrm import VrmMeta, encode_vrm0, encode_vrm1
 from pipeline.avatar.vrm_bones import human_bones
 from pipeline.io.glb import GlbFile
+from pipeline.io.glb_writer import GlbWriter
 from tests.avatar.anny_avatar import anny_body, anny_glb
 from tests.avatar.column import add_root_joint
 from tests.avatar.test_gltf import Player
@@ -190,6 +191,23 @@ def test_the_gaze_starts_between_the_eyes(files: dict[str, GlbFile]) -> None:
 def test_a_skeleton_that_is_no_humanoid_is_refused() -> None:
     with pytest.raises(ValueError, match="leftHand"):
         human_bones([name for name in anny_body().joint_names if name != "LeftHand"], "1.0")
+
+
+def test_morphs_turn_with_the_mesh(files: dict[str, GlbFile], tmp_path: Path) -> None:
+    """A morph of 1 cm to the front stays one on the torso, turned with the avatar; on the turned hands it is another."""
+    document = GlbWriter.from_file(files["glb"])
+    offsets = np.zeros((len(anny_body().vertices), 3), dtype=np.float32)
+    offsets[:, 2] = 0.01
+    primitive = document.json["meshes"][0]["primitives"][0]
+    primitive["targets"] = [{"POSITION": document.add_sparse_array(offsets, bounds=True)}]
+    (tmp_path / "morph.glb").write_bytes(document.to_bytes())
+    (tmp_path / "morph.vrm").write_bytes(encode_vrm0(GlbFile(tmp_path / "morph.glb"), anny_body().joint_names, META))
+    file = GlbFile(tmp_path / "morph.vrm")
+    moved = file.accessor(file.gltf["meshes"][0]["primitives"][0]["targets"][0]["POSITION"])
+    still = _weight_of(files["glb"], ("Hips", "Spine", "Spine1", "Head")) > 0.99999
+    np.testing.assert_allclose(moved[still], [[0.0, 0.0, -0.01]] * still.sum(), atol=1e-6)
+    hand = _weight_of(files["glb"], ("LeftHand",)) > 0.99999
+    assert np.abs(moved[hand] - [0.0, 0.0, -0.01]).max() > 0.004
 
 
 def test_a_root_joint_above_the_hips_changes_nothing(files: dict[str, GlbFile], tmp_path: Path) -> None:

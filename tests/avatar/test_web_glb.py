@@ -22,6 +22,7 @@ from pipeline.avatar.web_glb import (
 )
 from pipeline.core.errors import UserError
 from pipeline.io.glb import GlbFile
+from pipeline.io.glb_writer import GlbWriter
 from pipeline.io.image import png_bytes
 from tests.avatar.anny_avatar import anny_glb
 from tests.tools.khronos import validator_issues
@@ -113,6 +114,19 @@ def test_rotations_are_within_their_quantisation(files: tuple[GlbFile, WebGlb]) 
     full, web = files
     for mine, its in zip(web.gltf["animations"][0]["samplers"], full.gltf["animations"][0]["samplers"], strict=True):
         np.testing.assert_allclose(web.accessor(mine["output"]), full.accessor(its["output"]), atol=0.6 / 32767)
+
+
+def test_morphs_still_belong_to_their_vertices(files: tuple[GlbFile, WebGlb], tmp_path: Path) -> None:
+    document = GlbWriter.from_file(files[0])
+    primitive = document.json["meshes"][0]["primitives"][0]
+    positions = files[0].skinned_primitives()[0].positions
+    primitive["targets"] = [{"POSITION": document.add_sparse_array(0.1 * positions, bounds=True)}]
+    (tmp_path / "morph.glb").write_bytes(document.to_bytes())
+    (tmp_path / "web.glb").write_bytes(encode_web_glb(GlbFile(tmp_path / "morph.glb")))
+    web = WebGlb(tmp_path / "web.glb", files[0].path)
+    offsets = web.accessor(web.gltf["meshes"][0]["primitives"][0]["targets"][0]["POSITION"])
+    np.testing.assert_allclose(offsets, 0.1 * web.decoded()[1]["POSITION"], atol=2e-5)
+    assert validator_issues(tmp_path / "web.glb") == []
 
 
 def test_it_is_much_smaller_and_valid(files: tuple[GlbFile, WebGlb], tmp_path: Path) -> None:

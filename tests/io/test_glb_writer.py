@@ -8,6 +8,7 @@ import pytest
 from pipeline.io.glb import GlbFile
 from pipeline.io.glb_writer import GlbWriter
 from tests.io.test_glb import textured_box
+from tests.tools.khronos import validator_issues
 
 
 @pytest.fixture
@@ -60,6 +61,39 @@ def test_arrays_that_nothing_refers_to_are_removed(box: GlbFile, tmp_path: Path)
     cleaned = written(document, tmp_path)
     assert len(cleaned.gltf["accessors"]) == len(box.gltf["accessors"])
     np.testing.assert_array_equal(attribute(cleaned, "POSITION"), attribute(box, "POSITION"))
+
+
+@pytest.mark.parametrize("moved", [[], [2, 5, 6]])
+def test_sparse_arrays_are_read_back_and_valid(box: GlbFile, tmp_path: Path, moved: list[int]) -> None:
+    document, count = GlbWriter.from_file(box), len(attribute(box, "POSITION"))
+    values = np.zeros((count, 3), dtype=np.float32)
+    values[moved] = np.arange(3 * len(moved), dtype=np.float32).reshape(-1, 3) + 1.0
+    primitive = document.json["meshes"][0]["primitives"][0]
+    primitive["targets"] = [{"POSITION": document.add_sparse_array(values, bounds=True)}]
+    read = written(document, tmp_path)
+    target = read.gltf["meshes"][0]["primitives"][0]["targets"][0]["POSITION"]
+    np.testing.assert_array_equal(read.accessor(target), values)
+    assert validator_issues(read.path) == []
+    again = GlbWriter.from_file(read)
+    again.replace_array(target, 2.0 * values)
+    again.remove_unused()
+    (changed,) = written(again, tmp_path).gltf["meshes"][0]["primitives"][0]["targets"]
+    twice = GlbFile(tmp_path / "written.glb")
+    assert "sparse" in twice.gltf["accessors"][changed["POSITION"]]
+    np.testing.assert_array_equal(twice.accessor(changed["POSITION"]), 2.0 * values)
+
+
+def test_a_sparse_array_overrides_rows_of_a_dense_one(box: GlbFile, tmp_path: Path) -> None:
+    document = GlbWriter.from_file(box)
+    index = box.gltf["meshes"][0]["primitives"][0]["attributes"]["POSITION"]
+    positions = box.accessor(index)
+    rows, values = np.array([3, 4], dtype=np.uint16), np.float32([[7, 8, 9], [1, 2, 3]])
+    indices = {"bufferView": document.add_bytes(rows.tobytes()), "componentType": 5123}
+    stored = {"bufferView": document.add_bytes(values.tobytes())}
+    document.json["accessors"][index]["sparse"] = {"count": 2, "indices": indices, "values": stored}
+    expected = positions.copy()
+    expected[rows] = values
+    np.testing.assert_array_equal(written(document, tmp_path).accessor(index), expected)
 
 
 def test_the_file_that_was_read_does_not_change(box: GlbFile) -> None:
