@@ -194,7 +194,7 @@ def test_a_skeleton_that_is_no_humanoid_is_refused() -> None:
 
 
 def test_morphs_turn_with_the_mesh(files: dict[str, GlbFile], tmp_path: Path) -> None:
-    """A morph of 1 cm to the front stays one on the torso, turned with the avatar; on the turned hands it is another."""
+    """A morph of 1 cm to the front stays one on the torso; on the hands, which the T-pose turns, it is another."""
     document = GlbWriter.from_file(files["glb"])
     offsets = np.zeros((len(anny_body().vertices), 3), dtype=np.float32)
     offsets[:, 2] = 0.01
