@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Float, Float32
 from pydantic import Field, field_validator
 
-from pipeline.avatar.formats import ExportFormat, FormatRequest, missing_package, write_formats
+from pipeline.avatar.formats.vrm import VrmMeta
+from pipeline.avatar.formats.write import ExportFormat, FormatRequest, missing_package, write_formats
 from pipeline.avatar.gltf import MaterialMaps, SkinnedMesh, encode_glb, pack_specular_factor
 from pipeline.avatar.obj import write_obj
 from pipeline.avatar.placement import (
@@ -19,7 +20,6 @@ from pipeline.avatar.placement import (
     translate_motion,
     world_to_scene_translation_m,
 )
-from pipeline.avatar.vrm import VrmMeta
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.files import load_body, load_camera, load_motion
 from pipeline.capture.capture import load_capture

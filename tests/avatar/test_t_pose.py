@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.avatar.t_pose import t_pose_transforms
-from tests.avatar.anny_avatar import anny_body
+from tests.avatar.formats.anny_avatar import anny_body
 
 
 def t_pose() -> tuple[np.ndarray, np.ndarray]:

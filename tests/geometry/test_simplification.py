@@ -6,7 +6,7 @@ import pytest
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.simplification import ReducedFaces, collapse_textured_edges
 from pipeline.geometry.surface import closest_points_on_mesh
-from tests.avatar.column import ALONG, AROUND, column_mesh
+from tests.avatar.formats.column import ALONG, AROUND, column_mesh
 
 FULL = column_mesh()
 SEAM = np.isclose(FULL.uv[:, 0] % 1.0, 0.0)

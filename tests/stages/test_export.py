@@ -152,7 +152,7 @@ def test_unknown_formats_are_refused(formats: object) -> None:
 
 
 def test_a_format_without_its_package_is_refused_before_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.avatar.formats.find_spec", lambda module: None)
+    monkeypatch.setattr("pipeline.avatar.formats.write.find_spec", lambda module: None)
     with pytest.raises(ValidationError, match="EXTRA=usdz"):
         EXPORT.config(formats=["vrm", "usdz"])
 

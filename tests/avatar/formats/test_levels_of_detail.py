@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.avatar.levels_of_detail import FACE_RATIOS, encode_level, encode_levels
+from pipeline.avatar.formats.levels_of_detail import FACE_RATIOS, encode_level, encode_levels
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import closest_points_on_mesh
 from pipeline.io.glb import GlbFile
 from pipeline.io.glb_writer import GlbWriter
 from pipeline.io.image import png_bytes
-from tests.avatar.column import FRAMES, column_glb
+from tests.avatar.formats.column import FRAMES, column_glb
 from tests.avatar.test_gltf import Player
 from tests.tools.khronos import validator_issues
 

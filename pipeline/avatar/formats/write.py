@@ -6,10 +6,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
-from pipeline.avatar.levels_of_detail import encode_levels
-from pipeline.avatar.usdz import write_usdz
-from pipeline.avatar.vrm import VrmMeta, encode_vrm0, encode_vrm1
-from pipeline.avatar.web_glb import encode_web_glb
+from pipeline.avatar.formats.levels_of_detail import encode_levels
+from pipeline.avatar.formats.usdz import write_usdz
+from pipeline.avatar.formats.vrm import VrmMeta, encode_vrm0, encode_vrm1
+from pipeline.avatar.formats.web_glb import encode_web_glb
 from pipeline.io.glb import GlbFile
 
 ExportFormat = Literal["lod", "usdz", "vrm", "vrm0", "web"]

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.avatar.usdz import TIME_CODES_PER_SECOND, write_usdz
+from pipeline.avatar.formats.usdz import TIME_CODES_PER_SECOND, write_usdz
 from pipeline.io.glb import GlbFile
 from pipeline.io.glb_writer import GlbWriter
-from tests.avatar.column import FRAMES, add_root_joint, column_glb
+from tests.avatar.formats.column import FRAMES, add_root_joint, column_glb
 from tests.avatar.test_gltf import Player
 
 pytest.importorskip("pxr", reason="usd-core is not installed: make venv EXTRA=usdz")

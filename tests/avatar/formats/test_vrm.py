@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.avatar.vrm import VrmMeta, encode_vrm0, encode_vrm1
+from pipeline.avatar.formats.vrm import VrmMeta, encode_vrm0, encode_vrm1
 from pipeline.avatar.vrm_bones import human_bones
 from pipeline.io.glb import GlbFile
 from pipeline.io.glb_writer import GlbWriter
-from tests.avatar.anny_avatar import anny_body, anny_glb
-from tests.avatar.column import add_root_joint
+from tests.avatar.formats.anny_avatar import anny_body, anny_glb
+from tests.avatar.formats.column import add_root_joint
 from tests.avatar.test_gltf import Player
 from tests.tools.khronos import validator_issues
 

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from pipeline.avatar.gltf import MaterialMaps
-from pipeline.avatar.web_glb import (
+from pipeline.avatar.formats.web_glb import (
     MIN_COLOUR_PSNR_DB,
     MIN_SPECULAR_PSNR_DB,
     POSITION_BITS,
@@ -20,11 +19,12 @@ from pipeline.avatar.web_glb import (
     encode_webp,
     quantise_weights,
 )
+from pipeline.avatar.gltf import MaterialMaps
 from pipeline.core.errors import UserError
 from pipeline.io.glb import GlbFile
 from pipeline.io.glb_writer import GlbWriter
 from pipeline.io.image import png_bytes
-from tests.avatar.anny_avatar import anny_glb
+from tests.avatar.formats.anny_avatar import anny_glb
 from tests.tools.khronos import validator_issues
 
 DracoPy = pytest.importorskip("DracoPy", reason="DracoPy is not installed: make venv EXTRA=web")

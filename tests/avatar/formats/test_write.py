@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.avatar.formats import PACKAGES, FormatRequest, missing_package, write_formats
-from pipeline.avatar.vrm import VrmMeta
-from tests.avatar.anny_avatar import anny_body, anny_glb
+from pipeline.avatar.formats.vrm import VrmMeta
+from pipeline.avatar.formats.write import PACKAGES, FormatRequest, missing_package, write_formats
+from tests.avatar.formats.anny_avatar import anny_body, anny_glb
 
 FILES = {
     "lod": ["avatar_lod1.glb", "avatar_lod2.glb"],
@@ -37,7 +37,7 @@ def test_no_format_writes_no_file(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", PACKAGES)
 def test_a_missing_package_is_named_with_the_command(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.avatar.formats.find_spec", lambda module: None)
+    monkeypatch.setattr("pipeline.avatar.formats.write.find_spec", lambda module: None)
     assert missing_package(["vrm", "lod"]) is None
     message = missing_package(["vrm", name])
     assert message
@@ -46,5 +46,5 @@ def test_a_missing_package_is_named_with_the_command(name: str, monkeypatch: pyt
 
 
 def test_modules_of_installed_packages_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.avatar.formats.find_spec", lambda module: importlib.util.find_spec("json"))
+    monkeypatch.setattr("pipeline.avatar.formats.write.find_spec", lambda module: importlib.util.find_spec("json"))
     assert missing_package(list(PACKAGES)) is None
