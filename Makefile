@@ -55,7 +55,7 @@ help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z$$()A-Z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST) | sed 's/$$(STAGES)/STAGE    /'
 	@echo "  STAGE is one of: $(STAGES)"
 	@echo "  variables: VIDEO=file-or-folder RUN=runs/name PRESET=instant|default|fine SET='mesh.key=value'"
-	@echo "             EXTRA=cuda (an NVIDIA GPU) or EXTRA=cluster (Snakemake)"
+	@echo "             EXTRA=cuda (an NVIDIA GPU), cluster (Snakemake), usdz or web (export.formats)"
 
 ifeq ($(VIDEO)$(RUN),)
 all: $(STAMP) $(SAMPLE_DONE)  ## run all stages; without VIDEO: on a generated sample with known ground truth

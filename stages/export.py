@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float, Float32
-from pydantic import Field
+from pydantic import Field, field_validator
 
+from pipeline.avatar.formats.vrm import VrmMeta
+from pipeline.avatar.formats.write import ExportFormat, FormatRequest, missing_package, write_formats
 from pipeline.avatar.gltf import MaterialMaps, SkinnedMesh, encode_glb, pack_specular_factor
 from pipeline.avatar.idle import idle_motion
 from pipeline.avatar.obj import write_obj
@@ -61,6 +63,27 @@ class Config(BaseConfig):
         "Made from a video of a person: ask that person before you share it.",
         description="text written to the .glb as asset.extras.licence_note",
     )
+    formats: tuple[ExportFormat, ...] = Field(
+        (),
+        description="further files: vrm (VRM 1.0), vrm0 (VRM 0.x), lod (levels of detail), usdz, web (compressed .glb)",
+    )
+    author: str = Field("unknown", min_length=1, description="author in the .vrm files")
+    licence_url: str = Field(
+        "", description="address of the licence in the .vrm files; without it only the author may use them"
+    )
+
+    @field_validator("formats", mode="before")
+    @classmethod
+    def _split_names(cls, formats: object) -> object:
+        return formats.replace(" ", "").split(",") if isinstance(formats, str) else formats
+
+    @field_validator("formats")
+    @classmethod
+    def _check_packages(cls, formats: tuple[ExportFormat, ...]) -> tuple[ExportFormat, ...]:
+        missing = missing_package(formats)
+        if missing:
+            raise ValueError(missing)
+        return formats
 
 
 @dataclass(frozen=True)
@@ -89,7 +112,7 @@ class Scene:
 
 
 def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, float]:
-    """Write `avatar.glb`, and `avatar.obj` with its `.mtl` and maps.
+    """Write `avatar.glb`, `avatar.obj` with its `.mtl` and maps, and the files of `config.formats`.
 
     Raises:
         UserError: an input artifact cannot be read.
@@ -97,6 +120,8 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     scene = load_scene(inputs, config)
     glb = encode_scene(scene, config, {"capture": scene.motion, "idle": idle_motion(scene.body)})
     (out / "avatar.glb").write_bytes(glb)
+    meta = VrmMeta("avatar", config.author, config.licence_url)
+    write_formats(out / "avatar.glb", FormatRequest(config.formats, scene.body.joint_names, meta))
     write_scene_obj(inputs["texture"], out, scene.texture, to_rest_pose(scene.skinned, scene.rig).mesh)
     return {
         "glb_bytes": float(len(glb)),

@@ -4,11 +4,9 @@ glTF conventions: quaternions xyzw, v pointing down, column-major matrices, came
 trimesh writes neither skins nor animations; `pipeline.io.glb` reads what is written here.
 """
 
-import json
 import math
-import struct
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,11 +17,9 @@ from pipeline.avatar.rig import Rig
 from pipeline.body.body import Motion
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.rotation import continuous_quaternions, matrix_to_quaternion, quaternion_to_matrix
+from pipeline.io.glb_writer import GlbWriter
 
-_FLOAT, _U8, _U16, _U32 = 5126, 5121, 5123, 5125
 _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
-_ACCESSOR_TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
-_COMPONENT_TYPES = {"float32": _FLOAT, "uint8": _U8, "uint16": _U16, "uint32": _U32}
 _MIN_ANIMATED_ANGLE_RAD = 1e-4
 _MIN_ROTATION_RAD = 1e-6
 _MIN_NORM = 1e-12
@@ -68,49 +64,6 @@ class MaterialMaps:
     unlit: bool = False
 
 
-@dataclass
-class _GlbBuilder:
-    """Accumulates the JSON chunk and the binary chunk of a .glb."""
-
-    json: dict[str, Any] = field(default_factory=dict)
-    binary: bytearray = field(default_factory=bytearray)
-
-    def add(self, kind: str, value: dict[str, Any]) -> int:
-        """Append an object to a top-level array such as "nodes"; return its index."""
-        self.json.setdefault(kind, []).append(value)
-        return len(self.json[kind]) - 1
-
-    def add_bytes(self, data: bytes, target: int | None = None) -> int:
-        """Append a buffer view, aligned to 4 bytes; return its index."""
-        self.binary.extend(b"\0" * (-len(self.binary) % 4))
-        view = {"buffer": 0, "byteOffset": len(self.binary), "byteLength": len(data)}
-        self.binary.extend(data)
-        return self.add("bufferViews", view | ({"target": target} if target else {}))
-
-    def add_array(self, values: np.ndarray, target: int | None = None, bounds: bool = False) -> int:
-        """Append an accessor, one element per row; `bounds` adds min and max. Return its index."""
-        values = np.ascontiguousarray(values)
-        accessor: dict[str, Any] = {
-            "bufferView": self.add_bytes(values.tobytes(), target),
-            "componentType": _COMPONENT_TYPES[values.dtype.name],
-            "count": len(values),
-            "type": _ACCESSOR_TYPES[values[0].size],
-        }
-        if bounds:
-            rows = values.reshape(len(values), -1)
-            accessor |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
-        return self.add("accessors", accessor)
-
-    def to_bytes(self) -> bytes:
-        """Return the whole file; the JSON chunk is padded with spaces, the binary chunk with zeros."""
-        self.json["buffers"] = [{"byteLength": len(self.binary)}]
-        text = json.dumps(self.json, separators=(",", ":"), ensure_ascii=True).encode()
-        text += b" " * (-len(text) % 4)
-        binary = bytes(self.binary) + b"\0" * (-len(self.binary) % 4)
-        chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
-        return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
-
-
 def encode_glb(
     mesh: SkinnedMesh,
     rig: Rig,
@@ -137,7 +90,7 @@ def encode_glb(
         raise ValueError(f"glTF joint indices have 16 bits: {len(rig.joint_names)} joints exceed {_MAX_JOINTS}")
     for motion in clips.values():
         _check_motion(motion)
-    document = _GlbBuilder()
+    document = GlbWriter()
     document.json["asset"] = {"version": "2.0", "generator": "instant-human-mesh"}
     if extras:
         document.json["asset"]["extras"] = dict(extras)
@@ -174,7 +127,7 @@ def _check_motion(motion: Motion) -> None:
         raise ValueError("an animation needs quaternions of non-zero length")
 
 
-def _add_primitive(document: _GlbBuilder, mesh: SkinnedMesh, joint_count: int) -> dict[str, Any]:
+def _add_primitive(document: GlbWriter, mesh: SkinnedMesh, joint_count: int) -> dict[str, Any]:
     joints = mesh.joint_indices.astype(np.uint8 if joint_count <= 256 else np.uint16)
     uv = np.stack([mesh.uv[:, 0], 1.0 - mesh.uv[:, 1]], axis=1).astype(np.float32)
     # 65535 is the primitive restart value of 16-bit indices and is not allowed as an index
@@ -189,7 +142,7 @@ def _add_primitive(document: _GlbBuilder, mesh: SkinnedMesh, joint_count: int) -
     return {"attributes": attributes, "indices": document.add_array(faces.reshape(-1), _ELEMENT_ARRAY_BUFFER)}
 
 
-def _add_material(document: _GlbBuilder, maps: MaterialMaps) -> int:
+def _add_material(document: GlbWriter, maps: MaterialMaps) -> int:
     document.add("samplers", {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071})
     surface = {
         "name": "avatar",
@@ -209,13 +162,13 @@ def _add_material(document: _GlbBuilder, maps: MaterialMaps) -> int:
     return document.add("materials", surface | {"extensions": extensions})
 
 
-def _add_texture(document: _GlbBuilder, name: str, png: bytes) -> int:
+def _add_texture(document: GlbWriter, name: str, png: bytes) -> int:
     view = document.add_bytes(png)
     image = document.add("images", {"name": name, "mimeType": "image/png", "bufferView": view})
     return document.add("textures", {"name": name, "source": image, "sampler": 0})
 
 
-def _add_skeleton(document: _GlbBuilder, rig: Rig, first_joint: int) -> int:
+def _add_skeleton(document: GlbWriter, rig: Rig, first_joint: int) -> int:
     """Add the joint nodes in the rest pose, which is the bind pose, without scale; return the node of the root."""
     count, root = len(rig.joint_names), first_joint
     children: list[list[int]] = [[] for _ in rig.joint_names]
@@ -247,7 +200,7 @@ def _angle_rad(rotations_wxyz: np.ndarray) -> np.ndarray:
     return 2.0 * np.arctan2(np.linalg.norm(rotations_wxyz[..., 1:], axis=-1), np.abs(rotations_wxyz[..., 0]))
 
 
-def _add_animation(document: _GlbBuilder, name: str, motion: Motion, rig: Rig, first_joint: int) -> None:
+def _add_animation(document: GlbWriter, name: str, motion: Motion, rig: Rig, first_joint: int) -> None:
     """Add a clip; joints that stay in the rest pose have no channel."""
     times = document.add_array(motion.time_s.astype(np.float32), bounds=True)
     samplers: list[dict[str, Any]] = []
@@ -268,7 +221,7 @@ def _add_animation(document: _GlbBuilder, name: str, motion: Motion, rig: Rig, f
     document.add("animations", {"name": name, "samplers": samplers, "channels": channels})
 
 
-def _add_camera(document: _GlbBuilder, camera: Camera) -> int:
+def _add_camera(document: GlbWriter, camera: Camera) -> int:
     """Add the camera as a node.
 
     glTF cameras have a centred principal point; the full intrinsics are written to the extras of the node.

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from pydantic import ValidationError
 
 from pipeline.body.body import canonical_to_world
 from pipeline.geometry.atlas import Atlas
@@ -130,6 +131,30 @@ def test_highlights_become_a_specular_factor_unless_the_surface_is_unlit(
             assert not alpha[:, :half].any()
             assert 10 < np.median(alpha[:, half:]) < 120  # one level of 255 is a fraction of a dielectric's 4 %
     assert materials == [({"KHR_materials_specular"}, 2), ({"KHR_materials_unlit"}, 1)]
+
+
+def test_further_formats_are_written_and_the_glb_stays(
+    inputs: dict[str, Path], exported: tuple[Path, dict[str, float]], tmp_path: Path
+) -> None:
+    config = EXPORT.config(formats="vrm, lod", author="A. Person")
+    assert config.formats == ("vrm", "lod")
+    EXPORT.run(inputs, tmp_path, config)
+    made = {path.name for path in tmp_path.iterdir()}
+    assert made == {*EXPORT.makes, "avatar.vrm", "avatar_lod1.glb", "avatar_lod2.glb"}
+    assert (tmp_path / "avatar.glb").read_bytes() == (exported[0] / "avatar.glb").read_bytes()
+    assert GlbFile(tmp_path / "avatar.vrm").gltf["extensions"]["VRMC_vrm"]["meta"]["authors"] == ["A. Person"]
+
+
+@pytest.mark.parametrize("formats", ["fbx", ["vrm", "glb"], 3])
+def test_unknown_formats_are_refused(formats: object) -> None:
+    with pytest.raises(ValidationError, match="formats"):
+        EXPORT.config(formats=formats)
+
+
+def test_a_format_without_its_package_is_refused_before_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.avatar.formats.write.find_spec", lambda module: None)
+    with pytest.raises(ValidationError, match="EXTRA=usdz"):
+        EXPORT.config(formats=["vrm", "usdz"])
 
 
 @pytest.mark.parametrize("unlit", [False, True])
