@@ -13,6 +13,12 @@ SET ?=
 EXTRA ?=
 ARGS ?=
 
+# Inputs of pose; all are optional.
+BVH ?=
+FRAME ?=
+POSE ?=
+NAME ?=
+
 # Inputs of a batch.
 VIDEOS ?=
 RUNS ?= runs
@@ -46,13 +52,13 @@ OPTIONS = $(RUN_OPTIONS) $(ARGS)
 STAMP := $(VENV)/.stamp$(if $(EXTRA),-$(EXTRA))
 
 .DEFAULT_GOAL := help
-.PHONY: help all $(STAGES) batch chart ablate compare figures test test-all check format bench bench-field bench-body doctor venv lock configs gltf-validator clean
+.PHONY: help all $(STAGES) batch chart ablate pose compare figures test test-all check format bench bench-field bench-body doctor venv lock configs gltf-validator clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z$$()A-Z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST) | sed 's/$$(STAGES)/STAGE    /'
 	@echo "  STAGE is one of: $(STAGES)"
 	@echo "  variables: VIDEO=file-or-folder RUN=runs/name PRESET=instant|default|fine SET='mesh.key=value'"
-	@echo "             EXTRA=cuda (an NVIDIA GPU) or EXTRA=cluster (Snakemake)"
+	@echo "             EXTRA=cuda (an NVIDIA GPU), cluster (Snakemake), usdz or web (export.formats)"
 
 ifeq ($(VIDEO)$(RUN),)
 all: $(STAMP) $(SAMPLE_DONE)  ## run all stages; without VIDEO: on a generated sample with known ground truth
@@ -87,6 +93,10 @@ $(SAMPLE_DONE): | $(STAMP)
 	rm -rf $(SAMPLE)
 	$(RUN_PYTHON) -m data_tools.sample $(SAMPLE)
 	@touch $@
+
+pose: $(STAMP)  ## play BVH='clip.bvh ...' on the avatar of RUN=runs/name, or pose it by FRAME=12 or POSE=a|t|file.json
+	$(RUN_PYTHON) -m data_tools.pose "$(ONE_RUN)" $(foreach clip,$(BVH),--bvh "$(clip)") $(if $(FRAME),--frame $(FRAME)) \
+		$(if $(POSE),--pose "$(POSE)") $(if $(NAME),--name "$(NAME)") $(ARGS)
 
 compare: $(STAMP)  ## compare RUN=runs/name with the ground truth of TRUTH=capture (default: the sample): compare/truth.html
 	$(RUN_PYTHON) -m data_tools.evaluate.compare "$(or $(TRUTH),$(SAMPLE))" "$(ONE_RUN)"

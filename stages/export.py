@@ -2,15 +2,19 @@
 
 import shutil
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float32
-from pydantic import Field
+from pydantic import Field, field_validator
 
+from pipeline.avatar.formats.vrm import VrmMeta
+from pipeline.avatar.formats.write import ExportFormat, FormatRequest, missing_package, write_formats
 from pipeline.avatar.gltf import MaterialMaps, SkinnedMesh, encode_glb, pack_specular_factor
+from pipeline.avatar.idle import idle_motion
 from pipeline.avatar.obj import write_obj
 from pipeline.avatar.placement import (
     pad_motion_to_video,
@@ -18,6 +22,8 @@ from pipeline.avatar.placement import (
     translate_motion,
     world_to_scene_translation_m,
 )
+from pipeline.avatar.rig import RestPose, Rig, build_rig
+from pipeline.avatar.rig_names import RigName
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.files import load_body, load_camera, load_motion
 from pipeline.capture.capture import load_capture
@@ -25,10 +31,12 @@ from pipeline.core.cli import main
 from pipeline.core.config import Config as BaseConfig
 from pipeline.core.stage import Stage
 from pipeline.geometry.atlas import Atlas
+from pipeline.geometry.camera import Camera
+from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.io.image import png_bytes, to_uint8
 from pipeline.mesh.files import MeshArtifact, load_mesh
-from pipeline.texture.files import DIFFUSE, SPECULAR, load_texture, map_files
+from pipeline.texture.files import DIFFUSE, SPECULAR, TextureArtifact, load_texture, map_files
 from pipeline.texture.specular import dielectric_specular_factor
 
 OBJ_MAPS = tuple(f"avatar_{name}" for name in (DIFFUSE, SPECULAR))
@@ -45,49 +53,124 @@ class Config(BaseConfig):
         False,
         description="mark the .glb's material as unlit: viewers show the diffuse map without lights or highlights",
     )
+    rig: RigName = Field(
+        "plain",
+        description="names and axes of the joints, those of clips that play by name: mixamo, unity (Humanoid), unreal, "
+        "vrm; plain: as mixamo without the prefix mixamorig:, as in Ready Player Me",
+    )
+    rest_pose: RestPose = Field("a", description="pose of the .glb without animation, and of the .obj: a or t (T-pose)")
     licence_note: str = Field(
         "Made from a video of a person: ask that person before you share it.",
         description="text written to the .glb as asset.extras.licence_note",
     )
+    formats: tuple[ExportFormat, ...] = Field(
+        (),
+        description="further files: vrm (VRM 1.0), vrm0 (VRM 0.x), lod (levels of detail), usdz, web (compressed .glb)",
+    )
+    author: str = Field("unknown", min_length=1, description="author in the .vrm files")
+    licence_url: str = Field(
+        "", description="address of the licence in the .vrm files; without it only the author may use them"
+    )
+
+    @field_validator("formats", mode="before")
+    @classmethod
+    def _split_names(cls, formats: object) -> object:
+        return formats.replace(" ", "").split(",") if isinstance(formats, str) else formats
+
+    @field_validator("formats")
+    @classmethod
+    def _check_packages(cls, formats: tuple[ExportFormat, ...]) -> tuple[ExportFormat, ...]:
+        missing = missing_package(formats)
+        if missing:
+            raise ValueError(missing)
+        return formats
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What the exported files show.
+
+    Attributes:
+        body: in the A-pose.
+        skinned: the mesh in the A-pose.
+        rig: names, axes and rest pose of the joints.
+        texture: atlas and maps.
+        motion: of the video, on a floor at y = 0, with the duration of the video.
+        fps: frame rate of the video.
+        camera: of the capture, in the same scene.
+        extras: contents of `asset.extras`.
+    """
+
+    body: Body
+    skinned: MeshArtifact
+    rig: Rig
+    texture: TextureArtifact
+    motion: Motion
+    fps: float
+    camera: Camera
+    extras: dict[str, Any]
 
 
 def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, float]:
-    """Write `avatar.glb`, and `avatar.obj` with its `.mtl` and maps.
+    """Write `avatar.glb`, `avatar.obj` with its `.mtl` and maps, and the files of `config.formats`.
+
+    Raises:
+        UserError: an input artifact cannot be read.
+    """
+    scene = load_scene(inputs, config)
+    glb = encode_scene(scene, config, {"capture": scene.motion, "idle": idle_motion(scene.body)})
+    (out / "avatar.glb").write_bytes(glb)
+    meta = VrmMeta("avatar", config.author, config.licence_url)
+    write_formats(out / "avatar.glb", FormatRequest(config.formats, scene.body.joint_names, meta))
+    write_scene_obj(inputs["texture"], out, scene.texture, to_rest_pose(scene.skinned, scene.rig).mesh)
+    return {
+        "glb_bytes": float(len(glb)),
+        "texture_px": float(len(scene.texture.diffuse)),
+        "animation_s": float(scene.motion.time_s[-1]),
+        "vertices": float(len(scene.texture.atlas.uv)),
+        "faces": float(len(scene.skinned.mesh.faces)),
+    }
+
+
+def load_scene(inputs: Mapping[str, Path], config: Config) -> Scene:
+    """Read the artifacts of the stages in `STAGE.needs`, and place person and camera on the floor.
 
     Raises:
         UserError: an input artifact cannot be read.
     """
     body, skinned = load_body(inputs["body"] / "body.npz"), load_mesh(inputs["mesh"])
-    texture = load_texture(inputs["texture"])
-    mesh, atlas, is_specular = skinned.mesh, texture.atlas, bool(texture.specular.any())
+    capture, motion = load_capture(inputs["frames"]), load_motion(inputs["mesh"] / "motion.npz")
+    offset_m = world_to_scene_translation_m(motion, lowest_vertex_y_m(skinned, body, motion))
+    return Scene(
+        body=body,
+        skinned=skinned,
+        rig=build_rig(body, config.rig, config.rest_pose),
+        texture=load_texture(inputs["texture"]),
+        motion=pad_motion_to_video(translate_motion(motion, offset_m), capture.fps, capture.n_video_frames),
+        fps=capture.fps,
+        camera=translate_camera(load_camera(inputs["body"] / "camera.npz"), offset_m),
+        extras=asset_extras(config, offset_m, capture.fps),
+    )
+
+
+def encode_scene(scene: Scene, config: Config, clips: Mapping[str, Motion]) -> bytes:
+    """Return the .glb with the clips as animations."""
+    texture = scene.texture
     maps = MaterialMaps(
         png_bytes(to_uint8(texture.diffuse)),
-        encode_specular_png(texture.specular, texture.diffuse, config.roughness) if is_specular else None,
+        encode_specular_png(texture.specular, texture.diffuse, config.roughness) if texture.specular.any() else None,
         config.roughness,
         config.unlit,
     )
-    capture, motion = load_capture(inputs["frames"]), load_motion(inputs["mesh"] / "motion.npz")
-    offset_m = world_to_scene_translation_m(motion, lowest_vertex_y_m(skinned, body, motion))
-    padded_motion = pad_motion_to_video(translate_motion(motion, offset_m), capture.fps, capture.n_video_frames)
-    glb = encode_glb(
-        build_skinned_mesh(skinned, atlas),
-        body,
-        padded_motion,
-        maps,
-        translate_camera(load_camera(inputs["body"] / "camera.npz"), offset_m),
-        asset_extras(config, offset_m, capture.fps),
-    )
-    (out / "avatar.glb").write_bytes(glb)
-    diffuse_name, specular_name = (copy_map(inputs["texture"], name, out) for name in (DIFFUSE, SPECULAR))
-    map_names = (diffuse_name, specular_name if is_specular else None)
-    write_obj(out / "avatar.obj", mesh, atlas.uv, atlas.faces_uv, mesh.vertex_normals(), *map_names)
-    return {
-        "glb_bytes": float(len(glb)),
-        "texture_px": float(len(texture.diffuse)),
-        "animation_s": float(padded_motion.time_s[-1]),
-        "vertices": float(len(atlas.uv)),
-        "faces": float(len(mesh.faces)),
-    }
+    mesh = build_skinned_mesh(to_rest_pose(scene.skinned, scene.rig), texture.atlas)
+    return encode_glb(mesh, scene.rig, clips, maps, scene.camera, scene.extras)
+
+
+def write_scene_obj(texture_dir: Path, out: Path, texture: TextureArtifact, mesh: Mesh) -> None:
+    """Write `avatar.obj`, `avatar.mtl` and the maps for any pose of the mesh."""
+    diffuse_name, specular_name = (copy_map(texture_dir, name, out) for name in (DIFFUSE, SPECULAR))
+    map_names = (diffuse_name, specular_name if texture.specular.any() else None)
+    write_obj(out / "avatar.obj", mesh, texture.atlas.uv, texture.atlas.faces_uv, mesh.vertex_normals(), *map_names)
 
 
 def copy_map(texture_dir: Path, name: str, out: Path) -> str:
@@ -122,6 +205,13 @@ def build_skinned_mesh(skinned: MeshArtifact, atlas: Atlas) -> SkinnedMesh:
     )
 
 
+def to_rest_pose(skinned: MeshArtifact, rig: Rig) -> MeshArtifact:
+    """Return the mesh in the rest pose of a rig."""
+    mesh = skinned.mesh
+    weights = skinned.dense_skin_weights(len(rig.joint_names)).numpy()
+    return replace(skinned, mesh=Mesh(rig.rest_positions(mesh.vertices, weights), mesh.faces))
+
+
 def lowest_vertex_y_m(skinned: MeshArtifact, body: Body, motion: Motion) -> Float[np.ndarray, "n"]:
     """Return the world height (m) of the lowest vertex of the posed mesh in every frame."""
     weights, vertices = skinned.dense_skin_weights(len(body.joint_names)), torch.from_numpy(skinned.mesh.vertices)
@@ -145,7 +235,7 @@ def asset_extras(config: Config, offset_m: Float[np.ndarray, "3"], frame_rate_hz
 
 STAGE = Stage(
     "export",
-    version=4,
+    version=5,
     needs=("frames", "body", "mesh", "texture"),
     makes=("avatar.glb", "avatar.obj", "avatar.mtl", *OBJ_MAPS),
     config=Config,

@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from data_tools.synthetic.rig.retarget import local_quaternions
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.geometry.camera import Camera
+from pipeline.geometry.skinning import local_quaternions
 
 
 def joint_rotations_in_camera(body: Body, motion: Motion, camera: Camera) -> Float[Tensor, "n j 3 3"]:

@@ -4,26 +4,24 @@ glTF conventions: quaternions xyzw, v pointing down, column-major matrices, came
 trimesh writes neither skins nor animations; `pipeline.io.glb` reads what is written here.
 """
 
-import json
 import math
-import struct
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
 
-from pipeline.body.body import Body, Motion
+from pipeline.avatar.rig import Rig
+from pipeline.body.body import Motion
 from pipeline.geometry.camera import Camera
-from pipeline.geometry.rotation import continuous_quaternions, matrix_to_quaternion
+from pipeline.geometry.rotation import continuous_quaternions, matrix_to_quaternion, quaternion_to_matrix
+from pipeline.io.glb_writer import GlbWriter
 
-_FLOAT, _U8, _U16, _U32 = 5126, 5121, 5123, 5125
 _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
-_ACCESSOR_TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
-_COMPONENT_TYPES = {"float32": _FLOAT, "uint8": _U8, "uint16": _U16, "uint32": _U32}
 _MIN_ANIMATED_ANGLE_RAD = 1e-4
+_MIN_ROTATION_RAD = 1e-6
 _MIN_NORM = 1e-12
 _MAX_JOINTS = 1 << 16
 
@@ -66,63 +64,20 @@ class MaterialMaps:
     unlit: bool = False
 
 
-@dataclass
-class _GlbBuilder:
-    """Accumulates the JSON chunk and the binary chunk of a .glb."""
-
-    json: dict[str, Any] = field(default_factory=dict)
-    binary: bytearray = field(default_factory=bytearray)
-
-    def add(self, kind: str, value: dict[str, Any]) -> int:
-        """Append an object to a top-level array such as "nodes"; return its index."""
-        self.json.setdefault(kind, []).append(value)
-        return len(self.json[kind]) - 1
-
-    def add_bytes(self, data: bytes, target: int | None = None) -> int:
-        """Append a buffer view, aligned to 4 bytes; return its index."""
-        self.binary.extend(b"\0" * (-len(self.binary) % 4))
-        view = {"buffer": 0, "byteOffset": len(self.binary), "byteLength": len(data)}
-        self.binary.extend(data)
-        return self.add("bufferViews", view | ({"target": target} if target else {}))
-
-    def add_array(self, values: np.ndarray, target: int | None = None, bounds: bool = False) -> int:
-        """Append an accessor, one element per row; `bounds` adds min and max. Return its index."""
-        values = np.ascontiguousarray(values)
-        accessor: dict[str, Any] = {
-            "bufferView": self.add_bytes(values.tobytes(), target),
-            "componentType": _COMPONENT_TYPES[values.dtype.name],
-            "count": len(values),
-            "type": _ACCESSOR_TYPES[values[0].size],
-        }
-        if bounds:
-            rows = values.reshape(len(values), -1)
-            accessor |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
-        return self.add("accessors", accessor)
-
-    def to_bytes(self) -> bytes:
-        """Return the whole file; the JSON chunk is padded with spaces, the binary chunk with zeros."""
-        self.json["buffers"] = [{"byteLength": len(self.binary)}]
-        text = json.dumps(self.json, separators=(",", ":"), ensure_ascii=True).encode()
-        text += b" " * (-len(text) % 4)
-        binary = bytes(self.binary) + b"\0" * (-len(self.binary) % 4)
-        chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
-        return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
-
-
 def encode_glb(
     mesh: SkinnedMesh,
-    body: Body,
-    motion: Motion,
+    rig: Rig,
+    clips: Mapping[str, Motion],
     maps: MaterialMaps,
     camera: Camera | None = None,
     extras: Mapping[str, Any] | None = None,
 ) -> bytes:
-    """Encode one skinned mesh at the scene root, the body's joints and the motion (animation "capture") as a .glb.
+    """Encode one skinned mesh at the scene root, the joints and the clips (animations, by name) as a .glb.
 
     Args:
-        mesh: in the bind pose of `body`.
-        body: joint names, parents and rest positions.
-        motion: in the frame of the scene (+Y up, floor at y = 0); key times are its `time_s`.
+        mesh: in the rest pose of `rig`.
+        rig: joint names, axes and rest pose.
+        clips: in the frame of the scene (+Y up, floor at y = 0); key times are their `time_s`.
         maps: material.
         camera: capture camera, written as a node, so that the filmed images can be shown as a background.
         extras: contents of `asset.extras`.
@@ -131,21 +86,23 @@ def encode_glb(
         ValueError: more than 65536 joints (indices have 16 bits), no frame, times that do not increase, a value that is
             not finite, or a zero quaternion.
     """
-    if len(body.joint_names) > _MAX_JOINTS:
-        raise ValueError(f"glTF joint indices have 16 bits: {len(body.joint_names)} joints exceed {_MAX_JOINTS}")
-    _check_motion(motion)
-    document = _GlbBuilder()
+    if len(rig.joint_names) >= _MAX_JOINTS:
+        raise ValueError(f"glTF joint indices have 16 bits: {len(rig.joint_names)} joints exceed {_MAX_JOINTS}")
+    for motion in clips.values():
+        _check_motion(motion)
+    document = GlbWriter()
     document.json["asset"] = {"version": "2.0", "generator": "instant-human-mesh"}
     if extras:
         document.json["asset"]["extras"] = dict(extras)
     first_joint = 1
-    document.json |= {"scene": 0, "scenes": [{"name": "scene", "nodes": [0, first_joint]}]}
     material = _add_material(document, maps)
-    primitive = _add_primitive(document, mesh, len(body.joint_names)) | {"material": material}
+    primitive = _add_primitive(document, mesh, len(rig.joint_names)) | {"material": material}
     document.add("meshes", {"name": "avatar", "primitives": [primitive]})
     document.add("nodes", {"name": "avatar", "mesh": 0, "skin": 0})
-    _add_skeleton(document, body, first_joint)
-    _add_animation(document, motion, first_joint)
+    skeleton_root = _add_skeleton(document, rig, first_joint)
+    document.json |= {"scene": 0, "scenes": [{"name": "scene", "nodes": [0, skeleton_root]}]}
+    for name, motion in clips.items():
+        _add_animation(document, name, motion, rig, first_joint)
     if camera is not None:
         document.json["scenes"][0]["nodes"].append(_add_camera(document, camera))
     return document.to_bytes()
@@ -170,7 +127,7 @@ def _check_motion(motion: Motion) -> None:
         raise ValueError("an animation needs quaternions of non-zero length")
 
 
-def _add_primitive(document: _GlbBuilder, mesh: SkinnedMesh, joint_count: int) -> dict[str, Any]:
+def _add_primitive(document: GlbWriter, mesh: SkinnedMesh, joint_count: int) -> dict[str, Any]:
     joints = mesh.joint_indices.astype(np.uint8 if joint_count <= 256 else np.uint16)
     uv = np.stack([mesh.uv[:, 0], 1.0 - mesh.uv[:, 1]], axis=1).astype(np.float32)
     # 65535 is the primitive restart value of 16-bit indices and is not allowed as an index
@@ -185,7 +142,7 @@ def _add_primitive(document: _GlbBuilder, mesh: SkinnedMesh, joint_count: int) -
     return {"attributes": attributes, "indices": document.add_array(faces.reshape(-1), _ELEMENT_ARRAY_BUFFER)}
 
 
-def _add_material(document: _GlbBuilder, maps: MaterialMaps) -> int:
+def _add_material(document: GlbWriter, maps: MaterialMaps) -> int:
     document.add("samplers", {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071})
     surface = {
         "name": "avatar",
@@ -205,36 +162,46 @@ def _add_material(document: _GlbBuilder, maps: MaterialMaps) -> int:
     return document.add("materials", surface | {"extensions": extensions})
 
 
-def _add_texture(document: _GlbBuilder, name: str, png: bytes) -> int:
+def _add_texture(document: GlbWriter, name: str, png: bytes) -> int:
     view = document.add_bytes(png)
     image = document.add("images", {"name": name, "mimeType": "image/png", "bufferView": view})
     return document.add("textures", {"name": name, "source": image, "sampler": 0})
 
 
-def _add_skeleton(document: _GlbBuilder, body: Body, first_joint: int) -> None:
-    """Add joint nodes without rotation or scale: the rest pose is the bind pose, inverse bind is a translation."""
-    children: list[list[int]] = [[] for _ in body.joint_names]
-    for joint, parent in enumerate(body.parents):
+def _add_skeleton(document: GlbWriter, rig: Rig, first_joint: int) -> int:
+    """Add the joint nodes in the rest pose, which is the bind pose, without scale; return the node of the root."""
+    count, root = len(rig.joint_names), first_joint
+    children: list[list[int]] = [[] for _ in rig.joint_names]
+    for joint, parent in enumerate(rig.body.parents):
         if parent >= 0:
             children[parent].append(first_joint + joint)
-    for joint, (name, parent) in enumerate(zip(body.joint_names, body.parents, strict=True)):
-        origin = body.joints_m[parent] if parent >= 0 else np.zeros(3)
-        node: dict[str, Any] = {"name": name, "translation": _float_list(body.joints_m[joint] - origin)}
+    local = rig.local_rest_matrices()
+    rotations_wxyz = matrix_to_quaternion(torch.from_numpy(local[:, :3, :3])).numpy()
+    is_turned = _angle_rad(rotations_wxyz) > _MIN_ROTATION_RAD
+    for joint, name in enumerate(rig.joint_names):
+        node: dict[str, Any] = {"name": name, "translation": _float_list(local[joint, :3, 3])}
+        if is_turned[joint]:
+            node["rotation"] = _float_list(rotations_wxyz[joint, [1, 2, 3, 0]])
         document.add("nodes", node | ({"children": children[joint]} if children[joint] else {}))
-    inverse_bind = np.tile(np.eye(4, dtype=np.float32), (len(body.joints_m), 1, 1))
-    inverse_bind[:, 3, :3] = -body.joints_m  # column-major: the translation is the last row of the array
-    document.add(
-        "skins",
-        {
-            "name": "skeleton",
-            "inverseBindMatrices": document.add_array(inverse_bind.reshape(-1, 16)),
-            "joints": [first_joint + joint for joint in range(len(body.joint_names))],
-            "skeleton": first_joint,
-        },
-    )
+    inverse_bind = np.linalg.inv(rig.rest_matrices()).astype(np.float32)
+    inverse_bind[:, 3] = (0.0, 0.0, 0.0, 1.0)
+    joints = [first_joint + joint for joint in range(count)]
+    if rig.root_name is not None:
+        root = document.add("nodes", {"name": rig.root_name, "children": [first_joint]})
+        joints.append(root)
+        inverse_bind = np.concatenate([inverse_bind, np.eye(4, dtype=np.float32)[None]])
+    columns = inverse_bind.transpose(0, 2, 1).reshape(-1, 16)
+    skin = {"inverseBindMatrices": document.add_array(columns), "joints": joints, "skeleton": root}
+    document.add("skins", {"name": "skeleton", **skin})
+    return root
 
 
-def _add_animation(document: _GlbBuilder, motion: Motion, first_joint: int) -> None:
+def _angle_rad(rotations_wxyz: np.ndarray) -> np.ndarray:
+    return 2.0 * np.arctan2(np.linalg.norm(rotations_wxyz[..., 1:], axis=-1), np.abs(rotations_wxyz[..., 0]))
+
+
+def _add_animation(document: GlbWriter, name: str, motion: Motion, rig: Rig, first_joint: int) -> None:
+    """Add a clip; joints that stay in the rest pose have no channel."""
     times = document.add_array(motion.time_s.astype(np.float32), bounds=True)
     samplers: list[dict[str, Any]] = []
     channels: list[dict[str, Any]] = []
@@ -244,16 +211,17 @@ def _add_animation(document: _GlbBuilder, motion: Motion, first_joint: int) -> N
         channels.append({"sampler": len(samplers) - 1, "target": {"node": node, "path": path}})
 
     add_channel(first_joint, "translation", motion.root_translation_m.astype(np.float32))
-    continuous = continuous_quaternions(torch.from_numpy(motion.rotations_wxyz.astype(np.float64))).numpy()
+    rest = rig.local_rest_matrices()[:, :3, :3]
+    continuous = continuous_quaternions(torch.from_numpy(rig.local_rotations_wxyz(motion).astype(np.float64))).numpy()
     for joint in range(continuous.shape[1]):
         rotations = continuous[:, joint] / np.linalg.norm(continuous[:, joint], axis=1, keepdims=True)
-        angle = 2.0 * np.arctan2(np.linalg.norm(rotations[:, 1:], axis=1), np.abs(rotations[:, 0]))
-        if angle.max() > _MIN_ANIMATED_ANGLE_RAD:
+        from_rest = quaternion_to_matrix(torch.from_numpy(rotations)).numpy() @ rest[joint].T
+        if _angle_rad(matrix_to_quaternion(torch.from_numpy(from_rest)).numpy()).max() > _MIN_ANIMATED_ANGLE_RAD:
             add_channel(first_joint + joint, "rotation", rotations[:, [1, 2, 3, 0]].astype(np.float32))
-    document.add("animations", {"name": "capture", "samplers": samplers, "channels": channels})
+    document.add("animations", {"name": name, "samplers": samplers, "channels": channels})
 
 
-def _add_camera(document: _GlbBuilder, camera: Camera) -> int:
+def _add_camera(document: GlbWriter, camera: Camera) -> int:
     """Add the camera as a node.
 
     glTF cameras have a centred principal point; the full intrinsics are written to the extras of the node.

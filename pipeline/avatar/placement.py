@@ -1,12 +1,14 @@
-"""Place the avatar in its scene: origin on the floor, at the median position of the root."""
+"""Place the avatar in its scene: origin on the floor, at the median position of the root; times of its motion."""
 
 from dataclasses import replace
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
 from pipeline.body.body import Motion
 from pipeline.geometry.camera import Camera
+from pipeline.geometry.rotation import slerp
 
 FLOOR_PERCENTILE = 10.0
 
@@ -54,3 +56,20 @@ def pad_motion_to_video(motion: Motion, frame_rate: float, video_frame_count: in
         time_s = np.r_[time_s, time_s[-1] + missing_frame_count / frame_rate]
     padded_motion = motion.select(rows)
     return replace(padded_motion, frame_index=frames.astype(np.int32), time_s=time_s.astype(motion.time_s.dtype))
+
+
+def resample_uniformly(motion: Motion, fps: float) -> Motion:
+    """Return the motion at `fps` frames per second from its first to its last frame; rotations take the shorter arc."""
+    start_s, end_s = float(motion.time_s[0]), float(motion.time_s[-1])
+    time_s = start_s + np.arange(int(np.floor((end_s - start_s) * fps + 1e-6)) + 1) / fps
+    after = np.clip(np.searchsorted(motion.time_s, time_s, side="right"), 1, max(len(motion.time_s) - 1, 1))
+    before, after = after - 1, np.minimum(after, len(motion.time_s) - 1)
+    span_s = np.maximum(motion.time_s[after] - motion.time_s[before], 1e-9)
+    fraction = np.clip((time_s - motion.time_s[before]) / span_s, 0.0, 1.0)
+    rotations = torch.from_numpy(motion.rotations_wxyz.astype(np.float64))
+    step = torch.from_numpy(fraction)[:, None, None].expand(*rotations[before].shape[:2], 1)
+    between = slerp(rotations[before], rotations[after], step)
+    root_m = motion.root_translation_m.astype(np.float64)
+    place_m = root_m[before] + fraction[:, None] * (root_m[after] - root_m[before])
+    index = np.arange(len(time_s), dtype=np.int32)
+    return Motion(index, time_s, between.numpy().astype(np.float32), place_m.astype(np.float32))

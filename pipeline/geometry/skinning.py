@@ -13,6 +13,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pipeline.geometry.rotation import matrix_to_quaternion
+
 
 def rigid_transform(rotation: Float[Tensor, "*n 3 3"], translation: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 4 4"]:
     """Return homogeneous matrices of rotations and translations (m)."""
@@ -53,6 +55,15 @@ def forward_kinematics(
         world = world[:, torch.from_numpy(ancestor).to(device)] @ world
         ancestor = ancestor[ancestor]
     return world[:, :count]
+
+
+def local_quaternions(world: Float[np.ndarray, "n j 3 3"], parents: Int[np.ndarray, "j"]) -> Float[np.ndarray, "n j 4"]:
+    """Return the rotations (wxyz) of joints relative to their parents; of a root (parent -1), relative to the world."""
+    local = world.copy()
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            local[:, joint] = world[:, parent].transpose(0, 2, 1) @ world[:, joint]
+    return matrix_to_quaternion(torch.from_numpy(local)).numpy().astype(np.float32)
 
 
 def skinning_transforms(

@@ -33,6 +33,7 @@ class Primitive:
 
     Attributes:
         positions: in the space of the file's inverse bind matrices.
+        normals: of unit length; zeros if the file has none.
         uv: origin top-left, as in glTF; zeros if the file has none.
         joints: indices into the joint list of `skin`.
         weights: one row per vertex; rows sum to 1.
@@ -42,6 +43,7 @@ class Primitive:
     """
 
     positions: Float[np.ndarray, "v 3"]
+    normals: Float[np.ndarray, "v 3"]
     uv: Float[np.ndarray, "v 2"]
     joints: Int[np.ndarray, "v 4"]
     weights: Float[np.ndarray, "v 4"]
@@ -51,7 +53,7 @@ class Primitive:
 
 
 class GlbFile:
-    """A .glb file in memory: `gltf` is its JSON tree; methods read arrays and images from its binary chunk."""
+    """A .glb file in memory: `gltf` is its JSON tree, `binary` the chunk from which methods read arrays and images."""
 
     def __init__(self, path: Path) -> None:
         """Read the file.
@@ -77,7 +79,32 @@ class GlbFile:
             raise UserError(
                 f"{path} requires the extension {', '.join(sorted(unsupported))}; export it again without compression"
             )
-        self._binary = chunks.get(_BINARY_CHUNK, b"")
+        self.binary = chunks.get(_BINARY_CHUNK, b"")
+
+    def stored_array(self, index: int) -> np.ndarray:
+        """Return the values of an accessor as they are stored, shape (count, components), without conversion.
+
+        A sparse accessor without a buffer view is 0 where it has no values.
+
+        Raises:
+            UserError: the file does not hold its values.
+        """
+        try:
+            accessor = self.gltf["accessors"][index]
+            count, width = accessor["count"], _N_COMPONENTS[accessor["type"]]
+            if "sparse" not in accessor:
+                return self._view_array(accessor, accessor["componentType"], count, width)
+            sparse, dtype = accessor["sparse"], _COMPONENT_DTYPES[accessor["componentType"]]
+            values: np.ndarray = np.zeros((count, width), dtype)
+            if "bufferView" in accessor:
+                values[:] = self._view_array(accessor, accessor["componentType"], count, width)
+            rows = self._view_array(sparse["indices"], sparse["indices"]["componentType"], sparse["count"], 1)[:, 0]
+            values[rows] = self._view_array(sparse["values"], accessor["componentType"], sparse["count"], width)
+            return values
+        except (LookupError, TypeError, ValueError):
+            raise UserError(
+                f"{self.path} is damaged: the values of accessor {index} are missing; export it again"
+            ) from None
 
     def accessor(self, index: int) -> np.ndarray:
         """Return the values of an accessor, shape (count, components).
@@ -85,23 +112,11 @@ class GlbFile:
         Floats are float32, integers int64. Normalised integers become float32 in [-1, 1] or [0, 1].
 
         Raises:
-            UserError: the accessor is sparse, or the file does not hold its values.
+            UserError: the file does not hold its values.
         """
-        try:
-            accessor = self.gltf["accessors"][index]
-            if "sparse" in accessor:
-                raise UserError(f"{self.path}: accessor {index} is sparse; export the file without sparse accessors")
-            view = self.gltf["bufferViews"][accessor["bufferView"]]
-            kind, width = np.dtype(_COMPONENT_DTYPES[accessor["componentType"]]), _N_COMPONENTS[accessor["type"]]
-            start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-            stride = view.get("byteStride", kind.itemsize * width)
-            shape, strides = (accessor["count"], width), (stride, kind.itemsize)
-            values: np.ndarray = np.ndarray(shape, kind, self._binary, start, strides)
-        except (LookupError, TypeError, ValueError):
-            raise UserError(
-                f"{self.path} is damaged: the values of accessor {index} are missing; export it again"
-            ) from None
-        if accessor.get("normalized"):
+        values = self.stored_array(index)
+        kind = values.dtype
+        if self.gltf["accessors"][index].get("normalized"):
             return np.maximum(values.astype(np.float32) / np.iinfo(kind).max, -1.0)
         return values.astype(np.float32 if kind.kind == "f" else np.int64)
 
@@ -112,7 +127,14 @@ class GlbFile:
             raise UserError(f"{self.path}: image {index} is an external file; export the .glb with embedded images")
         view = self.gltf["bufferViews"][image["bufferView"]]
         start = view.get("byteOffset", 0)
-        return self._binary[start : start + view["byteLength"]]
+        return self.binary[start : start + view["byteLength"]]
+
+    def image_pixels(self, index: int) -> UInt8[np.ndarray, "h w c"]:
+        """Return an embedded image with the channels of its file (RGB or RGBA). UserError as `image_bytes`."""
+        pixels = cv2.imdecode(np.frombuffer(self.image_bytes(index), np.uint8), cv2.IMREAD_UNCHANGED)
+        if pixels is None or pixels.ndim != 3 or pixels.dtype != np.uint8:
+            raise UserError(f"{self.path}: image {index} has not 8-bit colours; export it as PNG or JPEG")
+        return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
 
     def node_to_world(self) -> Float[np.ndarray, "n 4 4"]:
         """Return the rest-pose matrix of every node."""
@@ -156,14 +178,23 @@ class GlbFile:
             raise UserError(f"{self.path} holds an image that is neither PNG nor JPEG; export it as PNG or JPEG")
         return np.rint(self._decode_image(texture["source"]) * factor).astype(np.uint8)
 
+    def _view_array(self, owner: dict[str, Any], component_type: int, count: int, width: int) -> np.ndarray:
+        """Return the rows in the buffer view of an accessor or of a part of a sparse one."""
+        view, kind = self.gltf["bufferViews"][owner["bufferView"]], np.dtype(_COMPONENT_DTYPES[component_type])
+        start = view.get("byteOffset", 0) + owner.get("byteOffset", 0)
+        stride = view.get("byteStride", kind.itemsize * width)
+        return np.ndarray((count, width), kind, self.binary, start, (stride, kind.itemsize))
+
     def _primitive(self, primitive: dict[str, Any], skin: int) -> Primitive:
         names = primitive["attributes"]
         positions = self.accessor(names["POSITION"]).astype(np.float32)
         indices = self.accessor(primitive["indices"]) if "indices" in primitive else np.arange(len(positions))
         weights = self.accessor(names["WEIGHTS_0"])
         uv = self.accessor(names["TEXCOORD_0"]) if "TEXCOORD_0" in names else np.zeros((len(positions), 2), np.float32)
+        normals = self.accessor(names["NORMAL"]).astype(np.float32) if "NORMAL" in names else np.zeros_like(positions)
         return Primitive(
             positions,
+            normals,
             uv,
             self.accessor(names["JOINTS_0"]),
             weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-9),

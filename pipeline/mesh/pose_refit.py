@@ -27,8 +27,8 @@ from pipeline.body.fit.linear_body import (
     merge_skin_weights,
     reduced_parents,
 )
-from pipeline.body.fit.posture import Posture, tie_to_posture
-from pipeline.body.fit.priors import (
+from pipeline.body.fit.prior.posture import Posture, tie_to_posture
+from pipeline.body.fit.prior.priors import (
     ShapePrior,
     estimate_motion_std,
     pose_prior,
@@ -156,14 +156,11 @@ def select_poses(use_first: Bool[np.ndarray, "n"], first: Motion, second: Motion
 
 def _energy_parameters(settings: FitSettings) -> EnergyParameters:
     """Return the parameters of a fit of poses alone to landmarks and outlines."""
-    return EnergyParameters(
+    return replace(
+        EnergyParameters.from_settings(settings),
         landmark_std_m=settings.silhouette_landmark_std_m,
         hand_std_m=settings.fitted_hand_std_m,
-        single_landmark_std_m=settings.landmark_std_m,
-        landmark_cutoff=settings.landmark_cutoff,
         landmark_3d_std_m=settings.silhouette_landmark_3d_std_m,
         contour_std_m=settings.avatar_contour_std_m,
-        contour_cutoff=settings.contour_cutoff,
-        motion_cutoff=settings.motion_cutoff,
         free_shape=False,
     )

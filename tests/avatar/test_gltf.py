@@ -11,6 +11,7 @@ import trimesh
 from scipy.spatial.transform import Rotation, Slerp
 
 from pipeline.avatar.gltf import MaterialMaps, encode_glb, pack_specular_factor
+from pipeline.avatar.rig import build_rig
 from pipeline.body.body import canonical_to_world
 from pipeline.geometry.camera import project
 from pipeline.geometry.skinning import linear_blend_skinning
@@ -33,8 +34,8 @@ def encoded(**changes: object) -> bytes:
     body = sample_body()
     parts = {
         "mesh": sample_skinned_mesh(body)[0],
-        "body": body,
-        "motion": sample_motion(FRAMES),
+        "rig": build_rig(body),
+        "clips": {"capture": sample_motion(FRAMES)},
         "maps": sample_maps(),
         "camera": sample_camera(),
         "extras": {"unit": "metre"},
@@ -189,7 +190,7 @@ def test_the_specular_factor_is_in_alpha() -> None:
 
 def test_times_must_increase() -> None:
     with pytest.raises(ValueError, match="increase"):
-        encoded(motion=sample_motion(np.array([0, 5, 5])))
+        encoded(clips={"capture": sample_motion(np.array([0, 5, 5]))})
 
 
 @pytest.mark.parametrize("name", ["time_s", "rotations_wxyz", "root_translation_m"])
@@ -197,20 +198,20 @@ def test_values_that_are_not_finite_are_refused(name: str) -> None:
     values = getattr(sample_motion(FRAMES), name).copy()
     values[-1] = np.nan if name != "time_s" else np.inf
     with pytest.raises(ValueError, match="finite"):
-        encoded(motion=replace(sample_motion(FRAMES), **{name: values}))
+        encoded(clips={"capture": replace(sample_motion(FRAMES), **{name: values})})
 
 
 def test_zero_quaternions_are_refused() -> None:
     motion = sample_motion(FRAMES)
     motion.rotations_wxyz[3, 1] = 0.0
     with pytest.raises(ValueError, match="non-zero length"):
-        encoded(motion=motion)
+        encoded(clips={"capture": motion})
 
 
 def test_more_than_65536_joints_are_refused() -> None:
     names = tuple(map(str, range(65537)))
     with pytest.raises(ValueError, match="65537"):
-        encoded(body=replace(sample_body(), joint_names=names))
+        encoded(rig=replace(build_rig(sample_body()), joint_names=names))
 
 
 def test_a_zero_normal_points_up(tmp_path: Path) -> None:

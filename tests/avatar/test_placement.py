@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.avatar.placement import pad_motion_to_video, world_to_scene_translation_m
+from pipeline.avatar.placement import pad_motion_to_video, resample_uniformly, world_to_scene_translation_m
 from pipeline.body.body import Motion
 
 
@@ -45,3 +45,18 @@ def test_frames_keep_the_times_of_a_video_of_variable_frame_rate() -> None:
 def test_a_complete_motion_is_not_padded(frames: list[int]) -> None:
     padded = pad_motion_to_video(motion_at(frames, np.eye(3)), frame_rate=30.0, video_frame_count=frames[-1] + 1)
     np.testing.assert_array_equal(padded.frame_index, frames)
+
+
+def test_an_uneven_motion_is_sampled_along_lines_and_arcs() -> None:
+    """Constant speed and constant rotation about y, at uneven times: the values at even times are known."""
+    time_s = np.array([0.0, 0.1, 0.35, 0.5])
+    half = 0.5 * 2.0 * time_s
+    rotations = np.stack([np.cos(half), 0 * half, np.sin(half), 0 * half], axis=1).astype(np.float32)[:, None]
+    rotations[2] *= -1  # the same rotation
+    motion = Motion(np.array([0, 1, 2, 3]), time_s, rotations, np.outer(time_s, [1, 2, 3]).astype(np.float32))
+    even = resample_uniformly(motion, 10.0)
+    expected_s = np.arange(6) / 10.0
+    np.testing.assert_allclose(even.time_s, expected_s, atol=1e-9)
+    np.testing.assert_allclose(even.root_translation_m, np.outer(expected_s, [1, 2, 3]), atol=1e-6)
+    np.testing.assert_allclose(np.abs(even.rotations_wxyz[:, 0, 2]), np.sin(expected_s), atol=1e-6)
+    assert len(resample_uniformly(motion.select(np.array([1])), 10.0).time_s) == 1

@@ -109,7 +109,7 @@ def test_required_extensions_are_named(box_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda tree: tree["accessors"][0].update(sparse={"count": 1}), "accessor 0 is sparse"),
+        (lambda tree: tree["accessors"][0].update(sparse={"count": 1}), "values of accessor 0 are missing"),
         (lambda tree: tree["accessors"][0].pop("bufferView"), "values of accessor 0 are missing"),
         (lambda tree: tree["accessors"][0].update(count=10**6), "values of accessor 0 are missing"),
         (lambda tree: tree["accessors"][0].update(componentType=1), "values of accessor 0 are missing"),

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.avatar.gltf import encode_glb
+from pipeline.avatar.rig import build_rig
 from pipeline.capture.frame_selection import INTERLEAVED_RULE
 from pipeline.core.manifest import Manifest
 from pipeline.report.page import FrameImages, PageContent
@@ -57,5 +58,5 @@ def sample_page() -> PageContent:
         frames=[FrameImages(index, video, field, mesh) for index in (0, 8)],
         turntable=[("A-pose", views)],
         images=[("Diffuse map", video)],
-        glb=encode_glb(sample_skinned_mesh(body)[0], body, motion, sample_maps()),
+        glb=encode_glb(sample_skinned_mesh(body)[0], build_rig(body), {"capture": motion}, sample_maps()),
     )

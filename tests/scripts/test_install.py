@@ -66,5 +66,5 @@ def test_extras_come_from_the_project_file() -> None:
         "snakemake-executor-plugin-slurm",
         "snakemake-storage-plugin-fs",
     ]
-    with pytest.raises(SystemExit, match="cuda, cluster, dev"):
+    with pytest.raises(SystemExit, match="cuda, cluster, usdz, web, dev"):
         install.extra_packages("gpu")

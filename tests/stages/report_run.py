@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from pipeline.avatar.gltf import encode_glb
+from pipeline.avatar.rig import build_rig
 from pipeline.avatar.textured_avatar import TexturedAvatar
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.files import save_body, save_camera, save_motion
@@ -42,7 +43,7 @@ def make_run(folder: Path) -> dict[str, Path]:
     _write_body(inputs["body"], body, motion)
     _write_field(inputs["field"], body, motion)
     _write_mesh_and_texture(inputs["mesh"], inputs["texture"], avatar, motion)
-    glb = encode_glb(sample_skinned_mesh(body)[0], body, motion, sample_maps())
+    glb = encode_glb(sample_skinned_mesh(body)[0], build_rig(body), {"capture": motion}, sample_maps())
     (inputs["export"] / "avatar.glb").write_bytes(glb)
     metrics = {"body": {"landmark_error_px": 3.5, "silhouette_iou": 0.9}}
     for number, (name, path) in enumerate(inputs.items(), start=1):

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from pydantic import ValidationError
 
 from pipeline.body.body import canonical_to_world
 from pipeline.geometry.atlas import Atlas
@@ -132,9 +133,55 @@ def test_highlights_become_a_specular_factor_unless_the_surface_is_unlit(
     assert materials == [({"KHR_materials_specular"}, 2), ({"KHR_materials_unlit"}, 1)]
 
 
+def test_further_formats_are_written_and_the_glb_stays(
+    inputs: dict[str, Path], exported: tuple[Path, dict[str, float]], tmp_path: Path
+) -> None:
+    config = EXPORT.config(formats="vrm, lod", author="A. Person")
+    assert config.formats == ("vrm", "lod")
+    EXPORT.run(inputs, tmp_path, config)
+    made = {path.name for path in tmp_path.iterdir()}
+    assert made == {*EXPORT.makes, "avatar.vrm", "avatar_lod1.glb", "avatar_lod2.glb"}
+    assert (tmp_path / "avatar.glb").read_bytes() == (exported[0] / "avatar.glb").read_bytes()
+    assert GlbFile(tmp_path / "avatar.vrm").gltf["extensions"]["VRMC_vrm"]["meta"]["authors"] == ["A. Person"]
+
+
+@pytest.mark.parametrize("formats", ["fbx", ["vrm", "glb"], 3])
+def test_unknown_formats_are_refused(formats: object) -> None:
+    with pytest.raises(ValidationError, match="formats"):
+        EXPORT.config(formats=formats)
+
+
+def test_a_format_without_its_package_is_refused_before_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.avatar.formats.write.find_spec", lambda module: None)
+    with pytest.raises(ValidationError, match="EXTRA=usdz"):
+        EXPORT.config(formats=["vrm", "usdz"])
+
+
 @pytest.mark.parametrize("unlit", [False, True])
 def test_the_khronos_validator_accepts_a_specular_map(unlit: bool, inputs: dict[str, Path], tmp_path: Path) -> None:
     specular = shutil.copytree(inputs["texture"], tmp_path / "texture")
     write_gray(specular / "specular.png", np.full((TEXTURE_PX, TEXTURE_PX), 9, dtype=np.uint8))
     EXPORT.run(inputs | {"texture": specular}, tmp_path, EXPORT.config(unlit=unlit))
     assert validator_issues(tmp_path / "avatar.glb") == []
+
+
+def test_the_t_pose_is_that_of_both_files_and_the_clips_are_the_same(
+    scene: PaintedScene, inputs: dict[str, Path], exported: tuple[Path, dict[str, float]], tmp_path: Path
+) -> None:
+    EXPORT.run(inputs, tmp_path, EXPORT.config(rest_pose="t", rig="unreal"))
+    player, other = Player(tmp_path / "avatar.glb"), Player(exported[0] / "avatar.glb")
+    positions = player.array(player.json["meshes"][0]["primitives"][0]["attributes"]["POSITION"])
+    lines = (tmp_path / "avatar.obj").read_text().splitlines()
+    obj = np.array([line.split()[1:] for line in lines if line.startswith("v ")], dtype=float)
+    atlas = load_texture(inputs["texture"]).atlas
+    np.testing.assert_allclose(positions, obj[atlas.vertex_of_uv], atol=2e-6)
+    assert np.ptp(positions[:, 0]) > np.ptp(scene.body.vertices[:, 0]) + 0.3
+    assert [animation["name"] for animation in player.json["animations"]] == ["capture", "idle"]
+    assert validator_issues(tmp_path / "avatar.glb") == []
+    time_s = scene.motion.time_s[FRAME]
+    for one, two in (("pelvis", "Hips"), ("hand_l", "LeftHand"), ("foot_r", "RightFoot")):
+        places = [
+            file.global_matrix([node.get("name") for node in file.json["nodes"]].index(name), time_s)[:3, 3]
+            for file, name in ((player, one), (other, two))
+        ]
+        np.testing.assert_allclose(*places, atol=2e-5)

@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
 
+from pipeline.avatar.feet import snap_feet_to_floor
 from pipeline.body.body import Body, Motion
 from pipeline.geometry.rotation import (
     axis_angle_to_quaternion,
@@ -12,7 +12,6 @@ from pipeline.geometry.rotation import (
     quaternion_multiply,
     quaternion_to_matrix,
 )
-from pipeline.geometry.skinning import forward_kinematics
 
 JointAngles = dict[str, tuple[float, float, float]]
 """Axis-angle (radians, canonical axes) by joint name; other joints have the identity rotation."""
@@ -146,20 +145,6 @@ def bend_at_hips(body: Body, motion: Motion, bend_deg: float) -> Motion:
     return motion.with_pose(rotations.float().numpy(), (motion.root_translation_m + shift_m.numpy()).astype(np.float32))
 
 
-def snap_feet_to_floor(body: Body, motion: Motion, floor_y_m: float) -> Motion:
-    """Translate each frame vertically so that the lowest foot joint has its A-pose height above the floor."""
-    root = motion.root_translation_m.copy()
-    root[:, 1] += floor_y_m - lowest_foot_offset_m(body, motion)
-    return motion.with_pose(motion.rotations_wxyz, root)
-
-
-def lowest_foot_offset_m(body: Body, motion: Motion) -> Float[np.ndarray, "n"]:
-    """Return the height of the lowest foot joint (ankle, ball of the foot) relative to its height in the A-pose."""
-    joint_to_world = _joint_to_world(body, motion.rotations_wxyz, motion.root_translation_m)
-    feet = [body.joint(side + part) for side in ("Left", "Right") for part in ("Foot", "ToeBase")]
-    return (joint_to_world[:, feet, 1, 3].numpy() - body.joints_m[feet, 1]).min(axis=1)
-
-
 def _smooth_random_signals(
     time_s: np.ndarray, period_s: float, random: np.random.Generator
 ) -> Float[np.ndarray, "n 3"]:
@@ -224,8 +209,3 @@ def _motion_on_ground(
         root_translation_m=root.astype(np.float32),
     )
     return snap_feet_to_floor(body, motion, float(ground_m[1]))
-
-
-def _joint_to_world(body: Body, rotations_wxyz: np.ndarray, root_m: np.ndarray) -> Float[Tensor, "n j 4 4"]:
-    matrices = quaternion_to_matrix(torch.from_numpy(rotations_wxyz))
-    return forward_kinematics(matrices, torch.from_numpy(root_m), torch.from_numpy(body.joints_m), body.parents)

@@ -7,17 +7,17 @@ from pathlib import Path
 import numpy as np
 
 from data_tools.synthetic.person.noise import ValueNoise
-from data_tools.synthetic.rig.bvh import read_bvh
-from data_tools.synthetic.rig.retarget import resample_motion, retarget
 from data_tools.synthetic.rig.subject import Subject
 from data_tools.synthetic.scene.backdrop import Room, make_room
 from data_tools.synthetic.scene.ball import Ball
 from data_tools.synthetic.scene.capture import HeldOutTargets, SyntheticCapture, novel_cameras, portrait_camera
 from data_tools.synthetic.scene.motion import bend_at_hips, novel_motion, turn_in_a_pose
 from data_tools.synthetic.scene.renderer import LIGHTING_PRESETS
+from pipeline.avatar.retarget import resample_motion, retarget
 from pipeline.body.body import Body, Motion
 from pipeline.core.errors import UserError
 from pipeline.geometry.camera import Camera
+from pipeline.io.bvh import read_bvh
 from pipeline.io.image import to_float, to_uint8
 
 LIGHT_HELP = (

@@ -17,8 +17,8 @@ from pipeline.body.fit.landmark_regressor import (
 from pipeline.body.fit.levenberg_marquardt import NormalEquations
 from pipeline.body.fit.linear_body import LinearBody
 from pipeline.body.fit.posed_points import pose_points, pose_skeleton
-from pipeline.body.fit.posture import Posture, estimate_posture
-from pipeline.body.fit.priors import PosePrior, ShapePrior
+from pipeline.body.fit.prior.posture import Posture, estimate_posture
+from pipeline.body.fit.prior.priors import PosePrior, ShapePrior
 from pipeline.body.fit.root_placement import world_to_perspective
 from pipeline.body.fit.state import FitState, Observations
 from pipeline.body.fit.terms import (
@@ -76,6 +76,23 @@ class EnergyParameters:
     free_landmark_offsets: bool = False
     free_focal: bool = False
     free_principal_point: bool = False
+
+    @staticmethod
+    def from_settings(settings: FitSettings) -> "EnergyParameters":
+        """Return the parameters of a fit to landmarks alone, with an unknown stature."""
+        return EnergyParameters(
+            landmark_std_m=settings.landmark_std_m,
+            hand_std_m=settings.hand_std_m,
+            single_landmark_std_m=settings.landmark_std_m,
+            landmark_cutoff=settings.landmark_cutoff,
+            landmark_3d_std_m=settings.landmark_3d_std_m,
+            contour_std_m=settings.contour_std_m,
+            contour_cutoff=settings.contour_cutoff,
+            motion_cutoff=settings.motion_cutoff,
+            landmark_offset_std_m=settings.landmark_offset_std_m,
+            height_m=settings.mean_stature_m,
+            height_std_m=settings.mean_stature_std_m,
+        )
 
     def landmark_stds_m(self) -> Float[Tensor, "l"]:
         """Return the standard deviation of each landmark in the image, metres at the depth of the person."""

@@ -28,8 +28,8 @@ from pipeline.body.fit.left_right_swaps import (
 )
 from pipeline.body.fit.levenberg_marquardt import NormalEquations, minimise, shared_covariance
 from pipeline.body.fit.linear_body import LinearBody, linearise_body, relaxed_curls_rad
-from pipeline.body.fit.posture import Posture, tie_to_posture, unknown_posture
-from pipeline.body.fit.priors import (
+from pipeline.body.fit.prior.posture import Posture, tie_to_posture, unknown_posture
+from pipeline.body.fit.prior.priors import (
     PosePrior,
     ShapePrior,
     estimate_motion_std,
@@ -185,7 +185,7 @@ def fit_supplied_poses(
     observations, left_right_swapped = _correct_left_right_swaps(observations, rest_landmarks_m)
     left_right_swapped = {sides: rows & to_fit for sides, rows in left_right_swapped.items()}
     if to_fit.any():
-        parameters = _with_silhouettes(_energy_parameters(settings), settings)
+        parameters = _with_silhouettes(EnergyParameters.from_settings(settings), settings)
         posture = unknown_posture(context.pose_prior)
         state, _, _ = _fit_poses(context, observations, windows, state, parameters, posture)
     if keep:
@@ -223,23 +223,6 @@ def _build_context(body: ParametricBody, curls_rad: Float[np.ndarray, "2 4"], se
     )
 
 
-def _energy_parameters(settings: FitSettings) -> EnergyParameters:
-    """Return the parameters of a fit to landmarks alone, with an unknown stature."""
-    return EnergyParameters(
-        landmark_std_m=settings.landmark_std_m,
-        hand_std_m=settings.hand_std_m,
-        single_landmark_std_m=settings.landmark_std_m,
-        landmark_cutoff=settings.landmark_cutoff,
-        landmark_3d_std_m=settings.landmark_3d_std_m,
-        contour_std_m=settings.contour_std_m,
-        contour_cutoff=settings.contour_cutoff,
-        motion_cutoff=settings.motion_cutoff,
-        landmark_offset_std_m=settings.landmark_offset_std_m,
-        height_m=settings.mean_stature_m,
-        height_std_m=settings.mean_stature_std_m,
-    )
-
-
 def _with_silhouettes(parameters: EnergyParameters, settings: FitSettings) -> EnergyParameters:
     """Return the parameters with less weight of the landmarks, whose errors are larger and correlated."""
     return replace(
@@ -270,7 +253,7 @@ def _fit_shared(
 ) -> tuple[FitState, EnergyParameters, NormalEquations, Posture]:
     """Fit the shared parameters and the poses of these frames; return last normal equations and posture as well."""
     settings = options.settings
-    parameters = _energy_parameters(settings)
+    parameters = EnergyParameters.from_settings(settings)
     if options.height_m is not None:
         parameters = replace(parameters, height_m=options.height_m, height_std_m=settings.known_stature_std_m)
     state, _ = _fit_landmarks(context, context.default, observations, parameters, state, settings.landmark_steps)

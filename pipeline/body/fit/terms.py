@@ -32,7 +32,7 @@ from pipeline.body.fit.posed_points import (
     shape_jacobian_rows,
     surface_points,
 )
-from pipeline.body.fit.priors import (
+from pipeline.body.fit.prior.priors import (
     PosePrior,
     ShapePrior,
     acceleration_factors,

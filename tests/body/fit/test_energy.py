@@ -10,7 +10,7 @@ from pipeline.body.fit.initialisation import solve_root_position
 from pipeline.body.fit.landmark_regressor import LANDMARK_COUNT, LANDMARK_OFFSET_COUNT, landmark_regressor
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS, linearise_body
 from pipeline.body.fit.posed_points import pose_skeleton
-from pipeline.body.fit.priors import pose_prior, shape_prior
+from pipeline.body.fit.prior.priors import pose_prior, shape_prior
 from pipeline.body.fit.silhouette_icp import match_silhouettes
 from pipeline.body.fit.state import FitState
 from pipeline.body.fit.terms import (

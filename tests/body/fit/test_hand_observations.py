@@ -30,7 +30,7 @@ from pipeline.body.fit.linear_body import (
     relaxed_curls_rad,
 )
 from pipeline.body.fit.posed_points import pose_points, pose_skeleton
-from pipeline.body.fit.priors import pose_prior, shape_prior
+from pipeline.body.fit.prior.priors import pose_prior, shape_prior
 from pipeline.body.settings import FitSettings
 from pipeline.body.smpl import SmplBody
 from pipeline.capture.hand_detector import N_HAND_LANDMARKS, HandLandmarks, undetected_hands

@@ -7,13 +7,16 @@ import numpy as np
 import pytest
 import torch
 
-from data_tools.synthetic.rig.bvh import read_bvh
-from data_tools.synthetic.rig.retarget import retarget
 from data_tools.synthetic.scene.motion import NOVEL_POSES
+from pipeline.avatar.retarget import retarget
 from pipeline.body.body import load_anny
 from pipeline.body.fit.camera_parameters import INTRINSICS_COUNT
 from pipeline.body.fit.energy import EnergyParameters, Objective
-from pipeline.body.fit.joint_limits import (
+from pipeline.body.fit.landmark_regressor import LANDMARK_COUNT, LANDMARK_OFFSET_COUNT, landmark_regressor
+from pipeline.body.fit.levenberg_marquardt import minimise
+from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody, linearise_body
+from pipeline.body.fit.posed_points import pose_points, pose_skeleton
+from pipeline.body.fit.prior.joint_limits import (
     BALL_JOINT_RANGES_DEG,
     LIMIT_STD_RAD,
     JointLimits,
@@ -21,15 +24,12 @@ from pipeline.body.fit.joint_limits import (
     strip_side,
     swing_twist,
 )
-from pipeline.body.fit.landmark_regressor import LANDMARK_COUNT, LANDMARK_OFFSET_COUNT, landmark_regressor
-from pipeline.body.fit.levenberg_marquardt import minimise
-from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody, linearise_body
-from pipeline.body.fit.posed_points import pose_points, pose_skeleton
-from pipeline.body.fit.priors import pose_prior, shape_prior
+from pipeline.body.fit.prior.priors import pose_prior, shape_prior
 from pipeline.body.fit.state import FitState, Observations
 from pipeline.body.smpl import SmplBody
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.rotation import axis_angle_to_matrix, matrix_to_quaternion, quaternion_to_matrix
+from pipeline.io.bvh import read_bvh
 from tests.body.smpl_sample import sample_arrays
 
 MIRROR = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)

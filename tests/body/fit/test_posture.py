@@ -5,14 +5,14 @@ import torch
 
 from pipeline.body.body import load_anny
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS, linearise_body
-from pipeline.body.fit.posture import (
+from pipeline.body.fit.prior.posture import (
     MIN_SPREAD_RAD,
     estimate_posture,
     frames_per_posture,
     most_likely_posture,
     tie_to_posture,
 )
-from pipeline.body.fit.priors import PosePrior, pose_prior, tilt_of_hips
+from pipeline.body.fit.prior.priors import PosePrior, pose_prior, tilt_of_hips
 from pipeline.geometry.rotation import axis_angle_to_matrix
 
 FRAMES = 400

@@ -4,7 +4,7 @@ import torch
 
 from pipeline.body.body import load_anny
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS, linearise_body
-from pipeline.body.fit.priors import (
+from pipeline.body.fit.prior.priors import (
     MIN_MOTION_RATIO,
     REFERENCE_INTERVAL_S,
     PosePrior,

@@ -14,8 +14,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.body.body import SCALE
-from pipeline.body.fit.joint_limits import JointLimits, hinge_axes, joint_limits, strip_side
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody
+from pipeline.body.fit.prior.joint_limits import JointLimits, hinge_axes, joint_limits, strip_side
 from pipeline.geometry.rotation import matrix_to_quaternion, quaternion_to_axis_angle
 
 REFERENCE_INTERVAL_S = 1.0 / 30.0

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from data_tools.synthetic.rig.bvh import BvhMotion, read_bvh
 from pipeline.core.errors import UserError
+from pipeline.io.bvh import MAX_FRAMES, BvhMotion, read_bvh, write_bvh
 
 ARM = """HIERARCHY
 ROOT Hips
@@ -97,3 +97,41 @@ def test_real_files(name: str, frames: int, fps: float, shared_data: Path) -> No
     assert len(bvh_motion.rotations) == frames
     assert bvh_motion.fps == pytest.approx(fps, rel=1e-3)
     assert np.allclose(bvh_motion.rotations @ bvh_motion.rotations.transpose(0, 1, 3, 2), np.eye(3), atol=1e-9)
+
+
+def test_what_is_written_is_read_back(bvh_motion: BvhMotion, tmp_path: Path) -> None:
+    write_bvh(tmp_path / "again.bvh", bvh_motion)
+    again = read_bvh(tmp_path / "again.bvh")
+    assert again.joint_names == bvh_motion.joint_names
+    assert again.parents.tolist() == bvh_motion.parents.tolist()
+    assert again.fps == pytest.approx(bvh_motion.fps, rel=1e-6)
+    np.testing.assert_allclose(again.offsets, bvh_motion.offsets, atol=1e-6)
+    np.testing.assert_allclose(again.rotations, bvh_motion.rotations, atol=1e-7)
+    np.testing.assert_allclose(again.root_positions, bvh_motion.root_positions, atol=1e-6)
+
+
+def test_joints_are_written_depth_first_and_get_an_end_site(tmp_path: Path) -> None:
+    """The second child of the root comes after the descendants of the first."""
+    rotations = Rotation.from_euler("XYZ", np.arange(12.0).reshape(4, 3), degrees=True).as_matrix()[None]
+    offsets = np.array([[0.0, 1, 0], [2, 0, 0], [0, 4, 0], [6, 0, 0]])
+    motion = BvhMotion(("Root", "A", "B", "A1"), np.array([-1, 0, 0, 1]), offsets, rotations, np.zeros((1, 3)), 30.0)
+    write_bvh(tmp_path / "tree.bvh", motion)
+    read = read_bvh(tmp_path / "tree.bvh")
+    assert read.joint_names == ("Root", "A", "A1", "A1_end", "B", "B_end")
+    assert read.offsets[[3, 5]].tolist() == [[3, 0, 0], [0, 2, 0]]
+    np.testing.assert_allclose(read.rotations[0, [0, 1, 4, 2]], rotations[0], atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("Frames: 2", "Frames: 10000000"), f"10000000 frames; supply a clip of 1 to {MAX_FRAMES}"),
+        (("Frames: 2", "Frames: 0"), "0 frames"),
+        (("Time: 0.04", "Time: 0"), "not a complete BVH"),
+        (("5 6 7", "5 nan 7"), "not finite"),
+    ],
+)
+def test_unusable_clips_are_errors(change: tuple[str, str], words: str, tmp_path: Path) -> None:
+    (tmp_path / "bad.bvh").write_text(ARM.replace(*change))
+    with pytest.raises(UserError, match=rf"bad\.bvh.*{words}"):
+        read_bvh(tmp_path / "bad.bvh")

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pipeline.body.fit.priors import PosePrior, inverse_left_jacobian_so3, rotation_to_axis_angle, tilt_of_hips
+from pipeline.body.fit.prior.priors import PosePrior, inverse_left_jacobian_so3, rotation_to_axis_angle, tilt_of_hips
 
 MIN_SPREAD_RAD, MAX_SPREAD_RAD, SPREADS = 0.01, 1.0, 41
 """Range and number of the spreads tried: whoever stands as still as possible sways by half a degree."""

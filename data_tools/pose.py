@@ -1,0 +1,179 @@
+"""Play motion capture on the avatar of a finished run, or pose it.
+
+python -m data_tools.pose RUN [--bvh CLIP.bvh ...] [--frame 12 | --pose a|t|POSE.json] [--name NAME]
+
+Writes RUN/pose/NAME/: capture.bvh, the motion of the video with standing feet held in place; with --bvh also
+avatar.glb, the avatar with each clip as a further animation; with --frame or --pose also avatar.obj, the posed mesh.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+
+from data_tools.command import run_command
+from data_tools.folder import replaced_folder
+from pipeline.avatar.bvh_export import motion_to_bvh
+from pipeline.avatar.feet import find_contacts, plant_feet, snap_feet_to_floor, sole_positions_m
+from pipeline.avatar.idle import idle_motion
+from pipeline.avatar.placement import resample_uniformly
+from pipeline.avatar.retarget import recorded_contacts, retarget
+from pipeline.avatar.rig import build_rig
+from pipeline.body.body import Body, Motion, canonical_to_world
+from pipeline.core.errors import UserError
+from pipeline.core.manifest import read_manifest
+from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.skinning import linear_blend_skinning, local_quaternions
+from pipeline.io.bvh import read_bvh, write_bvh
+from stages import export
+from stages.export import Scene, encode_scene, load_scene, write_scene_obj
+
+FLOOR_M = np.zeros(3)
+
+
+def main(argv: Sequence[str]) -> None:
+    """Write the clips and poses of one command."""
+    options = _parse_options(argv)
+    inputs = {name: options.run / name for name in export.STAGE.needs}
+    config = _export_config(options.run)
+    scene = load_scene(inputs, config)
+    clips = _retargeted_clips(options.bvh, scene.body, options.in_place)
+    posed = _chosen_pose(options, scene, clips)
+    with replaced_folder(options.run / "pose" / _result_name(options)) as out:
+        write_bvh(out / "capture.bvh", motion_to_bvh(scene.rig, planted_motion(scene), scene.fps))
+        if clips:
+            every_clip = {"capture": scene.motion, "idle": idle_motion(scene.body), **clips}
+            (out / "avatar.glb").write_bytes(encode_scene(scene, config, every_clip))
+        if posed is not None:
+            write_scene_obj(inputs["texture"], out, scene.texture, _posed_mesh(scene, posed))
+        written = sorted(path.name for path in out.iterdir() if path.suffix in (".bvh", ".glb", ".obj"))
+    print(f"{options.run / 'pose' / _result_name(options)}: {', '.join(written)}")
+
+
+def planted_motion(scene: Scene) -> Motion:
+    """Return the motion of the video at its frame rate, with standing feet held where they were."""
+    motion = resample_uniformly(scene.motion, scene.fps)
+    contact = find_contacts(sole_positions_m(scene.body, motion), motion.time_s)
+    return plant_feet(scene.body, motion, contact, float(FLOOR_M[1]))
+
+
+def play_bvh(path: Path, body: Body, in_place: bool = False) -> Motion:
+    """Return a recorded motion of the body on the floor at y = 0, with feet that stand where the recorded feet stand.
+
+    in_place: remove the horizontal translation; feet are then not held.
+
+    Raises:
+        UserError: the file is not a BVH file, lacks a required joint, or has fewer than two frames.
+    """
+    recorded = read_bvh(path)
+    if len(recorded.rotations) < 2:
+        raise UserError(f"motion {path} has one frame and no duration; supply a clip of at least two frames")
+    try:
+        motion = retarget(recorded, body, FLOOR_M, in_place)
+        return motion if in_place else plant_feet(body, motion, recorded_contacts(recorded, body), float(FLOOR_M[1]))
+    except UserError as error:
+        raise UserError(f"motion {path}: {error}") from error
+
+
+def read_pose(path: Path, body: Body) -> Float32[np.ndarray, "1 j 4"]:
+    """Read local rotations from the A-pose: a JSON object with a quaternion [w, x, y, z] by Mixamo's joint name.
+
+    Raises:
+        UserError: the file cannot be read, a joint is unknown or a value is not a quaternion.
+    """
+    rotations = np.tile(np.array([1.0, 0.0, 0.0, 0.0], dtype=np.float32), (1, len(body.joint_names), 1))
+    try:
+        poses = json.loads(path.read_text(encoding="utf-8"))
+        entries = {str(name): np.asarray(values, dtype=np.float32) for name, values in poses.items()}
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        raise UserError(f'pose {path} is not a JSON object such as {{"LeftArm": [1, 0, 0, 0]}} ({error})') from error
+    for name, quaternion in entries.items():
+        if name not in body.joint_names:
+            raise UserError(f"pose {path}: there is no joint {name}; use Mixamo's names, such as {body.joint_names[1]}")
+        if quaternion.shape != (4,) or not np.isfinite(quaternion).all() or not np.linalg.norm(quaternion) > 0:
+            raise UserError(f"pose {path}: {name} needs a quaternion of four numbers w, x, y, z that are not all 0")
+        rotations[0, body.joint(name)] = quaternion / np.linalg.norm(quaternion)
+    return rotations
+
+
+def _parse_options(argv: Sequence[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m data_tools.pose", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("run", type=Path, help="run folder with a finished export")
+    parser.add_argument("--bvh", type=Path, action="append", default=[], help="clip to play; repeatable")
+    parser.add_argument("--in-place", action="store_true", help="remove the horizontal movement of the clips")
+    pose = parser.add_mutually_exclusive_group()
+    pose.add_argument("--frame", type=int, help="pose of this frame of the video, or of the clip if there is one")
+    pose.add_argument("--pose", help="a, t, or a JSON file with a quaternion [w, x, y, z] by joint name")
+    parser.add_argument("--name", help="of the folder RUN/pose/NAME; default: that of the clip or pose")
+    return parser.parse_args(argv)
+
+
+def _result_name(options: argparse.Namespace) -> str:
+    """Return the name of the folder: as chosen, or of the first of clip, pose and frame."""
+    if options.name:
+        if Path(options.name).name != options.name or options.name in (".", ".."):
+            raise UserError(f"--name {options.name} is not the name of a folder; remove the slashes")
+        return str(options.name)
+    if options.bvh:
+        return str(options.bvh[0].stem)
+    if options.pose is not None:
+        return Path(options.pose).stem
+    return "capture" if options.frame is None else f"frame-{options.frame}"
+
+
+def _export_config(run: Path) -> export.Config:
+    """Return the options of the finished export stage."""
+    manifest = read_manifest(run / "export")
+    if manifest is None:
+        raise UserError(f"{run} has no finished export; run make export RUN={run}")
+    known = {name: value for name, value in manifest.config.items() if name in export.Config.model_fields}
+    return export.Config(**known)
+
+
+def _retargeted_clips(paths: Sequence[Path], body: Body, in_place: bool) -> dict[str, Motion]:
+    names = [path.stem for path in paths]
+    for name in names:
+        if names.count(name) > 1 or name in ("capture", "idle"):
+            raise UserError(f"there are several clips with the name {name}; rename the file {name}.bvh")
+    return {path.stem: play_bvh(path, body, in_place) for path in paths}
+
+
+def _chosen_pose(options: argparse.Namespace, scene: Scene, clips: Mapping[str, Motion]) -> Motion | None:
+    """Return one frame, or None without --frame and --pose."""
+    if options.frame is not None:
+        if len(clips) > 1:
+            raise UserError("--frame is for one clip; name one --bvh")
+        motion = next(iter(clips.values())) if clips else scene.motion
+        rows = np.flatnonzero(motion.frame_index == options.frame)
+        if not len(rows):
+            last = motion.frame_index[-1]
+            raise UserError(
+                f"frame {options.frame} has no pose; choose one of 0 to {last}"
+                + ("" if clips else ", of those that the frames stage selected")
+            )
+        return motion.select(rows[:1])
+    if options.pose is None:
+        return None
+    if options.pose in ("a", "t"):
+        rig = build_rig(scene.body, rest_pose=options.pose)
+        rotations = local_quaternions(rig.bind_to_rest[None, :, :3, :3], scene.body.parents)
+    else:
+        rotations = read_pose(Path(options.pose), scene.body)
+    motion = Motion(np.zeros(1, np.int32), np.zeros(1), rotations, scene.body.joints_m[:1])
+    return snap_feet_to_floor(scene.body, motion, float(FLOOR_M[1]))
+
+
+def _posed_mesh(scene: Scene, motion: Motion) -> Mesh:
+    mesh = scene.skinned.mesh
+    weights = scene.skinned.dense_skin_weights(len(scene.body.joint_names))
+    transforms = canonical_to_world(scene.body, motion)
+    return Mesh(linear_blend_skinning(torch.from_numpy(mesh.vertices), weights, transforms)[0].numpy(), mesh.faces)
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_command(main, sys.argv[1:]))

@@ -1,0 +1,254 @@
+"""Convert the avatar's .glb to VRM 1.0 or VRM 0.x, the formats of humanoid avatars in VR and streaming programs.
+
+A VRM is a .glb with an extension that names the bones and the licence; its rest pose is a T-pose without animations
+and cameras. VRM 1.0 keeps the mesh in the A-pose and moves only the joints, so that A-poses deform as in the .glb;
+VRM 0.x wants the mesh itself in the T-pose, facing -Z.
+
+The avatar has no morphs, eye bones, skirts' or hair's bones, so the files have no expressions and no spring bones, and
+look-at has only its origin.
+
+References: https://github.com/vrm-c/vrm-specification, VRMC_vrm-1.0 and 0.0.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipeline.avatar.t_pose import t_pose_transforms
+from pipeline.avatar.vrm_bones import human_bones
+from pipeline.io.glb import GlbFile
+from pipeline.io.glb_writer import GlbWriter
+
+VRM_1_LICENCE_URL = "https://vrm.dev/licenses/1.0/"
+GAZE_INPUT_DEG, GAZE_OUTPUT_DEG = 90.0, 10.0
+EYE_IN_HEAD_BOX = (0.61, 0.81)
+"""The eyes in the bounding box of the head: fraction of its height from below, of its depth from behind."""
+
+_FACE_BACKWARDS = np.diag([-1.0, 1.0, -1.0, 1.0])
+_LINEAR_CURVE = [0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0]
+
+
+@dataclass(frozen=True)
+class VrmMeta:
+    """Name, authors and licence of a VRM. What is not stated here is not permitted (the defaults of VRM).
+
+    name: of the avatar. author: who holds the rights, not empty. licence_url: a licence that grants more; may be empty.
+    """
+
+    name: str
+    author: str
+    licence_url: str
+
+
+@dataclass(frozen=True)
+class _RestPose:
+    """Skin joints: nodes, names, parents (-1: root), bind positions, transforms of their rigid parts to the T-pose."""
+
+    nodes: list[int]
+    joint_names: tuple[str, ...]
+    parents: Int[np.ndarray, "j"]
+    joints_m: Float[np.ndarray, "j 3"]
+    bind_to_rest: Float[np.ndarray, "j 4 4"]
+
+
+def encode_vrm1(file: GlbFile, joint_names: Sequence[str], meta: VrmMeta) -> bytes:
+    """Return the avatar as VRM 1.0.
+
+    Args:
+        file: one skinned mesh, facing +Z, +Y up.
+        joint_names: Mixamo's names of the skin's joints, in its order; the nodes may have others. A joint that follows
+            them in the skin, a root above the hips, stays at the origin.
+        meta: name and licence.
+
+    Raises:
+        UserError: the file's arrays cannot be read.
+        ValueError: a bone that VRM requires is missing.
+    """
+    document, rest = GlbWriter.from_file(file), _rest_pose(file, joint_names)
+    inverse_bind = _translations(-_rest_joints_m(rest)) @ rest.bind_to_rest
+    _write_rest_pose(document, rest, inverse_bind)
+    bones = {bone: {"node": rest.nodes[joint]} for bone, joint in human_bones(joint_names, "1.0").items()}
+    gaze = {"inputMaxValue": GAZE_INPUT_DEG, "outputScale": GAZE_OUTPUT_DEG}
+    ranges = ("HorizontalInner", "HorizontalOuter", "VerticalDown", "VerticalUp")
+    extension = {
+        "specVersion": "1.0",
+        "meta": {
+            "name": meta.name,
+            "authors": [meta.author],
+            "licenseUrl": VRM_1_LICENCE_URL,
+            **({"otherLicenseUrl": meta.licence_url} if meta.licence_url else {}),
+        },
+        "humanoid": {"humanBones": bones},
+        "expressions": {"preset": {}},  # none; three-vrm ignores look-at without this key
+        "firstPerson": {"meshAnnotations": [{"node": node, "type": "auto"} for node in _mesh_nodes(document)]},
+        "lookAt": {"type": "bone", "offsetFromHeadBone": _eye_offset_m(file, rest).tolist()}
+        | {f"rangeMap{name}": gaze for name in ranges},
+    }
+    return _encode(document, "VRMC_vrm", extension)
+
+
+def encode_vrm0(file: GlbFile, joint_names: Sequence[str], meta: VrmMeta) -> bytes:
+    """Return the avatar as VRM 0.x: mesh and joints are in the T-pose and turned by 180 degrees about y.
+
+    Arguments and errors as of `encode_vrm1`.
+    """
+    document, rest = GlbWriter.from_file(file), _rest_pose(file, joint_names)
+    turned = _FACE_BACKWARDS @ rest.bind_to_rest
+    rest = _RestPose(rest.nodes, rest.joint_names, rest.parents, rest.joints_m, turned)
+    _bake_mesh(file, document, turned)
+    _write_rest_pose(document, rest, _translations(-_rest_joints_m(rest)))
+    bones = [
+        {"bone": bone, "node": rest.nodes[joint], "useDefaultValues": True}
+        for bone, joint in human_bones(joint_names, "0.x").items()
+    ]
+    gaze = {"curve": _LINEAR_CURVE, "xRange": GAZE_INPUT_DEG, "yRange": GAZE_OUTPUT_DEG}
+    x, y, z = _eye_offset_m(file, rest).tolist()
+    annotations = [{"mesh": mesh, "firstPersonFlag": "Auto"} for mesh in range(len(document.json["meshes"]))]
+    first_person = {
+        "firstPersonBone": rest.nodes[rest.joint_names.index("Head")],
+        "firstPersonBoneOffset": {"x": x, "y": y, "z": -z},  # in Unity's axes, whose z is that of glTF negated
+        "meshAnnotations": annotations,
+        "lookAtTypeName": "Bone",
+    }
+    ranges = ("HorizontalInner", "HorizontalOuter", "VerticalDown", "VerticalUp")
+    licence = {"licenseName": "Other", "otherLicenseUrl": meta.licence_url}
+    extension = {
+        "exporterVersion": document.json["asset"].get("generator", ""),
+        "specVersion": "0.0",
+        "meta": {
+            "title": meta.name,
+            "author": meta.author,
+            "allowedUserName": "OnlyAuthor",
+            "violentUssageName": "Disallow",
+            "sexualUssageName": "Disallow",
+            "commercialUssageName": "Disallow",
+            **(licence if meta.licence_url else {"licenseName": "Redistribution_Prohibited"}),
+        },
+        "humanoid": {"humanBones": bones},
+        "firstPerson": first_person | {f"lookAt{name}": gaze for name in ranges},
+        "blendShapeMaster": {"blendShapeGroups": []},
+        "secondaryAnimation": {"boneGroups": [], "colliderGroups": []},
+        "materialProperties": [_gltf_material(material["name"]) for material in document.json["materials"]],
+    }
+    return _encode(document, "VRM", extension)
+
+
+def _encode(document: GlbWriter, extension_name: str, extension: dict[str, Any]) -> bytes:
+    document.json["extensionsUsed"] = [*document.json.get("extensionsUsed", ()), extension_name]
+    document.json["extensions"] = document.json.get("extensions", {}) | {extension_name: extension}
+    document.json.pop("animations", None)
+    _remove_cameras(document)
+    document.remove_unused()
+    return document.to_bytes()
+
+
+def _rest_pose(file: GlbFile, joint_names: Sequence[str]) -> _RestPose:
+    """Compute the T-pose from the bind pose of the file's skin; the lowest vertex then is at y = 0."""
+    skin, nodes = file.gltf["skins"][0], file.gltf["nodes"]
+    inverse_bind = file.accessor(skin["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
+    joints_m = np.linalg.inv(inverse_bind.astype(np.float64))[:, :3, 3]
+    joint_of_node = {node: joint for joint, node in enumerate(skin["joints"])}
+    parents = np.full(len(joints_m), -1)
+    for node, joint in joint_of_node.items():
+        parents[[joint_of_node[child] for child in nodes[node].get("children", ()) if child in joint_of_node]] = joint
+    names = (*joint_names, *(nodes[node]["name"] for node in skin["joints"][len(joint_names) :]))
+    transforms = t_pose_transforms(names, parents, joints_m)
+    lowest_m = min(_posed(file, primitive, transforms)[:, 1].min() for primitive in _primitives(file))
+    transforms[: len(joint_names), 1, 3] -= lowest_m
+    return _RestPose(skin["joints"], names, parents, joints_m, transforms)
+
+
+def _rest_joints_m(rest: _RestPose) -> Float[np.ndarray, "j 3"]:
+    return np.einsum("jab,jb->ja", rest.bind_to_rest[:, :3, :3], rest.joints_m) + rest.bind_to_rest[:, :3, 3]
+
+
+def _write_rest_pose(document: GlbWriter, rest: _RestPose, inverse_bind: Float[np.ndarray, "j 4 4"]) -> None:
+    """Give the joints' nodes a translation only, and the skin its inverse bind matrices."""
+    joints_m = _rest_joints_m(rest)
+    for joint, (node, parent) in enumerate(zip(rest.nodes, rest.parents, strict=True)):
+        for key in ("rotation", "scale", "matrix"):
+            document.json["nodes"][node].pop(key, None)
+        origin_m = joints_m[parent] if parent >= 0 else np.zeros(3)
+        document.json["nodes"][node]["translation"] = (joints_m[joint] - origin_m).astype(np.float32).tolist()
+    columns = inverse_bind.transpose(0, 2, 1).reshape(-1, 16).astype(np.float32)
+    document.replace_array(document.json["skins"][0]["inverseBindMatrices"], columns)
+
+
+def _bake_mesh(file: GlbFile, document: GlbWriter, transforms: Float[np.ndarray, "j 4 4"]) -> None:
+    """Write the vertices from which the joints' return to the bind pose makes the stored vertices again."""
+    for primitive in _primitives(file):
+        attributes = primitive["attributes"]
+        bind_to_rest = np.linalg.inv(_blended(file, primitive, np.linalg.inv(transforms)))
+        positions_m, normals = (_array(file, primitive, name) for name in ("POSITION", "NORMAL"))
+        positions_m = np.einsum("vab,vb->va", bind_to_rest[:, :3, :3], positions_m) + bind_to_rest[:, :3, 3]
+        normals = np.einsum("vab,vb->va", bind_to_rest[:, :3, :3], normals)
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        document.replace_array(attributes["POSITION"], positions_m.astype(np.float32))
+        document.replace_array(attributes["NORMAL"], normals.astype(np.float32))
+        for index in (index for target in primitive.get("targets", ()) for index in target.values()):
+            moved = np.einsum("vab,vb->va", bind_to_rest[:, :3, :3], file.accessor(index))
+            document.replace_array(index, moved.astype(np.float32))
+
+
+def _posed(file: GlbFile, primitive: dict[str, Any], transforms: Float[np.ndarray, "j 4 4"]) -> np.ndarray:
+    """Return the vertices by linear blend skinning, m."""
+    blended = _blended(file, primitive, transforms)
+    return np.einsum("vab,vb->va", blended[:, :3, :3], _array(file, primitive, "POSITION")) + blended[:, :3, 3]
+
+
+def _blended(file: GlbFile, primitive: dict[str, Any], transforms: Float[np.ndarray, "j 4 4"]) -> np.ndarray:
+    joints, weights = _array(file, primitive, "JOINTS_0"), _array(file, primitive, "WEIGHTS_0")
+    return np.einsum("vk,vkab->vab", weights, transforms[joints])
+
+
+def _array(file: GlbFile, primitive: dict[str, Any], name: str) -> np.ndarray:
+    return file.accessor(primitive["attributes"][name])
+
+
+def _primitives(file: GlbFile) -> list[dict[str, Any]]:
+    return [primitive for mesh in file.gltf["meshes"] for primitive in mesh["primitives"]]
+
+
+def _eye_offset_m(file: GlbFile, rest: _RestPose) -> Float[np.ndarray, "3"]:
+    """Return the position between the eyes relative to the head joint, in the T-pose."""
+    head = rest.joint_names.index("Head")
+    rows = []
+    for primitive in _primitives(file):
+        joints, weights = _array(file, primitive, "JOINTS_0"), _array(file, primitive, "WEIGHTS_0")
+        on_head = (weights * (joints == head)).sum(axis=1) > 0.5
+        rows.append(_array(file, primitive, "POSITION")[on_head])
+    low_m, high_m = np.min(np.concatenate(rows), axis=0), np.max(np.concatenate(rows), axis=0)
+    up, forward = EYE_IN_HEAD_BOX
+    eye_m = np.array([rest.joints_m[head, 0], *(low_m + [0.0, up, forward] * (high_m - low_m))[1:]])
+    return rest.bind_to_rest[head, :3, :3] @ (eye_m - rest.joints_m[head])
+
+
+def _mesh_nodes(document: GlbWriter) -> list[int]:
+    return [index for index, node in enumerate(document.json["nodes"]) if "mesh" in node]
+
+
+def _gltf_material(name: str) -> dict[str, Any]:
+    """Return the entry of VRM 0.x that tells an importer to use the glTF material."""
+    maps: dict[str, Any] = {
+        key: {} for key in ("floatProperties", "vectorProperties", "textureProperties", "keywordMap", "tagMap")
+    }
+    return {"name": name, "shader": "VRM_USE_GLTFSHADER", "renderQueue": 2000} | maps
+
+
+def _remove_cameras(document: GlbWriter) -> None:
+    """Remove the cameras and their nodes, which come last among the nodes (`pipeline.avatar.gltf`)."""
+    document.json.pop("cameras", None)
+    nodes = document.json["nodes"]
+    while "camera" in nodes[-1]:
+        nodes.pop()
+    for scene in document.json["scenes"]:
+        scene["nodes"] = [node for node in scene["nodes"] if node < len(nodes)]
+
+
+def _translations(offsets_m: Float[np.ndarray, "j 3"]) -> Float[np.ndarray, "j 4 4"]:
+    matrices = np.tile(np.eye(4), (len(offsets_m), 1, 1))
+    matrices[:, :3, 3] = offsets_m
+    return matrices

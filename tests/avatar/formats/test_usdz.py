@@ -1,0 +1,119 @@
+"""The USDZ, skinned by USD's own implementation and checked by its validators."""
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.avatar.formats.usdz import TIME_CODES_PER_SECOND, write_usdz
+from pipeline.io.glb import GlbFile
+from pipeline.io.glb_writer import GlbWriter
+from tests.avatar.formats.column import FRAMES, add_root_joint, column_glb
+from tests.avatar.test_gltf import Player
+
+pytest.importorskip("pxr", reason="usd-core is not installed: make venv EXTRA=usdz")
+from pxr import Usd, UsdGeom, UsdShade, UsdSkel, UsdValidation, Vt  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def glb(tmp_path_factory: pytest.TempPathFactory) -> GlbFile:
+    return column_glb(tmp_path_factory.mktemp("usdz"))
+
+
+@pytest.fixture(scope="module")
+def path(glb: GlbFile) -> Path:
+    path = glb.path.with_suffix(".usdz")
+    write_usdz(path, glb)
+    return path
+
+
+def skinned_points(stage: Usd.Stage, time_code: float) -> np.ndarray:
+    cache = UsdSkel.Cache()
+    cache.Populate(UsdSkel.Root(stage.GetDefaultPrim()), Usd.PrimDefaultPredicate)
+    skeleton = cache.GetSkelQuery(UsdSkel.Skeleton(stage.GetPrimAtPath("/Avatar/Skeleton")))
+    mesh = stage.GetPrimAtPath("/Avatar/Mesh")
+    points = Vt.Vec3fArray(UsdGeom.Mesh(mesh).GetPointsAttr().Get())
+    transforms = skeleton.ComputeSkinningTransforms(time_code)
+    assert cache.GetSkinningQuery(mesh).ComputeSkinnedPoints(transforms, points, time_code)
+    return np.array(points)
+
+
+@pytest.mark.parametrize("frame", [0, 3, 10])
+def test_usd_poses_the_mesh_as_a_gltf_viewer_does(glb: GlbFile, path: Path, frame: int) -> None:
+    stage, time_s = Usd.Stage.Open(str(path)), float(FRAMES[frame]) / 25.0
+    posed = skinned_points(stage, time_s * TIME_CODES_PER_SECOND)
+    np.testing.assert_allclose(posed, Player(glb.path).posed_vertices(time_s), atol=2e-6)
+
+
+def test_the_clip_has_the_length_of_the_gltf(path: Path) -> None:
+    stage = Usd.Stage.Open(str(path))
+    seconds = (stage.GetEndTimeCode() - stage.GetStartTimeCode()) / stage.GetTimeCodesPerSecond()
+    assert seconds == pytest.approx(FRAMES[-1] / 25.0)
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
+    assert UsdGeom.GetStageUpAxis(stage) == "Y"
+
+
+def test_texture_coordinates_and_texture(glb: GlbFile, path: Path) -> None:
+    stage = Usd.Stage.Open(str(path))
+    coordinates = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/Avatar/Mesh")).GetPrimvar("st").Get()
+    uv = glb.skinned_primitives()[0].uv
+    np.testing.assert_allclose(np.array(coordinates), np.c_[uv[:, 0], 1.0 - uv[:, 1]], atol=1e-7)
+    with zipfile.ZipFile(path) as package:
+        assert package.read("diffuse.png") == glb.image_bytes(0)
+    bound = UsdShade.MaterialBindingAPI(stage.GetPrimAtPath("/Avatar/Mesh")).ComputeBoundMaterial()[0]
+    surface = bound.ComputeSurfaceSource()[0]
+    assert surface.GetInput("diffuseColor").GetConnectedSource()[0].GetPath().name == "Diffuse"
+    assert surface.GetInput("roughness").Get() == pytest.approx(0.9)
+
+
+def test_the_package_is_stored_aligned_and_starts_with_the_stage(path: Path) -> None:
+    with zipfile.ZipFile(path) as package:
+        members = package.infolist()
+    assert [member.filename for member in members] == ["avatar.usdc", "diffuse.png"]
+    data = path.read_bytes()
+    for member in members:
+        assert member.compress_type == zipfile.ZIP_STORED
+        name, extra = (int.from_bytes(data[member.header_offset + at :][:2], "little") for at in (26, 28))
+        assert (member.header_offset + 30 + name + extra) % 64 == 0
+
+
+def test_usd_finds_no_fault(path: Path) -> None:
+    context = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators())
+    assert [error.GetMessage() for error in context.Validate(Usd.Stage.Open(str(path)))] == []
+
+
+def test_the_same_avatar_gives_the_same_bytes(glb: GlbFile, path: Path, tmp_path: Path) -> None:
+    write_usdz(tmp_path / "again.usdz", glb)
+    assert (tmp_path / "again.usdz").read_bytes() == path.read_bytes()
+
+
+def test_a_root_joint_that_comes_last_in_the_skin_is_first_in_usd(glb: GlbFile, tmp_path: Path) -> None:
+    rooted = add_root_joint(glb)
+    write_usdz(tmp_path / "rooted.usdz", rooted)
+    stage = Usd.Stage.Open(str(tmp_path / "rooted.usdz"))
+    joints = UsdSkel.Skeleton(stage.GetPrimAtPath("/Avatar/Skeleton")).GetJointsAttr().Get()
+    assert list(joints) == ["root", "root/Hips", "root/Hips/Spine", "root/Hips/Spine/Head"]
+    time_s = float(FRAMES[3]) / 25.0
+    posed = skinned_points(stage, time_s * TIME_CODES_PER_SECOND)
+    np.testing.assert_allclose(posed, Player(glb.path).posed_vertices(time_s), atol=2e-6)
+
+
+def test_without_a_clip_it_is_the_rest_pose(glb: GlbFile, tmp_path: Path) -> None:
+    document = GlbWriter.from_file(glb)
+    del document.json["animations"]
+    (tmp_path / "still.glb").write_bytes(document.to_bytes())
+    write_usdz(tmp_path / "still.usdz", GlbFile(tmp_path / "still.glb"))
+    posed = skinned_points(Usd.Stage.Open(str(tmp_path / "still.usdz")), 0.0)
+    np.testing.assert_allclose(posed, glb.skinned_primitives()[0].positions, atol=1e-6)
+
+
+def test_an_unlit_surface_emits_its_colour(glb: GlbFile, tmp_path: Path) -> None:
+    document = GlbWriter.from_file(glb)
+    document.json["materials"][0]["extensions"] = {"KHR_materials_unlit": {}}
+    (tmp_path / "unlit.glb").write_bytes(document.to_bytes())
+    write_usdz(tmp_path / "unlit.usdz", GlbFile(tmp_path / "unlit.glb"))
+    stage = Usd.Stage.Open(str(tmp_path / "unlit.usdz"))
+    surface = UsdShade.Shader(stage.GetPrimAtPath("/Avatar/Material/Surface"))
+    assert surface.GetInput("emissiveColor").HasConnectedSource()
+    assert tuple(surface.GetInput("diffuseColor").Get()) == (0.0, 0.0, 0.0)

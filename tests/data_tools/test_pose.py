@@ -1,0 +1,160 @@
+"""The command pose on a run with known mesh and motion."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from data_tools.pose import main, planted_motion, read_pose
+from pipeline.avatar.feet import joint_positions_m
+from pipeline.body.body import canonical_to_world
+from pipeline.core.errors import UserError
+from pipeline.core.manifest import Manifest, digest_files, write_manifest
+from pipeline.geometry.atlas import Atlas
+from pipeline.geometry.skinning import linear_blend_skinning
+from pipeline.io.bvh import read_bvh
+from pipeline.io.glb import GlbFile
+from pipeline.texture.files import TextureArtifact, save_texture
+from stages.export import STAGE, Config, load_scene
+from tests.field.scene import PaintedScene, painted_scene
+from tests.stages.painted_run import make_run
+from tests.tools.khronos import validator_issues
+
+
+@pytest.fixture(scope="module")
+def scene() -> PaintedScene:
+    return painted_scene(frames=6, height_px=32)
+
+
+@pytest.fixture
+def run(scene: PaintedScene, tmp_path: Path) -> Path:
+    """A run whose export is finished, in the names of Mixamo."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    make_run(folder, scene.body, scene.motion, scene.camera, scene.images, scene.masks)
+    faces = scene.body.faces
+    uv = np.random.default_rng(0).uniform(size=(len(scene.body.vertices), 2)).astype(np.float32)
+    atlas = Atlas(uv, faces.astype(np.int32), np.arange(len(uv), dtype=np.int32))
+    blank = np.zeros((16, 16), dtype=np.uint8)
+    (folder / "texture").mkdir()
+    save_texture(
+        folder / "texture", TextureArtifact(atlas, np.ones((16, 16, 3), np.float32), blank.astype(np.float32), blank)
+    )
+    (folder / "export").mkdir()
+    config = Config(rig="mixamo").model_dump()
+    manifest = Manifest("export", STAGE.version, "", config, {}, {}, {}, 0.0, 0.0)
+    write_manifest(manifest, folder / "export" / "manifest.json")
+    return folder
+
+
+def load(run: Path, **options: str):
+    return load_scene({name: run / name for name in STAGE.needs}, Config(**options))
+
+
+@pytest.fixture
+def clip(run: Path, tmp_path: Path) -> Path:
+    """The motion of the video as a clip."""
+    main([str(run)])
+    return (run / "pose" / "capture" / "capture.bvh").rename(tmp_path / "wave.bvh")
+
+
+def test_the_motion_of_the_video_as_bvh_is_that_of_the_avatar(run: Path) -> None:
+    main([str(run)])
+    scene = load(run, rig="mixamo")
+    bvh = read_bvh(run / "pose" / "capture" / "capture.bvh")
+    _, positions = bvh.forward_kinematics(bvh.rotations)
+    names = [bvh.joint_names.index(name) for name in scene.rig.joint_names]
+    joints_m = 0.01 * (positions + bvh.root_positions[:, None])[:, names]
+    np.testing.assert_allclose(joints_m, joint_positions_m(scene.body, planted_motion(scene)), atol=2e-5)
+    assert bvh.fps == pytest.approx(scene.fps, rel=1e-5)
+
+
+def test_clips_become_animations_and_the_export_keeps_its_bytes(run: Path, clip: Path, tmp_path: Path) -> None:
+    before = digest_files(run / "export")
+    other = tmp_path / "again.bvh"
+    other.write_bytes(clip.read_bytes())
+    main([str(run), "--bvh", str(clip), "--bvh", str(other)])
+    glb = GlbFile(run / "pose" / "wave" / "avatar.glb")
+    assert [animation["name"] for animation in glb.gltf["animations"]] == ["capture", "idle", "wave", "again"]
+    assert glb.gltf["nodes"][1]["name"] == "mixamorig:Hips"
+    assert validator_issues(run / "pose" / "wave" / "avatar.glb") == []
+    assert digest_files(run / "export") == before
+
+
+def test_a_frame_is_the_posed_mesh_of_that_frame(run: Path, scene: PaintedScene) -> None:
+    main([str(run), "--frame", "3"])
+    loaded = load(run)
+    motion = loaded.motion.select(loaded.motion.frame_index == 3)
+    weights = loaded.skinned.dense_skin_weights(len(scene.body.joint_names))
+    vertices = torch.from_numpy(loaded.skinned.mesh.vertices)
+    expected = linear_blend_skinning(vertices, weights, canonical_to_world(scene.body, motion))[0].numpy()
+    written = trimesh.load(run / "pose" / "frame-3" / "avatar.obj", process=False, maintain_order=True)
+    np.testing.assert_allclose(np.sort(written.vertices, axis=0), np.sort(expected, axis=0), atol=2e-6)
+    assert (run / "pose" / "frame-3" / "avatar.mtl").is_file()
+
+
+def test_poses_by_name_and_by_file(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "bow.json").write_text(json.dumps({"Spine": [0.9, 0.4358899, 0, 0]}))
+    for pose in ("a", "t", str(tmp_path / "bow.json")):
+        main([str(run), "--pose", pose])
+    heights, widths = {}, {}
+    for name in ("a", "t", "bow"):
+        size = np.ptp(trimesh.load(run / "pose" / name / "avatar.obj").vertices, axis=0)
+        widths[name], heights[name] = size[0], size[1]
+    assert widths["t"] > widths["a"] + 0.2
+    assert heights["bow"] < heights["a"] - 0.05
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--bvh", "none.bvh"], "none.bvh does not exist"),
+        (["--frame", "99"], "frame 99 has no pose; choose one of 0 to"),
+        (["--pose", "none.json"], "none.json is not a JSON object"),
+        (["--name", "../export"], "is not the name of a folder"),
+    ],
+)
+def test_bad_input_is_one_sentence_and_writes_nothing(arguments: list[str], words: str, run: Path) -> None:
+    before = sorted(path.name for path in run.rglob("*"))
+    with pytest.raises(UserError, match=words):
+        main([str(run), *arguments])
+    assert sorted(path.name for path in run.rglob("*")) == before
+
+
+def test_a_clip_without_hips_or_of_one_frame_is_named(run: Path, clip: Path, tmp_path: Path) -> None:
+    text = clip.read_text()
+    lines = text.splitlines()
+    start = next(row for row, line in enumerate(lines) if line.startswith("Frames:"))
+    (tmp_path / "legs.bvh").write_text(text.replace("mixamorig:Hips", "Tail"))
+    (tmp_path / "one.bvh").write_text("\n".join([*lines[:start], "Frames: 1", lines[start + 1], lines[start + 2]]))
+    for name, words in (("legs", "no joint for Hips"), ("one", "one frame")):
+        with pytest.raises(UserError, match=rf"{name}\.bvh.*{words}"):
+            main([str(run), "--bvh", str(tmp_path / f"{name}.bvh")])
+    with pytest.raises(UserError, match="several clips with the name wave"):
+        main([str(run), "--bvh", str(clip), "--bvh", str(clip)])
+    assert not (run / "pose" / "legs").exists()
+
+
+def test_poses_of_unknown_joints_or_without_four_numbers_are_errors(scene: PaintedScene, tmp_path: Path) -> None:
+    for content, words in (({"Tail": [1, 0, 0, 0]}, "no joint Tail"), ({"Spine": [0, 0, 0, 0]}, "not all 0"), ([], "")):
+        (tmp_path / "pose.json").write_text(json.dumps(content))
+        with pytest.raises(UserError, match=words):
+            read_pose(tmp_path / "pose.json", scene.body)
+
+
+def test_without_an_export_the_next_command_is_named(run: Path) -> None:
+    (run / "export" / "manifest.json").unlink()
+    with pytest.raises(UserError, match="run make export RUN="):
+        main([str(run)])
+
+
+def test_an_uneven_motion_is_sampled_evenly(run: Path) -> None:
+    loaded = load(run)
+    uneven = loaded.motion.select(np.array([0, 1, 4, 5]))
+    motion = planted_motion(replace(loaded, motion=uneven))
+    np.testing.assert_allclose(np.diff(motion.time_s), 1.0 / loaded.fps, rtol=1e-9)
+    assert motion.time_s[-1] == pytest.approx(uneven.time_s[-1], abs=0.5 / loaded.fps)

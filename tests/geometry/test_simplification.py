@@ -1,0 +1,64 @@
+"""Fewer faces on a column whose texture coordinates are a formula of the position."""
+
+import numpy as np
+import pytest
+
+from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.simplification import ReducedFaces, collapse_textured_edges
+from pipeline.geometry.surface import closest_points_on_mesh
+from tests.avatar.formats.column import ALONG, AROUND, column_mesh
+
+FULL = column_mesh()
+SEAM = np.isclose(FULL.uv[:, 0] % 1.0, 0.0)
+
+
+@pytest.fixture(scope="module", params=[0.5, 0.25])
+def reduced(request: pytest.FixtureRequest) -> ReducedFaces:
+    count = round(request.param * len(FULL.faces))
+    made = collapse_textured_edges(FULL.positions_m, FULL.uv, FULL.faces, count)
+    assert abs(len(made.faces) - count) <= 2
+    return made
+
+
+def test_texture_coordinates_are_those_of_the_vertex(reduced: ReducedFaces) -> None:
+    """Where a vertex of the seam was collapsed onto a neighbour, the corners behind the seam keep the seam's own."""
+    difference = np.abs(reduced.uv - FULL.uv[reduced.source_vertex])
+    difference[:, 0] = np.minimum(difference[:, 0], 1.0 - difference[:, 0])
+    assert (difference.max(axis=1) > 1e-6).mean() < 0.05
+    assert difference[:, 0].max() < 4.0 / AROUND
+    assert difference[:, 1].max() < 4.0 / ALONG
+
+
+def test_no_face_spans_the_texture(reduced: ReducedFaces) -> None:
+    """A face that took the wrong side of the seam would show the whole texture mirrored."""
+    assert np.ptp(reduced.uv[reduced.faces][..., 0], axis=1).max() < 0.2
+
+
+def test_the_seam_stays_closed(reduced: ReducedFaces) -> None:
+    positions = FULL.positions_m[reduced.source_vertex]
+    _, welded = np.unique(positions, axis=0, return_inverse=True)
+    faces = welded[reduced.faces]
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    ends = positions[reduced.faces].reshape(-1, 3)[:, 1]
+    _, count = np.unique(edges, axis=0, return_counts=True)
+    assert set(count) == {1, 2}
+    assert 4 < (count == 1).sum() < 2 * AROUND + 2  # only the rims at top and bottom are open
+    assert ends.min() == 0.0
+
+
+def test_the_surface_stays(reduced: ReducedFaces) -> None:
+    mesh = Mesh(FULL.positions_m[reduced.source_vertex], reduced.faces)
+    distance_m, _, _ = closest_points_on_mesh(FULL.positions_m, mesh)
+    assert distance_m.max() < 0.004
+    facing = np.einsum("fa,fa->f", mesh.face_normals(), FULL.normals[reduced.source_vertex[reduced.faces[:, 0]]])
+    area_m2 = mesh.face_areas_m2()
+    assert area_m2[facing < 0.5].sum() < 1e-4 * area_m2.sum()
+
+
+def test_a_turned_face_would_be_noticed() -> None:
+    turned = Mesh(FULL.positions_m, FULL.faces[:, ::-1])
+    assert np.einsum("fa,fa->f", turned.face_normals(), FULL.normals[FULL.faces[:, 0]]).max() < -0.9
+
+
+def test_the_column_has_a_seam() -> None:
+    assert SEAM.sum() == 2 * ALONG
