@@ -27,7 +27,7 @@ from pipeline.body.fit.linear_body import (
     merge_skin_weights,
     reduced_parents,
 )
-from pipeline.body.fit.prior.posture import Posture, tie_to_posture
+from pipeline.body.fit.prior.posture import Posture, prior_of_recording
 from pipeline.body.fit.prior.priors import (
     ShapePrior,
     estimate_motion_std,
@@ -137,8 +137,9 @@ def refit_poses(
             ),
             free_frames=torch.from_numpy(~is_fixed),
         )
-        posture = posture or objective.estimate_posture(state)
-        objective = replace(objective, pose_prior=tie_to_posture(prior, posture, observations.time_s))
+        posture = posture or objective.estimate_posture(prior, state)
+        tied = prior_of_recording(prior, posture, state.rotations, observations.time_s)
+        objective = replace(objective, pose_prior=tied)
         state, _ = minimise(state, objective, objective.retract, settings.silhouette_steps)
         contour, iou_after = match(state)
     rotations[:, active] = state.rotations

@@ -141,19 +141,19 @@ class Objective:
             system.fix_frames(self.free_frames)
         return system
 
-    def image_hessian(self, state: FitState) -> Float[Tensor, "n p p"]:
-        """Return the Gauss-Newton Hessian of landmarks, silhouettes and pose prior by the pose of each frame."""
+    def image_hessian(self, prior: PosePrior, state: FitState) -> Float[Tensor, "n p p"]:
+        """Return the Gauss-Newton Hessian of landmarks, silhouettes and a pose prior by the pose of each frame."""
         frame_count, joint_count = state.rotations.shape[:2]
         system = NormalEquations.zeros(frame_count, 3 * joint_count + 3, 0)
         linearisation = replace(self._linearise(state), has_shared=False)
         parameters = replace(self.parameters, landmark_std_m=self.parameters.single_landmark_std_m)
-        for term in (*self._image_terms(parameters), PosePriorTerm(self.pose_prior)):
+        for term in (*self._image_terms(parameters), PosePriorTerm(prior)):
             term.add_to(system, linearisation)
         return system.frame_hessian
 
-    def estimate_posture(self, state: FitState) -> Posture:
-        """Return the posture of a state that was fitted with the pose prior of this objective."""
-        return estimate_posture(self.pose_prior, state.rotations, self.observations.time_s, self.image_hessian(state))
+    def estimate_posture(self, prior: PosePrior, state: FitState) -> Posture | None:
+        """Return the posture of a fitted state, see `estimate_posture`; prior: that of anyone."""
+        return estimate_posture(prior, state.rotations, self.observations.time_s, self.image_hessian(prior, state))
 
     def retract(self, state: FitState, frame_step: Tensor, shared_step: Tensor) -> FitState:
         """Return the state after a step, with its shape clamped to the range of the shape prior."""

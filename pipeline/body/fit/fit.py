@@ -28,7 +28,7 @@ from pipeline.body.fit.left_right_swaps import (
 )
 from pipeline.body.fit.levenberg_marquardt import NormalEquations, minimise, shared_covariance
 from pipeline.body.fit.linear_body import LinearBody, linearise_body, relaxed_curls_rad
-from pipeline.body.fit.prior.posture import Posture, tie_to_posture, unknown_posture
+from pipeline.body.fit.prior.posture import Posture, prior_of_recording
 from pipeline.body.fit.prior.priors import (
     PosePrior,
     ShapePrior,
@@ -99,7 +99,7 @@ class _FitContext:
 class _Recording:
     """What the poses so far tell of the recording: posture, `Objective.motion_std` and contacts with the floor."""
 
-    posture: Posture
+    posture: Posture | None
     motion_std: Float[Tensor, "p"] | None = None
     contact: Contact | None = None
 
@@ -186,8 +186,7 @@ def fit_supplied_poses(
     left_right_swapped = {sides: rows & to_fit for sides, rows in left_right_swapped.items()}
     if to_fit.any():
         parameters = _with_silhouettes(EnergyParameters.from_settings(settings), settings)
-        posture = unknown_posture(context.pose_prior)
-        state, _, _ = _fit_poses(context, observations, windows, state, parameters, posture)
+        state, _, _ = _fit_poses(context, observations, windows, state, parameters, posture=None)
     if keep:
         state = supplied.overwrite_poses(state, model.full_joint_indices)
     _, silhouette_iou = match_silhouettes(model, state, observations, windows)
@@ -250,7 +249,7 @@ def _fit_shared(
     windows: Sequence[MaskWindow | None],
     state: FitState,
     options: FitOptions,
-) -> tuple[FitState, EnergyParameters, NormalEquations, Posture]:
+) -> tuple[FitState, EnergyParameters, NormalEquations, Posture | None]:
     """Fit the shared parameters and the poses of these frames; return last normal equations and posture as well."""
     settings = options.settings
     parameters = EnergyParameters.from_settings(settings)
@@ -267,14 +266,14 @@ def _fit_shared(
     model = context.linearise(state.shape)
     state, system = _fit_landmarks(context, model, observations, parameters, state, settings.landmark_steps)
     parameters = _with_silhouettes(parameters, settings)
-    posture = unknown_posture(context.pose_prior)
+    posture: Posture | None = None
     for number in track(range(options.rounds), "shape and focal length"):
         model = context.linearise(state.shape)
         state, system, objective = _silhouette_round(
             context, model, observations, windows, parameters, state, _Recording(posture)
         )
         if number + 1 == POSTURE_ROUND:
-            posture = objective.estimate_posture(state)
+            posture = objective.estimate_posture(context.pose_prior, state)
     return state, parameters, system, posture
 
 
@@ -284,11 +283,11 @@ def _fit_poses(
     windows: Sequence[MaskWindow | None],
     state: FitState,
     parameters: EnergyParameters,
-    posture: Posture,
+    posture: Posture | None,
 ) -> tuple[FitState, LinearBody, Float[np.ndarray, "n"]]:
     """Fit the poses of all frames with the shared parameters fixed; return each frame's silhouette IoU as well.
 
-    posture: of the recording, as far as it is known.
+    posture: of the recording, None if it is not known.
     """
     settings = context.settings
     parameters = replace(
@@ -333,7 +332,7 @@ def _silhouette_round(
     objective = Objective(
         model,
         context.regressor,
-        tie_to_posture(context.pose_prior, recording.posture, observations.time_s),
+        prior_of_recording(context.pose_prior, recording.posture, state.rotations, observations.time_s),
         context.shape_prior,
         observations,
         parameters,

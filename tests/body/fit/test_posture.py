@@ -7,9 +7,12 @@ from pipeline.body.body import load_anny
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS, linearise_body
 from pipeline.body.fit.prior.posture import (
     MIN_SPREAD_RAD,
+    MIN_STILL_SPREAD_RAD,
+    STILL_SLACK,
     estimate_posture,
     frames_per_posture,
     most_likely_posture,
+    tie_still_joints,
     tie_to_posture,
 )
 from pipeline.body.fit.prior.priors import PosePrior, pose_prior, tilt_of_hips
@@ -17,7 +20,7 @@ from pipeline.geometry.rotation import axis_angle_to_matrix
 
 FRAMES = 400
 TIME_S = torch.arange(FRAMES, dtype=torch.float64) / 10.0
-ARM = ACTIVE_JOINTS.index("LeftArm")
+ARM, SPINE = ACTIVE_JOINTS.index("LeftArm"), ACTIVE_JOINTS.index("Spine")
 
 
 @pytest.fixture(scope="module")
@@ -47,27 +50,71 @@ def test_errors_alone_have_no_spread() -> None:
     assert float(posture.spread_rad) == pytest.approx(MIN_SPREAD_RAD)
 
 
+def turning_person() -> torch.Tensor:
+    """Return the angles of a person who turns once and holds the A-pose."""
+    angles = torch.zeros(FRAMES, len(ACTIVE_JOINTS), 3, dtype=torch.float64)
+    angles[:, 0, 1] = torch.linspace(-3.0, 3.0, FRAMES, dtype=torch.float64)
+    return angles
+
+
 def posture_of(prior: PosePrior, angles: torch.Tensor, std_rad: torch.Tensor) -> PosePrior:
     """Return the prior of a recording with these angles, whose image leaves these standard deviations."""
     hessian = torch.diag_embed(std_rad**-2)
     posture = estimate_posture(prior, axis_angle_to_matrix(angles), TIME_S, hessian)
+    assert posture is not None
     return tie_to_posture(prior, posture, TIME_S)
 
 
 def test_frames_that_show_an_angle_decide_its_mean(prior: PosePrior) -> None:
     """An arm looks swung by 0.5 rad in frames that hardly show it, and is at 0.1 in those that do."""
     joints, shows = len(ACTIVE_JOINTS), torch.arange(FRAMES) % 4 == 0
-    angles = torch.zeros(FRAMES, joints, 3, dtype=torch.float64)
+    angles = turning_person()
     angles[:, ARM, 0] = torch.where(shows, 0.1, 0.5).double() + 0.01 * noise(FRAMES, seed=3)
     std = torch.full((FRAMES, 3 * joints + 3), 0.02, dtype=torch.float64)
     std[~shows, 3 * ARM] = 3.0
     tied = posture_of(prior, angles, std)
     assert float(tied.mean_rad[ARM, 0]) == pytest.approx(0.1, abs=0.01)
     assert float(tied.std_rad[ARM, 0]) == pytest.approx(MIN_SPREAD_RAD * frames_per_posture(TIME_S) ** 0.5)
+    assert torch.equal(tied.std_rad[SPINE], prior.std_rad[SPINE])  # a tight prior of anyone stays
+
+
+def test_whoever_is_filmed_from_one_side_is_not_tied(prior: PosePrior) -> None:
+    angles = turning_person()
+    angles[:, 0, 1] *= 0.3
+    hessian = torch.eye(3 * len(ACTIVE_JOINTS) + 3, dtype=torch.float64).expand(FRAMES, -1, -1)
+    assert estimate_posture(prior, axis_angle_to_matrix(angles), TIME_S, hessian) is None
+
+
+def test_still_joints_are_tied_to_their_mean(prior: PosePrior) -> None:
+    """An arm with little motion is tied to its mean; a swinging leg and the spine keep the general prior."""
+    arm, leg, spine = (ACTIVE_JOINTS.index(name) for name in ("LeftArm", "LeftUpLeg", "Spine"))
+    phase = torch.linspace(0.0, 6.0, 200, dtype=torch.float64)
+    angles = torch.zeros(200, len(ACTIVE_JOINTS), 3, dtype=torch.float64)
+    angles[:, arm, 2] = 0.9 + 0.05 * torch.sin(phase)
+    angles[:, leg, 0] = 0.5 * torch.sin(phase)
+    tied = tie_still_joints(prior, axis_angle_to_matrix(angles))
+    spread = float(angles[:, arm, 2].var(correction=0))
+    assert tied.mean_rad[arm, 2] == pytest.approx(float(angles[:, arm, 2].mean()))
+    assert tied.std_rad[arm, 2] == pytest.approx(STILL_SLACK * (spread + MIN_STILL_SPREAD_RAD**2) ** 0.5)
+    assert tied.mean_rad[leg, 0] == 0.0
+    assert tied.std_rad[leg, 0] == prior.std_rad[leg, 0]
+    assert torch.equal(tied.std_rad[spine], prior.std_rad[spine])
+
+
+def test_a_hidden_angle_moves_as_much_as_the_others(prior: PosePrior) -> None:
+    """The forearm looks still and the image hardly shows it; all other angles of the limbs spread by 0.2 rad."""
+    joints, forearm = len(ACTIVE_JOINTS), ACTIVE_JOINTS.index("LeftForeArm")
+    angles = turning_person()
+    angles[:, 1:] = 0.2 * noise(FRAMES, joints - 1, 3, seed=6)
+    angles[:, forearm] = 0.0
+    std = torch.full((FRAMES, 3 * joints + 3), 0.02, dtype=torch.float64)
+    std[:, 3 * forearm : 3 * forearm + 3] = 2.0
+    tied = posture_of(prior, angles, std)
+    assert float(tied.std_rad[forearm, 1]) == pytest.approx(0.2 * frames_per_posture(TIME_S) ** 0.5, rel=0.15)
 
 
 def test_a_dancer_is_not_tied(prior: PosePrior) -> None:
-    angles = torch.zeros(FRAMES, len(ACTIVE_JOINTS), 3, dtype=torch.float64)
+    angles = turning_person()
     angles[:, ARM] = 0.6 * noise(FRAMES, 3, seed=4)
     tied = posture_of(prior, angles, torch.full((FRAMES, 3 * len(ACTIVE_JOINTS) + 3), 0.05).double())
     assert torch.equal(tied.std_rad[ARM], prior.std_rad[ARM])

@@ -15,14 +15,24 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pipeline.body.fit.prior.priors import PosePrior, inverse_left_jacobian_so3, rotation_to_axis_angle, tilt_of_hips
+from pipeline.body.fit.prior.priors import (
+    UNCONSTRAINED_RAD,
+    PosePrior,
+    inverse_left_jacobian_so3,
+    rotation_to_axis_angle,
+    tilt_of_hips,
+)
 
 MIN_SPREAD_RAD, MAX_SPREAD_RAD, SPREADS = 0.01, 1.0, 41
 """Range and number of the spreads tried: whoever stands as still as possible sways by half a degree."""
 POSTURE_TIME_S = 0.5
+LOOSE_STD_RAD = 0.25
+MAX_MEAN_FACING_LENGTH = 0.75
+"""Length of the mean of the unit vectors in which the hips face: 0 for a full turn, 0.64 for half of one."""
+STILL_SLACK, MIN_STILL_SPREAD_RAD, MAX_STILL_SLACK_RAD = 3.0, 0.02, 0.25
 DAMPING = 1e-6
 
 
@@ -34,30 +44,29 @@ class Posture:
     spread_rad: Float[Tensor, "d"]
 
 
-def unknown_posture(prior: PosePrior) -> Posture:
-    """Return the posture of anyone."""
-    return Posture(
-        torch.cat([prior.mean_rad.flatten(), prior.tilt_mean]), torch.cat([prior.std_rad.flatten(), prior.tilt_std])
-    )
-
-
 def estimate_posture(
     prior: PosePrior,
     rotations: Float[Tensor, "n j 3 3"],
     time_s: Float[Tensor, "n"],
     hessian: Float[Tensor, "n p p"],
-) -> Posture:
-    """Return the posture of fitted poses.
+) -> Posture | None:
+    """Return the posture of fitted poses; None if it cannot be known.
+
+    An angle that the image hardly shows is taken to move as the others do: no spread is below their root mean square.
+    Whoever is filmed from one side has no frames that show what the others hide: the posture is not known.
 
     Args:
-        prior: the prior of anyone, with which the poses were fitted: those that are tied to a posture already lie too
-            near to its mean.
+        prior: the prior of anyone. Poses that were tied to a posture already lie too near to its mean.
         rotations: fitted poses.
         time_s: of the frames.
         hessian: of the energy of image and `prior` at these poses, for each frame (`Objective.image_hessian`).
     """
+    if _mean_facing_length(rotations) > MAX_MEAN_FACING_LENGTH:
+        return None
     angle_rad, variance = _angles(prior, rotations, hessian)
-    return most_likely_posture(angle_rad, variance / frames_per_posture(time_s))
+    posture = most_likely_posture(angle_rad, variance / frames_per_posture(time_s))
+    typical_rad = posture.spread_rad[_is_loose(prior)].square().mean().sqrt()
+    return replace(posture, spread_rad=posture.spread_rad.clamp(min=float(typical_rad)))
 
 
 def most_likely_posture(angle_rad: Float[Tensor, "n d"], variance: Float[Tensor, "n d"]) -> Posture:
@@ -70,19 +79,53 @@ def most_likely_posture(angle_rad: Float[Tensor, "n d"], variance: Float[Tensor,
     return Posture(mean_rad.gather(0, best[None])[0], spread_rad[best])
 
 
+def prior_of_recording(
+    prior: PosePrior, posture: Posture | None, rotations: Float[Tensor, "n j 3 3"], time_s: Float[Tensor, "n"]
+) -> PosePrior:
+    """Return the pose prior of a recording: tied to its posture, or the still joints to their mean if it is unknown."""
+    return tie_still_joints(prior, rotations) if posture is None else tie_to_posture(prior, posture, time_s)
+
+
 def tie_to_posture(prior: PosePrior, posture: Posture, time_s: Float[Tensor, "n"]) -> PosePrior:
-    """Return the prior of each frame of a recording: the posture, where it is tighter than the prior of anyone."""
-    anyone = unknown_posture(prior)
+    """Return the prior of each frame of a recording: the posture, where it is tighter than a loose prior of anyone."""
+    anyone_mean_rad = torch.cat([prior.mean_rad.flatten(), prior.tilt_mean])
+    anyone_std_rad = torch.cat([prior.std_rad.flatten(), prior.tilt_std])
     std_rad = frames_per_posture(time_s) ** 0.5 * posture.spread_rad
-    is_tighter = std_rad < anyone.spread_rad
-    mean_rad = torch.where(is_tighter, posture.mean_rad, anyone.mean_rad)
-    std_rad = torch.where(is_tighter, std_rad, anyone.spread_rad)
+    is_tighter = _is_loose(prior) & (std_rad < anyone_std_rad)
+    mean_rad = torch.where(is_tighter, posture.mean_rad, anyone_mean_rad)
+    std_rad = torch.where(is_tighter, std_rad, anyone_std_rad)
     return replace(
         prior,
         mean_rad=mean_rad[:-2].reshape(-1, 3),
         std_rad=std_rad[:-2].reshape(-1, 3),
         tilt_mean=mean_rad[-2:],
         tilt_std=std_rad[-2:],
+    )
+
+
+def _mean_facing_length(rotations: Float[Tensor, "n j 3 3"]) -> float:
+    facing = torch.nn.functional.normalize(rotations[:, 0, ::2, 2], dim=-1)
+    return float(facing.mean(0).norm())
+
+
+def _is_loose(prior: PosePrior) -> Bool[Tensor, "d"]:
+    """Return which angles have a loose prior: those of the limbs and the tilt of the hips, not of the spine."""
+    loose = (prior.std_rad >= LOOSE_STD_RAD) & (prior.std_rad < UNCONSTRAINED_RAD)
+    return torch.cat([loose.flatten(), torch.ones(2, dtype=torch.bool)])
+
+
+def tie_still_joints(prior: PosePrior, rotations: Float[Tensor, "n j 3 3"]) -> PosePrior:
+    """Return the prior with joints that hardly move tied to their mean; for recordings without a known posture.
+
+    Only axes with a loose prior and a slack below `MAX_STILL_SLACK_RAD` are changed.
+    """
+    angle_rad = (prior.axes @ rotation_to_axis_angle(rotations)[..., None]).squeeze(-1)
+    slack_rad = STILL_SLACK * (angle_rad.var(0, correction=0) + MIN_STILL_SPREAD_RAD**2).sqrt()
+    is_still = _is_loose(prior)[:-2].reshape(-1, 3) & (slack_rad < MAX_STILL_SLACK_RAD)
+    return replace(
+        prior,
+        mean_rad=torch.where(is_still, angle_rad.mean(0), prior.mean_rad),
+        std_rad=torch.where(is_still, slack_rad, prior.std_rad),
     )
 
 
