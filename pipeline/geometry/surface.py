@@ -215,7 +215,18 @@ def collapse_edges(mesh: Mesh, selected: Bool[np.ndarray, "f"], face_count: int,
     """
     meshes = _to_meshset(mesh, selected)
     meshes.meshing_decimation_quadric_edge_collapse(
-        targetfacenum=face_count, qualitythr=shape_weight, preservenormal=True, planarquadric=True, selected=True
+        targetfacenum=face_count,
+        qualitythr=shape_weight,
+        preservenormal=True,
+        planarquadric=True,
+        selected=True,
+        # In MeshLab the defaults of these are the values of the last call in the process.
+        preserveboundary=False,
+        boundaryweight=1.0,
+        preservetopology=False,
+        optimalplacement=True,
+        planarweight=0.001,
+        qualityweight=False,
     )
     return repair(_from_meshset(meshes))
 

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+import trimesh
 
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.simplification import ReducedFaces, collapse_textured_edges
-from pipeline.geometry.surface import closest_points_on_mesh
+from pipeline.geometry.surface import closest_points_on_mesh, collapse_edges
 from tests.avatar.formats.column import ALONG, AROUND, column_mesh
 
 FULL = column_mesh()
@@ -53,6 +54,18 @@ def test_the_surface_stays(reduced: ReducedFaces) -> None:
     facing = np.einsum("fa,fa->f", mesh.face_normals(), FULL.normals[reduced.source_vertex[reduced.faces[:, 0]]])
     area_m2 = mesh.face_areas_m2()
     assert area_m2[facing < 0.5].sum() < 1e-4 * area_m2.sum()
+
+
+def test_other_reductions_in_the_process_change_nothing() -> None:
+    """MeshLab keeps the parameters of its last call as defaults of the next one."""
+    count = len(FULL.faces) // 4
+    first = collapse_textured_edges(FULL.positions_m, FULL.uv, FULL.faces, count)
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    mesh = Mesh(ball.vertices.astype(np.float32), ball.faces.astype(np.int32))
+    collapse_edges(mesh, np.ones(len(mesh.faces), dtype=bool), 500)
+    second = collapse_textured_edges(FULL.positions_m, FULL.uv, FULL.faces, count)
+    np.testing.assert_array_equal(first.source_vertex, second.source_vertex)
+    np.testing.assert_array_equal(first.faces, second.faces)
 
 
 def test_a_turned_face_would_be_noticed() -> None:

@@ -130,7 +130,7 @@ def changed(path: Path, change: Callable[[dict[str, Any]], object]) -> Path:
             lambda gltf: gltf.update(extensionsRequired=["KHR_draco_mesh_compression"]),
             "the extension KHR_draco",
         ),
-        (lambda gltf: gltf["accessors"][0].update(sparse={"count": 1}), "accessor 0 is sparse"),
+        (lambda gltf: gltf["accessors"][0].update(sparse={"count": 1}), "accessor 0 are missing"),
         (lambda gltf: gltf["accessors"][0].pop("bufferView"), "accessor 0 are missing"),
         (lambda gltf: gltf["accessors"][0].update(count=10**6), "accessor 0 are missing"),
         (lambda gltf: gltf["accessors"][4].update(componentType=1), "accessor 4 are missing"),

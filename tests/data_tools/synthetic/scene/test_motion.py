@@ -7,11 +7,11 @@ import torch
 from data_tools.synthetic.scene.motion import (
     NOVEL_POSES,
     bend_at_hips,
-    lowest_foot_offset_m,
     novel_motion,
     snap_feet_to_floor,
     turn_in_a_pose,
 )
+from pipeline.avatar.feet import lowest_foot_offset_m
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.geometry.rotation import quaternion_to_matrix
 
