@@ -100,10 +100,8 @@ def run(
         warn(f"{inputs['frames']} has no validation frames: the isovalue and the rounds are not validated")
 
     target_edge_m = select_target_edge_m(body, train, config)
-    field, occupancy = (
-        load_field(inputs["field"] / "field.safetensors"),
-        load_occupancy(inputs["field"] / "occupancy.npz"),
-    )
+    field = load_field(inputs["field"] / "field.safetensors")
+    occupancy = load_occupancy(inputs["field"] / "occupancy.npz")
     if settings.field_views:
         train += render_field_views(field, occupancy, body, train, settings.field_views)
     field = field.requires_grad_(settings.appearance_learning_rate > 0.0)

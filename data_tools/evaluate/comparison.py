@@ -104,7 +104,7 @@ class Comparison:
     def joint_offsets(self) -> Float[Tensor, "j 3 3"]:
         """Mean rotation over the frames of the run from the retargeted true motion to the motion of the avatar."""
         run, truth = self.run, self.truth
-        true_motion = truth.motion.select(np.searchsorted(truth.motion.frame_index, run.motion.frame_index))
+        true_motion = truth.motion.select(run.motion.frame_index)
         retargeted = retarget_motion(run.body, truth.subject.body, true_motion)
         return mean_rotation_offsets(
             joint_rotations_in_camera(run.body, run.motion, run.camera),

@@ -26,7 +26,7 @@ from data_tools.sweep.chart_trials import (
     describe_machine,
     needs_comparison,
 )
-from data_tools.sweep.runs import last_error_message, log_path, reusable_stages
+from data_tools.sweep.runs import last_error_message, log_path, pick_numbers, reusable_stages
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import Manifest, read_manifest
 from pipeline.core.parent import die_with_parent_environment
@@ -186,11 +186,4 @@ def read_figures(run_dir: Path, mesh_manifest: Manifest) -> dict[str, float]:
         TRUTH: load_comparison_scores(run_dir) or {},
         MANIFEST: {"metrics": mesh_manifest.metrics, "seconds": mesh_manifest.seconds},
     }
-    figures = {}
-    for column, (document, *keys) in FIGURE_PATHS.items():
-        value: Any = documents[document]
-        for key in keys:
-            value = value.get(key) if isinstance(value, dict) else None
-        if isinstance(value, int | float):
-            figures[column] = float(value)
-    return figures
+    return pick_numbers(documents, FIGURE_PATHS)

@@ -5,7 +5,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
@@ -136,14 +136,19 @@ def read_scores(run_dir: Path) -> dict[str, float]:
         REPORT: _read_json(run_dir / "report" / "report.json"),
         COMPARISON: load_comparison_scores(run_dir) or {},
     }
-    scores = {}
-    for column, (name, *keys) in SCORE_PATHS.items():
+    return pick_numbers(documents, SCORE_PATHS)
+
+
+def pick_numbers(documents: Mapping[str, Any], paths: Mapping[str, Sequence[str]]) -> dict[str, float]:
+    """Return the number at each path (document, then keys) by column; absent and null ones are left out."""
+    numbers = {}
+    for column, (name, *keys) in paths.items():
         value: Any = documents[name]
         for key in keys:
             value = value.get(key) if isinstance(value, dict) else None
         if isinstance(value, int | float):
-            scores[column] = float(value)
-    return scores
+            numbers[column] = float(value)
+    return numbers
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:

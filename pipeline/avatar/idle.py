@@ -6,6 +6,7 @@ from jaxtyping import Float
 
 from pipeline.avatar.feet import snap_feet_to_floor
 from pipeline.body.body import Body, Motion
+from pipeline.body.fit.ground_contact import SOLE_JOINTS
 from pipeline.geometry.rotation import axis_angle_to_quaternion
 
 DURATION_S, FPS = 7.2, 30
@@ -48,8 +49,7 @@ def idle_motion(body: Body) -> Motion:
     rotations = axis_angle_to_quaternion(torch.from_numpy(axis_angles)).numpy()
     root_m = np.repeat(body.joints_m[:1], len(time_s), axis=0)
     motion = Motion(np.arange(len(time_s), dtype=np.int32), time_s, rotations.astype(np.float32), root_m)
-    feet = ("LeftFoot", "LeftToeBase", "RightFoot", "RightToeBase")
-    return snap_feet_to_floor(body, motion, 0.0) if set(feet) <= set(body.joint_names) else motion
+    return snap_feet_to_floor(body, motion, 0.0) if set(SOLE_JOINTS) <= set(body.joint_names) else motion
 
 
 def _add(axis_angles: Float[np.ndarray, "n j 3"], body: Body, name: str, angles_rad: Float[np.ndarray, "#n 3"]) -> None:

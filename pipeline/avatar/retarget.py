@@ -103,9 +103,7 @@ def recorded_contacts(bvh_motion: BvhMotion, body: Body) -> Bool[np.ndarray, "n 
     _, positions = bvh_motion.forward_kinematics(bvh_motion.rotations)
     axes = _body_axes(positions, recorded_joint_of)
     to_world = _bvh_to_world(axes.mean(axis=0), axes[0]) * _scale_to_m(bvh_motion, body, recorded_joint_of)
-    soles = [
-        recorded_joint_of.get(name, recorded_joint_of[name[: name.index("t") + 1] + "Foot"]) for name in SOLE_JOINTS
-    ]
+    soles = [recorded_joint_of.get(name, recorded_joint_of[name.replace("ToeBase", "Foot")]) for name in SOLE_JOINTS]
     soles_m = (positions[:, soles] + bvh_motion.root_positions[:, None]) @ to_world.T
     return find_contacts(soles_m, np.arange(len(soles_m)) / bvh_motion.fps)
 

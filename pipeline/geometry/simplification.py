@@ -15,7 +15,7 @@ _UV_SCALE = 1e-6
 _SHAPE_WEIGHT = 0.1
 """Weight of well-shaped triangles. 0.3, VCGlib's default, costs 1 dB in renders of the reduced mesh; 0 tears it."""
 
-_UNUSED = {
+_MESHLAB_DEFAULTS = {
     "planarquadric": False,
     "preserveboundary": False,
     "boundaryweight": 1.0,
@@ -66,7 +66,11 @@ def collapse_textured_edges(
     meshes.compute_texcoord_transfer_vertex_to_wedge()
     meshes.meshing_remove_duplicate_vertices()
     meshes.meshing_decimation_quadric_edge_collapse_with_texture(
-        targetfacenum=face_count, optimalplacement=False, preservenormal=True, qualitythr=_SHAPE_WEIGHT, **_UNUSED
+        targetfacenum=face_count,
+        optimalplacement=False,
+        preservenormal=True,
+        qualitythr=_SHAPE_WEIGHT,
+        **_MESHLAB_DEFAULTS,
     )
     reduced = meshes.current_mesh()
     corner_uv = reduced.wedge_tex_coord_matrix()

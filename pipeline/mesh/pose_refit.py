@@ -120,7 +120,7 @@ def refit_poses(
     match = partial(match_silhouettes, model, observations=observations, windows=windows, is_clothed=True)
     contour, iou_before = match(state)
     posture: Posture | None = None
-    for _ in track(range(settings.pose_rounds), "poses through the mesh"):
+    for number in track(range(settings.pose_rounds), "poses through the mesh"):
         root_perspective = world_to_perspective(state.root_m, observations.camera)
         objective = Objective(
             model=model,
@@ -137,7 +137,8 @@ def refit_poses(
             ),
             free_frames=torch.from_numpy(~is_fixed),
         )
-        posture = posture or objective.estimate_posture(prior, state)
+        if number == 0:
+            posture = objective.estimate_posture(prior, state)
         tied = prior_of_recording(prior, posture, state.rotations, observations.time_s)
         objective = replace(objective, pose_prior=tied)
         state, _ = minimise(state, objective, objective.retract, settings.silhouette_steps)

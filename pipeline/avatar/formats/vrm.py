@@ -11,7 +11,7 @@ References: https://github.com/vrm-c/vrm-specification, VRMC_vrm-1.0 and 0.0.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,7 @@ EYE_IN_HEAD_BOX = (0.61, 0.81)
 """The eyes in the bounding box of the head: fraction of its height from below, of its depth from behind."""
 
 _FACE_BACKWARDS = np.diag([-1.0, 1.0, -1.0, 1.0])
+_GAZE_RANGES = ("HorizontalInner", "HorizontalOuter", "VerticalDown", "VerticalUp")
 _LINEAR_CURVE = [0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0]
 
 
@@ -72,7 +73,6 @@ def encode_vrm1(file: GlbFile, joint_names: Sequence[str], meta: VrmMeta) -> byt
     _write_rest_pose(document, rest, inverse_bind)
     bones = {bone: {"node": rest.nodes[joint]} for bone, joint in human_bones(joint_names, "1.0").items()}
     gaze = {"inputMaxValue": GAZE_INPUT_DEG, "outputScale": GAZE_OUTPUT_DEG}
-    ranges = ("HorizontalInner", "HorizontalOuter", "VerticalDown", "VerticalUp")
     extension = {
         "specVersion": "1.0",
         "meta": {
@@ -85,7 +85,7 @@ def encode_vrm1(file: GlbFile, joint_names: Sequence[str], meta: VrmMeta) -> byt
         "expressions": {"preset": {}},  # none; three-vrm ignores look-at without this key
         "firstPerson": {"meshAnnotations": [{"node": node, "type": "auto"} for node in _mesh_nodes(document)]},
         "lookAt": {"type": "bone", "offsetFromHeadBone": _eye_offset_m(file, rest).tolist()}
-        | {f"rangeMap{name}": gaze for name in ranges},
+        | {f"rangeMap{name}": gaze for name in _GAZE_RANGES},
     }
     return _encode(document, "VRMC_vrm", extension)
 
@@ -97,7 +97,7 @@ def encode_vrm0(file: GlbFile, joint_names: Sequence[str], meta: VrmMeta) -> byt
     """
     document, rest = GlbWriter.from_file(file), _rest_pose(file, joint_names)
     turned = _FACE_BACKWARDS @ rest.bind_to_rest
-    rest = _RestPose(rest.nodes, rest.joint_names, rest.parents, rest.joints_m, turned)
+    rest = replace(rest, bind_to_rest=turned)
     _bake_mesh(file, document, turned)
     _write_rest_pose(document, rest, _translations(-_rest_joints_m(rest)))
     bones = [
@@ -113,7 +113,6 @@ def encode_vrm0(file: GlbFile, joint_names: Sequence[str], meta: VrmMeta) -> byt
         "meshAnnotations": annotations,
         "lookAtTypeName": "Bone",
     }
-    ranges = ("HorizontalInner", "HorizontalOuter", "VerticalDown", "VerticalUp")
     licence = {"licenseName": "Other", "otherLicenseUrl": meta.licence_url}
     extension = {
         "exporterVersion": document.json["asset"].get("generator", ""),
@@ -128,7 +127,7 @@ def encode_vrm0(file: GlbFile, joint_names: Sequence[str], meta: VrmMeta) -> byt
             **(licence if meta.licence_url else {"licenseName": "Redistribution_Prohibited"}),
         },
         "humanoid": {"humanBones": bones},
-        "firstPerson": first_person | {f"lookAt{name}": gaze for name in ranges},
+        "firstPerson": first_person | {f"lookAt{name}": gaze for name in _GAZE_RANGES},
         "blendShapeMaster": {"blendShapeGroups": []},
         "secondaryAnimation": {"boneGroups": [], "colliderGroups": []},
         "materialProperties": [_gltf_material(material["name"]) for material in document.json["materials"]],

@@ -30,9 +30,11 @@ MIN_SPREAD_RAD, MAX_SPREAD_RAD, SPREADS = 0.01, 1.0, 41
 """Range and number of the spreads tried: whoever stands as still as possible sways by half a degree."""
 POSTURE_TIME_S = 0.5
 LOOSE_STD_RAD = 0.25
+"""Standard deviation from which the prior of an angle is loose: only such angles are tied."""
 MAX_MEAN_FACING_LENGTH = 0.75
 """Length of the mean of the unit vectors in which the hips face: 0 for a full turn, 0.64 for half of one."""
 STILL_SLACK, MIN_STILL_SPREAD_RAD, MAX_STILL_SLACK_RAD = 3.0, 0.02, 0.25
+"""Without a posture: slack in spreads, smallest spread, and slack from which a joint is taken to move."""
 DAMPING = 1e-6
 
 
