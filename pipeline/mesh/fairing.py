@@ -4,8 +4,9 @@ The density determines the depth of a surface without texture to a few millimetr
 has bumps. Cloth that lies on a body varies over lengths in proportion to the thickness of the part it covers. The
 offset, the signed distance to the extracted surface less that to the body, is therefore smoothed by a Gaussian whose
 standard deviation is a fraction of the local thickness, and added to the signed distance to the body again. Hands and
-head keep the details of the body model (fingers, nose, lips); elsewhere the body is smoothed in the same way first,
-because cloth does not show them. Convex parts do not shrink as they would if the surface itself were smoothed.
+the skin of the head keep the details of the body model (fingers, nose, lips); elsewhere the body is smoothed in the
+same way first, because cloth and hair do not show them. In the face the offset is smoothed as far as anywhere. Convex
+parts do not shrink as they would if the surface itself were smoothed.
 
 Local thickness: Hildebrand and Ruegsegger, "A new method for the model-independent assessment of thickness in
 three-dimensional images", 1997.
@@ -20,13 +21,8 @@ from scipy import ndimage
 from pipeline.body.body import Body
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import isosurface, repair, signed_distance_m
-from pipeline.mesh.isosurface import (
-    CanonicalGrid,
-    head_middle_m,
-    head_vertices,
-    signed_distance_grid,
-    upsample,
-)
+from pipeline.mesh.face import face_weight, head_skin_weight, head_vertices
+from pipeline.mesh.isosurface import CanonicalGrid, signed_distance_grid, upsample
 from pipeline.mesh.settings import MeshSettings
 
 SIGMAS_M = (0.0, 0.005, 0.01, 0.02, 0.03)
@@ -43,6 +39,8 @@ DETAIL_BLEND_M, MIN_DETAIL = 0.015, 0.01
 CLOSE_OFFSET_M, LOOSE_OFFSET_M = 0.02, 0.06
 """Below the first distance from the body the offset is from the body itself, beyond the second from a smoothed one: the
 distance to the body has creases between the legs, which a skirt has not."""
+SKIN_SIGMA_M = 0.01
+"""Smoothing of the offset that tells hair from skin."""
 LOOSE_SIGMA_M = 0.03
 """Smoothing of the distance to the body where cloth is loose."""
 
@@ -70,11 +68,10 @@ def fair_surface(mesh: Mesh, samples: CanonicalGrid, body: Body, settings: MeshS
     body_m = coarse.body_distance_m.copy()
     body_m[near] = signed_distance_m(points, body.mesh())
     sigma_m = settings.fairing_ratio * local_thickness_m(body_m < 0.0, coarse.spacing_m)
-    sigma_m[_head_mask(coarse, body, front_only=True)] = SIGMAS_M[-1]
-    sigma_m = ndimage.gaussian_filter(sigma_m, 1.0)
+    face, skin = _face_and_skin(coarse, body, body_m - surface_m)
+    sigma_m = ndimage.gaussian_filter(sigma_m + face * (SIGMAS_M[-1] - sigma_m), 1.0)
     clothed_m = _without_creases(smooth_with_local_sigma(body_m, sigma_m, coarse.spacing_m), coarse.spacing_m)
-    has_detail = (coarse.hand_weight > 0.0) | _head_mask(coarse, body, front_only=False)
-    detail = ndimage.gaussian_filter(has_detail.astype(np.float64), DETAIL_BLEND_M / coarse.spacing_m)
+    detail = ndimage.gaussian_filter(np.maximum(coarse.hand_weight > 0.0, skin), DETAIL_BLEND_M / coarse.spacing_m)
     reference_m = clothed_m + detail * (body_m - clothed_m)
     offset_m = smooth_with_local_sigma(surface_m - reference_m, sigma_m, coarse.spacing_m)
     shape = samples.density.shape
@@ -125,20 +122,21 @@ def _without_creases(body_m: Float[np.ndarray, "x y z"], spacing_m: float) -> Fl
     return body_m + loose * (ndimage.gaussian_filter(body_m, LOOSE_SIGMA_M / spacing_m, truncate=3.0) - body_m)
 
 
-def _head_mask(samples: CanonicalGrid, body: Body, front_only: bool) -> Bool[np.ndarray, "x y z"]:
-    """Return the samples at the head, or at its front half, the face.
+def _face_and_skin(
+    samples: CanonicalGrid, body: Body, offset_m: Float[np.ndarray, "x y z"]
+) -> tuple[Float[np.ndarray, "x y z"], Float[np.ndarray, "x y z"]]:
+    """Return the weights of the face and of the skin of the whole head (`pipeline.mesh.face`) at all samples.
 
-    The dark and bright parts of a face look like dents and bumps to the density, and its shape is much alike from
-    person to person: there the offset is smoothed as far as anywhere.
+    offset_m: distance of the surface from the body at each sample, m.
     """
-    mask = np.zeros(samples.density.shape, dtype=bool)
+    face, skin = np.zeros(samples.density.shape), np.zeros(samples.density.shape)
     head = head_vertices(body)
     if head.any():
         low_m = body.vertices[head, 1].min()
-        back_m = head_middle_m(body)[2] if front_only else -np.inf
-        y, z = (
-            max(0.0, np.ceil((position_m - samples.origin_m[axis]) / samples.spacing_m))
-            for axis, position_m in ((1, low_m), (2, back_m))
-        )
-        mask[:, int(y) :, int(z) :] = True
-    return mask
+        first = max(0, int(np.ceil((low_m - samples.origin_m[1]) / samples.spacing_m)))
+        offset_m = ndimage.gaussian_filter(offset_m[:, first:], SKIN_SIGMA_M / samples.spacing_m)
+        points_m = np.argwhere(np.ones(offset_m.shape, dtype=bool)) * samples.spacing_m + samples.origin_m
+        points_m[:, 1] += first * samples.spacing_m
+        for weights, weight_fn in ((face, face_weight), (skin, head_skin_weight)):
+            weights[:, first:] = weight_fn(points_m, offset_m.ravel(), body).reshape(offset_m.shape)
+    return face, skin

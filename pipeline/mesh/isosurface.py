@@ -116,19 +116,6 @@ def hand_skin_weights(body: Body) -> Float[np.ndarray, "v"]:
     return body.skin_weights[:, hands].sum(axis=1)
 
 
-def head_vertices(body: Body) -> Bool[np.ndarray, "v"]:
-    """Return which body vertices belong to the head; none if the body has no joint of this name."""
-    if "Head" not in body.joint_names:
-        return np.zeros(len(body.vertices), dtype=bool)
-    return body.skin_weights[:, body.joint("Head")] > 0.5
-
-
-def head_middle_m(body: Body) -> Float[np.ndarray, "3"]:
-    """Return the middle of the bounding box of the head (m); the face is the half before it."""
-    head = body.vertices[head_vertices(body)]
-    return 0.5 * (head.min(axis=0) + head.max(axis=0))
-
-
 def indicator_grid(samples: CanonicalGrid, isovalue_per_m: float, settings: MeshSettings) -> Float[np.ndarray, "x y z"]:
     """Return a soft indicator function of the solid in [0, 1]; its surface is at `SURFACE_ISOVALUE`.
 

@@ -10,8 +10,16 @@ from jaxtyping import Bool, Float
 from pipeline.body.body import Body
 from pipeline.core.progress import warn
 from pipeline.geometry.mesh import Mesh
-from pipeline.geometry.surface import OpenSurfaceError, closest_points_on_mesh, remesh_isotropic, repair, subdivide
-from pipeline.mesh.isosurface import hand_skin_weights, head_middle_m, head_vertices
+from pipeline.geometry.surface import (
+    OpenSurfaceError,
+    closest_points_on_mesh,
+    remesh_isotropic,
+    repair,
+    signed_distance_m,
+    subdivide,
+)
+from pipeline.mesh.face import face_weight
+from pipeline.mesh.isosurface import hand_skin_weights
 from pipeline.mesh.settings import MeshSettings
 
 DECIMATION_FACE_RATIO = 3.0
@@ -59,21 +67,14 @@ def _remesh_in_two_sizes(mesh: Mesh, target_edge_m: float, body: Body) -> Mesh:
 
 def detailed_faces(mesh: Mesh, body: Body) -> Bool[np.ndarray, "f"]:
     """Return the mesh faces at the hands and at the face of the person."""
-    return _near_vertices(mesh, body, hand_skin_weights(body) > 0.5) | face_of_person(mesh, body)
+    _, nearest, _ = closest_points_on_mesh(mesh.vertices[mesh.faces].mean(axis=1), body.mesh())
+    return (hand_skin_weights(body) > 0.5)[body.faces[nearest, 0]] | face_of_person(mesh, body)
 
 
 def face_of_person(mesh: Mesh, body: Body) -> Bool[np.ndarray, "f"]:
-    """Return the mesh faces at the front half of the head; none if the body has no joint of this name."""
-    head = head_vertices(body)
-    if not head.any():
-        return np.zeros(len(mesh.faces), dtype=bool)
-    return _near_vertices(mesh, body, head & (body.vertices[:, 2] > head_middle_m(body)[2]))
-
-
-def _near_vertices(mesh: Mesh, body: Body, chosen: Bool[np.ndarray, "v"]) -> Bool[np.ndarray, "f"]:
-    """Return the mesh faces whose nearest point of the body is on one of its chosen vertices."""
-    _, nearest, _ = closest_points_on_mesh(mesh.vertices[mesh.faces].mean(axis=1), body.mesh())
-    return chosen[body.faces[nearest, 0]]
+    """Return the mesh faces at the face of the person, without hair; none if the body has no head joint."""
+    centres_m = mesh.vertices[mesh.faces].mean(axis=1)
+    return face_weight(centres_m, signed_distance_m(centres_m, body.mesh()), body) > 0.5
 
 
 def decimate(mesh: Mesh, face_count: int) -> Mesh:
