@@ -169,7 +169,7 @@ def fit_capture(
     """
     camera, focal_relative_std = initial_camera(capture, config, settings)
     landmarks = capture.landmarks_px, capture.landmarks_visibility, capture.landmarks_world_m
-    observations = make_observations(capture.time_s, *landmarks, camera, hands)
+    observations = make_observations(capture.time_s, *landmarks, camera, hands, capture.faces_px)
     side_px = max(camera.width, camera.height)
     principal_point_relative_std = (
         settings.principal_point_std_ratio * side_px / camera.fx if focal_relative_std > 0.0 else 0.0
@@ -301,7 +301,7 @@ def draw_overlay_grid(
 
 STAGE = Stage(
     "body",
-    version=14,
+    version=15,
     needs=("frames",),
     makes=(_BODY, _MOTION, _CAMERA, _OBSERVATIONS, SCORES_NPZ, _OVERLAY),
     config=Config,

@@ -206,6 +206,7 @@ def make_capture(
         scale=detections.scale,
         metadata_focal_px=metadata_focal_px(source, detections.width, detections.height),
         hands=detections.hands.rows(chosen),
+        faces_px=detections.faces_px[chosen],
         smpl_poses=None if user_files.smpl_poses is None else user_files.smpl_poses.for_frames(frame_index),
         camera_pose_is_known=user_files.camera is not None and user_files.camera.world_to_camera is not None,
     )
@@ -213,7 +214,7 @@ def make_capture(
 
 STAGE = Stage(
     "frames",
-    version=11,
+    version=12,
     needs=("video",),
     makes=(FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, CONTACT_SHEET),
     config=Config,

@@ -260,7 +260,7 @@ def write_results(out: Path, mesh: Mesh, skin: SkinnedTopology, shader: torch.nn
 
 STAGE = Stage(
     "mesh",
-    version=13,
+    version=14,
     needs=("frames", "body", "field"),
     makes=("mesh.npz", "motion.npz", "preview.png"),
     config=Config,

@@ -168,6 +168,11 @@ ANNY_LANDMARKS_M = {
     "hand_thumb": (0.485, 1.101, 0.268),
     "hand_index": (0.535, 1.077, 0.284),
     "hand_pinky": (0.559, 1.048, 0.230),
+    "face_eye_outer": (0.046, 1.722, 0.122),
+    "face_eye_inner": (0.016, 1.719, 0.127),
+    "face_mouth": (0.026, 1.649, 0.134),
+    "face_nose": (0.000, 1.685, 0.157),
+    "face_bridge": (0.000, 1.726, 0.137),
 }
 """Positions of the left and central landmarks (`landmark_regressor.LANDMARKS`) on the A-pose of the default shape."""
 

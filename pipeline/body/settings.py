@@ -29,6 +29,7 @@ class FitSettings:
         silhouette_landmark_std_m, silhouette_landmark_3d_std_m: the same with silhouettes. 3D, turn / walk: 0.2 m
             28.2 / 64.6 mm, 0.4 m 20.4 / 55.9 mm, 1 m 20.0 / 63.8 mm.
         hand_std_m, fitted_hand_std_m: standard deviation of the hand landmarks before and after the shape is fitted.
+        face_std_m, fitted_face_std_m: the same for the landmarks of the face detector.
         landmark_cutoff: cutoff of the robust landmark terms, standard deviations.
         contour_std_m, contour_cutoff: standard deviation and cutoff of the silhouette term.
         avatar_contour_std_m: the standard deviation for an outline that has the clothes and the hair of the masks.
@@ -57,6 +58,8 @@ class FitSettings:
     silhouette_landmark_3d_std_m: float = 0.4
     hand_std_m: float = 0.060
     fitted_hand_std_m: float = 0.012
+    face_std_m: float = 0.030
+    fitted_face_std_m: float = 0.008
     landmark_cutoff: float = 3.0
     contour_std_m: float = 0.010
     avatar_contour_std_m: float = 0.005
@@ -78,6 +81,7 @@ class FitSettings:
         for loose, tight in (
             ("initial_focal_std", "exif_focal_std"),
             ("hand_std_m", "fitted_hand_std_m"),
+            ("face_std_m", "fitted_face_std_m"),
             ("mean_stature_std_m", "known_stature_std_m"),
             ("contour_std_m", "avatar_contour_std_m"),
         ):

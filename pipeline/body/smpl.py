@@ -51,6 +51,11 @@ HEAD_LANDMARK_POSITIONS = {
     "eye_outer": (0.419, 0.61, 0.778),
     "ear": (0.639, 0.532, 0.556),
     "mouth": (0.198, 0.319, 0.884),
+    "face_eye_outer": (0.502, 0.544, 0.845),
+    "face_eye_inner": (0.179, 0.531, 0.867),
+    "face_mouth": (0.283, 0.257, 0.898),
+    "face_nose": (0.0, 0.398, 0.999),
+    "face_bridge": (0.0, 0.557, 0.912),
 }
 """Landmarks of the face in the bounding box of the head, as on the built-in body: fraction of the half width to the
 left, of the height from below, of the depth from behind. They do not depend on the order of the vertices."""

@@ -32,6 +32,8 @@ class Capture:
     scale: size of these images relative to the recording.
     metadata_focal_px: focal length for these images from the metadata of the recording; None if there is none.
     hands: landmarks of both hands in every frame; None if they were not detected.
+    faces_px: MediaPipe's face mesh in every frame, pixels and depth in pixels (`pipeline.capture.face_detector`); nan
+        without a face; None if faces were not detected.
     smpl_poses: user-supplied SMPL poses of some of these frames; None without.
     camera_pose_is_known: whether the user supplied the pose of the camera, in a world whose +Y is up.
     """
@@ -52,6 +54,7 @@ class Capture:
     scale: float
     metadata_focal_px: float | None = None
     hands: HandLandmarks | None = None
+    faces_px: Float[np.ndarray, "n 478 3"] | None = None
     smpl_poses: SmplPoses | None = None
     split_rule: str = INTERLEAVED_RULE
     camera_pose_is_known: bool = False
@@ -111,6 +114,8 @@ def save_capture(capture: Capture) -> None:
         arrays[name] = np.array(value)
     if capture.hands is not None:
         arrays |= {f"hands_{name}": value for name, value in vars(capture.hands).items()}
+    if capture.faces_px is not None:
+        arrays["faces_px"] = capture.faces_px.astype(np.float32)
     save_npz(capture.folder / FRAMES_NPZ, arrays)
     if capture.smpl_poses is not None:
         save_smpl_poses(capture.folder / SMPL_POSES_NPZ, capture.smpl_poses)
@@ -141,6 +146,7 @@ def load_capture(frames_dir: Path) -> Capture:
         scale=float(arrays["scale"].item()),
         metadata_focal_px=_metadata_focal_px(arrays),
         hands=_hands(arrays),
+        faces_px=arrays.get("faces_px"),
         smpl_poses=load_smpl_poses(poses_path) if poses_path.is_file() else None,
         split_rule=str(arrays["split_rule"].item()) if "split_rule" in arrays else INTERLEAVED_RULE,
         camera_pose_is_known=bool(np.ravel(arrays.get("camera_pose_is_known", False))[0]),

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.capture.background_plate import BackgroundPlate, estimate_background_plate
 from pipeline.capture.capture import IMAGES_FOLDER, MASKS_FOLDER, image_path, mask_path
+from pipeline.capture.face_detector import FaceDetector, undetected_face
 from pipeline.capture.hand_detector import HandDetector, HandLandmarks, stack_hands, undetected_hands
 from pipeline.capture.landmarks import N_LANDMARKS
 from pipeline.capture.matting import (
@@ -48,6 +49,7 @@ class _FrameDetection(NamedTuple):
     mask_png: bytes
     n_people: int
     hands: HandLandmarks = undetected_hands()
+    face_px: Float[np.ndarray, "478 3"] = undetected_face()
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,7 @@ class Detections:
     found: the mask shows the person (without landmarks if masks are user-supplied).
     gray_thumbnails, person_masks: small images and binary masks.
     masks_png: soft masks of the detector, PNG-encoded to save memory.
-    landmarks and hands as in `Capture`, nan where unknown. n_people: -1 where people were not counted.
+    landmarks, hands and faces_px as in `Capture`, nan where unknown. n_people: -1 where people were not counted.
     """
 
     frame_index: Int[np.ndarray, "n"]
@@ -70,6 +72,7 @@ class Detections:
     landmarks_visibility: Float[np.ndarray, "n 33"]
     landmarks_world_m: Float[np.ndarray, "n 33 3"]
     hands: HandLandmarks
+    faces_px: Float[np.ndarray, "n 478 3"]
     masks_png: tuple[bytes, ...]
     width: int
     height: int
@@ -125,6 +128,7 @@ def detect_in_frames(
         landmarks_visibility=np.nan_to_num(landmarks[..., 2]),
         landmarks_world_m=landmarks[..., 3:],
         hands=stack_hands([detection.hands for detection in frame_detections]),
+        faces_px=np.stack([detection.face_px for detection in frame_detections]),
         masks_png=tuple(detection.mask_png for detection in frame_detections),
         width=width,
         height=height,
@@ -226,6 +230,12 @@ def _hand_detector() -> HandDetector:
     return HandDetector()
 
 
+@cache
+def _face_detector() -> FaceDetector:
+    """Return the face detector of this process."""
+    return FaceDetector()
+
+
 def _detect_in_frame(
     rgb: UInt8[np.ndarray, "h w 3"],
     mask: UInt8[np.ndarray, "h w"] | None,
@@ -238,7 +248,7 @@ def _detect_in_frame(
     factor = min(1.0, _THUMBNAIL_SIDE_PX / max(rgb.shape[:2]))
     size = (max(1, round(rgb.shape[1] * factor)), max(1, round(rgb.shape[0] * factor)))
     gray = cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
-    landmarks, mask_png, hands = None, b"", undetected_hands()
+    landmarks, mask_png, hands, face_px = None, b"", undetected_hands(), undetected_face()
     if detection is not None:
         landmarks = np.concatenate(
             [detection.landmarks_px, detection.visibility[:, None], detection.landmarks_world_m], axis=1
@@ -247,13 +257,14 @@ def _detect_in_frame(
         hands = _hand_detector().detect_hands(
             rgb, detection.landmarks_px, detection.visibility, detection.landmarks_world_m
         )
+        face_px = _face_detector().detect_face_of_person(rgb, detection.landmarks_px, detection.landmarks_world_m)
     if mask is None and detection is not None:
         mask = detection.mask
         mask_png = cv2.imencode(".png", mask, (cv2.IMWRITE_PNG_COMPRESSION, 1))[1].tobytes()
     if mask is None:
         return _FrameDetection(gray, np.zeros(gray.shape, dtype=bool), None, b"", n_people)
     person = cv2.resize(mask, size, interpolation=cv2.INTER_AREA) > _MIN_PERSON_LEVEL
-    return _FrameDetection(gray, person, landmarks, mask_png, n_people, hands)
+    return _FrameDetection(gray, person, landmarks, mask_png, n_people, hands, face_px)
 
 
 def _landmarks(

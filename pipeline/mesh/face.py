@@ -12,7 +12,7 @@ from pipeline.body.body import Body
 
 SKIN_OFFSET_M, HAIR_OFFSET_M = 0.008, 0.02
 """Up to the first distance from the body model's head a surface is skin, from the second on it is hair."""
-BROW_HEIGHT, FEATURE_HALF_WIDTH = 0.68, 0.6
+BROW_HEIGHT, FEATURE_HALF_WIDTH = 0.62, 0.6
 """The brows, as a share of the height of the head over its lowest point; the features (eyes, nose, mouth), as a share
 of half its width with the ears."""
 EDGE_M = 0.01

@@ -162,6 +162,7 @@ def _energy_parameters(settings: FitSettings) -> EnergyParameters:
         EnergyParameters.from_settings(settings),
         landmark_std_m=settings.silhouette_landmark_std_m,
         hand_std_m=settings.fitted_hand_std_m,
+        face_std_m=settings.fitted_face_std_m,
         landmark_3d_std_m=settings.silhouette_landmark_3d_std_m,
         contour_std_m=settings.avatar_contour_std_m,
         free_shape=False,

@@ -8,7 +8,9 @@ import torch
 from pipeline.body.body import ParametricBody
 from pipeline.body.fit.camera_parameters import INTRINSICS_COUNT
 from pipeline.body.fit.diagnostics import make_observations
+from pipeline.body.fit.face_observations import FACE_MESH_POINTS
 from pipeline.body.fit.landmark_regressor import (
+    FACE_MESH_START,
     HAND_LANDMARKS,
     LANDMARK_OFFSET_COUNT,
     LEFT_RIGHT_PAIRS,
@@ -21,6 +23,7 @@ from pipeline.body.fit.posed_points import pose_points, pose_skeleton
 from pipeline.body.fit.result import FitResult
 from pipeline.body.fit.silhouette_icp import MaskWindow, crop_mask_window, posed_vertices
 from pipeline.body.fit.state import FitState, Observations
+from pipeline.capture.face_detector import undetected_face
 from pipeline.capture.hand_detector import N_HAND_LANDMARKS, HandLandmarks
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.rotation import axis_angle_to_matrix, quaternion_to_matrix
@@ -39,6 +42,7 @@ class SyntheticRecording:
     landmarks_px: np.ndarray
     landmarks_world_m: np.ndarray
     hands: HandLandmarks
+    faces_px: np.ndarray
 
     def observations(self, camera: Camera) -> Observations:
         return make_observations(
@@ -106,7 +110,8 @@ def simulate_detections(
     regressor = landmark_regressor(linearise_body(body, body.shape_defaults))
     skeleton = pose_skeleton(model, state.rotations, state.root_m)
     world = pose_points(model, skeleton, regressor.points(model, state.landmark_offsets_m)).world_m
-    hands = _hands(world[:, POSE_LANDMARK_COUNT:], camera)
+    hands = _hands(world[:, POSE_LANDMARK_COUNT:FACE_MESH_START], camera)
+    faces_px = _faces(world[:, FACE_MESH_START:], camera)
     world = world[:, :POSE_LANDMARK_COUNT]
     pixels, depth_m = project(world, camera)
     random = np.random.default_rng(seed)
@@ -114,7 +119,7 @@ def simulate_detections(
     landmarks_px = pixels.numpy() + noise_px * random.standard_normal(pixels.shape)
     relative = (world - 0.5 * (world[:, 23:24] + world[:, 24:25])).numpy() * [1.0, -1.0, -1.0]
     landmarks_3d_m = relative + 2 * noise_m * random.standard_normal(relative.shape)
-    return SyntheticRecording(model, state, camera, time_s, landmarks_px, landmarks_3d_m, hands)
+    return SyntheticRecording(model, state, camera, time_s, landmarks_px, landmarks_3d_m, hands, faces_px)
 
 
 def swap_left_right(scene: SyntheticRecording, rows: slice | list[int]) -> None:
@@ -132,6 +137,18 @@ def _hands(points_m: torch.Tensor, camera: Camera) -> HandLandmarks:
     pixels, _ = project(positions_m.flatten(0, 2), camera)
     in_camera = (positions_m - positions_m.mean(2, keepdim=True)).numpy() * [1.0, -1.0, -1.0]
     return HandLandmarks(pixels.reshape(*positions_m.shape[:3], 2).numpy(), in_camera, np.ones((len(points_m), 2)))
+
+
+def _faces(points_m: torch.Tensor, camera: Camera) -> np.ndarray:
+    """Return face detections in every frame, also from behind; points that the fit ignores but the chin are nan."""
+    pixels, depth_m = project(points_m.flatten(0, 1), camera)
+    px_per_m = camera.fx / depth_m.mean()
+    faces_px = undetected_face(len(points_m)).astype(np.float64)
+    points_px = torch.cat([pixels, px_per_m * depth_m[:, None]], dim=1).reshape(*points_m.shape[:2], 3).numpy()
+    faces_px[:, FACE_MESH_POINTS] = points_px
+    mouth_px, bridge_px = points_px[:, 4:6].mean(axis=1), points_px[:, 7]
+    faces_px[:, 152] = bridge_px + 1.5 * (mouth_px - bridge_px)
+    return faces_px
 
 
 def _synthetic_rotations(phase: torch.Tensor, turn_rad: float, wrists_rad: float) -> torch.Tensor:

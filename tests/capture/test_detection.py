@@ -6,6 +6,7 @@ import pytest
 from pipeline.capture import detection as sightings
 from pipeline.capture.capture import image_path, mask_path
 from pipeline.capture.detection import _temporal_windows, detect_in_frames, write_frames
+from pipeline.capture.face_detector import undetected_face
 from pipeline.capture.hand_detector import undetected_hands
 from pipeline.capture.person_detector import PersonDetection
 from pipeline.capture.process_pool import start_process_pool
@@ -53,10 +54,13 @@ class FakeDetector:
     def detect_hands(self, rgb, *pose):
         return undetected_hands()
 
+    def detect_face_of_person(self, rgb, *pose):
+        return undetected_face()
+
 
 @pytest.fixture
 def detector(monkeypatch):
-    for name in ("_detector", "_hand_detector"):
+    for name in ("_detector", "_hand_detector", "_face_detector"):
         monkeypatch.setattr(sightings, name, FakeDetector)
     return FakeDetector
 

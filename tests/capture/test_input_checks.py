@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from pipeline.capture.detection import Detections
+from pipeline.capture.face_detector import undetected_face
 from pipeline.capture.hand_detector import undetected_hands
 from pipeline.capture.input_checks import check_input, warn_about_input
 from pipeline.core.errors import UserError
@@ -27,6 +28,7 @@ def make_detections(n: int) -> Detections:
         landmarks_visibility=np.ones((n, 33), np.float32),
         landmarks_world_m=np.zeros((n, 33, 3), np.float32),
         hands=undetected_hands(n),
+        faces_px=undetected_face(n),
         masks_png=(b"",) * n,
         width=100,
         height=100,

@@ -29,7 +29,7 @@ def landmarks_m(*names: str) -> np.ndarray:
 
 
 def test_the_features_are_face_at_any_distance_and_hair_is_not(person: Body) -> None:
-    features_m = landmarks_m("nose", "eye", "mouth")
+    features_m = landmarks_m("face_nose", "face_eye_inner", "face_mouth")
     assert face_weight(features_m, np.full(3, HAIR_M), person).min() > 0.95
     crown_m = person.vertices[person.vertices[:, 1].argmax()][None].astype(np.float64)
     back_m = crown_m + [[0.0, -0.09, -0.1]]

@@ -4,9 +4,11 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
+from pipeline.body.fit.face_observations import face_landmarks
 from pipeline.body.fit.hand_observations import hand_landmarks
 from pipeline.body.fit.result import FitResult
 from pipeline.body.fit.state import Observations
+from pipeline.capture.face_detector import undetected_face
 from pipeline.capture.frame_selection import format_frame_ranges
 from pipeline.capture.hand_detector import HandLandmarks, undetected_hands
 from pipeline.geometry.camera import Camera
@@ -49,18 +51,25 @@ def make_observations(
     landmarks_world_m: Float[np.ndarray, "n 33 3"],
     camera: Camera,
     hands: HandLandmarks | None = None,
+    faces_px: Float[np.ndarray, "n 478 3"] | None = None,
 ) -> Observations:
     """Return the observations of a detector's output.
 
     landmarks_px: nan where nothing was detected. visibility: 0 to 1. landmarks_world_m: camera axes (y down, z away),
     relative to the hips. hands: from `hand_observations.filter_hand_detections`; None if they were not detected.
+    faces_px: as in `Capture`.
     """
     hands_px, hands_m, hands_confidence = hand_landmarks(hands or undetected_hands(len(time_s)), landmarks_world_m)
-    landmarks = torch.tensor(np.concatenate([landmarks_px, hands_px], axis=1)).double()
-    directions = torch.tensor(np.concatenate([landmarks_world_m, hands_m], axis=1)).double()
+    known_faces_px = undetected_face(len(time_s)) if faces_px is None else faces_px
+    face_px, face_confidence = face_landmarks(known_faces_px, landmarks_px, landmarks_world_m)
+    landmarks = torch.tensor(np.concatenate([landmarks_px, hands_px, face_px], axis=1)).double()
+    no_depth = np.full((*face_px.shape[:2], 3), np.nan)
+    directions = torch.tensor(np.concatenate([landmarks_world_m, hands_m, no_depth], axis=1)).double()
     to_world = torch.as_tensor(camera.world_to_camera, dtype=torch.float64)[:3, :3]
     pose_confidence = MIN_CONFIDENCE + (1.0 - MIN_CONFIDENCE) * np.nan_to_num(visibility)
-    landmark_confidence = torch.tensor(np.concatenate([pose_confidence, hands_confidence], axis=1)).double()
+    landmark_confidence = torch.tensor(
+        np.concatenate([pose_confidence, hands_confidence, face_confidence], axis=1)
+    ).double()
     known = landmarks.isfinite().all(-1)
     return Observations(
         time_s=torch.tensor(time_s).double(),

@@ -9,6 +9,7 @@ from torch import Tensor
 from pipeline.body.fit.camera_parameters import INTRINSICS_COUNT, apply_intrinsics_delta
 from pipeline.body.fit.ground_contact import Contact
 from pipeline.body.fit.landmark_regressor import (
+    FACE_MESH_START,
     LANDMARK_OFFSET_COUNT,
     POSE_LANDMARK_COUNT,
     LandmarkRegressor,
@@ -47,7 +48,7 @@ class EnergyParameters:
 
     Standard deviations in metres are measured at the depth of the person; cutoffs are in standard deviations.
 
-    landmark_std_m, hand_std_m: of pose and hand landmarks in the image.
+    landmark_std_m, hand_std_m, face_std_m: of the landmarks of pose, hands and face in the image.
     single_landmark_std_m: of one pose landmark by itself, for what a frame shows (`Objective.image_hessian`); with
     silhouettes `landmark_std_m` is larger, because the errors of landmarks are correlated.
     landmark_3d_std_m: of the detected 3D landmarks across the view.
@@ -60,6 +61,7 @@ class EnergyParameters:
 
     landmark_std_m: float = FitSettings.landmark_std_m
     hand_std_m: float = FitSettings.hand_std_m
+    face_std_m: float = FitSettings.face_std_m
     single_landmark_std_m: float = FitSettings.landmark_std_m
     landmark_cutoff: float = FitSettings.landmark_cutoff
     landmark_3d_std_m: float = FitSettings.landmark_3d_std_m
@@ -83,6 +85,7 @@ class EnergyParameters:
         return EnergyParameters(
             landmark_std_m=settings.landmark_std_m,
             hand_std_m=settings.hand_std_m,
+            face_std_m=settings.face_std_m,
             single_landmark_std_m=settings.landmark_std_m,
             landmark_cutoff=settings.landmark_cutoff,
             landmark_3d_std_m=settings.landmark_3d_std_m,
@@ -97,7 +100,8 @@ class EnergyParameters:
     def landmark_stds_m(self) -> Float[Tensor, "l"]:
         """Return the standard deviation of each landmark in the image, metres at the depth of the person."""
         std_m = self.landmark_std_m * landmark_std_ratio()
-        std_m[POSE_LANDMARK_COUNT:] = self.hand_std_m
+        std_m[POSE_LANDMARK_COUNT:FACE_MESH_START] = self.hand_std_m
+        std_m[FACE_MESH_START:] = self.face_std_m
         return std_m
 
     def has_free_shared_parameters(self) -> bool:

@@ -228,6 +228,7 @@ def _with_silhouettes(parameters: EnergyParameters, settings: FitSettings) -> En
         parameters,
         landmark_std_m=settings.silhouette_landmark_std_m,
         landmark_3d_std_m=settings.silhouette_landmark_3d_std_m,
+        face_std_m=settings.fitted_face_std_m,
     )
 
 

@@ -1,7 +1,8 @@
 """Positions of the detector's landmarks on the body.
 
 First BlazePose's 33 landmarks (Bazarevsky et al., "BlazePose: On-device real-time body pose tracking", 2020, figure 3),
-then some landmarks of each hand, which another model detects (`pipeline.capture.hand_detector`).
+then some landmarks of each hand and of the face, which other models detect (`pipeline.capture.hand_detector`,
+`pipeline.capture.face_detector`).
 """
 
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ class Landmark:
     reference_joint: the joint from which its offset is measured; None: the nearest vertex. Bodies without this joint
         use `parent_joint`.
     std_ratio: standard deviation of its detection over the typical one.
+    offset_std_ratio: standard deviation of its position on the body over the typical one.
     """
 
     name: str
@@ -32,7 +34,11 @@ class Landmark:
     parent_joint: str
     reference_joint: str | None
     std_ratio: float
+    offset_std_ratio: float = 1.0
 
+
+FACE_OFFSET_RATIO = 0.3
+"""The corners of eyes and mouth are exact points of the body; people's faces differ by some millimetres."""
 
 LANDMARKS = (
     Landmark("nose", (0,), "Head", None, 0.8),
@@ -56,9 +62,15 @@ LANDMARKS = (
     Landmark("hand_thumb", (35, 36), "LeftHand", "LeftHandThumb2", 1.0),
     Landmark("hand_index", (37, 38), "LeftHand", "LeftHandIndex1", 1.0),
     Landmark("hand_pinky", (39, 40), "LeftHand", "LeftHandPinky1", 1.0),
+    Landmark("face_eye_outer", (41, 42), "Head", None, 1.0, FACE_OFFSET_RATIO),
+    Landmark("face_eye_inner", (43, 44), "Head", None, 1.0, FACE_OFFSET_RATIO),
+    Landmark("face_mouth", (45, 46), "Head", None, 1.0, FACE_OFFSET_RATIO),
+    Landmark("face_nose", (47,), "Head", None, 1.0, FACE_OFFSET_RATIO),
+    Landmark("face_bridge", (48,), "Head", None, 1.0, FACE_OFFSET_RATIO),
 )
 
-LANDMARK_COUNT = 41
+FACE_MESH_START, LANDMARK_COUNT = 41, 49
+"""Index of the first landmark of the face detector, and number of all landmarks."""
 
 HAND_LANDMARKS = (0, 2, 5, 17)
 """Hand landmarks used after the pose landmarks, left and right alternating: those that finger flexion does not move."""
@@ -69,11 +81,13 @@ LANDMARK_OFFSET_COUNT = 3 * len(LANDMARKS)
 LEFT_RIGHT_PAIRS = tuple(landmark.indices for landmark in LANDMARKS if len(landmark.indices) == 2)
 
 SWAP_PAIR_GROUPS = {
-    "arms": tuple(pair for pair in LEFT_RIGHT_PAIRS if 13 <= pair[0] <= 21 or pair[0] >= POSE_LANDMARK_COUNT),
+    "arms": tuple(
+        pair for pair in LEFT_RIGHT_PAIRS if 13 <= pair[0] <= 21 or POSE_LANDMARK_COUNT <= pair[0] < FACE_MESH_START
+    ),
     "legs": tuple(pair for pair in LEFT_RIGHT_PAIRS if 25 <= pair[0] < POSE_LANDMARK_COUNT),
-    "whole body": LEFT_RIGHT_PAIRS,
+    "whole body": tuple(pair for pair in LEFT_RIGHT_PAIRS if pair[0] < FACE_MESH_START),
 }
-"""Pairs of landmarks that the detector swaps together."""
+"""Pairs of landmarks that the pose detector swaps together; the face detector does not swap the sides of a face."""
 
 
 def mirror_permutation(pairs: tuple[tuple[int, ...], ...]) -> list[int]:
@@ -90,6 +104,12 @@ def landmark_std_ratio() -> Float[Tensor, "l"]:
     for landmark in LANDMARKS:
         std_ratio[list(landmark.indices)] = landmark.std_ratio
     return std_ratio
+
+
+def landmark_offset_std_ratio() -> Float[Tensor, "o"]:
+    """Return the standard deviation of each landmark offset over the typical one."""
+    ratios = torch.tensor([landmark.offset_std_ratio for landmark in LANDMARKS], dtype=torch.float64)
+    return ratios.repeat_interleave(3)
 
 
 @dataclass(frozen=True)

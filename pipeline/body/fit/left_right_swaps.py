@@ -14,7 +14,6 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.body.fit.initialisation import facing_yaw_rad, has_torso_landmarks, torso_rotations
 from pipeline.body.fit.landmark_regressor import (
-    LEFT_RIGHT_PAIRS,
     POSE_LANDMARK_COUNT,
     SWAP_PAIR_GROUPS,
     mirror_permutation,
@@ -129,7 +128,7 @@ def swap_body_left_right(observations: Observations, left_right_swapped: Bool[np
     """
     to_camera = _camera_rotation(observations)
     mirror = to_camera.T @ torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)) @ to_camera
-    swapped = _swap_landmarks(observations, left_right_swapped, LEFT_RIGHT_PAIRS)
+    swapped = _swap_landmarks(observations, left_right_swapped, SWAP_PAIR_GROUPS["whole body"])
     directions = swapped.landmarks_3d_m.clone()
     directions[torch.from_numpy(left_right_swapped)] @= mirror.T
     return replace(swapped, landmarks_3d_m=directions)

@@ -21,7 +21,12 @@ from pipeline.body.fit.camera_parameters import (
     project_with_jacobian,
 )
 from pipeline.body.fit.ground_contact import CONTACT_CUTOFF, CONTACT_STD_M, Contact
-from pipeline.body.fit.landmark_regressor import LANDMARK_COUNT, LANDMARK_OFFSET_COUNT, landmark_std_ratio
+from pipeline.body.fit.landmark_regressor import (
+    LANDMARK_COUNT,
+    LANDMARK_OFFSET_COUNT,
+    landmark_offset_std_ratio,
+    landmark_std_ratio,
+)
 from pipeline.body.fit.levenberg_marquardt import NormalEquations, robust_weights
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody
 from pipeline.body.fit.posed_points import (
@@ -322,7 +327,7 @@ class SharedPriorTerm:
         std = torch.cat(
             [
                 self.shape_prior.std,
-                torch.full((LANDMARK_OFFSET_COUNT,), self.landmark_offset_std_m, dtype=torch.float64),
+                self.landmark_offset_std_m * landmark_offset_std_ratio(),
                 torch.tensor(self.intrinsics_std, dtype=torch.float64),
             ]
         )

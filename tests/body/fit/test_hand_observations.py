@@ -19,7 +19,13 @@ from pipeline.body.fit.hand_observations import (
     hand_landmarks,
     rest_hand_points_m,
 )
-from pipeline.body.fit.landmark_regressor import HAND_LANDMARKS, LANDMARKS, POSE_LANDMARK_COUNT, landmark_regressor
+from pipeline.body.fit.landmark_regressor import (
+    FACE_MESH_START,
+    HAND_LANDMARKS,
+    LANDMARKS,
+    POSE_LANDMARK_COUNT,
+    landmark_regressor,
+)
 from pipeline.body.fit.levenberg_marquardt import minimise
 from pipeline.body.fit.linear_body import (
     ACTIVE_JOINTS,
@@ -137,7 +143,8 @@ def test_hand_landmarks_are_in_the_order_of_the_fit() -> None:
     world = np.random.default_rng(0).normal(size=(3, 33, 3))
     hands.handedness_score[:, 0] = 0.7
     pixels, places, weights = hand_landmarks(hands, world)
-    indices = [index for landmark in LANDMARKS for index in landmark.indices if index >= POSE_LANDMARK_COUNT]
+    indices = [index for landmark in LANDMARKS for index in landmark.indices]
+    indices = [index for index in indices if POSE_LANDMARK_COUNT <= index < FACE_MESH_START]
     assert indices == list(range(POSE_LANDMARK_COUNT, POSE_LANDMARK_COUNT + pixels.shape[1]))
     for place, (point, side) in enumerate((point, side) for point in HAND_LANDMARKS for side in range(2)):
         np.testing.assert_array_equal(pixels[:, place], hands.landmarks_px[:, side, point])
@@ -168,7 +175,9 @@ def test_hand_landmarks_determine_the_wrist_rotation() -> None:
         state, _ = minimise(start, objective, objective.retract, 12)
         skeleton = pose_skeleton(scene.model, state.rotations, state.root_m)
         points = pose_points(scene.model, skeleton, regressor.points(scene.model, state.landmark_offsets_m)).world_m
-        found_px = project(points[:, POSE_LANDMARK_COUNT:].flatten(0, 1), scene.camera)[0].reshape(3, -1, 2, 2)
+        found_px = project(points[:, POSE_LANDMARK_COUNT:FACE_MESH_START].flatten(0, 1), scene.camera)[0].reshape(
+            3, -1, 2, 2
+        )
         true_px = scene.hands.landmarks_px[:, :, list(HAND_LANDMARKS)].swapaxes(1, 2)
         errors_px.append(float(np.linalg.norm(found_px.numpy() - true_px, axis=-1).max()))
     assert errors_px[0] > 2.5
