@@ -12,6 +12,7 @@ from pipeline.body.fit.prior.posture import (
     estimate_posture,
     frames_per_posture,
     most_likely_posture,
+    prior_of_recording,
     tie_still_joints,
     tie_to_posture,
 )
@@ -119,6 +120,33 @@ def test_a_dancer_is_not_tied(prior: PosePrior) -> None:
     tied = posture_of(prior, angles, torch.full((FRAMES, 3 * len(ACTIVE_JOINTS) + 3), 0.05).double())
     assert torch.equal(tied.std_rad[ARM], prior.std_rad[ARM])
     assert torch.equal(tied.mean_rad[ARM], prior.mean_rad[ARM])
+
+
+def test_frames_of_half_a_second_share_their_evidence(prior: PosePrior) -> None:
+    """Five frames tell an angle five times as exactly as one, so a scatter as large as one frame's error is motion."""
+    angles, std_rad, frames = turning_person(), 0.15, frames_per_posture(TIME_S)
+    angles[:, ARM] = std_rad * noise(FRAMES, 3, seed=7)
+    tied = posture_of(prior, angles, torch.full((FRAMES, 3 * len(ACTIVE_JOINTS) + 3), std_rad).double())
+    expected = std_rad * (1.0 - 1.0 / frames) ** 0.5 * frames**0.5
+    assert float(tied.std_rad[ARM, 0]) == pytest.approx(expected, rel=0.15)
+
+
+def test_whoever_leans_is_tied_to_the_lean(prior: PosePrior) -> None:
+    lean = axis_angle_to_matrix(torch.tensor([0.2, 0.0, 0.0], dtype=torch.float64))
+    rotations = axis_angle_to_matrix(turning_person())
+    rotations[:, 0] = rotations[:, 0] @ lean
+    hessian = (0.02**-2 * torch.eye(3 * len(ACTIVE_JOINTS) + 3, dtype=torch.float64)).expand(FRAMES, -1, -1)
+    posture = estimate_posture(prior, rotations, TIME_S, hessian)
+    assert posture is not None
+    expected, _ = tilt_of_hips(rotations[:1, 0])
+    torch.testing.assert_close(tie_to_posture(prior, posture, TIME_S).tilt_mean, expected[0], atol=0.01, rtol=0.0)
+
+
+def test_without_a_posture_still_joints_are_tied(prior: PosePrior) -> None:
+    rotations = axis_angle_to_matrix(turning_person())
+    expected = tie_still_joints(prior, rotations)
+    assert not torch.equal(expected.std_rad, prior.std_rad)
+    assert torch.equal(prior_of_recording(prior, None, rotations, TIME_S).std_rad, expected.std_rad)
 
 
 def test_frames_of_half_a_second_count_once() -> None:
