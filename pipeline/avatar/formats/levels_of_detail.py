@@ -1,5 +1,7 @@
 """Levels of detail: the avatar with fewer triangles and smaller textures, with the same skeleton, skin and clips.
 
+The textures are baked anew for the faces of the level (`level_textures`).
+
 Each level is a whole file of its own. The extension MSFT_lod would put all levels into one file, but the loaders of
 three.js, glTFast and Blender do not read it.
 """
@@ -8,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.avatar.formats.level_textures import TexelSources, UvMesh, bake_texture, find_texel_sources
 from pipeline.geometry.simplification import collapse_textured_edges
 from pipeline.io.glb import GlbFile
 from pipeline.io.glb_writer import GlbWriter
-from pipeline.io.image import png_bytes, resize
+from pipeline.io.image import png_bytes
 
 FACE_RATIOS = (0.5, 0.25)
 """Faces of each coarser level as a share of those of the avatar; the avatar itself is the finest level."""
@@ -42,16 +45,27 @@ def encode_level(file: GlbFile, face_ratio: float, texture_halvings: int) -> byt
         UserError: the file's arrays or images cannot be read.
     """
     document = GlbWriter.from_file(file)
-    for mesh in document.json["meshes"]:
-        for primitive in mesh["primitives"]:
-            _reduce_primitive(file, document, primitive, face_ratio)
+    meshes = [
+        _reduce_primitive(file, document, primitive, face_ratio)
+        for mesh in document.json["meshes"]
+        for primitive in mesh["primitives"]
+    ]
+    full, reduced = (_join(list(parts)) for parts in zip(*meshes, strict=True))
+    sources: dict[tuple[int, int], TexelSources] = {}
     for index in range(len(document.json.get("images", ()))):
-        document.replace_image(index, _halve_image(file.image_pixels(index), texture_halvings), "image/png")
+        pixels = file.image_pixels(index)
+        size_px = _halved_size(pixels, texture_halvings)
+        if size_px not in sources:
+            sources[size_px] = find_texel_sources(full, reduced, *size_px)
+        document.replace_image(index, png_bytes(bake_texture(pixels, sources[size_px])), "image/png")
     document.remove_unused()
     return document.to_bytes()
 
 
-def _reduce_primitive(file: GlbFile, document: GlbWriter, primitive: dict[str, Any], face_ratio: float) -> None:
+def _reduce_primitive(
+    file: GlbFile, document: GlbWriter, primitive: dict[str, Any], face_ratio: float
+) -> tuple[UvMesh, UvMesh]:
+    """Reduce the faces of a primitive in the document; return its mesh before and after."""
     attributes = primitive["attributes"]
     faces = file.accessor(primitive["indices"]).reshape(-1, 3)
     positions_m, uv = file.accessor(attributes["POSITION"]), file.accessor(attributes["TEXCOORD_0"])
@@ -63,8 +77,19 @@ def _reduce_primitive(file: GlbFile, document: GlbWriter, primitive: dict[str, A
     per_vertex += [index for target in primitive.get("targets", ()) for index in target.values()]
     for index in per_vertex:
         document.replace_array(index, file.stored_array(index)[reduced.source_vertex])
+    return UvMesh(positions_m, uv, faces), UvMesh(positions_m[reduced.source_vertex], reduced.uv, reduced.faces)
 
 
-def _halve_image(pixels: np.ndarray, halvings: int) -> bytes:
+def _join(meshes: list[UvMesh]) -> UvMesh:
+    """Return one mesh of all primitives; they share the textures."""
+    first = np.cumsum([0, *(len(mesh.uv) for mesh in meshes[:-1])])
+    return UvMesh(
+        np.concatenate([mesh.positions_m for mesh in meshes]),
+        np.concatenate([mesh.uv for mesh in meshes]),
+        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, first, strict=True)]),
+    )
+
+
+def _halved_size(pixels: np.ndarray, halvings: int) -> tuple[int, int]:
     height_px, width_px = (max(side_px >> halvings, min(side_px, MIN_TEXTURE_PX)) for side_px in pixels.shape[:2])
-    return png_bytes(resize(pixels, width_px, height_px, "box"))
+    return height_px, width_px
