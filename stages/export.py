@@ -235,7 +235,7 @@ def asset_extras(config: Config, offset_m: Float[np.ndarray, "3"], frame_rate_hz
 
 STAGE = Stage(
     "export",
-    version=5,
+    version=6,
     needs=("frames", "body", "mesh", "texture"),
     makes=("avatar.glb", "avatar.obj", "avatar.mtl", *OBJ_MAPS),
     config=Config,

