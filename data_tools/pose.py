@@ -22,7 +22,7 @@ from pipeline.avatar.bvh_export import motion_to_bvh
 from pipeline.avatar.feet import find_contacts, plant_feet, snap_feet_to_floor, sole_positions_m
 from pipeline.avatar.idle import idle_motion
 from pipeline.avatar.placement import resample_uniformly
-from pipeline.avatar.retarget import recorded_contacts, retarget
+from pipeline.avatar.retarget import retarget_with_contacts
 from pipeline.avatar.rig import build_rig
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.core.errors import UserError
@@ -74,8 +74,8 @@ def play_bvh(path: Path, body: Body, in_place: bool = False) -> Motion:
     if len(recorded.rotations) < 2:
         raise UserError(f"motion {path} has one frame and no duration; supply a clip of at least two frames")
     try:
-        motion = retarget(recorded, body, FLOOR_M, in_place)
-        return motion if in_place else plant_feet(body, motion, recorded_contacts(recorded, body), float(FLOOR_M[1]))
+        motion, contact = retarget_with_contacts(recorded, body, FLOOR_M, in_place)
+        return motion if in_place else plant_feet(body, motion, contact, float(FLOOR_M[1]))
     except UserError as error:
         raise UserError(f"motion {path}: {error}") from error
 

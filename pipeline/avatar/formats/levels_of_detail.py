@@ -102,7 +102,7 @@ def _unwrap_together(
     parts = []
     for number in range(len(reduced)):
         used, corners = np.unique(atlas.faces_uv[segment == number], return_inverse=True)
-        uv = atlas.uv[used] * np.float32([1.0, -1.0]) + np.float32([0.0, 1.0])
+        uv = np.stack([atlas.uv[used, 0], 1.0 - atlas.uv[used, 1]], axis=1)
         parts.append((atlas.vertex_of_uv[used] - first[number], uv, corners.reshape(-1, 3)))
     return parts
 
