@@ -45,8 +45,36 @@ GRID_M, LINE_M, LINE_STRENGTH = 0.5, 0.012, 0.1
 GROUND_FADE_M = 3.0
 """Distance from the person at which the grid has faded to 1/e."""
 
+MIN_FADE = 1e-3
+
 BACKGROUND_TOP, BACKGROUND_BOTTOM = 0.80, 0.93
 """sRGB grey at the upper and lower edge."""
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The ground in the rows from `first_row` on; the first axis is the direction across lines of constant x, z.
+
+    x_z_m: point relative to the followed one. width_m: of a pixel. strength: by how much a line darkens the pixel.
+    """
+
+    first_row: int
+    x_z_m: Float32[np.ndarray, "2 h w"]
+    width_m: Float32[np.ndarray, "2 h w"]
+    strength: Float32[np.ndarray, "2 h w"]
+
+    def line_darkness(self, point_m: Float[np.ndarray, "3"]) -> Float32[np.ndarray, "h w"]:
+        """Return by which share the lines darken each pixel when the camera follows `point_m`."""
+        darkness = np.zeros(self.x_z_m.shape[1:], np.float32)
+        for axis, start_m in enumerate(point_m[[0, 2]]):
+            to_line_m = self.x_z_m[axis] + np.float32(start_m)
+            to_line_m -= np.float32(GRID_M) * np.rint(to_line_m * np.float32(1.0 / GRID_M))
+            covered = np.float32(0.5 * LINE_M) - np.abs(to_line_m, out=to_line_m)
+            covered /= self.width_m[axis]
+            covered += np.float32(0.5)  # a ramp of the width of a pixel
+            np.clip(covered, 0.0, 1.0, out=covered)
+            np.maximum(darkness, covered * self.strength[axis], out=darkness)
+        return darkness
 
 
 @dataclass(frozen=True)
@@ -80,24 +108,24 @@ class FilmView:
         return replace(self.camera, world_to_camera=world_to_camera)
 
     @cached_property
-    def ground(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Per pixel the point x, z on the ground relative to the followed point (m), its width in metres, and the fade.
-
-        The fade is 0 above the horizon.
-        """
+    def ground(self) -> Ground:
+        """The part of the picture that shows the ground near the followed point."""
         camera = self.camera
         columns, rows = np.arange(WIDTH_PX) + 0.5 - camera.cx, np.arange(HEIGHT_PX) + 0.5 - camera.cy
-        rays = np.stack(
-            [*np.broadcast_arrays(columns / camera.fx, rows[:, None] / camera.fy, 1.0)], axis=-1
-        ) @ camera.world_to_camera[:3, :3].astype(np.float64)
-        centre_m = camera.centre_m().astype(np.float64)
-        distance = np.where(rays[..., 1] < -1e-4, -centre_m[1] / np.minimum(rays[..., 1], -1e-4), np.inf)
-        is_ground = np.isfinite(distance)
-        point_m = np.where(is_ground[..., None], centre_m + np.where(is_ground, distance, 0.0)[..., None] * rays, 1e3)
-        x_z_m = point_m[..., [0, 2]].astype(np.float32)
-        width_m = (np.abs(np.gradient(x_z_m, axis=0)) + np.abs(np.gradient(x_z_m, axis=1))).astype(np.float32)
-        fade = np.exp(-((np.linalg.norm(x_z_m, axis=-1) / GROUND_FADE_M) ** 2)) * is_ground
-        return x_z_m, width_m, fade.astype(np.float32)
+        rays = (
+            np.stack([*np.broadcast_arrays(columns / camera.fx, rows[:, None] / camera.fy, 1.0)], axis=-1)
+            @ camera.world_to_camera[:3, :3]
+        )
+        centre_m = camera.centre_m()
+        is_ground = rays[..., 1] < -1e-4
+        distance = np.where(is_ground, -centre_m[1] / np.where(is_ground, rays[..., 1], -1.0), 1e3)
+        x_z_m = np.moveaxis((centre_m + distance[..., None] * rays)[..., [0, 2]], -1, 0)
+        fade = np.exp(-((x_z_m**2).sum(axis=0) / GROUND_FADE_M**2)) * is_ground
+        first_row = int(np.argmax(fade.max(axis=1) > MIN_FADE))
+        x_z_m, fade = x_z_m[:, first_row:], fade[first_row:]
+        width_m = np.maximum(np.abs(np.gradient(x_z_m, axis=1)) + np.abs(np.gradient(x_z_m, axis=2)), 1e-6)
+        strength = LINE_STRENGTH * fade * np.minimum(1.0, LINE_M / width_m)
+        return Ground(first_row, *(values.astype(np.float32) for values in (x_z_m, width_m, strength)))
 
 
 def turntable_motion(body: Body) -> Motion:
@@ -123,25 +151,27 @@ def render_film(avatar: TexturedAvatar, body: Body, motion: Motion) -> Iterator[
     transforms = canonical_to_world(body, motion)
     path_m = _camera_path_m(motion)
     view = FilmView(_moving_box_m(avatar, transforms, path_m))
+    background, background_at_m = np.empty(0, np.float32), None
     for pose, point_m in zip(transforms, path_m, strict=True):
-        yield render_frame(avatar, avatar.pose_vertices(pose), view, point_m)
+        if background_at_m is None or not np.array_equal(point_m, background_at_m):
+            background, background_at_m = _background(view, point_m), point_m
+        yield _render_frame(avatar, avatar.pose_vertices(pose), view.at(point_m), background)
 
 
-def render_frame(
-    avatar: TexturedAvatar, vertices_world: Float[Tensor, "v 3"], view: FilmView, point_m: Float[np.ndarray, "3"]
+def _render_frame(
+    avatar: TexturedAvatar, vertices_world: Float[Tensor, "v 3"], camera: Camera, background: Float32[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Render one pose. point_m: the point on the ground that the camera follows."""
-    camera = view.at(point_m)
-    grey = _background(view, point_m) * (1.0 - SHADOW_STRENGTH * _shadow(vertices_world, avatar, camera))
-    image = np.repeat(grey[..., None], 3, axis=2)
+    """Render one pose before a grey background in [0, 255]."""
+    shadow = _shadow(vertices_world, avatar, camera)
+    grey = background * (np.float32(1.0) - np.float32(SHADOW_STRENGTH) * shadow)
+    image = cv2.cvtColor(cv2.convertScaleAbs(grey), cv2.COLOR_GRAY2RGB)
     left, top, right, bottom = _pixel_box(vertices_world, camera)
     if right > left and bottom > top:
         crop = camera.cropped(left, top, right - left, bottom - top)
         person = avatar.render(vertices_world, crop, SUPERSAMPLING)
-        window = image[top:bottom, left:right]
-        window *= 1.0 - person[..., 3:]
-        window += person[..., :3]
-    return cv2.convertScaleAbs(image, alpha=255.0)
+        window = 255.0 * person[..., :3] + (1.0 - person[..., 3:]) * grey[top:bottom, left:right, None]
+        image[top:bottom, left:right] = cv2.convertScaleAbs(window)
+    return image
 
 
 def _camera_path_m(motion: Motion) -> Float[np.ndarray, "n 3"]:
@@ -163,15 +193,11 @@ def _moving_box_m(
 
 
 def _background(view: FilmView, point_m: Float[np.ndarray, "3"]) -> Float32[np.ndarray, "h w"]:
-    """Return the grey of background and ground: a vertical gradient with a grid that fades with the distance."""
-    grey = np.linspace(BACKGROUND_TOP, BACKGROUND_BOTTOM, HEIGHT_PX, dtype=np.float32)[:, None]
-    x_z_m, width_m, fade = view.ground
-    phase = (x_z_m + point_m[[0, 2]].astype(np.float32)) * np.float32(1.0 / GRID_M)
-    to_line_m = np.abs(phase - np.rint(phase)) * np.float32(GRID_M)
-    # coverage of a line by a pixel, as a ramp of the pixel's width
-    covered = np.clip((0.5 * (LINE_M + width_m) - to_line_m) / np.maximum(width_m, 1e-6), 0.0, 1.0)
-    thinned = covered * np.minimum(1.0, LINE_M / np.maximum(width_m, 1e-6))
-    return grey * (1.0 - np.float32(LINE_STRENGTH) * fade * thinned.max(axis=-1))
+    """Return background and ground, grey in [0, 255]: a gradient, and a grid that fades with the distance."""
+    column = np.linspace(BACKGROUND_TOP, BACKGROUND_BOTTOM, HEIGHT_PX, dtype=np.float32)
+    grey = np.repeat(np.float32(255.0) * column[:, None], WIDTH_PX, axis=1)
+    grey[view.ground.first_row :] *= np.float32(1.0) - view.ground.line_darkness(point_m)
+    return grey
 
 
 def _shadow(vertices_world: Float[Tensor, "v 3"], avatar: TexturedAvatar, camera: Camera) -> Float32[np.ndarray, "h w"]:

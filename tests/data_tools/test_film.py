@@ -84,11 +84,19 @@ def test_the_camera_sees_the_whole_box_from_above(scene: PaintedScene) -> None:
     point_m = np.array([3.0, 0.0, -2.0])
     moved, _ = project(corners.float() + torch.from_numpy(point_m).float(), view.at(point_m))
     np.testing.assert_allclose(moved.numpy(), pixels.numpy(), atol=1e-2)
-    x_z_m, _, fade = view.ground
-    row, column = HEIGHT_PX - 40, 300
-    ground = torch.tensor([[x_z_m[row, column, 0], 0.0, x_z_m[row, column, 1]]])
-    np.testing.assert_allclose(project(ground, view.camera)[0][0].numpy(), [column + 0.5, row + 0.5], atol=0.02)
-    assert fade[row, column] > 0.0
+
+
+def test_the_lines_of_the_ground_are_where_they_project() -> None:
+    view, point_m = FilmView(np.array([[-0.9, 0.0, -0.5], [0.7, 2.1, 0.6]])), np.array([0.2, 0.0, -0.1])
+    row, column = HEIGHT_PX - view.ground.first_row - 40, 300
+    x_m, z_m = view.ground.x_z_m[:, row, column]
+    pixel = project(torch.tensor([[x_m, 0.0, z_m]]), view.camera)[0][0].numpy()
+    np.testing.assert_allclose(pixel, [column + 0.5, HEIGHT_PX - 40 + 0.5], atol=0.02)
+    darkness = view.ground.line_darkness(point_m)
+    for world_m, is_dark in ((0.5, True), (0.25, False)):
+        place = torch.tensor([[world_m, 0.0, 0.25]])
+        pixels = project(place, view.at(point_m))[0].numpy().astype(int)
+        assert (darkness[pixels[0, 1] - view.ground.first_row, pixels[0, 0]] > 0.03) == is_dark
 
 
 def test_the_film_shows_the_white_person_and_a_shadow_on_grey(run: Path) -> None:
