@@ -56,7 +56,7 @@ async function enter(view, onTrigger, onEnd) {
   visitor.space.add(camera);
   scene.add(visitor.space);
   scene.background = new THREE.Color(BACKGROUND);
-  key.castShadow = false; // three draw calls an eye less
+  key.castShadow = false; // the shadow map would draw the avatar once more
   view.controls.enabled = false;
   session.addEventListener("select", onTrigger);
   session.addEventListener("end", () => {
