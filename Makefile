@@ -19,6 +19,9 @@ FRAME ?=
 POSE ?=
 NAME ?=
 
+# Input of film besides NAME; optional.
+CLIP ?=
+
 # Inputs of a batch.
 VIDEOS ?=
 RUNS ?= runs
@@ -52,7 +55,7 @@ OPTIONS = $(RUN_OPTIONS) $(ARGS)
 STAMP := $(VENV)/.stamp$(if $(EXTRA),-$(EXTRA))
 
 .DEFAULT_GOAL := help
-.PHONY: help all $(STAGES) batch chart ablate pose compare figures test test-all check format bench bench-field bench-body doctor venv lock configs gltf-validator clean
+.PHONY: help all $(STAGES) batch chart ablate pose film compare figures test test-all check format bench bench-field bench-body doctor venv lock configs gltf-validator clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z$$()A-Z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST) | sed 's/$$(STAGES)/STAGE    /'
@@ -97,6 +100,9 @@ $(SAMPLE_DONE): | $(STAMP)
 pose: $(STAMP)  ## play BVH='clip.bvh ...' on the avatar of RUN=runs/name, or pose it by FRAME=12 or POSE=a|t|file.json
 	$(RUN_PYTHON) -m data_tools.pose "$(ONE_RUN)" $(foreach clip,$(BVH),--bvh "$(clip)") $(if $(FRAME),--frame $(FRAME)) \
 		$(if $(POSE),--pose "$(POSE)") $(if $(NAME),--name "$(NAME)") $(ARGS)
+
+film: $(STAMP)  ## render the turntable of RUN=runs/name, or CLIP=capture|idle|clip.bvh, to RUN/film/NAME/film.mp4
+	$(RUN_PYTHON) -m data_tools.film "$(ONE_RUN)" $(if $(CLIP),--clip "$(CLIP)") $(if $(NAME),--name "$(NAME)") $(ARGS)
 
 compare: $(STAMP)  ## compare RUN=runs/name with the ground truth of TRUTH=capture (default: the sample): compare/truth.html
 	$(RUN_PYTHON) -m data_tools.evaluate.compare "$(or $(TRUTH),$(SAMPLE))" "$(ONE_RUN)"

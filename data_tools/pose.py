@@ -22,7 +22,7 @@ from pipeline.avatar.bvh_export import motion_to_bvh
 from pipeline.avatar.feet import find_contacts, plant_feet, snap_feet_to_floor, sole_positions_m
 from pipeline.avatar.idle import idle_motion
 from pipeline.avatar.placement import resample_uniformly
-from pipeline.avatar.retarget import recorded_contacts, retarget
+from pipeline.avatar.retarget import retarget_with_contacts
 from pipeline.avatar.rig import build_rig
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.core.errors import UserError
@@ -40,7 +40,7 @@ def main(argv: Sequence[str]) -> None:
     """Write the clips and poses of one command."""
     options = _parse_options(argv)
     inputs = {name: options.run / name for name in export.STAGE.needs}
-    config = _export_config(options.run)
+    config = export_config(options.run)
     scene = load_scene(inputs, config)
     clips = _retargeted_clips(options.bvh, scene.body, options.in_place)
     posed = _chosen_pose(options, scene, clips)
@@ -74,8 +74,8 @@ def play_bvh(path: Path, body: Body, in_place: bool = False) -> Motion:
     if len(recorded.rotations) < 2:
         raise UserError(f"motion {path} has one frame and no duration; supply a clip of at least two frames")
     try:
-        motion = retarget(recorded, body, FLOOR_M, in_place)
-        return motion if in_place else plant_feet(body, motion, recorded_contacts(recorded, body), float(FLOOR_M[1]))
+        motion, contact = retarget_with_contacts(recorded, body, FLOOR_M, in_place)
+        return motion if in_place else plant_feet(body, motion, contact, float(FLOOR_M[1]))
     except UserError as error:
         raise UserError(f"motion {path}: {error}") from error
 
@@ -101,6 +101,22 @@ def read_pose(path: Path, body: Body) -> Float32[np.ndarray, "1 j 4"]:
     return rotations
 
 
+def export_config(run: Path) -> export.Config:
+    """Return the options of the finished export stage of a run. UserError if it is not finished."""
+    manifest = read_manifest(run / "export")
+    if manifest is None:
+        raise UserError(f"{run} has no finished export; run make export RUN={run}")
+    known = {name: value for name, value in manifest.config.items() if name in export.Config.model_fields}
+    return export.Config(**known)
+
+
+def check_folder_name(name: str) -> str:
+    """Return the name of a result folder. UserError if it is a path."""
+    if Path(name).name != name or name in (".", ".."):
+        raise UserError(f"--name {name} is not the name of a folder; remove the slashes")
+    return name
+
+
 def _parse_options(argv: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m data_tools.pose", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("run", type=Path, help="run folder with a finished export")
@@ -116,23 +132,12 @@ def _parse_options(argv: Sequence[str]) -> argparse.Namespace:
 def _result_name(options: argparse.Namespace) -> str:
     """Return the name of the folder: as chosen, or of the first of clip, pose and frame."""
     if options.name:
-        if Path(options.name).name != options.name or options.name in (".", ".."):
-            raise UserError(f"--name {options.name} is not the name of a folder; remove the slashes")
-        return str(options.name)
+        return check_folder_name(options.name)
     if options.bvh:
         return str(options.bvh[0].stem)
     if options.pose is not None:
         return Path(options.pose).stem
     return "capture" if options.frame is None else f"frame-{options.frame}"
-
-
-def _export_config(run: Path) -> export.Config:
-    """Return the options of the finished export stage."""
-    manifest = read_manifest(run / "export")
-    if manifest is None:
-        raise UserError(f"{run} has no finished export; run make export RUN={run}")
-    known = {name: value for name, value in manifest.config.items() if name in export.Config.model_fields}
-    return export.Config(**known)
 
 
 def _retargeted_clips(paths: Sequence[Path], body: Body, in_place: bool) -> dict[str, Motion]:

@@ -208,8 +208,8 @@ def build_skinned_mesh(skinned: MeshArtifact, atlas: Atlas) -> SkinnedMesh:
 def to_rest_pose(skinned: MeshArtifact, rig: Rig) -> MeshArtifact:
     """Return the mesh in the rest pose of a rig."""
     mesh = skinned.mesh
-    weights = skinned.dense_skin_weights(len(rig.joint_names)).numpy()
-    return replace(skinned, mesh=Mesh(rig.rest_positions(mesh.vertices, weights), mesh.faces))
+    positions_m = rig.rest_positions(mesh.vertices, skinned.joint_indices, skinned.joint_weights)
+    return replace(skinned, mesh=Mesh(positions_m, mesh.faces))
 
 
 def lowest_vertex_y_m(skinned: MeshArtifact, body: Body, motion: Motion) -> Float[np.ndarray, "n"]:
@@ -235,7 +235,7 @@ def asset_extras(config: Config, offset_m: Float[np.ndarray, "3"], frame_rate_hz
 
 STAGE = Stage(
     "export",
-    version=5,
+    version=6,
     needs=("frames", "body", "mesh", "texture"),
     makes=("avatar.glb", "avatar.obj", "avatar.mtl", *OBJ_MAPS),
     config=Config,

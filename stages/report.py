@@ -28,7 +28,7 @@ from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.texture_rendering import blur_coverage
-from pipeline.io.image import read_rgb, to_uint8, write_rgb
+from pipeline.io.image import read_gray, read_rgb, to_uint8, write_rgb
 from pipeline.mesh.views import crop_posed_view
 from pipeline.metrics.health import mesh_quality_metrics
 from pipeline.metrics.images import (
@@ -42,11 +42,13 @@ from pipeline.metrics.images import (
     frame_scores,
     reason_not_scorable,
 )
+from pipeline.report.embed import read_level
 from pipeline.report.lpips_weights import find_lpips_weights
 from pipeline.report.page import FrameImages, PageContent, error_map, render_page
 from pipeline.report.report_json import build_report, replace_nonfinite, report_to_json
 from pipeline.report.settings import REPORT_SETTINGS, ReportSettings
 from pipeline.report.sheets import composite_on_white_uint8, image_grid
+from pipeline.texture.files import COVERAGE
 
 NEEDS = ("frames", "body", "field", "mesh", "texture", "export")
 REPORT_IMAGES = (
@@ -114,6 +116,8 @@ def run(
         turntable=[turntable[0], *clay, turntable[1], clay_posed],
         images=[(caption, read_rgb(inputs[stage] / name)) for stage, name, caption in REPORT_IMAGES],
         glb=glb,
+        levels=[read_level(path) for path in sorted(inputs["export"].glob("avatar_lod*.glb"))],
+        coverage=read_gray(inputs["texture"] / COVERAGE),
     )
     (out / "index.html").write_text(render_page(page), encoding="utf-8")
     (out / "report.json").write_text(report_to_json(report), encoding="utf-8")
@@ -295,7 +299,7 @@ def _manifest(folder: Path) -> Manifest:
 
 STAGE = Stage(
     name="report",
-    version=6,
+    version=7,
     needs=NEEDS,
     makes=("report.json", "index.html", "turntable.jpg", "clay.jpg", "heldout.jpg"),
     config=Config,

@@ -59,6 +59,13 @@ _FRONT = (0.0, 0.0, 1.0)
 
 
 def retarget(bvh_motion: BvhMotion, body: Body, ground_m: Float[np.ndarray, "3"], in_place: bool) -> Motion:
+    """Retarget the recorded motion to another body; see `retarget_with_contacts`."""
+    return retarget_with_contacts(bvh_motion, body, ground_m, in_place)[0]
+
+
+def retarget_with_contacts(
+    bvh_motion: BvhMotion, body: Body, ground_m: Float[np.ndarray, "3"], in_place: bool
+) -> tuple[Motion, Bool[np.ndarray, "n 4"]]:
     """Retarget the recorded motion to another body, which faces +Z in the first frame.
 
     Distances are scaled by the ratio of the leg lengths. The 30th percentile of the lowest foot height is on the
@@ -68,44 +75,32 @@ def retarget(bvh_motion: BvhMotion, body: Body, ground_m: Float[np.ndarray, "3"]
         ground_m: world position below the middle of the trajectory.
         in_place: remove the horizontal root translation.
 
+    Returns:
+        The motion, and where each sole of the recorded person stands (`find_contacts`); a missing toe stands with its
+        ankle.
+
     Raises:
         UserError: the motion lacks a required joint.
     """
     recorded_joint_of = match_joints(bvh_motion, body)
     world, positions = bvh_motion.forward_kinematics(bvh_motion.rotations)
     reference = _reference_pose(bvh_motion, body, recorded_joint_of, world, positions)
-    bvh_to_world = _body_axes(positions, recorded_joint_of).mean(axis=0)
-    bvh_to_world = _bvh_to_world(bvh_to_world, _body_axes(positions[:1], recorded_joint_of)[0])
+    axes = _body_axes(positions, recorded_joint_of)
+    bvh_to_world = _bvh_to_world(axes.mean(axis=0), axes[0])
+    soles = [recorded_joint_of.get(name, recorded_joint_of[name.replace("ToeBase", "Foot")]) for name in SOLE_JOINTS]
+    soles_m = (positions[:, soles] + bvh_motion.root_positions[:, None]) @ bvh_to_world.T
+    soles_m *= _scale_to_m(bvh_motion, body, recorded_joint_of)
+    time_s = np.arange(len(positions)) / bvh_motion.fps
+    contact = find_contacts(soles_m, time_s)
     rotations = retarget_rotations(body, recorded_joint_of, world, reference, bvh_to_world)
-    _flatten_standing_feet(body, rotations, recorded_contacts(bvh_motion, body))
-    local = local_quaternions(rotations, body.parents)
+    _flatten_standing_feet(body, rotations, contact)
     root = _root_trajectory(bvh_motion, body, recorded_joint_of, bvh_to_world, ground_m, in_place)
-    count = len(local)
-    motion = Motion(
-        np.arange(count, dtype=np.int32),
-        np.arange(count) / bvh_motion.fps,
-        local,
-        root.astype(np.float32),
-    )
+    local = local_quaternions(rotations, body.parents)
+    motion = Motion(np.arange(len(local), dtype=np.int32), time_s, local, root.astype(np.float32))
     lowest_foot_height_m = lowest_foot_offset_m(body, motion)
     standing_height_m = float(np.percentile(lowest_foot_height_m, 30.0))
     root[:, 1] += ground_m[1] - standing_height_m + np.maximum(standing_height_m - lowest_foot_height_m, 0.0)
-    return motion.with_pose(motion.rotations_wxyz, root)
-
-
-def recorded_contacts(bvh_motion: BvhMotion, body: Body) -> Bool[np.ndarray, "n 4"]:
-    """Return where each sole of the recorded person stands; see `find_contacts`. A missing toe stands with its ankle.
-
-    Raises:
-        UserError: the motion lacks a required joint.
-    """
-    recorded_joint_of = match_joints(bvh_motion, body)
-    _, positions = bvh_motion.forward_kinematics(bvh_motion.rotations)
-    axes = _body_axes(positions, recorded_joint_of)
-    to_world = _bvh_to_world(axes.mean(axis=0), axes[0]) * _scale_to_m(bvh_motion, body, recorded_joint_of)
-    soles = [recorded_joint_of.get(name, recorded_joint_of[name.replace("ToeBase", "Foot")]) for name in SOLE_JOINTS]
-    soles_m = (positions[:, soles] + bvh_motion.root_positions[:, None]) @ to_world.T
-    return find_contacts(soles_m, np.arange(len(soles_m)) / bvh_motion.fps)
+    return motion.with_pose(motion.rotations_wxyz, root), contact
 
 
 def match_joints(bvh_motion: BvhMotion, body: Body) -> dict[str, int]:

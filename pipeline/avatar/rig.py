@@ -17,13 +17,13 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from pipeline.avatar.rig_names import RigName, rig_joint_name
 from pipeline.avatar.t_pose import t_pose_transforms
 from pipeline.body.body import Body, Motion
 from pipeline.geometry.rotation import quaternion_to_matrix
-from pipeline.geometry.skinning import forward_kinematics, local_quaternions
+from pipeline.geometry.skinning import forward_kinematics, inverse_skinning_matrices, local_quaternions
 
 RestPose = Literal["a", "t"]
 
@@ -117,18 +117,19 @@ class Rig:
         return local_quaternions(world @ self.axes, self.body.parents)
 
     def rest_positions(
-        self, positions_m: Float[np.ndarray, "v 3"], skin_weights: Float[np.ndarray, "v j"]
+        self,
+        positions_m: Float[np.ndarray, "v 3"],
+        joint_indices: Int[np.ndarray, "v k"],
+        joint_weights: Float[np.ndarray, "v k"],
     ) -> Float[np.ndarray, "v 3"]:
         """Return positions of the A-pose in the rest pose.
 
-        Linear blend skinning of the result into the A-pose gives back the positions exactly: each vertex is moved by
-        the inverse of the blended matrix with which that skinning would move it.
+        Linear blend skinning of the result into the A-pose gives back the positions exactly.
         """
         if np.allclose(self.bind_to_rest, np.eye(4)):
             return positions_m
-        rest_to_bind = np.linalg.inv(self.bind_to_rest)[:, :3]
-        blended = np.einsum("vj,jab->vab", skin_weights.astype(np.float64), rest_to_bind)
-        positions = np.linalg.solve(blended[..., :3], (positions_m - blended[..., 3])[..., None])[..., 0]
+        matrices = inverse_skinning_matrices(joint_indices, joint_weights, self.bind_to_rest)
+        positions = np.einsum("vab,vb->va", matrices[:, :3, :3], positions_m) + matrices[:, :3, 3]
         return positions.astype(np.float32)
 
 

@@ -85,6 +85,19 @@ def linear_blend_skinning(
     return (blended[..., :3] @ vertices[:, :, None]).squeeze(-1) + blended[..., 3]
 
 
+def inverse_skinning_matrices(
+    joint_indices: Int[np.ndarray, "v k"],
+    joint_weights: Float[np.ndarray, "v k"],
+    transforms: Float[np.ndarray, "j 4 4"],
+) -> Float[np.ndarray, "v 4 4"]:
+    """Return matrices that move each vertex to where linear blend skinning by the inverse transforms brings it back.
+
+    joint_weights: rows sum to 1. transforms: of the joints' rigid parts, to the pose in which the result is.
+    """
+    back = np.linalg.inv(transforms.astype(np.float64))
+    return np.linalg.inv(np.einsum("vk,vkab->vab", joint_weights.astype(np.float64), back[joint_indices]))
+
+
 def dense_weights(indices: Int[Tensor, "v k"], weights: Float[Tensor, "v k"], joint_count: int) -> Float[Tensor, "v j"]:
     """Convert sparse influences to one row of weights per vertex."""
     dense = weights.new_zeros(len(weights), joint_count)

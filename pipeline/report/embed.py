@@ -3,11 +3,21 @@
 import base64
 import json
 import struct
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
+
+from pipeline.io.glb import GlbFile
+from pipeline.io.glb_writer import GlbWriter
+
+MAX_COVERAGE_PX = 1024
+"""Side of the coverage map in the 3D view; finer texels are not told apart there."""
+
+COVERAGE_MARGIN_PX = 3
+"""Texels by which the coverage of a chart grows into its gutter; viewers blend texels across the edge of a chart."""
 
 WEBP_QUALITY = 84
 JPEG_QUALITY = 88
@@ -25,6 +35,31 @@ def webp_data_uri(pixels: UInt8[np.ndarray, "h w c"]) -> str:
     if not encoded:
         raise ValueError(f"an image of shape {pixels.shape} cannot be encoded as WebP")
     return f"data:image/webp;base64,{base64.b64encode(data.tobytes()).decode()}"
+
+
+def coverage_data_uri(coverage: UInt8[np.ndarray, "h w"]) -> str:
+    """Return a `data:` URI of the coverage map in colours: viridis, from texels that were filled in to well seen ones.
+
+    coverage: confidence that the video shows a texel, 0 to 255.
+    """
+    margin = cv2.dilate(coverage, np.ones((3, 3), np.uint8), iterations=COVERAGE_MARGIN_PX)
+    coverage = np.where(coverage == 0, margin, coverage)
+    scale = MAX_COVERAGE_PX / max(coverage.shape)
+    if scale < 1.0:
+        coverage = cv2.resize(coverage, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return webp_data_uri(cv2.cvtColor(cv2.applyColorMap(coverage, cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB))
+
+
+def read_level(path: Path) -> bytes:
+    """Return a level of detail without its clips: the 3D view plays those of the finest level on all of them.
+
+    Raises:
+        UserError: the file is not a .glb.
+    """
+    document = GlbWriter.from_file(GlbFile(path))
+    document.json.pop("animations", None)
+    document.remove_unused()
+    return document.to_bytes()
 
 
 def unpack_glb(data: bytes) -> tuple[dict[str, Any], bytes]:

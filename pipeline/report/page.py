@@ -13,7 +13,7 @@ from markupsafe import Markup
 
 from pipeline.io.image import resize
 from pipeline.report.charts import bar_chart, legend, line_chart
-from pipeline.report.embed import compress_glb_textures, webp_data_uri
+from pipeline.report.embed import compress_glb_textures, coverage_data_uri, webp_data_uri
 from pipeline.report.report_json import POSE_FITTED_SUFFIX
 from pipeline.report.templates import read_asset, render_macro, render_template
 
@@ -42,6 +42,8 @@ class PageContent:
     turntable: for each row its title and its views, RGBA of one height, evenly spaced over a full turn.
     images: caption and pixels of further images.
     glb: the bytes of avatar.glb.
+    levels: the bytes of coarser levels of detail, finest first.
+    coverage: confidence that the video shows a texel; row 0 is v = 1.
     """
 
     title: str
@@ -50,6 +52,8 @@ class PageContent:
     turntable: Sequence[tuple[str, Sequence[UInt8[np.ndarray, "_ _ 4"]]]]
     images: Sequence[tuple[str, UInt8[np.ndarray, "_ _ 3"]]]
     glb: bytes
+    levels: Sequence[bytes] = ()
+    coverage: UInt8[np.ndarray, "th tw"] | None = None
 
 
 def render_page(content: PageContent) -> str:
@@ -71,10 +75,16 @@ def render_page(content: PageContent) -> str:
         images=[(image_tag(_shrunk(pixels), caption), caption) for caption, pixels in content.images],
         tables=_tables(report),
         footer=_footer(report["environment"]),
-        glb=Markup(base64.b64encode(compress_glb_textures(content.glb)).decode()),
+        glb=_embedded_glb(content.glb),
+        levels=[_embedded_glb(level) for level in content.levels],
+        coverage=None if content.coverage is None else coverage_data_uri(content.coverage),
         viewer_script=Markup(read_asset("viewer.min.js")),
         page_script=Markup(read_asset("report.js")),
     )
+
+
+def _embedded_glb(glb: bytes) -> Markup:
+    return Markup(base64.b64encode(compress_glb_textures(glb)).decode())
 
 
 def error_map(a: UInt8[np.ndarray, "h w 3"], b: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:

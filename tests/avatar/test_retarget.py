@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from data_tools.synthetic.scene.motion import turn_in_a_pose
 from pipeline.avatar.bvh_export import motion_to_bvh
 from pipeline.avatar.feet import lowest_foot_offset_m, plant_feet
-from pipeline.avatar.retarget import match_joints, recorded_contacts, resample_motion, retarget
+from pipeline.avatar.retarget import match_joints, resample_motion, retarget, retarget_with_contacts
 from pipeline.avatar.rig import build_rig
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.core.errors import UserError
@@ -235,7 +235,7 @@ def world_angles_deg(body: Body, one: Motion, other: Motion) -> np.ndarray:
 @pytest.mark.parametrize("name", ["cmu1_jumping_jacks", "fair1_zombie", "rokoko_jesse_dance"])
 def test_planted_clips_do_not_slide_and_keep_the_arms(name: str, bare: Body, shared_data: Path) -> None:
     clip = read_bvh(shared_data / "motions" / f"{name}.bvh")
-    motion, contact = retarget(clip, bare, np.zeros(3), in_place=False), recorded_contacts(clip, bare)
+    motion, contact = retarget_with_contacts(clip, bare, np.zeros(3), in_place=False)
     planted = plant_feet(bare, motion, contact, 0.0)
     assert contact.any()
     assert max(slides_m(bare, planted, contact)) < 0.001

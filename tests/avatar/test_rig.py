@@ -46,9 +46,7 @@ def euler(x: float, y: float, z: float) -> np.ndarray:
 def skinned(body: Body, rig: Rig) -> SkinnedMesh:
     """The body's mesh in the rest pose, with four influences a vertex."""
     indices, weights = top_k_weights(body.skin_weights)
-    dense = np.zeros(body.skin_weights.shape, np.float32)
-    np.add.at(dense, (np.arange(len(dense))[:, None], indices), weights)
-    positions = rig.rest_positions(body.vertices, dense)
+    positions = rig.rest_positions(body.vertices, indices, weights)
     uv = np.zeros((len(positions), 2), np.float32)
     return SkinnedMesh(positions, np.tile(UP, (len(positions), 1)), uv, indices, weights, body.faces)
 

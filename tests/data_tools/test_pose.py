@@ -13,15 +13,13 @@ from data_tools.pose import main, planted_motion, read_pose
 from pipeline.avatar.feet import joint_positions_m
 from pipeline.body.body import canonical_to_world
 from pipeline.core.errors import UserError
-from pipeline.core.manifest import Manifest, digest_files, write_manifest
-from pipeline.geometry.atlas import Atlas
+from pipeline.core.manifest import digest_files
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.io.bvh import read_bvh
 from pipeline.io.glb import GlbFile
-from pipeline.texture.files import TextureArtifact, save_texture
 from stages.export import STAGE, Config, load_scene
+from tests.data_tools.exported_run import write_exported_run
 from tests.field.scene import PaintedScene, painted_scene
-from tests.stages.painted_run import make_run
 from tests.tools.khronos import validator_issues
 
 
@@ -35,19 +33,7 @@ def run(scene: PaintedScene, tmp_path: Path) -> Path:
     """A run whose export is finished, in the names of Mixamo."""
     folder = tmp_path / "run"
     folder.mkdir()
-    make_run(folder, scene.body, scene.motion, scene.camera, scene.images, scene.masks)
-    faces = scene.body.faces
-    uv = np.random.default_rng(0).uniform(size=(len(scene.body.vertices), 2)).astype(np.float32)
-    atlas = Atlas(uv, faces.astype(np.int32), np.arange(len(uv), dtype=np.int32))
-    blank = np.zeros((16, 16), dtype=np.uint8)
-    (folder / "texture").mkdir()
-    save_texture(
-        folder / "texture", TextureArtifact(atlas, np.ones((16, 16, 3), np.float32), blank.astype(np.float32), blank)
-    )
-    (folder / "export").mkdir()
-    config = Config(rig="mixamo").model_dump()
-    manifest = Manifest("export", STAGE.version, "", config, {}, {}, {}, 0.0, 0.0)
-    write_manifest(manifest, folder / "export" / "manifest.json")
+    write_exported_run(folder, scene)
     return folder
 
 

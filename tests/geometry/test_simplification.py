@@ -1,11 +1,12 @@
-"""Fewer faces on a column whose texture coordinates are a formula of the position."""
+"""Fewer faces on a wavy column whose vertices are doubled along a seam."""
 
 import numpy as np
 import pytest
 import trimesh
 
 from pipeline.geometry.mesh import Mesh
-from pipeline.geometry.simplification import ReducedFaces, collapse_textured_edges
+from pipeline.geometry.simplification import ReducedFaces
+from pipeline.geometry.simplification import collapse_edges as reduce_faces
 from pipeline.geometry.surface import closest_points_on_mesh, collapse_edges
 from tests.avatar.formats.column import ALONG, AROUND, column_mesh
 
@@ -16,23 +17,9 @@ SEAM = np.isclose(FULL.uv[:, 0] % 1.0, 0.0)
 @pytest.fixture(scope="module", params=[0.5, 0.25])
 def reduced(request: pytest.FixtureRequest) -> ReducedFaces:
     count = round(request.param * len(FULL.faces))
-    made = collapse_textured_edges(FULL.positions_m, FULL.uv, FULL.faces, count)
+    made = reduce_faces(FULL.positions_m, FULL.faces, count)
     assert abs(len(made.faces) - count) <= 2
     return made
-
-
-def test_texture_coordinates_are_those_of_the_vertex(reduced: ReducedFaces) -> None:
-    """Where a vertex of the seam was collapsed onto a neighbour, the corners behind the seam keep the seam's own."""
-    difference = np.abs(reduced.uv - FULL.uv[reduced.source_vertex])
-    difference[:, 0] = np.minimum(difference[:, 0], 1.0 - difference[:, 0])
-    assert (difference.max(axis=1) > 1e-6).mean() < 0.05
-    assert difference[:, 0].max() < 4.0 / AROUND
-    assert difference[:, 1].max() < 4.0 / ALONG
-
-
-def test_no_face_spans_the_texture(reduced: ReducedFaces) -> None:
-    """A face that took the wrong side of the seam would show the whole texture mirrored."""
-    assert np.ptp(reduced.uv[reduced.faces][..., 0], axis=1).max() < 0.2
 
 
 def test_the_seam_stays_closed(reduced: ReducedFaces) -> None:
@@ -59,11 +46,11 @@ def test_the_surface_stays(reduced: ReducedFaces) -> None:
 def test_other_reductions_in_the_process_change_nothing() -> None:
     """MeshLab keeps the parameters of its last call as defaults of the next one."""
     count = len(FULL.faces) // 4
-    first = collapse_textured_edges(FULL.positions_m, FULL.uv, FULL.faces, count)
+    first = reduce_faces(FULL.positions_m, FULL.faces, count)
     ball = trimesh.creation.icosphere(subdivisions=4)
     mesh = Mesh(ball.vertices.astype(np.float32), ball.faces.astype(np.int32))
     collapse_edges(mesh, np.ones(len(mesh.faces), dtype=bool), 500)
-    second = collapse_textured_edges(FULL.positions_m, FULL.uv, FULL.faces, count)
+    second = reduce_faces(FULL.positions_m, FULL.faces, count)
     np.testing.assert_array_equal(first.source_vertex, second.source_vertex)
     np.testing.assert_array_equal(first.faces, second.faces)
 

@@ -2,11 +2,8 @@
 
 import base64
 import re
-import shutil
-import subprocess
 from dataclasses import replace
 from html.parser import HTMLParser
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +14,6 @@ from pipeline.report.templates import ASSETS_DIR
 from tests.report.report_sample import sample_page
 
 VOID = {"meta", "link", "img", "input", "br"}
-CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 
 
 class Outline(HTMLParser):
@@ -113,15 +109,3 @@ def test_error_maps_are_black_for_equal_and_brightest_from_the_range_on():
 )
 def test_figures_are_short(value: object, text: str):
     assert format_metric(value) == text
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
-def test_a_browser_shows_the_avatar(page: str, tmp_path: Path):
-    """The viewer marks itself ready only after the model was read and drawn."""
-    file = tmp_path / "index.html"
-    file.write_text(page, encoding="utf-8")
-    options = ["--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    options += ["--virtual-time-budget=20000", "--dump-dom", file.as_uri()]
-    done = subprocess.run([CHROMIUM, *options], capture_output=True, text=True, timeout=120, check=True)
-    assert re.search(r'id="viewer"[^>]*data-ready="true"', done.stdout)
-    assert "Skeleton" in done.stdout

@@ -1,5 +1,7 @@
 """Levels of detail: the avatar with fewer triangles and smaller textures, with the same skeleton, skin and clips.
 
+Each level has its own texture coordinates and textures, baked from those of the avatar (`level_textures`).
+
 Each level is a whole file of its own. The extension MSFT_lod would put all levels into one file, but the loaders of
 three.js, glTFast and Blender do not read it.
 """
@@ -7,16 +9,31 @@ three.js, glTFast and Blender do not read it.
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Int
 
-from pipeline.geometry.simplification import collapse_textured_edges
+from pipeline.avatar.formats.level_textures import (
+    TexelSources,
+    UvMesh,
+    bake_texture,
+    find_texel_sources,
+    join_meshes,
+)
+from pipeline.geometry.atlas import unwrap
+from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.simplification import ReducedFaces, collapse_edges
 from pipeline.io.glb import GlbFile
 from pipeline.io.glb_writer import GlbWriter
-from pipeline.io.image import png_bytes, resize
+from pipeline.io.image import png_bytes
 
 FACE_RATIOS = (0.5, 0.25)
 """Faces of each coarser level as a share of those of the avatar; the avatar itself is the finest level."""
 
 MIN_TEXTURE_PX = 64
+
+SMOOTHING_STEPS = 0
+
+PADDING_PX = 1
+"""Distance of charts in the textures of a level."""
 
 
 def encode_levels(file: GlbFile) -> list[bytes]:
@@ -42,29 +59,68 @@ def encode_level(file: GlbFile, face_ratio: float, texture_halvings: int) -> byt
         UserError: the file's arrays or images cannot be read.
     """
     document = GlbWriter.from_file(file)
-    for mesh in document.json["meshes"]:
-        for primitive in mesh["primitives"]:
-            _reduce_primitive(file, document, primitive, face_ratio)
-    for index in range(len(document.json.get("images", ()))):
-        document.replace_image(index, _halve_image(file.image_pixels(index), texture_halvings), "image/png")
+    primitives = [primitive for mesh in document.json["meshes"] for primitive in mesh["primitives"]]
+    full = [_uv_mesh(file, primitive) for primitive in primitives]
+    reduced = [collapse_edges(mesh.positions_m, mesh.faces, round(face_ratio * len(mesh.faces))) for mesh in full]
+    images = [file.image_pixels(index) for index in range(len(document.json.get("images", ())))]
+    sizes_px = [_halved_size(pixels, texture_halvings) for pixels in images]
+    atlas = _unwrap_together(full, reduced, max((max(size_px) for size_px in sizes_px), default=MIN_TEXTURE_PX))
+    level = []
+    for mesh, part, (vertex, uv, faces), primitive in zip(full, reduced, atlas, primitives, strict=True):
+        source = part.source_vertex[vertex]
+        level.append(UvMesh(mesh.positions_m[source], uv, faces))
+        _replace_primitive(file, document, primitive, source, level[-1])
+    sources: dict[tuple[int, int], TexelSources] = {}
+    for index, (pixels, size_px) in enumerate(zip(images, sizes_px, strict=True)):
+        if size_px not in sources:
+            sources[size_px] = find_texel_sources(join_meshes(full), join_meshes(level), *size_px)
+        document.replace_image(index, png_bytes(bake_texture(pixels, sources[size_px])), "image/png")
     document.remove_unused()
     return document.to_bytes()
 
 
-def _reduce_primitive(file: GlbFile, document: GlbWriter, primitive: dict[str, Any], face_ratio: float) -> None:
-    attributes = primitive["attributes"]
+def _uv_mesh(file: GlbFile, primitive: dict[str, Any]) -> UvMesh:
+    names = primitive["attributes"]
     faces = file.accessor(primitive["indices"]).reshape(-1, 3)
-    positions_m, uv = file.accessor(attributes["POSITION"]), file.accessor(attributes["TEXCOORD_0"])
-    reduced = collapse_textured_edges(positions_m, uv, faces, round(face_ratio * len(faces)))
-    index_dtype = np.uint16 if len(reduced.uv) < 65535 else np.uint32
-    document.replace_array(primitive["indices"], reduced.faces.reshape(-1).astype(index_dtype))
-    document.replace_array(attributes["TEXCOORD_0"], reduced.uv)
+    return UvMesh(file.accessor(names["POSITION"]), file.accessor(names["TEXCOORD_0"]), faces)
+
+
+def _unwrap_together(
+    full: list[UvMesh], reduced: list[ReducedFaces], size_px: int
+) -> list[tuple[Int[np.ndarray, "t"], Float[np.ndarray, "t 2"], Int[np.ndarray, "g 3"]]]:
+    """Parametrise all primitives in one atlas.
+
+    Returns:
+        Of each primitive the vertex of `reduced` and the texture coordinate (origin top-left) of each new vertex, and
+        the faces between the new vertices.
+    """
+    first = np.cumsum([0, *(len(part.source_vertex) for part in reduced)])
+    positions_m = np.concatenate([m.positions_m[p.source_vertex] for m, p in zip(full, reduced, strict=True)])
+    faces = np.concatenate([part.faces + start for part, start in zip(reduced, first[:-1], strict=True)])
+    segment = np.repeat(np.arange(len(reduced)), [len(part.faces) for part in reduced])
+    atlas = unwrap(Mesh(positions_m, faces.astype(np.int32)), segment, size_px, PADDING_PX, SMOOTHING_STEPS)
+    parts = []
+    for number in range(len(reduced)):
+        used, corners = np.unique(atlas.faces_uv[segment == number], return_inverse=True)
+        uv = np.stack([atlas.uv[used, 0], 1.0 - atlas.uv[used, 1]], axis=1)
+        parts.append((atlas.vertex_of_uv[used] - first[number], uv, corners.reshape(-1, 3)))
+    return parts
+
+
+def _replace_primitive(
+    file: GlbFile, document: GlbWriter, primitive: dict[str, Any], source: Int[np.ndarray, "t"], mesh: UvMesh
+) -> None:
+    """Write the faces and texture coordinates of a mesh, and what else the source vertices have."""
+    attributes = primitive["attributes"]
+    index_dtype = np.uint16 if len(mesh.uv) < 65535 else np.uint32
+    document.replace_array(primitive["indices"], mesh.faces.reshape(-1).astype(index_dtype))
+    document.replace_array(attributes["TEXCOORD_0"], mesh.uv)
     per_vertex = [index for name, index in attributes.items() if name != "TEXCOORD_0"]
     per_vertex += [index for target in primitive.get("targets", ()) for index in target.values()]
     for index in per_vertex:
-        document.replace_array(index, file.stored_array(index)[reduced.source_vertex])
+        document.replace_array(index, file.stored_array(index)[source])
 
 
-def _halve_image(pixels: np.ndarray, halvings: int) -> bytes:
+def _halved_size(pixels: np.ndarray, halvings: int) -> tuple[int, int]:
     height_px, width_px = (max(side_px >> halvings, min(side_px, MIN_TEXTURE_PX)) for side_px in pixels.shape[:2])
-    return png_bytes(resize(pixels, width_px, height_px, "box"))
+    return height_px, width_px

@@ -19,6 +19,7 @@ from jaxtyping import Float, Int
 
 from pipeline.avatar.t_pose import t_pose_transforms
 from pipeline.avatar.vrm_bones import human_bones
+from pipeline.geometry.skinning import inverse_skinning_matrices
 from pipeline.io.glb import GlbFile
 from pipeline.io.glb_writer import GlbWriter
 
@@ -180,7 +181,8 @@ def _bake_mesh(file: GlbFile, document: GlbWriter, transforms: Float[np.ndarray,
     """Write the vertices from which the joints' return to the bind pose makes the stored vertices again."""
     for primitive in _primitives(file):
         attributes = primitive["attributes"]
-        bind_to_rest = np.linalg.inv(_blended(file, primitive, np.linalg.inv(transforms)))
+        joints, weights = _array(file, primitive, "JOINTS_0"), _array(file, primitive, "WEIGHTS_0")
+        bind_to_rest = inverse_skinning_matrices(joints, weights, transforms)
         positions_m, normals = (_array(file, primitive, name) for name in ("POSITION", "NORMAL"))
         positions_m = np.einsum("vab,vb->va", bind_to_rest[:, :3, :3], positions_m) + bind_to_rest[:, :3, 3]
         normals = np.einsum("vab,vb->va", bind_to_rest[:, :3, :3], normals)
@@ -194,13 +196,9 @@ def _bake_mesh(file: GlbFile, document: GlbWriter, transforms: Float[np.ndarray,
 
 def _posed(file: GlbFile, primitive: dict[str, Any], transforms: Float[np.ndarray, "j 4 4"]) -> np.ndarray:
     """Return the vertices by linear blend skinning, m."""
-    blended = _blended(file, primitive, transforms)
-    return np.einsum("vab,vb->va", blended[:, :3, :3], _array(file, primitive, "POSITION")) + blended[:, :3, 3]
-
-
-def _blended(file: GlbFile, primitive: dict[str, Any], transforms: Float[np.ndarray, "j 4 4"]) -> np.ndarray:
     joints, weights = _array(file, primitive, "JOINTS_0"), _array(file, primitive, "WEIGHTS_0")
-    return np.einsum("vk,vkab->vab", weights, transforms[joints])
+    blended = np.einsum("vk,vkab->vab", weights, transforms[joints])
+    return np.einsum("vab,vb->va", blended[:, :3, :3], _array(file, primitive, "POSITION")) + blended[:, :3, 3]
 
 
 def _array(file: GlbFile, primitive: dict[str, Any], name: str) -> np.ndarray:

@@ -1,7 +1,10 @@
 // The page's own behaviour: starts the 3D view, and the wipe that compares a held-out frame with its renders.
 (() => {
   const root = document.getElementById("viewer");
-  AvatarViewer.mount(root, document.getElementById("avatar-glb").textContent).then(
+  const texts = (selector) => [...document.querySelectorAll(selector)].map((part) => part.textContent);
+  const [glb] = texts("#avatar-glb");
+  const [coverage = null] = texts("#avatar-coverage");
+  AvatarViewer.mount(root, { glb, coverage, levels: texts(".avatar-level") }).then(
     (view) => { window.avatarView = view; },
     (error) => {
       root.innerHTML = '<p class="viewer-note"></p>';

@@ -1,0 +1,108 @@
+"""Pictures of an exported avatar by other programs, with our camera and without lights, for comparison with ours."""
+
+import base64
+import json
+import os
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from jaxtyping import Float, UInt8
+
+from pipeline.geometry.camera import Camera
+from pipeline.report.templates import read_asset
+from tests.tools.browser import BrowserPage
+
+NEAR_M, FAR_M = 0.1, 100.0
+
+_PAGE = """<!doctype html><html lang="en"><body>
+<div id="viewer" style="width:300px;height:300px"></div>
+<script>{viewer}</script>
+<script>
+const root = document.getElementById("viewer");
+AvatarViewer.mount(root, {{glb: "{glb}"}}).then((view) => {{ window.view = view; }});
+</script></body></html>"""
+
+_RENDER = """(() => {{
+  const {{ avatar, renderer, camera, scene, floor }} = view;
+  renderer.setAnimationLoop(null);
+  renderer.setPixelRatio(1);
+  renderer.setSize({width}, {height}, false);
+  renderer.setClearColor(0xffffff, 1);
+  floor.visible = false;
+  avatar.setSurface("unlit");
+  if (avatar.clipIndex !== {clip}) avatar.setClip({clip});
+  avatar.seek({time_s});
+  camera.matrixAutoUpdate = false;
+  camera.matrix.fromArray({camera_to_world});
+  camera.matrixWorldNeedsUpdate = true;
+  camera.projectionMatrix.fromArray({projection});
+  camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
+  renderer.render(scene, camera);
+  return renderer.domElement.toDataURL("image/png");
+}})()"""
+
+
+def open_in_three(page: BrowserPage, glb: Path, folder: Path) -> None:
+    """Open a .glb in three.js, in a page that is written into `folder`."""
+    text = base64.b64encode(glb.read_bytes()).decode()
+    file = folder / "three.html"
+    file.write_text(_PAGE.format(viewer=read_asset("viewer.min.js"), glb=text), encoding="utf-8")
+    page.open(file)
+
+
+def render_in_three(
+    page: BrowserPage, camera: Camera, clip: int = -1, time_s: float = 0.0
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Return a picture on white by three.js; clip: index of the animation, -1 is the rest pose."""
+    script = _RENDER.format(
+        width=camera.width,
+        height=camera.height,
+        clip=clip,
+        time_s=time_s,
+        camera_to_world=json.dumps(_camera_to_world(camera).T.ravel().tolist()),
+        projection=json.dumps(_projection(camera).T.ravel().tolist()),
+    )
+    return _decode(base64.b64decode(page.evaluate(script).split(",")[1]))
+
+
+def render_obj_in_blender(obj: Path, camera: Camera, folder: Path) -> tuple[UInt8[np.ndarray, "h w 3"], dict[str, Any]]:
+    """Return a picture on white by Blender, and what it found in the .obj: vertices (m, our axes) and images.
+
+    BLENDER_PYTHON names a Python with bpy; skips the test without it.
+    """
+    python = os.environ.get("BLENDER_PYTHON", "")
+    if not Path(python).is_file():
+        pytest.skip("BLENDER_PYTHON does not name a Python with bpy")
+    intrinsics = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
+    (folder / "camera.json").write_text(json.dumps(intrinsics | {"camera_to_world": _camera_to_world(camera).tolist()}))
+    script = Path(__file__).with_name("blender_obj.py")
+    done = subprocess.run([python, script, obj, folder], capture_output=True, text=True, check=False, timeout=600)
+    assert (folder / "found.npz").is_file(), done.stderr[-2000:]
+    with np.load(folder / "found.npz") as found:
+        return _decode((folder / "blender.png").read_bytes()), dict(found)
+
+
+def _camera_to_world(camera: Camera) -> Float[np.ndarray, "4 4"]:
+    """Return the pose of a camera that looks along -Z with +Y up."""
+    return np.linalg.inv(camera.world_to_camera.astype(np.float64)) @ np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def _projection(camera: Camera) -> Float[np.ndarray, "4 4"]:
+    """Return OpenGL's clip matrix."""
+    w, h = camera.width, camera.height
+    return np.array(
+        [
+            [2.0 * camera.fx / w, 0.0, 1.0 - 2.0 * camera.cx / w, 0.0],
+            [0.0, 2.0 * camera.fy / h, 2.0 * camera.cy / h - 1.0, 0.0],
+            [0.0, 0.0, -(FAR_M + NEAR_M) / (FAR_M - NEAR_M), -2.0 * FAR_M * NEAR_M / (FAR_M - NEAR_M)],
+            [0.0, 0.0, -1.0, 0.0],
+        ]
+    )
+
+
+def _decode(png: bytes) -> UInt8[np.ndarray, "h w 3"]:
+    return cv2.cvtColor(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
