@@ -1,0 +1,185 @@
+"""The avatar with a face that moves: the captured mesh, the template's face in it, one texture, and morph targets."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipeline.body.body import Body
+from pipeline.geometry.atlas import Atlas
+from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.skinning import top_k_weights
+from pipeline.geometry.surface import closest_points_on_mesh
+from pipeline.mesh.files import MeshArtifact
+from pipeline.template.face_frame import FaceFrame
+from pipeline.template.face_patch import (
+    EYE_LEFT,
+    EYE_RIGHT,
+    MOUTH,
+    SOCKET_LEFT,
+    SOCKET_RIGHT,
+    TEETH,
+    TONGUE,
+    FacePatch,
+    build_face_patch,
+    cut_face_out,
+    unit_transform,
+)
+from pipeline.template.face_texture import CapturedSurface, layout_charts, paint_patch
+from pipeline.template.face_units import add_visemes, load_face_units
+from pipeline.template.level_set_cut import CutMesh, zip_loops
+from pipeline.template.regions import load_template
+from pipeline.template.registration import Registration
+
+MIN_DISPLACEMENT_M = 5e-5
+"""Smaller displacements are not written: a twentieth of a millimetre is not seen."""
+
+_FULL_M, _NONE_M = 0.012, 0.03
+"""Captured surface nearer than the first distance to the template moves with it, farther than the second not at all:
+a fringe of hair before the brows stays."""
+
+_REACH_M = 0.30
+"""Radius around the eyes outside of which no face unit moves anything."""
+
+_RIGID_PARTS = (MOUTH, SOCKET_LEFT, SOCKET_RIGHT, TONGUE, EYE_LEFT, EYE_RIGHT, TEETH)
+
+
+@dataclass(frozen=True)
+class AnimatedFace:
+    """An avatar with morph targets.
+
+    Attributes:
+        skinned: the mesh in the A-pose, the face being the template's.
+        atlas: of that mesh; the captured charts are in the left half of the texture.
+        diffuse, specular: maps, twice as wide as high.
+        names: of the morph targets.
+        displacements_m: of the vertices at weight 1, in the A-pose.
+        boundary_gap_m: largest distance between the cuts that were joined.
+    """
+
+    skinned: MeshArtifact
+    atlas: Atlas
+    diffuse: Float[np.ndarray, "h w 3"]
+    specular: Float[np.ndarray, "h w"]
+    names: tuple[str, ...]
+    displacements_m: Float[np.ndarray, "m v 3"]
+    boundary_gap_m: float
+
+
+def animate_face(
+    body: Body, registration: Registration, skinned: MeshArtifact, captured: CapturedSurface
+) -> AnimatedFace:
+    """Return the avatar with the template's face in place of the captured one, and its morph targets.
+
+    Args:
+        body: the fitted built-in body.
+        registration: of the body on the captured mesh.
+        skinned: the captured mesh with its skin.
+        captured: the same mesh with its texture.
+
+    Raises:
+        FacePatchError: the face cannot be cut out in one piece.
+    """
+    mesh, captured_atlas = skinned.mesh, captured.atlas
+    patch = build_face_patch(body, registration, mesh)
+    cut, cut_uv, loop = cut_face_out(mesh, captured_atlas.faces_uv, captured_atlas.vertex_of_uv, patch.frame)
+    rest_m = cut.interpolate(mesh.vertices.astype(np.float64))
+    count, first = len(rest_m), len(cut_uv.edge)
+    outer_rad, inner_rad = (patch.frame.angle_rad(points_m) for points_m in (rest_m[loop], _boundary_m(patch)))
+    strip = zip_loops(loop, outer_rad, patch.boundary + count, inner_rad)
+    uv = layout_charts(patch)
+    strip_uv, strip_faces_uv = _strip_uv(patch, uv, rest_m, loop, strip, first)
+    half = np.array([0.5, 1.0], np.float32)
+    vertices = np.concatenate([rest_m, patch.mesh.vertices])
+    atlas = Atlas(
+        np.concatenate(
+            [cut_uv.interpolate(captured_atlas.uv) * half, uv * half + [0.5, 0.0], strip_uv * half + [0.5, 0.0]]
+        ).astype(np.float32),
+        np.concatenate([cut_uv.faces, patch.faces_uv + first, strip_faces_uv]).astype(np.int32),
+        np.zeros(first + len(uv) + len(strip_uv), np.int32),
+    )
+    faces = np.concatenate([cut.faces, patch.mesh.faces + count, strip]).astype(np.int32)
+    atlas.vertex_of_uv[atlas.faces_uv] = faces
+    units_m = np.concatenate([_captured_units(body, registration, rest_m, patch.frame), patch.units_m], axis=1)
+    names, displacements_m = add_visemes(load_face_units().names, units_m)
+    displacements_m[np.linalg.norm(displacements_m, axis=2) < MIN_DISPLACEMENT_M] = 0.0
+    diffuse, specular = paint_patch(patch, uv, captured)
+    return AnimatedFace(
+        _skin(skinned, cut, patch, Mesh(vertices.astype(np.float32), faces)),
+        atlas,
+        np.concatenate([captured.diffuse, diffuse], axis=1).astype(np.float32),
+        np.concatenate([captured.specular, specular], axis=1).astype(np.float32),
+        names,
+        displacements_m.astype(np.float32),
+        _gap_m(rest_m[loop], outer_rad, _boundary_m(patch), inner_rad),
+    )
+
+
+def _boundary_m(patch: FacePatch) -> Float[np.ndarray, "b 3"]:
+    return patch.mesh.vertices[patch.boundary]
+
+
+def _gap_m(
+    outer_m: Float[np.ndarray, "a 3"], outer_rad: Float[np.ndarray, "a"], inner_m: np.ndarray, inner_rad: np.ndarray
+) -> float:
+    """Return the largest distance of a vertex of the outer loop to the inner loop at the same angle."""
+    order, turn = np.argsort(inner_rad), 2.0 * np.pi
+    at_m = np.stack([np.interp(outer_rad, inner_rad[order], inner_m[order, k], period=turn) for k in range(3)], axis=1)
+    return float(np.linalg.norm(at_m - outer_m, axis=1).max())
+
+
+def _strip_uv(
+    patch: FacePatch,
+    uv: Float[np.ndarray, "t 2"],
+    rest_m: Float[np.ndarray, "v 3"],
+    loop: Int[np.ndarray, "a"],
+    strip: Int[np.ndarray, "n 3"],
+    first: int,
+) -> tuple[Float[np.ndarray, "a 2"], Int[np.ndarray, "n 3"]]:
+    """Return texture coordinates for the captured side of the strip, from the patch's outline at the same angle."""
+    uv_of_vertex = np.zeros(len(patch.mesh.vertices), int)
+    uv_of_vertex[patch.mesh.faces] = patch.faces_uv
+    angle, outline = patch.frame.angle_rad(_boundary_m(patch)), uv[uv_of_vertex[patch.boundary]]
+    order = np.argsort(angle)
+    at = patch.frame.angle_rad(rest_m[loop])
+    strip_uv = np.stack([np.interp(at, angle[order], outline[order, k], period=2.0 * np.pi) for k in range(2)], axis=1)
+    index = np.zeros(len(rest_m) + len(patch.mesh.vertices), int)
+    index[loop] = first + len(uv) + np.arange(len(loop))
+    index[patch.boundary + len(rest_m)] = first + uv_of_vertex[patch.boundary]
+    return strip_uv, index[strip]
+
+
+def _captured_units(
+    body: Body, registration: Registration, points_m: Float[np.ndarray, "v 3"], frame: FaceFrame
+) -> Float[np.ndarray, "m v 3"]:
+    """Return the face units at points of the captured surface, from the nearest point of the registered template."""
+    units, template = load_face_units(), load_template()
+    moved = np.zeros((len(units.names), len(points_m), 3))
+    rows = np.flatnonzero(np.linalg.norm(points_m - frame.origin_m, axis=1) < _REACH_M)
+    skin = Mesh(registration.vertices, template.faces[template.skin_faces])
+    distance_m, face, barycentric = closest_points_on_mesh(points_m[rows], skin)
+    amount = np.clip((_NONE_M - distance_m) / (_NONE_M - _FULL_M), 0.0, 1.0)
+    corners = units.template_m[:, skin.faces[face]]
+    moved[:, rows] = np.einsum("nk,mnkc->mnc", amount[:, None] * barycentric, corners)
+    return moved @ unit_transform(body, registration).T
+
+
+def _skin(skinned: MeshArtifact, cut: CutMesh, patch: FacePatch, mesh: Mesh) -> MeshArtifact:
+    """Return the joined mesh with the captured skin; parts behind lids and lips have one skin each."""
+    joints = int(skinned.joint_indices.max()) + 1
+    dense = skinned.dense_skin_weights(joints).numpy().astype(np.float64)
+    _, face, barycentric = closest_points_on_mesh(patch.mesh.vertices, skinned.mesh)
+    corners = skinned.mesh.faces[face]
+    weights = np.einsum("nk,nkj->nj", barycentric, dense[corners])
+    colours = np.einsum("nk,nkc->nc", barycentric, skinned.vertex_colours[corners].astype(np.float64))
+    for part in _RIGID_PARTS:
+        rows = patch.vertex_part == part
+        weights[rows] = weights[rows].mean(axis=0)
+    weights = np.concatenate([cut.interpolate(dense), weights])
+    indices, values = top_k_weights(weights, skinned.joint_indices.shape[1])
+    return MeshArtifact(
+        mesh,
+        indices,
+        values,
+        np.concatenate([cut.interpolate(skinned.vertex_colours.astype(np.float64)), colours]).astype(np.float32),
+    )
