@@ -1,5 +1,6 @@
 """The avatar with a face that moves: the captured mesh, the template's face in it, one texture, and morph targets."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,7 @@ from pipeline.geometry.skinning import top_k_weights
 from pipeline.geometry.surface import closest_points_on_mesh
 from pipeline.mesh.files import MeshArtifact
 from pipeline.template.face_frame import FaceFrame
+from pipeline.template.face_landmarks import Detector, find_face_landmarks
 from pipeline.template.face_patch import (
     EYE_LEFT,
     EYE_RIGHT,
@@ -21,6 +23,7 @@ from pipeline.template.face_patch import (
     TEETH,
     TONGUE,
     FacePatch,
+    FacePatchError,
     build_face_patch,
     cut_face_out,
     unit_transform,
@@ -28,8 +31,8 @@ from pipeline.template.face_patch import (
 from pipeline.template.face_texture import CapturedSurface, layout_charts, paint_patch
 from pipeline.template.face_units import add_visemes, load_face_units
 from pipeline.template.level_set_cut import CutMesh, zip_loops
-from pipeline.template.regions import load_template
-from pipeline.template.registration import Registration
+from pipeline.template.regions import is_template_body, load_template
+from pipeline.template.registration import Registration, register_template
 
 MIN_DISPLACEMENT_M = 5e-5
 """Smaller displacements are not written: a twentieth of a millimetre is not seen."""
@@ -44,6 +47,21 @@ _REACH_M = 0.30
 _RIGID_PARTS = (MOUTH, SOCKET_LEFT, SOCKET_RIGHT, TONGUE, EYE_LEFT, EYE_RIGHT, TEETH)
 
 
+MAX_GAP_M = 0.012
+"""A face whose cut lies farther from that of the captured surface is not joined to it: hair may hang before it."""
+
+MAX_MEDIAN_MM = 3.0
+"""A template that lies farther from the surface (median) is not used. Ten people: 0.1 to 0.4 mm."""
+
+
+@dataclass(frozen=True)
+class TemplateFit:
+    """Distance of the registered template's skin to the person's surface: median and 95th percentile."""
+
+    median_mm: float
+    p95_mm: float
+
+
 @dataclass(frozen=True)
 class AnimatedFace:
     """An avatar with morph targets.
@@ -55,6 +73,7 @@ class AnimatedFace:
         names: of the morph targets.
         displacements_m: of the vertices at weight 1, in the A-pose.
         boundary_gap_m: largest distance between the cuts that were joined.
+        fit: of the template to the surface.
     """
 
     skinned: MeshArtifact
@@ -64,6 +83,36 @@ class AnimatedFace:
     names: tuple[str, ...]
     displacements_m: Float[np.ndarray, "m v 3"]
     boundary_gap_m: float
+    fit: TemplateFit
+
+
+def build_animated_face(
+    body: Body, skinned: MeshArtifact, captured: CapturedSurface, make_detector: Callable[[], Detector]
+) -> AnimatedFace:
+    """Find the face, register the template, and return the avatar with a face that moves.
+
+    Args:
+        body: the fitted body.
+        skinned: the captured mesh with its skin.
+        captured: the same mesh with its texture.
+        make_detector: constructs the detector of face landmarks.
+
+    Raises:
+        FacePatchError: the avatar gets no such face; the message says why.
+    """
+    if not is_template_body(body):
+        raise FacePatchError("morph targets belong to the built-in body, and this run has a body of a model file")
+    landmarks = find_face_landmarks(body, captured.mesh, captured.atlas, captured.diffuse, make_detector())
+    if landmarks is None:
+        raise FacePatchError("no face was found on the textured avatar; it may be too small or hidden in the video")
+    face = animate_face(body, register_template(body, captured.mesh, landmarks), skinned, captured)
+    if face.fit.median_mm > MAX_MEDIAN_MM:
+        raise FacePatchError(f"the body's surface is {face.fit.median_mm:.0f} mm from the person's (median)")
+    if face.boundary_gap_m > MAX_GAP_M:
+        raise FacePatchError(
+            f"the outline of the face is {1e3 * face.boundary_gap_m:.0f} mm from the surface; hair may hide it"
+        )
+    return face
 
 
 def animate_face(
@@ -104,6 +153,7 @@ def animate_face(
     names, displacements_m = add_visemes(load_face_units().names, units_m)
     displacements_m[np.linalg.norm(displacements_m, axis=2) < MIN_DISPLACEMENT_M] = 0.0
     diffuse, specular = paint_patch(patch, uv, captured)
+    distance_mm = 1e3 * registration.distance_m[load_template().skin_vertices]
     return AnimatedFace(
         _skin(skinned, cut, patch, Mesh(vertices.astype(np.float32), faces)),
         atlas,
@@ -112,6 +162,7 @@ def animate_face(
         names,
         displacements_m.astype(np.float32),
         _gap_m(rest_m[loop], outer_rad, _boundary_m(patch), inner_rad),
+        TemplateFit(float(np.median(distance_mm)), float(np.quantile(distance_mm, 0.95))),
     )
 
 

@@ -17,8 +17,17 @@ from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import closest_points_on_mesh
 from pipeline.geometry.texture_rendering import sample_texture
 from pipeline.template.face_frame import FaceFrame
-from pipeline.template.face_patch import EYE_LEFT, EYE_RIGHT, MOUTH, SKIN, SOCKET_LEFT, SOCKET_RIGHT, TEETH, TONGUE
-from pipeline.template.face_patch import FacePatch
+from pipeline.template.face_patch import (
+    EYE_LEFT,
+    EYE_RIGHT,
+    MOUTH,
+    SKIN,
+    SOCKET_LEFT,
+    SOCKET_RIGHT,
+    TEETH,
+    TONGUE,
+    FacePatch,
+)
 from pipeline.template.front_view import view_from_front
 from pipeline.texture.edge_padding import fill_unknown_texels
 
