@@ -30,7 +30,7 @@ from pipeline.template.face_patch import (
 )
 from pipeline.template.face_texture import CapturedSurface, layout_charts, paint_patch
 from pipeline.template.face_units import add_visemes, load_face_units
-from pipeline.template.level_set_cut import CutMesh, zip_loops
+from pipeline.template.level_set_cut import CutMesh, points_on_edges, split_boundary_faces
 from pipeline.template.regions import is_template_body, load_template
 from pipeline.template.registration import Registration, register_template
 
@@ -52,6 +52,9 @@ MAX_GAP_M = 0.012
 
 MAX_MEDIAN_MM = 3.0
 """A template that lies farther from the surface (median) is not used. Ten people: 0.1 to 0.4 mm."""
+
+
+_Side = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -133,22 +136,18 @@ def animate_face(
     patch = build_face_patch(body, registration, mesh)
     cut, cut_uv, loop = cut_face_out(mesh, captured_atlas.faces_uv, captured_atlas.vertex_of_uv, patch.frame)
     rest_m = cut.interpolate(mesh.vertices.astype(np.float64))
-    count, first = len(rest_m), len(cut_uv.edge)
     outer_rad, inner_rad = (patch.frame.angle_rad(points_m) for points_m in (rest_m[loop], _boundary_m(patch)))
-    strip = zip_loops(loop, outer_rad, patch.boundary + count, inner_rad)
+    on_patch_m = _at_angle(outer_rad, inner_rad, _boundary_m(patch))
+    gap_m = float(np.linalg.norm(on_patch_m - rest_m[loop], axis=1).max())
+    rest_m[loop] = on_patch_m
     uv = layout_charts(patch)
-    strip_uv, strip_faces_uv = _strip_uv(patch, uv, rest_m, loop, strip, first)
-    half = np.array([0.5, 1.0], np.float32)
+    half = np.array([0.5, 1.0])
     vertices = np.concatenate([rest_m, patch.mesh.vertices])
-    atlas = Atlas(
-        np.concatenate(
-            [cut_uv.interpolate(captured_atlas.uv) * half, uv * half + [0.5, 0.0], strip_uv * half + [0.5, 0.0]]
-        ).astype(np.float32),
-        np.concatenate([cut_uv.faces, patch.faces_uv + first, strip_faces_uv]).astype(np.int32),
-        np.zeros(first + len(uv) + len(strip_uv), np.int32),
+    faces, atlas = _join(
+        (cut.faces, cut_uv.faces, cut_uv.interpolate(captured_atlas.uv) * half, loop, outer_rad),
+        (patch.mesh.faces, patch.faces_uv, uv * half + [0.5, 0.0], patch.boundary, inner_rad),
+        len(rest_m),
     )
-    faces = np.concatenate([cut.faces, patch.mesh.faces + count, strip]).astype(np.int32)
-    atlas.vertex_of_uv[atlas.faces_uv] = faces
     units_m = np.concatenate([_captured_units(body, registration, rest_m, patch.frame), patch.units_m], axis=1)
     names, displacements_m = add_visemes(load_face_units().names, units_m)
     displacements_m[np.linalg.norm(displacements_m, axis=2) < MIN_DISPLACEMENT_M] = 0.0
@@ -161,7 +160,7 @@ def animate_face(
         np.concatenate([captured.specular, specular], axis=1).astype(np.float32),
         names,
         displacements_m.astype(np.float32),
-        _gap_m(rest_m[loop], outer_rad, _boundary_m(patch), inner_rad),
+        gap_m,
         TemplateFit(float(np.median(distance_mm)), float(np.quantile(distance_mm, 0.95))),
     )
 
@@ -170,34 +169,39 @@ def _boundary_m(patch: FacePatch) -> Float[np.ndarray, "b 3"]:
     return patch.mesh.vertices[patch.boundary]
 
 
-def _gap_m(
-    outer_m: Float[np.ndarray, "a 3"], outer_rad: Float[np.ndarray, "a"], inner_m: np.ndarray, inner_rad: np.ndarray
-) -> float:
-    """Return the largest distance of a vertex of the outer loop to the inner loop at the same angle."""
-    order, turn = np.argsort(inner_rad), 2.0 * np.pi
-    at_m = np.stack([np.interp(outer_rad, inner_rad[order], inner_m[order, k], period=turn) for k in range(3)], axis=1)
-    return float(np.linalg.norm(at_m - outer_m, axis=1).max())
+def _at_angle(
+    angle_rad: Float[np.ndarray, "a"], loop_rad: Float[np.ndarray, "b"], values: Float[np.ndarray, "b c"]
+) -> Float[np.ndarray, "a c"]:
+    """Return the values of a closed loop, linear between its vertices, at some angles."""
+    order = np.argsort(loop_rad)
+    columns = [np.interp(angle_rad, loop_rad[order], column[order], period=2.0 * np.pi) for column in values.T]
+    return np.stack(columns, axis=1)
 
 
-def _strip_uv(
-    patch: FacePatch,
-    uv: Float[np.ndarray, "t 2"],
-    rest_m: Float[np.ndarray, "v 3"],
-    loop: Int[np.ndarray, "a"],
-    strip: Int[np.ndarray, "n 3"],
-    first: int,
-) -> tuple[Float[np.ndarray, "a 2"], Int[np.ndarray, "n 3"]]:
-    """Return texture coordinates for the captured side of the strip, from the patch's outline at the same angle."""
-    uv_of_vertex = np.zeros(len(patch.mesh.vertices), int)
-    uv_of_vertex[patch.mesh.faces] = patch.faces_uv
-    angle, outline = patch.frame.angle_rad(_boundary_m(patch)), uv[uv_of_vertex[patch.boundary]]
-    order = np.argsort(angle)
-    at = patch.frame.angle_rad(rest_m[loop])
-    strip_uv = np.stack([np.interp(at, angle[order], outline[order, k], period=2.0 * np.pi) for k in range(2)], axis=1)
-    index = np.zeros(len(rest_m) + len(patch.mesh.vertices), int)
-    index[loop] = first + len(uv) + np.arange(len(loop))
-    index[patch.boundary + len(rest_m)] = first + uv_of_vertex[patch.boundary]
-    return strip_uv, index[strip]
+def _join(outer: _Side, inner: _Side, first: int) -> tuple[Int[np.ndarray, "f 3"], Atlas]:
+    """Join two parts along a common outline: each takes the other's vertices on it.
+
+    Args:
+        outer, inner: faces, their corners in the texture coordinates, these, the outline, and its angles.
+        first: number of vertices of the outer part, which come before those of the inner one.
+    """
+    faces_a, faces_uv_a, uv_a, loop_a, rad_a = outer
+    faces_b, faces_uv_b, uv_b, loop_b, rad_b = (inner[0] + first, *inner[1:3], inner[3] + first, inner[4])
+    forwards = points_on_edges(loop_a, rad_a, loop_b, rad_b, ties_after=True)
+    backwards = {(v, u): [(p, 1.0 - f) for p, f in row[::-1]] for (u, v), row in forwards.items()}
+    faces_a, faces_uv_a, uv_a = split_boundary_faces(faces_a, faces_uv_a, uv_a, backwards)
+    on_b = points_on_edges(loop_b, rad_b, loop_a, rad_a, ties_after=False)
+    faces_b, faces_uv_b, uv_b = split_boundary_faces(faces_b, faces_uv_b, uv_b, on_b)
+    faces = np.concatenate([faces_a, faces_b]).astype(np.int32)
+    faces_uv = np.concatenate([faces_uv_a, faces_uv_b + len(uv_a)]).astype(np.int32)
+    used, corners = np.unique(faces_uv, return_inverse=True)
+    atlas = Atlas(
+        np.concatenate([uv_a, uv_b]).astype(np.float32)[used],
+        corners.reshape(-1, 3).astype(np.int32),
+        np.zeros(len(used), np.int32),
+    )
+    atlas.vertex_of_uv[atlas.faces_uv] = faces
+    return faces, atlas
 
 
 def _captured_units(

@@ -19,7 +19,7 @@ from pipeline.geometry.surface import closest_points_on_mesh
 from pipeline.template.face_frame import FaceFrame, face_frame
 from pipeline.template.face_landmarks import FACE_LANDMARKS, fit_similarity
 from pipeline.template.face_units import load_face_units, load_teeth
-from pipeline.template.front_view import view_from_front
+from pipeline.template.front_view import FrontView, view_from_front
 from pipeline.template.level_set_cut import CutMesh, boundary_loops, cut_mesh
 from pipeline.template.regions import Template, load_template
 from pipeline.template.registration import Registration
@@ -34,10 +34,13 @@ lips, and would shine through at the corners of a closed mouth."""
 _LIP_HEIGHT = 0.08
 """Height over which the lower lip moves up to the upper one, in units of the face: 8 mm."""
 
+_MOUTH_WINDOW = (-0.4, 0.4), (-0.95, -0.5)
+"""Where the slit between the lips is, x and y in the frame of the face."""
+
 _MAX_SLIT = 0.03
 """Greatest height by which the lip is raised at once; an open mouth stays open."""
 
-_SLIT_SMOOTHING_PX, _LIP_STEPS = 9, 2
+_SLIT_SMOOTHING_PX, _LIP_STEPS = 9, 4
 
 _PULL_LEVEL = -0.25
 """From here to the outline, the patch moves gradually onto the captured surface."""
@@ -149,6 +152,7 @@ def cut_face_out(
     level = -frame.level(surface.vertices)
     # A vertex on the outline itself would belong to both sides.
     level = np.where(np.abs(level) < 1e-6, 1e-6, level)
+    level = np.where((level < 0.0) & ~_largest_part(surface.faces, level < 0.0), 1.0, level)
     cut, cut_uv = cut_mesh(surface.faces, level), cut_mesh(faces_uv, level[vertex_of_uv])
     try:
         loops = boundary_loops(cut.boundary[:, ::-1])
@@ -181,6 +185,15 @@ def _connected_to_nose(template: Template, level: np.ndarray, shell: np.ndarray)
     graph = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(level), len(level)))
     component = sparse.csgraph.connected_components(graph, directed=False)[1]
     return np.asarray(touched & (component[template.faces[:, 0]] == component[FACE_LANDMARKS["nose_tip"][1]]))
+
+
+def _largest_part(faces: Int[np.ndarray, "f 3"], inside: Bool[np.ndarray, "v"]) -> Bool[np.ndarray, "v"]:
+    """Return the largest set of vertices that edges within `inside` connect: pockets behind the face fall away."""
+    pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    pairs = pairs[inside[pairs].all(axis=1)]
+    graph = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(inside), len(inside)))
+    component = sparse.csgraph.connected_components(graph, directed=False)[1]
+    return np.asarray(component == np.bincount(component[inside]).argmax())
 
 
 def _part_of_faces(template: Template) -> Int[np.ndarray, "f"]:
@@ -241,6 +254,7 @@ def _close_lips(patch: FacePatch) -> FacePatch:
     for _ in range(_LIP_STEPS):
         view = view_from_front(patch.mesh, patch.frame)
         inside = (view.face_id >= 0) & np.isin(patch.part, (MOUTH, TEETH, TONGUE))[np.maximum(view.face_id, 0)]
+        inside &= _mouth_window(view, patch.frame)
         if not inside.any():
             break
         columns, px_per_m = np.arange(inside.shape[1]), view.camera.fx / view.distance_m
@@ -254,6 +268,16 @@ def _close_lips(patch: FacePatch) -> FacePatch:
         amount = on_lip * raise_m * np.exp(-((below_m / (_LIP_HEIGHT * patch.frame.size_m)) ** 2))
         patch = replace(patch, mesh=Mesh(patch.mesh.vertices + amount[:, None] * patch.frame.axes[1], patch.mesh.faces))
     return patch
+
+
+def _mouth_window(view: FrontView, frame: FaceFrame) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels around the mouth: below the outline, nothing hides the inside of the mouth from the camera."""
+    unit_px = view.camera.fx / view.distance_m * frame.size_m
+    centre_px, _ = project(torch.from_numpy(frame.origin_m[None]).float(), view.camera)
+    x = (np.arange(view.camera.width) + 0.5 - float(centre_px[0, 0])) / unit_px
+    y = (float(centre_px[0, 1]) - np.arange(view.camera.height) - 0.5) / unit_px
+    (left, right), (bottom, top) = _MOUTH_WINDOW
+    return np.asarray(((y > bottom) & (y < top))[:, None] & ((x > left) & (x < right)))
 
 
 def _mean_row(mask: Bool[np.ndarray, "h w"]) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Cut a triangle mesh along the zero level set of a function, and close the gap between two such cuts."""
+"""Cut a triangle mesh along the zero level set of a function, and join two such cuts along their common outline."""
 
 from dataclasses import dataclass
 
@@ -87,38 +87,75 @@ def boundary_loops(half_edges: Int[np.ndarray, "b 2"]) -> list[Int[np.ndarray, "
     return sorted(loops, key=len, reverse=True)
 
 
-def zip_loops(
-    outer: Int[np.ndarray, "a"],
-    outer_angle_rad: Float[np.ndarray, "a"],
-    inner: Int[np.ndarray, "b"],
-    inner_angle_rad: Float[np.ndarray, "b"],
-) -> Int[np.ndarray, "n 3"]:
-    """Return triangles between two loops around the same centre, counter-clockwise where the loops are.
+def points_on_edges(
+    loop: Int[np.ndarray, "a"],
+    loop_rad: Float[np.ndarray, "a"],
+    points: Int[np.ndarray, "b"],
+    points_rad: Float[np.ndarray, "b"],
+    ties_after: bool,
+) -> dict[tuple[int, int], list[tuple[int, float]]]:
+    """Return which points lie on which edge of a loop around the same centre, in the order of the loop.
 
     Args:
-        outer, inner: vertices in counter-clockwise order.
-        outer_angle_rad, inner_angle_rad: angle of each vertex around the centre.
+        loop: vertices, counter-clockwise.
+        loop_rad: angle of each vertex around the centre, in (-pi, pi].
+        points: vertices of another loop.
+        points_rad: their angles.
+        ties_after: whether a point at the angle of a vertex comes after it; one of two loops comes first.
+
+    Returns:
+        For an edge (from, to) of the loop: points and their fractions of the angle of the edge.
     """
-    outer, outer_angle = _start_at_smallest(outer, outer_angle_rad)
-    inner, inner_angle = _start_at_smallest(inner, inner_angle_rad)
-    turn = 2.0 * np.pi
-    outer_angle = np.append(np.maximum.accumulate(outer_angle), outer_angle[0] + turn)
-    inner_angle = np.append(np.maximum.accumulate(inner_angle), inner_angle[0] + turn)
-    triangles, i, k = [], 0, 0
-    while i < len(outer) or k < len(inner):
-        a, b = outer[i % len(outer)], inner[k % len(inner)]
-        if k == len(inner) or (i < len(outer) and outer_angle[i + 1] <= inner_angle[k + 1]):
-            triangles.append((a, outer[(i + 1) % len(outer)], b))
-            i += 1
-        else:
-            triangles.append((a, inner[(k + 1) % len(inner)], b))
-            k += 1
-    return np.array(triangles)
+    first = int(np.argmin(loop_rad))
+    loop, turn = np.roll(loop, -first), 2.0 * np.pi
+    start = np.maximum.accumulate(np.roll(loop_rad, -first))
+    end = np.append(start[1:], start[0] + turn)
+    is_before = points_rad < start[0] if ties_after else points_rad <= start[0]
+    at = np.where(is_before, points_rad + turn, points_rad)
+    edge = np.clip(np.searchsorted(start, at, side="right" if ties_after else "left") - 1, 0, len(loop) - 1)
+    fraction = (at - start[edge]) / np.maximum(end[edge] - start[edge], 1e-12)
+    found: dict[tuple[int, int], list[tuple[int, float]]] = {}
+    for row in np.argsort(at, kind="stable"):
+        ends = int(loop[edge[row]]), int(loop[(edge[row] + 1) % len(loop)])
+        found.setdefault(ends, []).append((int(points[row]), float(fraction[row])))
+    return found
 
 
-def _start_at_smallest(loop: np.ndarray, angle_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    first = int(np.argmin(angle_rad))
-    return np.roll(loop, -first), np.roll(angle_rad, -first)
+def split_boundary_faces(
+    faces: Int[np.ndarray, "f 3"],
+    faces_uv: Int[np.ndarray, "f 3"],
+    uv: Float[np.ndarray, "t 2"],
+    points: dict[tuple[int, int], list[tuple[int, float]]],
+) -> tuple[Int[np.ndarray, "g 3"], Int[np.ndarray, "g 3"], Float[np.ndarray, "w 2"]]:
+    """Split faces at points on their boundary edges into fans; return faces, their corners in `uv`, and more of `uv`.
+
+    points: for each half edge (from, to) of the faces, vertices on it and their fractions, from first to last.
+    """
+    fans: list[tuple[int, int, int]] = []
+    fans_uv: list[tuple[int, int, int]] = []
+    more_uv: list[np.ndarray] = []
+    kept = np.ones(len(faces), dtype=bool)
+    on_boundary = np.isin(faces, [vertex for edge in points for vertex in edge]).sum(axis=1) >= 2
+    for row in np.flatnonzero(on_boundary):
+        for corner in range(3):
+            a, b, c = ((corner + k) % 3 for k in range(3))
+            inserted = points.get((int(faces[row, a]), int(faces[row, b])))
+            if not inserted or not kept[row]:
+                continue
+            kept[row] = False
+            first_uv, last_uv = uv[faces_uv[row, a]], uv[faces_uv[row, b]]
+            indices = len(uv) + len(more_uv) + np.arange(len(inserted))
+            more_uv += [first_uv + fraction * (last_uv - first_uv) for _, fraction in inserted]
+            chain = [int(faces[row, a]), *(vertex for vertex, _ in inserted), int(faces[row, b])]
+            chain_uv = [int(faces_uv[row, a]), *indices.tolist(), int(faces_uv[row, b])]
+            apex, apex_uv = int(faces[row, c]), int(faces_uv[row, c])
+            fans += [(u, v, apex) for u, v in zip(chain[:-1], chain[1:], strict=True)]
+            fans_uv += [(u, v, apex_uv) for u, v in zip(chain_uv[:-1], chain_uv[1:], strict=True)]
+    return (
+        np.concatenate([faces[kept], np.array(fans, dtype=faces.dtype).reshape(-1, 3)]),
+        np.concatenate([faces_uv[kept], np.array(fans_uv, dtype=faces_uv.dtype).reshape(-1, 3)]),
+        np.concatenate([uv, np.array(more_uv).reshape(-1, 2)]),
+    )
 
 
 def _rotate(faces: np.ndarray, inside: np.ndarray, value: bool) -> np.ndarray:

@@ -19,11 +19,13 @@ SHAPE_ERRORS = {"height": 0.02, "muscle": 0.15, "weight": -0.1, "head-width": 0.
 class GeneratedPerson:
     """A person and what is known about it.
 
-    surface: the visible surface. bare: body without clothes. fitted: a body with another shape.
+    surface: the visible surface. all_faces: with cavities, eyeballs and tongue. bare: body without clothes.
+    fitted: a body with another shape.
     template_m: where the template's vertices are on the surface.
     """
 
     surface: Mesh
+    all_faces: np.ndarray
     bare: Body
     fitted: Body
     template_m: np.ndarray
@@ -43,4 +45,5 @@ def generated_person(seed: int = 3) -> GeneratedPerson:
         shape[model.shape_names.index(name)] = value + SHAPE_ERRORS.get(name, 0.0)
     visible = np.repeat(template.skin_faces, 4)  # each face was split into four
     surface = Mesh(subject.body.vertices, subject.body.faces[visible])
-    return GeneratedPerson(surface, bare, model.at_shape(shape), subject.body.vertices[: len(bare.vertices)])
+    known_m = subject.body.vertices[: len(bare.vertices)]
+    return GeneratedPerson(surface, subject.body.faces, bare, model.at_shape(shape), known_m)
