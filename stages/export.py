@@ -13,7 +13,7 @@ from pydantic import Field, field_validator
 
 from pipeline.avatar.formats.vrm import VrmMeta
 from pipeline.avatar.formats.write import ExportFormat, FormatRequest, missing_package, write_formats
-from pipeline.avatar.gltf import MaterialMaps, SkinnedMesh, encode_glb, pack_specular_factor
+from pipeline.avatar.gltf import MaterialMaps, MorphTargets, SkinnedMesh, encode_glb, pack_specular_factor
 from pipeline.avatar.idle import idle_motion
 from pipeline.avatar.obj import write_obj
 from pipeline.avatar.placement import (
@@ -27,8 +27,10 @@ from pipeline.avatar.rig_names import RigName
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.files import load_body, load_camera, load_motion
 from pipeline.capture.capture import load_capture
+from pipeline.capture.face_detector import FaceDetector
 from pipeline.core.cli import main
 from pipeline.core.config import Config as BaseConfig
+from pipeline.core.progress import warn
 from pipeline.core.stage import Stage
 from pipeline.geometry.atlas import Atlas
 from pipeline.geometry.camera import Camera
@@ -36,6 +38,9 @@ from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.io.image import png_bytes, to_uint8
 from pipeline.mesh.files import MeshArtifact, load_mesh
+from pipeline.template.animated_face import AnimatedFace, build_animated_face
+from pipeline.template.face_patch import FacePatchError
+from pipeline.template.face_texture import CapturedSurface
 from pipeline.texture.files import DIFFUSE, SPECULAR, TextureArtifact, load_texture, map_files
 from pipeline.texture.specular import dielectric_specular_factor
 
@@ -59,6 +64,10 @@ class Config(BaseConfig):
         "vrm; plain: as mixamo without the prefix mixamorig:, as in Ready Player Me",
     )
     rest_pose: RestPose = Field("a", description="pose of the .glb without animation, and of the .obj: a or t (T-pose)")
+    face: bool = Field(
+        True,
+        description="the .glb's face moves: 52 morph targets of ARKit and 15 visemes, lids, lips, eyes, teeth, tongue",
+    )
     licence_note: str = Field(
         "Made from a video of a person: ask that person before you share it.",
         description="text written to the .glb as asset.extras.licence_note",
@@ -99,6 +108,7 @@ class Scene:
         fps: frame rate of the video.
         camera: of the capture, in the same scene.
         extras: contents of `asset.extras`.
+        face: the avatar with a face that moves; None without one.
     """
 
     body: Body
@@ -109,6 +119,7 @@ class Scene:
     fps: float
     camera: Camera
     extras: dict[str, Any]
+    face: AnimatedFace | None = None
 
 
 def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, float]:
@@ -123,12 +134,19 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     meta = VrmMeta("avatar", config.author, config.licence_url)
     write_formats(out / "avatar.glb", FormatRequest(config.formats, scene.body.joint_names, meta))
     write_scene_obj(inputs["texture"], out, scene.texture, to_rest_pose(scene.skinned, scene.rig).mesh)
+    face = scene.face
     return {
         "glb_bytes": float(len(glb)),
         "texture_px": float(len(scene.texture.diffuse)),
         "animation_s": float(scene.motion.time_s[-1]),
         "vertices": float(len(scene.texture.atlas.uv)),
         "faces": float(len(scene.skinned.mesh.faces)),
+        "morph_targets": float(len(face.names)) if face else 0.0,
+        **(
+            {"template_distance_median_mm": face.fit.median_mm, "template_distance_p95_mm": face.fit.p95_mm}
+            if face
+            else {}
+        ),
     }
 
 
@@ -141,28 +159,45 @@ def load_scene(inputs: Mapping[str, Path], config: Config) -> Scene:
     body, skinned = load_body(inputs["body"] / "body.npz"), load_mesh(inputs["mesh"])
     capture, motion = load_capture(inputs["frames"]), load_motion(inputs["mesh"] / "motion.npz")
     offset_m = world_to_scene_translation_m(motion, lowest_vertex_y_m(skinned, body, motion))
+    texture = load_texture(inputs["texture"])
     return Scene(
         body=body,
         skinned=skinned,
         rig=build_rig(body, config.rig, config.rest_pose),
-        texture=load_texture(inputs["texture"]),
+        texture=texture,
         motion=pad_motion_to_video(translate_motion(motion, offset_m), capture.fps, capture.n_video_frames),
         fps=capture.fps,
         camera=translate_camera(load_camera(inputs["body"] / "camera.npz"), offset_m),
         extras=asset_extras(config, offset_m, capture.fps),
+        face=make_face(body, skinned, texture) if config.face else None,
     )
+
+
+def make_face(body: Body, skinned: MeshArtifact, texture: TextureArtifact) -> AnimatedFace | None:
+    """Return the avatar with a face that moves; None, with a warning, where the face is not found or not cut out."""
+    captured = CapturedSurface(skinned.mesh, texture.atlas, texture.diffuse, texture.specular)
+    try:
+        return build_animated_face(body, skinned, captured, FaceDetector)
+    except FacePatchError as error:
+        warn(f"the avatar's face does not move: {error}")
+        return None
 
 
 def encode_scene(scene: Scene, config: Config, clips: Mapping[str, Motion]) -> bytes:
     """Return the .glb with the clips as animations."""
-    texture = scene.texture
+    texture, face = scene.texture, scene.face
+    atlas, diffuse, specular = texture.atlas, texture.diffuse, texture.specular
+    if face is not None:
+        atlas, diffuse, specular = face.atlas, face.diffuse, face.specular
     maps = MaterialMaps(
-        png_bytes(to_uint8(texture.diffuse)),
-        encode_specular_png(texture.specular, texture.diffuse, config.roughness) if texture.specular.any() else None,
+        png_bytes(to_uint8(diffuse)),
+        encode_specular_png(specular, diffuse, config.roughness) if specular.any() else None,
         config.roughness,
         config.unlit,
     )
-    mesh = build_skinned_mesh(to_rest_pose(scene.skinned, scene.rig), texture.atlas)
+    mesh = build_skinned_mesh(to_rest_pose(face.skinned if face else scene.skinned, scene.rig), atlas)
+    if face is not None:
+        mesh = replace(mesh, morphs=MorphTargets(face.names, face.displacements_m[:, atlas.vertex_of_uv]))
     return encode_glb(mesh, scene.rig, clips, maps, scene.camera, scene.extras)
 
 
@@ -185,7 +220,7 @@ def copy_map(texture_dir: Path, name: str, out: Path) -> str:
 
 
 def encode_specular_png(
-    amplitude: Float32[np.ndarray, "s s"], diffuse: Float32[np.ndarray, "s s 3"], roughness: float
+    amplitude: Float32[np.ndarray, "h w"], diffuse: Float32[np.ndarray, "h w 3"], roughness: float
 ) -> bytes:
     """Convert the texture stage's specular map (sRGB) to a PNG with glTF's specular factor."""
     factor = dielectric_specular_factor(amplitude, diffuse, roughness)

@@ -27,6 +27,19 @@ _MAX_JOINTS = 1 << 16
 
 
 @dataclass(frozen=True)
+class MorphTargets:
+    """Morph targets of a mesh.
+
+    Attributes:
+        names: written as `extras.targetNames`, where Blender, three.js and Unity read them.
+        displacements_m: of each vertex at weight 1, in the rest pose.
+    """
+
+    names: tuple[str, ...]
+    displacements_m: Float[np.ndarray, "m t 3"]
+
+
+@dataclass(frozen=True)
 class SkinnedMesh:
     """A mesh in the bind pose with one index per corner: vertices are duplicated along UV seams.
 
@@ -37,6 +50,7 @@ class SkinnedMesh:
         joint_indices: at most four influences per vertex; 0 where the weight is 0.
         joint_weights: rows sum to 1.
         faces: counter-clockwise.
+        morphs: morph targets; None without any.
     """
 
     positions_m: Float[np.ndarray, "t 3"]
@@ -45,6 +59,7 @@ class SkinnedMesh:
     joint_indices: Int[np.ndarray, "t 4"]
     joint_weights: Float[np.ndarray, "t 4"]
     faces: Int[np.ndarray, "f 3"]
+    morphs: MorphTargets | None = None
 
 
 @dataclass(frozen=True)
@@ -97,7 +112,15 @@ def encode_glb(
     first_joint = 1
     material = _add_material(document, maps)
     primitive = _add_primitive(document, mesh, len(rig.joint_names)) | {"material": material}
-    document.add("meshes", {"name": "avatar", "primitives": [primitive]})
+    named: dict[str, Any] = {"name": "avatar", "primitives": [primitive]}
+    if mesh.morphs is not None:
+        names = mesh.morphs.names
+        named |= {"weights": [0.0] * len(names), "extras": {"targetNames": list(names)}}
+        primitive["targets"] = [
+            {"POSITION": document.add_sparse_array(moved.astype(np.float32), bounds=True)}
+            for moved in mesh.morphs.displacements_m
+        ]
+    document.add("meshes", named)
     document.add("nodes", {"name": "avatar", "mesh": 0, "skin": 0})
     skeleton_root = _add_skeleton(document, rig, first_joint)
     document.json |= {"scene": 0, "scenes": [{"name": "scene", "nodes": [0, skeleton_root]}]}

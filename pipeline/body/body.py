@@ -240,6 +240,7 @@ class AnnyBody:
         self.skin_weights: Float[np.ndarray, "v j"] = self._dense_weights()
         self.landmark_positions_m: Mapping[str, tuple[float, float, float]] = ANNY_LANDMARKS_M
         self.uv: Float[np.ndarray, "t 2"] = model.texture_coordinates.numpy().astype(np.float32)
+        self.base_mesh_vertices: Int[np.ndarray, "v"] = model.base_mesh_vertex_indices.numpy()
         self.faces_uv: Int[np.ndarray, "f 3"] = model.face_texture_coordinate_indices.numpy().astype(np.int32)
 
     def _dense_weights(self) -> Float[np.ndarray, "v j"]:

@@ -10,7 +10,7 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation, Slerp
 
-from pipeline.avatar.gltf import MaterialMaps, encode_glb, pack_specular_factor
+from pipeline.avatar.gltf import MaterialMaps, MorphTargets, encode_glb, pack_specular_factor
 from pipeline.avatar.rig import build_rig
 from pipeline.body.body import canonical_to_world
 from pipeline.geometry.camera import project
@@ -249,3 +249,20 @@ def test_the_khronos_validator_finds_a_broken_accessor(glb_path: Path, tmp_path:
     broken = tmp_path / "broken.glb"
     broken.write_bytes(glb_path.read_bytes().replace(b'"MAT4"', b'"VEC4"', 1))
     assert validator_issues(broken)
+
+
+def test_morph_targets_have_names_and_the_displacements(tmp_path: Path) -> None:
+    mesh = sample_skinned_mesh(sample_body())[0]
+    moved = np.zeros((2, len(mesh.positions_m), 3), np.float32)
+    moved[0, 5:9] = np.random.default_rng(0).normal(size=(4, 3))
+    path = tmp_path / "morphs.glb"
+    path.write_bytes(encoded(mesh=replace(mesh, morphs=MorphTargets(("jawOpen", "viseme_sil"), moved))))
+    file = GlbFile(path)
+    (stored,) = file.gltf["meshes"]
+    assert stored["extras"]["targetNames"] == ["jawOpen", "viseme_sil"]
+    assert stored["weights"] == [0.0, 0.0]
+    targets = [target["POSITION"] for target in stored["primitives"][0]["targets"]]
+    for index, expected in zip(targets, moved, strict=True):
+        assert "sparse" in file.gltf["accessors"][index]
+        np.testing.assert_array_equal(file.accessor(index), expected)
+    assert validator_issues(path) == []

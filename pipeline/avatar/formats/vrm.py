@@ -4,8 +4,8 @@ A VRM is a .glb with an extension that names the bones and the licence; its rest
 and cameras. VRM 1.0 keeps the mesh in the A-pose and moves only the joints, so that A-poses deform as in the .glb;
 VRM 0.x wants the mesh itself in the T-pose, facing -Z.
 
-The avatar has no morphs, eye bones, skirts' or hair's bones, so the files have no expressions and no spring bones, and
-look-at has only its origin.
+Expressions and look-at use the avatar's morph targets; without them the files have no expressions, and look-at has only
+its origin. There are no bones of eyes, skirts or hair, so there are no spring bones.
 
 References: https://github.com/vrm-c/vrm-specification, VRMC_vrm-1.0 and 0.0.
 """
@@ -17,6 +17,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from pipeline.avatar.formats.vrm_expressions import (
+    GAZE_FULL_DEG,
+    expressions_vrm1,
+    gaze_range_vrm1,
+    groups_vrm0,
+    morph_names,
+)
 from pipeline.avatar.t_pose import t_pose_transforms
 from pipeline.avatar.vrm_bones import human_bones
 from pipeline.geometry.skinning import inverse_skinning_matrices
@@ -73,7 +80,8 @@ def encode_vrm1(file: GlbFile, joint_names: Sequence[str], meta: VrmMeta) -> byt
     inverse_bind = _translations(-_rest_joints_m(rest)) @ rest.bind_to_rest
     _write_rest_pose(document, rest, inverse_bind)
     bones = {bone: {"node": rest.nodes[joint]} for bone, joint in human_bones(joint_names, "1.0").items()}
-    gaze = {"inputMaxValue": GAZE_INPUT_DEG, "outputScale": GAZE_OUTPUT_DEG}
+    names, mesh_nodes = morph_names(file), _mesh_nodes(document)
+    gaze = gaze_range_vrm1() if names else {"inputMaxValue": GAZE_INPUT_DEG, "outputScale": GAZE_OUTPUT_DEG}
     extension = {
         "specVersion": "1.0",
         "meta": {
@@ -83,9 +91,10 @@ def encode_vrm1(file: GlbFile, joint_names: Sequence[str], meta: VrmMeta) -> byt
             **({"otherLicenseUrl": meta.licence_url} if meta.licence_url else {}),
         },
         "humanoid": {"humanBones": bones},
-        "expressions": {"preset": {}},  # none; three-vrm ignores look-at without this key
-        "firstPerson": {"meshAnnotations": [{"node": node, "type": "auto"} for node in _mesh_nodes(document)]},
-        "lookAt": {"type": "bone", "offsetFromHeadBone": _eye_offset_m(file, rest).tolist()}
+        # three-vrm ignores look-at without this key, which may be empty
+        "expressions": {"preset": expressions_vrm1(names, mesh_nodes[0])},
+        "firstPerson": {"meshAnnotations": [{"node": node, "type": "auto"} for node in mesh_nodes]},
+        "lookAt": {"type": "expression" if names else "bone", "offsetFromHeadBone": _eye_offset_m(file, rest).tolist()}
         | {f"rangeMap{name}": gaze for name in _GAZE_RANGES},
     }
     return _encode(document, "VRMC_vrm", extension)
@@ -105,14 +114,16 @@ def encode_vrm0(file: GlbFile, joint_names: Sequence[str], meta: VrmMeta) -> byt
         {"bone": bone, "node": rest.nodes[joint], "useDefaultValues": True}
         for bone, joint in human_bones(joint_names, "0.x").items()
     ]
-    gaze = {"curve": _LINEAR_CURVE, "xRange": GAZE_INPUT_DEG, "yRange": GAZE_OUTPUT_DEG}
+    names = morph_names(file)
+    input_deg, output = (GAZE_FULL_DEG, 1.0) if names else (GAZE_INPUT_DEG, GAZE_OUTPUT_DEG)
+    gaze = {"curve": _LINEAR_CURVE, "xRange": input_deg, "yRange": output}
     x, y, z = _eye_offset_m(file, rest).tolist()
     annotations = [{"mesh": mesh, "firstPersonFlag": "Auto"} for mesh in range(len(document.json["meshes"]))]
     first_person = {
         "firstPersonBone": rest.nodes[rest.joint_names.index("Head")],
         "firstPersonBoneOffset": {"x": x, "y": y, "z": -z},  # in Unity's axes, whose z is that of glTF negated
         "meshAnnotations": annotations,
-        "lookAtTypeName": "Bone",
+        "lookAtTypeName": "BlendShape" if names else "Bone",
     }
     licence = {"licenseName": "Other", "otherLicenseUrl": meta.licence_url}
     extension = {
@@ -129,7 +140,7 @@ def encode_vrm0(file: GlbFile, joint_names: Sequence[str], meta: VrmMeta) -> byt
         },
         "humanoid": {"humanBones": bones},
         "firstPerson": first_person | {f"lookAt{name}": gaze for name in _GAZE_RANGES},
-        "blendShapeMaster": {"blendShapeGroups": []},
+        "blendShapeMaster": {"blendShapeGroups": groups_vrm0(names, 0)},
         "secondaryAnimation": {"boneGroups": [], "colliderGroups": []},
         "materialProperties": [_gltf_material(material["name"]) for material in document.json["materials"]],
     }

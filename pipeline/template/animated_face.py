@@ -1,0 +1,240 @@
+"""The avatar with a face that moves: the captured mesh, the template's face in it, one texture, and morph targets."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from pipeline.body.body import Body
+from pipeline.geometry.atlas import Atlas
+from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.skinning import top_k_weights
+from pipeline.geometry.surface import closest_points_on_mesh
+from pipeline.mesh.files import MeshArtifact
+from pipeline.template.face_frame import FaceFrame
+from pipeline.template.face_landmarks import Detector, find_face_landmarks
+from pipeline.template.face_patch import (
+    EYE_LEFT,
+    EYE_RIGHT,
+    MOUTH,
+    SOCKET_LEFT,
+    SOCKET_RIGHT,
+    TEETH,
+    TONGUE,
+    FacePatch,
+    FacePatchError,
+    build_face_patch,
+    cut_face_out,
+    unit_transform,
+)
+from pipeline.template.face_texture import CapturedSurface, layout_charts, paint_patch
+from pipeline.template.face_units import add_visemes, load_face_units
+from pipeline.template.level_set_cut import CutMesh, points_on_edges, split_boundary_faces
+from pipeline.template.regions import is_template_body, load_template
+from pipeline.template.registration import Registration, register_template
+
+MIN_DISPLACEMENT_M = 5e-5
+"""Smaller displacements are not written: a twentieth of a millimetre is not seen."""
+
+_FULL_M, _NONE_M = 0.012, 0.03
+"""Captured surface nearer than the first distance to the template moves with it, farther than the second not at all:
+a fringe of hair before the brows stays."""
+
+_REACH_M = 0.30
+"""Radius around the eyes outside of which no face unit moves anything."""
+
+_RIGID_PARTS = (MOUTH, SOCKET_LEFT, SOCKET_RIGHT, TONGUE, EYE_LEFT, EYE_RIGHT, TEETH)
+
+
+MAX_GAP_M = 0.012
+"""A face whose cut lies farther from that of the captured surface is not joined to it: hair may hang before it."""
+
+MAX_MEDIAN_MM = 3.0
+"""A template that lies farther from the surface (median) is not used. Ten people: 0.1 to 0.4 mm."""
+
+
+_Side = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True)
+class TemplateFit:
+    """Distance of the registered template's skin to the person's surface: median and 95th percentile."""
+
+    median_mm: float
+    p95_mm: float
+
+
+@dataclass(frozen=True)
+class AnimatedFace:
+    """An avatar with morph targets.
+
+    Attributes:
+        skinned: the mesh in the A-pose, the face being the template's.
+        atlas: of that mesh; the captured charts are in the left half of the texture.
+        diffuse, specular: maps, twice as wide as high.
+        names: of the morph targets.
+        displacements_m: of the vertices at weight 1, in the A-pose.
+        boundary_gap_m: largest distance between the cuts that were joined.
+        fit: of the template to the surface.
+    """
+
+    skinned: MeshArtifact
+    atlas: Atlas
+    diffuse: Float[np.ndarray, "h w 3"]
+    specular: Float[np.ndarray, "h w"]
+    names: tuple[str, ...]
+    displacements_m: Float[np.ndarray, "m v 3"]
+    boundary_gap_m: float
+    fit: TemplateFit
+
+
+def build_animated_face(
+    body: Body, skinned: MeshArtifact, captured: CapturedSurface, make_detector: Callable[[], Detector]
+) -> AnimatedFace:
+    """Find the face, register the template, and return the avatar with a face that moves.
+
+    Args:
+        body: the fitted body.
+        skinned: the captured mesh with its skin.
+        captured: the same mesh with its texture.
+        make_detector: constructs the detector of face landmarks.
+
+    Raises:
+        FacePatchError: the avatar gets no such face; the message says why.
+    """
+    if not is_template_body(body):
+        raise FacePatchError("morph targets belong to the built-in body, and this run has a body of a model file")
+    landmarks = find_face_landmarks(body, captured.mesh, captured.atlas, captured.diffuse, make_detector())
+    if landmarks is None:
+        raise FacePatchError("no face was found on the textured avatar; it may be too small or hidden in the video")
+    face = animate_face(body, register_template(body, captured.mesh, landmarks), skinned, captured)
+    if face.fit.median_mm > MAX_MEDIAN_MM:
+        raise FacePatchError(f"the body's surface is {face.fit.median_mm:.0f} mm from the person's (median)")
+    if face.boundary_gap_m > MAX_GAP_M:
+        raise FacePatchError(
+            f"the outline of the face is {1e3 * face.boundary_gap_m:.0f} mm from the surface; hair may hide it"
+        )
+    return face
+
+
+def animate_face(
+    body: Body, registration: Registration, skinned: MeshArtifact, captured: CapturedSurface
+) -> AnimatedFace:
+    """Return the avatar with the template's face in place of the captured one, and its morph targets.
+
+    Args:
+        body: the fitted built-in body.
+        registration: of the body on the captured mesh.
+        skinned: the captured mesh with its skin.
+        captured: the same mesh with its texture.
+
+    Raises:
+        FacePatchError: the face cannot be cut out in one piece.
+    """
+    mesh, captured_atlas = skinned.mesh, captured.atlas
+    patch = build_face_patch(body, registration, mesh)
+    cut, cut_uv, loop = cut_face_out(mesh, captured_atlas.faces_uv, captured_atlas.vertex_of_uv, patch.frame)
+    rest_m = cut.interpolate(mesh.vertices.astype(np.float64))
+    outer_rad, inner_rad = (patch.frame.angle_rad(points_m) for points_m in (rest_m[loop], _boundary_m(patch)))
+    on_patch_m = _at_angle(outer_rad, inner_rad, _boundary_m(patch))
+    gap_m = float(np.linalg.norm(on_patch_m - rest_m[loop], axis=1).max())
+    rest_m[loop] = on_patch_m
+    uv = layout_charts(patch)
+    half = np.array([0.5, 1.0])
+    vertices = np.concatenate([rest_m, patch.mesh.vertices])
+    faces, atlas = _join(
+        (cut.faces, cut_uv.faces, cut_uv.interpolate(captured_atlas.uv) * half, loop, outer_rad),
+        (patch.mesh.faces, patch.faces_uv, uv * half + [0.5, 0.0], patch.boundary, inner_rad),
+        len(rest_m),
+    )
+    units_m = np.concatenate([_captured_units(body, registration, rest_m, patch.frame), patch.units_m], axis=1)
+    names, displacements_m = add_visemes(load_face_units().names, units_m)
+    displacements_m[np.linalg.norm(displacements_m, axis=2) < MIN_DISPLACEMENT_M] = 0.0
+    diffuse, specular = paint_patch(patch, uv, captured)
+    distance_mm = 1e3 * registration.distance_m[load_template().skin_vertices]
+    return AnimatedFace(
+        _skin(skinned, cut, patch, Mesh(vertices.astype(np.float32), faces)),
+        atlas,
+        np.concatenate([captured.diffuse, diffuse], axis=1).astype(np.float32),
+        np.concatenate([captured.specular, specular], axis=1).astype(np.float32),
+        names,
+        displacements_m.astype(np.float32),
+        gap_m,
+        TemplateFit(float(np.median(distance_mm)), float(np.quantile(distance_mm, 0.95))),
+    )
+
+
+def _boundary_m(patch: FacePatch) -> Float[np.ndarray, "b 3"]:
+    return patch.mesh.vertices[patch.boundary]
+
+
+def _at_angle(
+    angle_rad: Float[np.ndarray, "a"], loop_rad: Float[np.ndarray, "b"], values: Float[np.ndarray, "b c"]
+) -> Float[np.ndarray, "a c"]:
+    """Return the values of a closed loop, linear between its vertices, at some angles."""
+    order = np.argsort(loop_rad)
+    columns = [np.interp(angle_rad, loop_rad[order], column[order], period=2.0 * np.pi) for column in values.T]
+    return np.stack(columns, axis=1)
+
+
+def _join(outer: _Side, inner: _Side, first: int) -> tuple[Int[np.ndarray, "f 3"], Atlas]:
+    """Join two parts along a common outline: each takes the other's vertices on it.
+
+    Args:
+        outer, inner: faces, their corners in the texture coordinates, these, the outline, and its angles.
+        first: number of vertices of the outer part, which come before those of the inner one.
+    """
+    faces_a, faces_uv_a, uv_a, loop_a, rad_a = outer
+    faces_b, faces_uv_b, uv_b, loop_b, rad_b = (inner[0] + first, *inner[1:3], inner[3] + first, inner[4])
+    forwards = points_on_edges(loop_a, rad_a, loop_b, rad_b, ties_after=True)
+    backwards = {(v, u): [(p, 1.0 - f) for p, f in row[::-1]] for (u, v), row in forwards.items()}
+    faces_a, faces_uv_a, uv_a = split_boundary_faces(faces_a, faces_uv_a, uv_a, backwards)
+    on_b = points_on_edges(loop_b, rad_b, loop_a, rad_a, ties_after=False)
+    faces_b, faces_uv_b, uv_b = split_boundary_faces(faces_b, faces_uv_b, uv_b, on_b)
+    faces = np.concatenate([faces_a, faces_b]).astype(np.int32)
+    faces_uv = np.concatenate([faces_uv_a, faces_uv_b + len(uv_a)]).astype(np.int32)
+    used, corners = np.unique(faces_uv, return_inverse=True)
+    atlas = Atlas(
+        np.concatenate([uv_a, uv_b]).astype(np.float32)[used],
+        corners.reshape(-1, 3).astype(np.int32),
+        np.zeros(len(used), np.int32),
+    )
+    atlas.vertex_of_uv[atlas.faces_uv] = faces
+    return faces, atlas
+
+
+def _captured_units(
+    body: Body, registration: Registration, points_m: Float[np.ndarray, "v 3"], frame: FaceFrame
+) -> Float[np.ndarray, "m v 3"]:
+    """Return the face units at points of the captured surface, from the nearest point of the registered template."""
+    units, template = load_face_units(), load_template()
+    moved = np.zeros((len(units.names), len(points_m), 3))
+    rows = np.flatnonzero(np.linalg.norm(points_m - frame.origin_m, axis=1) < _REACH_M)
+    skin = Mesh(registration.vertices, template.faces[template.skin_faces])
+    distance_m, face, barycentric = closest_points_on_mesh(points_m[rows], skin)
+    amount = np.clip((_NONE_M - distance_m) / (_NONE_M - _FULL_M), 0.0, 1.0)
+    corners = units.template_m[:, skin.faces[face]]
+    moved[:, rows] = np.einsum("nk,mnkc->mnc", amount[:, None] * barycentric, corners)
+    return moved @ unit_transform(body, registration).T
+
+
+def _skin(skinned: MeshArtifact, cut: CutMesh, patch: FacePatch, mesh: Mesh) -> MeshArtifact:
+    """Return the joined mesh with the captured skin; parts behind lids and lips have one skin each."""
+    joints = int(skinned.joint_indices.max()) + 1
+    dense = skinned.dense_skin_weights(joints).numpy().astype(np.float64)
+    _, face, barycentric = closest_points_on_mesh(patch.mesh.vertices, skinned.mesh)
+    corners = skinned.mesh.faces[face]
+    weights = np.einsum("nk,nkj->nj", barycentric, dense[corners])
+    colours = np.einsum("nk,nkc->nc", barycentric, skinned.vertex_colours[corners].astype(np.float64))
+    for part in _RIGID_PARTS:
+        rows = patch.vertex_part == part
+        weights[rows] = weights[rows].mean(axis=0)
+    weights = np.concatenate([cut.interpolate(dense), weights])
+    indices, values = top_k_weights(weights, skinned.joint_indices.shape[1])
+    return MeshArtifact(
+        mesh,
+        indices,
+        values,
+        np.concatenate([cut.interpolate(skinned.vertex_colours.astype(np.float64)), colours]).astype(np.float32),
+    )

