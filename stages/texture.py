@@ -1,11 +1,14 @@
 """texture stage: unwrap the mesh into a UV atlas and bake diffuse, specular and coverage maps from the video."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from torch import Tensor
 from pydantic import Field, ValidationInfo, field_validator
 
 from pipeline.body.body import Body, canonical_to_world
@@ -34,8 +37,10 @@ from pipeline.texture.bake import (
     texels_to_texture,
 )
 from pipeline.texture.body_parts import body_part_of_faces
-from pipeline.texture.files import ATLAS, COVERAGE, DIFFUSE, SPECULAR, TextureArtifact, TextureFormat, save_texture
+from pipeline.texture.files import ATLAS, COVERAGE, DIFFUSE, LIGHT, SPECULAR, TextureArtifact, TextureFormat, save_texture
 from pipeline.texture.inpainting import average_texels_per_vertex, inpaint_vertex_colours
+from pipeline.texture.light import VideoLight
+from pipeline.texture.light_evidence import estimate_light
 from pipeline.texture.settings import DEFAULT_SETTINGS, TextureSettings
 from pipeline.texture.specular import fit_specular, observe_vertices, texels_at_vertices
 from pipeline.texture.views import BakeView, crop_bake_view, weight_by_resolution
@@ -57,6 +62,10 @@ class Config(BaseConfig):
     format: TextureFormat = Field(
         "png8",
         description="files of the maps: png8, png16, or exr (8-bit .png and half floats in .exr)",
+    )
+    light: Literal["auto", "removed", "kept"] = Field(
+        "auto",
+        description="light of the video in the diffuse map: removed, kept, or auto (removed if validation frames agree)",
     )
     max_frames: int = Field(
         100, ge=1, description="largest number of training frames, evenly spaced over the recording"
@@ -97,6 +106,11 @@ def run(
     atlas, size_px = build_atlas(skinned, body, train, config, settings)
     texels = rasterize_texels(atlas, size_px)
     surface = TexturedSurface.from_arrays(skinned.mesh.faces, atlas, texels)
+    light, light_metrics = find_light((train, validation), positions, skinned.mesh, len(capture), config, settings)
+    train, validation = (
+        light_views(views, light, subsample(part, config.max_frames), surface.faces)
+        for views, part in zip((train, validation), positions, strict=True)
+    )
     inpaint = make_texel_inpainter(skinned.mesh, texels)
     diffuse, texel_confidence = bake_diffuse(train, surface, inpaint, config.rounds, settings)
     amplitude, partial_r2 = bake_specular(train, validation, skinned.mesh, settings)
@@ -106,6 +120,7 @@ def run(
         diffuse=diffuse,
         specular=np.ascontiguousarray(texels_to_texture(specular, texels)[..., 0]),
         coverage=to_uint8(texels.to_texture(texel_confidence[:, None])[..., 0]),
+        light=light,
     )
     save_texture(out, artifact, config.format)
     return {
@@ -114,6 +129,7 @@ def run(
         "atlas_utilisation": float(len(texels.face) / size_px**2),
         "validation_psnr_body_db": mean_foreground_psnr_db(to_float(to_uint8(diffuse)), validation, surface),
         "specular_partial_r2": partial_r2,
+        **light_metrics,
     }
 
 
@@ -131,13 +147,65 @@ def load_views(
     vertices = torch.from_numpy(skinned.mesh.vertices)
     weights = skinned.dense_skin_weights(len(body.joint_names))
     faces = torch.from_numpy(skinned.mesh.faces)
-    subsampled = positions[evenly_spaced(len(positions), max_frames)]
     views = []
-    for k in track(subsampled.tolist(), "reading frames"):
+    for k in track(subsample(positions, max_frames).tolist(), "reading frames"):
         posed = linear_blend_skinning(vertices, weights, transforms[k : k + 1])[0]
         image, mask = to_uint8(capture.image(k)), to_uint8(capture.mask(k))
         views.append(crop_bake_view(image, mask, camera, posed, faces))
     return weight_by_resolution(views) if views else []
+
+
+def subsample(positions: Int[np.ndarray, "k"], max_frames: int) -> Int[np.ndarray, "m"]:
+    """Return at most `max_frames` evenly spaced positions."""
+    return positions[evenly_spaced(len(positions), max_frames)]
+
+
+def find_light(
+    views: tuple[list[BakeView], list[BakeView]],
+    positions: tuple[Int[np.ndarray, "t"], Int[np.ndarray, "w"]],
+    mesh: Mesh,
+    frames: int,
+    config: Config,
+    settings: TextureSettings,
+) -> tuple[VideoLight, dict[str, float]]:
+    """Return the light to remove, uniform for none, and its figures.
+
+    views, positions: of training and validation frames. frames: number of selected frames.
+    """
+    if config.light == "kept":
+        return VideoLight.uniform(frames), {"light_removed": 0.0}
+    if not views[1]:
+        warn("there are no validation frames to test the light on: it stays in the diffuse map")
+        return VideoLight.uniform(frames), {"light_removed": 0.0}
+    used = tuple(subsample(part, config.max_frames) for part in positions)
+    evidence = estimate_light(*views, vertex_surface(mesh), mesh.edges(), (used[0], used[1]), settings)
+    is_removed = evidence.helps or config.light == "removed"
+    return evidence.for_capture(used[0], frames, is_removed=is_removed), {
+        "light_removed": float(is_removed),
+        "light_explained": evidence.explained,
+        "light_standard_errors": evidence.standard_errors,
+        "key_light_standard_errors": evidence.key_standard_errors,
+        "gain_log_std": float(np.log(evidence.light.gain).std()),
+    }
+
+
+def light_views(
+    views: list[BakeView], light: VideoLight, positions: Int[np.ndarray, "k"], faces: Int[Tensor, "f 3"]
+) -> list[BakeView]:
+    """Return views with the irradiance of their vertices; unchanged under a uniform light of constant exposure."""
+    if light.is_uniform and bool((light.gain == 1.0).all()):
+        return views
+    return [
+        replace(view, irradiance=light.shade_vertices(view.vertices_world, faces, int(position)))
+        for view, position in zip(views, positions, strict=True)
+    ]
+
+
+def vertex_surface(mesh: Mesh) -> TexturedSurface:
+    """Return the surface whose texels are the vertices of a mesh."""
+    faces = torch.from_numpy(mesh.faces)
+    count = len(mesh.vertices)
+    return TexturedSurface(faces, faces, torch.zeros(count, 2), texels_at_vertices(mesh.faces, count))
 
 
 def build_atlas(
@@ -169,10 +237,7 @@ def bake_specular(
     if not validation:
         warn("there are no validation frames to test highlights on: the surface is exported as matte")
         return np.zeros(len(mesh.vertices), dtype=np.float32), 0.0
-    count = len(mesh.vertices)
-    texels = texels_at_vertices(mesh.faces, count)
-    faces = torch.from_numpy(mesh.faces)
-    surface = TexturedSurface(faces, faces, torch.zeros(count, 2), texels)
+    count, surface = len(mesh.vertices), vertex_surface(mesh)
     observed, held_out = (observe_vertices(views, surface, settings) for views in (train, validation))
     fitted = fit_specular(observed, held_out, mesh.edges(), count, settings.specular_min_partial_r2)
     amplitude, operator = fitted.amplitude.astype(np.float64), laplacian(mesh)
@@ -183,9 +248,9 @@ def bake_specular(
 
 STAGE = Stage(
     "texture",
-    version=5,
+    version=6,
     needs=("frames", "body", "mesh"),
-    makes=(ATLAS, DIFFUSE, SPECULAR, COVERAGE),
+    makes=(ATLAS, DIFFUSE, SPECULAR, COVERAGE, LIGHT),
     config=Config,
     run=run,
 )

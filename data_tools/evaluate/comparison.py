@@ -14,7 +14,7 @@ from data_tools.evaluate.truth import load_ground_truth
 from data_tools.synthetic.rig.labels import FaceLabels
 from data_tools.synthetic.scene.capture import SyntheticCapture
 from data_tools.synthetic.scene.renderer import pose_vertices
-from data_tools.synthetic.scene.shadow import find_exterior_faces
+from pipeline.geometry.shadow_map import find_exterior_faces
 from pipeline.avatar.feet import snap_feet_to_floor
 from pipeline.avatar.finished_run import FinishedRun, load_finished_run
 from pipeline.avatar.retarget import retarget_rotations

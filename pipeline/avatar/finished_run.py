@@ -80,6 +80,7 @@ def load_textured_avatar(mesh_dir: Path, texture_dir: Path) -> TexturedAvatar:
         uv=torch.from_numpy(texture.atlas.uv.astype(np.float32)),
         faces_uv=torch.from_numpy(texture.atlas.faces_uv.astype(np.int32)),
         diffuse=torch.from_numpy(texture.diffuse),
+        light=texture.light,
     )
 
 

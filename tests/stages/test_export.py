@@ -15,6 +15,7 @@ from pipeline.geometry.atlas import Atlas
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.io.glb import GlbFile
 from pipeline.io.image import read_rgb, to_float, write_gray
+from pipeline.texture.light import VideoLight
 from pipeline.texture.files import TextureArtifact, TextureFormat, load_texture, save_texture
 from stages.export import STAGE as EXPORT
 from tests.avatar.test_gltf import Player
@@ -43,7 +44,7 @@ def inputs(scene: PaintedScene, tmp_path_factory: pytest.TempPathFactory) -> dic
     diffuse = to_float(random.integers(0, 256, (TEXTURE_PX, TEXTURE_PX, 3), dtype=np.uint8))
     blank = np.zeros((TEXTURE_PX, TEXTURE_PX), dtype=np.uint8)
     (folder / "texture").mkdir()
-    save_texture(folder / "texture", TextureArtifact(atlas, diffuse, to_float(blank), blank))
+    save_texture(folder / "texture", TextureArtifact(atlas, diffuse, to_float(blank), blank, VideoLight.uniform(3)))
     return inputs | {"texture": folder / "texture"}
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from data_tools.synthetic.rig.subject import Subject
-from data_tools.synthetic.scene.shadow import ShadowMap, render_shadow_map
+from pipeline.geometry.shadow_map import ShadowMap, render_shadow_map
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.colour import linear_to_srgb, srgb_to_linear
 from pipeline.geometry.skinning import linear_blend_skinning

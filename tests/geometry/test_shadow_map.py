@@ -8,7 +8,7 @@ import torch
 
 from data_tools.synthetic.rig.subject import Subject
 from data_tools.synthetic.scene.renderer import FLAT, HARD, Light, render_subject, shade
-from data_tools.synthetic.scene.shadow import PCF_RADIUS_PX, SHADOW_TEXEL_M, find_exterior_faces, render_shadow_map
+from pipeline.geometry.shadow_map import PCF_RADIUS_PX, SHADOW_TEXEL_M, find_exterior_faces, render_shadow_map
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
 from tests.data_tools.synthetic.shapes import sphere

@@ -1,0 +1,126 @@
+"""The light of a video: irradiance by the surface normal, a key light that casts shadows, and a gain a frame.
+
+The person turns and the lamps do not, so the irradiance is a function of the world normal n:
+
+    E(n) = sum_i L_i Y_i(n) + K v max(0, n . d),
+
+with real spherical harmonics Y_i up to degree 2, which hold 99 % of the energy of the irradiance of distant light
+(Ramamoorthi and Hanrahan, "An efficient representation for irradiance environment maps", 2001), and a key light of
+irradiance K from direction d, which a surface point sees (v = 1) or not (v = 0). A linear colour of the video is albedo *
+E(n) * gain of the frame. The scale of each channel of E is a convention: the observed surface is as bright as the video.
+"""
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pipeline.core.errors import UserError
+from pipeline.geometry.mesh import area_weighted_vertex_normals
+from pipeline.geometry.shadow_map import render_shadow_map
+from pipeline.io.npz import load_npz, save_npz
+
+MIN_IRRADIANCE = 0.05
+"""Smallest irradiance relative to the mean: degree 2 may be negative far from the lamps."""
+
+
+@dataclass(frozen=True)
+class VideoLight:
+    """Light and exposure of a video, in linear RGB.
+
+    Attributes:
+        coefficients: of `spherical_harmonics`, one column a channel.
+        key_irradiance: of a surface that faces the key light; 0 without a key light.
+        key_direction: towards the key light, unit, world.
+        gain: exposure of each selected frame relative to the mean, in the order of the capture.
+    """
+
+    coefficients: Float[np.ndarray, "9 3"]
+    key_irradiance: Float[np.ndarray, "3"]
+    key_direction: Float[np.ndarray, "3"]
+    gain: Float[np.ndarray, "n"]
+
+    @staticmethod
+    def uniform(frames: int) -> "VideoLight":
+        """Return the light that shows a texture as it is, for a number of selected frames."""
+        coefficients = np.zeros((9, 3), dtype=np.float32)
+        coefficients[0] = 1.0
+        upwards = np.array([0.0, 1.0, 0.0], dtype=np.float32)
+        return VideoLight(coefficients, np.zeros(3, dtype=np.float32), upwards, np.ones(frames, dtype=np.float32))
+
+    @property
+    def is_uniform(self) -> bool:
+        """Whether the irradiance is 1 everywhere."""
+        return not self.casts_shadows and not self.coefficients[1:].any() and bool((self.coefficients[0] == 1.0).all())
+
+    @property
+    def casts_shadows(self) -> bool:
+        """Whether there is a key light."""
+        return bool(self.key_irradiance.any())
+
+    def irradiance(
+        self, normals: Float[np.ndarray, "k 3"], visibility: Float[np.ndarray, "k"]
+    ) -> Float[np.ndarray, "k 3"]:
+        """Return E at unit normals (world); visibility: of the key light, in [0, 1]. At least `MIN_IRRADIANCE`."""
+        lambert = visibility * np.maximum(normals @ self.key_direction, 0.0)
+        smooth = spherical_harmonics(normals) @ self.coefficients
+        return np.maximum(smooth + lambert[:, None] * self.key_irradiance, MIN_IRRADIANCE).astype(np.float32)
+
+    def shade_vertices(
+        self, vertices_world: Float[Tensor, "v 3"], faces: Tensor, frame: int | None = None
+    ) -> Float[Tensor, "v 3"]:
+        """Return the irradiance of each vertex of a posed mesh (m, world), times the gain of a selected frame.
+
+        frame: position in the capture; None for the mean exposure.
+        """
+        gain = 1.0 if frame is None else float(self.gain[frame])
+        if self.is_uniform:
+            return torch.full_like(vertices_world, gain)
+        normals = area_weighted_vertex_normals(vertices_world, faces)
+        visibility = key_visibility(vertices_world, faces, normals, self.key_direction) if self.casts_shadows else None
+        seen = np.ones(len(normals)) if visibility is None else visibility.numpy()
+        return torch.from_numpy(gain * self.irradiance(normals.numpy(), seen))
+
+
+def spherical_harmonics(directions: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 9"]:
+    """Evaluate real spherical harmonics up to degree 2 at unit vectors: orthogonal, the constant is 1."""
+    x, y, z = directions.astype(np.float64).T
+    return np.stack(
+        [np.ones_like(x), x, y, z, x * y, y * z, 3.0 * z * z - 1.0, x * z, x * x - y * y],
+        axis=1,
+    )
+
+
+def key_visibility(
+    vertices_world: Float[Tensor, "v 3"],
+    faces: Tensor,
+    normals: Float[Tensor, "v 3"],
+    key_direction: Float[np.ndarray, "3"],
+) -> Float[Tensor, "v"]:
+    """Return the fraction of the key light that other parts of the mesh let through to each vertex, in [0, 1]."""
+    x, y, z = (float(value) for value in key_direction)
+    return render_shadow_map(vertices_world, faces, (x, y, z)).visibility(vertices_world, normals)
+
+
+_ARRAYS = tuple(field.name for field in fields(VideoLight))
+
+
+def save_light(path: Path, light: VideoLight) -> None:
+    """Write light.npz; `load_light` is the inverse."""
+    save_npz(path, {name: getattr(light, name).astype(np.float32) for name in _ARRAYS})
+
+
+def load_light(path: Path) -> VideoLight:
+    """Read the file of `save_light`.
+
+    Raises:
+        UserError: the file is missing, is no npz, or lacks an array.
+    """
+    arrays = load_npz(path)
+    missing = [name for name in _ARRAYS if name not in arrays]
+    if missing:
+        raise UserError(f"{path} lacks the array {missing[0]}; run `python -m stages.texture` again")
+    return VideoLight(*(arrays[name] for name in _ARRAYS))
