@@ -59,11 +59,18 @@ class TexturedAvatar:
 
         light: None: unlit. frame: selected frame whose exposure is used; None: the mean exposure.
         """
-        is_shaded = light is not None and (not light.is_uniform or frame is not None)
-        irradiance = light.shade_vertices(vertices_world, self.faces, frame) if light and is_shaded else None
+        irradiance = None
+        if light is not None and not (light.is_uniform and frame is None):
+            irradiance = light.shade_vertices(vertices_world, self.faces, frame)
         return render_textured(
             vertices_world, self.faces, self.faces_uv, self.uv, self.diffuse, camera, supersampling, irradiance
         ).numpy()
+
+    def irradiance(self, vertices_world: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3"] | None:
+        """Return the irradiance of posed vertices under the light of the video; None if the texture holds it."""
+        if self.light is None or self.light.is_uniform:
+            return None
+        return self.light.shade_vertices(vertices_world, self.faces)
 
     def render_turntable(
         self,

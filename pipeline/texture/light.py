@@ -85,6 +85,19 @@ class VideoLight:
         return torch.from_numpy(gain * self.irradiance(normals.numpy(), seen))
 
 
+def directional_light(direction: tuple[float, float, float], ambient: float) -> VideoLight:
+    """Return a white key light of irradiance 1 with cast shadows, and uniform ambient light.
+
+    direction: towards the light, world, any length > 0. ambient: irradiance without the key light.
+    """
+    coefficients = np.zeros((9, 3), dtype=np.float32)
+    coefficients[0] = ambient
+    towards = np.array(direction, dtype=np.float32)
+    return VideoLight(
+        coefficients, np.ones(3, np.float32), towards / np.linalg.norm(towards), np.ones(1, np.float32)
+    )
+
+
 def spherical_harmonics(directions: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 9"]:
     """Evaluate real spherical harmonics up to degree 2 at unit vectors: orthogonal, the constant is 1."""
     x, y, z = directions.astype(np.float64).T
