@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
 from pydantic import Field, ValidationInfo, field_validator
+from torch import Tensor
 
 from pipeline.body.body import Body, canonical_to_world
 from pipeline.body.files import load_body, load_camera, load_motion
@@ -37,7 +37,16 @@ from pipeline.texture.bake import (
     texels_to_texture,
 )
 from pipeline.texture.body_parts import body_part_of_faces
-from pipeline.texture.files import ATLAS, COVERAGE, DIFFUSE, LIGHT, SPECULAR, TextureArtifact, TextureFormat, save_texture
+from pipeline.texture.files import (
+    ATLAS,
+    COVERAGE,
+    DIFFUSE,
+    LIGHT,
+    SPECULAR,
+    TextureArtifact,
+    TextureFormat,
+    save_texture,
+)
 from pipeline.texture.inpainting import average_texels_per_vertex, inpaint_vertex_colours
 from pipeline.texture.light import VideoLight
 from pipeline.texture.light_evidence import estimate_light
@@ -65,7 +74,7 @@ class Config(BaseConfig):
     )
     light: Literal["auto", "removed", "kept"] = Field(
         "auto",
-        description="light of the video in the diffuse map: removed, kept, or auto (removed if validation frames agree)",
+        description="light of the video in the diffuse map: removed, kept, or auto (decided on validation frames)",
     )
     max_frames: int = Field(
         100, ge=1, description="largest number of training frames, evenly spaced over the recording"

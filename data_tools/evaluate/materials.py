@@ -18,7 +18,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from data_tools.command import run_command
 from data_tools.evaluate.truth import load_ground_truth
@@ -38,7 +38,7 @@ from pipeline.geometry.surface import closest_points_on_mesh, collapse_edges
 from pipeline.geometry.texture_rendering import render_textured, sample_texture
 from pipeline.io.image import to_float, to_uint8, write_gray, write_rgb
 from pipeline.io.npz import save_npz
-from pipeline.mesh.files import MeshArtifact, save_mesh
+from pipeline.mesh.files import MeshArtifact, load_mesh, save_mesh
 from pipeline.metrics.images import composite_on_white, composite_premultiplied_on_white, foreground_mask, psnr_db
 from pipeline.metrics.surfaces import sample_surface
 from pipeline.texture.files import TextureArtifact, load_texture
@@ -61,7 +61,9 @@ def main(argv: Sequence[str]) -> None:
     )
     parser.add_argument("capture", type=Path, help="folder of the synthetic capture")
     parser.add_argument("--frames", type=int, default=48, help="frames used, evenly spaced (default 48)")
-    parser.add_argument("--flicker", type=float, default=0.0, help="largest relative change of the exposure (default 0)")
+    parser.add_argument(
+        "--flicker", type=float, default=0.0, help="largest relative change of the exposure (default 0)"
+    )
     parser.add_argument("--out", type=Path, help="folder for the maps; a temporary one if absent")
     options = parser.parse_args(argv)
     truth = load_ground_truth(options.capture)
@@ -80,11 +82,9 @@ def main(argv: Sequence[str]) -> None:
                 print(f"{mode:8} {name:32} {value:10.4f}")
 
 
-def write_true_run(
-    truth: SyntheticCapture, folder: Path, frames: int, flicker: float
-) -> Float[np.ndarray, "n"]:
+def write_true_run(truth: SyntheticCapture, folder: Path, frames: int, flicker: float) -> Float[np.ndarray, "n"]:
     """Write the folders `frames`, `body` and `mesh` of a run with the true person; return the gain of each frame."""
-    motion = truth.motion.select(np.unique(np.linspace(0, len(truth.motion.time_s) - 1, frames).round().astype(int)))
+    motion = truth.motion.select(_used_frames(truth, frames))
     gains = 1.0 + flicker * np.random.default_rng(0).uniform(-1.0, 1.0, len(motion.time_s))
     for name in ("frames/images", "frames/masks", "body", "mesh"):
         (folder / name).mkdir(parents=True, exist_ok=True)
@@ -120,6 +120,10 @@ def write_true_run(
     return gains
 
 
+def _used_frames(truth: SyntheticCapture, count: int) -> Int[np.ndarray, "n"]:
+    return np.unique(np.linspace(0, len(truth.motion.time_s) - 1, count).round().astype(int))
+
+
 def reduced_mesh(body: Body) -> MeshArtifact:
     """Return the surface of a body with `FACES` faces; vertices have the skin weights of the nearest true ones."""
     mesh = body.mesh()
@@ -144,14 +148,18 @@ def score_maps(
     truth: SyntheticCapture, texture: TextureArtifact, folder: Path, gains: Float[np.ndarray, "n"]
 ) -> dict[str, float]:
     """Return the error of the map against the true texture (of 255, one gain a channel), PSNR in dB, gain error."""
-    mesh, gain = _load_reduced(folder), albedo_gain(truth, texture, folder)
+    mesh, gain = load_mesh(folder / "mesh"), albedo_gain(truth, texture, folder)
     balanced = replace(texture, diffuse=_scaled(texture.diffuse, gain[0]))
     own_mesh_body = replace(
-        truth.subject.body, vertices=mesh.mesh.vertices, faces=mesh.mesh.faces,
+        truth.subject.body,
+        vertices=mesh.mesh.vertices,
+        faces=mesh.mesh.faces,
         skin_weights=mesh.dense_skin_weights(len(truth.subject.body.joint_names)).numpy(),
     )
     subject = Subject(own_mesh_body, texture.atlas.uv, texture.atlas.faces_uv, to_uint8(balanced.diffuse))
-    motion = truth.motion.frame_index[np.unique(np.linspace(0, len(truth.motion.time_s) - 1, len(gains)).round().astype(int))]
+    motion = truth.motion.frame_index[
+        np.unique(np.linspace(0, len(truth.motion.time_s) - 1, len(gains)).round().astype(int))
+    ]
     held_out = np.flatnonzero(assign_splits(np.arange(len(gains))) == HELDOUT)
     scores: dict[str, list[float]] = {"heldout_psnr_body_db": []}
     for position in held_out.tolist():
@@ -160,12 +168,20 @@ def score_maps(
         image, mask = _exposed(truth, int(motion[position]), float(gains[position]))
         irradiance = texture.light.shade_vertices(vertices, torch.from_numpy(mesh.mesh.faces), position)
         render = render_textured(
-            vertices, torch.from_numpy(mesh.mesh.faces), torch.from_numpy(texture.atlas.faces_uv),
-            torch.from_numpy(texture.atlas.uv), torch.from_numpy(texture.diffuse), truth.camera, SAMPLES, irradiance,
+            vertices,
+            torch.from_numpy(mesh.mesh.faces),
+            torch.from_numpy(texture.atlas.faces_uv),
+            torch.from_numpy(texture.atlas.uv),
+            torch.from_numpy(texture.diffuse),
+            truth.camera,
+            SAMPLES,
+            irradiance,
         ).numpy()
         scores["heldout_psnr_body_db"].append(_body_psnr_db(render, image, mask))
         for name, light in NEW_LIGHTS.items():
-            expected = unpremultiply_to_uint8(render_subject(truth.subject, true_vertices, truth.camera, light, SAMPLES))
+            expected = unpremultiply_to_uint8(
+                render_subject(truth.subject, true_vertices, truth.camera, light, SAMPLES)
+            )
             drawn = render_subject(subject, vertices, truth.camera, light, SAMPLES)
             scores.setdefault(f"relit_{name}_db", []).append(_body_psnr_db(drawn, expected[..., :3], expected[..., 3]))
     split = assign_splits(np.arange(len(gains)))
@@ -182,16 +198,12 @@ def _body_psnr_db(render: np.ndarray, image: np.ndarray, mask: np.ndarray) -> fl
     return psnr_db(composite_premultiplied_on_white(render), composite_on_white(image, mask), inside)
 
 
-def _load_reduced(folder: Path) -> MeshArtifact:
-    from pipeline.mesh.files import load_mesh
-
-    return load_mesh(folder / "mesh")
-
-
-def albedo_gain(truth: SyntheticCapture, texture: TextureArtifact, folder: Path) -> tuple[Float[np.ndarray, "3"], float]:
+def albedo_gain(
+    truth: SyntheticCapture, texture: TextureArtifact, folder: Path
+) -> tuple[Float[np.ndarray, "3"], float]:
     """Return the linear gain a channel from the map to the true texture, and the mean error after it, of 255."""
-    mesh, subject = _load_reduced(folder).mesh, truth.subject
-    points, on_mesh = sample_surface(mesh, SURFACE_POINTS, 0)
+    mesh, subject = load_mesh(folder / "mesh").mesh, truth.subject
+    points, _ = sample_surface(mesh, SURFACE_POINTS, 0)
     uv = _uv_at(points, mesh, texture.atlas.uv, texture.atlas.faces_uv)
     seen = sample_texture(torch.from_numpy(to_float(texture.coverage))[..., None], uv)[:, 0].numpy() > 0.5
     own = srgb_to_linear(sample_texture(torch.from_numpy(texture.diffuse), uv[seen]).numpy().astype(np.float64))

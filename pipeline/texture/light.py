@@ -6,8 +6,9 @@ The person turns and the lamps do not, so the irradiance is a function of the wo
 
 with real spherical harmonics Y_i up to degree 2, which hold 99 % of the energy of the irradiance of distant light
 (Ramamoorthi and Hanrahan, "An efficient representation for irradiance environment maps", 2001), and a key light of
-irradiance K from direction d, which a surface point sees (v = 1) or not (v = 0). A linear colour of the video is albedo *
-E(n) * gain of the frame. The scale of each channel of E is a convention: the observed surface is as bright as the video.
+irradiance K from direction d, which a surface point sees (v = 1) or not (v = 0). A linear colour of the video is
+albedo * E(n) * gain of the frame. The scale of each channel of E is a convention: the mean log E of what is observed
+is 0, so that an unlit avatar is about as bright as the video.
 """
 
 from dataclasses import dataclass, fields
@@ -93,9 +94,7 @@ def directional_light(direction: tuple[float, float, float], ambient: float) -> 
     coefficients = np.zeros((9, 3), dtype=np.float32)
     coefficients[0] = ambient
     towards = np.array(direction, dtype=np.float32)
-    return VideoLight(
-        coefficients, np.ones(3, np.float32), towards / np.linalg.norm(towards), np.ones(1, np.float32)
-    )
+    return VideoLight(coefficients, np.ones(3, np.float32), towards / np.linalg.norm(towards), np.ones(1, np.float32))
 
 
 def spherical_harmonics(directions: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 9"]:

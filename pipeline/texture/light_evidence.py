@@ -1,5 +1,6 @@
 """Decide from validation frames whether the light of a video can be removed, and find the exposure of every frame."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -54,11 +55,9 @@ class LightEvidence:
     @property
     def helps(self) -> bool:
         """Whether removing the light is supported by the validation frames."""
-        return self.standard_errors > MIN_IMPROVEMENT
+        return bool(self.standard_errors > MIN_IMPROVEMENT)
 
-    def for_capture(
-        self, train: Int[np.ndarray, "t"], frames: int, *, is_removed: bool
-    ) -> VideoLight:
+    def for_capture(self, train: Int[np.ndarray, "t"], frames: int, *, is_removed: bool) -> VideoLight:
         """Return the light with a gain for each of `frames` selected frames.
 
         Training frames have their own gain, others the interpolated one if `gain_is_smooth`, else 1. Nothing of a
@@ -137,7 +136,7 @@ def _improvement(before: Prediction, after: Prediction) -> float:
     decrease = before.squared_error - after.squared_error
     if len(decrease) < 2:
         return 0.0
-    standard_error = float(decrease.std(ddof=1)) / np.sqrt(len(decrease))
+    standard_error = float(decrease.std(ddof=1)) / math.sqrt(len(decrease))
     return float(decrease.mean()) / max(standard_error, 1e-12)
 
 

@@ -69,6 +69,10 @@ class LightObservations:
     weight: Float[np.ndarray, "k"]
     normal: Float[np.ndarray, "k 3"]
 
+    def select(self, rows: Bool[np.ndarray, "k"]) -> "LightObservations":
+        """Return some rows."""
+        return LightObservations(*(getattr(self, field.name)[rows] for field in fields(LightObservations)))
+
     def log_linear(self) -> Float[np.ndarray, "k 3"]:
         """Return the logarithm of the linear colours."""
         return np.log(srgb_to_linear(self.colour.astype(np.float64)))
@@ -91,9 +95,7 @@ class LightFit:
     log_albedo: Float[np.ndarray, "v 3"]
 
 
-def observe_light(
-    views: Sequence[BakeView], surface: TexturedSurface, settings: TextureSettings
-) -> LightObservations:
+def observe_light(views: Sequence[BakeView], surface: TexturedSurface, settings: TextureSettings) -> LightObservations:
     """Sample the colours of all vertices in all views that show them; surface: see `texels_at_vertices`."""
     parts = []
     vertices = surface.texels.columns
@@ -182,7 +184,7 @@ def find_key_direction(
     """
     chosen = np.unique(np.linspace(0, len(views) - 1, SEARCH_VIEWS).round().astype(int))
     rows = np.isin(observed.frame, chosen)
-    part = LightObservations(*(getattr(observed, field.name)[rows] for field in fields(LightObservations)))
+    part = observed.select(rows)
     part = replace(part, frame=np.searchsorted(chosen, part.frame))
     few = [views[number] for number in chosen]
     gain = fit.light.gain[chosen]
@@ -309,43 +311,31 @@ class _Problem:
         length = np.linalg.norm(residual, axis=1)
         noise = max(1.4826 * float(np.median(length)), MIN_NOISE)
         weight = self.weight / (1.0 + (length / noise) ** 2)
-        irradiance = self._irradiance(light)
-        lambert = self._lambert(light)
-        basis = self.basis if lambert is None else np.column_stack([self.basis, lambert])
+        irradiance, basis = self._irradiance(light), self._light_basis(light)
         albedo_matrix, smoothness = self._albedo_matrix(weight, fit.log_albedo)
         factor = splu(albedo_matrix)
         frames, terms = self.view_count, basis.shape[1]
-        size = frames + 3 * terms
-        schur, right = np.zeros((size, size)), np.zeros(size)
-        per_frame = coo_array((weight, (vertex, frame)), shape=(self.vertex_count, frames)).toarray()
-        couplings, reduced, rights = [], [], []
+        system = np.zeros((frames + 3 * terms, frames + 3 * terms + 1))
+        solutions = []
         for channel in range(3):
             jacobian = basis / irradiance[:, channel, None]
             jacobian[irradiance[:, channel] <= MIN_IRRADIANCE] = 0.0
-            weighted = weight[:, None] * jacobian
-            here = slice(frames + channel * terms, frames + (channel + 1) * terms)
-            columns = np.r_[np.arange(frames), np.arange(here.start, here.stop)]
-            by_vertex = np.stack([np.bincount(vertex, c, self.vertex_count) for c in weighted.T], axis=1)
-            coupling = np.concatenate([per_frame, by_vertex], axis=1)
-            block = np.zeros((frames + terms, frames + terms))
-            block[:frames, :frames] = np.diag(np.bincount(frame, weight, frames))
-            block[frames:, :frames] = np.stack([np.bincount(frame, c, frames) for c in weighted.T])
-            block[:frames, frames:] = block[frames:, :frames].T
-            block[frames:, frames:] = weighted.T @ jacobian
+            coupling, block = self._channel_blocks(jacobian, weight)
             error = weight * residual[:, channel]
             albedo_right = np.bincount(vertex, error, self.vertex_count) - smoothness @ fit.log_albedo[:, channel]
-            small_right = np.concatenate([np.bincount(frame, error, frames), jacobian.T @ error])
+            right = np.concatenate([np.bincount(frame, error, frames), jacobian.T @ error])
             solved = factor.solve(np.column_stack([coupling, albedo_right]))
-            schur[np.ix_(columns, columns)] += block - coupling.T @ solved[:, :-1]
-            right[columns] += small_right - coupling.T @ solved[:, -1]
-            couplings.append((columns, solved))
-        frame_weight = float(weight.sum()) / frames
-        prior = np.full(size, COEFFICIENT_PRIOR * frame_weight)
-        prior[:frames] = GAIN_PRIOR * frame_weight
-        small = np.clip(np.linalg.solve(schur + np.diag(prior), right), -MAX_STEP, MAX_STEP)
-        albedo = np.stack([solved[:, -1] - solved[:, :-1] @ small[columns] for columns, solved in couplings], axis=1)
+            rows = np.r_[np.arange(frames), frames + channel * terms + np.arange(terms)]
+            system[np.ix_(rows, rows)] += block - coupling.T @ solved[:, :-1]
+            system[rows, -1] += right - coupling.T @ solved[:, -1]
+            solutions.append((rows, solved))
+        prior = np.full(len(system), COEFFICIENT_PRIOR)
+        prior[:frames] = GAIN_PRIOR
+        matrix = system[:, :-1] + np.diag(prior * float(weight.sum()) / frames)
+        small = np.clip(np.linalg.solve(matrix, system[:, -1]), -MAX_STEP, MAX_STEP)
+        albedo = np.stack([solved[:, -1] - solved[:, :-1] @ small[rows] for rows, solved in solutions], axis=1)
         moved = small[frames:].reshape(3, terms).T
-        key = light.key_irradiance + moved[9] if terms > 9 else light.key_irradiance
+        key = light.key_irradiance if self.visibility is None else light.key_irradiance + moved[-1]
         changed = replace(
             light,
             coefficients=light.coefficients + moved[:9],
@@ -353,6 +343,25 @@ class _Problem:
             gain=light.gain * np.exp(small[:frames]),
         )
         return LightFit(changed, fit.log_albedo + np.clip(albedo, -MAX_STEP, MAX_STEP))
+
+    def _light_basis(self, light: VideoLight) -> np.ndarray:
+        """Return the derivative of the irradiance by the coefficients, and by the key light where there is one."""
+        lambert = self._lambert(light)
+        return self.basis if lambert is None else np.column_stack([self.basis, lambert])
+
+    def _channel_blocks(self, jacobian: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the blocks (albedos x others) and (others x others) of one channel's normal matrix.
+
+        The others are the log gains and the light; `jacobian` is the derivative of the logarithm by the light.
+        """
+        vertex, frame, frames = self.observed.vertex, self.observed.frame, self.view_count
+        weighted = weight[:, None] * jacobian
+        per_frame = coo_array((weight, (vertex, frame)), shape=(self.vertex_count, frames)).toarray()
+        per_vertex = np.stack([np.bincount(vertex, column, self.vertex_count) for column in weighted.T], axis=1)
+        gain_light = np.stack([np.bincount(frame, column, frames) for column in weighted.T], axis=1)
+        gains = np.diag(np.bincount(frame, weight, frames))
+        block = np.block([[gains, gain_light], [gain_light.T, weighted.T @ jacobian]])
+        return np.concatenate([per_frame, per_vertex], axis=1), block
 
     def _albedo_matrix(self, weight: np.ndarray, log_albedo: np.ndarray) -> tuple[csc_array, csc_array]:
         """Return the normal matrix of the albedos, data and prior, and the prior's part."""

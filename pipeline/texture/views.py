@@ -135,9 +135,7 @@ def render_irradiance(view: BakeView, faces: Int[Tensor, "f 3"]) -> Float[np.nda
     return irradiance
 
 
-def remove_light(
-    colour: Float[np.ndarray, "*n 3"], irradiance: Float[np.ndarray, "*n 3"]
-) -> Float[np.ndarray, "*n 3"]:
+def remove_light(colour: Float[np.ndarray, "*n 3"], irradiance: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     """Return the albedo (sRGB, at least 0) of surfaces that have this colour (sRGB in [0, 1]) under this irradiance."""
     linear = srgb_to_linear(np.maximum(colour, 0.0)) / np.maximum(irradiance, MIN_IRRADIANCE)
     return linear_to_srgb(linear).astype(np.float32)

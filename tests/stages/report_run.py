@@ -23,8 +23,8 @@ from pipeline.geometry.camera import Camera
 from pipeline.geometry.skinning import top_k_weights
 from pipeline.io.image import to_float, to_uint8, write_gray, write_rgb
 from pipeline.mesh.files import MeshArtifact, save_mesh
-from pipeline.texture.light import VideoLight
 from pipeline.texture.files import TextureArtifact, save_texture
+from pipeline.texture.light import VideoLight
 from tests.avatar.avatar_sample import FRAME_RATE, sample_body, sample_maps, sample_motion, sample_skinned_mesh
 
 FRAME_INDEX = np.array([0, 3, 4, 8, 11, 16], dtype=np.int32)

@@ -15,8 +15,8 @@ from pipeline.geometry.atlas import Atlas
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.io.glb import GlbFile
 from pipeline.io.image import read_rgb, to_float, write_gray
-from pipeline.texture.light import VideoLight
 from pipeline.texture.files import TextureArtifact, TextureFormat, load_texture, save_texture
+from pipeline.texture.light import VideoLight
 from stages.export import STAGE as EXPORT
 from tests.avatar.test_gltf import Player
 from tests.field.scene import PaintedScene, painted_scene

@@ -15,6 +15,7 @@ from pipeline.texture.files import (
     ATLAS,
     COVERAGE,
     DIFFUSE,
+    LIGHT,
     SPECULAR,
     TextureArtifact,
     TextureFormat,
@@ -22,6 +23,7 @@ from pipeline.texture.files import (
     map_files,
     save_texture,
 )
+from pipeline.texture.light import VideoLight
 
 
 @pytest.fixture

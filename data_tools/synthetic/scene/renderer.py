@@ -12,9 +12,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from data_tools.synthetic.rig.subject import Subject
-from pipeline.geometry.shadow_map import ShadowMap, render_shadow_map
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.colour import linear_to_srgb, srgb_to_linear
+from pipeline.geometry.shadow_map import ShadowMap, render_shadow_map
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.geometry.texture_rendering import sample_texture
 from pipeline.kernels.raster import rasterize
