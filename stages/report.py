@@ -249,12 +249,13 @@ def render_turntables(
     The diffuse map of an avatar whose light was not removed is shown unlit only: it holds the light.
     """
     avatar = loaded.avatar
+    is_uniform = avatar.light is None or avatar.light.is_uniform
     posed = avatar.pose_vertices(loaded.refined_canonical_to_world[position])
     rows: list[tuple[str, Float[Tensor, "v 3"], VideoLight | None]] = [
-        ("A-pose, unlit", avatar.vertices, None),
+        ("A-pose" if is_uniform else "A-pose, unlit", avatar.vertices, None),
         (_pose_title(loaded, position), posed, avatar.light),
     ]
-    if avatar.light is not None and not avatar.light.is_uniform:
+    if not is_uniform:
         rows.append(("A-pose, the video's light", avatar.vertices, avatar.light))
         rows += [(f"A-pose, {name}", avatar.vertices, light) for name, light in PREVIEW_LIGHTS.items()]
     return [
