@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 from pydantic import Field, field_validator
 
 from pipeline.avatar.formats.vrm import VrmMeta
@@ -47,7 +47,10 @@ class Config(BaseConfig):
     """Options of the export stage."""
 
     roughness: float = Field(
-        0.85, ge=0.0, le=1.0, description="glTF roughness of the whole surface, from 0 (mirror) to 1 (matte)"
+        0.85,
+        ge=0.0,
+        le=1.0,
+        description="glTF roughness if the video shows no highlights: 0 (mirror) to 1 (matte)",
     )
     unlit: bool = Field(
         False,
@@ -156,10 +159,11 @@ def load_scene(inputs: Mapping[str, Path], config: Config) -> Scene:
 def encode_scene(scene: Scene, config: Config, clips: Mapping[str, Motion]) -> bytes:
     """Return the .glb with the clips as animations."""
     texture = scene.texture
+    has_highlights = bool(texture.specular.any())
     maps = MaterialMaps(
         png_bytes(to_uint8(texture.diffuse)),
-        encode_specular_png(texture.specular, texture.diffuse, config.roughness) if texture.specular.any() else None,
-        config.roughness,
+        encode_specular_png(texture) if has_highlights else None,
+        texture.highlights.roughness if has_highlights else config.roughness,
         config.unlit,
     )
     mesh = build_skinned_mesh(to_rest_pose(scene.skinned, scene.rig), texture.atlas)
@@ -184,11 +188,10 @@ def copy_map(texture_dir: Path, name: str, out: Path) -> str:
     return f"avatar_{paths[-1].name}"
 
 
-def encode_specular_png(
-    amplitude: Float32[np.ndarray, "s s"], diffuse: Float32[np.ndarray, "s s 3"], roughness: float
-) -> bytes:
-    """Convert the texture stage's specular map (sRGB) to a PNG with glTF's specular factor."""
-    factor = dielectric_specular_factor(amplitude, diffuse, roughness)
+def encode_specular_png(texture: TextureArtifact) -> bytes:
+    """Convert the texture stage's specular map to a PNG with glTF's specular factor."""
+    lamp = texture.light.lamp_irradiance(texture.highlights.direction)
+    factor = dielectric_specular_factor(texture.specular, texture.highlights.roughness, lamp)
     return png_bytes(pack_specular_factor(to_uint8(factor)))
 
 
@@ -235,7 +238,7 @@ def asset_extras(config: Config, offset_m: Float[np.ndarray, "3"], frame_rate_hz
 
 STAGE = Stage(
     "export",
-    version=5,
+    version=6,
     needs=("frames", "body", "mesh", "texture"),
     makes=("avatar.glb", "avatar.obj", "avatar.mtl", *OBJ_MAPS),
     config=Config,

@@ -26,7 +26,6 @@ from pipeline.geometry.atlas import Atlas, Texels, rasterize_texels, texture_siz
 from pipeline.geometry.camera import pixel_footprint_m
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning
-from pipeline.geometry.surface import laplacian
 from pipeline.io.image import to_float, to_uint8
 from pipeline.mesh.files import MeshArtifact, load_mesh
 from pipeline.texture.bake import (
@@ -48,13 +47,11 @@ from pipeline.texture.files import (
     save_texture,
 )
 from pipeline.texture.inpainting import average_texels_per_vertex, inpaint_vertex_colours
-from pipeline.texture.light import VideoLight
-from pipeline.texture.light_evidence import estimate_light
+from pipeline.texture.light import Highlights, VideoLight
+from pipeline.texture.light_evidence import LightEvidence, estimate_light
 from pipeline.texture.settings import DEFAULT_SETTINGS, TextureSettings
-from pipeline.texture.specular import fit_specular, observe_vertices, texels_at_vertices
+from pipeline.texture.specular import SpecularFit, fit_specular, texels_at_vertices
 from pipeline.texture.views import BakeView, crop_bake_view, weight_by_resolution
-
-SPECULAR_SMOOTHING_STEPS = 8
 
 
 class Config(BaseConfig):
@@ -115,21 +112,29 @@ def run(
     atlas, size_px = build_atlas(skinned, body, train, config, settings)
     texels = rasterize_texels(atlas, size_px)
     surface = TexturedSurface.from_arrays(skinned.mesh.faces, atlas, texels)
-    light, light_metrics = find_light((train, validation), positions, skinned.mesh, len(capture), config, settings)
+    evidence = find_light((train, validation), positions, skinned.mesh, config, settings)
+    light = VideoLight.uniform(len(capture))
+    if evidence is not None:
+        light = evidence.for_capture(
+            subsample(positions[0], config.max_frames),
+            len(capture),
+            is_removed=evidence.helps or config.light == "removed",
+        )
     train, validation = (
         light_views(views, light, subsample(part, config.max_frames), surface.faces)
         for views, part in zip((train, validation), positions, strict=True)
     )
     inpaint = make_texel_inpainter(skinned.mesh, texels)
     diffuse, texel_confidence = bake_diffuse(train, surface, inpaint, config.rounds, settings)
-    amplitude, partial_r2 = bake_specular(train, validation, skinned.mesh, settings)
-    specular = torch.from_numpy(texels.interpolate(skinned.mesh.faces, amplitude[:, None]))
+    fitted = fit_highlights(evidence, light, skinned.mesh)
+    specular = torch.from_numpy(texels.interpolate(skinned.mesh.faces, fitted.strength[:, None]))
     artifact = TextureArtifact(
         atlas,
         diffuse=diffuse,
         specular=np.ascontiguousarray(texels_to_texture(specular, texels)[..., 0]),
         coverage=to_uint8(texels.to_texture(texel_confidence[:, None])[..., 0]),
         light=light,
+        highlights=fitted.highlights,
     )
     save_texture(out, artifact, config.format)
     return {
@@ -137,8 +142,9 @@ def run(
         "observed_texel_fraction": float((texel_confidence > 0.5).mean()),
         "atlas_utilisation": float(len(texels.face) / size_px**2),
         "validation_psnr_body_db": mean_foreground_psnr_db(to_float(to_uint8(diffuse)), validation, surface),
-        "specular_partial_r2": partial_r2,
-        **light_metrics,
+        "specular_explained": fitted.explained,
+        "specular_standard_errors": fitted.standard_errors,
+        **light_metrics(evidence, light),
     }
 
 
@@ -173,24 +179,28 @@ def find_light(
     views: tuple[list[BakeView], list[BakeView]],
     positions: tuple[Int[np.ndarray, "t"], Int[np.ndarray, "w"]],
     mesh: Mesh,
-    frames: int,
     config: Config,
     settings: TextureSettings,
-) -> tuple[VideoLight, dict[str, float]]:
-    """Return the light to remove, uniform for none, and its figures.
+) -> LightEvidence | None:
+    """Return the light of the video and what validation frames say about it; None if it is not looked for.
 
-    views, positions: of training and validation frames. frames: number of selected frames.
+    views, positions: of training and validation frames.
     """
     if config.light == "kept":
-        return VideoLight.uniform(frames), {"light_removed": 0.0}
+        return None
     if not views[1]:
         warn("there are no validation frames to test the light on: it stays in the diffuse map")
-        return VideoLight.uniform(frames), {"light_removed": 0.0}
+        return None
     used = tuple(subsample(part, config.max_frames) for part in positions)
-    evidence = estimate_light(*views, vertex_surface(mesh), mesh.edges(), (used[0], used[1]), settings)
-    is_removed = evidence.helps or config.light == "removed"
-    return evidence.for_capture(used[0], frames, is_removed=is_removed), {
-        "light_removed": float(is_removed),
+    return estimate_light(*views, vertex_surface(mesh), mesh.edges(), (used[0], used[1]), settings)
+
+
+def light_metrics(evidence: LightEvidence | None, light: VideoLight) -> dict[str, float]:
+    """Return the figures of the estimated light."""
+    if evidence is None:
+        return {"light_removed": 0.0}
+    return {
+        "light_removed": float(not light.is_uniform),
         "light_explained": evidence.explained,
         "light_standard_errors": evidence.standard_errors,
         "key_light_standard_errors": evidence.key_standard_errors,
@@ -239,20 +249,11 @@ def make_texel_inpainter(mesh: Mesh, texels: Texels) -> InpaintFunction:
     return inpaint
 
 
-def bake_specular(
-    train: list[BakeView], validation: list[BakeView], mesh: Mesh, settings: TextureSettings
-) -> tuple[Float[np.ndarray, "v"], float]:
-    """Return the highlight amplitude of each vertex (sRGB in [0, 1], smoothed) and `SpecularFit.partial_r2`."""
-    if not validation:
-        warn("there are no validation frames to test highlights on: the surface is exported as matte")
-        return np.zeros(len(mesh.vertices), dtype=np.float32), 0.0
-    count, surface = len(mesh.vertices), vertex_surface(mesh)
-    observed, held_out = (observe_vertices(views, surface, settings) for views in (train, validation))
-    fitted = fit_specular(observed, held_out, mesh.edges(), count, settings.specular_min_partial_r2)
-    amplitude, operator = fitted.amplitude.astype(np.float64), laplacian(mesh)
-    for _ in range(SPECULAR_SMOOTHING_STEPS):
-        amplitude = amplitude - 0.5 * (operator @ amplitude)
-    return amplitude.astype(np.float32), fitted.partial_r2
+def fit_highlights(evidence: LightEvidence | None, light: VideoLight, mesh: Mesh) -> SpecularFit:
+    """Return the highlights of the surface; none where no lamp was found, whose highlights they would be."""
+    if evidence is None or light.is_uniform:
+        return SpecularFit(Highlights.none(), np.zeros(len(mesh.vertices), dtype=np.float32), 0.0, 0.0)
+    return fit_specular(evidence.train, evidence.validation, evidence.light, mesh)
 
 
 STAGE = Stage(

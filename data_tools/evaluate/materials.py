@@ -24,7 +24,8 @@ from data_tools.command import run_command
 from data_tools.evaluate.truth import load_ground_truth
 from data_tools.synthetic.rig.subject import Subject
 from data_tools.synthetic.scene.capture import SyntheticCapture
-from data_tools.synthetic.scene.renderer import Light, pose_vertices, render_subject
+from data_tools.synthetic.scene.renderer import Light, pose_vertices, render_subject, shiny_faces
+from pipeline.avatar.finished_run import load_textured_avatar
 from pipeline.body.body import Body
 from pipeline.body.files import save_body, save_camera, save_motion
 from pipeline.capture.capture import Capture, image_path, mask_path, save_capture
@@ -35,7 +36,7 @@ from pipeline.geometry.colour import linear_to_srgb, srgb_to_linear
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import top_k_weights
 from pipeline.geometry.surface import closest_points_on_mesh, collapse_edges
-from pipeline.geometry.texture_rendering import render_textured, sample_texture
+from pipeline.geometry.texture_rendering import sample_texture
 from pipeline.io.image import to_float, to_uint8, write_gray, write_rgb
 from pipeline.io.npz import save_npz
 from pipeline.mesh.files import MeshArtifact, load_mesh, save_mesh
@@ -77,7 +78,7 @@ def main(argv: Sequence[str]) -> None:
             started = time.monotonic()
             metrics = TEXTURE.run(inputs, out, TEXTURE.config(light=mode))
             seconds = time.monotonic() - started
-            scores = score_maps(truth, load_texture(out), folder, gains) | {"seconds": seconds}
+            scores = score_maps(truth, out, folder, gains) | {"seconds": seconds}
             for name, value in {**metrics, **scores}.items():
                 print(f"{mode:8} {name:32} {value:10.4f}")
 
@@ -145,9 +146,11 @@ def _exposed(
 
 
 def score_maps(
-    truth: SyntheticCapture, texture: TextureArtifact, folder: Path, gains: Float[np.ndarray, "n"]
+    truth: SyntheticCapture, texture_dir: Path, folder: Path, gains: Float[np.ndarray, "n"]
 ) -> dict[str, float]:
     """Return the error of the map against the true texture (of 255, one gain a channel), PSNR in dB, gain error."""
+    avatar = load_textured_avatar(folder / "mesh", texture_dir)
+    texture = load_texture(texture_dir)
     mesh, gain = load_mesh(folder / "mesh"), albedo_gain(truth, texture, folder)
     balanced = replace(texture, diffuse=_scaled(texture.diffuse, gain[0]))
     own_mesh_body = replace(
@@ -166,17 +169,7 @@ def score_maps(
         pose = truth.canonical_to_world[int(motion[position])]
         vertices, true_vertices = pose_vertices(subject, pose), pose_vertices(truth.subject, pose)
         image, mask = _exposed(truth, int(motion[position]), float(gains[position]))
-        irradiance = texture.light.shade_vertices(vertices, torch.from_numpy(mesh.mesh.faces), position)
-        render = render_textured(
-            vertices,
-            torch.from_numpy(mesh.mesh.faces),
-            torch.from_numpy(texture.atlas.faces_uv),
-            torch.from_numpy(texture.atlas.uv),
-            torch.from_numpy(texture.diffuse),
-            truth.camera,
-            SAMPLES,
-            irradiance,
-        ).numpy()
+        render = avatar.render(vertices, truth.camera, SAMPLES, avatar.light, position)
         scores["heldout_psnr_body_db"].append(_body_psnr_db(render, image, mask))
         for name, light in NEW_LIGHTS.items():
             expected = unpremultiply_to_uint8(
@@ -184,6 +177,8 @@ def score_maps(
             )
             drawn = render_subject(subject, vertices, truth.camera, light, SAMPLES)
             scores.setdefault(f"relit_{name}_db", []).append(_body_psnr_db(drawn, expected[..., :3], expected[..., 3]))
+    if truth.light.specular_strength > 0:
+        scores["specular_correlation"] = [specular_correlation(truth, texture, folder)]
     split = assign_splits(np.arange(len(gains)))
     ratio = texture.light.gain[split == 0] / gains[split == 0]
     return {name: float(np.mean(values)) for name, values in scores.items()} | {
@@ -211,6 +206,18 @@ def albedo_gain(
     true_srgb = sample_texture(subject.texture_tensor(), uv_true).numpy()
     gain = np.median(srgb_to_linear(true_srgb.astype(np.float64)) / np.maximum(own, 1e-4), axis=0)
     return gain, 255.0 * float(np.abs(linear_to_srgb(np.clip(gain * own, 0.0, 1.0)) - true_srgb).mean())
+
+
+def specular_correlation(truth: SyntheticCapture, texture: TextureArtifact, folder: Path) -> float:
+    """Return the correlation of the specular map with the true strength on the surface; 0 for an empty map."""
+    mesh, subject = load_mesh(folder / "mesh").mesh, truth.subject
+    points, _ = sample_surface(mesh, SURFACE_POINTS, 0)
+    uv = _uv_at(points, mesh, texture.atlas.uv, texture.atlas.faces_uv)
+    seen = sample_texture(torch.from_numpy(to_float(texture.coverage))[..., None], uv)[:, 0].numpy() > 0.5
+    own = sample_texture(torch.from_numpy(texture.specular)[..., None], uv)[:, 0].numpy()[seen]
+    _, faces, _ = closest_points_on_mesh(points[seen], subject.body.mesh())
+    true = shiny_faces(subject, truth.light)[faces]
+    return float(np.corrcoef(own, true)[0, 1]) if own.any() else 0.0
 
 
 def _uv_at(points: np.ndarray, mesh: Mesh, uv: np.ndarray, faces_uv: np.ndarray) -> torch.Tensor:

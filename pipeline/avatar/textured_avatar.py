@@ -3,15 +3,16 @@
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from pipeline.geometry.alpha import crop_empty_columns, unpremultiply_to_uint8
 from pipeline.geometry.camera import Camera
-from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.mesh import Mesh, area_weighted_vertex_normals
 from pipeline.geometry.skinning import dense_weights, linear_blend_skinning
 from pipeline.geometry.texture_rendering import render_textured, turntable_cameras
-from pipeline.texture.light import VideoLight
+from pipeline.texture.light import Highlights, VideoLight
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,8 @@ class TexturedAvatar:
         faces_uv: corners of each face, as indices into `uv`.
         diffuse: sRGB in [0, 1]; row 0 is v = 1.
         light: of the video; None or uniform if the diffuse texture holds it.
+        highlights: the lobe of the surface under that light; None for a matte surface.
+        specular: linear radiance that a highlight adds at its peak, one per vertex; None for a matte surface.
     """
 
     vertices: Float[Tensor, "v 3"]
@@ -37,6 +40,8 @@ class TexturedAvatar:
     faces_uv: Int[Tensor, "f 3"]
     diffuse: Float[Tensor, "th tw 3"]
     light: VideoLight | None = None
+    highlights: Highlights | None = None
+    specular: Float[Tensor, "v"] | None = None
 
     def mesh(self) -> Mesh:
         """Return the canonical mesh without texture and skin."""
@@ -59,12 +64,26 @@ class TexturedAvatar:
 
         light: None: unlit. frame: selected frame whose exposure is used; None: the mean exposure.
         """
-        irradiance = None
+        shading = None
         if light is not None and not (light.is_uniform and frame is None):
-            irradiance = light.shade_vertices(vertices_world, self.faces, frame)
+            shading = self._shade(vertices_world, camera, light, frame)
         return render_textured(
-            vertices_world, self.faces, self.faces_uv, self.uv, self.diffuse, camera, supersampling, irradiance
+            vertices_world, self.faces, self.faces_uv, self.uv, self.diffuse, camera, supersampling, shading
         ).numpy()
+
+    def _shade(
+        self, vertices_world: Float[Tensor, "v 3"], camera: Camera, light: VideoLight, frame: int | None
+    ) -> Float[Tensor, "v d"]:
+        """Return the irradiance of each vertex and, under the light of the video, its highlight as a fourth column."""
+        irradiance = light.shade_vertices(vertices_world, self.faces, frame)
+        if self.highlights is None or self.specular is None or light is not self.light:
+            return irradiance
+        normals = area_weighted_vertex_normals(vertices_world, self.faces)
+        seen = light.visibility(vertices_world, self.faces, normals).numpy()
+        to_camera = torch.nn.functional.normalize(torch.from_numpy(camera.centre_m()).float() - vertices_world, dim=1)
+        lobe = self.highlights.lobe(normals.numpy(), to_camera.numpy(), seen)
+        gain = 1.0 if frame is None else float(light.gain[frame])
+        return torch.cat([irradiance, (gain * self.specular * torch.from_numpy(lobe).float())[:, None]], dim=1)
 
     def irradiance(self, vertices_world: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3"] | None:
         """Return the irradiance of posed vertices under the light of the video; None if the texture holds it."""

@@ -35,12 +35,12 @@ def render_textured(
     texture: Float[Tensor, "th tw c"],
     camera: Camera,
     supersampling: int = 3,
-    irradiance: Float[Tensor, "v 3"] | None = None,
+    shading: Float[Tensor, "v d"] | None = None,
 ) -> Float[Tensor, "h w c+1"]:
     """Render the texture: colours premultiplied by coverage, then the coverage, all in [0, 1].
 
     Each pixel is the mean of `supersampling` x `supersampling` bilinear samples, which antialiases silhouettes, seams
-    and texels. The texture is shown without lighting, or multiplied in linear RGB by the mean irradiance of the pixel.
+    and texels. The texture is shown without lighting, or shaded in linear RGB by the mean irradiance of the pixel.
 
     Args:
         vertices_world: posed vertices, m.
@@ -50,19 +50,22 @@ def render_textured(
         texture: colours in [0, 1], row 0 at the top.
         camera: the camera.
         supersampling: samples per pixel along each axis.
-        irradiance: of each vertex, linear RGB, 1 shows the texture as it is; needs a texture with three channels.
+        shading: of each vertex, linear; needs a texture with three channels. Three columns: irradiance, 1 shows the
+            texture as it is. A fourth: radiance that is added to all channels.
     """
     fine = camera.scaled(float(supersampling))
     vertices_px, depth_m = project(vertices_world, fine)
     face_id, barycentric, _ = rasterize(vertices_px, depth_m, faces, fine.height, fine.width)
     unlit = supersample_texture(face_id, barycentric, faces_uv, uv, texture, supersampling)
-    if irradiance is None:
+    if shading is None:
         return unlit
-    samples = interpolate_at_pixels(face_id, barycentric, faces, irradiance)
+    samples = interpolate_at_pixels(face_id, barycentric, faces, shading)
     pooled = torch.nn.functional.avg_pool2d(samples.permute(2, 0, 1), supersampling).permute(1, 2, 0)
     coverage = unlit[..., 3:]
     divisor = coverage.clamp(min=1e-6)
-    lit = linear_to_srgb(srgb_to_linear(unlit[..., :3] / divisor) * pooled / divisor).clamp(0.0, 1.0)
+    mean = pooled / divisor
+    linear = srgb_to_linear(unlit[..., :3] / divisor) * mean[..., :3] + mean[..., 3:].sum(dim=-1, keepdim=True)
+    lit = linear_to_srgb(linear.clamp(0.0, 1.0))
     return torch.cat([lit * coverage, coverage], dim=-1)
 
 

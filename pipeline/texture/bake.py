@@ -197,7 +197,7 @@ def render_textured_view(
         torch.from_numpy(texture),
         view.camera,
         supersampling=2,
-        irradiance=view.irradiance,
+        shading=view.irradiance,
     ).numpy()
 
 

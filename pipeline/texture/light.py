@@ -24,6 +24,12 @@ from pipeline.geometry.mesh import area_weighted_vertex_normals
 from pipeline.geometry.shadow_map import render_shadow_map
 from pipeline.io.npz import load_npz, save_npz
 
+MATTE_EXPONENT = 1.0
+"""Exponent that is written for a surface without highlights."""
+
+MIN_LAMP_IRRADIANCE = 0.2
+"""Smallest irradiance of a lamp that makes highlights, relative to the mean."""
+
 MIN_IRRADIANCE = 0.05
 """Smallest irradiance relative to the mean: degree 2 may be negative far from the lamps."""
 
@@ -70,6 +76,13 @@ class VideoLight:
         smooth = spherical_harmonics(normals) @ self.coefficients
         return np.maximum(smooth + lambert[:, None] * self.key_irradiance, MIN_IRRADIANCE).astype(np.float32)
 
+    def lamp_irradiance(self, direction: Float[np.ndarray, "3"]) -> float:
+        """Return the irradiance that the lamp in a direction adds, at a surface that faces it."""
+        if self.casts_shadows:
+            return max(float(self.key_irradiance.mean()), MIN_LAMP_IRRADIANCE)
+        facing, away = self.irradiance(np.stack([direction, -direction]), np.ones(2)).mean(axis=1)
+        return max(float(facing - away), MIN_LAMP_IRRADIANCE)
+
     def shade_vertices(
         self, vertices_world: Float[Tensor, "v 3"], faces: Tensor, frame: int | None = None
     ) -> Float[Tensor, "v 3"]:
@@ -81,9 +94,57 @@ class VideoLight:
         if self.is_uniform:
             return torch.full_like(vertices_world, gain)
         normals = area_weighted_vertex_normals(vertices_world, faces)
-        visibility = key_visibility(vertices_world, faces, normals, self.key_direction) if self.casts_shadows else None
-        seen = np.ones(len(normals)) if visibility is None else visibility.numpy()
-        return torch.from_numpy(gain * self.irradiance(normals.numpy(), seen))
+        seen = self.visibility(vertices_world, faces, normals)
+        return torch.from_numpy(gain * self.irradiance(normals.numpy(), seen.numpy()))
+
+    def visibility(
+        self, vertices_world: Float[Tensor, "v 3"], faces: Tensor, normals: Float[Tensor, "v 3"]
+    ) -> Float[Tensor, "v"]:
+        """Return the fraction of the key light that reaches each vertex, in [0, 1]; 1 without a key light."""
+        if not self.casts_shadows:
+            return torch.ones(len(normals))
+        return key_visibility(vertices_world, faces, normals, self.key_direction)
+
+
+@dataclass(frozen=True)
+class Highlights:
+    """The specular lobe of the surface under the lamp of a video: Blinn-Phong.
+
+    Attributes:
+        direction: towards the lamp, unit, world.
+        exponent: of the cosine between normal and half vector.
+    """
+
+    direction: Float[np.ndarray, "3"]
+    exponent: float
+
+    @staticmethod
+    def none() -> "Highlights":
+        """Return a lobe for a matte surface, whose strength is 0 everywhere."""
+        return Highlights(np.array([0.0, 1.0, 0.0], dtype=np.float32), MATTE_EXPONENT)
+
+    @property
+    def roughness(self) -> float:
+        """The roughness of glTF with the same width of the lobe: alpha^2 = 2 / (exponent + 2), alpha = roughness^2.
+
+        Walter et al., "Microfacet models for refraction through rough surfaces", 2007.
+        """
+        return float((2.0 / (self.exponent + 2.0)) ** 0.25)
+
+    def lobe(
+        self,
+        normals: Float[np.ndarray, "k 3"],
+        to_camera: Float[np.ndarray, "k 3"],
+        visibility: Float[np.ndarray, "k"],
+    ) -> Float[np.ndarray, "k"]:
+        """Return the highlight at surface points relative to its peak, in [0, 1]; 0 where the lamp is behind.
+
+        normals, to_camera: unit, world. visibility: of the lamp, in [0, 1].
+        """
+        half = self.direction + to_camera
+        half /= np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-9)
+        cosine = np.maximum(np.sum(normals * half, axis=1), 0.0)
+        return visibility * (normals @ self.direction > 0.0) * cosine**self.exponent
 
 
 def directional_light(direction: tuple[float, float, float], ambient: float) -> VideoLight:
@@ -117,22 +178,27 @@ def key_visibility(
     return render_shadow_map(vertices_world, faces, (x, y, z)).visibility(vertices_world, normals)
 
 
-_ARRAYS = tuple(field.name for field in fields(VideoLight))
+_LIGHT_ARRAYS = tuple(field.name for field in fields(VideoLight))
+_HIGHLIGHT_DIRECTION, _HIGHLIGHT_EXPONENT = "highlight_direction", "highlight_exponent"
 
 
-def save_light(path: Path, light: VideoLight) -> None:
+def save_light(path: Path, light: VideoLight, highlights: Highlights) -> None:
     """Write light.npz; `load_light` is the inverse."""
-    save_npz(path, {name: getattr(light, name).astype(np.float32) for name in _ARRAYS})
+    arrays = {name: getattr(light, name).astype(np.float32) for name in _LIGHT_ARRAYS}
+    arrays[_HIGHLIGHT_DIRECTION] = highlights.direction.astype(np.float32)
+    arrays[_HIGHLIGHT_EXPONENT] = np.float32(highlights.exponent)
+    save_npz(path, arrays)
 
 
-def load_light(path: Path) -> VideoLight:
+def load_light(path: Path) -> tuple[VideoLight, Highlights]:
     """Read the file of `save_light`.
 
     Raises:
         UserError: the file is missing, is no npz, or lacks an array.
     """
     arrays = load_npz(path)
-    missing = [name for name in _ARRAYS if name not in arrays]
+    missing = [name for name in (*_LIGHT_ARRAYS, _HIGHLIGHT_DIRECTION, _HIGHLIGHT_EXPONENT) if name not in arrays]
     if missing:
         raise UserError(f"{path} lacks the array {missing[0]}; run `python -m stages.texture` again")
-    return VideoLight(*(arrays[name] for name in _ARRAYS))
+    light = VideoLight(*(arrays[name] for name in _LIGHT_ARRAYS))
+    return light, Highlights(arrays[_HIGHLIGHT_DIRECTION], float(arrays[_HIGHLIGHT_EXPONENT]))

@@ -13,6 +13,7 @@ from pipeline.texture.light_fit import (
     LightFit,
     LightObservations,
     Prediction,
+    ViewObservations,
     find_key_direction,
     fit_light,
     mean_log_albedo,
@@ -44,6 +45,7 @@ class LightEvidence:
         standard_errors: mean decrease of that error by the light, divided by its standard error.
         key_standard_errors: the same for the shadows of the key light, against the light without; 0 if not tried.
         gain_is_smooth: the gains of validation frames lie nearer to those of the training frames around them than to 1.
+        train, validation: what the light was fitted to, and what it was tested on.
     """
 
     light: VideoLight
@@ -51,6 +53,8 @@ class LightEvidence:
     standard_errors: float
     key_standard_errors: float
     gain_is_smooth: bool
+    train: ViewObservations
+    validation: ViewObservations
 
     @property
     def helps(self) -> bool:
@@ -100,21 +104,21 @@ def estimate_light(
     observed, held_out = (observe_light(views, surface, settings) for views in (fit_views, validation))
     fit = fit_light(observed, edges, count, len(fit_views))
     constant = _constant_light(observed, fit.light.gain, count)
-    lit = np.ones(len(held_out.vertex))
+    visibility, lit = np.ones(len(observed.vertex)), np.ones(len(held_out.vertex))
     before, after = (predict_views(each, held_out, lit, len(validation)) for each in (constant, fit))
     key_errors = 0.0
     if _improvement(before, after) > MIN_IMPROVEMENT:
         direction = find_key_direction(fit_views, surface.faces, observed, fit)
         start = replace(fit, light=replace(fit.light, key_direction=direction))
-        visibility, lit = (
+        shaded = [
             observe_visibility(views, surface.faces, rows, direction)
             for views, rows in ((fit_views, observed), (validation, held_out))
-        )
-        shadowed = fit_light(observed, edges, count, len(fit_views), visibility, start)
-        prediction = predict_views(shadowed, held_out, lit, len(validation))
+        ]
+        shadowed = fit_light(observed, edges, count, len(fit_views), shaded[0], start)
+        prediction = predict_views(shadowed, held_out, shaded[1], len(validation))
         key_errors = _improvement(after, prediction)
         if key_errors > MIN_IMPROVEMENT and shadowed.light.casts_shadows:
-            fit, after = shadowed, prediction
+            fit, after, (visibility, lit) = shadowed, prediction, shaded
     gain = _all_gains(train, chosen, fit, surface, settings)
     total = float(before.squared_error.sum())
     return LightEvidence(
@@ -123,6 +127,8 @@ def estimate_light(
         standard_errors=_improvement(before, after),
         key_standard_errors=key_errors,
         gain_is_smooth=_is_smooth(np.log(gain), after.log_gain, positions),
+        train=ViewObservations(fit_views, observed, visibility, fit.light.gain),
+        validation=ViewObservations(validation, held_out, lit, np.exp(after.log_gain)),
     )
 
 
@@ -132,8 +138,11 @@ def _constant_light(observed: LightObservations, gain: np.ndarray, vertex_count:
 
 
 def _improvement(before: Prediction, after: Prediction) -> float:
-    """Return the mean decrease of the error over views, in standard errors; 0 with fewer than two views."""
-    decrease = before.squared_error - after.squared_error
+    return standard_errors(before.squared_error - after.squared_error)
+
+
+def standard_errors(decrease: Float[np.ndarray, "n"]) -> float:
+    """Return the mean of a decrease of the error over views, divided by its standard error; 0 with fewer than two."""
     if len(decrease) < 2:
         return 0.0
     standard_error = float(decrease.std(ddof=1)) / math.sqrt(len(decrease))

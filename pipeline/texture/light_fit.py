@@ -83,6 +83,23 @@ class LightObservations:
 
 
 @dataclass(frozen=True)
+class ViewObservations:
+    """What some views show of the vertices, with what is known of their light.
+
+    Attributes:
+        views: in order.
+        rows: `rows.frame` counts `views`.
+        visibility: of the key light, one per row, in [0, 1]; 1 without a key light.
+        gain: exposure of each view.
+    """
+
+    views: Sequence[BakeView]
+    rows: LightObservations
+    visibility: Float[np.ndarray, "k"]
+    gain: Float[np.ndarray, "n"]
+
+
+@dataclass(frozen=True)
 class LightFit:
     """Light and gains, and the albedo that was solved with them.
 
@@ -201,11 +218,10 @@ def find_key_direction(
         product = float(np.sum(weight * left * lost))
         return product**2 / max(float(np.sum(weight * lost**2)), 1e-12) if product < 0 else 0.0
 
-    directions = _spiral(SEARCH_DIRECTIONS)
-    directions = directions[directions[:, 1] > MIN_KEY_HEIGHT]
+    directions = search_directions()
     best = directions[int(np.argmax([explained(direction) for direction in directions]))]
     for angle_rad in SEARCH_REFINEMENTS_RAD:
-        around = np.concatenate([best[None], _around(best, angle_rad)])
+        around = np.concatenate([best[None], directions_around(best, angle_rad)])
         best = around[int(np.argmax([explained(direction) for direction in around]))]
     return best
 
@@ -215,15 +231,16 @@ def _vertex_mean(vertex: np.ndarray, values: np.ndarray, weight: np.ndarray, cou
     return np.bincount(vertex, weight * values, count) / total
 
 
-def _spiral(count: int) -> Float[np.ndarray, "n 3"]:
-    """Return directions on a golden-angle (Fibonacci) spiral."""
-    number = np.arange(count) + 0.5
-    height, angle = 1.0 - 2.0 * number / count, number * np.pi * (3.0 - np.sqrt(5.0))
+def search_directions() -> Float[np.ndarray, "n 3"]:
+    """Return directions of lamps, evenly spread on a golden-angle (Fibonacci) spiral, without those from below."""
+    number = np.arange(SEARCH_DIRECTIONS) + 0.5
+    height, angle = 1.0 - 2.0 * number / SEARCH_DIRECTIONS, number * np.pi * (3.0 - np.sqrt(5.0))
     level = np.sqrt(1.0 - height**2)
-    return np.stack([level * np.cos(angle), height, level * np.sin(angle)], axis=1)
+    directions = np.stack([level * np.cos(angle), height, level * np.sin(angle)], axis=1)
+    return directions[height > MIN_KEY_HEIGHT]
 
 
-def _around(direction: np.ndarray, angle_rad: float) -> Float[np.ndarray, "6 3"]:
+def directions_around(direction: np.ndarray, angle_rad: float) -> Float[np.ndarray, "6 3"]:
     """Return six directions at an angle from one."""
     across = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
     across /= np.linalg.norm(across)

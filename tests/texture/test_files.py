@@ -23,7 +23,7 @@ from pipeline.texture.files import (
     map_files,
     save_texture,
 )
-from pipeline.texture.light import VideoLight
+from pipeline.texture.light import Highlights, VideoLight
 
 
 @pytest.fixture
@@ -35,7 +35,9 @@ def artifact() -> TextureArtifact:
         np.array([0, 1, 2, 3, 0], dtype=np.int32),
     )
     diffuse, gray = (random.integers(0, 256, shape, dtype=np.uint8) for shape in ((8, 8, 3), (2, 8, 8)))
-    return TextureArtifact(atlas, to_float(diffuse), to_float(gray[0]), gray[1], VideoLight.uniform(4))
+    return TextureArtifact(
+        atlas, to_float(diffuse), to_float(gray[0]), gray[1], VideoLight.uniform(4), Highlights.none()
+    )
 
 
 def test_reading_inverts_writing(artifact: TextureArtifact, tmp_path: Path) -> None:

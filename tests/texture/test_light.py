@@ -12,9 +12,16 @@ from pipeline.core.errors import UserError
 from pipeline.geometry.colour import linear_to_srgb, srgb_to_linear
 from pipeline.geometry.mesh import Mesh
 from pipeline.texture.bake import TexturedSurface, average_views
-from pipeline.texture.light import VideoLight, directional_light, load_light, save_light, spherical_harmonics
+from pipeline.texture.light import (
+    Highlights,
+    VideoLight,
+    directional_light,
+    load_light,
+    save_light,
+    spherical_harmonics,
+)
 from pipeline.texture.light_evidence import LightEvidence, estimate_light
-from pipeline.texture.light_fit import LightObservations, fit_light, predict_views
+from pipeline.texture.light_fit import LightObservations, ViewObservations, fit_light, predict_views
 from pipeline.texture.settings import TextureSettings
 from pipeline.texture.specular import texels_at_vertices
 from pipeline.texture.views import BakeView, remove_light, render_depth
@@ -147,8 +154,9 @@ def test_removing_light_inverts_shading() -> None:
 
 def test_reading_inverts_writing_and_a_missing_array_is_named(tmp_path: Path) -> None:
     light = replace(smooth_light(), gain=np.array([0.9, 1.1], dtype=np.float32))
-    save_light(tmp_path / "light.npz", light)
-    read = load_light(tmp_path / "light.npz")
+    save_light(tmp_path / "light.npz", light, Highlights(KEY, 24.0))
+    read, highlights = load_light(tmp_path / "light.npz")
+    assert highlights.exponent == 24.0
     np.testing.assert_allclose(read.coefficients, light.coefficients, rtol=1e-6)
     assert not read.is_uniform
     assert VideoLight.uniform(3).is_uniform
@@ -222,7 +230,9 @@ def test_evidence_keeps_what_was_filmed_without_lamps() -> None:
 
 def test_gains_of_other_frames_are_interpolated_where_that_predicts_validation_frames() -> None:
     gain = np.array([0.8, 1.0, 1.25], dtype=np.float32)
-    evidence = LightEvidence(replace(VideoLight.uniform(3), gain=gain), 0.0, 0.0, 0.0, gain_is_smooth=True)
+    rows = observed(smooth_light(), np.ones(1))[0]
+    nothing = ViewObservations([], rows, np.ones(len(rows.vertex)), np.ones(1))
+    evidence = LightEvidence(replace(VideoLight.uniform(3), gain=gain), 0.0, 0.0, 0.0, True, nothing, nothing)
     train = np.array([0, 2, 4])
     smooth = evidence.for_capture(train, 5, is_removed=True).gain
     np.testing.assert_allclose(smooth, [0.8, np.sqrt(0.8), 1.0, np.sqrt(1.25), 1.25], rtol=1e-6)
