@@ -76,6 +76,15 @@ class VideoLight:
         smooth = spherical_harmonics(normals) @ self.coefficients
         return np.maximum(smooth + lambert[:, None] * self.key_irradiance, MIN_IRRADIANCE).astype(np.float32)
 
+    def dominant_direction(self) -> Float[np.ndarray, "3"]:
+        """Return the direction from which most light comes: the optimal linear direction of the luminance.
+
+        Sloan, "Stupid spherical harmonics tricks", 2008. Upwards under a light that comes from everywhere.
+        """
+        vector = self.coefficients[1:4].mean(axis=1) + self.key_irradiance.mean() * self.key_direction
+        length = float(np.linalg.norm(vector))
+        return vector / length if length > 0 else np.array([0.0, 1.0, 0.0])
+
     def lamp_irradiance(self, direction: Float[np.ndarray, "3"]) -> float:
         """Return the irradiance that the lamp in a direction adds, at a surface that faces it."""
         if self.casts_shadows:

@@ -29,15 +29,18 @@ from pipeline.texture.light_fit import (
     search_directions,
 )
 
-EXPONENTS = (6.0, 12.0, 24.0, 48.0, 96.0)
-"""Candidates of p: roughness 0.71 to 0.38."""
+EXPONENTS = (12.0, 24.0, 48.0, 96.0)
+"""Candidates of p: roughness 0.61 to 0.38. Errors of the irradiance look like wider lobes."""
+
+MAX_LAMP_ANGLE_RAD = 0.8
 
 ALBEDO_CONTRAST_SCALE = 0.05
 SMOOTHING_STEPS = 4
+RIDGE_FRACTION = 0.1
 MIN_LINEAR = 0.02
 """Linear colour below which noise does not fall any more."""
 
-MIN_EXPLAINED, MIN_STANDARD_ERRORS = 0.05, 3.0
+MIN_EXPLAINED, MIN_STANDARD_ERRORS = 0.1, 3.0
 """What highlights must explain of the squared error of validation frames."""
 
 
@@ -95,13 +98,19 @@ def fit_specular(train: ViewObservations, validation: ViewObservations, light: V
 def find_lobe(fitted: "_Regression", light: VideoLight, vertex_count: int) -> Highlights:
     """Return the direction and the exponent that explain most of the training views.
 
-    The key light is the lamp where its shadows are known; otherwise directions all around are tried.
+    The key light is the lamp where its shadows are known; otherwise directions are tried within `MAX_LAMP_ANGLE_RAD` of
+    that from which most light comes: errors of normals look like highlights of lamps that give no light.
     """
-    directions = light.key_direction[None] if light.casts_shadows else search_directions()
+    directions = light.key_direction[None]
+    if not light.casts_shadows:
+        directions = search_directions()
+        directions = directions[directions @ light.dominant_direction() > np.cos(MAX_LAMP_ANGLE_RAD)]
     candidates = [Highlights(direction, exponent) for direction in directions for exponent in EXPONENTS]
     best = max(candidates, key=lambda each: fitted.explained(each, vertex_count))
     for angle_rad in () if light.casts_shadows else SEARCH_REFINEMENTS_RAD:
-        around = [replace(best, direction=each) for each in directions_around(best.direction, angle_rad)]
+        near = directions_around(best.direction, angle_rad)
+        near = near[near @ light.dominant_direction() > np.cos(MAX_LAMP_ANGLE_RAD)]
+        around = [replace(best, direction=each) for each in near]
         best = max([best, *around], key=lambda each: fitted.explained(each, vertex_count))
     sharper = [replace(best, exponent=exponent) for exponent in EXPONENTS]
     return max(sharper, key=lambda each: fitted.explained(each, vertex_count))
@@ -214,7 +223,8 @@ def dielectric_specular_factor(
 
 
 def _ridge(power: np.ndarray) -> float:
-    return 0.3 * float(np.median(power[power > 0])) if np.any(power > 0) else 1.0
+    """Return the regularisation of s: a fraction of the power at well-observed vertices of uniform albedo."""
+    return max(RIDGE_FRACTION * float(np.quantile(power, 0.95)), 1e-12)
 
 
 def _smooth(strength: np.ndarray, mesh: Mesh) -> np.ndarray:
