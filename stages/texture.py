@@ -120,13 +120,13 @@ def run(
             len(capture),
             is_removed=evidence.helps or config.light == "removed",
         )
+    fitted = fit_highlights(evidence, light, skinned.mesh)
     train, validation = (
-        light_views(views, light, subsample(part, config.max_frames), surface.faces)
+        light_views(views, light, subsample(part, config.max_frames), surface.faces, fitted)
         for views, part in zip((train, validation), positions, strict=True)
     )
     inpaint = make_texel_inpainter(skinned.mesh, texels)
     diffuse, texel_confidence = bake_diffuse(train, surface, inpaint, config.rounds, settings)
-    fitted = fit_highlights(evidence, light, skinned.mesh)
     specular = torch.from_numpy(texels.interpolate(skinned.mesh.faces, fitted.strength[:, None]))
     artifact = TextureArtifact(
         atlas,
@@ -209,13 +209,20 @@ def light_metrics(evidence: LightEvidence | None, light: VideoLight) -> dict[str
 
 
 def light_views(
-    views: list[BakeView], light: VideoLight, positions: Int[np.ndarray, "k"], faces: Int[Tensor, "f 3"]
+    views: list[BakeView],
+    light: VideoLight,
+    positions: Int[np.ndarray, "k"],
+    faces: Int[Tensor, "f 3"],
+    specular: SpecularFit,
 ) -> list[BakeView]:
-    """Return views with the irradiance of their vertices; unchanged under a uniform light of constant exposure."""
+    """Return views with the shading of their vertices; unchanged under a uniform light of constant exposure."""
     if light.is_uniform and bool((light.gain == 1.0).all()):
         return views
+    lobe = (specular.highlights, torch.from_numpy(specular.strength))
     return [
-        replace(view, irradiance=light.shade_vertices(view.vertices_world, faces, int(position)))
+        replace(
+            view, shading=light.shade_specular(view.vertices_world, faces, int(position), lobe, view.camera.centre_m())
+        )
         for view, position in zip(views, positions, strict=True)
     ]
 

@@ -3,13 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from pipeline.geometry.alpha import crop_empty_columns, unpremultiply_to_uint8
 from pipeline.geometry.camera import Camera
-from pipeline.geometry.mesh import Mesh, area_weighted_vertex_normals
+from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import dense_weights, linear_blend_skinning
 from pipeline.geometry.texture_rendering import render_textured, turntable_cameras
 from pipeline.texture.light import Highlights, VideoLight
@@ -75,15 +74,10 @@ class TexturedAvatar:
         self, vertices_world: Float[Tensor, "v 3"], camera: Camera, light: VideoLight, frame: int | None
     ) -> Float[Tensor, "v d"]:
         """Return the irradiance of each vertex and, under the light of the video, its highlight as a fourth column."""
-        irradiance = light.shade_vertices(vertices_world, self.faces, frame)
         if self.highlights is None or self.specular is None or light is not self.light:
-            return irradiance
-        normals = area_weighted_vertex_normals(vertices_world, self.faces)
-        seen = light.visibility(vertices_world, self.faces, normals).numpy()
-        to_camera = torch.nn.functional.normalize(torch.from_numpy(camera.centre_m()).float() - vertices_world, dim=1)
-        lobe = self.highlights.lobe(normals.numpy(), to_camera.numpy(), seen)
-        gain = 1.0 if frame is None else float(light.gain[frame])
-        return torch.cat([irradiance, (gain * self.specular * torch.from_numpy(lobe).float())[:, None]], dim=1)
+            return light.shade_vertices(vertices_world, self.faces, frame)
+        specular = (self.highlights, self.specular)
+        return light.shade_specular(vertices_world, self.faces, frame, specular, camera.centre_m())
 
     def irradiance(self, vertices_world: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3"] | None:
         """Return the irradiance of posed vertices under the light of the video; None if the texture holds it."""

@@ -36,7 +36,7 @@ from pipeline.texture.views import (
     pixel_confidence,
     remove_light,
     render_depth,
-    render_irradiance,
+    render_shading,
 )
 
 HALF_CONFIDENCE_WEIGHT_RATIO = 0.1
@@ -45,6 +45,9 @@ recording a tenth of the texels below it have the background's colour, and a tho
 
 MAX_ALBEDO = 1.2
 """sRGB; an albedo above 1 is an error of the light, and a limit keeps it from outweighing other frames."""
+
+HIDING = 10.0
+"""Weight of a highlight's radiance against the irradiance: one of 0.1 halves the irradiance that counts."""
 
 InpaintFunction = Callable[[Float[np.ndarray, "t 3"], Float[np.ndarray, "t"]], Float[np.ndarray, "t 3"]]
 """Texel colours and their confidence in [0, 1] -> colours for all texels."""
@@ -125,26 +128,27 @@ def sample_frame_colours(
 ) -> tuple[Float[Tensor, "t 3"], Float[Tensor, "t"]]:
     """Sample the unaligned colours (sRGB) of a view at every texel; see `sample_view_at_texels`.
 
-    Colours are those of the frame, or albedos (at most `MAX_ALBEDO`) if the irradiance of the view is known.
+    Colours are those of the frame, or albedos (at most `MAX_ALBEDO`) if the shading of the view is known.
     """
     depth_m = render_depth(view, surface.faces)
     falloff_px = settings.silhouette_falloff_m / pixel_footprint_m(view.vertices_world, view.camera)
     pixel_weights = pixel_confidence(view.mask, depth_m.numpy(), falloff_px)
     image = view.image.astype(np.float32) / 255.0
     colour, weight = sample_view_at_texels(view, surface, image, pixel_weights, depth_m, settings)
-    if view.irradiance is None:
+    if view.shading is None:
         return colour, weight
-    irradiance = surface.texels.interpolate(surface.faces.numpy(), view.irradiance.numpy())
-    albedo = torch.from_numpy(remove_light(colour.numpy(), irradiance)).clamp(max=MAX_ALBEDO)
-    return albedo, weight * light_confidence(torch.from_numpy(irradiance))
+    shading = surface.texels.interpolate(surface.faces.numpy(), view.shading.numpy())
+    albedo = torch.from_numpy(remove_light(colour.numpy(), shading)).clamp(max=MAX_ALBEDO)
+    return albedo, weight * light_confidence(torch.from_numpy(shading))
 
 
-def light_confidence(irradiance: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
-    """Return the weight of an albedo that was seen under this irradiance: the inverse variance, at most 1.
+def light_confidence(shading: Float[Tensor, "*n d"]) -> Float[Tensor, "*n"]:
+    """Return the weight of an albedo that was seen under this shading: about the inverse variance, at most 1.
 
-    Noise of the image and errors of the light are divided by the irradiance.
+    Noise of the image and errors of the light are divided by the irradiance; a highlight hides the albedo.
     """
-    return irradiance.mean(dim=-1).clamp(max=1.0) ** 2
+    irradiance, highlight = shading[..., :3].mean(dim=-1), shading[..., 3:].sum(dim=-1)
+    return irradiance.clamp(max=1.0) ** 2 * (irradiance / (irradiance + HIDING * highlight)) ** 2
 
 
 def average_views(views: Iterable[BakeView], surface: TexturedSurface, settings: TextureSettings) -> WeightedMean:
@@ -177,10 +181,10 @@ def average_residuals(
         straight = rendered[..., :3] / np.maximum(rendered[..., 3:], 1e-3)
         residual = warped - straight
         pixel_weights /= (1.0 + (np.linalg.norm(residual, axis=2) / settings.geman_mcclure_scale) ** 2) ** 2
-        if view.irradiance is not None:
-            irradiance = render_irradiance(view, surface.faces)
-            residual = remove_light(warped, irradiance) - remove_light(straight, irradiance)
-            pixel_weights *= light_confidence(torch.from_numpy(irradiance)).numpy()
+        if view.shading is not None:
+            shading = render_shading(view, surface.faces)
+            residual = remove_light(warped, shading) - remove_light(straight, shading)
+            pixel_weights *= light_confidence(torch.from_numpy(shading)).numpy()
         mean.add(*sample_view_at_texels(view, surface, residual, pixel_weights, depth_m, settings))
     return mean
 
@@ -197,7 +201,7 @@ def render_textured_view(
         torch.from_numpy(texture),
         view.camera,
         supersampling=2,
-        shading=view.irradiance,
+        shading=view.shading,
     ).numpy()
 
 

@@ -106,6 +106,26 @@ class VideoLight:
         seen = self.visibility(vertices_world, faces, normals)
         return torch.from_numpy(gain * self.irradiance(normals.numpy(), seen.numpy()))
 
+    def shade_specular(
+        self,
+        vertices_world: Float[Tensor, "v 3"],
+        faces: Tensor,
+        frame: int | None,
+        specular: "tuple[Highlights, Float[Tensor, 'v']]",
+        camera_centre_m: Float[np.ndarray, "3"],
+    ) -> Float[Tensor, "v 4"]:
+        """Return `shade_vertices`, and the radiance of the highlight of each vertex as a fourth column.
+
+        specular: the lobe, and the strength of each vertex. camera_centre_m: world.
+        """
+        highlights, strength = specular
+        normals = area_weighted_vertex_normals(vertices_world, faces)
+        seen = self.visibility(vertices_world, faces, normals).numpy()
+        to_camera = torch.nn.functional.normalize(torch.from_numpy(camera_centre_m).float() - vertices_world, dim=1)
+        lobe = torch.from_numpy(highlights.lobe(normals.numpy(), to_camera.numpy(), seen)).float()
+        gain = 1.0 if frame is None else float(self.gain[frame])
+        return torch.cat([self.shade_vertices(vertices_world, faces, frame), (gain * strength * lobe)[:, None]], dim=1)
+
     def visibility(
         self, vertices_world: Float[Tensor, "v 3"], faces: Tensor, normals: Float[Tensor, "v 3"]
     ) -> Float[Tensor, "v"]:

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.sparse import eye_array
 
 from pipeline.geometry.atlas import Texels
 from pipeline.geometry.colour import linear_to_srgb, srgb_to_linear
@@ -35,12 +36,14 @@ EXPONENTS = (12.0, 24.0, 48.0, 96.0)
 MAX_LAMP_ANGLE_RAD = 0.8
 
 ALBEDO_CONTRAST_SCALE = 0.05
-SMOOTHING_STEPS = 4
-RIDGE_FRACTION = 0.1
+SMOOTHING_STEPS = 6
+RIDGE_FRACTION = 0.003
+"""Ridge of the strength, relative to the lobe's power at well-observed vertices of uniform albedo."""
+
 MIN_LINEAR = 0.02
 """Linear colour below which noise does not fall any more."""
 
-MIN_EXPLAINED, MIN_STANDARD_ERRORS = 0.1, 3.0
+MIN_EXPLAINED, MIN_STANDARD_ERRORS = 0.15, 2.0
 """What highlights must explain of the squared error of validation frames."""
 
 
@@ -84,7 +87,8 @@ def fit_specular(train: ViewObservations, validation: ViewObservations, light: V
     uniformity = albedo_uniformity(linear_to_srgb(fitted.albedo(count, 0.0)), edges)
     fitted, tested = (each.weighted(uniformity[each.vertex]) for each in (fitted, tested))
     highlights = find_lobe(fitted, light, count)
-    strength = _smooth(fitted.strength(highlights, count), mesh)
+    power, products = fitted.normal_equations(highlights, count)
+    strength = _smooth(power, products.min(axis=1), mesh)
     without = tested.squared_errors(highlights, np.zeros(count), fitted.albedo(count, 0.0))
     lobe = fitted.lobe(highlights) * strength[fitted.vertex]
     with_lobe = tested.squared_errors(highlights, strength, fitted.albedo(count, lobe))
@@ -173,7 +177,7 @@ class _Regression:
         below = np.bincount(self.vertex, self.weight * shading**2, count)
         return values - (above / np.maximum(below, 1e-12))[self.vertex] * shading
 
-    def _normal_equations(self, highlights: Highlights, count: int) -> tuple[np.ndarray, np.ndarray]:
+    def normal_equations(self, highlights: Highlights, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the power of the lobe at each vertex, and its products with the three channels."""
         lobe = self._eliminated(self.lobe(highlights), count)
         power = np.bincount(self.vertex, self.weight * lobe**2, count)
@@ -183,14 +187,9 @@ class _Regression:
 
     def explained(self, highlights: Highlights, count: int) -> float:
         """Return by how much grey highlights of strength >= 0 reduce the weighted squared error."""
-        power, products = self._normal_equations(highlights, count)
+        power, products = self.normal_equations(highlights, count)
         product = np.maximum(products.min(axis=1), 0.0)
         return float(np.sum(product**2 / (power + _ridge(power))))
-
-    def strength(self, highlights: Highlights, count: int) -> Float[np.ndarray, "v"]:
-        """Return s >= 0, the part of the change that all channels share; a ridge shrinks it where the lobe is weak."""
-        power, products = self._normal_equations(highlights, count)
-        return np.maximum(products.min(axis=1), 0.0) / (power + _ridge(power))
 
     def squared_errors(
         self, highlights: Highlights, strength: np.ndarray, albedo: np.ndarray
@@ -227,11 +226,15 @@ def _ridge(power: np.ndarray) -> float:
     return max(RIDGE_FRACTION * float(np.quantile(power, 0.95)), 1e-12)
 
 
-def _smooth(strength: np.ndarray, mesh: Mesh) -> np.ndarray:
-    operator = laplacian(mesh)
+def _smooth(power: np.ndarray, product: np.ndarray, mesh: Mesh) -> Float[np.ndarray, "v"]:
+    """Return s >= 0: power and product are pooled over the neighbourhood, and s is shrunk where the lobe is weak.
+
+    A vertex whose highlight no frame shows stays matte.
+    """
+    ridge, mixing = _ridge(power), eye_array(len(power)) - 0.5 * laplacian(mesh)
     for _ in range(SMOOTHING_STEPS):
-        strength = strength - 0.5 * (operator @ strength)
-    return np.clip(strength, 0.0, 1.0)
+        power, product = mixing @ power, mixing @ product
+    return np.clip(np.maximum(product, 0.0) / (power + ridge), 0.0, 1.0)
 
 
 def albedo_uniformity(albedo: Float[np.ndarray, "v 3"], edges: Int[np.ndarray, "e 2"]) -> Float[np.ndarray, "v"]:

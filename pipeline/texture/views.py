@@ -36,7 +36,8 @@ class BakeView:
         vertices_world: the posed mesh, m.
         view_cosine: cosine between each vertex normal and the direction to the camera.
         weight: of the whole frame; 1 for the median frame.
-        irradiance: of each vertex, linear RGB relative to the mean of the video; None: colours are taken as they are.
+        shading: of each vertex, linear: irradiance (RGB, relative to the mean of the video), and the radiance of its
+            highlight where the surface has any. None: colours are taken as they are.
     """
 
     image: UInt8[np.ndarray, "h w 3"]
@@ -45,7 +46,7 @@ class BakeView:
     vertices_world: Float[Tensor, "v 3"]
     view_cosine: Float[Tensor, "v"]
     weight: float = 1.0
-    irradiance: Float[Tensor, "v 3"] | None = None
+    shading: Float[Tensor, "v d"] | None = None
 
 
 def crop_bake_view(
@@ -120,25 +121,25 @@ def render_depth(view: BakeView, faces: Int[Tensor, "f 3"]) -> Float[Tensor, "h 
     return rasterize(vertices_px, depth_m, faces, view.camera.height, view.camera.width)[2]
 
 
-def render_irradiance(view: BakeView, faces: Int[Tensor, "f 3"]) -> Float[np.ndarray, "h w 3"]:
-    """Return the irradiance of a lit view at every pixel; 1 outside the mesh.
+def render_shading(view: BakeView, faces: Int[Tensor, "f 3"]) -> Float[np.ndarray, "h w d"]:
+    """Return the shading of a view at every pixel; 1 outside the mesh.
 
     Raises:
-        ValueError: the view has no irradiance.
+        ValueError: the view has no shading.
     """
-    if view.irradiance is None:
-        raise ValueError("the view has no irradiance")
+    if view.shading is None:
+        raise ValueError("the view has no shading")
     vertices_px, depth_m = project(view.vertices_world, view.camera)
     face_id, barycentric, _ = rasterize(vertices_px, depth_m, faces, view.camera.height, view.camera.width)
-    irradiance = interpolate_at_pixels(face_id, barycentric, faces, view.irradiance).numpy()
-    irradiance[face_id.numpy() < 0] = 1.0
-    return irradiance
+    shading = interpolate_at_pixels(face_id, barycentric, faces, view.shading).numpy()
+    shading[face_id.numpy() < 0] = 1.0
+    return shading
 
 
-def remove_light(colour: Float[np.ndarray, "*n 3"], irradiance: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-    """Return the albedo (sRGB, at least 0) of surfaces that have this colour (sRGB in [0, 1]) under this irradiance."""
-    linear = srgb_to_linear(np.maximum(colour, 0.0)) / np.maximum(irradiance, MIN_IRRADIANCE)
-    return linear_to_srgb(linear).astype(np.float32)
+def remove_light(colour: Float[np.ndarray, "*n 3"], shading: Float[np.ndarray, "*n d"]) -> Float[np.ndarray, "*n 3"]:
+    """Return the albedo (sRGB, at least 0) of surfaces that have this colour (sRGB in [0, 1]) under this shading."""
+    diffuse = srgb_to_linear(np.maximum(colour, 0.0)) - shading[..., 3:].sum(axis=-1, keepdims=True)
+    return linear_to_srgb(np.maximum(diffuse, 0.0) / np.maximum(shading[..., :3], MIN_IRRADIANCE)).astype(np.float32)
 
 
 def align_to_render(

@@ -203,7 +203,7 @@ class LitBall:
 
     def albedo_error(self, light: VideoLight) -> float:
         views = [
-            replace(view, irradiance=light.shade_vertices(view.vertices_world, self.ball.surface.faces))
+            replace(view, shading=light.shade_vertices(view.vertices_world, self.ball.surface.faces))
             for view in self.views
         ]
         mean = average_views(views, self.surface, TextureSettings())
