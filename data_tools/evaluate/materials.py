@@ -76,7 +76,7 @@ def main(argv: Sequence[str]) -> None:
             out = folder / f"texture-{mode}"
             out.mkdir(parents=True, exist_ok=True)
             started = time.monotonic()
-            metrics = TEXTURE.run(inputs, out, TEXTURE.config(light=mode))
+            metrics = TEXTURE.run(inputs, out, TEXTURE.config.model_validate({"light": mode}))
             seconds = time.monotonic() - started
             scores = score_maps(truth, out, folder, gains) | {"seconds": seconds}
             for name, value in {**metrics, **scores}.items():
