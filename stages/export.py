@@ -37,6 +37,7 @@ from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.io.image import png_bytes, to_uint8
 from pipeline.mesh.files import MeshArtifact, load_mesh
 from pipeline.texture.files import DIFFUSE, SPECULAR, TextureArtifact, load_texture, map_files
+from pipeline.texture.light import TERMS, VideoLight
 from pipeline.texture.specular import dielectric_specular_factor
 
 OBJ_MAPS = tuple(f"avatar_{name}" for name in (DIFFUSE, SPECULAR))
@@ -142,17 +143,18 @@ def load_scene(inputs: Mapping[str, Path], config: Config) -> Scene:
         UserError: an input artifact cannot be read.
     """
     body, skinned = load_body(inputs["body"] / "body.npz"), load_mesh(inputs["mesh"])
+    texture = load_texture(inputs["texture"])
     capture, motion = load_capture(inputs["frames"]), load_motion(inputs["mesh"] / "motion.npz")
     offset_m = world_to_scene_translation_m(motion, lowest_vertex_y_m(skinned, body, motion))
     return Scene(
         body=body,
         skinned=skinned,
         rig=build_rig(body, config.rig, config.rest_pose),
-        texture=load_texture(inputs["texture"]),
+        texture=texture,
         motion=pad_motion_to_video(translate_motion(motion, offset_m), capture.fps, capture.n_video_frames),
         fps=capture.fps,
         camera=translate_camera(load_camera(inputs["body"] / "camera.npz"), offset_m),
-        extras=asset_extras(config, offset_m, capture.fps),
+        extras=asset_extras(config, offset_m, capture.fps) | light_extras(texture.light),
     )
 
 
@@ -233,6 +235,23 @@ def asset_extras(config: Config, offset_m: Float[np.ndarray, "3"], frame_rate_hz
         "frame_rate_hz": frame_rate_hz,
         "source": "reconstructed from one video",
         "licence_note": config.licence_note,
+    }
+
+
+def light_extras(light: VideoLight) -> dict[str, Any]:
+    """Return `video_light` of `asset.extras`: the light that was removed from the diffuse map; nothing if none was.
+
+    Irradiance by the unit normal (x, y, z) of the scene, linear RGB; 1 shows the base colour as it is.
+    """
+    if light.is_uniform:
+        return {}
+    return {
+        "video_light": {
+            "terms": list(TERMS),
+            "coefficients": [[float(value) for value in row] for row in light.coefficients],
+            "key_direction": [float(value) for value in light.key_direction],
+            "key_irradiance": [float(value) for value in light.key_irradiance],
+        }
     }
 
 

@@ -24,6 +24,9 @@ from pipeline.geometry.mesh import area_weighted_vertex_normals
 from pipeline.geometry.shadow_map import render_shadow_map
 from pipeline.io.npz import load_npz, save_npz
 
+TERMS = ("1", "x", "y", "z", "xy", "yz", "3zz-1", "xz", "xx-yy")
+"""The functions of `spherical_harmonics` at a unit vector (x, y, z)."""
+
 MATTE_EXPONENT = 1.0
 """Exponent that is written for a surface without highlights."""
 

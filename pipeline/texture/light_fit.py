@@ -27,6 +27,7 @@ MIN_COLOUR, MAX_COLOUR = 0.04, 0.97
 """sRGB; a darker channel is noise in the logarithm, a brighter one is clipped."""
 
 GAUSS_NEWTON_STEPS = 8
+BASIS_SIZE = 9
 MAX_STEP = 0.7
 """Of log albedo, log gain or a coefficient in one Gauss-Newton step."""
 
@@ -36,9 +37,13 @@ ALBEDO_SMOOTHNESS = 0.05
 ALBEDO_EDGE = 0.08
 """Difference of two log albedos at which the robust prior has a quarter of its weight."""
 
-COEFFICIENT_PRIOR = 1e-3
-GAIN_PRIOR = 1e-3
-"""Weights of zero coefficients and unit gains, relative to the observations of a frame."""
+DAMPING, GAUGE_WEIGHT = 1e-3, 1e3
+"""Weights that keep a step small, of all unknowns and of the constant terms, whose scale is that of the albedo."""
+
+GAIN_PRIOR, SHAPE_PRIOR, COLOUR_PRIOR = 0.1, 0.1, 1.0
+"""Weights of unit gains, of coefficients of degree 1 and 2 that are 0, and of those that are equal in all channels: each is
+a squared error relative to the noise, times the weight of a frame. Few frames show normals that point up or down: without
+these priors wrong poses of the head decide their irradiance and its colour."""
 
 SEARCH_VIEWS, SEARCH_DIRECTIONS = 8, 48
 SEARCH_REFINEMENTS_RAD = (0.25, 0.12)
@@ -346,10 +351,12 @@ class _Problem:
             system[np.ix_(rows, rows)] += block - coupling.T @ solved[:, :-1]
             system[rows, -1] += right - coupling.T @ solved[:, -1]
             solutions.append((rows, solved))
-        prior = np.full(len(system), COEFFICIENT_PRIOR)
-        prior[:frames] = GAIN_PRIOR
-        matrix = system[:, :-1] + np.diag(prior * float(weight.sum()) / frames)
-        small = np.clip(np.linalg.solve(matrix, system[:, -1]), -MAX_STEP, MAX_STEP)
+        prior = self._prior(terms) * (noise**2 * float(weight.sum()) / frames)
+        state = np.concatenate([np.log(light.gain), self._light_state(light).T.reshape(-1)])
+        damping = np.full(len(prior), DAMPING * float(weight.sum()) / frames)
+        damping[frames::terms] = GAUGE_WEIGHT * float(weight.sum())
+        step = np.linalg.solve(system[:, :-1] + prior + np.diag(damping), system[:, -1] - prior @ state)
+        small = np.clip(step, -MAX_STEP, MAX_STEP)
         albedo = np.stack([solved[:, -1] - solved[:, :-1] @ small[rows] for rows, solved in solutions], axis=1)
         moved = small[frames:].reshape(3, terms).T
         key = light.key_irradiance if self.visibility is None else light.key_irradiance + moved[-1]
@@ -360,6 +367,22 @@ class _Problem:
             gain=light.gain * np.exp(small[:frames]),
         )
         return LightFit(changed, fit.log_albedo + np.clip(albedo, -MAX_STEP, MAX_STEP))
+
+    def _light_state(self, light: VideoLight) -> np.ndarray:
+        """Return the coefficients, and the key light where there is one: one column a channel."""
+        key = [] if self.visibility is None else [light.key_irradiance]
+        return np.stack([*light.coefficients, *key])
+
+    def _prior(self, terms: int) -> np.ndarray:
+        """Return the normal matrix of the priors of log gains and light, relative to the observations of a frame."""
+        matrix = np.diag(np.r_[np.full(self.view_count, GAIN_PRIOR), np.zeros(3 * terms)])
+        between_channels = np.eye(3) - 1.0 / 3.0
+        for term in range(1, terms):
+            rows = self.view_count + term + terms * np.arange(3)
+            matrix[np.ix_(rows, rows)] += COLOUR_PRIOR * between_channels
+            if term < BASIS_SIZE:
+                matrix[rows, rows] += SHAPE_PRIOR
+        return matrix
 
     def _light_basis(self, light: VideoLight) -> np.ndarray:
         """Return the derivative of the irradiance by the coefficients, and by the key light where there is one."""

@@ -137,6 +137,9 @@ def test_highlights_become_a_specular_factor_unless_the_surface_is_unlit(
             assert not alpha[:, :half].any()
             # strength * roughness^4 / 0.01, where exponent 24 has roughness (2 / 26)^(1/4)
             assert np.median(alpha[:, half:]) == pytest.approx(255 * (10 / 255) * (2 / 26) / 0.01, abs=1.0)
+            light = glb.gltf["asset"]["extras"]["video_light"]
+            assert light["coefficients"][0] == pytest.approx([0.3] * 3)
+            assert light["key_direction"] == [0.0, 0.0, 1.0]
             roughness = glb.gltf["materials"][0]["pbrMetallicRoughness"]["roughnessFactor"]
             assert roughness == pytest.approx((2 / 26) ** 0.25, rel=1e-6)
     assert materials == [({"KHR_materials_specular"}, 2), ({"KHR_materials_unlit"}, 1)]
