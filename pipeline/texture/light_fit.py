@@ -41,9 +41,9 @@ DAMPING, GAUGE_WEIGHT = 1e-3, 1e3
 """Weights that keep a step small, of all unknowns and of the constant terms, whose scale is that of the albedo."""
 
 GAIN_PRIOR, SHAPE_PRIOR, COLOUR_PRIOR = 0.1, 0.1, 1.0
-"""Weights of unit gains, of coefficients of degree 1 and 2 that are 0, and of those that are equal in all channels: each is
-a squared error relative to the noise, times the weight of a frame. Few frames show normals that point up or down: without
-these priors wrong poses of the head decide their irradiance and its colour."""
+"""Weights of unit gains, of coefficients of degree 1 and 2 that are 0, and of those that are equal in all channels,
+each against an error relative to the noise in all observations of a frame. Few frames show normals that point up or
+down: without these priors wrong poses of the head decide their irradiance and its colour."""
 
 SEARCH_VIEWS, SEARCH_DIRECTIONS = 8, 48
 SEARCH_REFINEMENTS_RAD = (0.25, 0.12)
