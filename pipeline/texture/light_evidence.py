@@ -8,13 +8,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.texture.bake import TexturedSurface
+from pipeline.texture.key_light import find_key_direction
 from pipeline.texture.light import VideoLight
 from pipeline.texture.light_fit import (
     LightFit,
     LightObservations,
     Prediction,
     ViewObservations,
-    find_key_direction,
     fit_light,
     mean_log_albedo,
     observe_light,

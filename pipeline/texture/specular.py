@@ -21,14 +21,10 @@ from pipeline.geometry.atlas import Texels
 from pipeline.geometry.colour import linear_to_srgb, srgb_to_linear
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import laplacian
+from pipeline.texture.key_light import SEARCH_REFINEMENTS_RAD, directions_around, search_directions
 from pipeline.texture.light import Highlights, VideoLight
 from pipeline.texture.light_evidence import standard_errors
-from pipeline.texture.light_fit import (
-    SEARCH_REFINEMENTS_RAD,
-    ViewObservations,
-    directions_around,
-    search_directions,
-)
+from pipeline.texture.light_fit import ViewObservations
 
 EXPONENTS = (12.0, 24.0, 48.0, 96.0)
 """Candidates of p: roughness 0.61 to 0.38. Errors of the irradiance look like wider lobes."""
