@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 from pydantic import Field, field_validator
 
 from pipeline.avatar.formats.vrm import VrmMeta
@@ -42,6 +42,7 @@ from pipeline.template.animated_face import AnimatedFace, build_animated_face
 from pipeline.template.face_patch import FacePatchError
 from pipeline.template.face_texture import CapturedSurface
 from pipeline.texture.files import DIFFUSE, SPECULAR, TextureArtifact, load_texture, map_files
+from pipeline.texture.light import TERMS, VideoLight
 from pipeline.texture.specular import dielectric_specular_factor
 
 OBJ_MAPS = tuple(f"avatar_{name}" for name in (DIFFUSE, SPECULAR))
@@ -52,7 +53,10 @@ class Config(BaseConfig):
     """Options of the export stage."""
 
     roughness: float = Field(
-        0.85, ge=0.0, le=1.0, description="glTF roughness of the whole surface, from 0 (mirror) to 1 (matte)"
+        0.85,
+        ge=0.0,
+        le=1.0,
+        description="glTF roughness if the video shows no highlights: 0 (mirror) to 1 (matte)",
     )
     unlit: bool = Field(
         False,
@@ -157,9 +161,9 @@ def load_scene(inputs: Mapping[str, Path], config: Config) -> Scene:
         UserError: an input artifact cannot be read.
     """
     body, skinned = load_body(inputs["body"] / "body.npz"), load_mesh(inputs["mesh"])
+    texture = load_texture(inputs["texture"])
     capture, motion = load_capture(inputs["frames"]), load_motion(inputs["mesh"] / "motion.npz")
     offset_m = world_to_scene_translation_m(motion, lowest_vertex_y_m(skinned, body, motion))
-    texture = load_texture(inputs["texture"])
     return Scene(
         body=body,
         skinned=skinned,
@@ -168,7 +172,7 @@ def load_scene(inputs: Mapping[str, Path], config: Config) -> Scene:
         motion=pad_motion_to_video(translate_motion(motion, offset_m), capture.fps, capture.n_video_frames),
         fps=capture.fps,
         camera=translate_camera(load_camera(inputs["body"] / "camera.npz"), offset_m),
-        extras=asset_extras(config, offset_m, capture.fps),
+        extras=asset_extras(config, offset_m, capture.fps) | light_extras(texture.light),
         face=make_face(body, skinned, texture) if config.face else None,
     )
 
@@ -189,10 +193,11 @@ def encode_scene(scene: Scene, config: Config, clips: Mapping[str, Motion]) -> b
     atlas, diffuse, specular = texture.atlas, texture.diffuse, texture.specular
     if face is not None:
         atlas, diffuse, specular = face.atlas, face.diffuse, face.specular
+    has_highlights = bool(specular.any())
     maps = MaterialMaps(
         png_bytes(to_uint8(diffuse)),
-        encode_specular_png(specular, diffuse, config.roughness) if specular.any() else None,
-        config.roughness,
+        encode_specular_png(specular, texture) if has_highlights else None,
+        texture.highlights.roughness if has_highlights else config.roughness,
         config.unlit,
     )
     mesh = build_skinned_mesh(to_rest_pose(face.skinned if face else scene.skinned, scene.rig), atlas)
@@ -219,11 +224,10 @@ def copy_map(texture_dir: Path, name: str, out: Path) -> str:
     return f"avatar_{paths[-1].name}"
 
 
-def encode_specular_png(
-    amplitude: Float32[np.ndarray, "h w"], diffuse: Float32[np.ndarray, "h w 3"], roughness: float
-) -> bytes:
-    """Convert the texture stage's specular map (sRGB) to a PNG with glTF's specular factor."""
-    factor = dielectric_specular_factor(amplitude, diffuse, roughness)
+def encode_specular_png(strength: Float[np.ndarray, "h w"], texture: TextureArtifact) -> bytes:
+    """Convert a specular map to a PNG with glTF's specular factor; `texture` has the lobe and the lamp."""
+    lamp = texture.light.lamp_irradiance(texture.highlights.direction)
+    factor = dielectric_specular_factor(strength, texture.highlights.roughness, lamp)
     return png_bytes(pack_specular_factor(to_uint8(factor)))
 
 
@@ -268,9 +272,26 @@ def asset_extras(config: Config, offset_m: Float[np.ndarray, "3"], frame_rate_hz
     }
 
 
+def light_extras(light: VideoLight) -> dict[str, Any]:
+    """Return `video_light` of `asset.extras`: the light that was removed from the diffuse map; nothing if none was.
+
+    Irradiance by the unit normal (x, y, z) of the scene, linear RGB; 1 shows the base colour as it is.
+    """
+    if light.is_uniform:
+        return {}
+    return {
+        "video_light": {
+            "terms": list(TERMS),
+            "coefficients": [[float(value) for value in row] for row in light.coefficients],
+            "key_direction": [float(value) for value in light.key_direction],
+            "key_irradiance": [float(value) for value in light.key_irradiance],
+        }
+    }
+
+
 STAGE = Stage(
     "export",
-    version=6,
+    version=7,
     needs=("frames", "body", "mesh", "texture"),
     makes=("avatar.glb", "avatar.obj", "avatar.mtl", *OBJ_MAPS),
     config=Config,

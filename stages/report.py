@@ -49,6 +49,7 @@ from pipeline.report.report_json import build_report, replace_nonfinite, report_
 from pipeline.report.settings import REPORT_SETTINGS, ReportSettings
 from pipeline.report.sheets import composite_on_white_uint8, image_grid
 from pipeline.texture.files import COVERAGE
+from pipeline.texture.light import VideoLight, directional_light
 
 NEEDS = ("frames", "body", "field", "mesh", "texture", "export")
 REPORT_IMAGES = (
@@ -58,6 +59,12 @@ REPORT_IMAGES = (
     ("mesh", "preview.png", "Mesh"),
 )
 
+
+PREVIEW_LIGHTS = {
+    "light from the left": directional_light((-0.85, 0.35, 0.4), 0.3),
+    "light from above": directional_light((0.1, 0.95, 0.3), 0.35),
+}
+"""Lights, other than that of the video, under which the report shows the avatar."""
 
 Turntable = tuple[str, list[UInt8[np.ndarray, "_ _ 4"]]]
 """Title of a row, and its views from all sides."""
@@ -113,7 +120,7 @@ def run(
         title=out.resolve().parent.name,
         report=report,
         frames=frame_images,
-        turntable=[turntable[0], *clay, turntable[1], clay_posed],
+        turntable=[turntable[0], *turntable[2:], *clay, turntable[1], clay_posed],
         images=[(caption, read_rgb(inputs[stage] / name)) for stage, name, caption in REPORT_IMAGES],
         glb=glb,
         levels=[read_level(path) for path in sorted(inputs["export"].glob("avatar_lod*.glb"))],
@@ -177,24 +184,30 @@ def score_frames(
     """
     blur_px = additional_blur_sigma_px(edge_blur_px)
 
-    def render_sharp(pose: Float[Tensor, "j 4 4"]) -> Float[np.ndarray, "h w 4"]:
-        return loaded.avatar.render(loaded.avatar.pose_vertices(pose), loaded.camera, config.samples_per_pixel_side)
+    avatar = loaded.avatar
 
-    def render_mesh(pose: Float[Tensor, "j 4 4"]) -> Float[np.ndarray, "h w 4"]:
-        return blur_coverage(render_sharp(pose), blur_px)
+    def render_field(pose: Float[Tensor, "j 4 4"], _: int) -> Float[np.ndarray, "h w 4"]:
+        return loaded.field_renderer(pose)
+
+    def render_sharp(pose: Float[Tensor, "j 4 4"], frame: int) -> Float[np.ndarray, "h w 4"]:
+        vertices = avatar.pose_vertices(pose)
+        return avatar.render(vertices, loaded.camera, config.samples_per_pixel_side, avatar.light, frame)
+
+    def render_mesh(pose: Float[Tensor, "j 4 4"], frame: int) -> Float[np.ndarray, "h w 4"]:
+        return blur_coverage(render_sharp(pose, frame), blur_px)
 
     renderers = {
-        "field": (loaded.field_renderer, loaded.refined_canonical_to_world),
+        "field": (render_field, loaded.refined_canonical_to_world),
         "mesh_sharp": (render_sharp, loaded.refined_canonical_to_world),
     }
     if config.score_unrefined_mesh:
         renderers["mesh_unrefined"] = (render_mesh, loaded.fitted_canonical_to_world)
     if settings.score_unrefined_field:
-        renderers["field_unrefined"] = (loaded.field_renderer, loaded.fitted_canonical_to_world)
+        renderers["field_unrefined"] = (render_field, loaded.fitted_canonical_to_world)
     if config.fit_held_out_poses:
         poses_fitted = fit_heldout_poses(loaded, positions, settings.pose_fit_steps)
         renderers |= {
-            "field_pose_fitted": (loaded.field_renderer, poses_fitted),
+            "field_pose_fitted": (render_field, poses_fitted),
             "mesh_pose_fitted": (render_mesh, poses_fitted),
         }
     weights = find_lpips_weights()
@@ -203,7 +216,7 @@ def score_frames(
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         for position in track(positions.tolist(), "held-out frames"):
             image, mask = (to_uint8(part(position)) for part in (loaded.capture.image, loaded.capture.mask))
-            renders = {name: render(poses[position]) for name, (render, poses) in renderers.items()}
+            renders = {name: render(poses[position], position) for name, (render, poses) in renderers.items()}
             softened = blur_coverage(renders["mesh_sharp"], blur_px)
             renders = {"field": renders["field"], "mesh": softened} | renders
             index = int(loaded.capture.frame_index[position])
@@ -235,19 +248,28 @@ def fit_heldout_poses(loaded: FinishedRun, positions: np.ndarray, steps: int) ->
 def render_turntables(
     loaded: FinishedRun, position: int, config: Config, settings: ReportSettings = REPORT_SETTINGS
 ) -> list[Turntable]:
-    """Render the avatar from all sides, in the A-pose and in the pose of one frame."""
-    bodies = {
-        "A-pose": loaded.avatar.vertices,
-        _pose_title(loaded, position): loaded.avatar.pose_vertices(loaded.refined_canonical_to_world[position]),
-    }
+    """Render the avatar from all sides: unlit and under several lights in the A-pose, and in the pose of one frame.
+
+    The diffuse map of an avatar whose light was not removed is shown unlit only: it holds the light.
+    """
+    avatar = loaded.avatar
+    is_uniform = avatar.light is None or avatar.light.is_uniform
+    posed = avatar.pose_vertices(loaded.refined_canonical_to_world[position])
+    rows: list[tuple[str, Float[Tensor, "v 3"], VideoLight | None]] = [
+        ("A-pose" if is_uniform else "A-pose, unlit", avatar.vertices, None),
+        (_pose_title(loaded, position), posed, avatar.light),
+    ]
+    if not is_uniform:
+        rows.append(("A-pose, the video's light", avatar.vertices, avatar.light))
+        rows += [(f"A-pose, {name}", avatar.vertices, light) for name, light in PREVIEW_LIGHTS.items()]
     return [
         (
             title,
-            loaded.avatar.render_turntable(
-                vertices, config.turntable_views, settings.turntable_height_px, config.samples_per_pixel_side
+            avatar.render_turntable(
+                vertices, config.turntable_views, settings.turntable_height_px, config.samples_per_pixel_side, light
             ),
         )
-        for title, vertices in bodies.items()
+        for title, vertices, light in rows
     ]
 
 
@@ -299,7 +321,7 @@ def _manifest(folder: Path) -> Manifest:
 
 STAGE = Stage(
     name="report",
-    version=7,
+    version=8,
     needs=NEEDS,
     makes=("report.json", "index.html", "turntable.jpg", "clay.jpg", "heldout.jpg"),
     config=Config,

@@ -1,12 +1,15 @@
 """texture stage: unwrap the mesh into a UV atlas and bake diffuse, specular and coverage maps from the video."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from pydantic import Field, ValidationInfo, field_validator
+from torch import Tensor
 
 from pipeline.body.body import Body, canonical_to_world
 from pipeline.body.files import load_body, load_camera, load_motion
@@ -23,7 +26,6 @@ from pipeline.geometry.atlas import Atlas, Texels, rasterize_texels, texture_siz
 from pipeline.geometry.camera import pixel_footprint_m
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning
-from pipeline.geometry.surface import laplacian
 from pipeline.io.image import to_float, to_uint8
 from pipeline.mesh.files import MeshArtifact, load_mesh
 from pipeline.texture.bake import (
@@ -34,13 +36,22 @@ from pipeline.texture.bake import (
     texels_to_texture,
 )
 from pipeline.texture.body_parts import body_part_of_faces
-from pipeline.texture.files import ATLAS, COVERAGE, DIFFUSE, SPECULAR, TextureArtifact, TextureFormat, save_texture
+from pipeline.texture.files import (
+    ATLAS,
+    COVERAGE,
+    DIFFUSE,
+    LIGHT,
+    SPECULAR,
+    TextureArtifact,
+    TextureFormat,
+    save_texture,
+)
 from pipeline.texture.inpainting import average_texels_per_vertex, inpaint_vertex_colours
+from pipeline.texture.light import Highlights, VideoLight
+from pipeline.texture.light_evidence import LightEvidence, estimate_light
 from pipeline.texture.settings import DEFAULT_SETTINGS, TextureSettings
-from pipeline.texture.specular import fit_specular, observe_vertices, texels_at_vertices
+from pipeline.texture.specular import SpecularFit, fit_specular, texels_at_vertices
 from pipeline.texture.views import BakeView, crop_bake_view, weight_by_resolution
-
-SPECULAR_SMOOTHING_STEPS = 8
 
 
 class Config(BaseConfig):
@@ -57,6 +68,10 @@ class Config(BaseConfig):
     format: TextureFormat = Field(
         "png8",
         description="files of the maps: png8, png16, or exr (8-bit .png and half floats in .exr)",
+    )
+    light: Literal["auto", "removed", "kept"] = Field(
+        "auto",
+        description="light of the video in the diffuse map: removed, kept, or auto (decided on validation frames)",
     )
     max_frames: int = Field(
         100, ge=1, description="largest number of training frames, evenly spaced over the recording"
@@ -97,15 +112,29 @@ def run(
     atlas, size_px = build_atlas(skinned, body, train, config, settings)
     texels = rasterize_texels(atlas, size_px)
     surface = TexturedSurface.from_arrays(skinned.mesh.faces, atlas, texels)
+    evidence = find_light((train, validation), positions, skinned.mesh, config, settings)
+    light = VideoLight.uniform(len(capture))
+    if evidence is not None:
+        light = evidence.for_capture(
+            subsample(positions[0], config.max_frames),
+            len(capture),
+            is_removed=evidence.helps or config.light == "removed",
+        )
+    fitted = fit_highlights(evidence, light, skinned.mesh)
+    train, validation = (
+        light_views(views, light, subsample(part, config.max_frames), surface.faces, fitted)
+        for views, part in zip((train, validation), positions, strict=True)
+    )
     inpaint = make_texel_inpainter(skinned.mesh, texels)
     diffuse, texel_confidence = bake_diffuse(train, surface, inpaint, config.rounds, settings)
-    amplitude, partial_r2 = bake_specular(train, validation, skinned.mesh, settings)
-    specular = torch.from_numpy(texels.interpolate(skinned.mesh.faces, amplitude[:, None]))
+    specular = torch.from_numpy(texels.interpolate(skinned.mesh.faces, fitted.strength[:, None]))
     artifact = TextureArtifact(
         atlas,
         diffuse=diffuse,
         specular=np.ascontiguousarray(texels_to_texture(specular, texels)[..., 0]),
         coverage=to_uint8(texels.to_texture(texel_confidence[:, None])[..., 0]),
+        light=light,
+        highlights=fitted.highlights,
     )
     save_texture(out, artifact, config.format)
     return {
@@ -113,7 +142,9 @@ def run(
         "observed_texel_fraction": float((texel_confidence > 0.5).mean()),
         "atlas_utilisation": float(len(texels.face) / size_px**2),
         "validation_psnr_body_db": mean_foreground_psnr_db(to_float(to_uint8(diffuse)), validation, surface),
-        "specular_partial_r2": partial_r2,
+        "specular_explained": fitted.explained,
+        "specular_standard_errors": fitted.standard_errors,
+        **light_metrics(evidence, light),
     }
 
 
@@ -131,13 +162,76 @@ def load_views(
     vertices = torch.from_numpy(skinned.mesh.vertices)
     weights = skinned.dense_skin_weights(len(body.joint_names))
     faces = torch.from_numpy(skinned.mesh.faces)
-    subsampled = positions[evenly_spaced(len(positions), max_frames)]
     views = []
-    for k in track(subsampled.tolist(), "reading frames"):
+    for k in track(subsample(positions, max_frames).tolist(), "reading frames"):
         posed = linear_blend_skinning(vertices, weights, transforms[k : k + 1])[0]
         image, mask = to_uint8(capture.image(k)), to_uint8(capture.mask(k))
         views.append(crop_bake_view(image, mask, camera, posed, faces))
     return weight_by_resolution(views) if views else []
+
+
+def subsample(positions: Int[np.ndarray, "k"], max_frames: int) -> Int[np.ndarray, "m"]:
+    """Return at most `max_frames` evenly spaced positions."""
+    return positions[evenly_spaced(len(positions), max_frames)]
+
+
+def find_light(
+    views: tuple[list[BakeView], list[BakeView]],
+    positions: tuple[Int[np.ndarray, "t"], Int[np.ndarray, "w"]],
+    mesh: Mesh,
+    config: Config,
+    settings: TextureSettings,
+) -> LightEvidence | None:
+    """Return the light of the video and what validation frames say about it; None if it is not looked for.
+
+    views, positions: of training and validation frames.
+    """
+    if config.light == "kept":
+        return None
+    if not views[1]:
+        warn("there are no validation frames to test the light on: it stays in the diffuse map")
+        return None
+    used = tuple(subsample(part, config.max_frames) for part in positions)
+    return estimate_light(*views, vertex_surface(mesh), mesh.edges(), (used[0], used[1]), settings)
+
+
+def light_metrics(evidence: LightEvidence | None, light: VideoLight) -> dict[str, float]:
+    """Return the figures of the estimated light."""
+    if evidence is None:
+        return {"light_removed": 0.0}
+    return {
+        "light_removed": float(not light.is_uniform),
+        "light_explained": evidence.explained,
+        "light_standard_errors": evidence.standard_errors,
+        "key_light_standard_errors": evidence.key_standard_errors,
+        "gain_log_std": float(np.log(evidence.light.gain).std()),
+    }
+
+
+def light_views(
+    views: list[BakeView],
+    light: VideoLight,
+    positions: Int[np.ndarray, "k"],
+    faces: Int[Tensor, "f 3"],
+    specular: SpecularFit,
+) -> list[BakeView]:
+    """Return views with the shading of their vertices; unchanged under a uniform light of constant exposure."""
+    if light.is_uniform and bool((light.gain == 1.0).all()):
+        return views
+    lobe = (specular.highlights, torch.from_numpy(specular.strength))
+    return [
+        replace(
+            view, shading=light.shade_specular(view.vertices_world, faces, int(position), lobe, view.camera.centre_m())
+        )
+        for view, position in zip(views, positions, strict=True)
+    ]
+
+
+def vertex_surface(mesh: Mesh) -> TexturedSurface:
+    """Return the surface whose texels are the vertices of a mesh."""
+    faces = torch.from_numpy(mesh.faces)
+    count = len(mesh.vertices)
+    return TexturedSurface(faces, faces, torch.zeros(count, 2), texels_at_vertices(mesh.faces, count))
 
 
 def build_atlas(
@@ -162,30 +256,18 @@ def make_texel_inpainter(mesh: Mesh, texels: Texels) -> InpaintFunction:
     return inpaint
 
 
-def bake_specular(
-    train: list[BakeView], validation: list[BakeView], mesh: Mesh, settings: TextureSettings
-) -> tuple[Float[np.ndarray, "v"], float]:
-    """Return the highlight amplitude of each vertex (sRGB in [0, 1], smoothed) and `SpecularFit.partial_r2`."""
-    if not validation:
-        warn("there are no validation frames to test highlights on: the surface is exported as matte")
-        return np.zeros(len(mesh.vertices), dtype=np.float32), 0.0
-    count = len(mesh.vertices)
-    texels = texels_at_vertices(mesh.faces, count)
-    faces = torch.from_numpy(mesh.faces)
-    surface = TexturedSurface(faces, faces, torch.zeros(count, 2), texels)
-    observed, held_out = (observe_vertices(views, surface, settings) for views in (train, validation))
-    fitted = fit_specular(observed, held_out, mesh.edges(), count, settings.specular_min_partial_r2)
-    amplitude, operator = fitted.amplitude.astype(np.float64), laplacian(mesh)
-    for _ in range(SPECULAR_SMOOTHING_STEPS):
-        amplitude = amplitude - 0.5 * (operator @ amplitude)
-    return amplitude.astype(np.float32), fitted.partial_r2
+def fit_highlights(evidence: LightEvidence | None, light: VideoLight, mesh: Mesh) -> SpecularFit:
+    """Return the highlights of the surface; none where no lamp was found, whose highlights they would be."""
+    if evidence is None or light.is_uniform:
+        return SpecularFit(Highlights.none(), np.zeros(len(mesh.vertices), dtype=np.float32), 0.0, 0.0)
+    return fit_specular(evidence.train, evidence.validation, evidence.light, mesh)
 
 
 STAGE = Stage(
     "texture",
-    version=5,
+    version=6,
     needs=("frames", "body", "mesh"),
-    makes=(ATLAS, DIFFUSE, SPECULAR, COVERAGE),
+    makes=(ATLAS, DIFFUSE, SPECULAR, COVERAGE, LIGHT),
     config=Config,
     run=run,
 )

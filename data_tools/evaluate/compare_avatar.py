@@ -241,7 +241,8 @@ def compare_heldout_images(comparison: Comparison) -> dict[str, dict[str, float]
             frame = run.capture.frame_index[position]
             warn(f"held-out frame {frame} is not scored with the true mask of {comparison.folder}: {reason}")
             continue
-        mesh = run.avatar.render(run.avatar.pose_vertices(pose), run.camera, SAMPLES_PER_AXIS)
+        posed = run.avatar.pose_vertices(pose)
+        mesh = run.avatar.render(posed, run.camera, SAMPLES_PER_AXIS, run.avatar.light, position)
         for name, render in {"field": run.field_renderer(pose), "mesh": mesh, "upper_bound": upper_bound_rgba}.items():
             rows[f"{name}_true_mask"].append(frame_scores(render, image, person_mask))
     if "mesh_true_mask" not in rows:

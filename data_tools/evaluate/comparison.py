@@ -14,13 +14,13 @@ from data_tools.evaluate.truth import load_ground_truth
 from data_tools.synthetic.rig.labels import FaceLabels
 from data_tools.synthetic.scene.capture import SyntheticCapture
 from data_tools.synthetic.scene.renderer import pose_vertices
-from data_tools.synthetic.scene.shadow import find_exterior_faces
 from pipeline.avatar.feet import snap_feet_to_floor
 from pipeline.avatar.finished_run import FinishedRun, load_finished_run
 from pipeline.avatar.retarget import retarget_rotations
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.rotation import quaternion_to_matrix
+from pipeline.geometry.shadow_map import find_exterior_faces
 from pipeline.geometry.skinning import forward_kinematics, local_quaternions
 from pipeline.io.image import to_float
 from pipeline.metrics.alignment import SimilarityTransform, align_surfaces_icp

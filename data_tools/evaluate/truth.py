@@ -58,7 +58,7 @@ def load_ground_truth(out: Path) -> SyntheticCapture:
     camera = load_camera(truth / "camera.npz")
     try:
         ground_m = np.array(settings["ground_m"], dtype=np.float64).reshape(3)
-        light = Light(**{**settings["light"], "key_direction": tuple(settings["light"]["key_direction"])})
+        light = Light(**{name: _tuple_of(value) for name, value in settings["light"].items()})
         fps, samples = float(settings["fps"]), int(settings["samples"])
     except (KeyError, TypeError, ValueError):
         raise _damaged_settings_error(out) from None
@@ -74,6 +74,11 @@ def load_ground_truth(out: Path) -> SyntheticCapture:
         samples=samples,
         ball=Ball(ground_m, subject.body.height_m()) if settings.get("ball") else None,
     )
+
+
+def _tuple_of(value: Any) -> Any:
+    """Return a tuple for a list of JSON, other values as they are."""
+    return tuple(value) if isinstance(value, list) else value
 
 
 def read_capture_settings(out: Path) -> dict[str, Any]:

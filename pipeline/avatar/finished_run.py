@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 from torch import Tensor
 
 from pipeline.avatar.textured_avatar import TexturedAvatar
@@ -16,7 +16,9 @@ from pipeline.capture.capture import Capture, load_capture
 from pipeline.field.files import load_field, load_occupancy
 from pipeline.field.rendering import render_field
 from pipeline.field.skin_grid import build_skin_grid, skin_margin_m
+from pipeline.geometry.atlas import Atlas
 from pipeline.geometry.camera import Camera
+from pipeline.geometry.texture_rendering import sample_texture
 from pipeline.mesh.files import load_mesh
 from pipeline.texture.files import load_texture
 
@@ -72,6 +74,7 @@ def load_finished_run(inputs: Mapping[str, Path]) -> FinishedRun:
 def load_textured_avatar(mesh_dir: Path, texture_dir: Path) -> TexturedAvatar:
     """Combine the skinned mesh of the mesh stage with the atlas and diffuse map of the texture stage."""
     skinned, texture = load_mesh(mesh_dir), load_texture(texture_dir)
+    has_highlights = bool(texture.specular.any())
     return TexturedAvatar(
         vertices=torch.from_numpy(skinned.mesh.vertices.astype(np.float32)),
         faces=torch.from_numpy(skinned.mesh.faces.astype(np.int32)),
@@ -80,7 +83,17 @@ def load_textured_avatar(mesh_dir: Path, texture_dir: Path) -> TexturedAvatar:
         uv=torch.from_numpy(texture.atlas.uv.astype(np.float32)),
         faces_uv=torch.from_numpy(texture.atlas.faces_uv.astype(np.int32)),
         diffuse=torch.from_numpy(texture.diffuse),
+        light=texture.light,
+        highlights=texture.highlights if has_highlights else None,
+        specular=vertex_values(texture.specular, texture.atlas, len(skinned.mesh.vertices)) if has_highlights else None,
     )
+
+
+def vertex_values(texture: Float32[np.ndarray, "th tw"], atlas: Atlas, vertex_count: int) -> Float[Tensor, "v"]:
+    """Sample a map with one channel at the vertices: the mean over the corners of a vertex along UV seams."""
+    values = sample_texture(torch.from_numpy(texture)[..., None], torch.from_numpy(atlas.uv))[:, 0]
+    total = torch.zeros(vertex_count).index_add_(0, torch.from_numpy(atlas.vertex_of_uv).long(), values)
+    return total / torch.from_numpy(np.maximum(np.bincount(atlas.vertex_of_uv, minlength=vertex_count), 1)).float()
 
 
 def _make_field_renderer(field_dir: Path, body: Body, camera: Camera) -> PoseRenderer:

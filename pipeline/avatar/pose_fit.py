@@ -16,6 +16,7 @@ from pipeline.avatar.textured_avatar import TexturedAvatar
 from pipeline.body.body import Body, Motion
 from pipeline.body.pose_correction import PoseCorrection
 from pipeline.core.progress import track
+from pipeline.geometry.colour import linear_to_srgb, srgb_to_linear
 from pipeline.geometry.differentiable_raster import face_adjacency, render_shaded
 from pipeline.geometry.texture_rendering import sample_texture
 from pipeline.mesh.views import PosedView, view_losses
@@ -84,15 +85,23 @@ class _AvatarRenderer:
     def __call__(
         self, canonical_to_world: Float[Tensor, "j 4 4"], view: PosedView
     ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
-        """Return premultiplied colours and alpha, differentiable in the pose."""
-        corners = self._avatar.pose_vertices(canonical_to_world)[self._vertex_of_uv]
-        avatar = self._avatar
+        """Return premultiplied colours and alpha, differentiable in the pose; the light moves with the surface."""
+        avatar, vertices = self._avatar, self._avatar.pose_vertices(canonical_to_world)
+        irradiance = avatar.irradiance(vertices.detach())
+        corners = [avatar.uv] if irradiance is None else [avatar.uv, irradiance[self._vertex_of_uv]]
+
+        def shade(attributes: Float[Tensor, "n c"]) -> Float[Tensor, "n 3"]:
+            albedo = sample_texture(self._diffuse, attributes[:, :2])
+            if irradiance is None:
+                return albedo
+            return linear_to_srgb(srgb_to_linear(albedo) * attributes[:, 2:]).clamp(0.0, 1.0)
+
         image, alpha, _ = render_shaded(
-            corners,
+            vertices[self._vertex_of_uv],
             avatar.faces_uv,
             view.camera,
-            avatar.uv,
-            lambda uv: sample_texture(self._diffuse, uv),
+            torch.cat(corners, dim=1),
+            shade,
             self._adjacency,
         )
         return image, alpha

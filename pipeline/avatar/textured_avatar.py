@@ -11,6 +11,7 @@ from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import dense_weights, linear_blend_skinning
 from pipeline.geometry.texture_rendering import render_textured, turntable_cameras
+from pipeline.texture.light import Highlights, VideoLight
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,9 @@ class TexturedAvatar:
         uv: origin bottom-left.
         faces_uv: corners of each face, as indices into `uv`.
         diffuse: sRGB in [0, 1]; row 0 is v = 1.
+        light: of the video; None or uniform if the diffuse texture holds it.
+        highlights: the lobe of the surface under that light; None for a matte surface.
+        specular: linear radiance that a highlight adds at its peak, one per vertex; None for a matte surface.
     """
 
     vertices: Float[Tensor, "v 3"]
@@ -34,6 +38,9 @@ class TexturedAvatar:
     uv: Float[Tensor, "t 2"]
     faces_uv: Int[Tensor, "f 3"]
     diffuse: Float[Tensor, "th tw 3"]
+    light: VideoLight | None = None
+    highlights: Highlights | None = None
+    specular: Float[Tensor, "v"] | None = None
 
     def mesh(self) -> Mesh:
         """Return the canonical mesh without texture and skin."""
@@ -45,23 +52,55 @@ class TexturedAvatar:
         return linear_blend_skinning(self.vertices, weights, canonical_to_world[None])[0]
 
     def render(
-        self, vertices_world: Float[Tensor, "v 3"], camera: Camera, supersampling: int
+        self,
+        vertices_world: Float[Tensor, "v 3"],
+        camera: Camera,
+        supersampling: int,
+        light: VideoLight | None = None,
+        frame: int | None = None,
     ) -> Float[np.ndarray, "h w 4"]:
-        """Render unlit: premultiplied texture colours and coverage, in [0, 1]; see `render_textured`."""
-        image = render_textured(vertices_world, self.faces, self.faces_uv, self.uv, self.diffuse, camera, supersampling)
-        return image.numpy()
+        """Render premultiplied colours and coverage, in [0, 1]; see `render_textured`.
+
+        light: None: unlit. frame: selected frame whose exposure is used; None: the mean exposure.
+        """
+        shading = None
+        if light is not None and not (light.is_uniform and frame is None):
+            shading = self._shade(vertices_world, camera, light, frame)
+        return render_textured(
+            vertices_world, self.faces, self.faces_uv, self.uv, self.diffuse, camera, supersampling, shading
+        ).numpy()
+
+    def _shade(
+        self, vertices_world: Float[Tensor, "v 3"], camera: Camera, light: VideoLight, frame: int | None
+    ) -> Float[Tensor, "v d"]:
+        """Return the irradiance of each vertex and, under the light of the video, its highlight as a fourth column."""
+        if self.highlights is None or self.specular is None or light is not self.light:
+            return light.shade_vertices(vertices_world, self.faces, frame)
+        specular = (self.highlights, self.specular)
+        return light.shade_specular(vertices_world, self.faces, frame, specular, camera.centre_m())
+
+    def irradiance(self, vertices_world: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3"] | None:
+        """Return the irradiance of posed vertices under the light of the video; None if the texture holds it."""
+        if self.light is None or self.light.is_uniform:
+            return None
+        return self.light.shade_vertices(vertices_world, self.faces)
 
     def render_turntable(
-        self, vertices_world: Float[Tensor, "v 3"], views: int, height_px: int, supersampling: int
+        self,
+        vertices_world: Float[Tensor, "v 3"],
+        views: int,
+        height_px: int,
+        supersampling: int,
+        light: VideoLight | None = None,
     ) -> list[UInt8[np.ndarray, "_ _ 4"]]:
         """Render views at evenly spaced azimuths, the first from +Z.
 
         Images are sRGB with straight alpha, cropped horizontally to the body; they share height and scale.
 
-        views: number of images. height_px: of each image.
+        views: number of images. height_px: of each image. light: None: unlit.
         """
         box_m = vertices_world.numpy().min(axis=0), vertices_world.numpy().max(axis=0)
         return [
-            crop_empty_columns(unpremultiply_to_uint8(self.render(vertices_world, camera, supersampling)))
+            crop_empty_columns(unpremultiply_to_uint8(self.render(vertices_world, camera, supersampling, light)))
             for camera in turntable_cameras(*box_m, views, height_px)
         ]

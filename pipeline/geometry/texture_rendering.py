@@ -4,10 +4,12 @@ import math
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from pipeline.geometry.camera import Camera, project
+from pipeline.geometry.colour import linear_to_srgb, srgb_to_linear
 from pipeline.kernels.raster import rasterize
 from pipeline.kernels.texture_sampling import supersample_texture
 from pipeline.kernels.texture_sampling.reference import sample_texture_reference
@@ -33,11 +35,12 @@ def render_textured(
     texture: Float[Tensor, "th tw c"],
     camera: Camera,
     supersampling: int = 3,
+    shading: Float[Tensor, "v d"] | None = None,
 ) -> Float[Tensor, "h w c+1"]:
-    """Render the texture without lighting: colours premultiplied by coverage, then the coverage, all in [0, 1].
+    """Render the texture: colours premultiplied by coverage, then the coverage, all in [0, 1].
 
     Each pixel is the mean of `supersampling` x `supersampling` bilinear samples, which antialiases silhouettes, seams
-    and texels.
+    and texels. The texture is shown without lighting, or shaded in linear RGB by the mean irradiance of the pixel.
 
     Args:
         vertices_world: posed vertices, m.
@@ -47,11 +50,37 @@ def render_textured(
         texture: colours in [0, 1], row 0 at the top.
         camera: the camera.
         supersampling: samples per pixel along each axis.
+        shading: of each vertex, linear; needs a texture with three channels. Three columns: irradiance, 1 shows the
+            texture as it is. A fourth: radiance that is added to all channels.
     """
     fine = camera.scaled(float(supersampling))
     vertices_px, depth_m = project(vertices_world, fine)
     face_id, barycentric, _ = rasterize(vertices_px, depth_m, faces, fine.height, fine.width)
-    return supersample_texture(face_id, barycentric, faces_uv, uv, texture, supersampling)
+    unlit = supersample_texture(face_id, barycentric, faces_uv, uv, texture, supersampling)
+    if shading is None:
+        return unlit
+    samples = interpolate_at_pixels(face_id, barycentric, faces, shading)
+    pooled = torch.nn.functional.avg_pool2d(samples.permute(2, 0, 1), supersampling).permute(1, 2, 0)
+    coverage = unlit[..., 3:]
+    divisor = coverage.clamp(min=1e-6)
+    mean = pooled / divisor
+    linear = srgb_to_linear(unlit[..., :3] / divisor) * mean[..., :3] + mean[..., 3:].sum(dim=-1, keepdim=True)
+    lit = linear_to_srgb(linear.clamp(0.0, 1.0))
+    return torch.cat([lit * coverage, coverage], dim=-1)
+
+
+def interpolate_at_pixels(
+    face_id: Int[Tensor, "h w"],
+    barycentric: Float[Tensor, "h w 3"],
+    faces: Int[Tensor, "f 3"],
+    values: Float[Tensor, "v c"],
+) -> Float[Tensor, "h w c"]:
+    """Interpolate values of vertices at rasterised pixels; 0 where there is no face (`face_id` -1)."""
+    image = torch.zeros(*face_id.shape, values.shape[1], dtype=values.dtype)
+    seen = face_id >= 0
+    corners = values[faces[face_id[seen].long()].long()]
+    image[seen] = (corners * barycentric[seen][..., None]).sum(dim=1)
+    return image
 
 
 def blur_coverage(

@@ -30,11 +30,24 @@ from pipeline.metrics.images import (
 )
 from pipeline.texture.edge_padding import fill_unknown_texels
 from pipeline.texture.settings import TextureSettings
-from pipeline.texture.views import BakeView, align_to_render, pixel_confidence, render_depth
+from pipeline.texture.views import (
+    BakeView,
+    align_to_render,
+    pixel_confidence,
+    remove_light,
+    render_depth,
+    render_shading,
+)
 
 HALF_CONFIDENCE_WEIGHT_RATIO = 0.1
 """A texel whose weight sum is this fraction of the median is blended half and half with the inpainted colour. On a real
 recording a tenth of the texels below it have the background's colour, and a thousandth of the well-observed ones."""
+
+MAX_ALBEDO = 1.2
+"""sRGB; an albedo above 1 is an error of the light, and a limit keeps it from outweighing other frames."""
+
+HIDING = 10.0
+"""Weight of a highlight's radiance against the irradiance: one of 0.1 halves the irradiance that counts."""
 
 InpaintFunction = Callable[[Float[np.ndarray, "t 3"], Float[np.ndarray, "t"]], Float[np.ndarray, "t 3"]]
 """Texel colours and their confidence in [0, 1] -> colours for all texels."""
@@ -113,12 +126,29 @@ def sample_view_at_texels(
 def sample_frame_colours(
     view: BakeView, surface: TexturedSurface, settings: TextureSettings
 ) -> tuple[Float[Tensor, "t 3"], Float[Tensor, "t"]]:
-    """Sample the unaligned colours (sRGB in [0, 1]) of a view at every texel; see `sample_view_at_texels`."""
+    """Sample the unaligned colours (sRGB) of a view at every texel; see `sample_view_at_texels`.
+
+    Colours are those of the frame, or albedos (at most `MAX_ALBEDO`) if the shading of the view is known.
+    """
     depth_m = render_depth(view, surface.faces)
     falloff_px = settings.silhouette_falloff_m / pixel_footprint_m(view.vertices_world, view.camera)
     pixel_weights = pixel_confidence(view.mask, depth_m.numpy(), falloff_px)
     image = view.image.astype(np.float32) / 255.0
-    return sample_view_at_texels(view, surface, image, pixel_weights, depth_m, settings)
+    colour, weight = sample_view_at_texels(view, surface, image, pixel_weights, depth_m, settings)
+    if view.shading is None:
+        return colour, weight
+    shading = surface.texels.interpolate(surface.faces.numpy(), view.shading.numpy())
+    albedo = torch.from_numpy(remove_light(colour.numpy(), shading)).clamp(max=MAX_ALBEDO)
+    return albedo, weight * light_confidence(torch.from_numpy(shading))
+
+
+def light_confidence(shading: Float[Tensor, "*n d"]) -> Float[Tensor, "*n"]:
+    """Return the weight of an albedo that was seen under this shading: about the inverse variance, at most 1.
+
+    Noise of the image and errors of the light are divided by the irradiance; a highlight hides the albedo.
+    """
+    irradiance, highlight = shading[..., :3].mean(dim=-1), shading[..., 3:].sum(dim=-1)
+    return irradiance.clamp(max=1.0) ** 2 * (irradiance / (irradiance + HIDING * highlight)) ** 2
 
 
 def average_views(views: Iterable[BakeView], surface: TexturedSurface, settings: TextureSettings) -> WeightedMean:
@@ -148,8 +178,13 @@ def average_residuals(
         )
         depth_m = render_depth(view, surface.faces)
         pixel_weights = pixel_confidence(warped_mask, depth_m.numpy(), settings.silhouette_falloff_m / pixel_m)
-        residual = warped - rendered[..., :3] / np.maximum(rendered[..., 3:], 1e-3)
+        straight = rendered[..., :3] / np.maximum(rendered[..., 3:], 1e-3)
+        residual = warped - straight
         pixel_weights /= (1.0 + (np.linalg.norm(residual, axis=2) / settings.geman_mcclure_scale) ** 2) ** 2
+        if view.shading is not None:
+            shading = render_shading(view, surface.faces)
+            residual = remove_light(warped, shading) - remove_light(straight, shading)
+            pixel_weights *= light_confidence(torch.from_numpy(shading)).numpy()
         mean.add(*sample_view_at_texels(view, surface, residual, pixel_weights, depth_m, settings))
     return mean
 
@@ -157,7 +192,7 @@ def average_residuals(
 def render_textured_view(
     texture: Float[np.ndarray, "s s 3"], view: BakeView, surface: TexturedSurface
 ) -> Float[np.ndarray, "h w 4"]:
-    """Render the textured mesh in the pose of a view: premultiplied colour and alpha, in [0, 1]."""
+    """Render the textured mesh in the pose and light of a view: premultiplied colour and alpha, in [0, 1]."""
     return render_textured(
         view.vertices_world,
         surface.faces,
@@ -166,6 +201,7 @@ def render_textured_view(
         torch.from_numpy(texture),
         view.camera,
         supersampling=2,
+        shading=view.shading,
     ).numpy()
 
 
@@ -196,7 +232,7 @@ def bake_diffuse(
     )
     texel_confidence = weight_confidence(initial.weight, half_confidence_weight)
     inpainted = torch.from_numpy(inpaint(initial.value().numpy(), texel_confidence.numpy()))
-    colour = torch.lerp(inpainted, initial.value(), texel_confidence[:, None])
+    colour = torch.lerp(inpainted, initial.value(), texel_confidence[:, None]).clamp(0.0, 1.0)
     for number in range(rounds):
         texture = texels_to_texture(colour, surface.texels)
         label = f"texture: round {number + 1}/{rounds}"

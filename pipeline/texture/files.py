@@ -11,8 +11,10 @@ from pipeline.core.errors import UserError
 from pipeline.geometry.atlas import Atlas
 from pipeline.io.image import read_gray, read_rgb_float, to_uint8, to_uint16, write_gray, write_rgb
 from pipeline.io.npz import load_npz, save_npz
+from pipeline.texture.light import Highlights, VideoLight, load_light, save_light
 
 ATLAS, DIFFUSE, SPECULAR, COVERAGE = "atlas.npz", "diffuse.png", "specular.png", "coverage.png"
+LIGHT = "light.npz"
 TextureFormat = Literal["png8", "png16", "exr"]
 
 
@@ -23,14 +25,18 @@ class TextureArtifact:
     Attributes:
         atlas: UV layout of the mesh.
         diffuse: sRGB in [0, 1], gutters filled.
-        specular: what a highlight adds to the diffuse colour, sRGB in [0, 1]; all 0 for a matte surface.
+        specular: linear radiance that a highlight adds at its peak, in [0, 1]; all 0 for a matte surface.
         coverage: confidence that the video shows the texel, 0 to 255; 0 outside the charts.
+        light: of the video. Uniform: the diffuse map holds the light; else it is the albedo.
+        highlights: the lobe of the specular map.
     """
 
     atlas: Atlas
     diffuse: Float32[np.ndarray, "s s 3"]
     specular: Float32[np.ndarray, "s s"]
     coverage: UInt8[np.ndarray, "s s"]
+    light: VideoLight
+    highlights: Highlights
 
 
 def save_texture(folder: Path, texture: TextureArtifact, texture_format: TextureFormat = "png8") -> None:
@@ -46,6 +52,7 @@ def save_texture(folder: Path, texture: TextureArtifact, texture_format: Texture
         if texture_format == "exr":
             write((folder / name).with_suffix(".exr"), values)
     write_gray(folder / COVERAGE, texture.coverage)
+    save_light(folder / LIGHT, texture.light, texture.highlights)
 
 
 def map_files(folder: Path, name: str) -> list[Path]:
@@ -67,4 +74,5 @@ def load_texture(folder: Path) -> TextureArtifact:
         raise UserError(f"{folder / ATLAS} lacks the array {error}; run `python -m stages.texture` again") from None
     diffuse = read_rgb_float(map_files(folder, DIFFUSE)[-1])
     specular = read_rgb_float(map_files(folder, SPECULAR)[-1])[..., 0]
-    return TextureArtifact(atlas, diffuse, np.ascontiguousarray(specular), read_gray(folder / COVERAGE))
+    coverage, (light, highlights) = read_gray(folder / COVERAGE), load_light(folder / LIGHT)
+    return TextureArtifact(atlas, diffuse, np.ascontiguousarray(specular), coverage, light, highlights)

@@ -11,7 +11,7 @@ _POSITIVE = ("silhouette_falloff_m", "depth_tolerance_m", "geman_mcclure_scale",
 
 @dataclass(frozen=True)
 class TextureSettings:
-    """Settings of the atlas, the diffuse bake and the specular fit.
+    """Settings of the atlas and the diffuse bake.
 
     Raises:
         ValueError: a value is outside its range.
@@ -26,8 +26,6 @@ class TextureSettings:
         geman_mcclure_scale: residual norm (sRGB in [0, 1]) at which a pixel has a quarter of its weight.
         texels_per_pixel: texels along the side of one pixel's footprint on the person.
         padding_px: smallest gutter between charts, texels.
-        specular_min_partial_r2: smallest share of the validation error that highlights must explain, in [0, 1];
-            below it the surface is matte. Pose errors alone explained 5.5 % of a matte recording.
     """
 
     cosine_power: float = 2.0
@@ -38,7 +36,6 @@ class TextureSettings:
     geman_mcclure_scale: float = 0.3
     texels_per_pixel: float = 1.5
     padding_px: int = 4
-    specular_min_partial_r2: float = 0.1
 
     def __post_init__(self) -> None:
         for name in _NON_NEGATIVE:
@@ -47,8 +44,6 @@ class TextureSettings:
         for name in _POSITIVE:
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} = {getattr(self, name)} must be above 0")
-        if not 0 <= self.specular_min_partial_r2 <= 1:
-            raise ValueError(f"specular_min_partial_r2 = {self.specular_min_partial_r2} must be between 0 and 1")
 
 
 DEFAULT_SETTINGS = TextureSettings()

@@ -1,52 +1,46 @@
-"""Separate specular highlights from diffuse shading in the video: the specular map.
+"""Specular highlights of the video: one lobe, and its strength at each vertex.
 
-Notation: c residual colour of a vertex in a frame (observation minus the mean over frames), a mean colour of the
-vertex, n world normal, r world reflection direction of the view. Camera and lights are static while the person turns:
-    c = a * (E(n) - mean E) + s * (L(r) - mean L),
-where E (diffuse shading, scales the colour) and L (specular lobe, adds light) are shared by all vertices and expanded
-in spherical harmonics without the constant term, and s >= 0 is the specular strength of each vertex. This is the split
-of nerf2mesh into diffuse colour and specular features (Tang et al., "Delicate textured mesh recovery from NeRF", 2023)
-with a linear lobe instead of a network, so that alternating least squares solves it. s is grey, because dielectrics
-reflect light without colouring it. The split is kept only if it reduces the error on validation frames; otherwise the
-surface is matte.
+Camera and lamps are static while the person turns. The linear colour of a vertex in a frame, divided by the gain, is
+
+    y = albedo * E(n) + s * D,    D = v max(0, n . h)^p  where the surface faces the lamp,
+
+the reflection model of Blinn ("Models of light reflection for computer synthesized pictures", 1977) with the half
+vector h between the lamp and the camera. E is known (`pipeline.texture.light`); direction of the lamp and exponent p
+are those that explain most, the strength s >= 0 of a vertex follows from linear regression, with its albedo eliminated.
+Highlights are grey, because dielectrics reflect light without colouring it, and they are kept only if they predict
+validation frames: errors of pose and normals change the colour of a vertex with the view as well.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.sparse import eye_array
 
 from pipeline.geometry.atlas import Texels
-from pipeline.geometry.colour import srgb_to_linear
-from pipeline.geometry.mesh import area_weighted_vertex_normals
-from pipeline.texture.bake import TexturedSurface, sample_frame_colours
-from pipeline.texture.settings import TextureSettings
-from pipeline.texture.views import BakeView
+from pipeline.geometry.colour import linear_to_srgb, srgb_to_linear
+from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.surface import laplacian
+from pipeline.texture.key_light import SEARCH_REFINEMENTS_RAD, directions_around, search_directions
+from pipeline.texture.light import Highlights, VideoLight
+from pipeline.texture.light_evidence import standard_errors
+from pipeline.texture.light_fit import ViewObservations
 
-ALTERNATING_LEAST_SQUARES_ITERATIONS = 8
-RIDGE_WEIGHT = 1e-3
+EXPONENTS = (12.0, 24.0, 48.0, 96.0)
+"""Candidates of p: roughness 0.61 to 0.38. Errors of the irradiance look like wider lobes."""
+
+MAX_LAMP_ANGLE_RAD = 0.8
+
 ALBEDO_CONTRAST_SCALE = 0.05
-TINT_PENALTY = 4.0
+SMOOTHING_STEPS = 6
+RIDGE_FRACTION = 0.003
+"""Ridge of the strength, relative to the lobe's power at well-observed vertices of uniform albedo."""
 
+MIN_LINEAR = 0.02
+"""Linear colour below which noise does not fall any more."""
 
-@dataclass(frozen=True)
-class VertexObservations:
-    """Observed vertices, one row per vertex and frame.
-
-    Attributes:
-        vertex: index of the vertex.
-        colour: sRGB in [0, 1].
-        weight: of the observation, > 0.
-        normal: unit vertex normal, world.
-        reflection_direction: view direction mirrored at the normal, unit, world.
-    """
-
-    vertex: Int[np.ndarray, "k"]
-    colour: Float[np.ndarray, "k 3"]
-    weight: Float[np.ndarray, "k"]
-    normal: Float[np.ndarray, "k 3"]
-    reflection_direction: Float[np.ndarray, "k 3"]
+MIN_EXPLAINED, MIN_STANDARD_ERRORS = 0.15, 2.0
+"""What highlights must explain of the squared error of validation frames."""
 
 
 @dataclass(frozen=True)
@@ -54,13 +48,17 @@ class SpecularFit:
     """Result of the specular fit.
 
     Attributes:
-        amplitude: what a highlight adds to the colour of a vertex, sRGB in [0, 1]; all 0 if `partial_r2` is too small.
-        partial_r2: fraction of the squared validation error after diffuse shading that highlights explain; at most 1,
-            negative if they increase the error.
+        highlights: the lobe.
+        strength: linear radiance that a highlight adds to each vertex at its peak; all 0 for a matte surface.
+        explained: fraction of the squared error of validation frames that highlights explain; negative if they
+            increase it.
+        standard_errors: mean decrease of that error over frames, divided by its standard error.
     """
 
-    amplitude: Float[np.ndarray, "v"]
-    partial_r2: float
+    highlights: Highlights
+    strength: Float[np.ndarray, "v"]
+    explained: float
+    standard_errors: float
 
 
 def texels_at_vertices(faces: Int[np.ndarray, "f 3"], vertex_count: int) -> Texels:
@@ -75,219 +73,174 @@ def texels_at_vertices(faces: Int[np.ndarray, "f 3"], vertex_count: int) -> Texe
     return Texels(vertex_count, zeros, vertices.astype(np.int32), (first // 3).astype(np.int32), barycentric)
 
 
-def observe_vertices(
-    views: Iterable[BakeView], surface: TexturedSurface, settings: TextureSettings
-) -> VertexObservations:
-    """Sample the colours of all vertices in all views that show them.
+def fit_specular(train: ViewObservations, validation: ViewObservations, light: VideoLight, mesh: Mesh) -> SpecularFit:
+    """Fit one lobe and its strength at each vertex to training views, and test them on validation views.
 
-    surface: its `texels` must come from `texels_at_vertices`.
+    light: with or without shadows of a key light.
     """
-    parts = []
-    vertices = surface.texels.columns
-    for view in views:
-        colour, weight = sample_frame_colours(view, surface, settings)
-        visible = (weight > 0).numpy()
-        normal = area_weighted_vertex_normals(view.vertices_world, surface.faces).numpy()[vertices[visible]]
-        to_camera = view.camera.centre_m() - view.vertices_world.numpy()[vertices[visible]]
-        to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
-        reflection_direction = 2.0 * np.sum(normal * to_camera, axis=1, keepdims=True) * normal - to_camera
-        parts.append(
-            (
-                vertices[visible],
-                colour.numpy()[visible],
-                weight.numpy()[visible],
-                normal,
-                reflection_direction.astype(np.float32),
-            )
-        )
-    return VertexObservations(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+    count, edges = len(mesh.vertices), mesh.edges()
+    fitted, tested = (_Regression.of_views(each, light) for each in (train, validation))
+    uniformity = albedo_uniformity(linear_to_srgb(fitted.albedo(count, 0.0)), edges)
+    fitted, tested = (each.weighted(uniformity[each.vertex]) for each in (fitted, tested))
+    highlights = find_lobe(fitted, light, count)
+    power, products = fitted.normal_equations(highlights, count)
+    strength = _smooth(power, products.min(axis=1), mesh)
+    without = tested.squared_errors(highlights, np.zeros(count), fitted.albedo(count, 0.0))
+    lobe = fitted.lobe(highlights) * strength[fitted.vertex]
+    with_lobe = tested.squared_errors(highlights, strength, fitted.albedo(count, lobe))
+    explained = 1.0 - float(with_lobe.sum() / max(without.sum(), 1e-12))
+    errors = standard_errors(without - with_lobe)
+    if explained < MIN_EXPLAINED or errors < MIN_STANDARD_ERRORS:
+        strength = np.zeros(count)
+    return SpecularFit(highlights, strength.astype(np.float32), explained, errors)
 
 
-def real_spherical_harmonics(directions: Float[np.ndarray, "k 3"], degree: int) -> Float[np.ndarray, "k m"]:
-    """Evaluate real spherical harmonics up to a degree without the constant; m = 8 for degree 2, 15 for degree 3.
+def find_lobe(fitted: "_Regression", light: VideoLight, vertex_count: int) -> Highlights:
+    """Return the direction and the exponent that explain most of the training views.
 
-    The functions are orthogonal, not normalised. Degree 2 holds 99 % of the energy of diffuse shading (Ramamoorthi and
-    Hanrahan, "An efficient representation for irradiance environment maps", 2001).
-
-    directions: unit vectors. degree: 2 or 3.
+    The key light is the lamp where its shadows are known; otherwise directions are tried within `MAX_LAMP_ANGLE_RAD` of
+    that from which most light comes: errors of normals look like highlights of lamps that give no light.
     """
-    x, y, z = directions.T
-    terms = [x, y, z, x * y, y * z, 3.0 * z * z - 1.0, x * z, x * x - y * y]
-    if degree >= 3:
-        terms += [
-            y * (3.0 * x * x - y * y),
-            x * y * z,
-            y * (5.0 * z * z - 1.0),
-            z * (5.0 * z * z - 3.0),
-            x * (5.0 * z * z - 1.0),
-            z * (x * x - y * y),
-            x * (x * x - 3.0 * y * y),
-        ]
-    return np.stack(terms, axis=1)
+    directions = light.key_direction[None]
+    if not light.casts_shadows:
+        directions = search_directions()
+        directions = directions[directions @ light.dominant_direction() > np.cos(MAX_LAMP_ANGLE_RAD)]
+    candidates = [Highlights(direction, exponent) for direction in directions for exponent in EXPONENTS]
+    best = max(candidates, key=lambda each: fitted.explained(each, vertex_count))
+    for angle_rad in () if light.casts_shadows else SEARCH_REFINEMENTS_RAD:
+        near = directions_around(best.direction, angle_rad)
+        near = near[near @ light.dominant_direction() > np.cos(MAX_LAMP_ANGLE_RAD)]
+        around = [replace(best, direction=each) for each in near]
+        best = max([best, *around], key=lambda each: fitted.explained(each, vertex_count))
+    sharper = [replace(best, exponent=exponent) for exponent in EXPONENTS]
+    return max(sharper, key=lambda each: fitted.explained(each, vertex_count))
 
 
 @dataclass(frozen=True)
-class _RegressionTerms:
-    """Left and right side of the regression for a set of observations, centred per vertex."""
+class _Regression:
+    """Rows of the model equation of the module docstring.
 
-    residual: Float[np.ndarray, "k 3"]
-    shading_basis: Float[np.ndarray, "k 8"]
-    lobe_basis: Float[np.ndarray, "k 15"]
+    Attributes:
+        vertex, view: of each row.
+        linear: y. irradiance: E. visibility: v of the key light.
+        normal, to_camera: unit, world.
+        weight: inverse variance of `linear`.
+    """
 
+    vertex: Int[np.ndarray, "k"]
+    view: Int[np.ndarray, "k"]
+    linear: Float[np.ndarray, "k 3"]
+    irradiance: Float[np.ndarray, "k 3"]
+    visibility: Float[np.ndarray, "k"]
+    normal: Float[np.ndarray, "k 3"]
+    to_camera: Float[np.ndarray, "k 3"]
+    weight: Float[np.ndarray, "k"]
 
-class _CentredModel:
-    """Makes regression terms relative to the weighted means of each vertex over the training frames."""
-
-    def __init__(self, train: VertexObservations, vertex_count: int) -> None:
-        self.albedo = _vertex_means(train, train.colour, vertex_count)
-        self._shading_mean = _vertex_means(train, real_spherical_harmonics(train.normal, 2), vertex_count)
-        self._lobe_mean = _vertex_means(train, real_spherical_harmonics(train.reflection_direction, 3), vertex_count)
-
-    def terms(self, observations: VertexObservations) -> _RegressionTerms:
-        vertex = observations.vertex
-        return _RegressionTerms(
-            observations.colour - self.albedo[vertex],
-            real_spherical_harmonics(observations.normal, 2) - self._shading_mean[vertex],
-            real_spherical_harmonics(observations.reflection_direction, 3) - self._lobe_mean[vertex],
+    @staticmethod
+    def of_views(observed: ViewObservations, light: VideoLight) -> "_Regression":
+        rows = observed.rows
+        linear = srgb_to_linear(rows.colour.astype(np.float64)) / observed.gain[rows.frame, None]
+        to_camera = np.zeros_like(linear)
+        for number, view in enumerate(observed.views):
+            here = rows.frame == number
+            to_camera[here] = view.camera.centre_m() - view.vertices_world.numpy()[rows.vertex[here]]
+        to_camera /= np.maximum(np.linalg.norm(to_camera, axis=1, keepdims=True), 1e-9)
+        irradiance = light.irradiance(rows.normal, observed.visibility).astype(np.float64)
+        weight = rows.weight / (linear.mean(axis=1) + MIN_LINEAR)
+        return _Regression(
+            rows.vertex, rows.frame, linear, irradiance, observed.visibility, rows.normal, to_camera, weight
         )
 
+    def weighted(self, factor: np.ndarray) -> "_Regression":
+        return replace(self, weight=self.weight * factor)
 
-@dataclass(frozen=True)
-class _SpecularModel:
-    """Solved coefficients: E and L of the module docstring, and s of each vertex."""
+    def lobe(self, highlights: Highlights) -> np.ndarray:
+        return highlights.lobe(self.normal, self.to_camera, self.visibility)
 
-    shading_coefficients: Float[np.ndarray, "8"]
-    lobe_coefficients: Float[np.ndarray, "15"]
-    strength: Float[np.ndarray, "v"]
+    def albedo(self, count: int, highlight: np.ndarray | float) -> Float[np.ndarray, "v 3"]:
+        """Return the linear albedo of each vertex under known highlights (one a row)."""
+        diffuse = self.linear - np.reshape(highlight, (-1, 1))
+        above, below = (
+            np.stack([np.bincount(self.vertex, self.weight * c, count) for c in (self.irradiance * each).T], axis=1)
+            for each in (diffuse, self.irradiance)
+        )
+        return np.maximum(above / np.maximum(below, 1e-12), 0.0)
 
+    def _eliminated(self, values: np.ndarray, count: int) -> np.ndarray:
+        """Return what is left of one value a row after the best multiple of E at each vertex."""
+        shading = self.irradiance.mean(axis=1)
+        above = np.bincount(self.vertex, self.weight * shading * values, count)
+        below = np.bincount(self.vertex, self.weight * shading**2, count)
+        return values - (above / np.maximum(below, 1e-12))[self.vertex] * shading
 
-def fit_specular(
-    train: VertexObservations,
-    validation: VertexObservations,
-    edges: Int[np.ndarray, "e 2"],
-    vertex_count: int,
-    min_partial_r2: float,
-) -> SpecularFit:
-    """Fit diffuse shading and highlights to training frames and test them on validation frames.
+    def normal_equations(self, highlights: Highlights, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the power of the lobe at each vertex, and its products with the three channels."""
+        lobe = self._eliminated(self.lobe(highlights), count)
+        power = np.bincount(self.vertex, self.weight * lobe**2, count)
+        return power, np.stack(
+            [np.bincount(self.vertex, self.weight * lobe * channel, count) for channel in self.linear.T], axis=1
+        )
 
-    A wrong pose changes the colour of a vertex with the view as a highlight does, and this generalises to other frames:
-    on a real recording the hem of a shirt and a print were the strongest "highlights". Only colourless changes on
-    surface parts of uniform albedo are therefore used.
+    def explained(self, highlights: Highlights, count: int) -> float:
+        """Return by how much grey highlights of strength >= 0 reduce the weighted squared error."""
+        power, products = self.normal_equations(highlights, count)
+        product = np.maximum(products.min(axis=1), 0.0)
+        return float(np.sum(product**2 / (power + _ridge(power))))
 
-    edges: of the mesh. min_partial_r2: smallest `SpecularFit.partial_r2` at which highlights are kept.
-    """
-    model = _CentredModel(train, vertex_count)
-    uniformity = albedo_uniformity(model.albedo, edges)
-    train = replace(train, weight=(train.weight * uniformity[train.vertex]).astype(np.float32))
-    validation = replace(validation, weight=(validation.weight * uniformity[validation.vertex]).astype(np.float32))
-    solved = _alternate_least_squares(train, model.terms(train), model.albedo, vertex_count)
-    partial_r2 = _partial_r2(model.terms(validation), validation, model.albedo, solved)
-    lobe_range = np.ptp(
-        np.percentile(real_spherical_harmonics(train.reflection_direction, 3) @ solved.lobe_coefficients, [1.0, 99.0])
-    )
-    is_specular = partial_r2 >= min_partial_r2
-    amplitude = np.clip(solved.strength * lobe_range, 0.0, 1.0) if is_specular else np.zeros(vertex_count)
-    return SpecularFit(amplitude.astype(np.float32), float(partial_r2))
+    def squared_errors(
+        self, highlights: Highlights, strength: np.ndarray, albedo: np.ndarray
+    ) -> Float[np.ndarray, "n"]:
+        """Return the weighted mean squared error of each view."""
+        predicted = albedo[self.vertex] * self.irradiance + (strength[self.vertex] * self.lobe(highlights))[:, None]
+        known = albedo.any(axis=1)[self.vertex]
+        squared = self.weight * known * np.sum((self.linear - predicted) ** 2, axis=1)
+        views = int(self.view.max(initial=-1)) + 1
+        total = np.bincount(self.view, self.weight * known, views)
+        return np.bincount(self.view, squared, views) / np.maximum(total, 1e-12)
 
 
 def dielectric_specular_factor(
-    amplitude: Float[np.ndarray, "*n"], base: Float[np.ndarray, "*n 3"], roughness: float
+    strength: Float[np.ndarray, "*n"], roughness: float, lamp_irradiance: float
 ) -> Float[np.ndarray, "*n"]:
-    """Return glTF's specular factor, in [0, 1], of a dielectric that shows highlights of this amplitude.
+    """Return glTF's specular factor, in [0, 1], of a dielectric that shows highlights of this strength.
 
     glTF's microfacet model (specification, appendix B; alpha = roughness^2) reflects 4 % of the light along the normal.
     At the peak of a highlight, where D = 1 / (pi alpha^2) and V = 1/4, the added radiance is
-    pi * 0.04 * D * V = 0.01 / alpha^2 under a light that renders a white diffuse surface as 1. The real lights are
-    unknown: such a light is assumed. The factor is clipped at 1, since few dielectrics reflect more.
+    pi * 0.04 * D * V = 0.01 / alpha^2 under a lamp that renders a white diffuse surface as 1. The factor is clipped at
+    1, since few dielectrics reflect more.
 
     Args:
-        amplitude: added to `base`, sRGB in [0, 1].
-        base: diffuse colour, sRGB in [0, 1].
+        strength: linear radiance at the peak of the highlight.
         roughness: glTF's, in [0, 1].
+        lamp_irradiance: of a surface that faces the lamp; 1 renders a white diffuse surface as 1.
     """
-    added = (srgb_to_linear(base + amplitude[..., None]) - srgb_to_linear(base)).mean(axis=-1)
-    return np.clip(added * roughness**4 / 0.01, 0.0, 1.0)
+    return np.clip(strength * roughness**4 / (0.01 * lamp_irradiance), 0.0, 1.0)
+
+
+def _ridge(power: np.ndarray) -> float:
+    """Return the regularisation of s: a fraction of the power at well-observed vertices of uniform albedo."""
+    return max(RIDGE_FRACTION * float(np.quantile(power, 0.95)), 1e-12)
+
+
+def _smooth(power: np.ndarray, product: np.ndarray, mesh: Mesh) -> Float[np.ndarray, "v"]:
+    """Return s >= 0: power and product are pooled over the neighbourhood, and s is shrunk where the lobe is weak.
+
+    A vertex whose highlight no frame shows stays matte.
+    """
+    ridge, mixing = _ridge(power), eye_array(len(power)) - 0.5 * laplacian(mesh)
+    for _ in range(SMOOTHING_STEPS):
+        power, product = mixing @ power, mixing @ product
+    return np.clip(np.maximum(product, 0.0) / (power + ridge), 0.0, 1.0)
 
 
 def albedo_uniformity(albedo: Float[np.ndarray, "v 3"], edges: Int[np.ndarray, "e 2"]) -> Float[np.ndarray, "v"]:
-    """Return how uniform the albedo is around each vertex, in (0, 1].
+    """Return how uniform the albedo (sRGB) is around each vertex, in (0, 1].
 
-    1 where all neighbours have the same colour; 1/4 where the largest difference of a channel is
-    `ALBEDO_CONTRAST_SCALE` (Geman-McClure weight).
+    A wrong pose changes the colour of a vertex next to an edge of the albedo as a highlight does. 1 where all
+    neighbours have the same colour; 1/4 where the largest difference of a channel is `ALBEDO_CONTRAST_SCALE`
+    (Geman-McClure weight).
     """
     difference = np.abs(albedo[edges[:, 0]] - albedo[edges[:, 1]]).max(axis=1)
     largest = np.zeros(len(albedo))
     np.maximum.at(largest, edges.ravel(), np.repeat(difference, 2))
     return 1.0 / (1.0 + (largest / ALBEDO_CONTRAST_SCALE) ** 2) ** 2
-
-
-def _vertex_means(train: VertexObservations, values: np.ndarray, vertex_count: int) -> np.ndarray:
-    """Return the weighted mean of the columns of `values` at each vertex; 0 without observations."""
-    total = np.maximum(np.bincount(train.vertex, train.weight, vertex_count), 1e-9)
-    columns = [np.bincount(train.vertex, train.weight * column, vertex_count) for column in values.T]
-    return np.stack(columns, axis=1) / total[:, None]
-
-
-def _alternate_least_squares(
-    train: VertexObservations, terms: _RegressionTerms, albedo: np.ndarray, vertex_count: int
-) -> _SpecularModel:
-    """Solve for E, L and s in turn."""
-    vertex = train.vertex
-    highlights = np.zeros_like(terms.residual)
-    strength = np.ones(vertex_count)
-    for _ in range(ALTERNATING_LEAST_SQUARES_ITERATIONS):
-        shading_coefficients = _solve_shared_coefficients(
-            terms.shading_basis, albedo[vertex], terms.residual - highlights, train.weight
-        )
-        unexplained = terms.residual - (terms.shading_basis @ shading_coefficients)[:, None] * albedo[vertex]
-        strength_per_channel = np.repeat(strength[vertex, None], 3, axis=1)
-        lobe_coefficients = _solve_shared_coefficients(
-            terms.lobe_basis, strength_per_channel, unexplained, train.weight
-        )
-        # Fix the scale of L: otherwise the ridge term shrinks s and L grows to compensate, in every iteration.
-        lobe_coefficients /= max(
-            float(np.sqrt(np.average((terms.lobe_basis @ lobe_coefficients) ** 2, weights=train.weight))), 1e-9
-        )
-        lobe_value = terms.lobe_basis @ lobe_coefficients
-        strength = _solve_vertex_strengths(train, lobe_value, unexplained, vertex_count)
-        highlights = np.repeat((lobe_value * strength[vertex])[:, None], 3, axis=1)
-    return _SpecularModel(shading_coefficients, lobe_coefficients, strength)
-
-
-def _solve_shared_coefficients(
-    basis: np.ndarray, scale: np.ndarray, target: np.ndarray, weight: np.ndarray
-) -> Float[np.ndarray, "m"]:
-    """Return the coefficients x that minimise sum w |scale * (basis x) - target|^2, with a ridge term."""
-    power = weight * np.sum(scale**2, axis=1)
-    matrix = (basis * power[:, None]).T @ basis
-    right_hand_side = basis.T @ (weight * np.sum(scale * target, axis=1))
-    ridge = RIDGE_WEIGHT * np.trace(matrix) / len(matrix) * np.eye(len(matrix))
-    return np.linalg.solve(matrix + ridge, right_hand_side)
-
-
-def _solve_vertex_strengths(
-    train: VertexObservations, lobe_value: np.ndarray, unexplained: np.ndarray, vertex_count: int
-) -> Float[np.ndarray, "v"]:
-    """Return s >= 0 of each vertex for a fixed lobe.
-
-    A ridge term and a tint penalty shrink s where observations are few, the lobe is weak, or the change is coloured.
-    """
-    power = np.bincount(train.vertex, train.weight * lobe_value**2, vertex_count)
-    right_hand_side = np.stack(
-        [np.bincount(train.vertex, train.weight * lobe_value * c, vertex_count) for c in unexplained.T], axis=1
-    )
-    ridge = np.median(power[power > 0]) if np.any(power > 0) else 1.0
-    channels = right_hand_side / (power + ridge)[:, None]
-    mean_strength = np.maximum(channels.mean(axis=1), 0.0)
-    tint = np.sum((channels - mean_strength[:, None]) ** 2, axis=1)
-    return mean_strength**3 / np.maximum(mean_strength**2 + TINT_PENALTY * tint, 1e-12)
-
-
-def _partial_r2(
-    terms: _RegressionTerms, observations: VertexObservations, albedo: np.ndarray, solved: _SpecularModel
-) -> float:
-    vertex, weight = observations.vertex, observations.weight[:, None]
-    unexplained = terms.residual - (terms.shading_basis @ solved.shading_coefficients)[:, None] * albedo[vertex]
-    remaining = unexplained - (terms.lobe_basis @ solved.lobe_coefficients * solved.strength[vertex])[:, None]
-    before = float(np.sum(weight * unexplained**2))
-    return 1.0 - float(np.sum(weight * remaining**2)) / before if before > 0 else 0.0

@@ -10,8 +10,11 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from pipeline.geometry.camera import Camera, pixel_footprint_m, project
+from pipeline.geometry.colour import linear_to_srgb, srgb_to_linear
 from pipeline.geometry.mesh import area_weighted_vertex_normals
+from pipeline.geometry.texture_rendering import interpolate_at_pixels
 from pipeline.kernels.raster import rasterize
+from pipeline.texture.light import MIN_IRRADIANCE
 
 MIN_FOREGROUND_ALPHA = 0.9
 """From this alpha on, a pixel shows the person only."""
@@ -33,6 +36,8 @@ class BakeView:
         vertices_world: the posed mesh, m.
         view_cosine: cosine between each vertex normal and the direction to the camera.
         weight: of the whole frame; 1 for the median frame.
+        shading: of each vertex, linear: irradiance (RGB, relative to the mean of the video), and the radiance of its
+            highlight where the surface has any. None: colours are taken as they are.
     """
 
     image: UInt8[np.ndarray, "h w 3"]
@@ -41,6 +46,7 @@ class BakeView:
     vertices_world: Float[Tensor, "v 3"]
     view_cosine: Float[Tensor, "v"]
     weight: float = 1.0
+    shading: Float[Tensor, "v d"] | None = None
 
 
 def crop_bake_view(
@@ -113,6 +119,27 @@ def render_depth(view: BakeView, faces: Int[Tensor, "f 3"]) -> Float[Tensor, "h 
     """Return the depth (m) of the posed mesh at every pixel of the view; inf outside the mesh."""
     vertices_px, depth_m = project(view.vertices_world, view.camera)
     return rasterize(vertices_px, depth_m, faces, view.camera.height, view.camera.width)[2]
+
+
+def render_shading(view: BakeView, faces: Int[Tensor, "f 3"]) -> Float[np.ndarray, "h w d"]:
+    """Return the shading of a view at every pixel; 1 outside the mesh.
+
+    Raises:
+        ValueError: the view has no shading.
+    """
+    if view.shading is None:
+        raise ValueError("the view has no shading")
+    vertices_px, depth_m = project(view.vertices_world, view.camera)
+    face_id, barycentric, _ = rasterize(vertices_px, depth_m, faces, view.camera.height, view.camera.width)
+    shading = interpolate_at_pixels(face_id, barycentric, faces, view.shading).numpy()
+    shading[face_id.numpy() < 0] = 1.0
+    return shading
+
+
+def remove_light(colour: Float[np.ndarray, "*n 3"], shading: Float[np.ndarray, "*n d"]) -> Float[np.ndarray, "*n 3"]:
+    """Return the albedo (sRGB, at least 0) of surfaces that have this colour (sRGB in [0, 1]) under this shading."""
+    diffuse = srgb_to_linear(np.maximum(colour, 0.0)) - shading[..., 3:].sum(axis=-1, keepdims=True)
+    return linear_to_srgb(np.maximum(diffuse, 0.0) / np.maximum(shading[..., :3], MIN_IRRADIANCE)).astype(np.float32)
 
 
 def align_to_render(

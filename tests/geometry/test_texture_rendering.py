@@ -105,3 +105,18 @@ def test_a_blurred_outline_has_the_given_blur_and_the_colours_of_the_surface():
 def test_a_blur_of_zero_returns_the_image():
     image = np.random.default_rng(0).random((9, 9, 4)).astype(np.float32)
     assert blur_coverage(image, 0.0) is image
+
+
+def test_shading_multiplies_and_adds_in_linear_rgb() -> None:
+    """A grey square under irradiance 0.5, and with radiance 0.1 added; coverage does not change."""
+    texture, camera = torch.full((4, 4, 3), 0.5), square_camera(8)
+    linear = ((0.5 + 0.055) / 1.055) ** 2.4
+    plain = render_textured(SQUARE, FACES, FACES, UV, texture, camera)
+    for shading, expected in (
+        (torch.tensor([[0.5, 1.0, 0.25]]), [0.5 * linear, linear, 0.25 * linear]),
+        (torch.tensor([[0.5, 1.0, 0.25, 0.1]]), [0.5 * linear + 0.1, linear + 0.1, 0.25 * linear + 0.1]),
+    ):
+        lit = render_textured(SQUARE, FACES, FACES, UV, texture, camera, shading=shading.expand(4, -1))
+        srgb = 1.055 * torch.tensor(expected) ** (1 / 2.4) - 0.055
+        assert torch.allclose(lit[2:-2, 2:-2, :3], srgb.expand(4, 4, 3), atol=1e-5)
+        assert torch.equal(lit[..., 3], plain[..., 3])

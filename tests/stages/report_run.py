@@ -24,6 +24,7 @@ from pipeline.geometry.skinning import top_k_weights
 from pipeline.io.image import to_float, to_uint8, write_gray, write_rgb
 from pipeline.mesh.files import MeshArtifact, save_mesh
 from pipeline.texture.files import TextureArtifact, save_texture
+from pipeline.texture.light import Highlights, VideoLight
 from tests.avatar.avatar_sample import FRAME_RATE, sample_body, sample_maps, sample_motion, sample_skinned_mesh
 
 FRAME_INDEX = np.array([0, 3, 4, 8, 11, 16], dtype=np.int32)
@@ -132,4 +133,7 @@ def _write_mesh_and_texture(mesh_dir: Path, texture_dir: Path, avatar: TexturedA
     side_px = len(avatar.diffuse)
     atlas = Atlas(avatar.uv.numpy(), avatar.faces_uv.numpy(), np.arange(len(avatar.uv), dtype=np.int32))
     blank = np.zeros((side_px, side_px), dtype=np.uint8)
-    save_texture(texture_dir, TextureArtifact(atlas, avatar.diffuse.numpy(), to_float(blank), blank))
+    light = VideoLight.uniform(len(motion.frame_index))
+    save_texture(
+        texture_dir, TextureArtifact(atlas, avatar.diffuse.numpy(), to_float(blank), blank, light, Highlights.none())
+    )

@@ -16,6 +16,7 @@ from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.io.glb import GlbFile
 from pipeline.io.image import read_rgb, to_float, write_gray
 from pipeline.texture.files import TextureArtifact, TextureFormat, load_texture, save_texture
+from pipeline.texture.light import Highlights, VideoLight, directional_light, save_light
 from stages.export import STAGE as EXPORT
 from tests.avatar.test_gltf import Player
 from tests.field.scene import PaintedScene, painted_scene
@@ -43,7 +44,10 @@ def inputs(scene: PaintedScene, tmp_path_factory: pytest.TempPathFactory) -> dic
     diffuse = to_float(random.integers(0, 256, (TEXTURE_PX, TEXTURE_PX, 3), dtype=np.uint8))
     blank = np.zeros((TEXTURE_PX, TEXTURE_PX), dtype=np.uint8)
     (folder / "texture").mkdir()
-    save_texture(folder / "texture", TextureArtifact(atlas, diffuse, to_float(blank), blank))
+    save_texture(
+        folder / "texture",
+        TextureArtifact(atlas, diffuse, to_float(blank), blank, VideoLight.uniform(3), Highlights.none()),
+    )
     return inputs | {"texture": folder / "texture"}
 
 
@@ -118,8 +122,10 @@ def test_highlights_become_a_specular_factor_unless_the_surface_is_unlit(
     specular = shutil.copytree(inputs["texture"], tmp_path / "texture")
     half = TEXTURE_PX // 2
     amplitude = np.zeros((TEXTURE_PX, TEXTURE_PX), dtype=np.uint8)
-    amplitude[:, half:] = 1
+    amplitude[:, half:] = 10
     write_gray(specular / "specular.png", amplitude)
+    towards = (0.0, 0.0, 1.0)
+    save_light(specular / "light.npz", directional_light(towards, 0.3), Highlights(np.array(towards), 24.0))
     materials = []
     for name, unlit in (("lit", False), ("unlit", True)):
         (tmp_path / name).mkdir()
@@ -129,7 +135,13 @@ def test_highlights_become_a_specular_factor_unless_the_surface_is_unlit(
         if not unlit:
             alpha = cv2.imdecode(np.frombuffer(glb.image_bytes(1), np.uint8), cv2.IMREAD_UNCHANGED)[..., 3]
             assert not alpha[:, :half].any()
-            assert 10 < np.median(alpha[:, half:]) < 120  # one level of 255 is a fraction of a dielectric's 4 %
+            # strength * roughness^4 / 0.01, where exponent 24 has roughness (2 / 26)^(1/4)
+            assert np.median(alpha[:, half:]) == pytest.approx(255 * (10 / 255) * (2 / 26) / 0.01, abs=1.0)
+            light = glb.gltf["asset"]["extras"]["video_light"]
+            assert light["coefficients"][0] == pytest.approx([0.3] * 3)
+            assert light["key_direction"] == [0.0, 0.0, 1.0]
+            roughness = glb.gltf["materials"][0]["pbrMetallicRoughness"]["roughnessFactor"]
+            assert roughness == pytest.approx((2 / 26) ** 0.25, rel=1e-6)
     assert materials == [({"KHR_materials_specular"}, 2), ({"KHR_materials_unlit"}, 1)]
 
 

@@ -147,7 +147,7 @@ def test_weight_is_proportional_to_pixels_per_area(ball: PaintedBall) -> None:
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("cosine_power", -1.0), ("max_flow_m", -0.01), ("padding_px", 0), ("specular_min_partial_r2", 1.5)],
+    [("cosine_power", -1.0), ("max_flow_m", -0.01), ("padding_px", 0)],
 )
 def test_settings_out_of_range_are_refused(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"{name} = {value}"):

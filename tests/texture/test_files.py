@@ -15,6 +15,7 @@ from pipeline.texture.files import (
     ATLAS,
     COVERAGE,
     DIFFUSE,
+    LIGHT,
     SPECULAR,
     TextureArtifact,
     TextureFormat,
@@ -22,6 +23,7 @@ from pipeline.texture.files import (
     map_files,
     save_texture,
 )
+from pipeline.texture.light import Highlights, VideoLight
 
 
 @pytest.fixture
@@ -33,12 +35,14 @@ def artifact() -> TextureArtifact:
         np.array([0, 1, 2, 3, 0], dtype=np.int32),
     )
     diffuse, gray = (random.integers(0, 256, shape, dtype=np.uint8) for shape in ((8, 8, 3), (2, 8, 8)))
-    return TextureArtifact(atlas, to_float(diffuse), to_float(gray[0]), gray[1])
+    return TextureArtifact(
+        atlas, to_float(diffuse), to_float(gray[0]), gray[1], VideoLight.uniform(4), Highlights.none()
+    )
 
 
 def test_reading_inverts_writing(artifact: TextureArtifact, tmp_path: Path) -> None:
     save_texture(tmp_path, artifact)
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([ATLAS, DIFFUSE, SPECULAR, COVERAGE])
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([ATLAS, DIFFUSE, SPECULAR, COVERAGE, LIGHT])
     read = load_texture(tmp_path)
     for name in ("uv", "faces_uv", "vertex_of_uv"):
         np.testing.assert_array_equal(getattr(read.atlas, name), getattr(artifact.atlas, name))

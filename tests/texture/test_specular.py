@@ -1,82 +1,107 @@
-"""Separation of highlights, shading and albedo, on observations made from the model equation and on others."""
+"""Highlights of a turning ball against the model equation, and against changes that are none."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import ConvexHull
 
-from pipeline.texture.bake import TexturedSurface
-from pipeline.texture.settings import TextureSettings
-from pipeline.texture.specular import (
-    VertexObservations,
-    albedo_uniformity,
-    dielectric_specular_factor,
-    fit_specular,
-    observe_vertices,
-    real_spherical_harmonics,
-    texels_at_vertices,
-)
-from tests.texture.painted_ball import PaintedBall, ball_colours
+from pipeline.geometry.camera import Camera
+from pipeline.geometry.colour import linear_to_srgb
+from pipeline.geometry.mesh import Mesh
+from pipeline.texture.light import Highlights, VideoLight
+from pipeline.texture.light_fit import LightObservations, ViewObservations
+from pipeline.texture.specular import SpecularFit, albedo_uniformity, dielectric_specular_factor, fit_specular
+from pipeline.texture.views import BakeView
 
-VERTICES, LIGHT = 400, np.array([0.3, 0.6, 0.74])
+LAMP = np.array([0.36, 0.48, 0.8])
+VERTICES = 500
 
 
-def synthetic_observations(
-    frames: int, specular_amplitude: np.ndarray, shade: float, noise: float, seed: int
-) -> VertexObservations:
-    """Oriented vertices that turn about +Y under one light, observed from +Z; specular_amplitude: RGB per vertex."""
-    base = np.random.default_rng(0)
-    normals = base.normal(size=(VERTICES, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    albedo = base.uniform(0.2, 0.6, (VERTICES, 3))
-    random = np.random.default_rng(seed)
-    parts = []
-    for angle in random.uniform(0, 2 * np.pi, frames):
+def ball() -> Mesh:
+    points = np.random.default_rng(0).normal(size=(VERTICES, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    return Mesh(points.astype(np.float32), ConvexHull(points).simplices.astype(np.int32))
+
+
+def lamp_light(frames: int) -> VideoLight:
+    coefficients = np.zeros((9, 3))
+    coefficients[0], coefficients[1:4] = 0.8, 0.3 * LAMP[:, None]
+    return replace(VideoLight.uniform(frames), coefficients=coefficients)
+
+
+def filmed(radiance: np.ndarray, angles: np.ndarray, noise: float, tilt_rad: float = 0.0) -> ViewObservations:
+    """Observations of a grey ball that turns in front of a far camera; radiance: RGB of the highlight a vertex.
+
+    tilt_rad: error of the normals.
+    """
+    mesh, light, lobe = ball(), lamp_light(1), Highlights(LAMP, 24.0)
+    random, views, parts = np.random.default_rng(len(angles)), [], []
+    camera = Camera(100.0, 100.0, 50.0, 50.0, 100, 100, np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32))
+    camera.world_to_camera[2, 3] = 100.0
+    wrong = random.normal(size=(VERTICES, 3)) * tilt_rad
+    for frame, angle in enumerate(angles):
         c, s = np.cos(angle), np.sin(angle)
-        normal = normals @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]).T
-        visible = np.flatnonzero(normal[:, 2] > 0.1)
-        n = normal[visible]
-        reflection_direction = 2.0 * n[:, 2:] * n - [0.0, 0.0, 1.0]
-        lambert = 1.0 + shade * (n @ LIGHT)
-        highlight = np.maximum(reflection_direction @ LIGHT, 0.0) ** 6
-        colour = albedo[visible] * lambert[:, None] + specular_amplitude[visible] * highlight[:, None]
-        colour += noise * random.normal(size=colour.shape)
-        parts.append((visible.astype(np.int32), colour, n[:, 2] ** 2, n, reflection_direction))
-    joined = [np.concatenate(part) for part in zip(*parts, strict=True)]
-    return VertexObservations(joined[0], *(values.astype(np.float32) for values in joined[1:]))
+        turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+        normal = mesh.vertices @ turn.T
+        shown = (mesh.vertices + wrong) @ turn.T
+        shown /= np.linalg.norm(shown, axis=1, keepdims=True)
+        vertices = torch.from_numpy(normal.astype(np.float32))
+        blank = np.zeros((1, 1, 3), np.uint8)
+        views.append(BakeView(blank, blank[..., 0], camera, vertices, vertices[:, 2]))
+        to_camera = camera.centre_m() - normal
+        to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
+        ones = np.ones(VERTICES)
+        linear = 0.2 * light.irradiance(shown, ones) + lobe.lobe(shown, to_camera, ones)[:, None] * radiance
+        colour = linear_to_srgb(linear) + noise * random.normal(size=linear.shape)
+        seen = np.flatnonzero(normal[:, 2] > 0.25)
+        parts.append((np.full(len(seen), frame), seen, colour[seen], normal[seen, 2], normal[seen]))
+    rows = LightObservations(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+    return ViewObservations(views, rows, np.ones(len(rows.vertex)), np.ones(len(angles)))
 
 
-def fitted(specular_amplitude: np.ndarray, shade: float, noise: float = 0.01):
-    sets = [
-        synthetic_observations(frames, specular_amplitude, shade, noise, seed) for frames, seed in ((60, 1), (15, 2))
-    ]
-    neighbours = np.stack([np.arange(VERTICES), np.arange(VERTICES)], axis=1)  # albedo without edges
-    return fit_specular(*sets, neighbours, VERTICES, min_partial_r2=0.02)
+def fitted(radiance: np.ndarray, noise: float = 0.01, tilt_rad: float = 0.0) -> SpecularFit:
+    angles = 2.0 * np.pi * np.arange(32) / 32
+    train, validation = (filmed(radiance, part, noise, tilt_rad) for part in (angles, angles[::4] + 0.1))
+    return fit_specular(train, validation, lamp_light(32), ball())
 
 
-def test_highlights_are_found_on_specular_vertices() -> None:
-    specular_amplitude = np.zeros((VERTICES, 3))
-    specular_amplitude[: VERTICES // 2] = 0.4
-    result = fitted(specular_amplitude, shade=0.3)
-    shiny, matte = result.amplitude[: VERTICES // 2], result.amplitude[VERTICES // 2 :]
-    assert result.partial_r2 > 0.3
-    assert shiny.mean() > 4.0 * matte.mean()
-    assert 0.05 < np.quantile(shiny, 0.75) < 0.5  # true value 0.4; weakly observed vertices are shrunk
-    assert result.amplitude.min() >= 0.0
-    assert result.amplitude.max() <= 1.0
+def test_a_shiny_patch_and_its_lobe_are_found() -> None:
+    """A half of the ball, on the parallels whose normals reach the half vector during the turn."""
+    vertices = ball().vertices
+    reached = (vertices[:, 1] > -0.1) & (vertices[:, 1] < 0.55)
+    shiny = vertices[:, 0] > 0.0
+    result = fitted(0.3 * np.repeat(shiny[:, None], 3, axis=1))
+    assert float(result.highlights.direction @ LAMP) > np.cos(np.radians(10.0))
+    assert result.highlights.exponent in (12.0, 24.0, 48.0)
+    assert np.corrcoef(result.strength[reached], shiny[reached])[0, 1] > 0.6
+    assert 0.1 < np.median(result.strength[reached & shiny]) < 0.4
+    assert np.median(result.strength[reached & ~shiny]) < 0.05
 
 
-@pytest.mark.parametrize("shade", [0.0, 0.5])
-def test_albedo_and_shading_alone_are_matte(shade: float) -> None:
-    result = fitted(np.zeros((VERTICES, 3)), shade)
-    assert result.partial_r2 < 0.02
-    assert not result.amplitude.any()
+def test_matte_balls_have_no_highlights() -> None:
+    result = fitted(np.zeros((VERTICES, 3)))
+    assert not result.strength.any()
 
 
-def test_coloured_changes_are_not_highlights() -> None:
+def test_wrong_normals_are_no_highlights() -> None:
+    assert not fitted(np.zeros((VERTICES, 3)), tilt_rad=0.1).strength.any()
+
+
+def test_coloured_changes_are_no_highlights() -> None:
     tinted = np.zeros((VERTICES, 3))
-    tinted[: VERTICES // 2], tinted[VERTICES // 2 :] = [0.4, 0.0, 0.0], [0.0, 0.4, 0.4]
-    white = fitted(np.full((VERTICES, 3), 0.3), shade=0.2)
-    assert white.amplitude.mean() > 4.0 * fitted(tinted, shade=0.2).amplitude.mean()
+    tinted[::2], tinted[1::2] = [0.3, 0.0, 0.0], [0.0, 0.2, 0.2]
+    assert fitted(tinted).strength.mean() < 0.25 * fitted(np.full((VERTICES, 3), 0.2)).strength.mean()
+
+
+def test_roughness_has_the_width_of_the_lobe() -> None:
+    """Half width of Beckmann's distribution, exp(-tan^2 / alpha^2) / cos^4 with alpha = roughness^2, and of cos^p."""
+    for exponent in (12.0, 48.0):
+        alpha = Highlights(LAMP, exponent).roughness ** 2
+        angle = np.arccos(0.5 ** (1.0 / exponent))
+        beckmann = np.exp(-((np.tan(angle) / alpha) ** 2)) / np.cos(angle) ** 4
+        assert beckmann == pytest.approx(0.5, abs=0.05)
 
 
 def reflected_at_the_peak(factor: float, roughness: float, lamp: float) -> float:
@@ -97,14 +122,12 @@ def reflected_at_the_peak(factor: float, roughness: float, lamp: float) -> float
 @pytest.mark.parametrize("roughness", [0.3, 0.5, 0.85, 1.0])
 @pytest.mark.parametrize("factor", [0.0, 0.2, 0.7, 1.0])
 def test_the_specular_factor_inverts_the_gltf_model(roughness: float, factor: float) -> None:
-    base = np.array([[0.3, 0.3, 0.3], [0.6, 0.6, 0.6]])
-    linear = ((base + 0.055) / 1.055) ** 2.4 + reflected_at_the_peak(factor, roughness, np.pi)
-    amplitude = (1.055 * linear ** (1 / 2.4) - 0.055 - base)[:, 0]
-    np.testing.assert_allclose(dielectric_specular_factor(amplitude, base, roughness), factor, atol=1e-6)
+    strength = np.array([reflected_at_the_peak(factor, roughness, 0.6 * np.pi)])
+    np.testing.assert_allclose(dielectric_specular_factor(strength, roughness, 0.6), factor, atol=1e-6)
 
 
 def test_the_specular_factor_is_clipped_at_one() -> None:
-    factor = dielectric_specular_factor(np.array([0.0, 0.9]), np.full((2, 3), 0.5), 0.85)
+    factor = dielectric_specular_factor(np.array([0.0, 0.9]), 0.85, 1.0)
     np.testing.assert_array_equal(factor, [0.0, 1.0])
 
 
@@ -114,32 +137,3 @@ def test_uniformity_is_low_at_an_albedo_edge() -> None:
     uniformity = albedo_uniformity(albedo, np.array([[0, 1], [1, 2], [2, 3], [3, 4]]))
     np.testing.assert_allclose(uniformity[[0, 1, 4]], 1.0)
     assert np.all(uniformity[[2, 3]] < 0.01)
-
-
-def test_harmonics_are_orthogonal_to_each_other_and_to_constants() -> None:
-    directions = np.random.default_rng(0).normal(size=(200_000, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    values = real_spherical_harmonics(directions, 3)
-    values = values / np.sqrt((values**2).mean(axis=0))
-    products = values.T @ values / len(values)
-    np.testing.assert_allclose(products, np.eye(15), atol=0.02)
-    np.testing.assert_allclose(values.mean(axis=0), 0.0, atol=0.02)
-    assert real_spherical_harmonics(directions[:5], 2).shape == (5, 8)
-
-
-def test_vertices_are_observed_with_their_true_colour() -> None:
-    ball = PaintedBall(4)
-    count = len(ball.mesh.vertices)
-    faces = torch.from_numpy(ball.mesh.faces)
-    surface = TexturedSurface(faces, faces, torch.zeros(count, 2), texels_at_vertices(ball.mesh.faces, count))
-    observed = observe_vertices(ball.views, surface, TextureSettings(silhouette_falloff_m=0.015))
-    reliable = observed.weight > 0.3
-    assert reliable.sum() > 200
-    assert np.abs(observed.colour - ball_colours(ball.mesh.vertices[observed.vertex]))[reliable].mean() < 0.02
-    np.testing.assert_allclose(np.linalg.norm(observed.reflection_direction, axis=1), 1.0, atol=1e-4)
-    # the camera is at +Z of the ball: view and reflection direction are symmetric about the normal
-    to_camera = (
-        observed.reflection_direction
-        - 2.0 * np.sum(observed.reflection_direction * observed.normal, axis=1, keepdims=True) * observed.normal
-    )
-    assert np.all(-to_camera[:, 2] > 0.95)

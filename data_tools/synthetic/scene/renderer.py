@@ -4,7 +4,7 @@ Shading: wrapped Lambert diffuse and Blinn-Phong specular of one key light, plus
 linear colour. The reflection model is Blinn, "Models of light reflection for computer synthesized pictures" (1977).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -12,9 +12,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from data_tools.synthetic.rig.subject import Subject
-from data_tools.synthetic.scene.shadow import ShadowMap, render_shadow_map
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.colour import linear_to_srgb, srgb_to_linear
+from pipeline.geometry.shadow_map import ShadowMap, render_shadow_map
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.geometry.texture_rendering import sample_texture
 from pipeline.kernels.raster import rasterize
@@ -34,6 +34,8 @@ class Light:
         specular_strength: Blinn-Phong coefficient.
         diffuse_wrap: wrap of the diffuse term around the terminator; 0 is Lambert.
         casts_shadows: the person casts shadows of the key light on itself.
+        shiny_heights: the surface is specular where its height in the A-pose, as a fraction of the stature, is in this
+            range.
     """
 
     key_intensity: float = 0.55
@@ -43,13 +45,15 @@ class Light:
     specular_strength: float = 0.0
     diffuse_wrap: float = 0.25
     casts_shadows: bool = False
+    shiny_heights: tuple[float, float] = (0.0, 1.0)
 
 
 STUDIO = Light()
 FLAT = Light(key_intensity=0.0, ambient_intensity=1.0, sky_gradient=0.0)
 SHINY = Light(specular_strength=0.35)
+PATCH = replace(SHINY, shiny_heights=(0.58, 0.74))
 HARD = Light(key_intensity=0.75, ambient_intensity=0.42, diffuse_wrap=0.0, casts_shadows=True)
-LIGHTING_PRESETS = {"studio": STUDIO, "flat": FLAT, "shiny": SHINY, "hard": HARD}
+LIGHTING_PRESETS = {"studio": STUDIO, "flat": FLAT, "shiny": SHINY, "patch": PATCH, "hard": HARD}
 
 BLINN_PHONG_EXPONENT = 24.0
 
@@ -112,9 +116,18 @@ def _shade_window(
     to_camera = torch.nn.functional.normalize(torch.from_numpy(camera.centre_m()) - point, dim=1)
     image = np.zeros((camera.height, camera.width, 4), dtype=np.float32)
     visibility = shadows.visibility(point, normal) if shadows else torch.ones(len(point))
-    image[seen.numpy(), :3] = shade(albedo, normal, to_camera, visibility, light).numpy()
+    shiny = torch.from_numpy(shiny_faces(subject, light))[face]
+    image[seen.numpy(), :3] = shade(albedo, normal, to_camera, visibility, light, shiny).numpy()
     image[seen.numpy(), 3] = 1.0
     return image
+
+
+def shiny_faces(subject: Subject, light: Light) -> Float[np.ndarray, "f"]:
+    """Return 1 for faces that are specular under a light, 0 for others."""
+    height = subject.body.vertices[subject.body.faces, 1].mean(axis=1)
+    low, high = subject.body.vertices[:, 1].min(), subject.body.vertices[:, 1].max()
+    relative = (height - low) / (high - low)
+    return ((relative >= light.shiny_heights[0]) & (relative <= light.shiny_heights[1])).astype(np.float32)
 
 
 def _normals(vertices: Float[Tensor, "v 3"], faces: Tensor) -> Float[Tensor, "v 3"]:
@@ -133,6 +146,7 @@ def shade(
     to_camera: Float[Tensor, "n 3"],
     visibility: Float[Tensor, "n"],
     light: Light,
+    shiny: Float[Tensor, "n"] | None = None,
 ) -> Float[Tensor, "n 3"]:
     """Compute sRGB colours in [0, 1]: wrapped Lambert diffuse, hemispheric ambient and Blinn-Phong specular.
 
@@ -140,6 +154,8 @@ def shade(
         albedo: sRGB in [0, 1]; the terms are summed in linear colour.
         normal, to_camera: unit vectors in the world.
         visibility: fraction of the key light that is not shadowed, in [0, 1].
+        light: the light.
+        shiny: factor of the specular term; None: 1.
     """
     key_direction = torch.nn.functional.normalize(torch.tensor(light.key_direction), dim=0)
     diffuse = visibility * ((normal @ key_direction + light.diffuse_wrap) / (1.0 + light.diffuse_wrap)).clamp_min(0.0)
@@ -148,4 +164,6 @@ def shade(
     specular = (
         light.specular_strength * visibility * (normal * half_vector).sum(1).clamp_min(0.0) ** BLINN_PHONG_EXPONENT
     )
+    if shiny is not None:
+        specular = specular * shiny
     return linear_to_srgb((srgb_to_linear(albedo) * irradiance[:, None] + specular[:, None]).clamp(0.0, 1.0))

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from data_tools.synthetic.rig.subject import Subject
-from data_tools.synthetic.scene.renderer import FLAT, SHINY, STUDIO, Light, render_subject, shade
+from data_tools.synthetic.scene.renderer import FLAT, PATCH, SHINY, STUDIO, Light, render_subject, shade, shiny_faces
 from pipeline.body.body import Body
 from pipeline.geometry.camera import Camera
 from tests.data_tools.synthetic.shapes import sphere
@@ -96,3 +96,15 @@ def test_specular_highlight_is_near_the_mirror_direction() -> None:
     mirror = (float(half[0]), float(half[1]), float(half[2]))
     assert lit(mirror, SHINY) > lit(mirror, dull) + 0.1
     assert lit((-1.0, 0.0, 0.0), SHINY) == pytest.approx(lit((-1.0, 0.0, 0.0), dull), abs=1e-6)
+
+
+def test_a_shiny_patch_is_shiny_inside_and_matte_outside() -> None:
+    """The ball's faces between two heights; renders agree with the shiny and with the matte light on either side."""
+    subject = ball()
+    height = (subject.body.vertices[subject.body.faces, 1].mean(axis=1) + BALL_M) / (2.0 * BALL_M)
+    inside = (height > PATCH.shiny_heights[0]) & (height < PATCH.shiny_heights[1])
+    assert np.array_equal(shiny_faces(subject, PATCH) > 0, inside)
+    patch, shiny, matte = (render(light, samples=1) for light in (PATCH, SHINY, STUDIO))
+    like_shiny, like_matte = (np.abs(patch - other).max(axis=2) < 1e-6 for other in (shiny, matte))
+    assert (like_shiny | like_matte).all()
+    assert (like_shiny & ~like_matte).sum() > 100

@@ -24,6 +24,9 @@ NORMAL_BIAS_M = 0.012
 _LIGHT_DISTANCE_M = 1000.0
 """Distance of the depth origin; float32 depth then has a resolution of 0.1 mm."""
 
+_MAX_UPRIGHT = 0.99
+"""Vertical component from which on a light comes from above or below, and Z instead of Y defines the up axis."""
+
 _N_VIEW_DIRECTIONS = 24
 """Directions of `find_exterior_faces`, on a golden-angle (Fibonacci) spiral."""
 
@@ -71,10 +74,11 @@ def render_shadow_map(
 ) -> ShadowMap:
     """Rasterise the depth of a surface (world, metres) as seen by a directional light.
 
-    key_direction: towards the light, in the world; must not be parallel to Y.
+    key_direction: towards the light, in the world; any length > 0.
     """
     away = -torch.nn.functional.normalize(torch.tensor(key_direction), dim=0)
-    right = torch.nn.functional.normalize(torch.linalg.cross(away, torch.tensor([0.0, 1.0, 0.0])), dim=0)
+    across = torch.tensor([0.0, 1.0, 0.0] if abs(float(away[1])) < _MAX_UPRIGHT else [0.0, 0.0, 1.0])
+    right = torch.nn.functional.normalize(torch.linalg.cross(away, across), dim=0)
     world_to_light = torch.stack([right, torch.linalg.cross(right, away), away])
     points_light_m = vertices @ world_to_light.T
     origin_m = points_light_m[:, :2].amin(0) - _MARGIN_PX * SHADOW_TEXEL_M
