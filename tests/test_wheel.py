@@ -86,6 +86,7 @@ def test_the_installed_command_finds_its_presets(installed: Path, tmp_path: Path
     assert not (tmp_path / "runs" / "notes").exists()
 
 
+@pytest.mark.slow
 def test_the_installed_command_refuses_a_broken_video(installed: Path, tmp_path: Path) -> None:
     """The first stage is started from the wheel, although the folder holds modules of the same names."""
     for name in ("stages.py", "pipeline.py"):

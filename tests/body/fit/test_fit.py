@@ -209,6 +209,7 @@ def test_principal_point_of_an_off_centre_crop_is_estimated() -> None:
     assert error_m[1] < error_m[0]
 
 
+@pytest.mark.slow
 def test_the_same_input_gives_the_same_bytes() -> None:
     scene = synthetic_recording(load_anny(), 4)
     results = [

@@ -80,6 +80,7 @@ def test_scale_is_aligned(perfect: Comparison) -> None:
     assert scores["scale_to_truth"] == pytest.approx(1 / 0.9, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_novel_poses_of_the_true_rig(perfect: Comparison) -> None:
     scores, pictures = compare_novel_poses(perfect)
     assert scores["novel_poses"]["chamfer_mm"] < 1.0
@@ -350,6 +351,7 @@ def test_unposed_vertices_ignore_depth_and_back_faces(perfect: Comparison) -> No
     assert sideways[towards < -0.9].mean() < 0.3 * sideways[towards > 0.9].mean()
 
 
+@pytest.mark.slow
 def test_missing_joints_follow_their_parent(perfect: Comparison) -> None:
     """The tip of the thumb, whose joint the fit lacks, follows the thumb."""
     body, true = perfect.run.body, perfect.truth.subject.body.vertices

@@ -58,6 +58,7 @@ def test_a_capture_without_labels_has_no_parts(perfect: Comparison) -> None:
     assert compare_labelled_surfaces(older) == {}
 
 
+@pytest.mark.slow
 def test_without_alignment_a_smaller_person_is_wrong(perfect: Comparison) -> None:
     """A person of nine tenths on the same floor: each point is moved by a tenth of its distance from the origin."""
     true = perfect.true_rest_mesh
@@ -72,6 +73,7 @@ def test_without_alignment_a_smaller_person_is_wrong(perfect: Comparison) -> Non
     assert compare_rest_surfaces(perfect)["chamfer_unaligned_mm"] < 0.2
 
 
+@pytest.mark.slow
 def test_without_alignment_a_wrong_distance_is_an_error(perfect: Comparison) -> None:
     """The person 5 cm too far away in all frames: aligned there is no error, unaligned up to 5 cm."""
     motion = perfect.run.motion

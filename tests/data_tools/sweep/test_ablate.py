@@ -125,6 +125,7 @@ def test_the_result_of_the_mesh_stage_depends_on_the_settings(base: Trial) -> No
     assert prints[0] == prints[2] != prints[1]
 
 
+@pytest.mark.slow
 def test_a_failed_stage_names_its_message_and_log(base: Trial) -> None:
     """The texture stage refuses inputs without a fitted body."""
     prepare_row(trial := AblationTrial(base, ROWS[REFERENCE]))

@@ -52,6 +52,7 @@ def test_skirt_is_one_closed_ring(person: Subject) -> None:
     assert skirt.volume == pytest.approx(THICKNESS_M * skirt.area / 2, rel=0.15)
 
 
+@pytest.mark.slow
 def test_flare_widens_the_hem_only() -> None:
     """The waist keeps its width; the mean radius of the hem grows by the difference of the flares."""
     rings = []
