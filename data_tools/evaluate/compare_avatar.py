@@ -6,6 +6,7 @@ without any alignment beside it.
 """
 
 from collections import defaultdict
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -125,7 +126,7 @@ def compare_novel_poses(comparison: Comparison) -> tuple[dict[str, dict[str, flo
     image_pairs = [
         ImagePair(
             read_rgba(comparison.folder / "novel_poses" / f"{index:06d}.png"),
-            _render_avatar(comparison, alignment.transform_mesh(avatar), comparison.truth.camera),
+            render_under_light(comparison, alignment.transform_mesh(avatar), comparison.truth.camera),
         )
         for index, (avatar, alignment) in enumerate(zip(matched, matched_to_truth, strict=True))
     ]
@@ -143,7 +144,7 @@ def compare_novel_views(comparison: Comparison) -> list[ImagePair]:
         avatar, comparison.true_surface(comparison.truth.canonical_to_world[0])
     ).transform_mesh(avatar)
     return [
-        ImagePair(read_rgba(path.with_suffix(".png")), _render_avatar(comparison, surface, load_camera(path)))
+        ImagePair(read_rgba(path.with_suffix(".png")), render_under_light(comparison, surface, load_camera(path)))
         for path in sorted((comparison.folder / "novel_views").glob("*.npz"))
     ]
 
@@ -269,8 +270,13 @@ def _true_mask(comparison: Comparison, position: int) -> UInt8[np.ndarray, "h w"
     return cv2.resize(mask, (capture.width, capture.height), interpolation=cv2.INTER_AREA)
 
 
-def _render_avatar(comparison: Comparison, surface: Mesh, camera: Camera) -> Float[np.ndarray, "h w 4"]:
-    return comparison.run.avatar.render(torch.from_numpy(surface.vertices).float(), camera, SAMPLES_PER_AXIS)
+def render_under_light(comparison: Comparison, surface: Mesh, camera: Camera) -> Float[np.ndarray, "h w 4"]:
+    """Render the avatar, posed in the true world, under the light that the run estimated in its own world."""
+    run, true_camera = comparison.run, comparison.truth.camera
+    vertices = map_between_worlds(torch.from_numpy(surface.vertices).float(), true_camera, run.camera)
+    from_run_world = np.linalg.inv(true_camera.world_to_camera) @ run.camera.world_to_camera
+    camera = replace(camera, world_to_camera=(camera.world_to_camera @ from_run_world).astype(np.float32))
+    return run.avatar.render(vertices, camera, SAMPLES_PER_AXIS, run.avatar.light)
 
 
 def _nearest_uv(

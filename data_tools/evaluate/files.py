@@ -17,7 +17,7 @@ from pipeline.core.manifest import MANIFEST_FILE, digest_file, read_manifest
 
 COMPARE_FOLDER = "compare"
 SCORES_FILE, PAGE_FILE = "truth.json", "truth.html"
-TRUTH_VERSION = 5
+TRUTH_VERSION = 6
 """Increased whenever the content or the meaning of a comparison changes, so that it is computed again."""
 
 

@@ -21,11 +21,12 @@ from data_tools.evaluate.compare_avatar import (
     compare_novel_views,
     compare_rest_surfaces,
     compare_texture,
+    render_under_light,
 )
 from data_tools.evaluate.comparison import Comparison, retarget_motion
 from data_tools.evaluate.truth import load_true_mask
 from data_tools.evaluate.upper_bound import render_upper_bound, unpose_true_vertices
-from pipeline.body.body import Body, Motion
+from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.files import save_motion
 from pipeline.capture.frame_selection import HELDOUT, TRAIN
 from pipeline.core.errors import UserError
@@ -36,6 +37,7 @@ from pipeline.geometry.texture_rendering import blur_coverage
 from pipeline.io.image import write_rgba
 from pipeline.metrics.alignment import SimilarityTransform
 from pipeline.metrics.images import composite_on_white, frame_scores
+from pipeline.texture.light import VideoLight
 from tests.data_tools.ground_truth_run import (
     bent_arm,
     with_frames,
@@ -368,3 +370,27 @@ def test_motion_is_retargeted_by_joint_name(bare: Body, perfect: Comparison) -> 
     head, arm = renamed.joint("Tail"), renamed.joint("LeftArm")
     assert np.allclose(taken.rotations_wxyz[:, head], [1.0, 0.0, 0.0, 0.0], atol=1e-6)
     assert np.allclose(np.abs(taken.rotations_wxyz[:, arm]), np.abs(motion.rotations_wxyz[:, arm]), atol=1e-5)
+
+
+def test_light_is_that_of_the_world_of_the_run(perfect: Comparison) -> None:
+    """The run's world is turned by 90 degrees: its lamp at +z shines on the side that the truth has at +x."""
+    light = replace(
+        VideoLight.uniform(1),
+        coefficients=np.zeros((9, 3), dtype=np.float32),
+        key_irradiance=np.ones(3, dtype=np.float32),
+        key_direction=np.array([0.0, 0.0, 1.0], dtype=np.float32),
+    )
+    turn = np.eye(4, dtype=np.float32)
+    turn[:3, :3] = Rotation.from_euler("y", 90, degrees=True).as_matrix()  # run world to true world: +z to +x
+    run = perfect.run
+    camera = replace(run.camera, world_to_camera=perfect.truth.camera.world_to_camera @ turn)
+    white = replace(run.avatar, light=light, diffuse=torch.ones_like(run.avatar.diffuse))
+    turned = replace(perfect, run=replace(run, camera=camera, avatar=white))
+    motion = perfect.match_motion(perfect.truth.motion.select(np.array([0])))
+    surface = perfect.avatar_surface(canonical_to_world(run.body, motion)[0])
+    drawn = render_under_light(turned, surface, perfect.truth.camera)
+    columns = np.flatnonzero(drawn[..., 3].any(axis=0))
+    middle = int(columns.mean())
+    halves = drawn[:, :middle], drawn[:, middle:]
+    left, right = (half[half[..., 3] > 0.5, :3].mean() for half in halves)
+    assert right > 1.5 * left
