@@ -56,14 +56,15 @@ PROTOCOL = (
     "avatar may score higher. These columns use the masks of the frames stage, so parts that are missing in a mask "
     "cost nothing; the columns true_mask use the true masks, and meshes with sharp edges. novel_views and "
     "novel_poses: the avatar in the true poses, aligned to the true surface and rendered by the true cameras, "
-    "under the light that was removed from its texture, if any. Their columns ceiling are the true mesh in the same poses with its best static texture: the true "
+    "under the light that was removed from its texture, if any. Their columns ceiling are the true mesh in the same "
+    "poses with its best static texture: the true "
     "one times the mean brightness of each vertex in the training frames. colour_error and balanced_colour_error "
     "(after one gain per channel) are mean absolute differences, of 255, on the observed texels."
 )
 SURFACES = ("mesh", "mesh_matched", "heldout_poses", "novel_poses", "novel_poses_matched")
 LIT_NOTE = (
-    "not flat: the novel views and poses of this capture are lit. The avatar is drawn under the estimated light if that "
-    "was removed from its texture, else unlit, and then the scores hold the light against it (--light flat does not)"
+    "not flat: the novel views and poses of this capture are lit. The avatar is drawn under the estimated light if "
+    "that was removed from its texture, else unlit, and then the scores hold the light against it (--light flat does not)"
 )
 
 
