@@ -64,7 +64,7 @@ PROTOCOL = (
 SURFACES = ("mesh", "mesh_matched", "heldout_poses", "novel_poses", "novel_poses_matched")
 LIT_NOTE = (
     "not flat: the novel views and poses of this capture are lit. The avatar is drawn under the estimated light if "
-    "that was removed from its texture, else unlit, and then the scores hold the light against it (--light flat does not)"
+    "that was removed from its texture, else unlit, and then its light counts against it (--light flat has none)"
 )
 
 
