@@ -228,7 +228,6 @@ def _with_silhouettes(parameters: EnergyParameters, settings: FitSettings) -> En
         parameters,
         landmark_std_m=settings.silhouette_landmark_std_m,
         landmark_3d_std_m=settings.silhouette_landmark_3d_std_m,
-        face_std_m=settings.fitted_face_std_m,
     )
 
 
@@ -298,6 +297,7 @@ def _fit_poses(
         free_focal=False,
         free_principal_point=False,
         hand_std_m=settings.fitted_hand_std_m,
+        face_std_m=settings.fitted_face_std_m,
     )
     model = context.linearise(state.shape)
     landmarks_only = replace(
