@@ -200,9 +200,11 @@ def encode_scene(scene: Scene, config: Config, clips: Mapping[str, Motion]) -> b
         texture.highlights.roughness if has_highlights else config.roughness,
         config.unlit,
     )
-    mesh = build_skinned_mesh(to_rest_pose(face.skinned if face else scene.skinned, scene.rig), atlas)
+    at_rest = to_rest_pose(face.skinned if face else scene.skinned, scene.rig)
+    mesh = build_skinned_mesh(at_rest, atlas)
     if face is not None:
-        mesh = replace(mesh, morphs=MorphTargets(face.names, face.displacements_m[:, atlas.vertex_of_uv]))
+        displacements_m, eyes_m = face.displacements_m[:, atlas.vertex_of_uv], face.eye_centres_m(at_rest.mesh.vertices)
+        mesh = replace(mesh, morphs=MorphTargets(face.names, displacements_m, eyes_m))
     return encode_glb(mesh, scene.rig, clips, maps, scene.camera, scene.extras)
 
 
@@ -291,7 +293,7 @@ def light_extras(light: VideoLight) -> dict[str, Any]:
 
 STAGE = Stage(
     "export",
-    version=7,
+    version=8,
     needs=("frames", "body", "mesh", "texture"),
     makes=("avatar.glb", "avatar.obj", "avatar.mtl", *OBJ_MAPS),
     config=Config,

@@ -24,6 +24,9 @@ _MIN_ANIMATED_ANGLE_RAD = 1e-4
 _MIN_ROTATION_RAD = 1e-6
 _MIN_NORM = 1e-12
 _MAX_JOINTS = 1 << 16
+_SCENE_NAME = "Armature"
+"""three.js names the group of all nodes after the scene. Programs for avatars look for a group `Armature` with mesh and
+joints, as Blender exports it; a node of this name above a skinned mesh would be against glTF's advice."""
 
 
 @dataclass(frozen=True)
@@ -33,10 +36,13 @@ class MorphTargets:
     Attributes:
         names: written as `extras.targetNames`, where Blender, three.js and Unity read them.
         displacements_m: of each vertex at weight 1, in the rest pose.
+        eyes_m: centres of the left and the right eyeball in the rest pose, written as nodes `LeftEye` and `RightEye` of
+            the head, which programs that direct a gaze look for; None without eyes.
     """
 
     names: tuple[str, ...]
     displacements_m: Float[np.ndarray, "m t 3"]
+    eyes_m: Float[np.ndarray, "2 3"] | None = None
 
 
 @dataclass(frozen=True)
@@ -123,7 +129,9 @@ def encode_glb(
     document.add("meshes", named)
     document.add("nodes", {"name": "avatar", "mesh": 0, "skin": 0})
     skeleton_root = _add_skeleton(document, rig, first_joint)
-    document.json |= {"scene": 0, "scenes": [{"name": "scene", "nodes": [0, skeleton_root]}]}
+    if mesh.morphs is not None and mesh.morphs.eyes_m is not None:
+        _add_eyes(document, mesh.morphs.eyes_m, rig, first_joint)
+    document.json |= {"scene": 0, "scenes": [{"name": _SCENE_NAME, "nodes": [0, skeleton_root]}]}
     for name, motion in clips.items():
         _add_animation(document, name, motion, rig, first_joint)
     if camera is not None:
@@ -217,6 +225,16 @@ def _add_skeleton(document: GlbWriter, rig: Rig, first_joint: int) -> int:
     skin = {"inverseBindMatrices": document.add_array(columns), "joints": joints, "skeleton": root}
     document.add("skins", {"name": "skeleton", **skin})
     return root
+
+
+def _add_eyes(document: GlbWriter, eyes_m: Float[np.ndarray, "2 3"], rig: Rig, first_joint: int) -> None:
+    """Add a node for each eyeball to the head; no vertex follows it."""
+    head = rig.body.joint("Head")
+    to_head = np.linalg.inv(rig.rest_matrices()[head])
+    for name, centre_m in zip(("LeftEye", "RightEye"), eyes_m, strict=True):
+        local_m = to_head[:3, :3] @ centre_m + to_head[:3, 3]
+        node = document.add("nodes", {"name": name, "translation": _float_list(local_m)})
+        document.json["nodes"][first_joint + head].setdefault("children", []).append(node)
 
 
 def _angle_rad(rotations_wxyz: np.ndarray) -> np.ndarray:

@@ -77,6 +77,7 @@ class AnimatedFace:
         displacements_m: of the vertices at weight 1, in the A-pose.
         boundary_gap_m: largest distance between the cuts that were joined.
         fit: of the template to the surface.
+        eyeballs: vertices of the left and of the right eyeball.
     """
 
     skinned: MeshArtifact
@@ -87,6 +88,13 @@ class AnimatedFace:
     displacements_m: Float[np.ndarray, "m v 3"]
     boundary_gap_m: float
     fit: TemplateFit
+    eyeballs: tuple[Int[np.ndarray, "k"], Int[np.ndarray, "k"]]
+
+    def eye_centres_m(self, vertices_m: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "2 3"]:
+        """Return the middles of the eyeballs where the vertices of the mesh are in any pose, m."""
+        return np.stack(
+            [0.5 * (ball.min(axis=0) + ball.max(axis=0)) for ball in (vertices_m[r] for r in self.eyeballs)]
+        )
 
 
 def build_animated_face(
@@ -162,7 +170,14 @@ def animate_face(
         displacements_m.astype(np.float32),
         gap_m,
         TemplateFit(float(np.median(distance_mm)), float(np.quantile(distance_mm, 0.95))),
+        _eyeballs(patch, len(rest_m)),
     )
+
+
+def _eyeballs(patch: FacePatch, first: int) -> tuple[Int[np.ndarray, "k"], Int[np.ndarray, "k"]]:
+    """Return the vertices of both eyeballs in the joined mesh, where those of the patch begin at `first`."""
+    left, right = (first + np.flatnonzero(patch.vertex_part == eye) for eye in (EYE_LEFT, EYE_RIGHT))
+    return left, right
 
 
 def _boundary_m(patch: FacePatch) -> Float[np.ndarray, "b 3"]:

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from pipeline.avatar.gltf import MaterialMaps, MorphTargets, encode_glb, pack_specular_factor
 from pipeline.avatar.rig import build_rig
+from pipeline.avatar.rig_names import RigName
 from pipeline.body.body import canonical_to_world
 from pipeline.geometry.camera import project
 from pipeline.geometry.skinning import linear_blend_skinning
@@ -265,4 +266,21 @@ def test_morph_targets_have_names_and_the_displacements(tmp_path: Path) -> None:
     for index, expected in zip(targets, moved, strict=True):
         assert "sparse" in file.gltf["accessors"][index]
         np.testing.assert_array_equal(file.accessor(index), expected)
+    assert validator_issues(path) == []
+
+
+@pytest.mark.parametrize("names", ["plain", "unreal"])
+def test_eyes_are_nodes_of_the_head_at_their_centres(tmp_path: Path, names: RigName) -> None:
+    mesh = sample_skinned_mesh(sample_body())[0]
+    eyes_m, moved = np.array([[0.03, 1.7, 0.1], [-0.03, 1.7, 0.1]]), np.zeros((1, len(mesh.positions_m), 3), np.float32)
+    rig = build_rig(sample_body(), names)
+    path = tmp_path / "eyes.glb"
+    path.write_bytes(encoded(mesh=replace(mesh, morphs=MorphTargets(("jawOpen",), moved, eyes_m)), rig=rig))
+    scene = trimesh.load(path, process=False)
+    for name, centre_m in zip(("LeftEye", "RightEye"), eyes_m, strict=True):
+        matrix, _ = scene.graph[name]
+        np.testing.assert_allclose(matrix[:3, 3], centre_m, atol=1e-6)
+    nodes = GlbFile(path).gltf["nodes"]
+    (head,) = [node for node in nodes if node["name"] == rig.joint_names[sample_body().joint("Head")]]
+    assert [nodes[child]["name"] for child in head["children"]] == ["LeftEye", "RightEye"]
     assert validator_issues(path) == []
