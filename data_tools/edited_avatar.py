@@ -35,7 +35,7 @@ def load_editable_avatar(run: Path) -> EditableAvatar:
 def write_edited_avatar(
     avatar: EditableAvatar, texture: TextureArtifact, out: Path, report: Callable[[str], None] = print
 ) -> None:
-    """Write `avatar.glb`, `avatar.obj` with its `.mtl` and maps, `diffuse.png` and `specular.png` into the folder `out`.
+    """Write `avatar.glb`, `avatar.obj` with its `.mtl` and maps, `diffuse.png` and `specular.png` into `out`.
 
     Rig, animations and face are those of the export; the face is found on the filmed texture and gets the edited one.
     """
