@@ -88,3 +88,34 @@ def test_missing_or_transparent_paint_is_named(run: Path, tmp_path: Path) -> Non
     for name, words in (("none.png", "does not exist"), ("clear.png", "transparent everywhere")):
         with pytest.raises(UserError, match=words):
             main([str(run), "--diffuse", str(tmp_path / name)])
+
+
+@pytest.mark.slow
+def test_the_other_persons_colours_are_where_the_mask_is_white(run: Path, scene: PaintedScene, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    other.mkdir()
+    write_exported_run(other, scene)
+    write_rgb(other / "texture" / "diffuse.png", np.tile(np.array([200, 10, 20], np.uint8), (16, 16, 1)))
+    mask = np.zeros((SIDE_PX, SIDE_PX, 3), np.uint8)
+    mask[:100] = 255
+    write_rgb(tmp_path / "shirt.png", mask)
+    main([str(run), "--from", str(other), "--mask", str(tmp_path / "shirt.png")])
+    written, on_charts = read_rgb(run / "retexture" / "shirt" / "diffuse.png"), covered(run, SIDE_PX)
+    for colour, rows in (([200, 10, 20], on_charts[:100]), ([255, 255, 255], on_charts[100:])):
+        pixels = (written[:100] if colour[0] == 200 else written[100:])[rows]
+        np.testing.assert_array_equal(pixels, np.tile(colour, (len(pixels), 1)))
+    assert not (other / "retexture").exists()
+
+
+def test_bad_masks_and_runs_are_named(run: Path, tmp_path: Path) -> None:
+    black, paint = tmp_path / "black.png", tmp_path / "paint.png"
+    write_rgb(black, np.zeros((SIDE_PX, SIDE_PX, 3), np.uint8))
+    write_rgb(paint, np.zeros((SIDE_PX, SIDE_PX, 3), np.uint8))
+    for arguments, words in (
+        (["--from", str(run), "--mask", str(black)], "black everywhere"),
+        (["--from", str(tmp_path)], "has no finished export"),
+        (["--diffuse", str(paint), "--mask", str(black)], "--mask is for"),
+    ):
+        with pytest.raises(UserError, match=words):
+            main([str(run), *arguments])
+    assert not (run / "retexture").exists()
