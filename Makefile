@@ -22,6 +22,12 @@ NAME ?=
 # Input of film besides NAME; optional.
 CLIP ?=
 
+# Inputs of retexture and stylise besides NAME.
+DIFFUSE ?=
+FROM ?=
+MASK ?=
+LOOK ?=
+
 # Inputs of a batch.
 VIDEOS ?=
 RUNS ?= runs
@@ -55,7 +61,7 @@ OPTIONS = $(RUN_OPTIONS) $(ARGS)
 STAMP := $(VENV)/.stamp$(if $(EXTRA),-$(EXTRA))
 
 .DEFAULT_GOAL := help
-.PHONY: help all $(STAGES) batch chart ablate pose film compare figures test test-all check format bench bench-field bench-body doctor venv lock configs gltf-validator clean
+.PHONY: help all $(STAGES) batch chart ablate pose film retexture stylise compare figures test test-all check format bench bench-field bench-body doctor venv lock configs gltf-validator clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z$$()A-Z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST) | sed 's/$$(STAGES)/STAGE    /'
@@ -103,6 +109,13 @@ pose: $(STAMP)  ## play BVH='clip.bvh ...' on the avatar of RUN=runs/name, or po
 
 film: $(STAMP)  ## render the turntable of RUN=runs/name, or CLIP=capture|idle|clip.bvh, to RUN/film/NAME/film.mp4
 	$(RUN_PYTHON) -m data_tools.film "$(ONE_RUN)" $(if $(CLIP),--clip "$(CLIP)") $(if $(NAME),--name "$(NAME)") $(ARGS)
+
+retexture: $(STAMP)  ## give the avatar of RUN=runs/name the texture DIFFUSE=paint.png, or that of FROM=runs/other where MASK=image.png is white
+	$(RUN_PYTHON) -m data_tools.retexture "$(ONE_RUN)" $(if $(DIFFUSE),--diffuse "$(DIFFUSE)") $(if $(FROM),--from "$(FROM)") \
+		$(if $(MASK),--mask "$(MASK)") $(if $(NAME),--name "$(NAME)") $(ARGS)
+
+stylise: $(STAMP)  ## give the avatar of RUN=runs/name the palette of LOOK=image.png
+	$(RUN_PYTHON) -m data_tools.stylise "$(ONE_RUN)" $(if $(LOOK),--look "$(LOOK)") $(if $(NAME),--name "$(NAME)") $(ARGS)
 
 compare: $(STAMP)  ## compare RUN=runs/name with the ground truth of TRUTH=capture (default: the sample): compare/truth.html
 	$(RUN_PYTHON) -m data_tools.evaluate.compare "$(or $(TRUTH),$(SAMPLE))" "$(ONE_RUN)"

@@ -177,11 +177,18 @@ def load_scene(inputs: Mapping[str, Path], config: Config) -> Scene:
     )
 
 
-def make_face(body: Body, skinned: MeshArtifact, texture: TextureArtifact) -> AnimatedFace | None:
-    """Return the avatar with a face that moves; None, with a warning, where the face is not found or not cut out."""
-    captured = CapturedSurface(skinned.mesh, texture.atlas, texture.diffuse, texture.specular)
+def make_face(
+    body: Body, skinned: MeshArtifact, texture: TextureArtifact, shown: TextureArtifact | None = None
+) -> AnimatedFace | None:
+    """Return the avatar with a face that moves; None, with a warning, where the face is not found or not cut out.
+
+    shown: maps that the avatar gets in place of those that the face is found on.
+    """
+    surfaces = [
+        CapturedSurface(skinned.mesh, maps.atlas, maps.diffuse, maps.specular) for maps in (texture, shown or texture)
+    ]
     try:
-        return build_animated_face(body, skinned, captured, FaceDetector)
+        return build_animated_face(body, skinned, surfaces[0], FaceDetector, surfaces[1])
     except FacePatchError as error:
         warn(f"the avatar's face does not move: {error}")
         return None

@@ -48,6 +48,11 @@ class Texels:
     face: Int[np.ndarray, "t"]
     barycentric: Float[np.ndarray, "t 3"]
 
+    def select(self, chosen: Bool[np.ndarray, "t"]) -> "Texels":
+        """Return some of the texels."""
+        arrays = (values[chosen] for values in (self.rows, self.columns, self.face, self.barycentric))
+        return Texels(self.size_px, *arrays)
+
     def coverage_mask(self) -> Bool[np.ndarray, "s s"]:
         """Return a texture that is True at the covered texels."""
         mask = np.zeros((self.size_px, self.size_px), dtype=bool)

@@ -98,7 +98,11 @@ class AnimatedFace:
 
 
 def build_animated_face(
-    body: Body, skinned: MeshArtifact, captured: CapturedSurface, make_detector: Callable[[], Detector]
+    body: Body,
+    skinned: MeshArtifact,
+    captured: CapturedSurface,
+    make_detector: Callable[[], Detector],
+    shown: CapturedSurface | None = None,
 ) -> AnimatedFace:
     """Find the face, register the template, and return the avatar with a face that moves.
 
@@ -107,6 +111,7 @@ def build_animated_face(
         skinned: the captured mesh with its skin.
         captured: the same mesh with its texture.
         make_detector: constructs the detector of face landmarks.
+        shown: the same mesh with the texture that the avatar gets, where it is not the one that the face is found on.
 
     Raises:
         FacePatchError: the avatar gets no such face; the message says why.
@@ -116,7 +121,7 @@ def build_animated_face(
     landmarks = find_face_landmarks(body, captured.mesh, captured.atlas, captured.diffuse, make_detector())
     if landmarks is None:
         raise FacePatchError("no face was found on the textured avatar; it may be too small or hidden in the video")
-    face = animate_face(body, register_template(body, captured.mesh, landmarks), skinned, captured)
+    face = animate_face(body, register_template(body, captured.mesh, landmarks), skinned, shown or captured)
     if face.fit.median_mm > MAX_MEDIAN_MM:
         raise FacePatchError(f"the body's surface is {face.fit.median_mm:.0f} mm from the person's (median)")
     if face.boundary_gap_m > MAX_GAP_M:

@@ -7,6 +7,7 @@ import numpy as np
 from pipeline.core.manifest import Manifest, write_manifest
 from pipeline.geometry.atlas import Atlas
 from pipeline.texture.files import TextureArtifact, save_texture
+from pipeline.texture.light import Highlights, VideoLight
 from stages.export import STAGE, Config
 from tests.field.scene import PaintedScene
 from tests.stages.painted_run import make_run
@@ -20,9 +21,15 @@ def write_exported_run(folder: Path, scene: PaintedScene) -> None:
     atlas = Atlas(uv, faces.astype(np.int32), np.arange(len(uv), dtype=np.int32))
     blank = np.zeros((16, 16), dtype=np.uint8)
     (folder / "texture").mkdir()
-    save_texture(
-        folder / "texture", TextureArtifact(atlas, np.ones((16, 16, 3), np.float32), blank.astype(np.float32), blank)
+    texture = TextureArtifact(
+        atlas,
+        np.ones((16, 16, 3), np.float32),
+        blank.astype(np.float32),
+        blank,
+        VideoLight.uniform(len(scene.images)),
+        Highlights.none(),
     )
+    save_texture(folder / "texture", texture)
     (folder / "export").mkdir()
     config = Config(rig="mixamo").model_dump()
     manifest = Manifest("export", STAGE.version, "", config, {}, {}, {}, 0.0, 0.0)

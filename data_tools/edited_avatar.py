@@ -1,0 +1,51 @@
+"""The avatar of a finished run with another diffuse map: what `retexture` and `stylise` read and write."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from data_tools.folder import replaced_folder
+from data_tools.pose import export_config
+from pipeline.avatar.idle import idle_motion
+from pipeline.io.image import to_uint8, write_gray, write_rgb
+from pipeline.texture.files import DIFFUSE, SPECULAR, TextureArtifact
+from stages import export
+from stages.export import Scene, encode_scene, load_scene, make_face, to_rest_pose, write_scene_obj
+
+
+@dataclass(frozen=True)
+class EditableAvatar:
+    """A finished run as its export shows it; `scene` has no moving face, which is made of the edited map."""
+
+    scene: Scene
+    config: export.Config
+
+
+def load_editable_avatar(run: Path) -> EditableAvatar:
+    """Read the artifacts of a run with a finished export.
+
+    Raises:
+        UserError: the export is not finished, or an artifact cannot be read.
+    """
+    config = export_config(run)
+    inputs = {name: run / name for name in export.STAGE.needs}
+    return EditableAvatar(load_scene(inputs, config.model_copy(update={"face": False})), config)
+
+
+def write_edited_avatar(
+    avatar: EditableAvatar, texture: TextureArtifact, out: Path, report: Callable[[str], None] = print
+) -> None:
+    """Write `avatar.glb`, `avatar.obj` with its `.mtl` and maps, `diffuse.png` and `specular.png` into `out`.
+
+    Rig, animations and face are those of the export; the face is found on the filmed texture and gets the edited one.
+    """
+    scene, config = avatar.scene, avatar.config
+    face = make_face(scene.body, scene.skinned, scene.texture, texture) if config.face else None
+    edited = replace(scene, texture=texture, face=face)
+    clips = {"capture": scene.motion, "idle": idle_motion(scene.body)}
+    with replaced_folder(out) as part:
+        write_rgb(part / DIFFUSE, to_uint8(texture.diffuse))
+        write_gray(part / SPECULAR, to_uint8(texture.specular))
+        (part / "avatar.glb").write_bytes(encode_scene(edited, config, clips))
+        write_scene_obj(part, part, texture, to_rest_pose(scene.skinned, scene.rig).mesh)
+    report(f"{out}: avatar.glb, avatar.obj, {DIFFUSE} ({len(texture.diffuse)} px)")

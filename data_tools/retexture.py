@@ -1,0 +1,104 @@
+"""Give the avatar of a finished run a painted diffuse map, or the clothes of another run's avatar.
+
+python -m data_tools.retexture RUN --diffuse PAINT.png [--name NAME]
+python -m data_tools.retexture RUN --from OTHER_RUN [--mask MASK.png] [--name NAME]
+
+PAINT.png and MASK.png have the layout of RUN/texture/diffuse.png, any square size. Alpha of the paint says where it
+applies; white of the mask is replaced by the other person's texture, without a mask everything from the neck down.
+Writes RUN/retexture/NAME/: avatar.glb, avatar.obj with its maps, diffuse.png.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from data_tools.command import run_command
+from data_tools.edited_avatar import EditableAvatar, load_editable_avatar, write_edited_avatar
+from data_tools.pose import check_folder_name
+from pipeline.capture.face_detector import FaceDetector
+from pipeline.core.errors import UserError
+from pipeline.core.progress import warn
+from pipeline.template.face_landmarks import find_face_landmarks
+from pipeline.template.regions import is_template_body
+from pipeline.template.registration import register_template
+from pipeline.template.texture_exchange import RegisteredSurface, exchanged_map
+from pipeline.texture.files import TextureArtifact
+from pipeline.texture.painting import Painting, enlarge_maps, paint_over, read_mask, read_painting, resize_map
+
+
+def main(argv: Sequence[str]) -> None:
+    """Write one edited avatar."""
+    options = _parse_options(argv)
+    if options.diffuse is not None and options.mask is not None:
+        raise UserError("--mask is for the texture of another run; with --diffuse, paint alpha instead")
+    chosen = options.mask or options.diffuse or options.other
+    name = check_folder_name(options.name) if options.name else Path(chosen).resolve().stem
+    if options.diffuse is not None:
+        painting = read_painting(options.diffuse)
+        avatar = load_editable_avatar(options.run)
+        texture = paint_over(avatar.scene.texture, painting)
+    else:
+        mask = None if options.mask is None else read_mask(options.mask)
+        avatar, other = load_editable_avatar(options.run), load_editable_avatar(options.other)
+        texture = wear_texture_of(
+            (avatar, registered_surface(avatar, options.run)), (other, registered_surface(other, options.other)), mask
+        )
+    write_edited_avatar(avatar, texture, options.run / "retexture" / name)
+
+
+def registered_surface(avatar: EditableAvatar, run: Path) -> RegisteredSurface:
+    """Return the surface of an avatar with the template on it.
+
+    Raises:
+        UserError: the body of the run is not the built-in one.
+    """
+    scene = avatar.scene
+    if not is_template_body(scene.body):
+        raise UserError(f"{run} has a body of a model file; textures are exchanged between runs with the built-in body")
+    mesh, texture = scene.skinned.mesh, scene.texture
+    landmarks = find_face_landmarks(scene.body, mesh, texture.atlas, texture.diffuse, FaceDetector())
+    return RegisteredSurface(mesh, register_template(scene.body, mesh, landmarks).vertices)
+
+
+def wear_texture_of(
+    target: tuple[EditableAvatar, RegisteredSurface],
+    source: tuple[EditableAvatar, RegisteredSurface],
+    mask: Float[np.ndarray, "s s"] | None,
+) -> TextureArtifact:
+    """Return the target's texture with the source's where the mask is white; None: from the neck down.
+
+    Highlights of what is replaced are removed: they belong to the old clothes and to the lamp of one video.
+    """
+    scene, texture, other = target[0].scene, target[0].scene.texture, source[0].scene.texture
+    if texture.light.is_uniform != other.light.is_uniform:
+        warn("the light of the video is in one of the two textures and not in the other: the brightness may differ")
+    side_px = max(len(texture.diffuse), len(other.diffuse), 0 if mask is None else len(mask))
+    colour, alpha = exchanged_map(
+        (target[1], texture.atlas),
+        (source[1], other.atlas),
+        other.diffuse,
+        scene.body,
+        side_px if mask is None else resize_map(mask, side_px),
+    )
+    painted = paint_over(enlarge_maps(texture, side_px), Painting(colour, alpha))
+    return replace(painted, specular=np.asarray(painted.specular * (1.0 - alpha), np.float32))
+
+
+def _parse_options(argv: Sequence[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m data_tools.retexture", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("run", type=Path, help="run folder with a finished export")
+    kind = parser.add_mutually_exclusive_group(required=True)
+    kind.add_argument("--diffuse", type=Path, help="painted map in the layout of texture/diffuse.png")
+    kind.add_argument("--from", dest="other", type=Path, help="run folder of the person whose texture is taken")
+    parser.add_argument("--mask", type=Path, help="with --from: white is replaced; layout of texture/diffuse.png")
+    parser.add_argument("--name", help="of the folder RUN/retexture/NAME; default: that of the mask, map or other run")
+    return parser.parse_args(argv)
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_command(main, sys.argv[1:]))
