@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32
 
 from pipeline.geometry.atlas import Atlas, Texels, rasterize_texels
 from pipeline.geometry.mesh import Mesh
-from pipeline.geometry.surface import closest_points_on_mesh, smooth_taubin
+from pipeline.geometry.surface import closest_points_on_mesh
 from pipeline.geometry.tangents import tangent_frames, vertex_tangents
 from pipeline.geometry.texture_rendering import sample_texture
 from pipeline.texture.edge_padding import fill_unknown_texels
@@ -24,13 +24,8 @@ MAX_DISTANCE_M = 0.01
 MIN_COSINE = 0.5
 """Between the normals of the two meshes; below, the nearest point is on another sheet, as between fingers."""
 
-DENSE_SMOOTHING_STEPS = 0
-"""Steps of Taubin's smoothing of the dense mesh."""
 
-
-def bake_normal_map(
-    mesh: Mesh, atlas: Atlas, dense: Mesh, size_px: int, smoothing_steps: int = DENSE_SMOOTHING_STEPS
-) -> Float32[np.ndarray, "s s 3"]:
+def bake_normal_map(mesh: Mesh, atlas: Atlas, dense: Mesh, size_px: int) -> Float32[np.ndarray, "s s 3"]:
     """Return the map whose normals are those of the dense mesh at the closest point of each texel; gutters filled.
 
     Args:
@@ -38,15 +33,13 @@ def bake_normal_map(
         atlas: of that mesh.
         dense: in the same pose.
         size_px: side of the map.
-        smoothing_steps: of the dense mesh.
     """
     texels = rasterize_texels(atlas, size_px)
     corners = mesh.faces[texels.face]
     frames = texel_frames(mesh, atlas, texels)
     points_m = np.einsum("tk,tkc->tc", texels.barycentric, mesh.vertices[corners])
-    smooth = smooth_taubin(dense, smoothing_steps) if smoothing_steps else dense
-    distance_m, face, weights = closest_points_on_mesh(points_m, smooth)
-    detail = np.einsum("tk,tkc->tc", weights, smooth.vertex_normals()[smooth.faces[face]])
+    distance_m, face, weights = closest_points_on_mesh(points_m, dense)
+    detail = np.einsum("tk,tkc->tc", weights, dense.vertex_normals()[dense.faces[face]])
     is_same_sheet = (distance_m < MAX_DISTANCE_M) & (np.sum(detail * frames[..., 2], axis=1) > MIN_COSINE)
     local = np.where(is_same_sheet[:, None], _solve(frames, detail), (0.0, 0.0, 1.0))
     encoded = 0.5 + 0.5 * local / np.linalg.norm(local, axis=1, keepdims=True)
