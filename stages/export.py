@@ -41,11 +41,12 @@ from pipeline.mesh.files import MeshArtifact, load_mesh
 from pipeline.template.animated_face import AnimatedFace, build_animated_face
 from pipeline.template.face_patch import FacePatchError
 from pipeline.template.face_texture import CapturedSurface
-from pipeline.texture.files import DIFFUSE, SPECULAR, TextureArtifact, load_texture, map_files
+from pipeline.texture.files import DIFFUSE, NORMAL, SPECULAR, TextureArtifact, load_texture, map_files
 from pipeline.texture.light import TERMS, VideoLight
+from pipeline.texture.normal_map import widen_flat
 from pipeline.texture.specular import dielectric_specular_factor
 
-OBJ_MAPS = tuple(f"avatar_{name}" for name in (DIFFUSE, SPECULAR))
+OBJ_MAPS = tuple(f"avatar_{name}" for name in (DIFFUSE, SPECULAR, NORMAL))
 POSES_PER_BATCH = 8
 
 
@@ -200,12 +201,16 @@ def encode_scene(scene: Scene, config: Config, clips: Mapping[str, Motion]) -> b
     atlas, diffuse, specular = texture.atlas, texture.diffuse, texture.specular
     if face is not None:
         atlas, diffuse, specular = face.atlas, face.diffuse, face.specular
+    normal = texture.normal
+    if face is not None and normal is not None:
+        normal = widen_flat(normal)
     has_highlights = bool(specular.any())
     maps = MaterialMaps(
         png_bytes(to_uint8(diffuse)),
         encode_specular_png(specular, texture) if has_highlights else None,
         texture.highlights.roughness if has_highlights else config.roughness,
         config.unlit,
+        None if normal is None else png_bytes(to_uint8(normal)),
     )
     at_rest = to_rest_pose(face.skinned if face else scene.skinned, scene.rig)
     mesh = build_skinned_mesh(at_rest, atlas)
@@ -217,8 +222,14 @@ def encode_scene(scene: Scene, config: Config, clips: Mapping[str, Motion]) -> b
 
 def write_scene_obj(texture_dir: Path, out: Path, texture: TextureArtifact, mesh: Mesh) -> None:
     """Write `avatar.obj`, `avatar.mtl` and the maps for any pose of the mesh."""
-    diffuse_name, specular_name = (copy_map(texture_dir, name, out) for name in (DIFFUSE, SPECULAR))
-    map_names = (diffuse_name, specular_name if texture.specular.any() else None)
+    diffuse_name, specular_name, normal_name = (
+        copy_map(texture_dir, name, out) for name in (DIFFUSE, SPECULAR, NORMAL)
+    )
+    map_names = (
+        diffuse_name,
+        specular_name if texture.specular.any() else None,
+        normal_name if texture.normal is not None else None,
+    )
     write_obj(out / "avatar.obj", mesh, texture.atlas.uv, texture.atlas.faces_uv, mesh.vertex_normals(), *map_names)
 
 

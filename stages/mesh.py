@@ -32,7 +32,15 @@ from pipeline.io.image import to_uint8, write_rgb
 from pipeline.mesh.face_reduction import reduce_faces
 from pipeline.mesh.fairing import fair_surface
 from pipeline.mesh.field_views import render_field_views
-from pipeline.mesh.files import MeshArtifact, load_checkpoint, save_checkpoint, save_mesh
+from pipeline.mesh.files import (
+    DENSE_NPZ,
+    MESH_NPZ,
+    MeshArtifact,
+    load_checkpoint,
+    save_checkpoint,
+    save_dense_mesh,
+    save_mesh,
+)
 from pipeline.mesh.isosurface import CanonicalGrid, extract_mesh, sample_canonical_grid, select_isovalue
 from pipeline.mesh.pose_refit import refit_poses, select_poses
 from pipeline.mesh.pose_selection import is_far_from, score_motion
@@ -78,7 +86,7 @@ class Config(BaseConfig):
 def run(
     inputs: Mapping[str, Path], out: Path, config: Config, settings: MeshSettings = DEFAULT_SETTINGS
 ) -> Mapping[str, float]:
-    """Extract and refine the mesh, and refit the motion through it; write `mesh.npz`, `motion.npz` and `preview.png`.
+    """Extract and refine the mesh, and refit the motion through it; write the files of `STAGE.makes`.
 
     Args:
         inputs: folders of the stages frames, body and field.
@@ -132,6 +140,7 @@ def run(
     mesh = finish_mesh(state.mesh, refinement_inputs)
     is_unchanged = mesh is state.mesh
     skin = state.skin if is_unchanged else transfer_skin(mesh, body)
+    save_dense_mesh(out, state.mesh)
     write_results(out, mesh, skin, shader)
     motion, motion_metrics = refit_motion(capture, inputs, body, (mesh, skin, shader), validation)
     save_motion(out / "motion.npz", motion)
@@ -260,9 +269,9 @@ def write_results(out: Path, mesh: Mesh, skin: SkinnedTopology, shader: torch.nn
 
 STAGE = Stage(
     "mesh",
-    version=14,
+    version=15,
     needs=("frames", "body", "field"),
-    makes=("mesh.npz", "motion.npz", "preview.png"),
+    makes=(MESH_NPZ, DENSE_NPZ, "motion.npz", "preview.png"),
     config=Config,
     run=run,
 )

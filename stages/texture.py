@@ -1,4 +1,4 @@
-"""texture stage: unwrap the mesh into a UV atlas and bake diffuse, specular and coverage maps from the video."""
+"""texture stage: unwrap the mesh into a UV atlas and bake diffuse, specular, normal and coverage maps."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float32, Int
 from pydantic import Field, ValidationInfo, field_validator
 from torch import Tensor
 
@@ -27,7 +27,7 @@ from pipeline.geometry.camera import pixel_footprint_m
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.io.image import to_float, to_uint8
-from pipeline.mesh.files import MeshArtifact, load_mesh
+from pipeline.mesh.files import MeshArtifact, load_dense_mesh, load_mesh
 from pipeline.texture.bake import (
     InpaintFunction,
     TexturedSurface,
@@ -41,6 +41,7 @@ from pipeline.texture.files import (
     COVERAGE,
     DIFFUSE,
     LIGHT,
+    NORMAL,
     SPECULAR,
     TextureArtifact,
     TextureFormat,
@@ -49,9 +50,13 @@ from pipeline.texture.files import (
 from pipeline.texture.inpainting import average_texels_per_vertex, inpaint_vertex_colours
 from pipeline.texture.light import Highlights, VideoLight
 from pipeline.texture.light_evidence import LightEvidence, estimate_light
+from pipeline.texture.normal_map import bake_normal_map
 from pipeline.texture.settings import DEFAULT_SETTINGS, TextureSettings
 from pipeline.texture.specular import SpecularFit, fit_specular, texels_at_vertices
 from pipeline.texture.views import BakeView, crop_bake_view, weight_by_resolution
+
+NORMAL_MAP_DIVISOR, MIN_NORMAL_MAP_PX = 2, 64
+"""Side of the normal map: half of that of the other maps. An edge of the dense mesh is two texels long or more."""
 
 
 class Config(BaseConfig):
@@ -72,6 +77,9 @@ class Config(BaseConfig):
     light: Literal["auto", "removed", "kept"] = Field(
         "auto",
         description="light of the video in the diffuse map: removed, kept, or auto (decided on validation frames)",
+    )
+    normal_map: bool = Field(
+        False, description="normal map of what the mesh lost when its faces were reduced; no closer to the person"
     )
     max_frames: int = Field(
         100, ge=1, description="largest number of training frames, evenly spaced over the recording"
@@ -135,6 +143,7 @@ def run(
         coverage=to_uint8(texels.to_texture(texel_confidence[:, None])[..., 0]),
         light=light,
         highlights=fitted.highlights,
+        normal=make_normal_map(inputs["mesh"], skinned.mesh, atlas, size_px) if config.normal_map else None,
     )
     save_texture(out, artifact, config.format)
     return {
@@ -246,6 +255,14 @@ def build_atlas(
     return unwrap(skinned.mesh, part, size_px, settings.padding_px), size_px
 
 
+def make_normal_map(mesh_dir: Path, mesh: Mesh, atlas: Atlas, texture_px: int) -> Float32[np.ndarray, "n n 3"] | None:
+    """Return the normal map of what the reduction of the faces removed; None if it removed none."""
+    dense = load_dense_mesh(mesh_dir)
+    if len(dense.faces) == len(mesh.faces):
+        return None
+    return bake_normal_map(mesh, atlas, dense, max(texture_px // NORMAL_MAP_DIVISOR, MIN_NORMAL_MAP_PX))
+
+
 def make_texel_inpainter(mesh: Mesh, texels: Texels) -> InpaintFunction:
     """Return a function that inpaints unobserved texels from the observed colours around them on the surface."""
 
@@ -265,9 +282,9 @@ def fit_highlights(evidence: LightEvidence | None, light: VideoLight, mesh: Mesh
 
 STAGE = Stage(
     "texture",
-    version=6,
+    version=7,
     needs=("frames", "body", "mesh"),
-    makes=(ATLAS, DIFFUSE, SPECULAR, COVERAGE, LIGHT),
+    makes=(ATLAS, DIFFUSE, SPECULAR, NORMAL, COVERAGE, LIGHT),
     config=Config,
     run=run,
 )

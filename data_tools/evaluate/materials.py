@@ -39,7 +39,7 @@ from pipeline.geometry.surface import closest_points_on_mesh, collapse_edges
 from pipeline.geometry.texture_rendering import sample_texture
 from pipeline.io.image import to_float, to_uint8, write_gray, write_rgb
 from pipeline.io.npz import save_npz
-from pipeline.mesh.files import MeshArtifact, load_mesh, save_mesh
+from pipeline.mesh.files import MeshArtifact, load_mesh, save_dense_mesh, save_mesh
 from pipeline.metrics.images import composite_on_white, composite_premultiplied_on_white, foreground_mask, psnr_db
 from pipeline.metrics.surfaces import sample_surface
 from pipeline.texture.files import TextureArtifact, load_texture
@@ -118,6 +118,7 @@ def write_true_run(truth: SyntheticCapture, folder: Path, frames: int, flicker: 
     save_npz(folder / "body" / SCORES_NPZ, {"usable": np.ones(count, dtype=bool)})
     save_motion(folder / "mesh" / "motion.npz", motion)
     save_mesh(folder / "mesh", reduced_mesh(truth.subject.body))
+    save_dense_mesh(folder / "mesh", truth.subject.body.mesh())
     return gains
 
 

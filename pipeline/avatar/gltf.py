@@ -17,6 +17,7 @@ from pipeline.avatar.rig import Rig
 from pipeline.body.body import Motion
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.rotation import continuous_quaternions, matrix_to_quaternion, quaternion_to_matrix
+from pipeline.geometry.tangents import vertex_tangents
 from pipeline.io.glb_writer import GlbWriter
 
 _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
@@ -76,13 +77,20 @@ class MaterialMaps:
         diffuse_png: RGB, sRGB.
         specular_png: result of `pack_specular_factor`; None for a surface without highlights.
         roughness: in [0, 1].
-        unlit: viewers show the diffuse map without lights; `specular_png` is then ignored.
+        normal_png: tangent-space normals, green up; None for a surface without a normal map.
+        unlit: viewers show the diffuse map without lights; `specular_png` and `normal_png` are then ignored.
     """
 
     diffuse_png: bytes
     specular_png: bytes | None = None
     roughness: float = 0.9
     unlit: bool = False
+    normal_png: bytes | None = None
+
+    @property
+    def has_normals(self) -> bool:
+        """Whether the material has a normal map, for which vertices need tangents."""
+        return self.normal_png is not None and not self.unlit
 
 
 def encode_glb(
@@ -117,7 +125,7 @@ def encode_glb(
         document.json["asset"]["extras"] = dict(extras)
     first_joint = 1
     material = _add_material(document, maps)
-    primitive = _add_primitive(document, mesh, len(rig.joint_names)) | {"material": material}
+    primitive = _add_primitive(document, mesh, len(rig.joint_names), maps.has_normals) | {"material": material}
     named: dict[str, Any] = {"name": "avatar", "primitives": [primitive]}
     if mesh.morphs is not None:
         names = mesh.morphs.names
@@ -158,7 +166,7 @@ def _check_motion(motion: Motion) -> None:
         raise ValueError("an animation needs quaternions of non-zero length")
 
 
-def _add_primitive(document: GlbWriter, mesh: SkinnedMesh, joint_count: int) -> dict[str, Any]:
+def _add_primitive(document: GlbWriter, mesh: SkinnedMesh, joint_count: int, has_tangents: bool) -> dict[str, Any]:
     joints = mesh.joint_indices.astype(np.uint8 if joint_count <= 256 else np.uint16)
     uv = np.stack([mesh.uv[:, 0], 1.0 - mesh.uv[:, 1]], axis=1).astype(np.float32)
     # 65535 is the primitive restart value of 16-bit indices and is not allowed as an index
@@ -170,12 +178,15 @@ def _add_primitive(document: GlbWriter, mesh: SkinnedMesh, joint_count: int) -> 
         "JOINTS_0": document.add_array(joints, _ARRAY_BUFFER),
         "WEIGHTS_0": document.add_array(_normalise_weights(mesh.joint_weights), _ARRAY_BUFFER),
     }
+    if has_tangents:
+        tangents = vertex_tangents(mesh.positions_m, _unit_normals(mesh.normals), mesh.uv, mesh.faces)
+        attributes["TANGENT"] = document.add_array(tangents, _ARRAY_BUFFER)
     return {"attributes": attributes, "indices": document.add_array(faces.reshape(-1), _ELEMENT_ARRAY_BUFFER)}
 
 
 def _add_material(document: GlbWriter, maps: MaterialMaps) -> int:
     document.add("samplers", {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071})
-    surface = {
+    surface: dict[str, Any] = {
         "name": "avatar",
         "pbrMetallicRoughness": {
             "baseColorTexture": {"index": _add_texture(document, "diffuse", maps.diffuse_png)},
@@ -189,6 +200,8 @@ def _add_material(document: GlbWriter, maps: MaterialMaps) -> int:
     elif maps.specular_png is not None:
         texture = {"index": _add_texture(document, "specular", maps.specular_png)}
         extensions = {"KHR_materials_specular": {"specularTexture": texture}}
+    if maps.normal_png is not None and maps.has_normals:
+        surface["normalTexture"] = {"index": _add_texture(document, "normal", maps.normal_png)}
     document.json["extensionsUsed"] = list(extensions)
     return document.add("materials", surface | {"extensions": extensions})
 

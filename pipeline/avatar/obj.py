@@ -22,11 +22,12 @@ def write_obj(
     normals: Float[np.ndarray, "v 3"],
     diffuse_name: str,
     specular_name: str | None,
+    normal_name: str | None = None,
 ) -> None:
     """Write `path` (.obj) and the .mtl of the same name, which references the maps in the same folder.
 
     mesh: m, +Y up. uv: origin bottom-left, as in OBJ. normals: unit, one per vertex. specular_name: None for a surface
-    without highlights.
+    without highlights. normal_name: tangent-space normals, green up, as `norm`; None without them.
     """
     corners = np.stack([mesh.faces, faces_uv, mesh.faces], axis=2).reshape(len(mesh.faces), 9) + 1
     lines = [f"mtllib {path.with_suffix('.mtl').name}", f"o {MATERIAL}"]
@@ -36,14 +37,14 @@ def write_obj(
     lines += [f"usemtl {MATERIAL}", "s 1"]
     lines += _format_rows("f %d/%d/%d %d/%d/%d %d/%d/%d", corners)
     path.write_text("\n".join(lines) + "\n", encoding="ascii")
-    path.with_suffix(".mtl").write_text(_mtl_text(diffuse_name, specular_name), encoding="ascii")
+    path.with_suffix(".mtl").write_text(_mtl_text(diffuse_name, specular_name, normal_name), encoding="ascii")
 
 
 def _format_rows(row_format: str, values: np.ndarray) -> list[str]:
     return [row_format % tuple(row) for row in values.tolist()]
 
 
-def _mtl_text(diffuse_name: str, specular_name: str | None) -> str:
+def _mtl_text(diffuse_name: str, specular_name: str | None, normal_name: str | None) -> str:
     ks = "1" if specular_name else "0"
     lines = [
         f"newmtl {MATERIAL}",
@@ -56,4 +57,6 @@ def _mtl_text(diffuse_name: str, specular_name: str | None) -> str:
         f"map_Kd {diffuse_name}",
     ]
     lines += [f"map_Ks {specular_name}"] if specular_name else []
+    # of the PBR extension of .mtl: `map_Bump` holds heights for some readers
+    lines += [f"norm {normal_name}"] if normal_name else []
     return "\n".join(lines) + "\n"

@@ -1,4 +1,4 @@
-"""The files of the mesh stage: the skinned mesh as npz, and the checkpoint of the refinement as safetensors."""
+"""The files of the mesh stage: the skinned and the dense mesh as npz, the state of the refinement as safetensors."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ from pipeline.io.tensors import load_tensors, save_tensors
 from pipeline.mesh.refinement import RefinementState
 from pipeline.mesh.skin_transfer import build_skinned_topology
 
-MESH_NPZ = "mesh.npz"
+MESH_NPZ, DENSE_NPZ = "mesh.npz", "dense.npz"
 SHADER_STATE_PREFIX = "appearance."
 
 
@@ -63,6 +63,25 @@ def load_mesh(folder: Path) -> MeshArtifact:
         return MeshArtifact(mesh, arrays["joint_indices"], arrays["joint_weights"], arrays["vertex_colors"])
     except KeyError as error:
         path = folder / MESH_NPZ
+        raise UserError(f"{path} has no array {error}; run python -m stages.mesh {folder.parent} --force") from None
+
+
+def save_dense_mesh(folder: Path, mesh: Mesh) -> None:
+    """Write dense.npz, the refined mesh (A-pose, m) before its faces are reduced; `load_dense_mesh` is the inverse."""
+    save_npz(folder / DENSE_NPZ, {"vertices": mesh.vertices.astype(np.float32), "faces": mesh.faces.astype(np.int32)})
+
+
+def load_dense_mesh(folder: Path) -> Mesh:
+    """Read dense.npz from the folder of the mesh stage.
+
+    Raises:
+        UserError: the file is missing, is no npz, or has not the arrays of a mesh.
+    """
+    arrays = load_npz(folder / DENSE_NPZ)
+    try:
+        return Mesh(arrays["vertices"], arrays["faces"])
+    except KeyError as error:
+        path = folder / DENSE_NPZ
         raise UserError(f"{path} has no array {error}; run python -m stages.mesh {folder.parent} --force") from None
 
 

@@ -14,7 +14,10 @@ from pipeline.io.npz import load_npz, save_npz
 from pipeline.texture.light import Highlights, VideoLight, load_light, save_light
 
 ATLAS, DIFFUSE, SPECULAR, COVERAGE = "atlas.npz", "diffuse.png", "specular.png", "coverage.png"
-LIGHT = "light.npz"
+LIGHT, NORMAL = "light.npz", "normal.png"
+FLAT_NORMAL = (0.5, 0.5, 1.0)
+"""Texel of a normal map that leaves the normal of the mesh as it is; 0.3 degrees off as (128, 128, 255) in 8 bits."""
+
 TextureFormat = Literal["png8", "png16", "exr"]
 
 
@@ -29,6 +32,8 @@ class TextureArtifact:
         coverage: confidence that the video shows the texel, 0 to 255; 0 outside the charts.
         light: of the video. Uniform: the diffuse map holds the light; else it is the albedo.
         highlights: the lobe of the specular map.
+        normal: tangent-space normals, from -1 to 1 as values in [0, 1] (`pipeline.texture.normal_map`); None for a
+            surface without a normal map. Its side may be another than that of the other maps.
     """
 
     atlas: Atlas
@@ -37,12 +42,14 @@ class TextureArtifact:
     coverage: UInt8[np.ndarray, "s s"]
     light: VideoLight
     highlights: Highlights
+    normal: Float32[np.ndarray, "n n 3"] | None = None
 
 
 def save_texture(folder: Path, texture: TextureArtifact, texture_format: TextureFormat = "png8") -> None:
     """Write the atlas and the maps into `folder`; `load_texture` is the inverse up to the precision of the format.
 
-    Maps are PNG with 8 bits per channel, or 16 for "png16". "exr" adds OpenEXR files with linear half floats.
+    Maps are PNG with 8 bits per channel, or 16 for "png16". "exr" adds OpenEXR files with linear half floats; its
+    normal map, whose values are no colours, is a PNG with 16 bits. Without a normal map, that file is one flat texel.
     """
     atlas = texture.atlas
     save_npz(folder / ATLAS, {"uv": atlas.uv, "faces_uv": atlas.faces_uv, "vertex_of_uv": atlas.vertex_of_uv})
@@ -51,6 +58,8 @@ def save_texture(folder: Path, texture: TextureArtifact, texture_format: Texture
         write(folder / name, to_uint16(values) if texture_format == "png16" else to_uint8(values))
         if texture_format == "exr":
             write((folder / name).with_suffix(".exr"), values)
+    normal = np.full((1, 1, 3), FLAT_NORMAL, dtype=np.float32) if texture.normal is None else texture.normal
+    write_rgb(folder / NORMAL, to_uint8(normal) if texture_format == "png8" else to_uint16(normal))
     write_gray(folder / COVERAGE, texture.coverage)
     save_light(folder / LIGHT, texture.light, texture.highlights)
 
@@ -75,4 +84,13 @@ def load_texture(folder: Path) -> TextureArtifact:
     diffuse = read_rgb_float(map_files(folder, DIFFUSE)[-1])
     specular = read_rgb_float(map_files(folder, SPECULAR)[-1])[..., 0]
     coverage, (light, highlights) = read_gray(folder / COVERAGE), load_light(folder / LIGHT)
-    return TextureArtifact(atlas, diffuse, np.ascontiguousarray(specular), coverage, light, highlights)
+    normal = read_rgb_float(folder / NORMAL)
+    return TextureArtifact(
+        atlas,
+        diffuse,
+        np.ascontiguousarray(specular),
+        coverage,
+        light,
+        highlights,
+        normal if normal.shape[0] > 1 else None,
+    )

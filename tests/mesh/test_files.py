@@ -9,7 +9,17 @@ import torch
 from pipeline.core.errors import UserError
 from pipeline.geometry.mesh import Mesh
 from pipeline.io.npz import load_npz, save_npz
-from pipeline.mesh.files import MESH_NPZ, MeshArtifact, load_checkpoint, load_mesh, save_checkpoint, save_mesh
+from pipeline.mesh.files import (
+    DENSE_NPZ,
+    MESH_NPZ,
+    MeshArtifact,
+    load_checkpoint,
+    load_dense_mesh,
+    load_mesh,
+    save_checkpoint,
+    save_dense_mesh,
+    save_mesh,
+)
 from pipeline.mesh.refinement import RefinementState
 from pipeline.mesh.skin_transfer import build_skinned_topology
 
@@ -32,6 +42,16 @@ def test_a_mesh_is_read_back(tmp_path: Path) -> None:
     np.testing.assert_array_equal(loaded.mesh.faces, TETRAHEDRON.faces)
     for name in ("joint_indices", "joint_weights", "vertex_colours"):
         np.testing.assert_array_equal(getattr(loaded, name), getattr(ARTIFACT, name))
+
+
+def test_the_dense_mesh_is_read_back(tmp_path: Path) -> None:
+    save_dense_mesh(tmp_path, TETRAHEDRON)
+    loaded = load_dense_mesh(tmp_path)
+    np.testing.assert_array_equal(loaded.vertices, TETRAHEDRON.vertices)
+    np.testing.assert_array_equal(loaded.faces, TETRAHEDRON.faces)
+    save_npz(tmp_path / DENSE_NPZ, {"vertices": TETRAHEDRON.vertices})
+    with pytest.raises(UserError, match=r"dense\.npz has no array 'faces'; run python -m stages\.mesh"):
+        load_dense_mesh(tmp_path)
 
 
 def test_dense_weights_have_one_row_per_vertex() -> None:

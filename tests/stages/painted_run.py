@@ -15,7 +15,7 @@ from pipeline.geometry.camera import Camera
 from pipeline.geometry.skinning import top_k_weights
 from pipeline.io.image import write_gray, write_rgb
 from pipeline.io.npz import save_npz
-from pipeline.mesh.files import MeshArtifact, save_mesh
+from pipeline.mesh.files import MeshArtifact, save_dense_mesh, save_mesh
 
 FPS = 24.0
 
@@ -59,5 +59,6 @@ def make_run(
         inputs["field"] / "field.safetensors", RadianceField(bounds_m, hash_grid_layout(bounds_m, 0.05, 2, 2, 10))
     )
     grey = np.full_like(body.vertices, 0.5)
+    save_dense_mesh(inputs["mesh"], body.mesh())
     save_mesh(inputs["mesh"], MeshArtifact(body.mesh(), *top_k_weights(body.skin_weights), grey))
     return inputs

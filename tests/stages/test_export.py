@@ -14,7 +14,7 @@ from pipeline.body.body import canonical_to_world
 from pipeline.geometry.atlas import Atlas
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.io.glb import GlbFile
-from pipeline.io.image import read_rgb, to_float, write_gray
+from pipeline.io.image import read_rgb, to_float, write_gray, write_rgb
 from pipeline.texture.files import TextureArtifact, TextureFormat, load_texture, save_texture
 from pipeline.texture.light import Highlights, VideoLight, directional_light, save_light
 from stages.export import STAGE as EXPORT
@@ -143,6 +143,28 @@ def test_highlights_become_a_specular_factor_unless_the_surface_is_unlit(
             roughness = glb.gltf["materials"][0]["pbrMetallicRoughness"]["roughnessFactor"]
             assert roughness == pytest.approx((2 / 26) ** 0.25, rel=1e-6)
     assert materials == [({"KHR_materials_specular"}, 2), ({"KHR_materials_unlit"}, 1)]
+
+
+def test_a_normal_map_is_exported_with_tangents_and_the_formats_accept_it(
+    inputs: dict[str, Path], tmp_path: Path
+) -> None:
+    texture, out = shutil.copytree(inputs["texture"], tmp_path / "texture"), tmp_path / "export"
+    out.mkdir()
+    pixels = np.random.default_rng(2).integers(100, 156, (TEXTURE_PX // 2, TEXTURE_PX // 2, 3), dtype=np.uint8)
+    pixels[..., 2] = 250
+    write_rgb(texture / "normal.png", pixels)
+    EXPORT.run(inputs | {"texture": texture}, out, EXPORT.config(formats="vrm", face=False))
+    assert "norm avatar_normal.png" in (out / "avatar.mtl").read_text().splitlines()
+    for name in ("avatar.glb", "avatar.vrm"):
+        file = GlbFile(out / name)
+        index = file.gltf["textures"][file.gltf["materials"][0]["normalTexture"]["index"]]["source"]
+        np.testing.assert_array_equal(file.image_pixels(index), pixels)
+        attributes = file.gltf["meshes"][0]["primitives"][0]["attributes"]
+        tangents, normals = file.accessor(attributes["TANGENT"]), file.accessor(attributes["NORMAL"])
+        np.testing.assert_allclose(np.linalg.norm(tangents[:, :3], axis=1), 1.0, atol=1e-5)
+        assert np.abs(np.sum(tangents[:, :3] * normals, axis=1)).max() < 0.1
+    for name in ("avatar.glb", "avatar.vrm"):
+        assert validator_issues(out / name) == []
 
 
 def test_further_formats_are_written_and_the_glb_stays(

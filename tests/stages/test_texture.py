@@ -10,14 +10,16 @@ import torch
 from pipeline.body.body import canonical_to_world
 from pipeline.core.config import ConfigLayers, build_config
 from pipeline.core.errors import UserError
+from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.geometry.texture_rendering import render_textured
 from pipeline.io.npz import load_npz
+from pipeline.mesh.files import save_dense_mesh
 from pipeline.metrics.images import composite_on_white, composite_premultiplied_on_white, foreground_mask, psnr_db
-from pipeline.texture.files import load_texture
+from pipeline.texture.files import FLAT_NORMAL, load_texture
 from pipeline.texture.settings import TextureSettings
 from stages.texture import STAGE as TEXTURE
-from stages.texture import run
+from stages.texture import make_normal_map, run
 from tests.field.scene import PaintedScene, painted_scene
 from tests.stages.painted_run import make_run
 
@@ -139,3 +141,21 @@ def test_invalid_texture_sizes_are_refused(options: dict[str, int], message: str
     layers.add({"texture": options}, "test.yaml")
     with pytest.raises(UserError, match=message):
         build_config("texture", TEXTURE.config, layers)
+
+
+def test_a_normal_map_is_made_only_where_faces_were_removed(
+    scene: PaintedScene, textured: tuple[Path, dict[str, float]], tmp_path: Path
+) -> None:
+    mesh, atlas = scene.body.mesh(), load_texture(textured[0]).atlas
+    assert load_texture(textured[0]).normal is None
+    save_dense_mesh(tmp_path, mesh)
+    assert make_normal_map(tmp_path, mesh, atlas, 256) is None
+    middle = mesh.vertices[mesh.faces[0]].mean(axis=0, keepdims=True)
+    a, b, c = mesh.faces[0]
+    extra = len(mesh.vertices)
+    split = np.array([[a, b, extra], [b, c, extra], [c, a, extra]], dtype=mesh.faces.dtype)
+    save_dense_mesh(tmp_path, Mesh(np.concatenate([mesh.vertices, middle]), np.concatenate([mesh.faces[1:], split])))
+    normal = make_normal_map(tmp_path, mesh, atlas, 256)
+    assert normal is not None
+    assert normal.shape == (128, 128, 3)
+    assert np.abs(normal - np.float32(FLAT_NORMAL)).mean() < 0.01

@@ -16,6 +16,7 @@ from pipeline.texture.files import (
     COVERAGE,
     DIFFUSE,
     LIGHT,
+    NORMAL,
     SPECULAR,
     TextureArtifact,
     TextureFormat,
@@ -42,7 +43,9 @@ def artifact() -> TextureArtifact:
 
 def test_reading_inverts_writing(artifact: TextureArtifact, tmp_path: Path) -> None:
     save_texture(tmp_path, artifact)
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([ATLAS, DIFFUSE, SPECULAR, COVERAGE, LIGHT])
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
+        [ATLAS, DIFFUSE, SPECULAR, COVERAGE, LIGHT, NORMAL]
+    )
     read = load_texture(tmp_path)
     for name in ("uv", "faces_uv", "vertex_of_uv"):
         np.testing.assert_array_equal(getattr(read.atlas, name), getattr(artifact.atlas, name))
@@ -73,12 +76,26 @@ def test_each_format_keeps_its_precision(
     assert cv2.imread(str(tmp_path / DIFFUSE), cv2.IMREAD_UNCHANGED).dtype == depth
 
 
-@pytest.mark.parametrize("name", [ATLAS, DIFFUSE, SPECULAR, COVERAGE])
+@pytest.mark.parametrize("name", [ATLAS, DIFFUSE, SPECULAR, NORMAL, COVERAGE])
 def test_a_missing_file_is_named(name: str, artifact: TextureArtifact, tmp_path: Path) -> None:
     save_texture(tmp_path, artifact)
     (tmp_path / name).unlink()
     with pytest.raises(UserError, match=name):
         load_texture(tmp_path)
+
+
+@pytest.mark.parametrize(("texture_format", "step"), [("png8", 255), ("png16", 65535), ("exr", 65535)])
+def test_a_normal_map_is_read_back_and_none_stays_none(
+    artifact: TextureArtifact, tmp_path: Path, texture_format: TextureFormat, step: int
+) -> None:
+    save_texture(tmp_path, artifact, texture_format)
+    assert load_texture(tmp_path).normal is None
+    normal = np.random.default_rng(0).uniform(size=(4, 4, 3)).astype(np.float32)
+    save_texture(tmp_path, replace(artifact, normal=normal), texture_format)
+    read = load_texture(tmp_path).normal
+    assert read is not None
+    np.testing.assert_allclose(read, normal, atol=0.501 / step)
+    assert [path.name for path in map_files(tmp_path, NORMAL)] == [NORMAL]
 
 
 def test_a_missing_array_is_named(artifact: TextureArtifact, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Levels of detail: the avatar with fewer triangles and smaller textures, with the same skeleton, skin and clips.
 
-Each level has its own texture coordinates and textures, baked from those of the avatar (`level_textures`).
+Each level has its own texture coordinates and textures, baked from those of the avatar (`level_textures`). A level has
+no normal map: its normals are those of the full mesh at its vertices.
 
 Each level is a whole file of its own. The extension MSFT_lod would put all levels into one file, but the loaders of
 three.js, glTFast and Blender do not read it.
@@ -18,6 +19,7 @@ from pipeline.avatar.formats.level_textures import (
     find_texel_sources,
     join_meshes,
 )
+from pipeline.avatar.formats.normal_maps import remove_normal_maps
 from pipeline.geometry.atlas import unwrap
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.simplification import ReducedFaces, collapse_edges
@@ -59,10 +61,10 @@ def encode_level(file: GlbFile, face_ratio: float, texture_halvings: int) -> byt
         UserError: the file's arrays or images cannot be read.
     """
     document = GlbWriter.from_file(file)
+    images = [file.image_pixels(index) for index in remove_normal_maps(document.json)]
     primitives = [primitive for mesh in document.json["meshes"] for primitive in mesh["primitives"]]
     full = [_uv_mesh(file, primitive) for primitive in primitives]
     reduced = [collapse_edges(mesh.positions_m, mesh.faces, round(face_ratio * len(mesh.faces))) for mesh in full]
-    images = [file.image_pixels(index) for index in range(len(document.json.get("images", ())))]
     sizes_px = [_halved_size(pixels, texture_halvings) for pixels in images]
     atlas = _unwrap_together(full, reduced, max((max(size_px) for size_px in sizes_px), default=MIN_TEXTURE_PX))
     level = []

@@ -1,7 +1,7 @@
 """Convert the avatar's .glb to USDZ: skinned mesh, skeleton, texture and the first clip, for Quick Look and USD tools.
 
 Quick Look plays one skeletal animation, in a loop; without a clip it shows the rest pose. The highlights' map has no
-counterpart in UsdPreviewSurface and is left out.
+counterpart in UsdPreviewSurface and is left out, and so is the normal map.
 
 References: https://openusd.org/release/api/usd_skel_page_front.html and https://openusd.org/release/spec_usdpreviewsurface.html.
 """

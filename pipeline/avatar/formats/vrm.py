@@ -200,6 +200,11 @@ def _bake_mesh(file: GlbFile, document: GlbWriter, transforms: Float[np.ndarray,
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         document.replace_array(attributes["POSITION"], positions_m.astype(np.float32))
         document.replace_array(attributes["NORMAL"], normals.astype(np.float32))
+        if "TANGENT" in attributes:
+            tangents = _array(file, primitive, "TANGENT")
+            turned = np.einsum("vab,vb->va", bind_to_rest[:, :3, :3], tangents[:, :3])
+            turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+            document.replace_array(attributes["TANGENT"], np.column_stack([turned, tangents[:, 3]]).astype(np.float32))
         for index in (index for target in primitive.get("targets", ()) for index in target.values()):
             moved = np.einsum("vab,vb->va", bind_to_rest[:, :3, :3], file.accessor(index))
             document.replace_array(index, moved.astype(np.float32))
