@@ -8,7 +8,7 @@ from data_tools.folder import replaced_folder
 from data_tools.pose import export_config
 from pipeline.avatar.idle import idle_motion
 from pipeline.io.image import to_uint8, write_gray, write_rgb
-from pipeline.texture.files import DIFFUSE, SPECULAR, TextureArtifact
+from pipeline.texture.files import DIFFUSE, NORMAL, SPECULAR, TextureArtifact, save_normal_map
 from stages import export
 from stages.export import Scene, encode_scene, load_scene, make_face, to_rest_pose, write_scene_obj
 
@@ -35,7 +35,7 @@ def load_editable_avatar(run: Path) -> EditableAvatar:
 def write_edited_avatar(
     avatar: EditableAvatar, texture: TextureArtifact, out: Path, report: Callable[[str], None] = print
 ) -> None:
-    """Write `avatar.glb`, `avatar.obj` with its `.mtl` and maps, `diffuse.png` and `specular.png` into `out`.
+    """Write `avatar.glb`, `avatar.obj` with its `.mtl` and maps, and the maps into `out`.
 
     Rig, animations and face are those of the export; the face is found on the filmed texture and gets the edited one.
     """
@@ -46,6 +46,7 @@ def write_edited_avatar(
     with replaced_folder(out) as part:
         write_rgb(part / DIFFUSE, to_uint8(texture.diffuse))
         write_gray(part / SPECULAR, to_uint8(texture.specular))
+        save_normal_map(part / NORMAL, texture)
         (part / "avatar.glb").write_bytes(encode_scene(edited, config, clips))
         write_scene_obj(part, part, texture, to_rest_pose(scene.skinned, scene.rig).mesh)
     report(f"{out}: avatar.glb, avatar.obj, {DIFFUSE} ({len(texture.diffuse)} px)")

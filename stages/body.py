@@ -301,7 +301,7 @@ def draw_overlay_grid(
 
 STAGE = Stage(
     "body",
-    version=16,
+    version=17,
     needs=("frames",),
     makes=(_BODY, _MOTION, _CAMERA, _OBSERVATIONS, SCORES_NPZ, _OVERLAY),
     config=Config,

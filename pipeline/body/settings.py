@@ -58,7 +58,7 @@ class FitSettings:
     silhouette_landmark_3d_std_m: float = 0.4
     hand_std_m: float = 0.060
     fitted_hand_std_m: float = 0.012
-    face_std_m: float = 0.030
+    face_std_m: float = 0.15
     fitted_face_std_m: float = 0.008
     landmark_cutoff: float = 3.0
     contour_std_m: float = 0.010

@@ -58,10 +58,15 @@ def save_texture(folder: Path, texture: TextureArtifact, texture_format: Texture
         write(folder / name, to_uint16(values) if texture_format == "png16" else to_uint8(values))
         if texture_format == "exr":
             write((folder / name).with_suffix(".exr"), values)
-    normal = np.full((1, 1, 3), FLAT_NORMAL, dtype=np.float32) if texture.normal is None else texture.normal
-    write_rgb(folder / NORMAL, to_uint8(normal) if texture_format == "png8" else to_uint16(normal))
+    save_normal_map(folder / NORMAL, texture, texture_format)
     write_gray(folder / COVERAGE, texture.coverage)
     save_light(folder / LIGHT, texture.light, texture.highlights)
+
+
+def save_normal_map(path: Path, texture: TextureArtifact, texture_format: TextureFormat = "png8") -> None:
+    """Write the normal map; without one, a single flat texel."""
+    normal = np.full((1, 1, 3), FLAT_NORMAL, dtype=np.float32) if texture.normal is None else texture.normal
+    write_rgb(path, to_uint8(normal) if texture_format == "png8" else to_uint16(normal))
 
 
 def map_files(folder: Path, name: str) -> list[Path]:
