@@ -32,6 +32,8 @@ class FaceDetector:
             self._model = FaceMesh(
                 static_image_mode=True, refine_landmarks=True, min_detection_confidence=MIN_CONFIDENCE
             )
+            # Its threads start asynchronously, and their messages would appear after this block.
+            self._model.process(np.zeros((64, 64, 3), dtype=np.uint8))
 
     def detect_face(self, rgb: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "478 2"] | None:
         """Return the landmarks of the largest face (px, pixel centres at +0.5), or None without a face.

@@ -85,7 +85,8 @@ def _run_pipeline(pipeline: Pipeline, argv: Sequence[str], version: str, isolate
     start = time.monotonic()
     forced = _forced_stages(pipeline.names, options)
     request = _build_request(run_dir, options, replace_video=pipeline.names[0] in forced)
-    outcomes = run_pipeline(pipeline, request, RunOptions(forced, isolate))
+    run_options = RunOptions(forced, isolate, fork_command=lambda arguments: main_pipeline(pipeline, arguments))
+    outcomes = run_pipeline(pipeline, request, run_options)
     print(format_summary(outcomes, time.monotonic() - start))
 
 

@@ -1,12 +1,15 @@
 """Run the stages of a pipeline in order, each in a process of its own.
 
-A process for each stage makes its peak memory measurable, returns its memory, and confines a crash to the stage.
+A process for each stage makes its peak memory measurable, returns its memory, and confines a crash to the stage. On
+Linux the command forks itself, so that libraries are imported once and not by every stage; elsewhere, and from Python,
+where the calling process may have threads that a fork would break, each stage starts an interpreter.
 """
 
+import multiprocessing
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,6 +58,8 @@ class Progress:
 
 
 ProgressCallback = Callable[[Progress], None]
+StageCommand = Callable[[list[str]], int]
+"""The command of one stage: takes its arguments, returns the exit status."""
 
 
 @dataclass(frozen=True)
@@ -65,11 +70,14 @@ class RunOptions:
     isolate: whether each stage runs in a process of its own.
     progress: called when a stage starts or ends and several times a second while it runs. An exception that it raises
         stops the run; the next run resumes. None: standard output of the stages is passed on unchanged.
+    fork_command: called in a fork of this process instead of starting an interpreter for each stage, on Linux and
+        without `progress`; this process must not have run parallel code before.
     """
 
     forced: Sequence[str] = ()
     isolate: bool = True
     progress: ProgressCallback | None = None
+    fork_command: StageCommand | None = None
 
 
 def run_pipeline(pipeline: Pipeline, request: RunRequest, options: RunOptions) -> list[StageOutcome]:
@@ -134,11 +142,15 @@ class _StageRunner:
             run_stage(self.plan, is_forced)
 
     def _run_in_child(self, is_forced: bool) -> None:
-        """Run the stage by its command; the child imports what this process would import."""
+        """Run the stage by its command in a fork, or in an interpreter that imports what this process would import."""
         name = self.plan.stage.name
-        command = [sys.executable, "-P", "-m", self.pipeline.package, name, str(self.plan.run_dir)]
-        command += ["--force"] if is_forced else []
-        environment = self.lock.child_environment() | {"PYTHONPATH": os.pathsep.join(_import_path())}
+        arguments = [name, str(self.plan.run_dir), *(["--force"] if is_forced else [])]
+        environment = self.lock.child_environment()
+        if sys.platform == "linux" and self.options.fork_command and self.options.progress is None:
+            self._check_exit_status(_run_in_fork(self.options.fork_command, arguments, environment), "")
+            return
+        command = [sys.executable, "-P", "-m", self.pipeline.package, *arguments]
+        environment |= {"PYTHONPATH": os.pathsep.join(_import_path())}
         has_events = self.options.progress is not None
         if has_events:
             environment[EVENTS_VARIABLE] = "1"
@@ -186,6 +198,24 @@ class _StageRunner:
             raise UserError(message)
         if code:
             raise StageFailedError(name, code)
+
+
+def _run_in_fork(command: StageCommand, arguments: list[str], environment: Mapping[str, str]) -> int:
+    """Run a command in a fork of this process; return its exit status, negative if a signal killed it."""
+
+    def run_command() -> None:
+        os.environ.update(environment)
+        sys.exit(command(arguments))
+
+    child = multiprocessing.get_context("fork").Process(target=run_command)
+    child.start()
+    try:
+        child.join()
+    except KeyboardInterrupt:
+        child.join()  # Ctrl-C reaches the child as well
+        raise
+    assert child.exitcode is not None  # it has ended
+    return child.exitcode
 
 
 def _import_path() -> list[str]:

@@ -1,15 +1,19 @@
 """Running a pipeline from Python: progress, errors and cancellation, with stages in child processes and in this one."""
 
+import os
+import signal
+import sys
 from pathlib import Path
 
 import pytest
 
+from pipeline.core.cli import main_pipeline
 from pipeline.core.errors import UserError
 from pipeline.core.events import EVENTS_VARIABLE, parse_event, send_event
 from pipeline.core.manifest import read_manifest
 from pipeline.core.pipeline import Pipeline
 from pipeline.core.run_folder import RunRequest, StageFailedError
-from pipeline.core.runner import Progress, RunOptions, StageOutcome, run_pipeline
+from pipeline.core.runner import Progress, RunOptions, StageCommand, StageOutcome, run_pipeline
 from tests.core.toy.stages import PIPELINE
 from tests.core.toy_pipeline import Toy
 
@@ -75,6 +79,39 @@ def test_a_crash_of_a_stage_is_not_a_user_error(
         run_pipeline(pipeline, RunRequest(tmp_path / "run"), RunOptions(progress=lambda _: None))
     assert caught.value.code == 3
     assert "output of a library" in capfd.readouterr().out
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux forks")
+def test_the_command_runs_each_stage_in_a_fork(toy: Toy) -> None:
+    """What the parent has imported or set is there; nothing that the stage changes comes back."""
+    marks = ["set before the fork"]
+
+    def command(arguments: list[str]) -> int:
+        marks.append("changed in the fork")
+        (toy.folder / arguments[0]).write_text(f"{os.getppid()} {marks[0]}")
+        return main_pipeline(PIPELINE, arguments)
+
+    options = RunOptions(fork_command=command)
+    outcomes = run_pipeline(PIPELINE, RunRequest(toy.run_dir, toy.video), options)
+    assert [outcome.state for outcome in outcomes] == ["run"] * 3
+    for name in PIPELINE.names:
+        assert (toy.folder / name).read_text() == f"{os.getpid()} set before the fork"
+    assert marks == ["set before the fork"]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux forks")
+@pytest.mark.parametrize(
+    ("command", "error", "message"),
+    [
+        (lambda _: 3, StageFailedError, "stage read ended with exit status 3"),
+        (lambda _: os.kill(os.getpid(), signal.SIGKILL), UserError, r"read was killed by signal 9 \(9 often means"),
+    ],
+)
+def test_a_fork_that_fails_names_its_stage(
+    toy: Toy, command: StageCommand, error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        run_pipeline(PIPELINE, RunRequest(toy.run_dir, toy.video), RunOptions(fork_command=command))
 
 
 def test_events_are_lines_of_their_own(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
