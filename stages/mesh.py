@@ -29,6 +29,7 @@ from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import top_k_weights
 from pipeline.geometry.surface import resolve_self_intersections
 from pipeline.io.image import to_uint8, write_rgb
+from pipeline.mesh.evidence import surface_evidence
 from pipeline.mesh.face_reduction import reduce_faces
 from pipeline.mesh.fairing import fair_surface
 from pipeline.mesh.field_views import render_field_views
@@ -55,6 +56,8 @@ from pipeline.metrics.health import mesh_quality_metrics
 CHECKPOINT = "checkpoint_round.safetensors"
 DEFAULT_SETTINGS = MeshSettings()
 MOTIONS = ("field", "refitted")
+EVIDENCE_FRAMES = 40
+"""Training frames that tell how well the surface is seen."""
 JUDGED_FRAMES = 12
 """Training frames on which the reduction of faces is judged if there are no validation frames."""
 
@@ -133,7 +136,8 @@ def run(
             return density
 
         samples = sample_canonical_grid(density_fn, occupancy.occupied_bounds_m(), body, config.voxel_size_m, settings)
-        extracted = extract_initial_mesh(samples, body, validation or train, settings)
+        evidence = surface_evidence(body, [train[k] for k in evenly_spaced(len(train), EVIDENCE_FRAMES)])
+        extracted = extract_initial_mesh(samples, body, evidence, validation or train, settings)
         start = remesh_to_edge_length(extracted, target_edge_m, body)
     state = refine_mesh(start, refinement_inputs, lambda state: save_checkpoint(out / CHECKPOINT, state))
     shader, psnr_db = refinement_inputs.shader, state.validation_psnr_db
@@ -187,11 +191,16 @@ def select_target_edge_m(body: Body, views: Sequence[PosedView], config: Config)
 
 
 def extract_initial_mesh(
-    samples: CanonicalGrid, body: Body, views: Sequence[PosedView], settings: MeshSettings
+    samples: CanonicalGrid,
+    body: Body,
+    evidence: Float[np.ndarray, "v"],
+    views: Sequence[PosedView],
+    settings: MeshSettings,
 ) -> Mesh:
     """Extract the surface of the density at the isovalue with the highest silhouette IoU.
 
-    The IoU is computed on at most `settings.isovalue_frames` of the views.
+    The IoU is computed on at most `settings.isovalue_frames` of the views. evidence: how well the training views show
+    each body vertex.
     """
     isovalue_views = [views[k] for k in evenly_spaced(len(views), settings.isovalue_frames)]
 
@@ -199,7 +208,7 @@ def extract_initial_mesh(
         return silhouette_iou(mesh, transfer_skin(mesh, body), isovalue_views)
 
     isovalue_per_m, _ = select_isovalue(samples, settings, score)
-    return fair_surface(extract_mesh(samples, isovalue_per_m, settings), samples, body, settings)
+    return fair_surface(extract_mesh(samples, isovalue_per_m, settings), samples, body, evidence, settings)
 
 
 def load_views(
@@ -269,7 +278,7 @@ def write_results(out: Path, mesh: Mesh, skin: SkinnedTopology, shader: torch.nn
 
 STAGE = Stage(
     "mesh",
-    version=15,
+    version=16,
     needs=("frames", "body", "field"),
     makes=(MESH_NPZ, DENSE_NPZ, "motion.npz", "preview.png"),
     config=Config,

@@ -3,10 +3,15 @@
 The density determines the depth of a surface without texture to a few millimetres only, so that the extracted surface
 has bumps. Cloth that lies on a body varies over lengths in proportion to the thickness of the part it covers. The
 offset, the signed distance to the extracted surface less that to the body, is therefore smoothed by a Gaussian whose
-standard deviation is a fraction of the local thickness, and added to the signed distance to the body again. Hands and
-the skin of the head keep the details of the body model (fingers, nose, lips); elsewhere the body is smoothed in the
-same way first, because cloth and hair do not show them. In the face the offset is smoothed as far as anywhere. Convex
-parts do not shrink as they would if the surface itself were smoothed.
+standard deviation is a fraction of the local thickness, and added to the signed distance to the body again.
+
+Where few frames show the surface (`pipeline.mesh.evidence`) the density is arbitrary. There the offset is that of what
+is seen around it, farther away the less is seen: a normalised convolution (Knutsson and Westin, "Normalized and
+differential convolution", 1993). What no frame shows is thus as far off the body as what is seen beside it.
+
+Hands and the skin of the head keep the details of the body model (fingers, nose, lips); elsewhere the body is smoothed
+in the same way first, because cloth and hair do not show them. In the face the offset is smoothed over a fixed length.
+Convex parts do not shrink as they would if the surface itself were smoothed.
 
 Local thickness: Hildebrand and Ruegsegger, "A new method for the model-independent assessment of thickness in
 three-dimensional images", 1997.
@@ -17,6 +22,7 @@ Grids with half the resolution of the canonical grid are called coarse.
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from pipeline.body.body import Body
 from pipeline.geometry.mesh import Mesh
@@ -25,8 +31,12 @@ from pipeline.mesh.face import face_weight, head_skin_weight, head_vertices
 from pipeline.mesh.isosurface import CanonicalGrid, signed_distance_grid, upsample
 from pipeline.mesh.settings import MeshSettings
 
-SIGMAS_M = (0.0, 0.005, 0.01, 0.02, 0.03)
+SIGMAS_M = (0.0, 0.005, 0.01, 0.02, 0.03, 0.06)
 """Standard deviations of the smoothed offsets that are blended."""
+FACE_SIGMA_M, UNSEEN_SIGMA_M = 0.03, 0.06
+"""Standard deviation of the smoothing in the face, and where no frame shows the surface."""
+MIN_EVIDENCE = 0.01
+"""Weight of an offset that no frame shows."""
 RADII_M = (0.01, 0.02, 0.03, 0.04, 0.06, 0.08, 0.10, 0.12)
 """Radii of the balls that measure the local thickness."""
 EXACT_BAND_M = 0.045
@@ -41,17 +51,22 @@ CLOSE_OFFSET_M, LOOSE_OFFSET_M = 0.02, 0.06
 distance to the body has creases between the legs, which a skirt has not."""
 SKIN_SIGMA_M = 0.01
 """Smoothing of the offset that tells hair from skin."""
+EVIDENCE_BAND_M, EVIDENCE_SIGMA_M = 0.1, 0.015
+"""Distance from the body within which the evidence is that of the nearest vertex, and its smoothing."""
 LOOSE_SIGMA_M = 0.03
 """Smoothing of the distance to the body where cloth is loose."""
 
 
-def fair_surface(mesh: Mesh, samples: CanonicalGrid, body: Body, settings: MeshSettings) -> Mesh:
+def fair_surface(
+    mesh: Mesh, samples: CanonicalGrid, body: Body, evidence: Float[np.ndarray, "v"], settings: MeshSettings
+) -> Mesh:
     """Return the surface with a smoothed offset from the body, closed and dense as from marching cubes.
 
     Args:
         mesh: the extracted surface, closed, m.
         samples: the grid from which it was extracted.
         body: the fitted body in its canonical pose.
+        evidence: how well the frames show each body vertex, in [0, 1], from `pipeline.mesh.evidence`.
         settings: `fairing_ratio` is the standard deviation over the local thickness; 0 returns the mesh as it is.
 
     Raises:
@@ -69,11 +84,14 @@ def fair_surface(mesh: Mesh, samples: CanonicalGrid, body: Body, settings: MeshS
     body_m[near] = signed_distance_m(points, body.mesh())
     sigma_m = settings.fairing_ratio * local_thickness_m(body_m < 0.0, coarse.spacing_m)
     face, skin = _face_and_skin(coarse, body, body_m - surface_m)
-    sigma_m = ndimage.gaussian_filter(sigma_m + face * (SIGMAS_M[-1] - sigma_m), 1.0)
+    sigma_m = ndimage.gaussian_filter(sigma_m + face * (FACE_SIGMA_M - sigma_m), 1.0)
     clothed_m = _without_creases(smooth_with_local_sigma(body_m, sigma_m, coarse.spacing_m), coarse.spacing_m)
     detail = ndimage.gaussian_filter(np.maximum(coarse.hand_weight > 0.0, skin), DETAIL_BLEND_M / coarse.spacing_m)
     reference_m = clothed_m + detail * (body_m - clothed_m)
-    offset_m = smooth_with_local_sigma(surface_m - reference_m, sigma_m, coarse.spacing_m)
+    seen = _evidence_grid(coarse, body, evidence)
+    offset_sigma_m = sigma_m + (1.0 - seen) * np.maximum(UNSEEN_SIGMA_M - sigma_m, 0.0)
+    weight = np.maximum(seen, MIN_EVIDENCE)
+    offset_m = smooth_with_local_sigma(surface_m - reference_m, offset_sigma_m, coarse.spacing_m, weight)
     shape = samples.density.shape
     value_m = upsample(reference_m, shape) + upsample(offset_m, shape) * (1.0 - samples.hand_weight)
     fine_detail = upsample(detail, shape)
@@ -100,20 +118,43 @@ def local_thickness_m(inside: Bool[np.ndarray, "x y z"], spacing_m: float) -> Fl
 
 
 def smooth_with_local_sigma(
-    values: Float[np.ndarray, "x y z"], sigma_m: Float[np.ndarray, "x y z"], spacing_m: float
+    values: Float[np.ndarray, "x y z"],
+    sigma_m: Float[np.ndarray, "x y z"],
+    spacing_m: float,
+    weight: Float[np.ndarray, "x y z"] | None = None,
 ) -> Float[np.ndarray, "x y z"]:
     """Smooth a grid by a Gaussian whose standard deviation varies from sample to sample, at most the last `SIGMAS_M`.
 
     Each sample interpolates linearly between the results of the two nearest standard deviations.
+
+    weight: of each sample in the mean, > 0; None: all are equal.
     """
     result = np.zeros_like(values)
     for row, level_m in enumerate(SIGMAS_M):
         rising = (sigma_m - SIGMAS_M[row - 1]) / (level_m - SIGMAS_M[row - 1]) if row > 0 else np.inf
         falling = (SIGMAS_M[row + 1] - sigma_m) / (SIGMAS_M[row + 1] - level_m) if row + 1 < len(SIGMAS_M) else np.inf
         share = np.clip(np.minimum(rising, falling), 0.0, 1.0)
-        smoothed = ndimage.gaussian_filter(values, level_m / spacing_m, truncate=3.0) if level_m else values
-        result += share * smoothed
+        result += share * (_smooth(values, level_m / spacing_m, weight) if level_m else values)
     return result
+
+
+def _smooth(
+    values: Float[np.ndarray, "x y z"], sigma_voxels: float, weight: Float[np.ndarray, "x y z"] | None
+) -> Float[np.ndarray, "x y z"]:
+    if weight is None:
+        return ndimage.gaussian_filter(values, sigma_voxels, truncate=3.0)
+    total = ndimage.gaussian_filter(weight, sigma_voxels, truncate=3.0)
+    return ndimage.gaussian_filter(weight * values, sigma_voxels, truncate=3.0) / total
+
+
+def _evidence_grid(samples: CanonicalGrid, body: Body, evidence: Float[np.ndarray, "v"]) -> Float[np.ndarray, "x y z"]:
+    """Return the evidence of the nearest body vertex at all samples, smoothed."""
+    near = np.abs(samples.body_distance_m) < EVIDENCE_BAND_M
+    grid = np.ones(samples.density.shape)
+    points_m = np.argwhere(near) * samples.spacing_m + samples.origin_m
+    grid[near] = evidence[cKDTree(body.vertices).query(points_m)[1]]
+    outer = ndimage.distance_transform_edt(~near, return_distances=False, return_indices=True)
+    return ndimage.gaussian_filter(grid[tuple(outer)], EVIDENCE_SIGMA_M / samples.spacing_m, truncate=3.0)
 
 
 def _without_creases(body_m: Float[np.ndarray, "x y z"], spacing_m: float) -> Float[np.ndarray, "x y z"]:

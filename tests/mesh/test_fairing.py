@@ -10,12 +10,17 @@ from torch import Tensor
 
 from pipeline.body.body import Body
 from pipeline.geometry.surface import is_closed_manifold
-from pipeline.mesh.fairing import fair_surface, local_thickness_m, smooth_with_local_sigma
+from pipeline.mesh.fairing import SIGMAS_M, fair_surface, local_thickness_m, smooth_with_local_sigma
 from pipeline.mesh.isosurface import extract_mesh, sample_canonical_grid
 from tests.mesh.capsule import BOUNDS_M, RADIUS_M, SETTINGS, capsule_body, capsule_distance
 
 SPACING_M, CLOTH_M, BUMP_M = 0.01, 0.03, 0.006
 WITHOUT_HANDS = replace(SETTINGS, hands_from_body=False, solid_core_depth_m=0.09)
+
+
+def seen(body: Body) -> np.ndarray:
+    """Every vertex is well seen."""
+    return np.ones(len(body.vertices))
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +40,7 @@ def test_bumps_go_and_the_offset_of_the_cloth_stays(body: Body) -> None:
     samples = sample_canonical_grid(bumpy_cloth, BOUNDS_M, body, SPACING_M, WITHOUT_HANDS)
     settings = replace(WITHOUT_HANDS, blur_sigma_voxels=0.0)
     rough = extract_mesh(samples, 100.0, settings)
-    fair = fair_surface(rough, samples, body, settings)
+    fair = fair_surface(rough, samples, body, seen(body), settings)
     assert is_closed_manifold(fair)
     deviation_m = [capsule_distance(mesh.vertices) - RADIUS_M - CLOTH_M for mesh in (rough, fair)]
     assert deviation_m[0].std() > 0.0015
@@ -46,7 +51,7 @@ def test_bumps_go_and_the_offset_of_the_cloth_stays(body: Body) -> None:
 def test_without_fairing_the_mesh_is_returned_as_it_is(body: Body) -> None:
     samples = sample_canonical_grid(bumpy_cloth, BOUNDS_M, body, 0.02, WITHOUT_HANDS)
     mesh = extract_mesh(samples, 100.0, WITHOUT_HANDS)
-    assert fair_surface(mesh, samples, body, replace(WITHOUT_HANDS, fairing_ratio=0.0)) is mesh
+    assert fair_surface(mesh, samples, body, seen(body), replace(WITHOUT_HANDS, fairing_ratio=0.0)) is mesh
 
 
 def test_local_thickness_is_the_radius_of_the_part(body: Body) -> None:
@@ -68,11 +73,47 @@ def test_smoothing_with_one_sigma_is_a_gaussian_filter() -> None:
         result = smooth_with_local_sigma(values, np.full(values.shape, sigma_m), SPACING_M)
         np.testing.assert_allclose(result, expected, atol=1e-12)
     largest = smooth_with_local_sigma(values, np.full(values.shape, 0.5), SPACING_M)
-    np.testing.assert_allclose(largest, ndimage.gaussian_filter(values, 3.0, truncate=3.0), atol=1e-12)
+    np.testing.assert_allclose(
+        largest, ndimage.gaussian_filter(values, SIGMAS_M[-1] / SPACING_M, truncate=3.0), atol=1e-12
+    )
+
+
+def test_a_weighted_mean_leaves_out_what_has_no_weight() -> None:
+    """Normalised convolution: a constant stays where its weight is 1, whatever lies where it is nearly 0."""
+    known = np.arange(24) < 12
+    values = np.where(known, 3.0, 1000.0)[:, None, None] * np.ones((24, 8, 8))
+    weight = np.where(known, 1.0, 1e-9)[:, None, None] * np.ones((24, 8, 8))
+    smoothed = smooth_with_local_sigma(values, np.full(values.shape, 0.02), SPACING_M, weight)
+    np.testing.assert_allclose(smoothed[:16], 3.0, atol=0.01)
+
+
+def test_what_no_frame_shows_is_as_far_off_the_body_as_what_is_seen_beside_it(body: Body) -> None:
+    """A lump of 4 cm on the back, where no frame shows it, goes; on the front, where frames show it, it stays."""
+    middle_m = 0.5 * (body.vertices.min(axis=0) + body.vertices.max(axis=0))
+
+    def lumps(points: Tensor) -> Tensor:
+        array = points.numpy().astype(np.float64)
+        distance_m = capsule_distance(array)
+        for side in (-1.0, 1.0):
+            centre_m = middle_m + [0.0, 0.0, side * (RADIUS_M + CLOTH_M)]
+            distance_m = np.minimum(distance_m, np.linalg.norm(array - centre_m, axis=1) + RADIUS_M - 0.01)
+        return torch.from_numpy(100.0 * np.exp(np.clip((RADIUS_M + CLOTH_M - distance_m) / 0.004, -20.0, 20.0))).float()
+
+    samples = sample_canonical_grid(lumps, BOUNDS_M, body, SPACING_M, WITHOUT_HANDS)
+    rough = extract_mesh(samples, 100.0, WITHOUT_HANDS)
+    evidence = (body.vertices[:, 2] > middle_m[2]).astype(float)
+    fair = fair_surface(rough, samples, body, evidence, WITHOUT_HANDS)
+    height_m = [
+        [(side * (mesh.vertices[:, 2] - middle_m[2])).max() - RADIUS_M - CLOTH_M for side in (-1.0, 1.0)]
+        for mesh in (rough, fair)
+    ]
+    assert min(height_m[0]) > 0.03
+    assert height_m[1][0] < 0.008
+    assert height_m[1][1] > 0.015
 
 
 def test_hands_keep_the_shape_of_the_body(body: Body) -> None:
     samples = sample_canonical_grid(bumpy_cloth, BOUNDS_M, body, SPACING_M, SETTINGS)
-    fair = fair_surface(extract_mesh(samples, 100.0, SETTINGS), samples, body, SETTINGS)
+    fair = fair_surface(extract_mesh(samples, 100.0, SETTINGS), samples, body, seen(body), SETTINGS)
     hand = fair.vertices[:, 0] > 0.2
     np.testing.assert_allclose(capsule_distance(fair.vertices[hand]), RADIUS_M, atol=0.004)

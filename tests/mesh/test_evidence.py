@@ -1,0 +1,51 @@
+"""Evidence: what frames show, from which side, and how much of a full turn is enough."""
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.body.body import Body
+from pipeline.geometry.camera import Camera
+from pipeline.geometry.rotation import axis_angle_to_matrix
+from pipeline.mesh.evidence import surface_evidence
+from pipeline.mesh.views import PosedView
+from tests.mesh.capsule import capsule_body
+
+CAMERA, DISTANCE_M = Camera(600.0, 600.0, 80.0, 60.0, 160, 120), 3.0
+
+
+@pytest.fixture(scope="module")
+def body() -> Body:
+    return capsule_body()
+
+
+def view_from(angle_rad: float) -> PosedView:
+    """The capsule, turned about its own axis (x) before a camera that looks along -Z."""
+    turn = torch.eye(4)
+    turn[:3, :3] = axis_angle_to_matrix(torch.tensor([angle_rad, 0.0, 0.0]))
+    turn[:3, 3] = torch.tensor([0.0, 0.0, -DISTANCE_M]) - turn[:3, :3] @ torch.tensor([0.0, 0.5, 0.0])
+    blank = torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.uint8)
+    return PosedView(blank[..., None].expand(-1, -1, 3), blank, CAMERA, turn.expand(2, 4, 4))
+
+
+def height_on_side(body: Body) -> np.ndarray:
+    """Cosine between the normal of a vertex on the straight part and +Z; nan at the caps."""
+    straight = np.abs(body.vertices[:, 0]) < 0.2
+    return np.where(straight, body.vertices[:, 2] / 0.1, np.nan)
+
+
+def test_one_side_is_seen_and_the_other_is_not(body: Body) -> None:
+    evidence, cosine = surface_evidence(body, [view_from(0.0)] * 3), height_on_side(body)
+    assert (evidence[cosine > 0.5] == 1.0).all()
+    assert (evidence[cosine < -0.3] == 0.0).all()
+
+
+def test_a_turn_shows_all_sides(body: Body) -> None:
+    views = [view_from(2.0 * np.pi * k / 12) for k in range(12)]
+    assert (surface_evidence(body, views)[np.isfinite(height_on_side(body))] == 1.0).all()
+
+
+def test_evidence_is_the_mean_squared_cosine(body: Body) -> None:
+    """One view in 40 from the front, the others from behind: the middle of the front has 1/40, half of enough."""
+    evidence = surface_evidence(body, [view_from(0.0), *[view_from(np.pi)] * 39])
+    assert evidence[height_on_side(body) > 0.97].mean() == pytest.approx(0.5, abs=0.05)
