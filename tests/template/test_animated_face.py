@@ -9,7 +9,7 @@ from scipy.sparse import coo_matrix, csgraph
 from pipeline.geometry.atlas import Atlas
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import top_k_weights
-from pipeline.geometry.surface import closest_points_on_mesh, remove_unreferenced_vertices
+from pipeline.geometry.surface import closest_points_on_mesh, collapse_edges, remove_unreferenced_vertices
 from pipeline.mesh.files import MeshArtifact
 from pipeline.template.animated_face import AnimatedFace, animate_face, build_animated_face
 from pipeline.template.face_frame import face_frame
@@ -20,10 +20,12 @@ from pipeline.template.face_units import VISEMES, add_visemes, load_face_units, 
 from pipeline.template.front_view import view_from_front
 from pipeline.template.regions import load_template
 from pipeline.template.registration import register_template
+from stages.mesh import STAGE as MESH
 from tests.template.generated_person import generated_person
 
 TEXTURE_PX = 128
 MAX_MORPH_ERROR = 0.25
+MAX_FINAL_FACES, MAX_GLB_FACES, COARSE_FACES = 19000, 25000, 6000
 
 
 @lru_cache(maxsize=1)
@@ -34,9 +36,9 @@ def closed_surface() -> Mesh:
     return remove_unreferenced_vertices(Mesh(person.surface.vertices, person.all_faces[closed]))
 
 
-def captured() -> tuple[MeshArtifact, CapturedSurface]:
+def captured(mesh: Mesh | None = None) -> tuple[MeshArtifact, CapturedSurface]:
     """The surface with a colour that depends on the height only, and a skin without joints but the head."""
-    mesh, person = closed_surface(), generated_person()
+    mesh, person = mesh or closed_surface(), generated_person()
     v = (mesh.vertices[:, 1] - 1.4) / 0.5
     u = 0.5 + mesh.vertices[:, 0]
     atlas = Atlas(
@@ -72,6 +74,18 @@ def test_the_surface_stays_closed(face: AnimatedFace) -> None:
     assert closed_surface().is_watertight()
     assert shell(face).is_watertight()
     assert face.boundary_gap_m < 0.004
+
+
+def test_the_face_adds_no_more_triangles_than_the_limit_of_the_mesh_leaves() -> None:
+    """The .glb has at most 25,000. A coarse surface is the worst case: it loses few faces where the face is put in."""
+    whole, person = closed_surface(), generated_person()
+    mesh = collapse_edges(whole, np.ones(len(whole.faces), dtype=bool), COARSE_FACES)
+    registration = register_template(person.fitted, mesh, person.landmarks())
+    found = animate_face(person.fitted, registration, *captured(mesh))
+    assert (
+        len(found.atlas.faces_uv) == len(found.skinned.mesh.faces) <= len(mesh.faces) + MAX_GLB_FACES - MAX_FINAL_FACES
+    )
+    assert MESH.config().max_final_faces == MAX_FINAL_FACES
 
 
 def test_the_morphs_are_the_known_ones(face: AnimatedFace) -> None:
