@@ -176,7 +176,7 @@ def _add_primitive(document: GlbWriter, mesh: SkinnedMesh, joint_count: int, has
         "NORMAL": document.add_array(_unit_normals(mesh.normals), _ARRAY_BUFFER),
         "TEXCOORD_0": document.add_array(uv, _ARRAY_BUFFER),
         "JOINTS_0": document.add_array(joints, _ARRAY_BUFFER),
-        "WEIGHTS_0": document.add_array(_normalise_weights(mesh.joint_weights), _ARRAY_BUFFER),
+        "WEIGHTS_0": document.add_array(normalise_weights(mesh.joint_weights), _ARRAY_BUFFER),
     }
     if has_tangents:
         tangents = vertex_tangents(mesh.positions_m, _unit_normals(mesh.normals), mesh.uv, mesh.faces)
@@ -311,7 +311,7 @@ def _unit_normals(normals: np.ndarray) -> np.ndarray:
     return np.where(length > _MIN_NORM, normals / np.maximum(length, _MIN_NORM), upright).astype(np.float32)
 
 
-def _normalise_weights(weights: np.ndarray) -> np.ndarray:
+def normalise_weights(weights: np.ndarray) -> np.ndarray:
     """Return float32 weights whose rows sum to 1 within one unit of precision: the largest takes the rounding error."""
     weights = (weights.astype(np.float64) / weights.sum(axis=1, keepdims=True, dtype=np.float64)).astype(np.float32)
     rows, largest = np.arange(len(weights)), weights.argmax(axis=1)
