@@ -235,7 +235,8 @@ def encode_scene(scene: Scene, config: Config, clips: Mapping[str, Motion]) -> b
     mesh = build_skinned_mesh(at_rest, atlas)
     if face is not None:
         displacements_m, eyes_m = face.displacements_m[:, atlas.vertex_of_uv], face.eye_centres_m(at_rest.mesh.vertices)
-        mesh = replace(mesh, morphs=MorphTargets(face.names, displacements_m, eyes_m))
+        turns = face.normal_changes[:, atlas.vertex_of_uv]
+        mesh = replace(mesh, morphs=MorphTargets(face.names, displacements_m, eyes_m, turns))
     return encode_glb(mesh, scene.rig, clips, maps, scene.camera, scene.extras)
 
 
@@ -330,7 +331,7 @@ def light_extras(light: VideoLight) -> dict[str, Any]:
 
 STAGE = Stage(
     "export",
-    version=8,
+    version=9,
     needs=("frames", "body", "mesh", "texture"),
     makes=("avatar.glb", "avatar.obj", "avatar.mtl", *OBJ_MAPS),
     config=Config,

@@ -37,6 +37,7 @@ class MorphTargets:
     Attributes:
         names: written as `extras.targetNames`, where Blender, three.js and Unity read them.
         displacements_m: of each vertex at weight 1, in the rest pose.
+        normal_changes: of the unit normal of each vertex, from weight 0 to 1; None where viewers keep those at rest.
         eyes_m: centres of the left and the right eyeball in the rest pose, written as nodes `LeftEye` and `RightEye` of
             the head, which programs that direct a gaze look for; None without eyes.
     """
@@ -44,6 +45,7 @@ class MorphTargets:
     names: tuple[str, ...]
     displacements_m: Float[np.ndarray, "m t 3"]
     eyes_m: Float[np.ndarray, "2 3"] | None = None
+    normal_changes: Float[np.ndarray, "m t 3"] | None = None
 
 
 @dataclass(frozen=True)
@@ -134,6 +136,9 @@ def encode_glb(
             {"POSITION": document.add_sparse_array(moved.astype(np.float32), bounds=True)}
             for moved in mesh.morphs.displacements_m
         ]
+        turns = mesh.morphs.normal_changes if mesh.morphs.normal_changes is not None else ()
+        for target, turned in zip(primitive["targets"], turns, strict=False):
+            target["NORMAL"] = document.add_sparse_array(turned.astype(np.float32))
     document.add("meshes", named)
     document.add("nodes", {"name": "avatar", "mesh": 0, "skin": 0})
     skeleton_root = _add_skeleton(document, rig, first_joint)
