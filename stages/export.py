@@ -12,6 +12,7 @@ from jaxtyping import Float
 from pydantic import Field, field_validator
 
 from pipeline.avatar.formats.vrm import VrmMeta
+from pipeline.avatar.formats.vrm_springs import LooseParts
 from pipeline.avatar.formats.write import ExportFormat, FormatRequest, missing_package, write_formats
 from pipeline.avatar.gltf import MaterialMaps, MorphTargets, SkinnedMesh, encode_glb, pack_specular_factor
 from pipeline.avatar.idle import idle_motion
@@ -41,6 +42,7 @@ from pipeline.mesh.files import MeshArtifact, load_mesh
 from pipeline.template.animated_face import AnimatedFace, build_animated_face
 from pipeline.template.face_patch import FacePatchError
 from pipeline.template.face_texture import CapturedSurface
+from pipeline.template.loose_parts import body_colliders, find_loose_parts
 from pipeline.texture.files import DIFFUSE, NORMAL, SPECULAR, TextureArtifact, load_texture, map_files
 from pipeline.texture.light import TERMS, VideoLight
 from pipeline.texture.normal_map import widen_flat
@@ -137,7 +139,8 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     glb = encode_scene(scene, config, {"capture": scene.motion, "idle": idle_motion(scene.body)})
     (out / "avatar.glb").write_bytes(glb)
     meta = VrmMeta("avatar", config.author, config.licence_url)
-    write_formats(out / "avatar.glb", FormatRequest(config.formats, scene.body.joint_names, meta))
+    loose = loose_parts(scene) if {"vrm", "vrm0"} & set(config.formats) else LooseParts()
+    write_formats(out / "avatar.glb", FormatRequest(config.formats, scene.body.joint_names, meta, loose))
     write_scene_obj(inputs["texture"], out, scene.texture, to_rest_pose(scene.skinned, scene.rig).mesh)
     face = scene.face
     return {
@@ -146,6 +149,8 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
         "animation_s": float(scene.motion.time_s[-1]),
         "vertices": float(len(scene.texture.atlas.uv)),
         "faces": float(len(scene.skinned.mesh.faces)),
+        "glb_faces": float(len((face.atlas if face else scene.texture.atlas).faces_uv)),
+        **({"spring_chains": float(len(loose.chains()))} if loose.parts else {}),
         "morph_targets": float(len(face.names)) if face else 0.0,
         **(
             {"template_distance_median_mm": face.fit.median_mm, "template_distance_p95_mm": face.fit.p95_mm}
@@ -195,6 +200,20 @@ def make_face(
         return None
 
 
+def loose_parts(scene: Scene) -> LooseParts:
+    """Return skirts and long hair, with chains and weights for the .glb in its rest pose."""
+    skinned, atlas = (scene.face.skinned, scene.face.atlas) if scene.face else (scene.skinned, scene.texture.atlas)
+    to_rest = dict(zip(scene.body.joint_names, scene.rig.bind_to_rest, strict=True))
+    parts = []
+    for part in find_loose_parts(scene.body, skinned):
+        chains = tuple(
+            replace(chain, joints_m=chain.joints_m @ to_rest[chain.parent][:3, :3].T + to_rest[chain.parent][:3, 3])
+            for chain in part.chains
+        )
+        parts.append(replace(part, chains=chains, weights=part.weights[atlas.vertex_of_uv]))
+    return LooseParts(tuple(parts), tuple(body_colliders(scene.body)) if parts else ())
+
+
 def encode_scene(scene: Scene, config: Config, clips: Mapping[str, Motion]) -> bytes:
     """Return the .glb with the clips as animations."""
     texture, face = scene.texture, scene.face
@@ -216,7 +235,8 @@ def encode_scene(scene: Scene, config: Config, clips: Mapping[str, Motion]) -> b
     mesh = build_skinned_mesh(at_rest, atlas)
     if face is not None:
         displacements_m, eyes_m = face.displacements_m[:, atlas.vertex_of_uv], face.eye_centres_m(at_rest.mesh.vertices)
-        mesh = replace(mesh, morphs=MorphTargets(face.names, displacements_m, eyes_m))
+        turns = face.normal_changes[:, atlas.vertex_of_uv]
+        mesh = replace(mesh, morphs=MorphTargets(face.names, displacements_m, eyes_m, turns))
     return encode_glb(mesh, scene.rig, clips, maps, scene.camera, scene.extras)
 
 
@@ -311,7 +331,7 @@ def light_extras(light: VideoLight) -> dict[str, Any]:
 
 STAGE = Stage(
     "export",
-    version=8,
+    version=9,
     needs=("frames", "body", "mesh", "texture"),
     makes=("avatar.glb", "avatar.obj", "avatar.mtl", *OBJ_MAPS),
     config=Config,

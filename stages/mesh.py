@@ -76,6 +76,12 @@ class Config(BaseConfig):
     min_edge_m: float = Field(0.008, gt=0.001, description="lower limit of the target edge length, m")
     max_edge_m: float = Field(0.014, gt=0.001, description="upper limit of the target edge length, m")
     max_faces: int = Field(60000, ge=100, description="no face is subdivided beyond this number of faces")
+    max_final_faces: int = Field(
+        19000,
+        ge=100,
+        description="upper limit of faces of the finished mesh, whatever it costs; the face that moves adds up to 6000 "
+        "in the .glb (export.face)",
+    )
 
     @field_validator("max_edge_m")
     @classmethod
@@ -141,7 +147,7 @@ def run(
         start = remesh_to_edge_length(extracted, target_edge_m, body)
     state = refine_mesh(start, refinement_inputs, lambda state: save_checkpoint(out / CHECKPOINT, state))
     shader, psnr_db = refinement_inputs.shader, state.validation_psnr_db
-    mesh = finish_mesh(state.mesh, refinement_inputs)
+    mesh = finish_mesh(state.mesh, refinement_inputs, config.max_final_faces)
     is_unchanged = mesh is state.mesh
     skin = state.skin if is_unchanged else transfer_skin(mesh, body)
     save_dense_mesh(out, state.mesh)
@@ -160,15 +166,18 @@ def run(
     }
 
 
-def finish_mesh(mesh: Mesh, inputs: RefinementInputs) -> Mesh:
-    """Reduce the faces of the refined mesh, judged on validation views (else on training views); untangle it."""
+def finish_mesh(mesh: Mesh, inputs: RefinementInputs, face_limit: int) -> Mesh:
+    """Reduce the faces of the refined mesh, judged on validation views (else on training views); untangle it.
+
+    face_limit: see `reduce_faces`.
+    """
     views = inputs.validation or [inputs.train[k] for k in evenly_spaced(len(inputs.train), JUDGED_FRAMES)]
 
     def psnr_db(trial: Mesh) -> float:
         return mesh_psnr_db(trial, transfer_skin(trial, inputs.body), views, inputs.shader)
 
     detailed = detailed_faces(mesh, inputs.body)
-    return resolve_self_intersections(reduce_faces(mesh, detailed, psnr_db, inputs.settings))
+    return resolve_self_intersections(reduce_faces(mesh, detailed, psnr_db, inputs.settings, face_limit))
 
 
 class FieldColourShader(torch.nn.Module):

@@ -37,6 +37,7 @@ class MorphTargets:
     Attributes:
         names: written as `extras.targetNames`, where Blender, three.js and Unity read them.
         displacements_m: of each vertex at weight 1, in the rest pose.
+        normal_changes: of the unit normal of each vertex, from weight 0 to 1; None where viewers keep those at rest.
         eyes_m: centres of the left and the right eyeball in the rest pose, written as nodes `LeftEye` and `RightEye` of
             the head, which programs that direct a gaze look for; None without eyes.
     """
@@ -44,6 +45,7 @@ class MorphTargets:
     names: tuple[str, ...]
     displacements_m: Float[np.ndarray, "m t 3"]
     eyes_m: Float[np.ndarray, "2 3"] | None = None
+    normal_changes: Float[np.ndarray, "m t 3"] | None = None
 
 
 @dataclass(frozen=True)
@@ -134,6 +136,9 @@ def encode_glb(
             {"POSITION": document.add_sparse_array(moved.astype(np.float32), bounds=True)}
             for moved in mesh.morphs.displacements_m
         ]
+        turns = mesh.morphs.normal_changes if mesh.morphs.normal_changes is not None else ()
+        for target, turned in zip(primitive["targets"], turns, strict=False):
+            target["NORMAL"] = document.add_sparse_array(turned.astype(np.float32))
     document.add("meshes", named)
     document.add("nodes", {"name": "avatar", "mesh": 0, "skin": 0})
     skeleton_root = _add_skeleton(document, rig, first_joint)
@@ -176,7 +181,7 @@ def _add_primitive(document: GlbWriter, mesh: SkinnedMesh, joint_count: int, has
         "NORMAL": document.add_array(_unit_normals(mesh.normals), _ARRAY_BUFFER),
         "TEXCOORD_0": document.add_array(uv, _ARRAY_BUFFER),
         "JOINTS_0": document.add_array(joints, _ARRAY_BUFFER),
-        "WEIGHTS_0": document.add_array(_normalise_weights(mesh.joint_weights), _ARRAY_BUFFER),
+        "WEIGHTS_0": document.add_array(normalise_weights(mesh.joint_weights), _ARRAY_BUFFER),
     }
     if has_tangents:
         tangents = vertex_tangents(mesh.positions_m, _unit_normals(mesh.normals), mesh.uv, mesh.faces)
@@ -311,7 +316,7 @@ def _unit_normals(normals: np.ndarray) -> np.ndarray:
     return np.where(length > _MIN_NORM, normals / np.maximum(length, _MIN_NORM), upright).astype(np.float32)
 
 
-def _normalise_weights(weights: np.ndarray) -> np.ndarray:
+def normalise_weights(weights: np.ndarray) -> np.ndarray:
     """Return float32 weights whose rows sum to 1 within one unit of precision: the largest takes the rounding error."""
     weights = (weights.astype(np.float64) / weights.sum(axis=1, keepdims=True, dtype=np.float64)).astype(np.float32)
     rows, largest = np.arange(len(weights)), weights.argmax(axis=1)

@@ -55,14 +55,18 @@ class Primitive:
 class GlbFile:
     """A .glb file in memory: `gltf` is its JSON tree, `binary` the chunk from which methods read arrays and images."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, contents: bytes | None = None) -> None:
         """Read the file.
+
+        Args:
+            path: of the file.
+            contents: of the file, where they are in memory; `path` is then only its name in messages.
 
         Raises:
             UserError: the file is not binary glTF 2, is damaged, or requires an unsupported extension.
         """
         self.path = path
-        data = path.read_bytes() if path.is_file() else b""
+        data = contents if contents is not None else path.read_bytes() if path.is_file() else b""
         if len(data) < 20 or data[:4] != b"glTF" or struct.unpack_from("<I", data, 4)[0] != 2:
             raise UserError(f"{path} is no binary glTF 2 file; supply a .glb")
         chunks, offset = {}, 12

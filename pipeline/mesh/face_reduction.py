@@ -18,11 +18,18 @@ from pipeline.mesh.settings import MeshSettings
 
 MAX_TRIALS = 10
 
+MAX_DETAILED_SHARE = 0.6
+"""Share of the faces of a limit that face and hands may keep; where they have more, all faces are collapsed alike."""
+
 
 def reduce_faces(
-    mesh: Mesh, detailed: Bool[np.ndarray, "f"], psnr_db: Callable[[Mesh], float], settings: MeshSettings
+    mesh: Mesh,
+    detailed: Bool[np.ndarray, "f"],
+    psnr_db: Callable[[Mesh], float],
+    settings: MeshSettings,
+    face_limit: int | None = None,
 ) -> Mesh:
-    """Remove as many faces as cost at most `settings.max_reduction_loss_db`.
+    """Remove as many faces as cost at most `settings.max_reduction_loss_db`, and those above a limit.
 
     Each trial multiplies the number of faces by `settings.reduction_ratio`; the first that costs more, has no fewer
     faces or leaves holes ends the search. With `settings.final_faces` there is one trial, to this number of faces,
@@ -35,9 +42,22 @@ def reduce_faces(
             what they are needed for.
         psnr_db: PSNR of renders of a mesh, dB.
         settings: see `MeshSettings`.
+        face_limit: more faces are removed until there are at most as many, whatever it costs; unused with
+            `settings.final_faces`.
     """
     if settings.final_faces:
         return _reduce_to(mesh, detailed, settings.final_faces)
+    reduced = _reduce_by_loss(mesh, detailed, psnr_db, settings)
+    if face_limit is None or len(reduced.faces) <= face_limit:
+        return reduced
+    # from the start: a second round of collapses would not know the surface that the first one left
+    limited = _reduce_to(mesh, detailed, face_limit)
+    return limited if limited is not mesh else _reduce_to(reduced, np.zeros(len(reduced.faces), dtype=bool), face_limit)
+
+
+def _reduce_by_loss(
+    mesh: Mesh, detailed: Bool[np.ndarray, "f"], psnr_db: Callable[[Mesh], float], settings: MeshSettings
+) -> Mesh:
     lowest_psnr_db, best = psnr_db(mesh) - settings.max_reduction_loss_db, mesh
     for trial in track(range(1, MAX_TRIALS + 1), "reduce faces"):
         try:
@@ -54,8 +74,12 @@ def reduce_faces(
 def _reduce_to(mesh: Mesh, detailed: Bool[np.ndarray, "f"], face_count: int) -> Mesh:
     if len(mesh.faces) <= face_count:
         return mesh
+    if np.count_nonzero(detailed) > MAX_DETAILED_SHARE * face_count:
+        detailed = np.zeros_like(detailed)
+    # two faces less: a collapse removes two at once, and the result may have one or two more than asked for
+    wanted = face_count - int(np.count_nonzero(detailed)) - 2
     return keep_if_repair_fails(
-        lambda: collapse_edges(mesh, ~detailed, max(0, face_count - int(np.count_nonzero(detailed)))),
+        lambda: collapse_edges(mesh, ~detailed, max(0, wanted)),
         mesh,
         f"the mesh keeps its {len(mesh.faces)} faces",
     )

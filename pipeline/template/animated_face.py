@@ -1,7 +1,7 @@
 """The avatar with a face that moves: the captured mesh, the template's face in it, one texture, and morph targets."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -12,8 +12,14 @@ from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import top_k_weights
 from pipeline.geometry.surface import closest_points_on_mesh
 from pipeline.mesh.files import MeshArtifact
-from pipeline.template.face_frame import FaceFrame
 from pipeline.template.face_landmarks import Detector, find_face_landmarks
+from pipeline.template.face_motion import (
+    closing_factors,
+    near_template,
+    normal_changes,
+    on_outline,
+    template_units_m,
+)
 from pipeline.template.face_patch import (
     EYE_LEFT,
     EYE_RIGHT,
@@ -26,7 +32,6 @@ from pipeline.template.face_patch import (
     FacePatchError,
     build_face_patch,
     cut_face_out,
-    unit_transform,
 )
 from pipeline.template.face_texture import CapturedSurface, layout_charts, paint_patch
 from pipeline.template.face_units import add_visemes, load_face_units
@@ -37,12 +42,8 @@ from pipeline.template.registration import Registration, register_template
 MIN_DISPLACEMENT_M = 5e-5
 """Smaller displacements are not written: a twentieth of a millimetre is not seen."""
 
-_FULL_M, _NONE_M = 0.012, 0.03
-"""Captured surface nearer than the first distance to the template moves with it, farther than the second not at all:
-a fringe of hair before the brows stays."""
-
-_REACH_M = 0.30
-"""Radius around the eyes outside of which no face unit moves anything."""
+MIN_NORMAL_CHANGE = 0.03
+"""Smaller changes of a unit normal are not written: less than two degrees."""
 
 _RIGID_PARTS = (MOUTH, SOCKET_LEFT, SOCKET_RIGHT, TONGUE, EYE_LEFT, EYE_RIGHT, TEETH)
 
@@ -75,6 +76,7 @@ class AnimatedFace:
         diffuse, specular: maps, twice as wide as high.
         names: of the morph targets.
         displacements_m: of the vertices at weight 1, in the A-pose.
+        normal_changes: of the vertices' unit normals from weight 0 to 1.
         boundary_gap_m: largest distance between the cuts that were joined.
         fit: of the template to the surface.
         eyeballs: vertices of the left and of the right eyeball.
@@ -86,6 +88,7 @@ class AnimatedFace:
     specular: Float[np.ndarray, "h w"]
     names: tuple[str, ...]
     displacements_m: Float[np.ndarray, "m v 3"]
+    normal_changes: Float[np.ndarray, "m v 3"]
     boundary_gap_m: float
     fit: TemplateFit
     eyeballs: tuple[Int[np.ndarray, "k"], Int[np.ndarray, "k"]]
@@ -147,6 +150,8 @@ def animate_face(
     """
     mesh, captured_atlas = skinned.mesh, captured.atlas
     patch = build_face_patch(body, registration, mesh)
+    factors = closing_factors(patch)[:, None, None]
+    patch = replace(patch, units_m=factors * patch.units_m)
     cut, cut_uv, loop = cut_face_out(mesh, captured_atlas.faces_uv, captured_atlas.vertex_of_uv, patch.frame)
     rest_m = cut.interpolate(mesh.vertices.astype(np.float64))
     outer_rad, inner_rad = (patch.frame.angle_rad(points_m) for points_m in (rest_m[loop], _boundary_m(patch)))
@@ -161,9 +166,21 @@ def animate_face(
         (patch.mesh.faces, patch.faces_uv, uv * half + [0.5, 0.0], patch.boundary, inner_rad),
         len(rest_m),
     )
-    units_m = np.concatenate([_captured_units(body, registration, rest_m, patch.frame), patch.units_m], axis=1)
-    names, displacements_m = add_visemes(load_face_units().names, units_m)
+    template_m = factors * template_units_m(body, registration)
+    transfer = near_template(registration, rest_m, patch.frame)
+    units_m, units = np.concatenate([transfer.apply(template_m), patch.units_m], axis=1), load_face_units().names
+    turns = normal_changes(
+        Mesh(vertices, faces),
+        units_m,
+        registration,
+        template_m,
+        transfer,
+        on_outline(registration, patch, len(rest_m), len(vertices)),
+    )
+    names, displacements_m = add_visemes(units, units_m)
+    _, turns = add_visemes(units, turns)
     displacements_m[np.linalg.norm(displacements_m, axis=2) < MIN_DISPLACEMENT_M] = 0.0
+    turns[np.linalg.norm(turns, axis=2) < MIN_NORMAL_CHANGE] = 0.0
     diffuse, specular = paint_patch(patch, uv, captured)
     distance_mm = 1e3 * registration.distance_m[load_template().skin_vertices]
     return AnimatedFace(
@@ -173,6 +190,7 @@ def animate_face(
         np.concatenate([captured.specular, specular], axis=1).astype(np.float32),
         names,
         displacements_m.astype(np.float32),
+        turns.astype(np.float32),
         gap_m,
         TemplateFit(float(np.median(distance_mm)), float(np.quantile(distance_mm, 0.95))),
         _eyeballs(patch, len(rest_m)),
@@ -222,21 +240,6 @@ def _join(outer: _Side, inner: _Side, first: int) -> tuple[Int[np.ndarray, "f 3"
     )
     atlas.vertex_of_uv[atlas.faces_uv] = faces
     return faces, atlas
-
-
-def _captured_units(
-    body: Body, registration: Registration, points_m: Float[np.ndarray, "v 3"], frame: FaceFrame
-) -> Float[np.ndarray, "m v 3"]:
-    """Return the face units at points of the captured surface, from the nearest point of the registered template."""
-    units, template = load_face_units(), load_template()
-    moved = np.zeros((len(units.names), len(points_m), 3))
-    rows = np.flatnonzero(np.linalg.norm(points_m - frame.origin_m, axis=1) < _REACH_M)
-    skin = Mesh(registration.vertices, template.faces[template.skin_faces])
-    distance_m, face, barycentric = closest_points_on_mesh(points_m[rows], skin)
-    amount = np.clip((_NONE_M - distance_m) / (_NONE_M - _FULL_M), 0.0, 1.0)
-    corners = units.template_m[:, skin.faces[face]]
-    moved[:, rows] = np.einsum("nk,mnkc->mnc", amount[:, None] * barycentric, corners)
-    return moved @ unit_transform(body, registration).T
 
 
 def _skin(skinned: MeshArtifact, cut: CutMesh, patch: FacePatch, mesh: Mesh) -> MeshArtifact:

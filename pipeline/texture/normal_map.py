@@ -8,7 +8,7 @@ Reference: Cignoni et al., "A general method for preserving attribute values on 
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 
 from pipeline.geometry.atlas import Atlas, Texels, rasterize_texels
 from pipeline.geometry.mesh import Mesh
@@ -41,8 +41,7 @@ def bake_normal_map(mesh: Mesh, atlas: Atlas, dense: Mesh, size_px: int) -> Floa
     distance_m, face, weights = closest_points_on_mesh(points_m, dense)
     detail = np.einsum("tk,tkc->tc", weights, dense.vertex_normals()[dense.faces[face]])
     is_same_sheet = (distance_m < MAX_DISTANCE_M) & (np.sum(detail * frames[..., 2], axis=1) > MIN_COSINE)
-    local = np.where(is_same_sheet[:, None], _solve(frames, detail), (0.0, 0.0, 1.0))
-    encoded = 0.5 + 0.5 * local / np.linalg.norm(local, axis=1, keepdims=True)
+    encoded = encode_normals(frames, detail, is_same_sheet)
     return fill_unknown_texels(texels.to_texture(encoded), texels.coverage_mask())
 
 
@@ -65,6 +64,14 @@ def decode_normals(
     samples = sample_texture(torch.from_numpy(normal_map), torch.from_numpy(uv.astype(np.float32))).numpy()
     normals = np.einsum("nij,nj->ni", frames, 2.0 * samples.astype(np.float64) - 1.0)
     return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def encode_normals(
+    frames: Float[np.ndarray, "n 3 3"], normals: Float[np.ndarray, "n 3"], known: Bool[np.ndarray, "n"]
+) -> Float[np.ndarray, "n 3"]:
+    """Return the texels, in [0, 1], with which frames from tangent space give unit normals; flat where not known."""
+    local = np.where(known[:, None], _solve(frames, normals), (0.0, 0.0, 1.0))
+    return np.asarray(0.5 + 0.5 * local / np.linalg.norm(local, axis=1, keepdims=True))
 
 
 def widen_flat(normal_map: Float32[np.ndarray, "s s 3"]) -> Float32[np.ndarray, "s w 3"]:

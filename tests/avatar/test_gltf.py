@@ -256,8 +256,9 @@ def test_morph_targets_have_names_and_the_displacements(tmp_path: Path) -> None:
     mesh = sample_skinned_mesh(sample_body())[0]
     moved = np.zeros((2, len(mesh.positions_m), 3), np.float32)
     moved[0, 5:9] = np.random.default_rng(0).normal(size=(4, 3))
+    turned = 0.1 * moved[..., ::-1]
     path = tmp_path / "morphs.glb"
-    path.write_bytes(encoded(mesh=replace(mesh, morphs=MorphTargets(("jawOpen", "viseme_sil"), moved))))
+    path.write_bytes(encoded(mesh=replace(mesh, morphs=MorphTargets(("jawOpen", "viseme_sil"), moved, None, turned))))
     file = GlbFile(path)
     (stored,) = file.gltf["meshes"]
     assert stored["extras"]["targetNames"] == ["jawOpen", "viseme_sil"]
@@ -266,6 +267,8 @@ def test_morph_targets_have_names_and_the_displacements(tmp_path: Path) -> None:
     for index, expected in zip(targets, moved, strict=True):
         assert "sparse" in file.gltf["accessors"][index]
         np.testing.assert_array_equal(file.accessor(index), expected)
+    for target, expected in zip(stored["primitives"][0]["targets"], turned, strict=True):
+        np.testing.assert_array_equal(file.accessor(target["NORMAL"]), expected)
     assert validator_issues(path) == []
 
 

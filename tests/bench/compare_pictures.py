@@ -9,6 +9,7 @@ same camera; greatest distance of the .obj's vertices. Pictures are written to R
 import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,23 +17,32 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 
-from pipeline.avatar.finished_run import load_textured_avatar
+from pipeline.avatar.finished_run import load_textured_avatar, vertex_values
 from pipeline.avatar.textured_avatar import TexturedAvatar
 from pipeline.body.body import canonical_to_world
 from pipeline.geometry.camera import Camera
+from pipeline.geometry.mesh import area_weighted_vertex_normals
 from pipeline.geometry.texture_rendering import render_textured, turntable_camera
 from pipeline.io.image import to_uint8, write_rgb
-from stages.export import STAGE, Config, load_scene
+from pipeline.texture.files import TextureArtifact
+from pipeline.texture.light import Highlights, directional_light
+from stages.export import STAGE, Config, encode_scene, load_scene
 from tests.tools.browser import open_browser
-from tests.tools.pictures import open_in_three, render_in_three, render_obj_in_blender
+from tests.tools.pictures import LampAndSky, open_in_three, render_in_three, render_obj_in_blender
 
 WIDTH_PX, HEIGHT_PX = 540, 720
 SUPERSAMPLING = 8
 THREE_SUPERSAMPLING = 4
 """three.js samples a texture once a pixel, from mip maps. A picture of 4 times the side, averaged, has our filter."""
+
+LAMP = LampAndSky((0.48, 0.6, 0.64), 0.7, 0.3)
+"""Light of the lit pictures: a lamp from the front, above and the person's left."""
+
+PAINTED_STRENGTH, PAINTED_EXPONENT = 0.08, 24.0
+"""Highlights of the shiny picture: of satin; glTF's specular factor is then 0.6 and its roughness 0.53."""
 
 CLIP_FRACTION = 0.4
 """Of the frames of the clip `capture`: the pose that is compared besides the rest pose."""
@@ -45,7 +55,7 @@ def main(argv: Sequence[str]) -> None:
     for run in parser.parse_args(argv).runs:
         out = run / "compare-pictures"
         out.mkdir(exist_ok=True)
-        for compare in (compare_in_three, compare_obj):
+        for compare in (compare_in_three, compare_lit, compare_obj):
             try:
                 print(f"{run.name}: {compare(run, out)}", flush=True)
             except pytest.skip.Exception as reason:  # no browser, no Blender
@@ -73,6 +83,47 @@ def compare_in_three(run: Path, out: Path) -> str:
             parts.append(f"averaged {_compare(avatar, vertices, camera, averaged, out / f'three_{name}_averaged')}")
         assert page.problems == [], page.problems
     return ", ".join(parts)
+
+
+def compare_lit(run: Path, out: Path) -> str:
+    """Compare the captured surface under a lamp and a uniform sky: as it is, and with painted highlights."""
+    inputs = {name: run / name for name in STAGE.needs}
+    config = Config(face=False)
+    scene = load_scene(inputs, config)
+    plain = load_textured_avatar(run / "mesh", run / "texture")
+    matte = replace(scene.texture, specular=np.zeros_like(scene.texture.specular))
+    shiny = replace(
+        scene.texture,
+        specular=np.full_like(scene.texture.specular, PAINTED_STRENGTH),
+        highlights=Highlights(np.array(LAMP.direction, np.float32), PAINTED_EXPONENT),
+        light=directional_light(LAMP.direction, LAMP.ambient),
+    )
+    parts, camera = [], camera_for(plain.vertices)
+    for name, texture in (("matte", matte), ("shiny", shiny)):
+        file = out / f"lit_{name}.glb"
+        file.write_bytes(encode_scene(replace(scene, texture=texture), config, {"capture": scene.motion}))
+        with open_browser() as page:
+            open_in_three(page, file, out)
+            fine = render_in_three(page, camera.scaled(THREE_SUPERSAMPLING), light=LAMP)
+            assert page.problems == [], page.problems
+        picture = cv2.resize(fine, (WIDTH_PX, HEIGHT_PX), interpolation=cv2.INTER_AREA)
+        ours = _render_lit(plain, texture, camera)
+        parts.append(f"three.js lit, {name} {_compare_to(ours, picture, out / f'three_lit_{name}')}")
+    return ", ".join(parts)
+
+
+def _render_lit(avatar: TexturedAvatar, texture: TextureArtifact, camera: Camera) -> Float[np.ndarray, "h w 4"]:
+    """Render with our rasteriser: Lambert's law, and the lobe of the highlights, at the vertices."""
+    towards, normals = torch.tensor(LAMP.direction), area_weighted_vertex_normals(avatar.vertices, avatar.faces)
+    irradiance = LAMP.ambient + LAMP.key * (normals @ towards).clamp(min=0.0)
+    to_camera = torch.nn.functional.normalize(torch.from_numpy(camera.centre_m()).float() - avatar.vertices, dim=1)
+    lobe = texture.highlights.lobe(normals.numpy(), to_camera.numpy(), np.ones(len(normals)))
+    strength = vertex_values(texture.specular, texture.atlas, len(normals)).numpy()
+    lamp = texture.light.lamp_irradiance(texture.highlights.direction)
+    added = torch.from_numpy(strength * lobe * LAMP.key / lamp).float()
+    shading = torch.cat([irradiance[:, None].expand(-1, 3), added[:, None]], dim=1).float()
+    surface = (avatar.faces, avatar.faces_uv, avatar.uv, avatar.diffuse)
+    return render_textured(avatar.vertices, *surface, camera, SUPERSAMPLING, shading).numpy()
 
 
 def compare_obj(run: Path, out: Path) -> str:
@@ -107,7 +158,12 @@ def picture_psnr_db(
     avatar: TexturedAvatar, vertices: torch.Tensor, camera: Camera, picture: UInt8[np.ndarray, "h w 3"]
 ) -> tuple[float, float, UInt8[np.ndarray, "h w 3"]]:
     """Return dB of the whole picture and of body pixels against our rasteriser, and our picture."""
-    ours = avatar.render(vertices, camera, SUPERSAMPLING)
+    return _psnr_db(avatar.render(vertices, camera, SUPERSAMPLING), picture)
+
+
+def _psnr_db(
+    ours: Float[np.ndarray, "h w 4"], picture: UInt8[np.ndarray, "h w 3"]
+) -> tuple[float, float, UInt8[np.ndarray, "h w 3"]]:
     on_white = to_uint8(ours[..., :3] + 1.0 - ours[..., 3:])
     squared = (on_white.astype(np.float64) - picture) ** 2
     body = squared[ours[..., 3] > 0.0]
@@ -115,9 +171,13 @@ def picture_psnr_db(
 
 
 def _compare(avatar: TexturedAvatar, vertices: torch.Tensor, camera: Camera, picture: np.ndarray, stem: Path) -> str:
-    full_db, body_db, ours = picture_psnr_db(avatar, vertices, camera, picture)
-    difference = np.clip(128 + 4 * (picture.astype(int) - ours), 0, 255).astype(np.uint8)
-    write_rgb(stem.with_suffix(".png"), np.concatenate([ours, picture, difference], axis=1))
+    return _compare_to(avatar.render(vertices, camera, SUPERSAMPLING), picture, stem)
+
+
+def _compare_to(ours: Float[np.ndarray, "h w 4"], picture: np.ndarray, stem: Path) -> str:
+    full_db, body_db, on_white = _psnr_db(ours, picture)
+    difference = np.clip(128 + 4 * (picture.astype(int) - on_white), 0, 255).astype(np.uint8)
+    write_rgb(stem.with_suffix(".png"), np.concatenate([on_white, picture, difference], axis=1))
     return f"{full_db:.1f} / {body_db:.1f} dB"
 
 

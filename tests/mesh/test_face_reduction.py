@@ -55,6 +55,23 @@ def test_a_mesh_that_needs_its_faces_stays() -> None:
     assert reduce_faces(mesh, no_detail(mesh), lambda trial: -abs(len(trial.faces) - count), MeshSettings()) is mesh
 
 
+def test_a_limit_holds_at_any_loss_and_only_where_it_is_exceeded() -> None:
+    mesh = sphere()
+    limit = len(mesh.faces) // 3
+    psnr_db = lambda trial: float(len(trial.faces))  # noqa: E731
+    assert reduce_faces(mesh, no_detail(mesh), psnr_db, MeshSettings(), len(mesh.faces)) is mesh
+    reduced = reduce_faces(mesh, no_detail(mesh), psnr_db, MeshSettings(), limit)
+    assert limit - 6 <= len(reduced.faces) <= limit
+    assert is_closed_manifold(reduced)
+
+
+def test_a_limit_holds_where_most_faces_are_detailed() -> None:
+    mesh = sphere()
+    detailed, limit = np.ones(len(mesh.faces), dtype=bool), len(mesh.faces) // 3
+    detailed[:10] = False
+    assert len(reduce_faces(mesh, detailed, lambda trial: 30.0, MeshSettings(), limit).faces) <= limit
+
+
 def test_a_number_of_final_faces_is_reached_at_any_loss() -> None:
     mesh = sphere()
     settings, wanted = MeshSettings(final_faces=len(mesh.faces) // 3), len(mesh.faces) // 3

@@ -220,6 +220,13 @@ def test_the_number_of_final_faces_is_reached(inputs: dict[str, Path], tmp_path:
     assert metrics["faces"] == pytest.approx(300, abs=2)
 
 
+def test_the_limit_of_faces_holds(inputs: dict[str, Path], tmp_path: Path) -> None:
+    config = CONFIG.model_copy(update={"rounds": 0, "max_final_faces": 300})
+    metrics = run(inputs, tmp_path, config, SETTINGS)
+    assert metrics["faces_before_reduction"] > 400
+    assert 290 <= metrics["faces"] <= 300
+
+
 @pytest.mark.parametrize(("shift_m", "kept_m"), [(-0.05, 0.0), (0.05, 0.05)])
 def test_validation_frames_decide_on_the_refitted_motion(
     inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shift_m: float, kept_m: float

@@ -1,5 +1,6 @@
 """The face that moves, on a generated person: closed surface, known morphs, lids and lips that close, one texture."""
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -9,21 +10,24 @@ from scipy.sparse import coo_matrix, csgraph
 from pipeline.geometry.atlas import Atlas
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import top_k_weights
-from pipeline.geometry.surface import closest_points_on_mesh, remove_unreferenced_vertices
+from pipeline.geometry.surface import closest_points_on_mesh, collapse_edges, remove_unreferenced_vertices
 from pipeline.mesh.files import MeshArtifact
 from pipeline.template.animated_face import AnimatedFace, animate_face, build_animated_face
 from pipeline.template.face_frame import face_frame
 from pipeline.template.face_landmarks import FACE_LANDMARKS
-from pipeline.template.face_patch import FacePatchError
+from pipeline.template.face_motion import closing_factors
+from pipeline.template.face_patch import EYE_LEFT, EYE_RIGHT, FacePatchError, build_face_patch
 from pipeline.template.face_texture import CapturedSurface
 from pipeline.template.face_units import VISEMES, add_visemes, load_face_units, load_teeth
 from pipeline.template.front_view import view_from_front
 from pipeline.template.regions import load_template
 from pipeline.template.registration import register_template
+from stages.mesh import STAGE as MESH
 from tests.template.generated_person import generated_person
 
 TEXTURE_PX = 128
 MAX_MORPH_ERROR = 0.25
+MAX_FINAL_FACES, MAX_GLB_FACES, COARSE_FACES = 19000, 25000, 6000
 
 
 @lru_cache(maxsize=1)
@@ -34,9 +38,9 @@ def closed_surface() -> Mesh:
     return remove_unreferenced_vertices(Mesh(person.surface.vertices, person.all_faces[closed]))
 
 
-def captured() -> tuple[MeshArtifact, CapturedSurface]:
+def captured(mesh: Mesh | None = None) -> tuple[MeshArtifact, CapturedSurface]:
     """The surface with a colour that depends on the height only, and a skin without joints but the head."""
-    mesh, person = closed_surface(), generated_person()
+    mesh, person = mesh or closed_surface(), generated_person()
     v = (mesh.vertices[:, 1] - 1.4) / 0.5
     u = 0.5 + mesh.vertices[:, 0]
     atlas = Atlas(
@@ -72,6 +76,18 @@ def test_the_surface_stays_closed(face: AnimatedFace) -> None:
     assert closed_surface().is_watertight()
     assert shell(face).is_watertight()
     assert face.boundary_gap_m < 0.004
+
+
+def test_the_face_adds_no_more_triangles_than_the_limit_of_the_mesh_leaves() -> None:
+    """The .glb has at most 25,000. A coarse surface is the worst case: it loses few faces where the face is put in."""
+    whole, person = closed_surface(), generated_person()
+    mesh = collapse_edges(whole, np.ones(len(whole.faces), dtype=bool), COARSE_FACES)
+    registration = register_template(person.fitted, mesh, person.landmarks())
+    found = animate_face(person.fitted, registration, *captured(mesh))
+    assert (
+        len(found.atlas.faces_uv) == len(found.skinned.mesh.faces) <= len(mesh.faces) + MAX_GLB_FACES - MAX_FINAL_FACES
+    )
+    assert MESH.config().max_final_faces == MAX_FINAL_FACES
 
 
 def test_the_morphs_are_the_known_ones(face: AnimatedFace) -> None:
@@ -111,6 +127,48 @@ def test_lids_close_over_the_eyes(face: AnimatedFace) -> None:
         seen.append(is_eye[view.face_id[view.face_id >= 0]].sum())
     assert seen[0] > 1000
     assert seen[1] < 0.05 * seen[0]
+
+
+def test_normals_turn_with_the_moved_surface(face: AnimatedFace) -> None:
+    """Against normals of the moved faces by trimesh, at skin whose faces are large: slivers are left out."""
+    import trimesh
+
+    mesh, row = face.skinned.mesh, face.names.index("jawOpen")
+    moved, rest = (
+        trimesh.Trimesh(mesh.vertices + weight * face.displacements_m[row], mesh.faces, process=False)
+        for weight in (1.0, 0.0)
+    )
+    found = rest.vertex_normals + face.normal_changes[row]
+    found /= np.linalg.norm(found, axis=1, keepdims=True)
+    turned_deg = np.rad2deg(np.arccos(np.sum(moved.vertex_normals * rest.vertex_normals, axis=1).clip(-1, 1)))
+    error_deg = np.rad2deg(np.arccos(np.sum(found * moved.vertex_normals, axis=1).clip(-1, 1)))
+    rows = turned_deg > 5.0
+    assert rows.sum() > 500
+    assert np.median(turned_deg[rows]) > 10.0
+    assert np.median(error_deg[rows]) < 2.0
+    assert np.quantile(error_deg[rows], 0.9) < 6.0
+    still = ~face.displacements_m[row].any(axis=1)
+    assert np.quantile(np.linalg.norm(face.normal_changes[row][still], axis=1), 0.99) == 0.0
+
+
+def test_lids_meet_at_weight_one_whatever_the_units_travel() -> None:
+    """A unit that moves the lids half as far again closes them at two thirds of its weight."""
+    person, names = generated_person(), load_face_units().names
+    patch = build_face_patch(
+        person.fitted, register_template(person.fitted, closed_surface(), person.landmarks()), closed_surface()
+    )
+    once, further = (closing_factors(replace(patch, units_m=travel * patch.units_m)) for travel in (1.3, 1.3 * 1.5))
+    blinks = [names.index("eyeBlinkLeft"), names.index("eyeBlinkRight")]
+    assert (once[blinks] < 1.0).all()
+    np.testing.assert_allclose(further[blinks], once[blinks] / 1.5, rtol=0.03)
+    assert (np.delete(once, blinks) == 1.0).all()
+    part = np.isin(patch.part, (EYE_LEFT, EYE_RIGHT))
+    seen = []
+    for weight in (0.0, 0.85, 1.0):
+        moved_m = 1.3 * weight * np.einsum("b,bvc->vc", once[blinks], patch.units_m[blinks])
+        view = view_from_front(Mesh(patch.mesh.vertices + moved_m, patch.mesh.faces), patch.frame)
+        seen.append(part[view.face_id[view.face_id >= 0]].sum())
+    assert seen[2] < 0.02 * seen[0] < seen[1]
 
 
 def test_lips_are_closed_and_open_with_the_jaw(face: AnimatedFace) -> None:

@@ -4,6 +4,7 @@ import base64
 import json
 import os
 import subprocess
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,19 @@ from pipeline.report.templates import read_asset
 from tests.tools.browser import BrowserPage
 
 NEAR_M, FAR_M = 0.1, 100.0
+
+
+@dataclass(frozen=True)
+class LampAndSky:
+    """A lamp that casts no shadows, and light from everywhere; an irradiance of 1 shows a surface's colour as it is.
+
+    direction: towards the lamp, unit, world. key, ambient: irradiance of a surface that faces the lamp, and of all.
+    """
+
+    direction: tuple[float, float, float]
+    key: float
+    ambient: float
+
 
 _PAGE = """<!doctype html><html lang="en"><body>
 <div id="viewer" style="width:300px;height:300px"></div>
@@ -33,7 +47,17 @@ _RENDER = """(() => {{
   renderer.setSize({width}, {height}, false);
   renderer.setClearColor(0xffffff, 1);
   floor.visible = false;
-  avatar.setSurface("unlit");
+  const light = {light};
+  avatar.setSurface(light ? "lit" : "unlit");
+  if (light) {{
+    const sky = scene.children.find((child) => child.isHemisphereLight);
+    sky.groundColor.copy(sky.color);
+    sky.intensity = Math.PI * light.ambient;
+    view.key.castShadow = false;
+    view.key.intensity = Math.PI * light.key;
+    view.key.target.position.set(0, 0, 0);
+    view.key.position.fromArray(light.direction);
+  }}
   if (avatar.clipIndex !== {clip}) avatar.setClip({clip});
   avatar.seek({time_s});
   camera.matrixAutoUpdate = false;
@@ -42,6 +66,7 @@ _RENDER = """(() => {{
   camera.projectionMatrix.fromArray({projection});
   camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
   renderer.render(scene, camera);
+  renderer.render(scene, camera);  // the first one may still show the joints of the page's own last frame
   return renderer.domElement.toDataURL("image/png");
 }})()"""
 
@@ -55,14 +80,15 @@ def open_in_three(page: BrowserPage, glb: Path, folder: Path) -> None:
 
 
 def render_in_three(
-    page: BrowserPage, camera: Camera, clip: int = -1, time_s: float = 0.0
+    page: BrowserPage, camera: Camera, clip: int = -1, time_s: float = 0.0, light: LampAndSky | None = None
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return a picture on white by three.js; clip: index of the animation, -1 is the rest pose."""
+    """Return a picture on white by three.js; clip: index of the animation, -1 is the rest pose; light: None: unlit."""
     script = _RENDER.format(
         width=camera.width,
         height=camera.height,
         clip=clip,
         time_s=time_s,
+        light="null" if light is None else json.dumps(asdict(light)),
         camera_to_world=json.dumps(_camera_to_world(camera).T.ravel().tolist()),
         projection=json.dumps(_projection(camera).T.ravel().tolist()),
     )

@@ -15,10 +15,13 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import closest_points_on_mesh
+from pipeline.geometry.tangents import tangent_frames
 from pipeline.geometry.texture_rendering import sample_texture
-from pipeline.io.image import resize, to_uint8
+from pipeline.io.image import resize, to_float, to_uint8
 from pipeline.kernels.raster import rasterize
 from pipeline.texture.edge_padding import fill_unknown_texels
+from pipeline.texture.files import FLAT_NORMAL
+from pipeline.texture.normal_map import MIN_COSINE, decode_normals, encode_normals
 
 _QUARTER = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 """Samples of a texel, in texels: the centres of its quarters, so that an unmoved texel is their exact mean."""
@@ -26,21 +29,50 @@ _QUARTER = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 
 @dataclass(frozen=True)
 class UvMesh:
-    """A mesh with one texture coordinate a vertex. uv: origin top-left, as in glTF."""
+    """A mesh with one texture coordinate a vertex.
+
+    Attributes:
+        uv: origin top-left, as in glTF.
+        normals: of unit length.
+        tangents: as in glTF; None without a normal map.
+    """
 
     positions_m: Float[np.ndarray, "v 3"]
     uv: Float[np.ndarray, "v 2"]
     faces: Int[np.ndarray, "f 3"]
+    normals: Float[np.ndarray, "v 3"]
+    tangents: Float[np.ndarray, "v 4"] | None = None
 
 
 def join_meshes(meshes: Sequence[UvMesh]) -> UvMesh:
     """Return several meshes as one."""
     first = np.cumsum([0, *(len(mesh.uv) for mesh in meshes[:-1])])
+    tangents = [mesh.tangents for mesh in meshes]
     return UvMesh(
         np.concatenate([mesh.positions_m for mesh in meshes]),
         np.concatenate([mesh.uv for mesh in meshes]),
         np.concatenate([mesh.faces + start for mesh, start in zip(meshes, first, strict=True)]),
+        np.concatenate([mesh.normals for mesh in meshes]),
+        None if any(t is None for t in tangents) else np.concatenate([t for t in tangents if t is not None]),
     )
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Points on a mesh: the vertices of their faces, and barycentric coordinates."""
+
+    corners: Int[np.ndarray, "n 3"]
+    barycentric: Float[np.ndarray, "n 3"]
+
+    def frames(self, mesh: UvMesh) -> Float[np.ndarray, "n 3 3"]:
+        """Return the matrices from the tangent space of a mesh with tangents."""
+        if mesh.tangents is None:
+            raise ValueError("a mesh without tangents has no tangent space")
+        normals, tangents = (
+            np.einsum("nk,nkc->nc", self.barycentric, values[self.corners].astype(np.float64))
+            for values in (mesh.normals, mesh.tangents)
+        )
+        return tangent_frames(normals, tangents)
 
 
 @dataclass(frozen=True)
@@ -50,10 +82,13 @@ class TexelSources:
     Attributes:
         uv: in the old texture, origin top-left.
         covered: texels that faces of the new mesh show.
+        old, new: where these are on the old and on the new mesh.
     """
 
     uv: Float[np.ndarray, "h w 2"]
     covered: Bool[np.ndarray, "h w"]
+    old: SurfacePoints
+    new: SurfacePoints
 
 
 def find_texel_sources(full: UvMesh, reduced: UvMesh, height_px: int, width_px: int) -> TexelSources:
@@ -71,7 +106,24 @@ def find_texel_sources(full: UvMesh, reduced: UvMesh, height_px: int, width_px: 
     columns, rows = np.meshgrid((np.arange(width_px) + 0.5) / width_px, (np.arange(height_px) + 0.5) / height_px)
     uv = np.stack([columns, rows], axis=2)
     uv[covered] = np.einsum("tk,tkc->tc", weights, full.uv[full.faces[face]])
-    return TexelSources(uv, covered)
+    own = SurfacePoints(corners, barycentric.numpy()[covered].astype(np.float64))
+    return TexelSources(uv, covered, SurfacePoints(full.faces[face], weights), own)
+
+
+def bake_normals(
+    pixels: UInt8[np.ndarray, "h w 3"], sources: TexelSources, full: UvMesh, reduced: UvMesh
+) -> UInt8[np.ndarray, "h2 w2 3"]:
+    """Return the normal map of the reduced mesh: the normals that the full mesh shows with its own, in other frames.
+
+    pixels: normal map of the full mesh.
+    """
+    uv = sources.uv[sources.covered] * [1.0, -1.0] + [0.0, 1.0]
+    normals = decode_normals(to_float(pixels), uv, sources.old.frames(full))
+    frames = sources.new.frames(reduced)
+    is_in_front = np.sum(frames[..., 2] * normals, axis=1) > MIN_COSINE
+    image = np.tile(np.array(FLAT_NORMAL, np.float32), (*sources.covered.shape, 1))
+    image[sources.covered] = encode_normals(frames, normals, is_in_front)
+    return to_uint8(fill_unknown_texels(image, sources.covered))
 
 
 def bake_texture(pixels: UInt8[np.ndarray, "h w c"], sources: TexelSources) -> UInt8[np.ndarray, "h2 w2 c"]:

@@ -1,7 +1,7 @@
 """Levels of detail: the avatar with fewer triangles and smaller textures, with the same skeleton, skin and clips.
 
-Each level has its own texture coordinates and textures, baked from those of the avatar (`level_textures`). A level has
-no normal map: its normals are those of the full mesh at its vertices.
+Each level has its own texture coordinates and textures, baked from those of the avatar (`level_textures`). A normal map
+shows the normals that the avatar's shows, in the tangent space of the level.
 
 Each level is a whole file of its own. The extension MSFT_lod would put all levels into one file, but the loaders of
 three.js, glTFast and Blender do not read it.
@@ -15,14 +15,16 @@ from jaxtyping import Float, Int
 from pipeline.avatar.formats.level_textures import (
     TexelSources,
     UvMesh,
+    bake_normals,
     bake_texture,
     find_texel_sources,
     join_meshes,
 )
-from pipeline.avatar.formats.normal_maps import remove_normal_maps
+from pipeline.avatar.formats.normal_maps import normal_images, remove_normal_maps
 from pipeline.geometry.atlas import unwrap
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.simplification import ReducedFaces, collapse_edges
+from pipeline.geometry.tangents import vertex_tangents
 from pipeline.io.glb import GlbFile
 from pipeline.io.glb_writer import GlbWriter
 from pipeline.io.image import png_bytes
@@ -61,8 +63,10 @@ def encode_level(file: GlbFile, face_ratio: float, texture_halvings: int) -> byt
         UserError: the file's arrays or images cannot be read.
     """
     document = GlbWriter.from_file(file)
-    images = [file.image_pixels(index) for index in remove_normal_maps(document.json)]
     primitives = [primitive for mesh in document.json["meshes"] for primitive in mesh["primitives"]]
+    has_tangents = all("TANGENT" in primitive["attributes"] for primitive in primitives)
+    kept = range(len(file.gltf.get("images", ()))) if has_tangents else remove_normal_maps(document.json)
+    images, maps_of_normals = [file.image_pixels(index) for index in kept], normal_images(document.json)
     full = [_uv_mesh(file, primitive) for primitive in primitives]
     reduced = [collapse_edges(mesh.positions_m, mesh.faces, round(face_ratio * len(mesh.faces))) for mesh in full]
     sizes_px = [_halved_size(pixels, texture_halvings) for pixels in images]
@@ -70,13 +74,18 @@ def encode_level(file: GlbFile, face_ratio: float, texture_halvings: int) -> byt
     level = []
     for mesh, part, (vertex, uv, faces), primitive in zip(full, reduced, atlas, primitives, strict=True):
         source = part.source_vertex[vertex]
-        level.append(UvMesh(mesh.positions_m[source], uv, faces))
+        normals = mesh.normals[source]
+        tangents = vertex_tangents(mesh.positions_m[source], normals, uv * [1.0, -1.0] + [0.0, 1.0], faces)
+        level.append(UvMesh(mesh.positions_m[source], uv, faces, normals, tangents if has_tangents else None))
         _replace_primitive(file, document, primitive, source, level[-1])
     sources: dict[tuple[int, int], TexelSources] = {}
+    both = join_meshes(full), join_meshes(level)
     for index, (pixels, size_px) in enumerate(zip(images, sizes_px, strict=True)):
         if size_px not in sources:
-            sources[size_px] = find_texel_sources(join_meshes(full), join_meshes(level), *size_px)
-        document.replace_image(index, png_bytes(bake_texture(pixels, sources[size_px])), "image/png")
+            sources[size_px] = find_texel_sources(*both, *size_px)
+        is_normals = index in maps_of_normals
+        baked = bake_normals(pixels, sources[size_px], *both) if is_normals else bake_texture(pixels, sources[size_px])
+        document.replace_image(index, png_bytes(baked), "image/png")
     document.remove_unused()
     return document.to_bytes()
 
@@ -84,7 +93,9 @@ def encode_level(file: GlbFile, face_ratio: float, texture_halvings: int) -> byt
 def _uv_mesh(file: GlbFile, primitive: dict[str, Any]) -> UvMesh:
     names = primitive["attributes"]
     faces = file.accessor(primitive["indices"]).reshape(-1, 3)
-    return UvMesh(file.accessor(names["POSITION"]), file.accessor(names["TEXCOORD_0"]), faces)
+    tangents = file.accessor(names["TANGENT"]) if "TANGENT" in names else None
+    positions_m, uv, normals = (file.accessor(names[name]) for name in ("POSITION", "TEXCOORD_0", "NORMAL"))
+    return UvMesh(positions_m, uv, faces, normals, tangents)
 
 
 def _unwrap_together(
@@ -121,6 +132,8 @@ def _replace_primitive(
     per_vertex += [index for target in primitive.get("targets", ()) for index in target.values()]
     for index in per_vertex:
         document.replace_array(index, file.stored_array(index)[source])
+    if mesh.tangents is not None:
+        document.replace_array(attributes["TANGENT"], mesh.tangents)
 
 
 def _halved_size(pixels: np.ndarray, halvings: int) -> tuple[int, int]:

@@ -1,7 +1,7 @@
 """Convert the avatar's .glb to USDZ: skinned mesh, skeleton, texture and the first clip, for Quick Look and USD tools.
 
-Quick Look plays one skeletal animation, in a loop; without a clip it shows the rest pose. The highlights' map has no
-counterpart in UsdPreviewSurface and is left out, and so is the normal map.
+Quick Look plays one skeletal animation, in a loop; without a clip it shows the rest pose. The specular factor becomes
+the colour of UsdPreviewSurface's specular workflow, whose reflection at grazing angles it does not scale.
 
 References: https://openusd.org/release/api/usd_skel_page_front.html and https://openusd.org/release/spec_usdpreviewsurface.html.
 """
@@ -13,12 +13,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from pipeline.io.glb import GlbFile, Primitive
+from pipeline.io.image import png_bytes
 
 TIME_CODES_PER_SECOND = 30.0
-_IMAGE_NAME = "diffuse.png"
+DIELECTRIC_REFLECTANCE = 0.04
+"""Reflectance at normal incidence of glTF's dielectric, which the specular factor scales."""
+
 _MEMBER_TIME_S = 1_000_000_000
 """Time stamp of the members of the package, s since 1970: the same avatar gives the same bytes."""
 
@@ -86,7 +89,7 @@ def write_usdz(path: Path, file: GlbFile) -> None:
         root.GetExtentAttr().Set(extent)
         stage.GetRootLayer().Save()
         with Sdf.ZipFileWriter.CreateNew(str(path)) as package:  # stored, aligned to 64 bytes; the root layer first
-            for member in (stage_path, Path(folder) / _IMAGE_NAME):
+            for member in (stage_path, *sorted(Path(folder).glob("*.png"))):
                 os.utime(member, (_MEMBER_TIME_S, _MEMBER_TIME_S))
                 package.AddFile(str(member), member.name)
 
@@ -147,36 +150,82 @@ def _define_mesh(stage: Any, primitive: Primitive, joints: _Joints) -> None:
 
 
 def _define_material(stage: Any, file: GlbFile, primitive: Primitive, folder: Path) -> None:
-    """Add UsdPreviewSurface with the base colour; an unlit surface emits it instead."""
+    """Add UsdPreviewSurface with the maps of the .glb; an unlit surface emits its base colour instead."""
     from pxr import Gf, Sdf, UsdShade
 
     surface = file.gltf["materials"][primitive.material]
-    optics = surface["pbrMetallicRoughness"]
-    image = file.gltf["textures"][optics["baseColorTexture"]["index"]]["source"]
-    (folder / _IMAGE_NAME).write_bytes(file.image_bytes(image))
+    optics, extensions = surface["pbrMetallicRoughness"], surface.get("extensions", {})
     material = UsdShade.Material.Define(stage, _MATERIAL)
+    shader = UsdShade.Shader.Define(stage, f"{_MATERIAL}/Surface")
+    shader.CreateIdAttr("UsdPreviewSurface")
+    material.CreateSurfaceOutput().ConnectToSource(shader.CreateOutput("surface", Sdf.ValueTypeNames.Token))
+    colours = _Map("Diffuse", _image_bytes(file, optics["baseColorTexture"]), "sRGB")
+    if "KHR_materials_unlit" in extensions:
+        shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(0.0))
+        _connect(stage, shader, "emissiveColor", colours, folder)
+    else:
+        _connect(stage, shader, "diffuseColor", colours, folder)
+        shader.CreateInput("useSpecularWorkflow", Sdf.ValueTypeNames.Int).Set(1)
+        specular = extensions.get("KHR_materials_specular", {})
+        factor = float(specular.get("specularFactor", 1.0))
+        if "specularTexture" in specular:
+            strength = Gf.Vec4f(*[DIELECTRIC_REFLECTANCE * factor] * 3, 1.0)
+            grey = np.repeat(_image_pixels(file, specular["specularTexture"])[..., 3:], 3, axis=2)
+            _connect(stage, shader, "specularColor", _Map("Specular", png_bytes(grey), "raw", strength), folder)
+        else:
+            grey_value = Gf.Vec3f(DIELECTRIC_REFLECTANCE * factor)
+            shader.CreateInput("specularColor", Sdf.ValueTypeNames.Color3f).Set(grey_value)
+        if "normalTexture" in surface:
+            scale, bias = Gf.Vec4f(2.0, 2.0, 2.0, 1.0), Gf.Vec4f(-1.0, -1.0, -1.0, 0.0)
+            normals = _Map("Normal", _image_bytes(file, surface["normalTexture"]), "raw", scale, bias)
+            _connect(stage, shader, "normal", normals, folder)
+    shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(float(optics.get("roughnessFactor", 1.0)))
+    shader.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(float(optics.get("metallicFactor", 1.0)))
+    UsdShade.MaterialBindingAPI.Apply(stage.GetPrimAtPath(_MESH)).Bind(material)
+
+
+@dataclass(frozen=True)
+class _Map:
+    """A texture: name of its shader and, in lower case, of its file; contents; colour space; value = scale x + bias."""
+
+    name: str
+    png: bytes
+    colour_space: str
+    scale: Any = None
+    bias: Any = None
+
+
+def _connect(stage: Any, shader: Any, input_name: str, texture: _Map, folder: Path) -> None:
+    """Write the image of a map, and connect it to an input of the surface."""
+    from pxr import Sdf, UsdShade
+
+    image_name = f"{texture.name.lower()}.png"
+    (folder / image_name).write_bytes(texture.png)
     reader = UsdShade.Shader.Define(stage, f"{_MATERIAL}/Coordinates")
     reader.CreateIdAttr("UsdPrimvarReader_float2")
     reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
-    texture = UsdShade.Shader.Define(stage, f"{_MATERIAL}/Diffuse")
-    texture.CreateIdAttr("UsdUVTexture")
-    texture.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(_IMAGE_NAME)
-    texture.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set("sRGB")
+    sampler = UsdShade.Shader.Define(stage, f"{_MATERIAL}/{texture.name}")
+    sampler.CreateIdAttr("UsdUVTexture")
+    sampler.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(image_name)
+    sampler.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set(texture.colour_space)
     for wrap in ("wrapS", "wrapT"):
-        texture.CreateInput(wrap, Sdf.ValueTypeNames.Token).Set("clamp")
+        sampler.CreateInput(wrap, Sdf.ValueTypeNames.Token).Set("clamp")
+    for name, value in (("scale", texture.scale), ("bias", texture.bias)):
+        if value is not None:
+            sampler.CreateInput(name, Sdf.ValueTypeNames.Float4).Set(value)
     result = reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
-    texture.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(result)
-    colour = texture.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
-    shader = UsdShade.Shader.Define(stage, f"{_MATERIAL}/Surface")
-    shader.CreateIdAttr("UsdPreviewSurface")
-    unlit = "KHR_materials_unlit" in surface.get("extensions", {})
-    if unlit:
-        shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(0.0))
-    shader.CreateInput("emissiveColor" if unlit else "diffuseColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(colour)
-    shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(float(optics.get("roughnessFactor", 1.0)))
-    shader.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(float(optics.get("metallicFactor", 1.0)))
-    material.CreateSurfaceOutput().ConnectToSource(shader.CreateOutput("surface", Sdf.ValueTypeNames.Token))
-    UsdShade.MaterialBindingAPI.Apply(stage.GetPrimAtPath(_MESH)).Bind(material)
+    sampler.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(result)
+    kind = Sdf.ValueTypeNames.Normal3f if input_name == "normal" else Sdf.ValueTypeNames.Color3f
+    output = sampler.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
+    shader.CreateInput(input_name, kind).ConnectToSource(output)
+
+
+def _image_bytes(file: GlbFile, texture: dict[str, Any]) -> bytes:
+    return file.image_bytes(file.gltf["textures"][texture["index"]]["source"])
+
+
+def _image_pixels(file: GlbFile, texture: dict[str, Any]) -> UInt8[np.ndarray, "h w c"]:
+    return file.image_pixels(file.gltf["textures"][texture["index"]]["source"])
 
 
 def _ordered_joints(file: GlbFile, skin: int) -> _Joints:

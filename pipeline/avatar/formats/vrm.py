@@ -5,7 +5,7 @@ and cameras. VRM 1.0 keeps the mesh in the A-pose and moves only the joints, so 
 VRM 0.x wants the mesh itself in the T-pose, facing -Z.
 
 Expressions and look-at use the avatar's morph targets; without them the files have no expressions, and look-at has only
-its origin. There are no bones of eyes, skirts or hair, so there are no spring bones.
+its origin. A skirt or long hair gets chains of joints that swing (`vrm_springs`).
 
 References: https://github.com/vrm-c/vrm-specification, VRMC_vrm-1.0 and 0.0.
 """
@@ -24,6 +24,16 @@ from pipeline.avatar.formats.vrm_expressions import (
     groups_vrm0,
     morph_names,
 )
+from pipeline.avatar.formats.vrm_springs import (
+    LooseParts,
+    RestColliders,
+    SpringJoints,
+    add_spring_joints,
+    place_colliders,
+    remove_cameras,
+    springs_vrm0,
+    springs_vrm1,
+)
 from pipeline.avatar.t_pose import t_pose_transforms
 from pipeline.avatar.vrm_bones import human_bones
 from pipeline.geometry.skinning import inverse_skinning_matrices
@@ -37,6 +47,7 @@ EYE_IN_HEAD_BOX = (0.61, 0.81)
 
 _FACE_BACKWARDS = np.diag([-1.0, 1.0, -1.0, 1.0])
 _GAZE_RANGES = ("HorizontalInner", "HorizontalOuter", "VerticalDown", "VerticalUp")
+NOTHING_LOOSE = LooseParts()
 _LINEAR_CURVE = [0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0]
 
 
@@ -63,7 +74,7 @@ class _RestPose:
     bind_to_rest: Float[np.ndarray, "j 4 4"]
 
 
-def encode_vrm1(file: GlbFile, joint_names: Sequence[str], meta: VrmMeta) -> bytes:
+def encode_vrm1(file: GlbFile, joint_names: Sequence[str], meta: VrmMeta, loose: LooseParts = NOTHING_LOOSE) -> bytes:
     """Return the avatar as VRM 1.0.
 
     Args:
@@ -71,11 +82,14 @@ def encode_vrm1(file: GlbFile, joint_names: Sequence[str], meta: VrmMeta) -> byt
         joint_names: Mixamo's names of the skin's joints, in its order; the nodes may have others. A joint that follows
             them in the skin, a root above the hips, stays at the origin.
         meta: name and licence.
+        loose: skirts and hair, which get spring bones; the file has none without them.
 
     Raises:
         UserError: the file's arrays cannot be read.
         ValueError: a bone that VRM requires is missing.
     """
+    springs = add_spring_joints(file, joint_names, loose)
+    file = springs.file
     document, rest = GlbWriter.from_file(file), _rest_pose(file, joint_names)
     inverse_bind = _translations(-_rest_joints_m(rest)) @ rest.bind_to_rest
     _write_rest_pose(document, rest, inverse_bind)
@@ -97,14 +111,19 @@ def encode_vrm1(file: GlbFile, joint_names: Sequence[str], meta: VrmMeta) -> byt
         "lookAt": {"type": "expression" if names else "bone", "offsetFromHeadBone": _eye_offset_m(file, rest).tolist()}
         | {f"rangeMap{name}": gaze for name in _GAZE_RANGES},
     }
-    return _encode(document, "VRMC_vrm", extension)
+    extensions = {"VRMC_vrm": extension}
+    if springs.nodes:
+        extensions["VRMC_springBone"] = springs_vrm1(springs, _colliders(springs, rest), _nodes_m(rest))
+    return _encode(document, extensions)
 
 
-def encode_vrm0(file: GlbFile, joint_names: Sequence[str], meta: VrmMeta) -> bytes:
+def encode_vrm0(file: GlbFile, joint_names: Sequence[str], meta: VrmMeta, loose: LooseParts = NOTHING_LOOSE) -> bytes:
     """Return the avatar as VRM 0.x: mesh and joints are in the T-pose and turned by 180 degrees about y.
 
     Arguments and errors as of `encode_vrm1`.
     """
+    springs = add_spring_joints(file, joint_names, loose)
+    file = springs.file
     document, rest = GlbWriter.from_file(file), _rest_pose(file, joint_names)
     turned = _FACE_BACKWARDS @ rest.bind_to_rest
     rest = replace(rest, bind_to_rest=turned)
@@ -141,17 +160,17 @@ def encode_vrm0(file: GlbFile, joint_names: Sequence[str], meta: VrmMeta) -> byt
         "humanoid": {"humanBones": bones},
         "firstPerson": first_person | {f"lookAt{name}": gaze for name in _GAZE_RANGES},
         "blendShapeMaster": {"blendShapeGroups": groups_vrm0(names, 0)},
-        "secondaryAnimation": {"boneGroups": [], "colliderGroups": []},
+        "secondaryAnimation": springs_vrm0(springs, _colliders(springs, rest), _nodes_m(rest)),
         "materialProperties": [_gltf_material(material["name"]) for material in document.json["materials"]],
     }
-    return _encode(document, "VRM", extension)
+    return _encode(document, {"VRM": extension})
 
 
-def _encode(document: GlbWriter, extension_name: str, extension: dict[str, Any]) -> bytes:
-    document.json["extensionsUsed"] = [*document.json.get("extensionsUsed", ()), extension_name]
-    document.json["extensions"] = document.json.get("extensions", {}) | {extension_name: extension}
+def _encode(document: GlbWriter, extensions: dict[str, dict[str, Any]]) -> bytes:
+    document.json["extensionsUsed"] = [*document.json.get("extensionsUsed", ()), *extensions]
+    document.json["extensions"] = document.json.get("extensions", {}) | extensions
     document.json.pop("animations", None)
-    _remove_cameras(document)
+    remove_cameras(document)
     document.remove_unused()
     return document.to_bytes()
 
@@ -168,12 +187,23 @@ def _rest_pose(file: GlbFile, joint_names: Sequence[str]) -> _RestPose:
     names = (*joint_names, *(nodes[node]["name"] for node in skin["joints"][len(joint_names) :]))
     transforms = t_pose_transforms(names, parents, joints_m)
     lowest_m = min(_posed(file, primitive, transforms)[:, 1].min() for primitive in _primitives(file))
-    transforms[: len(joint_names), 1, 3] -= lowest_m
+    is_added_root = (parents < 0) & (np.arange(len(names)) >= len(joint_names))
+    transforms[~is_added_root, 1, 3] -= lowest_m
     return _RestPose(skin["joints"], names, parents, joints_m, transforms)
 
 
 def _rest_joints_m(rest: _RestPose) -> Float[np.ndarray, "j 3"]:
     return np.einsum("jab,jb->ja", rest.bind_to_rest[:, :3, :3], rest.joints_m) + rest.bind_to_rest[:, :3, 3]
+
+
+def _nodes_m(rest: _RestPose) -> dict[int, np.ndarray]:
+    return dict(zip(rest.nodes, _rest_joints_m(rest), strict=True))
+
+
+def _colliders(springs: SpringJoints, rest: _RestPose) -> RestColliders:
+    nodes_m = _nodes_m(rest)
+    place = {name: (node, nodes_m[node]) for name, node in zip(rest.joint_names, rest.nodes, strict=True)}
+    return place_colliders(springs, place, nodes_m)
 
 
 def _write_rest_pose(document: GlbWriter, rest: _RestPose, inverse_bind: Float[np.ndarray, "j 4 4"]) -> None:
@@ -249,16 +279,6 @@ def _gltf_material(name: str) -> dict[str, Any]:
         key: {} for key in ("floatProperties", "vectorProperties", "textureProperties", "keywordMap", "tagMap")
     }
     return {"name": name, "shader": "VRM_USE_GLTFSHADER", "renderQueue": 2000} | maps
-
-
-def _remove_cameras(document: GlbWriter) -> None:
-    """Remove the cameras and their nodes, which come last among the nodes (`pipeline.avatar.gltf`)."""
-    document.json.pop("cameras", None)
-    nodes = document.json["nodes"]
-    while "camera" in nodes[-1]:
-        nodes.pop()
-    for scene in document.json["scenes"]:
-        scene["nodes"] = [node for node in scene["nodes"] if node < len(nodes)]
 
 
 def _translations(offsets_m: Float[np.ndarray, "j 3"]) -> Float[np.ndarray, "j 4 4"]:

@@ -38,7 +38,7 @@ def encode_web_glb(file: GlbFile) -> bytes:
 
     Args:
         file: triangle lists with positions, normals, texture coordinates, joints and weights. Morphs are not
-            compressed, and keep the order of the vertices, with which Draco compresses less.
+            compressed, lose their normals, and keep the order of the vertices, with which Draco compresses less.
 
     Raises:
         UserError: the file's arrays or images cannot be read.
@@ -102,6 +102,8 @@ def _compress_primitive(file: GlbFile, document: GlbWriter, primitive: dict[str,
     import DracoPy  # an optional package
 
     attributes = primitive["attributes"]
+    for target in primitive.get("targets", ()):
+        target.pop("NORMAL", None)  # as many bytes as the displacements
     attributes.pop("TANGENT", None)  # viewers derive it; its 16 bytes a vertex would be half of the geometry
     stored = {name: np.ascontiguousarray(file.stored_array(index)) for name, index in attributes.items()}
     stored["WEIGHTS_0"] = quantise_weights(file.accessor(attributes["WEIGHTS_0"]))

@@ -8,7 +8,8 @@ from typing import Literal
 
 from pipeline.avatar.formats.levels_of_detail import encode_levels
 from pipeline.avatar.formats.usdz import write_usdz
-from pipeline.avatar.formats.vrm import VrmMeta, encode_vrm0, encode_vrm1
+from pipeline.avatar.formats.vrm import NOTHING_LOOSE, VrmMeta, encode_vrm0, encode_vrm1
+from pipeline.avatar.formats.vrm_springs import LooseParts
 from pipeline.avatar.formats.web_glb import encode_web_glb
 from pipeline.io.glb import GlbFile
 
@@ -22,12 +23,14 @@ PACKAGES: dict[ExportFormat, tuple[str, str]] = {"usdz": ("pxr", "usd-core"), "w
 class FormatRequest:
     """What is made of the .glb.
 
-    joint_names: Mixamo's names of the skin's joints, in its order. meta: of the VRM files.
+    joint_names: Mixamo's names of the skin's joints, in its order. meta: of the VRM files. loose: skirts and hair, for
+    the spring bones of the VRM files.
     """
 
     formats: Sequence[ExportFormat]
     joint_names: Sequence[str]
     meta: VrmMeta
+    loose: LooseParts = NOTHING_LOOSE
 
 
 def missing_package(formats: Sequence[ExportFormat]) -> str | None:
@@ -46,12 +49,12 @@ def write_formats(glb_path: Path, request: FormatRequest) -> None:
         UserError: the .glb cannot be read.
         ModuleNotFoundError: a format needs a package that is not installed (`missing_package`).
     """
-    file, names, meta = GlbFile(glb_path), request.joint_names, request.meta
+    file, vrm = GlbFile(glb_path), (request.joint_names, request.meta, request.loose)
     writers: dict[ExportFormat, Callable[[], None]] = {
         "lod": lambda: _write_levels(glb_path, file),
         "usdz": lambda: write_usdz(glb_path.with_suffix(".usdz"), file),
-        "vrm": lambda: _write(glb_path.with_suffix(".vrm"), encode_vrm1(file, names, meta)),
-        "vrm0": lambda: _write(glb_path.with_name(f"{glb_path.stem}_vrm0.vrm"), encode_vrm0(file, names, meta)),
+        "vrm": lambda: _write(glb_path.with_suffix(".vrm"), encode_vrm1(file, *vrm)),
+        "vrm0": lambda: _write(glb_path.with_name(f"{glb_path.stem}_vrm0.vrm"), encode_vrm0(file, *vrm)),
         "web": lambda: _write(glb_path.with_name(f"{glb_path.stem}_web.glb"), encode_web_glb(file)),
     }
     for name in request.formats:

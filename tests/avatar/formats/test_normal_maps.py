@@ -1,18 +1,22 @@
-"""A .glb without its normal map equals one that never had it; a level of detail has none."""
+"""A .glb without its normal map equals one that never had it; levels of detail show the same normals."""
 
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from pipeline.avatar.formats.levels_of_detail import encode_level
 from pipeline.avatar.formats.normal_maps import normal_images, remove_normal_maps
-from pipeline.avatar.gltf import MaterialMaps
+from pipeline.avatar.gltf import MaterialMaps, encode_glb
+from pipeline.avatar.rig import build_rig
 from pipeline.io.glb import GlbFile
 from pipeline.io.glb_writer import GlbWriter
 from pipeline.io.image import png_bytes
-from tests.avatar.avatar_sample import sample_maps
+from tests.avatar.avatar_sample import sample_body, sample_maps, sample_motion
+from tests.avatar.formats.column import FRAMES, column_mesh
 from tests.avatar.test_gltf import encoded
 from tests.tools.khronos import validator_issues
 
@@ -61,12 +65,39 @@ def test_other_textures_are_renumbered() -> None:
     assert tree["meshes"][0]["primitives"][0]["attributes"] == {"POSITION": 0}
 
 
-def test_a_level_of_detail_has_no_normal_map(maps: MaterialMaps, tmp_path: Path) -> None:
-    file = file_of(encoded(maps=maps), tmp_path / "with.glb")
-    level = file_of(encode_level(file, 0.5, 1), tmp_path / "level.glb").gltf
-    assert "normalTexture" not in level["materials"][0]
-    assert "TANGENT" not in level["meshes"][0]["primitives"][0]["attributes"]
-    assert len(level["images"]) == len(file.gltf["images"]) - 1
+@pytest.mark.parametrize("ratio", [1.0, 0.5])
+def test_a_level_of_detail_shows_the_normals_of_the_avatar(ratio: float, tmp_path: Path) -> None:
+    """A map that bends the normals of a column by a smooth pattern: directions in space, by an independent decoder."""
+    v, u = np.meshgrid((np.arange(256) + 0.5) / 256, (np.arange(256) + 0.5) / 256, indexing="ij")
+    bent = np.stack([0.4 * np.sin(4 * np.pi * u), 0.4 * np.cos(6 * np.pi * v), np.ones_like(u)], axis=2)
+    bent /= np.linalg.norm(bent, axis=2, keepdims=True)
+    maps = replace(sample_maps(), normal_png=png_bytes(np.rint(127.5 + 127.5 * bent).astype(np.uint8)))
+    data = encode_glb(column_mesh(), build_rig(sample_body()), {"capture": sample_motion(FRAMES)}, maps)
+    full = file_of(data, tmp_path / "full.glb")
+    level = file_of(encode_level(full, ratio, 0), tmp_path / "level.glb")
+    (at_m, shown), (own_m, own) = shown_normals(level), shown_normals(full)
+    _, nearest = cKDTree(own_m).query(at_m)
+    error_deg = np.rad2deg(np.arccos(np.sum(shown * own[nearest], axis=1).clip(-1.0, 1.0)))
+    smooth = full.skinned_primitives()[0].normals  # what would be shown without a map
+    without_deg = np.rad2deg(np.arccos(np.sum(own * smooth, axis=1).clip(-1.0, 1.0)))
+    assert np.median(without_deg) > 15.0
+    assert np.median(error_deg) < 1.5
+    assert np.quantile(error_deg, 0.95) < 6.0
+    assert validator_issues(level.path) == []
+
+
+def shown_normals(file: GlbFile) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and shaded normals of the vertices that lie within a chart: glTF 2.0, 3.9.3."""
+    names = file.gltf["meshes"][0]["primitives"][0]["attributes"]
+    arrays = (file.accessor(names[name]).astype(np.float64) for name in ("POSITION", "NORMAL", "TANGENT", "TEXCOORD_0"))
+    positions, normals, tangents, uv = arrays
+    texture = file.gltf["textures"][file.gltf["materials"][0]["normalTexture"]["index"]]
+    pixels = file.image_pixels(texture["source"]).astype(np.float32)
+    rows, columns = (uv[:, [1, 0]] * pixels.shape[:2] - 0.5).T.astype(np.float32)
+    texel = cv2.remap(pixels, columns[None], rows[None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]
+    x, y, z = (texel / 127.5 - 1.0).T[..., None]
+    shown = x * tangents[:, :3] + y * tangents[:, 3:] * np.cross(normals, tangents[:, :3]) + z * normals
+    return positions, shown / np.linalg.norm(shown, axis=1, keepdims=True)
 
 
 @pytest.mark.parametrize("unlit", [False, True])

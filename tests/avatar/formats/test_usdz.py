@@ -3,12 +3,14 @@
 import zipfile
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from pipeline.avatar.formats.usdz import TIME_CODES_PER_SECOND, write_usdz
 from pipeline.io.glb import GlbFile
 from pipeline.io.glb_writer import GlbWriter
+from pipeline.io.image import png_bytes
 from tests.avatar.formats.column import FRAMES, add_root_joint, column_glb
 from tests.avatar.test_gltf import Player
 
@@ -70,7 +72,7 @@ def test_texture_coordinates_and_texture(glb: GlbFile, path: Path) -> None:
 def test_the_package_is_stored_aligned_and_starts_with_the_stage(path: Path) -> None:
     with zipfile.ZipFile(path) as package:
         members = package.infolist()
-    assert [member.filename for member in members] == ["avatar.usdc", "diffuse.png"]
+    assert [member.filename for member in members] == ["avatar.usdc", "diffuse.png", "specular.png"]
     data = path.read_bytes()
     for member in members:
         assert member.compress_type == zipfile.ZIP_STORED
@@ -106,6 +108,50 @@ def test_without_a_clip_it_is_the_rest_pose(glb: GlbFile, tmp_path: Path) -> Non
     write_usdz(tmp_path / "still.usdz", GlbFile(tmp_path / "still.glb"))
     posed = skinned_points(Usd.Stage.Open(str(tmp_path / "still.usdz")), 0.0)
     np.testing.assert_allclose(posed, glb.skinned_primitives()[0].positions, atol=1e-6)
+
+
+def read_map(path: Path, stage: Usd.Stage, name: str) -> np.ndarray:
+    """The values that an input of the surface gets from its map: scale times texel plus bias."""
+    surface = UsdShade.Shader(stage.GetPrimAtPath("/Avatar/Material/Surface"))
+    sampler = UsdShade.Shader(surface.GetInput(name).GetConnectedSource()[0].GetPrim())
+    assert sampler.GetInput("sourceColorSpace").Get() == "raw"
+    with zipfile.ZipFile(path) as package:
+        data = np.frombuffer(package.read(sampler.GetInput("file").Get().path), np.uint8)
+    texels = cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1] / 255.0
+    scale, bias = (sampler.GetInput(key) for key in ("scale", "bias"))
+    return texels * np.array(scale.Get())[:3] + (np.array(bias.Get())[:3] if bias else 0.0)
+
+
+def test_the_specular_factor_scales_the_reflectance_of_a_dielectric(glb: GlbFile, path: Path) -> None:
+    stage = Usd.Stage.Open(str(path))
+    surface = UsdShade.Shader(stage.GetPrimAtPath("/Avatar/Material/Surface"))
+    assert surface.GetInput("useSpecularWorkflow").Get() == 1
+    factor = glb.image_pixels(1)[..., 3:] / 255.0
+    np.testing.assert_allclose(read_map(path, stage, "specularColor"), 0.04 * np.repeat(factor, 3, axis=2), atol=1e-6)
+
+
+def test_a_surface_without_highlights_reflects_nothing(glb: GlbFile, tmp_path: Path) -> None:
+    document = GlbWriter.from_file(glb)
+    document.json["materials"][0]["extensions"] = {"KHR_materials_specular": {"specularFactor": 0.0}}
+    (tmp_path / "matte.glb").write_bytes(document.to_bytes())
+    write_usdz(tmp_path / "matte.usdz", GlbFile(tmp_path / "matte.glb"))
+    stage = Usd.Stage.Open(str(tmp_path / "matte.usdz"))
+    surface = UsdShade.Shader(stage.GetPrimAtPath("/Avatar/Material/Surface"))
+    assert tuple(surface.GetInput("specularColor").Get()) == (0.0, 0.0, 0.0)
+
+
+def test_the_normal_map_is_that_of_the_glb(glb: GlbFile, tmp_path: Path) -> None:
+    document = GlbWriter.from_file(glb)
+    pixels = np.random.default_rng(0).integers(0, 256, (16, 16, 3), dtype=np.uint8)
+    view = document.add_bytes(png_bytes(pixels))
+    image = document.add("images", {"mimeType": "image/png", "bufferView": view})
+    document.json["materials"][0]["normalTexture"] = {"index": document.add("textures", {"source": image})}
+    (tmp_path / "bumpy.glb").write_bytes(document.to_bytes())
+    write_usdz(tmp_path / "bumpy.usdz", GlbFile(tmp_path / "bumpy.glb"))
+    stage = Usd.Stage.Open(str(tmp_path / "bumpy.usdz"))
+    np.testing.assert_allclose(read_map(tmp_path / "bumpy.usdz", stage, "normal"), pixels / 127.5 - 1.0, atol=1e-6)
+    context = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators())
+    assert [error.GetMessage() for error in context.Validate(stage)] == []
 
 
 def test_an_unlit_surface_emits_its_colour(glb: GlbFile, tmp_path: Path) -> None:

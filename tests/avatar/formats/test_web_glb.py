@@ -121,10 +121,13 @@ def test_morphs_still_belong_to_their_vertices(files: tuple[GlbFile, WebGlb], tm
     primitive = document.json["meshes"][0]["primitives"][0]
     positions = files[0].skinned_primitives()[0].positions
     primitive["targets"] = [{"POSITION": document.add_sparse_array(0.1 * positions, bounds=True)}]
+    primitive["targets"][0]["NORMAL"] = document.add_sparse_array(0.1 * positions)
     (tmp_path / "morph.glb").write_bytes(document.to_bytes())
     (tmp_path / "web.glb").write_bytes(encode_web_glb(GlbFile(tmp_path / "morph.glb")))
     web = WebGlb(tmp_path / "web.glb", files[0].path)
-    offsets = web.accessor(web.gltf["meshes"][0]["primitives"][0]["targets"][0]["POSITION"])
+    (target,) = web.gltf["meshes"][0]["primitives"][0]["targets"]
+    assert set(target) == {"POSITION"}
+    offsets = web.accessor(target["POSITION"])
     np.testing.assert_allclose(offsets, 0.1 * web.decoded()[1]["POSITION"], atol=2e-5)
     assert validator_issues(tmp_path / "web.glb") == []
 
