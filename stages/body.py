@@ -46,6 +46,7 @@ from pipeline.capture.hand_detector import HandLandmarks, undetected_hands
 from pipeline.capture.smpl_poses import SMPL_POSES_NPZ
 from pipeline.capture.usable_frames import SCORES_NPZ
 from pipeline.core.cli import main
+from pipeline.core.command import format_command
 from pipeline.core.config import Config as BaseConfig
 from pipeline.core.errors import UserError
 from pipeline.core.progress import warn
@@ -193,9 +194,10 @@ def fit_capture(
             keep = config.supplied_poses == "keep"
             result = fit_supplied_poses(model, observations, windows, supplied, keep, settings)
     except TooFewLandmarksError as error:
+        again = format_command("frames", capture.folder.parent, "--force")
         raise UserError(
             f"the body cannot be fitted to {capture.folder}: {error}; film with hips and shoulders in view, or "
-            "complete or remove a supplied landmarks.npz, and run `python -m stages.frames` again"
+            f"complete or remove a supplied landmarks.npz, and run {again}"
         ) from error
     check_fit_quality(result, capture, config, supplied is not None)
     return result

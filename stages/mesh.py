@@ -18,6 +18,7 @@ from pipeline.capture.capture import Capture, load_capture
 from pipeline.capture.frame_selection import VALIDATION
 from pipeline.capture.usable_frames import usable_training_positions
 from pipeline.core.cli import main
+from pipeline.core.command import format_command
 from pipeline.core.config import Config as BaseConfig
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track, warn
@@ -112,7 +113,8 @@ def run(
     chosen = usable_training_positions(capture, inputs["body"]), capture.positions(VALIDATION)
     train, validation = (load_views(capture, positions, inputs, body, config) for positions in chosen)
     if not train:
-        raise UserError(f"{inputs['frames']} has no training frames; run python -m stages.frames {out.parent} --force")
+        again = format_command("frames", out.parent, "--force")
+        raise UserError(f"{inputs['frames']} has no training frames; run {again}")
     if not validation:
         warn(f"{inputs['frames']} has no validation frames: the isovalue and the rounds are not validated")
 

@@ -20,6 +20,7 @@ from pipeline.body.body import canonical_to_world
 from pipeline.capture.capture import CONTACT_SHEET, Capture
 from pipeline.capture.frame_selection import HELDOUT, TRAIN
 from pipeline.core.cli import main
+from pipeline.core.command import format_command
 from pipeline.core.config import Config as BaseConfig
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import Manifest, read_manifest
@@ -315,7 +316,7 @@ def _comparison_row(frame: FrameImages) -> list[UInt8[np.ndarray, "h w 3"]]:
 def _manifest(folder: Path) -> Manifest:
     manifest = read_manifest(folder)
     if manifest is None:
-        raise UserError(f"{folder} has no manifest: run python -m stages.{folder.name} {folder.parent}")
+        raise UserError(f"{folder} has no manifest: run {format_command(folder.name, folder.parent)}")
     return manifest
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from pipeline.body.body import Body, Motion
 from pipeline.body.fit.state import Observations
+from pipeline.core.command import format_command
 from pipeline.core.errors import UserError
 from pipeline.geometry.camera import Camera
 from pipeline.io.npz import load_npz, save_npz
@@ -112,7 +113,8 @@ def load_scores(path: Path) -> FrameScores:
     arrays = load_npz(path)
     missing = [field.name for field in fields(FrameScores) if field.name not in arrays]
     if missing:
-        raise UserError(f"{path} has no `{missing[0]}`: an older version wrote it; run `python -m stages.body` again")
+        again = format_command("body", path.parent.parent, "--force")
+        raise UserError(f"{path} has no array {missing[0]!r}: an older version wrote it; run {again}")
     return FrameScores(**{field.name: arrays[field.name] for field in fields(FrameScores)})
 
 

@@ -7,6 +7,7 @@ from jaxtyping import Int
 
 from pipeline.capture.capture import Capture
 from pipeline.capture.frame_selection import TRAIN
+from pipeline.core.command import format_command
 from pipeline.core.errors import UserError
 from pipeline.io.npz import load_npz
 
@@ -24,6 +25,6 @@ def usable_training_positions(capture: Capture, body_dir: Path) -> Int[np.ndarra
     if usable is None or usable.shape != capture.split.shape:
         raise UserError(
             f"{path} does not say which of the {len(capture)} frames are usable (written by an older version); "
-            "run `python -m stages.body` again"
+            f"run {format_command('body', body_dir.parent, '--force')}"
         )
     return np.flatnonzero((capture.split == TRAIN) & usable)

@@ -5,6 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from pipeline.core.command import format_command
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import Manifest
 from pipeline.metrics.images import mean_scores
@@ -121,6 +122,6 @@ def _manifest_metric(manifest: Manifest, name: str) -> float | None:
     if name not in manifest.metrics:
         raise UserError(
             f"the manifest of stage {manifest.stage} has no metric {name}: "
-            f"run it again with python -m stages.{manifest.stage} RUN --force"
+            f"run {format_command(manifest.stage, 'RUN', '--force')}"
         )
     return manifest.metrics[name]

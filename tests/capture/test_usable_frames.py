@@ -27,7 +27,7 @@ def test_training_frames_are_those_whose_fit_is_usable(tmp_path: Path) -> None:
 @pytest.mark.parametrize("arrays", [{"frame_index": np.arange(5)}, {"usable": np.ones(4, dtype=bool)}])
 def test_incomplete_scores_are_refused_with_a_remedy(tmp_path: Path, arrays: dict[str, np.ndarray]) -> None:
     save_npz(tmp_path / SCORES_NPZ, arrays)
-    with pytest.raises(UserError, match=r"which of the 5 frames are usable.*stages\.body"):
+    with pytest.raises(UserError, match=r"which of the 5 frames are usable.*stages body"):
         usable_training_positions(capture(tmp_path), tmp_path)
 
 

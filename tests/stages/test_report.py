@@ -188,5 +188,5 @@ def test_a_held_out_frame_without_a_person_is_left_out_with_a_warning(inputs: di
 
 
 def test_without_a_manifest_the_command_is_named(inputs: dict[str, Path], tmp_path: Path):
-    with pytest.raises(UserError, match="python -m stages.mesh"):
+    with pytest.raises(UserError, match="python -m stages mesh"):
         run(inputs | {"mesh": tmp_path / "mesh"}, tmp_path, CONFIG, SETTINGS)
