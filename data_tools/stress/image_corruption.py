@@ -56,7 +56,9 @@ def shift_smoothly(images: Sequence[np.ndarray], amplitude_px: float) -> Images:
     y = amplitude_px * (0.7 * np.sin(2 * np.pi * 1.7 * time + 2.0) + 0.3 * np.sin(2 * np.pi * 4.1 * time))
     height, width = images[0].shape[:2]
     return [
-        cv2.warpAffine(image, np.array([[1.0, 0.0, dx], [0.0, 1.0, dy]]), (width, height), borderMode=cv2.BORDER_REFLECT)
+        cv2.warpAffine(
+            image, np.array([[1.0, 0.0, dx], [0.0, 1.0, dy]]), (width, height), borderMode=cv2.BORDER_REFLECT
+        )
         for image, dx, dy in zip(images, x, y, strict=True)
     ]
 

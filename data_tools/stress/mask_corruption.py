@@ -17,7 +17,12 @@ HOLES_PER_FRAME = 6
 LOST_LIMB_PERIOD = 5
 """A limb is lost in one of so many frames: 20 %."""
 
-_LIMBS = (("LeftForeArm", "LeftHand"), ("RightForeArm", "RightHand"), ("LeftLeg", "LeftFoot"), ("RightLeg", "RightFoot"))
+_LIMBS = (
+    ("LeftForeArm", "LeftHand"),
+    ("RightForeArm", "RightHand"),
+    ("LeftLeg", "LeftFoot"),
+    ("RightLeg", "RightFoot"),
+)
 _LIMB_WIDTH = 0.09
 """Width of what is lost about the bone of a limb, as a fraction of the stature."""
 

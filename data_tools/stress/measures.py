@@ -31,7 +31,7 @@ from pipeline.core.manifest import list_files
 from pipeline.geometry.colour import linear_to_srgb, srgb_to_linear
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import closest_points_on_mesh
-from pipeline.io.image import to_float, to_uint8
+from pipeline.io.image import to_float
 from pipeline.io.npz import load_npz
 from pipeline.io.tensors import load_tensors
 from pipeline.metrics.images import composite_on_white, composite_premultiplied_on_white, foreground_mask, psnr_db

@@ -114,7 +114,9 @@ def bounded(score: str, low: float | None = None, high: float | None = None) -> 
     return crossed
 
 
-def bounded_change(reference: str, changes: Mapping[str, tuple[float | None, float | None]]) -> Callable[..., list[str]]:
+def bounded_change(
+    reference: str, changes: Mapping[str, tuple[float | None, float | None]]
+) -> Callable[..., list[str]]:
     """Return a pass line: each score minus that of the trial `reference` is within (low, high).
 
     changes: bounds by score; None: none.

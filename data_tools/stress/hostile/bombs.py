@@ -112,8 +112,9 @@ def _hdf5_bombs() -> Iterator[tuple[str, bytes]]:
     yield "strings", _hdf5(lambda file: file.create_dataset("masks", data=[b"a", b"bc"]))
     yield "link to another file", _hdf5(lambda file: file.__setitem__("masks", h5py.ExternalLink(SECRET, "masks")))
     external = [(SECRET, 0, 20 * 64 * 64)]
-    yield "bytes of another file", _hdf5(
-        lambda file: file.create_dataset("masks", (20, 64, 64), "u1", external=external)
+    yield (
+        "bytes of another file",
+        _hdf5(lambda file: file.create_dataset("masks", (20, 64, 64), "u1", external=external)),
     )
     yield "link to itself", _hdf5(lambda file: file.__setitem__("masks", h5py.SoftLink("/masks")))
 
@@ -255,7 +256,10 @@ def _video_bombs() -> Iterator[tuple[str, bytes]]:
     yield "playlist of an address", playlist.replace(SECRET, "http://127.0.0.1:9/x.ts").encode()
     yield "concatenation", f"ffconcat version 1.0\nfile {SECRET}\n".encode()
     yield "concatenation out of the folder", f"ffconcat version 1.0\nfile ../{SECRET}\n".encode()
-    yield "session description", b"v=0\no=- 0 0 IN IP4 127.0.0.1\ns=x\nc=IN IP4 127.0.0.1\nt=0 0\nm=video 9 RTP/AVP 96\n"
+    yield (
+        "session description",
+        b"v=0\no=- 0 0 IN IP4 127.0.0.1\ns=x\nc=IN IP4 127.0.0.1\nt=0 0\nm=video 9 RTP/AVP 96\n",
+    )
     gif = bytearray(b"GIF89a" + struct.pack("<HHBBB", 65535, 65535, 0x80, 0, 0) + bytes(6))
     gif += b"," + struct.pack("<HHHHB", 0, 0, 65535, 65535, 0) + b"\x02\x02\x44\x01\x00;"
     yield "gif of 65535 x 65535", bytes(gif)

@@ -37,8 +37,16 @@ Frame Time: 0.04
 5 6 7  10 20 30  40 50 60
 """
 
-CAMERA = {"fx": 80.0, "fy": 80.0, "cx": 32.0, "cy": 32.0, "width": SIDE_PX, "height": SIDE_PX, "distortion": [0.1, 0, 0, 0]}
-SPLIT = {"train": list(range(0, 16)), "validation": [16, 17], "heldout": [18, 19]}
+CAMERA = {
+    "fx": 80.0,
+    "fy": 80.0,
+    "cx": 32.0,
+    "cy": 32.0,
+    "width": SIDE_PX,
+    "height": SIDE_PX,
+    "distortion": [0.1, 0, 0, 0],
+}
+SPLIT = {"train": list(range(16)), "validation": [16, 17], "heldout": [18, 19]}
 PRESET = "frames:\n  max_frames: 100\nmesh:\n  rounds: 2\n"
 
 
