@@ -54,11 +54,9 @@ def shift_smoothly(images: Sequence[np.ndarray], amplitude_px: float) -> Images:
     time = np.arange(len(images)) / max(len(images), 1)
     x = amplitude_px * (0.7 * np.sin(2 * np.pi * 1.3 * time) + 0.3 * np.sin(2 * np.pi * 3.7 * time + 1.0))
     y = amplitude_px * (0.7 * np.sin(2 * np.pi * 1.7 * time + 2.0) + 0.3 * np.sin(2 * np.pi * 4.1 * time))
-    height, width = images[0].shape[:2]
+    size = (images[0].shape[1], images[0].shape[0])
     return [
-        cv2.warpAffine(
-            image, np.array([[1.0, 0.0, dx], [0.0, 1.0, dy]]), (width, height), borderMode=cv2.BORDER_REFLECT
-        )
+        cv2.warpAffine(image, np.array([[1.0, 0.0, dx], [0.0, 1.0, dy]]), size, borderMode=cv2.BORDER_REFLECT)
         for image, dx, dy in zip(images, x, y, strict=True)
     ]
 

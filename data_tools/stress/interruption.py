@@ -69,7 +69,7 @@ def interruption_scores(captures: Path, folder: Path, kind: str, count: int) -> 
 
 
 def differing_files(expected: Path, found: Path) -> list[str]:
-    """Return the files of finished stages that are missing, unknown or have other bytes; of the report, only missing."""
+    """Return the files of finished stages that are missing, unknown or differ; of the report, only missing."""
     differing = []
     for name in STAGES:
         wanted, own = read_manifest(expected / name), read_manifest(found / name)

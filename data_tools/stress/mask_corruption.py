@@ -41,7 +41,7 @@ def punch_holes(mask: Mask, radius_px: float, random: np.random.Generator) -> Ma
     rows, columns = np.nonzero(mask >= 128)
     holed = mask.copy()
     for index in random.integers(0, max(len(rows), 1), HOLES_PER_FRAME if len(rows) else 0):
-        cv2.circle(holed, (int(columns[index]), int(rows[index])), round(radius_px), 0, -1)
+        cv2.circle(holed, (int(columns[index]), int(rows[index])), round(radius_px), (0,), -1)
     return holed
 
 
@@ -58,9 +58,9 @@ def lose_limb(mask: Mask, capture: SyntheticCapture, frame: int) -> Mask:
     beyond = second + 0.6 * (second - first)
     ends_px, _ = project(torch.from_numpy(np.stack([first, beyond])).float(), capture.camera)
     width_px = _LIMB_WIDTH * body.height_m() * capture.camera.fy / abs(float(capture.ground_m[2]))
-    corners = [tuple(int(value) for value in point) for point in ends_px.numpy().round()]
+    corners = ends_px.round().int().tolist()
     lost = mask.copy()
-    cv2.line(lost, corners[0], corners[1], 0, round(width_px))
+    cv2.line(lost, corners[0], corners[1], (0,), round(width_px))
     return lost
 
 

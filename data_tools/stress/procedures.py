@@ -98,8 +98,8 @@ def _repeat_warnings(folder: Path) -> None:
 def add_pose_noise(folder: Path, joints_deg: float, root_m: float, seed: int = 0) -> None:
     """Perturb the poses of a body folder of a stress run; its manifest then describes the perturbed files.
 
-    Each joint angle about a random axis, and each coordinate of the root, gets normal noise. Applied once only: a folder
-    that is already perturbed says so in its metrics.
+    Each joint angle about a random axis, and each coordinate of the root, gets normal noise. Applied once only: a
+    folder that is already perturbed says so in its metrics.
     """
     manifest = read_manifest(folder)
     if manifest is None or "pose_noise_deg" in manifest.metrics:

@@ -29,9 +29,9 @@ MAX_FRAME_PIXELS = 1 << 27
 
 _FORMATS = (
     *("mov", "mp4", "m4a", "3gp", "3g2", "mj2", "avi", "matroska", "webm", "mpeg", "mpegts", "mpegvideo", "asf", "gif"),
-    *("mjpeg", "flv", "ogg", "h264", "hevc"),
+    *("mjpeg", "flv", "ogg", "h264", "hevc", "wav", "mp3", "aac", "flac"),
 )
-"""FFmpeg's names of formats whose files hold all of their content."""
+"""FFmpeg's names of formats whose files hold all of their content; those of sound get a message of their own."""
 
 _HEIF_SUFFIXES = (".heic", ".heif", ".avif")
 _IMAGE_FOLDER_NAMES = ("images", "frames", "image", "rgb", "color")
@@ -143,6 +143,8 @@ def _open_video(path: Path) -> FrameSource:
             if not container.streams.video:
                 raise UserError(f"{path} has no video track; supply a video file or a folder of images")
             stream = container.streams.video[0]
+            if stream.codec_context is None:
+                raise UserError(f"{path} has a video track of an unknown codec; supply an .mp4, .mov or .webm file")
             if stream.width * stream.height > MAX_FRAME_PIXELS:
                 raise UserError(
                     f"{path} claims frames of {stream.width}x{stream.height}, at most {MAX_FRAME_PIXELS >> 20} million "

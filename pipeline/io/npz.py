@@ -8,7 +8,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
@@ -77,7 +77,7 @@ def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
         return array
 
 
-def _check_claim(file: IO[bytes], info: zipfile.ZipInfo) -> None:
+def _check_claim(file: Any, info: zipfile.ZipInfo) -> None:
     """Raise ValueError if the header of an array does not claim the bytes that follow it."""
     version = np.lib.format.read_magic(file)
     if version not in _HEADER_READERS:

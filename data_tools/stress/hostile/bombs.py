@@ -130,10 +130,13 @@ def _json_bombs(valid: object, key: str) -> Iterator[tuple[str, bytes]]:
     yield "nested lists", b"[" * NESTING
     yield "nested objects", b'{"a":' * NESTING
     yield "nested value", json.dumps(valid).replace(f'"{key}": ', f'"{key}": ' + "[" * NESTING, 1).encode()
+    document = dict(valid) if isinstance(valid, dict) else {}
     for value in ("NaN", "Infinity", "-1e400", "9" * 5000, '"x"', "null", "[]", "{}", "true", "1e-320"):
-        document = dict(valid) if isinstance(valid, dict) else {}
         text = json.dumps(document | {key: "@"}).replace('"@"', value)
         yield f"{key} {value[:12]}", text.encode()
+    for depth in (40, 900):
+        text = json.dumps(document | {key: "@"}).replace('"@"', "[" * depth + "]" * depth)
+        yield f"list of depth {depth}", text.encode()
     yield "a list", b"[1, 2]"
     yield "a number", b"3"
     yield "many keys", ("{" + ",".join(f'"k{n}":{n}' for n in range(100_000)) + "}").encode()
@@ -171,7 +174,7 @@ def _bvh_bombs() -> Iterator[tuple[str, bytes]]:
 def _glb_bombs() -> Iterator[tuple[str, bytes]]:
     skin = {"joints": [0], "inverseBindMatrices": 0}
     primitive = {"attributes": {"POSITION": 0, "JOINTS_0": 0, "WEIGHTS_0": 0}}
-    base = {
+    base: dict[str, object] = {
         "asset": {"version": "2.0"},
         "nodes": [{"name": "Hips"}, {"mesh": 0, "skin": 0}],
         "skins": [skin],
@@ -199,6 +202,8 @@ def _glb_bombs() -> Iterator[tuple[str, bytes]]:
         document = {**base, **images, "materials": materials, "accessors": [accessor()]}
         yield f"image {uri}", glb_bytes(document, bytes(16))
     cyclic = [{"name": "Hips", "children": [1]}, {"mesh": 0, "skin": 0, "children": [0]}]
+    loop = [{"name": "Hips", "children": [1]}, {"mesh": 0, "skin": 0, "children": [1]}]
+    yield "a node that is its own child", glb_bytes({**base, "nodes": loop, "accessors": [accessor()]}, bytes(16))
     yield "cyclic nodes", glb_bytes({**base, "nodes": cyclic, "accessors": [accessor()]}, bytes(16))
     for field, value in (("nodes", 5), ("nodes", [7]), ("meshes", []), ("skins", {}), ("accessors", "x")):
         yield f"{field} {value}", glb_bytes({**base, "accessors": [accessor()], field: value}, bytes(16))

@@ -49,6 +49,9 @@ CAMERA = {
 SPLIT = {"train": list(range(16)), "validation": [16, 17], "heldout": [18, 19]}
 PRESET = "frames:\n  max_frames: 100\nmesh:\n  rounds: 2\n"
 
+_SMPL_PARENTS = (2**32 - 1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
+"""Parents of SMPL's joints as its files store them."""
+
 
 def write_image_folder(folder: Path) -> Path:
     """Write a folder of grey images, a recording."""
@@ -114,14 +117,18 @@ def _poses() -> bytes:
 
 
 def _model() -> dict[str, object]:
-    """Return a body model of two joints and four vertices in the layout of SMPL."""
+    """Return a body model of 24 joints in the layout of SMPL; its surface is a cloud of small triangles."""
+    random, joints, vertices = np.random.default_rng(0), len(_SMPL_PARENTS), 3 * len(_SMPL_PARENTS)
+    centres = random.uniform(-0.5, 0.5, (joints, 3)) + [0.0, 1.0, 0.0]
+    template = np.repeat(centres, 3, axis=0) + random.uniform(-0.05, 0.05, (vertices, 3))
+    owner = np.repeat(np.eye(joints), 3, axis=0)
     return {
-        "v_template": np.eye(4, 3),
-        "shapedirs": np.zeros((4, 3, 10)),
-        "J_regressor": csc_matrix(np.full((2, 4), 0.25)),
-        "kintree_table": np.array([[2**32 - 1, 0], [0, 1]], dtype=np.int64),
-        "weights": np.full((4, 2), 0.5),
-        "f": np.array([[0, 1, 2], [0, 2, 3]], dtype=np.uint32),
+        "v_template": template,
+        "shapedirs": random.normal(0.0, 0.001, (vertices, 3, 10)),
+        "J_regressor": csc_matrix(owner.T / 3.0),
+        "kintree_table": np.array([_SMPL_PARENTS, range(joints)], dtype=np.int64),
+        "weights": owner,
+        "f": np.arange(vertices, dtype=np.uint32).reshape(-1, 3),
     }
 
 

@@ -36,7 +36,7 @@ def weak_is_body_like(results: Results) -> list[str]:
 SHAPE_ROWS = (
     Row(
         name="masks",
-        failure="true masks eroded (-) and dilated (+) by 1-8 px of 288, with holes, or without a limb in 20 % of frames",
+        failure="true masks eroded (-) or dilated (+) by 1-8 px of 288, with holes, without a limb in 20 % of frames",
         line="volume of each limb within 10 % of the truth",
         trials=(
             *(turn_trial(f"{px:+d} px", px, corruption={"erode_px": -px}) for px in (-8, -4, -2, -1, 0, 1, 2, 4, 8)),

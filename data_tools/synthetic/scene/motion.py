@@ -149,7 +149,7 @@ def bend_at_hips(body: Body, motion: Motion, bend_deg: float) -> Motion:
 
 
 def posture(lower_arms_deg: float, close_legs_deg: float, hand_on_hip: bool) -> JointAngles:
-    """Return joint angles that lower both arms, close both legs (the feet stay level), and put the left hand on the hip.
+    """Return joint angles that lower both arms, close both legs (feet stay level), and put the left hand on the hip.
 
     The hand is on the hip of a person whose upper arm is at 45 degrees in the A-pose.
     """
