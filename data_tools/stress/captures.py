@@ -14,6 +14,7 @@ from data_tools.folder import atomic_folder
 from data_tools.sample import main as make_sample
 from data_tools.stress.image_corruption import IMAGE_CORRUPTIONS, Images
 from data_tools.stress.mask_corruption import MASK_CORRUPTIONS
+from data_tools.stress.row import Number
 from data_tools.synthetic.scene.capture import CAPTURE_VERSION, SyntheticCapture
 from data_tools.synthetic.scene.movie import LOSSLESS, Encoding, write_video
 from pipeline.capture.video import open_frame_source, read_frames
@@ -29,7 +30,7 @@ NAN_PIXEL = "nan_pixel"
 Options = Mapping[str, Any]
 
 
-def make_capture(folder: Path, options: Options, corruption: Mapping[str, float]) -> Path:
+def make_capture(folder: Path, options: Options, corruption: Mapping[str, Number]) -> Path:
     """Return the folder of a capture with these options of `data_tools.sample` and this damage; made only once.
 
     Args:
@@ -59,18 +60,18 @@ def option_arguments(options: Options) -> list[str]:
     return arguments
 
 
-def _write_damaged(out: Path, clean: Path, corruption: Mapping[str, float]) -> None:
+def _write_damaged(out: Path, clean: Path, corruption: Mapping[str, Number]) -> None:
     """Write `video/` with damaged images and masks, and link `truth/`."""
     capture = load_ground_truth(clean)
     images = [frame.rgb for frame in read_frames(open_frame_source(clean / "video"), lambda _: True, 1 << 30)]
     for name, value in corruption.items():
         if name in IMAGE_CORRUPTIONS:
-            images = IMAGE_CORRUPTIONS[name](images, capture, value)
+            images = IMAGE_CORRUPTIONS[name](images, capture, float(value))
     (out / "video").mkdir()
     if NAN_PIXEL in corruption:
         _write_exr(out / "video", images, int(corruption[NAN_PIXEL]))
     else:
-        encoding = h264_at(corruption[BITRATE]) if BITRATE in corruption else LOSSLESS
+        encoding = h264_at(float(corruption[BITRATE])) if BITRATE in corruption else LOSSLESS
         write_video(out / "video" / "video.mp4", images, capture.fps, encoding)
     masks = {name: value for name, value in corruption.items() if name in MASK_CORRUPTIONS}
     if masks:
@@ -82,12 +83,12 @@ def _write_damaged(out: Path, clean: Path, corruption: Mapping[str, float]) -> N
         shutil.copytree(clean / "truth", out / "truth")
 
 
-def _write_masks(folder: Path, clean: Path, capture: SyntheticCapture, corruption: Mapping[str, float]) -> None:
+def _write_masks(folder: Path, clean: Path, capture: SyntheticCapture, corruption: Mapping[str, Number]) -> None:
     folder.mkdir()
     for frame in range(len(capture.motion.frame_index)):
         mask = load_true_mask(clean, frame)
         for name, value in corruption.items():
-            mask = MASK_CORRUPTIONS[name](mask, capture, frame, value)
+            mask = MASK_CORRUPTIONS[name](mask, capture, frame, float(value))
         write_gray(folder / f"{frame:06d}.png", mask)
 
 

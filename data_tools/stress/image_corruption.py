@@ -20,7 +20,7 @@ from pipeline.geometry.colour import linear_to_srgb, srgb_to_linear
 from pipeline.geometry.rotation import slerp
 from pipeline.io.image import to_float, to_uint8
 
-Images = list[UInt8[np.ndarray, "h w 3"]]
+Images = list[UInt8[np.ndarray, "_ _ 3"]]
 
 READ_NOISE, SHOT_NOISE = 0.004, 0.03
 """Standard deviation of the noise of a small sensor in linear light: read noise, and shot noise at white."""

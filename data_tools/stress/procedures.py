@@ -22,6 +22,7 @@ from data_tools.stress.captures import make_capture, true_view_deg
 from data_tools.stress.hostile.run import hostile_scores
 from data_tools.stress.interruption import interruption_scores
 from data_tools.stress.measures import MEASURES
+from data_tools.stress.row import Number
 from data_tools.stress.store import PRESET_FILE
 from data_tools.sweep.runs import find_video
 from pipeline.body.body import Motion
@@ -49,10 +50,10 @@ def reconstruct(
     *,
     capture: Mapping[str, Any] | None = None,
     video: str | None = None,
-    corruption: Mapping[str, float] | None = None,
+    corruption: Mapping[str, Number] | None = None,
     overrides: Mapping[str, Any] | None = None,
-    told_focal_ratio: float | None = None,
-    pose_noise: tuple[float, float] | None = None,
+    told_focal_ratio: Number | None = None,
+    pose_noise: Sequence[Number] | None = None,
     measure: str = "avatar",
 ) -> Mapping[str, float]:
     """Run the stages that a measure needs on a capture, and return its scores.
@@ -85,7 +86,7 @@ def reconstruct(
             if not run_stage(plan):  # finished before an interruption: its warnings are in its manifest
                 _repeat_warnings(plan.folder)
             if name == "body" and pose_noise is not None:
-                add_pose_noise(workshop.run / "body", *pose_noise)
+                add_pose_noise(workshop.run / "body", *map(float, pose_noise))
     return MEASURES[measure].scores(folder, workshop.run)
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 Scores = Mapping[str, float]
+Number = int | float
 
 DONE, REFUSED, FAILED, MISSING = "done", "refused", "failed", "not run"
 """States of a trial: scores were measured; the program refused the input in one sentence; it failed in another way
@@ -23,7 +24,7 @@ class Trial:
     """
 
     label: str
-    x: float
+    x: Number
     settings: Mapping[str, Any] = field(default_factory=dict)
     procedure: str = "reconstruct"
 

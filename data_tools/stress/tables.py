@@ -64,7 +64,7 @@ def summary_table(rows: Mapping[str, Row], sweep: Sweep) -> str:
         done = [result for result in results.values() if result.state != MISSING]
         minutes = f"{sum(result.seconds for result in done) / 60:.0f}" if done else ""
         commit = join_distinct(_short(result.commit) for result in done)
-        missing = f" Not made: {row.missing}." if row.missing else ""
+        missing = f". Not made: {row.missing}" if row.missing else ""
         cells = (f"`{name}`", row.failure + missing, row.line, f"**{verdict}**")
         lines.append(
             "| " + " | ".join((*cells, f"{len(done)} of {len(row.trials)}", minutes, row.preset, commit)) + " |"

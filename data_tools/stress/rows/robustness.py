@@ -65,6 +65,7 @@ ROBUSTNESS_ROWS = (
         crossed=bounded("differing_files", high=0.0),
         score="differing_files",
         unit="files that differ",
+        preset="smoke",
     ),
     Row(
         name="hostile",
@@ -74,5 +75,6 @@ ROBUSTNESS_ROWS = (
         crossed=NO_FAULT,
         score="faults",
         unit="faults",
+        preset="none",
     ),
 )

@@ -60,7 +60,7 @@ SHAPE_ROWS = (
         crossed=all_of(bounded("skirt_chamfer_mm", high=8.0), bounded("far_area_share", high=0.005)),
         score="skirt_chamfer_mm",
         unit="Chamfer on the skirt, mm",
-        missing="wide sleeves: the generated person has none",
+        missing="wide sleeves, which the generated person does not have",
     ),
     Row(
         name="unseen-side",
@@ -96,7 +96,7 @@ SHAPE_ROWS = (
         score="psnr_body_db",
         unit="body PSNR, dB",
         may_refuse=True,
-        missing="moving camera: row `moving-camera`",
+        missing="a moving camera, which is the row `moving-camera`",
     ),
     Row(
         name="occlusion",
@@ -126,6 +126,6 @@ SHAPE_ROWS = (
         crossed=bounded("hand_recall", low=0.8),
         score="hand_recall",
         unit="recall of the hands at 5 mm",
-        missing="fingers of 2-10 mm and hair: the generator has one size",
+        missing="fingers of 2-10 mm and hair, of which the generator has one size",
     ),
 )
