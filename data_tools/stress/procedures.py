@@ -7,6 +7,7 @@ is a result and does not end the sweep. A refusal (UserError) ends it with exit 
 """
 
 import json
+import shutil
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,6 +19,7 @@ import torch
 
 import stages
 from data_tools.command import run_command
+from data_tools.folder import atomic_folder
 from data_tools.stress.captures import make_capture, true_view_deg
 from data_tools.stress.hostile.run import hostile_scores
 from data_tools.stress.interruption import interruption_scores
@@ -35,6 +37,9 @@ from pipeline.core.progress import warn
 from pipeline.core.record import RunRecord, write_record
 from pipeline.core.stage import plan_stage, run_stage
 from pipeline.geometry.rotation import axis_angle_to_quaternion, quaternion_multiply
+
+KEPT_STAGES = ("frames", "body")
+"""Stages whose results are kept by their fingerprint: trials that differ later need not run them again."""
 
 
 @dataclass(frozen=True)
@@ -83,10 +88,17 @@ def reconstruct(
     with run_lock(workshop.run):
         for name in stages.STAGES[: stages.STAGES.index(last) + 1]:
             plan = plan_stage(stages.load_stage(name), configs[name], workshop.run, record.video_path)
-            if not run_stage(plan):  # finished before an interruption: its warnings are in its manifest
+            kept = workshop.captures.with_name("stages") / plan.fingerprint
+            if name in KEPT_STAGES and kept.is_dir() and not plan.folder.exists():
+                shutil.copytree(kept, plan.folder)
+            if not run_stage(plan):  # finished in another trial or before an interruption
                 _repeat_warnings(plan.folder)
+            if name in KEPT_STAGES and not kept.exists():
+                with atomic_folder(kept) as part:
+                    shutil.copytree(plan.folder, part, dirs_exist_ok=True)
             if name == "body" and pose_noise is not None:
-                add_pose_noise(workshop.run / "body", *map(float, pose_noise))
+                joints_deg, root_m = map(float, pose_noise)
+                add_pose_noise(workshop.run / "body", joints_deg, root_m)
     return MEASURES[measure].scores(folder, workshop.run)
 
 
