@@ -22,7 +22,7 @@ ADDRESS_SPACE_BYTES = 6 << 30
 """What a reader may map beyond what the process has mapped already; allocations above it fail."""
 
 MAX_SECONDS, MAX_GROWTH_MIB = 20.0, 1024.0
-"""Limits of one file. A machine under load takes several times its usual seconds."""
+"""Limits of one file; seconds of the processor, which do not depend on what else the machine does."""
 
 SECRET_TEXT = b"the content of a foreign file"
 
@@ -36,7 +36,7 @@ class Fault:
 
 
 def hostile_scores(folder: Path, reader: str, count: int = MUTATIONS_PER_FILE) -> dict[str, float]:
-    """Return the number of files, of refusals and of faults, the slowest file and the growth of the memory.
+    """Return the number of files, of refusals and of faults, seconds of the slowest file and growth of the memory.
 
     Faults are printed. The limits apply to this process, which should end afterwards.
 
@@ -59,9 +59,9 @@ def hostile_scores(folder: Path, reader: str, count: int = MUTATIONS_PER_FILE) -
     for case, content in hostile_files(kind, count):
         for read in readers:
             cases += 1
-            start = time.monotonic()
+            start = time.process_time()
             problem, is_refused = _attempt(read, folder / name, content)
-            seconds = time.monotonic() - start
+            seconds = time.process_time() - start
             refused, slowest_s = refused + is_refused, max(slowest_s, seconds)
             if seconds > MAX_SECONDS:
                 problem = f"{seconds:.0f} s"

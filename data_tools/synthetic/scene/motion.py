@@ -79,7 +79,7 @@ NOVEL_POSES: dict[str, JointAngles] = {
 }
 """Poses that do not occur in the turn; they test the skinning of an avatar."""
 
-HAND_ON_HIP: JointAngles = {"LeftArm": (0.0, 0.0, 0.0), "LeftForeArm": (0.0, -0.9, -1.75)}
+HAND_ON_HIP: JointAngles = {"LeftForeArm": (-0.25, 0.0, -1.5)}
 """Bend of the left elbow that brings the hand to the hip."""
 
 
