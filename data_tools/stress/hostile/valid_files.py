@@ -3,6 +3,9 @@
 import io
 import json
 import pickle
+import tempfile
+from collections.abc import Callable, Mapping
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -12,6 +15,7 @@ from scipy.sparse import csc_matrix
 
 from data_tools.synthetic.scene.movie import FOR_PLAYERS, write_video
 from pipeline.capture.smpl_poses import SmplPoses, save_smpl_poses
+from pipeline.io.image import write_rgb
 
 FRAMES, SIDE_PX = 20, 64
 
@@ -61,7 +65,8 @@ def write_image_folder(folder: Path) -> Path:
     return folder
 
 
-def valid_files() -> dict[str, bytes]:
+@cache
+def valid_files() -> Mapping[str, bytes]:
     """Return the content of a valid file by kind."""
     random = np.random.default_rng(0)
     landmarks = random.uniform(0, SIDE_PX, (FRAMES, 33, 2)).astype(np.float32)
@@ -194,15 +199,11 @@ def _image(suffix: str, picture: np.ndarray) -> bytes:
 
 
 def _exr(picture: np.ndarray) -> bytes:
-    from pipeline.io.image import write_rgb
-
     return _written(lambda path: write_rgb(path, picture.astype(np.float32) / 255.0), "picture.exr")
 
 
-def _written(write: object, name: str) -> bytes:
-    import tempfile
-
+def _written(write: Callable[[Path], None], name: str) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name
-        write(path)  # type: ignore[operator]
+        write(path)
         return path.read_bytes()
