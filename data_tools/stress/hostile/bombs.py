@@ -12,6 +12,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import h5py
 import numpy as np
@@ -107,7 +108,7 @@ def _with_encryption_flag(archive: bytes) -> bytes:
 
 def _hdf5_bombs() -> Iterator[tuple[str, bytes]]:
     for shape in ((10**6, 4096, 4096), (HUGE,), (20, 10**5, 10**5)):
-        yield f"claims {shape}", _hdf5(lambda file, shape=shape: file.create_dataset("masks", shape, "u1", chunks=True))
+        yield f"claims {shape}", _hdf5(partial(_claim_dataset, shape))
     yield "a group", _hdf5(lambda file: file.create_group("masks"))
     yield "strings", _hdf5(lambda file: file.create_dataset("masks", data=[b"a", b"bc"]))
     yield "link to another file", _hdf5(lambda file: file.__setitem__("masks", h5py.ExternalLink(SECRET, "masks")))
@@ -117,6 +118,10 @@ def _hdf5_bombs() -> Iterator[tuple[str, bytes]]:
         _hdf5(lambda file: file.create_dataset("masks", (20, 64, 64), "u1", external=external)),
     )
     yield "link to itself", _hdf5(lambda file: file.__setitem__("masks", h5py.SoftLink("/masks")))
+
+
+def _claim_dataset(shape: tuple[int, ...], file: h5py.File) -> None:
+    file.create_dataset("masks", shape, "u1", chunks=True)
 
 
 def _hdf5(fill: Callable[[h5py.File], object]) -> bytes:
