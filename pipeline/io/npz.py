@@ -6,7 +6,7 @@ import lzma
 import math
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -48,25 +48,41 @@ def save_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 def load_npz(path: Path) -> dict[str, np.ndarray]:
     """Read all arrays into memory; members of the archive that are no `.npy` files are ignored.
 
+    Raises:
+        UserError: as `read_npz` raises ValueError.
+    """
+    try:
+        return read_npz(path)
+    except ValueError as error:
+        raise UserError(
+            f"{path} cannot be read as npz arrays ({error}); run the stage that writes it again, or write it again "
+            "with numpy.savez"
+        ) from error
+
+
+def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
+    """Read the named arrays, those that exist; None: all.
+
     The size that the header of an array claims must be that of its member, so that a few bytes cannot claim gigabytes.
 
     Raises:
-        UserError: the file is missing or damaged, is not an npz archive, holds pickled objects, or holds more than
-            `MAX_NPZ_BYTES`.
+        ValueError: the file is missing or damaged, is not an npz archive, or these arrays are pickled objects or larger
+            than `MAX_NPZ_BYTES`; the message is a short reason.
     """
     try:
         with zipfile.ZipFile(path) as archive:
-            members = [info for info in archive.infolist() if info.filename.endswith(_SUFFIX)]
-            total = sum(info.file_size for info in members)
+            found = {info.filename.removesuffix(_SUFFIX): info for info in archive.infolist() if _is_array(info)}
+            chosen = {name: info for name, info in found.items() if names is None or name in names}
+            total = sum(info.file_size for info in chosen.values())
             if total > MAX_NPZ_BYTES:
                 raise ValueError(f"its arrays have {total} bytes, at most {MAX_NPZ_BYTES} are read")
-            return {info.filename.removesuffix(_SUFFIX): _read_member(archive, info) for info in members}
+            return {name: _read_member(archive, info) for name, info in chosen.items()}
     except _DAMAGE as error:
-        reason = " ".join(str(error).split())[:_MAX_REASON_LENGTH]
-        raise UserError(
-            f"{path} cannot be read as npz arrays ({reason}); run the stage that writes it again, or write it again "
-            "with numpy.savez"
-        ) from error
+        raise ValueError(" ".join(str(error).split())[:_MAX_REASON_LENGTH]) from error
+
+
+def _is_array(info: zipfile.ZipInfo) -> bool:
+    return info.filename.endswith(_SUFFIX)
 
 
 def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:

@@ -36,6 +36,9 @@ def bombs(kind: str) -> Iterator[tuple[str, bytes]]:
         "npz": lambda: _npz_bombs("landmarks_px", "<f4"),
         "masks npz": lambda: _npz_bombs("masks", "|u1"),
         "poses npz": lambda: _npz_bombs("frame_index", "<i4"),
+        "model npz": lambda: _npz_bombs("v_template", "<f8"),
+        "colmap cameras": _colmap_camera_bombs,
+        "colmap images": _colmap_image_bombs,
         "masks hdf5": _hdf5_bombs,
         "camera json": lambda: _json_bombs(CAMERA, "fx"),
         "split json": lambda: _json_bombs(SPLIT, "train"),
@@ -129,6 +132,21 @@ def _hdf5(fill: Callable[[h5py.File], object]) -> bytes:
     with h5py.File(content, "w") as file:
         fill(file)
     return content.getvalue()
+
+
+def _colmap_camera_bombs() -> Iterator[tuple[str, bytes]]:
+    for count in (HUGE, 2**64 - 1):
+        yield f"{count} cameras", struct.pack("<QiiQQ4d", count, 1, 1, 64, 64, 80.0, 80.0, 32.0, 32.0)
+    yield "unknown model", struct.pack("<QiiQQ", 1, 1, 99, 64, 64)
+    yield "nan", struct.pack("<QiiQQ4d", 1, 1, 1, 64, 64, float("nan"), 80.0, 32.0, 32.0)
+
+
+def _colmap_image_bombs() -> Iterator[tuple[str, bytes]]:
+    for points in (HUGE, 2**64 - 1):
+        image = struct.pack("<i7di", 1, 1.0, *[0.0] * 6, 1) + b"000.png\0" + struct.pack("<Q", points)
+        yield f"{points} points", struct.pack("<Q", 2) + image
+    yield "name without end", struct.pack("<Qi7di", 1, 1, 1.0, *[0.0] * 6, 1) + b"a" * 100
+    yield "no rotation", struct.pack("<Qi7di", 1, 1, *[0.0] * 7, 1) + b"000.png\0" + struct.pack("<Q", 0)
 
 
 def _json_bombs(valid: object, key: str) -> Iterator[tuple[str, bytes]]:

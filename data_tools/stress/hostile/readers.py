@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from data_tools.convert.colmap import read_colmap_model
 from data_tools.convert.joblib_pickle import load_joblib
 from data_tools.convert.people_snapshot import read_people_snapshot
 from data_tools.pose import read_pose
@@ -55,6 +56,20 @@ def _people_snapshot(path: Path) -> object:
     return read_people_snapshot(folder)
 
 
+def _colmap(name: str) -> Reader:
+    """Return a reader of one file of a COLMAP model whose other file is valid."""
+
+    def read(path: Path) -> object:
+        folder = path.with_name("sparse")
+        folder.mkdir(exist_ok=True)
+        for part in ("cameras", "images"):
+            (folder / f"{part}.bin").write_bytes(valid_files()[f"colmap {part}"])
+        (folder / f"{name}.bin").write_bytes(path.read_bytes())
+        return read_colmap_model(folder)
+
+    return read
+
+
 def _video(path: Path) -> object:
     source = open_frame_source(path)
     return sum(1 for _ in read_frames(source, lambda _: True, MAX_SIDE_PX))
@@ -93,6 +108,9 @@ READERS: Mapping[str, tuple[str, str, tuple[Reader, ...]]] = {
     "pickle": ("pickle", "file.pkl", (load_pickle, load_npy, load_joblib)),
     "smpl-model": ("model pkl", "file.pkl", (load_smpl,)),
     "people-snapshot": ("camera pkl", "camera.pkl", (_people_snapshot,)),
+    "smpl-npz": ("model npz", "file.npz", (load_smpl,)),
+    "colmap-cameras": ("colmap cameras", "cameras.bin", (_colmap("cameras"),)),
+    "colmap-images": ("colmap images", "images.bin", (_colmap("images"),)),
     "video": ("video", "file.mp4", (_video,)),
     "png": ("png", "file.png", (read_rgb, read_gray)),
     "jpg": ("jpg", "file.jpg", (read_rgb,)),

@@ -3,6 +3,7 @@
 import io
 import json
 import pickle
+import struct
 import tempfile
 from collections.abc import Callable, Mapping
 from functools import cache
@@ -84,6 +85,9 @@ def valid_files() -> Mapping[str, bytes]:
         "pickle": pickle.dumps({"a": np.arange(12.0).reshape(3, 4), "b": [1, "two", {"c": np.int32(3)}]}, protocol=2),
         "model pkl": pickle.dumps(_model(), protocol=2),
         "camera pkl": pickle.dumps(_camera_pickle(), protocol=2),
+        "model npz": _npz(**_dense_model()),
+        "colmap cameras": struct.pack("<QiiQQ4d", 1, 1, 1, SIDE_PX, SIDE_PX, 80.0, 80.0, 32.0, 32.0),
+        "colmap images": struct.pack("<Qi7di", 1, 1, 1.0, *[0.0] * 6, 1) + b"000.png\0" + struct.pack("<Q", 0),
         "video": _video(),
         "png": _image(".png", picture),
         "jpg": _image(".jpg", picture),
@@ -135,6 +139,13 @@ def _model() -> dict[str, object]:
         "weights": owner,
         "f": np.arange(vertices, dtype=np.uint32).reshape(-1, 3),
     }
+
+
+def _dense_model() -> dict[str, np.ndarray]:
+    model = _model()
+    regressor = model["J_regressor"]
+    assert isinstance(regressor, csc_matrix)
+    return {name: np.asarray(value) for name, value in (model | {"J_regressor": regressor.toarray()}).items()}
 
 
 def _camera_pickle() -> dict[str, object]:
