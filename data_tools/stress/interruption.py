@@ -26,8 +26,8 @@ TIMELESS = tuple(name for name in STAGES if name != "report")
 """Stages whose bytes do not hold run times."""
 
 FULL_DISK_MIB, LARGE_DISK_MIB = 4, 512
-KILL_SHARE = 0.5
-"""Largest delay of a kill, as a fraction of the time of the whole run."""
+MIN_KILL_DELAY_S, KILL_SHARE = 1.0, 0.5
+"""Least delay of a kill, and the largest as a fraction of the time of the whole run."""
 
 
 def interruption_scores(captures: Path, folder: Path, kind: str, count: int) -> dict[str, float]:
@@ -102,7 +102,7 @@ def _kill_at_random(run: Path, video: Path, seconds: float, count: int) -> int:
     random, log, kills = np.random.default_rng(0), run.with_name("run.log"), 0
     while True:
         process = _start(run, video, log)
-        delay_s = float(random.uniform(1.0, KILL_SHARE * seconds)) if kills < count else None
+        delay_s = float(random.uniform(MIN_KILL_DELAY_S, KILL_SHARE * seconds)) if kills < count else None
         try:
             if process.wait(delay_s) != 0:
                 raise RuntimeError(f"the run did not continue after {kills} kills: {_last_line(log)}")

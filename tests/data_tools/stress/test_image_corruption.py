@@ -90,6 +90,7 @@ def test_a_box_is_in_the_middle_frames_only(capture: SyntheticCapture) -> None:
     assert [bool((image != 10).any()) for image in boxed] == [False, False, True, True, True, True, False, False]
 
 
+@pytest.mark.slow
 def test_a_passer_by_crosses_the_picture(capture: SyntheticCapture) -> None:
     side_px = capture.camera.height
     images = [np.full((side_px, side_px, 3), 10, np.uint8) for _ in range(9)]
