@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import lzma
 import math
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Collection, Mapping
@@ -22,7 +23,7 @@ _SUFFIX = ".npy"
 _HEADER_READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 _MAX_REASON_LENGTH = 160
 
-# What zipfile, its decompressors and numpy raise for damaged files; RuntimeError: encrypted.
+# What zipfile, its decompressors and numpy raise for damaged files; RuntimeError: encrypted; TokenError: header.
 _DAMAGE = (
     OSError,
     ValueError,
@@ -34,6 +35,7 @@ _DAMAGE = (
     zipfile.BadZipFile,
     zlib.error,
     lzma.LZMAError,
+    tokenize.TokenError,
 )
 
 

@@ -66,3 +66,11 @@ def test_shapes_of_all_kinds_come_back(tmp_path) -> None:
     found = npz.load_npz(tmp_path / "a.npz")
     assert found.keys() == arrays.keys()
     assert all(np.array_equal(found[name], arrays[name]) and found[name].dtype == arrays[name].dtype for name in arrays)
+
+
+def test_an_unfinished_header_is_refused(tmp_path) -> None:
+    header = b"{'descr': '<f4', 'fortran_order': (\n"
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("a.npy", b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
+    with pytest.raises(UserError, match="cannot be read as npz arrays"):
+        npz.load_npz(tmp_path / "a.npz")
