@@ -45,6 +45,7 @@ def test_two_runs_at_once_end_with_the_same_bytes(folders: tuple[Path, Path]) ->
     assert scores["interruptions"] <= 1.0
 
 
+@pytest.mark.slow
 def test_differences_are_counted(folders: tuple[Path, Path]) -> None:
     interruption_scores(*folders, kind="kills", count=0)
     expected, found = folders[0].parent / "undisturbed", folders[1] / "run"
