@@ -7,7 +7,6 @@ avatar.glb, the avatar with each clip as a further animation; with --frame or --
 """
 
 import argparse
-import json
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -26,6 +25,7 @@ from pipeline.avatar.retarget import retarget_with_contacts
 from pipeline.avatar.rig import build_rig
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.core.errors import UserError
+from pipeline.core.json_file import load_json
 from pipeline.core.manifest import read_manifest
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning, local_quaternions
@@ -88,7 +88,7 @@ def read_pose(path: Path, body: Body) -> Float32[np.ndarray, "1 j 4"]:
     """
     rotations = np.tile(np.array([1.0, 0.0, 0.0, 0.0], dtype=np.float32), (1, len(body.joint_names), 1))
     try:
-        poses = json.loads(path.read_text(encoding="utf-8"))
+        poses = load_json(path)
         entries = {str(name): np.asarray(values, dtype=np.float32) for name, values in poses.items()}
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise UserError(f'pose {path} is not a JSON object such as {{"LeftArm": [1, 0, 0, 0]}} ({error})') from error

@@ -80,7 +80,7 @@ def read_colmap_model(folder: Path) -> ColmapModel:
             world_to_camera[name] = _pose_to_matrix(pose)
     except FileNotFoundError:
         raise UserError(f"{path} does not exist; supply the complete COLMAP model") from None
-    except (ValueError, IndexError, struct.error) as error:
+    except (ValueError, IndexError, OverflowError, struct.error) as error:
         raise UserError(f"{path} is not a valid COLMAP file ({error}); export the model again") from None
     return ColmapModel(cameras, camera_id_of, world_to_camera)
 

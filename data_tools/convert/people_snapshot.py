@@ -13,10 +13,8 @@ centre for pixel centres at +0.5.
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import cv2
-import h5py
 import numpy as np
 from jaxtyping import Float, UInt8
 
@@ -27,6 +25,7 @@ from pipeline.capture.smpl_poses import SmplPoses
 from pipeline.capture.user_files import CameraCalibration
 from pipeline.capture.video import FrameSource, open_frame_source
 from pipeline.core.errors import UserError
+from pipeline.io.hdf5 import read_dataset, read_whole
 from pipeline.io.safe_pickle import load_pickle
 
 _CAMERA, _MASKS, _POSES = "camera.pkl", "masks.hdf5", "reconstructed_poses.hdf5"
@@ -64,8 +63,10 @@ def _read_camera(path: Path, source: FrameSource) -> tuple[CameraCalibration, Fl
     stored = load_pickle(path)
     values = {}
     for name, size in _CAMERA_SIZES.items():
-        number = np.asarray(stored.get(name) if isinstance(stored, dict) else None)
-        if number.size != size or not np.issubdtype(number.dtype, np.number):
+        value = stored.get(name) if isinstance(stored, dict) else None
+        # Lists are not accepted: nested ones that share their parts have more numbers than fit into memory.
+        number = np.asarray(value if isinstance(value, np.ndarray | np.number | int | float) else None)
+        if number.size != size or number.dtype.kind not in "iuf" or not np.isfinite(number).all():
             raise UserError(f"{path} has no `{name}` of {size} numbers; supply the camera.pkl of PeopleSnapshot")
         values[name] = number.astype(np.float64).reshape(-1)
     require_image_size(source, int(values["width"][0]), int(values["height"][0]), path)
@@ -78,24 +79,15 @@ def _read_camera(path: Path, source: FrameSource) -> tuple[CameraCalibration, Fl
 
 def _mask_reader(path: Path, source: FrameSource) -> Callable[[int], UInt8[np.ndarray, "h w"]]:
     """Return a function that reads one mask; all masks together would not fit into memory."""
-    shape = _read_hdf5(path, "masks", lambda masks: masks.shape)
+    shape = read_dataset(path, "masks", lambda masks: masks.shape)
     if len(shape) != 3 or shape[0] < source.n_frames:
         raise UserError(
             f"{path}: `masks` has shape {shape} for the {source.n_frames} frames of {source.path}; "
             "supply (frames, height, width) masks of this video"
         )
-    return lambda index: mask_to_uint8(_read_hdf5(path, "masks", lambda masks: masks[index]), path)
+    return lambda index: mask_to_uint8(read_dataset(path, "masks", lambda masks: masks[index]), path)
 
 
 def _read_poses(path: Path, world_to_camera: Float[np.ndarray, "4 4"], gender: str) -> SmplPoses:
-    arrays = {name: _read_hdf5(path, name, np.asarray) for name in ("pose", "trans", "betas")}
+    arrays = {name: read_dataset(path, name, read_whole) for name in ("pose", "trans", "betas")}
     return smpl_poses_from_arrays(arrays, np.arange(len(arrays["pose"])), world_to_camera, gender, path)
-
-
-def _read_hdf5(path: Path, name: str, select: Callable[[h5py.Dataset], Any]) -> Any:
-    """Apply `select` to the data set of this name."""
-    try:
-        with h5py.File(path, "r") as file:
-            return select(file[name])
-    except (OSError, KeyError) as error:
-        raise UserError(f"{path} cannot be read as HDF5 with a data set `{name}` ({error}); replace it") from None

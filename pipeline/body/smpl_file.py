@@ -10,7 +10,6 @@
 Chumpy objects and scipy matrices in pickles are read as opaque objects, of which only arrays are used.
 """
 
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from scipy.sparse import csc_matrix, csr_matrix
 
 from pipeline.body.smpl import SmplArrays, SmplBody
 from pipeline.core.errors import UserError
+from pipeline.io.npz import read_npz
 from pipeline.io.safe_pickle import OpaqueObject, load_pickle
 
 N_BETAS = 10
@@ -83,9 +83,8 @@ def _read(path: Path) -> dict[str, Any]:
             raise UserError(f"{path} holds a {type(values).__name__}, not a model; supply an SMPL model file")
         return values
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {key: archive[key] for key in REQUIRED_KEYS if key in archive.files}
-    except (OSError, ValueError, AttributeError, zipfile.BadZipFile) as error:
+        return {**read_npz(path, REQUIRED_KEYS)}
+    except ValueError as error:
         raise UserError(f"{path} cannot be read as .npz or .pkl ({error}); supply an SMPL model file") from error
 
 

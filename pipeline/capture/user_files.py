@@ -17,7 +17,6 @@ Row i of each array belongs to frame i of the recording; there is one row for ea
 (rotation of the container or EXIF applied), have square pixels, and include lens distortion.
 """
 
-import json
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -32,6 +31,7 @@ from pipeline.capture.landmarks import N_LANDMARKS
 from pipeline.capture.smpl_poses import SMPL_POSES_NPZ, SmplPoses, is_rigid, load_smpl_poses
 from pipeline.capture.video import FrameSource, image_size_px, natural_sort_key
 from pipeline.core.errors import UserError
+from pipeline.core.json_file import load_json
 from pipeline.geometry.camera import DEFAULT_WORLD_TO_CAMERA, Camera
 from pipeline.io.image import IMAGE_SUFFIXES, read_alpha, read_gray
 from pipeline.io.npz import load_npz
@@ -157,7 +157,7 @@ def _find_masks(path: Path, source: FrameSource) -> tuple[Callable[[int], np.nda
             raise UserError(f"{path / 'masks.npz'} has no array `masks`; store it as (frames, height, width)")
         return _masks_from_array(arrays["masks"], path / "masks.npz", source), "masks.npz"
     if (path / "masks.hdf5").is_file():
-        return _masks_from_array(_read_hdf5(path / "masks.hdf5"), path / "masks.hdf5", source), "masks.hdf5"
+        return _masks_from_array(_read_hdf5_masks(path / "masks.hdf5"), path / "masks.hdf5", source), "masks.hdf5"
     if source.files and read_alpha(source.files[0]).min() < 255:
         return (lambda index: read_alpha(source.files[index])), "the images' alpha channel"
     return None, ""
@@ -188,16 +188,10 @@ def _masks_from_array(masks: np.ndarray, path: Path, source: FrameSource) -> Cal
     return lambda index: np.rint(masks[index].astype(np.float32) * (255.0 / max(highest, 1e-6))).astype(np.uint8)
 
 
-def _read_hdf5(path: Path) -> np.ndarray:
-    import h5py  # here, because no other input needs it
+def _read_hdf5_masks(path: Path) -> np.ndarray:
+    from pipeline.io.hdf5 import read_dataset, read_whole  # here, because no other input needs h5py
 
-    try:
-        with h5py.File(path, "r") as file:
-            return np.asarray(file["masks"])
-    except (OSError, KeyError) as error:
-        raise UserError(
-            f"{path} cannot be read as HDF5 with a data set `masks` ({error}); remove or replace it"
-        ) from None
+    return read_dataset(path, "masks", read_whole)
 
 
 def _read_landmarks(path: Path, source: FrameSource) -> UserLandmarks:
@@ -224,7 +218,7 @@ def _read_landmarks(path: Path, source: FrameSource) -> UserLandmarks:
 
 def _read_camera(path: Path, source: FrameSource) -> CameraCalibration:
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = load_json(path)
         fx, fy, cx, cy = (float(values[key]) for key in ("fx", "fy", "cx", "cy"))
         size_px = (int(values["width"]), int(values["height"])) if {"width", "height"} & set(values) else None
         distortion = tuple(float(value) for value in values.get("distortion") or ())
@@ -266,7 +260,7 @@ def _check_image_size(path: Path, cx: float, cy: float, size_px: tuple[int, int]
 
 def _read_split(path: Path, source: FrameSource) -> UserSplit:
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = load_json(path)
         lists = {name: [operator.index(value) for value in indices] for name, indices in values.items()}
     except (ValueError, TypeError, AttributeError) as error:
         raise UserError(

@@ -14,6 +14,7 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
+from av.container import InputContainer
 from jaxtyping import Shaped, UInt8
 
 from pipeline.capture import hdr
@@ -23,6 +24,15 @@ from pipeline.io.image import IMAGE_SUFFIXES, read_rgb
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".3gp", ".wmv", ".gif")
 DEFAULT_IMAGE_FPS = 30.0
+MAX_FRAME_PIXELS = 1 << 27
+"""Pixels of a frame: four times those of 8K video. A damaged or malicious header may claim any size."""
+
+_FORMATS = (
+    *("mov", "mp4", "m4a", "3gp", "3g2", "mj2", "avi", "matroska", "webm", "mpeg", "mpegts", "mpegvideo", "asf", "gif"),
+    *("mjpeg", "flv", "ogg", "h264", "hevc", "wav", "mp3", "aac", "flac"),
+)
+"""FFmpeg's names of formats whose files hold all of their content; those of sound get a message of their own."""
+
 _HEIF_SUFFIXES = (".heic", ".heif", ".avif")
 _IMAGE_FOLDER_NAMES = ("images", "frames", "image", "rgb", "color")
 # Bicubic, with chroma brought to full resolution before the colour matrix: swscale's default repeats each chroma
@@ -129,10 +139,17 @@ def _images_in(folder: Path) -> tuple[Path, ...]:
 
 def _open_video(path: Path) -> FrameSource:
     try:
-        with av.open(str(path)) as container:
+        with _open_container(path) as container:
             if not container.streams.video:
                 raise UserError(f"{path} has no video track; supply a video file or a folder of images")
             stream = container.streams.video[0]
+            if stream.codec_context is None:
+                raise UserError(f"{path} has a video track of an unknown codec; supply an .mp4, .mov or .webm file")
+            if stream.width * stream.height > MAX_FRAME_PIXELS:
+                raise UserError(
+                    f"{path} claims frames of {stream.width}x{stream.height}, at most {MAX_FRAME_PIXELS >> 20} million "
+                    "pixels are read; supply a smaller video"
+                )
             fps = float(stream.average_rate or stream.guessed_rate or DEFAULT_IMAGE_FPS)
             # Packets hidden by an edit list (a clip that was trimmed without re-encoding) are decoded but not shown.
             n_frames = sum(packet.size > 0 and not packet.is_discard for packet in container.demux(stream))
@@ -141,6 +158,15 @@ def _open_video(path: Path) -> FrameSource:
             f"{path} cannot be read as a video ({error.strerror}); supply an .mp4, .mov or .webm file"
         ) from None
     return FrameSource(path, (), n_frames, fps)
+
+
+def _open_container(path: Path) -> InputContainer:
+    """Open a video file; formats that name other files or addresses (playlists, concatenations) are refused.
+
+    Titles and comments that are not UTF-8 do not matter.
+    """
+    options = {"format_whitelist": ",".join(_FORMATS), "protocol_whitelist": "file"}
+    return av.open(str(path), options=options, metadata_errors="replace")
 
 
 def _images(source: FrameSource, is_wanted: Callable[[int], bool]) -> Iterator[tuple[int, float, _DecodedImage]]:
@@ -153,7 +179,7 @@ def _video(source: FrameSource, is_wanted: Callable[[int], bool]) -> Iterator[tu
     start_s: float | None = None
     time_s: float | None = None
     index = -1
-    with av.open(str(source.path)) as container:
+    with _open_container(source.path) as container:
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
         try:

@@ -156,7 +156,11 @@ def default_yaml(sections: Mapping[str, type[Config]]) -> str:
 
 
 def _read_sections(path: Path) -> dict[str, Any]:
-    sections = _parse_yaml(path.read_text(encoding="utf-8"), str(path)) or {}
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path} is not UTF-8 text ({error}): save it as UTF-8") from None
+    sections = _parse_yaml(text, str(path)) or {}
     if not isinstance(sections, dict) or not all(isinstance(s, dict | None) for s in sections.values()):
         raise UserError(f"{path} is not a configuration: write sections (stage names) with `key: value` lines in them")
     return {name: values or {} for name, values in sections.items()}
@@ -164,10 +168,21 @@ def _read_sections(path: Path) -> dict[str, Any]:
 
 def _parse_yaml(text: str, origin: str) -> Any:
     try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError as error:
+        return yaml.load(text, _Loader)  # noqa: S506 - a safe loader
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         problem = " ".join(str(error).split())
         raise UserError(f"{origin} is not valid YAML: {problem}") from None
+
+
+class _Loader(yaml.SafeLoader):
+    """The safe loader without aliases: lists that share their parts have more items than fit into memory."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        """Compose a node; YAMLError for an alias."""
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("aliases (*name) are not read: write the value again")
+        node: yaml.Node | None = super().compose_node(parent, index)
+        return node
 
 
 def _merge(target: dict[str, Any], values: Mapping[str, Any]) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.core.errors import UserError
+from pipeline.core.json_file import load_json
 
 MANIFEST_FILE = "manifest.json"
 PROGRESS_FILE = "progress.csv"
@@ -58,7 +59,7 @@ def read_manifest(folder: Path) -> Manifest | None:
     """
     path = folder / MANIFEST_FILE
     try:
-        return Manifest(**json.loads(path.read_text(encoding="utf-8")))
+        return Manifest(**load_json(path))
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (ValueError, TypeError):

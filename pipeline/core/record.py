@@ -9,6 +9,7 @@ from typing import Any
 from pipeline.core.atomic import atomic_path
 from pipeline.core.config import PRESET_SUFFIXES
 from pipeline.core.errors import UserError
+from pipeline.core.json_file import load_json
 from pipeline.core.manifest import digest_video
 
 RUN_FILE = "run.json"
@@ -38,7 +39,7 @@ def read_record(run_dir: Path) -> RunRecord:
     if not path.exists():
         return RunRecord()
     try:
-        return RunRecord(**json.loads(path.read_text(encoding="utf-8")))
+        return RunRecord(**load_json(path))
     except (ValueError, TypeError):
         raise UserError(f"{path} is damaged: delete it and name the video again with --video") from None
 

@@ -16,7 +16,10 @@ from pipeline.core.errors import UserError
 MAX_FRAMES = 100_000
 """Frames of a file: 14 minutes at 120 frames per second."""
 
-_MAX_BYTES = 1 << 30
+MIN_FRAME_TIME_S = 1e-6
+"""Shorter frames have no finite rate, and no recording has them."""
+
+_MAX_BYTES = 1 << 28
 _END_SITE = "_end"
 _EULER_ORDER = "ZXY"
 
@@ -71,15 +74,15 @@ def read_bvh(path: Path) -> BvhMotion:
             raise UserError(f"motion {path} has {count} frames; supply a clip of 1 to {MAX_FRAMES} frames")
         next(tokens), next(tokens)
         frame_time_s = float(next(tokens))
-        if not 0.0 < frame_time_s < np.inf:
+        if not MIN_FRAME_TIME_S <= frame_time_s < np.inf:
             raise ValueError(f"frame time {frame_time_s}")
         width = sum(map(len, channels))
         values = np.array([float(token) for token in tokens])[: count * width].reshape(count, width)
-    except (StopIteration, ValueError) as error:
+        if not (np.isfinite(values).all() and np.isfinite(offsets).all()):
+            raise UserError(f"motion {path} has values that are not finite; export it again")
+        rotations, root_positions = _decode_channels(values, offsets, channels)
+    except (StopIteration, ValueError, IndexError) as error:
         raise UserError(f"motion {path} is not a complete BVH file ({error}); export it again") from error
-    if not (np.isfinite(values).all() and np.isfinite(offsets).all()):
-        raise UserError(f"motion {path} has values that are not finite; export it again")
-    rotations, root_positions = _decode_channels(values, offsets, channels)
     return BvhMotion(tuple(names), np.array(parents), offsets, rotations, root_positions, 1.0 / frame_time_s)
 
 
@@ -145,6 +148,8 @@ def _parse_hierarchy(tokens: Iterator[str]) -> tuple[list[str], list[int], np.nd
             parents.append(parent)
             channels.append([])
         elif token == "{":
+            if not names:
+                raise ValueError("a bracket without a joint")
             open_joints.append(len(names) - 1)
         elif token == "}":
             open_joints.pop()

@@ -7,8 +7,10 @@ Reference: https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html, chapters 3
 4.4 (container).
 """
 
-import json
+import io
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,8 +18,10 @@ from typing import Any
 import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
+from PIL import Image
 
 from pipeline.core.errors import UserError
+from pipeline.core.json_file import parse_json
 
 _COMPONENT_DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _N_COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -25,6 +29,14 @@ _SUPPORTED_EXTENSIONS = {"KHR_mesh_quantization", "KHR_materials_unlit"}
 _JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 _TRIANGLES = 4
 _UNTEXTURED_SIDE_PX = 8
+
+MAX_VALUES = 1 << 27
+"""Numbers of an accessor: 40 million vertices. A sparse accessor may claim more than its file holds."""
+MAX_IMAGE_PIXELS = 1 << 27
+"""Pixels of an embedded image: 11,500 squared. A damaged header may claim any number."""
+
+# What reading a damaged JSON tree raises: each field may be absent, or of any type.
+_DAMAGE = (LookupError, TypeError, ValueError, AttributeError, OverflowError, MemoryError, RecursionError)
 
 
 @dataclass(frozen=True)
@@ -75,9 +87,9 @@ class GlbFile:
             chunks[kind] = data[offset + 8 : offset + 8 + length]
             offset += 8 + length
         try:
-            self.gltf: dict[str, Any] = json.loads(chunks[_JSON_CHUNK])
-            unsupported = set(self.gltf.get("extensionsRequired", ())) - _SUPPORTED_EXTENSIONS
-        except (KeyError, ValueError, AttributeError):
+            self.gltf: dict[str, Any] = parse_json(chunks[_JSON_CHUNK])
+            unsupported = {str(name) for name in self.gltf.get("extensionsRequired", ())} - _SUPPORTED_EXTENSIONS
+        except (KeyError, ValueError, AttributeError, TypeError):
             raise UserError(f"{path} is damaged: its JSON cannot be read; export it again") from None
         if unsupported:
             raise UserError(
@@ -93,9 +105,11 @@ class GlbFile:
         Raises:
             UserError: the file does not hold its values.
         """
-        try:
+        with self.checked(f"the values of accessor {index} are missing"):
             accessor = self.gltf["accessors"][index]
             count, width = accessor["count"], _N_COMPONENTS[accessor["type"]]
+            if not 0 <= count * width <= MAX_VALUES:
+                raise ValueError(count)
             if "sparse" not in accessor:
                 return self._view_array(accessor, accessor["componentType"], count, width)
             sparse, dtype = accessor["sparse"], _COMPONENT_DTYPES[accessor["componentType"]]
@@ -105,10 +119,14 @@ class GlbFile:
             rows = self._view_array(sparse["indices"], sparse["indices"]["componentType"], sparse["count"], 1)[:, 0]
             values[rows] = self._view_array(sparse["values"], accessor["componentType"], sparse["count"], width)
             return values
-        except (LookupError, TypeError, ValueError):
-            raise UserError(
-                f"{self.path} is damaged: the values of accessor {index} are missing; export it again"
-            ) from None
+
+    @contextmanager
+    def checked(self, problem: str = "its nodes, meshes, skins and images do not fit together") -> Iterator[None]:
+        """Turn what a damaged tree raises in the block into a UserError with this problem."""
+        try:
+            yield
+        except _DAMAGE:
+            raise UserError(f"{self.path} is damaged: {problem}; export it again") from None
 
     def accessor(self, index: int) -> np.ndarray:
         """Return the values of an accessor, shape (count, components).
@@ -126,41 +144,47 @@ class GlbFile:
 
     def image_bytes(self, index: int) -> bytes:
         """Return the encoded file (PNG or JPEG) of an embedded image. UserError if the image is an external file."""
-        image = self.gltf["images"][index]
-        if "bufferView" not in image:
-            raise UserError(f"{self.path}: image {index} is an external file; export the .glb with embedded images")
-        view = self.gltf["bufferViews"][image["bufferView"]]
-        start = view.get("byteOffset", 0)
-        return self.binary[start : start + view["byteLength"]]
+        with self.checked(f"image {index} is missing"):
+            image = self.gltf["images"][index]
+            if "bufferView" not in image:
+                raise UserError(f"{self.path}: image {index} is an external file; export the .glb with embedded images")
+            view = self.gltf["bufferViews"][image["bufferView"]]
+            start = view.get("byteOffset", 0)
+            return self.binary[start : start + view["byteLength"]]
 
     def image_pixels(self, index: int) -> UInt8[np.ndarray, "h w c"]:
         """Return an embedded image with the channels of its file (RGB or RGBA). UserError as `image_bytes`."""
-        pixels = cv2.imdecode(np.frombuffer(self.image_bytes(index), np.uint8), cv2.IMREAD_UNCHANGED)
+        pixels = self._decode(index, cv2.IMREAD_UNCHANGED)
         if pixels is None or pixels.ndim != 3 or pixels.dtype != np.uint8:
             raise UserError(f"{self.path}: image {index} has not 8-bit colours; export it as PNG or JPEG")
         return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB if pixels.shape[2] == 3 else cv2.COLOR_BGRA2RGBA)
 
     def node_to_world(self) -> Float[np.ndarray, "n 4 4"]:
-        """Return the rest-pose matrix of every node."""
-        nodes = self.gltf["nodes"]
-        world = np.tile(np.eye(4), (len(nodes), 1, 1))
-        is_child = {child for node in nodes for child in node.get("children", ())}
-        pending = [(index, np.eye(4)) for index in range(len(nodes)) if index not in is_child]
-        while pending:
-            index, parent_to_world = pending.pop()
-            world[index] = parent_to_world @ _local_matrix(nodes[index])
-            pending += [(child, world[index]) for child in nodes[index].get("children", ())]
-        return world
+        """Return the rest-pose matrix of every node. UserError if the nodes are no forest."""
+        with self.checked("its nodes are no trees"):
+            nodes = self.gltf["nodes"]
+            world = np.tile(np.eye(4), (len(nodes), 1, 1))
+            children = [child for node in nodes for child in node.get("children", ())]
+            if len(set(children)) != len(children):
+                raise ValueError("a node with two parents")
+            is_child = set(children)
+            pending = [(index, np.eye(4)) for index in range(len(nodes)) if index not in is_child]
+            while pending:
+                index, parent_to_world = pending.pop()
+                world[index] = parent_to_world @ _local_matrix(nodes[index])
+                pending += [(child, world[index]) for child in nodes[index].get("children", ())]
+            return world
 
     def skinned_primitives(self) -> list[Primitive]:
-        """Return all triangle lists of nodes with a skin. UserError if there are none."""
-        found = [
-            self._primitive(primitive, node["skin"])
-            for node in self.gltf.get("nodes", ())
-            if "mesh" in node and "skin" in node
-            for primitive in self.gltf["meshes"][node["mesh"]]["primitives"]
-            if primitive.get("mode", _TRIANGLES) == _TRIANGLES and "JOINTS_0" in primitive["attributes"]
-        ]
+        """Return all triangle lists of nodes with a skin. UserError if there are none, or the file is damaged."""
+        with self.checked():
+            found = [
+                self._primitive(primitive, node["skin"])
+                for node in self.gltf.get("nodes", ())
+                if "mesh" in node and "skin" in node
+                for primitive in self.gltf["meshes"][node["mesh"]]["primitives"]
+                if primitive.get("mode", _TRIANGLES) == _TRIANGLES and "JOINTS_0" in primitive["attributes"]
+            ]
         if not found:
             raise UserError(f"{self.path} holds no skinned triangles; export the character with its armature")
         return found
@@ -173,14 +197,15 @@ class GlbFile:
         Raises:
             UserError: the image is an external file, or neither PNG nor JPEG.
         """
-        surface = self.gltf["materials"][material].get("pbrMetallicRoughness", {}) if material >= 0 else {}
-        factor = np.asarray(surface.get("baseColorFactor", [1.0] * 4)[:3])
-        if "baseColorTexture" not in surface:
-            return np.tile(np.rint(255 * factor).astype(np.uint8), (_UNTEXTURED_SIDE_PX, _UNTEXTURED_SIDE_PX, 1))
-        texture = self.gltf["textures"][surface["baseColorTexture"]["index"]]
-        if "source" not in texture:
-            raise UserError(f"{self.path} holds an image that is neither PNG nor JPEG; export it as PNG or JPEG")
-        return np.rint(self._decode_image(texture["source"]) * factor).astype(np.uint8)
+        with self.checked():
+            surface = self.gltf["materials"][material].get("pbrMetallicRoughness", {}) if material >= 0 else {}
+            factor = np.clip(np.asarray(surface.get("baseColorFactor", [1.0] * 4)[:3], dtype=np.float64), 0.0, 1.0)
+            if "baseColorTexture" not in surface:
+                return np.tile(np.rint(255 * factor).astype(np.uint8), (_UNTEXTURED_SIDE_PX, _UNTEXTURED_SIDE_PX, 1))
+            texture = self.gltf["textures"][surface["baseColorTexture"]["index"]]
+            if "source" not in texture:
+                raise UserError(f"{self.path} holds an image that is neither PNG nor JPEG; export it as PNG or JPEG")
+            return np.rint(self._decode_image(texture["source"]) * factor).astype(np.uint8)
 
     def _view_array(self, owner: dict[str, Any], component_type: int, count: int, width: int) -> np.ndarray:
         """Return the rows in the buffer view of an accessor or of a part of a sparse one."""
@@ -193,6 +218,12 @@ class GlbFile:
         names = primitive["attributes"]
         positions = self.accessor(names["POSITION"]).astype(np.float32)
         indices = self.accessor(primitive["indices"]) if "indices" in primitive else np.arange(len(positions))
+        if (
+            not np.isfinite(positions).all()
+            or indices.size
+            and not 0 <= indices.min() <= indices.max() < len(positions)
+        ):
+            raise ValueError("triangles of vertices that the file does not have")
         weights = self.accessor(names["WEIGHTS_0"])
         uv = self.accessor(names["TEXCOORD_0"]) if "TEXCOORD_0" in names else np.zeros((len(positions), 2), np.float32)
         normals = self.accessor(names["NORMAL"]).astype(np.float32) if "NORMAL" in names else np.zeros_like(positions)
@@ -208,10 +239,20 @@ class GlbFile:
         )
 
     def _decode_image(self, index: int) -> UInt8[np.ndarray, "h w 3"]:
-        pixels = cv2.imdecode(np.frombuffer(self.image_bytes(index), np.uint8), cv2.IMREAD_COLOR)
+        pixels = self._decode(index, cv2.IMREAD_COLOR)
         if pixels is None:
             raise UserError(f"{self.path}: image {index} cannot be decoded; export it as PNG or JPEG")
         return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
+
+    def _decode(self, index: int, mode: int) -> np.ndarray | None:
+        """Decode an embedded image; None if it is damaged, or its header claims more than `MAX_IMAGE_PIXELS`."""
+        content = self.image_bytes(index)
+        try:
+            with Image.open(io.BytesIO(content)) as header:
+                width, height = header.size
+        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+            return None
+        return cv2.imdecode(np.frombuffer(content, np.uint8), mode) if width * height <= MAX_IMAGE_PIXELS else None
 
 
 def _local_matrix(node: dict[str, Any]) -> Float[np.ndarray, "4 4"]:

@@ -252,6 +252,41 @@ def test_sound_alone_is_refused(tmp_path):
         video.open_frame_source(tmp_path / "a.wav")
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "#EXTM3U\n#EXT-X-TARGETDURATION:10\n#EXTINF:10,\nsecret.ts\n#EXT-X-ENDLIST\n",
+        "ffconcat version 1.0\nfile secret.ts\n",
+    ],
+)
+def test_files_that_name_other_files_are_refused(tmp_path, text):
+    with av.open(str(tmp_path / "secret.ts"), "w", format="mpegts") as container:
+        stream = container.add_stream("libx264", rate=24)
+        stream.width, stream.height, stream.pix_fmt = 64, 64, "yuv420p"
+        for _ in range(24):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((64, 64, 3), np.uint8), format="rgb24")))
+        container.mux(stream.encode())
+    assert video.open_frame_source(tmp_path / "secret.ts").n_frames == 24
+    (tmp_path / "a.mp4").write_text(text)
+    with pytest.raises(UserError, match=r"a\.mp4 cannot be read as a video"):
+        video.open_frame_source(tmp_path / "a.mp4")
+
+
+def test_a_title_that_is_not_utf8_does_not_matter(tmp_path):
+    with av.open(str(tmp_path / "a.avi"), "w") as container:
+        container.metadata["title"] = "Title of my film"
+        stream = container.add_stream("mjpeg", rate=24)
+        stream.width, stream.height, stream.pix_fmt = 64, 64, "yuvj420p"
+        for _ in range(3):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((64, 64, 3), np.uint8), format="rgb24")))
+        container.mux(stream.encode())
+    content = (tmp_path / "a.avi").read_bytes()
+    assert b"Title of my film" in content
+    (tmp_path / "a.avi").write_bytes(content.replace(b"Title of my film", "Titel: \xfcber mich".encode("latin1")[:16]))
+    source = video.open_frame_source(tmp_path / "a.avi")
+    assert len(list(video.read_frames(source, select_all, 1000))) == 3
+
+
 def test_unreadable_and_odd_sized_images_are_named(tmp_path):
     write_rgb(tmp_path / "a.png", ramp(9))
     (tmp_path / "b.png").write_bytes(b"nothing")

@@ -166,3 +166,25 @@ def test_default_yaml_reads_back_as_the_defaults() -> None:
 @given(st.integers(-(10**6), 10**6))
 def test_overrides_keep_whole_numbers(number: int) -> None:
     assert parse_overrides([f"a.b={number}"]) == {"a.b": number}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "mesh: &m\n  rounds: 2\nfield: *m\n",
+        "mesh:\n  rounds: " + "9" * 5000,
+        "mesh: " + "[" * 5000,
+        "mesh: !!python/object/apply:os.getcwd []",
+    ],
+)
+def test_yaml_that_is_more_than_values_is_refused(config_dir: Path, text: str) -> None:
+    """Aliases that share lists could have more items than fit into memory; tags could run code."""
+    (config_dir / "odd.yaml").write_text(text)
+    with pytest.raises(UserError, match=r"odd\.yaml is not valid YAML"):
+        load_layers(str(config_dir / "odd.yaml"), {}, config_dir)
+
+
+def test_a_preset_that_is_no_text_is_refused(config_dir: Path) -> None:
+    (config_dir / "odd.yaml").write_bytes(b"mesh:\n  rounds: \xff\n")
+    with pytest.raises(UserError, match=r"odd\.yaml is not UTF-8 text"):
+        load_layers(str(config_dir / "odd.yaml"), {}, config_dir)

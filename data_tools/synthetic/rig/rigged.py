@@ -45,6 +45,11 @@ def read_rigged_person(path: Path) -> Subject:
         UserError: the file has no skin, or its rig lacks a required joint.
     """
     glb = GlbFile(path)
+    with glb.checked():
+        return _rigged_person(glb)
+
+
+def _rigged_person(glb: GlbFile) -> Subject:
     primitives = glb.skinned_primitives()
     kept_joint_of_node, joint_nodes, parents = _select_joints(glb, primitives[0].skin)
     joint_names = tuple(_node_name(glb, node) for node in joint_nodes)

@@ -79,6 +79,9 @@ NOVEL_POSES: dict[str, JointAngles] = {
 }
 """Poses that do not occur in the turn; they test the skinning of an avatar."""
 
+HAND_ON_HIP: JointAngles = {"LeftForeArm": (-0.25, 0.0, -1.5)}
+"""Bend of the left elbow that brings the hand to the hip."""
+
 
 def turn_in_a_pose(
     body: Body,
@@ -143,6 +146,32 @@ def bend_at_hips(body: Body, motion: Motion, bend_deg: float) -> Motion:
     unbend = quaternion_conjugate(bend).expand(len(rotations), len(legs), 4)
     rotations[:, legs] = quaternion_multiply(unbend, rotations[:, legs])
     return motion.with_pose(rotations.float().numpy(), (motion.root_translation_m + shift_m.numpy()).astype(np.float32))
+
+
+def posture(lower_arms_deg: float, close_legs_deg: float, hand_on_hip: bool) -> JointAngles:
+    """Return joint angles that lower both arms, close both legs (feet stay level), and put the left hand on the hip.
+
+    The hand is on the hip of a person whose upper arm is at 45 degrees in the A-pose.
+    """
+    arm, leg = np.radians(lower_arms_deg), np.radians(close_legs_deg)
+    angles: JointAngles = {"LeftArm": (0.0, 0.0, -arm), "RightArm": (0.0, 0.0, arm)}
+    angles |= {"LeftUpLeg": (0.0, 0.0, -leg), "RightUpLeg": (0.0, 0.0, leg)}
+    angles |= {"LeftFoot": (0.0, 0.0, leg), "RightFoot": (0.0, 0.0, -leg)}
+    return angles | (HAND_ON_HIP if hand_on_hip else {})
+
+
+def add_joint_angles(body: Body, motion: Motion, angles: JointAngles) -> Motion:
+    """Rotate joints by constant angles in the frame of their parents, before their own motion; feet stay on the floor.
+
+    Joints that the rig does not have are skipped.
+    """
+    rotations = torch.from_numpy(motion.rotations_wxyz).double()
+    for name, angle in angles.items():
+        if name in body.joint_names:
+            joint = body.joint(name)
+            constant = axis_angle_to_quaternion(torch.tensor(angle, dtype=torch.float64))
+            rotations[:, joint] = quaternion_multiply(constant.expand(len(rotations), 4), rotations[:, joint])
+    return motion.with_pose(rotations.float().numpy(), motion.root_translation_m)
 
 
 def _smooth_random_signals(

@@ -11,7 +11,7 @@ from data_tools.synthetic.rig.subject import Subject
 from data_tools.synthetic.scene.backdrop import Room, make_room
 from data_tools.synthetic.scene.ball import Ball
 from data_tools.synthetic.scene.capture import HeldOutTargets, SyntheticCapture, novel_cameras, portrait_camera
-from data_tools.synthetic.scene.motion import bend_at_hips, novel_motion, turn_in_a_pose
+from data_tools.synthetic.scene.motion import add_joint_angles, bend_at_hips, novel_motion, posture, turn_in_a_pose
 from data_tools.synthetic.scene.renderer import LIGHTING_PRESETS
 from pipeline.avatar.retarget import resample_motion, retarget
 from pipeline.body.body import Body, Motion
@@ -54,6 +54,14 @@ def capture_parser(command: str, description: str) -> argparse.ArgumentParser:
         default=0.0,
         help="forward bend of the person at the hips in all frames, degrees; the legs stay as they are",
     )
+    parser.add_argument(
+        "--lower-arms-deg", type=float, default=0.0, help="angle by which both arms are lowered in all frames, degrees"
+    )
+    parser.add_argument(
+        "--close-legs-deg", type=float, default=0.0, help="angle by which both legs are closed in all frames, degrees"
+    )
+    parser.add_argument("--hand-on-hip", action="store_true", help="the left hand is on the hip in all frames")
+    parser.add_argument("--specular", type=float, help="strength of the highlights, instead of that of --light")
     parser.add_argument("--light", choices=sorted(LIGHTING_PRESETS), default="studio", help=LIGHT_HELP)
     parser.add_argument(
         "--background", choices=("busy", "plain"), default="busy", help="busy: furnished room; plain: bare wall"
@@ -98,6 +106,9 @@ def validate_capture_options(options: argparse.Namespace) -> None:
         ("pitch_deg", -45.0, 45.0),
         ("roll_deg", -45.0, 45.0),
         ("lean_deg", -30.0, 60.0),
+        ("lower_arms_deg", 0.0, 60.0),
+        ("close_legs_deg", 0.0, 20.0),
+        ("specular", 0.0, 1.0),
         ("samples", 1, 8),
         ("arc", 0.0, 360.0),
         ("turns", 1, 20),
@@ -147,13 +158,16 @@ def build_scene(options: argparse.Namespace, body: Body) -> tuple[Camera, np.nda
 
 
 def build_motion(options: argparse.Namespace, body: Body, ground_m: np.ndarray) -> Motion:
-    """Return the turn in A-pose, or the selected part of the --bvh file, bent by --lean-deg."""
+    """Return the turn in A-pose, or the selected part of the --bvh file, in the posture of the options."""
     if options.bvh:
         full_motion = retarget(read_bvh(options.bvh), body, ground_m, options.in_place)
         motion = resample_motion(full_motion, options.start, options.frames, options.fps)
     else:
         turns = options.turns or 1
         motion = turn_in_a_pose(body, options.frames, options.fps, ground_m, options.seed, options.arc, turns)
+    if options.lower_arms_deg or options.close_legs_deg or options.hand_on_hip:
+        angles = posture(options.lower_arms_deg, options.close_legs_deg, options.hand_on_hip)
+        motion = add_joint_angles(body, motion, angles)
     return bend_at_hips(body, motion, options.lean_deg) if options.lean_deg else motion
 
 
@@ -175,6 +189,8 @@ def build_capture(
     camera, ground_m, room = scene
     ball = Ball(ground_m, subject.body.height_m()) if options.ball else None
     light = LIGHTING_PRESETS[options.light]
+    if options.specular is not None:
+        light = replace(light, specular_strength=options.specular)
     capture = SyntheticCapture(subject, motion, camera, light, room, ground_m, options.fps, options.samples, ball)
     # The novel cameras show the first frame, in which a walking person may be metres from the middle of the trajectory.
     start_offset_m = motion.root_translation_m[0] - ground_m.astype(np.float32)

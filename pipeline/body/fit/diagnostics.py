@@ -167,6 +167,12 @@ def fit_warnings(result: FitResult, frame_index: Int[np.ndarray, "n"], training:
             f"frames {format_frame_ranges(frame_index, suspicious_rows)}: the body fits worse than in other frames; "
             "see overlay.png"
         )
+    if result.contradicting_focal_log:
+        seen_px = result.camera.fx * float(np.exp(result.contradicting_focal_log))
+        warnings.append(
+            f"the supplied focal length of {result.camera.fx:.0f} px contradicts the turn, which shows about "
+            f"{seen_px:.0f} px: correct or remove camera.json or body.field_of_view_deg"
+        )
     if result.focal_relative_std > UNCERTAIN_FOCAL_STD:
         warnings.append(
             f"focal length {result.camera.fx:.0f} px has a standard deviation of "

@@ -42,7 +42,7 @@ from pipeline.body.fit.silhouette_icp import MaskWindow, match_silhouettes
 from pipeline.body.fit.state import FitState, Observations
 from pipeline.body.fit.supplied_poses import SuppliedPoses
 from pipeline.body.fit.vertical.gravity import align_with_gravity, axis_evidence, lean_deg, turn_observations
-from pipeline.body.fit.vertical.turn_axis import estimate_turn_axis
+from pipeline.body.fit.vertical.turn_axis import contradicting_focal_log, estimate_turn_axis
 from pipeline.body.settings import DEFAULT_SETTINGS, FitSettings
 from pipeline.core.progress import track
 from pipeline.geometry.rotation import continuous_quaternions, matrix_to_quaternion
@@ -126,6 +126,7 @@ def fit_body(
     no_offsets = torch.zeros(offset_count, dtype=torch.float64)
     rest_landmarks_m = context.regressor.points(context.default, no_offsets).rest_m[0]
     observations, left_right_swapped = _correct_left_right_swaps(observations, rest_landmarks_m)
+    contradiction = contradicting_focal_log(observations) if options.focal_relative_std == 0.0 else 0.0
     evidence = None
     if not options.vertical_is_known:
         axis = estimate_turn_axis(observations, options.focal_relative_std)
@@ -133,10 +134,8 @@ def fit_body(
         observations = turn_observations(observations, evidence.up(), axis, rest_landmarks_m)
         if axis is not None and options.focal_relative_std > 0.0:
             # The deviation of the principal point is in focal lengths.
-            principal_point_std = options.principal_point_relative_std * float(np.exp(-axis.focal_log))
-            options = replace(
-                options, focal_relative_std=axis.focal_log_std, principal_point_relative_std=principal_point_std
-            )
+            shift_std = options.principal_point_relative_std * float(np.exp(-axis.focal_log))
+            options = replace(options, focal_relative_std=axis.focal_log_std, principal_point_relative_std=shift_std)
     start = initial_state(
         observations, rest_landmarks_m, context.default.joints_m, body.shape_defaults.double(), offset_count
     )
@@ -154,6 +153,7 @@ def fit_body(
         _result(context, model, state, observations, silhouette_iou, left_right_swapped),
         focal_relative_std=focal_relative_std,
         height_std_m=float(np.hypot(height_std_m, stature_std_m)),
+        contradicting_focal_log=contradiction,
     )
 
 

@@ -28,6 +28,8 @@ class FitResult:
     observations: the landmarks that the poses were fitted to, left-right swaps corrected.
     landmarks_m: their places on the A-pose of the body with the fitted finger curl, canonical frame.
     focal_relative_std, height_std_m: standard deviations from the curvature of the energy.
+    contradicting_focal_log: logarithm of the focal length that a turn shows over the supplied one, if they contradict;
+        0 if they do not, or none was supplied.
     lean_deg: angle between +Y and the mean axis of the trunk (mid-hips to neck); over a full turn 0 for upright people.
     """
 
@@ -43,6 +45,7 @@ class FitResult:
     focal_relative_std: float
     height_std_m: float
     lean_deg: float
+    contradicting_focal_log: float = 0.0
 
 
 def landmark_errors_px(

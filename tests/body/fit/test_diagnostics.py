@@ -167,6 +167,11 @@ def test_unreliable_landmarks_count_if_there_are_no_reliable_ones() -> None:
     assert errors_px == pytest.approx([0.0, 5.0, np.nan], abs=1e-3, nan_ok=True)
 
 
+def test_a_supplied_focal_length_that_the_turn_contradicts_is_named() -> None:
+    (warning,) = fit_warnings(result(contradicting_focal_log=float(np.log(2.0))), np.arange(FRAMES), ALL)
+    assert warning.startswith("the supplied focal length of 500 px contradicts the turn, which shows about 1000 px:")
+
+
 def test_an_uncertain_focal_length_is_reported_with_a_remedy() -> None:
     (warning,) = fit_warnings(result(focal_relative_std=0.2), np.arange(FRAMES), ALL)
     assert warning.startswith("focal length 500 px has a standard deviation of 20 %:")

@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 from scipy.optimize import least_squares
 
 from pipeline.body.fit.state import Observations
+from pipeline.body.settings import FitSettings
 
 AXIS_LANDMARKS = (7, 8, 11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28, 29, 30, 31, 32)
 """Ears, shoulders, elbows, wrists, hips, knees, ankles, heels, tips of the feet; left and right alternate."""
@@ -42,6 +43,11 @@ STD_FACTOR = 2.0
 
 COMMON_FOCAL_LOG_STD = 0.1
 """Standard deviation of the log focal length that any number of landmarks leaves; errors were -0.10 to 0.04."""
+
+CONTRADICTION_STDS = 2.5
+"""Standard deviations between a supplied focal length and that of a turn above which the user is told.
+
+About a factor of 1.4. Errors of the estimate on two captures were -0.03 (0.2 standard deviations) and -0.31 (2.1)."""
 
 
 @dataclass(frozen=True)
@@ -147,6 +153,18 @@ def estimate_turn_axis(observations: Observations, focal_log_std: float) -> Turn
     noise = max(float(np.median(residual)) / (1.18 * LANDMARK_STD_RATIO), 1.0)
     std = STD_FACTOR * noise * np.sqrt(np.diag(covariance)[-3:])
     return TurnAxis(found.x[-3:-1], std[:2], float(found.x[-1]), float(np.hypot(std[2], COMMON_FOCAL_LOG_STD)))
+
+
+def contradicting_focal_log(observations: Observations) -> float:
+    """Return the logarithm of the focal length that a turn shows over that of the camera, if they contradict; else 0.
+
+    They contradict if they differ by more than `CONTRADICTION_STDS` standard deviations of what the turn shows.
+
+    observations: with corrected left and right; their camera has the supplied focal length.
+    """
+    axis = estimate_turn_axis(observations, FitSettings.initial_focal_std)
+    is_contradiction = axis is not None and abs(axis.focal_log) > CONTRADICTION_STDS * axis.focal_log_std
+    return axis.focal_log if axis is not None and is_contradiction else 0.0
 
 
 def yaw_resultant(yaw_rad: Float[np.ndarray, "k"]) -> float:

@@ -8,7 +8,12 @@ import torch
 
 from pipeline.body.body import load_anny
 from pipeline.body.fit.state import Observations
-from pipeline.body.fit.vertical.turn_axis import axis_rotation, estimate_turn_axis, yaw_resultant
+from pipeline.body.fit.vertical.turn_axis import (
+    axis_rotation,
+    contradicting_focal_log,
+    estimate_turn_axis,
+    yaw_resultant,
+)
 from pipeline.geometry.camera import Camera
 from tests.body.acting import synthetic_recording
 
@@ -60,6 +65,20 @@ def test_focal_length_is_recovered_with_the_axis() -> None:
     assert axis is not None
     assert axis.tilt_rad == pytest.approx((0.0, 0.2), abs=0.005)
     assert 600.0 * np.exp(axis.focal_log) == pytest.approx(500.0, rel=0.02)
+
+
+@pytest.mark.parametrize(("ratio", "contradicts"), [(0.5, True), (1.05, False), (2.0, True)])
+def test_a_supplied_focal_length_that_contradicts_the_turn_is_found(ratio: float, contradicts: bool) -> None:
+    observations = turning_body((0.0, 0.1))
+    camera = replace(observations.camera, fx=500.0 * ratio, fy=500.0 * ratio)
+    found = contradicting_focal_log(replace(observations, camera=camera))
+    assert found == pytest.approx(-np.log(ratio) if contradicts else 0.0, abs=0.1)
+
+
+def test_without_a_turn_nothing_contradicts_a_focal_length() -> None:
+    observations = turning_body((0.0, 0.2), turn_rad=2.5)
+    camera = replace(observations.camera, fx=1000.0, fy=1000.0)
+    assert contradicting_focal_log(replace(observations, camera=camera)) == 0.0
 
 
 def test_a_person_who_does_not_turn_gives_no_axis() -> None:

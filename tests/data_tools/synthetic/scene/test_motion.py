@@ -6,8 +6,10 @@ import torch
 
 from data_tools.synthetic.scene.motion import (
     NOVEL_POSES,
+    add_joint_angles,
     bend_at_hips,
     novel_motion,
+    posture,
     snap_feet_to_floor,
     turn_in_a_pose,
 )
@@ -146,3 +148,43 @@ def test_bend_turns_the_trunk_forward_and_keeps_the_legs(bare: Body, turn: Motio
     assert np.degrees(np.arccos(cosine)) == pytest.approx(5.0, abs=0.1)
     front = quaternion_to_matrix(torch.from_numpy(turn.rotations_wxyz[:, 0]))[:, :, 2].numpy()
     assert ((axes[1] - axes[0]) * front).sum(1).min() > 0
+
+
+def bone_direction(body: Body, motion: Motion, start: str, end: str) -> np.ndarray:
+    """Unit vectors from one joint to another in the frame of the hips, (n, 3)."""
+    transforms = canonical_to_world(body, motion)
+    bone = torch.from_numpy(body.joints_m[body.joint(end)] - body.joints_m[body.joint(start)])
+    world = transforms[:, body.joint(start), :3, :3] @ bone
+    local = torch.linalg.solve(transforms[:, 0, :3, :3], world[..., None])[..., 0].numpy()
+    return local / np.linalg.norm(local, axis=1, keepdims=True)
+
+
+def test_arms_are_lowered_and_legs_closed_by_their_angles(bare: Body, turn: Motion) -> None:
+    changed = add_joint_angles(bare, turn, posture(30.0, 5.0, hand_on_hip=False))
+    for side, sign in (("Left", 1.0), ("Right", -1.0)):
+        for start, end, angle_deg in (("Arm", "ForeArm", 30.0), ("UpLeg", "Leg", 5.0)):
+            before, after = (bone_direction(bare, motion, side + start, side + end) for motion in (turn, changed))
+            slopes = [np.degrees(np.arctan2(-bone[:, 1], sign * bone[:, 0])) for bone in (before, after)]
+            assert np.allclose(slopes[1] - slopes[0], angle_deg, atol=3.0)
+    assert np.array_equal(changed.root_translation_m, turn.root_translation_m)
+
+
+def test_the_hand_is_on_the_hip(bare: Body, turn: Motion) -> None:
+    changed = add_joint_angles(bare, turn, posture(0.0, 0.0, hand_on_hip=True))
+    joints = torch.from_numpy(bare.joints_m)
+
+    def distance_m(motion: Motion, side: str) -> float:
+        transforms = canonical_to_world(bare, motion)
+        hand, hip = (bare.joint(side + name) for name in ("Hand", "UpLeg"))
+        hand_m, hip_m = (
+            transforms[0, joint, :3, :3] @ joints[joint] + transforms[0, joint, :3, 3] for joint in (hand, hip)
+        )
+        return float((hand_m - hip_m).norm())
+
+    assert distance_m(changed, "Left") < min(0.36, distance_m(turn, "Left") - 0.05)
+    assert distance_m(changed, "Right") == pytest.approx(distance_m(turn, "Right"))
+
+
+def test_no_angles_are_no_change(bare: Body, turn: Motion) -> None:
+    same = add_joint_angles(bare, turn, posture(0.0, 0.0, hand_on_hip=False))
+    assert np.allclose(same.rotations_wxyz, turn.rotations_wxyz, atol=1e-6)

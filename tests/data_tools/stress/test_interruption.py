@@ -1,0 +1,67 @@
+"""Interruptions of the toy pipeline with real kills, and what counts as a difference."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from data_tools.stress import interruption
+from data_tools.stress.interruption import differing_files, interruption_scores
+from pipeline.core.errors import UserError
+from tests.core.toy_pipeline import Toy
+from tests.test_resume import TOY_STAGES
+
+
+@pytest.fixture
+def folders(toy: Toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
+    """Folders of captures and runs; runs are those of the toy pipeline."""
+
+    def start(run: Path, video: Path, log: Path) -> subprocess.Popen[str]:
+        process = toy.start("stages", "--run", str(run), "--video", "numbers.txt")
+        _, errors = ("", "") if run.name == "run" else process.communicate()
+        log.parent.mkdir(parents=True, exist_ok=True)
+        log.write_text(errors)
+        return process
+
+    monkeypatch.setattr(interruption, "_start", start)
+    monkeypatch.setattr(interruption, "make_capture", lambda *_: toy.folder)
+    monkeypatch.setattr(interruption, "STAGES", TOY_STAGES)
+    monkeypatch.setattr(interruption, "TIMELESS", TOY_STAGES)
+    monkeypatch.setattr(interruption, "MIN_KILL_DELAY_S", 0.05)
+    return tmp_path / "captures", tmp_path / "trial"
+
+
+def test_killed_runs_end_with_the_same_bytes(folders: tuple[Path, Path]) -> None:
+    scores = interruption_scores(*folders, kind="kills", count=3)
+    assert scores["differing_files"] == 0.0
+    assert 0 <= scores["interruptions"] <= 3
+
+
+@pytest.mark.slow
+def test_two_runs_at_once_end_with_the_same_bytes(folders: tuple[Path, Path]) -> None:
+    scores = interruption_scores(*folders, kind="two runs", count=1)
+    assert scores["differing_files"] == 0.0
+    assert scores["interruptions"] <= 1.0
+
+
+@pytest.mark.slow
+def test_differences_are_counted(folders: tuple[Path, Path]) -> None:
+    interruption_scores(*folders, kind="kills", count=0)
+    expected, found = folders[0].parent / "undisturbed", folders[1] / "run"
+    assert differing_files(expected, found) == []
+    shutil.rmtree(found / TOY_STAGES[-1])
+    (found / "learn.part").mkdir()
+    differing = differing_files(expected, found)
+    assert "learn.part" in differing
+    assert any(name.startswith(f"{TOY_STAGES[-1]}/") for name in differing)
+
+
+def test_without_mount_a_full_disk_is_refused_in_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(command: list[str]) -> None:
+        raise subprocess.CalledProcessError(32, command)
+
+    monkeypatch.setattr(interruption, "_command", refused)
+    monkeypatch.setattr(shutil, "which", lambda name: f"/bin/{name}")
+    with pytest.raises(UserError, match="run it as root"), interruption._small_disk(tmp_path / "disk", 4):
+        pass
