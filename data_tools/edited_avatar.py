@@ -37,10 +37,10 @@ def write_edited_avatar(
 ) -> None:
     """Write `avatar.glb`, `avatar.obj` with its `.mtl` and maps, and the maps into `out`.
 
-    Rig, animations and face are those of the export; the face is found on the filmed texture and gets the edited one.
+    Rig, animations and face are those of the export; the face gets the edited texture.
     """
     scene, config = avatar.scene, avatar.config
-    face = make_face(scene.body, scene.skinned, scene.texture, texture) if config.face else None
+    face = make_face(scene.body, scene.template, scene.skinned, texture) if config.face else None
     edited = replace(scene, texture=texture, face=face)
     clips = {"capture": scene.motion, "idle": idle_motion(scene.body)}
     with replaced_folder(out) as part:

@@ -20,12 +20,8 @@ from jaxtyping import Float
 from data_tools.command import run_command
 from data_tools.edited_avatar import EditableAvatar, load_editable_avatar, write_edited_avatar
 from data_tools.pose import check_folder_name
-from pipeline.capture.face_detector import FaceDetector
 from pipeline.core.errors import UserError
 from pipeline.core.progress import warn
-from pipeline.template.face_landmarks import find_face_landmarks
-from pipeline.template.regions import is_template_body
-from pipeline.template.registration import register_template
 from pipeline.template.texture_exchange import RegisteredSurface, exchanged_map
 from pipeline.texture.files import TextureArtifact
 from pipeline.texture.painting import Painting, enlarge_maps, paint_over, read_mask, read_painting, resize_map
@@ -58,11 +54,9 @@ def registered_surface(avatar: EditableAvatar, run: Path) -> RegisteredSurface:
         UserError: the body of the run is not the built-in one.
     """
     scene = avatar.scene
-    if not is_template_body(scene.body):
+    if scene.template is None:
         raise UserError(f"{run} has a body of a model file; textures are exchanged between runs with the built-in body")
-    mesh, texture = scene.skinned.mesh, scene.texture
-    landmarks = find_face_landmarks(scene.body, mesh, texture.atlas, texture.diffuse, FaceDetector())
-    return RegisteredSurface(mesh, register_template(scene.body, mesh, landmarks).vertices)
+    return RegisteredSurface(scene.skinned.mesh, scene.template.registration.vertices)
 
 
 def wear_texture_of(

@@ -27,7 +27,6 @@ from pipeline.avatar.rig_names import RigName
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.files import load_body, load_camera, load_motion
 from pipeline.capture.capture import load_capture
-from pipeline.capture.face_detector import FaceDetector
 from pipeline.core.cli import main
 from pipeline.core.config import Config as BaseConfig
 from pipeline.core.progress import warn
@@ -41,6 +40,7 @@ from pipeline.mesh.files import MeshArtifact, load_mesh
 from pipeline.template.animated_face import AnimatedFace, build_animated_face
 from pipeline.template.face_patch import FacePatchError
 from pipeline.template.face_texture import CapturedSurface
+from pipeline.template.files import FittedTemplate, load_fitted_template
 from pipeline.texture.files import DIFFUSE, NORMAL, SPECULAR, TextureArtifact, load_texture, map_files
 from pipeline.texture.light import TERMS, VideoLight
 from pipeline.texture.normal_map import widen_flat
@@ -109,6 +109,7 @@ class Scene:
         skinned: the mesh in the A-pose.
         rig: names, axes and rest pose of the joints.
         texture: atlas and maps.
+        template: on the person; None for a body of a model file.
         motion: of the video, on a floor at y = 0, with the duration of the video.
         fps: frame rate of the video.
         camera: of the capture, in the same scene.
@@ -120,6 +121,7 @@ class Scene:
     skinned: MeshArtifact
     rig: Rig
     texture: TextureArtifact
+    template: FittedTemplate | None
     motion: Motion
     fps: float
     camera: Camera
@@ -147,11 +149,6 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
         "vertices": float(len(scene.texture.atlas.uv)),
         "faces": float(len(scene.skinned.mesh.faces)),
         "morph_targets": float(len(face.names)) if face else 0.0,
-        **(
-            {"template_distance_median_mm": face.fit.median_mm, "template_distance_p95_mm": face.fit.p95_mm}
-            if face
-            else {}
-        ),
     }
 
 
@@ -162,7 +159,7 @@ def load_scene(inputs: Mapping[str, Path], config: Config) -> Scene:
         UserError: an input artifact cannot be read.
     """
     body, skinned = load_body(inputs["body"] / "body.npz"), load_mesh(inputs["mesh"])
-    texture = load_texture(inputs["texture"])
+    texture, template = load_texture(inputs["texture"]), load_fitted_template(inputs["texture"])
     capture, motion = load_capture(inputs["frames"]), load_motion(inputs["mesh"] / "motion.npz")
     offset_m = world_to_scene_translation_m(motion, lowest_vertex_y_m(skinned, body, motion))
     return Scene(
@@ -170,26 +167,22 @@ def load_scene(inputs: Mapping[str, Path], config: Config) -> Scene:
         skinned=skinned,
         rig=build_rig(body, config.rig, config.rest_pose),
         texture=texture,
+        template=template,
         motion=pad_motion_to_video(translate_motion(motion, offset_m), capture.fps, capture.n_video_frames),
         fps=capture.fps,
         camera=translate_camera(load_camera(inputs["body"] / "camera.npz"), offset_m),
         extras=asset_extras(config, offset_m, capture.fps) | light_extras(texture.light),
-        face=make_face(body, skinned, texture) if config.face else None,
+        face=make_face(body, template, skinned, texture) if config.face else None,
     )
 
 
 def make_face(
-    body: Body, skinned: MeshArtifact, texture: TextureArtifact, shown: TextureArtifact | None = None
+    body: Body, template: FittedTemplate | None, skinned: MeshArtifact, texture: TextureArtifact
 ) -> AnimatedFace | None:
-    """Return the avatar with a face that moves; None, with a warning, where the face is not found or not cut out.
-
-    shown: maps that the avatar gets in place of those that the face is found on.
-    """
-    surfaces = [
-        CapturedSurface(skinned.mesh, maps.atlas, maps.diffuse, maps.specular) for maps in (texture, shown or texture)
-    ]
+    """Return the avatar with a face that moves; None, with a warning, where the face is not found or not cut out."""
+    captured = CapturedSurface(skinned.mesh, texture.atlas, texture.diffuse, texture.specular)
     try:
-        return build_animated_face(body, skinned, surfaces[0], FaceDetector, surfaces[1])
+        return build_animated_face(body, template.registration if template else None, skinned, captured)
     except FacePatchError as error:
         warn(f"the avatar's face does not move: {error}")
         return None
@@ -311,7 +304,7 @@ def light_extras(light: VideoLight) -> dict[str, Any]:
 
 STAGE = Stage(
     "export",
-    version=8,
+    version=9,
     needs=("frames", "body", "mesh", "texture"),
     makes=("avatar.glb", "avatar.obj", "avatar.mtl", *OBJ_MAPS),
     config=Config,

@@ -14,6 +14,7 @@ from torch import Tensor
 from pipeline.body.body import Body, canonical_to_world
 from pipeline.body.files import load_body, load_camera, load_motion
 from pipeline.capture.capture import Capture, load_capture
+from pipeline.capture.face_detector import FaceDetector
 from pipeline.capture.frame_selection import VALIDATION
 from pipeline.capture.usable_frames import usable_training_positions
 from pipeline.core.cli import main
@@ -28,6 +29,9 @@ from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.io.image import to_float, to_uint8
 from pipeline.mesh.files import MeshArtifact, load_dense_mesh, load_mesh
+from pipeline.template.correspondence import correspond
+from pipeline.template.files import TEMPLATE_NPZ, FittedTemplate, save_template
+from pipeline.template.head_texture import register_person
 from pipeline.texture.bake import (
     InpaintFunction,
     TexturedSurface,
@@ -117,6 +121,7 @@ def run(
     train, validation = (load_views(capture, part, inputs, body, skinned, config.max_frames) for part in positions)
     if not train:
         raise UserError(f"{inputs['frames']} has no training frames; run `python -m stages.frames` again")
+    template = fit_template(body, skinned, train, settings)
     atlas, size_px = build_atlas(skinned, body, train, config, settings)
     texels = rasterize_texels(atlas, size_px)
     surface = TexturedSurface.from_arrays(skinned.mesh.faces, atlas, texels)
@@ -146,6 +151,7 @@ def run(
         normal=make_normal_map(inputs["mesh"], skinned.mesh, atlas, size_px) if config.normal_map else None,
     )
     save_texture(out, artifact, config.format)
+    save_template(out, template)
     return {
         "texture_px": float(size_px),
         "observed_texel_fraction": float((texel_confidence > 0.5).mean()),
@@ -154,6 +160,7 @@ def run(
         "specular_explained": fitted.explained,
         "specular_standard_errors": fitted.standard_errors,
         **light_metrics(evidence, light),
+        **template_metrics(template),
     }
 
 
@@ -182,6 +189,30 @@ def load_views(
 def subsample(positions: Int[np.ndarray, "k"], max_frames: int) -> Int[np.ndarray, "m"]:
     """Return at most `max_frames` evenly spaced positions."""
     return positions[evenly_spaced(len(positions), max_frames)]
+
+
+def fit_template(
+    body: Body, skinned: MeshArtifact, views: list[BakeView], settings: TextureSettings
+) -> FittedTemplate | None:
+    """Return the template on the person, and where the vertices of the mesh lie on it; None with a model file."""
+    registration = register_person(body, skinned, views, FaceDetector, settings)
+    if registration is None:
+        return None
+    return FittedTemplate(registration, correspond(body, registration, skinned.mesh))
+
+
+def template_metrics(template: FittedTemplate | None) -> dict[str, float]:
+    """Return how well the template lies on the person, and the share of vertices of each label."""
+    if template is None:
+        return {}
+    median_mm, p95_mm = template.registration.skin_distance_mm()
+    return {
+        "template_distance_median_mm": median_mm,
+        "template_distance_p95_mm": p95_mm,
+        "template_flipped_faces": float(template.registration.flipped_faces),
+        "template_has_face": float(template.registration.has_face),
+        **{f"{name}_share": share for name, share in template.correspondence.shares().items()},
+    }
 
 
 def find_light(
@@ -282,9 +313,9 @@ def fit_highlights(evidence: LightEvidence | None, light: VideoLight, mesh: Mesh
 
 STAGE = Stage(
     "texture",
-    version=7,
+    version=8,
     needs=("frames", "body", "mesh"),
-    makes=(ATLAS, DIFFUSE, SPECULAR, NORMAL, COVERAGE, LIGHT),
+    makes=(ATLAS, DIFFUSE, SPECULAR, NORMAL, COVERAGE, LIGHT, TEMPLATE_NPZ),
     config=Config,
     run=run,
 )

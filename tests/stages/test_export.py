@@ -15,12 +15,13 @@ from pipeline.geometry.atlas import Atlas
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.io.glb import GlbFile
 from pipeline.io.image import read_rgb, to_float, write_gray, write_rgb
+from pipeline.template.files import TEMPLATE_NPZ
 from pipeline.texture.files import TextureArtifact, TextureFormat, load_texture, save_texture
 from pipeline.texture.light import Highlights, VideoLight, directional_light, save_light
 from stages.export import STAGE as EXPORT
 from tests.avatar.test_gltf import Player
 from tests.field.scene import PaintedScene, painted_scene
-from tests.stages.painted_run import make_run
+from tests.stages.painted_run import make_run, save_known_template
 from tests.tools.khronos import validator_issues
 
 TEXTURE_PX = 64
@@ -48,6 +49,7 @@ def inputs(scene: PaintedScene, tmp_path_factory: pytest.TempPathFactory) -> dic
         folder / "texture",
         TextureArtifact(atlas, diffuse, to_float(blank), blank, VideoLight.uniform(3), Highlights.none()),
     )
+    save_known_template(folder / "texture", scene.body)
     return inputs | {"texture": folder / "texture"}
 
 
@@ -105,6 +107,7 @@ def test_the_obj_refers_to_the_deepest_maps_and_the_glb_embeds_eight_bits(
     amplitude[:, TEXTURE_PX // 2 :] = 0.01
     diffuse = np.random.default_rng(1).uniform(size=(TEXTURE_PX, TEXTURE_PX, 3)).astype(np.float32)
     save_texture(texture, replace(artifact, diffuse=diffuse, specular=amplitude), texture_format)
+    shutil.copyfile(inputs["texture"] / TEMPLATE_NPZ, texture / TEMPLATE_NPZ)
     EXPORT.run(inputs | {"texture": texture}, out, EXPORT.config())
     material = (out / "avatar.mtl").read_text().splitlines()
     assert {f"map_Kd avatar_diffuse{suffix}", f"map_Ks avatar_specular{suffix}"} <= set(material)

@@ -160,11 +160,10 @@ def test_the_jaw_opens_downwards_and_the_left_eye_is_on_the_left() -> None:
     assert (at[:, 0] @ blink) / blink.sum() > 0.2
 
 
-def test_a_picture_without_a_face_is_refused_with_the_reason() -> None:
-    class Blind:
-        def detect_face(self, rgb: np.ndarray) -> None:
-            return None
-
-    artifact, surface = captured()
-    with pytest.raises(FacePatchError, match="no face was found"):
-        build_animated_face(generated_person().fitted, artifact, surface, Blind)
+def test_a_person_without_a_face_is_refused_with_the_reason() -> None:
+    person = generated_person()
+    registration = register_template(person.fitted, closed_surface())
+    assert not registration.has_face
+    for found, words in ((registration, "no face was found"), (None, "body of a model file")):
+        with pytest.raises(FacePatchError, match=words):
+            build_animated_face(person.fitted, found, *captured())
