@@ -106,7 +106,7 @@ class Scene:
 
     Attributes:
         body: in the A-pose.
-        skinned: the mesh in the A-pose.
+        skinned: the mesh in the A-pose, cut for the atlas.
         rig: names, axes and rest pose of the joints.
         texture: atlas and maps.
         template: on the person; None for a body of a model file.
@@ -158,8 +158,8 @@ def load_scene(inputs: Mapping[str, Path], config: Config) -> Scene:
     Raises:
         UserError: an input artifact cannot be read.
     """
-    body, skinned = load_body(inputs["body"] / "body.npz"), load_mesh(inputs["mesh"])
-    texture, template = load_texture(inputs["texture"]), load_fitted_template(inputs["texture"])
+    body, texture = load_body(inputs["body"] / "body.npz"), load_texture(inputs["texture"])
+    skinned, template = load_mesh(inputs["mesh"]).cut(texture.cut), load_fitted_template(inputs["texture"])
     capture, motion = load_capture(inputs["frames"]), load_motion(inputs["mesh"] / "motion.npz")
     offset_m = world_to_scene_translation_m(motion, lowest_vertex_y_m(skinned, body, motion))
     return Scene(

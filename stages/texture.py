@@ -27,11 +27,14 @@ from pipeline.geometry.atlas import Atlas, Texels, rasterize_texels, texture_siz
 from pipeline.geometry.camera import pixel_footprint_m
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning
+from pipeline.geometry.surface_cut import SurfaceCut
 from pipeline.io.image import to_float, to_uint8
 from pipeline.mesh.files import MeshArtifact, load_dense_mesh, load_mesh
 from pipeline.template.correspondence import correspond
 from pipeline.template.files import TEMPLATE_NPZ, FittedTemplate, save_template
 from pipeline.template.head_texture import register_person
+from pipeline.template.registration import Registration
+from pipeline.template.template_atlas import build_template_atlas
 from pipeline.texture.bake import (
     InpaintFunction,
     TexturedSurface,
@@ -57,7 +60,7 @@ from pipeline.texture.light_evidence import LightEvidence, estimate_light
 from pipeline.texture.normal_map import bake_normal_map
 from pipeline.texture.settings import DEFAULT_SETTINGS, TextureSettings
 from pipeline.texture.specular import SpecularFit, fit_specular, texels_at_vertices
-from pipeline.texture.views import BakeView, crop_bake_view, weight_by_resolution
+from pipeline.texture.views import BakeView, crop_bake_view, vertex_view_cosine, weight_by_resolution
 
 NORMAL_MAP_DIVISOR, MIN_NORMAL_MAP_PX = 2, 64
 """Side of the normal map: half of that of the other maps. An edge of the dense mesh is two texels long or more."""
@@ -77,6 +80,10 @@ class Config(BaseConfig):
     format: TextureFormat = Field(
         "png8",
         description="files of the maps: png8, png16, or exr (8-bit .png and half floats in .exr)",
+    )
+    atlas: Literal["capture", "template"] = Field(
+        "capture",
+        description="layout of the maps: capture (charts of this person) or template (the same for every person)",
     )
     light: Literal["auto", "removed", "kept"] = Field(
         "auto",
@@ -121,8 +128,13 @@ def run(
     train, validation = (load_views(capture, part, inputs, body, skinned, config.max_frames) for part in positions)
     if not train:
         raise UserError(f"{inputs['frames']} has no training frames; run `python -m stages.frames` again")
-    template = fit_template(body, skinned, train, settings)
-    atlas, size_px = build_atlas(skinned, body, train, config, settings)
+    registration = register_person(body, skinned, train, FaceDetector, settings)
+    atlas, size_px, cut = build_atlas(skinned, body, train, registration, config, settings)
+    skinned = skinned.cut(cut)
+    train, validation = ([cut_view(view, cut) for view in part] for part in (train, validation))
+    template = None
+    if registration is not None:
+        template = FittedTemplate(registration, correspond(body, registration, skinned.mesh))
     texels = rasterize_texels(atlas, size_px)
     surface = TexturedSurface.from_arrays(skinned.mesh.faces, atlas, texels)
     evidence = find_light((train, validation), positions, skinned.mesh, config, settings)
@@ -149,6 +161,7 @@ def run(
         light=light,
         highlights=fitted.highlights,
         normal=make_normal_map(inputs["mesh"], skinned.mesh, atlas, size_px) if config.normal_map else None,
+        cut=cut,
     )
     save_texture(out, artifact, config.format)
     save_template(out, template)
@@ -191,14 +204,13 @@ def subsample(positions: Int[np.ndarray, "k"], max_frames: int) -> Int[np.ndarra
     return positions[evenly_spaced(len(positions), max_frames)]
 
 
-def fit_template(
-    body: Body, skinned: MeshArtifact, views: list[BakeView], settings: TextureSettings
-) -> FittedTemplate | None:
-    """Return the template on the person, and where the vertices of the mesh lie on it; None with a model file."""
-    registration = register_person(body, skinned, views, FaceDetector, settings)
-    if registration is None:
-        return None
-    return FittedTemplate(registration, correspond(body, registration, skinned.mesh))
+def cut_view(view: BakeView, cut: SurfaceCut | None) -> BakeView:
+    """Return a view of the mesh that was cut."""
+    if cut is None:
+        return view
+    vertices = torch.from_numpy(cut.extend(view.vertices_world.numpy()))
+    cosine = vertex_view_cosine(vertices, torch.from_numpy(cut.faces), view.camera)
+    return replace(view, vertices_world=vertices, view_cosine=cosine)
 
 
 def template_metrics(template: FittedTemplate | None) -> dict[str, float]:
@@ -275,15 +287,29 @@ def vertex_surface(mesh: Mesh) -> TexturedSurface:
 
 
 def build_atlas(
-    skinned: MeshArtifact, body: Body, views: list[BakeView], config: Config, settings: TextureSettings
-) -> tuple[Atlas, int]:
-    """Unwrap the mesh, and choose the side of the textures (px) from the resolution of the capture."""
+    skinned: MeshArtifact,
+    body: Body,
+    views: list[BakeView],
+    registration: Registration | None,
+    config: Config,
+    settings: TextureSettings,
+) -> tuple[Atlas, int, SurfaceCut | None]:
+    """Lay the mesh out, and choose the side of the textures (px) from the resolution of the capture.
+
+    Returns:
+        The atlas, the side, and how the mesh is cut for the atlas; None if it is not.
+    """
     footprints_m = [pixel_footprint_m(view.vertices_world, view.camera) for view in views]
     texel_size_m = float(np.median(footprints_m)) / settings.texels_per_pixel
     area_m2 = float(skinned.mesh.face_areas_m2().sum())
     size_px = texture_size_px(area_m2, texel_size_m, config.min_texture_px, config.max_texture_px)
+    if config.atlas == "template":
+        if registration is None:
+            raise UserError("texture.atlas=template needs the built-in body, and this run has a body of a model file")
+        on_template = build_template_atlas(skinned.mesh, registration, size_px, settings.padding_px)
+        return on_template.atlas, size_px, on_template.cut
     part = body_part_of_faces(skinned.mesh.faces, skinned.joint_indices, skinned.joint_weights, body.joint_names)
-    return unwrap(skinned.mesh, part, size_px, settings.padding_px), size_px
+    return unwrap(skinned.mesh, part, size_px, settings.padding_px), size_px, None
 
 
 def make_normal_map(mesh_dir: Path, mesh: Mesh, atlas: Atlas, texture_px: int) -> Float32[np.ndarray, "n n 3"] | None:

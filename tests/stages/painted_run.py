@@ -23,10 +23,15 @@ from pipeline.template.registration import Registration
 FPS = 24.0
 
 
-def save_known_template(texture_dir: Path, body: Body) -> None:
-    """Write template.npz for a person whose surface is that of the built-in body; no face is found on it."""
+def known_registration(body: Body) -> Registration:
+    """The template on a person whose surface is that of the built-in body; no face is found on it."""
     count = len(body.vertices)
-    exact = Registration(body.vertices.astype(np.float64), np.zeros(count), np.ones(count, dtype=bool), 0, False)
+    return Registration(body.vertices.astype(np.float64), np.zeros(count), np.ones(count, dtype=bool), 0, False)
+
+
+def save_known_template(texture_dir: Path, body: Body) -> None:
+    """Write template.npz for a person whose surface is that of the built-in body."""
+    exact = known_registration(body)
     save_template(texture_dir, FittedTemplate(exact, correspond(body, exact, body.mesh())))
 
 
