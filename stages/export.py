@@ -4,7 +4,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from pipeline.avatar.formats.vrm import VrmMeta
 from pipeline.avatar.formats.write import ExportFormat, FormatRequest, missing_package, write_formats
 from pipeline.avatar.gltf import MaterialMaps, MorphTargets, SkinnedMesh, encode_glb, pack_specular_factor
 from pipeline.avatar.idle import idle_motion
-from pipeline.avatar.obj import write_obj
+from pipeline.avatar.obj import write_faces_obj, write_obj
 from pipeline.avatar.placement import (
     pad_motion_to_video,
     translate_camera,
@@ -29,18 +29,20 @@ from pipeline.body.files import load_body, load_camera, load_motion
 from pipeline.capture.capture import load_capture
 from pipeline.core.cli import main
 from pipeline.core.config import Config as BaseConfig
+from pipeline.core.errors import UserError
 from pipeline.core.progress import warn
 from pipeline.core.stage import Stage
 from pipeline.geometry.atlas import Atlas
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning
-from pipeline.io.image import png_bytes, to_uint8
+from pipeline.io.image import png_bytes, to_uint8, write_gray, write_rgb
 from pipeline.mesh.files import MeshArtifact, load_mesh
 from pipeline.template.animated_face import AnimatedFace, build_animated_face
 from pipeline.template.face_patch import FacePatchError
 from pipeline.template.face_texture import CapturedSurface
 from pipeline.template.files import FittedTemplate, load_fitted_template
+from pipeline.template.wrapped import wrap_template
 from pipeline.texture.files import DIFFUSE, NORMAL, SPECULAR, TextureArtifact, load_texture, map_files
 from pipeline.texture.light import TERMS, VideoLight
 from pipeline.texture.normal_map import widen_flat
@@ -72,6 +74,10 @@ class Config(BaseConfig):
     face: bool = Field(
         True,
         description="the .glb's face moves: 52 morph targets of ARKit and 15 visemes, lids, lips, eyes, teeth, tongue",
+    )
+    topology: Literal["adaptive", "template"] = Field(
+        "adaptive",
+        description="template: also write the built-in body's quads wrapped on the person: wrapped.obj, wrapped.glb",
     )
     licence_note: str = Field(
         "Made from a video of a person: ask that person before you share it.",
@@ -141,6 +147,8 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     meta = VrmMeta("avatar", config.author, config.licence_url)
     write_formats(out / "avatar.glb", FormatRequest(config.formats, scene.body.joint_names, meta))
     write_scene_obj(inputs["texture"], out, scene.texture, to_rest_pose(scene.skinned, scene.rig).mesh)
+    if config.topology == "template":
+        write_wrapped(scene, config, out)
     face = scene.face
     return {
         "glb_bytes": float(len(glb)),
@@ -197,20 +205,64 @@ def encode_scene(scene: Scene, config: Config, clips: Mapping[str, Motion]) -> b
     normal = texture.normal
     if face is not None and normal is not None:
         normal = widen_flat(normal)
-    has_highlights = bool(specular.any())
-    maps = MaterialMaps(
-        png_bytes(to_uint8(diffuse)),
-        encode_specular_png(specular, texture) if has_highlights else None,
-        texture.highlights.roughness if has_highlights else config.roughness,
-        config.unlit,
-        None if normal is None else png_bytes(to_uint8(normal)),
-    )
+    maps = material_maps(texture, config, diffuse, specular, normal)
     at_rest = to_rest_pose(face.skinned if face else scene.skinned, scene.rig)
     mesh = build_skinned_mesh(at_rest, atlas)
     if face is not None:
         displacements_m, eyes_m = face.displacements_m[:, atlas.vertex_of_uv], face.eye_centres_m(at_rest.mesh.vertices)
         mesh = replace(mesh, morphs=MorphTargets(face.names, displacements_m, eyes_m))
     return encode_glb(mesh, scene.rig, clips, maps, scene.camera, scene.extras)
+
+
+def write_wrapped(scene: Scene, config: Config, out: Path) -> None:
+    """Write `wrapped.obj` (quads) with its maps, and `wrapped.glb` (their halves): the template on the person.
+
+    Raises:
+        UserError: the body of the run is not the built-in one.
+    """
+    if scene.template is None:
+        raise UserError("export.topology=template needs the built-in body, and this run has a body of a model file")
+    texture = scene.texture
+    captured = CapturedSurface(scene.skinned.mesh, texture.atlas, texture.diffuse, texture.specular)
+    wrapped = wrap_template(scene.body, scene.template.registration, captured)
+    at_rest = to_rest_pose(wrapped.skinned, scene.rig)
+    vertices = at_rest.mesh.vertices
+    mesh = build_skinned_mesh(at_rest, wrapped.atlas)
+    if wrapped.names:
+        eyes_m = np.stack(
+            [0.5 * (ball.min(axis=0) + ball.max(axis=0)) for ball in (vertices[r] for r in wrapped.eyeballs)]
+        )
+        moved_m = wrapped.displacements_m[:, wrapped.atlas.vertex_of_uv]
+        mesh = replace(mesh, morphs=MorphTargets(wrapped.names, moved_m, eyes_m))
+    maps = material_maps(texture, config, wrapped.diffuse, wrapped.specular)
+    clips = {"capture": scene.motion, "idle": idle_motion(scene.body)}
+    (out / "wrapped.glb").write_bytes(encode_glb(mesh, scene.rig, clips, maps, scene.camera, scene.extras))
+    write_rgb(out / f"wrapped_{DIFFUSE}", to_uint8(wrapped.diffuse))
+    specular_name = None
+    if wrapped.specular.any():
+        specular_name = f"wrapped_{SPECULAR}"
+        write_gray(out / specular_name, to_uint8(wrapped.specular))
+    names = f"wrapped_{DIFFUSE}", specular_name, None
+    surface, layout = (vertices, wrapped.quads), (wrapped.atlas.uv, wrapped.quads_uv)
+    write_faces_obj(out / "wrapped.obj", surface, layout, at_rest.mesh.vertex_normals(), names)
+
+
+def material_maps(
+    texture: TextureArtifact,
+    config: Config,
+    diffuse: Float[np.ndarray, "h w 3"],
+    specular: Float[np.ndarray, "h w"],
+    normal: Float[np.ndarray, "n m 3"] | None = None,
+) -> MaterialMaps:
+    """Return the encoded maps; `texture` has the lobe and the lamp of the highlights."""
+    has_highlights = bool(specular.any())
+    return MaterialMaps(
+        png_bytes(to_uint8(diffuse)),
+        encode_specular_png(specular, texture) if has_highlights else None,
+        texture.highlights.roughness if has_highlights else config.roughness,
+        config.unlit,
+        None if normal is None else png_bytes(to_uint8(normal)),
+    )
 
 
 def write_scene_obj(texture_dir: Path, out: Path, texture: TextureArtifact, mesh: Mesh) -> None:

@@ -27,6 +27,10 @@ from pipeline.template.registration import Registration
 MIN_STRETCH = 0.3
 """A triangle that is shrunk below this in any direction, against the median of its chart, gets a chart of its own."""
 
+MIN_LOOSE_M2 = 1e-4
+"""Smaller pieces stay where they are: a folded or squeezed sliver shows the texels of its border, and a chart of its
+own would be smaller than a texel: it was seen as a black line."""
+
 MIN_REGION_FACES = 12
 """A smaller piece among loose faces is loose as well: a chart of three faces is mostly gutter."""
 
@@ -34,6 +38,7 @@ MAX_HALVES_GAP = 0.005
 """Places of a vertex in both halves of a chart that are nearer (in sides of the texture; 1 cm) are one: there is no
 cut."""
 
+_LOOSE_RINGS = 1
 _UNFOLDING_STEPS = 6
 _RESERVED_MARGIN = 0.01
 
@@ -45,7 +50,8 @@ class TemplateAtlas:
     Attributes:
         cut: of the person's mesh.
         atlas: of the mesh that was cut.
-        loose_faces: faces of that mesh in charts of their own.
+        loose_faces: faces of that mesh in charts of their own. The others are not folded and do not overlap, but for
+            slivers.
         loose_share: their share of the area.
         folded_faces: faces that were turned over before vertices moved.
     """
@@ -158,15 +164,26 @@ def _loose_faces(
         rows = chart_of_face == number
         loose[rows] |= smallest[rows] < MIN_STRETCH * np.median(smallest[rows])
     loose |= _overlapping(uv, faces_uv, loose, size_px)
-    near = np.zeros(len(surface.vertices), dtype=bool)
-    near[surface.faces[loose]] = True
-    loose |= near[surface.faces].sum(axis=1) == 3
+    loose &= _in_large_pieces(surface, loose)
+    for _ in range(_LOOSE_RINGS):
+        near = np.zeros(len(surface.vertices), dtype=bool)
+        near[surface.faces[loose]] = True
+        loose |= near[surface.faces].any(axis=1)
     for number in np.unique(chart_of_face):
         rows = np.flatnonzero((chart_of_face == number) & ~loose)
         if len(rows):
             piece = _pieces(surface.faces[rows])
             loose[rows[np.bincount(piece)[piece] < MIN_REGION_FACES]] = True
     return loose
+
+
+def _in_large_pieces(surface: Mesh, chosen: Bool[np.ndarray, "f"]) -> Bool[np.ndarray, "f"]:
+    """Return which of the chosen faces are connected to `MIN_LOOSE_M2` of them."""
+    rows, found = np.flatnonzero(chosen), np.zeros(len(chosen), dtype=bool)
+    if len(rows):
+        piece = _pieces(surface.faces[rows])
+        found[rows] = np.bincount(piece, surface.face_areas_m2()[rows])[piece] >= MIN_LOOSE_M2
+    return found
 
 
 def _pieces(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "f"]:

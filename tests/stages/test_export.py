@@ -11,11 +11,13 @@ import torch
 from pydantic import ValidationError
 
 from pipeline.body.body import canonical_to_world
+from pipeline.core.errors import UserError
 from pipeline.geometry.atlas import Atlas
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.io.glb import GlbFile
 from pipeline.io.image import read_rgb, to_float, write_gray, write_rgb
-from pipeline.template.files import TEMPLATE_NPZ
+from pipeline.template.files import TEMPLATE_NPZ, save_template
+from pipeline.template.regions import template_quads
 from pipeline.texture.files import TextureArtifact, TextureFormat, load_texture, save_texture
 from pipeline.texture.light import Highlights, VideoLight, directional_light, save_light
 from stages.export import STAGE as EXPORT
@@ -222,3 +224,26 @@ def test_the_t_pose_is_that_of_both_files_and_the_clips_are_the_same(
             for file, name in ((player, one), (other, two))
         ]
         np.testing.assert_allclose(*places, atol=2e-5)
+
+
+def test_the_wrapped_template_is_written_as_quads_and_as_an_animated_glb(
+    inputs: dict[str, Path], tmp_path: Path
+) -> None:
+    EXPORT.run(inputs, tmp_path, EXPORT.config(topology="template"))
+    lines = (tmp_path / "wrapped.obj").read_text().splitlines()
+    faces = [line.split()[1:] for line in lines if line.startswith("f ")]
+    assert {len(corners) for corners in faces} == {4}
+    assert len(faces) == len(template_quads())
+    assert "map_Kd wrapped_diffuse.png" in (tmp_path / "wrapped.mtl").read_text()
+    glb = GlbFile(tmp_path / "wrapped.glb")
+    assert [animation["name"] for animation in glb.gltf["animations"]] == ["capture", "idle"]
+    np.testing.assert_array_equal(glb.base_colour(0), read_rgb(tmp_path / "wrapped_diffuse.png"))
+    assert validator_issues(tmp_path / "wrapped.glb") == []
+
+
+def test_a_body_of_a_model_file_is_not_wrapped(inputs: dict[str, Path], tmp_path: Path) -> None:
+    texture = tmp_path / "texture"
+    shutil.copytree(inputs["texture"], texture)
+    save_template(texture, None)
+    with pytest.raises(UserError, match="needs the built-in body"):
+        EXPORT.run(inputs | {"texture": texture}, tmp_path, EXPORT.config(topology="template"))
