@@ -42,6 +42,7 @@ from pipeline.template.animated_face import AnimatedFace, build_animated_face
 from pipeline.template.face_patch import FacePatchError
 from pipeline.template.face_texture import CapturedSurface
 from pipeline.template.files import FittedTemplate, load_fitted_template
+from pipeline.template.reshape import SHAPE_KEY_STEP, SHAPE_KEYS, carry_to_surface, shape_change
 from pipeline.template.wrapped import wrap_template
 from pipeline.texture.files import DIFFUSE, NORMAL, SPECULAR, TextureArtifact, load_texture, map_files
 from pipeline.texture.light import TERMS, VideoLight
@@ -74,6 +75,9 @@ class Config(BaseConfig):
     face: bool = Field(
         True,
         description="the .glb's face moves: 52 morph targets of ARKit and 15 visemes, lids, lips, eyes, teeth, tongue",
+    )
+    shape_keys: bool = Field(
+        False, description="the .glb has morph targets height, weight, muscle and age of the body, +0.2 at weight 1"
     )
     topology: Literal["adaptive", "template"] = Field(
         "adaptive",
@@ -211,7 +215,33 @@ def encode_scene(scene: Scene, config: Config, clips: Mapping[str, Motion]) -> b
     if face is not None:
         displacements_m, eyes_m = face.displacements_m[:, atlas.vertex_of_uv], face.eye_centres_m(at_rest.mesh.vertices)
         mesh = replace(mesh, morphs=MorphTargets(face.names, displacements_m, eyes_m))
+    if config.shape_keys:
+        mesh = add_shape_keys(mesh, scene, atlas)
     return encode_glb(mesh, scene.rig, clips, maps, scene.camera, scene.extras)
+
+
+def add_shape_keys(mesh: SkinnedMesh, scene: Scene, atlas: Atlas) -> SkinnedMesh:
+    """Return the mesh with a morph target for each of `SHAPE_KEYS`, after those of the face.
+
+    Raises:
+        UserError: the body of the run is not the built-in one.
+    """
+    if scene.template is None:
+        raise UserError("export.shape_keys=true needs the built-in body, and this run has a body of a model file")
+    skinned = scene.face.skinned if scene.face else scene.skinned
+    registration, at_rest = scene.template.registration, to_rest_pose(skinned, scene.rig).mesh.vertices
+    moved = []
+    for name in SHAPE_KEYS:
+        change = shape_change(scene.body, {name: SHAPE_KEY_STEP})
+        vertices = (skinned.mesh.vertices + carry_to_surface(change, registration, skinned.mesh)).astype(np.float32)
+        new = to_rest_pose(replace(skinned, mesh=Mesh(vertices, skinned.mesh.faces)), scene.rig)
+        moved.append((new.mesh.vertices - at_rest)[atlas.vertex_of_uv])
+    keys = np.stack(moved).astype(np.float32)
+    old = mesh.morphs
+    if old is None:
+        return replace(mesh, morphs=MorphTargets(SHAPE_KEYS, keys))
+    merged = MorphTargets((*old.names, *SHAPE_KEYS), np.concatenate([old.displacements_m, keys]), old.eyes_m)
+    return replace(mesh, morphs=merged)
 
 
 def write_wrapped(scene: Scene, config: Config, out: Path) -> None:
