@@ -33,8 +33,9 @@ from pipeline.mesh.files import MeshArtifact, load_dense_mesh, load_mesh
 from pipeline.template.correspondence import correspond
 from pipeline.template.files import TEMPLATE_NPZ, FittedTemplate, save_template
 from pipeline.template.head_texture import register_person
+from pipeline.template.mirror import add_mirrored_colours, mirror_vertices
 from pipeline.template.registration import Registration
-from pipeline.template.template_atlas import build_template_atlas
+from pipeline.template.template_atlas import TemplateAtlas, build_template_atlas
 from pipeline.texture.bake import (
     InpaintFunction,
     TexturedSurface,
@@ -82,8 +83,8 @@ class Config(BaseConfig):
         description="files of the maps: png8, png16, or exr (8-bit .png and half floats in .exr)",
     )
     atlas: Literal["capture", "template"] = Field(
-        "capture",
-        description="layout of the maps: capture (charts of this person) or template (the same for every person)",
+        "template",
+        description="layout of the maps: template (the same for every person) or capture (charts of this person)",
     )
     light: Literal["auto", "removed", "kept"] = Field(
         "auto",
@@ -129,7 +130,9 @@ def run(
     if not train:
         raise UserError(f"{inputs['frames']} has no training frames; run `python -m stages.frames` again")
     registration = register_person(body, skinned, train, FaceDetector, settings)
-    atlas, size_px, cut = build_atlas(skinned, body, train, registration, config, settings)
+    atlas, size_px, on_template = build_atlas(skinned, body, train, registration, config, settings)
+    cut = None if on_template is None else on_template.cut
+    face_count = len(skinned.mesh.faces)
     skinned = skinned.cut(cut)
     train, validation = ([cut_view(view, cut) for view in part] for part in (train, validation))
     template = None
@@ -150,7 +153,7 @@ def run(
         light_views(views, light, subsample(part, config.max_frames), surface.faces, fitted)
         for views, part in zip((train, validation), positions, strict=True)
     )
-    inpaint = make_texel_inpainter(skinned.mesh, texels)
+    inpaint = make_texel_inpainter(skinned.mesh, texels, template)
     diffuse, texel_confidence = bake_diffuse(train, surface, inpaint, config.rounds, settings)
     specular = torch.from_numpy(texels.interpolate(skinned.mesh.faces, fitted.strength[:, None]))
     artifact = TextureArtifact(
@@ -160,7 +163,7 @@ def run(
         coverage=to_uint8(texels.to_texture(texel_confidence[:, None])[..., 0]),
         light=light,
         highlights=fitted.highlights,
-        normal=make_normal_map(inputs["mesh"], skinned.mesh, atlas, size_px) if config.normal_map else None,
+        normal=make_normal_map(inputs["mesh"], skinned.mesh, atlas, size_px, face_count) if config.normal_map else None,
         cut=cut,
     )
     save_texture(out, artifact, config.format)
@@ -169,6 +172,7 @@ def run(
         "texture_px": float(size_px),
         "observed_texel_fraction": float((texel_confidence > 0.5).mean()),
         "atlas_utilisation": float(len(texels.face) / size_px**2),
+        **({} if on_template is None else {"atlas_own_charts_share": on_template.loose_share}),
         "validation_psnr_body_db": mean_foreground_psnr_db(to_float(to_uint8(diffuse)), validation, surface),
         "specular_explained": fitted.explained,
         "specular_standard_errors": fitted.standard_errors,
@@ -293,38 +297,51 @@ def build_atlas(
     registration: Registration | None,
     config: Config,
     settings: TextureSettings,
-) -> tuple[Atlas, int, SurfaceCut | None]:
+) -> tuple[Atlas, int, TemplateAtlas | None]:
     """Lay the mesh out, and choose the side of the textures (px) from the resolution of the capture.
 
     Returns:
-        The atlas, the side, and how the mesh is cut for the atlas; None if it is not.
+        The atlas, the side, and what the atlas does to the mesh; None for a layout of the person's own.
     """
     footprints_m = [pixel_footprint_m(view.vertices_world, view.camera) for view in views]
     texel_size_m = float(np.median(footprints_m)) / settings.texels_per_pixel
     area_m2 = float(skinned.mesh.face_areas_m2().sum())
     size_px = texture_size_px(area_m2, texel_size_m, config.min_texture_px, config.max_texture_px)
-    if config.atlas == "template":
-        if registration is None:
-            raise UserError("texture.atlas=template needs the built-in body, and this run has a body of a model file")
+    if config.atlas == "template" and registration is None:
+        warn("texture.atlas=template needs the built-in body, not one of a model file: the layout is the person's own")
+    if config.atlas == "template" and registration is not None:
         on_template = build_template_atlas(skinned.mesh, registration, size_px, settings.padding_px)
-        return on_template.atlas, size_px, on_template.cut
+        return on_template.atlas, size_px, on_template
     part = body_part_of_faces(skinned.mesh.faces, skinned.joint_indices, skinned.joint_weights, body.joint_names)
     return unwrap(skinned.mesh, part, size_px, settings.padding_px), size_px, None
 
 
-def make_normal_map(mesh_dir: Path, mesh: Mesh, atlas: Atlas, texture_px: int) -> Float32[np.ndarray, "n n 3"] | None:
-    """Return the normal map of what the reduction of the faces removed; None if it removed none."""
+def make_normal_map(
+    mesh_dir: Path, mesh: Mesh, atlas: Atlas, texture_px: int, face_count: int
+) -> Float32[np.ndarray, "n n 3"] | None:
+    """Return the normal map of what the reduction of the faces removed; None if it removed none.
+
+    face_count: of the mesh stage's mesh; `mesh` may be cut for the atlas.
+    """
     dense = load_dense_mesh(mesh_dir)
-    if len(dense.faces) == len(mesh.faces):
+    if len(dense.faces) == face_count:
         return None
     return bake_normal_map(mesh, atlas, dense, max(texture_px // NORMAL_MAP_DIVISOR, MIN_NORMAL_MAP_PX))
 
 
-def make_texel_inpainter(mesh: Mesh, texels: Texels) -> InpaintFunction:
-    """Return a function that inpaints unobserved texels from the observed colours around them on the surface."""
+def make_texel_inpainter(mesh: Mesh, texels: Texels, template: FittedTemplate | None = None) -> InpaintFunction:
+    """Return a function that inpaints unobserved texels from the observed colours around them on the surface.
+
+    template: tells the other side of the body, whose colours are taken where both sides agree.
+    """
+    partner = None
+    if template is not None:
+        partner = mirror_vertices(template.correspondence, template.registration.vertices, mesh)
 
     def inpaint(colour: Float[np.ndarray, "t 3"], texel_confidence: Float[np.ndarray, "t"]) -> Float[np.ndarray, "t 3"]:
         means, weights = average_texels_per_vertex(texels, mesh.faces, len(mesh.vertices), colour, texel_confidence)
+        if partner is not None:
+            means, weights = add_mirrored_colours(mesh, partner, means, weights)
         return texels.interpolate(mesh.faces, inpaint_vertex_colours(mesh, means, weights))
 
     return inpaint
