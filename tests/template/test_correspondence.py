@@ -49,6 +49,7 @@ def test_distance_and_offset_are_those_of_the_surfaces() -> None:
     assert np.median(points.offset_m[rows]) == pytest.approx(0.01, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_skin_skirt_and_hair_are_told_apart() -> None:
     template, seed = load_template(), 3
     subject, bare = make_person(seed, texture_px=64, legwear="skirt")

@@ -89,6 +89,7 @@ def test_a_person_lies_on_it_without_folds() -> None:
     assert len(atlas.uv) < 1.15 * len(surface.vertices)
 
 
+@pytest.mark.slow
 def test_one_place_of_the_texture_is_the_same_place_on_two_people() -> None:
     found = []
     for seed in SEEDS:
@@ -111,6 +112,7 @@ def test_one_place_of_the_texture_is_the_same_place_on_two_people() -> None:
     assert np.quantile(error_mm, 0.95) < 25.0
 
 
+@pytest.mark.slow
 def test_a_skirt_gets_charts_in_the_reserved_square() -> None:
     template = load_template()
     subject, bare = make_person(SEEDS[0], texture_px=64, legwear="skirt")
