@@ -28,6 +28,9 @@ FROM ?=
 MASK ?=
 LOOK ?=
 
+# Input of reshape besides NAME.
+SHAPE ?=
+
 # Inputs of a batch.
 VIDEOS ?=
 RUNS ?= runs
@@ -61,7 +64,7 @@ OPTIONS = $(RUN_OPTIONS) $(ARGS)
 STAMP := $(VENV)/.stamp$(if $(EXTRA),-$(EXTRA))
 
 .DEFAULT_GOAL := help
-.PHONY: help all $(STAGES) batch chart ablate stress pose film retexture stylise compare figures test test-all check format bench bench-field bench-body doctor venv lock configs gltf-validator clean
+.PHONY: help all $(STAGES) batch chart ablate stress pose film retexture stylise reshape compare figures test test-all check format bench bench-field bench-body doctor venv lock configs gltf-validator clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z$$()A-Z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST) | sed 's/$$(STAGES)/STAGE    /'
@@ -119,6 +122,9 @@ retexture: $(STAMP)  ## give the avatar of RUN=runs/name the texture DIFFUSE=pai
 
 stylise: $(STAMP)  ## give the avatar of RUN=runs/name the palette of LOOK=image.png
 	$(RUN_PYTHON) -m data_tools.stylise "$(ONE_RUN)" $(if $(LOOK),--look "$(LOOK)") $(if $(NAME),--name "$(NAME)") $(ARGS)
+
+reshape: $(STAMP)  ## give the avatar of RUN=runs/name another shape: SHAPE='weight=+0.2 height=-0.1'
+	$(RUN_PYTHON) -m data_tools.reshape "$(ONE_RUN)" --shape "$(SHAPE)" $(if $(NAME),--name "$(NAME)") $(ARGS)
 
 compare: $(STAMP)  ## compare RUN=runs/name with the ground truth of TRUTH=capture (default: the sample): compare/truth.html
 	$(RUN_PYTHON) -m data_tools.evaluate.compare "$(or $(TRUTH),$(SAMPLE))" "$(ONE_RUN)"

@@ -7,10 +7,11 @@ from pathlib import Path
 from data_tools.folder import replaced_folder
 from data_tools.pose import export_config
 from pipeline.avatar.idle import idle_motion
+from pipeline.avatar.skinned_avatar import to_rest_pose
 from pipeline.io.image import to_uint8, write_gray, write_rgb
 from pipeline.texture.files import DIFFUSE, NORMAL, SPECULAR, TextureArtifact, save_normal_map
 from stages import export
-from stages.export import Scene, encode_scene, load_scene, make_face, to_rest_pose, write_scene_obj
+from stages.export import Scene, encode_scene, load_scene, make_face, write_scene_obj
 
 
 @dataclass(frozen=True)
@@ -37,10 +38,10 @@ def write_edited_avatar(
 ) -> None:
     """Write `avatar.glb`, `avatar.obj` with its `.mtl` and maps, and the maps into `out`.
 
-    Rig, animations and face are those of the export; the face is found on the filmed texture and gets the edited one.
+    Rig, animations and face are those of the export; the face gets the edited texture.
     """
     scene, config = avatar.scene, avatar.config
-    face = make_face(scene.body, scene.skinned, scene.texture, texture) if config.face else None
+    face = make_face(scene.body, scene.template, scene.skinned, texture) if config.face else None
     edited = replace(scene, texture=texture, face=face)
     clips = {"capture": scene.motion, "idle": idle_motion(scene.body)}
     with replaced_folder(out) as part:

@@ -3,8 +3,9 @@
 python -m data_tools.retexture RUN --diffuse PAINT.png [--name NAME]
 python -m data_tools.retexture RUN --from OTHER_RUN [--mask MASK.png] [--name NAME]
 
-PAINT.png and MASK.png have the layout of RUN/texture/diffuse.png, any square size. Alpha of the paint says where it
-applies; white of the mask is replaced by the other person's texture, without a mask everything from the neck down.
+PAINT.png and MASK.png have the layout of RUN/texture/diffuse.png, any square size; where two runs were made with
+texture.atlas=template, the map of one fits the other. Alpha of the paint says where it applies; white of the mask is
+replaced by the other person's texture, without a mask everything from the neck down.
 Writes RUN/retexture/NAME/: avatar.glb, avatar.obj with its maps, diffuse.png.
 """
 
@@ -20,14 +21,12 @@ from jaxtyping import Float
 from data_tools.command import run_command
 from data_tools.edited_avatar import EditableAvatar, load_editable_avatar, write_edited_avatar
 from data_tools.pose import check_folder_name
-from pipeline.capture.face_detector import FaceDetector
 from pipeline.core.errors import UserError
 from pipeline.core.progress import warn
-from pipeline.template.face_landmarks import find_face_landmarks
-from pipeline.template.regions import is_template_body
-from pipeline.template.registration import register_template
+from pipeline.geometry.atlas import rasterize_texels
+from pipeline.template.layout import load_layout
 from pipeline.template.texture_exchange import RegisteredSurface, exchanged_map
-from pipeline.texture.files import TextureArtifact
+from pipeline.texture.files import ATLAS, TextureArtifact, load_texture
 from pipeline.texture.painting import Painting, enlarge_maps, paint_over, read_mask, read_painting, resize_map
 
 
@@ -41,6 +40,7 @@ def main(argv: Sequence[str]) -> None:
     if options.diffuse is not None:
         painting = read_painting(options.diffuse)
         avatar = load_editable_avatar(options.run)
+        painting = fit_painting(painting, options.diffuse, options.run, avatar.scene.texture)
         texture = paint_over(avatar.scene.texture, painting)
     else:
         mask = None if options.mask is None else read_mask(options.mask)
@@ -51,6 +51,36 @@ def main(argv: Sequence[str]) -> None:
     write_edited_avatar(avatar, texture, options.run / "retexture" / name)
 
 
+def fit_painting(painting: Painting, path: Path, run: Path, texture: TextureArtifact) -> Painting:
+    """Return the part of a painting that fits the run's layout: of another run's map, all but its loose parts.
+
+    Raises:
+        UserError: the painting is the map of another run, and one of the two has a layout of its own.
+    """
+    source = run_of_map(path)
+    if source is None or source.resolve() == run.resolve():
+        return painting
+    for folder, cut in ((source, load_texture(source / "texture").cut), (run, texture.cut)):
+        if cut is None:
+            raise UserError(
+                f"{path} has the layout of {source}, and {folder} has one of its own: a map fits another person where "
+                f"both were made with texture.atlas=template; or use --from {source}"
+            )
+    reserved = load_layout().is_reserved(len(painting.colour))
+    return replace(painting, alpha=np.where(reserved, np.float32(0.0), painting.alpha))
+
+
+def run_of_map(path: Path) -> Path | None:
+    """Return the run whose texture, or an edit of it, a map lies in; None for a map elsewhere."""
+    folder = path.resolve().parent
+    candidates = (folder.parent, folder.parent.parent)
+    names = (folder.name, folder.parent.name)
+    for run, name in zip(candidates, names, strict=True):
+        if name in ("texture", "retexture", "stylise") and (run / "texture" / ATLAS).is_file():
+            return run
+    return None
+
+
 def registered_surface(avatar: EditableAvatar, run: Path) -> RegisteredSurface:
     """Return the surface of an avatar with the template on it.
 
@@ -58,11 +88,9 @@ def registered_surface(avatar: EditableAvatar, run: Path) -> RegisteredSurface:
         UserError: the body of the run is not the built-in one.
     """
     scene = avatar.scene
-    if not is_template_body(scene.body):
+    if scene.template is None:
         raise UserError(f"{run} has a body of a model file; textures are exchanged between runs with the built-in body")
-    mesh, texture = scene.skinned.mesh, scene.texture
-    landmarks = find_face_landmarks(scene.body, mesh, texture.atlas, texture.diffuse, FaceDetector())
-    return RegisteredSurface(mesh, register_template(scene.body, mesh, landmarks).vertices)
+    return RegisteredSurface(scene.skinned.mesh, scene.template.registration.vertices)
 
 
 def wear_texture_of(
@@ -85,8 +113,23 @@ def wear_texture_of(
         scene.body,
         side_px if mask is None else resize_map(mask, side_px),
     )
+    if texture.cut is not None and other.cut is not None:
+        colour = same_places(colour, (texture, other))
     painted = paint_over(enlarge_maps(texture, side_px), Painting(colour, alpha))
     return replace(painted, specular=np.asarray(painted.specular * (1.0 - alpha), np.float32))
+
+
+def same_places(
+    colour: Float[np.ndarray, "s s 3"], textures: tuple[TextureArtifact, TextureArtifact]
+) -> Float[np.ndarray, "s s 3"]:
+    """Return a map in which texels of two people on the template's layout take the other's texel as it is.
+
+    colour: used where one of the two has no chart there, and for loose parts.
+    """
+    side_px = len(colour)
+    known = [rasterize_texels(texture.atlas, side_px).coverage_mask() for texture in textures]
+    both = known[0] & known[1] & ~load_layout().is_reserved(side_px)
+    return np.where(both[..., None], resize_map(textures[1].diffuse, side_px), colour)
 
 
 def _parse_options(argv: Sequence[str]) -> argparse.Namespace:

@@ -4,10 +4,9 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from pydantic import Field, field_validator
 
@@ -16,7 +15,7 @@ from pipeline.avatar.formats.vrm_springs import LooseParts
 from pipeline.avatar.formats.write import ExportFormat, FormatRequest, missing_package, write_formats
 from pipeline.avatar.gltf import MaterialMaps, MorphTargets, SkinnedMesh, encode_glb, pack_specular_factor
 from pipeline.avatar.idle import idle_motion
-from pipeline.avatar.obj import write_obj
+from pipeline.avatar.obj import write_faces_obj, write_obj
 from pipeline.avatar.placement import (
     pad_motion_to_video,
     translate_camera,
@@ -25,31 +24,33 @@ from pipeline.avatar.placement import (
 )
 from pipeline.avatar.rig import RestPose, Rig, build_rig
 from pipeline.avatar.rig_names import RigName
-from pipeline.body.body import Body, Motion, canonical_to_world
+from pipeline.avatar.skinned_avatar import build_skinned_mesh, lowest_vertex_y_m, to_rest_pose
+from pipeline.body.body import Body, Motion
 from pipeline.body.files import load_body, load_camera, load_motion
 from pipeline.capture.capture import load_capture
-from pipeline.capture.face_detector import FaceDetector
 from pipeline.core.cli import main
 from pipeline.core.config import Config as BaseConfig
+from pipeline.core.errors import UserError
 from pipeline.core.progress import warn
 from pipeline.core.stage import Stage
 from pipeline.geometry.atlas import Atlas
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
-from pipeline.geometry.skinning import linear_blend_skinning
-from pipeline.io.image import png_bytes, to_uint8
+from pipeline.io.image import png_bytes, to_uint8, write_gray, write_rgb
 from pipeline.mesh.files import MeshArtifact, load_mesh
-from pipeline.template.animated_face import AnimatedFace, build_animated_face
-from pipeline.template.face_patch import FacePatchError
-from pipeline.template.face_texture import CapturedSurface
+from pipeline.template.face.animated_face import AnimatedFace, build_animated_face
+from pipeline.template.face.patch import FacePatchError
+from pipeline.template.face.texture import CapturedSurface
+from pipeline.template.files import FittedTemplate, load_fitted_template
 from pipeline.template.loose_parts import body_colliders, find_loose_parts
+from pipeline.template.reshape import SHAPE_KEY_STEP, SHAPE_KEYS, carry_to_surface, shape_change
+from pipeline.template.wrapped import wrap_template
 from pipeline.texture.files import DIFFUSE, NORMAL, SPECULAR, TextureArtifact, load_texture, map_files
 from pipeline.texture.light import TERMS, VideoLight
 from pipeline.texture.normal_map import widen_flat
 from pipeline.texture.specular import dielectric_specular_factor
 
 OBJ_MAPS = tuple(f"avatar_{name}" for name in (DIFFUSE, SPECULAR, NORMAL))
-POSES_PER_BATCH = 8
 
 
 class Config(BaseConfig):
@@ -74,6 +75,13 @@ class Config(BaseConfig):
     face: bool = Field(
         True,
         description="the .glb's face moves: 52 morph targets of ARKit and 15 visemes, lids, lips, eyes, teeth, tongue",
+    )
+    shape_keys: bool = Field(
+        False, description="the .glb has morph targets height, weight, muscle and age of the body, +0.2 at weight 1"
+    )
+    topology: Literal["adaptive", "template"] = Field(
+        "adaptive",
+        description="template: also write the built-in body's quads wrapped on the person: wrapped.obj, wrapped.glb",
     )
     licence_note: str = Field(
         "Made from a video of a person: ask that person before you share it.",
@@ -108,9 +116,10 @@ class Scene:
 
     Attributes:
         body: in the A-pose.
-        skinned: the mesh in the A-pose.
+        skinned: the mesh in the A-pose, cut for the atlas.
         rig: names, axes and rest pose of the joints.
         texture: atlas and maps.
+        template: on the person; None for a body of a model file.
         motion: of the video, on a floor at y = 0, with the duration of the video.
         fps: frame rate of the video.
         camera: of the capture, in the same scene.
@@ -122,6 +131,7 @@ class Scene:
     skinned: MeshArtifact
     rig: Rig
     texture: TextureArtifact
+    template: FittedTemplate | None
     motion: Motion
     fps: float
     camera: Camera
@@ -142,6 +152,8 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     loose = loose_parts(scene) if {"vrm", "vrm0"} & set(config.formats) else LooseParts()
     write_formats(out / "avatar.glb", FormatRequest(config.formats, scene.body.joint_names, meta, loose))
     write_scene_obj(inputs["texture"], out, scene.texture, to_rest_pose(scene.skinned, scene.rig).mesh)
+    if config.topology == "template":
+        write_wrapped(scene, config, out)
     face = scene.face
     return {
         "glb_bytes": float(len(glb)),
@@ -152,11 +164,6 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
         "glb_faces": float(len((face.atlas if face else scene.texture.atlas).faces_uv)),
         **({"spring_chains": float(len(loose.chains()))} if loose.parts else {}),
         "morph_targets": float(len(face.names)) if face else 0.0,
-        **(
-            {"template_distance_median_mm": face.fit.median_mm, "template_distance_p95_mm": face.fit.p95_mm}
-            if face
-            else {}
-        ),
     }
 
 
@@ -166,8 +173,8 @@ def load_scene(inputs: Mapping[str, Path], config: Config) -> Scene:
     Raises:
         UserError: an input artifact cannot be read.
     """
-    body, skinned = load_body(inputs["body"] / "body.npz"), load_mesh(inputs["mesh"])
-    texture = load_texture(inputs["texture"])
+    body, texture = load_body(inputs["body"] / "body.npz"), load_texture(inputs["texture"])
+    skinned, template = load_mesh(inputs["mesh"]).cut(texture.cut), load_fitted_template(inputs["texture"])
     capture, motion = load_capture(inputs["frames"]), load_motion(inputs["mesh"] / "motion.npz")
     offset_m = world_to_scene_translation_m(motion, lowest_vertex_y_m(skinned, body, motion))
     return Scene(
@@ -175,26 +182,22 @@ def load_scene(inputs: Mapping[str, Path], config: Config) -> Scene:
         skinned=skinned,
         rig=build_rig(body, config.rig, config.rest_pose),
         texture=texture,
+        template=template,
         motion=pad_motion_to_video(translate_motion(motion, offset_m), capture.fps, capture.n_video_frames),
         fps=capture.fps,
         camera=translate_camera(load_camera(inputs["body"] / "camera.npz"), offset_m),
         extras=asset_extras(config, offset_m, capture.fps) | light_extras(texture.light),
-        face=make_face(body, skinned, texture) if config.face else None,
+        face=make_face(body, template, skinned, texture) if config.face else None,
     )
 
 
 def make_face(
-    body: Body, skinned: MeshArtifact, texture: TextureArtifact, shown: TextureArtifact | None = None
+    body: Body, template: FittedTemplate | None, skinned: MeshArtifact, texture: TextureArtifact
 ) -> AnimatedFace | None:
-    """Return the avatar with a face that moves; None, with a warning, where the face is not found or not cut out.
-
-    shown: maps that the avatar gets in place of those that the face is found on.
-    """
-    surfaces = [
-        CapturedSurface(skinned.mesh, maps.atlas, maps.diffuse, maps.specular) for maps in (texture, shown or texture)
-    ]
+    """Return the avatar with a face that moves; None, with a warning, where the face is not found or not cut out."""
+    captured = CapturedSurface(skinned.mesh, texture.atlas, texture.diffuse, texture.specular)
     try:
-        return build_animated_face(body, skinned, surfaces[0], FaceDetector, surfaces[1])
+        return build_animated_face(body, template.registration if template else None, skinned, captured)
     except FacePatchError as error:
         warn(f"the avatar's face does not move: {error}")
         return None
@@ -223,21 +226,93 @@ def encode_scene(scene: Scene, config: Config, clips: Mapping[str, Motion]) -> b
     normal = texture.normal
     if face is not None and normal is not None:
         normal = widen_flat(normal)
-    has_highlights = bool(specular.any())
-    maps = MaterialMaps(
-        png_bytes(to_uint8(diffuse)),
-        encode_specular_png(specular, texture) if has_highlights else None,
-        texture.highlights.roughness if has_highlights else config.roughness,
-        config.unlit,
-        None if normal is None else png_bytes(to_uint8(normal)),
-    )
+    maps = material_maps(texture, config, diffuse, specular, normal)
     at_rest = to_rest_pose(face.skinned if face else scene.skinned, scene.rig)
     mesh = build_skinned_mesh(at_rest, atlas)
     if face is not None:
         displacements_m, eyes_m = face.displacements_m[:, atlas.vertex_of_uv], face.eye_centres_m(at_rest.mesh.vertices)
         turns = face.normal_changes[:, atlas.vertex_of_uv]
         mesh = replace(mesh, morphs=MorphTargets(face.names, displacements_m, eyes_m, turns))
+    if config.shape_keys:
+        mesh = add_shape_keys(mesh, scene, atlas)
     return encode_glb(mesh, scene.rig, clips, maps, scene.camera, scene.extras)
+
+
+def add_shape_keys(mesh: SkinnedMesh, scene: Scene, atlas: Atlas) -> SkinnedMesh:
+    """Return the mesh with a morph target for each of `SHAPE_KEYS`, after those of the face.
+
+    Raises:
+        UserError: the body of the run is not the built-in one.
+    """
+    if scene.template is None:
+        raise UserError("export.shape_keys=true needs the built-in body, and this run has a body of a model file")
+    skinned = scene.face.skinned if scene.face else scene.skinned
+    registration, at_rest = scene.template.registration, to_rest_pose(skinned, scene.rig).mesh
+    moved, turned = [], []
+    for name in SHAPE_KEYS:
+        change = shape_change(scene.body, {name: SHAPE_KEY_STEP})
+        vertices = (skinned.mesh.vertices + carry_to_surface(change, registration, skinned.mesh)).astype(np.float32)
+        new = to_rest_pose(replace(skinned, mesh=Mesh(vertices, skinned.mesh.faces)), scene.rig)
+        moved.append((new.mesh.vertices - at_rest.vertices)[atlas.vertex_of_uv])
+        turned.append((new.mesh.vertex_normals() - at_rest.vertex_normals())[atlas.vertex_of_uv])
+    keys, turns = np.stack(moved).astype(np.float32), np.stack(turned).astype(np.float32)
+    old = mesh.morphs
+    if old is None:
+        return replace(mesh, morphs=MorphTargets(SHAPE_KEYS, keys, None, turns))
+    displacements_m = np.concatenate([old.displacements_m, keys])
+    both_turn = None if old.normal_changes is None else np.concatenate([old.normal_changes, turns])
+    return replace(mesh, morphs=MorphTargets((*old.names, *SHAPE_KEYS), displacements_m, old.eyes_m, both_turn))
+
+
+def write_wrapped(scene: Scene, config: Config, out: Path) -> None:
+    """Write `wrapped.obj` (quads) with its maps, and `wrapped.glb` (their halves): the template on the person.
+
+    Raises:
+        UserError: the body of the run is not the built-in one.
+    """
+    if scene.template is None:
+        raise UserError("export.topology=template needs the built-in body, and this run has a body of a model file")
+    texture = scene.texture
+    captured = CapturedSurface(scene.skinned.mesh, texture.atlas, texture.diffuse, texture.specular)
+    wrapped = wrap_template(scene.body, scene.template.registration, captured)
+    at_rest = to_rest_pose(wrapped.skinned, scene.rig)
+    vertices = at_rest.mesh.vertices
+    mesh = build_skinned_mesh(at_rest, wrapped.atlas)
+    if wrapped.names:
+        eyes_m = np.stack(
+            [0.5 * (ball.min(axis=0) + ball.max(axis=0)) for ball in (vertices[r] for r in wrapped.eyeballs)]
+        )
+        moved_m = wrapped.displacements_m[:, wrapped.atlas.vertex_of_uv]
+        mesh = replace(mesh, morphs=MorphTargets(wrapped.names, moved_m, eyes_m))
+    maps = material_maps(texture, config, wrapped.diffuse, wrapped.specular)
+    clips = {"capture": scene.motion, "idle": idle_motion(scene.body)}
+    (out / "wrapped.glb").write_bytes(encode_glb(mesh, scene.rig, clips, maps, scene.camera, scene.extras))
+    write_rgb(out / f"wrapped_{DIFFUSE}", to_uint8(wrapped.diffuse))
+    specular_name = None
+    if wrapped.specular.any():
+        specular_name = f"wrapped_{SPECULAR}"
+        write_gray(out / specular_name, to_uint8(wrapped.specular))
+    names = f"wrapped_{DIFFUSE}", specular_name, None
+    surface, layout = (vertices, wrapped.quads), (wrapped.atlas.uv, wrapped.quads_uv)
+    write_faces_obj(out / "wrapped.obj", surface, layout, at_rest.mesh.vertex_normals(), names)
+
+
+def material_maps(
+    texture: TextureArtifact,
+    config: Config,
+    diffuse: Float[np.ndarray, "h w 3"],
+    specular: Float[np.ndarray, "h w"],
+    normal: Float[np.ndarray, "n m 3"] | None = None,
+) -> MaterialMaps:
+    """Return the encoded maps; `texture` has the lobe and the lamp of the highlights."""
+    has_highlights = bool(specular.any())
+    return MaterialMaps(
+        png_bytes(to_uint8(diffuse)),
+        encode_specular_png(specular, texture) if has_highlights else None,
+        texture.highlights.roughness if has_highlights else config.roughness,
+        config.unlit,
+        None if normal is None else png_bytes(to_uint8(normal)),
+    )
 
 
 def write_scene_obj(texture_dir: Path, out: Path, texture: TextureArtifact, mesh: Mesh) -> None:
@@ -269,34 +344,6 @@ def encode_specular_png(strength: Float[np.ndarray, "h w"], texture: TextureArti
     lamp = texture.light.lamp_irradiance(texture.highlights.direction)
     factor = dielectric_specular_factor(strength, texture.highlights.roughness, lamp)
     return png_bytes(pack_specular_factor(to_uint8(factor)))
-
-
-def build_skinned_mesh(skinned: MeshArtifact, atlas: Atlas) -> SkinnedMesh:
-    """Duplicate the vertices along UV seams; duplicates share position, normal and skin weights."""
-    mesh, source_vertex = skinned.mesh, atlas.vertex_of_uv
-    return SkinnedMesh(
-        mesh.vertices[source_vertex],
-        mesh.vertex_normals()[source_vertex],
-        atlas.uv,
-        skinned.joint_indices[source_vertex],
-        skinned.joint_weights[source_vertex],
-        atlas.faces_uv,
-    )
-
-
-def to_rest_pose(skinned: MeshArtifact, rig: Rig) -> MeshArtifact:
-    """Return the mesh in the rest pose of a rig."""
-    mesh = skinned.mesh
-    positions_m = rig.rest_positions(mesh.vertices, skinned.joint_indices, skinned.joint_weights)
-    return replace(skinned, mesh=Mesh(positions_m, mesh.faces))
-
-
-def lowest_vertex_y_m(skinned: MeshArtifact, body: Body, motion: Motion) -> Float[np.ndarray, "n"]:
-    """Return the world height (m) of the lowest vertex of the posed mesh in every frame."""
-    weights, vertices = skinned.dense_skin_weights(len(body.joint_names)), torch.from_numpy(skinned.mesh.vertices)
-    batches = canonical_to_world(body, motion).split(POSES_PER_BATCH)
-    lowest = [linear_blend_skinning(vertices, weights, batch)[..., 1].amin(dim=1) for batch in batches]
-    return torch.cat(lowest).numpy()
 
 
 def asset_extras(config: Config, offset_m: Float[np.ndarray, "3"], frame_rate_hz: float) -> dict[str, Any]:
@@ -331,7 +378,7 @@ def light_extras(light: VideoLight) -> dict[str, Any]:
 
 STAGE = Stage(
     "export",
-    version=9,
+    version=10,
     needs=("frames", "body", "mesh", "texture"),
     makes=("avatar.glb", "avatar.obj", "avatar.mtl", *OBJ_MAPS),
     config=Config,

@@ -14,6 +14,7 @@ from torch import Tensor
 from pipeline.body.body import Body, canonical_to_world
 from pipeline.body.files import load_body, load_camera, load_motion
 from pipeline.capture.capture import Capture, load_capture
+from pipeline.capture.face_detector import FaceDetector
 from pipeline.capture.frame_selection import VALIDATION
 from pipeline.capture.usable_frames import usable_training_positions
 from pipeline.core.cli import main
@@ -26,8 +27,15 @@ from pipeline.geometry.atlas import Atlas, Texels, rasterize_texels, texture_siz
 from pipeline.geometry.camera import pixel_footprint_m
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning
+from pipeline.geometry.surface_cut import SurfaceCut
 from pipeline.io.image import to_float, to_uint8
 from pipeline.mesh.files import MeshArtifact, load_dense_mesh, load_mesh
+from pipeline.template.correspondence import correspond
+from pipeline.template.face.head_texture import register_person
+from pipeline.template.files import TEMPLATE_NPZ, FittedTemplate, save_template
+from pipeline.template.mirror import add_mirrored_colours, mirror_vertices
+from pipeline.template.registration import Registration
+from pipeline.template.template_atlas import TemplateAtlas, build_template_atlas
 from pipeline.texture.bake import (
     InpaintFunction,
     TexturedSurface,
@@ -53,7 +61,7 @@ from pipeline.texture.light_evidence import LightEvidence, estimate_light
 from pipeline.texture.normal_map import bake_normal_map
 from pipeline.texture.settings import DEFAULT_SETTINGS, TextureSettings
 from pipeline.texture.specular import SpecularFit, fit_specular, texels_at_vertices
-from pipeline.texture.views import BakeView, crop_bake_view, weight_by_resolution
+from pipeline.texture.views import BakeView, crop_bake_view, vertex_view_cosine, weight_by_resolution
 
 NORMAL_MAP_DIVISOR, MIN_NORMAL_MAP_PX = 2, 64
 """Side of the normal map: half of that of the other maps. An edge of the dense mesh is two texels long or more."""
@@ -73,6 +81,10 @@ class Config(BaseConfig):
     format: TextureFormat = Field(
         "png8",
         description="files of the maps: png8, png16, or exr (8-bit .png and half floats in .exr)",
+    )
+    atlas: Literal["capture", "template"] = Field(
+        "template",
+        description="layout of the maps: template (the same for every person) or capture (charts of this person)",
     )
     light: Literal["auto", "removed", "kept"] = Field(
         "auto",
@@ -117,7 +129,15 @@ def run(
     train, validation = (load_views(capture, part, inputs, body, skinned, config.max_frames) for part in positions)
     if not train:
         raise UserError(f"{inputs['frames']} has no training frames; run `python -m stages.frames` again")
-    atlas, size_px = build_atlas(skinned, body, train, config, settings)
+    registration = register_person(body, skinned, train, FaceDetector, settings)
+    atlas, size_px, on_template = build_atlas(skinned, body, train, registration, config, settings)
+    cut = None if on_template is None else on_template.cut
+    face_count = len(skinned.mesh.faces)
+    skinned = skinned.cut(cut)
+    train, validation = ([cut_view(view, cut) for view in part] for part in (train, validation))
+    template = None
+    if registration is not None:
+        template = FittedTemplate(registration, correspond(body, registration, skinned.mesh))
     texels = rasterize_texels(atlas, size_px)
     surface = TexturedSurface.from_arrays(skinned.mesh.faces, atlas, texels)
     evidence = find_light((train, validation), positions, skinned.mesh, config, settings)
@@ -133,7 +153,7 @@ def run(
         light_views(views, light, subsample(part, config.max_frames), surface.faces, fitted)
         for views, part in zip((train, validation), positions, strict=True)
     )
-    inpaint = make_texel_inpainter(skinned.mesh, texels)
+    inpaint = make_texel_inpainter(skinned.mesh, texels, template)
     diffuse, texel_confidence = bake_diffuse(train, surface, inpaint, config.rounds, settings)
     specular = torch.from_numpy(texels.interpolate(skinned.mesh.faces, fitted.strength[:, None]))
     artifact = TextureArtifact(
@@ -143,17 +163,21 @@ def run(
         coverage=to_uint8(texels.to_texture(texel_confidence[:, None])[..., 0]),
         light=light,
         highlights=fitted.highlights,
-        normal=make_normal_map(inputs["mesh"], skinned.mesh, atlas, size_px) if config.normal_map else None,
+        normal=make_normal_map(inputs["mesh"], skinned.mesh, atlas, size_px, face_count) if config.normal_map else None,
+        cut=cut,
     )
     save_texture(out, artifact, config.format)
+    save_template(out, template)
     return {
         "texture_px": float(size_px),
         "observed_texel_fraction": float((texel_confidence > 0.5).mean()),
         "atlas_utilisation": float(len(texels.face) / size_px**2),
+        **({} if on_template is None else {"atlas_own_charts_share": on_template.loose_share}),
         "validation_psnr_body_db": mean_foreground_psnr_db(to_float(to_uint8(diffuse)), validation, surface),
         "specular_explained": fitted.explained,
         "specular_standard_errors": fitted.standard_errors,
         **light_metrics(evidence, light),
+        **template_metrics(template),
     }
 
 
@@ -182,6 +206,29 @@ def load_views(
 def subsample(positions: Int[np.ndarray, "k"], max_frames: int) -> Int[np.ndarray, "m"]:
     """Return at most `max_frames` evenly spaced positions."""
     return positions[evenly_spaced(len(positions), max_frames)]
+
+
+def cut_view(view: BakeView, cut: SurfaceCut | None) -> BakeView:
+    """Return a view of the mesh that was cut."""
+    if cut is None:
+        return view
+    vertices = torch.from_numpy(cut.extend(view.vertices_world.numpy()))
+    cosine = vertex_view_cosine(vertices, torch.from_numpy(cut.faces), view.camera)
+    return replace(view, vertices_world=vertices, view_cosine=cosine)
+
+
+def template_metrics(template: FittedTemplate | None) -> dict[str, float]:
+    """Return how well the template lies on the person, and the share of vertices of each label."""
+    if template is None:
+        return {}
+    median_mm, p95_mm = template.registration.skin_distance_mm()
+    return {
+        "template_distance_median_mm": median_mm,
+        "template_distance_p95_mm": p95_mm,
+        "template_flipped_faces": float(template.registration.flipped_faces),
+        "template_has_face": float(template.registration.has_face),
+        **{f"{name}_share": share for name, share in template.correspondence.shares().items()},
+    }
 
 
 def find_light(
@@ -244,30 +291,57 @@ def vertex_surface(mesh: Mesh) -> TexturedSurface:
 
 
 def build_atlas(
-    skinned: MeshArtifact, body: Body, views: list[BakeView], config: Config, settings: TextureSettings
-) -> tuple[Atlas, int]:
-    """Unwrap the mesh, and choose the side of the textures (px) from the resolution of the capture."""
+    skinned: MeshArtifact,
+    body: Body,
+    views: list[BakeView],
+    registration: Registration | None,
+    config: Config,
+    settings: TextureSettings,
+) -> tuple[Atlas, int, TemplateAtlas | None]:
+    """Lay the mesh out, and choose the side of the textures (px) from the resolution of the capture.
+
+    Returns:
+        The atlas, the side, and what the atlas does to the mesh; None for a layout of the person's own.
+    """
     footprints_m = [pixel_footprint_m(view.vertices_world, view.camera) for view in views]
     texel_size_m = float(np.median(footprints_m)) / settings.texels_per_pixel
     area_m2 = float(skinned.mesh.face_areas_m2().sum())
     size_px = texture_size_px(area_m2, texel_size_m, config.min_texture_px, config.max_texture_px)
+    if config.atlas == "template" and registration is None:
+        warn("texture.atlas=template needs the built-in body, not one of a model file: the layout is the person's own")
+    if config.atlas == "template" and registration is not None:
+        on_template = build_template_atlas(skinned.mesh, registration, size_px, settings.padding_px)
+        return on_template.atlas, size_px, on_template
     part = body_part_of_faces(skinned.mesh.faces, skinned.joint_indices, skinned.joint_weights, body.joint_names)
-    return unwrap(skinned.mesh, part, size_px, settings.padding_px), size_px
+    return unwrap(skinned.mesh, part, size_px, settings.padding_px), size_px, None
 
 
-def make_normal_map(mesh_dir: Path, mesh: Mesh, atlas: Atlas, texture_px: int) -> Float32[np.ndarray, "n n 3"] | None:
-    """Return the normal map of what the reduction of the faces removed; None if it removed none."""
+def make_normal_map(
+    mesh_dir: Path, mesh: Mesh, atlas: Atlas, texture_px: int, face_count: int
+) -> Float32[np.ndarray, "n n 3"] | None:
+    """Return the normal map of what the reduction of the faces removed; None if it removed none.
+
+    face_count: of the mesh stage's mesh; `mesh` may be cut for the atlas.
+    """
     dense = load_dense_mesh(mesh_dir)
-    if len(dense.faces) == len(mesh.faces):
+    if len(dense.faces) == face_count:
         return None
     return bake_normal_map(mesh, atlas, dense, max(texture_px // NORMAL_MAP_DIVISOR, MIN_NORMAL_MAP_PX))
 
 
-def make_texel_inpainter(mesh: Mesh, texels: Texels) -> InpaintFunction:
-    """Return a function that inpaints unobserved texels from the observed colours around them on the surface."""
+def make_texel_inpainter(mesh: Mesh, texels: Texels, template: FittedTemplate | None = None) -> InpaintFunction:
+    """Return a function that inpaints unobserved texels from the observed colours around them on the surface.
+
+    template: tells the other side of the body, whose colours are taken where both sides agree.
+    """
+    partner = None
+    if template is not None:
+        partner = mirror_vertices(template.correspondence, template.registration.vertices, mesh)
 
     def inpaint(colour: Float[np.ndarray, "t 3"], texel_confidence: Float[np.ndarray, "t"]) -> Float[np.ndarray, "t 3"]:
         means, weights = average_texels_per_vertex(texels, mesh.faces, len(mesh.vertices), colour, texel_confidence)
+        if partner is not None:
+            means, weights = add_mirrored_colours(mesh, partner, means, weights)
         return texels.interpolate(mesh.faces, inpaint_vertex_colours(mesh, means, weights))
 
     return inpaint
@@ -282,9 +356,9 @@ def fit_highlights(evidence: LightEvidence | None, light: VideoLight, mesh: Mesh
 
 STAGE = Stage(
     "texture",
-    version=7,
+    version=8,
     needs=("frames", "body", "mesh"),
-    makes=(ATLAS, DIFFUSE, SPECULAR, NORMAL, COVERAGE, LIGHT),
+    makes=(ATLAS, DIFFUSE, SPECULAR, NORMAL, COVERAGE, LIGHT, TEMPLATE_NPZ),
     config=Config,
     run=run,
 )

@@ -152,7 +152,7 @@ def score_maps(
     """Return the error of the map against the true texture (of 255, one gain a channel), PSNR in dB, gain error."""
     avatar = load_textured_avatar(folder / "mesh", texture_dir)
     texture = load_texture(texture_dir)
-    mesh, gain = load_mesh(folder / "mesh"), albedo_gain(truth, texture, folder)
+    mesh, gain = load_mesh(folder / "mesh").cut(texture.cut), albedo_gain(truth, texture, folder)
     balanced = replace(texture, diffuse=_scaled(texture.diffuse, gain[0]))
     own_mesh_body = replace(
         truth.subject.body,
@@ -198,7 +198,7 @@ def albedo_gain(
     truth: SyntheticCapture, texture: TextureArtifact, folder: Path
 ) -> tuple[Float[np.ndarray, "3"], float]:
     """Return the linear gain a channel from the map to the true texture, and the mean error after it, of 255."""
-    mesh, subject = load_mesh(folder / "mesh").mesh, truth.subject
+    mesh, subject = load_mesh(folder / "mesh").cut(texture.cut).mesh, truth.subject
     points, _ = sample_surface(mesh, SURFACE_POINTS, 0)
     uv = _uv_at(points, mesh, texture.atlas.uv, texture.atlas.faces_uv)
     seen = sample_texture(torch.from_numpy(to_float(texture.coverage))[..., None], uv)[:, 0].numpy() > 0.5
@@ -211,7 +211,7 @@ def albedo_gain(
 
 def specular_correlation(truth: SyntheticCapture, texture: TextureArtifact, folder: Path) -> float:
     """Return the correlation of the specular map with the true strength on the surface; 0 for an empty map."""
-    mesh, subject = load_mesh(folder / "mesh").mesh, truth.subject
+    mesh, subject = load_mesh(folder / "mesh").cut(texture.cut).mesh, truth.subject
     points, _ = sample_surface(mesh, SURFACE_POINTS, 0)
     uv = _uv_at(points, mesh, texture.atlas.uv, texture.atlas.faces_uv)
     seen = sample_texture(torch.from_numpy(to_float(texture.coverage))[..., None], uv)[:, 0].numpy() > 0.5

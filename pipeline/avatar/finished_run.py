@@ -73,7 +73,8 @@ def load_finished_run(inputs: Mapping[str, Path]) -> FinishedRun:
 
 def load_textured_avatar(mesh_dir: Path, texture_dir: Path) -> TexturedAvatar:
     """Combine the skinned mesh of the mesh stage with the atlas and diffuse map of the texture stage."""
-    skinned, texture = load_mesh(mesh_dir), load_texture(texture_dir)
+    texture = load_texture(texture_dir)
+    skinned = load_mesh(mesh_dir).cut(texture.cut)
     has_highlights = bool(texture.specular.any())
     return TexturedAvatar(
         vertices=torch.from_numpy(skinned.mesh.vertices.astype(np.float32)),

@@ -29,15 +29,33 @@ def write_obj(
     mesh: m, +Y up. uv: origin bottom-left, as in OBJ. normals: unit, one per vertex. specular_name: None for a surface
     without highlights. normal_name: tangent-space normals, green up, as `norm`; None without them.
     """
-    corners = np.stack([mesh.faces, faces_uv, mesh.faces], axis=2).reshape(len(mesh.faces), 9) + 1
+    write_faces_obj(
+        path, (mesh.vertices, mesh.faces), (uv, faces_uv), normals, (diffuse_name, specular_name, normal_name)
+    )
+
+
+def write_faces_obj(
+    path: Path,
+    surface: tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f k"]],
+    layout: tuple[Float[np.ndarray, "t 2"], Int[np.ndarray, "f k"]],
+    normals: Float[np.ndarray, "v 3"],
+    map_names: tuple[str, str | None, str | None],
+) -> None:
+    """Write a mesh of triangles or quads as `write_obj` does.
+
+    surface: vertices and faces. layout: texture coordinates and corners. map_names: diffuse, specular and normal map.
+    """
+    (vertices, faces), (uv, faces_uv) = surface, layout
+    count, sides = faces.shape
+    corners = np.stack([faces, faces_uv, faces], axis=2).reshape(count, 3 * sides) + 1
     lines = [f"mtllib {path.with_suffix('.mtl').name}", f"o {MATERIAL}"]
-    lines += _format_rows("v %.6f %.6f %.6f", mesh.vertices)
+    lines += _format_rows("v %.6f %.6f %.6f", vertices)
     lines += _format_rows("vt %.6f %.6f", uv)
     lines += _format_rows("vn %.4f %.4f %.4f", normals)
     lines += [f"usemtl {MATERIAL}", "s 1"]
-    lines += _format_rows("f %d/%d/%d %d/%d/%d %d/%d/%d", corners)
+    lines += _format_rows("f" + " %d/%d/%d" * sides, corners)
     path.write_text("\n".join(lines) + "\n", encoding="ascii")
-    path.with_suffix(".mtl").write_text(_mtl_text(diffuse_name, specular_name, normal_name), encoding="ascii")
+    path.with_suffix(".mtl").write_text(_mtl_text(*map_names), encoding="ascii")
 
 
 def _format_rows(row_format: str, values: np.ndarray) -> list[str]:

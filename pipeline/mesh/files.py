@@ -11,7 +11,8 @@ from torch import Tensor
 from pipeline.core.command import format_command
 from pipeline.core.errors import UserError
 from pipeline.geometry.mesh import Mesh
-from pipeline.geometry.skinning import dense_weights
+from pipeline.geometry.skinning import dense_weights, top_k_weights
+from pipeline.geometry.surface_cut import SurfaceCut
 from pipeline.io.npz import load_npz, save_npz
 from pipeline.io.tensors import load_tensors, save_tensors
 from pipeline.mesh.refinement import RefinementState
@@ -38,6 +39,20 @@ class MeshArtifact:
         """Return one row of skin weights per vertex."""
         indices, weights = torch.from_numpy(self.joint_indices), torch.from_numpy(self.joint_weights)
         return dense_weights(indices, weights, joint_count)
+
+    def cut(self, cut: SurfaceCut | None) -> "MeshArtifact":
+        """Return the mesh with its triangles split; new vertices have the mean skin and colour of their corners."""
+        if cut is None:
+            return self
+        dense = self.dense_skin_weights(int(self.joint_indices.max()) + 1).numpy()
+        count = len(self.mesh.vertices)
+        indices, weights = top_k_weights(cut.extend(dense)[count:], self.joint_indices.shape[1])
+        return MeshArtifact(
+            cut.apply(self.mesh),
+            np.concatenate([self.joint_indices, indices.astype(self.joint_indices.dtype)]),
+            np.concatenate([self.joint_weights, weights.astype(self.joint_weights.dtype)]),
+            cut.extend(self.vertex_colours),
+        )
 
 
 def save_mesh(folder: Path, artifact: MeshArtifact) -> None:

@@ -133,10 +133,11 @@ def metric_table(title: str, columns: Mapping[str, Mapping[str, object]]) -> Mar
 def _summary_text(report: Mapping[str, Any]) -> str:
     seconds = report["seconds"]["total"]
     duration = f"{seconds / 60:.1f} minutes" if seconds >= 90 else f"{seconds:.0f} seconds"
-    return (
+    made = (
         f"A textured, rigged mesh of {report['mesh']['faces']:,} triangles, reconstructed from "
         f"{report['masks']['count']} frames of one person in {duration}."
     )
+    return f"{made} {report['template']}" if report.get("template") else made
 
 
 def _headline_metrics(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:

@@ -33,6 +33,12 @@ LIGHT_REMOVED_NOTE = (
     "with the exposure interpolated between training frames"
 )
 LIGHT_KEPT_NOTE = ", which holds the light of the video, unlit"
+TEMPLATE_NOTE = (
+    "The template of the built-in body lies {median:.1f} mm from the surface (median; 95 % of it within {p95:.1f} mm) "
+    "with {flipped:.0f} faces turned over, so that each point has a place on the body. Of the surface, {close:.0%} lie "
+    "close to the body, {cloth:.0%} are cloth that follows it, {loose:.0%} stand off it (skirt, coat), {hair:.0%} are "
+    "hair."
+)
 UNREFINED_NOTE = (
     " Rows named unrefined use the poses of the body stage, without the field's corrections and the fit through the "
     "mesh."
@@ -89,6 +95,7 @@ def build_report(
         },
         **{name: dict(section) for name, section in metric_sections.items()},
         "body": {name: _manifest_metric(manifests["body"], name) for name in ("landmark_error_px", "silhouette_iou")},
+        "template": _template_note(manifests),
         "stages": {name: dict(manifest.metrics) for name, manifest in manifests.items()},
         "warnings": [f"{name}: {text}" for name, manifest in manifests.items() for text in manifest.warnings],
         "environment": {name: value for name, value in environment.items() if name != "packages"},
@@ -102,6 +109,19 @@ def _light_note(manifests: Mapping[str, Manifest]) -> str:
         return LIGHT_KEPT_NOTE
     explained, errors = metrics["light_explained"], metrics["light_standard_errors"]
     return LIGHT_REMOVED_NOTE.format(explained=explained, standard_errors=errors)
+
+
+def _template_note(manifests: Mapping[str, Manifest]) -> str | None:
+    """Say in words how well the template lies on the person; None for a body of a model file."""
+    metrics = manifests["texture"].metrics if "texture" in manifests else {}
+    if "template_distance_median_mm" not in metrics:
+        return None
+    return TEMPLATE_NOTE.format(
+        median=metrics["template_distance_median_mm"],
+        p95=metrics["template_distance_p95_mm"],
+        flipped=metrics["template_flipped_faces"],
+        **{name: metrics[f"{name}_share"] for name in ("close", "cloth", "loose", "hair")},
+    )
 
 
 def report_to_json(report: Mapping[str, Any]) -> str:

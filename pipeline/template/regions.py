@@ -87,6 +87,17 @@ def load_template() -> Template:
     )
 
 
+@lru_cache(maxsize=1)
+def template_quads() -> Int[np.ndarray, "q 4"]:
+    """Return the quads of the template, counter-clockwise: the faces 2 q and 2 q + 1 are the halves of quad q."""
+    first, second = load_template().faces[0::2], load_template().faces[1::2]
+    apex = (first[:, :, None] != second[:, None, :]).all(axis=2).argmax(axis=1)
+    first = np.take_along_axis(first, (apex[:, None] + np.arange(3)) % 3, axis=1)
+    opposite = (second[:, :, None] != first[:, None, :]).all(axis=2).argmax(axis=1)
+    last = np.take_along_axis(second, opposite[:, None], axis=1)[:, 0]
+    return np.stack([first[:, 0], first[:, 1], last, first[:, 2]], axis=1)
+
+
 def _components(faces: Int[np.ndarray, "f 3"], vertex_count: int) -> Int[np.ndarray, "v"]:
     """Return the connected component of each vertex."""
     pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])

@@ -19,7 +19,7 @@ from scipy.sparse.linalg import splu
 from pipeline.body.body import Body
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import closest_points_on_mesh
-from pipeline.template.face_landmarks import FaceLandmarks, fit_similarity
+from pipeline.template.face.landmarks import FaceLandmarks, fit_similarity
 from pipeline.template.regions import Template, load_template
 
 
@@ -58,12 +58,25 @@ class Registration:
         has_correspondence: whether the vertex was drawn to the surface; others follow their neighbours: cavities, and
             places under hair, between fingers or in folds.
         flipped_faces: number of faces of the skin that are turned over.
+        has_face: whether landmarks of the face took part; without them eyes and mouth are where the fitted body has
+            them.
     """
 
     vertices: Float[np.ndarray, "v 3"]
     distance_m: Float[np.ndarray, "v"]
     has_correspondence: Bool[np.ndarray, "v"]
     flipped_faces: int
+    has_face: bool
+
+    def skin(self) -> Mesh:
+        """Return the registered template without cavities, eyeballs and tongue; vertices are those of the template."""
+        template = load_template()
+        return Mesh(self.vertices, template.faces[template.skin_faces])
+
+    def skin_distance_mm(self) -> tuple[float, float]:
+        """Return the median and the 95th percentile of the distance of the skin's vertices to the surface, mm."""
+        distance_mm = 1e3 * self.distance_m[load_template().skin_vertices]
+        return float(np.median(distance_mm)), float(np.quantile(distance_mm, 0.95))
 
 
 @dataclass
@@ -136,7 +149,8 @@ def register_template(
     has_correspondence = np.zeros(len(vertices), dtype=bool)
     has_correspondence[rows] = weight > 0.0
     flipped = count_flipped_faces(rest, rest + displacement, faces[on_skin[faces].all(axis=1)])
-    return Registration(vertices, closest_points_on_mesh(vertices, mesh)[0], has_correspondence, flipped)
+    distance_m = closest_points_on_mesh(vertices, mesh)[0]
+    return Registration(vertices, distance_m, has_correspondence, flipped, landmarks is not None)
 
 
 def count_flipped_faces(

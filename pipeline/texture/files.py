@@ -9,6 +9,7 @@ from jaxtyping import Float32, UInt8
 
 from pipeline.core.errors import UserError
 from pipeline.geometry.atlas import Atlas
+from pipeline.geometry.surface_cut import SurfaceCut
 from pipeline.io.image import read_gray, read_rgb_float, to_uint8, to_uint16, write_gray, write_rgb
 from pipeline.io.npz import load_npz, save_npz
 from pipeline.texture.light import Highlights, VideoLight, load_light, save_light
@@ -34,6 +35,8 @@ class TextureArtifact:
         highlights: the lobe of the specular map.
         normal: tangent-space normals, from -1 to 1 as values in [0, 1] (`pipeline.texture.normal_map`); None for a
             surface without a normal map. Its side may be another than that of the other maps.
+        cut: how the triangles of the mesh stage are split for the atlas, where it has the template's layout; None for
+            an atlas of the person's own.
     """
 
     atlas: Atlas
@@ -43,6 +46,7 @@ class TextureArtifact:
     light: VideoLight
     highlights: Highlights
     normal: Float32[np.ndarray, "n n 3"] | None = None
+    cut: SurfaceCut | None = None
 
 
 def save_texture(folder: Path, texture: TextureArtifact, texture_format: TextureFormat = "png8") -> None:
@@ -51,8 +55,15 @@ def save_texture(folder: Path, texture: TextureArtifact, texture_format: Texture
     Maps are PNG with 8 bits per channel, or 16 for "png16". "exr" adds OpenEXR files with linear half floats; its
     normal map, whose values are no colours, is a PNG with 16 bits. Without a normal map, that file is one flat texel.
     """
-    atlas = texture.atlas
-    save_npz(folder / ATLAS, {"uv": atlas.uv, "faces_uv": atlas.faces_uv, "vertex_of_uv": atlas.vertex_of_uv})
+    atlas, cut = texture.atlas, texture.cut
+    arrays = {"uv": atlas.uv, "faces_uv": atlas.faces_uv, "vertex_of_uv": atlas.vertex_of_uv}
+    if cut is not None:
+        arrays |= {
+            "cut_corners": cut.corners.astype(np.int32),
+            "cut_weights": cut.weights.astype(np.float32),
+            "cut_faces": cut.faces.astype(np.int32),
+        }
+    save_npz(folder / ATLAS, arrays)
     for name, values in ((DIFFUSE, texture.diffuse), (SPECULAR, texture.specular)):
         write = write_rgb if values.ndim == 3 else write_gray
         write(folder / name, to_uint16(values) if texture_format == "png16" else to_uint8(values))
@@ -83,7 +94,9 @@ def load_texture(folder: Path) -> TextureArtifact:
     """
     arrays = load_npz(folder / ATLAS)
     try:
-        atlas = Atlas(arrays["uv"], arrays["faces_uv"], arrays["vertex_of_uv"])
+        atlas, cut = Atlas(arrays["uv"], arrays["faces_uv"], arrays["vertex_of_uv"]), None
+        if "cut_faces" in arrays:
+            cut = SurfaceCut(arrays["cut_corners"], arrays["cut_weights"], arrays["cut_faces"])
     except KeyError as error:
         raise UserError(f"{folder / ATLAS} lacks the array {error}; run `python -m stages.texture` again") from None
     diffuse = read_rgb_float(map_files(folder, DIFFUSE)[-1])
@@ -98,4 +111,5 @@ def load_texture(folder: Path) -> TextureArtifact:
         light,
         highlights,
         normal if normal.shape[0] > 1 else None,
+        cut,
     )

@@ -10,7 +10,7 @@ from pipeline.texture.files import TextureArtifact, save_texture
 from pipeline.texture.light import Highlights, VideoLight
 from stages.export import STAGE, Config
 from tests.field.scene import PaintedScene
-from tests.stages.painted_run import make_run
+from tests.stages.painted_run import make_run, save_known_template
 
 
 def write_exported_run(folder: Path, scene: PaintedScene) -> None:
@@ -30,6 +30,7 @@ def write_exported_run(folder: Path, scene: PaintedScene) -> None:
         Highlights.none(),
     )
     save_texture(folder / "texture", texture)
+    save_known_template(folder / "texture", scene.body)
     (folder / "export").mkdir()
     config = Config(rig="mixamo").model_dump()
     manifest = Manifest("export", STAGE.version, "", config, {}, {}, {}, 0.0, 0.0)

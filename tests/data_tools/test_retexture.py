@@ -1,5 +1,6 @@
 """The command retexture on a run with known mesh, motion and texture."""
 
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 
@@ -7,15 +8,19 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from data_tools.retexture import main
+from data_tools.retexture import main, same_places
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import digest_files
 from pipeline.geometry.atlas import rasterize_texels
 from pipeline.io.glb import GlbFile
 from pipeline.io.image import read_rgb, write_rgb, write_rgba
-from pipeline.texture.files import load_texture
+from pipeline.mesh.files import load_mesh
+from pipeline.template.layout import load_layout
+from pipeline.template.template_atlas import build_template_atlas
+from pipeline.texture.files import load_texture, save_texture
 from tests.data_tools.exported_run import write_exported_run
 from tests.field.scene import PaintedScene, painted_scene
+from tests.stages.painted_run import known_registration
 
 SIDE_PX = 256
 
@@ -119,3 +124,46 @@ def test_bad_masks_and_runs_are_named(run: Path, tmp_path: Path) -> None:
         with pytest.raises(UserError, match=words):
             main([str(run), *arguments])
     assert not (run / "retexture").exists()
+
+
+def on_template_layout(run: Path, scene: PaintedScene, colour: list[int]) -> None:
+    """Give a run the template's layout and a map of one colour."""
+    exact = known_registration(scene.body)
+    skinned = load_mesh(run / "mesh")
+    laid = build_template_atlas(skinned.mesh, exact, SIDE_PX, 4)
+    texture = replace(load_texture(run / "texture"), atlas=laid.atlas, cut=laid.cut)
+    diffuse = np.tile(np.array(colour, np.float32) / 255.0, (SIDE_PX, SIDE_PX, 1))
+    blank = np.zeros((SIDE_PX, SIDE_PX), np.float32)
+    save_texture(run / "texture", replace(texture, diffuse=diffuse, specular=blank, coverage=blank.astype(np.uint8)))
+
+
+def test_the_map_of_another_person_fits_on_the_templates_layout_only(
+    run: Path, scene: PaintedScene, tmp_path: Path
+) -> None:
+    other = tmp_path / "other"
+    other.mkdir()
+    write_exported_run(other, scene)
+    paint = other / "texture" / "diffuse.png"
+    on_template_layout(other, scene, [200, 10, 20])
+    with pytest.raises(UserError, match="one of its own"):
+        main([str(run), "--diffuse", str(paint)])
+    assert not (run / "retexture").exists()
+    on_template_layout(run, scene, [0, 0, 255])
+    main([str(run), "--diffuse", str(paint), "--name", "worn"])
+    written, reserved = read_rgb(run / "retexture" / "worn" / "diffuse.png"), load_layout().is_reserved(SIDE_PX)
+    on_charts = covered(run, SIDE_PX)
+    for colour, rows in (([200, 10, 20], on_charts & ~reserved), ([0, 0, 255], on_charts & reserved)):
+        np.testing.assert_array_equal(written[rows], np.tile(colour, (rows.sum(), 1)))
+    glb = GlbFile(run / "retexture" / "worn" / "avatar.glb")
+    assert glb.gltf["accessors"][0]["count"] == len(load_texture(run / "texture").atlas.uv)
+
+
+def test_texels_of_two_people_on_the_templates_layout_are_exchanged_as_they_are(run: Path, scene: PaintedScene) -> None:
+    on_template_layout(run, scene, [0, 0, 255])
+    texture = load_texture(run / "texture")
+    noise = np.random.default_rng(0).uniform(size=(SIDE_PX, SIDE_PX, 3)).astype(np.float32)
+    fallback = np.zeros((SIDE_PX, SIDE_PX, 3), np.float32)
+    moved = same_places(fallback, (texture, replace(texture, diffuse=noise)))
+    direct = covered(run, SIDE_PX) & ~load_layout().is_reserved(SIDE_PX)
+    np.testing.assert_array_equal(moved[direct], noise[direct])
+    assert not moved[~direct].any()

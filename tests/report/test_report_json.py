@@ -64,3 +64,21 @@ def test_a_figure_that_the_body_stage_did_not_leave_is_named():
     manifests["body"] = Manifest("body", 1, "", {}, {}, {}, {}, 1.0, 1.0)
     with pytest.raises(UserError, match="landmark_error_px.*stages.body"):
         sample_report(manifests=manifests)
+
+
+def test_how_the_template_fits_is_said_in_words():
+    assert sample_report()["template"] is None
+    manifests = sample_manifests()
+    shares = {"close_share": 0.7, "cloth_share": 0.2, "loose_share": 0.06, "hair_share": 0.04}
+    distances = {"template_distance_median_mm": 0.21, "template_distance_p95_mm": 4.7, "template_flipped_faces": 0.0}
+    manifests["texture"] = Manifest("texture", 1, "", {}, {}, {}, shares | distances, 1.0, 1.0)
+    sentence = sample_report(manifests=manifests)["template"]
+    for words in (
+        "0.2 mm",
+        "within 4.7 mm",
+        "with 0 faces turned over",
+        "70% lie close",
+        "6% stand off",
+        "4% are hair",
+    ):
+        assert words in sentence

@@ -16,8 +16,23 @@ from pipeline.geometry.skinning import top_k_weights
 from pipeline.io.image import write_gray, write_rgb
 from pipeline.io.npz import save_npz
 from pipeline.mesh.files import MeshArtifact, save_dense_mesh, save_mesh
+from pipeline.template.correspondence import correspond
+from pipeline.template.files import FittedTemplate, save_template
+from pipeline.template.registration import Registration
 
 FPS = 24.0
+
+
+def known_registration(body: Body) -> Registration:
+    """The template on a person whose surface is that of the built-in body; no face is found on it."""
+    count = len(body.vertices)
+    return Registration(body.vertices.astype(np.float64), np.zeros(count), np.ones(count, dtype=bool), 0, False)
+
+
+def save_known_template(texture_dir: Path, body: Body) -> None:
+    """Write template.npz for a person whose surface is that of the built-in body."""
+    exact = known_registration(body)
+    save_template(texture_dir, FittedTemplate(exact, correspond(body, exact, body.mesh())))
 
 
 def make_run(

@@ -11,16 +11,19 @@ import torch
 from pydantic import ValidationError
 
 from pipeline.body.body import canonical_to_world
+from pipeline.core.errors import UserError
 from pipeline.geometry.atlas import Atlas
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.io.glb import GlbFile
 from pipeline.io.image import read_rgb, to_float, write_gray, write_rgb
+from pipeline.template.files import TEMPLATE_NPZ, save_template
+from pipeline.template.regions import template_quads
 from pipeline.texture.files import TextureArtifact, TextureFormat, load_texture, save_texture
 from pipeline.texture.light import Highlights, VideoLight, directional_light, save_light
 from stages.export import STAGE as EXPORT
 from tests.avatar.test_gltf import Player
 from tests.field.scene import PaintedScene, painted_scene
-from tests.stages.painted_run import make_run
+from tests.stages.painted_run import make_run, save_known_template
 from tests.tools.khronos import validator_issues
 
 TEXTURE_PX = 64
@@ -48,6 +51,7 @@ def inputs(scene: PaintedScene, tmp_path_factory: pytest.TempPathFactory) -> dic
         folder / "texture",
         TextureArtifact(atlas, diffuse, to_float(blank), blank, VideoLight.uniform(3), Highlights.none()),
     )
+    save_known_template(folder / "texture", scene.body)
     return inputs | {"texture": folder / "texture"}
 
 
@@ -105,6 +109,7 @@ def test_the_obj_refers_to_the_deepest_maps_and_the_glb_embeds_eight_bits(
     amplitude[:, TEXTURE_PX // 2 :] = 0.01
     diffuse = np.random.default_rng(1).uniform(size=(TEXTURE_PX, TEXTURE_PX, 3)).astype(np.float32)
     save_texture(texture, replace(artifact, diffuse=diffuse, specular=amplitude), texture_format)
+    shutil.copyfile(inputs["texture"] / TEMPLATE_NPZ, texture / TEMPLATE_NPZ)
     EXPORT.run(inputs | {"texture": texture}, out, EXPORT.config())
     material = (out / "avatar.mtl").read_text().splitlines()
     assert {f"map_Kd avatar_diffuse{suffix}", f"map_Ks avatar_specular{suffix}"} <= set(material)
@@ -219,3 +224,26 @@ def test_the_t_pose_is_that_of_both_files_and_the_clips_are_the_same(
             for file, name in ((player, one), (other, two))
         ]
         np.testing.assert_allclose(*places, atol=2e-5)
+
+
+def test_the_wrapped_template_is_written_as_quads_and_as_an_animated_glb(
+    inputs: dict[str, Path], tmp_path: Path
+) -> None:
+    EXPORT.run(inputs, tmp_path, EXPORT.config(topology="template"))
+    lines = (tmp_path / "wrapped.obj").read_text().splitlines()
+    faces = [line.split()[1:] for line in lines if line.startswith("f ")]
+    assert {len(corners) for corners in faces} == {4}
+    assert len(faces) == len(template_quads())
+    assert "map_Kd wrapped_diffuse.png" in (tmp_path / "wrapped.mtl").read_text()
+    glb = GlbFile(tmp_path / "wrapped.glb")
+    assert [animation["name"] for animation in glb.gltf["animations"]] == ["capture", "idle"]
+    np.testing.assert_array_equal(glb.base_colour(0), read_rgb(tmp_path / "wrapped_diffuse.png"))
+    assert validator_issues(tmp_path / "wrapped.glb") == []
+
+
+def test_a_body_of_a_model_file_is_not_wrapped(inputs: dict[str, Path], tmp_path: Path) -> None:
+    texture = tmp_path / "texture"
+    shutil.copytree(inputs["texture"], texture)
+    save_template(texture, None)
+    with pytest.raises(UserError, match="needs the built-in body"):
+        EXPORT.run(inputs | {"texture": texture}, tmp_path, EXPORT.config(topology="template"))

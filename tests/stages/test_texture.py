@@ -14,8 +14,9 @@ from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.geometry.texture_rendering import render_textured
 from pipeline.io.npz import load_npz
-from pipeline.mesh.files import save_dense_mesh
+from pipeline.mesh.files import load_mesh, save_dense_mesh
 from pipeline.metrics.images import composite_on_white, composite_premultiplied_on_white, foreground_mask, psnr_db
+from pipeline.template.files import load_fitted_template
 from pipeline.texture.files import FLAT_NORMAL, load_texture
 from pipeline.texture.settings import TextureSettings
 from stages.texture import STAGE as TEXTURE
@@ -23,7 +24,7 @@ from stages.texture import make_normal_map, run
 from tests.field.scene import PaintedScene, painted_scene
 from tests.stages.painted_run import make_run
 
-OPTIONS = {"max_texture_px": 512, "rounds": 1}
+OPTIONS = {"max_texture_px": 512, "rounds": 1, "atlas": "capture"}
 SETTINGS = TextureSettings(silhouette_falloff_m=0.01)
 HELD_OUT = 8
 
@@ -149,13 +150,29 @@ def test_a_normal_map_is_made_only_where_faces_were_removed(
     mesh, atlas = scene.body.mesh(), load_texture(textured[0]).atlas
     assert load_texture(textured[0]).normal is None
     save_dense_mesh(tmp_path, mesh)
-    assert make_normal_map(tmp_path, mesh, atlas, 256) is None
+    assert make_normal_map(tmp_path, mesh, atlas, 256, len(mesh.faces)) is None
     middle = mesh.vertices[mesh.faces[0]].mean(axis=0, keepdims=True)
     a, b, c = mesh.faces[0]
     extra = len(mesh.vertices)
     split = np.array([[a, b, extra], [b, c, extra], [c, a, extra]], dtype=mesh.faces.dtype)
     save_dense_mesh(tmp_path, Mesh(np.concatenate([mesh.vertices, middle]), np.concatenate([mesh.faces[1:], split])))
-    normal = make_normal_map(tmp_path, mesh, atlas, 256)
+    normal = make_normal_map(tmp_path, mesh, atlas, 256, len(mesh.faces))
     assert normal is not None
     assert normal.shape == (128, 128, 3)
     assert np.abs(normal - np.float32(FLAT_NORMAL)).mean() < 0.01
+
+
+def test_the_templates_layout_is_baked_as_well_as_the_persons_own(
+    scene: PaintedScene, inputs: dict[str, Path], textured: tuple[Path, dict[str, float]], tmp_path: Path
+) -> None:
+    metrics = run(inputs, tmp_path, TEXTURE.config(**OPTIONS | {"atlas": "template"}), SETTINGS)
+    assert metrics["template_distance_p95_mm"] < 6.0
+    artifact = load_texture(tmp_path)
+    assert artifact.cut is not None
+    skinned = load_mesh(inputs["mesh"]).cut(artifact.cut)
+    np.testing.assert_array_equal(artifact.atlas.vertex_of_uv[artifact.atlas.faces_uv], skinned.mesh.faces)
+    np.testing.assert_allclose(skinned.joint_weights.sum(axis=1), 1.0, atol=1e-5)
+    fitted = load_fitted_template(tmp_path)
+    assert fitted is not None
+    assert len(fitted.correspondence.face) == len(skinned.mesh.vertices)
+    assert metrics["validation_psnr_body_db"] > textured[1]["validation_psnr_body_db"] - 0.5

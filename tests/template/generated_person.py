@@ -8,7 +8,7 @@ import numpy as np
 from data_tools.synthetic.person.person import make_person
 from pipeline.body.body import Body, load_anny
 from pipeline.geometry.mesh import Mesh
-from pipeline.template.face_landmarks import FACE_LANDMARKS, FaceLandmarks
+from pipeline.template.face.landmarks import FACE_LANDMARKS, FaceLandmarks
 from pipeline.template.regions import load_template
 
 SHAPE_ERRORS = {"height": 0.02, "muscle": 0.15, "weight": -0.1, "head-width": 0.3, "neck-length": 0.2}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.geometry.mesh import Mesh
-from pipeline.template.face_landmarks import fit_similarity
+from pipeline.template.face.landmarks import fit_similarity
 from pipeline.template.regions import load_template
 from pipeline.template.registration import Registration, count_flipped_faces, register_template
 from tests.template.generated_person import GeneratedPerson, generated_person

@@ -11,6 +11,7 @@ from data_tools.synthetic.rig.subject import Subject
 from pipeline.avatar.formats.vrm_springs import LooseParts
 from pipeline.avatar.gltf import MaterialMaps, encode_glb
 from pipeline.avatar.rig import build_rig
+from pipeline.avatar.skinned_avatar import build_skinned_mesh
 from pipeline.body.body import Body
 from pipeline.geometry.atlas import Atlas
 from pipeline.geometry.mesh import Mesh
@@ -19,7 +20,6 @@ from pipeline.io.glb import GlbFile
 from pipeline.io.image import png_bytes
 from pipeline.mesh.files import MeshArtifact
 from pipeline.template.loose_parts import body_colliders, find_loose_parts
-from stages.export import build_skinned_mesh
 from tests.avatar.avatar_sample import sample_camera
 from tests.field.scene import make_motion
 

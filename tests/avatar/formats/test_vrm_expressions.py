@@ -9,7 +9,7 @@ from pipeline.avatar.formats.vrm import VrmMeta, encode_vrm0, encode_vrm1
 from pipeline.avatar.formats.vrm_expressions import EXPRESSIONS
 from pipeline.io.glb import GlbFile
 from pipeline.io.glb_writer import GlbWriter
-from pipeline.template.face_units import VISEMES, load_face_units
+from pipeline.template.face.units import VISEMES, load_face_units
 from tests.avatar.formats.anny_avatar import anny_body, anny_glb
 
 META = VrmMeta("avatar", "A. Person", "")

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.mesh import Mesh
 from pipeline.kernels.raster import rasterize
-from pipeline.template.face_frame import FaceFrame
+from pipeline.template.face.frame import FaceFrame
 
 SIZE_PX = 640
 _DISTANCE_M = 2.0

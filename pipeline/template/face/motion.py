@@ -8,10 +8,10 @@ from jaxtyping import Float, Int
 from pipeline.body.body import Body
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import closest_points_on_mesh
-from pipeline.template.face_frame import FaceFrame
-from pipeline.template.face_patch import EYE_LEFT, EYE_RIGHT, FacePatch, unit_transform
-from pipeline.template.face_units import load_face_units
-from pipeline.template.front_view import view_from_front
+from pipeline.template.face.frame import FaceFrame
+from pipeline.template.face.front_view import view_from_front
+from pipeline.template.face.patch import EYE_LEFT, EYE_RIGHT, FacePatch, unit_transform
+from pipeline.template.face.units import load_face_units
 from pipeline.template.regions import load_template
 from pipeline.template.registration import Registration
 

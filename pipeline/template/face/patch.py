@@ -16,10 +16,10 @@ from pipeline.body.body import Body
 from pipeline.geometry.camera import project
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import closest_points_on_mesh
-from pipeline.template.face_frame import FaceFrame, face_frame
-from pipeline.template.face_landmarks import FACE_LANDMARKS, fit_similarity
-from pipeline.template.face_units import load_face_units, load_teeth
-from pipeline.template.front_view import FrontView, view_from_front
+from pipeline.template.face.frame import FaceFrame, face_frame
+from pipeline.template.face.front_view import FrontView, view_from_front
+from pipeline.template.face.landmarks import FACE_LANDMARKS, fit_similarity
+from pipeline.template.face.units import load_face_units, load_teeth
 from pipeline.template.level_set_cut import CutMesh, boundary_loops, cut_mesh
 from pipeline.template.regions import Template, load_template
 from pipeline.template.registration import Registration

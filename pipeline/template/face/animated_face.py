@@ -1,6 +1,5 @@
 """The avatar with a face that moves: the captured mesh, the template's face in it, one texture, and morph targets."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,15 +11,14 @@ from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import top_k_weights
 from pipeline.geometry.surface import closest_points_on_mesh
 from pipeline.mesh.files import MeshArtifact
-from pipeline.template.face_landmarks import Detector, find_face_landmarks
-from pipeline.template.face_motion import (
+from pipeline.template.face.motion import (
     closing_factors,
     near_template,
     normal_changes,
     on_outline,
     template_units_m,
 )
-from pipeline.template.face_patch import (
+from pipeline.template.face.patch import (
     EYE_LEFT,
     EYE_RIGHT,
     MOUTH,
@@ -33,11 +31,10 @@ from pipeline.template.face_patch import (
     build_face_patch,
     cut_face_out,
 )
-from pipeline.template.face_texture import CapturedSurface, layout_charts, paint_patch
-from pipeline.template.face_units import add_visemes, load_face_units
+from pipeline.template.face.texture import CapturedSurface, layout_charts, paint_patch
+from pipeline.template.face.units import add_visemes, load_face_units
 from pipeline.template.level_set_cut import CutMesh, points_on_edges, split_boundary_faces
-from pipeline.template.regions import is_template_body, load_template
-from pipeline.template.registration import Registration, register_template
+from pipeline.template.registration import Registration
 
 MIN_DISPLACEMENT_M = 5e-5
 """Smaller displacements are not written: a twentieth of a millimetre is not seen."""
@@ -59,14 +56,6 @@ _Side = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
-class TemplateFit:
-    """Distance of the registered template's skin to the person's surface: median and 95th percentile."""
-
-    median_mm: float
-    p95_mm: float
-
-
-@dataclass(frozen=True)
 class AnimatedFace:
     """An avatar with morph targets.
 
@@ -78,7 +67,6 @@ class AnimatedFace:
         displacements_m: of the vertices at weight 1, in the A-pose.
         normal_changes: of the vertices' unit normals from weight 0 to 1.
         boundary_gap_m: largest distance between the cuts that were joined.
-        fit: of the template to the surface.
         eyeballs: vertices of the left and of the right eyeball.
     """
 
@@ -90,7 +78,6 @@ class AnimatedFace:
     displacements_m: Float[np.ndarray, "m v 3"]
     normal_changes: Float[np.ndarray, "m v 3"]
     boundary_gap_m: float
-    fit: TemplateFit
     eyeballs: tuple[Int[np.ndarray, "k"], Int[np.ndarray, "k"]]
 
     def eye_centres_m(self, vertices_m: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "2 3"]:
@@ -101,32 +88,27 @@ class AnimatedFace:
 
 
 def build_animated_face(
-    body: Body,
-    skinned: MeshArtifact,
-    captured: CapturedSurface,
-    make_detector: Callable[[], Detector],
-    shown: CapturedSurface | None = None,
+    body: Body, registration: Registration | None, skinned: MeshArtifact, captured: CapturedSurface
 ) -> AnimatedFace:
-    """Find the face, register the template, and return the avatar with a face that moves.
+    """Return the avatar with a face that moves.
 
     Args:
         body: the fitted body.
+        registration: of the template on the captured mesh; None for a body of a model file.
         skinned: the captured mesh with its skin.
         captured: the same mesh with its texture.
-        make_detector: constructs the detector of face landmarks.
-        shown: the same mesh with the texture that the avatar gets, where it is not the one that the face is found on.
 
     Raises:
         FacePatchError: the avatar gets no such face; the message says why.
     """
-    if not is_template_body(body):
+    if registration is None:
         raise FacePatchError("morph targets belong to the built-in body, and this run has a body of a model file")
-    landmarks = find_face_landmarks(body, captured.mesh, captured.atlas, captured.diffuse, make_detector())
-    if landmarks is None:
-        raise FacePatchError("no face was found on the textured avatar; it may be too small or hidden in the video")
-    face = animate_face(body, register_template(body, captured.mesh, landmarks), skinned, shown or captured)
-    if face.fit.median_mm > MAX_MEDIAN_MM:
-        raise FacePatchError(f"the body's surface is {face.fit.median_mm:.0f} mm from the person's (median)")
+    if not registration.has_face:
+        raise FacePatchError("no face was found in the video's frames; it may be too small or hidden")
+    median_mm, _ = registration.skin_distance_mm()
+    if median_mm > MAX_MEDIAN_MM:
+        raise FacePatchError(f"the body's surface is {median_mm:.0f} mm from the person's (median)")
+    face = animate_face(body, registration, skinned, captured)
     if face.boundary_gap_m > MAX_GAP_M:
         raise FacePatchError(
             f"the outline of the face is {1e3 * face.boundary_gap_m:.0f} mm from the surface; hair may hide it"
@@ -182,7 +164,6 @@ def animate_face(
     displacements_m[np.linalg.norm(displacements_m, axis=2) < MIN_DISPLACEMENT_M] = 0.0
     turns[np.linalg.norm(turns, axis=2) < MIN_NORMAL_CHANGE] = 0.0
     diffuse, specular = paint_patch(patch, uv, captured)
-    distance_mm = 1e3 * registration.distance_m[load_template().skin_vertices]
     return AnimatedFace(
         _skin(skinned, cut, patch, Mesh(vertices.astype(np.float32), faces)),
         atlas,
@@ -192,7 +173,6 @@ def animate_face(
         displacements_m.astype(np.float32),
         turns.astype(np.float32),
         gap_m,
-        TemplateFit(float(np.median(distance_mm)), float(np.quantile(distance_mm, 0.95))),
         _eyeballs(patch, len(rest_m)),
     )
 

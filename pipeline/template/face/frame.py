@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.template.face_landmarks import FACE_LANDMARKS
+from pipeline.template.face.landmarks import FACE_LANDMARKS
 
 _HALF_WIDTH, _TAPER, _HALF_HEIGHT, _CENTRE_Y = 0.65, 0.28, 0.62, -0.40
 """Outline of the patch: from the brows to below the lower lip, 1.3 times as wide as the outer corners of the eyes at

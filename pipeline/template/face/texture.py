@@ -16,8 +16,9 @@ from pipeline.geometry.atlas import Atlas, Texels, rasterize_texels
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import closest_points_on_mesh
 from pipeline.geometry.texture_rendering import sample_texture
-from pipeline.template.face_frame import FaceFrame
-from pipeline.template.face_patch import (
+from pipeline.template.face.frame import FaceFrame
+from pipeline.template.face.front_view import view_from_front
+from pipeline.template.face.patch import (
     EYE_LEFT,
     EYE_RIGHT,
     MOUTH,
@@ -28,7 +29,6 @@ from pipeline.template.face_patch import (
     TONGUE,
     FacePatch,
 )
-from pipeline.template.front_view import view_from_front
 from pipeline.texture.edge_padding import fill_unknown_texels
 
 CHART_BOXES = {

@@ -12,14 +12,14 @@ from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import top_k_weights
 from pipeline.geometry.surface import closest_points_on_mesh, collapse_edges, remove_unreferenced_vertices
 from pipeline.mesh.files import MeshArtifact
-from pipeline.template.animated_face import AnimatedFace, animate_face, build_animated_face
-from pipeline.template.face_frame import face_frame
-from pipeline.template.face_landmarks import FACE_LANDMARKS
-from pipeline.template.face_motion import closing_factors
-from pipeline.template.face_patch import EYE_LEFT, EYE_RIGHT, FacePatchError, build_face_patch
-from pipeline.template.face_texture import CapturedSurface
-from pipeline.template.face_units import VISEMES, add_visemes, load_face_units, load_teeth
-from pipeline.template.front_view import view_from_front
+from pipeline.template.face.animated_face import AnimatedFace, animate_face, build_animated_face
+from pipeline.template.face.frame import face_frame
+from pipeline.template.face.front_view import view_from_front
+from pipeline.template.face.landmarks import FACE_LANDMARKS
+from pipeline.template.face.motion import closing_factors
+from pipeline.template.face.patch import EYE_LEFT, EYE_RIGHT, FacePatchError, build_face_patch
+from pipeline.template.face.texture import CapturedSurface
+from pipeline.template.face.units import VISEMES, add_visemes, load_face_units, load_teeth
 from pipeline.template.regions import load_template
 from pipeline.template.registration import register_template
 from stages.mesh import STAGE as MESH
@@ -218,11 +218,10 @@ def test_the_jaw_opens_downwards_and_the_left_eye_is_on_the_left() -> None:
     assert (at[:, 0] @ blink) / blink.sum() > 0.2
 
 
-def test_a_picture_without_a_face_is_refused_with_the_reason() -> None:
-    class Blind:
-        def detect_face(self, rgb: np.ndarray) -> None:
-            return None
-
-    artifact, surface = captured()
-    with pytest.raises(FacePatchError, match="no face was found"):
-        build_animated_face(generated_person().fitted, artifact, surface, Blind)
+def test_a_person_without_a_face_is_refused_with_the_reason() -> None:
+    person = generated_person()
+    registration = register_template(person.fitted, closed_surface())
+    assert not registration.has_face
+    for found, words in ((registration, "no face was found"), (None, "body of a model file")):
+        with pytest.raises(FacePatchError, match=words):
+            build_animated_face(person.fitted, found, *captured())

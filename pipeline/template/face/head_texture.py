@@ -1,0 +1,74 @@
+"""A first texture of the head, good enough for the face detector: the mean of frames that see the face from in front.
+
+The template is registered before the atlas of the person is made, because the atlas may be the template's.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from pipeline.body.body import Body
+from pipeline.geometry.atlas import rasterize_texels, unwrap
+from pipeline.geometry.mesh import Mesh
+from pipeline.mesh.files import MeshArtifact
+from pipeline.template.face.landmarks import Detector, FaceLandmarks, find_face_landmarks
+from pipeline.template.regions import is_template_body
+from pipeline.template.registration import Registration, register_template
+from pipeline.texture.bake import TexturedSurface, average_views, texels_to_texture
+from pipeline.texture.settings import TextureSettings
+from pipeline.texture.views import BakeView
+
+SIZE_PX = 1024
+MAX_FRAMES = 40
+"""Frames of the mean, those that see the face most from in front."""
+
+MIN_COSINE = 0.3
+"""Mean cosine between the front of the head and the direction to the camera; frames below do not show the face."""
+
+
+def register_person(
+    body: Body,
+    skinned: MeshArtifact,
+    views: Sequence[BakeView],
+    make_detector: Callable[[], Detector],
+    settings: TextureSettings,
+) -> Registration | None:
+    """Return the template on the person; None for a body of a model file.
+
+    Args:
+        body: the fitted body in the A-pose.
+        skinned: the person's mesh in the A-pose.
+        views: training frames.
+        make_detector: constructs the detector of face landmarks.
+        settings: of the projection of frames.
+    """
+    if not is_template_body(body):
+        return None
+    landmarks = find_landmarks(body, skinned, views, make_detector, settings)
+    return register_template(body, skinned.mesh, landmarks)
+
+
+def find_landmarks(
+    body: Body,
+    skinned: MeshArtifact,
+    views: Sequence[BakeView],
+    make_detector: Callable[[], Detector],
+    settings: TextureSettings,
+) -> FaceLandmarks | None:
+    """Return the landmarks of the face on the person's surface, or None where no frame shows a plausible face."""
+    mesh = skinned.mesh
+    head = skinned.dense_skin_weights(len(body.joint_names)).numpy()[:, body.joint("Head")] > 0.5
+    front = head & (mesh.vertex_normals()[:, 2] > 0.5)
+    faces = np.ascontiguousarray(mesh.faces[head[mesh.faces].all(axis=1)])
+    if not front.any() or len(faces) == 0:
+        return None
+    cosines = np.array([float(view.view_cosine.numpy()[front].mean()) for view in views])
+    order = np.argsort(-cosines, kind="stable")[:MAX_FRAMES]
+    chosen = [views[k] for k in order if cosines[k] > MIN_COSINE]
+    if not chosen:
+        return None
+    shell = Mesh(mesh.vertices, faces)
+    atlas = unwrap(shell, np.zeros(len(faces), np.int32), SIZE_PX, settings.padding_px)
+    texels = rasterize_texels(atlas, SIZE_PX)
+    mean = average_views(chosen, TexturedSurface.from_arrays(faces, atlas, texels), settings)
+    return find_face_landmarks(body, shell, atlas, texels_to_texture(mean.value(), texels), make_detector())

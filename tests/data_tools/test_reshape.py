@@ -1,0 +1,75 @@
+"""The command reshape on a run with known mesh, motion and texture."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from data_tools.edited_avatar import load_editable_avatar
+from data_tools.reshape import main, reshape_scene
+from pipeline.avatar.placement import FLOOR_PERCENTILE
+from pipeline.avatar.skinned_avatar import lowest_vertex_y_m
+from pipeline.core.errors import UserError
+from pipeline.core.manifest import digest_files
+from pipeline.io.glb import GlbFile
+from pipeline.template.files import save_template
+from pipeline.template.reshape import SHAPE_KEYS
+from stages.export import STAGE, encode_scene
+from tests.data_tools.exported_run import write_exported_run
+from tests.field.scene import PaintedScene, painted_scene
+
+
+@pytest.fixture(scope="module")
+def scene() -> PaintedScene:
+    return painted_scene(frames=6, height_px=32)
+
+
+@pytest.fixture
+def run(scene: PaintedScene, tmp_path: Path) -> Path:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    write_exported_run(folder, scene)
+    return folder
+
+
+def test_the_avatar_is_written_in_its_new_shape_and_stands_on_the_floor(run: Path) -> None:
+    before = {stage: digest_files(run / stage) for stage in STAGE.needs[1:]}
+    main([str(run), "--shape", "height=+0.3 weight=-0.2"])
+    out = run / "reshape" / "height+0.3_weight-0.2"
+    glb = GlbFile(out / "avatar.glb")
+    assert [animation["name"] for animation in glb.gltf["animations"]] == ["capture", "idle"]
+    heights = [
+        float(line.split()[2]) for line in (out / "avatar.obj").read_text().splitlines() if line.startswith("v ")
+    ]
+    avatar = load_editable_avatar(run)
+    assert np.ptp(heights) > np.ptp(avatar.scene.skinned.mesh.vertices[:, 1]) + 0.05
+    taller = reshape_scene(avatar, {"height": 0.3}, run)
+    assert taller.body.joints_m[taller.body.joint("Head"), 1] > avatar.scene.body.joints_m[taller.body.joint("Head"), 1]
+    lowest_m = lowest_vertex_y_m(taller.skinned, taller.body, taller.motion)
+    assert np.percentile(lowest_m, FLOOR_PERCENTILE) == pytest.approx(0.0, abs=1e-4)
+    assert taller.motion.root_translation_m[:, 1].mean() > avatar.scene.motion.root_translation_m[:, 1].mean()
+    assert {stage: digest_files(run / stage) for stage in before} == before
+
+
+def test_shape_keys_are_morph_targets(run: Path) -> None:
+    avatar = load_editable_avatar(run)
+    config = avatar.config.model_copy(update={"shape_keys": True})
+    path = run / "keys.glb"
+    path.write_bytes(encode_scene(avatar.scene, config, {}))
+    mesh = GlbFile(path).gltf["meshes"][0]
+    assert mesh["extras"]["targetNames"] == list(SHAPE_KEYS)
+    assert len(mesh["primitives"][0]["targets"]) == len(SHAPE_KEYS)
+
+
+def test_bad_changes_and_bodies_are_one_sentence_and_write_nothing(run: Path) -> None:
+    with pytest.raises(UserError, match="use height, weight, muscle, age"):
+        main([str(run), "--shape", "size=2"])
+    with pytest.raises(UserError, match="empty"):
+        main([str(run), "--shape", ""])
+    save_template(run / "texture", None)
+    with pytest.raises(UserError, match="only the built-in body"):
+        main([str(run), "--shape", "weight=0.1"])
+    avatar = load_editable_avatar(run)
+    with pytest.raises(UserError, match="shape_keys=true needs the built-in body"):
+        encode_scene(avatar.scene, avatar.config.model_copy(update={"shape_keys": True}), {})
+    assert not (run / "reshape").exists()
