@@ -51,7 +51,7 @@ BASELINE ?=
 
 # Tests: worker processes, each with one thread of OpenMP. TEST_JOBS=0 runs them in one process with all threads.
 TEST_JOBS ?= 2
-PYTEST := $(if $(filter 0,$(TEST_JOBS)),,OMP_NUM_THREADS=1) $(RUN_PYTHON) -m pytest -n $(TEST_JOBS)
+PYTEST := $(if $(filter 0,$(TEST_JOBS)),,OMP_NUM_THREADS=1) $(RUN_PYTHON) -m pytest -n $(TEST_JOBS) --dist loadfile
 
 TORCH_VERSION := 2.13.0
 GLTF_VALIDATOR_VERSION := 2.0.0-dev.3.10

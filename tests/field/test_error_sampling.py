@@ -70,6 +70,7 @@ def test_a_frame_without_a_person_has_only_rays_outside():
     assert sample_counts[1, :2].tolist() == [0, 0]
 
 
+@pytest.mark.slow
 def test_a_resumed_training_samples_the_same_pixels(scene):
     options = {"steps": 12, "error_sampling_ratio": 0.6, "occupancy_warmup_steps": 4}
     whole, first = make_trainer(scene, **options), make_trainer(scene, **options)

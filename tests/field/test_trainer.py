@@ -35,6 +35,7 @@ def test_learns_a_painted_body_and_renders_it_in_a_new_pose(scene):
     assert int(trainer.occupancy.occupied.sum()) < initially_occupied
 
 
+@pytest.mark.slow
 def test_refinement_finds_a_shift_of_the_body(scene):
     wrong = scene.motion.root_translation_m + np.array([0.03, 0, 0], dtype=np.float32)
     moved = scene.motion.with_pose(scene.motion.rotations_wxyz, wrong)
@@ -138,6 +139,7 @@ def test_parts_of_a_step_add_up_to_the_whole(scene, monkeypatch, frames_per_step
     np.testing.assert_allclose(error_map, part_errors, rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="this machine has one thread")
 def test_results_do_not_depend_on_thread_count(scene, monkeypatch):
     states = []
@@ -152,6 +154,7 @@ def test_results_do_not_depend_on_thread_count(scene, monkeypatch):
         assert torch.equal(value, states[1][name]), name
 
 
+@pytest.mark.slow
 def test_unobserved_cells_lose_their_density(scene):
     plain, penalised = (
         make_trainer(scene, steps=80, pose_refinement=False, unobserved_points=count) for count in (0, 256)

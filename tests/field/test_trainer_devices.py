@@ -96,6 +96,7 @@ def test_validation_with_refined_poses(scene, trained):
     assert all(np.isfinite(score) for score in subsampled_validator.psnr_per_frame_db(renders))
 
 
+@pytest.mark.slow
 def test_a_step_has_few_operations(scene):
     with fake_device() as calls:
         trainer = make_trainer(scene, FAKE_DEVICE, **FEW)

@@ -58,6 +58,7 @@ def test_second_process_uses_the_cache(kernels: Path) -> None:
     assert second["rows"] == first["rows"]
 
 
+@pytest.mark.slow
 def test_changed_constant_in_another_file_invalidates_the_cache(kernels: Path) -> None:
     before = json.loads(output(kernels, HASH_ROWS_SCRIPT))
     (kernels / "common" / "hashing.py").write_text("PRIMES = (2654435769, 805459861)\n")
@@ -66,6 +67,7 @@ def test_changed_constant_in_another_file_invalidates_the_cache(kernels: Path) -
     assert after["rows"] != before["rows"]
 
 
+@pytest.mark.slow
 def test_order_of_imports_has_no_effect(kernels: Path) -> None:
     """numba reads the environment at its import, which may be before the kernels set their variables."""
     late, early = (json.loads(output(kernels, f"import {first}\n{HASH_ROWS_SCRIPT}")) for first in ("numba", "json"))
@@ -73,6 +75,7 @@ def test_order_of_imports_has_no_effect(kernels: Path) -> None:
     assert (early["cached"], early["compiled"]) == (1, 0)
 
 
+@pytest.mark.slow
 def test_cache_is_separate_without_slp_vectorisation(kernels: Path) -> None:
     output(kernels, HASH_ROWS_SCRIPT, NUMBA_SLP_VECTORIZE="0")
     assert json.loads(output(kernels, HASH_ROWS_SCRIPT))["compiled"] == 1

@@ -167,6 +167,7 @@ def test_writes_a_closed_manifold_with_skin_and_colours(inputs: dict[str, Path],
     assert (preview < 250).any(axis=2).mean() > 0.1
 
 
+@pytest.mark.slow
 def test_a_run_killed_after_a_round_resumes_to_the_same_bytes(
     inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

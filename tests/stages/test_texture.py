@@ -162,6 +162,7 @@ def test_a_normal_map_is_made_only_where_faces_were_removed(
     assert np.abs(normal - np.float32(FLAT_NORMAL)).mean() < 0.01
 
 
+@pytest.mark.slow
 def test_the_templates_layout_is_baked_as_well_as_the_persons_own(
     scene: PaintedScene, inputs: dict[str, Path], textured: tuple[Path, dict[str, float]], tmp_path: Path
 ) -> None:

@@ -23,6 +23,7 @@ def found() -> tuple[GeneratedPerson, Registration, Correspondence]:
     return person, registration, correspond(person.fitted, registration, person.surface)
 
 
+@pytest.mark.slow
 def test_vertices_lie_where_the_template_does() -> None:
     """The vertices of the generated person that are the template's own come first."""
     person, _, points = found()

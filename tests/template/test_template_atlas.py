@@ -74,6 +74,7 @@ def _face_at_back(body) -> int:  # type: ignore[no-untyped-def]
     return int(np.linalg.norm(middle - target, axis=1).argmin())
 
 
+@pytest.mark.slow
 def test_a_person_lies_on_it_without_folds() -> None:
     found, surface = laid_out(SEEDS[0])
     atlas = found.atlas

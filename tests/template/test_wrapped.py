@@ -23,6 +23,7 @@ def wrapped() -> WrappedTemplate:
     return wrap_template(person.fitted, registration, captured()[1])
 
 
+@pytest.mark.slow
 def test_the_quads_lie_on_the_person_without_folds() -> None:
     found, template, person = wrapped(), load_template(), generated_person()
     rows = np.flatnonzero(template.skin_vertices)

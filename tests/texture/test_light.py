@@ -213,6 +213,7 @@ class LitBall:
         return float(np.abs(gain * found - truth).mean())
 
 
+@pytest.mark.slow
 def test_evidence_removes_the_light_of_a_lamp() -> None:
     scene = LitBall(ambient=0.4, key=0.6)
     evidence = scene.evidence()

@@ -76,6 +76,7 @@ def test_heldout_surfaces_depend_on_held_out_frames_only(perfect: Comparison) ->
     assert trained["chamfer_mm"] < 0.2
 
 
+@pytest.mark.slow
 def test_scale_is_aligned(perfect: Comparison) -> None:
     scores = compare_rest_surfaces(with_scale(perfect, 0.9))
     assert scores["chamfer_mm"] < 0.2
@@ -91,6 +92,7 @@ def test_novel_poses_of_the_true_rig(perfect: Comparison) -> None:
     assert min(picture.scores()["mask_iou"] for picture in pictures) > 0.97
 
 
+@pytest.mark.slow
 def test_matched_surfaces_follow_the_motion_of_the_avatar(perfect: Comparison) -> None:
     """An avatar whose arm is raised in every frame of the video is raised so in the A-pose of the true rig."""
     assert compare_matched_surfaces(perfect)["chamfer_mm"] < 0.2
@@ -112,6 +114,7 @@ def test_different_rest_pose_is_no_error(perfect: Comparison) -> None:
     assert compare_texture(other)["colour_error"] < 2.0
 
 
+@pytest.mark.slow
 def test_novel_views_of_the_true_avatar(perfect: Comparison) -> None:
     """The truth is lit and the avatar is unlit: masks agree, and a black avatar has a lower PSNR."""
     pictures = compare_novel_views(perfect)
@@ -122,6 +125,7 @@ def test_novel_views_of_the_true_avatar(perfect: Comparison) -> None:
     assert dark[0].scores()["psnr_body"] < pictures[0].scores()["psnr_body"] - 3.0
 
 
+@pytest.mark.slow
 def test_texture_of_known_error(perfect: Comparison) -> None:
     """Darker by a fifth, and only the left half is observed."""
     avatar = perfect.run.avatar
@@ -238,6 +242,7 @@ def test_upper_bound_of_true_poses(perfect: Comparison, perfect_upper_bound: dic
     assert perfect_upper_bound["mask_iou"] > 0.99
 
 
+@pytest.mark.slow
 def test_upper_bound_has_the_edge_blur_of_the_masks(perfect: Comparison, tmp_path: Path) -> None:
     """Edges are blurred by 1.5 px in all frames: a sharp upper bound scores lower than one with equal blur."""
     soft = with_frames(perfect, tmp_path, lambda person: unpremultiply_to_uint8(blur_coverage(person, 1.5)))
@@ -248,6 +253,7 @@ def test_upper_bound_has_the_edge_blur_of_the_masks(perfect: Comparison, tmp_pat
     assert compare_heldout_images(soft)["upper_bound"]["psnr_full"] > sharp["psnr_full"] + 6.0
 
 
+@pytest.mark.slow
 def test_missing_mask_parts_cost_only_in_the_true_mask_scores(perfect: Comparison, tmp_path: Path) -> None:
     """Masks without legs, and a field without legs: white where the true target has legs."""
 

@@ -19,6 +19,7 @@ from data_tools.evaluate.comparison import Comparison
 from tests.data_tools.ground_truth_run import with_motion, with_scale
 
 
+@pytest.mark.slow
 def test_a_wrong_part_is_found_by_its_label(perfect: Comparison) -> None:
     """The hair of the avatar stands out by 6 mm: its label shows that, the shoes' does not."""
     subject = perfect.truth.subject
@@ -36,6 +37,7 @@ def test_a_wrong_part_is_found_by_its_label(perfect: Comparison) -> None:
     assert sum(part["area_share"] for part in right.values()) == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_clay_shows_where_the_shape_is_wrong(perfect: Comparison) -> None:
     """Truth and avatar are equal in clay; a dent in the chest of the avatar is seen from the front only."""
     body = perfect.truth.subject.body

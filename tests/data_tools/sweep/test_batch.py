@@ -41,6 +41,7 @@ def rows(toy: Toy) -> dict[str, dict[str, str]]:
         return {row["video"]: row for row in csv.DictReader(file)}
 
 
+@pytest.mark.slow
 def test_broken_video_does_not_stop_the_others(batch: Toy) -> None:
     message = batch.expect_user_error("data_tools.sweep.batch", "videos", "--preset", "quick")
     assert "1 of 3 videos have no avatar (bob)" in message

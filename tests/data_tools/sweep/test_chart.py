@@ -184,6 +184,7 @@ def test_invalid_steps_are_an_error(entry: str) -> None:
         chart(["none.mp4", "--presets", "default", "--steps", entry])
 
 
+@pytest.mark.slow
 def test_failed_run_does_not_stop_the_others(sweep: Toy) -> None:
     (sweep.folder / "words.mp4").write_text("one two")
     message = sweep.expect_user_error(

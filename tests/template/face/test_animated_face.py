@@ -78,6 +78,7 @@ def test_the_surface_stays_closed(face: AnimatedFace) -> None:
     assert face.boundary_gap_m < 0.004
 
 
+@pytest.mark.slow
 def test_the_face_adds_no_more_triangles_than_the_limit_of_the_mesh_leaves() -> None:
     """The .glb has at most 25,000. A coarse surface is the worst case: it loses few faces where the face is put in."""
     whole, person = closed_surface(), generated_person()
@@ -151,6 +152,7 @@ def test_normals_turn_with_the_moved_surface(face: AnimatedFace) -> None:
     assert np.quantile(np.linalg.norm(face.normal_changes[row][still], axis=1), 0.99) == 0.0
 
 
+@pytest.mark.slow
 def test_lids_meet_at_weight_one_whatever_the_units_travel() -> None:
     """A unit that moves the lids half as far again closes them at two thirds of its weight."""
     person, names = generated_person(), load_face_units().names

@@ -67,6 +67,7 @@ def test_focal_length_is_recovered_with_the_axis() -> None:
     assert 600.0 * np.exp(axis.focal_log) == pytest.approx(500.0, rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ratio", "contradicts"), [(0.5, True), (1.05, False), (2.0, True)])
 def test_a_supplied_focal_length_that_contradicts_the_turn_is_found(ratio: float, contradicts: bool) -> None:
     observations = turning_body((0.0, 0.1))
@@ -85,6 +86,7 @@ def test_a_person_who_does_not_turn_gives_no_axis() -> None:
     assert estimate_turn_axis(turning_body((0.0, 0.2), turn_rad=2.5), 0.5) is None
 
 
+@pytest.mark.slow
 def test_a_body_that_is_not_rigid_gives_no_axis() -> None:
     assert estimate_turn_axis(turning_body((0.0, 0.2), swing_m=0.4), 0.5) is None
 
@@ -96,6 +98,7 @@ def test_undetected_feet_give_no_axis() -> None:
     assert estimate_turn_axis(replace(observations, confidence=confidence), 0.5) is None
 
 
+@pytest.mark.slow
 def test_a_level_turn_with_swinging_limbs_stays_level() -> None:
     scene = synthetic_recording(load_anny(), frames=30)
     axis = estimate_turn_axis(scene.observations(scene.camera), 0.5)
