@@ -54,6 +54,7 @@ def test_a_file_that_is_no_video(tmp_path: Path) -> None:
     assert "notes.mp4" in expect_user_error(tmp_path / "notes.mp4", tmp_path / "run")
 
 
+@pytest.mark.slow
 def test_black_frames(tmp_path: Path) -> None:
     assert str(tmp_path / "black") in expect_user_error(write_frames(tmp_path / "black", 0), tmp_path / "run")
 

@@ -205,6 +205,7 @@ def fitted(smpl: SmplBody) -> tuple[SyntheticRecording, FitResult]:
     return scene, fit_body(smpl, scene.observations(scene.camera), scene.windows(), options)
 
 
+@pytest.mark.slow
 def test_a_known_pose_is_fitted(fitted: tuple[SyntheticRecording, FitResult]) -> None:
     scene, result = fitted
     found = fitted_joints_m(result, scene)

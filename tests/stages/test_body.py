@@ -118,6 +118,7 @@ def test_the_vertical_is_estimated_unless_the_camera_pose_is_supplied(
     assert fit.call_args.args[3].vertical_is_known is is_known
 
 
+@pytest.mark.slow
 def test_an_unusable_frame_is_marked_reported_and_dropped(tmp_path, scene: SyntheticRecording) -> None:
     frames, out = tmp_path / "frames", tmp_path / "body"
     out.mkdir()
@@ -148,6 +149,7 @@ def test_a_fit_without_masks_is_refused() -> None:
         check_fit_quality(fit, capture_of([0] * 12), Config(min_silhouette_iou=0.0), False)
 
 
+@pytest.mark.slow
 def test_a_fit_with_too_many_unusable_frames_is_refused() -> None:
     silhouette_iou = np.where(np.arange(12) < 4, 0.3, 0.9)
     with pytest.raises(UserError, match=r"in 4 of 12 training frames.*frames 0-6.*split.json.*body.max_dropped_share"):
@@ -164,6 +166,7 @@ def test_a_fit_with_too_many_unusable_frames_is_refused() -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_foreign_object_is_reported(tmp_path, scene: SyntheticRecording) -> None:
     frames, out = tmp_path / "frames", tmp_path / "body"
     out.mkdir()

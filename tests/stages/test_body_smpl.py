@@ -140,6 +140,7 @@ def test_frames_without_a_supplied_pose_are_fitted(tmp_path, model_file, scene: 
     assert 1e-4 < errors[missing].max() < 0.06
 
 
+@pytest.mark.slow
 def test_supplied_poses_are_refined(tmp_path, model_file, scene: SyntheticRecording) -> None:
     """Poses with errors of 5 cm and bent joints are refined; the shape is that of the file."""
     true = true_poses(scene)

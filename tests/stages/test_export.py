@@ -172,6 +172,7 @@ def test_a_normal_map_is_exported_with_tangents_and_the_formats_accept_it(
         assert validator_issues(out / name) == []
 
 
+@pytest.mark.slow
 def test_further_formats_are_written_and_the_glb_stays(
     inputs: dict[str, Path], exported: tuple[Path, dict[str, float]], tmp_path: Path
 ) -> None:

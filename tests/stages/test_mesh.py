@@ -192,6 +192,7 @@ def test_a_run_killed_after_a_round_resumes_to_the_same_bytes(
     assert (whole / "mesh.npz").read_bytes() == (killed / "mesh.npz").read_bytes()
 
 
+@pytest.mark.slow
 def test_renders_of_the_field_are_training_views_only(
     inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

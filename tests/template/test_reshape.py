@@ -43,6 +43,7 @@ def test_the_body_itself_takes_the_models_shape() -> None:
     assert np.linalg.norm(change.joints_m, axis=1).max() > 0.01
 
 
+@pytest.mark.slow
 def test_clothes_keep_their_offset_and_the_way_back_is_the_start() -> None:
     person = generated_person()
     surface, registration = person.surface, exact(person.template_m)

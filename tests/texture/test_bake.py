@@ -63,6 +63,7 @@ def test_neither_background_nor_occluder_bleeds_in(ball: PaintedBall) -> None:
     assert np.abs(colour - ball.truth)[knobs & (confidence > 0.9)].mean() < 0.1
 
 
+@pytest.mark.slow
 def test_alignment_removes_the_blur_of_wrong_poses(misaligned_ball: PaintedBall) -> None:
     def contrast(rounds: int) -> float:
         colour, confidence = baked_colours(misaligned_ball, rounds)

@@ -14,6 +14,7 @@ from tests.avatar.formats.skirt_avatar import SKIRT_VERTICES, clothed, skirt_glb
 from tests.avatar.formats.test_vrm import RestPlayer
 from tests.tools.khronos import validator_issues
 
+pytestmark = pytest.mark.slow
 META = VrmMeta("avatar", "A. Person", "")
 
 

@@ -112,6 +112,7 @@ def test_fast_arm_motion_is_tracked() -> None:
     assert (found - true).abs().max() < 0.06
 
 
+@pytest.mark.slow
 def test_face_landmarks_on_the_back_of_a_head_are_ignored() -> None:
     """The person is seen from behind (126 to 206 degrees); the detector invents a face towards the camera."""
     away = torch.linspace(2.2, 3.6, 8, dtype=torch.float64)

@@ -125,7 +125,6 @@ def test_novel_views_of_the_true_avatar(perfect: Comparison) -> None:
     assert dark[0].scores()["psnr_body"] < pictures[0].scores()["psnr_body"] - 3.0
 
 
-@pytest.mark.slow
 def test_texture_of_known_error(perfect: Comparison) -> None:
     """Darker by a fifth, and only the left half is observed."""
     avatar = perfect.run.avatar
@@ -253,7 +252,6 @@ def test_upper_bound_has_the_edge_blur_of_the_masks(perfect: Comparison, tmp_pat
     assert compare_heldout_images(soft)["upper_bound"]["psnr_full"] > sharp["psnr_full"] + 6.0
 
 
-@pytest.mark.slow
 def test_missing_mask_parts_cost_only_in_the_true_mask_scores(perfect: Comparison, tmp_path: Path) -> None:
     """Masks without legs, and a field without legs: white where the true target has legs."""
 

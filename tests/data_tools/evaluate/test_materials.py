@@ -12,6 +12,7 @@ from pipeline.capture.capture import load_capture
 from pipeline.metrics.surfaces import chamfer_distance_mm
 
 
+@pytest.mark.slow
 def test_the_run_is_the_true_person(sample: Path, tmp_path: Path) -> None:
     truth = load_ground_truth(sample)
     gains = write_true_run(truth, tmp_path, 3, flicker=0.2)

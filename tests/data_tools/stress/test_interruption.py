@@ -32,6 +32,7 @@ def folders(toy: Toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[
     return tmp_path / "captures", tmp_path / "trial"
 
 
+@pytest.mark.slow
 def test_killed_runs_end_with_the_same_bytes(folders: tuple[Path, Path]) -> None:
     scores = interruption_scores(*folders, kind="kills", count=3)
     assert scores["differing_files"] == 0.0

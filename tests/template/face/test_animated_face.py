@@ -220,6 +220,7 @@ def test_the_jaw_opens_downwards_and_the_left_eye_is_on_the_left() -> None:
     assert (at[:, 0] @ blink) / blink.sum() > 0.2
 
 
+@pytest.mark.slow
 def test_a_person_without_a_face_is_refused_with_the_reason() -> None:
     person = generated_person()
     registration = register_template(person.fitted, closed_surface())

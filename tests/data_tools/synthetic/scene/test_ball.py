@@ -41,6 +41,7 @@ def test_ball_is_in_front_of_the_person() -> None:
     assert np.ptp(places[:, 1]) > 0.7
 
 
+@pytest.mark.slow
 def test_capture_with_a_ball_and_its_ground_truth(sample: Path, tmp_path: Path) -> None:
     main([str(tmp_path / "ball"), *SAMPLE_OPTIONS, "--ball"])
     assert json.loads((tmp_path / "ball" / "truth" / "capture_settings.json").read_text())["ball"] is True
