@@ -6,7 +6,6 @@ from pathlib import Path
 
 from data_tools.folder import replaced_folder
 from data_tools.pose import export_config
-from pipeline.avatar.idle import idle_motion
 from pipeline.avatar.skinned_avatar import to_rest_pose
 from pipeline.io.image import to_uint8, write_gray, write_rgb
 from pipeline.texture.files import DIFFUSE, NORMAL, SPECULAR, TextureArtifact, save_normal_map
@@ -43,11 +42,10 @@ def write_edited_avatar(
     scene, config = avatar.scene, avatar.config
     face = make_face(scene.body, scene.template, scene.skinned, texture) if config.face else None
     edited = replace(scene, texture=texture, face=face)
-    clips = {"capture": scene.motion, "idle": idle_motion(scene.body)}
     with replaced_folder(out) as part:
         write_rgb(part / DIFFUSE, to_uint8(texture.diffuse))
         write_gray(part / SPECULAR, to_uint8(texture.specular))
         save_normal_map(part / NORMAL, texture)
-        (part / "avatar.glb").write_bytes(encode_scene(edited, config, clips))
+        (part / "avatar.glb").write_bytes(encode_scene(edited, config, edited.clips()))
         write_scene_obj(part, part, texture, to_rest_pose(scene.skinned, scene.rig).mesh)
     report(f"{out}: avatar.glb, avatar.obj, {DIFFUSE} ({len(texture.diffuse)} px)")

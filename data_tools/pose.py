@@ -19,7 +19,6 @@ from data_tools.command import run_command
 from data_tools.folder import replaced_folder
 from pipeline.avatar.bvh_export import motion_to_bvh
 from pipeline.avatar.feet import find_contacts, plant_feet, snap_feet_to_floor, sole_positions_m
-from pipeline.avatar.idle import idle_motion
 from pipeline.avatar.placement import resample_uniformly
 from pipeline.avatar.retarget import retarget_with_contacts
 from pipeline.avatar.rig import build_rig
@@ -47,8 +46,7 @@ def main(argv: Sequence[str]) -> None:
     with replaced_folder(options.run / "pose" / _result_name(options)) as out:
         write_bvh(out / "capture.bvh", motion_to_bvh(scene.rig, planted_motion(scene), scene.fps))
         if clips:
-            every_clip = {"capture": scene.motion, "idle": idle_motion(scene.body), **clips}
-            (out / "avatar.glb").write_bytes(encode_scene(scene, config, every_clip))
+            (out / "avatar.glb").write_bytes(encode_scene(scene, config, scene.clips() | clips))
         if posed is not None:
             write_scene_obj(inputs["texture"], out, scene.texture, _posed_mesh(scene, posed))
         written = sorted(path.name for path in out.iterdir() if path.suffix in (".bvh", ".glb", ".obj"))

@@ -18,7 +18,6 @@ from data_tools.command import run_command
 from data_tools.edited_avatar import EditableAvatar, load_editable_avatar
 from data_tools.folder import replaced_folder
 from data_tools.pose import check_folder_name
-from pipeline.avatar.idle import idle_motion
 from pipeline.avatar.placement import FLOOR_PERCENTILE, translate_motion
 from pipeline.avatar.rig import build_rig
 from pipeline.avatar.skinned_avatar import lowest_vertex_y_m, to_rest_pose
@@ -46,9 +45,8 @@ def main(argv: Sequence[str]) -> None:
     avatar = load_editable_avatar(options.run)
     scene = reshape_scene(avatar, changes, options.run)
     out = options.run / "reshape" / name
-    clips = {"capture": scene.motion, "idle": idle_motion(scene.body)}
     with replaced_folder(out) as part:
-        (part / "avatar.glb").write_bytes(encode_scene(scene, avatar.config, clips))
+        (part / "avatar.glb").write_bytes(encode_scene(scene, avatar.config, scene.clips()))
         write_scene_obj(options.run / "texture", part, scene.texture, to_rest_pose(scene.skinned, scene.rig).mesh)
     print(f"{out}: avatar.glb, avatar.obj")
 

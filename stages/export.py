@@ -38,7 +38,7 @@ from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
 from pipeline.io.image import png_bytes, to_uint8, write_gray, write_rgb
 from pipeline.mesh.files import MeshArtifact, load_mesh
-from pipeline.template.face.animated_face import AnimatedFace, build_animated_face
+from pipeline.template.face.animated_face import AnimatedFace, build_animated_face, eye_centres_m
 from pipeline.template.face.patch import FacePatchError
 from pipeline.template.face.texture import CapturedSurface
 from pipeline.template.files import FittedTemplate, load_fitted_template
@@ -138,6 +138,10 @@ class Scene:
     extras: dict[str, Any]
     face: AnimatedFace | None = None
 
+    def clips(self) -> dict[str, Motion]:
+        """Return the animations of every .glb, by name."""
+        return {"capture": self.motion, "idle": idle_motion(self.body)}
+
 
 def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, float]:
     """Write `avatar.glb`, `avatar.obj` with its `.mtl` and maps, and the files of `config.formats`.
@@ -146,7 +150,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
         UserError: an input artifact cannot be read.
     """
     scene = load_scene(inputs, config)
-    glb = encode_scene(scene, config, {"capture": scene.motion, "idle": idle_motion(scene.body)})
+    glb = encode_scene(scene, config, scene.clips())
     (out / "avatar.glb").write_bytes(glb)
     meta = VrmMeta("avatar", config.author, config.licence_url)
     loose = loose_parts(scene) if {"vrm", "vrm0"} & set(config.formats) else LooseParts()
@@ -230,7 +234,8 @@ def encode_scene(scene: Scene, config: Config, clips: Mapping[str, Motion]) -> b
     at_rest = to_rest_pose(face.skinned if face else scene.skinned, scene.rig)
     mesh = build_skinned_mesh(at_rest, atlas)
     if face is not None:
-        displacements_m, eyes_m = face.displacements_m[:, atlas.vertex_of_uv], face.eye_centres_m(at_rest.mesh.vertices)
+        displacements_m = face.displacements_m[:, atlas.vertex_of_uv]
+        eyes_m = eye_centres_m(at_rest.mesh.vertices, face.eyeballs)
         turns = face.normal_changes[:, atlas.vertex_of_uv]
         mesh = replace(mesh, morphs=MorphTargets(face.names, displacements_m, eyes_m, turns))
     if config.shape_keys:
@@ -279,14 +284,11 @@ def write_wrapped(scene: Scene, config: Config, out: Path) -> None:
     vertices = at_rest.mesh.vertices
     mesh = build_skinned_mesh(at_rest, wrapped.atlas)
     if wrapped.names:
-        eyes_m = np.stack(
-            [0.5 * (ball.min(axis=0) + ball.max(axis=0)) for ball in (vertices[r] for r in wrapped.eyeballs)]
-        )
+        eyes_m = eye_centres_m(vertices, wrapped.eyeballs)
         moved_m = wrapped.displacements_m[:, wrapped.atlas.vertex_of_uv]
         mesh = replace(mesh, morphs=MorphTargets(wrapped.names, moved_m, eyes_m))
     maps = material_maps(texture, config, wrapped.diffuse, wrapped.specular)
-    clips = {"capture": scene.motion, "idle": idle_motion(scene.body)}
-    (out / "wrapped.glb").write_bytes(encode_glb(mesh, scene.rig, clips, maps, scene.camera, scene.extras))
+    (out / "wrapped.glb").write_bytes(encode_glb(mesh, scene.rig, scene.clips(), maps, scene.camera, scene.extras))
     write_rgb(out / f"wrapped_{DIFFUSE}", to_uint8(wrapped.diffuse))
     specular_name = None
     if wrapped.specular.any():

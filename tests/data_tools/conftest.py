@@ -1,4 +1,4 @@
-"""Session fixtures: one small synthetic person and one small capture."""
+"""One small synthetic person and one small capture; a run with a finished export."""
 
 from pathlib import Path
 
@@ -11,6 +11,8 @@ from data_tools.sample import main as make_sample  # noqa: E402 (after the hook,
 from data_tools.synthetic.rig.subject import Subject, load_subject  # noqa: E402
 from pipeline.body.body import Body  # noqa: E402
 from pipeline.body.files import load_body  # noqa: E402
+from tests.data_tools.exported_run import write_exported_run  # noqa: E402
+from tests.field.scene import PaintedScene, painted_scene  # noqa: E402
 
 SAMPLE_OPTIONS = [
     *("--frames", "6", "--fps", "6", "--size", "200", "--texture", "512"),
@@ -36,3 +38,18 @@ def subject(sample: Path) -> Subject:
 def bare(sample: Path) -> Body:
     """The body without clothes."""
     return load_body(sample / "truth" / "bare.npz")
+
+
+@pytest.fixture(scope="module")
+def scene() -> PaintedScene:
+    """A painted body in six frames."""
+    return painted_scene(frames=6, height_px=32)
+
+
+@pytest.fixture
+def run(scene: PaintedScene, tmp_path: Path) -> Path:
+    """A run whose export is finished, in the names of Mixamo; its texture is white."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    write_exported_run(folder, scene)
+    return folder

@@ -17,21 +17,7 @@ from pipeline.core.errors import UserError
 from pipeline.core.manifest import digest_files
 from pipeline.geometry.camera import project
 from stages.export import STAGE, Config, load_scene
-from tests.data_tools.exported_run import write_exported_run
-from tests.field.scene import PaintedScene, painted_scene
-
-
-@pytest.fixture(scope="module")
-def scene() -> PaintedScene:
-    return painted_scene(frames=6, height_px=32)
-
-
-@pytest.fixture
-def run(scene: PaintedScene, tmp_path: Path) -> Path:
-    folder = tmp_path / "run"
-    folder.mkdir()
-    write_exported_run(folder, scene)
-    return folder
+from tests.field.scene import PaintedScene
 
 
 def read_film(path: Path) -> list[np.ndarray]:

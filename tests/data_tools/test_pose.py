@@ -18,23 +18,8 @@ from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.io.bvh import read_bvh
 from pipeline.io.glb import GlbFile
 from stages.export import STAGE, Config, load_scene
-from tests.data_tools.exported_run import write_exported_run
-from tests.field.scene import PaintedScene, painted_scene
+from tests.field.scene import PaintedScene
 from tests.tools.khronos import validator_issues
-
-
-@pytest.fixture(scope="module")
-def scene() -> PaintedScene:
-    return painted_scene(frames=6, height_px=32)
-
-
-@pytest.fixture
-def run(scene: PaintedScene, tmp_path: Path) -> Path:
-    """A run whose export is finished, in the names of Mixamo."""
-    folder = tmp_path / "run"
-    folder.mkdir()
-    write_exported_run(folder, scene)
-    return folder
 
 
 def load(run: Path, **options: str):

@@ -15,21 +15,6 @@ from pipeline.io.glb import GlbFile
 from pipeline.template.files import save_template
 from pipeline.template.reshape import SHAPE_KEYS
 from stages.export import STAGE, encode_scene
-from tests.data_tools.exported_run import write_exported_run
-from tests.field.scene import PaintedScene, painted_scene
-
-
-@pytest.fixture(scope="module")
-def scene() -> PaintedScene:
-    return painted_scene(frames=6, height_px=32)
-
-
-@pytest.fixture
-def run(scene: PaintedScene, tmp_path: Path) -> Path:
-    folder = tmp_path / "run"
-    folder.mkdir()
-    write_exported_run(folder, scene)
-    return folder
 
 
 def test_the_avatar_is_written_in_its_new_shape_and_stands_on_the_floor(run: Path) -> None:

@@ -19,24 +19,10 @@ from pipeline.template.layout import load_layout
 from pipeline.template.template_atlas import build_template_atlas
 from pipeline.texture.files import load_texture, save_texture
 from tests.data_tools.exported_run import write_exported_run
-from tests.field.scene import PaintedScene, painted_scene
+from tests.field.scene import PaintedScene
 from tests.stages.painted_run import known_registration
 
 SIDE_PX = 256
-
-
-@pytest.fixture(scope="module")
-def scene() -> PaintedScene:
-    return painted_scene(frames=6, height_px=32)
-
-
-@pytest.fixture
-def run(scene: PaintedScene, tmp_path: Path) -> Path:
-    """A run whose export is finished; its texture is white."""
-    folder = tmp_path / "run"
-    folder.mkdir()
-    write_exported_run(folder, scene)
-    return folder
 
 
 def covered(run: Path, side_px: int) -> np.ndarray:

@@ -11,14 +11,9 @@ from pipeline.core.manifest import digest_files
 from pipeline.geometry.atlas import rasterize_texels
 from pipeline.io.image import read_rgb, write_rgb
 from pipeline.texture.files import load_texture
-from tests.data_tools.exported_run import write_exported_run
-from tests.field.scene import painted_scene
 
 
-def test_the_avatar_gets_the_palette_and_the_stages_keep_their_bytes(tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    run.mkdir()
-    write_exported_run(run, painted_scene(frames=6, height_px=32))
+def test_the_avatar_gets_the_palette_and_the_stages_keep_their_bytes(run: Path, tmp_path: Path) -> None:
     before = {stage: digest_files(run / stage) for stage in ("export", "texture")}
     look = np.zeros((20, 30, 3), np.uint8)
     look[..., 2] = 180

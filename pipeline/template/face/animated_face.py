@@ -80,11 +80,12 @@ class AnimatedFace:
     boundary_gap_m: float
     eyeballs: tuple[Int[np.ndarray, "k"], Int[np.ndarray, "k"]]
 
-    def eye_centres_m(self, vertices_m: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "2 3"]:
-        """Return the middles of the eyeballs where the vertices of the mesh are in any pose, m."""
-        return np.stack(
-            [0.5 * (ball.min(axis=0) + ball.max(axis=0)) for ball in (vertices_m[r] for r in self.eyeballs)]
-        )
+
+def eye_centres_m(
+    vertices_m: Float[np.ndarray, "v 3"], eyeballs: tuple[Int[np.ndarray, "k"], ...]
+) -> Float[np.ndarray, "2 3"]:
+    """Return the middles of the eyeballs (rows of vertices) where the vertices are in any pose, m."""
+    return np.stack([0.5 * (ball.min(axis=0) + ball.max(axis=0)) for ball in (vertices_m[rows] for rows in eyeballs)])
 
 
 def build_animated_face(
