@@ -18,7 +18,8 @@ from data_tools.command import run_command
 from data_tools.stress.row import Results, Row
 from data_tools.stress.rows import ROWS
 from data_tools.stress.run_trial import read_trial, run_trial
-from data_tools.stress.tables import Sweep, draw_figure, save_figure, write_csv_table, write_document
+from data_tools.stress.tables import Sweep, draw_figure, write_csv_table, write_document
+from data_tools.sweep.chart_figure import save_figure
 from pipeline.core.measure import REPOSITORY_DIR
 from pipeline.core.progress import track
 
@@ -58,7 +59,7 @@ def write_results(out: Path, document: Path | None, rows: dict[str, Row], chosen
     sweep: Sweep = {name: read_results(out, row) for name, row in rows.items()}
     write_csv_table(out / "stress.csv", rows, sweep)
     if any(result.scores for results in sweep.values() for result in results.values()):
-        save_figure(draw_figure(rows, sweep), out)
+        save_figure(draw_figure(rows, sweep), out, "stress", dpi=110)
     if document is not None:
         write_document(document, rows, sweep, "make stress")
     crossed = []

@@ -4,12 +4,11 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from data_tools.stress.row import DONE, MISSING, Results, Row
-from data_tools.sweep.chart_trials import join_distinct
+from data_tools.sweep.chart_trials import format_origin, join_distinct, short_commit
 from data_tools.sweep.runs import write_csv
 from pipeline.core.atomic import atomic_path
 
@@ -63,7 +62,7 @@ def summary_table(rows: Mapping[str, Row], sweep: Sweep) -> str:
         verdict, _ = row.verdict(results)
         done = [result for result in results.values() if result.state != MISSING]
         minutes = f"{sum(result.seconds for result in done) / 60:.0f}" if done else ""
-        commit = join_distinct(_short(result.commit) for result in done)
+        commit = join_distinct(short_commit(result.commit) for result in done)
         missing = f". Not made: {row.missing}" if row.missing else ""
         cells = (f"`{name}`", row.failure + missing, row.line, f"**{verdict}**")
         lines.append(
@@ -114,13 +113,6 @@ def draw_figure(rows: Mapping[str, Row], sweep: Sweep) -> Figure:
     return figure
 
 
-def save_figure(figure: Figure, folder: Path) -> None:
-    """Write `stress.png` and `stress.svg`; equal figures give equal bytes."""
-    figure.savefig(folder / "stress.png", dpi=110)
-    with mpl.rc_context({"svg.hashsalt": "stress", "svg.fonttype": "none"}):
-        figure.savefig(folder / "stress.svg", metadata={"Date": None})
-
-
 def _draw_row(axes: Axes, row: Row, results: Results) -> None:
     verdict, _ = row.verdict(results)
     colour = VERDICT_COLOURS[verdict]
@@ -144,12 +136,7 @@ def _points(row: Row, results: Results) -> list[tuple[str, float]]:
 
 def _provenance(sweep: Sweep) -> str:
     done = [result for results in sweep.values() for result in results.values() if result.state != MISSING]
-    commits, machines = join_distinct(_short(r.commit) for r in done), join_distinct(r.machine for r in done)
-    return f"Commit {commits or 'unknown'}, {machines or 'unknown machine'}"
-
-
-def _short(commit: str) -> str:
-    return f"{commit[:10]}{'+' if commit.endswith('+') else ''}"
+    return format_origin((result.commit for result in done), (result.machine for result in done))
 
 
 def _short_message(message: str) -> str:

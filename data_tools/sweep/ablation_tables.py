@@ -7,7 +7,7 @@ from pathlib import Path
 
 from data_tools.sweep.ablation_rows import REFERENCE, ROWS
 from data_tools.sweep.ablation_trials import FIGURE_PATHS, AblationResult, AblationTrial
-from data_tools.sweep.chart_trials import join_distinct
+from data_tools.sweep.chart_trials import format_origin
 from data_tools.sweep.runs import write_csv
 from data_tools.templates import render_template
 from pipeline.core.atomic import atomic_path
@@ -139,13 +139,9 @@ def markdown_table(table: Table) -> str:
 
 def provenance(results: Results) -> str:
     """Return commit and machine of the mesh stages, as one sentence part."""
-    commits = join_distinct(_short_commit(result.commit) for result in results.values())
-    machines = join_distinct(result.machine for result in results.values())
-    return f"Commit {commits or 'unknown'}, {machines or 'unknown machine'}"
-
-
-def _short_commit(commit: str) -> str:
-    return f"{commit[:10]}{'+' if commit.endswith('+') else ''}"
+    return format_origin(
+        (result.commit for result in results.values()), (result.machine for result in results.values())
+    )
 
 
 def _values(figures: Sequence[Mapping[str, float]], column: Column) -> list[float]:

@@ -111,9 +111,14 @@ def draw_chart(points: Sequence[ChartPoint], provenance: str) -> Figure:
 
 def save_chart(figure: Figure, folder: Path) -> None:
     """Write `chart.svg` and `chart.png`; equal figures give equal bytes."""
-    with mpl.rc_context({"svg.hashsalt": "chart", "svg.fonttype": "none"}):
-        figure.savefig(folder / "chart.svg", metadata={"Date": None})
-    figure.savefig(folder / "chart.png", dpi=130)
+    save_figure(figure, folder, "chart", dpi=130)
+
+
+def save_figure(figure: Figure, folder: Path, name: str, dpi: int) -> None:
+    """Write `NAME.svg` and `NAME.png`; equal figures give equal bytes."""
+    with mpl.rc_context({"svg.hashsalt": name, "svg.fonttype": "none"}):
+        figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
+    figure.savefig(folder / f"{name}.png", dpi=dpi)
 
 
 def _draw_runs(axes: Axes, panel: Panel, points: Sequence[ChartPoint], colours: dict[str, Colour]) -> None:

@@ -206,6 +206,17 @@ def join_distinct(texts: Iterable[str | None]) -> str:
     return "; ".join(dict.fromkeys(text for text in texts if text))
 
 
+def format_origin(commits: Iterable[str], machines: Iterable[str]) -> str:
+    """Return the commits, shortened, and the machines of some runs as one sentence part."""
+    short = join_distinct(short_commit(commit) for commit in commits)
+    return f"Commit {short or 'unknown'}, {join_distinct(machines) or 'unknown machine'}"
+
+
+def short_commit(commit: str) -> str:
+    """Return ten digits of a commit, with `+` if files differed from it."""
+    return f"{commit[:10]}{'+' if commit.endswith('+') else ''}"
+
+
 def describe_machine(environment: dict[str, Any]) -> str:
     """Return processor, cores and GPU of the environment of a manifest."""
     parts = [environment.get("cpu"), f"{environment.get('cores')} cores", environment.get("gpu")]

@@ -17,7 +17,7 @@ from typing import Any
 import stages
 from data_tools.command import run_command
 from data_tools.sweep.chart import run_and_compare
-from data_tools.sweep.chart_trials import STAGES_UNTIL_EXPORT, Trial, read_trial, table_row
+from data_tools.sweep.chart_trials import STAGES_UNTIL_EXPORT, Trial, read_trial, short_commit, table_row
 from data_tools.sweep.runs import RunState
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track
@@ -68,7 +68,7 @@ def single_origin(runs: Mapping[Trial, RunState]) -> str:
     if len(commits) > 1 or ";" in "".join(commits):
         raise UserError(f"the runs are of several commits ({', '.join(sorted(commits))}): remove the older runs")
     commit, machine = commits.pop(), "; ".join(sorted(machines))
-    return f"Commit {commit[:10]}{'+' if commit.endswith('+') else ''}, {machine}"
+    return f"Commit {short_commit(commit)}, {machine}"
 
 
 def preset_table(runs: Mapping[Trial, RunState], reports: Mapping[Trial, Mapping[str, Any]]) -> str:
