@@ -46,7 +46,7 @@ from pipeline.mesh.files import (
 from pipeline.mesh.isosurface import CanonicalGrid, extract_mesh, sample_canonical_grid, select_isovalue
 from pipeline.mesh.pose_refit import refit_poses, select_poses
 from pipeline.mesh.pose_selection import is_far_from, score_motion
-from pipeline.mesh.refinement import RefinementState, refine_mesh
+from pipeline.mesh.refinement import RefinementState, refine_mesh, with_offsets
 from pipeline.mesh.remeshing import detailed_faces, remesh_to_edge_length
 from pipeline.mesh.settings import MeshSettings
 from pipeline.mesh.skin_transfer import SkinnedTopology, transfer_skin
@@ -105,13 +105,15 @@ def run(
         settings: parameters that only sweeps and ablations vary.
 
     Returns:
-        The metrics of the manifest. Those of the mesh are of the written one in the poses of the field stage, except
+        The metrics of the manifest. Those of the mesh are of the written one, in the poses aligned to it, except
         `initial_validation_psnr_db`.
     """
     body = load_body(inputs["body"] / "body.npz")
     capture = load_capture(inputs["frames"])
-    chosen = usable_training_positions(capture, inputs["body"]), capture.positions(VALIDATION)
-    train, validation = (load_views(capture, positions, inputs, body, config) for positions in chosen)
+    motion = load_motion(inputs["field"] / "motion.npz")
+    parts = usable_training_positions(capture, inputs["body"]), capture.positions(VALIDATION)
+    chosen = [part[evenly_spaced(len(part), config.max_frames)] for part in parts]
+    train, validation = (load_views(capture, part, motion, inputs, body, config) for part in chosen)
     if not train:
         again = format_command("frames", out.parent, "--force")
         raise UserError(f"{inputs['frames']} has no training frames; run {again}")
@@ -133,6 +135,8 @@ def run(
         rounds=config.rounds,
         steps=config.steps,
         max_faces=config.max_faces,
+        train_motion=motion.select(chosen[0]),
+        validation_motion=motion.select(chosen[1]),
         settings=settings,
     )
     start: Mesh | RefinementState | None = load_checkpoint(out / CHECKPOINT)
@@ -148,19 +152,22 @@ def run(
         extracted = extract_initial_mesh(samples, body, evidence, validation or train, settings)
         start = remesh_to_edge_length(extracted, target_edge_m, body)
     state = refine_mesh(start, refinement_inputs, lambda state: save_checkpoint(out / CHECKPOINT, state))
-    shader, psnr_db = refinement_inputs.shader, state.validation_psnr_db
-    mesh = finish_mesh(state.mesh, refinement_inputs, config.max_final_faces)
+    aligned_inputs = with_offsets(refinement_inputs, state.pose_offsets)
+    aligned_views, shader, psnr_db = aligned_inputs.validation, aligned_inputs.shader, state.validation_psnr_db
+    if state.pose_offsets:
+        motion = state.pose_offsets.of(body, motion.select(chosen[0])).apply(motion)
+    mesh = finish_mesh(state.mesh, aligned_inputs, config.max_final_faces)
     is_unchanged = mesh is state.mesh
     skin = state.skin if is_unchanged else transfer_skin(mesh, body)
     save_dense_mesh(out, state.mesh)
     write_results(out, mesh, skin, shader)
-    motion, motion_metrics = refit_motion(capture, inputs, body, (mesh, skin, shader), validation)
-    save_motion(out / "motion.npz", motion)
+    final_motion, motion_metrics = refit_motion(capture, inputs, (body, motion), (mesh, skin, shader), aligned_views)
+    save_motion(out / "motion.npz", final_motion)
     return {
         **{key: float(value) for key, value in mesh_quality_metrics(mesh).items()},
         "initial_validation_psnr_db": psnr_db[0],
-        "refined_validation_psnr_db": psnr_db[-1] if is_unchanged else mesh_psnr_db(mesh, skin, validation, shader),
-        "silhouette_iou": silhouette_iou(mesh, skin, validation),
+        "refined_validation_psnr_db": psnr_db[-1] if is_unchanged else mesh_psnr_db(mesh, skin, aligned_views, shader),
+        "silhouette_iou": silhouette_iou(mesh, skin, aligned_views),
         "target_edge_m": target_edge_m,
         "accepted_rounds": len(psnr_db) - 1.0,
         "faces_before_reduction": float(len(state.mesh.faces)),
@@ -223,35 +230,38 @@ def extract_initial_mesh(
 
 
 def load_views(
-    capture: Capture, positions: Int[np.ndarray, "k"], inputs: Mapping[str, Path], body: Body, config: Config
+    capture: Capture,
+    positions: Int[np.ndarray, "k"],
+    motion: Motion,
+    inputs: Mapping[str, Path],
+    body: Body,
+    config: Config,
 ) -> list[PosedView]:
-    """Load crops of at most `max_frames` of the frames at these positions, evenly spaced."""
+    """Load crops of the frames at these positions, in their poses of the motion."""
     camera = load_camera(inputs["body"] / "camera.npz")
-    transforms = canonical_to_world(body, load_motion(inputs["field"] / "motion.npz"))
-    subsampled = positions[evenly_spaced(len(positions), config.max_frames)]
+    poses = canonical_to_world(body, motion.select(positions))
     return [
-        crop_posed_view(capture.image(k), capture.mask(k), camera, transforms[k], config.max_person_px)
-        for k in track(subsampled.tolist(), "reading frames")
+        crop_posed_view(capture.image(k), capture.mask(k), camera, pose, config.max_person_px)
+        for k, pose in zip(track(positions.tolist(), "reading frames"), poses, strict=True)
     ]
 
 
 def refit_motion(
     capture: Capture,
     inputs: Mapping[str, Path],
-    body: Body,
+    posed_body: tuple[Body, Motion],
     shaded_mesh: tuple[Mesh, SkinnedTopology, torch.nn.Module],
     validation: Sequence[PosedView],
 ) -> tuple[Motion, dict[str, float]]:
     """Fit the frames that are not trained on to landmarks and masks through the mesh; return motion and metrics.
 
-    Training frames keep the poses of the field stage. Frames near them keep the interpolated corrections, with a
-    warning, unless the validation views prefer the new poses (`MotionScores.is_better_than`). Frames far from them have
-    no corrections; they keep their poses unless the outlines of these frames fit better.
+    Training frames keep their poses. Frames near them keep the interpolated corrections, with a warning, unless the
+    validation views prefer the new poses (`MotionScores.is_better_than`). Frames far from them have no corrections;
+    they keep their poses unless the outlines of these frames fit better.
 
     validation: views of evenly spaced validation frames, from `load_views`.
     """
-    mesh, skin, shader = shaded_mesh
-    motion = load_motion(inputs["field"] / "motion.npz")
+    (body, motion), (mesh, skin, shader) = posed_body, shaded_mesh
     is_trained = np.zeros(len(capture), dtype=bool)
     is_trained[usable_training_positions(capture, inputs["body"])] = True
     masks = (None if is_trained[k] else to_uint8(capture.mask(k)) for k in range(len(capture)))
@@ -289,7 +299,7 @@ def write_results(out: Path, mesh: Mesh, skin: SkinnedTopology, shader: torch.nn
 
 STAGE = Stage(
     "mesh",
-    version=18,
+    version=19,
     needs=("frames", "body", "field"),
     makes=(MESH_NPZ, DENSE_NPZ, "motion.npz", "preview.png"),
     config=Config,

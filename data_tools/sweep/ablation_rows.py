@@ -51,6 +51,7 @@ ROWS = {
         ),
         Row(REFERENCE, "the stage as it is: remeshed by the image error, then reduced"),
         Row("no-global-offset", "without the offset of all vertices", settings={"global_learning_rate": 0.0}),
+        Row("no-pose-alignment", "poses are not aligned to the surface", settings={"alignment_steps": 0}),
         Row(
             "field-views",
             f"with {FIELD_VIEWS} renders of the field from other cameras as training views",

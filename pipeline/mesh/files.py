@@ -15,6 +15,7 @@ from pipeline.geometry.skinning import dense_weights, top_k_weights
 from pipeline.geometry.surface_cut import SurfaceCut
 from pipeline.io.npz import load_npz, save_npz
 from pipeline.io.tensors import load_tensors, save_tensors
+from pipeline.mesh.pose_alignment import PoseOffsets
 from pipeline.mesh.refinement import RefinementState
 from pipeline.mesh.skin_transfer import build_skinned_topology
 
@@ -116,7 +117,8 @@ def save_checkpoint(path: Path, state: RefinementState) -> None:
         "progress": torch.tensor(progress, dtype=torch.float64),
     }
     shader_state = {f"{SHADER_STATE_PREFIX}{name}": tensor for name, tensor in state.shader_state.items()}
-    save_tensors(path, tensors | shader_state)
+    offsets = state.pose_offsets._asdict() if state.pose_offsets else {}
+    save_tensors(path, tensors | offsets | shader_state)
 
 
 def load_checkpoint(path: Path) -> RefinementState | None:
@@ -132,4 +134,5 @@ def load_checkpoint(path: Path) -> RefinementState | None:
     }
     mesh = Mesh(tensors["vertices"].numpy(), tensors["faces"].numpy())
     skin = build_skinned_topology(mesh, tensors["skin_weights"])
-    return RefinementState(mesh, skin, shader_state, int(rounds_done), tuple(psnr_db), bool(finished))
+    offsets = PoseOffsets(tensors["rotation_rad"], tensors["shift_m"]) if "shift_m" in tensors else None
+    return RefinementState(mesh, skin, shader_state, int(rounds_done), tuple(psnr_db), bool(finished), offsets)

@@ -4,19 +4,23 @@ Each round after the first starts with adaptive remeshing: faces with an accumul
 percentile are subdivided, those below a lower percentile are decimated; the vertex offsets start from zero (IHM paper,
 section 2.3). `MeshSettings.remeshing` has alternatives for ablations. A round that lowers the validation PSNR is
 discarded and ends the refinement. Skin weights are transferred from the body after remeshing and stay with the vertices
-during optimisation, so that each round is scored with the weights that are exported.
+during optimisation, so that each round is scored with the weights that are exported. After the rounds that
+`MeshSettings.aligned_rounds` counts, the poses of the views are aligned to the surface.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
+from pipeline.body.body import Motion, canonical_to_world
 from pipeline.geometry.mesh import Mesh
+from pipeline.mesh.pose_alignment import PoseOffsets, align_poses, no_offsets
 from pipeline.mesh.remeshing import detailed_faces, remesh_adaptively, remesh_uniformly
 from pipeline.mesh.skin_transfer import SkinnedTopology, transfer_skin
 from pipeline.mesh.vertex_optimisation import RefinementInputs, optimise_vertices
-from pipeline.mesh.views import accumulate_face_errors, mesh_psnr_db
+from pipeline.mesh.views import PosedView, accumulate_face_errors, mesh_psnr_db
 
 
 @dataclass(frozen=True)
@@ -25,7 +29,8 @@ class RefinementState:
 
     mesh, skin: the mesh with the skin weights of its optimisation and validation. shader_state: state of the shader.
     rounds_done: number of completed rounds, including a discarded one. validation_psnr_db: of the initial mesh and of
-    each accepted round; NaN without validation views. finished: there is no further round.
+    each accepted round, with its aligned poses; NaN without validation views. finished: there is no further round.
+    pose_offsets: of the poses of `RefinementInputs.train_motion`; None if they are not aligned.
     """
 
     mesh: Mesh
@@ -34,6 +39,7 @@ class RefinementState:
     rounds_done: int
     validation_psnr_db: tuple[float, ...]
     finished: bool
+    pose_offsets: PoseOffsets | None = None
 
 
 def refine_mesh(
@@ -73,6 +79,7 @@ def _shader_state(inputs: RefinementInputs) -> dict[str, Tensor]:
 def _run_round(state: RefinementState, inputs: RefinementInputs) -> RefinementState:
     """Remesh (not in the first round) and optimise; return the old state as finished if the validation PSNR falls."""
     mesh, skin, rounds_done = state.mesh, state.skin, state.rounds_done + 1
+    inputs = with_offsets(inputs, state.pose_offsets)
     inputs.shader.load_state_dict(state.shader_state)
     if state.rounds_done > 0:
         mesh = _remesh(mesh, skin, inputs)
@@ -83,7 +90,42 @@ def _run_round(state: RefinementState, inputs: RefinementInputs) -> RefinementSt
     if inputs.validation and psnr_db < state.validation_psnr_db[-1]:
         return replace(state, rounds_done=rounds_done, finished=True)
     accepted = (*state.validation_psnr_db, psnr_db)
-    return RefinementState(mesh, skin, _shader_state(inputs), rounds_done, accepted, rounds_done == inputs.rounds)
+    finished = rounds_done == inputs.rounds
+    new = RefinementState(mesh, skin, _shader_state(inputs), rounds_done, accepted, finished, state.pose_offsets)
+    return _align(new, inputs)
+
+
+def with_offsets(inputs: RefinementInputs, offsets: PoseOffsets | None) -> RefinementInputs:
+    """Return the inputs with the views of `train_motion` and `validation_motion` in corrected poses."""
+    if offsets is None or inputs.train_motion is None:
+        return inputs
+    correction = offsets.of(inputs.body, inputs.train_motion)
+
+    def corrected(views: Sequence[PosedView], motion: Motion | None) -> list[PosedView]:
+        poses = canonical_to_world(inputs.body, correction.apply(motion)) if motion is not None else ()
+        moved = [replace(view, canonical_to_world=pose) for view, pose in zip(views, poses, strict=False)]
+        return [*moved, *views[len(moved) :]]
+
+    return replace(
+        inputs,
+        train=corrected(inputs.train, inputs.train_motion),
+        validation=corrected(inputs.validation, inputs.validation_motion),
+    )
+
+
+def _align(state: RefinementState, inputs: RefinementInputs) -> RefinementState:
+    """Return the state with the poses aligned to its surface, unless validation prefers the present ones."""
+    motion = inputs.train_motion
+    if motion is None or inputs.settings.alignment_steps == 0:
+        return state
+    correction = (state.pose_offsets or no_offsets(inputs.body, motion)).of(inputs.body, motion)
+    views = inputs.train[: len(motion.frame_index)]
+    vertices, steps = torch.from_numpy(state.mesh.vertices), inputs.settings.alignment_steps
+    offsets = align_poses(vertices, state.skin, inputs.shader, views, correction, steps)
+    psnr_db = mesh_psnr_db(state.mesh, state.skin, with_offsets(inputs, offsets).validation, inputs.shader)
+    if inputs.validation and psnr_db < state.validation_psnr_db[-1]:
+        return state
+    return replace(state, pose_offsets=offsets, validation_psnr_db=(*state.validation_psnr_db[:-1], psnr_db))
 
 
 def _remesh(mesh: Mesh, skin: SkinnedTopology, inputs: RefinementInputs) -> Mesh:

@@ -40,6 +40,7 @@ class MeshSettings:
         remeshed_faces: number of faces after uniform remeshing; unused otherwise.
         field_views: renders of the field from other cameras that are added to the training views (IHM paper: only
             renders); 0: none.
+        alignment_steps: Gauss-Newton steps after each round that align the poses of the views to the surface; 0: none.
         seed: seed of the frame order and of the random backgrounds.
 
     Reduction of faces:
@@ -76,6 +77,7 @@ class MeshSettings:
     remeshing: Remeshing = "error"
     remeshed_faces: int = 0
     field_views: int = 0
+    alignment_steps: int = 1
     seed: int = 0
 
     max_reduction_loss_db: float = 0.05
@@ -87,7 +89,7 @@ class MeshSettings:
         for name in ("learning_rate", "isovalue_frames", "frames_per_step"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"MeshSettings.{name} = {getattr(self, name)} is not allowed: it must be above 0")
-        for name in ("field_views", "final_faces"):
+        for name in ("field_views", "final_faces", "alignment_steps"):
             if getattr(self, name) < 0:
                 raise ValueError(f"MeshSettings.{name} = {getattr(self, name)} is not allowed: it must be at least 0")
         if not self.isovalues_per_m or min(self.isovalues_per_m) <= 0.0:

@@ -19,7 +19,7 @@ from scipy.sparse import csc_array, csr_array, diags_array, eye_array
 from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
-from pipeline.body.body import Body
+from pipeline.body.body import Body, Motion
 from pipeline.core.progress import track
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import adjacency, laplacian
@@ -40,10 +40,11 @@ would become grooves."""
 class RefinementInputs:
     """Everything that a refinement needs besides the initial mesh.
 
-    body: source of the skin weights. train, validation: views for optimisation and for validation. shader: module that
-    maps canonical points (n, 3) in m to colours (n, 3) in [0, 1]; its parameters that require a gradient are optimised.
-    target_edge_m: target edge length, m. rounds: number of rounds. steps: optimiser steps per round. max_faces: no face
-    is subdivided beyond this number of faces.
+    body: source of the skin weights. train, validation: views for optimisation and for validation. train_motion,
+    validation_motion: poses of the first views of either kind, in time order; those are aligned to the surface between
+    rounds, unless there are none. shader: module that maps canonical points (n, 3) in m to colours (n, 3) in [0, 1];
+    its parameters that require a gradient are optimised. target_edge_m: target edge length, m. rounds: number of
+    rounds. steps: optimiser steps per round. max_faces: no face is subdivided beyond this number of faces.
     """
 
     body: Body
@@ -54,6 +55,8 @@ class RefinementInputs:
     rounds: int
     steps: int
     max_faces: int
+    train_motion: Motion | None = None
+    validation_motion: Motion | None = None
     settings: MeshSettings = field(default_factory=MeshSettings)
 
 

@@ -1,5 +1,6 @@
 """The files of the mesh stage: what was written is read back, and a wrong file names itself and the next command."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from pipeline.mesh.files import (
     save_dense_mesh,
     save_mesh,
 )
+from pipeline.mesh.pose_alignment import PoseOffsets
 from pipeline.mesh.refinement import RefinementState
 from pipeline.mesh.skin_transfer import build_skinned_topology
 
@@ -33,6 +35,7 @@ ARTIFACT = MeshArtifact(
     np.array([[1, 0, 0, 0], [0.75, 0.25, 0, 0], [0.4, 0.3, 0.2, 0.1], [1, 0, 0, 0]], dtype=np.float32),
     np.linspace(0.0, 1.0, 12, dtype=np.float32).reshape(4, 3),
 )
+OFFSETS = PoseOffsets(torch.linspace(-0.1, 0.1, 12).view(2, 2, 3), torch.linspace(0.0, 0.01, 6).view(2, 3))
 
 
 def test_a_mesh_is_read_back(tmp_path: Path) -> None:
@@ -71,7 +74,7 @@ def test_a_checkpoint_is_read_back(tmp_path: Path) -> None:
     weights = torch.tensor([[1.0, 0.0], [0.5, 0.5], [0.25, 0.75], [0.0, 1.0]])
     shader_state = {"mean": torch.tensor(0.25)}
     state = RefinementState(
-        TETRAHEDRON, build_skinned_topology(TETRAHEDRON, weights), shader_state, 2, (20.0, 25.5), True
+        TETRAHEDRON, build_skinned_topology(TETRAHEDRON, weights), shader_state, 2, (20.0, 25.5), True, OFFSETS
     )
     assert load_checkpoint(tmp_path / "checkpoint.safetensors") is None
     save_checkpoint(tmp_path / "checkpoint.safetensors", state)
@@ -82,3 +85,10 @@ def test_a_checkpoint_is_read_back(tmp_path: Path) -> None:
     assert torch.equal(loaded.skin.adjacency, state.skin.adjacency)
     assert loaded.shader_state == shader_state
     assert (loaded.rounds_done, loaded.validation_psnr_db, loaded.finished) == (2, (20.0, 25.5), True)
+    assert loaded.pose_offsets is not None
+    assert torch.equal(loaded.pose_offsets.rotation_rad, OFFSETS.rotation_rad)
+    assert torch.equal(loaded.pose_offsets.shift_m, OFFSETS.shift_m)
+    save_checkpoint(tmp_path / "unaligned.safetensors", replace(state, pose_offsets=None))
+    unaligned = load_checkpoint(tmp_path / "unaligned.safetensors")
+    assert unaligned is not None
+    assert unaligned.pose_offsets is None

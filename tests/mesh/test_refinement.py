@@ -6,15 +6,21 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.body.body import Body
+from pipeline.body.body import Body, Motion
 from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.rotation import axis_angle_to_matrix, matrix_to_quaternion
 from pipeline.geometry.skinning import rigid_transform
 from pipeline.geometry.surface import is_closed_manifold
 from pipeline.mesh import refinement as refinement_module
+from pipeline.mesh.pose_alignment import PoseOffsets
 from pipeline.mesh.refinement import RefinementState, refine_mesh
 from pipeline.mesh.skin_transfer import SkinnedTopology, transfer_skin
-from pipeline.mesh.views import mesh_psnr_db
+from pipeline.mesh.vertex_optimisation import RefinementInputs
+from pipeline.mesh.views import PosedView, mesh_psnr_db
 from tests.mesh.egg import PATTERN, SETTINGS, Pattern, Views, refinement_inputs
+
+VIEW_ROWS = (np.flatnonzero(np.arange(12) % 3), np.arange(0, 12, 3))
+"""Of the training and of the validation views, in the order of their times."""
 
 
 def test_rounds_improve_the_psnr_and_keep_a_closed_manifold(dented_egg: Mesh, egg_body: Body, egg_views: Views) -> None:
@@ -129,3 +135,42 @@ def test_uniform_rounds_have_the_number_of_faces_even_if_none_is_kept(
         result = refine_mesh(dented_egg, inputs)
         assert wanted <= len(result.mesh.faces) <= 1.02 * wanted
         assert is_closed_manifold(result.mesh)
+
+
+def motion_of(views: list[PosedView], rows: np.ndarray) -> Motion:
+    """The poses of views of a single joint, a twentieth of a second apart."""
+    poses = torch.stack([view.canonical_to_world[0] for view in views])
+    rotations_wxyz = matrix_to_quaternion(poses[:, :3, :3]).numpy()[:, None]
+    return Motion(rows.astype(np.int32), rows / 20.0, rotations_wxyz, poses[:, :3, 3].numpy())
+
+
+def disturbed_views(views: list[PosedView], rows: np.ndarray) -> list[PosedView]:
+    """Views whose recorded poses are off by up to five degrees, slowly changing."""
+    turn_rad = np.radians(5.0) * np.sin(0.4 * rows)
+    turns = axis_angle_to_matrix(torch.from_numpy(np.outer(turn_rad, [0.2, 1.0, 0.0])).float())
+    moved = [rigid_transform(turn, torch.zeros(3)) for turn in turns]
+    return [replace(v, canonical_to_world=v.canonical_to_world @ turn) for v, turn in zip(views, moved, strict=True)]
+
+
+def disturbed_inputs(body: Body, views: Views, **changes: object) -> RefinementInputs:
+    parts = [disturbed_views(part, rows) for part, rows in zip(views, VIEW_ROWS, strict=True)]
+    motions = [motion_of(part, rows) for part, rows in zip(parts, VIEW_ROWS, strict=True)]
+    inputs = refinement_inputs(body, (parts[0], parts[1]), rounds=1, steps=30, **changes)
+    return replace(inputs, train_motion=motions[0], validation_motion=motions[1])
+
+
+def test_poses_are_aligned_after_a_round(dented_egg: Mesh, egg_body: Body, egg_views: Views) -> None:
+    inputs = disturbed_inputs(egg_body, egg_views)
+    aligned = refine_mesh(dented_egg, inputs)
+    as_recorded = refine_mesh(dented_egg, replace(inputs, settings=replace(SETTINGS, alignment_steps=0)))
+    assert as_recorded.pose_offsets is None
+    assert aligned.validation_psnr_db[-1] > as_recorded.validation_psnr_db[-1] + 0.2
+
+
+def test_poses_stay_where_validation_prefers_them(
+    egg: Mesh, egg_body: Body, egg_views: Views, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inputs = disturbed_inputs(egg_body, egg_views)
+    worse = PoseOffsets(torch.full((len(egg_views[0]), 1, 3), 0.3), torch.zeros(len(egg_views[0]), 3))
+    monkeypatch.setattr(refinement_module, "align_poses", lambda *_: worse)
+    assert refine_mesh(egg, inputs).pose_offsets is None

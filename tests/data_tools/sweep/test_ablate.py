@@ -251,7 +251,7 @@ def test_the_command_runs_the_reference_first_and_names_unfinished_runs(
 
 def test_write_only_runs_nothing(base: Trial, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ablate, "run_row", lambda *_: pytest.fail("started"))
-    with pytest.raises(UserError, match="7 of 7 runs are not done"):
+    with pytest.raises(UserError, match="8 of 8 runs are not done"):
         ablate.main([str(base.capture), "--seeds", "2", "--out", str(base.out), "--write-only"])
 
 

@@ -1,0 +1,317 @@
+"""Alignment of the poses of all training views to the coloured surface by Gauss-Newton steps.
+
+Each pixel says by how much, along its colour gradient, the surface point that it shows should move in the image
+(Lucas and Kanade, "An Iterative Image Registration Technique", 1981; with the mean gradient of render and image as in
+Benhimane and Malis, "Real-time image-based tracking of planes using efficient second-order minimization", 2004). The
+silhouette counts in the same way: alpha is a fourth channel. Pose errors change slowly, so the corrections of all
+views are solved together, as a process that drifts over time; views of the whole turn share one surface, as in bundle
+adjustment. Colours are compared after their local mean is removed, so that light that changes as the person turns
+does not move the person.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Int
+from scipy.linalg import solveh_banded
+from torch import Tensor
+
+from pipeline.body.body import Body, Motion
+from pipeline.body.pose_correction import PoseCorrection
+from pipeline.geometry.camera import Camera, project, transform_world_to_camera
+from pipeline.kernels.common.thread_pool import ThreadPool
+from pipeline.kernels.interpolate import interpolate
+from pipeline.mesh.skin_transfer import SkinnedTopology
+from pipeline.mesh.views import PosedView, Shader, render_posed_view
+
+BLUR_SIGMA_PX = 1.2
+"""Blur of render and image before their gradients are taken: an error of a pose is a pixel or two."""
+LIGHT_SIGMA_RATIO = 0.02
+"""Radius of the local mean that is removed from the colours, as a share of the height of the crop."""
+PIXEL_STRIDE = 2
+PIXELS = np.s_[::PIXEL_STRIDE, ::PIXEL_STRIDE]
+"""Every second row and column is used: the blur makes neighbours say the same."""
+MAX_DEPTH_STEP_M = 0.03
+"""Pixels next to a larger step of depth are not used for colour: the render there is two surfaces."""
+SILHOUETTE_BAND_PX = 4
+"""Largest distance of a pixel from the rendered surface at which alpha counts."""
+COLOUR_NOISE, ALPHA_NOISE = 0.01, 0.1
+"""Smallest standard deviation of colours, and standard deviation of alpha (masks are a pixel or two loose)."""
+ROTATION_STD_RAD, ROTATION_DRIFT_RAD_PER_SQRT_S = np.radians(2.0), np.radians(1.5)
+"""Standard deviation of the rotations that are corrected, and of their change in a second."""
+SHIFT_STD_M, SHIFT_DRIFT_M_PER_SQRT_S = 0.02, 0.015
+"""The same of the place of the root."""
+
+
+@dataclass(frozen=True)
+class ImageEvidence:
+    """What pixels of a view say about the motion of the surface points that they show.
+
+    points_m: surface points, world. structure: sum over channels of gradient · gradientᵀ over variance, 1/px². pull:
+    sum of gradient · (image - render) over variance, 1/px. subtree_weights: skin weights of each joint with all below.
+    """
+
+    points_m: Float[np.ndarray, "n 3"]
+    subtree_weights: Float[np.ndarray, "n k"]
+    structure: Float[np.ndarray, "n 2 2"]
+    pull: Float[np.ndarray, "n 2"]
+
+
+class PoseOffsets(NamedTuple):
+    """The values of a `PoseCorrection`: rotation vectors of its joints (rad) and shifts of the root (m)."""
+
+    rotation_rad: Float[Tensor, "n k 3"]
+    shift_m: Float[Tensor, "n 3"]
+
+    def of(self, body: Body, motion: Motion) -> PoseCorrection:
+        """Return the correction of a motion with these values."""
+        correction = PoseCorrection(body, motion)
+        correction.rotation_rad, correction.shift_m = self
+        return correction
+
+
+def no_offsets(body: Body, motion: Motion) -> PoseOffsets:
+    """Return offsets of zero for all frames of a motion."""
+    correction = PoseCorrection(body, motion)
+    return PoseOffsets(correction.rotation_rad.detach(), correction.shift_m.detach())
+
+
+def align_poses(
+    vertices: Float[Tensor, "v 3"],
+    skin: SkinnedTopology,
+    shader: Shader,
+    views: Sequence[PosedView],
+    correction: PoseCorrection,
+    iterations: int,
+) -> PoseOffsets:
+    """Return the offsets with which renders of the surface match the views best.
+
+    Args:
+        vertices, skin, shader: the coloured surface in the A-pose.
+        views: one view for each frame of the correction; their poses are not read.
+        correction: starting point.
+        iterations: number of Gauss-Newton steps.
+    """
+    body, threads = correction.body, ThreadPool(torch.get_num_threads())
+    offsets = PoseOffsets(correction.rotation_rad.detach(), correction.shift_m.detach())
+    weights = skin.weights @ subtree_indicator(body.parents, correction.joints.numpy()).float()
+    rows = torch.arange(len(views))
+
+    @torch.no_grad()
+    def evidence_of_view(view: PosedView, pose: Float[Tensor, "j 4 4"]) -> tuple[np.ndarray, np.ndarray]:
+        posed_view = PosedView(view.image, view.mask, view.camera, pose)
+        evidence = gather_evidence(vertices, weights, skin, shader, posed_view)
+        return normal_equations(evidence, view.camera, body, pose.numpy(), correction.joints.numpy())
+
+    for _ in range(iterations):
+        poses = offsets.of(body, correction.motion).canonical_to_world(rows)
+        systems = threads.map(evidence_of_view, views, poses)
+        matrices, vectors = (np.stack(parts) for parts in zip(*systems, strict=True))
+        present = np.concatenate([offsets.rotation_rad.flatten(1), offsets.shift_m], axis=1)
+        update = solve_drifting(matrices, vectors, present, correction.motion.time_s)
+        moved = torch.from_numpy(present + update).float()
+        offsets = PoseOffsets(moved[:, :-3].reshape(offsets.rotation_rad.shape), moved[:, -3:].clone())
+    return offsets
+
+
+def subtree_indicator(parents: Int[np.ndarray, "j"], joints: Int[np.ndarray, "k"]) -> Float[Tensor, "j k"]:
+    """Return a matrix whose entry (i, k) is 1 if joint i is joints[k] or a descendant of it."""
+    is_below = np.eye(len(parents))
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            is_below[joint] += is_below[parent]
+    return torch.from_numpy(is_below[:, joints])
+
+
+def gather_evidence(
+    vertices: Float[Tensor, "v 3"],
+    subtree_weights: Float[Tensor, "v k"],
+    skin: SkinnedTopology,
+    shader: Shader,
+    view: PosedView,
+) -> ImageEvidence:
+    """Compare the render of the surface with a view, in colour inside the surface and in alpha at its silhouette."""
+    image, alpha, face_id = render_posed_view(vertices, skin, view, shader)
+    posed = view.pose_vertices(vertices, skin.weights)
+    covered = torch.nonzero(face_id.reshape(-1) >= 0).squeeze(1)
+    vertices_px, depth_m = project(posed, view.camera)
+    faces_px = face_id.reshape(-1)[covered]
+    attributes = torch.cat([posed, subtree_weights], dim=1)
+    seen = interpolate(covered, faces_px, view.camera.width, vertices_px, depth_m, skin.faces, attributes).numpy()
+    point_of_pixel = np.full(face_id.numel(), -1)
+    point_of_pixel[covered.numpy()] = np.arange(len(covered))
+    depth_image = np.full(face_id.numel(), np.float32(1e3))
+    depth_image[covered.numpy()] = transform_world_to_camera(torch.from_numpy(seen[:, :3]), view.camera)[:, 2].numpy()
+    nearest_point, distance_px = _nearest_points(point_of_pixel.reshape(face_id.shape))
+
+    render_alpha, mask = alpha.numpy(), view.mask.numpy().astype(np.float32) / 255.0
+    render = image.numpy() / np.maximum(render_alpha, 1e-3)[..., None]
+    frame = view.image.numpy().astype(np.float32) / 255.0
+    inside = _is_inside(render_alpha, mask, depth_image.reshape(face_id.shape))
+    structure, pull = map(
+        np.add,
+        _silhouette_evidence(distance_px[PIXELS] < SILHOUETTE_BAND_PX, render_alpha, mask),
+        _colour_evidence(inside[PIXELS], (render, render_alpha), (frame, mask)),
+    )
+    used = (structure[..., 0, 0] + structure[..., 1, 1] > 0.0) & (distance_px[PIXELS] < SILHOUETTE_BAND_PX)
+    points = seen[nearest_point[PIXELS][used]]
+    return ImageEvidence(points[:, :3], points[:, 3:], structure[used], pull[used])
+
+
+def _nearest_points(
+    point_of_pixel: Int[np.ndarray, "h w"],
+) -> tuple[Int[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+    """Return the point of the nearest pixel that has one (-1: none), and the distance to that pixel, px."""
+    has_point = point_of_pixel >= 0
+    distance_px, label = cv2.distanceTransformWithLabels(
+        (~has_point).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    point_of_label = np.zeros(int(label.max()) + 1, dtype=np.int64)
+    point_of_label[label[has_point]] = point_of_pixel[has_point]
+    return point_of_label[label], distance_px
+
+
+def _is_inside(
+    render_alpha: Float32[np.ndarray, "h w"], mask: Float32[np.ndarray, "h w"], depth_m: Float32[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels well inside render and mask, away from steps of depth."""
+    both = ((render_alpha > 0.99) & (mask > 0.99)).astype(np.uint8)
+    kernel = np.ones((3, 3), np.uint8)
+    is_step = cv2.dilate(depth_m, kernel) - cv2.erode(depth_m, kernel) > 2.0 * MAX_DEPTH_STEP_M
+    reach_px = 2 * int(np.ceil(3.0 * BLUR_SIGMA_PX)) + 1
+    inner = cv2.erode(np.pad(both, 1), np.ones((reach_px, reach_px), np.uint8))[1:-1, 1:-1]
+    return inner.astype(bool) & ~is_step
+
+
+def _colour_evidence(
+    inside: Bool[np.ndarray, "m n"],
+    render: tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]],
+    frame: tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]],
+) -> tuple[Float32[np.ndarray, "m n 2 2"], Float32[np.ndarray, "m n 2"]]:
+    """Return structure and pull of the colours, without their local means, at `PIXELS` that are inside.
+
+    render, frame: straight colours and alpha, in [0, 1].
+    """
+    common = render[1] * frame[1]
+    wide_px = LIGHT_SIGMA_RATIO * len(common)
+    details = [
+        _masked_blur(colours, alpha, BLUR_SIGMA_PX) - _masked_blur(colours, common, wide_px)
+        for colours, alpha in (render, frame)
+    ]
+    residual = (details[1] - details[0])[PIXELS]
+    noise = COLOUR_NOISE + 1.4826 * float(np.median(np.abs(residual[inside]))) if inside.any() else COLOUR_NOISE
+    # Colours of one pixel err together.
+    weight = inside[..., None] * _geman_mcclure(residual, noise, 2.0) / 3.0
+    gradient = _gradient(0.5 * (details[0] + details[1]))
+    structure = np.einsum("hwc,hwci,hwcj->hwij", weight, gradient, gradient, optimize=True)
+    return structure, np.einsum("hwc,hwci->hwi", weight * residual, gradient)
+
+
+def _silhouette_evidence(
+    near: Bool[np.ndarray, "m n"],
+    render_alpha: Float32[np.ndarray, "h w"],
+    mask: Float32[np.ndarray, "h w"],
+) -> tuple[Float32[np.ndarray, "m n 2 2"], Float32[np.ndarray, "m n 2"]]:
+    """Return structure and pull of alpha at `PIXELS` that are near the rendered surface."""
+    blurred = [cv2.GaussianBlur(alpha, (0, 0), BLUR_SIGMA_PX) for alpha in (render_alpha, mask)]
+    residual = (blurred[1] - blurred[0])[PIXELS]
+    weight = near * _geman_mcclure(residual, ALPHA_NOISE, 3.0)
+    gradient = _gradient(0.5 * (blurred[0] + blurred[1])[..., None])[..., 0, :]
+    structure = weight[..., None, None] * gradient[..., :, None] * gradient[..., None, :]
+    return structure, (weight * residual)[..., None] * gradient
+
+
+def _geman_mcclure(residual: Float32[np.ndarray, "*n"], noise: float, limit: float) -> Float32[np.ndarray, "*n"]:
+    """Return weights of residuals: an inverse variance that fades beyond `limit` standard deviations.
+
+    It is divided by the number of pixels that say the same: the blur correlates 4 pi sigma² of them.
+    """
+    redundancy = 4.0 * np.pi * BLUR_SIGMA_PX**2 / PIXEL_STRIDE**2
+    return 1.0 / (redundancy * np.square(noise * (1.0 + np.square(residual / (limit * noise)))))
+
+
+def _masked_blur(
+    colours: Float32[np.ndarray, "h w 3"], alpha: Float32[np.ndarray, "h w"], sigma_px: float
+) -> Float32[np.ndarray, "h w 3"]:
+    """Return the mean of the colours weighted by alpha and a Gaussian."""
+    share = cv2.GaussianBlur(alpha, (0, 0), sigma_px)
+    return cv2.GaussianBlur(colours * alpha[..., None], (0, 0), sigma_px) / np.maximum(share, 1e-6)[..., None]
+
+
+def _gradient(image: Float32[np.ndarray, "h w c"]) -> Float32[np.ndarray, "m n c 2"]:
+    """Return the central differences of each channel along x and y at `PIXELS`, 1/px."""
+    padded = np.pad(image, ((1, 1), (1, 1), (0, 0)), mode="edge")
+    along_x = 0.5 * (padded[1:-1, 2:][PIXELS] - padded[1:-1, :-2][PIXELS])
+    along_y = 0.5 * (padded[2:, 1:-1][PIXELS] - padded[:-2, 1:-1][PIXELS])
+    return np.stack([along_x, along_y], axis=-1)
+
+
+def normal_equations(
+    evidence: ImageEvidence,
+    camera: Camera,
+    body: Body,
+    canonical_to_world: Float[np.ndarray, "j 4 4"],
+    joints: Int[np.ndarray, "k"],
+) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p"]]:
+    """Return matrix and right side of the least squares for one view.
+
+    The p = 3 k + 3 unknowns are those of `PoseCorrection`: a rotation vector of each joint in its own axes, rad, and
+    the shift of the root, m. A point that moves by d px takes its colour along and changes the render by -gradient · d;
+    this change is to be image - render.
+    """
+    points_m = evidence.points_m.astype(np.float32)
+    world_to_camera = np.asarray(camera.world_to_camera, dtype=np.float32)
+    in_camera = points_m @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+    inverse_depth = 1.0 / in_camera[:, 2]
+    pixel_by_point = np.zeros((len(points_m), 2, 3), np.float32)
+    pixel_by_point[:, 0, 0], pixel_by_point[:, 1, 1] = camera.fx * inverse_depth, camera.fy * inverse_depth
+    pixel_by_point[:, 0, 2] = -camera.fx * in_camera[:, 0] * inverse_depth**2
+    pixel_by_point[:, 1, 2] = -camera.fy * in_camera[:, 1] * inverse_depth**2
+    pixel_by_point = pixel_by_point @ world_to_camera[:3, :3]
+
+    rotations = canonical_to_world[joints, :3, :3].astype(np.float32)
+    joints_world_m = np.einsum("kij,kj->ki", rotations, body.joints_m[joints]) + canonical_to_world[joints, :3, 3]
+    count = len(joints)
+    jacobian = np.empty((len(points_m), 2, 3 * count + 3), np.float32)
+    for k in range(count):
+        lever_m = points_m - joints_world_m[k].astype(np.float32)
+        torque = np.cross(lever_m[:, None], pixel_by_point) @ rotations[k]
+        jacobian[:, :, 3 * k : 3 * k + 3] = evidence.subtree_weights[:, k, None, None] * torque
+    jacobian[:, :, -3:] = pixel_by_point
+    weighted = evidence.structure @ jacobian
+    matrix = np.tensordot(jacobian, weighted, axes=([0, 1], [0, 1])).astype(np.float64)
+    return 0.5 * (matrix + matrix.T), -np.einsum("nip,ni->p", jacobian, evidence.pull, optimize=True).astype(np.float64)
+
+
+def solve_drifting(
+    matrices: Float[np.ndarray, "n p p"],
+    vectors: Float[np.ndarray, "n p"],
+    present: Float[np.ndarray, "n p"],
+    time_s: Float[np.ndarray, "n"],
+) -> Float[np.ndarray, "n p"]:
+    """Return the update of all corrections: evidence of each view, drift over time, and zero mean.
+
+    matrices, vectors: from `normal_equations`. present: corrections to which the update is added; the last three are
+    the shift of the root. time_s: of the views, increasing.
+    """
+    count, size = vectors.shape
+    std = np.concatenate([np.full(size - 3, ROTATION_STD_RAD), np.full(3, SHIFT_STD_M)])
+    drift = np.concatenate([np.full(size - 3, ROTATION_DRIFT_RAD_PER_SQRT_S), np.full(3, SHIFT_DRIFT_M_PER_SQRT_S)])
+    links = 1.0 / (drift**2 * np.maximum(np.diff(time_s), 1e-4)[:, None])
+    diagonal = np.tile(1.0 / std**2, (count, 1))
+    diagonal[:-1] += links
+    diagonal[1:] += links
+    change = np.diff(present, axis=0) * links
+    right = vectors - present / std**2
+    right[:-1] += change
+    right[1:] -= change
+
+    rows, columns = np.tril_indices(size)
+    band = np.zeros((size + 1, count, size))
+    band[rows - columns, :, columns] = (matrices + diagonal[:, :, None] * np.eye(size))[:, rows, columns].T
+    band[size, :-1] = -links
+    return solveh_banded(band.reshape(size + 1, -1), right.ravel(), lower=True).reshape(count, size)

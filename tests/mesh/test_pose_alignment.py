@@ -1,0 +1,202 @@
+"""Alignment of poses to a coloured surface: renders in known poses, disturbed poses, and dense linear algebra."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.body.body import Body, Motion, canonical_to_world
+from pipeline.body.pose_correction import PoseCorrection
+from pipeline.geometry.camera import Camera, project
+from pipeline.geometry.rotation import axis_angle_to_quaternion, quaternion_multiply
+from pipeline.geometry.skinning import linear_blend_skinning
+from pipeline.mesh.pose_alignment import (
+    ROTATION_DRIFT_RAD_PER_SQRT_S,
+    ROTATION_STD_RAD,
+    SHIFT_DRIFT_M_PER_SQRT_S,
+    SHIFT_STD_M,
+    ImageEvidence,
+    PoseOffsets,
+    align_poses,
+    no_offsets,
+    normal_equations,
+    solve_drifting,
+    subtree_indicator,
+)
+from pipeline.mesh.skin_transfer import SkinnedTopology, transfer_skin
+from pipeline.mesh.views import PosedView, render_posed_view
+from tests.mesh.capsule import capsule_body
+from tests.mesh.egg import PATTERN
+
+FRAMES = 7
+JOINTS = 2
+WORLD_TO_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32)
+WORLD_TO_CAMERA[:3, 3] = [0.0, 0.5, 1.6]
+CAMERA = Camera(330.0, 330.0, 100.0, 70.0, 200, 140, WORLD_TO_CAMERA)
+
+
+@pytest.fixture(scope="module")
+def body() -> Body:
+    return capsule_body()
+
+
+@pytest.fixture(scope="module")
+def skin(body: Body) -> SkinnedTopology:
+    return transfer_skin(body.mesh(), body)
+
+
+@pytest.fixture(scope="module")
+def true_motion(body: Body) -> Motion:
+    """The capsule sways about the vertical axis while the hand bends."""
+    phase = np.linspace(0.0, 2.0, FRAMES)
+    turns = np.zeros((FRAMES, JOINTS, 3), np.float32)
+    turns[:, 0, 1], turns[:, 1, 2] = 0.4 * np.sin(phase), 0.5 * np.cos(phase)
+    rotations = axis_angle_to_quaternion(torch.from_numpy(turns)).numpy()
+    return Motion(np.arange(FRAMES, dtype=np.int32), phase / 4.0, rotations, np.tile(body.joints_m[:1], (FRAMES, 1)))
+
+
+@pytest.fixture(scope="module")
+def views(body: Body, skin: SkinnedTopology, true_motion: Motion) -> list[PosedView]:
+    return render_views(body, skin, true_motion)
+
+
+def render_views(body: Body, skin: SkinnedTopology, motion: Motion) -> list[PosedView]:
+    blank = torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.uint8)
+    views = []
+    for pose in canonical_to_world(body, motion):
+        view = PosedView(blank[..., None].expand(-1, -1, 3), blank, CAMERA, pose)
+        with torch.no_grad():
+            image, alpha, _ = render_posed_view(torch.from_numpy(body.vertices), skin, view, PATTERN)
+        straight = (image / alpha[..., None].clamp_min(1e-3)).clamp(0.0, 1.0)
+        views.append(replace(view, image=(255 * straight).round().byte(), mask=(255 * alpha).round().byte()))
+    return views
+
+
+def disturbed(motion: Motion) -> tuple[Motion, np.ndarray, np.ndarray]:
+    """Poses that are off by two degrees a joint and a centimetre, slowly changing; with the errors."""
+    phase = np.linspace(0.3, 2.0, FRAMES)[:, None, None]
+    turn_rad = np.radians(2.0) * np.sin(phase + np.arange(JOINTS * 3).reshape(1, JOINTS, 3))
+    shift_m = 0.01 * np.sin(phase[:, :, 0] + np.arange(3)) * [1.0, 1.0, 0.3]
+    turned = quaternion_multiply(
+        torch.from_numpy(motion.rotations_wxyz), axis_angle_to_quaternion(torch.from_numpy(turn_rad).float())
+    )
+    return motion.with_pose(turned.numpy(), motion.root_translation_m + shift_m), turn_rad, shift_m
+
+
+def remaining_error(body: Body, offsets: PoseOffsets, wrong: Motion, true_motion: Motion) -> tuple[float, float]:
+    """Median distance of the surface from the truth before and after the correction, m."""
+    vertices, weights = torch.from_numpy(body.vertices), torch.from_numpy(body.skin_weights)
+    true_m, before_m, after_m = (
+        linear_blend_skinning(vertices, weights, canonical_to_world(body, motion)).numpy()
+        for motion in (true_motion, wrong, offsets.of(body, wrong).apply(wrong))
+    )
+    return (
+        float(np.median(np.linalg.norm(before_m - true_m, axis=-1))),
+        float(np.median(np.linalg.norm(after_m - true_m, axis=-1))),
+    )
+
+
+def aligned(body: Body, skin: SkinnedTopology, views: list[PosedView], wrong: Motion) -> PoseOffsets:
+    start = no_offsets(body, wrong).of(body, wrong)
+    return align_poses(torch.from_numpy(body.vertices), skin, PATTERN, views, start, iterations=2)
+
+
+def test_disturbed_poses_are_found_again(
+    body: Body, skin: SkinnedTopology, views: list[PosedView], true_motion: Motion
+) -> None:
+    wrong, _, _ = disturbed(true_motion)
+    before_m, after_m = remaining_error(body, aligned(body, skin, views, wrong), wrong, true_motion)
+    assert before_m > 0.008
+    assert after_m < 0.2 * before_m
+
+
+def test_true_poses_stay(body: Body, skin: SkinnedTopology, views: list[PosedView], true_motion: Motion) -> None:
+    offsets = aligned(body, skin, views, true_motion)
+    assert float(offsets.rotation_rad.abs().max()) < np.radians(0.15)
+    assert float(offsets.shift_m.abs().max()) < 0.002
+
+
+def test_light_that_changes_slowly_over_the_image_moves_nobody(
+    body: Body, skin: SkinnedTopology, views: list[PosedView], true_motion: Motion
+) -> None:
+    light = torch.linspace(0.6, 1.0, CAMERA.width)[None, :, None]
+    lit = [replace(view, image=(view.image.float() * light).round().byte()) for view in views]
+    wrong, _, _ = disturbed(true_motion)
+    before_m, after_m = remaining_error(body, aligned(body, skin, lit, wrong), wrong, true_motion)
+    assert after_m < 0.4 * before_m
+
+
+def test_normal_equations_have_the_derivatives_of_skinning_and_projection(body: Body, true_motion: Motion) -> None:
+    """Central differences of projected vertices of one joint; blends are linearised at the blended point."""
+    weights = torch.from_numpy(body.skin_weights)
+    rigid = (weights > 0.999).any(dim=1)
+    vertices, weights = torch.from_numpy(body.vertices)[rigid], weights[rigid]
+    row = torch.tensor([2])
+
+    def project_corrected(values: np.ndarray) -> np.ndarray:
+        correction = PoseCorrection(body, true_motion)
+        moved = torch.from_numpy(values).float()
+        correction.rotation_rad = moved[:-3].view(1, JOINTS, 3).expand(FRAMES, -1, -1)
+        correction.shift_m = moved[-3:].view(1, 3).expand(FRAMES, -1)
+        return project(linear_blend_skinning(vertices, weights, correction.canonical_to_world(row))[0], CAMERA)[
+            0
+        ].numpy()
+
+    size, step = 3 * JOINTS + 3, 0.01
+    differences = [project_corrected(step * unit) - project_corrected(-step * unit) for unit in np.eye(size)]
+    jacobian = np.stack(differences, axis=-1) / (2.0 * step)
+    random = np.random.default_rng(1)
+    roots, pull = random.normal(size=(len(vertices), 2, 2)), random.normal(size=(len(vertices), 2))
+    structure = roots @ roots.transpose(0, 2, 1)
+
+    pose = canonical_to_world(body, true_motion)[2]
+    points_m = linear_blend_skinning(vertices, weights, pose[None])[0].numpy()
+    below = (weights @ subtree_indicator(body.parents, np.arange(JOINTS)).float()).numpy()
+    evidence = ImageEvidence(points_m, below, structure.astype(np.float32), pull.astype(np.float32))
+    matrix, vector = normal_equations(evidence, CAMERA, body, pose.numpy(), np.arange(JOINTS))
+    expected = np.einsum("nip,nij,njq->pq", jacobian, structure, jacobian)
+    np.testing.assert_allclose(matrix, expected, rtol=0.01, atol=1e-3 * np.abs(expected).max())
+    expected_vector = -np.einsum("nip,ni->p", jacobian, pull)
+    np.testing.assert_allclose(vector, expected_vector, rtol=0.01, atol=1e-2 * np.abs(expected_vector).max())
+
+
+def test_subtrees_hold_a_joint_and_all_below_it() -> None:
+    parents = np.array([-1, 0, 1, 0])
+    expected = [[1, 0], [1, 1], [1, 1], [1, 0]]
+    np.testing.assert_array_equal(subtree_indicator(parents, np.array([0, 1])), expected)
+
+
+def test_the_banded_solution_is_that_of_the_dense_system() -> None:
+    random = np.random.default_rng(0)
+    count, size, time_s = 4, 6, np.array([0.0, 0.1, 0.4, 0.5])
+    factors = random.normal(size=(count, 9, size)) * 40.0
+    matrices, vectors = factors.transpose(0, 2, 1) @ factors, random.normal(size=(count, size)) * 50.0
+    present = random.normal(size=(count, size)) * 0.01
+    std = np.array([ROTATION_STD_RAD] * 3 + [SHIFT_STD_M] * 3)
+    drift = np.array([ROTATION_DRIFT_RAD_PER_SQRT_S] * 3 + [SHIFT_DRIFT_M_PER_SQRT_S] * 3)
+
+    rows = [np.kron(np.eye(count), np.diag(1.0 / std))]
+    for k in range(count - 1):
+        row = np.zeros((size, count * size))
+        row[:, k * size : (k + 1) * size] = -np.diag(1.0 / (drift * np.sqrt(time_s[k + 1] - time_s[k])))
+        row[:, (k + 1) * size : (k + 2) * size] = -row[:, k * size : (k + 1) * size]
+        rows.append(row)
+    prior = np.concatenate(rows)
+    dense = prior.T @ prior
+    right = vectors.ravel() - dense @ present.ravel()
+    for k in range(count):
+        dense[k * size : (k + 1) * size, k * size : (k + 1) * size] += matrices[k]
+    expected = np.linalg.solve(dense, right).reshape(count, size)
+    np.testing.assert_allclose(solve_drifting(matrices, vectors, present, time_s), expected, rtol=1e-8, atol=1e-12)
+
+
+def test_a_view_without_the_person_keeps_its_neighbours_correction(
+    body: Body, skin: SkinnedTopology, views: list[PosedView], true_motion: Motion
+) -> None:
+    empty = replace(views[3], image=torch.zeros_like(views[3].image), mask=torch.zeros_like(views[3].mask))
+    wrong, _, _ = disturbed(true_motion)
+    offsets = aligned(body, skin, [*views[:3], empty, *views[4:]], wrong)
+    assert torch.isfinite(offsets.rotation_rad).all()
+    neighbours = 0.5 * (offsets.rotation_rad[2] + offsets.rotation_rad[4])
+    assert float((offsets.rotation_rad[3] - neighbours).abs().max()) < np.radians(1.0)
