@@ -93,9 +93,7 @@ class Config(BaseConfig):
     normal_map: bool = Field(
         False, description="normal map of what the mesh lost when its faces were reduced; no closer to the person"
     )
-    max_frames: int = Field(
-        100, ge=1, description="largest number of training frames, evenly spaced over the recording"
-    )
+    max_frames: int = Field(60, ge=1, description="largest number of training frames, evenly spaced over the recording")
 
     @field_validator("min_texture_px", "max_texture_px")
     @classmethod
@@ -274,13 +272,14 @@ def light_views(
     """Return views with the shading of their vertices; unchanged under a uniform light of constant exposure."""
     if light.is_uniform and bool((light.gain == 1.0).all()):
         return views
-    lobe = (specular.highlights, torch.from_numpy(specular.strength))
-    return [
-        replace(
-            view, shading=light.shade_specular(view.vertices_world, faces, int(position), lobe, view.camera.centre_m())
-        )
-        for view, position in zip(views, positions, strict=True)
-    ]
+    lobe = (specular.highlights, torch.from_numpy(specular.strength)) if specular.strength.any() else None
+
+    def shade(view: BakeView, frame: int) -> Float[Tensor, "v d"]:
+        if lobe is None:
+            return light.shade_vertices(view.vertices_world, faces, frame)
+        return light.shade_specular(view.vertices_world, faces, frame, lobe, view.camera.centre_m())
+
+    return [replace(view, shading=shade(view, int(position))) for view, position in zip(views, positions, strict=True)]
 
 
 def vertex_surface(mesh: Mesh) -> TexturedSurface:
@@ -356,7 +355,7 @@ def fit_highlights(evidence: LightEvidence | None, light: VideoLight, mesh: Mesh
 
 STAGE = Stage(
     "texture",
-    version=8,
+    version=9,
     needs=("frames", "body", "mesh"),
     makes=(ATLAS, DIFFUSE, SPECULAR, NORMAL, COVERAGE, LIGHT, TEMPLATE_NPZ),
     config=Config,
