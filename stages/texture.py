@@ -174,6 +174,7 @@ def run(
         "validation_psnr_body_db": mean_foreground_psnr_db(to_float(to_uint8(diffuse)), validation, surface),
         "specular_explained": fitted.explained,
         "specular_standard_errors": fitted.standard_errors,
+        "specular_regions": float(fitted.regions),
         **light_metrics(evidence, light),
         **template_metrics(template),
     }
@@ -349,7 +350,7 @@ def make_texel_inpainter(mesh: Mesh, texels: Texels, template: FittedTemplate | 
 def fit_highlights(evidence: LightEvidence | None, light: VideoLight, mesh: Mesh) -> SpecularFit:
     """Return the highlights of the surface; none where no lamp was found, whose highlights they would be."""
     if evidence is None or light.is_uniform:
-        return SpecularFit(Highlights.none(), np.zeros(len(mesh.vertices), dtype=np.float32), 0.0, 0.0)
+        return SpecularFit(Highlights.none(), np.zeros(len(mesh.vertices), dtype=np.float32), 0.0, 0.0, 0)
     return fit_specular(evidence.train, evidence.validation, evidence.light, mesh)
 
 
