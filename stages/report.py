@@ -337,6 +337,7 @@ STAGE = Stage(
     makes=("report.json", "index.html", "turntable.jpg", "clay.jpg", "heldout.jpg"),
     config=Config,
     run=run,
+    shows="index.html",
 )
 
 if __name__ == "__main__":
