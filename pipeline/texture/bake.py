@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pipeline.core.progress import track
@@ -38,7 +38,6 @@ from pipeline.texture.views import (
     align_to_render,
     pixel_confidence,
     remove_light,
-    render_depth,
 )
 
 HALF_CONFIDENCE_WEIGHT_RATIO = 0.1
@@ -135,18 +134,26 @@ def sample_frame_colours(
 
     Colours are those of the frame, or albedos (at most `MAX_ALBEDO`) if the shading of the view is known.
     """
-    depth_m = render_depth(view, surface.faces)
+    vertices_px, vertex_depth_m = project(view.vertices_world, view.camera)
+    face_id, barycentric, depth_m = rasterize(
+        vertices_px, vertex_depth_m, surface.faces, view.camera.height, view.camera.width
+    )
     falloff_px = settings.silhouette_falloff_m / pixel_footprint_m(view.vertices_world, view.camera)
     pixel_weights = pixel_confidence(view.mask, depth_m.numpy(), falloff_px)
     image = view.image.astype(np.float32) / 255.0
-    colour, weight = sample_view_at_texels(view, surface, image, pixel_weights, depth_m, settings)
-    if view.shading is None:
-        return colour, weight
-    seen = weight > 0
-    shading = surface.texels.select(seen.numpy()).interpolate(surface.faces.numpy(), view.shading.numpy())
-    albedo = torch.from_numpy(remove_light(colour[seen].numpy(), shading)).clamp(max=MAX_ALBEDO)
-    colour[seen], weight[seen] = albedo, weight[seen] * light_confidence(torch.from_numpy(shading))
-    return colour, weight
+    if view.shading is not None:
+        used = _used_pixels(pixel_weights)
+        shading = supersample_attributes(face_id, barycentric, surface.faces, view.shading, 1)
+        shading[face_id < 0] = 1.0
+        shading = shading[torch.from_numpy(used)]
+        image[used] = np.minimum(remove_light(image[used], shading.numpy()), MAX_ALBEDO)
+        pixel_weights[used] *= light_confidence(shading).numpy()
+    return sample_view_at_texels(view, surface, image, pixel_weights, depth_m, settings)
+
+
+def _used_pixels(weights: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels that bilinear samples with weight contain: also those without weight next to one with."""
+    return np.asarray(cv2.dilate(weights, np.ones((3, 3), np.uint8)) > 0)
 
 
 def light_confidence(shading: Float[Tensor, "*n d"]) -> Float[Tensor, "*n"]:
@@ -192,8 +199,7 @@ def sample_residuals(
         view, drawn.lit, settings.flow_smoothing_sigma_m / pixel_m, settings.max_flow_m / pixel_m
     )
     weights = pixel_confidence(warped_mask, drawn.depth_m.numpy(), settings.silhouette_falloff_m / pixel_m)
-    # A pixel without weight next to one with weight enters the bilinear samples.
-    used = cv2.dilate(weights, np.ones((3, 3), np.uint8)) > 0
+    used = _used_pixels(weights)
     colour, alpha = warped[used], np.maximum(drawn.lit[used][:, 3:], 1e-3)
     residual = colour - drawn.lit[used][:, :3] / alpha
     robust = 1.0 / (1.0 + (np.linalg.norm(residual, axis=1) / settings.geman_mcclure_scale) ** 2) ** 2
