@@ -26,7 +26,7 @@ from pipeline.texture.key_light import SEARCH_REFINEMENTS_RAD, directions_around
 from pipeline.texture.light import Highlights, VideoLight
 from pipeline.texture.light_evidence import standard_errors
 from pipeline.texture.light_fit import ViewObservations
-from pipeline.texture.material_regions import join_regions, material_regions
+from pipeline.texture.material_regions import material_regions
 
 EXPONENTS = (12.0, 24.0, 48.0, 96.0)
 """Candidates of p: roughness 0.61 to 0.38. Errors of the irradiance look like wider lobes."""
@@ -50,10 +50,6 @@ shiny shirt: 0.46 to 0.86; of five matte people, 40 regions each: at most 0.24."
 
 MIN_REGION_STANDARD_ERRORS = 1.0
 """The same of one region: half, since few validation frames see it; all regions together need `MIN_STANDARD_ERRORS`."""
-
-MIN_TOLD = 0.25
-"""Share of the vertices of a region whose highlight the training frames must reach. A region with less takes what the
-nearest of the others has: correlation with the true strength of a shiny shirt 0.55 -> 0.62 and 0.60 -> 0.68."""
 
 REGION_SMOOTHING_STEPS = 2
 """Of the strength, across the borders of regions."""
@@ -114,9 +110,6 @@ def fit_specular(train: ViewObservations, validation: ViewObservations, light: V
     explained, errors = tested.decrease(without, with_lobe, kept[tested.vertex])
     if not len(shiny) or explained < MIN_EXPLAINED or errors < MIN_STANDARD_ERRORS:
         return SpecularFit(highlights, np.zeros(count, dtype=np.float32), explained, errors, 0)
-    told = np.bincount(region, power > _ridge(power)) / np.bincount(region) >= MIN_TOLD
-    told[shiny] = True
-    region = join_regions(region, told, albedo, mesh.vertices)
     mean = np.bincount(region, np.maximum(product, 0.0)) / np.maximum(np.bincount(region, power), 1e-12)
     strength = np.isin(region, shiny) * _smooth(power, product, mean[region], mesh)
     mixing = _mixing(mesh)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.texture.material_regions import join_regions, material_regions
+from pipeline.texture.material_regions import material_regions
 
 
 def test_a_region_has_one_colour_and_one_place() -> None:
@@ -22,11 +22,3 @@ def test_a_region_has_one_colour_and_one_place() -> None:
 def test_fewer_vertices_than_regions() -> None:
     region = material_regions(np.eye(3), np.eye(3), regions=40)
     assert sorted(region.tolist()) == [0, 1, 2]
-
-
-def test_an_unknown_region_joins_the_nearest_known_one_of_its_colour() -> None:
-    vertices = np.array([[0.0, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.3, 0.0], [0.0, 0.9, 0.0]])
-    albedo = np.array([[0.2, 0.2, 0.2], [0.8, 0.2, 0.2], [0.8, 0.2, 0.2], [0.2, 0.2, 0.2]])
-    known = np.array([True, False, True, True])
-    assert join_regions(np.arange(4), known, albedo, vertices).tolist() == [0, 2, 2, 3]
-    assert join_regions(np.arange(4), np.zeros(4, dtype=bool), albedo, vertices).tolist() == [0, 1, 2, 3]

@@ -26,7 +26,6 @@ from data_tools.evaluate.compare_avatar import (
 from data_tools.evaluate.comparison import Comparison, retarget_motion
 from data_tools.evaluate.truth import load_true_mask
 from data_tools.evaluate.upper_bound import render_upper_bound, unpose_true_vertices
-from data_tools.synthetic.scene.renderer import LIGHTING_PRESETS
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.files import save_motion
 from pipeline.capture.frame_selection import HELDOUT, TRAIN
@@ -124,20 +123,6 @@ def test_novel_views_of_the_true_avatar(perfect: Comparison) -> None:
     black = replace(perfect, run=replace(perfect.run, avatar=replace(perfect.run.avatar, diffuse=torch.zeros(4, 4, 3))))
     dark = compare_novel_views(black)
     assert dark[0].scores()["psnr_body"] < pictures[0].scores()["psnr_body"] - 3.0
-
-
-def test_correlation_of_highlights_with_the_true_ones(perfect: Comparison) -> None:
-    """Strength by the height of a vertex: close to 1 where it is the true one, negative for the opposite."""
-    assert "specular_correlation" not in compare_texture(perfect)
-    shiny = replace(perfect, truth=replace(perfect.truth, light=LIGHTING_PRESETS["patch"]))
-    assert compare_texture(shiny)["specular_correlation"] == 0.0
-    avatar = shiny.run.avatar
-    height = avatar.vertices[:, 1] - avatar.vertices[:, 1].min()
-    low, high = LIGHTING_PRESETS["patch"].shiny_heights
-    strength = ((height > low * height.max()) & (height < high * height.max())).float()
-    for specular, range_of in ((strength, (0.9, 1.0)), (1.0 - strength, (-1.0, -0.9))):
-        lit = replace(shiny, run=replace(shiny.run, avatar=replace(avatar, specular=specular)))
-        assert range_of[0] <= compare_texture(lit)["specular_correlation"] <= range_of[1]
 
 
 def test_texture_of_known_error(perfect: Comparison) -> None:
