@@ -385,6 +385,7 @@ STAGE = Stage(
     makes=("avatar.glb", "avatar.obj", "avatar.mtl", *OBJ_MAPS),
     config=Config,
     run=run,
+    shows="avatar.glb",
 )
 
 if __name__ == "__main__":

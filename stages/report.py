@@ -27,6 +27,7 @@ from pipeline.core.manifest import Manifest, read_manifest
 from pipeline.core.measure import describe_environment, peak_rss_mib
 from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
+from pipeline.field.setup import evenly_spaced
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.texture_rendering import blur_coverage
 from pipeline.io.image import read_gray, read_rgb, to_uint8, write_rgb
@@ -46,7 +47,7 @@ from pipeline.metrics.images import (
 from pipeline.report.embed import read_level
 from pipeline.report.lpips_weights import find_lpips_weights
 from pipeline.report.page import FrameImages, PageContent, error_map, render_page
-from pipeline.report.report_json import build_report, replace_nonfinite, report_to_json
+from pipeline.report.report_json import SplitNote, build_report, replace_nonfinite, report_to_json
 from pipeline.report.settings import REPORT_SETTINGS, ReportSettings
 from pipeline.report.sheets import composite_on_white_uint8, image_grid
 from pipeline.texture.files import COVERAGE
@@ -84,7 +85,8 @@ class Config(BaseConfig):
     samples_per_pixel_side: int = Field(
         3, ge=1, le=8, description="texture samples along each side of a pixel when the mesh is rendered"
     )
-    max_page_frames: int = Field(8, ge=1, le=64, description="held-out frames on the page; all are scored")
+    frames: int = Field(12, ge=0, description="held-out frames that are scored, evenly spaced; 0: all of them")
+    max_page_frames: int = Field(8, ge=1, le=64, description="scored frames on the page")
     turntable_views: int = Field(8, ge=2, le=36, description="views of the turntable")
 
 
@@ -95,7 +97,8 @@ def run(
     started = time.monotonic()
     manifests = {name: _manifest(inputs[name]) for name in NEEDS}
     loaded = load_finished_run(inputs)
-    positions = scored_positions(loaded.capture)
+    scorable = scored_positions(loaded.capture)
+    positions = scorable[evenly_spaced(len(scorable), config.frames or len(scorable))]
     edge_blur_px = median_edge_blur_px(loaded, settings)
     rows, frame_images = score_frames(loaded, positions, edge_blur_px, config, settings)
     middle = int(positions[len(positions) // 2])
@@ -115,7 +118,14 @@ def run(
     }
     cost = (time.monotonic() - started, peak_rss_mib())
     report = replace_nonfinite(
-        build_report(manifests, rows, metric_sections, describe_environment(), cost, loaded.capture.split_rule)
+        build_report(
+            manifests,
+            rows,
+            metric_sections,
+            describe_environment(),
+            cost,
+            SplitNote(loaded.capture.split_rule, len(scorable)),
+        )
     )
     page = PageContent(
         title=out.resolve().parent.name,
@@ -178,7 +188,7 @@ def score_frames(
     config: Config,
     settings: ReportSettings = REPORT_SETTINGS,
 ) -> tuple[list[dict[str, Any]], list[FrameImages]]:
-    """Return the scores of every held-out frame by render, and the images of some of the frames.
+    """Return the scores of held-out frames by render, and the images of some of the frames.
 
     The silhouette of the render `mesh` is blurred to `edge_blur_px`, the softness of the capture, which the field has
     learnt; `mesh_sharp` has hard edges.
@@ -322,11 +332,12 @@ def _manifest(folder: Path) -> Manifest:
 
 STAGE = Stage(
     name="report",
-    version=8,
+    version=9,
     needs=NEEDS,
     makes=("report.json", "index.html", "turntable.jpg", "clay.jpg", "heldout.jpg"),
     config=Config,
     run=run,
+    shows="index.html",
 )
 
 if __name__ == "__main__":

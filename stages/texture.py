@@ -93,9 +93,7 @@ class Config(BaseConfig):
     normal_map: bool = Field(
         False, description="normal map of what the mesh lost when its faces were reduced; no closer to the person"
     )
-    max_frames: int = Field(
-        100, ge=1, description="largest number of training frames, evenly spaced over the recording"
-    )
+    max_frames: int = Field(60, ge=1, description="largest number of training frames, evenly spaced over the recording")
 
     @field_validator("min_texture_px", "max_texture_px")
     @classmethod
@@ -176,6 +174,7 @@ def run(
         "validation_psnr_body_db": mean_foreground_psnr_db(to_float(to_uint8(diffuse)), validation, surface),
         "specular_explained": fitted.explained,
         "specular_standard_errors": fitted.standard_errors,
+        "specular_regions": float(fitted.regions),
         **light_metrics(evidence, light),
         **template_metrics(template),
     }
@@ -274,13 +273,14 @@ def light_views(
     """Return views with the shading of their vertices; unchanged under a uniform light of constant exposure."""
     if light.is_uniform and bool((light.gain == 1.0).all()):
         return views
-    lobe = (specular.highlights, torch.from_numpy(specular.strength))
-    return [
-        replace(
-            view, shading=light.shade_specular(view.vertices_world, faces, int(position), lobe, view.camera.centre_m())
-        )
-        for view, position in zip(views, positions, strict=True)
-    ]
+    lobe = (specular.highlights, torch.from_numpy(specular.strength)) if specular.strength.any() else None
+
+    def shade(view: BakeView, frame: int) -> Float[Tensor, "v d"]:
+        if lobe is None:
+            return light.shade_vertices(view.vertices_world, faces, frame)
+        return light.shade_specular(view.vertices_world, faces, frame, lobe, view.camera.centre_m())
+
+    return [replace(view, shading=shade(view, int(position))) for view, position in zip(views, positions, strict=True)]
 
 
 def vertex_surface(mesh: Mesh) -> TexturedSurface:
@@ -350,13 +350,13 @@ def make_texel_inpainter(mesh: Mesh, texels: Texels, template: FittedTemplate | 
 def fit_highlights(evidence: LightEvidence | None, light: VideoLight, mesh: Mesh) -> SpecularFit:
     """Return the highlights of the surface; none where no lamp was found, whose highlights they would be."""
     if evidence is None or light.is_uniform:
-        return SpecularFit(Highlights.none(), np.zeros(len(mesh.vertices), dtype=np.float32), 0.0, 0.0)
+        return SpecularFit(Highlights.none(), np.zeros(len(mesh.vertices), dtype=np.float32), 0.0, 0.0, 0)
     return fit_specular(evidence.train, evidence.validation, evidence.light, mesh)
 
 
 STAGE = Stage(
     "texture",
-    version=8,
+    version=9,
     needs=("frames", "body", "mesh"),
     makes=(ATLAS, DIFFUSE, SPECULAR, NORMAL, COVERAGE, LIGHT, TEMPLATE_NPZ),
     config=Config,

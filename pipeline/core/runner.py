@@ -127,6 +127,8 @@ class _StageRunner:
             raise UserError(f"{self.plan.folder} was removed during the run: run the same command again")
         if not is_fresh:
             self._report("done")
+        if self.plan.stage.shows:
+            print(f"      {self.plan.folder / self.plan.stage.shows}", file=sys.stderr, flush=True)
         return StageOutcome(name, "cached" if is_fresh else "run", manifest.seconds, manifest.peak_rss_mib)
 
     def _report(self, state: Literal["cached", "running", "done"], **loop: Any) -> None:

@@ -43,6 +43,7 @@ class Stage:
     needs: names of the stages that it reads, or "video" for the user's file or folder.
     makes: files and folders on which later stages rely; not empty after a run. Other outputs are allowed.
     run: `run(inputs, out, config) -> metrics`; `inputs` maps each need to its path, `out` is the folder to fill.
+    shows: the file of `makes` that a user waits for; the command names it as soon as the stage is done.
     """
 
     name: str
@@ -51,6 +52,7 @@ class Stage:
     makes: tuple[str, ...]
     config: type[Config]
     run: Callable[[Mapping[str, Path], Path, Any], Mapping[str, float]]
+    shows: str | None = None
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from torch import Tensor
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.colour import linear_to_srgb, srgb_to_linear
 from pipeline.kernels.raster import rasterize
-from pipeline.kernels.texture_sampling import supersample_texture
+from pipeline.kernels.texture_sampling import supersample_attributes, supersample_texture
 from pipeline.kernels.texture_sampling.reference import sample_texture_reference
 
 
@@ -53,34 +53,43 @@ def render_textured(
         shading: of each vertex, linear; needs a texture with three channels. Three columns: irradiance, 1 shows the
             texture as it is. A fourth: radiance that is added to all channels.
     """
-    fine = camera.scaled(float(supersampling))
+    image = texture.new_zeros(camera.height, camera.width, texture.shape[2] + 1)
+    box = _pixel_box(vertices_world, camera)
+    if box is None:
+        return image
+    rows, columns = box
+    crop = camera.cropped(columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start)
+    fine = crop.scaled(float(supersampling))
     vertices_px, depth_m = project(vertices_world, fine)
     face_id, barycentric, _ = rasterize(vertices_px, depth_m, faces, fine.height, fine.width)
-    unlit = supersample_texture(face_id, barycentric, faces_uv, uv, texture, supersampling)
-    if shading is None:
-        return unlit
-    samples = interpolate_at_pixels(face_id, barycentric, faces, shading)
-    pooled = torch.nn.functional.avg_pool2d(samples.permute(2, 0, 1), supersampling).permute(1, 2, 0)
-    coverage = unlit[..., 3:]
-    divisor = coverage.clamp(min=1e-6)
-    mean = pooled / divisor
-    linear = srgb_to_linear(unlit[..., :3] / divisor) * mean[..., :3] + mean[..., 3:].sum(dim=-1, keepdim=True)
-    lit = linear_to_srgb(linear.clamp(0.0, 1.0))
-    return torch.cat([lit * coverage, coverage], dim=-1)
-
-
-def interpolate_at_pixels(
-    face_id: Int[Tensor, "h w"],
-    barycentric: Float[Tensor, "h w 3"],
-    faces: Int[Tensor, "f 3"],
-    values: Float[Tensor, "v c"],
-) -> Float[Tensor, "h w c"]:
-    """Interpolate values of vertices at rasterised pixels; 0 where there is no face (`face_id` -1)."""
-    image = torch.zeros(*face_id.shape, values.shape[1], dtype=values.dtype)
-    seen = face_id >= 0
-    corners = values[faces[face_id[seen].long()].long()]
-    image[seen] = (corners * barycentric[seen][..., None]).sum(dim=1)
+    drawn = supersample_texture(face_id, barycentric, faces_uv, uv, texture, supersampling)
+    if shading is not None:
+        drawn = apply_shading(drawn, supersample_attributes(face_id, barycentric, faces, shading, supersampling))
+    image[box] = drawn
     return image
+
+
+def apply_shading(unlit: Float[Tensor, "h w 4"], shading: Float[Tensor, "h w d"]) -> Float[Tensor, "h w 4"]:
+    """Shade a premultiplied sRGB image in linear RGB; see `render_textured`, but one row of shading a pixel."""
+    seen = unlit[..., 3] > 0
+    coverage, light = unlit[seen][:, 3:], shading[seen]
+    linear = srgb_to_linear(unlit[seen][:, :3] / coverage) * light[:, :3] + light[:, 3:].sum(dim=-1, keepdim=True)
+    lit = unlit.clone()
+    lit[seen] = torch.cat([linear_to_srgb(linear.clamp(0.0, 1.0)) * coverage, coverage], dim=-1)
+    return lit
+
+
+def _pixel_box(vertices_world: Float[Tensor, "v 3"], camera: Camera) -> tuple[slice, slice] | None:
+    """Return rows and columns of the pixels that a mesh can cover; None where there are none.
+
+    The whole image where a vertex is not in front of the camera.
+    """
+    position_px, depth_m = project(vertices_world, camera)
+    if not bool((depth_m > 0).all()) or not bool(position_px.isfinite().all()):
+        return slice(0, camera.height), slice(0, camera.width)
+    low, high = position_px.amin(dim=0).floor().int().tolist(), position_px.amax(dim=0).ceil().int().tolist()
+    left, top, right, bottom = max(low[0], 0), max(low[1], 0), min(high[0], camera.width), min(high[1], camera.height)
+    return (slice(top, bottom), slice(left, right)) if left < right and top < bottom else None
 
 
 def blur_coverage(
@@ -98,12 +107,18 @@ def blur_coverage(
     if sigma_px <= 0.0:
         return premultiplied
     size = 2 * math.ceil(4.0 * sigma_px) + 1
-    blurred = cv2.GaussianBlur(premultiplied, (size, size), sigma_px, borderType=cv2.BORDER_REPLICATE)
-    coverage, softened = premultiplied[..., -1:], blurred[..., -1:]
+    rows, columns = (np.flatnonzero(premultiplied[..., -1].any(axis=axis)) for axis in (1, 0))
+    if not len(rows):
+        return premultiplied
+    box = tuple(slice(max(0, each[0] - size), each[-1] + 1 + size) for each in (rows, columns))
+    sharp, softer = premultiplied[box], np.zeros_like(premultiplied)
+    blurred = cv2.GaussianBlur(sharp, (size, size), sigma_px, borderType=cv2.BORDER_REPLICATE)
+    coverage, softened = sharp[..., -1:], blurred[..., -1:]
     extrapolated = blurred[..., :-1] / np.maximum(softened, 1e-6)
-    own = premultiplied[..., :-1] / np.maximum(coverage, 1e-6)
+    own = sharp[..., :-1] / np.maximum(coverage, 1e-6)
     colour = np.where(coverage > 0.5, own, extrapolated)
-    return np.concatenate([colour * softened, softened], axis=2)
+    softer[box] = np.concatenate([colour * softened, softened], axis=2)
+    return softer
 
 
 def turntable_camera(

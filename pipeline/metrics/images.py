@@ -23,6 +23,10 @@ SSIM_RADIUS_PX = 5
 """Radius of the Gaussian window of SSIM: int(3.5 sigma + 0.5), an 11 x 11 window."""
 _VALID_REGION = slice(SSIM_RADIUS_PX, -SSIM_RADIUS_PX)
 
+MARGIN_PX = 16
+"""Margin around the pixels that differ within which SSIM and FLIP are computed: above twice the radius of the window of
+SSIM and above that of the filters of FLIP (10 px), so that the scores are those of the whole image."""
+
 PIXEL_BOX_SIGMA_PX = math.sqrt(1.0 / 12.0)
 """Standard deviation of a square pixel: the blur of a sharp outline in any image."""
 
@@ -132,6 +136,11 @@ def ssim(
     """
     if min(image.shape[:2]) <= 2 * SSIM_RADIUS_PX:
         raise ValueError(f"an image of {image.shape[1]} x {image.shape[0]} px is smaller than the 11 px window of SSIM")
+    return _mean_of_windows(ssim_map(render, image), pixel_mask)
+
+
+def ssim_map(render: UInt8[np.ndarray, "h w 3"], image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
+    """Return the similarity of the window at each pixel, see `ssim`; windows that leave the image do not count."""
     _, similarity = structural_similarity(
         render.astype(np.float64) / 255.0,
         image.astype(np.float64) / 255.0,
@@ -142,6 +151,10 @@ def ssim(
         use_sample_covariance=False,
         full=True,
     )
+    return np.asarray(similarity.mean(axis=2))
+
+
+def _mean_of_windows(similarity: Float[np.ndarray, "h w"], pixel_mask: Bool[np.ndarray, "h w"] | None = None) -> float:
     similarity = similarity[_VALID_REGION, _VALID_REGION]
     if pixel_mask is not None:
         window_centres = pixel_mask[_VALID_REGION, _VALID_REGION]
@@ -196,20 +209,29 @@ def frame_scores(
     Raises:
         ValueError: `reason_not_scorable` has a reason.
     """
+    reason = reason_not_scorable(mask)
+    if reason is not None:
+        raise ValueError(reason)
     render = composite_premultiplied_on_white(rgba)
     target, foreground = composite_on_white(image, mask), foreground_mask(mask)
-    box = foreground_bounding_box(foreground)
-    flip = flip_map(render, target)
     perceptual: dict[str, float] = {}
     if lpips_weights is not None and min(mask.shape) >= MIN_SIDE_PX:
         perceptual["lpips_full"] = lpips(render, target, lpips_weights)
+    box = foreground_bounding_box(foreground)
+    difference = render != target
+    difference[box] = True
+    rows, columns = foreground_bounding_box(difference.any(axis=2))
+    window = tuple(slice(max(0, part.start - MARGIN_PX), part.stop + MARGIN_PX) for part in (rows, columns))
+    similarity, flip = np.ones(mask.shape), np.zeros(mask.shape)
+    similarity[window] = ssim_map(render[window], target[window])
+    flip[window] = flip_map(render[window], target[window])
     return {
         "psnr_full": psnr_db(render, target),
         "psnr_body": psnr_db(render, target, foreground),
         "psnr_box": psnr_db(render[box], target[box]),
-        "ssim_full": ssim(render, target),
-        "ssim_body": ssim(render, target, foreground),
-        "ssim_box": ssim(render[box], target[box]),
+        "ssim_full": _mean_of_windows(similarity),
+        "ssim_body": _mean_of_windows(similarity, foreground),
+        "ssim_box": _mean_of_windows(similarity[box]),
         "flip_full": float(flip.mean()),
         "flip_body": float(flip[foreground].mean()),
         "flip_box": float(flip[box].mean()),

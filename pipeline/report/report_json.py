@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from pipeline.core.command import format_command
@@ -12,8 +13,23 @@ from pipeline.metrics.images import mean_scores
 from pipeline.metrics.lpips import MIN_SIDE_PX
 from pipeline.report.lpips_weights import WEIGHTS_MISSING_NOTE as LPIPS_ABSENT
 
+
+@dataclass(frozen=True)
+class SplitNote:
+    """How frames were held out.
+
+    Attributes:
+        rule: `Capture.split_rule`.
+        held_out: number of held-out frames that can be scored; the report may score some of them only.
+    """
+
+    rule: str
+    held_out: int
+
+
 PROTOCOL = (
-    "{count} frames were held out; split: {split_rule}. Scores of interleaved and disjoint frames do not compare. "
+    "{held_out} frames were held out; {count} of them, evenly spaced, are scored; split: {split_rule}. "
+    "Scores of interleaved and disjoint frames do not compare. "
     "Field, mesh and texture were not trained on their pixels, and no decision used them. Their "
     "poses are fitted to landmarks and silhouettes, never to colours: the body stage fits every frame, and the common "
     "shape and camera, to the landmarks and masks of all frames; the mesh stage fits frames that are not trained on "
@@ -61,7 +77,7 @@ def build_report(
     metric_sections: Mapping[str, Mapping[str, float | int | bool]],
     environment: Mapping[str, Any],
     cost: tuple[float, float],
-    split_rule: str,
+    split: SplitNote,
 ) -> dict[str, Any]:
     """Build the document.
 
@@ -71,7 +87,7 @@ def build_report(
         metric_sections: sections measured by the report: `mesh` (quality), `export` (glb_bytes, texture_px), `masks`.
         environment: machine and versions of this run.
         cost: seconds and peak memory (MiB) of the report stage so far.
-        split_rule: `Capture.split_rule`.
+        split: how frames were held out.
 
     Raises:
         UserError: the manifest of the body stage lacks a metric.
@@ -79,7 +95,9 @@ def build_report(
     seconds = {name: manifest.seconds for name, manifest in manifests.items()} | {"report": round(cost[0], 3)}
     peaks = {name: manifest.peak_rss_mib for name, manifest in manifests.items()} | {"report": round(cost[1], 1)}
     renders = [name for name in frames[0] if name != "index"]
-    protocol = PROTOCOL.format(count=len(frames), split_rule=split_rule, light=_light_note(manifests))
+    protocol = PROTOCOL.format(
+        count=len(frames), held_out=split.held_out, split_rule=split.rule, light=_light_note(manifests)
+    )
     protocol += UNREFINED_NOTE * any(name.endswith("_unrefined") for name in renders)
     protocol += POSE_FITTED_NOTE * any(name.endswith(POSE_FITTED_SUFFIX) for name in renders)
     has_lpips = "lpips_full" in frames[0][renders[0]]
@@ -88,7 +106,8 @@ def build_report(
         "peak_rss_mib": peaks | {"total": max(peaks.values())},
         "heldout": {name: mean_scores([row[name] for row in frames]) for name in renders}
         | {
-            "split": split_rule,
+            "split": split.rule,
+            "held_out_frames": split.held_out,
             "protocol": protocol,
             "lpips": LPIPS_NOTE if has_lpips else LPIPS_MISSING_NOTE,
             "frames": list(frames),

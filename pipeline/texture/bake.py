@@ -12,36 +12,40 @@ optimization", 2014), and back-projects residuals, which also removes the blur o
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pipeline.core.progress import track
 from pipeline.geometry.atlas import Atlas, Texels
 from pipeline.geometry.camera import pixel_footprint_m, project
-from pipeline.geometry.texture_rendering import render_textured
+from pipeline.geometry.texture_rendering import apply_shading, render_textured
+from pipeline.kernels.raster import rasterize
 from pipeline.kernels.texel_projection import ImageView, ProjectedMesh, TexelPoints, project_texels
+from pipeline.kernels.texture_sampling import supersample_attributes, supersample_texture
 from pipeline.metrics.images import (
     composite_on_white,
     composite_premultiplied_on_white,
     foreground_mask,
     validation_psnr_db,
 )
-from pipeline.texture.edge_padding import fill_unknown_texels
+from pipeline.texture.edge_padding import dilate_known_texels, fill_unknown_texels
 from pipeline.texture.settings import TextureSettings
 from pipeline.texture.views import (
     BakeView,
     align_to_render,
     pixel_confidence,
     remove_light,
-    render_depth,
-    render_shading,
 )
 
 HALF_CONFIDENCE_WEIGHT_RATIO = 0.1
 """A texel whose weight sum is this fraction of the median is blended half and half with the inpainted colour. On a real
 recording a tenth of the texels below it have the background's colour, and a thousandth of the well-observed ones."""
+
+MIN_ROUND_VIEWS = 30
+"""Of many views each round takes every second or third, others than the round before, but at least this many."""
 
 MAX_ALBEDO = 1.2
 """sRGB; an albedo above 1 is an error of the light, and a limit keeps it from outweighing other frames."""
@@ -130,16 +134,26 @@ def sample_frame_colours(
 
     Colours are those of the frame, or albedos (at most `MAX_ALBEDO`) if the shading of the view is known.
     """
-    depth_m = render_depth(view, surface.faces)
+    vertices_px, vertex_depth_m = project(view.vertices_world, view.camera)
+    face_id, barycentric, depth_m = rasterize(
+        vertices_px, vertex_depth_m, surface.faces, view.camera.height, view.camera.width
+    )
     falloff_px = settings.silhouette_falloff_m / pixel_footprint_m(view.vertices_world, view.camera)
     pixel_weights = pixel_confidence(view.mask, depth_m.numpy(), falloff_px)
     image = view.image.astype(np.float32) / 255.0
-    colour, weight = sample_view_at_texels(view, surface, image, pixel_weights, depth_m, settings)
-    if view.shading is None:
-        return colour, weight
-    shading = surface.texels.interpolate(surface.faces.numpy(), view.shading.numpy())
-    albedo = torch.from_numpy(remove_light(colour.numpy(), shading)).clamp(max=MAX_ALBEDO)
-    return albedo, weight * light_confidence(torch.from_numpy(shading))
+    if view.shading is not None:
+        used = _used_pixels(pixel_weights)
+        shading = supersample_attributes(face_id, barycentric, surface.faces, view.shading, 1)
+        shading[face_id < 0] = 1.0
+        shading = shading[torch.from_numpy(used)]
+        image[used] = np.minimum(remove_light(image[used], shading.numpy()), MAX_ALBEDO)
+        pixel_weights[used] *= light_confidence(shading).numpy()
+    return sample_view_at_texels(view, surface, image, pixel_weights, depth_m, settings)
+
+
+def _used_pixels(weights: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels that bilinear samples with weight contain: also those without weight next to one with."""
+    return np.asarray(cv2.dilate(weights, np.ones((3, 3), np.uint8)) > 0)
 
 
 def light_confidence(shading: Float[Tensor, "*n d"]) -> Float[Tensor, "*n"]:
@@ -171,22 +185,62 @@ def average_residuals(
     """
     mean = WeightedMean.empty(len(surface.texels.face))
     for view in views:
-        rendered = render_textured_view(texture, view, surface)
-        pixel_m = pixel_footprint_m(view.vertices_world, view.camera)
-        warped, warped_mask = align_to_render(
-            view, rendered, settings.flow_smoothing_sigma_m / pixel_m, settings.max_flow_m / pixel_m
-        )
-        depth_m = render_depth(view, surface.faces)
-        pixel_weights = pixel_confidence(warped_mask, depth_m.numpy(), settings.silhouette_falloff_m / pixel_m)
-        straight = rendered[..., :3] / np.maximum(rendered[..., 3:], 1e-3)
-        residual = warped - straight
-        pixel_weights /= (1.0 + (np.linalg.norm(residual, axis=2) / settings.geman_mcclure_scale) ** 2) ** 2
-        if view.shading is not None:
-            shading = render_shading(view, surface.faces)
-            residual = remove_light(warped, shading) - remove_light(straight, shading)
-            pixel_weights *= light_confidence(torch.from_numpy(shading)).numpy()
-        mean.add(*sample_view_at_texels(view, surface, residual, pixel_weights, depth_m, settings))
+        mean.add(*sample_residuals(texture, view, surface, settings))
     return mean
+
+
+def sample_residuals(
+    texture: Float[np.ndarray, "s s 3"], view: BakeView, surface: TexturedSurface, settings: TextureSettings
+) -> tuple[Float[Tensor, "t 3"], Float[Tensor, "t"]]:
+    """Sample the residual between an aligned view and the render of the texture at every texel, and its weight."""
+    drawn = draw_view(texture, view, surface)
+    pixel_m = pixel_footprint_m(view.vertices_world, view.camera)
+    warped, warped_mask = align_to_render(
+        view, drawn.lit, settings.flow_smoothing_sigma_m / pixel_m, settings.max_flow_m / pixel_m
+    )
+    weights = pixel_confidence(warped_mask, drawn.depth_m.numpy(), settings.silhouette_falloff_m / pixel_m)
+    used = _used_pixels(weights)
+    colour, alpha = warped[used], np.maximum(drawn.lit[used][:, 3:], 1e-3)
+    residual = colour - drawn.lit[used][:, :3] / alpha
+    robust = 1.0 / (1.0 + (np.linalg.norm(residual, axis=1) / settings.geman_mcclure_scale) ** 2) ** 2
+    if drawn.shading is not None:
+        shading = drawn.shading[used]
+        residual = remove_light(colour, shading) - drawn.unlit[used][:, :3] / alpha
+        robust *= light_confidence(torch.from_numpy(shading)).numpy()
+    weights[used] *= robust
+    residuals = np.zeros((*weights.shape, 3), dtype=np.float32)
+    residuals[used] = residual
+    return sample_view_at_texels(view, surface, residuals, weights, drawn.depth_m, settings)
+
+
+@dataclass(frozen=True)
+class DrawnView:
+    """Render of a texture in the pose and light of a view.
+
+    Attributes:
+        unlit, lit: premultiplied sRGB and coverage, in [0, 1]; the same for a view without shading.
+        shading: of each pixel, see `BakeView`; 1 outside the mesh.
+        depth_m: at the pixel centres; inf outside the mesh.
+    """
+
+    unlit: Float[np.ndarray, "h w 4"]
+    lit: Float[np.ndarray, "h w 4"]
+    shading: Float[np.ndarray, "h w d"] | None
+    depth_m: Float[Tensor, "h w"]
+
+
+def draw_view(texture: Float[np.ndarray, "s s 3"], view: BakeView, surface: TexturedSurface) -> DrawnView:
+    """Render the textured mesh in the pose and light of a view, one sample a pixel."""
+    vertices_px, vertex_depth_m = project(view.vertices_world, view.camera)
+    face_id, barycentric, depth_m = rasterize(
+        vertices_px, vertex_depth_m, surface.faces, view.camera.height, view.camera.width
+    )
+    unlit = supersample_texture(face_id, barycentric, surface.faces_uv, surface.uv, torch.from_numpy(texture), 1)
+    if view.shading is None:
+        return DrawnView(unlit.numpy(), unlit.numpy(), None, depth_m)
+    shading = supersample_attributes(face_id, barycentric, surface.faces, view.shading, 1)
+    shading[face_id < 0] = 1.0
+    return DrawnView(unlit.numpy(), apply_shading(unlit, shading).numpy(), shading.numpy(), depth_m)
 
 
 def render_textured_view(
@@ -233,12 +287,15 @@ def bake_diffuse(
     texel_confidence = weight_confidence(initial.weight, half_confidence_weight)
     inpainted = torch.from_numpy(inpaint(initial.value().numpy(), texel_confidence.numpy()))
     colour = torch.lerp(inpainted, initial.value(), texel_confidence[:, None]).clamp(0.0, 1.0)
+    parts = max(1, min(rounds, len(views) // MIN_ROUND_VIEWS))
     for number in range(rounds):
-        texture = texels_to_texture(colour, surface.texels)
-        label = f"texture: round {number + 1}/{rounds}"
-        mean_residual = average_residuals(texture, track(views, label, total=len(views)), surface, settings)
-        residual_confidence = weight_confidence(mean_residual.weight, half_confidence_weight)[:, None]
-        colour = (colour + residual_confidence * mean_residual.value()).clamp(0.0, 1.0)
+        texture = texels_to_texture(colour, surface.texels, is_final=False)
+        label, part = f"texture: round {number + 1}/{rounds}", views[number % parts :: parts]
+        mean_residual = average_residuals(texture, track(part, label, total=len(part)), surface, settings)
+        half = half_confidence_weight * len(part) / len(views)
+        colour = (colour + weight_confidence(mean_residual.weight, half)[:, None] * mean_residual.value()).clamp(
+            0.0, 1.0
+        )
     return texels_to_texture(colour, surface.texels), texel_confidence.numpy()
 
 
@@ -247,9 +304,12 @@ def weight_confidence(weight: Float[Tensor, "t"], half_confidence_weight: float)
     return weight**2 / (weight**2 + half_confidence_weight**2)
 
 
-def texels_to_texture(colour: Float[Tensor, "t c"], texels: Texels) -> Float[np.ndarray, "s s c"]:
-    """Write texel values into a texture and fill its gutters."""
-    return fill_unknown_texels(texels.to_texture(colour.numpy()), texels.coverage_mask())
+def texels_to_texture(
+    colour: Float[Tensor, "t c"], texels: Texels, *, is_final: bool = True
+) -> Float[np.ndarray, "s s c"]:
+    """Write texel values into a texture and fill its gutters; those of a final one for mip levels, too."""
+    fill = fill_unknown_texels if is_final else dilate_known_texels
+    return fill(texels.to_texture(colour.numpy()), texels.coverage_mask())
 
 
 def mean_foreground_psnr_db(

@@ -102,12 +102,14 @@ class VideoLight:
 
         frame: position in the capture; None for the mean exposure.
         """
-        gain = 1.0 if frame is None else float(self.gain[frame])
         if self.is_uniform:
-            return torch.full_like(vertices_world, gain)
+            return torch.full_like(vertices_world, self._gain(frame))
         normals = area_weighted_vertex_normals(vertices_world, faces)
         seen = self.visibility(vertices_world, faces, normals)
-        return torch.from_numpy(gain * self.irradiance(normals.numpy(), seen.numpy()))
+        return torch.from_numpy(self._gain(frame) * self.irradiance(normals.numpy(), seen.numpy()))
+
+    def _gain(self, frame: int | None) -> float:
+        return 1.0 if frame is None else float(self.gain[frame])
 
     def shade_specular(
         self,
@@ -126,8 +128,8 @@ class VideoLight:
         seen = self.visibility(vertices_world, faces, normals).numpy()
         to_camera = torch.nn.functional.normalize(torch.from_numpy(camera_centre_m).float() - vertices_world, dim=1)
         lobe = torch.from_numpy(highlights.lobe(normals.numpy(), to_camera.numpy(), seen)).float()
-        gain = 1.0 if frame is None else float(self.gain[frame])
-        return torch.cat([self.shade_vertices(vertices_world, faces, frame), (gain * strength * lobe)[:, None]], dim=1)
+        irradiance = torch.from_numpy(self.irradiance(normals.numpy(), seen))
+        return self._gain(frame) * torch.cat([irradiance, (strength * lobe)[:, None]], dim=1)
 
     def visibility(
         self, vertices_world: Float[Tensor, "v 3"], faces: Tensor, normals: Float[Tensor, "v 3"]

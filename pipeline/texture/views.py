@@ -12,8 +12,6 @@ from torch import Tensor
 from pipeline.geometry.camera import Camera, pixel_footprint_m, project
 from pipeline.geometry.colour import linear_to_srgb, srgb_to_linear
 from pipeline.geometry.mesh import area_weighted_vertex_normals
-from pipeline.geometry.texture_rendering import interpolate_at_pixels
-from pipeline.kernels.raster import rasterize
 from pipeline.texture.light import MIN_IRRADIANCE
 
 MIN_FOREGROUND_ALPHA = 0.9
@@ -113,27 +111,6 @@ def pixel_confidence(
     unoccluded = on_mesh & (mask >= 255 * MIN_FOREGROUND_ALPHA) & (farthest - nearest < DEPTH_DISCONTINUITY_M)
     distance_px = cv2.distanceTransform(unoccluded.astype(np.uint8), cv2.DIST_L2, 3)
     return np.clip((distance_px - 1.0) / falloff_px, 0.0, 1.0).astype(np.float32)
-
-
-def render_depth(view: BakeView, faces: Int[Tensor, "f 3"]) -> Float[Tensor, "h w"]:
-    """Return the depth (m) of the posed mesh at every pixel of the view; inf outside the mesh."""
-    vertices_px, depth_m = project(view.vertices_world, view.camera)
-    return rasterize(vertices_px, depth_m, faces, view.camera.height, view.camera.width)[2]
-
-
-def render_shading(view: BakeView, faces: Int[Tensor, "f 3"]) -> Float[np.ndarray, "h w d"]:
-    """Return the shading of a view at every pixel; 1 outside the mesh.
-
-    Raises:
-        ValueError: the view has no shading.
-    """
-    if view.shading is None:
-        raise ValueError("the view has no shading")
-    vertices_px, depth_m = project(view.vertices_world, view.camera)
-    face_id, barycentric, _ = rasterize(vertices_px, depth_m, faces, view.camera.height, view.camera.width)
-    shading = interpolate_at_pixels(face_id, barycentric, faces, view.shading).numpy()
-    shading[face_id.numpy() < 0] = 1.0
-    return shading
 
 
 def remove_light(colour: Float[np.ndarray, "*n 3"], shading: Float[np.ndarray, "*n d"]) -> Float[np.ndarray, "*n 3"]:

@@ -31,7 +31,13 @@ from pipeline.texture.files import TextureArtifact
 from pipeline.texture.light import Highlights, directional_light
 from stages.export import STAGE, Config, encode_scene, load_scene
 from tests.tools.browser import open_browser
-from tests.tools.pictures import LampAndSky, open_in_three, render_in_three, render_obj_in_blender
+from tests.tools.pictures import (
+    LampAndSky,
+    open_in_three,
+    render_glb_in_blender,
+    render_in_three,
+    render_obj_in_blender,
+)
 
 WIDTH_PX, HEIGHT_PX = 540, 720
 SUPERSAMPLING = 8
@@ -102,12 +108,14 @@ def compare_lit(run: Path, out: Path) -> str:
     for name, texture in (("matte", matte), ("shiny", shiny)):
         file = out / f"lit_{name}.glb"
         file.write_bytes(encode_scene(replace(scene, texture=texture), config, {"capture": scene.motion}))
+        ours = _render_lit(plain, texture, camera)
+        blender = render_glb_in_blender(file.resolve(), camera, LAMP, out.resolve())
+        parts.append(f"Blender lit, {name} {_compare_to(ours, blender, out / f'blender_lit_{name}')}")
         with open_browser() as page:
             open_in_three(page, file, out)
             fine = render_in_three(page, camera.scaled(THREE_SUPERSAMPLING), light=LAMP)
             assert page.problems == [], page.problems
         picture = cv2.resize(fine, (WIDTH_PX, HEIGHT_PX), interpolation=cv2.INTER_AREA)
-        ours = _render_lit(plain, texture, camera)
         parts.append(f"three.js lit, {name} {_compare_to(ours, picture, out / f'three_lit_{name}')}")
     return ", ".join(parts)
 

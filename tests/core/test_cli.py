@@ -35,6 +35,11 @@ def test_all_stages_run_and_then_are_cached(toy: Toy) -> None:
     assert states(toy.all("--status").stdout) == ["fresh"] * 3
 
 
+def test_what_a_user_waits_for_is_named_before_the_next_stage_begins(toy: Toy) -> None:
+    told = toy.call_all("--video", "numbers.txt").stderr
+    assert told.index("[2/3] learn") < told.index(str(Path("learn") / "trail")) < told.index("[3/3] summarise")
+
+
 def test_the_video_is_never_written(toy: Toy) -> None:
     before = toy.video.stat()
     toy.all("--video", "numbers.txt")

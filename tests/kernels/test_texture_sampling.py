@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from pipeline.kernels.raster import rasterize
-from pipeline.kernels.texture_sampling import supersample_texture
+from pipeline.kernels.texture_sampling import supersample_attributes, supersample_texture
+from pipeline.kernels.texture_sampling.reference import supersample_attributes_reference
 
 
 def random_raster(samples: int, seed: int) -> tuple[torch.Tensor, ...]:
@@ -48,3 +49,21 @@ def test_texture_gradient_when_required() -> None:
     )
     single = texture.clone().requires_grad_()
     assert supersample_texture(face_id, barycentric, faces_uv, uv, single, 2).requires_grad
+
+
+@pytest.mark.parametrize(("samples", "seed"), [(1, 4), (2, 5), (3, 6)])
+def test_compiled_mean_of_attributes_matches_reference(samples: int, seed: int) -> None:
+    face_id, barycentric, faces, _, _ = random_raster(samples, seed)
+    values = torch.rand(40, 4, generator=torch.Generator().manual_seed(seed))
+    fast = supersample_attributes(face_id, barycentric, faces, values, samples)
+    exact = supersample_attributes_reference(face_id, barycentric.double(), faces, values.double(), samples)
+    torch.testing.assert_close(fast, exact.float(), atol=2e-6, rtol=0.0)
+
+
+def test_mean_of_attributes_counts_covered_points_only() -> None:
+    face_id = torch.tensor([[0, -1, -1, -1], [0, -1, -1, -1]], dtype=torch.int32)
+    barycentric = torch.zeros(2, 4, 3)
+    barycentric[0, 0], barycentric[1, 0] = torch.tensor([1.0, 0, 0]), torch.tensor([0, 0.5, 0.5])
+    faces = torch.tensor([[0, 1, 2]], dtype=torch.int32)
+    image = supersample_attributes(face_id, barycentric, faces, torch.tensor([[1.0], [2.0], [4.0]]), 2)
+    assert image.tolist() == [[[2.0], [0.0]]]

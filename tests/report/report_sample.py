@@ -10,7 +10,7 @@ from pipeline.avatar.rig import build_rig
 from pipeline.capture.frame_selection import INTERLEAVED_RULE
 from pipeline.core.manifest import Manifest
 from pipeline.report.page import FrameImages, PageContent
-from pipeline.report.report_json import build_report, replace_nonfinite
+from pipeline.report.report_json import SplitNote, build_report, replace_nonfinite
 from tests.avatar.avatar_sample import sample_body, sample_maps, sample_motion, sample_skinned_mesh
 
 STAGES = ("frames", "body", "field", "mesh", "texture", "export")
@@ -41,7 +41,12 @@ def sample_report(first_psnr: float = 30.0, manifests: dict[str, Manifest] | Non
     rows = sample_rows(first_psnr)
     return replace_nonfinite(
         build_report(
-            manifests or sample_manifests(), rows, metric_sections, environment, (7.0, 700.0), INTERLEAVED_RULE
+            manifests or sample_manifests(),
+            rows,
+            metric_sections,
+            environment,
+            (7.0, 700.0),
+            SplitNote(INTERLEAVED_RULE, 2),
         )
     )
 

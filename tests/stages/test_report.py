@@ -187,6 +187,13 @@ def test_a_held_out_frame_without_a_person_is_left_out_with_a_warning(inputs: di
     assert len(take_warnings()) == 3
 
 
+def test_as_many_held_out_frames_are_scored_as_asked_for(inputs: dict[str, Path], tmp_path: Path):
+    run(inputs, tmp_path, QUICK.model_copy(update={"frames": 2}), SETTINGS)
+    heldout = json.loads((tmp_path / "report.json").read_text())["heldout"]
+    assert [row["index"] for row in heldout["frames"]] == [0, 16]
+    assert "3 frames were held out; 2 of them" in heldout["protocol"]
+
+
 def test_without_a_manifest_the_command_is_named(inputs: dict[str, Path], tmp_path: Path):
     with pytest.raises(UserError, match="python -m stages mesh"):
         run(inputs | {"mesh": tmp_path / "mesh"}, tmp_path, CONFIG, SETTINGS)

@@ -24,7 +24,7 @@ def test_texels_next_to_a_chart_take_its_colour() -> None:
     image, known = np.zeros((64, 64, 3), dtype=np.float32), np.zeros((64, 64), dtype=bool)
     image[:, :20], image[:, 40:] = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
     known[:, :20] = known[:, 40:] = True
-    filled = fill_unknown_texels(image, known, dilation_px=2)
+    filled = fill_unknown_texels(image, known)
     np.testing.assert_allclose(filled[:, 20:22], np.broadcast_to([1.0, 0.0, 0.0], (64, 2, 3)), atol=1e-6)
     np.testing.assert_allclose(filled[:, 38:40], np.broadcast_to([0.0, 0.0, 1.0], (64, 2, 3)), atol=1e-6)
     assert 0.2 < filled[32, 30, 0] < 0.8

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull, cKDTree
 from pipeline.core.errors import UserError
 from pipeline.geometry.colour import linear_to_srgb, srgb_to_linear
 from pipeline.geometry.mesh import Mesh
-from pipeline.texture.bake import TexturedSurface, average_views
+from pipeline.texture.bake import TexturedSurface, average_views, draw_view
 from pipeline.texture.light import (
     Highlights,
     VideoLight,
@@ -24,7 +24,7 @@ from pipeline.texture.light_evidence import LightEvidence, estimate_light
 from pipeline.texture.light_fit import LightObservations, ViewObservations, fit_light, predict_views
 from pipeline.texture.settings import TextureSettings
 from pipeline.texture.specular import texels_at_vertices
-from pipeline.texture.views import BakeView, remove_light, render_depth
+from pipeline.texture.views import BakeView, remove_light
 from tests.data_tools.synthetic.shapes import sphere
 from tests.texture.painted_ball import PaintedBall, ball_colours
 
@@ -182,7 +182,7 @@ class LitBall:
 
     def _lit(self, view: BakeView, lamp: VideoLight) -> BakeView:
         """Shade each pixel by the nearest vertex: independent of the rasteriser of the bake."""
-        depth = render_depth(view, self.ball.surface.faces).numpy()
+        depth = draw_view(np.zeros((2, 2, 3), np.float32), view, self.ball.surface).depth_m.numpy()
         rows, columns = np.nonzero(np.isfinite(depth))
         camera = view.camera
         z = depth[rows, columns]

@@ -80,6 +80,16 @@ def test_a_shiny_patch_and_its_lobe_are_found() -> None:
     assert np.median(result.strength[reached & ~shiny]) < 0.05
 
 
+def test_a_small_shiny_region_is_found_on_a_person_with_wrong_normals() -> None:
+    """Highlights explain little of the error of the whole surface, but most of it where they are."""
+    vertices = ball().vertices
+    shiny = (vertices[:, 0] > 0.7) & (np.abs(vertices[:, 1] - 0.2) < 0.3)
+    result = fitted(0.3 * np.repeat(shiny[:, None], 3, axis=1), tilt_rad=0.04)
+    assert 1 <= result.regions <= 6
+    assert result.strength[shiny].mean() > 0.08
+    assert result.strength[vertices[:, 0] < 0.0].max() < 0.02
+
+
 def test_matte_balls_have_no_highlights() -> None:
     result = fitted(np.zeros((VERTICES, 3)))
     assert not result.strength.any()

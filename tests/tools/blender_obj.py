@@ -46,17 +46,22 @@ def show_diffuse_only(material):
     return colour.image.name, images
 
 
-def render(picture):
-    """Render on white with the mean of 256 samples in the square of a pixel."""
+def configure_render(picture, samples):
+    """Render to a file with the mean of some samples in the square of a pixel."""
     scene = bpy.context.scene
     scene.render.engine, scene.render.filepath = "CYCLES", str(picture)
-    scene.cycles.samples, scene.cycles.use_denoising, scene.cycles.use_adaptive_sampling = 256, False, False
+    scene.cycles.samples, scene.cycles.use_denoising, scene.cycles.use_adaptive_sampling = samples, False, False
     scene.cycles.pixel_filter_type, scene.cycles.max_bounces = "BOX", 0
     scene.view_settings.view_transform = "Standard"
+
+
+def render(picture):
+    """Render on white."""
+    configure_render(picture, samples=256)
     world = bpy.data.worlds.new("white")
     world.use_nodes = True
     world.node_tree.nodes["Background"].inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
-    scene.world = world
+    bpy.context.scene.world = world
     bpy.ops.render.render(write_still=True)
 
 
@@ -72,4 +77,5 @@ def main(obj, folder):
     np.savez(folder / "found.npz", vertices_m=vertices[:, [0, 2, 1]] * [1, 1, -1], base=base, images=images)
 
 
-main(sys.argv[1], Path(sys.argv[2]))
+if __name__ == "__main__":
+    main(sys.argv[1], Path(sys.argv[2]))

@@ -14,6 +14,7 @@ import pytest
 from jaxtyping import Float, UInt8
 
 from pipeline.geometry.camera import Camera
+from pipeline.metrics.images import composite_on_white
 from pipeline.report.templates import read_asset
 from tests.tools.browser import BrowserPage
 
@@ -100,16 +101,30 @@ def render_obj_in_blender(obj: Path, camera: Camera, folder: Path) -> tuple[UInt
 
     BLENDER_PYTHON names a Python with bpy; skips the test without it.
     """
+    _run_in_blender("blender_obj.py", obj, camera, folder)
+    with np.load(folder / "found.npz") as found:
+        return _decode((folder / "blender.png").read_bytes()), dict(found)
+
+
+def render_glb_in_blender(glb: Path, camera: Camera, light: LampAndSky, folder: Path) -> UInt8[np.ndarray, "h w 3"]:
+    """Return a lit picture on white by Blender's Cycles, in the rest pose; see `render_obj_in_blender`."""
+    (folder / "light.json").write_text(json.dumps(asdict(light)))
+    _run_in_blender("blender_lit.py", glb, camera, folder)
+    rgba = cv2.imread(str(folder / "blender.png"), cv2.IMREAD_UNCHANGED)
+    return composite_on_white(np.ascontiguousarray(rgba[..., 2::-1]), np.ascontiguousarray(rgba[..., 3]))
+
+
+def _run_in_blender(script: str, file: Path, camera: Camera, folder: Path) -> None:
     python = os.environ.get("BLENDER_PYTHON", "")
     if not Path(python).is_file():
         pytest.skip("BLENDER_PYTHON does not name a Python with bpy")
+    picture = folder / "blender.png"
+    picture.unlink(missing_ok=True)
     intrinsics = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
     (folder / "camera.json").write_text(json.dumps(intrinsics | {"camera_to_world": _camera_to_world(camera).tolist()}))
-    script = Path(__file__).with_name("blender_obj.py")
-    done = subprocess.run([python, script, obj, folder], capture_output=True, text=True, check=False, timeout=600)
-    assert (folder / "found.npz").is_file(), done.stderr[-2000:]
-    with np.load(folder / "found.npz") as found:
-        return _decode((folder / "blender.png").read_bytes()), dict(found)
+    command = [python, Path(__file__).with_name(script), file, folder]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
+    assert picture.is_file(), done.stderr[-2000:]
 
 
 def _camera_to_world(camera: Camera) -> Float[np.ndarray, "4 4"]:

@@ -1,4 +1,4 @@
-"""Compiled loop of texture lookups. Each thread writes whole rows of pixels, so that the result is deterministic."""
+"""Compiled loops of lookups at rasterised points. A thread writes whole rows of pixels: the result is deterministic."""
 
 import numpy as np
 from numba import njit, prange
@@ -46,4 +46,30 @@ def supersample_texture_cpu(
                     upper = texture[top, left, c] + across * (texture[top, right, c] - texture[top, left, c])
                     lower = texture[bottom, left, c] + across * (texture[bottom, right, c] - texture[bottom, left, c])
                     image[row, column, c] += sample_weight * (upper + down * (lower - upper))
+    return image
+
+
+@njit(parallel=True, **NJIT_OPTIONS)
+def supersample_attributes_cpu(
+    face_id: np.ndarray, barycentric: np.ndarray, faces: np.ndarray, values: np.ndarray, samples: int
+) -> np.ndarray:
+    """Return the image (h, w, c): see `pipeline.kernels.texture_sampling.supersample_attributes`."""
+    height, width, channels = face_id.shape[0] // samples, face_id.shape[1] // samples, values.shape[1]
+    image = np.zeros((height, width, channels), np.float32)
+    for row in prange(height):
+        for column in range(width):
+            covered = np.float32(0.0)
+            for fine_row in range(row * samples, (row + 1) * samples):
+                for fine_column in range(column * samples, (column + 1) * samples):
+                    face = face_id[fine_row, fine_column]
+                    if face < 0:
+                        continue
+                    covered += np.float32(1.0)
+                    for k in range(3):
+                        weight = barycentric[fine_row, fine_column, k]
+                        for c in range(channels):
+                            image[row, column, c] += weight * values[faces[face, k], c]
+            if covered > 1.0:
+                for c in range(channels):
+                    image[row, column, c] /= covered
     return image

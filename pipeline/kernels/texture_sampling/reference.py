@@ -30,3 +30,20 @@ def supersample_texture_reference(
     image = torch.zeros(*face_id.shape, texture.shape[2] + 1, dtype=texture.dtype, device=texture.device)
     image[seen] = torch.cat([colour, torch.ones_like(colour[:, :1])], dim=1)
     return image.view(height, samples, width, samples, -1).mean(dim=(1, 3))
+
+
+def supersample_attributes_reference(
+    face_id: Int[Tensor, "fh fw"],
+    barycentric: Float[Tensor, "fh fw 3"],
+    faces: Int[Tensor, "f 3"],
+    values: Float[Tensor, "v c"],
+    samples: int,
+) -> Float[Tensor, "h w c"]:
+    """Do `pipeline.kernels.texture_sampling.supersample_attributes`."""
+    height, width = face_id.shape[0] // samples, face_id.shape[1] // samples
+    seen = face_id >= 0
+    image = torch.zeros(*face_id.shape, values.shape[1], dtype=values.dtype, device=values.device)
+    image[seen] = (values[faces[face_id[seen].long()].long()] * barycentric[seen][..., None]).sum(dim=1)
+    total = image.view(height, samples, width, samples, -1).sum(dim=(1, 3))
+    covered = seen.view(height, samples, width, samples).sum(dim=(1, 3))
+    return total / covered.clamp(min=1)[..., None]

@@ -44,7 +44,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: LearnConfig) -> Mapping[s
     return {"first_step": first}
 
 
-STAGE = Stage("learn", version=1, needs=("read",), makes=("trail",), config=LearnConfig, run=run)
+STAGE = Stage("learn", version=1, needs=("read",), makes=("trail",), config=LearnConfig, run=run, shows="trail")
 
 if __name__ == "__main__":
     raise SystemExit(main(STAGE, config_dir=CONFIG_DIR))
