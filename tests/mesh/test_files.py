@@ -8,6 +8,7 @@ import torch
 
 from pipeline.core.errors import UserError
 from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.surface_cut import cut_at_borders
 from pipeline.io.npz import load_npz, save_npz
 from pipeline.mesh.files import (
     DENSE_NPZ,
@@ -82,3 +83,14 @@ def test_a_checkpoint_is_read_back(tmp_path: Path) -> None:
     assert torch.equal(loaded.skin.adjacency, state.skin.adjacency)
     assert loaded.shader_state == shader_state
     assert (loaded.rounds_done, loaded.validation_psnr_db, loaded.finished) == (2, (20.0, 25.5), True)
+
+
+def test_a_cut_mesh_keeps_the_normals_of_the_surface_before_the_cut() -> None:
+    cut, _ = cut_at_borders(TETRAHEDRON, lambda points: (points[:, 0] > 0.3).astype(int))
+    before = TETRAHEDRON.vertex_normals()
+    found = ARTIFACT.cut(cut)
+    assert np.abs(found.mesh.vertex_normals()[:4] - before).max() > 0.05
+    np.testing.assert_allclose(found.vertex_normals()[:4], before, atol=1e-6)
+    between = cut.extend(before)[4:]
+    between /= np.linalg.norm(between, axis=1, keepdims=True)
+    np.testing.assert_allclose(found.vertex_normals()[4:], between, atol=1e-6)
