@@ -49,6 +49,7 @@ from pipeline.mesh.pose_selection import is_far_from, score_motion
 from pipeline.mesh.refinement import RefinementState, refine_mesh
 from pipeline.mesh.remeshing import detailed_faces, remesh_to_edge_length
 from pipeline.mesh.settings import MeshSettings
+from pipeline.mesh.skin_relaxation import move_along, relax_skin
 from pipeline.mesh.skin_transfer import SkinnedTopology, transfer_skin
 from pipeline.mesh.vertex_optimisation import RefinementInputs
 from pipeline.mesh.views import PosedView, crop_posed_view, mesh_psnr_db, silhouette_iou
@@ -150,20 +151,23 @@ def run(
     state = refine_mesh(start, refinement_inputs, lambda state: save_checkpoint(out / CHECKPOINT, state))
     shader, psnr_db = refinement_inputs.shader, state.validation_psnr_db
     mesh = finish_mesh(state.mesh, refinement_inputs, config.max_final_faces)
-    is_unchanged = mesh is state.mesh
-    skin = state.skin if is_unchanged else transfer_skin(mesh, body)
-    save_dense_mesh(out, state.mesh)
+    relaxed = relax_skin(mesh, state.skin if mesh is state.mesh else transfer_skin(mesh, body), body, train)
+    save_dense_mesh(out, move_along(state.mesh, mesh, relaxed.mesh))
+    mesh, skin = relaxed.mesh, relaxed.skin
     write_results(out, mesh, skin, shader)
     motion, motion_metrics = refit_motion(capture, inputs, body, (mesh, skin, shader), validation)
     save_motion(out / "motion.npz", motion)
     return {
         **{key: float(value) for key, value in mesh_quality_metrics(mesh).items()},
         "initial_validation_psnr_db": psnr_db[0],
-        "refined_validation_psnr_db": psnr_db[-1] if is_unchanged else mesh_psnr_db(mesh, skin, validation, shader),
+        "refined_validation_psnr_db": mesh_psnr_db(mesh, skin, validation, shader),
         "silhouette_iou": silhouette_iou(mesh, skin, validation),
         "target_edge_m": target_edge_m,
         "accepted_rounds": len(psnr_db) - 1.0,
         "faces_before_reduction": float(len(state.mesh.faces)),
+        "stretch_p999": relaxed.stretch_after,
+        "stretch_p999_before": relaxed.stretch_before,
+        "relaxation_shown_p99_mm": relaxed.shown_change_mm,
         **motion_metrics,
     }
 
@@ -289,7 +293,7 @@ def write_results(out: Path, mesh: Mesh, skin: SkinnedTopology, shader: torch.nn
 
 STAGE = Stage(
     "mesh",
-    version=18,
+    version=19,
     needs=("frames", "body", "field"),
     makes=(MESH_NPZ, DENSE_NPZ, "motion.npz", "preview.png"),
     config=Config,
