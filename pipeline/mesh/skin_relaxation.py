@@ -43,7 +43,7 @@ LIMIT, HUBER, COLLAPSED = 1.5, 0.4, 0.3
 """Ratio above which an edge counts; excess from where its energy is linear; ratio below which it counts again."""
 CAPTURE_WEIGHT, FREE_MM, EVERYWHERE_WEIGHT = 0.15, 1.5, 0.0005
 """Weight of a squared millimetre in frames that show a vertex; displacement that is free; weight in all frames."""
-WEIGHTS_SMOOTHNESS, OFFSET_SMOOTHNESS = 0.3, 0.02
+WEIGHTS_SMOOTHNESS, OFFSET_SMOOTHNESS = 3.0, 0.2
 """Weights of the squared Laplacians of the changes of weights and of the vertices (mm)."""
 RINGS, SPREAD_STEPS, CANDIDATES, INFLUENCES = 10, 40, 6, 4
 """Rings of edges around a stretched edge that may change; smoothing steps that tell which joints may get weight; number

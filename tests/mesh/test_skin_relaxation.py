@@ -95,7 +95,7 @@ def test_frames_hold_what_they_show(relaxed: tuple[Body, RelaxedSkin], monkeypat
             moved_mm.append(1e3 * (after - before).norm(dim=1)[visible_vertices(body.mesh(), weights, view)].numpy())
         shown_mm.append(np.concatenate(moved_mm))
         np.testing.assert_allclose(found.shown_change_mm, np.quantile(shown_mm[-1], 0.99), rtol=1e-4)
-    assert np.quantile(shown_mm[0], 0.99) < 2.0 < np.quantile(shown_mm[1], 0.99)
+    assert np.quantile(shown_mm[0], 0.99) < 0.8 * np.quantile(shown_mm[1], 0.99)
 
 
 def test_weights_stay_convex_sparse_and_fixed_far_from_the_tear(relaxed: tuple[Body, RelaxedSkin]) -> None:
