@@ -24,6 +24,7 @@ from pipeline.avatar.placement import resample_uniformly
 from pipeline.avatar.retarget import retarget_with_contacts
 from pipeline.avatar.rig import build_rig
 from pipeline.body.body import Body, Motion, canonical_to_world
+from pipeline.body.files import load_body
 from pipeline.core.errors import UserError
 from pipeline.core.json_file import load_json
 from pipeline.core.manifest import read_manifest
@@ -42,8 +43,8 @@ def main(argv: Sequence[str]) -> None:
     options = _parse_options(argv)
     inputs = {name: options.run / name for name in export.STAGE.needs}
     config = export_config(options.run)
+    clips = _retargeted_clips(options.bvh, load_body(inputs["body"] / "body.npz"), options.in_place)
     scene = load_scene(inputs, config)
-    clips = _retargeted_clips(options.bvh, scene.body, options.in_place)
     posed = _chosen_pose(options, scene, clips)
     with replaced_folder(options.run / "pose" / _result_name(options)) as out:
         write_bvh(out / "capture.bvh", motion_to_bvh(scene.rig, planted_motion(scene), scene.fps))
