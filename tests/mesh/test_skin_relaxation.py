@@ -112,6 +112,14 @@ def test_weights_stay_convex_sparse_and_fixed_far_from_the_tear(relaxed: tuple[B
     np.testing.assert_array_equal(weights[far], body.skin_weights[far])
 
 
+def test_the_same_input_gives_the_same_bytes(relaxed: tuple[Body, RelaxedSkin]) -> None:
+    body, first = relaxed
+    skin = build_skinned_topology(body.mesh(), torch.from_numpy(body.skin_weights))
+    again = relax_skin(body.mesh(), skin, body, [front_view(body), front_view(body, 0.1)])
+    assert again.mesh.vertices.tobytes() == first.mesh.vertices.tobytes()
+    assert torch.equal(again.skin.weights, first.skin.weights)
+
+
 def test_a_body_that_does_not_tear_is_not_changed() -> None:
     body = capsule_body()  # its joints are not turned in any of the poses
     skin = build_skinned_topology(body.mesh(), torch.from_numpy(body.skin_weights))
