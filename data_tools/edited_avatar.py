@@ -47,5 +47,5 @@ def write_edited_avatar(
         write_gray(part / SPECULAR, to_uint8(texture.specular))
         save_normal_map(part / NORMAL, texture)
         (part / "avatar.glb").write_bytes(encode_scene(edited, config, edited.clips()))
-        write_scene_obj(part, part, texture, to_rest_pose(scene.skinned, scene.rig).mesh)
+        write_scene_obj(part, part, texture, to_rest_pose(scene.skinned, scene.rig))
     report(f"{out}: avatar.glb, avatar.obj, {DIFFUSE} ({len(texture.diffuse)} px)")

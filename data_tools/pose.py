@@ -9,6 +9,7 @@ avatar.glb, the avatar with each clip as a further animation; with --frame or --
 import argparse
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,12 +24,14 @@ from pipeline.avatar.placement import resample_uniformly
 from pipeline.avatar.retarget import retarget_with_contacts
 from pipeline.avatar.rig import build_rig
 from pipeline.body.body import Body, Motion, canonical_to_world
+from pipeline.body.files import load_body
 from pipeline.core.errors import UserError
 from pipeline.core.json_file import load_json
 from pipeline.core.manifest import read_manifest
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning, local_quaternions
 from pipeline.io.bvh import read_bvh, write_bvh
+from pipeline.mesh.files import MeshArtifact
 from stages import export
 from stages.export import Scene, encode_scene, load_scene, write_scene_obj
 
@@ -40,8 +43,8 @@ def main(argv: Sequence[str]) -> None:
     options = _parse_options(argv)
     inputs = {name: options.run / name for name in export.STAGE.needs}
     config = export_config(options.run)
+    clips = _retargeted_clips(options.bvh, load_body(inputs["body"] / "body.npz"), options.in_place)
     scene = load_scene(inputs, config)
-    clips = _retargeted_clips(options.bvh, scene.body, options.in_place)
     posed = _chosen_pose(options, scene, clips)
     with replaced_folder(options.run / "pose" / _result_name(options)) as out:
         write_bvh(out / "capture.bvh", motion_to_bvh(scene.rig, planted_motion(scene), scene.fps))
@@ -171,11 +174,12 @@ def _chosen_pose(options: argparse.Namespace, scene: Scene, clips: Mapping[str, 
     return snap_feet_to_floor(scene.body, motion, float(FLOOR_M[1]))
 
 
-def _posed_mesh(scene: Scene, motion: Motion) -> Mesh:
+def _posed_mesh(scene: Scene, motion: Motion) -> MeshArtifact:
     mesh = scene.skinned.mesh
     weights = scene.skinned.dense_skin_weights(len(scene.body.joint_names))
     transforms = canonical_to_world(scene.body, motion)
-    return Mesh(linear_blend_skinning(torch.from_numpy(mesh.vertices), weights, transforms)[0].numpy(), mesh.faces)
+    posed = linear_blend_skinning(torch.from_numpy(mesh.vertices), weights, transforms)[0].numpy()
+    return replace(scene.skinned, mesh=Mesh(posed, mesh.faces))
 
 
 if __name__ == "__main__":

@@ -47,7 +47,7 @@ def main(argv: Sequence[str]) -> None:
     out = options.run / "reshape" / name
     with replaced_folder(out) as part:
         (part / "avatar.glb").write_bytes(encode_scene(scene, avatar.config, scene.clips()))
-        write_scene_obj(options.run / "texture", part, scene.texture, to_rest_pose(scene.skinned, scene.rig).mesh)
+        write_scene_obj(options.run / "texture", part, scene.texture, to_rest_pose(scene.skinned, scene.rig))
     print(f"{out}: avatar.glb, avatar.obj")
 
 

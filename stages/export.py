@@ -155,7 +155,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     meta = VrmMeta("avatar", config.author, config.licence_url)
     loose = loose_parts(scene) if {"vrm", "vrm0"} & set(config.formats) else LooseParts()
     write_formats(out / "avatar.glb", FormatRequest(config.formats, scene.body.joint_names, meta, loose))
-    write_scene_obj(inputs["texture"], out, scene.texture, to_rest_pose(scene.skinned, scene.rig).mesh)
+    write_scene_obj(inputs["texture"], out, scene.texture, to_rest_pose(scene.skinned, scene.rig))
     if config.topology == "template":
         write_wrapped(scene, config, out)
     face = scene.face
@@ -252,14 +252,14 @@ def add_shape_keys(mesh: SkinnedMesh, scene: Scene, atlas: Atlas) -> SkinnedMesh
     if scene.template is None:
         raise UserError("export.shape_keys=true needs the built-in body, and this run has a body of a model file")
     skinned = scene.face.skinned if scene.face else scene.skinned
-    registration, at_rest = scene.template.registration, to_rest_pose(skinned, scene.rig).mesh
+    registration, at_rest = scene.template.registration, to_rest_pose(skinned, scene.rig)
     moved, turned = [], []
     for name in SHAPE_KEYS:
         change = shape_change(scene.body, {name: SHAPE_KEY_STEP})
         vertices = (skinned.mesh.vertices + carry_to_surface(change, registration, skinned.mesh)).astype(np.float32)
         new = to_rest_pose(replace(skinned, mesh=Mesh(vertices, skinned.mesh.faces)), scene.rig)
-        moved.append((new.mesh.vertices - at_rest.vertices)[atlas.vertex_of_uv])
-        turned.append((new.mesh.vertex_normals() - at_rest.vertex_normals())[atlas.vertex_of_uv])
+        moved.append((new.mesh.vertices - at_rest.mesh.vertices)[atlas.vertex_of_uv])
+        turned.append((new.vertex_normals() - at_rest.vertex_normals())[atlas.vertex_of_uv])
     keys, turns = np.stack(moved).astype(np.float32), np.stack(turned).astype(np.float32)
     old = mesh.morphs
     if old is None:
@@ -317,8 +317,8 @@ def material_maps(
     )
 
 
-def write_scene_obj(texture_dir: Path, out: Path, texture: TextureArtifact, mesh: Mesh) -> None:
-    """Write `avatar.obj`, `avatar.mtl` and the maps for any pose of the mesh."""
+def write_scene_obj(texture_dir: Path, out: Path, texture: TextureArtifact, skinned: MeshArtifact) -> None:
+    """Write `avatar.obj`, `avatar.mtl` and the maps for the mesh in any pose."""
     diffuse_name, specular_name, normal_name = (
         copy_map(texture_dir, name, out) for name in (DIFFUSE, SPECULAR, NORMAL)
     )
@@ -327,7 +327,8 @@ def write_scene_obj(texture_dir: Path, out: Path, texture: TextureArtifact, mesh
         specular_name if texture.specular.any() else None,
         normal_name if texture.normal is not None else None,
     )
-    write_obj(out / "avatar.obj", mesh, texture.atlas.uv, texture.atlas.faces_uv, mesh.vertex_normals(), *map_names)
+    layout, normals = texture.atlas, skinned.vertex_normals()
+    write_obj(out / "avatar.obj", skinned.mesh, layout.uv, layout.faces_uv, normals, *map_names)
 
 
 def copy_map(texture_dir: Path, name: str, out: Path) -> str:
@@ -380,7 +381,7 @@ def light_extras(light: VideoLight) -> dict[str, Any]:
 
 STAGE = Stage(
     "export",
-    version=10,
+    version=11,
     needs=("frames", "body", "mesh", "texture"),
     makes=("avatar.glb", "avatar.obj", "avatar.mtl", *OBJ_MAPS),
     config=Config,

@@ -49,6 +49,7 @@ from pipeline.mesh.pose_selection import is_far_from, score_motion
 from pipeline.mesh.refinement import RefinementState, refine_mesh, with_offsets
 from pipeline.mesh.remeshing import detailed_faces, remesh_to_edge_length
 from pipeline.mesh.settings import MeshSettings
+from pipeline.mesh.skin_relaxation import move_along, relax_skin
 from pipeline.mesh.skin_transfer import SkinnedTopology, transfer_skin
 from pipeline.mesh.vertex_optimisation import RefinementInputs
 from pipeline.mesh.views import PosedView, crop_posed_view, mesh_psnr_db, silhouette_iou
@@ -152,25 +153,31 @@ def run(
         extracted = extract_initial_mesh(samples, body, evidence, validation or train, settings)
         start = remesh_to_edge_length(extracted, target_edge_m, body)
     state = refine_mesh(start, refinement_inputs, lambda state: save_checkpoint(out / CHECKPOINT, state))
-    aligned_inputs = with_offsets(refinement_inputs, state.pose_offsets)
-    aligned_views, shader, psnr_db = aligned_inputs.validation, aligned_inputs.shader, state.validation_psnr_db
+    aligned = with_offsets(refinement_inputs, state.pose_offsets)
     if state.pose_offsets:
         motion = state.pose_offsets.of(body, motion.select(chosen[0])).apply(motion)
-    mesh = finish_mesh(state.mesh, aligned_inputs, config.max_final_faces)
-    is_unchanged = mesh is state.mesh
-    skin = state.skin if is_unchanged else transfer_skin(mesh, body)
-    save_dense_mesh(out, state.mesh)
+    shader, psnr_db = aligned.shader, state.validation_psnr_db
+    mesh = finish_mesh(state.mesh, aligned, config.max_final_faces)
+    unrelaxed_skin = state.skin if mesh is state.mesh else transfer_skin(mesh, body)
+    relaxed = relax_skin(mesh, unrelaxed_skin, body, aligned.train)
+    save_dense_mesh(out, move_along(state.mesh, mesh, relaxed.mesh))
+    mesh, skin = relaxed.mesh, relaxed.skin
     write_results(out, mesh, skin, shader)
-    final_motion, motion_metrics = refit_motion(capture, inputs, (body, motion), (mesh, skin, shader), aligned_views)
+    final_motion, motion_metrics = refit_motion(
+        capture, inputs, (body, motion), (mesh, skin, shader), aligned.validation
+    )
     save_motion(out / "motion.npz", final_motion)
     return {
         **{key: float(value) for key, value in mesh_quality_metrics(mesh).items()},
         "initial_validation_psnr_db": psnr_db[0],
-        "refined_validation_psnr_db": psnr_db[-1] if is_unchanged else mesh_psnr_db(mesh, skin, aligned_views, shader),
-        "silhouette_iou": silhouette_iou(mesh, skin, aligned_views),
+        "refined_validation_psnr_db": mesh_psnr_db(mesh, skin, aligned.validation, shader),
+        "silhouette_iou": silhouette_iou(mesh, skin, aligned.validation),
         "target_edge_m": target_edge_m,
         "accepted_rounds": len(psnr_db) - 1.0,
         "faces_before_reduction": float(len(state.mesh.faces)),
+        "stretch_p999": relaxed.stretch_after,
+        "stretch_p999_before": relaxed.stretch_before,
+        "relaxation_shown_p99_mm": relaxed.shown_change_mm,
         **motion_metrics,
     }
 
@@ -299,7 +306,7 @@ def write_results(out: Path, mesh: Mesh, skin: SkinnedTopology, shader: torch.nn
 
 STAGE = Stage(
     "mesh",
-    version=19,
+    version=20,
     needs=("frames", "body", "field"),
     makes=(MESH_NPZ, DENSE_NPZ, "motion.npz", "preview.png"),
     config=Config,

@@ -22,7 +22,7 @@ def build_skinned_mesh(skinned: MeshArtifact, atlas: Atlas) -> SkinnedMesh:
     mesh, source_vertex = skinned.mesh, atlas.vertex_of_uv
     return SkinnedMesh(
         mesh.vertices[source_vertex],
-        mesh.vertex_normals()[source_vertex],
+        skinned.vertex_normals()[source_vertex],
         atlas.uv,
         skinned.joint_indices[source_vertex],
         skinned.joint_weights[source_vertex],

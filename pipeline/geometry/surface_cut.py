@@ -42,6 +42,34 @@ class SurfaceCut:
         return Mesh(self.extend(mesh.vertices), self.faces)
 
 
+@dataclass(frozen=True)
+class UnsplitNormals:
+    """How the vertices of a mesh whose triangles are split get the normals that they had before.
+
+    The normal of a vertex is a mean over the triangles around it, weighted by their areas. At the corners of a triangle
+    that was split, a part of it counts, which is seen as a line in the shading along the cut.
+
+    Attributes:
+        faces: triangles, some of them not split, whose normals count.
+        rows: vertices on the edges and in the middle of triangles of `faces`; they have interpolated normals.
+        corners: three vertices that are none of `rows`, for each of them.
+        weights: of the corners, sum 1.
+    """
+
+    faces: Int[np.ndarray, "f 3"]
+    rows: Int[np.ndarray, "n"]
+    corners: Int[np.ndarray, "n 3"]
+    weights: Float[np.ndarray, "n 3"]
+
+    def vertex_normals(self, vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
+        """Return unit normals for vertices in any pose."""
+        normals = Mesh(vertices, self.faces).vertex_normals()
+        between = np.einsum("nk,nkc->nc", self.weights, normals[self.corners].astype(np.float64))
+        length = np.linalg.norm(between, axis=1, keepdims=True)
+        normals[self.rows] = between / np.maximum(length, 1e-20)
+        return normals
+
+
 def cut_at_borders(mesh: Mesh, region_of: RegionOf) -> tuple[SurfaceCut, Int[np.ndarray, "g"]]:
     """Split triangles whose corners lie in several regions; return also the region of each new face.
 

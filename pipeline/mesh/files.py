@@ -12,7 +12,7 @@ from pipeline.core.command import format_command
 from pipeline.core.errors import UserError
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import dense_weights, top_k_weights
-from pipeline.geometry.surface_cut import SurfaceCut
+from pipeline.geometry.surface_cut import SurfaceCut, UnsplitNormals
 from pipeline.io.npz import load_npz, save_npz
 from pipeline.io.tensors import load_tensors, save_tensors
 from pipeline.mesh.pose_alignment import PoseOffsets
@@ -28,13 +28,19 @@ class MeshArtifact:
     """The canonical mesh with its skin: the content of mesh.npz.
 
     mesh: vertices in m (float32) and faces. joint_indices, joint_weights: up to four influences per vertex, the largest
-    first, sum 1. vertex_colours: sRGB in [0, 1].
+    first, sum 1. vertex_colours: sRGB in [0, 1]. unsplit: how normals are found where
+    triangles were split; not in the file.
     """
 
     mesh: Mesh
     joint_indices: Int[np.ndarray, "v k"]
     joint_weights: Float[np.ndarray, "v k"]
     vertex_colours: Float[np.ndarray, "v 3"]
+    unsplit: UnsplitNormals | None = None
+
+    def vertex_normals(self) -> Float[np.ndarray, "v 3"]:
+        """Return unit normals of the surface as it was before its triangles were split."""
+        return self.mesh.vertex_normals() if self.unsplit is None else self.unsplit.vertex_normals(self.mesh.vertices)
 
     def dense_skin_weights(self, joint_count: int) -> Float[Tensor, "v j"]:
         """Return one row of skin weights per vertex."""
@@ -53,6 +59,7 @@ class MeshArtifact:
             np.concatenate([self.joint_indices, indices.astype(self.joint_indices.dtype)]),
             np.concatenate([self.joint_weights, weights.astype(self.joint_weights.dtype)]),
             cut.extend(self.vertex_colours),
+            UnsplitNormals(self.mesh.faces, count + np.arange(len(cut.corners)), cut.corners, cut.weights),
         )
 
 

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from pipeline.geometry.surface_cut import UnsplitNormals
+
 _MIN_CUT_FRACTION = 0.02
 """A cut runs at least this fraction of an edge away from its ends, so that no faces without area arise."""
 
@@ -29,6 +31,44 @@ class CutMesh:
         """Return the values at the vertices of the part, interpolated on cut edges."""
         first, second = values[self.edge[:, 0]], values[self.edge[:, 1]]
         return np.asarray(first + self.fraction[:, None] * (second - first))
+
+    def keep_unsplit(self, before: UnsplitNormals, faces: Int[np.ndarray, "f 3"]) -> UnsplitNormals:
+        """Return the normals of a joined mesh that begins with this part, where its triangles are as they were.
+
+        Triangles that were split before and are whole in this part keep their normal. Other faces count as they are.
+
+        Args:
+            before: of the whole mesh.
+            faces: of the joined mesh; its first vertices are those of this part.
+        """
+        count = int(max(self.edge.max(), before.rows.max(initial=-1), before.faces.max())) + 1
+        kept = np.flatnonzero(self.edge[:, 0] == self.edge[:, 1])
+        new_of = np.full(count, -1)
+        new_of[self.edge[kept, 0]] = kept
+        roots = np.tile(np.arange(count)[:, None], (1, 3))
+        roots[before.rows] = before.corners
+        is_lost = np.zeros(len(before.faces), dtype=bool)
+        is_lost[new_of[before.faces].min(axis=1) < 0] = True
+        lost = before.corners[new_of[before.rows] < 0]
+        ends = np.sort(np.stack([before.faces, np.roll(before.faces, -1, axis=1)], axis=2), axis=2) @ [count, 1]
+        is_lost |= np.isin(ends, np.sort(lost[:, :2], axis=1) @ [count, 1]).any(axis=1)
+        whole = before.faces[~is_lost]
+        old_of = np.full(int(faces.max()) + 1, -1)
+        old_of[kept] = self.edge[kept, 0]
+        old = old_of[faces]
+        inside = (old >= 0).all(axis=1)
+        parent = _three_of_nine(roots[old[inside]].reshape(-1, 9))
+        is_child = np.zeros(len(faces), dtype=bool)
+        key = [count * count, count, 1]
+        is_child[inside] = np.isin(parent @ key, np.sort(whole, axis=1).astype(np.int64) @ key)
+        rows = new_of[before.rows]
+        stays = (rows >= 0) & (new_of[before.corners] >= 0).all(axis=1)
+        return UnsplitNormals(
+            np.concatenate([new_of[whole], faces[~is_child]]),
+            rows[stays],
+            new_of[before.corners[stays]],
+            before.weights[stays],
+        )
 
 
 def cut_mesh(faces: Int[np.ndarray, "f 3"], level: Float[np.ndarray, "v"]) -> CutMesh:
@@ -156,6 +196,13 @@ def split_boundary_faces(
         np.concatenate([faces_uv[kept], np.array(fans_uv, dtype=faces_uv.dtype).reshape(-1, 3)]),
         np.concatenate([uv, np.array(more_uv).reshape(-1, 2)]),
     )
+
+
+def _three_of_nine(corners: Int[np.ndarray, "f 9"]) -> Int[np.ndarray, "f 3"]:
+    """Return the three different numbers of each row, sorted."""
+    ordered = np.sort(corners, axis=1).astype(np.int64)
+    middle = np.argmax(ordered != ordered[:, :1], axis=1)
+    return np.stack([ordered[:, 0], ordered[np.arange(len(ordered)), middle], ordered[:, 8]], axis=1)
 
 
 def _rotate(faces: np.ndarray, inside: np.ndarray, value: bool) -> np.ndarray:

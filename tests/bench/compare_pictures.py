@@ -24,7 +24,6 @@ from pipeline.avatar.finished_run import load_textured_avatar, vertex_values
 from pipeline.avatar.textured_avatar import TexturedAvatar
 from pipeline.body.body import canonical_to_world
 from pipeline.geometry.camera import Camera
-from pipeline.geometry.mesh import area_weighted_vertex_normals
 from pipeline.geometry.texture_rendering import render_textured, turntable_camera
 from pipeline.io.image import to_uint8, write_rgb
 from pipeline.texture.files import TextureArtifact
@@ -108,7 +107,7 @@ def compare_lit(run: Path, out: Path) -> str:
     for name, texture in (("matte", matte), ("shiny", shiny)):
         file = out / f"lit_{name}.glb"
         file.write_bytes(encode_scene(replace(scene, texture=texture), config, {"capture": scene.motion}))
-        ours = _render_lit(plain, texture, camera)
+        ours = _render_lit(plain, texture, camera, scene.skinned.vertex_normals())
         blender = render_glb_in_blender(file.resolve(), camera, LAMP, out.resolve())
         parts.append(f"Blender lit, {name} {_compare_to(ours, blender, out / f'blender_lit_{name}')}")
         with open_browser() as page:
@@ -120,12 +119,14 @@ def compare_lit(run: Path, out: Path) -> str:
     return ", ".join(parts)
 
 
-def _render_lit(avatar: TexturedAvatar, texture: TextureArtifact, camera: Camera) -> Float[np.ndarray, "h w 4"]:
+def _render_lit(
+    avatar: TexturedAvatar, texture: TextureArtifact, camera: Camera, normals: Float[np.ndarray, "v 3"]
+) -> Float[np.ndarray, "h w 4"]:
     """Render with our rasteriser: Lambert's law, and the lobe of the highlights, at the vertices."""
-    towards, normals = torch.tensor(LAMP.direction), area_weighted_vertex_normals(avatar.vertices, avatar.faces)
-    irradiance = LAMP.ambient + LAMP.key * (normals @ towards).clamp(min=0.0)
+    towards = torch.tensor(LAMP.direction)
+    irradiance = LAMP.ambient + LAMP.key * (torch.from_numpy(normals).float() @ towards).clamp(min=0.0)
     to_camera = torch.nn.functional.normalize(torch.from_numpy(camera.centre_m()).float() - avatar.vertices, dim=1)
-    lobe = texture.highlights.lobe(normals.numpy(), to_camera.numpy(), np.ones(len(normals)))
+    lobe = texture.highlights.lobe(normals, to_camera.numpy(), np.ones(len(normals)))
     strength = vertex_values(texture.specular, texture.atlas, len(normals)).numpy()
     lamp = texture.light.lamp_irradiance(texture.highlights.direction)
     added = torch.from_numpy(strength * lobe * LAMP.key / lamp).float()

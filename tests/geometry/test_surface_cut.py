@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 
 from pipeline.geometry.mesh import Mesh
-from pipeline.geometry.surface_cut import MIN_FRACTION, cut_at_borders
+from pipeline.geometry.surface_cut import MIN_FRACTION, UnsplitNormals, cut_at_borders
 
 
 def sphere() -> Mesh:
@@ -50,3 +50,23 @@ def test_a_mesh_of_one_region_stays_as_it_is() -> None:
     np.testing.assert_array_equal(cut.faces, mesh.faces)
     assert len(cut.corners) == 0
     assert not region.any()
+
+
+def bend(points: np.ndarray) -> np.ndarray:
+    """A pose: the upper half of the sphere leans over."""
+    return points + np.stack([0.4 * points[:, 2] ** 2, 0.0 * points[:, 0], 0.1 * points[:, 0]], axis=1)
+
+
+def test_normals_are_those_before_the_cut_in_any_pose() -> None:
+    mesh = sphere()
+    cut, _ = cut_at_borders(mesh, sector)
+    count = len(mesh.vertices)
+    unsplit = UnsplitNormals(mesh.faces, count + np.arange(len(cut.corners)), cut.corners, cut.weights)
+    for posed in (mesh.vertices, bend(mesh.vertices)):
+        before = Mesh(posed, mesh.faces).vertex_normals()
+        between = np.einsum("nk,nkc->nc", cut.weights, before[cut.corners])
+        expected = np.concatenate([before, between / np.linalg.norm(between, axis=1, keepdims=True)])
+        found = unsplit.vertex_normals(cut.extend(posed))
+        np.testing.assert_allclose(found, expected, atol=1e-12)
+        split = Mesh(cut.extend(posed), cut.faces).vertex_normals()
+        assert np.degrees(np.arccos(np.clip(np.sum(split * expected, axis=1), -1.0, 1.0))).max() > 1.0

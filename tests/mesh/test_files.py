@@ -9,6 +9,7 @@ import torch
 
 from pipeline.core.errors import UserError
 from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.surface_cut import cut_at_borders
 from pipeline.io.npz import load_npz, save_npz
 from pipeline.mesh.files import (
     DENSE_NPZ,
@@ -92,3 +93,14 @@ def test_a_checkpoint_is_read_back(tmp_path: Path) -> None:
     unaligned = load_checkpoint(tmp_path / "unaligned.safetensors")
     assert unaligned is not None
     assert unaligned.pose_offsets is None
+
+
+def test_a_cut_mesh_keeps_the_normals_of_the_surface_before_the_cut() -> None:
+    cut, _ = cut_at_borders(TETRAHEDRON, lambda points: (points[:, 0] > 0.3).astype(int))
+    before = TETRAHEDRON.vertex_normals()
+    found = ARTIFACT.cut(cut)
+    assert np.abs(found.mesh.vertex_normals()[:4] - before).max() > 0.05
+    np.testing.assert_allclose(found.vertex_normals()[:4], before, atol=1e-6)
+    between = cut.extend(before)[4:]
+    between /= np.linalg.norm(between, axis=1, keepdims=True)
+    np.testing.assert_allclose(found.vertex_normals()[4:], between, atol=1e-6)

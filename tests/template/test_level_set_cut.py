@@ -3,8 +3,10 @@
 import igl
 import numpy as np
 import pytest
+import trimesh
 
 from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.surface_cut import UnsplitNormals, cut_at_borders
 from pipeline.template.level_set_cut import boundary_loops, cut_mesh, points_on_edges, split_boundary_faces
 
 
@@ -62,3 +64,24 @@ def test_split_faces_interpolate_texture_coordinates() -> None:
 def test_open_boundaries_are_refused() -> None:
     with pytest.raises(ValueError, match="simple loops"):
         boundary_loops(np.array([[0, 1], [1, 2]]))
+
+
+def test_normals_of_split_triangles_outlast_a_second_cut() -> None:
+    """A sphere is split at meridians, then a cap is taken away: normals away from the cap are those of the sphere."""
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    mesh = Mesh(np.asarray(ball.vertices), np.asarray(ball.faces))
+    split, _ = cut_at_borders(mesh, lambda points: (np.arctan2(points[:, 1], points[:, 0]) // 1.1).astype(int))
+    count = len(mesh.vertices)
+    before = UnsplitNormals(mesh.faces, count + np.arange(len(split.corners)), split.corners, split.weights)
+    vertices = split.extend(mesh.vertices)
+    part = cut_mesh(split.faces, vertices[:, 2] - 0.52)
+    rest = part.interpolate(vertices)
+    found = part.keep_unsplit(before, part.faces).vertex_normals(rest)
+    expected = part.interpolate(before.vertex_normals(vertices))
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    degrees = np.degrees(np.arccos(np.clip(np.sum(found * expected, axis=1), -1.0, 1.0)))
+    near = rest[:, 2] > 0.52 - 2.0 * np.linalg.norm(np.diff(vertices[part.edge], axis=1), axis=2).max() - 0.16
+    assert degrees[~near].max() < 1e-3
+    assert degrees.max() < 12.0  # on the rim the mean is over the faces that are left
+    as_it_is = np.sum(Mesh(rest, part.faces).vertex_normals() * expected, axis=1)[~near]
+    assert np.degrees(np.arccos(as_it_is.clip(-1.0, 1.0))).max() > 0.5

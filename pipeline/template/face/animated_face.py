@@ -241,4 +241,5 @@ def _skin(skinned: MeshArtifact, cut: CutMesh, patch: FacePatch, mesh: Mesh) -> 
         indices,
         values,
         np.concatenate([cut.interpolate(skinned.vertex_colours.astype(np.float64)), colours]).astype(np.float32),
+        None if skinned.unsplit is None else cut.keep_unsplit(skinned.unsplit, mesh.faces),
     )
