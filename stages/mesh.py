@@ -23,7 +23,9 @@ from pipeline.core.config import Config as BaseConfig
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
+from pipeline.field.field import RadianceField
 from pipeline.field.files import load_field, load_occupancy
+from pipeline.field.occupancy import BinaryOccupancy
 from pipeline.field.setup import evenly_spaced
 from pipeline.geometry.camera import pixel_footprint_m
 from pipeline.geometry.mesh import Mesh
@@ -46,7 +48,7 @@ from pipeline.mesh.files import (
 from pipeline.mesh.isosurface import CanonicalGrid, extract_mesh, sample_canonical_grid, select_isovalue
 from pipeline.mesh.pose_refit import refit_poses, select_poses
 from pipeline.mesh.pose_selection import is_far_from, score_motion
-from pipeline.mesh.refinement import RefinementState, refine_mesh, with_offsets
+from pipeline.mesh.refinement import refine_mesh, with_offsets
 from pipeline.mesh.remeshing import detailed_faces, remesh_to_edge_length
 from pipeline.mesh.settings import MeshSettings
 from pipeline.mesh.skin_relaxation import move_along, relax_skin
@@ -140,18 +142,7 @@ def run(
         validation_motion=motion.select(chosen[1]),
         settings=settings,
     )
-    start: Mesh | RefinementState | None = load_checkpoint(out / CHECKPOINT)
-    if start is None:
-
-        def density_fn(points_m: Tensor) -> Tensor:
-            occupied, density = occupancy.contains(points_m), torch.zeros(len(points_m))
-            density[occupied] = field.density(points_m[occupied])
-            return density
-
-        samples = sample_canonical_grid(density_fn, occupancy.occupied_bounds_m(), body, config.voxel_size_m, settings)
-        evidence = surface_evidence(body, [train[k] for k in evenly_spaced(len(train), EVIDENCE_FRAMES)])
-        extracted = extract_initial_mesh(samples, body, evidence, validation or train, settings)
-        start = remesh_to_edge_length(extracted, target_edge_m, body)
+    start = load_checkpoint(out / CHECKPOINT) or starting_mesh(field, occupancy, refinement_inputs, config.voxel_size_m)
     state = refine_mesh(start, refinement_inputs, lambda state: save_checkpoint(out / CHECKPOINT, state))
     aligned = with_offsets(refinement_inputs, state.pose_offsets)
     if state.pose_offsets:
@@ -180,6 +171,23 @@ def run(
         "relaxation_shown_p99_mm": relaxed.shown_change_mm,
         **motion_metrics,
     }
+
+
+def starting_mesh(
+    field: RadianceField, occupancy: BinaryOccupancy, inputs: RefinementInputs, voxel_size_m: float
+) -> Mesh:
+    """Extract the surface of the field and remesh it to the target edge length."""
+
+    def density_fn(points_m: Tensor) -> Tensor:
+        occupied, density = occupancy.contains(points_m), torch.zeros(len(points_m))
+        density[occupied] = field.density(points_m[occupied])
+        return density
+
+    body, train, settings = inputs.body, inputs.train, inputs.settings
+    samples = sample_canonical_grid(density_fn, occupancy.occupied_bounds_m(), body, voxel_size_m, settings)
+    evidence = surface_evidence(body, [train[k] for k in evenly_spaced(len(train), EVIDENCE_FRAMES)])
+    extracted = extract_initial_mesh(samples, body, evidence, inputs.validation or train, settings)
+    return remesh_to_edge_length(extracted, inputs.target_edge_m, body)
 
 
 def finish_mesh(mesh: Mesh, inputs: RefinementInputs, face_limit: int) -> Mesh:
