@@ -31,9 +31,9 @@ def reduce_faces(
 ) -> Mesh:
     """Remove as many faces as cost at most `settings.max_reduction_loss_db`, and those above a limit.
 
-    Each trial multiplies the number of faces by `settings.reduction_ratio`; the first that costs more, has no fewer
-    faces or leaves holes ends the search. With `settings.final_faces` there is one trial, to this number of faces,
-    which may cost anything.
+    A limit that costs more is reached in one collapse. Below it, each trial multiplies the number of faces by
+    `settings.reduction_ratio`; the first that costs more, has no fewer faces or leaves holes ends the search. With
+    `settings.final_faces` there is one trial, to this number of faces, which may cost anything.
 
     Args:
         mesh: a closed surface, m; returned as it is (the same object) if the first trial fails, or if it has no more
@@ -47,25 +47,34 @@ def reduce_faces(
     """
     if settings.final_faces:
         return _reduce_to(mesh, detailed, settings.final_faces)
-    reduced = _reduce_by_loss(mesh, detailed, psnr_db, settings)
+    lowest_psnr_db, limited = psnr_db(mesh) - settings.max_reduction_loss_db, mesh
+    if face_limit is not None and len(mesh.faces) > face_limit:
+        limited = _reduce_to(mesh, detailed, face_limit)
+        if len(limited.faces) <= face_limit and psnr_db(limited) < lowest_psnr_db:
+            return limited
+    reduced = _reduce_by_loss(mesh, limited, detailed, lambda trial: psnr_db(trial) >= lowest_psnr_db, settings)
     if face_limit is None or len(reduced.faces) <= face_limit:
         return reduced
-    # from the start: a second round of collapses would not know the surface that the first one left
-    limited = _reduce_to(mesh, detailed, face_limit)
-    return limited if limited is not mesh else _reduce_to(reduced, np.zeros(len(reduced.faces), dtype=bool), face_limit)
+    # the collapse of the mesh left holes: that of the reduced mesh may not
+    return _reduce_to(reduced, np.zeros(len(reduced.faces), dtype=bool), face_limit)
 
 
 def _reduce_by_loss(
-    mesh: Mesh, detailed: Bool[np.ndarray, "f"], psnr_db: Callable[[Mesh], float], settings: MeshSettings
+    mesh: Mesh,
+    best: Mesh,
+    detailed: Bool[np.ndarray, "f"],
+    is_good: Callable[[Mesh], bool],
+    settings: MeshSettings,
 ) -> Mesh:
-    lowest_psnr_db, best = psnr_db(mesh) - settings.max_reduction_loss_db, mesh
-    for trial in track(range(1, MAX_TRIALS + 1), "reduce faces"):
+    """Return the smallest good mesh of the trials that have fewer faces than `best`, else `best`."""
+    kept, free = np.count_nonzero(detailed), np.count_nonzero(~detailed)
+    counts = [int(free * settings.reduction_ratio**trial) for trial in range(1, MAX_TRIALS + 1)]
+    for count in track([count for count in counts if kept + count < len(best.faces)], "reduce faces"):
         try:
-            count = int(np.count_nonzero(~detailed) * settings.reduction_ratio**trial)
             reduced = collapse_edges(mesh, ~detailed, count)
         except OpenSurfaceError:
             break
-        if psnr_db(reduced) < lowest_psnr_db or len(reduced.faces) >= len(best.faces):
+        if not is_good(reduced) or len(reduced.faces) >= len(best.faces):
             break
         best = reduced
     return best

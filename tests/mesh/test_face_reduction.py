@@ -80,3 +80,17 @@ def test_a_number_of_final_faces_is_reached_at_any_loss() -> None:
     assert is_closed_manifold(reduced)
     settings = MeshSettings(final_faces=len(mesh.faces))
     assert reduce_faces(mesh, no_detail(mesh), lambda trial: 30.0, settings) is mesh
+
+
+def test_a_limit_that_costs_more_is_judged_once_and_a_cheap_one_is_passed() -> None:
+    mesh, judged = sphere(), []
+    limit = len(mesh.faces) // 3
+
+    def psnr_db(trial: Mesh) -> float:
+        judged.append(len(trial.faces))
+        return len(trial.faces) / 1000.0
+
+    reduced = reduce_faces(mesh, no_detail(mesh), psnr_db, MeshSettings(max_reduction_loss_db=0.05), limit)
+    assert judged == [len(mesh.faces), len(reduced.faces)]
+    cheap = reduce_faces(mesh, no_detail(mesh), lambda trial: 30.0, MeshSettings(), limit)
+    assert len(cheap.faces) < 0.8 * limit
