@@ -135,7 +135,7 @@ def run(
     train, validation = ([cut_view(view, cut) for view in part] for part in (train, validation))
     template = None
     if registration is not None:
-        template = FittedTemplate(registration, correspond(body, registration, skinned.mesh))
+        template = FittedTemplate(registration, correspond(body, registration, skinned.mesh, skinned.vertex_colours))
     texels = rasterize_texels(atlas, size_px)
     surface = TexturedSurface.from_arrays(skinned.mesh.faces, atlas, texels)
     evidence = find_light((train, validation), positions, skinned.mesh, config, settings)
@@ -356,7 +356,7 @@ def fit_highlights(evidence: LightEvidence | None, light: VideoLight, mesh: Mesh
 
 STAGE = Stage(
     "texture",
-    version=9,
+    version=10,
     needs=("frames", "body", "mesh"),
     makes=(ATLAS, DIFFUSE, SPECULAR, NORMAL, COVERAGE, LIGHT, TEMPLATE_NPZ),
     config=Config,

@@ -32,7 +32,9 @@ def known_registration(body: Body) -> Registration:
 def save_known_template(texture_dir: Path, body: Body) -> None:
     """Write template.npz for a person whose surface is that of the built-in body."""
     exact = known_registration(body)
-    save_template(texture_dir, FittedTemplate(exact, correspond(body, exact, body.mesh())))
+    save_template(
+        texture_dir, FittedTemplate(exact, correspond(body, exact, body.mesh(), np.full_like(body.vertices, 0.5)))
+    )
 
 
 def make_run(

@@ -16,11 +16,15 @@ from pipeline.template.registration import Registration, register_template
 from tests.template.generated_person import GeneratedPerson, generated_person
 
 
+def grey(mesh: Mesh) -> np.ndarray:
+    return np.full(mesh.vertices.shape, 0.5)
+
+
 @lru_cache(maxsize=1)
 def found() -> tuple[GeneratedPerson, Registration, Correspondence]:
     person = generated_person()
     registration = register_template(person.fitted, person.surface, person.landmarks())
-    return person, registration, correspond(person.fitted, registration, person.surface)
+    return person, registration, correspond(person.fitted, registration, person.surface, grey(person.surface))
 
 
 @pytest.mark.slow
@@ -44,10 +48,30 @@ def test_distance_and_offset_are_those_of_the_surfaces() -> None:
     moved = body.vertices.astype(np.float64) + 0.01 * normals
     count = len(moved)
     registration = Registration(moved, np.zeros(count), np.ones(count, dtype=bool), 0, False)
-    points = correspond(body, registration, Mesh(moved, skin))
+    points = correspond(body, registration, Mesh(moved, skin), grey(Mesh(moved, skin)))
     rows = template.skin_vertices
     assert points.distance_m[rows].max() < 1e-6
     assert np.median(points.offset_m[rows]) == pytest.approx(0.01, abs=1e-3)
+
+
+def test_short_hair_is_told_by_its_colour_and_a_bald_head_has_none() -> None:
+    """The body itself, with the scalp painted dark above the brows and behind the ears, and a dark beard."""
+    body, template = generated_person().bare, load_template()
+    count = len(body.vertices)
+    registration = Registration(body.vertices.astype(np.float64), np.zeros(count), np.ones(count, dtype=bool), 0, False)
+    mesh = Mesh(body.vertices, template.faces[template.skin_faces])
+    eyes_m = body.vertices[template.vertices_of(template.eye_faces.any(axis=0))].mean(axis=0)
+    up, ahead = body.vertices[:, 1] - eyes_m[1], body.vertices[:, 2] - body.joints_m[body.joint("Head"), 2]
+    scalp = template.skin_vertices & ((up > 0.06) | ((up > 0.0) & (ahead < -0.02)))
+    beard = template.skin_vertices & (ahead > 0.05) & (up < -0.08) & (up > -0.12)
+    skin, dark = (0.8, 0.6, 0.5), (0.15, 0.1, 0.08)
+    colours = np.where((scalp | beard)[:, None], dark, skin)
+    label = correspond(body, registration, mesh, colours).label
+    assert (label[scalp] == HAIR).mean() > 0.95
+    assert (label[beard] == HAIR).mean() < 0.05
+    assert (label[template.skin_vertices & ~scalp] == HAIR).mean() < 0.02
+    bald = correspond(body, registration, mesh, np.broadcast_to(skin, colours.shape)).label
+    assert not (bald == HAIR).any()
 
 
 @pytest.mark.slow
@@ -58,7 +82,7 @@ def test_skin_skirt_and_hair_are_told_apart() -> None:
     visible[: 4 * len(template.skin_faces)] = np.repeat(template.skin_faces, 4)
     surface = Mesh(subject.body.vertices, subject.body.faces[visible])
     registration = register_template(bare, surface)
-    label = correspond(bare, registration, surface).label[surface.faces]
+    label = correspond(bare, registration, surface, grey(surface)).label[surface.faces]
     assert subject.labels is not None
     of_face = np.array(subject.labels.names)[subject.labels.of_face[visible]]
     for part, expected, share in (

@@ -15,7 +15,7 @@ def body_surface() -> tuple[Mesh, tuple[np.ndarray, np.ndarray]]:
     body, template = generated_person().bare, load_template()
     mesh = remove_unreferenced_vertices(Mesh(body.vertices, template.faces[template.skin_faces]))
     registration = known_registration(body)
-    points = correspond(body, registration, mesh)
+    points = correspond(body, registration, mesh, np.full_like(mesh.vertices, 0.5))
     return mesh, mirror_vertices(points, registration.vertices, mesh)
 
 
