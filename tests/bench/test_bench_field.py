@@ -52,6 +52,7 @@ def trainer_and_timing():
         return trainer, time_steps(trainer, clock, warm_up=2, steps=2)
 
 
+@pytest.mark.slow
 def test_parts_sum_to_the_step(trainer_and_timing):
     _, timing = trainer_and_timing
     assert sum(timing.parts_ms.values()) == pytest.approx(timing.step_ms, rel=0.15)
@@ -59,6 +60,7 @@ def test_parts_sum_to_the_step(trainer_and_timing):
     assert timing.samples > 0
 
 
+@pytest.mark.slow
 def test_timers_do_not_change_training(trainer_and_timing):
     timed_trainer, _ = trainer_and_timing
     plain = trainer_from_synthetic_body(TINY)
@@ -153,6 +155,7 @@ def test_lower_bound_is_the_longest_of_three_times():
     assert Work(bytes=1e7, operations=3e8, rows=2e6).lower_bound_ms(peaks) == pytest.approx(3)
 
 
+@pytest.mark.slow
 def test_minimum_work_of_a_step(trainer_and_timing):
     trainer, _ = trainer_and_timing
     work = minimum_work(trainer, samples=1000)

@@ -2,11 +2,14 @@
 
 from dataclasses import replace
 
+import pytest
+
 from data_tools.evaluate.compare_avatar import compare_texture
 from data_tools.evaluate.comparison import Comparison
 from data_tools.synthetic.scene.renderer import LIGHTING_PRESETS
 
 
+@pytest.mark.slow
 def test_correlation_of_highlights_with_the_true_ones(perfect: Comparison) -> None:
     """Strength by the height of a vertex: close to 1 where it is the true one, negative for the opposite."""
     assert "specular_correlation" not in compare_texture(perfect)
