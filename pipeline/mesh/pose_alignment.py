@@ -21,6 +21,8 @@ from scipy.linalg import solveh_banded
 from torch import Tensor
 
 from pipeline.body.body import Body, Motion
+from pipeline.body.fit.camera_parameters import project_with_jacobian
+from pipeline.body.fit.linear_body import descendant_matrix
 from pipeline.body.pose_correction import PoseCorrection
 from pipeline.geometry.camera import Camera, project, transform_world_to_camera
 from pipeline.kernels.common.thread_pool import ThreadPool
@@ -74,12 +76,6 @@ class PoseOffsets(NamedTuple):
         return correction
 
 
-def no_offsets(body: Body, motion: Motion) -> PoseOffsets:
-    """Return offsets of zero for all frames of a motion."""
-    correction = PoseCorrection(body, motion)
-    return PoseOffsets(correction.rotation_rad.detach(), correction.shift_m.detach())
-
-
 def align_poses(
     vertices: Float[Tensor, "v 3"],
     skin: SkinnedTopology,
@@ -98,7 +94,7 @@ def align_poses(
     """
     body, threads = correction.body, ThreadPool(torch.get_num_threads())
     offsets = PoseOffsets(correction.rotation_rad.detach(), correction.shift_m.detach())
-    weights = skin.weights @ subtree_indicator(body.parents, correction.joints.numpy()).float()
+    weights = skin.weights @ descendant_matrix(body.parents.tolist())[correction.joints].T.float()
     rows = torch.arange(len(views))
 
     @torch.no_grad()
@@ -116,15 +112,6 @@ def align_poses(
         moved = torch.from_numpy(present + update).float()
         offsets = PoseOffsets(moved[:, :-3].reshape(offsets.rotation_rad.shape), moved[:, -3:].clone())
     return offsets
-
-
-def subtree_indicator(parents: Int[np.ndarray, "j"], joints: Int[np.ndarray, "k"]) -> Float[Tensor, "j k"]:
-    """Return a matrix whose entry (i, k) is 1 if joint i is joints[k] or a descendant of it."""
-    is_below = np.eye(len(parents))
-    for joint, parent in enumerate(parents):
-        if parent >= 0:
-            is_below[joint] += is_below[parent]
-    return torch.from_numpy(is_below[:, joints])
 
 
 def gather_evidence(
@@ -264,15 +251,7 @@ def normal_equations(
     this change is to be image - render.
     """
     points_m = evidence.points_m.astype(np.float32)
-    world_to_camera = np.asarray(camera.world_to_camera, dtype=np.float32)
-    in_camera = points_m @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
-    inverse_depth = 1.0 / in_camera[:, 2]
-    pixel_by_point = np.zeros((len(points_m), 2, 3), np.float32)
-    pixel_by_point[:, 0, 0], pixel_by_point[:, 1, 1] = camera.fx * inverse_depth, camera.fy * inverse_depth
-    pixel_by_point[:, 0, 2] = -camera.fx * in_camera[:, 0] * inverse_depth**2
-    pixel_by_point[:, 1, 2] = -camera.fy * in_camera[:, 1] * inverse_depth**2
-    pixel_by_point = pixel_by_point @ world_to_camera[:3, :3]
-
+    pixel_by_point = project_with_jacobian(torch.from_numpy(points_m)[None], camera)[1][0].numpy()
     rotations = canonical_to_world[joints, :3, :3].astype(np.float32)
     joints_world_m = np.einsum("kij,kj->ki", rotations, body.joints_m[joints]) + canonical_to_world[joints, :3, 3]
     count = len(joints)

@@ -4,8 +4,8 @@ Each round after the first starts with adaptive remeshing: faces with an accumul
 percentile are subdivided, those below a lower percentile are decimated; the vertex offsets start from zero (IHM paper,
 section 2.3). `MeshSettings.remeshing` has alternatives for ablations. A round that lowers the validation PSNR is
 discarded and ends the refinement. Skin weights are transferred from the body after remeshing and stay with the vertices
-during optimisation, so that each round is scored with the weights that are exported. After the rounds that
-`MeshSettings.aligned_rounds` counts, the poses of the views are aligned to the surface.
+during optimisation, so that each round is scored with the weights that are exported. After each accepted
+round the poses of the views are aligned to the surface, unless validation prefers the present ones.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from pipeline.body.body import Motion, canonical_to_world
+from pipeline.body.pose_correction import PoseCorrection
 from pipeline.geometry.mesh import Mesh
-from pipeline.mesh.pose_alignment import PoseOffsets, align_poses, no_offsets
+from pipeline.mesh.pose_alignment import PoseOffsets, align_poses
 from pipeline.mesh.remeshing import detailed_faces, remesh_adaptively, remesh_uniformly
 from pipeline.mesh.skin_transfer import SkinnedTopology, transfer_skin
 from pipeline.mesh.vertex_optimisation import RefinementInputs, optimise_vertices
@@ -118,7 +119,8 @@ def _align(state: RefinementState, inputs: RefinementInputs) -> RefinementState:
     motion = inputs.train_motion
     if motion is None or inputs.settings.alignment_steps == 0:
         return state
-    correction = (state.pose_offsets or no_offsets(inputs.body, motion)).of(inputs.body, motion)
+    offsets = state.pose_offsets
+    correction = PoseCorrection(inputs.body, motion) if offsets is None else offsets.of(inputs.body, motion)
     views = inputs.train[: len(motion.frame_index)]
     vertices, steps = torch.from_numpy(state.mesh.vertices), inputs.settings.alignment_steps
     offsets = align_poses(vertices, state.skin, inputs.shader, views, correction, steps)

@@ -91,19 +91,20 @@ def relax_skin(mesh: Mesh, skin: SkinnedTopology, body: Body, views: Sequence[Po
     level = float(np.quantile(before.numpy(), 0.999))
     if not zone.any():
         return RelaxedSkin(mesh, skin, level, level, 0.0)
-    poses = poses[(before > MAX_STRETCH).any(dim=1)]
     shown = [views[k] for k in np.unique(np.linspace(0, len(views) - 1, SHOWN_FRAMES).astype(int))]
-    vertices, weights = _minimise(mesh, skin.weights, zone, poses, shown)
+    seen = [visible_vertices(mesh, skin.weights, view) for view in shown]
+    tearing = poses[(before > MAX_STRETCH).any(dim=1)]
+    vertices, weights = _minimise(_build_zone(mesh, skin.weights, zone), (mesh, skin.weights), tearing, shown, seen)
     found = Mesh(vertices, mesh.faces)
     if count_self_intersecting_faces(found) > count_self_intersecting_faces(mesh):
         found = resolve_self_intersections(found)
     relaxed = build_skinned_topology(found, weights)
-    after = edge_stretch(found, weights, edges, sample_poses(body))
+    after = edge_stretch(found, weights, edges, poses)
     change_mm = []
-    for view in shown:
+    for view, is_seen in zip(shown, seen, strict=True):
         now_m = view.pose_vertices(torch.from_numpy(found.vertices), weights)
         moved_m = now_m - view.pose_vertices(torch.from_numpy(mesh.vertices), skin.weights)
-        change_mm.append(1e3 * moved_m.norm(dim=1)[visible_vertices(mesh, skin.weights, view)])
+        change_mm.append(1e3 * moved_m.norm(dim=1)[is_seen])
     last, shown_mm = float(np.quantile(after.numpy(), 0.999)), float(np.quantile(torch.cat(change_mm).numpy(), 0.99))
     return RelaxedSkin(found, relaxed, level, last, shown_mm)
 
@@ -208,16 +209,19 @@ def _build_zone(mesh: Mesh, weights: Float[Tensor, "v j"], zone: Bool[np.ndarray
 
 
 def _minimise(
-    mesh: Mesh,
-    weights: Float[Tensor, "v j"],
-    zone: Bool[np.ndarray, "v"],
+    part: _Zone,
+    skinned: tuple[Mesh, Float[Tensor, "v j"]],
     poses: Float[Tensor, "n j 4 4"],
     views: Sequence[PosedView],
+    is_seen: Sequence[Bool[Tensor, "v"]],
 ) -> tuple[Float[np.ndarray, "v 3"], Float[Tensor, "v j"]]:
-    """Return the vertices and weights of the least energy that Adam finds."""
-    part = _build_zone(mesh, weights, zone)
+    """Return the vertices and weights of the least energy that Adam finds.
+
+    skinned: the mesh and its weights. is_seen: which vertices each view shows.
+    """
+    mesh, weights = skinned
     filmed = torch.stack([view.canonical_to_world for view in views]).float()
-    seen = torch.stack([visible_vertices(mesh, weights, view)[part.rows] for view in views]).float()
+    seen = torch.stack([shown[part.rows] for shown in is_seen]).float()
     at_m = torch.from_numpy(mesh.vertices)[part.rows]
     shown_m = linear_blend_skinning(at_m, part.dense(part.start), filmed)
     logits = (0.5 * part.start + 0.5 * part.spread + 1e-4).log().requires_grad_(True)

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from pipeline.body.body import Body, Motion, canonical_to_world
+from pipeline.body.fit.linear_body import descendant_matrix
 from pipeline.body.pose_correction import PoseCorrection
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.rotation import axis_angle_to_quaternion, quaternion_multiply
@@ -19,10 +20,8 @@ from pipeline.mesh.pose_alignment import (
     ImageEvidence,
     PoseOffsets,
     align_poses,
-    no_offsets,
     normal_equations,
     solve_drifting,
-    subtree_indicator,
 )
 from pipeline.mesh.skin_transfer import SkinnedTopology, transfer_skin
 from pipeline.mesh.views import PosedView, render_posed_view
@@ -98,7 +97,7 @@ def remaining_error(body: Body, offsets: PoseOffsets, wrong: Motion, true_motion
 
 
 def aligned(body: Body, skin: SkinnedTopology, views: list[PosedView], wrong: Motion) -> PoseOffsets:
-    start = no_offsets(body, wrong).of(body, wrong)
+    start = PoseCorrection(body, wrong)
     return align_poses(torch.from_numpy(body.vertices), skin, PATTERN, views, start, iterations=2)
 
 
@@ -152,7 +151,7 @@ def test_normal_equations_have_the_derivatives_of_skinning_and_projection(body: 
 
     pose = canonical_to_world(body, true_motion)[2]
     points_m = linear_blend_skinning(vertices, weights, pose[None])[0].numpy()
-    below = (weights @ subtree_indicator(body.parents, np.arange(JOINTS)).float()).numpy()
+    below = (weights @ descendant_matrix(body.parents.tolist()).T.float()).numpy()
     evidence = ImageEvidence(points_m, below, structure.astype(np.float32), pull.astype(np.float32))
     matrix, vector = normal_equations(evidence, CAMERA, body, pose.numpy(), np.arange(JOINTS))
     expected = np.einsum("nip,nij,njq->pq", jacobian, structure, jacobian)
@@ -164,7 +163,7 @@ def test_normal_equations_have_the_derivatives_of_skinning_and_projection(body: 
 def test_subtrees_hold_a_joint_and_all_below_it() -> None:
     parents = np.array([-1, 0, 1, 0])
     expected = [[1, 0], [1, 1], [1, 1], [1, 0]]
-    np.testing.assert_array_equal(subtree_indicator(parents, np.array([0, 1])), expected)
+    np.testing.assert_array_equal(descendant_matrix(parents.tolist())[[0, 1]].T, expected)
 
 
 def test_the_banded_solution_is_that_of_the_dense_system() -> None:
