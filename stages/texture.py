@@ -24,13 +24,14 @@ from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
 from pipeline.field.setup import evenly_spaced
 from pipeline.geometry.atlas import Atlas, Texels, rasterize_texels, texture_size_px, unwrap
-from pipeline.geometry.camera import pixel_footprint_m
+from pipeline.geometry.camera import Camera, pixel_footprint_m
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.geometry.surface_cut import SurfaceCut
 from pipeline.io.image import to_float, to_uint8
 from pipeline.mesh.files import MeshArtifact, load_dense_mesh, load_mesh
 from pipeline.template.correspondence import correspond
+from pipeline.template.face.filmed_landmarks import FilmedFaces
 from pipeline.template.face.head_texture import register_person
 from pipeline.template.files import TEMPLATE_NPZ, FittedTemplate, save_template
 from pipeline.template.mirror import add_mirrored_colours, mirror_vertices
@@ -127,7 +128,8 @@ def run(
     train, validation = (load_views(capture, part, inputs, body, skinned, config.max_frames) for part in positions)
     if not train:
         raise UserError(f"{inputs['frames']} has no training frames; run `python -m stages.frames` again")
-    registration = register_person(body, skinned, train, FaceDetector, settings)
+    faces = FilmedFaces.of_capture(capture, positions[0], *load_poses(inputs, body))
+    registration = register_person(body, skinned, train, faces, FaceDetector, settings)
     atlas, size_px, on_template = build_atlas(skinned, body, train, registration, config, settings)
     cut = None if on_template is None else on_template.cut
     face_count = len(skinned.mesh.faces)
@@ -189,8 +191,7 @@ def load_views(
     max_frames: int,
 ) -> list[BakeView]:
     """Crop at most `max_frames` evenly spaced frames of `positions` to the mesh in the pose of each frame."""
-    camera = load_camera(inputs["body"] / "camera.npz")
-    transforms = canonical_to_world(body, load_motion(inputs["mesh"] / "motion.npz"))
+    transforms, camera = load_poses(inputs, body)
     vertices = torch.from_numpy(skinned.mesh.vertices)
     weights = skinned.dense_skin_weights(len(body.joint_names))
     faces = torch.from_numpy(skinned.mesh.faces)
@@ -200,6 +201,12 @@ def load_views(
         image, mask = to_uint8(capture.image(k)), to_uint8(capture.mask(k))
         views.append(crop_bake_view(image, mask, camera, posed, faces))
     return weight_by_resolution(views) if views else []
+
+
+def load_poses(inputs: Mapping[str, Path], body: Body) -> tuple[Float[Tensor, "n j 4 4"], Camera]:
+    """Return the canonical-to-world transforms of the joints in all frames, and the camera."""
+    motion = load_motion(inputs["mesh"] / "motion.npz")
+    return canonical_to_world(body, motion), load_camera(inputs["body"] / "camera.npz")
 
 
 def subsample(positions: Int[np.ndarray, "k"], max_frames: int) -> Int[np.ndarray, "m"]:
@@ -356,7 +363,7 @@ def fit_highlights(evidence: LightEvidence | None, light: VideoLight, mesh: Mesh
 
 STAGE = Stage(
     "texture",
-    version=10,
+    version=11,
     needs=("frames", "body", "mesh"),
     makes=(ATLAS, DIFFUSE, SPECULAR, NORMAL, COVERAGE, LIGHT, TEMPLATE_NPZ),
     config=Config,

@@ -11,7 +11,13 @@ from pipeline.body.body import Body
 from pipeline.geometry.atlas import rasterize_texels, unwrap
 from pipeline.geometry.mesh import Mesh
 from pipeline.mesh.files import MeshArtifact
-from pipeline.template.face.landmarks import Detector, FaceLandmarks, find_face_landmarks
+from pipeline.template.face.filmed_landmarks import FilmedFaces
+from pipeline.template.face.landmarks import (
+    Detector,
+    FaceLandmarks,
+    choose_landmarks,
+    rendered_landmarks_m,
+)
 from pipeline.template.regions import is_template_body
 from pipeline.template.registration import Registration, register_template
 from pipeline.texture.bake import TexturedSurface, average_views, texels_to_texture
@@ -30,6 +36,7 @@ def register_person(
     body: Body,
     skinned: MeshArtifact,
     views: Sequence[BakeView],
+    faces: FilmedFaces,
     make_detector: Callable[[], Detector],
     settings: TextureSettings,
 ) -> Registration | None:
@@ -39,12 +46,13 @@ def register_person(
         body: the fitted body in the A-pose.
         skinned: the person's mesh in the A-pose.
         views: training frames.
+        faces: detected in training frames.
         make_detector: constructs the detector of face landmarks.
         settings: of the projection of frames.
     """
     if not is_template_body(body):
         return None
-    landmarks = find_landmarks(body, skinned, views, make_detector, settings)
+    landmarks = find_landmarks(body, skinned, views, faces, make_detector, settings)
     return register_template(body, skinned.mesh, landmarks)
 
 
@@ -52,23 +60,24 @@ def find_landmarks(
     body: Body,
     skinned: MeshArtifact,
     views: Sequence[BakeView],
+    faces: FilmedFaces,
     make_detector: Callable[[], Detector],
     settings: TextureSettings,
 ) -> FaceLandmarks | None:
     """Return the landmarks of the face on the person's surface, or None where no frame shows a plausible face."""
     mesh = skinned.mesh
     head = skinned.dense_skin_weights(len(body.joint_names)).numpy()[:, body.joint("Head")] > 0.5
+    shell = Mesh(mesh.vertices, np.ascontiguousarray(mesh.faces[head[mesh.faces].all(axis=1)]))
     front = head & (mesh.vertex_normals()[:, 2] > 0.5)
-    faces = np.ascontiguousarray(mesh.faces[head[mesh.faces].all(axis=1)])
-    if not front.any() or len(faces) == 0:
+    if not front.any() or len(shell.faces) == 0:
         return None
     cosines = np.array([float(view.view_cosine.numpy()[front].mean()) for view in views])
     order = np.argsort(-cosines, kind="stable")[:MAX_FRAMES]
     chosen = [views[k] for k in order if cosines[k] > MIN_COSINE]
     if not chosen:
         return None
-    shell = Mesh(mesh.vertices, faces)
-    atlas = unwrap(shell, np.zeros(len(faces), np.int32), SIZE_PX, settings.padding_px)
+    atlas = unwrap(shell, np.zeros(len(shell.faces), np.int32), SIZE_PX, settings.padding_px)
     texels = rasterize_texels(atlas, SIZE_PX)
-    mean = average_views(chosen, TexturedSurface.from_arrays(faces, atlas, texels), settings)
-    return find_face_landmarks(body, shell, atlas, texels_to_texture(mean.value(), texels), make_detector())
+    mean = average_views(chosen, TexturedSurface.from_arrays(shell.faces, atlas, texels), settings)
+    rendered_m = rendered_landmarks_m(body, shell, atlas, texels_to_texture(mean.value(), texels), make_detector())
+    return choose_landmarks(body, rendered_m, faces.on_surface(shell, body))
