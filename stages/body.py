@@ -29,8 +29,9 @@ from pipeline.body.fit.diagnostics import (
     suspicious_frames,
     usable_frames,
 )
-from pipeline.body.fit.fit import FitOptions, TooFewLandmarksError, fit_body, fit_supplied_poses
+from pipeline.body.fit.fit import FitOptions, TooFewLandmarksError, fit_supplied_poses
 from pipeline.body.fit.hand_observations import filter_hand_detections, finger_curls_rad
+from pipeline.body.fit.rejection import fit_body_without_others
 from pipeline.body.fit.result import FitResult
 from pipeline.body.fit.silhouette_icp import crop_mask_window
 from pipeline.body.fit.supplied_poses import SuppliedPoses
@@ -189,7 +190,7 @@ def fit_capture(
     supplied = load_supplied_poses(capture, model, camera, focal_relative_std == 0.0, config)
     try:
         if supplied is None:
-            result = fit_body(model, observations, windows, options, finger_curls_rad(model, hands))
+            result = fit_body_without_others(model, observations, windows, options, finger_curls_rad(model, hands))
         else:
             keep = config.supplied_poses == "keep"
             result = fit_supplied_poses(model, observations, windows, supplied, keep, settings)
@@ -303,7 +304,7 @@ def draw_overlay_grid(
 
 STAGE = Stage(
     "body",
-    version=17,
+    version=18,
     needs=("frames",),
     makes=(_BODY, _MOTION, _CAMERA, _OBSERVATIONS, SCORES_NPZ, _OVERLAY),
     config=Config,

@@ -56,6 +56,8 @@ from pipeline.mesh.skin_transfer import SkinnedTopology, transfer_skin
 from pipeline.mesh.vertex_optimisation import RefinementInputs
 from pipeline.mesh.views import PosedView, crop_posed_view, mesh_psnr_db, silhouette_iou
 from pipeline.metrics.health import mesh_quality_metrics
+from pipeline.template.face.filmed_head import move_face_to_frames
+from pipeline.template.face.filmed_landmarks import FilmedFaces
 
 CHECKPOINT = "checkpoint_round.safetensors"
 DEFAULT_SETTINGS = MeshSettings()
@@ -142,7 +144,10 @@ def run(
         validation_motion=motion.select(chosen[1]),
         settings=settings,
     )
-    start = load_checkpoint(out / CHECKPOINT) or starting_mesh(field, occupancy, refinement_inputs, config.voxel_size_m)
+    camera = load_camera(inputs["body"] / "camera.npz")
+    faces = FilmedFaces.of_capture(capture, parts[0], canonical_to_world(body, motion), camera)
+    start_inputs = replace(refinement_inputs, body=move_face_to_frames(body, faces))
+    start = load_checkpoint(out / CHECKPOINT) or starting_mesh(field, occupancy, start_inputs, config.voxel_size_m)
     state = refine_mesh(start, refinement_inputs, lambda state: save_checkpoint(out / CHECKPOINT, state))
     aligned = with_offsets(refinement_inputs, state.pose_offsets)
     if state.pose_offsets:
@@ -176,7 +181,7 @@ def run(
 def starting_mesh(
     field: RadianceField, occupancy: BinaryOccupancy, inputs: RefinementInputs, voxel_size_m: float
 ) -> Mesh:
-    """Extract the surface of the field and remesh it to the target edge length."""
+    """Extract the surface of the field, its face at that of `inputs.body`, and remesh it to the target edge length."""
 
     def density_fn(points_m: Tensor) -> Tensor:
         occupied, density = occupancy.contains(points_m), torch.zeros(len(points_m))
@@ -314,7 +319,7 @@ def write_results(out: Path, mesh: Mesh, skin: SkinnedTopology, shader: torch.nn
 
 STAGE = Stage(
     "mesh",
-    version=21,
+    version=22,
     needs=("frames", "body", "field"),
     makes=(MESH_NPZ, DENSE_NPZ, "motion.npz", "preview.png"),
     config=Config,

@@ -40,8 +40,8 @@ def head_skin_weight(
     if len(head) == 0:
         return np.zeros(len(points_m))
     low_m, high_m = head.min(axis=0), head.max(axis=0)
-    close = 1.0 - _smooth_step((offset_m - SKIN_OFFSET_M) / (HAIR_OFFSET_M - SKIN_OFFSET_M))
-    return np.maximum(close, _features(points_m, low_m, high_m)) * _smooth_step((points_m[:, 1] - low_m[1]) / EDGE_M)
+    close = 1.0 - smooth_step((offset_m - SKIN_OFFSET_M) / (HAIR_OFFSET_M - SKIN_OFFSET_M))
+    return np.maximum(close, _features(points_m, low_m, high_m)) * smooth_step((points_m[:, 1] - low_m[1]) / EDGE_M)
 
 
 def face_weight(
@@ -52,7 +52,7 @@ def face_weight(
     if len(head) == 0:
         return np.zeros(len(points_m))
     middle_m = 0.5 * (head[:, 2].min() + head[:, 2].max())
-    return head_skin_weight(points_m, offset_m, body) * _smooth_step((points_m[:, 2] - middle_m) / EDGE_M)
+    return head_skin_weight(points_m, offset_m, body) * smooth_step((points_m[:, 2] - middle_m) / EDGE_M)
 
 
 def _features(
@@ -66,10 +66,10 @@ def _features(
         FEATURE_HALF_WIDTH * half_width_m - np.abs(points_m[:, 0] - middle_m[0]),
         points_m[:, 2] - middle_m[2],
     )
-    return np.prod([_smooth_step(margin_m / EDGE_M + 0.5) for margin_m in margins_m], axis=0)
+    return np.prod([smooth_step(margin_m / EDGE_M + 0.5) for margin_m in margins_m], axis=0)
 
 
-def _smooth_step(value: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+def smooth_step(value: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     """Return 0 below 0, 1 above 1, and 3 v² - 2 v³ between."""
     clipped = np.clip(value, 0.0, 1.0)
     return clipped * clipped * (3.0 - 2.0 * clipped)

@@ -112,7 +112,7 @@ def test_the_vertical_is_estimated_unless_the_camera_pose_is_supplied(
     masks = scene.masks()
     write_capture(tmp_path / "frames", scene, scene.camera, masks)
     capture = replace(load_capture(tmp_path / "frames"), camera_pose_is_known=is_known)
-    stop = mock.patch("stages.body.fit_body", side_effect=TooFewLandmarksError("stop"))
+    stop = mock.patch("stages.body.fit_body_without_others", side_effect=TooFewLandmarksError("stop"))
     with stop as fit, pytest.raises(UserError, match="stop"):
         fit_capture(capture, scene.hands, masks, Config())
     assert fit.call_args.args[3].vertical_is_known is is_known

@@ -22,7 +22,11 @@ from pipeline.template.face.landmarks import LANDMARK_NUMBERS, LANDMARK_VERTICES
 MIN_FACING_COSINE = 0.8
 """Cosine of the largest angle between face and view: farther aside, the detector's nose and lips lie on the outline."""
 MIN_FRAMES = 5
-"""A median of fewer frames is not used."""
+"""Fewer frames are not used."""
+RAY_SCALE_M, ROBUST_STEPS = 0.005, 20
+"""Distance from a ray at which it has a quarter of its weight, and steps of reweighting."""
+DEPTH_STD_M = 0.02
+"""Standard deviation of the depth of the body's face."""
 
 
 @dataclass(frozen=True)
@@ -66,19 +70,48 @@ class FilmedFaces:
             mesh: the person's head in the A-pose.
             body: the fitted body in the A-pose; its vertices have the skin weights of the landmarks.
         """
-        weights = torch.from_numpy(body.skin_weights[LANDMARK_VERTICES])
-        to_world = torch.einsum("lj,njab->nlab", weights, self.canonical_to_world).double().numpy()
+        origin_m, direction = self.canonical_rays(body)
         vertices, faces = mesh.vertices.astype(np.float64), mesh.faces.astype(np.int64)
-        points_m = np.full((len(self.faces_px), len(LANDMARK_NUMBERS), 3), np.nan)
-        for frame, (face_px, back) in enumerate(zip(self.faces_px, np.linalg.inv(to_world), strict=True)):
-            rays = pixel_rays(self.camera, torch.from_numpy(face_px[LANDMARK_NUMBERS]).double())
-            origin_m = np.einsum("lab,lb->la", back[:, :3, :3], rays[0].numpy()) + back[:, :3, 3]
-            direction = np.einsum("lab,lb->la", back[:, :3, :3], rays[1].numpy())
-            for row in range(len(LANDMARK_NUMBERS)):
-                # All hits, nearest first; `first=True` returns an arbitrary hit for a ray without any.
-                hits = igl.ray_mesh_intersect(origin_m[row], direction[row], vertices, faces)
-                if hits:
-                    points_m[frame, row] = origin_m[row] + hits[0][1] * direction[row]
+        points_m = np.full(origin_m.shape, np.nan)
+        for ray in np.ndindex(origin_m.shape[:2]):
+            # All hits, nearest first; `first=True` returns an arbitrary hit for a ray without any.
+            hits = igl.ray_mesh_intersect(origin_m[ray], direction[ray], vertices, faces)
+            if hits:
+                points_m[ray] = origin_m[ray] + hits[0][1] * direction[ray]
         if (np.isfinite(points_m[..., 0]).sum(axis=0) < MIN_FRAMES).any():
             return None
         return np.nanmedian(points_m, axis=0)
+
+    def triangulate(self, body: Body) -> Float[np.ndarray, "l 3"] | None:
+        """Return the points (m, canonical frame) nearest to the rays of `FACE_LANDMARKS`; None if too few show them.
+
+        A robust mean (Geman and McClure). The depth is uncertain, and biased where turned faces show the outline of the
+        nose: the body's is a weak prior.
+
+        body: the fitted body in the A-pose.
+        """
+        if len(self.faces_px) < MIN_FRAMES:
+            return None
+        origin_m, direction = self.canonical_rays(body)
+        across = np.eye(3) - direction[..., :, None] * direction[..., None, :]
+        prior_m = body.vertices[LANDMARK_VERTICES].astype(np.float64)
+        prior_weight = np.diag([0.0, 0.0, (RAY_SCALE_M / DEPTH_STD_M) ** 2])
+        weight = np.ones(origin_m.shape[:2])
+        for _ in range(ROBUST_STEPS):
+            normal = np.einsum("nl,nlab->lab", weight, across) + prior_weight
+            right = np.einsum("nl,nlab,nlb->la", weight, across, origin_m) + prior_m @ prior_weight
+            points_m = np.linalg.solve(normal, right[..., None])[..., 0]
+            distance_m = np.linalg.norm(np.einsum("nlab,nlb->nla", across, points_m - origin_m), axis=2)
+            weight = 1.0 / (1.0 + (distance_m / RAY_SCALE_M) ** 2) ** 2
+        return points_m
+
+    def canonical_rays(self, body: Body) -> tuple[Float[np.ndarray, "n l 3"], Float[np.ndarray, "n l 3"]]:
+        """Return origins (m) and unit directions of the rays of `FACE_LANDMARKS` in the canonical frame."""
+        weights = torch.from_numpy(body.skin_weights[LANDMARK_VERTICES])
+        to_world = torch.einsum("lj,njab->nlab", weights, self.canonical_to_world).double().numpy()
+        back = np.linalg.inv(to_world)
+        pixels_px = torch.from_numpy(self.faces_px[:, LANDMARK_NUMBERS].reshape(-1, 2)).double()
+        origin_m, direction = (ray.numpy().reshape(*back.shape[:2], 3) for ray in pixel_rays(self.camera, pixels_px))
+        origin_m = np.einsum("nlab,nlb->nla", back[..., :3, :3], origin_m) + back[..., :3, 3]
+        direction = np.einsum("nlab,nlb->nla", back[..., :3, :3], direction)
+        return origin_m, direction / np.linalg.norm(direction, axis=2, keepdims=True)

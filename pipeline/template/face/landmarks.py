@@ -111,7 +111,7 @@ def choose_landmarks(
 ) -> FaceLandmarks | None:
     """Return the landmarks found on renders, or those of the frames if only they are plausible or the two disagree."""
     rendered, filmed = (
-        None if positions_m is None else _if_plausible(body, positions_m) for positions_m in (rendered_m, filmed_m)
+        None if positions_m is None else if_plausible(body, positions_m) for positions_m in (rendered_m, filmed_m)
     )
     if rendered is None or filmed is None:
         return rendered or filmed
@@ -119,7 +119,8 @@ def choose_landmarks(
     return rendered if np.median(distance_m) <= MAX_DISAGREEMENT_M else filmed
 
 
-def _if_plausible(body: Body, positions_m: Float[np.ndarray, "l 3"]) -> FaceLandmarks | None:
+def if_plausible(body: Body, positions_m: Float[np.ndarray, "l 3"]) -> FaceLandmarks | None:
+    """Return the landmarks, or None where no similarity transform brings those of the body near them."""
     scale, rotation, translation_m = fit_similarity(body.vertices[LANDMARK_VERTICES], positions_m)
     moved_m = scale * body.vertices[LANDMARK_VERTICES] @ rotation.T + translation_m
     residual_m = float(np.sqrt(np.mean(np.sum((moved_m - positions_m) ** 2, axis=1))))
