@@ -19,8 +19,9 @@ from jaxtyping import Float32
 from data_tools.command import run_command
 from data_tools.folder import replaced_folder
 from pipeline.avatar.bvh_export import motion_to_bvh
-from pipeline.avatar.feet import find_contacts, plant_feet, snap_feet_to_floor, sole_positions_m
+from pipeline.avatar.feet import find_contacts, snap_feet_to_floor, sole_positions_m
 from pipeline.avatar.placement import resample_uniformly
+from pipeline.avatar.planting import plant_feet
 from pipeline.avatar.retarget import retarget_with_contacts
 from pipeline.avatar.rig import build_rig
 from pipeline.body.body import Body, Motion, canonical_to_world

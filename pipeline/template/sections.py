@@ -7,6 +7,9 @@ from jaxtyping import Float
 
 from pipeline.geometry.mesh import Mesh
 
+SLICE_M = 0.01
+"""Distance of the horizontal sections that are searched."""
+
 
 @dataclass(frozen=True)
 class Section:

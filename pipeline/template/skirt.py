@@ -1,0 +1,214 @@
+"""Skirts: cloth below the crotch that bridges both legs and ends in a hem, with a ring of chains around it.
+
+A skirt is told by horizontal sections. Its surface midway between the legs is as far forward, or back, as before the
+legs' axes; and its hem is a step: the convex hull of the section is larger above it than below. Trousers of wide legs
+and a low crotch bridge as well, but their hull goes on.
+
+A frontal video shows no back: there the surface lies on the legs of the fitted body. The ring is closed all the same.
+
+Notation: v vertices, a directions around the legs, h heights.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.interpolate import RegularGridInterpolator
+from scipy.spatial import ConvexHull
+
+from pipeline.body.body import Body
+from pipeline.geometry.mesh import Mesh
+from pipeline.mesh.files import MeshArtifact
+from pipeline.template.chains import (
+    Chain,
+    LoosePart,
+    between_angles,
+    chain_weights,
+    joint_count,
+    smooth,
+    smoothstep,
+    weight_of,
+)
+from pipeline.template.sections import SLICE_M, Section, cut_at_height
+
+MIN_SKIRT_M = 0.12
+"""Least length of a skirt below the crotch of the body, which most low trousers and long shirts do not reach."""
+
+BRIDGE_SHARE, FOLD_SHARE = 0.85, 0.5
+"""A section bridges the legs in front if its surface midway between them is this far forward, as a share of that before
+the legs' axes. Trousers that touch are at 0 there, a straight skirt at 1. Generated skirts: 1.05 to 1.3. Pleats of a
+real skirt have 0.69 for 5 cm: the search for the hem goes on where the share is above the second."""
+
+MAX_GAP_M = 0.03
+"""Sections below the second share are passed over this far: strands and holes."""
+
+MIN_HEM_STEP, HEM_BELOW_M = 1.3, 0.1
+"""Least ratio of the hull's largest area above the hem to its area below it, the median over this height. Generated
+skirts: 2.6 and more, a real one 1.7; wide trousers with a low crotch: 1.0. A skirt as tight as they does not swing."""
+
+SKIRT_CHAINS = 8
+
+RING_SHARE = 0.8
+"""A joint is on the surface where that is at least this far out, as a share of the convex hull, otherwise on the hull:
+between the legs, and where the surface is open."""
+
+CLINGING_SHARE = 0.5
+"""Cloth of a skirt that lies on the legs moves by this share with the chains half way to the hem. At its hem it moves
+with the legs, whose skin continues it."""
+
+_OUTER_TOLERANCE_M, _OUTER_DIRECTIONS = 0.015, 72
+"""Surface farther inside than the outermost one in its direction is no cloth: legs inside the skirt."""
+
+_CORE = (0.3, 0.8)
+"""Shares of the convex hull up to which surface is no cloth, and from which it is: near the middle, where the underside
+of a captured skirt closes it, directions and so the chains change from one vertex to the next."""
+
+
+def skirt_hem_m(mesh: Mesh, body: Body) -> tuple[float, float]:
+    """Return the lowest heights at which the surface and the body bridge both legs: the hem and the crotch."""
+    top_m = _top_m(body)
+    return _lowest_bridge_m(mesh, body, top_m), _lowest_bridge_m(Mesh(body.vertices, body.faces), body, top_m)
+
+
+def hem_step(mesh: Mesh, body: Body, hem_m: float, crotch_m: float) -> float:
+    """Return how many times larger the convex hull of the surface is above the hem than below; inf on the ankles."""
+    above = [_hull_area_m2(mesh, height_m) for height_m in np.arange(hem_m, crotch_m, SLICE_M)]
+    below_m = np.arange(hem_m - HEM_BELOW_M, hem_m - MAX_GAP_M, SLICE_M)
+    below = [_hull_area_m2(mesh, height_m) for height_m in below_m[below_m > _ankle_m(body)]]
+    return max(above, default=0.0) / float(np.median(below)) if below else np.inf
+
+
+def find_skirt(body: Body, skinned: MeshArtifact, looseness: Float[np.ndarray, "v"]) -> LoosePart | None:
+    """Return the skirt, or the lower part of a closed coat; None for a person without.
+
+    Args:
+        body: the fitted body in the A-pose.
+        skinned: the captured mesh in the same pose and frame.
+        looseness: of each vertex, 0 on the body, 1 away from it.
+    """
+    mesh = _without_arms(skinned, body)
+    hem_m, crotch_m = skirt_hem_m(mesh, body)
+    if crotch_m - hem_m < MIN_SKIRT_M or hem_step(mesh, body, hem_m, crotch_m) < MIN_HEM_STEP:
+        return None
+    top_m = _top_m(body)
+    angles_rad = 2.0 * np.pi * np.arange(SKIRT_CHAINS) / SKIRT_CHAINS
+    levels_m = np.linspace(top_m, hem_m + 0.5 * SLICE_M, joint_count(top_m - hem_m))
+    rings_m = np.stack([_ring_m(mesh, body, float(height_m), angles_rad) for height_m in levels_m])
+    vertices = skinned.mesh.vertices.astype(np.float64)
+    along = (top_m - vertices[:, 1]) / (top_m - hem_m)
+    heights_m = np.arange(hem_m, top_m + SLICE_M, SLICE_M)
+    middle_m = np.array([_leg_axis_m(body, height_m)[0] for height_m in heights_m.tolist()])
+    offset_m = vertices[:, [0, 2]] - np.stack([np.interp(vertices[:, 1], heights_m, x) for x in middle_m.T], axis=1)
+    around_rad = np.arctan2(*offset_m.T)
+    places = np.column_stack([vertices[:, 1], around_rad, offset_m])
+    amount = _cloth_amount(mesh, body, (hem_m, top_m), places, looseness) * ~_on_arms(skinned, body)
+    of_chain = between_angles(around_rad, angles_rad)
+    weights = chain_weights(smooth(amount, skinned.mesh), of_chain, along, len(levels_m) - 1)
+    return LoosePart("skirt", tuple(Chain("Hips", rings_m[:, k]) for k in range(SKIRT_CHAINS)), weights)
+
+
+def _ring_m(mesh: Mesh, body: Body, height_m: float, angles_rad: Float[np.ndarray, "a"]) -> Float[np.ndarray, "a 3"]:
+    """Return a point of the outer surface in each direction; across gaps one of the convex hull."""
+    surface_m, hull_m = _reach_m(mesh, body, height_m, angles_rad)
+    distance_m = np.where(surface_m > RING_SHARE * hull_m, surface_m, hull_m)  # nan is False
+    points_m = _leg_axis_m(body, height_m)[0] + distance_m[:, None] * _directions(angles_rad)
+    return np.column_stack([points_m[:, 0], np.full(len(points_m), height_m), points_m[:, 1]])
+
+
+def _reach_m(mesh: Mesh, body: Body, height_m: float, angles_rad: Float[np.ndarray, "a"]) -> Float[np.ndarray, "2 a"]:
+    """Return how far the outermost surface (nan: none) and the convex hull are from midway between the legs."""
+    section, (middle_m, _) = cut_at_height(mesh, height_m), _leg_axis_m(body, height_m)
+    towards = _directions(angles_rad)
+    points = [section.exit_point_m(middle_m, direction) for direction in towards]
+    surface_m = [np.nan if point is None else float(np.linalg.norm(point - middle_m)) for point in points]
+    sides = ConvexHull(section.ends_m.reshape(-1, 2)).equations  # outward normal and offset of each side
+    facing = towards @ sides[:, :2].T
+    inside_m = -(sides[:, :2] @ middle_m + sides[:, 2])
+    hull_m = np.where(facing > 1e-9, inside_m / np.maximum(facing, 1e-9), np.inf).min(axis=1)
+    return np.stack([np.array(surface_m), hull_m])
+
+
+def _directions(angles_rad: Float[np.ndarray, "a"]) -> Float[np.ndarray, "a 2"]:
+    """Return x and z of directions, from the front towards the person's left."""
+    return np.stack([np.sin(angles_rad), np.cos(angles_rad)], axis=1)
+
+
+def _cloth_amount(
+    mesh: Mesh, body: Body, range_m: tuple[float, float], places: Float[np.ndarray, "v 4"], looseness: np.ndarray
+) -> Float[np.ndarray, "v"]:
+    """Return by which share vertices move with chains around them: 1 where loose, less where they lie on the legs.
+
+    range_m: heights of hem and top. places: height, direction (rad), and x and z from midway between the legs, of each
+    vertex.
+    """
+    hem_m, top_m = range_m
+    heights_m, angles_rad = np.arange(hem_m, top_m, SLICE_M), np.linspace(-np.pi, np.pi, _OUTER_DIRECTIONS + 1)
+    reach_m = np.stack([_reach_m(mesh, body, height_m, angles_rad) for height_m in heights_m.tolist()], axis=2)
+    at = np.column_stack([places[:, 1], places[:, 0].clip(heights_m[0], heights_m[-1])])
+    surface_m, hull_m = (RegularGridInterpolator((angles_rad, heights_m), r, method="nearest")(at) for r in reach_m)
+    distance_m = np.linalg.norm(places[:, 2:], axis=1)
+    along = (top_m - places[:, 0]) / (top_m - hem_m)
+    is_outer = (along > 0.0) & (along < 1.0) & (distance_m > surface_m - _OUTER_TOLERANCE_M)  # nan is False
+    clinging = CLINGING_SHARE * (1.0 - smoothstep(along, 0.5, 1.0)) * is_outer
+    amount = smoothstep(along, 0.0, 0.5) * (looseness + (1.0 - looseness) * clinging)
+    return amount * smoothstep(distance_m / hull_m, *_CORE) * (places[:, 0] > hem_m - MAX_GAP_M)
+
+
+def _lowest_bridge_m(mesh: Mesh, body: Body, top_m: float) -> float:
+    """Return the lowest height, from `top_m` down over folds and short gaps, at which a surface bridges both legs."""
+    lowest_m = last_m = top_m
+    for height_m in np.arange(top_m, _ankle_m(body), -SLICE_M).tolist():
+        share = _bridge_share(cut_at_height(mesh, height_m), *_leg_axis_m(body, height_m))
+        if share > BRIDGE_SHARE:
+            lowest_m = height_m
+        if share > FOLD_SHARE:
+            last_m = height_m
+        elif last_m - height_m > MAX_GAP_M:
+            break
+    return float(lowest_m)
+
+
+def _bridge_share(section: Section, middle_m: Float[np.ndarray, "2"], half_m: Float[np.ndarray, "2"]) -> float:
+    """Return how far forward, or back, the surface between the legs is, as a share of that before the legs' axes.
+
+    -inf where there is no surface between or on the legs.
+    """
+    back_m, front_m = section.depth_range_m(float(middle_m[0]))
+    sides = [
+        (middle_m + sign * half_m, section.depth_range_m(float(middle_m[0] + sign * half_m[0]))) for sign in (-1, 1)
+    ]
+    leg_front_m = np.mean([found[1] - axis_m[1] for axis_m, found in sides])
+    leg_back_m = np.mean([axis_m[1] - found[0] for axis_m, found in sides])
+    shares = [(front_m - middle_m[1]) / leg_front_m, (middle_m[1] - back_m) / leg_back_m]
+    return float(np.nan_to_num(shares, nan=-np.inf).max())
+
+
+def _hull_area_m2(mesh: Mesh, height_m: float) -> float:
+    points_m = cut_at_height(mesh, height_m).ends_m.reshape(-1, 2)
+    return float(ConvexHull(points_m).volume) if len(points_m) else 0.0  # of a plane, "volume" is the area
+
+
+def _top_m(body: Body) -> float:
+    return float(body.joints_m[[body.joint("LeftUpLeg"), body.joint("RightUpLeg")], 1].mean())
+
+
+def _ankle_m(body: Body) -> float:
+    return float(body.joints_m[[body.joint("LeftFoot"), body.joint("RightFoot")], 1].mean())
+
+
+def _leg_axis_m(body: Body, height_m: float) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+    """Return x and z midway between the axes of the legs at a height, and half the way from right to left."""
+    points = []
+    for side in ("Right", "Left"):
+        leg_m = body.joints_m[[body.joint(f"{side}{name}") for name in ("Foot", "Leg", "UpLeg")]].astype(np.float64)
+        points.append(np.array([np.interp(height_m, leg_m[:, 1], leg_m[:, axis]) for axis in (0, 2)]))
+    return 0.5 * (points[0] + points[1]), 0.5 * (points[1] - points[0])
+
+
+def _on_arms(skinned: MeshArtifact, body: Body) -> Bool[np.ndarray, "v"]:
+    names = tuple(name for name in body.joint_names if "Arm" in name or "Hand" in name)
+    return np.asarray(weight_of(skinned, body, names) > 0.5)
+
+
+def _without_arms(skinned: MeshArtifact, body: Body) -> Mesh:
+    """Return the mesh without the faces of arms, which hang beside a skirt."""
+    on_arms = _on_arms(skinned, body)
+    return Mesh(skinned.mesh.vertices, skinned.mesh.faces[~on_arms[skinned.mesh.faces].any(axis=1)])
