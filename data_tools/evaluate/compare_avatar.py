@@ -223,7 +223,7 @@ def compare_texture(comparison: Comparison, seed: int = 0) -> dict[str, float]:
 
 def _specular_correlation(comparison: Comparison, avatar: Mesh, points: Float[np.ndarray, "n 3"]) -> dict[str, float]:
     """Return `specular_correlation` of `compare_texture` at surface points of the avatar."""
-    truth, own = comparison.truth, comparison.run.avatar.specular
+    truth, own = comparison.truth, comparison.run.avatar.gloss
     _, true_faces, _ = closest_points_on_mesh(comparison.alignment(points), truth.subject.body.mesh())
     true = shiny_faces(truth.subject, truth.light)[true_faces]
     if truth.light.specular_strength == 0 or true.std() == 0:
@@ -231,7 +231,7 @@ def _specular_correlation(comparison: Comparison, avatar: Mesh, points: Float[np
     if own is None:
         return {"specular_correlation": 0.0}
     _, faces, barycentric = closest_points_on_mesh(points, avatar)
-    strength = (own.numpy()[avatar.faces[faces]] * barycentric).sum(axis=1)
+    strength = (own.strength.numpy()[avatar.faces[faces]] * barycentric).sum(axis=1)
     return {"specular_correlation": float(np.corrcoef(strength, true)[0, 1])}
 
 

@@ -7,6 +7,7 @@ import pytest
 from data_tools.evaluate.compare_avatar import compare_texture
 from data_tools.evaluate.comparison import Comparison
 from data_tools.synthetic.scene.renderer import LIGHTING_PRESETS
+from pipeline.texture.light import Highlights, VertexGloss
 
 
 @pytest.mark.slow
@@ -20,5 +21,6 @@ def test_correlation_of_highlights_with_the_true_ones(perfect: Comparison) -> No
     low, high = LIGHTING_PRESETS["patch"].shiny_heights
     strength = ((height > low * height.max()) & (height < high * height.max())).float()
     for specular, range_of in ((strength, (0.9, 1.0)), (1.0 - strength, (-1.0, -0.9))):
-        lit = replace(shiny, run=replace(shiny.run, avatar=replace(avatar, specular=specular)))
+        gloss = VertexGloss(Highlights.none(), specular)
+        lit = replace(shiny, run=replace(shiny.run, avatar=replace(avatar, gloss=gloss)))
         assert range_of[0] <= compare_texture(lit)["specular_correlation"] <= range_of[1]
