@@ -21,16 +21,11 @@ import torch
 from jaxtyping import Float, Int, UInt8
 
 from data_tools.command import run_command
+from data_tools.evaluate.highlights import highlight_scores
 from data_tools.evaluate.truth import load_ground_truth
 from data_tools.synthetic.rig.subject import Subject
 from data_tools.synthetic.scene.capture import SyntheticCapture
-from data_tools.synthetic.scene.renderer import (
-    Light,
-    face_exponents,
-    pose_vertices,
-    render_subject,
-    shiny_faces,
-)
+from data_tools.synthetic.scene.renderer import Light, pose_vertices, render_subject
 from pipeline.avatar.finished_run import load_textured_avatar
 from pipeline.body.body import Body
 from pipeline.body.files import save_body, save_camera, save_motion
@@ -49,7 +44,6 @@ from pipeline.mesh.files import MeshArtifact, load_mesh, save_dense_mesh, save_m
 from pipeline.metrics.images import composite_on_white, composite_premultiplied_on_white, foreground_mask, psnr_db
 from pipeline.metrics.surfaces import sample_surface
 from pipeline.texture.files import TextureArtifact, load_texture
-from pipeline.texture.light import exponent_of_roughness, roughness_of_exponent
 from stages.texture import STAGE as TEXTURE
 
 FACES = 22_000
@@ -217,39 +211,22 @@ def albedo_gain(
 
 
 def score_highlights(truth: SyntheticCapture, texture: TextureArtifact, folder: Path) -> dict[str, float]:
-    """Return how the highlights agree with the true ones on the observed surface.
-
-    Returns:
-        `specular_correlation`: of the specular map with the true strength; 0 for an empty map.
-        `lamp_error_deg`: angle between the estimated lamp and the key light.
-        `roughness_P` and `exponent_P`, for each true exponent P: mean of the map there, weighted by the specular map,
-        and the exponent of that roughness; `roughness_error`: weighted mean distance to the true roughness.
-    """
+    """Return `highlight_scores` on the observed surface, and `lamp_error_deg`: from the lamp to the key light."""
     mesh, subject = load_mesh(folder / "mesh").cut(texture.cut).mesh, truth.subject
     points, _ = sample_surface(mesh, SURFACE_POINTS, 0)
     uv = _uv_at(points, mesh, texture.atlas.uv, texture.atlas.faces_uv)
     seen = sample_texture(torch.from_numpy(to_float(texture.coverage))[..., None], uv)[:, 0].numpy() > 0.5
-    own = sample_texture(torch.from_numpy(texture.specular)[..., None], uv)[:, 0].numpy()[seen]
-    if not own.any():
-        return {"specular_correlation": 0.0}
-    _, faces, _ = closest_points_on_mesh(points[seen], subject.body.mesh())
-    shines, exponent = shiny_faces(subject, truth.light)[faces], face_exponents(subject, truth.light)[faces]
-    roughness = np.full(len(own), texture.highlights.roughness)
+    strength = sample_texture(torch.from_numpy(texture.specular)[..., None], uv)[:, 0].numpy()[seen]
+    roughness = np.full(len(strength), texture.highlights.roughness)
     if texture.roughness is not None:
         roughness = sample_texture(torch.from_numpy(texture.roughness)[..., None], uv)[:, 0].numpy()[seen]
-    weight = own * shines
+    _, faces, _ = closest_points_on_mesh(points[seen], subject.body.mesh())
+    scores = highlight_scores(strength, roughness, subject, truth.light, faces)
+    if not strength.any():
+        return scores
     key = np.array(truth.light.key_direction) / np.linalg.norm(truth.light.key_direction)
     cosine = float(np.clip(texture.highlights.direction @ key, -1.0, 1.0))
-    scores = {
-        "specular_correlation": float(np.corrcoef(own, shines)[0, 1]),
-        "lamp_error_deg": float(np.degrees(np.arccos(cosine))),
-        "roughness_error": float(np.average(np.abs(roughness - roughness_of_exponent(exponent)), weights=weight)),
-    }
-    for value in np.unique(exponent[weight > 0.0]).tolist():
-        here = exponent == value
-        mean = np.average(roughness[here], weights=weight[here])
-        scores |= {f"roughness_{value:g}": mean, f"exponent_{value:g}": float(exponent_of_roughness(mean))}
-    return scores
+    return scores | {"lamp_error_deg": float(np.degrees(np.arccos(cosine)))}
 
 
 def _uv_at(points: np.ndarray, mesh: Mesh, uv: np.ndarray, faces_uv: np.ndarray) -> torch.Tensor:

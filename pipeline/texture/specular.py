@@ -12,7 +12,8 @@ and one place: a material) keeps them only if they predict its colours in valida
 change the colour of a vertex with the view as well. Where frames do not tell the strength, it is that of the region.
 
 The exponent of a region is the one that leaves the least error in training frames, where it differs from that of the
-whole person by `MIN_STANDARD_ERRORS`; the whole person has one if validation frames do not prefer those of regions.
+whole person by `MIN_STANDARD_ERRORS`; the whole person has one if validation frames do not prefer those of regions by
+as many.
 """
 
 from dataclasses import dataclass, replace
@@ -117,7 +118,7 @@ def fit_specular(train: ViewObservations, validation: ViewObservations, light: V
     direction = first.direction if light.casts_shadows else _refine_direction(surface, shiny, first.direction, light)
     whole, chosen, roughness_errors = _choose_exponents(surface, matte, shiny, direction)
     shiny = _shiny_regions(surface, matte, chosen.tested_error)
-    strength, roughness = _strength_and_roughness(surface, chosen, shiny)
+    strength, roughness = _strength_and_roughness(surface, chosen, shiny, whole)
     explained, errors = _decrease(surface, matte, chosen.tested_error, shiny)
     own = roughness if roughness_errors > 0.0 else None
     return SpecularFit(Highlights(direction, whole), strength, own, explained, errors, len(shiny), roughness_errors)
@@ -265,19 +266,22 @@ def _choose_exponents(
     kinds = _shiny_regions(surface, matte, own.tested_error)
     if len(np.unique(best[kinds])) > 1:
         _, errors = _decrease(surface, one.tested_error, own.tested_error, kinds)
-        if errors > MIN_REGION_STANDARD_ERRORS:
+        if errors > MIN_STANDARD_ERRORS:
             return FINE_EXPONENTS[whole], own, errors
     return FINE_EXPONENTS[whole], one, 0.0
 
 
 def _strength_and_roughness(
-    surface: _Surface, lobe: _LobeFit, shiny: Int[np.ndarray, "s"]
+    surface: _Surface, lobe: _LobeFit, shiny: Int[np.ndarray, "s"], whole: float
 ) -> tuple[Float[np.ndarray, "v"], Float[np.ndarray, "v"]]:
-    """Return the strength of the vertices of shiny regions, and their roughness, both smoothed across borders."""
-    region = surface.region
+    """Return the strength of the vertices of shiny regions, and their roughness, both smoothed across borders.
+
+    whole: exponent of the whole person, which other regions take.
+    """
+    region, is_shiny = surface.region, np.isin(surface.region, shiny)
     mean = np.bincount(region, np.maximum(lobe.product, 0.0)) / np.maximum(np.bincount(region, lobe.power), 1e-12)
-    strength = np.isin(region, shiny) * _smooth(lobe.power, lobe.product, mean[region], surface.mixing)
-    roughness = roughness_of_exponent(lobe.exponent)
+    strength = is_shiny * _smooth(lobe.power, lobe.product, mean[region], surface.mixing)
+    roughness = roughness_of_exponent(np.where(is_shiny, lobe.exponent, whole))
     for _ in range(REGION_SMOOTHING_STEPS):
         weighted, strength = surface.mixing @ (strength * roughness), surface.mixing @ strength
         roughness = np.where(strength > 0.0, weighted / np.maximum(strength, 1e-12), roughness)

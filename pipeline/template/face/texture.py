@@ -164,7 +164,8 @@ def paint_patch(
         slice(int((1.0 - top) * size_px), int((1.0 - bottom) * size_px)),
         slice(int(left * size_px), int(right * size_px)),
     )
-    maps[rows, columns, :3], known[rows, columns] = shade * np.array(TEETH_COLOUR), True
+    maps[rows, columns] = (*(shade * np.array(TEETH_COLOUR)), *captured.matte)
+    known[rows, columns] = True
     hidden = on_skin & ~view.sees(points_m, _VISIBLE_M) & _near_eyeballs(patch, points_m)
     known[texels.rows[hidden], texels.columns[hidden]] = False
     filled = fill_unknown_texels(maps, known)
