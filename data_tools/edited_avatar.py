@@ -8,7 +8,15 @@ from data_tools.folder import replaced_folder
 from data_tools.pose import export_config
 from pipeline.avatar.skinned_avatar import to_rest_pose
 from pipeline.io.image import to_uint8, write_gray, write_rgb
-from pipeline.texture.files import DIFFUSE, NORMAL, SPECULAR, TextureArtifact, save_normal_map
+from pipeline.texture.files import (
+    DIFFUSE,
+    NORMAL,
+    ROUGHNESS,
+    SPECULAR,
+    TextureArtifact,
+    save_normal_map,
+    save_roughness_map,
+)
 from stages import export
 from stages.export import Scene, encode_scene, load_scene, make_face, write_scene_obj
 
@@ -46,6 +54,7 @@ def write_edited_avatar(
         write_rgb(part / DIFFUSE, to_uint8(texture.diffuse))
         write_gray(part / SPECULAR, to_uint8(texture.specular))
         save_normal_map(part / NORMAL, texture)
+        save_roughness_map(part / ROUGHNESS, texture)
         (part / "avatar.glb").write_bytes(encode_scene(edited, config, edited.clips()))
         write_scene_obj(part, part, texture, to_rest_pose(scene.skinned, scene.rig))
     report(f"{out}: avatar.glb, avatar.obj, {DIFFUSE} ({len(texture.diffuse)} px)")

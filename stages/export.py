@@ -13,9 +13,10 @@ from pydantic import Field, field_validator
 from pipeline.avatar.formats.vrm import VrmMeta
 from pipeline.avatar.formats.vrm_springs import LooseParts
 from pipeline.avatar.formats.write import ExportFormat, FormatRequest, missing_package, write_formats
-from pipeline.avatar.gltf import MaterialMaps, MorphTargets, SkinnedMesh, encode_glb, pack_specular_factor
+from pipeline.avatar.gltf import MorphTargets, SkinnedMesh, encode_glb
+from pipeline.avatar.gltf_material import MaterialMaps, encode_gloss
 from pipeline.avatar.idle import idle_motion
-from pipeline.avatar.obj import write_faces_obj, write_obj
+from pipeline.avatar.obj import ObjMaps, write_faces_obj, write_obj
 from pipeline.avatar.placement import (
     pad_motion_to_video,
     translate_camera,
@@ -44,13 +45,12 @@ from pipeline.template.face.texture import CapturedSurface
 from pipeline.template.files import FittedTemplate, load_fitted_template
 from pipeline.template.loose_parts import body_colliders, find_loose_parts
 from pipeline.template.reshape import SHAPE_KEY_STEP, SHAPE_KEYS, carry_to_surface, shape_change
-from pipeline.template.wrapped import wrap_template
-from pipeline.texture.files import DIFFUSE, NORMAL, SPECULAR, TextureArtifact, load_texture, map_files
+from pipeline.template.wrapped import WrappedTemplate, wrap_template
+from pipeline.texture.files import DIFFUSE, NORMAL, ROUGHNESS, SPECULAR, TextureArtifact, load_texture, map_files
 from pipeline.texture.light import TERMS, VideoLight
 from pipeline.texture.normal_map import widen_flat
-from pipeline.texture.specular import dielectric_specular_factor
 
-OBJ_MAPS = tuple(f"avatar_{name}" for name in (DIFFUSE, SPECULAR, NORMAL))
+OBJ_MAPS = tuple(f"avatar_{name}" for name in (DIFFUSE, SPECULAR, ROUGHNESS, NORMAL))
 
 
 class Config(BaseConfig):
@@ -199,7 +199,7 @@ def make_face(
     body: Body, template: FittedTemplate | None, skinned: MeshArtifact, texture: TextureArtifact
 ) -> AnimatedFace | None:
     """Return the avatar with a face that moves; None, with a warning, where the face is not found or not cut out."""
-    captured = CapturedSurface(skinned.mesh, texture.atlas, texture.diffuse, texture.specular)
+    captured = CapturedSurface(skinned.mesh, texture.atlas, texture.diffuse, texture.specular, texture.roughness)
     try:
         return build_animated_face(body, template.registration if template else None, skinned, captured)
     except FacePatchError as error:
@@ -224,13 +224,10 @@ def loose_parts(scene: Scene) -> LooseParts:
 def encode_scene(scene: Scene, config: Config, clips: Mapping[str, Motion]) -> bytes:
     """Return the .glb with the clips as animations."""
     texture, face = scene.texture, scene.face
-    atlas, diffuse, specular = texture.atlas, texture.diffuse, texture.specular
-    if face is not None:
-        atlas, diffuse, specular = face.atlas, face.diffuse, face.specular
-    normal = texture.normal
+    atlas, normal = face.atlas if face else texture.atlas, texture.normal
     if face is not None and normal is not None:
         normal = widen_flat(normal)
-    maps = material_maps(texture, config, diffuse, specular, normal)
+    maps = material_maps(texture, config, face or texture, normal)
     at_rest = to_rest_pose(face.skinned if face else scene.skinned, scene.rig)
     mesh = build_skinned_mesh(at_rest, atlas)
     if face is not None:
@@ -278,7 +275,7 @@ def write_wrapped(scene: Scene, config: Config, out: Path) -> None:
     if scene.template is None:
         raise UserError("export.topology=template needs the built-in body, and this run has a body of a model file")
     texture = scene.texture
-    captured = CapturedSurface(scene.skinned.mesh, texture.atlas, texture.diffuse, texture.specular)
+    captured = CapturedSurface(scene.skinned.mesh, texture.atlas, texture.diffuse, texture.specular, texture.roughness)
     wrapped = wrap_template(scene.body, scene.template.registration, captured)
     at_rest = to_rest_pose(wrapped.skinned, scene.rig)
     vertices = at_rest.mesh.vertices
@@ -287,14 +284,16 @@ def write_wrapped(scene: Scene, config: Config, out: Path) -> None:
         eyes_m = eye_centres_m(vertices, wrapped.eyeballs)
         moved_m = wrapped.displacements_m[:, wrapped.atlas.vertex_of_uv]
         mesh = replace(mesh, morphs=MorphTargets(wrapped.names, moved_m, eyes_m))
-    maps = material_maps(texture, config, wrapped.diffuse, wrapped.specular)
+    maps = material_maps(texture, config, wrapped)
     (out / "wrapped.glb").write_bytes(encode_glb(mesh, scene.rig, scene.clips(), maps, scene.camera, scene.extras))
     write_rgb(out / f"wrapped_{DIFFUSE}", to_uint8(wrapped.diffuse))
-    specular_name = None
+    names = ObjMaps(f"wrapped_{DIFFUSE}", exponent=texture.highlights.exponent)
     if wrapped.specular.any():
-        specular_name = f"wrapped_{SPECULAR}"
-        write_gray(out / specular_name, to_uint8(wrapped.specular))
-    names = f"wrapped_{DIFFUSE}", specular_name, None
+        names = replace(names, specular=f"wrapped_{SPECULAR}")
+        write_gray(out / f"wrapped_{SPECULAR}", to_uint8(wrapped.specular))
+    if wrapped.roughness is not None:
+        names = replace(names, roughness=f"wrapped_{ROUGHNESS}")
+        write_gray(out / f"wrapped_{ROUGHNESS}", to_uint8(wrapped.roughness))
     surface, layout = (vertices, wrapped.quads), (wrapped.atlas.uv, wrapped.quads_uv)
     write_faces_obj(out / "wrapped.obj", surface, layout, at_rest.mesh.vertex_normals(), names)
 
@@ -302,33 +301,28 @@ def write_wrapped(scene: Scene, config: Config, out: Path) -> None:
 def material_maps(
     texture: TextureArtifact,
     config: Config,
-    diffuse: Float[np.ndarray, "h w 3"],
-    specular: Float[np.ndarray, "h w"],
+    shown: TextureArtifact | AnimatedFace | WrappedTemplate,
     normal: Float[np.ndarray, "n m 3"] | None = None,
 ) -> MaterialMaps:
-    """Return the encoded maps; `texture` has the lobe and the lamp of the highlights."""
-    has_highlights = bool(specular.any())
-    return MaterialMaps(
-        png_bytes(to_uint8(diffuse)),
-        encode_specular_png(specular, texture) if has_highlights else None,
-        texture.highlights.roughness if has_highlights else config.roughness,
-        config.unlit,
-        None if normal is None else png_bytes(to_uint8(normal)),
-    )
+    """Return the encoded maps of `shown`; `texture` has the lobe and the lamp of the highlights."""
+    specular_png, roughness, roughness_png = encode_gloss(texture, shown.specular, shown.roughness, config.roughness)
+    normal_png = None if normal is None else png_bytes(to_uint8(normal))
+    diffuse_png = png_bytes(to_uint8(shown.diffuse))
+    return MaterialMaps(diffuse_png, specular_png, roughness, config.unlit, normal_png, roughness_png)
 
 
 def write_scene_obj(texture_dir: Path, out: Path, texture: TextureArtifact, skinned: MeshArtifact) -> None:
     """Write `avatar.obj`, `avatar.mtl` and the maps for the mesh in any pose."""
-    diffuse_name, specular_name, normal_name = (
-        copy_map(texture_dir, name, out) for name in (DIFFUSE, SPECULAR, NORMAL)
-    )
-    map_names = (
-        diffuse_name,
-        specular_name if texture.specular.any() else None,
-        normal_name if texture.normal is not None else None,
+    names = {name: copy_map(texture_dir, name, out) for name in (DIFFUSE, SPECULAR, ROUGHNESS, NORMAL)}
+    maps = ObjMaps(
+        names[DIFFUSE],
+        specular=names[SPECULAR] if texture.specular.any() else None,
+        normal=None if texture.normal is None else names[NORMAL],
+        roughness=None if texture.roughness is None else names[ROUGHNESS],
+        exponent=texture.highlights.exponent,
     )
     layout, normals = texture.atlas, skinned.vertex_normals()
-    write_obj(out / "avatar.obj", skinned.mesh, layout.uv, layout.faces_uv, normals, *map_names)
+    write_obj(out / "avatar.obj", skinned.mesh, layout.uv, layout.faces_uv, normals, maps)
 
 
 def copy_map(texture_dir: Path, name: str, out: Path) -> str:
@@ -340,13 +334,6 @@ def copy_map(texture_dir: Path, name: str, out: Path) -> str:
     for path in paths:
         shutil.copyfile(path, out / f"avatar_{path.name}")
     return f"avatar_{paths[-1].name}"
-
-
-def encode_specular_png(strength: Float[np.ndarray, "h w"], texture: TextureArtifact) -> bytes:
-    """Convert a specular map to a PNG with glTF's specular factor; `texture` has the lobe and the lamp."""
-    lamp = texture.light.lamp_irradiance(texture.highlights.direction)
-    factor = dielectric_specular_factor(strength, texture.highlights.roughness, lamp)
-    return png_bytes(pack_specular_factor(to_uint8(factor)))
 
 
 def asset_extras(config: Config, offset_m: Float[np.ndarray, "3"], frame_rate_hz: float) -> dict[str, Any]:

@@ -51,13 +51,14 @@ from pipeline.texture.files import (
     DIFFUSE,
     LIGHT,
     NORMAL,
+    ROUGHNESS,
     SPECULAR,
     TextureArtifact,
     TextureFormat,
     save_texture,
 )
 from pipeline.texture.inpainting import average_texels_per_vertex, inpaint_vertex_colours
-from pipeline.texture.light import Highlights, VideoLight
+from pipeline.texture.light import VertexGloss, VideoLight
 from pipeline.texture.light_evidence import LightEvidence, estimate_light
 from pipeline.texture.normal_map import bake_normal_map
 from pipeline.texture.settings import DEFAULT_SETTINGS, TextureSettings
@@ -155,16 +156,16 @@ def run(
     )
     inpaint = make_texel_inpainter(skinned.mesh, texels, template)
     diffuse, texel_confidence = bake_diffuse(train, surface, inpaint, config.rounds, settings)
-    specular = torch.from_numpy(texels.interpolate(skinned.mesh.faces, fitted.strength[:, None]))
     artifact = TextureArtifact(
         atlas,
         diffuse=diffuse,
-        specular=np.ascontiguousarray(texels_to_texture(specular, texels)[..., 0]),
+        specular=vertex_map(fitted.strength, skinned.mesh, texels),
         coverage=to_uint8(texels.to_texture(texel_confidence[:, None])[..., 0]),
         light=light,
         highlights=fitted.highlights,
         normal=make_normal_map(inputs["mesh"], skinned.mesh, atlas, size_px, face_count) if config.normal_map else None,
         cut=cut,
+        roughness=None if fitted.roughness is None else vertex_map(fitted.roughness, skinned.mesh, texels),
     )
     save_texture(out, artifact, config.format)
     save_template(out, template)
@@ -177,6 +178,7 @@ def run(
         "specular_explained": fitted.explained,
         "specular_standard_errors": fitted.standard_errors,
         "specular_regions": float(fitted.regions),
+        "roughness_standard_errors": fitted.roughness_standard_errors,
         **light_metrics(evidence, light),
         **template_metrics(template),
     }
@@ -280,14 +282,23 @@ def light_views(
     """Return views with the shading of their vertices; unchanged under a uniform light of constant exposure."""
     if light.is_uniform and bool((light.gain == 1.0).all()):
         return views
-    lobe = (specular.highlights, torch.from_numpy(specular.strength)) if specular.strength.any() else None
+    gloss = None
+    if specular.strength.any():
+        roughness = None if specular.roughness is None else torch.from_numpy(specular.roughness)
+        gloss = VertexGloss(specular.highlights, torch.from_numpy(specular.strength), roughness)
 
     def shade(view: BakeView, frame: int) -> Float[Tensor, "v d"]:
-        if lobe is None:
+        if gloss is None:
             return light.shade_vertices(view.vertices_world, faces, frame)
-        return light.shade_specular(view.vertices_world, faces, frame, lobe, view.camera.centre_m())
+        return light.shade_specular(view.vertices_world, faces, frame, gloss, view.camera.centre_m())
 
     return [replace(view, shading=shade(view, int(position))) for view, position in zip(views, positions, strict=True)]
+
+
+def vertex_map(values: Float[np.ndarray, "v"], mesh: Mesh, texels: Texels) -> Float32[np.ndarray, "s s"]:
+    """Return a map of values at the vertices, gutters filled."""
+    at_texels = torch.from_numpy(texels.interpolate(mesh.faces, values[:, None]))
+    return np.ascontiguousarray(texels_to_texture(at_texels, texels)[..., 0])
 
 
 def vertex_surface(mesh: Mesh) -> TexturedSurface:
@@ -357,7 +368,7 @@ def make_texel_inpainter(mesh: Mesh, texels: Texels, template: FittedTemplate | 
 def fit_highlights(evidence: LightEvidence | None, light: VideoLight, mesh: Mesh) -> SpecularFit:
     """Return the highlights of the surface; none where no lamp was found, whose highlights they would be."""
     if evidence is None or light.is_uniform:
-        return SpecularFit(Highlights.none(), np.zeros(len(mesh.vertices), dtype=np.float32), 0.0, 0.0, 0)
+        return SpecularFit.matte(len(mesh.vertices))
     return fit_specular(evidence.train, evidence.validation, evidence.light, mesh)
 
 
@@ -365,7 +376,7 @@ STAGE = Stage(
     "texture",
     version=11,
     needs=("frames", "body", "mesh"),
-    makes=(ATLAS, DIFFUSE, SPECULAR, NORMAL, COVERAGE, LIGHT, TEMPLATE_NPZ),
+    makes=(ATLAS, DIFFUSE, SPECULAR, ROUGHNESS, NORMAL, COVERAGE, LIGHT, TEMPLATE_NPZ),
     config=Config,
     run=run,
 )

@@ -15,10 +15,11 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from data_tools.evaluate.comparison import SURFACE_POINTS, Comparison, ImagePair, retarget_motion
+from data_tools.evaluate.highlights import highlight_scores
 from data_tools.evaluate.static_texture import render_static, static_brightness
 from data_tools.evaluate.truth import load_true_mask
 from data_tools.evaluate.upper_bound import map_between_worlds, render_upper_bound
-from data_tools.synthetic.scene.renderer import pose_vertices, shiny_faces
+from data_tools.synthetic.scene.renderer import pose_vertices
 from pipeline.avatar.clay import render_clay_views
 from pipeline.body.body import Motion, canonical_to_world
 from pipeline.body.files import load_camera, load_motion
@@ -199,8 +200,8 @@ def compare_texture(comparison: Comparison, seed: int = 0) -> dict[str, float]:
         coverage: fraction of the surface that was observed.
         colour_error: mean absolute difference on the observed surface, of 255.
         balanced_colour_error: after one gain per channel, because the texture contains the lighting of the video.
-        specular_correlation: of the strength of the highlights with the true one, on the observed surface; 0 for an
-            avatar without highlights. Missing where the true person has none or the same everywhere.
+        specular_correlation, roughness_error, ...: see `highlight_scores`, on the observed surface; missing where the
+            true person has no highlights.
     """
     avatar = Mesh(comparison.rest_mesh.vertices, comparison.run.avatar.faces.numpy())
     true = comparison.truth.subject.body.mesh()
@@ -217,22 +218,24 @@ def compare_texture(comparison: Comparison, seed: int = 0) -> dict[str, float]:
         "coverage": float(observed.mean()),
         "colour_error": 255.0 * float(np.abs(avatar_colours - expected).mean()),
         "balanced_colour_error": 255.0 * float(np.abs(avatar_colours * gain - expected).mean()),
-        **_specular_correlation(comparison, avatar, points[observed]),
+        **_highlight_scores(comparison, avatar, points[observed]),
     }
 
 
-def _specular_correlation(comparison: Comparison, avatar: Mesh, points: Float[np.ndarray, "n 3"]) -> dict[str, float]:
-    """Return `specular_correlation` of `compare_texture` at surface points of the avatar."""
-    truth, own = comparison.truth, comparison.run.avatar.specular
-    _, true_faces, _ = closest_points_on_mesh(comparison.alignment(points), truth.subject.body.mesh())
-    true = shiny_faces(truth.subject, truth.light)[true_faces]
-    if truth.light.specular_strength == 0 or true.std() == 0:
+def _highlight_scores(comparison: Comparison, avatar: Mesh, points: Float[np.ndarray, "n 3"]) -> dict[str, float]:
+    """Return `highlight_scores` at surface points of the avatar; nothing where the true person is matte."""
+    truth, own = comparison.truth, comparison.run.avatar.gloss
+    if truth.light.specular_strength == 0:
         return {}
-    if own is None:
-        return {"specular_correlation": 0.0}
-    _, faces, barycentric = closest_points_on_mesh(points, avatar)
-    strength = (own.numpy()[avatar.faces[faces]] * barycentric).sum(axis=1)
-    return {"specular_correlation": float(np.corrcoef(strength, true)[0, 1])}
+    _, true_faces, _ = closest_points_on_mesh(comparison.alignment(points), truth.subject.body.mesh())
+    strength, roughness = np.zeros(len(points)), np.ones(len(points))
+    if own is not None:
+        _, faces, barycentric = closest_points_on_mesh(points, avatar)
+        strength = (own.strength.numpy()[avatar.faces[faces]] * barycentric).sum(axis=1)
+        roughness[:] = own.highlights.roughness
+        if own.roughness is not None:
+            roughness = (own.roughness.numpy()[avatar.faces[faces]] * barycentric).sum(axis=1)
+    return highlight_scores(strength, roughness, truth.subject, truth.light, true_faces)
 
 
 def compare_heldout_images(comparison: Comparison) -> dict[str, dict[str, float]]:

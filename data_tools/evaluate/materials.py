@@ -21,10 +21,11 @@ import torch
 from jaxtyping import Float, Int, UInt8
 
 from data_tools.command import run_command
+from data_tools.evaluate.highlights import highlight_scores
 from data_tools.evaluate.truth import load_ground_truth
 from data_tools.synthetic.rig.subject import Subject
 from data_tools.synthetic.scene.capture import SyntheticCapture
-from data_tools.synthetic.scene.renderer import Light, pose_vertices, render_subject, shiny_faces
+from data_tools.synthetic.scene.renderer import Light, pose_vertices, render_subject
 from pipeline.avatar.finished_run import load_textured_avatar
 from pipeline.body.body import Body
 from pipeline.body.files import save_body, save_camera, save_motion
@@ -179,7 +180,7 @@ def score_maps(
             drawn = render_subject(subject, vertices, truth.camera, light, SAMPLES)
             scores.setdefault(f"relit_{name}_db", []).append(_body_psnr_db(drawn, expected[..., :3], expected[..., 3]))
     if truth.light.specular_strength > 0:
-        scores["specular_correlation"] = [specular_correlation(truth, texture, folder)]
+        scores |= {name: [value] for name, value in score_highlights(truth, texture, folder).items()}
     split = assign_splits(np.arange(len(gains)))
     ratio = texture.light.gain[split == 0] / gains[split == 0]
     return {name: float(np.mean(values)) for name, values in scores.items()} | {
@@ -209,16 +210,23 @@ def albedo_gain(
     return gain, 255.0 * float(np.abs(linear_to_srgb(np.clip(gain * own, 0.0, 1.0)) - true_srgb).mean())
 
 
-def specular_correlation(truth: SyntheticCapture, texture: TextureArtifact, folder: Path) -> float:
-    """Return the correlation of the specular map with the true strength on the surface; 0 for an empty map."""
+def score_highlights(truth: SyntheticCapture, texture: TextureArtifact, folder: Path) -> dict[str, float]:
+    """Return `highlight_scores` on the observed surface, and `lamp_error_deg`: from the lamp to the key light."""
     mesh, subject = load_mesh(folder / "mesh").cut(texture.cut).mesh, truth.subject
     points, _ = sample_surface(mesh, SURFACE_POINTS, 0)
     uv = _uv_at(points, mesh, texture.atlas.uv, texture.atlas.faces_uv)
     seen = sample_texture(torch.from_numpy(to_float(texture.coverage))[..., None], uv)[:, 0].numpy() > 0.5
-    own = sample_texture(torch.from_numpy(texture.specular)[..., None], uv)[:, 0].numpy()[seen]
+    strength = sample_texture(torch.from_numpy(texture.specular)[..., None], uv)[:, 0].numpy()[seen]
+    roughness = np.full(len(strength), texture.highlights.roughness)
+    if texture.roughness is not None:
+        roughness = sample_texture(torch.from_numpy(texture.roughness)[..., None], uv)[:, 0].numpy()[seen]
     _, faces, _ = closest_points_on_mesh(points[seen], subject.body.mesh())
-    true = shiny_faces(subject, truth.light)[faces]
-    return float(np.corrcoef(own, true)[0, 1]) if own.any() else 0.0
+    scores = highlight_scores(strength, roughness, subject, truth.light, faces)
+    if not strength.any():
+        return scores
+    key = np.array(truth.light.key_direction) / np.linalg.norm(truth.light.key_direction)
+    cosine = float(np.clip(texture.highlights.direction @ key, -1.0, 1.0))
+    return scores | {"lamp_error_deg": float(np.degrees(np.arccos(cosine)))}
 
 
 def _uv_at(points: np.ndarray, mesh: Mesh, uv: np.ndarray, faces_uv: np.ndarray) -> torch.Tensor:

@@ -21,7 +21,7 @@ from data_tools.synthetic.scene.backdrop import Room, floor_points
 from data_tools.synthetic.scene.ball import Ball
 from data_tools.synthetic.scene.capture import CAPTURE_VERSION, SyntheticCapture
 from data_tools.synthetic.scene.renderer import Light, pose_vertices
-from pipeline.avatar.obj import write_obj
+from pipeline.avatar.obj import ObjMaps, write_obj
 from pipeline.body.files import load_camera, load_motion
 from pipeline.capture.video import open_frame_source, read_frames
 from pipeline.core.errors import UserError
@@ -157,7 +157,7 @@ def write_meshes(out: Path, folder: Path) -> int:
         for index, pose in enumerate(track(capture.canonical_to_world, "meshes")):
             mesh = Mesh(pose_vertices(subject, pose).numpy(), subject.body.faces)
             normals = mesh.vertex_normals()
-            write_obj(part / f"{index:06d}.obj", mesh, subject.uv, subject.faces_uv, normals, "texture.png", None)
+            write_obj(part / f"{index:06d}.obj", mesh, subject.uv, subject.faces_uv, normals, ObjMaps("texture.png"))
     return len(capture.canonical_to_world)
 
 

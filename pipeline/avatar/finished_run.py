@@ -20,7 +20,8 @@ from pipeline.geometry.atlas import Atlas
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.texture_rendering import sample_texture
 from pipeline.mesh.files import load_mesh
-from pipeline.texture.files import load_texture
+from pipeline.texture.files import TextureArtifact, load_texture
+from pipeline.texture.light import VertexGloss
 
 PoseRenderer = Callable[[Float[Tensor, "j 4 4"]], Float[np.ndarray, "h w 4"]]
 """Renders one pose (skinning matrices, canonical to world): premultiplied colours and alpha in [0, 1]."""
@@ -75,7 +76,6 @@ def load_textured_avatar(mesh_dir: Path, texture_dir: Path) -> TexturedAvatar:
     """Combine the skinned mesh of the mesh stage with the atlas and diffuse map of the texture stage."""
     texture = load_texture(texture_dir)
     skinned = load_mesh(mesh_dir).cut(texture.cut)
-    has_highlights = bool(texture.specular.any())
     return TexturedAvatar(
         vertices=torch.from_numpy(skinned.mesh.vertices.astype(np.float32)),
         faces=torch.from_numpy(skinned.mesh.faces.astype(np.int32)),
@@ -85,9 +85,17 @@ def load_textured_avatar(mesh_dir: Path, texture_dir: Path) -> TexturedAvatar:
         faces_uv=torch.from_numpy(texture.atlas.faces_uv.astype(np.int32)),
         diffuse=torch.from_numpy(texture.diffuse),
         light=texture.light,
-        highlights=texture.highlights if has_highlights else None,
-        specular=vertex_values(texture.specular, texture.atlas, len(skinned.mesh.vertices)) if has_highlights else None,
+        gloss=vertex_gloss(texture, len(skinned.mesh.vertices)),
     )
+
+
+def vertex_gloss(texture: TextureArtifact, vertex_count: int) -> VertexGloss | None:
+    """Return the highlights of the vertices of a textured mesh; None for a matte surface."""
+    if not texture.specular.any():
+        return None
+    maps = (texture.specular, texture.roughness)
+    strength, roughness = (None if each is None else vertex_values(each, texture.atlas, vertex_count) for each in maps)
+    return None if strength is None else VertexGloss(texture.highlights, strength, roughness)
 
 
 def vertex_values(texture: Float32[np.ndarray, "th tw"], atlas: Atlas, vertex_count: int) -> Float[Tensor, "v"]:

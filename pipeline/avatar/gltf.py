@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 
+from pipeline.avatar.gltf_material import MaterialMaps, add_material
 from pipeline.avatar.rig import Rig
 from pipeline.body.body import Motion
 from pipeline.geometry.camera import Camera
@@ -71,30 +72,6 @@ class SkinnedMesh:
     morphs: MorphTargets | None = None
 
 
-@dataclass(frozen=True)
-class MaterialMaps:
-    """Encoded maps and parameters of the material.
-
-    Attributes:
-        diffuse_png: RGB, sRGB.
-        specular_png: result of `pack_specular_factor`; None for a surface without highlights.
-        roughness: in [0, 1].
-        normal_png: tangent-space normals, green up; None for a surface without a normal map.
-        unlit: viewers show the diffuse map without lights; `specular_png` and `normal_png` are then ignored.
-    """
-
-    diffuse_png: bytes
-    specular_png: bytes | None = None
-    roughness: float = 0.9
-    unlit: bool = False
-    normal_png: bytes | None = None
-
-    @property
-    def has_normals(self) -> bool:
-        """Whether the material has a normal map, for which vertices need tangents."""
-        return self.normal_png is not None and not self.unlit
-
-
 def encode_glb(
     mesh: SkinnedMesh,
     rig: Rig,
@@ -126,7 +103,7 @@ def encode_glb(
     if extras:
         document.json["asset"]["extras"] = dict(extras)
     first_joint = 1
-    material = _add_material(document, maps)
+    material = add_material(document, maps)
     primitive = _add_primitive(document, mesh, len(rig.joint_names), maps.has_normals) | {"material": material}
     named: dict[str, Any] = {"name": "avatar", "primitives": [primitive]}
     if mesh.morphs is not None:
@@ -150,14 +127,6 @@ def encode_glb(
     if camera is not None:
         document.json["scenes"][0]["nodes"].append(_add_camera(document, camera))
     return document.to_bytes()
-
-
-def pack_specular_factor(factor: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 4"]:
-    """Return an RGBA image for KHR_materials_specular: the linear specular factor in alpha, RGB white.
-
-    factor: 255 reflects like a standard dielectric (4 % at normal incidence), 0 does not reflect.
-    """
-    return np.concatenate([np.full((*factor.shape, 3), 255, dtype=np.uint8), factor[..., None]], axis=2)
 
 
 def _check_motion(motion: Motion) -> None:
@@ -187,34 +156,6 @@ def _add_primitive(document: GlbWriter, mesh: SkinnedMesh, joint_count: int, has
         tangents = vertex_tangents(mesh.positions_m, _unit_normals(mesh.normals), mesh.uv, mesh.faces)
         attributes["TANGENT"] = document.add_array(tangents, _ARRAY_BUFFER)
     return {"attributes": attributes, "indices": document.add_array(faces.reshape(-1), _ELEMENT_ARRAY_BUFFER)}
-
-
-def _add_material(document: GlbWriter, maps: MaterialMaps) -> int:
-    document.add("samplers", {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071})
-    surface: dict[str, Any] = {
-        "name": "avatar",
-        "pbrMetallicRoughness": {
-            "baseColorTexture": {"index": _add_texture(document, "diffuse", maps.diffuse_png)},
-            "metallicFactor": 0.0,
-            "roughnessFactor": maps.roughness,
-        },
-    }
-    extensions: dict[str, Any] = {"KHR_materials_specular": {"specularFactor": 0.0}}
-    if maps.unlit:  # the extension forbids KHR_materials_specular on the same material
-        extensions = {"KHR_materials_unlit": {}}
-    elif maps.specular_png is not None:
-        texture = {"index": _add_texture(document, "specular", maps.specular_png)}
-        extensions = {"KHR_materials_specular": {"specularTexture": texture}}
-    if maps.normal_png is not None and maps.has_normals:
-        surface["normalTexture"] = {"index": _add_texture(document, "normal", maps.normal_png)}
-    document.json["extensionsUsed"] = list(extensions)
-    return document.add("materials", surface | {"extensions": extensions})
-
-
-def _add_texture(document: GlbWriter, name: str, png: bytes) -> int:
-    view = document.add_bytes(png)
-    image = document.add("images", {"name": name, "mimeType": "image/png", "bufferView": view})
-    return document.add("textures", {"name": name, "source": image, "sampler": 0})
 
 
 def _add_skeleton(document: GlbWriter, rig: Rig, first_joint: int) -> int:

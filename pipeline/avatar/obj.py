@@ -4,6 +4,7 @@ trimesh reads these files but is not used to write them: its meshes have one ind
 .obj would duplicate the vertices along UV seams and open the surface there; it also encodes the maps again.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,24 +15,38 @@ from pipeline.geometry.mesh import Mesh
 MATERIAL = "avatar"
 
 
+@dataclass(frozen=True)
+class ObjMaps:
+    """Names of the maps in the folder of the .mtl, and the exponent of the highlights.
+
+    Attributes:
+        diffuse: RGB.
+        specular: factor of the highlights; None for a surface without.
+        normal: tangent-space normals, green up; None without them.
+        roughness: glTF's; None where `exponent` is that of all highlights.
+        exponent: of Blinn's half-vector lobe, which is the model of .mtl.
+    """
+
+    diffuse: str
+    specular: str | None = None
+    normal: str | None = None
+    roughness: str | None = None
+    exponent: float = 20.0
+
+
 def write_obj(
     path: Path,
     mesh: Mesh,
     uv: Float[np.ndarray, "t 2"],
     faces_uv: Int[np.ndarray, "f 3"],
     normals: Float[np.ndarray, "v 3"],
-    diffuse_name: str,
-    specular_name: str | None,
-    normal_name: str | None = None,
+    maps: ObjMaps,
 ) -> None:
     """Write `path` (.obj) and the .mtl of the same name, which references the maps in the same folder.
 
-    mesh: m, +Y up. uv: origin bottom-left, as in OBJ. normals: unit, one per vertex. specular_name: None for a surface
-    without highlights. normal_name: tangent-space normals, green up, as `norm`; None without them.
+    mesh: m, +Y up. uv: origin bottom-left, as in OBJ. normals: unit, one per vertex.
     """
-    write_faces_obj(
-        path, (mesh.vertices, mesh.faces), (uv, faces_uv), normals, (diffuse_name, specular_name, normal_name)
-    )
+    write_faces_obj(path, (mesh.vertices, mesh.faces), (uv, faces_uv), normals, maps)
 
 
 def write_faces_obj(
@@ -39,11 +54,11 @@ def write_faces_obj(
     surface: tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f k"]],
     layout: tuple[Float[np.ndarray, "t 2"], Int[np.ndarray, "f k"]],
     normals: Float[np.ndarray, "v 3"],
-    map_names: tuple[str, str | None, str | None],
+    maps: ObjMaps,
 ) -> None:
     """Write a mesh of triangles or quads as `write_obj` does.
 
-    surface: vertices and faces. layout: texture coordinates and corners. map_names: diffuse, specular and normal map.
+    surface: vertices and faces. layout: texture coordinates and corners.
     """
     (vertices, faces), (uv, faces_uv) = surface, layout
     count, sides = faces.shape
@@ -55,26 +70,28 @@ def write_faces_obj(
     lines += [f"usemtl {MATERIAL}", "s 1"]
     lines += _format_rows("f" + " %d/%d/%d" * sides, corners)
     path.write_text("\n".join(lines) + "\n", encoding="ascii")
-    path.with_suffix(".mtl").write_text(_mtl_text(*map_names), encoding="ascii")
+    path.with_suffix(".mtl").write_text(_mtl_text(maps), encoding="ascii")
 
 
 def _format_rows(row_format: str, values: np.ndarray) -> list[str]:
     return [row_format % tuple(row) for row in values.tolist()]
 
 
-def _mtl_text(diffuse_name: str, specular_name: str | None, normal_name: str | None) -> str:
-    ks = "1" if specular_name else "0"
+def _mtl_text(maps: ObjMaps) -> str:
+    ks = "1" if maps.specular else "0"
     lines = [
         f"newmtl {MATERIAL}",
         "Ka 0 0 0",
         "Kd 1 1 1",
         f"Ks {ks} {ks} {ks}",
-        "Ns 20",
+        f"Ns {maps.exponent:g}",
         "d 1",
         "illum 2",
-        f"map_Kd {diffuse_name}",
+        f"map_Kd {maps.diffuse}",
     ]
-    lines += [f"map_Ks {specular_name}"] if specular_name else []
+    lines += [f"map_Ks {maps.specular}"] if maps.specular else []
+    # of the PBR extension of .mtl: values of `map_Ns` are exponents, of another scale in each program
+    lines += [f"map_Pr {maps.roughness}"] if maps.roughness else []
     # of the PBR extension of .mtl: `map_Bump` holds heights for some readers
-    lines += [f"norm {normal_name}"] if normal_name else []
+    lines += [f"norm {maps.normal}"] if maps.normal else []
     return "\n".join(lines) + "\n"

@@ -11,7 +11,7 @@ from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import dense_weights, linear_blend_skinning
 from pipeline.geometry.texture_rendering import render_textured, turntable_cameras
-from pipeline.texture.light import Highlights, VideoLight
+from pipeline.texture.light import VertexGloss, VideoLight
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,7 @@ class TexturedAvatar:
         faces_uv: corners of each face, as indices into `uv`.
         diffuse: sRGB in [0, 1]; row 0 is v = 1.
         light: of the video; None or uniform if the diffuse texture holds it.
-        highlights: the lobe of the surface under that light; None for a matte surface.
-        specular: linear radiance that a highlight adds at its peak, one per vertex; None for a matte surface.
+        gloss: highlights of the vertices under that light; None for a matte surface.
     """
 
     vertices: Float[Tensor, "v 3"]
@@ -39,8 +38,7 @@ class TexturedAvatar:
     faces_uv: Int[Tensor, "f 3"]
     diffuse: Float[Tensor, "th tw 3"]
     light: VideoLight | None = None
-    highlights: Highlights | None = None
-    specular: Float[Tensor, "v"] | None = None
+    gloss: VertexGloss | None = None
 
     def mesh(self) -> Mesh:
         """Return the canonical mesh without texture and skin."""
@@ -74,10 +72,9 @@ class TexturedAvatar:
         self, vertices_world: Float[Tensor, "v 3"], camera: Camera, light: VideoLight, frame: int | None
     ) -> Float[Tensor, "v d"]:
         """Return the irradiance of each vertex and, under the light of the video, its highlight as a fourth column."""
-        if self.highlights is None or self.specular is None or light is not self.light:
+        if self.gloss is None or light is not self.light:
             return light.shade_vertices(vertices_world, self.faces, frame)
-        specular = (self.highlights, self.specular)
-        return light.shade_specular(vertices_world, self.faces, frame, specular, camera.centre_m())
+        return light.shade_specular(vertices_world, self.faces, frame, self.gloss, camera.centre_m())
 
     def irradiance(self, vertices_world: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3"] | None:
         """Return the irradiance of posed vertices under the light of the video; None if the texture holds it."""

@@ -37,7 +37,7 @@ class WrappedTemplate:
         skinned: its triangles, halves of the quads, with the body's skin weights, in the A-pose.
         atlas: of the triangles.
         quads, quads_uv: corners of the quads as vertices, and as indices into `atlas.uv`.
-        diffuse, specular: maps.
+        diffuse, specular, roughness: maps; no roughness map where all highlights have one.
         names, displacements_m: of the morph targets; none where no face was found.
         eyeballs: vertices of the left and of the right eyeball.
     """
@@ -51,6 +51,7 @@ class WrappedTemplate:
     names: tuple[str, ...]
     displacements_m: Float[np.ndarray, "m v 3"]
     eyeballs: tuple[Int[np.ndarray, "k"], Int[np.ndarray, "k"]]
+    roughness: Float[np.ndarray, "s s"] | None = None
 
 
 def wrap_template(body: Body, registration: Registration, captured: CapturedSurface) -> WrappedTemplate:
@@ -64,7 +65,7 @@ def wrap_template(body: Body, registration: Registration, captured: CapturedSurf
     template, quads = load_template(), template_quads()
     atlas = _whole_atlas()
     mesh = Mesh(registration.vertices.astype(np.float32), template.faces.astype(np.int32))
-    diffuse, specular = _paint(mesh, atlas, captured)
+    maps = _paint(mesh, atlas, captured)
     names: tuple[str, ...] = ()
     displacements_m = np.zeros((0, len(mesh.vertices), 3), np.float32)
     if registration.has_face:
@@ -79,11 +80,12 @@ def wrap_template(body: Body, registration: Registration, captured: CapturedSurf
         atlas,
         quads,
         _quad_corners(quads, template.faces, atlas.faces_uv),
-        diffuse,
-        specular,
+        np.ascontiguousarray(maps[..., :3]),
+        np.ascontiguousarray(maps[..., 3]),
         names,
         displacements_m,
         (left, right),
+        None if captured.roughness is None else np.ascontiguousarray(maps[..., 4]),
     )
 
 
@@ -107,21 +109,17 @@ def _whole_atlas() -> Atlas:
     return Atlas(np.concatenate(uv).astype(np.float32), faces_uv.astype(np.int32), vertex)
 
 
-def _paint(
-    mesh: Mesh, atlas: Atlas, captured: CapturedSurface
-) -> tuple[Float[np.ndarray, "s s 3"], Float[np.ndarray, "s s"]]:
-    """Return the maps: colours of the nearest points of the captured surface, plain ones inside of the mouth."""
+def _paint(mesh: Mesh, atlas: Atlas, captured: CapturedSurface) -> Float[np.ndarray, "s s c"]:
+    """Return `CapturedSurface.stacked_maps` of the nearest points of the person, plain colours inside of the mouth."""
     template = load_template()
     texels = rasterize_texels(atlas, len(captured.diffuse))
     points_m = texels.interpolate(mesh.faces, mesh.vertices)
     _, face, barycentric = closest_points_on_mesh(points_m, captured.mesh)
     at = np.einsum("nk,nkc->nc", barycentric, captured.atlas.uv[captured.atlas.faces_uv[face]].astype(np.float64))
-    maps = torch.from_numpy(np.concatenate([captured.diffuse, captured.specular[..., None]], axis=2))
-    colour = sample_texture(maps, torch.from_numpy(at.astype(np.float32))).numpy()
+    colour = sample_texture(torch.from_numpy(captured.stacked_maps()), torch.from_numpy(at.astype(np.float32))).numpy()
     for faces, plain in ((template.mouth_faces, MOUTH_COLOUR), (template.tongue_faces, TONGUE_COLOUR)):
-        colour[faces[texels.face]] = (*plain, 0.0)
-    filled = fill_unknown_texels(texels.to_texture(colour), texels.coverage_mask())
-    return np.ascontiguousarray(filled[..., :3]), np.ascontiguousarray(filled[..., 3])
+        colour[faces[texels.face]] = (*plain, *captured.matte)
+    return fill_unknown_texels(texels.to_texture(colour), texels.coverage_mask())
 
 
 def _quad_corners(quads: np.ndarray, faces: np.ndarray, faces_uv: np.ndarray) -> Int[np.ndarray, "q 4"]:

@@ -15,7 +15,7 @@ from pipeline.io.npz import load_npz, save_npz
 from pipeline.texture.light import Highlights, VideoLight, load_light, save_light
 
 ATLAS, DIFFUSE, SPECULAR, COVERAGE = "atlas.npz", "diffuse.png", "specular.png", "coverage.png"
-LIGHT, NORMAL = "light.npz", "normal.png"
+LIGHT, NORMAL, ROUGHNESS = "light.npz", "normal.png", "roughness.png"
 FLAT_NORMAL = (0.5, 0.5, 1.0)
 """Texel of a normal map that leaves the normal of the mesh as it is; 0.3 degrees off as (128, 128, 255) in 8 bits."""
 
@@ -32,11 +32,12 @@ class TextureArtifact:
         specular: linear radiance that a highlight adds at its peak, in [0, 1]; all 0 for a matte surface.
         coverage: confidence that the video shows the texel, 0 to 255; 0 outside the charts.
         light: of the video. Uniform: the diffuse map holds the light; else it is the albedo.
-        highlights: the lobe of the specular map.
+        highlights: the lamp of the specular map, and the lobe where there is no roughness map.
         normal: tangent-space normals, from -1 to 1 as values in [0, 1] (`pipeline.texture.normal_map`); None for a
             surface without a normal map. Its side may be another than that of the other maps.
         cut: how the triangles of the mesh stage are split for the atlas, where it has the template's layout; None for
             an atlas of the person's own.
+        roughness: glTF's, in (0, 1], of the lobe of each texel; None where it is that of `highlights` everywhere.
     """
 
     atlas: Atlas
@@ -47,13 +48,15 @@ class TextureArtifact:
     highlights: Highlights
     normal: Float32[np.ndarray, "n n 3"] | None = None
     cut: SurfaceCut | None = None
+    roughness: Float32[np.ndarray, "s s"] | None = None
 
 
 def save_texture(folder: Path, texture: TextureArtifact, texture_format: TextureFormat = "png8") -> None:
     """Write the atlas and the maps into `folder`; `load_texture` is the inverse up to the precision of the format.
 
     Maps are PNG with 8 bits per channel, or 16 for "png16". "exr" adds OpenEXR files with linear half floats; its
-    normal map, whose values are no colours, is a PNG with 16 bits. Without a normal map, that file is one flat texel.
+    normal and roughness maps, whose values are no colours, are PNG with 16 bits. Without a normal map, that file is one
+    flat texel; without a roughness map, one texel of the roughness of the lobe.
     """
     atlas, cut = texture.atlas, texture.cut
     arrays = {"uv": atlas.uv, "faces_uv": atlas.faces_uv, "vertex_of_uv": atlas.vertex_of_uv}
@@ -70,6 +73,7 @@ def save_texture(folder: Path, texture: TextureArtifact, texture_format: Texture
         if texture_format == "exr":
             write((folder / name).with_suffix(".exr"), values)
     save_normal_map(folder / NORMAL, texture, texture_format)
+    save_roughness_map(folder / ROUGHNESS, texture, texture_format)
     write_gray(folder / COVERAGE, texture.coverage)
     save_light(folder / LIGHT, texture.light, texture.highlights)
 
@@ -78,6 +82,13 @@ def save_normal_map(path: Path, texture: TextureArtifact, texture_format: Textur
     """Write the normal map; without one, a single flat texel."""
     normal = np.full((1, 1, 3), FLAT_NORMAL, dtype=np.float32) if texture.normal is None else texture.normal
     write_rgb(path, to_uint8(normal) if texture_format == "png8" else to_uint16(normal))
+
+
+def save_roughness_map(path: Path, texture: TextureArtifact, texture_format: TextureFormat = "png8") -> None:
+    """Write the roughness map; without one, a single texel."""
+    one = np.full((1, 1), texture.highlights.roughness, dtype=np.float32)
+    roughness = one if texture.roughness is None else texture.roughness
+    write_gray(path, to_uint8(roughness) if texture_format == "png8" else to_uint16(roughness))
 
 
 def map_files(folder: Path, name: str) -> list[Path]:
@@ -102,7 +113,7 @@ def load_texture(folder: Path) -> TextureArtifact:
     diffuse = read_rgb_float(map_files(folder, DIFFUSE)[-1])
     specular = read_rgb_float(map_files(folder, SPECULAR)[-1])[..., 0]
     coverage, (light, highlights) = read_gray(folder / COVERAGE), load_light(folder / LIGHT)
-    normal = read_rgb_float(folder / NORMAL)
+    normal, roughness = read_rgb_float(folder / NORMAL), read_rgb_float(folder / ROUGHNESS)[..., 0]
     return TextureArtifact(
         atlas,
         diffuse,
@@ -112,4 +123,5 @@ def load_texture(folder: Path) -> TextureArtifact:
         highlights,
         normal if normal.shape[0] > 1 else None,
         cut,
+        np.ascontiguousarray(roughness) if roughness.shape[0] > 1 else None,
     )

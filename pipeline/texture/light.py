@@ -116,20 +116,20 @@ class VideoLight:
         vertices_world: Float[Tensor, "v 3"],
         faces: Tensor,
         frame: int | None,
-        specular: "tuple[Highlights, Float[Tensor, 'v']]",
+        gloss: "VertexGloss",
         camera_centre_m: Float[np.ndarray, "3"],
     ) -> Float[Tensor, "v 4"]:
         """Return `shade_vertices`, and the radiance of the highlight of each vertex as a fourth column.
 
-        specular: the lobe, and the strength of each vertex. camera_centre_m: world.
+        camera_centre_m: world.
         """
-        highlights, strength = specular
         normals = area_weighted_vertex_normals(vertices_world, faces)
         seen = self.visibility(vertices_world, faces, normals).numpy()
         to_camera = torch.nn.functional.normalize(torch.from_numpy(camera_centre_m).float() - vertices_world, dim=1)
-        lobe = torch.from_numpy(highlights.lobe(normals.numpy(), to_camera.numpy(), seen)).float()
+        exponent = None if gloss.roughness is None else exponent_of_roughness(gloss.roughness.numpy())
+        lobe = torch.from_numpy(gloss.highlights.lobe(normals.numpy(), to_camera.numpy(), seen, exponent)).float()
         irradiance = torch.from_numpy(self.irradiance(normals.numpy(), seen))
-        return self._gain(frame) * torch.cat([irradiance, (strength * lobe)[:, None]], dim=1)
+        return self._gain(frame) * torch.cat([irradiance, (gloss.strength * lobe)[:, None]], dim=1)
 
     def visibility(
         self, vertices_world: Float[Tensor, "v 3"], faces: Tensor, normals: Float[Tensor, "v 3"]
@@ -159,26 +159,53 @@ class Highlights:
 
     @property
     def roughness(self) -> float:
-        """The roughness of glTF with the same width of the lobe: alpha^2 = 2 / (exponent + 2), alpha = roughness^2.
-
-        Walter et al., "Microfacet models for refraction through rough surfaces", 2007.
-        """
-        return float((2.0 / (self.exponent + 2.0)) ** 0.25)
+        """The roughness of glTF with the same width of the lobe."""
+        return float(roughness_of_exponent(np.array([self.exponent]))[0])
 
     def lobe(
         self,
         normals: Float[np.ndarray, "k 3"],
         to_camera: Float[np.ndarray, "k 3"],
         visibility: Float[np.ndarray, "k"],
+        exponent: Float[np.ndarray, "k"] | None = None,
     ) -> Float[np.ndarray, "k"]:
         """Return the highlight at surface points relative to its peak, in [0, 1]; 0 where the lamp is behind.
 
-        normals, to_camera: unit, world. visibility: of the lamp, in [0, 1].
+        normals, to_camera: unit, world. visibility: of the lamp, in [0, 1]. exponent: of each point; None: of the lobe.
         """
         half = self.direction + to_camera
         half /= np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-9)
         cosine = np.maximum(np.sum(normals * half, axis=1), 0.0)
-        return visibility * (normals @ self.direction > 0.0) * cosine**self.exponent
+        own = self.exponent if exponent is None else exponent
+        return np.asarray(visibility * (normals @ self.direction > 0.0) * cosine**own)
+
+
+@dataclass(frozen=True)
+class VertexGloss:
+    """Highlights of the vertices of a mesh.
+
+    Attributes:
+        highlights: the lamp and the lobe.
+        strength: linear radiance that a highlight adds at its peak.
+        roughness: glTF's, of each vertex; None: that of the lobe.
+    """
+
+    highlights: Highlights
+    strength: Float[Tensor, "v"]
+    roughness: Float[Tensor, "v"] | None = None
+
+
+def roughness_of_exponent(exponent: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Return glTF's roughness of Blinn-Phong lobes: alpha^2 = 2 / (exponent + 2), alpha = roughness^2.
+
+    Walter et al., "Microfacet models for refraction through rough surfaces", 2007.
+    """
+    return np.asarray((2.0 / (exponent + 2.0)) ** 0.25)
+
+
+def exponent_of_roughness(roughness: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Return the inverse of `roughness_of_exponent`; roughness: above 0."""
+    return np.asarray(2.0 / roughness**4 - 2.0)
 
 
 def directional_light(direction: tuple[float, float, float], ambient: float) -> VideoLight:

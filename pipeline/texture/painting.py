@@ -72,6 +72,7 @@ def enlarge_maps(texture: TextureArtifact, side_px: int) -> TextureArtifact:
         texture,
         diffuse=resize_map(texture.diffuse, side_px),
         specular=resize_map(texture.specular, side_px),
+        roughness=None if texture.roughness is None else resize_map(texture.roughness, side_px),
         coverage=to_uint8(resize_map(to_float(texture.coverage), side_px)),
     )
 

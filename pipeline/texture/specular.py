@@ -1,4 +1,4 @@
-"""Specular highlights of the video: one lobe, and its strength at each vertex.
+"""Specular highlights of the video: the lamp, an exponent for each region, and a strength at each vertex.
 
 Camera and lamps are static while the person turns. The linear colour of a vertex in a frame, divided by the gain, is
 
@@ -10,39 +10,44 @@ are those that explain most, the strength s >= 0 of a vertex follows from linear
 Highlights are grey, because dielectrics reflect light without colouring it, and a region of the surface (of one albedo
 and one place: a material) keeps them only if they predict its colours in validation frames: errors of pose and normals
 change the colour of a vertex with the view as well. Where frames do not tell the strength, it is that of the region.
+
+The exponent of a region is the one that leaves the least error in training frames, where it differs from that of the
+whole person by `MIN_STANDARD_ERRORS`; the whole person has one if validation frames do not prefer those of regions by
+as many.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.sparse import csr_array, eye_array
 
 from pipeline.geometry.atlas import Texels
-from pipeline.geometry.colour import linear_to_srgb, srgb_to_linear
+from pipeline.geometry.colour import linear_to_srgb
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import laplacian
 from pipeline.texture.key_light import SEARCH_REFINEMENTS_RAD, directions_around, search_directions
-from pipeline.texture.light import Highlights, VideoLight
-from pipeline.texture.light_evidence import standard_errors
+from pipeline.texture.light import Highlights, VideoLight, roughness_of_exponent
 from pipeline.texture.light_fit import ViewObservations
 from pipeline.texture.material_regions import material_regions
+from pipeline.texture.specular_regression import HighlightRegression, ridge
 
 EXPONENTS = (12.0, 24.0, 48.0, 96.0)
 """Candidates of p: roughness 0.61 to 0.38. Errors of the irradiance look like wider lobes."""
 
+FINE_EXPONENTS = (12.0, 16.0, 24.0, 32.0, 48.0, 64.0, 96.0)
+"""Candidates once the lamp is known: steps of 6 to 10 % of the roughness."""
+
 MAX_LAMP_ANGLE_RAD = 0.8
+
+REFINEMENTS_RAD = (0.25, 0.12, 0.06)
+"""Steps of the direction of the lamp once regions with highlights are known, each with an exponent of its own."""
+
+MAX_STEPS = 2
+"""Of the direction, for each of `REFINEMENTS_RAD`."""
 
 ALBEDO_CONTRAST_SCALE = 0.05
 SMOOTHING_STEPS = 6
-RIDGE_FRACTION = 0.003
-"""Ridge of the strength, relative to the lobe's power at well-observed vertices of uniform albedo."""
-
-MIN_ROWS = 10
-"""Vertices of a region that a validation frame must show to count."""
-
-MIN_LINEAR = 0.02
-"""Linear colour below which noise does not fall any more."""
 
 MIN_EXPLAINED, MIN_STANDARD_ERRORS = 0.4, 2.0
 """What highlights must explain of the squared error of validation frames in the regions that keep them. Regions of a
@@ -60,19 +65,29 @@ class SpecularFit:
     """Result of the specular fit.
 
     Attributes:
-        highlights: the lobe.
+        highlights: the lamp, and the lobe of the whole person.
         strength: linear radiance that a highlight adds to each vertex at its peak; all 0 for a matte surface.
+        roughness: glTF's, of the lobe of each vertex; None where that of `highlights` is the only one.
         explained: fraction of the squared error of validation frames that highlights explain, in the regions that keep
             them, on the whole person if none does; negative if they increase it.
         standard_errors: mean decrease of that error over frames, divided by its standard error.
         regions: number of regions with highlights.
+        roughness_standard_errors: the same as `standard_errors` for exponents of the regions' own against one for all;
+            0 where all regions have the same.
     """
 
     highlights: Highlights
     strength: Float[np.ndarray, "v"]
+    roughness: Float[np.ndarray, "v"] | None
     explained: float
     standard_errors: float
     regions: int
+    roughness_standard_errors: float = 0.0
+
+    @staticmethod
+    def matte(vertex_count: int) -> "SpecularFit":
+        """Return the result for a surface without highlights that was not tested."""
+        return SpecularFit(Highlights.none(), np.zeros(vertex_count, dtype=np.float32), None, 0.0, 0.0, 0)
 
 
 def texels_at_vertices(faces: Int[np.ndarray, "f 3"], vertex_count: int) -> Texels:
@@ -88,50 +103,192 @@ def texels_at_vertices(faces: Int[np.ndarray, "f 3"], vertex_count: int) -> Texe
 
 
 def fit_specular(train: ViewObservations, validation: ViewObservations, light: VideoLight, mesh: Mesh) -> SpecularFit:
-    """Fit one lobe and its strength at each vertex to training views, and test them on validation views.
+    """Fit lamp, exponents and strengths to training views, and test them on validation views.
 
     light: with or without shadows of a key light.
     """
-    count, edges = len(mesh.vertices), mesh.edges()
-    fitted, tested = (_Regression.of_views(each, light) for each in (train, validation))
-    albedo = linear_to_srgb(fitted.albedo(count, 0.0))
-    uniformity = albedo_uniformity(albedo, edges)
-    fitted, tested = (each.weighted(uniformity[each.vertex]) for each in (fitted, tested))
-    highlights = find_lobe(fitted, light, count)
-    power, products = fitted.normal_equations(highlights, count)
-    product = products.min(axis=1)
-    strength = _smooth(power, product, np.zeros(count), mesh)
-    without = tested.squared_errors(highlights, np.zeros(count), fitted.albedo(count, 0.0))
-    lobe = fitted.lobe(highlights) * strength[fitted.vertex]
-    with_lobe = tested.squared_errors(highlights, strength, fitted.albedo(count, lobe))
-    region = material_regions(albedo, mesh.vertices)
-    shiny = _shiny_regions(region, tested, without, with_lobe)
-    kept = np.isin(region, shiny) if len(shiny) else np.ones(count, dtype=bool)
-    explained, errors = tested.decrease(without, with_lobe, kept[tested.vertex])
+    count = len(mesh.vertices)
+    surface = _Surface.of_views(train, validation, light, mesh)
+    first = find_lobe(surface.fitted, light, count)
+    matte, lit = surface.matte_errors(), _fit_lobe(surface, first, np.full(count, first.exponent))
+    shiny = _shiny_regions(surface, matte, lit.tested_error)
+    explained, errors = _decrease(surface, matte, lit.tested_error, shiny)
     if not len(shiny) or explained < MIN_EXPLAINED or errors < MIN_STANDARD_ERRORS:
-        return SpecularFit(highlights, np.zeros(count, dtype=np.float32), explained, errors, 0)
-    mean = np.bincount(region, np.maximum(product, 0.0)) / np.maximum(np.bincount(region, power), 1e-12)
-    strength = np.isin(region, shiny) * _smooth(power, product, mean[region], mesh)
-    mixing = _mixing(mesh)
-    for _ in range(REGION_SMOOTHING_STEPS):
-        strength = mixing @ strength
-    return SpecularFit(highlights, strength.astype(np.float32), explained, errors, len(shiny))
+        return SpecularFit(first, np.zeros(count, dtype=np.float32), None, explained, errors, 0)
+    direction = first.direction if light.casts_shadows else _refine_direction(surface, shiny, first.direction, light)
+    whole, chosen, roughness_errors = _choose_exponents(surface, matte, shiny, direction)
+    shiny = _shiny_regions(surface, matte, chosen.tested_error)
+    strength, roughness = _strength_and_roughness(surface, chosen, shiny, whole)
+    explained, errors = _decrease(surface, matte, chosen.tested_error, shiny)
+    own = roughness if roughness_errors > 0.0 else None
+    return SpecularFit(Highlights(direction, whole), strength, own, explained, errors, len(shiny), roughness_errors)
+
+
+@dataclass(frozen=True)
+class _Surface:
+    """What lobes are fitted to and tested on.
+
+    Attributes:
+        fitted, tested: what training and validation views show.
+        region: of each vertex.
+        mixing: averages a value of each vertex with those of its neighbours.
+    """
+
+    fitted: HighlightRegression
+    tested: HighlightRegression
+    region: Int[np.ndarray, "v"]
+    mixing: csr_array
+
+    @staticmethod
+    def of_views(train: ViewObservations, validation: ViewObservations, light: VideoLight, mesh: Mesh) -> "_Surface":
+        fitted, tested = (HighlightRegression.of_views(each, light) for each in (train, validation))
+        albedo = linear_to_srgb(fitted.albedo(len(mesh.vertices), 0.0))
+        uniformity = albedo_uniformity(albedo, mesh.edges())
+        fitted, tested = (each.weighted(uniformity[each.vertex]) for each in (fitted, tested))
+        return _Surface(fitted, tested, material_regions(albedo, mesh.vertices), _mixing(mesh))
+
+    def matte_errors(self) -> Float[np.ndarray, "k"]:
+        """Return the error of each row of the validation views without highlights."""
+        return self.tested.squared_errors(np.zeros(len(self.tested.vertex)), self.fitted.albedo(len(self.region), 0.0))
+
+
+@dataclass(frozen=True)
+class _LobeFit:
+    """Strengths under a lamp and an exponent at each vertex.
+
+    Attributes:
+        exponent: of each vertex.
+        power, product: of the normal equations of each vertex.
+        fitted_error, tested_error: weighted squared errors of the rows of training and validation views.
+    """
+
+    exponent: Float[np.ndarray, "v"]
+    power: Float[np.ndarray, "v"]
+    product: Float[np.ndarray, "v"]
+    fitted_error: Float[np.ndarray, "k"]
+    tested_error: Float[np.ndarray, "l"]
+
+
+def _fit_lobe(surface: _Surface, highlights: Highlights, exponent: Float[np.ndarray, "v"]) -> _LobeFit:
+    """Fit the strengths to training views; highlights: for the direction of the lamp."""
+    count, fitted, tested = len(exponent), surface.fitted, surface.tested
+    lobe = fitted.lobe(highlights, exponent)
+    power, products = fitted.normal_equations(lobe, count)
+    product = products.min(axis=1)
+    strength = _smooth(power, product, np.zeros(count), surface.mixing)
+    highlight = lobe * strength[fitted.vertex]
+    albedo = fitted.albedo(count, highlight)
+    tested_highlight = tested.lobe(highlights, exponent) * strength[tested.vertex]
+    return _LobeFit(
+        exponent,
+        power,
+        product,
+        fitted.squared_errors(highlight, albedo),
+        tested.squared_errors(tested_highlight, albedo),
+    )
+
+
+def _decrease(
+    surface: _Surface, before: Float[np.ndarray, "l"], after: Float[np.ndarray, "l"], regions: Int[np.ndarray, "s"]
+) -> tuple[float, float]:
+    """Return `HighlightRegression.decrease` of validation views in some regions; in all if there are none."""
+    everywhere = np.ones(len(before), dtype=bool)
+    rows = np.isin(surface.region[surface.tested.vertex], regions) if len(regions) else everywhere
+    return surface.tested.decrease(before, after, rows)
 
 
 def _shiny_regions(
-    region: Int[np.ndarray, "v"],
-    tested: "_Regression",
-    without: Float[np.ndarray, "k"],
-    with_lobe: Float[np.ndarray, "k"],
+    surface: _Surface, without: Float[np.ndarray, "l"], with_lobe: Float[np.ndarray, "l"]
 ) -> Int[np.ndarray, "s"]:
     """Return the regions whose colours in validation frames highlights predict; errors: squared, one a row."""
-    scores = [
-        tested.decrease(without, with_lobe, region[tested.vertex] == label) for label in range(int(region.max()) + 1)
-    ]
+    tested, region = surface.tested, surface.region[surface.tested.vertex]
+    scores = [tested.decrease(without, with_lobe, region == label) for label in range(int(surface.region.max()) + 1)]
     return np.flatnonzero([share > MIN_EXPLAINED and errors > MIN_REGION_STANDARD_ERRORS for share, errors in scores])
 
 
-def find_lobe(fitted: "_Regression", light: VideoLight, vertex_count: int) -> Highlights:
+def _refine_direction(
+    surface: _Surface, shiny: Int[np.ndarray, "s"], start: Float[np.ndarray, "3"], light: VideoLight
+) -> Float[np.ndarray, "3"]:
+    """Return the direction of the lamp that explains most of regions with highlights, each with its best exponent.
+
+    One exponent for all would turn the lamp: at a wrong angle, wide lobes look like the sides of narrow ones.
+    """
+    count = len(surface.region)
+    fitted = surface.fitted.select(np.isin(surface.region[surface.fitted.vertex], shiny))
+
+    def explained(direction: Float[np.ndarray, "3"]) -> float:
+        gains = []
+        for exponent in EXPONENTS:
+            power, products = fitted.normal_equations(fitted.lobe(Highlights(direction, exponent)), count)
+            strength = _smooth(power, products.min(axis=1), np.zeros(count), surface.mixing)
+            gain = 2.0 * strength * products.sum(axis=1) - 3.0 * strength**2 * power
+            gains.append(np.bincount(surface.region, gain))
+        return float(np.max(gains, axis=0).sum())
+
+    best, most = start, explained(start)
+    for angle_rad in REFINEMENTS_RAD:
+        for _ in range(MAX_STEPS):
+            near = directions_around(best, angle_rad)
+            near = near[near @ light.dominant_direction() > np.cos(MAX_LAMP_ANGLE_RAD)]
+            scores = [explained(direction) for direction in near]
+            if not scores or max(scores) <= most:
+                break
+            best, most = near[int(np.argmax(scores))], max(scores)
+    return best
+
+
+def _choose_exponents(
+    surface: _Surface,
+    matte: Float[np.ndarray, "l"],
+    shiny: Int[np.ndarray, "s"],
+    direction: Float[np.ndarray, "3"],
+) -> tuple[float, _LobeFit, float]:
+    """Choose the exponent of the whole person and those of regions.
+
+    Returns:
+        The exponent of the whole person, what is fitted with the chosen ones, and by how many standard errors those of
+        regions predict validation views better; 0 where all are that of the whole person.
+    """
+    fitted, count = surface.fitted, len(surface.region)
+    region = surface.region[fitted.vertex]
+    lobes = [_fit_lobe(surface, Highlights(direction, p), np.full(count, p)) for p in FINE_EXPONENTS]
+    here = np.isin(region, shiny)
+    whole = int(np.argmin([lobe.fitted_error[here].sum() for lobe in lobes]))
+    totals = np.stack([np.bincount(region, lobe.fitted_error, int(surface.region.max()) + 1) for lobe in lobes])
+    best = totals.argmin(axis=0)
+    for label in np.flatnonzero(best != whole).tolist():
+        _, errors = fitted.decrease(lobes[whole].fitted_error, lobes[best[label]].fitted_error, region == label)
+        if errors < MIN_STANDARD_ERRORS:
+            best[label] = whole
+    one = lobes[whole]
+    exponent = np.array(FINE_EXPONENTS)[best][surface.region]
+    own = _fit_lobe(surface, Highlights(direction, FINE_EXPONENTS[whole]), exponent)
+    kinds = _shiny_regions(surface, matte, own.tested_error)
+    if len(np.unique(best[kinds])) > 1:
+        _, errors = _decrease(surface, one.tested_error, own.tested_error, kinds)
+        if errors > MIN_STANDARD_ERRORS:
+            return FINE_EXPONENTS[whole], own, errors
+    return FINE_EXPONENTS[whole], one, 0.0
+
+
+def _strength_and_roughness(
+    surface: _Surface, lobe: _LobeFit, shiny: Int[np.ndarray, "s"], whole: float
+) -> tuple[Float[np.ndarray, "v"], Float[np.ndarray, "v"]]:
+    """Return the strength of the vertices of shiny regions, and their roughness, both smoothed across borders.
+
+    whole: exponent of the whole person, which other regions take.
+    """
+    region, is_shiny = surface.region, np.isin(surface.region, shiny)
+    mean = np.bincount(region, np.maximum(lobe.product, 0.0)) / np.maximum(np.bincount(region, lobe.power), 1e-12)
+    strength = is_shiny * _smooth(lobe.power, lobe.product, mean[region], surface.mixing)
+    roughness = roughness_of_exponent(np.where(is_shiny, lobe.exponent, whole))
+    for _ in range(REGION_SMOOTHING_STEPS):
+        weighted, strength = surface.mixing @ (strength * roughness), surface.mixing @ strength
+        roughness = np.where(strength > 0.0, weighted / np.maximum(strength, 1e-12), roughness)
+    return strength.astype(np.float32), roughness.astype(np.float32)
+
+
+def find_lobe(fitted: HighlightRegression, light: VideoLight, vertex_count: int) -> Highlights:
     """Return the direction and the exponent that explain most of the training views.
 
     The key light is the lamp where its shadows are known; otherwise directions are tried within `MAX_LAMP_ANGLE_RAD` of
@@ -141,108 +298,21 @@ def find_lobe(fitted: "_Regression", light: VideoLight, vertex_count: int) -> Hi
     if not light.casts_shadows:
         directions = search_directions()
         directions = directions[directions @ light.dominant_direction() > np.cos(MAX_LAMP_ANGLE_RAD)]
+
+    def explained(highlights: Highlights) -> float:
+        return fitted.explained(fitted.lobe(highlights), vertex_count)
+
     candidates = [Highlights(direction, exponent) for direction in directions for exponent in EXPONENTS]
-    best = max(candidates, key=lambda each: fitted.explained(each, vertex_count))
+    best = max(candidates, key=explained)
     for angle_rad in () if light.casts_shadows else SEARCH_REFINEMENTS_RAD:
         near = directions_around(best.direction, angle_rad)
         near = near[near @ light.dominant_direction() > np.cos(MAX_LAMP_ANGLE_RAD)]
-        around = [replace(best, direction=each) for each in near]
-        best = max([best, *around], key=lambda each: fitted.explained(each, vertex_count))
-    sharper = [replace(best, exponent=exponent) for exponent in EXPONENTS]
-    return max(sharper, key=lambda each: fitted.explained(each, vertex_count))
-
-
-@dataclass(frozen=True)
-class _Regression:
-    """Rows of the model equation of the module docstring.
-
-    Attributes:
-        vertex, view: of each row.
-        linear: y. irradiance: E. visibility: v of the key light.
-        normal, to_camera: unit, world.
-        weight: inverse variance of `linear`.
-    """
-
-    vertex: Int[np.ndarray, "k"]
-    view: Int[np.ndarray, "k"]
-    linear: Float[np.ndarray, "k 3"]
-    irradiance: Float[np.ndarray, "k 3"]
-    visibility: Float[np.ndarray, "k"]
-    normal: Float[np.ndarray, "k 3"]
-    to_camera: Float[np.ndarray, "k 3"]
-    weight: Float[np.ndarray, "k"]
-
-    @staticmethod
-    def of_views(observed: ViewObservations, light: VideoLight) -> "_Regression":
-        rows = observed.rows
-        linear = srgb_to_linear(rows.colour.astype(np.float64)) / observed.gain[rows.frame, None]
-        to_camera = np.zeros_like(linear)
-        for number, view in enumerate(observed.views):
-            here = rows.frame == number
-            to_camera[here] = view.camera.centre_m() - view.vertices_world.numpy()[rows.vertex[here]]
-        to_camera /= np.maximum(np.linalg.norm(to_camera, axis=1, keepdims=True), 1e-9)
-        irradiance = light.irradiance(rows.normal, observed.visibility).astype(np.float64)
-        weight = rows.weight / (linear.mean(axis=1) + MIN_LINEAR)
-        return _Regression(
-            rows.vertex, rows.frame, linear, irradiance, observed.visibility, rows.normal, to_camera, weight
-        )
-
-    def weighted(self, factor: np.ndarray) -> "_Regression":
-        return replace(self, weight=self.weight * factor)
-
-    def lobe(self, highlights: Highlights) -> np.ndarray:
-        return highlights.lobe(self.normal, self.to_camera, self.visibility)
-
-    def albedo(self, count: int, highlight: np.ndarray | float) -> Float[np.ndarray, "v 3"]:
-        """Return the linear albedo of each vertex under known highlights (one a row)."""
-        diffuse = self.linear - np.reshape(highlight, (-1, 1))
-        above, below = (
-            np.stack([np.bincount(self.vertex, self.weight * c, count) for c in (self.irradiance * each).T], axis=1)
-            for each in (diffuse, self.irradiance)
-        )
-        return np.maximum(above / np.maximum(below, 1e-12), 0.0)
-
-    def _eliminated(self, values: np.ndarray, count: int) -> np.ndarray:
-        """Return what is left of one value a row after the best multiple of E at each vertex."""
-        shading = self.irradiance.mean(axis=1)
-        above = np.bincount(self.vertex, self.weight * shading * values, count)
-        below = np.bincount(self.vertex, self.weight * shading**2, count)
-        return values - (above / np.maximum(below, 1e-12))[self.vertex] * shading
-
-    def normal_equations(self, highlights: Highlights, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the power of the lobe at each vertex, and its products with the three channels."""
-        lobe = self._eliminated(self.lobe(highlights), count)
-        power = np.bincount(self.vertex, self.weight * lobe**2, count)
-        return power, np.stack(
-            [np.bincount(self.vertex, self.weight * lobe * channel, count) for channel in self.linear.T], axis=1
-        )
-
-    def explained(self, highlights: Highlights, count: int) -> float:
-        """Return by how much grey highlights of strength >= 0 reduce the weighted squared error."""
-        power, products = self.normal_equations(highlights, count)
-        product = np.maximum(products.min(axis=1), 0.0)
-        return float(np.sum(product**2 / (power + _ridge(power))))
-
-    def squared_errors(
-        self, highlights: Highlights, strength: np.ndarray, albedo: np.ndarray
-    ) -> Float[np.ndarray, "k"]:
-        """Return the weighted squared error of each row."""
-        predicted = albedo[self.vertex] * self.irradiance + (strength[self.vertex] * self.lobe(highlights))[:, None]
-        known = albedo.any(axis=1)[self.vertex]
-        return np.asarray(self.weight * known * np.sum((self.linear - predicted) ** 2, axis=1))
-
-    def decrease(
-        self, before: Float[np.ndarray, "k"], after: Float[np.ndarray, "k"], rows: Bool[np.ndarray, "k"]
-    ) -> tuple[float, float]:
-        """Return by which share an error falls in some rows, and the decrease a view in standard errors."""
-        view, before, after = self.view[rows], before[rows], after[rows]
-        seen = np.bincount(view, minlength=1) >= MIN_ROWS
-        fall = np.bincount(view, before - after, minlength=1)[seen].astype(np.float64)
-        return 1.0 - float(after.sum() / max(float(before.sum()), 1e-12)), standard_errors(fall)
+        best = max([best, *(replace(best, direction=each) for each in near)], key=explained)
+    return max((replace(best, exponent=exponent) for exponent in EXPONENTS), key=explained)
 
 
 def dielectric_specular_factor(
-    strength: Float[np.ndarray, "*n"], roughness: float, lamp_irradiance: float
+    strength: Float[np.ndarray, "*n"], roughness: Float[np.ndarray, "*n"] | float, lamp_irradiance: float
 ) -> Float[np.ndarray, "*n"]:
     """Return glTF's specular factor, in [0, 1], of a dielectric that shows highlights of this strength.
 
@@ -259,17 +329,14 @@ def dielectric_specular_factor(
     return np.clip(strength * roughness**4 / (0.01 * lamp_irradiance), 0.0, 1.0)
 
 
-def _ridge(power: np.ndarray) -> float:
-    """Return the regularisation of s: a fraction of the power at well-observed vertices of uniform albedo."""
-    return max(RIDGE_FRACTION * float(np.quantile(power, 0.95)), 1e-12)
-
-
-def _smooth(power: np.ndarray, product: np.ndarray, prior: np.ndarray, mesh: Mesh) -> Float[np.ndarray, "v"]:
+def _smooth(
+    power: Float[np.ndarray, "v"], product: Float[np.ndarray, "v"], prior: Float[np.ndarray, "v"], mixing: csr_array
+) -> Float[np.ndarray, "v"]:
     """Return s >= 0: power and product are pooled over the neighbourhood; s is the prior's where the lobe is weak."""
-    ridge, mixing = _ridge(power), _mixing(mesh)
+    regularisation = ridge(power)
     for _ in range(SMOOTHING_STEPS):
         power, product = mixing @ power, mixing @ product
-    return np.clip((np.maximum(product, 0.0) + ridge * prior) / (power + ridge), 0.0, 1.0)
+    return np.clip((np.maximum(product, 0.0) + regularisation * prior) / (power + regularisation), 0.0, 1.0)
 
 
 def _mixing(mesh: Mesh) -> csr_array:

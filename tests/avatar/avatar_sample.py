@@ -5,7 +5,8 @@ import numpy as np
 import torch
 import trimesh
 
-from pipeline.avatar.gltf import MaterialMaps, SkinnedMesh
+from pipeline.avatar.gltf import SkinnedMesh
+from pipeline.avatar.gltf_material import MaterialMaps
 from pipeline.body.body import Body, Motion
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh

@@ -10,7 +10,8 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation, Slerp
 
-from pipeline.avatar.gltf import MaterialMaps, MorphTargets, encode_glb, pack_specular_factor
+from pipeline.avatar.gltf import MorphTargets, encode_glb
+from pipeline.avatar.gltf_material import MaterialMaps, pack_specular_factor
 from pipeline.avatar.rig import build_rig
 from pipeline.avatar.rig_names import RigName
 from pipeline.body.body import canonical_to_world

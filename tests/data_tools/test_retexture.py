@@ -13,11 +13,12 @@ from pipeline.core.errors import UserError
 from pipeline.core.manifest import digest_files
 from pipeline.geometry.atlas import rasterize_texels
 from pipeline.io.glb import GlbFile
-from pipeline.io.image import read_rgb, write_rgb, write_rgba
+from pipeline.io.image import read_gray, read_rgb, write_rgb, write_rgba
 from pipeline.mesh.files import load_mesh
 from pipeline.template.layout import load_layout
 from pipeline.template.template_atlas import build_template_atlas
 from pipeline.texture.files import load_texture, save_texture
+from pipeline.texture.light import Highlights
 from tests.data_tools.exported_run import write_exported_run
 from tests.field.scene import PaintedScene
 from tests.stages.painted_run import known_registration
@@ -43,6 +44,25 @@ def test_the_paint_is_the_map_of_glb_and_obj(run: Path, tmp_path: Path) -> None:
     assert glb.gltf["nodes"][1]["name"] == "mixamorig:Hips"
     assert (out / "avatar.mtl").read_text().count("avatar_diffuse.png") >= 1
     assert {stage: digest_files(run / stage) for stage in before} == before
+
+
+def test_paint_keeps_highlights_and_their_roughness(run: Path, tmp_path: Path) -> None:
+    """The map of the painted avatar has the size of the paint: here twice that of the texture."""
+    texture = load_texture(run / "texture")
+    half = len(texture.diffuse) // 2
+    strength, roughness = np.full((2, 2 * half, 2 * half), 0.02, np.float32)
+    roughness[:half], roughness[half:] = 0.4, 0.6
+    lobe = Highlights(np.array([0.0, 0.0, 1.0], np.float32), 30.0)
+    save_texture(run / "texture", replace(texture, specular=strength, highlights=lobe, roughness=roughness))
+    write_rgb(tmp_path / "plain.png", np.full((SIDE_PX, SIDE_PX, 3), 90, np.uint8))
+    main([str(run), "--diffuse", str(tmp_path / "plain.png")])
+    out, expected = run / "retexture" / "plain", np.repeat([102, 153], SIDE_PX // 2)[:, None]
+    glb = GlbFile(out / "avatar.glb")
+    optics = glb.gltf["materials"][0]["pbrMetallicRoughness"]
+    embedded = glb.image_pixels(glb.gltf["textures"][optics["metallicRoughnessTexture"]["index"]]["source"])[..., 1]
+    rows = np.abs(np.arange(SIDE_PX) - SIDE_PX // 2) > SIDE_PX // 16
+    for pixels in (embedded, read_gray(out / "roughness.png"), read_gray(out / "avatar_roughness.png")):
+        assert (pixels[:, :SIDE_PX] == expected)[rows].all()
 
 
 def test_alpha_says_where_the_paint_applies(run: Path, tmp_path: Path) -> None:

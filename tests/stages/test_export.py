@@ -15,7 +15,7 @@ from pipeline.core.errors import UserError
 from pipeline.geometry.atlas import Atlas
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.io.glb import GlbFile
-from pipeline.io.image import read_rgb, to_float, write_gray, write_rgb
+from pipeline.io.image import read_gray, read_rgb, to_float, write_gray, write_rgb
 from pipeline.template.files import TEMPLATE_NPZ, save_template
 from pipeline.template.regions import template_quads
 from pipeline.texture.files import TextureArtifact, TextureFormat, load_texture, save_texture
@@ -148,6 +148,41 @@ def test_highlights_become_a_specular_factor_unless_the_surface_is_unlit(
             roughness = glb.gltf["materials"][0]["pbrMetallicRoughness"]["roughnessFactor"]
             assert roughness == pytest.approx((2 / 26) ** 0.25, rel=1e-6)
     assert materials == [({"KHR_materials_specular"}, 2), ({"KHR_materials_unlit"}, 1)]
+
+
+def test_two_shines_are_a_roughness_map_beside_the_specular_factor(inputs: dict[str, Path], tmp_path: Path) -> None:
+    """Three parts: two with the roughness of their lobes, a matte one with that of the configuration."""
+    texture, third = shutil.copytree(inputs["texture"], tmp_path / "texture"), TEXTURE_PX // 4
+    towards = np.array([0.0, 0.0, 1.0], np.float32)
+    strength, roughness = np.full((2, TEXTURE_PX, TEXTURE_PX), 0.02, dtype=np.float32)
+    strength[:, 2 * third :] = 0.0
+    roughness[:, :third], roughness[:, third:] = 0.4, 0.6
+    artifact = replace(load_texture(texture), light=directional_light((0.0, 0.0, 1.0), 0.3))
+    artifact = replace(artifact, highlights=Highlights(towards, 30.0), specular=strength, roughness=roughness)
+    save_texture(texture, artifact)
+    for name, unlit in (("lit", False), ("unlit", True)):
+        (tmp_path / name).mkdir()
+        EXPORT.run(inputs | {"texture": texture}, tmp_path / name, EXPORT.config(unlit=unlit, topology="template"))
+        assert validator_issues(tmp_path / name / "avatar.glb") == []
+    glb = GlbFile(tmp_path / "lit" / "avatar.glb")
+    material = glb.gltf["materials"][0]
+    optics, specular = material["pbrMetallicRoughness"], material["extensions"]["KHR_materials_specular"]
+    assert (optics["roughnessFactor"], optics["metallicFactor"]) == (1.0, 0.0)
+    pixels, factor = (
+        glb.image_pixels(glb.gltf["textures"][each["index"]]["source"])
+        for each in (optics["metallicRoughnessTexture"], specular["specularTexture"])
+    )
+    assert not pixels[..., 2].any()
+    for columns, expected in ((slice(third), 0.4), (slice(third, 2 * third), 0.6), (slice(2 * third, None), 0.85)):
+        np.testing.assert_array_equal(pixels[:, columns, 1], round(255 * expected))
+        lit = 0.02 * expected**4 / 0.01 if expected < 0.8 else 0.0
+        np.testing.assert_allclose(factor[:, columns, 3] / 255.0, lit, atol=0.006)
+    assert len(GlbFile(tmp_path / "unlit" / "avatar.glb").gltf["images"]) == 1
+    material_lines = (tmp_path / "lit" / "avatar.mtl").read_text().splitlines()
+    assert {"Ns 30", "map_Pr avatar_roughness.png"} <= set(material_lines)
+    assert "map_Pr wrapped_roughness.png" in (tmp_path / "lit" / "wrapped.mtl").read_text()
+    wrapped = read_gray(tmp_path / "lit" / "wrapped_roughness.png")
+    assert {102, 153} <= set(np.unique(wrapped).tolist())
 
 
 def test_a_normal_map_is_exported_with_tangents_and_the_formats_accept_it(

@@ -70,5 +70,7 @@ def test_the_texture_is_the_persons() -> None:
     expected = (points_m[rows, 1] - 1.4) / 0.5
     seen = found.diffuse[texels.rows[rows], texels.columns[rows], 0]
     assert np.quantile(np.abs(seen - expected), 0.95) < 0.02
+    assert found.roughness is not None
+    assert np.quantile(np.abs(found.roughness[texels.rows[rows], texels.columns[rows]] - 0.5 * seen), 0.95) < 0.01
     assert len(found.names) == 67
     assert found.displacements_m.shape == (67, len(mesh.vertices), 3)

@@ -17,6 +17,7 @@ from pipeline.texture.files import (
     DIFFUSE,
     LIGHT,
     NORMAL,
+    ROUGHNESS,
     SPECULAR,
     TextureArtifact,
     TextureFormat,
@@ -44,7 +45,7 @@ def artifact() -> TextureArtifact:
 def test_reading_inverts_writing(artifact: TextureArtifact, tmp_path: Path) -> None:
     save_texture(tmp_path, artifact)
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
-        [ATLAS, DIFFUSE, SPECULAR, COVERAGE, LIGHT, NORMAL]
+        [ATLAS, DIFFUSE, SPECULAR, COVERAGE, LIGHT, NORMAL, ROUGHNESS]
     )
     read = load_texture(tmp_path)
     for name in ("uv", "faces_uv", "vertex_of_uv"):
@@ -76,7 +77,7 @@ def test_each_format_keeps_its_precision(
     assert cv2.imread(str(tmp_path / DIFFUSE), cv2.IMREAD_UNCHANGED).dtype == depth
 
 
-@pytest.mark.parametrize("name", [ATLAS, DIFFUSE, SPECULAR, NORMAL, COVERAGE])
+@pytest.mark.parametrize("name", [ATLAS, DIFFUSE, SPECULAR, NORMAL, ROUGHNESS, COVERAGE])
 def test_a_missing_file_is_named(name: str, artifact: TextureArtifact, tmp_path: Path) -> None:
     save_texture(tmp_path, artifact)
     (tmp_path / name).unlink()
@@ -96,6 +97,22 @@ def test_a_normal_map_is_read_back_and_none_stays_none(
     assert read is not None
     np.testing.assert_allclose(read, normal, atol=0.501 / step)
     assert [path.name for path in map_files(tmp_path, NORMAL)] == [NORMAL]
+
+
+@pytest.mark.parametrize(("texture_format", "step"), [("png8", 255), ("png16", 65535), ("exr", 65535)])
+def test_a_roughness_map_is_read_back_and_one_roughness_is_one_texel(
+    artifact: TextureArtifact, tmp_path: Path, texture_format: TextureFormat, step: int
+) -> None:
+    artifact = replace(artifact, highlights=Highlights(np.array([0.0, 0.0, 1.0], np.float32), 30.0))
+    save_texture(tmp_path, artifact, texture_format)
+    assert load_texture(tmp_path).roughness is None
+    texel = cv2.imread(str(tmp_path / ROUGHNESS), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_allclose(texel / (255.0 if step == 255 else 65535.0), [[0.5]], atol=0.501 / step)
+    roughness = np.random.default_rng(0).uniform(0.3, 0.7, size=(8, 8)).astype(np.float32)
+    save_texture(tmp_path, replace(artifact, roughness=roughness), texture_format)
+    read = load_texture(tmp_path).roughness
+    assert read is not None
+    np.testing.assert_allclose(read, roughness, atol=0.501 / step)
 
 
 def test_a_missing_array_is_named(artifact: TextureArtifact, tmp_path: Path) -> None:

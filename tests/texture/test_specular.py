@@ -1,6 +1,7 @@
 """Highlights of a turning ball against the model equation, and against changes that are none."""
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -10,17 +11,24 @@ from scipy.spatial import ConvexHull
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.colour import linear_to_srgb
 from pipeline.geometry.mesh import Mesh
-from pipeline.texture.light import Highlights, VideoLight
+from pipeline.texture.light import (
+    Highlights,
+    VertexGloss,
+    VideoLight,
+    exponent_of_roughness,
+    roughness_of_exponent,
+)
 from pipeline.texture.light_fit import LightObservations, ViewObservations
 from pipeline.texture.specular import SpecularFit, albedo_uniformity, dielectric_specular_factor, fit_specular
 from pipeline.texture.views import BakeView
 
 LAMP = np.array([0.36, 0.48, 0.8])
-VERTICES = 500
+VERTICES, MANY_VERTICES = 500, 2000
 
 
-def ball() -> Mesh:
-    points = np.random.default_rng(0).normal(size=(VERTICES, 3))
+@lru_cache
+def ball(vertices: int = VERTICES) -> Mesh:
+    points = np.random.default_rng(0).normal(size=(vertices, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     return Mesh(points.astype(np.float32), ConvexHull(points).simplices.astype(np.int32))
 
@@ -31,16 +39,23 @@ def lamp_light(frames: int) -> VideoLight:
     return replace(VideoLight.uniform(frames), coefficients=coefficients)
 
 
-def filmed(radiance: np.ndarray, angles: np.ndarray, noise: float, tilt_rad: float = 0.0) -> ViewObservations:
+def filmed(
+    radiance: np.ndarray,
+    angles: np.ndarray,
+    noise: float,
+    tilt_rad: float = 0.0,
+    exponent: np.ndarray | float = 24.0,
+) -> ViewObservations:
     """Observations of a grey ball that turns in front of a far camera; radiance: RGB of the highlight a vertex.
 
-    tilt_rad: error of the normals.
+    tilt_rad: error of the normals. exponent: of the lobe, one a vertex.
     """
-    mesh, light, lobe = ball(), lamp_light(1), Highlights(LAMP, 24.0)
+    count = len(radiance)
+    mesh, light = ball(count), lamp_light(1)
     random, views, parts = np.random.default_rng(len(angles)), [], []
     camera = Camera(100.0, 100.0, 50.0, 50.0, 100, 100, np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32))
     camera.world_to_camera[2, 3] = 100.0
-    wrong = random.normal(size=(VERTICES, 3)) * tilt_rad
+    wrong = random.normal(size=(count, 3)) * tilt_rad
     for frame, angle in enumerate(angles):
         c, s = np.cos(angle), np.sin(angle)
         turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
@@ -52,8 +67,9 @@ def filmed(radiance: np.ndarray, angles: np.ndarray, noise: float, tilt_rad: flo
         views.append(BakeView(blank, blank[..., 0], camera, vertices, vertices[:, 2]))
         to_camera = camera.centre_m() - normal
         to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
-        ones = np.ones(VERTICES)
-        linear = 0.2 * light.irradiance(shown, ones) + lobe.lobe(shown, to_camera, ones)[:, None] * radiance
+        half = (LAMP + to_camera) / np.linalg.norm(LAMP + to_camera, axis=1, keepdims=True)
+        lobe = (shown @ LAMP > 0) * np.maximum(np.sum(shown * half, axis=1), 0.0) ** exponent
+        linear = 0.2 * light.irradiance(shown, np.ones(count)) + lobe[:, None] * radiance
         colour = linear_to_srgb(linear) + noise * random.normal(size=linear.shape)
         seen = np.flatnonzero(normal[:, 2] > 0.25)
         parts.append((np.full(len(seen), frame), seen, colour[seen], normal[seen, 2], normal[seen]))
@@ -61,10 +77,12 @@ def filmed(radiance: np.ndarray, angles: np.ndarray, noise: float, tilt_rad: flo
     return ViewObservations(views, rows, np.ones(len(rows.vertex)), np.ones(len(angles)))
 
 
-def fitted(radiance: np.ndarray, noise: float = 0.01, tilt_rad: float = 0.0) -> SpecularFit:
+def fitted(
+    radiance: np.ndarray, noise: float = 0.01, tilt_rad: float = 0.0, exponent: np.ndarray | float = 24.0
+) -> SpecularFit:
     angles = 2.0 * np.pi * np.arange(32) / 32
-    train, validation = (filmed(radiance, part, noise, tilt_rad) for part in (angles, angles[::4] + 0.1))
-    return fit_specular(train, validation, lamp_light(32), ball())
+    train, validation = (filmed(radiance, part, noise, tilt_rad, exponent) for part in (angles, angles[::4] + 0.1))
+    return fit_specular(train, validation, lamp_light(32), ball(len(radiance)))
 
 
 def test_a_shiny_patch_and_its_lobe_are_found() -> None:
@@ -90,6 +108,36 @@ def test_a_small_shiny_region_is_found_on_a_person_with_wrong_normals() -> None:
     assert result.strength[vertices[:, 0] < 0.0].max() < 0.02
 
 
+def test_each_of_two_materials_has_its_exponent_and_the_lamp_its_direction() -> None:
+    """A wide lobe on the left half of the ball and a narrow one on the right; regions that tell nothing have neither.
+
+    With one exponent for all the lamp is 9 degrees off.
+    """
+    vertices = ball(MANY_VERTICES).vertices
+    left = vertices[:, 0] < 0.0
+    shiny = (vertices[:, 1] > -0.1) & (vertices[:, 1] < 0.55)
+    result = fitted(0.3 * np.repeat(shiny[:, None], 3, axis=1), exponent=np.where(left, 12.0, 96.0))
+    assert result.roughness is not None
+    assert float(result.highlights.direction @ LAMP) > np.cos(np.radians(4.0))
+    for half, exponent in ((left, 12.0), (~left, 96.0)):
+        rows = shiny & half & (np.abs(vertices[:, 0]) > 0.2)
+        mean = np.average(result.roughness[rows], weights=result.strength[rows])
+        assert mean == pytest.approx((2.0 / (exponent + 2.0)) ** 0.25, rel=0.07)
+    matte = (result.strength == 0.0) & (np.abs(vertices[:, 1] - 0.2) > 0.65)
+    assert matte.sum() > 300
+    np.testing.assert_allclose(result.roughness[matte], result.highlights.roughness, rtol=1e-6)
+
+
+@pytest.mark.parametrize("exponent", [16.0, 64.0])
+def test_one_material_has_one_exponent_and_no_map(exponent: float) -> None:
+    vertices = ball(MANY_VERTICES).vertices
+    shiny = (vertices[:, 1] > -0.1) & (vertices[:, 1] < 0.55)
+    result = fitted(0.3 * np.repeat(shiny[:, None], 3, axis=1), exponent=exponent)
+    assert result.roughness is None
+    assert result.highlights.exponent == exponent
+    assert result.roughness_standard_errors == 0.0
+
+
 def test_matte_balls_have_no_highlights() -> None:
     result = fitted(np.zeros((VERTICES, 3)))
     assert not result.strength.any()
@@ -112,6 +160,28 @@ def test_roughness_has_the_width_of_the_lobe() -> None:
         angle = np.arccos(0.5 ** (1.0 / exponent))
         beckmann = np.exp(-((np.tan(angle) / alpha) ** 2)) / np.cos(angle) ** 4
         assert beckmann == pytest.approx(0.5, abs=0.05)
+
+
+def test_roughness_and_exponent_are_inverse() -> None:
+    exponent = np.array([1.0, 12.0, 64.0])
+    np.testing.assert_allclose(exponent_of_roughness(roughness_of_exponent(exponent)), exponent, rtol=1e-12)
+    np.testing.assert_allclose(roughness_of_exponent(np.array([0.0, 30.0])), [1.0, 0.5], rtol=1e-12)
+
+
+def test_vertices_of_another_roughness_are_shaded_with_its_lobe() -> None:
+    """Shading with a roughness a vertex takes each vertex from the shading with that lobe alone."""
+    mesh, light = ball(), lamp_light(1)
+    vertices, faces = torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces)
+    strength, camera_m = torch.full((VERTICES,), 0.3), np.array([0.0, 0.0, 50.0])
+    left = mesh.vertices[:, 0] < 0.0
+    roughness = torch.from_numpy(roughness_of_exponent(np.where(left, 16.0, 64.0)))
+    gloss = VertexGloss(Highlights(LAMP, 24.0), strength, roughness)
+    shaded = light.shade_specular(vertices, faces, None, gloss, camera_m).numpy()
+    for half, exponent in ((left, 16.0), (~left, 64.0)):
+        alone = VertexGloss(Highlights(LAMP, exponent), strength)
+        expected = light.shade_specular(vertices, faces, None, alone, camera_m).numpy()
+        np.testing.assert_allclose(shaded[half], expected[half], atol=1e-5)
+        assert expected[half, 3].max() > 0.2
 
 
 def reflected_at_the_peak(factor: float, roughness: float, lamp: float) -> float:

@@ -22,7 +22,8 @@ from pipeline.io.image import to_float, to_uint8
 
 LIGHT_HELP = (
     "studio: ambient and key light; flat: unlit texture; shiny: studio with specular highlights; "
-    "patch: studio with highlights on the chest only; hard: strong key light with cast shadows"
+    "patch: studio with highlights on the chest only; two-shines: sharp ones on the chest, wide ones on the thighs; "
+    "hard: strong key light with cast shadows"
 )
 MIN_FRAMES, MIN_SIZE_PX = 2, 32
 MIN_FILL, MAX_FILL = 0.05, 0.95

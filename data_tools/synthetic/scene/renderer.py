@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from data_tools.synthetic.rig.subject import Subject
@@ -36,6 +36,9 @@ class Light:
         casts_shadows: the person casts shadows of the key light on itself.
         shiny_heights: the surface is specular where its height in the A-pose, as a fraction of the stature, is in this
             range.
+        specular_exponent: of the Blinn-Phong term there.
+        second_shiny_heights: range of heights of another material, which has the same strength; empty: none.
+        second_exponent: of that material.
     """
 
     key_intensity: float = 0.55
@@ -46,16 +49,25 @@ class Light:
     diffuse_wrap: float = 0.25
     casts_shadows: bool = False
     shiny_heights: tuple[float, float] = (0.0, 1.0)
+    specular_exponent: float = 24.0
+    second_shiny_heights: tuple[float, float] = (0.0, 0.0)
+    second_exponent: float = 24.0
 
 
 STUDIO = Light()
 FLAT = Light(key_intensity=0.0, ambient_intensity=1.0, sky_gradient=0.0)
 SHINY = Light(specular_strength=0.35)
 PATCH = replace(SHINY, shiny_heights=(0.58, 0.74))
+TWO_SHINES = replace(PATCH, specular_exponent=64.0, second_shiny_heights=(0.3, 0.5), second_exponent=16.0)
 HARD = Light(key_intensity=0.75, ambient_intensity=0.42, diffuse_wrap=0.0, casts_shadows=True)
-LIGHTING_PRESETS = {"studio": STUDIO, "flat": FLAT, "shiny": SHINY, "patch": PATCH, "hard": HARD}
-
-BLINN_PHONG_EXPONENT = 24.0
+LIGHTING_PRESETS = {
+    "studio": STUDIO,
+    "flat": FLAT,
+    "shiny": SHINY,
+    "patch": PATCH,
+    "two-shines": TWO_SHINES,
+    "hard": HARD,
+}
 
 
 def pose_vertices(subject: Subject, canonical_to_world: Float[Tensor, "j 4 4"]) -> Float[Tensor, "v 3"]:
@@ -116,18 +128,30 @@ def _shade_window(
     to_camera = torch.nn.functional.normalize(torch.from_numpy(camera.centre_m()) - point, dim=1)
     image = np.zeros((camera.height, camera.width, 4), dtype=np.float32)
     visibility = shadows.visibility(point, normal) if shadows else torch.ones(len(point))
-    shiny = torch.from_numpy(shiny_faces(subject, light))[face]
-    image[seen.numpy(), :3] = shade(albedo, normal, to_camera, visibility, light, shiny).numpy()
+    shine = (torch.from_numpy(values)[face] for values in (shiny_faces(subject, light), face_exponents(subject, light)))
+    image[seen.numpy(), :3] = shade(albedo, normal, to_camera, visibility, light, *shine).numpy()
     image[seen.numpy(), 3] = 1.0
     return image
 
 
 def shiny_faces(subject: Subject, light: Light) -> Float[np.ndarray, "f"]:
     """Return 1 for faces that are specular under a light, 0 for others."""
+    first, second = (_between(subject, heights) for heights in (light.shiny_heights, light.second_shiny_heights))
+    return (first | second).astype(np.float32)
+
+
+def face_exponents(subject: Subject, light: Light) -> Float[np.ndarray, "f"]:
+    """Return the Blinn-Phong exponent of each face; `specular_exponent` where faces are not specular."""
+    second = _between(subject, light.second_shiny_heights)
+    return np.where(second, light.second_exponent, light.specular_exponent).astype(np.float32)
+
+
+def _between(subject: Subject, heights: tuple[float, float]) -> Bool[np.ndarray, "f"]:
+    """Return which faces are at these heights in the A-pose, fractions of the stature; none in an empty range."""
     height = subject.body.vertices[subject.body.faces, 1].mean(axis=1)
     low, high = subject.body.vertices[:, 1].min(), subject.body.vertices[:, 1].max()
     relative = (height - low) / (high - low)
-    return ((relative >= light.shiny_heights[0]) & (relative <= light.shiny_heights[1])).astype(np.float32)
+    return np.asarray((relative >= heights[0]) & (relative <= heights[1]) & (heights[0] < heights[1]))
 
 
 def _normals(vertices: Float[Tensor, "v 3"], faces: Tensor) -> Float[Tensor, "v 3"]:
@@ -147,6 +171,7 @@ def shade(
     visibility: Float[Tensor, "n"],
     light: Light,
     shiny: Float[Tensor, "n"] | None = None,
+    exponent: Float[Tensor, "n"] | None = None,
 ) -> Float[Tensor, "n 3"]:
     """Compute sRGB colours in [0, 1]: wrapped Lambert diffuse, hemispheric ambient and Blinn-Phong specular.
 
@@ -156,14 +181,14 @@ def shade(
         visibility: fraction of the key light that is not shadowed, in [0, 1].
         light: the light.
         shiny: factor of the specular term; None: 1.
+        exponent: of the specular term; None: that of the light.
     """
     key_direction = torch.nn.functional.normalize(torch.tensor(light.key_direction), dim=0)
     diffuse = visibility * ((normal @ key_direction + light.diffuse_wrap) / (1.0 + light.diffuse_wrap)).clamp_min(0.0)
     irradiance = light.ambient_intensity + light.sky_gradient * normal[:, 1] + light.key_intensity * diffuse
     half_vector = torch.nn.functional.normalize(key_direction + to_camera, dim=1)
-    specular = (
-        light.specular_strength * visibility * (normal * half_vector).sum(1).clamp_min(0.0) ** BLINN_PHONG_EXPONENT
-    )
+    sharpness = light.specular_exponent if exponent is None else exponent
+    specular = light.specular_strength * visibility * (normal * half_vector).sum(1).clamp_min(0.0) ** sharpness
     if shiny is not None:
         specular = specular * shiny
     return linear_to_srgb((srgb_to_linear(albedo) * irradiance[:, None] + specular[:, None]).clamp(0.0, 1.0))

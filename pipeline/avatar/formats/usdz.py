@@ -179,7 +179,11 @@ def _define_material(stage: Any, file: GlbFile, primitive: Primitive, folder: Pa
             scale, bias = Gf.Vec4f(2.0, 2.0, 2.0, 1.0), Gf.Vec4f(-1.0, -1.0, -1.0, 0.0)
             normals = _Map("Normal", _image_bytes(file, surface["normalTexture"]), "raw", scale, bias)
             _connect(stage, shader, "normal", normals, folder)
-    shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(float(optics.get("roughnessFactor", 1.0)))
+    if "metallicRoughnessTexture" in optics:
+        grey = np.repeat(_image_pixels(file, optics["metallicRoughnessTexture"])[..., 1:2], 3, axis=2)
+        _connect(stage, shader, "roughness", _Map("Roughness", png_bytes(grey), "raw"), folder)
+    else:
+        shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(float(optics.get("roughnessFactor", 1.0)))
     shader.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(float(optics.get("metallicFactor", 1.0)))
     UsdShade.MaterialBindingAPI.Apply(stage.GetPrimAtPath(_MESH)).Bind(material)
 
@@ -215,9 +219,11 @@ def _connect(stage: Any, shader: Any, input_name: str, texture: _Map, folder: Pa
             sampler.CreateInput(name, Sdf.ValueTypeNames.Float4).Set(value)
     result = reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
     sampler.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(result)
-    kind = Sdf.ValueTypeNames.Normal3f if input_name == "normal" else Sdf.ValueTypeNames.Color3f
-    output = sampler.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
-    shader.CreateInput(input_name, kind).ConnectToSource(output)
+    kinds = {"normal": Sdf.ValueTypeNames.Normal3f, "roughness": Sdf.ValueTypeNames.Float}
+    is_scalar = input_name == "roughness"
+    output_kind = Sdf.ValueTypeNames.Float if is_scalar else Sdf.ValueTypeNames.Float3
+    output = sampler.CreateOutput("r" if is_scalar else "rgb", output_kind)
+    shader.CreateInput(input_name, kinds.get(input_name, Sdf.ValueTypeNames.Color3f)).ConnectToSource(output)
 
 
 def _image_bytes(file: GlbFile, texture: dict[str, Any]) -> bytes:

@@ -62,7 +62,7 @@ class AnimatedFace:
     Attributes:
         skinned: the mesh in the A-pose, the face being the template's.
         atlas: of that mesh; the captured charts are in the left half of the texture.
-        diffuse, specular: maps, twice as wide as high.
+        diffuse, specular, roughness: maps, twice as wide as high; no roughness map where all highlights have one.
         names: of the morph targets.
         displacements_m: of the vertices at weight 1, in the A-pose.
         normal_changes: of the vertices' unit normals from weight 0 to 1.
@@ -79,6 +79,7 @@ class AnimatedFace:
     normal_changes: Float[np.ndarray, "m v 3"]
     boundary_gap_m: float
     eyeballs: tuple[Int[np.ndarray, "k"], Int[np.ndarray, "k"]]
+    roughness: Float[np.ndarray, "h w"] | None = None
 
 
 def eye_centres_m(
@@ -164,17 +165,18 @@ def animate_face(
     _, turns = add_visemes(units, turns)
     displacements_m[np.linalg.norm(displacements_m, axis=2) < MIN_DISPLACEMENT_M] = 0.0
     turns[np.linalg.norm(turns, axis=2) < MIN_NORMAL_CHANGE] = 0.0
-    diffuse, specular = paint_patch(patch, uv, captured)
+    maps = np.concatenate([captured.stacked_maps(), paint_patch(patch, uv, captured)], axis=1).astype(np.float32)
     return AnimatedFace(
         _skin(skinned, cut, patch, Mesh(vertices.astype(np.float32), faces)),
         atlas,
-        np.concatenate([captured.diffuse, diffuse], axis=1).astype(np.float32),
-        np.concatenate([captured.specular, specular], axis=1).astype(np.float32),
+        np.ascontiguousarray(maps[..., :3]),
+        np.ascontiguousarray(maps[..., 3]),
         names,
         displacements_m.astype(np.float32),
         turns.astype(np.float32),
         gap_m,
         _eyeballs(patch, len(rest_m)),
+        None if captured.roughness is None else np.ascontiguousarray(maps[..., 4]),
     )
 
 

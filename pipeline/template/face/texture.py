@@ -70,21 +70,31 @@ _LUMA = np.array([0.299, 0.587, 0.114])
 
 @dataclass(frozen=True)
 class CapturedSurface:
-    """The captured mesh with its atlas and maps."""
+    """The captured mesh with its atlas and maps; roughness: of the highlights, None for one everywhere."""
 
     mesh: Mesh
     atlas: Atlas
     diffuse: Float[np.ndarray, "s s 3"]
     specular: Float[np.ndarray, "s s"]
+    roughness: Float[np.ndarray, "s s"] | None = None
 
-    def sample(self, points_m: Float[np.ndarray, "n 3"], near_m: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n 4"]:
-        """Return diffuse and specular colour of the nearest surface points; only the surface around `near_m` counts."""
+    def stacked_maps(self) -> Float[np.ndarray, "s s c"]:
+        """Return diffuse, specular and, where there is one, roughness as the channels of one map."""
+        maps = [self.diffuse, self.specular[..., None]]
+        return np.concatenate(maps if self.roughness is None else [*maps, self.roughness[..., None]], axis=2)
+
+    @property
+    def matte(self) -> tuple[float, ...]:
+        """The channels after the colour of `stacked_maps` of a surface without highlights."""
+        return (0.0,) if self.roughness is None else (0.0, 1.0)
+
+    def sample(self, points_m: Float[np.ndarray, "n 3"], near_m: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n c"]:
+        """Return `stacked_maps` at the nearest surface points; only the surface around `near_m` counts."""
         rows = self._rows_near(near_m)
         _, face, barycentric = closest_points_on_mesh(points_m, Mesh(self.mesh.vertices, self.mesh.faces[rows]))
         corners = self.atlas.uv[self.atlas.faces_uv[rows][face]]
         uv = torch.from_numpy(np.einsum("nk,nkc->nc", barycentric, corners).astype(np.float32))
-        maps = np.concatenate([self.diffuse, self.specular[..., None]], axis=2)
-        return sample_texture(torch.from_numpy(maps), uv).numpy()
+        return sample_texture(torch.from_numpy(self.stacked_maps()), uv).numpy()
 
     def drop_to_surface(
         self, points_m: Float[np.ndarray, "n 3"], frame: FaceFrame, steps: int = 4
@@ -122,8 +132,8 @@ def layout_charts(patch: FacePatch) -> Float[np.ndarray, "t 2"]:
 
 def paint_patch(
     patch: FacePatch, uv: Float[np.ndarray, "t 2"], captured: CapturedSurface
-) -> tuple[Float[np.ndarray, "s s 3"], Float[np.ndarray, "s s"]]:
-    """Return the diffuse and the specular map of the patch, of the size of the captured ones.
+) -> Float[np.ndarray, "s s c"]:
+    """Return the maps of the patch as `CapturedSurface.stacked_maps`, of the size of the captured ones.
 
     uv: of `layout_charts`.
     """
@@ -132,7 +142,7 @@ def paint_patch(
     texels = rasterize_texels(atlas, size_px)
     part, points_m = patch.part[texels.face], texels.interpolate(faces, patch.mesh.vertices)
     view = view_from_front(patch.mesh, patch.frame)
-    colour = np.zeros((len(part), 4))
+    colour = np.tile([0.0, 0.0, 0.0, *captured.matte], (len(part), 1))
     on_skin = np.isin(part, (SKIN, SOCKET_LEFT, SOCKET_RIGHT))
     colour[on_skin] = captured.sample(points_m[on_skin], patch.frame.origin_m)
     brightness = float(np.median(colour[part == SKIN][:, :3] @ _LUMA)) / _REFERENCE_SKIN_LUMA
@@ -146,7 +156,7 @@ def paint_patch(
     visible = view.sees(points_m[in_eye], _VISIBLE_M)
     before_m = captured.drop_to_surface(points_m[in_eye], patch.frame)
     filmed = captured.sample(before_m, patch.frame.origin_m)
-    colour[in_eye] = _eye_colours(texels, in_eye, visible, filmed, sclera)
+    colour[in_eye] = _eye_colours(texels, in_eye, visible, filmed, np.append(sclera, captured.matte))
     known = texels.coverage_mask()
     maps = texels.to_texture(colour)
     left, bottom, right, top = CHART_BOXES[TEETH]
@@ -154,30 +164,31 @@ def paint_patch(
         slice(int((1.0 - top) * size_px), int((1.0 - bottom) * size_px)),
         slice(int(left * size_px), int(right * size_px)),
     )
-    maps[rows, columns, :3], known[rows, columns] = shade * np.array(TEETH_COLOUR), True
+    maps[rows, columns] = (*(shade * np.array(TEETH_COLOUR)), *captured.matte)
+    known[rows, columns] = True
     hidden = on_skin & ~view.sees(points_m, _VISIBLE_M) & _near_eyeballs(patch, points_m)
     known[texels.rows[hidden], texels.columns[hidden]] = False
-    maps = cv2.resize(fill_unknown_texels(maps, known), captured.diffuse.shape[1::-1], interpolation=cv2.INTER_LINEAR)
-    return maps[..., :3], maps[..., 3]
+    filled = fill_unknown_texels(maps, known)
+    return np.asarray(cv2.resize(filled, captured.diffuse.shape[1::-1], interpolation=cv2.INTER_LINEAR))
 
 
 def _eye_colours(
     texels: Texels,
     in_eye: Bool[np.ndarray, "t"],
     visible: Bool[np.ndarray, "n"],
-    filmed: Float[np.ndarray, "n 4"],
-    white: Float[np.ndarray, "3"],
-) -> Float[np.ndarray, "n 4"]:
+    filmed: Float[np.ndarray, "n c"],
+    white: Float[np.ndarray, "c"],
+) -> Float[np.ndarray, "n c"]:
     """Return the filmed colour where the eyeball is visible between the lids, blended into the colour of the sclera.
 
-    white: usual colour of the sclera in this light; the brightest of what is filmed counts as much.
+    white: usual colour of the sclera in this light, and its gloss; the brightest of what is filmed counts as much.
     """
-    sclera = np.append(white, 0.0)
+    sclera = white.copy()
     if visible.sum() > _MIN_EYE_TEXELS:
         luma = filmed[visible, :3] @ _LUMA
-        sclera[:3] = 0.5 * (white + filmed[visible, :3][luma >= np.quantile(luma, 0.8)].mean(axis=0))
+        sclera[:3] = 0.5 * (white[:3] + filmed[visible, :3][luma >= np.quantile(luma, 0.8)].mean(axis=0))
     shown = np.zeros((texels.size_px, texels.size_px), dtype=bool)
-    image = np.zeros((*shown.shape, 4), np.float32)
+    image = np.zeros((*shown.shape, len(white)), np.float32)
     rows, columns = texels.rows[in_eye], texels.columns[in_eye]
     shown[rows, columns], image[rows, columns] = visible, filmed
     width = max(1, texels.size_px // 256)

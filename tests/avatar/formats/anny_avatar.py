@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.avatar.gltf import MaterialMaps, SkinnedMesh, encode_glb
+from pipeline.avatar.gltf import SkinnedMesh, encode_glb
+from pipeline.avatar.gltf_material import MaterialMaps
 from pipeline.avatar.rig import build_rig
 from pipeline.body.body import Body, load_anny
 from pipeline.geometry.skinning import top_k_weights

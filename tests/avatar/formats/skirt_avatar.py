@@ -9,7 +9,8 @@ from data_tools.synthetic.person.person import make_person
 from data_tools.synthetic.person.skirt import COLUMNS, ROWS
 from data_tools.synthetic.rig.subject import Subject
 from pipeline.avatar.formats.vrm_springs import LooseParts
-from pipeline.avatar.gltf import MaterialMaps, encode_glb
+from pipeline.avatar.gltf import encode_glb
+from pipeline.avatar.gltf_material import MaterialMaps
 from pipeline.avatar.rig import build_rig
 from pipeline.avatar.skinned_avatar import build_skinned_mesh
 from pipeline.body.body import Body

@@ -1,5 +1,6 @@
 """Levels of detail: files that play like the avatar, with fewer faces and smaller textures."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,9 @@ import pytest
 import torch
 
 from pipeline.avatar.formats.levels_of_detail import FACE_RATIOS, encode_level, encode_levels
+from pipeline.avatar.gltf import encode_glb
+from pipeline.avatar.gltf_material import pack_roughness
+from pipeline.avatar.rig import build_rig
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import closest_points_on_mesh
 from pipeline.geometry.texture_rendering import sample_texture
@@ -14,7 +18,8 @@ from pipeline.io.glb import GlbFile
 from pipeline.io.glb_writer import GlbWriter
 from pipeline.io.image import png_bytes
 from pipeline.kernels.raster import rasterize
-from tests.avatar.formats.column import FRAMES, column_glb
+from tests.avatar.avatar_sample import sample_body, sample_maps, sample_motion
+from tests.avatar.formats.column import FRAMES, column_glb, column_mesh
 from tests.avatar.test_gltf import Player
 from tests.tools.khronos import validator_issues
 
@@ -49,6 +54,18 @@ def test_textures_are_halved_with_all_channels(tmp_path: Path) -> None:
     assert (halved[..., 3] == 77).all()
     assert np.isclose((halved[..., 0] > 100).mean(), 0.25, atol=0.12)  # the layout is a new one
     assert GlbFile(tmp_path / "level.glb").image_pixels(0).shape == (64, 64, 3)  # small ones stay
+
+
+def test_a_roughness_map_is_kept(tmp_path: Path) -> None:
+    maps = replace(sample_maps(), roughness_png=png_bytes(pack_roughness(np.full((64, 64), 102, np.uint8))))
+    data = encode_glb(column_mesh(), build_rig(sample_body()), {"capture": sample_motion(FRAMES)}, maps)
+    (tmp_path / "full.glb").write_bytes(data)
+    (tmp_path / "level.glb").write_bytes(encode_level(GlbFile(tmp_path / "full.glb"), 0.5, 0))
+    level = GlbFile(tmp_path / "level.glb")
+    optics = level.gltf["materials"][0]["pbrMetallicRoughness"]
+    pixels = level.image_pixels(level.gltf["textures"][optics["metallicRoughnessTexture"]["index"]]["source"])
+    assert (pixels == [255, 102, 0]).all()
+    assert optics["roughnessFactor"] == 1.0
 
 
 def test_the_surface_keeps_its_colours(tmp_path: Path) -> None:

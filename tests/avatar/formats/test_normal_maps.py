@@ -10,7 +10,8 @@ from scipy.spatial import cKDTree
 
 from pipeline.avatar.formats.levels_of_detail import encode_level
 from pipeline.avatar.formats.normal_maps import normal_images, remove_normal_maps
-from pipeline.avatar.gltf import MaterialMaps, encode_glb
+from pipeline.avatar.gltf import encode_glb
+from pipeline.avatar.gltf_material import MaterialMaps
 from pipeline.avatar.rig import build_rig
 from pipeline.io.glb import GlbFile
 from pipeline.io.glb_writer import GlbWriter

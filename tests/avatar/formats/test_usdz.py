@@ -119,7 +119,7 @@ def read_map(path: Path, stage: Usd.Stage, name: str) -> np.ndarray:
         data = np.frombuffer(package.read(sampler.GetInput("file").Get().path), np.uint8)
     texels = cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1] / 255.0
     scale, bias = (sampler.GetInput(key) for key in ("scale", "bias"))
-    return texels * np.array(scale.Get())[:3] + (np.array(bias.Get())[:3] if bias else 0.0)
+    return texels * (np.array(scale.Get())[:3] if scale else 1.0) + (np.array(bias.Get())[:3] if bias else 0.0)
 
 
 def test_the_specular_factor_scales_the_reflectance_of_a_dielectric(glb: GlbFile, path: Path) -> None:
@@ -150,6 +150,21 @@ def test_the_normal_map_is_that_of_the_glb(glb: GlbFile, tmp_path: Path) -> None
     write_usdz(tmp_path / "bumpy.usdz", GlbFile(tmp_path / "bumpy.glb"))
     stage = Usd.Stage.Open(str(tmp_path / "bumpy.usdz"))
     np.testing.assert_allclose(read_map(tmp_path / "bumpy.usdz", stage, "normal"), pixels / 127.5 - 1.0, atol=1e-6)
+    context = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators())
+    assert [error.GetMessage() for error in context.Validate(stage)] == []
+
+
+def test_the_roughness_map_is_that_of_the_glb(glb: GlbFile, tmp_path: Path) -> None:
+    document = GlbWriter.from_file(glb)
+    pixels = np.random.default_rng(1).integers(0, 256, (16, 16, 3), dtype=np.uint8)
+    image = document.add("images", {"mimeType": "image/png", "bufferView": document.add_bytes(png_bytes(pixels))})
+    texture = {"index": document.add("textures", {"source": image})}
+    document.json["materials"][0]["pbrMetallicRoughness"]["metallicRoughnessTexture"] = texture
+    (tmp_path / "two.glb").write_bytes(document.to_bytes())
+    write_usdz(tmp_path / "two.usdz", GlbFile(tmp_path / "two.glb"))
+    stage = Usd.Stage.Open(str(tmp_path / "two.usdz"))
+    roughness = read_map(tmp_path / "two.usdz", stage, "roughness")[..., 0]
+    np.testing.assert_allclose(roughness, pixels[..., 1] / 255.0, atol=1e-6)
     context = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators())
     assert [error.GetMessage() for error in context.Validate(stage)] == []
 

@@ -19,7 +19,7 @@ from pipeline.avatar.formats.web_glb import (
     encode_webp,
     quantise_weights,
 )
-from pipeline.avatar.gltf import MaterialMaps
+from pipeline.avatar.gltf_material import MaterialMaps, pack_roughness
 from pipeline.core.errors import UserError
 from pipeline.io.glb import GlbFile
 from pipeline.io.glb_writer import GlbWriter
@@ -64,7 +64,8 @@ def specular_image() -> np.ndarray:
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[GlbFile, WebGlb]:
     folder = tmp_path_factory.mktemp("web")
-    maps = MaterialMaps(png_bytes(smooth_image(3)), png_bytes(specular_image()))
+    roughness_png = png_bytes(pack_roughness(smooth_image(3)[..., 0]))
+    maps = MaterialMaps(png_bytes(smooth_image(3)), png_bytes(specular_image()), roughness_png=roughness_png)
     full = anny_glb(folder, maps)
     (folder / "web.glb").write_bytes(encode_web_glb(full))
     return full, WebGlb(folder / "web.glb", full.path)
@@ -161,6 +162,15 @@ def test_textures_are_as_accurate_as_promised(pixels: np.ndarray, channels: slic
     error = np.mean((decoded[..., channels].astype(float) - pixels[..., channels]) ** 2)
     assert error <= 255**2 * 10 ** (-least_db / 10)
     assert (error == 0.0) == (least_db == np.inf)
+
+
+def test_the_roughness_map_is_exact(files: tuple[GlbFile, WebGlb]) -> None:
+    full, web = files
+    texture = web.gltf["materials"][0]["pbrMetallicRoughness"]["metallicRoughnessTexture"]["index"]
+    index = web.gltf["textures"][texture]["extensions"]["EXT_texture_webp"]["source"]
+    decoded = cv2.imdecode(np.frombuffer(web.image_bytes(index), np.uint8), cv2.IMREAD_COLOR)
+    np.testing.assert_array_equal(decoded[..., 1], smooth_image(3)[..., 0])
+    np.testing.assert_array_equal(decoded[..., ::-1], full.image_pixels(index))
 
 
 def test_weights_sum_to_65535_also_after_rounding() -> None:

@@ -41,7 +41,7 @@ def closed_surface() -> Mesh:
 
 
 def captured(mesh: Mesh | None = None) -> tuple[MeshArtifact, CapturedSurface]:
-    """The surface with a colour that depends on the height only, and a skin without joints but the head."""
+    """The surface with colour and roughness that depend on the height only, and a skin without joints but the head."""
     mesh, person = mesh or closed_surface(), generated_person()
     v = (mesh.vertices[:, 1] - 1.4) / 0.5
     u = 0.5 + mesh.vertices[:, 0]
@@ -53,7 +53,8 @@ def captured(mesh: Mesh | None = None) -> tuple[MeshArtifact, CapturedSurface]:
     weights = np.zeros((len(u), len(person.fitted.joint_names)), np.float32)
     weights[:, person.fitted.joint("Head")] = 1.0
     artifact = MeshArtifact(mesh, *top_k_weights(weights), np.full((len(u), 3), 0.5, np.float32))
-    return artifact, CapturedSurface(mesh, atlas, diffuse, np.zeros((TEXTURE_PX, TEXTURE_PX), np.float32))
+    strength = np.full((TEXTURE_PX, TEXTURE_PX), 0.1, np.float32)
+    return artifact, CapturedSurface(mesh, atlas, diffuse, strength, 0.5 * diffuse[..., 0])
 
 
 @pytest.fixture(scope="module")
@@ -198,6 +199,19 @@ def test_the_texture_goes_on_across_the_outline(face: AnimatedFace) -> None:
     assert at_outline.sum() > 100
     expected = (vertices[at_outline, 1] - 1.4) / 0.5
     assert np.quantile(np.abs(sampled[at_outline] - expected), 0.95) < 0.03
+
+
+def test_the_roughness_is_that_of_the_surface_and_the_mouth_is_matte(face: AnimatedFace) -> None:
+    """Half of the colour where the surface is shown; 1 where nothing shines."""
+    assert face.roughness is not None
+    captured_half, patch_half = (face.roughness[:, :TEXTURE_PX], face.diffuse[:, :TEXTURE_PX, 0]), np.s_[:, TEXTURE_PX:]
+    np.testing.assert_allclose(captured_half[0], 0.5 * captured_half[1], atol=1e-6)
+    roughness, strength, colour = (each[patch_half] for each in (face.roughness, face.specular, face.diffuse[..., 0]))
+    shiny = strength > 0.0999
+    assert shiny.mean() > 0.3
+    np.testing.assert_allclose(roughness[shiny], 0.5 * colour[shiny], atol=0.01)
+    assert (strength < 1e-6).mean() > 0.01
+    np.testing.assert_allclose(roughness[strength < 1e-6], 1.0, atol=1e-5)
 
 
 def test_visemes_are_sums_of_face_units() -> None:

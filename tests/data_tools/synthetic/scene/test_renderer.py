@@ -5,7 +5,18 @@ import pytest
 import torch
 
 from data_tools.synthetic.rig.subject import Subject
-from data_tools.synthetic.scene.renderer import FLAT, PATCH, SHINY, STUDIO, Light, render_subject, shade, shiny_faces
+from data_tools.synthetic.scene.renderer import (
+    FLAT,
+    PATCH,
+    SHINY,
+    STUDIO,
+    TWO_SHINES,
+    Light,
+    face_exponents,
+    render_subject,
+    shade,
+    shiny_faces,
+)
 from pipeline.body.body import Body
 from pipeline.geometry.camera import Camera
 from tests.data_tools.synthetic.shapes import sphere
@@ -108,3 +119,21 @@ def test_a_shiny_patch_is_shiny_inside_and_matte_outside() -> None:
     like_shiny, like_matte = (np.abs(patch - other).max(axis=2) < 1e-6 for other in (shiny, matte))
     assert (like_shiny | like_matte).all()
     assert (like_shiny & ~like_matte).sum() > 100
+
+
+def test_two_shines_have_their_own_exponents() -> None:
+    """Faces by their height; a highlight is strength * cos(angle)^p above the matte colour, in linear light."""
+    subject = ball()
+    height = (subject.body.vertices[subject.body.faces, 1].mean(axis=1) + BALL_M) / (2.0 * BALL_M)
+    first, second = ((height > low) & (height < high) for low, high in ((0.58, 0.74), (0.3, 0.5)))
+    np.testing.assert_array_equal(shiny_faces(subject, TWO_SHINES) > 0, first | second)
+    exponents = face_exponents(subject, TWO_SHINES)
+    assert set(exponents[first]) == {64.0}
+    assert set(exponents[second]) == {16.0}
+    light = Light(0.0, (0.0, 0.0, 1.0), 0.0, 0.0, specular_strength=0.35)
+    to_camera = torch.tensor([[0.0, 0.0, 1.0]]).repeat(2, 1)
+    normal = torch.tensor([[0.0, 0.6, 0.8], [0.0, 0.28, 0.96]])
+    found = shade(torch.zeros(2, 3), normal, to_camera, torch.ones(2), light, None, torch.tensor([16.0, 64.0]))
+    linear = 0.35 * np.array([0.8**16, 0.96**64])
+    srgb = np.where(linear > 0.0031308, 1.055 * linear ** (1 / 2.4) - 0.055, 12.92 * linear)
+    np.testing.assert_allclose(found[:, 0].numpy(), srgb, atol=1e-5)
