@@ -20,7 +20,7 @@ from data_tools.pose import check_folder_name, export_config, play_bvh
 from data_tools.synthetic.scene.movie import FOR_PLAYERS, write_video
 from pipeline.avatar.film import FPS, render_film, turntable_motion
 from pipeline.avatar.finished_run import load_textured_avatar
-from pipeline.avatar.idle import idle_motion
+from pipeline.avatar.motion.idle import idle_motion
 from pipeline.avatar.placement import resample_uniformly
 from pipeline.body.body import Motion
 from pipeline.core.errors import UserError

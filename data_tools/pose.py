@@ -18,11 +18,11 @@ from jaxtyping import Float32
 
 from data_tools.command import run_command
 from data_tools.folder import replaced_folder
-from pipeline.avatar.bvh_export import motion_to_bvh
-from pipeline.avatar.feet import find_contacts, snap_feet_to_floor, sole_positions_m
+from pipeline.avatar.motion.bvh_export import motion_to_bvh
+from pipeline.avatar.motion.feet import find_contacts, snap_feet_to_floor, sole_positions_m
+from pipeline.avatar.motion.planting import plant_feet
+from pipeline.avatar.motion.retarget import retarget_with_contacts
 from pipeline.avatar.placement import resample_uniformly
-from pipeline.avatar.planting import plant_feet
-from pipeline.avatar.retarget import retarget_with_contacts
 from pipeline.avatar.rig import build_rig
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.files import load_body

@@ -15,7 +15,7 @@ from pipeline.avatar.formats.vrm_springs import LooseParts
 from pipeline.avatar.formats.write import ExportFormat, FormatRequest, missing_package, write_formats
 from pipeline.avatar.gltf import MorphTargets, SkinnedMesh, encode_glb
 from pipeline.avatar.gltf_material import MaterialMaps, encode_gloss
-from pipeline.avatar.idle import idle_motion
+from pipeline.avatar.motion.idle import idle_motion
 from pipeline.avatar.obj import ObjMaps, write_faces_obj, write_obj
 from pipeline.avatar.placement import (
     pad_motion_to_video,
@@ -368,7 +368,7 @@ def light_extras(light: VideoLight) -> dict[str, Any]:
 
 STAGE = Stage(
     "export",
-    version=12,
+    version=13,
     needs=("frames", "body", "mesh", "texture"),
     makes=("avatar.glb", "avatar.obj", "avatar.mtl", *OBJ_MAPS),
     config=Config,

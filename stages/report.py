@@ -15,7 +15,7 @@ from torch import Tensor
 
 from pipeline.avatar.clay import render_clay, render_clay_head
 from pipeline.avatar.finished_run import FinishedRun, load_finished_run
-from pipeline.avatar.pose_fit import MAX_PERSON_PX, fit_poses
+from pipeline.avatar.motion.pose_fit import MAX_PERSON_PX, fit_poses
 from pipeline.body.body import canonical_to_world
 from pipeline.capture.capture import CONTACT_SHEET, Capture
 from pipeline.capture.frame_selection import HELDOUT, TRAIN

@@ -14,9 +14,9 @@ from data_tools.evaluate.truth import load_ground_truth
 from data_tools.synthetic.rig.labels import FaceLabels
 from data_tools.synthetic.scene.capture import SyntheticCapture
 from data_tools.synthetic.scene.renderer import pose_vertices
-from pipeline.avatar.feet import snap_feet_to_floor
 from pipeline.avatar.finished_run import FinishedRun, load_finished_run
-from pipeline.avatar.retarget import retarget_rotations
+from pipeline.avatar.motion.feet import snap_feet_to_floor
+from pipeline.avatar.motion.retarget import retarget_rotations
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.rotation import quaternion_to_matrix

@@ -8,8 +8,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from pipeline.avatar.feet import joint_positions_m
 from pipeline.avatar.gltf import SkinnedMesh, encode_glb
+from pipeline.avatar.motion.feet import joint_positions_m
 from pipeline.avatar.rig import Rig, build_rig
 from pipeline.avatar.rig_names import match_names, rig_joint_name
 from pipeline.body.body import Body, Motion, canonical_to_world

@@ -10,7 +10,7 @@ import torch
 import trimesh
 
 from data_tools.pose import main, planted_motion, read_pose
-from pipeline.avatar.feet import joint_positions_m
+from pipeline.avatar.motion.feet import joint_positions_m
 from pipeline.body.body import canonical_to_world
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import digest_files

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from pipeline.avatar.feet import snap_feet_to_floor
+from pipeline.avatar.motion.feet import snap_feet_to_floor
 from pipeline.body.body import Body, Motion
 from pipeline.geometry.rotation import (
     axis_angle_to_quaternion,

@@ -13,7 +13,7 @@ from data_tools.synthetic.scene.ball import Ball
 from data_tools.synthetic.scene.capture import HeldOutTargets, SyntheticCapture, novel_cameras, portrait_camera
 from data_tools.synthetic.scene.motion import add_joint_angles, bend_at_hips, novel_motion, posture, turn_in_a_pose
 from data_tools.synthetic.scene.renderer import LIGHTING_PRESETS
-from pipeline.avatar.retarget import resample_motion, retarget
+from pipeline.avatar.motion.retarget import resample_motion, retarget
 from pipeline.body.body import Body, Motion
 from pipeline.core.errors import UserError
 from pipeline.geometry.camera import Camera

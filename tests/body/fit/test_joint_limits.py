@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from data_tools.synthetic.scene.motion import NOVEL_POSES
-from pipeline.avatar.retarget import retarget
+from pipeline.avatar.motion.retarget import retarget
 from pipeline.body.body import load_anny
 from pipeline.body.fit.camera_parameters import INTRINSICS_COUNT
 from pipeline.body.fit.energy import EnergyParameters, Objective

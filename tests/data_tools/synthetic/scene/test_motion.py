@@ -13,7 +13,7 @@ from data_tools.synthetic.scene.motion import (
     snap_feet_to_floor,
     turn_in_a_pose,
 )
-from pipeline.avatar.feet import lowest_foot_offset_m
+from pipeline.avatar.motion.feet import lowest_foot_offset_m
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.geometry.rotation import quaternion_to_matrix
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.avatar.feet import find_contacts
+from pipeline.avatar.motion.feet import find_contacts
 
 FPS = 30.0
 

@@ -22,7 +22,7 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.spatial.transform import Rotation
 
-from pipeline.avatar.feet import joint_positions_m, runs_of
+from pipeline.avatar.motion.feet import joint_positions_m, runs_of
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.fit.ground_contact import SOLE_JOINTS
 from pipeline.geometry.rotation import rotation_between

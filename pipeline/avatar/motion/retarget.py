@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from pipeline.avatar.feet import find_contacts, lowest_foot_offset_m
+from pipeline.avatar.motion.feet import find_contacts, lowest_foot_offset_m
 from pipeline.avatar.rig import build_rig
 from pipeline.avatar.rig_names import match_names
 from pipeline.body.body import Body, Motion

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.avatar.pose_fit import fit_poses
+from pipeline.avatar.motion.pose_fit import fit_poses
 from pipeline.avatar.textured_avatar import TexturedAvatar
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.geometry.camera import Camera

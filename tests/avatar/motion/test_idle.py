@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from pipeline.avatar.feet import joint_positions_m, lowest_foot_offset_m
-from pipeline.avatar.idle import BREATHS, idle_motion
+from pipeline.avatar.motion.feet import joint_positions_m, lowest_foot_offset_m
+from pipeline.avatar.motion.idle import BREATHS, idle_motion
 from pipeline.body.body import Body
 from tests.avatar.avatar_sample import sample_body
 

@@ -7,10 +7,10 @@ import pytest
 import torch
 from scipy.spatial.distance import pdist
 
-from pipeline.avatar import planting
-from pipeline.avatar.feet import find_contacts, joint_positions_m, sole_positions_m
-from pipeline.avatar.planting import plant_feet
-from pipeline.avatar.retarget import retarget_with_contacts
+from pipeline.avatar.motion import planting
+from pipeline.avatar.motion.feet import find_contacts, joint_positions_m, sole_positions_m
+from pipeline.avatar.motion.planting import plant_feet
+from pipeline.avatar.motion.retarget import retarget_with_contacts
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.geometry.rotation import axis_angle_to_quaternion
 from pipeline.io.bvh import read_bvh

@@ -9,16 +9,16 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from data_tools.synthetic.scene.motion import turn_in_a_pose
-from pipeline.avatar.bvh_export import motion_to_bvh
-from pipeline.avatar.feet import lowest_foot_offset_m
-from pipeline.avatar.planting import plant_feet
-from pipeline.avatar.retarget import match_joints, resample_motion, retarget, retarget_with_contacts
+from pipeline.avatar.motion.bvh_export import motion_to_bvh
+from pipeline.avatar.motion.feet import lowest_foot_offset_m
+from pipeline.avatar.motion.planting import plant_feet
+from pipeline.avatar.motion.retarget import match_joints, resample_motion, retarget, retarget_with_contacts
 from pipeline.avatar.rig import build_rig
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.core.errors import UserError
 from pipeline.geometry.rotation import axis_angle_to_quaternion, quaternion_to_matrix
 from pipeline.io.bvh import BvhMotion, read_bvh, write_bvh
-from tests.avatar.test_planting import slides_m
+from tests.avatar.motion.test_planting import slides_m
 
 GROUND_M = np.array([0.0, -0.9, -3.5])
 LIMBS = (("LeftArm", "LeftForeArm"), ("RightForeArm", "RightHand"), ("LeftUpLeg", "LeftLeg"), ("RightLeg", "RightFoot"))
