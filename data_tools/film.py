@@ -36,7 +36,8 @@ def main(argv: Sequence[str]) -> None:
     """Render one film."""
     options = _parse_options(argv)
     inputs = {name: options.run / name for name in export.STAGE.needs}
-    scene = load_scene(inputs, export_config(options.run))
+    # The film shows the captured surface: five seconds for a face that moves would be for nothing.
+    scene = load_scene(inputs, export_config(options.run).model_copy(update={"face": False}))
     motion = film_motion(options.clip, scene, options.in_place)
     name = check_folder_name(options.name) if options.name else Path(options.clip or TURNTABLE).stem
     avatar = load_textured_avatar(inputs["mesh"], inputs["texture"])
