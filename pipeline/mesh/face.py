@@ -69,7 +69,7 @@ def _features(
     return np.prod([smooth_step(margin_m / EDGE_M + 0.5) for margin_m in margins_m], axis=0)
 
 
-def smooth_step(value: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """Return 0 below 0, 1 above 1, and 3 v² - 2 v³ between."""
-    clipped = np.clip(value, 0.0, 1.0)
-    return clipped * clipped * (3.0 - 2.0 * clipped)
+def smooth_step(values: Float[np.ndarray, "n"], low: float = 0.0, high: float = 1.0) -> Float[np.ndarray, "n"]:
+    """Return 0 up to `low`, 1 from `high` on, and a cubic with level ends between."""
+    clipped = np.clip((values - low) / (high - low), 0.0, 1.0)
+    return np.asarray(clipped * clipped * (3.0 - 2.0 * clipped))

@@ -119,9 +119,3 @@ def smooth(values: Float[np.ndarray, "v"], mesh: Mesh) -> Float[np.ndarray, "v"]
     system = sparse.diags_array(1.0 + coupling.sum(axis=1)) - coupling
     diffused = spsolve(system.tocsc(), values)
     return np.asarray(np.maximum(diffused - _LEAST_SHARE, 0.0) / (1.0 - _LEAST_SHARE))
-
-
-def smoothstep(values: Float[np.ndarray, "v"], low: float, high: float) -> Float[np.ndarray, "v"]:
-    """Return 0 up to `low`, 1 from `high` on, and a cubic with level ends between."""
-    t = np.clip((values - low) / (high - low), 0.0, 1.0)
-    return np.asarray(t * t * (3.0 - 2.0 * t))

@@ -6,6 +6,7 @@ from jaxtyping import Float
 
 from pipeline.body.body import Body
 from pipeline.geometry.mesh import Mesh
+from pipeline.mesh.face import smooth_step
 from pipeline.mesh.files import MeshArtifact
 from pipeline.template.chains import (
     Chain,
@@ -14,7 +15,6 @@ from pipeline.template.chains import (
     chain_weights,
     joint_count,
     smooth,
-    smoothstep,
     weight_of,
 )
 from pipeline.template.sections import SLICE_M, cut_at_height
@@ -63,7 +63,7 @@ def find_hair(body: Body, skinned: MeshArtifact, looseness: Float[np.ndarray, "v
     joints = max(len(chain.joints_m) for chain in chains)
     chains = [Chain(chain.parent, _resampled(chain.joints_m, joints)) for chain in chains]
     along = (skull_m[1] - vertices[:, 1]) / (skull_m[1] - min(lows_m))
-    amount = looseness * smoothstep(along, 0.0, 0.3) * (near & is_hair_colour & (vertices[:, 2] < neck_m[2]))
+    amount = looseness * smooth_step(along, 0.0, 0.3) * (near & is_hair_colour & (vertices[:, 2] < neck_m[2]))
     of_chain = between_angles(away_rad, np.array(kept_rad))
     return LoosePart("hair", tuple(chains), chain_weights(smooth(amount, mesh), of_chain, along, joints - 1))
 

@@ -10,8 +10,9 @@ import numpy as np
 from pipeline.body.body import Body
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import closest_points_on_mesh
+from pipeline.mesh.face import smooth_step
 from pipeline.mesh.files import MeshArtifact
-from pipeline.template.chains import LoosePart, smoothstep
+from pipeline.template.chains import LoosePart
 from pipeline.template.hair import find_hair
 from pipeline.template.skirt import find_skirt
 
@@ -52,7 +53,7 @@ def find_loose_parts(body: Body, skinned: MeshArtifact) -> list[LoosePart]:
     distance_m, face, barycentric = closest_points_on_mesh(skinned.mesh.vertices.astype(np.float64), surface)
     nearest_m = np.einsum("vk,vkc->vc", barycentric, body.vertices[body.faces[face]].astype(np.float64))
     is_outside = np.sum((skinned.mesh.vertices - nearest_m) * surface.face_normals()[face], axis=1) > 0.0
-    looseness = smoothstep(np.where(is_outside, distance_m, 0.0), TIGHT_M, LOOSE_M)
+    looseness = smooth_step(np.where(is_outside, distance_m, 0.0), TIGHT_M, LOOSE_M)
     found = [find_skirt(body, skinned, looseness), find_hair(body, skinned, looseness)]
     return [part for part in found if part is not None]
 

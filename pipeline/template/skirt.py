@@ -16,6 +16,7 @@ from scipy.spatial import ConvexHull
 
 from pipeline.body.body import Body
 from pipeline.geometry.mesh import Mesh
+from pipeline.mesh.face import smooth_step
 from pipeline.mesh.files import MeshArtifact
 from pipeline.template.chains import (
     Chain,
@@ -24,7 +25,6 @@ from pipeline.template.chains import (
     chain_weights,
     joint_count,
     smooth,
-    smoothstep,
     weight_of,
 )
 from pipeline.template.sections import SLICE_M, Section, cut_at_height
@@ -147,9 +147,9 @@ def _cloth_amount(
     distance_m = np.linalg.norm(places[:, 2:], axis=1)
     along = (top_m - places[:, 0]) / (top_m - hem_m)
     is_outer = (along > 0.0) & (along < 1.0) & (distance_m > surface_m - _OUTER_TOLERANCE_M)  # nan is False
-    clinging = CLINGING_SHARE * (1.0 - smoothstep(along, 0.5, 1.0)) * is_outer
-    amount = smoothstep(along, 0.0, 0.5) * (looseness + (1.0 - looseness) * clinging)
-    return amount * smoothstep(distance_m / hull_m, *_CORE) * (places[:, 0] > hem_m - MAX_GAP_M)
+    clinging = CLINGING_SHARE * (1.0 - smooth_step(along, 0.5, 1.0)) * is_outer
+    amount = smooth_step(along, 0.0, 0.5) * (looseness + (1.0 - looseness) * clinging)
+    return amount * smooth_step(distance_m / hull_m, *_CORE) * (places[:, 0] > hem_m - MAX_GAP_M)
 
 
 def _lowest_bridge_m(mesh: Mesh, body: Body, top_m: float) -> float:
