@@ -71,8 +71,13 @@ JUDGED_FRAMES = 12
 class Config(BaseConfig):
     """Options of the mesh stage; `pipeline.mesh.settings` has the parameters that no preset varies."""
 
-    rounds: int = Field(3, ge=0, le=10, description="rounds of refinement; 0 keeps the extracted mesh")
-    steps: int = Field(60, ge=1, le=5000, description="optimiser steps per round")
+    rounds: int = Field(2, ge=0, le=10, description="rounds of refinement; 0 keeps the extracted mesh")
+    steps: int = Field(
+        50,
+        ge=1,
+        le=5000,
+        description="optimiser steps of the last round; the others have twice as many, at half of the size",
+    )
     max_frames: int = Field(80, ge=1, description="training frames used, evenly spaced over the recording")
     max_person_px: int = Field(
         480, ge=64, le=4096, description="frames are downsampled until the person is at most this high, px"
@@ -319,7 +324,7 @@ def write_results(out: Path, mesh: Mesh, skin: SkinnedTopology, shader: torch.nn
 
 STAGE = Stage(
     "mesh",
-    version=22,
+    version=23,
     needs=("frames", "body", "field"),
     makes=(MESH_NPZ, DENSE_NPZ, "motion.npz", "preview.png"),
     config=Config,

@@ -5,7 +5,8 @@ percentile are subdivided, those below a lower percentile are decimated; the ver
 section 2.3). `MeshSettings.remeshing` has alternatives for ablations. A round that lowers the validation PSNR is
 discarded and ends the refinement. Skin weights are transferred from the body after remeshing and stay with the vertices
 during optimisation, so that each round is scored with the weights that are exported. After each accepted
-round the poses of the views are aligned to the surface, unless validation prefers the present ones.
+round the poses of the views are aligned to the surface, unless validation prefers the present ones. All rounds but the
+last see the training views with fewer pixels and have more steps (`MeshSettings.coarse_scale`).
 """
 
 from collections.abc import Callable, Sequence
@@ -81,6 +82,8 @@ def _run_round(state: RefinementState, inputs: RefinementInputs) -> RefinementSt
     """Remesh (not in the first round) and optimise; return the old state as finished if the validation PSNR falls."""
     mesh, skin, rounds_done = state.mesh, state.skin, state.rounds_done + 1
     inputs = with_offsets(inputs, state.pose_offsets)
+    if rounds_done < inputs.rounds:
+        inputs = _with_fewer_pixels(inputs)
     inputs.shader.load_state_dict(state.shader_state)
     if state.rounds_done > 0:
         mesh = _remesh(mesh, skin, inputs)
@@ -94,6 +97,16 @@ def _run_round(state: RefinementState, inputs: RefinementInputs) -> RefinementSt
     finished = rounds_done == inputs.rounds
     new = RefinementState(mesh, skin, _shader_state(inputs), rounds_done, accepted, finished, state.pose_offsets)
     return _align(new, inputs)
+
+
+def _with_fewer_pixels(inputs: RefinementInputs) -> RefinementInputs:
+    """Return the inputs of a coarse round: a step costs half as much, so there are more of them."""
+    settings = inputs.settings
+    return replace(
+        inputs,
+        train=[view.scaled(settings.coarse_scale) for view in inputs.train],
+        steps=round(settings.coarse_step_ratio * inputs.steps),
+    )
 
 
 def with_offsets(inputs: RefinementInputs, offsets: PoseOffsets | None) -> RefinementInputs:

@@ -20,6 +20,8 @@ class MeshSettings:
         isovalue_frames: validation frames on which the isovalue is selected.
 
     Refinement:
+        coarse_scale: resolution of the training views in all rounds but the last, over that in the last; at most 1.
+        coarse_step_ratio: optimiser steps of these rounds, over those of the last.
         frames_per_step: training frames in one optimiser step.
         learning_rate: step size of the smoothed vertex offsets, m (with 0.003 and lambda 20: 0.12 dB less, 40
             self-intersections).
@@ -60,10 +62,12 @@ class MeshSettings:
     isovalues_per_m: tuple[float, ...] = (8.0, 16.0, 32.0, 64.0, 128.0)
     isovalue_frames: int = 8
 
+    coarse_scale: float = 0.5
+    coarse_step_ratio: float = 2.0
     frames_per_step: int = 3
     learning_rate: float = 0.0012
     global_learning_rate: float = 0.0003
-    appearance_learning_rate: float = 0.003
+    appearance_learning_rate: float = 0.012
     appearance_steps: int = 20
     smoothing_lambda: float = 12.0
     colour_weight: float = 1.0
@@ -77,7 +81,7 @@ class MeshSettings:
     remeshing: Remeshing = "error"
     remeshed_faces: int = 0
     field_views: int = 0
-    alignment_steps: int = 1
+    alignment_steps: int = 2
     seed: int = 0
 
     max_reduction_loss_db: float = 0.05
@@ -86,12 +90,16 @@ class MeshSettings:
 
     def __post_init__(self) -> None:
         """Refuse values out of range and contradictions."""
-        for name in ("learning_rate", "isovalue_frames", "frames_per_step"):
+        for name in ("learning_rate", "isovalue_frames", "frames_per_step", "coarse_step_ratio"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"MeshSettings.{name} = {getattr(self, name)} is not allowed: it must be above 0")
         for name in ("field_views", "final_faces", "alignment_steps"):
             if getattr(self, name) < 0:
                 raise ValueError(f"MeshSettings.{name} = {getattr(self, name)} is not allowed: it must be at least 0")
+        if not 0.0 < self.coarse_scale <= 1.0:
+            raise ValueError(
+                f"MeshSettings.coarse_scale = {self.coarse_scale} is not allowed: it must be above 0, at most 1"
+            )
         if not self.isovalues_per_m or min(self.isovalues_per_m) <= 0.0:
             raise ValueError(
                 f"MeshSettings.isovalues_per_m = {self.isovalues_per_m} is not allowed: it must have values above 0"

@@ -41,6 +41,13 @@ class PosedView:
         """Return the vertices in the pose of this view (m, world) by linear blend skinning."""
         return linear_blend_skinning(vertices, weights, self.canonical_to_world[None])[0]
 
+    def scaled(self, factor: float) -> "PosedView":
+        """Return the view with its picture resized by `factor` (at most 1), by area averaging."""
+        camera = self.camera.scaled(factor)
+        image, mask = (part.numpy().astype(np.float32) / 255.0 for part in (self.image, self.mask))
+        resized = _quantise(resize_premultiplied(image, mask, (camera.width, camera.height)))
+        return PosedView(*resized, camera, self.canonical_to_world)
+
 
 def crop_posed_view(
     image: Float[np.ndarray, "h w 3"],
@@ -69,9 +76,16 @@ def crop_posed_view(
     crop_camera = camera.cropped(int(left), int(top), int(right - left), int(bottom - top))
     crop_camera = crop_camera.scaled(min(1.0, max_person_px / mask_height_px))
     size_px = (crop_camera.width, crop_camera.height)
-    parts = resize_premultiplied(image[top:bottom, left:right], mask[top:bottom, left:right], size_px)
-    pixels, alpha = (torch.from_numpy(np.round(255.0 * np.clip(part, 0.0, 1.0)).astype(np.uint8)) for part in parts)
-    return PosedView(pixels, alpha, crop_camera, canonical_to_world)
+    resized = _quantise(resize_premultiplied(image[top:bottom, left:right], mask[top:bottom, left:right], size_px))
+    return PosedView(*resized, crop_camera, canonical_to_world)
+
+
+def _quantise(
+    parts: tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]],
+) -> tuple[UInt8[Tensor, "h w 3"], UInt8[Tensor, "h w"]]:
+    """Return colours and alpha in [0, 1] as bytes."""
+    image, alpha = (torch.from_numpy(np.round(255.0 * np.clip(part, 0.0, 1.0)).astype(np.uint8)) for part in parts)
+    return image, alpha
 
 
 def render_posed_view(

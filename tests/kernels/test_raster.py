@@ -5,10 +5,12 @@ import math
 import numpy as np
 import pytest
 import torch
+import trimesh
 from torch import Tensor
 
 from pipeline.geometry.differentiable_raster import face_adjacency
 from pipeline.kernels.raster import antialias, rasterize
+from pipeline.kernels.raster.cpu import silhouette_edges_cpu
 from pipeline.kernels.raster.reference import rasterize_reference, silhouette_edges
 
 HEIGHT, WIDTH = 37, 53
@@ -215,3 +217,18 @@ def test_silhouette_edges_of_a_tetrahedron_are_its_outline() -> None:
     faces = torch.tensor([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
     edges = silhouette_edges(points, faces, face_adjacency(faces))
     assert {tuple(sorted(e)) for e in edges[:, :2].tolist()} == {(0, 1), (1, 2), (0, 2)}
+
+
+def test_compiled_silhouette_edges_are_those_of_the_reference() -> None:
+    """A crumpled torus with a hole: folds and borders, in the same order."""
+    torus = trimesh.creation.torus(1.0, 0.4)
+    generator = torch.Generator().manual_seed(0)
+    points = torch.from_numpy(torus.vertices[:, :2]).float() * 40.0
+    points += torch.randn(points.shape, generator=generator)
+    faces = torch.from_numpy(torus.faces[7:])
+    adjacency = face_adjacency(faces)
+    expected = silhouette_edges(points, faces, adjacency)
+    compiled = silhouette_edges_cpu(points.numpy(), faces.to(torch.int32).numpy(), adjacency.numpy())
+    assert int((adjacency < 0).sum()) > 0
+    assert len(expected) > 100
+    np.testing.assert_array_equal(compiled, expected.numpy())

@@ -115,6 +115,22 @@ def test_without_validation_views_every_round_is_accepted(dented_egg: Mesh, egg_
     assert np.isnan(result.validation_psnr_db).tolist() == [True, True, True]
 
 
+def test_all_rounds_but_the_last_have_fewer_pixels_and_more_steps(
+    dented_egg: Mesh, egg_body: Body, egg_views: Views, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+
+    def optimise(mesh: Mesh, skin: SkinnedTopology, inputs: RefinementInputs, seed: int, label: str) -> Mesh:
+        seen.append((inputs.train[0].camera.height, inputs.steps))
+        return mesh
+
+    monkeypatch.setattr(refinement_module, "optimise_vertices", optimise)
+    settings = replace(SETTINGS, coarse_scale=0.5, coarse_step_ratio=3.0)
+    refine_mesh(dented_egg, refinement_inputs(egg_body, (egg_views[0], []), steps=4, settings=settings))
+    height = egg_views[0][0].camera.height
+    assert seen == [(height // 2, 12), (height, 4)]
+
+
 def test_rounds_without_remeshing_keep_the_faces(dented_egg: Mesh, egg_body: Body, egg_views: Views) -> None:
     settings = replace(SETTINGS, remeshing="none")
     result = refine_mesh(dented_egg, refinement_inputs(egg_body, egg_views, steps=10, settings=settings))

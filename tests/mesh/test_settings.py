@@ -9,6 +9,8 @@ from pipeline.mesh.settings import MeshSettings
     ("changes", "message"),
     [
         ({"learning_rate": 0.0}, "learning_rate = 0.0 is not allowed"),
+        ({"coarse_scale": 1.5}, "coarse_scale = 1.5 is not allowed"),
+        ({"coarse_step_ratio": 0.0}, "coarse_step_ratio = 0.0 is not allowed"),
         ({"isovalues_per_m": ()}, "isovalues_per_m"),
         ({"isovalues_per_m": (8.0, -1.0)}, "isovalues_per_m"),
         ({"decimate_percentile": 96.0}, "decimate_percentile = 96.0 and subdivide_percentile = 95.0 contradict"),

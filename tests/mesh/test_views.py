@@ -50,6 +50,17 @@ def test_a_crop_contains_the_person_and_its_camera_has_the_same_rays() -> None:
     np.testing.assert_allclose(composite_target(view, torch.ones(3))[0][0, 0].numpy(), 1.0)
 
 
+def test_a_view_at_half_the_size_shows_the_same_pixels_in_the_mean(egg_views: Views) -> None:
+    view = egg_views[0][0]
+    half = view.scaled(0.5)
+    assert half.mask.shape == (half.camera.height, half.camera.width) == (view.camera.height // 2, view.camera.width // 2)
+    wide = [composite_target(each, torch.zeros(3))[0].numpy() for each in (view, half)]
+    blocks = wide[0].reshape(half.camera.height, 2, half.camera.width, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(wide[1], blocks, atol=2.0 / 255.0)
+    # The ray through a pixel of the small picture is that through the middle of the four.
+    assert (10.5 - half.camera.cx) / half.camera.fx == pytest.approx((21.0 - view.camera.cx) / view.camera.fx)
+
+
 def test_pixel_footprint_is_depth_over_focal_length(egg: Mesh, egg_body: Body, egg_views: Views) -> None:
     view = egg_views[0][0]
     posed = view.pose_vertices(torch.from_numpy(egg_body.vertices), torch.from_numpy(egg_body.skin_weights))

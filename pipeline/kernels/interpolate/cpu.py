@@ -10,7 +10,8 @@ from numba import njit, prange
 
 from pipeline.kernels.common.numba_options import NJIT_OPTIONS
 
-BLOCKS = 8
+BLOCKS = 2
+"""Each block costs a copy of the gradient, which is as large as the mesh; views are drawn in parallel besides."""
 
 
 @njit(**NJIT_OPTIONS)

@@ -5,8 +5,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pipeline.kernels.common.dispatch import runs_on_numba
-from pipeline.kernels.raster.cpu import rasterize_cpu
-from pipeline.kernels.raster.reference import antialias_reference, rasterize_reference
+from pipeline.kernels.raster.cpu import rasterize_cpu, silhouette_edges_cpu
+from pipeline.kernels.raster.reference import antialias_reference, blend_silhouettes, rasterize_reference
 
 
 def rasterize(
@@ -78,4 +78,8 @@ def antialias(
         adjacency: face across edge k = (corner k, corner k + 1), -1 if there is none
             (`pipeline.geometry.differentiable_raster.face_adjacency`).
     """
-    return antialias_reference(image, face_id, depth, vertices_px, depth_m, faces.long(), adjacency.long())
+    if not runs_on_numba(vertices_px, depth_m):
+        return antialias_reference(image, face_id, depth, vertices_px, depth_m, faces, adjacency.long())
+    arrays = [tensor.detach().contiguous().numpy() for tensor in (vertices_px, faces, adjacency)]
+    edges = torch.from_numpy(silhouette_edges_cpu(*arrays))
+    return blend_silhouettes(image, face_id, depth, vertices_px, depth_m, edges)

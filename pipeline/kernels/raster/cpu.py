@@ -172,3 +172,25 @@ def rasterize_cpu(
     depth = np.full((height, width), np.inf, np.float32)
     resolve(vertices_px, depth_m, faces, face_id, barycentric, depth)
     return face_id, barycentric, depth
+
+
+@njit(**NJIT_OPTIONS)
+def silhouette_edges_cpu(vertices_px: np.ndarray, faces: np.ndarray, adjacency: np.ndarray) -> np.ndarray:
+    """Return the vertices (s, 3) int64 (start, end, apex) of every silhouette edge, by face and then by edge."""
+    facing = np.empty(len(faces), np.bool_)
+    for f in range(len(faces)):
+        ax, ay = vertices_px[faces[f, 0], 0], vertices_px[faces[f, 0], 1]
+        bx, by = vertices_px[faces[f, 1], 0], vertices_px[faces[f, 1], 1]
+        cx, cy = vertices_px[faces[f, 2], 0], vertices_px[faces[f, 2], 1]
+        facing[f] = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax) < 0.0
+    edges = np.empty((3 * len(faces), 3), np.int64)
+    count = 0
+    for f in range(len(faces)):
+        for k in range(3):
+            other = adjacency[f, k]
+            if other < 0 or (facing[f] and not facing[other]):
+                edges[count, 0] = faces[f, k]
+                edges[count, 1] = faces[f, (k + 1) % 3]
+                edges[count, 2] = faces[f, (k + 2) % 3]
+                count += 1
+    return edges[:count].copy()

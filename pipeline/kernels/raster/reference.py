@@ -209,7 +209,20 @@ def antialias_reference(
     adjacency: Int[Tensor, "f 3"],
 ) -> Float[Tensor, "h w c"]:
     """Do `pipeline.kernels.raster.antialias` on any device, with any float type."""
-    edges = silhouette_edges(vertices_px.detach(), faces, adjacency)
+    return blend_silhouettes(
+        image, face_id, depth, vertices_px, depth_m, silhouette_edges(vertices_px.detach(), faces.long(), adjacency)
+    )
+
+
+def blend_silhouettes(
+    image: Float[Tensor, "h w c"],
+    face_id: Int[Tensor, "h w"],
+    depth: Float[Tensor, "h w"],
+    vertices_px: Float[Tensor, "v 2"],
+    depth_m: Float[Tensor, "v"],
+    edges: Int[Tensor, "s 3"],
+) -> Float[Tensor, "h w c"]:
+    """Blend the pixels on both sides of silhouette edges, which are given as in `silhouette_edges`."""
     edges = edges[(depth_m.detach()[edges] > 0).all(1)]
     ends = (vertices_px[edges], 1.0 / depth_m.detach()[edges[:, :2]])
     flat = image.reshape(-1, image.shape[2])
