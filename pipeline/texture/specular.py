@@ -159,12 +159,14 @@ class _LobeFit:
     Attributes:
         exponent: of each vertex.
         power, product: of the normal equations of each vertex.
+        largest: strength that the rows of a vertex allow, see `HighlightRegression.largest_strength`.
         fitted_error, tested_error: weighted squared errors of the rows of training and validation views.
     """
 
     exponent: Float[np.ndarray, "v"]
     power: Float[np.ndarray, "v"]
     product: Float[np.ndarray, "v"]
+    largest: Float[np.ndarray, "v"]
     fitted_error: Float[np.ndarray, "k"]
     tested_error: Float[np.ndarray, "l"]
 
@@ -175,6 +177,7 @@ def _fit_lobe(surface: _Surface, highlights: Highlights, exponent: Float[np.ndar
     lobe = fitted.lobe(highlights, exponent)
     power, products = fitted.normal_equations(lobe, count)
     product = products.min(axis=1)
+    largest = fitted.largest_strength(lobe, count)
     strength = _smooth(power, product, np.zeros(count), surface.mixing)
     highlight = lobe * strength[fitted.vertex]
     albedo = fitted.albedo(count, highlight)
@@ -183,6 +186,7 @@ def _fit_lobe(surface: _Surface, highlights: Highlights, exponent: Float[np.ndar
         exponent,
         power,
         product,
+        largest,
         fitted.squared_errors(highlight, albedo),
         tested.squared_errors(tested_highlight, albedo),
     )
@@ -281,10 +285,12 @@ def _strength_and_roughness(
     region, is_shiny = surface.region, np.isin(surface.region, shiny)
     mean = np.bincount(region, np.maximum(lobe.product, 0.0)) / np.maximum(np.bincount(region, lobe.power), 1e-12)
     strength = is_shiny * _smooth(lobe.power, lobe.product, mean[region], surface.mixing)
+    strength = np.minimum(strength, lobe.largest)
     roughness = roughness_of_exponent(np.where(is_shiny, lobe.exponent, whole))
     for _ in range(REGION_SMOOTHING_STEPS):
         weighted, strength = surface.mixing @ (strength * roughness), surface.mixing @ strength
         roughness = np.where(strength > 0.0, weighted / np.maximum(strength, 1e-12), roughness)
+    strength = np.minimum(strength, lobe.largest)
     return strength.astype(np.float32), roughness.astype(np.float32)
 
 
