@@ -43,7 +43,13 @@ def score_run_materials(capture: Path, run: Path, texture_dir: Path) -> dict[str
     """
     inputs = {name: run / name for name in REQUIRED_STAGES} | {"texture": texture_dir}
     coverage = to_float(load_texture(texture_dir).coverage)
-    comparison = Comparison(load_finished_run(inputs), coverage, load_ground_truth(capture), capture / "truth")
+    return score_comparison(
+        Comparison(load_finished_run(inputs), coverage, load_ground_truth(capture), capture / "truth")
+    )
+
+
+def score_comparison(comparison: Comparison) -> dict[str, float]:
+    """Return the figures of `score_run_materials`."""
     colours = compare_texture(comparison)
     names = ("specular_correlation", "roughness_error", "lamp_error_deg")
     return {

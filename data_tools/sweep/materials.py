@@ -19,11 +19,13 @@ from data_tools.command import run_command
 from data_tools.sweep.chart_trials import Trial, describe_machine, format_origin, read_trial, run_trial
 from data_tools.sweep.figures import MATERIALS, OWN_TABLES, insert_tables
 from data_tools.sweep.material_trials import MaterialTrial, measure, read_figures
-from data_tools.sweep.runs import log_path
+from data_tools.sweep.runs import RunState, log_path
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track
+from pipeline.core.status import FRESH
 
 DOCUMENT = Path("docs/benchmarks.md")
+STAGES_UNTIL_MESH = ("frames", "body", "field", "mesh")
 TRUE, RUN = "true", "run"
 Figures = Mapping[str, float]
 
@@ -52,7 +54,7 @@ def main(argv: Sequence[str]) -> None:
     for trial in track(trials, "trials"):
         figures = read_figures(trial)
         if figures is None and not options.write_only:
-            _finish_run(trial, trials)
+            finish_run(trial, trials)
             figures = measure(trial)
         if figures is not None:
             stored[trial] = figures
@@ -82,13 +84,18 @@ def trials_of(
     return trials
 
 
-def _finish_run(trial: MaterialTrial, trials: Sequence[MaterialTrial]) -> None:
-    if trial.true_mesh or read_trial(trial.base).status == "done":
+def finish_run(trial: MaterialTrial, trials: Sequence[MaterialTrial]) -> None:
+    """Run the stages that the figures of a run are made of; those after the mesh may be of another version."""
+    if trial.true_mesh or _is_finished(read_trial(trial.base)):
         return
     run_trial(trial.base, [other.base for other in trials if not other.true_mesh])
     state = read_trial(trial.base)
-    if state.status != "done":
+    if not _is_finished(state):
         raise UserError(f"{trial.base.run_dir.name} is {state.status}: see {log_path(trial.base.run_dir)}")
+
+
+def _is_finished(run: RunState) -> bool:
+    return all(run.states[name] == FRESH for name in STAGES_UNTIL_MESH)
 
 
 def _change(name: str) -> Callable[[Figures], float | None]:

@@ -7,7 +7,7 @@ import pytest
 
 from data_tools.evaluate.compare_avatar import compare_texture
 from data_tools.evaluate.comparison import Comparison
-from data_tools.evaluate.highlights import highlight_scores
+from data_tools.evaluate.highlights import highlight_scores, lamp_error_deg
 from data_tools.synthetic.rig.subject import Subject
 from data_tools.synthetic.scene.renderer import LIGHTING_PRESETS
 from pipeline.body.body import Body
@@ -32,6 +32,14 @@ def test_scores_of_two_shines() -> None:
     assert (scores["roughness_64"], scores["exponent_16"]) == (pytest.approx(0.5), pytest.approx(30.0))
     assert 0.8 < scores["specular_correlation"] < 1.0
     assert highlight_scores(0.0 * strength, strength, subject, light, rows) == {"specular_correlation": 0.0}
+
+
+def test_the_error_of_the_lamp_is_the_angle_to_the_key_light() -> None:
+    key = np.array(LIGHTING_PRESETS["patch"].key_direction)
+    across = np.cross(key, [0.0, 1.0, 0.0])
+    for direction, expected in ((key, 0.0), (across, 90.0), (-key, 180.0)):
+        error = lamp_error_deg(direction / np.linalg.norm(direction), LIGHTING_PRESETS["patch"])
+        assert error == pytest.approx(expected, abs=1e-4)
 
 
 @pytest.mark.slow

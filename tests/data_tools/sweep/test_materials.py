@@ -5,10 +5,12 @@ from pathlib import Path
 
 import pytest
 
+import stages
 from data_tools.sweep.chart_trials import Trial
 from data_tools.sweep.figures import END, insert_tables
 from data_tools.sweep.material_trials import MaterialTrial, read_figures
-from data_tools.sweep.materials import DOCUMENT, main, material_table, trials_of
+from data_tools.sweep.materials import DOCUMENT, finish_run, main, material_table, trials_of
+from data_tools.sweep.runs import RunState
 from pipeline.core.errors import UserError
 from stages.texture import STAGE as TEXTURE
 
@@ -57,6 +59,23 @@ def test_figures_of_another_version_of_the_stage_are_measured_again(tmp_path: Pa
     stored.path.write_text("{")
     with pytest.raises(UserError, match="damaged"):
         read_figures(stored)
+
+
+@pytest.mark.parametrize(("stale", "is_run"), [("texture", False), ("mesh", True)])
+def test_a_run_that_is_finished_up_to_the_mesh_is_measured_as_it_is(
+    monkeypatch: pytest.MonkeyPatch, stale: str, is_run: bool
+) -> None:
+    started = []
+    states = {name: "stale" if name == stale else "fresh" for name in stages.STAGES}
+    monkeypatch.setattr("data_tools.sweep.materials.read_trial", lambda _: RunState(states, {}, {}, "it broke"))
+    monkeypatch.setattr("data_tools.sweep.materials.run_trial", lambda *_: started.append(True))
+    if is_run:
+        with pytest.raises(UserError, match="ann-instant-0 is failed"):
+            finish_run(trial(), [trial()])
+    else:
+        finish_run(trial(), [trial()])
+    finish_run(trial(true_mesh=True), [])
+    assert bool(started) == is_run
 
 
 def test_stored_figures_are_written_into_the_document(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
