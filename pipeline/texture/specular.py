@@ -10,7 +10,7 @@ are those that explain most, the strength s >= 0 of a vertex follows from linear
 Highlights are grey, because dielectrics reflect light without colouring it, and a region of the surface (of one albedo
 and one place: a material) keeps them only if they predict its colours in validation frames: errors of pose and normals
 change the colour of a vertex with the view as well. Where frames do not tell the strength, it is that of the region;
-nowhere is it above the confidence interval of the regression of the vertex itself, so that it ends where the shine ends.
+nowhere is it above the confidence interval of the vertex's own regression, so that it ends where the shine ends.
 
 The exponent of a region is the one that leaves the least error in training frames, where it differs from that of the
 whole person by `MIN_STANDARD_ERRORS`; the whole person has one if validation frames do not prefer those of regions by
