@@ -102,6 +102,7 @@ def _compare_lights(run: Path, folder: Path, score: Any) -> dict[str, float]:
     """Run the texture stage with and without the light; `score` returns the figures of a folder of it."""
     figures: dict[str, float] = {}
     seconds = {}
+    _bake(run, folder / "warm-up", {"light": KEPT, "rounds": 0})  # the first one of a process loads libraries
     for mode in (KEPT, REMOVED):
         options = {"light": mode, "normal_map": mode == REMOVED}
         seconds[mode], metrics = _bake(run, folder / f"texture-{mode}", options)

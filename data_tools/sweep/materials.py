@@ -65,7 +65,13 @@ def main(argv: Sequence[str]) -> None:
         (str(each["commit"]) for each in stored.values()),
         (describe_machine(each["environment"]) for each in stored.values()),
     )
-    note = f"\n{origin}; `make materials CAPTURES='{' '.join(map(str, options.captures))}'`.\n"
+    chosen = {
+        "CAPTURES": " ".join(map(str, options.captures)),
+        "SEEDS": " ".join(map(str, options.seeds)),
+        "ARGS": f"--mesh {' '.join(options.mesh)}",
+    }
+    command = " ".join(f"{name}='{value}'" for name, value in chosen.items())
+    note = f"\n{origin}; `make materials {command}`.\n"
     text = DOCUMENT.read_text(encoding="utf-8")
     DOCUMENT.write_text(insert_tables(text, {MATERIALS: table + note}, DOCUMENT, OWN_TABLES), encoding="utf-8")
     print(table)
