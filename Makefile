@@ -64,7 +64,7 @@ OPTIONS = $(RUN_OPTIONS) $(ARGS)
 STAMP := $(VENV)/.stamp$(if $(EXTRA),-$(EXTRA))
 
 .DEFAULT_GOAL := help
-.PHONY: help all $(STAGES) batch chart ablate stress pose film retexture stylise reshape compare figures test test-all check format bench bench-field bench-body doctor venv lock configs gltf-validator clean
+.PHONY: help all $(STAGES) batch chart ablate stress pose film retexture stylise reshape compare figures materials test test-all check format bench bench-field bench-body doctor venv lock configs gltf-validator clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z$$()A-Z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST) | sed 's/$$(STAGES)/STAGE    /'
@@ -131,6 +131,9 @@ compare: $(STAMP)  ## compare RUN=runs/name with the ground truth of TRUTH=captu
 
 figures: $(STAMP)  ## measure every table of README and docs on this commit: CAPTURES, PRESETS
 	$(RUN_PYTHON) -m data_tools.sweep.figures $(CAPTURES) $(if $(PRESETS),--presets $(PRESETS)) $(ARGS)
+
+materials: $(STAMP)  ## measure light, albedo and highlights against the truth: CAPTURES, SEEDS, ARGS="--mesh true run"
+	$(RUN_PYTHON) -m data_tools.sweep.materials $(CAPTURES) $(if $(SEEDS),--seeds $(SEEDS)) $(ARGS)
 
 test: $(STAMP)  ## run the fast tests in TEST_JOBS=2 processes
 	$(PYTEST) -m "not slow" $(ARGS)

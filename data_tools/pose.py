@@ -104,11 +104,15 @@ def read_pose(path: Path, body: Body) -> Float32[np.ndarray, "1 j 4"]:
 
 
 def export_config(run: Path) -> export.Config:
-    """Return the options of the finished export stage of a run. UserError if it is not finished."""
+    """Return the options of the finished export stage of a run, without its further formats.
+
+    These need optional packages, and nothing that reads a finished export writes them. UserError if it is not finished.
+    """
     manifest = read_manifest(run / "export")
     if manifest is None:
         raise UserError(f"{run} has no finished export; run make export RUN={run}")
-    known = {name: value for name, value in manifest.config.items() if name in export.Config.model_fields}
+    names = export.Config.model_fields.keys() - {"formats"}
+    known = {name: value for name, value in manifest.config.items() if name in names}
     return export.Config(**known)
 
 

@@ -18,6 +18,7 @@ from pipeline.capture.face_detector import FaceDetector
 from pipeline.capture.frame_selection import VALIDATION
 from pipeline.capture.usable_frames import usable_training_positions
 from pipeline.core.cli import main
+from pipeline.core.command import format_command
 from pipeline.core.config import Config as BaseConfig
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track, warn
@@ -128,7 +129,8 @@ def run(
     positions = usable_training_positions(capture, inputs["body"]), capture.positions(VALIDATION)
     train, validation = (load_views(capture, part, inputs, body, skinned, config.max_frames) for part in positions)
     if not train:
-        raise UserError(f"{inputs['frames']} has no training frames; run `python -m stages.frames` again")
+        again = format_command("frames", inputs["frames"].parent, "--force")
+        raise UserError(f"{inputs['frames']} has no training frames; run {again}")
     faces = FilmedFaces.of_capture(capture, positions[0], *load_poses(inputs, body))
     registration = register_person(body, skinned, train, faces, FaceDetector, settings)
     atlas, size_px, on_template = build_atlas(skinned, body, train, registration, config, settings)
@@ -374,7 +376,7 @@ def fit_highlights(evidence: LightEvidence | None, light: VideoLight, mesh: Mesh
 
 STAGE = Stage(
     "texture",
-    version=12,
+    version=13,
     needs=("frames", "body", "mesh"),
     makes=(ATLAS, DIFFUSE, SPECULAR, ROUGHNESS, NORMAL, COVERAGE, LIGHT, TEMPLATE_NPZ),
     config=Config,

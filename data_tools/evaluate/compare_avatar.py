@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from data_tools.evaluate.comparison import SURFACE_POINTS, Comparison, ImagePair, retarget_motion
-from data_tools.evaluate.highlights import highlight_scores
+from data_tools.evaluate.highlights import highlight_scores, lamp_error_deg
 from data_tools.evaluate.static_texture import render_static, static_brightness
 from data_tools.evaluate.truth import load_true_mask
 from data_tools.evaluate.upper_bound import map_between_worlds, render_upper_bound
@@ -200,8 +200,26 @@ def compare_texture(comparison: Comparison, seed: int = 0) -> dict[str, float]:
         coverage: fraction of the surface that was observed.
         colour_error: mean absolute difference on the observed surface, of 255.
         balanced_colour_error: after one gain per channel, because the texture contains the lighting of the video.
-        specular_correlation, roughness_error, ...: see `highlight_scores`, on the observed surface; missing where the
-            true person has no highlights.
+        specular_correlation, roughness_error, ...: see `highlight_scores`, on the observed surface, and the angle from
+            the lamp of the highlights to the key light; missing where the true person has no highlights.
+    """
+    observed, avatar_colours, expected = observed_colours(comparison, seed)
+    gain = [_least_absolute_gain(*channels) for channels in zip(avatar_colours.T, expected.T, strict=True)]
+    return {
+        "coverage": len(observed) / SURFACE_POINTS,
+        "colour_error": 255.0 * float(np.abs(avatar_colours - expected).mean()),
+        "balanced_colour_error": 255.0 * float(np.abs(avatar_colours * gain - expected).mean()),
+        **_highlight_scores(comparison, observed),
+    }
+
+
+def observed_colours(
+    comparison: Comparison, seed: int = 0
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Return those of `SURFACE_POINTS` uniform points of `rest_mesh` that were observed, m, and colours there.
+
+    Returns:
+        Points, sRGB of the avatar, and sRGB of the truth at the nearest true points.
     """
     avatar = Mesh(comparison.rest_mesh.vertices, comparison.run.avatar.faces.numpy())
     true = comparison.truth.subject.body.mesh()
@@ -212,21 +230,15 @@ def compare_texture(comparison: Comparison, seed: int = 0) -> dict[str, float]:
     subject = comparison.truth.subject
     points_true = comparison.alignment(points[observed])
     uv_true = _nearest_uv(points_true, true, torch.from_numpy(subject.uv), subject.faces_uv)
-    expected = sample_texture(subject.texture_tensor(), uv_true).numpy()
-    gain = [_least_absolute_gain(*channels) for channels in zip(avatar_colours.T, expected.T, strict=True)]
-    return {
-        "coverage": float(observed.mean()),
-        "colour_error": 255.0 * float(np.abs(avatar_colours - expected).mean()),
-        "balanced_colour_error": 255.0 * float(np.abs(avatar_colours * gain - expected).mean()),
-        **_highlight_scores(comparison, avatar, points[observed]),
-    }
+    return points[observed], avatar_colours, sample_texture(subject.texture_tensor(), uv_true).numpy()
 
 
-def _highlight_scores(comparison: Comparison, avatar: Mesh, points: Float[np.ndarray, "n 3"]) -> dict[str, float]:
-    """Return `highlight_scores` at surface points of the avatar; nothing where the true person is matte."""
+def _highlight_scores(comparison: Comparison, points: Float[np.ndarray, "n 3"]) -> dict[str, float]:
+    """Return `highlight_scores` and `lamp_error_deg` at surface points; nothing where the true person is matte."""
     truth, own = comparison.truth, comparison.run.avatar.gloss
     if truth.light.specular_strength == 0:
         return {}
+    avatar = Mesh(comparison.rest_mesh.vertices, comparison.run.avatar.faces.numpy())
     _, true_faces, _ = closest_points_on_mesh(comparison.alignment(points), truth.subject.body.mesh())
     strength, roughness = np.zeros(len(points)), np.ones(len(points))
     if own is not None:
@@ -235,7 +247,11 @@ def _highlight_scores(comparison: Comparison, avatar: Mesh, points: Float[np.nda
         roughness[:] = own.highlights.roughness
         if own.roughness is not None:
             roughness = (own.roughness.numpy()[avatar.faces[faces]] * barycentric).sum(axis=1)
-    return highlight_scores(strength, roughness, truth.subject, truth.light, true_faces)
+    scores = highlight_scores(strength, roughness, truth.subject, truth.light, true_faces)
+    if own is None:
+        return scores
+    world_to_true_world = truth.camera.world_to_camera[:3, :3].T @ comparison.run.camera.world_to_camera[:3, :3]
+    return scores | {"lamp_error_deg": lamp_error_deg(world_to_true_world @ own.highlights.direction, truth.light)}
 
 
 def compare_heldout_images(comparison: Comparison) -> dict[str, dict[str, float]]:

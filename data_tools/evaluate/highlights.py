@@ -8,6 +8,12 @@ from data_tools.synthetic.scene.renderer import Light, face_exponents, shiny_fac
 from pipeline.texture.light import exponent_of_roughness, roughness_of_exponent
 
 
+def lamp_error_deg(direction: Float[np.ndarray, "3"], light: Light) -> float:
+    """Return the angle between the direction of the highlights' lamp (unit, world of the capture) and the key light."""
+    key = np.array(light.key_direction) / np.linalg.norm(light.key_direction)
+    return float(np.degrees(np.arccos(np.clip(direction @ key, -1.0, 1.0))))
+
+
 def highlight_scores(
     strength: Float[np.ndarray, "n"],
     roughness: Float[np.ndarray, "n"],

@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 
 from data_tools.command import run_command
-from data_tools.evaluate.highlights import highlight_scores
+from data_tools.evaluate.highlights import highlight_scores, lamp_error_deg
 from data_tools.evaluate.truth import load_ground_truth
 from data_tools.synthetic.rig.subject import Subject
 from data_tools.synthetic.scene.capture import SyntheticCapture
@@ -30,13 +30,14 @@ from pipeline.avatar.finished_run import load_textured_avatar
 from pipeline.body.body import Body
 from pipeline.body.files import save_body, save_camera, save_motion
 from pipeline.capture.capture import Capture, image_path, mask_path, save_capture
-from pipeline.capture.frame_selection import HELDOUT, assign_splits
+from pipeline.capture.frame_selection import HELDOUT, TRAIN, assign_splits
 from pipeline.capture.usable_frames import SCORES_NPZ
 from pipeline.geometry.alpha import unpremultiply_to_uint8
 from pipeline.geometry.colour import linear_to_srgb, srgb_to_linear
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import top_k_weights
 from pipeline.geometry.surface import closest_points_on_mesh, collapse_edges
+from pipeline.geometry.tangents import tangent_frames, vertex_tangents
 from pipeline.geometry.texture_rendering import sample_texture
 from pipeline.io.image import to_float, to_uint8, write_gray, write_rgb
 from pipeline.io.npz import save_npz
@@ -44,6 +45,7 @@ from pipeline.mesh.files import MeshArtifact, load_mesh, save_dense_mesh, save_m
 from pipeline.metrics.images import composite_on_white, composite_premultiplied_on_white, foreground_mask, psnr_db
 from pipeline.metrics.surfaces import sample_surface
 from pipeline.texture.files import TextureArtifact, load_texture
+from pipeline.texture.normal_map import decode_normals
 from stages.texture import STAGE as TEXTURE
 
 FACES = 22_000
@@ -84,10 +86,15 @@ def main(argv: Sequence[str]) -> None:
                 print(f"{mode:8} {name:32} {value:10.4f}")
 
 
-def write_true_run(truth: SyntheticCapture, folder: Path, frames: int, flicker: float) -> Float[np.ndarray, "n"]:
-    """Write the folders `frames`, `body` and `mesh` of a run with the true person; return the gain of each frame."""
+def write_true_run(
+    truth: SyntheticCapture, folder: Path, frames: int, flicker: float, seed: int = 0
+) -> Float[np.ndarray, "n"]:
+    """Write the folders `frames`, `body` and `mesh` of a run with the true person; return the gain of each frame.
+
+    seed: of the gains.
+    """
     motion = truth.motion.select(_used_frames(truth, frames))
-    gains = 1.0 + flicker * np.random.default_rng(0).uniform(-1.0, 1.0, len(motion.time_s))
+    gains = 1.0 + flicker * np.random.default_rng(seed).uniform(-1.0, 1.0, len(motion.time_s))
     for name in ("frames/images", "frames/masks", "body", "mesh"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     for index, gain in zip(motion.frame_index.tolist(), gains, strict=True):
@@ -154,7 +161,7 @@ def score_maps(
     avatar = load_textured_avatar(folder / "mesh", texture_dir)
     texture = load_texture(texture_dir)
     mesh, gain = load_mesh(folder / "mesh").cut(texture.cut), albedo_gain(truth, texture, folder)
-    balanced = replace(texture, diffuse=_scaled(texture.diffuse, gain[0]))
+    balanced = replace(texture, diffuse=scale_linear(texture.diffuse, gain[0]))
     own_mesh_body = replace(
         truth.subject.body,
         vertices=mesh.mesh.vertices,
@@ -172,25 +179,51 @@ def score_maps(
         vertices, true_vertices = pose_vertices(subject, pose), pose_vertices(truth.subject, pose)
         image, mask = _exposed(truth, int(motion[position]), float(gains[position]))
         render = avatar.render(vertices, truth.camera, SAMPLES, avatar.light, position)
-        scores["heldout_psnr_body_db"].append(_body_psnr_db(render, image, mask))
+        scores["heldout_psnr_body_db"].append(inner_psnr_db(render, image, mask))
         for name, light in NEW_LIGHTS.items():
             expected = unpremultiply_to_uint8(
                 render_subject(truth.subject, true_vertices, truth.camera, light, SAMPLES)
             )
             drawn = render_subject(subject, vertices, truth.camera, light, SAMPLES)
-            scores.setdefault(f"relit_{name}_db", []).append(_body_psnr_db(drawn, expected[..., :3], expected[..., 3]))
+            scores.setdefault(f"relit_{name}_db", []).append(inner_psnr_db(drawn, expected[..., :3], expected[..., 3]))
     if truth.light.specular_strength > 0:
         scores |= {name: [value] for name, value in score_highlights(truth, texture, folder).items()}
-    split = assign_splits(np.arange(len(gains)))
-    ratio = texture.light.gain[split == 0] / gains[split == 0]
     return {name: float(np.mean(values)) for name, values in scores.items()} | {
         "albedo_error": gain[1],
-        "gain_error_largest": float(np.abs(ratio / np.median(ratio) - 1.0).max()),
+        "gain_error_largest": largest_gain_error(texture, gains),
     }
 
 
-def _body_psnr_db(render: np.ndarray, image: np.ndarray, mask: np.ndarray) -> float:
-    """Return the PSNR of pixels inside the body, without the outline: the mesh is the true one."""
+def largest_gain_error(texture: TextureArtifact, gains: Float[np.ndarray, "n"]) -> float:
+    """Return the largest relative error of the estimated gain of a training frame; their common scale is free."""
+    train = assign_splits(np.arange(len(gains))) == TRAIN
+    ratio = texture.light.gain[train] / gains[train]
+    return float(np.abs(ratio / np.median(ratio) - 1.0).max())
+
+
+def normal_map_angle_deg(mesh: Mesh, texture: TextureArtifact, dense: Mesh) -> float:
+    """Return the mean angle at surface points from the normals that viewers shade with to those of the dense mesh.
+
+    mesh: that the texture belongs to, cut; in the pose of `dense`.
+    """
+    points, _ = sample_surface(mesh, SURFACE_POINTS, 0)
+    _, face, weights = closest_points_on_mesh(points, mesh)
+    atlas, normals = texture.atlas, mesh.vertex_normals()[texture.atlas.vertex_of_uv]
+    tangents = vertex_tangents(mesh.vertices[atlas.vertex_of_uv], normals, atlas.uv, atlas.faces_uv)
+    normal, tangent, uv = (
+        np.einsum("nk,nkc->nc", weights, each[atlas.faces_uv[face]]) for each in (normals, tangents, atlas.uv)
+    )
+    shown = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    if texture.normal is not None:
+        shown = decode_normals(texture.normal, uv, tangent_frames(normal, tangent))
+    _, face, weights = closest_points_on_mesh(points, dense)
+    true = np.einsum("nk,nkc->nc", weights, dense.vertex_normals()[dense.faces[face]])
+    cosine = np.sum(shown * true, axis=1) / np.linalg.norm(true, axis=1)
+    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).mean())
+
+
+def inner_psnr_db(render: np.ndarray, image: np.ndarray, mask: np.ndarray) -> float:
+    """Return the PSNR of pixels inside the body, without its outline, which shows errors of the shape."""
     inside = cv2.erode(foreground_mask(mask).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     return psnr_db(composite_premultiplied_on_white(render), composite_on_white(image, mask), inside)
 
@@ -224,9 +257,7 @@ def score_highlights(truth: SyntheticCapture, texture: TextureArtifact, folder: 
     scores = highlight_scores(strength, roughness, subject, truth.light, faces)
     if not strength.any():
         return scores
-    key = np.array(truth.light.key_direction) / np.linalg.norm(truth.light.key_direction)
-    cosine = float(np.clip(texture.highlights.direction @ key, -1.0, 1.0))
-    return scores | {"lamp_error_deg": float(np.degrees(np.arccos(cosine)))}
+    return scores | {"lamp_error_deg": lamp_error_deg(texture.highlights.direction, truth.light)}
 
 
 def _uv_at(points: np.ndarray, mesh: Mesh, uv: np.ndarray, faces_uv: np.ndarray) -> torch.Tensor:
@@ -234,7 +265,8 @@ def _uv_at(points: np.ndarray, mesh: Mesh, uv: np.ndarray, faces_uv: np.ndarray)
     return torch.from_numpy((uv[faces_uv[faces]] * barycentric[..., None]).sum(axis=1)).float()
 
 
-def _scaled(diffuse: np.ndarray, gain: np.ndarray) -> np.ndarray:
+def scale_linear(diffuse: np.ndarray, gain: np.ndarray) -> np.ndarray:
+    """Return sRGB colours whose linear values are multiplied by a gain a channel."""
     return linear_to_srgb(np.clip(srgb_to_linear(diffuse.astype(np.float64)) * gain, 0.0, 1.0)).astype(np.float32)
 
 

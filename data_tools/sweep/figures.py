@@ -25,6 +25,9 @@ from pipeline.core.progress import track
 DOCUMENTS = (Path("README.md"), Path("docs/benchmarks.md"))
 CAPTURES = (Path("runs/sample-capture"),)
 PRESETS = ("instant", "default", "fine")
+OWN_TABLES, MATERIALS = ("presets", "stages"), "materials"
+"""Tables that this command writes, and that of `data_tools.sweep.materials`."""
+
 END = "<!-- end of figures -->"
 
 
@@ -57,7 +60,7 @@ def main(argv: Sequence[str]) -> None:
     for document in DOCUMENTS:
         if document.is_file():
             text = document.read_text(encoding="utf-8")
-            document.write_text(insert_tables(text, tables, document), encoding="utf-8")
+            document.write_text(insert_tables(text, tables, document, (MATERIALS,)), encoding="utf-8")
     print(f"tables written to {', '.join(str(path) for path in DOCUMENTS if path.is_file())}: {origin}")
 
 
@@ -101,8 +104,10 @@ def stage_table(runs: Mapping[Trial, RunState], reports: Mapping[Trial, Mapping[
     return "\n".join(lines) + "\n"
 
 
-def insert_tables(text: str, tables: Mapping[str, str], document: Path) -> str:
+def insert_tables(text: str, tables: Mapping[str, str], document: Path, others: Sequence[str] = ()) -> str:
     """The document with every marked table replaced.
+
+    others: names of tables that stay as they are, because another command writes them.
 
     Raises:
         UserError: a marker names an unknown table or has no end.
@@ -110,6 +115,8 @@ def insert_tables(text: str, tables: Mapping[str, str], document: Path) -> str:
 
     def replaced(found: re.Match[str]) -> str:
         name = found.group(1)
+        if name in others:
+            return found.group(0)
         if name not in tables:
             raise UserError(f"{document}: no table is called {name}, only {', '.join(tables)}")
         return f"<!-- figures: {name} -->\n\n{tables[name]}\n{END}"

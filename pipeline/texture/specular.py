@@ -9,7 +9,8 @@ vector h between the lamp and the camera. E is known (`pipeline.texture.light`);
 are those that explain most, the strength s >= 0 of a vertex follows from linear regression, with its albedo eliminated.
 Highlights are grey, because dielectrics reflect light without colouring it, and a region of the surface (of one albedo
 and one place: a material) keeps them only if they predict its colours in validation frames: errors of pose and normals
-change the colour of a vertex with the view as well. Where frames do not tell the strength, it is that of the region.
+change the colour of a vertex with the view as well. Where frames do not tell the strength, it is that of the region;
+nowhere is it above the confidence interval of the vertex's own regression, so that it ends where the shine ends.
 
 The exponent of a region is the one that leaves the least error in training frames, where it differs from that of the
 whole person by `MIN_STANDARD_ERRORS`; the whole person has one if validation frames do not prefer those of regions by
@@ -159,12 +160,14 @@ class _LobeFit:
     Attributes:
         exponent: of each vertex.
         power, product: of the normal equations of each vertex.
+        largest: strength that the rows of a vertex allow, see `HighlightRegression.largest_strength`.
         fitted_error, tested_error: weighted squared errors of the rows of training and validation views.
     """
 
     exponent: Float[np.ndarray, "v"]
     power: Float[np.ndarray, "v"]
     product: Float[np.ndarray, "v"]
+    largest: Float[np.ndarray, "v"]
     fitted_error: Float[np.ndarray, "k"]
     tested_error: Float[np.ndarray, "l"]
 
@@ -175,6 +178,7 @@ def _fit_lobe(surface: _Surface, highlights: Highlights, exponent: Float[np.ndar
     lobe = fitted.lobe(highlights, exponent)
     power, products = fitted.normal_equations(lobe, count)
     product = products.min(axis=1)
+    largest = fitted.largest_strength(lobe, count)
     strength = _smooth(power, product, np.zeros(count), surface.mixing)
     highlight = lobe * strength[fitted.vertex]
     albedo = fitted.albedo(count, highlight)
@@ -183,6 +187,7 @@ def _fit_lobe(surface: _Surface, highlights: Highlights, exponent: Float[np.ndar
         exponent,
         power,
         product,
+        largest,
         fitted.squared_errors(highlight, albedo),
         tested.squared_errors(tested_highlight, albedo),
     )
@@ -281,10 +286,12 @@ def _strength_and_roughness(
     region, is_shiny = surface.region, np.isin(surface.region, shiny)
     mean = np.bincount(region, np.maximum(lobe.product, 0.0)) / np.maximum(np.bincount(region, lobe.power), 1e-12)
     strength = is_shiny * _smooth(lobe.power, lobe.product, mean[region], surface.mixing)
+    strength = np.minimum(strength, lobe.largest)
     roughness = roughness_of_exponent(np.where(is_shiny, lobe.exponent, whole))
     for _ in range(REGION_SMOOTHING_STEPS):
         weighted, strength = surface.mixing @ (strength * roughness), surface.mixing @ strength
         roughness = np.where(strength > 0.0, weighted / np.maximum(strength, 1e-12), roughness)
+    strength = np.minimum(strength, lobe.largest)
     return strength.astype(np.float32), roughness.astype(np.float32)
 
 

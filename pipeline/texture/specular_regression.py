@@ -16,6 +16,13 @@ from pipeline.texture.light_fit import ViewObservations
 RIDGE_FRACTION = 0.003
 """Ridge of the strength, relative to the lobe's power at well-observed vertices of uniform albedo."""
 
+UNKNOWNS = 2
+"""Of a vertex: its albedo and its strength."""
+
+CONFIDENCE_STANDARD_ERRORS = 2.0
+"""Half width of the confidence interval of a vertex's strength. 1, 2 and 3: 33.35, 33.33, 33.30 dB in validation frames
+of a shiny patch, 31.24 dB without an upper limit."""
+
 MIN_ROWS = 10
 """Vertices of a region that a view must show to count."""
 
@@ -97,6 +104,23 @@ class HighlightRegression:
         return power, np.stack(
             [np.bincount(self.vertex, self.weight * lobe * channel, count) for channel in self.linear.T], axis=1
         )
+
+    def largest_strength(self, lobe: Float[np.ndarray, "k"], count: int) -> Float[np.ndarray, "v"]:
+        """Return the upper end of the confidence interval of the strength of each vertex, from its own rows alone.
+
+        inf where they do not tell: the lobe (D of each row) does not change over fewer than three rows.
+        """
+        power, products = self.normal_equations(lobe, count)
+        product = products.mean(axis=1)
+        rows = np.bincount(self.vertex, minlength=count)
+        total = np.zeros(count)
+        for channel in self.linear.T:
+            total += np.bincount(self.vertex, self.weight * self._eliminated(channel, count) ** 2, count) / 3.0
+        is_told = (rows > UNKNOWNS) & (power > 1e-12)
+        power = np.where(is_told, power, 1.0)
+        variance = np.maximum(total - product**2 / power, 0.0) / np.maximum(rows - UNKNOWNS, 1)
+        largest = product / power + CONFIDENCE_STANDARD_ERRORS * np.sqrt(variance / power)
+        return np.where(is_told, np.maximum(largest, 0.0), np.inf)
 
     def explained(self, lobe: Float[np.ndarray, "k"], count: int) -> float:
         """Return by how much grey highlights of strength >= 0 reduce the weighted squared error."""

@@ -23,12 +23,14 @@ from scipy.spatial import cKDTree
 from pipeline.avatar.finished_run import load_textured_avatar, vertex_values
 from pipeline.avatar.textured_avatar import TexturedAvatar
 from pipeline.body.body import canonical_to_world
+from pipeline.geometry.atlas import rasterize_texels
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.texture_rendering import render_textured, turntable_camera
 from pipeline.io.image import to_uint8, write_rgb
 from pipeline.texture.files import TextureArtifact
-from pipeline.texture.light import Highlights, directional_light
-from stages.export import STAGE, Config, encode_scene, load_scene
+from pipeline.texture.light import Highlights, directional_light, exponent_of_roughness, roughness_of_exponent
+from stages.export import STAGE, Config, Scene, encode_scene, load_scene
+from stages.texture import vertex_map
 from tests.tools.browser import open_browser
 from tests.tools.pictures import (
     LampAndSky,
@@ -48,6 +50,9 @@ LAMP = LampAndSky((0.48, 0.6, 0.64), 0.7, 0.3)
 
 PAINTED_STRENGTH, PAINTED_EXPONENT = 0.08, 24.0
 """Highlights of the shiny picture: of satin; glTF's specular factor is then 0.6 and its roughness 0.53."""
+
+PAINTED_EXPONENTS = (64.0, 16.0)
+"""Above and below the middle of the person, where there is a roughness map: factors 0.24 and 0.89."""
 
 CLIP_FRACTION = 0.4
 """Of the frames of the clip `capture`: the pose that is compared besides the rest pose."""
@@ -91,7 +96,10 @@ def compare_in_three(run: Path, out: Path) -> str:
 
 
 def compare_lit(run: Path, out: Path) -> str:
-    """Compare the captured surface under a lamp and a uniform sky: as it is, and with painted highlights."""
+    """Compare the captured surface under a lamp and a uniform sky: as it is, and with painted highlights.
+
+    "two shines" has a roughness map of `PAINTED_EXPONENTS`.
+    """
     inputs = {name: run / name for name in STAGE.needs}
     config = Config(face=False)
     scene = load_scene(inputs, config)
@@ -103,20 +111,32 @@ def compare_lit(run: Path, out: Path) -> str:
         highlights=Highlights(np.array(LAMP.direction, np.float32), PAINTED_EXPONENT),
         light=directional_light(LAMP.direction, LAMP.ambient),
     )
+    two_shines = replace(shiny, roughness=_painted_roughness(scene))
     parts, camera = [], camera_for(plain.vertices)
-    for name, texture in (("matte", matte), ("shiny", shiny)):
-        file = out / f"lit_{name}.glb"
+    for name, texture in (("matte", matte), ("shiny", shiny), ("two shines", two_shines)):
+        stem = name.replace(" ", "_")
+        file = out / f"lit_{stem}.glb"
         file.write_bytes(encode_scene(replace(scene, texture=texture), config, {"capture": scene.motion}))
         ours = _render_lit(plain, texture, camera, scene.skinned.vertex_normals())
         blender = render_glb_in_blender(file.resolve(), camera, LAMP, out.resolve())
-        parts.append(f"Blender lit, {name} {_compare_to(ours, blender, out / f'blender_lit_{name}')}")
+        parts.append(f"Blender lit, {name} {_compare_to(ours, blender, out / f'blender_lit_{stem}')}")
         with open_browser() as page:
             open_in_three(page, file, out)
             fine = render_in_three(page, camera.scaled(THREE_SUPERSAMPLING), light=LAMP)
             assert page.problems == [], page.problems
         picture = cv2.resize(fine, (WIDTH_PX, HEIGHT_PX), interpolation=cv2.INTER_AREA)
-        parts.append(f"three.js lit, {name} {_compare_to(ours, picture, out / f'three_lit_{name}')}")
+        parts.append(f"three.js lit, {name} {_compare_to(ours, picture, out / f'three_lit_{stem}')}")
     return ", ".join(parts)
+
+
+def _painted_roughness(scene: Scene) -> Float[np.ndarray, "s s"]:
+    """Return a roughness map with the lobes of `PAINTED_EXPONENTS`."""
+    mesh, texture = scene.skinned.mesh, scene.texture
+    height = mesh.vertices[:, 1]
+    is_high = height > 0.5 * (height.min() + height.max())
+    exponent = np.where(is_high, *PAINTED_EXPONENTS)
+    texels = rasterize_texels(texture.atlas, texture.specular.shape[0])
+    return vertex_map(roughness_of_exponent(exponent), mesh, texels)
 
 
 def _render_lit(
@@ -126,8 +146,10 @@ def _render_lit(
     towards = torch.tensor(LAMP.direction)
     irradiance = LAMP.ambient + LAMP.key * (torch.from_numpy(normals).float() @ towards).clamp(min=0.0)
     to_camera = torch.nn.functional.normalize(torch.from_numpy(camera.centre_m()).float() - avatar.vertices, dim=1)
-    lobe = texture.highlights.lobe(normals, to_camera.numpy(), np.ones(len(normals)))
-    strength = vertex_values(texture.specular, texture.atlas, len(normals)).numpy()
+    strength, exponent = vertex_values(texture.specular, texture.atlas, len(normals)).numpy(), None
+    if texture.roughness is not None:
+        exponent = exponent_of_roughness(vertex_values(texture.roughness, texture.atlas, len(normals)).numpy())
+    lobe = texture.highlights.lobe(normals, to_camera.numpy(), np.ones(len(normals)), exponent)
     lamp = texture.light.lamp_irradiance(texture.highlights.direction)
     added = torch.from_numpy(strength * lobe * LAMP.key / lamp).float()
     shading = torch.cat([irradiance[:, None].expand(-1, 3), added[:, None]], dim=1).float()
@@ -197,7 +219,7 @@ def _offset_mm(avatar: TexturedAvatar, vertices_m: np.ndarray) -> str:
     return f"{1e3 * max(distance_m, back_m):.4f} mm"
 
 
-def _scene(run: Path):
+def _scene(run: Path) -> Scene:
     return load_scene({name: run / name for name in STAGE.needs}, Config())
 
 

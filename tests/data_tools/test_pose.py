@@ -9,7 +9,7 @@ import pytest
 import torch
 import trimesh
 
-from data_tools.pose import main, planted_motion, read_pose
+from data_tools.pose import export_config, main, planted_motion, read_pose
 from pipeline.avatar.motion.feet import joint_positions_m
 from pipeline.body.body import canonical_to_world
 from pipeline.core.errors import UserError
@@ -24,6 +24,16 @@ from tests.tools.khronos import validator_issues
 
 def load(run: Path, **options: str):
     return load_scene({name: run / name for name in STAGE.needs}, Config(**options))
+
+
+def test_a_run_with_formats_of_a_missing_package_is_read(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    manifest = json.loads((run / "export" / "manifest.json").read_text())
+    manifest["config"]["formats"] = ["usdz"]
+    (run / "export" / "manifest.json").write_text(json.dumps(manifest))
+    monkeypatch.setattr("stages.export.missing_package", lambda formats: "without usdz" if formats else None)
+    config = export_config(run)
+    assert config.formats == ()
+    assert config.rig == "mixamo"
 
 
 @pytest.fixture

@@ -121,7 +121,7 @@ def test_missing_training_frames_are_an_error_with_the_command(inputs: dict[str,
     only_held_out = tmp_path / "frames"
     only_held_out.mkdir()
     np.savez(only_held_out / "frames.npz", **arrays | {"split": np.full(len(arrays["split"]), 2, np.uint8)})
-    with pytest.raises(UserError, match="stages.frames"):
+    with pytest.raises(UserError, match="stages frames"):
         TEXTURE.run(inputs | {"frames": only_held_out}, tmp_path, TEXTURE.config(**OPTIONS))
 
 

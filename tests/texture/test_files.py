@@ -119,5 +119,5 @@ def test_a_missing_array_is_named(artifact: TextureArtifact, tmp_path: Path) -> 
     save_texture(tmp_path, artifact)
     arrays = load_npz(tmp_path / ATLAS)
     save_npz(tmp_path / ATLAS, {"uv": arrays["uv"]})
-    with pytest.raises(UserError, match=r"atlas\.npz lacks the array 'faces_uv'.*stages\.texture"):
+    with pytest.raises(UserError, match=r"atlas\.npz lacks the array 'faces_uv'.*stages texture"):
         load_texture(tmp_path)

@@ -7,7 +7,7 @@ import pytest
 
 from data_tools.evaluate.compare_avatar import compare_texture
 from data_tools.evaluate.comparison import Comparison
-from data_tools.evaluate.highlights import highlight_scores
+from data_tools.evaluate.highlights import highlight_scores, lamp_error_deg
 from data_tools.synthetic.rig.subject import Subject
 from data_tools.synthetic.scene.renderer import LIGHTING_PRESETS
 from pipeline.body.body import Body
@@ -16,7 +16,7 @@ from tests.data_tools.synthetic.shapes import sphere
 
 
 def test_scores_of_two_shines() -> None:
-    """Exponents 64 and 16 are roughness (2/66)^(1/4) and (2/18)^(1/4); the estimate is 0.5 everywhere."""
+    """Exponents 64 and 16 are roughness (2/66)^(1/4) and (2/18)^(1/4); the estimate is 0.45 and 0.55."""
     vertices, faces = sphere(0.5, (0.0, 0.0, 0.0))
     weights = np.ones((len(vertices), 1), dtype=np.float32)
     body = Body(("Hips",), np.array([-1], dtype=np.int32), np.zeros((1, 3), np.float32), vertices, faces, weights, {})
@@ -24,14 +24,23 @@ def test_scores_of_two_shines() -> None:
     height, rows = vertices[faces, 1].mean(axis=1) + 0.5, np.arange(len(faces))
     first, second = (height > 0.58) & (height < 0.74), (height > 0.3) & (height < 0.5)
     light, strength = LIGHTING_PRESETS["two-shines"], np.where(first, 0.3, np.where(second, 0.1, 0.0))
-    scores = highlight_scores(strength, np.full(len(rows), 0.5), subject, light, rows)
+    scores = highlight_scores(strength, np.where(first, 0.45, 0.55), subject, light, rows)
     wide, narrow = (2.0 / 18.0) ** 0.25, (2.0 / 66.0) ** 0.25
     total = 0.3 * first.sum() + 0.1 * second.sum()
-    expected = (0.3 * first.sum() * (0.5 - narrow) + 0.1 * second.sum() * (wide - 0.5)) / total
+    expected = (0.3 * first.sum() * (0.45 - narrow) + 0.1 * second.sum() * (wide - 0.55)) / total
     assert scores["roughness_error"] == pytest.approx(expected, rel=1e-5)
-    assert (scores["roughness_64"], scores["exponent_16"]) == (pytest.approx(0.5), pytest.approx(30.0))
+    assert (scores["roughness_64"], scores["roughness_16"]) == (pytest.approx(0.45), pytest.approx(0.55))
+    assert scores["exponent_16"] == pytest.approx(2.0 / 0.55**4 - 2.0)
     assert 0.8 < scores["specular_correlation"] < 1.0
     assert highlight_scores(0.0 * strength, strength, subject, light, rows) == {"specular_correlation": 0.0}
+
+
+def test_the_error_of_the_lamp_is_the_angle_to_the_key_light() -> None:
+    key = np.array(LIGHTING_PRESETS["patch"].key_direction)
+    across = np.cross(key, [0.0, 1.0, 0.0])
+    for direction, expected in ((key, 0.0), (across, 90.0), (-key, 180.0)):
+        error = lamp_error_deg(direction / np.linalg.norm(direction), LIGHTING_PRESETS["patch"])
+        assert error == pytest.approx(expected, abs=1e-4)
 
 
 @pytest.mark.slow

@@ -1,15 +1,24 @@
 """The comparison of materials on a small capture: its run is the true person, and its figures are consistent."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from data_tools.evaluate.materials import main, reduced_mesh, write_true_run
+from data_tools.evaluate.comparison import Comparison
+from data_tools.evaluate.materials import main, normal_map_angle_deg, reduced_mesh, write_true_run
+from data_tools.evaluate.run_materials import score_comparison
 from data_tools.evaluate.truth import load_ground_truth
 from pipeline.body.files import load_motion
 from pipeline.capture.capture import load_capture
+from pipeline.geometry.atlas import unwrap
+from pipeline.geometry.mesh import Mesh
 from pipeline.metrics.surfaces import chamfer_distance_mm
+from pipeline.texture.files import TextureArtifact
+from pipeline.texture.light import Highlights, VideoLight
+from pipeline.texture.normal_map import bake_normal_map
+from tests.data_tools.synthetic.shapes import sphere
 
 
 @pytest.mark.slow
@@ -38,3 +47,38 @@ def test_the_table_has_all_rows(sample: Path, capsys: pytest.CaptureFixture[str]
     for mode in ("kept", "auto", "removed"):
         for name in ("albedo_error", "relit_left_db", "heldout_psnr_body_db", "gain_error_largest"):
             assert f"{mode:8} {name} " in rows
+
+
+def test_the_normal_map_is_measured_against_the_dense_mesh() -> None:
+    """A bumpy ball shades almost like the dense sphere with its map, and 3 degrees off without."""
+    smooth, dense = (Mesh(*sphere(0.1, (0.0, 0.0, 0.0), level)) for level in (3, 5))
+    radii = np.random.default_rng(0).uniform(0.97, 1.03, (len(smooth.vertices), 1)).astype(np.float32)
+    mesh = Mesh(smooth.vertices * radii, smooth.faces)
+    atlas = unwrap(mesh, np.zeros(len(mesh.faces), np.int32), 128, 4, smoothing_steps=0)
+    blank = np.zeros((128, 128), np.float32)
+    texture = TextureArtifact(
+        atlas,
+        np.zeros((128, 128, 3), np.float32),
+        blank,
+        blank.astype(np.uint8),
+        VideoLight.uniform(1),
+        Highlights.none(),
+        bake_normal_map(mesh, atlas, dense, 128),
+    )
+    without = normal_map_angle_deg(mesh, replace(texture, normal=None), dense)
+    assert without > 2.0
+    assert normal_map_angle_deg(mesh, texture, dense) < 0.3 * without
+
+
+@pytest.mark.slow
+def test_the_true_person_as_a_run_has_the_true_texture(perfect: Comparison) -> None:
+    """Relit renders agree where the avatar is the truth; half of its albedo black is an error."""
+    run = perfect.run
+    scores = score_comparison(perfect)
+    assert scores["albedo_error"] < 3.0
+    dark = run.avatar.diffuse.clone()
+    dark[: len(dark) // 2] = 0.0
+    painted = score_comparison(replace(perfect, run=replace(run, avatar=replace(run.avatar, diffuse=dark))))
+    for name in ("relit_left_db", "relit_top_db", "heldout_psnr_body_db"):
+        assert scores[name] > painted[name] + 3.0
+    assert scores["relit_left_db"] > 28.0
