@@ -1,8 +1,8 @@
 """Two passes over a recording: detect the person in the frames, then write the selected frames with their masks."""
 
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,15 +23,17 @@ from pipeline.capture.matting import (
     smooth_mask_temporally,
 )
 from pipeline.capture.person_detector import PersonDetector
-from pipeline.capture.process_pool import ProcessPool
+from pipeline.capture.worker_pool import WorkerPool
 from pipeline.capture.user_files import UserFiles
-from pipeline.capture.video import Frame, FrameSource, read_frames
+from pipeline.capture.video import Frame, FrameSource, downscale, read_frames
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track
 from pipeline.io.image import to_uint8, write_gray, write_rgb
 
+# Longer side of the images in which the person is detected: the model sees 256 cells on 1.25 times the person's height.
+DETECTION_SIDE_PX = 640
 # Longer side of the grey thumbnails with which frames are compared.
-_THUMBNAIL_SIDE_PX = 320
+THUMBNAIL_SIDE_PX = 320
 # Minimum mask level of a pixel of the person in a thumbnail.
 _MIN_PERSON_LEVEL = 100
 # Minimum mask area relative to the median; smaller masks are specks.
@@ -58,7 +60,7 @@ class Detections:
 
     found: the mask shows the person (without landmarks if masks are user-supplied).
     gray_thumbnails, person_masks: small images and binary masks.
-    masks_png: soft masks of the detector, PNG-encoded to save memory.
+    masks_png: soft masks of the detector, PNG-encoded to save memory, of at most `DETECTION_SIDE_PX`.
     landmarks, hands and faces_px as in `Capture`, nan where unknown. n_people: -1 where people were not counted.
     """
 
@@ -85,7 +87,7 @@ def detect_in_frames(
     frame_indices: Sequence[int],
     n_people_count_frames: int,
     max_side_px: int,
-    workers: ProcessPool,
+    workers: WorkerPool,
 ) -> Detections:
     """Detect the person in the frames `frame_indices`, and count people in `n_people_count_frames` of them.
 
@@ -144,7 +146,7 @@ def write_frames(
     out: Path,
     max_side_px: int,
     noise: float,
-    workers: ProcessPool,
+    workers: WorkerPool,
 ) -> None:
     """Write image and mask of the detections at `positions` into `out`.
 
@@ -184,7 +186,8 @@ def estimate_background(
     is_taken = set(detections.frame_index[sampled].tolist()).__contains__
     images = np.stack([frame.rgb for frame in read_undistorted_frames(source, user_files, is_taken, max_side_px)])
     return estimate_background_plate(
-        images, np.stack([~definite_background(_decode_mask(detections.masks_png[p])) for p in sampled])
+        images,
+        np.stack([~definite_background(_decode_mask(detections.masks_png[p], images.shape[1:3])) for p in sampled]),
     )
 
 
@@ -218,22 +221,31 @@ def read_user_mask(user_files: UserFiles, frame: Frame) -> UInt8[np.ndarray, "h 
     return mask if user_files.camera is None else user_files.camera.undistort(mask[..., None], frame.scale)[..., 0]
 
 
-@cache
+_of_thread = threading.local()
+
+
 def _detector() -> PersonDetector:
-    """Return the detector of this process; loading takes seconds."""
-    return PersonDetector()
+    """Return the detector of this thread; loading takes a second."""
+    if not hasattr(_of_thread, "person"):
+        _of_thread.person = PersonDetector()
+    detector: PersonDetector = _of_thread.person
+    return detector
 
 
-@cache
 def _hand_detector() -> HandDetector:
-    """Return the hand detector of this process."""
-    return HandDetector()
+    """Return the hand detector of this thread."""
+    if not hasattr(_of_thread, "hand"):
+        _of_thread.hand = HandDetector()
+    detector: HandDetector = _of_thread.hand
+    return detector
 
 
-@cache
 def _face_detector() -> FaceDetector:
-    """Return the face detector of this process."""
-    return FaceDetector()
+    """Return the face detector of this thread."""
+    if not hasattr(_of_thread, "face"):
+        _of_thread.face = FaceDetector()
+    detector: FaceDetector = _of_thread.face
+    return detector
 
 
 def _detect_in_frame(
@@ -242,10 +254,13 @@ def _detect_in_frame(
     needs_landmarks: bool,
     needs_people_count: bool,
 ) -> _FrameDetection:
-    """Detect the person in one frame (runs in a worker process)."""
-    detection = _detector().detect(rgb) if needs_landmarks or mask is None else None
-    n_people = _detector().count_people(rgb) if needs_people_count and mask is None else -1
-    factor = min(1.0, _THUMBNAIL_SIDE_PX / max(rgb.shape[:2]))
+    """Detect the person in one frame (runs in a worker thread)."""
+    small, scale = downscale(rgb, DETECTION_SIDE_PX)
+    detection = _detector().detect(small) if needs_landmarks or mask is None else None
+    n_people = _detector().count_people(small) if needs_people_count and mask is None else -1
+    if detection is not None:
+        detection = replace(detection, landmarks_px=detection.landmarks_px / np.float32(scale))
+    factor = min(1.0, THUMBNAIL_SIDE_PX / max(rgb.shape[:2]))
     size = (max(1, round(rgb.shape[1] * factor)), max(1, round(rgb.shape[0] * factor)))
     gray = cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
     landmarks, mask_png, hands, face_px = None, b"", undetected_hands(), undetected_face()
@@ -330,12 +345,14 @@ def _write_matted_frame(
     noise: float,
     plate: BackgroundPlate,
 ) -> None:
-    """Compute and write the matte of one frame (runs in a worker process)."""
-    masks = np.stack([_decode_mask(data) for data in masks_png])
+    """Compute and write the matte of one frame (runs in a worker thread)."""
+    masks = np.stack([_decode_mask(data, images.shape[1:3]) for data in masks_png])
     mask = extend_mask_on_uniform_background(images[centre], smooth_mask_temporally(images, masks, centre, noise))
     alpha = estimate_alpha_matte(images[centre], mask, plate)
     _write_frame(images[centre], to_uint8(alpha), out, frame_index)
 
 
-def _decode_mask(mask_png: bytes) -> UInt8[np.ndarray, "h w"]:
-    return cv2.imdecode(np.frombuffer(mask_png, np.uint8), cv2.IMREAD_GRAYSCALE)
+def _decode_mask(mask_png: bytes, size_px: tuple[int, int]) -> UInt8[np.ndarray, "h w"]:
+    """Return a mask of the detector at the size (height, width) of the images."""
+    mask = cv2.imdecode(np.frombuffer(mask_png, np.uint8), cv2.IMREAD_GRAYSCALE)
+    return mask if mask.shape == size_px else cv2.resize(mask, size_px[::-1], interpolation=cv2.INTER_LINEAR)

@@ -30,6 +30,8 @@ _WIDE_WINDOW_FACTOR, _WIDE_WINDOW_WEIGHT = 8, 0.01
 _MIN_SAMPLE_WEIGHT = 1e-3
 # The background is uniform (synthetic) if this fraction of its pixels is within two levels of one colour.
 _MIN_UNIFORM_FRACTION, _UNIFORM_TOLERANCE_LEVELS = 0.95, 2
+# The same on every fourth pixel outside of the mask, some of which show what the mask misses: below it, no need to look.
+_UNIFORM_TEST_STRIDE, _MIN_UNIFORM_FRACTION_SAMPLED = 4, 0.8
 # Above this mask value a pixel is a foreground sample even if the first iteration rejected it. Without that a white hem
 # in front of a white wall is lost (synthetic captures, IoU median and worst: 0.978, 0.945; with it 0.991, 0.959).
 _CONFIDENT_MASK_VALUE = 0.97
@@ -186,6 +188,11 @@ def extend_mask_on_uniform_background(
     if not body.any():
         return mask
     cell_px = _mask_cell_px(body)
+    outside = rgb[::_UNIFORM_TEST_STRIDE, ::_UNIFORM_TEST_STRIDE][
+        mask[::_UNIFORM_TEST_STRIDE, ::_UNIFORM_TEST_STRIDE] <= _MIN_TRACE_LEVEL
+    ]
+    if len(outside) and _uniform_fraction(outside) < _MIN_UNIFORM_FRACTION_SAMPLED:
+        return mask
     near = _dilate(body, _UNKNOWN_BAND_CELLS * cell_px)
     away = rgb[~_dilate(body, 2 * _UNKNOWN_BAND_CELLS * cell_px)]
     if len(away) == 0:
@@ -199,6 +206,12 @@ def extend_mask_on_uniform_background(
     attached = support & np.isin(labels, np.unique(labels[body]))
     beyond = _dilate(attached & ~near, 2 * _UNKNOWN_BAND_CELLS * cell_px)
     return np.where(attached & beyond, np.uint8(255), mask)
+
+
+def _uniform_fraction(colours: UInt8[np.ndarray, "k 3"]) -> float:
+    """Return the fraction of colours near their median."""
+    backdrop = np.median(colours, axis=0).astype(np.int16)
+    return float((np.abs(colours.astype(np.int16) - backdrop) <= _UNIFORM_TOLERANCE_LEVELS).all(axis=-1).mean())
 
 
 def smooth_mask_temporally(

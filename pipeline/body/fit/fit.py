@@ -51,6 +51,11 @@ MIN_FRAMES = 3
 POSTURE_ROUND = 3
 """Number of matchings of the silhouettes before the posture of the recording is estimated."""
 
+CONVERGED_STEP_RATIO = 0.1
+"""Step of shape, camera and landmark offsets, in standard deviations, below which no further silhouettes are matched.
+
+Matched silhouettes jitter by 0.06 to 0.1: more rounds do not end nearer to the truth (docs/decisions/body.md)."""
+
 
 class TooFewLandmarksError(ValueError):
     """Too few frames have the landmarks that the initial state needs."""
@@ -65,7 +70,7 @@ class FitOptions:
     principal_point_relative_std: standard deviation of the principal point about the initial one, in focal lengths; 0
         fixes it.
     shared_frames: number of frames for the shared parameters.
-    rounds: matchings of the silhouettes for the shared parameters.
+    rounds: largest number of matchings of the silhouettes for the shared parameters.
     vertical_is_known: whether +Y of the camera's world is up; otherwise the vertical is estimated.
     """
 
@@ -268,12 +273,14 @@ def _fit_shared(
     parameters = _with_silhouettes(parameters, settings)
     posture: Posture | None = None
     for number in track(range(options.rounds), "shape and focal length"):
-        model = context.linearise(state.shape)
+        model, before = context.linearise(state.shape), state
         state, system, objective = _silhouette_round(
             context, model, observations, windows, parameters, state, _Recording(posture)
         )
         if number + 1 == POSTURE_ROUND:
             posture = objective.estimate_posture(context.pose_prior, state)
+        elif number + 1 > POSTURE_ROUND and _shared_step_ratio(before, state, system) < CONVERGED_STEP_RATIO:
+            break
     return state, parameters, system, posture
 
 
@@ -390,6 +397,12 @@ def _result(
         height_std_m=0.0,
         lean_deg=lean_deg(model, state),
     )
+
+
+def _shared_step_ratio(before: FitState, after: FitState, system: NormalEquations) -> float:
+    """Return the root mean square of a step of the shared parameters, in standard deviations of what is known."""
+    step = (after.shared_parameters() - before.shared_parameters()).numpy()
+    return float(np.sqrt(np.mean(step**2 / np.diag(shared_covariance(system)))))
 
 
 def _posterior_stds(model: LinearBody, system: NormalEquations) -> tuple[float, float]:
