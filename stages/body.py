@@ -77,9 +77,7 @@ class Config(BaseConfig):
         description="field of view along the longer image side, degrees; null: from the metadata, or estimated",
     )
     shared_frames: int = Field(48, ge=8, le=500, description="frames used to estimate shape and focal length")
-    rounds: int = Field(
-        8, ge=1, le=50, description="largest number of silhouette matchings for shape and focal length"
-    )
+    rounds: int = Field(8, ge=1, le=50, description="largest number of silhouette matchings for shape and focal length")
     supplied_poses: Literal["keep", "start", "ignore"] = Field(
         "keep",
         description="use of a supplied smpl_poses.npz (needs an SMPL model_file): keep its shape and poses; start: "

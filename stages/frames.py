@@ -16,9 +16,9 @@ from pipeline.capture.detection import THUMBNAIL_SIDE_PX, Detections, detect_in_
 from pipeline.capture.disjoint_split import assign_disjoint_splits
 from pipeline.capture.exif_focal import metadata_focal_px
 from pipeline.capture.input_checks import check_input, warn_about_input
-from pipeline.capture.worker_pool import start_worker_pool
 from pipeline.capture.user_files import UserFiles, UserSplit, load_user_files
 from pipeline.capture.video import DEFAULT_IMAGE_FPS, FrameSource, open_frame_source, read_thumbnails
+from pipeline.capture.worker_pool import start_worker_pool
 from pipeline.core.cli import main
 from pipeline.core.config import Config as BaseConfig
 from pipeline.core.errors import UserError
@@ -41,9 +41,7 @@ class Config(BaseConfig):
         200, ge=16, le=2000, description="maximum number of selected frames, held-out frames included"
     )
     min_frames: int = Field(16, ge=5, le=1000, description="minimum number of frames with a person")
-    max_detection_frames: int = Field(
-        900, ge=16, description="maximum number of frames that are looked at"
-    )
+    max_detection_frames: int = Field(900, ge=16, description="maximum number of frames that are looked at")
     max_side_px: int = Field(1280, ge=64, le=8192, description="maximum longer side of the stored images, px")
     duplicate_threshold_noise_ratio: float = Field(
         3.0,
@@ -108,7 +106,7 @@ def select_detection_frames(source: FrameSource, user_files: UserFiles, config: 
     """Return the indices of frames for detection, and the number of repeated frames that were left out.
 
     These are the frames of a user-supplied split. Else, of a recording with more frames than are used, small pictures
-    are looked at first: repeats are left out, and the others chosen at equal steps of motion, somewhat more than used.
+    are looked at first: repeats are left out, and of the others somewhat more than used are chosen by motion.
 
     Raises:
         UserError: the split lists more frames than the option allows.
@@ -126,18 +124,15 @@ def select_detection_frames(source: FrameSource, user_files: UserFiles, config: 
 
 
 def select_moving_frames(source: FrameSource, indices: range, config: Config) -> tuple[Sequence[int], int]:
-    """Return `_CANDIDATES_PER_FRAME` times as many frames as are used, at equal steps of motion, and the repeats."""
+    """Return frames at equal steps of motion, `_CANDIDATES_PER_FRAME` for each that is used, and count the repeats."""
     index, thumbnails = read_thumbnails(source, set(indices).__contains__, THUMBNAIL_SIDE_PX)
     noise = selection.estimate_noise_level(thumbnails)
     repeats, motion = selection.find_repeats(thumbnails, config.duplicate_threshold_noise_ratio * noise)
     moving = np.flatnonzero(~repeats)
-    count = round(_CANDIDATES_PER_FRAME * config.max_frames)
-    if config.split == "disjoint":
-        chosen = selection.evenly_spaced_indices(motion[moving], count)
-    else:
-        split = selection.assign_splits(index[moving])
-        chosen = np.flatnonzero(selection.select_frames_by_motion(split, motion[moving], count))
-    return index[moving[chosen]].tolist(), int(repeats.sum())
+    if config.split == "interleaved":  # a disjoint split is made of what is detected in all frames
+        split, count = selection.assign_splits(index[moving]), round(_CANDIDATES_PER_FRAME * config.max_frames)
+        moving = moving[selection.select_frames_by_motion(split, motion[moving], count)]
+    return index[moving].tolist(), int(repeats.sum())
 
 
 def detection_stride(n_frames: int, max_detection_frames: int) -> int:

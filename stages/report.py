@@ -31,6 +31,7 @@ from pipeline.field.setup import evenly_spaced
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.texture_rendering import blur_coverage
 from pipeline.io.image import read_gray, read_rgb, to_uint8, write_rgb
+from pipeline.kernels.common.thread_pool import ThreadPool
 from pipeline.mesh.views import crop_posed_view
 from pipeline.metrics.health import mesh_quality_metrics
 from pipeline.metrics.images import (
@@ -273,15 +274,13 @@ def render_turntables(
     if not is_uniform:
         rows.append(("A-pose, the video's light", avatar.vertices, avatar.light))
         rows += [(f"A-pose, {name}", avatar.vertices, light) for name, light in PREVIEW_LIGHTS.items()]
-    return [
-        (
-            title,
-            avatar.render_turntable(
-                vertices, config.turntable_views, settings.turntable_height_px, config.samples_per_pixel_side, light
-            ),
-        )
-        for title, vertices, light in rows
-    ]
+
+    def render(row: tuple[str, Float[Tensor, "v 3"], VideoLight | None]) -> Turntable:
+        title, vertices, light = row
+        size = config.turntable_views, settings.turntable_height_px, config.samples_per_pixel_side
+        return title, avatar.render_turntable(vertices, *size, light)
+
+    return ThreadPool(len(rows)).map(render, rows)
 
 
 def render_clay_turntables(
@@ -290,15 +289,16 @@ def render_clay_turntables(
     """Render the shape without texture: rows of the A-pose for the clay sheet, and clay in the pose of one frame."""
     mesh, views, height_px = loaded.avatar.mesh(), config.turntable_views, settings.turntable_height_px
     posed = loaded.avatar.pose_vertices(loaded.refined_canonical_to_world[position]).numpy()
-    canonical = render_clay(mesh, views, height_px)
+    meshes = (mesh, Mesh(posed, mesh.faces))
+    pool = ThreadPool(len(meshes))
+    canonical, in_pose = pool.map(lambda each: render_clay(each, views, height_px), meshes)
     rows = [
         ("A-pose, clay", canonical.smooth),
         ("A-pose, clay, flat shading: the triangles", canonical.flat),
         ("A-pose, canonical normals: red to the person's left, green up, blue to the front", canonical.normals),
         ("Head, clay", render_clay_head(mesh, views, settings.clay_head_height_px)),
     ]
-    in_pose = render_clay(Mesh(posed, mesh.faces), views, height_px).smooth
-    return rows, (f"{_pose_title(loaded, position)}, clay", in_pose)
+    return rows, (f"{_pose_title(loaded, position)}, clay", in_pose.smooth)
 
 
 def _pose_title(loaded: FinishedRun, position: int) -> str:
@@ -332,7 +332,7 @@ def _manifest(folder: Path) -> Manifest:
 
 STAGE = Stage(
     name="report",
-    version=10,
+    version=11,
     needs=NEEDS,
     makes=("report.json", "index.html", "turntable.jpg", "clay.jpg", "heldout.jpg"),
     config=Config,

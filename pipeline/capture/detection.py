@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,16 +23,18 @@ from pipeline.capture.matting import (
     extend_mask_on_uniform_background,
     smooth_mask_temporally,
 )
-from pipeline.capture.person_detector import PersonDetector
-from pipeline.capture.worker_pool import WorkerPool
+from pipeline.capture.person_detector import PersonDetection, PersonDetector
 from pipeline.capture.user_files import UserFiles
 from pipeline.capture.video import Frame, FrameSource, downscale, read_frames
+from pipeline.capture.worker_pool import WorkerPool
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track
 from pipeline.io.image import to_uint8, write_gray, write_rgb
 
 # Longer side of the images in which the person is detected: the model sees 256 cells on 1.25 times the person's height.
 DETECTION_SIDE_PX = 640
+# Successive frames in which the person is tracked; groups do not depend on the number of workers.
+_FRAMES_PER_GROUP = 4
 # Longer side of the grey thumbnails with which frames are compared.
 THUMBNAIL_SIDE_PX = 320
 # Minimum mask level of a pixel of the person in a thumbnail.
@@ -104,15 +107,16 @@ def detect_in_frames(
     seen: list[tuple[int, float]] = []
     shape: list[tuple[int, int, float]] = []
 
-    def tasks() -> Iterator[tuple[object, ...]]:
+    def tasks() -> Iterator[_FrameTask]:
         for frame in read_undistorted_frames(source, user_files, wanted.__contains__, max_side_px):
             seen.append((frame.index, frame.time_s))
             shape.append((frame.rgb.shape[0], frame.rgb.shape[1], frame.scale))
             mask = read_user_mask(user_files, frame)
-            yield frame.rgb, mask, needs_landmarks, frame.index in people_count_indices
+            yield _FrameTask(frame.rgb, mask, needs_landmarks, frame.index in people_count_indices)
 
+    groups = workers.map(_detect_in_frames, _grouped(tasks()))
     frame_detections = list(
-        track(workers.map(_detect_in_frame, tasks()), "detecting the person", total=len(frame_indices))
+        track((found for group in groups for found in group), "detecting the person", total=len(frame_indices))
     )
     if not frame_detections:
         raise UserError(f"{source.path} has no readable frame; use another video")
@@ -248,18 +252,43 @@ def _face_detector() -> FaceDetector:
     return detector
 
 
-def _detect_in_frame(
-    rgb: UInt8[np.ndarray, "h w 3"],
-    mask: UInt8[np.ndarray, "h w"] | None,
-    needs_landmarks: bool,
-    needs_people_count: bool,
+class _FrameTask(NamedTuple):
+    """A frame in which the person is detected; `mask`: user-supplied."""
+
+    rgb: UInt8[np.ndarray, "h w 3"]
+    mask: UInt8[np.ndarray, "h w"] | None
+    needs_landmarks: bool
+    needs_people_count: bool
+
+
+def _grouped(tasks: Iterable[_FrameTask]) -> Iterator[tuple[_FrameTask, ...]]:
+    """Yield successive tasks in groups."""
+    waiting = iter(tasks)
+    while group := tuple(islice(waiting, _FRAMES_PER_GROUP)):
+        yield group
+
+
+def _detect_in_frames(*tasks: _FrameTask) -> list[_FrameDetection]:
+    """Detect the person in successive frames, tracked from the first of them (runs in a worker thread)."""
+    reduced = [downscale(task.rgb, DETECTION_SIDE_PX) for task in tasks]
+    detections: list[PersonDetection | None] = [None] * len(tasks)
+    used = [k for k, task in enumerate(tasks) if task.needs_landmarks or task.mask is None]
+    if used:
+        for k, found in zip(used, _detector().track([reduced[k][0] for k in used]), strict=True):
+            if found is not None:
+                detections[k] = replace(found, landmarks_px=found.landmarks_px / np.float32(reduced[k][1]))
+    return [
+        _complete_detection(task, small, detection)
+        for task, (small, _), detection in zip(tasks, reduced, detections, strict=True)
+    ]
+
+
+def _complete_detection(
+    task: _FrameTask, small: UInt8[np.ndarray, "h2 w2 3"], detection: PersonDetection | None
 ) -> _FrameDetection:
-    """Detect the person in one frame (runs in a worker thread)."""
-    small, scale = downscale(rgb, DETECTION_SIDE_PX)
-    detection = _detector().detect(small) if needs_landmarks or mask is None else None
+    """Add hands, face and small pictures to the detection in one frame; people are counted in the reduced image."""
+    rgb, mask, needs_landmarks, needs_people_count = task
     n_people = _detector().count_people(small) if needs_people_count and mask is None else -1
-    if detection is not None:
-        detection = replace(detection, landmarks_px=detection.landmarks_px / np.float32(scale))
     factor = min(1.0, THUMBNAIL_SIDE_PX / max(rgb.shape[:2]))
     size = (max(1, round(rgb.shape[1] * factor)), max(1, round(rgb.shape[0] * factor)))
     gray = cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
@@ -346,7 +375,8 @@ def _write_matted_frame(
     plate: BackgroundPlate,
 ) -> None:
     """Compute and write the matte of one frame (runs in a worker thread)."""
-    masks = np.stack([_decode_mask(data, images.shape[1:3]) for data in masks_png])
+    height, width = images.shape[1:3]
+    masks = np.stack([_decode_mask(data, (height, width)) for data in masks_png])
     mask = extend_mask_on_uniform_background(images[centre], smooth_mask_temporally(images, masks, centre, noise))
     alpha = estimate_alpha_matte(images[centre], mask, plate)
     _write_frame(images[centre], to_uint8(alpha), out, frame_index)

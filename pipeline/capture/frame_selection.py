@@ -75,7 +75,9 @@ def find_distinct_frames(
     return keep, cumulative_motion
 
 
-def find_repeats(gray_thumbnails: UInt8[np.ndarray, "n h w"], threshold: float) -> tuple[Bool[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+def find_repeats(
+    gray_thumbnails: UInt8[np.ndarray, "n h w"], threshold: float
+) -> tuple[Bool[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """Return which frames differ from the last kept one nowhere, and the cumulative motion of all.
 
     A frame repeats another if no block of 16 x 16 pixels differs by more than `threshold` (levels of 255), wherever the
@@ -107,7 +109,7 @@ def select_frames_by_motion(
     quotas = {HELDOUT: share, VALIDATION: share, TRAIN: max(1, max_frames - 2 * share)}
     for kind, quota in quotas.items():
         members = np.flatnonzero(split == kind)
-        chosen[members[evenly_spaced_indices(cumulative_motion[members], quota)]] = True
+        chosen[members[_evenly_spaced_indices(cumulative_motion[members], quota)]] = True
     return chosen
 
 
@@ -136,7 +138,7 @@ def format_frame_ranges(frame_index: Int[np.ndarray, "n"], rows: Bool[np.ndarray
     return ", ".join(str(first) if first == last else f"{first}-{last}" for first, last in spans)
 
 
-def evenly_spaced_indices(cumulative_motion: Float[np.ndarray, "m"], quota: int) -> Int[np.ndarray, "k"]:
+def _evenly_spaced_indices(cumulative_motion: Float[np.ndarray, "m"], quota: int) -> Int[np.ndarray, "k"]:
     """Return `quota` positions in a non-decreasing sequence at which its values are as evenly spaced as possible."""
     if len(cumulative_motion) <= quota:
         return np.arange(len(cumulative_motion))

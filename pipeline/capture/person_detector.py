@@ -12,7 +12,7 @@ landmarks. The last two predictions are averaged, because the second model is se
 import os
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -132,19 +132,41 @@ class PersonDetector:
         centre of the hips, in camera axes (x right, y down, z forward). The mask is soft, 0..255, and smooth at the
         scale of about 1/200 of the person's height, the resolution of the model.
         """
-        with nullcontext() if self._is_stderr_quiet else suppress_stderr():
-            estimates = self._estimate_in_successive_rois(rgb)
+        return self.track([rgb])[0]
+
+    def track(self, images: Sequence[UInt8[np.ndarray, "h w 3"]]) -> list[PersonDetection | None]:
+        """Return the detections in successive images of a recording, see `detect`.
+
+        The first ROI of an image is that of the landmarks of the image before it, where the person was found there.
+        """
+        detections: list[PersonDetection | None] = []
+        square = None
+        for rgb in images:
+            with nullcontext() if self._is_stderr_quiet else suppress_stderr():
+                estimates = self._estimate_in_successive_rois(rgb, square)
+                if not estimates and square is not None:
+                    estimates = self._estimate_in_successive_rois(rgb)
+            self._is_stderr_quiet |= bool(estimates)
+            detections.append(self._mean_detection(estimates))
+            square = estimates[-1].next_square if estimates else None
+        return detections
+
+    def _mean_detection(self, estimates: list[_RoiEstimate]) -> PersonDetection | None:
+        """Return the mean of estimates; None without any."""
         if not estimates:
             return None
-        self._is_stderr_quiet = True
         points = np.mean([estimate.landmarks for estimate in estimates], axis=0)
         world = np.mean([estimate.landmarks_world_m for estimate in estimates], axis=0)
         mask = np.mean([estimate.mask for estimate in estimates], axis=0)
         return PersonDetection(points[:, :2].copy(), points[:, 2].copy(), world, np.rint(255.0 * mask).astype(np.uint8))
 
-    def _estimate_in_successive_rois(self, rgb: UInt8[np.ndarray, "h w 3"]) -> list[_RoiEstimate]:
-        """Return the estimates in the first ROI that contains the person and in the ROI of its landmarks."""
-        previous, current = None, self._estimate_in_roi(rgb, self._roi_graph.process(rgb).square)
+    def _estimate_in_successive_rois(self, rgb: UInt8[np.ndarray, "h w 3"], square: Any = None) -> list[_RoiEstimate]:
+        """Return the estimates in the first ROI that contains the person and in the ROI of its landmarks.
+
+        square: the ROI to begin with; None: that of the first model.
+        """
+        square = self._roi_graph.process(rgb).square if square is None else square
+        previous, current = None, self._estimate_in_roi(rgb, square)
         for _ in range(_MAX_ROI_ITERATIONS):
             if current is None or (previous is not None and not is_roi_too_small(previous)):
                 break
@@ -184,7 +206,6 @@ class PersonDetector:
                 people.append(mask)
         largest = max((mask.sum() for mask in people), default=0)
         return sum(bool(mask.sum() > _MIN_RELATIVE_AREA * largest) for mask in people)
-
 
     def _is_at_a_person(
         self, crop: UInt8[np.ndarray, "h w 3"], left: int, top: int, people: list[Bool[np.ndarray, "h2 w2"]]

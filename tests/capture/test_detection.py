@@ -9,9 +9,9 @@ from pipeline.capture.detection import _temporal_windows, detect_in_frames, writ
 from pipeline.capture.face_detector import undetected_face
 from pipeline.capture.hand_detector import undetected_hands
 from pipeline.capture.person_detector import PersonDetection
-from pipeline.capture.worker_pool import start_worker_pool
 from pipeline.capture.user_files import load_user_files
 from pipeline.capture.video import Frame, open_frame_source
+from pipeline.capture.worker_pool import start_worker_pool
 from pipeline.core.errors import UserError
 from pipeline.io.image import read_gray, read_rgb, write_gray, write_rgb
 from pipeline.io.npz import load_npz, save_npz
@@ -47,6 +47,9 @@ class FakeDetector:
             return None
         mask = np.where(rgb[..., 0] > 100, np.uint8(255), np.uint8(0))
         return PersonDetection(self.landmarks_px, np.full(33, 0.5, np.float32), self.landmarks_world_m, mask)
+
+    def track(self, images):
+        return [self.detect(rgb) for rgb in images]
 
     def count_people(self, rgb):
         return 1

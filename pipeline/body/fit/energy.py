@@ -18,14 +18,13 @@ from pipeline.body.fit.landmark_regressor import (
 )
 from pipeline.body.fit.levenberg_marquardt import NormalEquations
 from pipeline.body.fit.linear_body import LinearBody
-from pipeline.body.fit.posed_points import pose_points, pose_skeleton
+from pipeline.body.fit.posed_points import Contour, pose_points, pose_skeleton
 from pipeline.body.fit.prior.posture import Posture, estimate_posture
 from pipeline.body.fit.prior.priors import PosePrior, ShapePrior
 from pipeline.body.fit.root_placement import world_to_perspective
 from pipeline.body.fit.state import FitState, Observations
 from pipeline.body.fit.terms import (
     ContactTerm,
-    Contour,
     EnergyTerm,
     Landmark3dTerm,
     LandmarkTerm,

@@ -80,6 +80,25 @@ class PosedPoints:
         return PosedPoints(self.rest.select(rows), self.world_m[rows], self.lever_arms_m[rows])
 
 
+@dataclass(frozen=True)
+class Contour:
+    """Point-to-line constraints in the image: normal · (projection - target) = 0.
+
+    corners, barycentric: points on faces of the body, as vertex indices and barycentric coordinates.
+    weight: 0 for padding.
+    """
+
+    corners: Int[Tensor, "n m 3"]
+    barycentric: Float[Tensor, "n m 3"]
+    target_px: Float[Tensor, "n m 2"]
+    normal: Float[Tensor, "n m 2"]
+    weight: Float[Tensor, "n m"]
+
+    def select(self, rows: slice) -> "Contour":
+        """Return the constraints in some frames."""
+        return Contour(*(values[rows] for values in vars(self).values()))
+
+
 def surface_points(
     model: LinearBody, corners: Int[Tensor, "n m 3"], barycentric: Float[Tensor, "n m 3"]
 ) -> SkinnedPoints:

@@ -18,9 +18,8 @@ from torch import Tensor
 
 from pipeline.body.fit.camera_parameters import apply_intrinsics_delta
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody
-from pipeline.body.fit.posed_points import pose_skeleton
+from pipeline.body.fit.posed_points import Contour, pose_skeleton
 from pipeline.body.fit.state import FitState, Observations
-from pipeline.body.fit.terms import Contour
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.skinning import rigid_transform
 from pipeline.kernels.common.thread_pool import ThreadPool
@@ -136,12 +135,12 @@ def outward_normals(distance: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h 
 class PosedBody:
     """The body in every frame, skinned on demand.
 
-    weighted_vertices: w_j (x, y, z, 1) of all joints j, so that skinning is one matrix product; w the skin weights.
+    weighted_vertices: w_j (x, y, z, 1) of all joints j (q = 4 j), w the skin weights: skinning is one matrix product.
     transforms: of the joints in every frame, in the same order, transposed.
     """
 
-    weighted_vertices: Float[Tensor, "v 4*j"]
-    transforms: Float[Tensor, "n 4*j 3"]
+    weighted_vertices: Float[Tensor, "v q"]
+    transforms: Float[Tensor, "n q 3"]
 
     def vertices(self, rows: slice) -> Float[Tensor, "k v 3"]:
         """Return the world vertices (m, float32) in some frames."""
@@ -307,7 +306,9 @@ def match_silhouettes(
 
     def match_chunk(start: int) -> None:
         chunk = windows[start : start + SKIN_CHUNK]
-        for row, (vertices, window) in enumerate(zip(posed.vertices(slice(start, start + len(chunk))), chunk, strict=True)):
+        for row, (vertices, window) in enumerate(
+            zip(posed.vertices(slice(start, start + len(chunk))), chunk, strict=True)
+        ):
             if window is not None:
                 match(start + row, vertices, window)
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.body.fit.camera_parameters import (
@@ -30,6 +30,7 @@ from pipeline.body.fit.landmark_regressor import (
 from pipeline.body.fit.levenberg_marquardt import NormalEquations, robust_weights
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody
 from pipeline.body.fit.posed_points import (
+    Contour,
     PosedPoints,
     PosedSkeleton,
     pose_jacobian_rows,
@@ -173,9 +174,7 @@ class Landmark3dTerm:
     scale: Float[Tensor, "3"]
 
     @classmethod
-    def fitted_to(
-        cls, observations: Observations, std_m: float, cutoff: float, at: Linearisation
-    ) -> "Landmark3dTerm":
+    def fitted_to(cls, observations: Observations, std_m: float, cutoff: float, at: Linearisation) -> "Landmark3dTerm":
         """Return the term with the scale of least cost at a state of all frames."""
         unit = cls(observations, std_m, cutoff, torch.ones(3, dtype=torch.float64))
         return replace(unit, scale=fit_3d_landmark_scale(*unit._in_camera_axes(at), cutoff))
@@ -211,25 +210,6 @@ class Landmark3dTerm:
                 residual[..., axis],
                 weight,
             )
-
-
-@dataclass(frozen=True)
-class Contour:
-    """Point-to-line constraints in the image: normal · (projection - target) = 0.
-
-    corners, barycentric: points on faces of the body, as vertex indices and barycentric coordinates.
-    weight: 0 for padding.
-    """
-
-    corners: Int[Tensor, "n m 3"]
-    barycentric: Float[Tensor, "n m 3"]
-    target_px: Float[Tensor, "n m 2"]
-    normal: Float[Tensor, "n m 2"]
-    weight: Float[Tensor, "n m"]
-
-    def select(self, rows: slice) -> "Contour":
-        """Return the constraints in some frames."""
-        return Contour(*(values[rows] for values in vars(self).values()))
 
 
 @dataclass(frozen=True)

@@ -133,7 +133,6 @@ class _Problem:
             [pixels.ravel(), asymmetry.ravel(), np.array(gauge) / 1e-3, unknowns[-1:] / self.focal_log_std]
         )
 
-
     def jacobian(self, unknowns: Float[np.ndarray, "u"]) -> Float[np.ndarray, "r u"]:
         """Return the derivative of the residuals."""
         body, yaw, _, (_, right, towards, focal_log) = self.unpack(unknowns)
