@@ -1,11 +1,9 @@
 """report: scores of held-out frames, cost of all stages, and a page that shows them."""
 
 import time
-from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -69,8 +67,11 @@ PREVIEW_LIGHTS = {
 }
 """Lights, other than that of the video, under which the report shows the avatar."""
 
+
 Turntable = tuple[str, list[UInt8[np.ndarray, "_ _ 4"]]]
 """Title of a row, and its views from all sides."""
+
+Result = TypeVar("Result")
 
 
 class Config(BaseConfig):
@@ -224,19 +225,27 @@ def score_frames(
         }
     weights = find_lpips_weights()
     shown = set(positions[np.linspace(0, len(positions) - 1, config.max_page_frames).round().astype(int)].tolist())
-    rows, frame_images = [], []
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        for position in track(positions.tolist(), "held-out frames"):
-            image, mask = (to_uint8(part(position)) for part in (loaded.capture.image, loaded.capture.mask))
-            renders = {name: render(poses[position], position) for name, (render, poses) in renderers.items()}
-            softened = blur_coverage(renders["mesh_sharp"], blur_px)
-            renders = {"field": renders["field"], "mesh": softened} | renders
-            index = int(loaded.capture.frame_index[position])
-            scores = pool.map(partial(frame_scores, image=image, mask=mask, lpips_weights=weights), renders.values())
-            rows.append({"index": index} | dict(zip(renders, scores, strict=True)))
-            if position in shown:
-                frame_images.append(_frame_images(index, image, mask, renders, settings.crop_margin_px))
-    return rows, frame_images
+
+    def score(position: int) -> tuple[dict[str, Any], FrameImages | None]:
+        image, mask = (to_uint8(part(position)) for part in (loaded.capture.image, loaded.capture.mask))
+        renders = {name: render(poses[position], position) for name, (render, poses) in renderers.items()}
+        softened = blur_coverage(renders["mesh_sharp"], blur_px)
+        renders = {"field": renders["field"], "mesh": softened} | renders
+        index = int(loaded.capture.frame_index[position])
+        scores = {name: frame_scores(rgba, image, mask, weights) for name, rgba in renders.items()}
+        pictures = _frame_images(index, image, mask, renders, settings.crop_margin_px) if position in shown else None
+        return {"index": index} | scores, pictures
+
+    scored = list(track(_side_by_side(score, positions.tolist()), "held-out frames", total=len(positions)))
+    return [row for row, _ in scored], [pictures for _, pictures in scored if pictures is not None]
+
+
+def _side_by_side(function: Callable[[int], Result], items: Sequence[int]) -> Iterator[Result]:
+    """Yield the results for all items in order; a few at a time are computed, each with one thread."""
+    threads = torch.get_num_threads()
+    pool = ThreadPool(threads)
+    for start in range(0, len(items), 2 * threads):
+        yield from pool.map(function, items[start : start + 2 * threads])
 
 
 def fit_heldout_poses(loaded: FinishedRun, positions: np.ndarray, steps: int) -> Float[Tensor, "n j 4 4"]:
