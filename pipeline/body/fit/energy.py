@@ -40,7 +40,7 @@ from pipeline.kernels.common.thread_pool import ThreadPool
 
 FRAMES_PER_CHUNK = 16
 """Frames whose image terms are evaluated together: the largest of their arrays (2 MB) stays in the cache of a core,
-and memory does not grow with the recording. On any machine the same, so that sums have the same order."""
+and they do not grow with the recording. On any machine the same, so that sums have the same order."""
 
 VERTICAL_PRINCIPAL_POINT_RATIO = 0.2
 """Standard deviation of the principal point down the image over the one across it. A pitch of the camera shows the same
