@@ -64,7 +64,7 @@ OPTIONS = $(RUN_OPTIONS) $(ARGS)
 STAMP := $(VENV)/.stamp$(if $(EXTRA),-$(EXTRA))
 
 .DEFAULT_GOAL := help
-.PHONY: help all $(STAGES) batch chart ablate stress pose film retexture stylise reshape compare figures materials test test-all check format bench bench-field bench-body doctor venv lock configs gltf-validator clean
+.PHONY: help all $(STAGES) batch chart ablate stress pose film retexture stylise reshape compare figures materials test test-all check format bench bench-field bench-body bench-way doctor venv lock configs gltf-validator clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z$$()A-Z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST) | sed 's/$$(STAGES)/STAGE    /'
@@ -160,6 +160,9 @@ bench-field: $(STAMP)  ## time each part of a training step: RUN=runs/name or a 
 
 bench-body: $(STAMP)  ## compare frames and body with the ground truth of synthetic CAPTURES
 	$(RUN_PYTHON) -m tests.bench.bench_body $(CAPTURES) $(ARGS)
+
+bench-way: $(STAMP)  ## time each stage of the finished run RUN=runs/name and its parts; JSON=file
+	$(RUN_PYTHON) -m tests.bench.bench_way "$(ONE_RUN)" $(if $(JSON),--json "$(JSON)") $(ARGS)
 
 doctor:  ## check the requirements of this machine
 	@$(PYTHON) -m scripts.doctor

@@ -73,8 +73,7 @@ def reconstruct(
         overrides: options by "section.key", for instance {"mesh.max_faces": 30000}; the run folder records them.
         force: run every stage, even if its result is fresh.
         isolate: run each stage in a process of its own, as the command does: it returns its memory and cannot crash
-            this process. False runs all stages in this process, for debugging; a script then needs the guard
-            `if __name__ == "__main__":`, because the stage `frames` starts worker processes.
+            this process. False runs all stages in this process, for debugging.
         progress: called with the `Progress` of the run; an exception that it raises stops the run.
 
     Raises:

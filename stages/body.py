@@ -1,6 +1,7 @@
 """body: fit one parametric body, its pose in every frame and the camera to landmarks and masks."""
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal
 
@@ -33,7 +34,7 @@ from pipeline.body.fit.fit import FitOptions, TooFewLandmarksError, fit_supplied
 from pipeline.body.fit.hand_observations import filter_hand_detections, finger_curls_rad
 from pipeline.body.fit.rejection import fit_body_without_others
 from pipeline.body.fit.result import FitResult
-from pipeline.body.fit.silhouette_icp import crop_mask_window
+from pipeline.body.fit.silhouette_icp import MaskWindow, crop_mask_window
 from pipeline.body.fit.supplied_poses import SuppliedPoses
 from pipeline.body.fit.vertical.gravity import camera_tilt_deg
 from pipeline.body.foreign_objects import foreign_object_warnings, frames_with_foreign_objects, residual_blob_shares
@@ -76,9 +77,7 @@ class Config(BaseConfig):
         description="field of view along the longer image side, degrees; null: from the metadata, or estimated",
     )
     shared_frames: int = Field(48, ge=8, le=500, description="frames used to estimate shape and focal length")
-    rounds: int = Field(
-        8, ge=1, le=50, description="silhouette matching rounds of the estimate of shape and focal length"
-    )
+    rounds: int = Field(8, ge=1, le=50, description="largest number of silhouette matchings for shape and focal length")
     supplied_poses: Literal["keep", "start", "ignore"] = Field(
         "keep",
         description="use of a supplied smpl_poses.npz (needs an SMPL model_file): keep its shape and poses; start: "
@@ -107,16 +106,16 @@ def run(
         UserError: an input cannot be read, or the fit is worse than the options allow.
     """
     capture = load_capture(inputs["frames"])
-    masks = [to_uint8(capture.mask(position)) for position in range(len(capture))]
+    windows = read_mask_windows(capture)
     hands = filter_hand_detections(capture.hands or undetected_hands(len(capture)), capture.landmarks_px)
-    result = fit_capture(capture, hands, masks, config, settings)
+    result = fit_capture(capture, hands, windows, config, settings)
     motion = Motion(capture.frame_index, capture.time_s, result.rotations_wxyz, result.root_translation_m)
     left_right_swapped = np.stack(list(result.left_right_swapped.values())).any(axis=0)
     save_body(out / _BODY, result.body)
     save_motion(out / _MOTION, motion)
     save_camera(out / _CAMERA, result.camera)
     save_observations(out / _OBSERVATIONS, result.observations, result.landmarks_m)
-    blob_shares = residual_blob_shares(result.body, canonical_to_world(result.body, motion), result.camera, masks)
+    blob_shares = residual_blob_shares(result.body, canonical_to_world(result.body, motion), result.camera, windows)
     usable, training = usable_frames(result), capture.split == TRAIN
     scores = FrameScores(
         frame_index=capture.frame_index,
@@ -128,7 +127,7 @@ def run(
     )
     save_scores(out / SCORES_NPZ, scores)
     has_foreign_object = frames_with_foreign_objects(blob_shares)
-    write_rgb(out / _OVERLAY, draw_overlay_grid(capture, masks, result, motion, has_foreign_object))
+    write_rgb(out / _OVERLAY, draw_overlay_grid(capture, result, motion, has_foreign_object))
     for message in fit_warnings(result, capture.frame_index, training) + foreign_object_warnings(
         blob_shares, capture.frame_index
     ):
@@ -155,16 +154,26 @@ def run(
     }
 
 
+def read_mask_windows(capture: Capture) -> list[MaskWindow | None]:
+    """Return each frame's mask in its matching window (None if it is empty), all that the fit needs of it."""
+
+    def read(position: int) -> MaskWindow | None:
+        return crop_mask_window(to_uint8(capture.mask(position)))
+
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        return list(pool.map(read, range(len(capture))))
+
+
 def fit_capture(
     capture: Capture,
     hands: HandLandmarks,
-    masks: Sequence[UInt8[np.ndarray, "h w"]],
+    windows: Sequence[MaskWindow | None],
     config: Config,
     settings: FitSettings = DEFAULT_SETTINGS,
 ) -> FitResult:
     """Fit the body to a capture and check the quality of the fit.
 
-    hands: from `filter_hand_detections`. masks: 0 to 255, one for each frame.
+    hands: from `filter_hand_detections`. windows: of the masks, from `read_mask_windows`.
 
     Raises:
         UserError: too few landmarks, an unreadable model file, or a fit worse than the options allow.
@@ -185,7 +194,6 @@ def fit_capture(
         capture.camera_pose_is_known,
         settings,
     )
-    windows = [crop_mask_window(mask) for mask in masks]
     model = load_anny() if config.model_file is None else load_smpl(Path(config.model_file))
     supplied = load_supplied_poses(capture, model, camera, focal_relative_std == 0.0, config)
     try:
@@ -278,7 +286,6 @@ def initial_camera(capture: Capture, config: Config, settings: FitSettings = DEF
 
 def draw_overlay_grid(
     capture: Capture,
-    masks: Sequence[UInt8[np.ndarray, "h w"]],
     result: FitResult,
     motion: Motion,
     has_foreign_object: Bool[np.ndarray, "n"],
@@ -290,7 +297,7 @@ def draw_overlay_grid(
     tiles = [
         draw_overlay(
             to_uint8(capture.image(int(position))),
-            masks[position],
+            to_uint8(capture.mask(int(position))),
             pose_vertices(result.body, transforms[tile]),
             result.body,
             result.camera,
@@ -304,7 +311,7 @@ def draw_overlay_grid(
 
 STAGE = Stage(
     "body",
-    version=18,
+    version=19,
     needs=("frames",),
     makes=(_BODY, _MOTION, _CAMERA, _OBSERVATIONS, SCORES_NPZ, _OVERLAY),
     config=Config,

@@ -12,13 +12,13 @@ from pydantic import Field
 from pipeline.capture import frame_selection as selection
 from pipeline.capture.capture import CONTACT_SHEET, FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, Capture, save_capture
 from pipeline.capture.contact_sheet import contact_sheet
-from pipeline.capture.detection import Detections, detect_in_frames, write_frames
+from pipeline.capture.detection import THUMBNAIL_SIDE_PX, Detections, detect_in_frames, write_frames
 from pipeline.capture.disjoint_split import assign_disjoint_splits
 from pipeline.capture.exif_focal import metadata_focal_px
 from pipeline.capture.input_checks import check_input, warn_about_input
-from pipeline.capture.process_pool import start_process_pool
 from pipeline.capture.user_files import UserFiles, UserSplit, load_user_files
-from pipeline.capture.video import DEFAULT_IMAGE_FPS, FrameSource, open_frame_source
+from pipeline.capture.video import DEFAULT_IMAGE_FPS, FrameSource, open_frame_source, read_thumbnails
+from pipeline.capture.worker_pool import start_worker_pool
 from pipeline.core.cli import main
 from pipeline.core.config import Config as BaseConfig
 from pipeline.core.errors import UserError
@@ -26,6 +26,8 @@ from pipeline.core.stage import Stage
 from pipeline.io.image import write_rgb
 
 _PEOPLE_COUNT_FRAMES = 6
+_CANDIDATES_PER_FRAME = 1.25
+"""Frames in which the person is detected for each that is used: detections tell motion and duplicates better."""
 
 
 class Config(BaseConfig):
@@ -39,9 +41,7 @@ class Config(BaseConfig):
         200, ge=16, le=2000, description="maximum number of selected frames, held-out frames included"
     )
     min_frames: int = Field(16, ge=5, le=1000, description="minimum number of frames with a person")
-    max_detection_frames: int = Field(
-        900, ge=16, description="maximum number of frames in which the person is detected"
-    )
+    max_detection_frames: int = Field(900, ge=16, description="maximum number of frames that are looked at")
     max_side_px: int = Field(1280, ge=64, le=8192, description="maximum longer side of the stored images, px")
     duplicate_threshold_noise_ratio: float = Field(
         3.0,
@@ -52,7 +52,7 @@ class Config(BaseConfig):
     fps: float | None = Field(
         None, gt=0.0, le=1000.0, description="frame rate of an image folder, 1/s; null: 30. A video has its own"
     )
-    workers: int = Field(2, ge=1, le=64, description="processes for detection and matting")
+    workers: int = Field(2, ge=1, le=64, description="threads for detection and matting")
 
 
 def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, float]:
@@ -65,8 +65,8 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     user_files = load_user_files(inputs["video"], source)
     if user_files.split is not None and config.split == "disjoint":
         raise UserError(f"{inputs['video']} has a split.json, which frames.split=disjoint would ignore; remove one")
-    with start_process_pool(config.workers) as workers:
-        frame_indices = select_detection_frames(source, user_files, config)
+    with start_worker_pool(config.workers) as workers:
+        frame_indices, n_repeats = select_detection_frames(source, user_files, config)
         detections = detect_in_frames(
             source, user_files, frame_indices, _PEOPLE_COUNT_FRAMES, config.max_side_px, workers
         )
@@ -92,7 +92,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
         "frames_heldout": len(capture.positions(selection.HELDOUT)),
         "video_frames": source.n_frames,
         "dropped_no_person": int((~detections.found).sum()),
-        "dropped_duplicates": selected.n_duplicates,
+        "dropped_duplicates": n_repeats + selected.n_duplicates,
         "noise_levels": noise,
         "landmark_visibility": float(capture.landmarks_visibility.mean()),
         "hands_found": float((detections.hands.handedness_score[chosen] > 0.0).mean()),
@@ -102,21 +102,37 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     }
 
 
-def select_detection_frames(source: FrameSource, user_files: UserFiles, config: Config) -> Sequence[int]:
-    """Return the indices of frames for detection: those of a user-supplied split, else evenly spaced.
+def select_detection_frames(source: FrameSource, user_files: UserFiles, config: Config) -> tuple[Sequence[int], int]:
+    """Return the indices of frames for detection, and the number of repeated frames that were left out.
+
+    These are the frames of a user-supplied split. Else, of a recording with more frames than are used, small pictures
+    are looked at first: repeats are left out, and of the others somewhat more than used are chosen by motion.
 
     Raises:
         UserError: the split lists more frames than the option allows.
     """
     if user_files.split is None:
-        return range(0, source.n_frames, detection_stride(source.n_frames, config.max_detection_frames))
+        every = range(0, source.n_frames, detection_stride(source.n_frames, config.max_detection_frames))
+        return (every, 0) if len(every) <= config.max_frames else select_moving_frames(source, every, config)
     listed: list[int] = user_files.split.frame_index.tolist()
     if len(listed) > config.max_frames:
         raise UserError(
             f"split.json of {source.path} lists {len(listed)} frames, frames.max_frames is {config.max_frames}; "
             f"list fewer, or allow them with --set frames.max_frames={len(listed)}"
         )
-    return listed
+    return listed, 0
+
+
+def select_moving_frames(source: FrameSource, indices: range, config: Config) -> tuple[Sequence[int], int]:
+    """Return frames at equal steps of motion, `_CANDIDATES_PER_FRAME` for each that is used, and count the repeats."""
+    index, thumbnails = read_thumbnails(source, set(indices).__contains__, THUMBNAIL_SIDE_PX)
+    noise = selection.estimate_noise_level(thumbnails)
+    repeats, motion = selection.find_repeats(thumbnails, config.duplicate_threshold_noise_ratio * noise)
+    moving = np.flatnonzero(~repeats)
+    if config.split == "interleaved":  # a disjoint split is made of what is detected in all frames
+        split, count = selection.assign_splits(index[moving]), round(_CANDIDATES_PER_FRAME * config.max_frames)
+        moving = moving[selection.select_frames_by_motion(split, motion[moving], count)]
+    return index[moving].tolist(), int(repeats.sum())
 
 
 def detection_stride(n_frames: int, max_detection_frames: int) -> int:
@@ -214,7 +230,7 @@ def make_capture(
 
 STAGE = Stage(
     "frames",
-    version=12,
+    version=13,
     needs=("video",),
     makes=(FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, CONTACT_SHEET),
     config=Config,

@@ -1,11 +1,9 @@
 """report: scores of held-out frames, cost of all stages, and a page that shows them."""
 
 import time
-from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -31,6 +29,7 @@ from pipeline.field.setup import evenly_spaced
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.texture_rendering import blur_coverage
 from pipeline.io.image import read_gray, read_rgb, to_uint8, write_rgb
+from pipeline.kernels.common.thread_pool import ThreadPool
 from pipeline.mesh.views import crop_posed_view
 from pipeline.metrics.health import mesh_quality_metrics
 from pipeline.metrics.images import (
@@ -68,8 +67,11 @@ PREVIEW_LIGHTS = {
 }
 """Lights, other than that of the video, under which the report shows the avatar."""
 
+
 Turntable = tuple[str, list[UInt8[np.ndarray, "_ _ 4"]]]
 """Title of a row, and its views from all sides."""
+
+Result = TypeVar("Result")
 
 
 class Config(BaseConfig):
@@ -223,19 +225,27 @@ def score_frames(
         }
     weights = find_lpips_weights()
     shown = set(positions[np.linspace(0, len(positions) - 1, config.max_page_frames).round().astype(int)].tolist())
-    rows, frame_images = [], []
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        for position in track(positions.tolist(), "held-out frames"):
-            image, mask = (to_uint8(part(position)) for part in (loaded.capture.image, loaded.capture.mask))
-            renders = {name: render(poses[position], position) for name, (render, poses) in renderers.items()}
-            softened = blur_coverage(renders["mesh_sharp"], blur_px)
-            renders = {"field": renders["field"], "mesh": softened} | renders
-            index = int(loaded.capture.frame_index[position])
-            scores = pool.map(partial(frame_scores, image=image, mask=mask, lpips_weights=weights), renders.values())
-            rows.append({"index": index} | dict(zip(renders, scores, strict=True)))
-            if position in shown:
-                frame_images.append(_frame_images(index, image, mask, renders, settings.crop_margin_px))
-    return rows, frame_images
+
+    def score(position: int) -> tuple[dict[str, Any], FrameImages | None]:
+        image, mask = (to_uint8(part(position)) for part in (loaded.capture.image, loaded.capture.mask))
+        renders = {name: render(poses[position], position) for name, (render, poses) in renderers.items()}
+        softened = blur_coverage(renders["mesh_sharp"], blur_px)
+        renders = {"field": renders["field"], "mesh": softened} | renders
+        index = int(loaded.capture.frame_index[position])
+        scores = {name: frame_scores(rgba, image, mask, weights) for name, rgba in renders.items()}
+        pictures = _frame_images(index, image, mask, renders, settings.crop_margin_px) if position in shown else None
+        return {"index": index} | scores, pictures
+
+    scored = list(track(_side_by_side(score, positions.tolist()), "held-out frames", total=len(positions)))
+    return [row for row, _ in scored], [pictures for _, pictures in scored if pictures is not None]
+
+
+def _side_by_side(function: Callable[[int], Result], items: Sequence[int]) -> Iterator[Result]:
+    """Yield the results for all items in order; a few at a time are computed, each with one thread."""
+    threads = torch.get_num_threads()
+    pool = ThreadPool(threads)
+    for start in range(0, len(items), 2 * threads):
+        yield from pool.map(function, items[start : start + 2 * threads])
 
 
 def fit_heldout_poses(loaded: FinishedRun, positions: np.ndarray, steps: int) -> Float[Tensor, "n j 4 4"]:
@@ -273,15 +283,13 @@ def render_turntables(
     if not is_uniform:
         rows.append(("A-pose, the video's light", avatar.vertices, avatar.light))
         rows += [(f"A-pose, {name}", avatar.vertices, light) for name, light in PREVIEW_LIGHTS.items()]
-    return [
-        (
-            title,
-            avatar.render_turntable(
-                vertices, config.turntable_views, settings.turntable_height_px, config.samples_per_pixel_side, light
-            ),
-        )
-        for title, vertices, light in rows
-    ]
+
+    def render(row: tuple[str, Float[Tensor, "v 3"], VideoLight | None]) -> Turntable:
+        title, vertices, light = row
+        size = config.turntable_views, settings.turntable_height_px, config.samples_per_pixel_side
+        return title, avatar.render_turntable(vertices, *size, light)
+
+    return ThreadPool(len(rows)).map(render, rows)
 
 
 def render_clay_turntables(
@@ -290,15 +298,16 @@ def render_clay_turntables(
     """Render the shape without texture: rows of the A-pose for the clay sheet, and clay in the pose of one frame."""
     mesh, views, height_px = loaded.avatar.mesh(), config.turntable_views, settings.turntable_height_px
     posed = loaded.avatar.pose_vertices(loaded.refined_canonical_to_world[position]).numpy()
-    canonical = render_clay(mesh, views, height_px)
+    meshes = (mesh, Mesh(posed, mesh.faces))
+    pool = ThreadPool(len(meshes))
+    canonical, in_pose = pool.map(lambda each: render_clay(each, views, height_px), meshes)
     rows = [
         ("A-pose, clay", canonical.smooth),
         ("A-pose, clay, flat shading: the triangles", canonical.flat),
         ("A-pose, canonical normals: red to the person's left, green up, blue to the front", canonical.normals),
         ("Head, clay", render_clay_head(mesh, views, settings.clay_head_height_px)),
     ]
-    in_pose = render_clay(Mesh(posed, mesh.faces), views, height_px).smooth
-    return rows, (f"{_pose_title(loaded, position)}, clay", in_pose)
+    return rows, (f"{_pose_title(loaded, position)}, clay", in_pose.smooth)
 
 
 def _pose_title(loaded: FinishedRun, position: int) -> str:
@@ -332,7 +341,7 @@ def _manifest(folder: Path) -> Manifest:
 
 STAGE = Stage(
     name="report",
-    version=10,
+    version=11,
     needs=NEEDS,
     makes=("report.json", "index.html", "turntable.jpg", "clay.jpg", "heldout.jpg"),
     config=Config,

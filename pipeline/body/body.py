@@ -198,6 +198,10 @@ class ParametricBody(Protocol):
         """Return the A-pose vertices (v, 3) and joints (j, 3) of a shape, metres."""
         ...
 
+    def rest_poses(self, shapes: Tensor) -> tuple[Tensor, Tensor]:
+        """Return `rest_pose` of several shapes (b, p): (b, v, 3) and (b, j, 3)."""
+        ...
+
     def at_shape(self, shape: Tensor) -> Body:
         """Return the body of one shape."""
         ...
@@ -254,19 +258,26 @@ class AnnyBody:
 
         shape: ordered as `shape_names`.
         """
-        values = {name: shape[i : i + 1] for i, name in enumerate(self.shape_names)}
+        vertices, joints_m = self.rest_poses(shape[None])
+        return vertices[0], joints_m[0]
+
+    def rest_poses(self, shapes: Float[Tensor, "b p"]) -> tuple[Float[Tensor, "b v 3"], Float[Tensor, "b j 3"]]:
+        """Return `rest_pose` of several shapes, whose blend shapes (90 MB) are then read once."""
+        values = {name: shapes[:, i] for i, name in enumerate(self.shape_names)}
         coefficients = self._model.get_phenotype_blendshape_coefficients(
             **{name: values[name] for name in PHENOTYPE_DEFAULTS},
             local_changes={label: values[name] for name, labels in LOCAL_CHANGES.items() for label in labels},
         )
-        vertices = self._model.get_rest_vertices(coefficients)[0]
+        vertices = self._model.get_rest_vertices(coefficients)
         heads = self._model.template_bone_heads + torch.einsum(
-            "k,kjc->jc", coefficients[0], self._model.bone_heads_blendshapes
+            "bk,kjc->bjc", coefficients, self._model.bone_heads_blendshapes
         )
         to_y_up = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
         vertices, joints_m = vertices @ to_y_up.T, heads @ to_y_up.T
-        origin = torch.stack([joints_m[0, 0], vertices[:, 1].min(), joints_m[0, 2]])
-        return (vertices - origin) * values[SCALE], (joints_m - origin) * values[SCALE]
+        root_m = joints_m[:, 0]
+        origin = torch.stack([root_m[:, 0], vertices[..., 1].amin(1), root_m[:, 2]], dim=1)[:, None]
+        scale = values[SCALE][:, None, None]
+        return (vertices - origin) * scale, (joints_m - origin) * scale
 
     def at_shape(self, shape: Float[Tensor, "p"]) -> Body:
         """Return the body of one shape."""

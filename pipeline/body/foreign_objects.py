@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pipeline.body.body import Body
-from pipeline.body.fit.silhouette_icp import crop_mask_window, distance_px, rasterise_in_window
+from pipeline.body.fit.silhouette_icp import MaskWindow, distance_px, rasterise_in_window
 from pipeline.body.overlay import pose_vertices
 from pipeline.capture.frame_selection import format_frame_ranges
 from pipeline.geometry.camera import Camera
@@ -39,13 +39,15 @@ def residual_blob_shares(
     body: Body,
     canonical_to_world: Float[Tensor, "n j 4 4"],
     camera: Camera,
-    masks: Sequence[UInt8[np.ndarray, "h w"]],
+    windows: Sequence[MaskWindow | None],
 ) -> Float[np.ndarray, "n"]:
-    """Return `residual_blob_share` of every frame; nan where the mask is empty."""
+    """Return `residual_blob_share` of every frame; nan where the mask is empty.
+
+    windows: of the masks, from `crop_mask_window`.
+    """
     faces = torch.as_tensor(body.faces)
-    shares = np.full(len(masks), np.nan)
-    for frame, mask in enumerate(masks):
-        window = crop_mask_window(mask)
+    shares = np.full(len(windows), np.nan)
+    for frame, window in enumerate(windows):
         if window is not None:
             body_raster = rasterise_in_window(pose_vertices(body, canonical_to_world[frame]), faces, camera, window)
             shares[frame] = residual_blob_share(window.mask, body_raster.face_id >= 0, window.person_px)

@@ -134,6 +134,11 @@ class SmplBody:
         origin = torch.stack([joints_m[0, 0], vertices[:, 1].min(), joints_m[0, 2]])
         return vertices - origin, joints_m - origin
 
+    def rest_poses(self, shapes: Float[Tensor, "b p"]) -> tuple[Float[Tensor, "b v 3"], Float[Tensor, "b j 3"]]:
+        """Return `rest_pose` of several shapes."""
+        vertices, joints_m = zip(*map(self.rest_pose, shapes), strict=True)
+        return torch.stack(vertices), torch.stack(joints_m)
+
     def at_shape(self, shape: Float[Tensor, "p"]) -> Body:
         """Return the body of one shape (betas)."""
         return body_at_shape(self, shape)

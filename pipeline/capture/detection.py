@@ -1,8 +1,9 @@
 """Two passes over a recording: detect the person in the frames, then write the selected frames with their masks."""
 
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,16 +23,20 @@ from pipeline.capture.matting import (
     extend_mask_on_uniform_background,
     smooth_mask_temporally,
 )
-from pipeline.capture.person_detector import PersonDetector
-from pipeline.capture.process_pool import ProcessPool
+from pipeline.capture.person_detector import PersonDetection, PersonDetector
 from pipeline.capture.user_files import UserFiles
-from pipeline.capture.video import Frame, FrameSource, read_frames
+from pipeline.capture.video import Frame, FrameSource, downscale, read_frames
+from pipeline.capture.worker_pool import WorkerPool
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track
 from pipeline.io.image import to_uint8, write_gray, write_rgb
 
+# Longer side of the images in which the person is detected: the model sees 256 cells on 1.25 times the person's height.
+DETECTION_SIDE_PX = 640
+# Successive frames in which the person is tracked; groups do not depend on the number of workers.
+_FRAMES_PER_GROUP = 4
 # Longer side of the grey thumbnails with which frames are compared.
-_THUMBNAIL_SIDE_PX = 320
+THUMBNAIL_SIDE_PX = 320
 # Minimum mask level of a pixel of the person in a thumbnail.
 _MIN_PERSON_LEVEL = 100
 # Minimum mask area relative to the median; smaller masks are specks.
@@ -58,7 +63,7 @@ class Detections:
 
     found: the mask shows the person (without landmarks if masks are user-supplied).
     gray_thumbnails, person_masks: small images and binary masks.
-    masks_png: soft masks of the detector, PNG-encoded to save memory.
+    masks_png: soft masks of the detector, PNG-encoded to save memory, of at most `DETECTION_SIDE_PX`.
     landmarks, hands and faces_px as in `Capture`, nan where unknown. n_people: -1 where people were not counted.
     """
 
@@ -85,7 +90,7 @@ def detect_in_frames(
     frame_indices: Sequence[int],
     n_people_count_frames: int,
     max_side_px: int,
-    workers: ProcessPool,
+    workers: WorkerPool,
 ) -> Detections:
     """Detect the person in the frames `frame_indices`, and count people in `n_people_count_frames` of them.
 
@@ -102,15 +107,16 @@ def detect_in_frames(
     seen: list[tuple[int, float]] = []
     shape: list[tuple[int, int, float]] = []
 
-    def tasks() -> Iterator[tuple[object, ...]]:
+    def tasks() -> Iterator[_FrameTask]:
         for frame in read_undistorted_frames(source, user_files, wanted.__contains__, max_side_px):
             seen.append((frame.index, frame.time_s))
             shape.append((frame.rgb.shape[0], frame.rgb.shape[1], frame.scale))
             mask = read_user_mask(user_files, frame)
-            yield frame.rgb, mask, needs_landmarks, frame.index in people_count_indices
+            yield _FrameTask(frame.rgb, mask, needs_landmarks, frame.index in people_count_indices)
 
+    groups = workers.map(_detect_in_frames, _grouped(tasks()))
     frame_detections = list(
-        track(workers.map(_detect_in_frame, tasks()), "detecting the person", total=len(frame_indices))
+        track((found for group in groups for found in group), "detecting the person", total=len(frame_indices))
     )
     if not frame_detections:
         raise UserError(f"{source.path} has no readable frame; use another video")
@@ -144,7 +150,7 @@ def write_frames(
     out: Path,
     max_side_px: int,
     noise: float,
-    workers: ProcessPool,
+    workers: WorkerPool,
 ) -> None:
     """Write image and mask of the detections at `positions` into `out`.
 
@@ -184,7 +190,8 @@ def estimate_background(
     is_taken = set(detections.frame_index[sampled].tolist()).__contains__
     images = np.stack([frame.rgb for frame in read_undistorted_frames(source, user_files, is_taken, max_side_px)])
     return estimate_background_plate(
-        images, np.stack([~definite_background(_decode_mask(detections.masks_png[p])) for p in sampled])
+        images,
+        np.stack([~definite_background(_decode_mask(detections.masks_png[p], images.shape[1:3])) for p in sampled]),
     )
 
 
@@ -218,34 +225,71 @@ def read_user_mask(user_files: UserFiles, frame: Frame) -> UInt8[np.ndarray, "h 
     return mask if user_files.camera is None else user_files.camera.undistort(mask[..., None], frame.scale)[..., 0]
 
 
-@cache
+_of_thread = threading.local()
+
+
 def _detector() -> PersonDetector:
-    """Return the detector of this process; loading takes seconds."""
-    return PersonDetector()
+    """Return the detector of this thread; loading takes a second."""
+    if not hasattr(_of_thread, "person"):
+        _of_thread.person = PersonDetector()
+    detector: PersonDetector = _of_thread.person
+    return detector
 
 
-@cache
 def _hand_detector() -> HandDetector:
-    """Return the hand detector of this process."""
-    return HandDetector()
+    """Return the hand detector of this thread."""
+    if not hasattr(_of_thread, "hand"):
+        _of_thread.hand = HandDetector()
+    detector: HandDetector = _of_thread.hand
+    return detector
 
 
-@cache
 def _face_detector() -> FaceDetector:
-    """Return the face detector of this process."""
-    return FaceDetector()
+    """Return the face detector of this thread."""
+    if not hasattr(_of_thread, "face"):
+        _of_thread.face = FaceDetector()
+    detector: FaceDetector = _of_thread.face
+    return detector
 
 
-def _detect_in_frame(
-    rgb: UInt8[np.ndarray, "h w 3"],
-    mask: UInt8[np.ndarray, "h w"] | None,
-    needs_landmarks: bool,
-    needs_people_count: bool,
+class _FrameTask(NamedTuple):
+    """A frame in which the person is detected; `mask`: user-supplied."""
+
+    rgb: UInt8[np.ndarray, "h w 3"]
+    mask: UInt8[np.ndarray, "h w"] | None
+    needs_landmarks: bool
+    needs_people_count: bool
+
+
+def _grouped(tasks: Iterable[_FrameTask]) -> Iterator[tuple[_FrameTask, ...]]:
+    """Yield successive tasks in groups."""
+    waiting = iter(tasks)
+    while group := tuple(islice(waiting, _FRAMES_PER_GROUP)):
+        yield group
+
+
+def _detect_in_frames(*tasks: _FrameTask) -> list[_FrameDetection]:
+    """Detect the person in successive frames, tracked from the first of them (runs in a worker thread)."""
+    reduced = [downscale(task.rgb, DETECTION_SIDE_PX) for task in tasks]
+    detections: list[PersonDetection | None] = [None] * len(tasks)
+    used = [k for k, task in enumerate(tasks) if task.needs_landmarks or task.mask is None]
+    if used:
+        for k, found in zip(used, _detector().track([reduced[k][0] for k in used]), strict=True):
+            if found is not None:
+                detections[k] = replace(found, landmarks_px=found.landmarks_px / np.float32(reduced[k][1]))
+    return [
+        _complete_detection(task, small, detection)
+        for task, (small, _), detection in zip(tasks, reduced, detections, strict=True)
+    ]
+
+
+def _complete_detection(
+    task: _FrameTask, small: UInt8[np.ndarray, "h2 w2 3"], detection: PersonDetection | None
 ) -> _FrameDetection:
-    """Detect the person in one frame (runs in a worker process)."""
-    detection = _detector().detect(rgb) if needs_landmarks or mask is None else None
-    n_people = _detector().count_people(rgb) if needs_people_count and mask is None else -1
-    factor = min(1.0, _THUMBNAIL_SIDE_PX / max(rgb.shape[:2]))
+    """Add hands, face and small pictures to the detection in one frame; people are counted in the reduced image."""
+    rgb, mask, needs_landmarks, needs_people_count = task
+    n_people = _detector().count_people(small) if needs_people_count and mask is None else -1
+    factor = min(1.0, THUMBNAIL_SIDE_PX / max(rgb.shape[:2]))
     size = (max(1, round(rgb.shape[1] * factor)), max(1, round(rgb.shape[0] * factor)))
     gray = cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
     landmarks, mask_png, hands, face_px = None, b"", undetected_hands(), undetected_face()
@@ -330,12 +374,15 @@ def _write_matted_frame(
     noise: float,
     plate: BackgroundPlate,
 ) -> None:
-    """Compute and write the matte of one frame (runs in a worker process)."""
-    masks = np.stack([_decode_mask(data) for data in masks_png])
+    """Compute and write the matte of one frame (runs in a worker thread)."""
+    height, width = images.shape[1:3]
+    masks = np.stack([_decode_mask(data, (height, width)) for data in masks_png])
     mask = extend_mask_on_uniform_background(images[centre], smooth_mask_temporally(images, masks, centre, noise))
     alpha = estimate_alpha_matte(images[centre], mask, plate)
     _write_frame(images[centre], to_uint8(alpha), out, frame_index)
 
 
-def _decode_mask(mask_png: bytes) -> UInt8[np.ndarray, "h w"]:
-    return cv2.imdecode(np.frombuffer(mask_png, np.uint8), cv2.IMREAD_GRAYSCALE)
+def _decode_mask(mask_png: bytes, size_px: tuple[int, int]) -> UInt8[np.ndarray, "h w"]:
+    """Return a mask of the detector at the size (height, width) of the images."""
+    mask = cv2.imdecode(np.frombuffer(mask_png, np.uint8), cv2.IMREAD_GRAYSCALE)
+    return mask if mask.shape == size_px else cv2.resize(mask, size_px[::-1], interpolation=cv2.INTER_LINEAR)

@@ -4,6 +4,8 @@ Kartynnik et al., "Real-time facial surface geometry from monocular video on mob
 "Attention mesh", 2020. The models are part of the package.
 """
 
+from contextlib import nullcontext
+
 import numpy as np
 from jaxtyping import Float, UInt8
 
@@ -34,6 +36,7 @@ class FaceDetector:
             )
             # Its threads start asynchronously, and their messages would appear after this block.
             self._model.process(np.zeros((64, 64, 3), dtype=np.uint8))
+        self._is_stderr_quiet = False
 
     def detect_face(self, rgb: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "478 2"] | None:
         """Return the landmarks of the largest face (px, pixel centres at +0.5), or None without a face.
@@ -64,10 +67,11 @@ class FaceDetector:
         return nowhere_px if landmarks_px is None else (landmarks_px + [*low_px, 0.0]).astype(np.float32)
 
     def _detect(self, rgb: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "478 3"] | None:
-        with suppress_stderr():
+        with nullcontext() if self._is_stderr_quiet else suppress_stderr():
             found = self._model.process(rgb).multi_face_landmarks
         if not found:
             return None
+        self._is_stderr_quiet = True
         height_px, width_px = rgb.shape[:2]
         return np.array([(point.x, point.y, point.z) for point in found[0].landmark]) * [width_px, height_px, width_px]
 

@@ -5,6 +5,7 @@ The interleaved split depends on the index of a frame in the recording only, so 
 (`pipeline.capture.user_files`) replaces split and selection.
 """
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
@@ -72,6 +73,27 @@ def find_distinct_frames(
         cumulative_motion[i] = cumulative_motion[last] + (step if keep[i] else 0.0)
         last = i if keep[i] else last
     return keep, cumulative_motion
+
+
+def find_repeats(
+    gray_thumbnails: UInt8[np.ndarray, "n h w"], threshold: float
+) -> tuple[Bool[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Return which frames differ from the last kept one nowhere, and the cumulative motion of all.
+
+    A frame repeats another if no block of 16 x 16 pixels differs by more than `threshold` (levels of 255), wherever the
+    person is: stricter than `find_distinct_frames`, which needs masks. Motion is the mean over blocks.
+    """
+    repeats = np.zeros(len(gray_thumbnails), dtype=bool)
+    cumulative_motion = np.zeros(len(gray_thumbnails), dtype=np.float64)
+    last = 0
+    for i in range(1, len(gray_thumbnails)):
+        difference = cv2.absdiff(gray_thumbnails[last], gray_thumbnails[i])
+        size = tuple(max(1, round(side / _BLOCK_PX)) for side in difference.shape[::-1])
+        blocks = cv2.resize(difference.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        repeats[i] = blocks.max() <= threshold
+        cumulative_motion[i] = cumulative_motion[last] + (0.0 if repeats[i] else float(blocks.mean()))
+        last = last if repeats[i] else i
+    return repeats, cumulative_motion
 
 
 def select_frames_by_motion(

@@ -11,7 +11,8 @@ landmarks. The last two predictions are averaged, because the second model is se
 
 import os
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -131,19 +132,41 @@ class PersonDetector:
         centre of the hips, in camera axes (x right, y down, z forward). The mask is soft, 0..255, and smooth at the
         scale of about 1/200 of the person's height, the resolution of the model.
         """
-        with nullcontext() if self._is_stderr_quiet else suppress_stderr():
-            estimates = self._estimate_in_successive_rois(rgb)
+        return self.track([rgb])[0]
+
+    def track(self, images: Sequence[UInt8[np.ndarray, "h w 3"]]) -> list[PersonDetection | None]:
+        """Return the detections in successive images of a recording, see `detect`.
+
+        The first ROI of an image is that of the landmarks of the image before it, where the person was found there.
+        """
+        detections: list[PersonDetection | None] = []
+        square = None
+        for rgb in images:
+            with nullcontext() if self._is_stderr_quiet else suppress_stderr():
+                estimates = self._estimate_in_successive_rois(rgb, square)
+                if not estimates and square is not None:
+                    estimates = self._estimate_in_successive_rois(rgb)
+            self._is_stderr_quiet |= bool(estimates)
+            detections.append(self._mean_detection(estimates))
+            square = estimates[-1].next_square if estimates else None
+        return detections
+
+    def _mean_detection(self, estimates: list[_RoiEstimate]) -> PersonDetection | None:
+        """Return the mean of estimates; None without any."""
         if not estimates:
             return None
-        self._is_stderr_quiet = True
         points = np.mean([estimate.landmarks for estimate in estimates], axis=0)
         world = np.mean([estimate.landmarks_world_m for estimate in estimates], axis=0)
         mask = np.mean([estimate.mask for estimate in estimates], axis=0)
         return PersonDetection(points[:, :2].copy(), points[:, 2].copy(), world, np.rint(255.0 * mask).astype(np.uint8))
 
-    def _estimate_in_successive_rois(self, rgb: UInt8[np.ndarray, "h w 3"]) -> list[_RoiEstimate]:
-        """Return the estimates in the first ROI that contains the person and in the ROI of its landmarks."""
-        previous, current = None, self._estimate_in_roi(rgb, self._roi_graph.process(rgb).square)
+    def _estimate_in_successive_rois(self, rgb: UInt8[np.ndarray, "h w 3"], square: Any = None) -> list[_RoiEstimate]:
+        """Return the estimates in the first ROI that contains the person and in the ROI of its landmarks.
+
+        square: the ROI to begin with; None: that of the first model.
+        """
+        square = self._roi_graph.process(rgb).square if square is None else square
+        previous, current = None, self._estimate_in_roi(rgb, square)
         for _ in range(_MAX_ROI_ITERATIONS):
             if current is None or (previous is not None and not is_roi_too_small(previous)):
                 break
@@ -166,11 +189,15 @@ class PersonDetector:
         """Count the people of similar size in the image.
 
         The model finds one person per image, so it runs on the whole image and on overlapping square crops; confident
-        detections whose masks do not overlap are different people.
+        detections whose masks do not overlap are different people. The first model, a quarter of the cost, tells which
+        crops show nobody new.
         """
         people: list[Bool[np.ndarray, "h w"]] = []
         for left, top, right, bottom in _crops(*rgb.shape[:2]):
-            found = self.detect(np.ascontiguousarray(rgb[top:bottom, left:right]))
+            crop = np.ascontiguousarray(rgb[top:bottom, left:right])
+            if self._is_at_a_person(crop, left, top, people):
+                continue
+            found = self.detect(crop)
             if found is None or found.visibility[list(TORSO)].min() < _MIN_TORSO_VISIBILITY:
                 continue
             mask = np.zeros(rgb.shape[:2], dtype=bool)
@@ -179,6 +206,18 @@ class PersonDetector:
                 people.append(mask)
         largest = max((mask.sum() for mask in people), default=0)
         return sum(bool(mask.sum() > _MIN_RELATIVE_AREA * largest) for mask in people)
+
+    def _is_at_a_person(
+        self, crop: UInt8[np.ndarray, "h w 3"], left: int, top: int, people: list[Bool[np.ndarray, "h2 w2"]]
+    ) -> bool:
+        """Return whether the first model finds nobody in a crop, or someone whose hips lie on a person of the list."""
+        square = self._roi_graph.process(crop).square
+        if square is None:
+            return True
+        height, width = crop.shape[:2]
+        row = top + min(max(int(square.y_center * height), 0), height - 1)
+        column = left + min(max(int(square.x_center * width), 0), width - 1)
+        return any(bool(mask[row, column]) for mask in people)
 
 
 def is_roi_too_small(estimate: _RoiEstimate) -> bool:
@@ -243,18 +282,33 @@ def _overlap_coefficient(first: Bool[np.ndarray, "h w"], second: Bool[np.ndarray
     return float((first & second).sum() / max(1, min(first.sum(), second.sum())))
 
 
+_quiet_lock = threading.Lock()
+_saved_fds: list[int] = []
+"""Standard error as it was, once for each thread that suppresses it now."""
+
+
 @contextmanager
 def suppress_stderr() -> Iterator[None]:
-    """Suppress the messages of the C++ libraries, which write to the file descriptor itself."""
+    """Suppress the messages of the C++ libraries, which write to the file descriptor itself.
+
+    Threads may do so at the same time: the last one restores the descriptor.
+    """
     os.environ.setdefault("GLOG_minloglevel", "2")
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
-    sys.stderr.flush()
-    saved_fd = os.dup(2)
-    devnull_fd = os.open(os.devnull, os.O_WRONLY)
+    with _quiet_lock:
+        if not _saved_fds:
+            sys.stderr.flush()
+            saved_fd, devnull_fd = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+            os.dup2(devnull_fd, 2)
+            os.close(devnull_fd)
+        else:
+            saved_fd = _saved_fds[-1]
+        _saved_fds.append(saved_fd)
     try:
-        os.dup2(devnull_fd, 2)
         yield
     finally:
-        os.dup2(saved_fd, 2)
-        os.close(saved_fd)
-        os.close(devnull_fd)
+        with _quiet_lock:
+            _saved_fds.pop()
+            if not _saved_fds:
+                os.dup2(saved_fd, 2)
+                os.close(saved_fd)

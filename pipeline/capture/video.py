@@ -15,7 +15,7 @@ import av
 import cv2
 import numpy as np
 from av.container import InputContainer
-from jaxtyping import Shaped, UInt8
+from jaxtyping import Int, Shaped, UInt8
 
 from pipeline.capture import hdr
 from pipeline.core.errors import UserError
@@ -38,6 +38,7 @@ _IMAGE_FOLDER_NAMES = ("images", "frames", "image", "rgb", "color")
 # Bicubic, with chroma brought to full resolution before the colour matrix: swscale's default repeats each chroma
 # sample over 2 x 2 pixels, which leaves visible blocks along the person's outline (bits of libswscale's SWS_* flags).
 _SWS_FLAGS = 0x4 | 0x2000 | 0x4000 | 0x40000
+_SWS_AREA = 0x20
 # A decoded image (8-bit sRGB, or 16 bits with another transfer function) and its conversion to 8-bit sRGB.
 _DecodedImage = tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]
 
@@ -111,8 +112,35 @@ def read_frames(source: FrameSource, is_wanted: Callable[[int], bool], max_side_
                 "all frames must come from one camera at one size: remove or resize the odd ones"
             )
         size_px = rgb.shape[:2]
-        downscaled, scale = _downscale(rgb, max_side_px)
+        downscaled, scale = downscale(rgb, max_side_px)
         yield Frame(index, time_s, to_srgb(downscaled), scale)
+
+
+def read_thumbnails(
+    source: FrameSource, is_wanted: Callable[[int], bool], side_px: int
+) -> tuple[Int[np.ndarray, "n"], UInt8[np.ndarray, "n h w"]]:
+    """Return the indices of the wanted frames and small grey images of them, to compare frames with each other.
+
+    They are not upright, and their grey is that of the file. side_px: largest longer side.
+
+    Raises:
+        UserError: no frame can be read.
+    """
+
+    def shrink(picture: av.VideoFrame, _: Fraction | None) -> _DecodedImage:
+        scale = min(1.0, side_px / max(picture.width, picture.height))
+        width, height = (max(1, round(scale * side)) for side in (picture.width, picture.height))
+        small = picture.reformat(width, height, format="gray", interpolation=_SWS_AREA)
+        return small.to_ndarray(), np.asarray
+
+    if source.files:
+        frames = read_frames(source, is_wanted, side_px)
+        found = [(frame.index, cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)) for frame in frames]
+    else:
+        found = [(index, gray) for index, _, (gray, _) in _video(source, is_wanted, shrink)]
+    if not found:
+        raise UserError(f"{source.path} has no readable frame; use another video")
+    return np.array([index for index, _ in found], dtype=np.int32), np.stack([gray for _, gray in found])
 
 
 def image_size_px(source: FrameSource) -> tuple[int, int]:
@@ -175,7 +203,13 @@ def _images(source: FrameSource, is_wanted: Callable[[int], bool]) -> Iterator[t
             yield index, index / source.fps, (read_rgb(path), np.asarray)
 
 
-def _video(source: FrameSource, is_wanted: Callable[[int], bool]) -> Iterator[tuple[int, float, _DecodedImage]]:
+def _video(
+    source: FrameSource,
+    is_wanted: Callable[[int], bool],
+    convert: Callable[[av.VideoFrame, Fraction | None], _DecodedImage] | None = None,
+) -> Iterator[tuple[int, float, _DecodedImage]]:
+    """Yield index, time and converted image (default: `_to_upright_rgb`) of the wanted frames."""
+    convert = convert or _to_upright_rgb
     start_s: float | None = None
     time_s: float | None = None
     index = -1
@@ -187,7 +221,7 @@ def _video(source: FrameSource, is_wanted: Callable[[int], bool]) -> Iterator[tu
                 time_s = _monotonic_time_s(picture.time, time_s, 1.0 / source.fps)
                 start_s = time_s if start_s is None else start_s
                 if is_wanted(index):
-                    yield index, time_s - start_s, _to_upright_rgb(picture, stream.sample_aspect_ratio)
+                    yield index, time_s - start_s, convert(picture, stream.sample_aspect_ratio)
         except av.FFmpegError as error:
             warn(f"{source.path} is truncated after {index + 1} frames ({error.strerror}); these frames are used")
 
@@ -211,7 +245,7 @@ def _to_upright_rgb(picture: av.VideoFrame, aspect: Fraction | None) -> _Decoded
     return np.ascontiguousarray(np.rot90(rgb, k=round(picture.rotation / 90) % 4)), to_srgb
 
 
-def _downscale(rgb: Shaped[np.ndarray, "h w 3"], max_side_px: int) -> tuple[Shaped[np.ndarray, "h2 w2 3"], float]:
+def downscale(rgb: Shaped[np.ndarray, "h w 3"], max_side_px: int) -> tuple[Shaped[np.ndarray, "h2 w2 3"], float]:
     """Reduce the longer side to at most `max_side_px` by area averaging; return image and factor."""
     scale = min(1.0, max_side_px / max(rgb.shape[:2]))
     if scale == 1.0:

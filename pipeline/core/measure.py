@@ -5,7 +5,6 @@ import platform
 import re
 import subprocess
 import sys
-from collections.abc import Iterable
 from functools import cache
 from importlib.metadata import distributions
 from pathlib import Path
@@ -19,27 +18,17 @@ REPOSITORY_DIR = Path(__file__).resolve().parents[2]
 
 MIB = 1024.0 * 1024.0
 
-_worker_peaks_mib: dict[int, float] = {}
-
-
-def record_worker_peaks(pids: Iterable[int]) -> None:
-    """Add the peak memory of processes, which must still be running, to `peak_rss_mib`. No effect but on Linux."""
-    _worker_peaks_mib.update({pid: peak for pid in pids if (peak := _linux_peak_rss_mib(str(pid))) is not None})
-
 
 def peak_rss_mib() -> float:
-    """Return the peak resident memory so far, in MiB: of this process plus its recorded worker processes.
+    """Return the peak resident memory so far, in MiB: of this process or its largest finished child process.
 
-    An upper bound: the peaks need not coincide, and pages that processes share count for each of them. At least the
-    peak of the largest finished child process, which is all that systems other than Linux report of children;
-    Windows reports none.
+    Windows reports no children.
     """
     if sys.platform == "win32":
         return _windows_peak_rss_mib()
     # On Linux not the value of getrusage: it includes the memory of the parent at the time of the fork.
-    own = _linux_peak_rss_mib("self")
-    total = (_maxrss_mib(resource.RUSAGE_SELF) if own is None else own) + sum(_worker_peaks_mib.values())
-    return max(total, _maxrss_mib(resource.RUSAGE_CHILDREN))
+    own = _linux_peak_rss_mib()
+    return max(_maxrss_mib(resource.RUSAGE_SELF) if own is None else own, _maxrss_mib(resource.RUSAGE_CHILDREN))
 
 
 def describe_environment() -> dict[str, Any]:
@@ -62,13 +51,10 @@ def cpu_name() -> str:
     return found.group(1) if found else platform.processor() or platform.machine()
 
 
-def _linux_peak_rss_mib(process: str) -> float | None:
-    """Return VmHWM of a process, see proc_pid_status(5); None on other systems, and when the process has ended."""
-    try:
-        status = Path(f"/proc/{process}/status").read_text()
-    except (FileNotFoundError, ProcessLookupError):
-        return None
-    found = re.search(r"^VmHWM:\s+(\d+) kB", status, re.MULTILINE)
+def _linux_peak_rss_mib() -> float | None:
+    """Return VmHWM of this process, see proc_pid_status(5); None on other systems."""
+    path = Path("/proc/self/status")
+    found = re.search(r"^VmHWM:\s+(\d+) kB", path.read_text(), re.MULTILINE) if path.exists() else None
     return int(found.group(1)) * 1024 / MIB if found else None
 
 

@@ -2,8 +2,11 @@
 
 import base64
 import math
+import os
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import cv2
@@ -11,7 +14,6 @@ import numpy as np
 from jaxtyping import UInt8
 from markupsafe import Markup
 
-from pipeline.io.image import resize
 from pipeline.report.charts import bar_chart, legend, line_chart
 from pipeline.report.embed import compress_glb_textures, coverage_data_uri, webp_data_uri
 from pipeline.report.report_json import POSE_FITTED_SUFFIX
@@ -57,8 +59,12 @@ class PageContent:
 
 
 def render_page(content: PageContent) -> str:
-    """Return the HTML text of the report page."""
+    """Return the HTML text of the report page; pictures are encoded side by side."""
     report = content.report
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        turntable = list(pool.map(lambda row: (row[0], _turntable_rows(*row)), content.turntable))
+        frames = list(pool.map(partial(_frame_card, report=report), content.frames))
+        images = list(pool.map(lambda each: (image_tag(_shrunk(each[1]), each[0]), each[0]), content.images))
     return render_template(
         "report.html.j2",
         title=content.title,
@@ -66,13 +72,13 @@ def render_page(content: PageContent) -> str:
         style=Markup(read_asset("report.css")),
         headline=_headline_metrics(report),
         warnings=report["warnings"],
-        turntable=[(title, _turntable_rows(title, views)) for title, views in content.turntable],
+        turntable=turntable,
         protocol=f"{report['heldout']['protocol']} LPIPS: {report['heldout']['lpips']}.",
         error_map_max_levels=ERROR_MAP_MAX_LEVELS,
-        frames=[_frame_card(frame, report) for frame in content.frames],
+        frames=frames,
         error_charts=_error_charts(report["heldout"]["frames"]),
         cost_charts=_cost_charts(report),
-        images=[(image_tag(_shrunk(pixels), caption), caption) for caption, pixels in content.images],
+        images=images,
         tables=_tables(report),
         footer=_footer(report["environment"]),
         glb=_embedded_glb(content.glb),
@@ -219,7 +225,7 @@ def _shrunk(pixels: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "_ _ 3"]:
     if scale >= 1.0:
         return pixels
     height, width = pixels.shape[:2]
-    return resize(pixels, round(width * scale), round(height * scale))
+    return cv2.resize(pixels, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA)
 
 
 def _tables(report: Mapping[str, Any]) -> list[Markup]:

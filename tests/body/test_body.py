@@ -90,3 +90,11 @@ def test_weights_are_a_partition_of_unity(body: Body) -> None:
 
 def test_body_mesh_is_closed(body: Body) -> None:
     assert body.mesh().is_watertight()
+
+
+def test_several_rest_poses_equal_single_ones() -> None:
+    anny = load_anny()
+    shapes = anny.shape_defaults + torch.tensor([[0.0], [0.1], [-0.05]])
+    for row, many in enumerate(zip(*anny.rest_poses(shapes), strict=True)):
+        for found, single in zip(many, anny.rest_pose(shapes[row]), strict=True):
+            torch.testing.assert_close(found, single, atol=2e-6, rtol=0.0)

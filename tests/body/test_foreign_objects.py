@@ -3,6 +3,7 @@ import pytest
 import torch
 
 from pipeline.body.body import load_anny
+from pipeline.body.fit.silhouette_icp import crop_mask_window
 from pipeline.body.foreign_objects import (
     CLOTHING_MARGIN_RATIO,
     MIN_EXCESS_BLOB_SHARE,
@@ -71,7 +72,8 @@ def test_a_ball_at_the_hand_is_detected_in_its_frame() -> None:
     with_ball = alone.copy()
     with_ball[np.hypot(rows - hand_px[1], columns - hand_px[0]) < 20.0] = 255
     identity = torch.eye(4).expand(4, len(body.joint_names), 4, 4)
-    shares = residual_blob_shares(body, identity, camera, [alone, with_ball, np.zeros_like(alone), alone])
+    windows = [crop_mask_window(mask) for mask in (alone, with_ball, np.zeros_like(alone), alone)]
+    shares = residual_blob_shares(body, identity, camera, windows)
     assert np.isnan(shares).tolist() == [False, False, True, False]
     assert shares[[0, 3]].max() == 0.0
     assert shares[1] == pytest.approx(

@@ -9,9 +9,9 @@ from pipeline.capture.detection import _temporal_windows, detect_in_frames, writ
 from pipeline.capture.face_detector import undetected_face
 from pipeline.capture.hand_detector import undetected_hands
 from pipeline.capture.person_detector import PersonDetection
-from pipeline.capture.process_pool import start_process_pool
 from pipeline.capture.user_files import load_user_files
 from pipeline.capture.video import Frame, open_frame_source
+from pipeline.capture.worker_pool import start_worker_pool
 from pipeline.core.errors import UserError
 from pipeline.io.image import read_gray, read_rgb, write_gray, write_rgb
 from pipeline.io.npz import load_npz, save_npz
@@ -48,6 +48,9 @@ class FakeDetector:
         mask = np.where(rgb[..., 0] > 100, np.uint8(255), np.uint8(0))
         return PersonDetection(self.landmarks_px, np.full(33, 0.5, np.float32), self.landmarks_world_m, mask)
 
+    def track(self, images):
+        return [self.detect(rgb) for rgb in images]
+
     def count_people(self, rgb):
         return 1
 
@@ -74,7 +77,7 @@ def change_landmarks(folder, **changes):
 def detect_recording(folder, stride=1, max_side_px=60):
     source = open_frame_source(folder / "in")
     user_files = load_user_files(folder / "in", source)
-    with start_process_pool(1) as workers:
+    with start_worker_pool(1) as workers:
         frame_indices = range(0, source.n_frames, stride)
         return source, user_files, detect_in_frames(source, user_files, frame_indices, 2, max_side_px, workers)
 
@@ -144,7 +147,7 @@ def test_selected_frames_are_written_with_supplied_masks(folder):
     source, user_files, seen = detect_recording(folder)
     out = folder / "out"
     out.mkdir()
-    with start_process_pool(1) as workers:
+    with start_worker_pool(1) as workers:
         write_frames(source, user_files, seen, [0, 4, 11], out, 60, 1.0, workers)
     assert sorted(path.name for path in (out / "images").iterdir()) == ["000000.png", "000004.png", "000011.png"]
     for k in (0, 4, 11):
@@ -161,7 +164,7 @@ def test_where_a_mask_is_soft_the_picture_holds_the_persons_colour(folder):
     source, user_files, seen = detect_recording(folder)
     out = folder / "out"
     out.mkdir()
-    with start_process_pool(1) as workers:
+    with start_worker_pool(1) as workers:
         write_frames(source, user_files, seen, [4], out, 60, 1.0, workers)
     written = read_rgb(image_path(out, 4))
     np.testing.assert_allclose(written[4:36, 16:26], 200, atol=1)

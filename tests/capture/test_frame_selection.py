@@ -113,3 +113,15 @@ def test_widest_unseen_arc():
     assert selection.largest_yaw_gap_rad(np.radians([0.0, 90, 200, 350])) == pytest.approx(np.radians(150))
     assert selection.largest_yaw_gap_rad(np.array([1.0])) == pytest.approx(2 * np.pi)
     assert selection.largest_yaw_gap_rad(np.array([np.nan])) == pytest.approx(2 * np.pi)
+
+
+def test_repeats_are_found_without_masks_and_motion_adds_up():
+    random = np.random.default_rng(2)
+    thumbnails = np.repeat(random.integers(60, 200, (1, 48, 64)).astype(np.uint8), 6, axis=0)
+    thumbnails[2:, 16:32, 16:32] += 12  # one block of twelve moves once
+    thumbnails[4:, :16, :16] += 24
+    noisy = thumbnails + random.integers(0, 2, thumbnails.shape).astype(np.uint8)
+    repeats, motion = selection.find_repeats(noisy, 1.0)
+    assert repeats.tolist() == [False, True, False, True, False, True]
+    np.testing.assert_allclose(motion[[2, 4]], [1.0, 3.0], atol=1.2)
+    assert (np.diff(motion)[[0, 2, 4]] == 0.0).all()

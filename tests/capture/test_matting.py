@@ -301,3 +301,13 @@ def half_key(rgb: np.ndarray) -> np.ndarray:
     screen = around(1 - cv2.dilate(rough, disc).astype(np.float32))
     _, labels, stats, _ = cv2.connectedComponentsWithStats((green < (person + screen) / 2).astype(np.uint8))
     return labels == 1 + stats[1:, cv2.CC_STAT_AREA].argmax()
+
+
+def test_symmetric_systems_are_solved_as_by_lapack():
+    random = np.random.default_rng(5)
+    matrix = random.normal(size=(7, 9, 3, 3))
+    matrix = matrix @ matrix.swapaxes(-1, -2) + 1e-4 * np.eye(3)
+    right = random.normal(size=(7, 9, 3))
+    upper = np.stack([matrix[..., i, j] for i in range(3) for j in range(i, 3)])
+    found = np.stack(matte._solve_symmetric(upper, np.moveaxis(right, -1, 0)), axis=-1)
+    np.testing.assert_allclose(found, np.linalg.solve(matrix, right[..., None])[..., 0], rtol=1e-6)

@@ -182,6 +182,21 @@ def test_large_frames_are_shrunk_with_their_factor(tmp_path):
     assert frame.scale == pytest.approx(0.4)
 
 
+def test_thumbnails_of_a_video_and_of_images_are_grey_means(tmp_path):
+    halves = np.concatenate([ramp(60, 96, 64), ramp(180, 96, 64)], axis=1)
+    write_video(tmp_path / "a.mp4", [halves, halves[:, ::-1], halves])
+    (tmp_path / "images").mkdir()
+    for k in range(3):
+        write_rgb(tmp_path / "images" / f"{k}.png", halves if k != 1 else halves[:, ::-1])
+    for path in (tmp_path / "a.mp4", tmp_path / "images"):
+        index, gray = video.read_thumbnails(video.open_frame_source(path), {0, 1}.__contains__, 32)
+        assert index.tolist() == [0, 1]
+        assert gray.shape == (2, 24, 32)
+        assert gray[0, :, :14].std() < 2
+        assert int(gray[0, 0, 30]) - int(gray[0, 0, 1]) == pytest.approx(120, abs=6)
+        assert (np.abs(gray[0].astype(int) - gray[1, :, ::-1]) < 4).all()
+
+
 def test_image_folder_in_natural_order_at_thirty_a_second(tmp_path):
     for k in (1, 2, 10):
         write_rgb(tmp_path / f"shot{k}.png", ramp(20 * k))

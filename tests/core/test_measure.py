@@ -30,28 +30,6 @@ def test_a_childs_peak_does_not_count_its_parents_memory() -> None:
     assert len(ballast) == 300 << 20
 
 
-COUNT = """
-import subprocess, sys
-from pipeline.core.measure import record_worker_peaks, peak_rss_mib
-held = "b = bytearray(100 << 20); del b; print(flush=True); input()"
-start = [sys.executable, "-c", held]
-workers = [subprocess.Popen(start, stdin=subprocess.PIPE, stdout=subprocess.PIPE) for _ in range(2)]
-before = peak_rss_mib()
-for worker in workers: worker.stdout.readline()
-record_worker_peaks([worker.pid for worker in workers] + [2**22 + 1])
-record_worker_peaks([workers[0].pid])
-for worker in workers: worker.communicate(b"x")
-print(peak_rss_mib() - before)
-"""
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems report the largest child only")
-def test_peaks_of_workers_are_added() -> None:
-    """Two of 100 MiB plus an interpreter, one of them recorded twice; a process that has ended adds nothing."""
-    done = subprocess.run([sys.executable, "-c", COUNT], capture_output=True, text=True, check=True, cwd=REPOSITORY_DIR)
-    assert 200 < float(done.stdout) < 240
-
-
 def test_the_environment_names_machine_and_packages() -> None:
     found = describe_environment()
     assert found["packages"]["numpy"]

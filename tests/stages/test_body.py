@@ -25,7 +25,7 @@ from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
 from pipeline.geometry.camera import Camera, transform_world_to_camera
 from pipeline.io.image import read_rgb, write_gray, write_rgb
-from stages.body import STAGE, Config, check_fit_quality, fit_capture, initial_camera, run
+from stages.body import STAGE, Config, check_fit_quality, fit_capture, initial_camera, read_mask_windows, run
 from tests.body.acting import SyntheticRecording, synthetic_recording
 from tests.body.fit.test_diagnostics import result
 
@@ -114,7 +114,7 @@ def test_the_vertical_is_estimated_unless_the_camera_pose_is_supplied(
     capture = replace(load_capture(tmp_path / "frames"), camera_pose_is_known=is_known)
     stop = mock.patch("stages.body.fit_body_without_others", side_effect=TooFewLandmarksError("stop"))
     with stop as fit, pytest.raises(UserError, match="stop"):
-        fit_capture(capture, scene.hands, masks, Config())
+        fit_capture(capture, scene.hands, read_mask_windows(capture), Config())
     assert fit.call_args.args[3].vertical_is_known is is_known
 
 

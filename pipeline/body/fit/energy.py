@@ -1,6 +1,7 @@
 """The energy that the fit minimises: a sum of terms (`pipeline.body.fit.terms`) over one set of unknowns."""
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,14 +18,13 @@ from pipeline.body.fit.landmark_regressor import (
 )
 from pipeline.body.fit.levenberg_marquardt import NormalEquations
 from pipeline.body.fit.linear_body import LinearBody
-from pipeline.body.fit.posed_points import pose_points, pose_skeleton
+from pipeline.body.fit.posed_points import Contour, pose_points, pose_skeleton
 from pipeline.body.fit.prior.posture import Posture, estimate_posture
 from pipeline.body.fit.prior.priors import PosePrior, ShapePrior
 from pipeline.body.fit.root_placement import world_to_perspective
 from pipeline.body.fit.state import FitState, Observations
 from pipeline.body.fit.terms import (
     ContactTerm,
-    Contour,
     EnergyTerm,
     Landmark3dTerm,
     LandmarkTerm,
@@ -36,6 +36,11 @@ from pipeline.body.fit.terms import (
 )
 from pipeline.body.settings import FitSettings
 from pipeline.geometry.camera import Camera
+from pipeline.kernels.common.thread_pool import ThreadPool
+
+FRAMES_PER_CHUNK = 16
+"""Frames whose image terms are evaluated together: the largest of their arrays (2 MB) stays in the cache of a core,
+and they do not grow with the recording. On any machine the same, so that sums have the same order."""
 
 VERTICAL_PRINCIPAL_POINT_RATIO = 0.2
 """Standard deviation of the principal point down the image over the one across it. A pitch of the camera shows the same
@@ -137,7 +142,8 @@ class Objective:
         shape_count = len(state.shape)
         shared_count = shape_count + LANDMARK_OFFSET_COUNT + INTRINSICS_COUNT if linearisation.has_shared else 0
         system = NormalEquations.zeros(frame_count, 3 * joint_count + 3, shared_count)
-        for term in self._terms():
+        self._add_image_terms(system, linearisation, self.parameters)
+        for term in self._prior_terms():
             term.add_to(system, linearisation)
         if shared_count:
             system.fix_parameters(self._free_shared_mask(shape_count))
@@ -151,8 +157,8 @@ class Objective:
         system = NormalEquations.zeros(frame_count, 3 * joint_count + 3, 0)
         linearisation = replace(self._linearise(state), has_shared=False)
         parameters = replace(self.parameters, landmark_std_m=self.parameters.single_landmark_std_m)
-        for term in (*self._image_terms(parameters), PosePriorTerm(prior)):
-            term.add_to(system, linearisation)
+        replace(self, contact=None)._add_image_terms(system, linearisation, parameters)
+        PosePriorTerm(prior).add_to(system, linearisation)
         return system.frame_hessian
 
     def estimate_posture(self, prior: PosePrior, state: FitState) -> Posture | None:
@@ -171,14 +177,29 @@ class Objective:
         has_shared = self.parameters.has_free_shared_parameters()
         return Linearisation(state, self.observations.camera, model, skeleton, landmarks, has_shared)
 
-    def _terms(self) -> list[EnergyTerm]:
-        """Return the terms in the order in which they are summed."""
-        parameters, terms = self.parameters, self._image_terms(self.parameters)
-        if self.contact is not None:
-            terms.append(ContactTerm(self.contact))
-        centre_std = parameters.principal_point_std
+    def _add_image_terms(self, system: NormalEquations, at: Linearisation, parameters: EnergyParameters) -> None:
+        """Add the terms of single frames: chunks of frames side by side, summed in their order."""
+        all_frames_3d = Landmark3dTerm.fitted_to(
+            self.observations, parameters.landmark_3d_std_m, parameters.landmark_cutoff, at
+        )
+        frame_count, parameter_count, shared_count = system.border.shape
+        chunks = [slice(start, start + FRAMES_PER_CHUNK) for start in range(0, frame_count, FRAMES_PER_CHUNK)]
+
+        def evaluate(rows: slice) -> NormalEquations:
+            here = at.select(rows)
+            part = NormalEquations.zeros(len(here.state.root_m), parameter_count, shared_count)
+            landmarks_3d = replace(all_frames_3d, observations=all_frames_3d.observations.select(rows))
+            for term in (landmarks_3d, *self._image_terms(parameters, rows)):
+                term.add_to(part, here)
+            return part
+
+        for rows, part in zip(chunks, _thread_pool().map(evaluate, chunks), strict=True):
+            system.add_frames(rows, part)
+
+    def _prior_terms(self) -> list[EnergyTerm]:
+        """Return the terms that no image enters."""
+        parameters, centre_std = self.parameters, self.parameters.principal_point_std
         return [
-            *terms,
             PosePriorTerm(self.pose_prior),
             MotionTerm(
                 self.observations.time_s, self.motion_std, parameters.motion_std_factor, parameters.motion_cutoff
@@ -192,16 +213,16 @@ class Objective:
             ),
         ]
 
-    def _image_terms(self, parameters: EnergyParameters) -> list[EnergyTerm]:
-        cutoff = parameters.landmark_cutoff
-        terms: list[EnergyTerm] = [
-            LandmarkTerm(self.observations, parameters.landmark_stds_m(), self.px_per_m, cutoff),
-            Landmark3dTerm(self.observations, parameters.landmark_3d_std_m, cutoff),
-        ]
+    def _image_terms(self, parameters: EnergyParameters, rows: slice) -> list[EnergyTerm]:
+        """Return the terms of some frames but that of the 3D landmarks."""
+        px_per_m, cutoff = self.px_per_m[rows], parameters.landmark_cutoff
+        stds_m = parameters.landmark_stds_m()
+        terms: list[EnergyTerm] = [LandmarkTerm(self.observations.select(rows), stds_m, px_per_m, cutoff)]
         if self.contour is not None:
-            terms.append(
-                SilhouetteTerm(self.contour, parameters.contour_std_m, self.px_per_m, parameters.contour_cutoff)
-            )
+            contour = self.contour.select(rows)
+            terms.append(SilhouetteTerm(contour, parameters.contour_std_m, px_per_m, parameters.contour_cutoff))
+        if self.contact is not None:
+            terms.append(ContactTerm(self.contact.select(rows)))
         return terms
 
     def _free_shared_mask(self, shape_count: int) -> Bool[Tensor, "g"]:
@@ -211,6 +232,12 @@ class Objective:
         free[shape_count:-INTRINSICS_COUNT] = parameters.free_landmark_offsets
         free[-INTRINSICS_COUNT:-1], free[-1] = parameters.free_principal_point, parameters.free_focal
         return free
+
+
+@cache
+def _thread_pool() -> ThreadPool:
+    """Return the pool for chunks of frames; one thread each, because their operations are small."""
+    return ThreadPool(torch.get_num_threads())
 
 
 def compute_px_per_m(state: FitState, camera: Camera) -> Float[Tensor, "n"]:

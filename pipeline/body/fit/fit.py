@@ -26,7 +26,7 @@ from pipeline.body.fit.left_right_swaps import (
     swap_body_left_right,
     swap_limb_left_right,
 )
-from pipeline.body.fit.levenberg_marquardt import NormalEquations, minimise, shared_covariance
+from pipeline.body.fit.levenberg_marquardt import NormalEquations, minimise
 from pipeline.body.fit.linear_body import LinearBody, linearise_body, relaxed_curls_rad
 from pipeline.body.fit.prior.posture import Posture, prior_of_recording
 from pipeline.body.fit.prior.priors import (
@@ -36,7 +36,7 @@ from pipeline.body.fit.prior.priors import (
     pose_prior,
     shape_prior,
 )
-from pipeline.body.fit.result import FitResult, landmark_errors_px
+from pipeline.body.fit.result import FitResult, landmark_errors_px, posterior_stds, shared_step_ratio
 from pipeline.body.fit.root_placement import world_to_perspective
 from pipeline.body.fit.silhouette_icp import MaskWindow, match_silhouettes
 from pipeline.body.fit.state import FitState, Observations
@@ -50,6 +50,11 @@ from pipeline.geometry.rotation import continuous_quaternions, matrix_to_quatern
 MIN_FRAMES = 3
 POSTURE_ROUND = 3
 """Number of matchings of the silhouettes before the posture of the recording is estimated."""
+
+CONVERGED_STEP_RATIO = 0.1
+"""Step of shape, camera and landmark offsets, in standard deviations, below which no further silhouettes are matched.
+
+Matched silhouettes jitter by 0.06 to 0.1: more rounds do not end nearer to the truth (docs/decisions/body.md)."""
 
 
 class TooFewLandmarksError(ValueError):
@@ -65,7 +70,7 @@ class FitOptions:
     principal_point_relative_std: standard deviation of the principal point about the initial one, in focal lengths; 0
         fixes it.
     shared_frames: number of frames for the shared parameters.
-    rounds: matchings of the silhouettes for the shared parameters.
+    rounds: largest number of matchings of the silhouettes for the shared parameters.
     vertical_is_known: whether +Y of the camera's world is up; otherwise the vertical is estimated.
     """
 
@@ -147,7 +152,7 @@ def fit_body(
     state, model, silhouette_iou = _fit_poses(context, observations, windows, state, parameters, posture)
     if evidence is not None:
         state, observations = align_with_gravity(model, state, observations, evidence, options.settings)
-    focal_relative_std, height_std_m = _posterior_stds(model, system)
+    focal_relative_std, height_std_m = posterior_stds(model, system)
     stature_std_m = options.settings.stature_spread_m if options.height_m is None else 0.0
     return replace(
         _result(context, model, state, observations, silhouette_iou, left_right_swapped),
@@ -268,12 +273,14 @@ def _fit_shared(
     parameters = _with_silhouettes(parameters, settings)
     posture: Posture | None = None
     for number in track(range(options.rounds), "shape and focal length"):
-        model = context.linearise(state.shape)
+        model, before = context.linearise(state.shape), state
         state, system, objective = _silhouette_round(
             context, model, observations, windows, parameters, state, _Recording(posture)
         )
         if number + 1 == POSTURE_ROUND:
             posture = objective.estimate_posture(context.pose_prior, state)
+        elif number + 1 > POSTURE_ROUND and shared_step_ratio(before, state, system) < CONVERGED_STEP_RATIO:
+            break
     return state, parameters, system, posture
 
 
@@ -390,11 +397,3 @@ def _result(
         height_std_m=0.0,
         lean_deg=lean_deg(model, state),
     )
-
-
-def _posterior_stds(model: LinearBody, system: NormalEquations) -> tuple[float, float]:
-    """Return the standard deviations of the logarithm of the focal length and of the stature (m)."""
-    covariance, gradient = shared_covariance(system), model.height_m()[1].numpy()
-    variance = gradient @ covariance[: len(gradient), : len(gradient)] @ gradient
-    focal = float(np.sqrt(covariance[-1, -1])) if system.border[..., -1].any() else 0.0
-    return focal, float(np.sqrt(variance))

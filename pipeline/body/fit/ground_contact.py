@@ -55,6 +55,10 @@ class Contact:
     target_m: Float[Tensor, "n 4 3"]
     weight: Float[Tensor, "n 4 3"]
 
+    def select(self, rows: slice) -> "Contact":
+        """Return the contacts in some frames."""
+        return Contact(self.points.select(rows), self.axes, self.target_m[rows], self.weight[rows])
+
 
 def sole_points(model: LinearBody) -> SkinnedPoints:
     """Return heels and balls of the feet at ground level of the rest pose; each point moves with one joint."""

@@ -73,6 +73,15 @@ class NormalEquations:
         self.frame_gradient += (weighted * residual[..., None]).sum(1)
         self.shared_gradient += weighted_shared.T @ residual.flatten()
 
+    def add_frames(self, rows: slice, part: "NormalEquations") -> None:
+        """Add the system of some frames, without couplings between frames."""
+        self.frame_hessian[rows] += part.frame_hessian
+        self.border[rows] += part.border
+        self.shared_hessian += part.shared_hessian
+        self.frame_gradient[rows] += part.frame_gradient
+        self.shared_gradient += part.shared_gradient
+        self.cost += part.cost
+
     def fix_parameters(self, free: Bool[Tensor, "g"]) -> None:
         """Remove the shared parameters that are not free from the system: their step becomes zero."""
         self.border[:, :, ~free] = 0.0

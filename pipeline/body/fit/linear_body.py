@@ -89,20 +89,19 @@ def linearise_body(
     active = tuple(body.joint_names.index(name) for name in ACTIVE_JOINTS)
     parents = reduced_parents(body.parents, active)
     finger_rotations = finger_curl_rotations(body, relaxed_curls_rad() if curls_rad is None else curls_rad)
-    vertices, joints = _rest_with_finger_curl(body, shape, finger_rotations)
-    vertex_columns, joint_columns = [], []
-    for index, value in enumerate(shape.tolist()):
-        step = -SHAPE_DIFFERENCE_STEP if value + SHAPE_DIFFERENCE_STEP > 1.0 else SHAPE_DIFFERENCE_STEP
-        perturbed_shape = shape.clone()
-        perturbed_shape[index] += step
-        moved_vertices, moved_joints = _rest_with_finger_curl(body, perturbed_shape, finger_rotations)
-        vertex_columns.append((moved_vertices - vertices) / step)
-        joint_columns.append((moved_joints - joints) / step)
-    joints_shape_jacobian = torch.stack(joint_columns, dim=-1)
+    step = torch.where(shape + SHAPE_DIFFERENCE_STEP > 1.0, -SHAPE_DIFFERENCE_STEP, SHAPE_DIFFERENCE_STEP)
+    all_vertices, all_joints = _rest_with_finger_curl(
+        body, torch.cat([shape[None], shape + torch.diag(step)]), finger_rotations
+    )
+    vertices, joints = all_vertices[0], all_joints[0]
+    vertices_shape_jacobian, joints_shape_jacobian = (
+        ((moved[1:] - moved[0]) / step[:, None, None]).permute(1, 2, 0).contiguous()
+        for moved in (all_vertices, all_joints)
+    )
     return LinearBody(
         shape=shape.double(),
         vertices_m=vertices,
-        vertices_shape_jacobian=torch.stack(vertex_columns, dim=-1),
+        vertices_shape_jacobian=vertices_shape_jacobian,
         joints_m=joints[list(active)],
         joints_shape_jacobian=joints_shape_jacobian[list(active)],
         skin_weights=merge_skin_weights(body, active),
@@ -180,13 +179,18 @@ def finger_curl_rotations(body: ParametricBody, curls_rad: Float[np.ndarray, "2 
 
 
 def _rest_with_finger_curl(
-    body: ParametricBody, shape: Float[Tensor, "s"], finger_rotations: Float[Tensor, "full 3 3"]
-) -> tuple[Float[Tensor, "v 3"], Float[Tensor, "full 3"]]:
-    """Return the rest vertices with bent fingers, and the rest positions of all joints (m)."""
+    body: ParametricBody, shapes: Float[Tensor, "b s"], finger_rotations: Float[Tensor, "full 3 3"]
+) -> tuple[Float[Tensor, "b v 3"], Float[Tensor, "b full 3"]]:
+    """Return the rest vertices of several shapes with bent fingers, and the rest positions of all joints (m)."""
     with torch.no_grad():
-        vertices, joints = body.rest_pose(shape.float())
-    joint_to_world = forward_kinematics(finger_rotations.float()[None], joints[None, 0], joints, body.parents)
-    bent = linear_blend_skinning(
-        vertices, torch.as_tensor(body.skin_weights), skinning_transforms(joint_to_world, joints)
-    )
-    return bent[0].double(), joint_to_world[0, :, :3, 3].double()
+        vertices, joints = body.rest_poses(shapes.float())
+    weights, local = torch.as_tensor(body.skin_weights), finger_rotations.float()[None]
+    is_bent = (local[0] != torch.eye(3)).flatten(1).any(1)
+    on_fingers = torch.nonzero((weights[:, is_bent] > 0.0).any(1)).squeeze(1)  # the other vertices stay
+    positions = torch.empty_like(joints)
+    for row, joints_m in enumerate(joints):
+        joint_to_world = forward_kinematics(local, joints_m[None, 0], joints_m, body.parents)
+        transforms = skinning_transforms(joint_to_world, joints_m)
+        fingers = linear_blend_skinning(vertices[row, on_fingers], weights[on_fingers], transforms)
+        vertices[row, on_fingers], positions[row] = fingers[0], joint_to_world[0, :, :3, 3]
+    return vertices.double(), positions.double()

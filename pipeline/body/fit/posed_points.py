@@ -26,6 +26,10 @@ class PosedSkeleton:
     parent_rotation: Float[Tensor, "n j 3 3"]
     position_m: Float[Tensor, "n j 3"]
 
+    def select(self, rows: slice) -> "PosedSkeleton":
+        """Return the skeletons of some frames."""
+        return PosedSkeleton(self.rotation[rows], self.parent_rotation[rows], self.position_m[rows])
+
 
 def pose_skeleton(
     model: LinearBody, rotations: Float[Tensor, "n j 3 3"], root_m: Float[Tensor, "n 3"]
@@ -55,6 +59,10 @@ class SkinnedPoints:
     skin_weights: Float[Tensor, "#n m j"]
     shape_jacobian: Float[Tensor, "#n m 3 s"]
 
+    def select(self, rows: slice) -> "SkinnedPoints":
+        """Return the points of some frames."""
+        return self if len(self.rest_m) == 1 else SkinnedPoints(*(values[rows] for values in vars(self).values()))
+
 
 @dataclass(frozen=True)
 class PosedPoints:
@@ -66,6 +74,29 @@ class PosedPoints:
     rest: SkinnedPoints
     world_m: Float[Tensor, "n m 3"]
     lever_arms_m: Float[Tensor, "n m j 3"]
+
+    def select(self, rows: slice) -> "PosedPoints":
+        """Return the points of some frames."""
+        return PosedPoints(self.rest.select(rows), self.world_m[rows], self.lever_arms_m[rows])
+
+
+@dataclass(frozen=True)
+class Contour:
+    """Point-to-line constraints in the image: normal · (projection - target) = 0.
+
+    corners, barycentric: points on faces of the body, as vertex indices and barycentric coordinates.
+    weight: 0 for padding.
+    """
+
+    corners: Int[Tensor, "n m 3"]
+    barycentric: Float[Tensor, "n m 3"]
+    target_px: Float[Tensor, "n m 2"]
+    normal: Float[Tensor, "n m 2"]
+    weight: Float[Tensor, "n m"]
+
+    def select(self, rows: slice) -> "Contour":
+        """Return the constraints in some frames."""
+        return Contour(*(values[rows] for values in vars(self).values()))
 
 
 def surface_points(
@@ -123,13 +154,11 @@ def shape_jacobian_rows(
         step = joints_shape_jacobian[joint] - joints_shape_jacobian[parent]
         joint_motion.append(joint_motion[parent] + skeleton.rotation[:, parent] @ step)
     relative_joint_motion = torch.stack(joint_motion, dim=1) - skeleton.rotation @ joints_shape_jacobian
-    rest_gradient = torch.einsum(
-        "nmj,njab,nma->nmb",
-        points.skin_weights.expand(*point_gradient.shape[:2], -1),
-        skeleton.rotation,
-        point_gradient,
-    )
-    rows = (rest_gradient[..., None] * points.shape_jacobian).sum(2)
-    skeleton_gradient = torch.einsum("nma,njas->nmjs", point_gradient, relative_joint_motion)
-    rows[..., : relative_joint_motion.shape[-1]] += (points.skin_weights[..., None] * skeleton_gradient).sum(2)
+    weighted = (points.skin_weights[..., None] * point_gradient[:, :, None]).flatten(2)  # n, m, 3 j
+    # Sums over joints and axes as one matrix product a frame: an array of (n, m, j, s) would be written and read.
+    rest_gradient = (weighted @ skeleton.rotation.flatten(1, 2)).unbind(-1)
+    rows = rest_gradient[0][..., None] * points.shape_jacobian[:, :, 0]
+    for axis in (1, 2):
+        rows.addcmul_(rest_gradient[axis][..., None], points.shape_jacobian[:, :, axis].expand_as(rows))
+    rows[..., : relative_joint_motion.shape[-1]] += weighted @ relative_joint_motion.flatten(1, 2)
     return rows

@@ -10,6 +10,7 @@ from torch import Tensor
 from pipeline.body.body import Body
 from pipeline.body.fit.camera_parameters import apply_intrinsics_delta, project_with_jacobian
 from pipeline.body.fit.landmark_regressor import POSE_LANDMARK_COUNT, LandmarkRegressor
+from pipeline.body.fit.levenberg_marquardt import NormalEquations, shared_covariance
 from pipeline.body.fit.linear_body import LinearBody
 from pipeline.body.fit.posed_points import pose_points, pose_skeleton
 from pipeline.body.fit.state import FitState, Observations
@@ -64,3 +65,17 @@ def landmark_errors_px(
     reliable = confidence > RELIABLE_CONFIDENCE
     counted = torch.where(reliable.any(1, keepdim=True), reliable, confidence > 0.0)
     return torch.where(counted, error, torch.nan).nanmedian(1).values.numpy()
+
+
+def shared_step_ratio(before: FitState, after: FitState, system: NormalEquations) -> float:
+    """Return the root mean square of a step of the shared parameters, in standard deviations of what is known."""
+    step = (after.shared_parameters() - before.shared_parameters()).numpy()
+    return float(np.sqrt(np.mean(step**2 / np.diag(shared_covariance(system)))))
+
+
+def posterior_stds(model: LinearBody, system: NormalEquations) -> tuple[float, float]:
+    """Return the standard deviations of the logarithm of the focal length and of the stature (m)."""
+    covariance, gradient = shared_covariance(system), model.height_m()[1].numpy()
+    variance = gradient @ covariance[: len(gradient), : len(gradient)] @ gradient
+    focal = float(np.sqrt(covariance[-1, -1])) if system.border[..., -1].any() else 0.0
+    return focal, float(np.sqrt(variance))

@@ -7,6 +7,7 @@ with the nearest body outline of similar normal. Outlines inside the body are no
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
@@ -17,11 +18,11 @@ from torch import Tensor
 
 from pipeline.body.fit.camera_parameters import apply_intrinsics_delta
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody
-from pipeline.body.fit.posed_points import pose_skeleton
+from pipeline.body.fit.posed_points import Contour, pose_skeleton
 from pipeline.body.fit.state import FitState, Observations
-from pipeline.body.fit.terms import Contour
 from pipeline.geometry.camera import Camera, project
-from pipeline.geometry.skinning import linear_blend_skinning, rigid_transform
+from pipeline.geometry.skinning import rigid_transform
+from pipeline.kernels.common.thread_pool import ThreadPool
 from pipeline.kernels.raster import rasterize
 from pipeline.metrics.images import mask_iou
 
@@ -51,7 +52,8 @@ FULL_WEIGHT_IOU_DROP, MIN_WEIGHT_IOU_DROP = 0.05, 0.15
 
 MIN_MASK_WEIGHT = 0.05
 
-SKIN_CHUNK = 32
+SKIN_CHUNK = 8
+"""Frames that are skinned and matched in one go."""
 
 
 @dataclass(frozen=True)
@@ -129,15 +131,42 @@ def outward_normals(distance: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h 
     return np.stack([across / length, down / length], axis=-1)
 
 
-def posed_vertices(model: LinearBody, state: FitState) -> Float[Tensor, "n v 3"]:
-    """Return the world vertices (m, float32) of the body in every frame."""
+@dataclass(frozen=True)
+class PosedBody:
+    """The body in every frame, skinned on demand.
+
+    weighted_vertices: w_j (x, y, z, 1) of all joints j (q = 4 j), w the skin weights: skinning is one matrix product.
+    transforms: of the joints in every frame, in the same order, transposed.
+    """
+
+    weighted_vertices: Float[Tensor, "v q"]
+    transforms: Float[Tensor, "n q 3"]
+
+    def vertices(self, rows: slice) -> Float[Tensor, "k v 3"]:
+        """Return the world vertices (m, float32) in some frames."""
+        return self.weighted_vertices @ self.transforms[rows]
+
+
+def posed_body(model: LinearBody, state: FitState) -> PosedBody:
+    """Return the body of a state."""
     posed = model.at_shape(state.shape)
     skeleton = pose_skeleton(posed, state.rotations, state.root_m)
     rotated_joints_m = (skeleton.rotation @ posed.joints_m[:, :, None]).squeeze(-1)
     transforms = rigid_transform(skeleton.rotation, skeleton.position_m - rotated_joints_m).float()
-    vertices, weights = posed.vertices_m.float(), posed.skin_weights.float()
-    chunks = [linear_blend_skinning(vertices, weights, part) for part in transforms.split(SKIN_CHUNK)]
-    return torch.cat(chunks)
+    vertices = torch.nn.functional.pad(posed.vertices_m, (0, 1), value=1.0)
+    weighted = (posed.skin_weights[:, :, None] * vertices[:, None]).flatten(1)
+    return PosedBody(weighted.float(), transforms[:, :, :3].transpose(2, 3).flatten(1, 2).contiguous())
+
+
+def posed_vertices(model: LinearBody, state: FitState) -> Float[Tensor, "n v 3"]:
+    """Return the world vertices (m, float32) of the body in every frame."""
+    return posed_body(model, state).vertices(slice(None))
+
+
+@cache
+def _thread_pool() -> ThreadPool:
+    """Return the pool for frames, one thread each."""
+    return ThreadPool(torch.get_num_threads())
 
 
 @dataclass(frozen=True)
@@ -251,7 +280,7 @@ def match_silhouettes(
     is_clothed: whether the body has the clothes and the hair of the masks, so that all pairs have the same weight.
     """
     camera = apply_intrinsics_delta(observations.camera, state.intrinsics_delta)
-    vertices = posed_vertices(model, state)
+    posed = posed_body(model, state)
     head_and_foot_weight = model.skin_weights[:, [ACTIVE_JOINTS.index(name) for name in HEAD_AND_FOOT_JOINTS]].sum(1)
     head_and_foot_faces = (head_and_foot_weight > 0.5)[model.faces[:, 0].long()].numpy()
     size = 2 * PAIRS_PER_DIRECTION
@@ -260,10 +289,9 @@ def match_silhouettes(
     barycentric, target = torch.zeros(frames, size, 3).double(), torch.zeros(frames, size, 2).double()
     normal, weight = torch.zeros(frames, size, 2).double(), torch.zeros(frames, size).double()
     silhouette_iou = np.full(frames, np.nan)
-    for frame, window in enumerate(windows):
-        if window is None:
-            continue
-        body_raster = rasterise_in_window(vertices[frame], model.faces, camera, window)
+
+    def match(frame: int, vertices: Float[Tensor, "v 3"], window: MaskWindow) -> None:
+        body_raster = rasterise_in_window(vertices, model.faces, camera, window)
         body_mask = body_raster.face_id >= 0
         silhouette_iou[frame] = mask_iou(body_mask, window.mask)
         pairs = find_correspondences(window, body_mask, body_mask & head_and_foot_faces[body_raster.face_id])
@@ -275,5 +303,15 @@ def match_silhouettes(
         normal[frame, :count] = torch.from_numpy(pairs.normal).double()
         pair_weight = (pairs.weight > 0).astype(np.float64) if is_clothed else pairs.weight
         weight[frame, :count] = torch.from_numpy(pair_weight * (FRAME_WEIGHT / max(used, 1)))
+
+    def match_chunk(start: int) -> None:
+        chunk = windows[start : start + SKIN_CHUNK]
+        for row, (vertices, window) in enumerate(
+            zip(posed.vertices(slice(start, start + len(chunk))), chunk, strict=True)
+        ):
+            if window is not None:
+                match(start + row, vertices, window)
+
+    _thread_pool().map(match_chunk, range(0, frames, SKIN_CHUNK))
     weight *= torch.from_numpy(mask_weights(silhouette_iou))[:, None]
     return Contour(corners, barycentric, target, normal, weight), silhouette_iou

@@ -7,6 +7,7 @@ o landmark offset parameters, p = 3 j + 3 parameters of a frame, g shared parame
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -54,7 +55,11 @@ class FitState:
             intrinsics_delta=self.intrinsics_delta + shared_step[-INTRINSICS_COUNT:],
         )
 
-    def select(self, rows: Int[np.ndarray, "k"]) -> "FitState":
+    def shared_parameters(self) -> Float[Tensor, "g"]:
+        """Return shape, landmark offsets and intrinsics, in the order of a shared step."""
+        return torch.cat([self.shape, self.landmark_offsets_m, self.intrinsics_delta])
+
+    def select(self, rows: Int[np.ndarray, "k"] | slice) -> "FitState":
         """Return the state with the poses of the selected frames."""
         return replace(self, rotations=self.rotations[rows], root_m=self.root_m[rows])
 
@@ -75,7 +80,7 @@ class Observations:
     confidence_3d: Float[Tensor, "n l"]
     camera: Camera
 
-    def select(self, rows: Int[np.ndarray, "k"]) -> "Observations":
+    def select(self, rows: Int[np.ndarray, "k"] | slice) -> "Observations":
         """Return the observations of the selected frames."""
         return replace(
             self,

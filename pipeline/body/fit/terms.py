@@ -7,11 +7,11 @@ rho(r) = r^2 / (1 + r^2 / c^2) (Barron, "A general and adaptive robust loss func
 Dimensions: n frames, l landmarks, m points of a frame, g shared parameters.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.body.fit.camera_parameters import (
@@ -30,6 +30,7 @@ from pipeline.body.fit.landmark_regressor import (
 from pipeline.body.fit.levenberg_marquardt import NormalEquations, robust_weights
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody
 from pipeline.body.fit.posed_points import (
+    Contour,
     PosedPoints,
     PosedSkeleton,
     pose_jacobian_rows,
@@ -74,6 +75,15 @@ class Linearisation:
     skeleton: PosedSkeleton
     landmarks: PosedPoints
     has_shared: bool
+
+    def select(self, rows: slice) -> "Linearisation":
+        """Return the same for some frames."""
+        return replace(
+            self,
+            state=self.state.select(rows),
+            skeleton=self.skeleton.select(rows),
+            landmarks=self.landmarks.select(rows),
+        )
 
     def projection(
         self, points: PosedPoints
@@ -155,22 +165,37 @@ class Landmark3dTerm:
 
     The scale of the detector is unknown and has its own factor along the depth axis (`fit_3d_landmark_scale`).
     std_m: standard deviation across the view; the one along the depth is `DEPTH_STD_RATIO` times larger.
+    scale: of the detector in the whole recording, from `fitted_to`.
     """
 
     observations: Observations
     std_m: float
     cutoff: float
+    scale: Float[Tensor, "3"]
 
-    def add_to(self, system: NormalEquations, at: Linearisation) -> None:
-        """Add cost, gradient and Gauss-Newton Hessian at a state."""
+    @classmethod
+    def fitted_to(cls, observations: Observations, std_m: float, cutoff: float, at: Linearisation) -> "Landmark3dTerm":
+        """Return the term with the scale of least cost at a state of all frames."""
+        unit = cls(observations, std_m, cutoff, torch.ones(3, dtype=torch.float64))
+        return replace(unit, scale=fit_3d_landmark_scale(*unit._in_camera_axes(at), cutoff))
+
+    def _in_camera_axes(
+        self, at: Linearisation
+    ) -> tuple[Float[Tensor, "n l 3"], Float[Tensor, "n l 3"], Float[Tensor, "n l 3"]]:
+        """Return the landmarks of the body and the detected ones, relative to the hips, and inverse deviations."""
         world_m = at.landmarks.world_m
         facing = face_landmark_confidence(at.skeleton, at.camera)
         confidence = self.observations.confidence_3d * facing / landmark_std_ratio().square()
         to_camera = torch.as_tensor(at.camera.world_to_camera, dtype=world_m.dtype)[:3, :3]
-        relative_m = (world_m - _hip_midpoint(world_m)) @ to_camera.T
-        detected_m = self.observations.landmarks_3d_m @ to_camera.T
         inverse_std = confidence.sqrt()[..., None] / (self.std_m * world_m.new_tensor([1.0, 1.0, DEPTH_STD_RATIO]))
-        scale = fit_3d_landmark_scale(relative_m, detected_m, inverse_std, self.cutoff)
+        relative_m = (world_m - _hip_midpoint(world_m)) @ to_camera.T
+        return relative_m, self.observations.landmarks_3d_m @ to_camera.T, inverse_std
+
+    def add_to(self, system: NormalEquations, at: Linearisation) -> None:
+        """Add cost, gradient and Gauss-Newton Hessian at a state."""
+        world_m, scale = at.landmarks.world_m, self.scale
+        to_camera = torch.as_tensor(at.camera.world_to_camera, dtype=world_m.dtype)[:3, :3]
+        relative_m, detected_m, inverse_std = self._in_camera_axes(at)
         residual = (scale * relative_m - detected_m) * inverse_std
         weight = robust_weights(system, residual.square().sum(-1), self.cutoff)
         no_root = torch.zeros(len(world_m), 3, 3, dtype=torch.float64)  # a root translation moves hips and landmarks
@@ -185,21 +210,6 @@ class Landmark3dTerm:
                 residual[..., axis],
                 weight,
             )
-
-
-@dataclass(frozen=True)
-class Contour:
-    """Point-to-line constraints in the image: normal · (projection - target) = 0.
-
-    corners, barycentric: points on faces of the body, as vertex indices and barycentric coordinates.
-    weight: 0 for padding.
-    """
-
-    corners: Int[Tensor, "n m 3"]
-    barycentric: Float[Tensor, "n m 3"]
-    target_px: Float[Tensor, "n m 2"]
-    normal: Float[Tensor, "n m 2"]
-    weight: Float[Tensor, "n m"]
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,11 @@
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from pipeline.body.body import load_anny
+from pipeline.body.fit import energy
 from pipeline.body.fit.camera_parameters import INTRINSICS_COUNT
 from pipeline.body.fit.energy import VERTICAL_PRINCIPAL_POINT_RATIO, EnergyParameters, Objective, compute_px_per_m
 from pipeline.body.fit.initialisation import solve_root_position
@@ -65,6 +67,15 @@ def test_gradient_agrees_with_differences_of_the_cost(parameters: EnergyParamete
     slope = 2.0 * float((system.frame_gradient * frame_step).sum() + system.shared_gradient @ shared_step)
     # the shape derivative of a surface point is that of the nearest vertex, hence the tolerance
     assert (ahead - behind) / 2e-6 == pytest.approx(slope, rel=5e-3)
+
+
+def test_chunks_of_frames_do_not_change_the_system(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All frames in one chunk, or chunks of two."""
+    objective, state = build(EXACT)
+    whole = objective(state)
+    monkeypatch.setattr(energy, "FRAMES_PER_CHUNK", 2)
+    for name, value in vars(objective(state)).items():
+        np.testing.assert_allclose(value, getattr(whole, name), rtol=1e-9, atol=1e-9, err_msg=name)
 
 
 def test_cropping_does_not_change_the_energy() -> None:

@@ -26,6 +26,8 @@ HIPS_AND_SHOULDERS_LEFT, HIPS_AND_SHOULDERS_RIGHT = (11, 23), (12, 24)
 MAX_FRAMES = 24
 MIN_FRAMES = 8
 MAX_EVALUATIONS = 200
+COST_TOLERANCE = 1e-5
+"""Relative gain at which the fit ends. Costs are some hundred squared deviations: 0.05 deviations are left to gain."""
 
 MAX_YAW_RESULTANT = 0.5
 """Length of the mean of the facing directions up to which a recording counts as a turn: 0 for a full one, 0.5 for an
@@ -40,6 +42,9 @@ whose limbs swing is no rigid body."""
 
 STD_FACTOR = 2.0
 """True over formal standard deviation: errors of neighbouring frames are alike (1 to 2 degrees on three turns)."""
+
+TILT_DIFFERENCE_STEP = 1e-6
+"""Step of the central differences of `axis_rotation`, whose error is then 1e-11."""
 
 COMMON_FOCAL_LOG_STD = 0.1
 """Standard deviation of the log focal length that any number of landmarks leaves; errors were -0.10 to 0.04."""
@@ -94,11 +99,11 @@ class _Problem:
         middle = float(np.average(self.rays[..., 1], weights=self.weight[..., 0])) - self.start_body[:, 1].mean()
         return np.concatenate([self.start_body.ravel(), self.start_yaw_rad, place, [middle, 0.0, 0.0, 0.0]])
 
-    def reprojection(self, unknowns: Float[np.ndarray, "u"]) -> Float[np.ndarray, "k m 2"]:
-        """Return the distances of the projected body from the rays, over the height of the landmarks."""
-        body, yaw, place, (middle, right, towards, focal_log) = self.unpack(unknowns)
+    def turned(self, unknowns: Float[np.ndarray, "u"]) -> Float[np.ndarray, "k m 3"]:
+        """Return the body at its yaw and place in each frame, before the axis is tilted."""
+        body, yaw, place, _ = self.unpack(unknowns)
         sine, cosine = np.sin(yaw)[:, None], np.cos(yaw)[:, None]
-        turned = np.stack(
+        return np.stack(
             [
                 cosine * body[:, 0] + sine * body[:, 2] + place[:, :1],
                 np.broadcast_to(body[:, 1], self.rays.shape[:2]),
@@ -106,8 +111,16 @@ class _Problem:
             ],
             axis=-1,
         )
-        seen = turned @ axis_rotation(right, towards).T + [0.0, middle, -1.0]
-        return (np.exp(focal_log) * seen[..., :2] / -seen[..., 2:] - self.rays) / self.height
+
+    def seen(self, unknowns: Float[np.ndarray, "u"]) -> Float[np.ndarray, "k m 3"]:
+        """Return the body in the axes of the level camera."""
+        middle, right, towards, _ = self.unpack(unknowns)[3]
+        return self.turned(unknowns) @ axis_rotation(right, towards).T + [0.0, middle, -1.0]
+
+    def reprojection(self, unknowns: Float[np.ndarray, "u"]) -> Float[np.ndarray, "k m 2"]:
+        """Return the distances of the projected body from the rays, over the height of the landmarks."""
+        seen = self.seen(unknowns)
+        return (np.exp(unknowns[-1]) * seen[..., :2] / -seen[..., 2:] - self.rays) / self.height
 
     def residuals(self, unknowns: Float[np.ndarray, "u"]) -> Float[np.ndarray, "r"]:
         """Return all residuals in standard deviations; the gauge fixes what an image does not show."""
@@ -119,6 +132,49 @@ class _Problem:
         return np.concatenate(
             [pixels.ravel(), asymmetry.ravel(), np.array(gauge) / 1e-3, unknowns[-1:] / self.focal_log_std]
         )
+
+    def jacobian(self, unknowns: Float[np.ndarray, "u"]) -> Float[np.ndarray, "r u"]:
+        """Return the derivative of the residuals."""
+        body, yaw, _, (_, right, towards, focal_log) = self.unpack(unknowns)
+        (frames, points), unknown_count = self.rays.shape[:2], len(unknowns)
+        axes, seen = axis_rotation(right, towards), self.seen(unknowns)
+        frame, point = np.arange(frames), np.arange(points)
+        # Derivative of `seen`; unknowns as `unpack` splits them.
+        parts = np.zeros((frames, points, 3, unknown_count))
+        of_body, of_yaw, of_place, of_rest = np.split(parts, np.cumsum([3 * points, frames, 2 * frames]), axis=3)
+        sine, cosine, zero = np.sin(yaw), np.cos(yaw), np.zeros(frames)
+        turn = np.array([[cosine, zero, sine], [zero, zero + 1.0, zero], [-sine, zero, cosine]]).transpose(2, 0, 1)
+        by_yaw = np.array([[-sine, zero, cosine], [zero, zero, zero], [-cosine, zero, -sine]]).transpose(2, 0, 1)
+        for axis in range(3):
+            of_body[:, point, :, 3 * point + axis] = (axes @ turn)[None, :, :, axis]
+        of_yaw[frame, :, :, frame] = body @ (axes @ by_yaw).transpose(0, 2, 1)
+        of_place[frame, :, :, 2 * frame], of_place[frame, :, :, 2 * frame + 1] = axes[:, 0], axes[:, 2]
+        of_rest[..., 1, 0] = 1.0
+        step, turned = TILT_DIFFERENCE_STEP, self.turned(unknowns)
+        for column, (across, near) in enumerate(((step, 0.0), (0.0, step)), start=1):
+            ahead, behind = (axis_rotation(right + s * across, towards + s * near) for s in (1, -1))
+            of_rest[..., column] = turned @ (ahead - behind).T / (2.0 * step)
+        depth = -seen[..., 2, None]
+        pixels = (parts[..., :2, :] + (seen[..., :2] / depth)[..., None] * parts[..., 2:, :]) / depth[..., None]
+        pixels[..., -1] = seen[..., :2] / depth
+        pixels *= np.exp(focal_log) * self.weight[..., None] / (self.height * LANDMARK_STD_RATIO)
+        return np.concatenate([pixels.reshape(-1, unknown_count), self._prior_jacobian(unknown_count)])
+
+    def _prior_jacobian(self, unknown_count: int) -> Float[np.ndarray, "q u"]:
+        """Return the derivative of the residuals after those of the pixels."""
+        frames, points = self.rays.shape[:2]
+        of_body = np.zeros((points // 2, 3, points, 3))
+        pair, axis = np.divmod(np.arange(3 * (points // 2)), 3)
+        of_body[pair, axis, 2 * pair, axis] = np.where(axis == 0, -1.0, 1.0)
+        of_body[pair, axis, 2 * pair + 1, axis] = -1.0
+        rows = np.zeros((len(pair) + 6, unknown_count))
+        rows[: len(pair), : 3 * points] = of_body.reshape(len(pair), -1) / (self.height * SYMMETRY_STD_RATIO)
+        gauge, places = rows[len(pair) :], 3 * points + frames
+        gauge[0, 0 : 3 * points : 3] = gauge[1, 1 : 3 * points : 3] = 1e3 / points
+        gauge[2, places : places + 2 * frames : 2] = gauge[3, places + 1 : places + 2 * frames : 2] = 1e3 / frames
+        gauge[4, 3 * points : places] = 1e3 / frames
+        gauge[5, -1] = 1.0 / self.focal_log_std
+        return rows
 
 
 def axis_rotation(right: float, towards: float) -> Float[np.ndarray, "3 3"]:
@@ -144,7 +200,14 @@ def estimate_turn_axis(observations: Observations, focal_log_std: float) -> Turn
     if yaw_resultant(yaw_rad) > MAX_YAW_RESULTANT:
         return None
     problem = _make_problem(observations, rows, yaw_rad, max(focal_log_std, 1e-3))
-    found = least_squares(problem.residuals, problem.start(), loss="soft_l1", max_nfev=MAX_EVALUATIONS)
+    found = least_squares(
+        problem.residuals,
+        problem.start(),
+        problem.jacobian,
+        ftol=COST_TOLERANCE,
+        loss="soft_l1",
+        max_nfev=MAX_EVALUATIONS,
+    )
     residual = np.linalg.norm(problem.reprojection(found.x), axis=-1)
     if np.median(residual) > MAX_RESIDUAL_RATIO:
         return None

@@ -9,6 +9,8 @@ import torch
 from pipeline.body.body import load_anny
 from pipeline.body.fit.state import Observations
 from pipeline.body.fit.vertical.turn_axis import (
+    AXIS_LANDMARKS,
+    _Problem,
     axis_rotation,
     contradicting_focal_log,
     estimate_turn_axis,
@@ -47,6 +49,17 @@ def test_axis_rotation_takes_y_to_the_axis() -> None:
     assert np.linalg.det(rotation) == pytest.approx(1.0)
     assert np.allclose(rotation[:, 1] * np.sqrt(1.0 + 0.01 + 0.09), [-0.1, 1.0, 0.3])
     assert rotation[2, 0] == 0.0
+
+
+def test_jacobian_is_the_derivative_of_the_residuals() -> None:
+    random, frames, points = np.random.default_rng(1), 7, len(AXIS_LANDMARKS)
+    rays, weight = random.normal(scale=0.1, size=(frames, points, 2)), random.random((frames, points, 1))
+    body, yaw = random.normal(scale=0.2, size=(points, 3)), np.linspace(0.0, 6.0, frames)
+    problem = _Problem(rays, weight, body, yaw, height=0.7, focal_log_std=0.3)
+    at = problem.start() + random.normal(scale=0.05, size=len(problem.start()))
+    steps = 1e-6 * np.eye(len(at))
+    differences = [(problem.residuals(at + step) - problem.residuals(at - step)) / 2e-6 for step in steps]
+    np.testing.assert_allclose(problem.jacobian(at), np.stack(differences, axis=1), atol=1e-5)
 
 
 @pytest.mark.parametrize("tilt", [(0.0, 0.0), (-0.09, 0.27), (0.05, -0.18)])
