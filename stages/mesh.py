@@ -73,7 +73,7 @@ class Config(BaseConfig):
 
     rounds: int = Field(2, ge=0, le=10, description="rounds of refinement; 0 keeps the extracted mesh")
     steps: int = Field(
-        50,
+        90,
         ge=1,
         le=5000,
         description="optimiser steps of the last round; the others have twice as many, at half of the size",

@@ -61,7 +61,7 @@ def _remesh_in_two_sizes(mesh: Mesh, target_edge_m: float, body: Body) -> Mesh:
         selected = detailed_faces(mesh, body) == detailed
         if selected.any():
             part = None if selected.all() else selected
-            mesh = remesh_isotropic(mesh, edge_m, iterations=6, selected=part, tolerance_m=0.15 * edge_m)
+            mesh = remesh_isotropic(mesh, edge_m, iterations=3, selected=part, tolerance_m=0.15 * edge_m)
     return mesh
 
 
