@@ -72,7 +72,7 @@ class MeshSettings:
     smoothing_lambda: float = 12.0
     colour_weight: float = 1.0
     silhouette_weight: float = 1.0
-    laplacian_weight: float = 0.5
+    laplacian_weight: float = 1.5
     offset_weight: float = 0.002
     global_offset_weight: float = 0.02
     subdivide_percentile: float = 95.0

@@ -31,7 +31,7 @@ from pipeline.mesh.views import PosedView, render_posed_view, view_losses
 
 MAX_EDGE_WEIGHT = 16.0
 """Largest weight of an edge in the smoothing of the gradients: that of a quarter of the median length."""
-STIFFNESS = 6.0
+STIFFNESS = 12.0
 """Weight of edges of the face, which moves almost as a whole: its details are the body model's, and dark brows or lips
 would become grooves."""
 
