@@ -9,7 +9,7 @@ import torch
 from pipeline.body.body import Body
 from pipeline.geometry.mesh import Mesh
 from pipeline.mesh.skin_transfer import transfer_skin
-from pipeline.mesh.vertex_optimisation import FromDifferential, factorise_smoothing_matrix, optimise_vertices
+from pipeline.mesh.vertex_optimisation import STIFFNESS, FromDifferential, factorise_smoothing_matrix, optimise_vertices
 from pipeline.mesh.views import mesh_psnr_db
 from tests.mesh.egg import PATTERN, SETTINGS, Pattern, Views, refinement_inputs
 
@@ -66,7 +66,7 @@ def test_smoothed_offsets_solve_their_equation_and_so_do_their_gradients(egg: Me
     median = float(np.median(list(lengths.values())))
     for (a, b), length in lengths.items():
         weight = 5.0 * min((median / length) ** 2, 16.0)
-        weight *= 6.0 if a in stiff_vertices and b in stiff_vertices else 1.0
+        weight *= STIFFNESS if a in stiff_vertices and b in stiff_vertices else 1.0
         dense[a, a] += weight
         dense[b, b] += weight
         dense[a, b] -= weight
