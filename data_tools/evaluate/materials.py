@@ -180,18 +180,26 @@ def score_maps(
         image, mask = _exposed(truth, int(motion[position]), float(gains[position]))
         render = avatar.render(vertices, truth.camera, SAMPLES, avatar.light, position)
         scores["heldout_psnr_body_db"].append(inner_psnr_db(render, image, mask))
-        for name, light in NEW_LIGHTS.items():
-            expected = unpremultiply_to_uint8(
-                render_subject(truth.subject, true_vertices, truth.camera, light, SAMPLES)
-            )
-            drawn = render_subject(subject, vertices, truth.camera, light, SAMPLES)
-            scores.setdefault(f"relit_{name}_db", []).append(inner_psnr_db(drawn, expected[..., :3], expected[..., 3]))
+        for name, value in relit_psnr_db(truth, subject, vertices, true_vertices).items():
+            scores.setdefault(name, []).append(value)
     if truth.light.specular_strength > 0:
         scores |= {name: [value] for name, value in score_highlights(truth, texture, folder).items()}
     return {name: float(np.mean(values)) for name, values in scores.items()} | {
         "albedo_error": gain[1],
         "gain_error_largest": largest_gain_error(texture, gains),
     }
+
+
+def relit_psnr_db(
+    truth: SyntheticCapture, subject: Subject, vertices: Float[torch.Tensor, "v 3"], true_vertices: torch.Tensor
+) -> dict[str, float]:
+    """Return the PSNR of inner pixels of a posed subject against the true one under each of `NEW_LIGHTS`."""
+    scores = {}
+    for name, light in NEW_LIGHTS.items():
+        drawn = render_subject(subject, vertices, truth.camera, light, SAMPLES)
+        expected = unpremultiply_to_uint8(render_subject(truth.subject, true_vertices, truth.camera, light, SAMPLES))
+        scores[f"relit_{name}_db"] = inner_psnr_db(drawn, expected[..., :3], expected[..., 3])
+    return scores
 
 
 def largest_gain_error(texture: TextureArtifact, gains: Float[np.ndarray, "n"]) -> float:

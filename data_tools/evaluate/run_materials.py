@@ -13,14 +13,13 @@ from jaxtyping import Float
 
 from data_tools.evaluate.compare_avatar import compare_texture, observed_colours
 from data_tools.evaluate.comparison import REQUIRED_STAGES, Comparison
-from data_tools.evaluate.materials import NEW_LIGHTS, SAMPLES, inner_psnr_db, scale_linear
+from data_tools.evaluate.materials import SAMPLES, inner_psnr_db, relit_psnr_db, scale_linear
 from data_tools.evaluate.truth import load_ground_truth
 from data_tools.synthetic.rig.subject import Subject
-from data_tools.synthetic.scene.renderer import pose_vertices, render_subject
+from data_tools.synthetic.scene.renderer import pose_vertices
 from pipeline.avatar.finished_run import load_finished_run
 from pipeline.body.body import canonical_to_world
 from pipeline.capture.frame_selection import HELDOUT
-from pipeline.geometry.alpha import unpremultiply_to_uint8
 from pipeline.geometry.colour import srgb_to_linear
 from pipeline.geometry.mesh import Mesh
 from pipeline.io.image import to_float, to_uint8
@@ -92,11 +91,6 @@ def _relit_db(comparison: Comparison) -> Mapping[str, float]:
         )
         vertices: Float[torch.Tensor, "v 3"] = torch.from_numpy(moved.vertices).float()
         true_vertices = pose_vertices(truth.subject, true_pose)
-        for name, light in NEW_LIGHTS.items():
-            drawn = render_subject(subject, vertices, truth.camera, light, SAMPLES)
-            expected = unpremultiply_to_uint8(
-                render_subject(truth.subject, true_vertices, truth.camera, light, SAMPLES)
-            )
-            value = inner_psnr_db(drawn, expected[..., :3], expected[..., 3])
-            scores.setdefault(f"relit_{name}_db", []).append(value)
+        for name, value in relit_psnr_db(truth, subject, vertices, true_vertices).items():
+            scores.setdefault(name, []).append(value)
     return {name: float(np.mean(values)) for name, values in scores.items()}

@@ -4,6 +4,7 @@ import json
 import shutil
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -98,7 +99,7 @@ def _measure_run(trial: MaterialTrial, folder: Path) -> dict[str, float]:
     return _compare_lights(run, folder, lambda texture: score_run_materials(capture, run, texture))
 
 
-def _compare_lights(run: Path, folder: Path, score: Any) -> dict[str, float]:
+def _compare_lights(run: Path, folder: Path, score: Callable[[Path], dict[str, float]]) -> dict[str, float]:
     """Run the texture stage with and without the light; `score` returns the figures of a folder of it."""
     figures: dict[str, float] = {}
     seconds = {}

@@ -5,7 +5,6 @@ Letters: k poses, j joints, n rays.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
 
 import torch
 from jaxtyping import Float
@@ -21,7 +20,7 @@ from pipeline.field.volume_rendering import PoseBatch, PosedField, render_rays
 from pipeline.geometry.camera import Camera, pixel_rays, project
 from pipeline.kernels.common.grid_corners import corner_offsets
 from pipeline.kernels.common.packing import segment_ids_from_counts
-from pipeline.kernels.common.thread_pool import ThreadPool
+from pipeline.kernels.common.thread_pool import shared_thread_pool
 from pipeline.kernels.composite import composite
 from pipeline.kernels.hashgrid import FeatureGradients
 from pipeline.kernels.inverse_skinning import SkinGrid
@@ -96,13 +95,8 @@ def render_pose(
 
     chunks = _pixels_in_box(poses.inverse.posed_bounds_m[row], world_to_posed, camera)
     thread_count = torch.get_num_threads() if world_to_posed.device == CPU else 1
-    _thread_pool(thread_count).map(render_chunk, *zip(*chunks, strict=True))
+    shared_thread_pool(thread_count).map(render_chunk, *zip(*chunks, strict=True))
     return image
-
-
-@cache
-def _thread_pool(count: int) -> ThreadPool:
-    return ThreadPool(count)
 
 
 def _transform_rays(origins_m: Tensor, directions: Tensor, matrix: Float[Tensor, "4 4"]) -> tuple[Tensor, Tensor]:

@@ -1,7 +1,6 @@
 """The energy that the fit minimises: a sum of terms (`pipeline.body.fit.terms`) over one set of unknowns."""
 
 from dataclasses import dataclass, replace
-from functools import cache
 
 import torch
 from jaxtyping import Bool, Float
@@ -36,7 +35,7 @@ from pipeline.body.fit.terms import (
 )
 from pipeline.body.settings import FitSettings
 from pipeline.geometry.camera import Camera
-from pipeline.kernels.common.thread_pool import ThreadPool
+from pipeline.kernels.common.thread_pool import shared_thread_pool
 
 FRAMES_PER_CHUNK = 16
 """Frames whose image terms are evaluated together: the largest of their arrays (2 MB) stays in the cache of a core,
@@ -193,7 +192,7 @@ class Objective:
                 term.add_to(part, here)
             return part
 
-        for rows, part in zip(chunks, _thread_pool().map(evaluate, chunks), strict=True):
+        for rows, part in zip(chunks, shared_thread_pool(torch.get_num_threads()).map(evaluate, chunks), strict=True):
             system.add_frames(rows, part)
 
     def _prior_terms(self) -> list[EnergyTerm]:
@@ -232,12 +231,6 @@ class Objective:
         free[shape_count:-INTRINSICS_COUNT] = parameters.free_landmark_offsets
         free[-INTRINSICS_COUNT:-1], free[-1] = parameters.free_principal_point, parameters.free_focal
         return free
-
-
-@cache
-def _thread_pool() -> ThreadPool:
-    """Return the pool for chunks of frames; one thread each, because their operations are small."""
-    return ThreadPool(torch.get_num_threads())
 
 
 def compute_px_per_m(state: FitState, camera: Camera) -> Float[Tensor, "n"]:

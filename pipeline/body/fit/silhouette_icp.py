@@ -7,7 +7,6 @@ with the nearest body outline of similar normal. Outlines inside the body are no
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 
 import cv2
 import numpy as np
@@ -22,7 +21,7 @@ from pipeline.body.fit.posed_points import Contour, pose_skeleton
 from pipeline.body.fit.state import FitState, Observations
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.skinning import rigid_transform
-from pipeline.kernels.common.thread_pool import ThreadPool
+from pipeline.kernels.common.thread_pool import shared_thread_pool
 from pipeline.kernels.raster import rasterize
 from pipeline.metrics.images import mask_iou
 
@@ -161,12 +160,6 @@ def posed_body(model: LinearBody, state: FitState) -> PosedBody:
 def posed_vertices(model: LinearBody, state: FitState) -> Float[Tensor, "n v 3"]:
     """Return the world vertices (m, float32) of the body in every frame."""
     return posed_body(model, state).vertices(slice(None))
-
-
-@cache
-def _thread_pool() -> ThreadPool:
-    """Return the pool for frames, one thread each."""
-    return ThreadPool(torch.get_num_threads())
 
 
 @dataclass(frozen=True)
@@ -312,6 +305,6 @@ def match_silhouettes(
             if window is not None:
                 match(start + row, vertices, window)
 
-    _thread_pool().map(match_chunk, range(0, frames, SKIN_CHUNK))
+    shared_thread_pool(torch.get_num_threads()).map(match_chunk, range(0, frames, SKIN_CHUNK))
     weight *= torch.from_numpy(mask_weights(silhouette_iou))[:, None]
     return Contour(corners, barycentric, target, normal, weight), silhouette_iou

@@ -6,6 +6,7 @@ wake a thread takes as long as such an operation (docs/decisions.md).
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from typing import TypeVar
 
 import numba
@@ -42,3 +43,9 @@ class ThreadPool:
     def _set_thread_limits(self) -> None:
         torch.set_num_threads(self._threads_per_worker)
         numba.set_num_threads(self._threads_per_worker)
+
+
+@cache
+def shared_thread_pool(count: int) -> ThreadPool:
+    """Return the pool of `count` workers that all callers of this process share; its threads are started once."""
+    return ThreadPool(count)
