@@ -19,6 +19,7 @@ from pipeline.body.files import (
     save_observations,
     save_scores,
 )
+from pipeline.body.fit.detections.hand_observations import filter_hand_detections, finger_curls_rad
 from pipeline.body.fit.diagnostics import (
     FRAME_RATINGS,
     finite_median,
@@ -31,7 +32,6 @@ from pipeline.body.fit.diagnostics import (
     usable_frames,
 )
 from pipeline.body.fit.fit import FitOptions, TooFewLandmarksError, fit_supplied_poses
-from pipeline.body.fit.hand_observations import filter_hand_detections, finger_curls_rad
 from pipeline.body.fit.rejection import fit_body_without_others
 from pipeline.body.fit.result import FitResult
 from pipeline.body.fit.silhouette_icp import MaskWindow, crop_mask_window
@@ -311,7 +311,7 @@ def draw_overlay_grid(
 
 STAGE = Stage(
     "body",
-    version=19,
+    version=20,
     needs=("frames",),
     makes=(_BODY, _MOTION, _CAMERA, _OBSERVATIONS, SCORES_NPZ, _OVERLAY),
     config=Config,

@@ -7,8 +7,8 @@ import torch
 
 from pipeline.body.body import ParametricBody
 from pipeline.body.fit.camera_parameters import INTRINSICS_COUNT
+from pipeline.body.fit.detections.face_observations import FACE_MESH_POINTS
 from pipeline.body.fit.diagnostics import make_observations
-from pipeline.body.fit.face_observations import FACE_MESH_POINTS
 from pipeline.body.fit.landmark_regressor import (
     FACE_MESH_START,
     HAND_LANDMARKS,

@@ -4,8 +4,9 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
-from pipeline.body.fit.face_observations import face_landmarks
-from pipeline.body.fit.hand_observations import hand_landmarks
+from pipeline.body.fit.detections.face_observations import face_landmarks
+from pipeline.body.fit.detections.hand_observations import hand_landmarks
+from pipeline.body.fit.detections.hidden_legs import leg_visibility_factor
 from pipeline.body.fit.result import FitResult
 from pipeline.body.fit.state import Observations
 from pipeline.capture.face_detector import undetected_face
@@ -66,7 +67,9 @@ def make_observations(
     no_depth = np.full((*face_px.shape[:2], 3), np.nan)
     directions = torch.tensor(np.concatenate([landmarks_world_m, hands_m, no_depth], axis=1)).double()
     to_world = torch.as_tensor(camera.world_to_camera, dtype=torch.float64)[:3, :3]
-    pose_confidence = MIN_CONFIDENCE + (1.0 - MIN_CONFIDENCE) * np.nan_to_num(visibility)
+    known_visibility = np.nan_to_num(visibility)
+    pose_confidence = MIN_CONFIDENCE + (1.0 - MIN_CONFIDENCE) * known_visibility
+    pose_confidence *= leg_visibility_factor(known_visibility, time_s)
     landmark_confidence = torch.tensor(
         np.concatenate([pose_confidence, hands_confidence, face_confidence], axis=1)
     ).double()

@@ -15,17 +15,17 @@ from torch import Tensor
 
 from pipeline.body.body import ParametricBody
 from pipeline.body.fit.camera_parameters import apply_intrinsics_delta
-from pipeline.body.fit.energy import EnergyParameters, Objective, compute_px_per_m
-from pipeline.body.fit.ground_contact import Contact, estimate_floor_contact
-from pipeline.body.fit.initialisation import has_torso_landmarks, initial_state, interpolated_state
-from pipeline.body.fit.landmark_regressor import LandmarkRegressor, landmark_regressor
-from pipeline.body.fit.left_right_swaps import (
+from pipeline.body.fit.detections.left_right_swaps import (
     LIMB_SWAP_PAIRS,
     detect_body_swaps,
     detect_limb_swaps,
     swap_body_left_right,
     swap_limb_left_right,
 )
+from pipeline.body.fit.energy import EnergyParameters, Objective, compute_px_per_m
+from pipeline.body.fit.ground_contact import Contact, estimate_floor_contact
+from pipeline.body.fit.initialisation import has_torso_landmarks, initial_state, interpolated_state
+from pipeline.body.fit.landmark_regressor import LandmarkRegressor, landmark_regressor
 from pipeline.body.fit.levenberg_marquardt import NormalEquations, minimise
 from pipeline.body.fit.linear_body import LinearBody, linearise_body, relaxed_curls_rad
 from pipeline.body.fit.prior.posture import Posture, prior_of_recording

@@ -2,7 +2,8 @@
 
 The body is rasterised into the same small window as the mask, so that both outlines have the same half-pixel error,
 which cancels. Every point of the body outline is matched with the mask outline, and every point of the mask outline
-with the nearest body outline of similar normal. Outlines inside the body are not matched.
+with the nearest body outline of similar normal. Outlines inside the body are not matched, and those of legs that
+something hides have little weight (`pipeline.body.fit.detections.hidden_legs`).
 """
 
 from collections.abc import Sequence
@@ -16,6 +17,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pipeline.body.fit.camera_parameters import apply_intrinsics_delta
+from pipeline.body.fit.detections.hidden_legs import outline_weights
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody
 from pipeline.body.fit.posed_points import Contour, pose_skeleton
 from pipeline.body.fit.state import FitState, Observations
@@ -276,6 +278,8 @@ def match_silhouettes(
     posed = posed_body(model, state)
     head_and_foot_weight = model.skin_weights[:, [ACTIVE_JOINTS.index(name) for name in HEAD_AND_FOOT_JOINTS]].sum(1)
     head_and_foot_faces = (head_and_foot_weight > 0.5)[model.faces[:, 0].long()].numpy()
+    face_joint = model.skin_weights.argmax(1)[model.faces[:, 0].long()]
+    joint_weight = outline_weights(observations.confidence)
     size = 2 * PAIRS_PER_DIRECTION
     frames = len(windows)
     corners = torch.zeros(frames, size, 3, dtype=torch.int64)
@@ -290,12 +294,14 @@ def match_silhouettes(
         pairs = find_correspondences(window, body_mask, body_mask & head_and_foot_faces[body_raster.face_id])
         count, used = len(pairs.weight), (pairs.weight > 0).sum()
         rows, columns = pairs.pixel.T
-        corners[frame, :count] = model.faces[body_raster.face_id[rows, columns]].long()
+        face = torch.from_numpy(body_raster.face_id[rows, columns])
+        corners[frame, :count] = model.faces[face].long()
         barycentric[frame, :count] = torch.from_numpy(body_raster.barycentric[rows, columns]).double()
         target[frame, :count] = torch.from_numpy(pairs.target / window.scale + [window.left_px, window.top_px])
         normal[frame, :count] = torch.from_numpy(pairs.normal).double()
         pair_weight = (pairs.weight > 0).astype(np.float64) if is_clothed else pairs.weight
-        weight[frame, :count] = torch.from_numpy(pair_weight * (FRAME_WEIGHT / max(used, 1)))
+        shown = joint_weight[frame, face_joint[face]]
+        weight[frame, :count] = torch.from_numpy(pair_weight * (FRAME_WEIGHT / max(used, 1))) * shown
 
     def match_chunk(start: int) -> None:
         chunk = windows[start : start + SKIN_CHUNK]

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pipeline.body.body import Body
-from pipeline.body.fit.face_observations import face_landmarks, facing_cosine
+from pipeline.body.fit.detections.face_observations import face_landmarks, facing_cosine
 from pipeline.capture.capture import Capture
 from pipeline.geometry.camera import Camera, pixel_rays
 from pipeline.geometry.mesh import Mesh

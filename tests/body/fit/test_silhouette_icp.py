@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from pipeline.body.body import load_anny
+from pipeline.body.fit.linear_body import ACTIVE_JOINTS
 from pipeline.body.fit.silhouette_icp import (
     crop_mask_window,
     distance_px,
@@ -112,6 +113,20 @@ def test_the_true_body_matches_its_mask() -> None:
     assert np.isnan(silhouette_iou[2])
     assert contour.weight[2].max() == 0.0
     assert contour.weight[:2].sum(1).min() > 20.0
+
+
+def test_the_outline_of_a_hidden_leg_has_little_weight() -> None:
+    """It ends where the object begins, which says nothing about the leg."""
+    scene = synthetic_recording(load_anny(), 2)
+    observations = scene.observations(scene.camera)
+    observations.confidence[0, 27] = 1e-4
+    contour, _ = match_silhouettes(scene.model, scene.state, observations, scene.windows())
+    joint = scene.model.skin_weights.argmax(1)[contour.corners[..., 0]]
+    leg = torch.tensor([ACTIVE_JOINTS.index(name) for name in ("LeftUpLeg", "LeftLeg", "LeftFoot", "LeftToeBase")])
+    on_leg = torch.isin(joint, leg)
+    assert contour.weight[0, on_leg[0]].max() < 1e-3
+    assert contour.weight[0, ~on_leg[0]].max() > 0.1
+    assert contour.weight[1, on_leg[1]].max() > 0.1
 
 
 def test_hair_and_shoes_have_little_weight() -> None:

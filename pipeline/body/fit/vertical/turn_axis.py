@@ -36,6 +36,10 @@ arc of 217 degrees."""
 LANDMARK_STD_RATIO, SYMMETRY_STD_RATIO = 0.01, 0.012
 """Standard deviations of a landmark in the image and of the symmetry of the body, over the height of the landmarks."""
 
+MAX_FOCAL_LOG = 2.0 * FitSettings.initial_focal_std
+"""Logarithm of the focal length over the initial one beyond which there is no evidence: a factor of 2.7 either way,
+views of 17 to 97 degrees. A camera in the hand, which drifts up and down, looked like a lens of 100 times the length."""
+
 MAX_RESIDUAL_RATIO = 0.03
 """Median distance of the landmarks from the rigid body, over their height, above which there is no evidence: a walk
 whose limbs swing is no rigid body."""
@@ -209,7 +213,7 @@ def estimate_turn_axis(observations: Observations, focal_log_std: float) -> Turn
         max_nfev=MAX_EVALUATIONS,
     )
     residual = np.linalg.norm(problem.reprojection(found.x), axis=-1)
-    if np.median(residual) > MAX_RESIDUAL_RATIO:
+    if np.median(residual) > MAX_RESIDUAL_RATIO or abs(found.x[-1]) > MAX_FOCAL_LOG:
         return None
     covariance = np.linalg.pinv(found.jac.T @ found.jac)
     # The median distance of points with normal errors is 1.18 standard deviations.

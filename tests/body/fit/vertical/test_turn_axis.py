@@ -104,6 +104,15 @@ def test_a_body_that_is_not_rigid_gives_no_axis() -> None:
     assert estimate_turn_axis(turning_body((0.0, 0.2), swing_m=0.4), 0.5) is None
 
 
+def test_a_camera_that_drifts_gives_no_axis() -> None:
+    """Up and down by a tenth of the picture looks like a lens of eight times the focal length."""
+    observations = turning_body((0.0, 0.05))
+    frame = torch.arange(len(observations.time_s), dtype=torch.float64)
+    drift_px = 24.0 * torch.stack([torch.sin(0.9 * frame), torch.cos(1.3 * frame)], dim=-1)
+    drifting = replace(observations, landmarks_px=observations.landmarks_px + drift_px[:, None])
+    assert estimate_turn_axis(drifting, 0.5) is None
+
+
 def test_undetected_feet_give_no_axis() -> None:
     observations = turning_body((0.0, 0.2))
     confidence = observations.confidence.clone()

@@ -7,9 +7,7 @@ import pytest
 import torch
 
 from pipeline.body.body import AnnyBody, load_anny
-from pipeline.body.fit.diagnostics import make_observations
-from pipeline.body.fit.energy import EnergyParameters, Objective, compute_px_per_m
-from pipeline.body.fit.hand_observations import (
+from pipeline.body.fit.detections.hand_observations import (
     MAX_CURL_RAD,
     MAX_WRIST_DISTANCE_M,
     MIN_HAND_FRAMES,
@@ -19,6 +17,8 @@ from pipeline.body.fit.hand_observations import (
     hand_landmarks,
     rest_hand_points_m,
 )
+from pipeline.body.fit.diagnostics import make_observations
+from pipeline.body.fit.energy import EnergyParameters, Objective, compute_px_per_m
 from pipeline.body.fit.landmark_regressor import (
     FACE_MESH_START,
     HAND_LANDMARKS,

@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from pipeline.body.body import load_anny
-from pipeline.body.fit.landmark_regressor import POSE_LANDMARK_COUNT, mirror_permutation
-from pipeline.body.fit.left_right_swaps import (
+from pipeline.body.fit.detections.left_right_swaps import (
     LIMB_SWAP_PAIRS,
     detect_body_swaps,
     detect_limb_swaps,
@@ -15,6 +14,7 @@ from pipeline.body.fit.left_right_swaps import (
     swap_limb_left_right,
     viterbi_two_labels,
 )
+from pipeline.body.fit.landmark_regressor import POSE_LANDMARK_COUNT, mirror_permutation
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.rotation import axis_angle_to_matrix

@@ -4,9 +4,14 @@ import numpy as np
 import torch
 
 from pipeline.body.body import load_anny
+from pipeline.body.fit.detections.face_observations import (
+    FACE_MESH_POINTS,
+    MAX_DISTANCE_M,
+    face_landmarks,
+    facing_cosine,
+)
 from pipeline.body.fit.diagnostics import make_observations
 from pipeline.body.fit.energy import EnergyParameters, Objective, compute_px_per_m
-from pipeline.body.fit.face_observations import FACE_MESH_POINTS, MAX_DISTANCE_M, face_landmarks, facing_cosine
 from pipeline.body.fit.landmark_regressor import FACE_MESH_START, LANDMARKS, landmark_regressor
 from pipeline.body.fit.levenberg_marquardt import minimise
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS, linearise_body
