@@ -38,7 +38,7 @@ LANDMARK_STD_RATIO, SYMMETRY_STD_RATIO = 0.01, 0.012
 
 MAX_FOCAL_LOG = 2.0 * FitSettings.initial_focal_std
 """Logarithm of the focal length over the initial one beyond which there is no evidence: a factor of 2.7 either way,
-views of 17 to 97 degrees. A camera in the hand, which drifts up and down, looked like a lens of 100 times the length."""
+views of 17 to 97 degrees. A camera in the hand, which drifts up and down, looked like a lens of 100 times that."""
 
 MAX_RESIDUAL_RATIO = 0.03
 """Median distance of the landmarks from the rigid body, over their height, above which there is no evidence: a walk
