@@ -24,7 +24,7 @@ from pipeline.core.progress import track
 from pipeline.field.config import FieldConfig
 
 VALIDATION_FRAMES = 12
-"""Validation frames that are scored; the stage renders four."""
+"""Validation frames that are scored where they judge; the stage, and a comparison with the truth, render four."""
 
 
 def main(argv: Sequence[str]) -> None:
@@ -40,7 +40,7 @@ def main(argv: Sequence[str]) -> None:
                 raise UserError(f"{folder} does not exist: name runs whose body stage is finished")
     names = options.rows or rows_of_group(options.group)
     names.sort(key=lambda name: name != REFERENCE)
-    trials = [_trial(run, name, seed, options) for name, seed, run in product(names, options.seeds, options.runs)]
+    trials = [_trial(run, name, seed, options) for seed, name, run in product(options.seeds, names, options.runs)]
     results: dict[FieldTrial, TrialScores] = {}
     for trial in track(trials, "trainings"):
         result = read_trial(trial) if options.write_only else run_trial(trial)
@@ -56,7 +56,8 @@ def _capture(run: Path) -> Path:
 
 
 def _trial(run: Path, name: str, seed: int, options: argparse.Namespace) -> FieldTrial:
-    base = FieldConfig(seed=seed, early_stop=False, validation_frames=VALIDATION_FRAMES)
+    base = FieldConfig(seed=seed, early_stop=False)
+    base = base if options.truth else base.model_copy(update={"validation_frames": VALIDATION_FRAMES})
     base = base if options.steps is None else base.model_copy(update={"steps": options.steps})
     truth = _capture(run) if options.truth else None
     return FieldTrial(run, ROWS[name], seed, ROWS[name].config(base), truth, options.out)
