@@ -24,6 +24,7 @@ from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
 from pipeline.field.checkpoint import CHECKPOINT_FILE, load_checkpoint, save_checkpoint
 from pipeline.field.config import FieldConfig
+from pipeline.field.field import RadianceField
 from pipeline.field.files import save_field, save_occupancy
 from pipeline.field.optimiser import DivergedError
 from pipeline.field.setup import MaskedImage, create_trainer, evenly_spaced, training_scale
@@ -69,8 +70,17 @@ def run(inputs: Mapping[str, Path], out: Path, config: FieldConfig) -> Mapping[s
         "occupied_cells": int(trainer.occupancy.occupied.sum()),
         "train_frames": len(train),
         "parameters": sum(parameter.numel() for parameter in trainer.field.parameters()),
+        **finest_cell_metrics(trainer.field),
         **peak_gpu_memory_metrics(device),
     }
+
+
+def finest_cell_metrics(field: RadianceField) -> dict[str, float]:
+    """Return the edge of the finest cells of the hash grid, mm; empty for a field without a grid."""
+    if not field.layout.cells_per_axis:
+        return {}
+    extent_m = (field.bounds_m[1] - field.bounds_m[0]).cpu().numpy()
+    return {"finest_cell_mm": 1000.0 * float((extent_m / np.array(field.layout.cells_per_axis[-1])).max())}
 
 
 def peak_gpu_memory_metrics(device: torch.device) -> dict[str, float]:

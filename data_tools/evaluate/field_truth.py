@@ -1,7 +1,7 @@
 """Score a radiance field against the ground truth of its synthetic capture: surface, novel views and poses, haze.
 
-The field is drawn where its surface, extracted at one density and posed, is aligned with the true surface by a similarity
-transform, with the joints of both rigs matched (`data_tools.evaluate.comparison`).
+The field is drawn where its surface, extracted at one density and posed, is aligned with the true surface by a
+similarity transform, with the joints of both rigs matched (`data_tools.evaluate.comparison`).
 """
 
 from collections.abc import Iterator
@@ -109,7 +109,10 @@ def score_field(run: Path, field_folder: Path, capture: Path) -> dict[str, float
     shape = surface_scores(alignment.transform_mesh(surface), true_surface, SURFACE_POINTS)
     scores = {"field_chamfer_mm": shape["chamfer_mm"], "field_normal_angle_deg": shape["normal_angle_deg"]}
     haze = []
-    for name, images in (("novel_view", novel_views(comparison, capture)), ("novel_pose", novel_poses(comparison, capture))):
+    for name, images in (
+        ("novel_view", novel_views(comparison, capture)),
+        ("novel_pose", novel_poses(comparison, capture)),
+    ):
         rows = []
         for target, rgba in images:
             rows.append(frame_scores(rgba, target[..., :3], target[..., 3]))
@@ -191,8 +194,8 @@ def haze_alpha(alpha: Float[np.ndarray, "h w"], true_alpha: UInt8[np.ndarray, "h
     rows, columns = np.nonzero(mask.any(1))[0], np.nonzero(mask.any(0))[0]
     margin = round(0.1 * (rows[-1] - rows[0] + 1))
     near = np.zeros_like(mask)
-    near[
-        max(0, rows[0] - margin) : rows[-1] + 1 + margin, max(0, columns[0] - margin) : columns[-1] + 1 + margin
-    ] = True
+    near[max(0, rows[0] - margin) : rows[-1] + 1 + margin, max(0, columns[0] - margin) : columns[-1] + 1 + margin] = (
+        True
+    )
     distance_px = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return float(alpha[near & (distance_px > HAZE_DISTANCE_PX)].mean())

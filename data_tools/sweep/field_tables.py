@@ -32,7 +32,7 @@ COLUMNS = (
     Column("novel_view_psnr_body_db", "body, dB", 2),
     Column("novel_pose_psnr_db", "novel poses, dB", 2),
     Column("novel_pose_psnr_body_db", "body, dB", 2),
-    Column("haze", "haze, 0.001 of alpha", 2, 1e3),
+    Column("haze", "haze, alpha × 1e6", 1, 1e6),
     Column("field_chamfer_mm", "Chamfer, mm", 2),
     Column("field_normal_angle_deg", "normals, °", 2),
     Column("samples_per_step", "samples a step", 0),

@@ -82,9 +82,7 @@ def run_trial(trial: FieldTrial) -> TrialScores:
     if trial.truth is not None:
         scores |= score_field(trial.run, trial.folder, trial.truth)
     environment = describe_environment()
-    result = TrialScores(
-        trial.identity, scores, str(environment.get("commit") or ""), describe_machine(environment)
-    )
+    result = TrialScores(trial.identity, scores, str(environment.get("commit") or ""), describe_machine(environment))
     with atomic_path(trial.folder / SCORES_FILE) as path:
         path.write_text(json.dumps(asdict(result), indent=2, allow_nan=False) + "\n", encoding="utf-8")
     return result

@@ -4,8 +4,8 @@ A network of two layers maps the density of a voxel, its distance to the body su
 the weight. The weight multiplies the density of all samples in the voxel, in images and in the update of the occupancy
 grid, so that the losses of the images train the network end to end. The paper does not define the training of the
 network, nor the temporal window of the frequency. Here the frequency starts as the fraction of the posed frames whose
-mask contains the voxel, and every update of the grid moves it, with the grid's decay, towards 1 where the opacity of the
-voxel exceeds the threshold and towards 0 elsewhere.
+mask contains the voxel, and every update of the grid moves it, with the grid's decay, towards 1 where the opacity of
+the voxel exceeds the threshold and towards 0 elsewhere.
 """
 
 import torch

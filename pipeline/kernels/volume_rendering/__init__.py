@@ -57,8 +57,8 @@ def render_rays_fused(
 ) -> RenderOutput:
     """Render rays, and evaluate the density at additional canonical points.
 
-    float32 on the CPU. Differentiable in the weights and the gate of the network and in `skinning.blended`; the backward
-    pass appends the input of `add_table_gradient_` to `feature_gradients`.
+    float32 on the CPU. Differentiable in the weights and the gate of the network and in `skinning.blended`; the
+    backward pass appends the input of `add_table_gradient_` to `feature_gradients`.
 
     Args:
         rays: sorted by `skinning.batch_index`.
