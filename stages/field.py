@@ -57,7 +57,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: FieldConfig) -> Mapping[s
     device = select_device(config.device, "field.device")
     trainer = create_trainer(body, motion.select(train), camera, masked_images, config, device)
     validator = build_validator(capture, motion, camera, config)
-    seconds_per_step, samples_per_step = train_field(trainer, validator, out)
+    seconds_per_step = train_field(trainer, validator, out)
     motion, metrics, renders = select_poses(trainer, validator, motion)
     save_field(out / "field.safetensors", trainer.field)
     save_occupancy(out / "occupancy.npz", trainer.occupancy.binary())
@@ -66,7 +66,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: FieldConfig) -> Mapping[s
     return metrics | {
         "steps": trainer.completed_steps,
         "seconds_per_step": seconds_per_step,
-        "samples_per_step": samples_per_step,
+        "samples_per_step": trainer.count_samples(),
         "occupied_cells": int(trainer.occupancy.occupied.sum()),
         "train_frames": len(train),
         "parameters": sum(parameter.numel() for parameter in trainer.field.parameters()),
@@ -114,8 +114,8 @@ def build_validator(capture: Capture, motion: Motion, camera: Camera, config: Fi
     return Validator(motion.select(positions), camera, read_masked_images(capture, positions, camera))
 
 
-def train_field(trainer: Trainer, validator: Validator, out: Path) -> tuple[float, float]:
-    """Take all remaining steps with regular checkpoints; return the medians of a step: its time, s, and its samples.
+def train_field(trainer: Trainer, validator: Validator, out: Path) -> float:
+    """Take all remaining steps with regular checkpoints; return the median time of a step, s.
 
     Raises:
         UserError: the training diverged.
@@ -124,12 +124,12 @@ def train_field(trainer: Trainer, validator: Validator, out: Path) -> tuple[floa
     seconds_before = load_checkpoint(checkpoint, trainer)
     curve, subsampled_validator = ValidationCurve(out, trainer.completed_steps), validator.subsampled()
     validation_steps = {round(fraction * trainer.config.steps) for fraction in VALIDATION_FRACTIONS}
-    step_seconds, step_samples, last_save_s = [], [], time.monotonic()
+    step_seconds, last_save_s = [], time.monotonic()
     steps = range(trainer.completed_steps, trainer.config.steps)
     for _ in track(steps, "field", total=trainer.config.steps, initial=trainer.completed_steps):
         start_s = time.monotonic()
         try:
-            step_samples.append(trainer.step()["samples"])
+            trainer.step()
         except DivergedError as error:
             raise UserError(
                 f"the training of the field diverged ({error}): look for damaged images or masks in the frames "
@@ -145,13 +145,11 @@ def train_field(trainer: Trainer, validator: Validator, out: Path) -> tuple[floa
                 *subsampled_validator.mean_psnr_db(renders),
                 *subsampled_validator.psnr_per_frame_db(renders),
             )
-            if trainer.config.early_stop and curve.has_converged(trainer.config.steps / 2):
-                break
         if time.monotonic() - last_save_s > CHECKPOINT_INTERVAL_S:
             save_checkpoint(checkpoint, trainer, seconds_before + sum(step_seconds))
             last_save_s = time.monotonic()
     curve.finish()
-    return (float(np.median(step_seconds)), float(np.median(step_samples))) if step_seconds else (0.0, 0.0)
+    return float(np.median(step_seconds)) if step_seconds else 0.0
 
 
 def select_poses(
@@ -195,7 +193,7 @@ def write_preview(path: Path, renders: list[np.ndarray], validator: Validator) -
 
 STAGE = Stage(
     "field",
-    version=16,
+    version=17,
     needs=("frames", "body"),
     makes=("field.safetensors", "occupancy.npz", "motion.npz"),
     config=FieldConfig,

@@ -130,6 +130,15 @@ class Trainer:
         samples = sum(len(result.rendered.transmittance) for result in results)
         return {name: float(loss) for name, loss in losses.items()} | {"samples": float(samples)}
 
+    @torch.no_grad()
+    def count_samples(self) -> int:
+        """Return the number of samples on the rays of the next step, without taking it."""
+        frames = self.sampler.sample_frames(step_rng(self.config.seed, self.completed_steps, STEP_STREAM))
+        batch = self.sampler.sample_rays(frames, self.completed_steps, self.inverse_skinning.cameras)
+        posed_field = PosedField(self.field, self.inverse_skinning.inverse, self.occupancy.binary())
+        none_m = self.field.bounds_m[:0]
+        return len(render_rays(posed_field, batch.rays, None, none_m, self.step_m, MAX_SAMPLES_PER_RAY, []).weight)
+
     def forward_backward(
         self, frames: Int[np.ndarray, "k"], empty_m: Float[Tensor, "e 3"], ray_fraction: float
     ) -> StepResult:
