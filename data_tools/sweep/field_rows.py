@@ -1,7 +1,7 @@
 """Rows of the sweep of the field stage: each differs from the stage as it is in one size or one part."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from pipeline.field.config import FieldConfig
@@ -10,6 +10,7 @@ from pipeline.field.settings import FieldSettings
 REFERENCE = "reference"
 SIZE, ATTENTION = "size", "attention"
 SMALL_PERSON_PX = 240
+LEVELS = FieldSettings().levels
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,12 +47,6 @@ class FieldRow:
         return FieldConfig(**(values | changed))
 
 
-def _with_default(setting: str, change: float) -> dict[str, int]:
-    """Return a setting that differs from its default by a number."""
-    default = {each.name: each.default for each in fields(FieldSettings)}[setting]
-    return {setting: default + change}
-
-
 SMALL = "small-person"
 _SMALL_OPTIONS = {"max_person_px": SMALL_PERSON_PX}
 
@@ -62,8 +57,8 @@ ROWS = {
         FieldRow("rows-half", "half the rows of the hash table", options={"log2_hashmap_size": 16}),
         FieldRow("rows-quarter", "a quarter of the rows", options={"log2_hashmap_size": 15}),
         FieldRow("rows-double", "twice the rows", options={"log2_hashmap_size": 18}),
-        FieldRow("levels-less", "one level less, same finest cell", settings=_with_default("levels", -1)),
-        FieldRow("levels-more", "one level more, same finest cell", settings=_with_default("levels", 1)),
+        FieldRow("levels-less", "one level less, same finest cell", settings={"levels": LEVELS - 1}),
+        FieldRow("levels-more", "one level more, same finest cell", settings={"levels": LEVELS + 1}),
         FieldRow("width-half", "half the units of the hidden layer", settings={"hidden_width": 16}),
         FieldRow("width-double", "twice the units", settings={"hidden_width": 64}),
         FieldRow("steps-half", "half the steps", factors={"steps": 0.5}),

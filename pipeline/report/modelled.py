@@ -158,6 +158,8 @@ def _specular(manifests: Manifests) -> ModelledPart:
         return ModelledPart("Highlights", f"on in {regions} regions", reason, f"{size} for their map")
     if explained == errors == 0.0:
         reason = "not tried: no lamp was found whose highlights they could be"
+    else:
+        reason += ": too little, no region of the surface shines"
     return ModelledPart("Highlights", "off", reason, f"their map would cost {size}")
 
 
