@@ -6,12 +6,13 @@ similarity transform, with the joints of both rigs matched (`data_tools.evaluate
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from data_tools.evaluate.comparison import SURFACE_POINTS, retarget_motion
@@ -76,12 +77,21 @@ class TrueComparison:
 
     def true_surface(self, pose: Float[Tensor, "j 4 4"]) -> Mesh:
         """Return the true person in a pose, without interior faces."""
-        body = self.truth.subject.body
-        return Mesh(pose_vertices(self.truth.subject, pose).numpy(), body.faces[find_exterior_faces(body.mesh())])
+        return Mesh(pose_vertices(self.truth.subject, pose).numpy(), self._true_faces)
 
-    def render(self, pose: Float[Tensor, "j 4 4"], true_pose: Tensor, camera: Camera) -> Float[np.ndarray, "h w 4"]:
-        """Draw the field in a pose from a camera of the true world, premultiplied, aligned with `true_pose`."""
-        alignment = align_surfaces_icp(self.posed_surface(pose), self.true_surface(true_pose))
+    @cached_property
+    def _true_faces(self) -> Int[np.ndarray, "f 3"]:
+        body = self.truth.subject.body
+        return body.faces[find_exterior_faces(body.mesh())]
+
+    def align(self, pose: Float[Tensor, "j 4 4"], true_pose: Float[Tensor, "k 4 4"]) -> SimilarityTransform:
+        """Return the similarity from the surface in a pose to the true person in the pose of its own rig."""
+        return align_surfaces_icp(self.posed_surface(pose), self.true_surface(true_pose))
+
+    def render(
+        self, pose: Float[Tensor, "j 4 4"], alignment: SimilarityTransform, camera: Camera
+    ) -> Float[np.ndarray, "h w 4"]:
+        """Draw the field in a pose, moved by `alignment`, from a camera of the true world; premultiplied."""
         aligned = camera_before_similarity(camera, alignment)
         return render_field(self.field, self.occupancy, self.body, pose, aligned, self.skin).numpy()
 
@@ -154,9 +164,9 @@ def novel_views(
     """Yield true images (straight RGBA) and renders of the first frame from other cameras."""
     truth = comparison.truth
     pose = canonical_to_world(comparison.body, comparison.match(truth.motion.select(np.array([0]))))[0]
+    alignment = comparison.align(pose, truth.canonical_to_world[0])
     for path in sorted((capture / "truth" / "novel_views").glob("*.npz")):
-        rgba = comparison.render(pose, truth.canonical_to_world[0], load_camera(path))
-        yield read_rgba(path.with_suffix(".png")), rgba
+        yield read_rgba(path.with_suffix(".png")), comparison.render(pose, alignment, load_camera(path))
 
 
 def novel_poses(
@@ -167,7 +177,8 @@ def novel_poses(
     motion = load_motion(folder / "motion.npz")
     true_poses = canonical_to_world(truth.subject.body, motion)
     for index, pose in enumerate(canonical_to_world(comparison.body, comparison.match(motion))):
-        yield read_rgba(folder / f"{index:06d}.png"), comparison.render(pose, true_poses[index], truth.camera)
+        alignment = comparison.align(pose, true_poses[index])
+        yield read_rgba(folder / f"{index:06d}.png"), comparison.render(pose, alignment, truth.camera)
 
 
 def camera_before_similarity(camera: Camera, transform: SimilarityTransform) -> Camera:
