@@ -66,7 +66,7 @@ def markdown_means(results: Results) -> str:
     lines = []
     for name in _row_names(results):
         chosen = [result.scores for trial, result in results.items() if trial.row.name == name]
-        cells = (_format(statistics.fmean(scores[column.score] for scores in chosen), column) for column in columns)
+        cells = (format_mean(chosen, column) for column in columns)
         lines.append([f"`{name}`", ROWS[name].meaning, str(len(chosen)), *cells])
     return _table(["row", "what differs", "n", *(column.heading for column in columns)], lines)
 
@@ -95,25 +95,33 @@ def paired_scores(results: Results, name: str) -> list[tuple[Mapping[str, float]
 
 
 def format_difference(pairs: Sequence[tuple[Mapping[str, float], Mapping[str, float]]], column: Column) -> str:
-    """Return the mean difference with its sign and, from two pairs on, its standard error."""
-    values = [column.factor * (scores[column.score] - reference[column.score]) for scores, reference in pairs]
+    """Return the mean difference with its sign and, from two pairs on, its standard error; a dash without pairs.
+
+    Pairs of which one lacks the score are left out.
+    """
+    known = [pair for pair in pairs if all(column.score in scores for scores in pair)]
+    values = [column.factor * (scores[column.score] - reference[column.score]) for scores, reference in known]
+    if not values:
+        return "–"
     mean = f"{statistics.fmean(values):+.{column.decimals}f}"
     if len(values) < 2:
         return mean
     return f"{mean} ± {statistics.stdev(values) / math.sqrt(len(values)):.{column.decimals}f}"
 
 
+def format_mean(trainings: Sequence[Mapping[str, float]], column: Column) -> str:
+    """Return the mean over the trainings that have the score; a dash if none has."""
+    values = [column.factor * scores[column.score] for scores in trainings if column.score in scores]
+    return f"{statistics.fmean(values):,.{column.decimals}f}" if values else "–"
+
+
 def _columns(results: Results) -> list[Column]:
-    """Return the columns that all trainings have."""
-    return [column for column in COLUMNS if all(column.score in result.scores for result in results.values())]
+    """Return the columns that at least one training has."""
+    return [column for column in COLUMNS if any(column.score in result.scores for result in results.values())]
 
 
 def _row_names(results: Results) -> list[str]:
     return list(dict.fromkeys(trial.row.name for trial in results))
-
-
-def _format(value: float, column: Column) -> str:
-    return f"{column.factor * value:,.{column.decimals}f}"
 
 
 def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

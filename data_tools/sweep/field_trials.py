@@ -13,6 +13,7 @@ from data_tools.sweep.field_rows import FieldRow
 from pipeline.core.atomic import atomic_path
 from pipeline.core.manifest import digest_json
 from pipeline.core.measure import describe_environment
+from pipeline.field.checkpoint import CHECKPOINT_FILE
 from pipeline.field.config import FieldConfig
 from stages import field
 
@@ -65,7 +66,8 @@ class TrialScores:
 
 
 def run_trial(trial: FieldTrial) -> TrialScores:
-    """Train the field of a trial and score it, unless it has its scores already; an interrupted training goes on.
+    """Train the field of a trial and score it, unless it has its scores already; an interrupted training goes on, and
+    has no seconds then.
 
     Raises:
         UserError: a file of the run or of the truth is missing, or the training diverged.
@@ -75,10 +77,12 @@ def run_trial(trial: FieldTrial) -> TrialScores:
         return finished
     trial.folder.mkdir(parents=True, exist_ok=True)
     inputs = {name: trial.run / name for name in ("frames", "body")}
+    resumed = (trial.folder / CHECKPOINT_FILE).exists()
     start_s, start_cpu_s = time.monotonic(), _cpu_seconds()
     metrics: dict[str, Any] = dict(field.run(inputs, trial.folder, trial.config))
     scores = {name: float(metrics[name]) for name in STAGE_SCORES if metrics.get(name) is not None}
-    scores |= {"seconds": time.monotonic() - start_s, "cpu_seconds": _cpu_seconds() - start_cpu_s}
+    if not resumed:
+        scores |= {"seconds": time.monotonic() - start_s, "cpu_seconds": _cpu_seconds() - start_cpu_s}
     if trial.truth is not None:
         scores |= score_field(trial.run, trial.folder, trial.truth)
     environment = describe_environment()

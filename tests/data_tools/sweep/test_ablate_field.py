@@ -11,6 +11,7 @@ from data_tools.sweep.field_rows import ATTENTION, REFERENCE, ROWS, SIZE, rows_o
 from data_tools.sweep.field_tables import COLUMNS, format_difference, paired_scores, write_tables
 from data_tools.sweep.field_trials import FieldTrial, TrialScores, read_trial, run_trial
 from pipeline.core.errors import UserError
+from pipeline.field.checkpoint import CHECKPOINT_FILE
 from pipeline.field.config import FieldConfig
 
 
@@ -62,6 +63,14 @@ def test_a_finished_training_is_read_and_one_with_other_options_runs_again(tmp_p
     assert json.loads((tmp_path / "one-reference-0" / "scores.json").read_text())["scores"]["parameters"] == 10
 
 
+def test_an_interrupted_training_has_no_seconds(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(field_trials.field, "run", lambda inputs, out, config: {"validation_psnr_db": 30.0})
+    interrupted = trial(tmp_path, "rows-half")
+    interrupted.folder.mkdir()
+    (interrupted.folder / CHECKPOINT_FILE).touch()
+    assert set(run_trial(interrupted).scores) == {"validation_psnr_db"}
+
+
 def test_differences_are_paired_by_run_and_seed(tmp_path: Path):
     results = {
         trial(tmp_path, REFERENCE, "one"): scores(30.0),
@@ -75,6 +84,8 @@ def test_differences_are_paired_by_run_and_seed(tmp_path: Path):
     # Mean of -0.1 and 0.3; standard error |0.4| / 2.
     assert format_difference(pairs, COLUMNS[0]) == "+0.10 ± 0.20"
     assert format_difference(pairs[:1], COLUMNS[0]) == "-0.10"
+    assert format_difference([({}, pairs[0][1])], COLUMNS[0]) == "–"
+    assert format_difference([*pairs, ({}, pairs[0][1])], COLUMNS[0]) == "+0.10 ± 0.20"
     write_tables(tmp_path, results, "the command")
     text = (tmp_path / "field.md").read_text(encoding="utf-8")
     assert "| `rows-half` - `reference` | 2 | +0.10 ± 0.20 |" in text
