@@ -42,7 +42,7 @@ CAPTURES ?=
 PRESETS ?=
 SEEDS ?=
 
-# Inputs of the ablation besides CAPTURES and SEEDS, and of the stress test; optional.
+# Inputs of the ablations besides CAPTURES or RUN and SEEDS, and of the stress test; optional.
 ROWS ?=
 
 # bench-field: file for its figures, and runs of another preset for comparison (RUN may then name several runs).
@@ -64,7 +64,7 @@ OPTIONS = $(RUN_OPTIONS) $(ARGS)
 STAMP := $(VENV)/.stamp$(if $(EXTRA),-$(EXTRA))
 
 .DEFAULT_GOAL := help
-.PHONY: help all $(STAGES) batch chart ablate stress pose film retexture stylise reshape compare figures materials test test-all check format bench bench-field bench-body bench-way doctor venv lock configs gltf-validator clean
+.PHONY: help all $(STAGES) batch chart ablate ablate-field stress pose film retexture stylise reshape compare figures materials test test-all check format bench bench-field bench-body bench-way doctor venv lock configs gltf-validator clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z$$()A-Z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST) | sed 's/$$(STAGES)/STAGE    /'
@@ -99,6 +99,9 @@ chart: $(STAMP)  ## plot accuracy against time of PRESETS on CAPTURES with SEEDS
 
 ablate: $(STAMP)  ## remove, replace or add one part of the mesh stage: ROWS, CAPTURES, SEEDS (default: all, the sample, 0 1 2)
 	$(RUN_PYTHON) -m data_tools.sweep.ablate $(CAPTURES) $(if $(ROWS),--rows $(ROWS)) $(if $(SEEDS),--seeds $(SEEDS)) $(ARGS)
+
+ablate-field: $(STAMP)  ## change one size or part of the field stage on finished runs: RUN='runs/a runs/b', ROWS, SEEDS
+	$(RUN_PYTHON) -m data_tools.sweep.ablate_field $(ONE_RUN) $(if $(ROWS),--rows $(ROWS)) $(if $(SEEDS),--seeds $(SEEDS)) $(ARGS)
 
 stress: $(STAMP)  ## test stability where such methods fail: ROWS='focal seeds' (default: all); exit status 1 if a line is crossed
 	$(RUN_PYTHON) -m data_tools.stress $(if $(ROWS),--rows $(ROWS)) $(ARGS)

@@ -24,6 +24,7 @@ from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
 from pipeline.field.checkpoint import CHECKPOINT_FILE, load_checkpoint, save_checkpoint
 from pipeline.field.config import FieldConfig
+from pipeline.field.field import RadianceField
 from pipeline.field.files import save_field, save_occupancy
 from pipeline.field.optimiser import DivergedError
 from pipeline.field.setup import MaskedImage, create_trainer, evenly_spaced, training_scale
@@ -65,11 +66,21 @@ def run(inputs: Mapping[str, Path], out: Path, config: FieldConfig) -> Mapping[s
     return metrics | {
         "steps": trainer.completed_steps,
         "seconds_per_step": seconds_per_step,
+        "samples_per_step": trainer.count_samples(),
         "occupied_cells": int(trainer.occupancy.occupied.sum()),
         "train_frames": len(train),
         "parameters": sum(parameter.numel() for parameter in trainer.field.parameters()),
+        **finest_cell_metrics(trainer.field),
         **peak_gpu_memory_metrics(device),
     }
+
+
+def finest_cell_metrics(field: RadianceField) -> dict[str, float]:
+    """Return the edge of the finest cells of the hash grid, mm; empty for a field without a grid."""
+    if not field.layout.cells_per_axis:
+        return {}
+    extent_m = (field.bounds_m[1] - field.bounds_m[0]).cpu().numpy()
+    return {"finest_cell_mm": 1000.0 * float((extent_m / np.array(field.layout.cells_per_axis[-1])).max())}
 
 
 def peak_gpu_memory_metrics(device: torch.device) -> dict[str, float]:
@@ -134,8 +145,6 @@ def train_field(trainer: Trainer, validator: Validator, out: Path) -> float:
                 *subsampled_validator.mean_psnr_db(renders),
                 *subsampled_validator.psnr_per_frame_db(renders),
             )
-            if trainer.config.early_stop and curve.has_converged(trainer.config.steps / 2):
-                break
         if time.monotonic() - last_save_s > CHECKPOINT_INTERVAL_S:
             save_checkpoint(checkpoint, trainer, seconds_before + sum(step_seconds))
             last_save_s = time.monotonic()
@@ -184,7 +193,7 @@ def write_preview(path: Path, renders: list[np.ndarray], validator: Validator) -
 
 STAGE = Stage(
     "field",
-    version=16,
+    version=17,
     needs=("frames", "body"),
     makes=("field.safetensors", "occupancy.npz", "motion.npz"),
     config=FieldConfig,

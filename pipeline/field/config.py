@@ -31,9 +31,6 @@ class FieldConfig(Config):
     log2_hashmap_size: int = Field(17, ge=8, le=24, description="log2 of the largest number of rows of a hash table")
     pose_refinement: bool = Field(True, description="refine the fitted poses during the training")
     validation_frames: int = Field(4, ge=0, description="validation frames rendered to measure the PSNR of the field")
-    early_stop: bool = Field(
-        True, description="end the training when the PSNR of the validation frames no longer rises above its noise"
-    )
     settings: FieldSettings = Field(
         FieldSettings(), description="constants of the method, see pipeline/field/settings.py"
     )

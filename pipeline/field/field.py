@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.field.baselines.positional_mlp import PositionalMlp
+from pipeline.kernels.common.voxels import voxel_values
 from pipeline.kernels.hashgrid import FeatureGradients, GridLayout, encode
 
 EMPTY_GRID_LAYOUT = GridLayout((), 1, 0)
@@ -89,6 +90,8 @@ class RadianceField(torch.nn.Module):
 
     bounds_m: Tensor
     table: Tensor
+    gate: Tensor | None
+    """Factors (gx, gy, gz) of the density, one for each voxel of the box; None: no factors. Voxel attention sets it."""
 
     def __init__(
         self,
@@ -103,6 +106,7 @@ class RadianceField(torch.nn.Module):
         self.layout, self.trunk, self.inverse_skinning = layout, trunk, inverse_skinning
         width = trunk.width if trunk else layout.width
         self.register_buffer("bounds_m", torch.tensor(bounds_m, dtype=torch.float32))
+        self.register_buffer("gate", None)
         rng = torch.Generator().manual_seed(seed)
         table = _uniform((layout.rows, layout.features), 1e-4, rng)
         if trunk:
@@ -123,7 +127,8 @@ class RadianceField(torch.nn.Module):
         """
         unit = (x_canonical_m - self.bounds_m[0]) / (self.bounds_m[1] - self.bounds_m[0])
         features = self.trunk(unit) if self.trunk else encode(unit, self.table, self.layout, feature_gradients)
-        return _RadianceMlp.apply(features, self.hidden, self.output, self.bias)
+        colour, density = _RadianceMlp.apply(features, self.hidden, self.output, self.bias)
+        return colour, density if self.gate is None else density * voxel_values(unit, self.gate)
 
     def forward(self, x_canonical_m: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
         """Return colour (n, 3) in [0, 1] and density (n) >= 0, 1/m, of canonical points (m).

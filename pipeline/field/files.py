@@ -43,6 +43,7 @@ def load_field(path: Path) -> RadianceField:
         method = description["inverse_skinning"]
         bounds_m, width = tensors["bounds_m"].numpy(), description["hidden_width"]
         field = RadianceField(bounds_m, layout, width, trunk=trunk, inverse_skinning=method)
+        field.gate = tensors.get("gate")
         field.load_state_dict(tensors)
     except (KeyError, RuntimeError, TypeError) as error:
         raise UserError(

@@ -145,6 +145,18 @@ class OccupancyGrid:
             points_m, transmittance, weights, self.bounds_m, self.shape, self.max_transmittance, self.max_weight
         )
 
+    def parameters(self) -> dict[str, Tensor]:
+        """Return the parameters of the update rule that the optimiser trains, by name: none."""
+        return {}
+
+    def gate(self) -> Float[Tensor, "gx gy gz"] | None:
+        """Return the factor of the density of each voxel, as a leaf of autograd; None: there are no factors."""
+        return None
+
+    def parameter_gradients(self, gate_gradient: Float[Tensor, "gx gy gz"]) -> dict[str, Tensor]:
+        """Return the gradients of `parameters`, from that of `gate`."""
+        raise TypeError(f"{type(self).__name__} has no gate, so it has no gradient either")
+
     @torch.no_grad()
     def update(self, density_fn: Callable[[Tensor], Tensor], step_m: float, rng: np.random.Generator) -> None:
         """Update the opacity of all candidate cells from the density at a random point of each.

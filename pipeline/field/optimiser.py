@@ -1,6 +1,7 @@
 """Adam optimiser of field and poses, its learning-rate schedules, and the detection of divergence."""
 
 import math
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -37,24 +38,33 @@ def pose_learning_rate_factor(step: int, config: FieldConfig) -> float:
 
 
 class FieldOptimiser:
-    """Parameters of field and poses with their Adam moments.
+    """Parameters of field, poses and occupancy grid with their Adam moments.
 
     `grad_table` accumulates the gradient of the hash table, which the compiled encoding computes outside of autograd.
     """
 
-    def __init__(self, field: RadianceField, poses: PoseCorrection, config: FieldConfig) -> None:
-        self.config = config
+    def __init__(
+        self, field: RadianceField, poses: PoseCorrection, attention: Mapping[str, Tensor], config: FieldConfig
+    ) -> None:
+        """attention: parameters of the occupancy grid by name, with `attention_learning_rate`; other names than the
+        field's and the poses'."""
+        self.config, self.attention_names = config, tuple(attention)
         self.parameters: dict[str, Tensor] = dict(field.named_parameters())
-        self.parameters |= {"rotation_rad": poses.rotation_rad, "shift_m": poses.shift_m}
+        self.parameters |= {"rotation_rad": poses.rotation_rad, "shift_m": poses.shift_m, **attention}
         self.moments = {name: (torch.zeros_like(p), torch.zeros_like(p)) for name, p in self.parameters.items()}
         self.grad_table = torch.zeros_like(field.table)
         self.nonfinite_steps = 0
 
-    def gradients(self, loss: Tensor, names: tuple[str, ...] | None = None) -> dict[str, Tensor]:
-        """Return the gradients of a loss by parameter (`names`, or all), without parameters it does not depend on."""
-        names = names or tuple(self.parameters)
-        gradients = torch.autograd.grad(loss, [self.parameters[name] for name in names], allow_unused=True)
-        return {name: gradient for name, gradient in zip(names, gradients, strict=True) if gradient is not None}
+    def gradients(
+        self, loss: Tensor, names: tuple[str, ...] | None = None, others: Mapping[str, Tensor] | None = None
+    ) -> dict[str, Tensor]:
+        """Return the gradients of a loss by parameter (`names`, or all), without parameters it does not depend on.
+
+        others: further leaves of autograd whose gradients are wanted, by name.
+        """
+        leaves = {name: self.parameters[name] for name in names or self.parameters} | dict(others or {})
+        gradients = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True)
+        return {name: gradient for name, gradient in zip(leaves, gradients, strict=True) if gradient is not None}
 
     def step(self, step: int, gradients: dict[str, Tensor], is_finite: bool) -> None:
         """Update all parameters that have a gradient; skip the step if the loss is not finite.
@@ -90,6 +100,7 @@ class FieldOptimiser:
             "table": settings.table_learning_rate,
             "rotation_rad": settings.pose_learning_rate,
             "shift_m": settings.pose_learning_rate / SHIFT_LEARNING_RATE_RATIO,
+            **dict.fromkeys(self.attention_names, settings.attention_learning_rate),
         }
         schedule = pose_learning_rate_factor if name in POSE_PARAMETERS else learning_rate_factor
         return rates.get(name, settings.network_learning_rate) * schedule(step, self.config)

@@ -83,8 +83,8 @@ class FieldSettings:
     0.03: 0.9691."""
     occupancy_decay: DecayFactor = 0.95
     """Factor of the moving average of the opacity at each update."""
-    attention_learning_rate: PositiveFloat = 3e-3
-    """Learning rate of the voxel attention network."""
+    attention_learning_rate: PositiveFloat = 2e-2
+    """Learning rate of the voxel attention network, at the start: that of the field's network."""
     initial_min_mask_fraction: Fraction = 0.6
     """Fraction of the frames whose mask must contain a cell outside the body for it to be occupied initially."""
 

@@ -140,7 +140,6 @@ def create_occupancy_grid(
         settings.occupancy_decay,
         settings.occupancy_threshold,
         clothing_offset_m,
-        settings.attention_learning_rate,
         config.seed,
         device,
     )

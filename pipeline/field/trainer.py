@@ -32,7 +32,7 @@ MAX_SAMPLES_PER_RAY = 160
 CPU_BATCH_PARTS = 4
 """Parts into which the frames of a step are divided on the CPU. It does not depend on the number of threads, so that
 the order of floating-point sums does not either."""
-OCCUPANCY_PREFIX = "occupancy."
+OCCUPANCY_PREFIX, GATE = "occupancy.", "gate"
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Trainer:
         self.device = field.bounds_m.device
         self.poses = PoseCorrection(scene.body, scene.motion, self.device)
         self.sampler = RaySampler(scene.pool, config, self.device)
-        self.optimiser = FieldOptimiser(field, self.poses, config)
+        self.optimiser = FieldOptimiser(field, self.poses, occupancy.parameters(), config)
         self.inverse_skinning = BakedInverseSkinning(
             scene.body, scene.skin, scene.camera, self.poses, config.settings.inverse_skinning
         )
@@ -89,6 +89,7 @@ class Trainer:
         self.completed_steps = 0
         self.part_count = CPU_BATCH_PARTS if self.device.type == "cpu" else 1
         self.threads = ThreadPool(self.part_count)
+        field.gate = occupancy.gate()
 
     @property
     def refines_poses(self) -> bool:
@@ -122,11 +123,21 @@ class Trainer:
         is_finite = bool(torch.isfinite(total))
         if is_finite:
             self._record_results(results)
-        self.optimiser.step(self.completed_steps, sum_by_name(gradients), is_finite)
+        self.optimiser.step(self.completed_steps, self._through_gate(sum_by_name(gradients)), is_finite)
         self.completed_steps += 1
         self._update_occupancy(rng)
+        self.field.gate = self.occupancy.gate()
         samples = sum(len(result.rendered.transmittance) for result in results)
         return {name: float(loss) for name, loss in losses.items()} | {"samples": float(samples)}
+
+    @torch.no_grad()
+    def count_samples(self) -> int:
+        """Return the number of samples on the rays of the next step, without taking it."""
+        frames = self.sampler.sample_frames(step_rng(self.config.seed, self.completed_steps, STEP_STREAM))
+        batch = self.sampler.sample_rays(frames, self.completed_steps, self.inverse_skinning.cameras)
+        posed_field = PosedField(self.field, self.inverse_skinning.inverse, self.occupancy.binary())
+        none_m = self.field.bounds_m[:0]
+        return len(render_rays(posed_field, batch.rays, None, none_m, self.step_m, MAX_SAMPLES_PER_RAY, []).weight)
 
     def forward_backward(
         self, frames: Int[np.ndarray, "k"], empty_m: Float[Tensor, "e 3"], ray_fraction: float
@@ -145,9 +156,15 @@ class Trainer:
         targets = (batch.rgba, batch.background, batch.inlier_weight, rendered.density_per_m, self.config.settings)
         losses, error = field_losses(rendered.image, rendered.alpha, *targets)
         losses = {name: loss if name == "density" else ray_fraction * loss for name, loss in losses.items()}
-        gradients = self.optimiser.gradients(torch.stack(list(losses.values())).sum())
+        gate = {} if self.field.gate is None else {GATE: self.field.gate}
+        gradients = self.optimiser.gradients(torch.stack(list(losses.values())).sum(), others=gate)
         detached = {name: loss.detach() for name, loss in losses.items()}
         return StepResult(batch, rendered, error, detached, gradients, feature_gradients)
+
+    def _through_gate(self, gradients: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Replace the gradient of the gate, if there is one, by those of the parameters that it depends on."""
+        of_gate = gradients.pop(GATE, None)
+        return gradients if of_gate is None else gradients | self.occupancy.parameter_gradients(of_gate)
 
     def _prepare_pose_refinement(self) -> None:
         """Bake the inverse skinning for the refined poses if it is time, and crop the skin grid once."""
@@ -213,4 +230,5 @@ class Trainer:
             if name.startswith(OCCUPANCY_PREFIX)
         }
         self.occupancy.load_state_dict(occupancy)
+        self.field.gate = self.occupancy.gate()
         self._crop_skin_grid()

@@ -1,10 +1,7 @@
-"""PSNR of the validation frames over the training time, and the test for convergence."""
+"""PSNR of the validation frames over the training time."""
 
 import csv
-import math
 from pathlib import Path
-
-import numpy as np
 
 from pipeline.core.manifest import PROGRESS_FILE
 
@@ -32,18 +29,6 @@ class ValidationCurve:
         frames = range(len(self.rows[0]) - len(MEAN_COLUMNS))
         with self.checkpoint_path.open("w", newline="", encoding="utf-8") as file:
             csv.writer(file).writerows([(*MEAN_COLUMNS, *(f"frame_{frame}_db" for frame in frames)), *self.rows])
-
-    def has_converged(self, first_step: float) -> bool:
-        """Return whether neither of the last two gains exceeds its noise; both measurements are after `first_step`.
-
-        The noise is the standard error of the mean gain over frames. Needs three rows and two frames.
-        """
-        late = [row[len(MEAN_COLUMNS) :] for row in self.rows if row[0] >= first_step]
-        if len(late) < 3 or len(late[0]) < 2:
-            return False
-        gains_db = np.diff(np.array(late[-3:]), axis=0)
-        noise_db = gains_db.std(axis=1, ddof=1) / math.sqrt(gains_db.shape[1])
-        return bool((gains_db.mean(axis=1) <= noise_db).all())
 
     def finish(self) -> None:
         """Rename the checkpoint file to `progress.csv`, if there are rows."""

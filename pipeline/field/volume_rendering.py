@@ -82,7 +82,7 @@ def render_rays(
         rays,
         SamplingVolume(warps, occupancy.occupied, occupancy.bounds_m),
         RadianceNetwork(
-            field.bounds_m, field.table, field.layout, *network, INITIAL_DENSITY_PER_M, MAX_ABS_LOG_DENSITY
+            field.bounds_m, field.table, field.layout, *network, INITIAL_DENSITY_PER_M, MAX_ABS_LOG_DENSITY, field.gate
         ),
         BatchSkinning(pose_batch.skin, pose_batch.blended(), pose_batch.frame_slots(rays)) if pose_batch else None,
         points_m,

@@ -79,6 +79,7 @@ def render_page(content: PageContent) -> str:
         error_charts=_error_charts(report["heldout"]["frames"]),
         cost_charts=_cost_charts(report),
         images=images,
+        modelled=report["modelled"],
         tables=_tables(report),
         footer=_footer(report["environment"]),
         glb=_embedded_glb(content.glb),

@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from pipeline.core.command import format_command
@@ -12,6 +12,7 @@ from pipeline.core.manifest import Manifest
 from pipeline.metrics.images import mean_scores
 from pipeline.metrics.lpips import MIN_SIDE_PX
 from pipeline.report.lpips_weights import WEIGHTS_MISSING_NOTE as LPIPS_ABSENT
+from pipeline.report.modelled import modelled_parts
 
 
 @dataclass(frozen=True)
@@ -115,6 +116,7 @@ def build_report(
         **{name: dict(section) for name, section in metric_sections.items()},
         "body": {name: _manifest_metric(manifests["body"], name) for name in ("landmark_error_px", "silhouette_iou")},
         "template": _template_note(manifests),
+        "modelled": [asdict(part) for part in modelled_parts(manifests)],
         "stages": {name: dict(manifest.metrics) for name, manifest in manifests.items()},
         "warnings": [f"{name}: {text}" for name, manifest in manifests.items() for text in manifest.warnings],
         "environment": {name: value for name, value in environment.items() if name != "packages"},

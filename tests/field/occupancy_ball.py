@@ -12,7 +12,7 @@ RADIUS_M = 0.5
 CLOTHING_OFFSET_M = 0.3
 
 
-def ball_grid(attention: bool, rate: float = 0.03) -> OccupancyGrid:
+def ball_grid(attention: bool) -> OccupancyGrid:
     """Candidate cells within 0.8 m of the origin; the body is a ball of 0.5 m, one-sided where y > 0.5 m."""
     centres = cell_centres(BOUNDS)
     distance_m = (np.linalg.norm(centres, axis=1) - RADIUS_M).reshape((RESOLUTION,) * 3).astype(np.float32)
@@ -20,7 +20,7 @@ def ball_grid(attention: bool, rate: float = 0.03) -> OccupancyGrid:
     one_sided = (centres[:, 1] > RADIUS_M).reshape(distance_m.shape)
     cells = CellData(distance_m < CLOTHING_OFFSET_M, distance_m, mask_fraction, one_sided, BOUNDS)
     if attention:
-        return AttentionOccupancyGrid(cells, 0.9, 0.01, CLOTHING_OFFSET_M, rate, seed=0)
+        return AttentionOccupancyGrid(cells, 0.9, 0.01, CLOTHING_OFFSET_M, seed=0)
     return OccupancyGrid(cells, 0.9, 0.01)
 
 

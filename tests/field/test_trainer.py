@@ -195,3 +195,13 @@ def test_images_are_downscaled_to_the_height_of_the_person(scene):
 def test_evenly_spaced_includes_both_ends():
     assert evenly_spaced(10, 4).tolist() == [0, 3, 6, 9]
     assert evenly_spaced(3, 9).tolist() == [0, 1, 2]
+
+
+def test_the_samples_of_the_next_step_are_counted_without_taking_it(scene):
+    trainer = make_trainer(scene, steps=40, pose_refinement=False, occupancy_warmup_steps=8)
+    for _ in range(12):
+        trainer.step()
+    before = {name: value.clone() for name, value in trainer.state_dict().items()}
+    count = trainer.count_samples()
+    assert all(torch.equal(value, before[name]) for name, value in trainer.state_dict().items())
+    assert trainer.step()["samples"] == count > 0

@@ -47,14 +47,21 @@ def make_scene():
     return rays, volume, make_network(random), BatchSkinning(skin, blended, frame)
 
 
+def with_gate(network: RadianceNetwork) -> RadianceNetwork:
+    gate = 0.1 + torch.rand(5, 3, 4, generator=torch.Generator().manual_seed(4))
+    return replace(network, gate=gate.requires_grad_())
+
+
 def leaves(network: RadianceNetwork, skinning: BatchSkinning) -> dict[str, torch.Tensor]:
-    named = {name: getattr(network, name) for name in ("hidden", "output", "bias")}
+    names = ("hidden", "output", "bias", *(["gate"] if network.gate is not None else []))
+    named = {name: getattr(network, name) for name in names}
     return named | {"blended": skinning.blended}
 
 
-@pytest.mark.parametrize("newton", [True, False])
-def test_values_and_gradients_match_reference(newton: bool) -> None:
+@pytest.mark.parametrize(("newton", "gated"), [(True, False), (False, False), (True, True)])
+def test_values_and_gradients_match_reference(newton: bool, gated: bool) -> None:
     rays, volume, network, skinning = make_scene()
+    network = with_gate(network) if gated else network
     points_m = torch.tensor([[0.1, 0.02, 0.0], [-0.3, 0.0, 0.05]])
     feature_gradients: FeatureGradients = []
     used = skinning if newton else None

@@ -97,9 +97,7 @@ def test_a_resumed_stage_writes_the_files_of_an_uninterrupted_one(inputs, whole,
 
 def known_trainer(clock: SimpleNamespace, kill_in: int | None = None) -> mock.MagicMock:
     """A trainer of 32 steps that take two seconds each on `clock`."""
-    trainer = mock.MagicMock(
-        spec=Trainer, completed_steps=0, refines_poses=True, config=field_config(steps=32, early_stop=False)
-    )
+    trainer = mock.MagicMock(spec=Trainer, completed_steps=0, refines_poses=True, config=field_config(steps=32))
 
     def step() -> None:
         if trainer.completed_steps + 1 == kill_in:

@@ -1,9 +1,11 @@
-"""Voxel attention: the occupancy update of IHM (Wang et al. 2025, section 2.2).
+"""Voxel attention (IHM, Wang et al. 2025, section 2.2): each voxel of the occupancy grid has a learnt weight in [0, 1].
 
-A network of two layers maps density, distance to the body surface and mask fraction of a cell to a weight in [0, 1];
-the opacity of the cell is a moving average of weight times opacity. The paper does not define the training of the
-network. Here the training rays provide the labels: a cell that a ray reached is positive if it contributed to a pixel
-and negative if the ray passed through it. Cells that no ray reached have no label.
+A network of two layers maps the density of a voxel, its distance to the body surface and its frequency of occupancy to
+the weight. The weight multiplies the density of all samples in the voxel, in images and in the update of the occupancy
+grid, so that the losses of the images train the network end to end. The paper does not define the training of the
+network, nor the temporal window of the frequency. Here the frequency starts as the fraction of the posed frames whose
+mask contains the voxel, and every update of the grid moves it, with the grid's decay, towards 1 where the opacity of
+the voxel exceeds the threshold and towards 0 elsewhere.
 """
 
 import torch
@@ -11,17 +13,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.core.device import CPU
+from pipeline.field.field import INITIAL_DENSITY_PER_M
 from pipeline.field.occupancy import CellData, OccupancyGrid
 
 HIDDEN_WIDTH = 16
-MIN_LABELLED_TRANSMITTANCE = 0.25
-"""Transmittance above which a cell has a label."""
-POSITIVE_WEIGHT = 0.05
-"""Weight of a sample in its pixel from which a label is 1; below, the label is proportional to the weight."""
+INITIAL_LOGIT = 3.0
+"""Bias of the output: a weight of 0.95 before training, so that the training starts like one without attention."""
+MIN_WEIGHT = 1e-6
+"""Smallest weight that a density is divided by."""
 
 
 class VoxelAttention(torch.nn.Module):
-    """Map (density, distance, mask fraction) to the logit of a weight, which is close to 1 before training."""
+    """Map (density, distance, frequency of occupancy) to a weight in [0, 1]."""
 
     def __init__(self, clothing_offset_m: float, seed: int) -> None:
         super().__init__()
@@ -32,20 +35,23 @@ class VoxelAttention(torch.nn.Module):
         for weight in (self.first.weight, self.second.weight):
             weight.data.uniform_(-0.6, 0.6, generator=rng)
         self.first.bias.data.zero_()
-        self.second.bias.data.fill_(2.0)
+        self.second.bias.data.fill_(INITIAL_LOGIT)
 
     def forward(
-        self, density_per_m: Float[Tensor, "n"], distance_m: Float[Tensor, "n"], mask_fraction: Float[Tensor, "n"]
+        self, density_per_m: Float[Tensor, "n"], distance_m: Float[Tensor, "n"], frequency: Float[Tensor, "n"]
     ) -> Float[Tensor, "n"]:
-        """Return logits. density >= 0 (1/m); distance negative inside the body; mask fraction in [0, 1]."""
+        """Return weights. density >= 0 (1/m); distance negative inside the body; frequency in [0, 1]."""
         inputs = torch.stack(
-            [0.5 * torch.log1p(density_per_m) - 1, distance_m / self.clothing_offset_m, 2 * mask_fraction - 1], dim=-1
+            [0.5 * torch.log1p(density_per_m) - 1, distance_m / self.clothing_offset_m, 2 * frequency - 1], dim=-1
         )
-        return self.second(torch.relu(self.first(inputs))).squeeze(-1)
+        return torch.sigmoid(self.second(torch.relu(self.first(inputs))).squeeze(-1))
 
 
 class AttentionOccupancyGrid(OccupancyGrid):
-    """Occupancy grid whose moving average of the opacity is weighted by voxel attention, which it trains."""
+    """Occupancy grid with voxel attention: its opacity is a moving average of that of the weighted density.
+
+    density_per_m: density of the candidate cells at the last update, without weights. frequency: see the module.
+    """
 
     def __init__(
         self,
@@ -53,49 +59,47 @@ class AttentionOccupancyGrid(OccupancyGrid):
         decay: float,
         threshold: float,
         clothing_offset_m: float,
-        learning_rate: float,
         seed: int,
         device: torch.device = CPU,
     ) -> None:
         super().__init__(cells, decay, threshold, device)
         self.attention = VoxelAttention(clothing_offset_m, seed).to(device)
-        self.optimiser = torch.optim.Adam(self.attention.parameters(), lr=learning_rate)
+        self.frequency = self.mask_fraction.clone()
+        self.density_per_m = torch.full_like(self.frequency, INITIAL_DENSITY_PER_M)
+
+    def parameters(self) -> dict[str, Tensor]:
+        """Return the weights of the network by name, for the optimiser."""
+        return {f"attention.{name}": parameter for name, parameter in self.attention.named_parameters()}
+
+    def gate(self) -> Float[Tensor, "gx gy gz"]:
+        """Return the weight of each voxel for the present network, as a leaf of autograd; 1 if it is no candidate."""
+        gate = torch.ones(self.occupied.numel(), device=self.frequency.device)
+        with torch.no_grad():
+            gate[self.candidate_cells] = self._weights()
+        return gate.view(self.shape).requires_grad_()
+
+    def parameter_gradients(self, gate_gradient: Float[Tensor, "gx gy gz"]) -> dict[str, Tensor]:
+        """Return the gradients of `parameters`, from that of `gate`."""
+        named = self.parameters()
+        gradient = gate_gradient.reshape(-1)[self.candidate_cells]
+        return dict(zip(named, torch.autograd.grad(self._weights(), list(named.values()), gradient), strict=True))
+
+    def _weights(self) -> Float[Tensor, "n"]:
+        weights: Tensor = self.attention(self.density_per_m, self.distance_m, self.frequency)
+        return weights
 
     def _update_opacity(self, density_per_m: Float[Tensor, "n"], opacity: Float[Tensor, "n"]) -> None:
-        """Update `opacity_ema` with opacities times attention weights."""
-        weight = torch.sigmoid(self._train_attention(density_per_m))
-        self.opacity_ema = self.decay * self.opacity_ema + (1 - self.decay) * weight * opacity
-
-    def _train_attention(self, density_per_m: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-        """Take one step of the network on the cells with labels; return the logits of all candidate cells."""
-        max_transmittance = self.max_transmittance[self.candidate_cells]
-        has_label = (max_transmittance > MIN_LABELLED_TRANSMITTANCE).float()
-        target = (self.max_weight[self.candidate_cells] / POSITIVE_WEIGHT).clamp(max=1)
-        with torch.enable_grad():
-            logit = self.attention(density_per_m, self.distance_m, self.mask_fraction)
-            loss = torch.nn.functional.binary_cross_entropy_with_logits(logit, target, has_label, reduction="sum")
-            self.optimiser.zero_grad()
-            (loss / has_label.sum().clamp(min=1)).backward()
-            self.optimiser.step()
-        return logit.detach()
+        """Update opacity, density and frequency from the weighted density of the candidate cells."""
+        self.opacity_ema = torch.lerp(opacity, self.opacity_ema, self.decay)
+        self.density_per_m = density_per_m / self._weights().clamp(min=MIN_WEIGHT)
+        self.frequency = torch.lerp((opacity > self.threshold).float(), self.frequency, self.decay)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the state of the grid, the network and its optimiser."""
-        tensors = super().state_dict()
-        for name, parameter in self.attention.named_parameters():
-            moments = self.optimiser.state.get(parameter, {})
-            tensors[f"attention.{name}"] = parameter.detach()
-            tensors |= {f"attention.{name}.{key}": value for key, value in moments.items()}
-        return tensors
+        """Return the state of the grid and the inputs of the network, whose weights the optimiser keeps."""
+        return super().state_dict() | {"density_per_m": self.density_per_m, "frequency": self.frequency}
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
         """Restore the state that `state_dict` returned."""
         super().load_state_dict(tensors)
-        for name, parameter in self.attention.named_parameters():
-            parameter.data.copy_(tensors[f"attention.{name}"])
-            keys = [key for key in ("step", "exp_avg", "exp_avg_sq") if f"attention.{name}.{key}" in tensors]
-            if keys:
-                loaded = {key: tensors[f"attention.{name}.{key}"].clone() for key in keys}
-                # torch's Adam keeps the step count on the CPU.
-                moved = {key: loaded[key].to(parameter.device) for key in keys if key != "step"}
-                self.optimiser.state[parameter] = loaded | moved
+        for name in ("density_per_m", "frequency"):
+            setattr(self, name, tensors[name].clone().to(self.candidate_cells.device))

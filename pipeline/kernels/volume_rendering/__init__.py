@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pipeline.kernels.common.voxels import voxel_index
 from pipeline.kernels.hashgrid import FeatureGradients
 from pipeline.kernels.hashgrid import cpu as hashgrid_cpu
 from pipeline.kernels.inverse_skinning import newton_cpu
@@ -39,6 +40,8 @@ __all__ = [
     "render_rays_fused",
 ]
 
+MIN_GATE = 1e-6
+"""Smallest factor that a gradient is divided by."""
 INITIAL_SAMPLES_PER_RAY = 16
 """Mean number of samples of a ray that memory is first allocated for; doubled until it is sufficient."""
 
@@ -54,8 +57,8 @@ def render_rays_fused(
 ) -> RenderOutput:
     """Render rays, and evaluate the density at additional canonical points.
 
-    float32 on the CPU. Differentiable in the weights of the network and in `skinning.blended`; the backward pass
-    appends the input of `add_table_gradient_` to `feature_gradients`.
+    float32 on the CPU. Differentiable in the weights and the gate of the network and in `skinning.blended`; the
+    backward pass appends the input of `add_table_gradient_` to `feature_gradients`.
 
     Args:
         rays: sorted by `skinning.batch_index`.
@@ -74,14 +77,20 @@ def render_rays_fused(
     )
     threshold = settings.gradient_subsampling_threshold
     renderer = _Renderer(inputs, network, points_m.detach(), threshold, feature_gradients)
-    weights = (network.hidden, network.output, network.bias)
+    weights = (network.hidden, network.output, network.bias, network.gate)
     return RenderOutput(*_RenderRays.apply(*weights, skinning.blended.contiguous(), renderer))
 
 
 class _RenderRays(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, hidden: Tensor, output: Tensor, bias: Tensor, blended: Tensor, renderer: "_Renderer"
+        ctx: Any,
+        hidden: Tensor,
+        output: Tensor,
+        bias: Tensor,
+        gate: Tensor | None,
+        blended: Tensor,
+        renderer: "_Renderer",
     ) -> RenderOutput:
         samples, count, image, final_transmittance = renderer.forward_pass()
         ctx.kept = renderer, samples, count, final_transmittance
@@ -105,8 +114,8 @@ class _RenderRays(torch.autograd.Function):
         raw[count:, 3] = grad_density * samples.density[count:rows]
         grad_blended = torch.zeros_like(blended)
         grad_hidden, grad_output = renderer.backward_pass(samples, count, raw, grad_blended.numpy())
-        grad_bias = torch.from_numpy(raw.sum(0))
-        return torch.from_numpy(grad_hidden), torch.from_numpy(grad_output), grad_bias, grad_blended, None
+        grad_bias, grad_gate = torch.from_numpy(raw.sum(0)), renderer.gate_gradient(samples, raw)
+        return torch.from_numpy(grad_hidden), torch.from_numpy(grad_output), grad_bias, grad_gate, grad_blended, None
 
 
 @dataclass(frozen=True)
@@ -140,7 +149,7 @@ class _Renderer:
         self, samples: SampleBuffers, count: int, raw: np.ndarray, grad_blended: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the gradients of the weights from that of the network output (s, 4); add to `grad_blended`."""
-        _, table, lanes, network = self.inputs.field
+        _, table, lanes, network, _ = self.inputs.field
         hidden, output = network.hidden, network.output
         rows, scaled = backward_cpu.subsample_gradients(raw, self.gradient_subsampling_threshold)
         grad_hidden, grad_output = np.zeros_like(hidden), np.zeros_like(output)
@@ -156,6 +165,18 @@ class _Renderer:
             hashgrid_cpu.add_points_gradient(selected[0], table, lanes, selected[1], grad_unit)
             self._add_pose_gradient(samples, rows[:ray_row_count], grad_unit, grad_blended)
         return grad_hidden, grad_output
+
+    def gate_gradient(self, samples: SampleBuffers, raw: np.ndarray) -> Tensor | None:
+        """Return the gradient of the gate from that of the network output (s, 4).
+
+        The last column is that of the logarithm of the gated density, hence also that of the logarithm of the gate.
+        """
+        gate = self.network.gate
+        if gate is None:
+            return None
+        voxel = voxel_index(torch.from_numpy(samples.unit[: len(raw)]), tuple(gate.shape))
+        of_logarithm = torch.zeros(gate.numel()).index_add_(0, voxel, torch.from_numpy(raw[:, 3]))
+        return (of_logarithm / gate.detach().reshape(-1).clamp(min=MIN_GATE)).reshape(gate.shape)
 
     def _add_pose_gradient(
         self, samples: SampleBuffers, rows: np.ndarray, grad_unit: np.ndarray, grad_blended: np.ndarray

@@ -41,12 +41,16 @@ class NetworkArrays(NamedTuple):
 
 
 class FieldArrays(NamedTuple):
-    """The radiance field in the box `bounds` (2, 3); `lanes` as in `pipeline.kernels.hashgrid.cpu`."""
+    """The radiance field in the box `bounds` (2, 3); `lanes` as in `pipeline.kernels.hashgrid.cpu`.
+
+    gate: factors of the density, one for each voxel of the box (gx, gy, gz); empty: none.
+    """
 
     bounds: np.ndarray
     table: HashTable
     lanes: tuple[int, ...]
     network: NetworkArrays
+    gate: np.ndarray
 
 
 class RenderArrays(NamedTuple):
@@ -150,9 +154,21 @@ def _decode(first, last, network, samples, buffers):
 
 
 @njit(**NJIT_OPTIONS)
+def _apply_gate(first, last, gate, samples):
+    """Multiply the density of the samples first..last by the factor of their voxel."""
+    unit, density = samples.unit, samples.density
+    size_x, size_y, size_z = gate.shape
+    for s in range(first, last):
+        i = min(max(int(unit[s, 0] * np.float32(size_x)), 0), size_x - 1)
+        j = min(max(int(unit[s, 1] * np.float32(size_y)), 0), size_y - 1)
+        k = min(max(int(unit[s, 2] * np.float32(size_z)), 0), size_z - 1)
+        density[s] *= gate[i, j, k]
+
+
+@njit(**NJIT_OPTIONS)
 def evaluate_field(first, last, field, samples):
     """Fill features, colour and density of the samples first..last at their positions in the unit box."""
-    _, table, lanes, network = field
+    _, table, lanes, network, gate = field
     unit, features, levels = samples.unit, samples.features, table.level_params.shape[0]
     columns = np.empty((network.hidden.shape[0], BLOCK), np.float32)
     buffers = _DecodeBuffers(columns, np.empty(BLOCK, np.float32), np.empty((4, BLOCK), np.float32))
@@ -161,6 +177,8 @@ def evaluate_field(first, last, field, samples):
         for level in range(levels):
             encode_block(unit, table, lanes, level, features, start, stop)
         _decode(start, stop, network, samples, buffers)
+        if gate.size:
+            _apply_gate(start, stop, gate, samples)
 
 
 @njit(**NJIT_OPTIONS)

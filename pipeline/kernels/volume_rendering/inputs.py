@@ -51,7 +51,8 @@ class RadianceNetwork:
     """Hash grid and network: raw = relu(features hidden) output + bias.
 
     The colour is sigmoid(raw[:3]). The density (1/m) is initial_density_per_m * exp(raw[3]), with raw[3] clamped to
-    [-exponent_limit, exponent_limit]; the gradient is not clamped. The hash grid fills the box `bounds_m`.
+    [-exponent_limit, exponent_limit]; the gradient is not clamped. The hash grid fills the box `bounds_m`. `gate`, if
+    there is one, fills it too: each of its voxels multiplies the density at the points in it.
     """
 
     bounds_m: Float[Tensor, "2 3"]
@@ -62,6 +63,7 @@ class RadianceNetwork:
     bias: Float[Tensor, "4"]
     initial_density_per_m: float
     exponent_limit: float
+    gate: Float[Tensor, "gx gy gz"] | None = None
 
     def arrays(self) -> FieldArrays:
         """Return the field for the compiled loops; it is on the CPU."""
@@ -72,7 +74,8 @@ class RadianceNetwork:
             np.float32(self.initial_density_per_m),
             np.float32(self.exponent_limit),
         )
-        return FieldArrays(self.bounds_m.numpy(), self.layout.arrays(self.table), self.layout.lanes, network)
+        gate = np.empty((0, 0, 0), np.float32) if self.gate is None else self.gate.detach().contiguous().numpy()
+        return FieldArrays(self.bounds_m.numpy(), self.layout.arrays(self.table), self.layout.lanes, network, gate)
 
 
 @dataclass(frozen=True)

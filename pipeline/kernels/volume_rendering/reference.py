@@ -5,6 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.kernels.common.packing import segment_ids_from_counts
+from pipeline.kernels.common.voxels import voxel_values
 from pipeline.kernels.composite import composite
 from pipeline.kernels.hashgrid import encode
 from pipeline.kernels.inverse_skinning import newton_step
@@ -54,4 +55,6 @@ def _evaluate(
     # Truncated exponential of Instant-NGP: the exponent is clamped, its gradient is not.
     clamped = raw[:, 3].clamp(-network.exponent_limit, network.exponent_limit)
     exponent = raw[:, 3] + (clamped - raw[:, 3]).detach()
-    return torch.sigmoid(raw[:, :3]), network.initial_density_per_m * exponent.exp()
+    density = network.initial_density_per_m * exponent.exp()
+    gate = 1.0 if network.gate is None else voxel_values((points_m - low_m) / (high_m - low_m), network.gate)
+    return torch.sigmoid(raw[:, :3]), density * gate

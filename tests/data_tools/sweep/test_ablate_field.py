@@ -1,0 +1,103 @@
+"""The sweep of the field stage: its rows, its resumption, and its tables, on trainings whose scores are known."""
+
+import json
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from data_tools.sweep import ablate_field, field_trials
+from data_tools.sweep.field_rows import ATTENTION, REFERENCE, ROWS, SIZE, rows_of_group
+from data_tools.sweep.field_tables import COLUMNS, format_difference, paired_scores, write_tables
+from data_tools.sweep.field_trials import FieldTrial, TrialScores, read_trial, run_trial
+from pipeline.core.errors import UserError
+from pipeline.field.checkpoint import CHECKPOINT_FILE
+from pipeline.field.config import FieldConfig
+
+
+def trial(out: Path, row: str, run: str = "one", seed: int = 0, steps: int = 400) -> FieldTrial:
+    base = FieldConfig(seed=seed, steps=steps)
+    return FieldTrial(Path(run), ROWS[row], seed, ROWS[row].config(base), None, out)
+
+
+def scores(psnr_db: float) -> TrialScores:
+    return TrialScores("", {"validation_psnr_db": psnr_db, "parameters": 1e6, "cpu_seconds": 30.0}, "abc", "two cores")
+
+
+def test_rows_change_what_they_name_and_keep_the_rest():
+    base = FieldConfig(seed=3, steps=400)
+    for name, row in ROWS.items():
+        config = row.config(base)
+        options = {key for key in FieldConfig.model_fields if getattr(config, key) != getattr(base, key)} - {"settings"}
+        changed = {each.name for each in fields(base.settings)} & {
+            each.name
+            for each in fields(base.settings)
+            if getattr(config.settings, each.name) != getattr(base.settings, each.name)
+        }
+        assert options == set(row.factors) | set(row.options), name
+        assert changed == set(row.settings), name
+        assert row.compared_with in ROWS
+    assert ROWS["steps-half"].config(base).steps == 200
+    assert ROWS["levels-more"].config(base).settings.levels == base.settings.levels + 1
+    assert ROWS["rows-half"].config(base).log2_hashmap_size == base.log2_hashmap_size - 1
+    assert rows_of_group(ATTENTION) == [REFERENCE, "attention"]
+    assert set(rows_of_group(SIZE)) | {"attention"} == set(ROWS)
+
+
+def test_a_finished_training_is_read_and_one_with_other_options_runs_again(tmp_path: Path, monkeypatch):
+    made = []
+
+    def run(inputs, out, config):
+        made.append(config.steps)
+        return {"validation_psnr_db": 30.0, "parameters": 10, "occupied_cells": 5}
+
+    monkeypatch.setattr(field_trials.field, "run", run)
+    first = run_trial(trial(tmp_path, REFERENCE))
+    assert first.scores["validation_psnr_db"] == 30.0
+    assert first.scores["cpu_seconds"] >= 0.0
+    assert run_trial(trial(tmp_path, REFERENCE)) == first
+    assert made == [400]
+    assert read_trial(trial(tmp_path, REFERENCE, steps=500)) is None
+    run_trial(trial(tmp_path, REFERENCE, steps=500))
+    assert made == [400, 500]
+    assert json.loads((tmp_path / "one-reference-0" / "scores.json").read_text())["scores"]["parameters"] == 10
+
+
+def test_an_interrupted_training_has_no_seconds(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(field_trials.field, "run", lambda inputs, out, config: {"validation_psnr_db": 30.0})
+    interrupted = trial(tmp_path, "rows-half")
+    interrupted.folder.mkdir()
+    (interrupted.folder / CHECKPOINT_FILE).touch()
+    assert set(run_trial(interrupted).scores) == {"validation_psnr_db"}
+
+
+def test_differences_are_paired_by_run_and_seed(tmp_path: Path):
+    results = {
+        trial(tmp_path, REFERENCE, "one"): scores(30.0),
+        trial(tmp_path, REFERENCE, "two"): scores(20.0),
+        trial(tmp_path, "rows-half", "one"): scores(29.9),
+        trial(tmp_path, "rows-half", "two"): scores(20.3),
+        trial(tmp_path, "rows-half", "two", seed=1): scores(0.0),
+    }
+    pairs = paired_scores(results, "rows-half")
+    assert [(a["validation_psnr_db"], b["validation_psnr_db"]) for a, b in pairs] == [(29.9, 30.0), (20.3, 20.0)]
+    # Mean of -0.1 and 0.3; standard error |0.4| / 2.
+    assert format_difference(pairs, COLUMNS[0]) == "+0.10 ± 0.20"
+    assert format_difference(pairs[:1], COLUMNS[0]) == "-0.10"
+    assert format_difference([({}, pairs[0][1])], COLUMNS[0]) == "–"
+    assert format_difference([*pairs, ({}, pairs[0][1])], COLUMNS[0]) == "+0.10 ± 0.20"
+    write_tables(tmp_path, results, "the command")
+    text = (tmp_path / "field.md").read_text(encoding="utf-8")
+    assert "| `rows-half` - `reference` | 2 | +0.10 ± 0.20 |" in text
+    assert "| `reference` | the stage as it is | 2 | 25.00 |" in text
+    assert "novel views" not in text
+    assert "`the command`" in text
+    lines = (tmp_path / "field.csv").read_text(encoding="utf-8").splitlines()
+    assert len(lines) == 6
+    assert lines[1].startswith("one,reference,0,400,30.0")
+
+
+def test_a_run_without_a_body_is_named(tmp_path: Path):
+    (tmp_path / "frames").mkdir()
+    with pytest.raises(UserError, match="body does not exist"):
+        ablate_field.main([str(tmp_path), "--out", str(tmp_path / "out")])
