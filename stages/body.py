@@ -20,6 +20,7 @@ from pipeline.body.files import (
     save_scores,
 )
 from pipeline.body.fit.detections.hand_observations import filter_hand_detections, finger_curls_rad
+from pipeline.body.fit.detections.hidden_legs import hidden_leg_share
 from pipeline.body.fit.diagnostics import (
     FRAME_RATINGS,
     finite_median,
@@ -151,6 +152,7 @@ def run(
         "suspicious_frames": int(suspicious_frames(result).sum()),
         "dropped_frames": int((training & ~usable).sum()),
         "frames_with_foreign_objects": int(has_foreign_object.sum()),
+        "hidden_leg_share": hidden_leg_share(capture.landmarks_visibility, capture.time_s),
     }
 
 

@@ -15,7 +15,7 @@ from pipeline.capture.contact_sheet import contact_sheet
 from pipeline.capture.detection import THUMBNAIL_SIDE_PX, Detections, detect_in_frames, write_frames
 from pipeline.capture.disjoint_split import assign_disjoint_splits
 from pipeline.capture.exif_focal import metadata_focal_px
-from pipeline.capture.input_checks import check_input, warn_about_input
+from pipeline.capture.input_checks import assess_input, check_input
 from pipeline.capture.user_files import UserFiles, UserSplit, load_user_files
 from pipeline.capture.video import DEFAULT_IMAGE_FPS, FrameSource, open_frame_source, read_thumbnails
 from pipeline.capture.worker_pool import start_worker_pool
@@ -83,8 +83,8 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     save_capture(capture)
     write_rgb(out / CONTACT_SHEET, contact_sheet(capture))
     unseen_arc_rad = selection.largest_yaw_gap_rad(selection.body_yaw_rad(capture.landmarks_world_m))
-    warn_about_input(detections, unseen_arc_rad, source.path)
     return {
+        **assess_input(detections, unseen_arc_rad, source.path),
         "frames": len(chosen),
         "masks_count": len(chosen),
         "frames_train": len(capture.positions(selection.TRAIN)),
@@ -230,7 +230,7 @@ def make_capture(
 
 STAGE = Stage(
     "frames",
-    version=13,
+    version=14,
     needs=("video",),
     makes=(FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, CONTACT_SHEET),
     config=Config,

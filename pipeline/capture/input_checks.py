@@ -84,8 +84,14 @@ def _is_upright(torso_px: Float[np.ndarray, "n 4 2"]) -> bool:
     return bool(is_fallen.mean() <= 0.5)
 
 
-def warn_about_input(detections: Detections, unseen_arc_rad: float, path: Path) -> None:
-    """Warn about properties of the recording that reduce the quality."""
+def assess_input(detections: Detections, unseen_arc_rad: float, path: Path) -> dict[str, float]:
+    """Warn about properties of the recording that reduce the quality; return them as metrics.
+
+    Returns:
+        person_px: median height of the person in the pictures that are kept.
+        cut_feet_share: of the frames with a person, those in which the feet are cut off.
+        scene_change_share: of sampled frames, those with another background.
+    """
     missing = ~detections.found
     if missing.any():
         warn(
@@ -111,15 +117,19 @@ def warn_about_input(detections: Detections, unseen_arc_rad: float, path: Path) 
     if differs.sum() > _MAX_MOVED_FRACTION * len(differs):
         warn(
             f"the scene behind the person changes in {path} (frames {format_frame_ranges(frame_index, differs)}): "
-            "the camera or "
-            "the light seems to change, which causes errors of motion and colour; film again with a fixed camera and "
-            "locked exposure"
+            "the camera or the light seems to change, which causes errors of motion and colour; film again with a "
+            "fixed camera and locked exposure"
         )
     if unseen_arc_rad > np.radians(_MAX_UNSEEN_ARC_DEG):
         warn(
             f"the person in {path} is never seen from {np.degrees(unseen_arc_rad):.0f} degrees of the full turn; "
             "that side will be guessed; film a full turn"
         )
+    return {
+        "person_px": person_px,
+        "cut_feet_share": float(cropped.sum() / detections.found.sum()),
+        "scene_change_share": float(differs.mean()),
+    }
 
 
 def sample_scene_changes(detections: Detections) -> tuple[Int[np.ndarray, "k"], Bool[np.ndarray, "k"]]:

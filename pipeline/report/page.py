@@ -80,6 +80,7 @@ def render_page(content: PageContent) -> str:
         cost_charts=_cost_charts(report),
         images=images,
         modelled=report["modelled"],
+        risks=report["risks"],
         tables=_tables(report),
         footer=_footer(report["environment"]),
         glb=_embedded_glb(content.glb),

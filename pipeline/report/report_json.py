@@ -13,6 +13,7 @@ from pipeline.metrics.images import mean_scores
 from pipeline.metrics.lpips import MIN_SIDE_PX
 from pipeline.report.lpips_weights import WEIGHTS_MISSING_NOTE as LPIPS_ABSENT
 from pipeline.report.modelled import modelled_parts
+from pipeline.report.risks import capture_risks
 
 
 @dataclass(frozen=True)
@@ -117,6 +118,7 @@ def build_report(
         "body": {name: _manifest_metric(manifests["body"], name) for name in ("landmark_error_px", "silhouette_iou")},
         "template": _template_note(manifests),
         "modelled": [asdict(part) for part in modelled_parts(manifests)],
+        "risks": [asdict(risk) for risk in capture_risks(manifests)],
         "stages": {name: dict(manifest.metrics) for name, manifest in manifests.items()},
         "warnings": [f"{name}: {text}" for name, manifest in manifests.items() for text in manifest.warnings],
         "environment": {name: value for name, value in environment.items() if name != "packages"},

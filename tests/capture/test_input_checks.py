@@ -9,7 +9,7 @@ import pytest
 from pipeline.capture.detection import Detections
 from pipeline.capture.face_detector import undetected_face
 from pipeline.capture.hand_detector import undetected_hands
-from pipeline.capture.input_checks import check_input, warn_about_input
+from pipeline.capture.input_checks import assess_input, check_input
 from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
 
@@ -49,7 +49,7 @@ def changed(good: Detections, name: str, where, value) -> Detections:
 
 def test_good_recording_passes_without_warning(good):
     check_input(good, PATH, 16)
-    warn_about_input(good, 0.5, PATH)
+    assess_input(good, 0.5, PATH)
     assert take_warnings() == []
 
 
@@ -96,7 +96,7 @@ def test_feet_are_cut_off_whatever_is_unknown_of_them(good):
     """The other foot's points are nan in frames 2 and 3; in frame 9, where all are, nothing is known."""
     points = good.landmarks_px.copy()
     points[2:4, 31, 1], points[2:4, 30], points[9, 29:33] = 101.0, np.nan, np.nan
-    warn_about_input(dataclasses.replace(good, landmarks_px=points), 0.5, PATH)
+    assess_input(dataclasses.replace(good, landmarks_px=points), 0.5, PATH)
     assert [warning.endswith("less sharp: 2-3") for warning in take_warnings()] == [True]
 
 
@@ -128,7 +128,8 @@ def make_moving_scene(shifts_px: list[int], levels: list[int]) -> Detections:
     ids=["still", "one jolt", "pushed", "in the hand", "brighter"],
 )
 def test_moving_camera_is_reported(shifts_px, levels, expected_text):
-    warn_about_input(make_moving_scene(shifts_px, levels), 0.5, PATH)
+    metrics = assess_input(make_moving_scene(shifts_px, levels), 0.5, PATH)
+    assert (metrics["scene_change_share"] >= 0.2) == (expected_text is not None)
     warnings = take_warnings()
     assert [expected_text in warning for warning in warnings] == ([True] if expected_text else []), warnings
 
@@ -143,7 +144,8 @@ def test_moving_camera_is_reported(shifts_px, levels, expected_text):
     ],
 )
 def test_missing_data_is_reported(good, name, where, value, unseen_arc_rad, message):
-    warn_about_input(changed(good, name, where, value), unseen_arc_rad, PATH)
+    metrics = assess_input(changed(good, name, where, value), unseen_arc_rad, PATH)
+    assert metrics["cut_feet_share"] == (len(range(*where[0].indices(20))) / 20 if name == "landmarks_px" else 0.0)
     assert [message in warning for warning in take_warnings()] == [True]
 
 
@@ -159,10 +161,10 @@ def test_small_person_in_large_image_is_reported(good):
         height=720,
         scale=1 / 3,
     )
-    warn_about_input(small, 0.5, PATH)
+    assert assess_input(small, 0.5, PATH)["person_px"] == pytest.approx(360.0)
     (message,) = take_warnings()
     assert "1080 px tall in clip.mp4 and 360 px" in message
     assert "frames.max_side_px=2276" in message
-    warn_about_input(dataclasses.replace(small, scale=1.0), 0.5, PATH)
-    warn_about_input(dataclasses.replace(small, width=2560, height=1440), 0.5, PATH)
+    assess_input(dataclasses.replace(small, scale=1.0), 0.5, PATH)
+    assess_input(dataclasses.replace(small, width=2560, height=1440), 0.5, PATH)
     assert take_warnings() == []

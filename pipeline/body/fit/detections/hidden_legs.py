@@ -47,6 +47,13 @@ def leg_visibility_factor(
     return factor
 
 
+def hidden_leg_share(visibility: Float[np.ndarray, "n 33"], time_s: Float[np.ndarray, "n"]) -> float:
+    """Return the share of frames in which a leg is hidden (0 to 1). visibility: nan where nobody was detected."""
+    knees = [landmarks[0] for landmarks in LEG_LANDMARKS]
+    factor = leg_visibility_factor(np.nan_to_num(visibility, nan=1.0), time_s)[:, knees]
+    return float((factor <= MIN_SHOWN).any(1).mean())
+
+
 def outline_weights(confidence: Float[Tensor, "n l"]) -> Float[Tensor, "n j"]:
     """Return the weight (0 to 1) of the outline of each active joint: that of hidden legs says where the object ends.
 

@@ -11,6 +11,7 @@ from pipeline.body.fit.detections.hidden_legs import (
     LEG_JOINTS,
     LEG_LANDMARKS,
     MIN_SHOWN,
+    hidden_leg_share,
     leg_visibility_factor,
     outline_weights,
 )
@@ -38,6 +39,7 @@ def test_a_leg_that_is_hidden_once_is_hidden_in_the_frames_beside() -> None:
     assert (left == left[:, :1]).all()
     assert right[1:6] == pytest.approx(0.5)
     assert right[6:] == pytest.approx(1.0)
+    assert hidden_leg_share(visibility, np.arange(12) / FPS) == pytest.approx(5 / 12)
     assert (np.delete(factor, [*LEG_LANDMARKS[0], *LEG_LANDMARKS[1]], axis=1) == 1.0).all()
 
 
