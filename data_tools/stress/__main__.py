@@ -4,7 +4,7 @@ python -m data_tools.stress [--rows focal broken-numbers ...] [--out runs/stress
 
 Results of trials are kept in OUT/results, so an interrupted sweep continues, and a trial runs again only when its
 settings, the preset or the version of a stage change. Writes OUT/stress.csv, stress.png and the tables of
-docs/stress.md. Exit status 1: a pass line is crossed; 2: an input is not valid.
+docs/stress.md, which show the newest result of each trial and name its commit. Exit status 1: a pass line is crossed; 2: an input is not valid.
 """
 
 import argparse
@@ -17,7 +17,7 @@ from tqdm import tqdm
 from data_tools.command import run_command
 from data_tools.stress.row import Results, Row
 from data_tools.stress.rows import ROWS
-from data_tools.stress.run_trial import read_trial, run_trial
+from data_tools.stress.run_trial import read_latest, run_trial
 from data_tools.stress.tables import Sweep, draw_figure, write_csv_table, write_document
 from data_tools.sweep.chart_figure import save_figure
 from pipeline.core.measure import REPOSITORY_DIR
@@ -72,8 +72,8 @@ def write_results(out: Path, document: Path | None, rows: dict[str, Row], chosen
 
 
 def read_results(out: Path, row: Row) -> Results:
-    """Return the results of a row by the label of the trial; `MISSING` where a trial has not run."""
-    return {trial.label: read_trial(out, trial) for trial in row.trials}
+    """Return the newest results of a row by the label of the trial; `MISSING` where a trial has never run."""
+    return {trial.label: read_latest(out, trial) for trial in row.trials}
 
 
 def _parse(argv: Sequence[str]) -> argparse.Namespace:

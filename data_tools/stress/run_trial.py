@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 from data_tools.stress.row import DONE, FAILED, MISSING, REFUSED, Trial, TrialResult
-from data_tools.stress.store import load_result, save_result, trial_key
+from data_tools.stress.store import load_latest_result, load_result, save_result, trial_key
 from data_tools.sweep.chart_trials import describe_machine
 from data_tools.sweep.runs import last_error_message
 from pipeline.core.cli import EXIT_USER_ERROR
@@ -28,6 +28,12 @@ def result_path(out: Path, trial: Trial) -> Path:
 def read_trial(out: Path, trial: Trial) -> TrialResult:
     """Read the result of a trial; one of state `MISSING` if it has not run with these settings and versions."""
     return load_result(result_path(out, trial))
+
+
+def read_latest(out: Path, trial: Trial) -> TrialResult:
+    """Read the result of a trial, or the newest one of earlier versions; its commit tells which."""
+    found = read_trial(out, trial)
+    return found if found.state != MISSING else load_latest_result(out / "results", trial)
 
 
 def run_trial(out: Path, trial: Trial, keep: bool = False) -> TrialResult:

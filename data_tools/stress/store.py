@@ -59,5 +59,21 @@ def load_result(path: Path) -> TrialResult:
         return TrialResult(MISSING)
 
 
+def load_latest_result(folder: Path, trial: Trial) -> TrialResult:
+    """Return the newest result of a trial with these settings, whatever preset and versions it is of.
+
+    folder: of the results. State `MISSING` if there is none, or only damaged ones.
+    """
+    wanted = {"procedure": trial.procedure, "settings": json.loads(json.dumps(dict(trial.settings)))}
+    for path in sorted(folder.glob("*.json"), key=lambda path: path.stat().st_mtime, reverse=True):
+        try:
+            document = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError:
+            continue
+        if all(document.get(name) == value for name, value in wanted.items()):
+            return load_result(path)
+    return TrialResult(MISSING)
+
+
 def _json_number(value: float) -> float | None:
     return float(value) if abs(float(value)) < float("inf") else None

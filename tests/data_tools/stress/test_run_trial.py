@@ -1,6 +1,7 @@
 """Trials as processes: results, refusals and faults are told apart, kept, and not run twice; exit status and tables."""
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -70,6 +71,22 @@ def test_an_interrupted_sweep_continues(tmp_path: Path, monkeypatch: pytest.Monk
     assert runner.read_trial(tmp_path, TRIAL).state == MISSING
     monkeypatch.setattr(runner, "_run_process", stand_in(0, {"error": 1.0}))
     assert runner.run_trial(tmp_path, TRIAL).state == DONE
+
+
+def test_tables_show_the_newest_result_of_earlier_versions(tmp_path: Path) -> None:
+    """It is never taken for a result of these versions: the trial runs again."""
+    other = Trial("other", 1, {"capture": {"frames": 9}})
+    for number, (trial, name) in enumerate(((TRIAL, "older"), (TRIAL, "newer"), (other, "other"))):
+        path = tmp_path / "results" / f"{name}.json"
+        save_result(path, trial, TrialResult(DONE, {"error": float(number)}, commit=name))
+        os.utime(path, (number, number))
+    (tmp_path / "results" / "damaged.json").write_text("{")
+    assert runner.read_trial(tmp_path, TRIAL).state == MISSING
+    assert runner.read_latest(tmp_path, TRIAL).commit == "newer"
+    assert runner.read_latest(tmp_path, Trial("never", 2, {"capture": {}})).state == MISSING
+    save_result(runner.result_path(tmp_path, TRIAL), TRIAL, TrialResult(DONE, {"error": 5.0}, commit="exact"))
+    os.utime(runner.result_path(tmp_path, TRIAL), (0, 0))
+    assert runner.read_latest(tmp_path, TRIAL).commit == "exact"
 
 
 def test_the_key_depends_on_what_determines_the_result(tmp_path: Path) -> None:
