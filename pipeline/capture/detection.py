@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -225,31 +226,23 @@ def read_user_mask(user_files: UserFiles, frame: Frame) -> UInt8[np.ndarray, "h 
     return mask if user_files.camera is None else user_files.camera.undistort(mask[..., None], frame.scale)[..., 0]
 
 
-_of_thread = threading.local()
+class _Detectors(threading.local):
+    """The detectors of this thread, each loaded when it is first used; that of the person takes a second."""
+
+    @cached_property
+    def person(self) -> PersonDetector:
+        return PersonDetector()
+
+    @cached_property
+    def hand(self) -> HandDetector:
+        return HandDetector()
+
+    @cached_property
+    def face(self) -> FaceDetector:
+        return FaceDetector()
 
 
-def _detector() -> PersonDetector:
-    """Return the detector of this thread; loading takes a second."""
-    if not hasattr(_of_thread, "person"):
-        _of_thread.person = PersonDetector()
-    detector: PersonDetector = _of_thread.person
-    return detector
-
-
-def _hand_detector() -> HandDetector:
-    """Return the hand detector of this thread."""
-    if not hasattr(_of_thread, "hand"):
-        _of_thread.hand = HandDetector()
-    detector: HandDetector = _of_thread.hand
-    return detector
-
-
-def _face_detector() -> FaceDetector:
-    """Return the face detector of this thread."""
-    if not hasattr(_of_thread, "face"):
-        _of_thread.face = FaceDetector()
-    detector: FaceDetector = _of_thread.face
-    return detector
+_detectors = _Detectors()
 
 
 class _FrameTask(NamedTuple):
@@ -274,7 +267,7 @@ def _detect_in_frames(*tasks: _FrameTask) -> list[_FrameDetection]:
     detections: list[PersonDetection | None] = [None] * len(tasks)
     used = [k for k, task in enumerate(tasks) if task.needs_landmarks or task.mask is None]
     if used:
-        for k, found in zip(used, _detector().track([reduced[k][0] for k in used]), strict=True):
+        for k, found in zip(used, _detectors.person.track([reduced[k][0] for k in used]), strict=True):
             if found is not None:
                 detections[k] = replace(found, landmarks_px=found.landmarks_px / np.float32(reduced[k][1]))
     return [
@@ -288,7 +281,7 @@ def _complete_detection(
 ) -> _FrameDetection:
     """Add hands, face and small pictures to the detection in one frame; people are counted in the reduced image."""
     rgb, mask, needs_landmarks, needs_people_count = task
-    n_people = _detector().count_people(small) if needs_people_count and mask is None else -1
+    n_people = _detectors.person.count_people(small) if needs_people_count and mask is None else -1
     factor = min(1.0, THUMBNAIL_SIDE_PX / max(rgb.shape[:2]))
     size = (max(1, round(rgb.shape[1] * factor)), max(1, round(rgb.shape[0] * factor)))
     gray = cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
@@ -298,10 +291,10 @@ def _complete_detection(
             [detection.landmarks_px, detection.visibility[:, None], detection.landmarks_world_m], axis=1
         )
     if detection is not None and needs_landmarks:
-        hands = _hand_detector().detect_hands(
+        hands = _detectors.hand.detect_hands(
             rgb, detection.landmarks_px, detection.visibility, detection.landmarks_world_m
         )
-        face_px = _face_detector().detect_face_of_person(rgb, detection.landmarks_px, detection.landmarks_world_m)
+        face_px = _detectors.face.detect_face_of_person(rgb, detection.landmarks_px, detection.landmarks_world_m)
     if mask is None and detection is not None:
         mask = detection.mask
         mask_png = cv2.imencode(".png", mask, (cv2.IMWRITE_PNG_COMPRESSION, 1))[1].tobytes()

@@ -191,14 +191,13 @@ def extend_mask_on_uniform_background(
     outside = rgb[::_UNIFORM_TEST_STRIDE, ::_UNIFORM_TEST_STRIDE][
         mask[::_UNIFORM_TEST_STRIDE, ::_UNIFORM_TEST_STRIDE] <= _MIN_TRACE_LEVEL
     ]
-    if len(outside) and _uniform_fraction(outside) < _MIN_UNIFORM_FRACTION_SAMPLED:
+    if len(outside) and _is_painted(outside, np.median(outside, axis=0)).mean() < _MIN_UNIFORM_FRACTION_SAMPLED:
         return mask
     near = _dilate(body, _UNKNOWN_BAND_CELLS * cell_px)
     away = rgb[~_dilate(body, 2 * _UNKNOWN_BAND_CELLS * cell_px)]
     if len(away) == 0:
         return mask
-    backdrop = np.median(away, axis=0)
-    painted = (np.abs(rgb.astype(np.int16) - backdrop.astype(np.int16)) <= _UNIFORM_TOLERANCE_LEVELS).all(axis=-1)
+    painted = _is_painted(rgb, np.median(away, axis=0))
     if painted[~near].mean() < _MIN_UNIFORM_FRACTION:
         return mask
     support = cv2.morphologyEx((~painted).astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)) > 0
@@ -208,10 +207,9 @@ def extend_mask_on_uniform_background(
     return np.where(attached & beyond, np.uint8(255), mask)
 
 
-def _uniform_fraction(colours: UInt8[np.ndarray, "k 3"]) -> float:
-    """Return the fraction of colours near their median."""
-    backdrop = np.median(colours, axis=0).astype(np.int16)
-    return float((np.abs(colours.astype(np.int16) - backdrop) <= _UNIFORM_TOLERANCE_LEVELS).all(axis=-1).mean())
+def _is_painted(colours: UInt8[np.ndarray, "*k 3"], backdrop: Float[np.ndarray, "3"]) -> Bool[np.ndarray, "*k"]:
+    """Return which colours are that of the backdrop."""
+    return (np.abs(colours.astype(np.int16) - backdrop.astype(np.int16)) <= _UNIFORM_TOLERANCE_LEVELS).all(axis=-1)
 
 
 def smooth_mask_temporally(

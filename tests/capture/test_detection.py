@@ -1,5 +1,7 @@
 """The two walks through a recording, without the detector: masks and landmarks lie beside the images."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -63,8 +65,8 @@ class FakeDetector:
 
 @pytest.fixture
 def detector(monkeypatch):
-    for name in ("_detector", "_hand_detector", "_face_detector"):
-        monkeypatch.setattr(sightings, name, FakeDetector)
+    detectors = SimpleNamespace(person=FakeDetector(), hand=FakeDetector(), face=FakeDetector())
+    monkeypatch.setattr(sightings, "_detectors", detectors)
     return FakeDetector
 
 
@@ -130,7 +132,7 @@ def test_landmarks_without_depth_get_it_from_the_detector(folder, detector):
 
 
 def test_landmarks_with_depth_need_no_detector(folder, monkeypatch):
-    monkeypatch.setattr(sightings, "_detector", None)
+    monkeypatch.setattr(sightings, "_detectors", None)
     _, _, seen = detect_recording(folder)
     assert (seen.landmarks_world_m[3] == 1).all()
 
