@@ -49,7 +49,7 @@ from pipeline.capture.hand_detector import HandLandmarks, undetected_hands
 from pipeline.capture.smpl_poses import SMPL_POSES_NPZ
 from pipeline.capture.usable_frames import SCORES_NPZ
 from pipeline.core.cli import main
-from pipeline.core.command import format_command
+from pipeline.core.command import rerun_command
 from pipeline.core.config import Config as BaseConfig
 from pipeline.core.errors import UserError
 from pipeline.core.progress import warn
@@ -205,7 +205,7 @@ def fit_capture(
             keep = config.supplied_poses == "keep"
             result = fit_supplied_poses(model, observations, windows, supplied, keep, settings)
     except TooFewLandmarksError as error:
-        again = format_command("frames", capture.folder.parent, "--force")
+        again = rerun_command("frames", capture.folder)
         raise UserError(
             f"the body cannot be fitted to {capture.folder}: {error}; film with hips and shoulders in view, or "
             f"complete or remove a supplied landmarks.npz, and run {again}"

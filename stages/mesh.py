@@ -18,7 +18,7 @@ from pipeline.capture.capture import Capture, load_capture
 from pipeline.capture.frame_selection import VALIDATION
 from pipeline.capture.usable_frames import usable_training_positions
 from pipeline.core.cli import main
-from pipeline.core.command import format_command
+from pipeline.core.command import rerun_command
 from pipeline.core.config import Config as BaseConfig
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track, warn
@@ -125,7 +125,7 @@ def run(
     chosen = [part[evenly_spaced(len(part), config.max_frames)] for part in parts]
     train, validation = (load_views(capture, part, motion, inputs, body, config) for part in chosen)
     if not train:
-        again = format_command("frames", out.parent, "--force")
+        again = rerun_command("frames", inputs["frames"])
         raise UserError(f"{inputs['frames']} has no training frames; run {again}")
     if not validation:
         warn(f"{inputs['frames']} has no validation frames: the isovalue and the rounds are not validated")

@@ -18,7 +18,7 @@ from pipeline.capture.face_detector import FaceDetector
 from pipeline.capture.frame_selection import VALIDATION
 from pipeline.capture.usable_frames import usable_training_positions
 from pipeline.core.cli import main
-from pipeline.core.command import format_command
+from pipeline.core.command import rerun_command
 from pipeline.core.config import Config as BaseConfig
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track, warn
@@ -129,7 +129,7 @@ def run(
     positions = usable_training_positions(capture, inputs["body"]), capture.positions(VALIDATION)
     train, validation = (load_views(capture, part, inputs, body, skinned, config.max_frames) for part in positions)
     if not train:
-        again = format_command("frames", inputs["frames"].parent, "--force")
+        again = rerun_command("frames", inputs["frames"])
         raise UserError(f"{inputs['frames']} has no training frames; run {again}")
     faces = FilmedFaces.of_capture(capture, positions[0], *load_poses(inputs, body))
     registration = register_person(body, skinned, train, faces, FaceDetector, settings)

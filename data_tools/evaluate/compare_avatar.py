@@ -209,7 +209,7 @@ def compare_texture(comparison: Comparison, seed: int = 0) -> dict[str, float]:
         "coverage": len(observed) / SURFACE_POINTS,
         "colour_error": 255.0 * float(np.abs(avatar_colours - expected).mean()),
         "balanced_colour_error": 255.0 * float(np.abs(avatar_colours * gain - expected).mean()),
-        **_highlight_scores(comparison, observed),
+        **compare_highlights(comparison, observed),
     }
 
 
@@ -233,7 +233,7 @@ def observed_colours(
     return points[observed], avatar_colours, sample_texture(subject.texture_tensor(), uv_true).numpy()
 
 
-def _highlight_scores(comparison: Comparison, points: Float[np.ndarray, "n 3"]) -> dict[str, float]:
+def compare_highlights(comparison: Comparison, points: Float[np.ndarray, "n 3"]) -> dict[str, float]:
     """Return `highlight_scores` and `lamp_error_deg` at surface points; nothing where the true person is matte."""
     truth, own = comparison.truth, comparison.run.avatar.gloss
     if truth.light.specular_strength == 0:

@@ -36,7 +36,7 @@ from pipeline.geometry.alpha import unpremultiply_to_uint8
 from pipeline.geometry.colour import linear_to_srgb, srgb_to_linear
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import top_k_weights
-from pipeline.geometry.surface import closest_points_on_mesh, collapse_edges
+from pipeline.geometry.surface import closest_points_on_mesh, collapse_edges, weld_vertices
 from pipeline.geometry.tangents import tangent_frames, vertex_tangents
 from pipeline.geometry.texture_rendering import sample_texture
 from pipeline.io.image import to_float, to_uint8, write_gray, write_rgb
@@ -126,7 +126,7 @@ def write_true_run(
     save_npz(folder / "body" / SCORES_NPZ, {"usable": np.ones(count, dtype=bool)})
     save_motion(folder / "mesh" / "motion.npz", motion)
     save_mesh(folder / "mesh", reduced_mesh(truth.subject.body))
-    save_dense_mesh(folder / "mesh", truth.subject.body.mesh())
+    save_dense_mesh(folder / "mesh", weld_vertices(truth.subject.body.mesh()))
     return gains
 
 
@@ -135,9 +135,14 @@ def _used_frames(truth: SyntheticCapture, count: int) -> Int[np.ndarray, "n"]:
 
 
 def reduced_mesh(body: Body) -> MeshArtifact:
-    """Return the surface of a body with `FACES` faces; vertices have the skin weights of the nearest true ones."""
+    """Return the surface of a body with `FACES` faces; vertices have the skin weights of the nearest true ones.
+
+    Scanned people have their vertices several times along the seams of their texture, where edge collapses would tear
+    the surface.
+    """
     mesh = body.mesh()
-    reduced = collapse_edges(mesh, np.ones(len(mesh.faces), dtype=bool), FACES)
+    welded = weld_vertices(mesh)
+    reduced = collapse_edges(welded, np.ones(len(welded.faces), dtype=bool), FACES)
     _, faces, barycentric = closest_points_on_mesh(reduced.vertices, mesh)
     nearest = mesh.faces[faces, barycentric.argmax(axis=1)]
     reduced = Mesh(reduced.vertices.astype(np.float32), reduced.faces.astype(np.int32))
@@ -239,16 +244,23 @@ def inner_psnr_db(render: np.ndarray, image: np.ndarray, mask: np.ndarray) -> fl
 def albedo_gain(
     truth: SyntheticCapture, texture: TextureArtifact, folder: Path
 ) -> tuple[Float[np.ndarray, "3"], float]:
-    """Return the linear gain a channel from the map to the true texture, and the mean error after it, of 255."""
+    """Return `gain_to_truth` on the observed surface."""
     mesh, subject = load_mesh(folder / "mesh").cut(texture.cut).mesh, truth.subject
     points, _ = sample_surface(mesh, SURFACE_POINTS, 0)
     uv = _uv_at(points, mesh, texture.atlas.uv, texture.atlas.faces_uv)
     seen = sample_texture(torch.from_numpy(to_float(texture.coverage))[..., None], uv)[:, 0].numpy() > 0.5
-    own = srgb_to_linear(sample_texture(torch.from_numpy(texture.diffuse), uv[seen]).numpy().astype(np.float64))
     uv_true = _uv_at(points[seen], subject.body.mesh(), subject.uv, subject.faces_uv)
-    true_srgb = sample_texture(subject.texture_tensor(), uv_true).numpy()
-    gain = np.median(srgb_to_linear(true_srgb.astype(np.float64)) / np.maximum(own, 1e-4), axis=0)
-    return gain, 255.0 * float(np.abs(linear_to_srgb(np.clip(gain * own, 0.0, 1.0)) - true_srgb).mean())
+    own = sample_texture(torch.from_numpy(texture.diffuse), uv[seen]).numpy()
+    return gain_to_truth(own, sample_texture(subject.texture_tensor(), uv_true).numpy())
+
+
+def gain_to_truth(
+    own: Float[np.ndarray, "n 3"], true: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "3"], float]:
+    """Return the linear gain a channel from colours (sRGB) to the true ones, and the mean error after it, of 255."""
+    linear = srgb_to_linear(own.astype(np.float64))
+    gain = np.median(srgb_to_linear(true.astype(np.float64)) / np.maximum(linear, 1e-4), axis=0)
+    return gain, 255.0 * float(np.abs(linear_to_srgb(np.clip(gain * linear, 0.0, 1.0)) - true).mean())
 
 
 def score_highlights(truth: SyntheticCapture, texture: TextureArtifact, folder: Path) -> dict[str, float]:

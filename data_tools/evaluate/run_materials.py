@@ -11,16 +11,15 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from data_tools.evaluate.compare_avatar import compare_texture, observed_colours
+from data_tools.evaluate.compare_avatar import compare_highlights, observed_colours
 from data_tools.evaluate.comparison import REQUIRED_STAGES, Comparison
-from data_tools.evaluate.materials import SAMPLES, inner_psnr_db, relit_psnr_db, scale_linear
+from data_tools.evaluate.materials import SAMPLES, gain_to_truth, inner_psnr_db, relit_psnr_db, scale_linear
 from data_tools.evaluate.truth import load_ground_truth
 from data_tools.synthetic.rig.subject import Subject
 from data_tools.synthetic.scene.renderer import pose_vertices
 from pipeline.avatar.finished_run import load_finished_run
 from pipeline.body.body import canonical_to_world
 from pipeline.capture.frame_selection import HELDOUT
-from pipeline.geometry.colour import srgb_to_linear
 from pipeline.geometry.mesh import Mesh
 from pipeline.io.image import to_float, to_uint8
 from pipeline.metrics.alignment import align_surfaces_icp
@@ -49,13 +48,15 @@ def score_run_materials(capture: Path, run: Path, texture_dir: Path) -> dict[str
 
 def score_comparison(comparison: Comparison) -> dict[str, float]:
     """Return the figures of `score_run_materials`."""
-    colours = compare_texture(comparison)
+    points, own, true = observed_colours(comparison)
+    gain, error = gain_to_truth(own, true)
+    highlights = compare_highlights(comparison, points)
     names = ("specular_correlation", "roughness_error", "lamp_error_deg")
     return {
-        "albedo_error": colours["balanced_colour_error"],
+        "albedo_error": error,
         "heldout_psnr_body_db": _held_out_db(comparison),
-        **_relit_db(comparison),
-        **{name: colours[name] for name in names if name in colours},
+        **_relit_db(comparison, gain),
+        **{name: highlights[name] for name in names if name in highlights},
     }
 
 
@@ -70,15 +71,15 @@ def _held_out_db(comparison: Comparison) -> float:
     return float(np.mean(values))
 
 
-def _relit_db(comparison: Comparison) -> Mapping[str, float]:
+def _relit_db(comparison: Comparison, gain: Float[np.ndarray, "3"]) -> Mapping[str, float]:
     """Return the PSNR of body pixels under lights that were not filmed, in the true poses of held-out frames.
 
-    The avatar has the joints of the truth matched and is aligned to it, and its texture one linear gain a channel.
+    The avatar has the joints of the truth matched and is aligned to it.
+
+    gain: linear, a channel, of its texture.
     """
     run, truth, avatar = comparison.run, comparison.truth, comparison.run.avatar
-    _, own, true = observed_colours(comparison)
-    ratio = srgb_to_linear(true.astype(np.float64)) / np.maximum(srgb_to_linear(own.astype(np.float64)), 1e-4)
-    texture = to_uint8(scale_linear(avatar.diffuse.numpy(), np.median(ratio, axis=0)))
+    texture = to_uint8(scale_linear(avatar.diffuse.numpy(), gain))
     body = replace(truth.subject.body, vertices=avatar.vertices.numpy(), faces=avatar.faces.numpy())
     subject = Subject(body, avatar.uv.numpy(), avatar.faces_uv.numpy(), texture)
     frames = run.capture.frame_index[run.capture.positions(HELDOUT)]

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pipeline.body.body import Body, Motion
 from pipeline.body.fit.state import Observations
-from pipeline.core.command import format_command
+from pipeline.core.command import rerun_command
 from pipeline.core.errors import UserError
 from pipeline.geometry.camera import Camera
 from pipeline.io.npz import load_npz, save_npz
@@ -113,7 +113,7 @@ def load_scores(path: Path) -> FrameScores:
     arrays = load_npz(path)
     missing = [field.name for field in fields(FrameScores) if field.name not in arrays]
     if missing:
-        again = format_command("body", path.parent.parent, "--force")
+        again = rerun_command("body", path.parent)
         raise UserError(f"{path} has no array {missing[0]!r}: an older version wrote it; run {again}")
     return FrameScores(**{field.name: arrays[field.name] for field in fields(FrameScores)})
 

@@ -7,7 +7,7 @@ from jaxtyping import Int
 
 from pipeline.capture.capture import Capture
 from pipeline.capture.frame_selection import TRAIN
-from pipeline.core.command import format_command
+from pipeline.core.command import rerun_command
 from pipeline.core.errors import UserError
 from pipeline.io.npz import load_npz
 
@@ -25,6 +25,6 @@ def usable_training_positions(capture: Capture, body_dir: Path) -> Int[np.ndarra
     if usable is None or usable.shape != capture.split.shape:
         raise UserError(
             f"{path} does not say which of the {len(capture)} frames are usable (written by an older version); "
-            f"run {format_command('body', body_dir.parent, '--force')}"
+            f"run {rerun_command('body', body_dir)}"
         )
     return np.flatnonzero((capture.split == TRAIN) & usable)

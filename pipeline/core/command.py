@@ -14,3 +14,8 @@ def format_command(*arguments: str | Path) -> str:
     """Format a complete command line: the command that is running, followed by `arguments` in shell quotes."""
     words = (shlex.quote(str(argument)) for argument in arguments)
     return " ".join([os.environ.get(COMMAND_VARIABLE, MODULE_COMMAND), *words])
+
+
+def rerun_command(stage: str, folder: Path) -> str:
+    """Format the command that makes the folder of a stage anew; folder: of the stage, in that of its run."""
+    return format_command(stage, folder.parent, "--force")

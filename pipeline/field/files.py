@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from pipeline.core.command import format_command
+from pipeline.core.command import rerun_command
 from pipeline.core.errors import UserError
 from pipeline.field.baselines.positional_mlp import PositionalMlp
 from pipeline.field.field import RadianceField
@@ -47,8 +47,7 @@ def load_field(path: Path) -> RadianceField:
         field.load_state_dict(tensors)
     except (KeyError, RuntimeError, TypeError) as error:
         raise UserError(
-            f"{path} holds no radiance field of this version ({error}); run "
-            f"{format_command('field', path.parent.parent, '--force')}"
+            f"{path} holds no radiance field of this version ({error}); run {rerun_command('field', path.parent)}"
         ) from None
     return field.requires_grad_(False)
 

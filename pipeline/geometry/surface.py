@@ -66,6 +66,17 @@ def remove_unreferenced_vertices(mesh: Mesh) -> Mesh:
     return Mesh(mesh.vertices[used], flat.reshape(-1, 3).astype(mesh.faces.dtype))
 
 
+def weld_vertices(mesh: Mesh) -> Mesh:
+    """Return the mesh with one vertex at each position, without the faces that are a line then.
+
+    Files have a vertex several times where texture coordinates or normals change: the surface is open there.
+    """
+    vertices, flat = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    faces = flat.reshape(-1)[mesh.faces].astype(mesh.faces.dtype)
+    is_triangle = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    return remove_unreferenced_vertices(Mesh(vertices, faces[is_triangle]))
+
+
 def largest_component(mesh: Mesh) -> Mesh:
     """Return the connected component with the largest area."""
     component = igl.vertex_components(mesh.faces.astype(np.int64))[mesh.faces[:, 0]]

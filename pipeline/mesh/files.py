@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pipeline.core.command import format_command
+from pipeline.core.command import rerun_command
 from pipeline.core.errors import UserError
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import dense_weights, top_k_weights
@@ -87,7 +87,7 @@ def load_mesh(folder: Path) -> MeshArtifact:
         return MeshArtifact(mesh, arrays["joint_indices"], arrays["joint_weights"], arrays["vertex_colors"])
     except KeyError as error:
         path = folder / MESH_NPZ
-        raise UserError(f"{path} has no array {error}; run {_again(folder)}") from None
+        raise UserError(f"{path} has no array {error}; run {rerun_command('mesh', folder)}") from None
 
 
 def save_dense_mesh(folder: Path, mesh: Mesh) -> None:
@@ -106,12 +106,7 @@ def load_dense_mesh(folder: Path) -> Mesh:
         return Mesh(arrays["vertices"], arrays["faces"])
     except KeyError as error:
         path = folder / DENSE_NPZ
-        raise UserError(f"{path} has no array {error}; run {_again(folder)}") from None
-
-
-def _again(folder: Path) -> str:
-    """Return the command that writes the folder of this stage again."""
-    return format_command("mesh", folder.parent, "--force")
+        raise UserError(f"{path} has no array {error}; run {rerun_command('mesh', folder)}") from None
 
 
 def save_checkpoint(path: Path, state: RefinementState) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.core.command import format_command
+from pipeline.core.command import rerun_command
 from pipeline.core.errors import UserError
 from pipeline.io.npz import load_npz, save_npz
 from pipeline.template.correspondence import LABELS, Correspondence
@@ -50,7 +50,7 @@ def load_fitted_template(folder: Path) -> FittedTemplate | None:
         UserError: the file is missing, is no npz, or has not the arrays of a template.
     """
     path = folder / TEMPLATE_NPZ
-    again = f"run {format_command('texture', folder.parent, '--force')}"
+    again = f"run {rerun_command('texture', folder)}"
     if not path.is_file():
         raise UserError(f"{path} is missing, the texture is of an earlier version; {again}")
     arrays = load_npz(path)

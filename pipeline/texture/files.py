@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from pipeline.core.command import format_command
+from pipeline.core.command import rerun_command
 from pipeline.core.errors import UserError
 from pipeline.geometry.atlas import Atlas
 from pipeline.geometry.surface_cut import SurfaceCut
@@ -98,11 +98,6 @@ def map_files(folder: Path, name: str) -> list[Path]:
     return [folder / name, *([exr] if exr.is_file() else [])]
 
 
-def texture_command(folder: Path) -> str:
-    """Return the command that writes the folder of the texture stage again."""
-    return format_command("texture", folder.parent, "--force")
-
-
 def load_texture(folder: Path) -> TextureArtifact:
     """Read the artifact, maps in their highest precision.
 
@@ -115,7 +110,7 @@ def load_texture(folder: Path) -> TextureArtifact:
         if "cut_faces" in arrays:
             cut = SurfaceCut(arrays["cut_corners"], arrays["cut_weights"], arrays["cut_faces"])
     except KeyError as error:
-        raise UserError(f"{folder / ATLAS} lacks the array {error}; run {texture_command(folder)}") from None
+        raise UserError(f"{folder / ATLAS} lacks the array {error}; run {rerun_command('texture', folder)}") from None
     diffuse = read_rgb_float(map_files(folder, DIFFUSE)[-1])
     specular = read_rgb_float(map_files(folder, SPECULAR)[-1])[..., 0]
     coverage, (light, highlights) = read_gray(folder / COVERAGE), load_light(folder / LIGHT)

@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pipeline.core.command import format_command
+from pipeline.core.command import rerun_command
 from pipeline.core.errors import UserError
 from pipeline.geometry.mesh import area_weighted_vertex_normals
 from pipeline.geometry.shadow_map import render_shadow_map
@@ -261,8 +261,6 @@ def load_light(path: Path) -> tuple[VideoLight, Highlights]:
     arrays = load_npz(path)
     missing = [name for name in (*_LIGHT_ARRAYS, _HIGHLIGHT_DIRECTION, _HIGHLIGHT_EXPONENT) if name not in arrays]
     if missing:
-        raise UserError(
-            f"{path} lacks the array {missing[0]}; run {format_command('texture', path.parent.parent, '--force')}"
-        )
+        raise UserError(f"{path} lacks the array {missing[0]}; run {rerun_command('texture', path.parent)}")
     light = VideoLight(*(arrays[name] for name in _LIGHT_ARRAYS))
     return light, Highlights(arrays[_HIGHLIGHT_DIRECTION], float(arrays[_HIGHLIGHT_EXPONENT]))

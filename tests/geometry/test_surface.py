@@ -22,6 +22,7 @@ from pipeline.geometry.surface import (
     smooth_taubin,
     split_nonmanifold_vertices,
     subdivide,
+    weld_vertices,
 )
 
 TETRAHEDRON = Mesh(
@@ -243,3 +244,22 @@ def test_closest_point_against_brute_force(sphere: Mesh) -> None:
 def test_signed_distance_of_a_sphere(sphere: Mesh) -> None:
     points = np.random.default_rng(6).uniform(-0.7, 0.7, size=(300, 3))
     np.testing.assert_allclose(signed_distance_m(points, sphere), np.linalg.norm(points, axis=1) - 0.5, atol=0.005)
+
+
+def test_welding_closes_a_surface_whose_faces_have_their_own_vertices(sphere: Mesh) -> None:
+    soup = Mesh(
+        sphere.vertices[sphere.faces].reshape(-1, 3), np.arange(sphere.faces.size, dtype=np.int32).reshape(-1, 3)
+    )
+    assert not soup.is_watertight()
+    welded = weld_vertices(soup)
+    assert welded.is_watertight()
+    assert len(welded.vertices) == len(sphere.vertices)
+    np.testing.assert_array_equal(welded.vertices[welded.faces], sphere.vertices[sphere.faces])
+
+
+def test_a_face_that_is_a_line_after_welding_is_removed() -> None:
+    """Corners 1 and 4 of the second face are the same point."""
+    vertices = np.concatenate([TETRAHEDRON.vertices, TETRAHEDRON.vertices[1:2]])
+    welded = weld_vertices(Mesh(vertices, np.array([[0, 1, 2], [1, 4, 3]], dtype=np.int32)))
+    assert welded.faces.shape == (1, 3)
+    assert len(welded.vertices) == 3

@@ -7,13 +7,16 @@ import numpy as np
 import pytest
 
 from data_tools.evaluate.comparison import Comparison
-from data_tools.evaluate.materials import main, normal_map_angle_deg, reduced_mesh, write_true_run
+from data_tools.evaluate.materials import gain_to_truth, main, normal_map_angle_deg, reduced_mesh, write_true_run
 from data_tools.evaluate.run_materials import score_comparison
 from data_tools.evaluate.truth import load_ground_truth
+from pipeline.body.body import Body
 from pipeline.body.files import load_motion
 from pipeline.capture.capture import load_capture
 from pipeline.geometry.atlas import unwrap
+from pipeline.geometry.colour import linear_to_srgb, srgb_to_linear
 from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.surface import remove_unreferenced_vertices
 from pipeline.metrics.surfaces import chamfer_distance_mm
 from pipeline.texture.files import TextureArtifact
 from pipeline.texture.light import Highlights, VideoLight
@@ -40,6 +43,22 @@ def test_the_reduced_mesh_is_the_true_surface(sample: Path) -> None:
     assert chamfer_distance_mm(reduced.mesh, body.mesh(), 5_000) < 2.0
 
 
+def test_a_surface_with_texture_seams_is_reduced_without_tearing() -> None:
+    """Each half of a ball has vertices of its own, as in files; reduced apart, one half would be closed by a disc."""
+    vertices, faces = sphere(0.5, (0.0, 1.0, 0.0), 6)
+    right = vertices[faces].mean(axis=1)[:, 0] > 0.0
+    faces = np.where(right[:, None], faces, faces + len(vertices)).astype(np.int32)
+    split = remove_unreferenced_vertices(Mesh(np.concatenate([vertices, vertices]), faces))
+    weights = np.ones((len(split.vertices), 1), dtype=np.float32)
+    body = Body(("Hips",), np.array([-1]), np.zeros((1, 3)), split.vertices, split.faces, weights, {})
+    mesh = reduced_mesh(body).mesh
+    assert len(mesh.faces) <= 22_000
+    assert mesh.is_watertight()
+    outwards = (mesh.vertices - np.array([0.0, 1.0, 0.0])) / 0.5
+    assert np.linalg.norm(outwards, axis=1) == pytest.approx(1.0, abs=1e-3)
+    assert np.min(np.sum(mesh.vertex_normals() * outwards, axis=1)) > np.cos(np.radians(3.0))
+
+
 @pytest.mark.slow
 def test_the_table_has_all_rows(sample: Path, capsys: pytest.CaptureFixture[str]) -> None:
     main([str(sample), "--frames", "6"])
@@ -47,6 +66,19 @@ def test_the_table_has_all_rows(sample: Path, capsys: pytest.CaptureFixture[str]
     for mode in ("kept", "auto", "removed"):
         for name in ("albedo_error", "relit_left_db", "heldout_psnr_body_db", "gain_error_largest"):
             assert f"{mode:8} {name} " in rows
+
+
+def test_the_error_of_colours_is_what_one_gain_a_channel_leaves() -> None:
+    """Linear colours that are multiples of the true ones have no error; a tenth of black ones keeps the gain."""
+    true = np.random.default_rng(1).uniform(0.1, 0.9, (200, 3)).astype(np.float32)
+    own = linear_to_srgb(srgb_to_linear(true.astype(np.float64)) * np.array([0.5, 0.8, 0.3]))
+    gain, error = gain_to_truth(own, true)
+    assert gain == pytest.approx([2.0, 1.25, 1.0 / 0.3], rel=1e-4)
+    assert error < 0.01
+    own[:20] = 0.0
+    gain, error = gain_to_truth(own, true)
+    assert gain == pytest.approx([2.0, 1.25, 1.0 / 0.3], rel=1e-4)
+    assert error == pytest.approx(255.0 * true[:20].sum() / 600.0, rel=1e-3)
 
 
 def test_the_normal_map_is_measured_against_the_dense_mesh() -> None:
