@@ -34,13 +34,18 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument(
         "--flare-m", type=float, help="widening of the skirt from waist to hem in metres; 0.07 if absent"
     )
+    parser.add_argument("--sleeve-flare-m", type=float, default=0.0, help="widening of the sleeves to the hem, metres")
+    parser.add_argument("--finger-mm", type=float, help="width of the fingers, mm; that of the person if absent")
     options = parser.parse_args(argv)
     validate_capture_options(options)
     if options.flare_m is not None and options.legwear != "skirt":
         raise UserError("--flare-m widens a skirt; add --legwear skirt")
     require_absent(options.out)
     flare_m = HEM_FLARE_M if options.flare_m is None else options.flare_m
-    subject, bare = make_person(options.seed, options.texture, options.legwear, flare_m)
+    finger_m = None if options.finger_mm is None else 1e-3 * options.finger_mm
+    subject, bare = make_person(
+        options.seed, options.texture, options.legwear, flare_m, options.sleeve_flare_m, finger_m
+    )
     scene = build_scene(options, subject.body)
     motion = build_motion(options, subject.body, scene[1])
     capture, heldout = build_capture(options, subject, motion, scene)

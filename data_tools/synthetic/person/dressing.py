@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull
 
 from data_tools.synthetic.person.anatomy import SKIN, SKIRT, Anatomy, compute_arm_head_weights, label_faces
 from data_tools.synthetic.person.noise import ValueNoise
-from data_tools.synthetic.person.outfit import LAYERS, Outfit, compute_layer_depths_m
+from data_tools.synthetic.person.outfit import LAYERS, Outfit, compute_layer_depths_m, sleeve_flare_offset_m
 from data_tools.synthetic.person.skirt import ATLAS_HEIGHT_FRACTION, build_skirt
 from data_tools.synthetic.person.surface import (
     append_midpoint_values,
@@ -76,7 +76,8 @@ def add_clothing(model: AnnyBody, body: Body, anatomy: Anatomy, outfit: Outfit, 
         depths = np.where(
             skin_vertices[:, None], compute_layer_depths_m(drape, arm_head_weights, anatomy, outfit), -1.0
         )
-        vertices = _add_layers(base_surface, faces, mean, depths, anatomy, noise)
+        flare_m = sleeve_flare_offset_m(drape, arm_head_weights, anatomy, outfit)
+        vertices = _add_layers(base_surface, faces, mean, depths, flare_m, anatomy, noise)
     clothed_body = replace(
         body, vertices=vertices, faces=faces, skin_weights=append_midpoint_values(body.skin_weights, pairs)
     )
@@ -121,15 +122,18 @@ def _add_layers(
     faces: Int[np.ndarray, "f 3"],
     mean: sparse.csr_matrix,
     depths_m: Float[np.ndarray, "v 4"],
+    sleeve_flare_m: Float[np.ndarray, "v"],
     anatomy: Anatomy,
     noise: ValueNoise,
 ) -> Float[np.ndarray, "v 3"]:
-    """Displace the surface by all layers in order."""
+    """Displace the surface by all layers in order. sleeve_flare_m: additional thickness of the shirt."""
     vertices = skin_m
     for column, layer in enumerate(LAYERS):
         smooth = smooth_laplacian(vertices, mean, _SMOOTHING_ITERATIONS[layer])
         normals = Mesh(smooth, faces).vertex_normals()
         thickness = _THICKNESS[layer](skin_m, depths_m[:, column], anatomy, noise)
+        if layer == "shirt":
+            thickness = thickness + sleeve_flare_m
         layer_weight = np.clip(depths_m[:, column] / HEM_TRANSITION_M + 0.5, 0.0, 1.0)[:, None]
         vertices = vertices + layer_weight * (smooth + thickness[:, None] * normals - vertices)
         if layer == "shoes":

@@ -32,6 +32,7 @@ class Outfit:
         shirt_below_hips_m: height of the hips above the hem of the shirt.
         plaid: second colour of the skirt.
         hem_flare_m: additional radius of the skirt at the hem, compared with cloth that falls straight.
+        sleeve_flare_m: additional radius of the sleeves at their hem.
     """
 
     legwear: str
@@ -48,6 +49,7 @@ class Outfit:
     skin: Colour
     print_text: str
     hem_flare_m: float = HEM_FLARE_M
+    sleeve_flare_m: float = 0.0
 
 
 _SHIRTS: tuple[tuple[Colour, Colour], ...] = (
@@ -133,6 +135,18 @@ def _sleeve_depth_m(points_m: Float[np.ndarray, "n 3"], anatomy: Anatomy, outfit
         along = _dot(points_m[rows] - shoulder, elbow - shoulder) / length
         depth[rows] = outfit.sleeve_fraction * length - along
     return depth
+
+
+def sleeve_flare_offset_m(
+    points_m: Float[np.ndarray, "n 3"], arm_head_weights: Float[np.ndarray, "n 2"], anatomy: Anatomy, outfit: Outfit
+) -> Float[np.ndarray, "n"]:
+    """Return the additional thickness of the shirt: from 0 at the shoulder to `Outfit.sleeve_flare_m` at the hem.
+
+    Arguments as in `compute_layer_depths_m`.
+    """
+    upper_arm_m = np.linalg.norm(anatomy.joints_m["LeftForeArm"] - anatomy.joints_m["LeftArm"])
+    to_hem = 1.0 - _sleeve_depth_m(points_m, anatomy, outfit) / (outfit.sleeve_fraction * upper_arm_m)
+    return outfit.sleeve_flare_m * np.where(arm_head_weights[:, 0] > 0.5, np.clip(to_hem, 0.0, 1.0), 0.0)
 
 
 def _hair_depth_m(points_m: Float[np.ndarray, "n 3"], anatomy: Anatomy) -> Float[np.ndarray, "n"]:

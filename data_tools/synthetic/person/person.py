@@ -8,6 +8,7 @@ from torch import Tensor
 
 from data_tools.synthetic.person.anatomy import measure_anatomy
 from data_tools.synthetic.person.dressing import add_clothing, surface_names
+from data_tools.synthetic.person.fingers import with_finger_width
 from data_tools.synthetic.person.noise import ValueNoise
 from data_tools.synthetic.person.outfit import HEM_FLARE_M, choose_outfit
 from data_tools.synthetic.person.painting import paint_texture
@@ -28,15 +29,23 @@ _PHENOTYPES = {
 
 
 def make_person(
-    seed: int, texture_px: int = 2048, legwear: str = "trousers", hem_flare_m: float = HEM_FLARE_M
+    seed: int,
+    texture_px: int = 2048,
+    legwear: str = "trousers",
+    hem_flare_m: float = HEM_FLARE_M,
+    sleeve_flare_m: float = 0.0,
+    finger_width_m: float | None = None,
 ) -> tuple[Subject, Body]:
     """Return the clothed, textured person of a seed, and the body without clothes; equal seeds give equal arrays.
 
-    texture_px: side of the texture. legwear, hem_flare_m: see `Outfit`.
+    texture_px: side of the texture. legwear, hem_flare_m, sleeve_flare_m: see `Outfit`. finger_width_m: None: that of
+    the person.
     """
     model, noise = load_anny(), ValueNoise(seed)
-    outfit = replace(choose_outfit(seed, legwear), hem_flare_m=hem_flare_m)
+    outfit = replace(choose_outfit(seed, legwear), hem_flare_m=hem_flare_m, sleeve_flare_m=sleeve_flare_m)
     bare = model.at_shape(_shape(model, seed))
+    if finger_width_m is not None:
+        bare = with_finger_width(bare, finger_width_m)
     anatomy = measure_anatomy(model, bare)
     clothed = add_clothing(model, bare, anatomy, outfit, noise)
     texture = to_uint8(paint_texture(clothed, anatomy, outfit, noise, texture_px))

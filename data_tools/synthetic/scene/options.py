@@ -114,6 +114,8 @@ def validate_capture_options(options: argparse.Namespace) -> None:
         ("arc", 0.0, 360.0),
         ("turns", 1, 20),
         ("flare_m", 0.0, 0.6),
+        ("sleeve_flare_m", 0.0, 0.15),
+        ("finger_mm", 1.0, 30.0),
         ("novel_views", 0, 1000),
         ("novel_poses", 0, 1000),
         ("texture", 64, 8192),

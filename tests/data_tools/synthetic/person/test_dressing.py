@@ -7,6 +7,7 @@ import pytest
 
 from data_tools.synthetic.person.anatomy import EYE, SKIN, label_faces, measure_anatomy
 from data_tools.synthetic.person.outfit import LAYERS, choose_outfit, compute_layer_depths_m
+from data_tools.synthetic.person.person import make_person
 from data_tools.synthetic.person.surface import append_midpoint_values, subdivide_at_midpoints
 from data_tools.synthetic.rig.subject import Subject
 from pipeline.body.body import Body, load_anny
@@ -117,3 +118,17 @@ def test_anatomy_is_symmetric_and_in_place(bare: Body) -> None:
 def test_outfits_vary_with_the_seed(seed: int) -> None:
     assert choose_outfit(seed) == choose_outfit(seed)
     assert choose_outfit(seed) != choose_outfit(0)
+
+
+@pytest.mark.slow
+def test_wide_sleeves_widen_to_their_hem_alone() -> None:
+    narrow, wide = (make_person(0, 64, sleeve_flare_m=flare_m)[0].body for flare_m in (0.0, 0.05))
+    moved_m = np.linalg.norm(wide.vertices - narrow.vertices, axis=1)
+    joints = {name: narrow.joints_m[narrow.joint(name)] for name in ("LeftArm", "LeftForeArm", "Hips")}
+    bone = joints["LeftForeArm"] - joints["LeftArm"]
+    along = (narrow.vertices - joints["LeftArm"]) @ bone / (bone**2).sum()
+    on_arm = narrow.skin_weights[:, [narrow.joint(name) for name in ("LeftArm", "LeftForeArm")]].sum(axis=1) > 0.9
+    hem = on_arm & (along > 0.55) & (along < 0.64)
+    assert moved_m[hem].mean() == pytest.approx(0.045, abs=0.01)
+    assert moved_m[on_arm & (along > 0.8)].max() < 0.002
+    assert moved_m[narrow.vertices[:, 1] < joints["Hips"][1]].max() < 0.002
