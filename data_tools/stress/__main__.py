@@ -10,7 +10,7 @@ docs/stress.md, which show the newest result of each trial and name its commit. 
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from tqdm import tqdm
@@ -19,6 +19,7 @@ from data_tools.command import run_command
 from data_tools.stress.row import Results, Row
 from data_tools.stress.rows import ROWS
 from data_tools.stress.run_trial import read_latest, run_trial
+from data_tools.stress.store import index_results
 from data_tools.stress.tables import Sweep, draw_figure, write_csv_table, write_document
 from data_tools.sweep.chart_figure import save_figure
 from pipeline.core.measure import REPOSITORY_DIR
@@ -57,7 +58,8 @@ def _run(argv: Sequence[str]) -> None:
 
 def write_results(out: Path, document: Path | None, rows: dict[str, Row], chosen: Sequence[str]) -> list[str]:
     """Write tables and figure of all rows with results; return a sentence for each chosen row that is crossed."""
-    sweep: Sweep = {name: read_results(out, row) for name, row in rows.items()}
+    older = index_results(out / "results")
+    sweep: Sweep = {name: read_results(out, row, older) for name, row in rows.items()}
     write_csv_table(out / "stress.csv", rows, sweep)
     if any(result.scores for results in sweep.values() for result in results.values()):
         save_figure(draw_figure(rows, sweep), out, "stress", dpi=110)
@@ -72,9 +74,9 @@ def write_results(out: Path, document: Path | None, rows: dict[str, Row], chosen
     return crossed
 
 
-def read_results(out: Path, row: Row) -> Results:
+def read_results(out: Path, row: Row, older: Mapping[str, Path]) -> Results:
     """Return the newest results of a row by the label of the trial; `MISSING` where a trial has never run."""
-    return {trial.label: read_latest(out, trial) for trial in row.trials}
+    return {trial.label: read_latest(out, trial, older) for trial in row.trials}
 
 
 def _parse(argv: Sequence[str]) -> argparse.Namespace:

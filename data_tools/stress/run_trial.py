@@ -5,10 +5,11 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 from data_tools.stress.row import DONE, FAILED, MISSING, REFUSED, Trial, TrialResult
-from data_tools.stress.store import load_latest_result, load_result, save_result, trial_key
+from data_tools.stress.store import load_result, save_result, settings_key, trial_key
 from data_tools.sweep.chart_trials import describe_machine
 from data_tools.sweep.runs import last_error_message
 from pipeline.core.cli import EXIT_USER_ERROR
@@ -30,10 +31,14 @@ def read_trial(out: Path, trial: Trial) -> TrialResult:
     return load_result(result_path(out, trial))
 
 
-def read_latest(out: Path, trial: Trial) -> TrialResult:
-    """Read the result of a trial, or the newest one of earlier versions; its commit tells which."""
+def read_latest(out: Path, trial: Trial, older: Mapping[str, Path]) -> TrialResult:
+    """Read the result of a trial, or the newest one of earlier versions; its commit tells which.
+
+    older: from `index_results`.
+    """
     found = read_trial(out, trial)
-    return found if found.state != MISSING else load_latest_result(out / "results", trial)
+    path = older.get(settings_key(trial.procedure, trial.settings))
+    return found if found.state != MISSING or path is None else load_result(path)
 
 
 def run_trial(out: Path, trial: Trial, keep: bool = False) -> TrialResult:

@@ -1,6 +1,7 @@
 """Results of trials as JSON files, keyed by everything that determines them."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -59,20 +60,24 @@ def load_result(path: Path) -> TrialResult:
         return TrialResult(MISSING)
 
 
-def load_latest_result(folder: Path, trial: Trial) -> TrialResult:
-    """Return the newest result of a trial with these settings, whatever preset and versions it is of.
+def index_results(folder: Path) -> dict[str, Path]:
+    """Return the newest result file of each trial, whatever preset and versions it is of, by `settings_key`.
 
-    folder: of the results. State `MISSING` if there is none, or only damaged ones.
+    folder: of the results. Damaged files are left out.
     """
-    wanted = {"procedure": trial.procedure, "settings": json.loads(json.dumps(dict(trial.settings)))}
-    for path in sorted(folder.glob("*.json"), key=lambda path: path.stat().st_mtime, reverse=True):
+    newest: dict[str, Path] = {}
+    for path in sorted(folder.glob("*.json"), key=lambda path: path.stat().st_mtime):
         try:
             document = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError:
+            newest[settings_key(document["procedure"], document["settings"])] = path
+        except (ValueError, LookupError, TypeError):
             continue
-        if all(document.get(name) == value for name, value in wanted.items()):
-            return load_result(path)
-    return TrialResult(MISSING)
+    return newest
+
+
+def settings_key(procedure: str, settings: Mapping[str, Any]) -> str:
+    """Digest what a trial does, without preset and versions."""
+    return digest_json({"procedure": procedure, "settings": dict(settings)})
 
 
 def _json_number(value: float) -> float | None:

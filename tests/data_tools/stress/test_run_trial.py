@@ -10,7 +10,7 @@ import pytest
 from data_tools.stress import __main__ as command
 from data_tools.stress import run_trial as runner
 from data_tools.stress.row import DONE, FAILED, MISSING, REFUSED, Row, Trial, TrialResult, bounded
-from data_tools.stress.store import load_result, save_result, trial_key
+from data_tools.stress.store import index_results, load_result, save_result, trial_key
 from data_tools.stress.tables import TABLE_END, TABLE_START, draw_figure, summary_table, trial_table, write_document
 
 TRIAL = Trial("box", 1, {"capture": {"frames": 8}})
@@ -81,12 +81,13 @@ def test_tables_show_the_newest_result_of_earlier_versions(tmp_path: Path) -> No
         save_result(path, trial, TrialResult(DONE, {"error": float(number)}, commit=name))
         os.utime(path, (number, number))
     (tmp_path / "results" / "damaged.json").write_text("{")
+    older = index_results(tmp_path / "results")
     assert runner.read_trial(tmp_path, TRIAL).state == MISSING
-    assert runner.read_latest(tmp_path, TRIAL).commit == "newer"
-    assert runner.read_latest(tmp_path, Trial("never", 2, {"capture": {}})).state == MISSING
+    assert runner.read_latest(tmp_path, TRIAL, older).commit == "newer"
+    assert runner.read_latest(tmp_path, Trial("never", 2, {"capture": {}}), older).state == MISSING
     save_result(runner.result_path(tmp_path, TRIAL), TRIAL, TrialResult(DONE, {"error": 5.0}, commit="exact"))
     os.utime(runner.result_path(tmp_path, TRIAL), (0, 0))
-    assert runner.read_latest(tmp_path, TRIAL).commit == "exact"
+    assert runner.read_latest(tmp_path, TRIAL, index_results(tmp_path / "results")).commit == "exact"
 
 
 def test_the_key_depends_on_what_determines_the_result(tmp_path: Path) -> None:
