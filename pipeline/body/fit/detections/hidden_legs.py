@@ -11,11 +11,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS
+from pipeline.capture.landmarks import ANKLES, FEET, KNEES
 
-KNEE_AND_ANKLE = ((25, 27), (26, 28))
+KNEE_AND_ANKLE = tuple(zip(KNEES, ANKLES, strict=True))
 """Landmarks of the left and the right leg whose visibility is judged."""
 
-LEG_LANDMARKS = ((25, 27, 29, 31), (26, 28, 30, 32))
+LEG_LANDMARKS = tuple((*judged, *FEET[side::2]) for side, judged in enumerate(KNEE_AND_ANKLE))
 """Knee, ankle, heel and tip of the foot of the left and the right leg."""
 
 LEG_JOINTS = ("UpLeg", "Leg", "Foot", "ToeBase")
