@@ -90,7 +90,7 @@ def compare_heldout_surfaces(comparison: Comparison) -> dict[str, float]:
     rows = []
     for position, frame in zip(positions, frames, strict=True):
         avatar = comparison.avatar_surface(comparison.run.refined_canonical_to_world[position])
-        true = comparison.true_surface(comparison.truth.canonical_to_world[frame])
+        true = comparison.rigs.true_surface(comparison.truth.canonical_to_world[frame])
         seen = map_between_worlds(torch.from_numpy(avatar.vertices), comparison.run.camera, comparison.truth.camera)
         unaligned_mm = chamfer_distance_mm(Mesh(seen.numpy(), avatar.faces), true, SURFACE_POINTS)
         scores = _aligned_scores(avatar, true, align_surfaces_icp(avatar, true))
@@ -108,7 +108,7 @@ def compare_novel_poses(comparison: Comparison) -> tuple[dict[str, dict[str, flo
     """
     motion = load_motion(comparison.folder / "novel_poses" / "motion.npz")
     body, true_body = comparison.run.body, comparison.truth.subject.body
-    true_surfaces = [comparison.true_surface(pose) for pose in canonical_to_world(true_body, motion)]
+    true_surfaces = [comparison.rigs.true_surface(pose) for pose in canonical_to_world(true_body, motion)]
 
     def surfaces(avatar_motion: Motion) -> list[Mesh]:
         return [comparison.avatar_surface(pose) for pose in canonical_to_world(body, avatar_motion)]
@@ -120,7 +120,7 @@ def compare_novel_poses(comparison: Comparison) -> tuple[dict[str, dict[str, flo
             for avatar, true, alignment in zip(avatars, true_surfaces, alignments, strict=True)
         )
 
-    retargeted, matched = surfaces(retarget_motion(body, true_body, motion)), surfaces(comparison.match_motion(motion))
+    retargeted, matched = surfaces(retarget_motion(body, true_body, motion)), surfaces(comparison.rigs.match(motion))
     retargeted_to_truth, matched_to_truth = (
         list(map(align_surfaces_icp, avatars, true_surfaces)) for avatars in (retargeted, matched)
     )
@@ -139,10 +139,10 @@ def compare_novel_poses(comparison: Comparison) -> tuple[dict[str, dict[str, flo
 
 def compare_novel_views(comparison: Comparison) -> list[ImagePair]:
     """Render novel views: the avatar in the true pose of the first frame, joints matched, aligned to the truth."""
-    motion = comparison.match_motion(comparison.truth.motion.select(np.array([0])))
+    motion = comparison.rigs.match(comparison.truth.motion.select(np.array([0])))
     avatar = comparison.avatar_surface(canonical_to_world(comparison.run.body, motion)[0])
     surface = align_surfaces_icp(
-        avatar, comparison.true_surface(comparison.truth.canonical_to_world[0])
+        avatar, comparison.rigs.true_surface(comparison.truth.canonical_to_world[0])
     ).transform_mesh(avatar)
     return [
         ImagePair(read_rgba(path.with_suffix(".png")), render_under_light(comparison, surface, load_camera(path)))

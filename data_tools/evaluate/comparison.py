@@ -18,6 +18,7 @@ from pipeline.avatar.finished_run import FinishedRun, load_finished_run
 from pipeline.avatar.motion.feet import snap_feet_to_floor
 from pipeline.avatar.motion.retarget import retarget_rotations
 from pipeline.body.body import Body, Motion, canonical_to_world
+from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.rotation import quaternion_to_matrix
 from pipeline.geometry.shadow_map import find_exterior_faces
@@ -51,6 +52,58 @@ class ImagePair:
         return frame_scores(self.avatar, self.truth[..., :3], self.truth[..., 3])
 
 
+@dataclass(frozen=True, eq=False)
+class MatchedRigs:
+    """The fitted person of a run beside the true one: two rigs, whose joints are matched by their mean difference.
+
+    Attributes:
+        body, motion, camera: fitted.
+    """
+
+    body: Body
+    motion: Motion
+    camera: Camera
+    truth: SyntheticCapture
+
+    @cached_property
+    def joint_offsets(self) -> Float[Tensor, "j 3 3"]:
+        """Mean rotation over the frames of the run from the retargeted true motion to the fitted motion."""
+        true_motion = self.truth.motion.select(self.motion.frame_index)
+        return mean_rotation_offsets(
+            joint_rotations_in_camera(self.body, self.motion, self.camera),
+            joint_rotations_in_camera(self.body, self.retarget(true_motion), self.truth.camera),
+        )
+
+    def retarget(self, motion: Motion) -> Motion:
+        """Retarget a motion of the true rig, see `retarget_motion`."""
+        return retarget_motion(self.body, self.truth.subject.body, motion)
+
+    def match(self, motion: Motion) -> Motion:
+        """Retarget a motion of the true rig such that both rigs agree as they do, on average, in the video."""
+        return rotate_joints(self.body, self.retarget(motion), self.joint_offsets)
+
+    @cached_property
+    def true_rest_motion(self) -> Motion:
+        """The A-pose of the true rig: one frame."""
+        body, joints = self.truth.subject.body, len(self.truth.subject.body.joint_names)
+        identity_wxyz = np.tile(np.array([1.0, 0.0, 0.0, 0.0], dtype=np.float32), (1, joints, 1))
+        return Motion(np.zeros(1, np.int32), np.zeros(1), identity_wxyz, body.joints_m[:1])
+
+    @cached_property
+    def true_exterior(self) -> Bool[np.ndarray, "f"]:
+        """Which faces of the true person are exterior in the A-pose."""
+        return find_exterior_faces(self.truth.subject.body.mesh())
+
+    @cached_property
+    def true_faces(self) -> Int[np.ndarray, "f 3"]:
+        """The faces of `true_exterior`."""
+        return self.truth.subject.body.faces[self.true_exterior]
+
+    def true_surface(self, pose: Float[Tensor, "j 4 4"]) -> Mesh:
+        """Return the true person in one pose, with the faces that are exterior in the A-pose."""
+        return Mesh(pose_vertices(self.truth.subject, pose).numpy(), self.true_faces)
+
+
 @dataclass(frozen=True)
 class Comparison:
     """A finished run and its ground truth.
@@ -64,6 +117,11 @@ class Comparison:
     coverage: Float[np.ndarray, "th tw"]
     truth: SyntheticCapture
     folder: Path
+
+    @cached_property
+    def rigs(self) -> MatchedRigs:
+        """The rig of the avatar and the true one."""
+        return MatchedRigs(self.run.body, self.run.motion, self.run.camera, self.truth)
 
     @cached_property
     def rest_mesh(self) -> Mesh:
@@ -85,36 +143,13 @@ class Comparison:
 
     @cached_property
     def matched_rest_mesh(self) -> Mesh:
-        """The exterior of the avatar in the A-pose of the true rig, see `match_motion`."""
-        return self.avatar_surface(canonical_to_world(self.run.body, self.match_motion(self._true_rest_motion))[0])
+        """The exterior of the avatar in the A-pose of the true rig, see `MatchedRigs.match`."""
+        return self.avatar_surface(canonical_to_world(self.run.body, self.rigs.match(self.rigs.true_rest_motion))[0])
 
     @cached_property
     def _rest_motion(self) -> Motion:
         """The A-pose of the true rig, retargeted to the rig of the avatar: one frame."""
-        return retarget_motion(self.run.body, self.truth.subject.body, self._true_rest_motion)
-
-    @cached_property
-    def _true_rest_motion(self) -> Motion:
-        """The A-pose of the true rig: one frame."""
-        body, joints = self.truth.subject.body, len(self.truth.subject.body.joint_names)
-        identity_wxyz = np.tile(np.array([1.0, 0.0, 0.0, 0.0], dtype=np.float32), (1, joints, 1))
-        return Motion(np.zeros(1, np.int32), np.zeros(1), identity_wxyz, body.joints_m[:1])
-
-    @cached_property
-    def joint_offsets(self) -> Float[Tensor, "j 3 3"]:
-        """Mean rotation over the frames of the run from the retargeted true motion to the motion of the avatar."""
-        run, truth = self.run, self.truth
-        true_motion = truth.motion.select(run.motion.frame_index)
-        retargeted = retarget_motion(run.body, truth.subject.body, true_motion)
-        return mean_rotation_offsets(
-            joint_rotations_in_camera(run.body, run.motion, run.camera),
-            joint_rotations_in_camera(run.body, retargeted, truth.camera),
-        )
-
-    def match_motion(self, motion: Motion) -> Motion:
-        """Retarget a motion of the true rig such that both rigs agree as they do, on average, in the video."""
-        body = self.run.body
-        return rotate_joints(body, retarget_motion(body, self.truth.subject.body, motion), self.joint_offsets)
+        return self.rigs.retarget(self.rigs.true_rest_motion)
 
     @cached_property
     def alignment(self) -> SimilarityTransform:
@@ -124,29 +159,17 @@ class Comparison:
     @cached_property
     def true_rest_mesh(self) -> Mesh:
         """The exterior of the true person in the A-pose."""
-        return Mesh(self.truth.subject.body.vertices, self._true_faces)
+        return Mesh(self.truth.subject.body.vertices, self.rigs.true_faces)
 
     @cached_property
     def true_labels(self) -> FaceLabels | None:
         """The labels of the faces of `true_rest_mesh`; None if the capture has none."""
         labels = self.truth.subject.labels
-        return None if labels is None else labels.select(self._true_exterior)
-
-    @cached_property
-    def _true_exterior(self) -> Bool[np.ndarray, "f"]:
-        return find_exterior_faces(self.truth.subject.body.mesh())
-
-    @cached_property
-    def _true_faces(self) -> Int[np.ndarray, "f 3"]:
-        return self.truth.subject.body.faces[self._true_exterior]
+        return None if labels is None else labels.select(self.rigs.true_exterior)
 
     @cached_property
     def _avatar_faces(self) -> Int[np.ndarray, "f 3"]:
         return self.run.avatar.mesh().faces[find_exterior_faces(self.run.avatar.mesh())]
-
-    def true_surface(self, pose: Float[Tensor, "j 4 4"]) -> Mesh:
-        """Return the true person in one pose, with the faces that are exterior in the A-pose."""
-        return Mesh(pose_vertices(self.truth.subject, pose).numpy(), self._true_faces)
 
     def avatar_surface(self, pose: Float[Tensor, "j 4 4"]) -> Mesh:
         """Return the avatar in one pose, with the faces that are exterior in its A-pose."""

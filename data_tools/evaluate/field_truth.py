@@ -6,21 +6,17 @@ similarity transform, with the joints of both rigs matched (`data_tools.evaluate
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from data_tools.evaluate.comparison import SURFACE_POINTS, retarget_motion
-from data_tools.evaluate.rig_offsets import joint_rotations_in_camera, mean_rotation_offsets, rotate_joints
+from data_tools.evaluate.comparison import SURFACE_POINTS, MatchedRigs
 from data_tools.evaluate.truth import load_ground_truth
-from data_tools.synthetic.scene.capture import SyntheticCapture
-from data_tools.synthetic.scene.renderer import pose_vertices
-from pipeline.body.body import Body, Motion, canonical_to_world
+from pipeline.body.body import canonical_to_world
 from pipeline.body.files import load_body, load_camera, load_motion
 from pipeline.core.errors import UserError
 from pipeline.field.field import RadianceField
@@ -51,49 +47,30 @@ HAZE_DISTANCE_PX = 6.0
 
 @dataclass(frozen=True)
 class TrueComparison:
-    """A field with its extracted, skinned surface, and the truth of its capture.
-
-    offsets: see `mean_rotation_offsets`.
-    """
+    """A field with its extracted, skinned surface, and the rigs of the run and of the truth."""
 
     field: RadianceField
     occupancy: BinaryOccupancy
     skin: SkinGrid
-    body: Body
     surface: Mesh
     weights: Float[Tensor, "v j"]
-    camera: Camera
-    truth: SyntheticCapture
-    offsets: Float[Tensor, "j 3 3"]
-
-    def match(self, motion: Motion) -> Motion:
-        """Retarget a motion of the true rig such that both rigs agree as they do, on average, in the video."""
-        return rotate_joints(self.body, retarget_motion(self.body, self.truth.subject.body, motion), self.offsets)
+    rigs: MatchedRigs
 
     def posed_surface(self, pose: Float[Tensor, "j 4 4"]) -> Mesh:
         """Return the extracted surface in a pose (canonical to world)."""
         vertices = torch.from_numpy(self.surface.vertices.astype(np.float32))
         return Mesh(linear_blend_skinning(vertices, self.weights, pose[None].float())[0].numpy(), self.surface.faces)
 
-    def true_surface(self, pose: Float[Tensor, "j 4 4"]) -> Mesh:
-        """Return the true person in a pose, without interior faces."""
-        return Mesh(pose_vertices(self.truth.subject, pose).numpy(), self._true_faces)
-
-    @cached_property
-    def _true_faces(self) -> Int[np.ndarray, "f 3"]:
-        body = self.truth.subject.body
-        return body.faces[find_exterior_faces(body.mesh())]
-
     def align(self, pose: Float[Tensor, "j 4 4"], true_pose: Float[Tensor, "k 4 4"]) -> SimilarityTransform:
         """Return the similarity from the surface in a pose to the true person in the pose of its own rig."""
-        return align_surfaces_icp(self.posed_surface(pose), self.true_surface(true_pose))
+        return align_surfaces_icp(self.posed_surface(pose), self.rigs.true_surface(true_pose))
 
     def render(
         self, pose: Float[Tensor, "j 4 4"], alignment: SimilarityTransform, camera: Camera
     ) -> Float[np.ndarray, "h w 4"]:
         """Draw the field in a pose, moved by `alignment`, from a camera of the true world; premultiplied."""
         aligned = camera_before_similarity(camera, alignment)
-        return render_field(self.field, self.occupancy, self.body, pose, aligned, self.skin).numpy()
+        return render_field(self.field, self.occupancy, self.rigs.body, pose, aligned, self.skin).numpy()
 
 
 def score_field(run: Path, field_folder: Path, capture: Path) -> dict[str, float]:
@@ -109,12 +86,10 @@ def score_field(run: Path, field_folder: Path, capture: Path) -> dict[str, float
         UserError: a file is missing or damaged, or the capture has no novel views.
     """
     comparison = load_true_comparison(run, field_folder, capture)
-    body, true_body = comparison.body, comparison.truth.subject.body
-    identity_wxyz = np.tile(np.array([1.0, 0.0, 0.0, 0.0], dtype=np.float32), (1, len(true_body.joint_names), 1))
-    rest = Motion(np.zeros(1, np.int32), np.zeros(1), identity_wxyz, true_body.joints_m[:1])
-    surface = comparison.posed_surface(canonical_to_world(body, comparison.match(rest))[0])
+    rigs = comparison.rigs
+    surface = comparison.posed_surface(canonical_to_world(rigs.body, rigs.match(rigs.true_rest_motion))[0])
     surface = Mesh(surface.vertices, surface.faces[find_exterior_faces(surface)])
-    true_surface = comparison.true_surface(canonical_to_world(true_body, rest)[0])
+    true_surface = rigs.true_surface(canonical_to_world(rigs.truth.subject.body, rigs.true_rest_motion)[0])
     alignment = align_surfaces_icp(surface, true_surface)
     shape = surface_scores(alignment.transform_mesh(surface), true_surface, SURFACE_POINTS)
     scores = {"field_chamfer_mm": shape["chamfer_mm"], "field_normal_angle_deg": shape["normal_angle_deg"]}
@@ -149,21 +124,17 @@ def load_true_comparison(run: Path, field_folder: Path, capture: Path) -> TrueCo
     settings = MeshSettings()
     samples = sample_canonical_grid(density_fn, occupancy.occupied_bounds_m(), body, VOXEL_M, settings)
     surface = extract_mesh(samples, ISOVALUE_PER_M, settings)
-    retargeted = retarget_motion(body, truth.subject.body, truth.motion.select(motion.frame_index))
-    offsets = mean_rotation_offsets(
-        joint_rotations_in_camera(body, motion, camera), joint_rotations_in_camera(body, retargeted, truth.camera)
-    )
     skin = build_skin_grid(body, skin_margin_m(body, occupancy.bounds_m.numpy()))
     weights = transfer_skin(surface, body).weights
-    return TrueComparison(field, occupancy, skin, body, surface, weights, camera, truth, offsets)
+    return TrueComparison(field, occupancy, skin, surface, weights, MatchedRigs(body, motion, camera, truth))
 
 
 def novel_views(
     comparison: TrueComparison, capture: Path
 ) -> Iterator[tuple[UInt8[np.ndarray, "h w 4"], Float[np.ndarray, "h w 4"]]]:
     """Yield true images (straight RGBA) and renders of the first frame from other cameras."""
-    truth = comparison.truth
-    pose = canonical_to_world(comparison.body, comparison.match(truth.motion.select(np.array([0]))))[0]
+    rigs, truth = comparison.rigs, comparison.rigs.truth
+    pose = canonical_to_world(rigs.body, rigs.match(truth.motion.select(np.array([0]))))[0]
     alignment = comparison.align(pose, truth.canonical_to_world[0])
     for path in sorted((capture / "truth" / "novel_views").glob("*.npz")):
         yield read_rgba(path.with_suffix(".png")), comparison.render(pose, alignment, load_camera(path))
@@ -173,12 +144,12 @@ def novel_poses(
     comparison: TrueComparison, capture: Path
 ) -> Iterator[tuple[UInt8[np.ndarray, "h w 4"], Float[np.ndarray, "h w 4"]]]:
     """Yield true images (straight RGBA) and renders of poses that the video does not contain."""
-    folder, truth = capture / "truth" / "novel_poses", comparison.truth
+    folder, rigs = capture / "truth" / "novel_poses", comparison.rigs
     motion = load_motion(folder / "motion.npz")
-    true_poses = canonical_to_world(truth.subject.body, motion)
-    for index, pose in enumerate(canonical_to_world(comparison.body, comparison.match(motion))):
+    true_poses = canonical_to_world(rigs.truth.subject.body, motion)
+    for index, pose in enumerate(canonical_to_world(rigs.body, rigs.match(motion))):
         alignment = comparison.align(pose, true_poses[index])
-        yield read_rgba(folder / f"{index:06d}.png"), comparison.render(pose, alignment, truth.camera)
+        yield read_rgba(folder / f"{index:06d}.png"), comparison.render(pose, alignment, rigs.truth.camera)
 
 
 def camera_before_similarity(camera: Camera, transform: SimilarityTransform) -> Camera:

@@ -86,10 +86,9 @@ def _relit_db(comparison: Comparison, gain: Float[np.ndarray, "3"]) -> Mapping[s
     scores: dict[str, list[float]] = {}
     for frame in frames[np.linspace(0, len(frames) - 1, RELIT_FRAMES).round().astype(int)].tolist():
         true_pose = truth.canonical_to_world[frame]
-        pose = canonical_to_world(run.body, comparison.match_motion(truth.motion.select(np.array([frame]))))[0]
-        moved = align_surfaces_icp(comparison.avatar_surface(pose), comparison.true_surface(true_pose)).transform_mesh(
-            Mesh(avatar.pose_vertices(pose).numpy(), body.faces)
-        )
+        pose = canonical_to_world(run.body, comparison.rigs.match(truth.motion.select(np.array([frame]))))[0]
+        alignment = align_surfaces_icp(comparison.avatar_surface(pose), comparison.rigs.true_surface(true_pose))
+        moved = alignment.transform_mesh(Mesh(avatar.pose_vertices(pose).numpy(), body.faces))
         vertices: Float[torch.Tensor, "v 3"] = torch.from_numpy(moved.vertices).float()
         true_vertices = pose_vertices(truth.subject, true_pose)
         for name, value in relit_psnr_db(truth, subject, vertices, true_vertices).items():

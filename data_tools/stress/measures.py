@@ -153,7 +153,7 @@ def gained_psnr_db(truth: UInt8[np.ndarray, "h w 4"], avatar: Float[np.ndarray, 
 def posed_stretch(comparison: Comparison) -> float:
     """Return the 99.9th percentile of `edge_stretch` over all novel poses."""
     motion = load_motion(comparison.folder / "novel_poses" / "motion.npz")
-    poses = canonical_to_world(comparison.run.body, comparison.match_motion(motion))
+    poses = canonical_to_world(comparison.run.body, comparison.rigs.match(motion))
     rest = comparison.run.avatar.mesh()
     posed = [comparison.run.avatar.pose_vertices(pose).numpy() for pose in poses]
     ratios = np.concatenate([edge_stretch(rest, vertices) for vertices in posed])

@@ -390,7 +390,7 @@ def test_light_is_that_of_the_world_of_the_run(perfect: Comparison) -> None:
     camera = replace(run.camera, world_to_camera=perfect.truth.camera.world_to_camera @ turn)
     white = replace(run.avatar, light=light, diffuse=torch.ones_like(run.avatar.diffuse))
     turned = replace(perfect, run=replace(run, camera=camera, avatar=white))
-    motion = perfect.match_motion(perfect.truth.motion.select(np.array([0])))
+    motion = perfect.rigs.match(perfect.truth.motion.select(np.array([0])))
     surface = perfect.avatar_surface(canonical_to_world(run.body, motion)[0])
     drawn = render_under_light(turned, surface, perfect.truth.camera)
     columns = np.flatnonzero(drawn[..., 3].any(axis=0))
