@@ -20,6 +20,7 @@ from pipeline.capture.usable_frames import usable_training_positions
 from pipeline.core.cli import main
 from pipeline.core.command import rerun_command
 from pipeline.core.config import Config as BaseConfig
+from pipeline.core.determinism import deterministic_sums
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
@@ -103,6 +104,7 @@ class Config(BaseConfig):
         return max_edge_m
 
 
+@deterministic_sums()
 def run(
     inputs: Mapping[str, Path], out: Path, config: Config, settings: MeshSettings = DEFAULT_SETTINGS
 ) -> Mapping[str, float]:
