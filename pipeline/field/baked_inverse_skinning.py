@@ -42,6 +42,7 @@ class BakedInverseSkinning:
         self.world_to_posed = world_to_posed(canonical_to_world)
         self.cameras = posed_space_cameras(self.camera, self.world_to_posed.cpu().numpy())
         canonical_to_posed = self.world_to_posed[:, None] @ canonical_to_world
+        vars(self).pop("inverse", None)  # its memory is free before the next one is built
         self.inverse = build_inverse_skinning(self.method, self.body, self.cpu_skin, canonical_to_posed)
 
     @property

@@ -6,7 +6,6 @@ orientation and translation are factored out, so that the bounding box of a fram
 Letters: n frames, j joints.
 """
 
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -88,5 +87,5 @@ def bake_warp_grids(skin: SkinGrid, canonical_to_posed: Float[Tensor, "n j 4 4"]
         return bake_warp_grid(skin, matrices[row])
 
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        grids: Sequence[WarpGrid] = list(pool.map(bake_row, range(len(matrices))))
-    return PackedWarpGrids.from_grids(grids, skin.cell_m).to(canonical_to_posed.device)
+        packed = PackedWarpGrids.from_grids(pool.map(bake_row, range(len(matrices))), skin.cell_m)
+    return packed.to(canonical_to_posed.device)

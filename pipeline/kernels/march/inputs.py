@@ -3,7 +3,7 @@
 Notation: n rays, k frames.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,6 +14,13 @@ from torch import Tensor
 
 from pipeline.kernels.inverse_skinning import WarpGrid
 from pipeline.kernels.march.cpu import OccupancyArrays, WarpArrays
+
+_PACKED: dict[str, tuple[type, tuple[int, ...]]] = {
+    "canonical_m": (np.float32, (3,)),
+    "cell_codes": (np.int32, ()),
+    "affine_maps": (np.float32, (12,)),
+}
+"""Type and size of the rows of the arrays that differ in length from grid to grid."""
 
 
 class Rays(NamedTuple):
@@ -45,14 +52,24 @@ class PackedWarpGrids:
     affine_maps: Float[Tensor, "maps 12"]
 
     @staticmethod
-    def from_grids(grids: Sequence[WarpGrid], cell_m: float) -> "PackedWarpGrids":
-        """Concatenate warp grids, all with cells of `cell_m`."""
-        sizes = np.array([(len(g.canonical_m), len(g.cell_codes), len(g.affine_maps)) for g in grids], dtype=np.int64)
-        names = ("canonical_m", "cell_codes", "affine_maps")
-        joined = {name: np.concatenate([getattr(grid, name) for grid in grids]) for name in names}
-        joined |= {name: np.stack([getattr(grid, name) for grid in grids]) for name in ("origin_m", "dims")}
-        joined["offsets"] = np.cumsum(sizes, axis=0) - sizes
-        return PackedWarpGrids(cell_m, **{name: torch.from_numpy(array) for name, array in joined.items()})
+    def from_grids(grids: Iterable[WarpGrid], cell_m: float) -> "PackedWarpGrids":
+        """Concatenate warp grids, all with cells of `cell_m`; at least one.
+
+        The arrays grow in place, so that grids that come from an iterator are not all in memory twice.
+        """
+        first = []
+        joined = {name: np.zeros((0, *tail), dtype) for name, (dtype, tail) in _PACKED.items()}
+        origins, dims = [], []
+        for grid in grids:
+            first.append([len(array) for array in joined.values()])
+            origins.append(grid.origin_m)
+            dims.append(grid.dims)
+            for name, array in joined.items():
+                part = getattr(grid, name)
+                array.resize((len(array) + len(part), *part.shape[1:]), refcheck=False)
+                array[len(array) - len(part) :] = part
+        packed = joined | {"origin_m": np.stack(origins), "dims": np.stack(dims), "offsets": np.array(first, np.int64)}
+        return PackedWarpGrids(cell_m, **{name: torch.from_numpy(array) for name, array in packed.items()})
 
     def tensors(self) -> tuple[Tensor, ...]:
         """Return all tensors, in the order of the fields."""
