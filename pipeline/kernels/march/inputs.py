@@ -58,7 +58,7 @@ class PackedWarpGrids:
         The arrays grow in place, so that grids that come from an iterator are not all in memory twice.
         """
         first = []
-        joined = {name: np.zeros((0, *tail), dtype) for name, (dtype, tail) in _PACKED.items()}
+        joined: dict[str, np.ndarray] = {name: np.zeros((0, *tail), dtype) for name, (dtype, tail) in _PACKED.items()}
         origins, dims = [], []
         for grid in grids:
             first.append([len(array) for array in joined.values()])
