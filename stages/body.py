@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -19,6 +20,7 @@ from pipeline.body.files import (
     save_observations,
     save_scores,
 )
+from pipeline.body.filmed_legs import leg_profile, rest_with_filmed_legs
 from pipeline.body.fit.detections.hand_observations import filter_hand_detections, finger_curls_rad
 from pipeline.body.fit.detections.hidden_legs import hidden_leg_share
 from pipeline.body.fit.diagnostics import (
@@ -110,14 +112,22 @@ def run(
     windows = read_mask_windows(capture)
     hands = filter_hand_detections(capture.hands or undetected_hands(len(capture)), capture.landmarks_px)
     result = fit_capture(capture, hands, windows, config, settings)
-    motion = Motion(capture.frame_index, capture.time_s, result.rotations_wxyz, result.root_translation_m)
+    usable, training = usable_frames(result), capture.split == TRAIN
+    legs = leg_profile(result.body, capture_motion(capture, result), result.camera, windows, training & usable)
+    if legs.cloth_hangs_between_legs():
+        rest = rest_with_filmed_legs(
+            result.body, capture_motion(capture, result), result.landmarks_m, training & usable
+        )
+        result = replace(
+            result, body=rest.body, rotations_wxyz=rest.motion.rotations_wxyz, landmarks_m=rest.landmarks_m
+        )
+    motion = capture_motion(capture, result)
     left_right_swapped = np.stack(list(result.left_right_swapped.values())).any(axis=0)
     save_body(out / _BODY, result.body)
     save_motion(out / _MOTION, motion)
     save_camera(out / _CAMERA, result.camera)
     save_observations(out / _OBSERVATIONS, result.observations, result.landmarks_m)
     blob_shares = residual_blob_shares(result.body, canonical_to_world(result.body, motion), result.camera, windows)
-    usable, training = usable_frames(result), capture.split == TRAIN
     scores = FrameScores(
         frame_index=capture.frame_index,
         silhouette_iou=result.silhouette_iou,
@@ -152,8 +162,14 @@ def run(
         "suspicious_frames": int(suspicious_frames(result).sum()),
         "dropped_frames": int((training & ~usable).sum()),
         "frames_with_foreign_objects": int(has_foreign_object.sum()),
+        "legs_as_filmed": float(legs.cloth_hangs_between_legs()),
         "hidden_leg_share": hidden_leg_share(capture.landmarks_visibility, capture.time_s),
     }
+
+
+def capture_motion(capture: Capture, result: FitResult) -> Motion:
+    """Return the fitted poses at the times of the frames."""
+    return Motion(capture.frame_index, capture.time_s, result.rotations_wxyz, result.root_translation_m)
 
 
 def read_mask_windows(capture: Capture) -> list[MaskWindow | None]:
@@ -313,7 +329,7 @@ def draw_overlay_grid(
 
 STAGE = Stage(
     "body",
-    version=20,
+    version=21,
     needs=("frames",),
     makes=(_BODY, _MOTION, _CAMERA, _OBSERVATIONS, SCORES_NPZ, _OVERLAY),
     config=Config,

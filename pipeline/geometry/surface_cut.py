@@ -61,6 +61,11 @@ class UnsplitNormals:
     corners: Int[np.ndarray, "n 3"]
     weights: Float[np.ndarray, "n 3"]
 
+    @classmethod
+    def of_whole(cls, faces: Int[np.ndarray, "f 3"]) -> "UnsplitNormals":
+        """Return the normals of a mesh none of whose triangles is split."""
+        return cls(faces, np.zeros(0, np.int64), np.zeros((0, 3), np.int64), np.zeros((0, 3)))
+
     def vertex_normals(self, vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
         """Return unit normals for vertices in any pose."""
         normals = Mesh(vertices, self.faces).vertex_normals()

@@ -15,6 +15,9 @@ SKIN_OFFSET_M, HAIR_OFFSET_M = 0.008, 0.02
 BROW_HEIGHT, FEATURE_HALF_WIDTH = 0.62, 0.6
 """The brows, as a share of the height of the head over its lowest point; the features (eyes, nose, mouth), as a share
 of half its width with the ears."""
+EAR_HALF_WIDTH, EAR_HEIGHTS = 0.78, (0.25, 0.75)
+"""Ears: farther from the middle than this share of half the width of the head with the ears, between these heights, as
+shares of that of the head."""
 EDGE_M = 0.01
 """Width of the transition at the edges of the face and of its features."""
 
@@ -53,6 +56,18 @@ def face_weight(
         return np.zeros(len(points_m))
     middle_m = 0.5 * (head[:, 2].min() + head[:, 2].max())
     return head_skin_weight(points_m, offset_m, body) * smooth_step((points_m[:, 2] - middle_m) / EDGE_M)
+
+
+def is_ear(points_m: Float[np.ndarray, "n 3"], body: Body) -> Bool[np.ndarray, "n"]:
+    """Return which points of the canonical space (m) are as far out as the ears of the body, at their height."""
+    head = body.vertices[head_vertices(body)]
+    if len(head) == 0:
+        return np.zeros(len(points_m), dtype=bool)
+    low_m, high_m = head.min(axis=0), head.max(axis=0)
+    middle_m, half_width_m = 0.5 * (low_m + high_m), 0.5 * (high_m[0] - low_m[0])
+    height = (points_m[:, 1] - low_m[1]) / (high_m[1] - low_m[1])
+    is_outside = np.abs(points_m[:, 0] - middle_m[0]) > EAR_HALF_WIDTH * half_width_m
+    return np.asarray(is_outside & (height > EAR_HEIGHTS[0]) & (height < EAR_HEIGHTS[1]))
 
 
 def _features(

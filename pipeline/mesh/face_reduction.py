@@ -12,14 +12,14 @@ from jaxtyping import Bool
 
 from pipeline.core.progress import track
 from pipeline.geometry.mesh import Mesh
-from pipeline.geometry.surface import OpenSurfaceError, collapse_edges
+from pipeline.geometry.surface import OpenSurfaceError, closest_points_on_mesh, collapse_edges
 from pipeline.mesh.remeshing import keep_if_repair_fails
 from pipeline.mesh.settings import MeshSettings
 
 MAX_TRIALS = 10
 
-MAX_DETAILED_SHARE = 0.6
-"""Share of the faces of a limit that face and hands may keep; where they have more, all faces are collapsed alike."""
+MAX_DETAILED_SHARE = 0.3
+"""Share of the faces of a limit that face and hands may keep; where they have more, they are collapsed to it."""
 
 
 def reduce_faces(
@@ -46,8 +46,11 @@ def reduce_faces(
             `settings.final_faces`.
     """
     if settings.final_faces:
-        return _reduce_to(mesh, detailed, settings.final_faces)
-    lowest_psnr_db, limited = psnr_db(mesh) - settings.max_reduction_loss_db, mesh
+        return _reduce_to(*_limit_detail(mesh, detailed, settings.final_faces), settings.final_faces)
+    lowest_psnr_db = psnr_db(mesh) - settings.max_reduction_loss_db
+    if face_limit is not None:
+        mesh, detailed = _limit_detail(mesh, detailed, face_limit)
+    limited = mesh
     if face_limit is not None and len(mesh.faces) > face_limit:
         limited = _reduce_to(mesh, detailed, face_limit)
         if len(limited.faces) <= face_limit and psnr_db(limited) < lowest_psnr_db:
@@ -80,10 +83,22 @@ def _reduce_by_loss(
     return best
 
 
+def _limit_detail(mesh: Mesh, detailed: Bool[np.ndarray, "f"], face_limit: int) -> tuple[Mesh, Bool[np.ndarray, "g"]]:
+    """Collapse the detailed faces to their share of a limit that the mesh exceeds; return the mesh and its detail."""
+    count = int(MAX_DETAILED_SHARE * face_limit)
+    if len(mesh.faces) <= face_limit or np.count_nonzero(detailed) <= count:
+        return mesh, detailed
+    reduced = keep_if_repair_fails(
+        lambda: collapse_edges(mesh, detailed, count), mesh, "face and hands keep all their faces"
+    )
+    _, nearest, _ = closest_points_on_mesh(reduced.vertices[reduced.faces].mean(axis=1), mesh)
+    return reduced, detailed[nearest]
+
+
 def _reduce_to(mesh: Mesh, detailed: Bool[np.ndarray, "f"], face_count: int) -> Mesh:
     if len(mesh.faces) <= face_count:
         return mesh
-    if np.count_nonzero(detailed) > MAX_DETAILED_SHARE * face_count:
+    if np.count_nonzero(detailed) >= face_count:
         detailed = np.zeros_like(detailed)
     # two faces less: a collapse removes two at once, and the result may have one or two more than asked for
     wanted = face_count - int(np.count_nonzero(detailed)) - 2

@@ -18,7 +18,7 @@ from pipeline.geometry.surface import (
     signed_distance_m,
     subdivide,
 )
-from pipeline.mesh.face import face_weight
+from pipeline.mesh.face import HAIR_OFFSET_M, face_weight, head_vertices, is_ear
 from pipeline.mesh.isosurface import hand_skin_weights
 from pipeline.mesh.settings import MeshSettings
 
@@ -66,9 +66,12 @@ def _remesh_in_two_sizes(mesh: Mesh, target_edge_m: float, body: Body) -> Mesh:
 
 
 def detailed_faces(mesh: Mesh, body: Body) -> Bool[np.ndarray, "f"]:
-    """Return the mesh faces at the hands and at the face of the person."""
-    _, nearest, _ = closest_points_on_mesh(mesh.vertices[mesh.faces].mean(axis=1), body.mesh())
-    return (hand_skin_weights(body) > 0.5)[body.faces[nearest, 0]] | face_of_person(mesh, body)
+    """Return the mesh faces at the hands, and at the face and the ears of the person."""
+    centres_m = mesh.vertices[mesh.faces].mean(axis=1)
+    distance_m, nearest, _ = closest_points_on_mesh(centres_m, body.mesh())
+    at_hand = (hand_skin_weights(body) > 0.5)[body.faces[nearest, 0]]
+    at_ear = is_ear(centres_m, body) & head_vertices(body)[body.faces[nearest, 0]] & (distance_m < HAIR_OFFSET_M)
+    return at_hand | at_ear | face_of_person(mesh, body)
 
 
 def face_of_person(mesh: Mesh, body: Body) -> Bool[np.ndarray, "f"]:

@@ -8,10 +8,10 @@ from torch import Tensor
 
 from pipeline.body.body import AnnyBody, Body
 from pipeline.geometry.mesh import Mesh
-from pipeline.mesh.face import face_weight, head_skin_weight, head_vertices
+from pipeline.mesh.face import face_weight, head_skin_weight, head_vertices, is_ear
 from pipeline.mesh.fairing import fair_surface
 from pipeline.mesh.isosurface import extract_mesh, sample_canonical_grid
-from pipeline.mesh.remeshing import face_of_person
+from pipeline.mesh.remeshing import detailed_faces, face_of_person
 from pipeline.mesh.settings import MeshSettings
 from tests.mesh.capsule import capsule_body
 
@@ -26,6 +26,24 @@ def person() -> Body:
 
 def landmarks_m(*names: str) -> np.ndarray:
     return np.array([AnnyBody().landmark_positions_m[name] for name in names])
+
+
+def test_ears_are_detailed_where_they_are_seen(person: Body) -> None:
+    """The outermost points of the head are ears; hair that covers them has long edges."""
+    head = person.vertices[head_vertices(person)]
+    outermost = head[np.argsort(-np.abs(head[:, 0]))[:100]]
+    assert is_ear(outermost, person).all()
+    crown_m = head[head[:, 1].argmax()][None]
+    assert not is_ear(np.concatenate([landmarks_m("face_nose", "face_mouth"), crown_m]), person).any()
+    assert not is_ear(outermost, capsule_body()).any()
+    mesh = person.mesh()
+    at_ear = is_ear(mesh.vertices[mesh.faces].mean(axis=1), person)
+    assert detailed_faces(mesh, person)[at_ear].all()
+    covered = Mesh((mesh.vertices + HAIR_M * mesh.vertex_normals()).astype(np.float32), mesh.faces)
+    centres_m = covered.vertices[covered.faces].mean(axis=1)
+    behind = is_ear(centres_m, person) & at_ear & (mesh.vertices[mesh.faces].mean(axis=1)[:, 2] < 0.03)
+    assert behind.sum() > 10
+    assert not detailed_faces(covered, person)[behind].any()
 
 
 def test_the_features_are_face_at_any_distance_and_hair_is_not(person: Body) -> None:

@@ -1,10 +1,11 @@
 """Reduction of faces: as far as the images allow, close to the surface, and closed."""
 
 import numpy as np
+import pytest
 
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import closest_points_on_mesh, is_closed_manifold, isosurface
-from pipeline.mesh.face_reduction import reduce_faces
+from pipeline.mesh.face_reduction import MAX_DETAILED_SHARE, reduce_faces
 from pipeline.mesh.settings import MeshSettings
 
 RADIUS_M, SPACING_M = 0.1, 0.01
@@ -70,6 +71,19 @@ def test_a_limit_holds_where_most_faces_are_detailed() -> None:
     detailed, limit = np.ones(len(mesh.faces), dtype=bool), len(mesh.faces) // 3
     detailed[:10] = False
     assert len(reduce_faces(mesh, detailed, lambda trial: 30.0, MeshSettings(), limit).faces) <= limit
+
+
+def test_more_detail_than_its_share_is_collapsed_to_it() -> None:
+    """Detail on an eighth of the sphere has 30 % of the faces afterwards, not an eighth of them."""
+    mesh = sphere()
+    octant = (mesh.vertices[mesh.faces].mean(axis=1) > 0.0).all(axis=1)
+    limit = int(octant.sum() / 0.5)
+    assert octant.sum() > MAX_DETAILED_SHARE * limit
+    reduced = reduce_faces(mesh, octant, lambda trial: float(len(trial.faces)), MeshSettings(), limit)
+    kept = (reduced.vertices[reduced.faces].mean(axis=1) > 0.0).all(axis=1)
+    assert limit - 6 <= len(reduced.faces) <= limit
+    assert np.count_nonzero(kept) == pytest.approx(MAX_DETAILED_SHARE * limit, rel=0.05)
+    assert is_closed_manifold(reduced)
 
 
 def test_a_number_of_final_faces_is_reached_at_any_loss() -> None:

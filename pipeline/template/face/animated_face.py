@@ -10,6 +10,7 @@ from pipeline.geometry.atlas import Atlas
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import top_k_weights
 from pipeline.geometry.surface import closest_points_on_mesh
+from pipeline.geometry.surface_cut import UnsplitNormals
 from pipeline.mesh.files import MeshArtifact
 from pipeline.template.face.motion import (
     closing_factors,
@@ -30,6 +31,7 @@ from pipeline.template.face.patch import (
     FacePatchError,
     build_face_patch,
     cut_face_out,
+    draw_to_template,
 )
 from pipeline.template.face.texture import CapturedSurface, layout_charts, paint_patch
 from pipeline.template.face.units import add_visemes, load_face_units
@@ -132,15 +134,17 @@ def animate_face(
     Raises:
         FacePatchError: the face cannot be cut out in one piece.
     """
-    mesh, captured_atlas = skinned.mesh, captured.atlas
-    patch = build_face_patch(body, registration, mesh)
+    captured_atlas = captured.atlas
+    patch = build_face_patch(body, registration)
+    mesh = draw_to_template(skinned.mesh, registration, patch.frame)
     factors = closing_factors(patch)[:, None, None]
     patch = replace(patch, units_m=factors * patch.units_m)
     cut, cut_uv, loop = cut_face_out(mesh, captured_atlas.faces_uv, captured_atlas.vertex_of_uv, patch.frame)
     rest_m = cut.interpolate(mesh.vertices.astype(np.float64))
     outer_rad, inner_rad = (patch.frame.angle_rad(points_m) for points_m in (rest_m[loop], _boundary_m(patch)))
     on_patch_m = _at_angle(outer_rad, inner_rad, _boundary_m(patch))
-    gap_m = float(np.linalg.norm(on_patch_m - rest_m[loop], axis=1).max())
+    captured_loop_m = cut.interpolate(skinned.mesh.vertices.astype(np.float64))[loop]
+    gap_m = float(np.linalg.norm(on_patch_m - captured_loop_m, axis=1).max())
     rest_m[loop] = on_patch_m
     uv = layout_charts(patch)
     half = np.array([0.5, 1.0])
@@ -167,7 +171,7 @@ def animate_face(
     turns[np.linalg.norm(turns, axis=2) < MIN_NORMAL_CHANGE] = 0.0
     maps = np.concatenate([captured.stacked_maps(), paint_patch(patch, uv, captured)], axis=1).astype(np.float32)
     return AnimatedFace(
-        _skin(skinned, cut, patch, Mesh(vertices.astype(np.float32), faces)),
+        _skin(skinned, cut, patch, Mesh(vertices.astype(np.float32), faces), loop),
         atlas,
         np.ascontiguousarray(maps[..., :3]),
         np.ascontiguousarray(maps[..., 3]),
@@ -225,8 +229,13 @@ def _join(outer: _Side, inner: _Side, first: int) -> tuple[Int[np.ndarray, "f 3"
     return faces, atlas
 
 
-def _skin(skinned: MeshArtifact, cut: CutMesh, patch: FacePatch, mesh: Mesh) -> MeshArtifact:
-    """Return the joined mesh with the captured skin; parts behind lids and lips have one skin each."""
+def _skin(
+    skinned: MeshArtifact, cut: CutMesh, patch: FacePatch, mesh: Mesh, loop: Int[np.ndarray, "l"]
+) -> MeshArtifact:
+    """Return the joined mesh with the captured skin; parts behind lids and lips have one skin each.
+
+    loop: outline of the captured part.
+    """
     joints = int(skinned.joint_indices.max()) + 1
     dense = skinned.dense_skin_weights(joints).numpy().astype(np.float64)
     _, face, barycentric = closest_points_on_mesh(patch.mesh.vertices, skinned.mesh)
@@ -238,10 +247,34 @@ def _skin(skinned: MeshArtifact, cut: CutMesh, patch: FacePatch, mesh: Mesh) -> 
         weights[rows] = weights[rows].mean(axis=0)
     weights = np.concatenate([cut.interpolate(dense), weights])
     indices, values = top_k_weights(weights, skinned.joint_indices.shape[1])
+    before = skinned.unsplit or UnsplitNormals.of_whole(skinned.mesh.faces)
     return MeshArtifact(
         mesh,
         indices,
         values,
         np.concatenate([cut.interpolate(skinned.vertex_colours.astype(np.float64)), colours]).astype(np.float32),
-        None if skinned.unsplit is None else cut.keep_unsplit(skinned.unsplit, mesh.faces),
+        _shaded_by_patch(cut.keep_unsplit(before, mesh.faces), patch, loop, len(cut.edge), len(mesh.vertices)),
     )
+
+
+def _shaded_by_patch(
+    normals: UnsplitNormals, patch: FacePatch, loop: Int[np.ndarray, "l"], first: int, count: int
+) -> UnsplitNormals:
+    """Return normals that come from the patch alone along the outline.
+
+    The captured triangles there are long or slivers: their mean with the patch's would be seen as a line.
+
+    Args:
+        normals: of the joined mesh.
+        patch: the face.
+        loop: outline of the captured part.
+        first, count: number of vertices of the captured part, which come first, and of all.
+    """
+    is_outline = np.zeros(count, dtype=bool)
+    is_outline[loop], is_outline[first + patch.boundary] = True, True
+    is_inside = ~is_outline & (np.arange(count) >= first)
+    left_out = is_outline[normals.faces].any(axis=1) & ~is_inside[normals.faces].any(axis=1)
+    has_normal = np.zeros(count, dtype=bool)
+    has_normal[normals.faces[~left_out]] = True
+    left_out &= has_normal[normals.faces].all(axis=1)
+    return replace(normals, faces=normals.faces[~left_out])

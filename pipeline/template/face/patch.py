@@ -1,8 +1,9 @@
 """The face as the template's mesh: lids, lips, the inside of the mouth, eyeballs, teeth and tongue on the person.
 
 A captured surface is one closed skin. Inside an outline around eyes and mouth it is replaced by the registered
-template, which has openings for eyes and mouth. Both are cut along the same outline, and the gap between the two cuts,
-which are less than some millimetres apart, is zipped: the surface stays closed.
+template, which has openings for eyes and mouth. Around the outline the captured surface, whose edges are long, is drawn
+to the template. Both are cut along the same outline, and the gap between the two cuts, a millimetre or two, is zipped:
+the surface stays closed, and no crease is seen along the outline.
 """
 
 from dataclasses import dataclass, replace
@@ -16,6 +17,7 @@ from pipeline.body.body import Body
 from pipeline.geometry.camera import project
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import closest_points_on_mesh
+from pipeline.mesh.face import smooth_step
 from pipeline.template.face.frame import FaceFrame, face_frame
 from pipeline.template.face.front_view import FrontView, view_from_front
 from pipeline.template.face.landmarks import FACE_LANDMARKS, fit_similarity
@@ -42,8 +44,11 @@ _MAX_SLIT = 0.03
 
 _SLIT_SMOOTHING_PX, _LIP_STEPS = 9, 4
 
-_PULL_LEVEL = -0.25
-"""From here to the outline, the patch moves gradually onto the captured surface."""
+_BLEND_LEVEL = 0.5
+"""From the outline to here, the captured surface moves gradually from the template back to where it is: 2 to 3 cm."""
+
+_BLEND_BACK = -0.45, -0.65
+"""Depths behind the eyes, in units of the face, between which the same happens towards the back of the head."""
 
 
 class FacePatchError(ValueError):
@@ -74,20 +79,19 @@ class FacePatch:
     frame: FaceFrame
 
 
-def build_face_patch(body: Body, registration: Registration, surface: Mesh) -> FacePatch:
+def build_face_patch(body: Body, registration: Registration) -> FacePatch:
     """Return the face of the registered template, cut along the outline, with eyeballs, tongue and teeth.
 
     Args:
         body: the fitted body, on which the face units are defined.
         registration: of the body on the surface.
-        surface: the captured mesh.
 
     Raises:
         FacePatchError: the outline does not cut the template once.
     """
     template, units = load_template(), load_face_units()
     frame = face_frame(registration.vertices)
-    vertices = _pull_to_surface(registration.vertices, template, frame, surface)
+    vertices = registration.vertices.astype(np.float64)
     level = frame.level(vertices)
     inner = template.vertices_of(template.mouth_faces | template.socket_faces.any(axis=0))
     level[inner] = np.minimum(level[inner], -0.01)
@@ -163,18 +167,21 @@ def cut_face_out(
     return cut, cut_uv, loops[0]
 
 
-def _pull_to_surface(
-    template_m: Float[np.ndarray, "v 3"], template: Template, frame: FaceFrame, surface: Mesh
-) -> Float[np.ndarray, "v 3"]:
-    """Return the registered template whose skin lies exactly on the surface at the outline and outside of it."""
-    vertices = template_m.astype(np.float64).copy()
-    level = frame.level(vertices)
-    rows = np.flatnonzero(template.skin_vertices & (level > _PULL_LEVEL) & (level < 0.5))
-    _, face, barycentric = closest_points_on_mesh(vertices[rows], surface)
-    nearest = np.einsum("nk,nkc->nc", barycentric, surface.vertices[surface.faces[face]])
-    amount = np.clip(1.0 - level[rows] / _PULL_LEVEL, 0.0, 1.0)[:, None]
-    vertices[rows] += amount * (nearest - vertices[rows])
-    return vertices
+def draw_to_template(surface: Mesh, registration: Registration, frame: FaceFrame) -> Mesh:
+    """Return the captured surface with its vertices on the template inside the outline, and gradually around it.
+
+    The template has short edges and is smooth; where a coarse surface met it, the slope changed along the outline.
+    """
+    vertices = surface.vertices.astype(np.float64)
+    first, last = _BLEND_BACK
+    away = np.maximum(frame.level(vertices) / _BLEND_LEVEL, (frame.to_face(vertices)[:, 2] - first) / (last - first))
+    rows = np.flatnonzero(away < 1.0)
+    skin = registration.skin()
+    _, face, barycentric = closest_points_on_mesh(vertices[rows], skin)
+    nearest = np.einsum("nk,nkc->nc", barycentric, skin.vertices[skin.faces[face]])
+    kept = smooth_step(away[rows])[:, None]
+    vertices[rows] = nearest + kept * (vertices[rows] - nearest)
+    return Mesh(vertices.astype(surface.vertices.dtype), surface.faces)
 
 
 def _connected_to_nose(template: Template, level: np.ndarray, shell: np.ndarray) -> Bool[np.ndarray, "f"]:

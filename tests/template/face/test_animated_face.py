@@ -17,7 +17,7 @@ from pipeline.template.face.frame import face_frame
 from pipeline.template.face.front_view import view_from_front
 from pipeline.template.face.landmarks import FACE_LANDMARKS
 from pipeline.template.face.motion import closing_factors
-from pipeline.template.face.patch import EYE_LEFT, EYE_RIGHT, FacePatchError, build_face_patch
+from pipeline.template.face.patch import EYE_LEFT, EYE_RIGHT, FacePatchError, build_face_patch, draw_to_template
 from pipeline.template.face.texture import CapturedSurface
 from pipeline.template.face.units import VISEMES, add_visemes, load_face_units, load_teeth
 from pipeline.template.regions import load_template
@@ -79,6 +79,37 @@ def test_the_surface_stays_closed(face: AnimatedFace) -> None:
     assert closed_surface().is_watertight()
     assert shell(face).is_watertight()
     assert face.boundary_gap_m < 0.004
+
+
+def test_no_crease_is_seen_along_the_outline() -> None:
+    """On a captured surface with long edges, the outline is shaded as the smooth template is there."""
+    whole, person = closed_surface(), generated_person()
+    mesh = collapse_edges(whole, np.ones(len(whole.faces), dtype=bool), COARSE_FACES)
+    registration = register_template(person.fitted, mesh, person.landmarks())
+    artifact = animate_face(person.fitted, registration, *captured(mesh)).skinned
+    frame = face_frame(registration.vertices)
+    near = (np.abs(frame.level(artifact.mesh.vertices)) < 1e-3) & (frame.to_face(artifact.mesh.vertices)[:, 2] > -0.6)
+    assert near.sum() > 100
+    skin = registration.skin()
+    distance_m, face, barycentric = closest_points_on_mesh(artifact.mesh.vertices[near], skin)
+    assert distance_m.max() < 1e-4
+    expected = np.einsum("nk,nkc->nc", barycentric, skin.vertex_normals()[skin.faces[face]])
+    cosine = np.sum(artifact.vertex_normals()[near] * expected, axis=1) / np.linalg.norm(expected, axis=1)
+    angle_deg = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    assert np.quantile(angle_deg, 0.95) < 10.0
+    assert angle_deg.max() < 25.0
+    drawn = draw_to_template(mesh, registration, frame).vertices
+    around = (frame.level(drawn) > 0.0) & (frame.level(drawn) < 0.1) & (frame.to_face(drawn)[:, 2] > -0.4)
+    assert around.sum() > 5
+    assert closest_points_on_mesh(drawn[around], skin)[0].max() < 2e-4
+
+
+def test_the_surface_away_from_the_face_stays(face: AnimatedFace) -> None:
+    """What is drawn to the template ends some centimetres from the outline."""
+    before = generated_person().template_m[load_template().skin_vertices]
+    frame, after = face_frame(generated_person().template_m), face.skinned.mesh
+    far = (frame.level(before) > 0.6) | (frame.to_face(before)[:, 2] < -0.7)
+    assert closest_points_on_mesh(before[far], after)[0].max() < 1e-6
 
 
 @pytest.mark.slow
@@ -157,9 +188,7 @@ def test_normals_turn_with_the_moved_surface(face: AnimatedFace) -> None:
 def test_lids_meet_at_weight_one_whatever_the_units_travel() -> None:
     """A unit that moves the lids half as far again closes them at two thirds of its weight."""
     person, names = generated_person(), load_face_units().names
-    patch = build_face_patch(
-        person.fitted, register_template(person.fitted, closed_surface(), person.landmarks()), closed_surface()
-    )
+    patch = build_face_patch(person.fitted, register_template(person.fitted, closed_surface(), person.landmarks()))
     once, further = (closing_factors(replace(patch, units_m=travel * patch.units_m)) for travel in (1.3, 1.3 * 1.5))
     blinks = [names.index("eyeBlinkLeft"), names.index("eyeBlinkRight")]
     assert (once[blinks] < 1.0).all()

@@ -1,0 +1,217 @@
+"""Canonical legs as they were filmed, for skirts, dresses and coats.
+
+Cloth that hangs from leg to leg is moved by linear blend skinning with one leg or the other. In a canonical pose whose
+legs are farther apart than the filmed ones, nothing is filmed of what would then be between them: a skirt gets a slit.
+Where such cloth is seen, the body is therefore given the mean legs of the recording as its canonical pose. Bare legs
+and trousers keep the model's A-pose, whose legs are apart, so that they do not grow together.
+
+Notation: Q_j rotation of joint j from the old canonical pose to the new one, R_j its local rotation in a frame.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pipeline.body.body import Body, Motion, canonical_to_world
+from pipeline.body.fit.landmark_regressor import LANDMARKS, landmark_joint
+from pipeline.body.fit.silhouette_icp import MaskWindow, rasterise_in_window
+from pipeline.geometry.camera import Camera, project
+from pipeline.geometry.rotation import continuous_quaternions, matrix_to_quaternion, quaternion_to_matrix
+from pipeline.geometry.skinning import (
+    forward_kinematics,
+    linear_blend_skinning,
+    skinning_transforms,
+)
+
+LEGS = (("LeftUpLeg", "LeftLeg", "LeftFoot"), ("RightUpLeg", "RightLeg", "RightFoot"))
+"""Joints of either leg; the feet stay flat."""
+
+JUDGED_FRAMES = 24
+"""Frames, evenly spaced, whose masks are compared with the legs of the body."""
+
+HEIGHTS = tuple(round(0.1 * step, 1) for step in range(1, 15))
+"""Heights that are looked at, from the hips (0) over the knees (1) down."""
+
+HEM_HEIGHT = 0.3
+"""Above it thighs touch anyway, and a hem is that of a shirt."""
+
+MIN_MARGIN_M, MIN_STEP_M = 0.02, 0.015
+"""Cloth ends at a hem where its distance from the legs, left and right, is at least the first and falls by the second.
+Trousers of four people: at most 0.005 m; a knee-long coat 0.03, a wide skirt 0.23."""
+
+MAX_OPEN_SHARE = 0.1
+"""Share of the pixels between the legs above the hem that may show the background: through shorts it is seen."""
+
+
+@dataclass(frozen=True)
+class LegProfile:
+    """What masks show of the clothes of the legs at `HEIGHTS`.
+
+    Attributes:
+        margin_m: distance of the outline of the mask from that of the legs, mean of left and right, median over frames;
+            nan where no frame shows it.
+        gap_px: pixels between the legs of the body, all frames together.
+        open_px: those of them that the masks do not cover.
+    """
+
+    margin_m: Float[np.ndarray, "k"]
+    gap_px: Float[np.ndarray, "k"]
+    open_px: Float[np.ndarray, "k"]
+
+    def cloth_hangs_between_legs(self) -> bool:
+        """Return whether a skirt or coat goes from leg to leg: there is a hem, and nothing is seen between the legs."""
+        hem = self._hem()
+        if hem is None:
+            return False
+        return bool(self.open_px[:hem].sum() <= MAX_OPEN_SHARE * self.gap_px[:hem].sum())
+
+    def _hem(self) -> int | None:
+        """Return the row of `HEIGHTS` just above the hem; None without one. Cloth down to the floor ends below all."""
+        margin_m, is_judged = np.nan_to_num(self.margin_m), np.array(HEIGHTS) >= HEM_HEIGHT
+        after = np.append(margin_m, margin_m[[-1, -1]])
+        step_m = margin_m - np.minimum(after[1:-1], after[2:])
+        step_m[~is_judged | (margin_m < MIN_MARGIN_M)] = 0.0
+        if step_m.max() >= MIN_STEP_M:
+            return int(np.argmax(step_m))
+        return len(HEIGHTS) - 1 if (margin_m[is_judged] >= MIN_MARGIN_M).all() else None
+
+
+@dataclass(frozen=True)
+class RestPose:
+    """A body in another canonical pose, the same motion as rotations from that pose, and the landmarks on it."""
+
+    body: Body
+    motion: Motion
+    landmarks_m: Float[Tensor, "l 3"]
+
+
+def leg_profile(
+    body: Body, motion: Motion, camera: Camera, windows: Sequence[MaskWindow | None], frames: Bool[np.ndarray, "n"]
+) -> LegProfile:
+    """Compare the masks with the legs of the fitted body.
+
+    Args:
+        body: the fitted body.
+        motion: of all frames.
+        camera: of the recording.
+        windows: masks of the frames.
+        frames: those that may be judged.
+    """
+    found = np.flatnonzero(frames & np.array([window is not None for window in windows]))
+    chosen = found[np.unique(np.linspace(0, len(found) - 1, min(JUDGED_FRAMES, len(found))).astype(int))]
+    legs = np.stack([_leg_faces(body, side) for side in LEGS])
+    rows = np.full((3, len(chosen), len(HEIGHTS)), np.nan)
+    for k, pose in enumerate(canonical_to_world(body, motion.select(chosen))):
+        window = windows[chosen[k]]
+        if window is not None:
+            rows[:, k] = _profile_of_frame(body, legs, pose, camera, window)
+    seen = np.isfinite(rows[0]).any(axis=0)
+    margin_m = np.full(len(HEIGHTS), np.nan)
+    margin_m[seen] = np.nanmedian(rows[0][:, seen], axis=0)
+    return LegProfile(margin_m, np.nansum(rows[1], axis=0), np.nansum(rows[2], axis=0))
+
+
+def _profile_of_frame(
+    body: Body, legs: Bool[np.ndarray, "2 f"], pose: Float[Tensor, "j 4 4"], camera: Camera, window: MaskWindow
+) -> Float[np.ndarray, "3 k"]:
+    """Return margin (m), pixels between the legs, and uncovered ones of these; nan where the legs are not seen."""
+    vertices = linear_blend_skinning(torch.from_numpy(body.vertices), torch.from_numpy(body.skin_weights), pose[None])
+    face_id = rasterise_in_window(vertices[0], torch.from_numpy(body.faces), camera, window).face_id
+    is_body = face_id >= 0
+    left, right = legs[:, np.maximum(face_id, 0)] & is_body
+    metres_per_px = body.height_m() / window.person_px
+    profile = np.full((3, len(HEIGHTS)), np.nan)
+    for k, row in enumerate(_rows_px(body, pose, camera, window)):
+        if not (0 <= row < len(face_id) and left[row].any() and right[row].any()):
+            continue
+        columns = sorted((np.flatnonzero(left[row]), np.flatnonzero(right[row])), key=np.mean)
+        start, end = min(map(np.min, columns)), max(map(np.max, columns))
+        cloth = window.mask[row] & ~is_body[row]
+        outside_px = _run_length(cloth[:start][::-1]) + _run_length(cloth[end + 1 :])
+        between = np.zeros(len(cloth), dtype=bool)
+        between[columns[0].max() + 1 : columns[1].min()] = True
+        between &= ~is_body[row]
+        profile[:, k] = 0.5 * outside_px * metres_per_px, between.sum(), (between & ~window.mask[row]).sum()
+    return profile
+
+
+def _rows_px(body: Body, pose: Float[Tensor, "j 4 4"], camera: Camera, window: MaskWindow) -> list[int]:
+    """Return the rows of a window at `HEIGHTS`, the mean of both legs."""
+    names = [side[k] for k in (0, 1) for side in LEGS]
+    places = [
+        pose[joint] @ torch.from_numpy(np.append(body.joints_m[joint], 1.0)).to(pose)
+        for joint in map(body.joint, names)
+    ]
+    px = (project(torch.stack(places)[:, :3], camera)[0][:, 1].numpy() - window.top_px) * window.scale
+    hip_px, knee_px = px[:2].mean(), px[2:].mean()
+    return [int(hip_px + height * (knee_px - hip_px)) for height in HEIGHTS]
+
+
+def _run_length(flags: Bool[np.ndarray, "n"]) -> int:
+    """Return how many flags are set before the first that is not."""
+    return int(np.argmin(flags)) if not flags.all() else len(flags)
+
+
+def _leg_faces(body: Body, names: tuple[str, ...]) -> Bool[np.ndarray, "f"]:
+    weight = body.skin_weights[:, [body.joint(name) for name in names]].sum(axis=1)
+    return np.asarray((weight[body.faces] > 0.5).all(axis=1))
+
+
+def rest_with_filmed_legs(
+    body: Body, motion: Motion, landmarks_m: Float[Tensor, "l 3"], frames: Bool[np.ndarray, "n"]
+) -> RestPose:
+    """Return the body with the mean rotations of hips and knees in some frames as its canonical pose, feet flat.
+
+    Posed bodies stay the same, but for the blended skin around the hips, which differs by millimetres.
+
+    Args:
+        body: in its canonical pose.
+        motion: rotations from that pose.
+        landmarks_m: places of the landmarks on the body.
+        frames: those whose mean is taken.
+    """
+    local = torch.eye(3, dtype=torch.float64).repeat(len(body.joint_names), 1, 1)
+    rotations = quaternion_to_matrix(torch.from_numpy(motion.rotations_wxyz)).double()
+    for upper, lower, foot in (tuple(map(body.joint, side)) for side in LEGS):
+        local[upper], local[lower] = (_mean_rotation(rotations[frames, joint]) for joint in (upper, lower))
+        local[foot] = (local[upper] @ local[lower]).T
+    joints_m = torch.from_numpy(body.joints_m).double()
+    rest = forward_kinematics(local[None], joints_m[None, 0], joints_m, body.parents)
+    to_rest = skinning_transforms(rest, joints_m)
+    vertices = linear_blend_skinning(
+        torch.from_numpy(body.vertices).double(), torch.from_numpy(body.skin_weights).double(), to_rest
+    )[0]
+    drop_m = torch.tensor([0.0, float(vertices[:, 1].min()), 0.0], dtype=torch.float64)
+    moved = _carry(landmarks_m.double(), to_rest[0], body) - drop_m
+    turned = rest[0, :, :3, :3]
+    of_parent = torch.stack([turned[max(parent, 0)] for parent in body.parents.tolist()])
+    of_parent[0] = torch.eye(3, dtype=torch.float64)
+    changed = of_parent @ rotations @ turned.transpose(1, 2)
+    new = replace(
+        body,
+        vertices=(vertices - drop_m).float().numpy(),
+        joints_m=(rest[0, :, :3, 3] - drop_m).float().numpy(),
+    )
+    quaternions = continuous_quaternions(matrix_to_quaternion(changed)).float().numpy()
+    return RestPose(new, motion.with_pose(quaternions, motion.root_translation_m), moved.to(landmarks_m.dtype))
+
+
+def _mean_rotation(rotations: Float[Tensor, "n 3 3"]) -> Float[Tensor, "3 3"]:
+    """Return the rotation with the least squared chordal distance to some (Moakher, "Means and averaging", 2002)."""
+    u, _, vt = torch.linalg.svd(rotations.mean(0))
+    sign = torch.tensor([1.0, 1.0, float(torch.det(u @ vt).sign())], dtype=u.dtype)
+    return u @ torch.diag(sign) @ vt
+
+
+def _carry(points_m: Float[Tensor, "l 3"], to_rest: Float[Tensor, "j 4 4"], body: Body) -> Float[Tensor, "l 3"]:
+    """Return the landmarks moved with their joints."""
+    carried = points_m.clone()
+    for landmark in LANDMARKS:
+        for side, index in enumerate(landmark.indices):
+            joint = to_rest[body.joint(landmark_joint(landmark, side))]
+            carried[index] = joint[:3, :3] @ points_m[index] + joint[:3, 3]
+    return carried

@@ -1,0 +1,166 @@
+"""Legs of the canonical pose: which clothes hang from leg to leg, and the same posed body from another rest pose."""
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.body.body import Body, Motion, canonical_to_world, load_anny
+from pipeline.body.filmed_legs import HEIGHTS, LegProfile, leg_profile, rest_with_filmed_legs
+from pipeline.body.fit.landmark_regressor import LANDMARK_COUNT, LANDMARKS
+from pipeline.body.fit.silhouette_icp import crop_mask_window
+from pipeline.geometry.camera import Camera, project
+from pipeline.geometry.rotation import axis_angle_to_matrix, matrix_to_quaternion
+from pipeline.geometry.skinning import linear_blend_skinning
+from pipeline.kernels.raster import rasterize
+
+SIDE_PX, FRAMES = 400, 3
+WORLD_TO_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32)
+WORLD_TO_CAMERA[:3, 3] = (0.0, 0.85, 3.0)
+CAMERA = Camera(600.0, 600.0, 200.0, 200.0, SIDE_PX, SIDE_PX, WORLD_TO_CAMERA)
+
+
+@pytest.fixture(scope="module")
+def body() -> Body:
+    anny = load_anny()
+    return anny.at_shape(anny.shape_defaults)
+
+
+def motion_of(body: Body, bends: dict[str, tuple[float, float, float]], frames: int = FRAMES) -> Motion:
+    """The A-pose with some joints rotated (rad), in every frame."""
+    rotations = torch.eye(3).repeat(frames, len(body.joint_names), 1, 1)
+    for name, vector in bends.items():
+        rotations[:, body.joint(name)] = axis_angle_to_matrix(torch.tensor([vector]))[0]
+    root_m = np.tile(body.joints_m[:1], (frames, 1)) + [[0.1, 0.0, 0.2]]
+    index = np.arange(frames)
+    return Motion(index, index / 10.0, matrix_to_quaternion(rotations).numpy(), root_m.astype(np.float32))
+
+
+def silhouette(body: Body) -> np.ndarray:
+    vertices_px, depth_m = project(torch.as_tensor(body.vertices), CAMERA)
+    return rasterize(vertices_px, depth_m, torch.as_tensor(body.faces), SIDE_PX, SIDE_PX)[0].numpy() >= 0
+
+
+def row_px(height_m: float) -> int:
+    return int(project(torch.tensor([[0.0, height_m, 0.0]]), CAMERA)[0][0, 1])
+
+
+def dressed(body: Body, hem_m: float, margin_px: int, between: bool) -> np.ndarray:
+    """The silhouette with cloth from the hips to a hem, wider than the legs, with or without a gap between them."""
+    mask = silhouette(body)
+    centre_px = int(project(torch.zeros(1, 3), CAMERA)[0][0, 0])
+    for row in range(row_px(0.9), row_px(hem_m)):
+        legs = np.flatnonzero(mask[row, centre_px - 80 : centre_px + 80]) + centre_px - 80
+        cloth = np.zeros(SIDE_PX, dtype=bool)
+        cloth[legs.min() - margin_px : legs.max() + margin_px + 1] = True
+        if not between:
+            inside = ~mask[row] & (np.arange(SIDE_PX) > legs.min()) & (np.arange(SIDE_PX) < legs.max())
+            cloth &= ~inside
+        mask[row] |= cloth
+    return mask
+
+
+def profile_of(body: Body, mask: np.ndarray) -> LegProfile:
+    windows = [crop_mask_window(np.where(mask, np.uint8(255), np.uint8(0)))] * FRAMES
+    motion = motion_of(body, {})
+    motion = motion.with_pose(motion.rotations_wxyz, np.tile(body.joints_m[:1], (FRAMES, 1)))
+    return leg_profile(body, motion, CAMERA, windows, np.ones(FRAMES, dtype=bool))
+
+
+def test_bare_legs_and_trousers_hang_apart(body: Body) -> None:
+    profile = profile_of(body, silhouette(body))
+    assert np.nanmax(profile.margin_m) < 0.01
+    assert profile.open_px.sum() > 0.9 * profile.gap_px.sum() > 0.0
+    assert not profile.cloth_hangs_between_legs()
+    assert not profile_of(body, dressed(body, 0.1, 2, False)).cloth_hangs_between_legs()
+
+
+def test_a_skirt_ends_at_its_hem(body: Body) -> None:
+    profile = profile_of(body, dressed(body, 0.6, 12, True))
+    assert profile.cloth_hangs_between_legs()
+    knee_m, hip_m = (body.joints_m[body.joint(name), 1] for name in ("LeftLeg", "LeftUpLeg"))
+    above = np.array(HEIGHTS) < (hip_m - 0.6) / (hip_m - knee_m) - 0.1
+    assert np.nanmin(profile.margin_m[above][3:]) == pytest.approx(12 * 3.0 / 600.0, abs=0.01)
+
+
+def test_cloth_down_to_the_floor_has_no_hem(body: Body) -> None:
+    assert profile_of(body, dressed(body, 0.05, 14, True)).cloth_hangs_between_legs()
+
+
+def test_through_wide_shorts_the_background_is_seen(body: Body) -> None:
+    assert not profile_of(body, dressed(body, 0.6, 12, False)).cloth_hangs_between_legs()
+
+
+def test_a_long_shirt_ends_above_the_legs(body: Body) -> None:
+    assert not profile_of(body, dressed(body, 0.85, 12, True)).cloth_hangs_between_legs()
+
+
+def test_frames_without_masks_tell_nothing(body: Body) -> None:
+    motion = motion_of(body, {})
+    profile = leg_profile(body, motion, CAMERA, [None] * FRAMES, np.ones(FRAMES, dtype=bool))
+    assert np.isnan(profile.margin_m).all()
+    assert not profile.cloth_hangs_between_legs()
+
+
+CLOSED_LEGS = {
+    "LeftUpLeg": (0.05, 0.02, -0.10),
+    "RightUpLeg": (0.02, 0.00, 0.12),
+    "LeftLeg": (0.06, 0.0, 0.0),
+    "LeftFoot": (-0.05, 0.1, 0.0),
+    "Spine": (0.1, 0.0, 0.0),
+}
+
+
+def test_the_posed_body_stays(body: Body) -> None:
+    motion = motion_of(body, CLOSED_LEGS)
+    rest = rest_with_filmed_legs(body, motion, torch.zeros(LANDMARK_COUNT, 3), np.ones(FRAMES, dtype=bool))
+    weights = torch.from_numpy(body.skin_weights)
+    before, after = (
+        linear_blend_skinning(torch.from_numpy(each.vertices), weights, canonical_to_world(each, poses))
+        for each, poses in ((body, motion), (rest.body, rest.motion))
+    )
+    distance_mm = 1e3 * (before - after).norm(dim=2)
+    rigid = body.skin_weights.max(axis=1) > 0.999
+    assert rigid.sum() > 1000
+    assert float(distance_mm[:, rigid].max()) < 0.01
+    assert float(distance_mm.max()) < 5.0
+    assert rest.motion.root_translation_m == pytest.approx(motion.root_translation_m)
+
+
+def test_the_canonical_legs_are_the_filmed_ones(body: Body) -> None:
+    motion = motion_of(body, CLOSED_LEGS)
+    rest = rest_with_filmed_legs(body, motion, torch.zeros(LANDMARK_COUNT, 3), np.ones(FRAMES, dtype=bool))
+    identity = [1.0, 0.0, 0.0, 0.0]
+    for name in ("LeftUpLeg", "RightUpLeg", "LeftLeg", "RightLeg"):
+        assert np.abs(rest.motion.rotations_wxyz[0, body.joint(name)]) == pytest.approx(identity, abs=1e-5)
+    feet = [body.joint("LeftFoot"), body.joint("RightFoot")]
+    assert np.ptp(rest.body.joints_m[feet, 0]) < np.ptp(body.joints_m[feet, 0]) - 0.1
+    assert rest.body.vertices[:, 1].min() == pytest.approx(0.0, abs=1e-6)
+    toes = body.joint("LeftToeBase")
+    sole, old = (each.joints_m[toes] - each.joints_m[feet[0]] for each in (rest.body, body))
+    assert sole == pytest.approx(old, abs=1e-6)
+
+
+def test_landmarks_move_with_their_joints(body: Body) -> None:
+    """In the posed body they are where they were."""
+    motion = motion_of(body, CLOSED_LEGS)
+    landmarks_m = torch.rand(LANDMARK_COUNT, 3, generator=torch.Generator().manual_seed(0))
+    rest = rest_with_filmed_legs(body, motion, landmarks_m, np.ones(FRAMES, dtype=bool))
+    old, new = canonical_to_world(body, motion)[0], canonical_to_world(rest.body, rest.motion)[0]
+    knee = next(landmark for landmark in LANDMARKS if landmark.name == "ankle")
+    for index, joint in zip(knee.indices, (body.joint("LeftLeg"), body.joint("RightLeg")), strict=True):
+        before = old[joint, :3, :3] @ landmarks_m[index] + old[joint, :3, 3]
+        after = new[joint, :3, :3] @ rest.landmarks_m[index] + new[joint, :3, 3]
+        assert after.numpy() == pytest.approx(before.numpy(), abs=1e-5)
+
+
+def test_only_the_chosen_frames_count(body: Body) -> None:
+    """The legs of a frame that is not used are not part of the mean."""
+    motion = motion_of(body, CLOSED_LEGS)
+    rotations = motion.rotations_wxyz.copy()
+    rotations[0] = motion_of(body, {"LeftUpLeg": (0.8, 0.0, 0.0)}).rotations_wxyz[0]
+    used = np.array([False, True, True])
+    rest = rest_with_filmed_legs(
+        body, motion.with_pose(rotations, motion.root_translation_m), torch.zeros(LANDMARK_COUNT, 3), used
+    )
+    expected = rest_with_filmed_legs(body, motion, torch.zeros(LANDMARK_COUNT, 3), used)
+    assert rest.body.joints_m == pytest.approx(expected.body.joints_m, abs=1e-6)
