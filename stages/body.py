@@ -329,7 +329,7 @@ def draw_overlay_grid(
 
 STAGE = Stage(
     "body",
-    version=21,
+    version=22,
     needs=("frames",),
     makes=(_BODY, _MOTION, _CAMERA, _OBSERVATIONS, SCORES_NPZ, _OVERLAY),
     config=Config,

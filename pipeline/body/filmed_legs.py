@@ -46,6 +46,9 @@ Trousers of four people: at most 0.005 m; a knee-long coat 0.03, a wide skirt 0.
 MAX_OPEN_SHARE = 0.1
 """Share of the pixels between the legs above the hem that may show the background: through shorts it is seen."""
 
+MIN_GAP_PX = 4.0
+"""Width of a gap between the legs that trousers do not fill, of a person 240 px tall: 3 cm. Five pairs: 1 px."""
+
 
 @dataclass(frozen=True)
 class LegProfile:
@@ -54,7 +57,7 @@ class LegProfile:
     Attributes:
         margin_m: distance of the outline of the mask from that of the legs, mean of left and right, median over frames;
             nan where no frame shows it.
-        gap_px: pixels between the legs of the body, all frames together.
+        gap_px: pixels between the legs of the body, mean over frames.
         open_px: those of them that the masks do not cover.
     """
 
@@ -63,7 +66,14 @@ class LegProfile:
     open_px: Float[np.ndarray, "k"]
 
     def cloth_hangs_between_legs(self) -> bool:
-        """Return whether a skirt or coat goes from leg to leg: there is a hem, and nothing is seen between the legs."""
+        """Return whether a skirt or coat goes from leg to leg.
+
+        It does where it covers a wide gap between the legs, and where there is a hem above which nothing is seen
+        between legs that are close to each other.
+        """
+        is_covered = (self.gap_px >= MIN_GAP_PX) & (self.open_px <= MAX_OPEN_SHARE * self.gap_px)
+        if is_covered[np.array(HEIGHTS) >= HEM_HEIGHT].any():
+            return True
         hem = self._hem()
         if hem is None:
             return False
@@ -112,7 +122,8 @@ def leg_profile(
     seen = np.isfinite(rows[0]).any(axis=0)
     margin_m = np.full(len(HEIGHTS), np.nan)
     margin_m[seen] = np.nanmedian(rows[0][:, seen], axis=0)
-    return LegProfile(margin_m, np.nansum(rows[1], axis=0), np.nansum(rows[2], axis=0))
+    gap_px, open_px = np.nansum(rows[1:], axis=1) / max(1, len(chosen))
+    return LegProfile(margin_m, gap_px, open_px)
 
 
 def _profile_of_frame(

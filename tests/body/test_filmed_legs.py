@@ -82,6 +82,13 @@ def test_a_skirt_ends_at_its_hem(body: Body) -> None:
     assert np.nanmin(profile.margin_m[above][3:]) == pytest.approx(12 * 3.0 / 600.0, abs=0.01)
 
 
+def test_a_close_skirt_covers_the_gap(body: Body) -> None:
+    """Its hem is no step: the fitted hips are as wide as the skirt."""
+    profile = profile_of(body, dressed(body, 0.6, 2, True))
+    assert np.nanmax(profile.margin_m) < 0.02
+    assert profile.cloth_hangs_between_legs()
+
+
 def test_cloth_down_to_the_floor_has_no_hem(body: Body) -> None:
     assert profile_of(body, dressed(body, 0.05, 14, True)).cloth_hangs_between_legs()
 
