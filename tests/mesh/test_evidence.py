@@ -7,7 +7,7 @@ import torch
 from pipeline.body.body import Body
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.rotation import axis_angle_to_matrix
-from pipeline.mesh.evidence import surface_evidence
+from pipeline.mesh.evidence import DEPTH_SHARE, surface_evidence
 from pipeline.mesh.views import PosedView
 from tests.mesh.capsule import capsule_body
 
@@ -35,9 +35,22 @@ def height_on_side(body: Body) -> np.ndarray:
 
 
 def test_one_side_is_seen_and_the_other_is_not(body: Body) -> None:
-    evidence, cosine = surface_evidence(body, [view_from(0.0)] * 3), height_on_side(body)
-    assert (evidence[cosine > 0.5] == 1.0).all()
-    assert (evidence[cosine < -0.3] == 0.0).all()
+    evidence, cosine = surface_evidence(body, [view_from(angle) for angle in (-0.5, 0.0, 0.5)]), height_on_side(body)
+    assert (evidence[cosine > 0.7] == 1.0).all()
+    assert (evidence[cosine < -0.6] == 0.0).all()
+
+
+def test_frames_from_one_side_tell_no_depth(body: Body) -> None:
+    """The evidence rises with the arc that is filmed, from one minus `DEPTH_SHARE` to 1."""
+    front = height_on_side(body) > 0.97
+    arcs_rad = np.radians([0.0, 20.0, 40.0, 90.0])
+    found = [
+        surface_evidence(body, [view_from(angle) for angle in np.linspace(-0.5, 0.5, 9) * arc])[front].mean()
+        for arc in arcs_rad
+    ]
+    assert found[0] == pytest.approx(1.0 - DEPTH_SHARE, abs=1e-4)
+    assert found[0] < found[1] < found[2] - 0.05 < 0.95
+    assert found[3] == 1.0
 
 
 def test_a_turn_shows_all_sides(body: Body) -> None:
@@ -46,6 +59,6 @@ def test_a_turn_shows_all_sides(body: Body) -> None:
 
 
 def test_evidence_is_the_mean_squared_cosine(body: Body) -> None:
-    """One view in 40 from the front, the others from behind: the middle of the front has 1/40, half of enough."""
-    evidence = surface_evidence(body, [view_from(0.0), *[view_from(np.pi)] * 39])
-    assert evidence[height_on_side(body) > 0.97].mean() == pytest.approx(0.5, abs=0.05)
+    """Two views in 80 from the front, the others from behind: the middle of the front has 1/40 cos², half of enough."""
+    evidence = surface_evidence(body, [view_from(-0.6), view_from(0.6), *[view_from(np.pi)] * 78])
+    assert evidence[height_on_side(body) > 0.97].mean() == pytest.approx(0.5 * np.cos(0.6) ** 2, abs=0.05)
