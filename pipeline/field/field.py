@@ -17,11 +17,7 @@ from pipeline.field.baselines.positional_mlp import PositionalMlp
 from pipeline.kernels.common.voxels import voxel_values
 from pipeline.kernels.hashgrid import FeatureGradients, GridLayout, encode
 
-EMPTY_GRID_LAYOUT = GridLayout((), 1, ())
-
-NODES_PER_SURFACE_CELL = 3.0
-"""Nodes of the cells that a surface crosses, for an area of one cell's face: twice the mean of |nx| + |ny| + |nz| over
-all directions of the normal. Bodies of three captures, at all levels: 2.7 to 2.8."""
+EMPTY_GRID_LAYOUT = GridLayout((), 1, 0)
 
 INITIAL_DENSITY_PER_M = 10.0
 """Density before training. A torso of 0.2 m then has an opacity of 0.86, so that all samples inside have a gradient."""
@@ -159,25 +155,17 @@ def _uniform(shape: tuple[int, int], limit: float, rng: torch.Generator) -> torc
 
 
 def hash_grid_layout(
-    bounds_m: Float[np.ndarray, "2 3"],
-    finest_cell_m: float,
-    levels: int,
-    features: int,
-    log2_hashmap_size: int,
-    surface_m2: float = math.inf,
+    bounds_m: Float[np.ndarray, "2 3"], finest_cell_m: float, levels: int, features: int, log2_hashmap_size: int
 ) -> GridLayout:
     """Return hash grid levels in equal ratios from 1/16 of the longest side of the box to the finest cell.
 
     finest_cell_m: edge of the finest cell, m. Cells finer than a pixel's footprint on the body cannot be observed
     (Nyquist), coarser ones blur. features: per level. log2_hashmap_size: log2 of the most rows of a level.
-    surface_m2: area for which the rows of a level suffice without nodes that share one: as many as the cells that the
-    surface crosses have nodes, rounded up to a power of two.
     """
     extent = np.asarray(bounds_m[1] - bounds_m[0], dtype=np.float64)
     coarsest = max(float(extent.max()) / 16, finest_cell_m)
     ratio = (finest_cell_m / coarsest) ** (1 / max(levels - 1, 1))
-    edges_m = [coarsest * ratio**level for level in range(levels)]
-    cells = tuple(tuple(max(1, math.ceil(side / edge_m)) for side in extent) for edge_m in edges_m)
-    nodes = [NODES_PER_SURFACE_CELL * surface_m2 / edge_m**2 for edge_m in edges_m]
-    log2_rows = tuple(math.ceil(math.log2(min(max(count, 1), 2**log2_hashmap_size))) for count in nodes)
-    return GridLayout(cells, features, log2_rows)
+    cells = tuple(
+        tuple(max(1, math.ceil(side / (coarsest * ratio**level))) for side in extent) for level in range(levels)
+    )
+    return GridLayout(cells, features, log2_hashmap_size)

@@ -21,7 +21,7 @@ def save_field(path: Path, field: RadianceField) -> None:
     description = {
         "cells_per_axis": [list(cells) for cells in layout.cells_per_axis],
         "features": layout.features,
-        "log2_rows": list(layout.log2_rows),
+        "log2_hashmap_size": layout.log2_rows,
         "hidden_width": field.hidden.shape[1],
         "trunk": [len(field.trunk.layers), field.trunk.width] if field.trunk else None,
         "inverse_skinning": field.inverse_skinning,
@@ -38,7 +38,7 @@ def load_field(path: Path) -> RadianceField:
     tensors, description = load_tensors(path)
     try:
         cells = tuple((int(x), int(y), int(z)) for x, y, z in description["cells_per_axis"])
-        layout = GridLayout(cells, description["features"], tuple(description["log2_rows"]))
+        layout = GridLayout(cells, description["features"], description["log2_hashmap_size"])
         trunk = PositionalMlp(*description["trunk"]) if description["trunk"] else None
         method = description["inverse_skinning"]
         bounds_m, width = tensors["bounds_m"].numpy(), description["hidden_width"]

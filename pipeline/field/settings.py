@@ -38,8 +38,6 @@ class FieldSettings:
     levels: int = 5
     """Levels of the hash grid, 1 to 16. Six levels down to 1 px: 29.73 / 23.42 dB; five down to 2 px: 29.81 / 23.34 in
     half of the time."""
-    rows_per_surface_node: NonNegativeFloat = 0.0
-    """Rows of a level for each node of the cells that the surface crosses, at most 2^log2_hashmap_size; 0: so many."""
     features_per_level: Literal[1, 2, 4, 8] = 4
     """Features of a hash table row."""
     finest_cell_px: PositiveFloat = 2.0

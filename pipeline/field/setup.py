@@ -1,6 +1,5 @@
 """Set up the training of a field from a fitted body, the camera and the training images."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -169,12 +168,7 @@ def initial_field(
     if settings.network == "positional_mlp":
         trunk = PositionalMlp(LAYER_COUNT - 1, settings.hidden_width, config.seed)
         return RadianceField(bounds_m, EMPTY_GRID_LAYOUT, settings.hidden_width, config.seed, trunk, render_method)
-    surface_m2 = math.inf
-    if settings.rows_per_surface_node:
-        surface_m2 = settings.rows_per_surface_node * float(scene.body.mesh().face_areas_m2().sum())
-    layout = hash_grid_layout(
-        bounds_m, cell_m, settings.levels, settings.features_per_level, config.log2_hashmap_size, surface_m2
-    )
+    layout = hash_grid_layout(bounds_m, cell_m, settings.levels, settings.features_per_level, config.log2_hashmap_size)
     return RadianceField(bounds_m, layout, settings.hidden_width, config.seed, None, render_method)
 
 

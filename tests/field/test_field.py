@@ -9,7 +9,6 @@ from pipeline.field import field as field_module
 from pipeline.field.field import (
     INITIAL_DENSITY_PER_M,
     MIN_RELATIVE_GRADIENT,
-    NODES_PER_SURFACE_CELL,
     RadianceField,
     _RadianceMlp,
     hash_grid_layout,
@@ -92,23 +91,6 @@ def test_layout_ends_at_the_finest_cell():
     np.testing.assert_allclose(coarsest, 0.125, rtol=0.01)
     sizes = [np.prod(cells) for cells in layout.cells_per_axis]
     assert sizes == sorted(sizes)
-
-
-def test_rows_suffice_for_the_nodes_of_the_cells_that_a_sphere_crosses():
-    radius = 20
-    axis = np.abs(np.arange(-radius - 2, radius + 3))
-    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
-    # A node belongs to a crossed cell if the sphere crosses the cube of two cells around the node.
-    nearest = np.sqrt(sum(np.maximum(each - 1, 0) ** 2 for each in (x, y, z)))
-    farthest = np.sqrt(sum((each + 1) ** 2 for each in (x, y, z)))
-    nodes = int(((nearest < radius) & (radius < farthest)).sum())
-    cells_m2 = 4 * np.pi * radius**2
-    assert nodes == pytest.approx(NODES_PER_SURFACE_CELL * cells_m2, rel=0.03)
-    layout = hash_grid_layout(BOUNDS, 0.004, 4, 2, 17, cells_m2 * 0.004**2)
-    assert nodes <= layout.rows_per_level[-1] < 2 * nodes
-    assert list(layout.log2_rows) == sorted(layout.log2_rows)
-    assert hash_grid_layout(BOUNDS, 0.004, 4, 2, 12, cells_m2 * 0.004**2).log2_rows[-1] == 12
-    assert hash_grid_layout(BOUNDS, 0.004, 4, 2, 12, 0.0).rows == 4
 
 
 def test_field_round_trip(tmp_path):

@@ -9,7 +9,7 @@ CELLS = ((3, 5, 2), (9, 9, 9), (40, 70, 20), (300, 500, 150))
 
 
 def make(features, log2_rows=9, points=700):
-    layout = GridLayout(CELLS, features, (log2_rows,) * len(CELLS))
+    layout = GridLayout(CELLS, features, log2_rows)
     random = torch.Generator().manual_seed(features)
     table = torch.randn(layout.rows, features, generator=random)
     return layout, torch.rand(points, 3, generator=random), table
@@ -27,15 +27,13 @@ def corner_sum(point, table, cells, rows):
 
 
 def test_layout_counts_rows():
-    layout = GridLayout(CELLS, 4, (9, 9, 9, 8))
-    assert layout.rows_per_level == (72, 512, 512, 256)
-    assert layout.rows == 1352
+    layout = GridLayout(CELLS, 4, 9)
+    assert layout.rows_per_level == (72, 512, 512, 512)
+    assert layout.rows == 1608
     assert layout.width == 16
     assert layout.level_params[:, 5].tolist() == [1, 0, 0, 0]
     with pytest.raises(ValueError, match="features"):
-        GridLayout(CELLS, 3, (9,) * 4)
-    with pytest.raises(ValueError, match="4 levels, but 1 limits"):
-        GridLayout(CELLS, 4, (9,))
+        GridLayout(CELLS, 3, 9)
 
 
 def test_dense_level_is_trilinear_interpolation():
@@ -68,7 +66,7 @@ def test_compiled_encoding_matches_reference_in_float64(features):
 
 
 def test_reference_passes_gradcheck():
-    layout = GridLayout(((3, 2, 2), (7, 6, 5)), 2, (5, 5))
+    layout = GridLayout(((3, 2, 2), (7, 6, 5)), 2, 5)
     random = torch.Generator().manual_seed(1)
     table = torch.randn(layout.rows, 2, generator=random, dtype=torch.float64, requires_grad=True)
     points = (0.05 + 0.9 * torch.rand(6, 3, generator=random, dtype=torch.float64)).requires_grad_(True)

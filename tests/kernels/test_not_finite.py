@@ -13,7 +13,7 @@ NAN = float("nan")
 
 
 def test_nan_coordinates_are_clamped_to_the_box() -> None:
-    layout = GridLayout(((3, 5, 2), (40, 70, 20)), 2, (9, 9))
+    layout = GridLayout(((3, 5, 2), (40, 70, 20)), 2, 9)
     random = torch.Generator().manual_seed(0)
     table, points = torch.randn(layout.rows, 2, generator=random), torch.rand(300, 3, generator=random)
     points[::7, 0], points[5], points[9, 2] = NAN, NAN, NAN

@@ -42,7 +42,7 @@ def seeded() -> torch.Generator:
 
 def hash_grid_results() -> list[Tensor]:
     cells = ((5, 7, 6), (16, 20, 11), (60, 80, 40), (200, 300, 150), (400, 500, 350))
-    layout, random = GridLayout(cells, 4, (12,) * len(cells)), seeded()
+    layout, random = GridLayout(cells, 4, 12), seeded()
     points = torch.rand(6000, 3, generator=random).requires_grad_(True)
     table = torch.randn(layout.rows, 4, generator=random).requires_grad_(True)
     encoded = encode(points, table, layout)

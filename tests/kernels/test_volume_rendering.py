@@ -26,7 +26,7 @@ ANGLES = (0.4, -0.7)
 
 
 def make_network(random: torch.Generator) -> RadianceNetwork:
-    layout = GridLayout(((6, 3, 3), (20, 8, 8)), 4, (10, 10))
+    layout = GridLayout(((6, 3, 3), (20, 8, 8)), 4, 10)
     table = 0.5 * torch.randn(layout.rows, 4, generator=random)
     hidden, output = torch.randn(8, 16, generator=random), torch.randn(16, 4, generator=random)
     weights = (tensor.requires_grad_() for tensor in (hidden, output, torch.randn(4, generator=random)))

@@ -38,7 +38,7 @@ def dense_layout(bounds_m: Float[np.ndarray, "2 3"], cell_m: float, log2_hashmap
     while np.prod(np.ceil(sides_m / cell_m) + 1) > 2**log2_hashmap_size:
         cell_m *= 1.02
     x, y, z = (int(cells) for cells in np.ceil(sides_m / cell_m))
-    return GridLayout(((x, y, z),), CHANNELS, (log2_hashmap_size,))
+    return GridLayout(((x, y, z),), CHANNELS, log2_hashmap_size)
 
 
 def node_positions_m(bounds_m: Float[np.ndarray, "2 3"], layout: GridLayout) -> Float[np.ndarray, "nodes 3"]:

@@ -29,20 +29,18 @@ class GridLayout:
 
     cells_per_axis: number of cells (x, y, z) of each level, coarse to fine.
     features: floats of each row, one of `SUPPORTED_FEATURE_COUNTS`.
-    log2_rows: of each level, which has at most 2**log2_rows rows.
+    log2_rows: a level has at most 2**log2_rows rows.
 
-    Raises ValueError for an unsupported number of features, or another number of limits than levels.
+    Raises ValueError for an unsupported number of features.
     """
 
     cells_per_axis: tuple[tuple[int, int, int], ...]
     features: int
-    log2_rows: tuple[int, ...]
+    log2_rows: int
 
     def __post_init__(self) -> None:
         if self.features not in SUPPORTED_FEATURE_COUNTS:
             raise ValueError(f"features per level must be one of {SUPPORTED_FEATURE_COUNTS}, not {self.features}")
-        if len(self.log2_rows) != self.levels:
-            raise ValueError(f"{self.levels} levels, but {len(self.log2_rows)} limits of rows")
 
     @property
     def levels(self) -> int:
@@ -57,10 +55,8 @@ class GridLayout:
     @cached_property
     def rows_per_level(self) -> tuple[int, ...]:
         """Table rows of each level: one for each node (dense), or 2**`log2_rows` that nodes share (hashed)."""
-        return tuple(
-            min(1 << log2_rows, (x + 1) * (y + 1) * (z + 1))
-            for (x, y, z), log2_rows in zip(self.cells_per_axis, self.log2_rows, strict=True)
-        )
+        limit = 1 << self.log2_rows
+        return tuple(min(limit, (x + 1) * (y + 1) * (z + 1)) for x, y, z in self.cells_per_axis)
 
     @cached_property
     def rows(self) -> int:
