@@ -29,7 +29,6 @@ from pipeline.field.files import save_field, save_occupancy
 from pipeline.field.optimiser import DivergedError
 from pipeline.field.setup import MaskedImage, create_trainer, evenly_spaced, training_scale
 from pipeline.field.trainer import Trainer
-from pipeline.field.training_frames import choose_training_frames
 from pipeline.field.validation import Validator
 from pipeline.field.validation_curve import ValidationCurve
 from pipeline.geometry.camera import Camera
@@ -53,8 +52,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: FieldConfig) -> Mapping[s
     body, motion = load_body(inputs["body"] / "body.npz"), load_motion(inputs["body"] / "motion.npz")
     camera = camera.scaled(training_scale(body, motion, camera, config.max_person_px))
     train = usable_training_positions(capture, inputs["body"])
-    spacing_m = config.settings.pose_spacing_m
-    train = train[choose_training_frames(body, motion.select(train), config.max_frames, spacing_m)]
+    train = train[evenly_spaced(len(train), config.max_frames)]
     masked_images = read_masked_images(capture, train, camera)
     device = select_device(config.device, "field.device")
     trainer = create_trainer(body, motion.select(train), camera, masked_images, config, device)

@@ -65,12 +65,6 @@ ROWS = {
         FieldRow("steps-double", "twice the steps", factors={"steps": 2.0}),
         FieldRow("frames-half", "half of the training frames", factors={"max_frames": 0.5}),
         FieldRow("frames-quarter", "a quarter of the training frames", factors={"max_frames": 0.25}),
-        FieldRow("frames-by-motion", "poses 30 mm apart", settings={"pose_spacing_m": 0.03}),
-        FieldRow(
-            "by-capture",
-            "rows by the surface and poses 30 mm apart",
-            settings={"rows_per_surface_node": 1.0, "pose_spacing_m": 0.03},
-        ),
         FieldRow(SMALL, f"person at most {SMALL_PERSON_PX} px tall", options=_SMALL_OPTIONS),
         FieldRow(
             "small-person-rows-quarter",

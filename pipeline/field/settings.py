@@ -55,8 +55,6 @@ class FieldSettings:
     step_fraction: PositiveFraction = 0.01
     """Distance between samples of a ray, as a fraction of the body height."""
 
-    pose_spacing_m: NonNegativeFloat = 0.0
-    """As many training frames are used as there are poses that lie this far apart, m; 0: all up to `max_frames`."""
     frames_per_step: PositiveInt = 8
     """Training frames whose pixels a step samples."""
     pixel_jitter: bool = False
