@@ -36,6 +36,7 @@ COLUMNS = (
     Column("field_chamfer_mm", "Chamfer, mm", 2),
     Column("field_normal_angle_deg", "normals, °", 2),
     Column("samples_per_step", "samples a step", 0),
+    Column("train_frames", "frames", 0),
     Column("parameters", "parameters, thousands", 0, 1e-3),
     Column("cpu_seconds", "CPU, s", 1),
 )
