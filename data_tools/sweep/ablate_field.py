@@ -10,6 +10,7 @@ Outputs in OUT: `field.csv` (one line per training) and `field.md` (means, and d
 import argparse
 import sys
 from collections.abc import Sequence
+from functools import cache
 from itertools import product
 from pathlib import Path
 
@@ -19,6 +20,8 @@ from data_tools.command import run_command
 from data_tools.sweep.field_rows import ATTENTION, REFERENCE, ROWS, SIZE, rows_of_group
 from data_tools.sweep.field_tables import write_tables
 from data_tools.sweep.field_trials import FieldTrial, TrialScores, read_trial, run_trial
+from pipeline.capture.capture import load_capture
+from pipeline.capture.usable_frames import usable_training_positions
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track
 from pipeline.field.config import FieldConfig
@@ -55,10 +58,17 @@ def _capture(run: Path) -> Path:
     return run.with_name(f"{run.name}-capture")
 
 
+@cache
+def _training_frames(run: Path) -> int:
+    """Return the number of training frames of a run, so that half of `max_frames` is half of what is used."""
+    return len(usable_training_positions(load_capture(run / "frames"), run / "body"))
+
+
 def _trial(run: Path, name: str, seed: int, options: argparse.Namespace) -> FieldTrial:
     base = FieldConfig.model_validate({"seed": seed})
     base = base if options.truth else base.model_copy(update={"validation_frames": VALIDATION_FRAMES})
     base = base if options.steps is None else base.model_copy(update={"steps": options.steps})
+    base = base.model_copy(update={"max_frames": min(base.max_frames, _training_frames(run))})
     truth = _capture(run) if options.truth else None
     return FieldTrial(run, ROWS[name], seed, ROWS[name].config(base), truth, options.out)
 

@@ -63,6 +63,8 @@ ROWS = {
         FieldRow("width-double", "twice the units", settings={"hidden_width": 64}),
         FieldRow("steps-half", "half the steps", factors={"steps": 0.5}),
         FieldRow("steps-double", "twice the steps", factors={"steps": 2.0}),
+        FieldRow("frames-half", "half of the training frames", factors={"max_frames": 0.5}),
+        FieldRow("frames-quarter", "a quarter of the training frames", factors={"max_frames": 0.25}),
         FieldRow(SMALL, f"person at most {SMALL_PERSON_PX} px tall", options=_SMALL_OPTIONS),
         FieldRow(
             "small-person-rows-quarter",

@@ -36,9 +36,11 @@ COLUMNS = (
     Column("field_chamfer_mm", "Chamfer, mm", 2),
     Column("field_normal_angle_deg", "normals, °", 2),
     Column("samples_per_step", "samples a step", 0),
+    Column("train_frames", "frames", 0),
     Column("parameters", "parameters, thousands", 0, 1e-3),
     Column("cpu_seconds", "CPU, s", 1),
 )
+VALIDATION_COLUMNS = COLUMNS[:2]
 
 
 def write_tables(out: Path, results: Results, command: str) -> None:
@@ -55,7 +57,8 @@ def write_tables(out: Path, results: Results, command: str) -> None:
     ]
     write_csv(out / "field.csv", ("run", "row", "seed", "steps", *names, "seconds", "commit", "machine"), lines)
     commits, machines = [result.commit for result in results.values()], [result.machine for result in results.values()]
-    text = [markdown_means(results), markdown_differences(results), f"{format_origin(commits, machines)}; `{command}`."]
+    tables = [markdown_means(results), markdown_differences(results), markdown_differences_by_run(results)]
+    text = [*tables, f"{format_origin(commits, machines)}; `{command}`."]
     with atomic_path(out / "field.md") as path:
         path.write_text("\n\n".join(text) + "\n", encoding="utf-8")
 
@@ -81,6 +84,20 @@ def markdown_differences(results: Results) -> str:
             cells = (format_difference(pairs, column) for column in columns)
             lines.append([f"`{name}` - `{ROWS[name].compared_with}`", str(len(pairs)), *cells])
     return _table(["difference", "n", *(column.heading for column in columns)], lines) if lines else ""
+
+
+def markdown_differences_by_run(results: Results) -> str:
+    """Return a table of the differences of the validation PSNR, whole image / body pixels, a column for each run."""
+    runs = list(dict.fromkeys(trial.run.name for trial in results))
+    lines = []
+    for name in _row_names(results):
+        cells = []
+        for run in runs:
+            pairs = paired_scores({t: scores for t, scores in results.items() if t.run.name == run}, name)
+            cells.append(" / ".join(format_difference(pairs, column) for column in VALIDATION_COLUMNS))
+        if any(cell.strip("– /") for cell in cells):
+            lines.append([f"`{name}` - `{ROWS[name].compared_with}`", *cells])
+    return _table(["difference", *(f"{run}, dB" for run in runs)], lines) if lines else ""
 
 
 def paired_scores(results: Results, name: str) -> list[tuple[Mapping[str, float], Mapping[str, float]]]:

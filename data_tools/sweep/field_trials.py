@@ -24,6 +24,7 @@ STAGE_SCORES = (
     "samples_per_step",
     "occupied_cells",
     "parameters",
+    "train_frames",
 )
 
 

@@ -12,7 +12,7 @@ from tests.report.report_sample import sample_manifests, sample_page
 
 CONFIGS: dict[str, dict[str, Any]] = {
     "frames": {"max_frames": 200},
-    "field": {"settings": {"levels": 5, "finest_cell_px": 2.0, "occupancy": "plain"}},
+    "field": {"max_frames": 120, "settings": {"levels": 5, "finest_cell_px": 2.0, "occupancy": "plain"}},
     "mesh": {"rounds": 3, "max_final_faces": 14500},
     "texture": {"min_texture_px": 512, "max_texture_px": 2048, "light": "auto", "normal_map": False},
 }
@@ -79,11 +79,11 @@ def test_sizes_name_their_rule_limit_and_cost():
     assert "47 were left out" in found["Frames"].reason
     assert "limited" not in found["Frames"].reason
     field = found["Radiance field"]
-    assert field.choice == (
-        "5 levels of cells down to 7.4 mm, 1.36 million parameters, 750 steps on 72 of 72 training frames"
-    )
+    assert field.choice == "5 levels of cells down to 7.4 mm, 1.36 million parameters, 750 steps"
     assert "2 pixels" in field.reason
     assert field.cost == "3 s, 5.5 MB"
+    assert found["Frames of the field"].choice == "72 of 72 training frames"
+    assert "limited" not in found["Frames of the field"].reason
     assert found["Faces"].choice == "14,498 of 54,788"
     assert "mesh.max_final_faces" in found["Faces"].reason
     assert "12 mm" in found["Faces"].reason
@@ -93,9 +93,10 @@ def test_sizes_name_their_rule_limit_and_cost():
 
 
 def test_limits_are_named_only_where_they_bind():
-    found = parts(
-        known_manifests(frames={"frames_train": 176.0}, mesh={"faces": 9000.0}, texture={"texture_px": 2048.0})
-    )
+    changed = {"frames": {"frames_train": 176.0}, "field": {"train_frames": 120.0}, "mesh": {"faces": 9000.0}}
+    found = parts(known_manifests(**changed, texture={"texture_px": 2048.0}))
+    assert found["Frames of the field"].choice == "120 of 176 training frames"
+    assert "field.max_frames" in found["Frames of the field"].reason
     assert "frames.max_frames" in found["Frames"].reason
     assert "limited" not in found["Faces"].reason
     assert "texture.max_texture_px" in found["Texture"].reason

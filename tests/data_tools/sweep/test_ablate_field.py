@@ -40,6 +40,7 @@ def test_rows_change_what_they_name_and_keep_the_rest():
     assert ROWS["steps-half"].config(base).steps == 200
     assert ROWS["levels-more"].config(base).settings.levels == base.settings.levels + 1
     assert ROWS["rows-half"].config(base).log2_hashmap_size == base.log2_hashmap_size - 1
+    assert ROWS["frames-quarter"].config(base).max_frames == base.max_frames // 4
     assert rows_of_group(ATTENTION) == [REFERENCE, "attention"]
     assert set(rows_of_group(SIZE)) | {"attention"} == set(ROWS)
 
@@ -89,6 +90,8 @@ def test_differences_are_paired_by_run_and_seed(tmp_path: Path):
     write_tables(tmp_path, results, "the command")
     text = (tmp_path / "field.md").read_text(encoding="utf-8")
     assert "| `rows-half` - `reference` | 2 | +0.10 ± 0.20 |" in text
+    assert "| difference | one, dB | two, dB |" in text
+    assert "| `rows-half` - `reference` | -0.10 / – | +0.30 / – |" in text
     assert "| `reference` | the stage as it is | 2 | 25.00 |" in text
     assert "novel views" not in text
     assert "`the command`" in text
@@ -101,3 +104,20 @@ def test_a_run_without_a_body_is_named(tmp_path: Path):
     (tmp_path / "frames").mkdir()
     with pytest.raises(UserError, match="body does not exist"):
         ablate_field.main([str(tmp_path), "--out", str(tmp_path / "out")])
+
+
+def test_half_of_the_frames_is_half_of_those_of_the_run(tmp_path: Path, monkeypatch):
+    for name in ("frames", "body"):
+        (tmp_path / name).mkdir()
+    monkeypatch.setattr(ablate_field, "load_capture", lambda folder: folder)
+    monkeypatch.setattr(ablate_field, "usable_training_positions", lambda capture, body: range(72))
+    used = []
+
+    def run_trial(trial: FieldTrial) -> TrialScores:
+        used.append(trial.config.max_frames)
+        return scores(30.0)
+
+    monkeypatch.setattr(ablate_field, "run_trial", run_trial)
+    rows = [REFERENCE, "frames-half", "frames-quarter"]
+    ablate_field.main([str(tmp_path), "--rows", *rows, "--out", str(tmp_path / "out")])
+    assert used == [72, 36, 18]
