@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from data_tools.stress import interruption
-from data_tools.stress.interruption import differing_files, interruption_scores
-from pipeline.core.errors import UserError
+from data_tools.stress.interruption import KillLog, differing_files, interruption_scores
+from data_tools.stress.row import CannotRunError
 from tests.core.toy_pipeline import Toy
 from tests.test_resume import TOY_STAGES
 
@@ -19,7 +19,7 @@ def folders(toy: Toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[
 
     def start(run: Path, video: Path, log: Path) -> subprocess.Popen[str]:
         process = toy.start("stages", "--run", str(run), "--video", "numbers.txt")
-        _, errors = ("", "") if run.name == "run" else process.communicate()
+        _, errors = ("", "") if run.name.startswith("run") else process.communicate()
         log.parent.mkdir(parents=True, exist_ok=True)
         log.write_text(errors)
         return process
@@ -36,7 +36,9 @@ def folders(toy: Toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[
 def test_killed_runs_end_with_the_same_bytes(folders: tuple[Path, Path]) -> None:
     scores = interruption_scores(*folders, kind="kills", count=3)
     assert scores["differing_files"] == 0.0
-    assert 0 <= scores["interruptions"] <= 3
+    assert scores["interruptions"] == 3.0
+    assert sum(scores[f"kills_in_{name}"] for name in TOY_STAGES) <= 3.0
+    assert 0.0 <= scores["repeated_seconds"] < 20.0
 
 
 @pytest.mark.slow
@@ -49,7 +51,7 @@ def test_two_runs_at_once_end_with_the_same_bytes(folders: tuple[Path, Path]) ->
 @pytest.mark.slow
 def test_differences_are_counted(folders: tuple[Path, Path]) -> None:
     interruption_scores(*folders, kind="kills", count=0)
-    expected, found = folders[0].parent / "undisturbed", folders[1] / "run"
+    expected, found = folders[0].parent / "undisturbed", folders[1] / "run0"
     assert differing_files(expected, found) == []
     shutil.rmtree(found / TOY_STAGES[-1])
     (found / "learn.part").mkdir()
@@ -58,11 +60,29 @@ def test_differences_are_counted(folders: tuple[Path, Path]) -> None:
     assert any(name.startswith(f"{TOY_STAGES[-1]}/") for name in differing)
 
 
+def test_scores_of_kills_are_the_worst_of_each_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(interruption, "STAGES", ("a", "b", "c"))
+    log = KillLog(["a", "b", "a"], [1.0, 5.0, 3.0], cpu_s=230.0, differing=2, runs=2)
+    assert log.scores(undisturbed_cpu_s=100.0) == {
+        "differing_files": 2.0,
+        "interruptions": 3.0,
+        "repeated_seconds": 5.0,
+        "extra_seconds_a_kill": 10.0,
+        "kills_in_a": 2.0,
+        "kills_in_b": 1.0,
+        "kills_in_c": 0.0,
+        "repeated_in_a": 3.0,
+        "repeated_in_b": 5.0,
+    }
+    nothing = KillLog(runs=1).scores(100.0)
+    assert nothing["repeated_seconds"] != nothing["repeated_seconds"]
+
+
 def test_without_mount_a_full_disk_is_refused_in_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(command: list[str]) -> None:
         raise subprocess.CalledProcessError(32, command)
 
     monkeypatch.setattr(interruption, "_command", refused)
     monkeypatch.setattr(shutil, "which", lambda name: f"/bin/{name}")
-    with pytest.raises(UserError, match="run it as root"), interruption._small_disk(tmp_path / "disk", 4):
+    with pytest.raises(CannotRunError, match="run it as root"), interruption._small_disk(tmp_path / "disk", 4):
         pass
