@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from data_tools.stress.captures import make_capture
-from data_tools.stress.interruption import CAPTURE, differing_files
+from data_tools.stress.interruption import differing_files
 from data_tools.stress.row import CannotRunError
 from data_tools.stress.slurm import NAMESPACE, SlurmCluster, node_cpus, slurm_cluster, wait_until
 from pipeline.core.manifest import MANIFEST_FILE
@@ -15,14 +15,16 @@ from pipeline.core.measure import REPOSITORY_DIR
 from stages import STAGES
 
 PRESET = "smoke"
-KILLED_STAGE = "field"
-"""The node is lost when one of its jobs has begun this stage."""
+SET = "field.steps=40 mesh.steps=4"
+CAPTURE = {"frames": 20, "size": 200, "texture": 256, "novel_views": 0, "novel_poses": 0}
+KILLED_STAGE, DONE_BEFORE = "field", 3
+"""The node is lost when so many videos are done and one of its jobs has begun this stage."""
 
 GOOD = tuple(f"person{number}" for number in range(1, 8))
 BROKEN = "broken"
 BROKEN_BYTES = 2000
 
-BATCH_TIMEOUT_S, RUNNING_TIMEOUT_S = 1500.0, 600.0
+BATCH_TIMEOUT_S = 1500.0
 STATUS_INTERVAL_S = 5
 """Snakemake asks Slurm for the states of its jobs so often; its default is 40 s."""
 
@@ -92,13 +94,13 @@ def start_batch(cluster: SlurmCluster, videos: Path, runs: Path) -> "subprocess.
     """Start `make batch CLUSTER=slurm`; its output goes to RUNS.log."""
     options = f"--slurm-init-seconds-before-status-checks {STATUS_INTERVAL_S} --set-threads avatar={node_cpus()}"
     command = [*NAMESPACE, "make", "batch", f"VIDEOS={videos.resolve()}", f"RUNS={runs.resolve()}", "CLUSTER=slurm"]
-    command += [f"PRESET={PRESET}", f"ARGS={options}"]
+    command += [f"PRESET={PRESET}", f"SET={SET}", f"ARGS={options}"]
     with runs.with_name(f"{runs.name}.log").open("ab") as log:
         return subprocess.Popen(command, cwd=REPOSITORY_DIR, env=cluster.environment, stdout=log, stderr=log)
 
 
 def lose_node(cluster: SlurmCluster, runs: Path, batch: "subprocess.Popen[bytes]", lost: str) -> None:
-    """Wait until a job is in `KILLED_STAGE`, and kill its node or the slurmd of its node.
+    """Wait until a job is in `KILLED_STAGE` after `DONE_BEFORE` videos, and kill its node or the slurmd of its node.
 
     Raises:
         RuntimeError: no job came so far.
@@ -110,9 +112,9 @@ def lose_node(cluster: SlurmCluster, runs: Path, batch: "subprocess.Popen[bytes]
             raise RuntimeError(f"the batch ended with status {batch.returncode} before a node was lost: see {runs}.log")
         busy = {node: name for node, comment in cluster.running().items() for name in GOOD if comment.endswith(name)}
         found[:] = [node for node, name in busy.items() if (runs / name / f"{KILLED_STAGE}.part").exists()]
-        return bool(found)
+        return bool(found) and len(GOOD) - count_left(runs, GOOD) >= DONE_BEFORE
 
-    wait_until(is_in_stage, RUNNING_TIMEOUT_S, f"no job came to the stage {KILLED_STAGE}: see {runs}.log")
+    wait_until(is_in_stage, BATCH_TIMEOUT_S, f"no job came to the stage {KILLED_STAGE}: see {runs}.log")
     if lost == "node":
         cluster.stop_node(found[0])
     else:

@@ -8,9 +8,11 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,8 +33,8 @@ TIMELESS = tuple(name for name in STAGES if name != "report")
 """Stages whose bytes do not hold run times."""
 
 FULL_DISK_MIB, LARGE_DISK_MIB = 4, 512
-MIN_KILL_DELAY_S, KILL_SHARE = 1.0, 0.4
-"""Least delay of a kill, and the largest as a fraction of the time of the whole run."""
+EXTRA_KILLS = 3
+"""Kills of a trial beyond one in each stage, in random stages."""
 
 MAX_LOST_S = 20.0
 """Work that a kill may destroy, CPU seconds."""
@@ -71,15 +73,15 @@ class KillLog:
         }
 
 
-def interruption_scores(captures: Path, folder: Path, kind: str, count: int, seed: int = 0) -> dict[str, float]:
+def interruption_scores(captures: Path, folder: Path, kind: str, count: int = 1, seed: int = 0) -> dict[str, float]:
     """Interrupt runs of one capture, continue them, and compare their bytes with those of an undisturbed run.
 
     Args:
         captures: folder of captures.
         folder: for the runs.
         kind: "kills", "full disk" or "two runs".
-        count: kills; when a run ends before the last of them, another one starts.
-        seed: of the times of the kills.
+        count: interruptions of the kinds that are not kills, which are one.
+        seed: of the times of the kills: one at a random time in each stage, and `EXTRA_KILLS` in random stages.
 
     Returns:
         differing_files: files of the finished runs that differ from those of the undisturbed one, or are missing.
@@ -98,10 +100,9 @@ def interruption_scores(captures: Path, folder: Path, kind: str, count: int, see
     video = make_capture(captures, CAPTURE, {}) / "video"
     undisturbed = captures.parent / "undisturbed"
     cpu_s = _run_undisturbed(undisturbed, video)
-    seconds = sum(manifest.seconds for manifest in map(read_manifest, _stages_of(undisturbed)) if manifest)
     folder.mkdir(parents=True, exist_ok=True)
     if kind == "kills":
-        return _kill_at_random(folder, video, undisturbed, KillTimes(seconds, count, seed)).scores(cpu_s)
+        return _kill_at_random(folder, video, undisturbed, kill_times(undisturbed, seed)).scores(cpu_s)
     if kind == "two runs":
         refused = _run_twice_at_once(folder / "run", video)
         return {
@@ -124,10 +125,6 @@ def differing_files(expected: Path, found: Path) -> list[str]:
             if not same and file != "progress.csv":
                 differing.append(f"{name}/{file}")
     return differing + [path.name for path in found.glob("*.part")]
-
-
-def _stages_of(run: Path) -> list[Path]:
-    return [run / name for name in STAGES]
 
 
 def _start(run: Path, video: Path, log: Path) -> subprocess.Popen[bytes]:
@@ -158,38 +155,49 @@ def _run_undisturbed(run: Path, video: Path) -> float:
     return float(cost.read_text(encoding="utf-8"))
 
 
-@dataclass(frozen=True)
-class KillTimes:
-    """When runs are killed: `count` times, after random delays that depend on the `seconds` of a whole run."""
+@dataclass
+class KillTime:
+    """A time of a kill: `delay_s` after a stage, or a later one, has begun."""
 
-    seconds: float
-    count: int
-    seed: int
+    stage: str
+    delay_s: float
+    _begin_s: float | None = field(default=None, init=False)
+
+    def has_come(self, run: Path) -> bool:
+        """Return whether the time has come; to be asked again and again."""
+        later = STAGES[STAGES.index(self.stage) :]
+        if self._begin_s is None and any((run / name).exists() or (run / f"{name}.part").exists() for name in later):
+            self._begin_s = time.monotonic()
+        return self._begin_s is not None and time.monotonic() - self._begin_s >= self.delay_s
 
 
-def _kill_at_random(folder: Path, video: Path, undisturbed: Path, times: KillTimes) -> KillLog:
-    """Kill runs and continue them until there were `times.count` kills and the last run has ended."""
-    random, found = np.random.default_rng(times.seed), KillLog()
-    while found.runs == 0 or len(found.stages) < times.count:
+def kill_times(undisturbed: Path, seed: int) -> list[KillTime]:
+    """Return random times in each stage and `EXTRA_KILLS` more, by the seconds of the undisturbed run, in order."""
+    random = np.random.default_rng(seed)
+    chosen = [*range(len(STAGES)), *random.integers(len(STAGES), size=EXTRA_KILLS)]
+    seconds = [manifest.seconds if (manifest := read_manifest(undisturbed / name)) else 0.0 for name in STAGES]
+    return [KillTime(STAGES[index], float(random.uniform(0.0, seconds[index]))) for index in sorted(chosen)]
+
+
+def _kill_at_random(folder: Path, video: Path, undisturbed: Path, times: Sequence[KillTime]) -> KillLog:
+    """Kill runs and continue them until all times have come and the last run has ended."""
+    found, left = KillLog(), list(times)
+    while found.runs == 0 or left:
         run = folder / f"run{found.runs}"
         shutil.rmtree(run, ignore_errors=True)
-        _kill_until_done(run, video, found, times, random)
+        _kill_until_done(run, video, found, left)
         found.differing += len(differing_files(undisturbed, run))
         found.runs += 1
     return found
 
 
-def _kill_until_done(run: Path, video: Path, found: KillLog, times: KillTimes, random: np.random.Generator) -> None:
-    """Kill one run and continue it until it has ended."""
+def _kill_until_done(run: Path, video: Path, found: KillLog, left: list[KillTime]) -> None:
+    """Kill one run and continue it until it has ended; `left` keeps the times that did not come."""
     log = run.with_name(f"{run.name}.log")
     while True:
         process = _start(run, video, log)
         watch = LostWork(run, process.pid)
-        longest_s = KILL_SHARE * times.seconds
-        is_killed = len(found.stages) < times.count
-        ended = wait_and_watch(
-            process, watch, float(random.uniform(MIN_KILL_DELAY_S, longest_s)) if is_killed else None
-        )
+        ended = wait_and_watch(process, watch, partial(left[0].has_come, run) if left else None)
         if ended and process.returncode != 0:
             raise RuntimeError(f"the run did not continue after {len(found.stages)} kills: {_last_line(log)}")
         if not ended:
@@ -198,6 +206,7 @@ def _kill_until_done(run: Path, video: Path, found: KillLog, times: KillTimes, r
         found.cpu_s += watch.cpu_s
         if ended:
             return
+        left.pop(0)
         found.stages.append(next((name for name in STAGES if not (run / name).exists()), "end"))
         found.lost_s.append(watch.lost_s)
 

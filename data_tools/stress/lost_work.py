@@ -7,6 +7,7 @@ machine does. A poll sees a moment up to `POLL_INTERVAL_S` late, by which the lo
 import os
 import subprocess
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -46,15 +47,13 @@ class LostWork:
             self._kept, self._kept_cpu_s = kept, self.cpu_s
 
 
-def wait_and_watch(process: "subprocess.Popen[bytes]", watch: LostWork, limit_s: float | None) -> bool:
-    """Wait for the end of a process, at most `limit_s` seconds, and watch its work; return whether it ended."""
-    deadline = None if limit_s is None else time.monotonic() + limit_s
+def wait_and_watch(process: "subprocess.Popen[bytes]", watch: LostWork, until: Callable[[], bool] | None) -> bool:
+    """Wait for the end of a process, or until a condition holds, and watch its work; return whether it ended."""
     while process.poll() is None:
         watch.poll()
-        left_s = POLL_INTERVAL_S if deadline is None else min(POLL_INTERVAL_S, deadline - time.monotonic())
-        if left_s <= 0.0:
+        if until is not None and until():
             return False
-        time.sleep(left_s)
+        time.sleep(POLL_INTERVAL_S)
     return True
 
 

@@ -111,6 +111,7 @@ def test_a_lost_node_costs_no_video(toy: Toy, tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(cluster, "broken_video", lambda _: b"1 two")
     monkeypatch.setattr(cluster, "GOOD", ("person1", "person2", "person3"))
     monkeypatch.setattr(cluster, "KILLED_STAGE", "learn")
+    monkeypatch.setattr(cluster, "DONE_BEFORE", 0)
     for module in (cluster, interruption):
         monkeypatch.setattr(module, "STAGES", TOY_STAGES)
     monkeypatch.setattr(interruption, "TIMELESS", TOY_STAGES)

@@ -3,11 +3,12 @@
 import shutil
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from data_tools.stress import interruption
-from data_tools.stress.interruption import KillLog, differing_files, interruption_scores
+from data_tools.stress.interruption import KillLog, KillTime, differing_files, interruption_scores, kill_times
 from data_tools.stress.row import CannotRunError
 from tests.core.toy_pipeline import Toy
 from tests.test_resume import TOY_STAGES
@@ -28,16 +29,14 @@ def folders(toy: Toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[
     monkeypatch.setattr(interruption, "make_capture", lambda *_: toy.folder)
     monkeypatch.setattr(interruption, "STAGES", TOY_STAGES)
     monkeypatch.setattr(interruption, "TIMELESS", TOY_STAGES)
-    monkeypatch.setattr(interruption, "MIN_KILL_DELAY_S", 0.05)
     return tmp_path / "captures", tmp_path / "trial"
 
 
 @pytest.mark.slow
 def test_killed_runs_end_with_the_same_bytes(folders: tuple[Path, Path]) -> None:
-    scores = interruption_scores(*folders, kind="kills", count=3)
+    scores = interruption_scores(*folders, kind="kills")
     assert scores["differing_files"] == 0.0
-    assert scores["interruptions"] == 3.0
-    assert sum(scores[f"kills_in_{name}"] for name in TOY_STAGES) <= 3.0
+    assert scores["interruptions"] == len(TOY_STAGES) + interruption.EXTRA_KILLS
     assert 0.0 <= scores["repeated_seconds"] < 20.0
 
 
@@ -50,7 +49,7 @@ def test_two_runs_at_once_end_with_the_same_bytes(folders: tuple[Path, Path]) ->
 
 @pytest.mark.slow
 def test_differences_are_counted(folders: tuple[Path, Path]) -> None:
-    interruption_scores(*folders, kind="kills", count=0)
+    interruption_scores(*folders, kind="kills")
     expected, found = folders[0].parent / "undisturbed", folders[1] / "run0"
     assert differing_files(expected, found) == []
     shutil.rmtree(found / TOY_STAGES[-1])
@@ -58,6 +57,28 @@ def test_differences_are_counted(folders: tuple[Path, Path]) -> None:
     differing = differing_files(expected, found)
     assert "learn.part" in differing
     assert any(name.startswith(f"{TOY_STAGES[-1]}/") for name in differing)
+
+
+def test_each_stage_is_killed_within_its_seconds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seconds = {"a": 1.0, "b": 10.0, "c": 100.0}
+    monkeypatch.setattr(interruption, "STAGES", tuple(seconds))
+    monkeypatch.setattr(interruption, "read_manifest", lambda folder: SimpleNamespace(seconds=seconds[folder.name]))
+    times = kill_times(tmp_path, seed=3)
+    assert len(times) == len(seconds) + interruption.EXTRA_KILLS
+    assert list(dict.fromkeys(time.stage for time in times)) == list(seconds)
+    assert all(0.0 <= time.delay_s <= seconds[time.stage] for time in times)
+    assert times == kill_times(tmp_path, seed=3)
+    assert times != kill_times(tmp_path, seed=4)
+
+
+def test_a_kill_waits_for_its_stage_or_a_later_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(interruption, "STAGES", ("a", "b", "c"))
+    (tmp_path / "a").mkdir()
+    kill, late = KillTime("b", 0.0), KillTime("b", 60.0)
+    assert not kill.has_come(tmp_path)
+    (tmp_path / "c.part").mkdir()
+    assert kill.has_come(tmp_path)
+    assert not late.has_come(tmp_path)
 
 
 def test_scores_of_kills_are_the_worst_of_each_stage(monkeypatch: pytest.MonkeyPatch) -> None:

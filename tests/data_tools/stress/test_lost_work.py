@@ -67,8 +67,7 @@ def test_a_process_is_watched_to_its_limit_or_its_end(tmp_path: Path) -> None:
     process = subprocess.Popen([sys.executable, "-c", BUSY.format(seconds=60)], start_new_session=True)
     start, watch = time.monotonic(), LostWork(tmp_path, process.pid)
     try:
-        assert not wait_and_watch(process, watch, 0.6)
-        assert time.monotonic() - start < 30.0
+        assert not wait_and_watch(process, watch, lambda: time.monotonic() - start > 0.6)
         assert watch.cpu_s > 0.0
     finally:
         process.kill()
