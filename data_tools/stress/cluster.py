@@ -24,7 +24,7 @@ GOOD = tuple(f"person{number}" for number in range(1, 8))
 BROKEN = "broken"
 BROKEN_BYTES = 2000
 
-BATCH_TIMEOUT_S = 1500.0
+BATCH_TIMEOUT_S = 2400.0
 STATUS_INTERVAL_S = 5
 """Snakemake asks Slurm for the states of its jobs so often; its default is 40 s."""
 
