@@ -4,8 +4,8 @@ python -m data_tools.stress [--rows focal broken-numbers ...] [--out runs/stress
 
 Results of trials are kept in OUT/results, so an interrupted sweep continues, and a trial runs again only when its
 settings, the preset or the version of a stage change. Writes OUT/stress.csv, stress.png and the tables of
-docs/stress.md, which show the newest result of each trial and name its commit. Exit status 1: a pass line is crossed;
-2: an input is not valid.
+docs/stress.md, which show the newest result of each trial and name its commit; a row of which they show more trials
+than have results in OUT stays as it is. Exit status 1: a pass line is crossed; 2: an input is not valid.
 """
 
 import argparse

@@ -3,7 +3,8 @@
 python -m data_tools.stress.procedures REQUEST.json SCORES.json
 
 runs one trial; `data_tools.stress.run_trial` starts it as a process of its own, so that a crash or a leak of one trial
-is a result and does not end the sweep. A refusal (UserError) ends it with exit status 2 and one sentence.
+is a result and does not end the sweep. A refusal (UserError) ends it with exit status 2 and one sentence; a machine
+that lacks what the trial needs (CannotRunError), with exit status `EXIT_CANNOT_RUN`.
 """
 
 import json
@@ -21,10 +22,11 @@ import stages
 from data_tools.command import run_command
 from data_tools.folder import atomic_folder
 from data_tools.stress.captures import make_capture, true_view_deg
+from data_tools.stress.cluster import cluster_scores
 from data_tools.stress.hostile.run import hostile_scores
 from data_tools.stress.interruption import interruption_scores
 from data_tools.stress.measures import MEASURES
-from data_tools.stress.row import Number
+from data_tools.stress.row import EXIT_CANNOT_RUN, CannotRunError, Number
 from data_tools.stress.store import PRESET_FILE
 from data_tools.sweep.runs import find_video
 from pipeline.body.body import Motion
@@ -139,6 +141,7 @@ def noisy_motion(motion: Motion, joints_deg: float, root_m: float, seed: int) ->
 PROCEDURES: Mapping[str, Callable[..., Mapping[str, float]]] = {
     "reconstruct": reconstruct,
     "hostile": lambda workshop, **settings: hostile_scores(workshop.run, **settings),
+    "cluster": lambda workshop, **settings: cluster_scores(workshop.captures, workshop.run, **settings),
     "interruption": lambda workshop, **settings: interruption_scores(workshop.captures, workshop.run, **settings),
 }
 
@@ -156,4 +159,8 @@ def main(argv: Sequence[str]) -> None:
 
 if __name__ == "__main__":
     die_with_parent()
-    raise SystemExit(run_command(main, sys.argv[1:]))
+    try:
+        raise SystemExit(run_command(main, sys.argv[1:]))
+    except CannotRunError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(EXIT_CANNOT_RUN) from None

@@ -9,7 +9,14 @@ Number = int | float
 
 DONE, REFUSED, FAILED, MISSING = "done", "refused", "failed", "not run"
 """States of a trial: scores were measured; the program refused the input in one sentence; it failed in another way
-(a fault of the program, never a pass); not run yet."""
+(a fault of the program, never a pass); not run yet, or not possible on this machine."""
+
+EXIT_CANNOT_RUN = 3
+"""Exit status of the process of a trial that raised `CannotRunError`."""
+
+
+class CannotRunError(Exception):
+    """This machine lacks what a trial needs, which says nothing about the program; the message says what and how."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-from data_tools.stress.row import DONE, FAILED, MISSING, REFUSED, Trial, TrialResult
+from data_tools.stress.row import DONE, EXIT_CANNOT_RUN, FAILED, MISSING, REFUSED, Trial, TrialResult
 from data_tools.stress.store import load_result, save_result, settings_key, trial_key
 from data_tools.sweep.chart_trials import describe_machine
 from data_tools.sweep.runs import last_error_message
@@ -44,6 +44,8 @@ def read_latest(out: Path, trial: Trial, older: Mapping[str, Path]) -> TrialResu
 def run_trial(out: Path, trial: Trial, keep: bool = False) -> TrialResult:
     """Return the result of a trial, which is run if there is none.
 
+    If this machine lacks what the trial needs, the state is `MISSING` and the message says what; nothing is kept.
+
     A run folder that an interrupted sweep left is used: its finished stages are not run again.
 
     Args:
@@ -63,7 +65,8 @@ def run_trial(out: Path, trial: Trial, keep: bool = False) -> TrialResult:
     start = time.monotonic()
     code = _run_process(request, scores, log)
     result = _interpret(code, scores, log, round(time.monotonic() - start, 1), out)
-    save_result(result_path(out, trial), trial, result)
+    if result.state != MISSING:
+        save_result(result_path(out, trial), trial, result)
     if not keep and result.state != FAILED:
         shutil.rmtree(run, ignore_errors=True)
     for path in (request, scores):
@@ -99,6 +102,8 @@ def _interpret(code: int | None, scores: Path, log: Path, seconds: float, out: P
         numbers = {name: float("nan") if value is None else float(value) for name, value in document.items()}
     elif code == EXIT_USER_ERROR:
         state = REFUSED
+    elif code == EXIT_CANNOT_RUN:
+        state = MISSING
     else:
         state, message = FAILED, message or f"exit status {code}" if code is not None else "it hung"
     lines = log.read_text(encoding="utf-8", errors="replace").splitlines()

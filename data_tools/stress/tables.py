@@ -7,7 +7,8 @@ from pathlib import Path
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from data_tools.stress.row import DONE, MISSING, Results, Row
+from data_tools.stress.published import PublishedRow, read_published
+from data_tools.stress.row import DONE, MISSING, Results, Row, TrialResult
 from data_tools.sweep.chart_trials import format_origin, join_distinct, short_commit
 from data_tools.sweep.runs import write_csv
 from pipeline.core.atomic import atomic_path
@@ -41,26 +42,40 @@ def write_csv_table(path: Path, rows: Mapping[str, Row], sweep: Sweep) -> None:
 def write_document(path: Path, rows: Mapping[str, Row], sweep: Sweep, command: str) -> None:
     """Replace the tables of the document between its marks; what stands around them stays.
 
+    A row of which the document shows more finished trials than there are results here keeps its tables.
+
     Raises:
         ValueError: the document has no marks.
     """
     text = path.read_text(encoding="utf-8")
     before, start, rest = text.partition(TABLE_START)
-    _, end, after = rest.partition(TABLE_END)
+    old, end, after = rest.partition(TABLE_END)
     if not start or not end:
         raise ValueError(f"{path} has no {TABLE_START} and {TABLE_END}")
-    tables = "\n".join([summary_table(rows, sweep), *(trial_table(rows[name], sweep[name]) for name in sweep)])
+    published = read_published(old)
+    kept = {
+        name: row for name, row in published.rows.items() if name in sweep and row.trials > len(_finished(sweep[name]))
+    }
+    sections = [kept[name].section if name in kept else trial_table(rows[name], sweep[name]) for name in sweep]
+    tables = "\n".join([summary_table(rows, sweep, kept), *sections])
+    origin = _provenance(sweep, kept, published.machines)
     with atomic_path(path) as part:
-        part.write_text(f"{before}{start}\n\n{tables}\n{_provenance(sweep)}; `{command}`.\n{end}{after}", "utf-8")
+        part.write_text(f"{before}{start}\n\n{tables}\n{origin}; `{command}`.\n{end}{after}", "utf-8")
 
 
-def summary_table(rows: Mapping[str, Row], sweep: Sweep) -> str:
-    """Return the table of all rows: failure, pass line, verdict, number of trials and minutes."""
+def summary_table(rows: Mapping[str, Row], sweep: Sweep, kept: Mapping[str, PublishedRow] | None = None) -> str:
+    """Return the table of all rows: failure, pass line, verdict, number of trials and minutes.
+
+    kept: rows whose line is that of the document.
+    """
     lines = ["| row | failure | pass line | verdict | trials | minutes | preset | commit |", "|---" * 8 + "|"]
     for name, results in sweep.items():
+        if kept and name in kept:
+            lines.append(kept[name].summary)
+            continue
         row = rows[name]
         verdict, _ = row.verdict(results)
-        done = [result for result in results.values() if result.state != MISSING]
+        done = _finished(results)
         minutes = f"{sum(result.seconds for result in done) / 60:.0f}" if done else ""
         commit = join_distinct(short_commit(result.commit) for result in done)
         missing = f". Not made: {row.missing}" if row.missing else ""
@@ -134,9 +149,16 @@ def _points(row: Row, results: Results) -> list[tuple[str, float]]:
     return [(label, value) for label, value in values if math.isfinite(value)]
 
 
-def _provenance(sweep: Sweep) -> str:
-    done = [result for results in sweep.values() for result in results.values() if result.state != MISSING]
-    return format_origin((result.commit for result in done), (result.machine for result in done))
+def _finished(results: Results) -> list[TrialResult]:
+    return [result for result in results.values() if result.state != MISSING]
+
+
+def _provenance(sweep: Sweep, kept: Mapping[str, PublishedRow], machines: str) -> str:
+    """Return commits and machines of what is shown; `machines`: those of the document, of which the kept rows are."""
+    done = [result for name, results in sweep.items() if name not in kept for result in _finished(results)]
+    commits = [commit for row in kept.values() for commit in row.commits]
+    own = [result.machine for result in done]
+    return format_origin([*commits, *(result.commit for result in done)], [machines, *own] if kept else own)
 
 
 def _short_message(message: str) -> str:

@@ -61,6 +61,13 @@ def test_ends_are_told_apart(
     assert runner.read_trial(tmp_path, TRIAL) == result
 
 
+def test_what_this_machine_cannot_run_is_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runner, "_run_process", stand_in(3, {}, "error: the trial needs Slurm\n"))
+    result = runner.run_trial(tmp_path, TRIAL)
+    assert (result.state, result.message) == (MISSING, "the trial needs Slurm")
+    assert not runner.result_path(tmp_path, TRIAL).exists()
+
+
 def test_an_interrupted_sweep_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def killed(*_: Path) -> int:
         raise KeyboardInterrupt
