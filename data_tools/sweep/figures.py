@@ -126,6 +126,12 @@ def insert_tables(text: str, tables: Mapping[str, str], document: Path, others: 
     return re.sub(r"<!-- figures: (\S+) -->.*?" + re.escape(END), replaced, text, flags=re.DOTALL)
 
 
+def read_table(text: str, name: str) -> str:
+    """Return what stands between the markers of a table of a document; empty without them."""
+    found = re.search(rf"<!-- figures: {re.escape(name)} -->(.*?){re.escape(END)}", text, flags=re.DOTALL)
+    return found.group(1) if found else ""
+
+
 def _parse(argv: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m data_tools.sweep.figures", description=(__doc__ or "").splitlines()[0]

@@ -5,7 +5,8 @@ python -m data_tools.sweep.materials CAPTURE ... [--mesh true run] [--seeds 0 1 
 `--mesh true`: true mesh, poses and masks, so that errors are those of the texture stage alone; nothing of it depends on
 the seed but the changes of the exposure, so the first seed is used. `--mesh run`: whole runs; the seed enters from the
 field stage on, and runs of one capture share frames and body. Figures of a trial are stored, so an interrupted sweep
-continues, and stored again where the version of the texture stage has changed.
+continues, and stored again where the version of the texture stage has changed. A row of the table that was not measured
+now stays as it is; each row names its commit.
 """
 
 import argparse
@@ -14,10 +15,11 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from data_tools.command import run_command
-from data_tools.sweep.chart_trials import Trial, describe_machine, format_origin, read_trial, run_trial
-from data_tools.sweep.figures import MATERIALS, OWN_TABLES, insert_tables
+from data_tools.sweep.chart_trials import Trial, describe_machine, join_distinct, read_trial, run_trial, short_commit
+from data_tools.sweep.figures import MATERIALS, OWN_TABLES, insert_tables, read_table
 from data_tools.sweep.material_trials import MaterialTrial, measure, read_figures
 from data_tools.sweep.runs import RunState, log_path
 from pipeline.core.errors import UserError
@@ -28,6 +30,8 @@ DOCUMENT = Path("docs/benchmarks.md")
 STAGES_UNTIL_MESH = ("frames", "body", "field", "mesh")
 TRUE, RUN = "true", "run"
 Figures = Mapping[str, float]
+RowKey = tuple[str, str]
+"""Of a row of the table: capture and mesh."""
 
 
 @dataclass(frozen=True)
@@ -60,21 +64,28 @@ def main(argv: Sequence[str]) -> None:
             stored[trial] = figures
     if not stored:
         raise UserError(f"{options.out} has no figures: run the command without --write-only")
-    table = material_table({trial: each["figures"] for trial, each in stored.items()})
-    origin = format_origin(
-        (str(each["commit"]) for each in stored.values()),
-        (describe_machine(each["environment"]) for each in stored.values()),
-    )
+    text = DOCUMENT.read_text(encoding="utf-8")
+    rows = published_rows(read_table(text, MATERIALS)) | material_rows(stored)
+    table = "\n".join([*TABLE_HEAD, *(rows[key] for key in sorted(rows, key=lambda key: _order(key, rows)))]) + "\n"
+    machines = join_distinct(describe_machine(each["environment"]) for each in stored.values())
+    note = f"\nLast measured on {machines or 'an unknown machine'}: `make materials {_make_variables(options)}`.\n"
+    DOCUMENT.write_text(insert_tables(text, {MATERIALS: table + note}, DOCUMENT, OWN_TABLES), encoding="utf-8")
+    print(table)
+
+
+def _make_variables(options: argparse.Namespace) -> str:
     chosen = {
         "CAPTURES": " ".join(map(str, options.captures)),
         "SEEDS": " ".join(map(str, options.seeds)),
         "ARGS": f"--mesh {' '.join(options.mesh)}",
     }
-    command = " ".join(f"{name}='{value}'" for name, value in chosen.items())
-    note = f"\n{origin}; `make materials {command}`.\n"
-    text = DOCUMENT.read_text(encoding="utf-8")
-    DOCUMENT.write_text(insert_tables(text, {MATERIALS: table + note}, DOCUMENT, OWN_TABLES), encoding="utf-8")
-    print(table)
+    return " ".join(f"{name}='{value}'" for name, value in chosen.items())
+
+
+def _order(key: RowKey, rows: Mapping[RowKey, str]) -> tuple[int, bool]:
+    """Captures in the order of their first rows, the true mesh before runs."""
+    captures = list(dict.fromkeys(capture for capture, _ in rows))
+    return captures.index(key[0]), key[1] != TRUE
 
 
 def trials_of(
@@ -133,18 +144,40 @@ COLUMNS = (
 )
 
 
-def material_table(figures: Mapping[MaterialTrial, Figures]) -> str:
-    """Return a row for each capture and mesh: the mean over seeds, and least and greatest of several."""
-    heads = ["capture", "mesh", "seeds", *(column.heading for column in COLUMNS)]
-    lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
-    groups: dict[tuple[str, str], list[MaterialTrial]] = {}
-    for trial in figures:
+HEADINGS = ("capture", "mesh", "seeds", *(column.heading for column in COLUMNS), "commit")
+TABLE_HEAD = (f"| {' | '.join(HEADINGS)} |", "|---" * len(HEADINGS) + "|")
+
+
+def material_rows(stored: Mapping[MaterialTrial, Mapping[str, Any]]) -> dict[RowKey, str]:
+    """Return a row for each capture and mesh: the mean over seeds, least and greatest of several, and the commits.
+
+    stored: of each trial, what `read_figures` returns.
+    """
+    groups: dict[RowKey, list[MaterialTrial]] = {}
+    for trial in stored:
         groups.setdefault((trial.base.capture_name, TRUE if trial.true_mesh else RUN), []).append(trial)
-    for (capture, mesh), trials in groups.items():
+    rows = {}
+    for key, trials in groups.items():
         seeds = " ".join(str(trial.base.seed) for trial in trials)
-        cells = [_cell(column, [figures[trial] for trial in trials]) for column in COLUMNS]
-        lines.append(f"| {' | '.join([capture, mesh, seeds, *cells])} |")
-    return "\n".join(lines) + "\n"
+        cells = [_cell(column, [stored[trial]["figures"] for trial in trials]) for column in COLUMNS]
+        commits = join_distinct(short_commit(str(stored[trial]["commit"])) for trial in trials)
+        rows[key] = f"| {' | '.join([*key, seeds, *cells, commits])} |"
+    return rows
+
+
+def published_rows(table: str) -> dict[RowKey, str]:
+    """Return the rows of a table that was written before.
+
+    Raises:
+        UserError: the table has other columns than today's.
+    """
+    lines = [line for line in table.splitlines() if line.startswith("|")]
+    if lines and tuple(lines[:2]) != TABLE_HEAD:
+        raise UserError(
+            f"{DOCUMENT}: the table {MATERIALS} has other columns than this version writes: "
+            "remove its rows and measure all captures again"
+        )
+    return {(cells[1].strip(), cells[2].strip()): line for line in lines[2:] for cells in [line.split("|")]}
 
 
 def _cell(column: Column, rows: Sequence[Figures]) -> str:

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -9,7 +10,7 @@ import stages
 from data_tools.sweep.chart_trials import Trial
 from data_tools.sweep.figures import END, insert_tables
 from data_tools.sweep.material_trials import MaterialTrial, read_figures
-from data_tools.sweep.materials import DOCUMENT, finish_run, main, material_table, trials_of
+from data_tools.sweep.materials import DOCUMENT, TABLE_HEAD, finish_run, main, material_rows, trials_of
 from data_tools.sweep.runs import RunState
 from pipeline.core.errors import UserError
 from stages.texture import STAGE as TEXTURE
@@ -34,12 +35,19 @@ def trial(seed: int = 0, true_mesh: bool = False, out: Path = Path("runs/materia
     return MaterialTrial(Trial(Path("captures/ann"), "instant", seed, out), true_mesh)
 
 
-def test_a_row_has_mean_and_range_over_the_seeds() -> None:
+def measured(figures: dict[str, float], commit: str = "a" * 40) -> dict[str, Any]:
+    return {"texture_version": TEXTURE.version, "commit": commit, "environment": {"cpu": "Xeon"}, "figures": figures}
+
+
+def test_a_row_has_mean_and_range_over_the_seeds_and_its_commits() -> None:
     other = FIGURES | {"albedo_error_auto": 6.0, "heldout_psnr_body_db_auto": 27.5}
-    table = material_table({trial(0): FIGURES, trial(1): other, trial(0, true_mesh=True): FIGURES | SHINY})
-    runs, true = table.splitlines()[2:]
-    assert runs == ("| ann | run | 0 1 | 10.0 | 50 (40 to 60) | 4.0 | 1.2 (0.5 to 2.0) |  |  | 3 |  | 1.2 | 8 |")
-    assert true == "| ann | true | 0 | 10.0 | 40 | 4.0 | 0.5 | 0.62 | 4 | 3 | 1.2 | 1.2 | 8 |"
+    trials = {trial(0): FIGURES, trial(1): other, trial(0, true_mesh=True): FIGURES | SHINY}
+    commits = ["a" * 40, "b" * 40, "a" * 40]
+    rows = material_rows({key: measured(*each) for key, *each in zip(trials, trials.values(), commits, strict=True)})
+    runs, true = rows["ann", "run"], rows["ann", "true"]
+    cells = "| ann | run | 0 1 | 10.0 | 50 (40 to 60) | 4.0 | 1.2 (0.5 to 2.0) |  |  | 3 |  | 1.2 | 8 |"
+    assert runs == f"{cells} {'a' * 10}; {'b' * 10} |"
+    assert true == f"| ann | true | 0 | 10.0 | 40 | 4.0 | 0.5 | 0.62 | 4 | 3 | 1.2 | 1.2 | 8 | {'a' * 10} |"
 
 
 def test_the_true_mesh_is_measured_once_and_runs_once_a_seed() -> None:
@@ -78,25 +86,49 @@ def test_a_run_that_is_finished_up_to_the_mesh_is_measured_as_it_is(
     assert bool(started) == is_run
 
 
-def test_stored_figures_are_written_into_the_document(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Other tables stay; nothing is measured."""
+@pytest.fixture
+def stored_capture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A capture with stored figures of the true mesh in `out`, beside a docs folder."""
     monkeypatch.chdir(tmp_path)
-    capture, out = tmp_path / "ann", tmp_path / "out"
+    capture = tmp_path / "ann"
     (capture / "truth").mkdir(parents=True)
-    with pytest.raises(UserError, match="no figures"):
-        main([str(capture), "--out", str(out), "--write-only"])
-    stored = MaterialTrial(Trial(capture, "instant", 0, out), true_mesh=True)
+    stored = MaterialTrial(Trial(capture, "instant", 0, tmp_path / "out"), true_mesh=True)
     stored.path.parent.mkdir(parents=True)
-    figures = {"texture_version": TEXTURE.version, "commit": "a" * 40, "environment": {"cpu": "Xeon"}}
-    stored.path.write_text(json.dumps(figures | {"figures": FIGURES}))
+    stored.path.write_text(json.dumps(measured(FIGURES)))
     DOCUMENT.parent.mkdir()
-    presets = f"<!-- figures: presets -->\nold\n{END}\n"
-    DOCUMENT.write_text(f"{presets}<!-- figures: materials -->\n{END}\n")
-    main([str(capture), "--out", str(out), "--write-only"])
-    text = DOCUMENT.read_text()
-    assert text.startswith(presets)
+    return capture
+
+
+def write_table(capture: Path, table: str) -> str:
+    """Write stored figures into a document with a table, and return the document."""
+    DOCUMENT.write_text(f"<!-- figures: presets -->\nold\n{END}\n<!-- figures: materials -->\n{table}\n{END}\n")
+    main([str(capture), "--out", "out", "--write-only"])
+    return DOCUMENT.read_text()
+
+
+def test_stored_figures_are_written_into_the_document(stored_capture: Path) -> None:
+    """Other tables stay; nothing is measured."""
+    text = write_table(stored_capture, "")
+    assert text.startswith(f"<!-- figures: presets -->\nold\n{END}\n")
     assert "| ann | true | 0 | 10.0 | 40 |" in text
-    assert "Commit aaaaaaaaaa, Xeon" in text
+    assert "Last measured on Xeon" in text
+    with pytest.raises(UserError, match="no figures"):
+        main([str(stored_capture), "--out", "elsewhere", "--write-only"])
+
+
+def test_rows_that_are_not_measured_stay_and_others_are_replaced_in_place(stored_capture: Path) -> None:
+    rest = f"{'| 1.0 ' * (len(TABLE_HEAD[0].split('|')) - 5)}|"
+    kept = [f"| ann | run | 0 1 {rest}", f"| bob | true | 0 {rest}"]
+    old = [*TABLE_HEAD, kept[0], f"| ann | true | 0 {rest}", kept[1]]
+    rows = [line for line in write_table(stored_capture, "\n".join(old)).splitlines() if line.startswith("|")]
+    assert rows[:2] == list(TABLE_HEAD)
+    assert rows[2].startswith("| ann | true | 0 | 10.0 | 40 |")
+    assert rows[3:] == kept
+
+
+def test_a_table_with_other_columns_is_not_overwritten(stored_capture: Path) -> None:
+    with pytest.raises(UserError, match="other columns"):
+        write_table(stored_capture, "| capture | mesh |\n|---|---|\n| ann | run |")
 
 
 def test_a_video_without_truth_is_refused(tmp_path: Path) -> None:
