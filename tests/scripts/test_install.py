@@ -63,7 +63,7 @@ def test_extras_come_from_the_project_file() -> None:
     assert install.extra_packages("cluster") == [
         "snakemake>=8",
         "snakemake-executor-plugin-kubernetes",
-        "snakemake-executor-plugin-slurm",
+        "snakemake-executor-plugin-slurm>=2",
         "snakemake-storage-plugin-fs",
     ]
     with pytest.raises(SystemExit, match="cuda, cluster, usdz, web, dev"):
