@@ -20,7 +20,7 @@ HALF_THE_PARAMETERS = (
     "half the parameters, as many as the surface needs, cost three people 0.15 dB and saved 3 % of the time"
 )
 FEWER_FRAMES = (
-    "fewer gained 0.2 dB on two generated turns, but lost 0.3 dB on a filmed turn and 0.2 to 0.4 dB on a dance"
+    "fewer gained 0.2 to 0.4 dB on two rendered turns, but lost 0.3 dB on a filmed turn and 0.2 to 0.4 dB on a dance"
 )
 
 
