@@ -86,6 +86,7 @@ def load_textured_avatar(mesh_dir: Path, texture_dir: Path) -> TexturedAvatar:
         diffuse=torch.from_numpy(texture.diffuse),
         light=texture.light,
         gloss=vertex_gloss(texture, len(skinned.mesh.vertices)),
+        normal_map=texture.normal,
     )
 
 

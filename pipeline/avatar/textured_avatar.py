@@ -3,14 +3,15 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Float32, Int, UInt8
 from torch import Tensor
 
+from pipeline.avatar.pixel_shading import NormalMappedMesh
 from pipeline.geometry.alpha import crop_empty_columns, unpremultiply_to_uint8
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import dense_weights, linear_blend_skinning
-from pipeline.geometry.texture_rendering import render_textured, turntable_cameras
+from pipeline.geometry.texture_rendering import apply_shading, render_textured, turntable_cameras
 from pipeline.texture.light import VertexGloss, VideoLight
 
 
@@ -28,6 +29,7 @@ class TexturedAvatar:
         diffuse: sRGB in [0, 1]; row 0 is v = 1.
         light: of the video; None or uniform if the diffuse texture holds it.
         gloss: highlights of the vertices under that light; None for a matte surface.
+        normal_map: tangent space, in [0, 1]; None: the normals of the vertices. Drawn under a light, not unlit.
     """
 
     vertices: Float[Tensor, "v 3"]
@@ -39,6 +41,7 @@ class TexturedAvatar:
     diffuse: Float[Tensor, "th tw 3"]
     light: VideoLight | None = None
     gloss: VertexGloss | None = None
+    normal_map: Float32[np.ndarray, "n n 3"] | None = None
 
     def mesh(self) -> Mesh:
         """Return the canonical mesh without texture and skin."""
@@ -62,11 +65,17 @@ class TexturedAvatar:
         light: None: unlit. frame: selected frame whose exposure is used; None: the mean exposure.
         """
         shading = None
-        if light is not None and not (light.is_uniform and frame is None):
+        is_lit = light is not None and not (light.is_uniform and frame is None)
+        if light is not None and is_lit and self.normal_map is None:
             shading = self._shade(vertices_world, camera, light, frame)
-        return render_textured(
+        drawn = render_textured(
             vertices_world, self.faces, self.faces_uv, self.uv, self.diffuse, camera, supersampling, shading
-        ).numpy()
+        )
+        if light is not None and is_lit and self.normal_map is not None:
+            mesh = NormalMappedMesh(vertices_world, self.faces, self.uv, self.faces_uv, self.normal_map)
+            pixels = mesh.shade(camera, light, frame, self.gloss if light is self.light else None)
+            drawn = drawn if pixels is None else apply_shading(drawn, pixels)
+        return drawn.numpy()
 
     def _shade(
         self, vertices_world: Float[Tensor, "v 3"], camera: Camera, light: VideoLight, frame: int | None
