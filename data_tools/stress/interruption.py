@@ -1,6 +1,7 @@
 """Interrupted runs: kill -9 at random times, a full disk, two runs on one folder; each must end with the same bytes.
 
-A kill may destroy at most `MAX_LOST_S` of work. Work is counted in CPU seconds, see `data_tools.stress.lost_work`.
+A kill may destroy at most `MAX_LOST_S` of work. Work is counted in CPU seconds, see `data_tools.stress.lost_work`. The
+undisturbed run has as many threads as the others: the last digits of the fitted body depend on their number.
 """
 
 import os
@@ -98,7 +99,7 @@ def interruption_scores(captures: Path, folder: Path, kind: str, count: int = 1,
         RuntimeError: an interrupted run did not end as it should.
     """
     video = make_capture(captures, CAPTURE, {}) / "video"
-    undisturbed = captures.parent / "undisturbed"
+    undisturbed = captures.parent / f"undisturbed-{os.environ.get('OMP_NUM_THREADS', 'all')}-threads"
     cpu_s = _run_undisturbed(undisturbed, video)
     folder.mkdir(parents=True, exist_ok=True)
     if kind == "kills":

@@ -26,6 +26,7 @@ def folders(toy: Toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[
         return process
 
     monkeypatch.setattr(interruption, "_start", start)
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
     monkeypatch.setattr(interruption, "make_capture", lambda *_: toy.folder)
     monkeypatch.setattr(interruption, "STAGES", TOY_STAGES)
     monkeypatch.setattr(interruption, "TIMELESS", TOY_STAGES)
@@ -50,7 +51,7 @@ def test_two_runs_at_once_end_with_the_same_bytes(folders: tuple[Path, Path]) ->
 @pytest.mark.slow
 def test_differences_are_counted(folders: tuple[Path, Path]) -> None:
     interruption_scores(*folders, kind="kills")
-    expected, found = folders[0].parent / "undisturbed", folders[1] / "run0"
+    expected, found = folders[0].parent / "undisturbed-1-threads", folders[1] / "run0"
     assert differing_files(expected, found) == []
     shutil.rmtree(found / TOY_STAGES[-1])
     (found / "learn.part").mkdir()
