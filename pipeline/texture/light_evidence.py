@@ -16,10 +16,10 @@ from pipeline.texture.light_fit import (
     Prediction,
     ViewObservations,
     fit_light,
+    mean_log_albedo,
     observe_light,
     observe_visibility,
     predict_views,
-    robust_log_albedo,
 )
 from pipeline.texture.settings import TextureSettings
 from pipeline.texture.views import BakeView
@@ -134,7 +134,7 @@ def estimate_light(
 
 def _constant_light(observed: LightObservations, gain: np.ndarray, vertex_count: int) -> LightFit:
     irradiance = np.ones((len(observed.vertex), 3))
-    return LightFit(VideoLight.uniform(len(gain)), robust_log_albedo(observed, irradiance, gain, vertex_count))
+    return LightFit(VideoLight.uniform(len(gain)), mean_log_albedo(observed, irradiance, gain, vertex_count))
 
 
 def _improvement(before: Prediction, after: Prediction) -> float:

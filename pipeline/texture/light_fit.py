@@ -5,8 +5,6 @@ minimise the robust (Cauchy) error of all three. A step is linear, sparse in the
 unknowns, so the albedos are eliminated (variable projection: Golub and Pereyra, 1973). A turn about the vertical hardly
 tells how the light changes with height, because it keeps the height of a normal: neighbouring vertices of equal colour
 tell it, by a prior that their albedos are equal, robust against edges of the albedo (Retinex: Land and McCann, 1971).
-The prior weighs more, the noisier the observations are. Only the light is taken from this problem: an albedo is the
-robust mean of what its vertex shows under that light.
 """
 
 from collections.abc import Sequence
@@ -33,17 +31,11 @@ BASIS_SIZE = 9
 MAX_STEP = 0.7
 """Of log albedo, log gain or a coefficient in one Gauss-Newton step."""
 
-ALBEDO_CHANGE, ALBEDO_SMOOTHNESS = 0.08, (0.02, 10.0)
-"""Difference of two neighbours' log albedos that is usual: against the observations of a vertex (of median weight) the
-prior weighs (noise / ALBEDO_CHANGE)^2, within these limits. The noise is 0.015 to 0.05 with a true mesh, and 0.09 with
-the normals of a mesh from raw video."""
+ALBEDO_SMOOTHNESS = 0.05
+"""Weight of the difference of two neighbours' log albedos, relative to the median weight of a vertex's observations."""
 
-ALBEDO_EDGE, EDGE_PER_NOISE = (0.08, 0.2), 2.0
-"""Difference of two log albedos at which the robust prior has a quarter of its weight: so many times the noise,
-within these limits."""
-
-ALBEDO_REWEIGHTINGS = 3
-"""Of the observations of a vertex, to find its albedo under a known light."""
+ALBEDO_EDGE = 0.08
+"""Difference of two log albedos at which the robust prior has a quarter of its weight."""
 
 DAMPING, GAUGE_WEIGHT = 1e-3, 1e3
 """Weights that keep a step small, of all unknowns and of the constant terms, whose scale is that of the albedo."""
@@ -109,11 +101,11 @@ class ViewObservations:
 
 @dataclass(frozen=True)
 class LightFit:
-    """Light and gains, and the albedo under them.
+    """Light and gains, and the albedo that was solved with them.
 
     Attributes:
         light: its `gain` has one entry per view.
-        log_albedo: logarithm of the linear albedo of each vertex, robust mean; 0 at vertices that no view shows.
+        log_albedo: logarithm of the linear albedo of each vertex; 0 at vertices that no view shows.
     """
 
     light: VideoLight
@@ -155,33 +147,16 @@ def vertex_mean(vertex: np.ndarray, values: np.ndarray, weight: np.ndarray, coun
     return np.bincount(vertex, weight * values, count) / total
 
 
-def robust_log_albedo(
+def mean_log_albedo(
     observed: LightObservations,
     irradiance: Float[np.ndarray, "k 3"],
     gain: Float[np.ndarray, "n"],
     vertex_count: int,
 ) -> Float[np.ndarray, "v 3"]:
-    """Return the robust mean log albedo of each vertex under a light; 0 without observations."""
-    shaded, weight = _log_shaded(observed, irradiance, gain), observed.log_weight()
-    albedo = _vertex_means(observed, shaded, weight, vertex_count)
-    for _ in range(ALBEDO_REWEIGHTINGS):
-        length = np.linalg.norm(shaded - albedo[observed.vertex], axis=1)
-        albedo = _vertex_means(observed, shaded, weight / (1.0 + (length / _noise(length)) ** 2), vertex_count)
-    return albedo
-
-
-def _log_shaded(observed: LightObservations, irradiance: np.ndarray, gain: np.ndarray) -> np.ndarray:
-    """Return the log albedo that each observation shows under a light."""
-    return observed.log_linear() - np.log(irradiance) - np.log(gain)[observed.frame, None]
-
-
-def _vertex_means(observed: LightObservations, values: np.ndarray, weight: np.ndarray, count: int) -> np.ndarray:
-    return np.stack([vertex_mean(observed.vertex, column, weight, count) for column in values.T], axis=1)
-
-
-def _noise(length: np.ndarray) -> float:
-    """Return the scale of errors of these lengths."""
-    return max(1.4826 * float(np.median(length)), MIN_NOISE)
+    """Return the weighted mean log albedo of each vertex under a light; 0 without observations."""
+    shaded = observed.log_linear() - np.log(irradiance) - np.log(gain)[observed.frame, None]
+    columns = [vertex_mean(observed.vertex, column, observed.log_weight(), vertex_count) for column in shaded.T]
+    return np.stack(columns, axis=1)
 
 
 @dataclass(frozen=True)
@@ -243,7 +218,7 @@ def fit_light(
     fit = start or problem.uniform_light()
     for _ in range(GAUSS_NEWTON_STEPS):
         fit = problem.normalised(problem.step(fit))
-    return problem.with_own_albedos(fit.light)
+    return fit
 
 
 class _Problem:
@@ -264,11 +239,8 @@ class _Problem:
         self.weight = observed.log_weight()
 
     def uniform_light(self) -> LightFit:
-        return self.with_own_albedos(VideoLight.uniform(self.view_count))
-
-    def with_own_albedos(self, light: VideoLight) -> LightFit:
-        """Return a light with the albedos that the vertices show under it, without the prior."""
-        return LightFit(light, robust_log_albedo(self.observed, self._irradiance(light), light.gain, self.vertex_count))
+        light = VideoLight.uniform(self.view_count)
+        return LightFit(light, mean_log_albedo(self.observed, self._irradiance(light), light.gain, self.vertex_count))
 
     def _lambert(self, light: VideoLight) -> np.ndarray | None:
         if self.visibility is None:
@@ -302,10 +274,10 @@ class _Problem:
         light, vertex, frame = fit.light, self.observed.vertex, self.observed.frame
         residual = self.residual(fit)
         length = np.linalg.norm(residual, axis=1)
-        noise = _noise(length)
+        noise = max(1.4826 * float(np.median(length)), MIN_NOISE)
         weight = self.weight / (1.0 + (length / noise) ** 2)
         irradiance, basis = self._irradiance(light), self._light_basis(light)
-        albedo_matrix, smoothness = self._albedo_matrix(weight, fit)
+        albedo_matrix, smoothness = self._albedo_matrix(weight, fit.log_albedo)
         factor = splu(albedo_matrix)
         frames, terms = self.view_count, basis.shape[1]
         system = np.zeros((frames + 3 * terms, frames + 3 * terms + 1))
@@ -374,22 +346,13 @@ class _Problem:
         block = np.block([[gains, gain_light], [gain_light.T, weighted.T @ jacobian]])
         return np.concatenate([per_frame, per_vertex], axis=1), block
 
-    def _albedo_noise(self, light: VideoLight) -> float:
-        """Return the scale by which what a vertex shows under a light differs from its mean."""
-        shaded = _log_shaded(self.observed, self._irradiance(light), light.gain)
-        mean = _vertex_means(self.observed, shaded, self.weight, self.vertex_count)
-        return _noise(np.linalg.norm(shaded - mean[self.observed.vertex], axis=1))
-
-    def _albedo_matrix(self, weight: np.ndarray, fit: LightFit) -> tuple[csc_array, csc_array]:
+    def _albedo_matrix(self, weight: np.ndarray, log_albedo: np.ndarray) -> tuple[csc_array, csc_array]:
         """Return the normal matrix of the albedos, data and prior, and the prior's part."""
-        noise = self._albedo_noise(fit.light)
-        smoothness = np.clip((noise / ALBEDO_CHANGE) ** 2, *ALBEDO_SMOOTHNESS)
-        edge_change = np.clip(EDGE_PER_NOISE * noise, *ALBEDO_EDGE)
         per_vertex = np.bincount(self.observed.vertex, weight, self.vertex_count)
         scale = float(np.median(per_vertex[per_vertex > 0]))
         first, second = self.edges.T
-        difference = np.linalg.norm(fit.log_albedo[first] - fit.log_albedo[second], axis=1)
-        edge = smoothness * scale / (1.0 + (difference / edge_change) ** 2) ** 2
+        difference = np.linalg.norm(log_albedo[first] - log_albedo[second], axis=1)
+        edge = ALBEDO_SMOOTHNESS * scale / (1.0 + (difference / ALBEDO_EDGE) ** 2) ** 2
         edge[(per_vertex[first] == 0) | (per_vertex[second] == 0)] = 0.0
         rows, columns = np.r_[first, second], np.r_[second, first]
         neighbours = coo_array((np.r_[edge, edge], (rows, columns)), shape=(self.vertex_count,) * 2)

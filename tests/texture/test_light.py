@@ -123,31 +123,6 @@ def test_a_tenth_of_foreign_colours_changes_little() -> None:
     assert relative_error(fit.light, smooth_light(), rows, lit) < 0.04
 
 
-def test_the_vertical_part_is_found_with_normals_that_are_degrees_off() -> None:
-    """Noisy observations leave it to the prior: with little weight the light would be level."""
-    coefficients = np.array([0.95, 0.0, 0.2, 0.15, 0.0, 0.0, 0.0, 0.0, 0.0])[:, None] * np.ones(3)
-    light = replace(VideoLight.uniform(1), coefficients=coefficients)
-    rows, lit = observed(light, np.ones(FRAMES), noise=0.03)
-    wrong = ball_points()[0] + 0.12 * np.random.default_rng(7).normal(size=(500, 3))
-    x, y, z = (wrong / np.linalg.norm(wrong, axis=1, keepdims=True))[rows.vertex].T
-    c, s = np.cos(2.0 * np.pi * rows.frame / FRAMES), np.sin(2.0 * np.pi * rows.frame / FRAMES)
-    turned = np.stack([c * x + s * z, y, c * z - s * x], axis=1)
-    fit = fit_light(replace(rows, normal=turned), ball_points()[1], 500, FRAMES)
-    assert relative_error(fit.light, light, rows, lit) < 0.03
-
-
-def test_an_albedo_is_what_its_vertex_shows_not_its_neighbours() -> None:
-    """The prior finds the light only: a vertex that is a tenth brighter than the rest has a tenth more albedo."""
-    rows, _ = observed(smooth_light(), np.ones(FRAMES), noise=0.04)
-    spot = rows.vertex == rows.vertex[0]
-    brighter = np.where(spot[:, None], linear_to_srgb(1.1 * srgb_to_linear(rows.colour)), rows.colour)
-    before, after = (
-        fit_light(replace(rows, colour=colour), ball_points()[1], 500, FRAMES).log_albedo[rows.vertex[0]]
-        for colour in (rows.colour, brighter)
-    )
-    np.testing.assert_allclose(after - before, np.log(1.1), atol=0.01)
-
-
 def test_a_key_light_is_found_by_its_shadows() -> None:
     truth = replace(smooth_light(), key_irradiance=np.full(3, 0.5), key_direction=KEY)
     rows, lit = observed(truth, np.ones(FRAMES))
