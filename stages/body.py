@@ -113,15 +113,15 @@ def run(
     hands = filter_hand_detections(capture.hands or undetected_hands(len(capture)), capture.landmarks_px)
     result = fit_capture(capture, hands, windows, config, settings)
     usable, training = usable_frames(result), capture.split == TRAIN
-    legs = leg_profile(result.body, capture_motion(capture, result), result.camera, windows, training & usable)
-    if legs.cloth_hangs_between_legs():
-        rest = rest_with_filmed_legs(
-            result.body, capture_motion(capture, result), result.landmarks_m, training & usable
-        )
+    motion = Motion(capture.frame_index, capture.time_s, result.rotations_wxyz, result.root_translation_m)
+    legs = leg_profile(result.body, motion, result.camera, windows, training & usable)
+    legs_as_filmed = legs.cloth_hangs_between_legs()
+    if legs_as_filmed:
+        rest = rest_with_filmed_legs(result.body, motion, result.landmarks_m, training & usable)
+        motion = rest.motion
         result = replace(
             result, body=rest.body, rotations_wxyz=rest.motion.rotations_wxyz, landmarks_m=rest.landmarks_m
         )
-    motion = capture_motion(capture, result)
     left_right_swapped = np.stack(list(result.left_right_swapped.values())).any(axis=0)
     save_body(out / _BODY, result.body)
     save_motion(out / _MOTION, motion)
@@ -162,14 +162,9 @@ def run(
         "suspicious_frames": int(suspicious_frames(result).sum()),
         "dropped_frames": int((training & ~usable).sum()),
         "frames_with_foreign_objects": int(has_foreign_object.sum()),
-        "legs_as_filmed": float(legs.cloth_hangs_between_legs()),
+        "legs_as_filmed": float(legs_as_filmed),
         "hidden_leg_share": hidden_leg_share(capture.landmarks_visibility, capture.time_s),
     }
-
-
-def capture_motion(capture: Capture, result: FitResult) -> Motion:
-    """Return the fitted poses at the times of the frames."""
-    return Motion(capture.frame_index, capture.time_s, result.rotations_wxyz, result.root_translation_m)
 
 
 def read_mask_windows(capture: Capture) -> list[MaskWindow | None]:

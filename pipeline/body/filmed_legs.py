@@ -19,6 +19,7 @@ from torch import Tensor
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.fit.landmark_regressor import LANDMARKS, landmark_joint
 from pipeline.body.fit.silhouette_icp import MaskWindow, rasterise_in_window
+from pipeline.body.overlay import pose_vertices
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.rotation import continuous_quaternions, matrix_to_quaternion, quaternion_to_matrix
 from pipeline.geometry.skinning import (
@@ -130,8 +131,8 @@ def _profile_of_frame(
     body: Body, legs: Bool[np.ndarray, "2 f"], pose: Float[Tensor, "j 4 4"], camera: Camera, window: MaskWindow
 ) -> Float[np.ndarray, "3 k"]:
     """Return margin (m), pixels between the legs, and uncovered ones of these; nan where the legs are not seen."""
-    vertices = linear_blend_skinning(torch.from_numpy(body.vertices), torch.from_numpy(body.skin_weights), pose[None])
-    face_id = rasterise_in_window(vertices[0], torch.from_numpy(body.faces), camera, window).face_id
+    vertices = pose_vertices(body, pose)
+    face_id = rasterise_in_window(vertices, torch.from_numpy(body.faces), camera, window).face_id
     is_body = face_id >= 0
     left, right = legs[:, np.maximum(face_id, 0)] & is_body
     metres_per_px = body.height_m() / window.person_px
