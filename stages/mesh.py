@@ -326,7 +326,7 @@ def write_results(out: Path, mesh: Mesh, skin: SkinnedTopology, shader: torch.nn
 
 STAGE = Stage(
     "mesh",
-    version=27,
+    version=28,
     needs=("frames", "body", "field"),
     makes=(MESH_NPZ, DENSE_NPZ, "motion.npz", "preview.png"),
     config=Config,

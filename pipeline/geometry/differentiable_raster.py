@@ -6,14 +6,15 @@ gives gradients of the coverage (Laine et al., "Modular Primitives for High-Perf
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pipeline.geometry.camera import Camera, project
 from pipeline.kernels.interpolate import interpolate
-from pipeline.kernels.raster import antialias, rasterize
+from pipeline.kernels.raster import SilhouetteBlends, antialias, rasterize, silhouette_blends
 
 
 def face_adjacency(faces: Int[Tensor, "f 3"]) -> Int[Tensor, "f 3"]:
@@ -61,17 +62,58 @@ def render_shaded(
         The image premultiplied by alpha, alpha in [0, 1], and the face index of each pixel (-1 for none). The image
         composited on white is `image + 1 - alpha`.
     """
+    pixels = render_pixels(vertices_world, faces, camera, attributes, shader, adjacency)
+    shape = (camera.height, camera.width)
+    image = torch.zeros(camera.height * camera.width, pixels.values.shape[1]).to(pixels.values)
+    image = image.index_copy(0, pixels.pixel, pixels.values).view(*shape, -1)
+    return image[..., :-1], image[..., -1], pixels.face_id
+
+
+class RenderedPixels(NamedTuple):
+    """Some pixels of a render.
+
+    pixel: row-major indices, increasing. values: premultiplied colours, and alpha in the last column. at_silhouette:
+    pixels whose coverage depends on the vertices. face_id, depth_m: of every pixel of the image; -1 and inf for none.
+    """
+
+    pixel: Int[Tensor, "n"]
+    values: Float[Tensor, "n d"]
+    at_silhouette: Bool[Tensor, "n"]
+    face_id: Int[Tensor, "h w"]
+    depth_m: Float[Tensor, "h w"]
+
+
+def render_pixels(
+    vertices_world: Float[Tensor, "v 3"],
+    faces: Int[Tensor, "f 3"],
+    camera: Camera,
+    attributes: Float[Tensor, "v c"],
+    shader: Callable[[Float[Tensor, "n c"]], Float[Tensor, "n d"]],
+    adjacency: Int[Tensor, "f 3"] | None = None,
+    wanted: Bool[Tensor, "h w"] | None = None,
+) -> RenderedPixels:
+    """Do `render_shaded` at the silhouettes, and at those other covered pixels that are wanted (default: all)."""
     vertices_px, depth_m = project(vertices_world, camera)
     face_id, _, depth = rasterize(vertices_px, depth_m, faces, camera.height, camera.width)
     adjacency = face_adjacency(faces) if adjacency is None else adjacency
-    covered = torch.nonzero(face_id.reshape(-1) >= 0).squeeze(1)
-    face_of = face_id.reshape(-1)[covered]
-    shaded = shader(interpolate(covered, face_of, camera.width, vertices_px, depth_m, faces, attributes))
+    blends = silhouette_blends(face_id, depth, vertices_px, depth_m, faces, adjacency)
+    flat_face_id = face_id.reshape(-1)
+    is_covered, at_silhouette = flat_face_id >= 0, torch.zeros(face_id.numel(), dtype=torch.bool, device=face_id.device)
+    at_silhouette[blends.near], at_silhouette[blends.far] = True, True
+    is_drawn = is_covered if wanted is None else is_covered & wanted.reshape(-1)
+    pixel = torch.nonzero(is_drawn | at_silhouette).squeeze(1)
+    covered = torch.nonzero(is_covered[pixel]).squeeze(1)
+    covered_pixel = pixel[covered]
+    shaded = shader(
+        interpolate(covered_pixel, flat_face_id[covered_pixel], camera.width, vertices_px, depth_m, faces, attributes)
+    )
     with_alpha = torch.cat([shaded, torch.ones_like(shaded[:, :1])], dim=1)
-    flat_image = torch.zeros(face_id.numel(), with_alpha.shape[1], dtype=with_alpha.dtype, device=with_alpha.device)
-    image = flat_image.index_copy(0, covered, with_alpha).view(*face_id.shape, -1)
-    image = antialias(image, face_id, depth, vertices_px, depth_m, faces, adjacency)
-    return image[..., :-1], image[..., -1], face_id
+    values = torch.zeros(len(pixel), with_alpha.shape[1]).to(with_alpha).index_copy(0, covered, with_alpha)
+    row_of_pixel = torch.empty(face_id.numel(), dtype=torch.int64, device=face_id.device)
+    row_of_pixel[pixel] = torch.arange(len(pixel), device=pixel.device)
+    target, near, far = (row_of_pixel[part] for part in (blends.target, blends.near, blends.far))
+    rows = SilhouetteBlends(target, near, far, blends.fraction)
+    return RenderedPixels(pixel, antialias(values, rows), at_silhouette[pixel], face_id, depth)
 
 
 def render_attributes(

@@ -21,6 +21,7 @@ from torch import Tensor
 from pipeline.body.body import Body
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import isosurface, largest_solid, repair, signed_distance_m
+from pipeline.kernels.common.thread_pool import shared_thread_pool
 from pipeline.mesh.settings import MeshSettings
 
 BODY_PADDING_VOXELS = 4
@@ -221,10 +222,12 @@ def select_isovalue(
         The isovalue and its score.
     """
     coarse = samples.downsampled()
-    scores = []
-    for isovalue_per_m in settings.isovalues_per_m:
+
+    def score_of(isovalue_per_m: float) -> float:
         indicator = indicator_grid(coarse, isovalue_per_m, settings)
-        scores.append(score(isosurface(indicator, SURFACE_ISOVALUE, coarse.origin_m, coarse.spacing_m)))
+        return score(isosurface(indicator, SURFACE_ISOVALUE, coarse.origin_m, coarse.spacing_m))
+
+    scores = shared_thread_pool(torch.get_num_threads()).map(score_of, settings.isovalues_per_m)
     best = int(np.argmax(scores))
     return float(settings.isovalues_per_m[best]), scores[best]
 

@@ -24,11 +24,12 @@ from pipeline.body.body import Body, Motion
 from pipeline.body.fit.camera_parameters import project_with_jacobian
 from pipeline.body.fit.linear_body import descendant_matrix
 from pipeline.body.pose_correction import PoseCorrection
-from pipeline.geometry.camera import Camera, project, transform_world_to_camera
+from pipeline.geometry.camera import Camera, project
+from pipeline.geometry.differentiable_raster import render_pixels
 from pipeline.kernels.common.thread_pool import ThreadPool
 from pipeline.kernels.interpolate import interpolate
 from pipeline.mesh.skin_transfer import SkinnedTopology
-from pipeline.mesh.views import PosedView, Shader, render_posed_view
+from pipeline.mesh.views import PosedView, Shader
 
 BLUR_SIGMA_PX = 1.2
 """Blur of render and image before their gradients are taken: an error of a pose is a pixel or two."""
@@ -37,10 +38,11 @@ LIGHT_SIGMA_RATIO = 0.02
 SIGMA_OF_SMALLER_PX = 2.5
 """Standard deviation, at least, of a wide blur in the smaller picture to which it is applied."""
 PIXEL_STRIDE = 2
-PIXELS = np.s_[::PIXEL_STRIDE, ::PIXEL_STRIDE]
+PIXELS = np.s_[..., ::PIXEL_STRIDE, ::PIXEL_STRIDE]
 """Every second row and column is used: the blur makes neighbours say the same."""
 MAX_DEPTH_STEP_M = 0.03
 """Pixels next to a larger step of depth are not used for colour: the render there is two surfaces."""
+BACKGROUND_DEPTH_M = 1e3
 SILHOUETTE_BAND_PX = 4
 """Largest distance of a pixel from the rendered surface at which alpha counts."""
 COLOUR_NOISE, ALPHA_NOISE = 0.01, 0.1
@@ -124,31 +126,31 @@ def gather_evidence(
     view: PosedView,
 ) -> ImageEvidence:
     """Compare the render of the surface with a view, in colour inside the surface and in alpha at its silhouette."""
-    image, alpha, face_id = render_posed_view(vertices, skin, view, shader)
+    camera, shape = view.camera, (view.camera.height, view.camera.width)
     posed = view.pose_vertices(vertices, skin.weights)
-    covered = torch.nonzero(face_id.reshape(-1) >= 0).squeeze(1)
-    vertices_px, depth_m = project(posed, view.camera)
-    faces_px = face_id.reshape(-1)[covered]
-    attributes = torch.cat([posed, subtree_weights], dim=1)
-    seen = interpolate(covered, faces_px, view.camera.width, vertices_px, depth_m, skin.faces, attributes).numpy()
-    point_of_pixel = np.full(face_id.numel(), -1)
-    point_of_pixel[covered.numpy()] = np.arange(len(covered))
-    depth_image = np.full(face_id.numel(), np.float32(1e3))
-    depth_image[covered.numpy()] = transform_world_to_camera(torch.from_numpy(seen[:, :3]), view.camera)[:, 2].numpy()
-    nearest_point, distance_px = _nearest_points(point_of_pixel.reshape(face_id.shape))
+    drawn = render_pixels(posed, skin.faces, camera, vertices, shader, skin.adjacency)
+    render = np.zeros((4, camera.height * camera.width), np.float32)
+    render[:, drawn.pixel.numpy()] = drawn.values.numpy().T
+    render = render.reshape(4, *shape)
+    mask = view.mask.numpy().astype(np.float32) / 255.0
+    frame = np.concatenate([np.moveaxis(view.image.numpy(), 2, 0) * (mask / 255.0), mask[None]])
 
-    render_alpha, mask = alpha.numpy(), view.mask.numpy().astype(np.float32) / 255.0
-    render = image.numpy() / np.maximum(render_alpha, 1e-3)[..., None]
-    frame = view.image.numpy().astype(np.float32) / 255.0
-    inside = _is_inside(render_alpha, mask, depth_image.reshape(face_id.shape))
-    structure, pull = map(
-        np.add,
-        _silhouette_evidence(distance_px[PIXELS] < SILHOUETTE_BAND_PX, render_alpha, mask),
-        _colour_evidence(inside[PIXELS], (render, render_alpha), (frame, mask)),
-    )
-    used = (structure[..., 0, 0] + structure[..., 1, 1] > 0.0) & (distance_px[PIXELS] < SILHOUETTE_BAND_PX)
-    points = seen[nearest_point[PIXELS][used]]
-    return ImageEvidence(points[:, :3], points[:, 3:], structure[used], pull[used])
+    covered = torch.nonzero(drawn.face_id.reshape(-1) >= 0).squeeze(1)
+    point_of_pixel = np.full(drawn.face_id.numel(), -1)
+    point_of_pixel[covered.numpy()] = np.arange(len(covered))
+    nearest_point, distance_px = _nearest_points(point_of_pixel.reshape(shape))
+    near = distance_px[PIXELS] < SILHOUETTE_BAND_PX
+    inside = _is_inside(render[3], mask, np.minimum(drawn.depth_m.numpy(), BACKGROUND_DEPTH_M))
+    evidence = _silhouette_evidence(near, render[3], mask) + _colour_evidence(inside[PIXELS], render, frame)
+    used = (evidence[0] + evidence[2] > 0.0) & near
+    xx, xy, yy, pull_x, pull_y = evidence[:, used]
+    structure = np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
+
+    seen = covered[torch.from_numpy(nearest_point[PIXELS][used])]
+    attributes = torch.cat([posed, subtree_weights], dim=1)
+    at_pixel = seen, drawn.face_id.reshape(-1)[seen], camera.width
+    points = interpolate(*at_pixel, *project(posed, camera), skin.faces, attributes).numpy()
+    return ImageEvidence(points[:, :3], points[:, 3:], structure, np.stack([pull_x, pull_y], axis=-1))
 
 
 def _nearest_points(
@@ -177,45 +179,48 @@ def _is_inside(
 
 
 def _colour_evidence(
-    inside: Bool[np.ndarray, "m n"],
-    render: tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]],
-    frame: tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]],
-) -> tuple[Float32[np.ndarray, "m n 2 2"], Float32[np.ndarray, "m n 2"]]:
-    """Return structure and pull of the colours, without their local means, at `PIXELS` that are inside.
+    inside: Bool[np.ndarray, "m n"], render: Float32[np.ndarray, "4 h w"], frame: Float32[np.ndarray, "4 h w"]
+) -> Float32[np.ndarray, "5 m n"]:
+    """Return the evidence (see `_evidence`) of the colours, less their local means, at `PIXELS` that are inside.
 
-    render, frame: straight colours and alpha, in [0, 1].
+    render, frame: premultiplied colours and alpha, in [0, 1].
     """
-    common = render[1] * frame[1]
-    wide_px = LIGHT_SIGMA_RATIO * len(common)
+    wide_px = LIGHT_SIGMA_RATIO * render.shape[1]
     details = [
-        _masked_blur(colours, alpha, BLUR_SIGMA_PX) - _masked_blur(colours, common, wide_px)
-        for colours, alpha in (render, frame)
+        _blurred_colours(picture, BLUR_SIGMA_PX) - _blurred_colours(picture * other[3], wide_px)
+        for picture, other in ((render, frame), (frame, render))
     ]
     residual = (details[1] - details[0])[PIXELS]
-    noise = COLOUR_NOISE + 1.4826 * float(np.median(np.abs(residual[inside]))) if inside.any() else COLOUR_NOISE
+    noise = COLOUR_NOISE
+    if inside.any():
+        noise += 1.4826 * float(np.median(np.abs(residual[:, inside])))
     # Colours of one pixel err together.
-    weight = inside[..., None] * _geman_mcclure(residual, noise, 2.0) / 3.0
-    gradient = _gradient(0.5 * (details[0] + details[1]))
-    weighted = weight[..., None] * gradient
-    along_x, along_y = weighted[..., 0], weighted[..., 1]
-    xx, xy = (along_x * gradient[..., 0]).sum(2), (along_x * gradient[..., 1]).sum(2)
-    yy = (along_y * gradient[..., 1]).sum(2)
-    structure = np.stack([xx, xy, xy, yy], axis=-1).reshape(*xx.shape, 2, 2)
-    return structure, (weighted * residual[..., None]).sum(2)
+    weight = inside * _geman_mcclure(residual, noise, 2.0) / 3.0
+    return _evidence(weight, 0.5 * (details[0] + details[1]), residual)
 
 
 def _silhouette_evidence(
     near: Bool[np.ndarray, "m n"],
     render_alpha: Float32[np.ndarray, "h w"],
     mask: Float32[np.ndarray, "h w"],
-) -> tuple[Float32[np.ndarray, "m n 2 2"], Float32[np.ndarray, "m n 2"]]:
-    """Return structure and pull of alpha at `PIXELS` that are near the rendered surface."""
-    blurred = [cv2.GaussianBlur(alpha, (0, 0), BLUR_SIGMA_PX) for alpha in (render_alpha, mask)]
+) -> Float32[np.ndarray, "5 m n"]:
+    """Return the evidence (see `_evidence`) of alpha at `PIXELS` that are near the rendered surface."""
+    blurred = [cv2.GaussianBlur(alpha, (0, 0), BLUR_SIGMA_PX)[None] for alpha in (render_alpha, mask)]
     residual = (blurred[1] - blurred[0])[PIXELS]
-    weight = near * _geman_mcclure(residual, ALPHA_NOISE, 3.0)
-    gradient = _gradient(0.5 * (blurred[0] + blurred[1])[..., None])[..., 0, :]
-    structure = weight[..., None, None] * gradient[..., :, None] * gradient[..., None, :]
-    return structure, (weight * residual)[..., None] * gradient
+    return _evidence(near * _geman_mcclure(residual, ALPHA_NOISE, 3.0), 0.5 * (blurred[0] + blurred[1]), residual)
+
+
+def _evidence(
+    weight: Float32[np.ndarray, "c m n"], picture: Float32[np.ndarray, "c h w"], residual: Float32[np.ndarray, "c m n"]
+) -> Float32[np.ndarray, "5 m n"]:
+    """Return structure (xx, xy, yy) and pull (x, y) of channels with these weights, at `PIXELS`.
+
+    picture: its gradient is that of the channels. residual: image - render.
+    """
+    along_x, along_y = _gradient(picture)
+    weighted_x, weighted_y = weight * along_x, weight * along_y
+    products = (weighted_x * along_x, weighted_x * along_y, weighted_y * along_y)
+    return np.stack([part.sum(0) for part in (*products, weighted_x * residual, weighted_y * residual)])
 
 
 def _geman_mcclure(residual: Float32[np.ndarray, "*n"], noise: float, limit: float) -> Float32[np.ndarray, "*n"]:
@@ -227,30 +232,30 @@ def _geman_mcclure(residual: Float32[np.ndarray, "*n"], noise: float, limit: flo
     return 1.0 / (redundancy * np.square(noise * (1.0 + np.square(residual / (limit * noise)))))
 
 
-def _masked_blur(
-    colours: Float32[np.ndarray, "h w 3"], alpha: Float32[np.ndarray, "h w"], sigma_px: float
-) -> Float32[np.ndarray, "h w 3"]:
+def _blurred_colours(premultiplied: Float32[np.ndarray, "4 h w"], sigma_px: float) -> Float32[np.ndarray, "3 h w"]:
     """Return the mean of the colours weighted by alpha and a Gaussian; a wide one is applied to a smaller picture."""
-    size = alpha.shape[::-1]
+    size = premultiplied.shape[:0:-1]
     factor = max(1, int(sigma_px / SIGMA_OF_SMALLER_PX))
     smaller = tuple(max(1, round(side / factor)) for side in size)
-    premultiplied = np.concatenate([colours * alpha[..., None], alpha[..., None]], axis=2)
-    if factor > 1:
-        premultiplied = cv2.resize(premultiplied, smaller, interpolation=cv2.INTER_AREA)
-    blurred = cv2.GaussianBlur(
-        premultiplied, (0, 0), sigma_px * smaller[0] / size[0], sigmaY=sigma_px * smaller[1] / size[1]
-    )
-    if factor > 1:
-        blurred = cv2.resize(blurred, size, interpolation=cv2.INTER_LINEAR)
-    return blurred[..., :3] / np.maximum(blurred[..., 3:], 1e-6)
+    sigmas_px = sigma_px * smaller[0] / size[0], sigma_px * smaller[1] / size[1]
+
+    def blur(plane: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+        if factor == 1:
+            return cv2.GaussianBlur(plane, (0, 0), sigma_px)
+        plane = cv2.resize(plane, smaller, interpolation=cv2.INTER_AREA)
+        blurred = cv2.GaussianBlur(plane, (0, 0), sigmas_px[0], sigmaY=sigmas_px[1])
+        return cv2.resize(blurred, size, interpolation=cv2.INTER_LINEAR)
+
+    planes = np.stack([blur(plane) for plane in premultiplied])
+    return planes[:3] / np.maximum(planes[3], 1e-6)
 
 
-def _gradient(image: Float32[np.ndarray, "h w c"]) -> Float32[np.ndarray, "m n c 2"]:
-    """Return the central differences of each channel along x and y at `PIXELS`, 1/px."""
-    padded = np.pad(image, ((1, 1), (1, 1), (0, 0)), mode="edge")
-    along_x = 0.5 * (padded[1:-1, 2:][PIXELS] - padded[1:-1, :-2][PIXELS])
-    along_y = 0.5 * (padded[2:, 1:-1][PIXELS] - padded[:-2, 1:-1][PIXELS])
-    return np.stack([along_x, along_y], axis=-1)
+def _gradient(picture: Float32[np.ndarray, "c h w"]) -> tuple[Float32[np.ndarray, "c m n"], ...]:
+    """Return the central differences of each channel along x and along y at `PIXELS`, 1/px."""
+    padded = np.pad(picture, ((0, 0), (1, 1), (1, 1)), mode="edge")
+    along_x = 0.5 * (padded[:, 1:-1, 2:][PIXELS] - padded[:, 1:-1, :-2][PIXELS])
+    along_y = 0.5 * (padded[:, 2:, 1:-1][PIXELS] - padded[:, :-2, 1:-1][PIXELS])
+    return along_x, along_y
 
 
 def normal_equations(

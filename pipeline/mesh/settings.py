@@ -23,6 +23,7 @@ class MeshSettings:
         coarse_scale: resolution of the training views in all rounds but the last, over that in the last; at most 1.
         coarse_step_ratio: optimiser steps of these rounds, over those of the last.
         frames_per_step: training frames in one optimiser step.
+        pixel_stride: inside the silhouette a step uses one of this many pixels of a frame.
         learning_rate: step size of the smoothed vertex offsets, m (with 0.003 and lambda 20: 0.12 dB less, 40
             self-intersections).
         global_learning_rate: step size of the global offset, m.
@@ -64,7 +65,8 @@ class MeshSettings:
 
     coarse_scale: float = 0.5
     coarse_step_ratio: float = 2.0
-    frames_per_step: int = 3
+    frames_per_step: int = 4
+    pixel_stride: int = 3
     learning_rate: float = 0.0012
     global_learning_rate: float = 0.0003
     appearance_learning_rate: float = 0.012
@@ -90,7 +92,7 @@ class MeshSettings:
 
     def __post_init__(self) -> None:
         """Refuse values out of range and contradictions."""
-        for name in ("learning_rate", "isovalue_frames", "frames_per_step", "coarse_step_ratio"):
+        for name in ("learning_rate", "isovalue_frames", "frames_per_step", "pixel_stride", "coarse_step_ratio"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"MeshSettings.{name} = {getattr(self, name)} is not allowed: it must be above 0")
         for name in ("field_views", "final_faces", "alignment_steps"):

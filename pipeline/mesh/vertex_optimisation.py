@@ -10,7 +10,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import reduce
-from typing import Any
 
 import numpy as np
 import torch
@@ -23,11 +22,12 @@ from pipeline.body.body import Body, Motion
 from pipeline.core.progress import track
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import adjacency, laplacian
+from pipeline.kernels.adam import adam_step_
 from pipeline.kernels.common.thread_pool import ThreadPool
 from pipeline.mesh.remeshing import face_of_person
 from pipeline.mesh.settings import MeshSettings
 from pipeline.mesh.skin_transfer import SkinnedTopology
-from pipeline.mesh.views import PosedView, render_posed_view, view_losses
+from pipeline.mesh.views import PosedView, sampled_losses
 
 MAX_EDGE_WEIGHT = 16.0
 """Largest weight of an edge in the smoothing of the gradients: that of a quarter of the median length."""
@@ -60,21 +60,10 @@ class RefinementInputs:
     settings: MeshSettings = field(default_factory=MeshSettings)
 
 
-class FromDifferential(torch.autograd.Function):
-    """Compute D = (I + lambda L)^-1 u; the gradient is the same solve, because the matrix is symmetric."""
-
-    @staticmethod
-    def forward(context: Any, differential_coordinates: Tensor, factorisation: SuperLU) -> Tensor:
-        """Return D (v, 3) of u (v, 3)."""
-        context.factorisation = factorisation
-        return torch.from_numpy(factorisation.solve(differential_coordinates.detach().double().numpy())).to(
-            differential_coordinates
-        )
-
-    @staticmethod
-    def backward(context: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        """Return dL/du of dL/dD."""
-        return torch.from_numpy(context.factorisation.solve(gradient.double().contiguous().numpy())).to(gradient), None
+def smooth(factorisation: SuperLU, differential_coordinates: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3"]:
+    """Return D = (I + lambda L)^-1 u of u."""
+    solution = factorisation.solve(differential_coordinates.double().numpy())
+    return torch.from_numpy(solution).to(differential_coordinates)
 
 
 def factorise_smoothing_matrix(mesh: Mesh, stiff: Bool[np.ndarray, "f"], smoothing_lambda: float) -> SuperLU:
@@ -91,7 +80,9 @@ def factorise_smoothing_matrix(mesh: Mesh, stiff: Bool[np.ndarray, "f"], smoothi
     weight[stiff_vertex[ends].all(axis=1)] *= STIFFNESS
     weighted = adjacency(mesh, weight)
     combinatorial = diags_array(np.asarray(weighted.sum(axis=1)).ravel()) - weighted
-    return splu(csc_array(eye_array(count) + smoothing_lambda * combinatorial))
+    matrix = csc_array(eye_array(count) + smoothing_lambda * combinatorial)
+    # Positive definite: the ordering for symmetric matrices without pivoting has two thirds of the entries.
+    return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
 def optimise_vertices(
@@ -113,44 +104,34 @@ def optimise_vertices(
     generator = torch.Generator().manual_seed(seed)
     start = torch.from_numpy(mesh.vertices.astype(np.float32))
     stiff = face_of_person(mesh, inputs.body)
-    factorisation, operator = (
-        factorise_smoothing_matrix(mesh, stiff, settings.smoothing_lambda),
-        _to_torch(laplacian(mesh)),
-    )
-    coordinates, global_offset = torch.zeros_like(start, requires_grad=True), torch.zeros(3, requires_grad=True)
+    factorisation = factorise_smoothing_matrix(mesh, stiff, settings.smoothing_lambda)
+    operator = csr_array(laplacian(mesh)).astype(np.float32)
+    squared_laplacian = csr_array(operator.T @ operator)
+    coordinates, global_offset = torch.zeros_like(start), torch.zeros(3)
     learning_rates = [settings.learning_rate * (1.0 + settings.smoothing_lambda), settings.global_learning_rate]
     offset_optimiser = AdamUniform([coordinates, global_offset], learning_rates)
     colours: list[Tensor] = [parameter for parameter in inputs.shader.parameters() if parameter.requires_grad]
     colour_rate = settings.appearance_learning_rate
-    appearance_optimiser = torch.optim.Adam(colours, lr=colour_rate, betas=(0.9, 0.99), eps=1e-12) if colours else None
-    warm_up = settings.appearance_steps if appearance_optimiser else 0
+    moments = [(torch.zeros_like(colour), torch.zeros_like(colour)) for colour in colours]
+    warm_up = settings.appearance_steps if colours else 0
     threads = ThreadPool(settings.frames_per_step)
     for step in track(range(warm_up + inputs.steps), label):
         update_vertices = step >= warm_up
-        with torch.set_grad_enabled(update_vertices):
-            offset = FromDifferential.apply(coordinates, factorisation)
-            vertices = start + offset + global_offset
+        offset = smooth(factorisation, coordinates)
+        vertices = (start + offset + global_offset).requires_grad_(update_vertices)
         view_gradients = _batch_gradients(vertices, colours, skin, inputs, generator, threads)
         decay = 0.5 * (1.0 + math.cos(math.pi * step / (warm_up + inputs.steps)))
         if update_vertices:
-            regularisation = _regularisation_loss(offset, global_offset, operator, inputs)
-            loss = regularisation + (vertices * view_gradients[0]).sum()
-            offset_optimiser.step(torch.autograd.grad(loss, [coordinates, global_offset]), decay)
-        if appearance_optimiser:
-            _adam_step(appearance_optimiser, colours, view_gradients[-len(colours) :], colour_rate * decay)
-    with torch.no_grad():
-        moved = start + FromDifferential.apply(coordinates, factorisation) + global_offset
+            of_offset, of_global = regularisation_gradients(offset, global_offset, squared_laplacian, inputs)
+            of_vertices = view_gradients[0]
+            # (I + lambda L) is symmetric, so that the gradient of u is smoothed like u itself.
+            gradients = smooth(factorisation, of_offset + of_vertices), of_global + of_vertices.sum(0)
+            offset_optimiser.step(gradients, decay)
+        of_colours = view_gradients[len(view_gradients) - len(colours) :]
+        for colour, gradient, moment in zip(colours, of_colours, moments, strict=True):
+            adam_step_(colour, gradient, *moment, step + 1, colour_rate * decay, epsilon=1e-12)
+    moved = start + smooth(factorisation, coordinates) + global_offset
     return Mesh(moved.numpy(), mesh.faces)
-
-
-def _adam_step(
-    optimiser: torch.optim.Adam, parameters: Sequence[Tensor], gradients: Sequence[Tensor], rate: float
-) -> None:
-    optimiser.param_groups[0]["lr"] = rate
-    for parameter, gradient in zip(parameters, gradients, strict=True):
-        parameter.grad = gradient
-    optimiser.step()
-    optimiser.zero_grad(set_to_none=True)
 
 
 def _batch_gradients(
@@ -169,41 +150,37 @@ def _batch_gradients(
     settings = inputs.settings
     chosen = torch.randint(len(inputs.train), (settings.frames_per_step,), generator=generator).tolist()
     backgrounds = [torch.rand(3, generator=generator) for _ in chosen]
+    phases = torch.randint(settings.pixel_stride, (len(chosen),), generator=generator).tolist()
 
-    def gradients_of_view(k: int, background: Float[Tensor, "3"]) -> Sequence[Tensor]:
+    def gradients_of_view(k: int, background: Float[Tensor, "3"], phase: int) -> Sequence[Tensor]:
         leaf_vertices = vertices.detach().requires_grad_(vertices.requires_grad)
-        image, alpha, _ = render_posed_view(leaf_vertices, skin, inputs.train[k], inputs.shader)
-        colour_loss, silhouette_loss = view_losses(image, alpha, inputs.train[k], background)
+        colour_loss, silhouette_loss = sampled_losses(
+            leaf_vertices, skin, inputs.train[k], inputs.shader, background, (settings.pixel_stride, phase)
+        )
         loss = (settings.colour_weight * colour_loss + settings.silhouette_weight * silhouette_loss) / len(chosen)
         # A view without a covered pixel has no gradient of the colours: it is zero.
         gradient_inputs = ([leaf_vertices] if leaf_vertices.requires_grad else []) + list(colours)
         return torch.autograd.grad(loss, gradient_inputs, materialize_grads=True)
 
-    views = threads.map(gradients_of_view, chosen, backgrounds)
+    views = threads.map(gradients_of_view, chosen, backgrounds, phases)
     return [reduce(torch.add, gradients) for gradients in zip(*views, strict=True)]
 
 
-def _regularisation_loss(
+def regularisation_gradients(
     offset: Float[Tensor, "v 3"],
     global_offset: Float[Tensor, "3"],
-    operator: Tensor,
+    squared_laplacian: csr_array,
     inputs: RefinementInputs,
-) -> Float[Tensor, ""]:
-    """Return the weighted sum of squared Laplacian of the offsets, offsets and global offset, in edge lengths.
+) -> tuple[Float[Tensor, "v 3"], Float[Tensor, "3"]]:
+    """Return the gradients of the weighted sum of squared Laplacian of the offsets, offsets and global offset.
 
-    The Laplacian is that of the offsets, not of the positions, so that curved details of the initial mesh stay.
+    Lengths are in edge lengths; squares are averaged over the vertices. The Laplacian is that of the offsets, not of
+    the positions, so that curved details of the initial mesh stay. squared_laplacian: its transpose times itself.
     """
-    target_edge_m, settings = inputs.target_edge_m, inputs.settings
-    laplacian_penalty = (torch.sparse.mm(operator, offset) / target_edge_m).square().sum(1).mean()
-    offset_penalty, global_offset_penalty = (
-        (offset / target_edge_m).square().sum(1).mean(),
-        (global_offset / target_edge_m).square().sum(),
-    )
-    return (
-        settings.laplacian_weight * laplacian_penalty
-        + settings.offset_weight * offset_penalty
-        + settings.global_offset_weight * global_offset_penalty
-    )
+    settings, scale = inputs.settings, 2.0 / inputs.target_edge_m**2
+    bent = torch.from_numpy(squared_laplacian @ offset.detach().numpy())
+    of_offset = (settings.laplacian_weight * bent + settings.offset_weight * offset.detach()) / len(offset)
+    return scale * of_offset, scale * settings.global_offset_weight * global_offset.detach()
 
 
 class AdamUniform:
@@ -231,10 +208,3 @@ class AdamUniform:
             self._second_moments[i] = torch.lerp(gradient.square().max(), self._second_moments[i], second_beta)
             update = self._first_moments[i] / first_bias / ((self._second_moments[i] / second_bias).sqrt() + 1e-12)
             parameter -= self._learning_rates[i] * learning_rate_scale * update
-
-
-def _to_torch(matrix: csr_array) -> Tensor:
-    entries = matrix.tocoo()
-    positions = torch.from_numpy(np.stack(entries.coords).astype(np.int64))
-    values = torch.from_numpy(entries.data.astype(np.float32))
-    return torch.sparse_coo_tensor(positions, values, matrix.shape, check_invariants=True).coalesce()

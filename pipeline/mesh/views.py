@@ -10,9 +10,10 @@ from torch import Tensor
 
 from pipeline.capture.matting import resize_premultiplied
 from pipeline.geometry.camera import Camera, project
-from pipeline.geometry.differentiable_raster import render_shaded
+from pipeline.geometry.differentiable_raster import render_pixels, render_shaded
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning
+from pipeline.kernels.common.thread_pool import shared_thread_pool
 from pipeline.kernels.raster import rasterize
 from pipeline.mesh.skin_transfer import SkinnedTopology
 from pipeline.metrics.images import composite_on_white, composite_premultiplied_on_white, validation_psnr_db
@@ -22,6 +23,8 @@ Shader = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n 3"]]
 
 CROP_MARGIN_RATIO = 0.06
 """Margin of a crop around the mask, as a fraction of the height of the mask."""
+HUBER_DELTA = 0.1
+COLOUR_LOSS_SCALE = 1.0 / HUBER_DELTA
 
 
 @dataclass(frozen=True)
@@ -112,37 +115,72 @@ def view_losses(
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
     """Return the colour loss and the silhouette loss of a render (premultiplied colours, alpha) against a view.
 
-    The colour loss is ten times the Huber loss with delta 0.1 on the given background. Like the silhouette loss, it is
-    close to the mean absolute error for large errors.
+    The colour loss is a multiple of the Huber loss on the given background. Like the silhouette loss, it is close to
+    the mean absolute error for large errors.
     """
     target, mask = composite_target(view, background)
     composited = image + (1.0 - alpha[..., None]) * background
-    return 10.0 * torch.nn.functional.huber_loss(composited, target, delta=0.1), (alpha - mask).abs().mean()
+    return COLOUR_LOSS_SCALE * torch.nn.functional.huber_loss(composited, target, delta=HUBER_DELTA), (
+        alpha - mask
+    ).abs().mean()
 
 
-@torch.no_grad()
+def sampled_losses(
+    vertices: Float[Tensor, "v 3"],
+    skin: SkinnedTopology,
+    view: PosedView,
+    shader: Shader,
+    background: Float[Tensor, "3"],
+    lattice: tuple[int, int],
+) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+    """Render a part of the pixels of a view; return estimates of the losses of `view_losses`, less a constant.
+
+    All pixels at silhouettes count, and of the others inside the outline one of each `stride`, `stride` times; with
+    stride 1 the gradients are those of `view_losses`.
+
+    lattice: stride and phase; in all phases of a stride each pixel is used once.
+    """
+    stride, phase = lattice
+    height, width = view.mask.shape
+    rows, columns = torch.arange(height)[:, None], torch.arange(width)
+    wanted = (columns + (1 if stride == 2 else 2) * rows + phase) % stride == 0
+    posed = view.pose_vertices(vertices, skin.weights)
+    drawn = render_pixels(posed, skin.faces, view.camera, vertices, shader, skin.adjacency, wanted)
+    mask = view.mask.reshape(-1)[drawn.pixel].float() / 255.0
+    target = view.image.reshape(-1, 3)[drawn.pixel].float() / 255.0 * mask[:, None] + (1.0 - mask[:, None]) * background
+    alpha = drawn.values[:, -1]
+    composited = drawn.values[:, :-1] + (1.0 - alpha[:, None]) * background
+    weight = torch.where(drawn.at_silhouette, 1.0, float(stride)) / (height * width)
+    error = torch.nn.functional.huber_loss(composited, target, delta=HUBER_DELTA, reduction="none").mean(1)
+    return COLOUR_LOSS_SCALE * (weight * error).sum(), (weight * (alpha - mask).abs()).sum()
+
+
 def accumulate_face_errors(
     mesh: Mesh, skin: SkinnedTopology, views: Sequence[PosedView], shader: Shader
 ) -> Float[np.ndarray, "f"]:
     """Return the image error of each face: the absolute colour difference on white, summed over channels and views."""
-    total = np.zeros(len(mesh.faces))
     vertices, white = torch.from_numpy(mesh.vertices), torch.ones(3)
-    for view in views:
+
+    @torch.no_grad()
+    def errors_of(view: PosedView) -> Float[np.ndarray, "f"]:
         image, alpha, face_id = render_posed_view(vertices, skin, view, shader)
         error = (image + (1.0 - alpha[..., None]) - composite_target(view, white)[0]).abs().sum(2)
         covered = face_id >= 0
-        total += np.bincount(face_id[covered].numpy(), error[covered].numpy(), minlength=len(total))
-    return total
+        return np.bincount(face_id[covered].numpy(), error[covered].numpy(), minlength=len(mesh.faces))
+
+    return np.sum(shared_thread_pool(torch.get_num_threads()).map(errors_of, views), axis=0)
 
 
-@torch.no_grad()
 def mesh_psnr_db(mesh: Mesh, skin: SkinnedTopology, views: Sequence[PosedView], shader: Shader) -> float:
     """Return the validation PSNR (dB) of the shaded mesh over whole crops; NaN without views."""
     vertices = torch.from_numpy(mesh.vertices)
-    renders = []
-    for view in views:
+
+    @torch.no_grad()
+    def render(view: PosedView) -> UInt8[np.ndarray, "h w 3"]:
         image, alpha, _ = render_posed_view(vertices, skin, view, shader)
-        renders.append(composite_premultiplied_on_white(torch.cat([image, alpha[..., None]], dim=2).numpy()))
+        return composite_premultiplied_on_white(torch.cat([image, alpha[..., None]], dim=2).numpy())
+
+    renders = shared_thread_pool(torch.get_num_threads()).map(render, views)
     targets = [composite_on_white(view.image.numpy(), view.mask.numpy()) for view in views]
     return validation_psnr_db(renders, targets)
 

@@ -9,7 +9,7 @@ import trimesh
 from torch import Tensor
 
 from pipeline.geometry.differentiable_raster import face_adjacency
-from pipeline.kernels.raster import antialias, rasterize
+from pipeline.kernels.raster import antialias, rasterize, silhouette_blends
 from pipeline.kernels.raster.cpu import silhouette_edges_cpu
 from pipeline.kernels.raster.reference import rasterize_reference, silhouette_edges
 
@@ -148,8 +148,9 @@ def disc(radius_px: float, count: int = 64) -> tuple[Tensor, Tensor, Tensor]:
 
 def coverage(vertices_px: Tensor, depth_m: Tensor, faces: Tensor) -> Tensor:
     face_id, _, depth = rasterize(vertices_px, depth_m, faces, HEIGHT, WIDTH)
-    flat = (face_id >= 0).to(vertices_px.dtype)[..., None]
-    return antialias(flat, face_id, depth, vertices_px, depth_m, faces, face_adjacency(faces))[..., 0]
+    flat = (face_id >= 0).to(vertices_px.dtype).view(-1, 1)
+    blends = silhouette_blends(face_id, depth, vertices_px, depth_m, faces, face_adjacency(faces))
+    return antialias(flat, blends).view(HEIGHT, WIDTH)
 
 
 def test_antialiased_coverage_is_near_the_exact_area_of_each_pixel() -> None:
@@ -207,8 +208,8 @@ def test_near_part_is_blended_over_far_part() -> None:
     vertices, faces = torch.cat([far, near]), torch.cat([far_faces, near_faces + len(far)])
     depth_m = torch.cat([torch.full((len(far),), 3.0), torch.full((len(near),), 2.0)]).double()
     face_id, _, depth = rasterize(vertices, depth_m, faces, HEIGHT, WIDTH)
-    colour = (face_id >= len(far_faces)).double()[..., None]
-    blended = antialias(colour, face_id, depth, vertices, depth_m, faces, face_adjacency(faces))
+    colour = (face_id >= len(far_faces)).double().view(-1, 1)
+    blended = antialias(colour, silhouette_blends(face_id, depth, vertices, depth_m, faces, face_adjacency(faces)))
     assert float(blended.sum()) == pytest.approx(math.pi * 64.0, rel=0.01)
 
 

@@ -1,5 +1,8 @@
 """Views of a known mesh: crops and their cameras, renders of the true mesh, and where the image error is."""
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -13,9 +16,12 @@ from pipeline.mesh.views import (
     composite_target,
     crop_posed_view,
     mesh_psnr_db,
+    render_posed_view,
+    sampled_losses,
     silhouette_iou,
+    view_losses,
 )
-from tests.mesh.egg import CAMERA, DISTANCE_M, PATTERN, Views
+from tests.mesh.egg import CAMERA, DISTANCE_M, PATTERN, Pattern, Views
 
 
 def test_renders_of_the_true_mesh_match_its_views(egg: Mesh, egg_body: Body, egg_views: Views) -> None:
@@ -60,6 +66,33 @@ def test_a_view_at_half_the_size_shows_the_same_pixels_in_the_mean(egg_views: Vi
     np.testing.assert_allclose(wide[1], blocks, atol=2.0 / 255.0)
     # The ray through a pixel of the small picture is that through the middle of the four.
     assert (10.5 - half.camera.cx) / half.camera.fx == pytest.approx((21.0 - view.camera.cx) / view.camera.fx)
+
+
+@pytest.mark.parametrize("stride", [1, 2, 3, 5])
+def test_losses_of_all_lattices_add_up_to_those_of_the_whole_view(
+    egg: Mesh, egg_body: Body, egg_views: Views, stride: int
+) -> None:
+    skin, view, background = transfer_skin(egg, egg_body), egg_views[0][0], torch.tensor([0.2, 0.7, 0.4])
+    shader = Pattern(0.3)
+    shifted_m = torch.from_numpy(egg.vertices + np.float32([0.013, -0.007, 0.004]))
+
+    def gradients(losses: Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]]) -> list[torch.Tensor]:
+        vertices = shifted_m.clone().requires_grad_()
+        colour_loss, silhouette_loss = losses(vertices)
+        of_colour = torch.autograd.grad(colour_loss, [vertices, shader.contrast], retain_graph=True)
+        return [*of_colour, *torch.autograd.grad(silhouette_loss, [vertices])]
+
+    def whole(vertices: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        image, alpha, _ = render_posed_view(vertices, skin, view, shader)
+        return view_losses(image, alpha, view, background)
+
+    parts = [
+        gradients(partial(sampled_losses, skin=skin, view=view, shader=shader, background=background, lattice=lattice))
+        for lattice in ((stride, phase) for phase in range(stride))
+    ]
+    for expected, *found in zip(gradients(whole), *parts, strict=True):
+        assert expected.abs().max() > 0.0
+        torch.testing.assert_close(sum(found) / stride, expected, rtol=1e-3, atol=1e-6)
 
 
 def test_pixel_footprint_is_depth_over_focal_length(egg: Mesh, egg_body: Body, egg_views: Views) -> None:

@@ -5,8 +5,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pipeline.kernels.common.dispatch import runs_on_numba
+from pipeline.kernels.raster import reference
 from pipeline.kernels.raster.cpu import rasterize_cpu, silhouette_edges_cpu
-from pipeline.kernels.raster.reference import antialias_reference, blend_silhouettes, rasterize_reference
+from pipeline.kernels.raster.reference import SilhouetteBlends, rasterize_reference, silhouette_edges
 
 
 def rasterize(
@@ -53,16 +54,15 @@ def rasterize(
     return torch.from_numpy(face_id), torch.from_numpy(barycentric), torch.from_numpy(depth)
 
 
-def antialias(
-    image: Float[Tensor, "h w c"],
+def silhouette_blends(
     face_id: Int[Tensor, "h w"],
     depth: Float[Tensor, "h w"],
     vertices_px: Float[Tensor, "v 2"],
     depth_m: Float[Tensor, "v"],
     faces: Int[Tensor, "f 3"],
     adjacency: Int[Tensor, "f 3"],
-) -> Float[Tensor, "h w c"]:
-    """Blend neighbouring pixels by the position where a silhouette edge crosses the line between their centres.
+) -> SilhouetteBlends:
+    """Find neighbouring pixels to blend by the position where a silhouette edge crosses the line between their centres.
 
     The blend gives the coverage at silhouettes, and it is the only path for gradients of the silhouette's position
     (after Laine et al., "Modular primitives for high-performance differentiable rendering", 2020, section 3.4).
@@ -70,16 +70,23 @@ def antialias(
     of that edge is often a sliver that covers no pixel centre: on a sphere of 5120 faces and 50 px radius all but 8
     border pixels were missed. This function therefore visits every silhouette edge.
 
-    Differentiable in image and vertices_px.
-
     Args:
-        image: any attributes, 0 outside the mesh.
         face_id, depth: from `rasterize` of the same mesh.
         adjacency: face across edge k = (corner k, corner k + 1), -1 if there is none
             (`pipeline.geometry.differentiable_raster.face_adjacency`).
     """
-    if not runs_on_numba(vertices_px, depth_m):
-        return antialias_reference(image, face_id, depth, vertices_px, depth_m, faces, adjacency.long())
-    arrays = [tensor.detach().contiguous().numpy() for tensor in (vertices_px, faces, adjacency)]
-    edges = torch.from_numpy(silhouette_edges_cpu(*arrays))
-    return blend_silhouettes(image, face_id, depth, vertices_px, depth_m, edges)
+    if runs_on_numba(vertices_px, depth_m):
+        arrays = [tensor.detach().contiguous().numpy() for tensor in (vertices_px, faces, adjacency)]
+        edges = torch.from_numpy(silhouette_edges_cpu(*arrays))
+    else:
+        edges = silhouette_edges(vertices_px.detach(), faces.long(), adjacency.long())
+    return reference.silhouette_blends(face_id, depth, vertices_px, depth_m, edges)
+
+
+def antialias(values: Float[Tensor, "n c"], blends: SilhouetteBlends) -> Float[Tensor, "n c"]:
+    """Blend the values of pixels at silhouettes; differentiable in the values and, by `blends`, in the vertices.
+
+    Args:
+        values: any attributes of the pixels to which the indices of `blends` refer, 0 outside the mesh.
+    """
+    return values.index_add(0, blends.target, blends.fraction[:, None] * (values[blends.near] - values[blends.far]))

@@ -4,6 +4,8 @@ Notation as in `pipeline.kernels.raster.cpu`. The reductions (max of 1/z, then m
 the order, so that the result is deterministic.
 """
 
+from typing import NamedTuple
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -11,6 +13,19 @@ from torch import Tensor
 from pipeline.kernels.common.packing import segment_ids_from_counts
 
 FRAGMENTS_PER_CHUNK = 1 << 22
+
+
+class SilhouetteBlends(NamedTuple):
+    """Pairs of neighbouring pixels with a silhouette edge between their centres.
+
+    near, far: row-major indices of the pixel inside the silhouette and of the one outside. target: the one of the two
+    that changes, by fraction * (value of near - value of far). fraction: differentiable in the vertices.
+    """
+
+    target: Int[Tensor, "n"]
+    near: Int[Tensor, "n"]
+    far: Int[Tensor, "n"]
+    fraction: Float[Tensor, "n"]
 
 
 def signed_areas_px(vertices_px: Float[Tensor, "v 2"], faces: Int[Tensor, "f 3"]) -> Float[Tensor, "f"]:
@@ -157,14 +172,13 @@ def _outermost(distance: Float[Tensor, "n"], pair: Int[Tensor, "n"], pair_count:
     return order == first[pair]
 
 
-def _blend_along_axis(
-    flat: Float[Tensor, "n c"],
+def _blends_along_axis(
     face_id: Int[Tensor, "h w"],
     depth: Float[Tensor, "h w"],
     edges: tuple[Float[Tensor, "s 3 2"], Float[Tensor, "s 2"]],
     axis: int,
-) -> Float[Tensor, "n c"]:
-    """Return the colour change of every pixel by silhouettes between pairs of pixels along `axis` (0: x, 1: y)."""
+) -> SilhouetteBlends:
+    """Return the blends by silhouettes between pairs of pixels along `axis` (0: x, 1: y)."""
     ends_px, ends_inverse_depth = edges
     height, width = face_id.shape
     lines, size, step = (height, width, 1) if axis == 0 else (width, height, width)
@@ -195,36 +209,18 @@ def _blend_along_axis(
     keep = _outermost(distance.detach(), low_pixel, height * width)
     fraction, near, far = distance[keep] - 0.5, near[keep], far[keep]
     target = torch.where(fraction.detach() > 0, far, near)
-    fraction = fraction * weight[valid][keep]
-    return torch.zeros_like(flat).index_add(0, target, fraction[:, None] * (flat[near] - flat[far]))
+    return SilhouetteBlends(target, near, far, fraction * weight[valid][keep])
 
 
-def antialias_reference(
-    image: Float[Tensor, "h w c"],
-    face_id: Int[Tensor, "h w"],
-    depth: Float[Tensor, "h w"],
-    vertices_px: Float[Tensor, "v 2"],
-    depth_m: Float[Tensor, "v"],
-    faces: Int[Tensor, "f 3"],
-    adjacency: Int[Tensor, "f 3"],
-) -> Float[Tensor, "h w c"]:
-    """Do `pipeline.kernels.raster.antialias` on any device, with any float type."""
-    return blend_silhouettes(
-        image, face_id, depth, vertices_px, depth_m, silhouette_edges(vertices_px.detach(), faces.long(), adjacency)
-    )
-
-
-def blend_silhouettes(
-    image: Float[Tensor, "h w c"],
+def silhouette_blends(
     face_id: Int[Tensor, "h w"],
     depth: Float[Tensor, "h w"],
     vertices_px: Float[Tensor, "v 2"],
     depth_m: Float[Tensor, "v"],
     edges: Int[Tensor, "s 3"],
-) -> Float[Tensor, "h w c"]:
-    """Blend the pixels on both sides of silhouette edges, which are given as in `silhouette_edges`."""
+) -> SilhouetteBlends:
+    """Do `pipeline.kernels.raster.silhouette_blends` for silhouette edges that are given as in `silhouette_edges`."""
     edges = edges[(depth_m.detach()[edges] > 0).all(1)]
     ends = (vertices_px[edges], 1.0 / depth_m.detach()[edges[:, :2]])
-    flat = image.reshape(-1, image.shape[2])
-    change = [_blend_along_axis(flat, face_id, depth, ends, axis) for axis in (0, 1)]
-    return (flat + change[0] + change[1]).view(image.shape)
+    along = [_blends_along_axis(face_id, depth, ends, axis) for axis in (0, 1)]
+    return SilhouetteBlends(*map(torch.cat, zip(*along, strict=True)))
