@@ -14,12 +14,13 @@ from functools import reduce
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from scipy.sparse import csc_array, csr_array, diags_array, eye_array
-from scipy.sparse.linalg import SuperLU, splu
+from scipy.sparse import csr_array, diags_array, eye_array
+from scipy.sparse.linalg import SuperLU
 from torch import Tensor
 
 from pipeline.body.body import Body, Motion
 from pipeline.core.progress import track
+from pipeline.geometry.linear_systems import factorise_positive_definite
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import adjacency, laplacian
 from pipeline.kernels.adam import adam_step_
@@ -80,9 +81,7 @@ def factorise_smoothing_matrix(mesh: Mesh, stiff: Bool[np.ndarray, "f"], smoothi
     weight[stiff_vertex[ends].all(axis=1)] *= STIFFNESS
     weighted = adjacency(mesh, weight)
     combinatorial = diags_array(np.asarray(weighted.sum(axis=1)).ravel()) - weighted
-    matrix = csc_array(eye_array(count) + smoothing_lambda * combinatorial)
-    # Positive definite: the ordering for symmetric matrices without pivoting has two thirds of the entries.
-    return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    return factorise_positive_definite(eye_array(count) + smoothing_lambda * combinatorial)
 
 
 def optimise_vertices(

@@ -14,9 +14,9 @@ import igl
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
-from scipy.sparse.linalg import splu
 
 from pipeline.body.body import Body
+from pipeline.geometry.linear_systems import factorise_positive_definite
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import closest_points_on_mesh
 from pipeline.template.face.landmarks import FaceLandmarks, fit_similarity
@@ -95,12 +95,7 @@ class _System:
         bending = self.laplacian.T @ sparse.diags(length_m**4 / self.area_m2) @ self.laplacian
         # The second term fixes components of the solution that no target holds.
         diagonal = weight + 1e-6 * self.area_m2
-        factor = splu(
-            (bending + sparse.diags(diagonal)).tocsc(),
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
-        )
+        factor = factorise_positive_definite(bending + sparse.diags(diagonal))
         return np.asarray(factor.solve(weight[:, None] * target))
 
 

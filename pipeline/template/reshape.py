@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from scipy import sparse
-from scipy.sparse.linalg import splu
 
 from pipeline.body.body import Body, load_anny
 from pipeline.core.errors import UserError
+from pipeline.geometry.linear_systems import factorise_positive_definite
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import closest_points_on_mesh, laplacian
 from pipeline.template.registration import Registration
@@ -96,8 +96,8 @@ def carry_to_surface(change: ShapeChange, registration: Registration, mesh: Mesh
     wanted = np.einsum("vk,vkc->vc", barycentric, change.vertices_m[skin.faces[face]])
     weight = 1.0 / (1.0 + (distance_m / _CLEAR_M) ** 2) ** 2 + 1e-6
     operator = sparse.csc_matrix(laplacian(mesh))
-    matrix = sparse.csc_matrix(sparse.diags(weight) + _SMOOTHING * operator.T @ operator)
-    return np.asarray(splu(matrix).solve(weight[:, None] * wanted))
+    factor = factorise_positive_definite(sparse.diags(weight) + _SMOOTHING * operator.T @ operator)
+    return np.asarray(factor.solve(weight[:, None] * wanted))
 
 
 def reshape_body(body: Body, change: ShapeChange, changes: Mapping[str, float]) -> Body:

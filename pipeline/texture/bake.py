@@ -22,6 +22,7 @@ from pipeline.core.progress import track
 from pipeline.geometry.atlas import Atlas, Texels
 from pipeline.geometry.camera import pixel_footprint_m, project
 from pipeline.geometry.texture_rendering import apply_shading, render_textured
+from pipeline.kernels.common.thread_pool import shared_thread_pool
 from pipeline.kernels.raster import rasterize
 from pipeline.kernels.texel_projection import ImageView, ProjectedMesh, TexelPoints, project_texels
 from pipeline.kernels.texture_sampling import supersample_attributes, supersample_texture
@@ -167,9 +168,18 @@ def light_confidence(shading: Float[Tensor, "*n d"]) -> Float[Tensor, "*n"]:
 
 def average_views(views: Iterable[BakeView], surface: TexturedSurface, settings: TextureSettings) -> WeightedMean:
     """Return the weighted mean colour of each texel over all views, without alignment."""
+    return _mean_of_views(lambda view: sample_frame_colours(view, surface, settings), views, surface)
+
+
+def _mean_of_views(
+    sample: Callable[[BakeView], tuple[Float[Tensor, "t 3"], Float[Tensor, "t"]]],
+    views: Iterable[BakeView],
+    surface: TexturedSurface,
+) -> WeightedMean:
+    """Return the weighted mean of what is sampled in the views, several at a time, summed in their order."""
     mean = WeightedMean.empty(len(surface.texels.face))
-    for view in views:
-        mean.add(*sample_frame_colours(view, surface, settings))
+    for values, weight in shared_thread_pool(torch.get_num_threads()).imap(sample, views):
+        mean.add(values, weight)
     return mean
 
 
@@ -183,10 +193,7 @@ def average_residuals(
 
     texture: sRGB in [0, 1]. Residuals are down-weighted by the Geman-McClure function.
     """
-    mean = WeightedMean.empty(len(surface.texels.face))
-    for view in views:
-        mean.add(*sample_residuals(texture, view, surface, settings))
-    return mean
+    return _mean_of_views(lambda view: sample_residuals(texture, view, surface, settings), views, surface)
 
 
 def sample_residuals(
@@ -316,6 +323,9 @@ def mean_foreground_psnr_db(
     texture: Float[np.ndarray, "s s 3"], views: Sequence[BakeView], surface: TexturedSurface
 ) -> float:
     """Return the mean over views of the foreground PSNR, render and frame composited on white; nan without views."""
-    renders = [composite_premultiplied_on_white(render_textured_view(texture, view, surface)) for view in views]
+    pool = shared_thread_pool(torch.get_num_threads())
+    renders = pool.map(
+        lambda view: composite_premultiplied_on_white(render_textured_view(texture, view, surface)), views
+    )
     targets = [composite_on_white(view.image, view.mask) for view in views]
     return validation_psnr_db(renders, targets, [foreground_mask(view.mask) for view in views])

@@ -2,10 +2,10 @@
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.sparse import csc_array, diags_array
-from scipy.sparse.linalg import splu
+from scipy.sparse import diags_array
 
 from pipeline.geometry.atlas import Texels
+from pipeline.geometry.linear_systems import factorise_positive_definite
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import laplacian
 
@@ -48,5 +48,7 @@ def inpaint_vertex_colours(
     mean = (data_weight @ colour) / max(data_weight.sum(), 1e-12)
     degree = np.bincount(mesh.edges().ravel(), minlength=len(colour)).astype(np.float64)
     operator = diags_array(degree) @ laplacian(mesh)
-    matrix = csc_array(diags_array(data_weight + REGULARISATION_WEIGHT) + SMOOTHNESS_WEIGHT * operator)
-    return splu(matrix).solve(data_weight[:, None] * colour + REGULARISATION_WEIGHT * mean).astype(np.float32)
+    factor = factorise_positive_definite(
+        diags_array(data_weight + REGULARISATION_WEIGHT) + SMOOTHNESS_WEIGHT * operator
+    )
+    return factor.solve(data_weight[:, None] * colour + REGULARISATION_WEIGHT * mean).astype(np.float32)

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from pipeline.kernels.common.thread_pool import shared_thread_pool
 from pipeline.texture.light_fit import LightFit, LightObservations, observe_visibility, vertex_mean
 from pipeline.texture.views import BakeView
 
@@ -43,11 +44,11 @@ def find_key_direction(
         product = float(np.sum(weight * left * lost))
         return product**2 / max(float(np.sum(weight * lost**2)), 1e-12) if product < 0 else 0.0
 
-    directions = search_directions()
-    best = directions[int(np.argmax([explained(direction) for direction in directions]))]
+    pool, directions = shared_thread_pool(torch.get_num_threads()), search_directions()
+    best = directions[int(np.argmax(pool.map(explained, directions)))]
     for angle_rad in SEARCH_REFINEMENTS_RAD:
         around = np.concatenate([best[None], directions_around(best, angle_rad)])
-        best = around[int(np.argmax([explained(direction) for direction in around]))]
+        best = around[int(np.argmax(pool.map(explained, around)))]
     return best
 
 

@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array, csc_array, diags_array
-from scipy.sparse.linalg import splu
 
 from pipeline.geometry.colour import srgb_to_linear
+from pipeline.geometry.linear_systems import factorise_positive_definite
 from pipeline.geometry.mesh import area_weighted_vertex_normals
 from pipeline.texture.bake import TexturedSurface, sample_frame_colours
 from pipeline.texture.light import MIN_IRRADIANCE, VideoLight, key_visibility, spherical_harmonics
@@ -278,18 +278,23 @@ class _Problem:
         weight = self.weight / (1.0 + (length / noise) ** 2)
         irradiance, basis = self._irradiance(light), self._light_basis(light)
         albedo_matrix, smoothness = self._albedo_matrix(weight, fit.log_albedo)
-        factor = splu(albedo_matrix)
+        factor = factorise_positive_definite(albedo_matrix)
         frames, terms = self.view_count, basis.shape[1]
         system = np.zeros((frames + 3 * terms, frames + 3 * terms + 1))
+        per_frame = coo_array((weight, (vertex, frame)), shape=(self.vertex_count, frames)).toarray()
+        solved_per_frame = factor.solve(per_frame)
         solutions = []
         for channel in range(3):
             jacobian = basis / irradiance[:, channel, None]
             jacobian[irradiance[:, channel] <= MIN_IRRADIANCE] = 0.0
-            coupling, block = self._channel_blocks(jacobian, weight)
+            per_vertex, block = self._channel_blocks(jacobian, weight)
+            coupling = np.concatenate([per_frame, per_vertex], axis=1)
             error = weight * residual[:, channel]
             albedo_right = np.bincount(vertex, error, self.vertex_count) - smoothness @ fit.log_albedo[:, channel]
             right = np.concatenate([np.bincount(frame, error, frames), jacobian.T @ error])
-            solved = factor.solve(np.column_stack([coupling, albedo_right]))
+            solved = np.concatenate(
+                [solved_per_frame, factor.solve(np.column_stack([per_vertex, albedo_right]))], axis=1
+            )
             rows = np.r_[np.arange(frames), frames + channel * terms + np.arange(terms)]
             system[np.ix_(rows, rows)] += block - coupling.T @ solved[:, :-1]
             system[rows, -1] += right - coupling.T @ solved[:, -1]
@@ -333,18 +338,17 @@ class _Problem:
         return self.basis if lambert is None else np.column_stack([self.basis, lambert])
 
     def _channel_blocks(self, jacobian: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the blocks (albedos x others) and (others x others) of one channel's normal matrix.
+        """Return the blocks (albedos x light) and (others x others) of one channel's normal matrix.
 
         The others are the log gains and the light; `jacobian` is the derivative of the logarithm by the light.
         """
         vertex, frame, frames = self.observed.vertex, self.observed.frame, self.view_count
         weighted = weight[:, None] * jacobian
-        per_frame = coo_array((weight, (vertex, frame)), shape=(self.vertex_count, frames)).toarray()
         per_vertex = np.stack([np.bincount(vertex, column, self.vertex_count) for column in weighted.T], axis=1)
         gain_light = np.stack([np.bincount(frame, column, frames) for column in weighted.T], axis=1)
         gains = np.diag(np.bincount(frame, weight, frames))
         block = np.block([[gains, gain_light], [gain_light.T, weighted.T @ jacobian]])
-        return np.concatenate([per_frame, per_vertex], axis=1), block
+        return per_vertex, block
 
     def _albedo_matrix(self, weight: np.ndarray, log_albedo: np.ndarray) -> tuple[csc_array, csc_array]:
         """Return the normal matrix of the albedos, data and prior, and the prior's part."""

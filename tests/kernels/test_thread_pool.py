@@ -38,6 +38,19 @@ def test_results_keep_job_order(four_threads: None) -> None:
     assert ThreadPool(2).map(job, [0, 1], ["first", "second"]) == ["0 first", "1 second"]
 
 
+def test_imap_keeps_the_order_and_holds_few_results(four_threads: None) -> None:
+    started = []
+
+    def job(number: int) -> int:
+        started.append(number)
+        return number**2
+
+    results = ThreadPool(2).imap(job, iter(range(7)))
+    assert next(results) == 0
+    assert sorted(started) == [0, 1]
+    assert list(results) == [1, 4, 9, 16, 25, 36]
+
+
 def test_threads_are_divided_and_restored(four_threads: None) -> None:
     states = ThreadPool(2).map(thread_state, range(6))
     assert {state[1:] for state in states} == {(2, 2)}

@@ -4,14 +4,16 @@ A training step consists of about a thousand operations that are too small to be
 wake a thread takes as long as such an operation (docs/decisions.md).
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from itertools import islice
 from typing import TypeVar
 
 import numba
 import torch
 
+A = TypeVar("A")
 T = TypeVar("T")
 
 
@@ -25,7 +27,7 @@ class ThreadPool:
     def __init__(self, count: int) -> None:
         threads = min(torch.get_num_threads(), numba.get_num_threads())
         worker_count = 1 if numba.threading_layer() == "workqueue" else min(count, threads)
-        self._threads_per_worker = threads // worker_count
+        self._worker_count, self._threads_per_worker = worker_count, threads // worker_count
         self._pool = ThreadPoolExecutor(worker_count, initializer=self._set_thread_limits) if worker_count > 1 else None
 
     def map(self, function: Callable[..., T], *arguments: Iterable) -> list[T]:
@@ -39,6 +41,12 @@ class ThreadPool:
             return list(self._pool.map(function, *arguments))
         finally:
             torch.set_num_threads(threads)
+
+    def imap(self, function: Callable[[A], T], items: Iterable[A]) -> Iterator[T]:
+        """Yield the results of `function` for all items, in their order; no more are held than there are workers."""
+        iterator = iter(items)
+        while batch := list(islice(iterator, self._worker_count)):
+            yield from self.map(function, batch)
 
     def _set_thread_limits(self) -> None:
         torch.set_num_threads(self._threads_per_worker)
