@@ -22,6 +22,7 @@ from pipeline.body.body import Body
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import isosurface, largest_solid, repair, signed_distance_m
 from pipeline.kernels.common.thread_pool import shared_thread_pool
+from pipeline.mesh.between_legs import excess_between_legs
 from pipeline.mesh.settings import MeshSettings
 
 BODY_PADDING_VOXELS = 4
@@ -32,13 +33,6 @@ DISTANCE_GRID_STRIDE = 4
 HAND_NARROW_BAND_VOXELS = 4.0
 GRID_SIZE_MULTIPLE = 8
 """Sample counts minus one are multiples of this, so that downsampling by 2 or 4 keeps the last sample of each axis."""
-MAX_STRAND_AREA_M2 = 0.002
-"""Horizontal cross-section up to which a piece between the legs that holds no leg is a strand, m²: 4.5 cm squared. That
-of a skirt is a ring, and larger."""
-MIN_INNER_OFFSET_M, OUTER_OFFSET_PERCENTILE = 0.015, 90.0
-"""Trousers may lie this far from the inner side of a leg, or as far as this percentile from its outer side."""
-MIN_RIDGE_M = 0.015
-"""A ridge goes farther beyond by this distance at least: legs are not fitted exactly in the middle of trousers."""
 SURFACE_ISOVALUE = 0.5
 """Isovalue of the indicator function, which is 1 inside the solid and 0 outside."""
 
@@ -141,64 +135,16 @@ def indicator_grid(samples: CanonicalGrid, isovalue_per_m: float, settings: Mesh
     value = np.maximum(density_indicator, core)
     value = np.maximum(value, _close_concavities(value >= SURFACE_ISOVALUE, samples, settings.closing_radius_m))
     value += samples.hand_weight * (hand - value)
-    value = np.where(excess_between_legs(value >= SURFACE_ISOVALUE, samples), 0.0, value)
+    value = np.where(
+        excess_between_legs(value >= SURFACE_ISOVALUE, samples.body_distance_m, samples.origin_m, samples.spacing_m),
+        0.0,
+        value,
+    )
     inside = largest_solid(value >= SURFACE_ISOVALUE)
     # Filled cavities become 1; other components become empty.
     filled = np.maximum(value, np.where(value < SURFACE_ISOVALUE, 1.0, value))
     value = np.where(inside, filled, np.minimum(value, SURFACE_ISOVALUE - 1e-3))
     return value.astype(np.float32)
-
-
-def excess_between_legs(inside: Bool[np.ndarray, "x y z"], samples: CanonicalGrid) -> Bool[np.ndarray, "x y z"]:
-    """Return the parts of the solid between the legs that are no trousers: strands and ridges.
-
-    Where trousers touch each other, nothing shows the valley between them, and it is filled; the canonical pose, whose
-    legs are apart, cuts the filling into a ridge on either leg and strands between them. In each horizontal slice below
-    the crotch, a piece that holds no leg and is no larger than `MAX_STRAND_AREA_M2` is a strand, and a piece that holds
-    one leg alone ends on its inner side as near to the body as on its outer side. A piece that holds both legs is a
-    skirt or coat, and stays.
-    """
-    excess = np.zeros_like(inside)
-    body = samples.body_distance_m < 0.0
-    middle = round(-samples.origin_m[0] / samples.spacing_m)
-    if not 0 < middle < len(body):
-        return excess
-    crotch = int(np.argmax(body[middle].any(axis=1)))
-    for row in range(crotch):
-        legs = [np.flatnonzero(body[part, row].any(axis=1)) for part in (np.s_[:middle], np.s_[middle:])]
-        if all(len(leg) > 0 for leg in legs):
-            axes = (float(legs[0].mean()), float(legs[1].mean()) + middle)
-            excess[:, row] = _excess_in_slice(inside[:, row], samples.body_distance_m[:, row], axes, samples.spacing_m)
-    return excess
-
-
-def _excess_in_slice(
-    inside: Bool[np.ndarray, "x z"],
-    body_distance_m: Float[np.ndarray, "x z"],
-    axes: tuple[float, float],
-    spacing_m: float,
-) -> Bool[np.ndarray, "x z"]:
-    """Return the samples of a slice to be cleared. axes: columns of the axes of the two legs."""
-    column = np.arange(len(inside))[:, None]
-    between = (column > axes[0]) & (column < axes[1])
-    labels, count = ndimage.label(inside, np.ones((3, 3), dtype=int))
-    is_leg = body_distance_m < 0.0
-    of_leg = [np.unique(labels[is_leg & (labels > 0) & side]) for side in (column <= axes[0], column >= axes[1])]
-    holds_leg = np.zeros(count + 1, dtype=bool)
-    holds_leg[labels[is_leg]] = True
-    is_small = np.bincount(labels.ravel(), minlength=count + 1) * spacing_m**2 <= MAX_STRAND_AREA_M2
-    excess = inside & between & (is_small & ~holds_leg)[labels]
-    if np.intersect1d(*of_leg).size:
-        return excess
-    for own, outer in zip(of_leg, (column <= axes[0], column >= axes[1]), strict=True):
-        piece = np.isin(labels, own)
-        outline = piece & ~ndimage.binary_erosion(piece) & outer
-        if outline.any():
-            offset_m = max(np.percentile(body_distance_m[outline], OUTER_OFFSET_PERCENTILE), MIN_INNER_OFFSET_M)
-            beyond = piece & between & (body_distance_m > offset_m)
-            if (body_distance_m[beyond] > offset_m + MIN_RIDGE_M).any():
-                excess |= beyond
-    return excess
 
 
 def extract_mesh(samples: CanonicalGrid, isovalue_per_m: float, settings: MeshSettings) -> Mesh:

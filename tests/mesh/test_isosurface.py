@@ -11,8 +11,6 @@ from pipeline.body.body import Body
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import is_closed_manifold
 from pipeline.mesh.isosurface import (
-    CanonicalGrid,
-    excess_between_legs,
     extract_mesh,
     hand_skin_weights,
     indicator_grid,
@@ -132,68 +130,3 @@ def test_an_empty_solid_is_an_error(body: Body) -> None:
     samples = sample_canonical_grid(lambda points: torch.zeros(len(points)), BOUNDS_M, body, VOXEL_SIZE_M, settings)
     with pytest.raises(ValueError, match="reaches the isovalue"):
         extract_mesh(samples, 50.0, settings)
-
-
-LEG_X_M, LEG_RADIUS_M, CROTCH_M = 0.12, 0.06, 0.5
-GRID_M = 0.005
-
-
-def leg_grid() -> tuple[CanonicalGrid, tuple[np.ndarray, ...]]:
-    """Two vertical legs, which are one trunk above the crotch; returns the coordinates of the samples as well."""
-    axes = np.arange(-0.3, 0.3001, GRID_M), np.arange(0.0, 0.6001, GRID_M), np.arange(-0.2, 0.2001, GRID_M)
-    x, y, z = np.meshgrid(*axes, indexing="ij")
-    legs_m = np.hypot(np.abs(x) - LEG_X_M, z) - LEG_RADIUS_M
-    trunk_m = np.maximum(np.hypot(x, z) - 0.18, CROTCH_M - y)
-    nothing = np.zeros(x.shape)
-    grid = CanonicalGrid(
-        np.array([axis[0] for axis in axes]), GRID_M, nothing, np.minimum(legs_m, trunk_m), nothing.copy()
-    )
-    return grid, (x, y, z)
-
-
-def test_strands_and_ridges_between_legs_are_excess() -> None:
-    """The trousers are 1 cm from the legs all around; the ridge goes 4 cm farther, the strand touches nothing."""
-    grid, (x, y, z) = leg_grid()
-    trousers = grid.body_distance_m < 0.01
-    below = y < CROTCH_M - 0.02
-    strand = below & (np.hypot(x - 0.01, z - 0.08) < 0.012)
-    ridge = below & (y > 0.2) & (np.abs(z - 0.03) < 0.012) & (x > -LEG_X_M) & (x < -LEG_X_M + LEG_RADIUS_M + 0.05)
-    excess = excess_between_legs(trousers | strand | ridge, grid)
-    assert excess[strand & ~trousers].all()
-    assert not excess[trousers].any()
-    beyond = ridge & (grid.body_distance_m > 0.02) & (y < CROTCH_M - 0.1)
-    assert beyond.sum() > 100
-    assert excess[beyond].all()
-    assert not excess[~(strand | ridge)].any()
-
-
-def test_wide_trousers_are_as_wide_inside_as_outside() -> None:
-    grid, _ = leg_grid()
-    wide = grid.body_distance_m < 0.04
-    assert not excess_between_legs(wide, grid).any()
-
-
-def test_what_is_beside_the_legs_stays() -> None:
-    """A cord that hangs on the outer side, and cloth on the outer side of one leg."""
-    grid, (x, y, z) = leg_grid()
-    trousers, below = grid.body_distance_m < 0.01, y < CROTCH_M - 0.02
-    cord = below & (np.hypot(x - 0.25, z) < 0.012)
-    flare = below & (x > LEG_X_M) & (grid.body_distance_m < 0.05)
-    assert not excess_between_legs(trousers | cord | flare, grid).any()
-    button = below & (x > LEG_X_M) & (np.abs(z) < 0.5 * GRID_M) & (grid.body_distance_m < 0.042)
-    assert not excess_between_legs((grid.body_distance_m < 0.02) | button, grid).any()
-
-
-def test_a_skirt_is_no_excess() -> None:
-    """Cloth from leg to leg, and a ring around both that touches neither."""
-    grid, (x, y, z) = leg_grid()
-    trousers, below = grid.body_distance_m < 0.01, y < CROTCH_M - 0.02
-    cloth = below & (np.abs(x) < LEG_X_M) & (np.abs(np.abs(z) - 0.05) < 0.012)
-    assert not excess_between_legs(trousers | cloth, grid).any()
-    ring = below & (np.abs(np.hypot(x / 1.4, z) - 0.18) < 0.01)
-    assert not excess_between_legs(trousers | ring, grid).any()
-
-
-def test_a_body_without_two_legs_has_no_excess(body: Body) -> None:
-    samples = sample_canonical_grid(shell_density, BOUNDS_M, body, VOXEL_SIZE_M, WITHOUT_HANDS)
-    assert not excess_between_legs(samples.density > 0.0, samples).any()

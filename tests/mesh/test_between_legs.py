@@ -1,0 +1,107 @@
+"""The space between two legs: strands and ridges are excess, trousers and skirts are not; valleys are closed."""
+
+import numpy as np
+
+from pipeline.mesh.between_legs import VALLEY_RADIUS_M, close_valleys, excess_between_legs
+
+LEG_X_M, LEG_RADIUS_M, CROTCH_M = 0.12, 0.06, 0.5
+GRID_M = 0.005
+
+
+def leg_grid() -> tuple[tuple[np.ndarray, np.ndarray, float], tuple[np.ndarray, ...]]:
+    """Two vertical legs, which are one trunk above the crotch: body distance, origin and spacing; coordinates."""
+    axes = np.arange(-0.3, 0.3001, GRID_M), np.arange(0.0, 0.6001, GRID_M), np.arange(-0.2, 0.2001, GRID_M)
+    x, y, z = np.meshgrid(*axes, indexing="ij")
+    legs_m = np.hypot(np.abs(x) - LEG_X_M, z) - LEG_RADIUS_M
+    trunk_m = np.maximum(np.hypot(x, z) - 0.18, CROTCH_M - y)
+    return (np.minimum(legs_m, trunk_m), np.array([axis[0] for axis in axes]), GRID_M), (x, y, z)
+
+
+def test_strands_and_ridges_between_legs_are_excess() -> None:
+    """The trousers are 1 cm from the legs all around; the ridge goes 4 cm farther, the strand touches nothing."""
+    grid, (x, y, z) = leg_grid()
+    trousers = grid[0] < 0.01
+    below = y < CROTCH_M - 0.02
+    strand = below & (np.hypot(x - 0.01, z - 0.08) < 0.012)
+    ridge = below & (y > 0.2) & (np.abs(z - 0.03) < 0.012) & (x > -LEG_X_M) & (x < -LEG_X_M + LEG_RADIUS_M + 0.05)
+    excess = excess_between_legs(trousers | strand | ridge, *grid)
+    assert excess[strand & ~trousers].all()
+    assert not excess[trousers].any()
+    beyond = ridge & (grid[0] > 0.02) & (y < CROTCH_M - 0.1)
+    assert beyond.sum() > 100
+    assert excess[beyond].all()
+    assert not excess[~(strand | ridge)].any()
+
+
+def test_wide_trousers_are_as_wide_inside_as_outside() -> None:
+    grid, _ = leg_grid()
+    wide = grid[0] < 0.04
+    assert not excess_between_legs(wide, *grid).any()
+
+
+def test_what_is_beside_the_legs_stays() -> None:
+    """A cord that hangs on the outer side, and cloth on the outer side of one leg."""
+    grid, (x, y, z) = leg_grid()
+    trousers, below = grid[0] < 0.01, y < CROTCH_M - 0.02
+    cord = below & (np.hypot(x - 0.25, z) < 0.012)
+    flare = below & (x > LEG_X_M) & (grid[0] < 0.05)
+    assert not excess_between_legs(trousers | cord | flare, *grid).any()
+    button = below & (x > LEG_X_M) & (np.abs(z) < 0.5 * GRID_M) & (grid[0] < 0.042)
+    assert not excess_between_legs((grid[0] < 0.02) | button, *grid).any()
+
+
+def test_a_skirt_is_no_excess() -> None:
+    """Cloth from leg to leg, and a ring around both that touches neither."""
+    grid, (x, y, z) = leg_grid()
+    trousers, below = grid[0] < 0.01, y < CROTCH_M - 0.02
+    cloth = below & (np.abs(x) < LEG_X_M) & (np.abs(np.abs(z) - 0.05) < 0.012)
+    assert not excess_between_legs(trousers | cloth, *grid).any()
+    ring = below & (np.abs(np.hypot(x / 1.4, z) - 0.18) < 0.01)
+    assert not excess_between_legs(trousers | ring, *grid).any()
+
+
+def test_a_body_without_two_legs_has_no_excess() -> None:
+    grid, (x, y, z) = leg_grid()
+    ball_m = np.sqrt(x**2 + (y - 0.3) ** 2 + z**2) - 0.1
+    assert not excess_between_legs(ball_m < 0.02, ball_m, *grid[1:]).any()
+
+
+def joined_trousers(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Signed distance of trouser legs that touch each other from 0.37 m up, with a slit 2 cm wide in front of there."""
+    legs_m = np.hypot(np.abs(x) - LEG_X_M, z) - np.interp(y, (0.2, 0.42), (0.09, 0.13))
+    slit_m = np.maximum(np.abs(x) - 0.01, 0.02 - z)
+    return np.maximum(legs_m, -slit_m)
+
+
+def test_a_valley_between_joined_legs_is_closed() -> None:
+    grid, (x, y, z) = leg_grid()
+    before_m = joined_trousers(x, y, z)
+    after_m = close_valleys(before_m, *grid)
+    in_slit = (np.abs(x) < 0.006) & (y > 0.43) & (y < 0.52) & (z > 0.02) & (z < 0.05)
+    assert (before_m[in_slit] > 0.0).all()
+    assert (after_m[in_slit] < 0.0).all()
+    # Nothing is cleared but by the smoothing, and nothing beside the valley changes.
+    assert (after_m - before_m).max() < 0.01
+    beside = (np.abs(x) > 0.1) | (y < 0.25)
+    np.testing.assert_array_equal(after_m[beside], before_m[beside])
+
+
+def test_legs_apart_stay_apart() -> None:
+    grid, (x, y, z) = leg_grid()
+    apart_m = grid[0] - 0.01
+    after_m = close_valleys(apart_m, *grid)
+    far_below = y < CROTCH_M - 0.01 - VALLEY_RADIUS_M
+    middle = np.abs(x) < 0.02
+    assert (after_m[far_below & middle] > 0.0).all()
+
+
+def test_a_skirt_has_no_valleys() -> None:
+    grid, (x, y, z) = leg_grid()
+    skirt_m = np.maximum(np.hypot(x, 1.5 * z) - 0.22, 0.1 - y)
+    assert close_valleys(skirt_m, *grid) is skirt_m
+
+
+def test_a_solid_without_legs_has_no_valleys() -> None:
+    grid, (x, y, z) = leg_grid()
+    far_m = np.hypot(x - 0.2, z) - 0.05
+    assert close_valleys(far_m, far_m, *grid[1:]) is far_m
