@@ -35,7 +35,7 @@ from pipeline.geometry.camera import Camera
 from pipeline.io.image import read_gray, read_rgb, to_float, to_uint8, write_rgb
 
 CHECKPOINT_INTERVAL_S = 15.0
-PREVIEW_FRAMES = 4
+PREVIEW_FILE, PREVIEW_FRAMES = "preview.png", 4
 PSNR_DECIMALS = 2
 """Decimals (dB) to which the PSNR of fitted and of refined poses are compared."""
 VALIDATION_FRACTIONS = (1 / 32, 1 / 16, 1 / 8, 1 / 4, 3 / 8, 1 / 2, 5 / 8, 3 / 4, 7 / 8, 1)
@@ -62,7 +62,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: FieldConfig) -> Mapping[s
     save_field(out / "field.safetensors", trainer.field)
     save_occupancy(out / "occupancy.npz", trainer.occupancy.binary())
     save_motion(out / "motion.npz", motion)
-    write_preview(out / "preview.png", renders, validator)
+    write_preview(out / PREVIEW_FILE, renders, validator)
     return metrics | {
         "steps": trainer.completed_steps,
         "seconds_per_step": seconds_per_step,
@@ -115,7 +115,7 @@ def build_validator(capture: Capture, motion: Motion, camera: Camera, config: Fi
 
 
 def train_field(trainer: Trainer, validator: Validator, out: Path) -> float:
-    """Take all remaining steps with regular checkpoints; return the median time of a step, s.
+    """Take all remaining steps with regular checkpoints and small previews; return the median time of a step, s.
 
     Raises:
         UserError: the training diverged.
@@ -145,6 +145,7 @@ def train_field(trainer: Trainer, validator: Validator, out: Path) -> float:
                 *subsampled_validator.mean_psnr_db(renders),
                 *subsampled_validator.psnr_per_frame_db(renders),
             )
+            write_preview(out / PREVIEW_FILE, renders, subsampled_validator)
         if time.monotonic() - last_save_s > CHECKPOINT_INTERVAL_S:
             save_checkpoint(checkpoint, trainer, seconds_before + sum(step_seconds))
             last_save_s = time.monotonic()

@@ -59,15 +59,21 @@ def test_training_takes_all_steps_also_where_validation_frames_gain_nothing(tmp_
     """The learning rate falls until the last step: the last eighth gains most where the one before gained nothing."""
     trainer = mock.MagicMock(spec=Trainer, completed_steps=0, refines_poses=True, config=FieldConfig(steps=32))
 
+    has_preview = []
+
     def step():
+        has_preview.append((tmp_path / "preview.png").exists())
         trainer.completed_steps += 1
 
     trainer.step.side_effect = step
-    validator = mock.MagicMock(spec=Validator, ground_truth=[None, None])
+    picture = np.zeros((4, 3, 3), np.uint8)
+    validator = mock.MagicMock(spec=Validator, ground_truth=[None, None], targets=[picture, picture])
+    validator.render.return_value = [picture, picture]
     validator.subsampled.return_value = validator
     validator.mean_psnr_db.return_value, validator.psnr_per_frame_db.return_value = (30.0, 25.0), [29.0, 31.0]
     train_field(trainer, validator, tmp_path)
     assert trainer.completed_steps == 32
+    assert has_preview == [False] + 31 * [True]
     assert [float(row["step"]) for row in rows_of(tmp_path / "progress.csv")][-1] == 32
 
 
