@@ -17,6 +17,8 @@ MIN_RIDGE_M = 0.015
 """A ridge goes farther beyond by this distance at least: legs are not fitted exactly in the middle of trousers."""
 VALLEY_RADIUS_M, VALLEY_SIGMA_M = 0.03, 0.012
 """Valleys at the crotch that a disc of this radius cannot enter are closed, and what closes them is smoothed."""
+VALLEY_RISE_M = 0.02
+"""Height over the lowest slice that joins the legs from which on a valley is closed altogether."""
 MIN_JOINED_M, MAX_JOINED_M = 0.03, 0.15
 """Legs that are joined over less than the first height below the crotch of the body have no valley; cloth that joins
 them over more than the second is a skirt."""
@@ -111,9 +113,9 @@ def close_valleys(
         return distance_m
     across_m = spacing_m * np.abs(np.arange(len(distance_m)) - middle)
     up_m = spacing_m * np.arange(distance_m.shape[1])
-    share = _fade(across_m - VALLEY_HALF_WIDTH_M)[:, None] * (
-        _fade(up_m - spacing_m * crotch - VALLEY_HEIGHT_M) * _fade(spacing_m * lowest - up_m)
-    )
+    rise = np.clip((up_m - spacing_m * lowest) / VALLEY_RISE_M, 0.0, 1.0)
+    height = rise * _fade(up_m - spacing_m * crotch - VALLEY_HEIGHT_M)
+    share = _fade(across_m - VALLEY_HALF_WIDTH_M)[:, None] * height
     share *= 1.0 - _fade(np.array([joined_m - MIN_JOINED_M]))
     reach = round(VALLEY_RADIUS_M / spacing_m)
     columns, rows = (_padded_span(used, 2 * reach) for used in np.nonzero(share))
