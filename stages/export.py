@@ -36,6 +36,7 @@ from pipeline.core.progress import warn
 from pipeline.core.stage import Stage
 from pipeline.geometry.atlas import Atlas
 from pipeline.geometry.camera import Camera
+from pipeline.geometry.creases import Creases, find_creases
 from pipeline.geometry.mesh import Mesh
 from pipeline.io.image import png_bytes, to_uint8, write_gray, write_rgb
 from pipeline.mesh.files import MeshArtifact, load_mesh
@@ -210,6 +211,8 @@ def make_face(
 def loose_parts(scene: Scene) -> LooseParts:
     """Return skirts and long hair, with chains and weights for the .glb in its rest pose."""
     skinned, atlas = (scene.face.skinned, scene.face.atlas) if scene.face else (scene.skinned, scene.texture.atlas)
+    creases = find_creases(skinned.mesh)
+    source = creases.source[creases.split_atlas(atlas).vertex_of_uv]
     to_rest = dict(zip(scene.body.joint_names, scene.rig.bind_to_rest, strict=True))
     parts = []
     for part in find_loose_parts(scene.body, skinned):
@@ -217,7 +220,7 @@ def loose_parts(scene: Scene) -> LooseParts:
             replace(chain, joints_m=chain.joints_m @ to_rest[chain.parent][:3, :3].T + to_rest[chain.parent][:3, 3])
             for chain in part.chains
         )
-        parts.append(replace(part, chains=chains, weights=part.weights[atlas.vertex_of_uv]))
+        parts.append(replace(part, chains=chains, weights=part.weights[source]))
     return LooseParts(tuple(parts), tuple(body_colliders(scene.body)) if parts else ())
 
 
@@ -228,20 +231,25 @@ def encode_scene(scene: Scene, config: Config, clips: Mapping[str, Motion]) -> b
     if face is not None and normal is not None:
         normal = widen_flat(normal)
     maps = material_maps(texture, config, face or texture, normal)
-    at_rest = to_rest_pose(face.skinned if face else scene.skinned, scene.rig)
+    skinned = face.skinned if face else scene.skinned
+    creases = find_creases(skinned.mesh)
+    at_rest, atlas = to_rest_pose(skinned.split(creases), scene.rig), creases.split_atlas(atlas)
     mesh = build_skinned_mesh(at_rest, atlas)
     if face is not None:
-        displacements_m = face.displacements_m[:, atlas.vertex_of_uv]
+        source = creases.source[atlas.vertex_of_uv]
+        displacements_m = face.displacements_m[:, source]
         eyes_m = eye_centres_m(at_rest.mesh.vertices, face.eyeballs)
-        turns = face.normal_changes[:, atlas.vertex_of_uv]
+        turns = face.normal_changes[:, source]
         mesh = replace(mesh, morphs=MorphTargets(face.names, displacements_m, eyes_m, turns))
     if config.shape_keys:
-        mesh = add_shape_keys(mesh, scene, atlas)
+        mesh = add_shape_keys(mesh, scene, atlas, creases)
     return encode_glb(mesh, scene.rig, clips, maps, scene.camera, scene.extras)
 
 
-def add_shape_keys(mesh: SkinnedMesh, scene: Scene, atlas: Atlas) -> SkinnedMesh:
+def add_shape_keys(mesh: SkinnedMesh, scene: Scene, atlas: Atlas, creases: Creases) -> SkinnedMesh:
     """Return the mesh with a morph target for each of `SHAPE_KEYS`, after those of the face.
+
+    atlas: of the mesh with the copies of `creases`.
 
     Raises:
         UserError: the body of the run is not the built-in one.
@@ -249,12 +257,12 @@ def add_shape_keys(mesh: SkinnedMesh, scene: Scene, atlas: Atlas) -> SkinnedMesh
     if scene.template is None:
         raise UserError("export.shape_keys=true needs the built-in body, and this run has a body of a model file")
     skinned = scene.face.skinned if scene.face else scene.skinned
-    registration, at_rest = scene.template.registration, to_rest_pose(skinned, scene.rig)
+    registration, at_rest = scene.template.registration, to_rest_pose(skinned.split(creases), scene.rig)
     moved, turned = [], []
     for name in SHAPE_KEYS:
         change = shape_change(scene.body, {name: SHAPE_KEY_STEP})
         vertices = (skinned.mesh.vertices + carry_to_surface(change, registration, skinned.mesh)).astype(np.float32)
-        new = to_rest_pose(replace(skinned, mesh=Mesh(vertices, skinned.mesh.faces)), scene.rig)
+        new = to_rest_pose(replace(skinned, mesh=Mesh(vertices, skinned.mesh.faces)).split(creases), scene.rig)
         moved.append((new.mesh.vertices - at_rest.mesh.vertices)[atlas.vertex_of_uv])
         turned.append((new.vertex_normals() - at_rest.vertex_normals())[atlas.vertex_of_uv])
     keys, turns = np.stack(moved).astype(np.float32), np.stack(turned).astype(np.float32)
@@ -321,8 +329,9 @@ def write_scene_obj(texture_dir: Path, out: Path, texture: TextureArtifact, skin
         roughness=None if texture.roughness is None else names[ROUGHNESS],
         exponent=texture.highlights.exponent,
     )
-    layout, normals = texture.atlas, skinned.vertex_normals()
-    write_obj(out / "avatar.obj", skinned.mesh, layout.uv, layout.faces_uv, normals, maps)
+    layout, creases = texture.atlas, find_creases(skinned.mesh)
+    normals = skinned.split(creases).vertex_normals()
+    write_obj(out / "avatar.obj", skinned.mesh, layout.uv, layout.faces_uv, normals, maps, creases.faces)
 
 
 def copy_map(texture_dir: Path, name: str, out: Path) -> str:
@@ -368,7 +377,7 @@ def light_extras(light: VideoLight) -> dict[str, Any]:
 
 STAGE = Stage(
     "export",
-    version=14,
+    version=15,
     needs=("frames", "body", "mesh", "texture"),
     makes=("avatar.glb", "avatar.obj", "avatar.mtl", *OBJ_MAPS),
     config=Config,

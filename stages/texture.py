@@ -26,6 +26,7 @@ from pipeline.core.stage import Stage
 from pipeline.field.setup import evenly_spaced
 from pipeline.geometry.atlas import Atlas, Texels, rasterize_texels, texture_size_px, unwrap
 from pipeline.geometry.camera import Camera, pixel_footprint_m
+from pipeline.geometry.creases import Creases, find_creases
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.geometry.surface_cut import SurfaceCut
@@ -142,8 +143,11 @@ def run(
     if registration is not None:
         template = FittedTemplate(registration, correspond(body, registration, skinned.mesh, skinned.vertex_colours))
     texels = rasterize_texels(atlas, size_px)
-    surface = TexturedSurface.from_arrays(skinned.mesh.faces, atlas, texels)
-    evidence = find_light((train, validation), positions, skinned.mesh, config, settings)
+    creases = find_creases(skinned.mesh)
+    train, validation = ([split_view(view, creases) for view in part] for part in (train, validation))
+    shaded, layout = skinned.split(creases).mesh, creases.split_atlas(atlas)
+    surface = TexturedSurface.from_arrays(shaded.faces, layout, texels)
+    evidence = find_light((train, validation), positions, shaded, config, settings)
     light = VideoLight.uniform(len(capture))
     if evidence is not None:
         light = evidence.for_capture(
@@ -151,7 +155,7 @@ def run(
             len(capture),
             is_removed=evidence.helps or config.light == "removed",
         )
-    fitted = fit_highlights(evidence, light, skinned.mesh)
+    fitted = fit_highlights(evidence, light, shaded)
     train, validation = (
         light_views(views, light, subsample(part, config.max_frames), surface.faces, fitted)
         for views, part in zip((train, validation), positions, strict=True)
@@ -161,13 +165,13 @@ def run(
     artifact = TextureArtifact(
         atlas,
         diffuse=diffuse,
-        specular=vertex_map(fitted.strength, skinned.mesh, texels),
+        specular=vertex_map(fitted.strength, shaded, texels),
         coverage=to_uint8(texels.to_texture(texel_confidence[:, None])[..., 0]),
         light=light,
         highlights=fitted.highlights,
-        normal=make_normal_map(inputs["mesh"], skinned.mesh, atlas, size_px, face_count) if config.normal_map else None,
+        normal=make_normal_map(inputs["mesh"], shaded, layout, size_px, face_count) if config.normal_map else None,
         cut=cut,
-        roughness=None if fitted.roughness is None else vertex_map(fitted.roughness, skinned.mesh, texels),
+        roughness=None if fitted.roughness is None else vertex_map(fitted.roughness, shaded, texels),
     )
     save_texture(out, artifact, config.format)
     save_template(out, template)
@@ -224,6 +228,13 @@ def cut_view(view: BakeView, cut: SurfaceCut | None) -> BakeView:
         return view
     vertices = torch.from_numpy(cut.extend(view.vertices_world.numpy()))
     cosine = vertex_view_cosine(vertices, torch.from_numpy(cut.faces), view.camera)
+    return replace(view, vertices_world=vertices, view_cosine=cosine)
+
+
+def split_view(view: BakeView, creases: Creases) -> BakeView:
+    """Return a view of the mesh with copies of the vertices on its folds."""
+    vertices = view.vertices_world[torch.from_numpy(creases.source)]
+    cosine = vertex_view_cosine(vertices, torch.from_numpy(creases.faces), view.camera)
     return replace(view, vertices_world=vertices, view_cosine=cosine)
 
 
@@ -376,7 +387,7 @@ def fit_highlights(evidence: LightEvidence | None, light: VideoLight, mesh: Mesh
 
 STAGE = Stage(
     "texture",
-    version=13,
+    version=14,
     needs=("frames", "body", "mesh"),
     makes=(ATLAS, DIFFUSE, SPECULAR, ROUGHNESS, NORMAL, COVERAGE, LIGHT, TEMPLATE_NPZ),
     config=Config,

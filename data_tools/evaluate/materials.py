@@ -34,8 +34,9 @@ from pipeline.capture.frame_selection import HELDOUT, TRAIN, assign_splits
 from pipeline.capture.usable_frames import SCORES_NPZ
 from pipeline.geometry.alpha import unpremultiply_to_uint8
 from pipeline.geometry.colour import linear_to_srgb, srgb_to_linear
+from pipeline.geometry.creases import find_creases
 from pipeline.geometry.mesh import Mesh
-from pipeline.geometry.skinning import top_k_weights
+from pipeline.geometry.skinning import dense_weights, top_k_weights
 from pipeline.geometry.surface import closest_points_on_mesh, collapse_edges, weld_vertices
 from pipeline.geometry.tangents import tangent_frames, vertex_tangents
 from pipeline.geometry.texture_rendering import sample_texture
@@ -165,15 +166,16 @@ def score_maps(
     """Return the error of the map against the true texture (of 255, one gain a channel), PSNR in dB, gain error."""
     avatar = load_textured_avatar(folder / "mesh", texture_dir)
     texture = load_texture(texture_dir)
-    mesh, gain = load_mesh(folder / "mesh").cut(texture.cut), albedo_gain(truth, texture, folder)
+    gain = albedo_gain(truth, texture, folder)
     balanced = replace(texture, diffuse=scale_linear(texture.diffuse, gain[0]))
+    joint_count = len(truth.subject.body.joint_names)
     own_mesh_body = replace(
         truth.subject.body,
-        vertices=mesh.mesh.vertices,
-        faces=mesh.mesh.faces,
-        skin_weights=mesh.dense_skin_weights(len(truth.subject.body.joint_names)).numpy(),
+        vertices=avatar.vertices.numpy(),
+        faces=avatar.faces.numpy(),
+        skin_weights=dense_weights(avatar.joint_indices, avatar.joint_weights, joint_count).numpy(),
     )
-    subject = Subject(own_mesh_body, texture.atlas.uv, texture.atlas.faces_uv, to_uint8(balanced.diffuse))
+    subject = Subject(own_mesh_body, avatar.uv.numpy(), avatar.faces_uv.numpy(), to_uint8(balanced.diffuse))
     motion = truth.motion.frame_index[
         np.unique(np.linspace(0, len(truth.motion.time_s) - 1, len(gains)).round().astype(int))
     ]
@@ -221,17 +223,19 @@ def normal_map_angle_deg(mesh: Mesh, texture: TextureArtifact, dense: Mesh) -> f
     """
     points, _ = sample_surface(mesh, SURFACE_POINTS, 0)
     _, face, weights = closest_points_on_mesh(points, mesh)
-    atlas, normals = texture.atlas, mesh.vertex_normals()[texture.atlas.vertex_of_uv]
-    tangents = vertex_tangents(mesh.vertices[atlas.vertex_of_uv], normals, atlas.uv, atlas.faces_uv)
+    creases = find_creases(mesh)
+    shown, atlas = Mesh(mesh.vertices[creases.source], creases.faces), creases.split_atlas(texture.atlas)
+    normals = shown.vertex_normals()[atlas.vertex_of_uv]
+    tangents = vertex_tangents(shown.vertices[atlas.vertex_of_uv], normals, atlas.uv, atlas.faces_uv)
     normal, tangent, uv = (
         np.einsum("nk,nkc->nc", weights, each[atlas.faces_uv[face]]) for each in (normals, tangents, atlas.uv)
     )
-    shown = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    own = normal / np.linalg.norm(normal, axis=1, keepdims=True)
     if texture.normal is not None:
-        shown = decode_normals(texture.normal, uv, tangent_frames(normal, tangent))
+        own = decode_normals(texture.normal, uv, tangent_frames(normal, tangent))
     _, face, weights = closest_points_on_mesh(points, dense)
     true = np.einsum("nk,nkc->nc", weights, dense.vertex_normals()[dense.faces[face]])
-    cosine = np.sum(shown * true, axis=1) / np.linalg.norm(true, axis=1)
+    cosine = np.sum(own * true, axis=1) / np.linalg.norm(true, axis=1)
     return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).mean())
 
 

@@ -1,7 +1,7 @@
 """Load a finished run for evaluation: capture, fitted body, field and textured avatar, ready to render."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from pipeline.field.rendering import render_field
 from pipeline.field.skin_grid import build_skin_grid, skin_margin_m
 from pipeline.geometry.atlas import Atlas
 from pipeline.geometry.camera import Camera
+from pipeline.geometry.creases import find_creases
 from pipeline.geometry.texture_rendering import sample_texture
 from pipeline.mesh.files import load_mesh
 from pipeline.texture.files import TextureArtifact, load_texture
@@ -75,18 +76,21 @@ def load_finished_run(inputs: Mapping[str, Path]) -> FinishedRun:
 def load_textured_avatar(mesh_dir: Path, texture_dir: Path) -> TexturedAvatar:
     """Combine the skinned mesh of the mesh stage with the atlas and diffuse map of the texture stage."""
     texture = load_texture(texture_dir)
-    skinned = load_mesh(mesh_dir).cut(texture.cut)
+    whole = load_mesh(mesh_dir).cut(texture.cut)
+    creases = find_creases(whole.mesh)
+    skinned, atlas = whole.split(creases), creases.split_atlas(texture.atlas)
     return TexturedAvatar(
         vertices=torch.from_numpy(skinned.mesh.vertices.astype(np.float32)),
         faces=torch.from_numpy(skinned.mesh.faces.astype(np.int32)),
         joint_indices=torch.from_numpy(skinned.joint_indices.astype(np.int64)),
         joint_weights=torch.from_numpy(skinned.joint_weights.astype(np.float32)),
-        uv=torch.from_numpy(texture.atlas.uv.astype(np.float32)),
-        faces_uv=torch.from_numpy(texture.atlas.faces_uv.astype(np.int32)),
+        uv=torch.from_numpy(atlas.uv.astype(np.float32)),
+        faces_uv=torch.from_numpy(atlas.faces_uv.astype(np.int32)),
         diffuse=torch.from_numpy(texture.diffuse),
         light=texture.light,
-        gloss=vertex_gloss(texture, len(skinned.mesh.vertices)),
+        gloss=vertex_gloss(replace(texture, atlas=atlas), len(skinned.mesh.vertices)),
         normal_map=texture.normal,
+        whole=whole.mesh,
     )
 
 

@@ -39,22 +39,25 @@ def write_obj(
     mesh: Mesh,
     uv: Float[np.ndarray, "t 2"],
     faces_uv: Int[np.ndarray, "f 3"],
-    normals: Float[np.ndarray, "v 3"],
+    normals: Float[np.ndarray, "n 3"],
     maps: ObjMaps,
+    faces_normals: Int[np.ndarray, "f 3"] | None = None,
 ) -> None:
     """Write `path` (.obj) and the .mtl of the same name, which references the maps in the same folder.
 
-    mesh: m, +Y up. uv: origin bottom-left, as in OBJ. normals: unit, one per vertex.
+    mesh: m, +Y up. uv: origin bottom-left, as in OBJ. normals: unit. faces_normals: normals of the corners of each
+    face; None: one normal per vertex.
     """
-    write_faces_obj(path, (mesh.vertices, mesh.faces), (uv, faces_uv), normals, maps)
+    write_faces_obj(path, (mesh.vertices, mesh.faces), (uv, faces_uv), normals, maps, faces_normals)
 
 
 def write_faces_obj(
     path: Path,
     surface: tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f k"]],
     layout: tuple[Float[np.ndarray, "t 2"], Int[np.ndarray, "f k"]],
-    normals: Float[np.ndarray, "v 3"],
+    normals: Float[np.ndarray, "n 3"],
     maps: ObjMaps,
+    faces_normals: Int[np.ndarray, "f k"] | None = None,
 ) -> None:
     """Write a mesh of triangles or quads as `write_obj` does.
 
@@ -62,7 +65,8 @@ def write_faces_obj(
     """
     (vertices, faces), (uv, faces_uv) = surface, layout
     count, sides = faces.shape
-    corners = np.stack([faces, faces_uv, faces], axis=2).reshape(count, 3 * sides) + 1
+    of_normals = faces if faces_normals is None else faces_normals
+    corners = np.stack([faces, faces_uv, of_normals], axis=2).reshape(count, 3 * sides) + 1
     lines = [f"mtllib {path.with_suffix('.mtl').name}", f"o {MATERIAL}"]
     lines += _format_rows("v %.6f %.6f %.6f", vertices)
     lines += _format_rows("vt %.6f %.6f", uv)

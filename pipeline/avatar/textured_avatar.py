@@ -20,7 +20,7 @@ class TexturedAvatar:
     """A skinned mesh in the canonical A-pose with a diffuse texture.
 
     Attributes:
-        vertices: m.
+        vertices: m; those on sharp folds once for each side.
         faces: counter-clockwise.
         joint_indices: four influences per vertex.
         joint_weights: rows sum to 1.
@@ -30,6 +30,7 @@ class TexturedAvatar:
         light: of the video; None or uniform if the diffuse texture holds it.
         gloss: highlights of the vertices under that light; None for a matte surface.
         normal_map: tangent space, in [0, 1]; None: the normals of the vertices. Drawn under a light, not unlit.
+        whole: the same surface with each vertex once; None where `vertices` are so.
     """
 
     vertices: Float[Tensor, "v 3"]
@@ -42,10 +43,11 @@ class TexturedAvatar:
     light: VideoLight | None = None
     gloss: VertexGloss | None = None
     normal_map: Float32[np.ndarray, "n n 3"] | None = None
+    whole: Mesh | None = None
 
     def mesh(self) -> Mesh:
-        """Return the canonical mesh without texture and skin."""
-        return Mesh(self.vertices.numpy(), self.faces.numpy())
+        """Return the canonical mesh without texture and skin, connected across folds."""
+        return Mesh(self.vertices.numpy(), self.faces.numpy()) if self.whole is None else self.whole
 
     def pose_vertices(self, canonical_to_world: Float[Tensor, "j 4 4"]) -> Float[Tensor, "v 3"]:
         """Pose the vertices (m, world) by linear blend skinning, as a glTF viewer does."""

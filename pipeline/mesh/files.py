@@ -1,6 +1,6 @@
 """The files of the mesh stage: the skinned and the dense mesh as npz, the state of the refinement as safetensors."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from pipeline.core.command import rerun_command
 from pipeline.core.errors import UserError
+from pipeline.geometry.creases import Creases
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import dense_weights, top_k_weights
 from pipeline.geometry.surface_cut import SurfaceCut, UnsplitNormals
@@ -28,8 +29,8 @@ class MeshArtifact:
     """The canonical mesh with its skin: the content of mesh.npz.
 
     mesh: vertices in m (float32) and faces. joint_indices, joint_weights: up to four influences per vertex, the largest
-    first, sum 1. vertex_colours: sRGB in [0, 1]. unsplit: how normals are found where
-    triangles were split; not in the file.
+    first, sum 1. vertex_colours: sRGB in [0, 1]. unsplit: how normals are found where triangles were split. creases:
+    copies of vertices on folds, if these were made. The last two are not in the file.
     """
 
     mesh: Mesh
@@ -37,10 +38,20 @@ class MeshArtifact:
     joint_weights: Float[np.ndarray, "v k"]
     vertex_colours: Float[np.ndarray, "v 3"]
     unsplit: UnsplitNormals | None = None
+    creases: Creases | None = None
 
     def vertex_normals(self) -> Float[np.ndarray, "v 3"]:
-        """Return unit normals of the surface as it was before its triangles were split."""
-        return self.mesh.vertex_normals() if self.unsplit is None else self.unsplit.vertex_normals(self.mesh.vertices)
+        """Return unit normals of the surface as it was before its triangles were split, of each side of its folds."""
+        own = self.mesh.vertex_normals()
+        if self.unsplit is None:
+            return own
+        smooth = self.unsplit.vertex_normals(self.mesh.vertices)
+        if self.creases is None:
+            return smooth
+        folded = self.creases.on_fold()
+        folded[self.unsplit.rows] |= folded[self.unsplit.corners].any(axis=1)
+        source = self.creases.source
+        return np.where(folded[source][:, None], own, smooth[source])
 
     def dense_skin_weights(self, joint_count: int) -> Float[Tensor, "v j"]:
         """Return one row of skin weights per vertex."""
@@ -60,6 +71,18 @@ class MeshArtifact:
             np.concatenate([self.joint_weights, weights.astype(self.joint_weights.dtype)]),
             cut.extend(self.vertex_colours),
             UnsplitNormals(self.mesh.faces, count + np.arange(len(cut.corners)), cut.corners, cut.weights),
+        )
+
+    def split(self, creases: Creases) -> "MeshArtifact":
+        """Return the mesh with copies of the vertices on its folds, which share skin and colour."""
+        source = creases.source
+        return replace(
+            self,
+            mesh=Mesh(self.mesh.vertices[source], creases.faces),
+            joint_indices=self.joint_indices[source],
+            joint_weights=self.joint_weights[source],
+            vertex_colours=self.vertex_colours[source],
+            creases=creases,
         )
 
 

@@ -21,7 +21,8 @@ from pipeline.avatar.formats.level_textures import (
     join_meshes,
 )
 from pipeline.avatar.formats.normal_maps import normal_images, remove_normal_maps
-from pipeline.geometry.atlas import unwrap
+from pipeline.geometry.atlas import Atlas, unwrap
+from pipeline.geometry.creases import find_creases
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.simplification import ReducedFaces, collapse_edges
 from pipeline.geometry.tangents import vertex_tangents
@@ -72,8 +73,8 @@ def encode_level(file: GlbFile, face_ratio: float, texture_halvings: int) -> byt
     sizes_px = [_halved_size(pixels, texture_halvings) for pixels in images]
     atlas = _unwrap_together(full, reduced, max((max(size_px) for size_px in sizes_px), default=MIN_TEXTURE_PX))
     level = []
-    for mesh, part, (vertex, uv, faces), primitive in zip(full, reduced, atlas, primitives, strict=True):
-        source = part.source_vertex[vertex]
+    for mesh, part, layout, primitive in zip(full, reduced, atlas, primitives, strict=True):
+        source, uv, faces = _split_folds(mesh, part, layout)
         normals = mesh.normals[source]
         tangents = vertex_tangents(mesh.positions_m[source], normals, uv * [1.0, -1.0] + [0.0, 1.0], faces)
         level.append(UvMesh(mesh.positions_m[source], uv, faces, normals, tangents if has_tangents else None))
@@ -98,14 +99,11 @@ def _uv_mesh(file: GlbFile, primitive: dict[str, Any]) -> UvMesh:
     return UvMesh(positions_m, uv, faces, normals, tangents)
 
 
-def _unwrap_together(
-    full: list[UvMesh], reduced: list[ReducedFaces], size_px: int
-) -> list[tuple[Int[np.ndarray, "t"], Float[np.ndarray, "t 2"], Int[np.ndarray, "g 3"]]]:
+def _unwrap_together(full: list[UvMesh], reduced: list[ReducedFaces], size_px: int) -> list[Atlas]:
     """Parametrise all primitives in one atlas.
 
     Returns:
-        Of each primitive the vertex of `reduced` and the texture coordinate (origin top-left) of each new vertex, and
-        the faces between the new vertices.
+        Of each primitive the layout of `reduced`, with the origin of its texture coordinates top-left.
     """
     first = np.cumsum([0, *(len(part.source_vertex) for part in reduced)])
     positions_m = np.concatenate([m.positions_m[p.source_vertex] for m, p in zip(full, reduced, strict=True)])
@@ -116,8 +114,31 @@ def _unwrap_together(
     for number in range(len(reduced)):
         used, corners = np.unique(atlas.faces_uv[segment == number], return_inverse=True)
         uv = np.stack([atlas.uv[used, 0], 1.0 - atlas.uv[used, 1]], axis=1)
-        parts.append((atlas.vertex_of_uv[used] - first[number], uv, corners.reshape(-1, 3)))
+        parts.append(Atlas(uv, corners.reshape(-1, 3), atlas.vertex_of_uv[used] - first[number]))
     return parts
+
+
+def _split_folds(
+    full: UvMesh, part: ReducedFaces, atlas: Atlas
+) -> tuple[Int[np.ndarray, "t"], Float[np.ndarray, "t 2"], Int[np.ndarray, "g 3"]]:
+    """Return vertices of the full mesh, texture coordinates and faces of a level; each side of a fold has its normals.
+
+    Of the copies of a vertex of the full mesh, a corner takes the one whose normal is nearest to that of the level.
+    """
+    reduced = Mesh(full.positions_m[part.source_vertex], part.faces)
+    creases = find_creases(reduced)
+    layout = creases.split_atlas(atlas)
+    wanted = Mesh(reduced.vertices[creases.source], creases.faces).vertex_normals()[layout.vertex_of_uv]
+    source = part.source_vertex[creases.source[layout.vertex_of_uv]]
+    place = np.unique(full.positions_m, axis=0, return_inverse=True)[1].reshape(-1)
+    copies, count = np.argsort(place, kind="stable"), np.bincount(place)
+    first = np.cumsum(count) - count
+    best = np.sum(full.normals[source] * wanted, axis=1)
+    for number in range(count.max(initial=0)):
+        other = copies[first[place[source]] + np.minimum(number, count[place[source]] - 1)]
+        cosine = np.sum(full.normals[other] * wanted, axis=1)
+        source, best = np.where(cosine > best, other, source), np.maximum(cosine, best)
+    return source, layout.uv, layout.faces_uv
 
 
 def _replace_primitive(

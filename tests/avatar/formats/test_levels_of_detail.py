@@ -11,6 +11,8 @@ from pipeline.avatar.formats.levels_of_detail import FACE_RATIOS, encode_level, 
 from pipeline.avatar.gltf import encode_glb
 from pipeline.avatar.gltf_material import pack_roughness
 from pipeline.avatar.rig import build_rig
+from pipeline.avatar.skinned_avatar import build_skinned_mesh
+from pipeline.geometry.creases import find_creases
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import closest_points_on_mesh
 from pipeline.geometry.texture_rendering import sample_texture
@@ -21,6 +23,7 @@ from pipeline.kernels.raster import rasterize
 from tests.avatar.avatar_sample import sample_body, sample_maps, sample_motion
 from tests.avatar.formats.column import FRAMES, column_glb, column_mesh
 from tests.avatar.test_gltf import Player
+from tests.geometry.wedge import one_chart, skinned, wedge
 from tests.tools.khronos import validator_issues
 
 
@@ -54,6 +57,23 @@ def test_textures_are_halved_with_all_channels(tmp_path: Path) -> None:
     assert (halved[..., 3] == 77).all()
     assert np.isclose((halved[..., 0] > 100).mean(), 0.25, atol=0.12)  # the layout is a new one
     assert GlbFile(tmp_path / "level.glb").image_pixels(0).shape == (64, 64, 3)  # small ones stay
+
+
+def test_both_sides_of_a_fold_keep_their_normals(tmp_path: Path) -> None:
+    mesh = wedge()
+    creases = find_creases(mesh)
+    folded = build_skinned_mesh(skinned(mesh).split(creases), creases.split_atlas(one_chart(mesh)))
+    one_joint = np.tile(np.eye(4, dtype=np.float32)[:1], (len(folded.uv), 1))
+    folded = replace(folded, joint_indices=0 * folded.joint_indices, joint_weights=one_joint)
+    data = encode_glb(folded, build_rig(sample_body()), {"capture": sample_motion(FRAMES)}, sample_maps())
+    (tmp_path / "full.glb").write_bytes(data)
+    (tmp_path / "level.glb").write_bytes(encode_level(GlbFile(tmp_path / "full.glb"), 0.5, 1))
+    (level,) = GlbFile(tmp_path / "level.glb").skinned_primitives()
+    reduced = Mesh(level.positions, level.faces)
+    inner = np.flatnonzero(np.abs(reduced.face_normals()[:, 2]) > 0.9)
+    assert len(inner) > 10
+    facing = np.sum(reduced.face_normals()[inner, None] * level.normals[level.faces[inner]], axis=2)
+    assert (facing > 0.0).all()
 
 
 def test_a_roughness_map_is_kept_where_it_is_on_the_surface(tmp_path: Path) -> None:
