@@ -48,10 +48,6 @@ class PoseBatch(NamedTuple):
     frames: Int[Tensor, "b"]
     canonical_to_posed: Float[Tensor, "b j 4 4"]
 
-    def blended(self) -> Float[Tensor, "m b 12"]:
-        """Blend the matrices at the nodes of the skin grid."""
-        return self.skin.blend(self.canonical_to_posed)
-
     def frame_slots(self, rays: Rays) -> Int[Tensor, "n"]:
         """Return the position in `frames` of each ray's frame."""
         return torch.searchsorted(self.frames, rays.frame_index)
@@ -84,7 +80,7 @@ def render_rays(
         RadianceNetwork(
             field.bounds_m, field.table, field.layout, *network, INITIAL_DENSITY_PER_M, MAX_ABS_LOG_DENSITY, field.gate
         ),
-        BatchSkinning(pose_batch.skin, pose_batch.blended(), pose_batch.frame_slots(rays)) if pose_batch else None,
+        BatchSkinning(pose_batch.skin, pose_batch.canonical_to_posed, pose_batch.frame_slots(rays)) if pose_batch else None,
         points_m,
         RenderSettings(step_m, max_samples),
         feature_gradients,

@@ -20,10 +20,9 @@ from pipeline.field.occupancy import OccupancyGrid
 from pipeline.field.optimiser import FieldOptimiser
 from pipeline.field.ray_batches import RaySampler
 from pipeline.field.trainer import Trainer
-from pipeline.field.volume_rendering import PoseBatch
 from pipeline.kernels.common.thread_pool import ThreadPool
 from pipeline.kernels.hashgrid import cpu as hashgrid_cpu
-from pipeline.kernels.inverse_skinning import _NewtonStep, newton_cpu
+from pipeline.kernels.inverse_skinning import _NewtonStep, cell_skinning_cpu, newton_cpu
 from pipeline.kernels.volume_rendering import _RenderRays
 
 OTHER = "other"
@@ -35,7 +34,6 @@ TIMED_FUNCTIONS: tuple[tuple[str, Any, str], ...] = (
     ("pixel_sampling", RaySampler, "sample_rays"),
     ("pixel_sampling", OccupancyGrid, "sample_empty_points"),
     ("pose_blending", BakedInverseSkinning, "pose_batch"),
-    ("pose_blending", PoseBatch, "blended"),
     ("render_rays", trainer_module, "render_rays"),
     ("losses", trainer_module, "field_losses"),
     ("losses", PoseCorrection, "temporal_roughness"),
@@ -46,6 +44,7 @@ TIMED_FUNCTIONS: tuple[tuple[str, Any, str], ...] = (
     ("positions_backward", hashgrid_cpu, "add_points_gradient"),
     ("positions_backward", _NewtonStep, "backward"),
     ("positions_backward", newton_cpu, "add_pose_gradient"),
+    ("positions_backward", cell_skinning_cpu, "add_matrix_gradient"),
     ("rest_backward", FieldOptimiser, "gradients"),
     ("adam", optimiser_module, "adam_step_"),
     ("occupancy_record", OccupancyGrid, "record_observations"),

@@ -43,8 +43,8 @@ def make_scene():
     directions = torch.nn.functional.normalize(targets - origins, dim=-1)
     rays = Rays(origins, directions, frame, torch.rand(300, generator=random))
     volume = SamplingVolume(warps, torch.ones(8, 4, 4, dtype=torch.uint8), BOUNDS_M)
-    blended = skin.blend(torch.stack([bend(angle + 0.01) for angle in ANGLES])).requires_grad_()
-    return rays, volume, make_network(random), BatchSkinning(skin, blended, frame)
+    matrices = torch.stack([bend(angle + 0.01) for angle in ANGLES]).requires_grad_()
+    return rays, volume, make_network(random), BatchSkinning(skin, matrices, frame)
 
 
 def with_gate(network: RadianceNetwork) -> RadianceNetwork:
@@ -55,7 +55,7 @@ def with_gate(network: RadianceNetwork) -> RadianceNetwork:
 def leaves(network: RadianceNetwork, skinning: BatchSkinning) -> dict[str, torch.Tensor]:
     names = ("hidden", "output", "bias", *(["gate"] if network.gate is not None else []))
     named = {name: getattr(network, name) for name in names}
-    return named | {"blended": skinning.blended}
+    return named | {"canonical_to_posed": skinning.canonical_to_posed}
 
 
 @pytest.mark.parametrize(("newton", "gated"), [(True, False), (False, False), (True, True)])
@@ -76,7 +76,7 @@ def test_values_and_gradients_match_reference(newton: bool, gated: bool) -> None
         torch.testing.assert_close(ours, theirs, atol=2e-5, rtol=0)
     random = torch.Generator().manual_seed(3)
     to_image, to_alpha = torch.randn(300, 3, generator=random), torch.randn(300, generator=random)
-    parameters = {name: leaf for name, leaf in leaves(network, skinning).items() if newton or name != "blended"}
+    parameters = {name: leaf for name, leaf in leaves(network, skinning).items() if newton or name != "canonical_to_posed"}
     gradients = []
     for result, extra in ((fused, []), (expected, [network.table])):
         loss = (result.image * to_image).sum() + (result.alpha * to_alpha).sum() + result.density_per_m.sum()

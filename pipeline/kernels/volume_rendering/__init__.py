@@ -18,7 +18,7 @@ from torch import Tensor
 from pipeline.kernels.common.voxels import voxel_index
 from pipeline.kernels.hashgrid import FeatureGradients
 from pipeline.kernels.hashgrid import cpu as hashgrid_cpu
-from pipeline.kernels.inverse_skinning import newton_cpu
+from pipeline.kernels.inverse_skinning import cell_skinning_cpu
 from pipeline.kernels.march import Rays, SamplingVolume
 from pipeline.kernels.march.cpu import MarchArrays, RayArrays
 from pipeline.kernels.volume_rendering import backward_cpu, cpu
@@ -57,7 +57,7 @@ def render_rays_fused(
 ) -> RenderOutput:
     """Render rays, and evaluate the density at additional canonical points.
 
-    float32 on the CPU. Differentiable in the weights and the gate of the network and in `skinning.blended`; the
+    float32 on the CPU. Differentiable in the weights and the gate of the network and in `skinning.canonical_to_posed`; the
     backward pass appends the input of `add_table_gradient_` to `feature_gradients`.
 
     Args:
@@ -78,7 +78,7 @@ def render_rays_fused(
     threshold = settings.gradient_subsampling_threshold
     renderer = _Renderer(inputs, network, points_m.detach(), threshold, feature_gradients)
     weights = (network.hidden, network.output, network.bias, network.gate)
-    return RenderOutput(*_RenderRays.apply(*weights, skinning.blended.contiguous(), renderer))
+    return RenderOutput(*_RenderRays.apply(*weights, skinning.canonical_to_posed, renderer))
 
 
 class _RenderRays(torch.autograd.Function):
@@ -89,12 +89,12 @@ class _RenderRays(torch.autograd.Function):
         output: Tensor,
         bias: Tensor,
         gate: Tensor | None,
-        blended: Tensor,
+        matrices: Tensor,
         renderer: "_Renderer",
     ) -> RenderOutput:
         samples, count, image, final_transmittance = renderer.forward_pass()
         ctx.kept = renderer, samples, count, final_transmittance
-        ctx.save_for_backward(blended)
+        ctx.save_for_backward(matrices)
         arrays = (samples.canonical, samples.transmittance, samples.weight)
         sample_outputs = [torch.from_numpy(array[:count]) for array in arrays]
         ctx.mark_non_differentiable(*sample_outputs)
@@ -104,7 +104,7 @@ class _RenderRays(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        (blended,) = ctx.saved_tensors
+        (matrices,) = ctx.saved_tensors
         renderer, samples, count, final_transmittance = ctx.kept
         grad_image, grad_alpha, grad_density = (gradient.contiguous().numpy() for gradient in gradients[:3])
         rows = count + len(grad_density)
@@ -112,10 +112,10 @@ class _RenderRays(torch.autograd.Function):
         step = renderer.inputs.march.step
         backward_cpu.network_output_gradients(samples, count, step, final_transmittance, grad_image, grad_alpha, raw)
         raw[count:, 3] = grad_density * samples.density[count:rows]
-        grad_blended = torch.zeros_like(blended)
-        grad_hidden, grad_output = renderer.backward_pass(samples, count, raw, grad_blended.numpy())
+        grad_matrices = torch.zeros(matrices.shape)
+        grad_hidden, grad_output = renderer.backward_pass(samples, count, raw, grad_matrices.flatten(2).numpy())
         grad_bias, grad_gate = torch.from_numpy(raw.sum(0)), renderer.gate_gradient(samples, raw)
-        return torch.from_numpy(grad_hidden), torch.from_numpy(grad_output), grad_bias, grad_gate, grad_blended, None
+        return torch.from_numpy(grad_hidden), torch.from_numpy(grad_output), grad_bias, grad_gate, grad_matrices, None
 
 
 @dataclass(frozen=True)
@@ -146,9 +146,9 @@ class _Renderer:
         return samples, count, image, final_transmittance
 
     def backward_pass(
-        self, samples: SampleBuffers, count: int, raw: np.ndarray, grad_blended: np.ndarray
+        self, samples: SampleBuffers, count: int, raw: np.ndarray, grad_matrices: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the gradients of the weights from that of the network output (s, 4); add to `grad_blended`."""
+        """Return the gradients of the weights from that of the network output (s, 4); add to `grad_matrices`."""
         _, table, lanes, network, _ = self.inputs.field
         hidden, output = network.hidden, network.output
         rows, scaled = backward_cpu.subsample_gradients(raw, self.gradient_subsampling_threshold)
@@ -159,11 +159,11 @@ class _Renderer:
         )
         self.feature_gradients.append((torch.from_numpy(positions), torch.from_numpy(grad_features)))
         ray_row_count = np.searchsorted(rows, count)
-        if len(grad_blended) and ray_row_count:
+        if len(grad_matrices) and ray_row_count:
             grad_unit = np.zeros((ray_row_count, 3), np.float32)
             selected = positions[:ray_row_count], grad_features[:ray_row_count]
             hashgrid_cpu.add_points_gradient(selected[0], table, lanes, selected[1], grad_unit)
-            self._add_pose_gradient(samples, rows[:ray_row_count], grad_unit, grad_blended)
+            self._add_pose_gradient(samples, rows[:ray_row_count], grad_unit, grad_matrices)
         return grad_hidden, grad_output
 
     def gate_gradient(self, samples: SampleBuffers, raw: np.ndarray) -> Tensor | None:
@@ -179,22 +179,14 @@ class _Renderer:
         return (of_logarithm / gate.detach().reshape(-1).clamp(min=MIN_GATE)).reshape(gate.shape)
 
     def _add_pose_gradient(
-        self, samples: SampleBuffers, rows: np.ndarray, grad_unit: np.ndarray, grad_blended: np.ndarray
+        self, samples: SampleBuffers, rows: np.ndarray, grad_unit: np.ndarray, grad_matrices: np.ndarray
     ) -> None:
-        """Add the gradient of the blended matrices, from that of some samples' positions in the unit box."""
+        """Add the gradient of the matrices (k, j, 16), from that of some samples' positions in the unit box."""
         skinning, bounds_m = self.inputs.skinning, self.network.bounds_m
-        batch_index = skinning.batch_index[samples.ray_indices[rows]]
-        # A block of rays advances in passes, so that the samples of two frames in one block alternate.
-        order = np.argsort(batch_index, kind="stable")
-        rows, grad_unit = rows[order], grad_unit[order]
-        frame_offsets = np.searchsorted(batch_index[order], np.arange(grad_blended.shape[1] + 1))
-        newton_cpu.add_pose_gradient(
-            samples.canonical[rows],
-            samples.inverse_jacobian[rows],
-            grad_unit / (bounds_m[1] - bounds_m[0]).numpy(),
-            frame_offsets,
-            skinning.lattice,
-            grad_blended,
+        frames = skinning.batch_index[samples.ray_indices[rows]]
+        gradient = grad_unit / (bounds_m[1] - bounds_m[0]).numpy()
+        cell_skinning_cpu.add_matrix_gradient(
+            rows, frames, samples.canonical, samples.inverse_jacobian, gradient, skinning.cells, grad_matrices
         )
 
 

@@ -11,7 +11,7 @@ from numba import njit
 
 from pipeline.kernels.common.numba_options import NJIT_OPTIONS
 from pipeline.kernels.hashgrid.cpu import BLOCK, HashTable, encode_block
-from pipeline.kernels.inverse_skinning.newton_cpu import LatticeArrays, newton_step
+from pipeline.kernels.inverse_skinning.cell_skinning_cpu import CellWeights, newton_steps
 from pipeline.kernels.march.cpu import CANDIDATES, MarchArrays, SampleArrays, advance_ray, intersect_box
 
 RAYS_PER_BLOCK = 128
@@ -23,11 +23,11 @@ _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
 class SkinningArrays(NamedTuple):
-    """Frame of the batch of each ray (n), and the skin grid with its blended matrices (m, k, 12); m = 0: no step."""
+    """Frame of the batch of each ray (n), skin weights, and matrices (k, j, 16) of the frames; k = 0: no step."""
 
     batch_index: np.ndarray
-    lattice: LatticeArrays
-    blended: np.ndarray
+    cells: CellWeights
+    matrices: np.ndarray
 
 
 class NetworkArrays(NamedTuple):
@@ -90,25 +90,28 @@ class _DecodeBuffers(NamedTuple):
 
 @njit(**NJIT_OPTIONS)
 def _refine_samples(first, last, inputs, samples):
-    """Do one Newton step for the samples first..last, if there is a skin grid; then map them to the unit box."""
+    """Do one Newton step for the samples first..last, if there are matrices; then map them to the unit box."""
     rays, bounds = inputs.march.rays, inputs.field.bounds
-    batch_index, lattice, blended = inputs.skinning
+    batch_index, cells, matrices = inputs.skinning
     # Arrays are taken out of their tuples before the loop: in the loop this would count references for each sample.
     origins, directions, ray_indices, distance = rays.origins, rays.directions, samples.ray_indices, samples.distance
-    canonical, unit, inverse_jacobian = samples.canonical, samples.unit, samples.inverse_jacobian
+    canonical, unit = samples.canonical, samples.unit
+    points = canonical
+    if len(matrices):
+        for s in range(first, last):
+            ray, t = ray_indices[s], distance[s]
+            unit[s, 0] = origins[ray, 0] + t * directions[ray, 0]
+            unit[s, 1] = origins[ray, 1] + t * directions[ray, 1]
+            unit[s, 2] = origins[ray, 2] + t * directions[ray, 2]
+        newton_steps(
+            first, last, ray_indices, batch_index, matrices, cells, canonical, unit, samples.inverse_jacobian
+        )
+        points = unit
     low_x, low_y, low_z = bounds[0, 0], bounds[0, 1], bounds[0, 2]
     scale_x, scale_y = _ONE / (bounds[1, 0] - low_x), _ONE / (bounds[1, 1] - low_y)
     scale_z = _ONE / (bounds[1, 2] - low_z)
     for s in range(first, last):
-        x, y, z = canonical[s, 0], canonical[s, 1], canonical[s, 2]
-        if len(blended):
-            ray, t = ray_indices[s], distance[s]
-            posed = (
-                origins[ray, 0] + t * directions[ray, 0],
-                origins[ray, 1] + t * directions[ray, 1],
-                origins[ray, 2] + t * directions[ray, 2],
-            )
-            x, y, z = newton_step(posed, (x, y, z), batch_index[ray], lattice, blended, inverse_jacobian[s])
+        x, y, z = points[s, 0], points[s, 1], points[s, 2]
         unit[s, 0], unit[s, 1], unit[s, 2] = (x - low_x) * scale_x, (y - low_y) * scale_y, (z - low_z) * scale_z
 
 
