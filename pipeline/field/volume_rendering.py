@@ -3,8 +3,10 @@
 Letters: n rays, k frames of the motion, b frames of a batch, j joints, m nodes of the skin grid, p points, s samples.
 """
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -17,15 +19,18 @@ from pipeline.kernels.common.packing import segment_ids_from_counts
 from pipeline.kernels.composite import composite
 from pipeline.kernels.hashgrid import FeatureGradients
 from pipeline.kernels.inverse_skinning import SkinGrid
-from pipeline.kernels.march import Samples, SamplingVolume
+from pipeline.kernels.march import PackedWarpGrids, Samples, SamplingVolume
 from pipeline.kernels.transmittance_stats import transmittance_from_weights
 from pipeline.kernels.volume_rendering import (
     BatchSkinning,
+    OutputGradients,
     RadianceNetwork,
+    RenderGradients,
     RenderOutput,
     RenderSettings,
     render_rays_fused,
 )
+from pipeline.kernels.volume_rendering import render_rays_with_gradients as fused_with_gradients
 
 
 class PosedField(NamedTuple):
@@ -48,6 +53,11 @@ class PoseBatch(NamedTuple):
     frames: Int[Tensor, "b"]
     canonical_to_posed: Float[Tensor, "b j 4 4"]
 
+    def split(self, sizes: Sequence[int]) -> list["PoseBatch"]:
+        """Divide the frames into parts of some sizes; the poses of a part are leaves of autograd."""
+        parts = zip(self.frames.split(sizes), self.canonical_to_posed.detach().split(sizes), strict=True)
+        return [PoseBatch(self.skin, frames, poses.requires_grad_()) for frames, poses in parts]
+
     def frame_slots(self, rays: Rays) -> Int[Tensor, "n"]:
         """Return the position in `frames` of each ray's frame."""
         return torch.searchsorted(self.frames, rays.frame_index)
@@ -69,22 +79,45 @@ def render_rays(
     samples, m. max_samples: per ray. feature_gradients: list that takes the contributions to the gradient of the hash
     table (`pipeline.kernels.hashgrid.encode`).
     """
-    field, inverse, occupancy = posed_field
-    warps = inverse.warps
+    warps = posed_field.inverse.warps
     if warps is None or not posed_field.supports_early_termination:
         return render_rays_dense(posed_field, rays, pose_batch, points_m, step_m, max_samples, feature_gradients)
-    network = (field.hidden, field.output, field.bias)
-    return render_rays_fused(
-        rays,
-        SamplingVolume(warps, occupancy.occupied, occupancy.bounds_m),
-        RadianceNetwork(
-            field.bounds_m, field.table, field.layout, *network, INITIAL_DENSITY_PER_M, MAX_ABS_LOG_DENSITY, field.gate
-        ),
-        BatchSkinning(pose_batch.skin, pose_batch.canonical_to_posed, pose_batch.frame_slots(rays)) if pose_batch else None,
-        points_m,
-        RenderSettings(step_m, max_samples),
-        feature_gradients,
+    inputs = _fused_inputs(posed_field, warps, rays, pose_batch)
+    return render_rays_fused(*inputs, points_m, RenderSettings(step_m, max_samples), feature_gradients)
+
+
+def render_rays_with_gradients(
+    posed_field: PosedField,
+    rays: Rays,
+    pose_batch: PoseBatch | None,
+    points_m: Float[Tensor, "p 3"],
+    step_m: float,
+    max_samples: int,
+    output_gradients: Callable[[np.ndarray, np.ndarray, np.ndarray], OutputGradients],
+) -> tuple[RenderOutput, RenderGradients, FeatureGradients]:
+    """Do `render_rays` and its backward pass without autograd, for a field that supports early termination.
+
+    output_gradients: see `pipeline.kernels.volume_rendering.render_rays_with_gradients`.
+    """
+    warps = posed_field.inverse.warps
+    if warps is None:
+        raise TypeError("the inverse skinning has no warp grids")
+    inputs = _fused_inputs(posed_field, warps, rays, pose_batch)
+    return fused_with_gradients(*inputs, points_m, RenderSettings(step_m, max_samples), output_gradients)
+
+
+def _fused_inputs(
+    posed_field: PosedField, warps: PackedWarpGrids, rays: Rays, pose_batch: PoseBatch | None
+) -> tuple[Rays, SamplingVolume, RadianceNetwork, BatchSkinning | None]:
+    field, occupancy = posed_field.field, posed_field.occupancy
+    weights, limits = (field.hidden, field.output, field.bias), (INITIAL_DENSITY_PER_M, MAX_ABS_LOG_DENSITY)
+    network = RadianceNetwork(field.bounds_m, field.table, field.layout, *weights, *limits, field.gate)
+    skinning = (
+        BatchSkinning(pose_batch.skin, pose_batch.canonical_to_posed, pose_batch.frame_slots(rays))
+        if pose_batch
+        else None
     )
+    return rays, SamplingVolume(warps, occupancy.occupied, occupancy.bounds_m), network, skinning
 
 
 def render_rays_dense(
