@@ -142,7 +142,7 @@ class Trainer:
         """Return the number of samples on the rays of the next step, without taking it."""
         frames = self.sampler.sample_frames(step_rng(self.config.seed, self.completed_steps, STEP_STREAM))
         batch = self.sampler.sample_rays(frames, self.completed_steps, self.inverse_skinning.cameras)
-        posed_field = PosedField(self.field, self.inverse_skinning.inverse, self.occupancy.binary())
+        posed_field = self.posed_field()
         none_m = self.field.bounds_m[:0]
         return len(render_rays(posed_field, batch.rays, None, none_m, self.step_m, MAX_SAMPLES_PER_RAY, []).weight)
 
@@ -159,7 +159,7 @@ class Trainer:
         those of the last bake. Threads may call it concurrently.
         """
         batch = self.sampler.sample_rays(frames, self.completed_steps, self.inverse_skinning.cameras)
-        posed_field = PosedField(self.field, self.inverse_skinning.inverse, self.occupancy.binary())
+        posed_field = self.posed_field()
         if posed_field.supports_early_termination:
             return self._forward_backward_compiled(posed_field, batch, empty_m, ray_fraction, pose_batch)
         return self._forward_backward_autograd(posed_field, batch, empty_m, ray_fraction, pose_batch)
@@ -213,6 +213,10 @@ class Trainer:
         of_poses = gradients.pop(POSES, torch.zeros_like(leaves[POSES])) if pose_batch else None
         detached = {name: loss.detach() for name, loss in losses.items()}
         return StepResult(batch, rendered, error, detached, gradients, of_poses, feature_gradients)
+
+    def posed_field(self) -> PosedField:
+        """Return the field in the poses of the last bake, for the present step."""
+        return PosedField(self.field, self.inverse_skinning.inverse, self.occupancy.binary())
 
     def _frame_tensor(self, frames: Int[np.ndarray, "k"]) -> Int[Tensor, "k"]:
         return torch.from_numpy(frames).to(self.device)

@@ -4,6 +4,8 @@ Letters: n rays, k frames of the motion, b frames of a batch, j joints, m nodes 
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +21,7 @@ from pipeline.kernels.common.packing import segment_ids_from_counts
 from pipeline.kernels.composite import composite
 from pipeline.kernels.hashgrid import FeatureGradients
 from pipeline.kernels.inverse_skinning import SkinGrid
-from pipeline.kernels.march import PackedWarpGrids, Samples, SamplingVolume
+from pipeline.kernels.march import Samples, SamplingVolume
 from pipeline.kernels.transmittance_stats import transmittance_from_weights
 from pipeline.kernels.volume_rendering import (
     BatchSkinning,
@@ -33,8 +35,12 @@ from pipeline.kernels.volume_rendering import (
 from pipeline.kernels.volume_rendering import render_rays_with_gradients as fused_with_gradients
 
 
-class PosedField(NamedTuple):
-    """A canonical field, the inverse skinning of the frames in which it is seen, and its occupied cells."""
+@dataclass(frozen=True)
+class PosedField:
+    """A canonical field, the inverse skinning of the frames in which it is seen, and its occupied cells.
+
+    Valid until one of them changes.
+    """
 
     field: RadianceField
     inverse: InverseSkinning
@@ -44,6 +50,24 @@ class PosedField(NamedTuple):
     def supports_early_termination(self) -> bool:
         """Whether `render_rays` skips samples behind a surface: hash grid and warp grids on the CPU."""
         return self.inverse.warps is not None and self.field.trunk is None and runs_on_numba(self.field.table)
+
+    @cached_property
+    def network(self) -> RadianceNetwork:
+        """The field for the fused renderer."""
+        field, limits = self.field, (INITIAL_DENSITY_PER_M, MAX_ABS_LOG_DENSITY)
+        weights = field.hidden, field.output, field.bias
+        return RadianceNetwork(field.bounds_m, field.table, field.layout, *weights, *limits, field.gate)
+
+    @cached_property
+    def volume(self) -> SamplingVolume:
+        """Warp grids and occupied cells for the fused renderer.
+
+        Raises:
+            TypeError: the inverse skinning has no warp grids.
+        """
+        if self.inverse.warps is None:
+            raise TypeError("the inverse skinning has no warp grids")
+        return SamplingVolume(self.inverse.warps, self.occupancy.occupied, self.occupancy.bounds_m)
 
 
 class PoseBatch(NamedTuple):
@@ -79,11 +103,10 @@ def render_rays(
     samples, m. max_samples: per ray. feature_gradients: list that takes the contributions to the gradient of the hash
     table (`pipeline.kernels.hashgrid.encode`).
     """
-    warps = posed_field.inverse.warps
-    if warps is None or not posed_field.supports_early_termination:
+    if not posed_field.supports_early_termination:
         return render_rays_dense(posed_field, rays, pose_batch, points_m, step_m, max_samples, feature_gradients)
-    inputs = _fused_inputs(posed_field, warps, rays, pose_batch)
-    return render_rays_fused(*inputs, points_m, RenderSettings(step_m, max_samples), feature_gradients)
+    fused = rays, posed_field.volume, posed_field.network, _batch_skinning(rays, pose_batch), points_m
+    return render_rays_fused(*fused, RenderSettings(step_m, max_samples), feature_gradients)
 
 
 def render_rays_with_gradients(
@@ -99,25 +122,14 @@ def render_rays_with_gradients(
 
     output_gradients: see `pipeline.kernels.volume_rendering.render_rays_with_gradients`.
     """
-    warps = posed_field.inverse.warps
-    if warps is None:
-        raise TypeError("the inverse skinning has no warp grids")
-    inputs = _fused_inputs(posed_field, warps, rays, pose_batch)
-    return fused_with_gradients(*inputs, points_m, RenderSettings(step_m, max_samples), output_gradients)
+    fused = rays, posed_field.volume, posed_field.network, _batch_skinning(rays, pose_batch), points_m
+    return fused_with_gradients(*fused, RenderSettings(step_m, max_samples), output_gradients)
 
 
-def _fused_inputs(
-    posed_field: PosedField, warps: PackedWarpGrids, rays: Rays, pose_batch: PoseBatch | None
-) -> tuple[Rays, SamplingVolume, RadianceNetwork, BatchSkinning | None]:
-    field, occupancy = posed_field.field, posed_field.occupancy
-    weights, limits = (field.hidden, field.output, field.bias), (INITIAL_DENSITY_PER_M, MAX_ABS_LOG_DENSITY)
-    network = RadianceNetwork(field.bounds_m, field.table, field.layout, *weights, *limits, field.gate)
-    skinning = (
-        BatchSkinning(pose_batch.skin, pose_batch.canonical_to_posed, pose_batch.frame_slots(rays))
-        if pose_batch
-        else None
-    )
-    return rays, SamplingVolume(warps, occupancy.occupied, occupancy.bounds_m), network, skinning
+def _batch_skinning(rays: Rays, pose_batch: PoseBatch | None) -> BatchSkinning | None:
+    if pose_batch is None:
+        return None
+    return BatchSkinning(pose_batch.skin, pose_batch.canonical_to_posed, pose_batch.frame_slots(rays))
 
 
 def render_rays_dense(
@@ -130,7 +142,7 @@ def render_rays_dense(
     feature_gradients: FeatureGradients,
 ) -> RenderOutput:
     """`render_rays` for any field, inverse skinning and device; evaluates all samples, also those behind a surface."""
-    field, inverse, occupancy = posed_field
+    field, inverse, occupancy = posed_field.field, posed_field.inverse, posed_field.occupancy
     samples = inverse.sample_rays(rays, step_m, occupancy, max_samples)
     count = len(samples.distance_m)
     sample_positions_m = sample_positions(inverse, rays, pose_batch, samples) if pose_batch else samples.canonical_m

@@ -7,6 +7,7 @@ a block of rays stays in the cache.
 Notation: n rays, k frames of a batch, s samples, p points, w features of a point, h hidden units.
 """
 
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -95,12 +96,12 @@ def render_rays_with_gradients(
     output_gradients: returns the gradients of a loss from image (n, 3), alpha (n) and density (p).
     """
     renderer = _renderer(rays, volume, network, skinning, points_m, settings)
-    rendered = renderer.forward_pass()
+    rendered = renderer.forward_pass(_thread_buffers)
     output = rendered.output()
-    gradients, features = renderer.backward_pass(
-        rendered, output_gradients(*(tensor.numpy() for tensor in (output.image, output.alpha, output.density_per_m)))
-    )
-    return output, gradients, [features]
+    of_output = output_gradients(*(tensor.numpy() for tensor in (output.image, output.alpha, output.density_per_m)))
+    gradients, features = renderer.backward_pass(rendered, of_output)
+    of_samples = {name: getattr(output, name).clone() for name in ("canonical_m", "transmittance", "weight")}
+    return output._replace(**of_samples), gradients, [features]
 
 
 class _RenderRays(torch.autograd.Function):
@@ -115,7 +116,7 @@ class _RenderRays(torch.autograd.Function):
         renderer: "_Renderer",
         feature_gradients: FeatureGradients,
     ) -> RenderOutput:
-        rendered = renderer.forward_pass()
+        rendered = renderer.forward_pass(_allocate)
         ctx.kept = renderer, rendered, feature_gradients
         result = rendered.output()
         ctx.mark_non_differentiable(result.canonical_m, result.transmittance, result.weight)
@@ -156,14 +157,14 @@ class _Renderer:
     points: np.ndarray
     gradient_subsampling_threshold: float
 
-    def forward_pass(self) -> _Rendered:
-        """Render the rays, and evaluate the field at the further points."""
+    def forward_pass(self, allocate: Callable[[int, int], SampleBuffers]) -> _Rendered:
+        """Render the rays, and evaluate the field at the further points; `allocate` as `_allocate`."""
         inputs, rays, width = self.inputs, len(self.inputs.march.rays.frame_index), len(self.inputs.field.network.hidden)
         capacity = INITIAL_SAMPLES_PER_RAY * rays + cpu.MAX_SAMPLES_PER_PASS
         count = -1
         while count < 0:
             image, final_transmittance = np.zeros((rays, 3), np.float32), np.ones(rays, np.float32)
-            samples = _allocate(capacity + len(self.points), width)
+            samples = allocate(capacity + len(self.points), width)
             count = cpu.render_rays_fused(inputs, samples, capacity, image, final_transmittance)
             capacity *= 2
         last, bounds = count + len(self.points), inputs.field.bounds
@@ -203,11 +204,11 @@ def _renderer(
     marched = MarchArrays(
         RayArrays(*(tensor.contiguous().numpy() for tensor in rays)),
         np.float32(settings.step_m),
-        volume.warps.arrays(),
-        volume.occupancy_arrays(),
+        volume.warps.arrays,
+        volume.occupancy_arrays,
     )
     inputs = RenderArrays(
-        marched, skinning.arrays(), network.arrays(), settings.max_samples, np.float32(settings.min_transmittance)
+        marched, skinning.arrays(), network.arrays, settings.max_samples, np.float32(settings.min_transmittance)
     )
     return _Renderer(inputs, points_m.detach().numpy(), settings.gradient_subsampling_threshold)
 
@@ -217,3 +218,19 @@ def _allocate(rows: int, width: int) -> SampleBuffers:
     columns = (3, 0, 9, 3, width, 3, 0, 0, 0)
     arrays = (np.empty((rows, *([count] if count else [])), np.float32) for count in columns)
     return SampleBuffers(np.empty(rows, np.int32), *arrays)
+
+
+class _ThreadLocal(threading.local):
+    samples: SampleBuffers | None = None
+
+
+_THREAD_LOCAL = _ThreadLocal()
+
+
+def _thread_buffers(rows: int, width: int) -> SampleBuffers:
+    """Return buffers that the next call in the same thread returns again, if they suffice: new memory has to be mapped,
+    which takes as long as to fill it."""
+    samples = _THREAD_LOCAL.samples
+    if samples is None or len(samples.density) < rows or samples.features.shape[1] != width:
+        samples = _THREAD_LOCAL.samples = _allocate(rows, width)
+    return samples

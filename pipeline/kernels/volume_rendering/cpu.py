@@ -12,7 +12,7 @@ from numba import njit
 from pipeline.kernels.common.numba_options import NJIT_OPTIONS
 from pipeline.kernels.hashgrid.cpu import BLOCK, HashTable, encode_block
 from pipeline.kernels.inverse_skinning.cell_skinning_cpu import CellWeights, newton_steps
-from pipeline.kernels.march.cpu import CANDIDATES, MarchArrays, SampleArrays, advance_ray, intersect_box
+from pipeline.kernels.march.cpu import CANDIDATES, MarchArrays, RayProgress, SampleArrays, advance_rays, intersect_box
 
 RAYS_PER_BLOCK = 128
 """Rays that advance together."""
@@ -208,7 +208,9 @@ def render_rays_fused(inputs, samples, capacity, image, transmittance):
     rays, count, march, field = len(transmittance), 0, inputs.march, inputs.field
     marched = SampleArrays(samples.canonical, samples.distance, samples.ray_indices)
     near, step_count, step_index = np.empty(rays, np.float32), np.empty(rays, np.int64), np.zeros(rays, np.int64)
-    samples_left, active_rays = np.full(rays, inputs.max_samples), np.empty(RAYS_PER_BLOCK, np.int64)
+    samples_left = np.full(rays, inputs.max_samples)
+    progress = RayProgress(near, step_count, step_index, samples_left)
+    active_rays, target_counts = np.empty(RAYS_PER_BLOCK, np.int64), np.empty(RAYS_PER_BLOCK, np.int64)
     for block in range(0, rays, RAYS_PER_BLOCK):
         active_count = 0
         for ray in range(block, min(block + RAYS_PER_BLOCK, rays)):
@@ -221,11 +223,9 @@ def render_rays_fused(inputs, samples, capacity, image, transmittance):
             if first + MAX_SAMPLES_PER_PASS > capacity:
                 return -1
             for index in range(active_count):
-                ray, previous_count = active_rays[index], count
-                pass_samples = SAMPLES_PER_PASS if transmittance[ray] >= HALF_TRANSMITTANCE else 1
-                steps, max_count = (near[ray], step_index[ray], step_count[ray]), count + samples_left[ray]
-                count, step_index[ray] = advance_ray(ray, steps, march, marched, count, count + pass_samples, max_count)
-                samples_left[ray] -= count - previous_count
+                is_half_lit = transmittance[active_rays[index]] >= HALF_TRANSMITTANCE
+                target_counts[index] = SAMPLES_PER_PASS if is_half_lit else 1
+            count = advance_rays(active_rays[:active_count], progress, target_counts, march, marched, count)
             _refine_samples(first, count, inputs, samples)
             evaluate_field(first, count, field, samples)
             _composite(first, count, march.step, samples, image, transmittance)

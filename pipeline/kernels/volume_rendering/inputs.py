@@ -4,6 +4,7 @@ Notation: n rays, k frames of a batch, s samples, p points, w features of a poin
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -65,8 +66,9 @@ class RadianceNetwork:
     exponent_limit: float
     gate: Float[Tensor, "gx gy gz"] | None = None
 
+    @cached_property
     def arrays(self) -> FieldArrays:
-        """Return the field for the compiled loops; it is on the CPU."""
+        """The field for the compiled loops; it is on the CPU."""
         network = NetworkArrays(
             self.hidden.detach().numpy(),
             self.output.detach().numpy(),
