@@ -139,6 +139,31 @@ def test_parts_of_a_step_add_up_to_the_whole(scene, monkeypatch, frames_per_step
     np.testing.assert_allclose(error_map, part_errors, rtol=1e-5)
 
 
+@pytest.mark.parametrize("occupancy", ["plain", "attention"])
+def test_a_compiled_step_has_the_gradients_of_autograd(scene, occupancy):
+    options = {"pose_start_fraction": 0.0, "occupancy_warmup_steps": 4, "occupancy": occupancy}
+    trainer = make_trainer(scene, steps=40, **options)
+    for _ in range(6):
+        trainer.step()
+    frames, empty_m = np.array([1, 3, 4]), trainer.occupancy.sample_empty_points(40, 40, np.random.default_rng(0))
+    batch = trainer.sampler.sample_rays(frames, trainer.completed_steps, trainer.inverse_skinning.cameras)
+    (poses,) = trainer.inverse_skinning.pose_batch(batch.frame_indices).split([3])
+    arguments = (trainer.posed_field(), batch, empty_m, 0.4, poses)
+    found, expected = (
+        step(*arguments) for step in (trainer._forward_backward_compiled, trainer._forward_backward_autograd)
+    )
+    assert torch.equal(found.rendered.image, expected.rendered.image)
+    assert torch.equal(found.colour_error, expected.colour_error)
+    assert found.losses.keys() == expected.losses.keys() == {"colour", "alpha", "hard", "density"}
+    for name, loss in expected.losses.items():
+        torch.testing.assert_close(found.losses[name], loss, rtol=1e-5, atol=0)
+    gradients = [result.gradients | {"poses": result.pose_gradient} for result in (found, expected)]
+    assert gradients[0].keys() == gradients[1].keys() >= {"hidden", "output", "bias", "poses"}
+    for name, gradient in gradients[1].items():
+        assert float(gradient.norm()) > 0
+        assert float((gradients[0][name] - gradient).norm()) < 1e-3 * float(gradient.norm()), name
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="this machine has one thread")
 def test_results_do_not_depend_on_thread_count(scene, monkeypatch):
