@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from pipeline.body.body import canonical_to_world
+from pipeline.field import field as field_module
 from pipeline.field import volume_rendering
 from pipeline.field.optimiser import DivergedError
 from pipeline.field.rendering import render_field
@@ -137,6 +138,31 @@ def test_parts_of_a_step_add_up_to_the_whole(scene, monkeypatch, frames_per_step
         assert (part_gradients[name] - gradient).norm() < 1e-4 * gradient.norm(), name
     assert torch.equal(max_transmittance, part_max_transmittance)
     np.testing.assert_allclose(error_map, part_errors, rtol=1e-5)
+
+
+def test_a_compiled_step_equals_the_composition_of_torch_operations(scene, monkeypatch):
+    """Gradients of all parameters and poses in a whole step, without early termination and subsampling."""
+    exact = partial(RenderSettings, min_transmittance=0.0, gradient_subsampling_threshold=0.0)
+    monkeypatch.setattr(volume_rendering, "RenderSettings", exact)
+    monkeypatch.setattr(field_module, "MIN_RELATIVE_GRADIENT", 0.0)
+    found = []
+    for is_compiled in (True, False):
+        trainer, gradients = make_trainer(scene, steps=40, pose_start_fraction=0.0, occupancy_warmup_steps=4), {}
+        for _ in range(6):
+            trainer.step()
+        if not is_compiled:
+            monkeypatch.setattr(volume_rendering.PosedField, "supports_early_termination", False)
+        monkeypatch.setattr(
+            trainer.optimiser, "step", lambda _, by_name, is_finite, into=gradients: into.update(by_name)
+        )
+        losses = trainer.step()
+        found.append((losses, gradients | {"table": trainer.optimiser.grad_table}, trainer.sampler.error_map.error))
+    (losses, gradients, errors), (expected_losses, expected_gradients, expected_errors) = found
+    assert losses == pytest.approx(expected_losses, rel=1e-4)
+    assert set(gradients) == {"table", "hidden", "output", "bias", "rotation_rad", "shift_m"}
+    for name, gradient in expected_gradients.items():
+        assert float((gradients[name] - gradient).norm()) < 2e-3 * float(gradient.norm()), name
+    np.testing.assert_allclose(errors, expected_errors, rtol=1e-3)
 
 
 @pytest.mark.parametrize("occupancy", ["plain", "attention"])

@@ -103,7 +103,7 @@ def test_max_samples_limits_each_ray() -> None:
 
 @pytest.mark.parametrize(("newton", "gated"), [(True, True), (False, False)])
 def test_gradients_without_autograd_are_the_same(newton: bool, gated: bool) -> None:
-    """Twice, because the second call uses the buffers of the first."""
+    """The second call uses the buffers of the first, which must not change its result."""
     rays, volume, network, skinning = make_scene()
     network, used = with_gate(network) if gated else network, skinning if newton else None
     points_m = torch.tensor([[0.1, 0.02, 0.0], [-0.3, 0.0, 0.05]])
@@ -114,14 +114,15 @@ def test_gradients_without_autograd_are_the_same(newton: bool, gated: bool) -> N
     parameters = {name: leaf for name, leaf in leaves(network, skinning).items() if newton or name != POSES}
     by_autograd = dict(zip(parameters, torch.autograd.grad(loss, list(parameters.values())), strict=True))
     of_output = OutputGradients(*(slope.numpy() for slope in slopes))
-    kept = []
-    for _ in range(2):
-        kept.append(
-            render_rays_with_gradients(
-                rays, volume, network, used, points_m, RenderSettings(0.02, 160), lambda *_: of_output
-            )
+    other_rays = rays._replace(jitter=1 - rays.jitter)
+    results = [
+        render_rays_with_gradients(
+            drawn, volume, network, used, points_m, RenderSettings(0.02, 160), lambda *_: of_output
         )
-    for output, gradients, found_features in kept:
+        for drawn in (rays, other_rays, rays)
+    ]
+    assert not torch.equal(results[1][0].weight, expected.weight)
+    for output, gradients, found_features in results[::2]:
         for name, value in expected._asdict().items():
             assert torch.equal(getattr(output, name), value), name
         found = {name: value for name, value in gradients._asdict().items() if value is not None}
