@@ -122,7 +122,8 @@ class Trainer:
         losses = sum_by_name(result.losses for result in results)
         total, gradients = torch.stack(list(losses.values())).sum(), [result.gradients for result in results]
         if pose_batch:
-            pose_loss, of_poses = self._pose_loss(), torch.cat([result.pose_gradient for result in results])
+            of_parts = [result.pose_gradient for result in results if result.pose_gradient is not None]
+            pose_loss, of_poses = self._pose_loss(), torch.cat(of_parts)
             # The gradient of the sum is that of the losses of rays and poses.
             weighted_sum = (pose_batch.canonical_to_posed * of_poses).sum()
             gradients.append(self.optimiser.gradients(pose_loss + weighted_sum, POSE_PARAMETERS))

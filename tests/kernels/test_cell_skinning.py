@@ -25,9 +25,8 @@ def make_points(skin: SkinGrid) -> tuple[torch.Tensor, torch.Tensor, torch.Tenso
     start = torch.cat([bar_points(400), torch.tensor([[0.0, 0.16, 0.0], [-0.59, 0.0, 0.0], [2.0, 0.0, -9.0]])])
     frame = torch.arange(len(start)) % 2
     matrices = torch.stack([bend(angle) for angle in ANGLES])
-    posed = torch.stack(
-        [reference.skin_points(start[[row]], skin.blend(matrices)[:, f], skin.lattice)[0] for row, f in enumerate(frame)]
-    )
+    by_frame = [reference.skin_points(start, blended, skin.lattice) for blended in skin.blend(matrices).unbind(1)]
+    posed = torch.where(frame[:, None] == 0, *by_frame)
     return start, posed + 0.02 * torch.randn(posed.shape, generator=random), frame
 
 

@@ -4,7 +4,7 @@ A point of a cell is moved by the two to five joints that have a weight at a cor
 the weights of these joints and blend their matrices, which stay in the cache. `newton_cpu` interpolates matrices that
 were blended at all nodes before: the same function of the point, with more memory.
 
-Notation: k frames, j joints, c cells of which all corners exist, e pairs of such a cell and a joint. Matrices (k, j, 16)
+Notation: k frames, j joints, e pairs of a cell with all corners and a joint. Matrices (k, j, 16)
 are 4 x 4, row by row; the last row is not read.
 """
 
@@ -100,18 +100,45 @@ def newton_steps(first, last, ray_indices, batch_index, matrices, cells, canonic
                 along_x, along_y = (e0 + w * (e1 - e0)) * inverse, (b0 + w * (b1 - b0)) * inverse
                 along_z, value = (c1 - c0) * inverse, c0 + w * (c1 - c0)
                 m = joint[entry]
-                m0, m1, m2, m3 = matrices[frame, m, 0], matrices[frame, m, 1], matrices[frame, m, 2], matrices[frame, m, 3]
+                m0, m1, m2, m3 = (
+                    matrices[frame, m, 0],
+                    matrices[frame, m, 1],
+                    matrices[frame, m, 2],
+                    matrices[frame, m, 3],
+                )
                 qx = m0 * x + m1 * y + m2 * z + m3
                 px = px + value * qx
-                j00, j01, j02 = j00 + value * m0 + along_x * qx, j01 + value * m1 + along_y * qx, j02 + value * m2 + along_z * qx
-                m0, m1, m2, m3 = matrices[frame, m, 4], matrices[frame, m, 5], matrices[frame, m, 6], matrices[frame, m, 7]
+                j00, j01, j02 = (
+                    j00 + value * m0 + along_x * qx,
+                    j01 + value * m1 + along_y * qx,
+                    j02 + value * m2 + along_z * qx,
+                )
+                m0, m1, m2, m3 = (
+                    matrices[frame, m, 4],
+                    matrices[frame, m, 5],
+                    matrices[frame, m, 6],
+                    matrices[frame, m, 7],
+                )
                 qy = m0 * x + m1 * y + m2 * z + m3
                 py = py + value * qy
-                j10, j11, j12 = j10 + value * m0 + along_x * qy, j11 + value * m1 + along_y * qy, j12 + value * m2 + along_z * qy
-                m0, m1, m2, m3 = matrices[frame, m, 8], matrices[frame, m, 9], matrices[frame, m, 10], matrices[frame, m, 11]
+                j10, j11, j12 = (
+                    j10 + value * m0 + along_x * qy,
+                    j11 + value * m1 + along_y * qy,
+                    j12 + value * m2 + along_z * qy,
+                )
+                m0, m1, m2, m3 = (
+                    matrices[frame, m, 8],
+                    matrices[frame, m, 9],
+                    matrices[frame, m, 10],
+                    matrices[frame, m, 11],
+                )
                 qz = m0 * x + m1 * y + m2 * z + m3
                 pz = pz + value * qz
-                j20, j21, j22 = j20 + value * m0 + along_x * qz, j21 + value * m1 + along_y * qz, j22 + value * m2 + along_z * qz
+                j20, j21, j22 = (
+                    j20 + value * m0 + along_x * qz,
+                    j21 + value * m1 + along_y * qz,
+                    j22 + value * m2 + along_z * qz,
+                )
         invertible, (a, b, c, d, e, f, g, h, q) = invert((j00, j01, j02, j10, j11, j12, j20, j21, j22))
         if invertible:
             rx, ry, rz = points[s, 0] - px, points[s, 1] - py, points[s, 2] - pz

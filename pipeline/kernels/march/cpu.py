@@ -60,7 +60,7 @@ class SampleArrays(NamedTuple):
 
 
 class RayProgress(NamedTuple):
-    """State of all rays (n): distance of the box, steps in it, index of the next step, samples that are still allowed."""
+    """State of all rays (n): distance of the box, steps in it, next step, samples that are still allowed."""
 
     near: np.ndarray
     step_count: np.ndarray

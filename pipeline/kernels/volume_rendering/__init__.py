@@ -91,7 +91,7 @@ def render_rays_with_gradients(
     settings: RenderSettings,
     output_gradients: Callable[[np.ndarray, np.ndarray, np.ndarray], OutputGradients],
 ) -> tuple[RenderOutput, RenderGradients, FeatureGradients]:
-    """Do `render_rays_fused` and its backward pass without autograd, which takes longer than the loops of a small batch.
+    """Do `render_rays_fused` and its backward pass without autograd, which costs as much as a third of the loops.
 
     output_gradients: returns the gradients of a loss from image (n, 3), alpha (n) and density (p).
     """
@@ -133,7 +133,7 @@ class _RenderRays(torch.autograd.Function):
 
 @dataclass(frozen=True)
 class _Rendered:
-    """Result of a forward pass: `count` samples of rays, then `points` further points; image (n, 3), transmittance (n)."""
+    """Result of a forward pass: `count` samples of rays, then `points` others; image (n, 3), transmittance (n)."""
 
     samples: SampleBuffers
     count: int
@@ -159,7 +159,8 @@ class _Renderer:
 
     def forward_pass(self, allocate: Callable[[int, int], SampleBuffers]) -> _Rendered:
         """Render the rays, and evaluate the field at the further points; `allocate` as `_allocate`."""
-        inputs, rays, width = self.inputs, len(self.inputs.march.rays.frame_index), len(self.inputs.field.network.hidden)
+        inputs = self.inputs
+        rays, width = len(inputs.march.rays.frame_index), len(inputs.field.network.hidden)
         capacity = INITIAL_SAMPLES_PER_RAY * rays + cpu.MAX_SAMPLES_PER_PASS
         count = -1
         while count < 0:

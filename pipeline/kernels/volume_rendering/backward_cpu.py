@@ -25,7 +25,7 @@ class OutputGradients(NamedTuple):
 
 
 class ParameterGradients(NamedTuple):
-    """Gradients of hidden (w, h), output (h, 4), bias (4), gate (gx, gy, gz) and matrices (k, j, 16), which are added to.
+    """Gradients of hidden (w, h), output (h, 4), bias (4), gate (gx, gy, gz) and matrices (k, j, 16); added to.
 
     Gate and matrices have no elements where there are none.
     """

@@ -103,9 +103,7 @@ def _refine_samples(first, last, inputs, samples):
             unit[s, 0] = origins[ray, 0] + t * directions[ray, 0]
             unit[s, 1] = origins[ray, 1] + t * directions[ray, 1]
             unit[s, 2] = origins[ray, 2] + t * directions[ray, 2]
-        newton_steps(
-            first, last, ray_indices, batch_index, matrices, cells, canonical, unit, samples.inverse_jacobian
-        )
+        newton_steps(first, last, ray_indices, batch_index, matrices, cells, canonical, unit, samples.inverse_jacobian)
         points = unit
     low_x, low_y, low_z = bounds[0, 0], bounds[0, 1], bounds[0, 2]
     scale_x, scale_y = _ONE / (bounds[1, 0] - low_x), _ONE / (bounds[1, 1] - low_y)
