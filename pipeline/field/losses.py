@@ -3,11 +3,14 @@
 Letters: n rays, e points that should be empty.
 """
 
+import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.field.settings import FieldSettings
-from pipeline.kernels.ray_losses import ray_losses
+from pipeline.kernels.ray_losses import LossInputs, ray_loss_gradients, ray_losses
+from pipeline.kernels.volume_rendering import OutputGradients
 
 DENSITY_SCALE_M = 0.01
 """Length that turns the density of empty points (1/m) into the unit of the other losses."""
@@ -35,3 +38,22 @@ def field_losses(
         point_count = settings.empty_points + settings.unobserved_points
         losses["density"] = settings.empty_density_weight * DENSITY_SCALE_M * empty_density_per_m.sum() / point_count
     return losses, error
+
+
+def field_loss_gradients(
+    rays: LossInputs, density_per_m: Float[np.ndarray, "e"], settings: FieldSettings, ray_fraction: float
+) -> tuple[dict[str, Tensor], Float[Tensor, "n 3"], OutputGradients]:
+    """Do `field_losses` and its backward pass without autograd; return losses, colour errors and gradients.
+
+    ray_fraction: factor of the losses of rays. The gradients are those of the sum of the losses.
+    """
+    weights = (1.0, settings.alpha_weight, settings.hard_surface_weight)
+    of_rays = ray_loss_gradients(rays, settings.huber_delta, tuple(ray_fraction * weight for weight in weights))
+    values = ray_fraction * torch.tensor(weights) * torch.from_numpy(of_rays.means)
+    losses = dict(zip(("colour", "alpha", "hard"), values, strict=True))
+    point_count = max(settings.empty_points + settings.unobserved_points, 1)
+    slope = np.float32(settings.empty_density_weight * DENSITY_SCALE_M / point_count)
+    if len(density_per_m):
+        losses["density"] = torch.as_tensor(slope * density_per_m.sum())
+    gradients = OutputGradients(of_rays.grad_image, of_rays.grad_alpha, np.full(len(density_per_m), slope, np.float32))
+    return losses, torch.from_numpy(of_rays.error), gradients

@@ -13,17 +13,18 @@ from pipeline.body.pose_correction import PoseCorrection
 from pipeline.field.baked_inverse_skinning import BakedInverseSkinning
 from pipeline.field.config import FieldConfig
 from pipeline.field.field import RadianceField
-from pipeline.field.losses import field_losses
+from pipeline.field.losses import field_loss_gradients, field_losses
 from pipeline.field.occupancy import OccupancyGrid
 from pipeline.field.optimiser import POSE_PARAMETERS, FieldOptimiser
 from pipeline.field.pixel_sampler import PixelPool
 from pipeline.field.ray_batches import POINT_STREAM, STEP_STREAM, RayBatch, RaySampler, step_rng
-from pipeline.field.volume_rendering import PosedField, render_rays
+from pipeline.field.volume_rendering import PoseBatch, PosedField, render_rays, render_rays_with_gradients
 from pipeline.geometry.camera import Camera
 from pipeline.kernels.common.thread_pool import ThreadPool
 from pipeline.kernels.hashgrid import FeatureGradients, add_table_gradient_
 from pipeline.kernels.inverse_skinning import SkinGrid
-from pipeline.kernels.volume_rendering import RenderOutput
+from pipeline.kernels.ray_losses import LossInputs
+from pipeline.kernels.volume_rendering import OutputGradients, RenderOutput
 
 REBAKE_FRACTIONS = (0.6,)
 """Fractions of the steps at which the inverse skinning is baked for the refined poses (docs/decisions/field.md)."""
@@ -32,7 +33,7 @@ MAX_SAMPLES_PER_RAY = 160
 CPU_BATCH_PARTS = 4
 """Parts into which the frames of a step are divided on the CPU. It does not depend on the number of threads, so that
 the order of floating-point sums does not either."""
-OCCUPANCY_PREFIX, GATE = "occupancy.", "gate"
+OCCUPANCY_PREFIX, GATE, POSES = "occupancy.", "gate", "canonical_to_posed"
 
 
 @dataclass(frozen=True)
@@ -50,8 +51,8 @@ class TrainingScene:
 class StepResult:
     """Losses and gradients of a part of a step; they add up to those of the whole step.
 
-    gradients: by parameter. feature_gradients: contributions to the gradient of the hash table, if autograd does not
-    compute it.
+    gradients: by parameter. pose_gradient: of the matrices of the `PoseBatch`. feature_gradients: contributions to the
+    gradient of the hash table, if autograd does not compute it.
     """
 
     batch: RayBatch
@@ -59,6 +60,7 @@ class StepResult:
     colour_error: Float[Tensor, "n 3"]
     losses: dict[str, Tensor]
     gradients: dict[str, Tensor]
+    pose_gradient: Tensor | None
     feature_gradients: FeatureGradients
 
 
@@ -113,12 +115,18 @@ class Trainer:
             step_rng(self.config.seed, self.completed_steps, POINT_STREAM),
         )
         ray_fractions = [self.sampler.ray_fraction(part, frames) for part in parts]
-        results = self.threads.map(self.forward_backward, parts, empty_m.tensor_split(len(parts)), ray_fractions)
+        pose_batch = self.inverse_skinning.pose_batch(self._frame_tensor(frames)) if self.refines_poses else None
+        pose_parts = pose_batch.split([len(part) for part in parts]) if pose_batch else [None] * len(parts)
+        arguments = (parts, empty_m.tensor_split(len(parts)), ray_fractions, pose_parts)
+        results = self.threads.map(self.forward_backward, *arguments)
         losses = sum_by_name(result.losses for result in results)
         total, gradients = torch.stack(list(losses.values())).sum(), [result.gradients for result in results]
-        if self.refines_poses:
-            pose_loss = self._pose_loss()
-            gradients.append(self.optimiser.gradients(pose_loss, POSE_PARAMETERS))
+        if pose_batch:
+            of_parts = [result.pose_gradient for result in results if result.pose_gradient is not None]
+            pose_loss, of_poses = self._pose_loss(), torch.cat(of_parts)
+            # The gradient of the sum is that of the losses of rays and poses.
+            weighted_sum = (pose_batch.canonical_to_posed * of_poses).sum()
+            gradients.append(self.optimiser.gradients(pose_loss + weighted_sum, POSE_PARAMETERS))
             total = total + pose_loss.detach()
         is_finite = bool(torch.isfinite(total))
         if is_finite:
@@ -135,31 +143,84 @@ class Trainer:
         """Return the number of samples on the rays of the next step, without taking it."""
         frames = self.sampler.sample_frames(step_rng(self.config.seed, self.completed_steps, STEP_STREAM))
         batch = self.sampler.sample_rays(frames, self.completed_steps, self.inverse_skinning.cameras)
-        posed_field = PosedField(self.field, self.inverse_skinning.inverse, self.occupancy.binary())
+        posed_field = self.posed_field()
         none_m = self.field.bounds_m[:0]
         return len(render_rays(posed_field, batch.rays, None, none_m, self.step_m, MAX_SAMPLES_PER_RAY, []).weight)
 
     def forward_backward(
-        self, frames: Int[np.ndarray, "k"], empty_m: Float[Tensor, "e 3"], ray_fraction: float
+        self,
+        frames: Int[np.ndarray, "k"],
+        empty_m: Float[Tensor, "e 3"],
+        ray_fraction: float,
+        pose_batch: PoseBatch | None = None,
     ) -> StepResult:
         """Compute losses and gradients of rays of some frames and of empty points (m), without changing any state.
 
-        ray_fraction: rays of these frames as a fraction of all rays of the step. Threads may call it concurrently.
+        ray_fraction: rays of these frames as a fraction of all rays of the step. pose_batch: their present poses; None:
+        those of the last bake. Threads may call it concurrently.
         """
         batch = self.sampler.sample_rays(frames, self.completed_steps, self.inverse_skinning.cameras)
+        posed_field = self.posed_field()
+        if posed_field.supports_early_termination:
+            return self._forward_backward_compiled(posed_field, batch, empty_m, ray_fraction, pose_batch)
+        return self._forward_backward_autograd(posed_field, batch, empty_m, ray_fraction, pose_batch)
+
+    def _forward_backward_compiled(
+        self,
+        posed_field: PosedField,
+        batch: RayBatch,
+        empty_m: Float[Tensor, "e 3"],
+        ray_fraction: float,
+        pose_batch: PoseBatch | None,
+    ) -> StepResult:
+        """Do `_forward_backward_autograd` with compiled loops alone."""
+        losses: dict[str, Tensor] = {}
+        error = batch.background
+        targets = [tensor.numpy() for tensor in (batch.rgba, batch.background, batch.inlier_weight)]
+
+        def output_gradients(image: np.ndarray, alpha: np.ndarray, density: np.ndarray) -> OutputGradients:
+            nonlocal losses, error
+            rays = LossInputs(image, alpha, *targets)
+            losses, error, gradients = field_loss_gradients(rays, density, self.config.settings, ray_fraction)
+            return gradients
+
+        rendered, gradients, feature_gradients = render_rays_with_gradients(
+            posed_field, batch.rays, pose_batch, empty_m, self.step_m, MAX_SAMPLES_PER_RAY, output_gradients
+        )
+        by_name = {"hidden": gradients.hidden, "output": gradients.output, "bias": gradients.bias}
+        if gradients.gate is not None:
+            by_name[GATE] = gradients.gate
+        return StepResult(batch, rendered, error, losses, by_name, gradients.canonical_to_posed, feature_gradients)
+
+    def _forward_backward_autograd(
+        self,
+        posed_field: PosedField,
+        batch: RayBatch,
+        empty_m: Float[Tensor, "e 3"],
+        ray_fraction: float,
+        pose_batch: PoseBatch | None,
+    ) -> StepResult:
         feature_gradients = FeatureGradients()
-        posed_field = PosedField(self.field, self.inverse_skinning.inverse, self.occupancy.binary())
-        pose_batch = self.inverse_skinning.pose_batch(batch.frame_indices) if self.refines_poses else None
         rendered = render_rays(
             posed_field, batch.rays, pose_batch, empty_m, self.step_m, MAX_SAMPLES_PER_RAY, feature_gradients
         )
         targets = (batch.rgba, batch.background, batch.inlier_weight, rendered.density_per_m, self.config.settings)
         losses, error = field_losses(rendered.image, rendered.alpha, *targets)
         losses = {name: loss if name == "density" else ray_fraction * loss for name, loss in losses.items()}
-        gate = {} if self.field.gate is None else {GATE: self.field.gate}
-        gradients = self.optimiser.gradients(torch.stack(list(losses.values())).sum(), others=gate)
+        leaves = {} if self.field.gate is None else {GATE: self.field.gate}
+        if pose_batch:
+            leaves[POSES] = pose_batch.canonical_to_posed
+        gradients = self.optimiser.gradients(torch.stack(list(losses.values())).sum(), others=leaves)
+        of_poses = gradients.pop(POSES, torch.zeros_like(leaves[POSES])) if pose_batch else None
         detached = {name: loss.detach() for name, loss in losses.items()}
-        return StepResult(batch, rendered, error, detached, gradients, feature_gradients)
+        return StepResult(batch, rendered, error, detached, gradients, of_poses, feature_gradients)
+
+    def posed_field(self) -> PosedField:
+        """Return the field in the poses of the last bake, for the present step."""
+        return PosedField(self.field, self.inverse_skinning.inverse, self.occupancy.binary())
+
+    def _frame_tensor(self, frames: Int[np.ndarray, "k"]) -> Int[Tensor, "k"]:
+        return torch.from_numpy(frames).to(self.device)
 
     def _through_gate(self, gradients: dict[str, Tensor]) -> dict[str, Tensor]:
         """Replace the gradient of the gate, if there is one, by those of the parameters that it depends on."""

@@ -3,8 +3,12 @@
 Letters: n rays, k frames of the motion, b frames of a batch, j joints, m nodes of the skin grid, p points, s samples.
 """
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -21,15 +25,22 @@ from pipeline.kernels.march import Samples, SamplingVolume
 from pipeline.kernels.transmittance_stats import transmittance_from_weights
 from pipeline.kernels.volume_rendering import (
     BatchSkinning,
+    OutputGradients,
     RadianceNetwork,
+    RenderGradients,
     RenderOutput,
     RenderSettings,
     render_rays_fused,
 )
+from pipeline.kernels.volume_rendering import render_rays_with_gradients as fused_with_gradients
 
 
-class PosedField(NamedTuple):
-    """A canonical field, the inverse skinning of the frames in which it is seen, and its occupied cells."""
+@dataclass(frozen=True)
+class PosedField:
+    """A canonical field, the inverse skinning of the frames in which it is seen, and its occupied cells.
+
+    Valid until one of them changes.
+    """
 
     field: RadianceField
     inverse: InverseSkinning
@@ -40,6 +51,24 @@ class PosedField(NamedTuple):
         """Whether `render_rays` skips samples behind a surface: hash grid and warp grids on the CPU."""
         return self.inverse.warps is not None and self.field.trunk is None and runs_on_numba(self.field.table)
 
+    @cached_property
+    def network(self) -> RadianceNetwork:
+        """The field for the fused renderer."""
+        field, limits = self.field, (INITIAL_DENSITY_PER_M, MAX_ABS_LOG_DENSITY)
+        weights = field.hidden, field.output, field.bias
+        return RadianceNetwork(field.bounds_m, field.table, field.layout, *weights, *limits, field.gate)
+
+    @cached_property
+    def volume(self) -> SamplingVolume:
+        """Warp grids and occupied cells for the fused renderer.
+
+        Raises:
+            TypeError: the inverse skinning has no warp grids.
+        """
+        if self.inverse.warps is None:
+            raise TypeError("the inverse skinning has no warp grids")
+        return SamplingVolume(self.inverse.warps, self.occupancy.occupied, self.occupancy.bounds_m)
+
 
 class PoseBatch(NamedTuple):
     """Skin weights, and the skinning matrices of the frames of a batch; `frames` is in ascending order."""
@@ -48,9 +77,10 @@ class PoseBatch(NamedTuple):
     frames: Int[Tensor, "b"]
     canonical_to_posed: Float[Tensor, "b j 4 4"]
 
-    def blended(self) -> Float[Tensor, "m b 12"]:
-        """Blend the matrices at the nodes of the skin grid."""
-        return self.skin.blend(self.canonical_to_posed)
+    def split(self, sizes: Sequence[int]) -> list["PoseBatch"]:
+        """Divide the frames into parts of some sizes; the poses of a part are leaves of autograd."""
+        parts = zip(self.frames.split(sizes), self.canonical_to_posed.detach().split(sizes), strict=True)
+        return [PoseBatch(self.skin, frames, poses.requires_grad_()) for frames, poses in parts]
 
     def frame_slots(self, rays: Rays) -> Int[Tensor, "n"]:
         """Return the position in `frames` of each ray's frame."""
@@ -73,22 +103,33 @@ def render_rays(
     samples, m. max_samples: per ray. feature_gradients: list that takes the contributions to the gradient of the hash
     table (`pipeline.kernels.hashgrid.encode`).
     """
-    field, inverse, occupancy = posed_field
-    warps = inverse.warps
-    if warps is None or not posed_field.supports_early_termination:
+    if not posed_field.supports_early_termination:
         return render_rays_dense(posed_field, rays, pose_batch, points_m, step_m, max_samples, feature_gradients)
-    network = (field.hidden, field.output, field.bias)
-    return render_rays_fused(
-        rays,
-        SamplingVolume(warps, occupancy.occupied, occupancy.bounds_m),
-        RadianceNetwork(
-            field.bounds_m, field.table, field.layout, *network, INITIAL_DENSITY_PER_M, MAX_ABS_LOG_DENSITY, field.gate
-        ),
-        BatchSkinning(pose_batch.skin, pose_batch.blended(), pose_batch.frame_slots(rays)) if pose_batch else None,
-        points_m,
-        RenderSettings(step_m, max_samples),
-        feature_gradients,
-    )
+    fused = rays, posed_field.volume, posed_field.network, _batch_skinning(rays, pose_batch), points_m
+    return render_rays_fused(*fused, RenderSettings(step_m, max_samples), feature_gradients)
+
+
+def render_rays_with_gradients(
+    posed_field: PosedField,
+    rays: Rays,
+    pose_batch: PoseBatch | None,
+    points_m: Float[Tensor, "p 3"],
+    step_m: float,
+    max_samples: int,
+    output_gradients: Callable[[np.ndarray, np.ndarray, np.ndarray], OutputGradients],
+) -> tuple[RenderOutput, RenderGradients, FeatureGradients]:
+    """Do `render_rays` and its backward pass without autograd, for a field that supports early termination.
+
+    output_gradients: see `pipeline.kernels.volume_rendering.render_rays_with_gradients`.
+    """
+    fused = rays, posed_field.volume, posed_field.network, _batch_skinning(rays, pose_batch), points_m
+    return fused_with_gradients(*fused, RenderSettings(step_m, max_samples), output_gradients)
+
+
+def _batch_skinning(rays: Rays, pose_batch: PoseBatch | None) -> BatchSkinning | None:
+    if pose_batch is None:
+        return None
+    return BatchSkinning(pose_batch.skin, pose_batch.canonical_to_posed, pose_batch.frame_slots(rays))
 
 
 def render_rays_dense(
@@ -101,7 +142,7 @@ def render_rays_dense(
     feature_gradients: FeatureGradients,
 ) -> RenderOutput:
     """`render_rays` for any field, inverse skinning and device; evaluates all samples, also those behind a surface."""
-    field, inverse, occupancy = posed_field
+    field, inverse, occupancy = posed_field.field, posed_field.inverse, posed_field.occupancy
     samples = inverse.sample_rays(rays, step_m, occupancy, max_samples)
     count = len(samples.distance_m)
     sample_positions_m = sample_positions(inverse, rays, pose_batch, samples) if pose_batch else samples.canonical_m

@@ -14,23 +14,23 @@ The lower bound of a part is the longest of three times, each at a rate that is 
 rate of a copy of the size of the table with its gradient and moments; multiplications and additions at the rate of a
 large matrix product; table rows at the rate of random rows of a table of the size of the largest level. Consecutive
 rows, as for neighbouring samples, load faster: a part can be faster than a bound by rows. With n rays, s samples, p
-points (the samples, and points that should be empty), l levels of f features, w = l f, hidden width h, and for poses k
-frames, j joints, m nodes with e nonzero skin weights:
+points (the samples, and points that should be empty), l levels of f features, w = l f, hidden width h, and for poses j
+joints, m nodes:
 
 | part | work of a step |
 |---|---|
 | pixel_sampling | 84 n bytes: pixel and colour read; origin, direction, colour, background, jitter, frame written |
-| pose_blending | 24 e k operations (blending) |
+| poses | none: kinematics of the frames of the step |
 | render_rays: march | 8 s rows of a warp grid, 16 s bytes written |
-| render_rays: Newton | 8 s rows of blended matrices, 40 s bytes |
+| render_rays: Newton | s rows of skin weights, 40 s bytes |
 | render_rays: hash grid | 8 l p rows, (12 + 4 w) p bytes |
 | render_rays: network | 2 (w h + 4 h) p operations, (4 w + 16) p bytes |
 | render_rays: compositing | 32 s + 24 n bytes |
 | losses | 44 n bytes |
-| network_backward | twice the network's operations in render_rays, (8 w + 32) p bytes |
+| render_backward: network | twice the network's operations in render_rays, (8 w + 32) p + 32 s + 68 n bytes |
+| render_backward: positions | 8 l p rows, and s rows of skin weights for Newton |
 | table_backward | 16 l p rows: each is read and written |
-| positions_backward | 8 l p rows, and 24 s for Newton: the matrix of a node is read, its gradient read and written |
-| rest_backward | 32 s + 68 n bytes (losses, compositing), 24 e k operations (blending) |
+| rest_backward | none: kinematics |
 | adam | 32 bytes for each parameter |
 | occupancy_record | 4 s rows, 24 s bytes |
 | occupancy_update | hash grid and network of one point in each cell |
@@ -69,12 +69,11 @@ from tests.field.scene import painted_scene
 
 PARTS = (
     "pixel_sampling",
-    "pose_blending",
+    "poses",
     "render_rays",
     "losses",
-    "network_backward",
+    "render_backward",
     "table_backward",
-    "positions_backward",
     "rest_backward",
     "adam",
     "occupancy_record",
@@ -177,28 +176,27 @@ def minimum_work(trainer: Trainer, samples: float) -> dict[str, tuple[Work, ...]
     points = samples + len(occupancy.sample_empty_points(*point_counts, np.random.default_rng(0)))
     width = len(field.hidden)
     refines = float(trainer.refines_poses)
-    blending = (
-        refines * 24.0 * len(trainer.inverse_skinning.skin.sparse_weights.weight) * trainer.sampler.frames_per_step
-    )
     refined = refines * samples
     network = 2.0 * (width * hidden + 4 * hidden)
     cells = len(occupancy.candidate_cells) / config.settings.occupancy_update_interval
     render_rays = (
         Work(bytes=16 * samples, rows=8 * samples),
-        Work(bytes=40 * refined, rows=8 * refined),
+        Work(bytes=40 * refined, rows=refined),
         Work(bytes=(12 + 4 * width) * points, rows=8 * levels * points),
         Work(bytes=(4 * width + 16) * points, operations=network * points),
         Work(bytes=32 * samples + 24 * n),
     )
     return {
         "pixel_sampling": (Work(bytes=84.0 * n),),
-        "pose_blending": (Work(operations=blending),),
+        "poses": (),
         "render_rays": render_rays,
         "losses": (Work(bytes=44.0 * n),),
-        "network_backward": (Work(bytes=(8 * width + 32) * points, operations=2 * network * points),),
+        "render_backward": (
+            Work(bytes=(8 * width + 32) * points + 32 * samples + 68.0 * n, operations=2 * network * points),
+            Work(rows=refines * (8 * levels * points + samples)),
+        ),
         "table_backward": (Work(rows=16 * levels * points),),
-        "positions_backward": (Work(rows=refines * (8 * levels * points + 24 * samples)),),
-        "rest_backward": (Work(bytes=32 * samples + 68.0 * n, operations=blending),),
+        "rest_backward": (),
         "adam": (Work(bytes=32.0 * sum(parameter.numel() for parameter in field.parameters())),),
         "occupancy_record": (Work(bytes=24 * samples, rows=4 * samples),),
         UPDATE: (Work(bytes=(12 + 4 * width) * cells, operations=network * cells, rows=8 * levels * cells),),

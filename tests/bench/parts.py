@@ -20,11 +20,10 @@ from pipeline.field.occupancy import OccupancyGrid
 from pipeline.field.optimiser import FieldOptimiser
 from pipeline.field.ray_batches import RaySampler
 from pipeline.field.trainer import Trainer
-from pipeline.field.volume_rendering import PoseBatch
 from pipeline.kernels.common.thread_pool import ThreadPool
 from pipeline.kernels.hashgrid import cpu as hashgrid_cpu
-from pipeline.kernels.inverse_skinning import _NewtonStep, newton_cpu
-from pipeline.kernels.volume_rendering import _RenderRays
+from pipeline.kernels.inverse_skinning import _NewtonStep
+from pipeline.kernels.volume_rendering import _Renderer
 
 OTHER = "other"
 UPDATE = "occupancy_update"
@@ -34,18 +33,18 @@ TIMED_FUNCTIONS: tuple[tuple[str, Any, str], ...] = (
     (REBAKE, BakedInverseSkinning, "bake"),
     ("pixel_sampling", RaySampler, "sample_rays"),
     ("pixel_sampling", OccupancyGrid, "sample_empty_points"),
-    ("pose_blending", BakedInverseSkinning, "pose_batch"),
-    ("pose_blending", PoseBatch, "blended"),
+    ("poses", BakedInverseSkinning, "pose_batch"),
     ("render_rays", trainer_module, "render_rays"),
+    ("render_rays", trainer_module, "render_rays_with_gradients"),
     ("losses", trainer_module, "field_losses"),
+    ("losses", trainer_module, "field_loss_gradients"),
     ("losses", PoseCorrection, "temporal_roughness"),
     ("losses", PoseCorrection, "mean_square_correction"),
-    ("network_backward", _RadianceMlp, "backward"),
-    ("network_backward", _RenderRays, "backward"),
+    ("render_backward", _RadianceMlp, "backward"),
+    ("render_backward", _Renderer, "backward_pass"),
+    ("render_backward", hashgrid_cpu, "add_points_gradient"),
+    ("render_backward", _NewtonStep, "backward"),
     ("table_backward", hashgrid_cpu, "add_table_gradient"),
-    ("positions_backward", hashgrid_cpu, "add_points_gradient"),
-    ("positions_backward", _NewtonStep, "backward"),
-    ("positions_backward", newton_cpu, "add_pose_gradient"),
     ("rest_backward", FieldOptimiser, "gradients"),
     ("adam", optimiser_module, "adam_step_"),
     ("occupancy_record", OccupancyGrid, "record_observations"),

@@ -8,12 +8,16 @@ import pytest
 import torch
 
 from pipeline.body.body import canonical_to_world
+from pipeline.field import field as field_module
 from pipeline.field import volume_rendering
+from pipeline.field.losses import field_losses
 from pipeline.field.optimiser import DivergedError
+from pipeline.field.ray_batches import POINT_STREAM, STEP_STREAM, step_rng
 from pipeline.field.rendering import render_field
 from pipeline.field.setup import create_trainer, evenly_spaced, training_scale
-from pipeline.field.trainer import MAX_SAMPLES_PER_RAY
+from pipeline.field.trainer import MAX_SAMPLES_PER_RAY, Trainer
 from pipeline.field.volume_rendering import sample_positions
+from pipeline.kernels.hashgrid import FeatureGradients, add_table_gradient_
 from pipeline.kernels.volume_rendering import RenderSettings
 from tests.field.scene import TINY, TRAIN, field_config, make_trainer, psnr_on_white_db, sample_rays
 
@@ -137,6 +141,67 @@ def test_parts_of_a_step_add_up_to_the_whole(scene, monkeypatch, frames_per_step
         assert (part_gradients[name] - gradient).norm() < 1e-4 * gradient.norm(), name
     assert torch.equal(max_transmittance, part_max_transmittance)
     np.testing.assert_allclose(error_map, part_errors, rtol=1e-5)
+
+
+def reference_step(trainer: Trainer) -> tuple[dict[str, float], dict[str, torch.Tensor]]:
+    """Losses and gradients of the next step: all rays at once, by torch operations and autograd."""
+    seed, step, settings = trainer.config.seed, trainer.completed_steps, trainer.config.settings
+    frames = trainer.sampler.sample_frames(step_rng(seed, step, STEP_STREAM))
+    counts = settings.empty_points, settings.unobserved_points
+    empty_m = trainer.occupancy.sample_empty_points(*counts, step_rng(seed, step, POINT_STREAM))
+    batch = trainer.sampler.sample_rays(frames, step, trainer.inverse_skinning.cameras)
+    poses, features = trainer.inverse_skinning.pose_batch(batch.frame_indices), FeatureGradients()
+    limits = trainer.step_m, MAX_SAMPLES_PER_RAY
+    found = volume_rendering.render_rays_dense(trainer.posed_field(), batch.rays, poses, empty_m, *limits, features)
+    targets = batch.rgba, batch.background, batch.inlier_weight, found.density_per_m, settings
+    losses, _ = field_losses(found.image, found.alpha, *targets)
+    total = torch.stack(list(losses.values())).sum() + trainer._pose_loss()
+    gradients = trainer.optimiser.gradients(total) | {"table": torch.zeros_like(trainer.field.table)}
+    add_table_gradient_(gradients["table"], features, trainer.field.layout)
+    return {name: float(loss.detach()) for name, loss in losses.items()}, gradients
+
+
+def test_a_compiled_step_equals_the_composition_of_torch_operations(scene, monkeypatch):
+    """Losses and gradients of a whole step, without early termination and subsampling."""
+    exact = partial(RenderSettings, min_transmittance=0.0, gradient_subsampling_threshold=0.0)
+    monkeypatch.setattr(volume_rendering, "RenderSettings", exact)
+    monkeypatch.setattr(field_module, "MIN_RELATIVE_GRADIENT", 0.0)
+    trainer, gradients = make_trainer(scene, steps=40, pose_start_fraction=0.0, occupancy_warmup_steps=4), {}
+    for _ in range(6):
+        trainer.step()
+    expected_losses, expected_gradients = reference_step(trainer)
+    monkeypatch.setattr(trainer.optimiser, "step", lambda _, by_name, is_finite: gradients.update(by_name))
+    losses = trainer.step()
+    gradients["table"] = trainer.optimiser.grad_table
+    assert {name: losses[name] for name in expected_losses} == pytest.approx(expected_losses, rel=1e-4)
+    assert set(gradients) == {"table", "hidden", "output", "bias", "rotation_rad", "shift_m"}
+    for name, gradient in expected_gradients.items():
+        assert float((gradients[name] - gradient).norm()) < 2e-3 * float(gradient.norm()), name
+
+
+@pytest.mark.parametrize("occupancy", ["plain", "attention"])
+def test_a_compiled_step_has_the_gradients_of_autograd(scene, occupancy):
+    options = {"pose_start_fraction": 0.0, "occupancy_warmup_steps": 4, "occupancy": occupancy}
+    trainer = make_trainer(scene, steps=40, **options)
+    for _ in range(6):
+        trainer.step()
+    frames, empty_m = np.array([1, 3, 4]), trainer.occupancy.sample_empty_points(40, 40, np.random.default_rng(0))
+    batch = trainer.sampler.sample_rays(frames, trainer.completed_steps, trainer.inverse_skinning.cameras)
+    (poses,) = trainer.inverse_skinning.pose_batch(batch.frame_indices).split([3])
+    arguments = (trainer.posed_field(), batch, empty_m, 0.4, poses)
+    found, expected = (
+        step(*arguments) for step in (trainer._forward_backward_compiled, trainer._forward_backward_autograd)
+    )
+    assert torch.equal(found.rendered.image, expected.rendered.image)
+    assert torch.equal(found.colour_error, expected.colour_error)
+    assert found.losses.keys() == expected.losses.keys() == {"colour", "alpha", "hard", "density"}
+    for name, loss in expected.losses.items():
+        torch.testing.assert_close(found.losses[name], loss, rtol=1e-5, atol=0)
+    gradients = [result.gradients | {"poses": result.pose_gradient} for result in (found, expected)]
+    assert gradients[0].keys() == gradients[1].keys() >= {"hidden", "output", "bias", "poses"}
+    for name, gradient in gradients[1].items():
+        assert float(gradient.norm()) > 0
+        assert float((gradients[0][name] - gradient).norm()) < 1e-3 * float(gradient.norm()), name
 
 
 @pytest.mark.slow

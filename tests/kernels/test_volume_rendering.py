@@ -13,16 +13,19 @@ from pipeline.kernels.inverse_skinning import bake_warp_grid
 from pipeline.kernels.march import PackedWarpGrids, Rays, SamplingVolume
 from pipeline.kernels.volume_rendering import (
     BatchSkinning,
+    OutputGradients,
     RadianceNetwork,
     RenderSettings,
     reference,
     render_rays_fused,
+    render_rays_with_gradients,
 )
 from tests.kernels.bar import CELL_M, bar_skin, bend
 
 BOUNDS_M = torch.tensor([[-0.65, -0.2, -0.2], [0.65, 0.2, 0.2]])
 EXACT = RenderSettings(0.02, 160, min_transmittance=0.0, gradient_subsampling_threshold=0.0)
 ANGLES = (0.4, -0.7)
+POSES = "canonical_to_posed"
 
 
 def make_network(random: torch.Generator) -> RadianceNetwork:
@@ -43,8 +46,8 @@ def make_scene():
     directions = torch.nn.functional.normalize(targets - origins, dim=-1)
     rays = Rays(origins, directions, frame, torch.rand(300, generator=random))
     volume = SamplingVolume(warps, torch.ones(8, 4, 4, dtype=torch.uint8), BOUNDS_M)
-    blended = skin.blend(torch.stack([bend(angle + 0.01) for angle in ANGLES])).requires_grad_()
-    return rays, volume, make_network(random), BatchSkinning(skin, blended, frame)
+    matrices = torch.stack([bend(angle + 0.01) for angle in ANGLES]).requires_grad_()
+    return rays, volume, make_network(random), BatchSkinning(skin, matrices, frame)
 
 
 def with_gate(network: RadianceNetwork) -> RadianceNetwork:
@@ -55,7 +58,7 @@ def with_gate(network: RadianceNetwork) -> RadianceNetwork:
 def leaves(network: RadianceNetwork, skinning: BatchSkinning) -> dict[str, torch.Tensor]:
     names = ("hidden", "output", "bias", *(["gate"] if network.gate is not None else []))
     named = {name: getattr(network, name) for name in names}
-    return named | {"blended": skinning.blended}
+    return named | {POSES: skinning.canonical_to_posed}
 
 
 @pytest.mark.parametrize(("newton", "gated"), [(True, False), (False, False), (True, True)])
@@ -76,7 +79,7 @@ def test_values_and_gradients_match_reference(newton: bool, gated: bool) -> None
         torch.testing.assert_close(ours, theirs, atol=2e-5, rtol=0)
     random = torch.Generator().manual_seed(3)
     to_image, to_alpha = torch.randn(300, 3, generator=random), torch.randn(300, generator=random)
-    parameters = {name: leaf for name, leaf in leaves(network, skinning).items() if newton or name != "blended"}
+    parameters = {name: leaf for name, leaf in leaves(network, skinning).items() if newton or name != POSES}
     gradients = []
     for result, extra in ((fused, []), (expected, [network.table])):
         loss = (result.image * to_image).sum() + (result.alpha * to_alpha).sum() + result.density_per_m.sum()
@@ -96,3 +99,33 @@ def test_max_samples_limits_each_ray() -> None:
     expected = reference.render_rays(rays, volume, network, None, torch.zeros(0, 3), settings)
     assert len(fused.weight) == len(expected.weight) <= 3 * len(rays.frame_index)
     torch.testing.assert_close(fused.image, expected.image, atol=2e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize(("newton", "gated"), [(True, True), (False, False)])
+def test_gradients_without_autograd_are_the_same(newton: bool, gated: bool) -> None:
+    """The second call uses the buffers of the first, which must not change its result."""
+    rays, volume, network, skinning = make_scene()
+    network, used = with_gate(network) if gated else network, skinning if newton else None
+    points_m = torch.tensor([[0.1, 0.02, 0.0], [-0.3, 0.0, 0.05]])
+    random, features = torch.Generator().manual_seed(3), FeatureGradients()
+    slopes = torch.randn(300, 3, generator=random), torch.randn(300, generator=random), torch.ones(2)
+    expected = render_rays_fused(rays, volume, network, used, points_m, RenderSettings(0.02, 160), features)
+    loss = sum((value * slope).sum() for value, slope in zip(expected[:3], slopes, strict=True))
+    parameters = {name: leaf for name, leaf in leaves(network, skinning).items() if newton or name != POSES}
+    by_autograd = dict(zip(parameters, torch.autograd.grad(loss, list(parameters.values())), strict=True))
+    of_output = OutputGradients(*(slope.numpy() for slope in slopes))
+    other_rays = rays._replace(jitter=1 - rays.jitter)
+    results = [
+        render_rays_with_gradients(
+            drawn, volume, network, used, points_m, RenderSettings(0.02, 160), lambda *_: of_output
+        )
+        for drawn in (rays, other_rays) * 2
+    ]
+    assert not torch.equal(results[1][0].weight, expected.weight)
+    for output, gradients, found_features in results[::2]:
+        for name, value in expected._asdict().items():
+            assert torch.equal(getattr(output, name), value), name
+        found = {name: value for name, value in gradients._asdict().items() if value is not None}
+        assert found.keys() == by_autograd.keys()
+        assert all(torch.equal(found[name], value) for name, value in by_autograd.items())
+        assert all(torch.equal(a, b) for a, b in zip(found_features[0], features[0], strict=True))

@@ -155,44 +155,42 @@ def add_table_gradient(points, gradient, grad_table, lanes):
 
 
 @njit(**NJIT_OPTIONS)
-def _point_gradient_block(points, table, lanes, level, gradient, grad_points, start, stop):
+def point_gradient_block(points, table, lanes, level, gradient, grad_points, start, stop):
+    """Add the contribution of one level to dL/dpoints of the points start..stop, at most BLOCK."""
     level_params = table.level_params
     column = level * len(lanes)
-    rows = np.empty((8, BLOCK), np.uint32)
-    fractions = np.empty((3, BLOCK), np.float32)
+    rows, fractions = np.empty((8, BLOCK), np.uint32), np.empty((3, BLOCK), np.float32)
     buffers = CornerBuffers(rows, np.empty((8, BLOCK), np.float32), fractions)
     first = _fill_corners(points, start, stop, level_params[level], buffers)
     values = table.values[first:]
-    dots = np.empty(8, np.float32)
+    cells_x, cells_y, cells_z = (
+        np.float32(level_params[level, 0]),
+        np.float32(level_params[level, 1]),
+        np.float32(level_params[level, 2]),
+    )
+    # One element for each feature, so that the loops over features have no sum across elements.
+    slopes = np.empty((3, len(lanes)), np.float32)
     for k in range(stop - start):
-        for corner in range(8):
-            row, total = rows[corner, k], np.float32(0)
-            for f in range(len(lanes)):
-                total += values[row, f] * gradient[start + k, column + f]
-            dots[corner] = total
+        r0, r1, r2, r3 = rows[0, k], rows[1, k], rows[2, k], rows[3, k]
+        r4, r5, r6, r7 = rows[4, k], rows[5, k], rows[6, k], rows[7, k]
         u, v, w = fractions[0, k], fractions[1, k], fractions[2, k]
-        u0, v0, w0 = np.float32(1) - u, np.float32(1) - v, np.float32(1) - w
-        along_x = (
-            v0 * w0 * (dots[1] - dots[0])
-            + v * w0 * (dots[3] - dots[2])
-            + v0 * w * (dots[5] - dots[4])
-            + v * w * (dots[7] - dots[6])
-        )
-        along_y = (
-            u0 * w0 * (dots[2] - dots[0])
-            + u * w0 * (dots[3] - dots[1])
-            + u0 * w * (dots[6] - dots[4])
-            + u * w * (dots[7] - dots[5])
-        )
-        along_z = (
-            u0 * v0 * (dots[4] - dots[0])
-            + u * v0 * (dots[5] - dots[1])
-            + u0 * v * (dots[6] - dots[2])
-            + u * v * (dots[7] - dots[3])
-        )
-        grad_points[start + k, 0] += along_x * np.float32(level_params[level, 0])
-        grad_points[start + k, 1] += along_y * np.float32(level_params[level, 1])
-        grad_points[start + k, 2] += along_z * np.float32(level_params[level, 2])
+        for f in range(len(lanes)):
+            d0, d1 = values[r1, f] - values[r0, f], values[r3, f] - values[r2, f]
+            d2, d3 = values[r5, f] - values[r4, f], values[r7, f] - values[r6, f]
+            a0, a1 = values[r0, f] + u * d0, values[r2, f] + u * d1
+            a2, a3 = values[r4, f] + u * d2, values[r6, f] + u * d3
+            b0, b1 = a1 - a0, a3 - a2
+            e0, e1 = d0 + v * (d1 - d0), d2 + v * (d3 - d2)
+            g = gradient[start + k, column + f]
+            slopes[0, f] = g * (e0 + w * (e1 - e0))
+            slopes[1, f] = g * (b0 + w * (b1 - b0))
+            slopes[2, f] = g * ((a2 + v * b1) - (a0 + v * b0))
+        along_x = along_y = along_z = np.float32(0)
+        for f in range(len(lanes)):
+            along_x, along_y, along_z = along_x + slopes[0, f], along_y + slopes[1, f], along_z + slopes[2, f]
+        grad_points[start + k, 0] += along_x * cells_x
+        grad_points[start + k, 1] += along_y * cells_y
+        grad_points[start + k, 2] += along_z * cells_z
 
 
 @njit(parallel=True, **NJIT_OPTIONS)
@@ -203,4 +201,4 @@ def add_points_gradient(points, table, lanes, gradient, grad_points):
         for block in prange((count + BLOCK - 1) // BLOCK):
             start = block * BLOCK
             stop = min(start + BLOCK, count)
-            _point_gradient_block(points, table, lanes, level, gradient, grad_points, start, stop)
+            point_gradient_block(points, table, lanes, level, gradient, grad_points, start, stop)

@@ -20,7 +20,8 @@ from torch import Tensor
 from pipeline.kernels.blend import SparseWeights, blend
 from pipeline.kernels.common.dispatch import runs_on_numba
 from pipeline.kernels.common.packing import segment_ids_from_counts
-from pipeline.kernels.inverse_skinning import cpu, newton_cpu, reference
+from pipeline.kernels.inverse_skinning import cell_skinning_cpu, cpu, newton_cpu, reference
+from pipeline.kernels.inverse_skinning.cell_skinning_cpu import CellWeights
 from pipeline.kernels.inverse_skinning.cpu import PosedGrid, SkinArrays
 from pipeline.kernels.inverse_skinning.newton_cpu import LatticeArrays
 from pipeline.kernels.inverse_skinning.reference import Lattice
@@ -66,6 +67,13 @@ class SkinGrid:
     def sparse_weights(self) -> SparseWeights:
         """The nonzero weights: a node has two or three joints."""
         return SparseWeights.from_dense(self.weights)
+
+    @cached_property
+    def cell_weights(self) -> CellWeights:
+        """The nonzero weights by cell, for the compiled loops; the grid is on the CPU."""
+        node_weights, row_of_node = (tensor.numpy() for tensor in self.sparse_weights), self.row_of_node.numpy()
+        cells = cell_skinning_cpu.weights_by_cell(row_of_node, *node_weights, self.weights.shape[1])
+        return CellWeights(self.origin_m.numpy(), np.float32(self.cell_m), *cells)
 
     def crop_to_occupied(self, occupied: UInt8[Tensor, "ox oy oz"], bounds_m: Float[Tensor, "2 3"]) -> "SkinGrid":
         """Return the grid with only the nodes that some point of an occupied cell is interpolated from.

@@ -40,6 +40,6 @@ def march(rays: Rays, volume: SamplingVolume, step_m: float, max_samples: int = 
         return Samples(*reference.march(rays, volume, step_m, max_samples))
     ray_arrays = RayArrays(*(tensor.contiguous().numpy() for tensor in rays))
     points, distance, ray_offsets = cpu.march(
-        ray_arrays, np.float32(step_m), volume.warps.arrays(), volume.occupancy_arrays(), max_samples
+        ray_arrays, np.float32(step_m), volume.warps.arrays, volume.occupancy_arrays, max_samples
     )
     return Samples(torch.from_numpy(points), torch.from_numpy(distance), torch.from_numpy(ray_offsets))

@@ -6,7 +6,6 @@ import numpy as np
 from numba import njit, prange
 
 from pipeline.kernels.common.numba_options import NJIT_OPTIONS
-from pipeline.kernels.inverse_skinning.newton_cpu import apply_affine
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
 _MAX_DISTANCE_M = np.float32(1e9)
@@ -60,6 +59,15 @@ class SampleArrays(NamedTuple):
     ray_indices: np.ndarray
 
 
+class RayProgress(NamedTuple):
+    """State of all rays (n): distance of the box, steps in it, next step, samples that are still allowed."""
+
+    near: np.ndarray
+    step_count: np.ndarray
+    step_index: np.ndarray
+    samples_left: np.ndarray
+
+
 @njit(**NJIT_OPTIONS)
 def _slab(origin, direction, low, high, near, far):
     """Clip the interval [near, far] of a ray to the space between two planes of one axis."""
@@ -67,30 +75,6 @@ def _slab(origin, direction, low, high, near, far):
         return (near, far) if low <= origin <= high else (near, near - _ONE)
     a, b = (low - origin) / direction, (high - origin) / direction
     return max(near, min(a, b)), min(far, max(a, b))
-
-
-@njit(**NJIT_OPTIONS)
-def _is_occupied(x, y, z, occupancy):
-    occupied, low, cells_per_m = occupancy
-    i = int(np.floor((x - low[0]) * cells_per_m[0]))
-    j = int(np.floor((y - low[1]) * cells_per_m[1]))
-    k = int(np.floor((z - low[2]) * cells_per_m[2]))
-    inside = 0 <= i < occupied.shape[0] and 0 <= j < occupied.shape[1] and 0 <= k < occupied.shape[2]
-    return inside and occupied[i, j, k] != 0
-
-
-@njit(**NJIT_OPTIONS)
-def _interpolate(nodes, first, dims, cell, fractions):
-    """Interpolate the canonical positions at the corners of a posed cell trilinearly."""
-    i, j, k = cell
-    u, v, w = fractions
-    x = y = z = _ZERO
-    for corner in range(8):
-        a, b, c = corner & 1, (corner >> 1) & 1, corner >> 2
-        weight = (u if a == 1 else _ONE - u) * (v if b == 1 else _ONE - v) * (w if c == 1 else _ONE - w)
-        node = nodes[first + ((i + a) * dims[1] + j + b) * dims[2] + k + c]
-        x, y, z = x + weight * node[0], y + weight * node[1], z + weight * node[2]
-    return x, y, z
 
 
 @njit(**NJIT_OPTIONS)
@@ -108,44 +92,81 @@ def intersect_box(ray, inputs):
 
 
 @njit(**NJIT_OPTIONS)
-def advance_ray(ray, steps, inputs, samples, count, target_count, max_count):
-    """Append samples of a ray until there are `target_count` samples of all rays, but no more than `max_count`.
+def advance_rays(active, progress, target_counts, inputs, samples, count):
+    """Append samples of the rays `active`, of each at least `target_counts` if it has them; return their number.
 
-    steps: (distance of the box, index of the next step, number of steps). count: number of samples so far.
-    Returns the number of samples and the index of the next step.
+    A posed cell with several inverses may add more, up to the samples that the ray has left. count: samples so far.
     """
-    near, step_index, step_count = steps
+    near, step_count, step_index, samples_left = progress
     rays, step, warps, occupancy = inputs
     canonical, distance, ray_indices = samples
-    f, jitter, cell, dims = rays.frame_index[ray], rays.jitter[ray], warps.cell, warps.dims[rays.frame_index[ray]]
-    ox, oy, oz = rays.origins[ray, 0], rays.origins[ray, 1], rays.origins[ray, 2]
-    dx, dy, dz = rays.directions[ray, 0], rays.directions[ray, 1], rays.directions[ray, 2]
-    gx, gy, gz = warps.origin[f, 0], warps.origin[f, 1], warps.origin[f, 2]
-    nx, ny, nz = dims[0], dims[1], dims[2]
-    node_first, code_first, map_first = warps.offsets[f, 0], warps.offsets[f, 1], warps.offsets[f, 2]
-    nodes, cell_codes, affine_maps = warps.canonical, warps.cell_codes, warps.affine_maps
-    inverse = _ONE / cell
-    while step_index < step_count and count < target_count:
-        t = near + (np.float32(step_index) + jitter) * step
-        step_index += 1
-        px, py, pz = (ox + t * dx - gx) * inverse, (oy + t * dy - gy) * inverse, (oz + t * dz - gz) * inverse
-        i, j, k = min(max(int(px), 0), nx - 2), min(max(int(py), 0), ny - 2), min(max(int(pz), 0), nz - 2)
-        code = cell_codes[code_first + (i * (ny - 1) + j) * (nz - 1) + k]
-        if code < 0:
-            continue
-        candidates = 1 if code == 0 else 1 + (code - 1) % CANDIDATES
-        for candidate in range(candidates):
-            if code == 0:
-                u, v, w = px - np.float32(i), py - np.float32(j), pz - np.float32(k)
-                x, y, z = _interpolate(nodes, node_first, dims, (i, j, k), (u, v, w))
-            else:
-                m = affine_maps[map_first + (code - 1) // CANDIDATES + candidate]
-                x, y, z = apply_affine(m, px * cell + gx, py * cell + gy, pz * cell + gz)
-            if count < max_count and _is_occupied(x, y, z, occupancy):
-                canonical[count, 0], canonical[count, 1], canonical[count, 2] = x, y, z
-                distance[count], ray_indices[count] = t, ray
-                count += 1
-    return count, step_index
+    # Arrays are taken out of their tuples, and the inner loop calls nothing: a call passes ten numbers for each array.
+    origins, directions, frame_index, jitters = rays
+    cell, box_low, box_dims, offsets, nodes, cell_codes, affine_maps = warps
+    occupied, low, cells_per_m = occupancy
+    low_x, low_y, low_z = low[0], low[1], low[2]
+    scale_x, scale_y, scale_z = cells_per_m[0], cells_per_m[1], cells_per_m[2]
+    size_x, size_y, size_z = occupied.shape
+    limit_x, limit_y, limit_z = np.float32(size_x), np.float32(size_y), np.float32(size_z)
+    inverse, one = _ONE / cell, np.uint64(1)
+    for index in range(len(active)):
+        ray = active[index]
+        f, jitter, ray_near, last_step = frame_index[ray], jitters[ray], near[ray], step_count[ray]
+        first, target_count, max_count = count, count + target_counts[index], count + samples_left[ray]
+        ox, oy, oz = origins[ray, 0], origins[ray, 1], origins[ray, 2]
+        dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
+        gx, gy, gz = box_low[f, 0], box_low[f, 1], box_low[f, 2]
+        nx, ny, nz = box_dims[f, 0], box_dims[f, 1], box_dims[f, 2]
+        node_first, code_first, map_first = offsets[f, 0], offsets[f, 1], offsets[f, 2]
+        ray_step = step_index[ray]
+        while ray_step < last_step and count < target_count:
+            t = ray_near + (np.float32(ray_step) + jitter) * step
+            ray_step += 1
+            px, py, pz = (ox + t * dx - gx) * inverse, (oy + t * dy - gy) * inverse, (oz + t * dz - gz) * inverse
+            i, j, k = min(max(int(px), 0), nx - 2), min(max(int(py), 0), ny - 2), min(max(int(pz), 0), nz - 2)
+            code = cell_codes[np.uint64(code_first + (i * (ny - 1) + j) * (nz - 1) + k)]
+            if code < 0:
+                continue
+            candidates = 1 if code == 0 else 1 + (code - 1) % CANDIDATES
+            for candidate in range(candidates):
+                if code == 0:
+                    u, v, w = px - np.float32(i), py - np.float32(j), pz - np.float32(k)
+                    # Trilinear, along z first: the two nodes are neighbours in memory.
+                    # Unsigned, so that no index is tested for being negative.
+                    n00 = np.uint64(node_first + (i * ny + j) * nz + k)
+                    n01, n10 = n00 + np.uint64(nz), n00 + np.uint64(ny * nz)
+                    n11 = n10 + np.uint64(nz)
+                    a, b, c, d = nodes[n00, 0], nodes[n01, 0], nodes[n10, 0], nodes[n11, 0]
+                    a, b = a + w * (nodes[n00 + one, 0] - a), b + w * (nodes[n01 + one, 0] - b)
+                    c, d = c + w * (nodes[n10 + one, 0] - c), d + w * (nodes[n11 + one, 0] - d)
+                    a, c = a + v * (b - a), c + v * (d - c)
+                    x = a + u * (c - a)
+                    a, b, c, d = nodes[n00, 1], nodes[n01, 1], nodes[n10, 1], nodes[n11, 1]
+                    a, b = a + w * (nodes[n00 + one, 1] - a), b + w * (nodes[n01 + one, 1] - b)
+                    c, d = c + w * (nodes[n10 + one, 1] - c), d + w * (nodes[n11 + one, 1] - d)
+                    a, c = a + v * (b - a), c + v * (d - c)
+                    y = a + u * (c - a)
+                    a, b, c, d = nodes[n00, 2], nodes[n01, 2], nodes[n10, 2], nodes[n11, 2]
+                    a, b = a + w * (nodes[n00 + one, 2] - a), b + w * (nodes[n01 + one, 2] - b)
+                    c, d = c + w * (nodes[n10 + one, 2] - c), d + w * (nodes[n11 + one, 2] - d)
+                    a, c = a + v * (b - a), c + v * (d - c)
+                    z = a + u * (c - a)
+                else:
+                    m = map_first + (code - 1) // CANDIDATES + candidate
+                    qx, qy, qz = px * cell + gx, py * cell + gy, pz * cell + gz
+                    x = affine_maps[m, 0] * qx + affine_maps[m, 1] * qy + affine_maps[m, 2] * qz + affine_maps[m, 3]
+                    y = affine_maps[m, 4] * qx + affine_maps[m, 5] * qy + affine_maps[m, 6] * qz + affine_maps[m, 7]
+                    z = affine_maps[m, 8] * qx + affine_maps[m, 9] * qy + affine_maps[m, 10] * qz + affine_maps[m, 11]
+                cx, cy, cz = (x - low_x) * scale_x, (y - low_y) * scale_y, (z - low_z) * scale_z
+                # False for NaN, too.
+                inside = _ZERO <= cx < limit_x and _ZERO <= cy < limit_y and _ZERO <= cz < limit_z
+                if inside and count < max_count and occupied[int(cx), int(cy), int(cz)] != 0:
+                    canonical[count, 0], canonical[count, 1], canonical[count, 2] = x, y, z
+                    distance[count], ray_indices[count] = t, ray
+                    count += 1
+        step_index[ray] = ray_step
+        samples_left[ray] -= count - first
+    return count
 
 
 @njit(parallel=True, **NJIT_OPTIONS)
@@ -154,14 +175,16 @@ def march(rays, step, warps, occupancy, max_samples):
     ray_count = rays.origins.shape[0]
     capacity = ray_count * max_samples
     canonical, distance = np.empty((capacity, 3), np.float32), np.empty(capacity, np.float32)
-    samples = SampleArrays(canonical, distance, np.empty(capacity, np.int32))
-    counts = np.zeros(ray_count, np.int64)
+    ray_indices, counts = np.empty(capacity, np.int32), np.zeros(ray_count, np.int64)
+    near, step_count = np.empty(ray_count, np.float32), np.empty(ray_count, np.int64)
+    step_index, samples_left = np.zeros(ray_count, np.int64), np.full(ray_count, max_samples)
+    all_rays, target_counts = np.arange(ray_count), np.full(1, max_samples)
     for ray in prange(ray_count):
         first, inputs = ray * max_samples, MarchArrays(rays, step, warps, occupancy)
-        near, step_count = intersect_box(ray, inputs)
-        last, _ = advance_ray(
-            ray, (near, 0, step_count), inputs, samples, first, first + max_samples, first + max_samples
-        )
+        near[ray], step_count[ray] = intersect_box(ray, inputs)
+        progress = RayProgress(near, step_count, step_index, samples_left)
+        samples = SampleArrays(canonical, distance, ray_indices)
+        last = advance_rays(all_rays[ray : ray + 1], progress, target_counts, inputs, samples, first)
         counts[ray] = last - first
     return _pack(canonical, distance, counts, max_samples)
 

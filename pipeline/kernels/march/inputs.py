@@ -5,6 +5,7 @@ Notation: n rays, k frames.
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -79,8 +80,9 @@ class PackedWarpGrids:
         """Return the grids on another device."""
         return PackedWarpGrids(self.cell_m, *(tensor.to(device) for tensor in self.tensors()))
 
+    @cached_property
     def arrays(self) -> WarpArrays:
-        """Return the grids for the compiled loops; they are on the CPU."""
+        """The grids for the compiled loops; they are on the CPU."""
         return WarpArrays(np.float32(self.cell_m), *(tensor.contiguous().numpy() for tensor in self.tensors()))
 
 
@@ -95,8 +97,9 @@ class SamplingVolume:
     occupied: UInt8[Tensor, "gx gy gz"]
     bounds_m: Float[Tensor, "2 3"]
 
+    @cached_property
     def occupancy_arrays(self) -> OccupancyArrays:
-        """Return the occupancy grid for the compiled loops; it is on the CPU."""
+        """The occupancy grid for the compiled loops; it is on the CPU."""
         low_m, high_m = self.bounds_m
         cells_per_m = torch.tensor(self.occupied.shape) / (high_m - low_m)
         return OccupancyArrays(*(tensor.contiguous().numpy() for tensor in (self.occupied, low_m, cells_per_m)))

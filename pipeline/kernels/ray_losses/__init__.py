@@ -1,6 +1,6 @@
 """Losses of rendered rays (IHM, Wang et al. 2025, section 2.4) as one operation."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -9,6 +9,18 @@ from torch import Tensor
 
 from pipeline.kernels.common.dispatch import runs_on_numba
 from pipeline.kernels.ray_losses import cpu, reference
+from pipeline.kernels.ray_losses.cpu import LossInputs
+
+__all__ = ["LossInputs", "RayLossGradients", "ray_loss_gradients", "ray_losses"]
+
+
+class RayLossGradients(NamedTuple):
+    """Means of the three losses, colour errors, and the gradients of the weighted sum of the means."""
+
+    means: Float[np.ndarray, "3"]
+    error: Float[np.ndarray, "n 3"]
+    grad_image: Float[np.ndarray, "n 3"]
+    grad_alpha: Float[np.ndarray, "n"]
 
 
 class _RayLosses(torch.autograd.Function):
@@ -16,24 +28,38 @@ class _RayLosses(torch.autograd.Function):
     def forward(
         ctx: Any, image: Tensor, alpha: Tensor, rgba: Tensor, background: Tensor, confidence: Tensor, delta: float
     ) -> tuple[Tensor, Tensor]:
-        rays = len(alpha)
-        sums, error = torch.empty(3), torch.empty(rays, 3)
-        gradients = cpu.GradientArrays(
-            np.empty((rays, 3), np.float32), np.empty((rays, 2), np.float32), np.empty(rays, np.float32)
-        )
-        inputs = cpu.LossInputs(*(tensor.detach().numpy() for tensor in (image, alpha, rgba, background, confidence)))
-        cpu.ray_losses(inputs, np.float32(delta), sums.numpy(), error.numpy(), gradients)
-        counts = torch.tensor([3.0 * rays, rays, rays])
-        ctx.kept = counts, gradients
-        ctx.mark_non_differentiable(error)
-        return sums / counts, error
+        arrays = (tensor.detach().numpy() for tensor in (image, alpha, rgba, background, confidence))
+        means, error, ctx.kept = _evaluate(LossInputs(*arrays), delta)
+        result = torch.from_numpy(error)
+        ctx.mark_non_differentiable(result)
+        return torch.from_numpy(means), result
 
     @staticmethod
     def backward(ctx: Any, grad_means: Tensor, _grad_error: Tensor) -> tuple[Tensor | None, ...]:
-        counts, (grad_image, grad_alpha, grad_hard) = ctx.kept
-        colour, alpha, hard = (grad_means / counts).numpy()
-        total = colour * grad_alpha[:, 0] + alpha * grad_alpha[:, 1] + hard * grad_hard
-        return torch.from_numpy(colour * grad_image), torch.from_numpy(total), None, None, None, None
+        grad_image, grad_alpha = _weighted_gradients(grad_means.numpy(), ctx.kept)
+        return torch.from_numpy(grad_image), torch.from_numpy(grad_alpha), None, None, None, None
+
+
+def _evaluate(inputs: LossInputs, delta: float) -> tuple[np.ndarray, np.ndarray, cpu.GradientArrays]:
+    """Return the means of the losses, the colour errors, and the gradients of the sums of the losses."""
+    rays = len(inputs.alpha)
+    sums, error = np.empty(3, np.float32), np.empty((rays, 3), np.float32)
+    gradients = cpu.GradientArrays(*(np.empty(shape, np.float32) for shape in ((rays, 3), (rays, 2), rays)))
+    cpu.ray_losses(inputs, np.float32(delta), sums, error, gradients)
+    return sums / np.array([3.0 * rays, rays, rays], np.float32), error, gradients
+
+
+def _weighted_gradients(weights: np.ndarray, of_sums: cpu.GradientArrays) -> tuple[np.ndarray, np.ndarray]:
+    """Return the gradients of the means of the losses with some weights (3), with respect to image and alpha."""
+    rays = len(of_sums.hard)
+    colour, alpha, hard = (weights / np.array([3.0 * rays, rays, rays], np.float32)).astype(np.float32)
+    return colour * of_sums.image, colour * of_sums.alpha[:, 0] + alpha * of_sums.alpha[:, 1] + hard * of_sums.hard
+
+
+def ray_loss_gradients(inputs: LossInputs, huber_delta: float, weights: tuple[float, ...]) -> RayLossGradients:
+    """Do `ray_losses` and its backward pass without autograd; `weights` of the three means."""
+    means, error, of_sums = _evaluate(inputs, huber_delta)
+    return RayLossGradients(means, error, *_weighted_gradients(np.array(weights, np.float32), of_sums))
 
 
 def ray_losses(

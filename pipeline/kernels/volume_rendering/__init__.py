@@ -7,21 +7,21 @@ a block of rays stays in the cache.
 Notation: n rays, k frames of a batch, s samples, p points, w features of a point, h hidden units.
 """
 
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pipeline.kernels.common.voxels import voxel_index
 from pipeline.kernels.hashgrid import FeatureGradients
-from pipeline.kernels.hashgrid import cpu as hashgrid_cpu
-from pipeline.kernels.inverse_skinning import newton_cpu
 from pipeline.kernels.march import Rays, SamplingVolume
 from pipeline.kernels.march.cpu import MarchArrays, RayArrays
 from pipeline.kernels.volume_rendering import backward_cpu, cpu
+from pipeline.kernels.volume_rendering.backward_cpu import OutputGradients, ParameterGradients
 from pipeline.kernels.volume_rendering.cpu import RenderArrays, SampleBuffers
 from pipeline.kernels.volume_rendering.inputs import (
     MIN_TRANSMITTANCE,
@@ -34,16 +34,27 @@ from pipeline.kernels.volume_rendering.inputs import (
 __all__ = [
     "MIN_TRANSMITTANCE",
     "BatchSkinning",
+    "OutputGradients",
     "RadianceNetwork",
+    "RenderGradients",
     "RenderOutput",
     "RenderSettings",
     "render_rays_fused",
+    "render_rays_with_gradients",
 ]
 
-MIN_GATE = 1e-6
-"""Smallest factor that a gradient is divided by."""
 INITIAL_SAMPLES_PER_RAY = 16
 """Mean number of samples of a ray that memory is first allocated for; doubled until it is sufficient."""
+
+
+class RenderGradients(NamedTuple):
+    """Gradients of the parameters; None for a gate or a skinning that there is not."""
+
+    hidden: Float[Tensor, "w h"]
+    output: Float[Tensor, "h 4"]
+    bias: Float[Tensor, "4"]
+    gate: Float[Tensor, "gx gy gz"] | None
+    canonical_to_posed: Float[Tensor, "k j 4 4"] | None
 
 
 def render_rays_fused(
@@ -57,28 +68,40 @@ def render_rays_fused(
 ) -> RenderOutput:
     """Render rays, and evaluate the density at additional canonical points.
 
-    float32 on the CPU. Differentiable in the weights and the gate of the network and in `skinning.blended`; the
-    backward pass appends the input of `add_table_gradient_` to `feature_gradients`.
+    float32 on the CPU. Differentiable in the weights and the gate of the network and in `skinning.canonical_to_posed`;
+    the backward pass appends the input of `add_table_gradient_` to `feature_gradients`.
 
     Args:
         rays: sorted by `skinning.batch_index`.
         skinning: None: no Newton step, samples stay where the warp grids put them.
         points_m: canonical points whose density is evaluated, in the box of the network.
     """
-    skinning = skinning or BatchSkinning.empty(len(rays.frame_index))
-    marched = MarchArrays(
-        RayArrays(*(tensor.contiguous().numpy() for tensor in rays)),
-        np.float32(settings.step_m),
-        volume.warps.arrays(),
-        volume.occupancy_arrays(),
-    )
-    inputs = RenderArrays(
-        marched, skinning.arrays(), network.arrays(), settings.max_samples, np.float32(settings.min_transmittance)
-    )
-    threshold = settings.gradient_subsampling_threshold
-    renderer = _Renderer(inputs, network, points_m.detach(), threshold, feature_gradients)
+    renderer = _renderer(rays, volume, network, skinning, points_m, settings)
+    matrices = skinning.canonical_to_posed if skinning else None
     weights = (network.hidden, network.output, network.bias, network.gate)
-    return RenderOutput(*_RenderRays.apply(*weights, skinning.blended.contiguous(), renderer))
+    return RenderOutput(*_RenderRays.apply(*weights, matrices, renderer, feature_gradients))
+
+
+def render_rays_with_gradients(
+    rays: Rays,
+    volume: SamplingVolume,
+    network: RadianceNetwork,
+    skinning: BatchSkinning | None,
+    points_m: Float[Tensor, "p 3"],
+    settings: RenderSettings,
+    output_gradients: Callable[[np.ndarray, np.ndarray, np.ndarray], OutputGradients],
+) -> tuple[RenderOutput, RenderGradients, FeatureGradients]:
+    """Do `render_rays_fused` and its backward pass without autograd, which costs as much as a third of the loops.
+
+    output_gradients: returns the gradients of a loss from image (n, 3), alpha (n) and density (p).
+    """
+    renderer = _renderer(rays, volume, network, skinning, points_m, settings)
+    rendered = renderer.forward_pass(_thread_buffers)
+    output = rendered.output()
+    of_output = output_gradients(*(tensor.numpy() for tensor in (output.image, output.alpha, output.density_per_m)))
+    gradients, features = renderer.backward_pass(rendered, of_output)
+    of_samples = {name: getattr(output, name).clone() for name in ("canonical_m", "transmittance", "weight")}
+    return output._replace(**of_samples), gradients, [features]
 
 
 class _RenderRays(torch.autograd.Function):
@@ -89,33 +112,41 @@ class _RenderRays(torch.autograd.Function):
         output: Tensor,
         bias: Tensor,
         gate: Tensor | None,
-        blended: Tensor,
+        matrices: Tensor | None,
         renderer: "_Renderer",
+        feature_gradients: FeatureGradients,
     ) -> RenderOutput:
-        samples, count, image, final_transmittance = renderer.forward_pass()
-        ctx.kept = renderer, samples, count, final_transmittance
-        ctx.save_for_backward(blended)
-        arrays = (samples.canonical, samples.transmittance, samples.weight)
-        sample_outputs = [torch.from_numpy(array[:count]) for array in arrays]
-        ctx.mark_non_differentiable(*sample_outputs)
-        density = torch.from_numpy(samples.density[count : count + len(renderer.points_m)].copy())
-        alpha = torch.from_numpy(1 - final_transmittance)
-        return RenderOutput(torch.from_numpy(image), alpha, density, *sample_outputs)
+        rendered = renderer.forward_pass(_allocate)
+        ctx.kept = renderer, rendered, feature_gradients
+        result = rendered.output()
+        ctx.mark_non_differentiable(result.canonical_m, result.transmittance, result.weight)
+        return result
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        (blended,) = ctx.saved_tensors
-        renderer, samples, count, final_transmittance = ctx.kept
-        grad_image, grad_alpha, grad_density = (gradient.contiguous().numpy() for gradient in gradients[:3])
-        rows = count + len(grad_density)
-        raw = np.zeros((rows, 4), np.float32)
-        step = renderer.inputs.march.step
-        backward_cpu.network_output_gradients(samples, count, step, final_transmittance, grad_image, grad_alpha, raw)
-        raw[count:, 3] = grad_density * samples.density[count:rows]
-        grad_blended = torch.zeros_like(blended)
-        grad_hidden, grad_output = renderer.backward_pass(samples, count, raw, grad_blended.numpy())
-        grad_bias, grad_gate = torch.from_numpy(raw.sum(0)), renderer.gate_gradient(samples, raw)
-        return torch.from_numpy(grad_hidden), torch.from_numpy(grad_output), grad_bias, grad_gate, grad_blended, None
+        renderer, rendered, feature_gradients = ctx.kept
+        output_gradients = OutputGradients(*(gradient.contiguous().numpy() for gradient in gradients[:3]))
+        by_parameter, of_features = renderer.backward_pass(rendered, output_gradients)
+        feature_gradients.append(of_features)
+        return (*by_parameter, None, None)
+
+
+@dataclass(frozen=True)
+class _Rendered:
+    """Result of a forward pass: `count` samples of rays, then `points` others; image (n, 3), transmittance (n)."""
+
+    samples: SampleBuffers
+    count: int
+    points: int
+    image: np.ndarray
+    final_transmittance: np.ndarray
+
+    def output(self) -> RenderOutput:
+        """Return the result as tensors."""
+        samples, last = self.samples, self.count + self.points
+        of_samples = (array[: self.count] for array in (samples.canonical, samples.transmittance, samples.weight))
+        of_rays = self.image, 1 - self.final_transmittance, samples.density[self.count : last].copy()
+        return RenderOutput(*(torch.from_numpy(array) for array in (*of_rays, *of_samples)))
 
 
 @dataclass(frozen=True)
@@ -123,79 +154,64 @@ class _Renderer:
     """Inputs of one call, with its forward and backward pass on arrays."""
 
     inputs: RenderArrays
-    network: RadianceNetwork
-    points_m: Tensor
+    points: np.ndarray
     gradient_subsampling_threshold: float
-    feature_gradients: FeatureGradients
 
-    def forward_pass(self) -> tuple[SampleBuffers, int, np.ndarray, np.ndarray]:
-        """Return the samples, followed by the points, the number of samples, image (n, 3), final transmittance (n)."""
-        inputs, bounds_m = self.inputs, self.network.bounds_m
+    def forward_pass(self, allocate: Callable[[int, int], SampleBuffers]) -> _Rendered:
+        """Render the rays, and evaluate the field at the further points; `allocate` as `_allocate`."""
+        inputs = self.inputs
         rays, width = len(inputs.march.rays.frame_index), len(inputs.field.network.hidden)
         capacity = INITIAL_SAMPLES_PER_RAY * rays + cpu.MAX_SAMPLES_PER_PASS
         count = -1
         while count < 0:
             image, final_transmittance = np.zeros((rays, 3), np.float32), np.ones(rays, np.float32)
-            samples = _allocate(capacity + len(self.points_m), width)
+            samples = allocate(capacity + len(self.points), width)
             count = cpu.render_rays_fused(inputs, samples, capacity, image, final_transmittance)
             capacity *= 2
-        last = count + len(self.points_m)
-        unit = (self.points_m - bounds_m[0]) / (bounds_m[1] - bounds_m[0])
-        samples.unit[count:last] = unit.numpy()
+        last, bounds = count + len(self.points), inputs.field.bounds
+        samples.unit[count:last] = (self.points - bounds[0]) / (bounds[1] - bounds[0])
         cpu.evaluate_field(count, last, inputs.field, samples)
-        return samples, count, image, final_transmittance
+        return _Rendered(samples, count, len(self.points), image, final_transmittance)
 
     def backward_pass(
-        self, samples: SampleBuffers, count: int, raw: np.ndarray, grad_blended: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the gradients of the weights from that of the network output (s, 4); add to `grad_blended`."""
-        _, table, lanes, network, _ = self.inputs.field
-        hidden, output = network.hidden, network.output
-        rows, scaled = backward_cpu.subsample_gradients(raw, self.gradient_subsampling_threshold)
-        grad_hidden, grad_output = np.zeros_like(hidden), np.zeros_like(output)
-        grad_features, positions = np.empty((len(rows), len(hidden)), np.float32), samples.unit[rows]
-        backward_cpu.network_gradients(
-            rows, scaled, samples.features, hidden, output, grad_hidden, grad_output, grad_features
+        self, rendered: _Rendered, output_gradients: OutputGradients
+    ) -> tuple[RenderGradients, tuple[Tensor, Tensor]]:
+        """Return the gradients of the parameters, and the positions and the gradients of the features."""
+        network, matrices, gate = self.inputs.field.network, self.inputs.skinning.matrices, self.inputs.field.gate
+        parameters = (network.hidden, network.output, network.bias, gate, matrices)
+        gradients = ParameterGradients(*(np.zeros(array.shape, np.float32) for array in parameters))
+        threshold, final_transmittance = self.gradient_subsampling_threshold, rendered.final_transmittance
+        features = backward_cpu.backward_pass(
+            self.inputs, rendered.samples, rendered.count, final_transmittance, threshold, output_gradients, gradients
         )
-        self.feature_gradients.append((torch.from_numpy(positions), torch.from_numpy(grad_features)))
-        ray_row_count = np.searchsorted(rows, count)
-        if len(grad_blended) and ray_row_count:
-            grad_unit = np.zeros((ray_row_count, 3), np.float32)
-            selected = positions[:ray_row_count], grad_features[:ray_row_count]
-            hashgrid_cpu.add_points_gradient(selected[0], table, lanes, selected[1], grad_unit)
-            self._add_pose_gradient(samples, rows[:ray_row_count], grad_unit, grad_blended)
-        return grad_hidden, grad_output
-
-    def gate_gradient(self, samples: SampleBuffers, raw: np.ndarray) -> Tensor | None:
-        """Return the gradient of the gate from that of the network output (s, 4).
-
-        The last column is that of the logarithm of the gated density, hence also that of the logarithm of the gate.
-        """
-        gate = self.network.gate
-        if gate is None:
-            return None
-        voxel = voxel_index(torch.from_numpy(samples.unit[: len(raw)]), tuple(gate.shape))
-        of_logarithm = torch.zeros(gate.numel()).index_add_(0, voxel, torch.from_numpy(raw[:, 3]))
-        return (of_logarithm / gate.detach().reshape(-1).clamp(min=MIN_GATE)).reshape(gate.shape)
-
-    def _add_pose_gradient(
-        self, samples: SampleBuffers, rows: np.ndarray, grad_unit: np.ndarray, grad_blended: np.ndarray
-    ) -> None:
-        """Add the gradient of the blended matrices, from that of some samples' positions in the unit box."""
-        skinning, bounds_m = self.inputs.skinning, self.network.bounds_m
-        batch_index = skinning.batch_index[samples.ray_indices[rows]]
-        # A block of rays advances in passes, so that the samples of two frames in one block alternate.
-        order = np.argsort(batch_index, kind="stable")
-        rows, grad_unit = rows[order], grad_unit[order]
-        frame_offsets = np.searchsorted(batch_index[order], np.arange(grad_blended.shape[1] + 1))
-        newton_cpu.add_pose_gradient(
-            samples.canonical[rows],
-            samples.inverse_jacobian[rows],
-            grad_unit / (bounds_m[1] - bounds_m[0]).numpy(),
-            frame_offsets,
-            skinning.lattice,
-            grad_blended,
+        hidden, output, bias, of_gate, of_matrices = (torch.from_numpy(array) for array in gradients)
+        of_poses = of_matrices.unflatten(2, (4, 4)) if len(matrices) else None
+        positions, grad_features = features
+        return (
+            RenderGradients(hidden, output, bias, of_gate if gate.size else None, of_poses),
+            (torch.from_numpy(positions), torch.from_numpy(grad_features)),
         )
+
+
+def _renderer(
+    rays: Rays,
+    volume: SamplingVolume,
+    network: RadianceNetwork,
+    skinning: BatchSkinning | None,
+    points_m: Float[Tensor, "p 3"],
+    settings: RenderSettings,
+) -> _Renderer:
+    skinning = skinning or BatchSkinning.empty(len(rays.frame_index))
+    marched = MarchArrays(
+        RayArrays(*(tensor.contiguous().numpy() for tensor in rays)),
+        np.float32(settings.step_m),
+        volume.warps.arrays,
+        volume.occupancy_arrays,
+    )
+    inputs = RenderArrays(
+        marched, skinning.arrays(), network.arrays, settings.max_samples, np.float32(settings.min_transmittance)
+    )
+    return _Renderer(inputs, points_m.detach().numpy(), settings.gradient_subsampling_threshold)
 
 
 def _allocate(rows: int, width: int) -> SampleBuffers:
@@ -203,3 +219,19 @@ def _allocate(rows: int, width: int) -> SampleBuffers:
     columns = (3, 0, 9, 3, width, 3, 0, 0, 0)
     arrays = (np.empty((rows, *([count] if count else [])), np.float32) for count in columns)
     return SampleBuffers(np.empty(rows, np.int32), *arrays)
+
+
+class _ThreadLocal(threading.local):
+    samples: SampleBuffers | None = None
+
+
+_THREAD_LOCAL = _ThreadLocal()
+
+
+def _thread_buffers(rows: int, width: int) -> SampleBuffers:
+    """Return buffers that the next call in the same thread returns again, if they suffice: new memory has to be mapped,
+    which takes as long as to fill it."""
+    samples = _THREAD_LOCAL.samples
+    if samples is None or len(samples.density) < rows or samples.features.shape[1] != width:
+        samples = _THREAD_LOCAL.samples = _allocate(rows, width)
+    return samples

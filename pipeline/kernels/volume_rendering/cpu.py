@@ -11,8 +11,8 @@ from numba import njit
 
 from pipeline.kernels.common.numba_options import NJIT_OPTIONS
 from pipeline.kernels.hashgrid.cpu import BLOCK, HashTable, encode_block
-from pipeline.kernels.inverse_skinning.newton_cpu import LatticeArrays, newton_step
-from pipeline.kernels.march.cpu import CANDIDATES, MarchArrays, SampleArrays, advance_ray, intersect_box
+from pipeline.kernels.inverse_skinning.cell_skinning_cpu import CellWeights, newton_steps
+from pipeline.kernels.march.cpu import CANDIDATES, MarchArrays, RayProgress, SampleArrays, advance_rays, intersect_box
 
 RAYS_PER_BLOCK = 128
 """Rays that advance together."""
@@ -23,11 +23,11 @@ _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
 class SkinningArrays(NamedTuple):
-    """Frame of the batch of each ray (n), and the skin grid with its blended matrices (m, k, 12); m = 0: no step."""
+    """Frame of the batch of each ray (n), skin weights, and matrices (k, j, 16) of the frames; k = 0: no step."""
 
     batch_index: np.ndarray
-    lattice: LatticeArrays
-    blended: np.ndarray
+    cells: CellWeights
+    matrices: np.ndarray
 
 
 class NetworkArrays(NamedTuple):
@@ -90,25 +90,26 @@ class _DecodeBuffers(NamedTuple):
 
 @njit(**NJIT_OPTIONS)
 def _refine_samples(first, last, inputs, samples):
-    """Do one Newton step for the samples first..last, if there is a skin grid; then map them to the unit box."""
+    """Do one Newton step for the samples first..last, if there are matrices; then map them to the unit box."""
     rays, bounds = inputs.march.rays, inputs.field.bounds
-    batch_index, lattice, blended = inputs.skinning
+    batch_index, cells, matrices = inputs.skinning
     # Arrays are taken out of their tuples before the loop: in the loop this would count references for each sample.
     origins, directions, ray_indices, distance = rays.origins, rays.directions, samples.ray_indices, samples.distance
-    canonical, unit, inverse_jacobian = samples.canonical, samples.unit, samples.inverse_jacobian
+    canonical, unit = samples.canonical, samples.unit
+    points = canonical
+    if len(matrices):
+        for s in range(first, last):
+            ray, t = ray_indices[s], distance[s]
+            unit[s, 0] = origins[ray, 0] + t * directions[ray, 0]
+            unit[s, 1] = origins[ray, 1] + t * directions[ray, 1]
+            unit[s, 2] = origins[ray, 2] + t * directions[ray, 2]
+        newton_steps(first, last, ray_indices, batch_index, matrices, cells, canonical, unit, samples.inverse_jacobian)
+        points = unit
     low_x, low_y, low_z = bounds[0, 0], bounds[0, 1], bounds[0, 2]
     scale_x, scale_y = _ONE / (bounds[1, 0] - low_x), _ONE / (bounds[1, 1] - low_y)
     scale_z = _ONE / (bounds[1, 2] - low_z)
     for s in range(first, last):
-        x, y, z = canonical[s, 0], canonical[s, 1], canonical[s, 2]
-        if len(blended):
-            ray, t = ray_indices[s], distance[s]
-            posed = (
-                origins[ray, 0] + t * directions[ray, 0],
-                origins[ray, 1] + t * directions[ray, 1],
-                origins[ray, 2] + t * directions[ray, 2],
-            )
-            x, y, z = newton_step(posed, (x, y, z), batch_index[ray], lattice, blended, inverse_jacobian[s])
+        x, y, z = points[s, 0], points[s, 1], points[s, 2]
         unit[s, 0], unit[s, 1], unit[s, 2] = (x - low_x) * scale_x, (y - low_y) * scale_y, (z - low_z) * scale_z
 
 
@@ -205,7 +206,9 @@ def render_rays_fused(inputs, samples, capacity, image, transmittance):
     rays, count, march, field = len(transmittance), 0, inputs.march, inputs.field
     marched = SampleArrays(samples.canonical, samples.distance, samples.ray_indices)
     near, step_count, step_index = np.empty(rays, np.float32), np.empty(rays, np.int64), np.zeros(rays, np.int64)
-    samples_left, active_rays = np.full(rays, inputs.max_samples), np.empty(RAYS_PER_BLOCK, np.int64)
+    samples_left = np.full(rays, inputs.max_samples)
+    progress = RayProgress(near, step_count, step_index, samples_left)
+    active_rays, target_counts = np.empty(RAYS_PER_BLOCK, np.int64), np.empty(RAYS_PER_BLOCK, np.int64)
     for block in range(0, rays, RAYS_PER_BLOCK):
         active_count = 0
         for ray in range(block, min(block + RAYS_PER_BLOCK, rays)):
@@ -218,11 +221,9 @@ def render_rays_fused(inputs, samples, capacity, image, transmittance):
             if first + MAX_SAMPLES_PER_PASS > capacity:
                 return -1
             for index in range(active_count):
-                ray, previous_count = active_rays[index], count
-                pass_samples = SAMPLES_PER_PASS if transmittance[ray] >= HALF_TRANSMITTANCE else 1
-                steps, max_count = (near[ray], step_index[ray], step_count[ray]), count + samples_left[ray]
-                count, step_index[ray] = advance_ray(ray, steps, march, marched, count, count + pass_samples, max_count)
-                samples_left[ray] -= count - previous_count
+                is_half_lit = transmittance[active_rays[index]] >= HALF_TRANSMITTANCE
+                target_counts[index] = SAMPLES_PER_PASS if is_half_lit else 1
+            count = advance_rays(active_rays[:active_count], progress, target_counts, march, marched, count)
             _refine_samples(first, count, inputs, samples)
             evaluate_field(first, count, field, samples)
             _composite(first, count, march.step, samples, image, transmittance)

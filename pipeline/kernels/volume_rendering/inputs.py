@@ -1,9 +1,10 @@
 """Inputs and output of the fused renderer.
 
-Notation: n rays, k frames of a batch, s samples, p points, w features of a point, h hidden units, m skin-grid nodes.
+Notation: n rays, k frames of a batch, s samples, p points, w features of a point, h hidden units, j joints.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -24,26 +25,26 @@ samples. The added variance of the gradient of a step is 1e-4 of its square (doc
 
 
 class BatchSkinning(NamedTuple):
-    """Skinning of a batch, for the Newton step: `blended` is `SkinGrid.blend` of its k frames.
+    """Skinning of the k frames of a batch, for the Newton step.
 
     batch_index: frame of the batch that each ray belongs to, in non-decreasing order.
     """
 
     skin: SkinGrid
-    blended: Float[Tensor, "m k 12"]
+    canonical_to_posed: Float[Tensor, "k j 4 4"]
     batch_index: Int[Tensor, "n"]
 
     @staticmethod
     def empty(rays: int) -> "BatchSkinning":
-        """Return a skinning without nodes: samples stay where the warp grids put them."""
+        """Return a skinning without frames: samples stay where the warp grids put them."""
         empty = torch.zeros(0, 3)
         empty_grid = SkinGrid(torch.zeros(3), 1.0, torch.zeros(0, 0, 0, dtype=torch.int32), empty, empty[:, 0], empty)
-        return BatchSkinning(empty_grid, torch.zeros(0, 1, 12), torch.zeros(rays, dtype=torch.int64))
+        return BatchSkinning(empty_grid, torch.zeros(0, 1, 4, 4), torch.zeros(rays, dtype=torch.int64))
 
     def arrays(self) -> SkinningArrays:
         """Return the skinning for the compiled loops."""
-        blended = self.blended.detach().contiguous().numpy()
-        return SkinningArrays(self.batch_index.contiguous().numpy(), self.skin.lattice_arrays(), blended)
+        matrices = self.canonical_to_posed.detach().contiguous().flatten(2).numpy()
+        return SkinningArrays(self.batch_index.contiguous().numpy(), self.skin.cell_weights, matrices)
 
 
 @dataclass(frozen=True)
@@ -65,8 +66,9 @@ class RadianceNetwork:
     exponent_limit: float
     gate: Float[Tensor, "gx gy gz"] | None = None
 
+    @cached_property
     def arrays(self) -> FieldArrays:
-        """Return the field for the compiled loops; it is on the CPU."""
+        """The field for the compiled loops; it is on the CPU."""
         network = NetworkArrays(
             self.hidden.detach().numpy(),
             self.output.detach().numpy(),

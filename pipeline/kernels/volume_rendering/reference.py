@@ -40,9 +40,10 @@ def _refine(rays: Rays, samples: Samples, skinning: BatchSkinning) -> Float[Tens
     """Do one Newton step for each sample."""
     ray = segment_ids_from_counts(samples.ray_offsets.diff())
     posed_m = rays.origins_m[ray] + samples.distance_m[:, None] * rays.directions[ray]
-    slots = torch.arange(skinning.blended.shape[1] + 1)
+    slots = torch.arange(len(skinning.canonical_to_posed) + 1)
     frame_offsets = samples.ray_offsets[torch.searchsorted(skinning.batch_index, slots)]
-    return newton_step(skinning.blended, samples.canonical_m, posed_m, frame_offsets, skinning.skin)
+    blended = skinning.skin.blend(skinning.canonical_to_posed)
+    return newton_step(blended, samples.canonical_m, posed_m, frame_offsets, skinning.skin)
 
 
 def _evaluate(
