@@ -16,7 +16,7 @@ from pipeline.body.fit.result import FitResult
 from pipeline.body.fit.state import FitState
 from tests.body.acting import SyntheticRecording, synthetic_recording
 
-FRAMES = 10
+FRAMES = 8
 
 
 class Killed(BaseException):
@@ -29,7 +29,7 @@ def scene() -> SyntheticRecording:
 
 
 def fit(scene: SyntheticRecording, checkpoint: Path | None = None) -> FitResult:
-    options = FitOptions(focal_relative_std=0.2, shared_frames=6, rounds=4, vertical_is_known=False)
+    options = FitOptions(focal_relative_std=0.2, shared_frames=6, rounds=3, vertical_is_known=False)
     return fit_body(load_anny(), scene.observations(scene.camera), scene.windows(), options, checkpoint=checkpoint)
 
 
