@@ -2,6 +2,7 @@
 
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -34,10 +35,10 @@ def load_detections(path: Path) -> Detections | None:
     if not path.exists():
         return None
     tensors, numbers = load_tensors(path)
-    arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
-    masks, ends = arrays.pop(MASKS).tobytes(), [0, *arrays.pop(MASK_ENDS).tolist()]
+    values: dict[str, Any] = {name: tensor.numpy() for name, tensor in tensors.items()} | numbers
+    masks, ends = values.pop(MASKS).tobytes(), [0, *values.pop(MASK_ENDS).tolist()]
     hands = {
-        name.removeprefix(HANDS_PREFIX): arrays.pop(name) for name in list(arrays) if name.startswith(HANDS_PREFIX)
+        name.removeprefix(HANDS_PREFIX): values.pop(name) for name in list(values) if name.startswith(HANDS_PREFIX)
     }
     masks_png = tuple(masks[start:end] for start, end in pairwise(ends))
-    return Detections(**arrays, hands=HandLandmarks(**hands), masks_png=masks_png, **numbers)
+    return Detections(**values, hands=HandLandmarks(**hands), masks_png=masks_png)
