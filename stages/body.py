@@ -34,7 +34,8 @@ from pipeline.body.fit.diagnostics import (
     suspicious_frames,
     usable_frames,
 )
-from pipeline.body.fit.fit import FitOptions, TooFewLandmarksError, fit_supplied_poses
+from pipeline.body.fit.fit import TooFewLandmarksError, fit_supplied_poses
+from pipeline.body.fit.options import FitOptions
 from pipeline.body.fit.rejection import fit_body_without_others
 from pipeline.body.fit.result import FitResult
 from pipeline.body.fit.silhouette_icp import MaskWindow, crop_mask_window

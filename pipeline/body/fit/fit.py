@@ -30,6 +30,13 @@ from pipeline.body.fit.initialisation import has_torso_landmarks, initial_state,
 from pipeline.body.fit.landmark_regressor import LandmarkRegressor, landmark_regressor
 from pipeline.body.fit.levenberg_marquardt import NormalEquations, minimise
 from pipeline.body.fit.linear_body import LinearBody, linearise_body, relaxed_curls_rad
+from pipeline.body.fit.options import (
+    FitOptions,
+    free_parameters,
+    landmark_parameters,
+    shared_parameters,
+    with_silhouettes,
+)
 from pipeline.body.fit.prior.posture import Posture, prior_of_recording
 from pipeline.body.fit.prior.priors import (
     PosePrior,
@@ -61,28 +68,6 @@ Matched silhouettes jitter by 0.06 to 0.1: more rounds do not end nearer to the 
 
 class TooFewLandmarksError(ValueError):
     """Too few frames have the landmarks that the initial state needs."""
-
-
-@dataclass(frozen=True)
-class FitOptions:
-    """What is known of person and camera, and the effort of the fit.
-
-    height_m: known stature; None: the prior of the settings.
-    focal_relative_std: standard deviation of the logarithm of the true focal length over the initial one; 0 fixes it.
-    principal_point_relative_std: standard deviation of the principal point about the initial one, in focal lengths; 0
-        fixes it.
-    shared_frames: number of frames for the shared parameters.
-    rounds: largest number of matchings of the silhouettes for the shared parameters.
-    vertical_is_known: whether +Y of the camera's world is up; otherwise the vertical is estimated.
-    """
-
-    height_m: float | None = None
-    focal_relative_std: float = FitSettings.initial_focal_std
-    principal_point_relative_std: float = 0.0
-    shared_frames: int = 48
-    rounds: int = 8
-    vertical_is_known: bool = True
-    settings: FitSettings = DEFAULT_SETTINGS
 
 
 @dataclass(frozen=True)
@@ -152,7 +137,7 @@ def fit_body(
         )
         progress = _fit_shared(context, observations, windows, start, options)
         save_progress(checkpoint, progress)
-    parameters = _shared_parameters(options)
+    parameters = shared_parameters(options)
     state, model, silhouette_iou = _fit_poses(context, observations, windows, progress, parameters, checkpoint)
     if evidence is not None:
         state, observations = align_with_gravity(model, state, observations, evidence, options.settings)
@@ -193,7 +178,7 @@ def fit_supplied_poses(
     observations, left_right_swapped = _correct_left_right_swaps(observations, rest_landmarks_m)
     left_right_swapped = {sides: rows & to_fit for sides, rows in left_right_swapped.items()}
     if to_fit.any():
-        parameters = _with_silhouettes(EnergyParameters.from_settings(settings), settings)
+        parameters = with_silhouettes(EnergyParameters.from_settings(settings), settings)
         state, _, _ = _fit_poses(context, observations, windows, FitProgress(state), parameters)
     if keep:
         state = supplied.overwrite_poses(state, model.full_joint_indices)
@@ -230,15 +215,6 @@ def _build_context(body: ParametricBody, curls_rad: Float[np.ndarray, "2 4"], se
     )
 
 
-def _with_silhouettes(parameters: EnergyParameters, settings: FitSettings) -> EnergyParameters:
-    """Return the parameters with less weight of the landmarks, whose errors are larger and correlated."""
-    return replace(
-        parameters,
-        landmark_std_m=settings.silhouette_landmark_std_m,
-        landmark_3d_std_m=settings.silhouette_landmark_3d_std_m,
-    )
-
-
 def _correct_left_right_swaps(
     observations: Observations, rest_landmarks_m: Float[Tensor, "l 3"]
 ) -> tuple[Observations, dict[str, Bool[np.ndarray, "n"]]]:
@@ -249,31 +225,6 @@ def _correct_left_right_swaps(
         left_right_swapped[limb] = detect_limb_swaps(observations, limb)
         observations = swap_limb_left_right(observations, left_right_swapped[limb], limb)
     return observations, left_right_swapped
-
-
-def _landmark_parameters(options: FitOptions) -> EnergyParameters:
-    """Return the parameters of the first fit to landmarks: intrinsics and landmark offsets are fixed."""
-    parameters = EnergyParameters.from_settings(options.settings)
-    if options.height_m is None:
-        return parameters
-    return replace(parameters, height_m=options.height_m, height_std_m=options.settings.known_stature_std_m)
-
-
-def _free_parameters(options: FitOptions) -> EnergyParameters:
-    """Return the parameters of the fit to landmarks in which all unknown shared parameters are free."""
-    parameters = replace(_landmark_parameters(options), free_landmark_offsets=True)
-    if options.focal_relative_std > 0.0:
-        parameters = replace(parameters, free_focal=True, log_focal_std=options.focal_relative_std)
-    if options.principal_point_relative_std > 0.0:
-        parameters = replace(
-            parameters, free_principal_point=True, principal_point_std=options.principal_point_relative_std
-        )
-    return parameters
-
-
-def _shared_parameters(options: FitOptions) -> EnergyParameters:
-    """Return the parameters of the fit to landmarks and silhouettes."""
-    return _with_silhouettes(_free_parameters(options), options.settings)
 
 
 def _fit_shared(
@@ -287,12 +238,12 @@ def _fit_shared(
     settings, time_s = options.settings, observations.time_s
     chosen = select_shared_frames(observations, windows, options.shared_frames)
     observations, windows, state = observations.select(chosen), [windows[row] for row in chosen], start.select(chosen)
-    parameters = _landmark_parameters(options)
+    parameters = landmark_parameters(options)
     state, _ = _fit_landmarks(context, context.default, observations, parameters, state, settings.landmark_steps)
-    parameters = _free_parameters(options)
+    parameters = free_parameters(options)
     model = context.linearise(state.shape)
     state, system = _fit_landmarks(context, model, observations, parameters, state, settings.landmark_steps)
-    parameters = _shared_parameters(options)
+    parameters = shared_parameters(options)
     posture: Posture | None = None
     for number in track(range(options.rounds), "shape and focal length"):
         model, before = context.linearise(state.shape), state

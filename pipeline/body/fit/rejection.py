@@ -14,7 +14,8 @@ from jaxtyping import Bool, Float
 
 from pipeline.body.body import ParametricBody
 from pipeline.body.fit.diagnostics import suspicious_frames, usable_frames
-from pipeline.body.fit.fit import FitOptions, fit_body
+from pipeline.body.fit.fit import fit_body
+from pipeline.body.fit.options import FitOptions
 from pipeline.body.fit.result import FitResult
 from pipeline.body.fit.silhouette_icp import MaskWindow
 from pipeline.body.fit.state import Observations

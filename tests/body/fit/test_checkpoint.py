@@ -10,7 +10,8 @@ import torch
 from pipeline.body.body import load_anny
 from pipeline.body.fit import fit as fit_module
 from pipeline.body.fit.checkpoint import FitProgress, load_progress, save_progress
-from pipeline.body.fit.fit import FitOptions, fit_body
+from pipeline.body.fit.fit import fit_body
+from pipeline.body.fit.options import FitOptions
 from pipeline.body.fit.prior.posture import Posture
 from pipeline.body.fit.result import FitResult
 from pipeline.body.fit.state import FitState
