@@ -34,7 +34,8 @@ from pipeline.body.fit.diagnostics import (
     suspicious_frames,
     usable_frames,
 )
-from pipeline.body.fit.fit import FitOptions, TooFewLandmarksError, fit_supplied_poses
+from pipeline.body.fit.fit import TooFewLandmarksError, fit_supplied_poses
+from pipeline.body.fit.options import FitOptions
 from pipeline.body.fit.rejection import fit_body_without_others
 from pipeline.body.fit.result import FitResult
 from pipeline.body.fit.silhouette_icp import MaskWindow, crop_mask_window
@@ -111,7 +112,7 @@ def run(
     capture = load_capture(inputs["frames"])
     windows = read_mask_windows(capture)
     hands = filter_hand_detections(capture.hands or undetected_hands(len(capture)), capture.landmarks_px)
-    result = fit_capture(capture, hands, windows, config, settings)
+    result = fit_capture(capture, hands, windows, config, settings, out)
     usable, training = usable_frames(result), capture.split == TRAIN
     motion = Motion(capture.frame_index, capture.time_s, result.rotations_wxyz, result.root_translation_m)
     legs = leg_profile(result.body, motion, result.camera, windows, training & usable)
@@ -183,10 +184,12 @@ def fit_capture(
     windows: Sequence[MaskWindow | None],
     config: Config,
     settings: FitSettings = DEFAULT_SETTINGS,
+    out: Path | None = None,
 ) -> FitResult:
     """Fit the body to a capture and check the quality of the fit.
 
-    hands: from `filter_hand_detections`. windows: of the masks, from `read_mask_windows`.
+    hands: from `filter_hand_detections`. windows: of the masks, from `read_mask_windows`. out: folder of the
+    checkpoints; None: none.
 
     Raises:
         UserError: too few landmarks, an unreadable model file, or a fit worse than the options allow.
@@ -211,7 +214,8 @@ def fit_capture(
     supplied = load_supplied_poses(capture, model, camera, focal_relative_std == 0.0, config)
     try:
         if supplied is None:
-            result = fit_body_without_others(model, observations, windows, options, finger_curls_rad(model, hands))
+            curls_rad = finger_curls_rad(model, hands)
+            result = fit_body_without_others(model, observations, windows, options, curls_rad, out)
         else:
             keep = config.supplied_poses == "keep"
             result = fit_supplied_poses(model, observations, windows, supplied, keep, settings)

@@ -13,6 +13,7 @@ from pipeline.capture import frame_selection as selection
 from pipeline.capture.capture import CONTACT_SHEET, FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, Capture, save_capture
 from pipeline.capture.contact_sheet import contact_sheet
 from pipeline.capture.detection import THUMBNAIL_SIDE_PX, Detections, detect_in_frames, write_frames
+from pipeline.capture.detection_checkpoint import load_detections, save_detections
 from pipeline.capture.disjoint_split import assign_disjoint_splits
 from pipeline.capture.exif_focal import metadata_focal_px
 from pipeline.capture.input_checks import assess_input, check_input
@@ -25,6 +26,7 @@ from pipeline.core.errors import UserError
 from pipeline.core.stage import Stage
 from pipeline.io.image import write_rgb
 
+CHECKPOINT = "checkpoint_detections.safetensors"
 _PEOPLE_COUNT_FRAMES = 6
 _CANDIDATES_PER_FRAME = 1.25
 """Frames in which the person is detected for each that is used: detections tell motion and duplicates better."""
@@ -67,9 +69,12 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
         raise UserError(f"{inputs['video']} has a split.json, which frames.split=disjoint would ignore; remove one")
     with start_worker_pool(config.workers) as workers:
         frame_indices, n_repeats = select_detection_frames(source, user_files, config)
-        detections = detect_in_frames(
-            source, user_files, frame_indices, _PEOPLE_COUNT_FRAMES, config.max_side_px, workers
-        )
+        detections = load_detections(out / CHECKPOINT)
+        if detections is None:
+            detections = detect_in_frames(
+                source, user_files, frame_indices, _PEOPLE_COUNT_FRAMES, config.max_side_px, workers
+            )
+            save_detections(out / CHECKPOINT, detections)
         check_input(detections, source.path, config.min_frames)
         noise = selection.estimate_noise_level(detections.gray_thumbnails)
         if user_files.split is None:

@@ -67,6 +67,8 @@ from pipeline.texture.settings import DEFAULT_SETTINGS, TextureSettings
 from pipeline.texture.specular import SpecularFit, fit_specular, texels_at_vertices
 from pipeline.texture.views import BakeView, crop_bake_view, vertex_view_cosine, weight_by_resolution
 
+LANDMARKS_CHECKPOINT, TEXELS_CHECKPOINT = "checkpoint_landmarks.npz", "checkpoint_texels.safetensors"
+
 NORMAL_MAP_DIVISOR, MIN_NORMAL_MAP_PX = 2, 64
 """Side of the normal map: half of that of the other maps. An edge of the dense mesh is two texels long or more."""
 
@@ -133,7 +135,7 @@ def run(
         again = rerun_command("frames", inputs["frames"])
         raise UserError(f"{inputs['frames']} has no training frames; run {again}")
     faces = FilmedFaces.of_capture(capture, positions[0], *load_poses(inputs, body))
-    registration = register_person(body, skinned, train, faces, FaceDetector, settings)
+    registration = register_person(body, skinned, train, faces, FaceDetector, settings, out / LANDMARKS_CHECKPOINT)
     atlas, size_px, on_template = build_atlas(skinned, body, train, registration, config, settings)
     cut = None if on_template is None else on_template.cut
     face_count = len(skinned.mesh.faces)
@@ -161,7 +163,7 @@ def run(
         for views, part in zip((train, validation), positions, strict=True)
     )
     inpaint = make_texel_inpainter(skinned.mesh, texels, template)
-    diffuse, texel_confidence = bake_diffuse(train, surface, inpaint, config.rounds, settings)
+    diffuse, texel_confidence = bake_diffuse(train, surface, inpaint, config.rounds, settings, out / TEXELS_CHECKPOINT)
     artifact = TextureArtifact(
         atlas,
         diffuse=diffuse,

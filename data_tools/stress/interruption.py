@@ -74,7 +74,9 @@ class KillLog:
         }
 
 
-def interruption_scores(captures: Path, folder: Path, kind: str, count: int = 1, seed: int = 0) -> dict[str, float]:
+def interruption_scores(
+    captures: Path, folder: Path, kind: str, count: int = 1, seed: int = 0, threads: int | None = None
+) -> dict[str, float]:
     """Interrupt runs of one capture, continue them, and compare their bytes with those of an undisturbed run.
 
     Args:
@@ -83,6 +85,7 @@ def interruption_scores(captures: Path, folder: Path, kind: str, count: int = 1,
         kind: "kills", "full disk" or "two runs".
         count: interruptions of the kinds that are not kills, which are one.
         seed: of the times of the kills: one at a random time in each stage, and `EXTRA_KILLS` in random stages.
+        threads: of all runs; None: as the environment says. It is set for this process, which runs nothing else.
 
     Returns:
         differing_files: files of the finished runs that differ from those of the undisturbed one, or are missing.
@@ -99,6 +102,8 @@ def interruption_scores(captures: Path, folder: Path, kind: str, count: int = 1,
         RuntimeError: an interrupted run did not end as it should.
     """
     video = make_capture(captures, CAPTURE, {}) / "video"
+    if threads is not None:
+        os.environ |= {name: str(threads) for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")}
     undisturbed = captures.parent / f"undisturbed-{os.environ.get('OMP_NUM_THREADS', 'all')}-threads"
     cpu_s = _run_undisturbed(undisturbed, video)
     folder.mkdir(parents=True, exist_ok=True)

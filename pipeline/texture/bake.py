@@ -11,6 +11,7 @@ optimization", 2014), and back-projects residuals, which also removes the blur o
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -22,6 +23,7 @@ from pipeline.core.progress import track
 from pipeline.geometry.atlas import Atlas, Texels
 from pipeline.geometry.camera import pixel_footprint_m, project
 from pipeline.geometry.texture_rendering import apply_shading, render_textured
+from pipeline.io.tensors import load_tensors, save_tensors
 from pipeline.kernels.common.thread_pool import shared_thread_pool
 from pipeline.kernels.raster import rasterize
 from pipeline.kernels.texel_projection import ImageView, ProjectedMesh, TexelPoints, project_texels
@@ -266,12 +268,55 @@ def render_textured_view(
     ).numpy()
 
 
+@dataclass(frozen=True)
+class InitialTexels:
+    """Where the rounds start.
+
+    Attributes:
+        colour: mean of the frames, inpainted where few frames show the texel.
+        confidence: of each texel, in [0, 1].
+        half_confidence_weight: weight sum of a texel of confidence 1/2.
+    """
+
+    colour: Float[Tensor, "t 3"]
+    confidence: Float[Tensor, "t"]
+    half_confidence_weight: float
+
+    def save(self, path: Path) -> None:
+        """Write the texels as a checkpoint."""
+        tensors = {"colour": self.colour, "confidence": self.confidence}
+        save_tensors(path, tensors, {"half_confidence_weight": self.half_confidence_weight})
+
+    @staticmethod
+    def load(path: Path) -> "InitialTexels":
+        """Read what `save` wrote; UserError if the file is damaged."""
+        tensors, numbers = load_tensors(path)
+        return InitialTexels(tensors["colour"].clone(), tensors["confidence"].clone(), **numbers)
+
+
+def mean_texels(
+    views: Sequence[BakeView], surface: TexturedSurface, inpaint: InpaintFunction, settings: TextureSettings
+) -> InitialTexels:
+    """Return the mean of the frames at each texel; see `bake_diffuse`."""
+    initial = average_views(track(views, "texture: initial mean"), surface, settings)
+    half_confidence_weight = (
+        HALF_CONFIDENCE_WEIGHT_RATIO * float(initial.weight[initial.weight > 0].median())
+        if bool(initial.weight.any())
+        else 1.0
+    )
+    confidence = weight_confidence(initial.weight, half_confidence_weight)
+    inpainted = torch.from_numpy(inpaint(initial.value().numpy(), confidence.numpy()))
+    colour = torch.lerp(inpainted, initial.value(), confidence[:, None]).clamp(0.0, 1.0)
+    return InitialTexels(colour, confidence, half_confidence_weight)
+
+
 def bake_diffuse(
     views: Sequence[BakeView],
     surface: TexturedSurface,
     inpaint: InpaintFunction,
     rounds: int,
     settings: TextureSettings,
+    checkpoint: Path | None = None,
 ) -> tuple[Float[np.ndarray, "s s 3"], Float[np.ndarray, "t"]]:
     """Bake the diffuse texture.
 
@@ -281,29 +326,28 @@ def bake_diffuse(
         inpaint: gives colours for all texels from the initial mean and its confidence; used where confidence is low.
         rounds: of alignment and residual back-projection; 0 returns the initial mean.
         settings: see `TextureSettings`.
+        checkpoint: file of the initial mean, from which an interrupted run of the same inputs continues; None: none.
 
     Returns:
         The texture (sRGB in [0, 1], gutters filled), and the confidence of every texel in [0, 1].
     """
-    initial = average_views(track(views, "texture: initial mean"), surface, settings)
-    half_confidence_weight = (
-        HALF_CONFIDENCE_WEIGHT_RATIO * float(initial.weight[initial.weight > 0].median())
-        if bool(initial.weight.any())
-        else 1.0
-    )
-    texel_confidence = weight_confidence(initial.weight, half_confidence_weight)
-    inpainted = torch.from_numpy(inpaint(initial.value().numpy(), texel_confidence.numpy()))
-    colour = torch.lerp(inpainted, initial.value(), texel_confidence[:, None]).clamp(0.0, 1.0)
+    if checkpoint is not None and checkpoint.exists():
+        initial = InitialTexels.load(checkpoint)
+    else:
+        initial = mean_texels(views, surface, inpaint, settings)
+        if checkpoint is not None:
+            initial.save(checkpoint)
+    colour = initial.colour
     parts = max(1, min(rounds, len(views) // MIN_ROUND_VIEWS))
     for number in range(rounds):
         texture = texels_to_texture(colour, surface.texels, is_final=False)
         label, part = f"texture: round {number + 1}/{rounds}", views[number % parts :: parts]
         mean_residual = average_residuals(texture, track(part, label, total=len(part)), surface, settings)
-        half = half_confidence_weight * len(part) / len(views)
+        half = initial.half_confidence_weight * len(part) / len(views)
         colour = (colour + weight_confidence(mean_residual.weight, half)[:, None] * mean_residual.value()).clamp(
             0.0, 1.0
         )
-    return texels_to_texture(colour, surface.texels), texel_confidence.numpy()
+    return texels_to_texture(colour, surface.texels), initial.confidence.numpy()
 
 
 def weight_confidence(weight: Float[Tensor, "t"], half_confidence_weight: float) -> Float[Tensor, "t"]:

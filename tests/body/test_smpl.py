@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from pipeline.body.body import Motion, ParametricBody, canonical_to_world, load_anny
-from pipeline.body.fit.fit import FitOptions, fit_body
+from pipeline.body.fit.fit import fit_body
 from pipeline.body.fit.landmark_regressor import LANDMARKS
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS, RELAXED_CURL_RAD, finger_curl_rotations, relaxed_curls_rad
+from pipeline.body.fit.options import FitOptions
 from pipeline.body.fit.prior.priors import shape_prior
 from pipeline.body.fit.result import FitResult
 from pipeline.body.smpl import ARM_DIRECTIONS, FINGER_BEND_RAD, JOINT_NAMES, SmplBody

@@ -1,6 +1,7 @@
 """The frames stage from folder to artifact: on drawn recordings with masks beside them, and on the real ones."""
 
 import json
+from unittest import mock
 
 import cv2
 import numpy as np
@@ -70,6 +71,20 @@ def test_duplicates_are_dropped_and_the_rest_is_thinned_out(tmp_path):
     assert (capture.frame_index % 2 == 0).all()
     assert capture.frame_index[0] == 0
     assert capture.frame_index[-1] == 78
+
+
+def test_a_resumed_stage_writes_the_files_of_an_uninterrupted_one(tmp_path, monkeypatch):
+    """Killed while the frames are written; the person is not detected again."""
+    video = draw_recording(tmp_path / "in")
+    expected = run(video, tmp_path / "whole")
+    with monkeypatch.context() as patch:
+        patch.setattr(frames, "write_frames", mock.Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            run(video, tmp_path / "killed")
+    monkeypatch.setattr(frames, "detect_in_frames", None)
+    assert frames.run({"video": video}, tmp_path / "killed", frames.Config(workers=1)) == expected
+    for path in (path for path in (tmp_path / "whole").rglob("*") if path.is_file()):
+        assert path.read_bytes() == (tmp_path / "killed" / path.relative_to(tmp_path / "whole")).read_bytes(), path
 
 
 def test_the_last_of_several_turns_is_held_out(tmp_path):

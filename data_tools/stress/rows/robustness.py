@@ -63,13 +63,15 @@ ROBUSTNESS_ROWS = (
     ),
     Row(
         name="interruption",
-        failure="kill -9 at 50 random times over all seven stages, a full disk, two runs on one folder",
+        failure="kill -9 at 50 random times over all seven stages, ten of them at two threads, a full disk, two runs "
+        "on one folder",
         line=f"the same bytes as without, nothing lost; a kill destroys at most {MAX_LOST_S:.0f} s of work of one core",
         trials=(
             *(
                 Trial(f"ten kills, seed {seed}", seed, {"kind": "kills", "seed": seed}, "interruption")
-                for seed in range(5)
+                for seed in range(4)
             ),
+            Trial("ten kills, two threads", 4, {"kind": "kills", "seed": 4, "threads": 2}, "interruption"),
             Trial("full disk", 5, {"kind": "full disk", "count": 1}, procedure="interruption"),
             Trial("two runs", 6, {"kind": "two runs", "count": 1}, procedure="interruption"),
         ),

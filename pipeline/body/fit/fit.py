@@ -7,6 +7,7 @@ parameters fixed. `fit_supplied_poses` keeps user-supplied shape and poses, or s
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from pipeline.body.body import ParametricBody
 from pipeline.body.fit.camera_parameters import apply_intrinsics_delta
+from pipeline.body.fit.checkpoint import FitProgress, load_progress, save_progress
 from pipeline.body.fit.detections.left_right_swaps import (
     LIMB_SWAP_PAIRS,
     detect_body_swaps,
@@ -28,6 +30,13 @@ from pipeline.body.fit.initialisation import has_torso_landmarks, initial_state,
 from pipeline.body.fit.landmark_regressor import LandmarkRegressor, landmark_regressor
 from pipeline.body.fit.levenberg_marquardt import NormalEquations, minimise
 from pipeline.body.fit.linear_body import LinearBody, linearise_body, relaxed_curls_rad
+from pipeline.body.fit.options import (
+    FitOptions,
+    free_parameters,
+    landmark_parameters,
+    shared_parameters,
+    with_silhouettes,
+)
 from pipeline.body.fit.prior.posture import Posture, prior_of_recording
 from pipeline.body.fit.prior.priors import (
     PosePrior,
@@ -62,28 +71,6 @@ class TooFewLandmarksError(ValueError):
 
 
 @dataclass(frozen=True)
-class FitOptions:
-    """What is known of person and camera, and the effort of the fit.
-
-    height_m: known stature; None: the prior of the settings.
-    focal_relative_std: standard deviation of the logarithm of the true focal length over the initial one; 0 fixes it.
-    principal_point_relative_std: standard deviation of the principal point about the initial one, in focal lengths; 0
-        fixes it.
-    shared_frames: number of frames for the shared parameters.
-    rounds: largest number of matchings of the silhouettes for the shared parameters.
-    vertical_is_known: whether +Y of the camera's world is up; otherwise the vertical is estimated.
-    """
-
-    height_m: float | None = None
-    focal_relative_std: float = FitSettings.initial_focal_std
-    principal_point_relative_std: float = 0.0
-    shared_frames: int = 48
-    rounds: int = 8
-    vertical_is_known: bool = True
-    settings: FitSettings = DEFAULT_SETTINGS
-
-
-@dataclass(frozen=True)
 class _FitContext:
     """Constants of a fit. `default`: the body at the default shape."""
 
@@ -115,12 +102,14 @@ def fit_body(
     windows: Sequence[MaskWindow | None],
     options: FitOptions,
     curls_rad: Float[np.ndarray, "2 4"] | None = None,
+    checkpoint: Path | None = None,
 ) -> FitResult:
     """Fit a body to landmarks and masks.
 
     observations: their camera is the initial one, level unless the vertical is known.
     windows: from `silhouette_icp.crop_mask_window`.
     curls_rad: from `hand_observations.finger_curls_rad`; None: relaxed fingers.
+    checkpoint: file from which an interrupted fit of the same inputs continues; None: it starts over.
 
     Raises:
         TooFewLandmarksError: fewer than three frames have a torso in pixels and in 3D.
@@ -141,23 +130,22 @@ def fit_body(
             # The deviation of the principal point is in focal lengths.
             shift_std = options.principal_point_relative_std * float(np.exp(-axis.focal_log))
             options = replace(options, focal_relative_std=axis.focal_log_std, principal_point_relative_std=shift_std)
-    start = initial_state(
-        observations, rest_landmarks_m, context.default.joints_m, body.shape_defaults.double(), offset_count
-    )
-    chosen = select_shared_frames(observations, windows, options.shared_frames)
-    state, parameters, system, posture = _fit_shared(
-        context, observations.select(chosen), [windows[row] for row in chosen], start.select(chosen), options
-    )
-    state = interpolated_state(state, chosen, observations.time_s)
-    state, model, silhouette_iou = _fit_poses(context, observations, windows, state, parameters, posture)
+    progress = load_progress(checkpoint)
+    if progress is None:
+        start = initial_state(
+            observations, rest_landmarks_m, context.default.joints_m, body.shape_defaults.double(), offset_count
+        )
+        progress = _fit_shared(context, observations, windows, start, options)
+        save_progress(checkpoint, progress)
+    parameters = shared_parameters(options)
+    state, model, silhouette_iou = _fit_poses(context, observations, windows, progress, parameters, checkpoint)
     if evidence is not None:
         state, observations = align_with_gravity(model, state, observations, evidence, options.settings)
-    focal_relative_std, height_std_m = posterior_stds(model, system)
     stature_std_m = options.settings.stature_spread_m if options.height_m is None else 0.0
     return replace(
         _result(context, model, state, observations, silhouette_iou, left_right_swapped),
-        focal_relative_std=focal_relative_std,
-        height_std_m=float(np.hypot(height_std_m, stature_std_m)),
+        focal_relative_std=progress.focal_relative_std,
+        height_std_m=float(np.hypot(progress.height_std_m, stature_std_m)),
         contradicting_focal_log=contradiction,
     )
 
@@ -190,8 +178,8 @@ def fit_supplied_poses(
     observations, left_right_swapped = _correct_left_right_swaps(observations, rest_landmarks_m)
     left_right_swapped = {sides: rows & to_fit for sides, rows in left_right_swapped.items()}
     if to_fit.any():
-        parameters = _with_silhouettes(EnergyParameters.from_settings(settings), settings)
-        state, _, _ = _fit_poses(context, observations, windows, state, parameters, posture=None)
+        parameters = with_silhouettes(EnergyParameters.from_settings(settings), settings)
+        state, _, _ = _fit_poses(context, observations, windows, FitProgress(state), parameters)
     if keep:
         state = supplied.overwrite_poses(state, model.full_joint_indices)
     _, silhouette_iou = match_silhouettes(model, state, observations, windows)
@@ -227,15 +215,6 @@ def _build_context(body: ParametricBody, curls_rad: Float[np.ndarray, "2 4"], se
     )
 
 
-def _with_silhouettes(parameters: EnergyParameters, settings: FitSettings) -> EnergyParameters:
-    """Return the parameters with less weight of the landmarks, whose errors are larger and correlated."""
-    return replace(
-        parameters,
-        landmark_std_m=settings.silhouette_landmark_std_m,
-        landmark_3d_std_m=settings.silhouette_landmark_3d_std_m,
-    )
-
-
 def _correct_left_right_swaps(
     observations: Observations, rest_landmarks_m: Float[Tensor, "l 3"]
 ) -> tuple[Observations, dict[str, Bool[np.ndarray, "n"]]]:
@@ -252,25 +231,19 @@ def _fit_shared(
     context: _FitContext,
     observations: Observations,
     windows: Sequence[MaskWindow | None],
-    state: FitState,
+    start: FitState,
     options: FitOptions,
-) -> tuple[FitState, EnergyParameters, NormalEquations, Posture | None]:
-    """Fit the shared parameters and the poses of these frames; return last normal equations and posture as well."""
-    settings = options.settings
-    parameters = EnergyParameters.from_settings(settings)
-    if options.height_m is not None:
-        parameters = replace(parameters, height_m=options.height_m, height_std_m=settings.known_stature_std_m)
+) -> FitProgress:
+    """Fit the shared parameters and the poses of some frames, and interpolate the poses of the others."""
+    settings, time_s = options.settings, observations.time_s
+    chosen = select_shared_frames(observations, windows, options.shared_frames)
+    observations, windows, state = observations.select(chosen), [windows[row] for row in chosen], start.select(chosen)
+    parameters = landmark_parameters(options)
     state, _ = _fit_landmarks(context, context.default, observations, parameters, state, settings.landmark_steps)
-    parameters = replace(parameters, free_landmark_offsets=True)
-    if options.focal_relative_std > 0.0:
-        parameters = replace(parameters, free_focal=True, log_focal_std=options.focal_relative_std)
-    if options.principal_point_relative_std > 0.0:
-        parameters = replace(
-            parameters, free_principal_point=True, principal_point_std=options.principal_point_relative_std
-        )
+    parameters = free_parameters(options)
     model = context.linearise(state.shape)
     state, system = _fit_landmarks(context, model, observations, parameters, state, settings.landmark_steps)
-    parameters = _with_silhouettes(parameters, settings)
+    parameters = shared_parameters(options)
     posture: Posture | None = None
     for number in track(range(options.rounds), "shape and focal length"):
         model, before = context.linearise(state.shape), state
@@ -281,20 +254,21 @@ def _fit_shared(
             posture = objective.estimate_posture(context.pose_prior, state)
         elif number + 1 > POSTURE_ROUND and shared_step_ratio(before, state, system) < CONVERGED_STEP_RATIO:
             break
-    return state, parameters, system, posture
+    stds = posterior_stds(context.linearise(state.shape), system)
+    return FitProgress(interpolated_state(state, chosen, time_s), posture, *stds)
 
 
 def _fit_poses(
     context: _FitContext,
     observations: Observations,
     windows: Sequence[MaskWindow | None],
-    state: FitState,
+    progress: FitProgress,
     parameters: EnergyParameters,
-    posture: Posture | None,
+    checkpoint: Path | None = None,
 ) -> tuple[FitState, LinearBody, Float[np.ndarray, "n"]]:
     """Fit the poses of all frames with the shared parameters fixed; return each frame's silhouette IoU as well.
 
-    posture: of the recording, None if it is not known.
+    progress: where the fit starts. checkpoint: file that gets the progress after each round.
     """
     settings = context.settings
     parameters = replace(
@@ -306,13 +280,16 @@ def _fit_poses(
         hand_std_m=settings.fitted_hand_std_m,
         face_std_m=settings.fitted_face_std_m,
     )
+    state, posture = progress.state, progress.posture
     model = context.linearise(state.shape)
-    landmarks_only = replace(
-        parameters, landmark_std_m=settings.landmark_std_m, landmark_3d_std_m=settings.landmark_3d_std_m
-    )
-    state, _ = _fit_landmarks(context, model, observations, landmarks_only, state, settings.silhouette_steps)
-    recording = _Recording(posture)
-    for _ in track(range(settings.pose_rounds), "poses"):
+    if progress.rounds_done == 0:
+        landmarks_only = replace(
+            parameters, landmark_std_m=settings.landmark_std_m, landmark_3d_std_m=settings.landmark_3d_std_m
+        )
+        state, _ = _fit_landmarks(context, model, observations, landmarks_only, state, settings.silhouette_steps)
+    recording = _Recording(posture, progress.motion_std)
+    done = progress.rounds_done
+    for number in track(range(done, settings.pose_rounds), "poses", initial=done):
         contact = estimate_floor_contact(
             model, state.rotations, state.root_m, observations.confidence, observations.time_s
         )
@@ -322,6 +299,7 @@ def _fit_poses(
         root_perspective = world_to_perspective(state.root_m, observations.camera)
         motion_std = estimate_motion_std(state.rotations, root_perspective, observations.time_s)
         recording = _Recording(posture, motion_std)
+        save_progress(checkpoint, replace(progress, state=state, rounds_done=number + 1, motion_std=motion_std))
     _, silhouette_iou = match_silhouettes(model, state, observations, windows)
     return state, model, silhouette_iou
 

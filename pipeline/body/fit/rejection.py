@@ -6,6 +6,7 @@ which only another focal length explains.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -13,7 +14,8 @@ from jaxtyping import Bool, Float
 
 from pipeline.body.body import ParametricBody
 from pipeline.body.fit.diagnostics import suspicious_frames, usable_frames
-from pipeline.body.fit.fit import FitOptions, fit_body
+from pipeline.body.fit.fit import fit_body
+from pipeline.body.fit.options import FitOptions
 from pipeline.body.fit.result import FitResult
 from pipeline.body.fit.silhouette_icp import MaskWindow
 from pipeline.body.fit.state import Observations
@@ -21,6 +23,7 @@ from pipeline.core.progress import warn
 
 MAX_REJECTED_SHARE = 0.3
 """Share of rejected frames above which it is unclear who the person is, and the first fit is kept."""
+CHECKPOINTS = ("checkpoint_first_fit.safetensors", "checkpoint_second_fit.safetensors")
 
 
 def fit_body_without_others(
@@ -29,15 +32,19 @@ def fit_body_without_others(
     windows: Sequence[MaskWindow | None],
     options: FitOptions,
     curls_rad: Float[np.ndarray, "2 4"] | None = None,
+    out: Path | None = None,
 ) -> FitResult:
     """Fit a body as `fit_body` does; if some frames do not match it, again without their landmarks and masks.
 
     Their poses are then those between the frames around them, and their silhouette IoU is 0: they are not trained on.
 
+    out: folder of the checkpoints, one for each fit; None: none.
+
     Raises:
         TooFewLandmarksError: as `fit_body`.
     """
-    first = fit_body(body, observations, windows, options, curls_rad)
+    checkpoints = [None if out is None else out / name for name in CHECKPOINTS]
+    first = fit_body(body, observations, windows, options, curls_rad, checkpoints[0])
     rejected = frames_of_others(first)
     if not rejected.any() or rejected.mean() > MAX_REJECTED_SHARE:
         return first
@@ -47,7 +54,7 @@ def fit_body_without_others(
         observations, confidence=observations.confidence * kept, confidence_3d=observations.confidence_3d * kept
     )
     windows = [None if is_other else window for window, is_other in zip(windows, rejected, strict=True)]
-    second = fit_body(body, observations, windows, options, curls_rad)
+    second = fit_body(body, observations, windows, options, curls_rad, checkpoints[1])
     return replace(
         second,
         silhouette_iou=np.where(rejected, 0.0, second.silhouette_iou),

@@ -4,6 +4,7 @@ The template is registered before the atlas of the person is made, because the a
 """
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -16,7 +17,9 @@ from pipeline.template.face.landmarks import (
     Detector,
     FaceLandmarks,
     choose_landmarks,
+    load_landmarks,
     rendered_landmarks_m,
+    save_landmarks,
 )
 from pipeline.template.regions import is_template_body
 from pipeline.template.registration import Registration, register_template
@@ -39,6 +42,7 @@ def register_person(
     faces: FilmedFaces,
     make_detector: Callable[[], Detector],
     settings: TextureSettings,
+    checkpoint: Path | None = None,
 ) -> Registration | None:
     """Return the template on the person; None for a body of a model file.
 
@@ -49,10 +53,16 @@ def register_person(
         faces: detected in training frames.
         make_detector: constructs the detector of face landmarks.
         settings: of the projection of frames.
+        checkpoint: file of the landmarks, which an interrupted run of the same inputs need not find again; None: none.
     """
     if not is_template_body(body):
         return None
-    landmarks = find_landmarks(body, skinned, views, faces, make_detector, settings)
+    if checkpoint is not None and checkpoint.exists():
+        landmarks = load_landmarks(checkpoint)
+    else:
+        landmarks = find_landmarks(body, skinned, views, faces, make_detector, settings)
+        if checkpoint is not None:
+            save_landmarks(checkpoint, landmarks)
     return register_template(body, skinned.mesh, landmarks)
 
 

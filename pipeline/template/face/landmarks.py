@@ -7,6 +7,7 @@ below: median distance of the vertex 1 to 3 mm. A bias of the detector is the sa
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -14,9 +15,11 @@ import torch
 from jaxtyping import Float, Int, UInt8
 
 from pipeline.body.body import Body
+from pipeline.core.atomic import atomic_path
 from pipeline.geometry.atlas import Atlas
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.mesh import Mesh
+from pipeline.io.npz import load_npz, save_npz
 from pipeline.kernels.raster import rasterize
 from pipeline.kernels.texture_sampling import supersample_texture
 
@@ -80,6 +83,24 @@ class FaceLandmarks:
     vertices: Int[np.ndarray, "l"]
     positions_m: Float[np.ndarray, "l 3"]
     residual_m: float
+
+
+def save_landmarks(path: Path, landmarks: FaceLandmarks | None) -> None:
+    """Write the landmarks as a checkpoint; without arrays where there are none."""
+    with atomic_path(path) as temporary_path:
+        save_npz(temporary_path, {} if landmarks is None else vars(landmarks))
+
+
+def load_landmarks(path: Path) -> FaceLandmarks | None:
+    """Read what `save_landmarks` wrote.
+
+    Raises:
+        UserError: the file is damaged.
+    """
+    arrays = load_npz(path)
+    if not arrays:
+        return None
+    return FaceLandmarks(arrays["vertices"], arrays["positions_m"], float(arrays["residual_m"]))
 
 
 def rendered_landmarks_m(

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from pipeline.body.body import Motion, canonical_to_world, load_anny
-from pipeline.body.fit.fit import FitOptions, fit_body
+from pipeline.body.fit.fit import fit_body
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS
+from pipeline.body.fit.options import FitOptions
 from pipeline.body.fit.result import FitResult
 from pipeline.body.fit.silhouette_icp import rasterise_in_window
 from pipeline.body.fit.terms import FACE_LANDMARK_COUNT

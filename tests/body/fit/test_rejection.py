@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.body.body import load_anny
 from pipeline.body.fit import rejection
-from pipeline.body.fit.fit import FitOptions
+from pipeline.body.fit.options import FitOptions
 from pipeline.body.fit.rejection import MAX_REJECTED_SHARE, fit_body_without_others, frames_of_others
 from pipeline.body.fit.result import FitResult
 from pipeline.body.fit.silhouette_icp import MaskWindow, crop_mask_window

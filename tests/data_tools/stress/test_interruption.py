@@ -1,5 +1,6 @@
 """Interruptions of the toy pipeline with real kills, and what counts as a difference."""
 
+import os
 import shutil
 import subprocess
 from pathlib import Path
@@ -58,6 +59,20 @@ def test_differences_are_counted(folders: tuple[Path, Path]) -> None:
     differing = differing_files(expected, found)
     assert "learn.part" in differing
     assert any(name.startswith(f"{TOY_STAGES[-1]}/") for name in differing)
+
+
+def test_the_runs_of_a_trial_have_its_threads(folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NUMBA_NUM_THREADS", "1")
+    seen = []
+
+    def stop(run: Path, _: Path) -> float:
+        seen.append((run.name, os.environ["OMP_NUM_THREADS"], os.environ["NUMBA_NUM_THREADS"]))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(interruption, "_run_undisturbed", stop)
+    with pytest.raises(KeyboardInterrupt):
+        interruption_scores(*folders, kind="kills", threads=3)
+    assert seen == [("undisturbed-3-threads", "3", "3")]
 
 
 def test_each_stage_is_killed_within_its_seconds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

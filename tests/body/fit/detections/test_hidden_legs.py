@@ -16,9 +16,10 @@ from pipeline.body.fit.detections.hidden_legs import (
     outline_weights,
 )
 from pipeline.body.fit.diagnostics import make_observations
-from pipeline.body.fit.fit import FitOptions, fit_body
+from pipeline.body.fit.fit import fit_body
 from pipeline.body.fit.landmark_regressor import LANDMARK_COUNT
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS
+from pipeline.body.fit.options import FitOptions
 from pipeline.body.fit.silhouette_icp import crop_mask_window, posed_vertices
 from pipeline.geometry.camera import project
 from pipeline.kernels.raster import rasterize
