@@ -23,6 +23,7 @@ MODULES_OF_EXTRAS = {"pxr": ["usd-core"]}
 ALLOWED_PARAMETERS = {
     "pipeline/kernels/broyden/cpu.py",
     "pipeline/kernels/composite/cpu.py",
+    "pipeline/kernels/inverse_skinning/cell_skinning_cpu.py",
     "pipeline/kernels/inverse_skinning/cpu.py",
     "pipeline/kernels/inverse_skinning/newton_cpu.py",
     "pipeline/kernels/kinematics/cpu.py",

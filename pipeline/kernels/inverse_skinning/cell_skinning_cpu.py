@@ -65,6 +65,28 @@ def weights_by_cell(row_of_node, node_offsets, node_joint, node_weight, joints):
 
 
 @njit(**NJIT_OPTIONS)
+def _weight_and_slopes(weight, entry, u, v, w, inverse_spacing):
+    """Return the weight of a pair at the place (u, v, w) in its cell, and its derivatives by x, y and z, 1/m."""
+    w0, w1, w2, w3 = weight[entry, 0], weight[entry, 1], weight[entry, 2], weight[entry, 3]
+    w4, w5, w6, w7 = weight[entry, 4], weight[entry, 5], weight[entry, 6], weight[entry, 7]
+    # Slopes along x at the four edges, then values and slopes along y at two, then along z.
+    d0, d1, d2, d3 = w1 - w0, w3 - w2, w5 - w4, w7 - w6
+    a0, a1, a2, a3 = w0 + u * d0, w2 + u * d1, w4 + u * d2, w6 + u * d3
+    b0, b1 = a1 - a0, a3 - a2
+    c0, c1 = a0 + v * b0, a2 + v * b1
+    e0, e1 = d0 + v * (d1 - d0), d2 + v * (d3 - d2)
+    along_x, along_y = (e0 + w * (e1 - e0)) * inverse_spacing, (b0 + w * (b1 - b0)) * inverse_spacing
+    return c0 + w * (c1 - c0), along_x, along_y, (c1 - c0) * inverse_spacing
+
+
+@njit(**NJIT_OPTIONS)
+def _row_and_product(matrices, frame, m, first, x, y, z):
+    """Return three entries of a row of a matrix, from entry `first` on, and the row times (x, y, z, 1)."""
+    m0, m1, m2 = matrices[frame, m, first], matrices[frame, m, first + 1], matrices[frame, m, first + 2]
+    return m0, m1, m2, m0 * x + m1 * y + m2 * z + matrices[frame, m, first + 3]
+
+
+@njit(**NJIT_OPTIONS)
 def newton_steps(first, last, ray_indices, batch_index, matrices, cells, canonical, points, inverse_jacobian):
     """Move the points first..last by one Newton step from `canonical` (s, 3) to the inverse of the posed `points`.
 
@@ -89,56 +111,23 @@ def newton_steps(first, last, ray_indices, batch_index, matrices, cells, canonic
         if row >= 0:
             frame = batch_index[ray_indices[s]]
             for entry in range(offsets[row], offsets[row + 1]):
-                w0, w1, w2, w3 = weight[entry, 0], weight[entry, 1], weight[entry, 2], weight[entry, 3]
-                w4, w5, w6, w7 = weight[entry, 4], weight[entry, 5], weight[entry, 6], weight[entry, 7]
-                # Slopes along x at the four edges, then values and slopes along y at two, then along z.
-                d0, d1, d2, d3 = w1 - w0, w3 - w2, w5 - w4, w7 - w6
-                a0, a1, a2, a3 = w0 + u * d0, w2 + u * d1, w4 + u * d2, w6 + u * d3
-                b0, b1 = a1 - a0, a3 - a2
-                c0, c1 = a0 + v * b0, a2 + v * b1
-                e0, e1 = d0 + v * (d1 - d0), d2 + v * (d3 - d2)
-                along_x, along_y = (e0 + w * (e1 - e0)) * inverse, (b0 + w * (b1 - b0)) * inverse
-                along_z, value = (c1 - c0) * inverse, c0 + w * (c1 - c0)
+                value, along_x, along_y, along_z = _weight_and_slopes(weight, entry, u, v, w, inverse)
                 m = joint[entry]
-                m0, m1, m2, m3 = (
-                    matrices[frame, m, 0],
-                    matrices[frame, m, 1],
-                    matrices[frame, m, 2],
-                    matrices[frame, m, 3],
-                )
-                qx = m0 * x + m1 * y + m2 * z + m3
-                px = px + value * qx
-                j00, j01, j02 = (
-                    j00 + value * m0 + along_x * qx,
-                    j01 + value * m1 + along_y * qx,
-                    j02 + value * m2 + along_z * qx,
-                )
-                m0, m1, m2, m3 = (
-                    matrices[frame, m, 4],
-                    matrices[frame, m, 5],
-                    matrices[frame, m, 6],
-                    matrices[frame, m, 7],
-                )
-                qy = m0 * x + m1 * y + m2 * z + m3
-                py = py + value * qy
-                j10, j11, j12 = (
-                    j10 + value * m0 + along_x * qy,
-                    j11 + value * m1 + along_y * qy,
-                    j12 + value * m2 + along_z * qy,
-                )
-                m0, m1, m2, m3 = (
-                    matrices[frame, m, 8],
-                    matrices[frame, m, 9],
-                    matrices[frame, m, 10],
-                    matrices[frame, m, 11],
-                )
-                qz = m0 * x + m1 * y + m2 * z + m3
-                pz = pz + value * qz
-                j20, j21, j22 = (
-                    j20 + value * m0 + along_x * qz,
-                    j21 + value * m1 + along_y * qz,
-                    j22 + value * m2 + along_z * qz,
-                )
+                m0, m1, m2, q = _row_and_product(matrices, frame, m, 0, x, y, z)
+                px += value * q
+                j00 += value * m0 + along_x * q
+                j01 += value * m1 + along_y * q
+                j02 += value * m2 + along_z * q
+                m0, m1, m2, q = _row_and_product(matrices, frame, m, 4, x, y, z)
+                py += value * q
+                j10 += value * m0 + along_x * q
+                j11 += value * m1 + along_y * q
+                j12 += value * m2 + along_z * q
+                m0, m1, m2, q = _row_and_product(matrices, frame, m, 8, x, y, z)
+                pz += value * q
+                j20 += value * m0 + along_x * q
+                j21 += value * m1 + along_y * q
+                j22 += value * m2 + along_z * q
         invertible, (a, b, c, d, e, f, g, h, q) = invert((j00, j01, j02, j10, j11, j12, j20, j21, j22))
         if invertible:
             rx, ry, rz = points[s, 0] - px, points[s, 1] - py, points[s, 2] - pz
