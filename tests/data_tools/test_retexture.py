@@ -14,6 +14,7 @@ from pipeline.core.manifest import digest_files
 from pipeline.geometry.atlas import rasterize_texels
 from pipeline.io.glb import GlbFile
 from pipeline.io.image import read_gray, read_rgb, write_rgb, write_rgba
+from pipeline.mesh.files import load_mesh
 from pipeline.template.layout import load_layout
 from pipeline.template.template_atlas import build_template_atlas
 from pipeline.texture.files import load_texture, save_texture

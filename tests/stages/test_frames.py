@@ -270,7 +270,8 @@ def test_the_same_recording_gives_the_same_bytes(tmp_path):
     folder = draw_recording(tmp_path / "in", n=17)
     for name in ("a", "b"):
         run(folder, tmp_path / name)
-    written = sorted(path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*") if path.is_file())
+    files = (path for path in (tmp_path / "a").rglob("*") if path.is_file() and path.name != frames.CHECKPOINT)
+    written = sorted(path.relative_to(tmp_path / "a") for path in files)
     assert len(written) == 2 * 17 + 2
     for path in written:
         assert (tmp_path / "a" / path).read_bytes() == (tmp_path / "b" / path).read_bytes()
