@@ -194,7 +194,7 @@ def write_preview(path: Path, renders: list[np.ndarray], validator: Validator) -
 
 STAGE = Stage(
     "field",
-    version=17,
+    version=18,
     needs=("frames", "body"),
     makes=("field.safetensors", "occupancy.npz", "motion.npz"),
     config=FieldConfig,

@@ -341,7 +341,7 @@ def _manifest(folder: Path) -> Manifest:
 
 STAGE = Stage(
     name="report",
-    version=12,
+    version=13,
     needs=NEEDS,
     makes=("report.json", "index.html", "turntable.jpg", "clay.jpg", "heldout.jpg"),
     config=Config,

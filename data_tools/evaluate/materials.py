@@ -223,7 +223,7 @@ def normal_map_angle_deg(mesh: Mesh, texture: TextureArtifact, dense: Mesh) -> f
     """
     points, _ = sample_surface(mesh, SURFACE_POINTS, 0)
     _, face, weights = closest_points_on_mesh(points, mesh)
-    creases = find_creases(mesh)
+    creases, true_creases = find_creases(mesh), find_creases(dense)
     shown, atlas = Mesh(mesh.vertices[creases.source], creases.faces), creases.split_atlas(texture.atlas)
     normals = shown.vertex_normals()[atlas.vertex_of_uv]
     tangents = vertex_tangents(shown.vertices[atlas.vertex_of_uv], normals, atlas.uv, atlas.faces_uv)
@@ -234,7 +234,8 @@ def normal_map_angle_deg(mesh: Mesh, texture: TextureArtifact, dense: Mesh) -> f
     if texture.normal is not None:
         own = decode_normals(texture.normal, uv, tangent_frames(normal, tangent))
     _, face, weights = closest_points_on_mesh(points, dense)
-    true = np.einsum("nk,nkc->nc", weights, dense.vertex_normals()[dense.faces[face]])
+    true_normals = Mesh(dense.vertices[true_creases.source], true_creases.faces).vertex_normals()
+    true = np.einsum("nk,nkc->nc", weights, true_normals[true_creases.faces[face]])
     cosine = np.sum(own * true, axis=1) / np.linalg.norm(true, axis=1)
     return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).mean())
 
