@@ -65,7 +65,7 @@ from pipeline.texture.light_evidence import LightEvidence, estimate_light
 from pipeline.texture.normal_map import bake_normal_map
 from pipeline.texture.settings import DEFAULT_SETTINGS, TextureSettings
 from pipeline.texture.specular import SpecularFit, fit_specular, texels_at_vertices
-from pipeline.texture.views import BakeView, crop_bake_view, vertex_view_cosine, weight_by_resolution
+from pipeline.texture.views import BakeView, crop_bake_view, weight_by_resolution
 
 LANDMARKS_CHECKPOINT, TEXELS_CHECKPOINT = "checkpoint_landmarks.npz", "checkpoint_texels.safetensors"
 
@@ -228,16 +228,12 @@ def cut_view(view: BakeView, cut: SurfaceCut | None) -> BakeView:
     """Return a view of the mesh that was cut."""
     if cut is None:
         return view
-    vertices = torch.from_numpy(cut.extend(view.vertices_world.numpy()))
-    cosine = vertex_view_cosine(vertices, torch.from_numpy(cut.faces), view.camera)
-    return replace(view, vertices_world=vertices, view_cosine=cosine)
+    return view.with_mesh(torch.from_numpy(cut.extend(view.vertices_world.numpy())), cut.faces)
 
 
 def split_view(view: BakeView, creases: Creases) -> BakeView:
     """Return a view of the mesh with copies of the vertices on its folds."""
-    vertices = view.vertices_world[torch.from_numpy(creases.source)]
-    cosine = vertex_view_cosine(vertices, torch.from_numpy(creases.faces), view.camera)
-    return replace(view, vertices_world=vertices, view_cosine=cosine)
+    return view.with_mesh(view.vertices_world[torch.from_numpy(creases.source)], creases.faces)
 
 
 def template_metrics(template: FittedTemplate | None) -> dict[str, float]:

@@ -116,7 +116,7 @@ def close_valleys(
     rise = np.clip((up_m - spacing_m * lowest) / VALLEY_RISE_M, 0.0, 1.0)
     height = rise * _fade(up_m - spacing_m * crotch - VALLEY_HEIGHT_M)
     share = _fade(across_m - VALLEY_HALF_WIDTH_M)[:, None] * height
-    share *= 1.0 - _fade(np.array([joined_m - MIN_JOINED_M]))
+    share *= min(1.0, (joined_m - MIN_JOINED_M) / VALLEY_FADE_M)
     reach = round(VALLEY_RADIUS_M / spacing_m)
     columns, rows = (_padded_span(used, 2 * reach) for used in np.nonzero(share))
     square = np.arange(-reach, reach + 1) ** 2

@@ -106,8 +106,15 @@ def composite_target(
     view: PosedView, background: Float[Tensor, "3"]
 ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
     """Return the image of a view composited on a background, and its mask, both in [0, 1]."""
-    mask = view.mask.float() / 255.0
-    return view.image.float() / 255.0 * mask[..., None] + (1.0 - mask[..., None]) * background, mask
+    return _composite(view.image, view.mask, background)
+
+
+def _composite(
+    image: UInt8[Tensor, "*p 3"], mask: UInt8[Tensor, "*p"], background: Float[Tensor, "3"]
+) -> tuple[Float[Tensor, "*p 3"], Float[Tensor, "*p"]]:
+    """Do `composite_target` for some pixels of a view."""
+    alpha = mask.float() / 255.0
+    return image.float() / 255.0 * alpha[..., None] + (1.0 - alpha[..., None]) * background, alpha
 
 
 def view_losses(
@@ -120,9 +127,8 @@ def view_losses(
     """
     target, mask = composite_target(view, background)
     composited = image + (1.0 - alpha[..., None]) * background
-    return COLOUR_LOSS_SCALE * torch.nn.functional.huber_loss(composited, target, delta=HUBER_DELTA), (
-        alpha - mask
-    ).abs().mean()
+    colour_loss = COLOUR_LOSS_SCALE * torch.nn.functional.huber_loss(composited, target, delta=HUBER_DELTA)
+    return colour_loss, (alpha - mask).abs().mean()
 
 
 def sampled_losses(
@@ -146,8 +152,8 @@ def sampled_losses(
     wanted = (columns + (1 if stride == 2 else 2) * rows + phase) % stride == 0
     posed = view.pose_vertices(vertices, skin.weights)
     drawn = render_pixels(posed, skin.faces, view.camera, vertices, shader, skin.adjacency, wanted)
-    mask = view.mask.reshape(-1)[drawn.pixel].float() / 255.0
-    target = view.image.reshape(-1, 3)[drawn.pixel].float() / 255.0 * mask[:, None] + (1.0 - mask[:, None]) * background
+    pixels = view.image.reshape(-1, 3)[drawn.pixel], view.mask.reshape(-1)[drawn.pixel]
+    target, mask = _composite(*pixels, background)
     alpha = drawn.values[:, -1]
     composited = drawn.values[:, :-1] + (1.0 - alpha[:, None]) * background
     weight = torch.where(drawn.at_silhouette, 1.0, float(stride)) / (height * width)

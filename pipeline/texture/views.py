@@ -46,6 +46,11 @@ class BakeView:
     weight: float = 1.0
     shading: Float[Tensor, "v d"] | None = None
 
+    def with_mesh(self, vertices_world: Float[Tensor, "w 3"], faces: Int[np.ndarray, "f 3"]) -> "BakeView":
+        """Return the view of another mesh in the same pose; vertices_world: m."""
+        cosine = vertex_view_cosine(vertices_world, torch.from_numpy(faces), self.camera)
+        return replace(self, vertices_world=vertices_world, view_cosine=cosine)
+
 
 def crop_bake_view(
     image: UInt8[np.ndarray, "h w 3"],
