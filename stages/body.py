@@ -17,7 +17,6 @@ from pipeline.body.files import (
     save_body,
     save_camera,
     save_motion,
-    save_observations,
     save_scores,
 )
 from pipeline.body.filmed_legs import leg_profile, rest_with_filmed_legs
@@ -61,7 +60,6 @@ from pipeline.geometry.camera import Camera
 from pipeline.io.image import to_uint8, write_rgb
 
 _BODY, _MOTION, _CAMERA, _OVERLAY = "body.npz", "motion.npz", "camera.npz", "overlay.png"
-_OBSERVATIONS = "observations.npz"
 _OVERLAY_FRAMES = 12
 
 
@@ -118,16 +116,13 @@ def run(
     legs = leg_profile(result.body, motion, result.camera, windows, training & usable)
     legs_as_filmed = legs.cloth_hangs_between_legs()
     if legs_as_filmed:
-        rest = rest_with_filmed_legs(result.body, motion, result.landmarks_m, training & usable)
+        rest = rest_with_filmed_legs(result.body, motion, training & usable)
         motion = rest.motion
-        result = replace(
-            result, body=rest.body, rotations_wxyz=rest.motion.rotations_wxyz, landmarks_m=rest.landmarks_m
-        )
+        result = replace(result, body=rest.body, rotations_wxyz=motion.rotations_wxyz)
     left_right_swapped = np.stack(list(result.left_right_swapped.values())).any(axis=0)
     save_body(out / _BODY, result.body)
     save_motion(out / _MOTION, motion)
     save_camera(out / _CAMERA, result.camera)
-    save_observations(out / _OBSERVATIONS, result.observations, result.landmarks_m)
     blob_shares = residual_blob_shares(result.body, canonical_to_world(result.body, motion), result.camera, windows)
     scores = FrameScores(
         frame_index=capture.frame_index,
@@ -328,9 +323,9 @@ def draw_overlay_grid(
 
 STAGE = Stage(
     "body",
-    version=22,
+    version=23,
     needs=("frames",),
-    makes=(_BODY, _MOTION, _CAMERA, _OBSERVATIONS, SCORES_NPZ, _OVERLAY),
+    makes=(_BODY, _MOTION, _CAMERA, SCORES_NPZ, _OVERLAY),
     config=Config,
     run=run,
 )

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from pipeline.avatar.turntable import turntable_sheet
 from pipeline.body.body import Body, Motion, canonical_to_world
-from pipeline.body.files import load_body, load_camera, load_motion, load_observations, save_motion
-from pipeline.body.fit.silhouette_icp import crop_mask_window
+from pipeline.body.files import load_body, load_camera, load_motion, save_motion
 from pipeline.capture.capture import Capture, load_capture
 from pipeline.capture.frame_selection import VALIDATION
 from pipeline.capture.usable_frames import usable_training_positions
@@ -32,7 +31,7 @@ from pipeline.geometry.camera import pixel_footprint_m
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import top_k_weights
 from pipeline.geometry.surface import resolve_self_intersections
-from pipeline.io.image import to_uint8, write_rgb
+from pipeline.io.image import write_rgb
 from pipeline.mesh.evidence import surface_evidence
 from pipeline.mesh.face_reduction import reduce_faces
 from pipeline.mesh.fairing import fair_surface
@@ -47,8 +46,10 @@ from pipeline.mesh.files import (
     save_mesh,
 )
 from pipeline.mesh.isosurface import CanonicalGrid, extract_mesh, sample_canonical_grid, select_isovalue
-from pipeline.mesh.pose_refit import refit_poses, select_poses
-from pipeline.mesh.pose_selection import is_far_from, score_motion
+from pipeline.mesh.outline_alignment import MAX_PERSON_PX as MAX_OUTLINE_PX
+from pipeline.mesh.outline_alignment import align_outlines
+from pipeline.mesh.pose_alignment import AlignedSurface
+from pipeline.mesh.pose_selection import in_other_poses, is_far_from, score_motion, select_poses
 from pipeline.mesh.refinement import refine_mesh, with_offsets
 from pipeline.mesh.remeshing import detailed_faces, remesh_to_edge_length
 from pipeline.mesh.settings import MeshSettings
@@ -125,7 +126,7 @@ def run(
     motion = load_motion(inputs["field"] / "motion.npz")
     parts = usable_training_positions(capture, inputs["body"]), capture.positions(VALIDATION)
     chosen = [part[evenly_spaced(len(part), config.max_frames)] for part in parts]
-    train, validation = (load_views(capture, part, motion, inputs, body, config) for part in chosen)
+    train, validation = (load_views(capture, part, motion, inputs, body, config.max_person_px) for part in chosen)
     if not train:
         again = rerun_command("frames", inputs["frames"])
         raise UserError(f"{inputs['frames']} has no training frames; run {again}")
@@ -262,13 +263,13 @@ def load_views(
     motion: Motion,
     inputs: Mapping[str, Path],
     body: Body,
-    config: Config,
+    max_person_px: int,
 ) -> list[PosedView]:
     """Load crops of the frames at these positions, in their poses of the motion."""
     camera = load_camera(inputs["body"] / "camera.npz")
     poses = canonical_to_world(body, motion.select(positions))
     return [
-        crop_posed_view(capture.image(k), capture.mask(k), camera, pose, config.max_person_px)
+        crop_posed_view(capture.image(k), capture.mask(k), camera, pose, max_person_px)
         for k, pose in zip(track(positions.tolist(), "reading frames"), poses, strict=True)
     ]
 
@@ -280,39 +281,43 @@ def refit_motion(
     shaded_mesh: tuple[Mesh, SkinnedTopology, torch.nn.Module],
     validation: Sequence[PosedView],
 ) -> tuple[Motion, dict[str, float]]:
-    """Fit the frames that are not trained on to landmarks and masks through the mesh; return motion and metrics.
+    """Align the frames that are not trained on to the outlines of their masks through the mesh; never to colours.
 
     Training frames keep their poses. Frames near them keep the interpolated corrections, with a warning, unless the
     validation views prefer the new poses (`MotionScores.is_better_than`). Frames far from them have no corrections;
     they keep their poses unless the outlines of these frames fit better.
 
     validation: views of evenly spaced validation frames, from `load_views`.
+
+    Returns:
+        The motion, and metrics.
     """
     (body, motion), (mesh, skin, shader) = posed_body, shaded_mesh
     is_trained = np.zeros(len(capture), dtype=bool)
     is_trained[usable_training_positions(capture, inputs["body"])] = True
-    masks = (None if is_trained[k] else to_uint8(capture.mask(k)) for k in range(len(capture)))
-    windows = [None if mask is None else crop_mask_window(mask) for mask in masks]
-    camera = load_camera(inputs["body"] / "camera.npz")
-    landmarks = load_observations(inputs["body"] / "observations.npz", motion.time_s, camera)
-    surface = replace(body, vertices=mesh.vertices, faces=mesh.faces, skin_weights=skin.weights.numpy())
-    refitted = refit_poses(surface, motion, is_trained, landmarks, windows)
+    views = load_views(capture, np.flatnonzero(~is_trained), motion, inputs, body, MAX_OUTLINE_PX)
+    surface = AlignedSurface.without_colours(torch.from_numpy(mesh.vertices), skin)
+    fitted = load_motion(inputs["body"] / "motion.npz")
+    refitted = align_outlines(surface, body, (fitted, motion), is_trained, views)
+
     is_far = is_far_from(motion.time_s, motion.time_s[is_trained])
-    iou_gain = np.nan_to_num(refitted.iou_after - refitted.iou_before)
-    use_far = bool(is_far.any() and iou_gain[is_far].mean() > 0.0)
+    far_views = [view for view, far in zip(views, is_far[~is_trained], strict=True) if far]
+    moved = in_other_poses(far_views, canonical_to_world(body, refitted.select(np.flatnonzero(is_far))))
+    use_far = silhouette_iou(mesh, skin, moved) > silhouette_iou(mesh, skin, far_views)
     positions = capture.positions(VALIDATION)
     positions = positions[evenly_spaced(len(positions), len(validation))]
     scores = [
         score_motion(mesh, skin, shader, validation, canonical_to_world(body, poses.select(positions)))
-        for poses in (motion, refitted.motion)
+        for poses in (motion, refitted)
     ]
     use_near = scores[1].is_better_than(scores[0])
     if not use_near:
         warn("frames next to training frames keep interpolated poses: validation frames prefer them to a second fit")
-    return select_poses(np.where(is_far, use_far, use_near), refitted.motion, motion), {
+    use = ~is_trained & np.where(is_far, use_far, use_near)
+    return select_poses(use, refitted, motion), {
         **{f"{name}_motion_silhouette_iou": score.silhouette_iou for name, score in zip(MOTIONS, scores, strict=True)},
         **{f"{name}_motion_psnr_db": score.psnr_db for name, score in zip(MOTIONS, scores, strict=True)},
-        "refitted_frames": float(((is_far & use_far) | (~is_far & use_near) & ~is_trained).sum()),
+        "refitted_frames": float(use.sum()),
     }
 
 
@@ -326,7 +331,7 @@ def write_results(out: Path, mesh: Mesh, skin: SkinnedTopology, shader: torch.nn
 
 STAGE = Stage(
     "mesh",
-    version=28,
+    version=29,
     needs=("frames", "body", "field"),
     makes=(MESH_NPZ, DENSE_NPZ, "motion.npz", "preview.png"),
     config=Config,

@@ -79,7 +79,7 @@ class Config(BaseConfig):
 
     fit_held_out_poses: bool = Field(
         False,
-        description="add scores with poses fitted to the held-out images (InstantAvatar's protocol); takes minutes",
+        description="add scores with poses fitted to the held-out images (InstantAvatar's protocol)",
     )
     score_unrefined_mesh: bool = Field(
         True, description="score the mesh also with the poses of the body stage, without the field's corrections"
@@ -218,7 +218,7 @@ def score_frames(
     if settings.score_unrefined_field:
         renderers["field_unrefined"] = (render_field, loaded.fitted_canonical_to_world)
     if config.fit_held_out_poses:
-        poses_fitted = fit_heldout_poses(loaded, positions, settings.pose_fit_steps)
+        poses_fitted = fit_heldout_poses(loaded, positions)
         renderers |= {
             "field_pose_fitted": (render_field, poses_fitted),
             "mesh_pose_fitted": (render_mesh, poses_fitted),
@@ -248,7 +248,7 @@ def _side_by_side(function: Callable[[int], Result], items: Sequence[int]) -> It
         yield from pool.map(function, items[start : start + 2 * threads])
 
 
-def fit_heldout_poses(loaded: FinishedRun, positions: np.ndarray, steps: int) -> Float[Tensor, "n j 4 4"]:
+def fit_heldout_poses(loaded: FinishedRun, positions: np.ndarray) -> Float[Tensor, "n j 4 4"]:
     """Return the refined poses of all frames, those of held-out frames fitted to their own images through the mesh."""
     views = [
         crop_posed_view(
@@ -260,7 +260,7 @@ def fit_heldout_poses(loaded: FinishedRun, positions: np.ndarray, steps: int) ->
         )
         for position in positions.tolist()
     ]
-    motion = fit_poses(loaded.avatar, loaded.body, loaded.motion.select(positions), views, steps)
+    motion = fit_poses(loaded.avatar, loaded.body, loaded.motion.select(positions), views)
     return loaded.refined_canonical_to_world.index_copy(
         0, torch.from_numpy(positions), canonical_to_world(loaded.body, motion)
     )

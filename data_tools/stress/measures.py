@@ -237,7 +237,7 @@ def file_scores(run: Path) -> dict[str, float]:
     return {"files_with_nan": float(len(files_with_nonfinite_values(run)))}
 
 
-NAN_ALLOWED = ("frames/frames.npz", "body/scores.npz", "body/observations.npz")
+NAN_ALLOWED = ("frames/frames.npz", "body/scores.npz")
 """Files in which nan means unknown."""
 
 

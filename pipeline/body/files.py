@@ -4,12 +4,9 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor
 
 from pipeline.body.body import Body, Motion
-from pipeline.body.fit.state import Observations
 from pipeline.core.command import rerun_command
 from pipeline.core.errors import UserError
 from pipeline.geometry.camera import Camera
@@ -130,43 +127,3 @@ def load_camera(path: Path) -> Camera:
         UserError: the file is missing or not a readable npz.
     """
     return Camera.from_arrays(load_npz(path))
-
-
-def save_observations(path: Path, observations: Observations, landmarks_m: Float[Tensor, "l 3"]) -> None:
-    """Write the landmarks of every frame and their places on the body; `load_observations` is the inverse.
-
-    Time and camera are not written: the motion and the camera of the stage have them. 3D landmarks are written in
-    camera axes.
-
-    landmarks_m: on the A-pose of the body, canonical frame.
-    """
-    to_camera = torch.as_tensor(observations.camera.world_to_camera, dtype=torch.float64)[:3, :3]
-    arrays = {
-        "landmarks_px": observations.landmarks_px,
-        "landmarks_3d_camera_m": observations.landmarks_3d_m @ to_camera.T,
-        "confidence": observations.confidence,
-        "confidence_3d": observations.confidence_3d,
-        "landmarks_canonical_m": landmarks_m,
-    }
-    save_npz(path, {name: values.numpy() for name, values in arrays.items()})
-
-
-def load_observations(
-    path: Path, time_s: Float[np.ndarray, "n"], camera: Camera
-) -> tuple[Observations, Float[Tensor, "l 3"]]:
-    """Read the landmarks of the frames at these times and their places on the body (m), written by `save_observations`.
-
-    Raises:
-        UserError: the file is missing or not a readable npz.
-    """
-    arrays = {name: torch.from_numpy(values) for name, values in load_npz(path).items()}
-    to_camera = torch.as_tensor(camera.world_to_camera, dtype=torch.float64)[:3, :3]
-    observations = Observations(
-        time_s=torch.tensor(time_s).double(),
-        landmarks_px=arrays["landmarks_px"],
-        landmarks_3d_m=arrays["landmarks_3d_camera_m"] @ to_camera,
-        confidence=arrays["confidence"],
-        confidence_3d=arrays["confidence_3d"],
-        camera=camera,
-    )
-    return observations, arrays["landmarks_canonical_m"]

@@ -17,7 +17,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pipeline.body.body import Body, Motion, canonical_to_world
-from pipeline.body.fit.landmark_regressor import LANDMARKS, landmark_joint
 from pipeline.body.fit.silhouette_icp import MaskWindow, rasterise_in_window
 from pipeline.body.overlay import pose_vertices
 from pipeline.geometry.camera import Camera, project
@@ -93,11 +92,10 @@ class LegProfile:
 
 @dataclass(frozen=True)
 class RestPose:
-    """A body in another canonical pose, the same motion as rotations from that pose, and the landmarks on it."""
+    """A body in another canonical pose, and the same motion as rotations from that pose."""
 
     body: Body
     motion: Motion
-    landmarks_m: Float[Tensor, "l 3"]
 
 
 def leg_profile(
@@ -173,9 +171,7 @@ def _leg_faces(body: Body, names: tuple[str, ...]) -> Bool[np.ndarray, "f"]:
     return np.asarray((weight[body.faces] > 0.5).all(axis=1))
 
 
-def rest_with_filmed_legs(
-    body: Body, motion: Motion, landmarks_m: Float[Tensor, "l 3"], frames: Bool[np.ndarray, "n"]
-) -> RestPose:
+def rest_with_filmed_legs(body: Body, motion: Motion, frames: Bool[np.ndarray, "n"]) -> RestPose:
     """Return the body with the mean rotations of hips and knees in some frames as its canonical pose, feet flat.
 
     Posed bodies stay the same, but for the blended skin around the hips, which differs by millimetres.
@@ -183,7 +179,6 @@ def rest_with_filmed_legs(
     Args:
         body: in its canonical pose.
         motion: rotations from that pose.
-        landmarks_m: places of the landmarks on the body.
         frames: those whose mean is taken.
     """
     local = torch.eye(3, dtype=torch.float64).repeat(len(body.joint_names), 1, 1)
@@ -198,7 +193,6 @@ def rest_with_filmed_legs(
         torch.from_numpy(body.vertices).double(), torch.from_numpy(body.skin_weights).double(), to_rest
     )[0]
     drop_m = torch.tensor([0.0, float(vertices[:, 1].min()), 0.0], dtype=torch.float64)
-    moved = _carry(landmarks_m.double(), to_rest[0], body) - drop_m
     turned = rest[0, :, :3, :3]
     of_parent = torch.stack([turned[max(parent, 0)] for parent in body.parents.tolist()])
     of_parent[0] = torch.eye(3, dtype=torch.float64)
@@ -209,7 +203,7 @@ def rest_with_filmed_legs(
         joints_m=(rest[0, :, :3, 3] - drop_m).float().numpy(),
     )
     quaternions = continuous_quaternions(matrix_to_quaternion(changed)).float().numpy()
-    return RestPose(new, motion.with_pose(quaternions, motion.root_translation_m), moved.to(landmarks_m.dtype))
+    return RestPose(new, motion.with_pose(quaternions, motion.root_translation_m))
 
 
 def _mean_rotation(rotations: Float[Tensor, "n 3 3"]) -> Float[Tensor, "3 3"]:
@@ -217,13 +211,3 @@ def _mean_rotation(rotations: Float[Tensor, "n 3 3"]) -> Float[Tensor, "3 3"]:
     u, _, vt = torch.linalg.svd(rotations.mean(0))
     sign = torch.tensor([1.0, 1.0, float(torch.det(u @ vt).sign())], dtype=u.dtype)
     return u @ torch.diag(sign) @ vt
-
-
-def _carry(points_m: Float[Tensor, "l 3"], to_rest: Float[Tensor, "j 4 4"], body: Body) -> Float[Tensor, "l 3"]:
-    """Return the landmarks moved with their joints."""
-    carried = points_m.clone()
-    for landmark in LANDMARKS:
-        for side, index in enumerate(landmark.indices):
-            joint = to_rest[body.joint(landmark_joint(landmark, side))]
-            carried[index] = joint[:3, :3] @ points_m[index] + joint[:3, 3]
-    return carried

@@ -15,7 +15,9 @@ from pipeline.core.device import CPU
 from pipeline.geometry.rotation import (
     axis_angle_to_matrix,
     axis_angle_to_quaternion,
+    quaternion_conjugate,
     quaternion_multiply,
+    quaternion_to_axis_angle,
     quaternion_to_matrix,
 )
 from pipeline.geometry.skinning import forward_kinematics, skinning_transforms
@@ -56,6 +58,11 @@ class PoseCorrection:
             np.maximum(intervals_s / max(np.median(intervals_s), 1e-9), 1e-3) if len(intervals_s) else intervals_s
         )
         self._relative_interval = torch.tensor(relative_intervals, dtype=torch.float32, device=device)
+
+    @property
+    def size(self) -> int:
+        """Number of parameters of a frame: a rotation vector of each joint, and the shift of the root."""
+        return 3 * len(self.joints) + 3
 
     def canonical_to_world(self, rows: Tensor) -> Float[Tensor, "k j 4 4"]:
         """Return the skinning matrices of selected frames, differentiable in the corrections."""
@@ -101,6 +108,14 @@ class PoseCorrection:
         joints = self.joints.cpu()
         quaternions[:, joints] = quaternion_multiply(quaternions[:, joints], turn)
         return motion.with_pose(quaternions.numpy(), motion.root_translation_m + shift)
+
+
+def corrections_between(body: Body, first: Motion, second: Motion) -> Float[np.ndarray, "n p"]:
+    """Return the corrections (rotation vectors of the corrected joints, then the shift) that lead to another motion."""
+    joints = [body.joint(name) for name in CORRECTED_JOINTS if name in body.joint_names]
+    from_wxyz, to_wxyz = (torch.as_tensor(motion.rotations_wxyz[:, joints]) for motion in (first, second))
+    turns_rad = quaternion_to_axis_angle(quaternion_multiply(quaternion_conjugate(from_wxyz), to_wxyz))
+    return np.concatenate([turns_rad.flatten(1), second.root_translation_m - first.root_translation_m], axis=1)
 
 
 def interpolate_corrections(

@@ -32,8 +32,6 @@ class FitSettings:
         face_std_m, fitted_face_std_m: the same for the landmarks of the face detector.
         landmark_cutoff: cutoff of the robust landmark terms, standard deviations.
         contour_std_m, contour_cutoff: standard deviation and cutoff of the silhouette term.
-        avatar_contour_std_m: the standard deviation for an outline that has the clothes and the hair of the masks.
-            Validation frames of the real turn: 0.01 m 25.45 dB, 0.005 m 25.67 dB.
         motion_cutoff: cutoff of the motion prior, standard deviations.
         landmark_offset_std_m: standard deviation of the landmark positions on the body.
         mean_stature_m, mean_stature_std_m: prior of the stature if it is not known. A loose prior let it sink to
@@ -62,7 +60,6 @@ class FitSettings:
     fitted_face_std_m: float = 0.008
     landmark_cutoff: float = 3.0
     contour_std_m: float = 0.010
-    avatar_contour_std_m: float = 0.005
     contour_cutoff: float = 4.0
     motion_cutoff: float = 4.0
     landmark_offset_std_m: float = 0.012
@@ -83,7 +80,6 @@ class FitSettings:
             ("hand_std_m", "fitted_hand_std_m"),
             ("face_std_m", "fitted_face_std_m"),
             ("mean_stature_std_m", "known_stature_std_m"),
-            ("contour_std_m", "avatar_contour_std_m"),
         ):
             if getattr(self, tight) > getattr(self, loose):
                 raise ValueError(

@@ -107,7 +107,7 @@ def render_pixels(
     shaded = shader(
         interpolate(covered_pixel, flat_face_id[covered_pixel], camera.width, vertices_px, depth_m, faces, attributes)
     )
-    with_alpha = torch.cat([shaded, torch.ones_like(shaded[:, :1])], dim=1)
+    with_alpha = torch.cat([shaded, shaded.new_ones(len(shaded), 1)], dim=1)
     values = torch.zeros(len(pixel), with_alpha.shape[1]).to(with_alpha).index_copy(0, covered, with_alpha)
     row_of_pixel = torch.empty(face_id.numel(), dtype=torch.int64, device=face_id.device)
     row_of_pixel[pixel] = torch.arange(len(pixel), device=pixel.device)

@@ -1,15 +1,15 @@
-"""Alignment of the poses of all training views to the coloured surface by Gauss-Newton steps.
+"""Alignment of poses to a surface by Gauss-Newton steps: by its colours and its silhouette, or by the silhouette alone.
 
 Each pixel says by how much, along its colour gradient, the surface point that it shows should move in the image
 (Lucas and Kanade, "An Iterative Image Registration Technique", 1981; with the mean gradient of render and image as in
 Benhimane and Malis, "Real-time image-based tracking of planes using efficient second-order minimization", 2004). The
-silhouette counts in the same way: alpha is a fourth channel. Pose errors change slowly, so the corrections of all
-views are solved together, as a process that drifts over time; views of the whole turn share one surface, as in bundle
-adjustment. Colours are compared after their local mean is removed, so that light that changes as the person turns
-does not move the person.
+silhouette counts in the same way: alpha is a fourth channel. The corrections of all views are solved together, with a
+prior that ties those of successive frames; views of the whole turn share one surface, as in bundle adjustment.
+Colours are compared after their local mean is removed, so that light that changes as the person turns does not move
+the person.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -17,7 +17,6 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Int
-from scipy.linalg import solveh_banded
 from torch import Tensor
 
 from pipeline.body.body import Body, Motion
@@ -28,6 +27,7 @@ from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.differentiable_raster import render_pixels
 from pipeline.kernels.common.thread_pool import ThreadPool
 from pipeline.kernels.interpolate import interpolate
+from pipeline.mesh.correction_prior import CorrectionPrior
 from pipeline.mesh.skin_transfer import SkinnedTopology
 from pipeline.mesh.views import PosedView, Shader
 
@@ -47,10 +47,30 @@ SILHOUETTE_BAND_PX = 4
 """Largest distance of a pixel from the rendered surface at which alpha counts."""
 COLOUR_NOISE, ALPHA_NOISE = 0.01, 0.1
 """Smallest standard deviation of colours, and standard deviation of alpha (masks are a pixel or two loose)."""
-ROTATION_STD_RAD, ROTATION_DRIFT_RAD_PER_SQRT_S = np.radians(2.0), np.radians(1.5)
-"""Standard deviation of the rotations that are corrected, and of their change in a second."""
-SHIFT_STD_M, SHIFT_DRIFT_M_PER_SQRT_S = 0.02, 0.015
-"""The same of the place of the root."""
+
+
+@dataclass(frozen=True)
+class AlignedSurface:
+    """The surface to which poses are aligned.
+
+    vertices: A-pose, m. skin: their faces and skin weights. attributes: attributes (v, c) of the vertices from their
+    places in a pose (v, 3), m. shader: colours (n, 3) in [0, 1] from attributes (n, c); None: the outline alone counts.
+    """
+
+    vertices: Float[Tensor, "v 3"]
+    skin: SkinnedTopology
+    attributes: Callable[[Float[Tensor, "v 3"]], Float[Tensor, "v c"]]
+    shader: Callable[[Float[Tensor, "n c"]], Float[Tensor, "n 3"]] | None
+
+    @classmethod
+    def with_colours(cls, vertices: Float[Tensor, "v 3"], skin: SkinnedTopology, shader: Shader) -> "AlignedSurface":
+        """Return a surface whose colours are a function of the place in the A-pose."""
+        return cls(vertices, skin, lambda _: vertices, shader)
+
+    @classmethod
+    def without_colours(cls, vertices: Float[Tensor, "v 3"], skin: SkinnedTopology) -> "AlignedSurface":
+        """Return a surface of which the outline alone counts."""
+        return cls(vertices, skin, lambda posed: posed[:, :0], None)
 
 
 @dataclass(frozen=True)
@@ -81,30 +101,30 @@ class PoseOffsets(NamedTuple):
 
 
 def align_poses(
-    vertices: Float[Tensor, "v 3"],
-    skin: SkinnedTopology,
-    shader: Shader,
+    surface: AlignedSurface,
     views: Sequence[PosedView],
     correction: PoseCorrection,
+    prior: CorrectionPrior,
     iterations: int,
 ) -> PoseOffsets:
     """Return the offsets with which renders of the surface match the views best.
 
     Args:
-        vertices, skin, shader: the coloured surface in the A-pose.
+        surface: its colours and its outline, or its outline alone.
         views: one view for each frame of the correction; their poses are not read.
         correction: starting point.
+        prior: of the corrections of all these frames.
         iterations: number of Gauss-Newton steps.
     """
     body, threads = correction.body, ThreadPool(torch.get_num_threads())
     offsets = PoseOffsets(correction.rotation_rad.detach(), correction.shift_m.detach())
-    weights = skin.weights @ descendant_matrix(body.parents.tolist())[correction.joints].T.float()
+    weights = surface.skin.weights @ descendant_matrix(body.parents.tolist())[correction.joints].T.float()
     rows = torch.arange(len(views))
 
     @torch.no_grad()
     def evidence_of_view(view: PosedView, pose: Float[Tensor, "j 4 4"]) -> tuple[np.ndarray, np.ndarray]:
         posed_view = PosedView(view.image, view.mask, view.camera, pose)
-        evidence = gather_evidence(vertices, weights, skin, shader, posed_view)
+        evidence = gather_evidence(surface, weights, posed_view)
         return normal_equations(evidence, view.camera, body, pose.numpy(), correction.joints.numpy())
 
     for _ in range(iterations):
@@ -112,36 +132,33 @@ def align_poses(
         systems = threads.map(evidence_of_view, views, poses)
         matrices, vectors = (np.stack(parts) for parts in zip(*systems, strict=True))
         present = np.concatenate([offsets.rotation_rad.flatten(1), offsets.shift_m], axis=1)
-        update = solve_drifting(matrices, vectors, present, correction.motion.time_s)
+        update = prior.solve(matrices, vectors, present)
         moved = torch.from_numpy(present + update).float()
         offsets = PoseOffsets(moved[:, :-3].reshape(offsets.rotation_rad.shape), moved[:, -3:].clone())
     return offsets
 
 
-def gather_evidence(
-    vertices: Float[Tensor, "v 3"],
-    subtree_weights: Float[Tensor, "v k"],
-    skin: SkinnedTopology,
-    shader: Shader,
-    view: PosedView,
-) -> ImageEvidence:
+def gather_evidence(surface: AlignedSurface, subtree_weights: Float[Tensor, "v k"], view: PosedView) -> ImageEvidence:
     """Compare the render of the surface with a view, in colour inside the surface and in alpha at its silhouette."""
     camera, shape = view.camera, (view.camera.height, view.camera.width)
-    posed = view.pose_vertices(vertices, skin.weights)
-    drawn = render_pixels(posed, skin.faces, camera, vertices, shader, skin.adjacency)
-    render = np.zeros((4, camera.height * camera.width), np.float32)
+    skin, shader = surface.skin, surface.shader or (lambda attributes: attributes)
+    posed = view.pose_vertices(surface.vertices, skin.weights)
+    drawn = render_pixels(posed, skin.faces, camera, surface.attributes(posed), shader, skin.adjacency)
+    render = np.zeros((drawn.values.shape[1], camera.height * camera.width), np.float32)
     render[:, drawn.pixel.numpy()] = drawn.values.numpy().T
-    render = render.reshape(4, *shape)
+    render = render.reshape(-1, *shape)
     mask = view.mask.numpy().astype(np.float32) / 255.0
-    frame = np.concatenate([np.moveaxis(view.image.numpy(), 2, 0) * (mask / 255.0), mask[None]])
 
     covered = torch.nonzero(drawn.face_id.reshape(-1) >= 0).squeeze(1)
     point_of_pixel = np.full(drawn.face_id.numel(), -1)
     point_of_pixel[covered.numpy()] = np.arange(len(covered))
     nearest_point, distance_px = _nearest_points(point_of_pixel.reshape(shape))
     near = distance_px[PIXELS] < SILHOUETTE_BAND_PX
-    inside = _is_inside(render[3], mask, np.minimum(drawn.depth_m.numpy(), BACKGROUND_DEPTH_M))
-    evidence = _silhouette_evidence(near, render[3], mask) + _colour_evidence(inside[PIXELS], render, frame)
+    evidence = _silhouette_evidence(near, render[-1], mask)
+    if surface.shader is not None:
+        frame = np.concatenate([np.moveaxis(view.image.numpy(), 2, 0) * (mask / 255.0), mask[None]])
+        inside = _is_inside(render[3], mask, np.minimum(drawn.depth_m.numpy(), BACKGROUND_DEPTH_M))
+        evidence += _colour_evidence(inside[PIXELS], render, frame)
     used = (evidence[0] + evidence[2] > 0.0) & near
     xx, xy, yy, pull_x, pull_y = evidence[:, used]
     structure = np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
@@ -296,33 +313,3 @@ def _cross(first: Float32[np.ndarray, "*n 3"], second: Float32[np.ndarray, "*m 3
     """Return the cross products; `numpy.cross` takes ten times as long."""
     (a, b, c), (x, y, z) = np.moveaxis(first, -1, 0), np.moveaxis(second, -1, 0)
     return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=-1)
-
-
-def solve_drifting(
-    matrices: Float[np.ndarray, "n p p"],
-    vectors: Float[np.ndarray, "n p"],
-    present: Float[np.ndarray, "n p"],
-    time_s: Float[np.ndarray, "n"],
-) -> Float[np.ndarray, "n p"]:
-    """Return the update of all corrections: evidence of each view, drift over time, and zero mean.
-
-    matrices, vectors: from `normal_equations`. present: corrections to which the update is added; the last three are
-    the shift of the root. time_s: of the views, increasing.
-    """
-    count, size = vectors.shape
-    std = np.concatenate([np.full(size - 3, ROTATION_STD_RAD), np.full(3, SHIFT_STD_M)])
-    drift = np.concatenate([np.full(size - 3, ROTATION_DRIFT_RAD_PER_SQRT_S), np.full(3, SHIFT_DRIFT_M_PER_SQRT_S)])
-    links = 1.0 / (drift**2 * np.maximum(np.diff(time_s), 1e-4)[:, None])
-    diagonal = np.tile(1.0 / std**2, (count, 1))
-    diagonal[:-1] += links
-    diagonal[1:] += links
-    change = np.diff(present, axis=0) * links
-    right = vectors - present / std**2
-    right[:-1] += change
-    right[1:] -= change
-
-    rows, columns = np.tril_indices(size)
-    band = np.zeros((size + 1, count, size))
-    band[rows - columns, :, columns] = (matrices + diagonal[:, :, None] * np.eye(size))[:, rows, columns].T
-    band[size, :-1] = -links
-    return solveh_banded(band.reshape(size + 1, -1), right.ravel(), lower=True).reshape(count, size)

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pipeline.body.body import Motion
 from pipeline.body.pose_correction import TYPICAL_CORRELATION_TIME_S
 from pipeline.geometry.mesh import Mesh
 from pipeline.mesh.skin_transfer import SkinnedTopology
@@ -33,8 +34,21 @@ def score_motion(
     canonical_to_world: Float[Tensor, "k j 4 4"],
 ) -> MotionScores:
     """Score the mesh in other poses of the views."""
-    posed = [replace(view, canonical_to_world=pose) for view, pose in zip(views, canonical_to_world, strict=True)]
+    posed = in_other_poses(views, canonical_to_world)
     return MotionScores(silhouette_iou(mesh, skin, posed), mesh_psnr_db(mesh, skin, posed, shader))
+
+
+def in_other_poses(views: Sequence[PosedView], canonical_to_world: Float[Tensor, "k j 4 4"]) -> list[PosedView]:
+    """Return the views with other poses."""
+    return [replace(view, canonical_to_world=pose) for view, pose in zip(views, canonical_to_world, strict=True)]
+
+
+def select_poses(use_first: Bool[np.ndarray, "n"], first: Motion, second: Motion) -> Motion:
+    """Return the poses of the first motion in the given frames and those of the second in the others."""
+    return second.with_pose(
+        np.where(use_first[:, None, None], first.rotations_wxyz, second.rotations_wxyz),
+        np.where(use_first[:, None], first.root_translation_m, second.root_translation_m),
+    )
 
 
 def is_far_from(time_s: Float[np.ndarray, "n"], known_s: Float[np.ndarray, "k"]) -> Bool[np.ndarray, "n"]:

@@ -18,7 +18,8 @@ from torch import Tensor
 from pipeline.body.body import Motion, canonical_to_world
 from pipeline.body.pose_correction import PoseCorrection
 from pipeline.geometry.mesh import Mesh
-from pipeline.mesh.pose_alignment import PoseOffsets, align_poses
+from pipeline.mesh.correction_prior import drifting_prior
+from pipeline.mesh.pose_alignment import AlignedSurface, PoseOffsets, align_poses
 from pipeline.mesh.remeshing import detailed_faces, remesh_adaptively, remesh_uniformly
 from pipeline.mesh.skin_transfer import SkinnedTopology, transfer_skin
 from pipeline.mesh.vertex_optimisation import RefinementInputs, optimise_vertices
@@ -135,8 +136,9 @@ def _align(state: RefinementState, inputs: RefinementInputs) -> RefinementState:
     offsets = state.pose_offsets
     correction = PoseCorrection(inputs.body, motion) if offsets is None else offsets.of(inputs.body, motion)
     views = inputs.train[: len(motion.frame_index)]
-    vertices, steps = torch.from_numpy(state.mesh.vertices), inputs.settings.alignment_steps
-    offsets = align_poses(vertices, state.skin, inputs.shader, views, correction, steps)
+    surface = AlignedSurface.with_colours(torch.from_numpy(state.mesh.vertices), state.skin, inputs.shader)
+    prior = drifting_prior(motion.time_s, correction.size)
+    offsets = align_poses(surface, views, correction, prior, inputs.settings.alignment_steps)
     psnr_db = mesh_psnr_db(state.mesh, state.skin, with_offsets(inputs, offsets).validation, inputs.shader)
     if inputs.validation and psnr_db < state.validation_psnr_db[-1]:
         return state

@@ -117,20 +117,6 @@ def _composite(
     return image.float() / 255.0 * alpha[..., None] + (1.0 - alpha[..., None]) * background, alpha
 
 
-def view_losses(
-    image: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"], view: PosedView, background: Float[Tensor, "3"]
-) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-    """Return the colour loss and the silhouette loss of a render (premultiplied colours, alpha) against a view.
-
-    The colour loss is a multiple of the Huber loss on the given background. Like the silhouette loss, it is close to
-    the mean absolute error for large errors.
-    """
-    target, mask = composite_target(view, background)
-    composited = image + (1.0 - alpha[..., None]) * background
-    colour_loss = COLOUR_LOSS_SCALE * torch.nn.functional.huber_loss(composited, target, delta=HUBER_DELTA)
-    return colour_loss, (alpha - mask).abs().mean()
-
-
 def sampled_losses(
     vertices: Float[Tensor, "v 3"],
     skin: SkinnedTopology,
@@ -139,10 +125,11 @@ def sampled_losses(
     background: Float[Tensor, "3"],
     lattice: tuple[int, int],
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-    """Render a part of the pixels of a view; return estimates of the losses of `view_losses`, less a constant.
+    """Render a part of the pixels of a view; return estimates of its colour loss and its silhouette loss.
 
-    All pixels at silhouettes count, and of the others inside the outline one of each `stride`, `stride` times; with
-    stride 1 the gradients are those of `view_losses`.
+    The colour loss is a multiple of the mean Huber loss of all pixels on the given background; like the silhouette
+    loss, it is close to the mean absolute error for large errors. Both lack a constant: pixels that the mesh does not
+    cover do not count. All pixels at silhouettes do, and of the others one of each `stride`, `stride` times.
 
     lattice: stride and phase; in all phases of a stride each pixel is used once.
     """

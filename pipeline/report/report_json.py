@@ -30,20 +30,19 @@ class SplitNote:
 
 
 PROTOCOL = (
-    "{held_out} frames were held out; {count} of them, evenly spaced, are scored; split: {split_rule}. "
-    "Scores of interleaved and disjoint frames do not compare. "
-    "Field, mesh and texture were not trained on their pixels, and no decision used them. Their "
-    "poses are fitted to landmarks and silhouettes, never to colours: the body stage fits every frame, and the common "
-    "shape and camera, to the landmarks and masks of all frames; the mesh stage fits frames that are not trained on "
-    "once more, to the same landmarks and, through the outline of the mesh, to that of the mask, tied by the motion "
-    "prior to the training frames next to them, whose poses are learnt with the field. Where validation frames reject "
-    "this fit (stages.mesh.refitted_frames 0), the field's pose corrections are interpolated in time between training "
-    "frames and fade to zero away from them. Frames are composited on white with the mask of the frames "
-    "stage, so an error of that mask costs nothing; renders are composited with their own alpha; both are rounded to 8 "
-    "bits. psnr, ssim and flip (67 pixels a degree, lower is better) are means over frames: _full counts the whole "
-    "image, _body the pixels of the mask, _box its bounding box. field is the radiance field; mesh is the exported "
-    "mesh with its diffuse map{light}, its outline blurred to the softness of the masks (masks.edge_blur_sigma_px, "
-    "measured on frames that are not scored); mesh_sharp is the mesh with hard edges."
+    "{held_out} frames were held out; {count} of them, evenly spaced, are scored; split: {split_rule}. Scores of "
+    "interleaved and disjoint frames do not compare. Field, mesh and texture were not trained on their pixels, and no "
+    "decision used them. Their poses are fitted to landmarks and silhouettes, never to colours: the body stage fits "
+    "every frame, and the common shape and camera, to the landmarks and masks of all frames; the mesh stage aligns the "
+    "outline of the mesh, in frames that are not trained on, to that of the mask, tied to the training frames next to "
+    "them, whose poses are learnt from colours. Where validation frames reject this (stages.mesh.refitted_frames), "
+    "pose corrections are interpolated in time between training frames and fade to zero away from them. Frames are "
+    "composited on white with the mask of the frames stage, so an error of that mask costs nothing; renders are "
+    "composited with their own alpha; both are rounded to 8 bits. psnr, ssim and flip (67 pixels a degree, lower is "
+    "better) are means over frames: _full counts the whole image, _body the pixels of the mask, _box its bounding box. "
+    "field is the radiance field; mesh is the exported mesh with its diffuse map{light}, its outline blurred to the "
+    "softness of the masks (masks.edge_blur_sigma_px, measured on frames that are not scored); mesh_sharp is the mesh "
+    "with hard edges."
 )
 LIGHT_REMOVED_NOTE = (
     " under the light that was estimated from training frames (removed from the map: shading by it explains "

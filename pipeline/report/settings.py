@@ -8,7 +8,6 @@ class ReportSettings:
     """Constants of the evaluation.
 
     score_unrefined_field: score the field also with the poses of the body stage; doubles the time of the report.
-    pose_fit_steps: optimiser steps of the fit to held-out images (docs/decisions/evaluation.md: 40).
     turntable_height_px: height of a turntable image.
     clay_head_height_px: height of an image of the head in clay.
     edge_blur_frames: frames on which the softness of the masks is measured; none of them is scored.
@@ -16,7 +15,6 @@ class ReportSettings:
     """
 
     score_unrefined_field: bool = False
-    pose_fit_steps: int = 40
     turntable_height_px: int = 480
     clay_head_height_px: int = 320
     edge_blur_frames: int = 16
@@ -24,8 +22,8 @@ class ReportSettings:
 
     def __post_init__(self) -> None:
         """Raise ValueError for values that make no report."""
-        if self.pose_fit_steps < 1 or self.edge_blur_frames < 1:
-            raise ValueError("pose_fit_steps and edge_blur_frames must be at least 1")
+        if self.edge_blur_frames < 1:
+            raise ValueError("edge_blur_frames must be at least 1")
         if min(self.turntable_height_px, self.clay_head_height_px) < 64:
             raise ValueError("turntable_height_px and clay_head_height_px must be at least 64")
 

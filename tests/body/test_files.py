@@ -1,10 +1,7 @@
 """Artifacts of the body stage: round trips; poses that are not finite are refused."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-import torch
 
 from pipeline.body.body import Motion, load_anny
 from pipeline.body.files import (
@@ -12,18 +9,15 @@ from pipeline.body.files import (
     load_body,
     load_camera,
     load_motion,
-    load_observations,
     load_scores,
     save_body,
     save_camera,
     save_motion,
-    save_observations,
     save_scores,
 )
 from pipeline.core.errors import UserError
 from pipeline.geometry.camera import Camera
 from pipeline.io.npz import save_npz
-from tests.body.acting import synthetic_recording
 
 
 def test_body_round_trip(tmp_path) -> None:
@@ -56,23 +50,6 @@ def test_poses_that_are_not_finite_are_refused_with_their_frames(tmp_path, place
     save_motion(tmp_path / "motion.npz", motion)
     with pytest.raises(UserError, match=r"motion.npz: the poses of frames 20, 50 are not finite"):
         load_motion(tmp_path / "motion.npz")
-
-
-def test_observations_round_trip_into_a_turned_world(tmp_path) -> None:
-    """3D landmarks are directions in the world: they turn with it when the camera's pose changes."""
-    recording = synthetic_recording(load_anny(), frames=4)
-    observations, places_m = recording.observations(recording.camera), torch.rand(41, 3, dtype=torch.float64)
-    save_observations(tmp_path / "observations.npz", observations, places_m)
-    again, places = load_observations(tmp_path / "observations.npz", recording.time_s, recording.camera)
-    for name in ("time_s", "landmarks_px", "landmarks_3d_m", "confidence", "confidence_3d"):
-        torch.testing.assert_close(getattr(again, name), getattr(observations, name))
-    torch.testing.assert_close(places, places_m)
-    turn = np.eye(4)
-    turn[:3, :3] = [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]
-    turned_camera = replace(recording.camera, world_to_camera=recording.camera.world_to_camera @ turn.T)
-    turned, _ = load_observations(tmp_path / "observations.npz", recording.time_s, turned_camera)
-    expected = observations.landmarks_3d_m @ torch.from_numpy(turn[:3, :3]).T
-    torch.testing.assert_close(turned.landmarks_3d_m, expected)
 
 
 def test_scores_round_trip(tmp_path) -> None:

@@ -6,7 +6,6 @@ import torch
 
 from pipeline.body.body import Body, Motion, canonical_to_world, load_anny
 from pipeline.body.filmed_legs import HEIGHTS, LegProfile, leg_profile, rest_with_filmed_legs
-from pipeline.body.fit.landmark_regressor import LANDMARK_COUNT, LANDMARKS
 from pipeline.body.fit.silhouette_icp import crop_mask_window
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.rotation import axis_angle_to_matrix, matrix_to_quaternion
@@ -119,7 +118,7 @@ CLOSED_LEGS = {
 
 def test_the_posed_body_stays(body: Body) -> None:
     motion = motion_of(body, CLOSED_LEGS)
-    rest = rest_with_filmed_legs(body, motion, torch.zeros(LANDMARK_COUNT, 3), np.ones(FRAMES, dtype=bool))
+    rest = rest_with_filmed_legs(body, motion, np.ones(FRAMES, dtype=bool))
     weights = torch.from_numpy(body.skin_weights)
     before, after = (
         linear_blend_skinning(torch.from_numpy(each.vertices), weights, canonical_to_world(each, poses))
@@ -135,7 +134,7 @@ def test_the_posed_body_stays(body: Body) -> None:
 
 def test_the_canonical_legs_are_the_filmed_ones(body: Body) -> None:
     motion = motion_of(body, CLOSED_LEGS)
-    rest = rest_with_filmed_legs(body, motion, torch.zeros(LANDMARK_COUNT, 3), np.ones(FRAMES, dtype=bool))
+    rest = rest_with_filmed_legs(body, motion, np.ones(FRAMES, dtype=bool))
     identity = [1.0, 0.0, 0.0, 0.0]
     for name in ("LeftUpLeg", "RightUpLeg", "LeftLeg", "RightLeg"):
         assert np.abs(rest.motion.rotations_wxyz[0, body.joint(name)]) == pytest.approx(identity, abs=1e-5)
@@ -147,27 +146,12 @@ def test_the_canonical_legs_are_the_filmed_ones(body: Body) -> None:
     assert sole == pytest.approx(old, abs=1e-6)
 
 
-def test_landmarks_move_with_their_joints(body: Body) -> None:
-    """In the posed body they are where they were."""
-    motion = motion_of(body, CLOSED_LEGS)
-    landmarks_m = torch.rand(LANDMARK_COUNT, 3, generator=torch.Generator().manual_seed(0))
-    rest = rest_with_filmed_legs(body, motion, landmarks_m, np.ones(FRAMES, dtype=bool))
-    old, new = canonical_to_world(body, motion)[0], canonical_to_world(rest.body, rest.motion)[0]
-    knee = next(landmark for landmark in LANDMARKS if landmark.name == "ankle")
-    for index, joint in zip(knee.indices, (body.joint("LeftLeg"), body.joint("RightLeg")), strict=True):
-        before = old[joint, :3, :3] @ landmarks_m[index] + old[joint, :3, 3]
-        after = new[joint, :3, :3] @ rest.landmarks_m[index] + new[joint, :3, 3]
-        assert after.numpy() == pytest.approx(before.numpy(), abs=1e-5)
-
-
 def test_only_the_chosen_frames_count(body: Body) -> None:
     """The legs of a frame that is not used are not part of the mean."""
     motion = motion_of(body, CLOSED_LEGS)
     rotations = motion.rotations_wxyz.copy()
     rotations[0] = motion_of(body, {"LeftUpLeg": (0.8, 0.0, 0.0)}).rotations_wxyz[0]
     used = np.array([False, True, True])
-    rest = rest_with_filmed_legs(
-        body, motion.with_pose(rotations, motion.root_translation_m), torch.zeros(LANDMARK_COUNT, 3), used
-    )
-    expected = rest_with_filmed_legs(body, motion, torch.zeros(LANDMARK_COUNT, 3), used)
+    rest = rest_with_filmed_legs(body, motion.with_pose(rotations, motion.root_translation_m), used)
+    expected = rest_with_filmed_legs(body, motion, used)
     assert rest.body.joints_m == pytest.approx(expected.body.joints_m, abs=1e-6)

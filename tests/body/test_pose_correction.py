@@ -6,6 +6,7 @@ from pipeline.body.body import canonical_to_world, load_anny
 from pipeline.body.pose_correction import (
     TYPICAL_CORRELATION_TIME_S,
     PoseCorrection,
+    corrections_between,
     correlation_time_s,
     interpolate_corrections,
 )
@@ -38,6 +39,16 @@ def test_applied_corrections_equal_the_optimised_ones(body, correction):
     again = canonical_to_world(body, correction.apply(correction.motion))
     optimised = correction.canonical_to_world(torch.arange(4)).detach()
     torch.testing.assert_close(again, optimised, atol=1e-5, rtol=0)
+
+
+def test_corrections_between_two_motions_are_those_that_were_applied(body, correction):
+    with torch.no_grad():
+        correction.rotation_rad.normal_(std=0.05)
+        correction.shift_m.normal_(std=0.01)
+    found = corrections_between(body, correction.motion, correction.apply(correction.motion))
+    expected = torch.cat([correction.rotation_rad.flatten(1), correction.shift_m], dim=1).detach()
+    assert found.shape == (4, correction.size)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
 def test_corrections_reach_the_frames_between_and_no_others(body, correction):

@@ -9,30 +9,21 @@ import torch
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.fit.linear_body import descendant_matrix
 from pipeline.body.pose_correction import PoseCorrection
-from pipeline.geometry.camera import Camera, project
-from pipeline.geometry.rotation import axis_angle_to_quaternion, quaternion_multiply
+from pipeline.geometry.camera import project
 from pipeline.geometry.skinning import linear_blend_skinning
+from pipeline.mesh.correction_prior import drifting_prior
 from pipeline.mesh.pose_alignment import (
-    ROTATION_DRIFT_RAD_PER_SQRT_S,
-    ROTATION_STD_RAD,
-    SHIFT_DRIFT_M_PER_SQRT_S,
-    SHIFT_STD_M,
+    AlignedSurface,
     ImageEvidence,
     PoseOffsets,
     align_poses,
     normal_equations,
-    solve_drifting,
 )
 from pipeline.mesh.skin_transfer import SkinnedTopology, transfer_skin
-from pipeline.mesh.views import PosedView, render_posed_view
+from pipeline.mesh.views import PosedView
 from tests.mesh.capsule import capsule_body
 from tests.mesh.egg import PATTERN
-
-FRAMES = 7
-JOINTS = 2
-WORLD_TO_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32)
-WORLD_TO_CAMERA[:3, 3] = [0.0, 0.5, 1.6]
-CAMERA = Camera(330.0, 330.0, 100.0, 70.0, 200, 140, WORLD_TO_CAMERA)
+from tests.mesh.swaying_capsule import CAMERA, FRAMES, JOINTS, disturbed, render_views, swaying_motion
 
 
 @pytest.fixture(scope="module")
@@ -47,40 +38,12 @@ def skin(body: Body) -> SkinnedTopology:
 
 @pytest.fixture(scope="module")
 def true_motion(body: Body) -> Motion:
-    """The capsule sways about the vertical axis while the hand bends."""
-    phase = np.linspace(0.0, 2.0, FRAMES)
-    turns = np.zeros((FRAMES, JOINTS, 3), np.float32)
-    turns[:, 0, 1], turns[:, 1, 2] = 0.4 * np.sin(phase), 0.5 * np.cos(phase)
-    rotations = axis_angle_to_quaternion(torch.from_numpy(turns)).numpy()
-    return Motion(np.arange(FRAMES, dtype=np.int32), phase / 4.0, rotations, np.tile(body.joints_m[:1], (FRAMES, 1)))
+    return swaying_motion(body)
 
 
 @pytest.fixture(scope="module")
 def views(body: Body, skin: SkinnedTopology, true_motion: Motion) -> list[PosedView]:
     return render_views(body, skin, true_motion)
-
-
-def render_views(body: Body, skin: SkinnedTopology, motion: Motion) -> list[PosedView]:
-    blank = torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.uint8)
-    views = []
-    for pose in canonical_to_world(body, motion):
-        view = PosedView(blank[..., None].expand(-1, -1, 3), blank, CAMERA, pose)
-        with torch.no_grad():
-            image, alpha, _ = render_posed_view(torch.from_numpy(body.vertices), skin, view, PATTERN)
-        straight = (image / alpha[..., None].clamp_min(1e-3)).clamp(0.0, 1.0)
-        views.append(replace(view, image=(255 * straight).round().byte(), mask=(255 * alpha).round().byte()))
-    return views
-
-
-def disturbed(motion: Motion) -> tuple[Motion, np.ndarray, np.ndarray]:
-    """Poses that are off by two degrees a joint and a centimetre, slowly changing; with the errors."""
-    phase = np.linspace(0.3, 2.0, FRAMES)[:, None, None]
-    turn_rad = np.radians(2.0) * np.sin(phase + np.arange(JOINTS * 3).reshape(1, JOINTS, 3))
-    shift_m = 0.01 * np.sin(phase[:, :, 0] + np.arange(3)) * [1.0, 1.0, 0.3]
-    turned = quaternion_multiply(
-        torch.from_numpy(motion.rotations_wxyz), axis_angle_to_quaternion(torch.from_numpy(turn_rad).float())
-    )
-    return motion.with_pose(turned.numpy(), motion.root_translation_m + shift_m), turn_rad, shift_m
 
 
 def remaining_error(body: Body, offsets: PoseOffsets, wrong: Motion, true_motion: Motion) -> tuple[float, float]:
@@ -98,7 +61,8 @@ def remaining_error(body: Body, offsets: PoseOffsets, wrong: Motion, true_motion
 
 def aligned(body: Body, skin: SkinnedTopology, views: list[PosedView], wrong: Motion) -> PoseOffsets:
     start = PoseCorrection(body, wrong)
-    return align_poses(torch.from_numpy(body.vertices), skin, PATTERN, views, start, iterations=2)
+    surface = AlignedSurface.with_colours(torch.from_numpy(body.vertices), skin, PATTERN)
+    return align_poses(surface, views, start, drifting_prior(wrong.time_s, start.size), iterations=2)
 
 
 def test_disturbed_poses_are_found_again(
@@ -164,30 +128,6 @@ def test_subtrees_hold_a_joint_and_all_below_it() -> None:
     parents = np.array([-1, 0, 1, 0])
     expected = [[1, 0], [1, 1], [1, 1], [1, 0]]
     np.testing.assert_array_equal(descendant_matrix(parents.tolist())[[0, 1]].T, expected)
-
-
-def test_the_banded_solution_is_that_of_the_dense_system() -> None:
-    random = np.random.default_rng(0)
-    count, size, time_s = 4, 6, np.array([0.0, 0.1, 0.4, 0.5])
-    factors = random.normal(size=(count, 9, size)) * 40.0
-    matrices, vectors = factors.transpose(0, 2, 1) @ factors, random.normal(size=(count, size)) * 50.0
-    present = random.normal(size=(count, size)) * 0.01
-    std = np.array([ROTATION_STD_RAD] * 3 + [SHIFT_STD_M] * 3)
-    drift = np.array([ROTATION_DRIFT_RAD_PER_SQRT_S] * 3 + [SHIFT_DRIFT_M_PER_SQRT_S] * 3)
-
-    rows = [np.kron(np.eye(count), np.diag(1.0 / std))]
-    for k in range(count - 1):
-        row = np.zeros((size, count * size))
-        row[:, k * size : (k + 1) * size] = -np.diag(1.0 / (drift * np.sqrt(time_s[k + 1] - time_s[k])))
-        row[:, (k + 1) * size : (k + 2) * size] = -row[:, k * size : (k + 1) * size]
-        rows.append(row)
-    prior = np.concatenate(rows)
-    dense = prior.T @ prior
-    right = vectors.ravel() - dense @ present.ravel()
-    for k in range(count):
-        dense[k * size : (k + 1) * size, k * size : (k + 1) * size] += matrices[k]
-    expected = np.linalg.solve(dense, right).reshape(count, size)
-    np.testing.assert_allclose(solve_drifting(matrices, vectors, present, time_s), expected, rtol=1e-8, atol=1e-12)
 
 
 def test_a_view_without_the_person_keeps_its_neighbours_correction(

@@ -12,6 +12,8 @@ from pipeline.geometry.camera import Camera, pixel_footprint_m
 from pipeline.geometry.mesh import Mesh
 from pipeline.mesh.skin_transfer import transfer_skin
 from pipeline.mesh.views import (
+    COLOUR_LOSS_SCALE,
+    HUBER_DELTA,
     accumulate_face_errors,
     composite_target,
     crop_posed_view,
@@ -19,7 +21,6 @@ from pipeline.mesh.views import (
     render_posed_view,
     sampled_losses,
     silhouette_iou,
-    view_losses,
 )
 from tests.mesh.egg import CAMERA, DISTANCE_M, PATTERN, Pattern, Views
 
@@ -84,7 +85,10 @@ def test_losses_of_all_lattices_add_up_to_those_of_the_whole_view(
 
     def whole(vertices: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         image, alpha, _ = render_posed_view(vertices, skin, view, shader)
-        return view_losses(image, alpha, view, background)
+        target, mask = composite_target(view, background)
+        composited = image + (1.0 - alpha[..., None]) * background
+        colour_loss = COLOUR_LOSS_SCALE * torch.nn.functional.huber_loss(composited, target, delta=HUBER_DELTA)
+        return colour_loss, (alpha - mask).abs().mean()
 
     parts = [
         gradients(partial(sampled_losses, skin=skin, view=view, shader=shader, background=background, lattice=lattice))

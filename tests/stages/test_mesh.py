@@ -23,7 +23,7 @@ from pipeline.geometry.surface import isosurface
 from pipeline.io.image import read_rgb, write_gray, write_rgb
 from pipeline.io.npz import load_npz, save_npz
 from pipeline.mesh.files import load_mesh
-from pipeline.mesh.pose_refit import RefittedPoses
+from pipeline.mesh.pose_alignment import AlignedSurface
 from pipeline.mesh.settings import MeshSettings
 from pipeline.mesh.skin_transfer import build_skinned_topology, transfer_skin
 from pipeline.mesh.vertex_optimisation import RefinementInputs
@@ -85,8 +85,7 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
     """Folders of the preceding stages: a body that turns around once, and frames of the thicker capsule."""
     monkeypatch.setattr(mesh_stage, "load_field", lambda path: CapsuleField())
     monkeypatch.setattr(mesh_stage, "load_occupancy", lambda path: FullOccupancy())
-    monkeypatch.setattr(mesh_stage, "load_observations", lambda *_: (None, None))
-    monkeypatch.setattr(mesh_stage, "refit_poses", refit_to(lambda motion: motion, 0.0))
+    monkeypatch.setattr(mesh_stage, "align_outlines", align_to(lambda motion: motion))
     folders = {name: tmp_path / name for name in ("frames", "body", "field")}
     for folder in (*folders.values(), folders["frames"] / "images", folders["frames"] / "masks"):
         folder.mkdir()
@@ -101,20 +100,28 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
     save_body(folders["body"] / "body.npz", body)
     save_camera(folders["body"] / "camera.npz", CAMERA)
     save_npz(folders["body"] / SCORES_NPZ, {"usable": np.ones(FRAMES, dtype=bool)})
-    save_motion(folders["field"] / "motion.npz", motion)
+    for name in ("body", "field"):
+        save_motion(folders[name] / "motion.npz", motion)
     save_capture(capture_in(folders["frames"]))
     render_frames(folders["frames"], thick, body, motion)
     return folders
 
 
-def refit_to(change: Callable[[Motion], Motion], iou_gain: float) -> Callable[..., RefittedPoses]:
-    """A second fit with a known result; a capsule has no joints to fit. tests/mesh/test_pose_refit.py fits a person."""
+def align_to(change: Callable[[Motion], Motion]) -> Callable[..., Motion]:
+    """An alignment with a known result; tests/mesh/test_outline_alignment.py aligns a capsule with a hand."""
 
-    def refit(surface: Body, motion: Motion, is_fixed: np.ndarray, *_: object) -> RefittedPoses:
-        assert len(surface.vertices) == len(surface.skin_weights)
-        return RefittedPoses(change(motion), np.zeros(len(is_fixed)), np.full(len(is_fixed), iou_gain))
+    def align(
+        surface: AlignedSurface,
+        body: Body,
+        motions: tuple[Motion, Motion],
+        is_known: np.ndarray,
+        views: Sequence[PosedView],
+    ) -> Motion:
+        assert surface.shader is None
+        assert len(views) == (~is_known).sum()
+        return change(motions[1])
 
-    return refit
+    return align
 
 
 def shifted(motion: Motion, rows: Sequence[int], shift_m: float) -> Motion:
@@ -233,11 +240,11 @@ def test_the_limit_of_faces_holds(inputs: dict[str, Path], tmp_path: Path) -> No
 def test_validation_frames_decide_on_the_refitted_motion(
     inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shift_m: float, kept_m: float
 ) -> None:
-    """Frames 0, 4, 8 are 5 cm off; the second fit moves them to the truth, or farther away."""
+    """Frames 0, 4, 8 are 5 cm off; the alignment moves them to the truth, or farther away."""
     path, free = inputs["field"] / "motion.npz", (0, 4, 8)
     truth = load_motion(path)
     save_motion(path, shifted(truth, free, 0.05))
-    monkeypatch.setattr(mesh_stage, "refit_poses", refit_to(lambda motion: shifted(motion, free, shift_m), 0.0))
+    monkeypatch.setattr(mesh_stage, "align_outlines", align_to(lambda motion: shifted(motion, free, shift_m)))
     take_warnings()
     metrics = run(inputs, tmp_path, CONFIG.model_copy(update={"rounds": 0}), SETTINGS)
     np.testing.assert_array_equal(
@@ -247,22 +254,21 @@ def test_validation_frames_decide_on_the_refitted_motion(
     assert len(take_warnings()) == (0 if kept_m == 0.0 else 1)
 
 
-@pytest.mark.parametrize(("iou_gain", "moved_m"), [(0.01, 0.5), (-0.01, 0.0)])
+@pytest.mark.parametrize(("shift_m", "kept_m"), [(-0.05, 0.0), (0.05, 0.05)])
 def test_frames_far_from_training_frames_follow_their_own_outline(
-    inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, iou_gain: float, moved_m: float
+    inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shift_m: float, kept_m: float
 ) -> None:
-    """Frame 8 and later are held out; from 9 s on nothing is learnt. Validation frame 4 rejects the second fit."""
+    """From frame 9 on nothing is learnt, and poses are 5 cm off; validation frame 4 is right and rejects the change."""
     arrays = load_npz(inputs["frames"] / "frames.npz")
     split = np.where(np.arange(FRAMES) < 8, arrays["split"], 2).astype(np.uint8)
     np.savez(inputs["frames"] / "frames.npz", **(arrays | {"split": split}))
-    motion = load_motion(inputs["field"] / "motion.npz")
-    late = replace(motion, time_s=motion.time_s + 9.0 * (np.arange(FRAMES) >= 9))
-    save_motion(inputs["field"] / "motion.npz", late)
-    everywhere = range(FRAMES)
-    monkeypatch.setattr(mesh_stage, "refit_poses", refit_to(lambda old: shifted(old, everywhere, 0.5), iou_gain))
+    truth, late = load_motion(inputs["field"] / "motion.npz"), range(9, FRAMES)
+    after_a_gap = replace(truth, time_s=truth.time_s + 9.0 * (np.arange(FRAMES) >= 9))
+    save_motion(inputs["field"] / "motion.npz", shifted(after_a_gap, late, 0.05))
+    monkeypatch.setattr(mesh_stage, "align_outlines", align_to(lambda old: shifted(old, range(FRAMES), shift_m)))
     run(inputs, tmp_path, CONFIG.model_copy(update={"rounds": 0}), SETTINGS)
-    moved = load_motion(tmp_path / "motion.npz").root_translation_m - motion.root_translation_m
-    np.testing.assert_allclose(moved[:, 0], np.where(np.arange(FRAMES) >= 9, moved_m, 0.0), atol=1e-6)
+    off_m = load_motion(tmp_path / "motion.npz").root_translation_m - truth.root_translation_m
+    np.testing.assert_allclose(off_m[:, 0], np.where(np.arange(FRAMES) >= 9, kept_m, 0.0), atol=1e-6)
 
 
 def test_the_exported_skin_weights_are_those_of_the_refinement(tmp_path: Path) -> None:

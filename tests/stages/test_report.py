@@ -26,7 +26,7 @@ CONFIG = Config(
     turntable_views=4,
     fit_held_out_poses=True,
 )
-SETTINGS = ReportSettings(turntable_height_px=64, clay_head_height_px=64, pose_fit_steps=5)
+SETTINGS = ReportSettings(turntable_height_px=64, clay_head_height_px=64)
 QUICK = Config(samples_per_pixel_side=1, max_page_frames=1, turntable_views=2, score_unrefined_mesh=False)
 
 

@@ -119,7 +119,7 @@ class Objective:
 
     px_per_m: image scale at the person in each frame (`compute_px_per_m`), constant during a minimisation.
     motion_std: standard deviations of `motion_residuals`; None: `default_motion_std`, which admits fast motion.
-    contact, free_frames: need fixed shared parameters. Frames that are not free keep their pose; None: all are free.
+    contact: needs fixed shared parameters.
     """
 
     model: LinearBody
@@ -132,7 +132,6 @@ class Objective:
     contour: Contour | None = None
     motion_std: Float[Tensor, "p"] | None = None
     contact: Contact | None = None
-    free_frames: Bool[Tensor, "n"] | None = None
 
     def __call__(self, state: FitState) -> NormalEquations:
         """Return the normal equations of all terms at a state."""
@@ -146,8 +145,6 @@ class Objective:
             term.add_to(system, linearisation)
         if shared_count:
             system.fix_parameters(self._free_shared_mask(shape_count))
-        if self.free_frames is not None:
-            system.fix_frames(self.free_frames)
         return system
 
     def image_hessian(self, prior: PosePrior, state: FitState) -> Float[Tensor, "n p p"]:

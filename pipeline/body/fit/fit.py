@@ -369,8 +369,6 @@ def _result(
         landmark_error_px=landmark_errors_px(context.regressor, model, state, observations),
         silhouette_iou=silhouette_iou,
         left_right_swapped=left_right_swapped,
-        observations=observations,
-        landmarks_m=context.regressor.points(model, state.landmark_offsets_m).rest_m[0],
         focal_relative_std=0.0,
         height_std_m=0.0,
         lean_deg=lean_deg(model, state),

@@ -170,16 +170,6 @@ def landmark_regressor(default: LinearBody) -> LandmarkRegressor:
     return LandmarkRegressor(tuple(joints), tuple(vertices), offset, skin_weights, offset_jacobian)
 
 
-def fixed_landmarks(positions_m: Float[Tensor, "l 3"]) -> LandmarkRegressor:
-    """Return the regressor of a body of fixed shape from the positions of the landmarks on its A-pose."""
-    skin_weights = torch.zeros(LANDMARK_COUNT, len(ACTIVE_JOINTS), dtype=torch.float64)
-    for landmark in LANDMARKS:
-        for side, index in enumerate(landmark.indices):
-            skin_weights[index, ACTIVE_JOINTS.index(landmark_joint(landmark, side))] = 1.0
-    no_offsets = torch.zeros(LANDMARK_COUNT, 3, LANDMARK_OFFSET_COUNT, dtype=torch.float64)
-    return LandmarkRegressor((None,) * LANDMARK_COUNT, (None,) * LANDMARK_COUNT, positions_m, skin_weights, no_offsets)
-
-
 def landmark_joint(landmark: Landmark, side: int) -> str:
     """Return the name of the joint that a landmark moves with; side: 0 for the left or central one, 1 for the right."""
     return _on_side(landmark.parent_joint, side)

@@ -90,14 +90,6 @@ class NormalEquations:
         self.shared_hessian[~free, ~free] = 1.0
         self.shared_gradient[~free] = 0.0
 
-    def fix_frames(self, free: Bool[Tensor, "n"]) -> None:
-        """Remove the frames that are not free from a system without shared parameters: their step becomes zero."""
-        self.frame_hessian[~free] = torch.eye(self.frame_hessian.shape[-1], dtype=torch.float64)
-        self.frame_gradient[~free] = 0.0
-        for lag, coupling in ((1, self.next_frame_coupling), (2, self.second_next_frame_coupling)):
-            coupling[~free] = 0.0
-            coupling[:-lag][~free[lag:]] = 0.0
-
 
 def robust_weights(
     system: NormalEquations, squared: Float[Tensor, "*n"], cutoff: float, share: Float[Tensor, "*n"] | float = 1.0

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
 
 from pipeline.body.body import Body
 from pipeline.body.fit.camera_parameters import apply_intrinsics_delta, project_with_jacobian
@@ -26,8 +25,6 @@ class FitResult:
 
     landmark_error_px, silhouette_iou: of each frame; nan without landmarks or mask.
     left_right_swapped: by body part, the frames whose landmarks were swapped.
-    observations: the landmarks that the poses were fitted to, left-right swaps corrected.
-    landmarks_m: their places on the A-pose of the body with the fitted finger curl, canonical frame.
     focal_relative_std, height_std_m: standard deviations from the curvature of the energy.
     contradicting_focal_log: logarithm of the focal length that a turn shows over the supplied one, if they contradict;
         0 if they do not, or none was supplied.
@@ -41,8 +38,6 @@ class FitResult:
     landmark_error_px: Float[np.ndarray, "n"]
     silhouette_iou: Float[np.ndarray, "n"]
     left_right_swapped: dict[str, Bool[np.ndarray, "n"]]
-    observations: Observations
-    landmarks_m: Float[Tensor, "l 3"]
     focal_relative_std: float
     height_std_m: float
     lean_deg: float

@@ -267,12 +267,10 @@ def match_silhouettes(
     state: FitState,
     observations: Observations,
     windows: Sequence[MaskWindow | None],
-    is_clothed: bool = False,
 ) -> tuple[Contour, Float[np.ndarray, "n"]]:
     """Return the silhouette pairs of the current body, and each frame's IoU with its mask (nan without a mask).
 
     windows: masks of the frames (`crop_mask_window`); None without a mask.
-    is_clothed: whether the body has the clothes and the hair of the masks, so that all pairs have the same weight.
     """
     camera = apply_intrinsics_delta(observations.camera, state.intrinsics_delta)
     posed = posed_body(model, state)
@@ -299,9 +297,8 @@ def match_silhouettes(
         barycentric[frame, :count] = torch.from_numpy(body_raster.barycentric[rows, columns]).double()
         target[frame, :count] = torch.from_numpy(pairs.target / window.scale + [window.left_px, window.top_px])
         normal[frame, :count] = torch.from_numpy(pairs.normal).double()
-        pair_weight = (pairs.weight > 0).astype(np.float64) if is_clothed else pairs.weight
         shown = joint_weight[frame, face_joint[face]]
-        weight[frame, :count] = torch.from_numpy(pair_weight * (FRAME_WEIGHT / max(used, 1))) * shown
+        weight[frame, :count] = torch.from_numpy(pairs.weight * (FRAME_WEIGHT / max(used, 1))) * shown
 
     def match_chunk(start: int) -> None:
         chunk = windows[start : start + SKIN_CHUNK]

@@ -2,7 +2,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-import torch
 
 from pipeline.body.body import Body, load_anny
 from pipeline.body.fit.diagnostics import (
@@ -19,7 +18,6 @@ from pipeline.body.fit.diagnostics import (
 from pipeline.body.fit.landmark_regressor import landmark_regressor
 from pipeline.body.fit.linear_body import linearise_body
 from pipeline.body.fit.result import FitResult, landmark_errors_px
-from pipeline.body.fit.state import Observations
 from pipeline.geometry.camera import Camera
 from tests.body.acting import synthetic_recording
 
@@ -33,11 +31,6 @@ def default_body() -> Body:
     return load_anny().at_shape(load_anny().shape_defaults)
 
 
-@cache
-def turn_observations() -> Observations:
-    return synthetic_recording(load_anny(), frames=FRAMES).observations(CAMERA)
-
-
 def result(**changes: object) -> FitResult:
     """Return a good fit of a person at 2 m, about 460 pixels tall."""
     fields: dict[str, object] = {
@@ -48,8 +41,6 @@ def result(**changes: object) -> FitResult:
         "landmark_error_px": np.full(FRAMES, 2.0),
         "silhouette_iou": np.full(FRAMES, 0.93),
         "left_right_swapped": {"whole body": np.zeros(FRAMES, dtype=bool), "legs": np.zeros(FRAMES, dtype=bool)},
-        "observations": turn_observations(),
-        "landmarks_m": torch.zeros(41, 3),
         "focal_relative_std": 0.1,
         "height_std_m": 0.05,
         "lean_deg": 0.5,

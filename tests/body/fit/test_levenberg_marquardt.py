@@ -58,16 +58,6 @@ def test_fixed_parameters_have_zero_step() -> None:
     assert shared_step[0] != 0.0
 
 
-def test_fixed_frames_have_zero_step_and_the_others_solve_the_rest() -> None:
-    system, dense, gradient = random_system(0)
-    system.fix_frames(torch.tensor([True, False, True, True, False]))
-    free = np.repeat([True, False, True, True, False], PARAMETERS)
-    frame_step, _ = solve(system, 0.0)
-    assert (frame_step[[1, 4]] == 0.0).all()
-    expected = -np.linalg.solve(dense[np.ix_(free, free)], gradient[free])
-    assert np.allclose(frame_step.flatten().numpy()[free], expected, atol=1e-7)
-
-
 def test_minimise_solves_the_rosenbrock_problem() -> None:
     """Rosenbrock's function, residuals (10 (y - x^2), 1 - x), minimum at (1, 1)."""
 

@@ -11,7 +11,7 @@ from pipeline.body.fit.result import FitResult
 from pipeline.body.fit.silhouette_icp import MaskWindow, crop_mask_window
 from pipeline.core.progress import take_warnings
 from tests.body.acting import SyntheticRecording, fitted_joints_m, joint_errors_m, synthetic_recording
-from tests.body.fit.test_diagnostics import FRAMES, result
+from tests.body.fit.test_diagnostics import CAMERA, FRAMES, result
 
 PASSING = slice(8, 12)
 """Frames of a turn of 24 in which the detector takes a passer-by for the person."""
@@ -74,11 +74,12 @@ def count_fits(monkeypatch: pytest.MonkeyPatch, first: FitResult) -> tuple[int, 
 
     monkeypatch.setattr(rejection, "fit_body", fit)
     windows: list[MaskWindow | None] = [crop_mask_window(np.full((4, 4), 255, np.uint8))] * FRAMES
-    found = fit_body_without_others(load_anny(), first.observations, windows, FitOptions())
-    for observations, left in seen[1:]:
+    observations = synthetic_recording(load_anny(), FRAMES).observations(CAMERA)
+    found = fit_body_without_others(load_anny(), observations, windows, FitOptions())
+    for kept, left in seen[1:]:
         gone = np.array([window is None for window in left])
-        np.testing.assert_array_equal((observations.confidence == 0.0).all(1).numpy(), gone)
-        np.testing.assert_array_equal((observations.confidence_3d == 0.0).all(1).numpy(), gone)
+        np.testing.assert_array_equal((kept.confidence == 0.0).all(1).numpy(), gone)
+        np.testing.assert_array_equal((kept.confidence_3d == 0.0).all(1).numpy(), gone)
         np.testing.assert_array_equal(found.silhouette_iou == 0.0, gone)
     return len(seen), found
 
