@@ -63,7 +63,7 @@ from pipeline.template.face.filmed_landmarks import FilmedFaces
 
 CHECKPOINT = "checkpoint_round.safetensors"
 DEFAULT_SETTINGS = MeshSettings()
-MOTIONS = ("field", "refitted")
+MOTIONS = ("interpolated", "aligned")
 EVIDENCE_FRAMES = 40
 """Training frames that tell how well the surface is seen."""
 JUDGED_FRAMES = 12
@@ -167,7 +167,7 @@ def run(
     save_dense_mesh(out, move_along(state.mesh, mesh, relaxed.mesh))
     mesh, skin = relaxed.mesh, relaxed.skin
     write_results(out, mesh, skin, shader)
-    final_motion, motion_metrics = refit_motion(
+    final_motion, motion_metrics = align_other_frames(
         capture, inputs, (body, motion), (mesh, skin, shader), aligned.validation
     )
     save_motion(out / "motion.npz", final_motion)
@@ -274,7 +274,7 @@ def load_views(
     ]
 
 
-def refit_motion(
+def align_other_frames(
     capture: Capture,
     inputs: Mapping[str, Path],
     posed_body: tuple[Body, Motion],
@@ -298,26 +298,26 @@ def refit_motion(
     views = load_views(capture, np.flatnonzero(~is_trained), motion, inputs, body, MAX_OUTLINE_PX)
     surface = AlignedSurface.without_colours(torch.from_numpy(mesh.vertices), skin)
     fitted = load_motion(inputs["body"] / "motion.npz")
-    refitted = align_outlines(surface, body, (fitted, motion), is_trained, views)
+    aligned = align_outlines(surface, body, (fitted, motion), is_trained, views)
 
     is_far = is_far_from(motion.time_s, motion.time_s[is_trained])
     far_views = [view for view, far in zip(views, is_far[~is_trained], strict=True) if far]
-    moved = in_other_poses(far_views, canonical_to_world(body, refitted.select(np.flatnonzero(is_far))))
+    moved = in_other_poses(far_views, canonical_to_world(body, aligned.select(np.flatnonzero(is_far))))
     use_far = silhouette_iou(mesh, skin, moved) > silhouette_iou(mesh, skin, far_views)
     positions = capture.positions(VALIDATION)
     positions = positions[evenly_spaced(len(positions), len(validation))]
     scores = [
         score_motion(mesh, skin, shader, validation, canonical_to_world(body, poses.select(positions)))
-        for poses in (motion, refitted)
+        for poses in (motion, aligned)
     ]
     use_near = scores[1].is_better_than(scores[0])
     if not use_near:
-        warn("frames next to training frames keep interpolated poses: validation frames prefer them to a second fit")
+        warn("frames next to training frames keep interpolated poses: validation frames prefer them")
     use = ~is_trained & np.where(is_far, use_far, use_near)
-    return select_poses(use, refitted, motion), {
+    return select_poses(use, aligned, motion), {
         **{f"{name}_motion_silhouette_iou": score.silhouette_iou for name, score in zip(MOTIONS, scores, strict=True)},
         **{f"{name}_motion_psnr_db": score.psnr_db for name, score in zip(MOTIONS, scores, strict=True)},
-        "refitted_frames": float(use.sum()),
+        "aligned_frames": float(use.sum()),
     }
 
 

@@ -34,7 +34,7 @@ class FinishedRun:
 
     Attributes:
         motion: of every selected frame; training frames have the corrections of the field stage, the others were
-            refitted through the mesh.
+            aligned to the outline of the mesh.
         field_renderer: renders the field with `camera`.
         refined_canonical_to_world: skinning matrices of `motion`.
         fitted_canonical_to_world: skinning matrices of the body stage's motion.

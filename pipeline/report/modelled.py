@@ -135,13 +135,13 @@ def _faces(manifests: Manifests) -> ModelledPart:
     return ModelledPart("Faces", f"{faces:,} of {before:,}", reason, cost)
 
 
-def _second_fit(manifests: Manifests) -> ModelledPart:
+def _aligned_outlines(manifests: Manifests) -> ModelledPart:
     mesh = manifests["mesh"]
-    field, refitted = (_metric(mesh, f"{name}_motion_psnr_db") for name in ("field", "refitted"))
-    count = int(_metric(mesh, "refitted_frames"))
+    interpolated, aligned = (_metric(mesh, f"{name}_motion_psnr_db") for name in ("interpolated", "aligned"))
+    count = int(_metric(mesh, "aligned_frames"))
     choice = f"kept for {count} frames that were not trained on" if count else "dropped"
-    reason = f"validation frames: {field:.2f} dB with interpolated poses, {refitted:.2f} dB with a second fit"
-    return ModelledPart("Second fit of poses", choice, reason, "part of the mesh's time")
+    reason = f"validation frames: {interpolated:.2f} dB with interpolated poses, {aligned:.2f} dB so"
+    return ModelledPart("Poses by the outline", choice, reason, "part of the mesh's time")
 
 
 def _texture_size(manifests: Manifests) -> ModelledPart:
@@ -205,7 +205,7 @@ _DESCRIPTIONS: tuple[Callable[[Manifests], ModelledPart | None], ...] = (
     _voxel_attention,
     _mesh_rounds,
     _faces,
-    _second_fit,
+    _aligned_outlines,
     _texture_size,
     _light,
     _specular,

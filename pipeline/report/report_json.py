@@ -35,7 +35,7 @@ PROTOCOL = (
     "decision used them. Their poses are fitted to landmarks and silhouettes, never to colours: the body stage fits "
     "every frame, and the common shape and camera, to the landmarks and masks of all frames; the mesh stage aligns the "
     "outline of the mesh, in frames that are not trained on, to that of the mask, tied to the training frames next to "
-    "them, whose poses are learnt from colours. Where validation frames reject this (stages.mesh.refitted_frames), "
+    "them, whose poses are learnt from colours. Where validation frames reject this (stages.mesh.aligned_frames), "
     "pose corrections are interpolated in time between training frames and fade to zero away from them. Frames are "
     "composited on white with the mask of the frames stage, so an error of that mask costs nothing; renders are "
     "composited with their own alpha; both are rounded to 8 bits. psnr, ssim and flip (67 pixels a degree, lower is "

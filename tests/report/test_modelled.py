@@ -40,9 +40,9 @@ METRICS: dict[str, dict[str, float | None]] = {
         "accepted_rounds": 2.0,
         "initial_validation_psnr_db": 25.11,
         "refined_validation_psnr_db": 30.57,
-        "field_motion_psnr_db": 30.571,
-        "refitted_motion_psnr_db": 30.367,
-        "refitted_frames": 0.0,
+        "interpolated_motion_psnr_db": 30.571,
+        "aligned_motion_psnr_db": 30.367,
+        "aligned_frames": 0.0,
     },
     "texture": {
         "texture_px": 1024.0,
@@ -107,8 +107,8 @@ def test_optional_parts_state_decision_figure_and_cost():
     assert found["Pose corrections"].choice == "kept"
     assert "29.34 dB" in found["Pose corrections"].reason
     assert "34.01 dB" in found["Pose corrections"].reason
-    assert found["Second fit of poses"].choice == "dropped"
-    assert "30.37 dB" in found["Second fit of poses"].reason
+    assert found["Poses by the outline"].choice == "dropped"
+    assert "30.37 dB" in found["Poses by the outline"].reason
     assert found["Light of the video"].choice == "removed from the texture"
     assert "29 %" in found["Light of the video"].reason
     assert "9.4 standard errors" in found["Light of the video"].reason

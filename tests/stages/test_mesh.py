@@ -237,7 +237,7 @@ def test_the_limit_of_faces_holds(inputs: dict[str, Path], tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(("shift_m", "kept_m"), [(-0.05, 0.0), (0.05, 0.05)])
-def test_validation_frames_decide_on_the_refitted_motion(
+def test_validation_frames_decide_on_the_aligned_motion(
     inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shift_m: float, kept_m: float
 ) -> None:
     """Frames 0, 4, 8 are 5 cm off; the alignment moves them to the truth, or farther away."""
@@ -250,7 +250,7 @@ def test_validation_frames_decide_on_the_refitted_motion(
     np.testing.assert_array_equal(
         load_motion(tmp_path / "motion.npz").root_translation_m, shifted(truth, free, kept_m).root_translation_m
     )
-    assert metrics["refitted_frames"] == (3.0 if kept_m == 0.0 else 0.0)
+    assert metrics["aligned_frames"] == (3.0 if kept_m == 0.0 else 0.0)
     assert len(take_warnings()) == (0 if kept_m == 0.0 else 1)
 
 
