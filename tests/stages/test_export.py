@@ -10,12 +10,16 @@ import pytest
 import torch
 from pydantic import ValidationError
 
+from pipeline.avatar.finished_run import load_textured_avatar
 from pipeline.body.body import canonical_to_world
 from pipeline.core.errors import UserError
 from pipeline.geometry.atlas import Atlas
-from pipeline.geometry.skinning import linear_blend_skinning
+from pipeline.geometry.creases import find_creases
+from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.skinning import linear_blend_skinning, top_k_weights
 from pipeline.io.glb import GlbFile
 from pipeline.io.image import read_gray, read_rgb, to_float, write_gray, write_rgb
+from pipeline.mesh.files import MeshArtifact, save_mesh
 from pipeline.template.files import TEMPLATE_NPZ, save_template
 from pipeline.template.regions import template_quads
 from pipeline.texture.files import TextureArtifact, TextureFormat, load_texture, save_texture
@@ -283,3 +287,30 @@ def test_a_body_of_a_model_file_is_not_wrapped(inputs: dict[str, Path], tmp_path
     save_template(texture, None)
     with pytest.raises(UserError, match="needs the built-in body"):
         EXPORT.run(inputs | {"texture": texture}, tmp_path, EXPORT.config(topology="template"))
+
+
+def test_the_glb_is_shaded_like_the_report(inputs: dict[str, Path], scene: PaintedScene, tmp_path: Path) -> None:
+    """A brim around the waist has sharp folds, where both sides have normals of their own."""
+    body = scene.body
+    vertices = body.vertices.copy()
+    waist = np.abs(vertices[:, 1] - 1.05) < 0.012
+    vertices[waist, 0] *= 1.5
+    vertices[waist, 2] *= 1.8
+    mesh = shutil.copytree(inputs["mesh"], tmp_path / "mesh")
+    folded = Mesh(vertices, body.faces)
+    assert find_creases(folded).on_fold().sum() > 40
+    save_mesh(mesh, MeshArtifact(folded, *top_k_weights(body.skin_weights), np.full_like(vertices, 0.5)))
+    (tmp_path / "export").mkdir()
+    EXPORT.run(inputs | {"mesh": mesh}, tmp_path / "export", EXPORT.config(face=False))
+    avatar = load_textured_avatar(mesh, inputs["texture"])
+    shown = Mesh(avatar.vertices.numpy(), avatar.faces.numpy())
+    player = Player(tmp_path / "export" / "avatar.glb")
+    attributes = player.json["meshes"][0]["primitives"][0]["attributes"]
+    written_m, written = (player.array(attributes[name]) for name in ("POSITION", "NORMAL"))
+    corners = avatar.faces.numpy().ravel()
+    vertex_of_uv = np.zeros(len(avatar.uv), dtype=int)
+    vertex_of_uv[avatar.faces_uv.numpy().ravel()] = corners
+    assert len(written) == len(vertex_of_uv)
+    np.testing.assert_allclose(written_m, shown.vertices[vertex_of_uv], atol=1e-5)
+    cosine = np.sum(written * shown.vertex_normals()[vertex_of_uv], axis=1)
+    assert cosine.min() > 0.999
