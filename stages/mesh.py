@@ -67,7 +67,7 @@ MOTIONS = ("interpolated", "aligned")
 EVIDENCE_FRAMES = 40
 """Training frames that tell how well the surface is seen."""
 JUDGED_FRAMES = 12
-"""Training frames on which the reduction of faces is judged if there are no validation frames."""
+"""Validation frames that decide; without any, training frames on which the reduction of faces is judged."""
 
 
 class Config(BaseConfig):
@@ -125,7 +125,8 @@ def run(
     capture = load_capture(inputs["frames"])
     motion = load_motion(inputs["field"] / "motion.npz")
     parts = usable_training_positions(capture, inputs["body"]), capture.positions(VALIDATION)
-    chosen = [part[evenly_spaced(len(part), config.max_frames)] for part in parts]
+    limits = config.max_frames, min(config.max_frames, JUDGED_FRAMES)
+    chosen = [part[evenly_spaced(len(part), limit)] for part, limit in zip(parts, limits, strict=True)]
     train, validation = (load_views(capture, part, motion, inputs, body, config.max_person_px) for part in chosen)
     if not train:
         again = rerun_command("frames", inputs["frames"])
@@ -331,7 +332,7 @@ def write_results(out: Path, mesh: Mesh, skin: SkinnedTopology, shader: torch.nn
 
 STAGE = Stage(
     "mesh",
-    version=29,
+    version=30,
     needs=("frames", "body", "field"),
     makes=(MESH_NPZ, DENSE_NPZ, "motion.npz", "preview.png"),
     config=Config,

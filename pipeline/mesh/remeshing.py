@@ -26,6 +26,8 @@ DECIMATION_FACE_RATIO = 3.0
 """Ratio of the number of faces after decimation to the number of faces after remeshing."""
 DETAIL_EDGE_RATIO = 0.5
 """Edge length at face and hands, in target edge lengths: fingers and lips are thinner than cloth is smooth."""
+TOLERANCE_RATIO, DETAIL_TOLERANCE_RATIO = 0.1, 0.15
+"""Distance by which remeshing to longer edges, and that of face and hands, may move the surface, in edge lengths."""
 EQUILATERAL_AREA_RATIO = 0.43
 """Area of an equilateral triangle divided by its squared edge length (0.433)."""
 MAX_FACE_EXCESS, MAX_UNIFORM_TRIALS = 0.02, 6
@@ -61,7 +63,8 @@ def _remesh_in_two_sizes(mesh: Mesh, target_edge_m: float, body: Body) -> Mesh:
         selected = detailed_faces(mesh, body) == detailed
         if selected.any():
             part = None if selected.all() else selected
-            mesh = remesh_isotropic(mesh, edge_m, iterations=3, selected=part, tolerance_m=0.15 * edge_m)
+            tolerance_m = DETAIL_TOLERANCE_RATIO * edge_m if detailed else None
+            mesh = remesh_isotropic(mesh, edge_m, iterations=3, selected=part, tolerance_m=tolerance_m)
     return mesh
 
 
@@ -129,7 +132,9 @@ def remesh_adaptively(
         return fine
     decimated_edge_m = settings.decimated_edge_ratio * target_edge_m
     return keep_if_repair_fails(
-        lambda: remesh_isotropic(fine, decimated_edge_m, iterations=3, selected=selected),
+        lambda: remesh_isotropic(
+            fine, decimated_edge_m, iterations=3, selected=selected, tolerance_m=TOLERANCE_RATIO * decimated_edge_m
+        ),
         fine,
         "the faces with a small image error are not decimated in this round",
     )
@@ -154,7 +159,9 @@ def remesh_uniformly(mesh: Mesh, detailed: Bool[np.ndarray, "f"], face_count: in
     trials: list[Mesh] = []
     for _ in range(MAX_UNIFORM_TRIALS):
         trial = keep_if_repair_fails(
-            partial(remesh_isotropic, mesh, edge_m, iterations=3, selected=~detailed),
+            partial(
+                remesh_isotropic, mesh, edge_m, iterations=3, selected=~detailed, tolerance_m=TOLERANCE_RATIO * edge_m
+            ),
             mesh,
             "the mesh is not remeshed to a uniform edge length",
         )

@@ -48,7 +48,7 @@ WEIGHTS_SMOOTHNESS, OFFSET_SMOOTHNESS = 3.0, 0.2
 RINGS, SPREAD_STEPS, CANDIDATES, INFLUENCES = 10, 40, 6, 4
 """Rings of edges around a stretched edge that may change; smoothing steps that tell which joints may get weight; number
 of these joints; number of joints in the end."""
-STEPS, SPARSE_FROM, WEIGHT_RATE, OFFSET_RATE_MM = 120, 0.6, 0.05, 0.12
+STEPS, SPARSE_FROM, WEIGHT_RATE, OFFSET_RATE_MM = 80, 0.6, 0.075, 0.18
 """Steps of Adam; share of them after which only `INFLUENCES` joints are left; learning rates."""
 MIN_EDGE_M = 0.002
 """Shorter edges are not measured: their length is mostly noise of the extraction."""
