@@ -48,7 +48,7 @@ def egg_mesh(spacing_m: float = 0.05) -> Mesh:
     x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
     radius = 0.3 + 0.05 * np.sin(4 * x + 1) * np.cos(5 * y) + 0.04 * np.sin(6 * z)
     values = radius - np.sqrt(x**2 + (0.8 * y) ** 2 + z**2)
-    return remesh_isotropic(isosurface(values, 0.0, np.full(3, -0.5), spacing_m), EDGE_M)
+    return remesh_isotropic(isosurface(values, 0.0, np.full(3, -0.5), spacing_m), EDGE_M, tolerance_m=0.1 * EDGE_M)
 
 
 def single_joint_body(mesh: Mesh) -> Body:
