@@ -46,9 +46,8 @@ from pipeline.mesh.files import (
     save_mesh,
 )
 from pipeline.mesh.isosurface import CanonicalGrid, extract_mesh, sample_canonical_grid, select_isovalue
-from pipeline.mesh.outline_alignment import MAX_PERSON_PX as MAX_OUTLINE_PX
 from pipeline.mesh.outline_alignment import align_outlines
-from pipeline.mesh.pose_alignment import AlignedSurface
+from pipeline.mesh.pose_alignment import MAX_PERSON_PX, AlignedSurface
 from pipeline.mesh.pose_selection import in_other_poses, is_far_from, score_motion, select_poses
 from pipeline.mesh.refinement import refine_mesh, with_offsets
 from pipeline.mesh.remeshing import detailed_faces, remesh_to_edge_length
@@ -296,7 +295,7 @@ def align_other_frames(
     (body, motion), (mesh, skin, shader) = posed_body, shaded_mesh
     is_trained = np.zeros(len(capture), dtype=bool)
     is_trained[usable_training_positions(capture, inputs["body"])] = True
-    views = load_views(capture, np.flatnonzero(~is_trained), motion, inputs, body, MAX_OUTLINE_PX)
+    views = load_views(capture, np.flatnonzero(~is_trained), motion, inputs, body, MAX_PERSON_PX)
     surface = AlignedSurface.without_colours(torch.from_numpy(mesh.vertices), skin)
     fitted = load_motion(inputs["body"] / "motion.npz")
     aligned = align_outlines(surface, body, (fitted, motion), is_trained, views)

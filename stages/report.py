@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pipeline.avatar.clay import render_clay, render_clay_head
 from pipeline.avatar.finished_run import FinishedRun, load_finished_run
-from pipeline.avatar.motion.pose_fit import MAX_PERSON_PX, fit_poses
+from pipeline.avatar.motion.pose_fit import fit_poses
 from pipeline.body.body import canonical_to_world
 from pipeline.capture.capture import CONTACT_SHEET, Capture
 from pipeline.capture.frame_selection import HELDOUT, TRAIN
@@ -30,6 +30,7 @@ from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.texture_rendering import blur_coverage
 from pipeline.io.image import read_gray, read_rgb, to_uint8, write_rgb
 from pipeline.kernels.common.thread_pool import ThreadPool
+from pipeline.mesh.pose_alignment import MAX_PERSON_PX
 from pipeline.mesh.views import crop_posed_view
 from pipeline.metrics.health import mesh_quality_metrics
 from pipeline.metrics.images import (

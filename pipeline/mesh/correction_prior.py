@@ -53,8 +53,8 @@ def drifting_prior(time_s: Float[np.ndarray, "n"], size: int) -> CorrectionPrior
 
     time_s: increasing. size: number of parameters; the last three are the shift of the root, the others rotations.
     """
-    std = np.concatenate([np.full(size - 3, ROTATION_STD_RAD), np.full(3, SHIFT_STD_M)])
-    drift = np.concatenate([np.full(size - 3, ROTATION_DRIFT_RAD_PER_SQRT_S), np.full(3, SHIFT_DRIFT_M_PER_SQRT_S)])
+    std = _of_parameters(size, ROTATION_STD_RAD, SHIFT_STD_M)
+    drift = _of_parameters(size, ROTATION_DRIFT_RAD_PER_SQRT_S, SHIFT_DRIFT_M_PER_SQRT_S)
     links = 1.0 / (drift**2 * np.maximum(np.diff(time_s), MIN_INTERVAL_S)[:, None])
     diagonal = np.tile(1.0 / std**2, (len(time_s), 1))
     diagonal[:-1] += links
@@ -64,8 +64,13 @@ def drifting_prior(time_s: Float[np.ndarray, "n"], size: int) -> CorrectionPrior
 
 def independent_prior(count: int, size: int, width: float = 1.0) -> CorrectionPrior:
     """Return the prior of corrections with zero mean, of each frame alone; width: factor of the deviations."""
-    std = width * np.concatenate([np.full(size - 3, ROTATION_STD_RAD), np.full(3, SHIFT_STD_M)])
+    std = width * _of_parameters(size, ROTATION_STD_RAD, SHIFT_STD_M)
     return CorrectionPrior(np.tile(1.0 / std**2, (count, 1)), np.zeros((count - 1, size)))
+
+
+def _of_parameters(size: int, of_rotation: float, of_shift: float) -> Float[np.ndarray, "p"]:
+    """Return a value for each parameter of a frame: all are rotations but the last three, the shift of the root."""
+    return np.concatenate([np.full(size - 3, of_rotation), np.full(3, of_shift)])
 
 
 def prior_given_others(

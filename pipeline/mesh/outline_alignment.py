@@ -6,15 +6,13 @@ import numpy as np
 from jaxtyping import Bool
 
 from pipeline.body.body import Body, Motion
-from pipeline.body.pose_correction import PoseCorrection, corrections_between
+from pipeline.body.pose_correction import corrections_between
 from pipeline.mesh.correction_prior import prior_given_others
-from pipeline.mesh.pose_alignment import AlignedSurface, align_poses
+from pipeline.mesh.pose_alignment import AlignedSurface, align_motion
 from pipeline.mesh.views import PosedView
 
-MAX_PERSON_PX = 320
-"""Height of the person in the masks that are compared: 480 px give the same poses."""
-SCALES, ITERATIONS = (0.5, 1.0), 3
-"""Sizes of the masks, one after the other, and Gauss-Newton steps at each size."""
+ITERATIONS = 3
+"""Gauss-Newton steps at each size of the masks."""
 PRIOR_WIDTH = 1.5
 """Deviations of the prior over those of the known corrections, which priors of their own have made smaller."""
 
@@ -45,12 +43,7 @@ def align_outlines(
         return corrected
     learnt = corrections_between(body, fitted.select(known), corrected.select(known))
     prior = prior_given_others(corrected.time_s.astype(np.float64), is_known, PRIOR_WIDTH * learnt)
-    start = corrected.select(free)
-    correction = PoseCorrection(body, start)
-    for scale in SCALES:
-        scaled = [view.scaled(scale) for view in views]
-        correction = align_poses(surface, scaled, correction, prior, ITERATIONS).of(body, start)
-    aligned = correction.apply(start)
+    aligned = align_motion(surface, body, corrected.select(free), views, prior, ITERATIONS)
     rotations_wxyz, root_m = corrected.rotations_wxyz.copy(), corrected.root_translation_m.copy()
     rotations_wxyz[free], root_m[free] = aligned.rotations_wxyz, aligned.root_translation_m
     return corrected.with_pose(rotations_wxyz, root_m)

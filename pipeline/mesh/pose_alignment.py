@@ -31,6 +31,10 @@ from pipeline.mesh.correction_prior import CorrectionPrior
 from pipeline.mesh.skin_transfer import SkinnedTopology
 from pipeline.mesh.views import PosedView, Shader
 
+MAX_PERSON_PX = 320
+"""Height of the person in images in which frames are aligned to a finished surface: 480 px give the same poses."""
+SCALES = (0.5, 1.0)
+"""Sizes of these images, one after the other."""
 BLUR_SIGMA_PX = 1.2
 """Blur of render and image before their gradients are taken: an error of a pose is a pixel or two."""
 LIGHT_SIGMA_RATIO = 0.02
@@ -98,6 +102,22 @@ class PoseOffsets(NamedTuple):
         correction = PoseCorrection(body, motion)
         correction.rotation_rad, correction.shift_m = self
         return correction
+
+
+def align_motion(
+    surface: AlignedSurface,
+    body: Body,
+    motion: Motion,
+    views: Sequence[PosedView],
+    prior: CorrectionPrior,
+    iterations: int,
+) -> Motion:
+    """Return the motion aligned to its views from coarse to fine, see `align_poses`; iterations: at each size."""
+    correction = PoseCorrection(body, motion)
+    for scale in SCALES:
+        scaled = [view.scaled(scale) for view in views]
+        correction = align_poses(surface, scaled, correction, prior, iterations).of(body, motion)
+    return correction.apply(motion)
 
 
 def align_poses(

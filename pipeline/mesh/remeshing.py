@@ -37,8 +37,8 @@ MAX_FACE_EXCESS, MAX_UNIFORM_TRIALS = 0.02, 6
 def remesh_to_edge_length(mesh: Mesh, target_edge_m: float, body: Body) -> Mesh:
     """Decimate and remesh a surface to well-shaped triangles with the target edge length, half of it at face and hands.
 
-    Edges are shorter where the surface has a high curvature. If a step leaves holes that cannot be closed, that step is
-    skipped with a warning.
+    At face and hands edges are shorter still where longer ones would move the surface. If a step leaves holes that
+    cannot be closed, that step is skipped with a warning.
 
     Args:
         mesh: a closed, smooth surface, m.

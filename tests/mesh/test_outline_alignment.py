@@ -39,9 +39,21 @@ def free_views(body: Body, surface: AlignedSurface, true_motion: Motion) -> list
     return [view for view, known in zip(views, IS_KNOWN, strict=True) if not known]
 
 
+@pytest.fixture(scope="module")
+def motions(true_motion: Motion) -> tuple[Motion, Motion]:
+    """Disturbed poses, and the same with the true poses of known frames."""
+    fitted, _, _ = disturbed(true_motion)
+    return fitted, select_poses(IS_KNOWN, true_motion, fitted)
+
+
 def hand_angle_rad(motion: Motion) -> np.ndarray:
     """Turn of the hand about the line of sight in free frames."""
     return 2.0 * np.arcsin(motion.rotations_wxyz[~IS_KNOWN, 1, 3])
+
+
+def root_xy_m(motion: Motion) -> np.ndarray:
+    """Place of the root across the line of sight in free frames."""
+    return motion.root_translation_m[~IS_KNOWN, :2]
 
 
 def test_free_frames_are_moved_to_their_outlines(
@@ -49,16 +61,13 @@ def test_free_frames_are_moved_to_their_outlines(
     surface: AlignedSurface,
     free_views: list[PosedView],
     true_motion: Motion,
+    motions: tuple[Motion, Motion],
 ) -> None:
-    fitted, _, _ = disturbed(true_motion)
-    start = select_poses(IS_KNOWN, true_motion, fitted)
-    found = align_outlines(surface, body, (fitted, start), IS_KNOWN, free_views)
-    for name, share in (("root_translation_m", 0.2), ("hand_angle_rad", 0.7)):
-        wanted, before, after = (
-            hand_angle_rad(motion) if name == "hand_angle_rad" else motion.root_translation_m[~IS_KNOWN, :2]
-            for motion in (true_motion, start, found)
-        )
-        assert np.abs(after - wanted).max() < share * np.abs(before - wanted).max(), name
+    start = motions[1]
+    found = align_outlines(surface, body, motions, IS_KNOWN, free_views)
+    for measure, share in ((root_xy_m, 0.2), (hand_angle_rad, 0.7)):
+        wanted, before, after = (measure(motion) for motion in (true_motion, start, found))
+        assert np.abs(after - wanted).max() < share * np.abs(before - wanted).max(), measure.__name__
     np.testing.assert_array_equal(found.rotations_wxyz[IS_KNOWN], start.rotations_wxyz[IS_KNOWN])
     np.testing.assert_array_equal(found.root_translation_m[IS_KNOWN], start.root_translation_m[IS_KNOWN])
 
@@ -67,14 +76,10 @@ def test_colours_do_not_count(
     body: Body,
     surface: AlignedSurface,
     free_views: list[PosedView],
-    true_motion: Motion,
+    motions: tuple[Motion, Motion],
 ) -> None:
-    fitted, _, _ = disturbed(true_motion)
-    start = select_poses(IS_KNOWN, true_motion, fitted)
     other_colours = [replace(view, image=255 - view.image) for view in free_views]
-    found, again = (
-        align_outlines(surface, body, (fitted, start), IS_KNOWN, shown) for shown in (free_views, other_colours)
-    )
+    found, again = (align_outlines(surface, body, motions, IS_KNOWN, shown) for shown in (free_views, other_colours))
     np.testing.assert_array_equal(found.rotations_wxyz, again.rotations_wxyz)
     np.testing.assert_array_equal(found.root_translation_m, again.root_translation_m)
 

@@ -19,18 +19,14 @@ from pipeline.geometry.differentiable_raster import face_adjacency
 from pipeline.geometry.skinning import dense_weights
 from pipeline.geometry.texture_rendering import sample_texture
 from pipeline.mesh.correction_prior import independent_prior
-from pipeline.mesh.pose_alignment import AlignedSurface, align_poses
+from pipeline.mesh.pose_alignment import AlignedSurface, align_motion
 from pipeline.mesh.skin_transfer import SkinnedTopology
 from pipeline.mesh.views import PosedView
 
-MAX_PERSON_PX = 320
-"""Largest height of the person in the fitted images, px: higher resolution costs time and does not improve poses."""
-
-SCALES, ITERATIONS = (0.5, 1.0), 4
-"""Sizes of the images, one after the other, and Gauss-Newton steps at each size."""
+ITERATIONS = 4
+"""Gauss-Newton steps at each size of the images."""
 PRIOR_WIDTH = 3.0
 """Deviations of the prior, as a multiple of those in training frames: joints that no pixel shows keep their pose."""
-
 MAX_TEXTURE_PX = 512
 """Side to which the diffuse map is downsampled, as coarse as the images."""
 
@@ -44,12 +40,8 @@ def fit_poses(avatar: TexturedAvatar, body: Body, motion: Motion, views: Sequenc
         motion: initial poses, in order of time.
         views: a crop of each frame of `motion`, see `crop_posed_view`; their poses are not read.
     """
-    surface, correction = _surface(avatar, len(body.joint_names)), PoseCorrection(body, motion)
-    prior = independent_prior(len(views), correction.size, PRIOR_WIDTH)
-    for scale in SCALES:
-        scaled = [view.scaled(scale) for view in views]
-        correction = align_poses(surface, scaled, correction, prior, ITERATIONS).of(body, motion)
-    return correction.apply(motion)
+    prior = independent_prior(len(views), PoseCorrection(body, motion).size, PRIOR_WIDTH)
+    return align_motion(_surface(avatar, len(body.joint_names)), body, motion, views, prior, ITERATIONS)
 
 
 def _surface(avatar: TexturedAvatar, joint_count: int) -> AlignedSurface:

@@ -170,10 +170,6 @@ def landmark_regressor(default: LinearBody) -> LandmarkRegressor:
     return LandmarkRegressor(tuple(joints), tuple(vertices), offset, skin_weights, offset_jacobian)
 
 
-def landmark_joint(landmark: Landmark, side: int) -> str:
-    """Return the name of the joint that a landmark moves with; side: 0 for the left or central one, 1 for the right."""
-    return _on_side(landmark.parent_joint, side)
-
-
 def _on_side(name: str, side: int) -> str:
+    """Return the name of a joint on one side; side: 0 for left or centre, 1 for right."""
     return name.replace("Left", "Right") if side else name
