@@ -5,14 +5,20 @@ pose to the canonical frame, W rotation from the BVH world to the world, S_j the
 the recorded bone in the reference pose. The world rotation of the joint is W R_j(t) R_j(0)^T A^T S_j. The axes, rolls
 and rest pose of the recorded skeleton cancel. The reference is the pose most similar to the A-pose, of the rest pose of
 the file and the recorded poses; for arms and hands, it is the rest pose if that is a T-pose. In an A-pose and a T-pose
-palms face the body or the floor, which determines the twist of the arms.
+palms face the body or the floor, which determines the twist of the arms. Other reference poses may be twisted: people
+who stand with their legs turned out have none with knees to the front. Elbows and knees that bend about other axes than
+those of the A-pose tell (`pipeline.avatar.motion.hinges`), and their axes then determine the twist of the limb.
 """
+
+from collections.abc import Mapping
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
 
 from pipeline.avatar.motion.feet import find_contacts, lowest_foot_offset_m
+from pipeline.avatar.motion.hinges import a_pose_hinge_axis, frame_of, recorded_hinge_axes, twist_rad
 from pipeline.avatar.rig import build_rig
 from pipeline.avatar.rig_names import match_names
 from pipeline.body.body import Body, Motion
@@ -33,7 +39,9 @@ _FINGERS = {
 }
 _BONE_CHILD = {**_LIMBS, "{side}Hand": "{side}HandMiddle1", **_FINGERS}
 """Child joint at the end of a bone. Positions of spine, collar and foot joints differ between skeletons, so the
-directions of those bones are not comparable: their S is the identity (S of the parent for joints of hands)."""
+directions of those bones are not comparable: their S is the identity (S of the parent for joints of hands and toes)."""
+_FOOT_CHILD = {"{side}Foot": "{side}ToeBase"}
+"""Bones that are compared where the leg is twisted in the reference pose: then the foot is not that of an A-pose."""
 
 _REQUIRED_JOINTS = (
     "Hips",
@@ -51,6 +59,9 @@ _REQUIRED_JOINTS = (
 )
 _T_POSE_COSINE = 0.97
 """Mean cosine between the limbs of the file's rest pose and of a T-pose above which the rest pose is a T-pose."""
+
+_MAX_TWIST_RAD = np.radians(15.0)
+"""Twist by which the axes of elbow or knee may contradict the reference pose: no joint bends about one axis exactly."""
 
 _MIN_FLAT_FRAMES = 5
 """Frames in which ankle and ball of a foot stand, for an estimate of the pitch of the foot's bones."""
@@ -92,7 +103,8 @@ def retarget_with_contacts(
     soles_m *= _scale_to_m(bvh_motion, body, recorded_joint_of)
     time_s = np.arange(len(positions)) / bvh_motion.fps
     contact = find_contacts(soles_m, time_s)
-    rotations = retarget_rotations(body, recorded_joint_of, world, reference, bvh_to_world)
+    hinges = recorded_hinge_axes(world, positions, recorded_joint_of)
+    rotations = retarget_rotations(body, recorded_joint_of, world, reference, bvh_to_world, hinges)
     _flatten_standing_feet(body, rotations, contact)
     root = _root_trajectory(bvh_motion, body, recorded_joint_of, bvh_to_world, ground_m, in_place)
     local = local_quaternions(rotations, body.parents)
@@ -223,6 +235,7 @@ def retarget_rotations(
     world: Float[np.ndarray, "n s 3 3"],
     reference: tuple[np.ndarray, np.ndarray],
     bvh_to_world: Float[np.ndarray, "3 3"],
+    hinges: Mapping[str, Float[np.ndarray, "3"]] | None = None,
 ) -> Float[np.ndarray, "n j 3 3"]:
     """Return the world rotation of each joint of the body; joints without a recorded joint follow their parent.
 
@@ -230,20 +243,12 @@ def retarget_rotations(
         recorded_joint_of: column of `world` by name of the body's joint.
         world: world rotations of the recorded joints.
         reference: inverse rotations of the reference pose, and its joint positions in canonical axes.
+        hinges: from `recorded_hinge_axes`; None: the reference pose is an A-pose, or a T-pose in the arms.
     """
-    inverse_reference, canonical_positions = reference
-    bones = _common_bones(_BONE_CHILD, body.joint_names, recorded_joint_of)
+    inverse_reference, _ = reference
+    from_a_pose = _rotations_from_a_pose(body, recorded_joint_of, reference, hinges or {})
     rotations = np.tile(np.eye(3), (len(world), len(body.joint_names), 1, 1))
-    from_a_pose = np.tile(np.eye(3), (len(body.joint_names), 1, 1))
     for joint, (name, parent) in enumerate(zip(body.joint_names, body.parents, strict=True)):
-        if "Hand" in name:
-            from_a_pose[joint] = from_a_pose[parent]
-        if name in bones:
-            bone = (body.joints_m[body.joint(bones[name])] - body.joints_m[joint]).astype(np.float64)
-            recorded = (
-                canonical_positions[recorded_joint_of[bones[name]]] - canonical_positions[recorded_joint_of[name]]
-            )
-            from_a_pose[joint] = _bone_rotation(name, bone, recorded, from_a_pose[joint])
         if name in recorded_joint_of:
             rotations[:, joint] = (
                 bvh_to_world
@@ -256,15 +261,55 @@ def retarget_rotations(
     return rotations
 
 
+def _rotations_from_a_pose(
+    body: Body,
+    recorded_joint_of: dict[str, int],
+    reference: tuple[np.ndarray, np.ndarray],
+    hinges: Mapping[str, Float[np.ndarray, "3"]],
+) -> Float[np.ndarray, "j 3 3"]:
+    """Return S of each joint, see the notation of the module."""
+    inverse_reference, canonical_positions = reference
+    bones = _common_bones(_BONE_CHILD | _FOOT_CHILD, body.joint_names, recorded_joint_of)
+    result, twisted = np.tile(np.eye(3), (len(body.joint_names), 1, 1)), set()
+    for joint, (name, parent) in enumerate(zip(body.joint_names, body.parents, strict=True)):
+        if "Hand" in name or "Toe" in name:
+            result[joint] = result[parent]
+        if name not in bones:
+            continue
+        bone = (body.joints_m[body.joint(bones[name])] - body.joints_m[joint]).astype(np.float64)
+        recorded = canonical_positions[recorded_joint_of[bones[name]]] - canonical_positions[recorded_joint_of[name]]
+        limb_is_twisted = body.joint_names[parent] in twisted
+        if not name.endswith("Foot"):
+            result[joint] = _bone_rotation(name, bone, recorded, result[joint], limb_is_twisted)
+        if name not in hinges:
+            continue
+        axis, wanted = a_pose_hinge_axis(name, bone), inverse_reference[recorded_joint_of[name]].T @ hinges[name]
+        if name.endswith("Foot"):
+            if limb_is_twisted:
+                result[joint] = frame_of(recorded, wanted) @ frame_of(bone, axis).T
+            continue
+        angle_rad = twist_rad(recorded, result[joint] @ axis, wanted)
+        if limb_is_twisted or abs(angle_rad) > _MAX_TWIST_RAD:
+            twist = Rotation.from_rotvec(angle_rad * recorded / np.linalg.norm(recorded))
+            result[joint] = twist.as_matrix() @ result[joint]
+            twisted.add(name)
+    return result
+
+
 def _bone_rotation(
-    name: str, bone: Float[np.ndarray, "3"], recorded: Float[np.ndarray, "3"], start: Float[np.ndarray, "3 3"]
+    name: str,
+    bone: Float[np.ndarray, "3"],
+    recorded: Float[np.ndarray, "3"],
+    start: Float[np.ndarray, "3 3"],
+    limb_is_twisted: bool,
 ) -> Float[np.ndarray, "3 3"]:
     """Return the rotation from a bone of the A-pose to a recorded one, which continues `start`.
 
     Arms and hands also take the inner side of the elbow to the inner side: perpendicular to the bone and to the front,
-    which is the axis of the elbow and the normal of the palm in an A-pose and a T-pose. Others take the shortest arc.
+    which is the axis of the elbow and the normal of the palm in an A-pose and a T-pose. Others take the shortest arc,
+    as hands do whose arm was twisted in the reference pose.
     """
-    if name.endswith(("Arm", "Hand")):
+    if name.endswith(("Arm", "Hand")) and not limb_is_twisted:
         frames = [_arm_axes(direction) for direction in (bone, recorded)]
         if frames[0] is not None and frames[1] is not None:
             return frames[1] @ frames[0].T

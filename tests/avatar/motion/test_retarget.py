@@ -172,6 +172,36 @@ def test_a_clip_of_another_rest_pose_roll_and_scale_gives_the_same_rotations(
     np.testing.assert_allclose(one.root_translation_m, other.root_translation_m, atol=5e-3)
 
 
+def turned_out_and_bent(body: Body, turn: Motion, turned_out_deg: float) -> Motion:
+    """The right leg and the left arm are twisted in all frames, and all knees and elbows bend by 25 to 90 degrees."""
+    rotations = turn.rotations_wxyz.copy()
+    bend_rad = np.radians(np.linspace(25.0, 90.0, len(rotations)))
+
+    def turned(axis: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
+        unit = axis / np.linalg.norm(axis)
+        return Rotation.from_rotvec(angle_rad[:, None] * unit).as_quat()[:, [3, 0, 1, 2]]
+
+    for side in ("Left", "Right"):
+        for start, hinge, is_twisted in (("UpLeg", "Leg", side == "Right"), ("Arm", "ForeArm", side == "Left")):
+            first, second = body.joint(side + start), body.joint(side + hinge)
+            bone = body.joints_m[second] - body.joints_m[first]
+            axis = np.array([1.0, 0.0, 0.0]) if hinge == "Leg" else np.cross(bone, [0.0, 0.0, 1.0])
+            rotations[:, first] = turned(bone, np.full(len(bend_rad), np.radians(turned_out_deg) * is_twisted))
+            rotations[:, second] = turned(axis, bend_rad)
+    return turn.with_pose(rotations.astype(np.float32), turn.root_translation_m)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_limbs_that_no_recorded_pose_shows_as_in_an_a_pose_are_twisted_as_they_bend(
+    seed: int, bare: Body, turn: Motion
+) -> None:
+    """A leg that is turned out all the time, as a dancer's, whose knee else would bend sideways; an arm likewise."""
+    motion = turned_out_and_bent(bare, turn, 60.0)
+    found = retarget(in_another_rig(recorded(bare, motion), bare, seed), bare, GROUND_M, in_place=False)
+    limbs = [bare.joint(name) for name in bare.joint_names if name.endswith(("Arm", "Leg", "LeftHand", "RightFoot"))]
+    assert world_angles_deg(bare, motion, found)[:, limbs].max() < 12.0
+
+
 def test_the_rest_pose_of_a_t_pose_rig_is_not_twisted(bare: Body) -> None:
     """One frame in the T-pose, of a rig whose rest pose is that T-pose: arms as in the avatar's own T-pose."""
     body = t_posed(bare)
