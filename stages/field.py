@@ -15,7 +15,7 @@ from pipeline.body.files import load_body, load_camera, load_motion, save_motion
 from pipeline.capture import frame_selection as selection
 from pipeline.capture.capture import Capture, image_path, load_capture, mask_path
 from pipeline.capture.matting import resize_premultiplied
-from pipeline.capture.usable_frames import usable_training_positions
+from pipeline.capture.usable_frames import usable_positions
 from pipeline.core.cli import main
 from pipeline.core.device import select_device
 from pipeline.core.errors import UserError
@@ -51,12 +51,13 @@ def run(inputs: Mapping[str, Path], out: Path, config: FieldConfig) -> Mapping[s
     capture, camera = load_capture(inputs["frames"]), load_camera(inputs["body"] / "camera.npz")
     body, motion = load_body(inputs["body"] / "body.npz"), load_motion(inputs["body"] / "motion.npz")
     camera = camera.scaled(training_scale(body, motion, camera, config.max_person_px))
-    train = usable_training_positions(capture, inputs["body"])
+    train = usable_positions(capture, inputs["body"])
     train = train[evenly_spaced(len(train), config.max_frames)]
     masked_images = read_masked_images(capture, train, camera)
     device = select_device(config.device, "field.device")
     trainer = create_trainer(body, motion.select(train), camera, masked_images, config, device)
-    validator = build_validator(capture, motion, camera, config)
+    validation = usable_positions(capture, inputs["body"], selection.VALIDATION)
+    validator = build_validator(capture, validation, motion, camera, config)
     seconds_per_step = train_field(trainer, validator, out)
     motion, metrics, renders = select_poses(trainer, validator, motion)
     save_field(out / "field.safetensors", trainer.field)
@@ -107,9 +108,10 @@ def read_masked_image(capture: Capture, position: int | np.integer, camera: Came
     return to_uint8(small), to_uint8(alpha)
 
 
-def build_validator(capture: Capture, motion: Motion, camera: Camera, config: FieldConfig) -> Validator:
-    """Read at most `validation_frames` validation frames, evenly spaced."""
-    positions = capture.positions(selection.VALIDATION)
+def build_validator(
+    capture: Capture, positions: Int[np.ndarray, "k"], motion: Motion, camera: Camera, config: FieldConfig
+) -> Validator:
+    """Read at most `validation_frames` of these frames, evenly spaced."""
     positions = positions[evenly_spaced(len(positions), config.validation_frames)] if len(positions) else positions
     return Validator(motion.select(positions), camera, read_masked_images(capture, positions, camera))
 

@@ -99,7 +99,7 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
         "dropped_no_person": int((~detections.found).sum()),
         "dropped_duplicates": n_repeats + selected.n_duplicates,
         "noise_levels": noise,
-        "landmark_visibility": float(capture.landmarks_visibility.mean()),
+        "landmark_visibility": float(np.nan_to_num(capture.landmarks_visibility).mean()),
         "hands_found": float((detections.hands.handedness_score[chosen] > 0.0).mean()),
         "unseen_arc_deg": float(np.degrees(unseen_arc_rad)),
         "turns": selected.turns,

@@ -14,8 +14,8 @@ from pipeline.avatar.turntable import turntable_sheet
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.files import load_body, load_camera, load_motion, save_motion
 from pipeline.capture.capture import Capture, load_capture
-from pipeline.capture.frame_selection import VALIDATION
-from pipeline.capture.usable_frames import usable_training_positions
+from pipeline.capture.frame_selection import TRAIN, VALIDATION
+from pipeline.capture.usable_frames import usable_positions
 from pipeline.core.cli import main
 from pipeline.core.command import rerun_command
 from pipeline.core.config import Config as BaseConfig
@@ -123,7 +123,7 @@ def run(
     body = load_body(inputs["body"] / "body.npz")
     capture = load_capture(inputs["frames"])
     motion = load_motion(inputs["field"] / "motion.npz")
-    parts = usable_training_positions(capture, inputs["body"]), capture.positions(VALIDATION)
+    parts = [usable_positions(capture, inputs["body"], kind) for kind in (TRAIN, VALIDATION)]
     limits = config.max_frames, min(config.max_frames, JUDGED_FRAMES)
     chosen = [part[evenly_spaced(len(part), limit)] for part, limit in zip(parts, limits, strict=True)]
     train, validation = (load_views(capture, part, motion, inputs, body, config.max_person_px) for part in chosen)
@@ -294,7 +294,7 @@ def align_other_frames(
     """
     (body, motion), (mesh, skin, shader) = posed_body, shaded_mesh
     is_trained = np.zeros(len(capture), dtype=bool)
-    is_trained[usable_training_positions(capture, inputs["body"])] = True
+    is_trained[usable_positions(capture, inputs["body"])] = True
     views = load_views(capture, np.flatnonzero(~is_trained), motion, inputs, body, MAX_PERSON_PX)
     surface = AlignedSurface.without_colours(torch.from_numpy(mesh.vertices), skin)
     fitted = load_motion(inputs["body"] / "motion.npz")
@@ -304,7 +304,7 @@ def align_other_frames(
     far_views = [view for view, far in zip(views, is_far[~is_trained], strict=True) if far]
     moved = in_other_poses(far_views, canonical_to_world(body, aligned.select(np.flatnonzero(is_far))))
     use_far = silhouette_iou(mesh, skin, moved) > silhouette_iou(mesh, skin, far_views)
-    positions = capture.positions(VALIDATION)
+    positions = usable_positions(capture, inputs["body"], VALIDATION)
     positions = positions[evenly_spaced(len(positions), len(validation))]
     scores = [
         score_motion(mesh, skin, shader, validation, canonical_to_world(body, poses.select(positions)))

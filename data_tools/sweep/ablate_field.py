@@ -21,7 +21,7 @@ from data_tools.sweep.field_rows import ATTENTION, REFERENCE, ROWS, SIZE, rows_o
 from data_tools.sweep.field_tables import write_tables
 from data_tools.sweep.field_trials import FieldTrial, TrialScores, read_trial, run_trial
 from pipeline.capture.capture import load_capture
-from pipeline.capture.usable_frames import usable_training_positions
+from pipeline.capture.usable_frames import usable_positions
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track
 from pipeline.field.config import FieldConfig
@@ -61,7 +61,7 @@ def _capture(run: Path) -> Path:
 @cache
 def _training_frames(run: Path) -> int:
     """Return the number of training frames of a run, so that half of `max_frames` is half of what is used."""
-    return len(usable_training_positions(load_capture(run / "frames"), run / "body"))
+    return len(usable_positions(load_capture(run / "frames"), run / "body"))
 
 
 def _trial(run: Path, name: str, seed: int, options: argparse.Namespace) -> FieldTrial:

@@ -26,7 +26,8 @@ class Capture:
     split: 0 train, 1 validation, 2 held out (`pipeline.capture.frame_selection.assign_splits`,
         `pipeline.capture.disjoint_split`, or user-supplied).
     split_rule: how they were split, in words.
-    landmarks_px: MediaPipe's 33 landmarks, pixel centres at +0.5; nan where unknown. Visibility in [0, 1].
+    landmarks_px: MediaPipe's 33 landmarks, pixel centres at +0.5; nan where unknown. Visibility in [0, 1],
+        nan where unknown.
     landmarks_world_m: relative to the centre of the hips, in camera axes; nan where unknown.
     camera: user-supplied camera for these images; None if unknown.
     scale: size of these images relative to the recording.

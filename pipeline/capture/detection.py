@@ -132,7 +132,7 @@ def detect_in_frames(
         gray_thumbnails=np.stack([detection.gray for detection in frame_detections]),
         person_masks=person_masks,
         landmarks_px=landmarks[..., :2],
-        landmarks_visibility=np.nan_to_num(landmarks[..., 2]),
+        landmarks_visibility=np.where(np.isfinite(landmarks[..., :2]).all(-1), landmarks[..., 2], np.nan),
         landmarks_world_m=landmarks[..., 3:],
         hands=stack_hands([detection.hands for detection in frame_detections]),
         faces_px=np.stack([detection.face_px for detection in frame_detections]),

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from scipy.ndimage import median_filter
 
-from pipeline.capture.frame_selection import HELDOUT, SPLIT_PERIOD, TRAIN, UNUSED, VALIDATION, VALIDATION_PHASE
+from pipeline.capture.frame_selection import HELDOUT, TRAIN, UNUSED, VALIDATION, VALIDATION_PHASE, split_phases
 
 LAST_PART = 0.25
 """Fraction of the frames that is held out where there is no second turn."""
@@ -44,7 +44,7 @@ def assign_disjoint_splits(frame_index: Int[np.ndarray, "n"], yaw_rad: Float[np.
     """Hold out the last turn of at least two, else the last quarter of the frames.
 
     With k turns, the last k-th of the rotation is held out. Before it there is a guard gap. Among the other frames,
-    those with index 4 modulo 8 are validation frames.
+    those of phase 4 (`split_phases`) are validation frames.
 
     Args:
         frame_index: increasing.
@@ -61,7 +61,7 @@ def assign_disjoint_splits(frame_index: Int[np.ndarray, "n"], yaw_rad: Float[np.
         first = round((1.0 - LAST_PART) * count)
         part = "the last quarter"
     guard = max(_MIN_GUARD_FRAMES, round(GUARD_PART * count))
-    split = np.where(frame_index % SPLIT_PERIOD == VALIDATION_PHASE, VALIDATION, TRAIN).astype(np.uint8)
+    split = np.where(split_phases(frame_index) == VALIDATION_PHASE, VALIDATION, TRAIN).astype(np.uint8)
     split[max(0, first - guard) : first] = UNUSED
     split[first:] = HELDOUT
     return DisjointSplit(split, turns, part)

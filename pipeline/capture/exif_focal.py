@@ -5,10 +5,9 @@ Both store the 35 mm equivalent. According to EXIF 2.3 (tag 0xA405) images of eq
 
 from pathlib import Path
 
-import av
 from PIL import ExifTags
 
-from pipeline.capture.video import FrameSource
+from pipeline.capture.video import FrameSource, open_container
 from pipeline.io.image import read_exif_tag
 
 FULL_FRAME_DIAGONAL_MM = 43.27
@@ -27,7 +26,7 @@ def metadata_focal_px(source: FrameSource, width_px: int, height_px: int) -> flo
 
 
 def _quicktime_focal_35mm_mm(path: Path) -> float | None:
-    with av.open(str(path)) as container:
+    with open_container(path) as container:
         for metadata in (container.metadata, *(stream.metadata for stream in container.streams)):
             try:
                 return float(metadata[_QUICKTIME_KEY])

@@ -1,8 +1,8 @@
 """Selection and splits of frames. Pure functions on grey thumbnails and landmarks.
 
-The interleaved split depends on the index of a frame in the recording only, so it does not change with the selection;
-`pipeline.capture.disjoint_split` holds out the end of the recording. A user-supplied split
-(`pipeline.capture.user_files`) replaces split and selection.
+The interleaved split depends on the index of a frame in the recording only, so it does not change with the selection,
+unless the recording repeats its frames in step with it (`split_phases`); `pipeline.capture.disjoint_split` holds out
+the end of the recording. A user-supplied split (`pipeline.capture.user_files`) replaces split and selection.
 """
 
 import cv2
@@ -15,9 +15,11 @@ TRAIN, VALIDATION, HELDOUT = 0, 1, 2
 UNUSED = 3
 """Frames that are in no split; they are not selected."""
 
-INTERLEAVED_RULE = "interleaved: frames with an index divisible by eight held out"
+INTERLEAVED_RULE = "interleaved: every eighth frame held out"
 SPLIT_PERIOD = 8
 VALIDATION_PHASE = 4
+MIN_SHARE, MAX_SHARE = 0.5, 1.8
+"""Held-out and validation frames over an eighth of all frames: beyond these limits frames are missing in step."""
 # Mean absolute difference of two images of the same scene when rounding to integer levels is the only noise:
 # E|round(a + e1) - round(a + e2)| with independent uniform dither = 1/3.
 _QUANTISATION_NOISE = 1.0 / 3.0
@@ -25,9 +27,21 @@ _BLOCK_PX = 16
 
 
 def assign_splits(frame_index: Int[np.ndarray, "n"]) -> UInt8[np.ndarray, "n"]:
-    """Return HELDOUT for indices divisible by eight, VALIDATION for index = 4 modulo 8, TRAIN for all others."""
-    phase = frame_index % SPLIT_PERIOD
+    """Return HELDOUT for phase 0 of `split_phases`, VALIDATION for phase 4, TRAIN for all others."""
+    phase = split_phases(frame_index)
     return np.select([phase == 0, phase == VALIDATION_PHASE], [HELDOUT, VALIDATION], TRAIN).astype(np.uint8)
+
+
+def split_phases(frame_index: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
+    """Return the phase of each frame in a cycle of eight: its index modulo eight.
+
+    Where frames that repeat others are left out in step with this cycle (15 images a second in a file of 30), some
+    kind of frames would be empty or too many: then it is the place among the frames modulo eight.
+    """
+    phase = frame_index % SPLIT_PERIOD
+    shares = np.bincount(phase, minlength=SPLIT_PERIOD)[[0, VALIDATION_PHASE]] * SPLIT_PERIOD / max(1, len(phase))
+    is_regular = shares.min() >= MIN_SHARE and shares.max() <= MAX_SHARE
+    return phase if is_regular else np.arange(len(phase)) % SPLIT_PERIOD
 
 
 def estimate_noise_level(gray_thumbnails: UInt8[np.ndarray, "n h w"]) -> float:

@@ -1,4 +1,4 @@
-"""Training frames whose body fit is usable, from `scores.npz` of the body stage."""
+"""Frames whose body fit is usable, from `scores.npz` of the body stage."""
 
 from pathlib import Path
 
@@ -14,8 +14,8 @@ from pipeline.io.npz import load_npz
 SCORES_NPZ = "scores.npz"
 
 
-def usable_training_positions(capture: Capture, body_dir: Path) -> Int[np.ndarray, "k"]:
-    """Return the positions (0..n-1) of training frames with a usable fit, on which field, mesh and texture are trained.
+def usable_positions(capture: Capture, body_dir: Path, split: int = TRAIN) -> Int[np.ndarray, "k"]:
+    """Return the positions (0..n-1) of frames of one split with a usable fit: others neither train nor decide.
 
     Raises:
         UserError: the folder of the body stage does not hold this information.
@@ -27,4 +27,4 @@ def usable_training_positions(capture: Capture, body_dir: Path) -> Int[np.ndarra
             f"{path} does not say which of the {len(capture)} frames are usable (written by an older version); "
             f"run {rerun_command('body', body_dir)}"
         )
-    return np.flatnonzero((capture.split == TRAIN) & usable)
+    return np.flatnonzero((capture.split == split) & usable)

@@ -124,7 +124,7 @@ def read_thumbnails(
     They are not upright, and their grey is that of the file. side_px: largest longer side.
 
     Raises:
-        UserError: no frame can be read.
+        UserError: no frame can be read, or their shape changes.
     """
 
     def shrink(picture: av.VideoFrame, _: Fraction | None) -> _DecodedImage:
@@ -140,6 +140,9 @@ def read_thumbnails(
         found = [(index, gray) for index, _, (gray, _) in _video(source, is_wanted, shrink)]
     if not found:
         raise UserError(f"{source.path} has no readable frame; use another video")
+    odd = next((index for index, gray in found if gray.shape != found[0][1].shape), None)
+    if odd is not None:
+        raise UserError(f"frame {odd} of {source.path} has another shape than those before; cut the video there")
     return np.array([index for index, _ in found], dtype=np.int32), np.stack([gray for _, gray in found])
 
 
@@ -167,7 +170,7 @@ def _images_in(folder: Path) -> tuple[Path, ...]:
 
 def _open_video(path: Path) -> FrameSource:
     try:
-        with _open_container(path) as container:
+        with open_container(path) as container:
             if not container.streams.video:
                 raise UserError(f"{path} has no video track; supply a video file or a folder of images")
             stream = container.streams.video[0]
@@ -188,7 +191,7 @@ def _open_video(path: Path) -> FrameSource:
     return FrameSource(path, (), n_frames, fps)
 
 
-def _open_container(path: Path) -> InputContainer:
+def open_container(path: Path) -> InputContainer:
     """Open a video file; formats that name other files or addresses (playlists, concatenations) are refused.
 
     Titles and comments that are not UTF-8 do not matter.
@@ -213,7 +216,7 @@ def _video(
     start_s: float | None = None
     time_s: float | None = None
     index = -1
-    with _open_container(source.path) as container:
+    with open_container(source.path) as container:
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
         try:

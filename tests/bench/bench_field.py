@@ -53,7 +53,7 @@ import numpy as np
 from data_tools.command import run_command
 from pipeline.body.files import load_body, load_camera, load_motion
 from pipeline.capture.capture import load_capture
-from pipeline.capture.usable_frames import usable_training_positions
+from pipeline.capture.usable_frames import usable_positions
 from pipeline.core.config import build_config, load_layers
 from pipeline.core.errors import UserError
 from pipeline.core.progress import warn
@@ -125,7 +125,7 @@ def trainer_from_run(run: Path, config: FieldConfig) -> Trainer:
     capture, camera = load_capture(run / "frames"), load_camera(run / "body" / "camera.npz")
     body, motion = load_body(run / "body" / "body.npz"), load_motion(run / "body" / "motion.npz")
     camera = camera.scaled(training_scale(body, motion, camera, config.max_person_px))
-    chosen = usable_training_positions(capture, run / "body")
+    chosen = usable_positions(capture, run / "body")
     chosen = chosen[evenly_spaced(len(chosen), config.max_frames)]
     masked_images = [read_masked_image(capture, position, camera) for position in chosen]
     return create_trainer(body, motion.select(chosen), camera, masked_images, config)

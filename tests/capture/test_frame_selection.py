@@ -16,6 +16,14 @@ def test_split_rule():
     assert (split == selection.TRAIN).sum() == 18
 
 
+@pytest.mark.parametrize(("repeats", "first"), [(2, 0), (2, 1), (4, 0), (4, 3)])
+def test_split_of_a_file_that_repeats_its_frames(repeats, first):
+    """15 or 7.5 images a second in a file of 30: an index rule would leave no validation frames, or half of them."""
+    split = selection.assign_splits(np.arange(first, 320, repeats))
+    for kind in (selection.HELDOUT, selection.VALIDATION):
+        assert (split == kind).mean() == pytest.approx(1 / 8, abs=0.02)
+
+
 def test_ranges_join_neighbours_among_the_frames():
     index = np.array([0, 3, 6, 9, 12, 40])
     assert selection.format_frame_ranges(index, np.array([1, 0, 1, 1, 1, 0], dtype=bool)) == "0, 6-12"

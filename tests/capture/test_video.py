@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.capture import video
+from pipeline.capture.exif_focal import metadata_focal_px
 from pipeline.capture.hdr import BT_2020, HLG, to_srgb
 from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
@@ -300,6 +301,18 @@ def test_a_title_that_is_not_utf8_does_not_matter(tmp_path):
     (tmp_path / "a.avi").write_bytes(content.replace(b"Title of my film", "Titel: \xfcber mich".encode("latin1")[:16]))
     source = video.open_frame_source(tmp_path / "a.avi")
     assert len(list(video.read_frames(source, select_all, 1000))) == 3
+    assert metadata_focal_px(source, 64, 64) is None
+
+
+def test_a_video_whose_size_changes_is_refused(tmp_path):
+    for name, height, width in (("a.ts", 48, 64), ("b.ts", 64, 48)):
+        write_video(tmp_path / name, [ramp(90, height, width)] * 8)
+    (tmp_path / "both.ts").write_bytes((tmp_path / "a.ts").read_bytes() + (tmp_path / "b.ts").read_bytes())
+    source = video.open_frame_source(tmp_path / "both.ts")
+    with pytest.raises(UserError, match=r"frame \d+ of .*both.ts has another shape"):
+        video.read_thumbnails(source, select_all, 32)
+    with pytest.raises(UserError, match=r"frame \d+ of .*both.ts is 48x64"):
+        list(video.read_frames(source, select_all, 1000))
 
 
 def test_unreadable_and_odd_sized_images_are_named(tmp_path):

@@ -22,7 +22,7 @@ def test_contract_keys_are_present():
     assert {"glb_bytes", "texture_px"} <= report["export"].keys()
     assert report["masks"] == {"count": 9}
     assert report["body"] == {"landmark_error_px": 4.5, "silhouette_iou": 0.93}
-    assert "divisible by eight" in report["heldout"]["protocol"]
+    assert "every eighth frame" in report["heldout"]["protocol"]
     assert report["heldout"]["split"].startswith("interleaved")
     assert "fitted to landmarks and silhouettes, never to colours" in report["heldout"]["protocol"]
 

@@ -13,7 +13,7 @@ from pipeline.avatar.textured_avatar import TexturedAvatar
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.files import save_body, save_camera, save_motion
 from pipeline.capture.capture import Capture, image_path, mask_path, save_capture
-from pipeline.capture.frame_selection import assign_splits
+from pipeline.capture.frame_selection import HELDOUT, TRAIN, VALIDATION
 from pipeline.core.manifest import MANIFEST_FILE, Manifest, write_manifest
 from pipeline.field.field import RadianceField, hash_grid_layout
 from pipeline.field.files import save_field, save_occupancy
@@ -88,7 +88,7 @@ def _write_frames(folder: Path, avatar: TexturedAvatar, poses: torch.Tensor) -> 
         folder=folder,
         frame_index=FRAME_INDEX,
         time_s=FRAME_INDEX / FRAME_RATE,
-        split=assign_splits(FRAME_INDEX),
+        split=np.select([FRAME_INDEX % 8 == 0, FRAME_INDEX == 4], [HELDOUT, VALIDATION], TRAIN).astype(np.uint8),
         fps=FRAME_RATE,
         width=CAMERA.width,
         height=CAMERA.height,

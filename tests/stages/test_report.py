@@ -160,7 +160,7 @@ def test_without_held_out_frames_the_reason_is_named(inputs: dict[str, Path], tm
     shutil.copytree(inputs["frames"], frames)
     fields = load_capture(frames).__dict__ | {"split": np.zeros(len(FRAME_INDEX), dtype=np.uint8)}
     save_capture(Capture(**fields))
-    with pytest.raises(UserError, match="divisible by eight"):
+    with pytest.raises(UserError, match="every eighth frame"):
         run(inputs | {"frames": frames}, tmp_path, CONFIG, SETTINGS)
 
 

@@ -56,7 +56,7 @@ def make_observations(
 ) -> Observations:
     """Return the observations of a detector's output.
 
-    landmarks_px: nan where nothing was detected. visibility: 0 to 1. landmarks_world_m: camera axes (y down, z away),
+    landmarks_px, visibility (0 to 1): nan where nothing was detected. landmarks_world_m: camera axes (y down, z away),
     relative to the hips. hands: from `hand_observations.filter_hand_detections`; None if they were not detected.
     faces_px: as in `Capture`.
     """
@@ -67,9 +67,8 @@ def make_observations(
     no_depth = np.full((*face_px.shape[:2], 3), np.nan)
     directions = torch.tensor(np.concatenate([landmarks_world_m, hands_m, no_depth], axis=1)).double()
     to_world = torch.as_tensor(camera.world_to_camera, dtype=torch.float64)[:3, :3]
-    known_visibility = np.nan_to_num(visibility)
-    pose_confidence = MIN_CONFIDENCE + (1.0 - MIN_CONFIDENCE) * known_visibility
-    pose_confidence *= leg_visibility_factor(known_visibility, time_s)
+    pose_confidence = MIN_CONFIDENCE + (1.0 - MIN_CONFIDENCE) * np.nan_to_num(visibility)
+    pose_confidence *= leg_visibility_factor(visibility, time_s)
     landmark_confidence = torch.tensor(
         np.concatenate([pose_confidence, hands_confidence, face_confidence], axis=1)
     ).double()

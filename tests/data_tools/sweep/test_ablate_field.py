@@ -110,7 +110,7 @@ def test_half_of_the_frames_is_half_of_those_of_the_run(tmp_path: Path, monkeypa
     for name in ("frames", "body"):
         (tmp_path / name).mkdir()
     monkeypatch.setattr(ablate_field, "load_capture", lambda folder: folder)
-    monkeypatch.setattr(ablate_field, "usable_training_positions", lambda capture, body: range(72))
+    monkeypatch.setattr(ablate_field, "usable_positions", lambda capture, body: range(72))
     used = []
 
     def run_trial(trial: FieldTrial) -> TrialScores:

@@ -37,11 +37,14 @@ FULL_OUTLINE_CONFIDENCE = 0.2
 def leg_visibility_factor(
     visibility: Float[np.ndarray, "n 33"], time_s: Float[np.ndarray, "n"]
 ) -> Float[np.ndarray, "n 33"]:
-    """Return a factor in [`MIN_SHOWN`, 1] on the confidence of each landmark: small on legs that an object hides."""
+    """Return a factor in [`MIN_SHOWN`, 1] on the confidence of each landmark: small on legs that an object hides.
+
+    visibility: nan where nothing was detected; that hides no leg.
+    """
     factor = np.ones_like(visibility)
     is_near = np.abs(time_s[:, None] - time_s[None]) <= HALF_WINDOW_S
     for judged, landmarks in zip(KNEE_AND_ANKLE, LEG_LANDMARKS, strict=True):
-        lowest = visibility[:, list(judged)].min(1)
+        lowest = np.nan_to_num(visibility[:, list(judged)], nan=1.0).min(1)
         lowest = np.where(is_near, lowest, np.inf).min(1)
         shown = (lowest - HIDDEN_VISIBILITY) / (SHOWN_VISIBILITY - HIDDEN_VISIBILITY)
         factor[:, list(landmarks)] = np.clip(shown, MIN_SHOWN, 1.0)[:, None]
@@ -49,9 +52,9 @@ def leg_visibility_factor(
 
 
 def hidden_leg_share(visibility: Float[np.ndarray, "n 33"], time_s: Float[np.ndarray, "n"]) -> float:
-    """Return the share of frames in which a leg is hidden (0 to 1). visibility: nan where nobody was detected."""
+    """Return the share of frames in which a leg is hidden (0 to 1). visibility: nan where nothing was detected."""
     knees = [landmarks[0] for landmarks in LEG_LANDMARKS]
-    factor = leg_visibility_factor(np.nan_to_num(visibility, nan=1.0), time_s)[:, knees]
+    factor = leg_visibility_factor(visibility, time_s)[:, knees]
     return float((factor <= MIN_SHOWN).any(1).mean())
 
 

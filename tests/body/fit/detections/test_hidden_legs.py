@@ -44,6 +44,13 @@ def test_a_leg_that_is_hidden_once_is_hidden_in_the_frames_beside() -> None:
     assert (np.delete(factor, [*LEG_LANDMARKS[0], *LEG_LANDMARKS[1]], axis=1) == 1.0).all()
 
 
+def test_a_frame_in_which_nobody_was_detected_hides_no_leg() -> None:
+    visibility = np.ones((12, 33))
+    visibility[6] = np.nan
+    assert (leg_visibility_factor(visibility, np.arange(12) / FPS) == 1.0).all()
+    assert hidden_leg_share(visibility, np.arange(12) / FPS) == 0.0
+
+
 def test_the_outline_of_a_hidden_leg_has_no_weight_but_undetected_ones_do() -> None:
     confidence = torch.ones(2, LANDMARK_COUNT)
     confidence[0, LEFT_KNEE] = 1e-4
