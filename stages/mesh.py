@@ -14,7 +14,7 @@ from pipeline.avatar.turntable import turntable_sheet
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.files import load_body, load_camera, load_motion, save_motion
 from pipeline.capture.capture import Capture, load_capture
-from pipeline.capture.frame_selection import TRAIN, VALIDATION
+from pipeline.capture.frame_selection import VALIDATION
 from pipeline.capture.usable_frames import usable_positions
 from pipeline.core.cli import main
 from pipeline.core.command import rerun_command
@@ -123,7 +123,7 @@ def run(
     body = load_body(inputs["body"] / "body.npz")
     capture = load_capture(inputs["frames"])
     motion = load_motion(inputs["field"] / "motion.npz")
-    parts = [usable_positions(capture, inputs["body"], kind) for kind in (TRAIN, VALIDATION)]
+    parts = usable_positions(capture, inputs["body"]), usable_positions(capture, inputs["body"], VALIDATION)
     limits = config.max_frames, min(config.max_frames, JUDGED_FRAMES)
     chosen = [part[evenly_spaced(len(part), limit)] for part, limit in zip(parts, limits, strict=True)]
     train, validation = (load_views(capture, part, motion, inputs, body, config.max_person_px) for part in chosen)

@@ -15,7 +15,7 @@ from pipeline.body.body import Body, canonical_to_world
 from pipeline.body.files import load_body, load_camera, load_motion
 from pipeline.capture.capture import Capture, load_capture
 from pipeline.capture.face_detector import FaceDetector
-from pipeline.capture.frame_selection import TRAIN, VALIDATION
+from pipeline.capture.frame_selection import VALIDATION
 from pipeline.capture.usable_frames import usable_positions
 from pipeline.core.cli import main
 from pipeline.core.command import rerun_command
@@ -129,7 +129,7 @@ def run(
     """
     body, skinned = load_body(inputs["body"] / "body.npz"), load_mesh(inputs["mesh"])
     capture = load_capture(inputs["frames"])
-    positions = [usable_positions(capture, inputs["body"], kind) for kind in (TRAIN, VALIDATION)]
+    positions = usable_positions(capture, inputs["body"]), usable_positions(capture, inputs["body"], VALIDATION)
     train, validation = (load_views(capture, part, inputs, body, skinned, config.max_frames) for part in positions)
     if not train:
         again = rerun_command("frames", inputs["frames"])
