@@ -299,12 +299,14 @@ def find_lobe(fitted: HighlightRegression, light: VideoLight, vertex_count: int)
     """Return the direction and the exponent that explain most of the training views.
 
     The key light is the lamp where its shadows are known; otherwise directions are tried within `MAX_LAMP_ANGLE_RAD` of
-    that from which most light comes: errors of normals look like highlights of lamps that give no light.
+    that from which most light comes: errors of normals look like highlights of lamps that give no light. Lamps are not
+    below the person; where most light comes from below, the nearest direction is tried.
     """
     directions = light.key_direction[None]
     if not light.casts_shadows:
         directions = search_directions()
-        directions = directions[directions @ light.dominant_direction() > np.cos(MAX_LAMP_ANGLE_RAD)]
+        cosine = directions @ light.dominant_direction()
+        directions = directions[cosine >= min(np.cos(MAX_LAMP_ANGLE_RAD), cosine.max())]
 
     def explained(highlights: Highlights) -> float:
         return fitted.explained(fitted.lobe(highlights), vertex_count)

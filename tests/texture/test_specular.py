@@ -107,6 +107,19 @@ def test_a_shiny_patch_and_its_lobe_are_found() -> None:
     assert np.median(result.strength[reached & ~shiny]) < 0.05
 
 
+def test_where_most_light_comes_from_below_a_matte_person_stays_matte() -> None:
+    """A white floor: no lamp is searched below the person."""
+    nothing = np.zeros((len(ball().vertices), 3))
+    angles = 2.0 * np.pi * np.arange(32) / 32
+    train, validation = (filmed(nothing, part, 0.01) for part in (angles, angles[::4] + 0.1))
+    coefficients = np.zeros((9, 3))
+    coefficients[0], coefficients[2] = 0.8, -0.3
+    light = replace(VideoLight.uniform(32), coefficients=coefficients)
+    result = fit_specular(train, validation, light, ball(len(nothing)))
+    assert result.regions == 0
+    assert not result.strength.any()
+
+
 def test_a_small_shiny_region_is_found_on_a_person_with_wrong_normals() -> None:
     """Highlights explain little of the error of the whole surface, but most of it where they are."""
     vertices = ball().vertices
