@@ -59,6 +59,7 @@ from pipeline.mesh.views import PosedView, crop_posed_view, mesh_psnr_db, silhou
 from pipeline.metrics.health import mesh_quality_metrics
 from pipeline.template.face.filmed_head import move_face_to_frames
 from pipeline.template.face.filmed_landmarks import FilmedFaces
+from pipeline.template.regions import outer_surface
 
 CHECKPOINT = "checkpoint_round.safetensors"
 DEFAULT_SETTINGS = MeshSettings()
@@ -254,7 +255,8 @@ def extract_initial_mesh(
         return silhouette_iou(mesh, transfer_skin(mesh, body), isovalue_views)
 
     isovalue_per_m, _ = select_isovalue(samples, settings, score)
-    return fair_surface(extract_mesh(samples, isovalue_per_m, settings), samples, body, evidence, settings)
+    extracted = extract_mesh(samples, isovalue_per_m, settings)
+    return fair_surface(extracted, samples, body, outer_surface(body), evidence, settings)
 
 
 def load_views(
@@ -331,7 +333,7 @@ def write_results(out: Path, mesh: Mesh, skin: SkinnedTopology, shader: torch.nn
 
 STAGE = Stage(
     "mesh",
-    version=30,
+    version=31,
     needs=("frames", "body", "field"),
     makes=(MESH_NPZ, DENSE_NPZ, "motion.npz", "preview.png"),
     config=Config,

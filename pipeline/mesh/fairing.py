@@ -59,7 +59,12 @@ LOOSE_SIGMA_M = 0.03
 
 
 def fair_surface(
-    mesh: Mesh, samples: CanonicalGrid, body: Body, evidence: Float[np.ndarray, "v"], settings: MeshSettings
+    mesh: Mesh,
+    samples: CanonicalGrid,
+    body: Body,
+    outer_surface: Mesh,
+    evidence: Float[np.ndarray, "v"],
+    settings: MeshSettings,
 ) -> Mesh:
     """Return the surface with a smoothed offset from the body, closed and dense as from marching cubes.
 
@@ -67,6 +72,8 @@ def fair_surface(
         mesh: the extracted surface, closed, m.
         samples: the grid from which it was extracted.
         body: the fitted body in its canonical pose.
+        outer_surface: its surface without cavities, to which offsets refer: behind lips and lids a surface that lies
+            deeper than the body's would have holes.
         evidence: how well the frames show each body vertex, in [0, 1], from `pipeline.mesh.evidence`.
         settings: `fairing_ratio` is the standard deviation over the local thickness; 0 returns the mesh as it is.
 
@@ -82,7 +89,7 @@ def fair_surface(
     points = np.argwhere(near) * coarse.spacing_m + coarse.origin_m
     surface_m[near] = signed_distance_m(points, mesh)
     body_m = coarse.body_distance_m.copy()
-    body_m[near] = signed_distance_m(points, body.mesh())
+    body_m[near] = signed_distance_m(points, outer_surface)
     sigma_m = settings.fairing_ratio * local_thickness_m(body_m < 0.0, coarse.spacing_m)
     face, skin = _face_and_skin(coarse, body, body_m - surface_m)
     sigma_m = ndimage.gaussian_filter(sigma_m + face * (FACE_SIGMA_M - sigma_m), 1.0)
@@ -98,7 +105,7 @@ def fair_surface(
     value_m = close_valleys(value_m, samples.body_distance_m, samples.origin_m, samples.spacing_m)
     fine_detail = upsample(detail, shape)
     near_detail = (np.abs(value_m) < DETAIL_BAND_M) & (fine_detail > MIN_DETAIL)
-    exact_m = signed_distance_m(np.argwhere(near_detail) * samples.spacing_m + samples.origin_m, body.mesh())
+    exact_m = signed_distance_m(np.argwhere(near_detail) * samples.spacing_m + samples.origin_m, outer_surface)
     value_m[near_detail] += fine_detail[near_detail] * (exact_m - upsample(body_m, shape)[near_detail])
     return repair(isosurface(-value_m, 0.0, samples.origin_m, samples.spacing_m))
 

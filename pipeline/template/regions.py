@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import sparse
 
 from pipeline.body.body import Body, load_anny
+from pipeline.geometry.mesh import Mesh
 
 _MOUTH_CAVITY_UV = ((0.755, 0.005), (0.926, 0.142))
 _EYE_CAVITY_UVS = (((0.010, 0.545), (0.079, 0.636)), ((0.083, 0.545), (0.154, 0.636)))
@@ -58,6 +59,25 @@ def is_template_body(body: Body) -> bool:
     )
 
 
+def outer_surface(body: Body) -> Mesh:
+    """Return the surface of a body without the cavities of mouth and eyes; all of it for a body of a model file.
+
+    The skin, closed between the lids by a cone to the foremost point of the eyeball, between the lips to their middle.
+    """
+    if not is_template_body(body):
+        return body.mesh()
+    template = load_template()
+    skin, vertices = body.faces[template.skin_faces], body.vertices
+    parts = [skin]
+    for is_cavity in (*template.socket_faces, template.mouth_faces):
+        inward = _directed_edges(body.faces[is_cavity])
+        rim = inward[np.isin(_edge_keys(inward[:, ::-1]), _edge_keys(_directed_edges(skin)))]
+        parts.append(np.column_stack([rim, np.full(len(rim), len(vertices) + len(parts) - 1)]))
+    eyes = [vertices[np.unique(body.faces[is_eye])] for is_eye in template.eye_faces]
+    tips = [*(eye[eye[:, 2].argmax()] for eye in eyes), vertices[np.unique(rim)].mean(axis=0)]
+    return Mesh(np.concatenate([vertices, tips]).astype(np.float32), np.concatenate(parts).astype(np.int32))
+
+
 @lru_cache(maxsize=1)
 def load_template() -> Template:
     """Return the built-in body's topology and parts, computed once per process."""
@@ -96,6 +116,14 @@ def template_quads() -> Int[np.ndarray, "q 4"]:
     opposite = (second[:, :, None] != first[:, None, :]).all(axis=2).argmax(axis=1)
     last = np.take_along_axis(second, opposite[:, None], axis=1)[:, 0]
     return np.stack([first[:, 0], first[:, 1], last, first[:, 2]], axis=1)
+
+
+def _directed_edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
+    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+
+
+def _edge_keys(edges: Int[np.ndarray, "e 2"]) -> Int[np.ndarray, "e"]:
+    return edges[:, 0].astype(np.int64) << 32 | edges[:, 1]
 
 
 def _components(faces: Int[np.ndarray, "f 3"], vertex_count: int) -> Int[np.ndarray, "v"]:

@@ -97,7 +97,7 @@ def test_fairing_keeps_hair_over_the_forehead_and_smooths_the_face() -> None:
     bounds_m = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]) * (HEAD_M + HAIR_M + 0.02)
     samples = sample_canonical_grid(hairy_density, bounds_m, head, 0.006, settings)
     rough = extract_mesh(samples, 100.0, settings)
-    fair = fair_surface(rough, samples, head, np.ones(len(head.vertices)), settings)
+    fair = fair_surface(rough, samples, head, head.mesh(), np.ones(len(head.vertices)), settings)
     offset_m = np.linalg.norm(fair.vertices, axis=1) - HEAD_M
     x, y, z = fair.vertices.T
     assert np.median(offset_m[(z > 0.03) & (y > 0.08)]) == pytest.approx(HAIR_M, abs=0.006)
