@@ -45,9 +45,15 @@ def check_input(detections: Detections, path: Path, min_frames: int) -> None:
     n_found, n_detection_frames = int(detections.found.sum()), len(detections.found)
     if n_found == 0:
         raise UserError(f"no person was found in {path}; film the whole body at half of the image height or more")
+    if n_detection_frames < min_frames:
+        raise UserError(
+            f"only {n_detection_frames} frames of {path} differ from each other, {min_frames} are needed; "
+            "film a slow full turn"
+        )
     if n_found < min_frames:
         raise UserError(
-            f"a person was found in only {n_found} of {n_detection_frames} frames of {path}; {min_frames} are needed"
+            f"a person was found in only {n_found} of {n_detection_frames} frames of {path}; {min_frames} are needed: "
+            "film the whole body at half of the image height or more"
         )
     known = np.isfinite(detections.landmarks_px).all(axis=-1) & np.isfinite(detections.landmarks_world_m).all(axis=-1)
     is_torso_known = detections.found & known[:, TORSO].all(axis=1)
@@ -115,10 +121,12 @@ def assess_input(detections: Detections, unseen_arc_rad: float, path: Path) -> d
         )
     frame_index, differs = sample_scene_changes(detections)
     if differs.sum() > _MAX_MOVED_FRACTION * len(differs):
+        changes = np.flatnonzero(np.diff(differs.astype(np.int8)))
+        cut = f"; if it shows two scenes, cut it at frame {frame_index[changes[0] + 1]}" if len(changes) == 1 else ""
         warn(
             f"the scene behind the person changes in {path} (frames {format_frame_ranges(frame_index, differs)}): "
             "the camera or the light seems to change, which causes errors of motion and colour; film again with a "
-            "fixed camera and locked exposure"
+            f"fixed camera and locked exposure{cut}"
         )
     if unseen_arc_rad > np.radians(_MAX_UNSEEN_ARC_DEG):
         warn(

@@ -41,6 +41,7 @@ from pipeline.io.npz import load_npz
 _MAX_PRINCIPAL_POINT_OFFSET = 0.2
 # So many masks tell whether a folder holds levels or zeros and ones.
 _N_MASKS_SAMPLED = 8
+_WHITE = 200
 _SPLITS = {"train": TRAIN, "validation": VALIDATION, "heldout": HELDOUT}
 
 
@@ -135,6 +136,8 @@ def load_user_files(path: Path, source: FrameSource) -> UserFiles:
     if not path.is_dir():
         return UserFiles(None, "", None, None)
     read_mask, mask_source = _find_masks(path, source)
+    if read_mask is not None:
+        _refuse_inverted(read_mask, f"{path}: the masks ({mask_source})", source.n_frames)
     landmarks_path, camera_path, split_path, poses_path = (
         path / name for name in ("landmarks.npz", "camera.json", "split.json", SMPL_POSES_NPZ)
     )
@@ -158,9 +161,20 @@ def _find_masks(path: Path, source: FrameSource) -> tuple[Callable[[int], np.nda
         return _masks_from_array(arrays["masks"], path / "masks.npz", source), "masks.npz"
     if (path / "masks.hdf5").is_file():
         return _masks_from_array(_read_hdf5_masks(path / "masks.hdf5"), path / "masks.hdf5", source), "masks.hdf5"
-    if source.files and read_alpha(source.files[0]).min() < 255:
+    if any(read_alpha(source.files[k]).min() < 255 for k in (_sampled(len(source.files)) if source.files else ())):
         return (lambda index: read_alpha(source.files[index])), "the images' alpha channel"
     return None, ""
+
+
+def _refuse_inverted(read_mask: Callable[[int], UInt8[np.ndarray, "h w"]], name: str, count: int) -> None:
+    """Refuse masks that are white in all corners of most sampled images: nobody is there, so it is the background."""
+    corners = [read_mask(k)[[0, 0, -1, -1], [0, -1, 0, -1]] for k in _sampled(count)]
+    if np.mean([levels.min() > _WHITE for levels in corners]) > 0.5:
+        raise UserError(f"{name} are white in the corners of the images; white is the person, so invert them")
+
+
+def _sampled(count: int) -> list[int]:
+    return sorted({int(k) for k in np.linspace(0, count - 1, _N_MASKS_SAMPLED)})
 
 
 def _masks_from_folder(folder: Path, source: FrameSource) -> Callable[[int], np.ndarray]:
@@ -175,8 +189,7 @@ def _masks_from_folder(folder: Path, source: FrameSource) -> Callable[[int], np.
             )
         files = [by_stem[name] for name in names]
     _check_frame_count(folder, len(files), source)
-    sampled = {int(k) for k in np.linspace(0, len(files) - 1, _N_MASKS_SAMPLED)}
-    level_scale = 255 if all(read_gray(files[k]).max() <= 1 for k in sorted(sampled)) else 1
+    level_scale = 255 if all(read_gray(files[k]).max() <= 1 for k in _sampled(len(files))) else 1
     return lambda index: cv2.convertScaleAbs(read_gray(files[index]), alpha=level_scale)
 
 

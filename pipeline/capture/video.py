@@ -10,11 +10,13 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
+from typing import cast
 
 import av
 import cv2
 import numpy as np
 from av.container import InputContainer
+from av.video.stream import VideoStream
 from jaxtyping import Int, Shaped, UInt8
 
 from pipeline.capture import hdr
@@ -39,6 +41,8 @@ _IMAGE_FOLDER_NAMES = ("images", "frames", "image", "rgb", "color")
 # sample over 2 x 2 pixels, which leaves visible blocks along the person's outline (bits of libswscale's SWS_* flags).
 _SWS_FLAGS = 0x4 | 0x2000 | 0x4000 | 0x40000
 _SWS_AREA = 0x20
+_UNSPECIFIED, _BT_709 = 2, 1
+"""Codes of matrix coefficients (ITU-T H.273, table 4)."""
 # A decoded image (8-bit sRGB, or 16 bits with another transfer function) and its conversion to 8-bit sRGB.
 _DecodedImage = tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]
 
@@ -160,7 +164,9 @@ def image_size_px(source: FrameSource) -> tuple[int, int]:
 
 def natural_sort_key(path: Path) -> list[tuple[int, str]]:
     """Return a sort key that orders `frame2` before `frame10`."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name.lower()) if part]
+    return [
+        (int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name.lower()) if part
+    ]
 
 
 def _images_in(folder: Path) -> tuple[Path, ...]:
@@ -171,9 +177,7 @@ def _images_in(folder: Path) -> tuple[Path, ...]:
 def _open_video(path: Path) -> FrameSource:
     try:
         with open_container(path) as container:
-            if not container.streams.video:
-                raise UserError(f"{path} has no video track; supply a video file or a folder of images")
-            stream = container.streams.video[0]
+            stream = _video_stream(container, path)
             if stream.codec_context is None:
                 raise UserError(f"{path} has a video track of an unknown codec; supply an .mp4, .mov or .webm file")
             if stream.width * stream.height > MAX_FRAME_PIXELS:
@@ -183,12 +187,21 @@ def _open_video(path: Path) -> FrameSource:
                 )
             fps = float(stream.average_rate or stream.guessed_rate or DEFAULT_IMAGE_FPS)
             # Packets hidden by an edit list (a clip that was trimmed without re-encoding) are decoded but not shown.
-            n_frames = sum(packet.size > 0 and not packet.is_discard for packet in container.demux(stream))
+            is_shown = [not packet.is_discard for packet in container.demux(stream) if packet.size > 0]
+            if "mov" in container.format.name and stream.frames > len(is_shown):
+                warn(f"{path} is incomplete: {len(is_shown)} of its {stream.frames} frames are there; copy it again")
     except av.FFmpegError as error:
         raise UserError(
             f"{path} cannot be read as a video ({error.strerror}); supply an .mp4, .mov or .webm file"
         ) from None
-    return FrameSource(path, (), n_frames, fps)
+    return FrameSource(path, (), sum(is_shown), fps)
+
+
+def _video_stream(container: InputContainer, path: Path) -> VideoStream:
+    stream = container.streams.best("video")
+    if not isinstance(stream, VideoStream):
+        raise UserError(f"{path} has no video track; supply a video file or a folder of images")
+    return stream
 
 
 def open_container(path: Path) -> InputContainer:
@@ -217,16 +230,32 @@ def _video(
     time_s: float | None = None
     index = -1
     with open_container(source.path) as container:
-        stream = container.streams.video[0]
+        stream = _video_stream(container, source.path)
         stream.thread_type = "AUTO"
         try:
-            for index, picture in enumerate(container.decode(stream)):
+            for index, picture in enumerate(_decode(container, stream, source.path)):
                 time_s = _monotonic_time_s(picture.time, time_s, 1.0 / source.fps)
                 start_s = time_s if start_s is None else start_s
                 if is_wanted(index):
                     yield index, time_s - start_s, convert(picture, stream.sample_aspect_ratio)
         except av.FFmpegError as error:
             warn(f"{source.path} is truncated after {index + 1} frames ({error.strerror}); these frames are used")
+
+
+def _decode(container: InputContainer, stream: VideoStream, path: Path) -> Iterator[av.VideoFrame]:
+    """Yield the decoded frames; damaged packets, and frames that lack them, are left out with a warning."""
+    damaged = 0
+    for packet in container.demux(stream):
+        try:
+            pictures = packet.decode()
+        except av.InvalidDataError:
+            damaged += 1
+            continue
+        whole = [picture for picture in pictures if not (damaged and picture.is_corrupt)]
+        damaged += len(pictures) - len(whole)
+        yield from whole
+    if damaged:
+        warn(f"{path} is damaged: about {damaged} frames are left out; copy it again if you have another copy")
 
 
 def _monotonic_time_s(timestamp_s: float | None, previous_s: float | None, step_s: float) -> float:
@@ -237,15 +266,54 @@ def _monotonic_time_s(timestamp_s: float | None, previous_s: float | None, step_
 
 
 def _to_upright_rgb(picture: av.VideoFrame, aspect: Fraction | None) -> _DecodedImage:
-    """Return the RGB image of a decoded frame with square pixels, rotated as the container says."""
+    """Return the RGB image of a decoded frame with square pixels, turned as the container says."""
     transfer, primaries = int(picture.color_trc), int(picture.color_primaries)
     is_hdr = transfer in hdr.HDR_TRANSFERS
-    pixels = picture.reformat(format="rgb48le" if is_hdr else "rgb24", interpolation=_SWS_FLAGS)
+    pixels = picture.reformat(
+        format="rgb48le" if is_hdr else "rgb24", src_colorspace=_assumed_matrix(picture), interpolation=_SWS_FLAGS
+    )
     rgb: np.ndarray = pixels.to_ndarray()
+    if picture.interlaced_frame:
+        rgb = _first_field(rgb)
     if aspect and aspect != 1:
         rgb = cv2.resize(rgb, (round(rgb.shape[1] * aspect), rgb.shape[0]), interpolation=cv2.INTER_CUBIC)
     to_srgb = partial(hdr.to_srgb, transfer=transfer, primaries=primaries) if is_hdr else np.asarray
-    return np.ascontiguousarray(np.rot90(rgb, k=round(picture.rotation / 90) % 4)), to_srgb
+    return _upright(rgb, picture), to_srgb
+
+
+def _assumed_matrix(picture: av.VideoFrame) -> int | None:
+    """Return the code of the colour matrix of a frame that names none: BT.709 for high definition, as players assume.
+
+    None: the frame names one, or is of standard definition (BT.601), or of JPEG's full range (always BT.601).
+    """
+    is_untagged = picture.colorspace == _UNSPECIFIED and picture.format.name.startswith("yuv")
+    is_high_definition = picture.width >= 1280 or picture.height > 576
+    if is_untagged and is_high_definition and not picture.format.name.startswith("yuvj"):
+        return _BT_709
+    return None
+
+
+def _first_field(rgb: Shaped[np.ndarray, "h w 3"]) -> Shaped[np.ndarray, "h w 3"]:
+    """Return an interlaced image with the second field interpolated from the first: they are of different times."""
+    single = rgb.copy()
+    below = rgb[2::2].astype(np.float32)
+    between = single[1::2][: len(below)]
+    between[:] = np.rint(0.5 * (rgb[0::2][: len(below)] + below))
+    return single
+
+
+def _upright(rgb: Shaped[np.ndarray, "h w 3"], picture: av.VideoFrame) -> Shaped[np.ndarray, "h2 w2 3"]:
+    """Return the image turned by quarters and mirrored as the container's display matrix says.
+
+    The matrix (a b; c d) sends a pixel to x' = a x + c y, y' = b x + d y (ISO 14496-12, track header).
+    """
+    stored = picture.side_data.get("DISPLAYMATRIX")
+    if stored is None:
+        return np.ascontiguousarray(rgb)
+    (a, b, _), (c, d, _), _ = np.frombuffer(cast(bytes, stored), np.int32).reshape(3, 3).tolist()
+    if abs(a) < abs(b):
+        rgb, a, d = rgb.swapaxes(0, 1), c, b
+    return np.ascontiguousarray(rgb[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1])
 
 
 def downscale(rgb: Shaped[np.ndarray, "h w 3"], max_side_px: int) -> tuple[Shaped[np.ndarray, "h2 w2 3"], float]:

@@ -118,8 +118,14 @@ def read_rgba(path: Path) -> UInt8[np.ndarray, "h w 4"]:
 
 
 def read_alpha(path: Path) -> UInt8[np.ndarray, "h w"]:
-    """Read the alpha channel as it is stored, 255 where the file has none. Raises UserError as `read_rgb`."""
-    return np.ascontiguousarray(read_rgba(path)[:, :, 3])
+    """Read the alpha channel with the EXIF orientation applied, 255 where the file has none.
+
+    Raises UserError as `read_rgb`.
+    """
+    decoded = _decode(path)
+    if decoded.alpha is None:
+        return _upright(np.full(decoded.colour.shape[:2], 255, dtype=np.uint8), decoded.orientation)
+    return _upright(to_uint8(decoded.alpha), decoded.orientation)
 
 
 def read_exif_tag(path: Path, tag: int, directory: int | None = None) -> object:

@@ -123,7 +123,7 @@ def make_moving_scene(shifts_px: list[int], levels: list[int]) -> Detections:
         ([0] * 19 + [6], [0] * 20, None),
         ([0] * 15 + [6] * 5, [0] * 20, "changes in clip.mp4 (frames 15-19): the camera or the light seems to change"),
         ([0, 2, 4, 6, 5, 3, 1, -1, -3, -5] * 2, [0] * 20, "the camera or the light seems to change"),
-        ([0] * 20, [0] * 16 + [30] * 4, "changes in clip.mp4 (frames 16-19)"),
+        ([0] * 20, [0] * 16 + [30] * 4, "if it shows two scenes, cut it at frame 16"),
     ],
     ids=["still", "one jolt", "pushed", "in the hand", "brighter"],
 )

@@ -5,6 +5,7 @@ import json
 import h5py
 import numpy as np
 import pytest
+from PIL import Image
 
 from pipeline.capture.smpl_poses import save_smpl_poses
 from pipeline.capture.user_files import CameraCalibration, load_user_files
@@ -84,6 +85,28 @@ def test_alpha_channel_is_the_mask_unless_masks_are_supplied(tmp_path):
     assert (levels_of(user_files), user_files.mask_source) == ([0, 128, 255], "the images' alpha channel")
     write_masks(tmp_path, m1=10, m2=20, m3=30)
     assert levels_of(load_user_files(tmp_path, open_frame_source(tmp_path))) == [10, 20, 30]
+
+
+def test_inverted_masks_are_refused(tmp_path, source):
+    write_masks(tmp_path, m1=255, m2=255, m3=255)
+    with pytest.raises(UserError, match=r"masks/\) are white in the corners"):
+        load_user_files(tmp_path, source)
+
+
+def test_alpha_is_turned_with_the_colours(tmp_path):
+    """EXIF orientation 6: the first row of the file is the right side of the picture."""
+    (tmp_path / "images").mkdir()
+    rgba = np.full((4, 6, 4), 90, np.uint8)
+    rgba[..., 3] = 0
+    rgba[0, :, 3] = 255
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    for k in range(3):
+        Image.fromarray(rgba).save(tmp_path / "images" / f"{k}.png", exif=exif)
+    mask = load_user_files(tmp_path, open_frame_source(tmp_path)).read_mask(0)
+    assert mask.shape == (6, 4)
+    assert (mask[:, -1] == 255).all()
+    assert not mask[:, :-1].any()
 
 
 def test_a_folder_of_zeros_and_ones_is_brought_to_255(tmp_path, source):
