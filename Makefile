@@ -59,7 +59,7 @@ SAMPLE_RUN := runs/sample
 SAMPLE := runs/sample-capture
 SAMPLE_DONE := $(SAMPLE)/.done-$(shell sed -n 's/^CAPTURE_VERSION = //p' data_tools/synthetic/scene/capture.py)
 ONE_RUN := $(or $(RUN),$(SAMPLE_RUN))
-RUN_OPTIONS = $(if $(PRESET),--preset $(PRESET)) $(foreach item,$(SET),--set $(item))
+RUN_OPTIONS = $(if $(PRESET),--preset $(PRESET)) $(foreach item,$(SET),$(if $(findstring =,$(item)),--set $(item),$(error SET=$(SET): $(item) has no '='; a value with spaces goes through ARGS='--set "key=a value"')))
 OPTIONS = $(RUN_OPTIONS) $(ARGS)
 STAMP := $(VENV)/.stamp$(if $(EXTRA),-$(EXTRA))
 

@@ -88,6 +88,8 @@ def read_pose(path: Path, body: Body) -> Float32[np.ndarray, "1 j 4"]:
     Raises:
         UserError: the file cannot be read, a joint is unknown or a value is not a quaternion.
     """
+    if not path.is_file():
+        raise UserError(f"there is no pose {path}; choose a, t or a .json file")
     rotations = np.tile(np.array([1.0, 0.0, 0.0, 0.0], dtype=np.float32), (1, len(body.joint_names), 1))
     try:
         poses = load_json(path)
@@ -149,7 +151,9 @@ def _result_name(options: argparse.Namespace) -> str:
 def _retargeted_clips(paths: Sequence[Path], body: Body, in_place: bool) -> dict[str, Motion]:
     names = [path.stem for path in paths]
     for name in names:
-        if names.count(name) > 1 or name in ("capture", "idle"):
+        if name in ("capture", "idle"):
+            raise UserError(f"{name} is the name of a clip that every avatar has; rename the file {name}.bvh")
+        if names.count(name) > 1:
             raise UserError(f"there are several clips with the name {name}; rename the file {name}.bvh")
     return {path.stem: play_bvh(path, body, in_place) for path in paths}
 

@@ -14,8 +14,10 @@ from typing import Any
 from data_tools.command import run_command
 from data_tools.evaluate.compare_body import compare_body, compare_masks, compare_surface
 from data_tools.evaluate.page import write_comparison
+from data_tools.evaluate.truth import read_capture_settings
+from pipeline.core.command import format_command
 from pipeline.core.errors import UserError
-from pipeline.core.manifest import MANIFEST_FILE
+from pipeline.core.manifest import MANIFEST_FILE, digest_video, read_manifest
 
 
 def main(argv: Sequence[str]) -> None:
@@ -30,6 +32,8 @@ def main(argv: Sequence[str]) -> None:
     if not finished:
         command = f"python -m stages --run {options.run} --video {options.out}/video"
         raise UserError(f"{options.run} has no finished stage; run {command}")
+    read_capture_settings(options.out)
+    _require_video_of(options.out, options.run)
     sections: dict[str, Any] = {}
     if "frames" in finished:
         sections["masks"] = compare_masks(options.out, options.run / "frames")
@@ -42,6 +46,19 @@ def main(argv: Sequence[str]) -> None:
         _print_scores(name, scores)
     if sections.get("light", "flat") != "flat":
         print(f"light: {sections['light']}")
+
+
+def _require_video_of(out: Path, run: Path) -> None:
+    """Raise UserError if a run was made from another recording than that of the capture in `out`, wherever it lies."""
+    manifest, video = read_manifest(run / "frames"), out / "video"
+    if manifest is None or "video" not in manifest.inputs:
+        return
+    digests = {digest_video(video)} | {digest_video(path) for path in video.iterdir() if path.is_file()}
+    if manifest.inputs["video"] not in digests:
+        raise UserError(
+            f"{run} was made from another video than {video}; name the capture of its video with TRUTH=, or run "
+            f"{format_command('--run', run, '--video', video)}"
+        )
 
 
 def _print_scores(path: str, scores: Any) -> None:

@@ -18,7 +18,7 @@ class FieldConfig(Config):
     `settings` is not listed in configs/default.yaml: only smoke.yaml and the presets of published baselines set it.
     """
 
-    seed: int = Field(0, ge=0, description="seed of all random numbers")
+    seed: int = Field(0, ge=0, lt=1 << 63, description="seed of all random numbers")
     device: DeviceChoice = Field("auto", description="device of the training: auto uses a CUDA GPU if there is one")
     steps: int = Field(750, ge=0, le=200_000, description="training steps")
     rays_per_step: int = Field(4096, ge=64, le=1 << 18, description="rays per training step")

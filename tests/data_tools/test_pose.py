@@ -95,7 +95,7 @@ def test_poses_by_name_and_by_file(run: Path, tmp_path: Path) -> None:
     [
         (["--bvh", "none.bvh"], "none.bvh does not exist"),
         (["--frame", "99"], "frame 99 has no pose; choose one of 0 to"),
-        (["--pose", "none.json"], "none.json is not a JSON object"),
+        (["--pose", "none.json"], "there is no pose none.json; choose a, t or a .json file"),
         (["--name", "../export"], "is not the name of a folder"),
     ],
 )

@@ -23,6 +23,7 @@ from data_tools.evaluate.page import LIT_NOTE
 from data_tools.evaluate.truth import load_true_mask
 from pipeline.body.files import load_body, load_camera, load_motion, save_body, save_camera, save_motion
 from pipeline.core.errors import UserError
+from pipeline.core.manifest import MANIFEST_FILE, Manifest, digest_video, write_manifest
 from pipeline.geometry.rotation import axis_angle_to_quaternion, quaternion_multiply, quaternion_to_matrix
 from pipeline.io.image import write_gray
 from pipeline.io.npz import save_npz
@@ -163,11 +164,25 @@ def test_run_of_another_capture_is_an_error(sample: Path, run: Path) -> None:
         compare_body(sample, run / "body")
 
 
+def write_manifest_of(video: Path, frames: Path) -> None:
+    inputs = {"video": digest_video(video)}
+    write_manifest(Manifest("frames", 1, "", {}, inputs, {}, {}, 1.0, 1.0), frames / MANIFEST_FILE)
+
+
+def test_a_run_of_another_video_is_refused(
+    sample: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "other.mp4").write_bytes(b"another video")
+    write_manifest_of(tmp_path / "other.mp4", run / "frames")
+    assert run_command(compare_command, [str(sample), str(run)]) == 2
+    assert "was made from another video" in capsys.readouterr().err
+
+
 def test_command_prints_scores_of_finished_stages(sample: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_command(compare_command, [str(sample), str(run)]) == 2
     assert "has no finished stage" in capsys.readouterr().err
-    for stage in ("frames", "body"):
-        (run / stage / "manifest.json").write_text("{}")
+    write_manifest_of(sample / "video", run / "frames")
+    (run / "body" / "manifest.json").write_text("{}")
     assert run_command(compare_command, [str(sample), str(run)]) == 0
     printed = capsys.readouterr().out
     assert "mask_iou_median" in printed
@@ -176,10 +191,15 @@ def test_command_prints_scores_of_finished_stages(sample: Path, run: Path, capsy
 
 @pytest.mark.parametrize(("light", "is_said"), [("flat", False), (LIT_NOTE, True)])
 def test_command_says_where_the_light_is_not_flat(
-    light: str, is_said: bool, run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    light: str,
+    is_said: bool,
+    sample: Path,
+    run: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     (run / "report").mkdir()
     (run / "report" / "manifest.json").write_text("{}")
     monkeypatch.setattr(compare, "write_comparison", lambda out, run_dir, measured: {"light": light})
-    assert run_command(compare_command, ["capture", str(run)]) == 0
+    assert run_command(compare_command, [str(sample), str(run)]) == 0
     assert ("--light flat" in capsys.readouterr().out) == is_said
