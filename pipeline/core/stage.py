@@ -20,6 +20,7 @@ from pipeline.core.errors import UserError
 from pipeline.core.manifest import (
     MANIFEST_FILE,
     Manifest,
+    digest_file,
     digest_files,
     digest_video,
     fingerprint,
@@ -42,6 +43,7 @@ class Stage:
     version: raised when the meaning of the outputs changes.
     needs: names of the stages that it reads, or "video" for the user's file or folder.
     makes: files and folders on which later stages rely; not empty after a run. Other outputs are allowed.
+    config: its options; the content of a file that an option in `_file` names counts as an input.
     run: `run(inputs, out, config) -> metrics`; `inputs` maps each need to its path, `out` is the folder to fill.
     shows: the file of `makes` that a user waits for; the command names it as soon as the stage is done.
     """
@@ -107,8 +109,15 @@ def plan_stage(stage: Stage, config: Config, run_dir: Path, video: Path | None) 
         if manifest is None:
             raise UserError(f"{stage.name} needs {run_dir / need}, which is missing: {format_command(need, run_dir)}")
         inputs[need], digests[need] = run_dir / need, manifest.outputs_digest
+    digests |= _digests_of_named_files(config)
     key = fingerprint(stage.name, stage.version, config.model_dump(mode="json"), digests)
     return StagePlan(stage, config, run_dir, inputs, digests, key)
+
+
+def _digests_of_named_files(config: Config) -> dict[str, str]:
+    """Return the digests of the files that options ending in `_file` name; the stage reports one that is missing."""
+    paths = {name: Path(value) for name, value in config if name.endswith("_file") and value is not None}
+    return {name: digest_file(path) for name, path in paths.items() if path.is_file()}
 
 
 def run_stage(plan: StagePlan, force: bool = False) -> bool:

@@ -75,6 +75,25 @@ def test_the_content_of_the_video_makes_it_stale(tmp_path: Path) -> None:
     assert not plan(tmp_path).is_fresh()
 
 
+def test_the_content_of_a_file_that_an_option_names_makes_it_stale(tmp_path: Path) -> None:
+    class Named(Options):
+        model_file: str | None = None
+
+    stage = Stage("count", 1, (), ("number.txt",), Named, write_number)
+    model = tmp_path / "model.npz"
+
+    def runs(name: Path | None) -> bool:
+        options = Named(model_file=None if name is None else str(name))
+        return run_stage(plan_stage(stage, options, tmp_path / "run", None))
+
+    assert runs(None)
+    model.write_text("neutral")
+    assert runs(model)
+    assert not runs(model)
+    model.write_text("female")
+    assert runs(model)
+
+
 def test_a_lost_file_makes_it_stale(tmp_path: Path) -> None:
     run_stage(plan(tmp_path))
     (tmp_path / "run" / "count" / "number.txt").unlink()
