@@ -377,7 +377,7 @@ def light_extras(light: VideoLight) -> dict[str, Any]:
 
 STAGE = Stage(
     "export",
-    version=15,
+    version=16,
     needs=("frames", "body", "mesh", "texture"),
     makes=("avatar.glb", "avatar.obj", "avatar.mtl", *OBJ_MAPS),
     config=Config,
