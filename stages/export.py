@@ -351,7 +351,7 @@ def asset_extras(config: Config, offset_m: Float[np.ndarray, "3"], frame_rate_hz
         "unit": "metre",
         "axes": "+Y up, the rest pose faces +Z",
         "world_to_scene_translation_m": [float(value) for value in offset_m],
-        "world": "frame of the capture camera: +Y up, camera at the origin unless a camera was supplied",
+        "world": "+Y up; of the supplied camera or SMPL poses, else estimated from the video, with the floor at y = 0",
         "frame_rate_hz": frame_rate_hz,
         "source": "reconstructed from one video",
         "licence_note": config.licence_note,
@@ -377,7 +377,7 @@ def light_extras(light: VideoLight) -> dict[str, Any]:
 
 STAGE = Stage(
     "export",
-    version=15,
+    version=16,
     needs=("frames", "body", "mesh", "texture"),
     makes=("avatar.glb", "avatar.obj", "avatar.mtl", *OBJ_MAPS),
     config=Config,

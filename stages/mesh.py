@@ -48,7 +48,7 @@ from pipeline.mesh.files import (
 from pipeline.mesh.isosurface import CanonicalGrid, extract_mesh, sample_canonical_grid, select_isovalue
 from pipeline.mesh.outline_alignment import align_outlines
 from pipeline.mesh.pose_alignment import MAX_PERSON_PX, AlignedSurface
-from pipeline.mesh.pose_selection import in_other_poses, is_far_from, score_motion, select_poses
+from pipeline.mesh.pose_selection import in_other_poses, is_far_from, merge_poses, score_motion
 from pipeline.mesh.refinement import refine_mesh, with_offsets
 from pipeline.mesh.remeshing import detailed_faces, remesh_to_edge_length
 from pipeline.mesh.settings import MeshSettings
@@ -316,7 +316,7 @@ def align_other_frames(
     if not use_near:
         warn("frames next to training frames keep interpolated poses: validation frames prefer them")
     use = ~is_trained & np.where(is_far, use_far, use_near)
-    return select_poses(use, aligned, motion), {
+    return merge_poses(use, aligned, motion), {
         **{f"{name}_motion_silhouette_iou": score.silhouette_iou for name, score in zip(MOTIONS, scores, strict=True)},
         **{f"{name}_motion_psnr_db": score.psnr_db for name, score in zip(MOTIONS, scores, strict=True)},
         "aligned_frames": float(use.sum()),

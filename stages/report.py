@@ -342,7 +342,7 @@ def _manifest(folder: Path) -> Manifest:
 
 STAGE = Stage(
     name="report",
-    version=13,
+    version=14,
     needs=NEEDS,
     makes=("report.json", "index.html", "turntable.jpg", "clay.jpg", "heldout.jpg"),
     config=Config,

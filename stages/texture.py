@@ -385,7 +385,7 @@ def fit_highlights(evidence: LightEvidence | None, light: VideoLight, mesh: Mesh
 
 STAGE = Stage(
     "texture",
-    version=14,
+    version=15,
     needs=("frames", "body", "mesh"),
     makes=(ATLAS, DIFFUSE, SPECULAR, ROUGHNESS, NORMAL, COVERAGE, LIGHT, TEMPLATE_NPZ),
     config=Config,

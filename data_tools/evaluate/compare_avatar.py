@@ -29,10 +29,11 @@ from pipeline.core.progress import warn
 from pipeline.geometry.alpha import premultiply_to_float
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.similarity import SimilarityTransform
 from pipeline.geometry.surface import closest_points_on_mesh
 from pipeline.geometry.texture_rendering import blur_coverage, sample_texture, turntable_cameras
 from pipeline.io.image import read_rgba, to_uint8
-from pipeline.metrics.alignment import SimilarityTransform, align_surfaces_icp
+from pipeline.metrics.alignment import align_surfaces_icp
 from pipeline.metrics.images import additional_blur_sigma_px, frame_scores, mean_scores, reason_not_scorable
 from pipeline.metrics.surfaces import chamfer_distance_mm, sample_surface, surface_scores
 from stages.report import median_edge_blur_px, scored_positions

@@ -22,9 +22,10 @@ from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.rotation import quaternion_to_matrix
 from pipeline.geometry.shadow_map import find_exterior_faces
+from pipeline.geometry.similarity import SimilarityTransform
 from pipeline.geometry.skinning import forward_kinematics, local_quaternions
 from pipeline.io.image import to_float
-from pipeline.metrics.alignment import SimilarityTransform, align_surfaces_icp
+from pipeline.metrics.alignment import align_surfaces_icp
 from pipeline.metrics.images import frame_scores
 from pipeline.metrics.surfaces import SurfaceCorrespondence, surface_correspondence
 from pipeline.texture.files import load_texture

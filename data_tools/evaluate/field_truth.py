@@ -27,13 +27,14 @@ from pipeline.field.skin_grid import build_skin_grid, skin_margin_m
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.shadow_map import find_exterior_faces
+from pipeline.geometry.similarity import SimilarityTransform
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.io.image import read_rgba
 from pipeline.kernels.inverse_skinning import SkinGrid
 from pipeline.mesh.isosurface import extract_mesh, sample_canonical_grid
 from pipeline.mesh.settings import MeshSettings
 from pipeline.mesh.skin_transfer import transfer_skin
-from pipeline.metrics.alignment import SimilarityTransform, align_surfaces_icp
+from pipeline.metrics.alignment import align_surfaces_icp
 from pipeline.metrics.images import frame_scores, mean_scores
 from pipeline.metrics.surfaces import surface_scores
 

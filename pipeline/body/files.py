@@ -1,4 +1,4 @@
-"""Artifacts of the body stage: body, motion, camera, frame scores, landmarks; one writer and one reader each."""
+"""Artifacts of the body stage: body, motion, frame scores, camera; one writer and one reader each."""
 
 from dataclasses import dataclass, fields
 from pathlib import Path

@@ -145,10 +145,15 @@ def largest_yaw_gap_rad(yaw_rad: Float[np.ndarray, "n"]) -> float:
     return float(np.diff(np.append(angles, angles[0] + 2 * np.pi)).max())
 
 
+def runs_of(flags: Bool[np.ndarray, "n"]) -> list[tuple[int, int]]:
+    """Return start and end (exclusive) of each run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return [(int(first), int(end)) for first, end in edges.reshape(-1, 2)]
+
+
 def format_frame_ranges(frame_index: Int[np.ndarray, "n"], rows: Bool[np.ndarray, "n"]) -> str:
     """Format the marked frames; frames that are neighbours among the n frames are joined: "3, 81-96"."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], rows.astype(np.int8), [0]])))
-    spans = [(int(frame_index[start]), int(frame_index[end - 1])) for start, end in edges.reshape(-1, 2)]
+    spans = [(int(frame_index[start]), int(frame_index[end - 1])) for start, end in runs_of(rows)]
     return ", ".join(str(first) if first == last else f"{first}-{last}" for first, last in spans)
 
 

@@ -46,7 +46,6 @@ class PoseLandmark(IntEnum):
 
 _P = PoseLandmark
 N_LANDMARKS = len(PoseLandmark)
-LANDMARK_NAMES = tuple(landmark.name.lower() for landmark in PoseLandmark)
 TORSO = (_P.LEFT_SHOULDER, _P.RIGHT_SHOULDER, _P.LEFT_HIP, _P.RIGHT_HIP)
 KNEES, ANKLES = (_P.LEFT_KNEE, _P.RIGHT_KNEE), (_P.LEFT_ANKLE, _P.RIGHT_ANKLE)
 FEET = (_P.LEFT_HEEL, _P.RIGHT_HEEL, _P.LEFT_FOOT_INDEX, _P.RIGHT_FOOT_INDEX)

@@ -1,8 +1,9 @@
-"""Person detection with MediaPipe: 33 pose landmarks and a segmentation mask. Only this file and `hand_detector` use
-it.
+"""Person detection with MediaPipe: 33 pose landmarks and a segmentation mask. Only the detectors of people, hands and
+faces use it.
 
-Both models are part of the package; nothing is downloaded. Frames are processed independently (no tracking), so the
-result does not depend on which process handled which frame.
+Both models are part of the package; nothing is downloaded. They keep no state between frames: `track` alone starts at
+the landmarks of the image before, within the images that it is given, so that the result does not depend on which
+thread handled which images.
 
 The first model predicts a square region of interest (ROI) around the person, the second one predicts landmarks and
 mask in it. An ROI that is too small cuts off the feet and shifts all landmarks, so it is replaced by the ROI of the

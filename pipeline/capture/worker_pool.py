@@ -10,7 +10,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
-import cv2
+from pipeline.kernels.common.opencv_threads import single_threaded_opencv
 
 Result = TypeVar("Result")
 _MAX_PENDING_PER_WORKER = 2
@@ -41,9 +41,7 @@ class WorkerPool:
 @contextmanager
 def start_worker_pool(count: int) -> Iterator[WorkerPool]:
     """Start `count` threads (none for 1) that end with the block; OpenCV uses one thread for each meanwhile."""
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
+    with single_threaded_opencv():
         if count == 1:
             yield WorkerPool(None, 1)
             return
@@ -52,5 +50,3 @@ def start_worker_pool(count: int) -> Iterator[WorkerPool]:
                 yield WorkerPool(executor, count)
             finally:
                 executor.shutdown(wait=True, cancel_futures=True)
-    finally:
-        cv2.setNumThreads(threads)

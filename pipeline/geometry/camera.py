@@ -30,10 +30,6 @@ class Camera:
     height: int
     world_to_camera: Float[np.ndarray, "4 4"] = field(default_factory=DEFAULT_WORLD_TO_CAMERA.copy)
 
-    def intrinsic_matrix(self) -> Float[np.ndarray, "3 3"]:
-        """Return the intrinsic matrix K in pixels."""
-        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]], dtype=np.float32)
-
     def scaled(self, factor: float) -> Camera:
         """Return the camera of the image resized by `factor`; the sides are rounded to whole pixels."""
         width, height = max(1, round(self.width * factor)), max(1, round(self.height * factor))

@@ -3,8 +3,8 @@
 Reference: M. Meredith and S. Maddock, "Motion capture file formats explained", 2001.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +32,7 @@ class BvhMotion:
         offsets: of each joint from its parent.
         rotations: local, composed in the channel order of the file.
         root_positions: of joint 0.
+        child_positions: relative to the parent, of the other joints that have position channels; they replace offsets.
     """
 
     joint_names: tuple[str, ...]
@@ -40,11 +41,15 @@ class BvhMotion:
     rotations: Float[np.ndarray, "n j 3 3"]
     root_positions: Float[np.ndarray, "n 3"]
     fps: float
+    child_positions: Mapping[int, Float[np.ndarray, "n 3"]] = field(default_factory=dict)
 
     def forward_kinematics(
         self, rotations: Float[np.ndarray, "k j 3 3"]
     ) -> tuple[np.ndarray, Float[np.ndarray, "k j 3"]]:
-        """Return world rotations (k, j, 3, 3) and joint positions relative to the root (k, j, 3) of local rotations."""
+        """Return world rotations (k, j, 3, 3) and joint positions relative to the root (k, j, 3) of local rotations.
+
+        Bones have their length in the rest pose: `child_positions` do not count.
+        """
         world = rotations.copy()
         positions = np.zeros(rotations.shape[:3])
         for joint, parent in enumerate(self.parents):
@@ -52,6 +57,16 @@ class BvhMotion:
                 world[:, joint] = world[:, parent] @ rotations[:, joint]
                 positions[:, joint] = positions[:, parent] + world[:, parent] @ self.offsets[joint]
         return world, positions
+
+    def trajectory(self, joint: int) -> Float[np.ndarray, "n 3"]:
+        """Return the positions of a joint in the axes of the file, with all position channels from the root to it."""
+        path = np.zeros_like(self.root_positions)
+        while joint > 0:
+            parent = int(self.parents[joint])
+            path = self.child_positions.get(joint, self.offsets[joint]) + path
+            path = np.einsum("nab,nb->na", self.rotations[:, parent], path)
+            joint = parent
+        return self.root_positions + path
 
 
 def read_bvh(path: Path) -> BvhMotion:
@@ -80,14 +95,15 @@ def read_bvh(path: Path) -> BvhMotion:
         values = np.array([float(token) for token in tokens])[: count * width].reshape(count, width)
         if not (np.isfinite(values).all() and np.isfinite(offsets).all()):
             raise UserError(f"motion {path} has values that are not finite; export it again")
-        rotations, root_positions = _decode_channels(values, offsets, channels)
+        rotations, positions = _decode_channels(values, offsets, channels)
     except (StopIteration, ValueError, IndexError) as error:
         raise UserError(f"motion {path} is not a complete BVH file ({error}); export it again") from error
-    return BvhMotion(tuple(names), np.array(parents), offsets, rotations, root_positions, 1.0 / frame_time_s)
+    root_positions = positions.pop(0, np.tile(offsets[0], (count, 1)))
+    return BvhMotion(tuple(names), np.array(parents), offsets, rotations, root_positions, 1.0 / frame_time_s, positions)
 
 
 def write_bvh(path: Path, motion: BvhMotion) -> None:
-    """Write a file: rotation channels in the order z, x, y, for the root after its position.
+    """Write a file: rotation channels in the order z, x, y, after the position where a joint has one.
 
     A joint without children gets an end site of half the length of its bone, or, if its name ends in `_end`, is written
     as the end site of its parent.
@@ -95,8 +111,12 @@ def write_bvh(path: Path, motion: BvhMotion) -> None:
     lines = ["HIERARCHY", *_hierarchy_lines(motion, 0, 0)]
     lines += ["MOTION", f"Frames: {len(motion.rotations)}", f"Frame Time: {1.0 / motion.fps:.8f}"]
     order = [joint for joint in _depth_first(motion, 0) if not motion.joint_names[joint].endswith(_END_SITE)]
-    angles_deg = Rotation.from_matrix(motion.rotations[:, order].reshape(-1, 3, 3)).as_euler(_EULER_ORDER, degrees=True)
-    rows = np.concatenate([motion.root_positions, angles_deg.reshape(len(motion.rotations), -1)], axis=1)
+    positions = {0: motion.root_positions, **motion.child_positions}
+    columns = []
+    for joint in order:
+        angles_deg = Rotation.from_matrix(motion.rotations[:, joint]).as_euler(_EULER_ORDER, degrees=True)
+        columns += [positions[joint], angles_deg] if joint in positions else [angles_deg]
+    rows = np.concatenate(columns, axis=1)
     lines += [" ".join(f"{value:.6f}" for value in row) for row in rows.tolist()]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
@@ -119,7 +139,8 @@ def _hierarchy_lines(motion: BvhMotion, joint: int, depth: int) -> list[str]:
         body = ["End Site", "{", f"\t{offset}", "}"]
         return ["\t" * depth + line for line in body]
     rotations = " ".join(f"{axis}rotation" for axis in _EULER_ORDER)
-    channels = f"CHANNELS 3 {rotations}" if depth else f"CHANNELS 6 Xposition Yposition Zposition {rotations}"
+    moves = depth == 0 or joint in motion.child_positions
+    channels = f"CHANNELS 6 Xposition Yposition Zposition {rotations}" if moves else f"CHANNELS 3 {rotations}"
     lines = [f"{'JOINT' if depth else 'ROOT'} {name}", "{", f"\t{offset}", f"\t{channels}"]
     lines = ["\t" * depth + line for line in lines]
     for child in children:
@@ -166,27 +187,18 @@ def _parse_hierarchy(tokens: Iterator[str]) -> tuple[list[str], list[int], np.nd
 
 def _decode_channels(
     values: Float[np.ndarray, "n c"], offsets: Float[np.ndarray, "j 3"], channels: list[list[str]]
-) -> tuple[Float[np.ndarray, "n j 3 3"], Float[np.ndarray, "n 3"]]:
-    """Return local rotations and root positions; translation channels of other joints are ignored."""
+) -> tuple[Float[np.ndarray, "n j 3 3"], dict[int, Float[np.ndarray, "n 3"]]]:
+    """Return local rotations, and positions relative to the parent of the joints that have position channels."""
     rotations = np.tile(np.eye(3), (len(values), len(channels), 1, 1))
-    root_positions = np.tile(offsets[0], (len(values), 1))
+    positions: dict[int, np.ndarray] = {}
     column = 0
     for joint, names in enumerate(channels):
         for name in names:
             axis = "XYZ".index(name[0].upper())
             if name.lower().endswith("rotation"):
-                rotations[:, joint] = rotations[:, joint] @ _axis_rotation(axis, np.radians(values[:, column]))
-            elif joint == 0:
-                root_positions[:, axis] = values[:, column]
+                turn = Rotation.from_euler("XYZ"[axis], values[:, [column]], degrees=True)
+                rotations[:, joint] = rotations[:, joint] @ turn.as_matrix()
+            else:
+                positions.setdefault(joint, np.tile(offsets[joint], (len(values), 1)))[:, axis] = values[:, column]
             column += 1
-    return rotations, root_positions
-
-
-def _axis_rotation(axis: int, angle_rad: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3 3"]:
-    """Return rotation matrices about a coordinate axis (0, 1, 2)."""
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    matrices = np.tile(np.eye(3), (len(angle_rad), 1, 1))
-    matrices[:, i, i] = matrices[:, j, j] = np.cos(angle_rad)
-    matrices[:, j, i] = np.sin(angle_rad)
-    matrices[:, i, j] = -np.sin(angle_rad)
-    return matrices
+    return rotations, positions

@@ -43,7 +43,7 @@ def in_other_poses(views: Sequence[PosedView], canonical_to_world: Float[Tensor,
     return [replace(view, canonical_to_world=pose) for view, pose in zip(views, canonical_to_world, strict=True)]
 
 
-def select_poses(use_first: Bool[np.ndarray, "n"], first: Motion, second: Motion) -> Motion:
+def merge_poses(use_first: Bool[np.ndarray, "n"], first: Motion, second: Motion) -> Motion:
     """Return the poses of the first motion in the given frames and those of the second in the others."""
     return second.with_pose(
         np.where(use_first[:, None, None], first.rotations_wxyz, second.rotations_wxyz),

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pipeline.body.body import Body, Motion, canonical_to_world
 
-_X, _Y, _Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+_X, _Z = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 
 
 class _Turn(NamedTuple):

@@ -1,10 +1,7 @@
 """Data for embedding in an HTML file: WebP data URIs, and a GLB with smaller textures."""
 
 import base64
-import json
-import struct
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -21,7 +18,6 @@ COVERAGE_MARGIN_PX = 3
 
 WEBP_QUALITY = 84
 JPEG_QUALITY = 88
-_GLB_MAGIC, _JSON_CHUNK, _BIN_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
 
 
 def webp_data_uri(pixels: UInt8[np.ndarray, "h w c"]) -> str:
@@ -62,73 +58,24 @@ def read_level(path: Path) -> bytes:
     return document.to_bytes()
 
 
-def unpack_glb(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """Split a GLB into its JSON document and its binary chunk (glTF 2.0, section 4.4).
-
-    Raises:
-        ValueError: the data are no binary glTF 2.0.
-    """
-    if len(data) < 20 or struct.unpack_from("<II", data) != (_GLB_MAGIC, 2):
-        raise ValueError("no binary glTF 2.0")
-    length, kind = struct.unpack_from("<II", data, 12)
-    if kind != _JSON_CHUNK:
-        raise ValueError("the first chunk of the GLB is not JSON")
-    document = json.loads(data[20 : 20 + length])
-    rest = 20 + length
-    if rest >= len(data):
-        return document, b""
-    binary_length, kind = struct.unpack_from("<II", data, rest)
-    if kind != _BIN_CHUNK:
-        raise ValueError("the second chunk of the GLB is not binary")
-    return document, data[rest + 8 : rest + 8 + binary_length]
-
-
-def pack_glb(document: dict[str, Any], binary: bytes) -> bytes:
-    """Return the bytes of a GLB, the inverse of `unpack_glb`; chunks are padded to four bytes."""
-    text = json.dumps(document, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    binary += b"\0" * (-len(binary) % 4)
-    length = 12 + 8 + len(text) + 8 + len(binary)
-    return b"".join(
-        (
-            struct.pack("<III", _GLB_MAGIC, 2, length),
-            struct.pack("<II", len(text), _JSON_CHUNK),
-            text,
-            struct.pack("<II", len(binary), _BIN_CHUNK),
-            binary,
-        )
-    )
-
-
-def compress_glb_textures(data: bytes, max_texture_px: int = 2048) -> bytes:
+def compress_glb_textures(glb: bytes, max_texture_px: int = 2048) -> bytes:
     """Return the model with its opaque textures as JPEG of at most `max_texture_px` a side.
 
     For display only: geometry, skin and animation keep their bytes; textures with alpha stay PNG. A texture is
     unchanged if its JPEG is not smaller.
+
+    Raises:
+        UserError: the file is no .glb, or a texture is in another file.
     """
-    document, binary = unpack_glb(data)
-    replaced = {}
-    for image in document.get("images", []):
-        view = document["bufferViews"][image["bufferView"]]
-        original = _buffer_view_bytes(view, binary)
+    file = GlbFile(Path("avatar.glb"), glb)
+    document = GlbWriter.from_file(file)
+    for index in range(len(file.gltf.get("images", ()))):
+        original = file.image_bytes(index)
         smaller = _encode_jpeg(original, max_texture_px)
         if smaller is not None and len(smaller) < len(original):
-            replaced[image["bufferView"]] = smaller
-            image["mimeType"] = "image/jpeg"
-    packed = bytearray()
-    for number, view in enumerate(document.get("bufferViews", [])):
-        content = replaced.get(number, _buffer_view_bytes(view, binary))
-        packed.extend(b"\0" * (-len(packed) % 4))
-        view.update(byteOffset=len(packed), byteLength=len(content))
-        packed.extend(content)
-    if document.get("buffers"):
-        document["buffers"][0]["byteLength"] = len(packed)
-    return pack_glb(document, bytes(packed))
-
-
-def _buffer_view_bytes(view: dict[str, Any], binary: bytes) -> bytes:
-    start = view.get("byteOffset", 0)
-    return binary[start : start + view["byteLength"]]
+            document.replace_image(index, smaller, "image/jpeg")
+    document.remove_unused()
+    return document.to_bytes()
 
 
 def _encode_jpeg(encoded: bytes, max_texture_px: int) -> bytes | None:

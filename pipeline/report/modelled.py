@@ -172,7 +172,9 @@ def _specular(manifests: Manifests) -> ModelledPart:
     reason = _evidence("highlights", explained, errors)
     if regions:
         return ModelledPart("Highlights", f"on in {regions} regions", reason, f"{size} for their map")
-    if explained == errors == 0.0:
+    if texture.config.get("light") == "kept":
+        reason = "not tried: asked for by texture.light=kept"
+    elif not _metric(texture, "light_removed"):
         reason = "not tried: no lamp was found whose highlights they could be"
     else:
         reason += ": too little, no region of the surface shines"
@@ -190,7 +192,9 @@ def _face(manifests: Manifests) -> ModelledPart:
     export = manifests["export"]
     targets = int(_metric(export, "morph_targets"))
     if not targets:
-        return ModelledPart("Face that moves", "off", "asked for by export.face")
+        asked = not export.config.get("face", True)
+        reason = "asked for by export.face" if asked else "no face was found, or it could not be cut out of the mesh"
+        return ModelledPart("Face that moves", "off", reason)
     added = int(_metric(export, "glb_faces") - _metric(export, "faces"))
     return ModelledPart(
         "Face that moves", "on", "on by default (export.face)", f"{added:,} faces, {targets} morph targets"

@@ -18,8 +18,9 @@ from scipy import sparse
 from pipeline.body.body import Body
 from pipeline.geometry.linear_systems import factorise_positive_definite
 from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.similarity import fit_similarity
 from pipeline.geometry.surface import closest_points_on_mesh
-from pipeline.template.face.landmarks import FaceLandmarks, fit_similarity
+from pipeline.template.face.landmarks import FaceLandmarks
 from pipeline.template.regions import Template, load_template
 
 
@@ -179,8 +180,7 @@ def _held_vertices(template: Template, body: Body, settings: RegistrationSetting
 
 def _head_displacement(body: Body, rows: np.ndarray, landmarks: FaceLandmarks) -> Float[np.ndarray, "n 3"]:
     """Return the similarity transform of the face's landmarks as displacements, blended by the head's skin weights."""
-    scale, rotation, translation_m = fit_similarity(body.vertices[landmarks.vertices], landmarks.positions_m)
-    moved = scale * body.vertices[rows] @ rotation.T + translation_m
+    moved = fit_similarity(body.vertices[landmarks.vertices], landmarks.positions_m)(body.vertices[rows])
     return body.skin_weights[rows, body.joint("Head"), None] * (moved - body.vertices[rows])
 
 
@@ -213,5 +213,4 @@ def _move_loose_parts(template: Template, before: np.ndarray, after: np.ndarray)
     parts = [(template.eye_faces[side], template.socket_faces[side]) for side in range(2)]
     for part, surroundings in (*parts, (template.tongue_faces, template.mouth_faces)):
         moved, guide = template.vertices_of(part), template.vertices_of(surroundings)
-        scale, rotation, translation_m = fit_similarity(before[guide], after[guide])
-        after[moved] = scale * before[moved] @ rotation.T + translation_m
+        after[moved] = fit_similarity(before[guide], after[guide])(before[moved])

@@ -24,6 +24,7 @@ from pipeline.geometry.atlas import Atlas, Texels
 from pipeline.geometry.camera import pixel_footprint_m, project
 from pipeline.geometry.texture_rendering import apply_shading, render_textured
 from pipeline.io.tensors import load_tensors, save_tensors
+from pipeline.kernels.common.opencv_threads import single_threaded_opencv
 from pipeline.kernels.common.thread_pool import shared_thread_pool
 from pipeline.kernels.raster import rasterize
 from pipeline.kernels.texel_projection import ImageView, ProjectedMesh, TexelPoints, project_texels
@@ -180,8 +181,9 @@ def _mean_of_views(
 ) -> WeightedMean:
     """Return the weighted mean of what is sampled in the views, several at a time, summed in their order."""
     mean = WeightedMean.empty(len(surface.texels.face))
-    for values, weight in shared_thread_pool(torch.get_num_threads()).imap(sample, views):
-        mean.add(values, weight)
+    with single_threaded_opencv():
+        for values, weight in shared_thread_pool(torch.get_num_threads()).imap(sample, views):
+            mean.add(values, weight)
     return mean
 
 

@@ -93,7 +93,7 @@ def save_roughness_map(path: Path, texture: TextureArtifact, texture_format: Tex
 
 
 def map_files(folder: Path, name: str) -> list[Path]:
-    """Return the files of a map (`DIFFUSE` or `SPECULAR`); the last one has the highest precision."""
+    """Return the files of a map, the most precise last: `DIFFUSE` and `SPECULAR` may have an OpenEXR file."""
     exr = (folder / name).with_suffix(".exr")
     return [folder / name, *([exr] if exr.is_file() else [])]
 

@@ -129,7 +129,8 @@ def align_to_render(
 ) -> tuple[Float[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]:
     """Warp the image (in [0, 1]) and mask of a view onto a render by smoothed optical flow (DIS).
 
-    Both are composited on grey before the flow, so that silhouettes contribute as well as texture.
+    Both are composited on grey before the flow, so that silhouettes contribute as well as texture. DIS splits the image
+    into a stripe for each thread of OpenCV, and its result depends on the split: the caller gives it one thread.
 
     rendered: premultiplied colour and alpha, in [0, 1]. max_flow_px: largest displacement; 0 leaves the view unchanged.
     """
@@ -161,10 +162,5 @@ def _composite_image_on_grey(colour: np.ndarray, mask: np.ndarray) -> np.ndarray
 
 def _optical_flow_px(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return the displacement from each pixel of the first grey image to its match in the second."""
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)  # DIS splits the image into one stripe per thread, and its result depends on the split
-    try:
-        flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-        return flow.calc(first, second, np.zeros((*first.shape, 2), np.float32))
-    finally:
-        cv2.setNumThreads(threads)
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    return flow.calc(first, second, np.zeros((*first.shape, 2), np.float32))

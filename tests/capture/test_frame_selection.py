@@ -26,6 +26,7 @@ def test_split_of_a_file_that_repeats_its_frames(repeats, first):
 
 def test_ranges_join_neighbours_among_the_frames():
     index = np.array([0, 3, 6, 9, 12, 40])
+    assert selection.runs_of(np.array([1, 0, 1, 1, 1, 0], dtype=bool)) == [(0, 1), (2, 5)]
     assert selection.format_frame_ranges(index, np.array([1, 0, 1, 1, 1, 0], dtype=bool)) == "0, 6-12"
     assert selection.format_frame_ranges(index, np.zeros(6, dtype=bool)) == ""
     assert selection.format_frame_ranges(index, np.ones(6, dtype=bool)) == "0-40"

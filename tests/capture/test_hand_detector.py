@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.capture.hand_detector import HandDetector, image_scale_px_per_m, stack_hands, undetected_hands
-from pipeline.capture.landmarks import LANDMARK_NAMES
+from pipeline.capture.landmarks import PoseLandmark
 from pipeline.capture.person_detector import PersonDetection, PersonDetector
 from pipeline.capture.video import open_frame_source, read_frames
 
@@ -34,7 +34,7 @@ def test_a_hand_seen_from_its_back_is_found_and_the_hidden_one_is_not(detector, 
     assert hands.handedness_score[0] > 0.9
     assert hands.handedness_score[1] == 0.0  # behind the back
     assert np.isnan(hands.landmarks_px[1]).all()
-    wrist_px = person.landmarks_px[LANDMARK_NAMES.index("left_wrist")]
+    wrist_px = person.landmarks_px[PoseLandmark.LEFT_WRIST]
     points_px = hands.landmarks_px[0]
     assert np.linalg.norm(points_px[0] - wrist_px) < 12
     assert (points_px[[8, 12, 16, 20], 1] > points_px[0, 1] + 25).all()  # fingers hang
@@ -61,7 +61,7 @@ def test_a_small_hand_is_not_looked_at(detector, photograph, person):
 
 def test_a_hand_that_the_pose_calls_hidden_is_not_looked_at(detector, photograph, person):
     visibility = person.visibility.copy()
-    visibility[LANDMARK_NAMES.index("left_wrist")] = 0.2
+    visibility[PoseLandmark.LEFT_WRIST] = 0.2
     hands = detector.detect_hands(photograph, person.landmarks_px, visibility, person.landmarks_world_m)
     assert hands.handedness_score[0] == 0.0
 
@@ -78,8 +78,8 @@ def test_wrist_pinky_and_index_show_where_a_hand_is(detector, monkeypatch):
     pose_px = np.stack([10.0 * np.arange(33), 300.0 - np.arange(33)], axis=1)
     rgb = np.zeros((300, 400, 3), np.uint8)
     detector.detect_hands(rgb, pose_px, np.ones(33), np.random.default_rng(0).normal(size=(33, 3)) * 0.01)
-    for side, points in zip(("left", "right"), process_inputs, strict=True):
-        rows = [LANDMARK_NAMES.index(f"{side}_{name}") for name in ("wrist", "pinky", "index")]
+    for side, points in zip(("LEFT", "RIGHT"), process_inputs, strict=True):
+        rows = [PoseLandmark[f"{side}_{name}"] for name in ("WRIST", "PINKY", "INDEX")]
         np.testing.assert_allclose(points, pose_px[rows] / (400, 300), atol=1e-6)
 
 

@@ -267,7 +267,7 @@ def test_a_smaller_picture_of_a_person_holds_no_backdrop(factor: float) -> None:
 
 
 def test_real_video_gets_closer_to_the_green_screen_key(shared_data):
-    """The key at half of the local green, see docs/decisions.md; three frames of the full turn."""
+    """The key at half of the local green, see docs/decisions/capture.md; three frames of the full turn."""
     from pipeline.capture.person_detector import PersonDetector
     from pipeline.capture.video import open_frame_source, read_frames
 

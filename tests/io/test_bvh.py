@@ -110,6 +110,19 @@ def test_what_is_written_is_read_back(bvh_motion: BvhMotion, tmp_path: Path) -> 
     np.testing.assert_allclose(again.root_positions, bvh_motion.root_positions, atol=1e-6)
 
 
+def test_position_channels_of_children_move_them(tmp_path: Path) -> None:
+    """Expected by hand: the root at (5, 6, 7) turns its child, at (1, 2, 3), by 90 degrees about z."""
+    six = ARM.replace("CHANNELS 3 Yrotation", "CHANNELS 5 Xposition Zposition Yrotation")
+    six = six[: six.index("0 1 0  0 0 0")] + "0 1 0  0 0 0  2 0 0 0 0  0 0 0\n5 6 7  90 0 0  1 3 0 0 0  0 0 0\n"
+    (tmp_path / "six.bvh").write_text(six.replace("OFFSET 2.0 0.0 0.0", "OFFSET 2.0 2.0 0.0"))
+    read = read_bvh(tmp_path / "six.bvh")
+    assert read.child_positions[1].tolist() == [[2, 2, 0], [1, 2, 3]]
+    np.testing.assert_allclose(read.trajectory(1), [[2, 3, 0], [3, 7, 10]], atol=1e-12)
+    np.testing.assert_allclose(read.trajectory(2), [[2, 6, 0], [0, 7, 10]], atol=1e-12)
+    write_bvh(tmp_path / "again.bvh", read)
+    np.testing.assert_allclose(read_bvh(tmp_path / "again.bvh").trajectory(2), read.trajectory(2), atol=1e-5)
+
+
 def test_joints_are_written_depth_first_and_get_an_end_site(tmp_path: Path) -> None:
     """The second child of the root comes after the descendants of the first."""
     rotations = Rotation.from_euler("XYZ", np.arange(12.0).reshape(4, 3), degrees=True).as_matrix()[None]

@@ -9,7 +9,7 @@ import torch
 from pipeline.body.body import Body, Motion
 from pipeline.mesh.outline_alignment import align_outlines
 from pipeline.mesh.pose_alignment import AlignedSurface
-from pipeline.mesh.pose_selection import select_poses
+from pipeline.mesh.pose_selection import merge_poses
 from pipeline.mesh.skin_transfer import transfer_skin
 from pipeline.mesh.views import PosedView
 from tests.mesh.capsule import capsule_body
@@ -43,7 +43,7 @@ def free_views(body: Body, surface: AlignedSurface, true_motion: Motion) -> list
 def motions(true_motion: Motion) -> tuple[Motion, Motion]:
     """Disturbed poses, and the same with the true poses of known frames."""
     fitted, _, _ = disturbed(true_motion)
-    return fitted, select_poses(IS_KNOWN, true_motion, fitted)
+    return fitted, merge_poses(IS_KNOWN, true_motion, fitted)
 
 
 def hand_angle_rad(motion: Motion) -> np.ndarray:

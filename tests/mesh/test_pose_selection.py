@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from pipeline.body.body import Motion
-from pipeline.mesh.pose_selection import MotionScores, is_far_from, select_poses
+from pipeline.mesh.pose_selection import MotionScores, is_far_from, merge_poses
 
 
 @pytest.mark.parametrize(
@@ -24,5 +24,5 @@ def test_poses_are_taken_from_the_first_motion_where_asked() -> None:
         Motion(index, index / 10.0, np.full((3, 2, 4), value, np.float32), np.full((3, 3), value, np.float32))
         for value in (1.0, 2.0)
     )
-    chosen = select_poses(np.array([False, True, False]), first, second)
+    chosen = merge_poses(np.array([False, True, False]), first, second)
     assert chosen.root_translation_m[:, 0].tolist() == chosen.rotations_wxyz[:, 1, 3].tolist() == [2.0, 1.0, 2.0]

@@ -6,7 +6,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from pipeline.geometry.mesh import Mesh
-from pipeline.metrics.alignment import SimilarityTransform, align_surfaces_icp, umeyama_similarity
+from pipeline.geometry.similarity import SimilarityTransform
+from pipeline.metrics.alignment import align_surfaces_icp
 from pipeline.metrics.surfaces import surface_scores
 
 TRUE_TRANSFORM = SimilarityTransform(
@@ -25,28 +26,6 @@ def cross(subdivisions: int = 3) -> Mesh:
     for _ in range(subdivisions):
         made = made.subdivide()
     return Mesh(np.asarray(made.vertices), np.asarray(made.faces, dtype=np.int32))
-
-
-def test_umeyama_recovers_the_transform_of_corresponding_points(rng: np.random.Generator):
-    points = rng.normal(size=(40, 3))
-    found = umeyama_similarity(points, TRUE_TRANSFORM(points))
-    assert found.scale == pytest.approx(TRUE_TRANSFORM.scale)
-    assert found.rotation == pytest.approx(TRUE_TRANSFORM.rotation)
-    assert found.translation_m == pytest.approx(TRUE_TRANSFORM.translation_m)
-    mirrored = umeyama_similarity(points, points * [-1.0, 1.0, 1.0])
-    assert np.linalg.det(mirrored.rotation) == pytest.approx(1.0)  # a reflection is not a rotation
-
-
-def test_without_scale_the_scale_is_one(rng: np.random.Generator):
-    points = rng.normal(size=(40, 3))
-    found = umeyama_similarity(points, TRUE_TRANSFORM(points), with_scale=False)
-    assert found.scale == 1.0
-    assert found.rotation == pytest.approx(TRUE_TRANSFORM.rotation)
-
-
-def test_inverse_inverts(rng: np.random.Generator):
-    points = rng.normal(size=(5, 3))
-    assert TRUE_TRANSFORM.inverse()(TRUE_TRANSFORM(points)) == pytest.approx(points)
 
 
 def test_icp_aligns_a_transformed_surface_with_itself():

@@ -1,12 +1,16 @@
 """What goes into the page: round trips through WebP, and a lighter GLB that is still the same model."""
 
 import base64
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from pipeline.report.embed import compress_glb_textures, pack_glb, unpack_glb, webp_data_uri
+from pipeline.core.errors import UserError
+from pipeline.io.glb import GlbFile
+from pipeline.io.glb_writer import GlbWriter
+from pipeline.report.embed import compress_glb_textures, webp_data_uri
 
 
 def gradient(size: int, channels: int) -> np.ndarray:
@@ -29,48 +33,34 @@ def test_webp_keeps_colours_in_their_channels(channels):
     assert np.abs(cv2.cvtColor(back, code).astype(int) - pixels).mean() < 4
 
 
-def test_glb_round_trip_and_refusals():
-    document, binary = {"asset": {"version": "2.0"}, "name": "ä"}, bytes(range(7))
-    back, chunk = unpack_glb(pack_glb(document, binary))
-    assert back == document
-    assert chunk[:7] == binary
-    assert len(chunk) % 4 == 0
-    with pytest.raises(ValueError, match="no binary glTF"):
-        unpack_glb(b"PK\x03\x04 this is a zip archive")
-
-
 @pytest.fixture
 def textured_glb() -> bytes:
+    """Two textures, of which the second has alpha, between two arrays."""
     noise = np.random.default_rng(0).integers(0, 255, (64, 64, 4)).astype(np.uint8)
-    smooth = cv2.imencode(".png", cv2.GaussianBlur(noise[..., :3], (0, 0), 3))[1].tobytes()
-    with_alpha = cv2.imencode(".png", noise)[1].tobytes()
-    geometry = bytes(range(200))
-    parts, views = [geometry, smooth, with_alpha, geometry[::-1]], []
-    binary = b""
-    for part in parts:
-        binary += b"\0" * (-len(binary) % 4)
-        views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(part)})
-        binary += part
-    document = {
-        "asset": {"version": "2.0"},
-        "buffers": [{"byteLength": len(binary)}],
-        "bufferViews": views,
-        "images": [{"mimeType": "image/png", "bufferView": 1}, {"mimeType": "image/png", "bufferView": 2}],
-    }
-    return pack_glb(document, binary)
+    smooth = cv2.GaussianBlur(noise[..., :3], (0, 0), 3)
+    points = np.random.default_rng(1).normal(size=(20, 3)).astype(np.float32)
+    document = GlbWriter({"asset": {"version": "2.0"}})
+    attributes = {"POSITION": document.add_array(points, bounds=True)}
+    for pixels in (smooth, noise):
+        view = document.add_bytes(cv2.imencode(".png", pixels)[1].tobytes())
+        document.add("images", {"mimeType": "image/png", "bufferView": view})
+    attributes["NORMAL"] = document.add_array(points[::-1])
+    document.add("meshes", {"primitives": [{"attributes": attributes}]})
+    return document.to_bytes()
 
 
 def test_light_glb_changes_opaque_textures_alone(textured_glb):
-    before, before_binary = unpack_glb(textured_glb)
-    after, after_binary = unpack_glb(compress_glb_textures(textured_glb, max_texture_px=32))
+    light = compress_glb_textures(textured_glb, max_texture_px=32)
+    before, after = (GlbFile(Path("model.glb"), contents) for contents in (textured_glb, light))
+    for index in range(2):
+        np.testing.assert_array_equal(after.accessor(index), before.accessor(index))
+    assert after.image_bytes(1) == before.image_bytes(1)
+    assert [image["mimeType"] for image in after.gltf["images"]] == ["image/jpeg", "image/png"]
+    assert after.image_pixels(0).shape == (32, 32, 3)
+    assert len(light) < len(textured_glb) - len(before.image_bytes(0)) + len(after.image_bytes(0)) + 100
+    assert light[8:12] == len(light).to_bytes(4, "little")
 
-    def content(document: dict, binary: bytes, view: int) -> bytes:
-        start = document["bufferViews"][view]["byteOffset"]
-        return binary[start : start + document["bufferViews"][view]["byteLength"]]
 
-    for view in (0, 2, 3):
-        assert content(after, after_binary, view) == content(before, before_binary, view)
-    assert [image["mimeType"] for image in after["images"]] == ["image/jpeg", "image/png"]
-    texture = cv2.imdecode(np.frombuffer(content(after, after_binary, 1), np.uint8), cv2.IMREAD_COLOR)
-    assert texture.shape == (32, 32, 3)
-    assert after["buffers"][0]["byteLength"] <= len(after_binary) < len(before_binary)
+def test_what_is_no_glb_is_refused():
+    with pytest.raises(UserError, match="no binary glTF"):
+        compress_glb_textures(b"PK\x03\x04 this is a zip archive")

@@ -120,10 +120,22 @@ def test_optional_parts_state_decision_figure_and_cost():
     assert on.choice == "on in 3 regions"
     assert "12 %" in on.reason
     assert "would" not in on.cost
-    untried = parts(known_manifests(texture={"specular_explained": 0.0, "specular_standard_errors": 0.0}))
-    assert untried["Highlights"].reason.startswith("not tried")
     assert found["Voxel attention"].choice == found["Normal map"].choice == "off"
     assert found["Face that moves"].cost == "6,042 faces, 67 morph targets"
+
+
+def test_parts_that_are_off_name_who_decided_it():
+    """The figures are those of manifests of the texture stage without a light, and of the export without a face."""
+    nothing = {"light_removed": 0.0, "specular_explained": 0.0, "specular_standard_errors": 0.0}
+    manifests = known_manifests(texture=nothing, export={"morph_targets": 0.0})
+    found = parts(manifests)
+    assert found["Highlights"].reason.startswith("not tried: no lamp")
+    assert found["Face that moves"].reason.startswith("no face was found")
+    manifests["texture"] = replace(manifests["texture"], config=CONFIGS["texture"] | {"light": "kept"})
+    manifests["export"] = replace(manifests["export"], config={"face": False})
+    found = parts(manifests)
+    assert found["Highlights"].reason == "not tried: asked for by texture.light=kept"
+    assert found["Face that moves"].reason == "asked for by export.face"
 
 
 @pytest.mark.parametrize("missing", [{"parameters": None}, {}])

@@ -1,11 +1,14 @@
 """Closed loop: render a painted ball, bake its texture from the images, compare with the true texture."""
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
 import torch
 
 from pipeline.geometry.camera import pixel_footprint_m
+from pipeline.texture import bake
 from pipeline.texture.bake import bake_diffuse, mean_foreground_psnr_db, render_textured_view
 from pipeline.texture.settings import TextureSettings
 from pipeline.texture.views import (
@@ -15,7 +18,7 @@ from pipeline.texture.views import (
     vertex_view_cosine,
     weight_by_resolution,
 )
-from tests.texture.painted_ball import CAMERA, DISTANCE_M, PaintedBall
+from tests.texture.painted_ball import CAMERA, DISTANCE_M, SIZE_PX, PaintedBall
 
 MAGENTA = np.array([1.0, 0.0, 1.0], dtype=np.float32)
 
@@ -115,6 +118,26 @@ def test_align_warps_an_image_onto_the_render(misaligned_ball: PaintedBall, shif
     unmoved, same_mask = align_to_render(shifted, rendered, 2.0, 0.0)
     np.testing.assert_array_equal(unmoved, image.astype(np.float32) / 255.0)
     assert same_mask is mask
+
+
+def test_opencv_has_one_thread_while_views_are_aligned_and_its_own_number_afterwards(
+    ball: PaintedBall, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The result of the optical flow depends on the number of threads, which all workers share."""
+    found = []
+
+    def align(*arguments: Any) -> tuple[np.ndarray, np.ndarray]:
+        found.append(cv2.getNumThreads())
+        return align_to_render(*arguments)
+
+    monkeypatch.setattr(bake, "align_to_render", align)
+    texture, threads = np.full((SIZE_PX, SIZE_PX, 3), 0.5, np.float32), cv2.getNumThreads()
+    cv2.setNumThreads(3)
+    try:
+        bake.average_residuals(texture, ball.views, ball.surface, TextureSettings())
+        assert (set(found), cv2.getNumThreads()) == ({1}, 3)
+    finally:
+        cv2.setNumThreads(threads)
 
 
 def test_pixel_confidence_is_zero_at_silhouettes_and_depth_discontinuities() -> None:

@@ -92,7 +92,7 @@ def encode_vrm1(file: GlbFile, joint_names: Sequence[str], meta: VrmMeta, loose:
     file = springs.file
     document, rest = GlbWriter.from_file(file), _rest_pose(file, joint_names)
     inverse_bind = _translations(-_rest_joints_m(rest)) @ rest.bind_to_rest
-    _write_rest_pose(document, rest, inverse_bind)
+    _write_rest_pose(file, document, rest, inverse_bind)
     bones = {bone: {"node": rest.nodes[joint]} for bone, joint in human_bones(joint_names, "1.0").items()}
     names, mesh_nodes = morph_names(file), _mesh_nodes(document)
     gaze = gaze_range_vrm1() if names else {"inputMaxValue": GAZE_INPUT_DEG, "outputScale": GAZE_OUTPUT_DEG}
@@ -128,7 +128,7 @@ def encode_vrm0(file: GlbFile, joint_names: Sequence[str], meta: VrmMeta, loose:
     turned = _FACE_BACKWARDS @ rest.bind_to_rest
     rest = replace(rest, bind_to_rest=turned)
     _bake_mesh(file, document, turned)
-    _write_rest_pose(document, rest, _translations(-_rest_joints_m(rest)))
+    _write_rest_pose(file, document, rest, _translations(-_rest_joints_m(rest)))
     bones = [
         {"bone": bone, "node": rest.nodes[joint], "useDefaultValues": True}
         for bone, joint in human_bones(joint_names, "0.x").items()
@@ -206,14 +206,21 @@ def _colliders(springs: SpringJoints, rest: _RestPose) -> RestColliders:
     return place_colliders(springs, place, nodes_m)
 
 
-def _write_rest_pose(document: GlbWriter, rest: _RestPose, inverse_bind: Float[np.ndarray, "j 4 4"]) -> None:
-    """Give the joints' nodes a translation only, and the skin its inverse bind matrices."""
-    joints_m = _rest_joints_m(rest)
-    for joint, (node, parent) in enumerate(zip(rest.nodes, rest.parents, strict=True)):
+def _write_rest_pose(
+    file: GlbFile, document: GlbWriter, rest: _RestPose, inverse_bind: Float[np.ndarray, "j 4 4"]
+) -> None:
+    """Give the joints' nodes, and those of the eyes, a translation only, and the skin its inverse bind matrices."""
+    joints_m, node_to_world, nodes = _rest_joints_m(rest), file.node_to_world(), document.json["nodes"]
+
+    def place(node: int, position_m: np.ndarray, origin_m: np.ndarray) -> None:
         for key in ("rotation", "scale", "matrix"):
-            document.json["nodes"][node].pop(key, None)
-        origin_m = joints_m[parent] if parent >= 0 else np.zeros(3)
-        document.json["nodes"][node]["translation"] = (joints_m[joint] - origin_m).astype(np.float32).tolist()
+            nodes[node].pop(key, None)
+        nodes[node]["translation"] = (position_m - origin_m).astype(np.float32).tolist()
+
+    for joint, (node, parent) in enumerate(zip(rest.nodes, rest.parents, strict=True)):
+        place(node, joints_m[joint], joints_m[parent] if parent >= 0 else np.zeros(3))
+        for child in set(nodes[node].get("children", ())) - set(rest.nodes):
+            place(child, (rest.bind_to_rest[joint] @ node_to_world[child])[:3, 3], joints_m[joint])
     columns = inverse_bind.transpose(0, 2, 1).reshape(-1, 16).astype(np.float32)
     document.replace_array(document.json["skins"][0]["inverseBindMatrices"], columns)
 

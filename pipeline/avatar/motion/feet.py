@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.fit.ground_contact import SOLE_JOINTS, compute_speed_m_s
+from pipeline.capture.frame_selection import runs_of
 
 CONTACT_HEIGHT_M, CONTACT_SPEED_M_S = 0.04, 0.15
 """Height above the lowest (5th percentile of the lower one of both sides) and speed below which a sole stands."""
@@ -54,9 +55,3 @@ def find_contacts(soles_m: Float[np.ndarray, "n 4 3"], time_s: Float[np.ndarray,
                 if lasts_s < MIN_CONTACT_S and first > 0 and end < len(time_s):
                     contact[first:end, sole] = not is_contact
     return contact
-
-
-def runs_of(flags: Bool[np.ndarray, "n"]) -> list[tuple[int, int]]:
-    """Return start and end (exclusive) of each run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
-    return [(int(first), int(end)) for first, end in edges.reshape(-1, 2)]

@@ -22,9 +22,10 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.spatial.transform import Rotation
 
-from pipeline.avatar.motion.feet import joint_positions_m, runs_of
+from pipeline.avatar.motion.feet import joint_positions_m
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.fit.ground_contact import SOLE_JOINTS
+from pipeline.capture.frame_selection import runs_of
 from pipeline.geometry.rotation import rotation_between
 from pipeline.geometry.skinning import local_quaternions
 

@@ -99,14 +99,18 @@ def retarget_with_contacts(
     axes = _body_axes(positions, recorded_joint_of)
     bvh_to_world = _bvh_to_world(axes.mean(axis=0), axes[0])
     soles = [recorded_joint_of.get(name, recorded_joint_of[name.replace("ToeBase", "Foot")]) for name in SOLE_JOINTS]
-    soles_m = (positions[:, soles] + bvh_motion.root_positions[:, None]) @ bvh_to_world.T
-    soles_m *= _scale_to_m(bvh_motion, body, recorded_joint_of)
+    hips = recorded_joint_of["Hips"]
+    root = bvh_motion.trajectory(hips) @ bvh_to_world.T
+    soles_m = (positions[:, soles] - positions[:, [hips]]) @ bvh_to_world.T + root[:, None]
+    scale_to_m = _scale_to_m(bvh_motion, body, recorded_joint_of)
+    soles_m, root = scale_to_m * soles_m, scale_to_m * root
     time_s = np.arange(len(positions)) / bvh_motion.fps
     contact = find_contacts(soles_m, time_s)
     hinges = recorded_hinge_axes(world, positions, recorded_joint_of)
     rotations = retarget_rotations(body, recorded_joint_of, world, reference, bvh_to_world, hinges)
     _flatten_standing_feet(body, rotations, contact)
-    root = _root_trajectory(bvh_motion, body, recorded_joint_of, bvh_to_world, ground_m, in_place)
+    middle_m = 0.5 * (root.min(axis=0) + root.max(axis=0))
+    root[:, [0, 2]] += ground_m[[0, 2]] - (root[:, [0, 2]] if in_place else middle_m[[0, 2]])
     local = local_quaternions(rotations, body.parents)
     motion = Motion(np.arange(len(local), dtype=np.int32), time_s, local, root.astype(np.float32))
     lowest_foot_height_m = lowest_foot_offset_m(body, motion)
@@ -354,18 +358,3 @@ def _scale_to_m(bvh_motion: BvhMotion, body: Body, recorded_joint_of: dict[str, 
     if recorded <= 0.0:
         raise UserError("the motion has legs of zero length; export its skeleton with offsets")
     return float(leg_m / recorded)
-
-
-def _root_trajectory(
-    bvh_motion: BvhMotion,
-    body: Body,
-    recorded_joint_of: dict[str, int],
-    bvh_to_world: Float[np.ndarray, "3 3"],
-    ground_m: Float[np.ndarray, "3"],
-    in_place: bool,
-) -> Float[np.ndarray, "n 3"]:
-    """Return the hip positions in metres, scaled by the ratio of leg lengths; the caller sets the height."""
-    trajectory = bvh_motion.root_positions @ bvh_to_world.T * _scale_to_m(bvh_motion, body, recorded_joint_of)
-    middle = 0.5 * (trajectory.min(axis=0) + trajectory.max(axis=0))
-    trajectory[:, [0, 2]] += ground_m[[0, 2]] - (trajectory[:, [0, 2]] if in_place else middle[[0, 2]])
-    return trajectory

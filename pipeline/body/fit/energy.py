@@ -57,7 +57,6 @@ class EnergyParameters:
     silhouettes `landmark_std_m` is larger, because the errors of landmarks are correlated.
     landmark_3d_std_m: of the detected 3D landmarks across the view.
     contour_std_m: of the silhouette.
-    motion_std_factor: factor on `Objective.motion_std`.
     height_m, height_std_m: prior of the stature.
     log_focal_std: of the logarithm of the focal length.
     principal_point_std: across the image, in focal lengths.
@@ -71,7 +70,6 @@ class EnergyParameters:
     landmark_3d_std_m: float = FitSettings.landmark_3d_std_m
     contour_std_m: float = FitSettings.contour_std_m
     contour_cutoff: float = FitSettings.contour_cutoff
-    motion_std_factor: float = 1.0
     motion_cutoff: float = FitSettings.motion_cutoff
     landmark_offset_std_m: float = FitSettings.landmark_offset_std_m
     height_m: float = FitSettings.mean_stature_m
@@ -197,9 +195,7 @@ class Objective:
         parameters, centre_std = self.parameters, self.parameters.principal_point_std
         return [
             PosePriorTerm(self.pose_prior),
-            MotionTerm(
-                self.observations.time_s, self.motion_std, parameters.motion_std_factor, parameters.motion_cutoff
-            ),
+            MotionTerm(self.observations.time_s, self.motion_std, parameters.motion_cutoff),
             SharedPriorTerm(
                 self.shape_prior,
                 parameters.landmark_offset_std_m,

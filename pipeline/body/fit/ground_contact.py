@@ -14,6 +14,7 @@ from torch import Tensor
 
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody
 from pipeline.body.fit.posed_points import SkinnedPoints, pose_points, pose_skeleton
+from pipeline.capture.frame_selection import runs_of
 
 SOLE_JOINTS = ("LeftFoot", "LeftToeBase", "RightFoot", "RightToeBase")
 SOLE_LANDMARK_INDICES = (29, 31, 30, 32)
@@ -143,9 +144,7 @@ def _anchors(positions_m: Float[Tensor, "n 4 3"], weight: Float[Tensor, "n 4"]) 
     """Return the mean position of each sole over the run of frames in which it stands; else its own position."""
     anchors = positions_m.clone()
     for sole in range(weight.shape[1]):
-        stands = (weight[:, sole] > 0).numpy()
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], stands, [False]]).astype(np.int8)))
-        for first, end in edges.reshape(-1, 2):
+        for first, end in runs_of((weight[:, sole] > 0).numpy()):
             share = weight[first:end, sole, None]
             anchors[first:end, sole] = (share * positions_m[first:end, sole]).sum(0) / share.sum()
     return anchors

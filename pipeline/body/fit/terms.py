@@ -286,12 +286,11 @@ class PosePriorTerm:
 class MotionTerm:
     """Changes of velocity between successive frames, robust.
 
-    std: standard deviations of `motion_residuals`; None: `default_motion_std`. std_factor multiplies them.
+    std: standard deviations of `motion_residuals`; None: `default_motion_std`.
     """
 
     time_s: Float[Tensor, "n"]
     std: Float[Tensor, "p"] | None
-    std_factor: float
     cutoff: float
 
     def add_to(self, system: NormalEquations, at: Linearisation) -> None:
@@ -302,7 +301,7 @@ class MotionTerm:
         root_perspective = world_to_perspective(state.root_m, at.camera)
         residual = motion_residuals(state.rotations, root_perspective, self.time_s)
         std = default_motion_std(state.rotations.shape[1]) if self.std is None else self.std
-        residual = residual / (self.std_factor * std)
+        residual = residual / std
         weight = robust_weights(system, residual.square(), self.cutoff)
         before, after, scale = (factor[:, None] for factor in acceleration_factors(self.time_s))
         factors = (before * scale / std, -(before + after) * scale / std, after * scale / std)

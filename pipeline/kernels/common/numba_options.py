@@ -11,7 +11,7 @@ from numba.misc.appdirs import AppDirs
 NJIT_OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"arcp", "nsz"}}
 """Arguments of `numba.njit`. The fast-math flags exclude fusing and reordering of sums: how the compiler uses that
 freedom depends on the functions it compiles together, so a first process and a later one, which loads a part from the
-cache, would give different results (docs/decisions.md).
+cache, would give different results (docs/decisions/engineering.md).
 """
 
 KERNELS_FOLDER = Path(__file__).resolve().parents[1]

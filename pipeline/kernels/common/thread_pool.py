@@ -1,7 +1,7 @@
 """A thread pool for a few jobs of similar size, each with an equal number of the threads of torch and numba.
 
 A training step consists of about a thousand operations that are too small to be divided among threads one by one: to
-wake a thread takes as long as such an operation (docs/decisions.md).
+wake a thread takes as long as such an operation (docs/decisions/engineering.md).
 """
 
 from collections.abc import Callable, Iterable, Iterator

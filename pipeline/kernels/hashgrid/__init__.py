@@ -2,9 +2,9 @@
 
 Müller et al. 2022, "Instant Neural Graphics Primitives", section 3. Notation: n points, l levels, f features.
 
-Two differences from the paper, both measured (docs/decisions.md): the cells of a level are cubes in metres, so the
-number of cells is set for each axis and a standing body wastes no table rows on the empty half of a cube; levels whose
-nodes fit in the table are dense and have no collisions.
+Two differences from the paper, both measured (docs/decisions/field.md): the cells of a level are cubes in metres, so
+the number of cells is set for each axis and a standing body wastes no table rows on the empty half of a cube; levels
+whose nodes fit in the table are dense and have no collisions.
 """
 
 from dataclasses import dataclass

@@ -20,7 +20,7 @@ MIN_TRANSMITTANCE = 1e-3
 """A ray ends below this transmittance; what is behind changes the pixel by at most a quarter of an 8-bit level."""
 GRADIENT_SUBSAMPLING_THRESHOLD = 0.3
 """Samples with a gradient below this fraction of the mean gradient are subsampled, which leaves about a quarter of the
-samples. The added variance of the gradient of a step is 1e-4 of its square (docs/decisions.md).
+samples. The added variance of the gradient of a step is 1e-4 of its square (docs/decisions/field.md).
 """
 
 

@@ -19,6 +19,7 @@ from pipeline.core.atomic import atomic_path
 from pipeline.geometry.atlas import Atlas
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.similarity import fit_similarity
 from pipeline.io.npz import load_npz, save_npz
 from pipeline.kernels.raster import rasterize
 from pipeline.kernels.texture_sampling import supersample_texture
@@ -142,26 +143,9 @@ def choose_landmarks(
 
 def if_plausible(body: Body, positions_m: Float[np.ndarray, "l 3"]) -> FaceLandmarks | None:
     """Return the landmarks, or None where no similarity transform brings those of the body near them."""
-    scale, rotation, translation_m = fit_similarity(body.vertices[LANDMARK_VERTICES], positions_m)
-    moved_m = scale * body.vertices[LANDMARK_VERTICES] @ rotation.T + translation_m
+    moved_m = fit_similarity(body.vertices[LANDMARK_VERTICES], positions_m)(body.vertices[LANDMARK_VERTICES])
     residual_m = float(np.sqrt(np.mean(np.sum((moved_m - positions_m) ** 2, axis=1))))
     return FaceLandmarks(LANDMARK_VERTICES, positions_m, residual_m) if residual_m <= MAX_RESIDUAL_M else None
-
-
-def fit_similarity(
-    source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]
-) -> tuple[float, Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
-    """Return scale, rotation and translation with the least squared distance of `s R source + t` to `target`.
-
-    Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991.
-    """
-    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
-    centred, aim = (source - source_mean).astype(np.float64), (target - target_mean).astype(np.float64)
-    left, singular, right = np.linalg.svd(aim.T @ centred)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left) * np.linalg.det(right))])
-    rotation = (left * signs) @ right
-    scale = float((singular * signs).sum() / np.sum(centred**2))
-    return scale, rotation, target_mean - scale * rotation @ source_mean
 
 
 def head_camera(body: Body, azimuth_rad: float, elevation_rad: float) -> Camera:

@@ -16,11 +16,12 @@ from scipy import ndimage, sparse
 from pipeline.body.body import Body
 from pipeline.geometry.camera import project
 from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.similarity import fit_similarity
 from pipeline.geometry.surface import closest_points_on_mesh
 from pipeline.mesh.face import smooth_step
 from pipeline.template.face.frame import FaceFrame, face_frame
 from pipeline.template.face.front_view import FrontView, view_from_front
-from pipeline.template.face.landmarks import FACE_LANDMARKS, fit_similarity
+from pipeline.template.face.landmarks import FACE_LANDMARKS
 from pipeline.template.face.units import load_face_units, load_teeth
 from pipeline.template.level_set_cut import CutMesh, boundary_loops, cut_mesh
 from pipeline.template.regions import Template, load_template
@@ -139,8 +140,8 @@ def unit_transform(body: Body, registration: Registration) -> Float[np.ndarray, 
     Lids and lips are moved as a whole by the registration, so that one transform keeps their contact.
     """
     vertices = np.array([vertex for _, vertex in FACE_LANDMARKS.values()])
-    scale, rotation, _ = fit_similarity(body.vertices[vertices], registration.vertices[vertices])
-    return scale * rotation
+    fitted = fit_similarity(body.vertices[vertices], registration.vertices[vertices])
+    return fitted.scale * fitted.rotation
 
 
 def cut_face_out(
@@ -231,13 +232,12 @@ def _add_teeth(
     teeth, units = load_teeth(), load_face_units()
     template = load_template()
     guide = template.vertices_of(template.mouth_faces)
-    scale, rotation, translation_m = fit_similarity(teeth.base_m[guide], template_m[guide])
-    centre_m = scale * rotation @ teeth.vertices.mean(axis=0)
-    scale, translation_m = _TEETH_SCALE * scale, translation_m + (1.0 - _TEETH_SCALE) * centre_m
-    translation_m = translation_m - _TEETH_BACK * patch.frame.size_m * patch.frame.axes[2]
+    placed_m = fit_similarity(teeth.base_m[guide], template_m[guide])(teeth.vertices)
+    placed_m = _TEETH_SCALE * placed_m + (1.0 - _TEETH_SCALE) * placed_m.mean(axis=0)
+    placed_m -= _TEETH_BACK * patch.frame.size_m * patch.frame.axes[2]
     first, first_uv = len(patch.mesh.vertices), len(patch.uv)
     mesh = Mesh(
-        np.concatenate([patch.mesh.vertices, scale * teeth.vertices @ rotation.T + translation_m]),
+        np.concatenate([patch.mesh.vertices, placed_m]),
         np.concatenate([patch.mesh.faces, teeth.faces + first]),
     )
     count = len(teeth.vertices)

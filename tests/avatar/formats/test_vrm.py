@@ -166,6 +166,19 @@ def test_joints_have_no_rotation_and_there_is_no_clip_or_camera(files: dict[str,
     assert len(document["nodes"]) == 1 + len(anny_body().joint_names)
 
 
+@pytest.mark.parametrize("rig", ["plain", "unreal"])
+def test_eyes_keep_their_place_in_the_head(tmp_path: Path, rig: Any) -> None:
+    """In both versions, and where the head of the .glb has other axes than the world, as in Unreal's rig."""
+    head_m = anny_body().joints_m[anny_body().joint("Head")]
+    eyes_m = np.array([[0.03, 0.12, 0.1], [-0.03, 0.12, 0.1]]) + head_m
+    glb, head = anny_glb(tmp_path, None, rig, eyes_m), "head" if rig == "unreal" else "Head"
+    for turn, encode in ((1.0, encode_vrm1), (TURNED, encode_vrm0)):
+        (tmp_path / "eyes.vrm").write_bytes(encode(glb, anny_body().joint_names, META))
+        player = RestPlayer(tmp_path / "eyes.vrm")
+        found = [player.joint_m(name) - player.joint_m(head) for name in ("LeftEye", "RightEye")]
+        np.testing.assert_allclose(found, turn * (eyes_m - head_m), atol=1e-6)
+
+
 def test_the_licence_grants_no_more_than_its_author_says(files: dict[str, GlbFile]) -> None:
     one, zero = (extension(files[version])["meta"] for version in ("1.0", "0.x"))
     assert one == {"name": "avatar", "authors": ["A. Person"], "licenseUrl": "https://vrm.dev/licenses/1.0/"}

@@ -70,6 +70,30 @@ def test_result_is_independent_of_the_axes_of_the_file(bare: Body, turn: Motion)
     assert np.allclose(joint_positions(bare, one), joint_positions(bare, other), atol=1e-3)
 
 
+def test_hips_that_move_below_a_reference_joint_move_the_avatar(bare: Body, turn: Motion, tmp_path: Path) -> None:
+    """MotionBuilder's files: the root stands still beside the scene and is turned, its child has six channels."""
+    here = recorded(bare, turn)
+    here = replace(here, root_positions=here.root_positions + np.linspace(0, 300, 24)[:, None] * [0, 0, 1])
+    corner, tilt = np.array([40.0, -10.0, 70.0]), Rotation.from_euler("X", -60.0, degrees=True).as_matrix()
+    rotations = np.concatenate([np.tile(tilt, (24, 1, 1, 1)), here.rotations], axis=1)
+    rotations[:, 1] = tilt.T @ here.rotations[:, 0]
+    hips = (here.root_positions - corner) @ tilt
+    there = BvhMotion(
+        ("Reference", *here.joint_names),
+        np.array([-1, *(here.parents + 1)]),
+        np.concatenate([np.zeros((1, 3)), here.offsets]),
+        rotations,
+        np.tile(corner, (24, 1)),
+        here.fps,
+        {1: hips},
+    )
+    write_bvh(tmp_path / "reference.bvh", there)
+    read = read_bvh(tmp_path / "reference.bvh")
+    one, other = (retarget(bvh_motion, bare, GROUND_M, in_place=False) for bvh_motion in (here, read))
+    assert np.ptp(other.root_translation_m[:, 2]) == pytest.approx(3.0, abs=0.05)
+    assert np.allclose(joint_positions(bare, one), joint_positions(bare, other), atol=1e-3)
+
+
 def test_alternative_joint_names(bare: Body, turn: Motion) -> None:
     """LeftShoulder is the upper arm in CMU files and the collar bone in Mixamo files."""
     table = {"Arm": "Shoulder", "ForeArm": "Elbow", "Hand": "Wrist", "Shoulder": "Collar"}

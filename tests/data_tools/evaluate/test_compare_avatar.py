@@ -33,9 +33,9 @@ from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
 from pipeline.geometry.alpha import unpremultiply_to_uint8
 from pipeline.geometry.mesh import Mesh
+from pipeline.geometry.similarity import SimilarityTransform
 from pipeline.geometry.texture_rendering import blur_coverage
 from pipeline.io.image import write_rgba
-from pipeline.metrics.alignment import SimilarityTransform
 from pipeline.metrics.images import composite_on_white, frame_scores
 from pipeline.texture.light import VideoLight
 from tests.data_tools.ground_truth_run import (

@@ -7,7 +7,7 @@ import torch
 from data_tools.evaluate.field_truth import HAZE_DISTANCE_PX, camera_before_similarity, haze_alpha
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.rotation import axis_angle_to_quaternion, quaternion_to_matrix
-from pipeline.metrics.alignment import SimilarityTransform
+from pipeline.geometry.similarity import SimilarityTransform
 
 
 def test_haze_is_the_mean_alpha_off_the_mask():
