@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from pipeline.core.errors import UserError
 from pipeline.core.json_file import parse_json
@@ -259,14 +260,7 @@ def _local_matrix(node: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
     """Return a node's local matrix, from `matrix` (column-major) or translation, rotation (xyzw) and scale."""
     if "matrix" in node:
         return np.array(node["matrix"], dtype=float).reshape(4, 4).T
-    x, y, z, w = node.get("rotation", (0.0, 0.0, 0.0, 1.0))
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    rotation = Rotation.from_quat(node.get("rotation", (0.0, 0.0, 0.0, 1.0))).as_matrix()
     matrix = np.eye(4)
     matrix[:3, :3] = rotation * np.asarray(node.get("scale", (1.0, 1.0, 1.0)))
     matrix[:3, 3] = node.get("translation", (0.0, 0.0, 0.0))
