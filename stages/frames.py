@@ -235,7 +235,7 @@ def make_capture(
 
 STAGE = Stage(
     "frames",
-    version=14,
+    version=15,
     needs=("video",),
     makes=(FRAMES_NPZ, IMAGES_FOLDER, MASKS_FOLDER, CONTACT_SHEET),
     config=Config,

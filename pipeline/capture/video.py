@@ -8,7 +8,6 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import partial
 from pathlib import Path
 
 import av
@@ -17,7 +16,7 @@ import numpy as np
 from av.container import InputContainer
 from jaxtyping import Int, Shaped, UInt8
 
-from pipeline.capture import hdr
+from pipeline.capture.video_picture import DecodedImage, to_upright_rgb
 from pipeline.core.errors import UserError
 from pipeline.core.progress import warn
 from pipeline.io.image import IMAGE_SUFFIXES, read_rgb
@@ -35,12 +34,7 @@ _FORMATS = (
 
 _HEIF_SUFFIXES = (".heic", ".heif", ".avif")
 _IMAGE_FOLDER_NAMES = ("images", "frames", "image", "rgb", "color")
-# Bicubic, with chroma brought to full resolution before the colour matrix: swscale's default repeats each chroma
-# sample over 2 x 2 pixels, which leaves visible blocks along the person's outline (bits of libswscale's SWS_* flags).
-_SWS_FLAGS = 0x4 | 0x2000 | 0x4000 | 0x40000
 _SWS_AREA = 0x20
-# A decoded image (8-bit sRGB, or 16 bits with another transfer function) and its conversion to 8-bit sRGB.
-_DecodedImage = tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -127,7 +121,7 @@ def read_thumbnails(
         UserError: no frame can be read, or their shape changes.
     """
 
-    def shrink(picture: av.VideoFrame, _: Fraction | None) -> _DecodedImage:
+    def shrink(picture: av.VideoFrame, _: Fraction | None) -> DecodedImage:
         scale = min(1.0, side_px / max(picture.width, picture.height))
         width, height = (max(1, round(scale * side)) for side in (picture.width, picture.height))
         small = picture.reformat(width, height, format="gray", interpolation=_SWS_AREA)
@@ -200,7 +194,7 @@ def open_container(path: Path) -> InputContainer:
     return av.open(str(path), options=options, metadata_errors="replace")
 
 
-def _images(source: FrameSource, is_wanted: Callable[[int], bool]) -> Iterator[tuple[int, float, _DecodedImage]]:
+def _images(source: FrameSource, is_wanted: Callable[[int], bool]) -> Iterator[tuple[int, float, DecodedImage]]:
     for index, path in enumerate(source.files):
         if is_wanted(index):
             yield index, index / source.fps, (read_rgb(path), np.asarray)
@@ -209,10 +203,10 @@ def _images(source: FrameSource, is_wanted: Callable[[int], bool]) -> Iterator[t
 def _video(
     source: FrameSource,
     is_wanted: Callable[[int], bool],
-    convert: Callable[[av.VideoFrame, Fraction | None], _DecodedImage] | None = None,
-) -> Iterator[tuple[int, float, _DecodedImage]]:
-    """Yield index, time and converted image (default: `_to_upright_rgb`) of the wanted frames."""
-    convert = convert or _to_upright_rgb
+    convert: Callable[[av.VideoFrame, Fraction | None], DecodedImage] | None = None,
+) -> Iterator[tuple[int, float, DecodedImage]]:
+    """Yield index, time and converted image (default: `to_upright_rgb`) of the wanted frames."""
+    convert = convert or to_upright_rgb
     start_s: float | None = None
     time_s: float | None = None
     index = -1
@@ -234,18 +228,6 @@ def _monotonic_time_s(timestamp_s: float | None, previous_s: float | None, step_
     if previous_s is None:
         return timestamp_s or 0.0
     return timestamp_s if timestamp_s is not None and timestamp_s > previous_s else previous_s + step_s
-
-
-def _to_upright_rgb(picture: av.VideoFrame, aspect: Fraction | None) -> _DecodedImage:
-    """Return the RGB image of a decoded frame with square pixels, rotated as the container says."""
-    transfer, primaries = int(picture.color_trc), int(picture.color_primaries)
-    is_hdr = transfer in hdr.HDR_TRANSFERS
-    pixels = picture.reformat(format="rgb48le" if is_hdr else "rgb24", interpolation=_SWS_FLAGS)
-    rgb: np.ndarray = pixels.to_ndarray()
-    if aspect and aspect != 1:
-        rgb = cv2.resize(rgb, (round(rgb.shape[1] * aspect), rgb.shape[0]), interpolation=cv2.INTER_CUBIC)
-    to_srgb = partial(hdr.to_srgb, transfer=transfer, primaries=primaries) if is_hdr else np.asarray
-    return np.ascontiguousarray(np.rot90(rgb, k=round(picture.rotation / 90) % 4)), to_srgb
 
 
 def downscale(rgb: Shaped[np.ndarray, "h w 3"], max_side_px: int) -> tuple[Shaped[np.ndarray, "h2 w2 3"], float]:
