@@ -14,6 +14,7 @@ import av
 import cv2
 import numpy as np
 from av.container import InputContainer
+from av.video.stream import VideoStream
 from jaxtyping import Int, Shaped, UInt8
 
 from pipeline.capture.video_picture import DecodedImage, to_upright_rgb
@@ -32,6 +33,8 @@ _FORMATS = (
 )
 """FFmpeg's names of formats whose files hold all of their content; those of sound get a message of their own."""
 
+_QUICKTIME_SUFFIXES = (".mp4", ".mov", ".m4v", ".3gp")
+_MIN_BOX_BYTES = 8
 _HEIF_SUFFIXES = (".heic", ".heif", ".avif")
 _IMAGE_FOLDER_NAMES = ("images", "frames", "image", "rgb", "color")
 _SWS_AREA = 0x20
@@ -71,7 +74,9 @@ def open_frame_source(path: Path, image_fps: float = DEFAULT_IMAGE_FPS) -> Frame
     if not path.is_dir():
         raise UserError(f"{path} does not exist; supply a video file or a folder of images")
     files = _images_in(path)
-    videos = sorted(p for p in path.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES)
+    videos = sorted(p for p in path.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES and not p.name.startswith("."))
+    if files and len(videos) == 1:
+        raise UserError(f"{path} holds images ({files[0].name}) and a video ({videos[0].name}); move one of them away")
     if files:
         return FrameSource(path, files, len(files), image_fps)
     if len(videos) == 1:
@@ -92,7 +97,7 @@ def open_frame_source(path: Path, image_fps: float = DEFAULT_IMAGE_FPS) -> Frame
 def read_frames(source: FrameSource, is_wanted: Callable[[int], bool], max_side_px: int) -> Iterator[Frame]:
     """Yield the wanted frames in order, reduced to at most `max_side_px` on the longer side.
 
-    A video that is truncated is read as far as possible, with a warning.
+    A video that is truncated or damaged is read as far as possible, with a warning.
 
     Raises:
         UserError: an image cannot be read, or the image size changes.
@@ -146,7 +151,7 @@ def image_size_px(source: FrameSource) -> tuple[int, int]:
     Raises:
         UserError: no image can be read.
     """
-    first = next(read_frames(source, lambda index: index == 0, max_side_px=1 << 30), None)
+    first = next(read_frames(source, lambda _: True, max_side_px=1 << 30), None)
     if first is None:
         raise UserError(f"{source.path} has no readable image; use another recording")
     return first.rgb.shape[1], first.rgb.shape[0]
@@ -154,7 +159,8 @@ def image_size_px(source: FrameSource) -> tuple[int, int]:
 
 def natural_sort_key(path: Path) -> list[tuple[int, str]]:
     """Return a sort key that orders `frame2` before `frame10`."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name.lower()) if part]
+    parts = (part for part in re.split(r"(\d+)", path.name.lower()) if part)
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
 
 def _images_in(folder: Path) -> tuple[Path, ...]:
@@ -165,9 +171,9 @@ def _images_in(folder: Path) -> tuple[Path, ...]:
 def _open_video(path: Path) -> FrameSource:
     try:
         with open_container(path) as container:
-            if not container.streams.video:
+            stream = _best_video_stream(container)
+            if stream is None:
                 raise UserError(f"{path} has no video track; supply a video file or a folder of images")
-            stream = container.streams.video[0]
             if stream.codec_context is None:
                 raise UserError(f"{path} has a video track of an unknown codec; supply an .mp4, .mov or .webm file")
             if stream.width * stream.height > MAX_FRAME_PIXELS:
@@ -176,13 +182,32 @@ def _open_video(path: Path) -> FrameSource:
                     "pixels are read; supply a smaller video"
                 )
             fps = float(stream.average_rate or stream.guessed_rate or DEFAULT_IMAGE_FPS)
+            _warn_if_incomplete(path, stream, container.format.name)
             # Packets hidden by an edit list (a clip that was trimmed without re-encoding) are decoded but not shown.
             n_frames = sum(packet.size > 0 and not packet.is_discard for packet in container.demux(stream))
     except av.FFmpegError as error:
-        raise UserError(
-            f"{path} cannot be read as a video ({error.strerror}); supply an .mp4, .mov or .webm file"
-        ) from None
+        reason = f"{path} cannot be read as a video ({error.strerror})"
+        if path.suffix.lower() in _QUICKTIME_SUFFIXES and path.stat().st_size >= _MIN_BOX_BYTES:
+            raise UserError(f"{reason}: it is incomplete or no video; copy it from the camera again") from None
+        raise UserError(f"{reason}; supply an .mp4, .mov or .webm file") from None
     return FrameSource(path, (), n_frames, fps)
+
+
+def _best_video_stream(container: InputContainer) -> VideoStream | None:
+    """Return the video track that players choose: no cover picture or preview if there is another one."""
+    stream = container.streams.best("video")
+    return stream if isinstance(stream, VideoStream) else None
+
+
+def _warn_if_incomplete(path: Path, stream: VideoStream, format_name: str) -> None:
+    """Warn if the index, which other formats than MP4 and QuickTime lack, lists frames behind the end of the file."""
+    if "mov" not in format_name.split(","):
+        return
+    size = path.stat().st_size
+    ends = [entry.pos + entry.size for entry in stream.index_entries]
+    n_held = sum(end <= size for end in ends)
+    if n_held < len(ends):
+        warn(f"{path} is incomplete: its index lists {len(ends)} frames, it holds {n_held}; copy it again")
 
 
 def open_container(path: Path) -> InputContainer:
@@ -209,18 +234,55 @@ def _video(
     convert = convert or to_upright_rgb
     start_s: float | None = None
     time_s: float | None = None
-    index = -1
     with open_container(source.path) as container:
-        stream = container.streams.video[0]
+        stream = _best_video_stream(container)
+        if stream is None:
+            return
         stream.thread_type = "AUTO"
+        for index, picture in _intact_pictures(source, container, stream):
+            time_s = _monotonic_time_s(picture.time, time_s, 1.0 / source.fps)
+            start_s = time_s if start_s is None else start_s
+            if is_wanted(index):
+                yield index, time_s - start_s, convert(picture, stream.sample_aspect_ratio)
+
+
+def _intact_pictures(
+    source: FrameSource, container: InputContainer, stream: VideoStream
+) -> Iterator[tuple[int, av.VideoFrame]]:
+    """Yield index and picture of the frames that can be decoded; a damaged packet takes an index as well.
+
+    So later frames keep their index. Threads report damage some frames late, at the same place in every pass.
+    """
+    index = n_decoded = 0
+    is_damaged = False
+    packets = container.demux(stream)
+    while True:
         try:
-            for index, picture in enumerate(container.decode(stream)):
-                time_s = _monotonic_time_s(picture.time, time_s, 1.0 / source.fps)
-                start_s = time_s if start_s is None else start_s
-                if is_wanted(index):
-                    yield index, time_s - start_s, convert(picture, stream.sample_aspect_ratio)
+            packet = next(packets, None)
         except av.FFmpegError as error:
-            warn(f"{source.path} is truncated after {index + 1} frames ({error.strerror}); these frames are used")
+            warn(f"{source.path} is truncated after {n_decoded} frames ({error.strerror}); these frames are used")
+            return
+        if packet is None:
+            break
+        try:
+            pictures = packet.decode()
+        except av.FFmpegError:
+            is_damaged = True
+            index += packet.size > 0 and not packet.is_discard
+            continue
+        for picture in pictures:
+            if picture.is_corrupt:
+                is_damaged = True
+            else:
+                n_decoded += 1
+                yield index, picture
+            index += 1
+    if is_damaged:
+        n_missing = max(1, source.n_frames - n_decoded)
+        warn(
+            f"{source.path} is damaged: {n_missing} of {source.n_frames} frames are missing, the others are used; "
+            "copy it again"
+        )
 
 
 def _monotonic_time_s(timestamp_s: float | None, previous_s: float | None, step_s: float) -> float:
