@@ -122,6 +122,16 @@ def read_alpha(path: Path) -> UInt8[np.ndarray, "h w"]:
     return np.ascontiguousarray(read_rgba(path)[:, :, 3])
 
 
+def read_upright_alpha(path: Path) -> UInt8[np.ndarray, "h w"]:
+    """Read the alpha channel with the EXIF orientation applied, as `read_rgb` reads the colours; 255 without one.
+
+    Raises UserError as `read_rgb`.
+    """
+    decoded = _decode(path)
+    alpha = np.full(decoded.colour.shape[:2], 255, np.uint8) if decoded.alpha is None else to_uint8(decoded.alpha)
+    return _upright(alpha, decoded.orientation)
+
+
 def read_exif_tag(path: Path, tag: int, directory: int | None = None) -> object:
     """Read an EXIF tag of a file, or of one of its sub-directories (`PIL.ExifTags.IFD`).
 
