@@ -67,7 +67,7 @@ def open_frame_source(path: Path, image_fps: float = DEFAULT_IMAGE_FPS) -> Frame
     `image_fps` is used.
 
     Raises:
-        UserError: there is no recording, or the file cannot be read as a video.
+        UserError: there is no recording, images and a video, or a file that cannot be read as a video.
     """
     if path.is_file():
         return _open_video(path)
