@@ -16,7 +16,7 @@ from pipeline.capture.detection import THUMBNAIL_SIDE_PX, Detections, detect_in_
 from pipeline.capture.detection_checkpoint import load_detections, save_detections
 from pipeline.capture.disjoint_split import assign_disjoint_splits
 from pipeline.capture.exif_focal import metadata_focal_px
-from pipeline.capture.input_checks import assess_input, check_input
+from pipeline.capture.input_checks import assess_input, check_frames_that_differ, check_input
 from pipeline.capture.user_files import UserFiles, UserSplit, load_user_files
 from pipeline.capture.video import DEFAULT_IMAGE_FPS, FrameSource, open_frame_source, read_thumbnails
 from pipeline.capture.worker_pool import start_worker_pool
@@ -114,7 +114,7 @@ def select_detection_frames(source: FrameSource, user_files: UserFiles, config: 
     are looked at first: repeats are left out, and of the others somewhat more than used are chosen by motion.
 
     Raises:
-        UserError: the split lists more frames than the option allows.
+        UserError: the split lists more frames than the option allows, or fewer than needed differ.
     """
     if user_files.split is None:
         every = range(0, source.n_frames, detection_stride(source.n_frames, config.max_detection_frames))
@@ -129,11 +129,16 @@ def select_detection_frames(source: FrameSource, user_files: UserFiles, config: 
 
 
 def select_moving_frames(source: FrameSource, indices: range, config: Config) -> tuple[Sequence[int], int]:
-    """Return frames at equal steps of motion, `_CANDIDATES_PER_FRAME` for each that is used, and count the repeats."""
+    """Return frames at equal steps of motion, `_CANDIDATES_PER_FRAME` for each that is used, and count the repeats.
+
+    Raises:
+        UserError: fewer frames than needed differ.
+    """
     index, thumbnails = read_thumbnails(source, set(indices).__contains__, THUMBNAIL_SIDE_PX)
     noise = selection.estimate_noise_level(thumbnails)
     repeats, motion = selection.find_repeats(thumbnails, config.duplicate_threshold_noise_ratio * noise)
     moving = np.flatnonzero(~repeats)
+    check_frames_that_differ(len(moving), len(index), source.path, config.min_frames)
     if config.split == "interleaved":  # a disjoint split is made of what is detected in all frames
         split, count = selection.assign_splits(index[moving]), round(_CANDIDATES_PER_FRAME * config.max_frames)
         moving = moving[selection.select_frames_by_motion(split, motion[moving], count)]

@@ -27,6 +27,15 @@ _TARGET_PERSON_HEIGHT_PX = 640.0
 _N_SCENE_FRAMES, _MAX_MOVED_FRACTION, _PERSON_MARGIN_FRACTION = 32, 0.1, 0.03
 
 
+def check_frames_that_differ(n_different: int, n_frames: int, path: Path, min_frames: int) -> None:
+    """Raise UserError for a recording that repeats most of its frames. n_frames: those that were compared."""
+    if n_different < min_frames:
+        raise UserError(
+            f"{path} has only {n_different} frames that differ among the {n_frames} that were compared, {min_frames} "
+            "are needed; film a slow full turn"
+        )
+
+
 def check_input(detections: Detections, path: Path, min_frames: int) -> None:
     """Raise UserError for a recording that cannot be reconstructed.
 
@@ -45,14 +54,9 @@ def check_input(detections: Detections, path: Path, min_frames: int) -> None:
     n_found, n_detection_frames = int(detections.found.sum()), len(detections.found)
     if n_found == 0:
         raise UserError(f"no person was found in {path}; film the whole body at half of the image height or more")
-    if n_detection_frames < min_frames:
-        raise UserError(
-            f"only {n_detection_frames} frames of {path} differ from each other, {min_frames} are needed; "
-            "film a slow full turn"
-        )
     if n_found < min_frames:
         raise UserError(
-            f"a person was found in only {n_found} of {n_detection_frames} frames of {path}; {min_frames} are needed: "
+            f"a person was found in only {n_found} of {n_detection_frames} frames of {path}, {min_frames} are needed; "
             "film the whole body at half of the image height or more"
         )
     known = np.isfinite(detections.landmarks_px).all(axis=-1) & np.isfinite(detections.landmarks_world_m).all(axis=-1)
@@ -121,12 +125,10 @@ def assess_input(detections: Detections, unseen_arc_rad: float, path: Path) -> d
         )
     frame_index, differs = sample_scene_changes(detections)
     if differs.sum() > _MAX_MOVED_FRACTION * len(differs):
-        changes = np.flatnonzero(np.diff(differs.astype(np.int8)))
-        cut = f"; if it shows two scenes, cut it at frame {frame_index[changes[0] + 1]}" if len(changes) == 1 else ""
         warn(
             f"the scene behind the person changes in {path} (frames {format_frame_ranges(frame_index, differs)}): "
             "the camera or the light seems to change, which causes errors of motion and colour; film again with a "
-            f"fixed camera and locked exposure{cut}"
+            f"fixed camera and locked exposure{_advice_to_cut(frame_index, differs)}"
         )
     if unseen_arc_rad > np.radians(_MAX_UNSEEN_ARC_DEG):
         warn(
@@ -138,6 +140,15 @@ def assess_input(detections: Detections, unseen_arc_rad: float, path: Path) -> d
         "cut_feet_share": float(cropped.sum() / detections.found.sum()),
         "scene_change_share": float(differs.mean()),
     }
+
+
+def _advice_to_cut(frame_index: Int[np.ndarray, "k"], differs: Bool[np.ndarray, "k"]) -> str:
+    """Return what to do if the scene changes once and stays so; else nothing."""
+    changes = np.flatnonzero(differs[1:] != differs[:-1]) + 1
+    if len(changes) != 1:
+        return ""
+    first = frame_index[changes[0]]
+    return f"; from frame {first} on the scene is another one: if the video shows two scenes, cut it there"
 
 
 def sample_scene_changes(detections: Detections) -> tuple[Int[np.ndarray, "k"], Bool[np.ndarray, "k"]]:

@@ -1,8 +1,8 @@
 """User-supplied inputs, which override the detector: masks, landmarks, a camera, a split, SMPL poses.
 
-    masks/        one image per frame, with the names of the images or in natural order; 0 to 255, or 0 and 1
+    masks/        one image per frame, with the names of the images or in natural order
     masks.npz     array `masks` (n, h, w);  masks.hdf5: the same, as in PeopleSnapshot
-    (none)        alpha channel of the images, if the first image is partly transparent
+    (none)        alpha channel of the images, if they are partly transparent
     landmarks.npz MediaPipe's 33 landmarks: `landmarks_px` (n, 33, 2) in pixels of the original frames, nan where
                   unknown; optional `landmarks_visibility` (n, 33) in [0, 1] and `landmarks_world_m` (n, 33, 3) relative
                   to the centre of the hips, camera axes (else from the detector)
@@ -13,12 +13,14 @@
                   from the fifth on); frames in no list are not used
     smpl_poses.npz  SMPL poses of any frames (`pipeline.capture.smpl_poses`); they need a camera
 
+Masks are 0 where the person is not, and have any largest level, which counts as 255.
+
 Row i of each array belongs to frame i of the recording; there is one row for each frame. Original frames are upright
 (rotation of the container or EXIF applied), have square pixels, and include lens distortion.
 """
 
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,9 +41,8 @@ from pipeline.io.npz import load_npz
 # Maximum distance of a principal point from the centre, as a fraction of the side, if the image size of the calibration
 # is unknown. A calibration for images of half the size is off by a quarter.
 _MAX_PRINCIPAL_POINT_OFFSET = 0.2
-# So many masks tell whether a folder holds levels or zeros and ones.
+# So many masks tell the largest level, and whether they show the person.
 _N_MASKS_SAMPLED = 8
-_WHITE = 200
 _SPLITS = {"train": TRAIN, "validation": VALIDATION, "heldout": HELDOUT}
 
 
@@ -136,8 +137,6 @@ def load_user_files(path: Path, source: FrameSource) -> UserFiles:
     if not path.is_dir():
         return UserFiles(None, "", None, None)
     read_mask, mask_source = _find_masks(path, source)
-    if read_mask is not None:
-        _refuse_inverted(read_mask, f"{path}: the masks ({mask_source})", source.n_frames)
     landmarks_path, camera_path, split_path, poses_path = (
         path / name for name in ("landmarks.npz", "camera.json", "split.json", SMPL_POSES_NPZ)
     )
@@ -161,20 +160,43 @@ def _find_masks(path: Path, source: FrameSource) -> tuple[Callable[[int], np.nda
         return _masks_from_array(arrays["masks"], path / "masks.npz", source), "masks.npz"
     if (path / "masks.hdf5").is_file():
         return _masks_from_array(_read_hdf5_masks(path / "masks.hdf5"), path / "masks.hdf5", source), "masks.hdf5"
-    if any(read_alpha(source.files[k]).min() < 255 for k in (_sampled(len(source.files)) if source.files else ())):
-        return (lambda index: read_alpha(source.files[index])), "the images' alpha channel"
+    if source.files and (read_mask := _masks_from_alpha(path, source.files)) is not None:
+        return read_mask, "the images' alpha channel"
     return None, ""
 
 
-def _refuse_inverted(read_mask: Callable[[int], UInt8[np.ndarray, "h w"]], name: str, count: int) -> None:
-    """Refuse masks that are white in all corners of most sampled images: nobody is there, so it is the background."""
-    corners = [read_mask(k)[[0, 0, -1, -1], [0, -1, 0, -1]] for k in _sampled(count)]
-    if np.mean([levels.min() > _WHITE for levels in corners]) > 0.5:
-        raise UserError(f"{name} are white in the corners of the images; white is the person, so invert them")
+def _masks_from_alpha(path: Path, files: Sequence[Path]) -> Callable[[int], np.ndarray] | None:
+    """Return None where no sampled image has transparency."""
+    sampled = {k: read_alpha(files[k]) for k in _sampled(len(files))}
+    opaque = [k for k, alpha in sampled.items() if alpha.min() == 255]
+    if len(opaque) == len(sampled):
+        return None
+    if opaque:
+        other = next(k for k in sampled if k not in opaque)
+        raise UserError(
+            f"image {files[opaque[0]]} has no transparency, {files[other].name} has; make the background of all images "
+            "transparent, or of none"
+        )
+    _check_masks(f"the alpha channel of the images in {path}", list(sampled.values()))
+    return lambda index: read_alpha(files[index])
 
 
-def _sampled(count: int) -> list[int]:
-    return sorted({int(k) for k in np.linspace(0, count - 1, _N_MASKS_SAMPLED)})
+def _sampled(n_masks: int) -> list[int]:
+    return sorted({int(k) for k in np.linspace(0, n_masks - 1, _N_MASKS_SAMPLED)})
+
+
+def _check_masks(name: str, sampled: Sequence[np.ndarray]) -> float:
+    """Return the largest level of the sampled masks. Raise UserError where they are empty or inverted."""
+    highest = max(float(mask.max()) for mask in sampled)
+    if highest <= 0:
+        raise UserError(f"{name}: all {len(sampled)} masks looked at are empty; masks are white where the person is")
+    n_inverted = sum(bool((mask[[0, 0, -1, -1], [0, -1, 0, -1]] > highest / 2).all()) for mask in sampled)
+    if 2 * n_inverted >= len(sampled):
+        raise UserError(
+            f"{name}: {n_inverted} of {len(sampled)} masks looked at are white in all four corners, masks are white "
+            "where the person is; invert them"
+        )
+    return highest
 
 
 def _masks_from_folder(folder: Path, source: FrameSource) -> Callable[[int], np.ndarray]:
@@ -189,16 +211,17 @@ def _masks_from_folder(folder: Path, source: FrameSource) -> Callable[[int], np.
             )
         files = [by_stem[name] for name in names]
     _check_frame_count(folder, len(files), source)
-    level_scale = 255 if all(read_gray(files[k]).max() <= 1 for k in _sampled(len(files))) else 1
-    return lambda index: cv2.convertScaleAbs(read_gray(files[index]), alpha=level_scale)
+    highest = _check_masks(f"{folder}/", [read_gray(files[k]) for k in _sampled(len(files))])
+    return lambda index: cv2.convertScaleAbs(read_gray(files[index]), alpha=255.0 / highest)
 
 
 def _masks_from_array(masks: np.ndarray, path: Path, source: FrameSource) -> Callable[[int], np.ndarray]:
-    if masks.ndim != 3:
+    if masks.ndim != 3 or masks.size == 0:
         raise UserError(f"{path}: the masks have shape {masks.shape}; store them as (frames, height, width)")
     _check_frame_count(path, len(masks), source)
+    _check_masks(str(path), [masks[k] for k in _sampled(len(masks))])
     highest = float(masks.max())
-    return lambda index: np.rint(masks[index].astype(np.float32) * (255.0 / max(highest, 1e-6))).astype(np.uint8)
+    return lambda index: np.rint(masks[index].astype(np.float32) * (255.0 / highest)).astype(np.uint8)
 
 
 def _read_hdf5_masks(path: Path) -> np.ndarray:

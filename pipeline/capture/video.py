@@ -8,9 +8,7 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import partial
 from pathlib import Path
-from typing import cast
 
 import av
 import cv2
@@ -19,7 +17,7 @@ from av.container import InputContainer
 from av.video.stream import VideoStream
 from jaxtyping import Int, Shaped, UInt8
 
-from pipeline.capture import hdr
+from pipeline.capture.video_picture import DecodedImage, to_upright_rgb
 from pipeline.core.errors import UserError
 from pipeline.core.progress import warn
 from pipeline.io.image import IMAGE_SUFFIXES, read_rgb
@@ -35,16 +33,11 @@ _FORMATS = (
 )
 """FFmpeg's names of formats whose files hold all of their content; those of sound get a message of their own."""
 
+_QUICKTIME_SUFFIXES = (".mp4", ".mov", ".m4v", ".3gp")
+_MIN_BOX_BYTES = 8
 _HEIF_SUFFIXES = (".heic", ".heif", ".avif")
 _IMAGE_FOLDER_NAMES = ("images", "frames", "image", "rgb", "color")
-# Bicubic, with chroma brought to full resolution before the colour matrix: swscale's default repeats each chroma
-# sample over 2 x 2 pixels, which leaves visible blocks along the person's outline (bits of libswscale's SWS_* flags).
-_SWS_FLAGS = 0x4 | 0x2000 | 0x4000 | 0x40000
 _SWS_AREA = 0x20
-_UNSPECIFIED, _BT_709 = 2, 1
-"""Codes of matrix coefficients (ITU-T H.273, table 4)."""
-# A decoded image (8-bit sRGB, or 16 bits with another transfer function) and its conversion to 8-bit sRGB.
-_DecodedImage = tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -74,14 +67,16 @@ def open_frame_source(path: Path, image_fps: float = DEFAULT_IMAGE_FPS) -> Frame
     `image_fps` is used.
 
     Raises:
-        UserError: there is no recording, or the file cannot be read as a video.
+        UserError: there is no recording, images and a video, or a file that cannot be read as a video.
     """
     if path.is_file():
         return _open_video(path)
     if not path.is_dir():
         raise UserError(f"{path} does not exist; supply a video file or a folder of images")
     files = _images_in(path)
-    videos = sorted(p for p in path.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES)
+    videos = sorted(p for p in path.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES and not p.name.startswith("."))
+    if files and len(videos) == 1:
+        raise UserError(f"{path} holds images ({files[0].name}) and a video ({videos[0].name}); move one of them away")
     if files:
         return FrameSource(path, files, len(files), image_fps)
     if len(videos) == 1:
@@ -102,7 +97,7 @@ def open_frame_source(path: Path, image_fps: float = DEFAULT_IMAGE_FPS) -> Frame
 def read_frames(source: FrameSource, is_wanted: Callable[[int], bool], max_side_px: int) -> Iterator[Frame]:
     """Yield the wanted frames in order, reduced to at most `max_side_px` on the longer side.
 
-    A video that is truncated is read as far as possible, with a warning.
+    A video that is truncated or damaged is read as far as possible, with a warning.
 
     Raises:
         UserError: an image cannot be read, or the image size changes.
@@ -131,7 +126,7 @@ def read_thumbnails(
         UserError: no frame can be read, or their shape changes.
     """
 
-    def shrink(picture: av.VideoFrame, _: Fraction | None) -> _DecodedImage:
+    def shrink(picture: av.VideoFrame, _: Fraction | None) -> DecodedImage:
         scale = min(1.0, side_px / max(picture.width, picture.height))
         width, height = (max(1, round(scale * side)) for side in (picture.width, picture.height))
         small = picture.reformat(width, height, format="gray", interpolation=_SWS_AREA)
@@ -156,7 +151,7 @@ def image_size_px(source: FrameSource) -> tuple[int, int]:
     Raises:
         UserError: no image can be read.
     """
-    first = next(read_frames(source, lambda index: index == 0, max_side_px=1 << 30), None)
+    first = next(read_frames(source, lambda _: True, max_side_px=1 << 30), None)
     if first is None:
         raise UserError(f"{source.path} has no readable image; use another recording")
     return first.rgb.shape[1], first.rgb.shape[0]
@@ -164,9 +159,8 @@ def image_size_px(source: FrameSource) -> tuple[int, int]:
 
 def natural_sort_key(path: Path) -> list[tuple[int, str]]:
     """Return a sort key that orders `frame2` before `frame10`."""
-    return [
-        (int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name.lower()) if part
-    ]
+    parts = (part for part in re.split(r"(\d+)", path.name.lower()) if part)
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
 
 def _images_in(folder: Path) -> tuple[Path, ...]:
@@ -177,7 +171,9 @@ def _images_in(folder: Path) -> tuple[Path, ...]:
 def _open_video(path: Path) -> FrameSource:
     try:
         with open_container(path) as container:
-            stream = _video_stream(container, path)
+            stream = _best_video_stream(container)
+            if stream is None:
+                raise UserError(f"{path} has no video track; supply a video file or a folder of images")
             if stream.codec_context is None:
                 raise UserError(f"{path} has a video track of an unknown codec; supply an .mp4, .mov or .webm file")
             if stream.width * stream.height > MAX_FRAME_PIXELS:
@@ -186,22 +182,32 @@ def _open_video(path: Path) -> FrameSource:
                     "pixels are read; supply a smaller video"
                 )
             fps = float(stream.average_rate or stream.guessed_rate or DEFAULT_IMAGE_FPS)
+            _warn_if_incomplete(path, stream, container.format.name)
             # Packets hidden by an edit list (a clip that was trimmed without re-encoding) are decoded but not shown.
-            is_shown = [not packet.is_discard for packet in container.demux(stream) if packet.size > 0]
-            if "mov" in container.format.name and stream.frames > len(is_shown):
-                warn(f"{path} is incomplete: {len(is_shown)} of its {stream.frames} frames are there; copy it again")
+            n_frames = sum(packet.size > 0 and not packet.is_discard for packet in container.demux(stream))
     except av.FFmpegError as error:
-        raise UserError(
-            f"{path} cannot be read as a video ({error.strerror}); supply an .mp4, .mov or .webm file"
-        ) from None
-    return FrameSource(path, (), sum(is_shown), fps)
+        reason = f"{path} cannot be read as a video ({error.strerror})"
+        if path.suffix.lower() in _QUICKTIME_SUFFIXES and path.stat().st_size >= _MIN_BOX_BYTES:
+            raise UserError(f"{reason}: it is incomplete or no video; copy it from the camera again") from None
+        raise UserError(f"{reason}; supply an .mp4, .mov or .webm file") from None
+    return FrameSource(path, (), n_frames, fps)
 
 
-def _video_stream(container: InputContainer, path: Path) -> VideoStream:
+def _best_video_stream(container: InputContainer) -> VideoStream | None:
+    """Return the video track that players choose: no cover picture or preview if there is another one."""
     stream = container.streams.best("video")
-    if not isinstance(stream, VideoStream):
-        raise UserError(f"{path} has no video track; supply a video file or a folder of images")
-    return stream
+    return stream if isinstance(stream, VideoStream) else None
+
+
+def _warn_if_incomplete(path: Path, stream: VideoStream, format_name: str) -> None:
+    """Warn if the index, which other formats than MP4 and QuickTime lack, lists frames behind the end of the file."""
+    if "mov" not in format_name.split(","):
+        return
+    size = path.stat().st_size
+    ends = [entry.pos + entry.size for entry in stream.index_entries]
+    n_held = sum(end <= size for end in ends)
+    if n_held < len(ends):
+        warn(f"{path} is incomplete: its index lists {len(ends)} frames, it holds {n_held}; copy it again")
 
 
 def open_container(path: Path) -> InputContainer:
@@ -213,7 +219,7 @@ def open_container(path: Path) -> InputContainer:
     return av.open(str(path), options=options, metadata_errors="replace")
 
 
-def _images(source: FrameSource, is_wanted: Callable[[int], bool]) -> Iterator[tuple[int, float, _DecodedImage]]:
+def _images(source: FrameSource, is_wanted: Callable[[int], bool]) -> Iterator[tuple[int, float, DecodedImage]]:
     for index, path in enumerate(source.files):
         if is_wanted(index):
             yield index, index / source.fps, (read_rgb(path), np.asarray)
@@ -222,40 +228,61 @@ def _images(source: FrameSource, is_wanted: Callable[[int], bool]) -> Iterator[t
 def _video(
     source: FrameSource,
     is_wanted: Callable[[int], bool],
-    convert: Callable[[av.VideoFrame, Fraction | None], _DecodedImage] | None = None,
-) -> Iterator[tuple[int, float, _DecodedImage]]:
-    """Yield index, time and converted image (default: `_to_upright_rgb`) of the wanted frames."""
-    convert = convert or _to_upright_rgb
+    convert: Callable[[av.VideoFrame, Fraction | None], DecodedImage] | None = None,
+) -> Iterator[tuple[int, float, DecodedImage]]:
+    """Yield index, time and converted image (default: `to_upright_rgb`) of the wanted frames."""
+    convert = convert or to_upright_rgb
     start_s: float | None = None
     time_s: float | None = None
-    index = -1
     with open_container(source.path) as container:
-        stream = _video_stream(container, source.path)
+        stream = _best_video_stream(container)
+        if stream is None:
+            return
         stream.thread_type = "AUTO"
+        for index, picture in _intact_pictures(source, container, stream):
+            time_s = _monotonic_time_s(picture.time, time_s, 1.0 / source.fps)
+            start_s = time_s if start_s is None else start_s
+            if is_wanted(index):
+                yield index, time_s - start_s, convert(picture, stream.sample_aspect_ratio)
+
+
+def _intact_pictures(
+    source: FrameSource, container: InputContainer, stream: VideoStream
+) -> Iterator[tuple[int, av.VideoFrame]]:
+    """Yield index and picture of the frames that can be decoded; a damaged packet takes an index as well.
+
+    So later frames keep their index. Threads report damage some frames late, at the same place in every pass.
+    """
+    index = n_decoded = 0
+    is_damaged = False
+    packets = container.demux(stream)
+    while True:
         try:
-            for index, picture in enumerate(_decode(container, stream, source.path)):
-                time_s = _monotonic_time_s(picture.time, time_s, 1.0 / source.fps)
-                start_s = time_s if start_s is None else start_s
-                if is_wanted(index):
-                    yield index, time_s - start_s, convert(picture, stream.sample_aspect_ratio)
+            packet = next(packets, None)
         except av.FFmpegError as error:
-            warn(f"{source.path} is truncated after {index + 1} frames ({error.strerror}); these frames are used")
-
-
-def _decode(container: InputContainer, stream: VideoStream, path: Path) -> Iterator[av.VideoFrame]:
-    """Yield the decoded frames; damaged packets, and frames that lack them, are left out with a warning."""
-    damaged = 0
-    for packet in container.demux(stream):
+            warn(f"{source.path} is truncated after {n_decoded} frames ({error.strerror}); these frames are used")
+            return
+        if packet is None:
+            break
         try:
             pictures = packet.decode()
-        except av.InvalidDataError:
-            damaged += 1
+        except av.FFmpegError:
+            is_damaged = True
+            index += packet.size > 0 and not packet.is_discard
             continue
-        whole = [picture for picture in pictures if not (damaged and picture.is_corrupt)]
-        damaged += len(pictures) - len(whole)
-        yield from whole
-    if damaged:
-        warn(f"{path} is damaged: about {damaged} frames are left out; copy it again if you have another copy")
+        for picture in pictures:
+            if picture.is_corrupt:
+                is_damaged = True
+            else:
+                n_decoded += 1
+                yield index, picture
+            index += 1
+    if is_damaged:
+        n_missing = max(1, source.n_frames - n_decoded)
+        warn(
+            f"{source.path} is damaged: {n_missing} of {source.n_frames} frames are missing, the others are used; "
+            "copy it again"
+        )
 
 
 def _monotonic_time_s(timestamp_s: float | None, previous_s: float | None, step_s: float) -> float:
@@ -263,57 +290,6 @@ def _monotonic_time_s(timestamp_s: float | None, previous_s: float | None, step_
     if previous_s is None:
         return timestamp_s or 0.0
     return timestamp_s if timestamp_s is not None and timestamp_s > previous_s else previous_s + step_s
-
-
-def _to_upright_rgb(picture: av.VideoFrame, aspect: Fraction | None) -> _DecodedImage:
-    """Return the RGB image of a decoded frame with square pixels, turned as the container says."""
-    transfer, primaries = int(picture.color_trc), int(picture.color_primaries)
-    is_hdr = transfer in hdr.HDR_TRANSFERS
-    pixels = picture.reformat(
-        format="rgb48le" if is_hdr else "rgb24", src_colorspace=_assumed_matrix(picture), interpolation=_SWS_FLAGS
-    )
-    rgb: np.ndarray = pixels.to_ndarray()
-    if picture.interlaced_frame:
-        rgb = _first_field(rgb)
-    if aspect and aspect != 1:
-        rgb = cv2.resize(rgb, (round(rgb.shape[1] * aspect), rgb.shape[0]), interpolation=cv2.INTER_CUBIC)
-    to_srgb = partial(hdr.to_srgb, transfer=transfer, primaries=primaries) if is_hdr else np.asarray
-    return _upright(rgb, picture), to_srgb
-
-
-def _assumed_matrix(picture: av.VideoFrame) -> int | None:
-    """Return the code of the colour matrix of a frame that names none: BT.709 for high definition, as players assume.
-
-    None: the frame names one, or is of standard definition (BT.601), or of JPEG's full range (always BT.601).
-    """
-    is_untagged = picture.colorspace == _UNSPECIFIED and picture.format.name.startswith("yuv")
-    is_high_definition = picture.width >= 1280 or picture.height > 576
-    if is_untagged and is_high_definition and not picture.format.name.startswith("yuvj"):
-        return _BT_709
-    return None
-
-
-def _first_field(rgb: Shaped[np.ndarray, "h w 3"]) -> Shaped[np.ndarray, "h w 3"]:
-    """Return an interlaced image with the second field interpolated from the first: they are of different times."""
-    single = rgb.copy()
-    below = rgb[2::2].astype(np.float32)
-    between = single[1::2][: len(below)]
-    between[:] = np.rint(0.5 * (rgb[0::2][: len(below)] + below))
-    return single
-
-
-def _upright(rgb: Shaped[np.ndarray, "h w 3"], picture: av.VideoFrame) -> Shaped[np.ndarray, "h2 w2 3"]:
-    """Return the image turned by quarters and mirrored as the container's display matrix says.
-
-    The matrix (a b; c d) sends a pixel to x' = a x + c y, y' = b x + d y (ISO 14496-12, track header).
-    """
-    stored = picture.side_data.get("DISPLAYMATRIX")
-    if stored is None:
-        return np.ascontiguousarray(rgb)
-    (a, b, _), (c, d, _), _ = np.frombuffer(cast(bytes, stored), np.int32).reshape(3, 3).tolist()
-    if abs(a) < abs(b):
-        rgb, a, d = rgb.swapaxes(0, 1), c, b
-    return np.ascontiguousarray(rgb[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1])
 
 
 def downscale(rgb: Shaped[np.ndarray, "h w 3"], max_side_px: int) -> tuple[Shaped[np.ndarray, "h2 w2 3"], float]:

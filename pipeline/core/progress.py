@@ -42,7 +42,9 @@ def track(iterable: Iterable[Item], label: str, total: int | None = None, initia
 
 
 def warn(message: str) -> None:
-    """Print a warning; the manifest of the stage records it as well."""
+    """Print a warning, once for each text; the manifest of the stage records it as well."""
+    if message in _warnings:
+        return
     _warnings.append(message)
     tqdm.write(f"warning: {message}", file=sys.stderr)
 

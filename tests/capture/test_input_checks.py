@@ -9,7 +9,7 @@ import pytest
 from pipeline.capture.detection import Detections
 from pipeline.capture.face_detector import undetected_face
 from pipeline.capture.hand_detector import undetected_hands
-from pipeline.capture.input_checks import assess_input, check_input
+from pipeline.capture.input_checks import assess_input, check_frames_that_differ, check_input
 from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
 
@@ -59,7 +59,7 @@ def test_good_recording_passes_without_warning(good):
         ("gray_thumbnails", slice(None), 3, "all frames of clip.mp4 are black"),
         ("n_people", [4, 8], 3, r"several people \(for example in frame 4\)"),
         ("found", slice(None), False, "no person was found"),
-        ("found", slice(5, None), False, "only 5 of 20 frames"),
+        ("found", slice(5, None), False, "only 5 of 20 frames .*; film the whole body at half of the image"),
         ("landmarks_px", (slice(0, 11), [27, 28], 1), 120.0, "cut off above the feet in 11 of 20 frames"),
         ("landmarks_visibility", (slice(3, 20), [27, 28]), 0.01, "cut off .* in 17 of 20 frames .frame 3 first"),
         ("landmarks_px", (slice(15, 20), 23), np.nan, "known, .* in only 15 of the 20 frames .* landmarks.npz"),
@@ -123,7 +123,7 @@ def make_moving_scene(shifts_px: list[int], levels: list[int]) -> Detections:
         ([0] * 19 + [6], [0] * 20, None),
         ([0] * 15 + [6] * 5, [0] * 20, "changes in clip.mp4 (frames 15-19): the camera or the light seems to change"),
         ([0, 2, 4, 6, 5, 3, 1, -1, -3, -5] * 2, [0] * 20, "the camera or the light seems to change"),
-        ([0] * 20, [0] * 16 + [30] * 4, "if it shows two scenes, cut it at frame 16"),
+        ([0] * 20, [0] * 16 + [30] * 4, "if the video shows two scenes, cut it there"),
     ],
     ids=["still", "one jolt", "pushed", "in the hand", "brighter"],
 )
@@ -132,6 +132,28 @@ def test_moving_camera_is_reported(shifts_px, levels, expected_text):
     assert (metrics["scene_change_share"] >= 0.2) == (expected_text is not None)
     warnings = take_warnings()
     assert [expected_text in warning for warning in warnings] == ([True] if expected_text else []), warnings
+
+
+@pytest.mark.parametrize(
+    ("shifts_px", "levels", "first"),
+    [
+        ([0] * 15 + [6] * 5, [0] * 20, 15),
+        ([6] * 4 + [0] * 16, [0] * 20, 4),
+        ([0] * 8 + [6] * 5 + [0] * 7, [0] * 20, None),
+    ],
+    ids=["late cut", "early cut", "twice"],
+)
+def test_a_scene_that_changes_once_is_a_place_to_cut(shifts_px, levels, first):
+    assess_input(make_moving_scene(shifts_px, levels), 0.5, PATH)
+    (message,) = take_warnings()
+    advice = f"; from frame {first} on the scene is another one: if the video shows two scenes, cut it there"
+    assert message.endswith("locked exposure" if first is None else advice)
+
+
+def test_recordings_that_repeat_their_frames_are_refused():
+    check_frames_that_differ(16, 200, PATH, 16)
+    with pytest.raises(UserError, match="clip.mp4 has only 15 frames that differ .* 200 .* film a slow full turn"):
+        check_frames_that_differ(15, 200, PATH, 16)
 
 
 @pytest.mark.parametrize(

@@ -5,11 +5,11 @@ import json
 import h5py
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
 
 from pipeline.capture.smpl_poses import save_smpl_poses
 from pipeline.capture.user_files import CameraCalibration, load_user_files
-from pipeline.capture.video import FrameSource, open_frame_source
+from pipeline.capture.video import FrameSource, open_frame_source, read_frames
 from pipeline.core.errors import UserError
 from pipeline.io.image import write_gray, write_rgb, write_rgba
 from pipeline.io.npz import save_npz
@@ -43,25 +43,31 @@ def test_no_user_files(tmp_path, source):
 
 
 def write_masks(folder, **levels: int) -> None:
-    """Masks of one level each, by the names of their files."""
+    """Masks by the names of their files, each with a person of one level in its middle."""
     (folder / "masks").mkdir()
     for name, level in levels.items():
-        write_gray(folder / "masks" / f"{name}.png", np.full((4, 6), level, np.uint8))
+        write_gray(folder / "masks" / f"{name}.png", person(level))
+
+
+def person(level: int, around: int = 0) -> np.ndarray:
+    mask = np.full((4, 6), around, np.uint8)
+    mask[1:3, 2:4] = level
+    return mask
 
 
 def levels_of(user_files) -> list[int]:
-    return [int(user_files.read_mask(index).mean()) for index in range(3)]
+    return [int(user_files.read_mask(index)[1, 2]) for index in range(3)]
 
 
 def test_mask_folder_by_name(tmp_path, source):
-    write_masks(tmp_path, x1=10, x2=20, x10=30, other=99)
-    assert levels_of(load_user_files(tmp_path, source)) == [10, 20, 30]
+    write_masks(tmp_path, x1=85, x2=170, x10=255, other=99)
+    assert levels_of(load_user_files(tmp_path, source)) == [85, 170, 255]
 
 
 def test_mask_folder_by_order(tmp_path, source):
-    write_masks(tmp_path, m2=20, m1=10, m10=30)
-    assert levels_of(load_user_files(tmp_path, source)) == [10, 20, 30]
-    assert levels_of(load_user_files(tmp_path, FrameSource(tmp_path, (), 3, 25.0))) == [10, 20, 30]
+    write_masks(tmp_path, m2=170, m1=85, m10=255)
+    assert levels_of(load_user_files(tmp_path, source)) == [85, 170, 255]
+    assert levels_of(load_user_files(tmp_path, FrameSource(tmp_path, (), 3, 25.0))) == [85, 170, 255]
 
 
 def test_extra_mask_is_refused_when_names_do_not_match(tmp_path, source):
@@ -77,36 +83,49 @@ def test_masks_numbered_from_another_start_are_refused(tmp_path, source):
         load_user_files(tmp_path, source)
 
 
+def write_images_with_alpha(folder, alphas: list[np.ndarray]) -> FrameSource:
+    (folder / "images").mkdir()
+    for k, alpha in enumerate(alphas):
+        rgba = np.dstack([np.full((*alpha.shape, 3), (90, 80, 70), np.uint8), alpha])
+        write_rgba(folder / "images" / f"{k}.png", rgba)
+    return open_frame_source(folder)
+
+
 def test_alpha_channel_is_the_mask_unless_masks_are_supplied(tmp_path):
-    (tmp_path / "images").mkdir()
-    for k, opacity in enumerate((0, 128, 255)):
-        write_rgba(tmp_path / "images" / f"{k}.png", np.full((4, 6, 4), (90, 80, 70, opacity), np.uint8))
-    user_files = load_user_files(tmp_path, open_frame_source(tmp_path))
+    source = write_images_with_alpha(tmp_path, [person(level) for level in (0, 128, 255)])
+    user_files = load_user_files(tmp_path, source)
     assert (levels_of(user_files), user_files.mask_source) == ([0, 128, 255], "the images' alpha channel")
-    write_masks(tmp_path, m1=10, m2=20, m3=30)
-    assert levels_of(load_user_files(tmp_path, open_frame_source(tmp_path))) == [10, 20, 30]
+    write_masks(tmp_path, m1=51, m2=102, m3=255)
+    assert levels_of(load_user_files(tmp_path, source)) == [51, 102, 255]
 
 
-def test_inverted_masks_are_refused(tmp_path, source):
-    write_masks(tmp_path, m1=255, m2=255, m3=255)
-    with pytest.raises(UserError, match=r"masks/\) are white in the corners"):
+def test_one_image_without_transparency_is_named(tmp_path):
+    source = write_images_with_alpha(tmp_path, [person(255), person(255), np.full((4, 6), 255, np.uint8)])
+    with pytest.raises(UserError, match=r"2\.png has no transparency, 0\.png has; make the background"):
         load_user_files(tmp_path, source)
 
 
-def test_alpha_is_turned_with_the_colours(tmp_path):
-    """EXIF orientation 6: the first row of the file is the right side of the picture."""
+def test_transparency_after_an_opaque_first_image_is_not_ignored(tmp_path):
+    source = write_images_with_alpha(tmp_path, [np.full((4, 6), 255, np.uint8), person(255), person(255)])
+    with pytest.raises(UserError, match=r"0\.png has no transparency, 1\.png has"):
+        load_user_files(tmp_path, source)
+
+
+def test_alpha_is_turned_as_the_colours_are(tmp_path):
+    """EXIF orientation 6: the picture is shown after a clockwise quarter turn."""
     (tmp_path / "images").mkdir()
-    rgba = np.full((4, 6, 4), 90, np.uint8)
-    rgba[..., 3] = 0
-    rgba[0, :, 3] = 255
+    pixels = np.full((8, 12, 4), (40, 40, 40, 0), np.uint8)
+    pixels[5:, 2:9] = (200, 90, 60, 255)
     exif = Image.Exif()
-    exif[0x0112] = 6
-    for k in range(3):
-        Image.fromarray(rgba).save(tmp_path / "images" / f"{k}.png", exif=exif)
-    mask = load_user_files(tmp_path, open_frame_source(tmp_path)).read_mask(0)
-    assert mask.shape == (6, 4)
-    assert (mask[:, -1] == 255).all()
-    assert not mask[:, :-1].any()
+    exif[ExifTags.Base.Orientation] = 6
+    for k in range(2):
+        Image.fromarray(pixels).save(tmp_path / "images" / f"{k}.png", exif=exif)
+    source = open_frame_source(tmp_path)
+    frame = next(read_frames(source, lambda _: True, 1000))
+    mask = load_user_files(tmp_path, source).read_mask(0)
+    assert mask.shape == (12, 8)
+    np.testing.assert_array_equal(mask > 0, frame.rgb[..., 0] > 100)
+    np.testing.assert_array_equal(mask > 0, np.rot90(pixels[..., 3], k=-1) > 0)
 
 
 def test_a_folder_of_zeros_and_ones_is_brought_to_255(tmp_path, source):
@@ -114,10 +133,39 @@ def test_a_folder_of_zeros_and_ones_is_brought_to_255(tmp_path, source):
     assert levels_of(load_user_files(tmp_path, source)) == [0, 255, 0]
 
 
-def test_faint_levels_of_soft_masks_stay_faint(tmp_path, source):
-    """One bright mask tells that the folder holds levels, so a mask with nothing but specks of 1 shows nobody."""
-    write_masks(tmp_path, m1=1, m2=1, m3=200)
-    assert levels_of(load_user_files(tmp_path, source)) == [1, 1, 200]
+def test_the_largest_level_of_a_folder_counts_as_255(tmp_path, source):
+    """As in an array; a mask with nothing but specks of 1 still shows nobody."""
+    write_masks(tmp_path, m1=1, m2=100, m3=200)
+    assert levels_of(load_user_files(tmp_path, source)) == [1, 128, 255]
+
+
+def test_empty_masks_are_refused(tmp_path, source):
+    write_masks(tmp_path, m1=0, m2=0, m3=0)
+    with pytest.raises(UserError, match="masks/: all 3 masks looked at are empty; masks are white where the person is"):
+        load_user_files(tmp_path, source)
+
+
+@pytest.mark.parametrize("kind", ["masks/", "masks.npz", "masks.hdf5", "alpha"])
+@pytest.mark.parametrize("n_inverted", [1, 2])
+def test_inverted_masks_are_refused(tmp_path, kind, n_inverted):
+    """Black where the person is, in two of three masks; one alone may show a picture without the person."""
+    masks = [person(0, 255)] * n_inverted + [person(255)] * (3 - n_inverted)
+    alphas = masks if kind == "alpha" else [np.full((4, 6), 255, np.uint8)] * 3
+    source = write_images_with_alpha(tmp_path, alphas)
+    if kind == "masks/":
+        (tmp_path / "masks").mkdir()
+        for k, mask in enumerate(masks):
+            write_gray(tmp_path / "masks" / f"{k}.png", mask)
+    elif kind == "masks.npz":
+        save_npz(tmp_path / kind, {"masks": np.stack(masks)})
+    elif kind == "masks.hdf5":
+        with h5py.File(tmp_path / kind, "w") as file:
+            file["masks"] = np.stack(masks)
+    if n_inverted == 1:
+        assert load_user_files(tmp_path, source).read_mask is not None
+        return
+    with pytest.raises(UserError, match=rf"{kind}.*: 2 of 3 masks looked at are white in all four corners, .* invert"):
+        load_user_files(tmp_path, source)
 
 
 def test_mask_arrays_are_brought_to_255(tmp_path, source):

@@ -9,9 +9,9 @@ import pytest
 
 from pipeline.capture import video
 from pipeline.capture.exif_focal import metadata_focal_px
-from pipeline.capture.hdr import BT_2020, HLG, to_srgb
 from pipeline.core.errors import UserError
 from pipeline.core.progress import take_warnings
+from pipeline.io.hdr import BT_2020, HLG, to_srgb
 from pipeline.io.image import write_rgb
 from tests.capture.video_files import ramp, select_all, write_video
 

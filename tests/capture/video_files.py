@@ -6,6 +6,10 @@ from pathlib import Path
 import av
 import numpy as np
 
+IDENTITY = (0x10000).to_bytes(4, "big") + bytes(12) + (0x10000).to_bytes(4, "big") + bytes(12)
+IDENTITY += (0x40000000).to_bytes(4, "big")
+"""The display matrix of a track header that leaves the picture as it is (16.16 and 2.30 fixed point)."""
+
 
 def select_all(index: int) -> bool:
     return True

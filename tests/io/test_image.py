@@ -169,6 +169,9 @@ def test_every_exif_orientation_is_applied(tmp_path, pixels, suffix, orientation
     np.testing.assert_array_equal(image.read_rgb(tmp_path / f"a{suffix}"), upright)
     np.testing.assert_array_equal(image.read_gray(tmp_path / f"a{suffix}"), np.rint(upright @ [0.299, 0.587, 0.114]))
     np.testing.assert_array_equal(image.read_rgba(tmp_path / f"a{suffix}")[..., :3], pixels)
+    rgba = np.dstack([pixels, pixels[..., 0]])
+    Image.fromarray(rgba).save(tmp_path / f"a{suffix}", exif=exif, lossless=True, exact=True)
+    np.testing.assert_array_equal(image.read_alpha(tmp_path / f"a{suffix}"), upright[..., 0])
 
 
 def test_exif_orientation_is_honoured(tmp_path):

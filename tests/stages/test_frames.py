@@ -285,6 +285,8 @@ def test_too_few_frames_are_refused(tmp_path):
 def test_a_person_who_stands_still_is_refused(tmp_path):
     with pytest.raises(UserError, match="only 2 frames in which the person has moved"):
         run(draw_recording(tmp_path / "in", n=40, repeats=20), tmp_path / "out")
+    with pytest.raises(UserError, match="only 2 frames that differ among the 40 that were compared"):
+        run(tmp_path / "in", tmp_path / "again", max_frames=24)
 
 
 def test_black_frames_are_refused(tmp_path):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.capture.hdr import BT_2020, HLG, PQ, to_srgb
+from pipeline.io.hdr import BT_2020, HLG, PQ, to_srgb
 
 WHITE_XY = (0.3127, 0.3290)
 BT_2020_XY = ((0.708, 0.292), (0.170, 0.797), (0.131, 0.046))
