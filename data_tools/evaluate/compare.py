@@ -53,8 +53,8 @@ def _require_video_of(out: Path, run: Path) -> None:
     manifest, video = read_manifest(run / "frames"), out / "video"
     if manifest is None or "video" not in manifest.inputs:
         return
-    digests = {digest_video(video)} | {digest_video(path) for path in video.iterdir() if path.is_file()}
-    if manifest.inputs["video"] not in digests:
+    candidates = (video, *(path for path in video.iterdir() if path.is_file()))
+    if not any(digest_video(path) == manifest.inputs["video"] for path in candidates):
         raise UserError(
             f"{run} was made from another video than {video}; name the capture of its video with TRUTH=, or run "
             f"{format_command('--run', run, '--video', video)}"

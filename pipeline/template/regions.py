@@ -68,14 +68,13 @@ def outer_surface(body: Body) -> Mesh:
         return body.mesh()
     template = load_template()
     skin, vertices = body.faces[template.skin_faces], body.vertices
-    parts = [skin]
-    for is_cavity in (*template.socket_faces, template.mouth_faces):
-        inward = _directed_edges(body.faces[is_cavity])
-        rim = inward[np.isin(_edge_keys(inward[:, ::-1]), _edge_keys(_directed_edges(skin)))]
-        parts.append(np.column_stack([rim, np.full(len(rim), len(vertices) + len(parts) - 1)]))
+    skin_edges = _edge_keys(_directed_edges(skin))
+    cavity_edges = [_directed_edges(body.faces[part]) for part in (*template.socket_faces, template.mouth_faces)]
+    rims = [edges[np.isin(_edge_keys(edges[:, ::-1]), skin_edges)] for edges in cavity_edges]
     eyes = [vertices[np.unique(body.faces[is_eye])] for is_eye in template.eye_faces]
-    tips = [*(eye[eye[:, 2].argmax()] for eye in eyes), vertices[np.unique(rim)].mean(axis=0)]
-    return Mesh(np.concatenate([vertices, tips]).astype(np.float32), np.concatenate(parts).astype(np.int32))
+    tips = [*(eye[eye[:, 2].argmax()] for eye in eyes), vertices[np.unique(rims[-1])].mean(axis=0)]
+    cones = [np.column_stack([rim, np.full(len(rim), len(vertices) + k)]) for k, rim in enumerate(rims)]
+    return Mesh(np.concatenate([vertices, tips]).astype(np.float32), np.concatenate([skin, *cones]).astype(np.int32))
 
 
 @lru_cache(maxsize=1)

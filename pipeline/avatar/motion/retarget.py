@@ -66,8 +66,6 @@ _MAX_TWIST_RAD = np.radians(15.0)
 _MIN_FLAT_FRAMES = 5
 """Frames in which ankle and ball of a foot stand, for an estimate of the pitch of the foot's bones."""
 
-_FRONT = (0.0, 0.0, 1.0)
-
 
 def retarget(bvh_motion: BvhMotion, body: Body, ground_m: Float[np.ndarray, "3"], in_place: bool) -> Motion:
     """Retarget the recorded motion to another body; see `retarget_with_contacts`."""
@@ -323,12 +321,8 @@ def _bone_rotation(
 
 def _arm_axes(bone: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"] | None:
     """Return an orthonormal frame of an arm's bone; None for one that points to the front or back."""
-    along = bone / np.linalg.norm(bone)
-    inner = np.cross(along, _FRONT)
-    length = float(np.linalg.norm(inner))
-    if length < 0.5:
-        return None
-    return np.stack([along, inner / length, np.cross(along, inner / length)], axis=1)
+    inner = a_pose_hinge_axis("Arm", bone)
+    return frame_of(bone, inner) if np.linalg.norm(inner) >= 0.5 * np.linalg.norm(bone) else None
 
 
 def _flatten_standing_feet(
