@@ -59,7 +59,8 @@ SAMPLE_RUN := runs/sample
 SAMPLE := runs/sample-capture
 SAMPLE_DONE := $(SAMPLE)/.done-$(shell sed -n 's/^CAPTURE_VERSION = //p' data_tools/synthetic/scene/capture.py)
 ONE_RUN := $(or $(RUN),$(SAMPLE_RUN))
-RUN_OPTIONS = $(if $(PRESET),--preset $(PRESET)) $(foreach item,$(SET),$(if $(findstring =,$(item)),--set $(item),$(error SET=$(SET): $(item) has no '='; a value with spaces goes through ARGS='--set "key=a value"')))
+SET_OPTIONS = $(foreach item,$(SET),$(if $(findstring =,$(item)),--set $(item),$(error SET=$(SET): $(item) has no '='; a value with spaces goes through ARGS='--set "key=a value"')))
+RUN_OPTIONS = $(if $(PRESET),--preset $(PRESET)) $(SET_OPTIONS)
 OPTIONS = $(RUN_OPTIONS) $(ARGS)
 STAMP := $(VENV)/.stamp$(if $(EXTRA),-$(EXTRA))
 
@@ -95,9 +96,10 @@ else
 endif
 
 chart: $(STAMP)  ## plot accuracy against time of PRESETS on CAPTURES with SEEDS (default: all presets, two generated people)
-	$(RUN_PYTHON) -m data_tools.sweep.chart $(CAPTURES) $(if $(PRESETS),--presets $(PRESETS)) $(if $(SEEDS),--seeds $(SEEDS)) $(ARGS)
+	$(RUN_PYTHON) -m data_tools.sweep.chart $(CAPTURES) $(if $(PRESETS),--presets $(PRESETS)) $(if $(SEEDS),--seeds $(SEEDS)) \
+		$(SET_OPTIONS) $(ARGS)
 
-ablate: $(STAMP)  ## remove, replace or add one part of the mesh stage: ROWS, CAPTURES, SEEDS (default: all, the sample, 0 1 2)
+ablate: $(STAMP)  ## remove, replace or add one part of stage two, or change its sizes: ROWS, CAPTURES, SEEDS (default: all, the sample, 0 1 2)
 	$(RUN_PYTHON) -m data_tools.sweep.ablate $(CAPTURES) $(if $(ROWS),--rows $(ROWS)) $(if $(SEEDS),--seeds $(SEEDS)) $(ARGS)
 
 ablate-field: $(STAMP)  ## change one size or part of the field stage on finished runs: RUN='runs/a runs/b', ROWS, SEEDS

@@ -1,4 +1,4 @@
-"""Ablation of the mesh stage: remove, replace or add one part of it, on equal fields.
+"""Ablation of stage two: remove, replace or add one part of it, on equal fields.
 
 python -m data_tools.sweep.ablate [CAPTURE ...] [--rows uniform error-driven --seeds 0 1 2 --out runs/ablate]
 

@@ -1,4 +1,4 @@
-"""Rows of the ablation of the mesh stage: each is the stage with one part removed, replaced or added."""
+"""Rows of the ablation of stage two: mesh or texture with one part removed, replaced or added, or one size changed."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -14,7 +14,7 @@ FACES, FACES_BEFORE_REDUCTION = "faces", "faces_before_reduction"
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """One variant of the mesh stage. Rows are compared by identity, because mappings have no hash.
+    """One variant of the stages from the mesh on. Rows are compared by identity, because mappings have no hash.
 
     Attributes:
         name: in command, tables and names of run folders.
@@ -30,6 +30,16 @@ class Row:
     options: Mapping[str, Any] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
     from_reference: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def has_mesh_of_reference(self) -> bool:
+        """Whether the mesh stage is that of `REFERENCE`: only later stages differ."""
+        return bool(self.options) and not self.settings and all(key.startswith("texture.") for key in self.options)
+
+
+def _texels(side_px: int) -> Row:
+    limits = {"texture.min_texture_px": side_px, "texture.max_texture_px": side_px}
+    return Row(f"texels-{side_px}", f"maps of {side_px} px instead of the size that the frames ask for", options=limits)
 
 
 ROWS = {
@@ -57,6 +67,9 @@ ROWS = {
             f"with {FIELD_VIEWS} renders of the field from other cameras as training views",
             settings={"field_views": FIELD_VIEWS},
         ),
+        Row("faces-7000", "at most 7,000 faces, whatever it costs", options={"mesh.max_final_faces": 7000}),
+        Row("faces-29000", "at most 29,000 faces: twice the limit", options={"mesh.max_final_faces": 29_000}),
+        *map(_texels, (512, 1024, 2048)),
     )
 }
 

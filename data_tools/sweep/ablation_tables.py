@@ -33,6 +33,7 @@ COLUMNS = (
     Column("chamfer_mm", "Chamfer, mm", 2),
     Column("normal_angle_deg", "normals, °", 2),
     Column("faces", "faces", 0),
+    Column("texture_px", "texture, px", 0),
     Column("glb_bytes", "GLB, kB", 0, 1e-3),
     Column("rounds_kept", "rounds kept", 1),
     Column("mesh_seconds", "mesh stage, s", 0),

@@ -39,11 +39,12 @@ REPORT, TRUTH, MANIFEST = "report", "truth", "manifest"
 FIGURE_PATHS = {
     "psnr_full_db": (REPORT, "heldout", "mesh", "psnr_full"),
     "psnr_body_db": (REPORT, "heldout", "mesh", "psnr_body"),
-    "chamfer_mm": (TRUTH, "mesh", "chamfer_mm"),
-    "normal_angle_deg": (TRUTH, "mesh", "normal_angle_deg"),
+    "chamfer_mm": (TRUTH, "mesh_matched", "chamfer_mm"),
+    "normal_angle_deg": (TRUTH, "mesh_matched", "normal_angle_deg"),
     "novel_view_psnr_body_db": (TRUTH, "images", "novel_views", "psnr_body"),
     "faces": (REPORT, "mesh", "faces"),
     "faces_before_reduction": (MANIFEST, "metrics", "faces_before_reduction"),
+    "texture_px": (REPORT, "export", "texture_px"),
     "glb_bytes": (REPORT, "export", "glb_bytes"),
     "rounds_kept": (MANIFEST, "metrics", "accepted_rounds"),
     "mesh_seconds": (MANIFEST, "seconds"),
@@ -131,11 +132,11 @@ def prepare_row(trial: AblationTrial) -> None:
     """Write record and settings of a row into its folder, and link the stages before the mesh.
 
     Raises:
-        UserError: the mesh stage of `REFERENCE`, whose number of faces is needed, failed.
+        UserError: the mesh stage of `REFERENCE`, whose result is needed, failed.
     """
     metrics: dict[str, float | None] = {}
-    if trial.row.from_reference:
-        reference = AblationTrial(trial.base, ROWS[REFERENCE])
+    reference = AblationTrial(trial.base, ROWS[REFERENCE])
+    if trial.row.from_reference or trial.row.has_mesh_of_reference:
         prepare_row(reference)
         make_stage(reference.run_dir, MESH)
         manifest = read_manifest(reference.run_dir / MESH)
@@ -146,6 +147,8 @@ def prepare_row(trial: AblationTrial) -> None:
     save_settings(trial.run_dir, row_settings(trial.row, trial.base.seed, metrics))
     for name in STAGES_UNTIL_FIELD:
         link_folder(trial.base.run_dir / name, trial.run_dir / name)
+    if trial.row.has_mesh_of_reference:
+        link_folder(reference.run_dir / MESH, trial.run_dir / MESH)
 
 
 def link_folder(source: Path, link: Path) -> None:

@@ -4,8 +4,8 @@ python -m data_tools.sweep.chart [CAPTURE ...] [--presets instant ihm --steps ih
 
 Each combination has a run folder in OUT, so the same command continues an interrupted sweep; the interrupted stage
 restarts from its beginning, because its time is measured. Stages with equal inputs and options are computed once and
-copied; their seconds count for each run. Outputs in OUT: `chart.svg`, `chart.png`, `chart.csv` (one row per run) and
-`anytime.csv` (scores of the field during training).
+copied; their seconds count for each run. Outputs in OUT: `chart.svg` (accuracy against time), `sizes.svg` (against
+parameters, faces, bytes), both also as .png, `chart.csv` (one row per run) and `anytime.csv` (scores during training).
 """
 
 import argparse
@@ -21,7 +21,15 @@ import stages
 from data_tools.command import run_command
 from data_tools.evaluate.truth import read_capture_settings
 from data_tools.sample import main as make_sample
-from data_tools.sweep.chart_figure import PANELS, ChartPoint, draw_chart, pareto_front, preset_means, save_chart
+from data_tools.sweep.chart_figure import (
+    SIZE_PANELS,
+    TIME_PANELS,
+    ChartPoint,
+    draw_chart,
+    pareto_front,
+    preset_means,
+    save_figure,
+)
 from data_tools.sweep.chart_trials import (
     FIELD,
     PROGRESS_COLUMNS,
@@ -57,7 +65,7 @@ def main(argv: Sequence[str]) -> None:
     options = _parse(argv)
     steps = _parse_steps(options)
     for preset in options.presets:
-        validate_run_options(preset, [f"{FIELD}.steps={steps[preset]}"] if preset in steps else [])
+        validate_run_options(preset, [*options.set, *([f"{FIELD}.steps={steps[preset]}"] if preset in steps else [])])
     captures = options.captures or list(SAMPLE_CAPTURES)
     if not options.captures:
         _make_sample_captures()
@@ -65,13 +73,17 @@ def main(argv: Sequence[str]) -> None:
     if missing:
         raise UserError(f"{missing[0]} does not exist: name synthetic captures, videos or folders of images")
     combinations = product(options.seeds, captures, options.presets)
-    trials = [Trial(capture, preset, seed, options.out, steps.get(preset)) for seed, capture, preset in combinations]
+    overrides = tuple(options.set)
+    trials = [
+        Trial(capture, preset, seed, options.out, steps.get(preset), overrides)
+        for seed, capture, preset in combinations
+    ]
     require_distinct_run_folders(trials)
     process_trial = _read_only if options.draw else run_and_compare
     runs = {trial: process_trial(trial, trials) for trial in track(trials, "runs")}
     write_results(options.out, runs)
     _raise_if_incomplete(runs, options.out)
-    print(f"{len(runs)} runs: {options.out}/chart.svg, chart.png, chart.csv, anytime.csv")
+    print(f"{len(runs)} runs: {options.out}/chart.svg, sizes.svg, chart.csv, anytime.csv")
 
 
 def run_and_compare(trial: Trial, other_trials: Sequence[Trial]) -> RunState:
@@ -121,8 +133,9 @@ def write_results(out: Path, runs: Mapping[Trial, RunState]) -> None:
     write_csv(out / "chart.csv", list(rows[0]), [list(row.values()) for row in rows])
     curves = [(point.capture, point.preset, point.seed, *row) for point in points for row in point.curve]
     write_csv(out / "anytime.csv", ("capture", "preset", "seed", *PROGRESS_COLUMNS), curves)
-    if any(point.scores for point in points):
-        save_chart(draw_chart(points, provenance(rows)), out)
+    for name, panels in (("chart", TIME_PANELS), ("sizes", SIZE_PANELS)):
+        if any(panel.place(point) for panel in panels for point in points):
+            save_figure(draw_chart(points, provenance(rows), panels), out, name, dpi=130)
 
 
 def provenance(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -133,13 +146,13 @@ def provenance(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _pareto_optimal_scores(trial: Trial, points: Sequence[ChartPoint]) -> str:
-    """Return the scores for which the preset of the trial is Pareto-optimal."""
+    """Return the scores for which the preset of the trial is Pareto-optimal in time."""
     on = []
-    for panel in PANELS:
-        means = preset_means([point for point in points if point.capture == trial.capture_name], panel.mesh_score)
+    for panel in TIME_PANELS:
+        means = preset_means([point for point in points if point.capture == trial.capture_name], panel)
         front = pareto_front(list(means.values()), panel.higher_is_better)
         if trial.label in [list(means)[index] for index in front]:
-            on.append(panel.mesh_score)
+            on.append(panel.score)
     return " ".join(on)
 
 
@@ -181,6 +194,13 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     )
     parser.add_argument("--presets", nargs="+", default=presets, help="names in configs/ or .yaml files; default: all")
     parser.add_argument("--steps", nargs="+", default=[], help="PRESET=N: other number of training steps of the field")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="SECTION.KEY=VALUE",
+        help="option of all runs",
+    )
     parser.add_argument("--seeds", nargs="+", type=int, default=[0], help="seeds of the stages that use random numbers")
     parser.add_argument("--out", type=Path, default=Path("runs/chart"), help="folder of runs, tables and chart")
     parser.add_argument("--draw", action="store_true", help="run nothing, chart the finished runs")

@@ -33,6 +33,12 @@ FIELD = "field"
 STAGES_UNTIL_FIELD = ("frames", "body", FIELD)
 STAGES_BEFORE_FIELD = STAGES_UNTIL_FIELD[:-1]
 STAGES_UNTIL_EXPORT = tuple(name for name in stages.STAGES if name != "report")
+SIZE_METRICS = {
+    "parameters": (FIELD, "parameters"),
+    "glb_faces": ("export", "glb_faces"),
+    "glb_bytes": ("export", "glb_bytes"),
+}
+"""Column of the table, stage and metric of each size."""
 PROGRESS_COLUMNS = ("seconds", "validation_psnr_db", "validation_psnr_body_db")
 
 
@@ -44,6 +50,7 @@ class Trial:
         preset: name in configs/ or a .yaml file.
         out: parent of the run folder.
         steps: training steps of the field; None: those of the preset.
+        overrides: further options, as `section.key=value`.
     """
 
     capture: Path
@@ -51,6 +58,7 @@ class Trial:
     seed: int
     out: Path
     steps: int | None = None
+    overrides: tuple[str, ...] = ()
 
     @property
     def capture_name(self) -> str:
@@ -65,20 +73,23 @@ class Trial:
     @property
     def label(self) -> str:
         """Label of the preset in the chart."""
-        return self.preset_name if self.steps is None else f"{self.preset_name}, {self.steps} steps"
+        steps = [] if self.steps is None else [f"{self.steps} steps"]
+        return ", ".join([self.preset_name, *self.overrides, *steps])
 
     @property
     def run_dir(self) -> Path:
         """The run folder."""
         name = f"{self.capture_name}-{self.preset_name}-{self.seed}"
-        return self.out / (name if self.steps is None else f"{name}-{self.steps}-steps")
+        steps = [] if self.steps is None else [f"{self.steps}-steps"]
+        return self.out / "-".join([name, *(option.replace("/", "_") for option in self.overrides), *steps])
 
     @property
     def assignments(self) -> list[str]:
         """Options that differ from the preset, as `section.key=value`."""
         seeded = [name for name in stages.STAGES if "seed" in stages.load_stage(name).config.model_fields]
         seeds = [f"{name}.seed={self.seed}" for name in seeded]
-        return seeds if self.steps is None else [*seeds, f"{FIELD}.steps={self.steps}"]
+        steps = [] if self.steps is None else [f"{FIELD}.steps={self.steps}"]
+        return [*self.overrides, *seeds, *steps]
 
     @property
     def record(self) -> RunRecord:
@@ -156,7 +167,14 @@ def chart_point(trial: Trial, run: RunState) -> ChartPoint:
     before = run.seconds(STAGES_BEFORE_FIELD)
     curve = [(before + seconds, full, body) for seconds, full, body in read_progress(trial.run_dir / "field")]
     seconds = (run.seconds(STAGES_UNTIL_FIELD), run.seconds(STAGES_UNTIL_EXPORT))
-    return ChartPoint(trial.capture_name, trial.label, trial.seed, *seconds, run.scores, curve)
+    return ChartPoint(trial.capture_name, trial.label, trial.seed, *seconds, run.scores, curve, read_sizes(run))
+
+
+def read_sizes(run: RunState) -> dict[str, float]:
+    """Return the sizes of a run by column of `SIZE_METRICS`; those that a stage does not report are left out."""
+    metrics = {name: manifest.metrics for name, manifest in run.manifests.items()}
+    sizes = {column: metrics.get(stage, {}).get(metric) for column, (stage, metric) in SIZE_METRICS.items()}
+    return {column: size for column, size in sizes.items() if size is not None}
 
 
 def read_progress(field: Path) -> list[tuple[float, float, float]]:
@@ -193,6 +211,7 @@ def table_row(trial: Trial, run: RunState) -> dict[str, Any]:
         "field_seconds": round(run.seconds(STAGES_UNTIL_FIELD), 3),
         "seconds": round(run.seconds(STAGES_UNTIL_EXPORT), 3),
         **{score: run.scores.get(score) for score in SCORE_PATHS},
+        **{column: read_sizes(run).get(column) for column in SIZE_METRICS},
         "peak_rss_mib": max((manifest.peak_rss_mib for manifest in run.manifests.values()), default=None),
         "resumed": " ".join(name for name, manifest in run.manifests.items() if manifest.resumed),
         "commit": join_distinct(environment.get("commit") for environment in environments),

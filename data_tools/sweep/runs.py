@@ -32,8 +32,10 @@ SCORE_PATHS = {
     "field_psnr_body_db": (REPORT, "heldout", "field", "psnr_body"),
     "mesh_psnr_full_db": (REPORT, "heldout", "mesh", "psnr_full"),
     "mesh_psnr_body_db": (REPORT, "heldout", "mesh", "psnr_body"),
-    "chamfer_mm": (COMPARISON, "mesh", "chamfer_mm"),
+    "chamfer_mm": (COMPARISON, "mesh_matched", "chamfer_mm"),
+    "normal_angle_deg": (COMPARISON, "mesh_matched", "normal_angle_deg"),
 }
+"""Distances are those in the A-pose after the rigs are matched, so that they compare surfaces, not places of joints."""
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ def write_fake_report(run_dir: Path, fingerprint: str = "print") -> None:
 def write_fake_comparison(run_dir: Path) -> None:
     """Write a report, and a complete comparison of it with a Chamfer distance of 6.5 mm."""
     write_fake_report(run_dir)
-    files.save_comparison(run_dir, {"mesh": {"chamfer_mm": 6.5}}, "a page", "print")
+    files.save_comparison(run_dir, {"mesh_matched": {"chamfer_mm": 6.5}}, "a page", "print")
 
 
 def ground_truth_run(sample: Path, folder: Path) -> Comparison:

@@ -1,4 +1,4 @@
-"""Ablation of the mesh stage: settings of the rows, links to the shared stages, resuming, tables and errors."""
+"""Ablation of stage two: settings of the rows, links to the shared stages, resuming, tables and errors."""
 
 import csv
 import json
@@ -125,6 +125,27 @@ def test_the_result_of_the_mesh_stage_depends_on_the_settings(base: Trial) -> No
     assert prints[0] == prints[2] != prints[1]
 
 
+def test_rows_that_differ_after_the_mesh_share_the_mesh_of_the_reference(
+    base: Trial, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[str] = []
+
+    def make_mesh(run_dir: Path, name: str) -> None:
+        made.append(f"{run_dir.name} {name}")
+        write_stage(run_dir, name, {})
+
+    monkeypatch.setattr(ablation_trials, "make_stage", make_mesh)
+    prepare_row(trial := AblationTrial(base, ROWS["texels-512"]))
+    assert made == ["ann-default-2-error-driven mesh"]
+    assert (trial.run_dir / "mesh").resolve() == trial.run_dir.with_name("ann-default-2-error-driven") / "mesh"
+    assert load_settings(trial.run_dir) == {"seed": 2}
+    assert {name for name, row in ROWS.items() if row.has_mesh_of_reference} == {
+        "texels-512",
+        "texels-1024",
+        "texels-2048",
+    }
+
+
 @pytest.mark.slow
 def test_a_failed_stage_names_its_message_and_log(base: Trial) -> None:
     """The texture stage refuses inputs without a fitted body."""
@@ -150,7 +171,7 @@ def test_figures_are_read_from_report_truth_and_manifest(tmp_path: Path, monkeyp
         "mesh": {"faces": 9},
         "export": {"glb_bytes": 5},
     }
-    truth = {"mesh": {"chamfer_mm": 2.5, "normal_angle_deg": 10.0}, "images": {}}
+    truth = {"mesh_matched": {"chamfer_mm": 2.5, "normal_angle_deg": 10.0}, "images": {}}
     (tmp_path / "report").mkdir()
     (tmp_path / "report" / "report.json").write_text(json.dumps(report))
     monkeypatch.setattr(ablation_trials, "load_comparison_scores", lambda _: truth)
@@ -251,7 +272,7 @@ def test_the_command_runs_the_reference_first_and_names_unfinished_runs(
 
 def test_write_only_runs_nothing(base: Trial, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ablate, "run_row", lambda *_: pytest.fail("started"))
-    with pytest.raises(UserError, match="8 of 8 runs are not done"):
+    with pytest.raises(UserError, match=f"{len(ROWS)} of {len(ROWS)} runs are not done"):
         ablate.main([str(base.capture), "--seeds", "2", "--out", str(base.out), "--write-only"])
 
 

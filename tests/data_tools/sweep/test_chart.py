@@ -87,6 +87,10 @@ def test_steps_are_in_label_folder_and_table(tmp_path: Path) -> None:
     assert (own.label, fewer.label) == ("ihm", "ihm, 600 steps")
     assert own.run_dir != fewer.run_dir
     assert set(fewer.assignments) - set(own.assignments) == {"field.steps=600"}
+    judged = Trial(tmp_path / "ann", "ihm", 2, tmp_path, 600, ("frames.split=disjoint",))
+    assert judged.label == "ihm, frames.split=disjoint, 600 steps"
+    assert judged.run_dir != fewer.run_dir
+    assert set(judged.assignments) - set(fewer.assignments) == {"frames.split=disjoint"}
     run = finished(10.0, SCORES)
     run.manifests["field"].metrics["steps"] = 450.0  # it stopped early
     assert chart_point(fewer, run).preset == "ihm, 600 steps"
@@ -220,8 +224,11 @@ def test_seconds_until_field_and_avatar(tmp_path: Path) -> None:
     assert (point.field_seconds, point.seconds) == (30.0, 60.0)  # the report is not needed for the avatar
     assert point.curve == [(22.5, 20.0, 15.0), (25.0, 22.0, 17.5)]
     run = finished(10.0, SCORES, resumed=("field", "mesh"))
+    run.manifests["export"].metrics["glb_faces"] = 24_000.0
+    assert chart_point(trial, run).sizes == {"glb_faces": 24_000.0}
     run.manifests["field"] = replace(run.manifests["field"], peak_rss_mib=250.0)
     row = table_row(trial, run)
+    assert (row["glb_faces"], row["parameters"]) == (24_000.0, None)
     assert row["peak_rss_mib"] == 250.0
     assert (row["resumed"], row["commit"], row["machine"]) == ("field mesh", "abc", "Xeon, 2 cores")
     assert provenance([row, row | {"seed": 4, "status": "failed"}]) == "commit abc; Xeon, 2 cores; seed 3"

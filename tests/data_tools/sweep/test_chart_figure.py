@@ -8,12 +8,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from data_tools.sweep.chart_figure import PANELS, ChartPoint, draw_chart, pareto_front, preset_means, save_chart
+from data_tools.sweep.chart_figure import (
+    SIZE_PANELS,
+    TIME_PANELS,
+    ChartPoint,
+    draw_chart,
+    pareto_front,
+    preset_means,
+    save_figure,
+)
 
 QUICK = ChartPoint(
     "ann", "quick", 0, 10.0, 20.0, {"mesh_psnr_full_db": 24.0, "field_psnr_full_db": 25.0}, [(8.0, 22.0, 18.0)]
 )
 SLOW = ChartPoint("ann", "slow", 0, 100.0, 200.0, {"mesh_psnr_full_db": 28.0, "field_psnr_full_db": 30.0})
+WHOLE, _, CHAMFER, _ = TIME_PANELS
 WORSE = ChartPoint("ann", "worse", 0, 110.0, 210.0, {"mesh_psnr_full_db": 23.0})
 
 coarse = st.integers(0, 6).map(float)
@@ -36,9 +45,33 @@ def test_pareto_front_against_a_sorted_scan(entries: list[tuple[float, float]], 
 
 def test_means_over_seeds() -> None:
     again = replace(QUICK, seed=1, seconds=40.0, scores={"mesh_psnr_full_db": 26.0})
-    assert preset_means([QUICK, again, SLOW], "mesh_psnr_full_db") == {"quick": (30.0, 25.0), "slow": (200.0, 28.0)}
-    assert preset_means([QUICK, again, SLOW], "field_psnr_full_db") == {"quick": (20.0, 25.0), "slow": (200.0, 30.0)}
-    assert preset_means([QUICK], "chamfer_mm") == {}
+    assert preset_means([QUICK, again, SLOW], WHOLE) == {"quick": (30.0, 25.0), "slow": (200.0, 28.0)}
+    field = replace(WHOLE, score="field_psnr_full_db")
+    assert preset_means([QUICK, again, SLOW], field) == {"quick": (20.0, 25.0), "slow": (200.0, 30.0)}
+    assert preset_means([QUICK], CHAMFER) == {}
+
+
+def test_a_preset_has_the_range_of_its_seeds() -> None:
+    again = replace(QUICK, seed=1, seconds=40.0, scores={"mesh_psnr_full_db": 26.0})
+    (axes,) = draw_chart([QUICK, again], "").axes
+    bars = [line for line in axes.get_lines() if line.get_linewidth() == 2 and len(line.get_xydata()) == 2]
+    assert [[tuple(end) for end in bar.get_xydata()] for bar in bars] == [
+        [(20.0, 25.0), (40.0, 25.0)],
+        [(30.0, 24.0), (30.0, 26.0)],
+    ]
+
+
+def test_size_panels_have_sizes_along_their_axis() -> None:
+    scores = {"mesh_psnr_body_db": 24.0, "field_psnr_body_db": 26.0}
+    sized = replace(QUICK, scores=scores, sizes={"parameters": 1e6, "glb_bytes": 4e6})
+    figure = draw_chart([sized, replace(SLOW, scores=scores)], "", SIZE_PANELS)
+    assert [axes.get_xlabel() for axes in figure.axes] == ["parameters of the field", "bytes of the .glb"]
+    dots = [
+        [tuple(line.get_xydata()[0]) for line in axes.get_lines() if line.get_marker() == "."] for axes in figure.axes
+    ]
+    assert dots == [[(1e6, 26.0)], [(4e6, 24.0)]]
+    with pytest.raises(ValueError, match="at least one run with a score"):
+        draw_chart([QUICK], "", SIZE_PANELS)
 
 
 def test_panels_without_scores_are_left_out() -> None:
@@ -46,7 +79,7 @@ def test_panels_without_scores_are_left_out() -> None:
     known = replace(SLOW, capture="bob", scores={**SLOW.scores, "chamfer_mm": 5.0})
     figure = draw_chart([QUICK, known], "")
     assert [axes.get_title(loc="left") for axes in figure.axes] == [
-        f"{capture}: {panel.title}" for capture in ("ann", "bob") for panel in (PANELS[0], PANELS[2])
+        f"{capture}: {panel.title}" for capture in ("ann", "bob") for panel in (WHOLE, CHAMFER)
     ]
     with pytest.raises(ValueError, match="at least one run with a score"):
         draw_chart([replace(QUICK, scores={})], "")
@@ -67,7 +100,7 @@ def test_equal_runs_give_equal_files(tmp_path: Path) -> None:
     texts = []
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
-        save_chart(draw_chart([QUICK, SLOW], "commit <abc>; 2 cores"), tmp_path / name)
+        save_figure(draw_chart([QUICK, SLOW], "commit <abc>; 2 cores"), tmp_path / name, "chart", dpi=130)
         texts.append((tmp_path / name / "chart.svg").read_bytes())
         assert (tmp_path / name / "chart.png").stat().st_size > 5000
     assert texts[0] == texts[1]
