@@ -17,7 +17,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from data_tools.command import run_command
-from data_tools.sweep.field_rows import ATTENTION, REFERENCE, ROWS, SIZE, rows_of_group
+from data_tools.sweep.field_rows import GROUPS, REFERENCE, ROWS, SIZE, rows_of_group
 from data_tools.sweep.field_tables import write_tables
 from data_tools.sweep.field_trials import FieldTrial, TrialScores, read_trial, run_trial
 from pipeline.capture.capture import load_capture
@@ -87,7 +87,7 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
         prog="python -m data_tools.sweep.ablate_field", description=(__doc__ or "").splitlines()[0]
     )
     parser.add_argument("runs", nargs="+", type=Path, help="finished runs, whose frames and body are used")
-    parser.add_argument("--group", choices=[SIZE, ATTENTION], default=SIZE, help="rows that belong together")
+    parser.add_argument("--group", choices=GROUPS, default=SIZE, help="rows that belong together")
     parser.add_argument("--rows", nargs="+", choices=list(ROWS), help="rows; default: those of the group")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0], help="seeds of the field; default: 0")
     parser.add_argument("--steps", type=int, help="training steps of the reference; default: those of the stage")

@@ -8,7 +8,10 @@ from pipeline.field.config import FieldConfig
 from pipeline.field.settings import FieldSettings
 
 REFERENCE = "reference"
-SIZE, ATTENTION = "size", "attention"
+SIZE, ATTENTION, LOSS = "size", "attention", "loss"
+GROUPS = (SIZE, ATTENTION, LOSS)
+SQUARED_DELTA = 10.0
+"""A Huber loss that is quadratic for every difference of two colours."""
 SMALL_PERSON_PX = 240
 LEVELS = FieldSettings().levels
 
@@ -77,6 +80,18 @@ ROWS = {
             "the same, with an eighth of the rows",
             options={**_SMALL_OPTIONS, "log2_hashmap_size": 14},
             compared_with=SMALL,
+        ),
+        FieldRow("squared", "squared instead of Huber losses", group=LOSS, settings={"huber_delta": SQUARED_DELTA}),
+        FieldRow("no-alpha", "without the loss of alpha", group=LOSS, settings={"alpha_weight": 0.0}),
+        FieldRow("no-hard-surface", "without the hard-surface loss", group=LOSS, settings={"hard_surface_weight": 0.0}),
+        FieldRow(
+            "no-density",
+            "without the loss of density in empty space",
+            group=LOSS,
+            settings={"empty_density_weight": 0.0},
+        ),
+        FieldRow(
+            "pixel-jitter", "rays through random points of the pixels", group=LOSS, settings={"pixel_jitter": True}
         ),
         FieldRow("attention", "voxel attention", group=ATTENTION, settings={"occupancy": "attention"}),
     )

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from data_tools.sweep import ablate_field, field_trials
-from data_tools.sweep.field_rows import ATTENTION, REFERENCE, ROWS, SIZE, rows_of_group
+from data_tools.sweep.field_rows import ATTENTION, GROUPS, REFERENCE, ROWS, rows_of_group
 from data_tools.sweep.field_tables import COLUMNS, format_difference, paired_scores, write_tables
 from data_tools.sweep.field_trials import FieldTrial, TrialScores, read_trial, run_trial
 from pipeline.core.errors import UserError
@@ -42,7 +42,9 @@ def test_rows_change_what_they_name_and_keep_the_rest():
     assert ROWS["rows-half"].config(base).log2_hashmap_size == base.log2_hashmap_size - 1
     assert ROWS["frames-quarter"].config(base).max_frames == base.max_frames // 4
     assert rows_of_group(ATTENTION) == [REFERENCE, "attention"]
-    assert set(rows_of_group(SIZE)) | {"attention"} == set(ROWS)
+    groups = [set(rows_of_group(group)) - {REFERENCE} for group in GROUPS]
+    assert set.union(*groups) | {REFERENCE} == set(ROWS)
+    assert sum(map(len, groups)) == len(ROWS) - 1
 
 
 def test_a_finished_training_is_read_and_one_with_other_options_runs_again(tmp_path: Path, monkeypatch):
