@@ -19,7 +19,6 @@ from pipeline.capture.usable_frames import usable_positions
 from pipeline.core.cli import main
 from pipeline.core.command import rerun_command
 from pipeline.core.config import Config as BaseConfig
-from pipeline.core.determinism import deterministic_sums
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
@@ -32,6 +31,7 @@ from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import top_k_weights
 from pipeline.geometry.surface import resolve_self_intersections
 from pipeline.io.image import write_rgb
+from pipeline.kernels.common.determinism import deterministic_sums
 from pipeline.mesh.evidence import surface_evidence
 from pipeline.mesh.face_reduction import reduce_faces
 from pipeline.mesh.fairing import fair_surface

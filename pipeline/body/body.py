@@ -19,6 +19,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from pipeline.body.anny_cache import construct_anny, is_complete
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.rotation import quaternion_to_matrix
 from pipeline.geometry.skinning import forward_kinematics, skinning_transforms
@@ -146,6 +147,14 @@ SCALE = "scale"
 SHAPE_DEFAULTS = {**PHENOTYPE_DEFAULTS, **dict.fromkeys(LOCAL_CHANGES, 0.0), SCALE: 1.0}
 """Shape parameters with their defaults."""
 
+ANNY_OPTIONS = {
+    "rig": "mixamo",
+    "phenotypes": "all",
+    "skinning_method": "lbs",
+    "local_changes": [name for names in LOCAL_CHANGES.values() for name in names],
+}
+"""Arguments of `anny.Anny`."""
+
 ANNY_LANDMARKS_M = {
     "nose": (0.000, 1.703, 0.141),
     "eye_inner": (0.018, 1.739, 0.117),
@@ -226,15 +235,11 @@ class AnnyBody:
     """Anny (Apache-2.0 code, CC0 data) with the 52-joint Mixamo rig as a `ParametricBody`.
 
     Anny's frame (+Z up, facing -Y) is rotated to +Y up, facing +Z. Its rest pose is an A-pose. The first construction
-    on a machine builds a cache, which takes up to a minute.
+    on a machine builds a cache, see `pipeline.body.anny_cache`.
     """
 
     def __init__(self) -> None:
-        import anny  # not at the top: the import takes seconds, which `--status` does not need
-
-        changes = [name for names in LOCAL_CHANGES.values() for name in names]
-        model = anny.Anny(rig="mixamo", phenotypes="all", skinning_method="lbs", local_changes=changes)
-        model = model.to(torch.float32)
+        model = construct_anny(ANNY_OPTIONS).to(torch.float32)
         self._model = model
         self.shape_names: tuple[str, ...] = tuple(SHAPE_DEFAULTS)
         self.shape_defaults: Float[Tensor, "p"] = torch.tensor(list(SHAPE_DEFAULTS.values()))
@@ -288,3 +293,13 @@ class AnnyBody:
 def load_anny() -> AnnyBody:
     """Return the built-in body model, loaded once per process."""
     return AnnyBody()
+
+
+def is_prepared() -> bool:
+    """Return whether the cache of the built-in body model is complete."""
+    return is_complete(ANNY_OPTIONS)
+
+
+def prepare() -> None:
+    """Build the cache of the built-in body model."""
+    load_anny()

@@ -16,11 +16,13 @@ class Pipeline:
     package: Python package with a module for each stage; `python -m PACKAGE` runs the pipeline.
     names: names of the stages, which are the names of the modules; each module has a constant `STAGE`.
     config_dir: folder of the presets.
+    preparations: modules that prepare this machine beside the first run, see `pipeline.core.preparation`.
     """
 
     package: str
     names: tuple[str, ...]
     config_dir: Path = CONFIG_DIR
+    preparations: tuple[str, ...] = ()
 
     def load_stage(self, name: str) -> Stage:
         """Import one stage; its libraries take seconds to import, so nothing else imports the stages."""

@@ -12,7 +12,6 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 from pipeline.core.errors import UserError
@@ -20,6 +19,7 @@ from pipeline.core.events import EVENTS_VARIABLE, parse_event
 from pipeline.core.lock import RunLock
 from pipeline.core.manifest import read_manifest
 from pipeline.core.pipeline import Pipeline
+from pipeline.core.preparation import import_path, preparations
 from pipeline.core.progress import listen
 from pipeline.core.record import write_record
 from pipeline.core.run_folder import RunRequest, StageFailedError, open_run
@@ -91,10 +91,11 @@ def run_pipeline(pipeline: Pipeline, request: RunRequest, options: RunOptions) -
     with open_run(request) as (record, lock):
         configs = pipeline.build_configs(record)
         write_record(record, request.run_dir)
-        for number, stage in enumerate(pipeline.load_stages(), start=1):
-            plan = plan_stage(stage, configs[stage.name], request.run_dir, record.video_path)
-            runner = _StageRunner(pipeline, plan, lock, options, number)
-            outcomes.append(runner.run())
+        with preparations(pipeline.preparations):
+            for number, stage in enumerate(pipeline.load_stages(), start=1):
+                plan = plan_stage(stage, configs[stage.name], request.run_dir, record.video_path)
+                runner = _StageRunner(pipeline, plan, lock, options, number)
+                outcomes.append(runner.run())
     return outcomes
 
 
@@ -152,7 +153,7 @@ class _StageRunner:
             self._check_exit_status(_run_in_fork(self.options.fork_command, arguments, environment), "")
             return
         command = [sys.executable, "-P", "-m", self.pipeline.package, *arguments]
-        environment |= {"PYTHONPATH": os.pathsep.join(_import_path())}
+        environment |= {"PYTHONPATH": os.pathsep.join(import_path())}
         has_events = self.options.progress is not None
         if has_events:
             environment[EVENTS_VARIABLE] = "1"
@@ -218,11 +219,6 @@ def _run_in_fork(command: StageCommand, arguments: list[str], environment: Mappi
         raise
     assert child.exitcode is not None  # it has ended
     return child.exitcode
-
-
-def _import_path() -> list[str]:
-    """Return `sys.path` as absolute paths."""
-    return [str(Path(folder).absolute()) for folder in sys.path]
 
 
 def _end(child: "subprocess.Popen[str]") -> None:

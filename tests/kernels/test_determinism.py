@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from pipeline.core.determinism import deterministic_sums
+from pipeline.kernels.common.determinism import deterministic_sums
 
 
 @pytest.fixture
