@@ -26,6 +26,7 @@ from pipeline.avatar.placement import resample_uniformly
 from pipeline.avatar.rig import build_rig
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.files import load_body
+from pipeline.core.command import format_command
 from pipeline.core.errors import UserError
 from pipeline.core.json_file import load_json
 from pipeline.core.manifest import read_manifest
@@ -112,7 +113,7 @@ def export_config(run: Path) -> export.Config:
     """
     manifest = read_manifest(run / "export")
     if manifest is None:
-        raise UserError(f"{run} has no finished export; run make export RUN={run}")
+        raise UserError(f"{run} has no finished export; run {format_command('--run', run)}")
     names = export.Config.model_fields.keys() - {"formats"}
     known = {name: value for name, value in manifest.config.items() if name in names}
     return export.Config(**known)

@@ -1,14 +1,13 @@
 """Command line: run all stages of a video, or one stage of a run. User errors are one sentence and exit status 2."""
 
 import argparse
-import os
 import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from pipeline.core.command import COMMAND_VARIABLE, MODULE_COMMAND, format_command
+from pipeline.core.command import format_command, program_name
 from pipeline.core.config import CONFIG_DIR, build_config, default_yaml, load_layers, parse_overrides
 from pipeline.core.errors import UserError, format_os_error
 from pipeline.core.events import send_event, send_progress
@@ -97,7 +96,7 @@ def _forced_stages(names: tuple[str, ...], options: argparse.Namespace) -> tuple
 
 
 def _parse_pipeline_arguments(names: Sequence[str], argv: Sequence[str]) -> argparse.Namespace:
-    command = os.environ.get(COMMAND_VARIABLE, MODULE_COMMAND)
+    command = program_name()
     parser = _Parser(
         prog=command,
         description="Make a textured, rigged avatar from a video of one person.",

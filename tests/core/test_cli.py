@@ -123,7 +123,7 @@ def test_a_mistake_is_one_sentence_and_leaves_nothing(toy: Toy, arguments: Seque
 def test_a_stage_refuses_options_of_others(toy: Toy) -> None:
     assert "learn.key=value" in toy.expect_user_error("stages", "learn", "runs/a", "--set", "summarise.word=x")
     assert "python -m stages read runs/a" in toy.expect_user_error("stages", "learn", "runs/a")
-    assert "see python -m stages learn --help" in toy.expect_user_error("stages.learn")
+    assert "python -m stages learn --help" in toy.expect_user_error("stages.learn")
 
 
 def test_a_file_is_no_run(toy: Toy) -> None:

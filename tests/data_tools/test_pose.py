@@ -129,7 +129,7 @@ def test_poses_of_unknown_joints_or_without_four_numbers_are_errors(scene: Paint
 
 def test_without_an_export_the_next_command_is_named(run: Path) -> None:
     (run / "export" / "manifest.json").unlink()
-    with pytest.raises(UserError, match="run make export RUN="):
+    with pytest.raises(UserError, match=r"no finished export; run .*python -m stages --run"):
         main([str(run)])
 
 
