@@ -81,10 +81,10 @@ def _checked_video(record: RunRecord, run_dir: Path, video: Path, replace_video:
         raise UserError(f"video {video} does not exist: name a video file or a folder of images")
     video = video.resolve()
     if video.is_dir() and run_dir.resolve().is_relative_to(video):
-        raise UserError(f"run {run_dir} is inside the video folder, which is never written: choose another --run")
+        raise UserError(f"run {run_dir} is inside the video folder, which is never written: choose another run folder")
     known = record.video_path
     if known is None or known == video or replace_video:
         return video
     if known.exists() and digest_video(known) == digest_video(video):
         return video
-    raise UserError(f"{run_dir} belongs to the video {known}, not {video}: choose another --run, or use --force")
+    raise UserError(f"{run_dir} belongs to the video {known}, not {video}: choose another run folder, or use --force")

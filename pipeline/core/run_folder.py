@@ -37,6 +37,10 @@ class RunRequest:
     overrides: Mapping[str, Any] = field(default_factory=dict)
     replace_video: bool = False
 
+    def apply(self, record: RunRecord) -> RunRecord:
+        """Return the record that this command gives the run. UserError if the two contradict each other."""
+        return update_record(record, self.run_dir, self.video, self.preset, self.overrides, self.replace_video)
+
 
 def default_run_dir(video: Path | None) -> Path:
     """Return runs/NAME for a video; NAME is that of its folder if the file is just called `video`.
@@ -51,6 +55,16 @@ def default_run_dir(video: Path | None) -> Path:
     return RUNS_DIR / (video.parent.name if name == "video" else name)
 
 
+def require_run(run_dir: Path) -> None:
+    """Raise UserError if a path is not the folder of a run that was started."""
+    _require_no_file(run_dir)
+    if not run_dir.exists():
+        raise UserError(f"{run_dir} does not exist: name the folder of a run with --run, runs/NAME")
+    if not (run_dir / RUN_FILE).is_file():
+        command = format_command("--run", run_dir, "--video", "FILE_OR_FOLDER")
+        raise UserError(f"{run_dir} is not the folder of a run, it has no {RUN_FILE}: name one, or start it: {command}")
+
+
 @contextmanager
 def open_run(request: RunRequest) -> Iterator[tuple[RunRecord, RunLock]]:
     """Lock a run folder; yield its record, updated by the request but not written yet, and the lock.
@@ -61,13 +75,10 @@ def open_run(request: RunRequest) -> Iterator[tuple[RunRecord, RunLock]]:
         UserError: the folder is a file or is in use, or the request contradicts the record.
     """
     run_dir = request.run_dir
-    if run_dir.is_file():
-        raise UserError(f"{run_dir} is a file, but a run is a folder: choose another name with --run")
+    _require_no_file(run_dir)
     is_new = not run_dir.exists()
-    record = update_record(
-        read_record(run_dir), run_dir, request.video, request.preset, request.overrides, request.replace_video
-    )
-    run_dir.mkdir(parents=True, exist_ok=True)
+    record = request.apply(read_record(run_dir))
+    _make_folder(run_dir)
     is_ours = False
     try:
         with run_lock(run_dir) as lock:
@@ -77,6 +88,26 @@ def open_run(request: RunRequest) -> Iterator[tuple[RunRecord, RunLock]]:
         if is_ours:
             _remove_unused(run_dir)
         raise
+
+
+def _require_no_file(run_dir: Path) -> None:
+    if run_dir.is_file():
+        raise UserError(f"{run_dir} is a file, but a run is a folder: choose another run folder")
+    if run_dir.is_symlink() and not run_dir.exists():
+        raise _dangling_link_error(run_dir)
+
+
+def _make_folder(run_dir: Path) -> None:
+    try:
+        run_dir.mkdir(parents=True, exist_ok=True)
+    except FileExistsError as error:
+        raise _dangling_link_error(error.filename) from None
+    except FileNotFoundError as error:  # a file system without new folders, such as /proc
+        raise UserError(f"no folder can be made at {error.filename}: choose another run folder") from None
+
+
+def _dangling_link_error(link: Path | str) -> UserError:
+    return UserError(f"{link} is a link to a missing folder: make that folder, or remove the link")
 
 
 def _remove_unused(run_dir: Path) -> None:

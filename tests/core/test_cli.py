@@ -126,6 +126,86 @@ def test_a_stage_refuses_options_of_others(toy: Toy) -> None:
     assert "python -m stages learn --help" in toy.expect_user_error("stages.learn")
 
 
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("lern", "runs/a"), ("lern", "did you mean learn?", "read, learn, summarise")),
+        (("lern",), ("did you mean learn?",)),
+        (("export", "runs/a"), ("export is neither a stage nor a video", "read, learn, summarise")),
+        (("runs/a", "learn"), ("python -m stages learn runs/a",)),
+        (("--preset", "quick", "learn", "runs/a"), ("python -m stages learn runs/a",)),
+        (("--preset", "quick", "learn"), ("python -m stages learn RUN",)),
+        (("numbers.txt", "other.txt"), ("other.txt is a second", "quote")),
+    ],
+)
+def test_a_misspelt_or_misplaced_stage_is_named(toy: Toy, arguments: Sequence[str], words: Sequence[str]) -> None:
+    sentence = toy.expect_user_error("stages", *arguments)
+    assert all(word in sentence for word in words), sentence
+
+
+def test_a_video_may_have_the_name_of_a_stage(toy: Toy) -> None:
+    toy.video.rename(toy.folder / "learn")
+    assert toy.stages("--run", "runs/a", "learn").returncode == 0
+
+
+def test_the_status_is_that_under_the_options_of_the_command(toy: Toy) -> None:
+    toy.all("--video", "numbers.txt")
+    before = (toy.run_dir / "run.json").read_bytes()
+    assert states(toy.all("--status", "--set", "summarise.word=value").stdout) == ["fresh", "fresh", "stale"]
+    assert states(toy.all("--status", "--preset", "quick").stdout) == ["fresh", "stale", "waits"]
+    assert "known keys of learn: steps" in toy.expect_user_error(
+        "stages", "--run", "runs/a", "--status", "--set", "learn.stepz=3"
+    )
+    (toy.folder / "other.txt").write_text("4 5 6")
+    assert "--force" in toy.expect_user_error("stages", "--run", "runs/a", "--status", "--video", "other.txt")
+    assert (toy.run_dir / "run.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "unused"),
+    [
+        (("--status", "--force"), "--force"),
+        (("--status", "--from", "learn"), "--from"),
+        (("--verify", "--set", "learn.steps=3"), "--set"),
+        (("--verify", "--preset", "quick"), "--preset"),
+        (("--verify", "--status"), "--status"),
+        (("--defaults",), "--run"),
+    ],
+)
+def test_options_without_effect_are_refused(toy: Toy, arguments: Sequence[str], unused: str) -> None:
+    toy.all("--video", "numbers.txt")
+    assert unused in toy.expect_user_error("stages", "--run", "runs/a", *arguments)
+
+
+@pytest.mark.parametrize("mode", ["--status", "--verify"])
+def test_the_state_of_what_is_no_run_is_an_error(toy: Toy, mode: str) -> None:
+    (toy.folder / "photos").mkdir()
+    for run, words in (
+        ("runs/none", "runs/none does not exist: name the folder of a run"),
+        ("numbers.txt", "numbers.txt is a file, but a run is a folder"),
+        ("photos", "photos is not the folder of a run, it has no run.json"),
+    ):
+        assert words in toy.expect_user_error("stages", "--run", run, mode)
+    assert "runs/numbers does not exist" in toy.expect_user_error("stages", "numbers.txt", mode)
+
+
+@pytest.mark.parametrize("command", [("stages", "--run"), ("stages", "read")])
+def test_a_folder_that_cannot_be_made_is_one_sentence(toy: Toy, command: Sequence[str]) -> None:
+    (toy.folder / "link").symlink_to("nowhere")
+    (toy.folder / "loop").symlink_to("loop")
+    for run, words in (
+        ("link", "link is a link to a missing folder: make that folder, or remove the link"),
+        ("link/a", "link is a link to a missing folder"),
+        ("loop", "loop is a link to a missing folder"),
+        ("x" * 300, "the name is too long: choose a shorter name"),
+        ("/proc/new", "no folder can be made at /proc/new"),
+    ):
+        sentence = toy.expect_user_error(*command, run, "--video", "numbers.txt")
+        assert words in sentence
+        assert command[1] == "--run" or "--run" not in sentence
+    assert "name is too long" in toy.expect_user_error("stages", "x" * 300)
+
+
 def test_a_file_is_no_run(toy: Toy) -> None:
     (toy.folder / "notes").write_text("in the way")
     assert "notes is a file, but a run is a folder" in toy.expect_user_error(
