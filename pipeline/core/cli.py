@@ -10,13 +10,13 @@ from typing import NoReturn
 
 from pipeline.core.command import format_command, program_name
 from pipeline.core.config import CONFIG_DIR, build_config, default_yaml, load_layers, parse_overrides
-from pipeline.core.errors import UserError, format_os_error
+from pipeline.core.errors import EXIT_USER_ERROR, UserError, format_os_error
 from pipeline.core.events import send_event, send_progress
 from pipeline.core.parent import die_with_parent, is_runner_child
 from pipeline.core.pipeline import Pipeline
-from pipeline.core.record import read_record, write_record
+from pipeline.core.record import read_record
 from pipeline.core.run_folder import RunRequest, StageFailedError, default_run_dir, open_run, require_run
-from pipeline.core.runner import EXIT_INTERRUPTED, EXIT_USER_ERROR, RunOptions, format_summary, run_pipeline
+from pipeline.core.runner import EXIT_INTERRUPTED, RunOptions, format_summary, run_pipeline
 from pipeline.core.stage import Stage, plan_stage, run_stage
 from pipeline.core.status import format_status, verify_artifacts
 
@@ -58,11 +58,12 @@ def _run_single_stage(stage: Stage, argv: Sequence[str], config_dir: Path) -> No
         if not assignment.startswith(f"{stage.name}."):
             raise UserError(f"--set {assignment} is not an option of this stage: write --set {stage.name}.key=value")
     request = _build_request(options.run, options, replace_video=options.force)
-    with open_run(request) as (record, _), send_progress():
-        config = build_config(stage.name, stage.config, load_layers(record.preset, record.overrides, config_dir))
-        plan = plan_stage(stage, config, options.run, record.video_path)
-        write_record(record, options.run)
-        has_run = run_stage(plan, options.force)
+    with open_run(request) as run, send_progress():
+        layers = load_layers(run.record.preset, run.record.overrides, config_dir)
+        config = build_config(stage.name, stage.config, layers)
+        plan = plan_stage(stage, config, options.run, run.record.video_path)
+        with run.recorded_for(stage):
+            has_run = run_stage(plan, options.force)
     if not is_runner_child():
         print(f"{plan.folder}: {'done' if has_run else 'cached'}")
 

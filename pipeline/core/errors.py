@@ -2,6 +2,9 @@
 
 import errno
 
+EXIT_USER_ERROR = 2
+"""Exit status of a command after a `UserError`, or a system error that the user can correct."""
+
 ERRNO_REMEDIES = {
     errno.ENOSPC: "the disk is full: free some space, then run the same command again",
     errno.EDQUOT: "the disk quota is exceeded: free some space, then run the same command again",

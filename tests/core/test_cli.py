@@ -231,6 +231,48 @@ def test_bad_input_leaves_earlier_results(toy: Toy) -> None:
     assert {path.name for path in toy.run_dir.iterdir()} == {"read", "learn", "summarise", "run.json", ".lock"}
 
 
+def read_overrides(run_dir: Path) -> dict[str, object]:
+    overrides: dict[str, object] = json.loads((run_dir / "run.json").read_text())["overrides"]
+    return overrides
+
+
+@pytest.mark.parametrize("isolated", [False, True])
+def test_what_a_stage_refuses_is_not_recorded(toy: Toy, isolated: bool) -> None:
+    call = toy.call_all if isolated else toy.all
+    toy.all("--video", "numbers.txt", "--set", "summarise.word=value")
+    refused = call("--set", "summarise.word=w1", "--set", "learn.steps=7", "--preset", "quick")
+    assert refused.returncode == 2
+    assert refused.stderr.splitlines()[-1] == "error: summarise.word = w1 is not a word: choose letters"
+    record = json.loads((toy.run_dir / "run.json").read_text())
+    assert record == {"video": str(toy.video), "preset": "quick", "overrides": {"learn.steps": 7}}
+    assert call().returncode == 0
+
+
+def test_a_refusal_keeps_the_earlier_options(toy: Toy) -> None:
+    toy.all("--video", "numbers.txt", "--set", "summarise.word=value")
+    toy.expect_user_error("stages", "summarise", "runs/a", "--set", "summarise.word=w1")
+    assert read_overrides(toy.run_dir) == {"summarise.word": "value"}
+    assert states(toy.all("--status").stdout) == ["fresh"] * 3
+
+
+def test_a_new_run_keeps_its_video_if_a_later_stage_refuses(toy: Toy) -> None:
+    toy.expect_user_error("stages", "--run", "runs/a", "--video", "numbers.txt", "--set", "summarise.word=w1")
+    assert states(toy.all().stdout) == ["cached", "cached", "run"]
+
+
+def test_a_video_that_is_refused_is_not_recorded(toy: Toy) -> None:
+    toy.all("--video", "numbers.txt")
+    (toy.folder / "words.txt").write_text("1 two 3")
+    toy.expect_user_error("stages", "--run", "runs/a", "--video", "words.txt", "--force")
+    assert states(toy.all().stdout) == ["cached"] * 3
+
+
+def test_options_of_a_killed_run_stay_recorded(toy: Toy) -> None:
+    killed = toy.call_all("--video", "numbers.txt", "--set", "learn.steps=30", TOY_KILL_STEP="25")
+    assert "killed by signal 9" in killed.stderr
+    assert read_overrides(toy.run_dir) == {"learn.steps": 30}
+
+
 def test_another_video_needs_force(toy: Toy) -> None:
     toy.all("--video", "numbers.txt")
     copy, other = toy.folder / "copy.txt", toy.folder / "other.txt"
