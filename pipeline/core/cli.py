@@ -50,7 +50,7 @@ def main_pipeline(
 
 def _run_single_stage(stage: Stage, argv: Sequence[str], config_dir: Path) -> None:
     parser = _Parser(prog=format_command(stage.name), description=f"Run the stage {stage.name}.")
-    parser.add_argument("run", type=Path, help="run folder, runs/NAME")
+    parser.add_argument("run", type=_path, help="run folder, runs/NAME")
     _add_record_options(parser)
     parser.add_argument("--force", action="store_true", help="run even if the result is fresh")
     options = parser.parse_args(argv)
@@ -107,8 +107,8 @@ def _parse_pipeline_arguments(names: Sequence[str], argv: Sequence[str]) -> argp
         epilog=f"{command} STAGE RUN runs one stage of a run folder; STAGE is one of {', '.join(names)}. "
         f"{command} STAGE --help lists its arguments.",
     )
-    parser.add_argument("input", nargs="?", type=Path, metavar="VIDEO", help="video file or image folder")
-    parser.add_argument("--run", type=Path, help="run folder (default: runs/NAME, with the name of the video)")
+    parser.add_argument("input", nargs="?", type=_path, metavar="VIDEO", help="video file or image folder")
+    parser.add_argument("--run", type=_path, help="run folder (default: runs/NAME, with the name of the video)")
     _add_record_options(parser)
     parser.add_argument("--from", dest="from_stage", choices=names, metavar="STAGE", help="run STAGE and all after it")
     parser.add_argument("--force", action="store_true", help="run every stage, even if its result is fresh")
@@ -174,9 +174,16 @@ def _refuse_unused_options(options: argparse.Namespace) -> None:
 
 
 def _add_record_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--video", type=Path, help="video file or image folder; the run folder records it")
+    parser.add_argument("--video", type=_path, help="video file or image folder; the run folder records it")
     parser.add_argument("--preset", help="name of a preset or a .yaml file; recorded, clears earlier --set")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="option; recorded")
+
+
+def _path(text: str) -> Path:
+    """Return the path of an argument; an empty one, such as of an unset variable, would mean the working directory."""
+    if not text:
+        raise argparse.ArgumentTypeError("the path is empty")
+    return Path(text)
 
 
 def _build_request(run_dir: Path, options: argparse.Namespace, replace_video: bool) -> RunRequest:

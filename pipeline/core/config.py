@@ -99,6 +99,8 @@ def find_preset(preset: str, config_dir: Path = CONFIG_DIR) -> Path:
     """
     files = preset_files(config_dir)
     path = Path(preset) if preset.endswith(PRESET_SUFFIXES) else files.get(preset, config_dir / f"{preset}.yaml")
+    if preset.endswith(PRESET_SUFFIXES) and not path.is_file():
+        raise UserError(f"preset {path} is {'a folder' if path.is_dir() else 'missing'}: name a .yaml file")
     if not path.is_file() and preset != "default":
         raise UserError(f"preset {preset} is unknown: use one of {', '.join(files)}, or the path of a .yaml file")
     return path

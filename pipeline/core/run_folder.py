@@ -127,7 +127,7 @@ def open_run(request: RunRequest) -> Iterator[OpenRun]:
         with run_lock(run_dir) as lock:
             is_ours = is_new
             yield OpenRun(request, earlier, record, lock)
-    except (UserError, StageFailedError, OSError, MemoryError):
+    except (UserError, StageFailedError, OSError, MemoryError, KeyboardInterrupt):
         if is_ours:
             _remove_unused(run_dir)
         raise

@@ -283,6 +283,38 @@ def test_another_video_needs_force(toy: Toy) -> None:
     assert states(toy.all("--video", "other.txt", "--force").stdout) == ["run"] * 3
 
 
+def test_a_video_that_was_moved_is_known_by_its_content(toy: Toy) -> None:
+    toy.all("--video", "numbers.txt")
+    toy.video.rename(toy.folder / "moved.txt")
+    assert "name the video with --video" in toy.expect_user_error("stages", "--run", "runs/a", "--status")
+    assert states(toy.all("--status", "--video", "moved.txt").stdout) == ["fresh"] * 3
+    assert states(toy.all("--video", "moved.txt").stdout) == ["cached"] * 3
+    assert states(toy.all().stdout) == ["cached"] * 3
+
+
+def test_a_run_folder_is_no_video(toy: Toy) -> None:
+    toy.all("--video", "numbers.txt")
+    sentence = toy.expect_user_error("stages", "runs/a")
+    assert sentence.endswith(f"python -m stages --run {toy.run_dir}")
+    assert "is the folder of a run, not a video" in sentence
+
+
+@pytest.mark.parametrize("arguments", [("",), ("--run", ""), ("--video", ""), ("read", "")])
+def test_an_empty_path_is_not_the_working_directory(toy: Toy, arguments: Sequence[str]) -> None:
+    before = sorted(toy.folder.rglob("*"))
+    assert "the path is empty" in toy.expect_user_error("stages", *arguments)
+    assert sorted(toy.folder.rglob("*")) == before
+
+
+def test_ctrl_c_before_any_work_leaves_no_folder(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pipeline.core.pipeline.Pipeline.load_stages", interrupt)
+    assert toy.all("--video", "numbers.txt").returncode == 130
+    assert not toy.run_dir.exists()
+
+
 def test_a_video_needs_no_option(toy: Toy) -> None:
     done = toy.stages("numbers.txt")
     assert done.returncode == 0, done.stderr

@@ -143,6 +143,13 @@ def test_a_preset_may_be_a_baseline(config_dir: Path) -> None:
     assert list(preset_files(config_dir)) == ["default", "fine", "paper"]
 
 
+def test_a_preset_file_that_cannot_be_read_is_named(config_dir: Path) -> None:
+    (config_dir / "folder.yaml").mkdir()
+    for name, words in (("none.yaml", "none.yaml is missing"), ("folder.yaml", "folder.yaml is a folder")):
+        with pytest.raises(UserError, match=words):
+            load_layers(str(config_dir / name), {}, config_dir)
+
+
 def test_a_preset_may_be_a_path(config_dir: Path) -> None:
     assert built(config_dir, str(config_dir / "fine.yaml")).size == 200
 
