@@ -89,7 +89,8 @@ def read_capture_settings(out: Path) -> dict[str, Any]:
     """Read the options and the version of a capture. UserError if the file is absent or damaged."""
     path = out / "truth" / "capture_settings.json"
     if not path.is_file():
-        raise UserError(f"{path.parent} holds no ground truth; make a capture: {format_module_command(_SAMPLE, out)}")
+        command = format_module_command(_SAMPLE, out if not out.exists() else "NEW_FOLDER")
+        raise UserError(f"{path.parent} holds no ground truth; name a synthetic capture, or make one: {command}")
     try:
         settings = json.loads(path.read_text(encoding="utf-8"))
     except ValueError:

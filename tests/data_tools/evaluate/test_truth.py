@@ -51,7 +51,7 @@ def test_wrong_ground_truth_is_detected(sample: Path, tmp_path: Path, capsys: py
 
 
 def test_missing_ground_truth_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="holds no ground truth"):
+    with pytest.raises(UserError, match=r"holds no ground truth.*sample NEW_FOLDER"):
         load_ground_truth(tmp_path)
 
 
