@@ -82,7 +82,7 @@ all: $(STAMP)
 endif
 
 $(STAGES): $(STAMP)  ## run one stage of RUN=runs/name
-	$(RUN_PYTHON) -m stages.$@ "$(ONE_RUN)" $(if $(VIDEO),--video "$(VIDEO)") $(OPTIONS)
+	$(RUN_PYTHON) -m stages $@ "$(ONE_RUN)" $(if $(VIDEO),--video "$(VIDEO)") $(OPTIONS)
 
 batch: $(STAMP)  ## run all videos of VIDEOS=folder, JOBS=n at a time, or with CLUSTER=local|slurm|kubernetes
 	@test -n "$(VIDEOS)" || { echo "error: no folder of videos: make $@ VIDEOS=folder" >&2; exit 2; }

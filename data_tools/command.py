@@ -3,8 +3,7 @@
 import sys
 from collections.abc import Callable, Sequence
 
-from pipeline.core.cli import EXIT_USER_ERROR
-from pipeline.core.errors import UserError, format_os_error
+from pipeline.core.errors import EXIT_USER_ERROR, UserError, format_os_error
 from pipeline.core.runner import EXIT_INTERRUPTED
 
 

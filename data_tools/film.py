@@ -25,6 +25,7 @@ from pipeline.avatar.placement import resample_uniformly
 from pipeline.body.body import Motion
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track
+from pipeline.io.bvh import require_bvh_file
 from stages import export
 from stages.export import Scene, load_scene
 
@@ -35,11 +36,12 @@ MIN_FRAMES = 2
 def main(argv: Sequence[str]) -> None:
     """Render one film."""
     options = _parse_options(argv)
+    name = check_folder_name(options.name) if options.name else Path(options.clip or TURNTABLE).stem
+    _check_clip(options.clip)
     inputs = {name: options.run / name for name in export.STAGE.needs}
     # The film shows the captured surface: five seconds for a face that moves would be for nothing.
     scene = load_scene(inputs, export_config(options.run).model_copy(update={"face": False}))
     motion = film_motion(options.clip, scene, options.in_place)
-    name = check_folder_name(options.name) if options.name else Path(options.clip or TURNTABLE).stem
     avatar = load_textured_avatar(inputs["mesh"], inputs["texture"])
     with replaced_folder(options.run / "film" / name) as out:
         frames = render_film(avatar, scene.body, motion)
@@ -55,21 +57,29 @@ def film_motion(clip: str | None, scene: Scene, in_place: bool = False) -> Motio
     Raises:
         UserError: there is no such clip, its file cannot be played, or it is shorter than two frames.
     """
+    _check_clip(clip)
     if clip is None or clip == TURNTABLE:
         return turntable_motion(scene.body)
-    if Path(clip).suffix.lower() == ".bvh":
-        motion = play_bvh(Path(clip), scene.body, in_place)
-    elif clip == "capture":
+    if clip == "capture":
         motion = scene.motion
     elif clip == "idle":
         motion = idle_motion(scene.body)
     else:
-        raise UserError(f"there is no clip {clip}; choose capture, idle or {TURNTABLE}, or name a .bvh file")
+        motion = play_bvh(Path(clip), scene.body, in_place)
     resampled = resample_uniformly(motion, FPS)
     if len(resampled.time_s) < MIN_FRAMES:
         length_s = motion.time_s[-1] - motion.time_s[0]
         raise UserError(f"the clip {clip} lasts {length_s:.3f} s; a film needs at least {MIN_FRAMES / FPS:.2f} s")
     return resampled
+
+
+def _check_clip(clip: str | None) -> None:
+    """Raise UserError for a clip that does not exist, before anything is read."""
+    if clip is None or clip in (TURNTABLE, "capture", "idle"):
+        return
+    if Path(clip).suffix.lower() != ".bvh":
+        raise UserError(f"there is no clip {clip}; choose capture, idle or {TURNTABLE}, or name a .bvh file")
+    require_bvh_file(Path(clip))
 
 
 def _ahead(frames: Iterator[UInt8[np.ndarray, "h w 3"]]) -> Iterator[UInt8[np.ndarray, "h w 3"]]:

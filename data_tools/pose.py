@@ -22,39 +22,46 @@ from pipeline.avatar.motion.bvh_export import motion_to_bvh
 from pipeline.avatar.motion.feet import find_contacts, snap_feet_to_floor, sole_positions_m
 from pipeline.avatar.motion.planting import plant_feet
 from pipeline.avatar.motion.retarget import retarget_with_contacts
-from pipeline.avatar.placement import resample_uniformly
+from pipeline.avatar.placement import pad_motion_to_video, resample_uniformly
 from pipeline.avatar.rig import build_rig
 from pipeline.body.body import Body, Motion, canonical_to_world
-from pipeline.body.files import load_body
+from pipeline.body.files import load_body, load_motion
+from pipeline.capture.capture import load_capture
+from pipeline.core.command import format_command
 from pipeline.core.errors import UserError
 from pipeline.core.json_file import load_json
 from pipeline.core.manifest import read_manifest
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning, local_quaternions
-from pipeline.io.bvh import read_bvh, write_bvh
+from pipeline.io.bvh import read_bvh, require_bvh_file, write_bvh
 from pipeline.mesh.files import MeshArtifact
 from stages import export
 from stages.export import Scene, encode_scene, load_scene, write_scene_obj
 
 FLOOR_M = np.zeros(3)
+RIG_POSES = ("a", "t")
 
 
 def main(argv: Sequence[str]) -> None:
     """Write the clips and poses of one command."""
     options = _parse_options(argv)
+    name = _result_name(options)
+    _check_clips(options)
     inputs = {name: options.run / name for name in export.STAGE.needs}
     config = export_config(options.run)
-    clips = _retargeted_clips(options.bvh, load_body(inputs["body"] / "body.npz"), options.in_place)
+    body = load_body(inputs["body"] / "body.npz")
+    _check_pose(options, inputs, body)
+    clips = {path.stem: play_bvh(path, body, options.in_place) for path in options.bvh}
     scene = load_scene(inputs, config)
     posed = _chosen_pose(options, scene, clips)
-    with replaced_folder(options.run / "pose" / _result_name(options)) as out:
+    with replaced_folder(options.run / "pose" / name) as out:
         write_bvh(out / "capture.bvh", motion_to_bvh(scene.rig, planted_motion(scene), scene.fps))
         if clips:
             (out / "avatar.glb").write_bytes(encode_scene(scene, config, scene.clips() | clips))
         if posed is not None:
             write_scene_obj(inputs["texture"], out, scene.texture, _posed_mesh(scene, posed))
         written = sorted(path.name for path in out.iterdir() if path.suffix in (".bvh", ".glb", ".obj"))
-    print(f"{options.run / 'pose' / _result_name(options)}: {', '.join(written)}")
+    print(f"{options.run / 'pose' / name}: {', '.join(written)}")
 
 
 def planted_motion(scene: Scene) -> Motion:
@@ -88,6 +95,8 @@ def read_pose(path: Path, body: Body) -> Float32[np.ndarray, "1 j 4"]:
     Raises:
         UserError: the file cannot be read, a joint is unknown or a value is not a quaternion.
     """
+    if path.is_dir():
+        raise UserError(f"pose {path} is a folder; choose a, t or a .json file")
     if not path.is_file():
         raise UserError(f"there is no pose {path}; choose a, t or a .json file")
     rotations = np.tile(np.array([1.0, 0.0, 0.0, 0.0], dtype=np.float32), (1, len(body.joint_names), 1))
@@ -110,9 +119,11 @@ def export_config(run: Path) -> export.Config:
 
     These need optional packages, and nothing that reads a finished export writes them. UserError if it is not finished.
     """
+    if not run.is_dir():
+        raise UserError(f"{run} is not a folder; name the folder of a finished run")
     manifest = read_manifest(run / "export")
     if manifest is None:
-        raise UserError(f"{run} has no finished export; run make export RUN={run}")
+        raise UserError(f"{run} has no finished export; run {format_command('--run', run)}")
     names = export.Config.model_fields.keys() - {"formats"}
     known = {name: value for name, value in manifest.config.items() if name in names}
     return export.Config(**known)
@@ -148,33 +159,46 @@ def _result_name(options: argparse.Namespace) -> str:
     return "capture" if options.frame is None else f"frame-{options.frame}"
 
 
-def _retargeted_clips(paths: Sequence[Path], body: Body, in_place: bool) -> dict[str, Motion]:
-    names = [path.stem for path in paths]
-    for name in names:
+def _check_clips(options: argparse.Namespace) -> None:
+    """Raise UserError for files and names of clips that cannot be used, before anything is read."""
+    names = [path.stem for path in options.bvh]
+    for path, name in zip(options.bvh, names, strict=True):
+        require_bvh_file(path)
         if name in ("capture", "idle"):
-            raise UserError(f"{name} is the name of a clip that every avatar has; rename the file {name}.bvh")
+            raise UserError(f"{name} is the name of a clip that every avatar has; rename the file {path}")
         if names.count(name) > 1:
-            raise UserError(f"there are several clips with the name {name}; rename the file {name}.bvh")
-    return {path.stem: play_bvh(path, body, in_place) for path in paths}
+            raise UserError(f"there are several clips with the name {name}; rename the file {path}")
+    if options.frame is not None and len(options.bvh) > 1:
+        raise UserError("--frame is for one clip; name one --bvh")
+
+
+def _check_pose(options: argparse.Namespace, inputs: Mapping[str, Path], body: Body) -> None:
+    """Raise UserError for a pose or a frame of the video that does not exist, before the scene is loaded."""
+    if options.pose is not None and options.pose not in RIG_POSES:
+        read_pose(Path(options.pose), body)
+    if options.frame is not None and not options.bvh:
+        capture, motion = load_capture(inputs["frames"]), load_motion(inputs["mesh"] / "motion.npz")
+        _select_frame(pad_motion_to_video(motion, capture.fps, capture.n_video_frames), options.frame, of_video=True)
+
+
+def _select_frame(motion: Motion, frame: int, of_video: bool) -> Motion:
+    rows = np.flatnonzero(motion.frame_index == frame)
+    if not len(rows):
+        raise UserError(
+            f"frame {frame} has no pose; choose one of 0 to {motion.frame_index[-1]}"
+            + (", of those that the frames stage selected" if of_video else "")
+        )
+    return motion.select(rows[:1])
 
 
 def _chosen_pose(options: argparse.Namespace, scene: Scene, clips: Mapping[str, Motion]) -> Motion | None:
     """Return one frame, or None without --frame and --pose."""
     if options.frame is not None:
-        if len(clips) > 1:
-            raise UserError("--frame is for one clip; name one --bvh")
         motion = next(iter(clips.values())) if clips else scene.motion
-        rows = np.flatnonzero(motion.frame_index == options.frame)
-        if not len(rows):
-            last = motion.frame_index[-1]
-            raise UserError(
-                f"frame {options.frame} has no pose; choose one of 0 to {last}"
-                + ("" if clips else ", of those that the frames stage selected")
-            )
-        return motion.select(rows[:1])
+        return _select_frame(motion, options.frame, of_video=not clips)
     if options.pose is None:
         return None
-    if options.pose in ("a", "t"):
+    if options.pose in RIG_POSES:
         rig = build_rig(scene.body, rest_pose=options.pose)
         rotations = local_quaternions(rig.bind_to_rest[None, :, :3, :3], scene.body.parents)
     else:

@@ -23,6 +23,8 @@ from pipeline.avatar.rig import build_rig
 from pipeline.avatar.skinned_avatar import lowest_vertex_y_m, to_rest_pose
 from pipeline.body.body import Motion
 from pipeline.core.errors import UserError
+from pipeline.core.manifest import read_manifest
+from pipeline.core.progress import warn
 from pipeline.geometry.mesh import Mesh
 from pipeline.template.files import FittedTemplate
 from pipeline.template.reshape import (
@@ -44,6 +46,11 @@ def main(argv: Sequence[str]) -> None:
     name = check_folder_name(options.name) if options.name else _folder_name(changes)
     avatar = load_editable_avatar(options.run)
     scene = reshape_scene(avatar, changes, options.run)
+    if scene.face is None and _has_moving_face(options.run):
+        warn(
+            "this shape is too far from the filmed person for a face that moves: avatar.glb has the filmed face "
+            "without morph targets, the rest is complete; a smaller change keeps the face"
+        )
     out = options.run / "reshape" / name
     with replaced_folder(out) as part:
         (part / "avatar.glb").write_bytes(encode_scene(scene, avatar.config, scene.clips()))
@@ -90,6 +97,12 @@ def stand_on_floor(reshaped: Scene, before: Scene) -> Motion:
     scaled = motion.with_pose(motion.rotations_wxyz, motion.root_translation_m * (hips_m[0] / hips_m[1]))
     lowest_y_m = np.percentile(lowest_vertex_y_m(reshaped.skinned, reshaped.body, scaled), FLOOR_PERCENTILE)
     return translate_motion(scaled, np.array([0.0, -lowest_y_m, 0.0], dtype=np.float32))
+
+
+def _has_moving_face(run: Path) -> bool:
+    """Return whether the exported avatar has a face that moves."""
+    manifest = read_manifest(run / "export")
+    return manifest is not None and (manifest.metrics.get("morph_targets") or 0.0) > 0.0
 
 
 def _folder_name(changes: Mapping[str, float]) -> str:

@@ -16,6 +16,7 @@ from data_tools.convert.neuman import is_neuman, read_neuman
 from data_tools.convert.people_snapshot import is_people_snapshot, read_people_snapshot
 from data_tools.convert.recording import Recording, write_recording
 from data_tools.folder import require_absent
+from pipeline.core.command import format_command
 from pipeline.core.errors import UserError
 
 
@@ -55,7 +56,7 @@ def main(argv: Sequence[str]) -> None:
         raise UserError(f"unknown format {name}; choose one of {', '.join(FORMATS)}")
     recording = FORMATS[name].read(source)
     write_recording(recording, target)
-    print(f"{target} ({name}): {recording.summary()}; next: make all VIDEO={target}")
+    print(f"{target} ({name}): {recording.summary()}; next: {format_command(target)}")
 
 
 def detect_format(source: Path) -> str:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from data_tools.convert.recording import Recording, mask_folder_reader
 from pipeline.capture.video import open_frame_source
+from pipeline.core.command import format_command
 from pipeline.core.errors import UserError
 from pipeline.io.image import read_alpha
 
@@ -34,7 +35,7 @@ def read_image_folder(folder: Path) -> Recording:
     source, masks = open_frame_source(folder), _find_masks(folder)
     if not is_image_folder(folder):
         raise UserError(
-            f"{folder} has no mask folder and no alpha channel; it needs no conversion: make all VIDEO={folder}"
+            f"{folder} has no mask folder and no alpha channel; it needs no conversion: {format_command(folder)}"
         )
     return Recording(
         source=source,

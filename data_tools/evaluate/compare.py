@@ -14,10 +14,10 @@ from typing import Any
 from data_tools.command import run_command
 from data_tools.evaluate.compare_body import compare_body, compare_masks, compare_surface
 from data_tools.evaluate.page import write_comparison
-from data_tools.evaluate.truth import read_capture_settings
+from data_tools.evaluate.truth import read_capture_settings, require_current_version
 from pipeline.core.command import format_command
 from pipeline.core.errors import UserError
-from pipeline.core.manifest import MANIFEST_FILE, digest_video, read_manifest
+from pipeline.core.manifest import MANIFEST_FILE, digest_file, digest_json, digest_video, read_manifest
 
 
 def main(argv: Sequence[str]) -> None:
@@ -29,10 +29,10 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("run", type=Path, help="run folder of the pipeline on OUT/video")
     options = parser.parse_args(argv)
     finished = [stage for stage in ("frames", "body", "report") if (options.run / stage / MANIFEST_FILE).is_file()]
+    require_current_version(options.out, read_capture_settings(options.out))
     if not finished:
-        command = f"python -m stages --run {options.run} --video {options.out}/video"
+        command = format_command("--run", options.run, "--video", options.out / "video")
         raise UserError(f"{options.run} has no finished stage; run {command}")
-    read_capture_settings(options.out)
     _require_video_of(options.out, options.run)
     sections: dict[str, Any] = {}
     if "frames" in finished:
@@ -49,15 +49,21 @@ def main(argv: Sequence[str]) -> None:
 
 
 def _require_video_of(out: Path, run: Path) -> None:
-    """Raise UserError if a run was made from another recording than that of the capture in `out`, wherever it lies."""
-    manifest, video = read_manifest(run / "frames"), out / "video"
+    """Raise UserError if a run was made from another recording than that of the capture in `out`, wherever it lies.
+
+    The run may have read the video file, or a folder with the file alone or with what is in its folder now.
+    """
+    manifest, folder = read_manifest(run / "frames"), out / "video"
     if manifest is None or "video" not in manifest.inputs:
         return
-    candidates = (video, *(path for path in video.iterdir() if path.is_file()))
-    if not any(digest_video(path) == manifest.inputs["video"] for path in candidates):
+    video = folder / "video.mp4"
+    if not video.is_file():
+        raise UserError(f"{video} does not exist; remove {out} and make the capture again")
+    digest = digest_file(video)
+    if manifest.inputs["video"] not in (digest, digest_json({video.name: digest}), digest_video(folder)):
         raise UserError(
-            f"{run} was made from another video than {video}; name the capture of its video with TRUTH=, or run "
-            f"{format_command('--run', run, '--video', video)}"
+            f"{run} was not made from {video} as it is now: compare it with the capture of its video, or, if this "
+            f"capture was made again, make the run again: {format_command('--run', run, '--video', folder, '--force')}"
         )
 
 

@@ -21,6 +21,7 @@ from data_tools.evaluate.comparison import Comparison, ImagePair, load_compariso
 from data_tools.evaluate.files import TRUTH_VERSION, save_comparison
 from data_tools.synthetic.scene.renderer import FLAT
 from data_tools.templates import render_template
+from pipeline.core.command import format_command
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import read_manifest
 from pipeline.metrics.images import (
@@ -80,7 +81,7 @@ def write_comparison(out: Path, run_dir: Path, measured: Mapping[str, Mapping[st
     """
     report = read_manifest(run_dir / "report")
     if report is None:
-        raise UserError(f"{run_dir / 'report'} is not finished; run python -m stages --run {run_dir}")
+        raise UserError(f"{run_dir / 'report'} is not finished; run {format_command('--run', run_dir)}")
     heldout = json.loads((run_dir / "report" / "report.json").read_text(encoding="utf-8"))["heldout"]
     sections, image_pairs = avatar_sections(load_comparison(out, run_dir))
     report_scores = {name: heldout[name] for name in ("field", "mesh")}

@@ -24,6 +24,7 @@ from data_tools.synthetic.scene.renderer import Light, pose_vertices
 from pipeline.avatar.obj import ObjMaps, write_obj
 from pipeline.body.files import load_camera, load_motion
 from pipeline.capture.video import open_frame_source, read_frames
+from pipeline.core.command import format_module_command
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track
 from pipeline.geometry.mesh import Mesh
@@ -31,6 +32,9 @@ from pipeline.io.image import read_gray, read_rgb, to_float, write_rgb
 from pipeline.metrics.images import foreground_mask, mask_iou, psnr_db
 
 MIN_PSNR_DB, MIN_IOU = 45.0, 0.995
+
+_SAMPLE, _FROM_GLTF = "data_tools.sample", "data_tools.from_gltf"
+"""Modules that make captures; `source` in the settings of a capture names the one that made it."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +89,8 @@ def read_capture_settings(out: Path) -> dict[str, Any]:
     """Read the options and the version of a capture. UserError if the file is absent or damaged."""
     path = out / "truth" / "capture_settings.json"
     if not path.is_file():
-        raise UserError(f"{path.parent} holds no ground truth; make a capture: python -m data_tools.sample {out}")
+        command = format_module_command(_SAMPLE, out if not out.exists() else "NEW_FOLDER")
+        raise UserError(f"{path.parent} holds no ground truth; name a synthetic capture, or make one: {command}")
     try:
         settings = json.loads(path.read_text(encoding="utf-8"))
     except ValueError:
@@ -100,17 +105,18 @@ def require_current_version(out: Path, settings: Mapping[str, Any]) -> None:
     if "version" not in settings:
         raise _damaged_settings_error(out)
     if settings["version"] != CAPTURE_VERSION:
+        module = _FROM_GLTF if settings.get("source") == "gltf" else _SAMPLE
         raise UserError(
             f"{out} is a capture of version {settings['version']}, this program reads version {CAPTURE_VERSION}; "
-            f"remove {out} and make it again: python -m data_tools.{settings.get('source', 'sample')} with the "
-            f"options in {out / 'truth' / 'capture_settings.json'}"
+            f"remove {out} and make it again: {format_module_command(module, out)} with the options in "
+            f"{out / 'truth' / 'capture_settings.json'}"
         )
 
 
 def _damaged_settings_error(out: Path) -> UserError:
     return UserError(
         f"{out / 'truth' / 'capture_settings.json'} is damaged; remove {out} and make the capture again: "
-        f"python -m data_tools.sample {out}"
+        f"{format_module_command(_SAMPLE, out)}"
     )
 
 

@@ -22,8 +22,7 @@ from data_tools.stress.captures import make_capture
 from data_tools.stress.lost_work import LostWork, wait_and_watch
 from data_tools.stress.row import CannotRunError
 from data_tools.sweep.runs import TRACEBACK_HEADER
-from pipeline.core.cli import EXIT_USER_ERROR
-from pipeline.core.errors import UserError
+from pipeline.core.errors import EXIT_USER_ERROR, UserError
 from pipeline.core.manifest import read_manifest
 from pipeline.core.parent import die_with_parent_environment
 from stages import STAGES

@@ -12,7 +12,7 @@ from data_tools.stress.row import DONE, EXIT_CANNOT_RUN, FAILED, MISSING, REFUSE
 from data_tools.stress.store import load_result, save_result, settings_key, trial_key
 from data_tools.sweep.chart_trials import describe_machine
 from data_tools.sweep.runs import last_error_message
-from pipeline.core.cli import EXIT_USER_ERROR
+from pipeline.core.errors import EXIT_USER_ERROR
 from pipeline.core.measure import describe_environment
 from pipeline.core.parent import die_with_parent_environment
 

@@ -22,6 +22,7 @@ from data_tools.sweep.chart_trials import Trial, describe_machine, join_distinct
 from data_tools.sweep.figures import MATERIALS, OWN_TABLES, insert_tables, read_table
 from data_tools.sweep.material_trials import MaterialTrial, measure, read_figures
 from data_tools.sweep.runs import RunState, log_path
+from pipeline.core.command import format_module_command
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track
 from pipeline.core.status import FRESH
@@ -52,7 +53,8 @@ def main(argv: Sequence[str]) -> None:
     options = _parse(argv)
     missing = [str(path) for path in options.captures if not (path / "truth").is_dir()]
     if missing:
-        raise UserError(f"{missing[0]} is no synthetic capture: make one, python -m data_tools.sample {missing[0]}")
+        command = format_module_command("data_tools.sample", missing[0])
+        raise UserError(f"{missing[0]} is no synthetic capture: make one, {command}")
     trials = trials_of(options.captures, options.mesh, options.seeds, options.preset, options.out)
     stored = {}
     for trial in track(trials, "trials"):

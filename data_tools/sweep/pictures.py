@@ -14,6 +14,7 @@ from jaxtyping import Bool, UInt8
 
 from data_tools.command import run_command
 from pipeline.capture.capture import load_capture
+from pipeline.core.command import format_command
 from pipeline.core.errors import UserError
 from pipeline.io.image import read_rgb, to_uint8, write_rgb
 
@@ -37,7 +38,7 @@ def main(argv: Sequence[str]) -> None:
     run = parser.parse_args(argv).run
     turntable = run / "report" / "turntable.jpg"
     if not turntable.is_file():
-        raise UserError(f"{turntable} does not exist; finish the run with python -m stages --run {run}")
+        raise UserError(f"{turntable} does not exist; finish the run with {format_command('--run', run)}")
     views = read_rgb(turntable)
     views = views[: len(views) // 2]
     scale = TURNTABLE_WIDTH_PX / views.shape[1]

@@ -99,6 +99,8 @@ def find_preset(preset: str, config_dir: Path = CONFIG_DIR) -> Path:
     """
     files = preset_files(config_dir)
     path = Path(preset) if preset.endswith(PRESET_SUFFIXES) else files.get(preset, config_dir / f"{preset}.yaml")
+    if preset.endswith(PRESET_SUFFIXES) and not path.is_file():
+        raise UserError(f"preset {path} is {'a folder' if path.is_dir() else 'missing'}: name a .yaml file")
     if not path.is_file() and preset != "default":
         raise UserError(f"preset {preset} is unknown: use one of {', '.join(files)}, or the path of a .yaml file")
     return path
@@ -207,7 +209,7 @@ def _format_validation_error(
     section: str, config_type: type[Config], error: Mapping[str, Any], layers: ConfigLayers
 ) -> str:
     """Describe an error of pydantic in one sentence: layer, key, value, what is allowed."""
-    path = [str(part) for part in error["loc"]]
+    path = [part for part in error["loc"] if isinstance(part, str)]  # users know a list, not the numbers of its items
     dotted_key = ".".join([section, *path])
     origin = layers.origin_of(dotted_key)
     fields = config_type.model_fields
@@ -219,7 +221,11 @@ def _format_validation_error(
     info = fields[path[0]]
     allowed = _describe_constraints(info, error)
     meaning = f" ({info.description})" if info.description else ""
-    return f"{place}{dotted_key} = {error['input']!r} is not allowed: it must be {allowed}{meaning}"
+    if error["type"] == "missing":  # an item of a list: options have defaults
+        return f"{place}{dotted_key} = {error['input']!r} is not allowed: it has too few values{meaning}"
+    is_item = len(path) < len(error["loc"])
+    refused = f"contains {error['input']!r}, which" if is_item else f"= {error['input']!r}"
+    return f"{place}{dotted_key} {refused} is not allowed: it must be {allowed}{meaning}"
 
 
 def _describe_constraints(info: FieldInfo, error: Mapping[str, Any]) -> str:

@@ -2,13 +2,18 @@
 
 import errno
 
+EXIT_USER_ERROR = 2
+"""Exit status of a command after a `UserError`, or a system error that the user can correct."""
+
 ERRNO_REMEDIES = {
     errno.ENOSPC: "the disk is full: free some space, then run the same command again",
     errno.EDQUOT: "the disk quota is exceeded: free some space, then run the same command again",
-    errno.EACCES: "permission was denied: change the permissions, or choose another folder with --run",
-    errno.EPERM: "permission was denied: change the permissions, or choose another folder with --run",
-    errno.ENOTDIR: "a part of this path is a file: choose another folder with --run",
-    errno.EROFS: "the disk is read-only: choose another folder with --run",
+    errno.EACCES: "permission was denied: change the permissions, or choose another folder",
+    errno.EPERM: "permission was denied: change the permissions, or choose another folder",
+    errno.ENOTDIR: "a part of this path is a file: choose another folder",
+    errno.EISDIR: "it is a folder: choose a file",
+    errno.EROFS: "the disk is read-only: choose another folder",
+    errno.ENAMETOOLONG: "the name is too long: choose a shorter name",
 }
 
 

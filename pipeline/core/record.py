@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.core.atomic import atomic_path
+from pipeline.core.command import format_command
 from pipeline.core.config import PRESET_SUFFIXES
 from pipeline.core.errors import UserError
 from pipeline.core.json_file import load_json
-from pipeline.core.manifest import digest_video
+from pipeline.core.manifest import digest_video, read_manifest
 
 RUN_FILE = "run.json"
 
@@ -80,11 +81,20 @@ def _checked_video(record: RunRecord, run_dir: Path, video: Path, replace_video:
     if not video.exists():
         raise UserError(f"video {video} does not exist: name a video file or a folder of images")
     video = video.resolve()
+    if (video / RUN_FILE).is_file():
+        raise UserError(f"{video} is the folder of a run, not a video: {format_command('--run', video)}")
     if video.is_dir() and run_dir.resolve().is_relative_to(video):
-        raise UserError(f"run {run_dir} is inside the video folder, which is never written: choose another --run")
+        raise UserError(f"run {run_dir} is inside the video folder, which is never written: choose another run folder")
     known = record.video_path
     if known is None or known == video or replace_video:
         return video
-    if known.exists() and digest_video(known) == digest_video(video):
+    digest = digest_video(video)
+    if digest in _digests_of_video(run_dir) or (known.exists() and digest_video(known) == digest):
         return video
-    raise UserError(f"{run_dir} belongs to the video {known}, not {video}: choose another --run, or use --force")
+    raise UserError(f"{run_dir} belongs to the video {known}, not {video}: choose another run folder, or use --force")
+
+
+def _digests_of_video(run_dir: Path) -> set[str]:
+    """Return the digests of the videos that the finished stages of a run have read: of one that moved since, too."""
+    manifests = [read_manifest(folder) for folder in run_dir.iterdir()] if run_dir.is_dir() else []
+    return {manifest.inputs["video"] for manifest in manifests if manifest and "video" in manifest.inputs}

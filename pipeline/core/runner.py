@@ -14,18 +14,16 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from pipeline.core.errors import UserError
+from pipeline.core.errors import EXIT_USER_ERROR, UserError
 from pipeline.core.events import EVENTS_VARIABLE, parse_event
 from pipeline.core.lock import RunLock
 from pipeline.core.manifest import read_manifest
 from pipeline.core.pipeline import Pipeline
 from pipeline.core.preparation import import_path, preparations
 from pipeline.core.progress import listen
-from pipeline.core.record import write_record
-from pipeline.core.run_folder import RunRequest, StageFailedError, open_run
+from pipeline.core.run_folder import RunRequest, StageFailedError, StageKilledError, open_run
 from pipeline.core.stage import StagePlan, discard_work_dir, plan_stage, run_stage
 
-EXIT_USER_ERROR = 2
 EXIT_INTERRUPTED = 130
 
 
@@ -88,14 +86,14 @@ def run_pipeline(pipeline: Pipeline, request: RunRequest, options: RunOptions) -
         StageFailedError: the process of a stage failed.
     """
     outcomes = []
-    with open_run(request) as (record, lock):
-        configs = pipeline.build_configs(record)
-        write_record(record, request.run_dir)
+    with open_run(request) as run:
+        configs = pipeline.build_configs(run.record)
         with preparations(pipeline.preparations):
             for number, stage in enumerate(pipeline.load_stages(), start=1):
-                plan = plan_stage(stage, configs[stage.name], request.run_dir, record.video_path)
-                runner = _StageRunner(pipeline, plan, lock, options, number)
-                outcomes.append(runner.run())
+                with run.recorded_for(stage):
+                    plan = plan_stage(stage, configs[stage.name], request.run_dir, run.record.video_path)
+                    runner = _StageRunner(pipeline, plan, run.lock, options, number)
+                    outcomes.append(runner.run())
     return outcomes
 
 
@@ -191,7 +189,7 @@ class _StageRunner:
     def _check_exit_status(self, code: int, message: str) -> None:
         name = self.plan.stage.name
         if code < 0:
-            raise UserError(
+            raise StageKilledError(
                 f"stage {name} was killed by signal {-code} (9 often means that memory ran out): "
                 "run the same command again to resume"
             )

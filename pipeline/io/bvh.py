@@ -69,14 +69,21 @@ class BvhMotion:
         return self.root_positions + path
 
 
+def require_bvh_file(path: Path) -> None:
+    """Raise UserError if a path is not that of a file, before anything else is read."""
+    if path.is_dir():
+        raise UserError(f"motion {path} is a folder; choose a .bvh file in it")
+    if not path.is_file():
+        raise UserError(f"motion {path} does not exist; choose an existing .bvh file")
+
+
 def read_bvh(path: Path) -> BvhMotion:
     """Read a file.
 
     Raises:
         UserError: the file is missing, is not a complete BVH file, or has no frames or more than `MAX_FRAMES`.
     """
-    if not path.is_file():
-        raise UserError(f"motion {path} does not exist; choose an existing .bvh file")
+    require_bvh_file(path)
     if path.stat().st_size > _MAX_BYTES:
         raise UserError(f"motion {path} has {path.stat().st_size} bytes; cut it to at most {MAX_FRAMES} frames")
     tokens = iter(path.read_text(errors="replace").split())

@@ -226,6 +226,8 @@ def _pixels_of(buffer: oiio.ImageBuf) -> np.ndarray:
 
 
 def _decode(path: Path) -> _Decoded:
+    if path.is_dir():
+        raise UserError(f"image {path} is a folder; name an image file")
     if not path.is_file():
         raise UserError(f"image {path} does not exist; check the contents of the folder")
     try:

@@ -6,6 +6,7 @@ from statistics import median
 
 from data_tools.sweep.chart_trials import FIELD, read_progress
 from data_tools.sweep.runs import read_scores
+from pipeline.core.command import format_command
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import Manifest, read_manifest
 
@@ -69,7 +70,7 @@ def speedup(curve: Curve, baseline: Curve) -> tuple[float | None, str]:
 def _finished(run: Path, stage: str) -> Manifest:
     manifest = read_manifest(run / stage)
     if manifest is None:
-        raise UserError(f"{run} has no finished {stage}: run python -m stages --run {run}")
+        raise UserError(f"{run} has no finished {stage}: run {format_command('--run', run)}")
     return manifest
 
 

@@ -123,7 +123,87 @@ def test_a_mistake_is_one_sentence_and_leaves_nothing(toy: Toy, arguments: Seque
 def test_a_stage_refuses_options_of_others(toy: Toy) -> None:
     assert "learn.key=value" in toy.expect_user_error("stages", "learn", "runs/a", "--set", "summarise.word=x")
     assert "python -m stages read runs/a" in toy.expect_user_error("stages", "learn", "runs/a")
-    assert "see python -m stages learn --help" in toy.expect_user_error("stages.learn")
+    assert "python -m stages learn --help" in toy.expect_user_error("stages.learn")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("lern", "runs/a"), ("lern", "did you mean learn?", "read, learn, summarise")),
+        (("lern",), ("did you mean learn?",)),
+        (("export", "runs/a"), ("export is neither a stage nor a video", "read, learn, summarise")),
+        (("runs/a", "learn"), ("python -m stages learn runs/a",)),
+        (("--preset", "quick", "learn", "runs/a"), ("python -m stages learn runs/a",)),
+        (("--preset", "quick", "learn"), ("python -m stages learn RUN",)),
+        (("numbers.txt", "other.txt"), ("other.txt is a second", "quote")),
+    ],
+)
+def test_a_misspelt_or_misplaced_stage_is_named(toy: Toy, arguments: Sequence[str], words: Sequence[str]) -> None:
+    sentence = toy.expect_user_error("stages", *arguments)
+    assert all(word in sentence for word in words), sentence
+
+
+def test_a_video_may_have_the_name_of_a_stage(toy: Toy) -> None:
+    toy.video.rename(toy.folder / "learn")
+    assert toy.stages("--run", "runs/a", "learn").returncode == 0
+
+
+def test_the_status_is_that_under_the_options_of_the_command(toy: Toy) -> None:
+    toy.all("--video", "numbers.txt")
+    before = (toy.run_dir / "run.json").read_bytes()
+    assert states(toy.all("--status", "--set", "summarise.word=value").stdout) == ["fresh", "fresh", "stale"]
+    assert states(toy.all("--status", "--preset", "quick").stdout) == ["fresh", "stale", "waits"]
+    assert "known keys of learn: steps" in toy.expect_user_error(
+        "stages", "--run", "runs/a", "--status", "--set", "learn.stepz=3"
+    )
+    (toy.folder / "other.txt").write_text("4 5 6")
+    assert "--force" in toy.expect_user_error("stages", "--run", "runs/a", "--status", "--video", "other.txt")
+    assert (toy.run_dir / "run.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "unused"),
+    [
+        (("--status", "--force"), "--force"),
+        (("--status", "--from", "learn"), "--from"),
+        (("--verify", "--set", "learn.steps=3"), "--set"),
+        (("--verify", "--preset", "quick"), "--preset"),
+        (("--verify", "--status"), "--status"),
+        (("--defaults",), "--run"),
+    ],
+)
+def test_options_without_effect_are_refused(toy: Toy, arguments: Sequence[str], unused: str) -> None:
+    toy.all("--video", "numbers.txt")
+    assert unused in toy.expect_user_error("stages", "--run", "runs/a", *arguments)
+
+
+@pytest.mark.parametrize("mode", ["--status", "--verify"])
+def test_the_state_of_what_is_no_run_is_an_error(toy: Toy, mode: str) -> None:
+    (toy.folder / "photos").mkdir()
+    for run, words in (
+        ("runs/none", "runs/none does not exist: name the folder of a run"),
+        ("numbers.txt", "numbers.txt is a file, but a run is a folder"),
+        ("photos", "photos is not the folder of a run, it has no run.json"),
+    ):
+        assert words in toy.expect_user_error("stages", "--run", run, mode)
+    assert "runs/numbers does not exist" in toy.expect_user_error("stages", "numbers.txt", mode)
+
+
+@pytest.mark.parametrize("command", [("stages", "--run"), ("stages", "read")])
+def test_a_folder_that_cannot_be_made_is_one_sentence(toy: Toy, command: Sequence[str]) -> None:
+    (toy.folder / "link").symlink_to("nowhere")
+    (toy.folder / "loop").symlink_to("loop")
+    for run, words in (
+        ("link", "link is a link to a missing folder: make that folder, or remove the link"),
+        ("link/a", "link is a link to a missing folder"),
+        ("loop", "loop is a link to a missing folder"),
+        ("x" * 300, "the name is too long: choose a shorter name"),
+        ("/proc/new", "no folder can be made at /proc/new"),
+    ):
+        sentence = toy.expect_user_error(*command, run, "--video", "numbers.txt")
+        assert words in sentence
+        assert command[1] == "--run" or "--run" not in sentence
+    assert "name is too long" in toy.expect_user_error("stages", "x" * 300)
 
 
 def test_a_file_is_no_run(toy: Toy) -> None:
@@ -151,6 +231,48 @@ def test_bad_input_leaves_earlier_results(toy: Toy) -> None:
     assert {path.name for path in toy.run_dir.iterdir()} == {"read", "learn", "summarise", "run.json", ".lock"}
 
 
+def read_overrides(run_dir: Path) -> dict[str, object]:
+    overrides: dict[str, object] = json.loads((run_dir / "run.json").read_text())["overrides"]
+    return overrides
+
+
+@pytest.mark.parametrize("isolated", [False, True])
+def test_what_a_stage_refuses_is_not_recorded(toy: Toy, isolated: bool) -> None:
+    call = toy.call_all if isolated else toy.all
+    toy.all("--video", "numbers.txt", "--set", "summarise.word=value")
+    refused = call("--set", "summarise.word=w1", "--set", "learn.steps=7", "--preset", "quick")
+    assert refused.returncode == 2
+    assert refused.stderr.splitlines()[-1] == "error: summarise.word = w1 is not a word: choose letters"
+    record = json.loads((toy.run_dir / "run.json").read_text())
+    assert record == {"video": str(toy.video), "preset": "quick", "overrides": {"learn.steps": 7}}
+    assert call().returncode == 0
+
+
+def test_a_refusal_keeps_the_earlier_options(toy: Toy) -> None:
+    toy.all("--video", "numbers.txt", "--set", "summarise.word=value")
+    toy.expect_user_error("stages", "summarise", "runs/a", "--set", "summarise.word=w1")
+    assert read_overrides(toy.run_dir) == {"summarise.word": "value"}
+    assert states(toy.all("--status").stdout) == ["fresh"] * 3
+
+
+def test_a_new_run_keeps_its_video_if_a_later_stage_refuses(toy: Toy) -> None:
+    toy.expect_user_error("stages", "--run", "runs/a", "--video", "numbers.txt", "--set", "summarise.word=w1")
+    assert states(toy.all().stdout) == ["cached", "cached", "run"]
+
+
+def test_a_video_that_is_refused_is_not_recorded(toy: Toy) -> None:
+    toy.all("--video", "numbers.txt")
+    (toy.folder / "words.txt").write_text("1 two 3")
+    toy.expect_user_error("stages", "--run", "runs/a", "--video", "words.txt", "--force")
+    assert states(toy.all().stdout) == ["cached"] * 3
+
+
+def test_options_of_a_killed_run_stay_recorded(toy: Toy) -> None:
+    killed = toy.call_all("--video", "numbers.txt", "--set", "learn.steps=30", TOY_KILL_STEP="25")
+    assert "killed by signal 9" in killed.stderr
+    assert read_overrides(toy.run_dir) == {"learn.steps": 30}
+
+
 def test_another_video_needs_force(toy: Toy) -> None:
     toy.all("--video", "numbers.txt")
     copy, other = toy.folder / "copy.txt", toy.folder / "other.txt"
@@ -159,6 +281,38 @@ def test_another_video_needs_force(toy: Toy) -> None:
     assert states(toy.all("--video", "copy.txt").stdout) == ["cached"] * 3
     assert "--force" in toy.expect_user_error("stages", "--run", "runs/a", "--video", "other.txt")
     assert states(toy.all("--video", "other.txt", "--force").stdout) == ["run"] * 3
+
+
+def test_a_video_that_was_moved_is_known_by_its_content(toy: Toy) -> None:
+    toy.all("--video", "numbers.txt")
+    toy.video.rename(toy.folder / "moved.txt")
+    assert "name the video with --video" in toy.expect_user_error("stages", "--run", "runs/a", "--status")
+    assert states(toy.all("--status", "--video", "moved.txt").stdout) == ["fresh"] * 3
+    assert states(toy.all("--video", "moved.txt").stdout) == ["cached"] * 3
+    assert states(toy.all().stdout) == ["cached"] * 3
+
+
+def test_a_run_folder_is_no_video(toy: Toy) -> None:
+    toy.all("--video", "numbers.txt")
+    sentence = toy.expect_user_error("stages", "runs/a")
+    assert sentence.endswith(f"python -m stages --run {toy.run_dir}")
+    assert "is the folder of a run, not a video" in sentence
+
+
+@pytest.mark.parametrize("arguments", [("",), ("--run", ""), ("--video", ""), ("read", "")])
+def test_an_empty_path_is_not_the_working_directory(toy: Toy, arguments: Sequence[str]) -> None:
+    before = sorted(toy.folder.rglob("*"))
+    assert "the path is empty" in toy.expect_user_error("stages", *arguments)
+    assert sorted(toy.folder.rglob("*")) == before
+
+
+def test_ctrl_c_before_any_work_leaves_no_folder(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pipeline.core.pipeline.Pipeline.load_stages", interrupt)
+    assert toy.all("--video", "numbers.txt").returncode == 130
+    assert not toy.run_dir.exists()
 
 
 def test_a_video_needs_no_option(toy: Toy) -> None:

@@ -27,6 +27,7 @@ class Options(Config):
     kind: Literal["fast", "fine"] = Field("fast", description="speed or quality")
     name: str = Field("x", description="a name")
     sides_m: tuple[float, float] = Field((1.0, 2.0), description="metres")
+    words: tuple[Literal["fast", "fine"], ...] = Field((), description="a list")
     rate: float = Field(0.1, gt=0, le=1, description="learning rate, per step")
 
     @model_validator(mode="after")
@@ -82,8 +83,11 @@ def test_yaml_numbers_without_a_dot_are_numbers(config_dir: Path) -> None:
         ("mesh.name=a b", ("mesh.name = 'a b'", "text without spaces")),
         ("mesh.rate=.nan", ("mesh.rate = nan", "a number, above 0, at most 1", "per step")),
         ("mesh.rate=2", ("mesh.rate = 2", "above 0, at most 1")),
-        ("mesh.sides_m=[1, x]", ("mesh.sides_m.1 = 'x'",)),
-        ("mesh.sizes=8", ("mesh.sizes is unknown", "did you mean size?", "size, kind, name, sides_m, rate")),
+        ("mesh.sides_m=[1, x]", ("mesh.sides_m contains 'x', which is not allowed: it must be a valid number",)),
+        ("mesh.sides_m=[1]", ("mesh.sides_m = [1] is not allowed: it has too few values (metres)",)),
+        ("mesh.sides_m=[1, 2, 3]", ("mesh.sides_m = [1, 2, 3] is not allowed", "at most 2")),
+        ("mesh.words=[fast, slow]", ("mesh.words contains 'slow', which is not allowed: it must be 'fast' or 'fine'",)),
+        ("mesh.sizes=8", ("mesh.sizes is unknown", "did you mean size?", "size, kind, name, sides_m, words, rate")),
         ("mesh.rat=8", ("mesh.rat is unknown", "did you mean rate?")),
         ("mesh.size.a=8", ("mesh.size = {'a': 8}", "a whole number")),
         ("mesh.size={a: 8}", ("mesh.size = {'a': 8}", "a whole number")),
@@ -137,6 +141,13 @@ def test_a_preset_may_be_a_baseline(config_dir: Path) -> None:
     (folder / "paper.yaml").write_text("mesh:\n  size: 50\n")
     assert built(config_dir, "paper").size == 50
     assert list(preset_files(config_dir)) == ["default", "fine", "paper"]
+
+
+def test_a_preset_file_that_cannot_be_read_is_named(config_dir: Path) -> None:
+    (config_dir / "folder.yaml").mkdir()
+    for name, words in (("none.yaml", "none.yaml is missing"), ("folder.yaml", "folder.yaml is a folder")):
+        with pytest.raises(UserError, match=words):
+            load_layers(str(config_dir / name), {}, config_dir)
 
 
 def test_a_preset_may_be_a_path(config_dir: Path) -> None:

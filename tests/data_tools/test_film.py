@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from data_tools import film
 from data_tools.film import film_motion, main
 from data_tools.pose import main as pose
 from data_tools.synthetic.scene.movie import FOR_PLAYERS, write_video
@@ -100,10 +101,15 @@ def test_the_film_shows_the_white_person_and_a_shadow_on_grey(run: Path) -> None
     [
         (["--clip", "dance"], "there is no clip dance; choose capture, idle or turntable"),
         (["--clip", "none.bvh"], "none.bvh does not exist"),
+        (["--clip", "/"], "there is no clip /; choose capture"),
         (["--name", "a/b"], "is not the name of a folder"),
     ],
 )
-def test_bad_input_is_one_sentence_and_writes_nothing(arguments: list[str], words: str, run: Path) -> None:
+def test_bad_input_is_one_sentence_and_writes_nothing(
+    arguments: list[str], words: str, run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The scene, which takes seconds, is not loaded for it."""
+    monkeypatch.setattr(film, "load_scene", lambda inputs, config: pytest.fail("the scene was loaded"))
     before = sorted(path.name for path in run.rglob("*"))
     with pytest.raises(UserError, match=words):
         main([str(run), *arguments])

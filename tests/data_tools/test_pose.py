@@ -9,6 +9,7 @@ import pytest
 import torch
 import trimesh
 
+from data_tools import pose
 from data_tools.pose import export_config, main, planted_motion, read_pose
 from pipeline.avatar.motion.feet import joint_positions_m
 from pipeline.body.body import canonical_to_world
@@ -80,8 +81,8 @@ def test_a_frame_is_the_posed_mesh_of_that_frame(run: Path, scene: PaintedScene)
 
 def test_poses_by_name_and_by_file(run: Path, tmp_path: Path) -> None:
     (tmp_path / "bow.json").write_text(json.dumps({"Spine": [0.9, 0.4358899, 0, 0]}))
-    for pose in ("a", "t", str(tmp_path / "bow.json")):
-        main([str(run), "--pose", pose])
+    for chosen in ("a", "t", str(tmp_path / "bow.json")):
+        main([str(run), "--pose", chosen])
     heights, widths = {}, {}
     for name in ("a", "t", "bow"):
         size = np.ptp(trimesh.load(run / "pose" / name / "avatar.obj").vertices, axis=0)
@@ -94,12 +95,18 @@ def test_poses_by_name_and_by_file(run: Path, tmp_path: Path) -> None:
     ("arguments", "words"),
     [
         (["--bvh", "none.bvh"], "none.bvh does not exist"),
+        (["--bvh", "/"], "motion / is a folder; choose a .bvh file in it"),
+        (["--pose", "/"], "pose / is a folder; choose a, t or a .json file"),
         (["--frame", "99"], "frame 99 has no pose; choose one of 0 to"),
         (["--pose", "none.json"], "there is no pose none.json; choose a, t or a .json file"),
         (["--name", "../export"], "is not the name of a folder"),
     ],
 )
-def test_bad_input_is_one_sentence_and_writes_nothing(arguments: list[str], words: str, run: Path) -> None:
+def test_bad_input_is_one_sentence_and_writes_nothing(
+    arguments: list[str], words: str, run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The scene, which takes seconds, is not loaded for it."""
+    monkeypatch.setattr(pose, "load_scene", lambda inputs, config: pytest.fail("the scene was loaded"))
     before = sorted(path.name for path in run.rglob("*"))
     with pytest.raises(UserError, match=words):
         main([str(run), *arguments])
@@ -127,9 +134,14 @@ def test_poses_of_unknown_joints_or_without_four_numbers_are_errors(scene: Paint
             read_pose(tmp_path / "pose.json", scene.body)
 
 
+def test_a_run_that_does_not_exist_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="none is not a folder; name the folder of a finished run"):
+        main([str(tmp_path / "none")])
+
+
 def test_without_an_export_the_next_command_is_named(run: Path) -> None:
     (run / "export" / "manifest.json").unlink()
-    with pytest.raises(UserError, match="run make export RUN="):
+    with pytest.raises(UserError, match=r"no finished export; run .*python -m stages --run"):
         main([str(run)])
 
 

@@ -1,5 +1,6 @@
 """The command reshape on a run with known mesh, motion and texture."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from pipeline.avatar.placement import FLOOR_PERCENTILE
 from pipeline.avatar.skinned_avatar import lowest_vertex_y_m
 from pipeline.core.errors import UserError
 from pipeline.core.manifest import digest_files
+from pipeline.core.progress import take_warnings
 from pipeline.io.glb import GlbFile
 from pipeline.template.files import save_template
 from pipeline.template.reshape import SHAPE_KEYS
@@ -34,6 +36,19 @@ def test_the_avatar_is_written_in_its_new_shape_and_stands_on_the_floor(run: Pat
     assert np.percentile(lowest_m, FLOOR_PERCENTILE) == pytest.approx(0.0, abs=1e-4)
     assert taller.motion.root_translation_m[:, 1].mean() > avatar.scene.motion.root_translation_m[:, 1].mean()
     assert {stage: digest_files(run / stage) for stage in before} == before
+
+
+@pytest.mark.parametrize(("exported_targets", "is_warned"), [(67.0, True), (0.0, False)])
+def test_a_face_that_is_lost_with_the_new_shape_is_a_warning(
+    run: Path, exported_targets: float, is_warned: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("data_tools.reshape.make_face", lambda body, template, skinned, texture: None)
+    path = run / "export" / "manifest.json"
+    manifest = json.loads(path.read_text())
+    path.write_text(json.dumps(manifest | {"metrics": {"morph_targets": exported_targets}}))
+    main([str(run), "--shape", "age=-0.5"])
+    assert any("a smaller change keeps the face" in text for text in take_warnings()) == is_warned
+    assert (run / "reshape" / "age-0.5" / "avatar.glb").is_file()
 
 
 def test_shape_keys_are_morph_targets(run: Path) -> None:

@@ -86,6 +86,8 @@ def test_damaged_files_are_errors(text: str, tmp_path: Path) -> None:
 def test_missing_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="does not exist"):
         read_bvh(tmp_path / "none.bvh")
+    with pytest.raises(UserError, match="is a folder; choose a .bvh file in it"):
+        read_bvh(tmp_path)
 
 
 @pytest.mark.parametrize(

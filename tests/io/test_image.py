@@ -319,6 +319,8 @@ def test_damaged_file_is_named(tmp_path, content):
 def test_missing_file_is_named(tmp_path):
     with pytest.raises(UserError, match="nowhere.png"):
         image.read_gray(tmp_path / "nowhere.png")
+    with pytest.raises(UserError, match="is a folder; name an image file"):
+        image.read_gray(tmp_path)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif", ".webp", ".exr"])

@@ -1,5 +1,7 @@
 """Scores of the frames and body stages: zero error for the ground truth itself, and known errors."""
 
+import shlex
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -175,7 +177,37 @@ def test_a_run_of_another_video_is_refused(
     (tmp_path / "other.mp4").write_bytes(b"another video")
     write_manifest_of(tmp_path / "other.mp4", run / "frames")
     assert run_command(compare_command, [str(sample), str(run)]) == 2
-    assert "was made from another video" in capsys.readouterr().err
+    message = capsys.readouterr().err
+    assert "was not made from" in message
+    (words,) = [part for part in message.split(": ") if " --run " in part]
+    options = shlex.split(words)[3:]
+    assert options == ["--run", str(run), "--video", str(sample / "video"), "--force"]
+
+
+@pytest.mark.parametrize("reads_file", [True, False])
+def test_only_the_video_of_a_capture_counts(sample: Path, run: Path, tmp_path: Path, reads_file: bool) -> None:
+    """Files that were added to the folder of the video after the run change nothing, not even a second video."""
+    capture = tmp_path / "capture"
+    shutil.copytree(sample, capture)
+    write_manifest_of(capture / "video" / ("video.mp4" if reads_file else ""), run / "frames")
+    for name in ("notes.txt", "other.mp4"):
+        (capture / "video" / name).write_bytes(b"another file")
+        assert run_command(compare_command, [str(capture), str(run)]) == 0
+    (capture / "video" / "video.mp4").write_bytes(b"another video")
+    assert run_command(compare_command, [str(capture), str(run)]) == 2
+    (capture / "video" / "video.mp4").unlink()
+    assert run_command(compare_command, [str(capture), str(run)]) == 2
+
+
+def test_a_capture_of_another_version_is_refused_before_it_is_read(
+    sample: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_manifest_of(sample / "video", run / "frames")
+    shutil.copytree(sample / "video", tmp_path / "old" / "video")
+    (tmp_path / "old" / "truth").mkdir()
+    (tmp_path / "old" / "truth" / "capture_settings.json").write_text('{"version": 1}')
+    assert run_command(compare_command, [str(tmp_path / "old"), str(run)]) == 2
+    assert "is a capture of version 1" in capsys.readouterr().err
 
 
 def test_command_prints_scores_of_finished_stages(sample: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:

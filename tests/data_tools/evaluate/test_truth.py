@@ -51,7 +51,7 @@ def test_wrong_ground_truth_is_detected(sample: Path, tmp_path: Path, capsys: py
 
 
 def test_missing_ground_truth_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="holds no ground truth"):
+    with pytest.raises(UserError, match=r"holds no ground truth.*sample NEW_FOLDER"):
         load_ground_truth(tmp_path)
 
 
@@ -74,9 +74,10 @@ def test_a_capture_of_another_version_names_the_command(sample: Path, tmp_path: 
     shutil.copytree(sample / "truth", tmp_path / "truth")
     path = tmp_path / "truth" / "capture_settings.json"
     settings = json.loads(path.read_text())
-    path.write_text(json.dumps(settings | {"version": 1}))
-    with pytest.raises(UserError, match=r"is a capture of version 1, .*python -m data_tools\.sample"):
-        load_ground_truth(tmp_path)
+    for source, module in (("sample", "sample"), ("gltf", "from_gltf")):
+        path.write_text(json.dumps(settings | {"version": 1, "source": source}))
+        with pytest.raises(UserError, match=rf"is a capture of version 1, .*python -m data_tools\.{module} {tmp_path}"):
+            load_ground_truth(tmp_path)
 
 
 def test_shortened_video_is_detected(sample: Path, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from pydantic import Field
 
 from pipeline.core.cli import main
 from pipeline.core.config import Config
+from pipeline.core.errors import UserError
 from pipeline.core.stage import Stage
 
 from . import CONFIG_DIR
@@ -20,7 +21,9 @@ class SummariseConfig(Config):
 
 
 def run(inputs: Mapping[str, Path], out: Path, config: SummariseConfig) -> Mapping[str, float]:
-    """Write summary.txt."""
+    """Write summary.txt; refuse a word with other characters than letters, which the configuration allows."""
+    if not config.word.isalpha():
+        raise UserError(f"summarise.word = {config.word} is not a word: choose letters")
     state = json.loads((inputs["learn"] / "trail" / "state.json").read_text())["state"]
     count = len((inputs["read"] / "numbers.txt").read_text().split())
     (out / "summary.txt").write_text(f"{count} numbers, {config.word} {state}\n")
