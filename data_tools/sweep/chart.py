@@ -81,6 +81,8 @@ def main(argv: Sequence[str]) -> None:
     require_distinct_run_folders(trials)
     process_trial = _read_only if options.draw else run_and_compare
     runs = {trial: process_trial(trial, trials) for trial in track(trials, "runs")}
+    if options.draw and any(run.status == "done" for run in runs.values()):
+        runs = {trial: run for trial, run in runs.items() if run.status == "done"}
     write_results(options.out, runs)
     _raise_if_incomplete(runs, options.out)
     print(f"{len(runs)} runs: {options.out}/chart.svg, sizes.svg, chart.csv, anytime.csv")

@@ -182,6 +182,19 @@ def test_draw_option_runs_nothing(tmp_path: Path, forbid_runs: None) -> None:
         chart([str(tmp_path / "ann"), "--presets", "default", "--out", str(tmp_path / "out"), "--draw"])
 
 
+def test_draw_option_leaves_out_what_is_not_finished(
+    tmp_path: Path, forbid_runs: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "ann").mkdir()
+    missing = RunState(dict.fromkeys(STAGES, "missing"), {}, {}, "")
+    monkeypatch.setattr(
+        "data_tools.sweep.chart_trials.read_run",
+        lambda run_dir, _: finished(1.0, SCORES) if "instant" in run_dir.name else missing,
+    )
+    chart([str(tmp_path / "ann"), "--presets", "instant", "fine", "--out", str(tmp_path / "out"), "--draw"])
+    assert [row["preset"] for row in rows(tmp_path / "out" / "chart.csv")] == ["instant"]
+
+
 @pytest.mark.parametrize("entry", ["ihm=600", "default", "default=many", "default=-3"])
 def test_invalid_steps_are_an_error(entry: str) -> None:
     with pytest.raises(UserError, match=r"--steps .*: write PRESET=N with one of default"):
