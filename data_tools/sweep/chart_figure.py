@@ -108,7 +108,7 @@ def preset_means(points: Iterable[ChartPoint], panel: Panel) -> dict[str, tuple[
 
 
 def draw_chart(points: Sequence[ChartPoint], provenance: str, panels: Sequence[Panel] = TIME_PANELS) -> Figure:
-    """Draw the figure; panels without any score are left out. ValueError if none is left.
+    """Draw the figure; panels without any score, columns or single ones, are left out. ValueError if none is left.
 
     provenance: text above the figure, see `data_tools.sweep.chart.provenance`.
     """
@@ -124,6 +124,7 @@ def draw_chart(points: Sequence[ChartPoint], provenance: str, panels: Sequence[P
     for capture, row in zip(captures, grid, strict=True):
         chosen = [point for point in points if point.capture == capture]
         for panel, axes in zip(panels, row, strict=True):
+            axes.set_visible(any(panel.place(point) for point in chosen))
             _draw_runs(axes, panel, chosen, colours)
             _draw_presets(axes, panel, chosen, colours)
             _style_axes(axes, f"{capture}: {panel.title}", panel.axis)

@@ -81,6 +81,7 @@ def test_panels_without_scores_are_left_out() -> None:
     assert [axes.get_title(loc="left") for axes in figure.axes] == [
         f"{capture}: {panel.title}" for capture in ("ann", "bob") for panel in (WHOLE, CHAMFER)
     ]
+    assert [axes.get_visible() for axes in figure.axes] == [True, False, True, True]
     with pytest.raises(ValueError, match="at least one run with a score"):
         draw_chart([replace(QUICK, scores={})], "")
 
