@@ -10,10 +10,14 @@ from pipeline.field.settings import FieldSettings
 REFERENCE = "reference"
 SIZE, ATTENTION, LOSS = "size", "attention", "loss"
 GROUPS = (SIZE, ATTENTION, LOSS)
-SQUARED_DELTA = 10.0
-"""A Huber loss that is quadratic for every difference of two colours."""
+DEFAULTS = FieldSettings()
+SQUARED = {"huber_delta": 1.0} | {
+    name: getattr(DEFAULTS, name) * DEFAULTS.huber_delta
+    for name in ("hard_surface_weight", "empty_density_weight", "pose_smoothness_weight", "pose_l2_weight")
+}
+"""Losses that are quadratic for every difference of two colours, as steep near zero beside the other losses: a Huber
+loss is divided by its delta."""
 SMALL_PERSON_PX = 240
-LEVELS = FieldSettings().levels
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +64,8 @@ ROWS = {
         FieldRow("rows-half", "half the rows of the hash table", options={"log2_hashmap_size": 16}),
         FieldRow("rows-quarter", "a quarter of the rows", options={"log2_hashmap_size": 15}),
         FieldRow("rows-double", "twice the rows", options={"log2_hashmap_size": 18}),
-        FieldRow("levels-less", "one level less, same finest cell", settings={"levels": LEVELS - 1}),
-        FieldRow("levels-more", "one level more, same finest cell", settings={"levels": LEVELS + 1}),
+        FieldRow("levels-less", "one level less, same finest cell", settings={"levels": DEFAULTS.levels - 1}),
+        FieldRow("levels-more", "one level more, same finest cell", settings={"levels": DEFAULTS.levels + 1}),
         FieldRow("width-half", "half the units of the hidden layer", settings={"hidden_width": 16}),
         FieldRow("width-double", "twice the units", settings={"hidden_width": 64}),
         FieldRow("steps-half", "half the steps", factors={"steps": 0.5}),
@@ -81,7 +85,7 @@ ROWS = {
             options={**_SMALL_OPTIONS, "log2_hashmap_size": 14},
             compared_with=SMALL,
         ),
-        FieldRow("squared", "squared instead of Huber losses", group=LOSS, settings={"huber_delta": SQUARED_DELTA}),
+        FieldRow("squared", "squared instead of Huber losses", group=LOSS, settings=SQUARED),
         FieldRow("no-alpha", "without the loss of alpha", group=LOSS, settings={"alpha_weight": 0.0}),
         FieldRow("no-hard-surface", "without the hard-surface loss", group=LOSS, settings={"hard_surface_weight": 0.0}),
         FieldRow(

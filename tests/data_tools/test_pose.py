@@ -128,7 +128,8 @@ def test_a_clip_without_hips_or_of_one_frame_is_named(run: Path, clip: Path, tmp
 
 
 def test_poses_of_unknown_joints_or_without_four_numbers_are_errors(scene: PaintedScene, tmp_path: Path) -> None:
-    for content, words in (({"Tail": [1, 0, 0, 0]}, "no joint Tail"), ({"Spine": [0, 0, 0, 0]}, "not all 0"), ([], "pose.json")):
+    wrong = (({"Tail": [1, 0, 0, 0]}, "no joint Tail"), ({"Spine": [0, 0, 0, 0]}, "not all 0"), ([], "pose.json"))
+    for content, words in wrong:
         (tmp_path / "pose.json").write_text(json.dumps(content))
         with pytest.raises(UserError, match=words):
             read_pose(tmp_path / "pose.json", scene.body)
