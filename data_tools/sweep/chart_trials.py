@@ -211,7 +211,7 @@ def table_row(trial: Trial, run: RunState) -> dict[str, Any]:
         "field_seconds": round(run.seconds(STAGES_UNTIL_FIELD), 3),
         "seconds": round(run.seconds(STAGES_UNTIL_EXPORT), 3),
         **{score: run.scores.get(score) for score in SCORE_PATHS},
-        **{column: read_sizes(run).get(column) for column in SIZE_METRICS},
+        **(dict.fromkeys(SIZE_METRICS) | read_sizes(run)),
         "peak_rss_mib": max((manifest.peak_rss_mib for manifest in run.manifests.values()), default=None),
         "resumed": " ".join(name for name, manifest in run.manifests.items() if manifest.resumed),
         "commit": join_distinct(environment.get("commit") for environment in environments),

@@ -6,6 +6,7 @@ import signal
 import sys
 import threading
 import time
+from pathlib import Path
 
 PARENT_PID_VARIABLE = "AVATAR_RUN_PARENT"
 _POLL_INTERVAL_S = 0.5
@@ -14,6 +15,11 @@ _POLL_INTERVAL_S = 0.5
 def die_with_parent_environment() -> dict[str, str]:
     """Return the environment for a child process that calls `die_with_parent`."""
     return {**os.environ, PARENT_PID_VARIABLE: str(os.getpid())}
+
+
+def import_path_environment() -> dict[str, str]:
+    """Return the variable with which an interpreter finds the modules that this process finds."""
+    return {"PYTHONPATH": os.pathsep.join(str(Path(folder).absolute()) for folder in sys.path)}
 
 
 def is_runner_child() -> bool:

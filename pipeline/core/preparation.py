@@ -5,15 +5,13 @@ which stages may meet half-way: a stage that needs what is not there yet makes i
 here is met, and reported, by the stage.
 """
 
-import os
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
-from pathlib import Path
 
-from pipeline.core.parent import die_with_parent, die_with_parent_environment
+from pipeline.core.parent import die_with_parent, die_with_parent_environment, import_path_environment
 
 
 @contextmanager
@@ -32,15 +30,10 @@ def preparations(modules: Sequence[str]) -> Iterator[None]:
             process.wait()
 
 
-def import_path() -> list[str]:
-    """Return `sys.path` as absolute paths, for PYTHONPATH of a child process."""
-    return [str(Path(folder).absolute()) for folder in sys.path]
-
-
 def _start(module: str) -> "subprocess.Popen[bytes]":
     return subprocess.Popen(
         [sys.executable, "-P", "-m", __name__, module],
-        env=die_with_parent_environment() | {"PYTHONPATH": os.pathsep.join(import_path())},
+        env=die_with_parent_environment() | import_path_environment(),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,

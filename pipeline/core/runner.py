@@ -18,8 +18,9 @@ from pipeline.core.errors import EXIT_USER_ERROR, UserError
 from pipeline.core.events import EVENTS_VARIABLE, parse_event
 from pipeline.core.lock import RunLock
 from pipeline.core.manifest import read_manifest
+from pipeline.core.parent import import_path_environment
 from pipeline.core.pipeline import Pipeline
-from pipeline.core.preparation import import_path, preparations
+from pipeline.core.preparation import preparations
 from pipeline.core.progress import listen
 from pipeline.core.run_folder import RunRequest, StageFailedError, StageKilledError, open_run
 from pipeline.core.stage import StagePlan, discard_work_dir, plan_stage, run_stage
@@ -151,7 +152,7 @@ class _StageRunner:
             self._check_exit_status(_run_in_fork(self.options.fork_command, arguments, environment), "")
             return
         command = [sys.executable, "-P", "-m", self.pipeline.package, *arguments]
-        environment |= {"PYTHONPATH": os.pathsep.join(import_path())}
+        environment |= import_path_environment()
         has_events = self.options.progress is not None
         if has_events:
             environment[EVENTS_VARIABLE] = "1"

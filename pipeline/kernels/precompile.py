@@ -3,12 +3,14 @@
 import numba
 from numba.core.registry import cpu_target
 
-from pipeline.kernels.common.numba_options import cache_folder
+from pipeline.kernels.common.numba_options import CACHE_FOLDER
+
+MARKER = "complete"
 
 
 def is_prepared() -> bool:
     """Return whether `prepare` was done with these sources, this compiler and this processor."""
-    marker = cache_folder() / "complete"
+    marker = CACHE_FOLDER / MARKER
     return marker.is_file() and marker.read_text(encoding="utf-8") == _compiler()
 
 
@@ -18,8 +20,8 @@ def prepare() -> None:
 
     for function, arguments in SIGNATURES:
         function.compile(arguments)
-    cache_folder().mkdir(parents=True, exist_ok=True)
-    (cache_folder() / "complete").write_text(_compiler(), encoding="utf-8")
+    CACHE_FOLDER.mkdir(parents=True, exist_ok=True)
+    (CACHE_FOLDER / MARKER).write_text(_compiler(), encoding="utf-8")
 
 
 def _compiler() -> str:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numba
 import pytest
 
 from pipeline.core.measure import REPOSITORY_DIR
@@ -36,7 +37,7 @@ def test_prepared_when_done_with_this_compiler(tmp_path: Path, monkeypatch: pyte
         def compile(self, arguments: tuple[object, ...]) -> None:
             compiled.append(arguments)
 
-    monkeypatch.setattr(precompile, "cache_folder", lambda: tmp_path / "cache")
+    monkeypatch.setattr(precompile, "CACHE_FOLDER", tmp_path / "cache")
     monkeypatch.setattr("pipeline.kernels.signatures.SIGNATURES", ((Function(), (1, 2)), (Function(), (3,))))
     assert not precompile.is_prepared()
     precompile.prepare()
@@ -44,6 +45,10 @@ def test_prepared_when_done_with_this_compiler(tmp_path: Path, monkeypatch: pyte
     assert precompile.is_prepared()
     monkeypatch.setattr(precompile, "_compiler", lambda: "numba 99 for another processor")
     assert not precompile.is_prepared()
+
+
+def test_the_marker_is_in_the_folder_of_the_cache() -> None:
+    assert Path(numba.config.CACHE_DIR) == precompile.CACHE_FOLDER
 
 
 def test_every_function_is_cached_and_listed_once() -> None:

@@ -41,4 +41,5 @@ def cache_folder() -> Path:
 
 # If numba was imported before this package, it read the environment before the package set its variables.
 config.reload_config()
-config.CACHE_DIR = str(cache_folder())
+CACHE_FOLDER = cache_folder()
+config.CACHE_DIR = str(CACHE_FOLDER)
