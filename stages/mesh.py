@@ -32,7 +32,7 @@ from pipeline.geometry.skinning import top_k_weights
 from pipeline.geometry.surface import resolve_self_intersections
 from pipeline.io.image import write_rgb
 from pipeline.kernels.common.determinism import deterministic_sums
-from pipeline.mesh.evidence import surface_evidence
+from pipeline.mesh.evidence import surface_evidence, with_emptiness
 from pipeline.mesh.face_reduction import reduce_faces
 from pipeline.mesh.fairing import fair_surface
 from pipeline.mesh.field_views import render_field_views
@@ -199,7 +199,8 @@ def starting_mesh(
 
     body, train, settings = inputs.body, inputs.train, inputs.settings
     samples = sample_canonical_grid(density_fn, occupancy.occupied_bounds_m(), body, voxel_size_m, settings)
-    evidence = surface_evidence(body, [train[k] for k in evenly_spaced(len(train), EVIDENCE_FRAMES)])
+    witnesses = [train[k] for k in evenly_spaced(len(train), EVIDENCE_FRAMES)]
+    samples, evidence = with_emptiness(samples, body, witnesses), surface_evidence(body, witnesses)
     extracted = extract_initial_mesh(samples, body, evidence, inputs.validation or train, settings)
     return remesh_to_edge_length(extracted, inputs.target_edge_m, body)
 

@@ -1,12 +1,15 @@
 """The space between the legs, where frames show little: strands and ridges are cleared, valleys are closed.
 
 Grids are samples of canonical space: origin_m is the position of sample [0, 0, 0], spacing_m the distance of
-neighbours; body_distance_m is the signed distance to the fitted body, negative inside.
+neighbours; body_distance_m is the signed distance to the fitted body, negative inside. crotch_m is the height of its
+crotch (`crotch_height_m`).
 """
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
+
+from pipeline.body.body import Body
 
 MAX_STRAND_AREA_M2 = 0.002
 """Horizontal cross-section up to which a piece between the legs that holds no leg is a strand, m²: 4.5 cm squared. That
@@ -19,6 +22,12 @@ VALLEY_RADIUS_M, VALLEY_SIGMA_M = 0.03, 0.012
 """Valleys at the crotch that a disc of this radius cannot enter are closed, and what closes them is smoothed."""
 VALLEY_RISE_M = 0.02
 """Height over the lowest slice that joins the legs from which on a valley is closed altogether."""
+LEGS = (("LeftUpLeg", "LeftLeg"), ("RightUpLeg", "RightLeg"))
+"""Joints of hip and knee."""
+CROTCH_SHARE = 0.25
+"""Distance of the crotch below the hip joints, as a share of the thigh; 0.23 to 0.28 in three fitted bodies."""
+SKIRT_RADIUS_M = 0.06
+"""Gaps in a skirt that a horizontal disc of this radius cannot enter are closed."""
 MIN_JOINED_M, MAX_JOINED_M = 0.03, 0.15
 """Legs that are joined over less than the first height below the crotch of the body have no valley; cloth that joins
 them over more than the second is a skirt."""
@@ -27,19 +36,29 @@ VALLEY_HALF_WIDTH_M, VALLEY_HEIGHT_M, VALLEY_FADE_M = 0.05, 0.04, 0.04
 fades over a distance."""
 
 
+def crotch_height_m(body: Body) -> float:
+    """Return the height (y, canonical) of the crotch, m; that of the lowest vertex for a body without legs.
+
+    It follows from the joints, because thighs that were filmed side by side touch each other farther down.
+    """
+    if not {joint for leg in LEGS for joint in leg} <= set(body.joint_names):
+        return float(body.vertices[:, 1].min())
+    hips_m, knees_m = (np.mean([body.joints_m[body.joint(leg[part]), 1] for leg in LEGS]) for part in (0, 1))
+    return float(hips_m - CROTCH_SHARE * (hips_m - knees_m))
+
+
 def _middle_and_crotch(
-    body: Bool[np.ndarray, "x y z"], origin_m: Float[np.ndarray, "3"], spacing_m: float
+    shape: tuple[int, ...], crotch_m: float, origin_m: Float[np.ndarray, "3"], spacing_m: float
 ) -> tuple[int, int]:
-    """Return the column of x = 0, and the lowest row in which the body is in it; 0 without a body there."""
-    middle = round(-origin_m[0] / spacing_m)
-    if not 0 < middle < len(body):
-        return 0, 0
-    return middle, int(np.argmax(body[middle].any(axis=1)))
+    """Return the column of x = 0 and the row of the crotch; 0 and 0 where the grid has not both."""
+    middle, crotch = round(-origin_m[0] / spacing_m), round((crotch_m - origin_m[1]) / spacing_m)
+    return (middle, crotch) if 0 < middle < shape[0] and 0 < crotch < shape[1] else (0, 0)
 
 
 def excess_between_legs(
     inside: Bool[np.ndarray, "x y z"],
     body_distance_m: Float[np.ndarray, "x y z"],
+    crotch_m: float,
     origin_m: Float[np.ndarray, "3"],
     spacing_m: float,
 ) -> Bool[np.ndarray, "x y z"]:
@@ -53,7 +72,7 @@ def excess_between_legs(
     """
     excess = np.zeros_like(inside)
     body = body_distance_m < 0.0
-    middle, crotch = _middle_and_crotch(body, origin_m, spacing_m)
+    middle, crotch = _middle_and_crotch(inside.shape, crotch_m, origin_m, spacing_m)
     for row in range(crotch):
         legs = [np.flatnonzero(body[part, row].any(axis=1)) for part in (np.s_[:middle], np.s_[middle:])]
         if all(len(leg) > 0 for leg in legs):
@@ -91,9 +110,41 @@ def _excess_in_slice(
     return excess
 
 
+def gaps_in_skirt(
+    inside: Bool[np.ndarray, "x y z"],
+    body_distance_m: Float[np.ndarray, "x y z"],
+    crotch_m: float,
+    origin_m: Float[np.ndarray, "3"],
+    spacing_m: float,
+) -> Bool[np.ndarray, "x y z"]:
+    """Return holes and notches of a skirt or coat: cloth that joins both legs over more than `MAX_JOINED_M`.
+
+    Frames hardly show its depth between the legs, where it is far from the body. In each horizontal slice from the
+    crotch down to where the legs part, the piece that holds both is closed by a disc of `SKIRT_RADIUS_M`.
+    """
+    gaps, body = np.zeros_like(inside), body_distance_m < 0.0
+    middle, crotch = _middle_and_crotch(inside.shape, crotch_m, origin_m, spacing_m)
+    pieces = []
+    for row in range(crotch - 1, -1, -1):
+        labels, _ = ndimage.label(inside[:, row], np.ones((3, 3), dtype=int))
+        legs = np.where(body[:, row], labels, 0)
+        joined = np.intersect1d(legs[:middle], legs[middle:])
+        if not joined.any():
+            break
+        pieces.append(np.isin(labels, joined[joined > 0]))
+    if spacing_m * len(pieces) < MAX_JOINED_M:
+        return gaps
+    padding = int(np.ceil(SKIRT_RADIUS_M / spacing_m)) + 1
+    for row, piece in zip(range(crotch - 1, -1, -1), pieces, strict=False):
+        outside_m = spacing_m * ndimage.distance_transform_edt(~np.pad(piece, padding))
+        closed = spacing_m * ndimage.distance_transform_edt(outside_m <= SKIRT_RADIUS_M) > SKIRT_RADIUS_M
+        gaps[:, row] = closed[padding:-padding, padding:-padding] & ~inside[:, row]
+    return gaps
+
+
 def close_valleys(
     distance_m: Float[np.ndarray, "x y z"],
-    body_distance_m: Float[np.ndarray, "x y z"],
+    crotch_m: float,
     origin_m: Float[np.ndarray, "3"],
     spacing_m: float,
 ) -> Float[np.ndarray, "x y z"]:
@@ -105,7 +156,7 @@ def close_valleys(
 
     distance_m: of the solid, negative inside.
     """
-    middle, crotch = _middle_and_crotch(body_distance_m < 0.0, origin_m, spacing_m)
+    middle, crotch = _middle_and_crotch(distance_m.shape, crotch_m, origin_m, spacing_m)
     is_apart = (distance_m[middle] >= 0.0).all(axis=1)[:crotch]
     lowest = int(np.flatnonzero(is_apart)[-1]) + 1 if is_apart.any() else 0
     joined_m = spacing_m * (crotch - lowest)

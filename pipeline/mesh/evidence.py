@@ -2,18 +2,24 @@
 
 Where frames do not show a surface, or at grazing angles only, the density there is arbitrary: clothes on the back of a
 person filmed from the front, the neck under the chin, soles, armpits. Where all frames show it from nearly the same
-side, its depth is arbitrary.
+side, its depth is arbitrary. Density that a frame cannot see, because another part of the body takes the rays there, is
+arbitrary too; the masks of many frames together tell where nothing is.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from pipeline.body.body import Body
 from pipeline.geometry.camera import project
 from pipeline.kernels.raster import rasterize
+from pipeline.mesh.between_legs import gaps_in_skirt
+from pipeline.mesh.isosurface import CanonicalGrid, upsample
 from pipeline.mesh.views import PosedView
 from pipeline.texture.views import vertex_view_cosine
 
@@ -25,6 +31,15 @@ ENOUGH_SPREAD = 0.04
 the depth of a vertex. A full turn has 0.15, an arc of 90 degrees 0.08, of 40 degrees 0.02."""
 DEPTH_SHARE = 0.5
 """Part of its evidence that a vertex loses whose depth no frame tells: its outline is seen all the same."""
+CONTRADICTED_SHARE = 0.15
+"""Share of the frames in which a point lies beside the person from which on nothing is there: strands below a wide
+skirt have 0.3 and more, the surface of four people hardly anywhere more than 0.1."""
+EMPTY_MASK = 0.25
+"""A pixel with less than this alpha is beside the person."""
+CLOSE_TO_BODY_M = 0.01
+"""Nothing is cleared up to this distance from the body: poses err by as much."""
+MIN_DENSITY_PER_M = 2.0
+"""Less density is nothing already: a quarter of the smallest isovalue."""
 DEPTH_TOLERANCE_M = 0.02
 """Distance behind the nearest surface up to which a vertex is visible."""
 
@@ -56,3 +71,35 @@ def surface_evidence(body: Body, views: Sequence[PosedView]) -> Float[np.ndarray
     seen = (total / len(views) / ENOUGH_EVIDENCE).clamp(0.0, 1.0)
     depth = (spread / ENOUGH_SPREAD).clamp(0.0, 1.0)
     return (seen * (1.0 - DEPTH_SHARE * (1.0 - depth))).numpy()
+
+
+def share_beside_masks(
+    points_m: Float[np.ndarray, "n 3"], body: Body, views: Sequence[PosedView]
+) -> Float[np.ndarray, "n"]:
+    """Return the share of the views in which a canonical point lies beside the mask, in [0, 1].
+
+    Points move with the nearest body vertex. Where a point is outside the picture, the view does not say.
+    """
+    weights = torch.from_numpy(body.skin_weights[cKDTree(body.vertices).query(points_m)[1]])
+    points, count = torch.from_numpy(points_m).float(), torch.zeros(len(points_m))
+    for view in views:
+        camera = view.camera
+        column, row = project(view.pose_vertices(points, weights), camera)[0].floor().long().unbind(dim=1)
+        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        count[inside] += (view.mask[row[inside], column[inside]] < 255.0 * EMPTY_MASK).float()
+    return (count / max(1, len(views))).numpy()
+
+
+def with_emptiness(samples: CanonicalGrid, body: Body, views: Sequence[PosedView]) -> CanonicalGrid:
+    """Return the grid with the emptiness that the masks tell, decided for every second sample.
+
+    views: at least one.
+    """
+    coarse = samples.downsampled()
+    solid = (coarse.density > MIN_DENSITY_PER_M) | (coarse.body_distance_m < 0.0)
+    solid |= gaps_in_skirt(solid, coarse.body_distance_m, coarse.crotch_m, coarse.origin_m, coarse.spacing_m)
+    candidates = ndimage.binary_dilation(solid) & (coarse.body_distance_m > CLOSE_TO_BODY_M)
+    emptiness = np.zeros(candidates.shape)
+    points_m = np.argwhere(candidates) * coarse.spacing_m + coarse.origin_m
+    emptiness[candidates] = share_beside_masks(points_m, body, views) > CONTRADICTED_SHARE
+    return replace(samples, emptiness=upsample(emptiness, samples.density.shape))

@@ -102,7 +102,7 @@ def fair_surface(
     offset_m = smooth_with_local_sigma(surface_m - reference_m, offset_sigma_m, coarse.spacing_m, weight)
     shape = samples.density.shape
     value_m = upsample(reference_m, shape) + upsample(offset_m, shape) * (1.0 - samples.hand_weight)
-    value_m = close_valleys(value_m, samples.body_distance_m, samples.origin_m, samples.spacing_m)
+    value_m = close_valleys(value_m, samples.crotch_m, samples.origin_m, samples.spacing_m)
     fine_detail = upsample(detail, shape)
     near_detail = (np.abs(value_m) < DETAIL_BAND_M) & (fine_detail > MIN_DETAIL)
     exact_m = signed_distance_m(np.argwhere(near_detail) * samples.spacing_m + samples.origin_m, outer_surface)

@@ -22,7 +22,7 @@ from pipeline.body.body import Body
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import isosurface, largest_solid, repair, signed_distance_m
 from pipeline.kernels.common.thread_pool import shared_thread_pool
-from pipeline.mesh.between_legs import excess_between_legs
+from pipeline.mesh.between_legs import crotch_height_m, excess_between_legs, gaps_in_skirt
 from pipeline.mesh.settings import MeshSettings
 
 BODY_PADDING_VOXELS = 4
@@ -43,6 +43,8 @@ class CanonicalGrid:
 
     origin_m: position of sample [0, 0, 0]. spacing_m: distance of neighbouring samples. density: 1/m. body_distance_m:
     signed distance to the fitted body, negative inside. hand_weight: skin weight of the hand joints, in [0, 1].
+    crotch_m: height of the crotch of the body. emptiness: 1 where nothing is whatever the density, 0 elsewhere, see
+    `pipeline.mesh.evidence`.
     """
 
     origin_m: Float[np.ndarray, "3"]
@@ -50,11 +52,16 @@ class CanonicalGrid:
     density: Float[np.ndarray, "x y z"]
     body_distance_m: Float[np.ndarray, "x y z"]
     hand_weight: Float[np.ndarray, "x y z"]
+    crotch_m: float
+    emptiness: Float[np.ndarray, "x y z"]
 
     def downsampled(self) -> CanonicalGrid:
         """Return the grid with every second sample."""
-        grids = (grid[::2, ::2, ::2] for grid in (self.density, self.body_distance_m, self.hand_weight))
-        return CanonicalGrid(self.origin_m, 2.0 * self.spacing_m, *grids)
+        density, body_distance_m, hand_weight, emptiness = (
+            grid[::2, ::2, ::2] for grid in (self.density, self.body_distance_m, self.hand_weight, self.emptiness)
+        )
+        spacing_m = 2.0 * self.spacing_m
+        return CanonicalGrid(self.origin_m, spacing_m, density, body_distance_m, hand_weight, self.crotch_m, emptiness)
 
 
 def sample_canonical_grid(
@@ -92,7 +99,8 @@ def sample_canonical_grid(
         narrow_band = np.abs(distance_m) < HAND_NARROW_BAND_VOXELS * voxel_size_m
         exact = np.argwhere((hand_weight > 0.0) & narrow_band)
         distance_m[tuple(exact.T)] = signed_distance_m(exact * voxel_size_m + origin_m, mesh)
-    return CanonicalGrid(origin_m, voxel_size_m, density, distance_m, hand_weight)
+    emptiness, crotch_m = np.zeros_like(density), crotch_height_m(body)
+    return CanonicalGrid(origin_m, voxel_size_m, density, distance_m, hand_weight, crotch_m, emptiness)
 
 
 def _density_grid(
@@ -135,11 +143,9 @@ def indicator_grid(samples: CanonicalGrid, isovalue_per_m: float, settings: Mesh
     value = np.maximum(density_indicator, core)
     value = np.maximum(value, _close_concavities(value >= SURFACE_ISOVALUE, samples, settings.closing_radius_m))
     value += samples.hand_weight * (hand - value)
-    value = np.where(
-        excess_between_legs(value >= SURFACE_ISOVALUE, samples.body_distance_m, samples.origin_m, samples.spacing_m),
-        0.0,
-        value,
-    )
+    value = np.maximum(value, _close_skirt(value >= SURFACE_ISOVALUE, samples)) * (1.0 - samples.emptiness)
+    legs = samples.body_distance_m, samples.crotch_m, samples.origin_m, samples.spacing_m
+    value = np.where(excess_between_legs(value >= SURFACE_ISOVALUE, *legs), 0.0, value)
     inside = largest_solid(value >= SURFACE_ISOVALUE)
     # Filled cavities become 1; other components become empty.
     filled = np.maximum(value, np.where(value < SURFACE_ISOVALUE, 1.0, value))
@@ -235,6 +241,16 @@ def _close_concavities(
     closed = spacing_m * ndimage.distance_transform_edt(outside_m <= radius_m) > radius_m
     filled = closed & (samples.body_distance_m[::2, ::2, ::2] < 0.0)
     return upsample(ndimage.gaussian_filter(filled.astype(np.float64), 0.7), samples.density.shape)
+
+
+def _close_skirt(inside: Bool[np.ndarray, "x y z"], samples: CanonicalGrid) -> Float[np.ndarray, "x y z"]:
+    """Return an indicator in [0, 1] of the gaps in a skirt, see `gaps_in_skirt`; computed on every second sample."""
+    coarse, solid = samples.downsampled(), inside[::2, ::2, ::2]
+    gaps = gaps_in_skirt(solid, coarse.body_distance_m, coarse.crotch_m, coarse.origin_m, coarse.spacing_m)
+    if not gaps.any():
+        return np.zeros(inside.shape, dtype=np.float32)
+    near = ndimage.binary_dilation(gaps, iterations=2)
+    return upsample(near * ndimage.gaussian_filter((solid | gaps).astype(np.float64), 0.7), inside.shape)
 
 
 def upsample(grid: Float[np.ndarray, "a b c"], shape: tuple[int, ...]) -> Float[np.ndarray, "x y z"]:

@@ -2,19 +2,19 @@
 
 import numpy as np
 
-from pipeline.mesh.between_legs import VALLEY_RADIUS_M, close_valleys, excess_between_legs
+from pipeline.mesh.between_legs import VALLEY_RADIUS_M, close_valleys, excess_between_legs, gaps_in_skirt
 
 LEG_X_M, LEG_RADIUS_M, CROTCH_M = 0.12, 0.06, 0.5
 GRID_M = 0.005
 
 
-def leg_grid() -> tuple[tuple[np.ndarray, np.ndarray, float], tuple[np.ndarray, ...]]:
-    """Two vertical legs, which are one trunk above the crotch: body distance, origin and spacing; coordinates."""
+def leg_grid() -> tuple[tuple[np.ndarray, float, np.ndarray, float], tuple[np.ndarray, ...]]:
+    """Two vertical legs, which are one trunk above the crotch: body distance, crotch, origin, spacing; coordinates."""
     axes = np.arange(-0.3, 0.3001, GRID_M), np.arange(0.0, 0.6001, GRID_M), np.arange(-0.2, 0.2001, GRID_M)
     x, y, z = np.meshgrid(*axes, indexing="ij")
     legs_m = np.hypot(np.abs(x) - LEG_X_M, z) - LEG_RADIUS_M
     trunk_m = np.maximum(np.hypot(x, z) - 0.18, CROTCH_M - y)
-    return (np.minimum(legs_m, trunk_m), np.array([axis[0] for axis in axes]), GRID_M), (x, y, z)
+    return (np.minimum(legs_m, trunk_m), CROTCH_M, np.array([axis[0] for axis in axes]), GRID_M), (x, y, z)
 
 
 def test_strands_and_ridges_between_legs_are_excess() -> None:
@@ -76,7 +76,7 @@ def joined_trousers(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
 def test_a_valley_between_joined_legs_is_closed() -> None:
     grid, (x, y, z) = leg_grid()
     before_m = joined_trousers(x, y, z)
-    after_m = close_valleys(before_m, *grid)
+    after_m = close_valleys(before_m, *grid[1:])
     in_slit = (np.abs(x) < 0.006) & (y > 0.43) & (y < 0.52) & (z > 0.02) & (z < 0.05)
     assert (before_m[in_slit] > 0.0).all()
     assert (after_m[in_slit] < 0.0).all()
@@ -89,7 +89,7 @@ def test_a_valley_between_joined_legs_is_closed() -> None:
 def test_legs_apart_stay_apart() -> None:
     grid, (x, y, z) = leg_grid()
     apart_m = grid[0] - 0.01
-    after_m = close_valleys(apart_m, *grid)
+    after_m = close_valleys(apart_m, *grid[1:])
     far_below = y < CROTCH_M - 0.01 - VALLEY_RADIUS_M
     middle = np.abs(x) < 0.02
     assert (after_m[far_below & middle] > 0.0).all()
@@ -98,10 +98,36 @@ def test_legs_apart_stay_apart() -> None:
 def test_a_skirt_has_no_valleys() -> None:
     grid, (x, y, z) = leg_grid()
     skirt_m = np.maximum(np.hypot(x, 1.5 * z) - 0.22, 0.1 - y)
-    assert close_valleys(skirt_m, *grid) is skirt_m
+    assert close_valleys(skirt_m, *grid[1:]) is skirt_m
 
 
 def test_a_solid_without_legs_has_no_valleys() -> None:
     grid, (x, y, z) = leg_grid()
     far_m = np.hypot(x - 0.2, z) - 0.05
-    assert close_valleys(far_m, far_m, *grid[1:]) is far_m
+    assert close_valleys(far_m, 0.0, *grid[2:]) is far_m
+
+
+def pierced_skirt(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A skirt down to 0.1 m with a hole in front and a notch in its hem behind: what is left, the hole, the notch."""
+    skirt = (np.hypot(x, 1.5 * z) < 0.24) & (y > 0.1)
+    hole = (np.hypot(x - 0.03, y - 0.3) < 0.02) & (z > 0.1)
+    notch = (np.abs(x) < 0.02) & (y < 0.18) & (z < -0.06)
+    return skirt & ~hole & ~notch, hole & skirt, notch & skirt
+
+
+def test_holes_and_notches_of_a_skirt_are_gaps() -> None:
+    grid, coordinates = leg_grid()
+    inside, hole, notch = pierced_skirt(*coordinates)
+    gaps = gaps_in_skirt(inside | (grid[0] < 0.0), *grid)
+    assert gaps[hole].mean() > 0.9  # the disc leaves corners
+    assert gaps[notch].mean() > 0.9
+    # Outlines stay, and a skirt without gaps has none.
+    assert not gaps[~(hole | notch)].any()
+    assert not gaps_in_skirt(inside | hole | notch, *grid).any()
+
+
+def test_trousers_have_no_gaps_of_a_skirt() -> None:
+    """Neither legs apart nor trouser legs that touch each other over 13 cm are a skirt."""
+    grid, coordinates = leg_grid()
+    assert not gaps_in_skirt(grid[0] < 0.01, *grid).any()
+    assert not gaps_in_skirt(joined_trousers(*coordinates) < 0.0, *grid).any()

@@ -1,5 +1,7 @@
 """Evidence: what frames show, from which side, and how much of a full turn is enough."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,9 +9,10 @@ import torch
 from pipeline.body.body import Body
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.rotation import axis_angle_to_matrix
-from pipeline.mesh.evidence import DEPTH_SHARE, surface_evidence
+from pipeline.mesh.evidence import CONTRADICTED_SHARE, DEPTH_SHARE, share_beside_masks, surface_evidence, with_emptiness
+from pipeline.mesh.isosurface import sample_canonical_grid
 from pipeline.mesh.views import PosedView
-from tests.mesh.capsule import capsule_body
+from tests.mesh.capsule import BOUNDS_M, SETTINGS, VOXEL_SIZE_M, capsule_body, capsule_distance, shell_density
 
 CAMERA, DISTANCE_M = Camera(600.0, 600.0, 80.0, 60.0, 160, 120), 3.0
 
@@ -62,3 +65,33 @@ def test_evidence_is_the_mean_squared_cosine(body: Body) -> None:
     """Two views in 80 from the front, the others from behind: the middle of the front has 1/40 cos², half of enough."""
     evidence = surface_evidence(body, [view_from(-0.6), view_from(0.6), *[view_from(np.pi)] * 78])
     assert evidence[height_on_side(body) > 0.97].mean() == pytest.approx(0.5 * np.cos(0.6) ** 2, abs=0.05)
+
+
+def masked_view_from(angle_rad: float, radius_m: float = 0.15) -> PosedView:
+    """The view with the mask of a capsule of that radius, which looks the same from all sides."""
+    view, rows = view_from(angle_rad), np.arange(CAMERA.height)[:, None]
+    x_m = (np.arange(CAMERA.width)[None] + 0.5 - CAMERA.cx) * DISTANCE_M / CAMERA.fx
+    y_m = (rows + 0.5 - CAMERA.cy) * DISTANCE_M / CAMERA.fy
+    covered = capsule_distance(np.stack(np.broadcast_arrays(x_m, 0.5 - y_m, 0.0), axis=-1)) < radius_m
+    return replace(view, mask=torch.from_numpy(255 * covered.astype(np.uint8)))
+
+
+def test_a_point_beside_some_masks_has_their_share(body: Body) -> None:
+    """20 cm above the axis of the capsule, towards the camera in two of the four views."""
+    views = [masked_view_from(0.5 * np.pi * k) for k in range(4)]
+    points_m = np.array([[0.0, 0.7, 0.0], [0.0, 0.5, 0.2], [0.0, 0.55, 0.0], [3.0, 0.7, 0.0]])
+    np.testing.assert_array_equal(share_beside_masks(points_m, body, views), [0.5, 0.5, 0.0, 0.0])
+
+
+def test_density_that_masks_contradict_is_empty(body: Body) -> None:
+    """The shell reaches 0.14 m from the axis, the floater 0.23 m; masks reach 0.15 m."""
+    samples = sample_canonical_grid(shell_density, BOUNDS_M, body, 0.5 * VOXEL_SIZE_M, SETTINGS)
+    views = [masked_view_from(2.0 * np.pi * k / 12) for k in range(12)]
+    emptiness = with_emptiness(samples, body, views).emptiness
+    indices = np.argwhere(samples.density > 0.0)
+    distance_m = capsule_distance(indices * samples.spacing_m + samples.origin_m)
+    found = emptiness[tuple(indices.T)]
+    assert found[distance_m > 0.2].mean() > 0.9
+    assert found[distance_m < 0.13].max() == 0.0
+    few = [*views[:1], *[masked_view_from(0.0, 1.0)] * round(1.0 / CONTRADICTED_SHARE)]
+    assert not with_emptiness(samples, body, few).emptiness.any()
