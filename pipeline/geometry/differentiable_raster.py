@@ -92,10 +92,15 @@ def render_pixels(
     adjacency: Int[Tensor, "f 3"] | None = None,
     wanted: Bool[Tensor, "h w"] | None = None,
 ) -> RenderedPixels:
-    """Do `render_shaded` at the silhouettes, and at those other covered pixels that are wanted (default: all)."""
+    """Do `render_shaded` at the silhouettes, and at those other covered pixels that are wanted (default: all).
+
+    Of a closed mesh, whose faces are counter-clockwise seen from outside, only those that face the camera are drawn.
+    """
     vertices_px, depth_m = project(vertices_world, camera)
-    face_id, _, depth = rasterize(vertices_px, depth_m, faces, camera.height, camera.width)
     adjacency = face_adjacency(faces) if adjacency is None else adjacency
+    is_closed = bool((adjacency >= 0).all())
+    size = camera.height, camera.width
+    face_id, _, depth = rasterize(vertices_px, depth_m, faces, *size, cull_backfaces=is_closed)
     blends = silhouette_blends(face_id, depth, vertices_px, depth_m, faces, adjacency)
     flat_face_id = face_id.reshape(-1)
     is_covered, at_silhouette = flat_face_id >= 0, torch.zeros(face_id.numel(), dtype=torch.bool, device=face_id.device)

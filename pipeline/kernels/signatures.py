@@ -24,6 +24,7 @@ from pipeline.kernels.kinematics import cpu as kinematics
 from pipeline.kernels.march import cpu as march
 from pipeline.kernels.pixel_sampling import cpu as pixel_sampling_cpu
 from pipeline.kernels.raster import cpu as raster
+from pipeline.kernels.raster import silhouette_cpu
 from pipeline.kernels.ray_losses import cpu as ray_losses
 from pipeline.kernels.texel_projection import cpu as texel_projection
 from pipeline.kernels.texture_sampling import cpu as texture_sampling
@@ -105,6 +106,8 @@ SIGNATURES: tuple[tuple[Any, tuple[Any, ...]], ...] = (
     (inverse_skinning.bake_warp_grid, (F4_2D, SKIN, POSED_GRID)),
     # mesh
     (raster.silhouette_edges_cpu, (F4_2D, I8_2D, I8_2D)),
+    (silhouette_cpu.add_fraction_gradient, (I8_2D, F4_2D, F4_1D, I8)),
+    (silhouette_cpu.silhouette_blends_cpu, (I4_2D, F4_2D, F4_2D, F4_1D, I8_2D)),
     (interpolate.interpolate_backward, (I8_1D, I4_1D, I8, F4_2D, F4_1D, I8_2D, F4_2D, F4_2D)),
     (interpolate.interpolate_forward, (I8_1D, I4_1D, I8, F4_2D, F4_1D, I8_2D, F4_2D)),
     (hashgrid.find_nonzero_rows, (F4_2D,)),

@@ -9,7 +9,7 @@ import trimesh
 from torch import Tensor
 
 from pipeline.geometry.differentiable_raster import face_adjacency
-from pipeline.kernels.raster import antialias, rasterize, silhouette_blends
+from pipeline.kernels.raster import antialias, rasterize, reference, silhouette_blends
 from pipeline.kernels.raster.cpu import silhouette_edges_cpu
 from pipeline.kernels.raster.reference import rasterize_reference, silhouette_edges
 
@@ -233,3 +233,29 @@ def test_compiled_silhouette_edges_are_those_of_the_reference() -> None:
     assert int((adjacency < 0).sum()) > 0
     assert len(expected) > 100
     np.testing.assert_array_equal(compiled, expected.numpy())
+
+
+def test_compiled_blends_and_their_gradient_are_those_of_the_reference() -> None:
+    """A crumpled torus at changing depths, partly outside the picture and with a corner behind the camera."""
+    torus = trimesh.creation.torus(1.0, 0.4)
+    generator = torch.Generator().manual_seed(0)
+    points = torch.from_numpy(torus.vertices[:, :2]).float() * 0.3 * HEIGHT + torch.tensor([0.3 * WIDTH, 0.5 * HEIGHT])
+    points += torch.randn(points.shape, generator=generator)
+    depth_m = 2.0 + torch.from_numpy(torus.vertices[:, 2]).float()
+    depth_m[5] = -1.0
+    faces = torch.from_numpy(torus.faces[7:])
+    adjacency = face_adjacency(faces)
+    face_id, _, depth = rasterize(points, depth_m, faces, HEIGHT, WIDTH)
+    edges = silhouette_edges(points, faces, adjacency)
+    twins = [points.clone().requires_grad_() for _ in range(2)]
+    compiled = silhouette_blends(face_id, depth, twins[0], depth_m, faces, adjacency)
+    expected = reference.silhouette_blends(face_id, depth, twins[1], depth_m, edges)
+    assert len(expected.target) > 100
+    for name in ("target", "near", "far"):
+        assert torch.equal(getattr(compiled, name), getattr(expected, name))
+    torch.testing.assert_close(compiled.fraction, expected.fraction, rtol=1e-4, atol=1e-5)
+    upstream = torch.randn(len(expected.fraction), generator=generator)
+    for blends in (compiled, expected):
+        (blends.fraction * upstream).sum().backward()
+    assert float(twins[1].grad.abs().max()) > 1.0
+    torch.testing.assert_close(twins[0].grad, twins[1].grad, rtol=1e-3, atol=1e-3)

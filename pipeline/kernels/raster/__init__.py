@@ -1,5 +1,7 @@
 """Rasterisation of triangle meshes by z-buffer, and differentiable antialiasing of silhouettes."""
 
+from typing import Any
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -8,6 +10,7 @@ from pipeline.kernels.common.dispatch import runs_on_numba
 from pipeline.kernels.raster import reference
 from pipeline.kernels.raster.cpu import rasterize_cpu, silhouette_edges_cpu
 from pipeline.kernels.raster.reference import SilhouetteBlends, rasterize_reference, silhouette_edges
+from pipeline.kernels.raster.silhouette_cpu import add_fraction_gradient, silhouette_blends_cpu
 
 
 def rasterize(
@@ -75,12 +78,32 @@ def silhouette_blends(
         adjacency: face across edge k = (corner k, corner k + 1), -1 if there is none
             (`pipeline.geometry.differentiable_raster.face_adjacency`).
     """
-    if runs_on_numba(vertices_px, depth_m):
-        arrays = [tensor.detach().contiguous().numpy() for tensor in (vertices_px, faces, adjacency)]
-        edges = torch.from_numpy(silhouette_edges_cpu(*arrays))
-    else:
+    if not runs_on_numba(vertices_px, depth_m):
         edges = silhouette_edges(vertices_px.detach(), faces.long(), adjacency.long())
-    return reference.silhouette_blends(face_id, depth, vertices_px, depth_m, edges)
+        return reference.silhouette_blends(face_id, depth, vertices_px, depth_m, edges)
+    edges = silhouette_edges_cpu(*(part.detach().contiguous().numpy() for part in (vertices_px, faces, adjacency)))
+    fraction, pixels = _Fractions.apply(vertices_px, depth_m, face_id, depth, edges)
+    return SilhouetteBlends(*pixels.unbind(1), fraction)
+
+
+class _Fractions(torch.autograd.Function):
+    """Fractions of the blends, differentiable in the vertices, and their pixels (target, near, far)."""
+
+    @staticmethod
+    def forward(
+        context: Any, vertices_px: Tensor, depth_m: Tensor, face_id: Tensor, depth: Tensor, edges: Any
+    ) -> tuple[Tensor, Tensor]:
+        arrays = [tensor.detach().contiguous().numpy() for tensor in (face_id, depth, vertices_px, depth_m)]
+        pixels, fraction, *context.linear = silhouette_blends_cpu(*arrays, edges)
+        context.vertex_count = len(vertices_px)
+        result = torch.from_numpy(fraction), torch.from_numpy(pixels)
+        context.mark_non_differentiable(result[1])
+        return result
+
+    @staticmethod
+    def backward(context: Any, gradient: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+        total = add_fraction_gradient(*context.linear, gradient.contiguous().numpy(), context.vertex_count)
+        return torch.from_numpy(total), None, None, None, None
 
 
 def antialias(values: Float[Tensor, "n c"], blends: SilhouetteBlends) -> Float[Tensor, "n c"]:
