@@ -32,6 +32,8 @@ from pipeline.geometry.skinning import top_k_weights
 from pipeline.geometry.surface import resolve_self_intersections
 from pipeline.io.image import write_rgb
 from pipeline.kernels.common.determinism import deterministic_sums
+from pipeline.kernels.common.opencv_threads import single_threaded_opencv
+from pipeline.kernels.common.thread_pool import shared_thread_pool
 from pipeline.mesh.evidence import surface_evidence, with_emptiness
 from pipeline.mesh.face_reduction import reduce_faces
 from pipeline.mesh.fairing import fair_surface
@@ -271,10 +273,15 @@ def load_views(
     """Load crops of the frames at these positions, in their poses of the motion."""
     camera = load_camera(inputs["body"] / "camera.npz")
     poses = canonical_to_world(body, motion.select(positions))
-    return [
-        crop_posed_view(capture.image(k), capture.mask(k), camera, pose, max_person_px)
-        for k, pose in zip(track(positions.tolist(), "reading frames"), poses, strict=True)
-    ]
+
+    pool = shared_thread_pool(torch.get_num_threads())
+
+    def load_view(row: int) -> PosedView:
+        frame = capture.image(positions[row]), capture.mask(positions[row])
+        return crop_posed_view(*frame, camera, poses[row], max_person_px)
+
+    with single_threaded_opencv():
+        return list(track(pool.imap(load_view, range(len(positions))), "reading frames", len(positions)))
 
 
 def align_other_frames(

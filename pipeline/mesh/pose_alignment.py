@@ -25,6 +25,7 @@ from pipeline.body.fit.linear_body import descendant_matrix
 from pipeline.body.pose_correction import PoseCorrection
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.differentiable_raster import render_pixels
+from pipeline.kernels.common.opencv_threads import single_threaded_opencv
 from pipeline.kernels.common.thread_pool import ThreadPool
 from pipeline.kernels.interpolate import interpolate
 from pipeline.mesh.correction_prior import CorrectionPrior
@@ -149,7 +150,8 @@ def align_poses(
 
     for _ in range(iterations):
         poses = offsets.of(body, correction.motion).canonical_to_world(rows)
-        systems = threads.map(evidence_of_view, views, poses)
+        with single_threaded_opencv():
+            systems = threads.map(evidence_of_view, views, poses)
         matrices, vectors = (np.stack(parts) for parts in zip(*systems, strict=True))
         present = np.concatenate([offsets.rotation_rad.flatten(1), offsets.shift_m], axis=1)
         update = prior.solve(matrices, vectors, present)

@@ -83,7 +83,8 @@ def silhouette_blends(
         return reference.silhouette_blends(face_id, depth, vertices_px, depth_m, edges)
     edges = silhouette_edges_cpu(*(part.detach().contiguous().numpy() for part in (vertices_px, faces, adjacency)))
     fraction, pixels = _Fractions.apply(vertices_px, depth_m, face_id, depth, edges)
-    return SilhouetteBlends(*pixels.unbind(1), fraction)
+    target, near, far = pixels.unbind(1)
+    return SilhouetteBlends(target, near, far, fraction)
 
 
 class _Fractions(torch.autograd.Function):
