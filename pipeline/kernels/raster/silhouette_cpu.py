@@ -4,6 +4,8 @@ Notation: an edge runs from start to end, its face lies on the side of the apex.
 lines of pixel centres; t is the fraction of the edge from start to end at a crossing, low the pixel before it.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
@@ -16,9 +18,105 @@ def _first_line(across: float, lines: int) -> int:
     return int(np.ceil(min(max(across - np.float32(0.5), np.float32(0.0)), np.float32(lines))))
 
 
+class BlendArrays(NamedTuple):
+    """Blends as `silhouette_blends_cpu` returns them, with room for more.
+
+    distance: of the crossing from the near pixel, px; negative if another crossing between the same pixels is farther.
+    """
+
+    pixels: np.ndarray
+    fraction: np.ndarray
+    ends: np.ndarray
+    derivatives: np.ndarray
+    distance: np.ndarray
+
+
 @njit(**NJIT_OPTIONS)
-def _cross(ax: float, ay: float, bx: float, by: float) -> float:
-    return ax * by - ay * bx
+def _count_crossings(vertices_px: np.ndarray, edges: np.ndarray, axis: int, lines: int) -> int:
+    """Return the number of crossings of all edges with the lines along an axis."""
+    count = 0
+    for s in range(edges.shape[0]):
+        start, end = vertices_px[edges[s, 0], 1 - axis], vertices_px[edges[s, 1], 1 - axis]
+        count += _first_line(max(start, end), lines) - _first_line(min(start, end), lines)
+    return count
+
+
+@njit(**NJIT_OPTIONS)
+def _pixels_of_crossing(
+    face_id: np.ndarray, depth: np.ndarray, line: int, low: int, axis: int, outward: int, inverse_depth: float
+) -> tuple:
+    """Return the row-major indices of the pixels (near, far) of a crossing; near is -1 if they are not blended."""
+    along_x, along_y = 1 - axis, axis
+    low_x, low_y = (low, line) if axis == 0 else (line, low)
+    near_x, near_y = low_x + along_x * (outward < 0), low_y + along_y * (outward < 0)
+    far_x, far_y = low_x + along_x * (outward > 0), low_y + along_y * (outward > 0)
+    is_seen = (
+        depth[near_y, near_x] < depth[far_y, far_x]
+        and depth[far_y, far_x] * inverse_depth > 1.0
+        and face_id[near_y, near_x] != face_id[far_y, far_x]
+    )
+    width = face_id.shape[1]
+    return (near_y * width + near_x if is_seen else -1), far_y * width + far_x
+
+
+@njit(**NJIT_OPTIONS)
+def _add_along_axis(
+    face_id: np.ndarray,
+    depth: np.ndarray,
+    vertices_px: np.ndarray,
+    depth_m: np.ndarray,
+    edges: np.ndarray,
+    axis: int,
+    blends: BlendArrays,
+    count: int,
+) -> int:
+    """Write the blends along an axis from row `count` on; return the row after the last one."""
+    lines, size = (face_id.shape[0], face_id.shape[1]) if axis == 0 else (face_id.shape[1], face_id.shape[0])
+    half, one = np.float32(0.5), np.float32(1.0)
+    row_of_pair = np.full(face_id.size, -1, np.int64)
+    for s in range(edges.shape[0]):
+        i, j, k = edges[s, 0], edges[s, 1], edges[s, 2]
+        if not (depth_m[i] > 0.0 and depth_m[j] > 0.0 and depth_m[k] > 0.0):
+            continue
+        start_along, start_across = vertices_px[i, axis], vertices_px[i, 1 - axis]
+        along, across = vertices_px[j, axis] - start_along, vertices_px[j, 1 - axis] - start_across
+        first = _first_line(min(start_across, vertices_px[j, 1 - axis]), lines)
+        last = _first_line(max(start_across, vertices_px[j, 1 - axis]), lines)
+        edge_x, edge_y = vertices_px[j, 0] - vertices_px[i, 0], vertices_px[j, 1] - vertices_px[i, 1]
+        apex_x, apex_y = vertices_px[k, 0] - vertices_px[i, 0], vertices_px[k, 1] - vertices_px[i, 1]
+        slope = -edge_y if axis == 0 else edge_x
+        outward = -1 if (edge_x * apex_y - edge_y * apex_x) * slope > 0.0 else 1
+        # Row pairs and column pairs both meet a border: weights by the squared normal add up to one border.
+        weight = slope * slope / (edge_x * edge_x + edge_y * edge_y) * np.float32(outward)
+        inverse_start, inverse_end = one / depth_m[i], one / depth_m[j]
+        for line in range(first, last):
+            t = (np.float32(line) + half - start_across) / across
+            position = start_along + t * along
+            low = int(np.floor(min(max(position - half, np.float32(-2.0)), np.float32(size))))
+            if not (low >= 0 and low < size - 1):
+                continue
+            inverse = inverse_start + t * (inverse_end - inverse_start)
+            near, far = _pixels_of_crossing(face_id, depth, line, low, axis, outward, inverse)
+            if near < 0:
+                continue
+            distance = (position - (np.float32(low + (outward < 0)) + half)) * np.float32(outward)
+            pair = min(near, far)
+            row = row_of_pair[pair]
+            if row >= 0:
+                if not distance > blends.distance[row]:
+                    continue
+                blends.distance[row] = -one
+            row_of_pair[pair] = count
+            blends.distance[count], blends.fraction[count] = distance, (distance - half) * abs(weight)
+            blends.pixels[count, 0] = far if distance > half else near
+            blends.pixels[count, 1], blends.pixels[count, 2] = near, far
+            blends.ends[count, 0], blends.ends[count, 1] = i, j
+            of_start, of_end = weight * (one - t), weight * t
+            blends.derivatives[count, axis], blends.derivatives[count, 2 + axis] = of_start, of_end
+            blends.derivatives[count, 1 - axis] = -of_start * along / across
+            blends.derivatives[count, 3 - axis] = -of_end * along / across
+            count += 1
+    return count
 
 
 @njit(**NJIT_OPTIONS)
@@ -35,83 +133,15 @@ def silhouette_blends_cpu(
         derivatives (n, 4): of the fraction by x and y of start, and by x and y of end.
     """
     height, width = face_id.shape
-    half, one = np.float32(0.5), np.float32(1.0)
-    capacity = 0
-    for s in range(edges.shape[0]):
-        for axis in range(2):
-            start, end = vertices_px[edges[s, 0], 1 - axis], vertices_px[edges[s, 1], 1 - axis]
-            lines = height if axis == 0 else width
-            capacity += _first_line(max(start, end), lines) - _first_line(min(start, end), lines)
-    pixels, fraction = np.empty((capacity, 3), np.int64), np.empty(capacity, np.float32)
-    ends, derivatives = np.empty((capacity, 2), np.int64), np.empty((capacity, 4), np.float32)
-    distances = np.empty(capacity, np.float32)
-    row_of_pixel = np.empty(height * width, np.int64)
+    capacity = _count_crossings(vertices_px, edges, 0, height) + _count_crossings(vertices_px, edges, 1, width)
+    pixels, ends = np.empty((capacity, 3), np.int64), np.empty((capacity, 2), np.int64)
+    fraction, derivatives = np.empty(capacity, np.float32), np.empty((capacity, 4), np.float32)
+    blends = BlendArrays(pixels, fraction, ends, derivatives, np.empty(capacity, np.float32))
     count = 0
     for axis in range(2):
-        row_of_pixel[:] = -1
-        lines, size, step = (height, width, 1) if axis == 0 else (width, height, width)
-        first_row = count
-        for s in range(edges.shape[0]):
-            i, j, k = edges[s, 0], edges[s, 1], edges[s, 2]
-            if not (depth_m[i] > 0.0 and depth_m[j] > 0.0 and depth_m[k] > 0.0):
-                continue
-            start_along, start_across = vertices_px[i, axis], vertices_px[i, 1 - axis]
-            end_along, end_across = vertices_px[j, axis], vertices_px[j, 1 - axis]
-            first = _first_line(min(start_across, end_across), lines)
-            last = _first_line(max(start_across, end_across), lines)
-            if first >= last:
-                continue
-            edge_x, edge_y = vertices_px[j, 0] - vertices_px[i, 0], vertices_px[j, 1] - vertices_px[i, 1]
-            apex_x, apex_y = vertices_px[k, 0] - vertices_px[i, 0], vertices_px[k, 1] - vertices_px[i, 1]
-            slope = -edge_y if axis == 0 else edge_x
-            outward = -1 if _cross(edge_x, edge_y, apex_x, apex_y) * slope > 0.0 else 1
-            # Row pairs and column pairs both meet a border: weights by the squared normal add up to one border.
-            weight = slope * slope / (edge_x * edge_x + edge_y * edge_y) * np.float32(outward)
-            inverse_start, inverse_end = one / depth_m[i], one / depth_m[j]
-            along, across = end_along - start_along, end_across - start_across
-            for line in range(first, last):
-                t = (np.float32(line) + half - start_across) / across
-                position = start_along + t * along
-                inverse = inverse_start + t * (inverse_end - inverse_start)
-                low = int(np.floor(min(max(position - half, np.float32(-2.0)), np.float32(size))))
-                if not (low >= 0 and low < size - 1):
-                    continue
-                low_pixel = line * width + low if axis == 0 else low * width + line
-                near = low_pixel + (step if outward < 0 else 0)
-                far = low_pixel + (step if outward > 0 else 0)
-                near_y, near_x, far_y, far_x = near // width, near % width, far // width, far % width
-                if not (
-                    depth[near_y, near_x] < depth[far_y, far_x]
-                    and depth[far_y, far_x] * inverse > 1.0
-                    and face_id[near_y, near_x] != face_id[far_y, far_x]
-                ):
-                    continue
-                near_position = np.float32(low + 1 if outward < 0 else low) + half
-                distance = (position - near_position) * np.float32(outward)
-                row = row_of_pixel[low_pixel]
-                if row >= 0:
-                    if not distance > distances[row]:
-                        continue
-                    distances[row] = np.float32(-1.0)  # superseded: dropped below
-                row_of_pixel[low_pixel] = count
-                distances[count] = distance
-                moved = distance - half
-                pixels[count, 0] = far if moved > 0.0 else near
-                pixels[count, 1], pixels[count, 2] = near, far
-                fraction[count] = moved * abs(weight)
-                ends[count, 0], ends[count, 1] = i, j
-                ratio = along / across
-                derivatives[count, axis], derivatives[count, 1 - axis] = weight * (one - t), weight * ratio * (t - one)
-                derivatives[count, 2 + axis], derivatives[count, 3 - axis] = weight * t, -weight * ratio * t
-                count += 1
-        kept = first_row
-        for row in range(first_row, count):
-            if distances[row] >= 0.0:
-                pixels[kept], fraction[kept], ends[kept] = pixels[row], fraction[row], ends[row]
-                derivatives[kept] = derivatives[row]
-                kept += 1
-        count = kept
-    return pixels[:count].copy(), fraction[:count].copy(), ends[:count].copy(), derivatives[:count].copy()
+        count = _add_along_axis(face_id, depth, vertices_px, depth_m, edges, axis, blends, count)
+    kept = np.flatnonzero(blends.distance[:count] >= 0.0)
+    return pixels[kept], fraction[kept], ends[kept], derivatives[kept]
 
 
 @njit(**NJIT_OPTIONS)
