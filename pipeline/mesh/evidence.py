@@ -99,7 +99,9 @@ def with_emptiness(samples: CanonicalGrid, body: Body, views: Sequence[PosedView
     solid = (coarse.density > MIN_DENSITY_PER_M) | (coarse.body_distance_m < 0.0)
     solid |= gaps_in_skirt(solid, coarse.body_distance_m, coarse.crotch_m, coarse.origin_m, coarse.spacing_m)
     candidates = ndimage.binary_dilation(solid) & (coarse.body_distance_m > CLOSE_TO_BODY_M)
-    emptiness = np.zeros(candidates.shape)
     points_m = np.argwhere(candidates) * coarse.spacing_m + coarse.origin_m
-    emptiness[candidates] = share_beside_masks(points_m, body, views) > CONTRADICTED_SHARE
-    return replace(samples, emptiness=upsample(emptiness, samples.density.shape))
+    is_empty = np.zeros(candidates.shape, dtype=bool)
+    is_empty[candidates] = share_beside_masks(points_m, body, views) > CONTRADICTED_SHARE
+    # The samples next to what stays are left to the density, which tells the surface more finely.
+    is_empty &= ~ndimage.binary_dilation(solid & ~is_empty)
+    return replace(samples, emptiness=upsample(is_empty.astype(np.float64), samples.density.shape))
