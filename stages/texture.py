@@ -31,6 +31,7 @@ from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.geometry.surface_cut import SurfaceCut
 from pipeline.io.image import to_float, to_uint8
+from pipeline.kernels.common.thread_pool import shared_thread_pool
 from pipeline.mesh.files import MeshArtifact, load_dense_mesh, load_mesh
 from pipeline.template.correspondence import correspond
 from pipeline.template.face.filmed_landmarks import FilmedFaces
@@ -132,8 +133,7 @@ def run(
     positions = usable_positions(capture, inputs["body"]), usable_positions(capture, inputs["body"], VALIDATION)
     train, validation = (load_views(capture, part, inputs, body, skinned, config.max_frames) for part in positions)
     if not train:
-        again = rerun_command("frames", inputs["frames"])
-        raise UserError(f"{inputs['frames']} has no training frames; run {again}")
+        raise UserError(f"{inputs['frames']} has no training frames; run {rerun_command('frames', inputs['frames'])}")
     faces = FilmedFaces.of_capture(capture, positions[0], *load_poses(inputs, body))
     registration = register_person(body, skinned, train, faces, FaceDetector, settings, out / LANDMARKS_CHECKPOINT)
     atlas, size_px, on_template = build_atlas(skinned, body, train, registration, config, settings)
@@ -205,11 +205,14 @@ def load_views(
     vertices = torch.from_numpy(skinned.mesh.vertices)
     weights = skinned.dense_skin_weights(len(body.joint_names))
     faces = torch.from_numpy(skinned.mesh.faces)
-    views = []
-    for k in track(subsample(positions, max_frames).tolist(), "reading frames"):
+
+    def load_view(k: int) -> BakeView:
         posed = linear_blend_skinning(vertices, weights, transforms[k : k + 1])[0]
-        image, mask = to_uint8(capture.image(k)), to_uint8(capture.mask(k))
-        views.append(crop_bake_view(image, mask, camera, posed, faces))
+        return crop_bake_view(to_uint8(capture.image(k)), to_uint8(capture.mask(k)), camera, posed, faces)
+
+    chosen = subsample(positions, max_frames).tolist()
+    loaded = shared_thread_pool(torch.get_num_threads()).imap(load_view, chosen)
+    views = list(track(loaded, "reading frames", len(chosen)))
     return weight_by_resolution(views) if views else []
 
 
@@ -298,12 +301,13 @@ def light_views(
         roughness = None if specular.roughness is None else torch.from_numpy(specular.roughness)
         gloss = VertexGloss(specular.highlights, torch.from_numpy(specular.strength), roughness)
 
-    def shade(view: BakeView, frame: int) -> Float[Tensor, "v d"]:
+    def shaded(view: BakeView, frame: int) -> BakeView:
+        at = view.vertices_world, faces, frame
         if gloss is None:
-            return light.shade_vertices(view.vertices_world, faces, frame)
-        return light.shade_specular(view.vertices_world, faces, frame, gloss, view.camera.centre_m())
+            return replace(view, shading=light.shade_vertices(*at))
+        return replace(view, shading=light.shade_specular(*at, gloss, view.camera.centre_m()))
 
-    return [replace(view, shading=shade(view, int(position))) for view, position in zip(views, positions, strict=True)]
+    return shared_thread_pool(torch.get_num_threads()).map(shaded, views, positions.tolist())
 
 
 def vertex_map(values: Float[np.ndarray, "v"], mesh: Mesh, texels: Texels) -> Float32[np.ndarray, "s s"]:

@@ -18,6 +18,7 @@ from scipy.sparse import coo_array, csc_array, diags_array
 from pipeline.geometry.colour import srgb_to_linear
 from pipeline.geometry.linear_systems import factorise_positive_definite
 from pipeline.geometry.mesh import area_weighted_vertex_normals
+from pipeline.kernels.common.thread_pool import shared_thread_pool
 from pipeline.texture.bake import TexturedSurface, sample_frame_colours
 from pipeline.texture.light import MIN_IRRADIANCE, VideoLight, key_visibility, spherical_harmonics
 from pipeline.texture.settings import TextureSettings
@@ -114,14 +115,16 @@ class LightFit:
 
 def observe_light(views: Sequence[BakeView], surface: TexturedSurface, settings: TextureSettings) -> LightObservations:
     """Sample the colours of all vertices in all views that show them; surface: see `texels_at_vertices`."""
-    parts = []
     vertices = surface.texels.columns
-    for number, view in enumerate(views):
+
+    def observe(number: int, view: BakeView) -> tuple[np.ndarray, ...]:
         colour, weight = (values.numpy() for values in sample_frame_colours(view, surface, settings))
         used = (weight > 0) & (colour.min(axis=1) > MIN_COLOUR) & (colour.max(axis=1) < MAX_COLOUR)
         normal = area_weighted_vertex_normals(view.vertices_world, surface.faces).numpy()[vertices[used]]
         frame = np.full(int(used.sum()), number)
-        parts.append((frame, vertices[used].astype(np.int64), colour[used], weight[used], normal))
+        return frame, vertices[used].astype(np.int64), colour[used], weight[used], normal
+
+    parts = shared_thread_pool(torch.get_num_threads()).map(observe, range(len(views)), views)
     return LightObservations(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
@@ -132,10 +135,13 @@ def observe_visibility(
     key_direction: Float[np.ndarray, "3"],
 ) -> Float[np.ndarray, "k"]:
     """Return which part of the light from a direction reaches each observed vertex, in [0, 1]."""
-    visibility = np.ones(len(observed.vertex))
-    for number, view in enumerate(views):
+
+    def lit_vertices(view: BakeView) -> Float[np.ndarray, "v"]:
         normals = area_weighted_vertex_normals(view.vertices_world, faces)
-        seen = key_visibility(view.vertices_world, faces, normals, key_direction).numpy()
+        return key_visibility(view.vertices_world, faces, normals, key_direction).numpy()
+
+    visibility = np.ones(len(observed.vertex))
+    for number, seen in enumerate(shared_thread_pool(torch.get_num_threads()).map(lit_vertices, views)):
         rows = observed.frame == number
         visibility[rows] = seen[observed.vertex[rows]]
     return visibility
