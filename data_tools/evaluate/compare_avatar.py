@@ -16,6 +16,7 @@ from torch import Tensor
 
 from data_tools.evaluate.comparison import SURFACE_POINTS, Comparison, ImagePair, retarget_motion
 from data_tools.evaluate.highlights import highlight_scores, lamp_error_deg
+from data_tools.evaluate.shown_surface import shown_faces
 from data_tools.evaluate.static_texture import render_static, static_brightness
 from data_tools.evaluate.truth import load_true_mask
 from data_tools.evaluate.upper_bound import map_between_worlds, render_upper_bound
@@ -62,8 +63,16 @@ def compare_rest_surfaces(comparison: Comparison) -> dict[str, float]:
 
 def compare_matched_surfaces(comparison: Comparison) -> dict[str, float]:
     """Score the surface of the avatar in the A-pose of the true rig, with the rigs' joints matched."""
-    avatar, true = comparison.matched_rest_mesh, comparison.true_rest_mesh
-    return _aligned_scores(avatar, true, align_surfaces_icp(avatar, true))
+    return comparison.matched_correspondence.scores() | {"scale_to_truth": comparison.matched_alignment.scale}
+
+
+def compare_shown_surface(comparison: Comparison) -> dict[str, float]:
+    """Score the part of the true surface that a frame shows, as `SurfaceCorrespondence.label_scores`.
+
+    In the A-pose of the true rig, with the rigs' joints matched, aligned as the whole surfaces are.
+    """
+    shown = shown_faces(comparison.rigs).astype(np.int64)
+    return comparison.matched_correspondence.label_scores(shown, 1) or {}
 
 
 def compare_labelled_surfaces(comparison: Comparison) -> dict[str, dict[str, float]]:

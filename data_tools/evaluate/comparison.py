@@ -148,6 +148,18 @@ class Comparison:
         return self.avatar_surface(canonical_to_world(self.run.body, self.rigs.match(self.rigs.true_rest_motion))[0])
 
     @cached_property
+    def matched_alignment(self) -> SimilarityTransform:
+        """The similarity from `matched_rest_mesh` to `true_rest_mesh`."""
+        return align_surfaces_icp(self.matched_rest_mesh, self.true_rest_mesh)
+
+    @cached_property
+    def matched_correspondence(self) -> SurfaceCorrespondence:
+        """Corresponding points of `matched_rest_mesh`, aligned, and `true_rest_mesh`."""
+        return surface_correspondence(
+            self.matched_alignment.transform_mesh(self.matched_rest_mesh), self.true_rest_mesh, SURFACE_POINTS
+        )
+
+    @cached_property
     def _rest_motion(self) -> Motion:
         """The A-pose of the true rig, retargeted to the rig of the avatar: one frame."""
         return self.rigs.retarget(self.rigs.true_rest_motion)

@@ -15,6 +15,7 @@ from data_tools.evaluate.compare_avatar import (
     compare_novel_poses,
     compare_novel_views,
     compare_rest_surfaces,
+    compare_shown_surface,
     compare_texture,
 )
 from data_tools.evaluate.comparison import Comparison, ImagePair, load_comparison
@@ -47,7 +48,8 @@ PROTOCOL = (
     "with the hips in the same place. In mesh and novel_poses the limbs of both rigs have equal directions; rigs that "
     "place hips, shoulders or ankles differently then differ although their surfaces do not. In mesh_matched and "
     "novel_poses_matched, and in the images of novel views and poses, the rotation of each joint is corrected by the "
-    "mean rotation between the two rigs over the frames of the video. "
+    "mean rotation between the two rigs over the frames of the video. mesh_matched_shown: mesh_matched on the part of "
+    "the truth that a frame of the video shows (area_share), not the inside of a coat or legs under a skirt. "
     "surface_by_label: the A-pose, on the faces of one garment or body part of the "
     "truth and the points of the avatar nearest to them; area_share of the truth. Joints: after aligning the root, and "
     "without alignment. Images: field and mesh are the held-out scores of the report. upper_bound is the true "
@@ -62,7 +64,7 @@ PROTOCOL = (
     "one times the mean brightness of each vertex in the training frames. colour_error and balanced_colour_error "
     "(after one gain per channel) are mean absolute differences, of 255, on the observed texels."
 )
-SURFACES = ("mesh", "mesh_matched", "heldout_poses", "novel_poses", "novel_poses_matched")
+SURFACES = ("mesh", "mesh_matched", "mesh_matched_shown", "heldout_poses", "novel_poses", "novel_poses_matched")
 LIT_NOTE = (
     "not flat: the novel views and poses of this capture are lit. The avatar is drawn under the estimated light if "
     "that was removed from its texture, else unlit, and then its light counts against it (--light flat has none)"
@@ -104,6 +106,7 @@ def avatar_sections(comparison: Comparison) -> tuple[dict[str, Any], dict[str, l
     document: dict[str, Any] = {
         "mesh": compare_rest_surfaces(comparison),
         "mesh_matched": compare_matched_surfaces(comparison),
+        "mesh_matched_shown": compare_shown_surface(comparison),
         "heldout_poses": compare_heldout_surfaces(comparison),
     }
     if parts := compare_labelled_surfaces(comparison):

@@ -12,10 +12,13 @@ from data_tools.evaluate.compare_avatar import (
     compare_clay,
     compare_heldout_surfaces,
     compare_labelled_surfaces,
+    compare_matched_surfaces,
     compare_novel_poses,
     compare_rest_surfaces,
+    compare_shown_surface,
 )
 from data_tools.evaluate.comparison import Comparison
+from data_tools.evaluate.shown_surface import shown_faces
 from tests.data_tools.ground_truth_run import with_motion, with_scale
 
 
@@ -85,3 +88,28 @@ def test_without_alignment_a_wrong_distance_is_an_error(perfect: Comparison) -> 
     assert 5.0 < scores["chamfer_unaligned_mm"] < 50.0
     assert compare_heldout_surfaces(perfect)["chamfer_unaligned_mm"] < 0.2
     assert compare_novel_poses(perfect)[0]["novel_poses"]["chamfer_unaligned_mm"] < 1.0
+
+
+@pytest.mark.slow
+def test_what_no_frame_shows_does_not_count_as_shown(perfect: Comparison) -> None:
+    """A turn shows chest and back, not the soles; soles that stand out by 2 cm are an error of the whole."""
+    shown, true = shown_faces(perfect.rigs), perfect.true_rest_mesh
+    normals, centres_m = true.face_normals(), true.vertices[true.faces].mean(axis=1)
+    floor_m = true.vertices[:, 1].min()
+    is_sole = (normals[:, 1] < -0.9) & (centres_m[:, 1] < floor_m + 0.01)
+    is_trunk = (
+        (np.abs(normals[:, 2]) > 0.9)
+        & (np.abs(centres_m[:, 0]) < 0.08)
+        & (np.abs(centres_m[:, 1] - floor_m - 1.2) < 0.1)
+    )
+    assert is_sole.sum() > 50
+    assert shown[is_sole].mean() < 0.1
+    assert shown[is_trunk].mean() > 0.95
+    soles = np.unique(true.faces[is_sole])
+    vertices = perfect.truth.subject.body.vertices.copy()
+    vertices[soles, 1] -= 0.02
+    avatar = replace(perfect.run.avatar, vertices=torch.from_numpy(vertices))
+    wrong = replace(perfect, run=replace(perfect.run, avatar=avatar))
+    whole, part = compare_matched_surfaces(wrong), compare_shown_surface(wrong)
+    assert 0.5 < part["area_share"] < 1.0
+    assert part["chamfer_mm"] < whole["chamfer_mm"] - 0.15  # the alignment moves all by half of that
