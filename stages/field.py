@@ -14,6 +14,7 @@ from pipeline.body.body import Motion
 from pipeline.body.files import load_body, load_camera, load_motion, save_motion
 from pipeline.capture import frame_selection as selection
 from pipeline.capture.capture import Capture, image_path, load_capture, mask_path
+from pipeline.capture.frame_selection import evenly_spaced
 from pipeline.capture.matting import resize_premultiplied
 from pipeline.capture.usable_frames import usable_positions
 from pipeline.core.cli import main
@@ -27,7 +28,7 @@ from pipeline.field.config import FieldConfig
 from pipeline.field.field import RadianceField
 from pipeline.field.files import save_field, save_occupancy
 from pipeline.field.optimiser import DivergedError
-from pipeline.field.setup import MaskedImage, create_trainer, evenly_spaced, training_scale
+from pipeline.field.setup import MaskedImage, create_trainer, training_scale
 from pipeline.field.trainer import Trainer
 from pipeline.field.validation import Validator
 from pipeline.field.validation_curve import ValidationCurve

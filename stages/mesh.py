@@ -14,7 +14,7 @@ from pipeline.avatar.turntable import turntable_sheet
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.files import load_body, load_camera, load_motion, save_motion
 from pipeline.capture.capture import Capture, load_capture
-from pipeline.capture.frame_selection import VALIDATION
+from pipeline.capture.frame_selection import VALIDATION, evenly_spaced
 from pipeline.capture.usable_frames import usable_positions
 from pipeline.core.cli import main
 from pipeline.core.command import rerun_command
@@ -25,7 +25,6 @@ from pipeline.core.stage import Stage
 from pipeline.field.field import RadianceField
 from pipeline.field.files import load_field, load_occupancy
 from pipeline.field.occupancy import BinaryOccupancy
-from pipeline.field.setup import evenly_spaced
 from pipeline.geometry.camera import pixel_footprint_m
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import top_k_weights

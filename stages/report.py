@@ -16,7 +16,7 @@ from pipeline.avatar.finished_run import FinishedRun, load_finished_run
 from pipeline.avatar.motion.pose_fit import fit_poses
 from pipeline.body.body import canonical_to_world
 from pipeline.capture.capture import CONTACT_SHEET, Capture
-from pipeline.capture.frame_selection import HELDOUT, TRAIN
+from pipeline.capture.frame_selection import HELDOUT, TRAIN, evenly_spaced
 from pipeline.core.cli import main
 from pipeline.core.command import format_command
 from pipeline.core.config import Config as BaseConfig
@@ -25,7 +25,6 @@ from pipeline.core.manifest import Manifest, read_manifest
 from pipeline.core.measure import describe_environment, peak_rss_mib
 from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
-from pipeline.field.setup import evenly_spaced
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.texture_rendering import blur_coverage
 from pipeline.io.image import read_gray, read_rgb, to_uint8, write_rgb

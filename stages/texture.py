@@ -15,7 +15,7 @@ from pipeline.body.body import Body, canonical_to_world
 from pipeline.body.files import load_body, load_camera, load_motion
 from pipeline.capture.capture import Capture, load_capture
 from pipeline.capture.face_detector import FaceDetector
-from pipeline.capture.frame_selection import VALIDATION
+from pipeline.capture.frame_selection import VALIDATION, evenly_spaced
 from pipeline.capture.usable_frames import usable_positions
 from pipeline.core.cli import main
 from pipeline.core.command import rerun_command
@@ -23,7 +23,6 @@ from pipeline.core.config import Config as BaseConfig
 from pipeline.core.errors import UserError
 from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
-from pipeline.field.setup import evenly_spaced
 from pipeline.geometry.atlas import Atlas, Texels, rasterize_texels, texture_size_px, unwrap
 from pipeline.geometry.camera import Camera, pixel_footprint_m
 from pipeline.geometry.creases import Creases, find_creases

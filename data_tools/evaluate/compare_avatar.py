@@ -24,7 +24,7 @@ from data_tools.synthetic.scene.renderer import pose_vertices
 from pipeline.avatar.clay import render_clay_views
 from pipeline.body.body import Motion, canonical_to_world
 from pipeline.body.files import load_camera, load_motion
-from pipeline.capture.frame_selection import HELDOUT
+from pipeline.capture.frame_selection import HELDOUT, evenly_spaced
 from pipeline.core.errors import UserError
 from pipeline.core.progress import warn
 from pipeline.geometry.alpha import premultiply_to_float
@@ -343,4 +343,4 @@ def _least_absolute_gain(values: Float[np.ndarray, "n"], targets: Float[np.ndarr
 
 
 def _evenly_spaced(positions: np.ndarray) -> np.ndarray:
-    return np.unique(positions[np.linspace(0, len(positions) - 1, SURFACE_FRAMES).round().astype(int)])
+    return positions[evenly_spaced(len(positions), SURFACE_FRAMES)]

@@ -30,7 +30,7 @@ from pipeline.avatar.finished_run import load_textured_avatar
 from pipeline.body.body import Body
 from pipeline.body.files import save_body, save_camera, save_motion
 from pipeline.capture.capture import Capture, image_path, mask_path, save_capture
-from pipeline.capture.frame_selection import HELDOUT, TRAIN, assign_splits
+from pipeline.capture.frame_selection import HELDOUT, TRAIN, assign_splits, evenly_spaced
 from pipeline.capture.usable_frames import SCORES_NPZ
 from pipeline.geometry.alpha import unpremultiply_to_uint8
 from pipeline.geometry.colour import linear_to_srgb, srgb_to_linear
@@ -132,7 +132,7 @@ def write_true_run(
 
 
 def _used_frames(truth: SyntheticCapture, count: int) -> Int[np.ndarray, "n"]:
-    return np.unique(np.linspace(0, len(truth.motion.time_s) - 1, count).round().astype(int))
+    return evenly_spaced(len(truth.motion.time_s), count)
 
 
 def reduced_mesh(body: Body) -> MeshArtifact:
@@ -176,9 +176,7 @@ def score_maps(
         skin_weights=dense_weights(avatar.joint_indices, avatar.joint_weights, joint_count).numpy(),
     )
     subject = Subject(own_mesh_body, avatar.uv.numpy(), avatar.faces_uv.numpy(), to_uint8(balanced.diffuse))
-    motion = truth.motion.frame_index[
-        np.unique(np.linspace(0, len(truth.motion.time_s) - 1, len(gains)).round().astype(int))
-    ]
+    motion = truth.motion.frame_index[evenly_spaced(len(truth.motion.time_s), len(gains))]
     held_out = np.flatnonzero(assign_splits(np.arange(len(gains))) == HELDOUT)
     scores: dict[str, list[float]] = {"heldout_psnr_body_db": []}
     for position in held_out.tolist():

@@ -13,8 +13,7 @@ from torch import Tensor
 from data_tools.evaluate.comparison import Comparison
 from data_tools.synthetic.rig.subject import Subject
 from data_tools.synthetic.scene.renderer import pose_vertices, shade
-from pipeline.capture.frame_selection import TRAIN
-from pipeline.field.setup import evenly_spaced
+from pipeline.capture.frame_selection import TRAIN, evenly_spaced
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.mesh import area_weighted_vertex_normals
 from pipeline.geometry.shadow_map import render_shadow_map

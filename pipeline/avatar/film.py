@@ -18,6 +18,7 @@ from torch import Tensor
 
 from pipeline.avatar.textured_avatar import TexturedAvatar
 from pipeline.body.body import Body, Motion, canonical_to_world
+from pipeline.capture.frame_selection import evenly_spaced
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.rotation import axis_angle_to_quaternion
 from pipeline.kernels.raster import rasterize
@@ -184,7 +185,7 @@ def _moving_box_m(
     avatar: TexturedAvatar, transforms: Float[Tensor, "n j 4 4"], path_m: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "2 3"]:
     """Return the corners of the box of all poses, relative to the camera's path; the ground is inside."""
-    rows = np.unique(np.linspace(0, len(transforms) - 1, BOX_FRAMES).astype(int))
+    rows = evenly_spaced(len(transforms), BOX_FRAMES)
     low_m, high_m = np.zeros(3), np.zeros(3)
     for row in rows.tolist():
         vertices_m = avatar.pose_vertices(transforms[row]).numpy() - path_m[row]

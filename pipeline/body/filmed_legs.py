@@ -19,6 +19,7 @@ from torch import Tensor
 from pipeline.body.body import Body, Motion, canonical_to_world
 from pipeline.body.fit.silhouette_icp import MaskWindow, rasterise_in_window
 from pipeline.body.overlay import pose_vertices
+from pipeline.capture.frame_selection import evenly_spaced
 from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.rotation import continuous_quaternions, matrix_to_quaternion, quaternion_to_matrix
 from pipeline.geometry.skinning import (
@@ -111,7 +112,7 @@ def leg_profile(
         frames: those that may be judged.
     """
     found = np.flatnonzero(frames & np.array([window is not None for window in windows]))
-    chosen = found[np.unique(np.linspace(0, len(found) - 1, min(JUDGED_FRAMES, len(found))).astype(int))]
+    chosen = found[evenly_spaced(len(found), JUDGED_FRAMES)]
     legs = np.stack([_leg_faces(body, side) for side in LEGS])
     rows = np.full((3, len(chosen), len(HEIGHTS)), np.nan)
     for k, pose in enumerate(canonical_to_world(body, motion.select(chosen))):

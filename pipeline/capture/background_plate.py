@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import NamedTuple
 
 import cv2
@@ -88,7 +89,8 @@ def _differs_from_plate(rgb: UInt8[np.ndarray, "h w 3"], plate: BackgroundPlate)
     ones = np.ones((1, 3), dtype=np.float32)
     shading_ratio = cv2.transform(image * colour, ones) / np.maximum(cv2.transform(colour * colour, ones), 1.0)
     shaded = colour * np.clip(shading_ratio, _MIN_SHADOW_RATIO, 1.0)[..., None]
-    return plate.known & (np.abs(image - shaded).max(axis=-1) > _MAX_PLATE_DIFFERENCE_LEVELS)
+    largest = reduce(cv2.max, cv2.split(cv2.absdiff(image, shaded)))
+    return plate.known & (largest > _MAX_PLATE_DIFFERENCE_LEVELS)
 
 
 def _changed_background_fraction(

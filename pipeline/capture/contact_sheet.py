@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from pipeline.capture.capture import Capture
-from pipeline.capture.frame_selection import HELDOUT, VALIDATION
+from pipeline.capture.frame_selection import HELDOUT, VALIDATION, evenly_spaced
 from pipeline.capture.landmarks import POSE_CONNECTIONS
 from pipeline.capture.matting import inner_boundary
 from pipeline.io.image import to_uint8
@@ -17,7 +17,7 @@ _SPLIT_SIGN = {HELDOUT: " held out", VALIDATION: " validation"}
 
 def contact_sheet(capture: Capture) -> UInt8[np.ndarray, "h w 3"]:
     """Draw up to 24 evenly spaced frames with mask outline, bones (left blue, right orange) and frame index."""
-    positions = np.unique(np.linspace(0, len(capture) - 1, _COLUMNS * _ROWS).astype(int))
+    positions = evenly_spaced(len(capture), _COLUMNS * _ROWS)
     tiles = [_tile(capture, int(position)) for position in positions]
     width = max(tile.shape[1] for tile in tiles)
     tiles = [cv2.copyMakeBorder(tile, 0, 0, 0, width - tile.shape[1], cv2.BORDER_CONSTANT) for tile in tiles]

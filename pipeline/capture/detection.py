@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from pipeline.capture.background_plate import BackgroundPlate, estimate_background_plate
 from pipeline.capture.capture import IMAGES_FOLDER, MASKS_FOLDER, image_path, mask_path
 from pipeline.capture.face_detector import FaceDetector, undetected_face
+from pipeline.capture.frame_selection import evenly_spaced
 from pipeline.capture.hand_detector import HandDetector, HandLandmarks, stack_hands, undetected_hands
 from pipeline.capture.landmarks import N_LANDMARKS
 from pipeline.capture.matting import (
@@ -187,7 +188,7 @@ def estimate_background(
 ) -> BackgroundPlate:
     """Return the background plate from evenly spaced images; masks must come from the detector."""
     found = np.flatnonzero(detections.found)
-    sampled = found[np.unique(np.linspace(0, len(found) - 1, _MAX_PLATE_FRAMES).astype(int))]
+    sampled = found[evenly_spaced(len(found), _MAX_PLATE_FRAMES)]
     is_taken = set(detections.frame_index[sampled].tolist()).__contains__
     images = np.stack([frame.rgb for frame in read_undistorted_frames(source, user_files, is_taken, max_side_px)])
     return estimate_background_plate(

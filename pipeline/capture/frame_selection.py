@@ -26,6 +26,11 @@ _QUANTISATION_NOISE = 1.0 / 3.0
 _BLOCK_PX = 16
 
 
+def evenly_spaced(count: int, limit: int) -> Int[np.ndarray, "k"]:
+    """Return at most `limit` of the indices 0..count-1, evenly spaced, including both ends."""
+    return np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(np.int64))
+
+
 def assign_splits(frame_index: Int[np.ndarray, "n"]) -> UInt8[np.ndarray, "n"]:
     """Return HELDOUT for phase 0 of `split_phases`, VALIDATION for phase 4, TRAIN for all others."""
     phase = split_phases(frame_index)

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.capture.background_plate import detect_scene_changes
 from pipeline.capture.detection import Detections
-from pipeline.capture.frame_selection import format_frame_ranges
+from pipeline.capture.frame_selection import evenly_spaced, format_frame_ranges
 from pipeline.capture.landmarks import ANKLES, FEET, TORSO
 from pipeline.capture.person_detector import is_ankle_visible
 from pipeline.core.errors import UserError
@@ -157,7 +157,7 @@ def sample_scene_changes(detections: Detections) -> tuple[Int[np.ndarray, "k"], 
     Detection works on grey thumbnails: a camera shift of a few thumbnail pixels is found where the scene has edges.
     """
     found = np.flatnonzero(detections.found)
-    sampled = found[np.unique(np.linspace(0, len(found) - 1, _N_SCENE_FRAMES).astype(int))]
+    sampled = found[evenly_spaced(len(found), _N_SCENE_FRAMES)]
     margin_px = round(_PERSON_MARGIN_FRACTION * max(detections.gray_thumbnails.shape[1:]))
     kernel = np.ones((2 * margin_px + 1, 2 * margin_px + 1), np.uint8)
     dilated_masks = np.stack(

@@ -103,19 +103,24 @@ def estimate_edge_blur_px(
     and Sim, "Defocus map estimation from a single image", 2011). Both energies are summed along the outline in squares
     of half width `window_px`, so strong edges dominate; 0 far from the outline.
     """
-    line, side = _dilate(inner_boundary(body), 1.0).astype(np.float32), 2 * round(window_px) + 1
+    line, side = _dilate(inner_boundary(body), 1.0), 2 * round(window_px) + 1
     sharp, soft = (
-        cv2.blur(line * _squared_gradient(picture), (side, side))
+        cv2.blur(_squared_gradient(picture, line), (side, side))
         for picture in (image, cv2.GaussianBlur(image, (0, 0), _REBLUR_PX))
     )
     excess = np.maximum(sharp - soft, 1e-6)
     return np.sqrt(np.maximum(_REBLUR_PX**2 * soft / excess - _INTRINSIC_BLUR_VARIANCE_PX2, 0.0)).astype(np.float32)
 
 
-def _squared_gradient(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
-    across, down = (cv2.Sobel(image, cv2.CV_32F, *axis) for axis in ((1, 0), (0, 1)))
-    squares = cv2.add(cv2.multiply(across, across), cv2.multiply(down, down))
-    return cv2.transform(squares, np.ones((1, 3), dtype=np.float32))
+def _squared_gradient(image: Float[np.ndarray, "h w 3"], at: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Return the squared gradient (Sobel's) of some pixels, summed over channels; 0 at the others and at the border."""
+    rows, columns = np.nonzero(at[1:-1, 1:-1])
+    west, middle, east = ([image[rows + i, columns + j] for i in range(3)] for j in range(3))
+    across = (east[0] - west[0]) + 2.0 * (east[1] - west[1]) + (east[2] - west[2])
+    down = (west[2] - west[0]) + 2.0 * (middle[2] - middle[0]) + (east[2] - east[0])
+    squares = np.zeros(at.shape, dtype=np.float32)
+    squares[rows + 1, columns + 1] = (across**2 + down**2).sum(axis=1)
+    return squares
 
 
 def clean_alpha_matte(

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from pipeline.body.body import Body, Motion, canonical_to_world
+from pipeline.capture.frame_selection import evenly_spaced
 from pipeline.core.device import CPU
 from pipeline.field.baselines.positional_mlp import LAYER_COUNT, PositionalMlp
 from pipeline.field.baselines.visual_hull import carve_visual_hull, dense_layout
@@ -57,11 +58,6 @@ def training_scale(body: Body, motion: Motion, camera: Camera, max_person_px: in
     """Return the scale of the images, at most 1, at which the A-pose body is at most `max_person_px` tall."""
     person_px = body.height_m() * camera.fy / median_root_depth_m(motion, camera)
     return min(1.0, max_person_px / person_px)
-
-
-def evenly_spaced(count: int, limit: int) -> np.ndarray:
-    """Return at most `limit` of the indices 0..count-1, evenly spaced, including both ends."""
-    return np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(np.int64))
 
 
 def create_trainer(

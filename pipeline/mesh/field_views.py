@@ -13,11 +13,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.body.body import Body
+from pipeline.capture.frame_selection import evenly_spaced
 from pipeline.core.progress import track
 from pipeline.field.field import RadianceField
 from pipeline.field.occupancy import BinaryOccupancy
 from pipeline.field.rendering import render_field
-from pipeline.field.setup import evenly_spaced
 from pipeline.field.skin_grid import build_skin_grid, skin_margin_m
 from pipeline.geometry.alpha import unpremultiply_to_uint8
 from pipeline.geometry.camera import Camera, project

@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pipeline.body.body import Body
+from pipeline.capture.frame_selection import evenly_spaced
 from pipeline.core.progress import track
 from pipeline.geometry.camera import project
 from pipeline.geometry.mesh import Mesh
@@ -91,7 +92,7 @@ def relax_skin(mesh: Mesh, skin: SkinnedTopology, body: Body, views: Sequence[Po
     level = float(np.quantile(before.numpy(), 0.999))
     if not zone.any():
         return RelaxedSkin(mesh, skin, level, level, 0.0)
-    shown = [views[k] for k in np.unique(np.linspace(0, len(views) - 1, SHOWN_FRAMES).astype(int))]
+    shown = [views[k] for k in evenly_spaced(len(views), SHOWN_FRAMES)]
     seen = [visible_vertices(mesh, skin.weights, view) for view in shown]
     tearing = poses[(before > MAX_STRETCH).any(dim=1)]
     vertices, weights = _minimise(_build_zone(mesh, skin.weights, zone), (mesh, skin.weights), tearing, shown, seen)

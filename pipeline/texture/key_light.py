@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from pipeline.capture.frame_selection import evenly_spaced
 from pipeline.kernels.common.thread_pool import shared_thread_pool
 from pipeline.texture.light_fit import LightFit, LightObservations, observe_visibility, vertex_mean
 from pipeline.texture.views import BakeView
@@ -25,7 +26,7 @@ def find_key_direction(
     The camera hardly sees surfaces that face away from it, so the smooth light does not tell the direction; where
     shadows fall does. Evenly spread directions are tried in `SEARCH_VIEWS` views, then those around the best.
     """
-    chosen = np.unique(np.linspace(0, len(views) - 1, SEARCH_VIEWS).round().astype(int))
+    chosen = evenly_spaced(len(views), SEARCH_VIEWS)
     rows = np.isin(observed.frame, chosen)
     part = observed.select(rows)
     part = replace(part, frame=np.searchsorted(chosen, part.frame))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
+from pipeline.capture.frame_selection import evenly_spaced
 from pipeline.texture.bake import TexturedSurface
 from pipeline.texture.key_light import find_key_direction
 from pipeline.texture.light import VideoLight
@@ -99,7 +100,7 @@ def estimate_light(
         settings: of the stage.
     """
     count = surface.texels.size_px
-    chosen = np.unique(np.linspace(0, len(train) - 1, MAX_FIT_VIEWS).round().astype(int))
+    chosen = evenly_spaced(len(train), MAX_FIT_VIEWS)
     fit_views = [train[number] for number in chosen]
     observed, held_out = (observe_light(views, surface, settings) for views in (fit_views, validation))
     fit = fit_light(observed, edges, count, len(fit_views))

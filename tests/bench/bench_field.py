@@ -53,13 +53,14 @@ import numpy as np
 from data_tools.command import run_command
 from pipeline.body.files import load_body, load_camera, load_motion
 from pipeline.capture.capture import load_capture
+from pipeline.capture.frame_selection import evenly_spaced
 from pipeline.capture.usable_frames import usable_positions
 from pipeline.core.config import build_config, load_layers
 from pipeline.core.errors import UserError
 from pipeline.core.progress import warn
 from pipeline.field.config import FieldConfig
 from pipeline.field.occupancy import INITIAL_EMA_RATIO
-from pipeline.field.setup import create_trainer, evenly_spaced, training_scale
+from pipeline.field.setup import create_trainer, training_scale
 from pipeline.field.trainer import REBAKE_FRACTIONS, Trainer
 from stages.field import read_masked_image
 from tests.bench.machine import append_result, gather_mrow_s, machine_info, median_ms, memory_gb_s, multiply_gflop_s

@@ -15,6 +15,7 @@ import numpy as np
 from data_tools.pose import play_bvh
 from pipeline.body.body import Motion, canonical_to_world
 from pipeline.body.files import load_body, load_motion
+from pipeline.capture.frame_selection import evenly_spaced
 from pipeline.mesh.files import load_mesh
 from pipeline.mesh.skin_relaxation import edge_stretch, long_edges
 
@@ -45,7 +46,7 @@ def _row(run: Path, motion: Motion) -> str:
 def stretch_percentiles(run: Path, motion: Motion) -> tuple[float, float]:
     """Return the percentile of the worst frame, and of all frames together."""
     body, skinned = load_body(run / "body" / "body.npz"), load_mesh(run / "mesh")
-    rows = np.unique(np.linspace(0, len(motion.time_s) - 1, MAX_FRAMES).astype(int))
+    rows = evenly_spaced(len(motion.time_s), MAX_FRAMES)
     poses = canonical_to_world(body, motion.select(rows))
     weights = skinned.dense_skin_weights(len(body.joint_names))
     stretch = edge_stretch(skinned.mesh, weights, long_edges(skinned.mesh), poses).numpy()

@@ -8,13 +8,14 @@ import pytest
 import torch
 
 from pipeline.body.body import canonical_to_world
+from pipeline.capture.frame_selection import evenly_spaced
 from pipeline.field import field as field_module
 from pipeline.field import volume_rendering
 from pipeline.field.losses import field_losses
 from pipeline.field.optimiser import DivergedError
 from pipeline.field.ray_batches import POINT_STREAM, STEP_STREAM, step_rng
 from pipeline.field.rendering import render_field
-from pipeline.field.setup import create_trainer, evenly_spaced, training_scale
+from pipeline.field.setup import create_trainer, training_scale
 from pipeline.field.trainer import MAX_SAMPLES_PER_RAY, Trainer
 from pipeline.field.volume_rendering import sample_positions
 from pipeline.kernels.hashgrid import FeatureGradients, add_table_gradient_

@@ -53,6 +53,7 @@ from pipeline.body.fit.supplied_poses import SuppliedPoses
 from pipeline.body.fit.vertical.gravity import align_with_gravity, axis_evidence, lean_deg, turn_observations
 from pipeline.body.fit.vertical.turn_axis import contradicting_focal_log, estimate_turn_axis
 from pipeline.body.settings import DEFAULT_SETTINGS, FitSettings
+from pipeline.capture.frame_selection import evenly_spaced
 from pipeline.core.progress import track
 from pipeline.geometry.rotation import continuous_quaternions, matrix_to_quaternion
 
@@ -194,7 +195,7 @@ def select_shared_frames(
     found = has_torso_landmarks(observations)
     with_mask = found & np.array([window is not None for window in windows])
     candidates = np.flatnonzero(with_mask if with_mask.sum() >= MIN_FRAMES else found)
-    return np.unique(candidates[np.linspace(0, len(candidates) - 1, min(count, len(candidates))).astype(np.int64)])
+    return candidates[evenly_spaced(len(candidates), count)]
 
 
 def _check_landmarks(observations: Observations) -> None:

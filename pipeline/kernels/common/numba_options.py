@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from numba import config
+from numba.core.registry import cpu_target
 from numba.misc.appdirs import AppDirs
 
 NJIT_OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"arcp", "nsz"}}
@@ -43,3 +44,7 @@ def cache_folder() -> Path:
 config.reload_config()
 CACHE_FOLDER = cache_folder()
 config.CACHE_DIR = str(CACHE_FOLDER)
+
+# What numba itself is made of it loads at the first call of a function, in 0.4 s. Loaded here, the processes that a
+# command forks have it already.
+cpu_target.target_context.refresh()

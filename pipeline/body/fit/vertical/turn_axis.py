@@ -18,6 +18,7 @@ from scipy.optimize import least_squares
 
 from pipeline.body.fit.state import Observations
 from pipeline.body.settings import FitSettings
+from pipeline.capture.frame_selection import evenly_spaced
 
 AXIS_LANDMARKS = (7, 8, 11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28, 29, 30, 31, 32)
 """Ears, shoulders, elbows, wrists, hips, knees, ankles, heels, tips of the feet; left and right alternate."""
@@ -244,7 +245,7 @@ def _complete_frames(observations: Observations) -> Int[np.ndarray, "k"]:
     rows = list(AXIS_LANDMARKS)
     known = torch.minimum(observations.confidence[:, rows], observations.confidence_3d[:, rows]).min(1).values > 0
     complete = np.flatnonzero(known.numpy())
-    return complete[np.unique(np.linspace(0, len(complete) - 1, min(MAX_FRAMES, len(complete))).astype(np.int64))]
+    return complete[evenly_spaced(len(complete), MAX_FRAMES)]
 
 
 def _make_problem(
