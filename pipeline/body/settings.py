@@ -68,7 +68,7 @@ class FitSettings:
     known_stature_std_m: float = 0.005
     stature_spread_m: float = 0.09
     camera_tilt_std_deg: float = 10.0
-    body_axis_std_deg: float = 1.0
+    body_axis_std_deg: float = 0.7
 
     def __post_init__(self) -> None:
         for field in fields(self):

@@ -50,7 +50,7 @@ from pipeline.body.fit.root_placement import world_to_perspective
 from pipeline.body.fit.silhouette_icp import MaskWindow, match_silhouettes
 from pipeline.body.fit.state import FitState, Observations
 from pipeline.body.fit.supplied_poses import SuppliedPoses
-from pipeline.body.fit.vertical.gravity import align_with_gravity, axis_evidence, lean_deg, turn_observations
+from pipeline.body.fit.vertical import gravity
 from pipeline.body.fit.vertical.turn_axis import contradicting_focal_log, estimate_turn_axis
 from pipeline.body.settings import DEFAULT_SETTINGS, FitSettings
 from pipeline.capture.frame_selection import evenly_spaced
@@ -65,6 +65,10 @@ CONVERGED_STEP_RATIO = 0.1
 """Step of shape, camera and landmark offsets, in standard deviations, below which no further silhouettes are matched.
 
 Matched silhouettes jitter by 0.06 to 0.1: more rounds do not end nearer to the truth (docs/decisions/body.md)."""
+
+
+COS_CONVERGED_TURN = float(np.cos(np.radians(0.3)))
+"""Cosine of the turn of the world below which it counts as vertical."""
 
 
 class TooFewLandmarksError(ValueError):
@@ -125,8 +129,8 @@ def fit_body(
     evidence = None
     if not options.vertical_is_known:
         axis = estimate_turn_axis(observations, options.focal_relative_std)
-        evidence = axis_evidence(axis, options.settings)
-        observations = turn_observations(observations, evidence.up(), axis, rest_landmarks_m)
+        evidence = gravity.axis_evidence(axis, options.settings)
+        observations = gravity.turn_observations(observations, evidence.up(), axis, rest_landmarks_m)
         if axis is not None and options.focal_relative_std > 0.0:
             # The deviation of the principal point is in focal lengths.
             shift_std = options.principal_point_relative_std * float(np.exp(-axis.focal_log))
@@ -136,12 +140,14 @@ def fit_body(
         start = initial_state(
             observations, rest_landmarks_m, context.default.joints_m, body.shape_defaults.double(), offset_count
         )
-        progress = _fit_shared(context, observations, windows, start, options)
+        progress = _fit_shared(context, observations, windows, start, options, evidence)
         save_progress(checkpoint, progress)
+    observations = gravity.turn_world(observations, progress.to_vertical)
     parameters = shared_parameters(options)
     state, model, silhouette_iou = _fit_poses(context, observations, windows, progress, parameters, checkpoint)
     if evidence is not None:
-        state, observations = align_with_gravity(model, state, observations, evidence, options.settings)
+        evidence = evidence.about(progress.to_vertical[:, 1])
+        state, observations = gravity.align_with_gravity(model, state, observations, evidence, options.settings)
     stature_std_m = options.settings.stature_spread_m if options.height_m is None else 0.0
     return replace(
         _result(context, model, state, observations, silhouette_iou, left_right_swapped),
@@ -234,8 +240,14 @@ def _fit_shared(
     windows: Sequence[MaskWindow | None],
     start: FitState,
     options: FitOptions,
+    evidence: gravity.TiltEvidence | None,
 ) -> FitProgress:
-    """Fit the shared parameters and the poses of some frames, and interpolate the poses of the others."""
+    """Fit the shared parameters and the poses of some frames, and interpolate the poses of the others.
+
+    The world is turned after each round, see `upright_turn`.
+
+    evidence: of the vertical; None if it is known.
+    """
     settings, time_s = options.settings, observations.time_s
     chosen = select_shared_frames(observations, windows, options.shared_frames)
     observations, windows, state = observations.select(chosen), [windows[row] for row in chosen], start.select(chosen)
@@ -245,7 +257,7 @@ def _fit_shared(
     model = context.linearise(state.shape)
     state, system = _fit_landmarks(context, model, observations, parameters, state, settings.landmark_steps)
     parameters = shared_parameters(options)
-    posture: Posture | None = None
+    posture, to_vertical = None, torch.eye(3, dtype=torch.float64)
     for number in track(range(options.rounds), "shape and focal length"):
         model, before = context.linearise(state.shape), state
         state, system, objective = _silhouette_round(
@@ -253,10 +265,19 @@ def _fit_shared(
         )
         if number + 1 == POSTURE_ROUND:
             posture = objective.estimate_posture(context.pose_prior, state)
-        elif number + 1 > POSTURE_ROUND and shared_step_ratio(before, state, system) < CONVERGED_STEP_RATIO:
+        has_converged = shared_step_ratio(before, state, system) < CONVERGED_STEP_RATIO
+        if evidence is not None:
+            turn = gravity.upright_turn(model, state, evidence.about(to_vertical[:, 1]), settings)
+            state, observations = (
+                gravity.turn_state(state, turn, torch.zeros(3).double()),
+                gravity.turn_world(observations, turn),
+            )
+            to_vertical = turn @ to_vertical
+            has_converged = has_converged and float(turn[1, 1]) > COS_CONVERGED_TURN
+        if number + 1 > POSTURE_ROUND and has_converged:
             break
     stds = posterior_stds(context.linearise(state.shape), system)
-    return FitProgress(interpolated_state(state, chosen, time_s), posture, *stds)
+    return FitProgress(interpolated_state(state, chosen, time_s), posture, *stds, to_vertical=to_vertical)
 
 
 def _fit_poses(
@@ -372,5 +393,5 @@ def _result(
         left_right_swapped=left_right_swapped,
         focal_relative_std=0.0,
         height_std_m=0.0,
-        lean_deg=lean_deg(model, state),
+        lean_deg=gravity.lean_deg(model, state),
     )

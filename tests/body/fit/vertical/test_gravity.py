@@ -7,10 +7,15 @@ import pytest
 import torch
 
 from pipeline.body.body import load_anny
+from pipeline.body.fit import fit as fit_module
 from pipeline.body.fit.ground_contact import FLOOR_TILT_STD_RAD, floor_tilt_information, sole_points
 from pipeline.body.fit.landmark_regressor import landmark_regressor
+from pipeline.body.fit.options import FitOptions
 from pipeline.body.fit.posed_points import pose_points, pose_skeleton
+from pipeline.body.fit.state import FitState
 from pipeline.body.fit.vertical.gravity import (
+    LEAN_GAIN_TOWARDS,
+    MAX_TURN_RAD,
     TiltEvidence,
     align_with_gravity,
     axis_evidence,
@@ -20,6 +25,7 @@ from pipeline.body.fit.vertical.gravity import (
     turn_camera,
     turn_observations,
     turn_state,
+    upright_turn,
 )
 from pipeline.body.fit.vertical.turn_axis import TurnAxis, estimate_turn_axis
 from pipeline.body.settings import FitSettings
@@ -149,3 +155,52 @@ def test_observations_of_a_turn_become_upright() -> None:
     unturned = turn_observations(observations, up, None, rest)
     assert torch.allclose(unturned.landmarks_3d_m, observations.landmarks_3d_m @ rotation_deg(-10.0, 0.0, 0.0).T)
     assert unturned.camera.fx == scene.camera.fx
+
+
+def test_the_world_is_turned_by_the_mean_lean_of_a_turn() -> None:
+    """Hardly anything is known of the vertical but the bodies, and then the axis of the turn as well."""
+    scene = standing(2 * np.pi)
+
+    def turn(state: FitState, axis_std_rad: float = np.pi) -> torch.Tensor:
+        """Return where +Y of the old world points, to the right and towards the camera, degrees."""
+        axis = TiltEvidence.from_std(STILL[:2], torch.full_like(STILL[:2], axis_std_rad))
+        return torch.rad2deg(upright_turn(scene.model, state, axis, SETTINGS)[[0, 2], 1])
+
+    trunk = turn(scene.state)  # that of the A-pose leans a little in the body's frame
+    assert trunk.abs().max() < 0.6
+    leaning = turn_state(scene.state, rotation_deg(2.0, 0.0, 0.0) @ rotation_deg(0.0, 0.0, -1.0), STILL)
+    assert (turn(leaning) - trunk).tolist() == pytest.approx([-1.0, -2.0 * LEAN_GAIN_TOWARDS], abs=0.1)
+    slightly = turn_state(scene.state, rotation_deg(0.2, 0.0, 0.0), STILL)
+    halved = turn(slightly, np.radians(SETTINGS.body_axis_std_deg))  # as sure as the bodies are
+    assert float(halved[1] / turn(slightly)[1]) == pytest.approx(0.5, abs=0.05)
+    fallen = turn(turn_state(scene.state, rotation_deg(20.0, 0.0, 0.0), STILL))
+    assert float(fallen[1]) == pytest.approx(-np.degrees(MAX_TURN_RAD), abs=0.1)
+    assert turn(turn_state(standing(0.3).state, rotation_deg(5.0, 0.0, 0.0), STILL)).tolist() == [0.0, 0.0]
+
+
+def test_evidence_that_contradicts_the_bodies_is_doubted() -> None:
+    std = torch.tensor([0.01, 0.02], dtype=torch.float64)
+    evidence = TiltEvidence.from_std(torch.tensor([0.03, 0.0], dtype=torch.float64), std)
+    agreeing = evidence.doubted(torch.tensor([0.03, 0.0], dtype=torch.float64))
+    assert torch.allclose(agreeing.information, evidence.information)
+    two_stds = evidence.doubted(torch.tensor([0.03, 0.04], dtype=torch.float64))
+    assert torch.allclose(two_stds.information, 0.25 * evidence.information)
+    assert torch.allclose(two_stds.up(), evidence.up())
+
+
+def test_evidence_about_another_vertical() -> None:
+    std = torch.tensor([0.1, 0.3], dtype=torch.float64)
+    evidence = TiltEvidence.from_std(torch.tensor([0.2, 0.0], dtype=torch.float64), std)
+    up = rotation_deg(3.0, 0.0, -2.0)[:, 1]
+    assert torch.allclose(evidence.about(up).up(), up)
+    assert torch.equal(evidence.about(up).information, evidence.information)
+
+
+def test_silhouettes_mend_a_wrong_axis(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Landmarks said that the level camera looks down by 5 degrees; the outlines of the turn know better."""
+    scene = standing(2 * np.pi)
+    wrong = TurnAxis(np.radians([0.0, 5.0]), np.radians([2.0, 2.0]), focal_log=0.0, focal_log_std=0.1)
+    monkeypatch.setattr(fit_module, "estimate_turn_axis", lambda *_: wrong)
+    options = FitOptions(shared_frames=12, rounds=6, vertical_is_known=False)
+    result = fit_module.fit_body(load_anny(), scene.observations(scene.camera), scene.windows(), options)
+    assert camera_tilt_deg(result.camera) == pytest.approx((0.0, 0.0), abs=1.5)
