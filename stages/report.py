@@ -224,7 +224,7 @@ def score_frames(
             "mesh_pose_fitted": (render_mesh, poses_fitted),
         }
     weights = find_lpips_weights()
-    shown = set(positions[np.linspace(0, len(positions) - 1, config.max_page_frames).round().astype(int)].tolist())
+    shown = set(positions[evenly_spaced(len(positions), config.max_page_frames)].tolist())
 
     def score(position: int) -> tuple[dict[str, Any], FrameImages | None]:
         image, mask = (to_uint8(part(position)) for part in (loaded.capture.image, loaded.capture.mask))

@@ -176,7 +176,7 @@ def score_maps(
         skin_weights=dense_weights(avatar.joint_indices, avatar.joint_weights, joint_count).numpy(),
     )
     subject = Subject(own_mesh_body, avatar.uv.numpy(), avatar.faces_uv.numpy(), to_uint8(balanced.diffuse))
-    motion = truth.motion.frame_index[evenly_spaced(len(truth.motion.time_s), len(gains))]
+    motion = truth.motion.frame_index[_used_frames(truth, len(gains))]
     held_out = np.flatnonzero(assign_splits(np.arange(len(gains))) == HELDOUT)
     scores: dict[str, list[float]] = {"heldout_psnr_body_db": []}
     for position in held_out.tolist():

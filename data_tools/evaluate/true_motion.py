@@ -105,15 +105,9 @@ def true_motion(rigs: MatchedRigs) -> Motion:
     """
     fitted, truth = rigs.motion, rigs.truth
     motion = rigs.match(truth.motion.select(fitted.frame_index))
-    world_to_camera = truth.camera.world_to_camera.astype(np.float64)
-    centre_m = -world_to_camera[:3, :3].T @ world_to_camera[:3, 3]
     rotations = canonical_to_world(rigs.body, motion)[:, 0, :3, :3].double().numpy()
-    return replace(
-        motion,
-        frame_index=fitted.frame_index,
-        time_s=fitted.time_s,
-        root_translation_m=place_roots(fitted.root_translation_m, motion.root_translation_m, rotations, centre_m),
-    )
+    roots_m = fitted.root_translation_m, motion.root_translation_m
+    return fitted.with_pose(motion.rotations_wxyz, place_roots(*roots_m, rotations, truth.camera.centre_m()))
 
 
 def place_roots(

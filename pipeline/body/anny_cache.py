@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from filelock import FileLock
+from jaxtyping import Float
 
 from pipeline.core.errors import UserError
 
@@ -134,11 +135,23 @@ def load_blend_shape(filename: str, vertices_count: int, world_transformation: A
         ValueError: a line has not four numbers, or a vertex does not exist.
     """
     with gzip.open(filename, "rt") as archive:
-        numbers = np.fromstring(archive.read(), sep=" ").reshape(-1, TARGET_COLUMNS)
+        displacements_dm = parse_target(archive.read(), vertices_count, filename)
+    moved: torch.Tensor = world_transformation.apply(torch.from_numpy(displacements_dm).to(dtype))
+    return moved
+
+
+def parse_target(text: str, vertices_count: int, source: str) -> Float[np.ndarray, "v 3"]:
+    """Return the displacement of each vertex, in the unit of the text: lines `vertex x y z`, others do not move.
+
+    source: of the text, for errors.
+
+    Raises:
+        ValueError: a line has not four numbers, or a vertex does not exist.
+    """
+    numbers = np.fromstring(text, sep=" ").reshape(-1, TARGET_COLUMNS)
     indices = numbers[:, 0].astype(np.int64)
     if len(indices) and not (indices.min() >= 0 and indices.max() < vertices_count):
-        raise ValueError(f"{filename} names a vertex that does not exist")
-    blend_shape = torch.zeros((vertices_count, 3), dtype=dtype)
-    blend_shape[torch.from_numpy(indices)] = torch.from_numpy(numbers[:, 1:]).to(dtype)
-    moved: torch.Tensor = world_transformation.apply(blend_shape)
-    return moved
+        raise ValueError(f"{source} names a vertex that does not exist")
+    displacements = np.zeros((vertices_count, 3))
+    displacements[indices] = numbers[:, 1:]
+    return displacements

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Num, UInt8
 
 # Minimum number of images that show a pixel without the person.
 _MIN_OBSERVATIONS = 3
@@ -89,8 +89,12 @@ def _differs_from_plate(rgb: UInt8[np.ndarray, "h w 3"], plate: BackgroundPlate)
     ones = np.ones((1, 3), dtype=np.float32)
     shading_ratio = cv2.transform(image * colour, ones) / np.maximum(cv2.transform(colour * colour, ones), 1.0)
     shaded = colour * np.clip(shading_ratio, _MIN_SHADOW_RATIO, 1.0)[..., None]
-    largest = reduce(cv2.max, cv2.split(cv2.absdiff(image, shaded)))
-    return plate.known & (largest > _MAX_PLATE_DIFFERENCE_LEVELS)
+    return plate.known & (largest_difference(image, shaded) > _MAX_PLATE_DIFFERENCE_LEVELS)
+
+
+def largest_difference(first: Num[np.ndarray, "h w 3"], second: Num[np.ndarray, "h w 3"]) -> Num[np.ndarray, "h w"]:
+    """Return the largest absolute difference of a channel at each pixel; the images have one type."""
+    return reduce(cv2.max, cv2.split(cv2.absdiff(first, second)))
 
 
 def _changed_background_fraction(

@@ -4,14 +4,13 @@ Notation: I observed colour of a pixel, F and B colours of foreground (person) a
 covered fraction of the pixel: I = alpha F + (1 - alpha) B. Alphas are float32 in [0, 1].
 """
 
-from functools import reduce
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from pipeline.capture.background_plate import BackgroundPlate, subtract_background
+from pipeline.capture.background_plate import BackgroundPlate, largest_difference, subtract_background
 
 # The detector's mask has 256 cells on a square of 1.25 times the person's height.
 _MASK_CELLS_PER_PERSON_HEIGHT = 256 / 1.25
@@ -231,8 +230,7 @@ def smooth_mask_temporally(
     weights = np.ones_like(total)
     for time in range(len(images)):
         if time != centre:
-            change = reduce(cv2.max, cv2.split(cv2.absdiff(blurred[time], blurred[centre])))
-            weight = cv2.LUT(change, falloff)
+            weight = cv2.LUT(largest_difference(blurred[time], blurred[centre]), falloff)
             total += weight * masks[time]
             weights += weight
     return np.rint(total / weights).astype(np.uint8)

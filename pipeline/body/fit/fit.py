@@ -66,9 +66,8 @@ CONVERGED_STEP_RATIO = 0.1
 
 Matched silhouettes jitter by 0.06 to 0.1: more rounds do not end nearer to the truth (docs/decisions/body.md)."""
 
-
-COS_CONVERGED_TURN = float(np.cos(np.radians(0.3)))
-"""Cosine of the turn of the world below which it counts as vertical."""
+CONVERGED_TURN_RAD = np.radians(0.3)
+"""Turn of the world after a round below which it counts as vertical."""
 
 
 class TooFewLandmarksError(ValueError):
@@ -268,12 +267,10 @@ def _fit_shared(
         has_converged = shared_step_ratio(before, state, system) < CONVERGED_STEP_RATIO
         if evidence is not None:
             turn = gravity.upright_turn(model, state, evidence.about(to_vertical[:, 1]), settings)
-            state, observations = (
-                gravity.turn_state(state, turn, torch.zeros(3).double()),
-                gravity.turn_world(observations, turn),
-            )
+            state = gravity.turn_state(state, turn, torch.zeros(3, dtype=torch.float64))
+            observations = gravity.turn_world(observations, turn)
             to_vertical = turn @ to_vertical
-            has_converged = has_converged and float(turn[1, 1]) > COS_CONVERGED_TURN
+            has_converged = has_converged and float(turn[1, 1]) > np.cos(CONVERGED_TURN_RAD)
         if number + 1 > POSTURE_ROUND and has_converged:
             break
     stds = posterior_stds(context.linearise(state.shape), system)

