@@ -178,6 +178,8 @@ $(STAMP): requirements.lock pyproject.toml
 	@$(PYTHON) -m scripts.doctor
 	@test -x $(RUN_PYTHON) || $(PYTHON) -m venv $(VENV)
 	$(RUN_PYTHON) -m scripts.install requirements.lock $(EXTRA)
+	@echo "preparing kernels and body model, once on this machine"
+	$(RUN_PYTHON) -m stages --prepare
 	@touch $@
 
 # pip must find the CPU build of torch (TORCH_INDEX=https://download.pytorch.org/whl/cpu unless another index offers it):

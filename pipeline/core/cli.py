@@ -14,6 +14,7 @@ from pipeline.core.errors import EXIT_USER_ERROR, UserError, format_os_error
 from pipeline.core.events import send_event, send_progress
 from pipeline.core.parent import die_with_parent, is_runner_child
 from pipeline.core.pipeline import Pipeline
+from pipeline.core.preparation import prepare_machine
 from pipeline.core.record import read_record
 from pipeline.core.run_folder import RunRequest, StageFailedError, default_run_dir, open_run, require_run
 from pipeline.core.runner import EXIT_INTERRUPTED, RunOptions, format_summary, run_pipeline
@@ -73,6 +74,9 @@ def _run_pipeline(pipeline: Pipeline, argv: Sequence[str], version: str, isolate
     if options.version:
         print(version)
         return
+    if options.prepare:
+        prepare_machine(pipeline.preparations)
+        return
     if options.defaults:
         print(default_yaml({stage.name: stage.config for stage in pipeline.load_stages()}), end="")
         return
@@ -121,6 +125,7 @@ def _parse_pipeline_arguments(names: Sequence[str], argv: Sequence[str]) -> argp
         "would change",
     )
     mode.add_argument("--defaults", action="store_true", help="print every option with its default, as YAML")
+    mode.add_argument("--prepare", action="store_true", help="make once what a run needs on this machine")
     mode.add_argument("--version", action="store_true", help="print the version")
     options, surplus = parser.parse_known_args(argv)
     _check_arguments(options.input, surplus, names)
@@ -166,6 +171,7 @@ def _refuse_unused_options(options: argparse.Namespace) -> None:
         "--status": ("--run", "VIDEO", "--preset", "--set"),
         "--verify": ("--run", "VIDEO"),
         "--defaults": (),
+        "--prepare": (),
     }
     for mode, names in used.items():
         unused = [name for name, value in given.items() if value and name not in names]

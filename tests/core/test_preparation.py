@@ -1,4 +1,4 @@
-"""What the first run makes beside its stages: started where it is missing, ended with the run."""
+"""What a machine is prepared with: made ahead, or beside the first run, where it is missing; ended with the run."""
 
 import sys
 import time
@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.core.preparation import preparations
+from pipeline.core.errors import UserError
+from pipeline.core.preparation import preparations, prepare_machine
 
 MODULE = """
 import time
@@ -63,7 +64,29 @@ def test_what_is_there_is_not_made_again(
     module: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "done").touch()
-    monkeypatch.setattr("pipeline.core.preparation._start", lambda _: pytest.fail("started"))
+    monkeypatch.setattr("pipeline.core.preparation._start", lambda *_: pytest.fail("started"))
     with preparations([module]):
         pass
+    prepare_machine([module])
     assert capsys.readouterr().err == ""
+
+
+def test_a_machine_is_prepared_when_the_call_returns(module: str, tmp_path: Path) -> None:
+    (tmp_path / "go").touch()
+    prepare_machine([module])
+    assert (tmp_path / "done").exists()
+
+
+def test_a_module_that_fails_is_named_after_its_own_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    lines = (
+        "from pipeline.core.errors import UserError",
+        "def is_prepared(): return False",
+        "def prepare(): raise UserError('no place left')",
+    )
+    (tmp_path / "failing_preparation.py").write_text("\n".join(lines))
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(UserError, match="failing_preparation could not be prepared"):
+        prepare_machine(["failing_preparation"])
+    assert capfd.readouterr().err == "error: no place left\n"
