@@ -1,9 +1,8 @@
 """Two passes over a recording: detect the person in the frames, then write the selected frames with their masks."""
 
-import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -116,10 +115,13 @@ def detect_in_frames(
             mask = read_user_mask(user_files, frame)
             yield _FrameTask(frame.rgb, mask, needs_landmarks, frame.index in people_count_indices)
 
-    groups = workers.map(_detect_in_frames, _grouped(tasks()))
+    detectors = [_Detectors() for _ in range(workers.count)]
+    groups = workers.map(partial(_detect_in_frames, detectors), _grouped(tasks()))
     frame_detections = list(
         track((found for group in groups for found in group), "detecting the person", total=len(frame_indices))
     )
+    for one in detectors:
+        one.close()
     if not frame_detections:
         raise UserError(f"{source.path} has no readable frame; use another video")
     height, width, scale = shape[0]
@@ -190,11 +192,12 @@ def estimate_background(
     found = np.flatnonzero(detections.found)
     sampled = found[evenly_spaced(len(found), _MAX_PLATE_FRAMES)]
     is_taken = set(detections.frame_index[sampled].tolist()).__contains__
-    images = np.stack([frame.rgb for frame in read_undistorted_frames(source, user_files, is_taken, max_side_px)])
-    return estimate_background_plate(
-        images,
-        np.stack([~definite_background(_decode_mask(detections.masks_png[p], images.shape[1:3])) for p in sampled]),
-    )
+    size_px = detections.height, detections.width
+    images = np.empty((len(sampled), *size_px, 3), np.uint8)
+    for image, frame in zip(images, read_undistorted_frames(source, user_files, is_taken, max_side_px), strict=True):
+        image[:] = frame.rgb
+    masks = [~definite_background(_decode_mask(detections.masks_png[p], size_px)) for p in sampled]
+    return estimate_background_plate(images, np.stack(masks))
 
 
 def read_undistorted_frames(
@@ -227,8 +230,8 @@ def read_user_mask(user_files: UserFiles, frame: Frame) -> UInt8[np.ndarray, "h 
     return mask if user_files.camera is None else user_files.camera.undistort(mask[..., None], frame.scale)[..., 0]
 
 
-class _Detectors(threading.local):
-    """The detectors of this thread, each loaded when it is first used; that of the person takes a second."""
+class _Detectors:
+    """Detectors for one thread at a time, each loaded when it is first used; that of the person takes a second."""
 
     @cached_property
     def person(self) -> PersonDetector:
@@ -242,8 +245,10 @@ class _Detectors(threading.local):
     def face(self) -> FaceDetector:
         return FaceDetector()
 
-
-_detectors = _Detectors()
+    def close(self) -> None:
+        """Free the memory of the loaded detectors, which cannot be used any more."""
+        for detector in vars(self).values():
+            detector.close()
 
 
 class _FrameTask(NamedTuple):
@@ -262,27 +267,38 @@ def _grouped(tasks: Iterable[_FrameTask]) -> Iterator[tuple[_FrameTask, ...]]:
         yield group
 
 
-def _detect_in_frames(*tasks: _FrameTask) -> list[_FrameDetection]:
+def _detect_in_frames(unused: list[_Detectors], *tasks: _FrameTask) -> list[_FrameDetection]:
     """Detect the person in successive frames, tracked from the first of them (runs in a worker thread)."""
+    detectors = unused.pop()
+    try:
+        return _detect_successively(detectors, tasks)
+    finally:
+        unused.append(detectors)
+
+
+def _detect_successively(detectors: _Detectors, tasks: Sequence[_FrameTask]) -> list[_FrameDetection]:
     reduced = [downscale(task.rgb, DETECTION_SIDE_PX) for task in tasks]
     detections: list[PersonDetection | None] = [None] * len(tasks)
     used = [k for k, task in enumerate(tasks) if task.needs_landmarks or task.mask is None]
     if used:
-        for k, found in zip(used, _detectors.person.track([reduced[k][0] for k in used]), strict=True):
+        for k, found in zip(used, detectors.person.track([reduced[k][0] for k in used]), strict=True):
             if found is not None:
                 detections[k] = replace(found, landmarks_px=found.landmarks_px / np.float32(reduced[k][1]))
     return [
-        _complete_detection(task, small, detection)
+        _complete_detection(detectors, task, small, detection)
         for task, (small, _), detection in zip(tasks, reduced, detections, strict=True)
     ]
 
 
 def _complete_detection(
-    task: _FrameTask, small: UInt8[np.ndarray, "h2 w2 3"], detection: PersonDetection | None
+    detectors: _Detectors,
+    task: _FrameTask,
+    small: UInt8[np.ndarray, "h2 w2 3"],
+    detection: PersonDetection | None,
 ) -> _FrameDetection:
     """Add hands, face and small pictures to the detection in one frame; people are counted in the reduced image."""
     rgb, mask, needs_landmarks, needs_people_count = task
-    n_people = _detectors.person.count_people(small) if needs_people_count and mask is None else -1
+    n_people = detectors.person.count_people(small) if needs_people_count and mask is None else -1
     factor = min(1.0, THUMBNAIL_SIDE_PX / max(rgb.shape[:2]))
     size = (max(1, round(rgb.shape[1] * factor)), max(1, round(rgb.shape[0] * factor)))
     gray = cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
@@ -292,10 +308,10 @@ def _complete_detection(
             [detection.landmarks_px, detection.visibility[:, None], detection.landmarks_world_m], axis=1
         )
     if detection is not None and needs_landmarks:
-        hands = _detectors.hand.detect_hands(
+        hands = detectors.hand.detect_hands(
             rgb, detection.landmarks_px, detection.visibility, detection.landmarks_world_m
         )
-        face_px = _detectors.face.detect_face_of_person(rgb, detection.landmarks_px, detection.landmarks_world_m)
+        face_px = detectors.face.detect_face_of_person(rgb, detection.landmarks_px, detection.landmarks_world_m)
     if mask is None and detection is not None:
         mask = detection.mask
         mask_png = cv2.imencode(".png", mask, (cv2.IMWRITE_PNG_COMPRESSION, 1))[1].tobytes()

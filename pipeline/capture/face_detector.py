@@ -38,6 +38,10 @@ class FaceDetector:
             self._model.process(np.zeros((64, 64, 3), dtype=np.uint8))
         self._is_stderr_quiet = False
 
+    def close(self) -> None:
+        """Free the memory of the model; nothing can be detected afterwards."""
+        self._model.close()
+
     def detect_face(self, rgb: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "478 2"] | None:
         """Return the landmarks of the largest face (px, pixel centres at +0.5), or None without a face.
 

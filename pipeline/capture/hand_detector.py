@@ -101,6 +101,10 @@ class HandDetector:
             self._graph = SolutionBase(graph_config=_GRAPH, side_inputs={"model_complexity": 1})
         self._is_stderr_quiet = False
 
+    def close(self) -> None:
+        """Free the memory of the model; nothing can be detected afterwards."""
+        self._graph.close()
+
     def detect_hands(
         self,
         rgb: UInt8[np.ndarray, "h w 3"],

@@ -126,6 +126,11 @@ class PersonDetector:
             self._roi_graph.process(np.zeros((64, 64, 3), dtype=np.uint8))
         self._is_stderr_quiet = False
 
+    def close(self) -> None:
+        """Free the memory of the model; nothing can be detected afterwards."""
+        self._roi_graph.close()
+        self._landmark_graph.close()
+
     def detect(self, rgb: UInt8[np.ndarray, "h w 3"]) -> PersonDetection | None:
         """Return the most prominent person, or None.
 

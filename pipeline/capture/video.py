@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 
 import av
@@ -17,7 +18,7 @@ from av.container import InputContainer
 from av.video.stream import VideoStream
 from jaxtyping import Int, Shaped, UInt8
 
-from pipeline.capture.video_picture import DecodedImage, to_upright_rgb
+from pipeline.capture.video_picture import DecodedImage, read_display_matrix, to_upright_rgb
 from pipeline.core.errors import UserError
 from pipeline.core.progress import warn
 from pipeline.io.image import IMAGE_SUFFIXES, read_rgb
@@ -231,7 +232,6 @@ def _video(
     convert: Callable[[av.VideoFrame, Fraction | None], DecodedImage] | None = None,
 ) -> Iterator[tuple[int, float, DecodedImage]]:
     """Yield index, time and converted image (default: `to_upright_rgb`) of the wanted frames."""
-    convert = convert or to_upright_rgb
     start_s: float | None = None
     time_s: float | None = None
     with open_container(source.path) as container:
@@ -243,6 +243,7 @@ def _video(
             time_s = _monotonic_time_s(picture.time, time_s, 1.0 / source.fps)
             start_s = time_s if start_s is None else start_s
             if is_wanted(index):
+                convert = convert or partial(to_upright_rgb, display_matrix=read_display_matrix(picture))
                 yield index, time_s - start_s, convert(picture, stream.sample_aspect_ratio)
 
 

@@ -27,10 +27,23 @@ DecodedImage = tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]
 """An image (8-bit sRGB, or 16 bits with another transfer function) and its conversion to 8-bit sRGB."""
 
 
-def to_upright_rgb(picture: av.VideoFrame, aspect: Fraction | None) -> DecodedImage:
+def read_display_matrix(picture: av.VideoFrame) -> Int32[np.ndarray, "9"] | None:
+    """Return the display matrix of a decoded frame, see `orient`; None if the container has none.
+
+    To be read once for a video: a frame and its side data refer to each other, and stay in memory until the garbage
+    collector finds them.
+    """
+    data = cast(SideData | None, picture.side_data.get("DISPLAYMATRIX"))  # PyAV's stubs lack it
+    return None if data is None else np.frombuffer(bytes(data), np.int32)
+
+
+def to_upright_rgb(
+    picture: av.VideoFrame, aspect: Fraction | None, display_matrix: Int32[np.ndarray, "9"] | None = None
+) -> DecodedImage:
     """Return the RGB image of a decoded frame with square pixels, turned and mirrored as the container says.
 
-    aspect: width of a pixel divided by its height; None: 1. The picture of an interlaced frame is its first field.
+    aspect: width of a pixel divided by its height; None: 1. display_matrix: see `orient`; None: upright. The picture of
+    an interlaced frame is its first field.
     """
     transfer, primaries = int(picture.color_trc), int(picture.color_primaries)
     is_hdr = transfer in hdr.HDR_TRANSFERS
@@ -43,9 +56,8 @@ def to_upright_rgb(picture: av.VideoFrame, aspect: Fraction | None) -> DecodedIm
     if aspect and aspect != 1:
         rgb = cv2.resize(rgb, (round(rgb.shape[1] * aspect), rgb.shape[0]), interpolation=cv2.INTER_CUBIC)
     to_srgb = partial(hdr.to_srgb, transfer=transfer, primaries=primaries) if is_hdr else np.asarray
-    display_matrix = cast(SideData | None, picture.side_data.get("DISPLAYMATRIX"))  # PyAV's stubs lack it
     if display_matrix is not None:
-        rgb = orient(rgb, np.frombuffer(bytes(display_matrix), np.int32))
+        rgb = orient(rgb, display_matrix)
     return np.ascontiguousarray(rgb), to_srgb
 
 

@@ -1,7 +1,5 @@
 """The two walks through a recording, without the detector: masks and landmarks lie beside the images."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
@@ -63,10 +61,13 @@ class FakeDetector:
         return undetected_face()
 
 
+class FakeDetectors(sightings._Detectors):
+    person = hand = face = FakeDetector()
+
+
 @pytest.fixture
 def detector(monkeypatch):
-    detectors = SimpleNamespace(person=FakeDetector(), hand=FakeDetector(), face=FakeDetector())
-    monkeypatch.setattr(sightings, "_detectors", detectors)
+    monkeypatch.setattr(sightings, "_Detectors", FakeDetectors)
     return FakeDetector
 
 
@@ -132,7 +133,8 @@ def test_landmarks_without_depth_get_it_from_the_detector(folder, detector):
 
 
 def test_landmarks_with_depth_need_no_detector(folder, monkeypatch):
-    monkeypatch.setattr(sightings, "_detectors", None)
+    monkeypatch.setattr(FakeDetectors, "person", None)
+    monkeypatch.setattr(sightings, "_Detectors", FakeDetectors)
     _, _, seen = detect_recording(folder)
     assert (seen.landmarks_world_m[3] == 1).all()
 

@@ -1,5 +1,6 @@
 """Recordings written here, with container features set by hand, must come back as a viewer shows them."""
 
+import gc
 from fractions import Fraction
 
 import av
@@ -24,6 +25,20 @@ def test_frames_come_in_order_with_index_and_time(tmp_path):
     assert [frame.index for frame in frames] == [0, 3, 6, 9]
     assert [frame.time_s for frame in frames] == pytest.approx([0, 0.12, 0.24, 0.36])
     assert [round(frame.rgb.mean() / 20) for frame in frames] == [0, 3, 6, 9]
+
+
+def test_pictures_that_were_read_stay_no_longer_in_memory(tmp_path):
+    write_video(tmp_path / "a.mp4", [ramp(10 * k) for k in range(20)])
+    source = video.open_frame_source(tmp_path / "a.mp4")
+    gc.collect()
+    gc.disable()
+    try:
+        for _ in video.read_frames(source, select_all, 1000):
+            pass
+        left = sum(isinstance(thing, av.VideoFrame) for thing in gc.get_objects())
+    finally:
+        gc.enable()
+    assert left <= 2
 
 
 def test_variable_frame_rate_keeps_its_times(tmp_path):
