@@ -212,8 +212,10 @@ def push_pull(image: Float32[np.ndarray, "h w c"], known: Bool[np.ndarray, "h w"
     height, width, channels = image.shape
     spec = oiio.ImageSpec(width, height, channels + 1, "float")
     spec.alpha_channel = channels
-    source = oiio.ImageBuf(spec)
-    source.set_pixels(spec.roi, np.dstack([np.where(known[..., None], image, 0.0), known]).astype(np.float32))
+    source, pixels = oiio.ImageBuf(spec), np.zeros((height, width, channels + 1), np.float32)
+    np.copyto(pixels[..., :channels], image, where=known[..., None])
+    pixels[..., channels] = known
+    source.set_pixels(spec.roi, pixels)
     filled = _pixels_of(oiio.ImageBufAlgo.fillholes_pushpull(source))
     return np.ascontiguousarray(filled[..., :channels])
 

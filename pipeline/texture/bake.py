@@ -91,7 +91,7 @@ class WeightedMean:
 
     def add(self, values: Float[Tensor, "t c"], weight: Float[Tensor, "t"]) -> None:
         """Add the values of one frame."""
-        self.total += values * weight[:, None]
+        self.total.addcmul_(values, weight[:, None])
         self.weight += weight
 
     def value(self) -> Float[Tensor, "t c"]:

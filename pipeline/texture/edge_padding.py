@@ -24,7 +24,10 @@ def fill_unknown_texels(
 def dilate_known_texels(
     image: Float[np.ndarray, "h w c"], known: Bool[np.ndarray, "h w"]
 ) -> Float32[np.ndarray, "h w c"]:
-    """Fill the nearest `DILATION_PX` rings of unknown texels only: enough for bilinear samples without mip levels."""
+    """Fill the nearest `DILATION_PX` rings of unknown texels only: enough for bilinear samples without mip levels.
+
+    Unknown texels beyond are 0.
+    """
     return _dilated(image, known)[0]
 
 
@@ -32,11 +35,11 @@ def _dilated(
     image: Float[np.ndarray, "h w c"], known: Bool[np.ndarray, "h w"]
 ) -> tuple[Float32[np.ndarray, "h w c"], Bool[np.ndarray, "h w"]]:
     """Return the image with `DILATION_PX` rings filled, and which texels are known then."""
-    colour = np.array(image, dtype=np.float32)
+    colour = np.where(known[..., None], image, np.float32(0.0)).astype(np.float32, copy=False)
     weight = known.astype(np.float32)
     for _ in range(DILATION_PX):
         near_weight = cv2.boxFilter(weight, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
-        near = cv2.boxFilter(colour * weight[..., None], -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        near = cv2.boxFilter(colour, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
         new = (weight == 0) & (near_weight > 0.5)
         colour[new] = near.reshape(colour.shape)[new] / near_weight[new][:, None]
         weight[new] = 1.0
