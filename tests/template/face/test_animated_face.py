@@ -98,10 +98,13 @@ def test_no_crease_is_seen_along_the_outline() -> None:
     angle_deg = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
     assert np.quantile(angle_deg, 0.95) < 10.0
     assert angle_deg.max() < 25.0
-    drawn = draw_to_template(mesh, registration, frame).vertices
-    around = (frame.level(drawn) > 0.0) & (frame.level(drawn) < 0.1) & (frame.to_face(drawn)[:, 2] > -0.4)
+    level = frame.level(mesh.vertices)
+    around = (level > 0.0) & (level < 0.1) & (frame.to_face(mesh.vertices)[:, 2] > -0.4)
     assert around.sum() > 5
-    assert closest_points_on_mesh(drawn[around], skin)[0].max() < 2e-4
+    drawn = draw_to_template(mesh, registration, frame).vertices
+    before_m, after_m = (closest_points_on_mesh(points[around], skin)[0] for points in (mesh.vertices, drawn))
+    # A fifth of the way to where nothing is drawn, smooth_step is 0.104.
+    assert (after_m <= 0.104 * before_m + 1e-6).all()
 
 
 def test_the_surface_away_from_the_face_stays(face: AnimatedFace) -> None:
@@ -163,7 +166,10 @@ def test_lids_close_over_the_eyes(face: AnimatedFace) -> None:
 
 
 def test_normals_turn_with_the_moved_surface(face: AnimatedFace) -> None:
-    """Against normals of the moved faces by trimesh, at skin whose faces are large: slivers are left out."""
+    """Against normals of the moved faces by trimesh, at skin whose faces are large: slivers are left out.
+
+    So are tips of folds, whose faces cancel each other.
+    """
     import trimesh
 
     mesh, row = face.skinned.mesh, face.names.index("jawOpen")
@@ -171,11 +177,12 @@ def test_normals_turn_with_the_moved_surface(face: AnimatedFace) -> None:
         trimesh.Trimesh(mesh.vertices + weight * face.displacements_m[row], mesh.faces, process=False)
         for weight in (1.0, 0.0)
     )
+    has_normal = rest.vertex_normals.any(axis=1)
     found = rest.vertex_normals + face.normal_changes[row]
-    found /= np.linalg.norm(found, axis=1, keepdims=True)
+    found[has_normal] /= np.linalg.norm(found[has_normal], axis=1, keepdims=True)
     turned_deg = np.rad2deg(np.arccos(np.sum(moved.vertex_normals * rest.vertex_normals, axis=1).clip(-1, 1)))
     error_deg = np.rad2deg(np.arccos(np.sum(found * moved.vertex_normals, axis=1).clip(-1, 1)))
-    rows = turned_deg > 5.0
+    rows = (turned_deg > 5.0) & has_normal
     assert rows.sum() > 500
     assert np.median(turned_deg[rows]) > 10.0
     assert np.median(error_deg[rows]) < 2.0
