@@ -21,11 +21,12 @@ from pipeline.geometry.surface import signed_distance_m
 from pipeline.kernels.inverse_skinning import SkinGrid, WarpGrid, bake_warp_grid
 from pipeline.kernels.march import PackedWarpGrids
 
+CELL_M = 0.03
 NEIGHBOUR_COUNT = 24
 """Nearest vertices whose skin weights a node averages."""
 
 
-def build_skin_grid(body: Body, margin_m: float, cell_m: float = 0.03) -> SkinGrid:
+def build_skin_grid(body: Body, margin_m: float, cell_m: float = CELL_M) -> SkinGrid:
     """Compute skin weights on all grid nodes within `margin_m` (plus two cells) outside the canonical surface, and
     inside.
 
@@ -45,7 +46,7 @@ def build_skin_grid(body: Body, margin_m: float, cell_m: float = 0.03) -> SkinGr
     distance[near] = signed_distance_m(nodes[near], body.mesh())
     kept = distance < max_distance_m
     row_of_node = np.where(kept, np.cumsum(kept) - 1, -1).astype(np.int32).reshape(tuple(size))
-    weights = _smooth_weights(nodes[kept], tree, body.skin_weights, cell_m)
+    weights = smooth_skin_weights(nodes[kept], body, cell_m)
     arrays = (origin, row_of_node, nodes[kept], distance[kept], weights)
     origin_m, rows, nodes_m, distance_m, weights_of = (torch.from_numpy(array) for array in arrays)
     return SkinGrid(origin_m, cell_m, rows, nodes_m, distance_m, weights_of)
@@ -58,14 +59,17 @@ def skin_margin_m(body: Body, bounds_m: Float[np.ndarray, "2 3"]) -> float:
     return float(max((body.vertices.min(0) - bounds_m[0]).max(), (bounds_m[1] - body.vertices.max(0)).max()))
 
 
-def _smooth_weights(nodes: np.ndarray, tree: cKDTree, skin_weights: np.ndarray, cell_m: float) -> np.ndarray:
-    distance, neighbour = tree.query(nodes, k=NEIGHBOUR_COUNT, workers=torch.get_num_threads())
+def smooth_skin_weights(
+    points_m: Float[np.ndarray, "n 3"], body: Body, cell_m: float = CELL_M
+) -> Float[np.ndarray, "n j"]:
+    """Return skin weights of canonical points: a Gaussian average over the nearest vertices of the body."""
+    distance, neighbour = cKDTree(body.vertices).query(points_m, k=NEIGHBOUR_COUNT, workers=torch.get_num_threads())
     sigma = 0.5 * cell_m + 0.35 * distance[:, :1]
     kernel = np.exp(-(distance**2 - distance[:, :1] ** 2) / (2 * sigma**2))
     kernel = (kernel / kernel.sum(1, keepdims=True)).astype(np.float32)
-    row_start = np.arange(len(nodes) + 1) * NEIGHBOUR_COUNT
-    smoothing = csr_array((kernel.ravel(), neighbour.ravel(), row_start), shape=(len(nodes), len(skin_weights)))
-    weights: np.ndarray = smoothing @ skin_weights
+    row_start = np.arange(len(points_m) + 1) * NEIGHBOUR_COUNT
+    shape = len(points_m), len(body.vertices)
+    weights: np.ndarray = csr_array((kernel.ravel(), neighbour.ravel(), row_start), shape=shape) @ body.skin_weights
     return weights
 
 

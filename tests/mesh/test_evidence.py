@@ -9,10 +9,17 @@ import torch
 from pipeline.body.body import Body
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.rotation import axis_angle_to_matrix
-from pipeline.mesh.evidence import CONTRADICTED_SHARE, DEPTH_SHARE, share_beside_masks, surface_evidence, with_emptiness
+from pipeline.mesh.evidence import (
+    CONTRADICTED_SHARE,
+    DEPTH_SHARE,
+    is_copy,
+    share_beside_masks,
+    surface_evidence,
+    with_emptiness,
+)
 from pipeline.mesh.isosurface import sample_canonical_grid
 from pipeline.mesh.views import PosedView
-from tests.mesh.capsule import BOUNDS_M, SETTINGS, VOXEL_SIZE_M, capsule_body, capsule_distance, shell_density
+from tests.mesh.capsule import BOUNDS_M, RADIUS_M, SETTINGS, VOXEL_SIZE_M, capsule_body, capsule_distance, shell_density
 
 CAMERA, DISTANCE_M = Camera(600.0, 600.0, 80.0, 60.0, 160, 120), 3.0
 
@@ -95,3 +102,32 @@ def test_density_that_masks_contradict_is_empty(body: Body) -> None:
     assert found[distance_m < 0.13].max() == 0.0
     few = [*views[:1], *[masked_view_from(0.0, 1.0)] * round(1.0 / CONTRADICTED_SHARE)]
     assert not with_emptiness(samples, body, few).emptiness.any()
+
+
+def bent_view(angle_rad: float) -> PosedView:
+    """The capsule with its end at positive x turned up about the joint, over the other half at 130 degrees."""
+    bent, joint_m = torch.eye(4).repeat(2, 1, 1), torch.tensor([0.05, 0.5, 0.0])
+    bent[1, :3, :3] = axis_angle_to_matrix(torch.tensor([0.0, 0.0, angle_rad]))
+    bent[1, :3, 3] = joint_m - bent[1, :3, :3] @ joint_m
+    return replace(view_from(0.0), canonical_to_world=bent)
+
+
+def test_what_a_pose_brings_to_the_body_is_a_copy(body: Body) -> None:
+    """Above the end, inside the crook, but not below it, and nothing in a straight pose or next to the surface."""
+    above_m, below_m, near_m = ([0.2, 0.5 + height_m, 0.0] for height_m in (0.16, -0.16, 0.11))
+    points_m = np.array([above_m, below_m, near_m])
+    bent, straight = bent_view(np.radians(130.0)), bent_view(0.0)
+    np.testing.assert_array_equal(is_copy(points_m, body, [bent] * 3), [True, False, False])
+    assert not is_copy(points_m, body, [straight, straight, bent]).any()
+
+
+def test_the_copy_of_a_shell_is_empty(body: Body) -> None:
+    """All of the shell inside the crook that is not next to the body; the outside stays."""
+    samples = sample_canonical_grid(shell_density, BOUNDS_M, body, 0.5 * VOXEL_SIZE_M, SETTINGS)
+    view = replace(bent_view(np.radians(130.0)), mask=torch.full((CAMERA.height, CAMERA.width), 255, dtype=torch.uint8))
+    emptiness = with_emptiness(samples, body, [view]).emptiness
+    points_m = np.argwhere(samples.density > 0.0) * samples.spacing_m + samples.origin_m
+    found = emptiness[samples.density > 0.0]
+    along, far = np.abs(points_m[:, 0] - 0.2) < 0.05, capsule_distance(points_m) > RADIUS_M + 0.025
+    assert found[along & far & (points_m[:, 1] > 0.6)].mean() > 0.9
+    assert found[along & (points_m[:, 1] < 0.5)].max() == 0.0
