@@ -216,6 +216,7 @@ def push_pull(image: Float32[np.ndarray, "h w c"], known: Bool[np.ndarray, "h w"
     np.copyto(pixels[..., :channels], image, where=known[..., None])
     pixels[..., channels] = known
     source.set_pixels(spec.roi, pixels)
+    del pixels  # as large as the picture, like each of the next
     filled = _pixels_of(oiio.ImageBufAlgo.fillholes_pushpull(source))
     return np.ascontiguousarray(filled[..., :channels])
 

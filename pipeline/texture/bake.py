@@ -11,6 +11,7 @@ optimization", 2014), and back-projects residuals, which also removes the blur o
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import repeat
 from pathlib import Path
 
 import cv2
@@ -47,6 +48,9 @@ from pipeline.texture.views import (
 HALF_CONFIDENCE_WEIGHT_RATIO = 0.1
 """A texel whose weight sum is this fraction of the median is blended half and half with the inpainted colour. On a real
 recording a tenth of the texels below it have the background's colour, and a thousandth of the well-observed ones."""
+
+TEXELS_PER_PART = 1 << 18
+"""Texels that are sampled at once."""
 
 MIN_ROUND_VIEWS = 30
 """Of many views each round takes every second or third, others than the round before, but at least this many."""
@@ -89,55 +93,61 @@ class WeightedMean:
         """Return the mean of no observations."""
         return WeightedMean(torch.zeros(count, channels), torch.zeros(count))
 
-    def add(self, values: Float[Tensor, "t c"], weight: Float[Tensor, "t"]) -> None:
-        """Add the values of one frame."""
-        self.total.addcmul_(values, weight[:, None])
-        self.weight += weight
+    def add(self, values: Float[Tensor, "u c"], weight: Float[Tensor, "u"], texels: slice) -> None:
+        """Add the values of one frame at some texels."""
+        self.total[texels].addcmul_(values, weight[:, None])
+        self.weight[texels] += weight
 
     def value(self) -> Float[Tensor, "t c"]:
         """Return the mean; 0 where the weight is 0."""
         return self.total / self.weight.clamp(min=1e-6)[:, None]
 
 
-def sample_view_at_texels(
-    view: BakeView,
-    surface: TexturedSurface,
-    image: Float[np.ndarray, "h w c"],
-    pixel_weights: Float[np.ndarray, "h w"],
-    depth_m: Float[Tensor, "h w"],
-    settings: TextureSettings,
-) -> tuple[Float[Tensor, "t c"], Float[Tensor, "t"]]:
-    """Sample an image in the pixel grid of a view at the projection of every texel.
+@dataclass(frozen=True)
+class FrameValues:
+    """Values in the pixels of a view, of any number of channels, for the texels that are seen there.
 
-    Args:
-        view: gives camera, posed vertices and view cosine.
-        surface: mesh and texels.
-        image: values to sample; any number of channels.
-        pixel_weights: confidence of each pixel, in [0, 1].
+    Attributes:
+        view: gives posed vertices, view cosine and weight.
+        values: what is sampled.
+        confidence: of each pixel, in [0, 1].
         depth_m: of the posed mesh, for the depth test; inf outside it.
-        settings: depth tolerance and exponent of the view cosine.
-
-    Returns:
-        The sampled values, and their weights: 0 for hidden texels, else pixel weight * cosine^power * view weight.
     """
-    vertices_px, vertex_depth_m = project(view.vertices_world, view.camera)
-    texels = surface.texels
-    values, weight_and_cosine = project_texels(
-        ProjectedMesh(vertices_px, vertex_depth_m, view.view_cosine, surface.faces),
-        TexelPoints(torch.from_numpy(texels.face), torch.from_numpy(texels.barycentric)),
-        ImageView(torch.from_numpy(np.ascontiguousarray(image)), depth_m, torch.from_numpy(pixel_weights)),
-        settings.depth_tolerance_m,
-    )
-    return values, weight_and_cosine[:, 0] * weight_and_cosine[:, 1] ** settings.cosine_power * view.weight
+
+    view: BakeView
+    values: Float[np.ndarray, "h w c"]
+    confidence: Float[np.ndarray, "h w"]
+    depth_m: Float[Tensor, "h w"]
+
+    def at_texels(
+        self, surface: TexturedSurface, settings: TextureSettings, part: slice = slice(None)
+    ) -> tuple[Float[Tensor, "t c"], Float[Tensor, "t"]]:
+        """Sample the values at the projection of every texel, or of a part of the texels.
+
+        Returns:
+            The values, and their weights: 0 for hidden texels, else confidence * cosine^power * weight of the view.
+        """
+        texels = surface.texels
+        values, weight_and_cosine = project_texels(
+            ProjectedMesh(*project(self.view.vertices_world, self.view.camera), self.view.view_cosine, surface.faces),
+            TexelPoints(torch.from_numpy(texels.face[part]), torch.from_numpy(texels.barycentric[part])),
+            ImageView(
+                torch.from_numpy(np.ascontiguousarray(self.values)), self.depth_m, torch.from_numpy(self.confidence)
+            ),
+            settings.depth_tolerance_m,
+        )
+        return values, weight_and_cosine[:, 0] * weight_and_cosine[:, 1] ** settings.cosine_power * self.view.weight
 
 
 def sample_frame_colours(
     view: BakeView, surface: TexturedSurface, settings: TextureSettings
 ) -> tuple[Float[Tensor, "t 3"], Float[Tensor, "t"]]:
-    """Sample the unaligned colours (sRGB) of a view at every texel; see `sample_view_at_texels`.
+    """Sample the colours of `frame_colours` at every texel; see `FrameValues.at_texels`."""
+    return frame_colours(view, surface, settings).at_texels(surface, settings)
 
-    Colours are those of the frame, or albedos (at most `MAX_ALBEDO`) if the shading of the view is known.
-    """
+
+def frame_colours(view: BakeView, surface: TexturedSurface, settings: TextureSettings) -> FrameValues:
+    """Return the unaligned colours (sRGB) of a view, or albedos (at most `MAX_ALBEDO`) if its shading is known."""
     vertices_px, vertex_depth_m = project(view.vertices_world, view.camera)
     face_id, barycentric, depth_m = rasterize(
         vertices_px, vertex_depth_m, surface.faces, view.camera.height, view.camera.width
@@ -152,7 +162,7 @@ def sample_frame_colours(
         shading = shading[torch.from_numpy(used)]
         image[used] = np.minimum(remove_light(image[used], shading.numpy()), MAX_ALBEDO)
         pixel_weights[used] *= light_confidence(shading).numpy()
-    return sample_view_at_texels(view, surface, image, pixel_weights, depth_m, settings)
+    return FrameValues(view, image, pixel_weights, depth_m)
 
 
 def _used_pixels(weights: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
@@ -171,19 +181,28 @@ def light_confidence(shading: Float[Tensor, "*n d"]) -> Float[Tensor, "*n"]:
 
 def average_views(views: Iterable[BakeView], surface: TexturedSurface, settings: TextureSettings) -> WeightedMean:
     """Return the weighted mean colour of each texel over all views, without alignment."""
-    return _mean_of_views(lambda view: sample_frame_colours(view, surface, settings), views, surface)
+    return _mean_of_views(lambda view: frame_colours(view, surface, settings), views, surface, settings)
 
 
 def _mean_of_views(
-    sample: Callable[[BakeView], tuple[Float[Tensor, "t 3"], Float[Tensor, "t"]]],
+    values_of: Callable[[BakeView], FrameValues],
     views: Iterable[BakeView],
     surface: TexturedSurface,
+    settings: TextureSettings,
 ) -> WeightedMean:
-    """Return the weighted mean of what is sampled in the views, several at a time, summed in their order."""
-    mean = WeightedMean.empty(len(surface.texels.face))
+    """Return the weighted mean of values of the views: several views at a time are made, then added in their order.
+
+    Parts of the texels are added side by side: values of all texels would be as large as the texture for each thread.
+    """
+    count, pool = len(surface.texels.face), shared_thread_pool(torch.get_num_threads())
+    mean, parts = WeightedMean.empty(count), [slice(k, k + TEXELS_PER_PART) for k in range(0, count, TEXELS_PER_PART)]
+
+    def add(frame: FrameValues, part: slice) -> None:
+        mean.add(*frame.at_texels(surface, settings, part), part)
+
     with single_threaded_opencv():
-        for values, weight in shared_thread_pool(torch.get_num_threads()).imap(sample, views):
-            mean.add(values, weight)
+        for frame in pool.imap(values_of, views):
+            pool.map(add, repeat(frame), parts)
     return mean
 
 
@@ -197,13 +216,13 @@ def average_residuals(
 
     texture: sRGB in [0, 1]. Residuals are down-weighted by the Geman-McClure function.
     """
-    return _mean_of_views(lambda view: sample_residuals(texture, view, surface, settings), views, surface)
+    return _mean_of_views(lambda view: frame_residuals(texture, view, surface, settings), views, surface, settings)
 
 
-def sample_residuals(
+def frame_residuals(
     texture: Float[np.ndarray, "s s 3"], view: BakeView, surface: TexturedSurface, settings: TextureSettings
-) -> tuple[Float[Tensor, "t 3"], Float[Tensor, "t"]]:
-    """Sample the residual between an aligned view and the render of the texture at every texel, and its weight."""
+) -> FrameValues:
+    """Return the residual between an aligned view and the render of the texture, with its weights."""
     drawn = draw_view(texture, view, surface)
     pixel_m = pixel_footprint_m(view.vertices_world, view.camera)
     warped, warped_mask = align_to_render(
@@ -221,7 +240,7 @@ def sample_residuals(
     weights[used] *= robust
     residuals = np.zeros((*weights.shape, 3), dtype=np.float32)
     residuals[used] = residual
-    return sample_view_at_texels(view, surface, residuals, weights, drawn.depth_m, settings)
+    return FrameValues(view, residuals, weights, drawn.depth_m)
 
 
 @dataclass(frozen=True)

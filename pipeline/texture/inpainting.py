@@ -26,13 +26,15 @@ def average_texels_per_vertex(
 
     weight: one per texel, >= 0. Both results are 0 for a vertex without texels.
     """
-    corner_weight = texels.barycentric.ravel()
-    vertex = faces[texels.face].ravel()
-    weighted = corner_weight * np.repeat(weight, 3)
-    total = np.bincount(vertex, weighted, vertex_count)
-    summed = [np.bincount(vertex, weighted * np.repeat(column, 3), vertex_count) for column in colour.T]
-    mean = np.stack(summed, axis=1) / np.maximum(total, 1e-12)[:, None]
-    mean_weight = total / np.maximum(np.bincount(vertex, corner_weight, vertex_count), 1e-12)
+    total, every, summed = np.zeros(vertex_count), np.zeros(vertex_count), np.zeros((vertex_count, colour.shape[1]))
+    for corner, share in enumerate(texels.barycentric.T):
+        vertex, weighted = faces[texels.face, corner], share * weight
+        every += np.bincount(vertex, share, vertex_count)
+        total += np.bincount(vertex, weighted, vertex_count)
+        for channel, column in enumerate(colour.T):
+            summed[:, channel] += np.bincount(vertex, weighted * column, vertex_count)
+    mean = summed / np.maximum(total, 1e-12)[:, None]
+    mean_weight = total / np.maximum(every, 1e-12)
     return mean.astype(np.float32), mean_weight.astype(np.float32)
 
 

@@ -4,6 +4,7 @@ The template is registered before the atlas of the person is made, because the a
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -89,5 +90,6 @@ def find_landmarks(
     atlas = unwrap(shell, np.zeros(len(shell.faces), np.int32), SIZE_PX, settings.padding_px)
     texels = rasterize_texels(atlas, SIZE_PX)
     mean = average_views(chosen, TexturedSurface.from_arrays(shell.faces, atlas, texels), settings)
-    rendered_m = rendered_landmarks_m(body, shell, atlas, texels_to_texture(mean.value(), texels), make_detector())
+    with closing(make_detector()) as detector:
+        rendered_m = rendered_landmarks_m(body, shell, atlas, texels_to_texture(mean.value(), texels), detector)
     return choose_landmarks(body, rendered_m, faces.on_surface(shell, body))

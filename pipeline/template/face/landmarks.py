@@ -70,6 +70,10 @@ class Detector(Protocol):
         """Return the landmarks of a face in pixels, or None."""
         ...
 
+    def close(self) -> None:
+        """Free the memory of the detector."""
+        ...
+
 
 @dataclass(frozen=True)
 class FaceLandmarks:
