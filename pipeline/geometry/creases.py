@@ -16,6 +16,9 @@ from pipeline.geometry.mesh import Mesh
 
 MIN_SMOOTH_COSINE = 0.0
 """Between the normals of two faces; below, they look away from each other and their edge is a fold."""
+MIN_HEIGHT_RATIO = 1e-4
+"""Height of a triangle over its longest edge up to which its normal is noise: float32 coordinates of a metre, edges of
+half a centimetre."""
 
 
 @dataclass(frozen=True)
@@ -71,9 +74,18 @@ def _smooth_half_edges(mesh: Mesh, faces: Int[np.ndarray, "f 3"]) -> tuple[Int[n
     _, at, sharing = np.unique(key[order], return_index=True, return_counts=True)
     first, second = order[at[sharing == 2]], order[at[sharing == 2] + 1]
     normals = mesh.face_normals().astype(np.float64)
+    normals[_is_line(mesh)] = 0.0
     cosine = np.sum(normals[first // 3] * normals[second // 3], axis=1)
     smooth = (cosine >= MIN_SMOOTH_COSINE) & (start[first] == end[second])
     return first[smooth], second[smooth]
+
+
+def _is_line(mesh: Mesh) -> Bool[np.ndarray, "f"]:
+    """Return the faces without area, whose normals are made of rounding errors."""
+    corners = mesh.vertices.astype(np.float64)[mesh.faces]
+    edges = np.roll(corners, -1, axis=1) - corners
+    twice_area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    return np.asarray(twice_area <= MIN_HEIGHT_RATIO * np.square(edges).sum(axis=2).max(axis=1, initial=0.0))
 
 
 def _next(half_edge: Int[np.ndarray, "e"]) -> Int[np.ndarray, "e"]:
