@@ -67,22 +67,21 @@ def run(inputs: Mapping[str, Path], out: Path, config: Config) -> Mapping[str, f
     user_files = load_user_files(inputs["video"], source)
     if user_files.split is not None and config.split == "disjoint":
         raise UserError(f"{inputs['video']} has a split.json, which frames.split=disjoint would ignore; remove one")
-    frame_indices, n_repeats = select_detection_frames(source, user_files, config)
-    detections = load_detections(out / CHECKPOINT)
-    if detections is None:
-        with start_worker_pool(config.workers) as workers:
+    with start_worker_pool(config.workers) as workers:
+        frame_indices, n_repeats = select_detection_frames(source, user_files, config)
+        detections = load_detections(out / CHECKPOINT)
+        if detections is None:
             detections = detect_in_frames(
                 source, user_files, frame_indices, _PEOPLE_COUNT_FRAMES, config.max_side_px, workers
             )
-        save_detections(out / CHECKPOINT, detections)
-    check_input(detections, source.path, config.min_frames)
-    noise = selection.estimate_noise_level(detections.gray_thumbnails)
-    if user_files.split is None:
-        selected = select_capture_frames(detections, source.path, config, noise)
-    else:
-        selected = select_listed_frames(detections, user_files.split, source.path)
-    chosen = selected.positions
-    with start_worker_pool(config.workers) as workers:
+            save_detections(out / CHECKPOINT, detections)
+        check_input(detections, source.path, config.min_frames)
+        noise = selection.estimate_noise_level(detections.gray_thumbnails)
+        if user_files.split is None:
+            selected = select_capture_frames(detections, source.path, config, noise)
+        else:
+            selected = select_listed_frames(detections, user_files.split, source.path)
+        chosen = selected.positions
         # The colour noise of a blurred patch is at least one level, whatever the grey thumbnails show.
         write_frames(source, user_files, detections, chosen, out, config.max_side_px, max(1.0, noise), workers)
     capture = make_capture(detections, selected, out, source, user_files)

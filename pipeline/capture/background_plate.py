@@ -40,7 +40,8 @@ def estimate_background_plate(
     images: overwritten (sorted in place), because the array is large.
     person_masks: dilated masks; misses are tolerated in less than half of the images.
     """
-    for image, person in zip(images, person_masks, strict=True):  # indices of all at once would be larger than they
+    # The indices of the masked pixels of all images at once would need more memory than the images.
+    for image, person in zip(images, person_masks, strict=True):
         image[person] = 255
     images.sort(axis=0)
     count = len(images) - person_masks.sum(axis=0)

@@ -115,7 +115,7 @@ def detect_in_frames(
             mask = read_user_mask(user_files, frame)
             yield _FrameTask(frame.rgb, mask, needs_landmarks, frame.index in people_count_indices)
 
-    detectors = [_Detectors() for _ in range(workers.count)]
+    detectors = [_Detectors() for _ in range(workers.count)]  # each worker takes one and puts it back
     groups = workers.map(partial(_detect_in_frames, detectors), _grouped(tasks()))
     frame_detections = list(
         track((found for group in groups for found in group), "detecting the person", total=len(frame_indices))

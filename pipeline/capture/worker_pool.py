@@ -17,14 +17,18 @@ _MAX_PENDING_PER_WORKER = 2
 
 
 class WorkerPool:
-    """Runs functions in worker threads."""
+    """Runs functions in worker threads, or in the calling thread if `executor` is None."""
 
-    def __init__(self, executor: ThreadPoolExecutor, count: int) -> None:
+    def __init__(self, executor: ThreadPoolExecutor | None, count: int) -> None:
         self._executor = executor
         self.count = count
 
     def map(self, function: Callable[..., Result], tasks: Iterable[tuple[Any, ...]]) -> Iterator[Result]:
         """Yield `function(*task)` for each task in order; tasks are taken from the iterator when a worker is free."""
+        if self._executor is None:
+            for task in tasks:
+                yield function(*task)
+            return
         pending: deque[Future[Result]] = deque()
         for task in tasks:
             pending.append(self._executor.submit(function, *task))
@@ -36,9 +40,13 @@ class WorkerPool:
 
 @contextmanager
 def start_worker_pool(count: int) -> Iterator[WorkerPool]:
-    """Start `count` threads that end with the block; OpenCV uses one thread for each meanwhile."""
-    with single_threaded_opencv(), ThreadPoolExecutor(count) as executor:
-        try:
-            yield WorkerPool(executor, count)
-        finally:
-            executor.shutdown(wait=True, cancel_futures=True)
+    """Start `count` threads (none for 1) that end with the block; OpenCV uses one thread for each meanwhile."""
+    with single_threaded_opencv():
+        if count == 1:
+            yield WorkerPool(None, 1)
+            return
+        with ThreadPoolExecutor(count) as executor:
+            try:
+                yield WorkerPool(executor, count)
+            finally:
+                executor.shutdown(wait=True, cancel_futures=True)

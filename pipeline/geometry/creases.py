@@ -84,8 +84,9 @@ def _is_line(mesh: Mesh) -> Bool[np.ndarray, "f"]:
     """Return the faces without area, whose normals are made of rounding errors."""
     corners = mesh.vertices.astype(np.float64)[mesh.faces]
     edges = np.roll(corners, -1, axis=1) - corners
-    twice_area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
-    return np.asarray(twice_area <= MIN_HEIGHT_RATIO * np.square(edges).sum(axis=2).max(axis=1, initial=0.0))
+    return np.asarray(
+        2.0 * mesh.face_areas_m2() <= MIN_HEIGHT_RATIO * np.square(edges).sum(axis=2).max(axis=1, initial=0.0)
+    )
 
 
 def _next(half_edge: Int[np.ndarray, "e"]) -> Int[np.ndarray, "e"]:

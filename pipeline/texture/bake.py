@@ -105,45 +105,36 @@ class WeightedMean:
 
 @dataclass(frozen=True)
 class FrameValues:
-    """Values in the pixels of a view, of any number of channels, for the texels that are seen there.
+    """Values in the pixels of a view, for the texels that are seen there.
 
     Attributes:
-        view: gives posed vertices, view cosine and weight.
-        values: what is sampled.
-        confidence: of each pixel, in [0, 1].
-        depth_m: of the posed mesh, for the depth test; inf outside it.
+        mesh: the posed mesh in the pixels of the view.
+        image: values of any number of channels, depth of the mesh, and confidence of each pixel in [0, 1].
+        weight: of the view.
     """
 
-    view: BakeView
-    values: Float[np.ndarray, "h w c"]
-    confidence: Float[np.ndarray, "h w"]
-    depth_m: Float[Tensor, "h w"]
+    mesh: ProjectedMesh
+    image: ImageView
+    weight: float
 
     def at_texels(
-        self, surface: TexturedSurface, settings: TextureSettings, part: slice = slice(None)
+        self, texels: Texels, settings: TextureSettings, part: slice = slice(None)
     ) -> tuple[Float[Tensor, "t c"], Float[Tensor, "t"]]:
         """Sample the values at the projection of every texel, or of a part of the texels.
 
         Returns:
             The values, and their weights: 0 for hidden texels, else confidence * cosine^power * weight of the view.
         """
-        texels = surface.texels
-        values, weight_and_cosine = project_texels(
-            ProjectedMesh(*project(self.view.vertices_world, self.view.camera), self.view.view_cosine, surface.faces),
-            TexelPoints(torch.from_numpy(texels.face[part]), torch.from_numpy(texels.barycentric[part])),
-            ImageView(
-                torch.from_numpy(np.ascontiguousarray(self.values)), self.depth_m, torch.from_numpy(self.confidence)
-            ),
-            settings.depth_tolerance_m,
-        )
-        return values, weight_and_cosine[:, 0] * weight_and_cosine[:, 1] ** settings.cosine_power * self.view.weight
+        points = TexelPoints(torch.from_numpy(texels.face[part]), torch.from_numpy(texels.barycentric[part]))
+        values, weight_and_cosine = project_texels(self.mesh, points, self.image, settings.depth_tolerance_m)
+        return values, weight_and_cosine[:, 0] * weight_and_cosine[:, 1] ** settings.cosine_power * self.weight
 
 
 def sample_frame_colours(
     view: BakeView, surface: TexturedSurface, settings: TextureSettings
 ) -> tuple[Float[Tensor, "t 3"], Float[Tensor, "t"]]:
     """Sample the colours of `frame_colours` at every texel; see `FrameValues.at_texels`."""
-    return frame_colours(view, surface, settings).at_texels(surface, settings)
+    return frame_colours(view, surface, settings).at_texels(surface.texels, settings)
 
 
 def frame_colours(view: BakeView, surface: TexturedSurface, settings: TextureSettings) -> FrameValues:
@@ -162,7 +153,8 @@ def frame_colours(view: BakeView, surface: TexturedSurface, settings: TextureSet
         shading = shading[torch.from_numpy(used)]
         image[used] = np.minimum(remove_light(image[used], shading.numpy()), MAX_ALBEDO)
         pixel_weights[used] *= light_confidence(shading).numpy()
-    return FrameValues(view, image, pixel_weights, depth_m)
+    mesh = ProjectedMesh(vertices_px, vertex_depth_m, view.view_cosine, surface.faces)
+    return FrameValues(mesh, ImageView(torch.from_numpy(image), depth_m, torch.from_numpy(pixel_weights)), view.weight)
 
 
 def _used_pixels(weights: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
@@ -198,7 +190,7 @@ def _mean_of_views(
     mean, parts = WeightedMean.empty(count), [slice(k, k + TEXELS_PER_PART) for k in range(0, count, TEXELS_PER_PART)]
 
     def add(frame: FrameValues, part: slice) -> None:
-        mean.add(*frame.at_texels(surface, settings, part), part)
+        mean.add(*frame.at_texels(surface.texels, settings, part), part)
 
     with single_threaded_opencv():
         for frame in pool.imap(values_of, views):
@@ -240,7 +232,10 @@ def frame_residuals(
     weights[used] *= robust
     residuals = np.zeros((*weights.shape, 3), dtype=np.float32)
     residuals[used] = residual
-    return FrameValues(view, residuals, weights, drawn.depth_m)
+    mesh = ProjectedMesh(*project(view.vertices_world, view.camera), view.view_cosine, surface.faces)
+    return FrameValues(
+        mesh, ImageView(torch.from_numpy(residuals), drawn.depth_m, torch.from_numpy(weights)), view.weight
+    )
 
 
 @dataclass(frozen=True)

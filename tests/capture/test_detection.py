@@ -133,7 +133,8 @@ def test_landmarks_without_depth_get_it_from_the_detector(folder, detector):
 
 
 def test_landmarks_with_depth_need_no_detector(folder, monkeypatch):
-    monkeypatch.setattr(FakeDetectors, "person", None)
+    for name in ("person", "hand", "face"):
+        monkeypatch.setattr(FakeDetectors, name, None)
     monkeypatch.setattr(sightings, "_Detectors", FakeDetectors)
     _, _, seen = detect_recording(folder)
     assert (seen.landmarks_world_m[3] == 1).all()

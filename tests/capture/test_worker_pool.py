@@ -1,4 +1,4 @@
-"""Order, laziness and errors of the worker pool."""
+"""Order, laziness and errors of the worker pool; the same answers with and without threads."""
 
 import threading
 
@@ -22,6 +22,11 @@ def test_results_come_in_order_from_other_threads():
         results = list(workers.map(square, ((k,) for k in range(20))))
     assert [value for value, _ in results] == [k * k for k in range(20)]
     assert threading.get_ident() not in {thread for _, thread in results}
+
+
+def test_one_worker_is_this_thread():
+    with start_worker_pool(1) as workers:
+        assert list(workers.map(square, [(3,)])) == [(9, threading.get_ident())]
 
 
 def test_tasks_are_drawn_as_they_are_needed():
