@@ -2,8 +2,9 @@
 
 Cloth that hangs from leg to leg is moved by linear blend skinning with one leg or the other. In a canonical pose whose
 legs are farther apart than the filmed ones, nothing is filmed of what would then be between them: a skirt gets a slit.
-Where such cloth is seen, the body is therefore given the mean legs of the recording as its canonical pose. Bare legs
-and trousers keep the model's A-pose, whose legs are apart, so that they do not grow together.
+Where such cloth is seen, the body is therefore given the mean legs of the recording as its canonical pose, opened
+until there is room for trousers between the shins. Bare legs and trousers without a skirt or coat keep the model's
+A-pose, whose legs are apart, so that they do not grow together.
 
 Notation: Q_j rotation of joint j from the old canonical pose to the new one, R_j its local rotation in a frame.
 """
@@ -17,11 +18,17 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pipeline.body.body import Body, Motion, canonical_to_world
+from pipeline.body.fit.linear_body import descendant_matrix
 from pipeline.body.fit.silhouette_icp import MaskWindow, rasterise_in_window
 from pipeline.body.overlay import pose_vertices
 from pipeline.capture.frame_selection import evenly_spaced
 from pipeline.geometry.camera import Camera, project
-from pipeline.geometry.rotation import continuous_quaternions, matrix_to_quaternion, quaternion_to_matrix
+from pipeline.geometry.rotation import (
+    axis_angle_to_matrix,
+    continuous_quaternions,
+    matrix_to_quaternion,
+    quaternion_to_matrix,
+)
 from pipeline.geometry.skinning import (
     forward_kinematics,
     linear_blend_skinning,
@@ -30,6 +37,10 @@ from pipeline.geometry.skinning import (
 
 LEGS = (("LeftUpLeg", "LeftLeg", "LeftFoot"), ("RightUpLeg", "RightLeg", "RightFoot"))
 """Joints of either leg; the feet stay flat."""
+
+MIN_SHIN_GAP_M = 0.06
+"""Room between the shins, feet included: trousers are 2 to 3 cm wider than the legs. A coat that was filmed with 0.02 m
+had trousers that grew together below it, one that was filmed with 0.05 m had not."""
 
 JUDGED_FRAMES = 24
 """Frames, evenly spaced, whose masks are compared with the legs of the body."""
@@ -175,7 +186,8 @@ def _leg_faces(body: Body, names: tuple[str, ...]) -> Bool[np.ndarray, "f"]:
 def rest_with_filmed_legs(body: Body, motion: Motion, frames: Bool[np.ndarray, "n"]) -> RestPose:
     """Return the body with the mean rotations of hips and knees in some frames as its canonical pose, feet flat.
 
-    Posed bodies stay the same, but for the blended skin around the hips, which differs by millimetres.
+    Shins that are nearer to each other than `MIN_SHIN_GAP_M` are opened at the hips. Posed bodies stay the same, but
+    for the blended skin around the hips, which differs by millimetres.
 
     Args:
         body: in its canonical pose.
@@ -187,12 +199,17 @@ def rest_with_filmed_legs(body: Body, motion: Motion, frames: Bool[np.ndarray, "
     for upper, lower, foot in (tuple(map(body.joint, side)) for side in LEGS):
         local[upper], local[lower] = (_mean_rotation(rotations[frames, joint]) for joint in (upper, lower))
         local[foot] = (local[upper] @ local[lower]).T
-    joints_m = torch.from_numpy(body.joints_m).double()
-    rest = forward_kinematics(local[None], joints_m[None, 0], joints_m, body.parents)
-    to_rest = skinning_transforms(rest, joints_m)
-    vertices = linear_blend_skinning(
-        torch.from_numpy(body.vertices).double(), torch.from_numpy(body.skin_weights).double(), to_rest
-    )[0]
+    rest, vertices = _posed_by(local, body)
+    missing_m = MIN_SHIN_GAP_M - _shin_gap_m(body, vertices)
+    if missing_m > 0.0:
+        hip_m, foot_m = (rest[0, [body.joint(side[part]) for side in LEGS], :3, 3].mean(0) for part in (0, 2))
+        angle_rad = 0.5 * missing_m / float(hip_m[1] - foot_m[1])
+        for side, outwards_rad in zip(LEGS, (angle_rad, -angle_rad), strict=True):
+            upper, lower, foot = map(body.joint, side)
+            about_z = torch.tensor([[0.0, 0.0, outwards_rad]], dtype=torch.float64)
+            local[upper] = axis_angle_to_matrix(about_z)[0] @ local[upper]
+            local[foot] = (local[upper] @ local[lower]).T
+        rest, vertices = _posed_by(local, body)
     drop_m = torch.tensor([0.0, float(vertices[:, 1].min()), 0.0], dtype=torch.float64)
     turned = rest[0, :, :3, :3]
     of_parent = torch.stack([turned[max(parent, 0)] for parent in body.parents.tolist()])
@@ -205,6 +222,25 @@ def rest_with_filmed_legs(body: Body, motion: Motion, frames: Bool[np.ndarray, "
     )
     quaternions = continuous_quaternions(matrix_to_quaternion(changed)).float().numpy()
     return RestPose(new, motion.with_pose(quaternions, motion.root_translation_m))
+
+
+def _posed_by(local: Float[Tensor, "j 3 3"], body: Body) -> tuple[Float[Tensor, "1 j 4 4"], Float[Tensor, "v 3"]]:
+    """Return the joints' transforms and the vertices (m) of a body with these local rotations."""
+    joints_m = torch.from_numpy(body.joints_m).double()
+    rest = forward_kinematics(local[None], joints_m[None, 0], joints_m, body.parents)
+    vertices = linear_blend_skinning(
+        torch.from_numpy(body.vertices).double(),
+        torch.from_numpy(body.skin_weights).double(),
+        skinning_transforms(rest, joints_m),
+    )[0]
+    return rest, vertices
+
+
+def _shin_gap_m(body: Body, vertices: Float[Tensor, "v 3"]) -> float:
+    """Return the distance between both shins with their feet along x, m; negative where they overlap."""
+    below = descendant_matrix(body.parents.tolist()).numpy()[[body.joint(side[1]) for side in LEGS]]
+    left, right = (vertices[torch.from_numpy(body.skin_weights @ of_leg > 0.5), 0] for of_leg in below)
+    return float(left.min() - right.max())
 
 
 def _mean_rotation(rotations: Float[Tensor, "n 3 3"]) -> Float[Tensor, "3 3"]:

@@ -1,5 +1,7 @@
 """The space between the legs, where frames show little: strands and ridges are cleared, valleys are closed.
 
+A skirt or coat is one piece down to its hem; below it the legs are parted.
+
 Grids are samples of canonical space: origin_m is the position of sample [0, 0, 0], spacing_m the distance of
 neighbours; body_distance_m is the signed distance to the fitted body, negative inside. crotch_m is the height of its
 crotch (`crotch_height_m`).
@@ -27,7 +29,13 @@ LEGS = (("LeftUpLeg", "LeftLeg"), ("RightUpLeg", "RightLeg"))
 CROTCH_SHARE = 0.25
 """Distance of the crotch below the hip joints, as a share of the thigh; 0.23 to 0.28 in three fitted bodies."""
 SKIRT_RADIUS_M = 0.06
-"""Gaps in a skirt that a horizontal disc of this radius cannot enter are closed."""
+"""Gaps in a skirt that a horizontal disc, or a ball, of this radius cannot enter are closed."""
+SKIRT_ABOVE_CROTCH_M = 0.2
+"""A skirt or coat is closed up to this height above the crotch."""
+HEM_STEP_M, HEM_HEIGHT_M, HEM_RATIO = 0.015, 0.04, 0.5
+"""At a hem the distance from the outer sides of the legs falls by the first within the second, and to this share."""
+PARTING_M = 0.01
+"""Width of the gap that parts the legs below a hem; two samples at least."""
 MIN_JOINED_M, MAX_JOINED_M = 0.03, 0.15
 """Legs that are joined over less than the first height below the crotch of the body have no valley; cloth that joins
 them over more than the second is a skirt."""
@@ -119,27 +127,101 @@ def gaps_in_skirt(
 ) -> Bool[np.ndarray, "x y z"]:
     """Return holes and notches of a skirt or coat: cloth that joins both legs over more than `MAX_JOINED_M`.
 
-    Frames hardly show its depth between the legs, where it is far from the body. In each horizontal slice from the
-    crotch down to where the legs part, the piece that holds both is closed by a disc of `SKIRT_RADIUS_M`.
+    Frames hardly show its depth between the legs, where it is far from the body. In each horizontal slice from
+    `SKIRT_ABOVE_CROTCH_M` above the crotch down to the hem, or to where the legs part, the piece that holds both is
+    closed by a disc of `SKIRT_RADIUS_M`; then all slices together by a ball.
     """
     gaps, body = np.zeros_like(inside), body_distance_m < 0.0
     middle, crotch = _middle_and_crotch(inside.shape, crotch_m, origin_m, spacing_m)
-    pieces = []
-    for row in range(crotch - 1, -1, -1):
+    hem = hem_row(inside, body_distance_m, crotch_m, origin_m, spacing_m)
+    top = min(crotch + round(SKIRT_ABOVE_CROTCH_M / spacing_m), inside.shape[1]) if crotch else 0
+    skirt = np.zeros_like(inside)
+    for row in range(top - 1, hem - 1, -1):
         labels, _ = ndimage.label(inside[:, row], np.ones((3, 3), dtype=int))
         legs = np.where(body[:, row], labels, 0)
         joined = np.intersect1d(legs[:middle], legs[middle:])
         if not joined.any():
             break
-        pieces.append(np.isin(labels, joined[joined > 0]))
-    if spacing_m * len(pieces) < MAX_JOINED_M:
+        skirt[:, row] = np.isin(labels, joined[joined > 0])
+    rows = np.flatnonzero(skirt.any(axis=(0, 2)))
+    if spacing_m * np.count_nonzero(rows < crotch) < MAX_JOINED_M:
         return gaps
-    padding = int(np.ceil(SKIRT_RADIUS_M / spacing_m)) + 1
-    for row, piece in zip(range(crotch - 1, -1, -1), pieces, strict=False):
-        outside_m = spacing_m * ndimage.distance_transform_edt(~np.pad(piece, padding))
-        closed = spacing_m * ndimage.distance_transform_edt(outside_m <= SKIRT_RADIUS_M) > SKIRT_RADIUS_M
-        gaps[:, row] = closed[padding:-padding, padding:-padding] & ~inside[:, row]
+    part = np.s_[:, rows[0] : rows[-1] + 1]
+    closed = skirt[part].copy()
+    for row in range(closed.shape[1]):
+        closed[:, row] = _closed(closed[:, row], spacing_m)
+    # Nothing is below the hem; above the top the cloth goes on.
+    reach = int(np.ceil(SKIRT_RADIUS_M / spacing_m)) + 1
+    going_on = np.pad(closed, ((0, 0), (0, reach), (0, 0)), mode="edge")
+    gaps[part] = _closed(going_on, spacing_m)[:, : closed.shape[1]] & ~inside[part]
     return gaps
+
+
+def _closed(solid: Bool[np.ndarray, "*n"], spacing_m: float) -> Bool[np.ndarray, "*n"]:
+    """Return the morphological closing by a disc or ball of `SKIRT_RADIUS_M`."""
+    padding = int(np.ceil(SKIRT_RADIUS_M / spacing_m)) + 1
+    outside_m = spacing_m * ndimage.distance_transform_edt(~np.pad(solid, padding))
+    closed = spacing_m * ndimage.distance_transform_edt(outside_m <= SKIRT_RADIUS_M) > SKIRT_RADIUS_M
+    return closed[(np.s_[padding:-padding],) * solid.ndim]
+
+
+def hem_row(
+    inside: Bool[np.ndarray, "x y z"],
+    body_distance_m: Float[np.ndarray, "x y z"],
+    crotch_m: float,
+    origin_m: Float[np.ndarray, "3"],
+    spacing_m: float,
+) -> int:
+    """Return the lowest row of a skirt or coat; 0 where no hem is between the crotch and the feet.
+
+    The distance of the outline from the outer sides of the legs falls there (`HEM_STEP_M`).
+    """
+    middle, crotch = _middle_and_crotch(inside.shape, crotch_m, origin_m, spacing_m)
+    offset_m = np.array([_outer_offset_m(inside[:, row], body_distance_m[:, row], middle) for row in range(crotch)])
+    reach = max(1, round(HEM_HEIGHT_M / spacing_m))
+    if len(offset_m) <= reach:
+        return 0
+    step_m = np.nan_to_num(offset_m[reach:] - offset_m[:-reach])
+    highest = int(np.argmax(step_m))
+    if step_m[highest] < HEM_STEP_M or offset_m[highest] > HEM_RATIO * offset_m[highest + reach]:
+        return 0
+    half_m = 0.5 * (offset_m[highest] + offset_m[highest + reach])
+    return highest + int(np.argmax(offset_m[highest : highest + reach + 1] > half_m))
+
+
+def _outer_offset_m(inside: Bool[np.ndarray, "x z"], body_distance_m: Float[np.ndarray, "x z"], middle: int) -> float:
+    """Return the median distance of the outline from the outer sides of the legs in a slice; nan without two legs."""
+    legs = [np.flatnonzero((body_distance_m[part] < 0.0).any(axis=1)) for part in (np.s_[:middle], np.s_[middle:])]
+    if not all(len(leg) for leg in legs):
+        return float("nan")
+    column = np.arange(len(inside))[:, None]
+    outer = (column <= legs[0].mean()) | (column >= legs[1].mean() + middle)
+    outline = inside & ~ndimage.binary_erosion(inside) & outer
+    return float(np.median(body_distance_m[outline])) if outline.any() else float("nan")
+
+
+def parted_legs(
+    inside: Bool[np.ndarray, "x y z"],
+    body_distance_m: Float[np.ndarray, "x y z"],
+    crotch_m: float,
+    origin_m: Float[np.ndarray, "3"],
+    spacing_m: float,
+) -> Float[np.ndarray, "x y z"]:
+    """Return an indicator that falls from 1 to 0 in the middle between the legs below a hem; 1 elsewhere.
+
+    Trousers that touch each other below a coat would grow together in its canonical pose, whose legs are the filmed
+    ones. It is 0.5 at `PARTING_M` from side to side.
+    """
+    indicator = np.ones(inside.shape, dtype=np.float32)
+    middle = _middle_and_crotch(inside.shape, crotch_m, origin_m, spacing_m)[0]
+    width_m = max(PARTING_M, 2.0 * spacing_m)
+    for row in range(hem_row(inside, body_distance_m, crotch_m, origin_m, spacing_m)):
+        is_leg = body_distance_m[:, row] < 0.0
+        if is_leg[:middle].any() and is_leg[middle:].any():
+            left = np.arange(len(is_leg))[:, None] >= middle
+            apart_m = np.subtract(*(ndimage.distance_transform_edt(~(is_leg & side)) for side in (left, ~left)))
+            indicator[:, row] = np.minimum(np.abs(apart_m) * spacing_m / (2.0 * width_m), 1.0)
+    return indicator
 
 
 def close_valleys(

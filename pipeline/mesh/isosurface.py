@@ -22,7 +22,7 @@ from pipeline.body.body import Body
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import isosurface, largest_solid, repair, signed_distance_m
 from pipeline.kernels.common.thread_pool import shared_thread_pool
-from pipeline.mesh.between_legs import crotch_height_m, excess_between_legs, gaps_in_skirt
+from pipeline.mesh.between_legs import crotch_height_m, excess_between_legs, gaps_in_skirt, parted_legs
 from pipeline.mesh.settings import MeshSettings
 
 BODY_PADDING_VOXELS = 4
@@ -145,6 +145,7 @@ def indicator_grid(samples: CanonicalGrid, isovalue_per_m: float, settings: Mesh
     value += samples.hand_weight * (hand - value)
     value = np.maximum(value, _close_skirt(value >= SURFACE_ISOVALUE, samples)) * (1.0 - samples.emptiness)
     legs = samples.body_distance_m, samples.crotch_m, samples.origin_m, samples.spacing_m
+    value = np.minimum(value, parted_legs(value >= SURFACE_ISOVALUE, *legs))
     value = np.where(excess_between_legs(value >= SURFACE_ISOVALUE, *legs), 0.0, value)
     inside = largest_solid(value >= SURFACE_ISOVALUE)
     # Filled cavities become 1; other components become empty.

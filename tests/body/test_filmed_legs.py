@@ -155,3 +155,25 @@ def test_only_the_chosen_frames_count(body: Body) -> None:
     rest = rest_with_filmed_legs(body, motion.with_pose(rotations, motion.root_translation_m), used)
     expected = rest_with_filmed_legs(body, motion, used)
     assert rest.body.joints_m == pytest.approx(expected.body.joints_m, abs=1e-6)
+
+
+def shin_gap_m(body: Body) -> float:
+    """Distance between what hangs below the knees, along x."""
+    below = body.joints_m[body.joint("LeftLeg"), 1] - 0.05
+    shins = body.vertices[body.vertices[:, 1] < below]
+    return float(shins[shins[:, 0] > 0.0, 0].min() - shins[shins[:, 0] < 0.0, 0].max())
+
+
+def test_closed_legs_are_opened_until_trousers_have_room(body: Body) -> None:
+    """Feet side by side: below a coat, trousers would grow together."""
+    together = {"LeftUpLeg": (0.0, 0.0, -0.14), "RightUpLeg": (0.0, 0.0, 0.14)}
+    motion = motion_of(body, together)
+    rest = rest_with_filmed_legs(body, motion, np.ones(FRAMES, dtype=bool))
+    assert shin_gap_m(rest.body) == pytest.approx(0.06, abs=0.005)
+    weights = torch.from_numpy(body.skin_weights)
+    before, after = (
+        linear_blend_skinning(torch.from_numpy(each.vertices), weights, canonical_to_world(each, poses))
+        for each, poses in ((body, motion), (rest.body, rest.motion))
+    )
+    rigid = body.skin_weights.max(axis=1) > 0.999
+    assert float((before - after)[:, rigid].norm(dim=2).max()) < 1e-5

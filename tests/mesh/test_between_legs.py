@@ -2,17 +2,27 @@
 
 import numpy as np
 
-from pipeline.mesh.between_legs import VALLEY_RADIUS_M, close_valleys, excess_between_legs, gaps_in_skirt
+from pipeline.mesh.between_legs import (
+    PARTING_M,
+    VALLEY_RADIUS_M,
+    close_valleys,
+    excess_between_legs,
+    gaps_in_skirt,
+    hem_row,
+    parted_legs,
+)
 
 LEG_X_M, LEG_RADIUS_M, CROTCH_M = 0.12, 0.06, 0.5
 GRID_M = 0.005
 
 
-def leg_grid() -> tuple[tuple[np.ndarray, float, np.ndarray, float], tuple[np.ndarray, ...]]:
+def leg_grid(
+    leg_x_m: float = LEG_X_M,
+) -> tuple[tuple[np.ndarray, float, np.ndarray, float], tuple[np.ndarray, ...]]:
     """Two vertical legs, which are one trunk above the crotch: body distance, crotch, origin, spacing; coordinates."""
     axes = np.arange(-0.3, 0.3001, GRID_M), np.arange(0.0, 0.6001, GRID_M), np.arange(-0.2, 0.2001, GRID_M)
     x, y, z = np.meshgrid(*axes, indexing="ij")
-    legs_m = np.hypot(np.abs(x) - LEG_X_M, z) - LEG_RADIUS_M
+    legs_m = np.hypot(np.abs(x) - leg_x_m, z) - LEG_RADIUS_M
     trunk_m = np.maximum(np.hypot(x, z) - 0.18, CROTCH_M - y)
     return (np.minimum(legs_m, trunk_m), CROTCH_M, np.array([axis[0] for axis in axes]), GRID_M), (x, y, z)
 
@@ -109,7 +119,7 @@ def test_a_solid_without_legs_has_no_valleys() -> None:
 
 def pierced_skirt(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A skirt down to 0.1 m with a hole in front and a notch in its hem behind: what is left, the hole, the notch."""
-    skirt = (np.hypot(x, 1.5 * z) < 0.24) & (y > 0.1)
+    skirt = (np.hypot(x, 1.3 * z) < 0.24) & (y > 0.1)
     hole = (np.hypot(x - 0.03, y - 0.3) < 0.02) & (z > 0.1)
     notch = (np.abs(x) < 0.02) & (y < 0.18) & (z < -0.06)
     return skirt & ~hole & ~notch, hole & skirt, notch & skirt
@@ -131,3 +141,62 @@ def test_trousers_have_no_gaps_of_a_skirt() -> None:
     grid, coordinates = leg_grid()
     assert not gaps_in_skirt(grid[0] < 0.01, *grid).any()
     assert not gaps_in_skirt(joined_trousers(*coordinates) < 0.0, *grid).any()
+
+
+def test_a_slot_across_the_front_of_a_skirt_is_a_gap() -> None:
+    """A disc enters it in each of its slices; a ball cannot."""
+    grid, (x, y, z) = leg_grid()
+    skirt = (np.hypot(x, 1.3 * z) < 0.24) & (y > 0.1)
+    slot = skirt & (np.abs(y - 0.3) < 0.02) & (z > 0.07)
+    gaps = gaps_in_skirt((skirt & ~slot) | (grid[0] < 0.0), *grid)
+    assert gaps[slot].mean() > 0.9
+    assert not gaps[~slot].any()
+
+
+def test_a_coat_has_no_holes_above_the_crotch() -> None:
+    grid, (x, y, z) = leg_grid()
+    coat = (np.hypot(x, 1.25 * z) < 0.24) & (y > 0.1)
+    hole = coat & (np.hypot(z, y - CROTCH_M - 0.06) < 0.02) & (x > 0.185)
+    assert gaps_in_skirt((coat & ~hole) | (grid[0] < 0.0), *grid)[hole].mean() > 0.9
+
+
+HEM_M = 0.25
+CLOSE_LEG_X_M = 0.09
+"""Legs 6 cm from each other."""
+
+
+def coat_over_trousers() -> tuple[
+    np.ndarray, tuple[np.ndarray, float, np.ndarray, float], tuple[np.ndarray, np.ndarray, np.ndarray]
+]:
+    """A coat down to `HEM_M` over trousers 3.5 cm wider than the legs, which touch each other; grid, coordinates."""
+    grid, (x, y, z) = leg_grid(CLOSE_LEG_X_M)
+    coat = (np.hypot(x / 1.1, z) < 0.22) & (y > HEM_M)
+    return (grid[0] < 0.035) & (y < CROTCH_M) | (grid[0] < 0.0) | coat, grid, (x, y, z)
+
+
+def test_trousers_are_parted_below_the_hem_of_a_coat() -> None:
+    inside, grid, (x, y, z) = coat_over_trousers()
+    assert abs(hem_row(inside, *grid) * GRID_M - HEM_M) < 0.015
+    indicator = parted_legs(inside, *grid)
+    below = y < HEM_M - 0.015
+    apart = (np.abs(x) > 0.5 * PARTING_M + GRID_M) & (np.abs(z) < 0.03)
+    assert (indicator[below & (np.abs(x) < 0.3 * PARTING_M)] < 0.5).all()
+    assert (indicator[below & apart] > 0.5).all()
+    assert (indicator[(grid[0] < 0.0) | (y > HEM_M + 0.015)] == 1.0).all()
+    assert np.count_nonzero(inside & below & (indicator < 0.5)) > 100
+
+
+def test_below_its_hem_a_coat_has_no_gaps() -> None:
+    """The notches between both trouser legs stay."""
+    inside, grid, (_, y, _) = coat_over_trousers()
+    assert not gaps_in_skirt(inside, *grid)[y < HEM_M - 0.015].any()
+
+
+def test_trousers_and_long_skirts_have_no_hem() -> None:
+    """The long skirt has a fold of 2 cm halfway down."""
+    grid, (x, y, z) = leg_grid()
+    assert hem_row(grid[0] < 0.01, *grid) == 0
+    radius_m = np.where(y > 0.25, 0.2, 0.18)
+    skirt = np.hypot(x / 1.3, z) < radius_m
+    assert hem_row(skirt, *grid) == 0
+    assert (parted_legs(skirt, *grid) == 1.0).all()
