@@ -25,7 +25,7 @@ from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
 from pipeline.geometry.atlas import Atlas, Texels, rasterize_texels, texture_size_px, unwrap
 from pipeline.geometry.camera import Camera, pixel_footprint_m
-from pipeline.geometry.creases import Creases, find_creases
+from pipeline.geometry.creases import find_creases
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.geometry.surface_cut import SurfaceCut
@@ -47,6 +47,7 @@ from pipeline.texture.bake import (
     texels_to_texture,
 )
 from pipeline.texture.body_parts import body_part_of_faces
+from pipeline.texture.contact import hide_contacts, limb_of_vertices
 from pipeline.texture.files import (
     ATLAS,
     COVERAGE,
@@ -145,8 +146,11 @@ def run(
         template = FittedTemplate(registration, correspond(body, registration, skinned.mesh, skinned.vertex_colours))
     texels = rasterize_texels(atlas, size_px)
     creases = find_creases(skinned.mesh)
-    train, validation = ([split_view(view, creases) for view in part] for part in (train, validation))
-    shaded, layout = skinned.split(creases).mesh, creases.split_atlas(atlas)
+    split, layout = skinned.split(creases), creases.split_atlas(atlas)
+    shaded, limb = split.mesh, limb_of_vertices(split.joint_indices, split.joint_weights, body.joint_names)
+    train, validation = (
+        [hide_contacts(view.split(creases), shaded.faces, limb) for view in part] for part in (train, validation)
+    )
     surface = TexturedSurface.from_arrays(shaded.faces, layout, texels)
     evidence = find_light((train, validation), positions, shaded, config, settings)
     light = VideoLight.uniform(len(capture))
@@ -231,11 +235,6 @@ def cut_view(view: BakeView, cut: SurfaceCut | None) -> BakeView:
     if cut is None:
         return view
     return view.with_mesh(torch.from_numpy(cut.extend(view.vertices_world.numpy())), cut.faces)
-
-
-def split_view(view: BakeView, creases: Creases) -> BakeView:
-    """Return a view of the mesh with copies of the vertices on its folds."""
-    return view.with_mesh(view.vertices_world[torch.from_numpy(creases.source)], creases.faces)
 
 
 def template_metrics(template: FittedTemplate | None) -> dict[str, float]:
@@ -388,7 +387,7 @@ def fit_highlights(evidence: LightEvidence | None, light: VideoLight, mesh: Mesh
 
 STAGE = Stage(
     "texture",
-    version=15,
+    version=16,
     needs=("frames", "body", "mesh"),
     makes=(ATLAS, DIFFUSE, SPECULAR, ROUGHNESS, NORMAL, COVERAGE, LIGHT, TEMPLATE_NPZ),
     config=Config,

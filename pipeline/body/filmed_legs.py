@@ -58,8 +58,12 @@ Trousers of four people: at most 0.005 m; a knee-long coat 0.03, a wide skirt 0.
 MAX_OPEN_SHARE = 0.1
 """Share of the pixels between the legs above the hem that may show the background: through shorts it is seen."""
 
-MIN_GAP_PX = 4.0
-"""Width of a gap between the legs that trousers do not fill, of a person 240 px tall: 3 cm. Five pairs: 1 px."""
+MIN_GAP_PX, WIDE_GAP_PX = 4.0, 8.0
+"""Width of a gap between the legs, of a person 240 px tall (3 and 6 cm), that trousers do not fill where the background
+is seen between the legs below, and wherever it is. Trousers down to the floor fill 4 px between shins side by side."""
+
+MIN_OPEN_SHARE = 0.5
+"""Share of the pixels between the legs that show the background below a skirt."""
 
 
 @dataclass(frozen=True)
@@ -80,11 +84,14 @@ class LegProfile:
     def cloth_hangs_between_legs(self) -> bool:
         """Return whether a skirt or coat goes from leg to leg.
 
-        It does where it covers a wide gap between the legs, and where there is a hem above which nothing is seen
-        between legs that are close to each other.
+        It does where it covers a gap between the legs that is wide, or open below, and where there is a hem above
+        which nothing is seen between legs that are close to each other.
         """
         is_covered = (self.gap_px >= MIN_GAP_PX) & (self.open_px <= MAX_OPEN_SHARE * self.gap_px)
-        if is_covered[np.array(HEIGHTS) >= HEM_HEIGHT].any():
+        is_open = (self.gap_px >= 1.0) & (self.open_px >= MIN_OPEN_SHARE * self.gap_px)
+        is_open_below = np.append(np.maximum.accumulate(is_open[::-1])[-2::-1], False)
+        is_cloth = is_covered & (is_open_below | (self.gap_px >= WIDE_GAP_PX))
+        if is_cloth[np.array(HEIGHTS) >= HEM_HEIGHT].any():
             return True
         hem = self._hem()
         if hem is None:

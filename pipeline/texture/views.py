@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pipeline.geometry.camera import Camera, pixel_footprint_m, project
 from pipeline.geometry.colour import linear_to_srgb, srgb_to_linear
+from pipeline.geometry.creases import Creases
 from pipeline.geometry.mesh import area_weighted_vertex_normals
 from pipeline.texture.light import MIN_IRRADIANCE
 
@@ -50,6 +51,10 @@ class BakeView:
         """Return the view of another mesh in the same pose; vertices_world: m."""
         cosine = vertex_view_cosine(vertices_world, torch.from_numpy(faces), self.camera)
         return replace(self, vertices_world=vertices_world, view_cosine=cosine)
+
+    def split(self, creases: Creases) -> "BakeView":
+        """Return the view of the mesh with copies of the vertices on its folds."""
+        return self.with_mesh(self.vertices_world[torch.from_numpy(creases.source)], creases.faces)
 
 
 def crop_bake_view(

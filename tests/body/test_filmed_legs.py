@@ -100,6 +100,16 @@ def test_a_long_shirt_ends_above_the_legs(body: Body) -> None:
     assert not profile_of(body, dressed(body, 0.85, 12, True)).cloth_hangs_between_legs()
 
 
+def test_trousers_that_touch_each_other_down_to_the_floor_are_no_skirt() -> None:
+    """Shins stand 3 cm from each other. Where the background is seen below, or they stand farther apart, it is one."""
+    margin_m, rows = np.full(len(HEIGHTS), 0.004), np.array(HEIGHTS)
+    narrow_px, covered = np.interp(rows, (0.7, 1.2), (0.0, 4.5)), np.zeros(len(rows))
+    assert not LegProfile(margin_m, narrow_px, covered).cloth_hangs_between_legs()
+    assert LegProfile(margin_m, 2.0 * narrow_px, covered).cloth_hangs_between_legs()
+    assert LegProfile(margin_m, narrow_px, np.where(rows >= 1.4, narrow_px, 0.0)).cloth_hangs_between_legs()
+    assert not LegProfile(margin_m, narrow_px, np.where(rows <= 1.0, narrow_px, 0.0)).cloth_hangs_between_legs()
+
+
 def test_frames_without_masks_tell_nothing(body: Body) -> None:
     motion = motion_of(body, {})
     profile = leg_profile(body, motion, CAMERA, [None] * FRAMES, np.ones(FRAMES, dtype=bool))
