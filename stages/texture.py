@@ -47,7 +47,7 @@ from pipeline.texture.bake import (
     texels_to_texture,
 )
 from pipeline.texture.body_parts import body_part_of_faces
-from pipeline.texture.contact import hide_contacts, limb_of_vertices
+from pipeline.texture.contact import Limbs, hide_contacts
 from pipeline.texture.files import (
     ATLAS,
     COVERAGE,
@@ -60,6 +60,7 @@ from pipeline.texture.files import (
     TextureFormat,
     save_texture,
 )
+from pipeline.texture.hand_colours import hide_foreign_hands
 from pipeline.texture.inpainting import average_texels_per_vertex, inpaint_vertex_colours
 from pipeline.texture.light import VertexGloss, VideoLight
 from pipeline.texture.light_evidence import LightEvidence, estimate_light
@@ -147,10 +148,11 @@ def run(
     texels = rasterize_texels(atlas, size_px)
     creases = find_creases(skinned.mesh)
     split, layout = skinned.split(creases), creases.split_atlas(atlas)
-    shaded, limb = split.mesh, limb_of_vertices(split.joint_indices, split.joint_weights, body.joint_names)
+    shaded, limbs = split.mesh, Limbs.of_vertices(split.joint_indices, split.joint_weights, body.joint_names)
     train, validation = (
-        [hide_contacts(view.split(creases), shaded.faces, limb) for view in part] for part in (train, validation)
+        [hide_contacts(view.split(creases), shaded.faces, limbs.limb) for view in part] for part in (train, validation)
     )
+    train = hide_foreign_hands(train, vertex_surface(shaded), limbs, settings)
     surface = TexturedSurface.from_arrays(shaded.faces, layout, texels)
     evidence = find_light((train, validation), positions, shaded, config, settings)
     light = VideoLight.uniform(len(capture))

@@ -5,7 +5,7 @@ pixel shows: the trunk would be painted with the skin of an arm, and the palm wi
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -22,19 +22,34 @@ angles, and poses err by a quarter of it."""
 BALL_RADIUS_M, TOUCHING = 0.035, 0.9
 """Radius of a ball that must fit on a surface beside another limb, and the share of it within which a limb is in the
 ball: a surface that goes on smoothly is just outside."""
+MIN_HAND_WEIGHT = 0.9
+"""Skin weight of hand and fingers from which on a vertex belongs to a hand: sleeves end before."""
 
 
-def limb_of_vertices(
-    joint_indices: Int[np.ndarray, "v k"], joint_weights: Float[np.ndarray, "v k"], joint_names: Sequence[str]
-) -> Int[np.ndarray, "v"]:
-    """Return a number for the limb that moves each vertex: an arm with its hand, a leg, or trunk and head."""
-    parts = (body_part_of_joint(name) for name in joint_names)
-    limbs = ["torso" if part == "head" else part.replace("hand", "arm") for part in parts]
-    names = sorted(set(limbs))
-    of_joint = np.array([names.index(limb) for limb in limbs])
-    weight = np.zeros((len(joint_indices), len(names)))
-    np.add.at(weight, (np.arange(len(weight))[:, None], of_joint[joint_indices]), joint_weights)
-    return weight.argmax(axis=1)
+@dataclass(frozen=True)
+class Limbs:
+    """The parts of the person that touch each other.
+
+    limb: a number for what moves each vertex: an arm with its hand, a leg, or trunk and head. is_hand: vertices that a
+    hand or finger moves alone, for the most part.
+    """
+
+    limb: Int[np.ndarray, "v"]
+    is_hand: Bool[np.ndarray, "v"]
+
+    @staticmethod
+    def of_vertices(
+        joint_indices: Int[np.ndarray, "v k"], joint_weights: Float[np.ndarray, "v k"], joint_names: Sequence[str]
+    ) -> "Limbs":
+        """Return the limbs of vertices with these skin weights, whose rows sum to 1."""
+        parts = [body_part_of_joint(name) for name in joint_names]
+        limbs = ["torso" if part == "head" else part.replace("hand", "arm") for part in parts]
+        names = sorted(set(limbs))
+        of_joint = np.array([names.index(limb) for limb in limbs])
+        weight = np.zeros((len(joint_indices), len(names)))
+        np.add.at(weight, (np.arange(len(weight))[:, None], of_joint[joint_indices]), joint_weights)
+        of_hand = np.array([part.endswith("hand") for part in parts])[joint_indices]
+        return Limbs(weight.argmax(axis=1), (joint_weights * of_hand).sum(axis=1) > MIN_HAND_WEIGHT)
 
 
 def touches_other_limb(

@@ -191,13 +191,14 @@ def predict_views(
         rows = np.flatnonzero((observed.frame == view) & is_fitted)
         if not len(rows):
             continue
-        gains[view] = _weighted_median(residual[rows].mean(axis=1), weight[rows])
+        gains[view] = weighted_median(residual[rows].mean(axis=1), weight[rows])
         squared = np.minimum((residual[rows] - gains[view]) ** 2, MAX_ERROR**2).sum(axis=1)
         errors[view] = np.average(squared, weights=weight[rows])
     return Prediction(errors, gains)
 
 
-def _weighted_median(values: np.ndarray, weight: np.ndarray) -> float:
+def weighted_median(values: Float[np.ndarray, "n"], weight: Float[np.ndarray, "n"]) -> float:
+    """Return the value below which half of the weight lies."""
     order = np.argsort(values)
     cumulative = np.cumsum(weight[order])
     return float(values[order[np.searchsorted(cumulative, 0.5 * cumulative[-1])]])

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from pipeline.geometry.camera import Camera
-from pipeline.texture.contact import BALL_RADIUS_M, CONTACT_M, hide_contacts, limb_of_vertices, touches_other_limb
+from pipeline.texture.contact import BALL_RADIUS_M, CONTACT_M, Limbs, hide_contacts, touches_other_limb
 from pipeline.texture.views import BakeView
 
 
@@ -67,13 +67,16 @@ def test_a_gap_is_seen_into_and_a_surface_that_goes_on_is_no_contact() -> None:
 
 def test_hands_belong_to_arms_and_the_head_to_the_trunk() -> None:
     names = ("Hips", "Spine", "Head", "LeftArm", "LeftHandIndex1", "RightForeArm", "LeftUpLeg", "LeftFoot")
-    limb = limb_of_vertices(np.arange(8)[:, None], np.ones((8, 1)), names)
+    limbs = Limbs.of_vertices(np.arange(8)[:, None], np.ones((8, 1)), names)
+    limb = limbs.limb
+    assert np.flatnonzero(limbs.is_hand).tolist() == [4]
     assert limb[0] == limb[1] == limb[2]
     assert limb[3] == limb[4]
     assert limb[6] == limb[7]
     assert len(set(limb.tolist())) == 4
-    blended = limb_of_vertices(np.array([[3, 0], [3, 0]]), np.array([[0.7, 0.3], [0.3, 0.7]]), names)
-    assert blended.tolist() == [limb[3], limb[0]]
+    blended = Limbs.of_vertices(np.array([[3, 0], [4, 0]]), np.array([[0.7, 0.3], [0.3, 0.7]]), names)
+    assert blended.limb.tolist() == [limb[3], limb[0]]
+    assert not blended.is_hand.any()
 
 
 def test_hidden_vertices_face_away() -> None:

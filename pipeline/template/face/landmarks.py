@@ -58,6 +58,9 @@ CAMERA_DISTANCE_M = 3.0
 MAX_RESIDUAL_M = 0.008
 """A face whose landmarks differ more (root mean square) from those of the template after a similarity transform is
 not used. Ten generated people: 2 to 3 mm."""
+MAX_SCALE, MAX_ROTATION_RAD, MAX_SHIFT_M = 1.3, math.radians(20.0), 0.04
+"""Largest factor of size either way, rotation and shift of the similarity transform: a larger one is another face, or a
+pattern that looks like one. Ten people: 0.93 to 1.08, 5 degrees, 19 mm."""
 MAX_DISAGREEMENT_M = 0.004
 """Landmarks of the renders are used while they are (median) this close to those of the frames. The former are the more
 accurate: renders are large and alike for everyone. Six people without glasses: 1.9 to 2.9 mm; with dark ones 6.3 mm."""
@@ -146,10 +149,19 @@ def choose_landmarks(
 
 
 def if_plausible(body: Body, positions_m: Float[np.ndarray, "l 3"]) -> FaceLandmarks | None:
-    """Return the landmarks, or None where no similarity transform brings those of the body near them."""
-    moved_m = fit_similarity(body.vertices[LANDMARK_VERTICES], positions_m)(body.vertices[LANDMARK_VERTICES])
+    """Return the landmarks, or None where no small similarity transform brings those of the body near them."""
+    of_body_m = body.vertices[LANDMARK_VERTICES]
+    transform = fit_similarity(of_body_m, positions_m)
+    moved_m = transform(of_body_m)
     residual_m = float(np.sqrt(np.mean(np.sum((moved_m - positions_m) ** 2, axis=1))))
-    return FaceLandmarks(LANDMARK_VERTICES, positions_m, residual_m) if residual_m <= MAX_RESIDUAL_M else None
+    rotation_rad = math.acos(float(np.clip(0.5 * (np.trace(transform.rotation) - 1.0), -1.0, 1.0)))
+    is_small = (
+        1.0 / MAX_SCALE < transform.scale < MAX_SCALE
+        and rotation_rad < MAX_ROTATION_RAD
+        and np.linalg.norm(moved_m.mean(axis=0) - of_body_m.mean(axis=0)) < MAX_SHIFT_M
+    )
+    is_plausible = is_small and residual_m <= MAX_RESIDUAL_M
+    return FaceLandmarks(LANDMARK_VERTICES, positions_m, residual_m) if is_plausible else None
 
 
 def head_camera(body: Body, azimuth_rad: float, elevation_rad: float) -> Camera:

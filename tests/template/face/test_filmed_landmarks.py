@@ -94,3 +94,16 @@ def test_landmarks_that_are_no_face_are_not_used() -> None:
     np.testing.assert_array_equal(chosen.positions_m, true_m)
     assert choose_landmarks(person.bare, scattered_m, None) is None
     assert choose_landmarks(person.bare, scattered_m, scattered_m) is None
+
+
+def test_another_face_is_not_used() -> None:
+    """A print on the clothes, or hair that looks like a face: half as large, turned, or beside the person's."""
+    person, true_m = generated_person(), true_landmarks_m()
+    centre_m = true_m.mean(axis=0)
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    others = (0.6 * (true_m - centre_m), 1.6 * (true_m - centre_m), (true_m - centre_m) @ turn.T)
+    for other_m in (*(part + centre_m for part in others), true_m + [0.0, 0.06, 0.0]):
+        assert choose_landmarks(person.bare, other_m, None) is None
+        chosen = choose_landmarks(person.bare, other_m, true_m)
+        assert chosen is not None
+        np.testing.assert_array_equal(chosen.positions_m, true_m)
