@@ -30,8 +30,8 @@ MIN_HAND_WEIGHT = 0.9
 class Limbs:
     """The parts of the person that touch each other.
 
-    limb: a number for what moves each vertex: an arm with its hand, a leg, or trunk and head. is_hand: vertices that a
-    hand or finger moves alone, for the most part.
+    limb: a number for what moves each vertex: an arm with its hand, or all the rest. Legs wear the same clothes: one
+    cannot be mistaken for the other. is_hand: vertices that a hand moves alone, for the most part.
     """
 
     limb: Int[np.ndarray, "v"]
@@ -43,7 +43,7 @@ class Limbs:
     ) -> "Limbs":
         """Return the limbs of vertices with these skin weights, whose rows sum to 1."""
         parts = [body_part_of_joint(name) for name in joint_names]
-        limbs = ["torso" if part == "head" else part.replace("hand", "arm") for part in parts]
+        limbs = [part.replace("hand", "arm") if part.endswith(("arm", "hand")) else "rest" for part in parts]
         names = sorted(set(limbs))
         of_joint = np.array([names.index(limb) for limb in limbs])
         weight = np.zeros((len(joint_indices), len(names)))
