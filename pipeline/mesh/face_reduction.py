@@ -84,8 +84,11 @@ def _reduce_by_loss(
 
 
 def _limit_detail(mesh: Mesh, detailed: Bool[np.ndarray, "f"], face_limit: int) -> tuple[Mesh, Bool[np.ndarray, "g"]]:
-    """Collapse the detailed faces to their share of a limit that the mesh exceeds; return the mesh and its detail."""
-    count = int(MAX_DETAILED_SHARE * face_limit)
+    """Collapse the detailed faces to their share of a limit that the mesh exceeds; return the mesh and its detail.
+
+    They keep as many more as the other faces leave of the limit.
+    """
+    count = max(int(MAX_DETAILED_SHARE * face_limit), face_limit - int(np.count_nonzero(~detailed)))
     if len(mesh.faces) <= face_limit or np.count_nonzero(detailed) <= count:
         return mesh, detailed
     reduced = keep_if_repair_fails(

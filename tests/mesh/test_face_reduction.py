@@ -96,6 +96,15 @@ def test_a_number_of_final_faces_is_reached_at_any_loss() -> None:
     assert reduce_faces(mesh, no_detail(mesh), lambda trial: 30.0, settings) is mesh
 
 
+def test_detail_keeps_what_the_rest_leaves_of_a_limit() -> None:
+    """A mesh just above the limit, half of whose faces are detailed, is not reduced far below it."""
+    mesh = sphere()
+    detailed = mesh.vertices[mesh.faces].mean(axis=1)[:, 1] > 0.0
+    wanted = len(mesh.faces) - 100
+    reduced = reduce_faces(mesh, detailed, lambda trial: 0.0, MeshSettings(final_faces=wanted))
+    assert wanted - 4 <= len(reduced.faces) <= wanted
+
+
 def test_a_limit_that_costs_more_is_judged_once_and_a_cheap_one_is_passed() -> None:
     mesh, judged = sphere(), []
     limit = len(mesh.faces) // 3
