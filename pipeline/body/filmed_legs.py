@@ -203,20 +203,17 @@ def rest_with_filmed_legs(body: Body, motion: Motion, frames: Bool[np.ndarray, "
     """
     local = torch.eye(3, dtype=torch.float64).repeat(len(body.joint_names), 1, 1)
     rotations = quaternion_to_matrix(torch.from_numpy(motion.rotations_wxyz)).double()
-    for upper, lower, foot in (tuple(map(body.joint, side)) for side in LEGS):
+    for upper, lower, _ in (tuple(map(body.joint, side)) for side in LEGS):
         local[upper], local[lower] = (_mean_rotation(rotations[frames, joint]) for joint in (upper, lower))
-        local[foot] = (local[upper] @ local[lower]).T
-    rest, vertices = _posed_by(local, body)
+    rest, vertices = _with_flat_feet(local, body)
     missing_m = MIN_SHIN_GAP_M - _shin_gap_m(body, vertices)
     if missing_m > 0.0:
         hip_m, foot_m = (rest[0, [body.joint(side[part]) for side in LEGS], :3, 3].mean(0) for part in (0, 2))
         angle_rad = 0.5 * missing_m / float(hip_m[1] - foot_m[1])
         for side, outwards_rad in zip(LEGS, (angle_rad, -angle_rad), strict=True):
-            upper, lower, foot = map(body.joint, side)
             about_z = torch.tensor([[0.0, 0.0, outwards_rad]], dtype=torch.float64)
-            local[upper] = axis_angle_to_matrix(about_z)[0] @ local[upper]
-            local[foot] = (local[upper] @ local[lower]).T
-        rest, vertices = _posed_by(local, body)
+            local[body.joint(side[0])] = axis_angle_to_matrix(about_z)[0] @ local[body.joint(side[0])]
+        rest, vertices = _with_flat_feet(local, body)
     drop_m = torch.tensor([0.0, float(vertices[:, 1].min()), 0.0], dtype=torch.float64)
     turned = rest[0, :, :3, :3]
     of_parent = torch.stack([turned[max(parent, 0)] for parent in body.parents.tolist()])
@@ -231,8 +228,10 @@ def rest_with_filmed_legs(body: Body, motion: Motion, frames: Bool[np.ndarray, "
     return RestPose(new, motion.with_pose(quaternions, motion.root_translation_m))
 
 
-def _posed_by(local: Float[Tensor, "j 3 3"], body: Body) -> tuple[Float[Tensor, "1 j 4 4"], Float[Tensor, "v 3"]]:
-    """Return the joints' transforms and the vertices (m) of a body with these local rotations."""
+def _with_flat_feet(local: Float[Tensor, "j 3 3"], body: Body) -> tuple[Float[Tensor, "1 j 4 4"], Float[Tensor, "v 3"]]:
+    """Return the joints' transforms and the vertices (m) with these local rotations, but for the feet."""
+    for upper, lower, foot in (tuple(map(body.joint, side)) for side in LEGS):
+        local[foot] = (local[upper] @ local[lower]).T
     joints_m = torch.from_numpy(body.joints_m).double()
     rest = forward_kinematics(local[None], joints_m[None, 0], joints_m, body.parents)
     vertices = linear_blend_skinning(

@@ -63,6 +63,12 @@ def _middle_and_crotch(
     return (middle, crotch) if 0 < middle < shape[0] and 0 < crotch < shape[1] else (0, 0)
 
 
+def _leg_axes(is_leg: Bool[np.ndarray, "x z"], middle: int) -> tuple[float, float] | None:
+    """Return the columns of the axes of the two legs in a slice; None where it has not both."""
+    legs = [np.flatnonzero(part.any(axis=1)) for part in (is_leg[:middle], is_leg[middle:])]
+    return (float(legs[0].mean()), float(legs[1].mean()) + middle) if all(len(leg) for leg in legs) else None
+
+
 def excess_between_legs(
     inside: Bool[np.ndarray, "x y z"],
     body_distance_m: Float[np.ndarray, "x y z"],
@@ -82,9 +88,8 @@ def excess_between_legs(
     body = body_distance_m < 0.0
     middle, crotch = _middle_and_crotch(inside.shape, crotch_m, origin_m, spacing_m)
     for row in range(crotch):
-        legs = [np.flatnonzero(body[part, row].any(axis=1)) for part in (np.s_[:middle], np.s_[middle:])]
-        if all(len(leg) > 0 for leg in legs):
-            axes = (float(legs[0].mean()), float(legs[1].mean()) + middle)
+        axes = _leg_axes(body[:, row], middle)
+        if axes is not None:
             excess[:, row] = _excess_in_slice(inside[:, row], body_distance_m[:, row], axes, spacing_m)
     return excess
 
@@ -191,11 +196,11 @@ def hem_row(
 
 def _outer_offset_m(inside: Bool[np.ndarray, "x z"], body_distance_m: Float[np.ndarray, "x z"], middle: int) -> float:
     """Return the median distance of the outline from the outer sides of the legs in a slice; nan without two legs."""
-    legs = [np.flatnonzero((body_distance_m[part] < 0.0).any(axis=1)) for part in (np.s_[:middle], np.s_[middle:])]
-    if not all(len(leg) for leg in legs):
+    axes = _leg_axes(body_distance_m < 0.0, middle)
+    if axes is None:
         return float("nan")
     column = np.arange(len(inside))[:, None]
-    outer = (column <= legs[0].mean()) | (column >= legs[1].mean() + middle)
+    outer = (column <= axes[0]) | (column >= axes[1])
     outline = inside & ~ndimage.binary_erosion(inside) & outer
     return float(np.median(body_distance_m[outline])) if outline.any() else float("nan")
 

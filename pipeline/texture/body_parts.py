@@ -35,6 +35,17 @@ def body_part_of_faces(
     joint_indices: into `joint_names`, k influences per vertex. joint_weights: rows sum to 1.
     """
     part_of_joint = np.array([BODY_PARTS.index(body_part_of_joint(name)) for name in joint_names])
-    part_weight = np.zeros((len(joint_indices), len(BODY_PARTS)))
-    np.add.at(part_weight, (np.arange(len(part_weight))[:, None], part_of_joint[joint_indices]), joint_weights)
+    part_weight = group_weights(joint_indices, joint_weights, part_of_joint, len(BODY_PARTS))
     return part_weight[faces].sum(axis=1).argmax(axis=1).astype(np.int32)
+
+
+def group_weights(
+    joint_indices: Int[np.ndarray, "v k"],
+    joint_weights: Float[np.ndarray, "v k"],
+    group_of_joint: Int[np.ndarray, "j"],
+    group_count: int,
+) -> Float[np.ndarray, "v g"]:
+    """Return the summed skin weight of the joints of each group at every vertex."""
+    weight = np.zeros((len(joint_indices), group_count))
+    np.add.at(weight, (np.arange(len(weight))[:, None], group_of_joint[joint_indices]), joint_weights)
+    return weight

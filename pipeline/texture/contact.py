@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from pipeline.geometry.mesh import area_weighted_vertex_normals
-from pipeline.texture.body_parts import body_part_of_joint
+from pipeline.texture.body_parts import body_part_of_joint, group_weights
 from pipeline.texture.views import BakeView
 
 CONTACT_M = 0.04
@@ -46,8 +46,7 @@ class Limbs:
         limbs = [part.replace("hand", "arm") if part.endswith(("arm", "hand")) else "rest" for part in parts]
         names = sorted(set(limbs))
         of_joint = np.array([names.index(limb) for limb in limbs])
-        weight = np.zeros((len(joint_indices), len(names)))
-        np.add.at(weight, (np.arange(len(weight))[:, None], of_joint[joint_indices]), joint_weights)
+        weight = group_weights(joint_indices, joint_weights, of_joint, len(names))
         of_hand = np.array([part.endswith("hand") for part in parts])[joint_indices]
         return Limbs(weight.argmax(axis=1), (joint_weights * of_hand).sum(axis=1) > MIN_HAND_WEIGHT)
 

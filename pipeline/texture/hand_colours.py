@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Int
 from scipy.spatial import cKDTree
 
+from pipeline.kernels.common.opencv_threads import single_threaded_opencv
 from pipeline.kernels.common.thread_pool import shared_thread_pool
 from pipeline.texture.bake import TexturedSurface, sample_frame_colours
 from pipeline.texture.contact import Limbs
@@ -41,7 +42,8 @@ def hide_foreign_hands(
     if not len(vertex) or not views:
         return list(views)
     pool = shared_thread_pool(torch.get_num_threads())
-    samples = pool.map(lambda view: sample_frame_colours(view, hands, settings), views)
+    with single_threaded_opencv():
+        samples = pool.map(lambda view: sample_frame_colours(view, hands, settings), views)
     colour, weight = (np.stack([part.numpy() for part in parts]) for parts in zip(*samples, strict=True))
     chroma = colour / np.maximum(colour.sum(axis=2, keepdims=True), MIN_BRIGHTNESS)
     seen = weight > 0.0
