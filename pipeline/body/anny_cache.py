@@ -22,6 +22,7 @@ from filelock import FileLock
 from jaxtyping import Float
 
 from pipeline.core.errors import UserError
+from pipeline.kernels.common.determinism import single_threaded_torch
 
 if TYPE_CHECKING:
     import anny
@@ -92,14 +93,11 @@ def _build(folder: Path, options: Mapping[str, Any]) -> None:
     part = folder / "unfinished"
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir()
-    threads = torch.get_num_threads()
     set_anny_cache_path(part)
-    torch.set_num_threads(1)
     try:
-        with _fast_parser():
+        with _fast_parser(), single_threaded_torch():
             anny.Anny(**options)
     finally:
-        torch.set_num_threads(threads)
         set_anny_cache_path(folder)
     model = max(part.rglob("*.safetensors"), key=lambda path: path.stat().st_mtime_ns)
     target = folder / model.relative_to(part)

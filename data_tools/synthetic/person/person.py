@@ -16,6 +16,7 @@ from data_tools.synthetic.rig.labels import labels_from_names
 from data_tools.synthetic.rig.subject import Subject
 from pipeline.body.body import AnnyBody, Body, load_anny
 from pipeline.io.image import to_uint8
+from pipeline.kernels.common.determinism import single_threaded_torch
 
 _PHENOTYPES = {
     "gender": (0.12, 0.5),
@@ -36,14 +37,17 @@ def make_person(
     sleeve_flare_m: float = 0.0,
     finger_width_m: float | None = None,
 ) -> tuple[Subject, Body]:
-    """Return the clothed, textured person of a seed, and the body without clothes; equal seeds give equal arrays.
+    """Return the clothed, textured person of a seed, and the body without clothes.
+
+    Equal seeds give equal arrays, whatever the number of threads.
 
     texture_px: side of the texture. legwear, hem_flare_m, sleeve_flare_m: see `Outfit`. finger_width_m: None: that of
     the person.
     """
     model, noise = load_anny(), ValueNoise(seed)
     outfit = replace(choose_outfit(seed, legwear), hem_flare_m=hem_flare_m, sleeve_flare_m=sleeve_flare_m)
-    bare = model.at_shape(_shape(model, seed))
+    with single_threaded_torch():
+        bare = model.at_shape(_shape(model, seed))
     if finger_width_m is not None:
         bare = with_finger_width(bare, finger_width_m)
     anatomy = measure_anatomy(model, bare)

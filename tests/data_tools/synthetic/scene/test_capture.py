@@ -9,10 +9,11 @@ import torch
 
 from data_tools.command import run_command
 from data_tools.sample import main
-from data_tools.synthetic.rig.subject import Subject
+from data_tools.synthetic.person.person import make_person
+from data_tools.synthetic.rig.subject import Subject, save_subject
 from data_tools.synthetic.scene.capture import CAPTURE_VERSION, novel_cameras, portrait_camera
 from data_tools.synthetic.scene.movie import write_video
-from pipeline.body.files import load_camera, load_motion
+from pipeline.body.files import load_camera, load_motion, save_body
 from pipeline.capture.video import open_frame_source, read_frames
 from pipeline.geometry.camera import DEFAULT_WORLD_TO_CAMERA, project
 from pipeline.io.image import read_rgba
@@ -28,6 +29,20 @@ def test_same_seed_same_bytes(sample: Path, tmp_path: Path) -> None:
     first, second = read_all_bytes(sample), read_all_bytes(tmp_path / "again")
     assert first.keys() == second.keys()
     assert [name for name in first if first[name] != second[name]] == []
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_the_number_of_threads_changes_no_byte(sample: Path, tmp_path: Path, threads: int) -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        person, bare = make_person(0, texture_px=512)
+    finally:
+        torch.set_num_threads(before)
+    save_subject(tmp_path, person)
+    save_body(tmp_path / "bare.npz", bare)
+    for name in ("bare.npz", "clothed.npz", "labels.npz", "texture.png"):
+        assert (tmp_path / name).read_bytes() == (sample / "truth" / name).read_bytes(), name
 
 
 def test_layout(sample: Path) -> None:
