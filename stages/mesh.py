@@ -31,6 +31,7 @@ from pipeline.geometry.skinning import top_k_weights
 from pipeline.geometry.surface import resolve_self_intersections
 from pipeline.io.image import write_rgb
 from pipeline.kernels.common.determinism import deterministic_sums
+from pipeline.kernels.common.heap import trim_heap
 from pipeline.kernels.common.opencv_threads import single_threaded_opencv
 from pipeline.kernels.common.thread_pool import shared_thread_pool
 from pipeline.mesh.evidence import surface_evidence, with_emptiness
@@ -257,7 +258,9 @@ def extract_initial_mesh(
         return silhouette_iou(mesh, transfer_skin(mesh, body), isovalue_views)
 
     isovalue_per_m, _ = select_isovalue(samples, settings, score)
+    trim_heap()
     extracted = extract_mesh(samples, isovalue_per_m, settings)
+    trim_heap()
     return fair_surface(extracted, samples, body, outer_surface(body), evidence, settings)
 
 
@@ -340,7 +343,7 @@ def write_results(out: Path, mesh: Mesh, skin: SkinnedTopology, shader: torch.nn
 
 STAGE = Stage(
     "mesh",
-    version=34,
+    version=35,
     needs=("frames", "body", "field"),
     makes=(MESH_NPZ, DENSE_NPZ, "motion.npz", "preview.png"),
     config=Config,

@@ -30,6 +30,7 @@ from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.geometry.surface_cut import SurfaceCut
 from pipeline.io.image import to_float, to_uint8
+from pipeline.kernels.common.heap import trim_heap
 from pipeline.kernels.common.thread_pool import shared_thread_pool
 from pipeline.mesh.files import MeshArtifact, load_dense_mesh, load_mesh
 from pipeline.template.correspondence import correspond
@@ -207,9 +208,8 @@ def load_views(
 ) -> list[BakeView]:
     """Crop at most `max_frames` evenly spaced frames of `positions` to the mesh in the pose of each frame."""
     transforms, camera = load_poses(inputs, body)
-    vertices = torch.from_numpy(skinned.mesh.vertices)
+    vertices, faces = torch.from_numpy(skinned.mesh.vertices), torch.from_numpy(skinned.mesh.faces)
     weights = skinned.dense_skin_weights(len(body.joint_names))
-    faces = torch.from_numpy(skinned.mesh.faces)
 
     def load_view(k: int) -> BakeView:
         posed = linear_blend_skinning(vertices, weights, transforms[k : k + 1])[0]
@@ -218,6 +218,7 @@ def load_views(
     chosen = subsample(positions, max_frames).tolist()
     loaded = shared_thread_pool(torch.get_num_threads()).imap(load_view, chosen)
     views = list(track(loaded, "reading frames", len(chosen)))
+    trim_heap()
     return weight_by_resolution(views) if views else []
 
 
@@ -367,9 +368,8 @@ def make_texel_inpainter(mesh: Mesh, texels: Texels, template: FittedTemplate | 
 
     template: tells the other side of the body, whose colours are taken where both sides agree.
     """
-    partner = None
-    if template is not None:
-        partner = mirror_vertices(template.correspondence, template.registration.vertices, mesh)
+    fitted = None if template is None else (template.correspondence, template.registration.vertices)
+    partner = None if fitted is None else mirror_vertices(*fitted, mesh)
 
     def inpaint(colour: Float[np.ndarray, "t 3"], texel_confidence: Float[np.ndarray, "t"]) -> Float[np.ndarray, "t 3"]:
         means, weights = average_texels_per_vertex(texels, mesh.faces, len(mesh.vertices), colour, texel_confidence)
@@ -389,7 +389,7 @@ def fit_highlights(evidence: LightEvidence | None, light: VideoLight, mesh: Mesh
 
 STAGE = Stage(
     "texture",
-    version=16,
+    version=17,
     needs=("frames", "body", "mesh"),
     makes=(ATLAS, DIFFUSE, SPECULAR, ROUGHNESS, NORMAL, COVERAGE, LIGHT, TEMPLATE_NPZ),
     config=Config,

@@ -29,7 +29,9 @@ def largest_solid(inside: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"
     if count == 0:
         return inside
     sizes = np.bincount(labels.ravel())[1:]
-    return ndimage.binary_fill_holes(labels == 1 + int(np.argmax(sizes)))
+    largest = labels == 1 + int(np.argmax(sizes))
+    del labels  # 32 bits a sample
+    return ndimage.binary_fill_holes(largest)
 
 
 def isosurface(
@@ -54,7 +56,7 @@ def isosurface(
         largest = float(values.max())
         raise ValueError(f"no sample of the grid reaches the isovalue {isovalue:g}; the largest is {largest:g}")
     # A sample equal to the isovalue gives faces without area, which make vertices non-manifold.
-    padded = np.where(np.abs(padded - isovalue) < 1e-6, isovalue + 1e-6, padded)
+    padded[(padded > isovalue - 1e-6) & (padded < isovalue + 1e-6)] = isovalue + 1e-6
     vertices, faces, _, _ = marching_cubes(padded, isovalue, gradient_direction="ascent", allow_degenerate=False)
     vertices_m = (vertices - 1.0) * spacing_m + np.asarray(origin_m)
     return Mesh(vertices_m.astype(np.float32), faces.astype(np.int32))

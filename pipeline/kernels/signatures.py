@@ -80,6 +80,7 @@ OUTPUT_GRADIENTS = _named(backward_cpu.OutputGradients, F4_2D, F4_1D, F4_1D)
 PARAMETER_GRADIENTS = _named(backward_cpu.ParameterGradients, F4_2D, F4_2D, F4_1D, F4_3D, F4_3D)
 
 MESH = _named(texel_projection.MeshArrays, F4_2D, F4_1D, F4_1D, I4_2D)
+TEXEL_SUMS = types.Tuple((F4_2D, F4_1D))
 VIEW = _named(texel_projection.ViewArrays, F4_3D, F4_2D, F4_2D)
 
 SIGNATURES: tuple[tuple[Any, tuple[Any, ...]], ...] = (
@@ -114,6 +115,7 @@ SIGNATURES: tuple[tuple[Any, tuple[Any, ...]], ...] = (
     (hashgrid.add_points_gradient, (F4_2D, HASH_TABLE, FEATURES, F4_2D, F4_2D)),
     (hashgrid.encode, (F4_2D, HASH_TABLE, FEATURES, F4_2D)),
     # texture and report
+    (texel_projection.add_projections, (TEXEL_SUMS, MESH, I4_1D, F4_2D, VIEW, types.UniTuple(F8, 4))),
     (texel_projection.project_texels, (MESH, I4_1D, F4_2D, VIEW, F8, F8)),
     (texture_sampling.supersample_texture_cpu, (I4_2D, F4_3D, I4_2D, F4_2D, F4_3D, I8)),
     (texture_sampling.supersample_attributes_cpu, (I4_2D, F4_3D, I4_2D, F4_2D, I8)),

@@ -5,6 +5,8 @@ person filmed from the front, the neck under the chin, soles, armpits. Where all
 side, its depth is arbitrary. Density that a frame cannot see, because another part of the body takes the rays there, is
 arbitrary too; the masks of many frames together tell where nothing is. And where a pose brings two canonical points to
 one place, at an arm on the hip, frames put density on both: the one that the pose brings near to the body is a copy.
+What covers another part of the body in all frames, such as a collar before the shoulder that moves with the head, is
+told by colours alone.
 """
 
 from collections.abc import Sequence
@@ -44,6 +46,14 @@ COPY_RATIO, MIN_COPY_DISTANCE_M = 0.8, 0.015
 head, forearms and shins of a real turn 98 % of the samples with density keep 0.9 of it or more."""
 COPY_VIEWS = 8
 """Views whose poses tell copies, evenly spaced: the median of their distances counts."""
+FAR_FROM_BODY_M = 0.025
+"""From this distance on, colours alone are not enough to tell of a point."""
+ANOTHER_PART_M, FACING_COSINE = 0.06, 0.3
+"""The surface behind a point is of another part if it is so far from the vertex that is nearest to the point, in the
+canonical pose, and faces the camera: at its outline a part lies behind what surrounds it."""
+COVERING_SHARE, COVERING_VIEWS = 0.8, 16
+"""Share of the views that show a point in which it covers another part of the body, from which on colours alone tell
+of it; and the views that are looked at, evenly spaced."""
 EMPTY_MASK = 0.25
 """A pixel with less than this alpha is beside the person."""
 CLOSE_TO_BODY_M = 0.01
@@ -123,6 +133,40 @@ def is_copy(points_m: Float[np.ndarray, "n 3"], body: Body, views: Sequence[Pose
     return found
 
 
+def is_told_by_colours_alone(
+    points_m: Float[np.ndarray, "n 3"], body: Body, views: Sequence[PosedView]
+) -> Bool[np.ndarray, "n"]:
+    """Return the canonical points far from the body that cover another part of it in all views that show them.
+
+    No outline tells of such a point. If the views come from different sides, it is seen beside that part in some of
+    them; if they come from one side, it has the colours of what is on that part, at a depth that nothing tells.
+    """
+    tree, vertices = cKDTree(body.vertices), torch.from_numpy(body.vertices)
+    distance_m, nearest = tree.query(points_m)
+    found, rows = np.zeros(len(points_m), dtype=bool), np.flatnonzero(distance_m > FAR_FROM_BODY_M)
+    points, origin = torch.from_numpy(points_m[rows]).float(), vertices[nearest[rows]]
+    weights, point_weights = (torch.from_numpy(body.skin_weights[k]) for k in (slice(None), nearest[rows]))
+    faces = torch.from_numpy(body.faces)
+    shown, covering = torch.zeros(len(rows)), torch.zeros(len(rows))
+    for view in (views[k] for k in evenly_spaced(len(views), COVERING_VIEWS)):
+        camera, posed = view.camera, view.pose_vertices(vertices, weights)
+        drawn_px, drawn_m = project(posed, camera)
+        cosine = vertex_view_cosine(posed, faces, camera)
+        face, barycentric, surface_m = rasterize(drawn_px, drawn_m, faces, camera.height, camera.width)
+        position_px, depth_m = project(view.pose_vertices(points, point_weights), camera)
+        column, row = position_px.floor().long().unbind(dim=1)
+        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        inside[inside.clone()] = depth_m[inside] < surface_m[row[inside], column[inside]]
+        face_behind = face[row[inside], column[inside]].long()
+        corners, share = faces[face_behind.clamp_min(0)].long(), barycentric[row[inside], column[inside]]
+        gap_m = ((vertices[corners] * share[..., None]).sum(dim=1) - origin[inside]).norm(dim=1)
+        is_other = (gap_m > ANOTHER_PART_M) & ((cosine[corners] * share).sum(dim=1) > FACING_COSINE)
+        shown[inside] += 1.0
+        covering[inside] += ((face_behind >= 0) & is_other).float()
+    found[rows] = ((covering > 0.0) & (covering >= COVERING_SHARE * shown)).numpy()
+    return found
+
+
 def with_emptiness(samples: CanonicalGrid, body: Body, views: Sequence[PosedView]) -> CanonicalGrid:
     """Return the grid with the emptiness that masks and poses tell, decided for every second sample.
 
@@ -137,5 +181,5 @@ def with_emptiness(samples: CanonicalGrid, body: Body, views: Sequence[PosedView
     is_empty[candidates] = share_beside_masks(points_m, body, views) > CONTRADICTED_SHARE
     # The samples next to what stays are left to the density, which tells the surface more finely.
     is_empty &= ~ndimage.binary_dilation(solid & ~is_empty)
-    is_empty[candidates] |= is_copy(points_m, body, views)
+    is_empty[candidates] |= is_copy(points_m, body, views) | is_told_by_colours_alone(points_m, body, views)
     return replace(samples, emptiness=upsample(is_empty.astype(np.float64), samples.density.shape))

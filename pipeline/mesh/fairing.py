@@ -101,13 +101,16 @@ def fair_surface(
     weight = np.maximum(seen, MIN_EVIDENCE)
     offset_m = smooth_with_local_sigma(surface_m - reference_m, offset_sigma_m, coarse.spacing_m, weight)
     shape = samples.density.shape
-    value_m = upsample(reference_m, shape) + upsample(offset_m, shape) * (1.0 - samples.hand_weight)
+    value_m = upsample(offset_m, shape)
+    value_m *= 1.0 - samples.hand_weight
+    value_m += upsample(reference_m, shape)
     value_m = close_valleys(value_m, samples.crotch_m, samples.origin_m, samples.spacing_m)
     fine_detail = upsample(detail, shape)
     near_detail = (np.abs(value_m) < DETAIL_BAND_M) & (fine_detail > MIN_DETAIL)
     exact_m = signed_distance_m(np.argwhere(near_detail) * samples.spacing_m + samples.origin_m, outer_surface)
     value_m[near_detail] += fine_detail[near_detail] * (exact_m - upsample(body_m, shape)[near_detail])
-    return repair(isosurface(-value_m, 0.0, samples.origin_m, samples.spacing_m))
+    del near_detail, fine_detail
+    return repair(isosurface(np.negative(value_m, out=value_m), 0.0, samples.origin_m, samples.spacing_m))
 
 
 def local_thickness_m(inside: Bool[np.ndarray, "x y z"], spacing_m: float) -> Float[np.ndarray, "x y z"]:

@@ -134,24 +134,37 @@ def indicator_grid(samples: CanonicalGrid, isovalue_per_m: float, settings: Mesh
         isovalue_per_m: density (1/m) at which the indicator of the density is 0.5.
         settings: see `MeshSettings`.
     """
-    density_indicator = samples.density / (samples.density + isovalue_per_m)
+    # A fine grid has 100 MB: results replace their operands.
+    value = samples.density / (samples.density + isovalue_per_m)
     if settings.blur_sigma_voxels > 0.0:
-        density_indicator = ndimage.gaussian_filter(density_indicator, settings.blur_sigma_voxels, truncate=3.0)
+        ndimage.gaussian_filter(value, settings.blur_sigma_voxels, output=value, truncate=3.0)
     ramp_m = 3.0 * samples.spacing_m
-    core = np.clip(SURFACE_ISOVALUE + (_depth_inside_m(samples) - settings.solid_core_depth_m) / ramp_m, 0.0, 1.0)
-    hand = np.clip(SURFACE_ISOVALUE - samples.body_distance_m / ramp_m, 0.0, 1.0)
-    value = np.maximum(density_indicator, core)
-    value = np.maximum(value, _close_concavities(value >= SURFACE_ISOVALUE, samples, settings.closing_radius_m))
-    value += samples.hand_weight * (hand - value)
-    value = np.maximum(value, _close_skirt(value >= SURFACE_ISOVALUE, samples)) * (1.0 - samples.emptiness)
+    core = _clipped_ramp(_depth_inside_m(samples) - np.float32(settings.solid_core_depth_m), ramp_m)
+    np.maximum(value, core, out=value)
+    del core
+    closed = _close_concavities(value >= SURFACE_ISOVALUE, samples, settings.closing_radius_m)
+    np.maximum(value, closed, out=value)
+    del closed
+    hands = samples.hand_weight > 0.0
+    hand = _clipped_ramp(-samples.body_distance_m[hands], ramp_m)
+    value[hands] += samples.hand_weight[hands] * (hand - value[hands])
+    np.maximum(value, _close_skirt(value >= SURFACE_ISOVALUE, samples), out=value)
+    value *= 1.0 - samples.emptiness
     legs = samples.body_distance_m, samples.crotch_m, samples.origin_m, samples.spacing_m
-    value = np.minimum(value, parted_legs(value >= SURFACE_ISOVALUE, *legs))
-    value = np.where(excess_between_legs(value >= SURFACE_ISOVALUE, *legs), 0.0, value)
-    inside = largest_solid(value >= SURFACE_ISOVALUE)
+    np.minimum(value, parted_legs(value >= SURFACE_ISOVALUE, *legs), out=value)
+    value[excess_between_legs(value >= SURFACE_ISOVALUE, *legs)] = 0.0
+    is_solid = value >= SURFACE_ISOVALUE
+    inside = largest_solid(is_solid)
     # Filled cavities become 1; other components become empty.
-    filled = np.maximum(value, np.where(value < SURFACE_ISOVALUE, 1.0, value))
-    value = np.where(inside, filled, np.minimum(value, SURFACE_ISOVALUE - 1e-3))
-    return value.astype(np.float32)
+    value[inside & ~is_solid] = 1.0
+    return np.minimum(value, SURFACE_ISOVALUE - 1e-3, out=value, where=~inside)
+
+
+def _clipped_ramp(depth_m: Float[np.ndarray, "*n"], ramp_m: float) -> Float[np.ndarray, "*n"]:
+    """Replace depths by an indicator that rises from 0 to 1 over `ramp_m`, and return it."""
+    depth_m /= np.float32(ramp_m)
+    depth_m += np.float32(SURFACE_ISOVALUE)
+    return np.clip(depth_m, 0.0, 1.0, out=depth_m)
 
 
 def extract_mesh(samples: CanonicalGrid, isovalue_per_m: float, settings: MeshSettings) -> Mesh:

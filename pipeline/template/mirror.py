@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from pipeline.body.body import load_anny
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import adjacency, closest_points_on_mesh
 from pipeline.template.correspondence import Correspondence
@@ -33,8 +32,8 @@ _LEAST_EVIDENCE = 1e-6
 @lru_cache(maxsize=1)
 def _mirrored_points() -> tuple[Int[np.ndarray, "v"], Float[np.ndarray, "v 3"]]:
     """Return for each vertex of the template the face and barycentric coordinates of its mirrored point."""
-    model, template = load_anny(), load_template()
-    vertices = model.at_shape(model.shape_defaults).vertices.astype(np.float64)
+    template = load_template()
+    vertices = template.vertices.astype(np.float64)
     skin = np.flatnonzero(template.skin_faces)
     _, row, barycentric = closest_points_on_mesh(vertices * [-1.0, 1.0, 1.0], Mesh(vertices, template.faces[skin]))
     return skin[row], barycentric

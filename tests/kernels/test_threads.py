@@ -26,7 +26,15 @@ from pipeline.kernels.interpolate import interpolate
 from pipeline.kernels.inverse_skinning import bake_warp_grid, newton_step
 from pipeline.kernels.march import PackedWarpGrids, Rays, SamplingVolume, march
 from pipeline.kernels.raster import rasterize
-from pipeline.kernels.texel_projection import ImageView, ProjectedMesh, TexelPoints, project_texels
+from pipeline.kernels.texel_projection import (
+    ImageView,
+    ProjectedMesh,
+    ProjectionWeights,
+    TexelPoints,
+    TexelSums,
+    add_projections_,
+    project_texels,
+)
 from pipeline.kernels.texture_sampling import supersample_texture
 from pipeline.kernels.transmittance_stats import transmittance_from_weights
 from tests.kernels.bar import CELL_M, bar_skin, bend
@@ -114,8 +122,10 @@ def raster_results() -> list[Tensor]:
     texels = torch.randint(0, len(faces), (4000,), generator=random).int(), torch.full((4000, 3), 1 / 3)
     image, confidence = torch.rand(HEIGHT, WIDTH, 3, generator=random), torch.ones(HEIGHT, WIDTH)
     mesh = ProjectedMesh(vertices_px.detach(), depth_m.detach(), torch.ones(len(grid)), faces)
-    projected = project_texels(mesh, TexelPoints(*texels), ImageView(image, depth, confidence))
-    return [face_id, barycentric, depth, values, *gradients, textured, *projected]
+    view = mesh, TexelPoints(*texels), ImageView(image, depth, confidence)
+    sums = TexelSums(torch.zeros(len(texels[0]), image.shape[2]), torch.zeros(len(texels[0])))
+    add_projections_(sums, *view, ProjectionWeights(1.0, 2.0))
+    return [face_id, barycentric, depth, values, *gradients, textured, *project_texels(*view), *sums]
 
 
 KERNELS: tuple[Callable[[], list[Tensor]], ...] = (

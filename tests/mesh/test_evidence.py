@@ -13,6 +13,7 @@ from pipeline.mesh.evidence import (
     CONTRADICTED_SHARE,
     DEPTH_SHARE,
     is_copy,
+    is_told_by_colours_alone,
     share_beside_masks,
     surface_evidence,
     with_emptiness,
@@ -131,3 +132,35 @@ def test_the_copy_of_a_shell_is_empty(body: Body) -> None:
     along, far = np.abs(points_m[:, 0] - 0.2) < 0.05, capsule_distance(points_m) > RADIUS_M + 0.025
     assert found[along & far & (points_m[:, 1] > 0.6)].mean() > 0.9
     assert found[along & (points_m[:, 1] < 0.5)].max() == 0.0
+
+
+def covering_view(angle_deg: float = 150.0) -> PosedView:
+    """The end at positive x is turned towards the camera, from 120 degrees on in front of the other half."""
+    turned, joint_m = torch.eye(4).repeat(2, 1, 1), torch.tensor([0.05, 0.5, 0.0])
+    turned[1, :3, :3] = axis_angle_to_matrix(torch.tensor([0.0, -np.radians(angle_deg), 0.0]))
+    turned[1, :3, 3] = joint_m - turned[1, :3, :3] @ joint_m
+    view, white = view_from(0.0), torch.full((CAMERA.height, CAMERA.width), 255, dtype=torch.uint8)
+    return replace(view, mask=white, canonical_to_world=view.canonical_to_world @ turned)
+
+
+def test_what_covers_another_part_in_all_views_is_told_by_colours_alone(body: Body) -> None:
+    """Five centimetres beyond the tip, not as far in front of its own part, and not where an outline shows it."""
+    beyond_m, in_front_m, near_m = [0.45, 0.5, 0.0], [0.2, 0.5, 0.15], [0.42, 0.5, 0.0]
+    points_m = np.array([beyond_m, in_front_m, near_m])
+    covering, beside = covering_view(), covering_view(60.0)
+    found = is_told_by_colours_alone(points_m, body, [covering] * 3)
+    np.testing.assert_array_equal(found, [True, False, False])
+    assert not is_told_by_colours_alone(points_m, body, [covering, covering, beside]).any()
+    assert not is_told_by_colours_alone(points_m, body, [beside]).any()
+
+
+def test_density_that_colours_alone_tell_of_is_empty(body: Body) -> None:
+    samples = sample_canonical_grid(shell_density, BOUNDS_M, body, 0.5 * VOXEL_SIZE_M, SETTINGS)
+    points_m = np.argwhere(samples.density > 0.0) * samples.spacing_m + samples.origin_m
+    beyond = (points_m[:, 0] > 0.43) & (np.abs(points_m[:, 1:] - [0.5, 0.0]) < 0.045).all(axis=1)
+    emptiness = with_emptiness(samples, body, [covering_view()]).emptiness[samples.density > 0.0]
+    assert beyond.sum() > 10
+    assert emptiness[beyond].min() >= 0.5
+    assert emptiness[beyond].mean() > 0.7
+    outside_the_bend = (np.abs(points_m[:, 0] - 0.2) < 0.05) & (points_m[:, 2] < -0.05)
+    assert emptiness[outside_the_bend].max() == 0.0

