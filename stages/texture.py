@@ -30,7 +30,6 @@ from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning
 from pipeline.geometry.surface_cut import SurfaceCut
 from pipeline.io.image import to_float, to_uint8
-from pipeline.kernels.common.heap import trim_heap
 from pipeline.kernels.common.thread_pool import shared_thread_pool
 from pipeline.mesh.files import MeshArtifact, load_dense_mesh, load_mesh
 from pipeline.template.correspondence import correspond
@@ -218,7 +217,6 @@ def load_views(
     chosen = subsample(positions, max_frames).tolist()
     loaded = shared_thread_pool(torch.get_num_threads()).imap(load_view, chosen)
     views = list(track(loaded, "reading frames", len(chosen)))
-    trim_heap()
     return weight_by_resolution(views) if views else []
 
 
@@ -368,8 +366,9 @@ def make_texel_inpainter(mesh: Mesh, texels: Texels, template: FittedTemplate | 
 
     template: tells the other side of the body, whose colours are taken where both sides agree.
     """
-    fitted = None if template is None else (template.correspondence, template.registration.vertices)
-    partner = None if fitted is None else mirror_vertices(*fitted, mesh)
+    partner = None
+    if template is not None:
+        partner = mirror_vertices(template.correspondence, template.registration.vertices, mesh)
 
     def inpaint(colour: Float[np.ndarray, "t 3"], texel_confidence: Float[np.ndarray, "t"]) -> Float[np.ndarray, "t 3"]:
         means, weights = average_texels_per_vertex(texels, mesh.faces, len(mesh.vertices), colour, texel_confidence)

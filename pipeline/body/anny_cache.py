@@ -22,7 +22,7 @@ from filelock import FileLock
 from jaxtyping import Float
 
 from pipeline.core.errors import UserError
-from pipeline.kernels.common.determinism import single_threaded_torch
+from pipeline.kernels.common.thread_pool import torch_threads
 
 if TYPE_CHECKING:
     import anny
@@ -95,7 +95,7 @@ def _build(folder: Path, options: Mapping[str, Any]) -> None:
     part.mkdir()
     set_anny_cache_path(part)
     try:
-        with _fast_parser(), single_threaded_torch():
+        with _fast_parser(), torch_threads(1):
             anny.Anny(**options)
     finally:
         set_anny_cache_path(folder)

@@ -5,7 +5,7 @@ person filmed from the front, the neck under the chin, soles, armpits. Where all
 side, its depth is arbitrary. Density that a frame cannot see, because another part of the body takes the rays there, is
 arbitrary too; the masks of many frames together tell where nothing is. And where a pose brings two canonical points to
 one place, at an arm on the hip, frames put density on both: the one that the pose brings near to the body is a copy.
-What covers another part of the body in all frames, such as a collar before the shoulder that moves with the head, is
+What covers another part of the body in most frames, such as a collar before the shoulder that moves with the head, is
 told by colours alone.
 """
 
@@ -14,14 +14,15 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from scipy.spatial import cKDTree
+from torch import Tensor
 
 from pipeline.body.body import Body
 from pipeline.capture.frame_selection import evenly_spaced
 from pipeline.field.skin_grid import smooth_skin_weights
-from pipeline.geometry.camera import project
+from pipeline.geometry.camera import Camera, project
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import signed_distance_m
 from pipeline.kernels.raster import rasterize
@@ -78,8 +79,8 @@ def surface_evidence(body: Body, views: Sequence[PosedView]) -> Float[np.ndarray
         cosine = vertex_view_cosine(posed, faces, camera)
         vertices_px, depth_m = project(posed, camera)
         _, _, nearest_m = rasterize(vertices_px, depth_m, faces, camera.height, camera.width)
-        column, row = vertices_px.floor().long().unbind(dim=1)
-        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height) & (cosine > 0.0)
+        row, column, inside = _pixels(vertices_px, camera)
+        inside &= cosine > 0.0
         shown = torch.zeros_like(inside)
         shown[inside] = depth_m[inside] < nearest_m[row[inside], column[inside]] + DEPTH_TOLERANCE_M
         weight = shown * cosine.square()
@@ -104,10 +105,17 @@ def share_beside_masks(
     points, count = torch.from_numpy(points_m).float(), torch.zeros(len(points_m))
     for view in views:
         camera = view.camera
-        column, row = project(view.pose_vertices(points, weights), camera)[0].floor().long().unbind(dim=1)
-        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        row, column, inside = _pixels(project(view.pose_vertices(points, weights), camera)[0], camera)
         count[inside] += (view.mask[row[inside], column[inside]] < 255.0 * EMPTY_MASK).float()
     return (count / max(1, len(views))).numpy()
+
+
+def _pixels(
+    position_px: Float[Tensor, "n 2"], camera: Camera
+) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"], Bool[Tensor, "n"]]:
+    """Return row and column of the pixel at each position, and whether it is in the picture."""
+    column, row = position_px.floor().long().unbind(dim=1)
+    return row, column, (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
 
 
 def is_copy(points_m: Float[np.ndarray, "n 3"], body: Body, views: Sequence[PosedView]) -> Bool[np.ndarray, "n"]:
@@ -136,7 +144,7 @@ def is_copy(points_m: Float[np.ndarray, "n 3"], body: Body, views: Sequence[Pose
 def is_told_by_colours_alone(
     points_m: Float[np.ndarray, "n 3"], body: Body, views: Sequence[PosedView]
 ) -> Bool[np.ndarray, "n"]:
-    """Return the canonical points far from the body that cover another part of it in all views that show them.
+    """Return the canonical points far from the body that cover another part of it in most views that show them.
 
     No outline tells of such a point. If the views come from different sides, it is seen beside that part in some of
     them; if they come from one side, it has the colours of what is on that part, at a depth that nothing tells.
@@ -154,8 +162,7 @@ def is_told_by_colours_alone(
         cosine = vertex_view_cosine(posed, faces, camera)
         face, barycentric, surface_m = rasterize(drawn_px, drawn_m, faces, camera.height, camera.width)
         position_px, depth_m = project(view.pose_vertices(points, point_weights), camera)
-        column, row = position_px.floor().long().unbind(dim=1)
-        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        row, column, inside = _pixels(position_px, camera)
         inside[inside.clone()] = depth_m[inside] < surface_m[row[inside], column[inside]]
         face_behind = face[row[inside], column[inside]].long()
         corners, share = faces[face_behind.clamp_min(0)].long(), barycentric[row[inside], column[inside]]

@@ -7,7 +7,8 @@ and on the bounding box of the foreground.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
+from itertools import repeat
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -97,9 +98,9 @@ def psnr_db(
 
 
 def validation_psnr_db(
-    renders: Sequence[UInt8[np.ndarray, "_ _ 3"]],
-    images: Sequence[UInt8[np.ndarray, "_ _ 3"]],
-    pixel_masks: Sequence[Bool[np.ndarray, "_ _"]] | None = None,
+    renders: Iterable[UInt8[np.ndarray, "_ _ 3"]],
+    images: Iterable[UInt8[np.ndarray, "_ _ 3"]],
+    pixel_masks: Iterable[Bool[np.ndarray, "_ _"]] | None = None,
 ) -> float:
     """Return the validation PSNR of field, mesh and texture: the mean over frames of `psnr_db`.
 
@@ -111,9 +112,9 @@ def validation_psnr_db(
     Returns:
         The mean in dB; NaN if no frame has a pixel to compare.
     """
-    masks = [None] * len(images) if pixel_masks is None else pixel_masks
-    triples = zip(renders, images, masks, strict=True)
-    values = [psnr_db(render, image, mask) for render, image, mask in triples if mask is None or mask.any()]
+    pairs = zip(renders, images, strict=True)
+    masked = zip(pairs, repeat(None), strict=False) if pixel_masks is None else zip(pairs, pixel_masks, strict=True)
+    values = [psnr_db(*pair, mask) for pair, mask in masked if mask is None or mask.any()]
     return float(np.mean(values)) if values else math.nan
 
 

@@ -9,7 +9,6 @@ optimization", 2014), and back-projects residuals, which also removes the blur o
 "Improving resolution by image registration", 1991).
 """
 
-import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,7 +42,7 @@ from pipeline.metrics.images import (
     composite_on_white,
     composite_premultiplied_on_white,
     foreground_mask,
-    psnr_db,
+    validation_psnr_db,
 )
 from pipeline.texture.edge_padding import dilate_known_texels, fill_unknown_texels
 from pipeline.texture.settings import TextureSettings
@@ -185,6 +184,7 @@ def _mean_of_views(
     settings: TextureSettings,
 ) -> WeightedMean:
     """Return the weighted mean of values of the views: several views at a time are made, then added in their order."""
+    trim_heap()
     mean, pool = WeightedMean.empty(len(surface.texels.face)), shared_thread_pool(torch.get_num_threads())
     with single_threaded_opencv():
         for frame in pool.imap(values_of, views):
@@ -387,11 +387,8 @@ def mean_foreground_psnr_db(
     texture: Float[np.ndarray, "s s 3"], views: Sequence[BakeView], surface: TexturedSurface
 ) -> float:
     """Return the mean over views of the foreground PSNR, render and frame composited on white; nan without views."""
-
-    def score(view: BakeView) -> float:
-        render = composite_premultiplied_on_white(render_textured_view(texture, view, surface))
-        target, body = composite_on_white(view.image, view.mask), foreground_mask(view.mask)
-        return psnr_db(render, target, body) if body.any() else math.nan
-
-    scores = np.array(shared_thread_pool(torch.get_num_threads()).map(score, views))
-    return float(np.mean(scores[~np.isnan(scores)])) if not np.isnan(scores).all() else math.nan
+    renders = shared_thread_pool(torch.get_num_threads()).imap(
+        lambda view: composite_premultiplied_on_white(render_textured_view(texture, view, surface)), views
+    )
+    targets = (composite_on_white(view.image, view.mask) for view in views)
+    return validation_psnr_db(renders, targets, (foreground_mask(view.mask) for view in views))

@@ -16,7 +16,7 @@ from data_tools.synthetic.rig.labels import labels_from_names
 from data_tools.synthetic.rig.subject import Subject
 from pipeline.body.body import AnnyBody, Body, load_anny
 from pipeline.io.image import to_uint8
-from pipeline.kernels.common.determinism import single_threaded_torch
+from pipeline.kernels.common.thread_pool import torch_threads
 
 _PHENOTYPES = {
     "gender": (0.12, 0.5),
@@ -46,7 +46,7 @@ def make_person(
     """
     model, noise = load_anny(), ValueNoise(seed)
     outfit = replace(choose_outfit(seed, legwear), hem_flare_m=hem_flare_m, sleeve_flare_m=sleeve_flare_m)
-    with single_threaded_torch():
+    with torch_threads(1):
         bare = model.at_shape(_shape(model, seed))
     if finger_width_m is not None:
         bare = with_finger_width(bare, finger_width_m)

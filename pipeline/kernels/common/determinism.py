@@ -1,4 +1,4 @@
-"""Sums of torch in an order that depends neither on the timing of threads nor on their number."""
+"""Sums of torch in an order that does not depend on the timing of threads."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -25,14 +25,3 @@ def deterministic_sums() -> Iterator[None]:
     finally:
         torch.use_deterministic_algorithms(before[0], warn_only=before[1])
         options.fill_uninitialized_memory = filled
-
-
-@contextmanager
-def single_threaded_torch() -> Iterator[None]:
-    """Run the operations of torch on one thread inside the block: how products are rounded depends on their number."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)

@@ -105,7 +105,7 @@ def project_texels(mesh, texel_face, texel_barycentric, view, tolerance_m, min_c
 
 @njit(parallel=True, **NJIT_OPTIONS)
 def add_projections(sums, mesh, texel_face, texel_barycentric, view, weighting):
-    """Add to `sums`: see `pipeline.kernels.texel_projection.add_projections`."""
+    """Add to `sums`: see `pipeline.kernels.texel_projection.add_projections_`."""
     total, total_weight = sums
     view_weight, cosine_power, tolerance_m, min_cosine = weighting
     for t in prange(texel_face.shape[0]):

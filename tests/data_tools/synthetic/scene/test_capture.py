@@ -17,6 +17,7 @@ from pipeline.body.files import load_camera, load_motion, save_body
 from pipeline.capture.video import open_frame_source, read_frames
 from pipeline.geometry.camera import DEFAULT_WORLD_TO_CAMERA, project
 from pipeline.io.image import read_rgba
+from pipeline.kernels.common.thread_pool import torch_threads
 from tests.data_tools.conftest import SAMPLE_OPTIONS
 
 
@@ -33,12 +34,8 @@ def test_same_seed_same_bytes(sample: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_the_number_of_threads_changes_no_byte(sample: Path, tmp_path: Path, threads: int) -> None:
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
+    with torch_threads(threads):
         person, bare = make_person(0, texture_px=512)
-    finally:
-        torch.set_num_threads(before)
     save_subject(tmp_path, person)
     save_body(tmp_path / "bare.npz", bare)
     for name in ("bare.npz", "clothed.npz", "labels.npz", "texture.png"):
