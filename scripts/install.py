@@ -34,7 +34,7 @@ def main(arguments: Sequence[str]) -> int:
     if not installed_torch():
         _pip("install", *torch_pip_arguments(pin, lock, use_cuda))
     _pip("install", "--requirement", str(lock))
-    wanted = [package for extra in extras if extra != "cuda" for package in extra_packages(extra)]
+    wanted = [package for extra in extras for package in extra_packages(extra)]
     if wanted:
         _pip("install", "--constraint", str(lock), *wanted)
     return 0

@@ -21,7 +21,11 @@ from pipeline.core.stage import Stage
 __version__ = "0.2.0"
 
 STAGES = ("frames", "body", "field", "mesh", "texture", "export", "report")
-PIPELINE = Pipeline(__name__, STAGES, preparations=("pipeline.body.body", "pipeline.kernels.precompile"))
+PIPELINE = Pipeline(
+    __name__,
+    STAGES,
+    preparations=("pipeline.body.body", "pipeline.kernels.precompile", "pipeline.kernels.precompile_cuda"),
+)
 
 __all__ = ["PIPELINE", "STAGES", "Progress", "Reconstruction", "load_stage", "reconstruct"]
 

@@ -5,12 +5,17 @@ from pathlib import Path
 
 import hypothesis
 import pytest
+import torch
 from filelock import FileLock
 from jaxtyping import install_import_hook
 
 from pipeline.core.measure import REPOSITORY_DIR
 from pipeline.core.progress import take_warnings
 from tests.core.toy_pipeline import Toy
+
+# numba reads this when it is imported: its CUDA kernels then run in a simulator where there is no GPU.
+if not torch.cuda.is_available():
+    os.environ["NUMBA_ENABLE_CUDASIM"] = "1"
 
 # Must run before any of these packages is imported. Every annotated shape and dtype in them is checked at each call.
 # The numba kernels are left out, because numba compiles plain functions.
@@ -43,8 +48,6 @@ def shared_data() -> Path:
 @pytest.fixture(scope="session")
 def cuda() -> str:
     """Name of torch's CUDA device; skips if there is none. No other place decides this."""
-    import torch
-
     if not torch.cuda.is_available():
         pytest.skip("no CUDA device")
     return "cuda"

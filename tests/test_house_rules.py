@@ -16,7 +16,7 @@ MAX_FUNCTION_LINES = 80
 MAX_PARAMETERS = 8
 MAX_MODULES = 20
 
-MODULES_OF_EXTRAS = {"pxr": ["usd-core"]}
+MODULES_OF_EXTRAS = {"cuda": ["cuda-core"], "pxr": ["usd-core"]}
 """Modules of extras whose name is not that of their package; it is not known where the package is not installed."""
 
 # Offenders that remain; no entry may be added.

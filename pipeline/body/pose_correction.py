@@ -11,7 +11,6 @@ from jaxtyping import Float, Float32, Int
 from torch import Tensor
 
 from pipeline.body.body import Body, Motion
-from pipeline.core.device import CPU
 from pipeline.geometry.rotation import (
     axis_angle_to_matrix,
     axis_angle_to_quaternion,
@@ -40,24 +39,24 @@ class PoseCorrection:
     The correction of a joint is applied before its fitted local rotation: R = R_fit · exp(correction).
     """
 
-    def __init__(self, body: Body, motion: Motion, device: torch.device = CPU) -> None:
+    def __init__(self, body: Body, motion: Motion) -> None:
         self.body, self.motion = body, motion
         joints = [body.joint(name) for name in CORRECTED_JOINTS if name in body.joint_names]
-        self.joints = torch.tensor(joints, device=device)
+        self.joints = torch.tensor(joints)
         frames = len(motion.frame_index)
-        self.rotation_rad = torch.zeros(frames, len(joints), 3, device=device, requires_grad=True)
-        self.shift_m = torch.zeros(frames, 3, device=device, requires_grad=True)
-        self._joints_m = torch.as_tensor(body.joints_m).to(device)
-        self._rotations = quaternion_to_matrix(torch.as_tensor(motion.rotations_wxyz)).to(device)
-        self._root_m = torch.as_tensor(motion.root_translation_m).to(device)
+        self.rotation_rad = torch.zeros(frames, len(joints), 3, requires_grad=True)
+        self.shift_m = torch.zeros(frames, 3, requires_grad=True)
+        self._joints_m = torch.as_tensor(body.joints_m)
+        self._rotations = quaternion_to_matrix(torch.as_tensor(motion.rotations_wxyz))
+        self._root_m = torch.as_tensor(motion.root_translation_m)
         correction_row = torch.full((len(body.joint_names),), -1)
-        correction_row[self.joints.cpu()] = torch.arange(len(joints))
+        correction_row[self.joints] = torch.arange(len(joints))
         self._skeleton = Skeleton(torch.as_tensor(body.joints_m), torch.as_tensor(body.parents).long(), correction_row)
         intervals_s = np.diff(motion.time_s.astype(np.float64)) if frames > 1 else np.zeros(0)
         relative_intervals = (
             np.maximum(intervals_s / max(np.median(intervals_s), 1e-9), 1e-3) if len(intervals_s) else intervals_s
         )
-        self._relative_interval = torch.tensor(relative_intervals, dtype=torch.float32, device=device)
+        self._relative_interval = torch.tensor(relative_intervals, dtype=torch.float32)
 
     @property
     def size(self) -> int:
@@ -100,13 +99,12 @@ class PoseCorrection:
     def apply(self, motion: Motion) -> Motion:
         """Return a motion (any frames) with the corrections interpolated to its times (`interpolate_corrections`)."""
         known_s, wanted_s = self.motion.time_s.astype(np.float64), motion.time_s.astype(np.float64)
-        rotation_rad = self.rotation_rad.detach().cpu().numpy().reshape(len(known_s), -1)
+        rotation_rad = self.rotation_rad.detach().numpy().reshape(len(known_s), -1)
         rotation = interpolate_corrections(wanted_s, known_s, rotation_rad)
-        shift = interpolate_corrections(wanted_s, known_s, self.shift_m.detach().cpu().numpy())
+        shift = interpolate_corrections(wanted_s, known_s, self.shift_m.detach().numpy())
         quaternions = torch.as_tensor(motion.rotations_wxyz).clone()
         turn = axis_angle_to_quaternion(torch.from_numpy(rotation.reshape(len(wanted_s), -1, 3)))
-        joints = self.joints.cpu()
-        quaternions[:, joints] = quaternion_multiply(quaternions[:, joints], turn)
+        quaternions[:, self.joints] = quaternion_multiply(quaternions[:, self.joints], turn)
         return motion.with_pose(quaternions.numpy(), motion.root_translation_m + shift)
 
 

@@ -27,8 +27,9 @@ class BakedInverseSkinning:
     """
 
     def __init__(self, body: Body, skin: SkinGrid, camera: Camera, poses: PoseCorrection, method: str) -> None:
-        self.body, self.cpu_skin, self.camera, self.poses, self.method = body, skin, camera, poses, method
-        self.full_skin = self.skin = skin.to(poses.shift_m.device)
+        """skin: on the device of the training; the poses are on the CPU."""
+        self.body, self.camera, self.poses, self.method = body, camera, poses, method
+        self.full_skin = self.skin = skin
         self.baked_rotation_rad, self.baked_shift_m = torch.zeros(()), torch.zeros(())
         self.bake()
 
@@ -37,13 +38,12 @@ class BakedInverseSkinning:
         """Invert the skinning of all training frames in their present poses."""
         self.baked_rotation_rad = self.poses.rotation_rad.detach().clone()
         self.baked_shift_m = self.poses.shift_m.detach().clone()
-        all_frames = torch.arange(len(self.poses.shift_m), device=self.poses.shift_m.device)
-        canonical_to_world = self.poses.canonical_to_world(all_frames)
+        canonical_to_world = self.poses.canonical_to_world(torch.arange(len(self.poses.shift_m)))
         self.world_to_posed = world_to_posed(canonical_to_world)
-        self.cameras = posed_space_cameras(self.camera, self.world_to_posed.cpu().numpy())
-        canonical_to_posed = self.world_to_posed[:, None] @ canonical_to_world
+        self.cameras = posed_space_cameras(self.camera, self.world_to_posed.numpy())
+        canonical_to_posed = (self.world_to_posed[:, None] @ canonical_to_world).to(self.full_skin.weights.device)
         vars(self).pop("inverse", None)  # its memory is free before the next one is built
-        self.inverse = build_inverse_skinning(self.method, self.body, self.cpu_skin, canonical_to_posed)
+        self.inverse = build_inverse_skinning(self.method, self.body, self.full_skin, canonical_to_posed)
 
     @property
     def is_cropped(self) -> bool:
@@ -55,6 +55,6 @@ class BakedInverseSkinning:
         self.skin = self.full_skin.crop_to_occupied(occupancy.occupied, occupancy.bounds_m)
 
     def pose_batch(self, frames: Int[Tensor, "k"]) -> PoseBatch:
-        """Return the present poses of some frames, differentiable in the corrections."""
+        """Return the present poses of some frames (on the CPU), differentiable in the corrections."""
         poses = self.poses.canonical_to_posed(frames, self.world_to_posed[frames])
-        return PoseBatch(self.skin, frames, poses)
+        return PoseBatch(self.skin, frames.to(self.skin.weights.device), poses)

@@ -3,13 +3,12 @@
 Letters: n rays, e points that should be empty.
 """
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.field.settings import FieldSettings
-from pipeline.kernels.ray_losses import LossInputs, ray_loss_gradients, ray_losses
+from pipeline.kernels.ray_losses import ray_loss_gradients, ray_losses
 from pipeline.kernels.volume_rendering import OutputGradients
 
 DENSITY_SCALE_M = 0.01
@@ -41,19 +40,26 @@ def field_losses(
 
 
 def field_loss_gradients(
-    rays: LossInputs, density_per_m: Float[np.ndarray, "e"], settings: FieldSettings, ray_fraction: float
+    image: Float[Tensor, "n 3"],
+    alpha: Float[Tensor, "n"],
+    rgba: Float[Tensor, "n 4"],
+    background: Float[Tensor, "n 3"],
+    inlier_weight: Float[Tensor, "n"],
+    empty_density_per_m: Float[Tensor, "e"],
+    settings: FieldSettings,
+    ray_fraction: float,
 ) -> tuple[dict[str, Tensor], Float[Tensor, "n 3"], OutputGradients]:
     """Do `field_losses` and its backward pass without autograd; return losses, colour errors and gradients.
 
     ray_fraction: factor of the losses of rays. The gradients are those of the sum of the losses.
     """
-    weights = (1.0, settings.alpha_weight, settings.hard_surface_weight)
-    of_rays = ray_loss_gradients(rays, settings.huber_delta, tuple(ray_fraction * weight for weight in weights))
-    values = ray_fraction * torch.tensor(weights) * torch.from_numpy(of_rays.means)
-    losses = dict(zip(("colour", "alpha", "hard"), values, strict=True))
+    colour, opacity, hard = 1.0, settings.alpha_weight, settings.hard_surface_weight
+    weights = ray_fraction * colour, ray_fraction * opacity, ray_fraction * hard
+    of_rays = ray_loss_gradients(image, alpha, rgba, background, inlier_weight, settings.huber_delta, weights)
+    losses = dict(zip(("colour", "alpha", "hard"), of_rays.losses, strict=True))
     point_count = max(settings.empty_points + settings.unobserved_points, 1)
-    slope = np.float32(settings.empty_density_weight * DENSITY_SCALE_M / point_count)
-    if len(density_per_m):
-        losses["density"] = torch.as_tensor(slope * density_per_m.sum())
-    gradients = OutputGradients(of_rays.grad_image, of_rays.grad_alpha, np.full(len(density_per_m), slope, np.float32))
-    return losses, torch.from_numpy(of_rays.error), gradients
+    slope = settings.empty_density_weight * DENSITY_SCALE_M / point_count
+    if len(empty_density_per_m):
+        losses["density"] = slope * empty_density_per_m.sum()
+    of_density = torch.full_like(empty_density_per_m, slope)
+    return losses, of_rays.error, OutputGradients(of_rays.grad_image, of_rays.grad_alpha, of_density)

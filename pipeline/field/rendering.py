@@ -133,7 +133,7 @@ def _render_chunk_rays(
     count, device = len(origins_m), origins_m.device
     frame, jitter = torch.full((count,), row, device=device), torch.full((count,), 0.5, device=device)
     rays = Rays(origins_m, directions, frame, jitter)
-    if not posed_field.supports_early_termination:
+    if not posed_field.is_fused:
         return _render_in_sample_chunks(posed_field, poses, row, rays)
     pose_batch = PoseBatch(poses.skin, frame[:1], poses.canonical_to_posed[row : row + 1])
     rendered = render_rays(

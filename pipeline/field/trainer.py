@@ -1,6 +1,8 @@
 """One step of the training of field, poses and occupancy grid, and the state that it changes."""
 
+import math
 from collections.abc import Iterable
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +12,7 @@ from torch import Tensor
 
 from pipeline.body.body import Body, Motion
 from pipeline.body.pose_correction import PoseCorrection
+from pipeline.core.device import CPU
 from pipeline.field.baked_inverse_skinning import BakedInverseSkinning
 from pipeline.field.config import FieldConfig
 from pipeline.field.field import RadianceField
@@ -20,10 +23,10 @@ from pipeline.field.pixel_sampler import PixelPool
 from pipeline.field.ray_batches import POINT_STREAM, STEP_STREAM, RayBatch, RaySampler, step_rng
 from pipeline.field.volume_rendering import PoseBatch, PosedField, render_rays, render_rays_with_gradients
 from pipeline.geometry.camera import Camera
-from pipeline.kernels.common.thread_pool import ThreadPool
+from pipeline.kernels.common.dispatch import runs_on_cuda
+from pipeline.kernels.common.thread_pool import ThreadPool, one_thread
 from pipeline.kernels.hashgrid import FeatureGradients, add_table_gradient_
 from pipeline.kernels.inverse_skinning import SkinGrid
-from pipeline.kernels.ray_losses import LossInputs
 from pipeline.kernels.volume_rendering import OutputGradients, RenderOutput
 
 REBAKE_FRACTIONS = (0.6,)
@@ -74,18 +77,22 @@ def sum_by_name(parts: Iterable[dict[str, Tensor]]) -> dict[str, Tensor]:
 
 
 class Trainer:
-    """Training of a field, on the device of the field. `state_dict` holds everything that a step changes."""
+    """Training of a field, on the device of the field. `state_dict` holds everything that a step changes.
+
+    Frames, pixels and poses of a step are computed on the CPU, whatever the device: they are small, and follow each
+    other.
+    """
 
     def __init__(
         self, scene: TrainingScene, field: RadianceField, occupancy: OccupancyGrid, config: FieldConfig
     ) -> None:
         self.scene, self.field, self.occupancy, self.config = scene, field, occupancy, config
         self.device = field.bounds_m.device
-        self.poses = PoseCorrection(scene.body, scene.motion, self.device)
+        self.poses = PoseCorrection(scene.body, scene.motion)
         self.sampler = RaySampler(scene.pool, config, self.device)
         self.optimiser = FieldOptimiser(field, self.poses, occupancy.parameters(), config)
         self.inverse_skinning = BakedInverseSkinning(
-            scene.body, scene.skin, scene.camera, self.poses, config.settings.inverse_skinning
+            scene.body, scene.skin.to(self.device), scene.camera, self.poses, config.settings.inverse_skinning
         )
         self.step_m = scene.body.height_m() * config.settings.step_fraction
         self.completed_steps = 0
@@ -105,8 +112,13 @@ class Trainer:
         Raises:
             DivergedError: many consecutive steps had no finite loss.
         """
-        settings, rng = self.config.settings, step_rng(self.config.seed, self.completed_steps, STEP_STREAM)
         self._prepare_pose_refinement()
+        # On a GPU what is left for the CPU is small: to wake a second thread takes longer than what it would do.
+        with nullcontext() if self.device == CPU else one_thread():
+            return self._step()
+
+    def _step(self) -> dict[str, float]:
+        settings, rng = self.config.settings, step_rng(self.config.seed, self.completed_steps, STEP_STREAM)
         frames = self.sampler.sample_frames(rng)
         parts = np.array_split(frames, min(self.part_count, len(frames)))
         empty_m = self.occupancy.sample_empty_points(
@@ -115,20 +127,21 @@ class Trainer:
             step_rng(self.config.seed, self.completed_steps, POINT_STREAM),
         )
         ray_fractions = [self.sampler.ray_fraction(part, frames) for part in parts]
-        pose_batch = self.inverse_skinning.pose_batch(self._frame_tensor(frames)) if self.refines_poses else None
+        pose_batch = self.inverse_skinning.pose_batch(torch.from_numpy(frames)) if self.refines_poses else None
         pose_parts = pose_batch.split([len(part) for part in parts]) if pose_batch else [None] * len(parts)
         arguments = (parts, empty_m.tensor_split(len(parts)), ray_fractions, pose_parts)
         results = self.threads.map(self.forward_backward, *arguments)
-        losses = sum_by_name(result.losses for result in results)
-        total, gradients = torch.stack(list(losses.values())).sum(), [result.gradients for result in results]
+        of_losses = sum_by_name(result.losses for result in results)
+        losses = dict(zip(of_losses, torch.stack(list(of_losses.values())).tolist(), strict=True))
+        total, gradients = sum(losses.values()), [result.gradients for result in results]
         if pose_batch:
             of_parts = [result.pose_gradient for result in results if result.pose_gradient is not None]
-            pose_loss, of_poses = self._pose_loss(), torch.cat(of_parts)
+            pose_loss, of_poses = self._pose_loss(), torch.cat(of_parts).cpu()
             # The gradient of the sum is that of the losses of rays and poses.
             weighted_sum = (pose_batch.canonical_to_posed * of_poses).sum()
             gradients.append(self.optimiser.gradients(pose_loss + weighted_sum, POSE_PARAMETERS))
-            total = total + pose_loss.detach()
-        is_finite = bool(torch.isfinite(total))
+            total += float(pose_loss.detach())
+        is_finite = math.isfinite(total)
         if is_finite:
             self._record_results(results)
         self.optimiser.step(self.completed_steps, self._through_gate(sum_by_name(gradients)), is_finite)
@@ -136,7 +149,7 @@ class Trainer:
         self._update_occupancy(rng)
         self.field.gate = self.occupancy.gate()
         samples = sum(len(result.rendered.transmittance) for result in results)
-        return {name: float(loss) for name, loss in losses.items()} | {"samples": float(samples)}
+        return losses | {"samples": float(samples)}
 
     @torch.no_grad()
     def count_samples(self) -> int:
@@ -161,7 +174,7 @@ class Trainer:
         """
         batch = self.sampler.sample_rays(frames, self.completed_steps, self.inverse_skinning.cameras)
         posed_field = self.posed_field()
-        if posed_field.supports_early_termination:
+        if posed_field.is_fused:
             return self._forward_backward_compiled(posed_field, batch, empty_m, ray_fraction, pose_batch)
         return self._forward_backward_autograd(posed_field, batch, empty_m, ray_fraction, pose_batch)
 
@@ -173,15 +186,14 @@ class Trainer:
         ray_fraction: float,
         pose_batch: PoseBatch | None,
     ) -> StepResult:
-        """Do `_forward_backward_autograd` with compiled loops alone."""
+        """Do `_forward_backward_autograd` with compiled kernels alone."""
         losses: dict[str, Tensor] = {}
-        error = batch.background
-        targets = [tensor.numpy() for tensor in (batch.rgba, batch.background, batch.inlier_weight)]
+        error, settings = batch.background, self.config.settings
 
-        def output_gradients(image: np.ndarray, alpha: np.ndarray, density: np.ndarray) -> OutputGradients:
+        def output_gradients(image: Tensor, alpha: Tensor, density_per_m: Tensor) -> OutputGradients:
             nonlocal losses, error
-            rays = LossInputs(image, alpha, *targets)
-            losses, error, gradients = field_loss_gradients(rays, density, self.config.settings, ray_fraction)
+            targets = batch.rgba, batch.background, batch.inlier_weight, density_per_m
+            losses, error, gradients = field_loss_gradients(image, alpha, *targets, settings, ray_fraction)
             return gradients
 
         rendered, gradients, feature_gradients = render_rays_with_gradients(
@@ -219,9 +231,6 @@ class Trainer:
         """Return the field in the poses of the last bake, for the present step."""
         return PosedField(self.field, self.inverse_skinning.inverse, self.occupancy.binary())
 
-    def _frame_tensor(self, frames: Int[np.ndarray, "k"]) -> Int[Tensor, "k"]:
-        return torch.from_numpy(frames).to(self.device)
-
     def _through_gate(self, gradients: dict[str, Tensor]) -> dict[str, Tensor]:
         """Replace the gradient of the gate, if there is one, by those of the parameters that it depends on."""
         of_gate = gradients.pop(GATE, None)
@@ -234,7 +243,7 @@ class Trainer:
         if self.completed_steps in {round(fraction * self.config.steps) for fraction in REBAKE_FRACTIONS}:
             self.inverse_skinning.bake()
         if not self.inverse_skinning.is_cropped:
-            self.inverse_skinning.crop_skin_grid(self.occupancy.binary())
+            self._crop_skin_grid()
 
     def _pose_loss(self) -> Tensor:
         settings = self.config.settings
@@ -262,7 +271,8 @@ class Trainer:
             self._crop_skin_grid()
 
     def _crop_skin_grid(self) -> None:
-        if self.refines_poses:
+        """Crop the skin grid, so that what a step reads fits in the cache; CUDA kernels do not gain from it."""
+        if self.refines_poses and not runs_on_cuda(self.field.table):
             self.inverse_skinning.crop_skin_grid(self.occupancy.binary())
 
     def state_dict(self) -> dict[str, Tensor]:

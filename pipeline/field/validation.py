@@ -53,8 +53,8 @@ class Validator:
         refined: add the pose corrections of the training frames, interpolated in time.
         """
         motion = trainer.poses.apply(self.motion) if refined else self.motion
-        scene = trainer.scene
-        return build_pose_warps(trainer.field, scene.body, scene.skin, canonical_to_world(scene.body, motion))
+        body, skin = trainer.scene.body, trainer.inverse_skinning.full_skin
+        return build_pose_warps(trainer.field, body, skin, canonical_to_world(body, motion))
 
     def render(self, trainer: Trainer, poses: PoseWarps) -> list[UInt8[np.ndarray, "h w 3"]]:
         """Render all frames on white with the present field, in poses from `pose_warps`."""

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -16,7 +15,7 @@ from torch import Tensor
 from pipeline.field.field import INITIAL_DENSITY_PER_M, MAX_ABS_LOG_DENSITY, RadianceField
 from pipeline.field.inverse_skinning import InverseSkinning, Rays
 from pipeline.field.occupancy import BinaryOccupancy
-from pipeline.kernels.common.dispatch import runs_on_numba
+from pipeline.kernels.common.dispatch import runs_on_cuda, runs_on_numba
 from pipeline.kernels.common.packing import segment_ids_from_counts
 from pipeline.kernels.composite import composite
 from pipeline.kernels.hashgrid import FeatureGradients
@@ -47,9 +46,11 @@ class PosedField:
     occupancy: BinaryOccupancy
 
     @property
-    def supports_early_termination(self) -> bool:
-        """Whether `render_rays` skips samples behind a surface: hash grid and warp grids on the CPU."""
-        return self.inverse.warps is not None and self.field.trunk is None and runs_on_numba(self.field.table)
+    def is_fused(self) -> bool:
+        """Whether compiled kernels render: hash grid and warp grids, on the CPU or on a GPU with numba-cuda."""
+        table = self.field.table
+        is_compiled = runs_on_numba(table) or runs_on_cuda(table)
+        return self.inverse.warps is not None and self.field.trunk is None and is_compiled
 
     @cached_property
     def network(self) -> RadianceNetwork:
@@ -78,8 +79,9 @@ class PoseBatch(NamedTuple):
     canonical_to_posed: Float[Tensor, "b j 4 4"]
 
     def split(self, sizes: Sequence[int]) -> list["PoseBatch"]:
-        """Divide the frames into parts of some sizes; the poses of a part are leaves of autograd."""
-        parts = zip(self.frames.split(sizes), self.canonical_to_posed.detach().split(sizes), strict=True)
+        """Divide the frames into parts of some sizes; the poses of a part are leaves of autograd, beside the frames."""
+        poses_of_parts = self.canonical_to_posed.detach().to(self.frames.device).split(sizes)
+        parts = zip(self.frames.split(sizes), poses_of_parts, strict=True)
         return [PoseBatch(self.skin, frames, poses.requires_grad_()) for frames, poses in parts]
 
     def frame_slots(self, rays: Rays) -> Int[Tensor, "n"]:
@@ -103,7 +105,7 @@ def render_rays(
     samples, m. max_samples: per ray. feature_gradients: list that takes the contributions to the gradient of the hash
     table (`pipeline.kernels.hashgrid.encode`).
     """
-    if not posed_field.supports_early_termination:
+    if not posed_field.is_fused:
         return render_rays_dense(posed_field, rays, pose_batch, points_m, step_m, max_samples, feature_gradients)
     fused = rays, posed_field.volume, posed_field.network, _batch_skinning(rays, pose_batch), points_m
     return render_rays_fused(*fused, RenderSettings(step_m, max_samples), feature_gradients)
@@ -116,9 +118,9 @@ def render_rays_with_gradients(
     points_m: Float[Tensor, "p 3"],
     step_m: float,
     max_samples: int,
-    output_gradients: Callable[[np.ndarray, np.ndarray, np.ndarray], OutputGradients],
+    output_gradients: Callable[[Tensor, Tensor, Tensor], OutputGradients],
 ) -> tuple[RenderOutput, RenderGradients, FeatureGradients]:
-    """Do `render_rays` and its backward pass without autograd, for a field that supports early termination.
+    """Do `render_rays` and its backward pass without autograd, for a field that compiled kernels render.
 
     output_gradients: see `pipeline.kernels.volume_rendering.render_rays_with_gradients`.
     """

@@ -1,9 +1,10 @@
-"""Kernels: operations that are compiled with numba for float32 on the CPU, with a plain-torch reference for the rest.
+"""Kernels: operations that are compiled with numba for float32, with a plain-torch reference for the rest.
 
 Each kernel is a folder:
 
     hashgrid/__init__.py    the public operation: checks, choice of the implementation, autograd function
-    hashgrid/cpu.py         the compiled loops, on numpy arrays
+    hashgrid/cpu.py         the compiled loops of the CPU, on numpy arrays
+    hashgrid/cuda.py        the kernels for a CUDA GPU, where the training has one; imported only there
     hashgrid/reference.py   the reference in plain torch: any dtype, any device, gradients by autograd
     hashgrid/inputs.py      named tuples of tensors, where operation and reference share them
 
@@ -18,7 +19,10 @@ To add a kernel:
 3. Write the operation in `__init__.py`: `runs_on_numba` chooses the implementation. At most 8 parameters.
 4. Add `tests/kernels/test_<kernel>.py`: values and gradients of the compiled loops against the reference in float64, a
    closed form, `gradcheck` of the reference; for a parallel loop an entry in `tests/kernels/test_threads.py`.
-5. If the kernel takes a noticeable part of a run, add it to `tests/bench/bench_kernels.py`.
+5. On a GPU the reference runs. If that is too slow, write `cuda.py` with `@cuda.jit(**CUDA_OPTIONS)` and `launch`
+   (`common/cuda.py`), `runs_on_cuda` in the operation, its types in `cuda_signatures.py`, and a test in
+   `tests/kernels/test_cuda.py`, which numba's simulator runs where there is no GPU.
+6. If the kernel takes a noticeable part of a run, add it to `tests/bench/bench_kernels.py`.
 """
 
 import os
@@ -27,3 +31,5 @@ import os
 os.environ.setdefault("NUMBA_THREADING_LAYER_PRIORITY", "omp tbb workqueue")
 # LLVM then combines the few floats of a hash-grid row into one vector instruction: 1.7 to 2.6 times faster.
 os.environ.setdefault("NUMBA_SLP_VECTORIZE", "1")
+# A few thousand rays do not fill a large GPU, of which numba warns at each launch.
+os.environ.setdefault("NUMBA_CUDA_LOW_OCCUPANCY_WARNINGS", "0")

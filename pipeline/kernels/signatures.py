@@ -33,7 +33,7 @@ from pipeline.kernels.volume_rendering import backward_cpu
 from pipeline.kernels.volume_rendering import cpu as volume_rendering
 
 
-def _named(tuple_class: type, *fields: Any) -> Any:
+def named_tuple(tuple_class: type, *fields: Any) -> Any:
     """Return the type of a named tuple with these types of its fields."""
     return types.BaseTuple.from_types(fields, tuple_class)
 
@@ -48,40 +48,42 @@ U1_2D, U1_3D = U1[:, ::1], U1[:, :, ::1]
 STRIDED_F4_2D = F4[:, :]
 
 FEATURES = types.UniTuple(I8, 4)  # features of a level of the hash grid
-HASH_TABLE = _named(hashgrid.HashTable, F4_2D, I8_2D)
+HASH_TABLE = named_tuple(hashgrid.HashTable, F4_2D, I8_2D)
 
-LATTICE = _named(newton_cpu.LatticeArrays, F4_1D, F4, I4_3D)
-SKIN = _named(inverse_skinning.SkinArrays, LATTICE, F4_2D, F4_1D, F4_3D)
-POSED_GRID = _named(inverse_skinning.PosedGrid, F4_1D, I8_1D)
+LATTICE = named_tuple(newton_cpu.LatticeArrays, F4_1D, F4, I4_3D)
+SKIN = named_tuple(inverse_skinning.SkinArrays, LATTICE, F4_2D, F4_1D, F4_3D)
+POSED_GRID = named_tuple(inverse_skinning.PosedGrid, F4_1D, I8_1D)
 
-SKELETON = _named(kinematics.SkeletonArrays, F4_2D, I8_1D, I8_1D)
-POSES = _named(kinematics.PoseArrays, F4_4D, F4_2D, F4_3D)
+SKELETON = named_tuple(kinematics.SkeletonArrays, F4_2D, I8_1D, I8_1D)
+POSES = named_tuple(kinematics.PoseArrays, F4_4D, F4_2D, F4_3D)
 
-PIXEL_LISTS = _named(pixel_sampling.PixelLists, I8_2D, I2_2D)
-SAMPLE_COUNTS = _named(pixel_sampling.SampleCounts, I8_1D, I8_2D, I8_2D)
-TILE_ERRORS = _named(pixel_sampling.TileErrors, F4_3D, I8, F8)
-CAMERAS = _named(pixel_sampling.PosedCameras, F4_1D, F4_1D, F4_2D, F4_3D)
-PIXEL_RAYS = _named(pixel_sampling_cpu.PixelRays, F4_2D, F4_2D, F4_2D)
+PIXEL_LISTS = named_tuple(pixel_sampling.PixelLists, I8_2D, I2_2D)
+SAMPLE_COUNTS = named_tuple(pixel_sampling.SampleCounts, I8_1D, I8_2D, I8_2D)
+TILE_ERRORS = named_tuple(pixel_sampling.TileErrors, F4_3D, I8, F8)
+CAMERAS = named_tuple(pixel_sampling.PosedCameras, F4_1D, F4_1D, F4_2D, F4_3D)
+PIXEL_RAYS = named_tuple(pixel_sampling_cpu.PixelRays, F4_2D, F4_2D, F4_2D)
 
-LOSS_INPUTS = _named(ray_losses.LossInputs, F4_2D, F4_1D, F4_2D, STRIDED_F4_2D, F4_1D)
-LOSS_GRADIENTS = _named(ray_losses.GradientArrays, F4_2D, F4_2D, F4_1D)
+LOSS_INPUTS = named_tuple(ray_losses.LossInputs, F4_2D, F4_1D, F4_2D, STRIDED_F4_2D, F4_1D)
+LOSS_GRADIENTS = named_tuple(ray_losses.GradientArrays, F4_2D, F4_2D, F4_1D)
 
-RAYS = _named(march.RayArrays, F4_2D, F4_2D, I8_1D, F4_1D)
-WARP = _named(march.WarpArrays, F4, F4_2D, I8_2D, I8_2D, F4_2D, I4_1D, F4_2D)
-OCCUPANCY = _named(march.OccupancyArrays, U1_3D, F4_1D, F4_1D)
-MARCH = _named(march.MarchArrays, RAYS, F4, WARP, OCCUPANCY)
-CELL_WEIGHTS = _named(cell_skinning_cpu.CellWeights, F4_1D, F4, I4_3D, I8_1D, I4_1D, F4_2D)
-SKINNING = _named(volume_rendering.SkinningArrays, I8_1D, CELL_WEIGHTS, F4_3D)
-NETWORK = _named(volume_rendering.NetworkArrays, F4_2D, F4_2D, F4_1D, F4, F4)
-FIELD = _named(volume_rendering.FieldArrays, F4_2D, HASH_TABLE, FEATURES, NETWORK, F4_3D)
-RENDER = _named(volume_rendering.RenderArrays, MARCH, SKINNING, FIELD, I8, F4)
-BUFFERS = _named(volume_rendering.SampleBuffers, I4_1D, F4_2D, F4_1D, F4_2D, F4_2D, F4_2D, F4_2D, F4_1D, F4_1D, F4_1D)
-OUTPUT_GRADIENTS = _named(backward_cpu.OutputGradients, F4_2D, F4_1D, F4_1D)
-PARAMETER_GRADIENTS = _named(backward_cpu.ParameterGradients, F4_2D, F4_2D, F4_1D, F4_3D, F4_3D)
+RAYS = named_tuple(march.RayArrays, F4_2D, F4_2D, I8_1D, F4_1D)
+WARP = named_tuple(march.WarpArrays, F4, F4_2D, I8_2D, I8_2D, F4_2D, I4_1D, F4_2D)
+OCCUPANCY = named_tuple(march.OccupancyArrays, U1_3D, F4_1D, F4_1D)
+MARCH = named_tuple(march.MarchArrays, RAYS, F4, WARP, OCCUPANCY)
+CELL_WEIGHTS = named_tuple(cell_skinning_cpu.CellWeights, F4_1D, F4, I4_3D, I8_1D, I4_1D, F4_2D)
+SKINNING = named_tuple(volume_rendering.SkinningArrays, I8_1D, CELL_WEIGHTS, F4_3D)
+NETWORK = named_tuple(volume_rendering.NetworkArrays, F4_2D, F4_2D, F4_1D, F4, F4)
+FIELD = named_tuple(volume_rendering.FieldArrays, F4_2D, HASH_TABLE, FEATURES, NETWORK, F4_3D)
+RENDER = named_tuple(volume_rendering.RenderArrays, MARCH, SKINNING, FIELD, I8, F4)
+BUFFERS = named_tuple(
+    volume_rendering.SampleBuffers, I4_1D, F4_2D, F4_1D, F4_2D, F4_2D, F4_2D, F4_2D, F4_1D, F4_1D, F4_1D
+)
+OUTPUT_GRADIENTS = named_tuple(backward_cpu.OutputGradientArrays, F4_2D, F4_1D, F4_1D)
+PARAMETER_GRADIENTS = named_tuple(backward_cpu.ParameterGradients, F4_2D, F4_2D, F4_1D, F4_3D, F4_3D)
 
-MESH = _named(texel_projection.MeshArrays, F4_2D, F4_1D, F4_1D, I4_2D)
+MESH = named_tuple(texel_projection.MeshArrays, F4_2D, F4_1D, F4_1D, I4_2D)
 TEXEL_SUMS = types.Tuple((F4_2D, F4_1D))
-VIEW = _named(texel_projection.ViewArrays, F4_3D, F4_2D, F4_2D)
+VIEW = named_tuple(texel_projection.ViewArrays, F4_3D, F4_2D, F4_2D)
 
 SIGNATURES: tuple[tuple[Any, tuple[Any, ...]], ...] = (
     # body

@@ -5,7 +5,6 @@ import torch
 from pipeline.field.losses import field_loss_gradients, field_losses
 from pipeline.field.pixel_sampler import ErrorMap, build_pixel_pool
 from pipeline.field.settings import FieldSettings
-from pipeline.kernels.ray_losses import LossInputs
 
 SETTINGS = FieldSettings(huber_delta=0.1, alpha_weight=0.5, hard_surface_weight=0.2, empty_density_weight=0.1)
 
@@ -35,8 +34,7 @@ def test_gradients_without_autograd_are_those_of_the_losses(points):
     shapes = ((50, 3), 50, (50, 4), (50, 3), 50)
     image, alpha, rgba, background, weight = (torch.rand(shape, generator=random) for shape in shapes)
     density = 20 * torch.rand(points, generator=random)
-    arrays = LossInputs(*(tensor.numpy() for tensor in (image, alpha, rgba, background, weight)))
-    found, error, gradients = field_loss_gradients(arrays, density.numpy(), SETTINGS, 0.3)
+    found, error, gradients = field_loss_gradients(image, alpha, rgba, background, weight, density, SETTINGS, 0.3)
     outputs = [tensor.clone().requires_grad_() for tensor in (image, alpha, density)]
     expected, expected_error = field_losses(*outputs[:2], rgba, background, weight, outputs[2], SETTINGS)
     expected = {name: loss if name == "density" else 0.3 * loss for name, loss in expected.items()}
@@ -47,7 +45,7 @@ def test_gradients_without_autograd_are_those_of_the_losses(points):
     total = torch.stack(list(expected.values())).sum()
     by_autograd = torch.autograd.grad(total, outputs, allow_unused=True)
     for mine, theirs, output in zip(gradients, by_autograd, outputs, strict=True):
-        torch.testing.assert_close(torch.from_numpy(mine), torch.zeros_like(output) if theirs is None else theirs)
+        torch.testing.assert_close(mine, torch.zeros_like(output) if theirs is None else theirs)
 
 
 def make_pool():

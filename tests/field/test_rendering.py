@@ -21,7 +21,7 @@ def render_in_chunks(trainer: Trainer, scene) -> tuple[np.ndarray, int]:
     """Render the first frame without the compiled kernel; also return the number of evaluated points."""
     with (
         mock.patch.object(trainer.field, "radiance", wraps=trainer.field.radiance) as radiance,
-        mock.patch.object(PosedField, "supports_early_termination", False),
+        mock.patch.object(PosedField, "is_fused", False),
     ):
         image = render_first_frame(trainer, scene)
     return image, sum(len(call.args[0]) for call in radiance.call_args_list)

@@ -5,12 +5,13 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numba
 import pytest
 
 from pipeline.core.measure import REPOSITORY_DIR
-from pipeline.kernels import precompile
+from pipeline.kernels import precompile, precompile_cuda
 from pipeline.kernels.signatures import SIGNATURES
 
 CALLED = """
@@ -45,6 +46,28 @@ def test_prepared_when_done_with_this_compiler(tmp_path: Path, monkeypatch: pyte
     assert precompile.is_prepared()
     monkeypatch.setattr(precompile, "_compiler", lambda: "numba 99 for another processor")
     assert not precompile.is_prepared()
+
+
+def test_without_numba_cuda_nothing_is_prepared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(precompile_cuda, "CUDA_CACHE_FOLDER", tmp_path / "cache")
+    monkeypatch.setattr(precompile_cuda, "has_numba_cuda", lambda: False)
+    assert precompile_cuda.is_prepared()
+
+
+@pytest.mark.parametrize("has_gpu", [True, False])
+def test_cuda_kernels_are_compiled_where_there_is_a_gpu(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_gpu: bool
+) -> None:
+    compiled = []
+    kernel = SimpleNamespace(compile=compiled.append)
+    monkeypatch.setattr(precompile_cuda, "CUDA_CACHE_FOLDER", tmp_path / "cache")
+    monkeypatch.setattr(precompile_cuda, "has_numba_cuda", lambda: True)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: has_gpu)
+    monkeypatch.setattr("pipeline.kernels.cuda_signatures.SIGNATURES", ((kernel, (1, 2)), (kernel, (3,))))
+    assert not precompile_cuda.is_prepared()
+    precompile_cuda.prepare()
+    assert compiled == ([(1, 2), (3,)] if has_gpu else [])
+    assert precompile_cuda.is_prepared()
 
 
 def test_the_marker_is_in_the_folder_of_the_cache() -> None:

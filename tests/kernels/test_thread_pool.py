@@ -6,7 +6,7 @@ import numba
 import pytest
 import torch
 
-from pipeline.kernels.common.thread_pool import ThreadPool
+from pipeline.kernels.common.thread_pool import ThreadPool, one_thread
 
 
 @pytest.fixture
@@ -23,6 +23,13 @@ def four_threads(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def thread_state(_: int) -> tuple[int, int, int]:
     return threading.get_ident(), torch.get_num_threads(), numba.get_num_threads()
+
+
+def test_one_thread_and_then_as_before() -> None:
+    before = torch.get_num_threads(), numba.get_num_threads()
+    with one_thread():
+        assert (torch.get_num_threads(), numba.get_num_threads()) == (1, 1)
+    assert (torch.get_num_threads(), numba.get_num_threads()) == before
 
 
 def test_results_keep_job_order(four_threads: None) -> None:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pipeline.kernels.adam import cpu, reference
-from pipeline.kernels.common.dispatch import runs_on_numba
+from pipeline.kernels.common.dispatch import runs_on_cuda, runs_on_numba
 
 
 def adam_step_(
@@ -41,5 +41,9 @@ def adam_step_(
         if runs_on_numba(*tensors):
             flat = [tensor.view(-1).numpy() for tensor in tensors]
             cpu.update(flat[0], flat[1], flat[2], flat[3], rate, betas[0], betas[1], scaled_epsilon)
+        elif runs_on_cuda(*tensors):
+            from pipeline.kernels.adam import cuda  # only where there is a GPU
+
+            cuda.update(*tensors, rate, betas[0], betas[1], scaled_epsilon)
         else:
             reference.update(*tensors, rate, betas[0], betas[1], scaled_epsilon)

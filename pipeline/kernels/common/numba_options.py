@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,8 @@ COMPILED_SOURCES = (
 """Source files of all compiled functions and of the constants in them."""
 
 
-def cache_folder() -> Path:
-    """Return numba's cache folder, one for each state of `COMPILED_SOURCES` and of the compiler flags.
+def cache_folder(sources: Iterable[Path]) -> Path:
+    """Return numba's cache folder, one for each state of the sources and of the compiler flags.
 
     numba itself checks only the file of a function for changes, not the files of the functions and constants that are
     compiled into it, and not the flags. The parent folder is NUMBA_CACHE_DIR; without it `__pycache__` next to the
@@ -33,7 +34,7 @@ def cache_folder() -> Path:
     """
     compiler_flags = f"{config.OPT} {config.LOOP_VECTORIZE} {config.SLP_VECTORIZE}"
     digest = hashlib.sha256(compiler_flags.encode())
-    for path in COMPILED_SOURCES:
+    for path in sources:
         digest.update(path.read_bytes())
     writable = os.access(KERNELS_FOLDER, os.W_OK)
     default_folder = KERNELS_FOLDER / "__pycache__" if writable else AppDirs("numba", False).user_cache_dir
@@ -42,8 +43,11 @@ def cache_folder() -> Path:
 
 # If numba was imported before this package, it read the environment before the package set its variables.
 config.reload_config()
-CACHE_FOLDER = cache_folder()
+CACHE_FOLDER = cache_folder(COMPILED_SOURCES)
 config.CACHE_DIR = str(CACHE_FOLDER)
+
+CUDA_SOURCES = (*COMPILED_SOURCES, *sorted(KERNELS_FOLDER.glob("*/cuda.py")))
+CUDA_CACHE_FOLDER = cache_folder(CUDA_SOURCES)
 
 # What numba itself is made of it loads at the first call of a function, in 0.4 s. Loaded here, the processes that a
 # command forks have it already.

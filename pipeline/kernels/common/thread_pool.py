@@ -29,6 +29,18 @@ def torch_threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch and numba use one thread inside the block, for many small operations one after the other."""
+    before = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        with torch_threads(1):
+            yield
+    finally:
+        numba.set_num_threads(before)
+
+
 class ThreadPool:
     """At most `count` concurrent workers, at least one, and no more than torch and numba have threads.
 

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pipeline.kernels.common.dispatch import runs_on_numba
+from pipeline.kernels.common.dispatch import runs_on_cuda, runs_on_numba
 from pipeline.kernels.hashgrid import cpu, reference
 from pipeline.kernels.hashgrid.cpu import HashTable
 
@@ -141,6 +141,10 @@ def encode(
             this list, and autograd gets no gradient of the table. A training step then neither allocates nor clears a
             table, and parallel backward passes do not write to the same table.
     """
+    if runs_on_cuda(points_unit, table) and not torch.is_grad_enabled():
+        from pipeline.kernels.hashgrid import cuda  # only where there is a GPU
+
+        return cuda.encode(points_unit.contiguous(), table, layout.level_params)
     if not runs_on_numba(points_unit, table):
         return reference.encode(points_unit, table, layout.level_params)
     return _Encode.apply(points_unit.contiguous(), table, layout, feature_gradients)
@@ -153,6 +157,12 @@ def add_table_gradient_(
 
     One call for all passes starts the parallel threads only once.
     """
-    if feature_gradients:
-        points, grad_features = (torch.cat(parts).numpy() for parts in zip(*feature_gradients, strict=True))
-        cpu.add_table_gradient(points, grad_features, layout.arrays(grad_table), layout.lanes)
+    if not feature_gradients:
+        return
+    points, grad_features = (torch.cat(parts) for parts in zip(*feature_gradients, strict=True))
+    if runs_on_cuda(grad_table, points):
+        from pipeline.kernels.hashgrid import cuda  # only where there is a GPU
+
+        cuda.add_table_gradient(points, grad_features, grad_table, layout.level_params)
+    else:
+        cpu.add_table_gradient(points.numpy(), grad_features.numpy(), layout.arrays(grad_table), layout.lanes)

@@ -10,7 +10,7 @@ Notation: m nodes of the skin grid, j joints, k frames of a batch, s samples.
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -25,6 +25,9 @@ from pipeline.kernels.inverse_skinning.cell_skinning_cpu import CellWeights
 from pipeline.kernels.inverse_skinning.cpu import PosedGrid, SkinArrays
 from pipeline.kernels.inverse_skinning.newton_cpu import LatticeArrays
 from pipeline.kernels.inverse_skinning.reference import Lattice
+
+if TYPE_CHECKING:
+    from pipeline.kernels.inverse_skinning.cuda import CellTensors
 
 
 @dataclass(frozen=True)
@@ -74,6 +77,13 @@ class SkinGrid:
         node_weights, row_of_node = (tensor.numpy() for tensor in self.sparse_weights), self.row_of_node.numpy()
         cells = cell_skinning_cpu.weights_by_cell(row_of_node, *node_weights, self.weights.shape[1])
         return CellWeights(self.origin_m.numpy(), np.float32(self.cell_m), *cells)
+
+    @cached_property
+    def cuda_cell_weights(self) -> "CellTensors":
+        """The nonzero weights by cell, as tensors on the device of the grid, for CUDA kernels."""
+        from pipeline.kernels.inverse_skinning import cuda  # only where there is a GPU
+
+        return cuda.cells_on(self.weights.device, self.to(torch.device("cpu")).cell_weights)
 
     def crop_to_occupied(self, occupied: UInt8[Tensor, "ox oy oz"], bounds_m: Float[Tensor, "2 3"]) -> "SkinGrid":
         """Return the grid with only the nodes that some point of an occupied cell is interpolated from.

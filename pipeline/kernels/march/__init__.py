@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pipeline.kernels.common.dispatch import runs_on_numba
+from pipeline.kernels.common.dispatch import runs_on_cuda, runs_on_numba
 from pipeline.kernels.march import cpu, reference
 from pipeline.kernels.march.cpu import RayArrays
 from pipeline.kernels.march.inputs import PackedWarpGrids, Rays, SamplingVolume
@@ -36,6 +36,11 @@ def march(rays: Rays, volume: SamplingVolume, step_m: float, max_samples: int = 
     A step in a posed cell with several inverses gives one sample for each inverse that is occupied, all at the same
     distance. Samples of a ray after the first `max_samples` are dropped.
     """
+    if runs_on_cuda(rays.origins_m, rays.directions, rays.jitter):
+        from pipeline.kernels.march import cuda  # only where there is a GPU
+
+        samples, ray_offsets = cuda.march(rays, volume, step_m, max_samples)
+        return Samples(samples.canonical, samples.distance, ray_offsets)
     if not runs_on_numba(rays.origins_m, rays.directions, rays.jitter):
         return Samples(*reference.march(rays, volume, step_m, max_samples))
     ray_arrays = RayArrays(*(tensor.contiguous().numpy() for tensor in rays))

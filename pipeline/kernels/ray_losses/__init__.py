@@ -7,20 +7,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pipeline.kernels.common.dispatch import runs_on_numba
+from pipeline.kernels.common.dispatch import runs_on_cuda, runs_on_numba
 from pipeline.kernels.ray_losses import cpu, reference
 from pipeline.kernels.ray_losses.cpu import LossInputs
 
-__all__ = ["LossInputs", "RayLossGradients", "ray_loss_gradients", "ray_losses"]
+__all__ = ["RayLossGradients", "ray_loss_gradients", "ray_losses"]
 
 
 class RayLossGradients(NamedTuple):
-    """Means of the three losses, colour errors, and the gradients of the weighted sum of the means."""
+    """Weighted means of the three losses, colour errors, and the gradients of the sum of the weighted means."""
 
-    means: Float[np.ndarray, "3"]
-    error: Float[np.ndarray, "n 3"]
-    grad_image: Float[np.ndarray, "n 3"]
-    grad_alpha: Float[np.ndarray, "n"]
+    losses: Float[Tensor, "3"]
+    error: Float[Tensor, "n 3"]
+    grad_image: Float[Tensor, "n 3"]
+    grad_alpha: Float[Tensor, "n"]
 
 
 class _RayLosses(torch.autograd.Function):
@@ -56,10 +56,25 @@ def _weighted_gradients(weights: np.ndarray, of_sums: cpu.GradientArrays) -> tup
     return colour * of_sums.image, colour * of_sums.alpha[:, 0] + alpha * of_sums.alpha[:, 1] + hard * of_sums.hard
 
 
-def ray_loss_gradients(inputs: LossInputs, huber_delta: float, weights: tuple[float, ...]) -> RayLossGradients:
-    """Do `ray_losses` and its backward pass without autograd; `weights` of the three means."""
-    means, error, of_sums = _evaluate(inputs, huber_delta)
-    return RayLossGradients(means, error, *_weighted_gradients(np.array(weights, np.float32), of_sums))
+def ray_loss_gradients(
+    image: Float[Tensor, "n 3"],
+    alpha: Float[Tensor, "n"],
+    rgba: Float[Tensor, "n 4"],
+    background: Float[Tensor, "n 3"],
+    confidence: Float[Tensor, "n"],
+    huber_delta: float,
+    weights: tuple[float, float, float],
+) -> RayLossGradients:
+    """Do `ray_losses` and its backward pass without autograd, on the CPU or a CUDA GPU; `weights` of the means."""
+    tensors = image, alpha, rgba, background, confidence
+    if runs_on_cuda(*tensors):
+        from pipeline.kernels.ray_losses import cuda  # only where there is a GPU
+
+        return RayLossGradients(*cuda.ray_loss_gradients(*tensors, huber_delta, weights))
+    means, error, of_sums = _evaluate(LossInputs(*(tensor.numpy() for tensor in tensors)), huber_delta)
+    factors = np.array(weights, np.float32)
+    arrays = factors * means, error, *_weighted_gradients(factors, of_sums)
+    return RayLossGradients(*(torch.from_numpy(array) for array in arrays))
 
 
 def ray_losses(

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pipeline.kernels.common.dispatch import runs_on_numba
+from pipeline.kernels.common.dispatch import runs_on_cuda, runs_on_numba
 from pipeline.kernels.transmittance_stats import cpu, reference
 
 
@@ -25,6 +25,11 @@ def update_voxel_maxima(
     if runs_on_numba(*tensors, max_transmittance, max_weight):
         arrays = (tensor.detach().numpy() for tensor in tensors)
         cpu.update_voxel_maxima(*arrays, shape, max_transmittance.numpy(), max_weight.numpy())
+    elif runs_on_cuda(*tensors, max_transmittance, max_weight):
+        from pipeline.kernels.transmittance_stats import cuda  # only where there is a GPU
+
+        points_m, transmittance, weight, bounds_m = (tensor.detach().contiguous() for tensor in tensors)
+        cuda.update_voxel_maxima(points_m, transmittance, weight, bounds_m, shape, max_transmittance, max_weight)
     else:
         reference.update_voxel_maxima(*tensors, shape, max_transmittance, max_weight)
 

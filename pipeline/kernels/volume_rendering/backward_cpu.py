@@ -16,7 +16,7 @@ MIN_GATE = np.float32(1e-6)
 """Smallest factor that a gradient is divided by."""
 
 
-class OutputGradients(NamedTuple):
+class OutputGradientArrays(NamedTuple):
     """Gradients of image (n, 3), alpha (n) and density (p) of the further points."""
 
     image: np.ndarray

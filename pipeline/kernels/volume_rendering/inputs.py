@@ -105,3 +105,21 @@ class RenderOutput(NamedTuple):
     canonical_m: Float[Tensor, "s 3"]
     transmittance: Float[Tensor, "s"]
     weight: Float[Tensor, "s"]
+
+
+class OutputGradients(NamedTuple):
+    """Gradients of image and alpha of the rays, and of the density of the points."""
+
+    image: Float[Tensor, "n 3"]
+    alpha: Float[Tensor, "n"]
+    density: Float[Tensor, "p"]
+
+
+class RenderGradients(NamedTuple):
+    """Gradients of the parameters; None for a gate or a skinning that there is not."""
+
+    hidden: Float[Tensor, "w h"]
+    output: Float[Tensor, "h 4"]
+    bias: Float[Tensor, "4"]
+    gate: Float[Tensor, "gx gy gz"] | None
+    canonical_to_posed: Float[Tensor, "k j 4 4"] | None
