@@ -37,6 +37,7 @@ from pipeline.body.fit.options import (
     shared_parameters,
     with_silhouettes,
 )
+from pipeline.body.fit.prior.forearm_flips import unflip_forearms
 from pipeline.body.fit.prior.posture import Posture, prior_of_recording
 from pipeline.body.fit.prior.priors import (
     PosePrior,
@@ -263,6 +264,7 @@ def _fit_shared(
             context, model, observations, windows, parameters, state, _Recording(posture)
         )
         if number + 1 == POSTURE_ROUND:
+            state = unflip_forearms(model, state, observations.camera)
             posture = objective.estimate_posture(context.pose_prior, state)
         has_converged = shared_step_ratio(before, state, system) < CONVERGED_STEP_RATIO
         if evidence is not None:

@@ -63,7 +63,7 @@ def estimate_posture(
         time_s: of the frames.
         hessian: of the energy of image and `prior` at these poses, for each frame (`Objective.image_hessian`).
     """
-    if _mean_facing_length(rotations) > MAX_MEAN_FACING_LENGTH:
+    if not is_filmed_from_all_sides(rotations):
         return None
     angle_rad, variance = _angles(prior, rotations, hessian)
     posture = most_likely_posture(angle_rad, variance / frames_per_posture(time_s))
@@ -105,9 +105,10 @@ def tie_to_posture(prior: PosePrior, posture: Posture, time_s: Float[Tensor, "n"
     )
 
 
-def _mean_facing_length(rotations: Float[Tensor, "n j 3 3"]) -> float:
+def is_filmed_from_all_sides(rotations: Float[Tensor, "n j 3 3"]) -> bool:
+    """Return whether the hips face in so many directions that frames show what others hide."""
     facing = torch.nn.functional.normalize(rotations[:, 0, ::2, 2], dim=-1)
-    return float(facing.mean(0).norm())
+    return float(facing.mean(0).norm()) <= MAX_MEAN_FACING_LENGTH
 
 
 def _is_loose(prior: PosePrior) -> Bool[Tensor, "d"]:
