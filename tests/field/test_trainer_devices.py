@@ -1,6 +1,8 @@
 """Training on another device than the CPU: a CUDA GPU if there is one, and a fake device with the same rules."""
 
-from contextlib import nullcontext
+import sys
+from contextlib import ExitStack, nullcontext
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -60,6 +62,33 @@ def test_training_on_another_device_agrees_with_the_cpu(scene, options):
 @pytest.mark.cuda
 def test_training_on_a_gpu_agrees_with_the_cpu(scene, cuda):
     compare(scene, torch.device(cuda))
+
+
+@pytest.mark.slow
+def test_steps_with_cuda_kernels_in_the_simulator_agree_with_the_cpu(scene):
+    """Without a GPU, tensors of the CPU stand for those of one; few, because each thread is one of Python."""
+    few = {"rays_per_step": 64, "empty_points": 64, "unobserved_points": 8, "occupancy_warmup_steps": 99}
+    options = few | {"pose_start_fraction": 0.04}  # the second step refines the poses
+    cpu, expected = train(scene, torch.device("cpu"), 3, **options)
+    with ExitStack() as patches:
+        for module in [module for name, module in sys.modules.items() if name.startswith("pipeline.")]:
+            if "runs_on_cuda" in vars(module):
+                patches.enter_context(mock.patch.object(module, "runs_on_cuda", stands_for_cuda))
+        patches.enter_context(mock.patch("pipeline.field.trainer.CPU_BATCH_PARTS", 1))
+        patches.enter_context(mock.patch("pipeline.field.trainer.MAX_SAMPLES_PER_RAY", 40))
+        simulated, losses = train(scene, torch.device("cpu"), 3, **options)
+    for name, value in expected[0].items():
+        if name != "samples":  # on the CPU rays end at low transmittance
+            assert losses[0][name] == pytest.approx(value, rel=2e-3, abs=1e-6), name
+    assert losses[2]["colour"] == pytest.approx(expected[2]["colour"], rel=0.02)
+    # The first steps of Adam are signs of the gradient, which the CPU's subsampling changes where it is near zero.
+    shift_m, cpu_shift_m = simulated.poses.shift_m.detach(), cpu.poses.shift_m.detach()
+    assert float(cpu_shift_m.abs().max()) > 2e-4
+    assert float(((shift_m - cpu_shift_m).abs() < 1e-4).float().mean()) > 0.8
+
+
+def stands_for_cuda(*tensors: torch.Tensor) -> bool:
+    return all(tensor.dtype == torch.float32 for tensor in tensors)
 
 
 @pytest.fixture(scope="module", params=["fake", "cuda"])
