@@ -4,8 +4,8 @@ Imported only where a tensor is on a GPU. With NUMBA_ENABLE_CUDASIM=1 kernels ru
 the CPU, which is how they are tested on machines without a GPU.
 
 numba's own launch makes an array object of each tensor and looks up the types of all arguments, which takes longer than
-most kernels here run: 20 ms a training step. The launch here passes addresses and shapes of tensors straight on, in the
-order in which kernels of numba take them (docs/decisions/field.md).
+most kernels here run. The launch here passes addresses and shapes of tensors straight on, in the order in which kernels
+of numba take them: a training step takes 7 instead of 13 ms (docs/decisions/field.md).
 """
 
 import ctypes

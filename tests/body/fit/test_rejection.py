@@ -49,7 +49,8 @@ def test_a_passer_by_does_not_change_camera_and_poses() -> None:
     _, absolute_m = joint_errors_m(fitted_joints_m(found, scene), scene.joints_m())
     assert absolute_m < 0.1
     rejected = np.flatnonzero(found.silhouette_iou == 0.0)
-    assert set(range(TURN_FRAMES)[PASSING]) <= set(rejected) <= set(range(PASSING.start - 1, PASSING.stop + 1))
+    # The first fit leads smoothly to the passer-by and back, so that up to two frames on either side do not match it.
+    assert set(range(TURN_FRAMES)[PASSING]) <= set(rejected) <= set(range(PASSING.start - 2, PASSING.stop + 2))
 
 
 def test_suspicious_frames_beside_an_unusable_one_belong_to_it() -> None:
