@@ -31,5 +31,3 @@ import os
 os.environ.setdefault("NUMBA_THREADING_LAYER_PRIORITY", "omp tbb workqueue")
 # LLVM then combines the few floats of a hash-grid row into one vector instruction: 1.7 to 2.6 times faster.
 os.environ.setdefault("NUMBA_SLP_VECTORIZE", "1")
-# A few thousand rays do not fill a large GPU, of which numba warns at each launch.
-os.environ.setdefault("NUMBA_CUDA_LOW_OCCUPANCY_WARNINGS", "0")

@@ -27,11 +27,23 @@ def _cell(coordinate, cells):
 
 
 @cuda.jit(device=True)
-def _row(i, j, k, cells_x, cells_y, rows, dense):
-    """Return the row of a node in the table of its level."""
+def _locate(points, s, level_params, level):
+    """Return the cell of a point in the grid of a level (3), and its position in the cell (3)."""
+    i, u = _cell(points[s, 0], level_params[level, 0])
+    j, v = _cell(points[s, 1], level_params[level, 1])
+    k, w = _cell(points[s, 2], level_params[level, 2])
+    return (i, j, k), (u, v, w)
+
+
+@cuda.jit(device=True)
+def _row(cell, a, b, c, level_params, level):
+    """Return the table row of the corner (a, b, c), each 0 or 1, of a cell."""
+    i, j, k = cell[0] + a, cell[1] + b, cell[2] + c
+    cells_x, cells_y = level_params[level, 0], level_params[level, 1]
+    first, rows, dense = level_params[level, 3], level_params[level, 4], level_params[level, 5]
     if dense == 1:
-        return i + (cells_x + 1) * (j + (cells_y + 1) * k)
-    return (i ^ (j * _PRIME_Y) ^ (k * _PRIME_Z)) & (rows - 1)
+        return first + i + (cells_x + 1) * (j + (cells_y + 1) * k)
+    return first + ((i ^ (j * _PRIME_Y) ^ (k * _PRIME_Z)) & (rows - 1))
 
 
 @cuda.jit(**CUDA_OPTIONS)
@@ -42,18 +54,14 @@ def encode_points(points, table, level_params, count, encoded):
     if thread >= count * levels:
         return
     s, level = thread // levels, thread % levels
-    cells_x, cells_y, cells_z = level_params[level, 0], level_params[level, 1], level_params[level, 2]
-    first, rows, dense = level_params[level, 3], level_params[level, 4], level_params[level, 5]
-    i, u = _cell(points[s, 0], cells_x)
-    j, v = _cell(points[s, 1], cells_y)
-    k, w = _cell(points[s, 2], cells_z)
+    cell, (u, v, w) = _locate(points, s, level_params, level)
     column = level * features
     for f in range(features):
         encoded[s, column + f] = _ZERO
     for corner in range(8):
         a, b, c = corner & 1, (corner >> 1) & 1, corner >> 2
         weight = (u if a else _ONE - u) * (v if b else _ONE - v) * (w if c else _ONE - w)
-        row = first + _row(i + a, j + b, k + c, cells_x, cells_y, rows, dense)
+        row = _row(cell, a, b, c, level_params, level)
         for f in range(features):
             encoded[s, column + f] += weight * table[row, f]
 
@@ -71,15 +79,11 @@ def scatter_table_gradient(points, gradient, level_params, count, grad_table):
         largest = max(largest, abs(gradient[s, column + f]))
     if not largest > _ZERO:
         return
-    cells_x, cells_y, cells_z = level_params[level, 0], level_params[level, 1], level_params[level, 2]
-    first, rows, dense = level_params[level, 3], level_params[level, 4], level_params[level, 5]
-    i, u = _cell(points[s, 0], cells_x)
-    j, v = _cell(points[s, 1], cells_y)
-    k, w = _cell(points[s, 2], cells_z)
+    cell, (u, v, w) = _locate(points, s, level_params, level)
     for corner in range(8):
         a, b, c = corner & 1, (corner >> 1) & 1, corner >> 2
         weight = (u if a else _ONE - u) * (v if b else _ONE - v) * (w if c else _ONE - w)
-        row = first + _row(i + a, j + b, k + c, cells_x, cells_y, rows, dense)
+        row = _row(cell, a, b, c, level_params, level)
         for f in range(features):
             cuda.atomic.add(grad_table, (row, f), weight * gradient[s, column + f])
 
@@ -93,22 +97,18 @@ def gather_points_gradient(points, table, level_params, gradient, count, grad_po
     features = table.shape[1]
     along_x = along_y = along_z = _ZERO
     for level in range(level_params.shape[0]):
-        cells_x, cells_y, cells_z = level_params[level, 0], level_params[level, 1], level_params[level, 2]
-        first, rows, dense = level_params[level, 3], level_params[level, 4], level_params[level, 5]
-        i, u = _cell(points[s, 0], cells_x)
-        j, v = _cell(points[s, 1], cells_y)
-        k, w = _cell(points[s, 2], cells_z)
+        cell, (u, v, w) = _locate(points, s, level_params, level)
         column = level * features
         for corner in range(8):
             a, b, c = corner & 1, (corner >> 1) & 1, corner >> 2
             weight_x, weight_y, weight_z = u if a else _ONE - u, v if b else _ONE - v, w if c else _ONE - w
-            row = first + _row(i + a, j + b, k + c, cells_x, cells_y, rows, dense)
+            row = _row(cell, a, b, c, level_params, level)
             product = _ZERO
             for f in range(features):
                 product += table[row, f] * gradient[s, column + f]
-            along_x += (product if a else -product) * weight_y * weight_z * np.float32(cells_x)
-            along_y += (product if b else -product) * weight_x * weight_z * np.float32(cells_y)
-            along_z += (product if c else -product) * weight_x * weight_y * np.float32(cells_z)
+            along_x += (product if a else -product) * weight_y * weight_z * np.float32(level_params[level, 0])
+            along_y += (product if b else -product) * weight_x * weight_z * np.float32(level_params[level, 1])
+            along_z += (product if c else -product) * weight_x * weight_y * np.float32(level_params[level, 2])
     grad_points[s, 0] += along_x
     grad_points[s, 1] += along_y
     grad_points[s, 2] += along_z
