@@ -77,7 +77,8 @@ def reconstruct(
         overrides: options by "section.key", for instance {"mesh.max_faces": 30000}; the run folder records them.
         force: run every stage, even if its result is fresh.
         isolate: run each stage in a process of its own, as the command does: it returns its memory and cannot crash
-            this process. False runs all stages in this process, for debugging.
+            this process. False runs all stages in this process, for debugging; results can then differ in the last
+            bits if NumPy was imported before this package, which sets the threads of its matrix products.
         progress: called with the `Progress` of the run; an exception that it raises stops the run.
 
     Raises:

@@ -1,6 +1,8 @@
 """Fixtures of all tests, and the check of annotated array shapes."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import hypothesis
@@ -11,7 +13,7 @@ from jaxtyping import install_import_hook
 
 from pipeline.core.measure import REPOSITORY_DIR
 from pipeline.core.progress import take_warnings
-from tests.core.toy_pipeline import Toy
+from tests.core.toy_pipeline import Toy, user_environment
 
 # numba reads this when it is imported: its CUDA kernels then run in a simulator where there is no GPU.
 if not torch.cuda.is_available():
@@ -87,3 +89,18 @@ def smoke_run(shared_folder: Path) -> Path:
             make_sample([str(folder / "capture"), "--frames", "24", "--size", "192"])
             reconstruct(folder / "capture" / "video", folder / "run", preset="smoke", isolate=False)
     return folder / "run"
+
+
+@pytest.fixture(scope="session")
+def command_run(smoke_run: Path) -> Path:
+    """Finished run of the command on the capture of `smoke_run`, to whose bytes those of other runs are compared.
+
+    In the process of the tests NumPy is imported before the pipeline, so that its BLAS divides products of matrices
+    between threads: sums have other last bits there.
+    """
+    folder, video = smoke_run.parent / "command", smoke_run.parent / "capture" / "video"
+    command = [sys.executable, "-m", "stages", "--run", str(folder), "--preset", "smoke", "--video", str(video)]
+    with FileLock(smoke_run.parent / "command.lock"):
+        if not (folder / "report" / "manifest.json").is_file():
+            subprocess.run(command, cwd=REPOSITORY_DIR, env=user_environment(), check=True, capture_output=True)
+    return folder

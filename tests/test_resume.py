@@ -88,15 +88,15 @@ def real_run(run_dir: Path, video: Path) -> subprocess.Popen[bytes]:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", STAGES)
 @pytest.mark.parametrize("share", [0.3, 0.8])
-def test_each_real_stage_survives_a_kill(smoke_run: Path, tmp_path: Path, name: str, share: float) -> None:
+def test_each_real_stage_survives_a_kill(command_run: Path, tmp_path: Path, name: str, share: float) -> None:
     """The killed run starts from copies of what comes before; the report, which holds times, need only end."""
-    whole = read_manifest(smoke_run / name)
+    whole = read_manifest(command_run / name)
     assert whole is not None
     run_dir = tmp_path / "killed"
     run_dir.mkdir()
     for earlier in STAGES[: STAGES.index(name)]:
-        shutil.copytree(smoke_run / earlier, run_dir / earlier)
-    video = smoke_run.parent / "capture" / "video"
+        shutil.copytree(command_run / earlier, run_dir / earlier)
+    video = command_run.parent / "capture" / "video"
     runner = real_run(run_dir, video)
     wait_for(run_dir / f"{name}.part" / ".fingerprint", runner)
     time.sleep(share * whole.seconds)
@@ -104,9 +104,9 @@ def test_each_real_stage_survives_a_kill(smoke_run: Path, tmp_path: Path, name: 
     runner.wait()
     assert real_run(run_dir, video).wait() == 0
     timeless = tuple(stage for stage in STAGES if stage != "report")
-    assert artifacts(run_dir, timeless) == artifacts(smoke_run, timeless)
+    assert artifacts(run_dir, timeless) == artifacts(command_run, timeless)
     assert not list(run_dir.glob("*.part"))
-    assert list_files(run_dir / "report") == list_files(smoke_run / "report")
+    assert list_files(run_dir / "report") == list_files(command_run / "report")
     assert digest_json(artifacts(run_dir, STAGES).get("report", "")) != digest_json("")
 
 

@@ -23,7 +23,7 @@ from pipeline.field.trainer import Trainer
 from pipeline.kernels.common.thread_pool import ThreadPool
 from pipeline.kernels.hashgrid import cpu as hashgrid_cpu
 from pipeline.kernels.inverse_skinning import _NewtonStep
-from pipeline.kernels.volume_rendering import _Renderer
+from pipeline.kernels.volume_rendering import _CpuRenderer
 
 OTHER = "other"
 UPDATE = "occupancy_update"
@@ -41,7 +41,7 @@ TIMED_FUNCTIONS: tuple[tuple[str, Any, str], ...] = (
     ("losses", PoseCorrection, "temporal_roughness"),
     ("losses", PoseCorrection, "mean_square_correction"),
     ("render_backward", _RadianceMlp, "backward"),
-    ("render_backward", _Renderer, "backward_pass"),
+    ("render_backward", _CpuRenderer, "backward_pass"),
     ("render_backward", hashgrid_cpu, "add_points_gradient"),
     ("render_backward", _NewtonStep, "backward"),
     ("table_backward", hashgrid_cpu, "add_table_gradient"),
