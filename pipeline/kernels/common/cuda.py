@@ -35,6 +35,11 @@ if not IS_SIMULATED:
 _compiled: dict[tuple, Any] = {}
 
 
+def device_function(function: Any) -> Any:
+    """Return a function that `njit` compiles for the CPU as one that CUDA kernels may call."""
+    return cuda.jit(device=True)(function.py_func)
+
+
 def launch(kernel: Any, threads: int, *arguments: Any) -> None:
     """Run at least `threads` threads of a kernel in torch's default stream; its `cuda.grid(1)` is the thread.
 

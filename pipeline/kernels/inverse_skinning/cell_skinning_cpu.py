@@ -65,7 +65,7 @@ def weights_by_cell(row_of_node, node_offsets, node_joint, node_weight, joints):
 
 
 @njit(**NJIT_OPTIONS)
-def _weight_and_slopes(weight, entry, u, v, w, inverse_spacing):
+def weight_and_slopes(weight, entry, u, v, w, inverse_spacing):
     """Return the weight of a pair at the place (u, v, w) in its cell, and its derivatives by x, y and z, 1/m."""
     w0, w1, w2, w3 = weight[entry, 0], weight[entry, 1], weight[entry, 2], weight[entry, 3]
     w4, w5, w6, w7 = weight[entry, 4], weight[entry, 5], weight[entry, 6], weight[entry, 7]
@@ -111,7 +111,7 @@ def newton_steps(first, last, ray_indices, batch_index, matrices, cells, canonic
         if row >= 0:
             frame = batch_index[ray_indices[s]]
             for entry in range(offsets[row], offsets[row + 1]):
-                value, along_x, along_y, along_z = _weight_and_slopes(weight, entry, u, v, w, inverse)
+                value, along_x, along_y, along_z = weight_and_slopes(weight, entry, u, v, w, inverse)
                 m = joint[entry]
                 m0, m1, m2, q = _row_and_product(matrices, frame, m, 0, x, y, z)
                 px += value * q

@@ -10,10 +10,12 @@ import torch
 from numba import cuda
 from torch import Tensor
 
-from pipeline.kernels.common.cuda import CUDA_OPTIONS, launch
-from pipeline.kernels.inverse_skinning.cell_skinning_cpu import CellWeights
+from pipeline.kernels.common.cuda import CUDA_OPTIONS, device_function, launch
+from pipeline.kernels.inverse_skinning.cell_skinning_cpu import CellWeights, weight_and_slopes
 
 _ZERO, _ONE, _MIN_DETERMINANT = np.float32(0), np.float32(1), np.float32(1e-3)
+
+_weight_and_slopes = device_function(weight_and_slopes)
 
 
 class CellTensors(NamedTuple):
@@ -46,20 +48,6 @@ def _cell_of(x, y, z, cells):
         row = cells.row_of_cell[int(u), int(v), int(w)]
         u, v, w = u - np.float32(int(u)), v - np.float32(int(v)), w - np.float32(int(w))
     return row, u, v, w
-
-
-@cuda.jit(device=True)
-def _weight_and_slopes(weight, entry, u, v, w, inverse_spacing):
-    """Return the weight of a pair at the place (u, v, w) in its cell, and its derivatives by x, y and z, 1/m."""
-    w0, w1, w2, w3 = weight[entry, 0], weight[entry, 1], weight[entry, 2], weight[entry, 3]
-    w4, w5, w6, w7 = weight[entry, 4], weight[entry, 5], weight[entry, 6], weight[entry, 7]
-    d0, d1, d2, d3 = w1 - w0, w3 - w2, w5 - w4, w7 - w6
-    a0, a1, a2, a3 = w0 + u * d0, w2 + u * d1, w4 + u * d2, w6 + u * d3
-    b0, b1 = a1 - a0, a3 - a2
-    c0, c1 = a0 + v * b0, a2 + v * b1
-    e0, e1 = d0 + v * (d1 - d0), d2 + v * (d3 - d2)
-    along_x, along_y = (e0 + w * (e1 - e0)) * inverse_spacing, (b0 + w * (b1 - b0)) * inverse_spacing
-    return c0 + w * (c1 - c0), along_x, along_y, (c1 - c0) * inverse_spacing
 
 
 @cuda.jit(**CUDA_OPTIONS)

@@ -69,7 +69,7 @@ class RayProgress(NamedTuple):
 
 
 @njit(**NJIT_OPTIONS)
-def _slab(origin, direction, low, high, near, far):
+def slab(origin, direction, low, high, near, far):
     """Clip the interval [near, far] of a ray to the space between two planes of one axis."""
     if abs(direction) < np.float32(1e-9):
         return (near, far) if low <= origin <= high else (near, near - _ONE)
@@ -86,7 +86,7 @@ def intersect_box(ray, inputs):
     near, far = _ZERO, _MAX_DISTANCE_M
     for axis in range(3):
         high = low[axis] + warps.cell * np.float32(dims[axis] - 1)
-        near, far = _slab(rays.origins[ray, axis], rays.directions[ray, axis], low[axis], high, near, far)
+        near, far = slab(rays.origins[ray, axis], rays.directions[ray, axis], low[axis], high, near, far)
     # No plane ends a degenerate ray (NaN, or a zero direction): it would have 1e11 steps.
     return near, max(0, int(np.ceil((far - near) / step - rays.jitter[ray]))) if far < _MAX_DISTANCE_M else 0
 

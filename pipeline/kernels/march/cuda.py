@@ -8,12 +8,14 @@ import torch
 from numba import cuda
 from torch import Tensor
 
-from pipeline.kernels.common.cuda import CUDA_OPTIONS, launch
-from pipeline.kernels.march.cpu import CANDIDATES
+from pipeline.kernels.common.cuda import CUDA_OPTIONS, device_function, launch
+from pipeline.kernels.march.cpu import CANDIDATES, slab
 from pipeline.kernels.march.inputs import Rays, SamplingVolume
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
-_MAX_DISTANCE_M, _PARALLEL = np.float32(1e9), np.float32(1e-9)
+_MAX_DISTANCE_M = np.float32(1e9)
+
+_slab = device_function(slab)
 
 
 class WarpTensors(NamedTuple):
@@ -42,15 +44,6 @@ class SampleTensors(NamedTuple):
     canonical: Tensor
     distance: Tensor
     ray_indices: Tensor
-
-
-@cuda.jit(device=True)
-def _slab(origin, direction, low, high, near, far):
-    """Clip the interval [near, far] of a ray to the space between two planes of one axis."""
-    if abs(direction) < _PARALLEL:
-        return (near, far) if low <= origin <= high else (near, near - _ONE)
-    a, b = (low - origin) / direction, (high - origin) / direction
-    return max(near, min(a, b)), min(far, max(a, b))
 
 
 @cuda.jit(device=True)

@@ -35,7 +35,7 @@ class GradientArrays(NamedTuple):
 
 
 @njit(**NJIT_OPTIONS)
-def _huber(error, delta):
+def huber(error, delta):
     """Return the value and the slope of the Huber loss, divided by delta."""
     size = abs(error)
     if size < delta:
@@ -60,12 +60,12 @@ def ray_losses(inputs, delta, sums, error, gradients):
                 - (rgba[ray, channel] * mask + background_value * (_ONE - mask))
             )
             error[ray, channel] = residual
-            value, slope = _huber(residual, delta)
+            value, slope = huber(residual, delta)
             slope *= ray_confidence
             colours += ray_confidence * value
             grad_image[ray, channel] = slope
             grad_alpha[ray, 0] -= slope * background_value
-        value, slope = _huber(a - mask, delta)
+        value, slope = huber(a - mask, delta)
         alphas += ray_confidence * value
         grad_alpha[ray, 1] = ray_confidence * slope
         full, clear = np.exp(-abs(a)), np.exp(-abs(a - _ONE))

@@ -8,10 +8,13 @@ import torch
 from numba import cuda
 from torch import Tensor
 
-from pipeline.kernels.common.cuda import CUDA_OPTIONS, launch
+from pipeline.kernels.common.cuda import CUDA_OPTIONS, device_function, launch
+from pipeline.kernels.ray_losses.cpu import huber
 
-_ZERO, _ONE, _HALF = np.float32(0), np.float32(1), np.float32(0.5)
+_ZERO, _ONE = np.float32(0), np.float32(1)
 _HARD_OFFSET = np.float32(math.log(1 + math.exp(-1)))
+
+_huber = device_function(huber)
 
 
 class RayTensors(NamedTuple):
@@ -22,15 +25,6 @@ class RayTensors(NamedTuple):
     rgba: Tensor
     background: Tensor
     confidence: Tensor
-
-
-@cuda.jit(device=True)
-def _huber(error, delta):
-    """Return the value and the slope of the Huber loss, divided by delta."""
-    size = abs(error)
-    if size < delta:
-        return _HALF * error * error / delta, error / delta
-    return size - _HALF * delta, _ONE if error > _ZERO else -_ONE
 
 
 @cuda.jit(**CUDA_OPTIONS)
