@@ -1,7 +1,6 @@
 """texture stage: unwrap the mesh into a UV atlas and bake diffuse, specular, normal and coverage maps."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -28,7 +27,6 @@ from pipeline.geometry.camera import Camera, pixel_footprint_m
 from pipeline.geometry.creases import find_creases
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import linear_blend_skinning
-from pipeline.geometry.surface_cut import SurfaceCut
 from pipeline.io.image import to_float, to_uint8
 from pipeline.kernels.common.thread_pool import shared_thread_pool
 from pipeline.mesh.files import MeshArtifact, load_dense_mesh, load_mesh
@@ -44,7 +42,6 @@ from pipeline.texture.bake import (
     TexturedSurface,
     bake_diffuse,
     mean_foreground_psnr_db,
-    texels_to_texture,
 )
 from pipeline.texture.body_parts import body_part_of_faces
 from pipeline.texture.contact import Limbs, hide_contacts
@@ -62,11 +59,11 @@ from pipeline.texture.files import (
 )
 from pipeline.texture.hand_colours import hide_foreign_hands
 from pipeline.texture.inpainting import average_texels_per_vertex, inpaint_vertex_colours
-from pipeline.texture.light import VertexGloss, VideoLight
-from pipeline.texture.light_evidence import LightEvidence, estimate_light
+from pipeline.texture.light import VideoLight
+from pipeline.texture.lighting.shading import find_light, fit_highlights, light_metrics, light_views
 from pipeline.texture.normal_map import bake_normal_map
 from pipeline.texture.settings import DEFAULT_SETTINGS, TextureSettings
-from pipeline.texture.specular import SpecularFit, fit_specular, texels_at_vertices
+from pipeline.texture.vertex_texels import vertex_map, vertex_surface
 from pipeline.texture.views import BakeView, crop_bake_view, weight_by_resolution
 
 LANDMARKS_CHECKPOINT, TEXELS_CHECKPOINT = "checkpoint_landmarks.npz", "checkpoint_texels.safetensors"
@@ -131,40 +128,42 @@ def run(
     """
     body, skinned = load_body(inputs["body"] / "body.npz"), load_mesh(inputs["mesh"])
     capture = load_capture(inputs["frames"])
-    positions = usable_positions(capture, inputs["body"]), usable_positions(capture, inputs["body"], VALIDATION)
-    train, validation = (load_views(capture, part, inputs, body, skinned, config.max_frames) for part in positions)
+    usable = usable_positions(capture, inputs["body"]), usable_positions(capture, inputs["body"], VALIDATION)
+    positions = subsample(usable[0], config.max_frames), subsample(usable[1], config.max_frames)
+    train, validation = (load_views(capture, part, inputs, body, skinned) for part in positions)
     if not train:
         raise UserError(f"{inputs['frames']} has no training frames; run {rerun_command('frames', inputs['frames'])}")
-    faces = FilmedFaces.of_capture(capture, positions[0], *load_poses(inputs, body))
+
+    faces = FilmedFaces.of_capture(capture, usable[0], *load_poses(inputs, body))
     registration = register_person(body, skinned, train, faces, FaceDetector, settings, out / LANDMARKS_CHECKPOINT)
     atlas, size_px, on_template = build_atlas(skinned, body, train, registration, config, settings)
-    cut = None if on_template is None else on_template.cut
+    texels = rasterize_texels(atlas, size_px)
     face_count = len(skinned.mesh.faces)
-    skinned = skinned.cut(cut)
-    train, validation = ([cut_view(view, cut) for view in part] for part in (train, validation))
+    cut = None if on_template is None else on_template.cut
+    if cut is not None:
+        skinned = skinned.cut(cut)
+        train, validation = ([view.cut(cut) for view in part] for part in (train, validation))
     template = None
     if registration is not None:
         template = FittedTemplate(registration, correspond(body, registration, skinned.mesh, skinned.vertex_colours))
-    texels = rasterize_texels(atlas, size_px)
+
     creases = find_creases(skinned.mesh)
     split, layout = skinned.split(creases), creases.split_atlas(atlas)
-    shaded, limbs = split.mesh, Limbs.of_vertices(split.joint_indices, split.joint_weights, body.joint_names)
+    mesh, limbs = split.mesh, Limbs.of_vertices(split.joint_indices, split.joint_weights, body.joint_names)
     train, validation = (
-        [hide_contacts(view.split(creases), shaded.faces, limbs.limb) for view in part] for part in (train, validation)
+        [hide_contacts(view.split(creases), mesh.faces, limbs.limb) for view in part] for part in (train, validation)
     )
-    train = hide_foreign_hands(train, vertex_surface(shaded), limbs, settings)
-    surface = TexturedSurface.from_arrays(shaded.faces, layout, texels)
-    evidence = find_light((train, validation), positions, shaded, config, settings)
+    train = hide_foreign_hands(train, vertex_surface(mesh), limbs, settings)
+    evidence = None if config.light == "kept" else find_light((train, validation), positions, mesh, settings)
     light = VideoLight.uniform(len(capture))
     if evidence is not None:
-        light = evidence.for_capture(
-            subsample(positions[0], config.max_frames),
-            len(capture),
-            is_removed=evidence.helps or config.light == "removed",
-        )
-    fitted = fit_highlights(evidence, light, shaded)
+        is_removed = evidence.helps or config.light == "removed"
+        light = evidence.for_capture(positions[0], len(capture), is_removed=is_removed)
+    highlights = fit_highlights(evidence, light, mesh)
+
+    surface = TexturedSurface.from_arrays(mesh.faces, layout, texels)
     train, validation = (
-        light_views(views, light, subsample(part, config.max_frames), surface.faces, fitted)
+        light_views(views, light, part, surface.faces, highlights)
         for views, part in zip((train, validation), positions, strict=True)
     )
     inpaint = make_texel_inpainter(skinned.mesh, texels, template)
@@ -172,13 +171,13 @@ def run(
     artifact = TextureArtifact(
         atlas,
         diffuse=diffuse,
-        specular=vertex_map(fitted.strength, shaded, texels),
+        specular=vertex_map(highlights.strength, mesh, texels),
         coverage=to_uint8(texels.to_texture(texel_confidence[:, None])[..., 0]),
         light=light,
-        highlights=fitted.highlights,
-        normal=make_normal_map(inputs["mesh"], shaded, layout, size_px, face_count) if config.normal_map else None,
+        highlights=highlights.highlights,
+        normal=make_normal_map(inputs["mesh"], mesh, layout, size_px, face_count) if config.normal_map else None,
         cut=cut,
-        roughness=None if fitted.roughness is None else vertex_map(fitted.roughness, shaded, texels),
+        roughness=None if highlights.roughness is None else vertex_map(highlights.roughness, mesh, texels),
     )
     save_texture(out, artifact, config.format)
     save_template(out, template)
@@ -188,10 +187,7 @@ def run(
         "atlas_utilisation": float(len(texels.face) / size_px**2),
         **({} if on_template is None else {"atlas_own_charts_share": on_template.loose_share}),
         "validation_psnr_body_db": mean_foreground_psnr_db(to_float(to_uint8(diffuse)), validation, surface),
-        "specular_explained": fitted.explained,
-        "specular_standard_errors": fitted.standard_errors,
-        "specular_regions": float(fitted.regions),
-        "roughness_standard_errors": fitted.roughness_standard_errors,
+        **highlights.metrics(),
         **light_metrics(evidence, light),
         **template_metrics(template),
     }
@@ -203,9 +199,8 @@ def load_views(
     inputs: Mapping[str, Path],
     body: Body,
     skinned: MeshArtifact,
-    max_frames: int,
 ) -> list[BakeView]:
-    """Crop at most `max_frames` evenly spaced frames of `positions` to the mesh in the pose of each frame."""
+    """Crop frames to the mesh in the pose of each frame."""
     transforms, camera = load_poses(inputs, body)
     vertices, faces = torch.from_numpy(skinned.mesh.vertices), torch.from_numpy(skinned.mesh.faces)
     weights = skinned.dense_skin_weights(len(body.joint_names))
@@ -214,9 +209,8 @@ def load_views(
         posed = linear_blend_skinning(vertices, weights, transforms[k : k + 1])[0]
         return crop_bake_view(to_uint8(capture.image(k)), to_uint8(capture.mask(k)), camera, posed, faces)
 
-    chosen = subsample(positions, max_frames).tolist()
-    loaded = shared_thread_pool(torch.get_num_threads()).imap(load_view, chosen)
-    views = list(track(loaded, "reading frames", len(chosen)))
+    loaded = shared_thread_pool(torch.get_num_threads()).imap(load_view, positions.tolist())
+    views = list(track(loaded, "reading frames", len(positions)))
     return weight_by_resolution(views) if views else []
 
 
@@ -231,13 +225,6 @@ def subsample(positions: Int[np.ndarray, "k"], max_frames: int) -> Int[np.ndarra
     return positions[evenly_spaced(len(positions), max_frames)]
 
 
-def cut_view(view: BakeView, cut: SurfaceCut | None) -> BakeView:
-    """Return a view of the mesh that was cut."""
-    if cut is None:
-        return view
-    return view.with_mesh(torch.from_numpy(cut.extend(view.vertices_world.numpy())), cut.faces)
-
-
 def template_metrics(template: FittedTemplate | None) -> dict[str, float]:
     """Return how well the template lies on the person, and the share of vertices of each label."""
     if template is None:
@@ -250,76 +237,6 @@ def template_metrics(template: FittedTemplate | None) -> dict[str, float]:
         "template_has_face": float(template.registration.has_face),
         **{f"{name}_share": share for name, share in template.correspondence.shares().items()},
     }
-
-
-def find_light(
-    views: tuple[list[BakeView], list[BakeView]],
-    positions: tuple[Int[np.ndarray, "t"], Int[np.ndarray, "w"]],
-    mesh: Mesh,
-    config: Config,
-    settings: TextureSettings,
-) -> LightEvidence | None:
-    """Return the light of the video and what validation frames say about it; None if it is not looked for.
-
-    views, positions: of training and validation frames.
-    """
-    if config.light == "kept":
-        return None
-    if not views[1]:
-        warn("there are no validation frames to test the light on: it stays in the diffuse map")
-        return None
-    used = tuple(subsample(part, config.max_frames) for part in positions)
-    return estimate_light(*views, vertex_surface(mesh), mesh.edges(), (used[0], used[1]), settings)
-
-
-def light_metrics(evidence: LightEvidence | None, light: VideoLight) -> dict[str, float]:
-    """Return the figures of the estimated light."""
-    if evidence is None:
-        return {"light_removed": 0.0}
-    return {
-        "light_removed": float(not light.is_uniform),
-        "light_explained": evidence.explained,
-        "light_standard_errors": evidence.standard_errors,
-        "key_light_standard_errors": evidence.key_standard_errors,
-        "gain_log_std": float(np.log(evidence.light.gain).std()),
-    }
-
-
-def light_views(
-    views: list[BakeView],
-    light: VideoLight,
-    positions: Int[np.ndarray, "k"],
-    faces: Int[Tensor, "f 3"],
-    specular: SpecularFit,
-) -> list[BakeView]:
-    """Return views with the shading of their vertices; unchanged under a uniform light of constant exposure."""
-    if light.is_uniform and bool((light.gain == 1.0).all()):
-        return views
-    gloss = None
-    if specular.strength.any():
-        roughness = None if specular.roughness is None else torch.from_numpy(specular.roughness)
-        gloss = VertexGloss(specular.highlights, torch.from_numpy(specular.strength), roughness)
-
-    def shaded(view: BakeView, frame: int) -> BakeView:
-        at = view.vertices_world, faces, frame
-        if gloss is None:
-            return replace(view, shading=light.shade_vertices(*at))
-        return replace(view, shading=light.shade_specular(*at, gloss, view.camera.centre_m()))
-
-    return shared_thread_pool(torch.get_num_threads()).map(shaded, views, positions.tolist())
-
-
-def vertex_map(values: Float[np.ndarray, "v"], mesh: Mesh, texels: Texels) -> Float32[np.ndarray, "s s"]:
-    """Return a map of values at the vertices, gutters filled."""
-    at_texels = torch.from_numpy(texels.interpolate(mesh.faces, values[:, None]))
-    return np.ascontiguousarray(texels_to_texture(at_texels, texels)[..., 0])
-
-
-def vertex_surface(mesh: Mesh) -> TexturedSurface:
-    """Return the surface whose texels are the vertices of a mesh."""
-    faces = torch.from_numpy(mesh.faces)
-    count = len(mesh.vertices)
-    return TexturedSurface(faces, faces, torch.zeros(count, 2), texels_at_vertices(mesh.faces, count))
 
 
 def build_atlas(
@@ -377,13 +294,6 @@ def make_texel_inpainter(mesh: Mesh, texels: Texels, template: FittedTemplate | 
         return texels.interpolate(mesh.faces, inpaint_vertex_colours(mesh, means, weights))
 
     return inpaint
-
-
-def fit_highlights(evidence: LightEvidence | None, light: VideoLight, mesh: Mesh) -> SpecularFit:
-    """Return the highlights of the surface; none where no lamp was found, whose highlights they would be."""
-    if evidence is None or light.is_uniform:
-        return SpecularFit.matte(len(mesh.vertices))
-    return fit_specular(evidence.train, evidence.validation, evidence.light, mesh)
 
 
 STAGE = Stage(

@@ -34,12 +34,13 @@ from pipeline.geometry.surface import closest_points_on_mesh
 from pipeline.geometry.texture_rendering import sample_texture
 from pipeline.mesh.files import load_mesh
 from pipeline.texture.light import VideoLight, exponent_of_roughness
-from pipeline.texture.light_evidence import estimate_light
-from pipeline.texture.light_fit import ViewObservations, observe_light, observe_visibility
+from pipeline.texture.lighting.light_evidence import estimate_light
+from pipeline.texture.lighting.light_fit import ViewObservations, observe_light, observe_visibility
+from pipeline.texture.lighting.specular import SpecularFit, fit_specular
+from pipeline.texture.lighting.specular_regression import HighlightRegression
 from pipeline.texture.settings import DEFAULT_SETTINGS
-from pipeline.texture.specular import SpecularFit, fit_specular
-from pipeline.texture.specular_regression import HighlightRegression
-from stages.texture import load_poses, load_views, vertex_surface
+from pipeline.texture.vertex_texels import vertex_surface
+from stages.texture import load_poses, load_views
 
 PENALTIES = (1e-5, 1e-3, 1e-1)
 """Candidates of the penalty of what the network adds; the first is NeRF2Mesh's."""
@@ -142,7 +143,7 @@ def observe_views(run: Path) -> Views:
     inputs = {name: run / name for name in ("frames", "body", "mesh")}
     body, skinned, capture = load_body(run / "body" / "body.npz"), load_mesh(run / "mesh"), load_capture(run / "frames")
     positions = {split: capture.positions(split) for split in (TRAIN, VALIDATION, HELDOUT)}
-    loaded = {split: load_views(capture, part, inputs, body, skinned, len(part)) for split, part in positions.items()}
+    loaded = {split: load_views(capture, part, inputs, body, skinned) for split, part in positions.items()}
     mesh, surface = skinned.mesh, vertex_surface(skinned.mesh)
     between = (positions[TRAIN], positions[VALIDATION])
     evidence = estimate_light(loaded[TRAIN], loaded[VALIDATION], surface, mesh.edges(), between, DEFAULT_SETTINGS)

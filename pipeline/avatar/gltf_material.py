@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 from pipeline.io.glb_writer import GlbWriter
 from pipeline.io.image import png_bytes, to_uint8
 from pipeline.texture.files import TextureArtifact
-from pipeline.texture.specular import dielectric_specular_factor
+from pipeline.texture.lighting.specular import dielectric_specular_factor
 
 
 @dataclass(frozen=True)

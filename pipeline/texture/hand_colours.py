@@ -16,7 +16,7 @@ from pipeline.kernels.common.opencv_threads import single_threaded_opencv
 from pipeline.kernels.common.thread_pool import shared_thread_pool
 from pipeline.texture.bake import TexturedSurface, sample_frame_colours
 from pipeline.texture.contact import Limbs
-from pipeline.texture.light_fit import weighted_median
+from pipeline.texture.lighting.light_fit import weighted_median
 from pipeline.texture.settings import TextureSettings
 from pipeline.texture.views import BakeView
 

@@ -13,6 +13,7 @@ from pipeline.geometry.camera import Camera, pixel_footprint_m, project
 from pipeline.geometry.colour import linear_to_srgb, srgb_to_linear
 from pipeline.geometry.creases import Creases
 from pipeline.geometry.mesh import area_weighted_vertex_normals
+from pipeline.geometry.surface_cut import SurfaceCut
 from pipeline.texture.light import MIN_IRRADIANCE
 
 MIN_FOREGROUND_ALPHA = 0.9
@@ -54,6 +55,10 @@ class BakeView:
         """Return the view of another mesh in the same pose; vertices_world: m."""
         cosine = vertex_view_cosine(vertices_world, torch.from_numpy(faces), self.camera)
         return replace(self, vertices_world=vertices_world, view_cosine=cosine)
+
+    def cut(self, cut: SurfaceCut) -> "BakeView":
+        """Return the view of the mesh that was cut for its atlas."""
+        return self.with_mesh(torch.from_numpy(cut.extend(self.vertices_world.numpy())), cut.faces)
 
     def split(self, creases: Creases) -> "BakeView":
         """Return the view of the mesh with copies of the vertices on its folds."""

@@ -29,8 +29,8 @@ from pipeline.geometry.texture_rendering import render_textured, turntable_camer
 from pipeline.io.image import to_uint8, write_rgb
 from pipeline.texture.files import TextureArtifact
 from pipeline.texture.light import Highlights, directional_light, exponent_of_roughness, roughness_of_exponent
+from pipeline.texture.vertex_texels import vertex_map
 from stages.export import STAGE, Config, Scene, encode_scene, load_scene
-from stages.texture import vertex_map
 from tests.tools.browser import open_browser
 from tests.tools.pictures import (
     LampAndSky,

@@ -8,7 +8,7 @@ from pipeline.texture.bake import TexturedSurface
 from pipeline.texture.contact import Limbs
 from pipeline.texture.hand_colours import hide_foreign_hands
 from pipeline.texture.settings import TextureSettings
-from pipeline.texture.specular import texels_at_vertices
+from pipeline.texture.vertex_texels import texels_at_vertices
 from pipeline.texture.views import BakeView
 
 SIDE, FOCAL_PX, DEPTH_M = 120, 100.0, 1.0

@@ -20,10 +20,10 @@ from pipeline.texture.light import (
     save_light,
     spherical_harmonics,
 )
-from pipeline.texture.light_evidence import LightEvidence, estimate_light
-from pipeline.texture.light_fit import LightObservations, ViewObservations, fit_light, predict_views
+from pipeline.texture.lighting.light_evidence import LightEvidence, estimate_light
+from pipeline.texture.lighting.light_fit import LightObservations, ViewObservations, fit_light, predict_views
 from pipeline.texture.settings import TextureSettings
-from pipeline.texture.specular import texels_at_vertices
+from pipeline.texture.vertex_texels import texels_at_vertices
 from pipeline.texture.views import BakeView, remove_light
 from tests.data_tools.synthetic.shapes import sphere
 from tests.texture.painted_ball import PaintedBall, ball_colours

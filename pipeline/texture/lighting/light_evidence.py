@@ -9,9 +9,9 @@ from jaxtyping import Float, Int
 
 from pipeline.capture.frame_selection import evenly_spaced
 from pipeline.texture.bake import TexturedSurface
-from pipeline.texture.key_light import find_key_direction
 from pipeline.texture.light import VideoLight
-from pipeline.texture.light_fit import (
+from pipeline.texture.lighting.key_light import find_key_direction
+from pipeline.texture.lighting.light_fit import (
     LightFit,
     LightObservations,
     Prediction,
@@ -94,7 +94,7 @@ def estimate_light(
 
     Args:
         train, validation: views; at least one validation view.
-        surface: its texels must come from `texels_at_vertices`.
+        surface: see `pipeline.texture.vertex_texels`.
         edges: of the mesh.
         positions: of the training and the validation views among the selected frames.
         settings: of the stage.

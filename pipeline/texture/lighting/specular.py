@@ -23,15 +23,14 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import csr_array, eye_array
 
-from pipeline.geometry.atlas import Texels
 from pipeline.geometry.colour import linear_to_srgb
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import laplacian
-from pipeline.texture.key_light import SEARCH_REFINEMENTS_RAD, directions_around, search_directions
 from pipeline.texture.light import Highlights, VideoLight, roughness_of_exponent
-from pipeline.texture.light_fit import ViewObservations
-from pipeline.texture.material_regions import material_regions
-from pipeline.texture.specular_regression import HighlightRegression, ridge
+from pipeline.texture.lighting.key_light import SEARCH_REFINEMENTS_RAD, directions_around, search_directions
+from pipeline.texture.lighting.light_fit import ViewObservations
+from pipeline.texture.lighting.material_regions import material_regions
+from pipeline.texture.lighting.specular_regression import HighlightRegression, ridge
 
 EXPONENTS = (12.0, 24.0, 48.0, 96.0)
 """Candidates of p: roughness 0.61 to 0.38. Errors of the irradiance look like wider lobes."""
@@ -90,17 +89,14 @@ class SpecularFit:
         """Return the result for a surface without highlights that was not tested."""
         return SpecularFit(Highlights.none(), np.zeros(vertex_count, dtype=np.float32), None, 0.0, 0.0, 0)
 
-
-def texels_at_vertices(faces: Int[np.ndarray, "f 3"], vertex_count: int) -> Texels:
-    """Return one "texel" at each vertex that has a face, so that vertices are sampled like texels.
-
-    The column of each texel is its vertex index.
-    """
-    corners = faces.reshape(-1)
-    vertices, first = np.unique(corners, return_index=True)
-    barycentric = np.eye(3, dtype=np.float32)[first % 3]
-    zeros = np.zeros(len(vertices), dtype=np.int32)
-    return Texels(vertex_count, zeros, vertices.astype(np.int32), (first // 3).astype(np.int32), barycentric)
+    def metrics(self) -> dict[str, float]:
+        """Return the figures of the fit for the manifest."""
+        return {
+            "specular_explained": self.explained,
+            "specular_standard_errors": self.standard_errors,
+            "specular_regions": float(self.regions),
+            "roughness_standard_errors": self.roughness_standard_errors,
+        }
 
 
 def fit_specular(train: ViewObservations, validation: ViewObservations, light: VideoLight, mesh: Mesh) -> SpecularFit:

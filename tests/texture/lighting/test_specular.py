@@ -18,9 +18,9 @@ from pipeline.texture.light import (
     exponent_of_roughness,
     roughness_of_exponent,
 )
-from pipeline.texture.light_fit import LightObservations, ViewObservations
-from pipeline.texture.specular import SpecularFit, albedo_uniformity, dielectric_specular_factor, fit_specular
-from pipeline.texture.specular_regression import HighlightRegression
+from pipeline.texture.lighting.light_fit import LightObservations, ViewObservations
+from pipeline.texture.lighting.specular import SpecularFit, albedo_uniformity, dielectric_specular_factor, fit_specular
+from pipeline.texture.lighting.specular_regression import HighlightRegression
 from pipeline.texture.views import BakeView
 
 LAMP = np.array([0.36, 0.48, 0.8])

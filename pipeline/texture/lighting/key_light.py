@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from pipeline.capture.frame_selection import evenly_spaced
 from pipeline.kernels.common.thread_pool import shared_thread_pool
-from pipeline.texture.light_fit import LightFit, LightObservations, observe_visibility, vertex_mean
+from pipeline.texture.lighting.light_fit import LightFit, LightObservations, observe_visibility, vertex_mean
 from pipeline.texture.views import BakeView
 
 SEARCH_VIEWS, SEARCH_DIRECTIONS = 8, 48

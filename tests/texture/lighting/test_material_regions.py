@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.texture.material_regions import material_regions
+from pipeline.texture.lighting.material_regions import material_regions
 
 
 def test_a_region_has_one_colour_and_one_place() -> None:

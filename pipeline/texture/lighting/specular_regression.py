@@ -1,6 +1,6 @@
 """Least squares of highlights at the vertices of a mesh: y = albedo * E(n) + s * D, with the albedo eliminated.
 
-See `pipeline.texture.specular` for the model.
+See `pipeline.texture.lighting.specular` for the model.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.geometry.colour import srgb_to_linear
 from pipeline.texture.light import Highlights, VideoLight
-from pipeline.texture.light_evidence import standard_errors
-from pipeline.texture.light_fit import ViewObservations
+from pipeline.texture.lighting.light_evidence import standard_errors
+from pipeline.texture.lighting.light_fit import ViewObservations
 
 RIDGE_FRACTION = 0.003
 """Ridge of the strength, relative to the lobe's power at well-observed vertices of uniform albedo."""

@@ -114,7 +114,7 @@ class LightFit:
 
 
 def observe_light(views: Sequence[BakeView], surface: TexturedSurface, settings: TextureSettings) -> LightObservations:
-    """Sample the colours of all vertices in all views that show them; surface: see `texels_at_vertices`."""
+    """Sample the colours of all vertices in all views that show them; surface: see `pipeline.texture.vertex_texels`."""
     vertices = surface.texels.columns
 
     def observe(number: int, view: BakeView) -> tuple[np.ndarray, ...]:

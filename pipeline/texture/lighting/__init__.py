@@ -1,0 +1,1 @@
+"""Light and highlights of a video, told from its frames."""
