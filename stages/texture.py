@@ -63,6 +63,7 @@ from pipeline.texture.light import VideoLight
 from pipeline.texture.lighting.shading import find_light, fit_highlights, light_metrics, light_views
 from pipeline.texture.normal_map import bake_normal_map
 from pipeline.texture.settings import DEFAULT_SETTINGS, TextureSettings
+from pipeline.texture.unseen_sides import BodySlices, add_slice_colours
 from pipeline.texture.vertex_texels import vertex_map, vertex_surface
 from pipeline.texture.views import BakeView, crop_bake_view, weight_by_resolution
 
@@ -166,7 +167,7 @@ def run(
         light_views(views, light, part, surface.faces, highlights)
         for views, part in zip((train, validation), positions, strict=True)
     )
-    inpaint = make_texel_inpainter(skinned.mesh, texels, template)
+    inpaint = make_texel_inpainter(skinned, body, texels, template)
     diffuse, texel_confidence = bake_diffuse(train, surface, inpaint, config.rounds, settings, out / TEXELS_CHECKPOINT)
     artifact = TextureArtifact(
         atlas,
@@ -278,17 +279,23 @@ def make_normal_map(
     return bake_normal_map(mesh, atlas, dense, max(texture_px // NORMAL_MAP_DIVISOR, MIN_NORMAL_MAP_PX))
 
 
-def make_texel_inpainter(mesh: Mesh, texels: Texels, template: FittedTemplate | None = None) -> InpaintFunction:
-    """Return a function that inpaints unobserved texels from the observed colours around them on the surface.
+def make_texel_inpainter(
+    skinned: MeshArtifact, body: Body, texels: Texels, template: FittedTemplate | None = None
+) -> InpaintFunction:
+    """Return a function that inpaints unobserved texels from observed colours.
 
-    template: tells the other side of the body, whose colours are taken where both sides agree.
+    From those of the other side of the body where both sides agree, of the same slice of the body part far from
+    everything that is observed, and around them on the surface elsewhere.
+
+    template: tells the other side of the body.
     """
-    partner = None
+    mesh, slices, partner = skinned.mesh, BodySlices.of_mesh(skinned, body), None
     if template is not None:
         partner = mirror_vertices(template.correspondence, template.registration.vertices, mesh)
 
     def inpaint(colour: Float[np.ndarray, "t 3"], texel_confidence: Float[np.ndarray, "t"]) -> Float[np.ndarray, "t 3"]:
         means, weights = average_texels_per_vertex(texels, mesh.faces, len(mesh.vertices), colour, texel_confidence)
+        means, weights = add_slice_colours(mesh.vertices, slices, means, weights)
         if partner is not None:
             means, weights = add_mirrored_colours(mesh, partner, means, weights)
         return texels.interpolate(mesh.faces, inpaint_vertex_colours(mesh, means, weights))
@@ -298,7 +305,7 @@ def make_texel_inpainter(mesh: Mesh, texels: Texels, template: FittedTemplate | 
 
 STAGE = Stage(
     "texture",
-    version=17,
+    version=18,
     needs=("frames", "body", "mesh"),
     makes=(ATLAS, DIFFUSE, SPECULAR, ROUGHNESS, NORMAL, COVERAGE, LIGHT, TEMPLATE_NPZ),
     config=Config,

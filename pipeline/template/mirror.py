@@ -79,8 +79,9 @@ def add_mirrored_colours(
     everywhere = squared.sum() / max(both.sum(), 1)
     difference = np.sqrt((total + _LEAST_EVIDENCE * everywhere) / (count + _LEAST_EVIDENCE))
     trust = both.any() / (1.0 + (difference / AGREEMENT) ** 2) ** 2
-    taken = exists & (weight < UNSEEN) & (weight[other] > OBSERVED)
+    mirrored = MIRROR_WEIGHT * trust * weight[other]
+    taken = exists & (weight < UNSEEN) & (weight[other] > OBSERVED) & (mirrored > weight)
     return (
         np.where(taken[:, None], colour[other], colour).astype(colour.dtype),
-        np.where(taken, MIRROR_WEIGHT * trust * weight[other], weight).astype(weight.dtype),
+        np.where(taken, mirrored, weight).astype(weight.dtype),
     )

@@ -1,0 +1,97 @@
+"""The back of a person who was filmed from in front has the colours that the same slices have in front."""
+
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.body.files import load_body
+from pipeline.mesh.files import load_mesh
+from pipeline.texture.body_parts import BODY_PARTS
+from pipeline.texture.unseen_sides import SLICE_M, SLICE_WEIGHT, BodySlices, add_slice_colours
+
+RED, BLUE, WHITE, BLACK = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
+TORSO, HANDS = BODY_PARTS.index("torso"), BODY_PARTS.index("left hand")
+ANGLES_DEG = np.arange(0.0, 360.0, 5.0)
+"""Around the vertical, 0 in front."""
+RADIUS_M, HEIGHT_M = 0.15, 0.6
+
+
+def pillar(part: int = TORSO) -> tuple[np.ndarray, np.ndarray, np.ndarray, BodySlices]:
+    """Vertices of a pillar with their angles (degrees) and heights (m), and its slices."""
+    angle_deg, height_m = (part.ravel() for part in np.meshgrid(ANGLES_DEG, np.arange(0.0, HEIGHT_M, 0.01)))
+    angle = np.deg2rad(angle_deg)
+    vertices = np.stack([RADIUS_M * np.sin(angle), height_m, RADIUS_M * np.cos(angle)], axis=1)
+    number = np.floor(height_m / SLICE_M).astype(int) if part == TORSO else np.full(len(vertices), -1)
+    return (
+        vertices,
+        np.minimum(angle_deg, 360.0 - angle_deg),
+        height_m,
+        BodySlices(np.full(len(vertices), part), number),
+    )
+
+
+def filmed(shown: np.ndarray, colour: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Colours, black where nothing is shown, and their weights."""
+    return np.where(shown[:, None], colour, BLACK), shown.astype(float)
+
+
+def test_the_back_has_shirt_and_trousers_with_a_hem_between() -> None:
+    vertices, angle_deg, height_m, slices = pillar()
+    truth = np.where((height_m > 0.3)[:, None], RED, BLUE)
+    colour, weight = add_slice_colours(vertices, slices, *filmed(angle_deg < 90.0, truth))
+    back = angle_deg > 120.0
+    assert np.all(weight[back] == SLICE_WEIGHT)
+    clear_of_hem = np.abs(height_m - 0.3) > 2.0 * SLICE_M
+    np.testing.assert_array_equal(colour[back & clear_of_hem], truth[back & clear_of_hem])
+    assert {tuple(row) for row in colour[back].tolist()} == {RED, BLUE}
+
+
+def test_a_print_on_the_chest_stays_in_front() -> None:
+    vertices, angle_deg, _, slices = pillar()
+    truth = np.where((angle_deg < 50.0)[:, None], WHITE, RED)
+    colour, _ = add_slice_colours(vertices, slices, *filmed(angle_deg < 90.0, truth))
+    assert np.all(colour[angle_deg > 120.0] == RED)
+
+
+def test_what_is_seen_and_small_holes_stay() -> None:
+    vertices, angle_deg, height_m, slices = pillar()
+    hole = (angle_deg < 15.0) & (np.abs(height_m - 0.4) < 0.03)
+    before = filmed(~hole, np.broadcast_to(RED, vertices.shape))
+    after = add_slice_colours(vertices, slices, *before)
+    for old, new in zip(before, after, strict=True):
+        np.testing.assert_array_equal(old, new)
+
+
+def test_slices_that_are_not_seen_nearby_have_no_colour() -> None:
+    vertices, angle_deg, height_m, slices = pillar()
+    _, weight = add_slice_colours(vertices, slices, *filmed((angle_deg < 90.0) & (height_m > 0.4), vertices * 0.0))
+    back = angle_deg > 120.0
+    assert np.all(weight[back & (height_m < 0.3)] == 0.0)
+    assert np.all(weight[back & (height_m > 0.4)] == SLICE_WEIGHT)
+
+
+def test_hands_and_people_whom_no_frame_shows_stay_as_they_are() -> None:
+    vertices, angle_deg, _, slices = pillar(HANDS)
+    before = filmed(angle_deg < 90.0, np.broadcast_to(RED, vertices.shape))
+    assert np.array_equal(add_slice_colours(vertices, slices, *before)[1], before[1])
+    vertices, _, _, slices = pillar()
+    assert not add_slice_colours(vertices, slices, vertices * 0.0, np.zeros(len(vertices)))[1].any()
+
+
+def test_slices_follow_limbs_and_the_hairline(smoke_run: Path) -> None:
+    body, skinned = load_body(smoke_run / "body" / "body.npz"), load_mesh(smoke_run / "mesh")
+    slices, vertices = BodySlices.of_mesh(skinned, body), skinned.mesh.vertices
+    arm = slices.part == BODY_PARTS.index("left arm")
+    along = np.linalg.norm(vertices[arm] - body.joints_m[body.joint("LeftArm")], axis=1)
+    assert np.corrcoef(along, slices.number[arm])[0, 1] > 0.98
+    head = np.flatnonzero(slices.part == BODY_PARTS.index("head"))
+    joint = body.joints_m[body.joint("Head")]
+
+    def slice_at(up_m: float, forward_m: float) -> int:
+        place = joint + np.array([0.0, up_m, forward_m], dtype=np.float32)
+        return int(slices.number[head[np.linalg.norm(vertices[head] - place, axis=1).argmin()]])
+
+    chin, forehead, nape, crown = slice_at(-0.02, 0.1), slice_at(0.13, 0.1), slice_at(0.0, -0.08), slice_at(0.2, -0.05)
+    assert chin < min(nape, forehead) <= max(nape, forehead) < crown
+    assert abs(nape - forehead) < 4
+    assert np.all(slices.number[slices.part == HANDS] == -1)
