@@ -289,7 +289,8 @@ def make_texel_inpainter(
 
     template: tells the other side of the body.
     """
-    mesh, slices, partner = skinned.mesh, BodySlices.of_mesh(skinned, body), None
+    mesh, partner = skinned.mesh, None
+    slices = BodySlices.of_vertices(mesh.vertices, skinned.joint_indices, skinned.joint_weights, body)
     if template is not None:
         partner = mirror_vertices(template.correspondence, template.registration.vertices, mesh)
 

@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from pipeline.body.body import Body
-from pipeline.mesh.files import MeshArtifact
 from pipeline.texture.body_parts import BODY_PARTS, body_part_of_joint, group_weights
 
 SLICE_M = 0.015
@@ -60,10 +59,16 @@ class BodySlices:
     number: Int[np.ndarray, "v"]
 
     @classmethod
-    def of_mesh(cls, skinned: MeshArtifact, body: Body) -> "BodySlices":
-        """Return the slices of a mesh in the A-pose."""
+    def of_vertices(
+        cls,
+        vertices_m: Float[np.ndarray, "v 3"],
+        joint_indices: Int[np.ndarray, "v k"],
+        joint_weights: Float[np.ndarray, "v k"],
+        body: Body,
+    ) -> "BodySlices":
+        """Return the slices of vertices in the A-pose, which are bound to joints of the body."""
         part_of_joint = np.array([BODY_PARTS.index(body_part_of_joint(name)) for name in body.joint_names])
-        weights = group_weights(skinned.joint_indices, skinned.joint_weights, part_of_joint, len(BODY_PARTS))
+        weights = group_weights(joint_indices, joint_weights, part_of_joint, len(BODY_PARTS))
         part = weights.argmax(axis=1)
         number = np.full(len(part), -1)
         slope = np.deg2rad(HAIRLINE_DEG)
@@ -74,7 +79,7 @@ class BodySlices:
         for name, axis in axes.items():
             rows = np.flatnonzero(part == BODY_PARTS.index(name))
             if len(rows):
-                along_m = skinned.mesh.vertices[rows] @ axis
+                along_m = vertices_m[rows] @ axis
                 number[rows] = np.floor((along_m - along_m.min()) / SLICE_M)
         return cls(part, number)
 
