@@ -10,6 +10,7 @@ from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import adjacency, closest_points_on_mesh
 from pipeline.template.correspondence import Correspondence
 from pipeline.template.regions import load_template
+from pipeline.texture.inpainting import OBSERVED, SMOOTHNESS_WEIGHT
 
 MAX_MIRROR_DISTANCE_M = 0.03
 """A vertex that lies farther from the mirrored place is not its partner."""
@@ -17,10 +18,7 @@ MAX_MIRROR_DISTANCE_M = 0.03
 AGREEMENT = 0.08
 """Difference of colours (RMS of sRGB) of both sides at which the other side has a quarter of its weight."""
 
-OBSERVED, UNSEEN = 0.5, 0.1
-"""Weights from which a vertex is observed, and up to which it takes the colour of the other side."""
-
-MIRROR_WEIGHT = 0.02
+MIRROR_WEIGHT = SMOOTHNESS_WEIGHT
 """Of the other side's colour against an observed one: as much as that of a neighbour in `inpaint_vertex_colours`, so
 that small holes are filled from their border."""
 
@@ -80,7 +78,7 @@ def add_mirrored_colours(
     difference = np.sqrt((total + _LEAST_EVIDENCE * everywhere) / (count + _LEAST_EVIDENCE))
     trust = both.any() / (1.0 + (difference / AGREEMENT) ** 2) ** 2
     mirrored = MIRROR_WEIGHT * trust * weight[other]
-    taken = exists & (weight < UNSEEN) & (weight[other] > OBSERVED) & (mirrored > weight)
+    taken = exists & (weight[other] > OBSERVED) & (mirrored > weight)
     return (
         np.where(taken[:, None], colour[other], colour).astype(colour.dtype),
         np.where(taken, mirrored, weight).astype(weight.dtype),

@@ -1,5 +1,7 @@
 """Assign joints and mesh faces to body parts by the Mixamo names of the joints."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -34,9 +36,16 @@ def body_part_of_faces(
 
     joint_indices: into `joint_names`, k influences per vertex. joint_weights: rows sum to 1.
     """
-    part_of_joint = np.array([BODY_PARTS.index(body_part_of_joint(name)) for name in joint_names])
-    part_weight = group_weights(joint_indices, joint_weights, part_of_joint, len(BODY_PARTS))
+    part_weight = body_part_weights(joint_indices, joint_weights, joint_names)
     return part_weight[faces].sum(axis=1).argmax(axis=1).astype(np.int32)
+
+
+def body_part_weights(
+    joint_indices: Int[np.ndarray, "v k"], joint_weights: Float[np.ndarray, "v k"], joint_names: Sequence[str]
+) -> Float[np.ndarray, "v p"]:
+    """Return the summed skin weight of each of `BODY_PARTS` at every vertex."""
+    part_of_joint = np.array([BODY_PARTS.index(body_part_of_joint(name)) for name in joint_names])
+    return group_weights(joint_indices, joint_weights, part_of_joint, len(BODY_PARTS))
 
 
 def group_weights(

@@ -9,6 +9,9 @@ from pipeline.geometry.linear_systems import factorise_positive_definite
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import laplacian
 
+OBSERVED = 0.5
+"""Weight from which a vertex is observed: others may take its colour."""
+
 SMOOTHNESS_WEIGHT = 0.02
 REGULARISATION_WEIGHT = 1e-6
 

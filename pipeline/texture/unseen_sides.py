@@ -11,7 +11,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from pipeline.body.body import Body
-from pipeline.texture.body_parts import BODY_PARTS, body_part_of_joint, group_weights
+from pipeline.texture.body_parts import BODY_PARTS, body_part_weights
+from pipeline.texture.inpainting import OBSERVED, SMOOTHNESS_WEIGHT
 
 SLICE_M = 0.015
 """Thickness of a slice; its colour is that of itself and of one slice on either side."""
@@ -29,13 +30,13 @@ NEAR_M = 0.05
 """Distance from the unseen side at which a seen vertex has a quarter of its weight: flanks count more than a print on
 the chest, temples more than the face."""
 
-OBSERVED, UNSEEN = 0.5, 0.1
-"""Weights from which a vertex is observed, and up to which it takes the colour of its slice."""
+UNSEEN = 0.1
+"""Weight up to which a vertex takes the colour of its slice."""
 
 HOLE_M = 0.04
 """Vertices that are nearer to one that is seen belong to a hole, which is filled from its border."""
 
-SLICE_WEIGHT = 0.02
+SLICE_WEIGHT = SMOOTHNESS_WEIGHT
 """Of a slice's colour against an observed one: as much as that of a neighbour in `inpaint_vertex_colours`."""
 
 HAIRLINE_DEG = 40.0
@@ -67,9 +68,7 @@ class BodySlices:
         body: Body,
     ) -> "BodySlices":
         """Return the slices of vertices in the A-pose, which are bound to joints of the body."""
-        part_of_joint = np.array([BODY_PARTS.index(body_part_of_joint(name)) for name in body.joint_names])
-        weights = group_weights(joint_indices, joint_weights, part_of_joint, len(BODY_PARTS))
-        part = weights.argmax(axis=1)
+        part = body_part_weights(joint_indices, joint_weights, body.joint_names).argmax(axis=1)
         number = np.full(len(part), -1)
         slope = np.deg2rad(HAIRLINE_DEG)
         axes = {"head": np.array([0.0, np.cos(slope), -np.sin(slope)])}
