@@ -1,6 +1,7 @@
 """Rules that no linter checks: size of files, functions and packages, parameters, declared dependencies."""
 
 import ast
+import subprocess
 import sys
 import tomllib
 from collections import Counter
@@ -148,6 +149,14 @@ def test_every_declared_dependency_is_locked(repository: Path) -> None:
     locked = {normal(line) for line in (repository / "requirements.lock").read_text().splitlines()}
     wanted = {normal(line) for line in project["dependencies"] + project["optional-dependencies"]["dev"]}
     assert wanted <= locked
+
+
+def test_importing_the_stages_imports_no_slow_library(repository: Path) -> None:
+    """A second or more for each command: torch's compiler (which roma imports), the detector, the body model."""
+    slow = "torch._dynamo", "sympy", "mediapipe", "jax", "anny", "warp", "pymeshlab", "matplotlib"
+    code = f"import sys, stages; stages.PIPELINE.load_stages(); print([m for m in {slow} if m in sys.modules])"
+    printed = subprocess.run([sys.executable, "-c", code], cwd=repository, check=True, capture_output=True, text=True)
+    assert printed.stdout.strip() == "[]"
 
 
 @pytest.mark.parametrize("line", ["Torch==2.4+cpu", "torch>=2,<3", "torch"])

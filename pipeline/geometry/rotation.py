@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -29,7 +28,11 @@ def axis_angle_to_quaternion(axis_angle_rad: Float[Tensor, "*n 3"]) -> Float[Ten
 
 def quaternion_to_axis_angle(quaternion_wxyz: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 3"]:
     """Convert quaternions to axis-angle vectors (logarithm map) with angles in [0, pi] rad."""
-    return roma.unitquat_to_rotvec(quaternion_wxyz[..., [1, 2, 3, 0]])
+    w, vector = quaternion_wxyz[..., :1], quaternion_wxyz[..., 1:]
+    sine = vector.norm(dim=-1, keepdim=True)
+    half_angle = torch.atan2(sine, w.abs())
+    scale = torch.where(sine > 0.0, 2.0 * half_angle / sine, 2.0)
+    return torch.where(w < 0.0, -scale, scale) * vector
 
 
 def quaternion_to_matrix(quaternion_wxyz: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 3 3"]:

@@ -48,6 +48,17 @@ def test_logarithm_map_inverts_the_exponential_map(axis_angle: torch.Tensor) -> 
     torch.testing.assert_close(rot.quaternion_to_matrix(again), rot.quaternion_to_matrix(quaternion), atol=1e-7, rtol=0)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("angle_rad", [0.0, 1e-30, 1e-9, 1e-4, 1.0, 3.1, 3.2, 6.2])
+def test_logarithm_map_agrees_with_scipy(angle_rad: float, dtype: torch.dtype) -> None:
+    half = torch.tensor(0.5 * angle_rad, dtype=torch.float64)
+    axis = torch.tensor([[0.48, -0.6, 0.64]], dtype=torch.float64)
+    quaternion = torch.cat([half.cos().view(1, 1), half.sin() * axis], dim=1)
+    expected = to_scipy(quaternion).as_rotvec()
+    given = rot.quaternion_to_axis_angle(quaternion.to(dtype)).numpy()
+    np.testing.assert_allclose(given, expected, atol=2e-6 * angle_rad if dtype == torch.float32 else 1e-14 * angle_rad)
+
+
 @pytest.mark.parametrize("angle_rad", [1e-9, 1e-4, 0.0099, 0.0101, 1.0])
 def test_small_angles_are_as_accurate_as_large_ones(angle_rad: float) -> None:
     axis = torch.tensor([[0.48, -0.6, 0.64]], dtype=torch.float64)
