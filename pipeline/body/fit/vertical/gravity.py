@@ -2,7 +2,7 @@
 
 Evidence of the tilt of the vertical, each with a standard deviation: a camera is held nearly level, the axis of a turn
 in the images (module `turn_axis`), the floor through the standing soles, and the axis of the body over a
-turn. Where there is no turn and nobody walks, the camera stays level. A tilt is the slope (x, z) of the vertical in a
+turn. Where nobody turns or walks, the camera stays level. A tilt is the slope (x, z) of the vertical in a
 world whose y axis is nearly vertical: the vertical is (x, 1, z), normalised.
 
 Silhouettes tell the vertical of a turn as well as its landmarks do, which err by several degrees at times: between

@@ -1,4 +1,4 @@
-"""The axis of a turn in the images alone: the vertical, seen by a camera that need not be level.
+"""The axis of a turn, or of an arc of it, in the images alone: the vertical, seen by a camera that need not be level.
 
 The 3D landmarks of the detector report 30 to 70 % of a camera's pitch. Their pixels show all of it: a point of a body
 that turns about the vertical describes an ellipse, flatter the more level it is seen. Unknowns: one rigid body, its yaw
@@ -30,9 +30,9 @@ MAX_EVALUATIONS = 200
 COST_TOLERANCE = 1e-5
 """Relative gain at which the fit ends. Costs are some hundred squared deviations: 0.05 deviations are left to gain."""
 
-MAX_YAW_RESULTANT = 0.5
-"""Length of the mean of the facing directions up to which a recording counts as a turn: 0 for a full one, 0.5 for an
-arc of 217 degrees."""
+MAX_YAW_RESULTANT, MAX_ARC_RESULTANT = 0.5, 0.98
+"""Lengths of the mean of the facing directions (`yaw_resultant`) up to which a recording counts as a turn, and as an
+arc that shows its axis: 0 for a full turn, 0.5 for an arc of 217 degrees, 0.98 for one of 40 degrees."""
 
 LANDMARK_STD_RATIO, SYMMETRY_STD_RATIO = 0.01, 0.012
 """Standard deviations of a landmark in the image and of the symmetry of the body, over the height of the landmarks."""
@@ -41,9 +41,13 @@ MAX_FOCAL_LOG = 2.0 * FitSettings.initial_focal_std
 """Logarithm of the focal length over the initial one beyond which there is no evidence: a factor of 2.7 either way,
 views of 17 to 97 degrees. A camera in the hand, which drifts up and down, looked like a lens of 100 times that."""
 
-MAX_RESIDUAL_RATIO = 0.03
-"""Median distance of the landmarks from the rigid body, over their height, above which there is no evidence: a walk
-whose limbs swing is no rigid body."""
+MAX_RESIDUAL_RATIO, MAX_ARC_RESIDUAL_RATIO = 0.03, 0.014
+"""Median distance of the landmarks from the rigid body, over their height, above which a turn and an arc are no
+evidence: a walk whose limbs swing is no rigid body. Arcs had 0.003 to 0.009, a walk and a juggler 0.023 to 0.028."""
+
+ARC_FOCAL_LOG_STD = 0.06
+"""Standard deviation of an unknown log focal length in the fit of an arc, which hardly shows it: a loose one makes the
+tilt worse (docs/decisions/body.md)."""
 
 STD_FACTOR = 2.0
 """True over formal standard deviation: errors of neighbouring frames are alike (1 to 2 degrees on three turns)."""
@@ -190,11 +194,16 @@ def axis_rotation(right: float, towards: float) -> Float[np.ndarray, "3 3"]:
     return np.stack([across, up, np.cross(across, up)], axis=1)
 
 
-def estimate_turn_axis(observations: Observations, focal_log_std: float) -> TurnAxis | None:
-    """Return the axis of the turn of a person; None if there is no turn, or too few or contradicting landmarks.
+def estimate_turn_axis(
+    observations: Observations, focal_log_std: float, max_resultant: float = MAX_ARC_RESULTANT
+) -> TurnAxis | None:
+    """Return the axis about which a person turns, all round or in an arc.
+
+    None if the person hardly turns or is not rigid, or if landmarks are too few.
 
     observations: with corrected left and right, in the world of a level camera.
     focal_log_std: standard deviation of the logarithm of its focal length; 0 for a known one.
+    max_resultant: largest `yaw_resultant`; `MAX_YAW_RESULTANT` admits no arc.
     """
     rows = _complete_frames(observations)
     if len(rows) < MIN_FRAMES:
@@ -202,9 +211,12 @@ def estimate_turn_axis(observations: Observations, focal_log_std: float) -> Turn
     directions = observations.landmarks_3d_m[rows].numpy()
     left = directions[:, HIPS_AND_SHOULDERS_LEFT].mean(1) - directions[:, HIPS_AND_SHOULDERS_RIGHT].mean(1)
     yaw_rad = np.unwrap(np.arctan2(-left[:, 2], left[:, 0]))
-    if yaw_resultant(yaw_rad) > MAX_YAW_RESULTANT:
+    resultant = yaw_resultant(yaw_rad)
+    if resultant > max_resultant:
         return None
-    problem = _make_problem(observations, rows, yaw_rad, max(focal_log_std, 1e-3))
+    is_arc = resultant > MAX_YAW_RESULTANT
+    prior_std = min(focal_log_std, ARC_FOCAL_LOG_STD) if is_arc else focal_log_std
+    problem = _make_problem(observations, rows, yaw_rad, max(prior_std, 1e-3))
     found = least_squares(
         problem.residuals,
         problem.start(),
@@ -214,7 +226,8 @@ def estimate_turn_axis(observations: Observations, focal_log_std: float) -> Turn
         max_nfev=MAX_EVALUATIONS,
     )
     residual = np.linalg.norm(problem.reprojection(found.x), axis=-1)
-    if np.median(residual) > MAX_RESIDUAL_RATIO or abs(found.x[-1]) > MAX_FOCAL_LOG:
+    max_residual = MAX_ARC_RESIDUAL_RATIO if is_arc else MAX_RESIDUAL_RATIO
+    if np.median(residual) > max_residual or abs(found.x[-1]) > MAX_FOCAL_LOG:
         return None
     covariance = np.linalg.pinv(found.jac.T @ found.jac)
     # The median distance of points with normal errors is 1.18 standard deviations.
@@ -230,7 +243,7 @@ def contradicting_focal_log(observations: Observations) -> float:
 
     observations: with corrected left and right; their camera has the supplied focal length.
     """
-    axis = estimate_turn_axis(observations, FitSettings.initial_focal_std)
+    axis = estimate_turn_axis(observations, FitSettings.initial_focal_std, MAX_YAW_RESULTANT)
     is_contradiction = axis is not None and abs(axis.focal_log) > CONTRADICTION_STDS * axis.focal_log_std
     return axis.focal_log if axis is not None and is_contradiction else 0.0
 

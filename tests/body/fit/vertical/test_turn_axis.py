@@ -95,8 +95,28 @@ def test_without_a_turn_nothing_contradicts_a_focal_length() -> None:
     assert contradicting_focal_log(replace(observations, camera=camera)) == 0.0
 
 
-def test_a_person_who_does_not_turn_gives_no_axis() -> None:
-    assert estimate_turn_axis(turning_body((0.0, 0.2), turn_rad=2.5), 0.5) is None
+@pytest.mark.parametrize("arc_deg", [50.0, 140.0])
+@pytest.mark.parametrize("tilt", [(-0.09, 0.27), (0.05, -0.18)])
+def test_an_arc_shows_the_axis(tilt: tuple[float, float], arc_deg: float) -> None:
+    axis = estimate_turn_axis(turning_body(tilt, np.radians(arc_deg)), 0.5)
+    assert axis is not None
+    assert axis.tilt_rad == pytest.approx(tilt, abs=0.01)
+
+
+def test_an_arc_is_less_certain_than_a_turn() -> None:
+    turn, arc = (estimate_turn_axis(turning_body((0.0, 0.2), turn_rad), 0.5) for turn_rad in (2 * np.pi, 1.5))
+    assert turn is not None
+    assert arc is not None
+    assert (arc.std_rad > turn.std_rad).all()
+
+
+def test_a_person_who_hardly_turns_gives_no_axis() -> None:
+    assert estimate_turn_axis(turning_body((0.0, 0.2), turn_rad=np.radians(35.0)), 0.5) is None
+
+
+def test_an_arc_of_a_body_that_is_not_rigid_gives_no_axis() -> None:
+    """It swings as much as a turn tolerates, and as a person who walks in an arc."""
+    assert estimate_turn_axis(turning_body((0.0, 0.2), turn_rad=2.5, swing_m=0.04), 0.5) is None
 
 
 @pytest.mark.slow
