@@ -17,6 +17,7 @@ from pipeline.body.fit.prior.priors import (
     rotation_to_axis_angle,
     shape_prior,
     skew_symmetric,
+    tilt_of_hips,
 )
 from pipeline.geometry.rotation import axis_angle_to_matrix
 
@@ -57,6 +58,16 @@ def test_pose_derivative_agrees_with_differences(prior: PosePrior) -> None:
     residual, derivative = pose_residuals(prior, rotations)
     moved, _ = pose_residuals(prior, axis_angle_to_matrix(step) @ rotations)
     assert torch.allclose((derivative @ step[..., None])[..., 0], moved - residual, atol=1e-8)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 2.0])
+def test_people_stand_upright_unless_they_are_seen_to_bend(prior: PosePrior, yaw: float) -> None:
+    """Bent by 20 degrees they are about one standard deviation off, so that images decide; turning costs nothing."""
+    turn = axis_angle_to_matrix(torch.tensor([[0.0, yaw, 0.0]], dtype=torch.float64))
+    bend = axis_angle_to_matrix(torch.tensor([[np.radians(20.0), 0.0, 0.0]], dtype=torch.float64))
+    upright, bent_over = ((tilt_of_hips(pose)[0] - prior.tilt_mean) / prior.tilt_std for pose in (turn, turn @ bend))
+    assert upright.norm() < 1e-9
+    assert bent_over.norm() == pytest.approx(1.14, abs=0.01)
 
 
 def test_knees_flex_backward_only(prior: PosePrior) -> None:

@@ -36,6 +36,9 @@ MOTION_STD_FACTOR = 2.0
 
 UNCONSTRAINED_RAD = 10.0
 
+TILT_STD_RAD = 0.3
+"""Standard deviation of the tilt of the hips about upright (docs/decisions/body.md)."""
+
 BALL_JOINT_STD_RAD = {
     "Hips": (UNCONSTRAINED_RAD, UNCONSTRAINED_RAD, UNCONSTRAINED_RAD),
     "Spine": (0.15, 0.10, 0.10),
@@ -123,7 +126,7 @@ def pose_prior(model: LinearBody) -> PosePrior:
             axes[joint], _ = hinge_axes(model, joint)
         std[joint] = torch.tensor({**BALL_JOINT_STD_RAD, **HINGE_JOINT_STD_RAD}[joint_type], dtype=torch.float64)
     no_tilt = torch.zeros(2, dtype=torch.float64)
-    return PosePrior(axes, torch.zeros_like(std), std, joint_limits(model), no_tilt, no_tilt + UNCONSTRAINED_RAD)
+    return PosePrior(axes, torch.zeros_like(std), std, joint_limits(model), no_tilt, no_tilt + TILT_STD_RAD)
 
 
 def tilt_of_hips(rotation: Float[Tensor, "n 3 3"]) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 3"]]:
