@@ -27,7 +27,7 @@ def axis_angle_to_quaternion(axis_angle_rad: Float[Tensor, "*n 3"]) -> Float[Ten
 
 
 def quaternion_to_axis_angle(quaternion_wxyz: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 3"]:
-    """Convert quaternions to axis-angle vectors (logarithm map) with angles in [0, pi] rad."""
+    """Convert quaternions to axis-angle vectors (logarithm map) with angles in [0, pi] rad; no gradient at zero."""
     w, vector = quaternion_wxyz[..., :1], quaternion_wxyz[..., 1:]
     sine = vector.norm(dim=-1, keepdim=True)
     half_angle = torch.atan2(sine, w.abs())

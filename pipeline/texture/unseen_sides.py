@@ -129,9 +129,8 @@ def _slice_colours(
         if len(members) >= MIN_SEEN:
             found[row], has_colour[row] = _weighted_medoid(colour[members], weight[members]), True
     if has_colour.any():
-        nearest = np.flatnonzero(has_colour)[
-            np.abs(np.arange(count)[:, None] - np.flatnonzero(has_colour)).argmin(axis=1)
-        ]
+        known = np.flatnonzero(has_colour)
+        nearest = known[np.abs(np.arange(count)[:, None] - known).argmin(axis=1)]
         found, has_colour = found[nearest], np.abs(nearest - np.arange(count)) <= MAX_GAP_SLICES
     return found, has_colour
 

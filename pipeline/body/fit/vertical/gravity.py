@@ -88,7 +88,7 @@ def level_evidence(settings: FitSettings) -> TiltEvidence:
 def axis_evidence(axis: TurnAxis | None, settings: FitSettings) -> TiltEvidence:
     """Return what is known of the vertical before the fit, in the world of a level camera.
 
-    axis: None if there is no turn.
+    axis: None if the person hardly turns.
     """
     evidence = level_evidence(settings)
     if axis is None:
@@ -133,7 +133,7 @@ def turn_observations(
     The detector reports a part of the tilt of the camera only, and the fit would start from there. The camera gets the
     focal length at which the turn was seen.
 
-    axis: None if there is no turn.
+    axis: None if the person hardly turns.
     """
     to_vertical = rotation_between(up, _y_axis())
     directions = observations.landmarks_3d_m @ to_vertical.T

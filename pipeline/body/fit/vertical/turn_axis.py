@@ -199,7 +199,7 @@ def estimate_turn_axis(
 ) -> TurnAxis | None:
     """Return the axis about which a person turns, all round or in an arc.
 
-    None if the person hardly turns or is not rigid, or if landmarks are too few.
+    None if the person hardly turns or is not rigid, if landmarks are too few, or if the focal length is implausible.
 
     observations: with corrected left and right, in the world of a level camera.
     focal_log_std: standard deviation of the logarithm of its focal length; 0 for a known one.
