@@ -1,4 +1,9 @@
-"""Adam optimiser of field and poses, its learning-rate schedules, and the detection of divergence."""
+"""Adam optimiser of field and poses, its learning-rate schedules, and the detection of divergence.
+
+Gradients of the poses are averaged over time before Adam's step (`PoseCorrection.averaging_weights`): a step shows few of
+the frames, and errors of neighbouring frames are alike (a Sobolev gradient: Neuberger, "Sobolev Gradients and
+Differential Equations", 1997).
+"""
 
 import math
 from collections.abc import Mapping
@@ -53,6 +58,7 @@ class FieldOptimiser:
         self.parameters |= {"rotation_rad": poses.rotation_rad, "shift_m": poses.shift_m, **attention}
         self.moments = {name: (torch.zeros_like(p), torch.zeros_like(p)) for name, p in self.parameters.items()}
         self.grad_table = torch.zeros_like(field.table)
+        self.pose_averaging = poses.averaging_weights(config.settings.pose_correlation_time_s)
         self.nonfinite_steps = 0
 
     def gradients(
@@ -84,6 +90,8 @@ class FieldOptimiser:
             gradients = {"table": self.grad_table} | gradients
         for name, gradient in gradients.items():
             is_pose = name in POSE_PARAMETERS
+            if is_pose:
+                gradient = torch.einsum("nm,m...->n...", self.pose_averaging, gradient)
             start_step = math.ceil(self.config.settings.pose_start_fraction * self.config.steps) if is_pose else 0
             adam_step_(
                 self.parameters[name],

@@ -41,6 +41,14 @@ def test_applied_corrections_equal_the_optimised_ones(body, correction):
     torch.testing.assert_close(again, optimised, atol=1e-5, rtol=0)
 
 
+def test_averages_over_time_have_the_weights_of_an_exponential(correction):
+    """Frames 0, 2, 3, 5 of 30 a second; the weight falls to 1 / e in a tenth of a second, which is three frames."""
+    weights = correction.averaging_weights(0.1)
+    torch.testing.assert_close(weights.sum(1), torch.ones(4))
+    torch.testing.assert_close(weights[0] / weights[0, 0], torch.exp(-torch.tensor([0.0, 2.0, 3.0, 5.0]) / 3.0))
+    torch.testing.assert_close(correction.averaging_weights(0.0), torch.eye(4))
+
+
 def test_corrections_between_two_motions_are_those_that_were_applied(body, correction):
     with torch.no_grad():
         correction.rotation_rad.normal_(std=0.05)
