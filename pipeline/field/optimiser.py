@@ -1,7 +1,7 @@
 """Adam optimiser of field and poses, its learning-rate schedules, and the detection of divergence.
 
-Gradients of the poses are averaged over time before Adam's step (`PoseCorrection.averaging_weights`): a step shows few of
-the frames, and errors of neighbouring frames are alike (a Sobolev gradient: Neuberger, "Sobolev Gradients and
+Gradients of the poses are averaged over time before Adam's step (`PoseCorrection.averaging_weights`): a step shows few
+of the frames, and errors of neighbouring frames are alike (a Sobolev gradient: Neuberger, "Sobolev Gradients and
 Differential Equations", 1997).
 """
 
