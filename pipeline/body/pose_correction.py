@@ -96,17 +96,16 @@ class PoseCorrection:
         """Return the mean squared correction (rad² and dm²)."""
         return self.rotation_rad.square().sum((1, 2)).mean() + (10 * self.shift_m).square().sum(1).mean()
 
-    def averaging_weights(self, correlation_time_s: float) -> Float[Tensor, "n n"]:
-        """Return weights that average over the frames near each frame: exp(-interval / correlation time), of sum 1.
+    def averaging_weights(self, correlation_s: float) -> Float[Tensor, "n n"]:
+        """Return weights that average over the frames near each frame: exp(-interval / correlation_s), rows of sum 1.
 
-        They are the covariance of the corrections (see `interpolate_corrections`), up to its scale. A gradient that is
-        averaged in this way is the one of independent unknowns whose mixture the corrections are: a frame learns from
-        what its neighbours show. 0 s: each frame alone.
+        Corrections of near frames are alike with this covariance (see `interpolate_corrections`): a frame can learn
+        from the gradients of its neighbours. 0 s: each frame alone.
         """
         time_s = self.motion.time_s.astype(np.float64)
-        if correlation_time_s == 0.0:
+        if correlation_s == 0.0:
             return torch.eye(len(time_s))
-        weights = np.exp(-np.abs(time_s[:, None] - time_s) / correlation_time_s)
+        weights = np.exp(-np.abs(time_s[:, None] - time_s) / correlation_s)
         return torch.from_numpy((weights / weights.sum(1, keepdims=True)).astype(np.float32))
 
     def apply(self, motion: Motion) -> Motion:

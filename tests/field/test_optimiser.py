@@ -1,10 +1,8 @@
 """The optimiser of the field's training, apart from any image: poses under gradients of a few frames a step."""
 
 import numpy as np
-import pytest
 import torch
 
-from pipeline.body.body import load_anny
 from pipeline.body.pose_correction import PoseCorrection
 from pipeline.field.field import RadianceField, hash_grid_layout
 from pipeline.field.optimiser import FieldOptimiser
@@ -13,12 +11,6 @@ from tests.field.scene import field_config, make_motion
 FRAMES, STEPS, FRAMES_PER_STEP = 60, 600, 4
 NOISE = 2.0
 """Standard deviation of a frame's gradient, over the root mean square of the true one."""
-
-
-@pytest.fixture(scope="module")
-def body():
-    anny = load_anny()
-    return anny.at_shape(anny.shape_defaults)
 
 
 def errors_after_training(body, wanted_rad, correlation_time_s):
