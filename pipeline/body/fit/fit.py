@@ -2,7 +2,8 @@
 
 The shared parameters (shape, focal length, principal point, landmark offsets) are fitted on some frames spread over the
 recording, first to landmarks, then to silhouettes as well. Then the poses of all frames are fitted with the shared
-parameters fixed. `fit_supplied_poses` keeps user-supplied shape and poses, or starts from them.
+parameters fixed. The shape includes clothes (`clothing`), which masks show and the result leaves out.
+`fit_supplied_poses` keeps user-supplied shape and poses, or starts from them.
 """
 
 from collections.abc import Sequence
@@ -17,6 +18,7 @@ from torch import Tensor
 from pipeline.body.body import ParametricBody
 from pipeline.body.fit.camera_parameters import apply_intrinsics_delta
 from pipeline.body.fit.checkpoint import FitProgress, load_progress, save_progress
+from pipeline.body.fit.context import FitContext
 from pipeline.body.fit.detections.left_right_swaps import (
     LIMB_SWAP_PAIRS,
     detect_body_swaps,
@@ -27,9 +29,8 @@ from pipeline.body.fit.detections.left_right_swaps import (
 from pipeline.body.fit.energy import EnergyParameters, Objective, compute_px_per_m
 from pipeline.body.fit.ground_contact import Contact, estimate_floor_contact
 from pipeline.body.fit.initialisation import has_torso_landmarks, initial_state, interpolated_state
-from pipeline.body.fit.landmark_regressor import LandmarkRegressor, landmark_regressor
 from pipeline.body.fit.levenberg_marquardt import NormalEquations, minimise
-from pipeline.body.fit.linear_body import LinearBody, linearise_body, relaxed_curls_rad
+from pipeline.body.fit.linear_body import LinearBody, relaxed_curls_rad
 from pipeline.body.fit.options import (
     FitOptions,
     free_parameters,
@@ -39,13 +40,7 @@ from pipeline.body.fit.options import (
 )
 from pipeline.body.fit.prior.forearm_flips import unflip_forearms
 from pipeline.body.fit.prior.posture import Posture, prior_of_recording
-from pipeline.body.fit.prior.priors import (
-    PosePrior,
-    ShapePrior,
-    estimate_motion_std,
-    pose_prior,
-    shape_prior,
-)
+from pipeline.body.fit.prior.priors import estimate_motion_std
 from pipeline.body.fit.result import FitResult, landmark_errors_px, posterior_stds, shared_step_ratio
 from pipeline.body.fit.root_placement import world_to_perspective
 from pipeline.body.fit.silhouette_icp import MaskWindow, match_silhouettes
@@ -76,23 +71,6 @@ class TooFewLandmarksError(ValueError):
 
 
 @dataclass(frozen=True)
-class _FitContext:
-    """Constants of a fit. `default`: the body at the default shape."""
-
-    body: ParametricBody
-    regressor: LandmarkRegressor
-    pose_prior: PosePrior
-    shape_prior: ShapePrior
-    default: LinearBody
-    curls_rad: Float[np.ndarray, "2 4"]
-    settings: FitSettings
-
-    def linearise(self, shape: Float[Tensor, "s"]) -> LinearBody:
-        """Return the body linearised around a shape."""
-        return linearise_body(self.body, shape, self.curls_rad)
-
-
-@dataclass(frozen=True)
 class _Recording:
     """What the poses so far tell of the recording: posture, `Objective.motion_std` and contacts with the floor."""
 
@@ -120,7 +98,8 @@ def fit_body(
         TooFewLandmarksError: fewer than three frames have a torso in pixels and in 3D.
     """
     _check_landmarks(observations)
-    context = _build_context(body, relaxed_curls_rad() if curls_rad is None else curls_rad, options.settings)
+    curls_rad = relaxed_curls_rad() if curls_rad is None else curls_rad
+    context = FitContext.of(body, curls_rad, options.settings, has_clothing=True)
     offset_count = context.regressor.offset_jacobian.shape[-1]
     no_offsets = torch.zeros(offset_count, dtype=torch.float64)
     rest_landmarks_m = context.regressor.points(context.default, no_offsets).rest_m[0]
@@ -138,7 +117,7 @@ def fit_body(
     progress = load_progress(checkpoint)
     if progress is None:
         start = initial_state(
-            observations, rest_landmarks_m, context.default.joints_m, body.shape_defaults.double(), offset_count
+            observations, rest_landmarks_m, context.default.joints_m, context.default.shape, offset_count
         )
         progress = _fit_shared(context, observations, windows, start, options, evidence)
         save_progress(checkpoint, progress)
@@ -178,7 +157,7 @@ def fit_supplied_poses(
     to_fit[supplied.rows] = not keep
     if to_fit.any():
         _check_landmarks(observations)
-    context = _build_context(body, relaxed_curls_rad(), settings)
+    context = FitContext.of(body, relaxed_curls_rad(), settings, has_clothing=False)
     model = context.linearise(supplied.shape)
     state = supplied.to_fit_state(model.full_joint_indices, observations.time_s)
     rest_landmarks_m = context.regressor.points(model, state.landmark_offsets_m).rest_m[0]
@@ -209,19 +188,6 @@ def _check_landmarks(observations: Observations) -> None:
         raise TooFewLandmarksError(f"fewer than {MIN_FRAMES} frames have hips and shoulders in pixels and in 3D")
 
 
-def _build_context(body: ParametricBody, curls_rad: Float[np.ndarray, "2 4"], settings: FitSettings) -> _FitContext:
-    default = linearise_body(body, body.shape_defaults, curls_rad)
-    return _FitContext(
-        body,
-        landmark_regressor(default),
-        pose_prior(default),
-        shape_prior(body.shape_names, body.shape_defaults),
-        default,
-        curls_rad,
-        settings,
-    )
-
-
 def _correct_left_right_swaps(
     observations: Observations, rest_landmarks_m: Float[Tensor, "l 3"]
 ) -> tuple[Observations, dict[str, Bool[np.ndarray, "n"]]]:
@@ -235,7 +201,7 @@ def _correct_left_right_swaps(
 
 
 def _fit_shared(
-    context: _FitContext,
+    context: FitContext,
     observations: Observations,
     windows: Sequence[MaskWindow | None],
     start: FitState,
@@ -280,7 +246,7 @@ def _fit_shared(
 
 
 def _fit_poses(
-    context: _FitContext,
+    context: FitContext,
     observations: Observations,
     windows: Sequence[MaskWindow | None],
     progress: FitProgress,
@@ -326,7 +292,7 @@ def _fit_poses(
 
 
 def _silhouette_round(
-    context: _FitContext,
+    context: FitContext,
     model: LinearBody,
     observations: Observations,
     windows: Sequence[MaskWindow | None],
@@ -352,7 +318,7 @@ def _silhouette_round(
 
 
 def _fit_landmarks(
-    context: _FitContext,
+    context: FitContext,
     model: LinearBody,
     observations: Observations,
     parameters: EnergyParameters,
@@ -373,7 +339,7 @@ def _fit_landmarks(
 
 
 def _result(
-    context: _FitContext,
+    context: FitContext,
     model: LinearBody,
     state: FitState,
     observations: Observations,
@@ -383,7 +349,7 @@ def _result(
     """Return the result with zero standard deviations."""
     quaternions = matrix_to_quaternion(model.all_joint_rotations(state.rotations))
     return FitResult(
-        body=context.body.at_shape(state.shape.float()),
+        body=context.bare_body(state.shape),
         rotations_wxyz=continuous_quaternions(quaternions).float().numpy(),
         root_translation_m=state.root_m.float().numpy(),
         camera=apply_intrinsics_delta(observations.camera, state.intrinsics_delta),
