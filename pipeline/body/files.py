@@ -81,7 +81,7 @@ def load_motion(path: Path) -> Motion:
 class FrameScores:
     """Quality of the fit in each frame.
 
-    silhouette_iou: of body and mask, 0 to 1; nan without a mask.
+    silhouette_iou: of the body with its clothes and the mask, 0 to 1; nan without a mask.
     landmark_error_px: median reprojection error; nan without landmarks.
     left_right_swapped: whether swapped landmarks of any body part were corrected.
     residual_blob_share: fraction of the mask in its largest part away from the body; nan without a mask.

@@ -158,7 +158,7 @@ def _headline_metrics(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
         (_format_db(field["psnr_full"]), "dB", "field, full held-out image"),
         (_format_db(field["psnr_body"]), "dB", "field, body pixels"),
         (format_metric(mesh["ssim_full"]), "SSIM", "mesh, full held-out image"),
-        (format_metric(report["body"]["silhouette_iou"]), "IoU", "fitted body and masks"),
+        (format_metric(report["body"]["silhouette_iou"]), "IoU", "fitted body with clothes, and masks"),
         (f"{health['faces']:,}", "faces", closed),
         (f"{report['seconds']['total']:.0f}", "s", "all stages"),
         (f"{max(report['peak_rss_mib'].values()):,.0f}", "MiB", "peak memory"),

@@ -23,7 +23,8 @@ RELIABLE_CONFIDENCE = 0.5
 class FitResult:
     """The fitted person and camera, n frames.
 
-    landmark_error_px, silhouette_iou: of each frame; nan without landmarks or mask.
+    landmark_error_px, silhouette_iou: of each frame; nan without landmarks or mask. The silhouette is that of the
+        clothed body.
     left_right_swapped: by body part, the frames whose landmarks were swapped.
     focal_relative_std, height_std_m: standard deviations from the curvature of the energy.
     contradicting_focal_log: logarithm of the focal length that a turn shows over the supplied one, if they contradict;
