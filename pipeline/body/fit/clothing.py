@@ -3,11 +3,13 @@
 Masks show clothes, the parametric body is bare. What its shape cannot explain, the poses do: under a coat the hips
 turned by 4 degrees to where the body is as wide as the mask. The offset is a sum of manifold harmonics (Vallet and
 Levy, "Spectral geometry processing with manifold harmonics", 2008) of trunk and limbs with a Gaussian prior, small for
-short wavelengths. Heads, hands and feet have none. Only the fit uses it: the body that it returns is bare.
+short wavelengths. Heads, hands and feet have none. The body that results is the bare one that fills these clothes: the
+offset itself is not told where nothing is seen, between the legs.
 
 Dimensions: v vertices, s parameters of the bare shape, c harmonics.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import igl
@@ -32,6 +34,15 @@ SMOOTH_LENGTH_M = 0.12
 
 LARGEST_OFFSET = 5.0
 """Bound of each parameter, in standard deviations."""
+
+FILL_STD_M, FILL_JOINT_STD_M = 0.01, 0.001
+"""Standard deviations of the surface and of the joints of the body that fills the clothes."""
+
+FILL_POINTS = 1000
+"""Independent points as which the surface counts, about as many as the silhouettes of a fit."""
+
+FILL_STEPS = 3
+"""Gauss-Newton steps; the shape is nearly linear in its parameters."""
 
 BARE_JOINTS = ("Head", "LeftHand", "RightHand", "LeftFoot", "LeftToeBase", "RightFoot", "RightToeBase")
 
@@ -79,6 +90,38 @@ def with_clothing(prior: ShapePrior, count: int) -> ShapePrior:
         lower_bound=torch.nn.functional.pad(prior.lower_bound, (0, count), value=-LARGEST_OFFSET),
         upper_bound=torch.nn.functional.pad(prior.upper_bound, (0, count), value=LARGEST_OFFSET),
     )
+
+
+def fill_clothes(
+    clothed: LinearBody,
+    shape: Float[Tensor, "s"],
+    prior: ShapePrior,
+    linearise: Callable[[Float[Tensor, "s"]], LinearBody],
+) -> Float[Tensor, "s"]:
+    """Return the parameters of the bare body whose surface is nearest to a clothed one and whose joints are the same.
+
+    shape: of the body below the clothes. prior: of these parameters. linearise: the bare body around a shape.
+    """
+    for _ in range(FILL_STEPS):
+        bare = linearise(shape)
+        surface_scale = (FILL_POINTS / len(bare.vertices_m)) ** 0.5 / FILL_STD_M
+        jacobian = torch.cat(
+            [
+                bare.vertices_shape_jacobian.flatten(0, 1) * surface_scale,
+                bare.joints_shape_jacobian.flatten(0, 1) / FILL_JOINT_STD_M,
+                torch.diag(1.0 / prior.std),
+            ]
+        )
+        residual = torch.cat(
+            [
+                (clothed.vertices_m - bare.vertices_m).flatten() * surface_scale,
+                (clothed.joints_m - bare.joints_m).flatten() / FILL_JOINT_STD_M,
+                (prior.mean - shape) / prior.std,
+            ]
+        )
+        step = torch.linalg.solve(jacobian.T @ jacobian, jacobian.T @ residual)
+        shape = (shape + step).clamp(prior.lower_bound, prior.upper_bound)
+    return shape
 
 
 def _lowest_eigenvectors(

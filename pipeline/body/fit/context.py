@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.body.body import Body, ParametricBody
-from pipeline.body.fit.clothing import clothing_offsets, dress, with_clothing
+from pipeline.body.fit.clothing import clothing_offsets, dress, fill_clothes, with_clothing
 from pipeline.body.fit.landmark_regressor import LandmarkRegressor, landmark_regressor
 from pipeline.body.fit.linear_body import LinearBody, linearise_body
 from pipeline.body.fit.prior.priors import PosePrior, ShapePrior, pose_prior, shape_prior
@@ -50,12 +50,19 @@ class FitContext:
     def linearise(self, shape: Float[Tensor, "s"]) -> LinearBody:
         """Return the clothed body linearised around a shape."""
         bare, clothing = self._split(shape)
-        return dress(linearise_body(self.body, bare, self.curls_rad), self.clothing_m, clothing)
+        return dress(self._linearise_bare(bare), self.clothing_m, clothing)
 
-    def bare_body(self, shape: Float[Tensor, "s"]) -> Body:
-        """Return the body of a shape without its clothes."""
-        bare, _ = self._split(shape)
+    def filled_body(self, shape: Float[Tensor, "s"]) -> Body:
+        """Return the bare body that fills the clothes of a shape and keeps its joints."""
+        bare, clothing = self._split(shape)
+        if len(clothing) > 0:
+            prior = ShapePrior(*(values[: len(bare)] for values in vars(self.shape_prior).values()))
+            bare = fill_clothes(self.linearise(shape), bare, prior, self._linearise_bare)
         return self.body.at_shape(bare.float())
+
+    def _linearise_bare(self, bare: Float[Tensor, "s"]) -> LinearBody:
+        """Return the bare body linearised around a shape."""
+        return linearise_body(self.body, bare, self.curls_rad)
 
     def _split(self, shape: Float[Tensor, "s"]) -> tuple[Tensor, Tensor]:
         """Return the parameters of body and clothing."""

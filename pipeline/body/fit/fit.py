@@ -2,7 +2,7 @@
 
 The shared parameters (shape, focal length, principal point, landmark offsets) are fitted on some frames spread over the
 recording, first to landmarks, then to silhouettes as well. Then the poses of all frames are fitted with the shared
-parameters fixed. The shape includes clothes (`clothing`), which masks show and the result leaves out.
+parameters fixed. The shape includes clothes (`clothing`), which masks show.
 `fit_supplied_poses` keeps user-supplied shape and poses, or starts from them.
 """
 
@@ -349,7 +349,7 @@ def _result(
     """Return the result with zero standard deviations."""
     quaternions = matrix_to_quaternion(model.all_joint_rotations(state.rotations))
     return FitResult(
-        body=context.bare_body(state.shape),
+        body=context.filled_body(state.shape),
         rotations_wxyz=continuous_quaternions(quaternions).float().numpy(),
         root_translation_m=state.root_m.float().numpy(),
         camera=apply_intrinsics_delta(observations.camera, state.intrinsics_delta),

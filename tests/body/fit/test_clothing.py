@@ -91,6 +91,11 @@ def test_thick_clothes_do_not_move_the_joints() -> None:
     aligned_m, absolute_m = joint_errors_m(fitted_joints_m(result, scene), scene.joints_m())
     print(f"joints {1000 * aligned_m:.1f} and {1000 * absolute_m:.1f} mm, iou {result.silhouette_iou.mean():.3f}")
     assert aligned_m < 0.020  # the bare body: 0.035
+    thighs = scene.model.skin_weights[:, [ACTIVE_JOINTS.index("LeftUpLeg"), ACTIVE_JOINTS.index("RightUpLeg")]]
+    surface_m = torch.from_numpy(result.body.vertices).double() - dressed.model.vertices_m
+    distance_m = surface_m[thighs.sum(1) > 0.9].norm(dim=1).median()
+    print(f"thighs {1000 * distance_m:.1f} mm")
+    assert distance_m < 0.025  # below the clothes: 0.036
     assert result.silhouette_iou.mean() > 0.97
     height_m = float(np.ptp(result.body.vertices[:, 1]))
     assert height_m == pytest.approx(scene.model.height_m()[0], abs=0.01)
