@@ -1,6 +1,7 @@
 """Clothes in the fit: harmonics of the surface, and a fit to masks of thick clothes."""
 
 from dataclasses import replace
+from functools import partial
 
 import igl
 import numpy as np
@@ -8,7 +9,15 @@ import pytest
 import torch
 
 from pipeline.body.body import load_anny
-from pipeline.body.fit.clothing import BARE_JOINTS, HARMONICS, OFFSET_STD_M, clothing_offsets, dress, with_clothing
+from pipeline.body.fit.clothing import (
+    BARE_JOINTS,
+    HARMONICS,
+    OFFSET_STD_M,
+    clothing_offsets,
+    dress,
+    fill_clothes,
+    with_clothing,
+)
 from pipeline.body.fit.fit import fit_body
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody, linearise_body
 from pipeline.body.fit.options import FitOptions
@@ -77,6 +86,26 @@ def test_the_prior_of_the_body_stays(model: LinearBody) -> None:
         assert torch.equal(getattr(clothed, name)[:-2], value)
     assert clothed.std[-2:].tolist() == [1.0, 1.0]
     assert clothed.mean[-2:].tolist() == [0.0, 0.0]
+
+
+def test_a_body_that_fills_a_body_is_that_body(model: LinearBody) -> None:
+    body = load_anny()
+    true = torch.tensor(
+        [
+            {"waist-girth": 0.5, "weight": 0.7}.get(name, float(value))
+            for name, value in zip(body.shape_names, body.shape_defaults, strict=True)
+        ]
+    ).double()
+    prior = shape_prior(body.shape_names, body.shape_defaults)
+    target = linearise_body(body, true)
+    found = fill_clothes(target, body.shape_defaults.double(), prior, partial(linearise_body, body))
+    filled = linearise_body(body, found)
+    before_m = (model.vertices_m - target.vertices_m).norm(dim=1).mean()
+    after_m = (filled.vertices_m - target.vertices_m).norm(dim=1).mean()
+    joints_m = (filled.joints_m - target.joints_m).norm(dim=1).max()
+    print(f"surface {1000 * before_m:.1f} -> {1000 * after_m:.2f} mm, joints {1000 * joints_m:.2f} mm")
+    assert after_m < 0.1 * before_m
+    assert joints_m < 0.002
 
 
 def test_thick_clothes_do_not_move_the_joints() -> None:
