@@ -8,9 +8,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.body.body import Body, ParametricBody
-from pipeline.body.fit.clothing import clothing_offsets, dress, fill_clothes, with_clothing
 from pipeline.body.fit.landmark_regressor import LandmarkRegressor, landmark_regressor
 from pipeline.body.fit.linear_body import LinearBody, linearise_body
+from pipeline.body.fit.prior.clothing import clothing_offsets, dress, fill_clothes, with_clothing
 from pipeline.body.fit.prior.priors import PosePrior, ShapePrior, pose_prior, shape_prior
 from pipeline.body.settings import FitSettings
 
@@ -20,7 +20,7 @@ class FitContext:
     """Constants of a fit.
 
     default: the body at the default shape.
-    clothing_m: from `clothing.clothing_offsets`; without columns, the body is bare. The shape parameters of the fit are
+    clothing_m: from `prior.clothing.clothing_offsets`; without columns, the body is bare. The shape parameters of the fit are
         those of the body followed by those of the clothing.
     """
 

@@ -2,7 +2,7 @@
 
 The shared parameters (shape, focal length, principal point, landmark offsets) are fitted on some frames spread over the
 recording, first to landmarks, then to silhouettes as well. Then the poses of all frames are fitted with the shared
-parameters fixed. The shape includes clothes (`clothing`), which masks show.
+parameters fixed. The shape includes clothes (`prior.clothing`), which masks show.
 `fit_supplied_poses` keeps user-supplied shape and poses, or starts from them.
 """
 

@@ -9,7 +9,10 @@ import pytest
 import torch
 
 from pipeline.body.body import load_anny
-from pipeline.body.fit.clothing import (
+from pipeline.body.fit.fit import fit_body
+from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody, linearise_body
+from pipeline.body.fit.options import FitOptions
+from pipeline.body.fit.prior.clothing import (
     BARE_JOINTS,
     HARMONICS,
     OFFSET_STD_M,
@@ -18,9 +21,6 @@ from pipeline.body.fit.clothing import (
     fill_clothes,
     with_clothing,
 )
-from pipeline.body.fit.fit import fit_body
-from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody, linearise_body
-from pipeline.body.fit.options import FitOptions
 from pipeline.body.fit.prior.priors import shape_prior
 from tests.body.acting import fitted_joints_m, joint_errors_m, synthetic_recording
 
