@@ -20,8 +20,8 @@ class FitContext:
     """Constants of a fit.
 
     default: the body at the default shape.
-    clothing_m: from `prior.clothing.clothing_offsets`; without columns, the body is bare. The shape parameters of the fit are
-        those of the body followed by those of the clothing.
+    clothing_m: from `prior.clothing.clothing_offsets`; without columns, the body is bare. The shape parameters of the
+        fit are those of the body followed by those of the clothing.
     """
 
     body: ParametricBody
