@@ -52,12 +52,12 @@ class FitContext:
         bare, clothing = self._split(shape)
         return dress(self._linearise_bare(bare), self.clothing_m, clothing)
 
-    def filled_body(self, shape: Float[Tensor, "s"]) -> Body:
-        """Return the bare body that fills the clothes of a shape and keeps its joints."""
-        bare, clothing = self._split(shape)
+    def filled_body(self, clothed: LinearBody) -> Body:
+        """Return the bare body that fills the clothes of a body from `linearise` and keeps its joints."""
+        bare, clothing = self._split(clothed.shape)
         if len(clothing) > 0:
             prior = ShapePrior(*(values[: len(bare)] for values in vars(self.shape_prior).values()))
-            bare = fill_clothes(self.linearise(shape), bare, prior, self._linearise_bare)
+            bare = fill_clothes(clothed, bare, prior, self._linearise_bare)
         return self.body.at_shape(bare.float())
 
     def _linearise_bare(self, bare: Float[Tensor, "s"]) -> LinearBody:
