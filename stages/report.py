@@ -11,7 +11,7 @@ from jaxtyping import Float, Int, UInt8
 from pydantic import Field
 from torch import Tensor
 
-from pipeline.avatar.clay import render_clay, render_clay_head
+from pipeline.avatar.clay import ClayViews, render_clay, render_clay_head
 from pipeline.avatar.finished_run import FinishedRun, load_finished_run
 from pipeline.avatar.motion.pose_fit import fit_poses
 from pipeline.body.body import canonical_to_world
@@ -27,6 +27,7 @@ from pipeline.core.progress import track, warn
 from pipeline.core.stage import Stage
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.texture_rendering import blur_coverage
+from pipeline.io.glb import GlbFile
 from pipeline.io.image import read_gray, read_rgb, to_uint8, write_rgb
 from pipeline.kernels.common.thread_pool import ThreadPool
 from pipeline.mesh.pose_alignment import MAX_PERSON_PX
@@ -109,10 +110,11 @@ def run(
         out / "turntable.jpg",
         image_grid([[composite_on_white_uint8(view) for view in turntable_views] for _, turntable_views in turntable]),
     )
-    clay, clay_posed = render_clay_turntables(loaded, middle, config, settings)
+    glb_path = inputs["export"] / "avatar.glb"
+    glb = glb_path.read_bytes()
+    clay, clay_posed = render_clay_turntables(loaded, GlbFile(glb_path, glb), middle, config, settings)
     write_rgb(out / "clay.jpg", image_grid([[composite_on_white_uint8(view) for view in views] for _, views in clay]))
     write_rgb(out / "heldout.jpg", image_grid([_comparison_row(frame) for frame in frame_images]))
-    glb = (inputs["export"] / "avatar.glb").read_bytes()
     metric_sections: dict[str, Mapping[str, float | int | bool]] = {
         "mesh": mesh_quality_metrics(loaded.avatar.mesh()),
         "export": {"glb_bytes": len(glb), "texture_px": len(loaded.avatar.diffuse)},
@@ -293,21 +295,34 @@ def render_turntables(
 
 
 def render_clay_turntables(
-    loaded: FinishedRun, position: int, config: Config, settings: ReportSettings = REPORT_SETTINGS
+    loaded: FinishedRun, glb: GlbFile, position: int, config: Config, settings: ReportSettings = REPORT_SETTINGS
 ) -> tuple[list[Turntable], Turntable]:
-    """Render the shape without texture: rows of the A-pose for the clay sheet, and clay in the pose of one frame."""
-    mesh, views, height_px = loaded.avatar.mesh(), config.turntable_views, settings.turntable_height_px
+    """Render the shape without texture: rows of the exported avatar at rest, and clay in the pose of one frame."""
+    views, height_px = config.turntable_views, settings.turntable_height_px
     posed = loaded.avatar.pose_vertices(loaded.refined_canonical_to_world[position]).numpy()
-    meshes = (mesh, Mesh(posed, mesh.faces))
-    pool = ThreadPool(len(meshes))
-    canonical, in_pose = pool.map(lambda each: render_clay(each, views, height_px), meshes)
+    in_pose = Mesh(posed, loaded.avatar.faces.numpy()), loaded.avatar.vertex_normals(posed)
+    at_rest = exported_surface(glb)
+
+    def render(surface: tuple[Mesh, Float[np.ndarray, "v 3"]]) -> ClayViews:
+        return render_clay(*surface, views, height_px)
+
+    rest_clay, posed_clay = ThreadPool(2).map(render, (at_rest, in_pose))
     rows = [
-        ("A-pose, clay", canonical.smooth),
-        ("A-pose, clay, flat shading: the triangles", canonical.flat),
-        ("A-pose, canonical normals: red to the person's left, green up, blue to the front", canonical.normals),
-        ("Head, clay", render_clay_head(mesh, views, settings.clay_head_height_px)),
+        ("Rest pose, clay", rest_clay.smooth),
+        ("Rest pose, clay, flat shading: the triangles", rest_clay.flat),
+        ("Rest pose, normals: red to the person's left, green up, blue to the front", rest_clay.normals),
+        ("Head, clay", render_clay_head(*at_rest, views, settings.clay_head_height_px)),
     ]
-    return rows, (f"{_pose_title(loaded, position)}, clay", in_pose.smooth)
+    return rows, (f"{_pose_title(loaded, position)}, clay", posed_clay.smooth)
+
+
+def exported_surface(glb: GlbFile) -> tuple[Mesh, Float[np.ndarray, "v 3"]]:
+    """Return the surface of an exported avatar in its rest pose (m, +Y up), and the unit normals of its vertices."""
+    parts = glb.skinned_primitives()
+    first = np.cumsum([0, *(len(part.positions) for part in parts)])
+    faces = np.concatenate([part.faces + start for part, start in zip(parts, first, strict=False)])
+    vertices, normals = (np.concatenate([getattr(part, name) for part in parts]) for name in ("positions", "normals"))
+    return Mesh(vertices, faces.astype(np.int32)), normals
 
 
 def _pose_title(loaded: FinishedRun, position: int) -> str:
@@ -341,7 +356,7 @@ def _manifest(folder: Path) -> Manifest:
 
 STAGE = Stage(
     name="report",
-    version=14,
+    version=15,
     needs=NEEDS,
     makes=("report.json", "index.html", "turntable.jpg", "clay.jpg", "heldout.jpg"),
     config=Config,

@@ -190,13 +190,16 @@ def compare_ceiling(comparison: Comparison) -> dict[str, dict[str, float]]:
 
 def compare_clay(comparison: Comparison) -> list[ImagePair]:
     """Render truth and avatar in clay, in the A-pose of the true rig and aligned, from `CLAY_VIEWS` sides."""
-    true, avatar = comparison.true_rest_mesh, comparison.alignment.transform_mesh(comparison.rest_mesh)
+    run, true = comparison.run.avatar, comparison.true_rest_mesh
+    avatar = comparison.alignment.transform_mesh(Mesh(comparison.rest_mesh.vertices, run.faces.numpy()))
     corners = true.vertices[true.faces].reshape(-1, 3)
     cameras = turntable_cameras(corners.min(axis=0), corners.max(axis=0), CLAY_VIEWS, CLAY_HEIGHT_PX)
     return [
         ImagePair(truth, premultiply_to_float(drawn))
         for truth, drawn in zip(
-            render_clay_views(true, cameras).smooth, render_clay_views(avatar, cameras).smooth, strict=True
+            render_clay_views(true, true.vertex_normals(), cameras).smooth,
+            render_clay_views(avatar, run.vertex_normals(avatar.vertices), cameras).smooth,
+            strict=True,
         )
     ]
 

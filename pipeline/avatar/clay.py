@@ -60,26 +60,27 @@ class ClayViews:
         )
 
 
-def render_clay(mesh: Mesh, views: int, height_px: int) -> ClayViews:
+def render_clay(mesh: Mesh, vertex_normals: Float[np.ndarray, "v 3"], views: int, height_px: int) -> ClayViews:
     """Render the whole body in clay and as normal map; cameras and cropping as in `TexturedAvatar.render_turntable`.
 
     Args:
         mesh: m, +Y up.
+        vertex_normals: of unit length.
         views: number of views.
         height_px: height of each image.
     """
     box_m = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    return render_clay_views(mesh, turntable_cameras(*box_m, views, height_px)).cropped()
+    return render_clay_views(mesh, vertex_normals, turntable_cameras(*box_m, views, height_px)).cropped()
 
 
-def render_clay_head(mesh: Mesh, views: int, height_px: int) -> Views:
+def render_clay_head(mesh: Mesh, vertex_normals: Float[np.ndarray, "v 3"], views: int, height_px: int) -> Views:
     """Render the head of a standing person in clay with interpolated normals; arguments as in `render_clay`."""
     top_m, bottom_m = float(mesh.vertices[:, 1].max()), float(mesh.vertices[:, 1].min())
     neck_m = top_m - HEAD_FRACTION * (top_m - bottom_m)
     head = mesh.vertices[mesh.vertices[:, 1] > neck_m]
     box_m = np.minimum(head.min(axis=0), [np.inf, neck_m, np.inf]), head.max(axis=0)
     cameras = turntable_cameras(*box_m, views, height_px)
-    return render_clay_views(mesh, cameras).cropped().smooth
+    return render_clay_views(mesh, vertex_normals, cameras).cropped().smooth
 
 
 def shade_clay(normals: Float[Tensor, "n 3"], world_to_camera: Float[np.ndarray, "4 4"]) -> Float[Tensor, "n"]:
@@ -90,21 +91,19 @@ def shade_clay(normals: Float[Tensor, "n 3"], world_to_camera: Float[np.ndarray,
     return linear_to_srgb((ALBEDO * irradiance).clamp(0.0, 1.0))
 
 
-def render_clay_views(mesh: Mesh, cameras: Sequence[Camera]) -> ClayViews:
+def render_clay_views(mesh: Mesh, vertex_normals: Float[np.ndarray, "v 3"], cameras: Sequence[Camera]) -> ClayViews:
     """Render one view of a mesh (m, world, +Y up) for each camera, of the size of its image."""
     vertices, faces = torch.from_numpy(mesh.vertices).float(), torch.from_numpy(mesh.faces)
-    vertex_normals, face_normals = (
-        torch.from_numpy(normals).float() for normals in (mesh.vertex_normals(), mesh.face_normals())
-    )
+    of_vertices, of_faces = (torch.from_numpy(each).float() for each in (vertex_normals, mesh.face_normals()))
     made = ClayViews([], [], [])
     for camera in cameras:
         fine = camera.scaled(float(SUPERSAMPLING))
         face_id, barycentric, _ = rasterize(*project(vertices, fine), faces, fine.height, fine.width)
         seen = face_id >= 0
         face = face_id[seen].long()
-        smooth = (vertex_normals[faces[face].long()] * barycentric[seen][..., None]).sum(1)
+        smooth = (of_vertices[faces[face].long()] * barycentric[seen][..., None]).sum(1)
         smooth = torch.nn.functional.normalize(smooth, dim=1)
-        grey = [shade_clay(normals, camera.world_to_camera)[:, None] for normals in (smooth, face_normals[face])]
+        grey = [shade_clay(normals, camera.world_to_camera)[:, None] for normals in (smooth, of_faces[face])]
         for views, colours in zip((made.smooth, made.flat, made.normals), (*grey, 0.5 * smooth + 0.5), strict=True):
             samples = np.zeros((fine.height, fine.width, 4), dtype=np.float32)
             samples[seen.numpy()] = torch.cat([colours.expand(-1, 3), torch.ones(len(face), 1)], dim=1).numpy()

@@ -91,6 +91,7 @@ def load_textured_avatar(mesh_dir: Path, texture_dir: Path) -> TexturedAvatar:
         gloss=vertex_gloss(replace(texture, atlas=atlas), len(skinned.mesh.vertices)),
         normal_map=texture.normal,
         whole=whole.mesh,
+        skinned=skinned,
     )
 
 

@@ -12,6 +12,7 @@ from pipeline.geometry.camera import Camera
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.skinning import dense_weights, linear_blend_skinning
 from pipeline.geometry.texture_rendering import apply_shading, render_textured, turntable_cameras
+from pipeline.mesh.files import MeshArtifact
 from pipeline.texture.light import VertexGloss, VideoLight
 
 
@@ -31,6 +32,7 @@ class TexturedAvatar:
         gloss: highlights of the vertices under that light; None for a matte surface.
         normal_map: tangent space, in [0, 1]; None: the normals of the vertices. Drawn under a light, not unlit.
         whole: the same surface with each vertex once; None where `vertices` are so.
+        skinned: the same vertices, with the triangles that normals are those of; None: `faces`.
     """
 
     vertices: Float[Tensor, "v 3"]
@@ -44,6 +46,7 @@ class TexturedAvatar:
     gloss: VertexGloss | None = None
     normal_map: Float32[np.ndarray, "n n 3"] | None = None
     whole: Mesh | None = None
+    skinned: MeshArtifact | None = None
 
     def mesh(self) -> Mesh:
         """Return the canonical mesh without texture and skin, connected across folds."""
@@ -53,6 +56,12 @@ class TexturedAvatar:
         """Pose the vertices (m, world) by linear blend skinning, as a glTF viewer does."""
         weights = dense_weights(self.joint_indices, self.joint_weights, len(canonical_to_world))
         return linear_blend_skinning(self.vertices, weights, canonical_to_world[None])[0]
+
+    def vertex_normals(self, posed: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
+        """Return the unit normals of posed vertices, as the exported files have them."""
+        if self.skinned is None:
+            return Mesh(posed, self.faces.numpy()).vertex_normals()
+        return self.skinned.vertex_normals(posed)
 
     def render(
         self,

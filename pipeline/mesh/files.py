@@ -40,12 +40,16 @@ class MeshArtifact:
     unsplit: UnsplitNormals | None = None
     creases: Creases | None = None
 
-    def vertex_normals(self) -> Float[np.ndarray, "v 3"]:
-        """Return unit normals of the surface as it was before its triangles were split, of each side of its folds."""
-        own = self.mesh.vertex_normals()
+    def vertex_normals(self, posed: Float[np.ndarray, "v 3"] | None = None) -> Float[np.ndarray, "v 3"]:
+        """Return unit normals of the surface as it was before its triangles were split, of each side of its folds.
+
+        posed: the vertices in another pose; None: as they are in the mesh.
+        """
+        vertices = self.mesh.vertices if posed is None else posed
+        own = Mesh(vertices, self.mesh.faces).vertex_normals()
         if self.unsplit is None:
             return own
-        smooth = self.unsplit.vertex_normals(self.mesh.vertices)
+        smooth = self.unsplit.vertex_normals(vertices)
         if self.creases is None:
             return smooth
         folded = self.creases.on_fold()

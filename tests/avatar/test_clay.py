@@ -26,7 +26,7 @@ def sphere(subdivisions: int) -> Mesh:
 
 @pytest.fixture(scope="module")
 def ball():
-    return render_clay(sphere(4), views=4, height_px=120)
+    return render_clay(sphere(4), sphere(4).vertex_normals(), views=4, height_px=120)
 
 
 def test_normals_of_a_sphere_are_its_directions(ball):
@@ -68,7 +68,7 @@ def test_irradiance_is_that_of_one_lamp_and_the_sky():
 
 def test_flat_shading_shows_the_triangles():
     """On an icosahedron each face has one level when shaded flat, and many when shaded smoothly."""
-    coarse = render_clay(sphere(0), views=1, height_px=150)
+    coarse = render_clay(sphere(0), sphere(0).vertex_normals(), views=1, height_px=150)
     inside = coarse.flat[0][..., 3] == 255
     flat, smooth = (len(np.unique(view[0][..., 0][inside])) for view in (coarse.flat, coarse.smooth))
     levels, counts = np.unique(coarse.flat[0][..., 0][inside], return_counts=True)
@@ -83,8 +83,18 @@ def test_the_head_fills_its_image():
     head = trimesh.creation.icosphere(subdivisions=3, radius=0.15).apply_translation([0, 1.85, 0])
     both = trimesh.util.concatenate([post, head])
     mesh = Mesh(np.asarray(both.vertices, dtype=np.float32), np.asarray(both.faces, dtype=np.int32))
-    (view,) = render_clay_head(mesh, views=1, height_px=100)
+    (view,) = render_clay_head(mesh, mesh.vertex_normals(), views=1, height_px=100)
     rows = np.flatnonzero(view[..., 3].any(axis=1))
     assert rows[0] < 8
     assert rows[-1] > 92
     assert view.shape[1] == pytest.approx(94, abs=8)
+
+
+def test_clay_is_shaded_with_the_normals_that_are_given():
+    """With normals that all point up a sphere has one level, whatever its triangles are; flat shading stays."""
+    mesh = sphere(2)
+    up = np.tile(np.array([0, 1, 0], dtype=np.float32), (len(mesh.vertices), 1))
+    drawn, expected = render_clay(mesh, up, views=1, height_px=100), render_clay(mesh, mesh.vertex_normals(), 1, 100)
+    inside = drawn.smooth[0][..., 3] == 255
+    assert np.ptp(drawn.smooth[0][..., 0][inside]) <= 1
+    assert np.array_equal(drawn.flat[0], expected.flat[0])

@@ -104,3 +104,5 @@ def test_a_cut_mesh_keeps_the_normals_of_the_surface_before_the_cut() -> None:
     between = cut.extend(before)[4:]
     between /= np.linalg.norm(between, axis=1, keepdims=True)
     np.testing.assert_allclose(found.vertex_normals()[4:], between, atol=1e-6)
+    turned = found.mesh.vertices[:, [1, 2, 0]]  # a rotation: the axes are exchanged cyclically
+    np.testing.assert_allclose(found.vertex_normals(turned), found.vertex_normals()[:, [1, 2, 0]], atol=1e-6)
