@@ -154,19 +154,19 @@ def gaps_in_skirt(
     part = np.s_[:, rows[0] : rows[-1] + 1]
     closed = skirt[part].copy()
     for row in range(closed.shape[1]):
-        closed[:, row] = _closed(closed[:, row], spacing_m)
+        closed[:, row] = closing(closed[:, row], SKIRT_RADIUS_M, spacing_m)
     # Nothing is below the hem; above the top the cloth goes on.
     reach = int(np.ceil(SKIRT_RADIUS_M / spacing_m)) + 1
     going_on = np.pad(closed, ((0, 0), (0, reach), (0, 0)), mode="edge")
-    gaps[part] = _closed(going_on, spacing_m)[:, : closed.shape[1]] & ~inside[part]
+    gaps[part] = closing(going_on, SKIRT_RADIUS_M, spacing_m)[:, : closed.shape[1]] & ~inside[part]
     return gaps
 
 
-def _closed(solid: Bool[np.ndarray, "*n"], spacing_m: float) -> Bool[np.ndarray, "*n"]:
-    """Return the morphological closing by a disc or ball of `SKIRT_RADIUS_M`."""
-    padding = int(np.ceil(SKIRT_RADIUS_M / spacing_m)) + 1
+def closing(solid: Bool[np.ndarray, "*n"], radius_m: float, spacing_m: float) -> Bool[np.ndarray, "*n"]:
+    """Return the morphological closing by a disc or ball."""
+    padding = int(np.ceil(radius_m / spacing_m)) + 1
     outside_m = spacing_m * ndimage.distance_transform_edt(~np.pad(solid, padding))
-    closed = spacing_m * ndimage.distance_transform_edt(outside_m <= SKIRT_RADIUS_M) > SKIRT_RADIUS_M
+    closed = spacing_m * ndimage.distance_transform_edt(outside_m <= radius_m) > radius_m
     return closed[(np.s_[padding:-padding],) * solid.ndim]
 
 

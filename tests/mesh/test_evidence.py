@@ -9,6 +9,7 @@ import torch
 from pipeline.body.body import Body
 from pipeline.geometry.camera import Camera
 from pipeline.geometry.rotation import axis_angle_to_matrix
+from pipeline.mesh import evidence
 from pipeline.mesh.evidence import (
     CONTRADICTED_SHARE,
     DEPTH_SHARE,
@@ -134,6 +135,24 @@ def test_the_copy_of_a_shell_is_empty(body: Body) -> None:
     assert found[along & (points_m[:, 1] < 0.5)].max() == 0.0
 
 
+def test_a_pit_in_cloth_is_no_copy(body: Body, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the samples above the middle those within 2 cm stay in the shell around them, those within 10 cm do not."""
+    samples = sample_canonical_grid(shell_density, BOUNDS_M, body, 0.5 * VOXEL_SIZE_M, SETTINGS)
+    view = replace(bent_view(0.0), mask=torch.full((CAMERA.height, CAMERA.width), 255, dtype=torch.uint8))
+
+    def emptied_m3(radius_m: float) -> float:
+        def is_near_the_middle(points_m: np.ndarray, *_: object) -> np.ndarray:
+            return (np.hypot(points_m[:, 0], points_m[:, 2]) < radius_m) & (points_m[:, 1] > 0.5)
+
+        monkeypatch.setattr(evidence, "is_copy", is_near_the_middle)
+        found = with_emptiness(samples, body, [view]).emptiness * (samples.density > 0.0)
+        return float(found.sum() * samples.spacing_m**3)
+
+    thickness_m = 0.03  # of what is more than a centimetre off the body
+    assert emptied_m3(0.02) < 0.1 * np.pi * 0.02**2 * thickness_m
+    assert emptied_m3(0.10) > 0.3 * np.pi * 0.10**2 * thickness_m
+
+
 def covering_view(angle_deg: float = 150.0) -> PosedView:
     """The end at positive x is turned towards the camera, from 120 degrees on in front of the other half."""
     turned, joint_m = torch.eye(4).repeat(2, 1, 1), torch.tensor([0.05, 0.5, 0.0])
@@ -143,14 +162,14 @@ def covering_view(angle_deg: float = 150.0) -> PosedView:
     return replace(view, mask=white, canonical_to_world=view.canonical_to_world @ turned)
 
 
-def test_what_covers_another_part_in_all_views_is_told_by_colours_alone(body: Body) -> None:
+def test_what_covers_another_part_in_most_views_is_told_by_colours_alone(body: Body) -> None:
     """Five centimetres beyond the tip, not as far in front of its own part, and not where an outline shows it."""
     beyond_m, in_front_m, near_m = [0.45, 0.5, 0.0], [0.2, 0.5, 0.15], [0.42, 0.5, 0.0]
     points_m = np.array([beyond_m, in_front_m, near_m])
     covering, beside = covering_view(), covering_view(60.0)
     found = is_told_by_colours_alone(points_m, body, [covering] * 3)
     np.testing.assert_array_equal(found, [True, False, False])
-    assert not is_told_by_colours_alone(points_m, body, [covering, covering, beside]).any()
+    assert not is_told_by_colours_alone(points_m, body, [covering, beside]).any()
     assert not is_told_by_colours_alone(points_m, body, [beside]).any()
 
 

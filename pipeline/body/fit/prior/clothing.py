@@ -23,6 +23,7 @@ from torch import Tensor
 
 from pipeline.body.fit.linear_body import ACTIVE_JOINTS, LinearBody
 from pipeline.body.fit.prior.priors import ShapePrior
+from pipeline.body.fit.silhouette_icp import HEAD_AND_FOOT_JOINTS
 
 HARMONICS = 60
 
@@ -44,7 +45,7 @@ FILL_POINTS = 1000
 FILL_STEPS = 3
 """Gauss-Newton steps; the shape is nearly linear in its parameters."""
 
-BARE_JOINTS = ("Head", "LeftHand", "RightHand", "LeftFoot", "LeftToeBase", "RightFoot", "RightToeBase")
+BARE_JOINTS = (*HEAD_AND_FOOT_JOINTS, "LeftHand", "RightHand")
 
 
 def clothing_offsets(model: LinearBody) -> Float[Tensor, "v 3 c"]:
