@@ -12,6 +12,7 @@ from pydantic import Field
 from torch import Tensor
 
 from pipeline.avatar.clay import ClayViews, render_clay, render_clay_head
+from pipeline.avatar.exported_surface import ExportedSurface
 from pipeline.avatar.finished_run import FinishedRun, load_finished_run
 from pipeline.avatar.motion.pose_fit import fit_poses
 from pipeline.body.body import canonical_to_world
@@ -105,14 +106,15 @@ def run(
     edge_blur_px = median_edge_blur_px(loaded, settings)
     rows, frame_images = score_frames(loaded, positions, edge_blur_px, config, settings)
     middle = int(positions[len(positions) // 2])
-    turntable = render_turntables(loaded, middle, config, settings)
+    glb_path = inputs["export"] / "avatar.glb"
+    glb = glb_path.read_bytes()
+    exported = ExportedSurface.of_glb(GlbFile(glb_path, glb))
+    turntable = render_turntables(loaded, exported, middle, config, settings)
     write_rgb(
         out / "turntable.jpg",
         image_grid([[composite_on_white_uint8(view) for view in turntable_views] for _, turntable_views in turntable]),
     )
-    glb_path = inputs["export"] / "avatar.glb"
-    glb = glb_path.read_bytes()
-    clay, clay_posed = render_clay_turntables(loaded, GlbFile(glb_path, glb), middle, config, settings)
+    clay, clay_posed = render_clay_turntables(loaded, exported, middle, config, settings)
     write_rgb(out / "clay.jpg", image_grid([[composite_on_white_uint8(view) for view in views] for _, views in clay]))
     write_rgb(out / "heldout.jpg", image_grid([_comparison_row(frame) for frame in frame_images]))
     metric_sections: dict[str, Mapping[str, float | int | bool]] = {
@@ -269,9 +271,15 @@ def fit_heldout_poses(loaded: FinishedRun, positions: np.ndarray) -> Float[Tenso
 
 
 def render_turntables(
-    loaded: FinishedRun, position: int, config: Config, settings: ReportSettings = REPORT_SETTINGS
+    loaded: FinishedRun,
+    exported: ExportedSurface,
+    position: int,
+    config: Config,
+    settings: ReportSettings = REPORT_SETTINGS,
 ) -> list[Turntable]:
     """Render the avatar from all sides: unlit and under several lights in the A-pose, and in the pose of one frame.
+
+    The last row is the head of the exported avatar.
 
     The diffuse map of an avatar whose light was not removed is shown unlit only: it holds the light.
     """
@@ -291,17 +299,23 @@ def render_turntables(
         size = config.turntable_views, settings.turntable_height_px, config.samples_per_pixel_side
         return title, avatar.render_turntable(vertices, *size, light)
 
-    return ThreadPool(len(rows)).map(render, rows)
+    views, samples = config.turntable_views, config.samples_per_pixel_side
+    head = exported.render_head(views, settings.head_height_px, samples)
+    return [*ThreadPool(len(rows)).map(render, rows), ("Head, as exported", head)]
 
 
 def render_clay_turntables(
-    loaded: FinishedRun, glb: GlbFile, position: int, config: Config, settings: ReportSettings = REPORT_SETTINGS
+    loaded: FinishedRun,
+    exported: ExportedSurface,
+    position: int,
+    config: Config,
+    settings: ReportSettings = REPORT_SETTINGS,
 ) -> tuple[list[Turntable], Turntable]:
     """Render the shape without texture: rows of the exported avatar at rest, and clay in the pose of one frame."""
     views, height_px = config.turntable_views, settings.turntable_height_px
     posed = loaded.avatar.pose_vertices(loaded.refined_canonical_to_world[position]).numpy()
     in_pose = Mesh(posed, loaded.avatar.faces.numpy()), loaded.avatar.vertex_normals(posed)
-    at_rest = exported_surface(glb)
+    at_rest = exported.mesh, exported.vertex_normals
 
     def render(surface: tuple[Mesh, Float[np.ndarray, "v 3"]]) -> ClayViews:
         return render_clay(*surface, views, height_px)
@@ -311,18 +325,9 @@ def render_clay_turntables(
         ("Rest pose, clay", rest_clay.smooth),
         ("Rest pose, clay, flat shading: the triangles", rest_clay.flat),
         ("Rest pose, normals: red to the person's left, green up, blue to the front", rest_clay.normals),
-        ("Head, clay", render_clay_head(*at_rest, views, settings.clay_head_height_px)),
+        ("Head, clay", render_clay_head(*at_rest, views, settings.head_height_px)),
     ]
     return rows, (f"{_pose_title(loaded, position)}, clay", posed_clay.smooth)
-
-
-def exported_surface(glb: GlbFile) -> tuple[Mesh, Float[np.ndarray, "v 3"]]:
-    """Return the surface of an exported avatar in its rest pose (m, +Y up), and the unit normals of its vertices."""
-    parts = glb.skinned_primitives()
-    first = np.cumsum([0, *(len(part.positions) for part in parts)])
-    faces = np.concatenate([part.faces + start for part, start in zip(parts, first, strict=False)])
-    vertices, normals = (np.concatenate([getattr(part, name) for part in parts]) for name in ("positions", "normals"))
-    return Mesh(vertices, faces.astype(np.int32)), normals
 
 
 def _pose_title(loaded: FinishedRun, position: int) -> str:

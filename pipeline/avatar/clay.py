@@ -75,12 +75,16 @@ def render_clay(mesh: Mesh, vertex_normals: Float[np.ndarray, "v 3"], views: int
 
 def render_clay_head(mesh: Mesh, vertex_normals: Float[np.ndarray, "v 3"], views: int, height_px: int) -> Views:
     """Render the head of a standing person in clay with interpolated normals; arguments as in `render_clay`."""
+    return render_clay_views(mesh, vertex_normals, head_cameras(mesh, views, height_px)).cropped().smooth
+
+
+def head_cameras(mesh: Mesh, views: int, height_px: int) -> list[Camera]:
+    """Return cameras around the head of a standing person (m, +Y up), as `turntable_cameras`."""
     top_m, bottom_m = float(mesh.vertices[:, 1].max()), float(mesh.vertices[:, 1].min())
     neck_m = top_m - HEAD_FRACTION * (top_m - bottom_m)
     head = mesh.vertices[mesh.vertices[:, 1] > neck_m]
     box_m = np.minimum(head.min(axis=0), [np.inf, neck_m, np.inf]), head.max(axis=0)
-    cameras = turntable_cameras(*box_m, views, height_px)
-    return render_clay_views(mesh, vertex_normals, cameras).cropped().smooth
+    return turntable_cameras(*box_m, views, height_px)
 
 
 def shade_clay(normals: Float[Tensor, "n 3"], world_to_camera: Float[np.ndarray, "4 4"]) -> Float[Tensor, "n"]:
