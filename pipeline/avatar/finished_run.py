@@ -90,7 +90,6 @@ def load_textured_avatar(mesh_dir: Path, texture_dir: Path) -> TexturedAvatar:
         light=texture.light,
         gloss=vertex_gloss(replace(texture, atlas=atlas), len(skinned.mesh.vertices)),
         normal_map=texture.normal,
-        whole=whole.mesh,
         skinned=skinned,
     )
 

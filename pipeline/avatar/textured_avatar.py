@@ -31,8 +31,8 @@ class TexturedAvatar:
         light: of the video; None or uniform if the diffuse texture holds it.
         gloss: highlights of the vertices under that light; None for a matte surface.
         normal_map: tangent space, in [0, 1]; None: the normals of the vertices. Drawn under a light, not unlit.
-        whole: the same surface with each vertex once; None where `vertices` are so.
-        skinned: the same vertices, with the triangles that normals are those of; None: `faces`.
+        skinned: the same vertices, with the triangles that normals are those of and the folds; None: normals are those
+            of `faces`, and no vertex is a copy.
     """
 
     vertices: Float[Tensor, "v 3"]
@@ -45,12 +45,13 @@ class TexturedAvatar:
     light: VideoLight | None = None
     gloss: VertexGloss | None = None
     normal_map: Float32[np.ndarray, "n n 3"] | None = None
-    whole: Mesh | None = None
     skinned: MeshArtifact | None = None
 
     def mesh(self) -> Mesh:
         """Return the canonical mesh without texture and skin, connected across folds."""
-        return Mesh(self.vertices.numpy(), self.faces.numpy()) if self.whole is None else self.whole
+        if self.skinned is None or self.skinned.creases is None:
+            return Mesh(self.vertices.numpy(), self.faces.numpy())
+        return self.skinned.creases.join(self.vertices.numpy())
 
     def pose_vertices(self, canonical_to_world: Float[Tensor, "j 4 4"]) -> Float[Tensor, "v 3"]:
         """Pose the vertices (m, world) by linear blend skinning, as a glTF viewer does."""

@@ -7,7 +7,7 @@ copy of the vertex for each side then, as files have them along the seams of the
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -36,6 +36,11 @@ class Creases:
     def on_fold(self) -> Bool[np.ndarray, "w"]:
         """Return which vertices have copies."""
         return np.asarray(np.bincount(self.source)[self.source] > 1)
+
+    def join(self, vertices: Float[np.ndarray, "w 3"]) -> Mesh:
+        """Return the mesh without copies; vertices: those of the mesh with copies, in any pose."""
+        count = int(self.source.max(initial=-1)) + 1
+        return Mesh(vertices[:count], self.source[self.faces].astype(self.faces.dtype))
 
     def split_atlas(self, atlas: Atlas) -> Atlas:
         """Return the layout of the mesh with copies: nothing moves, corners on a fold inside a chart are doubled."""

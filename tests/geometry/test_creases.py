@@ -34,6 +34,15 @@ def test_each_side_of_a_fold_has_its_normal() -> None:
     np.testing.assert_array_equal(np.flatnonzero(creases.on_fold())[: len(copied)], copied)
 
 
+def test_a_mesh_without_its_copies_is_the_one_before() -> None:
+    mesh = wedge()
+    creases = find_creases(mesh)
+    assert len(creases.source) > len(mesh.vertices)
+    joined = creases.join(mesh.vertices[creases.source])
+    np.testing.assert_array_equal(joined.vertices, mesh.vertices)
+    np.testing.assert_array_equal(joined.faces, mesh.faces)
+
+
 def test_a_smooth_surface_and_faces_without_area_have_no_folds() -> None:
     ball = trimesh.creation.icosphere(subdivisions=1)
     mesh = Mesh(np.asarray(ball.vertices), np.asarray(ball.faces))
