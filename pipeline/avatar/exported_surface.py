@@ -16,7 +16,7 @@ from pipeline.io.image import to_float
 
 @dataclass(frozen=True)
 class ExportedSurface:
-    """The triangles of a .glb with one material, in its rest pose.
+    """The triangles of an exported .glb, in its rest pose.
 
     Attributes:
         mesh: m, +Y up.
@@ -33,14 +33,9 @@ class ExportedSurface:
     @classmethod
     def of_glb(cls, glb: GlbFile) -> "ExportedSurface":
         """Read the surface of a .glb. UserError if the file is damaged or holds no skinned triangles."""
-        parts = glb.skinned_primitives()
-        starts = np.cumsum([0, *(len(part.positions) for part in parts[:-1])])
-        faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)])
-        positions, normals, uv = (
-            np.concatenate([getattr(part, name) for part in parts]) for name in ("positions", "normals", "uv")
-        )
-        uv = np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1)
-        return cls(Mesh(positions, faces.astype(np.int32)), normals, uv, glb.base_colour(parts[0].material))
+        part = glb.skinned_primitives()[0]  # an exported avatar has one
+        uv = np.stack([part.uv[:, 0], 1.0 - part.uv[:, 1]], axis=1)
+        return cls(Mesh(part.positions, part.faces), part.normals, uv, glb.base_colour(part.material))
 
     def render_head(self, views: int, height_px: int, supersampling: int) -> list[UInt8[np.ndarray, "_ _ 4"]]:
         """Render the head from all sides, unlit: sRGB with straight alpha, cropped horizontally."""

@@ -22,7 +22,7 @@ from pipeline.body.body import Body
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import isosurface, largest_solid, repair, signed_distance_m
 from pipeline.kernels.common.thread_pool import shared_thread_pool
-from pipeline.mesh.between_legs import crotch_height_m, excess_between_legs, gaps_in_skirt, parted_legs
+from pipeline.mesh.between_legs import closing, crotch_height_m, excess_between_legs, gaps_in_skirt, parted_legs
 from pipeline.mesh.settings import MeshSettings
 
 BODY_PADDING_VOXELS = 4
@@ -251,9 +251,7 @@ def _close_concavities(
     real holes. Computed on every second sample.
     """
     spacing_m = 2.0 * samples.spacing_m
-    outside_m = spacing_m * ndimage.distance_transform_edt(~inside[::2, ::2, ::2])
-    closed = spacing_m * ndimage.distance_transform_edt(outside_m <= radius_m) > radius_m
-    filled = closed & (samples.body_distance_m[::2, ::2, ::2] < 0.0)
+    filled = closing(inside[::2, ::2, ::2], radius_m, spacing_m) & (samples.body_distance_m[::2, ::2, ::2] < 0.0)
     return upsample(ndimage.gaussian_filter(filled.astype(np.float64), 0.7), samples.density.shape)
 
 
