@@ -39,7 +39,7 @@ CHECKPOINT_INTERVAL_S = 15.0
 PREVIEW_FILE, PREVIEW_FRAMES = "preview.png", 4
 PSNR_DECIMALS = 2
 """Decimals (dB) to which the PSNR of fitted and of refined poses are compared."""
-VALIDATION_FRACTIONS = (1 / 32, 1 / 16, 1 / 8, 1 / 4, 3 / 8, 1 / 2, 5 / 8, 3 / 4, 7 / 8, 1)
+VALIDATION_FRACTIONS = (1 / 32, 1 / 15, 1 / 8, 1 / 4, 3 / 8, 1 / 2, 5 / 8, 3 / 4, 7 / 8, 1)
 """Fractions of the steps after which the validation PSNR is measured."""
 
 

@@ -52,7 +52,7 @@ from pipeline.mesh.outline_alignment import align_outlines
 from pipeline.mesh.pose_alignment import MAX_PERSON_PX, AlignedSurface
 from pipeline.mesh.pose_selection import in_other_poses, is_far_from, merge_poses, score_motion
 from pipeline.mesh.refinement import refine_mesh, with_offsets
-from pipeline.mesh.remeshing import detailed_faces, remesh_to_edge_length
+from pipeline.mesh.remeshing import faces_by_part, remesh_to_edge_length
 from pipeline.mesh.settings import MeshSettings
 from pipeline.mesh.skin_relaxation import move_along, relax_skin
 from pipeline.mesh.skin_transfer import SkinnedTopology, transfer_skin
@@ -217,8 +217,8 @@ def finish_mesh(mesh: Mesh, inputs: RefinementInputs, face_limit: int) -> Mesh:
     def psnr_db(trial: Mesh) -> float:
         return mesh_psnr_db(trial, transfer_skin(trial, inputs.body), views, inputs.shader)
 
-    detailed = detailed_faces(mesh, inputs.body)
-    return resolve_self_intersections(reduce_faces(mesh, detailed, psnr_db, inputs.settings, face_limit))
+    parts = faces_by_part(mesh, inputs.body)
+    return resolve_self_intersections(reduce_faces(mesh, parts, psnr_db, inputs.settings, face_limit))
 
 
 class FieldColourShader(torch.nn.Module):
@@ -343,7 +343,7 @@ def write_results(out: Path, mesh: Mesh, skin: SkinnedTopology, shader: torch.nn
 
 STAGE = Stage(
     "mesh",
-    version=36,
+    version=37,
     needs=("frames", "body", "field"),
     makes=(MESH_NPZ, DENSE_NPZ, "motion.npz", "preview.png"),
     config=Config,

@@ -20,7 +20,7 @@ from pipeline.body.pose_correction import PoseCorrection
 from pipeline.geometry.mesh import Mesh
 from pipeline.mesh.correction_prior import drifting_prior
 from pipeline.mesh.pose_alignment import AlignedSurface, PoseOffsets, align_poses
-from pipeline.mesh.remeshing import detailed_faces, remesh_adaptively, remesh_uniformly
+from pipeline.mesh.remeshing import FREE, detailed_faces, faces_by_part, remesh_adaptively, remesh_uniformly
 from pipeline.mesh.skin_transfer import SkinnedTopology, transfer_skin
 from pipeline.mesh.vertex_optimisation import RefinementInputs, optimise_vertices
 from pipeline.mesh.views import PosedView, accumulate_face_errors, mesh_psnr_db
@@ -149,8 +149,8 @@ def _remesh(mesh: Mesh, skin: SkinnedTopology, inputs: RefinementInputs) -> Mesh
     settings = inputs.settings
     if settings.remeshing == "none":
         return mesh
-    detailed = detailed_faces(mesh, inputs.body)
     if settings.remeshing == "uniform":
-        return remesh_uniformly(mesh, detailed, settings.remeshed_faces)
+        return remesh_uniformly(mesh, detailed_faces(mesh, inputs.body), settings.remeshed_faces)
     errors = accumulate_face_errors(mesh, skin, inputs.train, inputs.shader)
-    return remesh_adaptively(mesh, errors, detailed, inputs.target_edge_m, inputs.max_faces, settings)
+    kept = faces_by_part(mesh, inputs.body) != FREE
+    return remesh_adaptively(mesh, errors, kept, inputs.target_edge_m, inputs.max_faces, settings)

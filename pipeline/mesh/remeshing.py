@@ -5,7 +5,7 @@ from functools import partial
 
 import fast_simplification
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from pipeline.body.body import Body
 from pipeline.core.progress import warn
@@ -28,6 +28,8 @@ DETAIL_EDGE_RATIO = 0.5
 """Edge length at face and hands, in target edge lengths: fingers and lips are thinner than cloth is smooth."""
 TOLERANCE_RATIO, DETAIL_TOLERANCE_RATIO = 0.1, 0.15
 """Distance by which remeshing to longer edges, and that of face and hands, may move the surface, in edge lengths."""
+FREE, DETAILED, HEAD = 0, 1, 2
+"""Parts of the mesh: `HEAD` is what is no face and no ear, mostly hair."""
 EQUILATERAL_AREA_RATIO = 0.43
 """Area of an equilateral triangle divided by its squared edge length (0.433)."""
 MAX_FACE_EXCESS, MAX_UNIFORM_TRIALS = 0.02, 6
@@ -77,6 +79,15 @@ def detailed_faces(mesh: Mesh, body: Body) -> Bool[np.ndarray, "f"]:
     return at_hand | at_ear | face_of_person(mesh, body)
 
 
+def faces_by_part(mesh: Mesh, body: Body) -> Int[np.ndarray, "f"]:
+    """Return the part of each mesh face: `DETAILED` (see `detailed_faces`), else `HEAD`, else `FREE`."""
+    centres_m = mesh.vertices[mesh.faces].mean(axis=1)
+    _, nearest, _ = closest_points_on_mesh(centres_m, body.mesh())
+    parts = np.where(head_vertices(body)[body.faces[nearest, 0]], HEAD, FREE)
+    parts[detailed_faces(mesh, body)] = DETAILED
+    return parts
+
+
 def face_of_person(mesh: Mesh, body: Body) -> Bool[np.ndarray, "f"]:
     """Return the mesh faces at the face of the person, without hair; none if the body has no head joint."""
     centres_m = mesh.vertices[mesh.faces].mean(axis=1)
@@ -105,7 +116,7 @@ def keep_if_repair_fails(change: Callable[[], Mesh], before: Mesh, consequence: 
 def remesh_adaptively(
     mesh: Mesh,
     errors: Float[np.ndarray, "f"],
-    detailed: Bool[np.ndarray, "f"],
+    kept: Bool[np.ndarray, "f"],
     target_edge_m: float,
     max_faces: int,
     settings: MeshSettings,
@@ -115,7 +126,7 @@ def remesh_adaptively(
     Args:
         mesh: a closed surface, m.
         errors: accumulated image error of each face.
-        detailed: faces that are not decimated, from `detailed_faces`.
+        kept: faces that are not decimated.
         target_edge_m: target edge length, m.
         max_faces: no face is subdivided beyond this number of faces.
         settings: percentiles of the error, and the edge length of decimated regions.
@@ -123,7 +134,7 @@ def remesh_adaptively(
     Returns:
         The new mesh; if decimation would leave holes, the faces with a small error stay, with a warning.
     """
-    low = (errors <= np.percentile(errors, settings.decimate_percentile)) & ~detailed
+    low = (errors <= np.percentile(errors, settings.decimate_percentile)) & ~kept
     fine, _ = subdivide(mesh, _faces_to_subdivide(errors, max_faces, settings.subdivide_percentile))
     # The subdivision keeps these faces, but not their indices: find them by their vertices.
     keys = {tuple(face) for face in np.sort(mesh.faces[low], axis=1).tolist()}

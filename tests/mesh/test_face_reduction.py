@@ -5,7 +5,8 @@ import pytest
 
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import closest_points_on_mesh, is_closed_manifold, isosurface
-from pipeline.mesh.face_reduction import MAX_DETAILED_SHARE, reduce_faces
+from pipeline.mesh.face_reduction import MAX_SHARES, reduce_faces
+from pipeline.mesh.remeshing import DETAILED, FREE, HEAD
 from pipeline.mesh.settings import MeshSettings
 
 RADIUS_M, SPACING_M = 0.1, 0.01
@@ -18,13 +19,13 @@ def sphere() -> Mesh:
 
 
 def no_detail(mesh: Mesh) -> np.ndarray:
-    return np.zeros(len(mesh.faces), dtype=bool)
+    return np.full(len(mesh.faces), FREE)
 
 
 def test_detailed_faces_stay() -> None:
     mesh = sphere()
     detailed = mesh.vertices[mesh.faces].mean(axis=1)[:, 1] > 0.0
-    reduced = reduce_faces(mesh, detailed, lambda trial: 30.0, MeshSettings())
+    reduced = reduce_faces(mesh, np.where(detailed, DETAILED, FREE), lambda trial: 30.0, MeshSettings())
     above = reduced.vertices[reduced.faces].mean(axis=1)[:, 1] > 0.0
     assert above.sum() >= 0.97 * detailed.sum()
     assert (~above).sum() < 0.3 * (~detailed).sum()
@@ -70,20 +71,36 @@ def test_a_limit_holds_where_most_faces_are_detailed() -> None:
     mesh = sphere()
     detailed, limit = np.ones(len(mesh.faces), dtype=bool), len(mesh.faces) // 3
     detailed[:10] = False
-    assert len(reduce_faces(mesh, detailed, lambda trial: 30.0, MeshSettings(), limit).faces) <= limit
+    assert (
+        len(reduce_faces(mesh, np.where(detailed, DETAILED, FREE), lambda trial: 30.0, MeshSettings(), limit).faces)
+        <= limit
+    )
 
 
-def test_more_detail_than_its_share_is_collapsed_to_it() -> None:
-    """Detail on an eighth of the sphere has 30 % of the faces afterwards, not an eighth of them."""
+@pytest.mark.parametrize("part", [DETAILED, HEAD])
+def test_a_part_with_more_faces_than_its_share_is_collapsed_to_it(part: int) -> None:
+    """An eighth of the sphere has the share of its part afterwards, not that of its area."""
     mesh = sphere()
     octant = (mesh.vertices[mesh.faces].mean(axis=1) > 0.0).all(axis=1)
     limit = int(octant.sum() / 0.5)
-    assert octant.sum() > MAX_DETAILED_SHARE * limit
-    reduced = reduce_faces(mesh, octant, lambda trial: float(len(trial.faces)), MeshSettings(), limit)
+    assert octant.sum() > MAX_SHARES[part] * limit
+    reduced = reduce_faces(
+        mesh, np.where(octant, part, FREE), lambda trial: float(len(trial.faces)), MeshSettings(), limit
+    )
     kept = (reduced.vertices[reduced.faces].mean(axis=1) > 0.0).all(axis=1)
     assert limit - 6 <= len(reduced.faces) <= limit
-    assert np.count_nonzero(kept) == pytest.approx(MAX_DETAILED_SHARE * limit, rel=0.05)
+    assert np.count_nonzero(kept) == pytest.approx(MAX_SHARES[part] * limit, rel=0.05)
     assert is_closed_manifold(reduced)
+
+
+def test_the_head_stays_round_while_the_rest_is_reduced() -> None:
+    mesh = sphere()
+    above = mesh.vertices[mesh.faces].mean(axis=1)[:, 1] > 0.05
+    limit = int(above.sum() / MAX_SHARES[HEAD])
+    reduced = reduce_faces(mesh, np.where(above, HEAD, FREE), lambda trial: 30.0, MeshSettings(), limit)
+    still_above = reduced.vertices[reduced.faces].mean(axis=1)[:, 1] > 0.05
+    assert still_above.sum() >= 0.97 * above.sum()
+    assert len(reduced.faces) < 0.4 * len(mesh.faces)
 
 
 def test_a_number_of_final_faces_is_reached_at_any_loss() -> None:
@@ -101,7 +118,9 @@ def test_detail_keeps_what_the_rest_leaves_of_a_limit() -> None:
     mesh = sphere()
     detailed = mesh.vertices[mesh.faces].mean(axis=1)[:, 1] > 0.0
     wanted = len(mesh.faces) - 100
-    reduced = reduce_faces(mesh, detailed, lambda trial: 0.0, MeshSettings(final_faces=wanted))
+    reduced = reduce_faces(
+        mesh, np.where(detailed, DETAILED, FREE), lambda trial: 0.0, MeshSettings(final_faces=wanted)
+    )
     assert wanted - 4 <= len(reduced.faces) <= wanted
 
 

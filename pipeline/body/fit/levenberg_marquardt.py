@@ -15,7 +15,8 @@ from typing import TypeVar
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
+from scipy.linalg import cho_factor, cho_solve, cholesky_banded
+from scipy.linalg.lapack import dtbtrs
 from torch import Tensor
 
 DAMPING_START = 1e-3
@@ -64,7 +65,11 @@ class NormalEquations:
         residual: Float[Tensor, "n r"],
         weight: Float[Tensor, "n r"],
     ) -> None:
-        """Add residuals that depend on the parameters of one frame and the shared ones. Their cost is not added."""
+        """Add residuals that depend on the parameters of one frame and the shared ones. Their cost is not added.
+
+        Products have the precision of the Jacobians, sums over terms are float64.
+        """
+        weight, residual = weight.to(frame_jacobian), residual.to(frame_jacobian)
         weighted = frame_jacobian * weight[..., None]
         weighted_shared = (shared_jacobian * weight[..., None]).flatten(0, 1)
         self.frame_hessian += weighted.transpose(1, 2) @ frame_jacobian
@@ -118,14 +123,20 @@ def _banded_factor(system: NormalEquations, damping: float) -> np.ndarray:
 def _schur_complement(
     system: NormalEquations, factor: np.ndarray, damping: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Eliminate the frames; return the reduced matrix, the solved border and the solved frame gradient."""
+    """Eliminate the frames; return the reduced matrix, and border and gradient times the inverse of the factor."""
     n, p = system.frame_gradient.shape
     border = system.border.reshape(n * p, -1).numpy()
     right = np.concatenate([border, system.frame_gradient.reshape(-1, 1).numpy()], axis=1)
-    solved = cho_solve_banded((factor, True), right, check_finite=False)
+    halfway = _substitute(factor, right)
     shared = system.shared_hessian.numpy().copy()
     shared[np.diag_indices_from(shared)] *= 1.0 + damping
-    return shared - border.T @ solved[:, :-1], solved[:, :-1], solved[:, -1]
+    return shared - halfway[:, :-1].T @ halfway[:, :-1], halfway[:, :-1], halfway[:, -1]
+
+
+def _substitute(factor: np.ndarray, right: np.ndarray, *, transposed: bool = False) -> np.ndarray:
+    """Solve L x = right, or its transpose, with the lower banded Cholesky factor L."""
+    solution: np.ndarray = dtbtrs(factor, right, uplo="L", trans="T" if transposed else "N")[0]
+    return solution
 
 
 def solve(system: NormalEquations, damping: float) -> tuple[Float[Tensor, "n p"], Float[Tensor, "g"]]:
@@ -136,14 +147,10 @@ def solve(system: NormalEquations, damping: float) -> tuple[Float[Tensor, "n p"]
     """
     n, p = system.frame_gradient.shape
     factor = _banded_factor(system, damping)
-    if len(system.shared_gradient) == 0:
-        step = -cho_solve_banded((factor, True), system.frame_gradient.flatten().numpy(), check_finite=False)
-        return torch.from_numpy(step.reshape(n, p)), system.shared_gradient
-    matrix, solved_border, solved_gradient = _schur_complement(system, factor, damping)
-    border = system.border.reshape(n * p, -1).numpy()
-    right = system.shared_gradient.numpy() - border.T @ solved_gradient
+    matrix, border, gradient = _schur_complement(system, factor, damping)
+    right = system.shared_gradient.numpy() - border.T @ gradient
     shared_step = -cho_solve(cho_factor(matrix, check_finite=False), right, check_finite=False)
-    frame_step = -(solved_gradient + solved_border @ shared_step)
+    frame_step = -_substitute(factor, gradient + border @ shared_step, transposed=True)
     return torch.from_numpy(frame_step.reshape(n, p)), torch.from_numpy(shared_step)
 
 

@@ -5,6 +5,8 @@ position to which joint k alone would carry a point, and w_k its skin weight. Th
 point by (parent rotation · delta_j) x arm_j with the lever arm arm_j = sum over k = j and its descendants of
 w_k (x_k - joint_j). The root moves in perspective coordinates (`pipeline.body.fit.root_placement`).
 
+Positions are float64; derivatives, the largest arrays of the fit, are float32.
+
 Dimensions: n frames, m points, j active joints, p = 3 j + 3 parameters of a frame, s shape parameters.
 """
 
@@ -121,9 +123,9 @@ def pose_points(model: LinearBody, skeleton: PosedSkeleton, points: SkinnedPoint
     carried = torch.einsum("njab,nmjb->nmja", skeleton.rotation, offsets.expand(len(skeleton.rotation), -1, -1, -1))
     weighted = points.skin_weights[..., None] * (carried + skeleton.position_m[:, None])
     world = weighted.sum(2)
-    below = torch.einsum("jk,nmkc->nmjc", model.is_descendant, weighted)
-    weight_below = (points.skin_weights @ model.is_descendant.T)[..., None]
-    return PosedPoints(points, world, below - weight_below * skeleton.position_m[:, None])
+    below = torch.einsum("jk,nmkc->nmjc", model.is_descendant.float(), weighted.float())
+    weight_below = (points.skin_weights @ model.is_descendant.T)[..., None].float()
+    return PosedPoints(points, world, below - weight_below * skeleton.position_m[:, None].float())
 
 
 def pose_jacobian_rows(
@@ -136,9 +138,10 @@ def pose_jacobian_rows(
 
     root_jacobian: derivative of the world position of the root with respect to its parameters.
     """
+    point_gradient = point_gradient.float()
     torque = torch.linalg.cross(lever_arms_m, point_gradient[:, :, None].expand_as(lever_arms_m))
-    rotation_jacobian = torch.einsum("njba,nmjb->nmja", skeleton.parent_rotation, torque)
-    return torch.cat([rotation_jacobian.flatten(2), point_gradient @ root_jacobian], dim=2)
+    rotation_jacobian = torch.einsum("njba,nmjb->nmja", skeleton.parent_rotation.float(), torque)
+    return torch.cat([rotation_jacobian.flatten(2), point_gradient @ root_jacobian.float()], dim=2)
 
 
 def shape_jacobian_rows(
@@ -154,11 +157,12 @@ def shape_jacobian_rows(
         step = joints_shape_jacobian[joint] - joints_shape_jacobian[parent]
         joint_motion.append(joint_motion[parent] + skeleton.rotation[:, parent] @ step)
     relative_joint_motion = torch.stack(joint_motion, dim=1) - skeleton.rotation @ joints_shape_jacobian
-    weighted = (points.skin_weights[..., None] * point_gradient[:, :, None]).flatten(2)  # n, m, 3 j
+    weighted = (points.skin_weights.float()[..., None] * point_gradient.float()[:, :, None]).flatten(2)  # n, m, 3 j
     # Sums over joints and axes as one matrix product a frame: an array of (n, m, j, s) would be written and read.
-    rest_gradient = (weighted @ skeleton.rotation.flatten(1, 2)).unbind(-1)
-    rows = rest_gradient[0][..., None] * points.shape_jacobian[:, :, 0]
+    rest_gradient = (weighted @ skeleton.rotation.flatten(1, 2).float()).unbind(-1)
+    shape_jacobian = points.shape_jacobian.float()
+    rows = rest_gradient[0][..., None] * shape_jacobian[:, :, 0]
     for axis in (1, 2):
-        rows.addcmul_(rest_gradient[axis][..., None], points.shape_jacobian[:, :, axis].expand_as(rows))
-    rows[..., : relative_joint_motion.shape[-1]] += weighted @ relative_joint_motion.flatten(1, 2)
+        rows.addcmul_(rest_gradient[axis][..., None], shape_jacobian[:, :, axis].expand_as(rows))
+    rows[..., : relative_joint_motion.shape[-1]] += weighted @ relative_joint_motion.flatten(1, 2).float()
     return rows

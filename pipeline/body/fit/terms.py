@@ -110,11 +110,11 @@ class Linearisation:
         It has no columns if there are no shared parameters.
         """
         if not self.has_shared:
-            return point_gradient[..., :0]
+            return point_gradient[..., :0].float()
         shape_jacobian = shape_jacobian_rows(self.model, self.skeleton, points.rest, point_gradient)
         missing = len(self.model.shape) + LANDMARK_OFFSET_COUNT - shape_jacobian.shape[-1]
         offsets = shape_jacobian.new_zeros(*shape_jacobian.shape[:2], missing)
-        return torch.cat([shape_jacobian, offsets, intrinsics_jacobian], dim=-1)
+        return torch.cat([shape_jacobian, offsets, intrinsics_jacobian.float()], dim=-1)
 
 
 @runtime_checkable
@@ -205,8 +205,8 @@ class Landmark3dTerm:
             rows = at.pose_jacobian(at.landmarks, no_root, point_gradient)
             shared = at.shared_jacobian(at.landmarks, point_gradient, no_intrinsics)
             system.accumulate(
-                (rows - _hip_midpoint(rows)) * inverse_std[..., axis, None],
-                (shared - _hip_midpoint(shared)) * inverse_std[..., axis, None],
+                (rows - _hip_midpoint(rows)) * inverse_std[..., axis, None].float(),
+                (shared - _hip_midpoint(shared)) * inverse_std[..., axis, None].float(),
                 residual[..., axis],
                 weight,
             )
@@ -255,7 +255,7 @@ class ContactTerm:
         for axis, direction in enumerate(contact.axes):
             point_gradient = (direction / CONTACT_STD_M).expand_as(points.world_m)
             rows = at.pose_jacobian(points, perspective_jacobian, point_gradient)
-            system.accumulate(rows, point_gradient[..., :0], residual[..., axis], weight[..., axis])
+            system.accumulate(rows, point_gradient[..., :0].float(), residual[..., axis], weight[..., axis])
 
 
 @dataclass(frozen=True)

@@ -73,12 +73,15 @@ def test_gradient_agrees_with_differences_of_the_cost(parameters: EnergyParamete
 
 
 def test_chunks_of_frames_do_not_change_the_system(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All frames in one chunk, or chunks of two."""
+    """All frames in one chunk, or chunks of two; derivatives are float32, the cost is float64."""
     objective, state = build(EXACT)
     whole = objective(state)
     monkeypatch.setattr(energy, "FRAMES_PER_CHUNK", 2)
     for name, value in vars(objective(state)).items():
-        np.testing.assert_allclose(value, getattr(whole, name), rtol=1e-9, atol=1e-9, err_msg=name)
+        expected = np.asarray(getattr(whole, name))
+        largest = np.abs(expected).max()
+        tolerance = (1e-9 if name == "cost" else 1e-6) * largest
+        np.testing.assert_allclose(value, expected, rtol=0.0, atol=tolerance, err_msg=name)
 
 
 def test_cropping_does_not_change_the_energy() -> None:
