@@ -202,7 +202,8 @@ def starting_mesh(
     body, train, settings = inputs.body, inputs.train, inputs.settings
     samples = sample_canonical_grid(density_fn, occupancy.occupied_bounds_m(), body, voxel_size_m, settings)
     witnesses = [train[k] for k in evenly_spaced(len(train), EVIDENCE_FRAMES)]
-    samples, evidence = with_emptiness(samples, body, witnesses), surface_evidence(body, witnesses)
+    samples = with_emptiness(samples, body, witnesses)
+    evidence = surface_evidence(body, witnesses, samples.ambiguous_m)
     extracted = extract_initial_mesh(samples, body, evidence, inputs.validation or train, settings)
     return remesh_to_edge_length(extracted, inputs.target_edge_m, body)
 
@@ -343,7 +344,7 @@ def write_results(out: Path, mesh: Mesh, skin: SkinnedTopology, shader: torch.nn
 
 STAGE = Stage(
     "mesh",
-    version=37,
+    version=38,
     needs=("frames", "body", "field"),
     makes=(MESH_NPZ, DENSE_NPZ, "motion.npz", "preview.png"),
     config=Config,

@@ -6,7 +6,7 @@ side, its depth is arbitrary. Density that a frame cannot see, because another p
 arbitrary too; the masks of many frames together tell where nothing is. And where a pose brings two canonical points to
 one place, at an arm on the hip, frames put density on both: the one that the pose brings near to the body is a copy.
 What covers another part of the body in most frames, such as a collar before the shoulder that moves with the head, is
-told by colours alone.
+told by colours alone. Both are ambiguous, and near them density is arbitrary.
 """
 
 from collections.abc import Sequence
@@ -58,6 +58,8 @@ canonical pose, and faces the camera: at its outline a part lies behind what sur
 COVERING_SHARE, COVERING_VIEWS = 0.6, 16
 """Share of the views that show a point in which it covers another part of the body, from which on colours alone tell
 of it; and the views that are looked at, evenly spaced."""
+AMBIGUOUS_REACH_M, AMBIGUOUS_FADE_M = 0.05, 0.02
+"""The surface is arbitrary up to the first distance from an ambiguous sample, less and less over the second."""
 EMPTY_MASK = 0.25
 """A pixel with less than this alpha is beside the person."""
 CLOSE_TO_BODY_M = 0.01
@@ -68,10 +70,12 @@ DEPTH_TOLERANCE_M = 0.02
 """Distance behind the nearest surface up to which a vertex is visible."""
 
 
-def surface_evidence(body: Body, views: Sequence[PosedView]) -> Float[np.ndarray, "v"]:
+def surface_evidence(
+    body: Body, views: Sequence[PosedView], ambiguous_m: Float[np.ndarray, "k 3"] | None = None
+) -> Float[np.ndarray, "v"]:
     """Return how well the views show each body vertex: 0 if none does, 1 where enough do from sides that differ enough.
 
-    views: at least one.
+    views: at least one. ambiguous_m: canonical points near which they do not tell (`CanonicalGrid.ambiguous_m`).
     """
     vertices, weights = torch.from_numpy(body.vertices), torch.from_numpy(body.skin_weights)
     faces = torch.from_numpy(body.faces)
@@ -94,7 +98,11 @@ def surface_evidence(body: Body, views: Sequence[PosedView]) -> Float[np.ndarray
     spread = 1.0 - direction.norm(dim=1) / total.clamp_min(1e-12)
     seen = (total / len(views) / ENOUGH_EVIDENCE).clamp(0.0, 1.0)
     depth = (spread / ENOUGH_SPREAD).clamp(0.0, 1.0)
-    return (seen * (1.0 - DEPTH_SHARE * (1.0 - depth))).numpy()
+    evidence = (seen * (1.0 - DEPTH_SHARE * (1.0 - depth))).numpy()
+    if ambiguous_m is None or len(ambiguous_m) == 0:
+        return evidence
+    distance_m, _ = cKDTree(ambiguous_m).query(body.vertices)
+    return evidence * np.clip((distance_m - AMBIGUOUS_REACH_M) / AMBIGUOUS_FADE_M, 0.0, 1.0)
 
 
 def share_beside_masks(
@@ -178,7 +186,9 @@ def is_told_by_colours_alone(
 
 
 def with_emptiness(samples: CanonicalGrid, body: Body, views: Sequence[PosedView]) -> CanonicalGrid:
-    """Return the grid with the emptiness that masks and poses tell, decided for every second sample.
+    """Return the grid with the emptiness that masks and poses tell, and with its ambiguous samples.
+
+    Both are decided for every second sample.
 
     views: at least one.
     """
@@ -195,6 +205,8 @@ def with_emptiness(samples: CanonicalGrid, body: Body, views: Sequence[PosedView
     copies[candidates] = is_copy(points_m, body, views)
     trunk = np.s_[:, max(0, round((coarse.crotch_m + PIT_ABOVE_CROTCH_M - coarse.origin_m[1]) / coarse.spacing_m)) :]
     copies[trunk] &= ~closing(solid & ~is_empty & ~copies, PIT_RADIUS_M, coarse.spacing_m)[trunk]
-    is_empty |= copies
-    is_empty[candidates] |= is_told_by_colours_alone(points_m, body, views)
-    return replace(samples, emptiness=upsample(is_empty.astype(np.float64), samples.density.shape))
+    ambiguous = copies
+    ambiguous[candidates] |= is_told_by_colours_alone(points_m, body, views)
+    emptiness = upsample((is_empty | ambiguous).astype(np.float64), samples.density.shape)
+    ambiguous_m = np.argwhere(ambiguous & solid) * coarse.spacing_m + coarse.origin_m
+    return replace(samples, emptiness=emptiness, ambiguous_m=ambiguous_m)

@@ -9,7 +9,7 @@ body.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -37,13 +37,17 @@ SURFACE_ISOVALUE = 0.5
 """Isovalue of the indicator function, which is 1 inside the solid and 0 outside."""
 
 
+_GRIDS = ("density", "body_distance_m", "hand_weight", "emptiness")
+
+
 @dataclass(frozen=True)
 class CanonicalGrid:
     """Density and signed distance on a regular grid in canonical space.
 
     origin_m: position of sample [0, 0, 0]. spacing_m: distance of neighbouring samples. density: 1/m. body_distance_m:
     signed distance to the fitted body, negative inside. hand_weight: skin weight of the hand joints, in [0, 1].
-    crotch_m: height of the crotch of the body. emptiness: 1 where nothing is whatever the density, 0 elsewhere, see
+    crotch_m: height of the crotch of the body. emptiness: 1 where nothing is whatever the density, 0 elsewhere.
+    ambiguous_m: empty samples with density, which the frames put there for another part of the body; see
     `pipeline.mesh.evidence`.
     """
 
@@ -54,14 +58,12 @@ class CanonicalGrid:
     hand_weight: Float[np.ndarray, "x y z"]
     crotch_m: float
     emptiness: Float[np.ndarray, "x y z"]
+    ambiguous_m: Float[np.ndarray, "k 3"] = field(default_factory=lambda: np.zeros((0, 3)))
 
     def downsampled(self) -> CanonicalGrid:
         """Return the grid with every second sample."""
-        density, body_distance_m, hand_weight, emptiness = (
-            grid[::2, ::2, ::2] for grid in (self.density, self.body_distance_m, self.hand_weight, self.emptiness)
-        )
-        spacing_m = 2.0 * self.spacing_m
-        return CanonicalGrid(self.origin_m, spacing_m, density, body_distance_m, hand_weight, self.crotch_m, emptiness)
+        grids = {name: getattr(self, name)[::2, ::2, ::2] for name in _GRIDS}
+        return replace(self, spacing_m=2.0 * self.spacing_m, **grids)
 
 
 def sample_canonical_grid(

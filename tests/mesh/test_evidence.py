@@ -11,6 +11,8 @@ from pipeline.geometry.camera import Camera
 from pipeline.geometry.rotation import axis_angle_to_matrix
 from pipeline.mesh import evidence
 from pipeline.mesh.evidence import (
+    AMBIGUOUS_FADE_M,
+    AMBIGUOUS_REACH_M,
     CONTRADICTED_SHARE,
     DEPTH_SHARE,
     is_copy,
@@ -133,6 +135,22 @@ def test_the_copy_of_a_shell_is_empty(body: Body) -> None:
     along, far = np.abs(points_m[:, 0] - 0.2) < 0.05, capsule_distance(points_m) > RADIUS_M + 0.025
     assert found[along & far & (points_m[:, 1] > 0.6)].mean() > 0.9
     assert found[along & (points_m[:, 1] < 0.5)].max() == 0.0
+
+
+def test_the_surface_is_arbitrary_where_a_copy_was(body: Body) -> None:
+    """Ambiguous are samples of the shell that are emptied; near them views tell nothing, elsewhere as much as before."""
+    samples = sample_canonical_grid(shell_density, BOUNDS_M, body, 0.5 * VOXEL_SIZE_M, SETTINGS)
+    view = replace(bent_view(np.radians(130.0)), mask=torch.full((CAMERA.height, CAMERA.width), 255, dtype=torch.uint8))
+    ambiguous_m = with_emptiness(samples, body, [view]).ambiguous_m
+    assert len(ambiguous_m) > 20
+    assert (shell_density(torch.from_numpy(ambiguous_m)) > 0.0).all()
+    turn = [view_from(2.0 * np.pi * k / 12) for k in range(12)]
+    before, after = surface_evidence(body, turn), surface_evidence(body, turn, ambiguous_m)
+    distance_m = np.linalg.norm(body.vertices[:, None] - ambiguous_m[None], axis=2).min(axis=1)
+    assert (after[distance_m < AMBIGUOUS_REACH_M] == 0.0).all()
+    assert (before[distance_m < AMBIGUOUS_REACH_M] > 0.0).any()
+    far = distance_m > AMBIGUOUS_REACH_M + AMBIGUOUS_FADE_M
+    np.testing.assert_array_equal(after[far], before[far])
 
 
 def test_a_pit_in_cloth_is_no_copy(body: Body, monkeypatch: pytest.MonkeyPatch) -> None:
