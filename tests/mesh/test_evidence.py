@@ -138,7 +138,7 @@ def test_the_copy_of_a_shell_is_empty(body: Body) -> None:
 
 
 def test_the_surface_is_arbitrary_where_a_copy_was(body: Body) -> None:
-    """Ambiguous are samples of the shell that are emptied; near them views tell nothing, elsewhere as much as before."""
+    """Ambiguous are emptied samples of the shell; near them views tell nothing, elsewhere as much as before."""
     samples = sample_canonical_grid(shell_density, BOUNDS_M, body, 0.5 * VOXEL_SIZE_M, SETTINGS)
     view = replace(bent_view(np.radians(130.0)), mask=torch.full((CAMERA.height, CAMERA.width), 255, dtype=torch.uint8))
     ambiguous_m = with_emptiness(samples, body, [view]).ambiguous_m
