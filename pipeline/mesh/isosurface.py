@@ -47,7 +47,7 @@ class CanonicalGrid:
     origin_m: position of sample [0, 0, 0]. spacing_m: distance of neighbouring samples. density: 1/m. body_distance_m:
     signed distance to the fitted body, negative inside. hand_weight: skin weight of the hand joints, in [0, 1].
     crotch_m: height of the crotch of the body. emptiness: 1 where nothing is whatever the density, 0 elsewhere.
-    ambiguous_m: empty samples with density, which the frames put there for another part of the body; see
+    ambiguous_m: empty samples above the crotch with density, which frames put there for another part of the body; see
     `pipeline.mesh.evidence`.
     """
 

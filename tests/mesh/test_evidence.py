@@ -144,6 +144,7 @@ def test_the_surface_is_arbitrary_where_a_copy_was(body: Body) -> None:
     ambiguous_m = with_emptiness(samples, body, [view]).ambiguous_m
     assert len(ambiguous_m) > 20
     assert (shell_density(torch.from_numpy(ambiguous_m)) > 0.0).all()
+    assert len(with_emptiness(replace(samples, crotch_m=2.0), body, [view]).ambiguous_m) == 0
     turn = [view_from(2.0 * np.pi * k / 12) for k in range(12)]
     before, after = surface_evidence(body, turn), surface_evidence(body, turn, ambiguous_m)
     distance_m = np.linalg.norm(body.vertices[:, None] - ambiguous_m[None], axis=2).min(axis=1)
