@@ -28,7 +28,7 @@ from pipeline.body.body import Body, load_anny
 from pipeline.geometry.mesh import Mesh
 from pipeline.io.npz import save_npz
 from pipeline.template.layout import LAYOUT_NPZ
-from pipeline.template.regions import load_template, template_quads
+from pipeline.template.regions import ASSETS, load_template, template_quads
 
 HEAD_SCALE = 2.0
 """Texels of the head are half as long: it is looked at most."""
@@ -55,7 +55,7 @@ class _Chart:
 
 def main(argv: Sequence[str]) -> None:
     """Write the layout."""
-    out = Path(argv[0]) if argv else Path(__file__).parents[1] / "pipeline" / "template" / "assets" / LAYOUT_NPZ
+    out = Path(argv[0]) if argv else ASSETS / LAYOUT_NPZ
     model = load_anny()
     charts = _make_charts(model.at_shape(model.shape_defaults))
     scale, places = _pack(charts)

@@ -154,9 +154,27 @@ def test_every_declared_dependency_is_locked(repository: Path) -> None:
 def test_importing_the_stages_imports_no_slow_library(repository: Path) -> None:
     """A second or more for each command: torch's compiler (which roma imports), the detector, the body model."""
     slow = "torch._dynamo", "sympy", "mediapipe", "jax", "anny", "warp", "pymeshlab", "matplotlib"
-    code = f"import sys, stages; stages.PIPELINE.load_stages(); print([m for m in {slow} if m in sys.modules])"
-    printed = subprocess.run([sys.executable, "-c", code], cwd=repository, check=True, capture_output=True, text=True)
-    assert printed.stdout.strip() == "[]"
+    assert imported_by("import stages; stages.PIPELINE.load_stages()", slow, repository) == "[]"
+
+
+def test_reading_the_template_imports_neither_the_body_model_nor_a_compiler(repository: Path) -> None:
+    """Mesh, texture and export read its parts, sum in a fixed order, and would wait for each import."""
+    code = """
+from pipeline.kernels.common.determinism import deterministic_sums
+from pipeline.template.face.units import load_face_units, load_teeth
+from pipeline.template.layout import load_layout
+from pipeline.template.regions import load_template
+with deterministic_sums():
+    load_template(), load_layout(), load_face_units(), load_teeth()
+"""
+    assert imported_by(code, ("torch._dynamo", "sympy", "anny", "roma"), repository) == "[]"
+
+
+def imported_by(code: str, modules: tuple[str, ...], repository: Path) -> str:
+    """Run code in an interpreter; return the list of those modules that are imported then."""
+    code += f"\nimport sys; print([m for m in {modules} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], cwd=repository, check=True, capture_output=True, text=True)
+    return done.stdout.strip()
 
 
 @pytest.mark.parametrize("line", ["Torch==2.4+cpu", "torch>=2,<3", "torch"])

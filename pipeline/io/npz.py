@@ -41,9 +41,11 @@ _DAMAGE = (
 
 def save_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Write arrays by name. (`numpy.savez` would store the current time in the archive.)"""
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+    with zipfile.ZipFile(path, "w") as archive:
         for name in sorted(arrays):
-            with archive.open(zipfile.ZipInfo(f"{name}{_SUFFIX}", _ZIP_EPOCH), "w", force_zip64=True) as member:
+            info = zipfile.ZipInfo(f"{name}{_SUFFIX}", _ZIP_EPOCH)
+            info.compress_type = zipfile.ZIP_DEFLATED  # the archive's own applies to no member that comes with its info
+            with archive.open(info, "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, np.asarray(arrays[name], order="C"), allow_pickle=False)
 
 

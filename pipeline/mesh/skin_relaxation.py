@@ -33,6 +33,7 @@ from pipeline.geometry.surface import (
     laplacian,
     resolve_self_intersections,
 )
+from pipeline.kernels.adam import adam_step_
 from pipeline.kernels.raster import rasterize
 from pipeline.mesh.range_of_motion import sample_poses
 from pipeline.mesh.skin_transfer import SkinnedTopology, build_skinned_topology
@@ -53,6 +54,7 @@ STEPS, SPARSE_FROM, WEIGHT_RATE, OFFSET_RATE_MM = 80, 0.6, 0.075, 0.18
 """Steps of Adam; share of them after which only `INFLUENCES` joints are left; learning rates."""
 MIN_EDGE_M = 0.002
 """Shorter edges are not measured: their length is mostly noise of the extraction."""
+ADAM_BETAS, ADAM_EPSILON = (0.9, 0.999), 1e-8
 SHOWN_FRAMES = 8
 """Filmed frames whose pictures must not change."""
 
@@ -228,9 +230,10 @@ def _minimise(
     logits = (0.5 * part.start + 0.5 * part.spread + 1e-4).log().requires_grad_(True)
     offset_mm = torch.zeros_like(at_m, requires_grad=True)
     allowed = torch.ones_like(part.start, dtype=torch.bool)
-    optimiser = torch.optim.Adam(
-        [{"params": [logits], "lr": WEIGHT_RATE}, {"params": [offset_mm], "lr": OFFSET_RATE_MM}]
-    )
+    free = ((logits, WEIGHT_RATE), (offset_mm, OFFSET_RATE_MM))
+    for values, _ in free:
+        values.grad = torch.zeros_like(values)
+    moments = [(torch.zeros_like(values), torch.zeros_like(values)) for values, _ in free]
 
     def current() -> tuple[Float[Tensor, "u k"], Float[Tensor, "u 3"]]:
         chosen = torch.softmax(logits.masked_fill(~allowed, -torch.inf), dim=1)
@@ -250,9 +253,10 @@ def _minimise(
             + WEIGHTS_SMOOTHNESS * part.laplacian(part.dense(now - part.start)).square().sum()
             + OFFSET_SMOOTHNESS * part.laplacian(moved_mm).square().sum()
         )
-        optimiser.zero_grad()
         energy.backward()
-        optimiser.step()
+        for (values, rate), (first, second) in zip(free, moments, strict=True):
+            assert values.grad is not None
+            adam_step_(values, values.grad, first, second, step + 1, rate, ADAM_BETAS, ADAM_EPSILON)
     now, moved_mm = (values.detach() for values in current())
     new_weights, new_vertices = weights.clone(), mesh.vertices.copy()
     is_free = part.free[:, 0] > 0.0

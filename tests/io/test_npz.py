@@ -21,6 +21,11 @@ def test_same_arrays_give_the_same_bytes_and_come_back(tmp_path) -> None:
     assert again["a"].tolist() == ["x", "yy"]
 
 
+def test_arrays_are_compressed(tmp_path) -> None:
+    npz.save_npz(tmp_path / "one.npz", {"zeros": np.zeros(10_000)})
+    assert (tmp_path / "one.npz").stat().st_size < 1_000
+
+
 def test_shapes_are_kept(tmp_path) -> None:
     arrays = {"number": np.array(2.5), "word": np.array("x"), "row": np.zeros(1), "turned": np.eye(3, 2).T}
     npz.save_npz(tmp_path / "one.npz", arrays)

@@ -1,11 +1,23 @@
-"""The outer surface of the built-in body."""
+"""Parts of the built-in body, and its outer surface."""
 
 import numpy as np
 import trimesh
 
+from data_tools.template_assets import main
 from pipeline.body.body import load_anny
 from pipeline.geometry.surface import signed_distance_m
-from pipeline.template.regions import load_template, outer_surface
+from pipeline.io.npz import load_npz
+from pipeline.template.face.units import FACE_UNITS_NPZ
+from pipeline.template.regions import ASSETS, PARTS_NPZ, load_template, outer_surface
+
+
+def test_the_parts_of_the_package_are_those_of_the_library(tmp_path) -> None:
+    main([str(tmp_path)])
+    for name in (PARTS_NPZ, FACE_UNITS_NPZ):
+        made, kept = load_npz(tmp_path / name), load_npz(ASSETS / name)
+        assert made.keys() == kept.keys()
+        for key, array in made.items():
+            np.testing.assert_array_equal(kept[key], array, err_msg=f"{name}: {key}", strict=True)
 
 
 def test_the_outer_surface_is_closed_and_solid_behind_lips_and_lids() -> None:

