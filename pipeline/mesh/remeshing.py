@@ -70,22 +70,21 @@ def _remesh_in_two_sizes(mesh: Mesh, target_edge_m: float, body: Body) -> Mesh:
     return mesh
 
 
-def detailed_faces(mesh: Mesh, body: Body) -> Bool[np.ndarray, "f"]:
-    """Return the mesh faces at the hands, and at the face and the ears of the person."""
+def faces_by_part(mesh: Mesh, body: Body) -> Int[np.ndarray, "f"]:
+    """Return the part of each mesh face: `DETAILED` at hands, face and ears of the person, else `HEAD` or `FREE`."""
     centres_m = mesh.vertices[mesh.faces].mean(axis=1)
     distance_m, nearest, _ = closest_points_on_mesh(centres_m, body.mesh())
-    at_hand = (hand_skin_weights(body) > 0.5)[body.faces[nearest, 0]]
-    at_ear = is_ear(centres_m, body) & head_vertices(body)[body.faces[nearest, 0]] & (distance_m < HAIR_OFFSET_M)
-    return at_hand | at_ear | face_of_person(mesh, body)
-
-
-def faces_by_part(mesh: Mesh, body: Body) -> Int[np.ndarray, "f"]:
-    """Return the part of each mesh face: `DETAILED` (see `detailed_faces`), else `HEAD`, else `FREE`."""
-    centres_m = mesh.vertices[mesh.faces].mean(axis=1)
-    _, nearest, _ = closest_points_on_mesh(centres_m, body.mesh())
-    parts = np.where(head_vertices(body)[body.faces[nearest, 0]], HEAD, FREE)
-    parts[detailed_faces(mesh, body)] = DETAILED
+    vertex = body.faces[nearest, 0]
+    at_hand, at_head = (hand_skin_weights(body) > 0.5)[vertex], head_vertices(body)[vertex]
+    at_ear = is_ear(centres_m, body) & at_head & (distance_m < HAIR_OFFSET_M)
+    parts = np.where(at_head, HEAD, FREE)
+    parts[at_hand | at_ear | face_of_person(mesh, body)] = DETAILED
     return parts
+
+
+def detailed_faces(mesh: Mesh, body: Body) -> Bool[np.ndarray, "f"]:
+    """Return the mesh faces that are `DETAILED`."""
+    return faces_by_part(mesh, body) == DETAILED
 
 
 def face_of_person(mesh: Mesh, body: Body) -> Bool[np.ndarray, "f"]:
