@@ -207,7 +207,7 @@ def with_emptiness(samples: CanonicalGrid, body: Body, views: Sequence[PosedView
     copies[trunk] &= ~closing(solid & ~is_empty & ~copies, PIT_RADIUS_M, coarse.spacing_m)[trunk]
     ambiguous = copies
     ambiguous[candidates] |= is_told_by_colours_alone(points_m, body, views)
-    emptiness = upsample((is_empty | ambiguous).astype(np.float64), samples.density.shape)
+    emptiness = upsample((is_empty | ambiguous).astype(np.float64), samples.density.shape).astype(np.float16)
     ambiguous_m = np.argwhere(ambiguous & solid) * coarse.spacing_m + coarse.origin_m
     # Cloth between the legs has rules of its own (`pipeline.mesh.between_legs`).
     ambiguous_m = ambiguous_m[ambiguous_m[:, 1] > coarse.crotch_m]

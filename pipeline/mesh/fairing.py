@@ -107,9 +107,13 @@ def fair_surface(
     value_m = close_valleys(value_m, samples.crotch_m, samples.origin_m, samples.spacing_m)
     fine_detail = upsample(detail, shape)
     near_detail = (np.abs(value_m) < DETAIL_BAND_M) & (fine_detail > MIN_DETAIL)
-    exact_m = signed_distance_m(np.argwhere(near_detail) * samples.spacing_m + samples.origin_m, outer_surface)
-    value_m[near_detail] += fine_detail[near_detail] * (exact_m - upsample(body_m, shape)[near_detail])
-    del near_detail, fine_detail
+    share = fine_detail[near_detail]
+    del fine_detail
+    indices = np.argwhere(near_detail)
+    exact_m = signed_distance_m(indices * samples.spacing_m + samples.origin_m, outer_surface)
+    coarse_m = ndimage.map_coordinates(body_m, indices.T / 2.0, order=1)
+    value_m[near_detail] += share * (exact_m - coarse_m)
+    del near_detail
     return repair(isosurface(np.negative(value_m, out=value_m), 0.0, samples.origin_m, samples.spacing_m))
 
 

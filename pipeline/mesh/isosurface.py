@@ -49,6 +49,8 @@ class CanonicalGrid:
     crotch_m: height of the crotch of the body. emptiness: 1 where nothing is whatever the density, 0 elsewhere.
     ambiguous_m: empty samples above the crotch with density, which frames put there for another part of the body; see
     `pipeline.mesh.evidence`.
+
+    Weight and emptiness are kept in half precision, because a fine grid has 25 million samples.
     """
 
     origin_m: Float[np.ndarray, "3"]
@@ -89,7 +91,7 @@ def sample_canonical_grid(
     mesh = body.mesh()
     distance_m = signed_distance_grid(mesh, origin_m, counts, voxel_size_m)
     density = _density_grid(density_fn, origin_m, distance_m.shape, voxel_size_m)
-    hand_weight = np.zeros_like(density)
+    hand_weight, emptiness = np.zeros(density.shape, np.float16), np.zeros(density.shape, np.float16)
     if settings.hands_from_body:
         vertex_hand_weight = hand_skin_weights(body)
         near_hand = _indices_in_side_boxes(
@@ -101,7 +103,7 @@ def sample_canonical_grid(
         narrow_band = np.abs(distance_m) < HAND_NARROW_BAND_VOXELS * voxel_size_m
         exact = np.argwhere((hand_weight > 0.0) & narrow_band)
         distance_m[tuple(exact.T)] = signed_distance_m(exact * voxel_size_m + origin_m, mesh)
-    emptiness, crotch_m = np.zeros_like(density), crotch_height_m(body)
+    crotch_m = crotch_height_m(body)
     return CanonicalGrid(origin_m, voxel_size_m, density, distance_m, hand_weight, crotch_m, emptiness)
 
 

@@ -18,6 +18,7 @@ from torch import Tensor
 from pipeline.body.body import Motion, canonical_to_world
 from pipeline.body.pose_correction import PoseCorrection
 from pipeline.geometry.mesh import Mesh
+from pipeline.kernels.common.heap import trim_heap
 from pipeline.mesh.correction_prior import drifting_prior
 from pipeline.mesh.pose_alignment import AlignedSurface, PoseOffsets, align_poses
 from pipeline.mesh.remeshing import FREE, detailed_faces, faces_by_part, remesh_adaptively, remesh_uniformly
@@ -89,11 +90,13 @@ def _run_round(state: RefinementState, inputs: RefinementInputs) -> RefinementSt
     if state.rounds_done > 0:
         mesh = _remesh(mesh, skin, inputs)
         skin = transfer_skin(mesh, inputs.body)
+    trim_heap()
     seed = inputs.settings.seed + 1000 * rounds_done
     mesh = optimise_vertices(mesh, skin, inputs, seed, f"mesh round {rounds_done}")
     psnr_db = mesh_psnr_db(mesh, skin, inputs.validation, inputs.shader)
     if inputs.validation and psnr_db < state.validation_psnr_db[-1]:
         return replace(state, rounds_done=rounds_done, finished=True)
+    trim_heap()
     accepted = (*state.validation_psnr_db, psnr_db)
     finished = rounds_done == inputs.rounds
     new = RefinementState(mesh, skin, _shader_state(inputs), rounds_done, accepted, finished, state.pose_offsets)

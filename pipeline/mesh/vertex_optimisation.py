@@ -24,7 +24,7 @@ from pipeline.geometry.linear_systems import factorise_positive_definite
 from pipeline.geometry.mesh import Mesh
 from pipeline.geometry.surface import adjacency, laplacian
 from pipeline.kernels.adam import adam_step_
-from pipeline.kernels.common.thread_pool import ThreadPool
+from pipeline.kernels.common.thread_pool import ThreadPool, shared_thread_pool
 from pipeline.mesh.remeshing import face_of_person
 from pipeline.mesh.settings import MeshSettings
 from pipeline.mesh.skin_transfer import SkinnedTopology
@@ -113,7 +113,7 @@ def optimise_vertices(
     colour_rate = settings.appearance_learning_rate
     moments = [(torch.zeros_like(colour), torch.zeros_like(colour)) for colour in colours]
     warm_up = settings.appearance_steps if colours else 0
-    threads = ThreadPool(settings.frames_per_step)
+    threads = shared_thread_pool(settings.frames_per_step)
     for step in track(range(warm_up + inputs.steps), label):
         update_vertices = step >= warm_up
         offset = smooth(factorisation, coordinates)
