@@ -55,6 +55,7 @@ STEPS, SPARSE_FROM, WEIGHT_RATE, OFFSET_RATE_MM = 80, 0.6, 0.075, 0.18
 MIN_EDGE_M = 0.002
 """Shorter edges are not measured: their length is mostly noise of the extraction."""
 ADAM_BETAS, ADAM_EPSILON = (0.9, 0.999), 1e-8
+"""Decay of both moments, and what keeps a step finite (Kingma & Ba 2015)."""
 SHOWN_FRAMES = 8
 """Filmed frames whose pictures must not change."""
 
