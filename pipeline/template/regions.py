@@ -20,9 +20,6 @@ ASSETS = Path(__file__).parent / "assets"
 """Folder of the files that are the same for every person."""
 PARTS_NPZ = "parts.npz"
 
-COMPONENT_SIZES = {"skin": 13348, "tongue": 226, "eye": 72}
-"""Vertices of the skin with its cavities, of the tongue, and of each eyeball."""
-
 
 @dataclass(frozen=True)
 class Template:
@@ -59,7 +56,8 @@ class Template:
 
 def is_template_body(body: Body) -> bool:
     """Return whether a body has the topology of the built-in model; an SMPL model has another one."""
-    return np.array_equal(body.faces, load_template().faces)
+    template = load_template()
+    return len(body.vertices) == len(template.vertices) and np.array_equal(body.faces, template.faces)
 
 
 def outer_surface(body: Body) -> Mesh:

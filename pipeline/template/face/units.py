@@ -78,16 +78,21 @@ class Teeth:
 
 
 @lru_cache(maxsize=1)
+def _read() -> dict[str, np.ndarray]:
+    return load_npz(ASSETS / FACE_UNITS_NPZ)
+
+
+@lru_cache(maxsize=1)
 def load_teeth() -> Teeth:
-    """Read the teeth, once per process."""
-    arrays = load_npz(ASSETS / FACE_UNITS_NPZ)
+    """Return the teeth, read once per process."""
+    arrays = _read()
     return Teeth(arrays["teeth_vertices"], arrays["teeth_faces"].astype(np.int64), arrays["base_m"])
 
 
 @lru_cache(maxsize=1)
 def load_face_units() -> FaceUnits:
-    """Read the face units, once per process."""
-    arrays = load_npz(ASSETS / FACE_UNITS_NPZ)
+    """Return the face units, read once per process."""
+    arrays = _read()
     template = np.zeros((len(arrays["names"]), len(arrays["base_m"]), 3))
     template[:, arrays["moved_vertices"]] = arrays["moved_steps"] / STEPS_OF_UNIT
     teeth = arrays["teeth_steps"] / STEPS_OF_UNIT
